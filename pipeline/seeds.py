@@ -1,0 +1,34 @@
+"""The one place where random generators are made.
+
+Generators are *named*, not ordered: `rng_for(seed, "skin", "b3_s1")` stays the same when
+another board, skin or fold is added before it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    import torch
+
+
+def seed_for(seed: int, *names: str | int) -> int:
+    """Derive a 63-bit seed from a base seed and a path of names."""
+    text = "\x1f".join([str(seed), *map(str, names)])
+    digest = hashlib.blake2b(text.encode(), digest_size=8).digest()
+    return int.from_bytes(digest, "little") >> 1
+
+
+def rng_for(seed: int, *names: str | int) -> np.random.Generator:
+    """Make the generator that belongs to `names` under `seed` (PCG64)."""
+    return np.random.Generator(np.random.PCG64(seed_for(seed, *names)))
+
+
+def torch_generator_for(seed: int, *names: str | int) -> torch.Generator:
+    """Make the CPU torch generator that belongs to `names` under `seed`."""
+    import torch  # late: takes seconds, and only training needs it
+
+    return torch.Generator().manual_seed(seed_for(seed, *names))

@@ -1,0 +1,49 @@
+"""The base of every parameter model: frozen, strict, nothing extra, no defaults. Knows no knob.
+
+Sections live beside what they steer (`Split` in dataset.splits, `Recipe` in learning.recipe, ...) and are
+put together to a scene in `pipeline.params`.
+"""
+
+import json
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+
+from pipeline.errors import ParamsError, complain
+
+
+class Strict(BaseModel):
+    """A parameter model: what is not written is an error, and so is what is not known."""
+
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
+
+
+Model = TypeVar("Model", bound=Strict)
+
+
+def read_yaml(path: Path) -> Any:
+    """Read YAML 1.2 as DVC does (`1e-3` is a number)."""
+    try:
+        return YAML(typ="safe").load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ParamsError(complain(path, "the file", "there", "nothing", "Check the name.")) from None
+    except (YAMLError, UnicodeDecodeError) as error:
+        problem = " ".join(str(error).split())
+        raise ParamsError(complain(path, "the file", "YAML", problem, "Mend the line it names.")) from None
+
+
+def parse(model: type[Model], value: Any, where: str) -> Model:
+    """Check plain values against a model; name the first parameter that is wrong, and what is allowed."""
+    try:
+        # Through JSON, so that a YAML list may fill a tuple while "3" still does not become 3.
+        return model.model_validate_json(json.dumps(value))
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        name = ".".join(map(str, first["loc"])) or "the file"
+        got = "nothing" if first["type"] == "missing" else repr(first.get("input"))[:80]
+        rule = {"missing": "given", "extra_forbidden": "a known parameter"}.get(first["type"])
+        rule = rule or first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
+        raise ParamsError(complain(where, name, rule, got, "Mend it there.")) from None

@@ -1,0 +1,15 @@
+"""Fixtures that every folder of tests shares."""
+
+from pathlib import Path
+
+import pytest
+
+SHARED_DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The folder of real recordings beside the checkout; tests that need it say so when they skip."""
+    if not SHARED_DATA.is_dir():
+        pytest.skip("needs the real recordings in ../shared/data, which are not part of the repository")
+    return SHARED_DATA.resolve()

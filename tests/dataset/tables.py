@@ -1,0 +1,34 @@
+"""Readings and rows made by hand, for tests."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeline.dataset.rows import Rows
+from pipeline.schema import Readings
+from pipeline.seeds import rng_for
+
+
+def readings(capture: str = "c0", board: str = "b0", skin: str = "s0", f: int = 6, **changes: object) -> Readings:
+    """A capture of one chip: two passes of one place a reading, force 1 N, db = b - noload = row number."""
+    ones = np.ones(f, np.float32)
+    values = {
+        "capture": capture, "board": board, "skin": skin, "source": "recorded",
+        "indentation": np.arange(f, dtype=np.int32), "pass_i": (np.arange(f, dtype=np.int32) * 2) // f,
+        "reading_i": np.zeros(f, np.int32), "x_mm": np.arange(f, dtype=np.float32), "y_mm": 2 * ones,
+        "depth_mm": ones, "Fx_N": ones * np.nan, "Fy_N": ones * np.nan, "Fz_N": ones,
+        "b_uT": np.arange(f, dtype=np.float32)[:, None] + np.full((f, 3), 100, np.float32),
+        "noload_uT": np.full((f, 3), 100, np.float32), "temperature_degC": np.full((f, 1), 25, np.float32),
+        "t_s": np.arange(f, dtype=np.float64), "n_contacts": np.arange(f, dtype=np.int32),
+    }  # fmt: skip
+    return Readings(**(values | changes))
+
+
+def rows(boards: Sequence[str], skins: Sequence[str], pass_i: Sequence[int] | None = None) -> Rows:
+    """Rows with these labels and random fields."""
+    rng = rng_for(0, "rows")
+    f = len(boards)
+    return Rows(
+        np.array(boards), np.array(skins), rng.normal(0, 50, (f, 3)).astype(np.float32),
+        rng.uniform(0, 16, (f, 3)).astype(np.float32), np.array(pass_i or [0] * f, np.int32), {},
+    )  # fmt: skip

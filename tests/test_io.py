@@ -1,0 +1,89 @@
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from pipeline import io
+from pipeline.errors import SchemaError
+from pipeline.schema import UNITS
+from tests.dataset.tables import readings
+
+
+def test_readings_come_back_as_they_were_written(tmp_path):
+    before = readings(x_mm=np.array([0, np.nan, 2, 3, 4, 5], np.float32))
+    io.write_readings(tmp_path / "c0.parquet", [before], {"rows_n": 6})
+    after = io.read_readings(tmp_path / "c0.parquet")
+    for name in UNITS:
+        np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
+        assert getattr(after, name).dtype == getattr(before, name).dtype
+    assert (after.capture, after.board, after.skin, after.source) == ("c0", "b0", "s0", "recorded")
+    assert io.read_account(tmp_path / "c0.parquet") == {"rows_n": 6}
+
+
+def test_every_column_of_the_file_has_its_unit_and_the_file_its_schema_version(tmp_path):
+    io.write_readings(tmp_path / "c0.parquet", [readings()], {})
+    schema = pq.read_schema(tmp_path / "c0.parquet")
+    assert {field.name: field.metadata[b"unit"].decode() for field in schema if field.name in UNITS} == UNITS
+    assert schema.metadata[b"reskin.schema"] == b"1"
+    assert pq.ParquetFile(tmp_path / "c0.parquet").metadata.row_group(0).column(5).compression == "ZSTD"
+
+
+def test_blocks_and_one_piece_hold_the_same_rows(tmp_path):
+    io.write_readings(tmp_path / "whole.parquet", [readings()], {})
+    io.write_readings(tmp_path / "blocks.parquet", [readings(), readings()], {})
+    assert len(io.read_readings(tmp_path / "blocks.parquet")) == 2 * len(io.read_readings(tmp_path / "whole.parquet"))
+
+
+def test_same_readings_same_bytes(tmp_path):
+    for name in ("one", "other"):
+        io.write_readings(tmp_path / name, [readings()], {"rows_n": 6})
+    assert (tmp_path / "one").read_bytes() == (tmp_path / "other").read_bytes()
+
+
+def test_a_capture_without_readings_writes_nothing(tmp_path):
+    with pytest.raises(SchemaError, match="at least one reading"):
+        io.write_readings(tmp_path / "c0.parquet", [], {})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_failure_in_the_middle_leaves_the_old_file(tmp_path):
+    io.write_text(tmp_path / "a.txt", "old")
+    with pytest.raises(RuntimeError), io.replacing(tmp_path / "a.txt") as temporary:
+        temporary.write_text("half")
+        raise RuntimeError
+    assert [file.read_text() for file in tmp_path.iterdir()] == ["old"]
+
+
+@pytest.mark.parametrize("content", [b"", b"x", bytes(range(256)) * 9])
+def test_what_is_no_parquet_is_one_sentence(tmp_path, content):
+    (tmp_path / "c0.parquet").write_bytes(content)
+    with pytest.raises(SchemaError, match=r"c0.parquet: the file must be readable Parquet"):
+        io.read_readings(tmp_path / "c0.parquet")
+
+
+def test_a_column_in_another_unit_is_refused(tmp_path):
+    io.write_readings(tmp_path / "c0.parquet", [readings()], {})
+    table = pq.read_table(tmp_path / "c0.parquet")
+    i = table.schema.get_field_index("b_uT")
+    table = table.cast(table.schema.set(i, table.schema.field("b_uT").with_metadata({"unit": "mT"})))
+    io.write_table(tmp_path / "c1.parquet", table)
+    with pytest.raises(SchemaError, match="unit of b_uT must be 'uT'; got mT"):
+        io.read_readings(tmp_path / "c1.parquet")
+
+
+def test_a_missing_column_is_named(tmp_path):
+    io.write_readings(tmp_path / "c0.parquet", [readings()], {})
+    io.write_table(tmp_path / "c1.parquet", pq.read_table(tmp_path / "c0.parquet").drop_columns(["noload_uT"]))
+    with pytest.raises(SchemaError, match="none named \\['noload_uT'\\]"):
+        io.read_readings(tmp_path / "c1.parquet")
+
+
+def test_json_refuses_what_json_cannot_say(tmp_path):
+    with pytest.raises(ValueError, match="Out of range float"):
+        io.write_json(tmp_path / "a.json", {"x": float("nan")})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_broken_safetensors_are_one_sentence(tmp_path):
+    (tmp_path / "m.safetensors").write_bytes(b"junk")
+    with pytest.raises(SchemaError, match="must be safetensors"):
+        io.read_tensors(tmp_path / "m.safetensors")

@@ -1,0 +1,28 @@
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.seeds import rng_for, seed_for, torch_generator_for
+
+names = st.lists(st.text(max_size=5), max_size=3)
+
+
+@given(st.integers(0, 2**40), names)
+def test_a_generator_is_known_by_its_names(seed, path):
+    assert rng_for(seed, *path).integers(2**60) == rng_for(seed, *path).integers(2**60)
+
+
+@given(st.integers(0, 2**40), names, names)
+def test_other_names_or_seeds_give_other_streams(seed, one, other):
+    if one != other:
+        assert seed_for(seed, *one) != seed_for(seed, *other)
+    assert seed_for(seed, *one) != seed_for(seed + 1, *one)
+
+
+def test_a_name_cannot_be_split_in_another_way():
+    assert seed_for(0, "a", "bc") != seed_for(0, "ab", "c")
+
+
+def test_torch_draws_from_the_named_stream():
+    draws = [torch.rand(3, generator=torch_generator_for(1, "x")) for _ in range(2)]
+    assert torch.equal(*draws)
