@@ -1,0 +1,36 @@
+"""The card of a model: all that somebody needs to use it, and to know what it was trained on. JSON-ready words only."""
+
+from typing import Any
+
+import numpy as np
+
+from pipeline.dataset.rows import TARGETS, Rows
+from pipeline.learning.grid import Cell, Trained
+
+FORMAT = "reskin-model/1"
+
+
+def describe(cell: Cell, trained: Trained, rows: Rows, scene: str, code: str) -> dict[str, Any]:
+    """Describe a trained cell; `scores` are added by whoever knows the truth."""
+    return {
+        "format": FORMAT,
+        "scene": scene,
+        "question": cell.question,
+        "recipe_name": cell.recipe_name,
+        "recipe": cell.recipe.model_dump(mode="json"),
+        "fold": cell.fold,
+        "seed": cell.seed,
+        "seed_i": cell.seed_i,
+        "key": trained.key,
+        "git": code,
+        "architecture": {name: list(value.shape) for name, value in trained.weights.items()},
+        "input": {"quantity": "change of field", "unit": "uT", "channels_n": rows.db_uT.shape[1]},
+        "output": {name: name.rsplit("_", 1)[1] for name in TARGETS},
+        "scaler": {name: value.tolist() for name, value in trained.scaler.arrays().items()},
+        "train_boards": np.unique(rows.board[cell.train]).tolist(),
+        "train_skins": np.unique(rows.skin[cell.train]).tolist(),
+        "train_rows_n": len(cell.train),
+        "test_boards": np.unique(rows.board[cell.test]).tolist(),
+        "test_skins": np.unique(rows.skin[cell.test]).tolist(),
+        "curve": [round(value, 9) for value in trained.curve],
+    }

@@ -1,0 +1,39 @@
+"""Where trainings run. In: the environment variable RESKIN_EXECUTOR. Out: a `concurrent.futures` executor.
+
+An environment variable and no parameter, because where a training ran must not change its hash. Refuses to know
+what is run.
+"""
+
+import multiprocessing
+import os
+import threading
+from concurrent.futures import Executor, ProcessPoolExecutor
+
+from pipeline.errors import ParamsError, complain
+
+VARIABLE = "RESKIN_EXECUTOR"
+DEFAULT = "processes:2"
+
+
+def make_executor() -> Executor:
+    """Make the executor that RESKIN_EXECUTOR names: `processes:N` (default N = 2, one thread each)."""
+    word = os.environ.get(VARIABLE, DEFAULT)
+    kind, _, count = word.partition(":")
+    if kind != "processes" or not count.isdecimal() or int(count) < 1:
+        raise ParamsError(
+            complain(VARIABLE, "the executor", "processes:N with N >= 1", repr(word), "Unset it for two.")
+        )
+    # spawn: a forked child of a threaded parent can hang in BLAS.
+    return ProcessPoolExecutor(int(count), multiprocessing.get_context("spawn"), _end_with_parent)
+
+
+def _end_with_parent() -> None:
+    """Let no worker outlive a killed stage: an orphan would train on, unseen, beside the next attempt."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def wait() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()

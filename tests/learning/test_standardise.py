@@ -1,0 +1,70 @@
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.learning.standardise import SCALE_FLOOR, Scaler, fit_released, fit_standard
+from pipeline.seeds import rng_for
+
+
+def rows(n: int = 50, ch: int = 6) -> tuple[np.ndarray, np.ndarray]:
+    rng = rng_for(0, "rows")
+    return rng.normal(3, 40, (n, ch)).astype(np.float32), rng.uniform(0, 16, (n, 3)).astype(np.float32)
+
+
+def test_standard_inputs_have_zero_mean_and_unit_deviation():
+    db_uT, target = rows()
+    scaled = fit_standard(db_uT, target).encode(db_uT).astype(float)
+    # float32 rounding of numbers around 3 sd
+    np.testing.assert_allclose(scaled.mean(axis=0), 0, atol=1e-5)
+    np.testing.assert_allclose(scaled.std(axis=0), 1, atol=1e-5)
+
+
+def test_a_scaler_knows_training_rows_only():
+    db_uT, target = rows()
+    train = np.arange(30)
+    fitted = fit_standard(db_uT[train], target[train])
+    db_uT[30:] += 1e6  # whatever the test rows hold
+    target[30:] -= 1e6
+    again = fit_standard(db_uT[train], target[train])
+    assert all((a == b).all() for a, b in zip(fitted.arrays().values(), again.arrays().values(), strict=True))
+
+
+def test_a_channel_that_never_moves_gets_the_floor_and_stays_finite():
+    db_uT, target = rows()
+    db_uT[:, 2] = 5.0
+    for fit in (fit_standard, fit_released):
+        scaler = fit(db_uT, target)
+        assert scaler.input_scale[2] == SCALE_FLOOR
+        assert np.isfinite(scaler.encode(db_uT)).all()
+
+
+def test_a_force_that_is_never_known_leaves_places_as_they_are():
+    db_uT, target = rows()
+    target[:, 2] = np.nan
+    scaler = fit_standard(db_uT, target)
+    assert np.isfinite(scaler.decode(np.zeros((1, 3), np.float32))).all()
+
+
+def test_the_released_scaling_is_five_deviations_and_fixed_targets():
+    db_uT, target = rows()
+    scaler = fit_released(db_uT, target)
+    # float32 against float64
+    np.testing.assert_allclose(scaler.input_scale, 5 * db_uT.std(axis=0, dtype=float), rtol=1e-6)
+    assert (scaler.input_shift == 0).all()
+    assert scaler.encode_target(np.array([[16, 8, 3]], np.float32)).tolist() == [[1.0, 0.5, 1.0]]
+
+
+@given(st.integers(0, 10_000))
+def test_decode_undoes_encode(seed):
+    rng = rng_for(seed, "round trip")
+    db_uT, target = rows()
+    scaler = fit_standard(db_uT, target)
+    wanted = rng.uniform(-20, 20, (5, 3)).astype(np.float32)
+    # two float32 roundings
+    np.testing.assert_allclose(scaler.decode(scaler.encode_target(wanted)), wanted, atol=1e-4)
+
+
+def test_a_scaler_survives_being_saved():
+    scaler = fit_standard(*rows())
+    again = Scaler.of_arrays(scaler.arrays() | {"other": np.zeros(1)})
+    assert all((a == b).all() for a, b in zip(scaler.arrays().values(), again.arrays().values(), strict=True))
