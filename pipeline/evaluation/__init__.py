@@ -1,0 +1,1 @@
+"""From predictions to scores. NumPy only: knows no network and no picture."""

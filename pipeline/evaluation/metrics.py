@@ -1,0 +1,53 @@
+"""The paper's three numbers, from predictions. In: true and predicted x, y, F. Out: accuracy and mean squared errors.
+
+Refuses to know models, folds and files. NaN in the truth means unknown, and is left out of that number.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Float
+
+ACCURACY_LIMIT_MM = 1.0  # paper section 4: both |dx| and |dy| within 1 mm
+METRICS = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2")
+
+
+def score(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -> dict[str, float]:
+    """Score predictions of (x_mm, y_mm, F_N).
+
+    MSE_xy is the mean over the two axes (the paper does not say whether it sums or averages); MSE_F is absent when no
+    force is known.
+    """
+    error = predicted.astype(float) - true
+    known = ~np.isnan(error[:, 2])
+    place = error[:, :2]
+    numbers = {
+        "accuracy_pct": 100.0 * float((np.abs(place) <= ACCURACY_LIMIT_MM).all(axis=1).mean()),
+        "mse_xy_mm2": float((place**2).mean()),
+    }
+    if known.any():
+        numbers["mse_f_N2"] = float((error[known, 2] ** 2).mean())
+    return numbers
+
+
+def register(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
+    """Shift predicted places by one constant offset, so that their mean error is zero.
+
+    Each rig's origin was set by hand; this tells what of the error is registration. It uses the true places, so it is a
+    diagnosis and no result.
+    """
+    shifted = predicted.astype(float)
+    shifted[:, :2] -= (predicted[:, :2] - true[:, :2]).mean(axis=0)
+    return shifted
+
+
+def summarise(scores: list[Mapping[str, float]]) -> dict[str, dict[str, float]]:
+    """Mean, standard deviation (n - 1; absent for one score) and number of each metric over folds."""
+    summary: dict[str, dict[str, float]] = {}
+    for name in METRICS:
+        values = np.array([one[name] for one in scores if name in one])
+        if len(values):
+            summary[name] = {"mean": float(values.mean()), "n": len(values)}
+            if len(values) > 1:
+                summary[name]["sd"] = float(values.std(ddof=1))
+    return summary

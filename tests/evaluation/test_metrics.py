@@ -1,0 +1,61 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.evaluation.metrics import register, score, summarise
+
+TRUE = np.array([[2.0, 2.0, 1.0], [4.0, 6.0, 2.0], [8.0, 8.0, 3.0], [16.0, 0.0, 0.5]])
+
+
+def test_a_perfect_prediction_has_no_error():
+    assert score(TRUE, TRUE) == {"accuracy_pct": 100.0, "mse_xy_mm2": 0.0, "mse_f_N2": 0.0}
+
+
+def test_both_axes_must_be_within_one_millimetre():
+    error = np.array([[1.0, -1.0, 0.0], [1.01, 0.0, 0.0], [0.0, -1.01, 0.0], [0.5, 0.5, 0.0]])
+    assert score(TRUE, TRUE + error)["accuracy_pct"] == 50.0
+
+
+def test_place_error_is_the_mean_over_axes_as_a_naive_loop_finds():
+    rng = np.random.default_rng(0)
+    predicted = TRUE + rng.normal(size=TRUE.shape)
+    total = 0.0
+    for i in range(len(TRUE)):
+        for axis in (0, 1):
+            total += (predicted[i, axis] - TRUE[i, axis]) ** 2
+    # the same sum in another order: rounding only
+    assert score(TRUE, predicted)["mse_xy_mm2"] == pytest.approx(total / (2 * len(TRUE)), rel=1e-12)
+
+
+def test_unknown_force_is_left_out_and_all_unknown_gives_no_number():
+    true = TRUE.copy()
+    true[1:, 2] = np.nan
+    assert score(true, TRUE + [0, 0, 2.0])["mse_f_N2"] == 4.0
+    true[0, 2] = np.nan
+    assert "mse_f_N2" not in score(true, TRUE)
+
+
+@given(st.floats(-5, 5), st.floats(-5, 5))
+def test_a_constant_offset_is_all_registration(dx_mm, dy_mm):
+    shifted = TRUE + [dx_mm, dy_mm, 0.0]
+    # exact but for the rounding of means of numbers below 32
+    assert score(TRUE, register(TRUE, shifted))["mse_xy_mm2"] == pytest.approx(0.0, abs=1e-24)
+
+
+@given(st.floats(1e-6, 1e6))
+def test_force_error_scales_with_the_square_of_the_unit(scale):
+    predicted = TRUE + 0.25
+    scaled = score(TRUE * [1, 1, scale], predicted * [1, 1, scale])
+    # two roundings a row
+    assert scaled["mse_f_N2"] == pytest.approx(scale**2 * score(TRUE, predicted)["mse_f_N2"], rel=1e-9)
+
+
+def test_summary_is_mean_and_sample_deviation():
+    summary = summarise([{"accuracy_pct": 80.0, "mse_xy_mm2": 1.0}, {"accuracy_pct": 90.0, "mse_xy_mm2": 3.0}])
+    assert summary["accuracy_pct"] == {"mean": 85.0, "n": 2, "sd": pytest.approx(50**0.5)}
+    assert "mse_f_N2" not in summary
+
+
+def test_one_fold_has_no_deviation():
+    assert summarise([{"accuracy_pct": 80.0}]) == {"accuracy_pct": {"mean": 80.0, "n": 1}}
