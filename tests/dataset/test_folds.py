@@ -1,0 +1,50 @@
+import doctest
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.dataset import folds as module
+from pipeline.dataset import splits
+from pipeline.dataset.folds import from_ranges, parse_folds, render_folds, to_ranges
+from pipeline.dataset.splits import Split, draw_folds
+from pipeline.errors import SchemaError
+from tests.dataset.tables import rows
+
+TABLE = rows(["b0", "b0", "b1", "b2"], ["s0", "s0", "s1", "s2"])
+
+
+@given(st.sets(st.integers(0, 200)))
+def test_ranges_hold_exactly_the_numbers(numbers):
+    sorted_numbers = np.array(sorted(numbers), np.int64)
+    assert from_ranges(to_ranges(sorted_numbers)).tolist() == sorted_numbers.tolist()
+
+
+def test_folds_survive_json():
+    drawn = draw_folds(TABLE, ["lobo"], Split(), 0)
+    words = json.loads(json.dumps(render_folds(["c0"], TABLE, drawn)))
+    again = parse_folds(words, TABLE, "folds.json")
+    assert [(one.name, one.train.tolist(), one.test.tolist()) for one in again] == [
+        (one.name, one.train.tolist(), one.test.tolist()) for one in drawn
+    ]
+
+
+def test_folds_tell_a_reader_who_is_on_which_side():
+    words = render_folds(["c0"], TABLE, draw_folds(TABLE, ["lobo"], Split(), 0))
+    assert words["folds"][0]["test_boards"] == ["b0"]
+    assert words["folds"][0]["train_skins"] == ["s1", "s2"]
+
+
+def test_folds_of_other_rows_are_refused():
+    words = render_folds(["c0"], TABLE, draw_folds(TABLE, ["lobo"], Split(), 0))
+    with pytest.raises(SchemaError, match="rows_n must be the 2 rows"):
+        parse_folds(words, rows(["b0", "b1"], ["s0", "s1"]), "folds.json")
+
+
+@pytest.mark.parametrize("documented", [module, splits])
+def test_the_folds_drawn_in_the_docstrings_are_right(documented):
+    outcome = doctest.testmod(documented, extraglobs={"np": np})
+    assert outcome.attempted > 0
+    assert outcome.failed == 0

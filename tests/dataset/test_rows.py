@@ -1,0 +1,54 @@
+import numpy as np
+import pytest
+
+from pipeline.dataset.rows import Selection, gather
+from pipeline.errors import ParamsError
+from tests.dataset.tables import readings
+
+ALL = Selection(force_min_N=0.0)
+
+
+def test_the_change_of_field_is_against_the_rows_own_no_load_reading():
+    rows = gather([readings()], ALL)
+    assert rows.db_uT[:, 0].tolist() == [0, 1, 2, 3, 4, 5]
+
+
+def test_rows_without_place_or_with_too_little_force_are_counted_and_left_out():
+    x_mm = np.array([0, np.nan, 2, 3, 4, 5], np.float32)
+    Fz_N = np.array([1, 1, 0.05, np.nan, 1, 1], np.float32)
+    rows = gather([readings(x_mm=x_mm, Fz_N=Fz_N)], Selection(force_min_N=0.1))
+    assert rows.target[:, 0].tolist() == [0, 3, 4, 5]  # unknown force is not too little
+    assert rows.dropped == {"no_contact_rows_n": 1, "low_force_rows_n": 1}
+
+
+def test_passes_count_on_over_the_captures_of_a_skin_but_not_over_skins():
+    rows = gather([readings("c1"), readings("c0"), readings("c2", skin="s1")], ALL)
+    assert rows.pass_i.tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 0, 0, 0, 1, 1, 1]
+
+
+def test_the_order_of_captures_changes_nothing():
+    one, other = readings("c0"), readings("c1", board="b1", skin="s1", Fz_N=np.full(6, 2, np.float32))
+    ahead, behind = gather([one, other], ALL), gather([other, one], ALL)
+    assert (ahead.board == behind.board).all()
+    assert (ahead.target == behind.target).all()
+
+
+@pytest.mark.parametrize(
+    ("second", "sentence"),
+    [
+        (readings("c1", board="b9"), "board of skin s0 must be b0"),
+        (readings("c1", skin="s1", source="simulated"), "source must be recorded"),
+        (
+            readings("c1", skin="s1", b_uT=np.zeros((6, 6), np.float32), noload_uT=np.zeros((6, 6), np.float32)),
+            "chips of a scene's captures must be the 1 of c0; got 2",
+        ),
+    ],
+)
+def test_captures_that_do_not_go_together_are_refused(second, sentence):
+    with pytest.raises(ParamsError, match=sentence):
+        gather([readings(), second], ALL)
+
+
+def test_a_scene_without_captures_says_how_to_get_some():
+    with pytest.raises(ParamsError, match="reskin add"):
+        gather([], ALL)
