@@ -1,0 +1,107 @@
+"""Which stage runs for which scene: scenes + recorded captures -> section `stages` of params.yaml.
+
+DVC expands stages from lists in params.yaml and cannot look into a scene's questions; this module can. Refuses to
+know what a stage does.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ruamel.yaml import YAML
+
+from pipeline import io
+from pipeline.errors import ParamsError, complain
+from pipeline.params import ANSWERED_BY, ARMS, Params, Scene, read_params, read_scene
+from pipeline.registry import Registry, read_registry
+
+PARAMS = "params.yaml"
+SCENES = "pipeline/scenes"
+
+
+def make_plan(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, Any]:
+    """Derive the section `stages`: a question that no scene asks leaves its stage with an empty list."""
+    simulated = [name for name, scene in scenes.items() if scene.source == "simulated"]
+    captures = {name: sorted(registry.captures.get(name, {})) for name in scenes}
+    for name, scene in scenes.items():
+        if scene.source == "recorded" and not captures[name]:
+            raise ParamsError(
+                complain(
+                    f"scene {name}",
+                    "recorded captures",
+                    "one or more",
+                    "none",
+                    f"Try: reskin add RECORDING --scene {name} ...",
+                )
+            )
+    asked = {name: {ANSWERED_BY[question] for question in scene.questions} for name, scene in scenes.items()}
+    plan: dict[str, Any] = {
+        "simulate": simulated,
+        "ingest_simulated": simulated,
+        "ingest": {
+            f"{name}-{capture}": {"scene": name, "capture": capture} for name in scenes for capture in captures[name]
+        },
+        "split": captures,
+    }
+    plan |= {arm: [name for name in scenes if arm in asked[name]] for arm in ARMS}
+    return plan | {"report": list(scenes), "publish": list(scenes)}
+
+
+def scene_names(root: Path) -> list[str]:
+    """The scenes that this checkout has."""
+    return sorted(file.stem for file in (root / SCENES).glob("*.yaml"))
+
+
+def use(root: Path, names: Sequence[str]) -> None:
+    """Let `params.yaml` run exactly these scenes."""
+    plan = _plan_of(root, names)
+    file = root / PARAMS
+    yaml = YAML()  # round trip: comments stay
+    yaml.width = 120
+    document = yaml.load(file.read_text(encoding="utf-8"))
+    document["scenes"] = _flow(list(dict.fromkeys(names)))
+    document["stages"] = {key: _flow(value) for key, value in plan.items()}
+    with io.replacing(file) as temporary, temporary.open("w", encoding="utf-8") as stream:
+        yaml.dump(document, stream)
+
+
+def check(root: Path) -> Params:
+    """Raise if `params.yaml` is not what its scenes ask for; return it otherwise."""
+    params = read_params(root / PARAMS)
+    written = params.stages.model_dump(mode="json")
+    if written != _plan_of(root, params.scenes):
+        raise ParamsError(
+            complain(
+                root / PARAMS, "section stages", "what its scenes ask for", "an older plan",
+                f"Try: reskin scenes use {' '.join(params.scenes)}",
+            )
+        )  # fmt: skip
+    return params
+
+
+def _plan_of(root: Path, names: Sequence[str]) -> dict[str, Any]:
+    unknown = sorted(set(names) - set(scene_names(root)))
+    if unknown:
+        raise ParamsError(
+            complain(
+                "scenes", "a scene", f"one of {', '.join(scene_names(root))}", ", ".join(unknown), "Check the name."
+            )
+        )
+    scenes = {name: read_scene(root / SCENES / f"{name}.yaml") for name in dict.fromkeys(names)}
+    return make_plan(scenes, read_registry(root))
+
+
+def _flow(value: Any) -> Any:
+    """Let ruamel write short lists on one line."""
+    from ruamel.yaml.comments import CommentedMap, CommentedSeq
+
+    if isinstance(value, list):
+        sequence = CommentedSeq(value)
+        sequence.fa.set_flow_style()
+        return sequence
+    if isinstance(value, dict):
+        mapping = CommentedMap({key: _flow(item) for key, item in value.items()})
+        if not value:
+            mapping.fa.set_flow_style()
+        return mapping
+    return value

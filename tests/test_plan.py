@@ -1,0 +1,84 @@
+from pathlib import Path
+
+import pytest
+from ruamel.yaml import YAML
+
+from pipeline import plan
+from pipeline.errors import ParamsError
+from pipeline.params import Scene, Stages
+from pipeline.registry import Entry, Registry
+from pipeline.strict import parse
+from tests.scenes import recorded
+
+ROOT = Path(__file__).resolve().parents[1]
+ENTRY = Entry(board="b", skin="s", layout="lab", chips_n=5, sha256="0", copy_of=None)
+
+
+def scene(**changes: object) -> Scene:
+    return parse(Scene, recorded(**changes), "scene.yaml")
+
+
+def test_the_plan_of_the_checkout_is_what_its_scenes_ask_for():
+    plan.check(ROOT)
+
+
+def test_a_question_that_no_scene_asks_has_no_stage():
+    made = plan.make_plan({"lab": scene()}, Registry(captures={"lab": {"c0": ENTRY}}))
+    assert made["train_multi"] == ["lab"]
+    assert made["train_single"] == made["simulate"] == made["ingest_simulated"] == []
+
+
+def test_every_recorded_capture_has_an_ingest_of_its_own():
+    made = plan.make_plan({"lab": scene()}, Registry(captures={"lab": {"c1": ENTRY, "c0": ENTRY}, "ini": {"x": ENTRY}}))
+    assert made["ingest"] == {
+        "lab-c0": {"scene": "lab", "capture": "c0"},
+        "lab-c1": {"scene": "lab", "capture": "c1"},
+    }
+    assert made["split"] == {"lab": ["c0", "c1"]}
+    parse(Stages, made, "plan")
+
+
+def test_a_recorded_scene_without_recordings_says_how_to_add_one():
+    with pytest.raises(ParamsError, match="reskin add RECORDING --scene lab"):
+        plan.make_plan({"lab": scene()}, Registry(captures={}))
+
+
+def checkout(folder: Path, params: str) -> Path:
+    (folder / plan.SCENES).mkdir(parents=True)
+    (folder / "data").mkdir()
+    for name, questions in (("one", ["lobo"]), ("two", ["lobo"])):
+        with (folder / plan.SCENES / f"{name}.yaml").open("w") as stream:
+            YAML().dump(recorded(questions=questions), stream)
+    with (folder / "data/captures.yaml").open("w") as stream:
+        YAML().dump({"captures": {"one": {"c0": ENTRY.model_dump()}, "two": {"c0": ENTRY.model_dump()}}}, stream)
+    (folder / plan.PARAMS).write_text(params)
+    return folder
+
+
+EMPTY = """\
+# a comment that stays
+scenes: []
+lost_fraction_max: 0.05
+stages:
+  {simulate: [], ingest_simulated: [], ingest: {}, split: {}, train_single: [], train_multi: [], report: [], publish: []}
+"""
+
+
+def test_use_writes_the_plan_and_keeps_comments(tmp_path):
+    root = checkout(tmp_path, EMPTY)
+    plan.use(root, ["two", "one", "two"])
+    params = plan.check(root)
+    assert params.scenes == ("two", "one")
+    assert params.stages.train_multi == ("two", "one")
+    assert "# a comment that stays" in (root / plan.PARAMS).read_text()
+
+
+def test_a_plan_that_is_behind_its_scenes_is_refused_with_the_remedy(tmp_path):
+    root = checkout(tmp_path, EMPTY.replace("scenes: []", "scenes: [one]"))
+    with pytest.raises(ParamsError, match="Try: reskin scenes use one"):
+        plan.check(root)
+
+
+def test_an_unknown_scene_is_named_beside_the_known_ones(tmp_path):
+    with pytest.raises(ParamsError, match="a scene must be one of one, two; got three"):
+        plan.use(checkout(tmp_path, EMPTY), ["three"])

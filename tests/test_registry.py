@@ -1,0 +1,62 @@
+import pytest
+
+from pipeline.capture.header import Clock, Header
+from pipeline.errors import CaptureError
+from pipeline.registry import Registry, with_capture, without_capture
+
+EMPTY = Registry(captures={})
+
+
+def header(capture: str = "c0", board: str = "b0", skin: str = "s0", chips_n: int = 5) -> Header:
+    return Header(
+        format="reskin-capture/1", capture=capture, board=board, skin=skin, source="recorded", layout="lab", wire=None,
+        chips_n=chips_n, unit_b="uT", unit_force="N", unit_place="mm", firmware=None,
+        clock=Clock(kind="recording", rate_hz=None, marks=()), protocol="", contacts_before_n=0, options={}, files={},
+        note="",
+    )  # fmt: skip
+
+
+def added(registry: Registry, one: Header, sha256: str, *, allow_copy: bool = False) -> Registry:
+    return with_capture(registry, "lab", one, sha256, allow_copy=allow_copy)
+
+
+ONE = added(EMPTY, header(), "aa")
+
+
+def test_several_captures_of_one_board_and_skin_stand_beside_each_other():
+    assert sorted(added(ONE, header("c1"), "bb").captures["lab"]) == ["c0", "c1"]
+
+
+def test_the_same_recording_twice_is_refused():
+    with pytest.raises(CaptureError, match=r"new to its scene; got the bytes of c0. It is in the scene already"):
+        added(ONE, header("c1"), "aa", allow_copy=True)
+
+
+def test_a_relabelled_copy_would_leak_and_needs_a_word():
+    copy = header("c1", board="b1", skin="s1")
+    with pytest.raises(CaptureError, match="--allow-copy"):
+        added(ONE, copy, "aa")
+    assert added(ONE, copy, "aa", allow_copy=True).captures["lab"]["c1"].copy_of == "c0"
+
+
+@pytest.mark.parametrize(
+    ("second", "sentence"),
+    [
+        (header("c0"), "its name must be new to its scene"),
+        (header("c1", board="b1"), "the board of skin s0 must be b0, as in c0; got b1"),
+        (header("c1", skin="s1", chips_n=10), "chips must be the 5 of c0; got 10"),
+    ],
+)
+def test_a_capture_that_contradicts_the_others_is_refused(second, sentence):
+    with pytest.raises(CaptureError, match=sentence):
+        added(ONE, second, "bb")
+
+
+def test_taking_out_what_was_added_leaves_what_was_there():
+    assert without_capture(added(ONE, header("c1"), "bb"), "lab", "c1") == ONE
+    assert without_capture(ONE, "lab", "c0") == EMPTY
+
+
+def test_an_unknown_capture_cannot_be_taken_out():
+    with pytest.raises(CaptureError, match=r"one of its own \(c0\); got c7"):
+        without_capture(ONE, "lab", "c7")
