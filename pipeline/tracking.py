@@ -1,0 +1,153 @@
+"""The diary: writes finished trainings to MLflow. The only module that says mlflow; nothing reads it back.
+
+In: the cards and weights in `data/models`. Out: one experiment a scene, one parent run a stage and set of trainings, one
+child a training. Published after training and from files, so a server that is away costs nothing but the entry, and
+`reskin publish` sends later what is missing.
+"""
+
+import hashlib
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from pipeline import io
+from pipeline.server import TrackingAway, probe, server_uri
+
+STORE = "mlflow.db"
+ARTIFACTS = "mlartifacts"
+
+
+def tracking_uri(root: Path) -> str:
+    """The server of MLFLOW_TRACKING_URI, else the embedded store of the checkout."""
+    return server_uri() or f"sqlite:///{(root / STORE).resolve()}"
+
+
+def publish(models: Path, figures: Path, *, scene: str, stage: str, root: Path) -> dict[str, int]:
+    """Write every training of one stage to MLflow once, and the scene's figures to their parent.
+
+    Returns counts of new, kept and superseded runs; raises `TrackingAway` if the server does not answer.
+    """
+    uri = tracking_uri(root)
+    probe(uri)
+    cards = {file: io.read_json(file) for file in sorted(models.glob("*.json"))}
+    with _client(uri) as client:
+        experiment_id = _experiment(client, scene, root)
+        counts = {"new_n": 0, "kept_n": 0, "superseded_n": 0}
+        parent_key = _parent_key([card["key"] for card in cards.values()])
+        parent_id = _open_parent(client, experiment_id, stage, scene, parent_key)
+        for file, card in cards.items():
+            fresh = _publish_one(client, experiment_id, stage, parent_id, file, card)
+            counts["new_n" if fresh else "kept_n"] += 1
+        current = {card["key"] for card in cards.values()} | {parent_key}
+        counts["superseded_n"] = _mark_superseded(client, experiment_id, stage, current)
+        client.log_artifacts(parent_id, str(figures), "figures")
+        client.set_terminated(parent_id)
+    return counts
+
+
+@contextmanager
+def _client(uri: str) -> Iterator[Any]:
+    # Before the import: MLflow reads these once. Without limits a dead server costs minutes a call.
+    os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
+    os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "10")
+    os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
+    import logging
+
+    for name in ("alembic", "mlflow"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    import mlflow
+    from mlflow.exceptions import MlflowException
+
+    try:
+        yield mlflow.MlflowClient(tracking_uri=uri)
+    except MlflowException as error:
+        sentence = str(error).splitlines()[0][:200]
+        raise TrackingAway(
+            f"MLflow at {uri} failed ({sentence}). Results are kept; `reskin publish` sends them later."
+        ) from None
+
+
+def _experiment(client: Any, scene: str, root: Path) -> str:
+    found = client.get_experiment_by_name(scene)
+    if found is not None:
+        return str(found.experiment_id)
+    location = None if server_uri() else (root / ARTIFACTS / scene).resolve().as_uri()
+    return str(client.create_experiment(scene, artifact_location=location))
+
+
+def _open_parent(client: Any, experiment_id: str, stage: str, scene: str, key: str) -> str:
+    found = _find(client, experiment_id, stage, key)
+    if found:
+        _set_tags(client, found, {"current": "true"})
+        return str(found.info.run_id)
+    tags = {"run_key": key, "stage": stage, "scene": scene, "kind": "stage", "current": "true"}
+    return str(client.create_run(experiment_id, tags=tags, run_name=stage).info.run_id)
+
+
+def _publish_one(client: Any, experiment_id: str, stage: str, parent_id: str, file: Path, card: dict[str, Any]) -> bool:
+    """Write one training; True if it was not there yet. A half-written run of a killed process is replaced."""
+    parent_tag = "mlflow.parentRunId"
+    found = _find(client, experiment_id, stage, card["key"])
+    if found and found.info.status == "FINISHED":
+        _set_tags(client, found, {parent_tag: parent_id, "current": "true"})
+        return False
+    if found:
+        client.delete_run(found.info.run_id)
+    words = ("scene", "question", "recipe_name", "fold", "git")
+    tags = {name: card[name] for name in words} | {
+        "run_key": card["key"], "stage": stage, "kind": "training", "current": "true", parent_tag: parent_id,
+    }  # fmt: skip
+    run_id = client.create_run(experiment_id, tags=tags, run_name=file.stem).info.run_id
+    _log(client, run_id, card)
+    for artifact in (file, file.with_suffix(".safetensors")):
+        client.log_artifact(run_id, str(artifact), "model")
+    client.set_terminated(run_id)
+    return True
+
+
+def _log(client: Any, run_id: str, card: dict[str, Any]) -> None:
+    from mlflow.entities import Metric, Param
+
+    known = {"fold": card["fold"], "seed_i": card["seed_i"], "seed": card["seed"], **card["recipe"]}
+    known |= {name: card[name] for name in ("train_rows_n", "train_boards", "test_boards")}
+    parameters = [Param(name, str(value)[:500]) for name, value in known.items()]
+    curve = [Metric("train_loss", value, 0, step) for step, value in enumerate(card["curve"])]
+    parts = (("", "all"), ("registered_", "registered"))
+    scores = [Metric(f"{p}{name}", v, 0, 0) for p, part in parts for name, v in card["scores"][part].items()]
+    client.log_batch(run_id, metrics=scores, params=parameters)
+    for start in range(0, len(curve), 1000):  # MLflow takes at most 1000 metrics a call
+        client.log_batch(run_id, metrics=curve[start : start + 1000])
+
+
+def _set_tags(client: Any, run: Any, tags: dict[str, str]) -> None:
+    for name, value in tags.items():
+        if run.data.tags.get(name) != value:
+            client.set_tag(run.info.run_id, name, value)
+
+
+def _find(client: Any, experiment_id: str, stage: str, key: str) -> Any:
+    found = client.search_runs([experiment_id], f"tags.run_key = '{key}' and tags.stage = '{stage}'", max_results=1)
+    return found[0] if found else None
+
+
+def _mark_superseded(client: Any, experiment_id: str, stage: str, current: set[str]) -> int:
+    """Tag runs of this stage that the newest results replace, so that `tags.current = 'true'` shows each once."""
+    marked_n = 0
+    token = None
+    while True:
+        page = client.search_runs(
+            [experiment_id], f"tags.stage = '{stage}' and tags.current = 'true'", max_results=1000, page_token=token
+        )
+        for run in page:
+            if run.data.tags["run_key"] not in current:
+                client.set_tag(run.info.run_id, "current", "false")
+                marked_n += 1
+        token = page.token
+        if not token:
+            return marked_n
+
+
+def _parent_key(keys: list[str]) -> str:
+    return hashlib.sha256("".join(sorted(keys)).encode()).hexdigest()[:32]

@@ -1,0 +1,106 @@
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import mlflow
+import numpy as np
+import pytest
+
+from pipeline import io
+from pipeline.server import TrackingAway, probe
+from pipeline.tracking import publish
+
+
+@pytest.fixture(autouse=True)
+def _embedded(monkeypatch):
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+
+
+@pytest.fixture
+def silent_server() -> Iterator[str]:
+    """A server that accepts and never answers."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        accepted: list[socket.socket] = []
+        threading.Thread(target=lambda: accepted.append(server.accept()[0]), daemon=True).start()
+        yield f"http://127.0.0.1:{server.getsockname()[1]}"
+        for connection in accepted:
+            connection.close()
+
+
+@pytest.fixture
+def dead_address() -> str:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return f"http://127.0.0.1:{server.getsockname()[1]}"  # closed again on return
+
+
+def write_model(models: Path, name: str, key: str) -> None:
+    card = {
+        "scene": "ci", "question": "lobo", "recipe_name": "paper", "fold": name, "git": "abc", "key": key, "seed": 1,
+        "seed_i": 0, "recipe": {"epochs_n": 3}, "train_rows_n": 4, "train_boards": ["b1"], "test_boards": ["b0"],
+        "curve": [3.0, 2.0, 1.0],
+        "scores": {"all": {"accuracy_pct": 50.0}, "registered": {"accuracy_pct": 60.0}, "by_skin": {}},
+    }  # fmt: skip
+    io.write_json(models / f"{name}.json", card)
+    io.write_tensors(models / f"{name}.safetensors", {"weights.a": np.zeros(2, np.float32)}, {})
+
+
+def write(root: Path, **keys: str) -> dict[str, int]:
+    io.remove(root / "models")
+    for name, key in keys.items():
+        write_model(root / "models", name, key)
+    (root / "figures").mkdir(exist_ok=True)
+    (root / "figures/a.svg").write_text("<svg/>")
+    return publish(root / "models", root / "figures", scene="ci", stage="train_multi", root=root)
+
+
+def runs(root: Path, query: str) -> list:
+    client = mlflow.MlflowClient(f"sqlite:///{root / 'mlflow.db'}")
+    return list(client.search_runs([client.get_experiment_by_name("ci").experiment_id], query))
+
+
+def test_every_training_is_a_child_run_once_however_often_it_is_published(tmp_path):
+    assert write(tmp_path, b0="k0", b1="k1") == {"new_n": 2, "kept_n": 0, "superseded_n": 0}
+    assert write(tmp_path, b0="k0", b1="k1") == {"new_n": 0, "kept_n": 2, "superseded_n": 0}
+    children = runs(tmp_path, "tags.kind = 'training'")
+    (parent,) = runs(tmp_path, "tags.kind = 'stage'")
+    assert sorted(run.data.tags["fold"] for run in children) == ["b0", "b1"]
+    assert {run.data.tags["mlflow.parentRunId"] for run in children} == {parent.info.run_id}
+    assert {run.info.status for run in [*children, parent]} == {"FINISHED"}
+    client = mlflow.MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
+    run = children[0]
+    assert run.data.metrics == {"accuracy_pct": 50.0, "registered_accuracy_pct": 60.0, "train_loss": 1.0}
+    assert run.data.params["epochs_n"] == "3"
+    assert [point.value for point in client.get_metric_history(run.info.run_id, "train_loss")] == [3.0, 2.0, 1.0]
+    assert len(client.list_artifacts(run.info.run_id, "model")) == 2
+    assert [one.path for one in client.list_artifacts(parent.info.run_id, "figures")] == ["figures/a.svg"]
+
+    # Other settings: the new result is shown, the old one is kept and marked.
+    assert write(tmp_path, b0="k0", b1="k9") == {"new_n": 1, "kept_n": 1, "superseded_n": 2}
+    current = runs(tmp_path, "tags.kind = 'training' and tags.current = 'true'")
+    assert sorted(run.data.tags["run_key"] for run in current) == ["k0", "k9"]
+
+    # A half-written run of a killed process is replaced, and going back shows the old result again.
+    client.set_terminated(next(run.info.run_id for run in current if run.data.tags["run_key"] == "k9"), "KILLED")
+    assert write(tmp_path, b0="k0", b1="k9")["new_n"] == 1
+    assert write(tmp_path, b0="k0", b1="k1") == {"new_n": 0, "kept_n": 2, "superseded_n": 2}
+    current = runs(tmp_path, "tags.kind = 'training' and tags.current = 'true'")
+    assert sorted(run.data.tags["run_key"] for run in current) == ["k0", "k1"]
+
+
+@pytest.mark.parametrize("kind", ["silent_server", "dead_address"])
+def test_a_server_that_is_away_is_noticed_within_seconds(kind, request, tmp_path, monkeypatch):
+    uri = request.getfixturevalue(kind)
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", uri)
+    start_s = time.monotonic()
+    with pytest.raises(TrackingAway, match="`reskin publish` sends them when it is back"):
+        write(tmp_path, b0="k0")
+    assert time.monotonic() - start_s < 4  # the two-second time-out, and writing two files
+
+
+def test_the_embedded_store_is_never_asked_for_a_sign_of_life():
+    probe(None)
+    probe("sqlite:///somewhere.db")
+
+
