@@ -1,0 +1,52 @@
+"""Where a result came from: the commit of the code, the machine, the seconds. Knows no result."""
+
+import os
+import platform
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+from pipeline import io
+
+CODE = Path(__file__).parent
+
+
+def code_version() -> str:
+    """The last commit that changed `pipeline/`, `+dirty` when it was changed since, `unknown` outside git.
+
+    Not the checkout's HEAD: a later commit of results must not make equal results look different.
+    """
+    commit = _git("log", "-1", "--format=%h", "--abbrev=12", "--", str(CODE))
+    if not commit:
+        return "unknown"
+    return commit + ("+dirty" if _git("status", "--porcelain", "--", str(CODE)) else "")
+
+
+def device() -> str:
+    """The machine in words: processor kind, cores that this process may use, Python."""
+    cores_n = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return f"cpu {platform.machine()}, {cores_n} cores, Python {platform.python_version()}"
+
+
+def note_cost(folder: Path, stage: str, seconds: float) -> None:
+    """Keep what a stage cost beside the pipeline, never in an output: it differs between identical runs."""
+    peaks = (resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    unit = 1 if sys.platform == "darwin" else 1024  # bytes on macOS, KiB elsewhere
+    io.write_json(
+        folder / f"{stage}.json",
+        {"seconds": round(seconds, 2), "peak_process_memory_MB": round(max(peaks) * unit / 1e6, 1)},
+    )
+
+
+def read_costs(folder: Path) -> dict[str, dict[str, float]]:
+    """Read the costs of the stages that ran here, by stage."""
+    return {file.stem: io.read_json(file) for file in sorted(folder.glob("*.json"))}
+
+
+def _git(*words: str) -> str:
+    try:
+        done = subprocess.run(["git", *words], cwd=CODE, capture_output=True, text=True, check=False)
+    except OSError:
+        return ""  # no git on this machine: the version is reported as unknown
+    return done.stdout.strip() if done.returncode == 0 else ""

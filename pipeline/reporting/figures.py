@@ -1,0 +1,43 @@
+"""Figures of a scene: predictions -> SVG text. Same data, same bytes. Sees no model and no path."""
+
+import io
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from jaxtyping import Float
+
+mpl.use("Agg")
+STYLE = {
+    "svg.hashsalt": "reskin",
+    "svg.fonttype": "none",
+    "font.size": 10.0,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+}
+
+
+def error_grid(true_mm: Float[np.ndarray, "f 2"], predicted_mm: Float[np.ndarray, "f 2"], *, title: str) -> str:
+    """Draw the places of the indentations, coloured by the mean distance between true and predicted place."""
+    from matplotlib.figure import Figure
+
+    places, which = np.unique(np.round(true_mm, 2), axis=0, return_inverse=True)
+    distance_mm = np.linalg.norm(predicted_mm - true_mm, axis=1)
+    mean_mm = np.bincount(which.ravel(), distance_mm) / np.bincount(which.ravel())
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(5.2, 4.4), layout="constrained")
+        axes = figure.subplots()
+        size = float(np.clip(12_000 / len(places), 6, 170))
+        points = axes.scatter(
+            places[:, 0], places[:, 1], c=mean_mm, s=size, cmap="viridis", vmin=0.0, marker="s", linewidths=0
+        )
+        figure.colorbar(points, label="mean place error / mm")
+        axes.set(xlabel="x / mm", ylabel="y / mm", aspect="equal")
+        axes.set_title(title, loc="left", fontsize=10, wrap=True)
+        return _svg(figure)
+
+
+def _svg(figure: Any) -> str:
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    return buffer.getvalue()

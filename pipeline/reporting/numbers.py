@@ -1,0 +1,91 @@
+"""`numbers.json`: every number that any text shows, nested by question. In: cards, accounts, costs. Out: plain words.
+
+A question that was not asked is absent. Refuses to know how a number is shown.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from pipeline.evaluation.metrics import summarise
+from pipeline.evaluation.summary import over_folds, over_test_skins
+
+SINGLE = ("single_random", "single_temporal")
+
+Cards = Sequence[dict[str, Any]]
+
+
+def compose(
+    cards: Cards, accounts: Iterable[Mapping[str, int]], dropped: Mapping[str, int], *, headline: str
+) -> dict[str, Any]:
+    """Compose what follows from the data alone; `headline` names the recipe that stands beside the paper's numbers."""
+    numbers: dict[str, Any] = {"capture": add_up(accounts) | {"left_out": dict(dropped)}}
+    by_question: dict[str, list[dict[str, Any]]] = {}
+    for card in cards:
+        by_question.setdefault(card["question"], []).append(card)
+    table2 = {}
+    if "transfer" in by_question:
+        table2["single"] = over_test_skins(_of(by_question["transfer"], headline))
+    if "lobo" in by_question:
+        pooled = _of(by_question["lobo"], headline)
+        table2["multi"] = over_folds(pooled)
+        numbers["lobo"] = {
+            "registered": over_folds(pooled, "registered"),
+            "by_board": {
+                board: {"as_labelled": summarise_means(own, "all"), "registered": summarise_means(own, "registered")}
+                for board, own in _group(pooled, "fold").items()
+            },
+        }
+    if table2:
+        numbers["table2"] = table2
+    for question in (name for name in SINGLE if name in by_question):
+        numbers[question] = over_folds(_of(by_question[question], headline))
+        numbers.setdefault("single_sensor", {"split": question} | numbers[question])
+    numbers["variants"] = {
+        question: {recipe: over_folds(own) for recipe, own in _group(all_, "recipe_name").items()}
+        for question, all_ in by_question.items()
+    }
+    return numbers
+
+
+def summarise_means(cards: Cards, part: str) -> dict[str, float]:
+    """Mean over seeds of each metric."""
+    return {name: value["mean"] for name, value in summarise([card["scores"][part] for card in cards]).items()}
+
+
+def add_up(accounts: Iterable[Mapping[str, int]]) -> dict[str, int]:
+    """Add the accounts of all captures."""
+    total: dict[str, int] = {"captures_n": 0}
+    for account in accounts:
+        total["captures_n"] += 1
+        for name, count in account.items():
+            total[name] = total.get(name, 0) + count
+    return total
+
+
+def runtime(cards: Cards, costs: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
+    """What it cost, where it ran here: seconds and memory a stage, and networks trained."""
+    return {"stages": {stage: dict(cost) for stage, cost in costs.items()}, "trainings_n": len(cards)}
+
+
+def rounded(value: Any, digits: int = 6) -> Any:
+    """Round every float to significant digits, so that committed numbers do not change with the last bit."""
+    if isinstance(value, dict):
+        return {key: rounded(item, digits) for key, item in value.items()}
+    if isinstance(value, list):
+        return [rounded(item, digits) for item in value]
+    if isinstance(value, float):
+        return float(np.format_float_positional(value, digits, unique=False, fractional=False, trim="-"))
+    return value
+
+
+def _of(cards: Cards, recipe: str) -> list[dict[str, Any]]:
+    return [card for card in cards if card["recipe_name"] == recipe]
+
+
+def _group(cards: Cards, key: str) -> dict[str, list[dict[str, Any]]]:
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for card in cards:
+        groups.setdefault(card[key], []).append(card)
+    return groups

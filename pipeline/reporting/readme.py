@@ -1,0 +1,39 @@
+"""Generated parts of README.md: text with marked blocks + their contents -> text. No number there is typed."""
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from pipeline.errors import SchemaError, complain
+from pipeline.reporting.tables import make_tables, to_markdown
+
+
+def fill(text: str, blocks: Mapping[str, str]) -> str:
+    """Put each block between its marks `<!-- name -->` and `<!-- /name -->`; a missing mark is an error."""
+    for name, content in blocks.items():
+        pattern = re.compile(rf"(<!-- {name} -->\n).*?(<!-- /{name} -->)", re.DOTALL)
+        if not pattern.search(text):
+            raise SchemaError(complain("README.md", f"the block {name}", "between its two marks", "none", "Put them back."))
+        text = pattern.sub(lambda found, new=content: found[1] + new.strip("\n") + "\n" + found[2], text)
+    return text
+
+
+def blocks_of(numbers: Mapping[str, Any], dag: str, stages: Mapping[str, Any]) -> dict[str, str]:
+    """Make the blocks: results beside the paper's, the flow as DVC sees it, and where each stage's code is."""
+    provenance = numbers["provenance"]
+    tables = make_tables(numbers)
+    words = (
+        f"Scene `{provenance['scene']}`, **{provenance['source']}**; code {provenance['git']}, seed {provenance['seed']}, "
+        f"{provenance['device']}; mean ± sd over n folds."
+    )
+    results = [words] + [to_markdown(tables[name]) for name in ("table2", "single_sensor") if name in tables]
+    return {"results": "\n\n".join(results), "dag": f"```\n{dag.rstrip()}\n```", "stages": _stages(stages)}
+
+
+def _stages(stages: Mapping[str, Any]) -> str:
+    lines = ["| stage | code | writes |", "|---|---|---|"]
+    for name, stage in stages.items():
+        outs = [out if isinstance(out, str) else next(iter(out)) for out in stage["do"].get("outs", [])]
+        written = ", ".join(f"`{re.sub(r'[$]{[^}]*}', '…', out)}`" for out in outs) or "MLflow runs"
+        lines.append(f"| {name} | [pipeline/stages/{name}.py](pipeline/stages/{name}.py) | {written} |")
+    return "\n".join(lines)

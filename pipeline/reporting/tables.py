@@ -1,0 +1,86 @@
+"""Tables of a scene: numbers.json -> rows, as Markdown for people and CSV for programs. Sees no model.
+
+Every table says whether its rows are simulated or recorded.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import pandas as pd
+
+from pipeline.reporting.paper import SINGLE_SENSOR, TABLE_2, TABLE_2_ROWS, Number
+
+COLUMNS = {"accuracy_pct": "accuracy, %", "mse_xy_mm2": "MSE_xy, mm²", "mse_f_N2": "MSE_F, N²"}
+SPLIT_WORDS = {
+    "single_random": "random readings held out (the paper's way: readings of one indentation on both sides)",
+    "single_temporal": "first passes → last passes",
+}
+
+
+def make_tables(numbers: Mapping[str, Any]) -> dict[str, pd.DataFrame]:
+    """Make every table that the numbers can fill, by name."""
+    source = numbers["provenance"]["source"]
+    tables = {}
+    if "table2" in numbers:
+        tables["table2"] = _beside_paper(
+            {TABLE_2_ROWS[row]: (value, TABLE_2[row]) for row, value in numbers["table2"].items()}, source
+        )
+    single = {SPLIT_WORDS[name]: (numbers[name], SINGLE_SENSOR) for name in SPLIT_WORDS if name in numbers}
+    if single:
+        tables["single_sensor"] = _beside_paper(single, source)
+    if "lobo" in numbers:
+        tables["lobo_boards"] = _boards(numbers["lobo"]["by_board"], source)
+    tables["variants"] = _variants(numbers["variants"], source)
+    tables["captures"] = _captures(numbers["capture"], source)
+    return tables
+
+
+def to_markdown(table: pd.DataFrame) -> str:
+    """Write a table as Markdown; empty where a number is not known."""
+    return str(table.fillna("").to_markdown(index=False, disable_numparse=True)) + "\n"
+
+
+def show(value: Mapping[str, float] | None) -> str:
+    """Write a mean and its deviation with three significant digits."""
+    if value is None:
+        return "–"
+    mean = f"{value['mean']:.4g}" if value["mean"] >= 100 else f"{value['mean']:.3g}"
+    return mean + (f" ± {value['sd']:.2g}" if "sd" in value else "")
+
+
+def _beside_paper(rows: Mapping[str, tuple[Mapping[str, Any], Mapping[str, Number]]], source: str) -> pd.DataFrame:
+    lines = []
+    for name, (ours, paper) in rows.items():
+        line = {"model": name, "source": source}
+        for metric, title in COLUMNS.items():
+            line[f"{title} (ours)"] = show(ours.get(metric))
+            line[f"{title} (paper)"] = show({"mean": paper[metric][0], "sd": paper[metric][1]})
+        line["n"] = str(ours["accuracy_pct"]["n"])
+        lines.append(line)
+    return pd.DataFrame(lines)
+
+
+def _boards(by_board: Mapping[str, Any], source: str) -> pd.DataFrame:
+    words = {"as_labelled": "as labelled", "registered": "after one offset a board (uses its labels: a diagnosis)"}
+    lines = []
+    for board, parts in by_board.items():
+        for part, metrics in parts.items():
+            line = {"held-out board": board, "places": words[part], "source": source}
+            lines.append(line | {title: f"{metrics[m]:.3g}" for m, title in COLUMNS.items() if m in metrics})
+    return pd.DataFrame(lines)
+
+
+def _variants(variants: Mapping[str, Any], source: str) -> pd.DataFrame:
+    lines = []
+    for question, recipes in variants.items():
+        for recipe, metrics in recipes.items():
+            line = {"question": question, "recipe": recipe, "source": source}
+            lines.append(line | {title: show(metrics.get(metric)) for metric, title in COLUMNS.items()})
+    return pd.DataFrame(lines)
+
+
+def _captures(account: Mapping[str, Any], source: str) -> pd.DataFrame:
+    flat = {**account, **{f"left out of training: {key}": n for key, n in account["left_out"].items()}}
+    return pd.DataFrame(
+        [{"what": key, "count": str(value), "source": source} for key, value in flat.items() if key != "left_out"]
+    )

@@ -1,0 +1,42 @@
+"""What every stage does around its work: argv, a word if MLflow is away, one-sentence errors, its cost.
+
+In: the stage's function; its parameters are its options. Refuses to know what the stage does.
+"""
+
+import argparse
+import inspect
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from pipeline.errors import ReskinError
+from pipeline.provenance import note_cost
+from pipeline.server import TrackingAway, probe, server_uri
+
+COSTS = Path(".reskin/costs")
+
+
+def run(work: Callable[..., None]) -> None:
+    """Call `work` with options of its own names (`--scene quick`); all are required."""
+    stage = Path(inspect.getfile(work)).stem
+    parser = argparse.ArgumentParser(prog=f"python -m pipeline.stages.{stage}", description=work.__doc__)
+    for parameter in inspect.signature(work).parameters.values():
+        parser.add_argument(f"--{parameter.name.replace('_', '-')}", type=parameter.annotation, required=True)
+    arguments = vars(parser.parse_args())
+    try:
+        probe(server_uri())
+    except TrackingAway as away:
+        say(f"warning: {away}")
+    start_s = time.monotonic()
+    try:
+        work(**arguments)
+    except ReskinError as error:
+        say(f"error: {error}")
+        sys.exit(error.exit_code)
+    note_cost(COSTS / arguments["scene"], stage, time.monotonic() - start_s)
+
+
+def say(sentence: str) -> None:
+    """Tell the person in front of the terminal, at once."""
+    print(sentence, file=sys.stderr, flush=True)

@@ -1,0 +1,24 @@
+"""Stage ingest: one recorded capture -> indentations/<scene>/<capture>.parquet, one row a reading."""
+
+from pathlib import Path
+
+from pipeline import io
+from pipeline.dataset.captures import check_losses, open_capture
+from pipeline.stages._run import run, say
+
+
+def ingest(scene: str, raw: Path, lost_fraction_max: float, indentations: Path) -> None:
+    """Read a capture, check what it lost, and write its readings."""
+    header, blocks, account = open_capture(raw)
+    io.write_readings(indentations, blocks, account)
+    try:
+        check_losses(account, lost_fraction_max, str(raw))
+    except ValueError:
+        io.remove(indentations)
+        raise
+    kept = ", ".join(f"{key} {count}" for key, count in account.items() if count)
+    say(f"{scene}/{header.capture} ({header.source}): {kept}")
+
+
+if __name__ == "__main__":
+    run(ingest)

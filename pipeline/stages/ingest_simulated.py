@@ -1,0 +1,19 @@
+"""Stage ingest_simulated: all captures of a simulated scene -> indentations/<scene>/, one file a capture."""
+
+from pathlib import Path
+
+from pipeline import io
+from pipeline.stages._run import run
+from pipeline.stages.ingest import ingest
+
+
+def ingest_simulated(scene: str, raw: Path, lost_fraction_max: float, indentations: Path) -> None:
+    """Read every capture that the stage `simulate` wrote for a scene, through the same door as recorded ones."""
+    with io.replacing(indentations) as folder:
+        folder.mkdir()
+        for capture in sorted(child for child in raw.iterdir() if child.is_dir()):
+            ingest(scene, capture, lost_fraction_max, folder / f"{capture.name}.parquet")
+
+
+if __name__ == "__main__":
+    run(ingest_simulated)

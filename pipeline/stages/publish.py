@@ -1,0 +1,22 @@
+"""Stage publish: models and figures -> the MLflow diary. No output: nothing reads the diary back."""
+
+from pathlib import Path
+
+from pipeline.params import arms_of, read_scene
+from pipeline.server import TrackingAway
+from pipeline.stages._run import run, say
+from pipeline.tracking import publish as write
+
+
+def publish(scene: str, settings: Path, models: Path, figures: Path) -> None:
+    """Write every training of a scene to MLflow once; if the server is away, say so and go on."""
+    for arm in arms_of(read_scene(settings)):
+        try:
+            counts = write(models / arm, figures, scene=scene, stage=arm, root=Path())
+            say(f"{scene} {arm}: MLflow runs {counts}")
+        except TrackingAway as away:
+            say(f"warning: {scene} {arm} is not in MLflow: {away}")
+
+
+if __name__ == "__main__":
+    run(publish)
