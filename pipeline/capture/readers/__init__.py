@@ -1,0 +1,25 @@
+"""One module a layout of recording: files in, `Readings` and an account of what was left out."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Protocol
+
+from pipeline.capture.header import Header
+from pipeline.capture.readers import eflesh, ini, lab
+from pipeline.schema import Readings
+
+
+class Reader(Protocol):
+    """What each module of a layout offers."""
+
+    def collect(self, recording: Path) -> dict[str, Path]:
+        """Find a recording's files: name in the capture folder -> source."""
+
+    def count_chips(self, files: Mapping[str, Path]) -> int:
+        """Count the chips that collected files have columns for."""
+
+    def read(self, folder: Path, header: Header) -> tuple[Readings, dict[str, int]]:
+        """Read a capture folder; `rows_n` + `noload_rows_n` + all `dropped_*_rows_n` = `rows_read_n`."""
+
+
+READERS: Mapping[str, Reader] = {"lab": lab, "ini": ini, "eflesh": eflesh}

@@ -1,0 +1,192 @@
+"""Layout `eflesh`: a robot arm over an eFlesh skin, three CSV files in a folder. In: that folder. Out: readings.
+
+Places are the recording's robot coordinates less their minimum, so a scan reads 0 mm upwards; the depth is counted
+down from the highest z of the recording, which may hang above the skin: its offset is unknown. Only one force is known.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int32
+
+from pipeline.capture.header import Header
+from pipeline.capture.readers.chips import find_whole_rows
+from pipeline.capture.readers.passes import find_passes
+from pipeline.capture.readers.table import read_cells, to_numbers
+from pipeline.capture.readers.units import check_fields, check_forces
+from pipeline.errors import CaptureError, complain
+from pipeline.schema import AXES_PER_CHIP_N, Readings
+
+SENSOR = "sensor.csv"
+CHANGES = "sensor_post_baselines.csv"
+STATES = "states.csv"
+FILES = (SENSOR, STATES, CHANGES)
+
+FORCE_AXES = ("x", "y", "z")
+NEWTON_PER_GRAM = 9.80665e-3  # standard gravity
+WEIGHT_COLUMN = 4  # of states.csv, after time, x, y and z; a recording of places only has none
+NO_NEW_WEIGHT = -1.0
+CLOCKS_APART_MAX_s = 0.05  # both files are written in one loop, milliseconds apart
+PLACE_DECIMALS = 3  # the robot reports -84.999992 mm for -85
+# Rounding of raw - dB in float32 stays below 0.004 uT; in a new reading some channel moves by an LSB, 0.15 uT or more.
+SAME_NOLOAD_uT = 0.02
+
+Account = dict[str, int]
+
+
+def collect(recording: Path) -> dict[str, Path]:
+    """Find the three files in the folder of one recording."""
+    missing = [name for name in FILES if not (recording / name).is_file()]
+    if missing:
+        rule = f"a folder with {', '.join(FILES)}"
+        raise CaptureError(
+            complain(recording, "an eflesh recording", rule, f"no {', '.join(missing)}", "Fetch it whole.")
+        )
+    return {name: recording / name for name in FILES}
+
+
+def count_chips(files: Mapping[str, Path]) -> int:
+    """Count the chips from the columns of `sensor.csv`: one time, then three a chip."""
+    where = str(files[SENSOR])
+    columns_n = len(read_cells(files[SENSOR], where, separator=",")[0])
+    if columns_n < 1 + AXES_PER_CHIP_N or (columns_n - 1) % AXES_PER_CHIP_N:
+        raise CaptureError(complain(where, "columns", "a time and 3 a chip", columns_n, "Is this layout eflesh?"))
+    return (columns_n - 1) // AXES_PER_CHIP_N
+
+
+def read(folder: Path, header: Header) -> tuple[Readings, Account]:
+    """Read every row as one indentation; its no-load field is the baseline that the recorder subtracted, raw - dB."""
+    time_s, b_uT, noload_uT = _read_fields(folder, header)
+    states = _read_states(folder, header)
+    _check_rows_n({SENSOR: len(time_s), STATES: len(states)}, header)
+    _check_clocks(time_s, states[:, 0], header)
+    temperature_degC = np.full((len(time_s), header.chips_n), np.nan, np.float32)
+    keep = find_whole_rows(b_uT, temperature_degC, header, where=f"{header.capture}/{SENSOR}")
+    place_mm = np.round(states[:, 1:3], PLACE_DECIMALS)
+    place_mm -= place_mm.min(axis=0)
+    pass_i, touches_i = _number_passes(place_mm, noload_uT)
+    force_N = _read_force(states, header)
+    rows_n = int(keep.sum())
+    readings = Readings(
+        capture=header.capture,
+        board=header.board,
+        skin=header.skin,
+        source=header.source,
+        indentation=np.flatnonzero(keep).astype(np.int32),
+        pass_i=pass_i[keep],
+        reading_i=np.zeros(rows_n, np.int32),
+        x_mm=place_mm[keep, 0].astype(np.float32),
+        y_mm=place_mm[keep, 1].astype(np.float32),
+        depth_mm=_read_depth(states, header)[keep],
+        Fx_N=force_N["x"][keep],
+        Fy_N=force_N["y"][keep],
+        Fz_N=force_N["z"][keep],
+        b_uT=b_uT[keep].astype(np.float32),
+        noload_uT=noload_uT[keep].astype(np.float32),
+        temperature_degC=temperature_degC[keep],
+        t_s=time_s[keep],
+        n_contacts=(header.contacts_before_n + touches_i[keep]).astype(np.int32),
+    )
+    return readings, {
+        "rows_n": rows_n,
+        "rows_read_n": len(keep),
+        "noload_rows_n": 0,
+        "dropped_failed_read_rows_n": len(keep) - rows_n,
+        "no_new_force_rows_n": _count_no_new_force(states[keep]),
+        "passes_n": int(pass_i.max()) + 1,
+    }
+
+
+def _read_fields(
+    folder: Path, header: Header
+) -> tuple[Float64[np.ndarray, " f"], Float64[np.ndarray, "f ch"], Float64[np.ndarray, "f ch"]]:
+    """Read times, raw fields and no-load fields; both files of the sensor must hold the same times."""
+    channels = [f"B{axis}{chip}" for chip in range(header.chips_n) for axis in "xyz"]
+    sensor = _read_numbers(folder, header, SENSOR, ["time", *channels])
+    changes = _read_numbers(folder, header, CHANGES, ["time", *channels])
+    _check_rows_n({SENSOR: len(sensor), CHANGES: len(changes)}, header)
+    differ = np.flatnonzero(sensor[:, 0] != changes[:, 0])
+    if len(differ):
+        got = f"another in line {differ[0] + 1}"
+        where = f"{header.capture}/{CHANGES}"
+        raise CaptureError(complain(where, "time", f"that of {SENSOR}", got, "Take both files of one recording."))
+    check_fields(sensor[:, 1:], f"{header.capture}/{SENSOR}", first_line_n=1)
+    return sensor[:, 0], sensor[:, 1:], sensor[:, 1:] - changes[:, 1:]
+
+
+def _read_states(folder: Path, header: Header) -> Float64[np.ndarray, "f c"]:
+    """Read time, x, y, z and, if the recording has it, the weight."""
+    where = f"{header.capture}/{STATES}"
+    cells = read_cells(folder / STATES, where, separator=",")
+    names = ["time", "x", "y", "z"] + (["weight"] if len(cells[0]) > WEIGHT_COLUMN else [])
+    return to_numbers(cells, where, names=names, first_line_n=1)
+
+
+def _read_numbers(folder: Path, header: Header, name: str, names: list[str]) -> Float64[np.ndarray, "f c"]:
+    where = f"{header.capture}/{name}"
+    return to_numbers(read_cells(folder / name, where, separator=","), where, names=names, first_line_n=1)
+
+
+def _check_rows_n(rows_n: Mapping[str, int], header: Header) -> None:
+    if len(set(rows_n.values())) != 1:
+        got = " and ".join(f"{count} in {name}" for name, count in rows_n.items())
+        raise CaptureError(complain(header.capture, "rows", "equal in number", got, "Was one of the files cut?"))
+
+
+def _check_clocks(sensor_s: Float64[np.ndarray, " f"], states_s: Float64[np.ndarray, " f"], header: Header) -> None:
+    """Rows pair in order, so the clocks must agree row by row, and go on."""
+    apart = np.flatnonzero(np.abs(states_s - sensor_s) >= CLOCKS_APART_MAX_s)
+    if len(apart):
+        got = f"{states_s[apart[0]] - sensor_s[apart[0]]:.3f} s in line {apart[0] + 1}"
+        rule = f"within {CLOCKS_APART_MAX_s} s of {SENSOR}"
+        where = f"{header.capture}/{STATES}"
+        raise CaptureError(complain(where, "time", rule, got, "Is a row missing in one of the files?"))
+    back = np.flatnonzero(np.diff(sensor_s) <= 0)
+    if len(back):
+        where = f"{header.capture}/{SENSOR}"
+        got = f"an earlier one in line {back[0] + 2}"
+        raise CaptureError(complain(where, "time", "later in each line", got, "Were two recordings joined?"))
+
+
+def _number_passes(
+    place_mm: Float64[np.ndarray, "f 2"], noload_uT: Float64[np.ndarray, "f ch"]
+) -> tuple[Int32[np.ndarray, " f"], Int32[np.ndarray, " f"]]:
+    """Number passes, and the touches before each row.
+
+    Over many places each row is a touch, and a pass ends when the places repeat. At a single place the robot
+    strokes up and down and takes a fresh baseline before each stroke: a new no-load field begins a pass, one touch.
+    """
+    if place_mm.any():
+        everywhere = np.ones(len(place_mm), bool)
+        return find_passes(place_mm, everywhere), np.arange(len(place_mm), dtype=np.int32)
+    fresh = (np.abs(np.diff(noload_uT, axis=0)) > SAME_NOLOAD_uT).any(axis=1)
+    pass_i = np.concatenate([[0], np.cumsum(fresh)]).astype(np.int32)
+    return pass_i, pass_i
+
+
+def _read_force(states: Float64[np.ndarray, "f c"], header: Header) -> dict[str, Float32[np.ndarray, " f"]]:
+    """Give the force by axis, NaN where no gauge looked or had no new reading."""
+    force_N = {axis: np.full(len(states), np.nan, np.float32) for axis in FORCE_AXES}
+    if states.shape[1] <= WEIGHT_COLUMN:
+        return force_N
+    if "force_axis" not in header.options or header.options["force_axis"] not in FORCE_AXES:
+        got = header.options if header.options else "no option"
+        remedy = "Say which force the gauge measured."
+        raise CaptureError(complain(header.capture, "option force_axis", "x, y or z", got, remedy))
+    weight_g = states[:, WEIGHT_COLUMN]
+    weight_N = np.where(weight_g == NO_NEW_WEIGHT, np.nan, weight_g * NEWTON_PER_GRAM)
+    check_forces(weight_N, f"{header.capture}/{STATES}", first_line_n=1)
+    force_N[header.options["force_axis"]] = weight_N.astype(np.float32)
+    return force_N
+
+
+def _read_depth(states: Float64[np.ndarray, "f c"], header: Header) -> Float32[np.ndarray, " f"]:
+    """Count down from the highest z; NaN where the gauge measured along the skin, as that stroke is no depth."""
+    along = states.shape[1] > WEIGHT_COLUMN and header.options["force_axis"] != "z"
+    depth_mm = np.full(len(states), np.nan) if along else states[:, 3].max() - states[:, 3]
+    return depth_mm.astype(np.float32)
+
+
+def _count_no_new_force(states: Float64[np.ndarray, "f c"]) -> int:
+    return int((states[:, WEIGHT_COLUMN:] == NO_NEW_WEIGHT).sum())

@@ -1,0 +1,155 @@
+"""Layout `ini`: a 3-D printer and a force gauge, two text files. In: readings and truths. Out: one reading a press.
+
+Rows below the gauge's 0.02 N count as no contact, wherever the truths say they are: they stay, without place or force.
+Those that begin a pass, at a corner of the grid, are its no-load reading. `t_s` and `depth_mm` are NaN: none is known.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int32
+
+from pipeline.capture.header import Header
+from pipeline.capture.readers.chips import find_whole_rows
+from pipeline.capture.readers.passes import find_passes
+from pipeline.capture.readers.table import read_cells, to_numbers
+from pipeline.capture.readers.units import check_fields, check_forces
+from pipeline.errors import CaptureError, complain
+from pipeline.schema import Readings
+
+READINGS = "readings.txt"
+TRUTHS = "truths.txt"
+FILES = (READINGS, TRUTHS)
+CONTACT_MIN_N = 0.02  # the recorder labels weaker rows (10, 10, 0), a real place: only force tells them apart
+VALUES_PER_CHIP_N = 4
+
+Account = dict[str, int]
+
+
+def collect(recording: Path) -> dict[str, Path]:
+    """Find the readings file and its truths beside it: `b20_NAME.txt` goes with `truths_NAME.txt`."""
+    if not recording.is_file() or recording.name.startswith("truths_"):
+        rule = "the text file of readings"
+        raise CaptureError(
+            complain(recording, "an ini recording", rule, recording.name, "Name the file, not truths_*.")
+        )
+    names = [f"truths_{recording.name.partition('_')[2]}", f"truths_{recording.name}"]
+    found = [recording.with_name(name) for name in names if recording.with_name(name).is_file()]
+    if not found:
+        got = f"no {' or '.join(names)}"
+        raise CaptureError(
+            complain(recording, "the truths", "in the same folder", got, "Fetch or rename the truths file.")
+        )
+    return {READINGS: recording, TRUTHS: found[0]}
+
+
+def count_chips(files: Mapping[str, Path]) -> int:
+    """Count the chips from the columns of the readings: X, Y, Z, T a chip."""
+    where = str(files[READINGS])
+    columns_n = len(read_cells(files[READINGS], where, separator=None)[0])
+    if columns_n == 0 or columns_n % VALUES_PER_CHIP_N:
+        raise CaptureError(complain(where, "columns", "X, Y, Z, T a chip", columns_n, "Is this layout ini?"))
+    return columns_n // VALUES_PER_CHIP_N
+
+
+def read(folder: Path, header: Header) -> tuple[Readings, Account]:
+    """Read all rows but those with a failed chip; the no-load field of a row is the mean of its pass's corner rows."""
+    b_uT, temperature_degC = _read_fields(folder, header)
+    truths = _read_truths(folder, header)
+    _check_rows_n(len(b_uT), len(truths), header)
+    contact = truths[:, 2] >= CONTACT_MIN_N
+    pass_i = find_passes(truths[:, :2], contact)
+    keep = find_whole_rows(b_uT, temperature_degC, header, where=f"{header.capture}/{READINGS}")
+    corner = _corner_rows(pass_i, contact)
+    noload_uT = _noload_field(b_uT, pass_i, corner & keep, header)
+    place_mm = np.where(contact[:, None], truths[:, :2], np.nan).astype(np.float32)
+    rows_n = int(keep.sum())
+    unknown = np.full(rows_n, np.nan)
+    readings = Readings(
+        capture=header.capture,
+        board=header.board,
+        skin=header.skin,
+        source=header.source,
+        indentation=np.flatnonzero(keep).astype(np.int32),
+        pass_i=pass_i[keep],
+        reading_i=np.zeros(rows_n, np.int32),
+        x_mm=place_mm[keep, 0],
+        y_mm=place_mm[keep, 1],
+        depth_mm=unknown.astype(np.float32),
+        Fx_N=unknown.astype(np.float32),
+        Fy_N=unknown.astype(np.float32),
+        Fz_N=np.where(contact, truths[:, 2], 0.0)[keep].astype(np.float32),
+        b_uT=b_uT[keep].astype(np.float32),
+        noload_uT=noload_uT[keep].astype(np.float32),
+        temperature_degC=temperature_degC[keep].astype(np.float32),
+        t_s=unknown,
+        n_contacts=(header.contacts_before_n + np.cumsum(contact) - contact)[keep].astype(np.int32),
+    )
+    return readings, {
+        "rows_n": rows_n,
+        "rows_read_n": len(keep),
+        "dropped_failed_read_rows_n": len(keep) - rows_n,
+        "noload_rows_n": 0,
+        "no_contact_rows_n": int((keep & ~contact).sum()),
+        "corner_rows_n": int((keep & corner).sum()),
+        "passes_n": int(pass_i.max()) + 1,
+    }
+
+
+def _read_fields(folder: Path, header: Header) -> tuple[Float64[np.ndarray, "f ch"], Float64[np.ndarray, "f k"]]:
+    """Read fields and temperatures, chip by chip."""
+    names = [f"{value}{chip}" for chip in range(header.chips_n) for value in ("Bx", "By", "Bz", "T")]
+    where = f"{header.capture}/{READINGS}"
+    numbers = to_numbers(read_cells(folder / READINGS, where, separator=None), where, names=names, first_line_n=1)
+    per_chip = numbers.reshape(len(numbers), header.chips_n, VALUES_PER_CHIP_N)
+    b_uT = per_chip[:, :, :3].reshape(len(numbers), -1)
+    check_fields(b_uT, where, first_line_n=1)
+    return b_uT, per_chip[:, :, 3]
+
+
+def _read_truths(folder: Path, header: Header) -> Float64[np.ndarray, "f 3"]:
+    """Read x mm, y mm, F N."""
+    where = f"{header.capture}/{TRUTHS}"
+    cells = read_cells(folder / TRUTHS, where, separator=None)
+    truths = to_numbers(cells, where, names=["x_mm", "y_mm", "F_N"], first_line_n=1)
+    check_forces(truths[:, 2], where, first_line_n=1)
+    return truths
+
+
+def _check_rows_n(readings_n: int, truths_n: int, header: Header) -> None:
+    if readings_n != truths_n:
+        got = f"{readings_n} in {READINGS} and {truths_n} in {TRUTHS}"
+        raise CaptureError(
+            complain(header.capture, "rows", "equal in number", got, "Is this the truths file of this one?")
+        )
+
+
+def _corner_rows(pass_i: Int32[np.ndarray, " f"], contact: Bool[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
+    """Mark the rows of each pass before its first contact: the indenter is at the first corner, off the skin."""
+    touches_before_n = np.cumsum(contact)
+    begins = np.flatnonzero(np.diff(pass_i, prepend=-1))
+    before_pass_n = (touches_before_n - contact)[begins]
+    return np.asarray(touches_before_n == before_pass_n[pass_i])
+
+
+def _noload_field(
+    b_uT: Float64[np.ndarray, "f ch"],
+    pass_i: Int32[np.ndarray, " f"],
+    corner: Bool[np.ndarray, " f"],
+    header: Header,
+) -> Float64[np.ndarray, "f ch"]:
+    """Give each row the mean field of the corner rows of its pass."""
+    passes_n = int(pass_i.max()) + 1
+    rows_n = np.bincount(pass_i[corner], minlength=passes_n)
+    without = np.flatnonzero(rows_n == 0)
+    if len(without):
+        got = f"none in the pass from line {int(np.argmax(pass_i == without[0])) + 1}"
+        where = f"{header.capture}/{READINGS}"
+        rule = f"begun by a whole row without contact (F < {CONTACT_MIN_N} N)"
+        raise CaptureError(
+            complain(where, "each pass", rule, got, "Start each pass off the skin, or cut this pass out.")
+        )
+    sums_uT = np.zeros((passes_n, b_uT.shape[1]))
+    np.add.at(sums_uT, pass_i[corner], b_uT[corner])
+    return (sums_uT / rows_n[:, None])[pass_i]

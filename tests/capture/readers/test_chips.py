@@ -1,0 +1,50 @@
+"""A chip is believed if it was read, and if it speaks the scale of its header or neighbours."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline import seeds
+from pipeline.capture import faults
+from pipeline.capture.readers.chips import GRID_ROWS_N, find_whole_rows
+from pipeline.errors import CaptureError
+from tests.capture.headers import make_header
+
+HEADER = make_header()
+CHIPS_N = 5
+
+
+def noisy_fields_uT(rows_n: int) -> np.ndarray:
+    """Fields as five chips at GAIN_SEL 7 send them: 5 uT of noise about 300 uT, on the grid of their LSB."""
+    lsb_uT = np.tile([0.15, 0.15, 0.242], CHIPS_N)
+    b_uT = 300 + 5 * seeds.rng_for(2021, "fields").standard_normal((rows_n, 3 * CHIPS_N))
+    return np.round(b_uT / lsb_uT) * lsb_uT
+
+
+@settings(max_examples=30, deadline=None)
+@given(failed=st.sets(st.tuples(st.integers(0, 49), st.integers(0, CHIPS_N - 1))))
+def test_a_row_is_whole_if_none_of_its_chips_failed(failed: set[tuple[int, int]]) -> None:
+    b_uT, temperature_degC = noisy_fields_uT(50), np.full((50, CHIPS_N), 25.0)
+    for row_i, chip_i in failed:
+        b_uT[row_i, 3 * chip_i : 3 * chip_i + 3] = faults.FAILED_B_uT
+        temperature_degC[row_i, chip_i] = faults.FAILED_TEMPERATURE_degC
+    rows = {row_i for row_i, _ in failed}
+    if len(rows) < 50:
+        whole = find_whole_rows(b_uT, temperature_degC, HEADER, where="here")
+        assert set(np.flatnonzero(~whole).tolist()) == rows
+
+
+@pytest.mark.parametrize("chip_i", range(CHIPS_N))
+def test_a_chip_without_the_others_grid_is_named(chip_i: int) -> None:
+    b_uT = noisy_fields_uT(GRID_ROWS_N)
+    spread = seeds.rng_for(2021, "spread").standard_normal((GRID_ROWS_N, 3))
+    b_uT[:, 3 * chip_i : 3 * chip_i + 3] = 300 + 5 * spread
+    with pytest.raises(CaptureError, match=f"chip {chip_i} must be"):
+        find_whole_rows(b_uT, np.full((GRID_ROWS_N, CHIPS_N), np.nan), HEADER, where="here")
+
+
+def test_fields_that_show_no_grid_at_all_are_believed() -> None:
+    # As of a recorder that averages: there is nothing to compare.
+    b_uT = 300 + 5 * seeds.rng_for(2021, "averaged").standard_normal((GRID_ROWS_N, 3 * CHIPS_N))
+    assert find_whole_rows(b_uT, np.full((GRID_ROWS_N, CHIPS_N), np.nan), HEADER, where="here").all()

@@ -1,0 +1,66 @@
+"""Passes are found as a person would: the protocol is written down, repeated, and must be found again."""
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline import seeds
+from pipeline.capture.readers.passes import find_passes
+
+
+def raster(columns_n: int, rows_n: int, presses_n: int) -> np.ndarray:
+    """One pass over a grid of 2 mm, `presses_n` rows a place."""
+    places = [(2.0 * x, 2.0 * y) for x in range(columns_n) for y in range(rows_n)]
+    return np.repeat(np.array(places), presses_n, axis=0)
+
+
+grids = st.tuples(st.integers(2, 5), st.integers(2, 5), st.integers(1, 6))
+
+
+@settings(deadline=None)
+@given(grid=grids, passes_n=st.integers(2, 5))
+def test_a_repeated_raster_is_cut_where_it_repeats(grid: tuple[int, int, int], passes_n: int) -> None:
+    once = raster(*grid)
+    place_mm = np.tile(once, (passes_n, 1))
+    expected = np.repeat(np.arange(passes_n), len(once))
+    assert find_passes(place_mm, np.ones(len(place_mm), bool)).tolist() == expected.tolist()
+
+
+@settings(deadline=None)
+@given(seed=st.integers(0, 1000), passes_n=st.integers(4, 8))
+def test_rows_without_contact_may_carry_any_place(seed: int, passes_n: int) -> None:
+    once = raster(4, 4, 3)
+    place_mm = np.tile(once, (passes_n, 1))
+    contact = seeds.rng_for(seed, "contact").random(len(place_mm)) > 0.1
+    place_mm[~contact] = (4.0, 4.0)
+    expected = np.repeat(np.arange(passes_n), len(once))
+    assert find_passes(place_mm, contact).tolist() == expected.tolist()
+
+
+@settings(deadline=None)
+@given(grid=grids, passes_n=st.integers(2, 4), shift_mm=st.floats(-50, 50))
+def test_moving_the_whole_grid_changes_nothing(grid: tuple[int, int, int], passes_n: int, shift_mm: float) -> None:
+    place_mm = np.tile(raster(*grid), (passes_n, 1))
+    contact = np.ones(len(place_mm), bool)
+    np.testing.assert_array_equal(find_passes(place_mm + shift_mm, contact), find_passes(place_mm, contact))
+
+
+def test_the_last_pass_may_be_cut() -> None:
+    once = raster(3, 3, 2)
+    place_mm = np.tile(once, (3, 1))[:-5]
+    assert np.bincount(find_passes(place_mm, np.ones(len(place_mm), bool))).tolist() == [18, 18, 13]
+
+
+def test_one_mislabelled_row_does_not_hide_the_passes() -> None:
+    place_mm = np.tile(raster(9, 9, 6), (5, 1))
+    place_mm[700] = (-1.0, -1.0)
+    assert find_passes(place_mm, np.ones(len(place_mm), bool)).max() == 4
+
+
+def test_places_that_never_repeat_are_one_pass() -> None:
+    for place_mm in (raster(5, 5, 3), raster(1, 1, 40)):
+        assert not find_passes(place_mm, np.ones(len(place_mm), bool)).any()
+
+
+def test_a_recording_without_contact_is_one_pass() -> None:
+    assert not find_passes(raster(3, 3, 2), np.zeros(18, bool)).any()
