@@ -1,0 +1,60 @@
+"""The paper's protocol of pokes: a 65-point grid, depth by depth, pass by pass. In: depths, passes. Out: arrays.
+
+Places are labels: mm from 0 to 16, the middle of the skin at (8, 8).
+Refuses to know robots, clocks and fields.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64, Int32
+
+# "a 9x9 grid (excluding 4 points per corner; a total of 65 indentations)"; its "16cm" is a typo for 16 mm.
+SIDE_POINTS_N = 9
+PITCH_MM = 2.0
+CORNER_SIDE_POINTS_N = 2
+CENTRE_MM = (SIDE_POINTS_N - 1) * PITCH_MM / 2
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """Commanded pokes in order of time, one row an indentation."""
+
+    indentation: Int32[np.ndarray, " n"]
+    pass_i: Int32[np.ndarray, " n"]
+    x_mm: Float64[np.ndarray, " n"]
+    y_mm: Float64[np.ndarray, " n"]
+    depth_mm: Float64[np.ndarray, " n"]
+
+    def __len__(self) -> int:
+        return len(self.indentation)
+
+
+def points_mm() -> Float64[np.ndarray, "65 2"]:
+    """Give (x, y) of the grid points in snake order: along x, every second row backwards."""
+    points = []
+    for row_i in range(SIDE_POINTS_N):
+        columns = [column_i for column_i in range(SIDE_POINTS_N) if not _cut_off(column_i, row_i)]
+        points += [(column_i, row_i) for column_i in (columns if row_i % 2 == 0 else columns[::-1])]
+    return np.array(points) * PITCH_MM
+
+
+def protocol(depths_mm: Sequence[float], passes_n: int) -> Protocol:
+    """Poke every point at the first depth, then at the next; a pass is all depths once, as in the paper."""
+    xy_mm = points_mm()
+    points_n, depths_n = len(xy_mm), len(depths_mm)
+    pokes_n = points_n * depths_n
+    return Protocol(
+        indentation=np.arange(passes_n * pokes_n, dtype=np.int32),
+        pass_i=np.repeat(np.arange(passes_n, dtype=np.int32), pokes_n),
+        x_mm=np.tile(xy_mm[:, 0], passes_n * depths_n),
+        y_mm=np.tile(xy_mm[:, 1], passes_n * depths_n),
+        depth_mm=np.tile(np.repeat(np.array(depths_mm, dtype=np.float64), points_n), passes_n),
+    )
+
+
+def _cut_off(column_i: int, row_i: int) -> bool:
+    # A point is missing where both its row and its column lie within a corner's two.
+    inner = range(CORNER_SIDE_POINTS_N, SIDE_POINTS_N - CORNER_SIDE_POINTS_N)
+    return column_i not in inner and row_i not in inner

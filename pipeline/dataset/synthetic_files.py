@@ -1,0 +1,36 @@
+"""A synthetic capture as a port would have left it: arrays -> header and files in the wire format.
+
+From here on nothing tells it from a recorded one, but for the word `simulated` in its header. Refuses to know folders.
+"""
+
+import numpy as np
+
+from pipeline.capture import arrivals, probe, wire
+from pipeline.capture.arrivals import Arrivals
+from pipeline.capture.header import ARRIVALS_FILE, PROBE_FILE, STREAM_FILE, Clock, Firmware, Header
+from pipeline.capture.wire import Frames
+from pipeline.dataset.synthetic import SyntheticCapture, Synthesis
+from pipeline.physics.sensor import steps_uT
+
+WIRE: wire.Wire = "binary"
+
+
+def to_files(capture: SyntheticCapture, parameters: Synthesis) -> tuple[Header, dict[str, bytes]]:
+    """Write a synthetic capture as the files of a native one; the files' hashes are still to come."""
+    frames_n, chips_n = capture.temperature_degC.shape
+    unknown = Frames(capture.b_uT, capture.temperature_degC, np.full(frames_n, np.nan), np.zeros(frames_n, np.int64))
+    frame_bytes_n = wire.record_type(WIRE, chips_n).itemsize
+    xy_uT, _, z_uT = steps_uT(parameters.chip.gain_sel).tolist()
+    header = Header(
+        format="reskin-capture/1", capture=capture.skin, board=capture.board, skin=capture.skin, source="simulated",
+        layout="native", wire=WIRE, chips_n=chips_n, unit_b="uT", unit_force="N", unit_place="mm",
+        firmware=Firmware(gain_sel=parameters.chip.gain_sel, lsb_xy_uT=xy_uT, lsb_z_uT=z_uT),
+        clock=Clock(kind="arrivals", rate_hz=None, marks=capture.marks),
+        protocol=f"65-point grid, {len(parameters.recording.depths_mm)} depths, {parameters.recording.passes_n} passes",
+        contacts_before_n=0, options={}, files={}, note=f"values past the chip's range: {capture.wrapped_n}",
+    )  # fmt: skip
+    return header, {
+        STREAM_FILE: wire.encode(unknown, WIRE),
+        ARRIVALS_FILE: arrivals.render(Arrivals(capture.arrived_frames_n * frame_bytes_n, capture.arrived_s)).encode(),
+        PROBE_FILE: probe.render(capture.probe).encode(),
+    }

@@ -1,0 +1,86 @@
+"""The circuit board, and every spread of boards and skins. In: a design and a name. Out: one `Board`, SI inside.
+
+A board is drawn from a generator that bears its name: board 7 stays the same when board 8 is added.
+Refuses to know magnets, skins and what a chip makes of the field (`sensor`).
+"""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import Field, model_validator
+from scipy.constants import micro, milli
+from scipy.spatial.transform import Rotation
+
+from pipeline.errors import ParamsError, complain
+from pipeline.seeds import rng_for
+from pipeline.strict import Strict
+
+Share = Annotated[float, Field(ge=0, le=0.5)]
+
+
+class BoardDesign(Strict):
+    """Where the chips sit, seen from the middle of the board, and how each is turned about z (authors' board file)."""
+
+    chips_xy_mm: Annotated[tuple[tuple[float, float], ...], Field(min_length=1, max_length=64)]
+    chips_turn_deg: tuple[float, ...]
+    gap_mm: Annotated[float, Field(gt=0, le=10)]  # sensing plane below the skin: rigid 1.1, flexible 0.6
+
+    @model_validator(mode="after")
+    def _each_chip_is_turned(self) -> "BoardDesign":
+        if len(self.chips_xy_mm) != len(self.chips_turn_deg):
+            raise ValueError("chips_turn_deg needs one turn for each of chips_xy_mm")
+        return self
+
+
+class Spreads(Strict):
+    """Standard deviations between boards and between skins. All of them are ASSUMPTIONS (PHYSICS 6 and 7).
+
+    Factors are drawn as exp(sd * normal), so that they stay positive; all else is normal around the design.
+    """
+
+    board_gap_mm: Annotated[float, Field(ge=0, le=1)]
+    chip_gain: Share
+    chip_cross_axis: Share
+    chip_tilt_deg: Annotated[float, Field(ge=0, le=10)]
+    chip_offset_uT: Annotated[float, Field(ge=0, le=5000)]
+    skin_amplitude: Share  # of the magnetisation
+    skin_filler: Share  # of the magnetisation from place to place
+    skin_filler_length_mm: Annotated[float, Field(gt=0, le=50)]  # correlation exp(-r^2 / 2 length^2)
+    skin_thickness: Share
+    skin_modulus: Share
+    skin_seat_mm: Annotated[float, Field(ge=0, le=2)]  # skin sideways of its place on the board, each axis
+    skin_depth_zero_mm: Annotated[float, Field(ge=0, le=0.2)]  # true depth minus commanded depth
+
+
+@dataclass(frozen=True)
+class Board:
+    """One board: z = 0 is where the skin's base lies; a chip reads sensitivity @ turn^T @ B + offset."""
+
+    name: str
+    chips_m: Float[np.ndarray, "k 3"]
+    turn: Float[np.ndarray, "k 3 3"]  # columns: the chip's axes in the board's frame
+    sensitivity: Float[np.ndarray, "k 3 3"]
+    offset_T: Float[np.ndarray, "k 3"]
+
+
+def draw_board(design: BoardDesign, spreads: Spreads, *, seed: int, name: str) -> Board:
+    """Draw the board called `name`."""
+    rng = rng_for(seed, "board", name)
+    chips_n = len(design.chips_xy_mm)
+    gap_mm = design.gap_mm + spreads.board_gap_mm * rng.standard_normal()
+    if gap_mm <= 0:
+        raise ParamsError(complain(f"board {name}", "gap", "above 0 mm", f"{gap_mm:.3g}", "Lower board_gap_mm."))
+    chips_mm = np.column_stack([np.array(design.chips_xy_mm), np.full(chips_n, -gap_mm)])
+    tilt_deg = spreads.chip_tilt_deg * rng.standard_normal((chips_n, 2))
+    turn = Rotation.from_euler("ZYX", np.column_stack([design.chips_turn_deg, tilt_deg]), degrees=True)
+    gain = np.exp(spreads.chip_gain * rng.standard_normal((chips_n, 3)))
+    cross = spreads.chip_cross_axis * rng.standard_normal((chips_n, 3, 3))
+    return Board(
+        name=name,
+        chips_m=chips_mm * milli,
+        turn=turn.as_matrix(),
+        sensitivity=np.where(np.eye(3, dtype=bool), gain[:, :, None], cross),
+        offset_T=spreads.chip_offset_uT * micro * rng.standard_normal((chips_n, 3)),
+    )

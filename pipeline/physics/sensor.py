@@ -1,0 +1,58 @@
+"""The magnetometer, MLX90393. In: field at the chips in tesla, board's frame. Out: what the chip says, in uT, float32.
+
+The one place where tesla become microtesla. Noise, step and range are those of the chip as the firmware sets it.
+Refuses to know where the field comes from and how readings travel.
+"""
+
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Float, Float32
+from pydantic import Field
+from scipy.constants import micro
+
+from pipeline.physics.board import Board
+from pipeline.strict import Strict
+
+GAINS = (5.0, 4.0, 3.0, 2.5, 2.0, 5 / 3, 4 / 3, 1.0)  # by GAIN_SEL (data sheet, table 17)
+STEP_AT_GAIN_ONE_uT = (0.150, 0.150, 0.242)  # RES 0; x, y, z
+TEMPERATURE_ZERO_DEGC, TEMPERATURE_ZERO_RAW, TEMPERATURE_STEPS_PER_DEGC = 25.0, 46244, 45.2  # data sheet
+
+
+class ChipDesign(Strict):
+    """How the firmware sets the chip, and the noise of one reading."""
+
+    gain_sel: Annotated[int, Field(ge=0, le=7)]
+    noise_xy_uT: Annotated[float, Field(ge=0, le=100)]
+    noise_z_uT: Annotated[float, Field(ge=0, le=100)]
+    noise_temperature_degC: Annotated[float, Field(ge=0, le=10)]
+
+
+def steps_uT(gain_sel: int) -> Float[np.ndarray, " 3"]:
+    """Give the field of one count on x, y and z."""
+    return np.array(STEP_AT_GAIN_ONE_uT) * GAINS[gain_sel]
+
+
+def read_field(
+    b_T: Float[np.ndarray, "f k 3"], board: Board, *, design: ChipDesign, rng: np.random.Generator
+) -> tuple[Float32[np.ndarray, "f ch"], int]:
+    """Read the field as the board's chips do, each in its own frame; count the values past int16, which wrap."""
+    to_chip = board.sensitivity @ board.turn.transpose(0, 2, 1)
+    b_uT = (np.einsum("kij,fkj->fki", to_chip, b_T) + board.offset_T) / micro
+    noise_uT = np.array([design.noise_xy_uT, design.noise_xy_uT, design.noise_z_uT])
+    b_uT += noise_uT * rng.standard_normal(b_uT.shape)
+    step_uT = steps_uT(design.gain_sel)
+    counts = np.rint(b_uT / step_uT).astype(np.int64)
+    wrapped = (counts + 2**15) % 2**16 - 2**15
+    read_uT = (wrapped * step_uT).astype(np.float32).reshape(len(b_T), -1)
+    return read_uT, int(np.count_nonzero(wrapped != counts))
+
+
+def read_temperature(
+    temperature_degC: Float[np.ndarray, "f k"], design: ChipDesign, rng: np.random.Generator
+) -> Float32[np.ndarray, "f k"]:
+    """Read the chips' temperature, with its noise and its step of 1/45.2 degC."""
+    noisy_degC = temperature_degC + design.noise_temperature_degC * rng.standard_normal(temperature_degC.shape)
+    raw = np.rint(TEMPERATURE_ZERO_RAW + (noisy_degC - TEMPERATURE_ZERO_DEGC) * TEMPERATURE_STEPS_PER_DEGC)
+    read_degC = TEMPERATURE_ZERO_DEGC + (raw - TEMPERATURE_ZERO_RAW) / TEMPERATURE_STEPS_PER_DEGC
+    return read_degC.astype(np.float32)

@@ -1,0 +1,55 @@
+"""The protocol against the paper's counts and against the order of real recordings."""
+
+import csv
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.dataset.grid import points_mm, protocol
+
+depths_mm = st.lists(st.floats(0.1, 1.2), min_size=1, max_size=6, unique=True)
+
+
+def test_there_are_65_points_on_16_mm_with_4_missing_in_each_corner():
+    points = {tuple(point) for point in points_mm()}
+    full = {(2.0 * i, 2.0 * j) for i in range(9) for j in range(9)}
+    missing = {(x, y) for x in (0.0, 2.0, 14.0, 16.0) for y in (0.0, 2.0, 14.0, 16.0)}
+    assert len(points) == 65
+    assert points == full - missing
+
+
+def test_the_snake_steps_over_corners_only_and_never_jumps_two_rows():
+    steps_mm = np.abs(np.diff(points_mm(), axis=0))
+    assert (steps_mm[:, 1] <= 2).all()
+    along = steps_mm[:, 1] == 0
+    assert (steps_mm[along, 0] == 2).all()
+    assert (steps_mm[~along, 0] <= 4).all()  # a row that is two points longer or shorter
+
+
+def test_the_points_come_in_the_order_of_the_labs_recordings(shared_data):
+    with (shared_data / "lab" / "board1_depth1.csv").open() as file:
+        rows = {int(row["indent"]): (float(row["x_mm"]), float(row["y_mm"])) for row in csv.DictReader(file)}
+    np.testing.assert_array_equal(points_mm(), [rows[i] for i in sorted(rows)])
+
+
+def test_six_depths_make_390_indentations_a_pass():
+    plan = protocol((0.2, 0.4, 0.6, 0.8, 1.0, 1.2), 26)
+    assert len(plan) == 26 * 390
+    assert np.bincount(plan.pass_i).tolist() == [390] * 26
+
+
+@given(depths_mm, st.integers(1, 3))
+def test_every_pass_pokes_every_point_at_every_depth_once(depths, passes_n):
+    plan = protocol(depths, passes_n)
+    pokes = set(zip(plan.pass_i, plan.x_mm, plan.y_mm, plan.depth_mm, strict=True))
+    assert len(pokes) == len(plan) == passes_n * len(depths) * 65
+    assert np.array_equal(plan.indentation, np.arange(len(plan)))
+    assert (np.diff(plan.pass_i) >= 0).all()
+
+
+@given(depths_mm)
+def test_a_pass_more_leaves_the_passes_before_as_they_are(depths):
+    short, long = protocol(depths, 1), protocol(depths, 2)
+    for name in ("indentation", "pass_i", "x_mm", "y_mm", "depth_mm"):
+        assert np.array_equal(getattr(short, name), getattr(long, name)[: len(short)])

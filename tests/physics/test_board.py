@@ -1,0 +1,107 @@
+"""Boards against the design they are drawn from: chips where the CAD says, turns as published, draws by name."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.errors import ParamsError
+from pipeline.physics.board import BoardDesign, Spreads, draw_board
+from pipeline.strict import parse
+
+CROSS_MM = [[0.0, 0.0], [-7.0, 0.0], [0.0, -7.0], [7.0, 0.0], [0.0, 7.0]]
+DESIGN = {"chips_xy_mm": CROSS_MM, "chips_turn_deg": [0.0, 180.0, 0.0, 90.0, 270.0], "gap_mm": 1.1}
+SPREADS = {
+    "board_gap_mm": 0.1,
+    "chip_gain": 0.025,
+    "chip_cross_axis": 0.01,
+    "chip_tilt_deg": 2.0,
+    "chip_offset_uT": 200.0,
+    "skin_amplitude": 0.1,
+    "skin_filler": 0.1,
+    "skin_filler_length_mm": 3.0,
+    "skin_thickness": 0.03,
+    "skin_modulus": 0.1,
+    "skin_seat_mm": 0.25,
+    "skin_depth_zero_mm": 0.05,
+}
+
+
+def as_tuples(value):
+    return tuple(map(as_tuples, value)) if isinstance(value, list) else value
+
+
+def design(**changes):
+    return parse(BoardDesign, {name: as_tuples(value) for name, value in (DESIGN | changes).items()}, "test")
+
+
+def spreads(**changes):
+    return Spreads(**(SPREADS | changes))
+
+
+def no_spread(**changes):
+    exact = {name: value if name == "skin_filler_length_mm" else 0.0 for name, value in SPREADS.items()}
+    return Spreads(**(exact | changes))
+
+
+def same(one, other):
+    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in one.__dataclass_fields__)
+
+
+def test_without_spreads_the_chips_sit_and_turn_as_in_the_authors_files():
+    board = draw_board(design(), no_spread(), seed=1, name="b0")
+    np.testing.assert_allclose(board.chips_m, 1e-3 * np.array([[*xy, -1.1] for xy in CROSS_MM]))
+    published = [
+        np.eye(3),
+        np.diag([-1, -1, 1]),
+        np.eye(3),
+        [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
+        [[0, 1, 0], [-1, 0, 0], [0, 0, 1]],
+    ]
+    np.testing.assert_allclose(board.turn, published, atol=1e-15)
+    assert np.array_equal(board.sensitivity, np.tile(np.eye(3), (5, 1, 1)))
+    assert not board.offset_T.any()
+
+
+@given(st.integers(0, 10**6))
+def test_a_chips_axes_stay_orthonormal_and_right_handed_however_it_is_tilted(seed):
+    turn = draw_board(design(), spreads(chip_tilt_deg=10.0), seed=seed, name="b0").turn
+    np.testing.assert_allclose(turn @ turn.transpose(0, 2, 1), np.tile(np.eye(3), (5, 1, 1)), atol=1e-12)
+    assert (np.linalg.det(turn) > 0).all()
+
+
+def test_the_same_name_and_seed_give_the_same_board_and_another_name_another():
+    first, again = (draw_board(design(), spreads(), seed=1, name="b0") for _ in range(2))
+    assert same(first, again)
+    assert not same(first, draw_board(design(), spreads(), seed=1, name="b1"))
+    assert not same(first, draw_board(design(), spreads(), seed=2, name="b0"))
+
+
+def test_over_many_boards_the_draws_have_the_spreads_that_are_stated():
+    boards = [draw_board(design(), spreads(), seed=0, name=f"b{i}") for i in range(400)]
+    gains = np.array([np.diagonal(board.sensitivity, axis1=1, axis2=2) for board in boards])
+    # 10 %: sampling error of a standard deviation is 1 / sqrt(2 n), 3.5 % for 400 boards and less for chips.
+    assert np.std([board.chips_m[0, 2] for board in boards]) == pytest.approx(0.1e-3, rel=0.1)
+    assert np.std([board.offset_T for board in boards]) == pytest.approx(200e-6, rel=0.1)
+    assert np.std(np.log(gains)) == pytest.approx(0.025, rel=0.1)
+    cross = np.array([board.sensitivity for board in boards])[:, :, ~np.eye(3, dtype=bool)]
+    assert np.std(cross) == pytest.approx(0.01, rel=0.1)
+    tilt_rad = np.arccos([board.turn[:, 2, 2] for board in boards])  # two axes of 2 degrees each
+    assert np.sqrt(np.mean(tilt_rad**2)) == pytest.approx(np.sqrt(2) * np.radians(2), rel=0.1)
+
+
+def test_a_gap_that_vanishes_is_refused():
+    # Of boards 0.1 mm above their skin, give or take 1 mm, nearly every second one is impossible.
+    with pytest.raises(ParamsError, match="board b0: gap must be above 0 mm"):
+        [draw_board(design(gap_mm=0.1), spreads(board_gap_mm=1.0), seed=seed, name="b0") for seed in range(100)]
+
+
+def test_a_chip_without_its_turn_is_refused():
+    with pytest.raises(ParamsError, match="chips_turn_deg needs one turn"):
+        design(chips_turn_deg=[0.0])
+
+
+@pytest.mark.parametrize(("name", "value"), [("chip_gain", -0.1), ("chip_gain", 2.0), ("chip_gian", 0.1)])
+def test_a_spread_out_of_bounds_or_unknown_is_refused(name, value):
+    with pytest.raises(ParamsError, match=name):
+        parse(Spreads, SPREADS | {name: value}, "test")

@@ -1,0 +1,111 @@
+"""The dipole field against closed forms on and off the axis, a naive sum, and the laws of magnetostatics."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.constants import mu_0
+
+from pipeline.errors import ParamsError
+from pipeline.physics.dipole import MU0_4PI, field, field_of_each
+from pipeline.seeds import rng_for
+
+ROUNDING = 1e-12  # a few hundred operations in float64
+SIX_STEPS = (np.eye(3)[:, None] * np.array([1.0, -1.0])[:, None]).reshape(6, 3)
+
+coordinates = st.floats(-1, 1, allow_subnormal=False)
+triples = st.tuples(coordinates, coordinates, coordinates).map(np.array)
+# Sources off the origin and observers well away: a wrong sign of the separation cannot hide.
+sources_m = triples.map(lambda v: v + np.array([3.0, -2.0, 1.0]))
+observers_m = triples.map(lambda v: v + np.array([-3.0, 4.0, 5.0]))
+
+
+def at(source_m, moment, observer_m):
+    return field(np.atleast_2d(source_m), np.atleast_2d(moment).astype(float), np.atleast_2d(observer_m))[0]
+
+
+def test_the_constant_is_codata_and_not_exactly_1e_7():
+    assert mu_0 / (4 * np.pi) == MU0_4PI
+    assert 0 < abs(MU0_4PI / 1e-7 - 1) < 1e-9
+
+
+@given(sources_m, st.floats(0.1, 5))
+def test_on_its_axis_a_dipole_gives_twice_the_moment_over_r3(source_m, r_m):
+    np.testing.assert_allclose(
+        at(source_m, (0, 0, 2.0), source_m + np.array([0, 0, r_m])), (0, 0, 4 * MU0_4PI / r_m**3), rtol=1e-9, atol=0
+    )  # rtol: (source + r) - source loses digits
+
+
+@given(sources_m, st.floats(0.1, 5))
+def test_beside_it_the_field_points_against_the_moment(source_m, r_m):
+    np.testing.assert_allclose(
+        at(source_m, (0, 0, 2.0), source_m + np.array([r_m, 0, 0])),
+        (0, 0, -2 * MU0_4PI / r_m**3),
+        rtol=1e-9,
+        atol=1e-25,
+    )
+
+
+def test_at_45_degrees_it_leans_as_three_cos_sin_to_three_cos2_less_one():
+    b_T = at((1.0, 2.0, 3.0), (0, 0, 1), np.array([1.0, 2.0, 3.0]) + np.array([1, 0, 1]) / np.sqrt(2))
+    np.testing.assert_allclose(b_T, MU0_4PI * np.array([1.5, 0, 0.5]), rtol=ROUNDING, atol=1e-20)
+
+
+def test_many_dipoles_equal_the_loop_over_the_textbook_formula():
+    rng = rng_for(0, "dipole")
+    positions, moments, observers = rng.normal(size=(7, 3)), rng.normal(size=(7, 3)), rng.normal(size=(4, 3)) + 5
+    naive = np.zeros((4, 3))
+    for o, observer in enumerate(observers):
+        for position, moment in zip(positions, moments, strict=True):
+            d = observer - position
+            r = np.linalg.norm(d)
+            naive[o] += MU0_4PI * (3 * d * (moment @ d) / r**5 - moment / r**3)
+    np.testing.assert_allclose(field(positions, moments, observers), naive, rtol=ROUNDING)
+    np.testing.assert_allclose(field_of_each(positions, moments, observers).sum(axis=1), naive, rtol=ROUNDING)
+
+
+def test_magpylib_agrees():
+    magpylib = pytest.importorskip("magpylib", reason="needs magpylib, of the dev dependencies")
+    rng = rng_for(1, "dipole")
+    position, moment, observers = rng.normal(size=3), rng.normal(size=3), rng.normal(size=(20, 3)) + 3
+    theirs = magpylib.misc.Dipole(moment=moment, position=position).getB(observers)
+    # rtol: magpylib's mu_0 is of another CODATA year
+    np.testing.assert_allclose(field(position[None], moment[None], observers), theirs, rtol=1e-8)
+
+
+@given(sources_m, triples, triples, observers_m, coordinates)
+def test_the_field_is_linear_in_the_moment(source_m, one, other, observer_m, share):
+    together = at(source_m, one + share * other, observer_m)
+    apart = at(source_m, one, observer_m) + share * at(source_m, other, observer_m)
+    np.testing.assert_allclose(together, apart, rtol=1e-9, atol=1e-20)  # atol: terms may cancel
+
+
+@given(sources_m, triples, observers_m)
+def test_the_field_has_neither_divergence_nor_curl(source_m, moment, observer_m):
+    step_m = 1e-3
+    b_T = field(source_m[None], moment[None], observer_m + step_m * SIX_STEPS).reshape(3, 2, 3)
+    jacobian = (b_T[:, 0] - b_T[:, 1]) / (2 * step_m)
+    size = MU0_4PI * (np.linalg.norm(moment) + 1e-3) / np.linalg.norm(observer_m - source_m) ** 4
+    assert abs(np.trace(jacobian)) < 1e-5 * size  # central differences: (step / r)^2
+    assert np.abs(jacobian - jacobian.T).max() < 1e-5 * size
+
+
+@given(sources_m, triples, observers_m)
+def test_turning_everything_by_90_degrees_turns_the_field(source_m, moment, observer_m):
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    np.testing.assert_allclose(
+        at(turn @ source_m, turn @ moment, turn @ observer_m),
+        turn @ at(source_m, moment, observer_m),
+        rtol=1e-9,
+        atol=1e-22,
+    )
+
+
+@pytest.mark.parametrize("place", [0.0, np.nan])
+def test_an_observer_on_a_dipole_is_refused(place):
+    with pytest.raises(ParamsError, match="distance to a chip must be above 0 m"):
+        field(np.full((1, 3), place), np.ones((1, 3)), np.zeros((1, 3)))
+
+
+def test_no_dipoles_make_no_field():
+    assert not field(np.zeros((0, 3)), np.zeros((0, 3)), np.ones((2, 3))).any()
