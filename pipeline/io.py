@@ -40,6 +40,20 @@ def replacing(path: Path) -> Iterator[Path]:
         remove(temporary)
 
 
+@contextmanager
+def restoring(*files: Path) -> Iterator[None]:
+    """Give files their old content back if the block fails, Ctrl-C included."""
+    before = {file: file.read_bytes() for file in files}
+    try:
+        yield
+    except BaseException:
+        for file, content in before.items():
+            if file.read_bytes() != content:
+                with replacing(file) as temporary:
+                    temporary.write_bytes(content)
+        raise
+
+
 def remove(path: Path) -> None:
     """Delete a file or a folder, if it is there."""
     if path.is_dir() and not path.is_symlink():
@@ -52,6 +66,14 @@ def sha256(path: Path) -> str:
     """Hash a file."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def read_bytes(path: Path) -> bytes:
+    """Read a whole file; raise `SchemaError` if it is not one."""
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise SchemaError(complain(path, "the file", "readable", error.strerror, "Check the path.")) from None
 
 
 def write_text(path: Path, text: str) -> None:

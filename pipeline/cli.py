@@ -1,0 +1,208 @@
+"""The `reskin` command: words of the command line -> one call each. Knows no format and no model."""
+
+import math
+import subprocess
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipeline import adding, io, plan
+from pipeline.errors import ReskinError
+from pipeline.params import arms_of, read_scene
+from pipeline.server import TrackingAway
+from pipeline.strict import read_yaml
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Learning for magnetic tactile skins. Run it in the checkout.",
+)
+scenes = typer.Typer(no_args_is_help=True, help="Choose which scenes `dvc repro` runs.")
+app.add_typer(scenes, name="scenes")
+
+ROOT = Path()
+
+
+class Layout(StrEnum):
+    """What `reskin add` can read."""
+
+    CAPTURE = "capture"
+    SERIAL_BINARY = "serial-binary"
+    SERIAL_TEXT = "serial-text"
+    LAB = "lab"
+    INI = "ini"
+    EFLESH = "eflesh"
+
+
+class TextOrder(StrEnum):
+    """Order of the four values a chip in a text stream."""
+
+    XYZT = "xyzt"
+    TXYZ = "txyz"
+
+
+class Wire(StrEnum):
+    """The formats that boards send."""
+
+    BINARY = "binary"
+    BINARY_CLOCK = "binary-clock"
+    TEXT_XYZT = "text-xyzt"
+    TEXT_TXYZ = "text-txyz"
+
+
+class Axis(StrEnum):
+    """The direction that a one-axis gauge measured."""
+
+    X = "x"
+    Y = "y"
+    Z = "z"
+
+
+def main() -> None:
+    """Run the command; show what a user did wrong as one sentence, without a traceback."""
+    try:
+        app()
+    except ReskinError as error:
+        typer.echo(f"error: {error}", err=True)
+        sys.exit(error.exit_code)
+
+
+@app.command()
+def add(
+    recording: Annotated[Path, typer.Argument(help="A file or a folder, as its layout has it.")],
+    layout: Annotated[Layout, typer.Option(help="What wrote it.")],
+    board: Annotated[str, typer.Option(help="The circuit board's name.")],
+    skin: Annotated[str, typer.Option(help="The skin's name; a skin belongs to one board.")],
+    scene: Annotated[str, typer.Option(help="The scene that it joins.")],
+    name: Annotated[str | None, typer.Option(help="The capture's name; made from the labels if not given.")] = None,
+    probe: Annotated[Path | None, typer.Option(help="capture, serial-*: the robot's log (CSV).")] = None,
+    chips_n: Annotated[int, typer.Option("--chips", help="serial-*: chips in a frame.", min=1, max=64)] = 5,
+    rate_hz: Annotated[float, typer.Option("--rate-hz", help="serial-*: frames a second.")] = 400.0,
+    order: Annotated[TextOrder, typer.Option(help="serial-text: order of values.")] = TextOrder.XYZT,
+    force_axis: Annotated[Axis, typer.Option(help="eflesh: the gauge's direction.")] = Axis.Z,
+    allow_copy: Annotated[
+        bool, typer.Option("--allow-copy", help="Accept bytes that are there under another label.")
+    ] = False,
+) -> None:
+    """Add a recording to a scene; then `dvc repro` uses it."""
+    labels = adding.Labels(board, skin, scene, name)
+    if layout is Layout.CAPTURE:
+        prepared = adding.native(recording, labels, probe)
+    elif layout in (Layout.SERIAL_BINARY, Layout.SERIAL_TEXT):
+        wire = "binary" if layout is Layout.SERIAL_BINARY else f"text-{order}"
+        prepared = adding.dump(recording, labels, adding.Dump(wire, chips_n, rate_hz, probe))  # type: ignore[arg-type]
+    else:
+        prepared = adding.foreign(recording, layout.value, labels, force_axis.value)  # type: ignore[arg-type]
+    header = adding.add(ROOT, scene, prepared, allow_copy=allow_copy)
+    typer.echo(f"added {scene}/{header.capture} (board {board}, skin {skin}); now: dvc repro")
+
+
+@app.command()
+def remove(scene: str, capture: str) -> None:
+    """Take a recorded capture out of a scene again."""
+    adding.remove(ROOT, scene, capture)
+    typer.echo(f"removed {scene}/{capture}; now: dvc repro")
+
+
+@app.command()
+def record(
+    port: Annotated[str, typer.Option(help="The serial port, such as /dev/ttyACM0 or COM3.")],
+    board: Annotated[str, typer.Option(help="The circuit board's name.")],
+    skin: Annotated[str, typer.Option(help="The skin's name.")],
+    out: Annotated[Path, typer.Option(help="The capture's folder; must be new.")],
+    wire: Annotated[Wire, typer.Option(help="What the firmware sends.")] = Wire.BINARY,
+    chips_n: Annotated[int, typer.Option("--chips", help="Chips in a frame.", min=1, max=64)] = 5,
+    baud: Annotated[int, typer.Option(help="Baud rate; USB ports ignore it.", min=1)] = 115200,
+    seconds: Annotated[float, typer.Option(help="How long; without it, until Ctrl-C.", min=0.0)] = math.inf,
+) -> None:
+    """Record what a board sends; label it with the robot's log when adding it."""
+    from pipeline.capture.port import PortSettings
+    from pipeline.recording import record_capture
+
+    settings = PortSettings(baud, wire.value, chips_n, seconds, bytes_max_n=None, silence_s=5.0, no_frame_s=5.0)
+    done = record_capture(port, out, board=board, skin=skin, settings=settings)
+    counts = ", ".join(f"{key} {count}" for key, count in done.account.items() if count)
+    typer.echo(f"recorded {out} ({done.ended} after {done.duration_s:.1f} s): {counts}")
+
+
+@app.command()
+def decode(
+    stream: Annotated[Path, typer.Argument(help="A file of bytes as they came from a port.")],
+    out: Annotated[Path, typer.Option(help="The Parquet file to write.")],
+    wire: Annotated[Wire, typer.Option(help="What the firmware sent.")] = Wire.BINARY,
+    chips_n: Annotated[int, typer.Option("--chips", help="Chips in a frame.", min=1, max=64)] = 5,
+) -> None:
+    """Decode a dump of a port to one row a frame, and account for every byte."""
+    from pipeline.capture.dump import decode_dump
+
+    table, account = decode_dump(io.read_bytes(stream), wire.value, chips_n, str(stream))
+    io.write_table(out, table)
+    typer.echo(f"decoded {out}: " + ", ".join(f"{key} {count}" for key, count in account.items()))
+
+
+@app.command()
+def publish() -> None:
+    """Write to MLflow what is not there yet, from the models of the scenes that run."""
+    from pipeline.tracking import publish as write
+
+    for scene in plan.check(ROOT).scenes:
+        for arm in arms_of(read_scene(ROOT / plan.SCENES / f"{scene}.yaml")):
+            models = ROOT / "data/models" / scene / arm
+            if not models.is_dir():
+                typer.echo(f"{scene} {arm}: no models yet; run dvc repro first")
+                continue
+            try:
+                counts = write(models, ROOT / "reports" / scene / "figures", scene=scene, stage=arm, root=ROOT)
+            except TrackingAway as away:
+                typer.echo(f"error: {away}", err=True)
+                sys.exit(3)
+            typer.echo(f"{scene} {arm}: MLflow runs {counts}")
+
+
+@app.command()
+def readme(check: Annotated[bool, typer.Option("--check", help="Only tell whether it is up to date.")] = False) -> None:
+    """Fill in the generated parts of README.md from the results of the scenes that run."""
+    from pipeline.reporting.readme import blocks_of, fill
+
+    scene = plan.check(ROOT).scenes[0]
+    dag = subprocess.run([sys.executable, "-m", "dvc", "dag"], capture_output=True, text=True, check=True).stdout
+    blocks = blocks_of(
+        io.read_json(ROOT / "reports" / scene / "numbers.json"), dag, read_yaml(ROOT / "dvc.yaml")["stages"]
+    )
+    file = ROOT / "README.md"
+    before = file.read_text(encoding="utf-8")
+    after = fill(before, blocks)
+    if check and after != before:
+        typer.echo("README.md is behind reports and dvc.yaml; run: reskin readme", err=True)
+        sys.exit(1)
+    if not check:
+        io.write_text(file, after)
+
+
+@scenes.command("list")
+def list_scenes() -> None:
+    """Show the scenes of this checkout; a star marks those that `dvc repro` runs."""
+    running = plan.check(ROOT).scenes
+    for name in plan.scene_names(ROOT):
+        typer.echo(f"{'*' if name in running else ' '} {name}")
+
+
+@scenes.command()
+def use(names: list[str]) -> None:
+    """Let `dvc repro` run exactly these scenes."""
+    plan.use(ROOT, names)
+    typer.echo(f"dvc repro now runs: {', '.join(names)}")
+
+
+@scenes.command()
+def check() -> None:
+    """Fail if params.yaml is not what its scenes ask for."""
+    plan.check(ROOT)
+
+
+if __name__ == "__main__":
+    main()

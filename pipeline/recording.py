@@ -1,0 +1,45 @@
+"""Recording from a board: a port -> a capture folder that `reskin add` takes. Or the part that came, kept.
+
+The header is written first and sealed last, into `<folder>.part`, which is renamed when the recording has ended: a
+killed recorder leaves a `.part` that can still be added. Refuses to know ports (`capture.port`).
+"""
+
+import threading
+from pathlib import Path
+
+from pipeline import io
+from pipeline.capture.folder import seal
+from pipeline.capture.header import HEADER_FILE, Clock, Header, parse, render
+from pipeline.capture.port import PortSettings, Recording, record
+from pipeline.errors import CaptureError, complain
+
+
+def record_capture(port: str, folder: Path, *, board: str, skin: str, settings: PortSettings) -> Recording:
+    """Record what a port sends, as a native capture without labels."""
+    part = folder.with_name(f"{folder.name}.part")
+    for path in (folder, part):
+        if path.exists():
+            raise CaptureError(
+                complain(path, "the capture's folder", "new", "one that is there", "Choose another --out.")
+            )
+    header = _header(folder.name, board, skin, settings)
+    part.mkdir(parents=True)
+    io.write_text(part / HEADER_FILE, render(header))
+    try:
+        done = record(port, part, settings=settings, stop=threading.Event())
+    except CaptureError:
+        io.remove(part)  # no frame came: there is nothing to keep
+        raise
+    seal(part, header)
+    part.rename(folder)
+    return done
+
+
+def _header(capture: str, board: str, skin: str, settings: PortSettings) -> Header:
+    header = Header.model_construct(
+        format="reskin-capture/1", capture=capture, board=board, skin=skin, source="recorded", layout="native",
+        wire=settings.wire, chips_n=settings.chips_n, unit_b="uT", unit_force="N", unit_place="mm", firmware=None,
+        clock=Clock(kind="arrivals", rate_hz=None, marks=()), protocol="as the probe log says", contacts_before_n=0,
+        options={}, files={}, note="recorded by reskin record; arrival times are unix seconds of the host",
+    )  # fmt: skip
+    return parse(render(header), f"--out {capture}")

@@ -1,0 +1,113 @@
+"""The whole flow on the tiny scene, as a user runs it: twice, killed in the middle, deleted and restored."""
+
+import json
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from tests.stages.checkout import ENVIRONMENT, copy_checkout, run
+
+pytestmark = pytest.mark.timeout(420)
+
+
+@pytest.fixture(scope="module")
+def story(tmp_path_factory) -> Iterator[Path]:
+    folder = copy_checkout(tmp_path_factory.mktemp("story"))
+    run(folder, "reskin", "scenes", "use", "ci")
+    run(folder, "dvc", "repro")
+    return folder
+
+
+def test_every_number_of_the_first_tables_is_there_and_says_that_it_is_simulated(story):
+    numbers = json.loads((story / "reports/ci/numbers.json").read_text())
+    assert numbers["provenance"]["source"] == "simulated"
+    assert {"git", "seed", "device", "seconds"} <= set(numbers["provenance"])
+    for row in ("single", "multi"):
+        for metric in ("accuracy_pct", "mse_xy_mm2", "mse_f_N2"):
+            assert {"mean", "sd", "n"} <= set(numbers["table2"][row][metric])
+    assert numbers["table2"]["multi"]["accuracy_pct"]["n"] == 3  # boards, from the data
+    assert {"mean", "sd"} <= set(numbers["single_sensor"]["accuracy_pct"])
+    capture = numbers["capture"]
+    skipped = sum(n for key, n in capture.items() if key.startswith("skipped_") and key.endswith("_bytes_n"))
+    assert capture["frame_bytes_n"] + skipped == capture["bytes_n"]
+    assert "simulated" in (story / "reports/ci/tables/table2.md").read_text()
+    assert "<svg" in (story / "reports/ci/figures/error_grid_lobo.svg").read_text()
+
+
+def test_there_is_one_parquet_file_a_capture_with_units(story):
+    files = sorted((story / "data/indentations/ci").glob("*.parquet"))
+    assert [file.stem for file in files] == ["b0_s0", "b0_s1", "b1_s0", "b1_s1", "b2_s0", "b2_s1"]
+    assert pq.read_schema(files[0]).field("b_uT").metadata[b"unit"] == b"uT"
+
+
+def test_a_second_repro_does_nothing(story):
+    assert "Data and pipelines are up to date." in run(story, "dvc", "repro").stdout
+
+
+def test_training_again_from_nothing_gives_the_same_lock_file(story):
+    before = (story / "dvc.lock").read_text()
+    for file in (story / ".reskin/cells").glob("*.safetensors"):
+        file.unlink()  # else finished trainings would be reused, and prove nothing
+    run(story, "dvc", "repro", "-f")
+    assert (story / "dvc.lock").read_text() == before
+
+
+def test_deleted_models_are_restored_without_training(story):
+    models = sorted((story / "data/models/ci/train_multi").iterdir())
+    content = models[0].read_bytes()
+    for file in models:
+        file.unlink()
+    for file in (story / ".reskin/cells").glob("*.safetensors"):
+        file.unlink()
+    run(story, "dvc", "repro")
+    assert models[0].read_bytes() == content
+    assert list((story / ".reskin/cells").glob("*.safetensors")) == []
+
+
+def test_a_stage_killed_in_the_middle_loses_no_finished_fold(story):
+    models = story / "data/models/killed"
+    words = ["--scene", "ci", "--settings", "pipeline/scenes/ci.yaml", "--indentations", "data/indentations/ci",
+             "--folds", "data/folds/ci.json", "--models", str(models)]  # fmt: skip
+    command = [str(story / ".venv/bin/python"), "-m", "pipeline.stages.train_multi", *words]
+    environment = {**os.environ, **ENVIRONMENT, "PYTHONPATH": str(story), "RESKIN_EXECUTOR": "processes:1"}
+    cells = story / ".reskin/cells"
+    for file in cells.glob("*.safetensors"):
+        file.unlink()
+    stage = subprocess.Popen(command, cwd=story, env=environment, stderr=subprocess.DEVNULL)
+    while not list(cells.glob("*.safetensors")):
+        time.sleep(0.005)
+        assert stage.poll() is None, "the stage ended before it could be killed"
+    stage.send_signal(signal.SIGKILL)
+    stage.wait()
+    finished_n = len(list(cells.glob("*.safetensors")))
+    assert not models.exists()
+    again = subprocess.run(command, cwd=story, env=environment, capture_output=True, text=True, check=True)
+    assert f"{finished_n} of 3 trainings were finished before" in again.stderr
+    assert len(list(models.glob("*.safetensors"))) == 3
+
+
+def test_a_dead_tracking_server_is_said_and_costs_no_result(story):
+    start_s = time.monotonic()
+    words = ["--scene", "ci", "--settings", "pipeline/scenes/ci.yaml", "--models", "data/models/ci",
+             "--figures", "reports/ci/figures"]  # fmt: skip
+    done = run(story, "python", "-m", "pipeline.stages.publish", *words, MLFLOW_TRACKING_URI="http://127.0.0.1:9")
+    assert "does not answer" in done.stderr
+    assert time.monotonic() - start_s < 20  # not MLflow's own minutes; two cores may be busy
+
+
+def test_a_parameter_that_nobody_knows_is_one_sentence(story):
+    scene = story / "pipeline/scenes/ci.yaml"
+    before = scene.read_text()
+    scene.write_text(before.replace("random_repeats_n:", "random_repeets_n:"))
+    done = run(story, "dvc", "repro", check=False)
+    scene.write_text(before)
+    assert done.returncode != 0
+    said = done.stdout + done.stderr
+    assert "split.random_repeets_n must be a known parameter; got 2" in said
+    assert "Traceback" not in said

@@ -1,0 +1,237 @@
+"""Adding recordings as a user does: it works, or it is refused in one sentence and leaves nothing behind."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ruamel.yaml import YAML
+
+from pipeline import adding, plan
+from pipeline.adding import Dump, Labels
+from pipeline.capture import probe
+from pipeline.capture.folder import write_capture
+from pipeline.capture.header import Clock
+from pipeline.capture.probe import ProbeLog
+from pipeline.capture.wire import encode
+from pipeline.dataset.captures import open_capture, read_header
+from pipeline.errors import ReskinError
+from pipeline.registry import read_registry
+from tests.capture.headers import make_header
+from tests.capture.readers.test_lab import PRESSES, write
+from tests.capture.signals import make_frames
+from tests.scenes import recorded
+from tests.stages.checkout import copy_checkout, run
+
+NOTHING = {"simulate": [], "ingest_simulated": [], "ingest": {}, "split": {}, "train_single": [], "train_multi": [],
+           "report": [], "publish": []}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def empty(tmp_path_factory) -> Path:
+    """A checkout that runs no scene yet."""
+    root = copy_checkout(tmp_path_factory.mktemp("checkout"))
+    with (root / plan.PARAMS).open("w") as stream:
+        YAML().dump({"scenes": [], "lost_fraction_max": 0.05, "stages": NOTHING}, stream)
+    with (root / plan.SCENES / "small.yaml").open("w") as stream:
+        YAML().dump(recorded(), stream)
+    return root
+
+
+@pytest.fixture
+def root(empty, tmp_path) -> Path:
+    return shutil.copytree(empty, tmp_path / "checkout", symlinks=True)
+
+
+@pytest.fixture
+def lab_file(tmp_path) -> Path:
+    (tmp_path / "recording").mkdir()
+    return write(tmp_path / "recording", *PRESSES) / "readings.csv"
+
+
+def labels(board: str = "board1", skin: str = "skin1", name: str | None = None) -> Labels:
+    return Labels(board, skin, "small", name)
+
+
+def add_lab(root: Path, file: Path, *, allow_copy: bool = False, **words: str):
+    return adding.add(root, "small", adding.foreign(file, "lab", labels(**words), "z"), allow_copy=allow_copy)
+
+
+def contents(root: Path) -> dict[str, bytes]:
+    found = [
+        path for path in root.rglob("*") if path.is_file() and ".dvc/" not in str(path) and ".venv" not in str(path)
+    ]
+    return {str(path.relative_to(root)): path.read_bytes() for path in found if "__pycache__" not in str(path)}
+
+
+def refuse(root: Path, act, sentence: str) -> None:
+    before = contents(root)
+    with pytest.raises(ReskinError, match=sentence) as caught:
+        act()
+    assert "\n" not in str(caught.value)
+    assert contents(root) == before
+
+
+def test_a_recording_that_was_added_is_tracked_registered_and_planned(root, lab_file):
+    header = add_lab(root, lab_file)
+    assert header.capture == "board1_skin1_readings"
+    assert (root / "data/raw/small/board1_skin1_readings.dvc").exists()
+    assert read_registry(root).captures["small"]["board1_skin1_readings"].board == "board1"
+    params = plan.check(root)
+    assert params.scenes == ("small",)
+    assert list(params.stages.ingest) == ["small-board1_skin1_readings"]
+    adding.remove(root, "small", "board1_skin1_readings")
+    assert plan.check(root).scenes == ()
+    assert not list((root / "data/raw").rglob("*readings*"))
+
+
+def test_the_same_recording_twice_is_refused_and_another_label_needs_a_word(root, lab_file):
+    add_lab(root, lab_file)
+    refuse(root, lambda: add_lab(root, lab_file), "folder must be free|new to its scene")
+    refuse(root, lambda: add_lab(root, lab_file, name="again"), "It is in the scene already")
+    refuse(root, lambda: add_lab(root, lab_file, board="board2", skin="skin2"), "--allow-copy")
+    refuse(root, lambda: add_lab(root, lab_file, board="board2", name="x"), "the bytes of")
+    add_lab(root, lab_file, board="board2", skin="skin2", allow_copy=True)
+    assert len(plan.check(root).stages.ingest) == 2
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"x", bytes(range(256)) * 40, b"indent,phase\n0,contact\n", b"\x00" * 4096, "µ".encode() * 9]
+)
+def test_a_broken_recording_leaves_nothing_behind(root, tmp_path, content):
+    (tmp_path / "broken.csv").write_bytes(content)
+    refuse(root, lambda: add_lab(root, tmp_path / "broken.csv"), "broken.csv|readings.csv")
+
+
+def test_a_recording_that_is_not_there_is_named(root, tmp_path):
+    refuse(root, lambda: add_lab(root, tmp_path / "none.csv"), "none.csv")
+
+
+def test_a_recording_in_the_wrong_layout_is_refused(root, lab_file):
+    for layout in ("ini", "eflesh"):
+        refuse(root, lambda: adding.foreign(lab_file, layout, labels(), "z"), "readings.csv")  # noqa: B023
+    refuse(root, lambda: adding.native(lab_file.parent, labels(), None), "header.json")
+
+
+@pytest.mark.parametrize("name", ["../up", "a b", "", "x" * 80, "ä"])
+def test_a_name_that_is_no_name_is_refused(root, lab_file, name):
+    refuse(root, lambda: add_lab(root, lab_file, board=name), "board")
+
+
+def test_an_unknown_scene_is_named_beside_the_known_ones(root, lab_file):
+    prepared = adding.foreign(lab_file, "lab", labels(), "z")
+    refuse(
+        root, lambda: adding.add(root, "smal", prepared, allow_copy=False), "a scene must be one of .*small.*; got smal"
+    )
+
+
+def test_a_recording_does_not_join_a_simulated_scene(root, lab_file):
+    prepared = adding.foreign(lab_file, "lab", labels(), "z")
+    refuse(
+        root,
+        lambda: adding.add(root, "ci", prepared, allow_copy=False),
+        "source must be simulated, as scene ci is; got recorded",
+    )
+
+
+# A native capture: two indentations of one place each, ten frames a dwell, at 400 Hz.
+FRAMES = make_frames(60, 2, seed=0)
+
+
+def probe_log(frame_s: float = 1 / 400) -> ProbeLog:
+    starts = np.array([0, 15, 30, 45]) * frame_s
+    label = np.array([4, 4, 8, 8], np.float32)
+    return ProbeLog(
+        indentation=np.array([0, 0, 1, 1], np.int32), pass_i=np.zeros(4, np.int32), contact=np.array([False, True] * 2),
+        t_start_s=starts, t_end_s=starts + 10.5 * frame_s, x_mm=label, y_mm=label, depth_mm=label / 10, Fx_N=label,
+        Fy_N=label, Fz_N=label,
+    )  # fmt: skip
+
+
+def native_folder(folder: Path, stream: bytes = encode(FRAMES, "binary")) -> Path:
+    header = make_header(
+        capture=folder.name, layout="native", wire="binary", chips_n=2,
+        clock=Clock(kind="rate", rate_hz=400.0, marks=((0.0, 0.0),)),
+    )  # fmt: skip
+    files = {"stream.bin": stream, "probe.csv": probe.render(probe_log()).encode()}
+    write_capture(folder, header, files)
+    return folder
+
+
+def test_a_native_capture_is_added_with_its_own_header(root, tmp_path):
+    folder = native_folder(tmp_path / "run1")
+    header = adding.add(root, "small", adding.native(folder, labels(), None), allow_copy=False)
+    assert header == read_header(root / "data/raw/small/run1")
+    _, blocks, account = open_capture(root / "data/raw/small/run1")
+    assert sum(map(len, blocks)) == account["frames_contact_n"] > 0
+
+
+def test_a_native_capture_under_another_label_or_with_changed_bytes_is_refused(root, tmp_path):
+    folder = native_folder(tmp_path / "run1")
+    refuse(
+        root,
+        lambda: adding.native(folder, labels(board="board7"), None),
+        "--board must be 'board1', as its header says; got 'board7'",
+    )
+    (folder / "stream.bin").write_bytes(b"other")
+    refuse(
+        root,
+        lambda: adding.native(folder, labels(), None),
+        "stream.bin: the file must be unchanged since it was recorded",
+    )
+    (folder / "header.json").write_text("{")
+    refuse(root, lambda: adding.native(folder, labels(), None), "header.json")
+
+
+@pytest.mark.parametrize(
+    ("damage", "sentence"),
+    [(b"", "no frame found in 0 bytes"), (b"x", "no frame found"), (bytes(range(251)) * 99, "no frame found")],
+)
+def test_a_dump_without_a_frame_is_refused(root, tmp_path, damage, sentence):
+    (tmp_path / "dump.bin").write_bytes(damage)
+    (tmp_path / "probe.csv").write_text(probe.render(probe_log()))
+    what = Dump("binary", 2, 400.0, tmp_path / "probe.csv")
+    refuse(
+        root,
+        lambda: adding.add(root, "small", adding.dump(tmp_path / "dump.bin", labels(), what), allow_copy=False),
+        sentence,
+    )
+
+
+def test_a_dump_of_the_wrong_number_of_chips_says_what_fits(root, tmp_path):
+    (tmp_path / "dump.bin").write_bytes(encode(FRAMES, "binary"))
+    (tmp_path / "probe.csv").write_text(probe.render(probe_log()))
+    what = Dump("binary", 5, 400.0, tmp_path / "probe.csv")
+    refuse(
+        root,
+        lambda: adding.add(root, "small", adding.dump(tmp_path / "dump.bin", labels(), what), allow_copy=False),
+        "It fits binary with 2 chips",
+    )
+    refuse(root, lambda: adding.dump(tmp_path / "dump.bin", labels(), Dump("binary", 2, 400.0, None)), "Add --probe")
+
+
+def test_a_capture_that_lost_too_much_is_refused_with_the_counts(root, tmp_path):
+    stream = encode(FRAMES, "binary")
+    damaged = native_folder(tmp_path / "run1", stream[:1000] + bytes(1500) + stream[1000:])
+    refuse(
+        root,
+        lambda: adding.add(root, "small", adding.native(damaged, labels(), None), allow_copy=False),
+        r"lost bytes must be at most 5%.*skipped_resync_bytes",
+    )
+
+
+def test_the_command_line_says_what_is_wrong_without_a_traceback(root, tmp_path):
+    (tmp_path / "broken.csv").write_bytes(b"")
+    words = ["--layout", "lab", "--board", "b", "--skin", "s", "--scene", "small"]
+    done = run(root, "reskin", "add", str(tmp_path / "broken.csv"), *words, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: ")
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_a_scene_that_asks_for_folds_its_data_cannot_give_says_so(root, lab_file):
+    add_lab(root, lab_file)
+    done = run(root, "dvc", "repro", check=False)
+    assert done.returncode != 0
+    assert "question lobo: boards must be two or more; got 1 (board1)" in done.stderr + done.stdout
+    assert "Traceback" not in done.stderr + done.stdout
