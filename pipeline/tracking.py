@@ -1,7 +1,7 @@
 """The diary: writes finished trainings to MLflow. The only module that says mlflow; nothing reads it back.
 
-In: the cards and weights in `data/models`. Out: one experiment a scene, one parent run a stage and set of trainings, one
-child a training. Published after training and from files, so a server that is away costs nothing but the entry, and
+In: the cards and weights in `data/models`. Out: one experiment a scene, one parent run a stage and set of trainings,
+one child a training. Published after training and from files, so a server that is away costs nothing but the entry, and
 `reskin publish` sends later what is missing.
 """
 

@@ -60,7 +60,8 @@ EMPTY = """\
 scenes: []
 lost_fraction_max: 0.05
 stages:
-  {simulate: [], ingest_simulated: [], ingest: {}, split: {}, train_single: [], train_multi: [], report: [], publish: []}
+  {simulate: [], ingest_simulated: [], ingest: {}, split: {}, train_single: [], train_multi: [], report: [],
+   publish: []}
 """
 
 

@@ -102,5 +102,3 @@ def test_a_server_that_is_away_is_noticed_within_seconds(kind, request, tmp_path
 def test_the_embedded_store_is_never_asked_for_a_sign_of_life():
     probe(None)
     probe("sqlite:///somewhere.db")
-
-

@@ -112,7 +112,8 @@ def _check_one_kind(captures: Sequence[Readings]) -> None:
         if boards.setdefault(one.skin, one.board) != one.board:
             raise ParamsError(
                 complain(
-                    f"capture {one.capture}", f"the board of skin {one.skin}", f"{boards[one.skin]}, as before", one.board,
+                    f"capture {one.capture}", f"the board of skin {one.skin}", f"{boards[one.skin]}, as before",
+                    one.board,
                     "A skin moved to another board is a new skin here: give it a new name.",
                 )
             )  # fmt: skip

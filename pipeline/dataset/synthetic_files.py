@@ -7,12 +7,12 @@ import numpy as np
 
 from pipeline.capture import arrivals, probe, wire
 from pipeline.capture.arrivals import Arrivals
-from pipeline.capture.header import ARRIVALS_FILE, PROBE_FILE, STREAM_FILE, Clock, Firmware, Header
+from pipeline.capture.header import ARRIVALS_FILE, PROBE_FILE, STREAM_FILE, Clock, Firmware, Header, Wire
 from pipeline.capture.wire import Frames
-from pipeline.dataset.synthetic import SyntheticCapture, Synthesis
+from pipeline.dataset.synthetic import Synthesis, SyntheticCapture
 from pipeline.physics.sensor import steps_uT
 
-WIRE: wire.Wire = "binary"
+WIRE: Wire = "binary"
 
 
 def to_files(capture: SyntheticCapture, parameters: Synthesis) -> tuple[Header, dict[str, bytes]]:

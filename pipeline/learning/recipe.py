@@ -6,7 +6,6 @@ from pydantic import Field, model_validator
 
 from pipeline.strict import Strict
 
-
 HEADLINE = "paper"  # the recipe whose numbers stand beside the paper's; others are variants
 
 

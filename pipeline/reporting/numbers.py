@@ -55,11 +55,13 @@ def summarise_means(cards: Cards, part: str) -> dict[str, float]:
 
 
 def add_up(accounts: Iterable[Mapping[str, int]]) -> dict[str, int]:
-    """Add the accounts of all captures."""
+    """Add the counts of all captures."""
     total: dict[str, int] = {"captures_n": 0}
     for account in accounts:
         total["captures_n"] += 1
         for name, count in account.items():
+            if not name.endswith("_n"):
+                continue  # a quality of one capture's clock is no count
             total[name] = total.get(name, 0) + count
     return total
 

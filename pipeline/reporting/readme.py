@@ -12,9 +12,13 @@ def fill(text: str, blocks: Mapping[str, str]) -> str:
     """Put each block between its marks `<!-- name -->` and `<!-- /name -->`; a missing mark is an error."""
     for name, content in blocks.items():
         pattern = re.compile(rf"(<!-- {name} -->\n).*?(<!-- /{name} -->)", re.DOTALL)
-        if not pattern.search(text):
-            raise SchemaError(complain("README.md", f"the block {name}", "between its two marks", "none", "Put them back."))
-        text = pattern.sub(lambda found, new=content: found[1] + new.strip("\n") + "\n" + found[2], text)
+        found = pattern.search(text)
+        if not found:
+            raise SchemaError(
+                complain("README.md", f"the block {name}", "between its two marks", "none", "Put them back.")
+            )
+        # Not as a template: a backslash in the content is a backslash.
+        text = "".join([text[: found.end(1)], content.strip("\n"), "\n", text[found.start(2) :]])
     return text
 
 
@@ -23,8 +27,9 @@ def blocks_of(numbers: Mapping[str, Any], dag: str, stages: Mapping[str, Any]) -
     provenance = numbers["provenance"]
     tables = make_tables(numbers)
     words = (
-        f"Scene `{provenance['scene']}`, **{provenance['source']}**; code {provenance['git']}, seed {provenance['seed']}, "
-        f"{provenance['device']}; mean ± sd over n folds."
+        f"Scene `{provenance['scene']}`, **{provenance['source']}**; code {provenance['git']}, "
+        f"seed {provenance['seed']}, {provenance['device']}; mean ± sd over n scores (folds x seeds; for the "
+        "single-sensor row, training skins x test skins)."
     )
     results = [words] + [to_markdown(tables[name]) for name in ("table2", "single_sensor") if name in tables]
     return {"results": "\n\n".join(results), "dag": f"```\n{dag.rstrip()}\n```", "stages": _stages(stages)}

@@ -8,10 +8,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from pipeline import io
+from pipeline.learning.recipe import HEADLINE
 from pipeline.params import arms_of, read_scene
 from pipeline.provenance import code_version, device, read_costs
 from pipeline.reporting.figures import error_grid
-from pipeline.learning.recipe import HEADLINE
 from pipeline.reporting.numbers import compose, rounded, runtime
 from pipeline.reporting.tables import make_tables, to_markdown
 from pipeline.stages._run import COSTS, run, say

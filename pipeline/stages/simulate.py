@@ -21,7 +21,7 @@ def simulate(scene: str, settings: Path, raw: Path) -> None:
         for i, (board, skin) in enumerate(pairs, 1):
             capture = record_skin(synthesis, board, skin=skin, seed=asked.seed)
             write_capture(folder / skin, *to_files(capture, synthesis))
-            say(f"{scene}: simulated {skin} on {board} ({i}/{len(pairs)})")
+            say(f"{scene}: simulated {skin} on {board} ({i}/{len(pairs)}), {capture.wrapped_n} values past the range")
 
 
 if __name__ == "__main__":

@@ -5,6 +5,11 @@ from pipeline.learning.recipe import Recipe
 
 def recipe(**changes: object) -> Recipe:
     values = {
-        "architecture": "paper", "scaling": "standard", "epochs_n": 2, "batch_n": 16, "rate_max": 3e-3, "weight_decay": 0.0,
-    }  # fmt: skip
+        "architecture": "paper",
+        "scaling": "standard",
+        "epochs_n": 2,
+        "batch_n": 16,
+        "rate_max": 3e-3,
+        "weight_decay": 0.0,
+    }
     return Recipe.model_validate(values | changes)
