@@ -160,8 +160,8 @@ def _header(
     header = Header.model_construct(
         format="reskin-capture/1", capture=labels.name or f"{labels.board}_{labels.skin}_{stem}"[:64],
         board=labels.board, skin=labels.skin, source="recorded", layout=layout, wire=None, chips_n=chips_n,
-        unit_b="uT", unit_force="N", unit_place="mm", firmware=None, clock=RECORDINGS_OWN, protocol=f"as recorded in {stem}",
-        contacts_before_n=0, options={}, files={}, note="added by reskin add",
+        unit_b="uT", unit_force="N", unit_place="mm", firmware=None, clock=RECORDINGS_OWN,
+        protocol=f"as recorded in {stem}", contacts_before_n=0, options={}, files={}, note="added by reskin add",
     )  # fmt: skip
     return headers.parse(headers.render(header.model_copy(update=dict(special))), str(recording))
 
