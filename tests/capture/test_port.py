@@ -1,0 +1,250 @@
+"""A port is recorded whole, over a pseudo-terminal, however the recording ends."""
+
+import math
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+import tty
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.capture import arrivals, port, stream
+from pipeline.capture.header import ARRIVALS_FILE, STREAM_FILE
+from pipeline.capture.port import PortSettings, Recording
+from pipeline.capture.wire import encode
+from pipeline.errors import CaptureError
+from tests.capture.signals import make_frames
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo-terminals")
+
+ROOT = Path(__file__).resolve().parents[2]
+FRAMES = make_frames(100, 5, 0)
+LONG_s = 20.0  # for what must not happen in a test that passes
+SETTINGS = PortSettings(
+    baud=115200, wire="binary", chips_n=5, duration_s=LONG_s, bytes_max_n=None, silence_s=LONG_s, no_frame_s=LONG_s
+)
+
+
+@dataclass
+class Board:
+    """The far end of a pseudo-terminal: what it sends arrives at `name`."""
+
+    far: int
+    near: int
+    name: str
+
+    def send(self, *chunks: bytes, pause_s: float = 0.0) -> None:
+        with suppress(OSError):  # nobody listens any more
+            for chunk in chunks:
+                os.write(self.far, chunk)
+                time.sleep(pause_s)
+
+    def unplug(self) -> None:
+        os.close(self.far)
+        self.far = -1
+
+
+@pytest.fixture
+def board() -> Iterator[Board]:
+    far, near = os.openpty()
+    tty.setraw(near)
+    end = Board(far, near, os.ttyname(near))
+    yield end
+    for handle in (end.far, end.near):
+        if handle >= 0:
+            os.close(handle)
+
+
+def record(board: Board, folder: Path, act: Callable[[threading.Event], None], **changed: object) -> Recording:
+    """Record from a board that begins to `act` once the port is open, or nearly so."""
+    stop = threading.Event()
+    actor = threading.Timer(0.3, act, [stop])
+    actor.start()
+    try:
+        return port.record(board.name, folder, settings=replace(SETTINGS, **changed), stop=stop)
+    finally:
+        actor.cancel()
+        actor.join()
+
+
+def check_files(folder: Path, recording: Recording, sent: bytes) -> None:
+    data = (folder / STREAM_FILE).read_bytes()
+    rows = arrivals.parse(folder / ARRIVALS_FILE, "arrivals.csv")
+    assert data == sent
+    assert recording.bytes_n == len(data) == rows.byte_end[-1]
+    assert rows.byte_end[0] == 0
+    assert abs(rows.t_s[-1] - time.time()) < 60
+    assert recording.frames_n == len(stream.decode_all(data, SETTINGS.wire, 5, "stream.bin")[0])
+
+
+def test_what_was_sent_is_what_is_written_and_stops_after_the_duration(board, tmp_path):
+    data = encode(FRAMES, "binary")
+    chunks = [data[i : i + 1000] for i in range(0, len(data), 1000)]
+    recording = record(board, tmp_path, lambda _: board.send(*chunks, pause_s=0.01), duration_s=1.5)
+    assert recording.ended == "duration"
+    assert recording.frames_n == len(FRAMES)
+    assert 1.5 <= recording.duration_s < 5
+    check_files(tmp_path, recording, data)
+
+
+def test_arrivals_tell_when_bytes_came(board, tmp_path):
+    data, pause_s = encode(FRAMES, "binary"), 0.4
+    record(board, tmp_path, lambda _: board.send(data[:4100], data[4100:], pause_s=pause_s), bytes_max_n=len(data))
+    rows = arrivals.parse(tmp_path / ARRIVALS_FILE, "arrivals.csv")
+    came_s = arrivals.times_of(np.array([4100, 8200]), rows)
+    assert came_s[1] - came_s[0] == pytest.approx(pause_s, abs=0.2)  # two cores, shared with other work
+
+
+def test_a_byte_limit_is_kept_to_the_byte(board, tmp_path):
+    data = encode(FRAMES, "binary")
+    recording = record(board, tmp_path, lambda _: board.send(data), bytes_max_n=1000)
+    assert recording.ended == "bytes"
+    check_files(tmp_path, recording, data[:1000])
+    assert recording.account["skipped_truncated_bytes_n"] == 1000 % 82
+
+
+def test_unplugging_keeps_what_came(board, tmp_path):
+    data = encode(FRAMES, "binary")
+
+    def act(_: threading.Event) -> None:
+        board.send(data[:-7], pause_s=0.5)
+        board.unplug()
+
+    recording = record(board, tmp_path, act)
+    assert recording.ended == "unplugged"
+    assert recording.frames_n == len(FRAMES) - 1
+    check_files(tmp_path, recording, data[:-7])
+
+
+def test_a_stop_from_outside_keeps_what_came(board, tmp_path):
+    data = encode(FRAMES, "binary")
+
+    def act(stop: threading.Event) -> None:
+        board.send(data, pause_s=0.5)
+        stop.set()
+
+    recording = record(board, tmp_path, act)
+    assert recording.ended == "stopped"
+    check_files(tmp_path, recording, data)
+
+
+def test_a_port_that_falls_silent_after_its_frames_keeps_them(board, tmp_path):
+    data = encode(FRAMES, "binary")
+    recording = record(board, tmp_path, lambda _: board.send(data), silence_s=0.8)
+    assert recording.ended == "silent"
+    check_files(tmp_path, recording, data)
+
+
+LISTEN = """
+import sys, threading
+from pathlib import Path
+from pipeline.capture import port
+settings = port.PortSettings(115200, "binary", 5, float("inf"), None, 20.0, 20.0)
+print(port.record(sys.argv[1], Path(sys.argv[2]), settings=settings, stop=threading.Event()).ended)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_and_termination_keep_what_came(board, tmp_path, number):
+    data = encode(FRAMES, "binary")
+    command = [sys.executable, "-c", LISTEN, board.name, str(tmp_path)]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+        written = tmp_path / STREAM_FILE
+        wait_until(written.exists)
+        board.send(data)
+        wait_until(lambda: written.stat().st_size == len(data))
+        process.send_signal(number)
+        output, _ = process.communicate(timeout=LONG_s)
+    assert process.returncode == 0
+    assert output == "stopped\n"
+    assert arrivals.parse(tmp_path / ARRIVALS_FILE, "arrivals.csv").byte_end[-1] == len(data)
+
+
+def test_a_kill_loses_nothing_that_was_read(board, tmp_path):
+    data = encode(FRAMES, "binary")
+    with subprocess.Popen([sys.executable, "-c", LISTEN, board.name, str(tmp_path)], cwd=ROOT) as process:
+        written = tmp_path / STREAM_FILE
+        wait_until(written.exists)
+        board.send(data)
+        wait_until(lambda: written.stat().st_size == len(data))
+        process.kill()
+    assert arrivals.parse(tmp_path / ARRIVALS_FILE, "arrivals.csv").byte_end[-1] <= len(data)
+
+
+def wait_until(is_so: Callable[[], bool]) -> None:
+    end_s = time.monotonic() + LONG_s
+    while not is_so():
+        assert time.monotonic() < end_s
+        time.sleep(0.02)
+
+
+def test_waiting_for_bytes_costs_no_processor_time(board, tmp_path):
+    before_s = time.process_time()
+    with pytest.raises(CaptureError):
+        record(board, tmp_path, lambda _: None, silence_s=1.0)
+    assert time.process_time() - before_s < 0.3  # a busy wait takes all of the second
+
+
+def test_the_partial_line_at_the_start_of_text_is_counted_and_not_written(board, tmp_path):
+    data = encode(FRAMES, "text-xyzt")
+    first_n = data.index(b"\n") + 1
+    recording = record(board, tmp_path, lambda _: board.send(data[3:2000]), wire="text-xyzt", silence_s=0.8)
+    assert recording.partial_line_bytes_n == first_n - 3
+    assert (tmp_path / STREAM_FILE).read_bytes() == data[first_n:2000]
+
+
+class TestErrors:
+    def test_an_absent_port_is_named(self, tmp_path):
+        with pytest.raises(CaptureError, match="/dev/tty-none: the port must be one that opens; .*orts?.*found"):
+            port.record("/dev/tty-none", tmp_path, settings=SETTINGS, stop=threading.Event())
+        assert list(tmp_path.iterdir()) == []
+
+    def test_a_file_is_no_port(self, tmp_path):
+        file = tmp_path / "no_port"
+        file.touch()
+        with pytest.raises(CaptureError, match="no_port: the port must be one that opens"):
+            port.record(str(file), tmp_path, settings=SETTINGS, stop=threading.Event())
+
+    def test_a_silent_port_is_named(self, board, tmp_path):
+        with pytest.raises(CaptureError, match=f"{board.name}: bytes must be coming in; got none in 0.[6-9] s. Is the"):
+            record(board, tmp_path, lambda _: None, silence_s=0.6)
+
+    def test_a_port_unplugged_before_its_first_byte_is_named(self, board, tmp_path):
+        with pytest.raises(CaptureError, match="bytes must be coming in"):
+            record(board, tmp_path, lambda _: board.unplug())
+
+    def test_bytes_without_a_frame_mean_a_wrong_baud_rate(self, board, tmp_path):
+        rubbish = bytes(range(128)) * 4
+
+        def act(stop: threading.Event) -> None:
+            while not stop.wait(0.05) and board.far >= 0:
+                board.send(rubbish)
+
+        stop = threading.Event()
+        actor = threading.Thread(target=act, args=[stop])
+        actor.start()
+        try:
+            with pytest.raises(CaptureError, match="no frame found in .* Wrong baud rate"):
+                port.record(board.name, tmp_path, settings=replace(SETTINGS, no_frame_s=0.7), stop=threading.Event())
+        finally:
+            stop.set()
+            actor.join()
+
+    def test_the_error_says_that_the_board_has_fewer_chips(self, board, tmp_path):
+        data = encode(make_frames(30, 4, 0), "binary")
+        with pytest.raises(CaptureError, match="It fits binary with 4 chips"):
+            record(board, tmp_path, lambda _: board.send(data), no_frame_s=0.5)
+
+    def test_a_folder_that_holds_a_stream_is_not_written_to(self, board, tmp_path):
+        (tmp_path / STREAM_FILE).write_bytes(b"old")
+        with pytest.raises(FileExistsError):
+            port.record(board.name, tmp_path, settings=replace(SETTINGS, duration_s=math.inf), stop=threading.Event())
+        assert (tmp_path / STREAM_FILE).read_bytes() == b"old"
