@@ -1,0 +1,103 @@
+"""A native capture becomes readings. In: a folder with `stream.bin`, `arrivals.csv`, `probe.csv`, and its header.
+Out: blocks of `Readings` and an account of every byte, frame and indentation, in bounded memory.
+Refuses to know how to decode, to time or to join; only the order in which this is done.
+"""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from pipeline.capture import arrivals, faults, probe, wire
+from pipeline.capture.arrivals import Arrivals
+from pipeline.capture.header import ARRIVALS_FILE, PROBE_FILE, STREAM_FILE, Header, Wire
+from pipeline.capture.probe import ProbeLog
+from pipeline.capture.stream import FrameStream, no_frame
+from pipeline.capture.wire import Frames
+from pipeline.dataset.clocks import ClockMap, from_contacts, from_marks
+from pipeline.dataset.indentations import TimedFrames, join
+from pipeline.errors import CaptureError, complain
+from pipeline.schema import Readings
+
+BLOCK_BYTES_N = 2**22
+
+Timer = Callable[[Frames, int], Float64[np.ndarray, "_"]]  # frames, and how many came before -> stream time of each
+
+
+def read_native(folder: Path, header: Header) -> tuple[Iterator[Readings], dict[str, int]]:
+    """Begin to read a capture; the account is complete when the readings are exhausted.
+
+    Without sync marks the stream is read twice, first for the clock.
+    """
+    stream = folder / STREAM_FILE
+    if not stream.is_file():
+        raise CaptureError(complain(stream, "the file", "there", "nothing", "Copy the whole capture folder."))
+    log = probe.parse(folder / PROBE_FILE, str(folder / PROBE_FILE))
+    times_of = _timer(folder, header)
+    clock = _clock(folder, header, log, times_of)
+    account = {
+        "clock_residual_us": round(1e6 * clock.residual_s),
+        "clock_explained_pct": round(100 * clock.explained),
+    }
+    return join(_timed_frames(folder, header, times_of, account), log, clock, header, account), account
+
+
+def _clock(folder: Path, header: Header, log: ProbeLog, times_of: Timer) -> ClockMap:
+    if header.clock.marks:
+        return from_marks(np.array(header.clock.marks), str(folder))
+    blocks = _timed_frames(folder, header, times_of, {})
+    return from_contacts(((one.t_s[~one.failed], one.frames.b_uT[~one.failed]) for one in blocks), log, str(folder))
+
+
+def _timed_frames(folder: Path, header: Header, times_of: Timer, account: dict[str, int]) -> Iterator[TimedFrames]:
+    """Decode the stream block by block; the stream's own account is added when it has ended."""
+    stream = FrameStream(_wire(header), header.chips_n)
+    frames_n = 0
+    with (folder / STREAM_FILE).open("rb") as file:
+        head = data = file.read(BLOCK_BYTES_N)
+        while data:
+            frames = stream.feed(data)
+            yield _timed(frames, times_of(frames, frames_n))
+            frames_n += len(frames)
+            data = file.read(BLOCK_BYTES_N)
+    frames = stream.close()
+    yield _timed(frames, times_of(frames, frames_n))
+    if not stream.account()["frames_n"]:
+        raise no_frame(str(folder / STREAM_FILE), head, _wire(header), header.chips_n)
+    account.update(stream.account())
+
+
+def _timed(frames: Frames, t_s: Float64[np.ndarray, " f"]) -> TimedFrames:
+    failed = np.asarray(faults.failed_reads(frames.b_uT, frames.temperature_degC).any(axis=1))
+    return TimedFrames(frames, t_s, failed)
+
+
+def _timer(folder: Path, header: Header) -> Timer:
+    """Choose how frames get a time, as the header's clock says."""
+    rate_hz = header.clock.rate_hz
+    if header.clock.kind == "arrivals":
+        table = _arrivals(folder)
+        return lambda frames, _: arrivals.times_of(frames.end_byte, table)
+    if rate_hz is None:
+        got = repr(header.clock.kind)
+        raise CaptureError(complain(folder, "clock.kind", "'arrivals' or 'rate' for a port's stream", got, "Mend it."))
+    if header.wire in wire.TEXT_WIRES:
+        return lambda frames, before_n: arrivals.constant_rate(before_n + 1.0 + np.arange(len(frames)), rate_hz)
+    frame_bytes_n = wire.record_type(_wire(header), header.chips_n).itemsize
+    return lambda frames, _: arrivals.constant_rate(frames.end_byte / frame_bytes_n, rate_hz)
+
+
+def _arrivals(folder: Path) -> Arrivals:
+    """Read the arrivals; a stream that is shorter than they say was cut off after it was recorded."""
+    table = arrivals.parse(folder / ARRIVALS_FILE, str(folder / ARRIVALS_FILE))
+    bytes_n, arrived_n = (folder / STREAM_FILE).stat().st_size, int(table.byte_end[-1])
+    if bytes_n < arrived_n:
+        rule = f"the {arrived_n} bytes long that {ARRIVALS_FILE} says"
+        raise CaptureError(complain(folder / STREAM_FILE, "the stream", rule, bytes_n, "Copy the capture again."))
+    return table
+
+
+def _wire(header: Header) -> Wire:
+    assert header.wire is not None, "the header's own check: a native capture has a wire"
+    return header.wire

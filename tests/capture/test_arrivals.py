@@ -1,0 +1,97 @@
+"""Arrival times: a frame's time lies between the chunks around its last byte."""
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.capture import arrivals
+from pipeline.capture.arrivals import Arrivals
+from pipeline.errors import CaptureError
+
+GOOD = "byte_end,t_s\n0,10.0\n100,10.5\n300,10.5\n400,11.5\n"
+STEPS = st.lists(st.tuples(st.integers(1, 10_000), st.floats(0, 10)), min_size=1, max_size=30)
+Steps = list[tuple[int, float]]
+
+
+def arrivals_of(steps: Steps, first: tuple[int, float]) -> Arrivals:
+    rows = np.cumsum([first, *steps], axis=0)
+    return Arrivals(rows[:, 0].astype(np.int64), rows[:, 1] + 1e-6 * np.arange(len(rows)))
+
+
+def naive_time_s(end_byte: int, table: Arrivals) -> float:
+    """Walk the chunks one by one, as the words of `times_of` say it."""
+    rows = list(zip(table.byte_end.tolist(), table.t_s.tolist(), strict=True))
+    if end_byte <= rows[0][0]:
+        return rows[0][1] - (rows[0][0] - end_byte) * (rows[-1][1] - rows[0][1]) / (rows[-1][0] - rows[0][0])
+    for (byte_0, t_0), (byte_1, t_1) in pairwise(rows):
+        if byte_0 < end_byte <= byte_1:
+            return t_0 + (t_1 - t_0) * (end_byte - byte_0) / (byte_1 - byte_0)
+    return float("nan")
+
+
+@given(steps=STEPS, first=st.tuples(st.integers(0, 500), st.floats(-1e3, 1e3)))
+def test_a_frame_time_is_what_a_walk_over_the_chunks_gives(steps: Steps, first: tuple[int, float]) -> None:
+    table = arrivals_of(steps, first)
+    end_byte = np.linspace(1, table.byte_end[-1] + 50, 40).astype(np.int64)
+    want_s = [naive_time_s(int(byte), table) for byte in end_byte]
+    # Sums of up to 31 doubles of size 1e3 to 1e4.
+    np.testing.assert_allclose(arrivals.times_of(end_byte, table), want_s, rtol=1e-12, atol=1e-9)
+
+
+@given(steps=STEPS, first=st.tuples(st.integers(0, 500), st.floats(-1e3, 1e3)))
+def test_times_never_fall_and_stay_within_their_chunk(steps: Steps, first: tuple[int, float]) -> None:
+    table = arrivals_of(steps, first)
+    end_byte = np.arange(table.byte_end[0], min(table.byte_end[-1], table.byte_end[0] + 3000), dtype=np.int64) + 1
+    t_s = arrivals.times_of(end_byte, table)
+    chunk_i = np.searchsorted(table.byte_end, end_byte)
+    assert (np.diff(t_s) >= 0).all()
+    assert (t_s <= table.t_s[chunk_i] + 1e-9).all()
+    assert (t_s >= table.t_s[chunk_i - 1] - 1e-9).all()
+
+
+def test_a_frame_past_the_last_chunk_has_no_time() -> None:
+    t_s = arrivals.times_of(np.array([82, 400, 401], np.int64), arrivals.parse(GOOD, "arrivals.csv"))
+    np.testing.assert_array_equal(t_s, [10 + 0.5 * 0.82, 11.5, np.nan])
+
+
+def test_at_a_constant_rate_frames_follow_evenly_whatever_the_dump_starts_with() -> None:
+    t_s = arrivals.constant_rate(np.array([1.0, 2.0, 401.0]), 400.0)
+    np.testing.assert_allclose(t_s, [0.0025, 0.005, 1.0025], rtol=1e-15)
+
+
+@given(steps=STEPS, first=st.tuples(st.integers(0, 500), st.floats(-1e9, 1e9)))
+def test_parse_undoes_render(steps: Steps, first: tuple[int, float]) -> None:
+    table = arrivals_of(steps, first)
+    again = arrivals.parse(arrivals.render(table), "arrivals.csv")
+    np.testing.assert_array_equal(again.byte_end, table.byte_end)
+    np.testing.assert_array_equal(again.t_s, table.t_s)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("t_s", "t_ms", "row 1.*missing t_s, unknown t_ms"),
+        ("300", "99", "row 4: byte_end must be more than in the row above; got 99"),
+        ("11.5", "9.5", "row 5: t_s must be not before the row above; got 9.5"),
+        ("11.5", "", "row 5: t_s must be a finite time; got nan"),
+        ("11.5", "inf", "row 5: t_s must be a finite time; got inf"),
+        ("300,", ",", "row 4: byte_end must be known"),
+        ("\n0,", "\n-5,", "row 2: byte_end must be 0 or more; got -5"),
+        ("300", "three", "Row #4.*three"),
+        ("100,10.5\n300,10.5\n400,11.5\n", "", "two rows or more; got 1"),
+        (GOOD, "", "CSV"),
+        (GOOD, "byte_end,t_s\n1,2\n3,2\n", "spread in time; got 2.0 in every row"),
+    ],
+)
+def test_a_fault_is_one_sentence_that_names_its_place(old: str, new: str, says: str) -> None:
+    with pytest.raises(CaptureError, match=rf"^arrivals\.csv.*{says}"):
+        arrivals.parse(GOOD.replace(old, new, 1), "arrivals.csv")
+
+
+def test_an_absent_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(CaptureError, match="arrivals.csv: the file must be there"):
+        arrivals.parse(tmp_path / "arrivals.csv", "arrivals.csv")

@@ -1,0 +1,100 @@
+"""The probe log: CSV and arrays tell the same, and every fault is one sentence that names its row."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.capture import probe
+from pipeline.capture.probe import LABELS, ProbeLog
+from pipeline.errors import CaptureError
+from pipeline.seeds import rng_for
+
+HEAD = "indentation,pass_i,phase,t_start_s,t_end_s,x_mm,y_mm,depth_mm,Fx_N,Fy_N,Fz_N\n"
+GOOD = (
+    HEAD
+    + "0,0,noload,0.0,0.5,,,,,,\n0,0,contact,1.0,1.5,2,4,0.6,,,1.25\n"
+    + "1,0,noload,2,2.5,,,,,,\n1,0,contact,3,3.5,4,4,0.8,,,2.5\n"
+)
+
+
+def assert_same(one: ProbeLog, other: ProbeLog) -> None:
+    for name in ProbeLog.__dataclass_fields__:
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+
+
+def test_a_log_reads_as_it_is_written() -> None:
+    log = probe.parse(GOOD, "probe.csv")
+    assert log.indentation.tolist() == [0, 0, 1, 1]
+    assert log.contact.tolist() == [False, True, False, True]
+    assert log.t_end_s.tolist() == [0.5, 1.5, 2.5, 3.5]
+    assert log.x_mm.tolist()[1::2] == [2.0, 4.0]
+    assert np.isnan(log.x_mm[0])
+    assert np.isnan(log.Fx_N).all()
+    assert log.Fz_N[3] == 2.5
+
+
+def test_columns_may_stand_in_any_order() -> None:
+    swapped = "\n".join(",".join(reversed(row.split(","))) for row in GOOD.splitlines()) + "\n"
+    assert_same(probe.parse(swapped, "probe.csv"), probe.parse(GOOD, "probe.csv"))
+
+
+def test_a_file_reads_like_its_text(tmp_path: Path) -> None:
+    (tmp_path / "probe.csv").write_text(GOOD, encoding="utf-8")
+    assert_same(probe.parse(tmp_path / "probe.csv", "probe.csv"), probe.parse(GOOD, "probe.csv"))
+
+
+@given(
+    lengths=st.lists(st.floats(1e-3, 1e3), min_size=4, max_size=4),
+    begin_s=st.floats(-1e9, 1e9),
+    label=st.floats(-(2.0**100), 2.0**100, width=32) | st.just(float("nan")),
+)
+def test_parse_undoes_render_to_the_last_bit(lengths: list[float], begin_s: float, label: float) -> None:
+    edges_s = begin_s + np.cumsum(lengths)
+    labels = {name: np.array([np.nan, label], np.float32) for name in LABELS}
+    number = np.zeros(2, np.int32)
+    log = ProbeLog(number, number, np.array([False, True]), edges_s[0::2], edges_s[1::2], **labels)
+    assert_same(probe.parse(probe.render(log), "probe.csv"), log)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("Fz_N\n", "Fz_lbf\n", "row 1.*missing Fz_N, unknown Fz_lbf"),
+        (",Fz_N\n", "\n", "Row #2: Expected 10 columns, got 11"),
+        ("Fy_N,Fz_N\n", "Fz_N,Fz_N\n", "row 1.*missing Fy_N"),
+        ("0.6", "deep", "Row #3.*deep"),
+        ("0,0,contact", "0.5,0,contact", "Row #3.*0.5"),
+        ("1,0,contact", "1,0,touch", "row 5: phase must be noload or contact; got touch"),
+        ("1,0,contact", "1,0,", "row 5: phase must be known; got an empty field"),
+        ("1,0,contact", ",0,contact", "row 5: indentation must be known"),
+        ("1,0,contact", "1,-1,contact", "row 5: pass_i must be 0 or more; got -1"),
+        ("2,2.5,", ",2.5,", "row 4: t_start_s must be known"),
+        ("2,2.5,", "nan,2.5,", "row 4: t_start_s must be a finite time; got nan"),
+        ("1.0,1.5", "1.0,0.9", "row 3: t_end_s must be later than t_start_s of its row; got 0.9"),
+        ("2,2.5,", "1.4,2.5,", "row 4: t_start_s must be not before the dwell above has ended; got 1.4"),
+        ("2.5\n", "inf\n", "row 5: Fz_N must be finite, or empty if unknown; got inf"),
+        ("0,0,noload,0.0,0.5,,,,,,\n", "", "row 2: an indentation's first dwell must be noload; got contact"),
+        ("1,0,contact", "1,0,noload", "row 5: an indentation's later dwells must be contact; got noload"),
+        ("1,0,contact", "0,0,contact", "row 5: indentation must be rising with time; got 0"),
+        (GOOD.removeprefix(HEAD), "", "the log must be one row a dwell; got no rows"),
+        (GOOD, "", "CSV"),
+        (GOOD, "\x00\x01\x02", "Empty CSV"),
+        (GOOD, "\n\n", "CSV|row 1"),
+    ],
+)
+def test_a_fault_is_one_sentence_that_names_its_place(old: str, new: str, says: str) -> None:
+    assert old in GOOD
+    with pytest.raises(CaptureError, match=rf"^probe\.csv.*({says})"):
+        probe.parse(GOOD.replace(old, new, 1), "probe.csv")
+
+
+def test_random_bytes_raise_nothing_but_a_capture_error(tmp_path: Path) -> None:
+    noise = rng_for(0, "noise").bytes(4096)
+    (tmp_path / "probe.csv").write_bytes(noise)
+    with pytest.raises(CaptureError):
+        probe.parse(tmp_path / "probe.csv", "probe.csv")
+    with pytest.raises(CaptureError, match="there"):
+        probe.parse(tmp_path / "absent.csv", "absent.csv")

@@ -1,0 +1,200 @@
+"""Two clocks: marks give the line exactly, contacts to a fraction of a dwell, and what fits twice is refused."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.capture.probe import LABELS, ProbeLog
+from pipeline.dataset.clocks import Block, ClockMap, from_contacts, from_marks
+from pipeline.errors import CaptureError
+from pipeline.seeds import rng_for
+
+FRAME_S = 1 / 400
+NOISE_UT = 4.0  # of a real board
+DRIFT_UT_PER_S = 10 / 60  # of a board that warms up
+UNIX_S = 1.7e9
+JITTER_S = (0.2, 0.5)
+
+
+def log_of(indentations_n: int, dwell_s: float, travel_s: tuple[float, float] = JITTER_S) -> ProbeLog:
+    """A log whose robot travels for a random time between dwells; equal bounds make it periodic."""
+    gap_s = rng_for(0, "travel").uniform(*travel_s, 2 * indentations_n)
+    start_s = np.cumsum(gap_s + dwell_s)
+    d = np.arange(2 * indentations_n, dtype=np.int32)
+    labels = dict.fromkeys(LABELS, np.full(len(d), np.nan, np.float32))
+    return ProbeLog(d // 2, 0 * d, d % 2 == 1, start_s, start_s + dwell_s, **labels)
+
+
+def line(offset_s: float, rate: float = 1.0) -> ClockMap:
+    return ClockMap(offset_s, rate, 0.0, 1.0)
+
+
+def stream_of(log: ProbeLog, truth: ClockMap, margin_s: float = 1.0, faint: float = 0.0) -> Block:
+    """What a board reads: 15 channels that go from a drifting no-load to a random contact and back.
+
+    The skin is touched from 60 ms before a contact dwell, and until 60 ms after it; the share `faint` of the contacts
+    is not felt.
+    """
+    rng = rng_for(1, "stream")
+    probe_s = np.arange(log.t_start_s[0] - margin_s, log.t_end_s[-1] + margin_s, FRAME_S * truth.rate)
+    start_s, end_s = log.t_start_s[log.contact], log.t_end_s[log.contact]
+    corners_s = np.stack([start_s - 0.06, start_s, end_s, end_s + 0.06], axis=1)
+    pressed = np.interp(probe_s, corners_s.ravel(), np.tile([0.0, 1, 1, 0], len(start_s)))
+    nearest_i = np.searchsorted((end_s[:-1] + start_s[1:]) / 2, probe_s)
+    contact_uT = rng.normal(0, 1, (len(start_s), 15)) * rng.uniform(20, 300, (len(start_s), 1))
+    contact_uT[rng.uniform(0, 1, len(start_s)) < faint] = 0
+    drift_uT = DRIFT_UT_PER_S * (probe_s - probe_s[0])[:, None]
+    noload_uT = 1000 + drift_uT + rng.normal(0, NOISE_UT, (len(probe_s), 15))
+    b_uT = noload_uT + pressed[:, None] * contact_uT[nearest_i]
+    return (probe_s - truth.offset_s) / truth.rate, b_uT.astype(np.float32)
+
+
+def worst_s(found: ClockMap, truth: ClockMap, stream_s: np.ndarray) -> float:
+    return float(np.abs(found.probe_s(stream_s) - truth.probe_s(stream_s)).max())
+
+
+@given(
+    offset_s=st.floats(-1e6, 1e6),
+    drift_ppm=st.floats(-100, 100),
+    begin_s=st.sampled_from([0.0, UNIX_S]),
+    marks_n=st.integers(2, 6),
+)
+def test_exact_marks_give_the_line_back(offset_s: float, drift_ppm: float, begin_s: float, marks_n: int) -> None:
+    stream_s = begin_s + np.linspace(3, 3600, marks_n)
+    # Times since 1970 are told to 2e-7 s by a double; the line is looked at within its marks.
+    truth = line(offset_s, 1 + drift_ppm * 1e-6)
+    found = from_marks(np.stack([stream_s, truth.probe_s(stream_s)], axis=1), "header.json")
+    assert worst_s(found, truth, stream_s) < 3e-6
+    assert found.residual_s < 3e-6
+
+
+def test_one_mark_gives_the_offset_alone() -> None:
+    found = from_marks(np.array([[10.0, 110.5]]), "header.json")
+    assert (found.offset_s, found.rate, found.residual_s) == (100.5, 1.0, 0.0)
+
+
+def test_noisy_marks_give_the_least_squares_line_and_their_misfit() -> None:
+    stream_s = np.linspace(0, 600, 12)
+    probe_s = 5 + (1 + 50e-6) * stream_s + rng_for(0, "marks").normal(0, 2e-3, 12)
+    found = from_marks(np.stack([stream_s, probe_s], axis=1), "header.json")
+    slope, offset_s = np.polyfit(stream_s, probe_s, 1)  # an independent solver, in another parametrisation
+    assert found.rate == pytest.approx(slope, abs=1e-12)
+    assert found.offset_s == pytest.approx(offset_s, abs=1e-9)
+    assert found.residual_s == pytest.approx(np.abs(probe_s - offset_s - slope * stream_s).max(), abs=1e-9)
+
+
+def test_marks_read_to_a_millisecond_time_ten_minutes_of_drift_to_a_frame() -> None:
+    truth = line(-37.25, 1 + 50e-6)
+    stream_s = np.array([2.0, 300.0, 598.0])
+    probe_s = truth.probe_s(stream_s) + np.array([1e-3, -1e-3, 1e-3])
+    found = from_marks(np.stack([stream_s, probe_s], axis=1), "header.json")
+    assert worst_s(found, truth, np.linspace(0, 600, 100)) < FRAME_S
+
+
+@pytest.mark.parametrize(
+    ("marks", "says"),
+    [
+        (np.zeros((0, 2)), "one or more pairs"),
+        (np.array([[0.0, np.nan]]), "finite"),
+        (np.array([[1.0, 2.0], [1.0, 3.0]]), "different stream times"),
+        (np.array([[1.0, 2.0], [2.0, 1002.0]]), "rate is 1 within 0.1; got rate 1000"),
+    ],
+)
+def test_marks_that_cannot_be_are_refused(marks: np.ndarray, says: str) -> None:
+    with pytest.raises(CaptureError, match=f"^header.json: clock.marks must be .*{says}"):
+        from_marks(marks, "header.json")
+
+
+@pytest.mark.parametrize("offset_s", [0.0, 12.345, -250.06, UNIX_S])
+@pytest.mark.parametrize("dwell_s", [0.1, 0.4])
+def test_contacts_give_the_offset_to_a_quarter_of_a_dwell(offset_s: float, dwell_s: float) -> None:
+    log, truth = log_of(100, dwell_s), line(offset_s)
+    t_s, b_uT = stream_of(log, truth)
+    found = from_contacts([(t_s, b_uT)], log, "c")
+    assert worst_s(found, truth, t_s) < dwell_s / 4
+    assert worst_s(found, truth, t_s) < FRAME_S  # nothing biases it: pressing and lifting are alike
+    assert found.explained > 0.8
+
+
+def test_contacts_follow_clocks_that_drift_for_half_an_hour() -> None:
+    log, truth = log_of(2000, 0.1), line(8.0, 1 + 200e-6)
+    t_s, b_uT = stream_of(log, truth)
+    blocks = [(t_s[i : i + 20_000], b_uT[i : i + 20_000]) for i in range(0, len(t_s), 20_000)]
+    found = from_contacts(blocks, log, "c")
+    assert 200e-6 * np.ptp(t_s) > 0.1  # an offset alone would be wrong by a dwell in the end
+    assert worst_s(found, truth, t_s) < 0.1 / 4
+
+
+def test_contacts_pressed_twice_as_long_as_not_are_found() -> None:
+    log, truth = log_of(60, 0.5, (0.13, 0.4)), line(3.0)
+    t_s, b_uT = stream_of(log, truth)
+    assert worst_s(from_contacts([(t_s, b_uT)], log, "c"), truth, t_s) < 0.5 / 4
+
+
+def test_a_part_of_the_stream_is_enough_when_travel_is_irregular() -> None:
+    log, truth = log_of(100, 0.2), line(3.0)
+    t_s, b_uT = stream_of(log, truth)
+    part = slice(np.searchsorted(truth.probe_s(t_s), log.t_start_s[60]), None)
+    found = from_contacts([(t_s[part], b_uT[part])], log, "c")
+    assert worst_s(found, truth, t_s[part]) < 0.2 / 4
+
+
+@pytest.mark.parametrize("part", [slice(None), slice(5000, 15000)], ids=["whole", "piece"])
+def test_a_periodic_protocol_fits_a_period_later_about_as_well_and_is_refused(part: slice) -> None:
+    log = log_of(40, 0.25, (0.25, 0.25))
+    t_s, b_uT = stream_of(log, line(7.0), margin_s=3.0)
+    with pytest.raises(CaptureError, match="better than any other; got two fits .* Add sync marks"):
+        from_contacts([(t_s[part], b_uT[part])], log, "c")
+
+
+@given(
+    faint=st.floats(0, 0.6),
+    travel_s=st.sampled_from([(0.25, 0.25), (0.2, 0.3), JITTER_S]),
+    margin_s=st.floats(0, 2),
+    lost=st.floats(0, 0.3),
+    indentations_n=st.integers(15, 60),
+)
+def test_the_offset_is_right_or_refused(
+    faint: float, travel_s: tuple[float, float], margin_s: float, lost: float, indentations_n: int
+) -> None:
+    log, truth = log_of(indentations_n, 0.25, travel_s), line(7.0)
+    t_s, b_uT = stream_of(log, truth, margin_s, faint)
+    # The stream begins with the robot lifted, wherever it is cut.
+    begin_i = np.searchsorted(truth.probe_s(t_s), log.t_start_s[2 * int(lost * indentations_n)])
+    try:
+        found = from_contacts([(t_s[begin_i:], b_uT[begin_i:])], log, "c")
+    except CaptureError:
+        return
+    assert worst_s(found, truth, t_s) < 0.25 / 4
+
+
+def test_a_field_that_feels_nothing_is_refused() -> None:
+    log = log_of(50, 0.2)
+    t_s, b_uT = stream_of(log, line(0.0))
+    still_uT = rng_for(3, "still").normal(1000, NOISE_UT, b_uT.shape).astype(np.float32)
+    with pytest.raises(CaptureError, match="Add sync marks"):
+        from_contacts([(t_s, still_uT)], log, "c")
+
+
+def test_the_contacts_of_another_log_are_refused() -> None:
+    t_s, b_uT = stream_of(log_of(50, 0.2), line(0.0))
+    with pytest.raises(CaptureError, match="Add sync marks"):
+        from_contacts([(t_s, b_uT)], log_of(50, 0.2, (0.1, 0.9)), "c")
+
+
+def test_a_log_without_contacts_and_a_stream_without_frames_are_refused() -> None:
+    log = log_of(2, 0.2)
+    with pytest.raises(CaptureError, match="one with frames"):
+        from_contacts([], log, "c")
+    lifted = ProbeLog(**{name: getattr(log, name)[:1] for name in ProbeLog.__dataclass_fields__})
+    with pytest.raises(CaptureError, match="one with contacts"):
+        from_contacts([stream_of(log, line(0.0))], lifted, "c")
+
+
+def test_frames_that_cannot_be_read_do_not_move_the_clock() -> None:
+    log, truth = log_of(60, 0.2), line(1.5)
+    t_s, b_uT = stream_of(log, truth)
+    b_uT[::50] = np.nan
+    t_s[-5:] = np.nan
+    assert worst_s(from_contacts([(t_s, b_uT)], log, "c"), truth, t_s[:-5]) < 0.2 / 4
