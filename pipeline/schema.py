@@ -1,7 +1,8 @@
 """What a row means: column, dtype, unit, axis. In: arrays. Out: the Arrow schema of `data/indentations`.
 
 Axis letters, used in every array annotation: n indentations, f readings (frames), ch = 3 k channels
-(Bx, By, Bz of chip 0, then of chip 1, ...), k chips, s sources, o observers, b batch.
+(Bx, By, Bz of chip 0, then of chip 1, ...), k chips, s sources, o observers, b batch, d dwells of the robot,
+c chunks of a stream, g steps of a time grid.
 Refuses to know where a reading came from or what will be learned from it.
 """
 

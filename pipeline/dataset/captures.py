@@ -15,6 +15,10 @@ from pipeline.errors import CaptureError, complain
 from pipeline.schema import Readings
 
 
+# What lies between dwells is no loss.
+LOST_FRAMES = ("dropped_failed_read_frames_n", "dropped_no_time_frames_n", "dropped_not_finite_frames_n")
+
+
 class Opened(NamedTuple):
     """A capture being read; `account` is complete when `blocks` is exhausted."""
 
@@ -62,7 +66,7 @@ def check_losses(account: Mapping[str, int], limit: float, where: str) -> None:
     """Raise if a capture lost more than the fraction `limit` of its bytes, frames, rows or indentations."""
     for whole, lost in (
         ("bytes_n", [key for key in account if key.startswith("skipped_") and key.endswith("_bytes_n")]),
-        ("frames_n", [key for key in account if key.startswith("dropped_failed") and key.endswith("_frames_n")]),
+        ("frames_n", [key for key in account if key in LOST_FRAMES]),
         ("rows_read_n", [key for key in account if key.startswith("dropped_") and key.endswith("_rows_n")]),
         ("indentations_n", [key for key in account if key.startswith("dropped_") and key.endswith("_indentations_n")]),
     ):

@@ -1,0 +1,111 @@
+"""How much faster whole blocks decode than one frame at a time, over the same bytes in the same run.
+
+`pytest -s -o addopts= tests/benchmarks/test_decode_benchmark.py`. The loops run over a tenth of the frames, and their
+time counts tenfold; every time is the best of three. Nothing but equality of the values is asserted.
+"""
+
+import io
+import struct
+import time
+import tracemalloc
+from collections import namedtuple
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.capture.stream import FrameStream, decode_all
+from pipeline.capture.wire import encode
+from tests.capture.signals import make_frames
+
+FRAMES_N = 1_000_000
+LOOP_FRAMES_N = 100_000
+CHIPS_N = 5
+FRAME_BYTES_N = 82
+PORTION_BYTES_N = 4096
+
+Sample = namedtuple("Sample", "time_s, delay_s, values, device")
+
+
+def bare_loop(data: bytes) -> list[tuple[float, ...]]:
+    """Unpack frame after frame where each is known to be: no check, no array."""
+    return [struct.unpack_from("<20f", data, first) for first in range(0, len(data), FRAME_BYTES_N)]
+
+
+def loop_to_arrays(data: bytes) -> tuple[np.ndarray, np.ndarray]:
+    """Unpack frame after frame, checking each end, into the arrays that a model needs."""
+    b_uT, temperature_degC = [], []
+    for first in range(0, len(data), FRAME_BYTES_N):
+        frame = data[first : first + FRAME_BYTES_N]
+        if frame[-2:] == b"\r\n":
+            values = np.array(struct.unpack("<20f", frame[:-2]), np.float32).reshape(CHIPS_N, 4)
+            b_uT.append(values[:, 1:].ravel())
+            temperature_degC.append(values[:, 0])
+    return np.array(b_uT), np.array(temperature_degC)
+
+
+def reader_loop(data: bytes) -> list[Sample]:
+    """Do for each frame what the sensor's public reader does, from memory in place of its port."""
+    port, samples = io.BytesIO(data), []
+    for _ in range(len(data) // FRAME_BYTES_N):
+        start_s = time.time()
+        frame = port.read(FRAME_BYTES_N)
+        if frame[-2:] == b"\r\n":
+            values = struct.unpack("@{}fcc".format(4 * CHIPS_N), frame)[: 4 * CHIPS_N]  # noqa: UP032 - as it does
+            samples.append(Sample(start_s, time.time() - start_s, values, -1))
+    return samples
+
+
+def best_s(call: Callable[[], Any]) -> float:
+    times_s = []
+    for _ in range(3):
+        start_s = time.perf_counter()
+        call()
+        times_s.append(time.perf_counter() - start_s)
+    return min(times_s)
+
+
+def peak_MB(call: Callable[[], Any]) -> float:
+    tracemalloc.start()
+    call()
+    peak_bytes_n = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return peak_bytes_n / 1e6
+
+
+def feed_in_portions(data: bytes, wire: str) -> None:
+    stream = FrameStream(wire, CHIPS_N)
+    for first in range(0, len(data), PORTION_BYTES_N):
+        stream.feed(data[first : first + PORTION_BYTES_N])
+    stream.close()
+
+
+@pytest.mark.parametrize("crlf_share", [0.0, 0.01])
+def test_binary(crlf_share):
+    frames = make_frames(FRAMES_N, CHIPS_N, 0, crlf_share=crlf_share)
+    data = encode(frames, "binary")
+    decoded, _ = decode_all(data, "binary", CHIPS_N, "benchmark")
+    np.testing.assert_array_equal(decoded.b_uT, frames.b_uT)
+    ours_s = best_s(lambda: decode_all(data, "binary", CHIPS_N, "benchmark"))
+    print(f"\n{FRAMES_N} binary frames, {len(data) / 1e6:.0f} MB, {crlf_share:.0%} of values hold CR LF")
+    print(f"  blocks: {ours_s:.3f} s, {FRAMES_N / ours_s:.3g} frames/s, ", end="")
+    print(f"peak {peak_MB(lambda: decode_all(data, 'binary', CHIPS_N, 'benchmark')):.0f} MB beside the bytes")
+    print(f"  blocks, fed {PORTION_BYTES_N} bytes at a time: {best_s(lambda: feed_in_portions(data, 'binary')):.3f} s")
+    some = data[: LOOP_FRAMES_N * FRAME_BYTES_N]
+    for loop in (bare_loop, reader_loop, loop_to_arrays):
+        loop_s = best_s(lambda loop=loop: loop(some)) * FRAMES_N / LOOP_FRAMES_N
+        print(f"  {loop.__name__}: {loop_s:.3f} s, ratio {loop_s / ours_s:.0f}")
+
+
+@pytest.mark.parametrize("wire", ["text-xyzt", "text-txyz"])
+def test_text(wire):
+    frames = make_frames(LOOP_FRAMES_N, CHIPS_N, 0)
+    data = encode(frames, wire)
+    decoded, _ = decode_all(data, wire, CHIPS_N, "benchmark")
+    np.testing.assert_array_equal(decoded.b_uT, frames.b_uT.astype(float).round(2).astype(np.float32))
+    ours_s = best_s(lambda: decode_all(data, wire, CHIPS_N, "benchmark"))
+    print(f"\n{LOOP_FRAMES_N} frames of {wire}: {ours_s:.3f} s, {LOOP_FRAMES_N / ours_s:.3g} frames/s")
+    if wire == "text-xyzt":  # nothing splits the other at white space
+        loop_s = best_s(lambda: [[float(word) for word in line.split()] for line in data.decode().splitlines()])
+        print(f"  a loop over lines and words: {loop_s:.3f} s, ratio {loop_s / ours_s:.1f}")

@@ -1,0 +1,93 @@
+"""A million indentations go from bytes to Parquet in bounded memory: frames a second and the peak are printed.
+
+Not in the default suite: `pytest -s tests/benchmarks/test_ingest_memory.py`. It writes 2 GB below pytest's folder.
+"""
+
+import resource
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline import io
+from pipeline.capture import probe
+from pipeline.capture.header import PROBE_FILE, STREAM_FILE, Clock
+from pipeline.capture.probe import LABELS, ProbeLog
+from pipeline.capture.wire import Frames, encode
+from pipeline.dataset.native import read_native
+from pipeline.seeds import rng_for
+from tests.capture.headers import make_header
+
+INDENTATIONS_N = 1_000_000
+TILE_N = 4_000  # indentations whose bytes are written again and again
+QUIET_N = 400  # frames before the first and after the last
+SHARE = np.array([0, 0, 0, 0, 0.5, 1, 1, 1, 1, 0.5])  # of an indentation's change of field, frame by frame
+TRAVEL_N = 8  # frames at most, at random, until the next: what the clocks are aligned by without marks
+RATE_HZ = 400.0
+PEAK_MAX_MB = 1500  # the log of 2e6 dwells is 0.1 GB, its text 0.15 GB and what parses them the rest
+
+
+def write_capture(folder: Path) -> None:
+    rng = rng_for(0, "tile")
+    begin_i = np.cumsum(len(SHARE) + rng.integers(0, TRAVEL_N, TILE_N + 1))
+    begin_i -= begin_i[0]
+    share = np.zeros((begin_i[-1], 1))
+    share[begin_i[:-1, None] + np.arange(len(SHARE))] = SHARE[:, None]
+    tile = encoded(share * np.repeat(rng.normal(0, 200, (TILE_N, 15)), np.diff(begin_i), axis=0), rng)
+    quiet = encoded(np.zeros((QUIET_N, 15)), rng)
+    with (folder / STREAM_FILE).open("wb") as file:
+        file.write(quiet)
+        for _ in range(INDENTATIONS_N // TILE_N):
+            file.write(tile)
+        file.write(quiet)
+    d = np.arange(2 * INDENTATIONS_N, dtype=np.int32)
+    start_i = QUIET_N + d // 2 // TILE_N * begin_i[-1] + begin_i[d // 2 % TILE_N] + 5 * (d % 2)
+    labels = dict.fromkeys(LABELS, np.round(rng.uniform(0, 16, len(d)), 2).astype(np.float32))
+    start_s, end_s = (start_i + 0.5) / RATE_HZ, (start_i + 4.5) / RATE_HZ
+    log = ProbeLog(d // 2, d // 2 // 390, d % 2 == 1, start_s, end_s, **labels)
+    (folder / PROBE_FILE).write_text(probe.render(log), encoding="utf-8")
+
+
+def encoded(change_uT: np.ndarray, rng: np.random.Generator) -> bytes:
+    f = len(change_uT)
+    b_uT = (1000 + change_uT + rng.normal(0, 4, change_uT.shape)).astype(np.float32)
+    return encode(Frames(b_uT, np.full((f, 5), 25, np.float32), np.zeros(f), np.zeros(f, np.int64)), "binary")
+
+
+def peak_mb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("million")
+    write_capture(path)
+    return path
+
+
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("marks", [((1.0, 1.0),), ()], ids=["marks", "contacts"])
+def test_a_million_indentations_are_read_in_bounded_memory(
+    folder: Path, tmp_path: Path, marks: tuple[tuple[float, float], ...]
+) -> None:
+    clock = Clock(kind="rate", rate_hz=RATE_HZ, marks=marks)
+    header = make_header(layout="native", wire="binary", clock=clock)
+    before_mb, begin_s = peak_mb(), time.perf_counter()
+    probe.parse(folder / PROBE_FILE, PROBE_FILE)
+    parse_s = time.perf_counter() - begin_s
+    begin_s = time.perf_counter()
+    blocks, account = read_native(folder, header)
+    rows_n = sum(len(block) for block in blocks)
+    read_s = time.perf_counter() - begin_s
+    begin_s = time.perf_counter()
+    io.write_readings(tmp_path / "c.parquet", *read_native(folder, header))
+    write_s = time.perf_counter() - begin_s
+    print(
+        f"\nprobe log {parse_s:.1f} s; read {account['frames_n'] / read_s:,.0f} frames/s ({read_s:.0f} s), "
+        f"with Parquet {account['frames_n'] / write_s:,.0f} frames/s ({write_s:.0f} s); "
+        f"peak {peak_mb():.0f} MB ({before_mb:.0f} MB before)"
+    )
+    assert rows_n == 4 * INDENTATIONS_N
+    assert account["indentations_n"] == INDENTATIONS_N
+    assert peak_mb() < PEAK_MAX_MB

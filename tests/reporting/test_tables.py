@@ -1,0 +1,87 @@
+import json
+
+import pytest
+
+from pipeline.errors import SchemaError
+from pipeline.evaluation.metrics import METRICS
+from pipeline.reporting.numbers import add_up, compose, rounded
+from pipeline.reporting.paper import TABLE_2
+from pipeline.reporting.readme import fill
+from pipeline.reporting.tables import make_tables, show, to_markdown
+
+
+def card(question: str, fold: str, accuracy_pct: float, recipe: str = "paper") -> dict:
+    one = {"accuracy_pct": accuracy_pct, "mse_xy_mm2": 1.0, "mse_f_N2": 0.5}
+    scores = {"all": one, "registered": one, "by_skin": {"s0": one, "s1": {**one, "accuracy_pct": accuracy_pct + 10}}}
+    return {"question": question, "fold": fold, "recipe_name": recipe, "scores": scores}
+
+
+CARDS = [
+    card("lobo", "b0", 80.0), card("lobo", "b1", 90.0), card("lobo", "b0", 1.0, "released"),
+    card("transfer", "s0", 20.0),
+]  # fmt: skip
+ACCOUNTS = [{"bytes_n": 82, "frames_n": 1}, {"bytes_n": 164, "frames_n": 2}]
+
+
+def numbers(cards: list[dict] = CARDS, source: str = "recorded") -> dict:
+    provenance = {"source": source, "scene": "x", "git": "y", "seed": 1, "device": "z", "seconds": 1.0}
+    return {"provenance": provenance, **compose(cards, ACCOUNTS, {"low_force_rows_n": 3}, headline="paper")}
+
+
+def test_pooled_numbers_are_over_folds_and_single_ones_over_pairs_of_skins():
+    table2 = numbers()["table2"]
+    assert table2["multi"]["accuracy_pct"] == {"mean": 85.0, "n": 2, "sd": pytest.approx(50**0.5)}
+    assert table2["single"]["accuracy_pct"] == {"mean": 25.0, "n": 2, "sd": pytest.approx(50**0.5)}
+
+
+def test_a_question_that_was_not_asked_is_absent_and_not_null():
+    only_single = numbers([card("single_temporal", "s0", 99.0)])
+    assert "table2" not in only_single
+    assert "lobo" not in only_single
+    assert only_single["single_sensor"]["split"] == "single_temporal"
+    assert "null" not in json.dumps(only_single)
+
+
+def test_variants_stand_apart_from_the_headline():
+    assert numbers()["variants"]["lobo"]["released"]["accuracy_pct"]["mean"] == 1.0
+
+
+def test_accounts_add_up():
+    assert add_up(ACCOUNTS) == {"captures_n": 2, "bytes_n": 246, "frames_n": 3}
+
+
+def test_every_table_says_where_its_rows_come_from():
+    for source in ("simulated", "recorded"):
+        for table in make_tables(numbers(source=source)).values():
+            assert set(table["source"]) == {source}
+
+
+def test_the_papers_numbers_stand_beside_ours():
+    text = to_markdown(make_tables(numbers())["table2"])
+    for value in TABLE_2["multi"].values():
+        assert show({"mean": value[0], "sd": value[1]}) in text
+    assert "85 ± 7.1" in text
+
+
+def test_a_number_that_is_not_known_is_a_dash():
+    cards = [card("single_temporal", "s0", 99.0)]
+    del cards[0]["scores"]["all"]["mse_f_N2"]
+    table = make_tables(numbers(cards))["single_sensor"]
+    assert table["MSE_F, N² (ours)"].tolist() == ["–"]
+
+
+@pytest.mark.parametrize(("value", "kept"), [(1234567.8, 1234570.0), (0.000123456789, 0.000123457), (0.0, 0.0)])
+def test_rounding_keeps_six_digits(value, kept):
+    assert rounded({"a": [value, 3]}) == {"a": [kept, 3]}
+
+
+def test_generated_blocks_replace_only_what_is_between_their_marks():
+    text = "before\n<!-- a -->\nold\n<!-- /a -->\nafter\n"
+    assert fill(text, {"a": "new"}) == "before\n<!-- a -->\nnew\n<!-- /a -->\nafter\n"
+    assert fill(fill(text, {"a": r"\1 new"}), {"a": r"\1 new"}) == fill(text, {"a": r"\1 new"})
+    with pytest.raises(SchemaError, match="the block b must be between its two marks"):
+        fill(text, {"b": "new"})
+
+
+def test_all_metrics_have_a_column():
+    assert {metric for row in TABLE_2.values() for metric in row} == set(METRICS)
