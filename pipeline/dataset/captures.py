@@ -14,7 +14,6 @@ from pipeline.dataset.native import read_native
 from pipeline.errors import CaptureError, complain
 from pipeline.schema import Readings
 
-
 # What lies between dwells is no loss.
 LOST_FRAMES = ("dropped_failed_read_frames_n", "dropped_no_time_frames_n", "dropped_not_finite_frames_n")
 
