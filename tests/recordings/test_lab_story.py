@@ -1,0 +1,60 @@
+"""Real recordings from `reskin add` to a leave-one-board-out table, and one board more, and one less."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from ruamel.yaml import YAML
+
+from pipeline import plan
+from tests.stages.checkout import copy_checkout, run
+
+pytestmark = pytest.mark.timeout(420)
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory, shared_data) -> Iterator[Path]:
+    root = copy_checkout(tmp_path_factory.mktemp("lab"))
+    scene = root / plan.SCENES / "lab.yaml"
+    settings = YAML(typ="safe").load(scene.read_text())
+    settings["train_multi"]["seeds_n"] = 1
+    settings["train_multi"]["recipes"] = {"paper": settings["train_multi"]["recipes"]["paper"] | {"epochs_n": 4}}
+    with scene.open("w") as stream:
+        YAML().dump(settings, stream)
+    params = YAML(typ="safe").load((root / plan.PARAMS).read_text())
+    params["scenes"] = []
+    params["stages"] = {name: {} if name in ("ingest", "split") else [] for name in params["stages"]}
+    with (root / plan.PARAMS).open("w") as stream:
+        YAML().dump(params, stream)
+    for board in (1, 2):
+        add(root, shared_data / f"lab/board{board}_depth2.csv", f"board{board}", f"skin{board}")
+    run(root, "dvc", "repro")
+    return root
+
+
+def add(root: Path, file: Path, board: str, skin: str, *more: str) -> None:
+    run(root, "reskin", "add", str(file), "--layout", "lab", "--board", board, "--skin", skin, "--scene", "lab", *more)
+
+
+def by_board(root: Path) -> dict:
+    numbers = json.loads((root / "reports/lab/numbers.json").read_text())
+    assert numbers["provenance"]["source"] == "recorded"
+    return numbers["lobo"]["by_board"]
+
+
+def test_two_real_boards_give_two_folds_with_all_three_numbers(lab):
+    boards = by_board(lab)
+    assert sorted(boards) == ["board1", "board2"]
+    for parts in boards.values():
+        assert set(parts["as_labelled"]) == {"accuracy_pct", "mse_xy_mm2", "mse_f_N2"}
+
+
+def test_a_third_board_is_one_command_and_no_line_of_code(lab, shared_data):
+    add(lab, shared_data / "lab/board1_depth1.csv", "board3", "skin3")  # stands for a third board
+    said = run(lab, "dvc", "repro").stdout
+    assert sorted(by_board(lab)) == ["board1", "board2", "board3"]
+    assert "Stage 'ingest@lab-board1_skin1_board1_depth2' didn't change, skipping" in said
+    run(lab, "reskin", "remove", "lab", "board3_skin3_board1_depth1")
+    run(lab, "dvc", "repro")
+    assert sorted(by_board(lab)) == ["board1", "board2"]

@@ -1,0 +1,102 @@
+"""From a port to a capture that can be added, over a pseudo-terminal; whatever ends the recording."""
+
+import os
+import signal
+import subprocess
+import time
+import tty
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from pipeline.adding import Labels, native
+from pipeline.capture.header import HEADER_FILE, parse
+from pipeline.capture.wire import encode
+from tests.capture.signals import make_frames
+from tests.stages.checkout import ROOT
+
+FRAMES = make_frames(200, 5, seed=0)
+
+
+@pytest.fixture
+def terminal() -> Iterator[tuple[int, str]]:
+    far, near = os.openpty()
+    tty.setraw(near)
+    yield far, os.ttyname(near)
+    os.close(far)
+    os.close(near)
+
+
+def start(name: str, out: Path, *words: str) -> subprocess.Popen:
+    command = [
+        ROOT / ".venv/bin/reskin",
+        "record",
+        "--port",
+        name,
+        "--board",
+        "b0",
+        "--skin",
+        "s0",
+        "--out",
+        out,
+        *words,
+    ]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def send_until_something_came(far: int, part: Path) -> None:
+    stream = part / "stream.bin"
+    for _ in range(600):
+        if stream.exists():
+            os.write(far, encode(FRAMES, "binary")[:1640])
+            if stream.stat().st_size:
+                return
+        time.sleep(0.05)
+    raise AssertionError("nothing was recorded")
+
+
+def test_ctrl_c_ends_a_recording_that_can_be_added(terminal, tmp_path):
+    far, name = terminal
+    recorder = start(name, tmp_path / "run1")
+    send_until_something_came(far, tmp_path / "run1.part")
+    recorder.send_signal(signal.SIGINT)
+    said, complained = recorder.communicate(timeout=20)
+    assert recorder.returncode == 0, complained
+    assert "stopped" in said
+    header = parse((tmp_path / "run1" / HEADER_FILE).read_text(), "header")
+    assert set(header.files) == {"stream.bin", "arrivals.csv"}
+    probe = tmp_path / "probe.csv"
+    probe.write_text("")
+    _, files = native(tmp_path / "run1", Labels("b0", "s0", "lab", None), probe)
+    assert set(files) == {"stream.bin", "arrivals.csv", "probe.csv"}
+
+
+def test_what_a_killed_recorder_had_read_can_still_be_added(terminal, tmp_path):
+    far, name = terminal
+    recorder = start(name, tmp_path / "run1")
+    send_until_something_came(far, tmp_path / "run1.part")
+    recorder.kill()
+    recorder.communicate()
+    probe = tmp_path / "probe.csv"
+    probe.write_text("")
+    header, files = native(tmp_path / "run1.part", Labels("b0", "s0", "lab", None), probe)
+    assert header.capture == "run1"
+    assert files["stream.bin"].stat().st_size > 0
+
+
+def test_a_port_that_is_not_there_leaves_nothing_behind(tmp_path):
+    recorder = start(str(tmp_path / "none"), tmp_path / "run1")
+    _, complained = recorder.communicate(timeout=20)
+    assert recorder.returncode == 2
+    assert "the port must be one that opens" in complained
+    assert "Traceback" not in complained
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_is_there_is_not_written_over(tmp_path):
+    (tmp_path / "run1").mkdir()
+    recorder = start("/dev/null", tmp_path / "run1")
+    _, complained = recorder.communicate(timeout=20)
+    assert recorder.returncode == 2
+    assert "the capture's folder must be new" in complained
