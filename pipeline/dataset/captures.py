@@ -67,7 +67,10 @@ def check_losses(account: Mapping[str, int], limit: float, where: str) -> None:
         ("bytes_n", [key for key in account if key.startswith("skipped_") and key.endswith("_bytes_n")]),
         ("frames_n", [key for key in account if key in LOST_FRAMES]),
         ("rows_read_n", [key for key in account if key.startswith("dropped_") and key.endswith("_rows_n")]),
-        ("indentations_n", [key for key in account if key.startswith("dropped_") and key.endswith("_indentations_n")]),
+        (
+            "logged_indentations_n",
+            [key for key in account if key.startswith("dropped_") and key.endswith("_indentations_n")],
+        ),
     ):
         lost_n = sum(account[key] for key in lost)
         if lost_n > limit * account.get(whole, 0):

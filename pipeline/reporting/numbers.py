@@ -33,7 +33,11 @@ def compose(
         numbers["lobo"] = {
             "registered": over_folds(pooled, "registered"),
             "by_board": {
-                board: {"as_labelled": summarise_means(own, "all"), "registered": summarise_means(own, "registered")}
+                board: {
+                    "trained_on_skins_n": len(own[0]["train_skins"]),
+                    "as_labelled": summarise_means(own, "all"),
+                    "registered": summarise_means(own, "registered"),
+                }
                 for board, own in _group(pooled, "fold").items()
             },
         }

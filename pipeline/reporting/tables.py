@@ -64,8 +64,10 @@ def _boards(by_board: Mapping[str, Any], source: str) -> pd.DataFrame:
     words = {"as_labelled": "as labelled", "registered": "after one offset a board (uses its labels: a diagnosis)"}
     lines = []
     for board, parts in by_board.items():
-        for part, metrics in parts.items():
-            line = {"held-out board": board, "places": words[part], "source": source}
+        for part in words:
+            metrics = parts[part]
+            skins_n = str(parts["trained_on_skins_n"])
+            line = {"held-out board": board, "trained on skins": skins_n, "places": words[part], "source": source}
             lines.append(line | {title: f"{metrics[m]:.3g}" for m, title in COLUMNS.items() if m in metrics})
     return pd.DataFrame(lines)
 

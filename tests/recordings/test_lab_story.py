@@ -47,6 +47,7 @@ def test_two_real_boards_give_two_folds_with_all_three_numbers(lab):
     boards = by_board(lab)
     assert sorted(boards) == ["board1", "board2"]
     for parts in boards.values():
+        assert parts["trained_on_skins_n"] == 1
         assert set(parts["as_labelled"]) == {"accuracy_pct", "mse_xy_mm2", "mse_f_N2"}
 
 

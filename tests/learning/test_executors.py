@@ -1,0 +1,19 @@
+import os
+
+import pytest
+
+from pipeline.errors import ParamsError
+from pipeline.learning.executors import make_executor
+
+
+def test_trainings_run_in_processes_of_their_own(monkeypatch):
+    monkeypatch.setenv("RESKIN_EXECUTOR", "processes:1")
+    with make_executor() as executor:
+        assert executor.submit(os.getpid).result() != os.getpid()
+
+
+@pytest.mark.parametrize("word", ["", "threads:2", "processes", "processes:0", "processes:-1", "processes:x"])
+def test_an_unknown_executor_is_one_sentence(monkeypatch, word):
+    monkeypatch.setenv("RESKIN_EXECUTOR", word)
+    with pytest.raises(ParamsError, match="RESKIN_EXECUTOR: the executor must be processes:N"):
+        make_executor()

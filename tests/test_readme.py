@@ -1,0 +1,17 @@
+import subprocess
+
+import pytest
+
+from tests.stages.checkout import ROOT, run
+
+OWN = ["reports", "params.yaml", "data/captures.yaml", "dvc.yaml", "README.md"]
+
+
+def test_the_readme_shows_what_the_committed_results_say():
+    status = subprocess.run(
+        ["git", "status", "--porcelain", "--", *OWN], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    if status.returncode or status.stdout:
+        pytest.skip("this checkout has results or scenes of its own; `reskin readme` would show those")
+    done = run(ROOT, "reskin", "readme", "--check", check=False)
+    assert done.returncode == 0, done.stderr
