@@ -169,7 +169,9 @@ def readme(check: Annotated[bool, typer.Option("--check", help="Only tell whethe
     from pipeline.reporting.readme import blocks_of, fill
 
     scene = plan.check(ROOT).scenes[0]
-    dag = subprocess.run([sys.executable, "-m", "dvc", "dag"], capture_output=True, text=True, check=True).stdout
+    dag = subprocess.run(
+        [sys.executable, "-m", "dvc", "dag", "--md"], capture_output=True, text=True, check=True
+    ).stdout
     blocks = blocks_of(
         io.read_json(ROOT / "reports" / scene / "numbers.json"), dag, read_yaml(ROOT / "dvc.yaml")["stages"]
     )

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline import io
+from pipeline.evaluation.summary import over_folds
 from pipeline.server import TrackingAway, probe, server_uri
 
 STORE = "mlflow.db"
@@ -42,6 +43,7 @@ def publish(models: Path, figures: Path, *, scene: str, stage: str, root: Path) 
             counts["new_n" if fresh else "kept_n"] += 1
         current = {card["key"] for card in cards.values()} | {parent_key}
         counts["superseded_n"] = _mark_superseded(client, experiment_id, stage, current)
+        _log_means(client, parent_id, list(cards.values()))
         client.log_artifacts(parent_id, str(figures), "figures")
         client.set_terminated(parent_id)
     return counts
@@ -74,7 +76,9 @@ def _experiment(client: Any, scene: str, root: Path) -> str:
     if found is not None:
         return str(found.experiment_id)
     location = None if server_uri() else (root / ARTIFACTS / scene).resolve().as_uri()
-    return str(client.create_experiment(scene, artifact_location=location))
+    # The kind tells the UI to show trainings, not chats.
+    kind = {"mlflow.experimentKind": "custom_model_development"}
+    return str(client.create_experiment(scene, artifact_location=location, tags=kind))
 
 
 def _open_parent(client: Any, experiment_id: str, stage: str, scene: str, key: str) -> str:
@@ -98,6 +102,7 @@ def _publish_one(client: Any, experiment_id: str, stage: str, parent_id: str, fi
     words = ("scene", "question", "recipe_name", "fold", "git")
     tags = {name: card[name] for name in words} | {
         "run_key": card["key"], "stage": stage, "kind": "training", "current": "true", parent_tag: parent_id,
+        "mlflow.source.name": f"pipeline.stages.{stage}", "mlflow.source.git.commit": card["git"],
     }  # fmt: skip
     run_id = client.create_run(experiment_id, tags=tags, run_name=file.stem).info.run_id
     _log(client, run_id, card)
@@ -125,6 +130,18 @@ def _set_tags(client: Any, run: Any, tags: dict[str, str]) -> None:
     for name, value in tags.items():
         if run.data.tags.get(name) != value:
             client.set_tag(run.info.run_id, name, value)
+
+
+def _log_means(client: Any, run_id: str, cards: list[dict[str, Any]]) -> None:
+    """Write to the parent what its children say together: mean and sd of each question and recipe."""
+    from mlflow.entities import Metric
+
+    metrics = []
+    for question, recipe in sorted({(card["question"], card["recipe_name"]) for card in cards}):
+        own = [card for card in cards if (card["question"], card["recipe_name"]) == (question, recipe)]
+        for name, summary in over_folds(own).items():
+            metrics += [Metric(f"{question}.{recipe}.{name}.{key}", value, 0, 0) for key, value in summary.items()]
+    client.log_batch(run_id, metrics=metrics)
 
 
 def _find(client: Any, experiment_id: str, stage: str, key: str) -> Any:

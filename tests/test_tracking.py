@@ -68,6 +68,8 @@ def test_every_training_is_a_child_run_once_however_often_it_is_published(tmp_pa
     assert sorted(run.data.tags["fold"] for run in children) == ["b0", "b1"]
     assert {run.data.tags["mlflow.parentRunId"] for run in children} == {parent.info.run_id}
     assert {run.info.status for run in [*children, parent]} == {"FINISHED"}
+    assert parent.data.metrics["lobo.paper.accuracy_pct.mean"] == 50.0
+    assert parent.data.metrics["lobo.paper.accuracy_pct.n"] == 2
     client = mlflow.MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
     run = children[0]
     assert run.data.metrics == {"accuracy_pct": 50.0, "registered_accuracy_pct": 60.0, "train_loss": 1.0}

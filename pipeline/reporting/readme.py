@@ -32,7 +32,7 @@ def blocks_of(numbers: Mapping[str, Any], dag: str, stages: Mapping[str, Any]) -
         "single-sensor row, training skins x test skins)."
     )
     results = [words] + [to_markdown(tables[name]) for name in ("table2", "single_sensor") if name in tables]
-    return {"results": "\n\n".join(results), "dag": f"```\n{dag.rstrip()}\n```", "stages": _stages(stages)}
+    return {"results": "\n\n".join(results), "dag": dag, "stages": _stages(stages)}
 
 
 def _stages(stages: Mapping[str, Any]) -> str:
