@@ -21,6 +21,7 @@ LSB_TOLERANCE = 0.1  # gains of the MLX90393 are a fifth or more apart (data she
 # real recordings are one step. Values without a grid have one smallest gap, and by chance one or two close to it.
 STEP_SHARE_MIN = 0.04
 STEPS_MIN_N = 4
+STEP_MIN_uT = 0.1  # no setting of the MLX90393 has a finer LSB than 0.150 uT (data sheet, table 17)
 SAME_VALUE_uT = 1e-3  # float32 arithmetic may write one value in two ways
 
 # Noise moves a chip that works; it repeats itself only when it is read again before its next conversion is done
@@ -90,7 +91,7 @@ def _step(axes_uT: list[Float[np.ndarray, " f"]]) -> float:
     if not len(gaps_uT):
         return np.nan
     single = gaps_uT[gaps_uT < 1.5 * gaps_uT.min()]
-    shows = len(single) >= max(STEPS_MIN_N, STEP_SHARE_MIN * len(gaps_uT))
+    shows = len(single) >= max(STEPS_MIN_N, STEP_SHARE_MIN * len(gaps_uT)) and single.mean() >= STEP_MIN_uT
     return float(single.mean()) if shows else np.nan
 
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.capture import bursts
+from pipeline.capture import bursts, stream
 from pipeline.capture.stream import FrameStream, decode_all
 from pipeline.capture.wire import Frames, concatenate, encode, line_bytes_max_n, record_type
 from pipeline.errors import CaptureError
@@ -23,9 +23,9 @@ def chips_of(frames: Frames) -> int:
 
 
 def stream_in(portions: list[bytes], wire: str, chips_n: int) -> tuple[Frames, dict[str, int]]:
-    stream = FrameStream(wire, chips_n)
-    parts = [stream.feed(portion) for portion in portions]
-    return concatenate([*parts, stream.close()], chips_n), stream.account()
+    frame_stream = FrameStream(wire, chips_n)
+    parts = [frame_stream.feed(portion) for portion in portions]
+    return concatenate([*parts, frame_stream.close()], chips_n), frame_stream.account()
 
 
 def check_account(account: dict[str, int], data: bytes) -> None:
@@ -90,8 +90,8 @@ def test_byte_by_byte_is_as_good_as_whole(wire):
 @pytest.mark.parametrize("wire", WIRES)
 def test_a_frame_is_there_with_its_last_byte_and_not_one_frame_later(wire):
     frames = make_frames(4, 5, 2)
-    stream, data = FrameStream(wire, 5), encode(frames, wire)
-    arrivals = [i + 1 for i in range(len(data)) for _ in range(len(stream.feed(data[i : i + 1])))]
+    frame_stream, data = FrameStream(wire, 5), encode(frames, wire)
+    arrivals = [i + 1 for i in range(len(data)) for _ in range(len(frame_stream.feed(data[i : i + 1])))]
     whole, _ = stream_in([data], wire, 5)
     assert arrivals == whole.end_byte.tolist()
 
@@ -179,6 +179,15 @@ def test_a_steady_temperature_that_holds_the_terminator_misleads_nobody():
         assert records(kept) == records(frames)[1:]
 
 
+def test_the_rest_of_two_frames_behind_a_terminator_in_a_payload_is_no_frame():
+    frames = make_frames(6, 1, 3)
+    frames.temperature_degC[2], frames.b_uT[2, 0] = CRLF_TEMPERATURE_degC, 100.0
+    data = encode(frames, "binary")
+    # 8 bytes of frame 2 and 13 of frame 3 are left: from behind the CR LF in the temperature, as many as a frame has.
+    kept, _ = stream_in([data[: 2 * 18 + 8] + data[3 * 18 + 5 :]], "binary", 1)
+    assert records(kept) == [record for i, record in enumerate(records(frames)) if i not in (2, 3)]
+
+
 @pytest.mark.parametrize("wire", BINARY_WIRES)
 def test_chips_that_answer_nonsense_still_send_frames(wire):
     frames = make_frames(20, 5, 4)
@@ -224,6 +233,19 @@ def test_a_line_without_end_is_not_kept_waiting(portion_n):
     kept, account = stream_in([data[i : i + portion_n] for i in range(0, len(data), portion_n)], "text-xyzt", 1)
     assert len(kept) == 2
     check_account(account, data)
+
+
+def test_what_is_left_of_a_line_without_end_is_no_frame():
+    line = encode(make_frames(1, 1, 8), "text-xyzt")
+    kept, account = stream_in([line + b"9" * 2 * line_bytes_max_n(1), line, line], "text-xyzt", 1)
+    assert kept.end_byte.tolist() == [len(line), account["bytes_n"]]
+
+
+def test_many_lines_are_read_in_pieces_and_each_ends_where_it_ends(monkeypatch):
+    data = encode(make_frames(10, 2, 8), "text-xyzt")
+    monkeypatch.setattr(stream, "BLOCK_LINES_N", 3)
+    kept, _ = stream_in([data[:20], data[20:]], "text-xyzt", 2)
+    assert kept.end_byte.tolist() == np.cumsum([len(line) for line in data.splitlines(keepends=True)]).tolist()
 
 
 def test_a_long_stream_with_many_breaks_is_read_in_pieces():
