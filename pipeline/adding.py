@@ -1,116 +1,33 @@
-"""Adding a recording: somebody's files -> data/raw/<scene>/<capture>/, tracked, registered, planned. Or nothing at all.
+"""Adding a recording: a header and files -> data/raw/<scene>/<capture>/, tracked, registered, planned. Or nothing.
 
-Everything is read and checked in a temporary folder first; what fails leaves no trace. Refuses to know layouts
-(`capture.readers`) and plans (`plan`).
+Everything is read through and checked before it counts; what fails, or is stopped, leaves no trace. Refuses to know
+layouts (`preparing`, `capture.readers`) and stages (`plan`).
 """
 
-import re
+import hashlib
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
 
 from pipeline import io, plan
-from pipeline.capture import header as headers
-from pipeline.capture.folder import digest, write_capture
-from pipeline.capture.header import Clock, Header
-from pipeline.capture.readers import READERS
-from pipeline.dataset.captures import check_losses, open_capture, read_header
-from pipeline.errors import CaptureError, ParamsError, complain
+from pipeline.capture.folder import write_capture
+from pipeline.capture.header import STREAM_FILE, Header
+from pipeline.dataset.captures import check_losses, open_capture
+from pipeline.errors import CaptureError, ReskinError, complain
 from pipeline.params import read_params, read_scene
+from pipeline.preparing import Prepared
 from pipeline.registry import REGISTRY, read_registry, with_capture, without_capture, write_registry
 
 RAW = "data/raw"
 INDENTATIONS = "data/indentations"
-AddLayout = Literal["capture", "serial-binary", "serial-text", "lab", "ini", "eflesh"]
-NATIVE_FILES = (headers.STREAM_FILE, headers.ARRIVALS_FILE, headers.PROBE_FILE)
-RECORDINGS_OWN = Clock(kind="recording", rate_hz=None, marks=())
-
-
-@dataclass(frozen=True)
-class Labels:
-    """What the user says of a recording; `None` where the recording itself may say."""
-
-    board: str
-    skin: str
-    scene: str
-    name: str | None
-
-
-@dataclass(frozen=True)
-class Dump:
-    """What a bare serial dump does not say: wire format, chips, rate, and where the robot was."""
-
-    wire: headers.Wire
-    chips_n: int
-    rate_hz: float
-    probe: Path | None
-
-
-Prepared = tuple[Header, Mapping[str, bytes | Path]]
-
-
-def foreign(recording: Path, layout: Literal["lab", "ini", "eflesh"], labels: Labels, force_axis: str) -> Prepared:
-    """Prepare somebody else's recording: its own files, untouched, under a header."""
-    files = READERS[layout].collect(recording)
-    chips_n = READERS[layout].count_chips(files)
-    options = {"force_axis": force_axis} if layout == "eflesh" else {}
-    return _header(labels, recording, layout=layout, chips_n=chips_n, special={"options": options}), files
-
-
-def dump(recording: Path, labels: Labels, what: Dump) -> Prepared:
-    """Prepare a bare dump of a port with the robot's log; frames get their time from a constant rate."""
-    if what.probe is None:
-        raise CaptureError(
-            complain(
-                recording,
-                "a serial dump",
-                "accompanied by its probe log",
-                "none",
-                "Add --probe PROBE.csv (columns in data/README.md).",
-            )
-        )
-    _need_file(recording)
-    _need_file(what.probe)
-    clock = Clock(kind="rate", rate_hz=what.rate_hz, marks=())
-    special = {"wire": what.wire, "clock": clock}
-    header = _header(labels, recording, layout="native", chips_n=what.chips_n, special=special)
-    return header, {headers.STREAM_FILE: recording, headers.PROBE_FILE: what.probe}
-
-
-def native(recording: Path, labels: Labels, probe: Path | None) -> Prepared:
-    """Prepare a capture folder that `reskin record` wrote; `probe` adds the robot's log to it."""
-    found = read_header(recording)
-    for what, said, written in (("board", labels.board, found.board), ("skin", labels.skin, found.skin)):
-        if said != written:
-            raise CaptureError(
-                complain(recording, f"--{what}", f"{written!r}, as its header says", repr(said), "Which is right?")
-            )
-    # A recorder that was killed has not hashed its files into the header; they are there all the same.
-    files = {name: recording / name for name in NATIVE_FILES if (recording / name).exists() or name in found.files}
-    if probe is not None:
-        _need_file(probe)
-        files[headers.PROBE_FILE] = probe
-    if headers.PROBE_FILE not in files:
-        raise CaptureError(
-            complain(recording, "a capture", "labelled by a probe log", "none", "Add --probe PROBE.csv.")
-        )
-    for name, file in files.items():
-        _need_file(file)
-        if file.parent == recording and found.files.get(name, io.sha256(file)) != io.sha256(file):
-            raise CaptureError(
-                complain(file, "the file", "unchanged since it was recorded", "another hash", "Record it again.")
-            )
-    return found.model_copy(update={"capture": labels.name or found.capture}), files
 
 
 def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Header:
     """Check a prepared recording, write it, track it with DVC, register it, and plan its scene; all, or nothing."""
     header, files = prepared
-    settings = read_scene(_scene_file(root, scene))
+    settings = read_scene(plan.scene_file(root, scene))
     if settings.source != header.source:
         raise CaptureError(
             complain(
@@ -118,17 +35,14 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
                 "Simulated and recorded captures belong to different scenes.",
             )
         )  # fmt: skip
-    params = read_params(root / plan.PARAMS)
-    before = read_registry(root)
+    params, before = read_params(root / plan.PARAMS), read_registry(root)
     target = root / RAW / scene / header.capture
-    if target.exists():
-        raise CaptureError(
-            complain(target, "a new capture's folder", "free", "one that is there", "Choose another --name.")
-        )
+    _check_free(target, header.capture in before.captures.get(scene, {}))
     with io.restoring(root / REGISTRY, root / plan.PARAMS), _forgetting_on_failure(target):
-        complete = write_capture(target, header, files)
-        after = with_capture(before, scene, complete, digest(complete), allow_copy=allow_copy)
-        _read_through(target, params.lost_fraction_max)
+        with _naming_sources(target, files):
+            complete = write_capture(target, header, files)
+            fingerprints = _read_through(target, complete, params.lost_fraction_max)
+        after = with_capture(before, scene, complete, fingerprints, allow_copy=allow_copy)
         _dvc(root, "add", "--quiet", str(target.relative_to(root)))
         write_registry(root, after)
         plan.use(root, [*params.scenes, scene])
@@ -136,60 +50,52 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
 
 
 def remove(root: Path, scene: str, capture: str) -> None:
-    """Take a capture out again: its raw files, its readings, its entry, and its stage."""
+    """Take a capture out again: its entry and its stage, then its raw files and its readings."""
     after = without_capture(read_registry(root), scene, capture)
     params = read_params(root / plan.PARAMS)
-    write_registry(root, after)
-    plan.use(root, [name for name in params.scenes if name != scene or scene in after.captures])
+    with io.restoring(root / REGISTRY, root / plan.PARAMS):
+        write_registry(root, after)
+        plan.use(root, [name for name in params.scenes if name != scene or scene in after.captures])
     _forget(root / RAW / scene / capture)
     io.remove(root / INDENTATIONS / scene / f"{capture}.parquet")
 
 
-def _header(
-    labels: Labels,
-    recording: Path,
-    *,
-    layout: headers.Layout,
-    chips_n: int,
-    special: Mapping[str, Any],
-) -> Header:
-    for option, word in (("--board", labels.board), ("--skin", labels.skin), ("--name", labels.name)):
-        if word is not None and not re.fullmatch(headers.NAME, word):
-            raise CaptureError(complain(option, "a name", "1 to 64 of A-Z a-z 0-9 _ -", repr(word), "Choose another."))
-    stem = re.sub(r"[^A-Za-z0-9_-]", "_", recording.resolve().stem)
-    header = Header.model_construct(
-        format="reskin-capture/1", capture=labels.name or f"{labels.board}_{labels.skin}_{stem}"[:64],
-        board=labels.board, skin=labels.skin, source="recorded", layout=layout, wire=None, chips_n=chips_n,
-        unit_b="uT", unit_force="N", unit_place="mm", firmware=None, clock=RECORDINGS_OWN,
-        protocol=f"as recorded in {stem}", contacts_before_n=0, options={}, files={}, note="added by reskin add",
-    )  # fmt: skip
-    return headers.parse(headers.render(header.model_copy(update=dict(special))), str(recording))
+def _check_free(target: Path, registered: bool) -> None:
+    if registered:
+        remedy = "Choose another --name, or reskin remove the old one first."
+        raise CaptureError(
+            complain(f"capture {target.name}", "its name", "new to its scene", "one that is taken", remedy)
+        )
+    if target.exists():
+        remedy = "It is in no scene: an add was killed there. Delete the folder, or choose another --name."
+        raise CaptureError(complain(target, "a new capture's folder", "free", "one that is there", remedy))
 
 
-def _read_through(folder: Path, limit: float) -> None:
+def _read_through(folder: Path, header: Header, limit: float) -> tuple[str, ...]:
+    """Read a capture as ingest will; return the hashes that tell a copy of it, however it is labelled or laid out."""
     _, blocks, account = open_capture(folder)
-    rows_n = sum(len(block) for block in blocks)
+    rows_n, readings = 0, hashlib.sha256()
+    for block in blocks:
+        rows_n += len(block)
+        readings.update(block.b_uT.tobytes())
     check_losses(account, limit, folder.name)
     if rows_n == 0:
-        raise CaptureError(
-            complain(
-                folder.name, "a capture", "one reading or more", f"none; counted {dict(account)}", "Check its files."
-            )
-        )
+        counts = f"none; counted {dict(account)}"
+        raise CaptureError(complain(folder.name, "a capture", "one reading or more", counts, "Check its files."))
+    return (readings.hexdigest(), *(header.files[name] for name in (STREAM_FILE,) if name in header.files))
 
 
-def _need_file(path: Path) -> None:
-    if not path.is_file():
-        raise CaptureError(complain(path, "the file", "there", "nothing", "Check the path."))
-
-
-def _scene_file(root: Path, scene: str) -> Path:
-    if scene not in plan.scene_names(root):
-        known = ", ".join(plan.scene_names(root))
-        raise ParamsError(
-            complain("--scene", "a scene", f"one of {known}", scene, f"Or write {plan.SCENES}/{scene}.yaml.")
-        )
-    return root / plan.SCENES / f"{scene}.yaml"
+@contextmanager
+def _naming_sources(target: Path, files: Mapping[str, bytes | Path]) -> Iterator[None]:
+    """Let errors name the user's files, and not copies that are about to go."""
+    try:
+        yield
+    except ReskinError as error:
+        sentence = str(error)
+        for name, source in files.items():
+            for copy in (str(target / name), f"{target.name}/{name}"):
+                sentence = sentence.replace(copy, str(source))
+        raise type(error)(sentence) from None
 
 
 @contextmanager

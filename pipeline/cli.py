@@ -1,6 +1,7 @@
 """The `reskin` command: words of the command line -> one call each. Knows no format and no model."""
 
 import math
+import signal
 import subprocess
 import sys
 from enum import StrEnum
@@ -9,8 +10,8 @@ from typing import Annotated
 
 import typer
 
-from pipeline import adding, io, plan
-from pipeline.errors import ReskinError
+from pipeline import adding, io, plan, preparing
+from pipeline.errors import ParamsError, ReskinError, complain
 from pipeline.params import arms_of, read_scene
 from pipeline.server import TrackingAway
 from pipeline.strict import read_yaml
@@ -38,13 +39,6 @@ class Layout(StrEnum):
     EFLESH = "eflesh"
 
 
-class TextOrder(StrEnum):
-    """Order of the four values a chip in a text stream."""
-
-    XYZT = "xyzt"
-    TXYZ = "txyz"
-
-
 class Wire(StrEnum):
     """The formats that boards send."""
 
@@ -65,6 +59,7 @@ class Axis(StrEnum):
 def main() -> None:
     """Run the command; show what a user did wrong as one sentence, without a traceback."""
     try:
+        signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what began is undone
         app()
     except ReskinError as error:
         typer.echo(f"error: {error}", err=True)
@@ -82,21 +77,30 @@ def add(
     probe: Annotated[Path | None, typer.Option(help="capture, serial-*: the robot's log (CSV).")] = None,
     chips_n: Annotated[int, typer.Option("--chips", help="serial-*: chips in a frame.", min=1, max=64)] = 5,
     rate_hz: Annotated[float, typer.Option("--rate-hz", help="serial-*: frames a second.")] = 400.0,
-    order: Annotated[TextOrder, typer.Option(help="serial-text: order of values.")] = TextOrder.XYZT,
+    wire: Annotated[Wire | None, typer.Option(help="serial-*: format, if not binary or text-xyzt.")] = None,
+    mark: Annotated[
+        list[str] | None,
+        typer.Option(help="capture, serial-*: STREAM_S,PROBE_S, one event on both clocks; may be repeated."),
+    ] = None,
+    rows_late: Annotated[int, typer.Option(help="ini: rows by which fields lag behind truths.", min=0, max=5)] = 0,
     force_axis: Annotated[Axis, typer.Option(help="eflesh: the gauge's direction.")] = Axis.Z,
     allow_copy: Annotated[
         bool, typer.Option("--allow-copy", help="Accept bytes that are there under another label.")
     ] = False,
 ) -> None:
     """Add a recording to a scene; then `dvc repro` uses it."""
-    labels = adding.Labels(board, skin, scene, name)
+    labels = preparing.Labels(board, skin, name)
+    marks = preparing.parse_marks(mark or [])
     if layout is Layout.CAPTURE:
-        prepared = adding.native(recording, labels, probe)
+        prepared = preparing.native(recording, labels, probe, marks)
     elif layout in (Layout.SERIAL_BINARY, Layout.SERIAL_TEXT):
-        wire = "binary" if layout is Layout.SERIAL_BINARY else f"text-{order}"
-        prepared = adding.dump(recording, labels, adding.Dump(wire, chips_n, rate_hz, probe))  # type: ignore[arg-type]
+        usual = Wire.BINARY if layout is Layout.SERIAL_BINARY else Wire.TEXT_XYZT
+        dump = preparing.Dump((wire or usual).value, chips_n, rate_hz, probe, marks)
+        prepared = preparing.dump(recording, labels, dump)
     else:
-        prepared = adding.foreign(recording, layout.value, labels, force_axis.value)  # type: ignore[arg-type]
+        options = {"force_axis": force_axis.value} if layout is Layout.EFLESH else {}
+        options |= {"rows_late": str(rows_late)} if layout is Layout.INI else {}
+        prepared = preparing.foreign(recording, layout.value, labels, options)  # type: ignore[arg-type]
     header = adding.add(ROOT, scene, prepared, allow_copy=allow_copy)
     typer.echo(f"added {scene}/{header.capture} (board {board}, skin {skin}); now: dvc repro")
 
@@ -150,17 +154,16 @@ def publish() -> None:
     from pipeline.tracking import publish as write
 
     for scene in plan.check(ROOT).scenes:
-        for arm in arms_of(read_scene(ROOT / plan.SCENES / f"{scene}.yaml")):
-            models = ROOT / "data/models" / scene / arm
-            if not models.is_dir():
-                typer.echo(f"{scene} {arm}: no models yet; run dvc repro first")
-                continue
-            try:
-                counts = write(models, ROOT / "reports" / scene / "figures", scene=scene, stage=arm, root=ROOT)
-            except TrackingAway as away:
-                typer.echo(f"error: {away}", err=True)
-                sys.exit(3)
-            typer.echo(f"{scene} {arm}: MLflow runs {counts}")
+        arms = {arm: ROOT / "data/models" / scene / arm for arm in arms_of(read_scene(plan.scene_file(ROOT, scene)))}
+        if not all(models.is_dir() for models in arms.values()):
+            typer.echo(f"{scene}: no models yet; run dvc repro first")
+            continue
+        try:
+            counts = write(arms, ROOT / "reports" / scene / "figures", scene=scene, root=ROOT)
+        except TrackingAway as away:
+            typer.echo(f"error: {away}", err=True)
+            sys.exit(3)
+        typer.echo(f"{scene}: MLflow runs {counts}")
 
 
 @app.command()
@@ -168,7 +171,10 @@ def readme(check: Annotated[bool, typer.Option("--check", help="Only tell whethe
     """Fill in the generated parts of README.md from the results of the scenes that run."""
     from pipeline.reporting.readme import blocks_of, fill
 
-    scene = plan.check(ROOT).scenes[0]
+    running = plan.check(ROOT).scenes
+    if not running:
+        raise ParamsError(complain("params.yaml", "scenes", "one or more", "none", "Try: reskin scenes use quick"))
+    scene = running[0]
     dag = subprocess.run(
         [sys.executable, "-m", "dvc", "dag", "--md"], capture_output=True, text=True, check=True
     ).stdout

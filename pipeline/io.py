@@ -35,6 +35,8 @@ def replacing(path: Path) -> Iterator[Path]:
         yield temporary
         if temporary.is_dir():
             remove(path)
+        elif path.is_dir():
+            raise SchemaError(complain(path, "a file to write", "no folder", "a folder", "Choose another name."))
         temporary.replace(path)
     finally:
         remove(temporary)
@@ -108,7 +110,7 @@ def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
         with safetensors.safe_open(path, framework="numpy") as file:
             return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}
     except (safetensors.SafetensorError, OSError) as error:
-        raise SchemaError(complain(path, "the file", "safetensors", error, "Train it again.")) from None
+        raise SchemaError(complain(path, "the file", "safetensors", error, "Delete it, and train again.")) from None
 
 
 def write_table(path: Path, table: pa.Table) -> None:

@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 
 from pipeline.dataset.rows import Selection
 from pipeline.dataset.splits import Question, Split
+from pipeline.errors import ParamsError, complain
 from pipeline.learning.recipe import Training
 from pipeline.strict import Strict, parse, read_yaml
 
@@ -93,6 +94,18 @@ def read_scene(path: Path) -> Scene:
 def read_params(path: Path) -> Params:
     """Read and check `params.yaml`."""
     return parse(Params, read_yaml(path), str(path))
+
+
+def check_planned(name: str, scene: Scene, params: Params, where: str) -> None:
+    """Raise if `params.yaml` has no stage for a question that the scene asks: it was added by hand since."""
+    unplanned = [arm for arm in arms_of(scene) if name not in getattr(params.stages, arm)]
+    if unplanned:
+        raise ParamsError(
+            complain(
+                where, "questions", "planned in params.yaml", f"{', '.join(unplanned)} without a stage",
+                f"Try: reskin scenes use {' '.join(params.scenes)}",
+            )
+        )  # fmt: skip
 
 
 def arms_of(scene: Scene) -> list[str]:

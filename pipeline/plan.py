@@ -14,6 +14,7 @@ from pipeline import io
 from pipeline.errors import ParamsError, complain
 from pipeline.params import ANSWERED_BY, ARMS, Params, Scene, read_params, read_scene
 from pipeline.registry import Registry, read_registry
+from pipeline.strict import read_yaml
 
 PARAMS = "params.yaml"
 SCENES = "pipeline/scenes"
@@ -35,27 +36,40 @@ def make_plan(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, Any]
                 )
             )
     asked = {name: {ANSWERED_BY[question] for question in scene.questions} for name, scene in scenes.items()}
+    pairs = [(name, capture) for name in scenes for capture in captures[name]]
+    ingest = {f"{name}-{capture}": {"scene": name, "capture": capture} for name, capture in pairs}
+    if len(ingest) < len(pairs):
+        raise ParamsError(
+            complain("stage ingest", "scene-capture", "unlike any other", "two that read the same", "Rename a scene.")
+        )
     plan: dict[str, Any] = {
-        "simulate": simulated,
-        "ingest_simulated": simulated,
-        "ingest": {
-            f"{name}-{capture}": {"scene": name, "capture": capture} for name in scenes for capture in captures[name]
-        },
-        "split": captures,
-    }
+        "simulate": simulated, "ingest_simulated": simulated, "ingest": ingest, "split": captures,
+    }  # fmt: skip
     plan |= {arm: [name for name in scenes if arm in asked[name]] for arm in ARMS}
     return plan | {"report": list(scenes), "publish": list(scenes)}
 
 
 def scene_names(root: Path) -> list[str]:
     """The scenes that this checkout has."""
+    if not (root / SCENES).is_dir():
+        raise ParamsError(complain(root / SCENES, "the folder", "there", "nothing", "Run this in the checkout."))
     return sorted(file.stem for file in (root / SCENES).glob("*.yaml"))
+
+
+def scene_file(root: Path, name: str) -> Path:
+    """The file of a scene; raise if there is none."""
+    known = scene_names(root)
+    if name not in known:
+        remedy = f"Check the name, or write {SCENES}/{name}.yaml."
+        raise ParamsError(complain("scenes", "a scene", f"one of {', '.join(known)}", name, remedy))
+    return root / SCENES / f"{name}.yaml"
 
 
 def use(root: Path, names: Sequence[str]) -> None:
     """Let `params.yaml` run exactly these scenes."""
     plan = _plan_of(root, names)
     file = root / PARAMS
+    read_yaml(file)  # says in one sentence what a broken file has wrong
     yaml = YAML()  # round trip: comments stay
     yaml.width = 120
     document = yaml.load(file.read_text(encoding="utf-8"))
@@ -80,14 +94,7 @@ def check(root: Path) -> Params:
 
 
 def _plan_of(root: Path, names: Sequence[str]) -> dict[str, Any]:
-    unknown = sorted(set(names) - set(scene_names(root)))
-    if unknown:
-        raise ParamsError(
-            complain(
-                "scenes", "a scene", f"one of {', '.join(scene_names(root))}", ", ".join(unknown), "Check the name."
-            )
-        )
-    scenes = {name: read_scene(root / SCENES / f"{name}.yaml") for name in dict.fromkeys(names)}
+    scenes = {name: read_scene(scene_file(root, name)) for name in dict.fromkeys(names)}
     return make_plan(scenes, read_registry(root))
 
 

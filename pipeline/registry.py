@@ -16,13 +16,13 @@ REGISTRY = "data/captures.yaml"
 
 
 class Entry(Strict):
-    """One recorded capture: its labels, and the hash of its files, which tells a second copy."""
+    """One recorded capture: its labels, and the hashes that tell a second copy."""
 
     board: str
     skin: str
     layout: str
     chips_n: int
-    sha256: str
+    fingerprints: tuple[str, ...]  # of readings, and of the stream: one in common tells a copy
     copy_of: str | None
 
 
@@ -37,11 +37,13 @@ def read_registry(root: Path) -> Registry:
     return parse(Registry, read_yaml(root / REGISTRY), str(root / REGISTRY))
 
 
-def with_capture(registry: Registry, scene: str, header: Header, sha256: str, *, allow_copy: bool) -> Registry:
+def with_capture(
+    registry: Registry, scene: str, header: Header, fingerprints: tuple[str, ...], *, allow_copy: bool
+) -> Registry:
     """Add a capture, or raise if it is there already or contradicts what is there."""
     own = registry.captures.get(scene, {})
     where = f"capture {header.capture}"
-    twin = next((name for name, entry in own.items() if entry.sha256 == sha256), None)
+    twin = next((name for name, entry in own.items() if set(entry.fingerprints) & set(fingerprints)), None)
     if twin is not None:
         _refuse_copy(where, twin, own[twin], header, allow_copy)
     if header.capture in own:
@@ -63,7 +65,12 @@ def with_capture(registry: Registry, scene: str, header: Header, sha256: str, *,
                 )
             )
     entry = Entry(
-        board=header.board, skin=header.skin, layout=header.layout, chips_n=header.chips_n, sha256=sha256, copy_of=twin
+        board=header.board,
+        skin=header.skin,
+        layout=header.layout,
+        chips_n=header.chips_n,
+        fingerprints=fingerprints,
+        copy_of=twin,
     )
     return Registry(captures={**registry.captures, scene: {**own, header.capture: entry}})
 
@@ -98,4 +105,4 @@ def _refuse_copy(where: str, twin: str, entry: Entry, header: Header, allow_copy
     remedy = "It is in the scene already."
     if relabelled:
         remedy = "Under two labels it would stand on both sides of a fold; to try that knowingly, add --allow-copy."
-    raise CaptureError(complain(where, "a recording", "new to its scene", f"the bytes of {twin}", remedy))
+    raise CaptureError(complain(where, "a recording", "new to its scene", f"the readings of {twin}", remedy))

@@ -18,7 +18,7 @@ from pipeline.errors import ParamsError, complain
 class Strict(BaseModel):
     """A parameter model: what is not written is an error, and so is what is not known."""
 
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
 
 
 Model = TypeVar("Model", bound=Strict)
@@ -39,7 +39,7 @@ def parse(model: type[Model], value: Any, where: str) -> Model:
     """Check plain values against a model; name the first parameter that is wrong, and what is allowed."""
     try:
         # Through JSON, so that a YAML list may fill a tuple while "3" still does not become 3.
-        return model.model_validate_json(json.dumps(value))
+        return model.model_validate_json(json.dumps(value, default=str))
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         name = ".".join(map(str, first["loc"])) or "the file"

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from pipeline import adding, plan
-from pipeline.adding import Dump, Labels
+from pipeline import adding, plan, preparing
 from pipeline.capture import probe
 from pipeline.capture.folder import write_capture
 from pipeline.capture.header import Clock
@@ -16,6 +15,7 @@ from pipeline.capture.probe import ProbeLog
 from pipeline.capture.wire import encode
 from pipeline.dataset.captures import open_capture, read_header
 from pipeline.errors import ReskinError
+from pipeline.preparing import Dump, Labels
 from pipeline.registry import read_registry
 from tests.capture.headers import make_header
 from tests.capture.readers.test_lab import PRESSES, write
@@ -50,11 +50,11 @@ def lab_file(tmp_path) -> Path:
 
 
 def labels(board: str = "board1", skin: str = "skin1", name: str | None = None) -> Labels:
-    return Labels(board, skin, "small", name)
+    return Labels(board, skin, name)
 
 
 def add_lab(root: Path, file: Path, *, allow_copy: bool = False, **words: str):
-    return adding.add(root, "small", adding.foreign(file, "lab", labels(**words), "z"), allow_copy=allow_copy)
+    return adding.add(root, "small", preparing.foreign(file, "lab", labels(**words), {}), allow_copy=allow_copy)
 
 
 def contents(root: Path) -> dict[str, bytes]:
@@ -87,12 +87,56 @@ def test_a_recording_that_was_added_is_tracked_registered_and_planned(root, lab_
 
 def test_the_same_recording_twice_is_refused_and_another_label_needs_a_word(root, lab_file):
     add_lab(root, lab_file)
-    refuse(root, lambda: add_lab(root, lab_file), "folder must be free|new to its scene")
+    refuse(root, lambda: add_lab(root, lab_file), "its name must be new to its scene")
     refuse(root, lambda: add_lab(root, lab_file, name="again"), "It is in the scene already")
     refuse(root, lambda: add_lab(root, lab_file, board="board2", skin="skin2"), "--allow-copy")
-    refuse(root, lambda: add_lab(root, lab_file, board="board2", name="x"), "the bytes of")
+    refuse(root, lambda: add_lab(root, lab_file, board="board2", name="x"), "the readings of")
     add_lab(root, lab_file, board="board2", skin="skin2", allow_copy=True)
     assert len(plan.check(root).stages.ingest) == 2
+
+
+def test_a_copy_written_with_a_digit_more_is_still_a_copy(root, lab_file, tmp_path):
+    add_lab(root, lab_file)
+    (tmp_path / "copy.csv").write_text(lab_file.read_text().replace("21.5,", "21.50,"))
+    refuse(root, lambda: add_lab(root, tmp_path / "copy.csv", board="board2", skin="skin2"), "--allow-copy")
+
+
+def test_a_removal_that_cannot_be_planned_changes_nothing(root, lab_file):
+    add_lab(root, lab_file)
+    params = root / plan.PARAMS
+    params.write_text(
+        params.read_text().replace("- small", "- small\n- nowhere").replace("[small]", "[small, nowhere]")
+    )
+    refuse(root, lambda: adding.remove(root, "small", "board1_skin1_readings"), "nowhere")
+
+
+def test_what_a_killed_add_left_is_told_from_a_capture(root, lab_file):
+    (root / "data/raw/small/board1_skin1_readings").mkdir(parents=True)
+    refuse(root, lambda: add_lab(root, lab_file), "an add was killed there")
+
+
+def test_errors_name_the_users_file_and_not_a_copy_of_it(root, tmp_path):
+    (tmp_path / "mine.csv").write_bytes(b"indent,phase,x_mm,y_mm,T0,Bx0,By0,Bz0,Fx,Fy,Fz\n")
+    refuse(root, lambda: add_lab(root, tmp_path / "mine.csv"), str(tmp_path / "mine.csv"))
+
+
+@pytest.mark.parametrize("rate_hz", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_rate_that_is_none_is_refused(root, tmp_path, rate_hz):
+    for name in ("dump.bin", "probe.csv"):
+        (tmp_path / name).write_bytes(b"")
+    what = Dump("binary", 2, rate_hz, tmp_path / "probe.csv", ())
+    refuse(root, lambda: preparing.dump(tmp_path / "dump.bin", labels(), what), "--rate-hz")
+
+
+@pytest.mark.parametrize("word", ["", "1", "1,2,3", "a,b", "nan,1"])
+def test_a_mark_that_is_none_is_refused(word):
+    with pytest.raises(ReskinError, match="--mark: a mark must be STREAM_S,PROBE_S"):
+        preparing.parse_marks([word])
+
+
+def test_marks_join_the_clock_of_a_capture(tmp_path):
+    header, _ = preparing.native(native_folder(tmp_path / "run1"), labels(), None, preparing.parse_marks(["1.5,2e1"]))
+    assert header.clock.marks == ((0.0, 0.0), (1.5, 20.0))
 
 
 @pytest.mark.parametrize(
@@ -109,24 +153,26 @@ def test_a_recording_that_is_not_there_is_named(root, tmp_path):
 
 def test_a_recording_in_the_wrong_layout_is_refused(root, lab_file):
     for layout in ("ini", "eflesh"):
-        refuse(root, lambda: adding.foreign(lab_file, layout, labels(), "z"), "readings.csv")  # noqa: B023
-    refuse(root, lambda: adding.native(lab_file.parent, labels(), None), "header.json")
+        refuse(root, lambda: preparing.foreign(lab_file, layout, labels(), {}), "readings.csv")  # noqa: B023
+    refuse(root, lambda: preparing.native(lab_file.parent, labels(), None, ()), "header.json")
 
 
-@pytest.mark.parametrize("name", ["../up", "a b", "", "x" * 80, "ä"])
-def test_a_name_that_is_no_name_is_refused(root, lab_file, name):
-    refuse(root, lambda: add_lab(root, lab_file, board=name), "board")
+@pytest.mark.parametrize("name", ["../up", "a b", "", "x" * 80, "ä", "/abs"])
+def test_a_name_that_is_no_name_is_refused(root, lab_file, tmp_path, name):
+    refuse(root, lambda: add_lab(root, lab_file, board=name), "--board: a name must be")
+    folder = native_folder(tmp_path / "run1")
+    refuse(root, lambda: preparing.native(folder, labels(name=name), None, ()), "--name: a name must be")
 
 
 def test_an_unknown_scene_is_named_beside_the_known_ones(root, lab_file):
-    prepared = adding.foreign(lab_file, "lab", labels(), "z")
+    prepared = preparing.foreign(lab_file, "lab", labels(), {})
     refuse(
         root, lambda: adding.add(root, "smal", prepared, allow_copy=False), "a scene must be one of .*small.*; got smal"
     )
 
 
 def test_a_recording_does_not_join_a_simulated_scene(root, lab_file):
-    prepared = adding.foreign(lab_file, "lab", labels(), "z")
+    prepared = preparing.foreign(lab_file, "lab", labels(), {})
     refuse(
         root,
         lambda: adding.add(root, "ci", prepared, allow_copy=False),
@@ -160,7 +206,7 @@ def native_folder(folder: Path, stream: bytes = encode(FRAMES, "binary")) -> Pat
 
 def test_a_native_capture_is_added_with_its_own_header(root, tmp_path):
     folder = native_folder(tmp_path / "run1")
-    header = adding.add(root, "small", adding.native(folder, labels(), None), allow_copy=False)
+    header = adding.add(root, "small", preparing.native(folder, labels(), None, ()), allow_copy=False)
     assert header == read_header(root / "data/raw/small/run1")
     _, blocks, account = open_capture(root / "data/raw/small/run1")
     assert sum(map(len, blocks)) == account["frames_contact_n"] > 0
@@ -170,17 +216,17 @@ def test_a_native_capture_under_another_label_or_with_changed_bytes_is_refused(r
     folder = native_folder(tmp_path / "run1")
     refuse(
         root,
-        lambda: adding.native(folder, labels(board="board7"), None),
+        lambda: preparing.native(folder, labels(board="board7"), None, ()),
         "--board must be 'board1', as its header says; got 'board7'",
     )
     (folder / "stream.bin").write_bytes(b"other")
     refuse(
         root,
-        lambda: adding.native(folder, labels(), None),
+        lambda: preparing.native(folder, labels(), None, ()),
         "stream.bin: the file must be unchanged since it was recorded",
     )
-    (folder / "header.json").write_text("{")
-    refuse(root, lambda: adding.native(folder, labels(), None), "header.json")
+    (folder / "header.json").write_bytes(b"\xff{")
+    refuse(root, lambda: preparing.native(folder, labels(), None, ()), "header.json")
 
 
 @pytest.mark.parametrize(
@@ -190,10 +236,10 @@ def test_a_native_capture_under_another_label_or_with_changed_bytes_is_refused(r
 def test_a_dump_without_a_frame_is_refused(root, tmp_path, damage, sentence):
     (tmp_path / "dump.bin").write_bytes(damage)
     (tmp_path / "probe.csv").write_text(probe.render(probe_log()))
-    what = Dump("binary", 2, 400.0, tmp_path / "probe.csv")
+    what = Dump("binary", 2, 400.0, tmp_path / "probe.csv", ())
     refuse(
         root,
-        lambda: adding.add(root, "small", adding.dump(tmp_path / "dump.bin", labels(), what), allow_copy=False),
+        lambda: adding.add(root, "small", preparing.dump(tmp_path / "dump.bin", labels(), what), allow_copy=False),
         sentence,
     )
 
@@ -201,13 +247,15 @@ def test_a_dump_without_a_frame_is_refused(root, tmp_path, damage, sentence):
 def test_a_dump_of_the_wrong_number_of_chips_says_what_fits(root, tmp_path):
     (tmp_path / "dump.bin").write_bytes(encode(FRAMES, "binary"))
     (tmp_path / "probe.csv").write_text(probe.render(probe_log()))
-    what = Dump("binary", 5, 400.0, tmp_path / "probe.csv")
+    what = Dump("binary", 5, 400.0, tmp_path / "probe.csv", ())
     refuse(
         root,
-        lambda: adding.add(root, "small", adding.dump(tmp_path / "dump.bin", labels(), what), allow_copy=False),
+        lambda: adding.add(root, "small", preparing.dump(tmp_path / "dump.bin", labels(), what), allow_copy=False),
         "It fits binary with 2 chips",
     )
-    refuse(root, lambda: adding.dump(tmp_path / "dump.bin", labels(), Dump("binary", 2, 400.0, None)), "Add --probe")
+    refuse(
+        root, lambda: preparing.dump(tmp_path / "dump.bin", labels(), Dump("binary", 2, 400.0, None, ())), "Add --probe"
+    )
 
 
 def test_a_capture_that_lost_too_much_is_refused_with_the_counts(root, tmp_path):
@@ -215,7 +263,7 @@ def test_a_capture_that_lost_too_much_is_refused_with_the_counts(root, tmp_path)
     damaged = native_folder(tmp_path / "run1", stream[:1000] + bytes(1500) + stream[1000:])
     refuse(
         root,
-        lambda: adding.add(root, "small", adding.native(damaged, labels(), None), allow_copy=False),
+        lambda: adding.add(root, "small", preparing.native(damaged, labels(), None, ()), allow_copy=False),
         r"lost bytes must be at most 5%.*skipped_resync_bytes",
     )
 

@@ -11,7 +11,7 @@ from pipeline.strict import parse
 from tests.scenes import recorded
 
 ROOT = Path(__file__).resolve().parents[1]
-ENTRY = Entry(board="b", skin="s", layout="lab", chips_n=5, sha256="0", copy_of=None)
+ENTRY = Entry(board="b", skin="s", layout="lab", chips_n=5, fingerprints=("0",), copy_of=None)
 
 
 def scene(**changes: object) -> Scene:

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.adding import Labels, native
 from pipeline.capture.header import HEADER_FILE, parse
 from pipeline.capture.wire import encode
+from pipeline.preparing import Labels, native
 from tests.capture.signals import make_frames
 from tests.stages.checkout import ROOT
 
@@ -68,7 +68,7 @@ def test_ctrl_c_ends_a_recording_that_can_be_added(terminal, tmp_path):
     assert set(header.files) == {"stream.bin", "arrivals.csv"}
     probe = tmp_path / "probe.csv"
     probe.write_text("")
-    _, files = native(tmp_path / "run1", Labels("b0", "s0", "lab", None), probe)
+    _, files = native(tmp_path / "run1", Labels("b0", "s0", None), probe, ())
     assert set(files) == {"stream.bin", "arrivals.csv", "probe.csv"}
 
 
@@ -80,7 +80,7 @@ def test_what_a_killed_recorder_had_read_can_still_be_added(terminal, tmp_path):
     recorder.communicate()
     probe = tmp_path / "probe.csv"
     probe.write_text("")
-    header, files = native(tmp_path / "run1.part", Labels("b0", "s0", "lab", None), probe)
+    header, files = native(tmp_path / "run1.part", Labels("b0", "s0", None), probe, ())
     assert header.capture == "run1"
     assert files["stream.bin"].stat().st_size > 0
 

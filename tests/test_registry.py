@@ -16,8 +16,8 @@ def header(capture: str = "c0", board: str = "b0", skin: str = "s0", chips_n: in
     )  # fmt: skip
 
 
-def added(registry: Registry, one: Header, sha256: str, *, allow_copy: bool = False) -> Registry:
-    return with_capture(registry, "lab", one, sha256, allow_copy=allow_copy)
+def added(registry: Registry, one: Header, fingerprint: str, *, allow_copy: bool = False) -> Registry:
+    return with_capture(registry, "lab", one, (fingerprint, f"stream of {fingerprint}"), allow_copy=allow_copy)
 
 
 ONE = added(EMPTY, header(), "aa")
@@ -28,7 +28,7 @@ def test_several_captures_of_one_board_and_skin_stand_beside_each_other():
 
 
 def test_the_same_recording_twice_is_refused():
-    with pytest.raises(CaptureError, match=r"new to its scene; got the bytes of c0. It is in the scene already"):
+    with pytest.raises(CaptureError, match=r"new to its scene; got the readings of c0. It is in the scene already"):
         added(ONE, header("c1"), "aa", allow_copy=True)
 
 

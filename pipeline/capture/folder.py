@@ -3,7 +3,6 @@
 Refuses to know what the files mean, and where captures are kept.
 """
 
-import hashlib
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -30,8 +29,3 @@ def seal(folder: Path, header: Header) -> Header:
     complete = header.model_copy(update={"files": {name: io.sha256(folder / name) for name in names}})
     io.write_text(folder / HEADER_FILE, render(complete))
     return complete
-
-
-def digest(header: Header) -> str:
-    """One hash for all files of a capture, whatever they are called: it tells a copy under another name."""
-    return hashlib.sha256("".join(sorted(header.files.values())).encode()).hexdigest()

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from pipeline.errors import CaptureError, complain
 
+RATE_MAX_HZ = 1e5
 HEADER_FILE = "header.json"
 STREAM_FILE = "stream.bin"
 ARRIVALS_FILE = "arrivals.csv"
@@ -36,7 +37,7 @@ class Clock(_Frozen):
     """
 
     kind: Literal["arrivals", "rate", "recording"]
-    rate_hz: Annotated[float, Field(gt=0, le=1e5)] | None
+    rate_hz: Annotated[float, Field(gt=0, le=RATE_MAX_HZ)] | None
     marks: tuple[tuple[float, float], ...]
 
     @model_validator(mode="after")

@@ -1,0 +1,152 @@
+"""Preparing a recording to be added: somebody's files and labels -> a header and the files it will vouch for.
+
+Nothing is written here. Refuses to know scenes, DVC and where captures are kept (`adding`).
+"""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from pipeline import io
+from pipeline.capture import header as headers
+from pipeline.capture.header import Clock, Header
+from pipeline.capture.readers import READERS
+from pipeline.dataset.captures import read_header
+from pipeline.errors import CaptureError, complain
+
+NATIVE_FILES = (headers.STREAM_FILE, headers.ARRIVALS_FILE, headers.PROBE_FILE)
+RECORDINGS_OWN = Clock(kind="recording", rate_hz=None, marks=())
+
+Foreign = Literal["lab", "ini", "eflesh"]
+Marks = tuple[tuple[float, float], ...]
+Prepared = tuple[Header, Mapping[str, bytes | Path]]
+
+
+@dataclass(frozen=True)
+class Labels:
+    """What the user says of a recording; `name` None makes one from the labels."""
+
+    board: str
+    skin: str
+    name: str | None
+
+
+@dataclass(frozen=True)
+class Dump:
+    """What a bare serial dump does not say: wire format, chips, rate, where the robot was, and on which clock."""
+
+    wire: headers.Wire
+    chips_n: int
+    rate_hz: float
+    probe: Path | None
+    marks: Marks
+
+
+def parse_marks(words: list[str]) -> Marks:
+    """Read `STREAM_S,PROBE_S` pairs.
+
+    >>> parse_marks(["0,12.5"])
+    ((0.0, 12.5),)
+    """
+    marks = []
+    for word in words:
+        if not re.fullmatch(r"-?[0-9.]+(e[0-9]+)?,-?[0-9.]+(e[0-9]+)?", word):
+            raise CaptureError(
+                complain("--mark", "a mark", "STREAM_S,PROBE_S in seconds", repr(word), "Try: --mark 0,12.5")
+            )
+        stream_s, probe_s = map(float, word.split(","))
+        marks.append((stream_s, probe_s))
+    return tuple(marks)
+
+
+def foreign(recording: Path, layout: Foreign, labels: Labels, options: Mapping[str, str]) -> Prepared:
+    """Prepare somebody else's recording: its own files, untouched, under a header."""
+    files = READERS[layout].collect(recording)
+    chips_n = READERS[layout].count_chips(files)
+    return _header(labels, recording, layout=layout, chips_n=chips_n, special={"options": dict(options)}), files
+
+
+def dump(recording: Path, labels: Labels, what: Dump) -> Prepared:
+    """Prepare a bare dump of a port with the robot's log; frames get their time from a constant rate."""
+    if what.probe is None:
+        raise CaptureError(
+            complain(
+                recording,
+                "a serial dump",
+                "accompanied by its probe log",
+                "none",
+                "Add --probe PROBE.csv (columns in data/README.md).",
+            )
+        )
+    _need_file(recording)
+    _need_file(what.probe)
+    if not 0 < what.rate_hz <= headers.RATE_MAX_HZ:
+        raise CaptureError(
+            complain(
+                "--rate-hz", "the rate", f"above 0, at most {headers.RATE_MAX_HZ:g}", what.rate_hz, "Count frames."
+            )
+        )
+    clock = Clock(kind="rate", rate_hz=what.rate_hz, marks=what.marks)
+    special = {"wire": what.wire, "clock": clock}
+    header = _header(labels, recording, layout="native", chips_n=what.chips_n, special=special)
+    return header, {headers.STREAM_FILE: recording, headers.PROBE_FILE: what.probe}
+
+
+def native(recording: Path, labels: Labels, probe: Path | None, marks: Marks) -> Prepared:
+    """Prepare a capture folder that `reskin record` wrote; `probe` adds the robot's log to it."""
+    found = read_header(recording)
+    for what, said, written in (("board", labels.board, found.board), ("skin", labels.skin, found.skin)):
+        if said != written:
+            raise CaptureError(
+                complain(recording, f"--{what}", f"{written!r}, as its header says", repr(said), "Which is right?")
+            )
+    # A recorder that was killed has not hashed its files into the header; they are there all the same.
+    files = {name: recording / name for name in NATIVE_FILES if (recording / name).exists() or name in found.files}
+    if probe is not None:
+        _need_file(probe)
+        files[headers.PROBE_FILE] = probe
+    if headers.PROBE_FILE not in files:
+        raise CaptureError(
+            complain(recording, "a capture", "labelled by a probe log", "none", "Add --probe PROBE.csv.")
+        )
+    for name, file in files.items():
+        _need_file(file)
+        if file.parent == recording and found.files.get(name, io.sha256(file)) != io.sha256(file):
+            raise CaptureError(
+                complain(file, "the file", "unchanged since it was recorded", "another hash", "Record it again.")
+            )
+    _check_names(labels)
+    clock = found.clock.model_copy(update={"marks": (*found.clock.marks, *marks)})
+    return found.model_copy(update={"capture": labels.name or found.capture, "clock": clock}), files
+
+
+def _check_names(labels: Labels) -> None:
+    for option, word in (("--board", labels.board), ("--skin", labels.skin), ("--name", labels.name)):
+        if word is not None and not re.fullmatch(headers.NAME, word):
+            raise CaptureError(complain(option, "a name", "1 to 64 of A-Z a-z 0-9 _ -", repr(word), "Choose another."))
+
+
+def _header(
+    labels: Labels,
+    recording: Path,
+    *,
+    layout: headers.Layout,
+    chips_n: int,
+    special: Mapping[str, Any],
+) -> Header:
+    _check_names(labels)
+    stem = re.sub(r"[^A-Za-z0-9_-]", "_", recording.resolve().stem)
+    header = Header.model_construct(
+        format="reskin-capture/1", capture=labels.name or f"{labels.board}_{labels.skin}_{stem}"[:64],
+        board=labels.board, skin=labels.skin, source="recorded", layout=layout, wire=None, chips_n=chips_n,
+        unit_b="uT", unit_force="N", unit_place="mm", firmware=None, clock=RECORDINGS_OWN,
+        protocol=f"as recorded in {stem}", contacts_before_n=0, options={}, files={}, note="added by reskin add",
+    )  # fmt: skip
+    return headers.parse(headers.render(header.model_copy(update=dict(special))), str(recording))
+
+
+def _need_file(path: Path) -> None:
+    if not path.is_file():
+        raise CaptureError(complain(path, "the file", "there", "nothing", "Check the path."))
