@@ -1,5 +1,6 @@
 """Asks a tracking server for a sign of life, in seconds and not minutes. Knows nothing of what is written there."""
 
+import http.client
 import os
 import urllib.error
 import urllib.request
@@ -24,8 +25,8 @@ def probe(uri: str | None) -> None:
     try:
         with urllib.request.urlopen(f"{uri.rstrip('/')}/health", timeout=TIMEOUT_S):
             return
-    except (urllib.error.URLError, OSError, ValueError) as error:
-        reason = getattr(error, "reason", error)
+    except (urllib.error.URLError, http.client.HTTPException, OSError, ValueError) as error:
+        reason = getattr(error, "reason", error) or type(error).__name__
         raise TrackingAway(
             f"MLflow at {uri} does not answer ({reason}). Results are made all the same; "
             "`reskin publish` sends them when it is back."

@@ -6,8 +6,9 @@ one child a training. Published after training and from files, so a server that 
 """
 
 import hashlib
+import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -25,28 +26,37 @@ def tracking_uri(root: Path) -> str:
     return server_uri() or f"sqlite:///{(root / STORE).resolve()}"
 
 
-def publish(models: Path, figures: Path, *, scene: str, stage: str, root: Path) -> dict[str, int]:
-    """Write every training of one stage to MLflow once, and the scene's figures to their parent.
+def publish(arms: Mapping[str, Path], figures: Path, *, scene: str, root: Path) -> dict[str, int]:
+    """Write every training of a scene to MLflow once, and its figures to the parents; `arms` maps stage to models.
 
     Returns counts of new, kept and superseded runs; raises `TrackingAway` if the server does not answer.
     """
     uri = tracking_uri(root)
     probe(uri)
-    cards = {file: io.read_json(file) for file in sorted(models.glob("*.json"))}
+    counts = {"new_n": 0, "kept_n": 0, "superseded_n": 0}
     with _client(uri) as client:
         experiment_id = _experiment(client, scene, root)
-        counts = {"new_n": 0, "kept_n": 0, "superseded_n": 0}
-        parent_key = _parent_key([card["key"] for card in cards.values()])
-        parent_id = _open_parent(client, experiment_id, stage, scene, parent_key)
-        for file, card in cards.items():
-            fresh = _publish_one(client, experiment_id, stage, parent_id, file, card)
-            counts["new_n" if fresh else "kept_n"] += 1
-        current = {card["key"] for card in cards.values()} | {parent_key}
-        counts["superseded_n"] = _mark_superseded(client, experiment_id, stage, current)
-        _log_means(client, parent_id, list(cards.values()))
-        client.log_artifacts(parent_id, str(figures), "figures")
-        client.set_terminated(parent_id)
+        current: set[str] = set()
+        for stage, models in arms.items():
+            cards = {file: io.read_json(file) for file in sorted(models.glob("*.json"))}
+            keys = {file: run_key(card) for file, card in cards.items()}
+            parent_key = hashlib.sha256("".join(sorted(keys.values())).encode()).hexdigest()[:32]
+            parent_id = _open_parent(client, experiment_id, stage, scene, parent_key)
+            for file, card in cards.items():
+                fresh = _publish_one(client, experiment_id, stage, parent_id, file, card)
+                counts["new_n" if fresh else "kept_n"] += 1
+            current |= {parent_key, *keys.values()}
+            _log_means(client, parent_id, list(cards.values()))
+            client.log_artifacts(parent_id, str(figures), "figures")
+            client.set_terminated(parent_id)
+        counts["superseded_n"] = _mark_superseded(client, experiment_id, current)
     return counts
+
+
+def run_key(card: Mapping[str, Any]) -> str:
+    """Name a result by all that its card says, scores included, but for the commit: equal results are one."""
+    words = {name: value for name, value in card.items() if name != "git"}
+    return hashlib.sha256(json.dumps(words, sort_keys=True).encode()).hexdigest()[:32]
 
 
 @contextmanager
@@ -61,11 +71,12 @@ def _client(uri: str) -> Iterator[Any]:
         logging.getLogger(name).setLevel(logging.WARNING)
     import mlflow
     from mlflow.exceptions import MlflowException
+    from sqlalchemy.exc import SQLAlchemyError
 
     try:
         yield mlflow.MlflowClient(tracking_uri=uri)
-    except MlflowException as error:
-        sentence = str(error).splitlines()[0][:200]
+    except (MlflowException, SQLAlchemyError, OSError) as error:
+        sentence = " ".join(str(error).split())[:200]
         raise TrackingAway(
             f"MLflow at {uri} failed ({sentence}). Results are kept; `reskin publish` sends them later."
         ) from None
@@ -93,7 +104,8 @@ def _open_parent(client: Any, experiment_id: str, stage: str, scene: str, key: s
 def _publish_one(client: Any, experiment_id: str, stage: str, parent_id: str, file: Path, card: dict[str, Any]) -> bool:
     """Write one training; True if it was not there yet. A half-written run of a killed process is replaced."""
     parent_tag = "mlflow.parentRunId"
-    found = _find(client, experiment_id, stage, card["key"])
+    key = run_key(card)
+    found = _find(client, experiment_id, stage, key)
     if found and found.info.status == "FINISHED":
         _set_tags(client, found, {parent_tag: parent_id, "current": "true"})
         return False
@@ -101,8 +113,9 @@ def _publish_one(client: Any, experiment_id: str, stage: str, parent_id: str, fi
         client.delete_run(found.info.run_id)
     words = ("scene", "question", "recipe_name", "fold", "git")
     tags = {name: card[name] for name in words} | {
-        "run_key": card["key"], "stage": stage, "kind": "training", "current": "true", parent_tag: parent_id,
-        "mlflow.source.name": f"pipeline.stages.{stage}", "mlflow.source.git.commit": card["git"],
+        "run_key": key, "cell": card["key"], "stage": stage, "kind": "training", "current": "true",
+        parent_tag: parent_id, "mlflow.source.name": f"pipeline.stages.{stage}",
+        "mlflow.source.git.commit": card["git"],
     }  # fmt: skip
     run_id = client.create_run(experiment_id, tags=tags, run_name=file.stem).info.run_id
     _log(client, run_id, card)
@@ -149,14 +162,12 @@ def _find(client: Any, experiment_id: str, stage: str, key: str) -> Any:
     return found[0] if found else None
 
 
-def _mark_superseded(client: Any, experiment_id: str, stage: str, current: set[str]) -> int:
-    """Tag runs of this stage that the newest results replace, so that `tags.current = 'true'` shows each once."""
+def _mark_superseded(client: Any, experiment_id: str, current: set[str]) -> int:
+    """Tag runs that the scene's newest results replace, so that `tags.current = 'true'` shows each once."""
     marked_n = 0
     token = None
     while True:
-        page = client.search_runs(
-            [experiment_id], f"tags.stage = '{stage}' and tags.current = 'true'", max_results=1000, page_token=token
-        )
+        page = client.search_runs([experiment_id], "tags.current = 'true'", max_results=1000, page_token=token)
         for run in page:
             if run.data.tags["run_key"] not in current:
                 client.set_tag(run.info.run_id, "current", "false")
@@ -164,7 +175,3 @@ def _mark_superseded(client: Any, experiment_id: str, stage: str, current: set[s
         token = page.token
         if not token:
             return marked_n
-
-
-def _parent_key(keys: list[str]) -> str:
-    return hashlib.sha256("".join(sorted(keys)).encode()).hexdigest()[:32]

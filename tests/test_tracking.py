@@ -35,12 +35,12 @@ def dead_address() -> str:
         return f"http://127.0.0.1:{server.getsockname()[1]}"  # closed again on return
 
 
-def write_model(models: Path, name: str, key: str) -> None:
+def write_model(models: Path, name: str, key: str, accuracy_pct: float = 50.0) -> None:
     card = {
         "scene": "ci", "question": "lobo", "recipe_name": "paper", "fold": name, "git": "abc", "key": key, "seed": 1,
         "seed_i": 0, "recipe": {"epochs_n": 3}, "train_rows_n": 4, "train_boards": ["b1"], "test_boards": ["b0"],
         "curve": [3.0, 2.0, 1.0],
-        "scores": {"all": {"accuracy_pct": 50.0}, "registered": {"accuracy_pct": 60.0}, "by_skin": {}},
+        "scores": {"all": {"accuracy_pct": accuracy_pct}, "registered": {"accuracy_pct": 60.0}, "by_skin": {}},
     }  # fmt: skip
     io.write_json(models / f"{name}.json", card)
     io.write_tensors(models / f"{name}.safetensors", {"weights.a": np.zeros(2, np.float32)}, {})
@@ -52,7 +52,7 @@ def write(root: Path, **keys: str) -> dict[str, int]:
         write_model(root / "models", name, key)
     (root / "figures").mkdir(exist_ok=True)
     (root / "figures/a.svg").write_text("<svg/>")
-    return publish(root / "models", root / "figures", scene="ci", stage="train_multi", root=root)
+    return publish({"train_multi": root / "models"}, root / "figures", scene="ci", root=root)
 
 
 def runs(root: Path, query: str) -> list:
@@ -81,14 +81,40 @@ def test_every_training_is_a_child_run_once_however_often_it_is_published(tmp_pa
     # Other settings: the new result is shown, the old one is kept and marked.
     assert write(tmp_path, b0="k0", b1="k9") == {"new_n": 1, "kept_n": 1, "superseded_n": 2}
     current = runs(tmp_path, "tags.kind = 'training' and tags.current = 'true'")
-    assert sorted(run.data.tags["run_key"] for run in current) == ["k0", "k9"]
+    assert sorted(run.data.tags["cell"] for run in current) == ["k0", "k9"]
 
     # A half-written run of a killed process is replaced, and going back shows the old result again.
-    client.set_terminated(next(run.info.run_id for run in current if run.data.tags["run_key"] == "k9"), "KILLED")
+    client.set_terminated(next(run.info.run_id for run in current if run.data.tags["cell"] == "k9"), "KILLED")
     assert write(tmp_path, b0="k0", b1="k9")["new_n"] == 1
     assert write(tmp_path, b0="k0", b1="k1") == {"new_n": 0, "kept_n": 2, "superseded_n": 2}
     current = runs(tmp_path, "tags.kind = 'training' and tags.current = 'true'")
-    assert sorted(run.data.tags["run_key"] for run in current) == ["k0", "k1"]
+    assert sorted(run.data.tags["cell"] for run in current) == ["k0", "k1"]
+
+
+def test_a_new_score_replaces_the_old_one_and_a_dropped_question_is_not_current(tmp_path):
+    write(tmp_path, b0="k0", b1="k1")
+    # The same training, scored anew: the old score is not what is shown.
+    write_model(tmp_path / "models", "b1", "k1", accuracy_pct=77.0)
+    counts = publish({"train_multi": tmp_path / "models"}, tmp_path / "figures", scene="ci", root=tmp_path)
+    assert counts == {"new_n": 1, "kept_n": 1, "superseded_n": 2}
+    current = runs(tmp_path, "tags.kind = 'training' and tags.current = 'true'")
+    assert sorted(run.data.metrics["accuracy_pct"] for run in current) == [50.0, 77.0]
+
+    # A question that is asked no more has no current runs.
+    publish({}, tmp_path / "figures", scene="ci", root=tmp_path)
+    assert runs(tmp_path, "tags.current = 'true'") == []
+
+
+def test_a_store_that_is_broken_costs_no_result(tmp_path):
+    (tmp_path / "mlflow.db").write_bytes(b"junk" * 99)
+    with pytest.raises(TrackingAway, match="Results are kept"):
+        write(tmp_path, b0="k0")
+
+
+@pytest.mark.parametrize("uri", ["http://localhost:notaport", "http://", "https://[::1", "http://127.0.0.1:99999"])
+def test_a_mistyped_address_is_a_server_that_is_away(uri):
+    with pytest.raises(TrackingAway, match="does not answer"):
+        probe(uri)
 
 
 @pytest.mark.parametrize("kind", ["silent_server", "dead_address"])

@@ -10,12 +10,11 @@ from pipeline.tracking import publish as write
 
 def publish(scene: str, settings: Path, models: Path, figures: Path) -> None:
     """Write every training of a scene to MLflow once; if the server is away, say so and go on."""
-    for arm in arms_of(read_scene(settings)):
-        try:
-            counts = write(models / arm, figures, scene=scene, stage=arm, root=Path())
-            say(f"{scene} {arm}: MLflow runs {counts}")
-        except TrackingAway as away:
-            say(f"warning: {scene} {arm} is not in MLflow: {away}")
+    arms = {arm: models / arm for arm in arms_of(read_scene(settings))}
+    try:
+        say(f"{scene}: MLflow runs {write(arms, figures, scene=scene, root=Path())}")
+    except TrackingAway as away:
+        say(f"warning: {scene} is not in MLflow: {away}")
 
 
 if __name__ == "__main__":
