@@ -58,7 +58,7 @@ def read_header(folder: Path) -> Header:
         raise CaptureError(
             complain(file, "a capture", f"a folder with {HEADER_FILE}", "none", "Is it another --layout?")
         )
-    return parse(file.read_text(encoding="utf-8"), str(file))
+    return parse(file.read_text(encoding="utf-8", errors="replace"), str(file))
 
 
 def check_losses(account: Mapping[str, int], limit: float, where: str) -> None:

@@ -32,6 +32,7 @@ class Rows:
     Fz_N (NaN where a recording has no force); `pass_i` counts on over the captures of one skin.
     """
 
+    capture: np.ndarray
     board: np.ndarray
     skin: np.ndarray
     db_uT: Float32[np.ndarray, "f ch"]
@@ -47,7 +48,7 @@ class Rows:
         """Rows without readings, for showing how folds are drawn."""
         f = len(boards)
         empty = np.zeros((f, 3), np.float32)
-        return cls(np.array(boards), np.array(skins), empty, empty, np.zeros(f, np.int32), {})
+        return cls(np.array(["c"] * f), np.array(boards), np.array(skins), empty, empty, np.zeros(f, np.int32), {})
 
 
 def gather(captures: Sequence[Readings], selection: Selection) -> Rows:
@@ -57,6 +58,14 @@ def gather(captures: Sequence[Readings], selection: Selection) -> Rows:
     _check_one_kind(captures)
     captures = sorted(captures, key=lambda one: one.capture)
     kept = [_contacts(one, selection) for one in captures]
+    for one, keep in zip(captures, kept, strict=True):
+        if not keep.any():
+            raise ParamsError(
+                complain(
+                    f"capture {one.capture}", f"readings with a known place and at least {selection.force_min_N} N",
+                    "one or more", f"none of {len(one)}", "Look at its places and at the sign of its force.",
+                )
+            )  # fmt: skip
     passes_n: dict[str, int] = {}
     pass_i = []
     for one, keep in zip(captures, kept, strict=True):
@@ -66,6 +75,7 @@ def gather(captures: Sequence[Readings], selection: Selection) -> Rows:
     places_unknown_n = sum(int(np.isnan(one.x_mm).sum()) for one in captures)
     all_n, kept_n = sum(map(len, captures)), sum(int(keep.sum()) for keep in kept)
     return Rows(
+        capture=_repeat([one.capture for one in captures], kept),
         board=_repeat([one.board for one in captures], kept),
         skin=_repeat([one.skin for one in captures], kept),
         db_uT=np.concatenate(

@@ -73,13 +73,12 @@ def one_skin_to_others(rows: Rows, split: Split, seed: int) -> list[Fold]:
     are the first of the first three boards and the tests all skins of the other three.
     """
     assert split.transfer_skins_n is not None
-    boards = np.unique(rows.board)
-    train_n = min(split.transfer_skins_n, len(boards) - 1)
-    if train_n < 1:
+    boards, train_n = np.unique(rows.board), split.transfer_skins_n
+    if train_n >= len(boards):
         raise ParamsError(
             complain(
-                "question transfer", "boards", "two or more", f"{len(boards)}",
-                "Add another board's recording, or take transfer out of the scene's questions.",
+                "question transfer", "split.transfer_skins_n", f"less than the scene's {len(boards)} boards", train_n,
+                "Each training skin takes a board; another must be left to test on.",
             )
         )  # fmt: skip
     test = np.flatnonzero(np.isin(rows.board, boards[train_n:]))
@@ -99,9 +98,8 @@ def random_readings(rows: Rows, split: Split, seed: int) -> list[Fold]:
     assert split.random_test_fraction is not None
     assert split.random_repeats_n is not None
     own = np.flatnonzero(rows.skin == np.unique(rows.skin)[0])
-    if len(own) < 2:
-        raise ParamsError(complain("question single_random", "rows of a skin", "two or more", len(own), "Record more."))
-    shuffle = ShuffleSplit(split.random_repeats_n, test_size=split.random_test_fraction, random_state=seed % 2**32)
+    test_n = _test_n(len(own), split.random_test_fraction, f"readings of skin {rows.skin[own[0]]}", "single_random")
+    shuffle = ShuffleSplit(split.random_repeats_n, test_size=test_n, random_state=seed % 2**32)
     return [
         Fold("single_random", f"repeat{i}", np.sort(own[train]), np.sort(own[test]))
         for i, (train, test) in enumerate(shuffle.split(own))
@@ -114,15 +112,17 @@ def last_passes(rows: Rows, split: Split, seed: int) -> list[Fold]:
     folds = []
     for skin in np.unique(rows.skin):
         own = np.flatnonzero(rows.skin == skin)
-        passes = np.unique(rows.pass_i[own])
-        if len(passes) < 2:
+        captures = np.unique(rows.capture[own])
+        if len(captures) > 1:
             raise ParamsError(
                 complain(
-                    "question single_temporal", f"passes of skin {skin}", "two or more", len(passes),
-                    "Record more passes, or take single_temporal out of the scene's questions.",
+                    "question single_temporal", f"the captures of skin {skin}", "one, as no clock orders several",
+                    ", ".join(captures), "Record the passes in one capture, or ask single_random.",
                 )
             )  # fmt: skip
-        first, last = train_test_split(passes, test_size=split.temporal_test_fraction, shuffle=False)
+        passes = np.unique(rows.pass_i[own])
+        test_n = _test_n(len(passes), split.temporal_test_fraction, f"passes of skin {skin}", "single_temporal")
+        first, last = train_test_split(passes, test_size=test_n, shuffle=False)
         folds.append(
             Fold(
                 "single_temporal", str(skin),
@@ -130,6 +130,19 @@ def last_passes(rows: Rows, split: Split, seed: int) -> list[Fold]:
             )
         )  # fmt: skip
     return folds
+
+
+def _test_n(all_n: int, fraction: float, what: str, question: str) -> int:
+    """Round the number held out to the nearest; both sides need one at least."""
+    test_n = round(fraction * all_n)
+    if not 0 < test_n < all_n:
+        raise ParamsError(
+            complain(
+                f"question {question}", what, "enough for both sides", f"{all_n}, of which {fraction:g} are {test_n}",
+                f"Record more, change the fraction, or take {question} out of the scene's questions.",
+            )
+        )  # fmt: skip
+    return test_n
 
 
 def _prove_apart(rows: Rows, fold: Fold) -> None:

@@ -5,14 +5,16 @@ from pathlib import Path
 from pipeline import io
 from pipeline.dataset.folds import load_rows, render_folds
 from pipeline.dataset.splits import draw_folds
-from pipeline.params import captures_of, read_params, read_scene
+from pipeline.params import captures_of, check_planned, read_params, read_scene
 from pipeline.stages._run import run, say
 
 
 def split(scene: str, params: Path, settings: Path, indentations: Path, folds: Path) -> None:
     """Draw the folds of every question that the scene asks."""
     asked = read_scene(settings)
-    captures = captures_of(scene, read_params(params), indentations)
+    shared = read_params(params)
+    check_planned(scene, asked, shared, str(settings))
+    captures = captures_of(scene, shared, indentations)
     rows = load_rows([indentations / f"{name}.parquet" for name in captures], asked.selection)
     drawn = draw_folds(rows, asked.questions, asked.split, asked.seed)
     io.write_json(folds, render_folds(captures, rows, drawn))

@@ -29,6 +29,7 @@ def rows(boards: Sequence[str], skins: Sequence[str], pass_i: Sequence[int] | No
     rng = rng_for(0, "rows")
     f = len(boards)
     return Rows(
-        np.array(boards), np.array(skins), rng.normal(0, 50, (f, 3)).astype(np.float32),
+        np.array([f"c_{skin}" for skin in skins]), np.array(boards), np.array(skins),
+        rng.normal(0, 50, (f, 3)).astype(np.float32),
         rng.uniform(0, 16, (f, 3)).astype(np.float32), np.array(pass_i or [0] * f, np.int32), {},
     )  # fmt: skip

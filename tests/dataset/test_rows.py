@@ -49,6 +49,13 @@ def test_captures_that_do_not_go_together_are_refused(second, sentence):
         gather([readings(), second], ALL)
 
 
+def test_a_capture_that_would_vanish_is_an_error_and_no_silent_loss():
+    with pytest.raises(
+        ParamsError, match="capture c1: readings with a known place and at least 0.0 N must be one or more"
+    ):
+        gather([readings(), readings("c1", board="b1", skin="s1", Fz_N=np.full(6, -3, np.float32))], ALL)
+
+
 def test_a_scene_without_captures_says_how_to_get_some():
     with pytest.raises(ParamsError, match="reskin add"):
         gather([], ALL)

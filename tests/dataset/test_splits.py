@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -73,7 +75,7 @@ def test_random_readings_stay_within_one_skin_and_differ_between_repeats():
     assert all((a.test == b.test).all() for a, b in zip(folds, again, strict=True))
 
 
-@given(st.integers(2, 30))
+@given(st.integers(3, 30))
 def test_the_last_passes_are_tested_and_no_later_pass_is_trained_on(passes_n):
     table = rows(["b0"] * 2 * passes_n, ["s0"] * 2 * passes_n, [i // 2 for i in range(2 * passes_n)])
     (fold,) = draw_folds(table, ["single_temporal"], TEMPORAL, 0)
@@ -87,15 +89,24 @@ def test_fifty_passes_split_forty_to_ten():
     assert (len(fold.train), len(fold.test)) == (40, 10)
 
 
-@pytest.mark.parametrize(("question", "split"), [("lobo", Split()), ("transfer", TRANSFER)])
-def test_one_board_has_no_other_to_be_tested_on_and_says_so(question, split):
-    with pytest.raises(ParamsError, match=f"question {question}: boards must be two or more; got 1"):
-        draw_folds(rows(["b0"] * 3, ["s0"] * 3), [question], split, 0)
+ALMOST_ALL = Split(random_test_fraction=0.95, random_repeats_n=1)
+ONE_BOARD = rows(["b0"] * 3, ["s0"] * 3)
+TWO_CAPTURES = replace(ONE_BOARD, capture=np.array(["run2", "run10", "run10"]))
 
 
-def test_one_pass_has_no_later_one_and_says_so():
-    with pytest.raises(ParamsError, match="passes of skin s0 must be two or more; got 1"):
-        draw_folds(rows(["b0"] * 3, ["s0"] * 3), ["single_temporal"], TEMPORAL, 0)
+@pytest.mark.parametrize(
+    ("table", "question", "split", "sentence"),
+    [
+        (ONE_BOARD, "lobo", Split(), "question lobo: boards must be two or more; got 1"),
+        (ONE_BOARD, "transfer", TRANSFER, "split.transfer_skins_n must be less than .* 1 boards; got 3"),
+        (ONE_BOARD, "single_temporal", TEMPORAL, "passes of skin s0 must be .*; got 1, of which 0.2 are 0"),
+        (ONE_BOARD, "single_random", ALMOST_ALL, "got 3, of which 0.95 are 3"),
+        (TWO_CAPTURES, "single_temporal", TEMPORAL, "the captures of skin s0 must be one, .*; got run10, run2"),
+    ],
+)  # fmt: skip
+def test_folds_that_the_data_cannot_give_are_one_sentence(table, question, split, sentence):
+    with pytest.raises(ParamsError, match=sentence):
+        draw_folds(table, [question], split, 0)
 
 
 def test_a_planted_leak_a_skin_on_two_boards_is_refused():
