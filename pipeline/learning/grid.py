@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from pipeline import io
+from pipeline import io, seeds
 from pipeline.errors import TrainingError, complain
 from pipeline.learning.recipe import Recipe
 from pipeline.learning.standardise import FIT, Scaler
@@ -103,6 +103,9 @@ def run_cells(
     for done_n, future in enumerate(as_completed(running), 1):
         try:
             future.result()
+        except TrainingError as error:
+            executor.shutdown(cancel_futures=True)
+            raise TrainingError(f"{cells[running[future]].name}, {error}") from None
         except BrokenExecutor:
             raise TrainingError(
                 complain(
@@ -123,7 +126,7 @@ def cell_key(cell: Cell, db_uT: Float32[np.ndarray, "f ch"], target: Float32[np.
     """Name a cell by all that decides its result: rows of both sides, recipe, seed, code, torch and platform."""
     words = [
         cell.question, cell.fold, cell.recipe.model_dump_json(), cell.seed, cell.seed_i,
-        _code_digest(), importlib.metadata.version("torch"), sys.platform,
+        _code_digest(), importlib.metadata.version("torch"), importlib.metadata.version("numpy"), sys.platform,
     ]  # fmt: skip
     rows = _digest(db_uT[cell.train], target[cell.train], db_uT[cell.test])
     return hashlib.sha256(json.dumps([*words, rows]).encode()).hexdigest()[:32]
@@ -162,6 +165,6 @@ def _digest(*arrays: np.ndarray) -> str:
 @lru_cache(maxsize=1)
 def _code_digest() -> str:
     digest = hashlib.sha256()
-    for source in sorted(SOURCES.glob("*.py")):
+    for source in [*sorted(SOURCES.glob("*.py")), Path(seeds.__file__)]:
         digest.update(source.read_bytes())
     return digest.hexdigest()

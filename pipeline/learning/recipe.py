@@ -28,7 +28,7 @@ class Recipe(Strict):
 class Training(Strict):
     """What a training stage runs: every recipe on every fold with every seed."""
 
-    recipes: dict[str, Recipe]
+    recipes: dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,40}$")], Recipe]  # a name is part of file names
     seeds_n: Annotated[int, Field(ge=1)]
 
     @model_validator(mode="after")

@@ -45,7 +45,11 @@ def train(
         if not torch.isfinite(total):
             raise TrainingError(
                 complain(
-                    f"epoch {epoch_i + 1}", "the loss", "finite", curve[-1], "Lower rate_max, or look at the rows."
+                    f"epoch {epoch_i + 1}",
+                    "the loss",
+                    "finite",
+                    curve[-1],
+                    f"Lower rate_max ({recipe.rate_max:g}), or look at the rows.",
                 )
             )
     return net, curve

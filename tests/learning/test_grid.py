@@ -5,7 +5,7 @@ import pytest
 
 from pipeline import io
 from pipeline.errors import TrainingError
-from pipeline.learning.grid import Cell, cell_key, run_cells
+from pipeline.learning.grid import Cell, cell_key, run_cells, train_cell
 from pipeline.seeds import rng_for
 from tests.learning.recipes import recipe
 
@@ -22,8 +22,11 @@ class Here(Executor):
         future: Future = Future()
         if self.calls_n > self.die_after:
             future.set_exception(TrainingError("killed"))
-        else:
+            return future
+        try:
             future.set_result(fn(*args, **kwargs))
+        except TrainingError as error:
+            future.set_exception(error)
         return future
 
 
@@ -85,3 +88,23 @@ def test_what_is_left_in_the_cache_opens_without_pickle(tmp_path):
     tensors, metadata = io.read_tensors(file)
     assert tensors["weights.feat.0.weight"].shape == (200, 15)
     assert float(metadata["seconds"]) > 0
+
+
+def test_a_planted_leak_would_show_nothing_of_a_test_row_reaches_the_model():
+    (cell,) = cells(1)
+    db_uT, target = rows()
+    weights, scaler, curve, predicted = train_cell(cell, db_uT, target)
+    db_uT[cell.test] += 1e4
+    target[cell.test] -= 1e4
+    again, again_scaler, again_curve, again_predicted = train_cell(cell, db_uT, target)
+    assert all((weights[name] == again[name]).all() for name in weights)
+    assert all((a == b).all() for a, b in zip(scaler.arrays().values(), again_scaler.arrays().values(), strict=True))
+    assert curve == again_curve
+    assert (predicted != again_predicted).any()
+
+
+def test_a_cell_that_diverges_is_named_and_ends_the_grid(tmp_path):
+    with pytest.raises(
+        TrainingError, match=r"lobo.paper.b[012].seed0, epoch 1: the loss must be finite.*rate_max \(1e\+30\)"
+    ):
+        run(cells(rate_max=1e30, batch_n=4), tmp_path, Here())

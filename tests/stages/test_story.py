@@ -8,9 +8,13 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
+from pipeline import io
+from pipeline.learning.standardise import Scaler
 from tests.stages.checkout import ENVIRONMENT, copy_checkout, run
 
 pytestmark = pytest.mark.timeout(420)
@@ -44,6 +48,38 @@ def test_there_is_one_parquet_file_a_capture_with_units(story):
     files = sorted((story / "data/indentations/ci").glob("*.parquet"))
     assert [file.stem for file in files] == ["b0_s0", "b0_s1", "b1_s0", "b1_s1", "b2_s0", "b2_s1"]
     assert pq.read_schema(files[0]).field("b_uT").metadata[b"unit"] == b"uT"
+
+
+def test_a_score_is_what_a_naive_loop_over_the_held_out_readings_finds(story):
+    card = json.loads((story / "data/models/ci/train_multi/lobo.paper.b1.seed0.json").read_text())
+    predictions = pq.read_table(story / "data/models/ci/train_multi/predictions.parquet").to_pylist()
+    own = [row for row in predictions if row["fold"] == "b1"]
+    truths = []
+    for skin in ("b1_s0", "b1_s1"):
+        for reading in pq.read_table(story / f"data/indentations/ci/{skin}.parquet").to_pylist():
+            if reading["Fz_N"] >= 0:  # what the scene's selection asks for
+                truths.append((skin, reading["x_mm"], reading["y_mm"], reading["Fz_N"]))
+    assert [(row["skin"], row["true_x_mm"], row["true_y_mm"], row["true_Fz_N"]) for row in own] == truths
+    hits = sum(
+        abs(row["predicted_x_mm"] - x_mm) <= 1 and abs(row["predicted_y_mm"] - y_mm) <= 1
+        for row, (_, x_mm, y_mm, _) in zip(own, truths, strict=True)
+    )
+    assert card["scores"]["all"]["accuracy_pct"] == pytest.approx(100 * hits / len(truths))
+
+
+def test_predictions_follow_from_the_saved_model_alone(story):
+    folder = story / "data/models/ci/train_multi"
+    tensors, _ = io.read_tensors(folder / "lobo.paper.b1.seed0.safetensors")
+    reading = pq.read_table(story / "data/indentations/ci/b1_s0.parquet").slice(0, 1).to_pylist()[0]
+    scaler = Scaler.of_arrays(tensors)
+    features = scaler.encode(np.array([reading["b_uT"]], np.float32) - np.array([reading["noload_uT"]], np.float32))[0]
+    for i, layer in enumerate(("feat.0", "feat.2", "feat.3", "head.0", "head.2", "head.4")):
+        features = tensors[f"{layer}.weight"] @ features + tensors[f"{layer}.bias"]
+        features = np.maximum(features, 0) if i in (0, 3, 4) else features  # ReLU where the paper has one
+    expected = scaler.decode(features[None].astype(np.float32))[0]
+    first = pq.read_table(folder / "predictions.parquet").filter(pc.field("fold") == "b1").slice(0, 1).to_pylist()[0]
+    # float32 sums in another order
+    assert [first[f"predicted_{name}"] for name in ("x_mm", "y_mm", "Fz_N")] == pytest.approx(expected, abs=1e-3)
 
 
 def test_a_second_repro_does_nothing(story):
