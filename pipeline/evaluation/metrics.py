@@ -3,7 +3,7 @@
 Refuses to know models, folds and files. NaN in the truth means unknown, and is left out of that number.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -41,7 +41,7 @@ def register(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]
     return shifted
 
 
-def summarise(scores: list[Mapping[str, float]]) -> dict[str, dict[str, float]]:
+def summarise(scores: Sequence[Mapping[str, float]]) -> dict[str, dict[str, float]]:
     """Mean, standard deviation (n - 1; absent for one score) and number of each metric over folds."""
     summary: dict[str, dict[str, float]] = {}
     for name in METRICS:

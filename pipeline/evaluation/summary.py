@@ -28,10 +28,26 @@ def score_groups(
 
 
 def over_folds(cards: Sequence[dict[str, Any]], part: str = "all") -> dict[str, dict[str, float]]:
-    """Mean and sd over trainings (folds x seeds), one score each."""
-    return summarise([card["scores"][part] for card in cards])
+    """Mean and sd over folds, each the mean of its seeds."""
+    return _over_units([(card["fold"], card["scores"][part]) for card in cards])
 
 
 def over_test_skins(cards: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """Mean and sd over pairs of (training, test skin), as for the paper's single-sensor row: 3 x 9 pairs."""
-    return summarise([one for card in cards for one in card["scores"]["by_skin"].values()])
+    """Mean and sd over pairs (training skin, test skin), as for the paper's single-sensor row: 3 x 9 pairs."""
+    return _over_units(
+        [((card["fold"], skin), one) for card in cards for skin, one in card["scores"]["by_skin"].items()]
+    )
+
+
+def _over_units(scores: Sequence[tuple[Any, dict[str, float]]]) -> dict[str, dict[str, float]]:
+    """Summarise over units (`mean`, `sd`, `n`); with several seeds, also `sd_seeds`, the mean spread within a unit."""
+    units: dict[Any, list[dict[str, float]]] = {}
+    for unit, one in scores:
+        units.setdefault(unit, []).append(one)
+    within = [summarise(own) for own in units.values()]
+    summary = summarise([{name: value["mean"] for name, value in one.items()} for one in within])
+    for name, value in summary.items():
+        spreads = [one[name]["sd"] for one in within if "sd" in one.get(name, {})]
+        if spreads:
+            value["sd_seeds"] = float(np.mean(spreads))
+    return summary

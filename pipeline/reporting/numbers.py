@@ -3,7 +3,7 @@
 A question that was not asked is absent. Refuses to know how a number is shown.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -47,10 +47,14 @@ def compose(
         numbers[question] = over_folds(_of(by_question[question], headline))
         numbers.setdefault("single_sensor", {"split": question} | numbers[question])
     numbers["variants"] = {
-        question: {recipe: over_folds(own) for recipe, own in _group(all_, "recipe_name").items()}
+        question: {recipe: _over(question)(own) for recipe, own in _group(all_, "recipe_name").items()}
         for question, all_ in by_question.items()
     }
     return numbers
+
+
+def _over(question: str) -> Callable[[Cards], dict[str, dict[str, float]]]:
+    return over_test_skins if question == "transfer" else over_folds
 
 
 def summarise_means(cards: Cards, part: str) -> dict[str, float]:
@@ -67,6 +71,9 @@ def add_up(accounts: Iterable[Mapping[str, int]]) -> dict[str, int]:
             if not name.endswith("_n"):
                 continue  # a quality of one capture's clock is no count
             total[name] = total.get(name, 0) + count
+    skipped = [count for name, count in total.items() if name.startswith("skipped_") and name.endswith("_bytes_n")]
+    if skipped:
+        total["lost_bytes_n"] = sum(skipped)
     return total
 
 

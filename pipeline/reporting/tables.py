@@ -45,7 +45,9 @@ def show(value: Mapping[str, float] | None) -> str:
     if value is None:
         return "–"
     mean = f"{value['mean']:.4g}" if value["mean"] >= 100 else f"{value['mean']:.3g}"
-    return mean + (f" ± {value['sd']:.2g}" if "sd" in value else "")
+    if "sd" in value:
+        return f"{mean} ± {value['sd']:.2g}"
+    return mean + (f" ± {value['sd_seeds']:.2g} (seeds)" if "sd_seeds" in value else "")
 
 
 def _beside_paper(rows: Mapping[str, tuple[Mapping[str, Any], Mapping[str, Number]]], source: str) -> pd.DataFrame:
@@ -54,7 +56,7 @@ def _beside_paper(rows: Mapping[str, tuple[Mapping[str, Any], Mapping[str, Numbe
         line = {"model": name, "source": source}
         for metric, title in COLUMNS.items():
             line[f"{title} (ours)"] = show(ours.get(metric))
-            line[f"{title} (paper)"] = show({"mean": paper[metric][0], "sd": paper[metric][1]})
+            line[f"{title} (paper)"] = "{:g} ± {:g}".format(*paper[metric])
         line["n"] = str(ours["accuracy_pct"]["n"])
         lines.append(line)
     return pd.DataFrame(lines)

@@ -27,6 +27,23 @@ def test_one_offset_a_board_is_registration_and_the_true_places_do_not_change_th
 
 
 def test_summaries_are_over_trainings_or_over_pairs_with_test_skins():
-    cards = [{"scores": score_groups(TRUE, TRUE + shift, BOARD, SKIN)} for shift in (0.0, 2.0)]
+    cards = [
+        {"fold": fold, "scores": score_groups(TRUE, TRUE + shift, BOARD, SKIN)}
+        for fold, shift in (("b0", 0), ("b1", 2))
+    ]
     assert over_folds(cards)["mse_xy_mm2"] == {"mean": pytest.approx(2.0), "n": 2, "sd": pytest.approx(8**0.5)}
     assert over_test_skins(cards)["mse_xy_mm2"]["n"] == 6
+
+
+def test_seeds_of_one_fold_are_averaged_before_folds_are_counted():
+    # squared errors: fold b0 has 0 and 4 (two seeds), fold b1 has 16
+    cards = [
+        {"fold": fold, "scores": score_groups(TRUE, TRUE + shift, BOARD, SKIN)}
+        for fold, shift in (("b0", 0), ("b0", 2), ("b1", 4))
+    ]
+    summary = over_folds(cards)["mse_xy_mm2"]
+    assert summary["n"] == 2
+    assert summary["mean"] == pytest.approx((2 + 16) / 2)
+    assert summary["sd"] == pytest.approx(14 / 2**0.5)
+    assert summary["sd_seeds"] == pytest.approx(8**0.5)
+    assert "sd" not in over_folds(cards[:2])["mse_xy_mm2"]

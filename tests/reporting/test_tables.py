@@ -20,7 +20,16 @@ CARDS = [
     card("lobo", "b0", 80.0), card("lobo", "b1", 90.0), card("lobo", "b0", 1.0, "released"),
     card("transfer", "s0", 20.0),
 ]  # fmt: skip
-ACCOUNTS = [{"bytes_n": 82, "frames_n": 1}, {"bytes_n": 164, "frames_n": 2}]
+ACCOUNTS = [
+    {
+        "bytes_n": 85,
+        "frames_n": 1,
+        "skipped_resync_bytes_n": 1,
+        "skipped_truncated_bytes_n": 2,
+        "clock_explained_pct": 9,
+    },
+    {"bytes_n": 164, "frames_n": 2, "skipped_resync_bytes_n": 0},
+]
 
 
 def numbers(cards: list[dict] = CARDS, source: str = "recorded") -> dict:
@@ -47,7 +56,10 @@ def test_variants_stand_apart_from_the_headline():
 
 
 def test_accounts_add_up():
-    assert add_up(ACCOUNTS) == {"captures_n": 2, "bytes_n": 246, "frames_n": 3}
+    assert add_up(ACCOUNTS) == {
+        "captures_n": 2, "bytes_n": 249, "frames_n": 3, "skipped_resync_bytes_n": 1, "skipped_truncated_bytes_n": 2,
+        "lost_bytes_n": 3,
+    }  # fmt: skip
 
 
 def test_every_table_says_where_its_rows_come_from():
@@ -59,7 +71,7 @@ def test_every_table_says_where_its_rows_come_from():
 def test_the_papers_numbers_stand_beside_ours():
     text = to_markdown(make_tables(numbers())["table2"])
     for value in TABLE_2["multi"].values():
-        assert show({"mean": value[0], "sd": value[1]}) in text
+        assert f"{value[0]:g} ± {value[1]:g}" in text  # as published, no digit less
     assert "85 ± 7.1" in text
 
 
@@ -68,6 +80,11 @@ def test_a_number_that_is_not_known_is_a_dash():
     del cards[0]["scores"]["all"]["mse_f_N2"]
     table = make_tables(numbers(cards))["single_sensor"]
     assert table["MSE_F, N² (ours)"].tolist() == ["–"]
+
+
+def test_a_spread_over_seeds_alone_is_called_so():
+    assert show({"mean": 99.7, "n": 1, "sd_seeds": 0.04}) == "99.7 ± 0.04 (seeds)"
+    assert show({"mean": 99.7, "n": 2, "sd": 1.0, "sd_seeds": 0.04}) == "99.7 ± 1"
 
 
 @pytest.mark.parametrize(("value", "kept"), [(1234567.8, 1234570.0), (0.000123456789, 0.000123457), (0.0, 0.0)])
