@@ -34,7 +34,9 @@ def run(work: Callable[..., None]) -> None:
     except ReskinError as error:
         say(f"error: {error}")
         sys.exit(error.exit_code)
-    note_cost(COSTS / arguments["scene"], stage, time.monotonic() - start_s)
+    # Each recorded capture has an ingest of its own.
+    unit = f"{stage}-{arguments['indentations'].stem}" if stage == "ingest" else stage
+    note_cost(COSTS / arguments["scene"], unit, time.monotonic() - start_s)
 
 
 def say(sentence: str) -> None:
