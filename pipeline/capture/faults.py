@@ -5,7 +5,7 @@ stopped. Refuses to mend or drop anything, and to know bytes.
 """
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float
 
 # What the ReSkin firmware sends for a chip whose I2C read failed; seen in INI's recording AFG_flex_50.
 FAILED_B_uT = (8028.16, 5194.00, 12943.36)
@@ -21,12 +21,15 @@ LSB_TOLERANCE = 0.1  # gains of the MLX90393 are a fifth or more apart (data she
 # real recordings are one step. Values without a grid have one smallest gap, and by chance one or two close to it.
 STEP_SHARE_MIN = 0.04
 STEPS_MIN_N = 4
+STEP_SPREAD_MAX = 0.06  # two decimals spread a step of 0.242 uT by 0.02; gaps by chance up to 1.5 of the least, by 0.12
+SURE_STEPS_MIN_N = 20  # so many equal gaps are no accident, even of few values without noise
 STEP_MIN_uT = 0.1  # no setting of the MLX90393 has a finer LSB than 0.150 uT (data sheet, table 17)
 SAME_VALUE_uT = 1e-3  # float32 arithmetic may write one value in two ways
 
 # Noise moves a chip that works; it repeats itself only when it is read again before its next conversion is done
 # (1.84 ms), or where its LSB is coarse: for at most 3 frames in 14 real recordings.
 STUCK_FRAMES_MIN_N = 20
+OTHERS_MOVE_MIN = 0.5  # without noise a board moves only while it is pressed or released
 
 
 def failed_reads(
@@ -38,13 +41,19 @@ def failed_reads(
     return same_b.all(axis=2) & (same_temperature | np.isnan(temperature_degC))
 
 
-def find_lsb(b_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "k 2"]:
+def find_lsb(
+    b_uT: Float[np.ndarray, "f ch"], *, step_min_uT: float = STEP_MIN_uT, steps_min_n: int = STEPS_MIN_N
+) -> Float[np.ndarray, "k 2"]:
     """Estimate the step between a chip's values, in uT, along x and y and along z; NaN where no grid shows.
 
-    A few hundred frames show it; a chip whose settings change among them shows none.
+    A few hundred frames show it; a chip whose settings change among them shows none. A grid is `steps_min_n` steps of
+    `step_min_uT` or more.
     """
     chips = np.moveaxis(_by_chip(b_uT), 1, 0)
-    return np.array([[_step([chip[:, 0], chip[:, 1]]), _step([chip[:, 2]])] for chip in chips]).reshape(-1, 2)
+    steps_uT = np.array(
+        [[_step([chip[:, 0], chip[:, 1]], steps_min_n), _step([chip[:, 2]], steps_min_n)] for chip in chips]
+    ).reshape(-1, 2)
+    return np.where(steps_uT >= step_min_uT, steps_uT, np.nan)
 
 
 def reset_chips(b_uT: Float[np.ndarray, "f ch"], expected_lsb_uT: tuple[float, float] | None) -> Bool[np.ndarray, " k"]:
@@ -53,7 +62,11 @@ def reset_chips(b_uT: Float[np.ndarray, "f ch"], expected_lsb_uT: tuple[float, f
     Without an expectation: those whose grid differs from that of most chips, or is the one of a chip after a reset. A
     chip that shows no grid is not flagged.
     """
-    lsb_uT = find_lsb(b_uT)
+    return odd_scales(find_lsb(b_uT), expected_lsb_uT)
+
+
+def odd_scales(lsb_uT: Float[np.ndarray, "k 2"], expected_lsb_uT: tuple[float, float] | None) -> Bool[np.ndarray, " k"]:
+    """Flag chips as `reset_chips` does, from the steps that `find_lsb` gave."""
     if expected_lsb_uT is not None:
         return _not_on_grid(lsb_uT, expected_lsb_uT)
     after_reset = ~_not_on_grid(lsb_uT, (RESET_LSB_XY_uT, RESET_LSB_Z_uT)) & np.isfinite(lsb_uT).all(axis=1)
@@ -62,36 +75,48 @@ def reset_chips(b_uT: Float[np.ndarray, "f ch"], expected_lsb_uT: tuple[float, f
 
 
 def stuck_chips(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
-    """Mark the readings of a chip that stays the same for `STUCK_FRAMES_MIN_N` frames while another chip moves."""
-    chips = _by_chip(b_uT)
-    stuck = np.zeros(chips.shape[:2], bool)
-    if len(chips) < STUCK_FRAMES_MIN_N:
-        return stuck
-    moves = (np.diff(chips, axis=0) != 0).any(axis=2)
-    moves_before_n = np.concatenate([np.zeros((1, 1), np.int64), moves.sum(axis=1, keepdims=True).cumsum(axis=0)])[:, 0]
-    for chip_i in range(chips.shape[1]):
-        first, last = _quiet_runs(moves[:, chip_i])
-        others_move = moves_before_n[last] > moves_before_n[first]  # within the run this chip has no move of its own
-        for start, stop in zip(first[others_move], last[others_move] + 1, strict=True):
-            stuck[start:stop, chip_i] = True
-    return stuck
+    """Mark the readings of a chip that has stayed the same for `STUCK_FRAMES_MIN_N` frames while the board moved."""
+    return StuckChips(b_uT.shape[1] // 3).feed(b_uT)
 
 
-def _quiet_runs(moves: Bool[np.ndarray, " g"]) -> tuple[Int64[np.ndarray, " r"], Int64[np.ndarray, " r"]]:
-    """Give first and last frame of every long run without a move; `moves[i]` is the one from frame i to i + 1."""
-    edges = np.concatenate([[0], np.flatnonzero(moves) + 1, [len(moves) + 1]])
-    long = np.diff(edges) >= STUCK_FRAMES_MIN_N
-    return edges[:-1][long], edges[1:][long] - 1
+class StuckChips:
+    """Remembers since when each chip has not moved, so that a recording may come in any portions.
+
+    A reading is stuck if it is at least the `STUCK_FRAMES_MIN_N`-th of a run of equal ones, and other chips moved in
+    `OTHERS_MOVE_MIN` or more of the run: a board that stands still as a whole, or has no noise, is not broken.
+    """
+
+    def __init__(self, chips_n: int) -> None:
+        self._last_uT = np.full((1, chips_n, 3), np.nan)
+        self._quiet_n = np.zeros(chips_n, np.int64)  # frames since each chip's last move
+        self._moved_n = np.zeros(chips_n, np.int64)  # of these, the ones in which another chip moved
+
+    def feed(self, b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
+        """Take the next readings; mark the stuck ones."""
+        chips = _by_chip(b_uT)
+        if not len(chips):
+            return np.zeros(chips.shape[:2], bool)
+        moves = (np.diff(np.concatenate([self._last_uT, chips]), axis=0) != 0).any(axis=2)
+        frame_n = np.arange(1, len(chips) + 1)[:, None]
+        board_n = moves.any(axis=1).cumsum()[:, None]
+        begin_n = np.maximum.accumulate(np.where(moves, frame_n, 0), axis=0)
+        moved_before_n = np.concatenate([[0], board_n[:, 0]])[begin_n]
+        carried = begin_n == 0
+        quiet_n = frame_n - begin_n + carried * self._quiet_n
+        moved_n = board_n - moved_before_n + carried * self._moved_n
+        self._last_uT, self._quiet_n, self._moved_n = chips[-1:].astype(np.float64), quiet_n[-1], moved_n[-1]
+        return (quiet_n >= STUCK_FRAMES_MIN_N - 1) & (moved_n >= OTHERS_MOVE_MIN * quiet_n)
 
 
-def _step(axes_uT: list[Float[np.ndarray, " f"]]) -> float:
+def _step(axes_uT: list[Float[np.ndarray, " f"]], steps_min_n: int) -> float:
     """Find the step of the grid on which all values of some axes lie."""
     gaps_uT = np.concatenate([np.diff(np.unique(axis[np.isfinite(axis)])) for axis in axes_uT])
     gaps_uT = gaps_uT[gaps_uT > SAME_VALUE_uT]
     if not len(gaps_uT):
         return np.nan
     single = gaps_uT[gaps_uT < 1.5 * gaps_uT.min()]
-    shows = len(single) >= max(STEPS_MIN_N, STEP_SHARE_MIN * len(gaps_uT)) and single.mean() >= STEP_MIN_uT
+    alike = single.std() <= STEP_SPREAD_MAX * single.mean()
+    shows = alike and len(single) >= max(steps_min_n, STEP_SHARE_MIN * len(gaps_uT))
     return float(single.mean()) if shows else np.nan
 
 

@@ -15,7 +15,12 @@ from pipeline.errors import CaptureError, complain
 from pipeline.schema import Readings
 
 # What lies between dwells is no loss.
-LOST_FRAMES = ("dropped_failed_read_frames_n", "dropped_no_time_frames_n", "dropped_not_finite_frames_n")
+LOST_FRAMES = (
+    "dropped_failed_read_frames_n",
+    "dropped_no_time_frames_n",
+    "dropped_not_finite_frames_n",
+    "dropped_stuck_chip_frames_n",
+)
 
 
 class Opened(NamedTuple):

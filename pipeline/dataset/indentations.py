@@ -23,6 +23,7 @@ COUNTS = (
     "dropped_no_time_frames_n",
     "dropped_not_finite_frames_n",
     "dropped_failed_read_frames_n",
+    "dropped_stuck_chip_frames_n",
     "dropped_between_dwells_frames_n",
     "dropped_no_noload_frames_n",
     "dropped_no_contact_frames_n",
@@ -33,11 +34,17 @@ COUNTS = (
 
 @dataclass(frozen=True)
 class TimedFrames:
-    """Frames with the stream time of each (NaN: unknown, as for all that follow) and a mask of failed reads."""
+    """Frames with the stream time of each (NaN: unknown, as for all that follow); masks of failed and stuck chips."""
 
     frames: Frames
     t_s: Float64[np.ndarray, " f"]
     failed: Bool[np.ndarray, " f"]
+    stuck: Bool[np.ndarray, " f"]
+
+    @property
+    def sound(self) -> Bool[np.ndarray, " f"]:
+        """Mark the frames that hold a fresh reading of every chip."""
+        return ~(self.failed | self.stuck)
 
 
 @dataclass(frozen=True)
@@ -75,8 +82,8 @@ def join(
 class Joiner:
     """Sorts frames into dwells; holds back the indentation that may still grow.
 
-    A frame counts under the first reason that fits: no time, not finite, failed read, between dwells. The no-load
-    field of an indentation is the mean over its no-load dwell. `t_s` of a reading is the stream's time.
+    A frame counts under the first reason that fits: no time, not finite, failed read, stuck chip, between dwells. The
+    no-load field of an indentation is the mean over its no-load dwell. `t_s` of a reading is the stream's time.
     """
 
     def __init__(self, log: ProbeLog, clock: ClockMap, header: Header) -> None:
@@ -124,6 +131,7 @@ class Joiner:
                 np.isfinite(frames.b_uT).all(axis=1) & np.isfinite(frames.temperature_degC).all(axis=1)
             ),
             "dropped_failed_read_frames_n": block.failed,
+            "dropped_stuck_chip_frames_n": block.stuck,
             "dropped_between_dwells_frames_n": (dwell_i < 0) | (probe_s > log.t_end_s[dwell_i]),
         }
         keep = np.ones(len(probe_s), bool)

@@ -13,6 +13,7 @@ from pipeline.capture import arrivals, faults, probe, wire
 from pipeline.capture.arrivals import Arrivals
 from pipeline.capture.header import ARRIVALS_FILE, PROBE_FILE, STREAM_FILE, Header, Wire
 from pipeline.capture.probe import ProbeLog
+from pipeline.capture.readers.watch import Watch, check_log
 from pipeline.capture.stream import FrameStream, no_frame
 from pipeline.capture.wire import Frames
 from pipeline.dataset.clocks import ClockMap, from_contacts, from_marks
@@ -34,6 +35,7 @@ def read_native(folder: Path, header: Header) -> tuple[Iterator[Readings], dict[
     if not stream.is_file():
         raise CaptureError(complain(stream, "the file", "there", "nothing", "Copy the whole capture folder."))
     log = probe.parse(folder / PROBE_FILE, str(folder / PROBE_FILE))
+    check_log(log, str(folder / PROBE_FILE))
     times_of = _timer(folder, header)
     clock = _clock(folder, header, log, times_of)
     account = {
@@ -47,30 +49,30 @@ def _clock(folder: Path, header: Header, log: ProbeLog, times_of: Timer) -> Cloc
     if header.clock.marks:
         return from_marks(np.array(header.clock.marks), str(folder))
     blocks = _timed_frames(folder, header, times_of, {})
-    return from_contacts(((one.t_s[~one.failed], one.frames.b_uT[~one.failed]) for one in blocks), log, str(folder))
+    return from_contacts(((one.t_s[one.sound], one.frames.b_uT[one.sound]) for one in blocks), log, str(folder))
 
 
 def _timed_frames(folder: Path, header: Header, times_of: Timer, account: dict[str, int]) -> Iterator[TimedFrames]:
     """Decode the stream block by block; the stream's own account is added when it has ended."""
-    stream = FrameStream(_wire(header), header.chips_n)
+    stream, watch = FrameStream(_wire(header), header.chips_n), Watch(header, str(folder / STREAM_FILE))
     frames_n = 0
     with (folder / STREAM_FILE).open("rb") as file:
         head = data = file.read(BLOCK_BYTES_N)
         while data:
             frames = stream.feed(data)
-            yield _timed(frames, times_of(frames, frames_n))
+            yield _timed(frames, times_of(frames, frames_n), watch)
             frames_n += len(frames)
             data = file.read(BLOCK_BYTES_N)
     frames = stream.close()
-    yield _timed(frames, times_of(frames, frames_n))
+    yield _timed(frames, times_of(frames, frames_n), watch)
     if not stream.account()["frames_n"]:
         raise no_frame(str(folder / STREAM_FILE), head, _wire(header), header.chips_n)
     account.update(stream.account())
 
 
-def _timed(frames: Frames, t_s: Float64[np.ndarray, " f"]) -> TimedFrames:
+def _timed(frames: Frames, t_s: Float64[np.ndarray, " f"], watch: Watch) -> TimedFrames:
     failed = np.asarray(faults.failed_reads(frames.b_uT, frames.temperature_degC).any(axis=1))
-    return TimedFrames(frames, t_s, failed)
+    return TimedFrames(frames, t_s, failed, watch.stuck(frames, failed))
 
 
 def _timer(folder: Path, header: Header) -> Timer:

@@ -96,19 +96,20 @@ class TestScale:
 
 class TestStuck:
     def naive(self, b_uT: np.ndarray) -> np.ndarray:
-        """For every chip and frame, walk to both ends of its run of equal readings, and see if others moved there."""
+        """For every chip and frame, walk back over its run of equal readings, and count others' moves on the way."""
         frames_n, chips_n = len(b_uT), b_uT.shape[1] // 3
         rows = b_uT.reshape(frames_n, chips_n, 3)
         stuck = np.zeros((frames_n, chips_n), bool)
         for chip_i in range(chips_n):
             for frame_i in range(frames_n):
-                first = last = frame_i
+                first, moved_n = frame_i, 0
                 while first > 0 and (rows[first - 1, chip_i] == rows[frame_i, chip_i]).all():
+                    moved_n += (rows[first - 1] != rows[first]).any()
                     first -= 1
-                while last < frames_n - 1 and (rows[last + 1, chip_i] == rows[frame_i, chip_i]).all():
-                    last += 1
-                moved = (rows[first : last + 1] != rows[first]).any()
-                stuck[frame_i, chip_i] = moved and last - first + 1 >= faults.STUCK_FRAMES_MIN_N
+                run_n = frame_i - first + 1
+                stuck[frame_i, chip_i] = run_n >= faults.STUCK_FRAMES_MIN_N and moved_n >= faults.OTHERS_MOVE_MIN * (
+                    run_n - 1
+                )
         return stuck
 
     @given(st.lists(st.tuples(st.integers(0, 3), st.integers(1, 45)), max_size=6), st.integers(1, 2))
@@ -119,11 +120,19 @@ class TestStuck:
         b_uT = np.repeat(places, 3, axis=1).astype(np.float32)
         np.testing.assert_array_equal(faults.stuck_chips(b_uT), self.naive(b_uT))
 
-    def test_a_chip_that_stops_while_others_move_is_stuck_from_its_last_move_on(self):
+    @given(st.lists(st.integers(0, 200), max_size=4))
+    def test_portions_do_not_matter(self, ends):
+        b_uT = readings_on_grid([GRIDS_uT["ini"]] * 2, 200, 0)
+        b_uT[60:150, 3:6] = b_uT[60, 3:6]
+        watch = faults.StuckChips(2)
+        parts = [watch.feed(part) for part in np.split(b_uT, sorted(ends))]
+        np.testing.assert_array_equal(np.concatenate(parts), faults.stuck_chips(b_uT))
+
+    def test_a_chip_that_stops_while_others_move_is_stuck_from_its_20th_equal_reading_on(self):
         b_uT = readings_on_grid([GRIDS_uT["ini"]] * 3, 200, 0)
         b_uT[120:, 3:6] = b_uT[120, 3:6]
         expected = np.zeros((200, 3), bool)
-        expected[120:, 1] = True
+        expected[120 + faults.STUCK_FRAMES_MIN_N - 1 :, 1] = True
         np.testing.assert_array_equal(faults.stuck_chips(b_uT), expected)
 
     def test_a_board_that_stands_still_as_a_whole_is_not_a_stuck_chip(self):

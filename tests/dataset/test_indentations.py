@@ -41,14 +41,14 @@ def timed_of(frames_n: int, faults: dict[int, str] | None = None) -> TimedFrames
     b_uT = rng.normal(0, 100, (frames_n, 3 * CHIPS_N)).astype(np.float32)
     temperature_degC = rng.normal(25, 1, (frames_n, CHIPS_N)).astype(np.float32)
     t_s = (np.arange(frames_n) - 2.0 - CLOCK.offset_s) / CLOCK.rate
-    failed = np.zeros(frames_n, bool)
+    failed, stuck = np.zeros((2, frames_n), bool)
     for row_i, fault in (faults or {}).items():
         if row_i < frames_n:
-            failed[row_i] = fault == "failed"
+            failed[row_i], stuck[row_i] = fault == "failed", fault == "stuck"
             b_uT[row_i, -1] = np.nan if fault == "field" else b_uT[row_i, -1]
             temperature_degC[row_i, 0] = np.inf if fault == "temperature" else 25
     end_byte = 34 * (1 + np.arange(frames_n, dtype=np.int64))
-    return TimedFrames(Frames(b_uT, temperature_degC, np.full(frames_n, np.nan), end_byte), t_s, failed)
+    return TimedFrames(Frames(b_uT, temperature_degC, np.full(frames_n, np.nan), end_byte), t_s, failed, stuck)
 
 
 def cut(whole: TimedFrames, ends: list[int]) -> list[TimedFrames]:
@@ -57,7 +57,7 @@ def cut(whole: TimedFrames, ends: list[int]) -> list[TimedFrames]:
     for begin, end in pairwise(edges):
         names = [field.name for field in dataclasses.fields(Frames)]
         frames = Frames(**{name: getattr(whole.frames, name)[begin:end] for name in names})
-        blocks.append(TimedFrames(frames, whole.t_s[begin:end], whole.failed[begin:end]))
+        blocks.append(TimedFrames(frames, whole.t_s[begin:end], whole.failed[begin:end], whole.stuck[begin:end]))
     return blocks
 
 
@@ -81,7 +81,7 @@ def naive(timed: TimedFrames, log: ProbeLog) -> list[dict[str, object]]:
             np.isfinite(timed.frames.b_uT[frame_i]).all() and np.isfinite(timed.frames.temperature_degC[frame_i]).all()
         )
         inside = [d for d in range(len(log)) if log.t_start_s[d] <= CLOCK.offset_s + CLOCK.rate * t_s <= log.t_end_s[d]]
-        if inside and finite and not timed.failed[frame_i]:
+        if inside and finite and not (timed.failed[frame_i] or timed.stuck[frame_i]):
             dwell_i = inside[-1]
             if log.contact[dwell_i]:
                 contact.append((frame_i, dwell_i))
@@ -107,7 +107,7 @@ def naive(timed: TimedFrames, log: ProbeLog) -> list[dict[str, object]]:
     return rows
 
 
-FAULTS = st.dictionaries(st.integers(0, 60), st.sampled_from(["failed", "field", "temperature"]), max_size=12)
+FAULTS = st.dictionaries(st.integers(0, 60), st.sampled_from(["failed", "stuck", "field", "temperature"]), max_size=12)
 
 
 @given(indentations=st.lists(DWELLS, min_size=1, max_size=6), frames_n=st.integers(0, 60), faults=FAULTS)
@@ -175,6 +175,7 @@ def test_each_loss_has_its_reason() -> None:
         "dropped_no_time_frames_n": 1,
         "dropped_not_finite_frames_n": 2,
         "dropped_failed_read_frames_n": 2,
+        "dropped_stuck_chip_frames_n": 0,
         "dropped_between_dwells_frames_n": 2,  # at -2 and -1 s
         "dropped_no_noload_frames_n": 2,  # at 7 and 8 s, whose no-load dwell was not read
         "dropped_no_contact_frames_n": 1,  # at 9 s

@@ -10,7 +10,7 @@ import pytest
 from pipeline import io
 from pipeline.capture import arrivals, probe
 from pipeline.capture.arrivals import Arrivals
-from pipeline.capture.faults import FAILED_B_uT, FAILED_TEMPERATURE_degC
+from pipeline.capture.faults import STUCK_FRAMES_MIN_N, FAILED_B_uT, FAILED_TEMPERATURE_degC
 from pipeline.capture.header import ARRIVALS_FILE, PROBE_FILE, STREAM_FILE, Clock, Header, Wire
 from pipeline.capture.probe import LABELS, ProbeLog
 from pipeline.capture.wire import Frames, encode
@@ -148,6 +148,53 @@ def test_every_byte_and_frame_is_accounted_for_when_the_stream_is_broken(tmp_pat
     assert account["dropped_failed_read_frames_n"] == 3
     assert account["not_finite_frames_n"] == 1
     assert account["skipped_resync_bytes_n"] > 0
+
+
+def with_chip(rows: slice, values_uT: np.ndarray) -> Frames:
+    b_uT = FRAMES.b_uT.copy()
+    b_uT[rows, 3:6] = values_uT
+    return dataclasses.replace(FRAMES, b_uT=b_uT)
+
+
+@pytest.mark.parametrize("marks", [MARKS, ()], ids=["marks", "contacts"])
+def test_a_chip_that_freezes_costs_its_frames(tmp_path: Path, marks: tuple[tuple[float, float], ...]) -> None:
+    begin = len(FRAMES) // 3
+    frozen = with_chip(slice(begin, None), FRAMES.b_uT[begin, 3:6])
+    _, account = read(write(tmp_path, "binary", frozen), header_of("binary", marks=marks))
+    assert account["dropped_stuck_chip_frames_n"] == len(FRAMES) - begin - STUCK_FRAMES_MIN_N + 1
+    dropped = [key for key in account if key.startswith("dropped_") and key.endswith("_frames_n")]
+    used = account["frames_noload_n"] + account["frames_contact_n"]
+    assert account["frames_n"] == used + sum(account[key] for key in dropped)
+
+
+def test_a_chip_that_loses_its_settings_is_named(tmp_path: Path) -> None:
+    b_uT = FRAMES.b_uT.copy()
+    steps_uT = np.tile([0.15, 0.15, 0.242], CHIPS_N).astype(np.float32)
+    b_uT = np.round(b_uT / steps_uT) * steps_uT
+    reset_uT = np.array([0.98, 0.98, 1.58], np.float32)
+    b_uT[600:, 3:6] = np.round(b_uT[600:, 3:6] / reset_uT) * reset_uT
+    folder = write(tmp_path, "binary", dataclasses.replace(FRAMES, b_uT=b_uT))
+    with pytest.raises(CaptureError, match="stream.bin from sound frame .*: the LSB of chip 1 must be as before"):
+        read(folder, header_of("binary"))
+
+
+@pytest.mark.parametrize("of_a_uT", [1e-2, 1e-3, 1e-6])
+def test_a_stream_in_another_unit_is_refused(tmp_path: Path, of_a_uT: float) -> None:
+    other = dataclasses.replace(FRAMES, b_uT=FRAMES.b_uT * np.float32(of_a_uT))
+    with pytest.raises(CaptureError, match="stream.bin: field must be .* G to uT"):
+        read(write(tmp_path, "binary", other), header_of("binary"))
+
+
+@pytest.mark.parametrize(("sent", "said"), [("text-xyzt", "text-txyz"), ("text-txyz", "text-xyzt")])
+def test_lines_of_the_other_order_are_refused(tmp_path: Path, sent: Wire, said: Wire) -> None:
+    with pytest.raises(CaptureError, match=rf"stream.bin: temperatures of {said} .* Is the wire format {sent}\?"):
+        read(write(tmp_path, sent), header_of(said))
+
+
+def test_a_probe_log_in_another_unit_is_refused(tmp_path: Path) -> None:
+    folder = write(tmp_path, "binary", probe=probe.render(dataclasses.replace(LOG, x_mm=LOG.x_mm * 1000)).encode())
+    with pytest.raises(CaptureError, match="probe.csv: places must be one, or spread over 1 to 200 mm; got 5.9e"):
+        read(folder, header_of("binary"))
 
 
 def test_a_smaller_block_gives_the_same_readings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,8 +1,10 @@
 """Can the chips of a recording be believed? In: all its fields. Out: the rows in which every chip was read.
 
-A failed read costs a row; a chip of another scale than its header or neighbours costs the recording, as nobody knows
-what its numbers mean. Refuses to know layouts, and to mend anything.
+A failed read or a stuck chip costs a row; a chip of another scale than its header or neighbours costs the recording,
+as nobody knows what its numbers mean. Refuses to know layouts, and to mend anything.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -14,18 +16,38 @@ from pipeline.errors import CaptureError, complain
 GRID_ROWS_N = 1000  # real recordings show each sound chip's grid in blocks of 400 rows; in 200 it may hide
 
 
+class Rows(NamedTuple):
+    """What became of each row: `whole` ones hold a reading of every chip; the others failed or, if not, are stuck."""
+
+    whole: Bool[np.ndarray, " f"]
+    failed: Bool[np.ndarray, " f"]
+    stuck: Bool[np.ndarray, " f"]
+
+    def losses(self) -> dict[str, int]:
+        """Count the rows that are not whole, as accounts do."""
+        return {
+            "dropped_failed_read_rows_n": int(self.failed.sum()),
+            "dropped_stuck_chip_rows_n": int(self.stuck.sum()),
+        }
+
+    def part(self, rows: slice) -> "Rows":
+        """Keep some of the rows."""
+        return Rows(self.whole[rows], self.failed[rows], self.stuck[rows])
+
+
 def find_whole_rows(
     b_uT: Float[np.ndarray, "f ch"], temperature_degC: Float[np.ndarray, "f k"], header: Header, *, where: str
-) -> Bool[np.ndarray, " f"]:
-    """Mark the rows that hold a reading of every chip; raise if there is none, or if a chip's scale is unknown."""
-    whole = np.asarray(~faults.failed_reads(b_uT, temperature_degC).any(axis=1))
-    if not whole.any():
+) -> Rows:
+    """Tell the rows that hold a reading of every chip; raise if there is none, or if a chip's scale is unknown."""
+    failed = np.asarray(faults.failed_reads(b_uT, temperature_degC).any(axis=1))
+    if failed.all():
         remedy = "Mend the wiring, and record again."
         raise CaptureError(complain(where, "rows", "read from every chip", "failed I2C reads in all of them", remedy))
-    rows = np.flatnonzero(whole)
+    rows = np.flatnonzero(~failed)
     for block in np.array_split(rows, max(1, len(rows) // GRID_ROWS_N)):
         _check_scale(b_uT[block], header, where=f"{where} from row {block[0] + 1}")
-    return whole
+    stuck = np.asarray(faults.stuck_chips(b_uT).any(axis=1)) & ~failed
+    return Rows(~failed & ~stuck, failed, stuck)
 
 
 def _check_scale(b_uT: Float[np.ndarray, "f ch"], header: Header, *, where: str) -> None:

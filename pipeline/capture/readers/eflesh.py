@@ -14,7 +14,7 @@ from pipeline.capture.header import Header
 from pipeline.capture.readers.chips import find_whole_rows
 from pipeline.capture.readers.passes import find_passes
 from pipeline.capture.readers.table import read_cells, to_numbers
-from pipeline.capture.readers.units import check_fields, check_forces
+from pipeline.capture.readers.units import check_depths, check_fields, check_forces, check_places, check_touch
 from pipeline.errors import CaptureError, complain
 from pipeline.schema import AXES_PER_CHIP_N, Readings
 
@@ -62,7 +62,8 @@ def read(folder: Path, header: Header) -> tuple[Readings, Account]:
     _check_rows_n({SENSOR: len(time_s), STATES: len(states)}, header)
     _check_clocks(time_s, states[:, 0], header)
     temperature_degC = np.full((len(time_s), header.chips_n), np.nan, np.float32)
-    keep = find_whole_rows(b_uT, temperature_degC, header, where=f"{header.capture}/{SENSOR}")
+    rows = find_whole_rows(b_uT, temperature_degC, header, where=f"{header.capture}/{SENSOR}")
+    keep = rows.whole
     place_mm = np.round(states[:, 1:3], PLACE_DECIMALS)
     place_mm -= place_mm.min(axis=0)
     pass_i, touches_i = _number_passes(place_mm, noload_uT)
@@ -92,7 +93,7 @@ def read(folder: Path, header: Header) -> tuple[Readings, Account]:
         "rows_n": rows_n,
         "rows_read_n": len(keep),
         "noload_rows_n": 0,
-        "dropped_failed_read_rows_n": len(keep) - rows_n,
+        **rows.losses(),
         "no_new_force_rows_n": _count_no_new_force(states[keep]),
         "passes_n": int(pass_i.max()) + 1,
     }
@@ -120,7 +121,10 @@ def _read_states(folder: Path, header: Header) -> Float64[np.ndarray, "f c"]:
     where = f"{header.capture}/{STATES}"
     cells = read_cells(folder / STATES, where, separator=",")
     names = ["time", "x", "y", "z"] + (["weight"] if len(cells[0]) > WEIGHT_COLUMN else [])
-    return to_numbers(cells, where, names=names, first_line_n=1)
+    states = to_numbers(cells, where, names=names, first_line_n=1)
+    check_places(states[:, 1:3], where)
+    check_depths(states[:, 3] - states[:, 3].min(), where)
+    return states
 
 
 def _read_numbers(folder: Path, header: Header, name: str, names: list[str]) -> Float64[np.ndarray, "f c"]:
@@ -176,7 +180,9 @@ def _read_force(states: Float64[np.ndarray, "f c"], header: Header) -> dict[str,
         raise CaptureError(complain(header.capture, "option force_axis", "x, y or z", got, remedy))
     weight_g = states[:, WEIGHT_COLUMN]
     weight_N = np.where(weight_g == NO_NEW_WEIGHT, np.nan, weight_g * NEWTON_PER_GRAM)
-    check_forces(weight_N, f"{header.capture}/{STATES}", first_line_n=1)
+    where = f"{header.capture}/{STATES}"
+    check_forces(weight_N, where, first_line_n=1)
+    check_touch(weight_N, where)
     force_N[header.options["force_axis"]] = weight_N.astype(np.float32)
     return force_N
 

@@ -2,19 +2,21 @@
 
 Rows below the gauge's 0.02 N count as no contact, wherever the truths say they are: they stay, without place or force.
 Those that begin a pass, at a corner of the grid, are its no-load reading. `t_s` and `depth_mm` are NaN: none is known.
+If the header says that fields come late (`rows_late`), row i of the truths goes with a later row of the readings.
 """
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int32
 
 from pipeline.capture.header import Header
-from pipeline.capture.readers.chips import find_whole_rows
+from pipeline.capture.readers.chips import Rows, find_whole_rows
 from pipeline.capture.readers.passes import find_passes
 from pipeline.capture.readers.table import read_cells, to_numbers
-from pipeline.capture.readers.units import check_fields, check_forces
+from pipeline.capture.readers.units import check_fields, check_forces, check_places, check_touch
 from pipeline.errors import CaptureError, complain
 from pipeline.schema import Readings
 
@@ -23,8 +25,20 @@ TRUTHS = "truths.txt"
 FILES = (READINGS, TRUTHS)
 CONTACT_MIN_N = 0.02  # the recorder labels weaker rows (10, 10, 0), a real place: only force tells them apart
 VALUES_PER_CHIP_N = 4
+ROWS_LATE = ("0", "1", "2", "3", "4", "5")
 
 Account = dict[str, int]
+
+
+class _Pairs(NamedTuple):
+    """Rows of both files that belong together; those without a partner are left out."""
+
+    b_uT: Float64[np.ndarray, "f ch"]
+    temperature_degC: Float64[np.ndarray, "f k"]
+    truths: Float64[np.ndarray, "f 3"]  # x mm, y mm, F N
+    rows: Rows
+    rows_late_n: int
+    best_rows_late_n: int
 
 
 def collect(recording: Path) -> dict[str, Path]:
@@ -55,12 +69,10 @@ def count_chips(files: Mapping[str, Path]) -> int:
 
 def read(folder: Path, header: Header) -> tuple[Readings, Account]:
     """Read all rows but those with a failed chip; the no-load field of a row is the mean of its pass's corner rows."""
-    b_uT, temperature_degC = _read_fields(folder, header)
-    truths = _read_truths(folder, header)
-    _check_rows_n(len(b_uT), len(truths), header)
+    pairs = _read_pairs(folder, header)
+    b_uT, truths, keep = pairs.b_uT, pairs.truths, pairs.rows.whole
     contact = truths[:, 2] >= CONTACT_MIN_N
     pass_i = find_passes(truths[:, :2], contact)
-    keep = find_whole_rows(b_uT, temperature_degC, header, where=f"{header.capture}/{READINGS}")
     corner = _corner_rows(pass_i, contact)
     noload_uT = _noload_field(b_uT, pass_i, corner & keep, header)
     place_mm = np.where(contact[:, None], truths[:, :2], np.nan).astype(np.float32)
@@ -82,19 +94,39 @@ def read(folder: Path, header: Header) -> tuple[Readings, Account]:
         Fz_N=np.where(contact, truths[:, 2], 0.0)[keep].astype(np.float32),
         b_uT=b_uT[keep].astype(np.float32),
         noload_uT=noload_uT[keep].astype(np.float32),
-        temperature_degC=temperature_degC[keep].astype(np.float32),
+        temperature_degC=pairs.temperature_degC[keep].astype(np.float32),
         t_s=unknown,
         n_contacts=(header.contacts_before_n + np.cumsum(contact) - contact)[keep].astype(np.int32),
     )
     return readings, {
         "rows_n": rows_n,
-        "rows_read_n": len(keep),
-        "dropped_failed_read_rows_n": len(keep) - rows_n,
+        "rows_read_n": len(keep) + pairs.rows_late_n,
+        **pairs.rows.losses(),
+        "dropped_no_partner_rows_n": pairs.rows_late_n,
         "noload_rows_n": 0,
         "no_contact_rows_n": int((keep & ~contact).sum()),
         "corner_rows_n": int((keep & corner).sum()),
         "passes_n": int(pass_i.max()) + 1,
+        "best_rows_late_n": pairs.best_rows_late_n,
     }
+
+
+def _read_pairs(folder: Path, header: Header) -> _Pairs:
+    """Read both files, and pair their rows as the header says."""
+    rows_late_n = _rows_late(header)
+    b_uT, temperature_degC = _read_fields(folder, header)
+    truths = _read_truths(folder, header)
+    _check_rows_n(len(b_uT), len(truths), rows_late_n, header)
+    rows = find_whole_rows(b_uT, temperature_degC, header, where=f"{header.capture}/{READINGS}")
+    late = slice(rows_late_n, None)
+    return _Pairs(
+        b_uT=b_uT[late],
+        temperature_degC=temperature_degC[late],
+        truths=truths[: len(truths) - rows_late_n],
+        rows=rows.part(late),
+        rows_late_n=rows_late_n,
+        best_rows_late_n=_best_rows_late(b_uT, truths[:, 2], rows),
+    )
 
 
 def _read_fields(folder: Path, header: Header) -> tuple[Float64[np.ndarray, "f ch"], Float64[np.ndarray, "f k"]]:
@@ -114,15 +146,42 @@ def _read_truths(folder: Path, header: Header) -> Float64[np.ndarray, "f 3"]:
     cells = read_cells(folder / TRUTHS, where, separator=None)
     truths = to_numbers(cells, where, names=["x_mm", "y_mm", "F_N"], first_line_n=1)
     check_forces(truths[:, 2], where, first_line_n=1)
+    check_touch(truths[:, 2], where)
+    check_places(truths[truths[:, 2] >= CONTACT_MIN_N, :2], where)
     return truths
 
 
-def _check_rows_n(readings_n: int, truths_n: int, header: Header) -> None:
+def _check_rows_n(readings_n: int, truths_n: int, rows_late_n: int, header: Header) -> None:
+    if readings_n <= rows_late_n:
+        rule = f"more than the {rows_late_n} of option rows_late"
+        raise CaptureError(complain(header.capture, "rows", rule, readings_n, "Was the recording cut?"))
     if readings_n != truths_n:
         got = f"{readings_n} in {READINGS} and {truths_n} in {TRUTHS}"
         raise CaptureError(
             complain(header.capture, "rows", "equal in number", got, "Is this the truths file of this one?")
         )
+
+
+def _rows_late(header: Header) -> int:
+    rows_late = header.options.get("rows_late", "0")
+    if rows_late not in ROWS_LATE:
+        remedy = "Say by how many rows the fields come late."
+        raise CaptureError(complain(header.capture, "option rows_late", f"0 to {ROWS_LATE[-1]}", rows_late, remedy))
+    return int(rows_late)
+
+
+def _best_rows_late(b_uT: Float64[np.ndarray, "f ch"], force_N: Float64[np.ndarray, " f"], rows: Rows) -> int:
+    """Find by how many rows the fields come late: |dB| goes best with the force then. 0 if the data do not tell."""
+    correlations = []
+    for rows_late_n in range(min(len(ROWS_LATE), len(force_N) - 1)):
+        whole = rows.whole[rows_late_n:]
+        late_uT, pressed_N = b_uT[rows_late_n:][whole], force_N[: len(whole)][whole]
+        rest = pressed_N < CONTACT_MIN_N
+        if not (rest.any() and len(np.unique(pressed_N)) > 1):
+            return 0
+        change_uT = np.linalg.norm(late_uT - late_uT[rest].mean(axis=0), axis=1)
+        correlations.append(np.corrcoef(change_uT, pressed_N)[0, 1] if np.ptp(change_uT) > 0 else -1.0)
+    return int(np.argmax(correlations)) if correlations else 0
 
 
 def _corner_rows(pass_i: Int32[np.ndarray, " f"], contact: Bool[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
@@ -145,7 +204,7 @@ def _noload_field(
     without = np.flatnonzero(rows_n == 0)
     if len(without):
         got = f"none in the pass from line {int(np.argmax(pass_i == without[0])) + 1}"
-        where = f"{header.capture}/{READINGS}"
+        where = f"{header.capture}/{TRUTHS}"
         rule = f"begun by a whole row without contact (F < {CONTACT_MIN_N} N)"
         raise CaptureError(
             complain(where, "each pass", rule, got, "Start each pass off the skin, or cut this pass out.")

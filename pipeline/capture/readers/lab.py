@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float64, Int
 from pipeline.capture.header import Header
 from pipeline.capture.readers.chips import find_whole_rows
 from pipeline.capture.readers.table import read_cells, to_numbers
-from pipeline.capture.readers.units import check_fields, check_forces
+from pipeline.capture.readers.units import check_fields, check_forces, check_places, check_touch
 from pipeline.errors import CaptureError, complain
 from pipeline.schema import Readings
 
@@ -62,8 +62,8 @@ def read(folder: Path, header: Header) -> tuple[Readings, Account]:
     if table.temperature_degC.shape[1] != header.chips_n:
         got = table.temperature_degC.shape[1]
         raise CaptureError(complain(where, "chips", f"{header.chips_n}, as in the header", got, "Mend header or file."))
-    whole = find_whole_rows(table.b_uT, table.temperature_degC, header, where=where)
-    keep, noload = table.contact & whole, ~table.contact & whole
+    rows = find_whole_rows(table.b_uT, table.temperature_degC, header, where=where)
+    keep, noload = table.contact & rows.whole, ~table.contact & rows.whole
     noload_uT = _noload_field(table, noload, where)
     rows_n = int(keep.sum())
     unknown = np.full(rows_n, np.nan)
@@ -91,7 +91,7 @@ def read(folder: Path, header: Header) -> tuple[Readings, Account]:
         "rows_n": rows_n,
         "rows_read_n": len(keep),
         "noload_rows_n": int(noload.sum()),
-        "dropped_failed_read_rows_n": int((~whole).sum()),
+        **rows.losses(),
         "ignored_columns_n": table.ignored_columns_n,
     }
 
@@ -167,10 +167,16 @@ def _number_presses(indent: Float64[np.ndarray, " f"], where: str) -> Int[np.nda
 
 
 def _check_table(table: _Table, where: str) -> None:
-    """Check units, and that a press has one place."""
+    """Check units and signs, and that a press has one place."""
     check_fields(table.b_uT, where, first_line_n=FIRST_LINE_N)
     for axis in range(3):
         check_forces(table.force_N[:, axis], where, first_line_n=FIRST_LINE_N)
+    check_touch(table.force_N[table.contact], where)
+    pressed_N = float(np.median(table.force_N[table.contact, 2]))
+    if pressed_N > 0:
+        remedy = "Is compression negative Fz in this file? Turn its sign."
+        raise CaptureError(complain(where, "the usual Fz in contact", "negative", f"{pressed_N:.4g} N", remedy))
+    check_places(table.place_mm, where)
     begins = np.flatnonzero(np.diff(table.press, prepend=-1))
     moved = np.flatnonzero((table.place_mm != table.place_mm[begins][table.press]).any(axis=1))
     if len(moved):

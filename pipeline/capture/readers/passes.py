@@ -9,6 +9,9 @@ from jaxtyping import Bool, Float, Int32, Int64
 
 AGREEMENT_MIN = 0.95
 SEEN_TWICE_MIN = 0.25  # a shift of half the recording leaves half the moves to compare, of which some touch nothing
+PROBES_N = 256
+PROBES_MIN_N = 8  # fewer say nothing
+GOLDEN = (np.sqrt(5.0) - 1) / 2
 
 
 def find_passes(place_mm: Float[np.ndarray, "f 2"], contact: Bool[np.ndarray, " f"]) -> Int32[np.ndarray, " f"]:
@@ -18,7 +21,7 @@ def find_passes(place_mm: Float[np.ndarray, "f 2"], contact: Bool[np.ndarray, " 
     """
     rows_n = len(place_mm)
     moves = _find_moves(place_mm, contact)
-    for period_n in range(1, rows_n // 2 + 1):
+    for period_n in _likely_periods(place_mm, contact, moves):
         here = moves[moves[:, 1] < rows_n - period_n]
         here = here[contact[here + period_n].all(axis=1)]
         if len(here) and len(here) >= SEEN_TWICE_MIN * len(moves):
@@ -26,6 +29,27 @@ def find_passes(place_mm: Float[np.ndarray, "f 2"], contact: Bool[np.ndarray, " 
             if same.mean() >= AGREEMENT_MIN:
                 return (np.arange(rows_n) // period_n).astype(np.int32)
     return np.zeros(rows_n, np.int32)
+
+
+def _likely_periods(
+    place_mm: Float[np.ndarray, "f 2"], contact: Bool[np.ndarray, " f"], moves: Int64[np.ndarray, "moves 2"]
+) -> Int64[np.ndarray, " p"]:
+    """Leave out the shifts at which most of a few moves of the first half differ: trying all on all is quadratic."""
+    half_n = len(contact) // 2
+    early = moves[moves[:, 1] < half_n]
+    if not len(early):
+        return np.arange(1, half_n + 1) if len(moves) else np.zeros(0, np.int64)
+    # Steps of the golden section lie evenly, and in step with no grid.
+    probes = early[np.unique((np.arange(PROBES_N) * GOLDEN % 1 * len(early)).astype(np.int64))]
+    tried_n, same_n = np.zeros((2, half_n), np.int64)
+    for first, second in probes:
+        shifts = slice(1, half_n + 1)
+        touch = contact[first:][shifts] & contact[second : second + half_n + 1][shifts]
+        same_first = (place_mm[first:][shifts] == place_mm[first]).all(axis=1)
+        same_second = (place_mm[second : second + half_n + 1][shifts] == place_mm[second]).all(axis=1)
+        tried_n += touch
+        same_n += touch & same_first & same_second
+    return np.flatnonzero((tried_n < PROBES_MIN_N) | (2 * same_n >= tried_n)) + 1
 
 
 def _find_moves(place_mm: Float[np.ndarray, "f 2"], contact: Bool[np.ndarray, " f"]) -> Int64[np.ndarray, "moves 2"]:

@@ -195,6 +195,46 @@ def test_a_weight_that_no_skin_bears_is_refused(tmp_path: Path) -> None:
     assert "in line 3" in complaint_of(tmp_path, GAUGED)
 
 
+def rescale(path: Path, columns: slice, factor: float) -> None:
+    rows = np.array([[float(cell) for cell in line.split(",")] for line in path.read_text().splitlines()])
+    rows[:, columns] *= factor
+    path.write_text(lines_of(rows.tolist()))
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+def test_places_in_metres_or_micrometres_are_refused(tmp_path: Path, factor: float) -> None:
+    folder = write(tmp_path, [[5.0 * i, 0.0, 142.0] for i in range(4)], [300.0] * 4)
+    eflesh.read(folder, HEADER)
+    rescale(folder / eflesh.STATES, slice(1, 4), factor)
+    assert "states.csv: places must be one, or spread over 1 to 200 mm" in complaint_of(folder)
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+def test_a_stroke_in_metres_or_micrometres_is_refused(tmp_path: Path, factor: float) -> None:
+    rescale(strokes(tmp_path) / eflesh.STATES, slice(3, 4), factor)
+    assert "states.csv: depth must be 0.05 to 100 mm where it is greatest" in complaint_of(tmp_path, GAUGED)
+
+
+def test_weights_in_kilograms_are_refused(tmp_path: Path) -> None:
+    folder = strokes(tmp_path)
+    states = np.array(
+        [[float(cell) for cell in row.split(",")] for row in (folder / eflesh.STATES).read_text().split()]
+    )
+    states[:, 4] = np.where(states[:, 4] == -1, -1, states[:, 4] / 1000)
+    (folder / eflesh.STATES).write_text(lines_of(states.tolist()))
+    assert "force must be 0.05 N or more somewhere in contact; got 0.00981 at most. Convert kg" in complaint_of(
+        folder, GAUGED
+    )
+
+
+@pytest.mark.parametrize("of_a_uT", [1e-2, 1e-3, 1e-6])
+def test_fields_in_other_units_are_refused(tmp_path: Path, of_a_uT: float) -> None:
+    scan(tmp_path)
+    for name in (eflesh.SENSOR, eflesh.CHANGES):
+        rescale(tmp_path / name, slice(1, None), of_a_uT)
+    assert "G to uT" in complaint_of(tmp_path)
+
+
 @settings(max_examples=50, deadline=None)
 @given(content=st.binary(max_size=200), name=st.sampled_from(eflesh.FILES))
 def test_random_bytes_are_refused_in_one_sentence(

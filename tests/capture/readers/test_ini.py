@@ -134,6 +134,108 @@ def test_every_row_is_a_reading_or_counted(
     assert account["rows_n"] + account["noload_rows_n"] + dropped_n == account["rows_read_n"] == 8 * passes_n
 
 
+def late(rows_late: str) -> Header:
+    return HEADER.model_copy(update={"options": {"rows_late": rows_late}})
+
+
+def write_late(folder: Path, truths: list[tuple[float, float, float]], late_n: int) -> Path:
+    """Write fields that grow with the force, `late_n` rows later."""
+    write(folder, truths)
+    force = [truths[max(i - late_n, 0)][2] for i in range(len(truths))]
+    lines = []
+    for row_i, force_N in enumerate(force):
+        steps = [1000 + row_i % 7 + round(500 * force_N) + 100 * axis for axis in range(3)]
+        chip = f"{steps[0] * 0.15:.2f} {steps[1] * 0.15:.2f} {steps[2] * 0.242:.2f} 28.5"
+        lines.append(" ".join([chip] * CHIPS_N) + "\n")
+    (folder / ini.READINGS).write_text("".join(lines))
+    return folder
+
+
+@settings(max_examples=10, deadline=None)
+@given(late_n=st.integers(0, 5))
+def test_the_account_says_by_how_many_rows_the_fields_come_late(
+    tmp_path_factory: pytest.TempPathFactory, late_n: int
+) -> None:
+    folder = write_late(tmp_path_factory.mktemp("ini"), ONE_PASS * 5, late_n)
+    for said in ("0", str(late_n)):
+        _, account = ini.read(folder, late(said))
+        assert account["best_rows_late_n"] == late_n
+
+
+@settings(max_examples=12, deadline=None)
+@given(late_n=st.integers(0, 5), failed=st.sets(st.integers(10, 20), max_size=1))
+def test_late_fields_are_paired_with_their_presses(
+    tmp_path_factory: pytest.TempPathFactory, late_n: int, failed: set[int]
+) -> None:
+    folder = write(tmp_path_factory.mktemp("ini"), ONE_PASS * 3)
+    for row_i in failed:
+        edit(folder / ini.READINGS, row_i + 1, f"{FAILED} {chip_line(row_i, 1)} {chip_line(row_i, 2)}")
+    readings, account = ini.read(folder, late(str(late_n)))
+    truths_i = [i for i in range(24 - late_n) if i + late_n not in failed]
+    assert readings.indentation.tolist() == truths_i
+    np.testing.assert_array_equal(
+        readings.Fz_N,
+        np.float32([max(ONE_PASS[i % 8][2], 0.02) for i in truths_i])
+        * (np.array([ONE_PASS[i % 8][2] for i in truths_i]) >= 0.02),
+    )
+    np.testing.assert_array_equal(readings.b_uT, np.float32([field_uT(i + late_n) for i in truths_i]))
+    assert readings.pass_i.tolist() == [i // 8 for i in truths_i]
+    corner_uT = (field_uT(late_n) + field_uT(1 + late_n)) / 2
+    np.testing.assert_array_equal(readings.noload_uT[0], corner_uT.astype(np.float32))
+    assert account["dropped_no_partner_rows_n"] == late_n
+    dropped_n = sum(n for key, n in account.items() if key.startswith("dropped_"))
+    assert account["rows_n"] + account["noload_rows_n"] + dropped_n == account["rows_read_n"] == 24
+
+
+@pytest.mark.parametrize("rows_late", ["6", "-1", "one", ""])
+def test_another_lateness_is_refused(tmp_path: Path, rows_late: str) -> None:
+    assert "option rows_late must be 0 to 5" in complaint_of(write(tmp_path, ONE_PASS), late(rows_late))
+
+
+def test_a_recording_shorter_than_its_lateness_is_refused(tmp_path: Path) -> None:
+    assert "rows must be more than the 5 of option rows_late; got 4" in complaint_of(
+        write(tmp_path, ONE_PASS[:4]), late("5")
+    )
+
+
+def test_the_public_recording_comes_one_row_late(tmp_path: Path, shared_data: Path) -> None:
+    for name, source in (
+        (ini.READINGS, "b20_artillery_AFG_board2_50_screw.txt"),
+        (ini.TRUTHS, "truths_artillery_AFG_board2_50_screw.txt"),
+    ):
+        (tmp_path / name).write_bytes((shared_data / "ini" / source).read_bytes())
+    _, account = ini.read(tmp_path, make_header(layout="ini", options={"rows_late": "1"}))
+    assert account["best_rows_late_n"] == 1
+    assert account["passes_n"] == 50
+    assert account["rows_n"] + account["dropped_no_partner_rows_n"] == account["rows_read_n"] == 23300
+
+
+@pytest.mark.parametrize(
+    ("columns", "factor", "expected"),
+    [
+        (slice(0, 2), 1e-3, "places must be one, or spread over 1 to 200 mm; got 0.008"),
+        (slice(0, 2), 1e3, "Convert m or um to mm"),
+        (slice(2, 3), 0.01, "force must be 0.05 N or more somewhere in contact; got 0.015 at most"),
+        (slice(2, 3), 1e3, "Convert grams or mN to N"),
+    ],
+)
+def test_truths_in_other_units_are_refused(tmp_path: Path, columns: slice, factor: float, expected: str) -> None:
+    truths = np.array(ONE_PASS)
+    truths[:, columns] *= factor
+    truths[:, 2] = np.where(factor == 1e-3, np.array(ONE_PASS)[:, 2], truths[:, 2])
+    message = complaint_of(write(tmp_path, [tuple(row) for row in truths.tolist()]))
+    assert expected in message
+    assert ini.TRUTHS in message
+
+
+def test_a_stuck_chip_costs_its_rows(tmp_path: Path) -> None:
+    write(tmp_path, ONE_PASS * 8)
+    for row_i in range(20, 64):
+        edit(tmp_path / ini.READINGS, row_i + 1, f"{chip_line(row_i, 0)} {chip_line(20, 1)} {chip_line(row_i, 2)}")
+    # Told from the 20th equal reading on; the last passes' corner rows are all stuck.
+    assert "none in the pass from line 41" in complaint_of(tmp_path)
+
+
 def test_a_recording_of_failed_reads_only_is_refused(tmp_path: Path) -> None:
     write(tmp_path, ONE_PASS)
     (tmp_path / ini.READINGS).write_text(f"{FAILED} {FAILED} {FAILED}\n" * len(ONE_PASS))

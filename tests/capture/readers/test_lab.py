@@ -175,6 +175,47 @@ def test_fields_in_millitesla_are_suspected(tmp_path: Path) -> None:
     assert "Convert mT or G to uT" in complaint_of(write(tmp_path, *tiny))
 
 
+def scaled(column: str, factor: float) -> list[str]:
+    """The presses with one kind of column (B, place or F) in another unit."""
+    names = NAMES.split(",")
+    chosen = {i for i, name in enumerate(names) if name.startswith(column) or name.endswith(column)}
+    return [
+        ",".join(f"{factor * float(cell)!r}" if i in chosen else cell for i, cell in enumerate(line.split(",")))
+        for line in PRESSES
+    ]
+
+
+@pytest.mark.parametrize(
+    ("column", "factor", "expected"),
+    [
+        ("B", 1e-2, "Convert mT or G to uT"),
+        ("B", 1e-6, "Convert mT or G to uT"),
+        ("B", 1e4, "below the full scale"),
+        ("_mm", 1e-3, "places must be one, or spread over 1 to 200 mm; got 0.004. Convert m or um"),
+        ("_mm", 1e3, "got 4000. Convert m or um"),
+        ("F", 102.0, "force must be below 100 N; got -357 in line 4. Convert grams"),
+        ("F", 1e3, "Convert grams or mN to N"),
+        ("F", 1e-3, "force must be 0.05 N or more somewhere in contact; got 0.0035 at most. Convert kg"),
+        ("Fz", -1.0, "the usual Fz in contact must be negative; got 3.5 N. Is compression negative Fz in this file?"),
+    ],
+)
+def test_other_units_and_signs_are_refused(tmp_path: Path, column: str, factor: float, expected: str) -> None:
+    assert expected in complaint_of(write(tmp_path, *scaled(column, factor)))
+
+
+def test_a_real_file_in_gauss_is_refused(tmp_path: Path, shared_data: Path) -> None:
+    lines = (shared_data / "lab" / "board1_depth1.csv").read_text().splitlines()[:1101]
+    names = lines[0].split(",")
+    rows = [
+        ",".join(
+            f"{float(cell) / 100:.6f}" if name.startswith("B") else cell for name, cell in zip(names, row, strict=True)
+        )
+        for row in (line.split(",") for line in lines[1:])
+    ]
+    message = complaint_of(write(tmp_path, *rows, names=lines[0]), make_header(layout="lab", chips_n=5))
+    assert "G to uT" in message
+
+
 def test_another_number_of_chips_than_the_headers_is_refused(tmp_path: Path) -> None:
     message = complaint_of(write(tmp_path, *PRESSES), HEADER.model_copy(update={"chips_n": 5}))
     assert "chips must be 5" in message

@@ -1,5 +1,8 @@
 """Passes are found as a person would: the protocol is written down, repeated, and must be found again."""
 
+import time
+from itertools import pairwise
+
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -64,3 +67,39 @@ def test_places_that_never_repeat_are_one_pass() -> None:
 
 def test_a_recording_without_contact_is_one_pass() -> None:
     assert not find_passes(raster(3, 3, 2), np.zeros(18, bool)).any()
+
+
+def walk(place_mm: np.ndarray, contact: np.ndarray) -> np.ndarray:
+    """Try every shift, as the rule is written."""
+    rows_n = len(place_mm)
+    touched = np.flatnonzero(contact).tolist()
+    pairs = pairwise(touched)
+    moves = [(a, b) for a, b in pairs if tuple(place_mm[a]) != tuple(place_mm[b])]
+    for period_n in range(1, rows_n // 2 + 1):
+        met = [(a, b) for a, b in moves if b + period_n < rows_n and contact[a + period_n] and contact[b + period_n]]
+        same_n = sum(
+            tuple(place_mm[a]) == tuple(place_mm[a + period_n]) and tuple(place_mm[b]) == tuple(place_mm[b + period_n])
+            for a, b in met
+        )
+        if met and len(met) >= 0.25 * len(moves) and same_n >= 0.95 * len(met):
+            return np.arange(rows_n) // period_n
+    return np.zeros(rows_n, int)
+
+
+@settings(deadline=None, max_examples=60)
+@given(seed=st.integers(0, 10000), once_n=st.integers(2, 30), touch=st.floats(0.3, 1.0), kinds_n=st.integers(1, 4))
+def test_passes_are_those_that_trying_every_shift_finds(seed: int, once_n: int, touch: float, kinds_n: int) -> None:
+    rng = seeds.rng_for(seed, "passes")
+    place_mm = np.tile(rng.integers(0, kinds_n, (once_n, 2)).astype(float), (3, 1))[: rng.integers(2, 3 * once_n + 1)]
+    contact = rng.random(len(place_mm)) < touch
+    wrong = rng.random(len(place_mm)) < 0.02
+    place_mm[wrong] = -1
+    np.testing.assert_array_equal(find_passes(place_mm, contact), walk(place_mm, contact))
+
+
+def test_a_long_recording_that_never_repeats_is_looked_through_in_a_moment() -> None:
+    place_mm = seeds.rng_for(0, "never").random((20000, 2))
+    begin_s = time.process_time()
+    assert not find_passes(place_mm, np.ones(len(place_mm), bool)).any()
+    # Trying every shift took 17 s; now it is 0.1 to 0.3 s.
+    assert time.process_time() - begin_s < 5
