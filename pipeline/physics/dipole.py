@@ -1,6 +1,6 @@
 """Field of point dipoles. In: places, moments, observers, all SI. Out: magnetic flux density in tesla.
 
-Everything magnetic in this project goes through this one body.
+The textbook form; `change` is the same kernel compiled, for dipoles that move.
 Refuses to know skins, chips and deformation.
 """
 

@@ -1,87 +1,67 @@
-"""The magnetised skin at rest. In: how it was magnetised. Out: a lattice of dipoles, and J at its nodes.
+"""How a skin is magnetised. In: the authors' array of magnets, places in the slab. Out: field and magnetisation in T.
 
-Simplified: the array's field is that of an endless checkerboard, as a Fourier series; the powder's own field is
-left out (<= 2.5 %, PHYSICS 8). Refuses to know chips, pokes and what differs from skin to skin.
+The powder's own field is left out (<= 2.5 %, PHYSICS 8), and so are tolerances of the array.
+Refuses to know quadrature, chips, pokes and what differs from skin to skin.
 """
 
-from dataclasses import dataclass
-from itertools import pairwise
+from itertools import product
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 from scipy.constants import mu_0
 
-SKIN_SIDE_M = 20e-3  # authors' CAD
-CUBE_SIDE_M = 6.35e-3  # the 4x4 array of 0.25 in cubes: seams at 0 and +-6.35 mm
-ARRAY_BELOW_M = 0.50e-3  # magnet faces below and above the skin, authors' CAD
-ARRAY_ABOVE_M = 0.25e-3
+from pipeline.errors import ParamsError, complain
+
+CUBE_SIDE_M = 6.35e-3  # 0.25 in cubes
+CUBES_N = 4  # along x and along y
+ARRAY_BELOW_M = 0.50e-3  # from the skin's base down to the lower cubes' faces, authors' CAD
+ARRAY_ABOVE_M = 0.25e-3  # from the skin's top up to the upper cubes' faces, authors' CAD
 ARRAY_REMANENCE_T = 1.32  # N42 cubes, assumed
-HARMONICS = (1, 3, 5, 7)  # of the square wave; all the others change J by 3 %
 
-CELL_M = 0.64e-3  # wished lateral size of a cell; cells end at seams
-LAYERS_N = 6  # Gauss-Legendre nodes in z: midpoint layers would cost up to 74 % of dB (PHYSICS 0)
-
-Polarity = Literal["checkerboard", "same"]
+Polarity = Literal["checkerboard", "same"]  # the paper does not say; upper and lower cubes attract in both
 
 
-@dataclass(frozen=True)
-class Lattice:
-    """Nodes of the skin at rest; z runs from the bonded base (0) up to the thickness."""
+def cuboid_field(
+    observers_m: Float[np.ndarray, "o 3"], polarization_T: float, *, sides_m: tuple[float, float, float]
+) -> Float[np.ndarray, "o 3"]:
+    """Give the field, in tesla, of a box around the origin that is magnetised along z.
 
-    nodes_m: Float[np.ndarray, "s 3"]
-    volumes_m3: Float[np.ndarray, " s"]
-
-
-def lattice(thickness_m: float) -> Lattice:
-    """Lay cells that end at the seams, with Gauss nodes over the thickness."""
-    seams_m = np.array([-SKIN_SIDE_M / 2, -CUBE_SIDE_M, 0.0, CUBE_SIDE_M, SKIN_SIDE_M / 2])
-    spans = [np.linspace(a, b, round((b - a) / CELL_M) + 1) for a, b in pairwise(seams_m)]
-    centres_m = np.concatenate([(edges[1:] + edges[:-1]) / 2 for edges in spans])
-    widths_m = np.concatenate([np.diff(edges) for edges in spans])
-    gauss, weights = np.polynomial.legendre.leggauss(LAYERS_N)
-    x, y, z = np.meshgrid(centres_m, centres_m, (1 + gauss) / 2 * thickness_m, indexing="ij")
-    volumes_m3 = np.einsum("i,j,k->ijk", widths_m, widths_m, weights / 2 * thickness_m)
-    return Lattice(np.stack([x, y, z], axis=-1).reshape(-1, 3), volumes_m3.ravel())
-
-
-def array_field(nodes_m: Float[np.ndarray, "s 3"], thickness_m: float) -> Float[np.ndarray, "s 3"]:
-    """Give the field between two endless checkerboards of cubes that attract each other, in tesla.
-
-    Each face is a sheet of charge +-Br; its harmonic sin(m kx) sin(n ky) decays as exp(-k_mn distance).
+    Two charged rectangles (Engel-Herbert & Hesjedal, J. Appl. Phys. 97:074504, 2005), plus J inside.
+    The lines through the box's edges are left to the caller: there the logarithms are infinite.
     """
-    x_m, y_m, z_m = nodes_m.T
-    b_T = np.zeros((3, len(nodes_m)))
-    for m, n in ((m, n) for m in HARMONICS for n in HARMONICS):
-        kx, ky = m * np.pi / CUBE_SIDE_M, n * np.pi / CUBE_SIDE_M
-        k = np.hypot(kx, ky)
-        sheet_T = ARRAY_REMANENCE_T * 8 / (np.pi**2 * m * n) * (1 - np.exp(-k * CUBE_SIDE_M))
-        below_T = sheet_T * np.exp(-k * (z_m + ARRAY_BELOW_M))
-        above_T = sheet_T * np.exp(-k * (thickness_m + ARRAY_ABOVE_M - z_m))
-        b_T[0] -= (below_T - above_T) * kx / k * np.cos(kx * x_m) * np.sin(ky * y_m)
-        b_T[1] -= (below_T - above_T) * ky / k * np.sin(kx * x_m) * np.cos(ky * y_m)
-        b_T[2] += (below_T + above_T) * np.sin(kx * x_m) * np.sin(ky * y_m)
-    return b_T.T
+    half_m = np.array(sides_m) / 2
+    b_T = np.zeros_like(observers_m)
+    for sx, sy, sz in product((1, -1), repeat=3):
+        x, y, z = (observers_m - half_m * (sx, sy, sz)).T
+        r = np.sqrt(x * x + y * y + z * z)
+        # asinh(y / hypot(x, z)) is log(y + r) less what both ends share, and keeps its digits where y < 0.
+        b_T[:, 0] -= sx * sy * sz * np.arcsinh(y / np.hypot(x, z))
+        b_T[:, 1] -= sx * sy * sz * np.arcsinh(x / np.hypot(y, z))
+        b_T[:, 2] += sx * sy * sz * np.arctan(x * y / (z * r))
+    b_T *= polarization_T / (4 * np.pi)
+    b_T[:, 2] += polarization_T * (np.abs(observers_m) < half_m).all(axis=1)
+    return b_T
 
 
-def magnetise(
-    nodes_m: Float[np.ndarray, "s 3"],
-    thickness_m: float,
-    *,
-    polarity: Polarity,
-    saturation_T: float,
-    half_field_T: float,
-) -> Float[np.ndarray, "s 3"]:
-    """Give the magnetisation J at each node: partly saturated along the array's field (PHYSICS 3), in tesla.
+def array_field(nodes_m: Float[np.ndarray, "s 3"], thickness_m: float, polarity: Polarity) -> Float[np.ndarray, "s 3"]:
+    """Sum the field of the 4x4 cubes below and the 4x4 above at places in the slab, in tesla."""
+    if not (nodes_m[:, 2].min() >= 0 and nodes_m[:, 2].max() <= thickness_m):
+        got = f"{nodes_m[:, 2].min():.3g} ... {nodes_m[:, 2].max():.3g} m"
+        raise ParamsError(complain("magnet array", "places", "inside the slab", got, "Magnetise the skin at rest."))
+    middles_m = (np.arange(CUBES_N) - (CUBES_N - 1) / 2) * CUBE_SIDE_M
+    heights_m = (-ARRAY_BELOW_M - CUBE_SIDE_M / 2, thickness_m + ARRAY_ABOVE_M + CUBE_SIDE_M / 2)
+    b_T = np.zeros_like(nodes_m)
+    for (i, x_m), (j, y_m) in product(enumerate(middles_m), repeat=2):
+        sign = -1 if polarity == "checkerboard" and (i + j) % 2 else 1
+        for z_m in heights_m:
+            b_T += cuboid_field(nodes_m - (x_m, y_m, z_m), sign * ARRAY_REMANENCE_T, sides_m=(CUBE_SIDE_M,) * 3)
+    return b_T
 
-    `same` stands for one uniform field of the array's strength, along z.
-    """
-    if polarity == "same":
-        b_T = np.tile([0.0, 0.0, ARRAY_REMANENCE_T / 2], (len(nodes_m), 1))
-    else:
-        b_T = array_field(nodes_m, thickness_m)
-    strength_T = np.linalg.norm(b_T, axis=1, keepdims=True)
-    u = strength_T / half_field_T
+
+def magnetise(b_T: Float[np.ndarray, "s 3"], *, saturation_T: float, half_field_T: float) -> Float[np.ndarray, "s 3"]:
+    """Give the magnetisation J that a field leaves in the powder: phi Br u^3 / (1 + u^3) along B, u = |B| / B_half."""
+    u = np.linalg.norm(b_T, axis=1, keepdims=True) / half_field_T
     # u^2 / half_field_T stands for u^3 / |B|, which is finite where the field vanishes (seam crossings).
     return saturation_T * b_T * u**2 / half_field_T / (1 + u**3)
 

@@ -12,8 +12,11 @@ from jaxtyping import Float
 from pydantic import Field
 from scipy.constants import kilo, milli
 
-from pipeline.physics import dipole, layer, magnet
+from pipeline.errors import ParamsError, complain
+from pipeline.physics import dipole, flow, layer, magnet
 from pipeline.physics.board import Board, Spreads
+from pipeline.physics.change import change_of_field, turned
+from pipeline.physics.nodes import CHOSEN, SKIN_SIDE_M, Quadrature, place_nodes
 from pipeline.seeds import rng_for
 from pipeline.strict import Strict
 
@@ -33,39 +36,36 @@ class SkinDesign(Strict):
 
 @dataclass(frozen=True)
 class Skin:
-    """One skin at rest on its board, in the board's frame."""
+    """One skin at rest on its board, in the board's frame; its pattern and its edges sit where the skin does."""
 
     name: str
     nodes_m: Float[np.ndarray, "s 3"]
     moments_A_m2: Float[np.ndarray, "s 3"]
+    seat_m: Float[np.ndarray, " 2"]  # the skin's middle
     thickness_m: float
     modulus_Pa: float
     tip_radius_m: float
     depth_zero_m: float  # added to a commanded depth
 
 
-def draw_skin(design: SkinDesign, spreads: Spreads, *, seed: int, name: str) -> Skin:
-    """Draw the skin called `name`, as it sits on its board."""
+def draw_skin(design: SkinDesign, spreads: Spreads, *, seed: int, name: str, rule: Quadrature = CHOSEN) -> Skin:
+    """Draw the skin called `name`, as it sits on its board; another rule of quadrature sees the same skin."""
     rng = rng_for(seed, "skin", name)
     amplitude, thickness, modulus = np.exp(
         np.array([spreads.skin_amplitude, spreads.skin_thickness, spreads.skin_modulus]) * rng.standard_normal(3)
     )
-    seat_mm = spreads.skin_seat_mm * rng.standard_normal(2)
+    seat_m = spreads.skin_seat_mm * milli * rng.standard_normal(2)
     depth_zero_mm = spreads.skin_depth_zero_mm * rng.standard_normal()
     thickness_m = float(design.thickness_mm * milli * thickness)
-    rest = magnet.lattice(thickness_m)
-    j_T = amplitude * magnet.magnetise(
-        rest.nodes_m,
-        thickness_m,
-        polarity=design.polarity,
-        saturation_T=design.saturation_T,
-        half_field_T=design.half_field_T,
-    )
+    rest = place_nodes(thickness_m, rule)
+    b_T = magnet.array_field(rest.nodes_m, thickness_m, design.polarity)
+    j_T = magnet.magnetise(b_T, saturation_T=amplitude * design.saturation_T, half_field_T=design.half_field_T)
     filler = _filler(rest.nodes_m[:, :2], spreads, rng)
     return Skin(
         name=name,
-        nodes_m=rest.nodes_m + np.append(seat_mm, 0.0) * milli,
+        nodes_m=rest.nodes_m + np.append(seat_m, 0.0),
         moments_A_m2=magnet.moments(j_T * filler[:, None], rest.volumes_m3),
+        seat_m=seat_m,
         thickness_m=thickness_m,
         modulus_Pa=float(design.modulus_kPa * kilo * modulus),
         tip_radius_m=design.tip_radius_mm * milli,
@@ -78,50 +78,44 @@ def changes_of_field(
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "n k 3"]]:
     """Give the field at rest, and how each poke (x, y, depth) changes it, at the chips, in tesla.
 
-    The change is summed node by node over what moves, never as the difference of two large sums. No contact (true
-    depth of zero or less): exactly zero.
+    No contact (true depth of zero or less): exactly zero. A poke beside the skin is refused.
     """
-    rest_T = dipole.field_of_each(skin.nodes_m, skin.moments_A_m2, board.chips_m)
+    rest_T = dipole.field(skin.nodes_m, skin.moments_A_m2, board.chips_m)
     changes_T = np.zeros((len(pokes_m), *board.chips_m.shape))
-    for poke_i, (x_m, y_m, depth_m) in enumerate(pokes_m):
-        depth_m += skin.depth_zero_m
-        if depth_m <= 0:
-            continue
-        dent = layer.dent_under_sphere(depth_m, skin.tip_radius_m, skin.thickness_m)
-        away_m = skin.nodes_m[:, :2] - (x_m, y_m)
-        moves = np.einsum("si,si->s", away_m, away_m) < (layer.REACH * dent.width_m) ** 2
-        moved_m, turned = _deform(skin.nodes_m[moves], skin.moments_A_m2[moves], away_m[moves], dent)
-        each_T = dipole.field_of_each(moved_m, turned, board.chips_m) - rest_T[:, moves]
-        changes_T[poke_i] = each_T.sum(axis=1)
-    return rest_T.sum(axis=1), changes_T
+    true_m = pokes_m + np.array([0.0, 0.0, skin.depth_zero_m])
+    _refuse_beside(true_m, skin)
+    contacts = np.flatnonzero(~(true_m[:, 2] <= 0))  # a depth that is NaN goes on, to be refused
+    if not contacts.size:
+        return rest_T, changes_T
+    depths_m = tuple(np.unique(true_m[contacts, 2]).tolist())
+    table = flow.tabulate(skin.thickness_m, skin.tip_radius_m, depths_m)
+    for poke_i in contacts:
+        moved = flow.move(table, skin.nodes_m, true_m[poke_i])
+        before = skin.nodes_m.take(moved.i, axis=0), skin.moments_A_m2.take(moved.i, axis=0)
+        # Moments turn with the material (R m, not F m: magnetisation does not feel stretch, Danas & Reis 2024).
+        after = moved.nodes_m, turned(before[1], moved.axis, moved.angle_rad)
+        changes_T[poke_i] = change_of_field(before, after, board.chips_m)
+    return rest_T, changes_T
 
 
 def forces(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """Give the force that the tip feels at commanded depths, in newtons, positive in compression."""
     return layer.force(
         depth_m + skin.depth_zero_m,
-        radius_m=skin.tip_radius_m,
         thickness_m=skin.thickness_m,
+        tip_radius_m=skin.tip_radius_m,
         modulus_Pa=skin.modulus_Pa,
     )
 
 
-def _deform(
-    nodes_m: Float[np.ndarray, "s 3"],
-    moments: Float[np.ndarray, "s 3"],
-    away_m: Float[np.ndarray, "s 2"],
-    dent: layer.Dent,
-) -> tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]:
-    # Moments turn with the material (R m, not F m: magnetisation does not feel stretch, Danas & Reis 2024).
-    r_m = np.hypot(away_m[:, 0], away_m[:, 1])
-    ex, ey = away_m.T / np.maximum(r_m, np.finfo(float).tiny)
-    outward_m, up_m = layer.displacement(r_m, nodes_m[:, 2], dent)
-    moved_m = nodes_m + np.column_stack([outward_m * ex, outward_m * ey, up_m])
-    cos, sin = layer.rotation(layer.gradient(r_m, nodes_m[:, 2], dent))
-    mx, my, mz = moments.T
-    radial = mx * ex + my * ey
-    gain = (cos - 1) * radial + sin * mz
-    return moved_m, np.column_stack([mx + gain * ex, my + gain * ey, cos * mz - sin * radial])
+def _refuse_beside(pokes_m: Float[np.ndarray, "n 3"], skin: Skin) -> None:
+    # The layer is endless in the model: past the skin's edge it would press on material that is not there.
+    off = ~(np.abs(pokes_m[:, :2] - skin.seat_m) <= SKIN_SIDE_M / 2).all(axis=1)
+    if off.any():
+        x_mm, y_mm = pokes_m[np.argmax(off), :2] / milli
+        rule = f"on the skin, within {SKIN_SIDE_M / 2 / milli:.3g} mm of its middle"
+        remedy = "Poke elsewhere, or lower skin_seat_mm."
+        raise ParamsError(complain(f"skin {skin.name}", "poke", rule, f"({x_mm:.3g}, {y_mm:.3g}) mm", remedy))
 
 
 def _filler(xy_m: Float[np.ndarray, "s 2"], spreads: Spreads, rng: np.random.Generator) -> Float[np.ndarray, " s"]:

@@ -1,29 +1,36 @@
-"""The change of field under a poke: a naive loop as truth; symmetry, no contact, amplitude and names as laws."""
+"""The change of field under a poke: a naive loop as truth; quadrature, symmetry, no contact, amplitude as laws."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from pipeline.errors import ParamsError
-from pipeline.physics import layer
+from pipeline.physics import dipole, flow
 from pipeline.physics.board import Board
+from pipeline.physics.change import change_of_field
 from pipeline.physics.dipole import MU0_4PI
+from pipeline.physics.nodes import CHOSEN, Quadrature
 from pipeline.physics.skin import SkinDesign, changes_of_field, draw_skin, forces
 from tests.physics.test_board import design as board_design
 from tests.physics.test_board import draw_board, no_spread, same, spreads
 
 EXACT, UNEVEN = no_spread(), spreads()
+SEATED = no_spread(skin_seat_mm=0.35)
 BOARD = draw_board(board_design(), EXACT, seed=0, name="b0")
 PEAK_T = 1e-3  # size of the fields; tolerances are rounding relative to it
+COARSE, SPARSE = Quadrature(1e-3, 3), Quadrature(5e-3, 1)  # for laws that hold for any rule, and for draws
+DEPTH_M = 0.6e-3  # the laws of place hold at any depth; one depth is one table
 places_m = st.floats(-8e-3, 8e-3)
-depths_m = st.floats(0.1e-3, 1.2e-3)
+# No deadline: the first example tabulates the flow for all the others.
+patient = settings(max_examples=20, deadline=None)
 
 
 def design(**changes):
     usual = {
         "polarity": "checkerboard",
-        "saturation_T": 0.17,
+        "saturation_T": 0.11,
         "half_field_T": 0.5,
         "thickness_mm": 2.0,
         "modulus_kPa": 190.0,
@@ -32,34 +39,27 @@ def design(**changes):
     return SkinDesign(**(usual | changes))
 
 
-def skin(spread=EXACT, name="s0", **changes):
-    return draw_skin(design(**changes), spread, seed=0, name=name)
+def skin(spread=EXACT, name="s0", rule=COARSE, **changes):
+    return draw_skin(design(**changes), spread, seed=0, name=name, rule=rule)
 
 
 def change(poke_m, on=None, board=BOARD):
     return changes_of_field(board, on or skin(), np.array([poke_m]))[1][0]
 
 
-def rotated_dipoles_in_a_loop(one, board, poke_m):
-    """The specification: move each node, turn its moment about the tangent, take the difference of its field."""
-    dent = layer.dent_under_sphere(poke_m[2] + one.depth_zero_m, one.tip_radius_m, one.thickness_m)
-    total_T = np.zeros_like(board.chips_m)
-    for node, moment in zip(one.nodes_m, one.moments_A_m2, strict=True):
-        away = node - (poke_m[0], poke_m[1], node[2])
-        r = float(np.linalg.norm(away))
-        outward, up = (part[0] for part in layer.displacement(np.array([r]), node[2:], dent))
-        f = layer.gradient(np.array([r]), node[2:], dent)
-        angle = np.arctan2(f.rz - f.zr, f.rr + f.zz)[0]
-        radial, vertical = away / r, np.array([0.0, 0.0, 1.0])
-        tangent = np.cross(vertical, radial)
-        turned = (  # Rodrigues
-            moment * np.cos(angle)
-            + np.cross(tangent, moment) * np.sin(angle)
-            + tangent * (tangent @ moment) * (1 - np.cos(angle))
-        )
+def moved_by(one, poke_m):
+    true_m = np.array(poke_m) + (0, 0, one.depth_zero_m)
+    return flow.move(flow.tabulate(one.thickness_m, one.tip_radius_m, (true_m[2],)), one.nodes_m, true_m)
+
+
+def turned_dipoles_in_a_loop(one, board, poke_m):
+    """The specification: move each node, turn its moment with the material, take the difference of its field."""
+    moved, total_T = moved_by(one, poke_m), np.zeros_like(board.chips_m)
+    for i, place, angle, axis in zip(moved.i, moved.nodes_m, moved.angle_rad, moved.axis, strict=True):
+        after = Rotation.from_rotvec(angle * axis).apply(one.moments_A_m2[i])
         for chip_i, chip in enumerate(board.chips_m):
-            total_T[chip_i] += one_dipole(node + outward * radial + up * vertical, turned, chip)
-            total_T[chip_i] -= one_dipole(node, moment, chip)
+            total_T[chip_i] += one_dipole(place, after, chip)
+            total_T[chip_i] -= one_dipole(one.nodes_m[i], one.moments_A_m2[i], chip)
     return total_T
 
 
@@ -71,9 +71,56 @@ def one_dipole(position, moment, chip):
 
 def test_a_poke_equals_the_loop_over_turned_dipoles():
     one, poke_m = skin(UNEVEN), (1.1e-3, -2.3e-3, 0.7e-3)
-    truth_T = rotated_dipoles_in_a_loop(one, BOARD, poke_m)
-    # 1 %: the loop also sums what lies past the reach, where material moves less than 0.3 % of the depth
-    assert np.abs(change(poke_m, one) - truth_T).max() < 0.01 * np.abs(truth_T).max()
+    truth_T = turned_dipoles_in_a_loop(one, BOARD, poke_m)
+    np.testing.assert_allclose(change(poke_m, one), truth_T, atol=1e-12 * PEAK_T)
+
+
+def test_material_under_the_tips_flank_leans_as_the_dent_does():
+    # Beside the tip the surface falls towards the axis: an arrow that points up leans inwards, over the dent.
+    one = skin()
+    moved = moved_by(one, (0.0, 0.0, DEPTH_M))
+    start_m = one.nodes_m[moved.i]
+    r_m = np.linalg.norm(start_m[:, :2], axis=1)
+    flank = (r_m > 0.5e-3) & (r_m < 1.5e-3) & (start_m[:, 2] > 1.5e-3)
+    up = np.tile([0.0, 0.0, 1.0], (flank.sum(), 1))
+    leant = Rotation.from_rotvec(moved.angle_rad[flank, None] * moved.axis[flank]).apply(up)
+    outwards = np.einsum("si,si->s", leant[:, :2], start_m[flank, :2])
+    assert flank.sum() >= 4
+    assert (outwards < 0).all()
+
+
+@pytest.mark.parametrize("depth_m", [0.2e-3, 1.0e-3])
+def test_cells_half_as_wide_change_the_field_of_a_poke_by_less_than_two_percent(depth_m):
+    # PHYSICS 9. Judged on dB, not on the field at rest; a pattern off its place, so that no symmetry helps.
+    places = [(x, y) for x in (-6e-3, 0.0, 4e-3) for y in (-2e-3, 6e-3)]
+    pokes_m = np.array([(*place, depth_m) for place in places])
+    (_, chosen_T), (_, fine_T) = (
+        changes_of_field(BOARD, skin(SEATED, rule=rule), pokes_m)
+        for rule in (CHOSEN, Quadrature(CHOSEN.cell_m / 2, CHOSEN.layers_n))
+    )
+    assert np.linalg.norm(chosen_T - fine_T) < 0.02 * np.linalg.norm(fine_T)
+    # Of a shallow poke over a seam 2 % is less than any chip can see: there the bound is a tenth of its noise, 3.3 uT.
+    wrong_T, size_T = np.abs(chosen_T - fine_T), np.linalg.norm(fine_T, axis=(1, 2), keepdims=True)
+    assert (wrong_T < np.maximum(0.02 * size_T, 0.33e-6)).all()
+
+
+def test_more_layers_change_the_field_of_a_poke_by_less_than_half_a_percent():
+    poke_m, one, fine = (2e-3, 4e-3, 1e-3), skin(rule=CHOSEN), skin(rule=Quadrature(CHOSEN.cell_m, 12))
+    fine_T = change(poke_m, fine)
+    assert np.linalg.norm(change(poke_m, one) - fine_T) < 0.005 * np.linalg.norm(fine_T)
+
+
+def test_without_the_rotation_of_the_moments_the_change_would_be_wrong_by_more_than_itself():
+    # PHYSICS 0.2: 156-242 %, over pokes of the grid; R.M, never M alone
+    one, wrong, size = skin(SEATED, rule=CHOSEN), [], []
+    for place in ((0.0, 0.0), (4e-3, 0.0), (-4e-3, 4e-3), (2e-3, -6e-3)):
+        moved = moved_by(one, (*place, DEPTH_M))
+        before = one.moments_A_m2[moved.i]
+        unturned_T = change_of_field((one.nodes_m[moved.i], before), (moved.nodes_m, before), BOARD.chips_m)
+        truth_T = change((*place, DEPTH_M), one)
+        wrong.append(np.linalg.norm(unturned_T - truth_T))
+        size.append(np.linalg.norm(truth_T))
+    assert np.sum(wrong) > np.sum(size)
 
 
 def test_the_field_at_rest_is_the_loop_over_dipoles():
@@ -83,6 +130,17 @@ def test_the_field_at_rest_is_the_loop_over_dipoles():
     np.testing.assert_allclose(rest_T[3], truth_T, atol=1e-12 * PEAK_T)
 
 
+def test_the_change_is_what_two_large_sums_differ_by():
+    one, poke_m = skin(UNEVEN), (1.1e-3, -2.3e-3, 1e-3)
+    moved = moved_by(one, poke_m)
+    places_m, moments = one.nodes_m.copy(), one.moments_A_m2.copy()
+    places_m[moved.i] = moved.nodes_m
+    moments[moved.i] = Rotation.from_rotvec(moved.angle_rad[:, None] * moved.axis).apply(moments[moved.i])
+    after_T = dipole.field(places_m, moments, BOARD.chips_m)
+    before_T = dipole.field(one.nodes_m, one.moments_A_m2, BOARD.chips_m)
+    np.testing.assert_allclose(change(poke_m, one), after_T - before_T, atol=1e-11 * PEAK_T)
+
+
 @pytest.mark.parametrize("depth_m", [0.0, -0.1e-3])
 def test_without_contact_the_field_does_not_change_at_all(depth_m):
     assert not change((1e-3, 2e-3, depth_m)).any()
@@ -90,44 +148,66 @@ def test_without_contact_the_field_does_not_change_at_all(depth_m):
 
 
 def test_a_tip_that_starts_too_high_makes_no_contact_at_a_shallow_command():
-    high = next(s for s in (skin(UNEVEN, name=f"s{i}") for i in range(50)) if s.depth_zero_m < -0.05e-3)
+    high = next(s for s in (skin(UNEVEN, f"s{i}", SPARSE) for i in range(50)) if s.depth_zero_m < -0.05e-3)
     assert not change((0.0, 0.0, 0.05e-3), high).any()
 
 
-@settings(max_examples=20)
-@given(places_m, places_m, depths_m, st.floats(0, 5))
-def test_the_change_is_proportional_to_the_magnetisation(x_m, y_m, depth_m, factor):
-    once = change((x_m, y_m, depth_m), skin(saturation_T=0.1))
-    scaled = change((x_m, y_m, depth_m), skin(saturation_T=0.1 * factor))
+def test_a_skin_without_magnetisation_has_no_field_and_no_change_at_all():
+    rest_T, changes_T = changes_of_field(BOARD, skin(UNEVEN, saturation_T=0.0), np.array([[1e-3, 2e-3, DEPTH_M]]))
+    assert not rest_T.any()
+    assert not changes_T.any()
+
+
+@patient
+@given(places_m, places_m, st.floats(0, 5))
+def test_the_change_is_proportional_to_the_magnetisation(x_m, y_m, factor):
+    once = change((x_m, y_m, DEPTH_M), skin(saturation_T=0.1))
+    scaled = change((x_m, y_m, DEPTH_M), skin(saturation_T=0.1 * factor))
     np.testing.assert_allclose(scaled, factor * once, atol=1e-12 * PEAK_T)
 
 
-@settings(max_examples=20)
-@given(places_m, places_m, depths_m, st.sampled_from(["checkerboard", "same"]))
-def test_turning_board_and_poke_by_90_degrees_turns_the_change(x_m, y_m, depth_m, polarity):
+@patient
+@given(places_m, places_m, st.sampled_from(["checkerboard", "same"]))
+def test_turning_board_and_poke_by_90_degrees_turns_the_change(x_m, y_m, polarity):
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     sign = -1 if polarity == "checkerboard" else 1  # a quarter turn swaps the poles of a checkerboard
     one = skin(polarity=polarity)
     turned_board = Board("turned", BOARD.chips_m @ turn.T, BOARD.turn, BOARD.sensitivity, BOARD.offset_T)
-    there = change((-y_m, x_m, depth_m), one, turned_board)
-    np.testing.assert_allclose(there, sign * change((x_m, y_m, depth_m), one) @ turn.T, atol=1e-10 * PEAK_T)
+    there = change((-y_m, x_m, DEPTH_M), one, turned_board)
+    np.testing.assert_allclose(there, sign * change((x_m, y_m, DEPTH_M), one) @ turn.T, atol=1e-9 * PEAK_T)
 
 
-@settings(max_examples=20)
-@given(places_m, places_m, depths_m)
-def test_the_mirror_image_of_a_poke_has_the_mirrored_field(x_m, y_m, depth_m):
+@patient
+@given(places_m, places_m)
+def test_the_mirror_image_of_a_poke_has_the_mirrored_field(x_m, y_m):
     # Chips 1 and 3 swap. B is axial (By, Bz flip in x -> -x), and so does the checkerboard: Jx of it flips instead.
-    mirrored = change((-x_m, y_m, depth_m))[[0, 3, 2, 1, 4]]
-    np.testing.assert_allclose(mirrored, change((x_m, y_m, depth_m)) * (1, -1, -1), atol=1e-10 * PEAK_T)
+    mirrored = change((-x_m, y_m, DEPTH_M))[[0, 3, 2, 1, 4]]
+    np.testing.assert_allclose(mirrored, change((x_m, y_m, DEPTH_M)) * (1, -1, -1), atol=1e-9 * PEAK_T)
+
+
+def shifted(one, board, shift_m):
+    nodes_m, seat_m = one.nodes_m + shift_m, one.seat_m + shift_m[:2]
+    moved = type(one)(**{**one.__dict__, "nodes_m": nodes_m, "seat_m": seat_m})
+    return moved, Board("moved", board.chips_m + shift_m, board.turn, board.sensitivity, board.offset_T)
 
 
 def test_moving_skin_poke_and_chips_together_changes_nothing():
-    one = skin(UNEVEN)
-    shift_m = np.array([0.4e-3, -0.7e-3, 0.0])
-    moved = type(one)(**{**one.__dict__, "nodes_m": one.nodes_m + shift_m})
-    board = Board("moved", BOARD.chips_m + shift_m, BOARD.turn, BOARD.sensitivity, BOARD.offset_T)
+    one, shift_m = skin(UNEVEN), np.array([0.4e-3, -0.7e-3, 0.0])
+    moved, board = shifted(one, BOARD, shift_m)
     there = change(np.array([1e-3, 1e-3, 1e-3]) + shift_m, moved, board)
     np.testing.assert_allclose(there, change((1e-3, 1e-3, 1e-3), one), atol=1e-10 * PEAK_T)
+
+
+def test_the_pattern_sits_where_the_skin_does_and_the_poke_where_the_board_says():
+    # A skin off its place sees the poke elsewhere: shifting it is poking it, and sensing it, from the other side.
+    exact, seated = skin(), skin(SEATED)
+    assert np.abs(seated.seat_m).min() > 0
+    there_m = np.append(seated.seat_m, 0.0)
+    board = Board("moved", BOARD.chips_m - there_m, BOARD.turn, BOARD.sensitivity, BOARD.offset_T)
+    found = change((2e-3, 1e-3, DEPTH_M), seated)
+    expected = change(np.array([2e-3, 1e-3, DEPTH_M]) - there_m, exact, board)
+    np.testing.assert_allclose(found, expected, atol=1e-10 * PEAK_T)
+    assert np.abs(found - change((2e-3, 1e-3, DEPTH_M))).max() > 1e-3 * PEAK_T
 
 
 def test_stiffness_changes_the_force_and_not_the_field():
@@ -140,7 +220,9 @@ def test_many_pokes_are_what_each_poke_is_alone():
     pokes_m = np.array([[0.0, 0.0, 1e-3], [3e-3, -8e-3, 0.2e-3], [1e-3, 1e-3, 0.0]])
     _, together = changes_of_field(BOARD, skin(), pokes_m)
     for poke_m, of_many in zip(pokes_m, together, strict=True):
-        assert np.array_equal(of_many, change(poke_m))
+        # 1 %: the increments to a depth end at the other depths that are asked for on the way
+        alone = change(poke_m)
+        assert np.linalg.norm(of_many - alone) <= 0.01 * np.linalg.norm(alone)
 
 
 def test_the_same_name_and_seed_give_the_same_skin_and_another_name_another():
@@ -149,32 +231,52 @@ def test_the_same_name_and_seed_give_the_same_skin_and_another_name_another():
 
 
 def test_over_many_skins_the_draws_have_the_spreads_that_are_stated():
-    skins = [skin(UNEVEN, f"s{i}") for i in range(100)]
-    middle_m = [one.nodes_m.mean(axis=0)[:2] for one in skins]
+    skins = [skin(UNEVEN, f"s{i}", SPARSE) for i in range(100)]
     # 25 %: three and a half times the sampling error 1 / sqrt(2 n) of 100 skins
-    assert np.std(middle_m) == pytest.approx(0.25e-3, rel=0.25)
+    assert np.std([one.seat_m for one in skins]) == pytest.approx(0.25e-3, rel=0.25)
+    np.testing.assert_allclose([one.nodes_m[:, :2].mean(axis=0) for one in skins], [one.seat_m for one in skins])
     assert np.std([one.depth_zero_m for one in skins]) == pytest.approx(0.05e-3, rel=0.25)
     assert np.std(np.log([one.thickness_m for one in skins])) == pytest.approx(0.03, rel=0.25)
     assert np.std(np.log([one.modulus_Pa for one in skins])) == pytest.approx(0.1, rel=0.25)
 
 
 def test_filler_and_amplitude_scale_the_moments_by_their_spreads():
-    exact = np.linalg.norm(skin().moments_A_m2, axis=1)
+    # One layer has its nodes at half height, where the field vanishes at seam crossings but not at these middles.
+    exact = np.linalg.norm(skin(rule=SPARSE).moments_A_m2, axis=1)
     for spread, within in ((no_spread(skin_amplitude=0.1), False), (no_spread(skin_filler=0.1), True)):
-        factors = [np.log(np.linalg.norm(skin(spread, f"s{i}").moments_A_m2, axis=1) / exact) for i in range(60)]
+        drawn = [np.linalg.norm(skin(spread, f"s{i}", SPARSE).moments_A_m2, axis=1) for i in range(60)]
+        factors = np.log(np.array(drawn) / exact)
         assert np.std(factors) == pytest.approx(0.1, rel=0.3)  # three times the sampling error of 60 skins
         assert (np.std(factors, axis=1).min() > 0.01) == within
 
 
-def test_the_size_of_the_change_is_that_of_a_real_skin_within_a_factor_of_three():
-    # Recorded at about 3 N: 650-1090 uT over 15 channels (PHYSICS 3). A bonded skin of this J gives about half.
-    pokes_m = np.array([[x, y, 1.2e-3] for x in (-4e-3, 0.0, 4e-3) for y in (-4e-3, 0.0, 4e-3)])
-    rest_T, changes_T = changes_of_field(BOARD, skin(), pokes_m)
-    assert 300e-6 < np.median(np.linalg.norm(changes_T.reshape(9, -1), axis=1)) < 1090e-6
-    assert forces(skin(), np.array([1.2e-3])) == pytest.approx(3.0, rel=0.1)
-    assert np.abs(rest_T[:, :2]).max() > 10 * np.abs(rest_T[:, 2]).max()  # in-plane, as the lab's skins
+def test_the_field_at_rest_lies_in_the_plane_and_is_as_strong_as_a_recorded_one():
+    # PHYSICS 3: recorded B0 in-plane up to 3.6 mT; a factor of two, since the amplitude is one number for all skins.
+    rest_T, _ = changes_of_field(BOARD, skin(rule=CHOSEN), np.zeros((0, 3)))
+    assert np.abs(rest_T[:, :2]).max() > 10 * np.abs(rest_T[:, 2]).max()
+    assert 1.8e-3 < np.abs(rest_T).max() < 7.2e-3
 
 
-def test_a_poke_that_would_fold_the_skin_is_refused():
+def test_the_force_at_the_deepest_poke_is_that_of_the_specification():
+    assert forces(skin(), np.array([1.2e-3])) == pytest.approx(3.0, rel=0.05)  # PHYSICS 4, two digits
+
+
+@pytest.mark.parametrize("place_m", [(10.1e-3, 0.0), (0.0, -12e-3), (np.nan, 0.0)])
+def test_a_poke_beside_the_skin_is_refused(place_m):
+    with pytest.raises(ParamsError, match="skin s0: poke must be on the skin, within 10 mm of its middle"):
+        change((*place_m, DEPTH_M))
+
+
+def test_the_edge_is_the_skins_and_not_the_boards():
+    one = skin(SEATED)
+    corner_m = np.append(one.seat_m + np.sign(one.seat_m) * 9.99e-3, 0.0)
+    assert np.abs(corner_m).max() > 10e-3
+    assert not change(corner_m, one).any()
+    with pytest.raises(ParamsError, match="on the skin"):
+        change(-corner_m, one)
+
+
+@pytest.mark.parametrize("depth_m", [2.5e-3, np.nan])
+def test_a_poke_through_the_skin_or_of_no_depth_is_refused(depth_m):
     with pytest.raises(ParamsError, match="depth"):
-        change((0.0, 0.0, 1.6e-3))
+        change((0.0, 0.0, depth_m))

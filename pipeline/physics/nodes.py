@@ -1,0 +1,51 @@
+"""Where the skin is summed. In: thickness and a rule of quadrature. Out: nodes and the volume that each stands for.
+
+Cells end at the magnets' seams, where the magnetisation bends; over the thickness lie Gauss-Legendre nodes, because
+midpoint layers cost up to 74 % of dB (PHYSICS 0). Refuses to know magnets, moments and chips.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+from math import ceil
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.errors import ParamsError, complain
+
+SKIN_SIDE_M = 20e-3  # authors' CAD
+SEAMS_M = (-6.35e-3, 0.0, 6.35e-3)  # of the 4x4 array of 0.25 in cubes that magnetises the skin
+
+
+@dataclass(frozen=True)
+class Quadrature:
+    """A rule: cells at most so wide, and so many Gauss nodes over the thickness."""
+
+    cell_m: float
+    layers_n: int
+
+
+CHOSEN = Quadrature(cell_m=0.5e-3, layers_n=6)  # 42 x 42 x 6 nodes; dB within 2 % of cells half as wide (test_skin)
+
+
+@dataclass(frozen=True)
+class Nodes:
+    """Nodes of a skin at rest; x and y from its middle, z from the base (0) to the top."""
+
+    nodes_m: Float[np.ndarray, "s 3"]
+    volumes_m3: Float[np.ndarray, " s"]
+
+
+def place_nodes(thickness_m: float, rule: Quadrature = CHOSEN) -> Nodes:
+    """Fill the skin with midpoints of cells that end at seams and edges, times Gauss nodes in z."""
+    if not (thickness_m > 0 and rule.cell_m > 0 and rule.layers_n > 0):
+        got = f"{thickness_m:.3g} m, {rule.cell_m:.3g} m and {rule.layers_n}"
+        raise ParamsError(complain("quadrature", "thickness, cell and layers", "above 0", got, "Mend the design."))
+    marks_m = (-SKIN_SIDE_M / 2, *SEAMS_M, SKIN_SIDE_M / 2)
+    spans = [np.linspace(a, b, ceil((b - a) / rule.cell_m - 1e-9) + 1) for a, b in pairwise(marks_m)]
+    centres_m = np.concatenate([(edges[1:] + edges[:-1]) / 2 for edges in spans])
+    widths_m = np.concatenate([np.diff(edges) for edges in spans])
+    gauss, weights = np.polynomial.legendre.leggauss(rule.layers_n)
+    x_m, y_m, z_m = np.meshgrid(centres_m, centres_m, (1 + gauss) / 2 * thickness_m, indexing="ij")
+    volumes_m3 = np.einsum("i,j,k->ijk", widths_m, widths_m, weights / 2 * thickness_m)
+    return Nodes(np.stack([x_m, y_m, z_m], axis=-1).reshape(-1, 3), volumes_m3.ravel())

@@ -1,0 +1,121 @@
+"""What an indentation costs on one core, and how often magpylib's dipoles would fit into that, in the same run.
+
+`OMP_NUM_THREADS=1 pytest -s -o addopts= tests/benchmarks/test_physics_benchmark.py`. Nothing but equality is asserted.
+"""
+
+import resource
+import time
+import tracemalloc
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.constants import mu_0
+
+from pipeline.dataset.grid import CENTRE_MM, protocol
+from pipeline.physics import dipole, flow
+from pipeline.physics.board import Board, draw_board
+from pipeline.physics.change import change_of_field, turned
+from pipeline.physics.skin import Skin, changes_of_field, draw_skin
+from tests.physics.test_board import design as board_design
+from tests.physics.test_board import no_spread, spreads
+from tests.physics.test_skin import design
+
+DEPTHS_MM = (0.2, 0.4, 0.6, 0.8, 1.0, 1.2)
+SKINS_N = 18
+BOARD = draw_board(board_design(), no_spread(), seed=0, name="b0")
+
+
+def skin(name: str) -> Skin:
+    return draw_skin(design(), spreads(), seed=0, name=name)
+
+
+def one_pass_m() -> np.ndarray:
+    plan = protocol(DEPTHS_MM, 1)
+    return 1e-3 * np.column_stack([plan.x_mm - CENTRE_MM, plan.y_mm - CENTRE_MM, plan.depth_mm]).astype(np.float64)
+
+
+def best_ms(call: Callable[[], Any], repeats_n: int) -> float:
+    times_s = []
+    for _ in range(repeats_n):
+        start_s = time.perf_counter()
+        call()
+        times_s.append(time.perf_counter() - start_s)
+    return 1e3 * min(times_s)
+
+
+def everything_moves(one: Skin) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    axis, angle_rad = np.tile([0.6, 0.8, 0.0], (len(one.nodes_m), 1)), np.full(len(one.nodes_m), 0.1)
+    moved = one.nodes_m + 1e-4 * np.cos(1e3 * one.nodes_m), turned(one.moments_A_m2, axis, angle_rad)
+    return (one.nodes_m, one.moments_A_m2), moved
+
+
+def core_field(dipoles: tuple[np.ndarray, np.ndarray], board: Board) -> np.ndarray:
+    """Sum magpylib.core's dipoles: one call over every pair of node and chip."""
+    from magpylib.core import dipole_Hfield
+
+    positions_m, moments = dipoles
+    away_m = (board.chips_m[:, None] - positions_m).reshape(-1, 3)
+    each_T = mu_0 * dipole_Hfield(observers=away_m, moments=np.tile(moments, (len(board.chips_m), 1)))
+    return each_T.reshape(len(board.chips_m), -1, 3).sum(axis=1)
+
+
+@pytest.mark.timeout(600)
+def test_the_field_of_all_nodes_costs_less_than_magpylibs_dipoles() -> None:
+    magpylib = pytest.importorskip("magpylib", reason="needs magpylib, of the dev dependencies")
+    rest, moved = everything_moves(skin("s0"))
+    objects = [
+        [magpylib.misc.Dipole(moment=m, position=x) for x, m in zip(*dipoles, strict=True)] for dipoles in (rest, moved)
+    ]
+
+    def by_objects() -> np.ndarray:
+        before_T, after_T = (magpylib.getB(one, BOARD.chips_m, sumup=True) for one in objects)
+        return after_T - before_T
+
+    calls: dict[str, tuple[Callable[[], np.ndarray], int]] = {
+        "compiled": (lambda: change_of_field(rest, moved, BOARD.chips_m), 50),
+        "NumPy": (lambda: dipole.field(*moved, BOARD.chips_m) - dipole.field(*rest, BOARD.chips_m), 10),
+        "magpylib.core": (lambda: core_field(moved, BOARD) - core_field(rest, BOARD), 10),
+        "magpylib objects": (by_objects, 3),
+    }
+    truth_T = calls["compiled"][0]()
+    times_ms = {name: best_ms(call, repeats_n) for name, (call, repeats_n) in calls.items()}
+    print(f"\nfield before and after, {len(rest[0])} nodes that all move x {len(BOARD.chips_m)} chips")
+    for name, (call, _) in calls.items():
+        print(f"  {name:16} {times_ms[name]:8.2f} ms {times_ms[name] / times_ms['compiled']:8.1f} x")
+        # The others lose digits to the difference of two sums, and magpylib's mu_0 is of another year.
+        np.testing.assert_allclose(call(), truth_T, atol=1e-7 * np.abs(truth_T).max())
+
+
+@pytest.mark.timeout(600)
+def test_an_indentation_of_one_skin_is_timed_with_and_without_its_table() -> None:
+    pokes_m, one = one_pass_m(), skin("s0")
+    changes_of_field(BOARD, skin("s1"), pokes_m[:1])  # compiles
+    flow.tabulate.cache_clear()
+    start_s = time.perf_counter()
+    _, first_T = changes_of_field(BOARD, one, pokes_m)
+    with_table_ms = 1e3 * (time.perf_counter() - start_s)
+    poking_ms = best_ms(lambda: changes_of_field(BOARD, one, pokes_m), 3)
+    tracemalloc.start()
+    flow.tabulate.cache_clear()
+    _, again_T = changes_of_field(BOARD, one, pokes_m)
+    peak_MB = tracemalloc.get_traced_memory()[1] / 1e6
+    tracemalloc.stop()
+    assert np.array_equal(first_T, again_T)
+    n = len(pokes_m)
+    print(f"\n{n} pokes of one skin: {poking_ms / n:.3f} ms each, and {with_table_ms - poking_ms:.0f} ms for the table")
+    print(f"  together {with_table_ms / n:.3f} ms each; peak {peak_MB:.1f} MB")
+
+
+@pytest.mark.timeout(600)
+def test_eighteen_skins_are_timed_from_their_names_on() -> None:
+    pokes_m = one_pass_m()
+    start_s = time.perf_counter()
+    for skin_i in range(SKINS_N):
+        _, changes_T = changes_of_field(BOARD, skin(f"s{skin_i}"), pokes_m)
+        assert np.isfinite(changes_T).all()
+    total_s = time.perf_counter() - start_s
+    peak_MB = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(f"\n{SKINS_N} skins x {len(pokes_m)} pokes, magnets and tables included: {total_s:.1f} s,")
+    print(f"  {1e3 * total_s / SKINS_N / len(pokes_m):.3f} ms an indentation; the process peaked at {peak_MB:.0f} MB")

@@ -1,0 +1,125 @@
+"""The compiled change of field against one naive body in NumPy and against magpylib; linearity and exact zeros."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from pipeline.errors import ParamsError
+from pipeline.physics import dipole
+from pipeline.physics.change import change_of_field, turned
+from pipeline.seeds import rng_for
+
+ROUNDING = 1e-12  # a few thousand operations in float64, of like sign in the sum of sizes
+seeds = st.integers(0, 10**6)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def compiled():
+    """Compile before the clock of a single example runs."""
+    change_of_field(*scene(0))
+    turned(np.ones((1, 3)), np.ones((1, 3)), np.ones(1))
+
+
+def naive(rest, moved, observers_m):
+    """The specification: the field of each dipole after, less its field before, then the sum."""
+    after_T = dipole.field_of_each(*moved, observers_m)
+    return (after_T - dipole.field_of_each(*rest, observers_m)).sum(axis=1)
+
+
+def scene(seed, nodes_n=200):
+    """Dipoles of a slab off the origin that move by a tenth of a millimetre and turn by a tenth."""
+    rng = rng_for(seed, "change")
+    nodes_m = rng.uniform((2e-3, -9e-3, 1e-3), (9e-3, 4e-3, 3e-3), size=(nodes_n, 3))
+    moments = 1e-5 * rng.normal(size=(nodes_n, 3))
+    moved = nodes_m + 1e-4 * rng.normal(size=nodes_m.shape), moments + 1e-6 * rng.normal(size=nodes_m.shape)
+    return (nodes_m, moments), moved, rng.uniform((-3e-3, -3e-3, -2e-3), (3e-3, 3e-3, -1e-3), size=(5, 3))
+
+
+def size_T(rest, moved, observers_m):
+    return np.abs(dipole.field_of_each(*rest, observers_m)).sum()
+
+
+@given(seeds)
+def test_the_compiled_sum_is_the_naive_one(seed):
+    args = scene(seed)
+    np.testing.assert_allclose(change_of_field(*args), naive(*args), atol=ROUNDING * size_T(*args))
+
+
+def test_magpylib_agrees():
+    magpylib = pytest.importorskip("magpylib", reason="needs magpylib, of the dev dependencies")
+    rest, moved, observers_m = scene(1, nodes_n=20)
+
+    def theirs_T(nodes_m, moments):
+        return sum(
+            magpylib.misc.Dipole(moment=m, position=x).getB(observers_m) for x, m in zip(nodes_m, moments, strict=True)
+        )
+
+    # rtol: magpylib's mu_0 is of another CODATA year
+    np.testing.assert_allclose(change_of_field(rest, moved, observers_m), theirs_T(*moved) - theirs_T(*rest), rtol=1e-7)
+
+
+@given(seeds)
+def test_dipoles_that_stay_change_nothing_at_all(seed):
+    rest, _, observers_m = scene(seed)
+    assert not change_of_field(rest, rest, observers_m).any()
+
+
+def test_dipoles_of_no_moment_change_nothing_at_all():
+    (nodes_m, moments), (moved_m, _), observers_m = scene(2)
+    nothing = np.zeros_like(moments)
+    assert not change_of_field((nodes_m, nothing), (moved_m, nothing), observers_m).any()
+
+
+def test_no_dipoles_make_no_change():
+    nothing = (np.zeros((0, 3)), np.zeros((0, 3)))
+    assert not change_of_field(nothing, nothing, np.ones((2, 3))).any()
+
+
+@given(seeds, st.floats(-5, 5))
+def test_the_change_is_linear_in_the_moments(seed, factor):
+    (nodes_m, before), (moved_m, after), observers_m = scene(seed)
+    scaled = change_of_field((nodes_m, factor * before), (moved_m, factor * after), observers_m)
+    once = change_of_field((nodes_m, before), (moved_m, after), observers_m)
+    atol = ROUNDING * 5 * size_T((nodes_m, before), None, observers_m)
+    np.testing.assert_allclose(scaled, factor * once, atol=atol)
+
+
+@given(seeds)
+def test_there_and_back_again_is_no_change(seed):
+    rest, moved, observers_m = scene(seed)
+    back_T = change_of_field(moved, rest, observers_m)
+    np.testing.assert_allclose(back_T, -change_of_field(rest, moved, observers_m), atol=1e-20)
+
+
+def test_a_tiny_move_keeps_the_digits_that_two_large_sums_would_lose():
+    # The field's slope along the move is the truth; one step of 1e-9 m changes the field by 1e-6 of itself.
+    (nodes_m, moments), _, observers_m = scene(3)
+    step_m = np.array([1e-9, 0.0, 0.0])
+    found_T = change_of_field((nodes_m, moments), (nodes_m + step_m, moments), observers_m)
+    wide_m = 1e3 * step_m
+    slope_T = dipole.field(nodes_m + wide_m, moments, observers_m) - dipole.field(
+        nodes_m - wide_m, moments, observers_m
+    )
+    np.testing.assert_allclose(
+        found_T, slope_T / 2e3, rtol=1e-4
+    )  # next order: (1e-6 m / 3e-3 m)^2, and 1e-9 m / 3e-3 m
+
+
+@given(seeds)
+def test_moments_turn_as_scipys_rotations_do(seed):
+    rng = rng_for(seed, "turned")
+    moments, axis, angle_rad = rng.normal(size=(20, 3)), rng.normal(size=(20, 3)), rng.uniform(-3, 3, 20)
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    truth = Rotation.from_rotvec(axis * angle_rad[:, None]).apply(moments)
+    np.testing.assert_allclose(turned(moments, axis, angle_rad), truth, atol=1e-13)
+
+
+@pytest.mark.parametrize("place", [0.0, np.nan])
+def test_an_observer_on_a_dipole_is_refused(place):
+    at, away, moment = np.full((1, 3), place), np.ones((1, 3)), np.ones((1, 3))
+    with pytest.raises(ParamsError, match="distance to a chip must be above 0 m"):
+        change_of_field((at, moment), (away, moment), np.zeros((1, 3)))
+    with pytest.raises(ParamsError, match="distance to a chip must be above 0 m"):
+        change_of_field((away, moment), (at, moment), np.zeros((1, 3)))
