@@ -28,8 +28,8 @@ def blocks_of(numbers: Mapping[str, Any], dag: str, stages: Mapping[str, Any]) -
     tables = make_tables(numbers)
     words = (
         f"Scene `{provenance['scene']}`, **{provenance['source']}**; code {provenance['git']}, "
-        f"seed {provenance['seed']}, {provenance['device']}; mean ± sd over n scores (folds x seeds; for the "
-        "single-sensor row, training skins x test skins)."
+        f"seed {provenance['seed']}, {provenance['device']}; mean ± sd over n folds (for the "
+        "single-sensor row, over n pairs of a training and a test skin)."
     )
     results = [words] + [to_markdown(tables[name]) for name in ("table2", "single_sensor") if name in tables]
     return {"results": "\n\n".join(results), "dag": dag, "stages": _stages(stages)}
