@@ -62,7 +62,7 @@ def remove(root: Path, scene: str, capture: str) -> None:
 
 def _check_free(target: Path, registered: bool) -> None:
     if registered:
-        remedy = "Choose another --name, or reskin remove the old one first."
+        remedy = "Is it the same recording? It is in already. Otherwise choose another --name."
         raise CaptureError(
             complain(f"capture {target.name}", "its name", "new to its scene", "one that is taken", remedy)
         )

@@ -41,7 +41,8 @@ def parse(model: type[Model], value: Any, where: str) -> Model:
         # Through JSON, so that a YAML list may fill a tuple while "3" still does not become 3.
         return model.model_validate_json(json.dumps(value, default=str))
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
+        # A misspelt name is also a missing one: name what was written first.
+        first = min(error.errors(include_url=False), key=lambda one: one["type"] != "extra_forbidden")
         name = ".".join(map(str, first["loc"])) or "the file"
         got = "nothing" if first["type"] == "missing" else repr(first.get("input"))[:80]
         rule = {"missing": "given", "extra_forbidden": "a known parameter"}.get(first["type"])

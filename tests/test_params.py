@@ -51,6 +51,13 @@ def test_what_is_not_written_is_an_error_and_no_default():
         parse(Scene, scene, "scene.yaml")
 
 
+def test_a_misspelt_parameter_is_named_as_it_was_written():
+    recipe = {name: value for name, value in RECIPE.items() if name != "epochs_n"} | {"epoch_n": 4}
+    scene = recorded(train_multi={"seeds_n": 1, "recipes": {"paper": recipe}})
+    with pytest.raises(ParamsError, match=r"recipes.paper.epoch_n must be a known parameter; got 4"):
+        parse(Scene, scene, "scene.yaml")
+
+
 def test_yaml_reads_exponents_as_numbers(tmp_path):
     (tmp_path / "a.yaml").write_text("rate: 1e-3\n")
     assert read_yaml(tmp_path / "a.yaml") == {"rate": 0.001}

@@ -11,6 +11,11 @@ import pandas as pd
 from pipeline.reporting.paper import SINGLE_SENSOR, TABLE_2, TABLE_2_ROWS, Number
 
 COLUMNS = {"accuracy_pct": "accuracy, %", "mse_xy_mm2": "MSE_xy, mm²", "mse_f_N2": "MSE_F, N²"}
+MEANING = (
+    "Accuracy: the part of held-out readings whose x and y are both within 1 mm. MSE_xy: mean over the two axes. "
+    "± is the sd over n folds (over n pairs of a training and a test skin for one skin on others), or over seeds where "
+    "it says so."
+)
 SPLIT_WORDS = {
     "single_random": "random readings held out (the paper's way: readings of one indentation on both sides)",
     "single_temporal": "first passes → last passes",
@@ -22,9 +27,7 @@ def make_tables(numbers: Mapping[str, Any]) -> dict[str, pd.DataFrame]:
     source = numbers["provenance"]["source"]
     tables = {}
     if "table2" in numbers:
-        tables["table2"] = _beside_paper(
-            {TABLE_2_ROWS[row]: (value, TABLE_2[row]) for row, value in numbers["table2"].items()}, source
-        )
+        tables["table2"] = _beside_paper(_table_2_rows(numbers), source)
     single = {SPLIT_WORDS[name]: (numbers[name], SINGLE_SENSOR) for name in SPLIT_WORDS if name in numbers}
     if single:
         tables["single_sensor"] = _beside_paper(single, source)
@@ -36,8 +39,9 @@ def make_tables(numbers: Mapping[str, Any]) -> dict[str, pd.DataFrame]:
 
 
 def to_markdown(table: pd.DataFrame) -> str:
-    """Write a table as Markdown; empty where a number is not known."""
-    return str(table.fillna("").to_markdown(index=False, disable_numparse=True)) + "\n"
+    """Write a table as Markdown, empty where a number is not known, and say below what its numbers mean."""
+    text = str(table.fillna("").to_markdown(index=False, disable_numparse=True)) + "\n"
+    return text + (f"\n{MEANING}\n" if any("accuracy" in str(column) for column in table.columns) else "")
 
 
 def show(value: Mapping[str, float] | None) -> str:
@@ -48,6 +52,17 @@ def show(value: Mapping[str, float] | None) -> str:
     if "sd" in value:
         return f"{mean} ± {value['sd']:.2g}"
     return mean + (f" ± {value['sd_seeds']:.2g} (seeds)" if "sd_seeds" in value else "")
+
+
+def _table_2_rows(numbers: Mapping[str, Any]) -> dict[str, tuple[Mapping[str, Any], Mapping[str, Number]]]:
+    """Put each row beside the paper's row of the same kind: with one training skin, nothing was pooled."""
+    rows = {}
+    for row, value in numbers["table2"].items():
+        skins_n = [one["trained_on_skins_n"] for one in numbers["lobo"]["by_board"].values()] if row == "multi" else []
+        alone = bool(skins_n) and max(skins_n) == 1
+        name = "Leave-one-board-out, one training skin (paper: single-sensor)" if alone else TABLE_2_ROWS[row]
+        rows[name] = (value, TABLE_2["single" if alone else row])
+    return rows
 
 
 def _beside_paper(rows: Mapping[str, tuple[Mapping[str, Any], Mapping[str, Number]]], source: str) -> pd.DataFrame:
@@ -79,7 +94,8 @@ def _variants(variants: Mapping[str, Any], source: str) -> pd.DataFrame:
     for question, recipes in variants.items():
         for recipe, metrics in recipes.items():
             line = {"question": question, "recipe": recipe, "source": source}
-            lines.append(line | {title: show(metrics.get(metric)) for metric, title in COLUMNS.items()})
+            line |= {title: show(metrics.get(metric)) for metric, title in COLUMNS.items()}
+            lines.append(line | {"n": str(metrics["accuracy_pct"]["n"])})
     return pd.DataFrame(lines)
 
 

@@ -75,6 +75,19 @@ def test_the_papers_numbers_stand_beside_ours():
     assert "85 ± 7.1" in text
 
 
+def test_one_training_skin_is_not_called_pooled():
+    cards = [{**one, "train_skins": ["s9"]} for one in CARDS]
+    (row,) = [name for name in make_tables(numbers(cards))["table2"]["model"] if "board" in name]
+    assert row == "Leave-one-board-out, one training skin (paper: single-sensor)"
+    assert "84.43" not in to_markdown(make_tables(numbers(cards))["table2"])
+
+
+def test_a_table_of_scores_says_what_they_mean():
+    tables = make_tables(numbers())
+    assert "within 1 mm" in to_markdown(tables["table2"])
+    assert "within 1 mm" not in to_markdown(tables["captures"])
+
+
 def test_a_number_that_is_not_known_is_a_dash():
     cards = [card("single_temporal", "s0", 99.0)]
     del cards[0]["scores"]["all"]["mse_f_N2"]
