@@ -56,7 +56,7 @@ def show(value: Mapping[str, float] | None) -> str:
 
 def _table_2_rows(numbers: Mapping[str, Any]) -> dict[str, tuple[Mapping[str, Any], Mapping[str, Number]]]:
     """Put each row beside the paper's row of the same kind: with one training skin, nothing was pooled."""
-    rows = {}
+    rows: dict[str, tuple[Mapping[str, Any], Mapping[str, Number]]] = {}
     for row, value in numbers["table2"].items():
         skins_n = [one["trained_on_skins_n"] for one in numbers["lobo"]["by_board"].values()] if row == "multi" else []
         alone = bool(skins_n) and max(skins_n) == 1
