@@ -1,11 +1,12 @@
-"""The bonded skin under a round tip. In: thickness, tip, depth, SI. Out: contact, force, displacement and gradient.
+"""The skin under a round tip. In: thickness, tip, depth, base, SI. Out: contact, force, displacement and gradient.
 
-Incompressible elastic layer on a rigid base, endless sideways, frictionless sphere, linear: small changes of depth.
-Refuses to know magnets, and what many small changes add up to (`flow`).
+Incompressible elastic layer on a rigid base that holds it (bonded) or lets it slide (`slip`), endless sideways,
+frictionless sphere, linear: small changes of depth. Refuses to know magnets, and what many small changes add up to.
 """
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -14,6 +15,9 @@ from scipy.optimize import brentq
 from scipy.special import j0, j1
 
 from pipeline.errors import ParamsError, complain
+from pipeline.physics import slip
+
+Base = Literal["bonded", "slipping"]
 
 VERIFIED_DEPTH = 0.6  # of the thickness: Long et al. 2011 compared with finite elements up to here
 CURVE_N = 48  # contact radii of the force curve
@@ -46,6 +50,7 @@ class Waves:
     k_per_m: Float[np.ndarray, " w"]
     amplitude_m: Float[np.ndarray, " w"]
     thickness_m: float
+    base: Base
 
 
 @dataclass(frozen=True)
@@ -74,7 +79,7 @@ def compliance(kh: Float[np.ndarray, " w"]) -> Float[np.ndarray, " w"]:
     return sinh_part / (1 + fade**2 + (s + 2) * fade)
 
 
-def contact_of_radius(radius_m: float, *, thickness_m: float, tip_radius_m: float) -> Contact:
+def contact_of_radius(radius_m: float, *, thickness_m: float, tip_radius_m: float, base: Base) -> Contact:
     """Find pressure and depth for a contact of this radius, from a Fredholm equation (Lebedev & Ufliand 1958).
 
     p^(k) = integral of chi(x) cos(kx) makes the pressure vanish outside; chi - K chi = 2/pi (depth - x artanh(x/R))
@@ -82,7 +87,7 @@ def contact_of_radius(radius_m: float, *, thickness_m: float, tip_radius_m: floa
     """
     x_m, weights_m = radius_m * CONTACT_X, radius_m * CONTACT_W
     at_m = np.append(x_m, radius_m)
-    kernel = _kernel(at_m, x_m, thickness_m) * weights_m
+    kernel = _kernel(at_m, x_m, thickness_m, base) * weights_m
     sources = np.stack([np.ones_like(at_m), at_m * np.arctanh(at_m / tip_radius_m)], axis=1)
     inside = np.linalg.solve(np.eye(len(x_m)) - kernel[:-1], sources[:-1])
     flat, round_ = sources[-1] + kernel[-1] @ inside
@@ -91,17 +96,17 @@ def contact_of_radius(radius_m: float, *, thickness_m: float, tip_radius_m: floa
 
 
 @lru_cache(maxsize=4096)
-def contact_of_depth(depth_m: float, *, thickness_m: float, tip_radius_m: float) -> Contact:
+def contact_of_depth(depth_m: float, *, thickness_m: float, tip_radius_m: float, base: Base) -> Contact:
     """Find the contact at this depth, above 0."""
 
     def miss_m(radius_m: float) -> float:
-        here = contact_of_radius(radius_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m)
+        here = contact_of_radius(radius_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m, base=base)
         return here.depth_m - depth_m
 
     # A thick layer has a^2 = R d; a thin one, that can only flow aside, 4 R d.
     top_m = min(2.1 * np.sqrt(tip_radius_m * depth_m), 0.999 * tip_radius_m)
     radius_m = float(brentq(miss_m, 1e-3 * np.sqrt(tip_radius_m * depth_m), top_m, rtol=1e-12))
-    return contact_of_radius(radius_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m)
+    return contact_of_radius(radius_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m, base=base)
 
 
 def beyond_verified(depth_m: Float[np.ndarray, " n"], thickness_m: float) -> Bool[np.ndarray, " n"]:
@@ -110,14 +115,19 @@ def beyond_verified(depth_m: Float[np.ndarray, " n"], thickness_m: float) -> Boo
 
 
 def force(
-    depth_m: Float[np.ndarray, " n"], *, thickness_m: float, tip_radius_m: float, modulus_Pa: float
+    depth_m: Float[np.ndarray, " n"],
+    *,
+    thickness_m: float,
+    tip_radius_m: float,
+    modulus_Pa: float,
+    base: Base,
 ) -> Float[np.ndarray, " n"]:
     """Give the force on the tip in newtons; a depth of zero or less is no contact: no force."""
     refuse_layer(depth_m, thickness_m, tip_radius_m)
     if not (np.isfinite(modulus_Pa) and modulus_Pa >= 0):
         raise ParamsError(complain("layer", "modulus", "0 Pa or more", f"{modulus_Pa}", "Check the skin's modulus."))
     root_m = np.sqrt(np.maximum(depth_m, 0.0))
-    return modulus_Pa * root_m**3 * _force_curve(thickness_m, tip_radius_m)(root_m)
+    return modulus_Pa * root_m**3 * _force_curve(thickness_m, tip_radius_m, base)(root_m)
 
 
 def refuse_layer(depth_m: Float[np.ndarray, " n"], thickness_m: float, tip_radius_m: float) -> None:
@@ -131,16 +141,17 @@ def refuse_layer(depth_m: Float[np.ndarray, " n"], thickness_m: float, tip_radiu
         raise ParamsError(complain("poke", "depth", rule, f"{1e3 * np.max(depth_m):.3g} mm", "Poke less deep."))
 
 
-def waves(contact: Contact, thickness_m: float) -> Waves:
+def waves(contact: Contact, thickness_m: float, base: Base) -> Waves:
     """Write the contact's pressure as waves; a cos^2 window over the shortest half of them hides the cut."""
     window = np.cos(np.pi * np.maximum(WAVES_KH / WAVES_KH[-1] - 0.5, 0)) ** 2
     pressure_m2 = np.cos(np.outer(WAVES_KH / thickness_m, contact.x_m)) @ contact.weights_m2
-    return Waves(WAVES_KH / thickness_m, pressure_m2 * window * WAVES_W / thickness_m, thickness_m)
+    return Waves(WAVES_KH / thickness_m, pressure_m2 * window * WAVES_W / thickness_m, thickness_m, base)
 
 
 def displacement(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"], of: Waves) -> Displacement:
     """Sum the waves at (r, z): u_r = sum of amplitude g' J1, u_z = -sum of amplitude g J0 (PHYSICS 4: U = -W'/k)."""
-    g, slope, bend = depth_profile(np.outer(z_m, of.k_per_m), of.thickness_m * of.k_per_m)
+    profile = depth_profile if of.base == "bonded" else slip.depth_profile
+    g, slope, bend = profile(np.outer(z_m, of.k_per_m), of.thickness_m * of.k_per_m)
     kr = np.outer(r_m, of.k_per_m)
     bessel0, bessel1 = j0(kr), j1(kr)
     weights = np.stack([of.amplitude_m, of.amplitude_m * of.k_per_m], axis=1)
@@ -178,22 +189,23 @@ def depth_profile(
 
 
 @lru_cache(maxsize=64)
-def _force_curve(thickness_m: float, tip_radius_m: float) -> CubicSpline:
+def _force_curve(thickness_m: float, tip_radius_m: float, base: Base) -> CubicSpline:
     # F / E d^1.5 over sqrt(d): smooth, and Hertz's 16/9 sqrt(R) at 0, where the layer is thick beside the contact.
     deepest_m = (1 - 1e-6) * min(thickness_m, tip_radius_m)
-    widest = contact_of_depth(deepest_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m)
+    widest = contact_of_depth(deepest_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m, base=base)
     radii_m = widest.radius_m * np.linspace(0, 1, CURVE_N)[1:]
-    contacts = [contact_of_radius(a_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m) for a_m in radii_m]
+    contacts = [contact_of_radius(a, thickness_m=thickness_m, tip_radius_m=tip_radius_m, base=base) for a in radii_m]
     root = np.sqrt([0.0] + [one.depth_m for one in contacts])
     share = [4 * np.pi / 3 * one.weights_m2.sum() / one.depth_m**1.5 for one in contacts]
     return CubicSpline(root, [16 / 9 * np.sqrt(tip_radius_m), *share])
 
 
 def _kernel(
-    at_m: Float[np.ndarray, " p"], x_m: Float[np.ndarray, " q"], thickness_m: float
+    at_m: Float[np.ndarray, " p"], x_m: Float[np.ndarray, " q"], thickness_m: float, base: Base
 ) -> Float[np.ndarray, "p q"]:
     # 2/pi integral of (1 - compliance) cos(k at) cos(k x) dk.
-    missing = KERNEL_W / thickness_m * (1 - compliance(KERNEL_KH))
+    surface = compliance if base == "bonded" else slip.compliance
+    missing = KERNEL_W / thickness_m * (1 - surface(KERNEL_KH))
     k_per_m = KERNEL_KH / thickness_m
     return 2 / np.pi * np.cos(np.outer(at_m, k_per_m)) * missing @ np.cos(np.outer(k_per_m, x_m))
 

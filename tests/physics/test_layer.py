@@ -11,7 +11,7 @@ from scipy.special import ellipe, ellipk, j0, j1
 from pipeline.errors import ParamsError
 from pipeline.physics import layer
 
-SKIN = {"thickness_m": 2e-3, "tip_radius_m": 3e-3}
+SKIN = {"thickness_m": 2e-3, "tip_radius_m": 3e-3, "base": "bonded"}
 DEPTHS_M = np.arange(1, 7) * 0.2e-3
 waves_kh = st.floats(1e-3, 300)
 thicknesses_m = st.floats(1e-3, 5e-3)
@@ -28,7 +28,7 @@ def hertz_N(depth_m, tip_radius_m=3e-3, modulus_Pa=190e3):
 
 def field(r_m, z_m, depth_m=1.2e-3):
     contact = layer.contact_of_depth(depth_m, **SKIN)
-    return layer.displacement(np.asarray(r_m), np.asarray(z_m), layer.waves(contact, SKIN["thickness_m"]))
+    return layer.displacement(np.asarray(r_m), np.asarray(z_m), layer.waves(contact, SKIN["thickness_m"], "bonded"))
 
 
 @given(waves_kh)
@@ -77,7 +77,7 @@ def test_the_base_is_held_and_the_surface_free_of_shear():
 
 @pytest.mark.parametrize("radius_m", [0.3e-3, 1e-3, 2.2e-3])
 def test_on_a_thick_layer_depth_and_force_are_sneddons_for_a_sphere(radius_m):
-    contact = layer.contact_of_radius(radius_m, thickness_m=100.0, tip_radius_m=3e-3)
+    contact = layer.contact_of_radius(radius_m, thickness_m=100.0, tip_radius_m=3e-3, base="bonded")
     log = np.log((3e-3 + radius_m) / (3e-3 - radius_m))
     assert contact.depth_m == pytest.approx(radius_m * log / 2, rel=1e-4)  # a / h = 2e-5
     sneddon_N = 4 / 3 * ((radius_m**2 + 9e-6) / 2 * log - radius_m * 3e-3)  # Sneddon 1965, E = 1 Pa
