@@ -4,6 +4,7 @@ The one place where tesla become microtesla. Noise, step and range are those of 
 Refuses to know where the field comes from and how readings travel.
 """
 
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -17,6 +18,7 @@ from pipeline.strict import Strict
 GAINS = (5.0, 4.0, 3.0, 2.5, 2.0, 5 / 3, 4 / 3, 1.0)  # by GAIN_SEL (data sheet, table 17)
 STEP_AT_GAIN_ONE_uT = (0.150, 0.150, 0.242)  # RES 0; x, y, z
 TEMPERATURE_ZERO_DEGC, TEMPERATURE_ZERO_RAW, TEMPERATURE_STEPS_PER_DEGC = 25.0, 46244, 45.2  # data sheet
+FIELD_MAX_T = 50e-3  # the chip measures no more on any axis, whatever its gain (data sheet)
 
 
 class ChipDesign(Strict):
@@ -28,6 +30,14 @@ class ChipDesign(Strict):
     noise_temperature_degC: Annotated[float, Field(ge=0, le=10)]
 
 
+@dataclass(frozen=True)
+class Overruns:
+    """Values that the chips could not give as they were: held at 50 mT, and past int16, which wraps."""
+
+    clipped_n: int
+    wrapped_n: int
+
+
 def steps_uT(gain_sel: int) -> Float[np.ndarray, " 3"]:
     """Give the field of one count on x, y and z."""
     return np.array(STEP_AT_GAIN_ONE_uT) * GAINS[gain_sel]
@@ -35,17 +45,19 @@ def steps_uT(gain_sel: int) -> Float[np.ndarray, " 3"]:
 
 def read_field(
     b_T: Float[np.ndarray, "f k 3"], board: Board, *, design: ChipDesign, rng: np.random.Generator
-) -> tuple[Float32[np.ndarray, "f ch"], int]:
-    """Read the field as the board's chips do, each in its own frame; count the values past int16, which wrap."""
+) -> tuple[Float32[np.ndarray, "f ch"], Overruns]:
+    """Read the field as the board's chips do, each in its own frame; count what the readings could not hold."""
     to_chip = board.sensitivity @ board.turn.transpose(0, 2, 1)
-    b_uT = (np.einsum("kij,fkj->fki", to_chip, b_T) + board.offset_T) / micro
+    seen_T = np.einsum("kij,fkj->fki", to_chip, b_T)
+    clipped_n = int(np.count_nonzero(np.abs(seen_T) > FIELD_MAX_T))
+    b_uT = (seen_T.clip(-FIELD_MAX_T, FIELD_MAX_T) + board.offset_T) / micro
     noise_uT = np.array([design.noise_xy_uT, design.noise_xy_uT, design.noise_z_uT])
     b_uT += noise_uT * rng.standard_normal(b_uT.shape)
     step_uT = steps_uT(design.gain_sel)
     counts = np.rint(b_uT / step_uT).astype(np.int64)
     wrapped = (counts + 2**15) % 2**16 - 2**15
     read_uT = (wrapped * step_uT).astype(np.float32).reshape(len(b_T), -1)
-    return read_uT, int(np.count_nonzero(wrapped != counts))
+    return read_uT, Overruns(clipped_n, int(np.count_nonzero(wrapped != counts)))
 
 
 def read_temperature(

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.physics.board import Board
-from pipeline.physics.sensor import ChipDesign, read_field, read_temperature, steps_uT
+from pipeline.physics.sensor import ChipDesign, Overruns, read_field, read_temperature, steps_uT
 from pipeline.seeds import rng_for
 
 QUARTER = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
@@ -33,9 +33,9 @@ def test_the_steps_are_those_of_the_data_sheet():
 
 @given(fields_T)
 def test_a_quiet_chip_reads_the_field_in_uT_to_half_a_step(b_T):
-    b_uT, wrapped_n = read(b_T)
+    b_uT, overruns = read(b_T)
     assert b_uT.dtype == np.float32
-    assert wrapped_n == 0
+    assert overruns == Overruns(clipped_n=0, wrapped_n=0)
     assert (np.abs(b_uT[0] - 1e6 * b_T) <= steps_uT(7) / 2 + 1e-3).all()  # float32 of 4000 uT: 2e-4
 
 
@@ -56,10 +56,25 @@ def test_readings_are_whole_steps():
 
 
 def test_past_its_range_a_reading_wraps_and_is_counted():
-    b_uT, wrapped_n = read([[5e-3, 0, 0], [0, 0, -8e-3], [4.9e-3, 0, 7.9e-3]])
-    assert wrapped_n == 2
+    b_uT, overruns = read([[5e-3, 0, 0], [0, 0, -8e-3], [4.9e-3, 0, 7.9e-3]])
+    assert overruns == Overruns(clipped_n=0, wrapped_n=2)
     assert b_uT[0, 0] == pytest.approx(5000 - 2**16 * 0.150, abs=0.08)
     assert b_uT[1, 2] == pytest.approx(-8000 + 2**16 * 0.242, abs=0.13)
+
+
+@pytest.mark.parametrize(("field_T", "clipped_n"), [(49.99e-3, 0), (50.01e-3, 1), (-60e-3, 1)])
+def test_past_50_mT_the_chip_reads_50_mT_and_wraps_that(field_T, clipped_n):
+    b_uT, overruns = read([0, field_T, 0])
+    held_uT = 1e6 * np.clip(field_T, -50e-3, 50e-3)
+    turns_n = round(held_uT / (2**16 * 0.150))
+    assert overruns == Overruns(clipped_n=clipped_n, wrapped_n=1)
+    assert b_uT[0, 1] == pytest.approx(held_uT - turns_n * 2**16 * 0.150, abs=0.08)  # half a step
+
+
+def test_what_clips_is_the_field_that_the_chip_sees_and_not_its_offset():
+    _, overruns = read([0, 0, 49.9e-3], board(offset_T=200e-6))
+    assert overruns.clipped_n == 0
+    assert read([0, 0, 49.9e-3], board(gain=1.1))[1].clipped_n == 1
 
 
 def test_noise_has_the_stated_spread_on_each_axis():
