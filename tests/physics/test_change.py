@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
 from pipeline.errors import ParamsError
 from pipeline.physics import dipole
-from pipeline.physics.change import change_of_field, turned
+from pipeline.physics.change import change_of_field
 from pipeline.seeds import rng_for
 
 ROUNDING = 1e-12  # a few thousand operations in float64, of like sign in the sum of sizes
@@ -19,7 +18,6 @@ seeds = st.integers(0, 10**6)
 def compiled():
     """Compile before the clock of a single example runs."""
     change_of_field(*scene(0))
-    turned(np.ones((1, 3)), np.ones((1, 3)), np.ones(1))
 
 
 def naive(rest, moved, observers_m):
@@ -105,15 +103,6 @@ def test_a_tiny_move_keeps_the_digits_that_two_large_sums_would_lose():
     np.testing.assert_allclose(
         found_T, slope_T / 2e3, rtol=1e-4
     )  # next order: (1e-6 m / 3e-3 m)^2, and 1e-9 m / 3e-3 m
-
-
-@given(seeds)
-def test_moments_turn_as_scipys_rotations_do(seed):
-    rng = rng_for(seed, "turned")
-    moments, axis, angle_rad = rng.normal(size=(20, 3)), rng.normal(size=(20, 3)), rng.uniform(-3, 3, 20)
-    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
-    truth = Rotation.from_rotvec(axis * angle_rad[:, None]).apply(moments)
-    np.testing.assert_allclose(turned(moments, axis, angle_rad), truth, atol=1e-13)
 
 
 @pytest.mark.parametrize("place", [0.0, np.nan])
