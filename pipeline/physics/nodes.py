@@ -7,14 +7,29 @@ midpoint layers cost up to 74 % of dB (PHYSICS 0). Refuses to know magnets, mome
 from dataclasses import dataclass
 from itertools import pairwise
 from math import ceil
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
+from pydantic import Field
+from scipy.constants import milli
 
 from pipeline.errors import ParamsError, complain
+from pipeline.strict import Strict
 
 SKIN_SIDE_M = 20e-3  # authors' CAD
 SEAMS_M = (-6.35e-3, 0.0, 6.35e-3)  # of the 4x4 array of 0.25 in cubes that magnetises the skin
+
+
+class Rule(Strict):
+    """A rule of quadrature as a scene writes it: the nearer the chips, the finer it must be (question runtime)."""
+
+    cell_mm: Annotated[float, Field(gt=0, le=20)]
+    layers_n: Annotated[int, Field(ge=1, le=100)]
+
+    def quadrature(self) -> "Quadrature":
+        """Give it in SI."""
+        return Quadrature(self.cell_mm * milli, self.layers_n)
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ A skin is drawn from a generator that bears its name: skin 7 stays the same when
 Refuses to know chips' electronics, protocols and labels: pokes come as true places in the board's frame.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -13,12 +14,14 @@ from pydantic import Field
 from scipy.constants import kilo, milli
 
 from pipeline.errors import ParamsError, complain
-from pipeline.physics import dipole, flow, layer, magnet
+from pipeline.physics import dipole, flow_map, layer, magnet
 from pipeline.physics.board import Board, Spreads
-from pipeline.physics.change import change_of_field, turned
+from pipeline.physics.change import change_of_field
 from pipeline.physics.nodes import CHOSEN, SKIN_SIDE_M, Quadrature, place_nodes
 from pipeline.seeds import rng_for
 from pipeline.strict import Strict
+
+Dipoles = tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]  # positions in m, moments in A m^2
 
 FILLER_WAVES_N = 64  # plane waves that make up a skin's unevenness
 
@@ -27,6 +30,7 @@ class SkinDesign(Strict):
     """What all skins of a scene have in common, the tip that pokes them included."""
 
     polarity: magnet.Polarity
+    base: layer.Base
     saturation_T: Annotated[float, Field(ge=0, le=1)]  # phi Br: volume fraction times remanence of the powder
     half_field_T: Annotated[float, Field(gt=0, le=10)]  # field that magnetises the powder to half of that
     thickness_mm: Annotated[float, Field(gt=0, le=20)]
@@ -46,6 +50,7 @@ class Skin:
     modulus_Pa: float
     tip_radius_m: float
     depth_zero_m: float  # added to a commanded depth
+    base: layer.Base
 
 
 def draw_skin(design: SkinDesign, spreads: Spreads, *, seed: int, name: str, rule: Quadrature = CHOSEN) -> Skin:
@@ -70,6 +75,7 @@ def draw_skin(design: SkinDesign, spreads: Spreads, *, seed: int, name: str, rul
         modulus_Pa=float(design.modulus_kPa * kilo * modulus),
         tip_radius_m=design.tip_radius_mm * milli,
         depth_zero_m=float(depth_zero_mm * milli),
+        base=design.base,
     )
 
 
@@ -82,20 +88,32 @@ def changes_of_field(
     """
     rest_T = dipole.field(skin.nodes_m, skin.moments_A_m2, board.chips_m)
     changes_T = np.zeros((len(pokes_m), *board.chips_m.shape))
+    for poke_i, before, after in moved_dipoles(skin, pokes_m):
+        changes_T[poke_i] = change_of_field(before, after, board.chips_m)
+    return rest_T, changes_T
+
+
+def moved_dipoles(skin: Skin, pokes_m: Float[np.ndarray, "n 3"]) -> Iterator[tuple[int, Dipoles, Dipoles]]:
+    """Yield index, dipoles at rest and dipoles moved, of each poke that moves some: of those within its reach alone.
+
+    What displaces them further may be applied to the last; `change_of_field` sums what they change.
+    """
     true_m = pokes_m + np.array([0.0, 0.0, skin.depth_zero_m])
     _refuse_beside(true_m, skin)
     contacts = np.flatnonzero(~(true_m[:, 2] <= 0))  # a depth that is NaN goes on, to be refused
     if not contacts.size:
-        return rest_T, changes_T
-    depths_m = tuple(np.unique(true_m[contacts, 2]).tolist())
-    table = flow.tabulate(skin.thickness_m, skin.tip_radius_m, depths_m)
+        return
+    rest = flow_map.at_rest(skin.nodes_m, skin.moments_A_m2, skin.thickness_m)
+    deepest_m = float(np.max(true_m[:, 2]))
+    table = flow_map.tabulate(skin.thickness_m, skin.tip_radius_m, deepest_m, heights=rest.heights, base=skin.base)
     for poke_i in contacts:
-        moved = flow.move(table, skin.nodes_m, true_m[poke_i])
-        before = skin.nodes_m.take(moved.i, axis=0), skin.moments_A_m2.take(moved.i, axis=0)
-        # Moments turn with the material (R m, not F m: magnetisation does not feel stretch, Danas & Reis 2024).
-        after = moved.nodes_m, turned(before[1], moved.axis, moved.angle_rad)
-        changes_T[poke_i] = change_of_field(before, after, board.chips_m)
-    return rest_T, changes_T
+        moved = flow_map.move(table, rest, true_m[poke_i])
+        yield int(poke_i), moved.before, moved.after
+
+
+def beyond_verified_n(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> int:
+    """Count the commanded depths that take this skin deeper than any published solution vouches for."""
+    return int(layer.beyond_verified(depth_m + skin.depth_zero_m, skin.thickness_m).sum())
 
 
 def forces(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
@@ -105,6 +123,7 @@ def forces(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, " 
         thickness_m=skin.thickness_m,
         tip_radius_m=skin.tip_radius_m,
         modulus_Pa=skin.modulus_Pa,
+        base=skin.base,
     )
 
 

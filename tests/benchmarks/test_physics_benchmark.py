@@ -12,12 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.constants import mu_0
+from scipy.spatial.transform import Rotation
 
 from pipeline.dataset.grid import CENTRE_MM, protocol
-from pipeline.physics import dipole, flow
+from pipeline.physics import dipole, flow_map, layer
 from pipeline.physics.board import Board, draw_board
-from pipeline.physics.change import change_of_field, turned
+from pipeline.physics.change import change_of_field
 from pipeline.physics.skin import Skin, changes_of_field, draw_skin
+from pipeline.seeds import rng_for
 from tests.physics.test_board import design as board_design
 from tests.physics.test_board import no_spread, spreads
 from tests.physics.test_skin import design
@@ -36,6 +38,11 @@ def one_pass_m() -> np.ndarray:
     return 1e-3 * np.column_stack([plan.x_mm - CENTRE_MM, plan.y_mm - CENTRE_MM, plan.depth_mm]).astype(np.float64)
 
 
+def forget_tables() -> None:
+    for cached in (flow_map.tabulate, flow_map._rung, layer.contact_of_depth):
+        cached.cache_clear()
+
+
 def best_ms(call: Callable[[], Any], repeats_n: int) -> float:
     times_s = []
     for _ in range(repeats_n):
@@ -46,9 +53,10 @@ def best_ms(call: Callable[[], Any], repeats_n: int) -> float:
 
 
 def everything_moves(one: Skin) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    axis, angle_rad = np.tile([0.6, 0.8, 0.0], (len(one.nodes_m), 1)), np.full(len(one.nodes_m), 0.1)
-    moved = one.nodes_m + 1e-4 * np.cos(1e3 * one.nodes_m), turned(one.moments_A_m2, axis, angle_rad)
-    return (one.nodes_m, one.moments_A_m2), moved
+    moments = Rotation.from_rotvec([0.06, 0.08, 0.0]).apply(one.moments_A_m2)
+    moved = one.nodes_m + 1e-4 * np.cos(1e3 * one.nodes_m), moments
+    rest = one.nodes_m, one.moments_A_m2
+    return tuple(map(np.asfortranarray, rest)), tuple(map(np.asfortranarray, moved))  # as `flow_map.move` gives them
 
 
 def core_field(dipoles: tuple[np.ndarray, np.ndarray], board: Board) -> np.ndarray:
@@ -92,13 +100,13 @@ def test_the_field_of_all_nodes_costs_less_than_magpylibs_dipoles() -> None:
 def test_an_indentation_of_one_skin_is_timed_with_and_without_its_table() -> None:
     pokes_m, one = one_pass_m(), skin("s0")
     changes_of_field(BOARD, skin("s1"), pokes_m[:1])  # compiles
-    flow.tabulate.cache_clear()
+    forget_tables()
     start_s = time.perf_counter()
     _, first_T = changes_of_field(BOARD, one, pokes_m)
     with_table_ms = 1e3 * (time.perf_counter() - start_s)
     poking_ms = best_ms(lambda: changes_of_field(BOARD, one, pokes_m), 3)
     tracemalloc.start()
-    flow.tabulate.cache_clear()
+    forget_tables()
     _, again_T = changes_of_field(BOARD, one, pokes_m)
     peak_MB = tracemalloc.get_traced_memory()[1] / 1e6
     tracemalloc.stop()
@@ -111,6 +119,7 @@ def test_an_indentation_of_one_skin_is_timed_with_and_without_its_table() -> Non
 @pytest.mark.timeout(600)
 def test_eighteen_skins_are_timed_from_their_names_on() -> None:
     pokes_m = one_pass_m()
+    forget_tables()
     start_s = time.perf_counter()
     for skin_i in range(SKINS_N):
         _, changes_T = changes_of_field(BOARD, skin(f"s{skin_i}"), pokes_m)
@@ -119,3 +128,18 @@ def test_eighteen_skins_are_timed_from_their_names_on() -> None:
     peak_MB = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(f"\n{SKINS_N} skins x {len(pokes_m)} pokes, magnets and tables included: {total_s:.1f} s,")
     print(f"  {1e3 * total_s / SKINS_N / len(pokes_m):.3f} ms an indentation; the process peaked at {peak_MB:.0f} MB")
+
+
+@pytest.mark.timeout(600)
+def test_a_papers_worth_of_pokes_each_at_its_own_place_and_depth_is_timed_on_two_skins() -> None:
+    rng = rng_for(0, "benchmark")
+    pokes_m = np.tile(one_pass_m(), (26, 1))
+    pokes_m += rng.normal(0, (0.05e-3, 0.05e-3, 0.01e-3), pokes_m.shape)
+    forget_tables()
+    start_s = time.perf_counter()
+    for skin_i in range(2):
+        changes_of_field(BOARD, skin(f"s{skin_i}"), pokes_m)
+    total_s = time.perf_counter() - start_s
+    peak_MB = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(f"\n2 skins x {len(pokes_m)} pokes: {total_s:.1f} s; {SKINS_N} would take {9 * total_s:.0f} s on one core")
+    print(f"  {500 * total_s / len(pokes_m):.3f} ms an indentation; the process peaked at {peak_MB:.0f} MB")

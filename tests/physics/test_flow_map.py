@@ -1,0 +1,127 @@
+"""The tabulated flow: following each node as truth; no poke, base, reach, and material that moves as one as laws."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.errors import ParamsError
+from pipeline.physics import flow, flow_map, layer
+
+H_M, TIP_M = 2e-3, 3e-3
+HEIGHTS = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 1.0)
+MAPS = {base: flow_map.tabulate(H_M, TIP_M, 1.2e-3, heights=HEIGHTS, base=base) for base in ("bonded", "slipping")}
+MAP = MAPS["bonded"]
+depths_m = st.floats(1e-5, 1.2e-3)
+bases = st.sampled_from(sorted(MAPS))
+
+
+def follow(r_m, z_m, to_m, base):
+    press = flow.Press(H_M, TIP_M, base)
+    return flow.follow(r_m, z_m, flow.steps((to_m,), press), press=press)[-1]
+
+
+def move(places_m, poke_m, base="bonded"):
+    places_m = np.asarray(places_m, dtype=float)
+    up = np.tile([0.0, 0.0, 1.0], (len(places_m), 1))
+    height_i = np.argmin(np.abs(places_m[:, 2:] / H_M - HEIGHTS), axis=1)
+    return flow_map.move(MAPS[base], flow_map.Rest(places_m, up, height_i, HEIGHTS), np.asarray(poke_m, dtype=float))
+
+
+def places(rng, places_n, half_m=10e-3):
+    return np.column_stack([rng.uniform(-half_m, half_m, (places_n, 2)), H_M * rng.choice(HEIGHTS, places_n)])
+
+
+@pytest.mark.parametrize("base", sorted(MAPS))
+@pytest.mark.parametrize(("depth_m", "share"), [(MAP.depth_m[4], 2e-3), (MAP.depth_m[-1], 2e-3), (0.55e-3, 0.05)])
+def test_the_table_gives_what_following_each_node_gives(depth_m, share, base):
+    # 2e-3 of the depth: between tables of R/h and places r. Between its depths 5 %: the contact's edge jumps outwards.
+    start_m = places(np.random.default_rng(0), 150) * (1, 0, 1)
+    start_m = start_m[start_m[:, 2] < H_M]  # on the surface itself the angle jumps at the contact's edge
+    moved = move(start_m, (0, 0, depth_m), base)
+    at = follow(np.abs(start_m[:, 0]), start_m[:, 2], depth_m, base)
+    sign = np.sign(start_m[:, 0])
+    np.testing.assert_allclose(moved.after[0][:, 0], sign * at.r_m, atol=share * depth_m)
+    np.testing.assert_allclose(moved.after[0][:, 2], at.z_m, atol=share * depth_m)
+    if share < 0.01:
+        np.testing.assert_allclose(moved.after[1][:, 0], sign * np.sin(flow.angle(at.f)), atol=3e-3)
+
+
+@given(st.floats(-8e-3, 8e-3), st.floats(-8e-3, 8e-3), depths_m, bases)
+def test_each_node_moves_and_leans_in_its_plane_through_the_axis(x_m, y_m, depth_m, base):
+    moved = move(places(np.random.default_rng(1), 60), (x_m, y_m, depth_m), base)
+    away_m = moved.before[0][:, :2] - (x_m, y_m)
+    for part in ((moved.after[0] - moved.before[0]), 1e-3 * moved.after[1]):
+        np.testing.assert_allclose(away_m[:, 0] * part[:, 1] - away_m[:, 1] * part[:, 0], 0, atol=1e-17)
+    np.testing.assert_allclose(np.linalg.norm(moved.after[1], axis=1), 1)
+
+
+@pytest.mark.parametrize("base", sorted(MAPS))
+@pytest.mark.parametrize("depth_m", [0.0, -0.3e-3])
+def test_without_contact_no_node_moves(depth_m, base):
+    assert move(places(np.random.default_rng(2), 100), (1e-3, 1e-3, depth_m), base).i.size == 0
+
+
+@given(depths_m)
+def test_a_bonded_base_stays_where_it_is_to_the_last_bit(depth_m):
+    base_m = np.column_stack([np.linspace(0, 10e-3, 200), np.zeros(200), np.zeros(200)])
+    np.testing.assert_array_equal(move(base_m, (0, 0, depth_m)).after[0], base_m)
+
+
+@settings(max_examples=25)
+@given(depths_m, depths_m, bases)
+def test_deeper_pokes_press_the_material_under_the_tip_deeper(first_m, second_m, base):
+    shallow_m, deep_m = sorted((first_m, second_m))
+    column_m = np.column_stack([np.zeros((7, 2)), H_M * np.array(HEIGHTS[1:])])
+    shallow, deep = (move(column_m, (0, 0, depth), base).after[0][:, 2] for depth in (shallow_m, deep_m))
+    assert (deep <= shallow + 1e-12).all()
+    assert (np.diff(deep) > 0).all()  # what lay above stays above
+
+
+def test_what_lies_past_the_reach_does_not_move_and_would_hardly():
+    radius_m = layer.contact_of_depth(1.2e-3, thickness_m=H_M, tip_radius_m=TIP_M, base="bonded").radius_m
+    assert MAP.reach_m == pytest.approx(radius_m + 5 * H_M, rel=0.01)
+    assert move([[1.001 * MAP.reach_m, 0, 1e-3]], (0, 0, 1.2e-3)).i.size == 0
+    assert np.abs(MAP.moved[-1, :, -1, :2]).max() * H_M < 0.015 * 1.2e-3
+
+
+@given(depths_m)
+def test_past_its_reach_a_sliding_skin_moves_outward_as_one_and_loses_nothing(depth_m):
+    r_m = np.repeat(MAPS["slipping"].reach_m * np.array([0.999, 1.001, 1.5, 2.2]), len(HEIGHTS))
+    rest_m = np.column_stack([r_m, np.zeros_like(r_m), H_M * np.tile(HEIGHTS, 4)])
+    moved = move(rest_m, (0, 0, depth_m), "slipping")
+    assert moved.i.size == r_m.size
+    grown_m2 = moved.after[0][:, 0] ** 2 - r_m**2
+    np.testing.assert_allclose(grown_m2, grown_m2[-1], rtol=0.01)  # the edge of the table joins: exp(-5 pi), and sums
+    past = slice(len(HEIGHTS), None)
+    np.testing.assert_array_equal(moved.after[0][past, 1:], rest_m[past, 1:])
+    np.testing.assert_array_equal(moved.after[1][past], moved.before[1][past])
+
+
+@given(depths_m)
+def test_a_sliding_base_keeps_its_height_and_moves_outward(depth_m):
+    base_m = np.column_stack([np.linspace(0.1e-3, 15e-3, 100), np.zeros(100), np.zeros(100)])
+    after_m = move(base_m, (0, 0, depth_m), "slipping").after[0]
+    assert not after_m[:, 2].any()
+    assert (after_m[:, 0] > base_m[:, 0]).all()
+
+
+def test_a_thin_skin_flows_too():
+    thin = flow_map.tabulate(0.2e-3, TIP_M, 0.058e-3, heights=(0.5, 1.0), base="bonded")
+    assert flow_map.at_depth(thin, 0.058e-3)[-1, 0, 1] * 0.2e-3 == pytest.approx(-0.058e-3, rel=0.02)
+    with pytest.raises(ParamsError, match="depth must be such that"):
+        flow_map.tabulate(0.2e-3, TIP_M, 0.12e-3, heights=(0.5, 1.0), base="bonded")
+
+
+@pytest.mark.parametrize(
+    ("thickness_m", "depth_m"), [(0.0, 1e-3), (np.nan, 1e-3), (H_M, H_M), (H_M, 1.95e-3), (H_M, np.nan), (H_M, -1e-3)]
+)
+def test_impossible_layers_and_pokes_are_refused(thickness_m, depth_m):
+    with pytest.raises(ParamsError, match="must be"):
+        flow_map.tabulate(thickness_m, TIP_M, depth_m, heights=(0.5,), base="bonded")
+
+
+@pytest.mark.parametrize("depth_m", [1.3e-3, np.nan, np.inf, -np.inf])
+def test_pokes_deeper_than_the_table_or_of_no_depth_at_all_are_refused(depth_m):
+    with pytest.raises(ParamsError, match="depth must be"):
+        move(np.zeros((1, 3)), (0, 0, depth_m))
