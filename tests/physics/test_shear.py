@@ -1,0 +1,451 @@
+"""Shear under a dragged tip: 50 digits, a boundary value problem, Mindlin, Johnson, thin layers as truth; laws."""
+
+import mpmath
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import quad, solve_bvp
+from scipy.linalg import polar
+from scipy.special import jv
+
+from pipeline.errors import ParamsError
+from pipeline.physics import layer, shear
+from pipeline.physics.shear import Traction
+
+H_M, TIP_M, YOUNG_PA = 2e-3, 3e-3, 190e3
+SKIN = {"thickness_m": H_M, "tip_radius_m": TIP_M, "base": "bonded"}
+ROUNDING = 1e-12
+DEPTHS_M = np.arange(1, 7) * 0.2e-3
+forces_N = st.tuples(st.floats(-3, 3), st.floats(-3, 3)).map(np.array)
+
+
+def of_shape(chi, radius_m):
+    """A traction whose transform is the integral of chi(x / a) cos(k x)."""
+    weights = layer.CONTACT_W * chi(layer.CONTACT_X)
+    return Traction(radius_m, radius_m * layer.CONTACT_X, weights / weights.sum())
+
+
+def hertzian(radius_m=1.5e-3):
+    """q = 3 Q / (2 pi a^2) sqrt(1 - r^2 / a^2), whose transform is 3 (sin ka - ka cos ka) / (ka)^3."""
+    return of_shape(lambda x: 1 - x**2, radius_m)
+
+
+def sliding(depth_m=0.6e-3):
+    return shear.slip(layer.contact_of_depth(depth_m, **SKIN))
+
+
+def displacement_m(traction, places_m, thickness_m=H_M):
+    """The displacement as `ShearMap` says in words, per Q / G along x, without a table."""
+    found = []
+    for x, y, z in np.atleast_2d(places_m):
+        r, f = np.hypot(x, y), np.arctan2(y, x)
+        a, b, c = shear.parts_at(traction, np.array([r]), np.array([z]), thickness_m=thickness_m)[0, 0, :3]
+        found.append([a + b * np.cos(2 * f), b * np.sin(2 * f), c * np.cos(f)])
+    return np.array(found)
+
+
+def gradients(traction, places_m, step_m=2e-6):
+    """u_i,j by central differences; the field's shortest wave is 0.3 mm long, so they are good to 3e-4 of it."""
+    steps = step_m * np.eye(3)
+    pairs = [(displacement_m(traction, places_m + e) - displacement_m(traction, places_m - e)) for e in steps]
+    return np.stack(pairs, axis=-1) / (2 * step_m)
+
+
+def some_places_m(places_n=40, top=0.95):
+    rng = np.random.default_rng(5)
+    r_m, f = 4e-3 * np.sqrt(rng.uniform(0, 1, places_n)), rng.uniform(0, 2 * np.pi, places_n)
+    return np.stack([r_m * np.cos(f), r_m * np.sin(f), H_M * rng.uniform(0.05, top, places_n)], axis=1)
+
+
+def moved(force_N, nodes_m, of=None, centre_m=(0.3e-3, -0.2e-3), modulus_Pa=YOUNG_PA, by=shear.shear):
+    of = shear.tabulate_depth(0.6e-3, **SKIN) if of is None else of
+    force_N, centre_m = np.asarray(force_N, dtype=float), np.asarray(centre_m, dtype=float)
+    return by(of, nodes_m, centre_m, force_N=force_N, modulus_Pa=modulus_Pa)
+
+
+@given(st.floats(0.01, 200), st.floats(0, 1))
+def test_the_response_to_a_wave_is_that_of_50_digits(kh, share):
+    with mpmath.workdps(250):
+        a, z = mpmath.mpf(kh), mpmath.mpf(kh * share)
+        size = mpmath.cosh(a) ** 2 + a**2
+
+        def w(x):
+            return (a * x * mpmath.cosh(a - x) - (a - x) * mpmath.cosh(a) * mpmath.sinh(x)) / size
+
+        second = mpmath.diff(w, z, 2)
+        truth = [
+            w(z),
+            mpmath.diff(w, z),
+            second - w(z),
+            mpmath.sinh(z) / mpmath.cosh(a),
+            mpmath.cosh(z) / mpmath.cosh(a),
+        ]
+    found = shear.response(np.array([[kh * share]]), np.array([kh]))
+    found = [found.w, found.w_slope, found.w_spin, found.v, found.v_slope]
+    # relative to tractions of 1; kz carries a rounding of 1e-16 kh into the exponents
+    np.testing.assert_allclose([part[0, 0] for part in found], [float(part) for part in truth], atol=1e-13)
+
+
+@pytest.mark.parametrize("kh", [0.05, 0.5, 1.5, 4.0, 12.0])
+def test_the_response_solves_elasticity_as_a_boundary_value_problem(kh):
+    """Equilibrium and Hooke's law at k = G = 1: in the wave's plane two u and two stresses, across one each."""
+
+    def slopes(_z, at):
+        along, up, shearing, normal, across, across_stress = at
+        return np.stack([shearing - up, along, normal + 4 * along, -shearing, across_stress, across])
+
+    def ends(base, top):
+        return np.array([base[0], base[1], base[4], top[2] - 1, top[3], top[5] - 1])
+
+    z = np.linspace(0, kh, 60)
+    truth = solve_bvp(slopes, ends, z, np.zeros((6, 60)), tol=1e-8, max_nodes=20_000)
+    assert truth.success
+    along, up, shearing, _, across, across_stress = truth.sol(z)
+    found = shear.response(z[:, None], np.array([kh]))
+    parts = {
+        "w": 2 * up,
+        "w_slope": 2 * along,
+        "w_spin": 2 * (shearing - 2 * up),
+        "v": across,
+        "v_slope": across_stress,
+    }
+    for name, values in parts.items():
+        np.testing.assert_allclose(getattr(found, name)[:, 0], values, atol=1e-6, err_msg=name)  # 100 x tol
+
+
+def test_the_base_is_held_and_the_top_feels_the_traction_alone_however_short_the_wave():
+    kh = np.geomspace(1e-3, 500, 40)
+    base, top = shear.response(np.zeros((1, 40)), kh), shear.response(kh[None], kh)
+    np.testing.assert_allclose([base.w, base.w_slope, base.v], 0, atol=1e-15)
+    np.testing.assert_allclose(top.w_spin + 2 * top.w, 2, atol=1e-12)  # w'' + w = 2: stress T
+    np.testing.assert_allclose(top.v_slope, 1, atol=1e-14)
+
+
+def test_what_a_traction_lifts_is_what_a_pressure_moves_aside():
+    """Betti: work of either load on the other's displacement; `layer` solves the other load."""
+    kh = np.geomspace(1e-3, 100, 60)
+    _, aside, _ = layer.depth_profile(kh[None], kh)
+    np.testing.assert_allclose(shear.response(kh[None], kh).w, aside, atol=1e-14)
+
+
+@pytest.mark.parametrize("radius_m", [0.6e-3, 1.5e-3])
+def test_the_surface_moves_as_johnson_has_it_on_a_half_space_less_what_the_base_holds(radius_m):
+    traction, r_m = hertzian(radius_m), np.linspace(0, radius_m, 12)
+    found = shear.parts_at(traction, r_m, np.array([H_M]), thickness_m=H_M)[:, 0, :2].T
+    # Johnson 1985, 3.91 at nu = 1/2: u_x = pi q0 / 32 G a (6 a^2 - 2.5 x^2 - 3.5 y^2), u_y = pi q0 / 32 G a x y
+    free = 3 / (64 * radius_m**3) * np.stack([6 * radius_m**2 - 3 * r_m**2, r_m**2 / 2])
+
+    def held(k, r, order):
+        ka, kh = k * radius_m, k * H_M
+        slope, across = (kh + np.sinh(kh) * np.cosh(kh)) / (np.cosh(kh) ** 2 + kh**2), np.tanh(kh)
+        missing = 3 - 2 * across - slope if order == 0 else 1 - 2 * across + slope
+        return 3 * (np.sin(ka) - ka * np.cos(ka)) / ka**3 * missing * jv(order, k * r) / (8 * np.pi)
+
+    base = [[quad(held, 1e-3, 25 / H_M, args=(r, order), limit=200)[0] for r in r_m] for order in (0, 2)]
+    # 1 % of the middle: the table's waves end at 0.3 mm
+    np.testing.assert_allclose(found, free - np.array(base), atol=0.01 * found[0, 0])
+
+
+def test_the_surface_under_the_tip_carries_the_traction_and_no_other_shear():
+    traction, step_m = hertzian(), 4e-6
+    r_m, f = np.linspace(0, 0.9, 10) * traction.radius_m, np.linspace(0, 3, 10)
+    places_m = np.stack([r_m * np.cos(f), r_m * np.sin(f), np.full(10, H_M)], axis=1)
+    top, below, deeper = (displacement_m(traction, places_m - [0, 0, n * step_m]) for n in range(3))
+    along_z = (3 * top - 4 * below + deeper) / (2 * step_m)
+    slope = [
+        (displacement_m(traction, places_m + e) - displacement_m(traction, places_m - e))[:, 2] / (2 * step_m)
+        for e in step_m * np.eye(3)[:2]
+    ]
+    q_per_m2 = 1.5 / np.pi / traction.radius_m**2 * np.sqrt(1 - (r_m / traction.radius_m) ** 2)
+    # 2 % of the peak: no waves shorter than 0.3 mm
+    np.testing.assert_allclose(along_z[:, 0] + slope[0], q_per_m2, atol=0.02 * q_per_m2[0])
+    np.testing.assert_allclose(along_z[:, 1] + slope[1], 0, atol=0.02 * q_per_m2[0])
+
+
+@pytest.mark.parametrize("traction", [sliding(), shear.stick(2e-3, H_M)])
+def test_every_level_of_the_layer_carries_the_whole_force(traction):
+    r_m, step_m = np.linspace(0, 12 * H_M, 1500), 1e-6
+    for z_m in (0.0, 0.4 * H_M, 0.8 * H_M):
+        z = np.array([z_m, z_m + step_m, z_m + 2 * step_m])
+        along = shear.parts_at(traction, r_m, z, thickness_m=H_M)[..., 0]
+        slope = (-3 * along[:, 0] + 4 * along[:, 1] - along[:, 2]) / (2 * step_m)
+        # u_x,z; u_z,x adds up to nothing. 12 h away shear has died down to exp(-0.74 * 12), times the area there
+        assert np.trapezoid(2 * np.pi * r_m * slope, r_m) == pytest.approx(1, abs=1e-3)
+
+
+def test_volume_is_kept_and_the_turning_is_half_the_curl():
+    traction, places_m = sliding(), some_places_m()
+    grad = gradients(traction, places_m)
+    size = np.abs(grad).max()
+    np.testing.assert_allclose(np.trace(grad, axis1=1, axis2=2), 0, atol=1e-5 * size)  # of differences
+    truth = np.stack(
+        [grad[:, 2, 1] - grad[:, 1, 2], grad[:, 0, 2] - grad[:, 2, 0], grad[:, 1, 0] - grad[:, 0, 1]], axis=1
+    )
+    of = shear.tabulate(traction, H_M)
+    found = moved([YOUNG_PA / 3, 0], places_m, of, centre_m=(0, 0)).half_curl
+    np.testing.assert_allclose(found, truth / 2, atol=2e-3 * size)  # and of the table
+
+
+@pytest.mark.parametrize("force", [(1.0, 0.0), (-0.6, 0.8)])
+def test_the_table_gives_the_field_it_was_made_of(force):
+    traction, places_m = sliding(), some_places_m(top=1.0)
+    found = moved(np.array(force) * YOUNG_PA / 3, places_m, shear.tabulate(traction, H_M), centre_m=(0, 0))
+    turn = np.array([[force[0], -force[1], 0], [force[1], force[0], 0], [0, 0, 1]])
+    truth_m = displacement_m(traction, places_m @ turn) @ turn.T
+    np.testing.assert_allclose(found.displacement_m, truth_m, atol=1e-3 * np.abs(truth_m).max())  # steps of 25 um
+
+
+def test_on_a_thick_layer_a_tip_that_sticks_is_as_stiff_as_mindlins():
+    for radius_m in (1e-3, 2.2e-3):
+        found_m = shear.stiffness_m(shear.stick(radius_m, 100.0), 100.0)
+        assert found_m == pytest.approx(16 / 3 * radius_m, rel=1e-4)  # a / h = 2e-5; 8 G a / (2 - nu)
+
+
+def test_on_a_thick_layer_hertzs_shape_is_a_sixth_softer():
+    # mean of 6 a^2 - 3 r^2 over q ~ sqrt(a^2 - r^2) is 24/5 a^2: u = pi q0 a / 32 G * 24/5 = 9 Q / 40 G a
+    assert shear.stiffness_m(hertzian(), 100.0) == pytest.approx(40 / 9 * 1.5e-3, rel=1e-4)
+    contact = layer.contact_of_radius(0.05e-3, thickness_m=100.0, tip_radius_m=3e-3, base="bonded")
+    assert shear.stiffness_m(shear.slip(contact), 100.0) == pytest.approx(40 / 9 * 0.05e-3, rel=1e-3)  # (a / R)^2
+
+
+def test_a_thin_layer_shears_like_a_block_with_a_seam_round_it():
+    wide_m = np.array([4.0, 5.0, 6.0]) * H_M
+    blocks_m = np.sqrt([H_M / np.pi * shear.stiffness_m(shear.stick(a_m, H_M), H_M) for a_m in wide_m])
+    # k_t = pi G (a + seam)^2 / h with one seam for all radii, up to (h / a)^2
+    np.testing.assert_allclose(np.diff(blocks_m), H_M, rtol=5e-3)
+    seam = (blocks_m - wide_m) / H_M
+    assert ((seam > 0.5) & (seam < 1)).all()
+    middle_m = shear.parts_at(shear.stick(3 * H_M, H_M), np.array([0.0]), np.linspace(0, H_M, 9), thickness_m=H_M)[
+        0, :, 0
+    ]
+    np.testing.assert_allclose(middle_m / middle_m[-1], np.linspace(0, 1, 9), atol=0.01)  # u = q z / G, edges 3 h away
+
+
+def test_a_tip_that_sticks_moves_its_contact_as_one():
+    for a_h in (0.5, 1.0, 2.0):
+        traction = shear.stick(a_h * H_M, H_M)
+        parts = shear.parts_at(traction, np.linspace(0, 0.8, 9) * a_h * H_M, np.array([H_M]), thickness_m=H_M)[
+            :, 0, :2
+        ].T
+        mean_per_m = 1 / shear.stiffness_m(traction, H_M)
+        np.testing.assert_allclose(parts[0], mean_per_m, rtol=0.03)  # an edge of endless traction, cut at 0.3 mm
+        assert np.abs(parts[1]).max() < 0.05 * mean_per_m  # what the shape, the same all round, cannot do
+
+
+@given(st.floats(0.05, 3), st.floats(-0.9, 5), st.floats(-0.9, 5))
+def test_no_other_traction_is_as_stiff_as_sticking(a_h, square, fourth):
+    """Thomson: of all tractions with one sum, that of the rigid motion stores the least work."""
+    other = of_shape(lambda x: 1 + square * x**2 + (1 + square) * fourth * x**4, a_h * H_M)
+    best = shear.stiffness_m(shear.stick(a_h * H_M, H_M), H_M)
+    assert 0 < shear.stiffness_m(other, H_M) <= best * (1 + ROUNDING)
+
+
+def test_the_specifications_sum_of_limits_is_up_to_5_percent_too_stiff_for_sticking():
+    a_m = np.geomspace(0.01, 6, 40) * H_M
+    ratio = [shear.stiffness_m(shear.stick(a, H_M), H_M) for a in a_m] / (16 / 3 * a_m + np.pi * a_m**2 / H_M)
+    # PHYSICS 4; right at both ends. Sticking that is the same all round is at most as stiff as the true one.
+    assert ratio.max() < 1
+    assert ratio.min() == pytest.approx(0.955, abs=0.005)
+
+
+def test_sliding_is_19_to_20_percent_softer_than_sticking_on_the_skin():
+    tractions = [sliding(float(depth_m)) for depth_m in DEPTHS_M]
+    ratio = [shear.stiffness_m(t, H_M) / shear.stiffness_m(shear.stick(t.radius_m, H_M), H_M) for t in tractions]
+    np.testing.assert_allclose(ratio, 0.803, atol=0.008)
+
+
+@given(forces_N, forces_N, st.floats(-3, 3))
+def test_the_skin_answers_in_proportion_and_sums(one_N, other_N, times):
+    nodes_m = some_places_m(30)
+    both = moved(one_N + times * other_N, nodes_m)
+    first, second = moved(one_N, nodes_m), moved(other_N, nodes_m)
+    for name in ("displacement_m", "half_curl"):
+        parts = getattr(first, name) + times * getattr(second, name)
+        np.testing.assert_allclose(getattr(both, name), parts, atol=ROUNDING)
+
+
+@given(forces_N, st.floats(-np.pi, np.pi))
+def test_turning_force_and_nodes_turns_everything(force_N, angle_rad):
+    nodes_m, (c, s) = some_places_m(30), (np.cos(angle_rad), np.sin(angle_rad))
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    still, turned = (
+        moved(force_N, nodes_m, centre_m=(0, 0)),
+        moved(turn[:2, :2] @ force_N, nodes_m @ turn.T, centre_m=(0, 0)),
+    )
+    # a node at the edge of a cell of the table may fall into the next, where it has the same value
+    np.testing.assert_allclose(turned.displacement_m, still.displacement_m @ turn.T, atol=1e-10)
+    np.testing.assert_allclose(turned.half_curl, still.half_curl @ turn.T, atol=1e-9)
+
+
+def test_a_mirror_along_the_force_shows_the_same_skin():
+    nodes_m, mirror = some_places_m(), np.array([1, -1, 1])
+    here, there = moved([0.5, 0], nodes_m, centre_m=(0, 0)), moved([0.5, 0], nodes_m * mirror, centre_m=(0, 0))
+    np.testing.assert_allclose(there.displacement_m, here.displacement_m * mirror, atol=1e-18)
+    np.testing.assert_allclose(there.half_curl, -here.half_curl * mirror, atol=1e-15)  # an axial vector
+    back = moved([-0.5, 0], nodes_m * [-1, 1, 1], centre_m=(0, 0))
+    np.testing.assert_allclose(back.displacement_m, here.displacement_m * [-1, 1, 1], atol=1e-18)
+
+
+def test_the_skin_follows_the_tip_and_leans_forward():
+    middle = moved([0.5, 0], np.array([[0.3e-3, -0.2e-3, H_M], [0.3e-3, -0.2e-3, H_M / 2]]))
+    assert (middle.displacement_m[:, 0] > 0).all()
+    assert not middle.displacement_m[:, 1:].any()
+    assert (middle.half_curl[:, 1] > 0).all()  # from z towards x
+    assert not middle.half_curl[:, [0, 2]].any()
+
+
+def test_nothing_moves_on_the_base_or_out_of_reach():
+    base = moved([0.5, 0.3], some_places_m() * [1, 1, 0])
+    assert not base.displacement_m.any()
+    assert base.half_curl.any()  # the material on the base shears, and so turns
+    away = moved([0.5, 0.3], np.array([[0.0, 12.5e-3, 1e-3], [-30e-3, 0.0, 2e-3]]))
+    assert not away.displacement_m.any()
+    assert not away.half_curl.any()
+
+
+def test_the_reach_leaves_out_displacements_below_half_a_percent():
+    for depth_m in DEPTHS_M:
+        of = shear.tabulate_depth(float(depth_m), **SKIN)
+        assert np.abs(of.parts[-1, :, :3]).max() < 0.005 * of.parts[..., 0].max()
+
+
+@settings(max_examples=10, deadline=None)  # a table takes 20 ms
+@given(st.floats(0.1, 10), st.floats(0.1, 10))
+def test_size_and_stiffness_scale_away(size, hardness):
+    nodes_m = some_places_m(30)
+    large = shear.tabulate_depth(size * 0.6e-3, thickness_m=size * H_M, tip_radius_m=size * TIP_M, base="bonded")
+    here = moved([0.5, 0.2], nodes_m, centre_m=(0, 0))
+    there = moved(
+        [0.5 * hardness * size**2, 0.2 * hardness * size**2],
+        size * nodes_m,
+        large,
+        (0, 0),
+        modulus_Pa=hardness * YOUNG_PA,
+    )
+    np.testing.assert_allclose(there.displacement_m, size * here.displacement_m, atol=1e-9 * size * 1e-3)
+    np.testing.assert_allclose(there.half_curl, here.half_curl, atol=1e-9)
+
+
+# the square of less than 1e-150 loses digits
+@given(st.floats(-20, 20).filter(lambda amount: amount == 0 or abs(amount) > 1e-150), st.floats(-np.pi, np.pi))
+def test_in_simple_shear_the_turning_is_the_one_of_the_polar_decomposition(amount, towards_rad):
+    ahead = np.array([np.cos(towards_rad), np.sin(towards_rad), 0.0])
+    truth, _ = polar(np.eye(3) + amount * np.outer(ahead, [0, 0, 1]))
+    half_curl = amount / 2 * np.array([[-ahead[1], ahead[0], 0]])
+    angle_rad, axis = shear.angle_and_axis(half_curl)
+    x, y, z = axis[0]
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    found = np.eye(3) + np.sin(angle_rad) * cross + (1 - np.cos(angle_rad)) * cross @ cross
+    np.testing.assert_allclose(found, truth, atol=1e-13)
+    assert np.linalg.norm(axis) == pytest.approx(1)
+
+
+def test_the_table_moves_the_traction_by_force_over_stiffness():
+    traction = hertzian()
+    of, r_m = shear.tabulate(traction, H_M), np.linspace(0, 1, 2000) * traction.radius_m
+    surface_per_m = np.interp(r_m, of.r_m, of.parts[:, -1, 0])
+    q_per_m2 = 1.5 / np.pi / traction.radius_m**2 * np.sqrt(1 - (r_m / traction.radius_m) ** 2)
+    mean_per_m = np.trapezoid(2 * np.pi * r_m * q_per_m2 * surface_per_m, r_m)
+    assert mean_per_m == pytest.approx(1 / of.stiffness_m, rel=1e-3)  # waves that end at 0.3 mm
+
+
+def followed(force_N, nodes_m, of, steps_n):
+    """The force in many small steps, each where nodes and traction are by then; the centre rests at 0."""
+    at_m, ahead_m = nodes_m, np.array(force_N) * 3 / YOUNG_PA / of.stiffness_m
+    for step_i in range(steps_n):
+        centre_m = ahead_m * (step_i + 0.5) / steps_n
+        half_m = at_m + moved(np.array(force_N) / steps_n, at_m, of, centre_m).displacement_m / 2
+        at_m = at_m + moved(np.array(force_N) / steps_n, half_m, of, centre_m).displacement_m
+    return at_m - nodes_m
+
+
+def test_midpoint_steps_go_where_many_small_steps_go():
+    nodes_m, over = [0.5, 0.5, 1] * some_places_m(200), []
+    for depth_m, force_N in ((0.6e-3, 0.59), (0.6e-3, 0.59 / 2), (1.2e-3, 2.40)):  # mu = 0.8, 0.4, 0.8; 1, 1, 2 steps
+        of = shear.tabulate_depth(depth_m, **SKIN)
+        truth_m = followed([force_N, 0], nodes_m, of, 48)
+        found_m, one_shot_m = (
+            moved([force_N, 0], nodes_m, of, (0, 0), by=by).displacement_m for by in (shear.carry, shear.shear)
+        )
+        over.append(np.abs(found_m - truth_m).max() / np.abs(truth_m).max())
+        assert over[-1] < np.abs(one_shot_m - truth_m).max() / np.abs(truth_m).max() / 5
+    assert over[0] < 0.02
+    assert over[2] < 0.05
+    assert over[1] < over[0] / 3  # second order: 4, and the table's corners
+
+
+def test_a_small_force_needs_no_midpoint():
+    nodes_m = some_places_m()
+    once, half_way = (moved([3e-5, -4e-5], nodes_m, by=by) for by in (shear.shear, shear.carry))
+    size_m = np.abs(once.displacement_m).max()
+    # half of 0.1 um beside a field that changes over 1 mm
+    np.testing.assert_allclose(half_way.displacement_m, once.displacement_m, atol=2e-4 * size_m)
+
+
+def test_carrying_turns_with_the_force_and_leaves_the_base_alone():
+    nodes_m, turn = some_places_m(), np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1]])
+    here = moved([0.5, 0], nodes_m, centre_m=(0, 0), by=shear.carry)
+    there = moved([0.3, 0.4], nodes_m @ turn.T, centre_m=(0, 0), by=shear.carry)
+    np.testing.assert_allclose(there.displacement_m, here.displacement_m @ turn.T, atol=1e-15)
+    np.testing.assert_allclose(there.half_curl, here.half_curl @ turn.T, atol=1e-12)
+    assert not moved([0.5, 0.3], nodes_m * [1, 1, 0], by=shear.carry).displacement_m.any()
+
+
+@pytest.mark.parametrize("traction", [sliding(), shear.stick(1.2 * H_M, H_M)])
+def test_the_table_knows_its_steepest_place(traction):
+    of, force_N = shear.tabulate(traction, H_M), np.array([YOUNG_PA / 3, 0.0])
+    r_m, f = (part.ravel() for part in np.meshgrid(of.r_m[:200], np.linspace(0, np.pi, 13)))
+    places_m = np.stack([r_m * np.cos(f), r_m * np.sin(f), np.full_like(r_m, H_M)], axis=1)
+    largest = np.linalg.norm(moved(force_N, places_m, of, (0, 0)).half_curl, axis=1).max()
+    assert of.steepest_per_m2 == pytest.approx(largest, rel=1e-6)  # rounding of places: beside one of the table's
+
+
+def test_a_rim_above_the_thickness_moves_as_the_surface():
+    rim_m = np.array([[2e-3, 1e-3, 1.1 * H_M], [2e-3, 1e-3, H_M]])
+    rim, surface = moved([0.5, 0.2], rim_m).displacement_m
+    np.testing.assert_array_equal(rim, surface)
+
+
+@pytest.mark.parametrize(
+    ("depth_m", "force_N", "loss"), [(0.6e-3, 0.5, 0.03), (0.6e-3, 0.59, 0.05), (0.8e-3, 1.0, 0.08)]
+)
+def test_midpoint_steps_keep_volume_where_one_linear_step_loses_several_times_as_much(depth_m, force_N, loss):
+    of, step_m = shear.tabulate_depth(depth_m, **SKIN), 20e-6
+    sides_m = np.linspace(-3.5e-3, 3.5e-3, 36), np.linspace(0, 2.5e-3, 8), np.linspace(0.05, 0.95, 10) * H_M
+    places_m = np.stack(np.meshgrid(*sides_m), axis=-1).reshape(-1, 3)
+    losses = []
+    for by in (shear.shear, shear.carry):
+        ends = [
+            [moved([force_N, 0], places_m + sign * e, of, (0, 0), by=by).displacement_m for e in step_m * np.eye(3)]
+            for sign in (1, -1)
+        ]
+        grad = np.moveaxis(np.array(ends[0]) - np.array(ends[1]), 0, -1) / (2 * step_m)
+        losses.append(np.abs(np.linalg.det(np.eye(3) + grad) - 1))
+    assert losses[1].max() < loss  # the larger, the steeper; a step of the midpoint rule is good to second order
+    assert losses[0].max() > 4 * losses[1].max()
+    assert losses[0].mean() > 4 * losses[1].mean()
+
+
+@pytest.mark.parametrize(
+    ("what", "of"),
+    [
+        ("depth", lambda: shear.tabulate_depth(0.0, **SKIN)),
+        ("depth", lambda: shear.tabulate_depth(np.nan, **SKIN)),
+        ("depth", lambda: shear.tabulate_depth(2e-3, **SKIN)),
+        ("thickness", lambda: shear.tabulate_depth(1e-3, thickness_m=0.0, tip_radius_m=3e-3, base="bonded")),
+        ("contact radius", lambda: shear.tabulate(hertzian(6.1e-3), H_M)),
+        ("contact radius", lambda: shear.tabulate(hertzian(), np.inf)),
+        ("modulus", lambda: moved([1, 0], np.zeros((1, 3)), modulus_Pa=0.0)),
+        ("modulus", lambda: moved([1, 0], np.zeros((1, 3)), modulus_Pa=np.nan)),
+        ("height of nodes", lambda: moved([1, 0], np.array([[0.0, 0.0, 2.41e-3]]))),
+        ("height of nodes", lambda: moved([1, 0], np.array([[0.0, 0.0, -1e-6]]))),
+        ("height of nodes", lambda: moved([1, 0], np.array([[0.0, 0.0, np.nan]]))),
+        ("half of the curl", lambda: moved([3, 0], some_places_m(), by=shear.carry)),
+        ("half of the curl", lambda: moved([0, np.nan], some_places_m(), by=shear.carry)),
+        ("modulus", lambda: moved([1, 0], np.zeros((1, 3)), modulus_Pa=0.0, by=shear.carry)),
+    ],
+)
+def test_impossible_drags_are_refused(what, of):
+    with pytest.raises(ParamsError, match=f"{what} must be"):
+        of()
