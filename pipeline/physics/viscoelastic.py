@@ -5,11 +5,14 @@ Refuses to know where the elastic force comes from.
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
+from pydantic import Field
 
 from pipeline.errors import ParamsError, complain
+from pipeline.strict import Strict
 
 
 @dataclass(frozen=True)
@@ -30,6 +33,19 @@ class Prony:
 
 
 SKIN = Prony(tau_s=np.array([1e-3, 1e-1, 1e1, 1e3, 1e4]), share=np.array([0.05, 0.05, 0.05, 0.03, 0.02]))  # assumed
+
+
+class Relaxation(Strict):
+    """How long a real indentation takes, frames or not: the tip goes down evenly, then holds; a rested skin."""
+
+    approach_s: Annotated[float, Field(ge=0, le=100)]
+    hold_s: Annotated[float, Field(ge=0, le=100)]  # until the middle of the readings
+
+
+def force_left(how: Relaxation, prony: Prony = SKIN) -> float:
+    """Give the force when an indentation is read, over that of a skin without memory."""
+    elastic = np.array([0.0, 1.0, 1.0])
+    return float(relax(np.cumsum([0.0, how.approach_s, how.hold_s]), elastic, prony)[-1])
 
 
 def advance(state: Float[np.ndarray, " p"], change: float, dt_s: float, prony: Prony) -> Float[np.ndarray, " p"]:

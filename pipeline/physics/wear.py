@@ -1,17 +1,29 @@
-"""What contacts and warmth do to a skin. In: number of contacts so far, change of temperature. Out: factors and drifts.
+"""What contacts do to a skin. In: the number of contacts so far. Out: factors and drifts.
 
 All sizes are design values (PHYSICS 5: assumed, within the ranges given there).
 Refuses to know which contact was where and how deep.
 """
 
+from typing import Annotated
+
 import numpy as np
 from jaxtyping import Float, Int
+from pydantic import Field
 
 from pipeline.errors import ParamsError, complain
+from pipeline.strict import Strict
 
 SETTLING_CONTACTS = 300  # the first softening is over after a few times as many
 AGEING_CONTACTS = 1e3
-REMANENCE_PER_K = -0.12e-2  # NdFeB powder: Br falls by 0.12 % for each kelvin
+
+
+class Ageing(Strict):
+    """How fast a skin softens and its field at rest drifts."""
+
+    settling: Annotated[float, Field(ge=0, le=0.5)]  # force lost in the first contacts
+    ageing: Annotated[float, Field(ge=0, le=0.1)]  # force lost with each decade of contacts
+    fading_per_decade: Annotated[float, Field(ge=0, le=0.1)]  # of the field at rest
+    wandering_uT: Annotated[float, Field(ge=0, le=10)]  # sd a contact and channel
 
 
 def softening(contacts_n: Int[np.ndarray, " n"], *, settling: float, ageing: float) -> Float[np.ndarray, " n"]:
@@ -44,11 +56,6 @@ def wandering(
         raise ParamsError(complain("wear", "contact count", "never falling", f"{new_n.min()}", "Sort the contacts."))
     steps_T = step_T * np.sqrt(new_n)[:, None] * rng.standard_normal((len(contacts_n), channels_n))
     return np.cumsum(steps_T, axis=0)
-
-
-def remanence(warmer_K: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Give magnetisation over that at the reference temperature; fields at rest and their changes scale alike."""
-    return 1 + REMANENCE_PER_K * warmer_K
 
 
 def _refuse_counts(contacts_n: Int[np.ndarray, " n"]) -> None:

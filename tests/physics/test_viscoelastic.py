@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import ParamsError
-from pipeline.physics.viscoelastic import SKIN, Prony, advance, relax
+from pipeline.physics.viscoelastic import SKIN, Prony, Relaxation, advance, force_left, relax
 
 ROUNDING = 1e-14  # a few dozen operations on doubles
 times_s = st.floats(0, 1e5)
@@ -92,3 +92,12 @@ def test_time_that_runs_backwards_or_is_no_number_is_refused(dt_s):
 def test_impossible_relaxation_is_refused(tau_s, share):
     with pytest.raises(ParamsError, match="prony"):
         Prony(np.array([tau_s]), np.array([share]))
+
+
+def test_an_indentation_is_read_after_the_tip_went_down_and_held():
+    jump, slow = Relaxation(approach_s=0.0, hold_s=5.0), Relaxation(approach_s=5.0, hold_s=0.0)
+    truth = 1 - (SKIN.share * -np.expm1(-5.0 / SKIN.tau_s)).sum()
+    assert force_left(jump) == pytest.approx(truth, rel=1e-12)
+    # While it went down, each part of the force had less time: by the mean of the decay over the approach.
+    x = 5.0 / SKIN.tau_s
+    assert force_left(slow) == pytest.approx(1 - (SKIN.share * (1 + np.expm1(-x) / x)).sum(), rel=1e-12)

@@ -1,4 +1,4 @@
-"""Wear and warmth: published numbers as truth; a fresh skin, order and the walk's statistics as laws."""
+"""Wear: published numbers as truth; a fresh skin, order and the walk's statistics as laws."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import ParamsError
-from pipeline.physics.wear import fading, remanence, softening, wandering
+from pipeline.physics.wear import fading, softening, wandering
 from pipeline.seeds import rng_for
 
 DESIGN = {"settling": 0.10, "ageing": 0.01}
@@ -51,10 +51,6 @@ def test_the_same_generator_gives_the_same_walk():
     first, again = (wandering(np.arange(50), 15, step_T=1e-7, rng=rng_for(0, "wear")) for _ in range(2))
     assert first.tobytes() == again.tobytes()
     assert not first[0].any()  # no contact yet
-
-
-def test_warmth_takes_3_6_uT_off_3_mT_for_each_kelvin():
-    np.testing.assert_allclose(3e-3 * (remanence(np.array([-1.0, 0.0, 1.0])) - 1), [3.6e-6, 0.0, -3.6e-6], atol=1e-18)
 
 
 @pytest.mark.parametrize(
