@@ -9,8 +9,8 @@ from pipeline.capture import arrivals, probe, wire
 from pipeline.capture.arrivals import Arrivals
 from pipeline.capture.header import ARRIVALS_FILE, PROBE_FILE, STREAM_FILE, Clock, Firmware, Header, Wire
 from pipeline.capture.wire import Frames
-from pipeline.dataset.synthetic import Synthesis, SyntheticCapture
 from pipeline.physics.sensor import steps_uT
+from pipeline.synthesis.capture import Synthesis, SyntheticCapture
 
 WIRE: Wire = "binary"
 
@@ -22,12 +22,13 @@ def to_files(capture: SyntheticCapture, parameters: Synthesis) -> tuple[Header, 
     frame_bytes_n = wire.record_type(WIRE, chips_n).itemsize
     xy_uT, _, z_uT = steps_uT(parameters.chip.gain_sel).tolist()
     header = Header(
-        format="reskin-capture/1", capture=capture.skin, board=capture.board, skin=capture.skin, source="simulated",
+        format="reskin-capture/1", capture=capture.name, board=capture.board, skin=capture.skin, source="simulated",
         layout="native", wire=WIRE, chips_n=chips_n, unit_b="uT", unit_force="N", unit_place="mm",
         firmware=Firmware(gain_sel=parameters.chip.gain_sel, lsb_xy_uT=xy_uT, lsb_z_uT=z_uT),
         clock=Clock(kind="arrivals", rate_hz=None, marks=capture.marks),
-        protocol=f"65-point grid, {len(parameters.recording.depths_mm)} depths, {parameters.recording.passes_n} passes",
-        contacts_before_n=0, options={}, files={}, note=f"values past the chip's range: {capture.wrapped_n}",
+        protocol=capture.words,
+        contacts_before_n=0, options={}, files={},
+        note=", ".join(f"{what}: {n}" for what, n in capture.overruns.items()),
     )  # fmt: skip
     return header, {
         STREAM_FILE: wire.encode(unknown, WIRE),

@@ -1,0 +1,1 @@
+"""Captures of skins that do not exist: a plan, a rig and physics -> what a port and a probe would have written."""

@@ -1,0 +1,141 @@
+"""Where the tip goes, in what order: grid, drag lines, hand. In: a section of a scene. Out: a `Plan` of stops.
+
+Places are labels: mm from 0 to 16, the middle of the skin at (8, 8). A stop is a place and a depth at which readings
+are taken; an indentation is one stop, or the many of a dragged line. Refuses to know robots' errors, clocks and fields.
+"""
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+from jaxtyping import Float64, Int32
+from pydantic import Field, model_validator
+
+from pipeline.dataset.grid import CENTRE_MM, PITCH_MM, SIDE_POINTS_N, protocol
+from pipeline.strict import Strict
+
+Count = Annotated[int, Field(ge=1, le=100_000)]
+Depth_mm = Annotated[float, Field(gt=0, le=10)]
+
+
+class _Shared(Strict):
+    boards: str  # the kind of board, one of `boards` of the scene
+    skins_n: Count  # so many, the first skin of each board before the second of any
+    terms: tuple[Literal["ageing", "friction", "relaxation", "temperature"], ...]  # physics that it needs (PHYSICS 8)
+
+
+class Grid(_Shared):
+    """The paper's grid: 65 places, depth by depth, pass by pass (section 3)."""
+
+    kind: Literal["grid"]
+    passes_n: Count
+    depths_mm: Annotated[tuple[Depth_mm, ...], Field(min_length=1)]
+
+
+class Drag(_Shared):
+    """Drag lines every 2 mm, along x and along y, over the whole grid (section 4, shear)."""
+
+    kind: Literal["drag"]
+    passes_n: Count
+    depths_mm: Annotated[tuple[Depth_mm, ...], Field(min_length=1)]
+    step_mm: Annotated[float, Field(gt=0, le=4)]  # between stops
+
+
+class Hand(_Shared):
+    """Pokes by hand along lines: only their order is known, not their place, depth or force (section 5.2)."""
+
+    kind: Literal["hand"]
+    lines_n: Count
+    pokes_per_line_n: Annotated[int, Field(ge=2, le=1000)]
+    depth_mm: tuple[Depth_mm, Depth_mm]  # from, to: anything between them
+    place_sd_mm: Annotated[float, Field(ge=0, le=2)]  # off the line, and along it
+    tilt_sd_deg: Annotated[float, Field(ge=0, le=20)]  # of the stylus, about each axis
+
+    @model_validator(mode="after")
+    def _depths_rise(self) -> "Hand":
+        if not self.depth_mm[0] <= self.depth_mm[1]:
+            raise ValueError(f"depth_mm goes from the shallower to the deeper, not {self.depth_mm}")
+        return self
+
+
+Protocol = Annotated[Grid | Drag | Hand, Field(discriminator="kind")]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Stops in order of time, axes n indentations and p stops of each; `tilt` is the stylus' lean, x and y over z."""
+
+    pass_i: Int32[np.ndarray, " n"]
+    x_mm: Float64[np.ndarray, "n p"]
+    y_mm: Float64[np.ndarray, "n p"]
+    depth_mm: Float64[np.ndarray, "n p"]
+    tilt: Float64[np.ndarray, "n 2"]
+    labelled: bool  # whether anybody knows places, depths and forces
+    words: str
+
+    def __len__(self) -> int:
+        return len(self.pass_i)
+
+
+def make_plan(asked: Grid | Drag | Hand, rng: np.random.Generator) -> Plan:
+    """Lay out the stops of a protocol; only a hand is random."""
+    match asked:
+        case Grid():
+            return _grid(asked)
+        case Drag():
+            return _drag(asked)
+        case Hand():
+            return _hand(asked, rng)
+
+
+def _grid(asked: Grid) -> Plan:
+    pokes = protocol(asked.depths_mm, asked.passes_n)
+    return Plan(
+        pass_i=pokes.pass_i,
+        x_mm=pokes.x_mm[:, None],
+        y_mm=pokes.y_mm[:, None],
+        depth_mm=pokes.depth_mm[:, None],
+        tilt=np.zeros((len(pokes), 2)),
+        labelled=True,
+        words=f"65-point grid, {len(asked.depths_mm)} depths, {asked.passes_n} passes",
+    )
+
+
+def _drag(asked: Drag) -> Plan:
+    # Snake: each next line is dragged the other way, along x on every row, then along y on every column.
+    stops_n = round(2 * CENTRE_MM / asked.step_mm) + 1
+    along_mm = np.linspace(0, 2 * CENTRE_MM, stops_n)
+    there = np.where((np.arange(SIDE_POINTS_N) % 2 == 0)[:, None], along_mm, along_mm[::-1])
+    across_mm = np.repeat(PITCH_MM * np.arange(SIDE_POINTS_N)[:, None], stops_n, axis=1)
+    one_x_mm, one_y_mm = np.concatenate([there, across_mm]), np.concatenate([across_mm, there])
+    lines_n, depths_n = len(one_x_mm), len(asked.depths_mm)
+    repeats = (asked.passes_n * depths_n, 1)
+    depth_mm = np.tile(np.repeat(np.array(asked.depths_mm), lines_n), asked.passes_n)
+    return Plan(
+        pass_i=np.repeat(np.arange(asked.passes_n, dtype=np.int32), depths_n * lines_n),
+        x_mm=np.tile(one_x_mm, repeats),
+        y_mm=np.tile(one_y_mm, repeats),
+        depth_mm=np.repeat(depth_mm[:, None], stops_n, axis=1),
+        tilt=np.zeros((len(depth_mm), 2)),
+        labelled=True,
+        words=f"drag lines every {PITCH_MM:g} mm, {depths_n} depths, {asked.passes_n} passes, "
+        f"stops every {2 * CENTRE_MM / (stops_n - 1):g} mm",
+    )
+
+
+def _hand(asked: Hand, rng: np.random.Generator) -> Plan:
+    # Lines side by side over the grid; the pass counts lines, so that the order along one line is what is known.
+    across_mm = np.linspace(0, 2 * CENTRE_MM, asked.lines_n) if asked.lines_n > 1 else np.array([CENTRE_MM])
+    along_mm = np.linspace(0, 2 * CENTRE_MM, asked.pokes_per_line_n)
+    pokes_n = asked.lines_n * asked.pokes_per_line_n
+    place_mm = np.stack([np.tile(along_mm, asked.lines_n), np.repeat(across_mm, asked.pokes_per_line_n)], axis=1)
+    place_mm = np.clip(place_mm + asked.place_sd_mm * rng.standard_normal((pokes_n, 2)), 0, 2 * CENTRE_MM)
+    return Plan(
+        pass_i=np.repeat(np.arange(asked.lines_n, dtype=np.int32), asked.pokes_per_line_n),
+        x_mm=place_mm[:, :1],
+        y_mm=place_mm[:, 1:],
+        depth_mm=rng.uniform(*asked.depth_mm, size=(pokes_n, 1)),
+        tilt=np.tan(np.radians(asked.tilt_sd_deg) * rng.standard_normal((pokes_n, 2)).clip(-2, 2)),
+        labelled=False,
+        words=f"by hand, {asked.lines_n} lines of {asked.pokes_per_line_n} pokes, order known only",
+    )

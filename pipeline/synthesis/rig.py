@@ -1,0 +1,118 @@
+"""The rig that records: robot, force sensor, port and clocks. In: a plan, forces. Out: when frames and dwells come.
+
+Simplified: dwells are as short as their frames, contacts follow each other without a pause (so a capture takes a small
+part of a real one's time), and frames on the way down or up see a share of the change of field.
+Refuses to know fields and skins.
+"""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Float, Float64, Int64
+from pydantic import Field
+
+from pipeline.capture.probe import ProbeLog
+from pipeline.strict import Strict
+from pipeline.synthesis.protocols import Plan
+
+Frames = Annotated[int, Field(ge=1, le=1000)]
+Spread = Annotated[float, Field(ge=0, le=1)]
+
+
+class Rig(Strict):
+    """Section `rig`: how often frames come, how well the robot repeats, and what the clocks and the port do."""
+
+    noload_frames_n: Frames
+    moving_frames_n: Annotated[int, Field(ge=0, le=1000)]  # on the way down, and as many on the way up
+    settling_frames_n: Annotated[int, Field(ge=0, le=1000)]  # at rest, before each dwell
+    readings_n: Frames
+    rate_hz: Annotated[float, Field(gt=0, le=1e4)]
+    robot_place_sd_mm: Spread  # each axis
+    robot_depth_sd_mm: Annotated[float, Field(ge=0, le=0.2)]
+    force_noise_N: Annotated[float, Field(ge=0, le=10)]
+    chunk_frames_max_n: Frames
+    arrival_jitter_s: Annotated[float, Field(ge=0, le=1)]  # mean delay of a chunk, exponential
+    probe_clock_offset_s: Annotated[float, Field(ge=0, le=1e6)]  # sd of the probe's clock minus the stream's
+    probe_clock_rate_error: Annotated[float, Field(ge=0, le=0.01)]  # sd
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """The frames of one indentation, axis t: the stop that each sees, and what share of its change of field."""
+
+    stop_i: Int64[np.ndarray, " t"]
+    share: Float64[np.ndarray, " t"]
+    noload_i: int  # first frame of the no-load dwell
+    contact_i: Int64[np.ndarray, " p"]  # first frame of each contact dwell
+
+    def __len__(self) -> int:
+        return len(self.stop_i)
+
+
+def timeline(rig: Rig, stops_n: int) -> Timeline:
+    """Lay out one indentation: settle, no load, down, at every stop settle and read, up."""
+    ramp = np.arange(1, rig.moving_frames_n + 1) / (rig.moving_frames_n + 1)
+    lifted_n, dwell_n = rig.settling_frames_n + rig.noload_frames_n, rig.settling_frames_n + rig.readings_n
+    share = np.concatenate([np.zeros(lifted_n), ramp, np.ones(stops_n * dwell_n), ramp[::-1]])
+    before_i = lifted_n + rig.moving_frames_n
+    stop_i = np.clip((np.arange(len(share)) - before_i) // dwell_n, 0, stops_n - 1)
+    contact_i = before_i + dwell_n * np.arange(stops_n) + rig.settling_frames_n
+    return Timeline(stop_i, share, rig.settling_frames_n, contact_i)
+
+
+def misplace(plan: Plan, rig: Rig, rng: np.random.Generator) -> Float64[np.ndarray, "n p 3"]:
+    """Give where the tip really goes, in mm: x, y and depth; off the plan alike at all stops of an indentation.
+
+    A hand goes where it goes: its plan is what it did.
+    """
+    planned_mm = np.stack([plan.x_mm, plan.y_mm, plan.depth_mm], axis=2)
+    if not plan.labelled:
+        return planned_mm
+    sd_mm = np.array([rig.robot_place_sd_mm, rig.robot_place_sd_mm, rig.robot_depth_sd_mm])
+    return planned_mm + sd_mm * rng.standard_normal((len(plan), 1, 3))
+
+
+def chunks(
+    frame_s: Float64[np.ndarray, " f"], rig: Rig, rng: np.random.Generator
+) -> tuple[Int64[np.ndarray, " c"], Float64[np.ndarray, " c"]]:
+    """Let frames arrive: frames come in all, and when. A port hands over a few at once, none early, all in order."""
+    frames_n = len(frame_s)
+    sizes = rng.integers(1, rig.chunk_frames_max_n + 1, size=frames_n)
+    ends = np.cumsum(sizes)
+    ends = np.append(ends[ends < frames_n], frames_n)
+    arrival_s = frame_s[ends - 1] + rig.arrival_jitter_s * rng.standard_exponential(len(ends))
+    return np.append(0, ends), np.append(0.0, np.maximum.accumulate(arrival_s))
+
+
+def draw_clock(rig: Rig, rng: np.random.Generator) -> tuple[float, float]:
+    """Draw offset in s and rate of the probe's clock against the stream's."""
+    offset_s, error = rng.standard_normal(2) * (rig.probe_clock_offset_s, rig.probe_clock_rate_error)
+    return float(offset_s), float(1 + error)
+
+
+def probe_log(plan: Plan, felt_N: Float[np.ndarray, "n d 3"], rig: Rig, clock: tuple[float, float]) -> ProbeLog:
+    """Write what robot and force sensor log: for each indentation its no-load dwell, then its stops (d = 1 + p).
+
+    A dwell runs from half a frame before its first frame to half a frame after its last.
+    """
+    stops_n = plan.x_mm.shape[1]
+    frames = timeline(rig, stops_n)
+    offset_s, rate = clock
+    first_i = np.append(frames.noload_i, frames.contact_i)
+    long_n = np.append(rig.noload_frames_n, np.full(stops_n, rig.readings_n))
+    start_i = np.arange(len(plan))[:, None] * len(frames) + first_i
+    contact = np.tile(np.arange(1 + stops_n) > 0, len(plan))
+    unknown = 0.0 if plan.labelled else np.nan
+    depth_mm = np.hstack([np.zeros((len(plan), 1)), plan.depth_mm + unknown])
+    places_mm = (np.hstack([one[:, :1], one]) + unknown for one in (plan.x_mm, plan.y_mm))
+    force_N = (felt_N + unknown).reshape(-1, 3)
+    labels = [one.astype(np.float32).ravel() for one in (*places_mm, depth_mm, *force_N.T)]
+    return ProbeLog(
+        np.repeat(np.arange(len(plan), dtype=np.int32), 1 + stops_n),
+        np.repeat(plan.pass_i, 1 + stops_n),
+        contact,
+        offset_s + rate * (start_i + 0.5).ravel() / rig.rate_hz,
+        offset_s + rate * (start_i + long_n + 0.5).ravel() / rig.rate_hz,
+        *labels,
+    )

@@ -1,0 +1,65 @@
+"""A small scene to simulate, as plain words, and small changes of it."""
+
+from pipeline.strict import parse
+from pipeline.synthesis.capture import Synthesis
+
+GRID = {"kind": "grid", "boards": "rigid", "skins_n": 4, "passes_n": 2, "depths_mm": (0.6, 1.2), "terms": []}
+CHIPS_MM = ((0.0, 0.0), (-7.0, 0.0), (0.0, -7.0), (7.0, 0.0), (0.0, 7.0))
+RIGID = {"chips_xy_mm": CHIPS_MM, "chips_turn_deg": (0.0, 180.0, 0.0, 90.0, 270.0), "gap_mm": 1.1}
+RULE = {"cell_mm": 1.0, "layers_n": 4}
+AGEING = {"settling": 0.1, "ageing": 0.01, "fading_per_decade": 0.005, "wandering_uT": 0.2}
+TEMPERATURE = {"warming_K": 3.0, "warming_s": 5.0, "swing_K": 0.0, "swing_s": 1.0, "chip_sensitivity_per_K": 0.0}
+RELAXATION = {"approach_s": 0.5, "hold_s": 0.5}
+SECTIONS = {
+    "boards": {"rigid": {"letter": "b", "boards_n": 2, "skins_per_board_n": 2, "design": RIGID, "quadrature": RULE}},
+    "protocols": {"grid": GRID},
+    "rig": {
+        "noload_frames_n": 4,
+        "moving_frames_n": 2,
+        "settling_frames_n": 1,
+        "readings_n": 3,
+        "rate_hz": 400.0,
+        "robot_place_sd_mm": 0.0,
+        "robot_depth_sd_mm": 0.0,
+        "force_noise_N": 0.006,
+        "chunk_frames_max_n": 4,
+        "arrival_jitter_s": 1e-4,
+        "probe_clock_offset_s": 5.0,
+        "probe_clock_rate_error": 5e-5,
+    },
+    "skin": {
+        "polarity": "checkerboard",
+        "base": "slipping",
+        "saturation_T": 0.11,
+        "half_field_T": 0.8,
+        "thickness_mm": 2.0,
+        "modulus_kPa": 345.0,
+        "tip_radius_mm": 3.0,
+    },
+    "chip": {"gain_sel": 6, "noise_xy_uT": 3.3, "noise_z_uT": 5.0, "noise_temperature_degC": 0.1},
+    "spreads": {
+        "board_gap_mm": 0.1,
+        "chip_gain": 0.025,
+        "chip_cross_axis": 0.01,
+        "chip_tilt_deg": 2.0,
+        "chip_offset_uT": 200.0,
+        "skin_amplitude": 0.1,
+        "skin_filler": 0.1,
+        "skin_filler_length_mm": 3.0,
+        "skin_thickness": 0.03,
+        "skin_modulus": 0.1,
+        "skin_seat_mm": 0.25,
+        "skin_depth_zero_mm": 0.05,
+    },
+    "terms": {},
+}
+
+
+def synthesis(section: str = "rig", **changes: object) -> Synthesis:
+    """The scene, one of its sections changed."""
+    return parse(Synthesis, SECTIONS | {section: {**SECTIONS[section], **changes}}, "test")  # type: ignore[dict-item]
+
+
+def with_protocol(name: str, protocol: dict[str, object], **changes: object) -> Synthesis:
+    """The scene with one protocol more, and other sections instead of its own."""
+    return parse(Synthesis, SECTIONS | {"protocols": {"grid": GRID, name: protocol}} | changes, "test")

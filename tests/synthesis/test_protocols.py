@@ -1,0 +1,62 @@
+"""The paper's counts as truth; order, spacing and randomness of each protocol as laws."""
+
+import numpy as np
+import pytest
+
+from pipeline.dataset.grid import points_mm
+from pipeline.seeds import rng_for
+from pipeline.synthesis.protocols import Drag, Grid, Hand, make_plan
+
+SHARED = {"boards": "rigid", "skins_n": 1, "terms": ()}
+GRID = Grid(kind="grid", passes_n=2, depths_mm=(0.2, 0.4, 0.6, 0.8, 1.0, 1.2), **SHARED)
+DRAG = Drag(kind="drag", passes_n=1, depths_mm=(0.6, 1.2), step_mm=1.0, **SHARED)
+HAND = Hand(
+    kind="hand", lines_n=13, pokes_per_line_n=25, depth_mm=(0.4, 1.2), place_sd_mm=0.3, tilt_sd_deg=5.0, **SHARED
+)
+
+
+def plan_of(asked, name="plan"):
+    return make_plan(asked, rng_for(0, name))
+
+
+def test_a_pass_over_the_grid_is_390_indentations_at_one_stop_each():
+    plan = plan_of(GRID)
+    assert plan.x_mm.shape == (2 * 390, 1)
+    np.testing.assert_array_equal(np.hstack([plan.x_mm, plan.y_mm])[:65], points_mm())
+    np.testing.assert_array_equal(plan.pass_i, np.repeat([0, 1], 390))
+
+
+def test_drag_lines_lie_2_mm_apart_along_x_and_then_along_y():
+    plan = plan_of(DRAG)
+    assert plan.x_mm.shape == (2 * 18, 17)  # 9 rows and 9 columns, at two depths
+    rows, columns = slice(0, 9), slice(9, 18)
+    np.testing.assert_array_equal(plan.y_mm[rows], np.repeat(2.0 * np.arange(9)[:, None], 17, axis=1))
+    np.testing.assert_array_equal(plan.x_mm[columns], plan.y_mm[rows])
+    np.testing.assert_allclose(np.abs(np.diff(plan.x_mm[rows], axis=1)), 1.0)
+    np.testing.assert_allclose(np.abs(np.diff(plan.y_mm[columns], axis=1)), 1.0)
+
+
+def test_each_next_line_is_dragged_the_other_way():
+    steps_mm = np.diff(plan_of(DRAG).x_mm, axis=1)[:9, 0]
+    np.testing.assert_array_equal(np.sign(steps_mm), np.where(np.arange(9) % 2 == 0, 1, -1))
+
+
+def test_a_hand_pokes_325_times_in_order_along_lines_and_nobody_knows_where():
+    plan = plan_of(HAND)
+    assert len(plan) == 325  # paper section 5.2
+    assert not plan.labelled
+    x_mm, y_mm = plan.x_mm.reshape(13, 25), plan.y_mm.reshape(13, 25)
+    assert (np.diff(x_mm.mean(axis=0)) > 0).all()
+    assert (np.diff(y_mm.mean(axis=1)) > 0).all()
+    assert (y_mm - np.linspace(0, 16, 13)[:, None]).std() == pytest.approx(0.3, rel=0.15)  # 325 draws, edges clipped
+    assert plan.depth_mm.min() > 0.4
+    assert plan.depth_mm.max() < 1.2
+    assert plan.tilt.std() == pytest.approx(np.tan(np.radians(5.0)), rel=0.15)  # 650 draws, cut at two sd
+    assert plan.depth_mm.mean() == pytest.approx(0.8, abs=0.05)  # four times 0.23 / sqrt(325)
+
+
+def test_only_a_hand_is_random():
+    for asked, alike in ((GRID, True), (DRAG, True), (HAND, False)):
+        one, other = plan_of(asked, "one"), plan_of(asked, "other")
+        assert np.array_equal(one.x_mm, other.x_mm) == alike
+        assert np.array_equal(plan_of(asked, "one").depth_mm, one.depth_mm)
