@@ -1,0 +1,107 @@
+"""What a skin's recordings look like: fields, noise, steps, forces. In: `Readings`. Out: numbers by name, units in it.
+
+The same numbers for simulated and recorded skins, so that they can stand side by side. Refuses to know who they are.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from pipeline.capture.faults import find_lsb
+from pipeline.dataset.baseline import subtract
+from pipeline.schema import AXES_PER_CHIP_N, Readings
+
+FORCES_N = (0.5, 1.0, 2.0, 3.0)  # at which changes of field are compared
+NEAR = 0.2  # of the force
+ENOUGH_N = 20  # readings, or a number is not given
+STEP_READINGS_N = 2000  # show the chips' steps
+PRESSED_N = 0.5  # below, a weak chip shows its noise
+
+
+def describe(one: Readings) -> dict[str, float]:
+    """Describe one capture; what it does not hold, or hardly, is absent."""
+    # A row with a force but no place is no contact; one with neither is a contact that nobody labelled.
+    touched = ~(one.Fz_N <= 0) & ~(np.isnan(one.x_mm) & ~np.isnan(one.Fz_N))
+    change_uT = subtract(one.b_uT, one.noload_uT).astype(np.float64)
+    return {
+        **_rest(one.noload_uT),
+        **_noise(one, touched),
+        **_steps(one),
+        **_forces(one.Fz_N[touched]),
+        **_changes(change_uT[touched], one.Fz_N[touched]),
+    }
+
+
+def over_skins(described: Sequence[tuple[str, Mapping[str, float]]]) -> dict[str, dict[str, float]]:
+    """Give mean, sd, least and most over skins of every quantity of (skin, description); a skin's captures averaged."""
+    by_skin: dict[str, dict[str, list[float]]] = {}
+    for skin, numbers in described:
+        for name, value in numbers.items():
+            by_skin.setdefault(skin, {}).setdefault(name, []).append(value)
+    skins = [_with_growth({name: float(np.mean(own)) for name, own in one.items()}) for one in by_skin.values()]
+    together = {}
+    for name in dict.fromkeys(name for one in skins for name in one):
+        means = np.array([one[name] for one in skins if name in one])
+        together[name] = {"mean": float(means.mean()), "least": float(means.min()), "most": float(means.max())}
+        together[name] |= {"sd": float(means.std(ddof=1))} if len(means) > 1 else {}
+        together[name]["n"] = len(means)
+    return together
+
+
+def _with_growth(skin: dict[str, float]) -> dict[str, float]:
+    # Captures of one skin may each hold one force alone, so this is asked of the skin.
+    weak, strong = "change_at_1_N_uT", "change_at_3_N_uT"
+    return skin | ({"change_at_3_N_over_1_N": skin[strong] / skin[weak]} if weak in skin and strong in skin else {})
+
+
+def _rest(noload_uT: Float[np.ndarray, "f ch"]) -> dict[str, float]:
+    b_uT = np.abs(np.median(noload_uT.astype(np.float64), axis=0)).reshape(-1, AXES_PER_CHIP_N)
+    return {
+        "field_at_rest_chip_median_uT": float(np.median(np.linalg.norm(b_uT, axis=1))),
+        "field_at_rest_channel_max_uT": float(b_uT.max()),
+    }
+
+
+def _noise(one: Readings, touched: Bool[np.ndarray, " f"]) -> dict[str, float]:
+    # Within one indentation nothing moves: what is left is noise. Pooled over indentations.
+    _, group_i, group_n = np.unique(one.indentation[touched], return_inverse=True, return_counts=True)
+    freedom_n = int((group_n - 1).sum())
+    if freedom_n < ENOUGH_N:
+        return {}
+    b_uT = one.b_uT[touched].astype(np.float64)
+    sums_uT = np.zeros((len(group_n), b_uT.shape[1]))
+    np.add.at(sums_uT, group_i, b_uT)
+    left_uT = b_uT - (sums_uT / group_n[:, None])[group_i]
+    sd_uT = np.sqrt((left_uT**2).sum(axis=0) / freedom_n).reshape(-1, AXES_PER_CHIP_N)
+    return {"noise_xy_uT": float(np.median(sd_uT[:, :2])), "noise_z_uT": float(np.median(sd_uT[:, 2]))}
+
+
+def _steps(one: Readings) -> dict[str, float]:
+    lsb_uT = find_lsb(one.b_uT[:STEP_READINGS_N])
+    known = {"step_xy_uT": lsb_uT[:, 0], "step_z_uT": lsb_uT[:, 1]}
+    return {name: float(np.nanmedian(steps)) for name, steps in known.items() if np.isfinite(steps).any()}
+
+
+def _forces(force_N: Float[np.ndarray, " f"]) -> dict[str, float]:
+    known_N = force_N[np.isfinite(force_N)]
+    if len(known_N) < ENOUGH_N:
+        return {}
+    return {"force_median_N": float(np.median(known_N)), "force_max_N": float(known_N.max())}
+
+
+def _changes(change_uT: Float[np.ndarray, "f ch"], force_N: Float[np.ndarray, " f"]) -> dict[str, float]:
+    size_uT = np.linalg.norm(change_uT, axis=1)
+    found = {}
+    for at_N in FORCES_N:
+        near = np.abs(force_N - at_N) <= NEAR * at_N
+        if near.sum() >= ENOUGH_N:
+            found[f"change_at_{at_N:g}_N_uT"] = float(np.median(size_uT[near]))
+    chips_uT = np.linalg.norm(
+        change_uT.reshape(len(change_uT), change_uT.shape[1] // AXES_PER_CHIP_N, AXES_PER_CHIP_N), axis=2
+    )
+    pressed = ~(force_N < PRESSED_N)
+    if pressed.sum() >= ENOUGH_N and chips_uT.shape[1] > 1:
+        ratio = chips_uT[pressed].min(axis=1) / chips_uT[pressed].max(axis=1)
+        found["weakest_over_strongest_chip"] = float(np.median(ratio))
+    return found

@@ -1,0 +1,68 @@
+"""What skins look like, scene beside scene: descriptions -> one table. Sees numbers, never readings.
+
+Simulated and recorded skins stand in columns of their own, each of which says what it is.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+QUANTITIES = {
+    "field_at_rest_chip_median_uT": "field at rest, median chip, µT",
+    "field_at_rest_channel_max_uT": "field at rest, largest channel, µT",
+    "change_at_0.5_N_uT": "change of field at 0.5 N, µT",
+    "change_at_1_N_uT": "change of field at 1 N, µT",
+    "change_at_2_N_uT": "change of field at 2 N, µT",
+    "change_at_3_N_uT": "change of field at 3 N, µT",
+    "change_at_3_N_over_1_N": "change of field at 3 N over that at 1 N",
+    "weakest_over_strongest_chip": "change at the weakest chip over the strongest",
+    "noise_xy_uT": "noise of one reading, x and y, µT",
+    "noise_z_uT": "noise of one reading, z, µT",
+    "step_xy_uT": "step of a chip, x and y, µT",
+    "step_z_uT": "step of a chip, z, µT",
+    "force_median_N": "force, median, N",
+    "force_max_N": "force, largest, N",
+}
+ALIKE = 2.0  # a factor within which skins of different make count as alike
+MEANING = (
+    "Mean over skins [least … most] (number of skins); a change of field is the length of the vector of all channels. "
+    f"Alike: the means are within a factor of {ALIKE:g} of a recorded one. – : too few readings tell."
+)
+
+
+def skins_table(columns: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
+    """Put descriptions side by side by title; with simulated and recorded ones, say where they are alike."""
+    lines = []
+    for name, title in QUANTITIES.items():
+        values = {column: described["over_skins"].get(name) for column, described in columns.items()}
+        if not any(values.values()):
+            continue
+        line = {"quantity": title} | {column: _show(value) for column, value in values.items()}
+        sides = {
+            side: [v["mean"] for c, v in values.items() if v and columns[c]["source"] == side]
+            for side in ("simulated", "recorded")
+        }
+        if {described["source"] for described in columns.values()} == set(sides):
+            line["simulated against recorded"] = _compare(sides["simulated"], sides["recorded"])
+        lines.append(line)
+    table = pd.DataFrame(lines)
+    table.attrs["meaning"] = MEANING
+    return table
+
+
+def _show(value: Mapping[str, float] | None) -> str:
+    if value is None:
+        return "–"
+    return f"{value['mean']:.3g} [{value['least']:.3g} … {value['most']:.3g}] ({value['n']})"
+
+
+def _compare(simulated: list[float], recorded: list[float]) -> str:
+    if not simulated or not recorded:
+        return "–"
+    ratios = [one / other for one in simulated for other in recorded]
+    nearest = min(ratios, key=lambda ratio: abs(np.log(ratio)))
+    if 1 / ALIKE <= nearest <= ALIKE:
+        return "alike"
+    return f"differs: {nearest:.2g} times the nearest recorded"

@@ -1,0 +1,88 @@
+"""What is read off readings of a made-up skin, against what it was made of; skins and missing values as laws."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.evaluation.description import describe, over_skins
+from pipeline.schema import Readings
+from pipeline.seeds import rng_for
+
+INDENTATIONS_N, READINGS_N = 400, 5
+REST_uT = np.array([300.0, -400.0, 0.0, 1000.0, 0.0, -2500.0], np.float32)
+
+
+def made(*, uT_per_N=100.0, noise_uT=(3.0, 5.0), force_N=2.0, places=True, known_force=True):
+    """Two chips; the second feels a quarter of what the first does."""
+    rng, f = rng_for(0, "made"), INDENTATIONS_N * READINGS_N
+    forces_N = force_N * np.repeat(rng.uniform(0.9, 1.1, INDENTATIONS_N), READINGS_N)
+    shape = np.array([0, 0, 4.0, 0, 0, 1.0]) / np.sqrt(17)
+    sd_uT = np.tile([noise_uT[0], noise_uT[0], noise_uT[1]], 2)
+    b_uT = REST_uT + uT_per_N * forces_N[:, None] * shape + sd_uT * rng.standard_normal((f, 6))
+    steps_uT = np.tile([0.2, 0.2, 0.3227], 2)
+    ones, index = np.ones(f, np.float32), np.arange(f, dtype=np.int32)
+    return Readings(
+        "c", "b", "s", "simulated", index // READINGS_N, 0 * index, index % READINGS_N,
+        ones if places else np.nan * ones, ones if places else np.nan * ones, ones, 0 * ones, 0 * ones,
+        (forces_N if known_force else np.nan * ones).astype(np.float32),
+        (np.rint(b_uT / steps_uT) * steps_uT).astype(np.float32), np.tile(REST_uT, (f, 1)), np.ones((f, 2), np.float32),
+        index / 400.0, index // READINGS_N,
+    )  # fmt: skip
+
+
+def test_fields_noise_steps_and_forces_are_those_it_was_made_of():
+    found = describe(made())
+    assert found["field_at_rest_chip_median_uT"] == pytest.approx((500 + np.hypot(1000, 2500)) / 2)
+    assert found["field_at_rest_channel_max_uT"] == 2500
+    assert found["noise_xy_uT"] == pytest.approx(3.0, rel=0.05)  # 1600 degrees of freedom: 2 %
+    assert found["noise_z_uT"] == pytest.approx(5.0, rel=0.05)
+    assert found["step_xy_uT"] == pytest.approx(0.2, rel=1e-3)
+    assert found["step_z_uT"] == pytest.approx(0.3227, rel=1e-3)
+    assert found["force_median_N"] == pytest.approx(2.0, rel=0.02)
+    assert found["change_at_2_N_uT"] == pytest.approx(200, rel=0.02)
+    assert found["weakest_over_strongest_chip"] == pytest.approx(0.25, rel=0.1)
+
+
+def test_forces_that_were_not_reached_have_no_change_of_field():
+    assert {"change_at_0.5_N_uT", "change_at_1_N_uT", "change_at_3_N_uT"}.isdisjoint(describe(made()))
+
+
+def test_without_force_the_field_is_described_all_the_same():
+    found = describe(made(known_force=False))
+    assert "force_max_N" not in found
+    assert "change_at_2_N_uT" not in found
+    assert found["noise_z_uT"] == pytest.approx(5.0, rel=0.05)
+    assert found["weakest_over_strongest_chip"] == pytest.approx(0.25, rel=0.1)
+
+
+def test_contacts_that_nobody_labelled_are_described_by_their_fields():
+    found = describe(made(places=False, known_force=False))
+    assert found["field_at_rest_channel_max_uT"] == 2500
+    assert found["weakest_over_strongest_chip"] == pytest.approx(0.25, rel=0.1)
+
+
+def test_rows_without_contact_are_described_by_their_field_at_rest():
+    found = describe(made(places=False))
+    assert found["field_at_rest_channel_max_uT"] == 2500
+    assert {"force_max_N", "noise_z_uT", "weakest_over_strongest_chip"}.isdisjoint(found)
+
+
+def test_captures_of_one_skin_count_once():
+    together = over_skins([("s0", {"a": 1.0}), ("s0", {"a": 3.0}), ("s1", {"a": 4.0, "b": 7.0})])
+    assert together["a"] == {"mean": 3.0, "least": 2.0, "most": 4.0, "sd": pytest.approx(np.sqrt(2)), "n": 2}
+    assert together["b"] == {"mean": 7.0, "least": 7.0, "most": 7.0, "n": 1}
+
+
+def test_how_the_change_grows_with_force_is_asked_of_a_skin_over_all_its_captures():
+    together = over_skins(
+        [("s0", {"change_at_1_N_uT": 200.0}), ("s0", {"change_at_3_N_uT": 500.0}), ("s1", {"a": 1.0})]
+    )
+    assert together["change_at_3_N_over_1_N"]["mean"] == pytest.approx(2.5)
+    assert together["change_at_3_N_over_1_N"]["n"] == 1
+
+
+@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=9))
+def test_the_mean_lies_between_least_and_most(values):
+    one = over_skins([(f"s{i}", {"a": value}) for i, value in enumerate(values)])["a"]
+    assert one["least"] - 1e-6 <= one["mean"] <= one["most"] + 1e-6
