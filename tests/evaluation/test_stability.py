@@ -1,0 +1,123 @@
+"""Stiff, extreme and broken cases end as they should, and a product that lets one through is found out."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.capture import faults, stream
+from pipeline.errors import CaptureError
+from pipeline.evaluation.stability import physics
+from pipeline.evaluation.stability.cases import measured, peak_bytes, refused
+from pipeline.evaluation.stability.chip import survey_chip
+from pipeline.evaluation.stability.physics import survey_physics
+from pipeline.evaluation.stability.relaxing import survey_relaxing
+from pipeline.evaluation.stability.survey import survey
+from pipeline.evaluation.stability.wire import survey_wire
+from pipeline.physics import force_sensor, layer, sensor, viscoelastic
+from pipeline.strict import parse, read_yaml
+from pipeline.synthesis.capture import Synthesis
+
+SCENE = Path(__file__).resolve().parents[2] / "pipeline" / "scenes" / "quick.yaml"
+DESIGN = parse(Synthesis, read_yaml(SCENE)["simulate"], "simulate")
+BOARD = DESIGN.boards["rigid"].design
+SEED = 2021
+
+
+def broken(cases):
+    return {case.case for case in cases if not case.holds}
+
+
+@pytest.fixture(scope="module")
+def cases():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(physics, "POKES_N", 100)  # checked types and traced memory are slow together
+        return survey(BOARD, DESIGN.spreads, skin=DESIGN.skin, chip=DESIGN.chip, seed=SEED)
+
+
+def test_every_case_ends_as_it_should(cases):
+    assert broken(cases) == set()
+
+
+def test_every_row_is_its_own_and_says_what_happened(cases):
+    assert len({(case.area, case.case) for case in cases}) == len(cases)
+    assert {case.area for case in cases} == {"time", "physics", "chip", "wire"}
+    assert all(case.should and case.happened for case in cases)
+    assert all((case.error is None) == (case.limit is None) for case in cases)
+
+
+def test_the_same_seed_gives_the_same_words():
+    assert survey_chip(DESIGN.chip, 5, SEED) == survey_chip(DESIGN.chip, 5, SEED)
+    assert survey_relaxing() == survey_relaxing()
+
+
+@pytest.mark.parametrize(("chips_n", "gain_sel"), [(1, 7), (8, 0)])
+def test_streams_of_other_boards_are_surveyed_too(chips_n, gain_sel):
+    assert broken(survey_wire(gain_sel, chips_n, SEED)) == set()
+
+
+def test_what_is_not_refused_and_what_is_no_number_does_not_hold():
+    def raises():
+        raise CaptureError("here: a thing must be so; got nothing. Mend it.")
+
+    assert refused("wire", "a", should="b", attempt=raises).happened.startswith("refused: here: a thing")
+    assert not refused("wire", "a", should="b", attempt=lambda: None).holds
+    assert not measured("wire", "a", should="b", happened="c", error=np.nan, limit=1.0).holds
+
+
+def test_an_error_of_ours_is_no_refusal():
+    with pytest.raises(ZeroDivisionError):
+        refused("wire", "a", should="b", attempt=lambda: 1 / 0)
+
+
+def test_the_peak_is_what_is_held_at_once():
+    def one_after_another():
+        for _ in range(3):
+            np.ones(125_000)
+
+    assert peak_bytes(one_after_another) == pytest.approx(1e6, rel=0.1)  # bytes beside the array
+
+
+# Each fault is planted where the product has its guard.
+
+
+def test_the_naive_quotient_of_a_small_step_is_found_out(monkeypatch):
+    monkeypatch.setattr(viscoelastic, "_mean_decay", lambda x: (1 - np.exp(-x)) / np.where(x > 0, x, 1.0))
+    assert "dt / tau_min 1e-16" in broken(survey_relaxing())
+
+
+def test_time_that_may_run_backwards_is_found_out(monkeypatch):
+    monkeypatch.setattr(viscoelastic.np, "isfinite", lambda _: np.True_)
+    assert "a time step of inf s" in broken(survey_relaxing())
+
+
+def test_a_force_sensor_without_a_range_and_a_flag_that_never_rises_are_found_out(monkeypatch):
+    monkeypatch.setattr(force_sensor, "RANGE_N", (np.inf,) * 3)
+    monkeypatch.setattr(layer, "VERIFIED_DEPTH", 10.0)
+    monkeypatch.setattr(physics, "POKES_N", 10)
+    wrong = broken(survey_physics(BOARD, DESIGN.spreads, skin=DESIGN.skin, seed=SEED))
+    assert wrong == {"a stiff skin, E = 1 GPa", "depths of 0.2, 0.59, 0.6 and 0.8 of the thickness"}
+
+
+def test_a_chip_that_never_saturates_is_found_out(monkeypatch):
+    monkeypatch.setattr(sensor, "FIELD_MAX_T", 1.0)
+    assert broken(survey_chip(DESIGN.chip, 5, SEED)) == {"60, -4 and -70 mT at GAIN_SEL 7"}
+
+
+@pytest.mark.parametrize(
+    ("guard", "blind", "case"),
+    [
+        ("failed_reads", lambda b_uT, _: np.zeros((len(b_uT), 5), bool), "50 dropped readings of one chip"),
+        ("stuck_chips", lambda b_uT: np.zeros((len(b_uT), 5), bool), "a chip that stops while the board moves"),
+        ("reset_chips", lambda *_: np.zeros(5, bool), "chip 3 lost its settings"),
+    ],
+)
+def test_a_fault_that_nobody_looks_for_is_found_out(monkeypatch, guard, blind, case):
+    monkeypatch.setattr(faults, guard, blind)
+    assert any(name.startswith(case) for name in broken(survey_chip(DESIGN.chip, 5, SEED)))
+
+
+def test_a_stream_that_forgets_bytes_is_found_out(monkeypatch):
+    right = stream.FrameStream.account
+    monkeypatch.setattr(stream.FrameStream, "account", lambda self: right(self) | {"skipped_truncated_bytes_n": 0})
+    assert "last frame truncated (binary)" in broken(survey_wire(7, 5, SEED))
