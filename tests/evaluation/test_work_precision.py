@@ -1,0 +1,429 @@
+"""Error against run time: closed forms, the flow and adaptive quadrature as truth; refinement and order as laws."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.constants import mu_0
+from scipy.integrate import quad
+
+from pipeline.errors import ParamsError
+from pipeline.evaluation.work_precision import integrators, methods
+from pipeline.evaluation.work_precision.choose import CANDIDATES, ERROR_MAX, choose
+from pipeline.evaluation.work_precision.history import exact_forces, poke_often, stiff
+from pipeline.evaluation.work_precision.integrators import EULER, EXACT, SOLVERS, Sweep, study_integrators
+from pipeline.evaluation.work_precision.lattices import box_m, gauss_everywhere, midpoints, written
+from pipeline.evaluation.work_precision.methods import METHODS, whole
+from pipeline.evaluation.work_precision.motion import Path, paths
+from pipeline.evaluation.work_precision.quadrature import ALL, Reference, errors, study_quadratures
+from pipeline.evaluation.work_precision.rows import REFERENCE, Contestant, Precision
+from pipeline.evaluation.work_precision.stopwatch import race
+from pipeline.evaluation.work_precision.trials import Pokes, Trial, draw_trial, laid
+from pipeline.physics import flow
+from pipeline.physics.magnet import cuboid_field
+from pipeline.physics.nodes import CHOSEN, SKIN_SIDE_M, Quadrature, place_nodes
+from pipeline.physics.skin import draw_skin
+from pipeline.physics.viscoelastic import SKIN
+from tests.physics.test_board import design as board_design
+from tests.physics.test_board import draw_board, no_spread, spreads
+from tests.physics.test_skin import design
+
+BOARD = draw_board(board_design(), no_spread(), seed=0, name="b0")
+POKES = Pokes(places_mm=((6.35, 0.0), (-2.0, 5.0)), depths_mm=(0.6, 1.2))
+COARSE = Quadrature(1e-3, 4)
+
+
+def trial(board=BOARD, pokes=POKES, name="s0", **spread) -> Trial:
+    return draw_trial(board, design(), spreads=spreads(**spread), seed=0, name=name, pokes=pokes)
+
+
+def rules(*sizes) -> tuple[Quadrature, ...]:
+    return tuple(Quadrature(1e-3 * cell_mm, layers_n) for cell_mm, layers_n in sizes)
+
+
+TRIED = {
+    "Gauss in z": rules((2, 6), (1, 6), (0.5, 4), (0.5, 6)),
+    "midpoint": rules((0.5, 4), (0.5, 8)),
+    "Gauss in x, y and z": rules((2, 6), (1, 6)),
+    "kernel alone": rules((1, 4)),
+    "magpylib.core dipoles": rules((1, 4)),
+    "magpylib dipoles": rules((1, 4)),
+    "magpylib cuboids": rules((2, 2), (1, 4)),
+}
+
+
+@pytest.fixture(scope="module")
+def quadratures():
+    reference = Reference(coarser=Quadrature(1e-3, 8), finer=Quadrature(0.7e-3, 8), per_cell_n=3)
+    return study_quadratures([trial()], TRIED, reference)
+
+
+def error_of(rows, method, cell_mm=None, layers_n=None) -> float:
+    setting = None if cell_mm is None else written(Quadrature(1e-3 * cell_mm, layers_n))
+    (row,) = [row for row in rows if row.method == method and setting in (None, row.setting)]
+    return row.error
+
+
+def test_a_skin_laid_on_the_products_nodes_is_the_drawn_one_but_for_its_unevenness():
+    even = spreads(skin_amplitude=0.0, skin_filler=0.0)
+    drawn = draw_skin(design(), even, seed=0, name="s3", rule=COARSE)
+    ours = laid(trial(name="s3"), place_nodes(drawn.thickness_m, COARSE))
+    np.testing.assert_array_equal(ours.nodes_m, drawn.nodes_m)
+    np.testing.assert_allclose(ours.moments_A_m2, drawn.moments_A_m2, rtol=1e-14)  # a factor of one less
+    assert (ours.seat_m == drawn.seat_m).all()
+    assert ours.depth_zero_m == drawn.depth_zero_m
+
+
+def test_pokes_sit_on_the_skins_pattern_wherever_that_sits_on_the_board():
+    one = trial(skin_seat_mm=1.0)
+    assert np.abs(one.skin.seat_m).min() > 0
+    places_mm = 1e3 * (one.pokes_m[:, :2] - one.skin.seat_m)
+    np.testing.assert_allclose(places_mm, POKES.places_mm * 2, atol=1e-12)
+    np.testing.assert_allclose(1e3 * one.pokes_m[:, 2], [0.6, 0.6, 1.2, 1.2])
+
+
+def test_a_poke_that_would_not_touch_is_refused():
+    with pytest.raises(ParamsError, match="skin s0: true depth of every poke must be above 0 m"):
+        trial(pokes=Pokes(((0.0, 0.0),), (0.0,)), skin_depth_zero_mm=0.0)
+
+
+@pytest.mark.parametrize(("cell_mm", "layers_n"), [(0.5, 4), (3.0, 1)])
+def test_the_mean_square_over_midpoints_is_short_by_the_square_of_the_number_of_boxes(cell_mm, layers_n):
+    rest = midpoints(2e-3, Quadrature(1e-3 * cell_mm, layers_n))
+    volume_m3, boxes_n = SKIN_SIDE_M**2 * 2e-3, np.ceil(1e3 * SKIN_SIDE_M / cell_mm)
+    assert rest.volumes_m3.sum() == pytest.approx(volume_m3, rel=1e-12)
+    for axis, (size_m, parts_n) in enumerate([(SKIN_SIDE_M, boxes_n), (SKIN_SIDE_M, boxes_n), (2e-3, layers_n)]):
+        off_m = rest.nodes_m[:, axis] - (1e-3 if axis == 2 else 0.0)
+        mean_m2 = rest.volumes_m3 @ off_m**2 / volume_m3
+        assert mean_m2 == pytest.approx(size_m**2 / 12 * (1 - 1 / parts_n**2), rel=1e-9, abs=1e-18)
+
+
+def test_the_boxes_of_a_lattice_touch_and_have_its_volumes():
+    rule = Quadrature(0.7e-3, 5)
+    rest, sides_m = midpoints(2e-3, rule), box_m(2e-3, rule)
+    for places_m, side_m in zip(rest.nodes_m.T, sides_m, strict=True):
+        np.testing.assert_allclose(np.diff(np.unique(np.round(places_m, 12))), side_m, rtol=1e-6)
+    np.testing.assert_allclose(rest.volumes_m3, np.prod(sides_m))
+
+
+def test_a_box_that_is_lifted_changes_the_field_as_charged_faces_do(monkeypatch):
+    # One box is the whole skin, far too wide for a dipole; in the middle of like poles it is magnetised along z.
+    whole_skin, lift_m = Quadrature(SKIN_SIDE_M, 1), np.array([0.0, 0.0, 1e-3])
+    like = design(polarity="same")
+    one = draw_trial(BOARD, like, spreads=no_spread(), seed=0, name="s0", pokes=Pokes(((0.0, 0.0),), (1.0,)))
+    skin = laid(one, midpoints(one.skin.thickness_m, whole_skin))
+    lifted = Path(skin.nodes_m[None] + lift_m, np.zeros((1, 1, 3)))
+    monkeypatch.setattr(methods, "paths", lambda *_: lifted)
+    found_T = methods.magpylib_cuboids(one, whole_skin).call()[0]
+    sides_m = (SKIN_SIDE_M, SKIN_SIDE_M, one.skin.thickness_m)
+    jx_T, jy_T, jz_T = mu_0 * skin.moments_A_m2[0] / np.prod(sides_m)
+    assert max(abs(jx_T), abs(jy_T)) < 1e-12 * abs(jz_T)
+    before_m = BOARD.chips_m - skin.nodes_m
+    after_T, before_T = (cuboid_field(at_m, jz_T, sides_m=sides_m) for at_m in (before_m - lift_m, before_m))
+    np.testing.assert_allclose(found_T, after_T - before_T, atol=1e-9 * abs(jz_T))
+
+
+def test_gauss_nodes_in_every_cell_integrate_polynomials_that_midpoints_cannot():
+    rest = gauss_everywhere(2e-3, Quadrature(5e-3, 3), per_cell_n=3)
+    x, y, z = 2 * rest.nodes_m.T / np.array([[SKIN_SIDE_M], [SKIN_SIDE_M], [4e-3]])
+    share = rest.volumes_m3 / (SKIN_SIDE_M**2 * 2e-3)
+    for power_x, power_y, power_z in ((0, 0, 0), (4, 4, 5), (2, 4, 4), (1, 2, 3)):
+        mean = (power_x % 2 == 0) / (power_x + 1) / (power_y + 1) / (power_z + 1)
+        assert share @ (x**power_x * y**power_y * z**power_z) == pytest.approx(mean, rel=1e-12, abs=1e-15)
+
+
+def test_a_path_goes_where_the_flow_carries_the_very_node():
+    one = trial()
+    skin = laid(one, place_nodes(one.skin.thickness_m, COARSE))
+    path, poke_m, few = paths(one, skin), one.pokes_m[3], slice(700, 1100, 40)
+    away_m = skin.nodes_m[few, :2] - poke_m[:2]
+    r_m, z_m, depths_m = np.linalg.norm(away_m, axis=1), skin.nodes_m[few, 2], one.pokes_m[:, 2] + skin.depth_zero_m
+    press = flow.Press(skin.thickness_m, skin.tip_radius_m, skin.base)
+    there = flow.follow(r_m, z_m, flow.steps(tuple(np.unique(depths_m)), press), press=press)[-1]
+    outward_m = (path.nodes_m[3, few, :2] - poke_m[:2]) * away_m / r_m[:, None]
+    assert np.abs(there.r_m - r_m).max() > 20e-6
+    # 2 um: the spline between the places where the flow was computed; the material moves by up to 1 mm
+    np.testing.assert_allclose(outward_m.sum(axis=1), there.r_m, atol=2e-6)
+    np.testing.assert_allclose(path.nodes_m[3, few, 2], there.z_m, atol=2e-6)
+    turn_rad = np.cross(path.turns_rad[3, few], [0.0, 0.0, 1.0])[:, :2]  # from z towards r
+    angle_rad = (turn_rad * away_m / r_m[:, None]).sum(axis=1)
+    np.testing.assert_allclose(angle_rad, flow.angle(there.f), atol=5e-3)
+
+
+def test_errors_are_those_of_the_skin_that_is_worst_at_each_depth():
+    trials = [trial(), trial(name="s1")]
+    truth_T = [np.ones((4, 5, 3)), 2 * np.ones((4, 5, 3))]
+    factors = [np.array([1.1, 0.9, 1.0, 1.0]), np.array([1.0, 1.0, 1.3, 1.3])]
+    found_T = [one * factor[:, None, None] for one, factor in zip(truth_T, factors, strict=True)]
+    parts = errors(trials, found_T, truth_T)
+    assert parts == {
+        "0.6 mm": pytest.approx(0.1),
+        "1.2 mm": pytest.approx(0.3),
+        ALL: pytest.approx(np.sqrt((2 * 0.1**2 + 2 * 0.6**2) / (4 + 16))),
+    }
+
+
+def test_midpoint_layers_are_wrong_by_what_the_specification_says_and_gauss_layers_are_not(quadratures):
+    rows, _ = quadratures
+    # PHYSICS 0.1: 9-74 % at 0.5 mm x 4 layers; about 1 % with six Gauss nodes
+    assert 0.09 < error_of(rows, "midpoint", 0.5, 4) < 0.74
+    assert error_of(rows, "Gauss in z", 0.5, 6) < 0.02
+    assert error_of(rows, "midpoint", 0.5, 8) > 2 * error_of(rows, "Gauss in z", 0.5, 4)
+
+
+def test_refining_any_method_makes_it_better(quadratures):
+    rows, _ = quadratures
+    widths = [error_of(rows, "Gauss in z", cell_mm, 6) for cell_mm in (2, 1, 0.5)]
+    assert widths[0] > 2 * widths[1] > 4 * widths[2]
+    assert error_of(rows, "Gauss in z", 0.5, 4) > error_of(rows, "Gauss in z", 0.5, 6)
+    assert error_of(rows, "midpoint", 0.5, 4) > 2 * error_of(rows, "midpoint", 0.5, 8)
+    assert error_of(rows, "Gauss in x, y and z", 2, 6) > 2 * error_of(rows, "Gauss in x, y and z", 1, 6)
+    assert error_of(rows, "magpylib cuboids", 2, 2) > error_of(rows, "magpylib cuboids", 1, 4)
+
+
+def test_the_reference_is_ten_times_as_good_as_a_rule_must_be(quadratures):
+    rows, _ = quadratures
+    assert rows[0].method == REFERENCE
+    assert 0 < rows[0].error < 0.1 * ERROR_MAX
+
+
+def test_magpylib_and_the_kernel_say_the_same_of_the_same_nodes(quadratures):
+    _, contestants = quadratures
+    calls = {one.key[1]: one.call for one in contestants if one.key[2] == written(COARSE)}
+    kernel_T = calls["kernel alone"]()
+    for name in ("magpylib.core dipoles", "magpylib dipoles"):
+        # The others lose digits to the difference of two sums, and magpylib's mu_0 is of another year.
+        np.testing.assert_allclose(calls[name](), kernel_T, atol=1e-7 * np.abs(kernel_T).max())
+
+
+def test_the_flow_of_the_product_and_that_of_the_paths_are_the_same():
+    one = trial()
+    ours_T, theirs_T = (METHODS[name](one, COARSE).call() for name in ("Gauss in z", "kernel alone"))
+    # 0.5 %: both interpolate, between other places; without the rotation dB would be wrong by more than itself
+    assert np.linalg.norm(ours_T - theirs_T) < 0.005 * np.linalg.norm(ours_T)
+
+
+def test_far_away_boxes_are_dipoles():
+    deep = replace(BOARD, chips_m=BOARD.chips_m - (0.0, 0.0, 40e-3))
+    one = trial(deep)
+    boxes_T = METHODS["magpylib cuboids"](one, Quadrature(2e-3, 2)).call()
+    dipoles_T = whole(one, midpoints(one.skin.thickness_m, Quadrature(2e-3, 2))).call()
+    # 1 %: (cell / distance)^2 is 0.2 %, and the flows are interpolated differently
+    assert np.linalg.norm(boxes_T - dipoles_T) < 0.01 * np.linalg.norm(dipoles_T)
+
+
+def test_every_rule_has_one_row_and_may_be_timed(quadratures):
+    rows, contestants = quadratures
+    asked = {(method, written(rule)) for method, own in TRIED.items() for rule in own}
+    assert {(row.method, row.setting) for row in rows[1:]} == asked
+    assert len(rows) == 1 + len(asked)
+    assert [one.key for one in contestants] == [row.key for row in rows[1:]]
+    assert all(row.error == max(row.parts.values()) for row in rows)
+    nodes_n = {row.setting: row.work_n for row in rows if row.method == CANDIDATES}
+    assert nodes_n[written(CHOSEN)] == len(place_nodes(1e-3, CHOSEN).nodes_m)
+
+
+def test_a_method_nobody_knows_is_refused():
+    with pytest.raises(ParamsError, match="methods must be among"):
+        study_quadratures([trial()], {"Simpson": rules((1, 4))})
+
+
+def row(method, cell_mm, layers_n, nodes_n, error) -> Precision:
+    return Precision("dB", method, f"{cell_mm:g} mm x {layers_n}", nodes_n, error)
+
+
+GOOD, BETTER = row(CANDIDATES, 0.5, 5, 8820, 0.015), row(CANDIDATES, 0.5, 6, 10584, 0.004)
+ROWS = [
+    row(CANDIDATES, 1, 4, 1936, 0.08),
+    BETTER,
+    GOOD,
+    row("midpoint", 2, 9, 900, 0.001),  # the product cannot lay these
+]
+
+
+def test_the_cheapest_rule_below_the_limit_is_chosen_and_compared_with_the_one_in_use():
+    choice = choose(ROWS, used=CHOSEN)
+    assert (choice.setting, choice.nodes_n, choice.error) == ("0.5 mm x 5", 8820, 0.015)
+    assert (choice.used_setting, choice.used_nodes_n, choice.used_error) == ("0.5 mm x 6", 10584, 0.004)
+    assert choice.differs
+    assert not choose(ROWS, used=CHOSEN, error_max=0.01).differs
+
+
+def test_where_no_rule_is_good_enough_none_is_chosen():
+    choice = choose(ROWS, used=CHOSEN, error_max=0.001)
+    assert choice.setting is None
+    assert choice.differs
+
+
+def test_a_rule_in_use_that_was_not_tried_has_no_error():
+    assert choose(ROWS, used=Quadrature(0.1e-3, 20)).used_error is None
+
+
+@given(
+    st.lists(st.tuples(st.integers(1, 10**5), st.floats(0, 1)), max_size=8),
+    st.floats(0, 1),
+    st.floats(0, 1),
+)
+def test_who_accepts_more_error_never_pays_more(points, strict, extra):
+    rows = [row(CANDIDATES, i, 1, nodes_n, error) for i, (nodes_n, error) in enumerate(points)]
+    strictly, loosely = (choose(rows, used=CHOSEN, error_max=most) for most in (strict, strict + extra))
+    if strictly.nodes_n is not None:
+        assert strictly.error < strict
+        assert loosely.nodes_n <= strictly.nodes_n
+
+
+def test_contestants_run_in_turn_and_backwards_in_every_other_round():
+    ran = []
+    contestants = [Contestant(("study", name, ""), lambda name=name: ran.append(name), 1) for name in "abc"]
+    assert [one.method for one in race(contestants, 3)] == ["a", "b", "c"]
+    assert "".join(ran) == "abc" + "cba" + "abc"
+
+
+def test_seconds_are_medians_an_indentation():
+    naps_s = iter([0.005, 0.5, 0.005])
+    (slow,) = race([Contestant(("study", "naps", "x"), lambda: time.sleep(next(naps_s)), 5)], 3)
+    assert slow.key == ("study", "naps", "x")
+    assert 0.001 <= slow.median_s < 0.1
+    assert slow.repeats_n == 3
+
+
+def test_a_race_without_rounds_is_refused():
+    with pytest.raises(ParamsError, match="repeats_n must be 1 or more"):
+        race([], 0)
+
+
+RATIOS = (1e3, 1e4, 1e5, 1e6, 1e7, 1e8)
+SMALL = Sweep(RATIOS, tolerances=(1e-3, 1e-6), euler_steps_s=(1e-2, 1e-3), pokes_n=1, calls_per_poke_max_n=5000)
+
+
+@pytest.fixture(scope="module")
+def relaxations():
+    return study_integrators(SMALL)
+
+
+def of(rows, ratio, method) -> list[Precision]:
+    return [row for row in rows if row.study == integrators.study(ratio) and row.method == method]
+
+
+def test_the_skins_own_relaxation_has_its_own_stiffness():
+    np.testing.assert_allclose(stiff(1e7).tau_s, SKIN.tau_s, rtol=1e-12)
+
+
+@pytest.mark.parametrize("ratio", RATIOS)
+def test_a_stiffness_is_the_ratio_of_the_slowest_relaxation_to_the_fastest(ratio):
+    prony = stiff(ratio)
+    assert prony.tau_s.max() / prony.tau_s.min() == pytest.approx(ratio, rel=1e-9)
+    assert prony.tau_s.max() == SKIN.tau_s.max()
+    assert (prony.share == SKIN.share).all()
+
+
+def test_the_exact_force_is_the_convolution_with_the_relaxation_function():
+    # Lee & Radok 1960, by adaptive quadrature instead of by states
+    prony, history = stiff(1e5), poke_often(2)
+    speeds = np.diff(history.elastic) / np.diff(history.time_s)
+
+    def relaxation(t_s):
+        return 1 - (prony.share * -np.expm1(-t_s / prony.tau_s)).sum()
+
+    for end_i, force in enumerate(exact_forces(history, prony), start=1):
+        end_s = history.time_s[end_i]
+        pieces = zip(history.time_s[:end_i], history.time_s[1 : end_i + 1], speeds[:end_i], strict=True)
+        parts = [v * quad(lambda s, t=end_s: relaxation(t - s), a, b, epsabs=1e-13)[0] for a, b, v in pieces]
+        assert force == pytest.approx(sum(parts), rel=1e-10, abs=1e-12)
+
+
+def test_a_history_of_twenty_pokes_takes_thirty_seconds():
+    history = poke_often(20)
+    assert history.time_s[-1] == pytest.approx(30.0)
+    assert len(history.time_s) == 61
+    assert (np.diff(history.time_s) > 0).all()
+    assert (history.elastic[1:4] == [1.0, 1.0, 0.0]).all()
+
+
+@pytest.mark.parametrize("ratio", RATIOS)
+def test_the_exact_update_is_exact_however_stiff(relaxations, ratio):
+    (exact,) = of(relaxations[0], ratio, EXACT)
+    assert exact.error < 1e-14
+    assert exact.work_n == 0
+
+
+def test_every_method_has_a_row_for_every_stiffness_and_setting(relaxations):
+    rows, contestants = relaxations
+    asked = [(EXACT, 1), *((name, 2) for name in SOLVERS), (EULER, 2)]
+    for ratio in RATIOS:
+        for method, settings_n in asked:
+            assert len(of(rows, ratio, method)) == settings_n
+    assert len({row.key for row in rows}) == len(rows) == 11 * len(RATIOS)
+    assert {one.key for one in contestants} == {row.key for row in rows if row.failure is None}
+    assert all((row.error is None) == (row.failure is not None) for row in rows)
+
+
+@pytest.mark.parametrize("method", SOLVERS)
+def test_a_smaller_tolerance_costs_calls_and_gives_a_smaller_error(relaxations, method):
+    for ratio in RATIOS[1:5]:  # at 1e3 even a loose step is as exact as a solver can be
+        loose, tight = of(relaxations[0], ratio, method)
+        assert tight.error < loose.error
+        assert tight.work_n > loose.work_n
+
+
+def test_euler_is_of_first_order(relaxations):
+    # 20 %: the next order, with a step of a thousandth of the shortest relaxation time
+    wide, narrow = of(relaxations[0], 1e3, EULER)
+    assert wide.error / narrow.error == pytest.approx(10, rel=0.2)
+
+
+@pytest.mark.parametrize(("step_over_fastest", "stable"), [(1.9, True), (2.1, False)])
+def test_euler_diverges_above_twice_the_fastest_relaxation_and_is_listed(step_over_fastest, stable):
+    sweep = replace(SMALL, ratios=(1e7,), tolerances=(), euler_steps_s=(1e-3 * step_over_fastest,), pokes_n=4)
+    rows, contestants = study_integrators(sweep)
+    (euler,) = of(rows, 1e7, EULER)
+    if stable:
+        assert euler.error < 1e-2
+    else:
+        assert euler.error is None
+        assert euler.failure.startswith("diverged: error")
+        assert euler.key not in {one.key for one in contestants}
+
+
+def test_euler_beyond_any_number_is_listed_as_diverged(relaxations):
+    assert of(relaxations[0], 1e8, EULER)[0].failure.startswith("diverged")
+
+
+@pytest.mark.parametrize("method", [*SOLVERS, EULER])
+def test_who_works_too_long_is_stopped_and_listed(method):
+    rows, _ = study_integrators(replace(SMALL, ratios=(1e6,), calls_per_poke_max_n=20))
+    for stopped in of(rows, 1e6, method):
+        assert (stopped.error, stopped.work_n) == (None, 20)
+        assert stopped.failure == "stopped after 20 right-hand sides"
+
+
+def test_only_an_explicit_solver_is_stopped_at_the_highest_stiffness(relaxations):
+    failed = {name for name in SOLVERS for one in of(relaxations[0], 1e8, name) if one.failure}
+    assert failed == {"RK45"}
+
+
+def test_a_solver_that_reports_failure_is_listed_with_its_words(monkeypatch):
+    class Gone:
+        success, message = False, "Required step size is less than spacing between numbers."
+
+    monkeypatch.setattr(integrators, "solve_ivp", lambda *_, **__: Gone)
+    rows, _ = study_integrators(replace(SMALL, ratios=(1e7,)))
+    assert {one.failure for one in of(rows, 1e7, "BDF")} == {Gone.message}
+
+
+def test_more_pokes_leave_the_error_and_the_work_of_a_poke_nearly_as_they_are():
+    # So few pokes may stand for many; a factor of two, where errors span ten decades.
+    few, many = (
+        study_integrators(replace(SMALL, ratios=(1e7,), tolerances=(1e-5,), pokes_n=pokes_n))[0] for pokes_n in (2, 6)
+    )
+    for one, other in zip(few[1:], many[1:], strict=True):
+        if one.failure is None:
+            assert 0.5 < other.error / one.error < 2
+            assert 0.8 < other.work_n / one.work_n / 3 < 1.25
+
+
+def test_the_same_sweep_gives_the_same_rows(relaxations):
+    assert study_integrators(SMALL)[0] == relaxations[0]
