@@ -1,0 +1,37 @@
+"""What a scene's physics does without: measured rows -> one table. Sees numbers, never physics."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import pandas as pd
+
+MEANING = (
+    "Errors that leaving a term out makes, measured on this scene's first skin: of all changes of field together (root "
+    "of the mean square), the largest of the field at rest before the no-load reading is taken off, and of the force. "
+    "Not quantified, and always left out: the skin's corner tabs and screws, and how its base is held in a drag."
+)
+
+
+def left_out_table(rows: Sequence[Mapping[str, Any]], source: str) -> pd.DataFrame:
+    """Show every term, what was left out first."""
+    ordered = sorted(rows, key=lambda row: row["done"] != "left out")
+    table = pd.DataFrame(
+        {
+            "term": row["term"],
+            "in this scene": row["done"],
+            "error of the change of field, %": _show(row["field_pct"]),
+            "error of the field at rest, µT": _show(row["rest_uT"]),
+            "error of the force, %": _show(row["force_pct"]),
+            "measured": row["how"],
+            "source": source,
+        }
+        for row in ordered
+    )
+    table.attrs["meaning"] = MEANING
+    return table
+
+
+def _show(value: float | None) -> str:
+    if value is None:
+        return "–"
+    return f"{value:.0f}" if value >= 10 else f"{value:.2g}"

@@ -1,0 +1,77 @@
+"""What leaving physics out costs, against closed forms of the terms; what scales with what as laws."""
+
+import numpy as np
+import pytest
+
+from pipeline.evaluation import left_out
+from pipeline.evaluation.left_out import AGEING, RELAXATION, measure
+from pipeline.physics.board import draw_board
+from pipeline.physics.nodes import Quadrature
+from pipeline.physics.skin import changes_of_field, draw_skin
+from pipeline.physics.viscoelastic import force_left
+from pipeline.physics.wear import softening
+from tests.synthesis.scene import AGEING as SIZES
+from tests.synthesis.scene import GRID, synthesis, with_protocol
+
+FEW = GRID | {"passes_n": 1}
+INDENTATIONS_N = 130
+
+
+@pytest.fixture(autouse=True, scope="module")
+def few_nodes():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(left_out, "COARSE", Quadrature(2e-3, 3))
+        yield
+
+
+def rows_of(scene):
+    return {row.term: row for row in measure(scene, seed=1)}
+
+
+@pytest.fixture(scope="module")
+def rows(few_nodes):
+    return rows_of(with_protocol("grid", FEW))
+
+
+def test_terms_that_a_scene_does_without_are_left_out_and_others_are_kept(rows):
+    assert {term for term, row in rows.items() if row.done == "left out"} == {
+        "ageing", "relaxation", "temperature", "the powder's own field"
+    }  # fmt: skip
+    aged = rows_of(with_protocol("grid", FEW | {"terms": ["ageing"]}, terms={"ageing": SIZES}))
+    assert aged["ageing"].done == "kept"
+
+
+def test_ageing_and_relaxation_cost_the_force_what_their_formulas_say(rows):
+    left = softening(np.array([INDENTATIONS_N - 1]), settling=AGEING.settling, ageing=AGEING.ageing)[0]
+    assert rows["ageing"].force_pct == pytest.approx(100 * (1 / left - 1), rel=1e-9)
+    assert rows["relaxation"].force_pct == pytest.approx(100 * (1 / force_left(RELAXATION) - 1), rel=1e-9)
+    assert rows["ageing"].field_pct == rows["relaxation"].field_pct == 0  # displacement is prescribed (PHYSICS 0)
+
+
+def test_a_kelvin_costs_0_12_percent_of_every_field(rows):
+    of = synthesis()
+    board = draw_board(of.main_boards.design, of.spreads, seed=1, name="b0")
+    skin = draw_skin(of.skin, of.spreads, seed=1, name="b0_s0", rule=of.main_boards.quadrature.quadrature())
+    rest_T, _ = changes_of_field(board, skin, np.zeros((0, 3)))
+    assert rows["temperature"].field_pct == pytest.approx(100 * (1 / 0.9988 - 1), rel=1e-6)
+    assert rows["temperature"].rest_uT == pytest.approx(0.0012e6 * np.abs(rest_T).max(), rel=1e-6)
+
+
+def test_what_is_kept_could_not_go(rows):
+    # PHYSICS 8: increments 16-23 % of a bonded skin at 1.2 mm; of a sliding one the far field, which is linear, counts
+    assert rows["increments"].field_pct > 2
+    assert rows["rotation of the magnetisation"].field_pct > 5
+    assert rows["slipping base"].field_pct > 50
+    assert rows["the chips' steps"].field_pct < 0.5
+
+
+def test_the_powders_own_field_matters_by_how_much_powder_there_is(rows):
+    half = rows_of(with_protocol("grid", FEW, skin=synthesis("skin", saturation_T=0.055).skin.model_dump()))
+    # 10 %: the field that acts is half as strong, and the magnetisation is not quite linear in it
+    assert half["the powder's own field"].field_pct == pytest.approx(
+        rows["the powder's own field"].field_pct / 2, rel=0.1
+    )
+
+
+def test_every_row_says_how_it_was_measured(rows):
+    assert all(row.how for row in rows.values())
