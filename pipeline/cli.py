@@ -178,9 +178,9 @@ def readme(check: Annotated[bool, typer.Option("--check", help="Only tell whethe
     dag = subprocess.run(
         [sys.executable, "-m", "dvc", "dag", "--md"], capture_output=True, text=True, check=True
     ).stdout
-    blocks = blocks_of(
-        io.read_json(ROOT / "reports" / scene / "numbers.json"), dag, read_yaml(ROOT / "dvc.yaml")["stages"]
-    )
+    numbers = {file.parent.name: io.read_json(file) for file in sorted((ROOT / "reports").glob("*/numbers.json"))}
+    recorded = [own for own in numbers.values() if own["provenance"]["source"] == "recorded"]
+    blocks = blocks_of(numbers[scene], recorded, dag, read_yaml(ROOT / "dvc.yaml")["stages"])
     file = ROOT / "README.md"
     before = file.read_text(encoding="utf-8")
     after = fill(before, blocks)

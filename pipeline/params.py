@@ -15,6 +15,8 @@ from pipeline.errors import ParamsError, complain
 from pipeline.learning.recipe import Training
 from pipeline.strict import Strict, parse, read_yaml
 
+Study = Literal["verification", "stability", "runtime", "left_out"]
+
 # question -> the section (and stage) that answers it, and the keys of `split` that draw its folds
 ANSWERED_BY: dict[str, str] = {
     "lobo": "train_multi",
@@ -29,6 +31,27 @@ DRAWN_WITH: dict[str, set[str]] = {
     "single_temporal": {"temporal_test_fraction"},
 }
 ARMS = ("train_single", "train_multi")
+# questions about the physics of a simulated scene -> the stage that answers it
+STUDIED_BY: dict[str, str] = {
+    "verification": "verify",
+    "stability": "stability",
+    "runtime": "runtime",
+    "left_out": "leave_out",
+}
+STUDIES = tuple(STUDIED_BY.values())
+MAIN_PROTOCOL = "grid"  # folds are drawn on its captures
+
+
+class OnBoards(Strict, extra="allow"):
+    """A protocol, as far as the plan must know it: on which kind of boards it runs."""
+
+    boards: str
+
+
+class Simulation(Strict, extra="allow"):
+    """Section `simulate`; the rest is checked by `synthesis`, so that only its stages depend on physics."""
+
+    protocols: Annotated[dict[str, OnBoards], Field(min_length=1)]
 
 
 class Scene(Strict):
@@ -36,10 +59,11 @@ class Scene(Strict):
 
     source: Literal["simulated", "recorded"]
     seed: Annotated[int, Field(ge=0)]
-    questions: Annotated[tuple[Question, ...], Field(min_length=1)]
+    questions: Annotated[tuple[Literal[Question, Study], ...], Field(min_length=1)]
     selection: Selection
     split: Split
-    simulate: dict[str, Any] | None = None  # checked by dataset.synthetic, so that only its stage depends on physics
+    simulate: Simulation | None = None
+    runtime: dict[str, Any] | None = None  # checked by the stage, as `simulate` is
     train_single: Training | None = None
     train_multi: Training | None = None
 
@@ -47,15 +71,37 @@ class Scene(Strict):
     def _sections_follow_questions(self) -> "Scene":
         if (self.simulate is not None) != (self.source == "simulated"):
             raise ValueError("section simulate stands in a scene if and only if its source is simulated")
-        asked = {ANSWERED_BY[question] for question in self.questions}
+        asked = {ANSWERED_BY[question] for question in self.trained}
         for arm in ARMS:
             if (getattr(self, arm) is not None) != (arm in asked):
                 asking = [question for question, stage in ANSWERED_BY.items() if stage == arm]
                 raise ValueError(f"section {arm} stands in a scene if and only if it asks one of {asking}")
-        needed = set().union(*(DRAWN_WITH[question] for question in self.questions))
+        needed = set().union(*(DRAWN_WITH[question] for question in self.trained))
         if needed != self.split.model_fields_set:
             raise ValueError(f"split holds exactly what the questions need, {sorted(needed)}")
         return self
+
+    @model_validator(mode="after")
+    def _questions_fit_the_source(self) -> "Scene":
+        if not self.trained:
+            raise ValueError(f"questions holds at least one of {sorted(ANSWERED_BY)}")
+        if self.simulate is None and self.studied:
+            raise ValueError(f"questions {list(self.studied)} are about physics: only a simulated scene asks them")
+        if self.simulate is not None and self.trained and MAIN_PROTOCOL not in self.simulate.protocols:
+            raise ValueError(f"a scene that asks {list(self.trained)} has a protocol named {MAIN_PROTOCOL}")
+        if (self.runtime is not None) != ("runtime" in self.questions):
+            raise ValueError("section runtime stands in a scene if and only if it asks runtime")
+        return self
+
+    @property
+    def trained(self) -> tuple[str, ...]:
+        """The questions that trainings answer."""
+        return tuple(question for question in self.questions if question in ANSWERED_BY)
+
+    @property
+    def studied(self) -> tuple[str, ...]:
+        """The questions about the physics."""
+        return tuple(question for question in self.questions if question in STUDIED_BY)
 
 
 class IngestItem(Strict):
@@ -65,15 +111,35 @@ class IngestItem(Strict):
     capture: str
 
 
+class ProtocolItem(Strict):
+    """One protocol of a simulated scene, and the boards it needs; its key names the folder of its captures."""
+
+    scene: str
+    protocol: str
+    boards: str
+
+
+class DescribeItem(Strict):
+    """One folder of captures, and the name of its description."""
+
+    scene: str
+    protocol: str
+
+
 class Stages(Strict):
     """Which scenes each stage of dvc.yaml runs for; made from the scenes by `reskin scenes use`, never by hand."""
 
-    simulate: tuple[str, ...]
-    ingest_simulated: tuple[str, ...]
+    simulate: dict[str, ProtocolItem]
+    ingest_simulated: dict[str, ProtocolItem]
     ingest: dict[str, IngestItem]
+    describe: dict[str, DescribeItem]
     split: dict[str, tuple[str, ...]]  # scene -> its recorded captures; none for a simulated one
     train_single: tuple[str, ...]
     train_multi: tuple[str, ...]
+    verify: tuple[str, ...]
+    stability: tuple[str, ...]
+    runtime: tuple[str, ...]
+    leave_out: tuple[str, ...]
     publish: tuple[str, ...]
     report: tuple[str, ...]
 
@@ -98,7 +164,8 @@ def read_params(path: Path) -> Params:
 
 def check_planned(name: str, scene: Scene, params: Params, where: str) -> None:
     """Raise if `params.yaml` has no stage for a question that the scene asks: it was added by hand since."""
-    unplanned = [arm for arm in arms_of(scene) if name not in getattr(params.stages, arm)]
+    wanted = arms_of(scene) + [STUDIED_BY[question] for question in scene.studied]
+    unplanned = [stage for stage in wanted if name not in getattr(params.stages, stage)]
     if unplanned:
         raise ParamsError(
             complain(
@@ -110,7 +177,12 @@ def check_planned(name: str, scene: Scene, params: Params, where: str) -> None:
 
 def arms_of(scene: Scene) -> list[str]:
     """Name the training stages that answer a scene's questions."""
-    return [arm for arm in ARMS if arm in {ANSWERED_BY[question] for question in scene.questions}]
+    return [arm for arm in ARMS if arm in {ANSWERED_BY[question] for question in scene.trained}]
+
+
+def described_in(scene: Scene) -> list[str]:
+    """Name the descriptions of a scene's captures: one a protocol, or that of the recorded ones."""
+    return ["recorded"] if scene.simulate is None else list(scene.simulate.protocols)
 
 
 def captures_of(scene: str, params: Params, indentations: Path) -> list[str]:

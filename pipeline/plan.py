@@ -12,7 +12,18 @@ from ruamel.yaml import YAML
 
 from pipeline import io
 from pipeline.errors import ParamsError, complain
-from pipeline.params import ANSWERED_BY, ARMS, Params, Scene, read_params, read_scene
+from pipeline.params import (
+    ARMS,
+    MAIN_PROTOCOL,
+    STUDIED_BY,
+    STUDIES,
+    Params,
+    Scene,
+    arms_of,
+    described_in,
+    read_params,
+    read_scene,
+)
 from pipeline.registry import Registry, read_registry
 from pipeline.strict import read_yaml
 
@@ -22,7 +33,6 @@ SCENES = "pipeline/scenes"
 
 def make_plan(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, Any]:
     """Derive the section `stages`: a question that no scene asks leaves its stage with an empty list."""
-    simulated = [name for name, scene in scenes.items() if scene.source == "simulated"]
     captures = {name: sorted(registry.captures.get(name, {})) for name in scenes}
     for name, scene in scenes.items():
         if scene.source == "recorded" and not captures[name]:
@@ -35,18 +45,40 @@ def make_plan(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, Any]
                     f"Try: reskin add RECORDING --scene {name} ...",
                 )
             )
-    asked = {name: {ANSWERED_BY[question] for question in scene.questions} for name, scene in scenes.items()}
+    asked = {name: _stages_of(scene) for name, scene in scenes.items()}
     pairs = [(name, capture) for name in scenes for capture in captures[name]]
     ingest = {f"{name}-{capture}": {"scene": name, "capture": capture} for name, capture in pairs}
     if len(ingest) < len(pairs):
         raise ParamsError(
             complain("stage ingest", "scene-capture", "unlike any other", "two that read the same", "Rename a scene.")
         )
+    simulated = _folders(scenes)
+    described = {key: {"scene": item["scene"], "protocol": item["protocol"]} for key, item in simulated.items()} | {
+        name: {"scene": name, "protocol": described_in(scene)[0]} for name, scene in scenes.items() if captures[name]
+    }
     plan: dict[str, Any] = {
-        "simulate": simulated, "ingest_simulated": simulated, "ingest": ingest, "split": captures,
+        "simulate": simulated, "ingest_simulated": simulated, "ingest": ingest, "describe": described,
+        "split": captures,
     }  # fmt: skip
-    plan |= {arm: [name for name in scenes if arm in asked[name]] for arm in ARMS}
+    plan |= {stage: [name for name in scenes if stage in asked[name]] for stage in (*ARMS, *STUDIES)}
     return plan | {"report": list(scenes), "publish": list(scenes)}
+
+
+def _stages_of(scene: Scene) -> set[str]:
+    return {*arms_of(scene), *(STUDIED_BY[question] for question in scene.studied)}
+
+
+def _folders(scenes: Mapping[str, Scene]) -> dict[str, dict[str, str]]:
+    """Name the folder of each protocol's captures: the scene's own for the main one."""
+    folders: dict[str, dict[str, str]] = {}
+    for name, scene in scenes.items():
+        for protocol, own in scene.simulate.protocols.items() if scene.simulate is not None else ():
+            folder = name if protocol == MAIN_PROTOCOL else f"{name}-{protocol}"
+            if folder in folders or (folder in scenes and folder != name):
+                rule = "unlike any scene and any other's protocol"
+                raise ParamsError(complain(f"scene {name}", "a protocol's folder", rule, folder, "Rename one."))
+            folders[folder] = {"scene": name, "protocol": protocol, "boards": own.boards}
+    return folders
 
 
 def scene_names(root: Path) -> list[str]:

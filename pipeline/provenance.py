@@ -10,6 +10,7 @@ from pathlib import Path
 from pipeline import io
 
 CODE = Path(__file__).parent
+SECONDS = Path(".reskin/seconds")  # what was timed here: beside the pipeline, as costs are
 
 
 def code_version() -> str:

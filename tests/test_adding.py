@@ -23,7 +23,8 @@ from tests.capture.signals import make_frames
 from tests.scenes import recorded
 from tests.stages.checkout import copy_checkout, run
 
-NOTHING = {"simulate": [], "ingest_simulated": [], "ingest": {}, "split": {}, "train_single": [], "train_multi": [],
+NOTHING = {"simulate": {}, "ingest_simulated": {}, "ingest": {}, "describe": {}, "split": {}, "train_single": [],
+           "train_multi": [], "verify": [], "stability": [], "runtime": [], "leave_out": [],
            "report": [], "publish": []}  # fmt: skip
 
 

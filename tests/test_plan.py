@@ -25,7 +25,8 @@ def test_the_plan_of_the_checkout_is_what_its_scenes_ask_for():
 def test_a_question_that_no_scene_asks_has_no_stage():
     made = plan.make_plan({"lab": scene()}, Registry(captures={"lab": {"c0": ENTRY}}))
     assert made["train_multi"] == ["lab"]
-    assert made["train_single"] == made["simulate"] == made["ingest_simulated"] == []
+    assert made["train_single"] == made["verify"] == made["runtime"] == []
+    assert made["simulate"] == made["ingest_simulated"] == {}
 
 
 def test_every_recorded_capture_has_an_ingest_of_its_own():
@@ -60,8 +61,8 @@ EMPTY = """\
 scenes: []
 lost_fraction_max: 0.05
 stages:
-  {simulate: [], ingest_simulated: [], ingest: {}, split: {}, train_single: [], train_multi: [], report: [],
-   publish: []}
+  {simulate: {}, ingest_simulated: {}, ingest: {}, describe: {}, split: {}, train_single: [], train_multi: [],
+   verify: [], stability: [], runtime: [], leave_out: [], report: [], publish: []}
 """
 
 

@@ -82,6 +82,26 @@ def runtime(cards: Cards, costs: Mapping[str, Mapping[str, float]]) -> dict[str,
     return {"stages": {stage: dict(cost) for stage, cost in costs.items()}, "trainings_n": len(cards)}
 
 
+def answered(
+    studied: Mapping[str, Any], cost: Mapping[str, Any], seconds: Sequence[Mapping[str, Any]]
+) -> dict[str, Any]:
+    """Put the answers to questions about physics beside each other; those about run time stand with what all cost."""
+    others = {question: answer for question, answer in studied.items() if question != "runtime"}
+    own = timed(studied["runtime"], seconds) if "runtime" in studied else {}
+    return others | {"runtime": {**cost, **own}}
+
+
+def timed(answer: Mapping[str, Any], seconds: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Put what was timed here beside the errors of the studies of run time; what was not timed has no time."""
+    key = ("study", "method", "setting")
+    times = {tuple(one[part] for part in key): one for one in seconds}
+    joined: dict[str, Any] = {"choice": answer["choice"]}
+    for study in ("quadratures", "integrators"):
+        rows = [(row, tuple(row[part] for part in key)) for row in answer[study]]
+        joined[study] = [row | times[own] if own in times else row for row, own in rows]
+    return joined
+
+
 def rounded(value: Any, digits: int = 6) -> Any:
     """Round every float to significant digits, so that committed numbers do not change with the last bit."""
     if isinstance(value, dict):

@@ -1,10 +1,11 @@
 """Generated parts of README.md: text with marked blocks + their contents -> text. No number there is typed."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from pipeline.errors import SchemaError, complain
+from pipeline.reporting.skins import skins_table
 from pipeline.reporting.tables import make_tables, to_markdown
 
 
@@ -22,8 +23,10 @@ def fill(text: str, blocks: Mapping[str, str]) -> str:
     return text
 
 
-def blocks_of(numbers: Mapping[str, Any], dag: str, stages: Mapping[str, Any]) -> dict[str, str]:
-    """Make the blocks: results beside the paper's, the flow as DVC sees it, and where each stage's code is."""
+def blocks_of(
+    numbers: Mapping[str, Any], others: Iterable[Mapping[str, Any]], dag: str, stages: Mapping[str, Any]
+) -> dict[str, str]:
+    """Make the blocks: results beside the paper's, skins beside recorded ones, the flow as DVC sees it, its code."""
     provenance = numbers["provenance"]
     tables = make_tables(numbers)
     words = (
@@ -32,7 +35,15 @@ def blocks_of(numbers: Mapping[str, Any], dag: str, stages: Mapping[str, Any]) -
         "single-sensor row, over n pairs of a training and a test skin)."
     )
     results = [words] + [to_markdown(tables[name]) for name in ("table2", "single_sensor") if name in tables]
-    return {"results": "\n\n".join(results), "dag": dag, "stages": _stages(stages)}
+    skins = to_markdown(skins_table(dict(_main_skins([numbers, *others]))))
+    return {"results": "\n\n".join(results), "skins": skins, "dag": dag, "stages": _stages(stages)}
+
+
+def _main_skins(scenes: Iterable[Mapping[str, Any]]) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """Title the description of each scene's own captures: the grid of a simulated one, or what was recorded."""
+    for numbers in scenes:
+        provenance, described = numbers["provenance"], numbers["described"]
+        yield f"{provenance['scene']} ({provenance['source']})", next(iter(described.values()))
 
 
 def _stages(stages: Mapping[str, Any]) -> str:

@@ -8,7 +8,10 @@ from typing import Any
 
 import pandas as pd
 
+from pipeline.reporting.checks import stability_table, verification_table
+from pipeline.reporting.left_out import left_out_table
 from pipeline.reporting.paper import SINGLE_SENSOR, TABLE_2, TABLE_2_ROWS, Number
+from pipeline.reporting.skins import skins_table
 
 COLUMNS = {"accuracy_pct": "accuracy, %", "mse_xy_mm2": "MSE_xy, mm²", "mse_f_N2": "MSE_F, N²"}
 MEANING = (
@@ -33,6 +36,15 @@ def make_tables(numbers: Mapping[str, Any]) -> dict[str, pd.DataFrame]:
         tables["single_sensor"] = _beside_paper(single, source)
     if "lobo" in numbers:
         tables["lobo_boards"] = _boards(numbers["lobo"]["by_board"], source)
+    if "verification" in numbers:
+        tables["verification"] = verification_table(numbers["verification"], source)
+    if "stability" in numbers:
+        tables["stability"] = stability_table(numbers["stability"], source)
+    if "left_out" in numbers:
+        tables["left_out"] = left_out_table(numbers["left_out"], source)
+    if "described" in numbers:
+        titled = {f"{protocol} ({one['source']})": one for protocol, one in numbers["described"].items()}
+        tables["skins"] = skins_table(titled)
     tables["variants"] = _variants(numbers["variants"], source)
     tables["captures"] = _captures(numbers["capture"], source)
     return tables
@@ -41,7 +53,9 @@ def make_tables(numbers: Mapping[str, Any]) -> dict[str, pd.DataFrame]:
 def to_markdown(table: pd.DataFrame) -> str:
     """Write a table as Markdown, empty where a number is not known, and say below what its numbers mean."""
     text = str(table.fillna("").to_markdown(index=False, disable_numparse=True)) + "\n"
-    return text + (f"\n{MEANING}\n" if any("accuracy" in str(column) for column in table.columns) else "")
+    meanings = [table.attrs["meaning"]] if "meaning" in table.attrs else []
+    meanings += [MEANING] if any("accuracy" in str(column) for column in table.columns) else []
+    return text + "".join(f"\n{meaning}\n" for meaning in meanings)
 
 
 def show(value: Mapping[str, float] | None) -> str:

@@ -7,8 +7,9 @@ import argparse
 import inspect
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 from pipeline.errors import ReskinError
 from pipeline.provenance import note_cost
@@ -34,9 +35,16 @@ def run(work: Callable[..., None]) -> None:
     except ReskinError as error:
         say(f"error: {error}")
         sys.exit(error.exit_code)
-    # Each recorded capture has an ingest of its own.
-    unit = f"{stage}-{arguments['indentations'].stem}" if stage == "ingest" else stage
-    note_cost(COSTS / arguments["scene"], unit, time.monotonic() - start_s)
+    note_cost(COSTS / arguments["scene"], _unit(stage, arguments), time.monotonic() - start_s)
+
+
+def _unit(stage: str, arguments: Mapping[str, Any]) -> str:
+    """Name what ran: some stages run for each recorded capture, or for each protocol's folder."""
+    of = {"ingest": "indentations", "ingest_simulated": "indentations", "describe": "indentations", "simulate": "raw"}
+    if stage not in of:
+        return stage
+    own = arguments[of[stage]].stem.removeprefix(arguments["scene"]).strip("-")
+    return f"{stage}-{own}" if own else stage
 
 
 def say(sentence: str) -> None:

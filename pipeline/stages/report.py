@@ -1,5 +1,6 @@
 """Stage report: models' cards, predictions and accounts -> numbers.json, tables, figures."""
 
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,50 +10,65 @@ import pyarrow.compute as pc
 
 from pipeline import io
 from pipeline.learning.recipe import HEADLINE
-from pipeline.params import arms_of, read_scene
-from pipeline.provenance import code_version, device, read_costs
+from pipeline.params import Scene, arms_of, described_in, read_scene
+from pipeline.provenance import SECONDS, code_version, device, read_costs
 from pipeline.reporting.figures import error_grid
-from pipeline.reporting.numbers import compose, rounded, runtime
+from pipeline.reporting.numbers import answered, compose, rounded, runtime
 from pipeline.reporting.tables import make_tables, to_markdown
+from pipeline.reporting.work_precision import pages
 from pipeline.stages._run import COSTS, run, say
 
 
-def report(scene: str, settings: Path, indentations: Path, folds: Path, models: Path, reports: Path) -> None:
+def report(
+    scene: str, settings: Path, indentations: Path, folds: Path, models: Path, answers: Path, reports: Path
+) -> None:
     """Write the numbers, tables and figures of a scene."""
     asked = read_scene(settings)
-    arms = arms_of(asked)
-    words = io.read_json(folds)
+    arms, words = arms_of(asked), io.read_json(folds)
     cards = [io.read_json(file) for arm in arms for file in sorted((models / arm).glob("*.json"))]
     accounts = [io.read_account(indentations / f"{name}.parquet") for name in words["captures"]]
-    costs = read_costs(COSTS / scene)
-    seconds = round(sum(cost["seconds"] for cost in costs.values()), 1)
-    provenance = {"scene": scene, "source": asked.source, "git": code_version(), "seed": asked.seed}
-    provenance |= {"device": device(), "seconds": seconds}
-    numbers = {"provenance": provenance, **compose(cards, accounts, words["dropped"], headline=HEADLINE)}
-    numbers["runtime"] = runtime(cards, costs)
+    numbers: dict[str, Any] = {"provenance": _provenance(scene, asked)}
+    numbers |= compose(cards, accounts, words["dropped"], headline=HEADLINE)
+    numbers["described"] = {name: io.read_json(answers / f"described/{name}.json") for name in described_in(asked)}
+    studied = {question: io.read_json(answers / f"{question}.json") for question in asked.studied}
+    numbers |= answered(studied, runtime(cards, read_costs(COSTS / scene)), _seconds(scene))
     numbers = rounded(numbers)
     io.write_json(reports / "numbers.json", numbers)
-    with io.replacing(reports / "tables") as folder:
-        folder.mkdir()
-        for name, table in make_tables(numbers).items():
-            io.write_text(folder / f"{name}.md", to_markdown(table))
-            io.write_text(folder / f"{name}.csv", table.to_csv(index=False))
-    with io.replacing(reports / "figures") as folder:
-        folder.mkdir()
-        for arm in arms:
-            _draw(folder, io.read_table(models / arm / "predictions.parquet"), f"{scene} ({asked.source})")
+    tables = make_tables(numbers)
+    texts = {f"{name}.md": to_markdown(table) for name, table in tables.items()}
+    _write(reports / "tables", texts | {f"{name}.csv": table.to_csv(index=False) for name, table in tables.items()})
+    predictions = [io.read_table(models / arm / "predictions.parquet") for arm in arms]
+    _write(reports / "figures", dict(_error_grids(predictions, f"{scene} ({asked.source})")))
+    if "runtime" in studied:  # seconds differ between identical runs, so what shows them is no DVC output
+        _write(reports / "runtime", pages(numbers["runtime"], source=asked.source))
     say(f"{scene}: {reports}/numbers.json, tables, figures")
 
 
-def _draw(folder: Path, predictions: pa.Table, scene: str) -> None:
-    for question in predictions["question"].unique().to_pylist():
-        chosen = pc.and_(pc.equal(predictions["question"], question), pc.equal(predictions["recipe"], HEADLINE))
-        own = predictions.filter(chosen)
-        true_mm, predicted_mm = (_places(own, side) for side in ("true", "predicted"))
-        io.write_text(
-            folder / f"error_grid_{question}.svg",
-            error_grid(true_mm, predicted_mm, title=f"{scene}, {question}: place error on held-out readings"),
-        )
+def _provenance(scene: str, asked: Scene) -> dict[str, Any]:
+    seconds = round(sum(cost["seconds"] for cost in read_costs(COSTS / scene).values()), 1)
+    known = {"scene": scene, "source": asked.source, "git": code_version(), "seed": asked.seed}
+    return known | {"device": device(), "seconds": seconds}
+
+
+def _seconds(scene: str) -> list[dict[str, Any]]:
+    file = SECONDS / scene / "runtime.json"
+    return io.read_json(file) if file.is_file() else []
+
+
+def _write(folder: Path, texts: Mapping[str, str]) -> None:
+    with io.replacing(folder) as temporary:
+        temporary.mkdir()
+        for name, text in texts.items():
+            io.write_text(temporary / name, text)
+
+
+def _error_grids(predictions: Iterable[pa.Table], scene: str) -> Iterator[tuple[str, str]]:
+    for table in predictions:
+        for question in table["question"].unique().to_pylist():
+            chosen = pc.and_(pc.equal(table["question"], question), pc.equal(table["recipe"], HEADLINE))
+            true_mm, predicted_mm = (_places(table.filter(chosen), side) for side in ("true", "predicted"))
+            title = f"{scene}, {question}: place error on held-out readings"
+            yield f"error_grid_{question}.svg", error_grid(true_mm, predicted_mm, title=title)
 
 
 def _places(table: pa.Table, side: str) -> Any:

@@ -4,24 +4,29 @@ from pathlib import Path
 
 from pipeline import io
 from pipeline.capture.folder import write_capture
-from pipeline.dataset.synthetic import Synthesis, record_skin, roster
-from pipeline.dataset.synthetic_files import to_files
-from pipeline.params import read_scene
+from pipeline.learning.executors import make_executor
 from pipeline.stages._run import run, say
-from pipeline.strict import parse
+from pipeline.stages._simulated import read_synthesis
+from pipeline.synthesis.capture import Synthesis, record, roster
+from pipeline.synthesis.files import to_files
 
 
-def simulate(scene: str, settings: Path, raw: Path) -> None:
-    """Record every skin of a simulated scene."""
-    asked = read_scene(settings)
-    synthesis = parse(Synthesis, asked.simulate, f"{settings}: simulate")
-    pairs = roster(synthesis)
-    with io.replacing(raw) as folder:
+def simulate(scene: str, settings: Path, protocol: str, raw: Path) -> None:
+    """Record every skin of one protocol of a simulated scene."""
+    synthesis, seed = read_synthesis(settings)
+    pairs = roster(synthesis, protocol)
+    with io.replacing(raw) as folder, make_executor() as executor:
         folder.mkdir()
-        for i, (board, skin) in enumerate(pairs, 1):
-            capture = record_skin(synthesis, board, skin=skin, seed=asked.seed)
-            write_capture(folder / skin, *to_files(capture, synthesis))
-            say(f"{scene}: simulated {skin} on {board} ({i}/{len(pairs)}), {capture.wrapped_n} values past the range")
+        waiting = [executor.submit(_record, synthesis, protocol, pair, seed, folder) for pair in pairs]
+        for i, done in enumerate(waiting, 1):
+            say(f"{scene}: simulated {done.result()} ({i}/{len(pairs)})")
+
+
+def _record(synthesis: Synthesis, protocol: str, pair: tuple[str, str], seed: int, folder: Path) -> str:
+    board, skin = pair
+    capture = record(synthesis, protocol, board=board, skin=skin, seed=seed)
+    header = write_capture(folder / capture.name, *to_files(capture, synthesis))
+    return f"{capture.name} on {board}, {header.protocol}; {header.note}"
 
 
 if __name__ == "__main__":

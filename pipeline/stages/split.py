@@ -16,7 +16,7 @@ def split(scene: str, params: Path, settings: Path, indentations: Path, folds: P
     check_planned(scene, asked, shared, str(settings))
     captures = captures_of(scene, shared, indentations)
     rows = load_rows([indentations / f"{name}.parquet" for name in captures], asked.selection)
-    drawn = draw_folds(rows, asked.questions, asked.split, asked.seed)
+    drawn = draw_folds(rows, asked.trained, asked.split, asked.seed)
     io.write_json(folds, render_folds(captures, rows, drawn))
     say(f"{scene}: {len(rows)} rows of {len(captures)} captures, {len(drawn)} folds; left out: {rows.dropped}")
 

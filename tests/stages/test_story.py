@@ -44,6 +44,32 @@ def test_every_number_of_the_first_tables_is_there_and_says_that_it_is_simulated
     assert "<svg" in (story / "reports/ci/figures/error_grid_lobo.svg").read_text()
 
 
+def test_every_protocol_goes_through_the_wire_into_a_folder_of_its_own(story):
+    names = {"ci-wear": "b0_s0-wear", "ci-flexible": "f0_s0-flexible", "ci-hand": "b0_s0-hand", "ci-drag": "b0_s0-drag"}
+    for folder, capture in names.items():
+        assert [file.stem for file in (story / "data/indentations" / folder).glob("*.parquet")] == [capture]
+    hand, drag, wear = (
+        io.read_readings(story / f"data/indentations/ci-{protocol}/b0_s0-{protocol}.parquet")
+        for protocol in ("hand", "drag", "wear")
+    )
+    assert np.isnan(hand.x_mm).all()
+    assert np.isnan(hand.Fz_N).all()
+    assert len(np.unique(drag.x_mm[drag.indentation == 0])) == 9  # one line, a stop every 2 mm
+    assert np.abs(drag.Fx_N).max() > 0.3  # dragged along x, held by friction
+    assert wear.n_contacts.max() == 2 * 2 * 65 - 1
+
+
+def test_the_physics_is_answered_for_and_says_that_it_is_simulated(story):
+    numbers = json.loads((story / "reports/ci/numbers.json").read_text())
+    assert {row["term"] for row in numbers["left_out"] if row["done"] == "left out"} >= {"ageing", "temperature"}
+    rows = numbers["runtime"]["quadratures"] + numbers["runtime"]["integrators"]
+    assert all(("median_s" in row) == (row["failure"] is None and row["method"] != "reference") for row in rows)
+    assert set(numbers["described"]) == {"grid", "wear", "flexible", "hand", "drag"}
+    for name in ("left_out", "skins"):
+        assert "simulated" in (story / f"reports/ci/tables/{name}.md").read_text()
+    assert "<svg" in (story / "reports/ci/runtime/quadratures.svg").read_text()
+
+
 def test_there_is_one_parquet_file_a_capture_with_units(story):
     files = sorted((story / "data/indentations/ci").glob("*.parquet"))
     assert [file.stem for file in files] == ["b0_s0", "b0_s1", "b1_s0", "b1_s1", "b2_s0", "b2_s1"]

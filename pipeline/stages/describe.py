@@ -1,0 +1,26 @@
+"""Stage describe: the readings of one folder of captures -> what skins look like there, as numbers."""
+
+from pathlib import Path
+
+from pipeline import io
+from pipeline.evaluation.description import describe as describe_one
+from pipeline.evaluation.description import over_skins
+from pipeline.params import captures_of, read_params
+from pipeline.stages._run import run, say
+
+
+def describe(scene: str, params: Path, indentations: Path, description: Path) -> None:
+    """Describe every capture of a folder, and put them together over skins."""
+    names = captures_of(scene, read_params(params), indentations)
+    captures = [io.read_readings(indentations / f"{name}.parquet") for name in names]
+    together = over_skins([(one.skin, describe_one(one)) for one in captures])
+    accounts = {one.capture: io.read_account(indentations / f"{one.capture}.parquet") for one in captures}
+    readings_n = sum(map(len, captures))
+    counts = {"captures_n": len(captures), "readings_n": readings_n}
+    counts["indentations_n"] = sum(account.get("indentations_n", 0) for account in accounts.values())
+    io.write_json(description, {"counts": counts, "source": captures[0].source, "over_skins": together})
+    say(f"{scene}: {indentations}: {readings_n} readings of {len(captures)} captures described")
+
+
+if __name__ == "__main__":
+    run(describe)

@@ -1,0 +1,22 @@
+"""Stage leave_out: what the physics of a simulated scene leaves out -> what that costs, as the rows of one table."""
+
+from dataclasses import asdict
+from pathlib import Path
+
+from pipeline import io
+from pipeline.evaluation.left_out import measure
+from pipeline.stages._run import run, say
+from pipeline.stages._simulated import read_synthesis
+
+
+def leave_out(scene: str, settings: Path, answer: Path) -> None:
+    """Measure every term on the scene's own first skin."""
+    of, seed = read_synthesis(settings)
+    omissions = measure(of, seed=seed)
+    io.write_json(answer, [asdict(omission) for omission in omissions])
+    left = ", ".join(omission.term for omission in omissions if omission.done == "left out")
+    say(f"{scene}: left out, and measured: {left}")
+
+
+if __name__ == "__main__":
+    run(leave_out)

@@ -1,0 +1,24 @@
+"""Stage stability: stiff and extreme cases of skins, chips and wires -> the rows of one table."""
+
+from dataclasses import asdict
+from pathlib import Path
+
+from pipeline import io
+from pipeline.evaluation.stability.survey import survey
+from pipeline.stages._run import run, say
+from pipeline.stages._simulated import read_synthesis
+
+
+def stability(scene: str, settings: Path, answer: Path) -> None:
+    """Try every case on the scene's own skins and chips, and write down what happened."""
+    of, seed = read_synthesis(settings)
+    cases = survey(of.main_boards.design, of.spreads, skin=of.skin, chip=of.chip, seed=seed)
+    io.write_json(answer, [asdict(case) for case in cases])
+    for case in cases:
+        if not case.holds:
+            say(f"warning: {scene}: {case.area}, {case.case}: {case.happened}")
+    say(f"{scene}: {sum(case.holds for case in cases)} of {len(cases)} extreme cases behave as they should")
+
+
+if __name__ == "__main__":
+    run(stability)
