@@ -163,13 +163,16 @@ def read_params(path: Path) -> Params:
 
 
 def check_planned(name: str, scene: Scene, params: Params, where: str) -> None:
-    """Raise if `params.yaml` has no stage for a question that the scene asks: it was added by hand since."""
+    """Raise if `params.yaml` has other stages than the scene's questions and protocols ask for: it was edited since."""
     wanted = arms_of(scene) + [STUDIED_BY[question] for question in scene.studied]
     unplanned = [stage for stage in wanted if name not in getattr(params.stages, stage)]
+    if scene.simulate is not None:
+        planned = {item.protocol for item in params.stages.simulate.values() if item.scene == name}
+        unplanned += [f"protocol {one}" for one in sorted(planned ^ set(scene.simulate.protocols))]
     if unplanned:
         raise ParamsError(
             complain(
-                where, "questions", "planned in params.yaml", f"{', '.join(unplanned)} without a stage",
+                where, "questions and protocols", "those planned in params.yaml", f"{', '.join(unplanned)} only in one",
                 f"Try: reskin scenes use {' '.join(params.scenes)}",
             )
         )  # fmt: skip

@@ -25,7 +25,7 @@ from pipeline.params import (
     read_scene,
 )
 from pipeline.registry import Registry, read_registry
-from pipeline.strict import read_yaml
+from pipeline.strict import parse, read_yaml
 
 PARAMS = "params.yaml"
 SCENES = "pipeline/scenes"
@@ -126,8 +126,18 @@ def check(root: Path) -> Params:
 
 
 def _plan_of(root: Path, names: Sequence[str]) -> dict[str, Any]:
-    scenes = {name: read_scene(scene_file(root, name)) for name in dict.fromkeys(names)}
+    scenes = {name: _read(scene_file(root, name)) for name in dict.fromkeys(names)}
     return make_plan(scenes, read_registry(root))
+
+
+def _read(file: Path) -> Scene:
+    """Read a scene, and how its skins are made: the physics is imported for a simulated one only."""
+    scene = read_scene(file)
+    if scene.simulate is not None:
+        from pipeline.synthesis.capture import Synthesis
+
+        parse(Synthesis, scene.simulate.model_dump(), f"{file}: simulate")
+    return scene
 
 
 def _flow(value: Any) -> Any:

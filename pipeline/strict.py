@@ -47,4 +47,9 @@ def parse(model: type[Model], value: Any, where: str) -> Model:
         got = "nothing" if first["type"] == "missing" else repr(first.get("input"))[:80]
         rule = {"missing": "given", "extra_forbidden": "a known parameter"}.get(first["type"])
         rule = rule or first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
+        if (
+            first["type"] == "value_error"
+        ):  # parameters that contradict each other: the rule names them and their values
+            place = f"{where}: {name}" if first["loc"] else where
+            raise ParamsError(f"{place}: {rule}. Mend it there.") from None
         raise ParamsError(complain(where, name, rule, got, "Mend it there.")) from None

@@ -5,7 +5,7 @@ from ruamel.yaml import YAML
 
 from pipeline import plan
 from pipeline.errors import ParamsError
-from pipeline.params import Scene, Stages
+from pipeline.params import Scene, Stages, check_planned, read_params, read_scene
 from pipeline.registry import Entry, Registry
 from pipeline.strict import parse
 from tests.scenes import recorded
@@ -84,3 +84,54 @@ def test_a_plan_that_is_behind_its_scenes_is_refused_with_the_remedy(tmp_path):
 def test_an_unknown_scene_is_named_beside_the_known_ones(tmp_path):
     with pytest.raises(ParamsError, match="a scene must be one of one, two; got three"):
         plan.use(checkout(tmp_path, EMPTY), ["three"])
+
+
+def simulated(tmp_path, **changes):
+    """A checkout whose scene `one` is the tiny one, changed."""
+    root = checkout(tmp_path, EMPTY)
+    scene_of = YAML(typ="safe").load((ROOT / plan.SCENES / "ci.yaml").read_text())
+    for path, value in changes.items():
+        section = scene_of["simulate"]
+        *sections, name = path.split("__")
+        for part in sections:
+            section = section[part]
+        section[name] = value
+    with (root / plan.SCENES / "one.yaml").open("w") as stream:
+        YAML().dump(scene_of, stream)
+    return root
+
+
+def test_every_protocol_has_a_folder_and_stages_of_its_own(tmp_path):
+    root = simulated(tmp_path)
+    plan.use(root, ["one"])
+    stages = plan.check(root).stages
+    assert set(stages.simulate) == {"one", "one-wear", "one-flexible", "one-hand", "one-drag"}
+    assert stages.simulate["one-flexible"].boards == "flexible"
+    assert set(stages.describe) == set(stages.ingest_simulated) == set(stages.simulate)
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"skin__base": "glued"}, "skin.base must be 'bonded' or 'slipping'; got 'glued'"),
+        ({"protocols__wear__terms": ["ageing"]}, r"terms holds exactly what a protocol needs, .*; it holds"),
+        ({"protocols__wear__skins_n": 99}, "protocol wear: skins_n 99 is more than rigid boards have, 6"),
+    ],
+)
+def test_a_scene_that_cannot_be_simulated_is_refused_before_anything_runs(tmp_path, changes, sentence):
+    root = simulated(tmp_path, **changes)
+    before = (root / plan.PARAMS).read_text()
+    with pytest.raises(ParamsError, match=sentence):
+        plan.use(root, ["one"])
+    assert (root / plan.PARAMS).read_text() == before
+
+
+def test_a_protocol_that_was_added_since_is_noticed_by_the_stages(tmp_path):
+    root = simulated(tmp_path)
+    plan.use(root, ["one"])
+    params, scene_of = read_params(root / plan.PARAMS), read_scene(root / plan.SCENES / "one.yaml")
+    check_planned("one", scene_of, params, "one.yaml")
+    fewer = {name: own for name, own in scene_of.simulate.protocols.items() if name != "drag"}
+    edited = scene_of.model_copy(update={"simulate": scene_of.simulate.model_copy(update={"protocols": fewer})})
+    with pytest.raises(ParamsError, match="protocol drag only in one. Try: reskin scenes use one"):
+        check_planned("one", edited, params, "one.yaml")

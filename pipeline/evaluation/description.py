@@ -64,8 +64,9 @@ def _rest(noload_uT: Float[np.ndarray, "f ch"]) -> dict[str, float]:
 
 
 def _noise(one: Readings, touched: Bool[np.ndarray, " f"]) -> dict[str, float]:
-    # Within one indentation nothing moves: what is left is noise. Pooled over indentations.
-    _, group_i, group_n = np.unique(one.indentation[touched], return_inverse=True, return_counts=True)
+    # At one stop of one indentation nothing moves: what is left is noise. Pooled over stops.
+    stops = np.stack([one.indentation, np.nan_to_num(one.x_mm), np.nan_to_num(one.y_mm)], axis=1)[touched]
+    _, group_i, group_n = np.unique(stops, axis=0, return_inverse=True, return_counts=True)
     freedom_n = int((group_n - 1).sum())
     if freedom_n < ENOUGH_N:
         return {}

@@ -1,10 +1,13 @@
 """Figures of a scene: predictions -> SVG text. Same data, same bytes. Sees no model and no path."""
 
 import io
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 from jaxtyping import Float
 
 mpl.use("Agg")
@@ -15,6 +18,16 @@ STYLE = {
     "axes.spines.top": False,
     "axes.spines.right": False,
 }
+
+
+def error_grids(predictions: Iterable[pa.Table], recipe: str, scene: str) -> Iterator[tuple[str, str]]:
+    """Draw the place errors of one recipe for every question: file name and SVG text."""
+    for table in predictions:
+        for question in table["question"].unique().to_pylist():
+            chosen = pc.and_(pc.equal(table["question"], question), pc.equal(table["recipe"], recipe))
+            true_mm, predicted_mm = (_places(table.filter(chosen), side) for side in ("true", "predicted"))
+            title = f"{scene}, {question}: place error on held-out readings"
+            yield f"error_grid_{question}.svg", error_grid(true_mm, predicted_mm, title=title)
 
 
 def error_grid(true_mm: Float[np.ndarray, "f 2"], predicted_mm: Float[np.ndarray, "f 2"], *, title: str) -> str:
@@ -41,3 +54,7 @@ def _svg(figure: Any) -> str:
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     return buffer.getvalue()
+
+
+def _places(table: pa.Table, side: str) -> Any:
+    return np.stack([np.asarray(table[f"{side}_{axis}_mm"], np.float64) for axis in "xy"], axis=1)

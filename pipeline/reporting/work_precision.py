@@ -49,7 +49,20 @@ def pages(numbers: Mapping[str, Any], *, source: str) -> dict[str, str]:
         else:
             drawn = integrators(rows, seconds)
         texts |= {f"{study}.svg": drawn, f"{study}.md": to_markdown(table(numbers[study], source))}
-    return texts
+    return texts | {"stages.md": to_markdown(costs(numbers["stages"]))}
+
+
+def costs(stages: Mapping[str, Mapping[str, float]]) -> pd.DataFrame:
+    """List what each stage cost where it ran last."""
+    rows = [
+        {
+            "stage": name,
+            "s": f"{one['seconds']:.1f}",
+            "peak memory of a process, MB": f"{one['peak_process_memory_MB']:.0f}",
+        }
+        for name, one in stages.items()
+    ]
+    return pd.DataFrame(rows)
 
 
 def table(rows: Sequence[Mapping[str, Any]], source: str) -> pd.DataFrame:

@@ -1,18 +1,14 @@
 """Stage report: models' cards, predictions and accounts -> numbers.json, tables, figures."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import pyarrow as pa
-import pyarrow.compute as pc
-
 from pipeline import io
 from pipeline.learning.recipe import HEADLINE
-from pipeline.params import Scene, arms_of, described_in, read_scene
+from pipeline.params import Scene, arms_of, check_planned, described_in, read_params, read_scene
 from pipeline.provenance import SECONDS, code_version, device, read_costs
-from pipeline.reporting.figures import error_grid
+from pipeline.reporting.figures import error_grids
 from pipeline.reporting.numbers import answered, compose, rounded, runtime
 from pipeline.reporting.tables import make_tables, to_markdown
 from pipeline.reporting.work_precision import pages
@@ -20,10 +16,18 @@ from pipeline.stages._run import COSTS, run, say
 
 
 def report(
-    scene: str, settings: Path, indentations: Path, folds: Path, models: Path, answers: Path, reports: Path
+    scene: str,
+    params: Path,
+    settings: Path,
+    indentations: Path,
+    folds: Path,
+    models: Path,
+    answers: Path,
+    reports: Path,
 ) -> None:
     """Write the numbers, tables and figures of a scene."""
     asked = read_scene(settings)
+    check_planned(scene, asked, read_params(params), str(settings))
     arms, words = arms_of(asked), io.read_json(folds)
     cards = [io.read_json(file) for arm in arms for file in sorted((models / arm).glob("*.json"))]
     accounts = [io.read_account(indentations / f"{name}.parquet") for name in words["captures"]]
@@ -38,7 +42,7 @@ def report(
     texts = {f"{name}.md": to_markdown(table) for name, table in tables.items()}
     _write(reports / "tables", texts | {f"{name}.csv": table.to_csv(index=False) for name, table in tables.items()})
     predictions = [io.read_table(models / arm / "predictions.parquet") for arm in arms]
-    _write(reports / "figures", dict(_error_grids(predictions, f"{scene} ({asked.source})")))
+    _write(reports / "figures", dict(error_grids(predictions, HEADLINE, f"{scene} ({asked.source})")))
     if "runtime" in studied:  # seconds differ between identical runs, so what shows them is no DVC output
         _write(reports / "runtime", pages(numbers["runtime"], source=asked.source))
     say(f"{scene}: {reports}/numbers.json, tables, figures")
@@ -60,19 +64,6 @@ def _write(folder: Path, texts: Mapping[str, str]) -> None:
         temporary.mkdir()
         for name, text in texts.items():
             io.write_text(temporary / name, text)
-
-
-def _error_grids(predictions: Iterable[pa.Table], scene: str) -> Iterator[tuple[str, str]]:
-    for table in predictions:
-        for question in table["question"].unique().to_pylist():
-            chosen = pc.and_(pc.equal(table["question"], question), pc.equal(table["recipe"], HEADLINE))
-            true_mm, predicted_mm = (_places(table.filter(chosen), side) for side in ("true", "predicted"))
-            title = f"{scene}, {question}: place error on held-out readings"
-            yield f"error_grid_{question}.svg", error_grid(true_mm, predicted_mm, title=title)
-
-
-def _places(table: pa.Table, side: str) -> Any:
-    return np.stack([np.asarray(table[f"{side}_{axis}_mm"], np.float64) for axis in "xy"], axis=1)
 
 
 if __name__ == "__main__":

@@ -56,7 +56,9 @@ class Synthesis(Strict):
     def _nothing_is_named_that_is_not_there(self) -> "Synthesis":
         used = {term for protocol in self.protocols.values() for term in protocol.terms}
         if used != self.terms.named():
-            raise ValueError(f"terms holds exactly what a protocol needs, {sorted(used)}")
+            raise ValueError(
+                f"terms holds exactly what a protocol needs, {sorted(used)}; it holds {sorted(self.terms.named())}"
+            )
         for name, protocol in self.protocols.items():
             if protocol.boards not in self.boards:
                 raise ValueError(f"protocol {name}: boards is one of {sorted(self.boards)}, not {protocol.boards!r}")
@@ -64,7 +66,10 @@ class Synthesis(Strict):
                 raise ValueError(f"protocol {name}: a stylus that leans (tilt_sd_deg) needs the term friction")
             kind = self.boards[protocol.boards]
             if protocol.skins_n > kind.boards_n * kind.skins_per_board_n:
-                raise ValueError(f"protocol {name}: skins_n is more than the {protocol.boards} boards have")
+                have_n, asked_n = kind.boards_n * kind.skins_per_board_n, protocol.skins_n
+                raise ValueError(
+                    f"protocol {name}: skins_n {asked_n} is more than {protocol.boards} boards have, {have_n}"
+                )
         if len({kind.letter for kind in self.boards.values()}) < len(self.boards):
             raise ValueError("kinds of boards need different letters")
         if MAIN not in self.protocols or not isinstance(self.protocols[MAIN], Grid):

@@ -1,5 +1,7 @@
 """What is read off readings of a made-up skin, against what it was made of; skins and missing values as laws."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -42,6 +44,12 @@ def test_fields_noise_steps_and_forces_are_those_it_was_made_of():
     assert found["force_median_N"] == pytest.approx(2.0, rel=0.02)
     assert found["change_at_2_N_uT"] == pytest.approx(200, rel=0.02)
     assert found["weakest_over_strongest_chip"] == pytest.approx(0.25, rel=0.1)
+
+
+def test_what_moves_between_stops_of_one_indentation_is_no_noise():
+    line = made()
+    moved = replace(line, indentation=line.indentation // 2, x_mm=(line.indentation % 2).astype(np.float32))
+    assert describe(moved)["noise_z_uT"] == describe(line)["noise_z_uT"]
 
 
 def test_forces_that_were_not_reached_have_no_change_of_field():

@@ -179,7 +179,7 @@ def test_an_unknown_parameter_is_refused_by_name(section, name):
 @pytest.mark.parametrize(
     ("protocol", "changes", "sentence"),
     [
-        (GRID | {"skins_n": 5}, {}, "skins_n is more than the rigid boards have"),
+        (GRID | {"skins_n": 5}, {}, "skins_n 5 is more than rigid boards have, 4"),
         (GRID | {"boards": "soft"}, {}, "boards is one of .'rigid'., not 'soft'"),
         (GRID | {"terms": ["ageing"]}, {}, "terms holds exactly what a protocol needs"),
         (GRID, {"terms": {"ageing": AGEING}}, "terms holds exactly what a protocol needs"),

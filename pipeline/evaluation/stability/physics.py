@@ -142,7 +142,7 @@ def _place(board: Board, one: Skin) -> list[Case]:
     on_dipoles = replace(board, chips_m=one.nodes_m[: len(board.chips_m)].copy())
     return [
         refused(AREA, "a poke beside the skin, 0.2 mm past its edge",
-                should="refused, never extrapolated: PHYSICS says flagged, but a flagged reading would need a field",
+                should="refused, never extrapolated: a flagged reading would need a field",
                 attempt=lambda: changes_of_field(board, one, beside_m)),
         measured(AREA, "a place inside a magnet of the array", should="the field of the box, J included: as magpylib",
                  happened=f"{len(inside_m)} places, relative error {error:.1e}", error=error, limit=1e-12),

@@ -59,7 +59,8 @@ def check_quadrature(
     cells = f"cells of {fine_cells.cell_m / milli:g} mm for {rule.cell_m / milli:g} mm"
     few = f"{len(places_m)} places of the protocol"
     return [
-        Check("dB of pokes", f"quadrature, {few}, all depths", cells, apart(found_T, cells_T), "1", 0.02, "PHYSICS 9"),
+        Check("dB of pokes", f"quadrature, {few}, all depths", cells, apart(found_T, cells_T), "1", 0.02,
+              "2 % is what an indentation may be wrong by in all (DESIGN 6)"),
         Check("dB of pokes", f"quadrature, {few}, each channel of each poke", cells,
               float((np.abs(found_T - cells_T) / allowed_T).max()), "of the allowed", 1.0,
               f"2 % of the poke's dB, or {UNSEEN_uT:g} uT where that is more: a third of a chip's noise"),
