@@ -35,8 +35,10 @@ def rows(few_nodes):
 
 def test_terms_that_a_scene_does_without_are_left_out_and_others_are_kept(rows):
     assert {term for term, row in rows.items() if row.done == "left out"} == {
-        "ageing", "relaxation", "temperature", "the powder's own field"
+        "ageing", "relaxation", "temperature", "friction", "the earth's field", "the skin's free edge",
+        "the powder's own field",
     }  # fmt: skip
+    assert rows["friction"].field_pct == rows["friction"].force_pct == 0  # nothing is dragged
     aged = rows_of(with_protocol("grid", FEW | {"terms": ["ageing"]}, terms={"ageing": SIZES}))
     assert aged["ageing"].done == "kept"
 

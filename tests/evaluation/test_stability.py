@@ -96,7 +96,11 @@ def test_a_force_sensor_without_a_range_and_a_flag_that_never_rises_are_found_ou
     monkeypatch.setattr(layer, "VERIFIED_DEPTH", 10.0)
     monkeypatch.setattr(physics, "POKES_N", 10)
     wrong = broken(survey_physics(BOARD, DESIGN.spreads, skin=DESIGN.skin, seed=SEED))
-    assert wrong == {"a stiff skin, E = 1 GPa", "depths of 0.2, 0.59, 0.6 and 0.8 of the thickness"}
+    assert wrong == {
+        "a stiff skin, E = 1 GPa",
+        "depths of 0.2, 0.59, 0.6 and 0.8 of the thickness",
+        "a poke to 0.95 of the thickness",
+    }
 
 
 def test_a_chip_that_never_saturates_is_found_out(monkeypatch):

@@ -24,7 +24,7 @@ def lab(tmp_path_factory, shared_data) -> Iterator[Path]:
         YAML().dump(settings, stream)
     params = YAML(typ="safe").load((root / plan.PARAMS).read_text())
     params["scenes"] = []
-    params["stages"] = {name: {} if name in ("ingest", "split") else [] for name in params["stages"]}
+    params["stages"] = {name: {} if isinstance(of, dict) else [] for name, of in params["stages"].items()}
     with (root / plan.PARAMS).open("w") as stream:
         YAML().dump(params, stream)
     for board in (1, 2):

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.physics import shear
 from pipeline.synthesis.capture import record
 from tests.synthesis.scene import AGEING, GRID, RELAXATION, TEMPERATURE, with_protocol
 
@@ -26,6 +27,7 @@ def files_run(scene):
         if event == "call":
             called.add(frame.f_code.co_filename)
 
+    shear.tabulate_depth.cache_clear()  # what an earlier test left there would hide a call
     sys.setprofile(note)
     try:
         record(scene, "few", board="b0", skin="b0_s0", seed=1)
