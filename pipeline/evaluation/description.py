@@ -6,6 +6,7 @@ The same numbers for simulated and recorded skins, so that they can stand side b
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Bool, Float
 
 from pipeline.capture.faults import find_lsb
@@ -65,15 +66,12 @@ def _rest(noload_uT: Float[np.ndarray, "f ch"]) -> dict[str, float]:
 
 def _noise(one: Readings, touched: Bool[np.ndarray, " f"]) -> dict[str, float]:
     # At one stop of one indentation nothing moves: what is left is noise. Pooled over stops.
-    stops = np.stack([one.indentation, np.nan_to_num(one.x_mm), np.nan_to_num(one.y_mm)], axis=1)[touched]
-    _, group_i, group_n = np.unique(stops, axis=0, return_inverse=True, return_counts=True)
-    freedom_n = int((group_n - 1).sum())
+    stops = [part[touched] for part in (one.indentation, one.x_mm, one.y_mm)]
+    by_stop = pd.DataFrame(one.b_uT[touched].astype(np.float64)).groupby(stops, dropna=False, sort=False)
+    freedom_n = int(touched.sum()) - by_stop.ngroups
     if freedom_n < ENOUGH_N:
         return {}
-    b_uT = one.b_uT[touched].astype(np.float64)
-    sums_uT = np.zeros((len(group_n), b_uT.shape[1]))
-    np.add.at(sums_uT, group_i, b_uT)
-    left_uT = b_uT - (sums_uT / group_n[:, None])[group_i]
+    left_uT = one.b_uT[touched] - by_stop.transform("mean").to_numpy()
     sd_uT = np.sqrt((left_uT**2).sum(axis=0) / freedom_n).reshape(-1, AXES_PER_CHIP_N)
     return {"noise_xy_uT": float(np.median(sd_uT[:, :2])), "noise_z_uT": float(np.median(sd_uT[:, 2]))}
 

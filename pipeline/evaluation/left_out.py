@@ -30,6 +30,7 @@ from pipeline.synthesis.sideways import push
 AGEING = Ageing(settling=0.10, ageing=0.01, fading_per_decade=0.005, wandering_uT=0.2)
 RELAXATION = Relaxation(approach_s=0.5, hold_s=0.5)
 WARMER_K = 1.0
+EARTH_T = np.array([20e-6, 0.0, -45e-6])  # some place of middle latitude
 PLACES_M = ((4e-3, 2e-3), (-6e-3, 4e-3))  # pokes for what moves inside the skin: flank and edge
 BOXES = nodes.Quadrature(cell_m=1.5e-3, layers_n=3)  # whose own field is summed
 FRICTION = Friction(coefficient=0.8)  # 0.5-1.2, assumed (PHYSICS 4)
@@ -49,17 +50,6 @@ class Omission:
     how: str
 
 
-EARTH_uT = 50.0
-EARTH = Omission(
-    "the earth's field",
-    "left out",
-    0.0,
-    EARTH_uT,
-    0.0,
-    "as long as the board does not turn: the no-load reading has it",
-)
-
-
 @dataclass(frozen=True)
 class Subject:
     """What everything is measured on: the first skin of the main protocol, and that protocol."""
@@ -75,14 +65,15 @@ class Subject:
 def measure(of: Synthesis, *, seed: int) -> list[Omission]:
     """Measure every term of PHYSICS 8 on a scene."""
     subject = _subject(of, seed)
+    without = _feel(subject, Terms(), seed)
     return [
-        *_over_time(subject, seed),
-        _temperature(subject, seed),
+        *_over_time(subject, without, seed),
+        _temperature(subject, without),
         _friction(subject),
-        EARTH,
+        _earth(without),
         *_inside(subject),
         *_free_edge(subject),
-        _steps(subject, of, seed),
+        _steps(without, of),
         _own_field(subject, of),
         _too_deep(of, seed),
     ]
@@ -103,14 +94,13 @@ def _subject(of: Synthesis, seed: int) -> Subject:
     )
 
 
-def _over_time(on: Subject, seed: int) -> list[Omission]:
-    """Feel the whole protocol with and without a term."""
-    n = len(on.plan)
-    without = _feel(on, Terms(), seed)
+def _over_time(on: Subject, without: Felt, seed: int) -> list[Omission]:
+    """Feel the whole protocol with a term, and compare with what was felt without."""
+    n, slack = len(on.plan), RELAXATION
     rows = []
     for name, terms, how in (
         ("ageing", Terms(ageing=AGEING), f"at the last of {n} contacts, a no-load reading before each"),
-        ("relaxation", Terms(relaxation=RELAXATION), "0.5 s down, held for 0.5 s"),
+        ("relaxation", Terms(relaxation=slack), f"{slack.approach_s:g} s down, held for {slack.hold_s:g} s"),
     ):
         felt = _feel(on, terms, seed)
         rest_uT = np.abs(felt.rest_T[-1] - without.rest_T[-1]).max() / micro
@@ -120,11 +110,10 @@ def _over_time(on: Subject, seed: int) -> list[Omission]:
     return rows
 
 
-def _temperature(on: Subject, seed: int) -> Omission:
-    felt = _feel(on, Terms(), seed)
+def _temperature(on: Subject, without: Felt) -> Omission:
     factor = warmth.remanence(np.array([WARMER_K]))[0]
-    rest_uT = float(np.abs((factor - 1) * felt.rest_T).max() / micro)
-    field_pct = _error_pct(felt.change_T, factor * felt.change_T)
+    rest_uT = float(np.abs((factor - 1) * without.rest_T).max() / micro)
+    field_pct = _error_pct(without.change_T, factor * without.change_T)
     how = f"{WARMER_K:g} K warmer, a no-load reading before each contact"
     return Omission("temperature", _done("temperature", on), field_pct, rest_uT, 0.0, how)
 
@@ -136,6 +125,15 @@ def _friction(on: Subject) -> Omission:
     force_pct = 100 * float(np.abs(pushed.force_N).max() / forces(on.skin, tip_m[..., 2].ravel()).max())
     how = f"coefficient {FRICTION.coefficient:g}, {FEW} indentations of the protocol: nothing moves sideways"
     return Omission("friction", _done("friction", on), field_pct, 0.0, force_pct, how)
+
+
+def _earth(without: Felt) -> Omission:
+    """Add a steady field to no-load reading and contact alike, and take one from the other."""
+    rest_T = without.rest_T[:, None] + EARTH_T
+    seen_T = (rest_T + without.change_T) - rest_T
+    how = "a steady field, as long as the board does not turn; a no-load reading before each contact"
+    rest_uT = float(np.abs(EARTH_T).max() / micro)
+    return Omission("the earth's field", "left out", _error_pct(without.change_T, seen_T), rest_uT, 0.0, how)
 
 
 def _free_edge(on: Subject) -> list[Omission]:
@@ -216,8 +214,8 @@ def _base_pct(skin: Skin, depth_m: float, other: layer.Base) -> float:
     return _error_pct(force_N(other), force_N(skin.base))
 
 
-def _steps(on: Subject, of: Synthesis, seed: int) -> Omission:
-    change_uT = _feel(on, Terms(), seed).change_T / micro
+def _steps(without: Felt, of: Synthesis) -> Omission:
+    change_uT = without.change_T / micro
     step_uT = sensor.steps_uT(of.chip.gain_sel)
     share = np.sqrt((step_uT**2 / 12).mean() / (change_uT**2).mean())
     return Omission("the chips' steps", "kept", float(100 * share), float(step_uT.max() / 2), 0.0, "rounding alone")

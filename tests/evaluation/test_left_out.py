@@ -59,6 +59,11 @@ def test_a_kelvin_costs_0_12_percent_of_every_field(rows):
     assert rows["temperature"].rest_uT == pytest.approx(0.0012e6 * np.abs(rest_T).max(), rel=1e-6)
 
 
+def test_a_steady_field_is_taken_off_with_the_no_load_reading(rows):
+    assert 0 < rows["the earth's field"].field_pct < 1e-6  # rounding
+    assert rows["the earth's field"].rest_uT == pytest.approx(45)
+
+
 def test_what_is_kept_could_not_go(rows):
     # PHYSICS 8: increments 16-23 % of a bonded skin at 1.2 mm; of a sliding one the far field, which is linear, counts
     assert rows["increments"].field_pct > 2
