@@ -2,6 +2,7 @@
 
 from pipeline.strict import parse
 from pipeline.synthesis.capture import Synthesis
+from tests.physics.test_board import SPREADS
 
 GRID = {"kind": "grid", "boards": "rigid", "skins_n": 4, "passes_n": 2, "depths_mm": (0.6, 1.2), "terms": []}
 CHIPS_MM = ((0.0, 0.0), (-7.0, 0.0), (0.0, -7.0), (7.0, 0.0), (0.0, 7.0))
@@ -37,20 +38,7 @@ SECTIONS = {
         "tip_radius_mm": 3.0,
     },
     "chip": {"gain_sel": 6, "noise_xy_uT": 3.3, "noise_z_uT": 5.0, "noise_temperature_degC": 0.1},
-    "spreads": {
-        "board_gap_mm": 0.1,
-        "chip_gain": 0.025,
-        "chip_cross_axis": 0.01,
-        "chip_tilt_deg": 2.0,
-        "chip_offset_uT": 200.0,
-        "skin_amplitude": 0.1,
-        "skin_filler": 0.1,
-        "skin_filler_length_mm": 3.0,
-        "skin_thickness": 0.03,
-        "skin_modulus": 0.1,
-        "skin_seat_mm": 0.25,
-        "skin_depth_zero_mm": 0.05,
-    },
+    "spreads": SPREADS,
     "terms": {},
 }
 

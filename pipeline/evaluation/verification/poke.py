@@ -8,6 +8,7 @@ from jaxtyping import Float
 from scipy.constants import micro, milli
 
 from pipeline.dataset.grid import CENTRE_MM, protocol
+from pipeline.evaluation.magpylib_sum import field_of
 from pipeline.evaluation.verification import reference
 from pipeline.evaluation.verification.checks import Check, apart, no_spread, worst
 from pipeline.physics.board import Board, BoardDesign, Spreads, draw_board
@@ -74,9 +75,9 @@ def _shortcuts(board: Board, skin: Skin, depths_m: tuple[float, ...]) -> list[Ch
     for depth_m, kind in ((min(depths_m), "shallowest"), (max(depths_m), "deepest")):
         pokes_m = _each_depth(PLACES_M, (depth_m,))
         _, found_T = changes_of_field(board, skin, pokes_m)
-        before_T = reference.field_of((skin.nodes_m, skin.moments_A_m2), board.chips_m)
+        before_T = field_of((skin.nodes_m, skin.moments_A_m2), board.chips_m)
         moved = [reference.moved_dipoles(skin, poke_m, REFERENCE_STEPS_N) for poke_m in pokes_m]
-        truth_T = np.stack([reference.field_of(one, board.chips_m) - before_T for one in moved])
+        truth_T = np.stack([field_of(one, board.chips_m) - before_T for one in moved])
         checks.append(
             Check("dB of pokes", f"table, steps and kernel, {kind} depth ({depth_m / milli:g} mm)",
                   f"each node followed in {REFERENCE_STEPS_N} steps, F = R U by SVD, magpylib's dipoles",

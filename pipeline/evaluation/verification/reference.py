@@ -1,18 +1,15 @@
-"""A poke without shortcuts: no table, no interpolation, no compiled kernel. In: a skin, a poke. Out: moved dipoles, dB.
+"""A poke without shortcuts: no table, no interpolation. In: a skin, a poke. Out: moved dipoles.
 
-Every node is followed by itself, its moment turned by the R of F = R U from a singular value decomposition, and
-magpylib sums. Too slow for a capture. Refuses to know chips.
+Every node is followed by itself, its moment turned by the R of F = R U from a singular value decomposition: too slow
+for a capture. Refuses to know chips and how fields are summed (`magpylib_sum`).
 """
 
 import numpy as np
 from jaxtyping import Float
-from scipy.constants import mu_0
 
 from pipeline.evaluation.verification.kinematics import descent
 from pipeline.physics import flow
-from pipeline.physics.skin import Skin
-
-Dipoles = tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]  # places in m, moments in A m^2
+from pipeline.physics.skin import Dipoles, Skin
 
 
 def moved_dipoles(skin: Skin, poke_m: Float[np.ndarray, "3"], steps_n: int) -> Dipoles:
@@ -29,13 +26,3 @@ def moved_dipoles(skin: Skin, poke_m: Float[np.ndarray, "3"], steps_n: int) -> D
     turned = np.einsum("sij,sj->si", u @ vt, plane)
     aside = skin.moments_A_m2 - plane[:, :1] * outward - plane[:, 1:] * (0, 0, 1)
     return places_m, aside + turned[:, :1] * outward + turned[:, 1:] * (0, 0, 1)
-
-
-def field_of(dipoles: Dipoles, observers_m: Float[np.ndarray, "o 3"]) -> Float[np.ndarray, "o 3"]:
-    """Sum magpylib's field of dipoles at observers, in tesla."""
-    from magpylib.core import dipole_Hfield
-
-    places_m, moments = dipoles
-    separation_m = (observers_m[:, None] - places_m).reshape(-1, 3)
-    h_A_m = dipole_Hfield(observers=separation_m, moments=np.tile(moments, (len(observers_m), 1)))
-    return mu_0 * h_A_m.reshape(len(observers_m), -1, 3).sum(axis=1)

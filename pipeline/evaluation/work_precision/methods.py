@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 from magpylib import getB
-from magpylib.core import dipole_Hfield
 from magpylib.magnet import Cuboid
 from magpylib.misc import Dipole
 from scipy.constants import mu_0
 from scipy.spatial.transform import Rotation
 
+from pipeline.evaluation.magpylib_sum import field_of
 from pipeline.evaluation.work_precision.lattices import box_m, gauss_everywhere, midpoints
 from pipeline.evaluation.work_precision.motion import Path, paths
 from pipeline.evaluation.work_precision.trials import Trial, laid
@@ -79,11 +79,11 @@ def magpylib_core(trial: Trial, rule: Quadrature) -> Prepared:
     skin = laid(trial, place_nodes(trial.skin.thickness_m, rule))
     path = paths(trial, skin)
     moments = _turned(path, skin.moments_A_m2)
-    rest_T = _core_field(skin.nodes_m, skin.moments_A_m2, trial.board.chips_m)
+    rest_T = field_of((skin.nodes_m, skin.moments_A_m2), trial.board.chips_m)
 
     def call() -> Changes:
         poked = zip(path.nodes_m, moments, strict=True)
-        return np.stack([_core_field(*now, trial.board.chips_m) - rest_T for now in poked])
+        return np.stack([field_of(now, trial.board.chips_m) - rest_T for now in poked])
 
     return Prepared(len(skin.nodes_m), call)
 
@@ -116,14 +116,6 @@ METHODS: dict[str, Callable[[Trial, Quadrature], Prepared]] = {
 
 def _turned(path: Path, moments_A_m2: Float[np.ndarray, "s 3"]) -> Float[np.ndarray, "n s 3"]:
     return np.stack([Rotation.from_rotvec(turns_rad).apply(moments_A_m2) for turns_rad in path.turns_rad])
-
-
-def _core_field(
-    nodes_m: Float[np.ndarray, "s 3"], moments_A_m2: Float[np.ndarray, "s 3"], chips_m: Float[np.ndarray, "k 3"]
-) -> Float[np.ndarray, "k 3"]:
-    away_m = (chips_m[:, None] - nodes_m).reshape(-1, 3)
-    each_T = mu_0 * dipole_Hfield(observers=away_m, moments=np.tile(moments_A_m2, (len(chips_m), 1)))
-    return each_T.reshape(len(chips_m), -1, 3).sum(axis=1)
 
 
 def _by_objects(trial: Trial, skin: Skin, at_origin: Callable[[int], Any]) -> Prepared:
