@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Int32
+from jaxtyping import Float32, Int32, Int64
 
 from pipeline.dataset.baseline import subtract
 from pipeline.errors import ParamsError, complain
@@ -29,7 +29,8 @@ class Rows:
     """Stacked rows of a scene, captures in order of name.
 
     `db_uT` is the change of field against the no-load reading of the same indentation; `target` holds x_mm, y_mm and
-    Fz_N (NaN where a recording has no force); `pass_i` counts on over the captures of one skin.
+    Fz_N (NaN where a recording has no force); `pass_i` counts on over the captures of one skin; `indentation` counts on
+    over the captures of the scene, and the readings of one indentation share it.
     """
 
     capture: np.ndarray
@@ -38,17 +39,19 @@ class Rows:
     db_uT: Float32[np.ndarray, "f ch"]
     target: Float32[np.ndarray, "f 3"]
     pass_i: Int32[np.ndarray, " f"]
+    indentation: Int64[np.ndarray, " f"]
     dropped: dict[str, int]
 
     def __len__(self) -> int:
         return len(self.db_uT)
 
     @classmethod
-    def of_labels(cls, boards: Sequence[str], skins: Sequence[str]) -> "Rows":
-        """Rows without readings, for showing how folds are drawn."""
+    def of_labels(cls, boards: Sequence[str], skins: Sequence[str], pass_i: Sequence[int] | None = None) -> "Rows":
+        """Rows without readings, one an indentation, for showing how folds are drawn; one pass unless told."""
         f = len(boards)
-        empty = np.zeros((f, 3), np.float32)
-        return cls(np.array(["c"] * f), np.array(boards), np.array(skins), empty, empty, np.zeros(f, np.int32), {})
+        empty, passes = np.zeros((f, 3), np.float32), np.array(pass_i if pass_i is not None else [0] * f, np.int32)
+        labels = np.array(["c"] * f), np.array(boards), np.array(skins)
+        return cls(*labels, empty, empty, passes, np.arange(f), {})
 
 
 def gather(captures: Sequence[Readings], selection: Selection) -> Rows:
@@ -83,6 +86,7 @@ def gather(captures: Sequence[Readings], selection: Selection) -> Rows:
         ),
         target=np.concatenate([_targets(one)[keep] for one, keep in zip(captures, kept, strict=True)]),
         pass_i=np.concatenate(pass_i),
+        indentation=_count_on([one.indentation[keep] for one, keep in zip(captures, kept, strict=True)]),
         dropped={"no_contact_rows_n": places_unknown_n, "low_force_rows_n": all_n - kept_n - places_unknown_n},
     )
 
@@ -99,6 +103,16 @@ def _targets(one: Readings) -> Float32[np.ndarray, "f 3"]:
 
 def _repeat(labels: list[str], kept: list[np.ndarray]) -> np.ndarray:
     return np.repeat(np.array(labels), [int(keep.sum()) for keep in kept])
+
+
+def _count_on(indentations: list[np.ndarray]) -> Int64[np.ndarray, " f"]:
+    """Number the indentations of each capture after those of the one before."""
+    before_n, counted = 0, []
+    for own in indentations:
+        distinct, own_i = np.unique(own, return_inverse=True)
+        counted.append(before_n + own_i)
+        before_n += len(distinct)
+    return np.concatenate(counted)
 
 
 def _check_one_kind(captures: Sequence[Readings]) -> None:

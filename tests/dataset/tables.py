@@ -25,11 +25,12 @@ def readings(capture: str = "c0", board: str = "b0", skin: str = "s0", f: int = 
 
 
 def rows(boards: Sequence[str], skins: Sequence[str], pass_i: Sequence[int] | None = None) -> Rows:
-    """Rows with these labels and random fields."""
+    """Rows with these labels and random fields, each an indentation of its own."""
     rng = rng_for(0, "rows")
     f = len(boards)
     return Rows(
         np.array([f"c_{skin}" for skin in skins]), np.array(boards), np.array(skins),
         rng.normal(0, 50, (f, 3)).astype(np.float32),
-        rng.uniform(0, 16, (f, 3)).astype(np.float32), np.array(pass_i or [0] * f, np.int32), {},
+        rng.uniform(0, 16, (f, 3)).astype(np.float32), np.array(pass_i or [0] * f, np.int32),
+        np.arange(f), {},
     )  # fmt: skip

@@ -26,6 +26,21 @@ def test_passes_count_on_over_the_captures_of_a_skin_but_not_over_skins():
     assert rows.pass_i.tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 0, 0, 0, 1, 1, 1]
 
 
+def test_an_indentation_has_one_number_in_the_whole_scene_and_its_readings_share_it():
+    press = np.array([7, 7, 2, 2, 9, 9], np.int32)  # the captures number alike, and not from 0
+    lost = np.array([0, 0, np.nan, np.nan, 4, 4], np.float32)
+    rows = gather([readings("c1", indentation=press, x_mm=lost), readings("c0", indentation=press)], ALL)
+    naive, seen = [], []
+    for capture, own in zip(rows.capture, [*press, *press[~np.isnan(lost)]], strict=True):
+        if (capture, own) not in seen:
+            seen.append((capture, own))
+        naive.append((capture, own))
+    same = np.array([[one == other for one in naive] for other in naive])
+    assert ((rows.indentation[:, None] == rows.indentation) == same).all()
+    assert sorted(set(rows.indentation.tolist())) == list(range(len(seen)))
+    assert rows.indentation[rows.capture == "c0"].max() < rows.indentation[rows.capture == "c1"].min()
+
+
 def test_the_order_of_captures_changes_nothing():
     one, other = readings("c0"), readings("c1", board="b1", skin="s1", Fz_N=np.full(6, 2, np.float32))
     ahead, behind = gather([one, other], ALL), gather([other, one], ALL)
