@@ -1,4 +1,4 @@
-"""`folds.json`: which rows are on which side, readable by people. In: `Fold`s. Out: JSON words, and back.
+"""`folds.json`: which rows are on which side or in the pool, for people. In: `Fold`s. Out: JSON words, and back.
 
 Row numbers stand as half-open ranges, because folds by board or pass are few long runs. Refuses to know how folds
 were drawn.
@@ -23,7 +23,7 @@ def load_rows(files: Sequence[Path], selection: Selection) -> Rows:
 
 
 def render_folds(captures: Sequence[str], rows: Rows, folds: Sequence[Fold]) -> dict[str, Any]:
-    """Write folds as JSON words, with the boards and skins of each side for the reader."""
+    """Write folds as JSON words, with the boards and skins of each side and of the pool for the reader."""
     return {
         "captures": list(captures),
         "rows_n": len(rows),
@@ -34,8 +34,10 @@ def render_folds(captures: Sequence[str], rows: Rows, folds: Sequence[Fold]) -> 
                 "name": fold.name,
                 **_who("train", rows, fold.train),
                 **_who("test", rows, fold.test),
+                **_who("pool", rows, fold.pool),
                 "train": to_ranges(fold.train),
                 "test": to_ranges(fold.test),
+                "pool": to_ranges(fold.pool),
             }
             for fold in folds
         ],
@@ -49,7 +51,7 @@ def parse_folds(words: dict[str, Any], rows: Rows, where: str) -> list[Fold]:
             complain(where, "rows_n", f"the {len(rows)} rows of its captures", words["rows_n"], "Split again.")
         )
     return [
-        Fold(one["question"], one["name"], from_ranges(one["train"]), from_ranges(one["test"]))
+        Fold(one["question"], one["name"], *(from_ranges(one[side]) for side in ("train", "test", "pool")))
         for one in words["folds"]
     ]
 

@@ -1,4 +1,4 @@
-"""Who is held out: leave-one-board-out, one skin to others, random, temporal. In: rows. Out: folds.
+"""Who is held out: leave-one-board-out, fewer sensors, one skin to others, random, temporal. In: rows. Out: folds.
 
 The drawing is scikit-learn's; this module names the groups and proves that no skin or board is on both sides of
 a fold that claims so. Refuses to know what is trained on a fold.
@@ -10,33 +10,52 @@ from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Int64
-from pydantic import Field
+from pydantic import Field, field_validator
 from sklearn.model_selection import LeaveOneGroupOut, ShuffleSplit, train_test_split
 
 from pipeline.dataset.rows import Rows
 from pipeline.errors import ParamsError, complain
+from pipeline.seeds import rng_for
 from pipeline.strict import Strict
 
-Question = Literal["lobo", "transfer", "single_random", "single_temporal"]
+Question = Literal["lobo", "sensors", "transfer", "single_random", "single_temporal"]
+Count = Annotated[int, Field(ge=1)]
 
 
 class Split(Strict):
     """How folds are drawn; each part is there if, and only if, its question is asked."""
 
     random_test_fraction: Annotated[float, Field(gt=0, lt=1)] | None = None
-    random_repeats_n: Annotated[int, Field(ge=1)] | None = None
+    random_repeats_n: Count | None = None
     temporal_test_fraction: Annotated[float, Field(gt=0, lt=1)] | None = None
-    transfer_skins_n: Annotated[int, Field(ge=1)] | None = None
+    transfer_skins_n: Count | None = None
+    sensors_skins_n: Annotated[tuple[Count, ...], Field(min_length=1)] | None = None
+    sensors_draws_n: Count | None = None
+    pool_passes_n: Count | None = None  # of each held-out skin, its first ones
+
+    @field_validator("sensors_skins_n")
+    @classmethod
+    def _sensors_differ(cls, skins_n: tuple[int, ...] | None) -> tuple[int, ...] | None:
+        if skins_n is not None and len(set(skins_n)) < len(skins_n):
+            raise ValueError(f"sensors_skins_n names each number of skins once, not {list(skins_n)}")
+        return skins_n
 
 
 @dataclass(frozen=True)
 class Fold:
-    """Row numbers (of `Rows`) on both sides of one hold-out."""
+    """Row numbers (of `Rows`): the two sides of one hold-out, and the pool of unlabelled pokes on the held-out skins.
+
+    Adaptation may poke in the pool; nothing is scored there, so that every method is scored on the same rows.
+    """
 
     question: str
     name: str
     train: Int64[np.ndarray, " a"]
     test: Int64[np.ndarray, " b"]
+    pool: Int64[np.ndarray, " c"]
+
+
+NO_POOL = np.zeros(0, np.int64)
 
 
 def draw_folds(rows: Rows, questions: Iterable[str], split: Split, seed: int) -> list[Fold]:
@@ -45,6 +64,28 @@ def draw_folds(rows: Rows, questions: Iterable[str], split: Split, seed: int) ->
     >>> rows = Rows.of_labels(boards=["b1", "b1", "b2"], skins=["s1", "s2", "s3"])
     >>> [(fold.name, fold.train.tolist(), fold.test.tolist()) for fold in draw_folds(rows, ["lobo"], Split(), 0)]
     [('b1', [2], [0, 1]), ('b2', [0, 1], [2])]
+
+    With a pool, the first passes of each held-out skin are adapted on, and its later ones tested:
+
+    >>> rows = Rows.of_labels(["b1"] * 3 + ["b2"] * 2, ["s1"] * 3 + ["s2"] * 2, pass_i=[0, 1, 2, 0, 1])
+    >>> def show(folds):
+    ...     for fold in folds:
+    ...         print(fold.name, fold.train, fold.pool, fold.test)
+    >>> show(draw_folds(rows, ["lobo"], Split(pool_passes_n=1), 0))
+    b1 [3 4] [0] [1 2]
+    b2 [0 1 2] [3] [4]
+
+    Fewer sensors: the last board stays held out, and each draw adds skins to those that it had:
+
+    >>> rows = Rows.of_labels(["b1", "b1", "b2", "b3", "b3"], ["s1", "s2", "s3", "s4", "s4"], pass_i=[0, 0, 0, 0, 1])
+    >>> sensors = Split(sensors_skins_n=(1, 2, 3), sensors_draws_n=2, pool_passes_n=1)
+    >>> show(draw_folds(rows, ["sensors"], sensors, 0))
+    01skins-draw0 [1] [3] [4]
+    01skins-draw1 [0] [3] [4]
+    02skins-draw0 [1 2] [3] [4]
+    02skins-draw1 [0 2] [3] [4]
+    03skins-draw0 [0 1 2] [3] [4]
+    03skins-draw1 [0 1 2] [3] [4]
     """
     return [fold for question in questions for fold in _DRAW[question](rows, split, seed)]
 
@@ -60,9 +101,32 @@ def leave_one_board_out(rows: Rows, split: Split, seed: int) -> list[Fold]:
             )
         )  # fmt: skip
     drawn = LeaveOneGroupOut().split(np.empty((len(rows), 0)), groups=rows.board)
-    folds = [Fold("lobo", str(rows.board[test[0]]), train, test) for train, test in drawn]
-    for fold in folds:
-        _prove_apart(rows, fold)
+    return [_hold_out(rows, "lobo", str(rows.board[held[0]]), (train, held), split) for train, held in drawn]
+
+
+def fewer_sensors(rows: Rows, split: Split, seed: int) -> list[Fold]:
+    """Train on k skins of all boards but the last, test on that board; one fold a k and draw (paper figure 6b).
+
+    Within a draw, the skins of a smaller k are among those of a larger one.
+    """
+    assert split.sensors_skins_n is not None
+    assert split.sensors_draws_n is not None
+    last = np.unique(rows.board)[-1]
+    held, skins = np.flatnonzero(rows.board == last), np.unique(rows.skin[rows.board != last])
+    if max(split.sensors_skins_n) > len(skins):
+        raise ParamsError(
+            complain(
+                "question sensors", "split.sensors_skins_n",
+                f"at most the {len(skins)} skins beside held-out board {last}", max(split.sensors_skins_n),
+                "Ask for fewer, or add another board's recording.",
+            )
+        )  # fmt: skip
+    orders = [rng_for(seed, "sensors", draw_i).permutation(skins) for draw_i in range(split.sensors_draws_n)]
+    folds = []
+    for skins_n in split.sensors_skins_n:
+        for draw_i, order in enumerate(orders):
+            train = np.flatnonzero(np.isin(rows.skin, order[:skins_n]))
+            folds.append(_hold_out(rows, "sensors", f"{skins_n:02d}skins-draw{draw_i}", (train, held), split))
     return folds
 
 
@@ -85,7 +149,8 @@ def one_skin_to_others(rows: Rows, split: Split, seed: int) -> list[Fold]:
     folds = []
     for board in boards[:train_n]:
         skin = np.unique(rows.skin[rows.board == board])[0]
-        folds.append(Fold("transfer", str(skin), np.flatnonzero((rows.board == board) & (rows.skin == skin)), test))
+        train = np.flatnonzero((rows.board == board) & (rows.skin == skin))
+        folds.append(Fold("transfer", str(skin), train, test, NO_POOL))
         _prove_apart(rows, folds[-1])
     return folds
 
@@ -101,7 +166,7 @@ def random_readings(rows: Rows, split: Split, seed: int) -> list[Fold]:
     test_n = _test_n(len(own), split.random_test_fraction, f"readings of skin {rows.skin[own[0]]}", "single_random")
     shuffle = ShuffleSplit(split.random_repeats_n, test_size=test_n, random_state=seed % 2**32)
     return [
-        Fold("single_random", f"repeat{i}", np.sort(own[train]), np.sort(own[test]))
+        Fold("single_random", f"repeat{i}", np.sort(own[train]), np.sort(own[test]), NO_POOL)
         for i, (train, test) in enumerate(shuffle.split(own))
     ]
 
@@ -126,10 +191,32 @@ def last_passes(rows: Rows, split: Split, seed: int) -> list[Fold]:
         folds.append(
             Fold(
                 "single_temporal", str(skin),
-                own[np.isin(rows.pass_i[own], first)], own[np.isin(rows.pass_i[own], last)],
+                own[np.isin(rows.pass_i[own], first)], own[np.isin(rows.pass_i[own], last)], NO_POOL,
             )
         )  # fmt: skip
     return folds
+
+
+def _hold_out(rows: Rows, question: str, name: str, sides: tuple[np.ndarray, np.ndarray], split: Split) -> Fold:
+    """Make a fold of train and held-out rows; the first passes of each held-out skin are its pool, if one is asked."""
+    train, held = sides
+    pooled = np.zeros(len(held), bool)
+    if split.pool_passes_n is not None:
+        for skin in np.unique(rows.skin[held]):
+            own = rows.skin[held] == skin
+            passes = np.unique(rows.pass_i[held[own]])
+            if len(passes) <= split.pool_passes_n:
+                raise ParamsError(
+                    complain(
+                        f"question {question}", f"passes of held-out skin {skin}",
+                        f"more than split.pool_passes_n, {split.pool_passes_n}", len(passes),
+                        "Record more passes, or make the pool smaller.",
+                    )
+                )  # fmt: skip
+            pooled |= own & np.isin(rows.pass_i[held], passes[: split.pool_passes_n])
+    fold = Fold(question, name, train, held[~pooled], held[pooled])
+    _prove_apart(rows, fold)
+    return fold
 
 
 def _test_n(all_n: int, fraction: float, what: str, question: str) -> int:
@@ -146,8 +233,9 @@ def _test_n(all_n: int, fraction: float, what: str, question: str) -> int:
 
 
 def _prove_apart(rows: Rows, fold: Fold) -> None:
+    held = np.concatenate([fold.test, fold.pool])
     for what, labels in (("board", rows.board), ("skin", rows.skin)):
-        both = np.intersect1d(np.unique(labels[fold.train]), np.unique(labels[fold.test]))
+        both = np.intersect1d(np.unique(labels[fold.train]), np.unique(labels[held]))
         if len(both):
             raise ParamsError(
                 complain(
@@ -159,6 +247,7 @@ def _prove_apart(rows: Rows, fold: Fold) -> None:
 
 _DRAW: dict[str, Callable[[Rows, Split, int], list[Fold]]] = {
     "lobo": leave_one_board_out,
+    "sensors": fewer_sensors,
     "transfer": one_skin_to_others,
     "single_random": random_readings,
     "single_temporal": last_passes,

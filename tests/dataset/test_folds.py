@@ -22,19 +22,26 @@ def test_ranges_hold_exactly_the_numbers(numbers):
     assert from_ranges(to_ranges(sorted_numbers)).tolist() == sorted_numbers.tolist()
 
 
-def test_folds_survive_json():
-    drawn = draw_folds(TABLE, ["lobo"], Split(), 0)
-    words = json.loads(json.dumps(render_folds(["c0"], TABLE, drawn)))
-    again = parse_folds(words, TABLE, "folds.json")
-    assert [(one.name, one.train.tolist(), one.test.tolist()) for one in again] == [
-        (one.name, one.train.tolist(), one.test.tolist()) for one in drawn
-    ]
+PASSES = rows(["b0"] * 3 + ["b1"] * 2, ["s0"] * 3 + ["s1"] * 2, [0, 1, 2, 0, 1])
+
+
+@pytest.mark.parametrize(("table", "split"), [(TABLE, Split()), (PASSES, Split(pool_passes_n=1))])
+def test_folds_survive_json_with_and_without_a_pool(table, split):
+    def listed(folds):
+        return [[one.name, one.train.tolist(), one.test.tolist(), one.pool.tolist()] for one in folds]
+
+    drawn = draw_folds(table, ["lobo"], split, 0)
+    words = json.loads(json.dumps(render_folds(["c0"], table, drawn)))
+    assert listed(parse_folds(words, table, "folds.json")) == listed(drawn)
 
 
 def test_folds_tell_a_reader_who_is_on_which_side():
     words = render_folds(["c0"], TABLE, draw_folds(TABLE, ["lobo"], Split(), 0))
     assert words["folds"][0]["test_boards"] == ["b0"]
     assert words["folds"][0]["train_skins"] == ["s1", "s2"]
+    assert words["folds"][0]["pool_skins"] == []
+    words = render_folds(["c0"], PASSES, draw_folds(PASSES, ["lobo"], Split(pool_passes_n=1), 0))
+    assert [(one["pool_boards"], one["pool_skins"]) for one in words["folds"]] == [(["b0"], ["s0"]), (["b1"], ["s1"])]
 
 
 def test_folds_of_other_rows_are_refused():

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from pipeline.dataset.splits import Split, draw_folds
 from pipeline.errors import ParamsError
+from pipeline.strict import parse
 from tests.dataset.tables import rows
 
 TRANSFER = Split(transfer_skins_n=3)
@@ -89,7 +90,94 @@ def test_fifty_passes_split_forty_to_ten():
     assert (len(fold.train), len(fold.test)) == (40, 10)
 
 
+def six_by_three_in_passes(passes_n: int, readings_n: int = 2):
+    labels = [
+        (f"b{board}", f"b{board}_s{skin}", pass_i)
+        for board in range(6) for skin in range(3) for pass_i in range(passes_n) for _ in range(readings_n)
+    ]  # fmt: skip
+    return rows(*(list(column) for column in zip(*labels, strict=True)))
+
+
+SENSORS = Split(sensors_skins_n=(15, 1, 6), sensors_draws_n=3, pool_passes_n=2)
+
+
+@pytest.mark.parametrize(("question", "split"), [("lobo", Split(pool_passes_n=2)), ("sensors", SENSORS)])
+def test_the_pool_is_the_first_passes_of_each_held_out_skin_and_the_test_its_later_ones(question, split):
+    table = six_by_three_in_passes(5)
+    for fold in draw_folds(table, [question], split, 0):
+        board = {*table.board[fold.test]}
+        assert len(board) == 1
+        held = [i for i in range(len(table)) if table.board[i] in board]
+        assert fold.pool.tolist() == [i for i in held if table.pass_i[i] in (0, 1)]
+        assert fold.test.tolist() == [i for i in held if table.pass_i[i] not in (0, 1)]
+        assert not {*table.indentation[fold.pool]} & {*table.indentation[fold.test]}
+
+
+@pytest.mark.parametrize("question", ["lobo", "sensors"])
+@given(order=st.permutations(range(12)))
+def test_the_order_of_rows_decides_neither_pool_nor_training_skins(question, order):
+    labels = [(f"b{board}", f"b{board}_s{skin}", p) for board in range(3) for skin in range(2) for p in (3, 5)]
+    split = Split(sensors_skins_n=(1, 3), sensors_draws_n=2, pool_passes_n=1)  # pass 4 has no row left
+    straight, shuffled = (
+        rows(*(list(column) for column in zip(*(labels[i] for i in numbers), strict=True)))
+        for numbers in (range(12), order)
+    )
+    ahead, behind = (draw_folds(table, [question], split, 7) for table in (straight, shuffled))
+    for one, other in zip(ahead, behind, strict=True):
+        assert one.name == other.name
+        for side in ("train", "test", "pool"):
+            assert {*getattr(one, side).tolist()} == {order[i] for i in getattr(other, side).tolist()}
+
+
+def test_without_a_pool_all_rows_of_the_held_out_board_are_tested():
+    table = six_by_three_in_passes(2)
+    for question in ("lobo", "sensors"):
+        for fold in draw_folds(table, [question], Split(sensors_skins_n=(2,), sensors_draws_n=1), 0):
+            assert len(fold.pool) == 0
+            assert fold.test.tolist() == np.flatnonzero(table.board == table.board[fold.test[0]]).tolist()
+
+
+@pytest.mark.parametrize(
+    ("question", "split"), [("transfer", TRANSFER), ("single_random", RANDOM), ("single_temporal", TEMPORAL)]
+)
+def test_questions_that_adapt_nothing_have_no_pool_even_where_others_have_one(question, split):
+    table = six_by_three_in_passes(5)
+    pooled = draw_folds(table, [question], split.model_copy(update={"pool_passes_n": 1}), 0)
+    for fold, plain in zip(pooled, draw_folds(table, [question], split, 0), strict=True):
+        assert len(fold.pool) == 0
+        assert fold.test.tolist() == plain.test.tolist()
+
+
+@given(st.integers(0, 2**32))
+def test_fewer_sensors_are_nested_within_a_draw_and_never_of_the_board_held_out(seed):
+    table = six_by_three_in_passes(3, readings_n=1)
+    folds = {fold.name: fold for fold in draw_folds(table, ["sensors"], SENSORS, seed)}
+    assert list(folds) == [f"{k:02d}skins-draw{draw_i}" for k in (15, 1, 6) for draw_i in range(3)]
+    assert {tuple(fold.test) for fold in folds.values()} == {tuple(folds["01skins-draw0"].test)}
+    for draw_i in range(3):
+        one, six, all_of_them = ({*table.skin[folds[f"{k:02d}skins-draw{draw_i}"].train]} for k in (1, 6, 15))
+        assert one < six < all_of_them
+        assert (len(one), len(six), len(all_of_them)) == (1, 6, 15)
+        assert "b5" not in {skin[:2] for skin in all_of_them}
+
+
+def test_another_draw_of_sensors_takes_other_skins_and_no_more_draws_change_it():
+    table = six_by_three_in_passes(1)
+    few, many = (
+        draw_folds(table, ["sensors"], Split(sensors_skins_n=(6,), sensors_draws_n=draws_n), 0) for draws_n in (2, 5)
+    )
+    assert len({tuple(fold.train) for fold in many}) == 5
+    assert [fold.train.tolist() for fold in few] == [fold.train.tolist() for fold in many[:2]]
+
+
+def test_a_number_of_sensors_asked_twice_is_refused_as_its_folds_would_share_a_name():
+    with pytest.raises(ParamsError, match="names each number of skins once"):
+        parse(Split, {"sensors_skins_n": [3, 3]}, "scene")
+
+
 ALMOST_ALL = Split(random_test_fraction=0.95, random_repeats_n=1)
+POOL_OF_2 = Split(pool_passes_n=2)
+MANY_SENSORS = Split(sensors_skins_n=(3, 16), sensors_draws_n=1)
 ONE_BOARD = rows(["b0"] * 3, ["s0"] * 3)
 TWO_CAPTURES = replace(ONE_BOARD, capture=np.array(["run2", "run10", "run10"]))
 
@@ -101,6 +189,10 @@ TWO_CAPTURES = replace(ONE_BOARD, capture=np.array(["run2", "run10", "run10"]))
         (ONE_BOARD, "transfer", TRANSFER, "split.transfer_skins_n must be less than .* 1 boards; got 3"),
         (ONE_BOARD, "single_temporal", TEMPORAL, "passes of skin s0 must be .*; got 1, of which 0.2 are 0"),
         (ONE_BOARD, "single_random", ALMOST_ALL, "got 3, of which 0.95 are 3"),
+        (six_by_three_in_passes(2), "lobo", POOL_OF_2, "passes of held-out skin b0_s0 must be more than .*, 2; got 2"),
+        (six_by_three_in_passes(2), "sensors", SENSORS, "passes of held-out skin b5_s0 must be more than .*, 2; got 2"),
+        (six_by_three_in_passes(1), "sensors", MANY_SENSORS, "at most the 15 skins beside held-out board b5; got 16"),
+        (ONE_BOARD, "sensors", SENSORS, "at most the 0 skins beside held-out board b0; got 15"),
         (TWO_CAPTURES, "single_temporal", TEMPORAL, "the captures of skin s0 must be one, .*; got run10, run2"),
     ],
 )  # fmt: skip
@@ -109,6 +201,9 @@ def test_folds_that_the_data_cannot_give_are_one_sentence(table, question, split
         draw_folds(table, [question], split, 0)
 
 
-def test_a_planted_leak_a_skin_on_two_boards_is_refused():
-    with pytest.raises(ParamsError, match="a skin must be on one side only; got s0 on both"):
-        draw_folds(rows(["b0", "b1"], ["s0", "s0"]), ["lobo"], Split(), 0)
+@pytest.mark.parametrize(
+    ("question", "split"), [("lobo", Split()), ("sensors", Split(sensors_skins_n=(1,), sensors_draws_n=1))]
+)
+def test_a_planted_leak_a_skin_on_two_boards_is_refused(question, split):
+    with pytest.raises(ParamsError, match="must be on one side only; got .* on both"):
+        draw_folds(rows(["b0", "b1"], ["s0", "s0"]), [question], split, 0)
