@@ -1,0 +1,62 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.learning.inputs import VIEW, DB_FLOOR_uT
+from pipeline.seeds import rng_for
+
+SHAPE_ATOL = 1e-6  # a component is at most 1, and is rounded to float32 (6e-8) a few times
+LOG_ATOL = 1e-5  # a log of up to 17, rounded to float32 (6e-8 of it) a few times
+
+
+def rows(seed: int = 0, n: int = 20, ch: int = 15) -> np.ndarray:
+    """Changes of some 120 uT, far above the floor."""
+    return rng_for(seed, "rows").normal(3, 30, (n, ch)).astype(np.float32)
+
+
+def test_raw_is_the_change_of_field_itself():
+    db_uT = rows()
+    assert (VIEW["raw"](db_uT) == db_uT).all()
+
+
+def test_a_shape_is_the_change_over_its_length_and_the_log_of_its_length():
+    db_uT = rows()
+    seen = VIEW["shape"](db_uT)
+    assert seen.shape == (20, 16)
+    assert seen.dtype == np.float32
+    for i in range(len(db_uT)):
+        length_uT = math.sqrt(sum(float(value) ** 2 for value in db_uT[i]))
+        for channel in range(15):
+            assert seen[i, channel] == pytest.approx(float(db_uT[i, channel]) / length_uT, abs=SHAPE_ATOL)
+        assert seen[i, 15] == pytest.approx(math.log(length_uT), abs=LOG_ATOL)
+
+
+@given(st.integers(0, 10_000), st.floats(1, 1e6))
+def test_a_stronger_magnet_has_the_same_shape_and_a_longer_log(seed, times):
+    db_uT = rows(seed)
+    seen, stronger = VIEW["shape"](db_uT), VIEW["shape"]((db_uT * times).astype(np.float32))
+    np.testing.assert_allclose(stronger[:, :-1], seen[:, :-1], atol=SHAPE_ATOL)
+    np.testing.assert_allclose(stronger[:, -1] - seen[:, -1], math.log(times), atol=LOG_ATOL)
+
+
+@given(st.integers(0, 10_000), st.floats(1e-3, 1e6))
+def test_a_shape_is_of_unit_length_wherever_it_is_above_the_floor(seed, times):
+    db_uT = (rows(seed) * times).astype(np.float32)
+    above = np.linalg.norm(db_uT.astype(float), axis=1) >= DB_FLOOR_uT
+    length = np.linalg.norm(VIEW["shape"](db_uT)[:, :-1].astype(float), axis=1)
+    np.testing.assert_allclose(length[above], 1, atol=SHAPE_ATOL)
+    assert (length[~above] < 1).all()
+
+
+def test_no_change_at_all_is_zeros_and_the_log_of_the_floor():
+    seen = VIEW["shape"](np.zeros((2, 15), np.float32))
+    assert (seen[:, :-1] == 0).all()
+    assert (seen[:, -1] == math.log(DB_FLOOR_uT)).all()
+
+
+@given(st.floats(0, 2.0**100))
+def test_a_change_of_any_length_is_seen_as_finite_numbers(length_uT):
+    assert np.isfinite(VIEW["shape"](np.array([[length_uT, -length_uT, 0]], np.float32))).all()
