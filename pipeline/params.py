@@ -12,25 +12,52 @@ from pydantic import Field, model_validator
 from pipeline.dataset.rows import Selection
 from pipeline.dataset.splits import Question, Split
 from pipeline.errors import ParamsError, complain
-from pipeline.learning.recipe import Training
+from pipeline.learning.recipe import Adaptations, PokesSweep, Training
 from pipeline.strict import Strict, parse, read_yaml
 
 Study = Literal["verification", "stability", "runtime", "left_out"]
+Further = Literal["triplet", "adapt", "pokes", "baselines", "audit"]
 
-# question -> the section (and stage) that answers it, and the keys of `split` that draw its folds
+# question -> the stage that answers it, and the keys of `split` that draw its folds
 ANSWERED_BY: dict[str, str] = {
     "lobo": "train_multi",
     "transfer": "train_single",
     "single_random": "train_single",
     "single_temporal": "train_single",
+    "sensors": "sweep_sensors",
+    "labels": "few_labels",
 }
 DRAWN_WITH: dict[str, set[str]] = {
     "lobo": set(),
     "transfer": {"transfer_skins_n"},
     "single_random": {"random_test_fraction", "random_repeats_n"},
     "single_temporal": {"temporal_test_fraction"},
+    "sensors": {"sensors_skins_n", "sensors_draws_n"},
+    "labels": {"labels_pool_n", "labels_draws_n"},
 }
-ARMS = ("train_single", "train_multi")
+# questions about the folds of others -> the stage that answers it, and the questions that it goes on from
+CONTINUED_BY: dict[str, str] = {
+    "triplet": "train_triplet",
+    "adapt": "adapt",
+    "pokes": "sweep_pokes",
+    "baselines": "train_classical",
+    "audit": "audit",
+}
+NEEDS: dict[str, set[str]] = {
+    "triplet": {"lobo"},
+    "adapt": {"triplet"},
+    "pokes": {"adapt"},
+    "sensors": {"adapt"},
+    "baselines": {"lobo"},
+    "labels": {"triplet"},
+    "audit": {"lobo"},
+}
+POOLED_BY = "adapt"  # takes pokes of the held-out skins, so a part of these is kept from every test
+ARMS = (
+    "train_single", "train_multi", "train_triplet", "adapt", "sweep_pokes", "sweep_sensors", "train_classical",
+    "few_labels", "audit",
+)  # fmt: skip
+WITHOUT_SECTION = {"sweep_sensors", "audit"}  # settings of others are all they need
 # questions about the physics of a simulated scene -> the stage that answers it
 STUDIED_BY: dict[str, str] = {
     "verification": "verify",
@@ -39,6 +66,9 @@ STUDIED_BY: dict[str, str] = {
     "left_out": "leave_out",
 }
 STUDIES = tuple(STUDIED_BY.values())
+MODELLED = {"train_single", "train_multi", "train_triplet", "adapt"}
+SWEPT = {"pokes": "sweep_pokes", "sensors": "sweep_sensors"}
+_STAGES = ANSWERED_BY | CONTINUED_BY
 MAIN_PROTOCOL = "grid"  # folds are drawn on its captures
 
 
@@ -59,24 +89,33 @@ class Scene(Strict):
 
     source: Literal["simulated", "recorded"]
     seed: Annotated[int, Field(ge=0)]
-    questions: Annotated[tuple[Literal[Question, Study], ...], Field(min_length=1)]
+    questions: Annotated[tuple[Literal[Question, Further, Study], ...], Field(min_length=1)]
     selection: Selection
     split: Split
     simulate: Simulation | None = None
     runtime: dict[str, Any] | None = None  # checked by the stage, as `simulate` is
     train_single: Training | None = None
     train_multi: Training | None = None
+    train_triplet: Training | None = None
+    adapt: Adaptations | None = None
+    sweep_pokes: PokesSweep | None = None
+    train_classical: dict[str, Any] | None = None  # checked by the stage, as `simulate` is
+    few_labels: dict[str, Any] | None = None
 
     @model_validator(mode="after")
     def _sections_follow_questions(self) -> "Scene":
         if (self.simulate is not None) != (self.source == "simulated"):
             raise ValueError("section simulate stands in a scene if and only if its source is simulated")
-        asked = {ANSWERED_BY[question] for question in self.trained}
+        asked = set(arms_of(self))
         for arm in ARMS:
-            if (getattr(self, arm) is not None) != (arm in asked):
-                asking = [question for question, stage in ANSWERED_BY.items() if stage == arm]
+            if arm not in WITHOUT_SECTION and (getattr(self, arm) is not None) != (arm in asked):
+                asking = [question for question, stage in _STAGES.items() if stage == arm]
                 raise ValueError(f"section {arm} stands in a scene if and only if it asks one of {asking}")
+        for question in self.questions:
+            if lacking := NEEDS.get(question, set()) - set(self.questions):
+                raise ValueError(f"a scene that asks {question} also asks {sorted(lacking)}, on which it goes on")
         needed = set().union(*(DRAWN_WITH[question] for question in self.trained))
+        needed |= {"pool_passes_n"} if POOLED_BY in self.questions else set()
         if needed != self.split.model_fields_set:
             raise ValueError(f"split holds exactly what the questions need, {sorted(needed)}")
         return self
@@ -95,7 +134,7 @@ class Scene(Strict):
 
     @property
     def trained(self) -> tuple[str, ...]:
-        """The questions that trainings answer."""
+        """The questions that have folds of their own."""
         return tuple(question for question in self.questions if question in ANSWERED_BY)
 
     @property
@@ -136,6 +175,13 @@ class Stages(Strict):
     split: dict[str, tuple[str, ...]]  # scene -> its recorded captures; none for a simulated one
     train_single: tuple[str, ...]
     train_multi: tuple[str, ...]
+    train_triplet: tuple[str, ...]
+    adapt: tuple[str, ...]
+    sweep_pokes: tuple[str, ...]
+    sweep_sensors: tuple[str, ...]
+    train_classical: tuple[str, ...]
+    few_labels: tuple[str, ...]
+    audit: tuple[str, ...]
     verify: tuple[str, ...]
     stability: tuple[str, ...]
     runtime: tuple[str, ...]
@@ -179,8 +225,19 @@ def check_planned(name: str, scene: Scene, params: Params, where: str) -> None:
 
 
 def arms_of(scene: Scene) -> list[str]:
-    """Name the training stages that answer a scene's questions."""
-    return [arm for arm in ARMS if arm in {ANSWERED_BY[question] for question in scene.trained}]
+    """Name the stages that answer a scene's questions about learning."""
+    asked = {_STAGES[question] for question in scene.questions if question in _STAGES}
+    return [arm for arm in ARMS if arm in asked]
+
+
+def modelled(scene: Scene) -> list[str]:
+    """Name the stages that leave models, with cards and predictions."""
+    return [arm for arm in arms_of(scene) if arm in MODELLED]
+
+
+def swept(scene: Scene) -> dict[str, str]:
+    """Name the questions whose answers are points of a curve, and the stage that finds them."""
+    return {question: stage for question, stage in SWEPT.items() if question in scene.questions}
 
 
 def described_in(scene: Scene) -> list[str]:

@@ -1,7 +1,8 @@
 """Scenes for tests, as plain words."""
 
 RECIPE = {
-    "architecture": "paper", "scaling": "standard", "epochs_n": 1, "batch_n": 64, "rate_max": 3e-3, "weight_decay": 0.0,
+    "architecture": "paper", "inputs": "raw", "scaling": "standard", "triplet_weight": 0.0, "steps_n": 1, "batch_n": 64,
+    "rate_max": 3e-3, "weight_decay": 0.0,
 }  # fmt: skip
 
 

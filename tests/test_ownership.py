@@ -19,7 +19,7 @@ HOMES = {
     r"ruamel": {"pipeline/strict.py", "pipeline/plan.py", "pipeline/registry.py"},
     r"\bimport torch|from torch": {
         "pipeline/seeds.py", "pipeline/learning/grid.py", "pipeline/learning/losses.py", "pipeline/learning/model.py",
-        "pipeline/learning/train.py",
+        "pipeline/learning/train.py", "pipeline/learning/feed.py",
     },
     r"from sklearn": {"pipeline/dataset/splits.py"},
     r"os\.environ": {"pipeline/learning/executors.py", "pipeline/server.py", "pipeline/tracking.py"},

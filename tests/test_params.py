@@ -52,9 +52,9 @@ def test_what_is_not_written_is_an_error_and_no_default():
 
 
 def test_a_misspelt_parameter_is_named_as_it_was_written():
-    recipe = {name: value for name, value in RECIPE.items() if name != "epochs_n"} | {"epoch_n": 4}
+    recipe = {name: value for name, value in RECIPE.items() if name != "steps_n"} | {"step_n": 4}
     scene = recorded(train_multi={"seeds_n": 1, "recipes": {"paper": recipe}})
-    with pytest.raises(ParamsError, match=r"recipes.paper.epoch_n must be a known parameter; got 4"):
+    with pytest.raises(ParamsError, match=r"recipes.paper.step_n must be a known parameter; got 4"):
         parse(Scene, scene, "scene.yaml")
 
 

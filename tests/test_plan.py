@@ -62,6 +62,7 @@ scenes: []
 lost_fraction_max: 0.05
 stages:
   {simulate: {}, ingest_simulated: {}, ingest: {}, describe: {}, split: {}, train_single: [], train_multi: [],
+   train_triplet: [], adapt: [], sweep_pokes: [], sweep_sensors: [], train_classical: [], few_labels: [], audit: [],
    verify: [], stability: [], runtime: [], leave_out: [], report: [], publish: []}
 """
 

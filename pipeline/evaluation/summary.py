@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.errors import SchemaError, complain
 from pipeline.evaluation.metrics import register, score, summarise
 
 
@@ -37,6 +38,51 @@ def over_test_skins(cards: Sequence[dict[str, Any]]) -> dict[str, dict[str, floa
     return _over_units(
         [((card["fold"], skin), one) for card in cards for skin, one in card["scores"]["by_skin"].items()]
     )
+
+
+def pool_skins(cards: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Put the cards of networks that were adapted to one skin each together: one a fold and seed, the mean over skins.
+
+    The test skins of a fold have equally many rows, so that this is the score of all its rows.
+    """
+    together: dict[tuple[str, int], list[dict[str, Any]]] = {}
+    for card in cards:
+        together.setdefault((card["fold"], card["seed_i"]), []).append(card)
+    return [
+        {"fold": fold, "seed_i": seed_i, "scores": _pool([card["scores"] for card in own])}
+        for (fold, seed_i), own in together.items()
+    ]
+
+
+def paired(cards: Sequence[dict[str, Any]], others: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
+    """Mean, sd and number of the differences on each held-out skin, both sides the mean over seeds."""
+    one, other = _by_held_out_skin(cards), _by_held_out_skin(others)
+    if one.keys() != other.keys():
+        raise SchemaError(
+            complain(
+                "a paired difference", "held-out skins", "the same on both sides", sorted(one.keys() ^ other.keys()),
+                "Train both on the same folds.",
+            )
+        )  # fmt: skip
+    return summarise([{name: one[key][name] - other[key][name] for name in one[key]} for key in one])
+
+
+def _by_held_out_skin(cards: Sequence[dict[str, Any]]) -> dict[tuple[str, str], dict[str, float]]:
+    scores: dict[tuple[str, str], list[dict[str, float]]] = {}
+    for card in cards:
+        for skin, one in card["scores"]["by_skin"].items():
+            scores.setdefault((card["fold"], skin), []).append(one)
+    return {key: _means(own) for key, own in scores.items()}
+
+
+def _pool(scores: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    by_skin = {skin: one for own in scores for skin, one in own["by_skin"].items()}
+    parts = {part: _means([own[part] for own in scores]) for part in ("all", "registered")}
+    return parts | {"by_skin": by_skin, "rows_n": sum(own["rows_n"] for own in scores)}
+
+
+def _means(scores: Sequence[dict[str, float]]) -> dict[str, float]:
+    return {name: value["mean"] for name, value in summarise(scores).items()}
 
 
 def _over_units(scores: Sequence[tuple[Any, dict[str, float]]]) -> dict[str, dict[str, float]]:

@@ -5,14 +5,14 @@ from typing import Any
 import numpy as np
 
 from pipeline.dataset.rows import TARGETS, Rows
-from pipeline.learning.grid import Cell, Trained
+from pipeline.learning.cell import Adapting, Cell, FewLabels, Trained
 
-FORMAT = "reskin-model/1"
+FORMAT = "reskin-model/2"
 
 
 def describe(cell: Cell, trained: Trained, rows: Rows, scene: str, code: str) -> dict[str, Any]:
     """Describe a trained cell; `scores` are added by whoever knows the truth."""
-    return {
+    card = {
         "format": FORMAT,
         "scene": scene,
         "question": cell.question,
@@ -24,13 +24,30 @@ def describe(cell: Cell, trained: Trained, rows: Rows, scene: str, code: str) ->
         "key": trained.key,
         "git": code,
         "architecture": {name: list(value.shape) for name, value in trained.weights.items()},
-        "input": {"quantity": "change of field", "unit": "uT", "channels_n": rows.db_uT.shape[1]},
+        "input": {
+            "quantity": "change of field",
+            "unit": "uT",
+            "channels_n": rows.db_uT.shape[1],
+            "view": cell.recipe.inputs,
+        },
         "output": {name: name.rsplit("_", 1)[1] for name in TARGETS},
         "scaler": {name: value.tolist() for name, value in trained.scaler.arrays().items()},
+        "stopped_step": trained.stopped_step,
         "train_boards": np.unique(rows.board[cell.train]).tolist(),
         "train_skins": np.unique(rows.skin[cell.train]).tolist(),
         "train_rows_n": len(cell.train),
         "test_boards": np.unique(rows.board[cell.test]).tolist(),
         "test_skins": np.unique(rows.skin[cell.test]).tolist(),
         "curve": [round(value, 9) for value in trained.curve],
+    }
+    return card if cell.tuning is None else card | {"tuning": _tuning(cell.tuning, rows)}
+
+
+def _tuning(tuning: Adapting | FewLabels, rows: Rows) -> dict[str, Any]:
+    used = tuning.lines.row if isinstance(tuning, Adapting) else tuning.own
+    words = {"from": tuning.start.key, "settings": tuning.settings.model_dump(mode="json")}
+    return words | {
+        "kind": "unlabelled" if isinstance(tuning, Adapting) else "labelled",
+        "skins": np.unique(rows.skin[used]).tolist(),
+        "pokes_n": len(np.unique(rows.indentation[used])),
     }

@@ -13,6 +13,8 @@ from pipeline.errors import ParamsError, complain
 
 VARIABLE = "RESKIN_EXECUTOR"
 DEFAULT = "processes:2"
+DEVICE_VARIABLE = "RESKIN_DEVICE"
+DEVICES = ("cpu", "cuda")
 
 
 def make_executor() -> Executor:
@@ -25,6 +27,14 @@ def make_executor() -> Executor:
         )
     # spawn: a forked child of a threaded parent can hang in BLAS.
     return ProcessPoolExecutor(int(count), multiprocessing.get_context("spawn"), _end_with_parent)
+
+
+def device() -> str:
+    """Where networks are trained: RESKIN_DEVICE, `cpu` if it is not set; one code path for all."""
+    word = os.environ.get(DEVICE_VARIABLE, DEVICES[0])
+    if word not in DEVICES:
+        raise ParamsError(complain(DEVICE_VARIABLE, "the device", f"one of {DEVICES}", repr(word), "Unset it for cpu."))
+    return word
 
 
 def _end_with_parent() -> None:

@@ -1,170 +1,122 @@
 """Many trainings at once: recipes x folds x seeds. In: rows and cells. Out: one finished file a cell.
 
-A cell is known by its content (rows, recipe, seed, code), and a finished one is never trained again: a killed stage
-goes on where it was, and one more seed costs one seed. Refuses to know stages, scores and pages.
+Cells of equal settings are trained as one stack. A finished cell is never trained again: a killed stage goes on where
+it was, and one more seed costs one seed. Refuses to know stages, scores and pages.
 """
 
-import hashlib
-import importlib.metadata
-import json
-import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, as_completed
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Int64
 
-from pipeline import io, seeds
+from pipeline import io
 from pipeline.errors import TrainingError, complain
-from pipeline.learning.recipe import Recipe
-from pipeline.learning.standardise import FIT, Scaler
+from pipeline.learning.cell import Cell, Keys, Measured, Trained, make_job
+from pipeline.learning.executors import device
+from pipeline.learning.inputs import VIEW
+from pipeline.learning.standardise import Scaler
 
-SOURCES = Path(__file__).parent
-
-
-@dataclass(frozen=True)
-class Cell:
-    """One training: a recipe on one fold with one seed. `train` and `test` are row numbers."""
-
-    question: str
-    recipe_name: str
-    recipe: Recipe
-    fold: str
-    seed: int
-    seed_i: int
-    train: Int64[np.ndarray, " a"]
-    test: Int64[np.ndarray, " b"]
-
-    @property
-    def name(self) -> str:
-        """A name for files and for people, unique within a stage."""
-        return f"{self.question}.{self.recipe_name}.{self.fold}.seed{self.seed_i}"
+STACK_N = {"cpu": 3, "cuda": 64}  # networks trained side by side; on a CPU more gain nothing, and two processes share
 
 
-@dataclass(frozen=True)
-class Trained:
-    """A finished cell: weights by name, scaler, loss a epoch, predictions (mm, mm, N) for the test rows."""
-
-    key: str
-    weights: dict[str, np.ndarray]
-    scaler: Scaler
-    curve: list[float]
-    predicted: Float32[np.ndarray, "b 3"]
-    seconds: float
-
-
-def train_cell(
-    cell: Cell, db_uT: Float32[np.ndarray, "f ch"], target: Float32[np.ndarray, "f 3"]
-) -> tuple[dict[str, np.ndarray], Scaler, list[float], Float32[np.ndarray, "b 3"]]:
-    """Fit the scaler on training rows, train, predict the test rows."""
+def train_stack(cells: Sequence[Cell], rows: Measured) -> list[Trained]:
+    """Train cells of equal settings side by side, and predict their test rows."""
     import torch  # late: only a process that trains pays for it
 
-    from pipeline.learning.train import predict, train
-    from pipeline.seeds import torch_generator_for
+    from pipeline.learning.model import predict
+    from pipeline.learning.train import train
 
-    torch.set_num_threads(1)  # the same sums in the same order, however many cells run beside this one
-    scaler = FIT[cell.recipe.scaling](db_uT[cell.train], target[cell.train])
-    generator = torch_generator_for(cell.seed, "train", cell.question, cell.fold, cell.seed_i)
-    net, curve = train(
-        torch.from_numpy(scaler.encode(db_uT[cell.train])),
-        torch.from_numpy(scaler.encode_target(target[cell.train])),
-        cell.recipe,
-        generator,
-    )
-    answers = predict(net, torch.from_numpy(scaler.encode(db_uT[cell.test]))).numpy()
-    weights = {name: value.numpy() for name, value in net.state_dict().items()}
-    return weights, scaler, curve, scaler.decode(answers)
+    torch.set_num_threads(1)  # the same sums in the same order, however many processes run beside this one
+    start_s, on, first = time.monotonic(), device(), cells[0]
+    jobs, scalers = zip(*(make_job(cell, rows) for cell in cells), strict=True)
+    architecture = first.recipe.architecture
+    outcomes = train(jobs, architecture, first.schedule, first.terms, on)
+    seconds = (time.monotonic() - start_s) / len(cells)
+    trained = []
+    for cell, scaler, outcome in zip(cells, scalers, outcomes, strict=True):
+        inputs = scaler.encode(VIEW[cell.recipe.inputs](rows.db_uT[cell.test]))
+        predicted = scaler.decode(predict(outcome.weights, architecture, inputs, on))
+        trained.append(Trained("", outcome.weights, scaler, outcome.curve, predicted, outcome.stopped_step, seconds))
+    return trained
 
 
 def run_cells(
-    cells: Sequence[Cell],
-    db_uT: Float32[np.ndarray, "f ch"],
-    target: Float32[np.ndarray, "f 3"],
-    *,
-    executor: Executor,
-    cache: Path,
-    tell: Callable[[str], None],
+    cells: Sequence[Cell], rows: Measured, *, executor: Executor, cache: Path, tell: Callable[[str], None]
 ) -> list[Trained]:
     """Train what `cache` does not hold yet, and return every cell's result in the order of `cells`."""
-    rows_file = cache / "rows" / f"{_digest(db_uT, target)}.safetensors"
-    if not rows_file.exists():
-        io.write_tensors(rows_file, {"db_uT": db_uT, "target": target}, {})
-    keys = [cell_key(cell, db_uT, target) for cell in cells]
-    files = [cache / f"{key}.safetensors" for key in keys]
-    missing = [i for i, file in enumerate(files) if not file.exists()]
+    keys = Keys(rows)
+    files = {cell.name: cache / f"{keys.key(cell)}.safetensors" for cell in cells}
+    missing = [cell for cell in cells if not files[cell.name].exists()]
     if len(missing) < len(cells):
         tell(f"{len(cells) - len(missing)} of {len(cells)} trainings were finished before")
-    start_s = time.monotonic()
-    running = {executor.submit(_train_to_file, rows_file, cells[i], files[i]): i for i in missing}
-    for done_n, future in enumerate(as_completed(running), 1):
+    if missing:
+        rows_file = cache / "rows" / f"{keys.rows_digest()}.safetensors"
+        skin = np.unique(rows.skin, return_inverse=True)[1].astype(np.int64)
+        io.write_tensors(rows_file, {"db_uT": rows.db_uT, "target": rows.target, "skin": skin}, {})
+        _run_stacks(missing, rows_file, files, executor, tell)
+        io.remove(rows_file)
+    return [_read_trained(files[cell.name]) for cell in cells]
+
+
+def _run_stacks(
+    cells: Sequence[Cell], rows_file: Path, files: Mapping[str, Path], executor: Executor, tell: Callable[[str], None]
+) -> None:
+    start_s, done_n, running = time.monotonic(), 0, {}
+    for stack in stacks(cells, STACK_N[device()]):
+        running[executor.submit(_stack_to_files, rows_file, stack, [files[cell.name] for cell in stack])] = stack
+    for future in as_completed(running):
         try:
             future.result()
         except TrainingError as error:
             executor.shutdown(cancel_futures=True)
-            raise TrainingError(f"{cells[running[future]].name}, {error}") from None
+            raise TrainingError(f"{running[future][0].name}, {error}") from None
         except BrokenExecutor:
             raise TrainingError(
                 complain(
-                    "training",
-                    "a worker process",
-                    "alive to its end",
-                    "one that died",
+                    "training", "a worker process", "alive to its end", "one that died",
                     "Out of memory? Run again: what was finished is kept.",
                 )
-            ) from None
-        left_s = (time.monotonic() - start_s) / done_n * (len(missing) - done_n)
-        tell(f"{done_n}/{len(missing)} {cells[running[future]].name}, about {left_s:.0f} s left")
-    io.remove(rows_file)
-    return [_read_trained(file, key) for file, key in zip(files, keys, strict=True)]
+            ) from None  # fmt: skip
+        done_n += len(running[future])
+        left_s = (time.monotonic() - start_s) / done_n * (len(cells) - done_n)
+        tell(f"{done_n}/{len(cells)} {running[future][-1].name}, about {left_s:.0f} s left")
 
 
-def cell_key(cell: Cell, db_uT: Float32[np.ndarray, "f ch"], target: Float32[np.ndarray, "f 3"]) -> str:
-    """Name a cell by all that decides its result: rows of both sides, recipe, seed, code, torch and platform."""
-    words = [
-        cell.question, cell.fold, cell.recipe.model_dump_json(), cell.seed, cell.seed_i,
-        _code_digest(), importlib.metadata.version("torch"), importlib.metadata.version("numpy"), sys.platform,
-    ]  # fmt: skip
-    rows = _digest(db_uT[cell.train], target[cell.train], db_uT[cell.test])
-    return hashlib.sha256(json.dumps([*words, rows]).encode()).hexdigest()[:32]
+def stacks(cells: Sequence[Cell], size_n: int) -> list[list[Cell]]:
+    """Put cells of equal settings together, at most so many; what a cell becomes does not depend on it."""
+    alike: dict[tuple[object, ...], list[Cell]] = {}
+    for cell in cells:
+        alike.setdefault((cell.recipe, cell.schedule, cell.terms), []).append(cell)
+    return [group[i : i + size_n] for group in alike.values() for i in range(0, len(group), size_n)]
 
 
-def _train_to_file(rows_file: Path, cell: Cell, file: Path) -> None:
-    start_s = time.monotonic()
-    rows = _read_rows(rows_file)
-    weights, scaler, curve, predicted = train_cell(cell, rows["db_uT"], rows["target"])
-    tensors = {f"weights.{name}": value for name, value in weights.items()} | scaler.arrays()
-    tensors |= {"curve": np.array(curve), "predicted": predicted}
-    io.write_tensors(file, tensors, {"seconds": f"{time.monotonic() - start_s:.3f}", "cell": cell.name})
+def _stack_to_files(rows_file: Path, cells: Sequence[Cell], files: Sequence[Path]) -> None:
+    for cell, file, one in zip(cells, files, train_stack(cells, _read_rows(rows_file)), strict=True):
+        tensors = {f"weights.{name}": value for name, value in one.weights.items()} | one.scaler.arrays()
+        tensors |= {"curve": np.array(one.curve), "predicted": one.predicted}
+        words = {"seconds": f"{one.seconds:.3f}", "cell": cell.name}
+        if one.stopped_step is not None:
+            words["stopped_step"] = str(one.stopped_step)
+        io.write_tensors(file, tensors, words)
 
 
 @lru_cache(maxsize=1)
-def _read_rows(rows_file: Path) -> dict[str, np.ndarray]:
-    return io.read_tensors(rows_file)[0]
+def _read_rows(rows_file: Path) -> Measured:
+    return Measured(**io.read_tensors(rows_file)[0])
 
 
-def _read_trained(file: Path, key: str) -> Trained:
-    tensors, metadata = io.read_tensors(file)
+def _read_trained(file: Path) -> Trained:
+    tensors, words = io.read_tensors(file)
     weights = {name.removeprefix("weights."): v for name, v in tensors.items() if name.startswith("weights.")}
-    curve = [float(value) for value in tensors["curve"]]
-    seconds = float(metadata["seconds"])
-    return Trained(key, weights, Scaler.of_arrays(tensors), curve, tensors["predicted"], seconds)
-
-
-def _digest(*arrays: np.ndarray) -> str:
-    digest = hashlib.sha256()
-    for array in arrays:
-        digest.update(f"{array.dtype}{array.shape}".encode())
-        digest.update(np.ascontiguousarray(array).data)
-    return digest.hexdigest()[:32]
-
-
-@lru_cache(maxsize=1)
-def _code_digest() -> str:
-    digest = hashlib.sha256()
-    for source in [*sorted(SOURCES.glob("*.py")), Path(seeds.__file__)]:
-        digest.update(source.read_bytes())
-    return digest.hexdigest()
+    return Trained(
+        key=file.stem,
+        weights=weights,
+        scaler=Scaler.of_arrays(tensors),
+        curve=[float(value) for value in tensors["curve"]],
+        predicted=tensors["predicted"],
+        stopped_step=int(words["stopped_step"]) if "stopped_step" in words else None,
+        seconds=float(words["seconds"]),
+    )

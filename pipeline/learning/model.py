@@ -1,66 +1,74 @@
-"""The paper's five-layer perceptron. In: scaled changes of field. Out: scaled x, y, F, and the 40 features.
+"""Perceptrons at work, many copies at once. In: scaled inputs [m b c]. Out: scaled x, y, F, and the 40 features.
 
-Refuses to know how it is trained, and in which units.
+A stack of m networks is one tensor a layer, and a batched product does what m small products did: a small network costs
+more in calls than in sums. Refuses to know how it is trained, and in which units.
 """
 
+from collections.abc import Sequence
+
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Float32
 from torch import nn
 
-HIDDEN_N = 200
-FEATURES_N = 40  # the bottleneck that the triplet term acts on (paper section 4)
-OUTPUTS_N = 3
+from pipeline.learning.architecture import FEATURE_LAYERS_N, LAYERS, Layer, Weights
+
+BLOCK_ROWS_N = 65_536
 
 
-class SkinNet(nn.Module):
-    """`feat`: the first three layers, `head`: the last three; weights are drawn from `generator` only."""
+class Stack(nn.Module):
+    """Networks of one architecture, side by side; those of one stack never touch each other."""
 
-    def __init__(self, feat: nn.Sequential, head: nn.Sequential, generator: torch.Generator) -> None:
+    def __init__(self, layers: Sequence[Layer], members: Sequence[Weights]) -> None:
         super().__init__()
-        self.feat = feat
-        self.head = head
-        for layer in self.modules():
-            if isinstance(layer, nn.Linear):
-                _draw(layer, generator)
+        self.relus = [layer.relu for layer in layers]
+        self.members_n = len(members)
+        numbers = range(1, len(layers) + 1)
+        self.weights = nn.ParameterList(_stacked(members, f"layer{i}.weight").transpose(1, 2) for i in numbers)
+        self.biases = nn.ParameterList(_stacked(members, f"layer{i}.bias")[:, None] for i in numbers)
 
-    def forward(self, inputs: Float[torch.Tensor, "b ch"]) -> Float[torch.Tensor, "b 3"]:
-        """Answer for a batch of scaled changes of field."""
-        answer: torch.Tensor = self.head(self.feat(inputs))
-        return answer
+    def features(self, inputs: Float[torch.Tensor, "m b c"]) -> Float[torch.Tensor, "m b 40"]:
+        """What the first three layers make of a batch for each network."""
+        return self._run(inputs, 0, FEATURE_LAYERS_N)
 
+    def answer(self, features: Float[torch.Tensor, "m b 40"]) -> Float[torch.Tensor, "m b 3"]:
+        """Turn features into scaled x, y, F."""
+        return self._run(features, FEATURE_LAYERS_N, len(self.relus))
 
-def paper_net(channels_n: int, generator: torch.Generator) -> SkinNet:
-    """B(15) -> MLP+ReLU(200) -> MLP(200) -> MLP(40) -> MLP+ReLU(200) -> MLP+ReLU(200) -> xyF(3), as printed."""
-    feat = nn.Sequential(
-        _linear(channels_n, HIDDEN_N), nn.ReLU(), _linear(HIDDEN_N, HIDDEN_N), _linear(HIDDEN_N, FEATURES_N)
-    )
-    return SkinNet(feat, nn.Sequential(*_head()), generator)
+    def forward(self, inputs: Float[torch.Tensor, "m b c"]) -> Float[torch.Tensor, "m b 3"]:
+        """Answer for a batch of each network."""
+        return self.answer(self.features(inputs))
 
+    def member(self, i: int) -> dict[str, np.ndarray]:
+        """Take the weights of one network out, as `layer1.weight` [out in], `layer1.bias` [out], ..."""
+        taken = {}
+        for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True), 1):
+            taken[f"layer{k}.weight"] = weight.detach()[i].T.contiguous().cpu().numpy().copy()
+            taken[f"layer{k}.bias"] = bias.detach()[i, 0].cpu().numpy().copy()
+        return taken
 
-def released_net(channels_n: int, generator: torch.Generator) -> SkinNet:
-    """The network that the authors released: also a ReLU after layer 2 and one on the output."""
-    feat = nn.Sequential(
-        _linear(channels_n, HIDDEN_N), nn.ReLU(), _linear(HIDDEN_N, HIDDEN_N), nn.ReLU(), _linear(HIDDEN_N, FEATURES_N)
-    )
-    return SkinNet(feat, nn.Sequential(*_head(), nn.ReLU()), generator)
+    def finite(self) -> Bool[torch.Tensor, " m"]:
+        """Tell which networks have finite weights only."""
+        return torch.stack([torch.isfinite(one.detach()).flatten(1).all(1) for one in self.parameters()]).all(0)
 
-
-BUILD = {"paper": paper_net, "released": released_net}
-
-
-def _head() -> list[nn.Module]:
-    wide = _linear(HIDDEN_N, HIDDEN_N)
-    return [_linear(FEATURES_N, HIDDEN_N), nn.ReLU(), wide, nn.ReLU(), _linear(HIDDEN_N, OUTPUTS_N)]
-
-
-def _linear(in_n: int, out_n: int) -> nn.Linear:
-    # skip_init: the constructor would draw from torch's global generator.
-    layer: nn.Linear = nn.utils.skip_init(nn.Linear, in_n, out_n)
-    return layer
+    def _run(self, values: torch.Tensor, first: int, last: int) -> torch.Tensor:
+        for weight, bias, relu in zip(
+            self.weights[first:last], self.biases[first:last], self.relus[first:last], strict=True
+        ):
+            values = torch.baddbmm(bias, values, weight)
+            values = torch.relu_(values) if relu else values
+        return values
 
 
-def _draw(layer: nn.Linear, generator: torch.Generator) -> None:
-    """PyTorch's own default for linear layers, uniform within 1/sqrt(fan in), from a named generator."""
-    limit = layer.in_features**-0.5
-    nn.init.uniform_(layer.weight, -limit, limit, generator=generator)
-    nn.init.uniform_(layer.bias, -limit, limit, generator=generator)
+@torch.no_grad()
+def predict(
+    weights: Weights, architecture: str, inputs: Float32[np.ndarray, "n c"], device: str
+) -> Float32[np.ndarray, "n 3"]:
+    """Answer for many rows by one network, a block at a time to bound memory."""
+    net = Stack(LAYERS[architecture](inputs.shape[1]), [weights]).to(device)
+    blocks = torch.from_numpy(inputs).split(BLOCK_ROWS_N)
+    return torch.cat([net(block[None].to(device))[0].cpu() for block in blocks]).numpy()
+
+
+def _stacked(members: Sequence[Weights], name: str) -> torch.Tensor:
+    return torch.from_numpy(np.stack([member[name] for member in members]))

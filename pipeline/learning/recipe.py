@@ -1,6 +1,6 @@
 """A recipe: one row of settings for the one training loop. Knows no data and no network."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 from pydantic import Field, model_validator
 
@@ -8,31 +8,88 @@ from pipeline.strict import Strict
 
 HEADLINE = "paper"  # the recipe whose numbers stand beside the paper's; others are variants
 
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,40}$")]  # a name is part of file names
+Weight = Annotated[float, Field(ge=0)]
 
-class Recipe(Strict):
-    """What the paper leaves open is written here: optimiser settings, batch, length, scaling.
+
+class Schedule(Strict):
+    """How the loop descends: AdamW under a one-cycle rate whose peak is `rate_max`; a batch is drawn at every step."""
+
+    steps_n: Annotated[int, Field(ge=1)]
+    batch_n: Annotated[int, Field(ge=1)]
+    rate_max: Annotated[float, Field(gt=0)]
+    weight_decay: Weight
+
+
+class Recipe(Schedule):
+    """What the paper leaves open is written here: inputs, scaling, schedule, weight of the triplet term.
 
     `architecture` is the paper's text or the network that its authors released (FACTS: ReLU after layer 2 and on the
-    output); `scaling` is per-channel standardisation or the released one (5 sd without mean; x/16, y/16, F/3). The
-    optimiser is AdamW under a one-cycle rate whose peak is `rate_max`.
+    output). `inputs` is the change of field as it is, or its direction and the logarithm of its length. `scaling` is
+    per-channel standardisation or the released one (5 sd without mean; x/16, y/16, F/3). With a `triplet_weight` of 0
+    no triplet is drawn.
     """
 
     architecture: Literal["paper", "released"]
+    inputs: Literal["raw", "shape"]
     scaling: Literal["standard", "released"]
-    epochs_n: Annotated[int, Field(ge=1)]
-    batch_n: Annotated[int, Field(ge=1)]
-    rate_max: Annotated[float, Field(gt=0)]
-    weight_decay: Annotated[float, Field(ge=0)]
+    triplet_weight: Weight
+
+
+class FineTuning(Schedule):
+    """How a trained network is adapted to a new skin: its recipe's loss goes on, beside a term on the skin's pokes.
+
+    `unlabelled_weight` weighs the triplet loss of unlabelled pokes along lines (paper section 5).
+    """
+
+    unlabelled_weight: Weight
+
+
+class Labelling(Schedule):
+    """How a trained network is fine-tuned on a few labelled pokes of a new skin, weighed by `own_weight`."""
+
+    own_weight: Weight
+
+
+class Adaptation(FineTuning):
+    """Fine-tuning from one recipe of train_triplet; with an `unlabelled_weight` of 0 it is the control."""
+
+    base: Name
+
+
+class Adaptations(Strict):
+    """What stage adapt runs on every held-out skin: so many indentations of its own, unlabelled."""
+
+    pokes_n: Annotated[int, Field(ge=1)]
+    recipes: dict[Name, Adaptation]
+
+    @model_validator(mode="after")
+    def _has_a_headline(self) -> "Adaptations":
+        return _headed(self)
+
+
+class PokesSweep(Strict):
+    """Numbers of unlabelled indentations to adapt with, on the last so many boards held out; 0 is no adaptation."""
+
+    pokes_n: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
+    boards_n: Annotated[int, Field(ge=1)]
 
 
 class Training(Strict):
     """What a training stage runs: every recipe on every fold with every seed."""
 
-    recipes: dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,40}$")], Recipe]  # a name is part of file names
+    recipes: dict[Name, Recipe]
     seeds_n: Annotated[int, Field(ge=1)]
 
     @model_validator(mode="after")
     def _has_a_headline(self) -> "Training":
-        if HEADLINE not in self.recipes:
-            raise ValueError(f"recipes hold a recipe named {HEADLINE}, which stands beside the paper's numbers")
-        return self
+        return _headed(self)
+
+
+Headed = TypeVar("Headed", Training, Adaptations)
+
+
+def _headed(section: Headed) -> Headed:
+    if HEADLINE not in section.recipes:
+        raise ValueError(f"recipes hold a recipe named {HEADLINE}, which stands beside the paper's numbers")
+    return section

@@ -1,61 +1,88 @@
-"""The one training loop. In: scaled rows, a recipe, a generator. Out: a trained network and its loss curve.
+"""The one training loop, for a stack of networks. In: what each learns from, a schedule. Out: weights and curves.
 
-Read it from top to bottom. Refuses to know folds, files and scores.
+Read it from top to bottom. What a network becomes does not depend on its neighbours in the stack. Refuses to know
+folds, files and scores.
 """
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 
-from pipeline.errors import TrainingError, complain
-from pipeline.learning.losses import squared_error
-from pipeline.learning.model import BUILD, SkinNet
-from pipeline.learning.recipe import Recipe
+from pipeline.learning.architecture import LAYERS, Weights
+from pipeline.learning.feed import Feed
+from pipeline.learning.job import Job, Terms
+from pipeline.learning.losses import squared_error, triplet
+from pipeline.learning.model import Stack
+from pipeline.learning.recipe import Schedule
+
+BLOCK_STEPS_N = 50  # batches drawn at once, and how often the loss is looked at
 
 
-def train(
-    inputs: Float[torch.Tensor, "n ch"],
-    targets: Float[torch.Tensor, "n 3"],
-    recipe: Recipe,
-    generator: torch.Generator,
-) -> tuple[SkinNet, list[float]]:
-    """Descend the L2 loss; return the network and the mean loss of every epoch (scaled units).
+@dataclass(frozen=True)
+class Outcome:
+    """A trained network, and the mean L2 loss of every block of steps (scaled units).
 
-    Batches are drawn without replacement, the last short one of an epoch is left to the next shuffle. AdamW under a
-    one-cycle rate: both are our choice, the paper names neither.
+    `stopped_step` says when a loss or a weight was no longer finite; the weights are then the last finite ones.
     """
-    net = BUILD[recipe.architecture](inputs.shape[1], generator)
-    batch_n = min(recipe.batch_n, len(inputs))
-    steps_n = len(inputs) // batch_n
-    optimizer = torch.optim.AdamW(net.parameters(), lr=recipe.rate_max, weight_decay=recipe.weight_decay, fused=True)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(
-        optimizer, recipe.rate_max, total_steps=max(recipe.epochs_n * steps_n, 2)
-    )
-    curve = []
-    for epoch_i in range(recipe.epochs_n):
-        order = torch.randperm(len(inputs), generator=generator)
-        total = torch.zeros(())
-        for batch in order[: steps_n * batch_n].split(batch_n):  # [b]
-            loss = squared_error(net(inputs[batch]), targets[batch])
+
+    weights: Weights
+    curve: list[float]
+    stopped_step: int | None
+
+
+def train(jobs: Sequence[Job], architecture: str, schedule: Schedule, terms: Terms, device: str) -> list[Outcome]:
+    """Descend the L2 loss and what stands beside it; AdamW under a one-cycle rate, as the paper names neither."""
+    net = Stack(LAYERS[architecture](jobs[0].labelled.inputs.shape[1]), [job.start for job in jobs]).to(device)
+    optimizer = torch.optim.AdamW(net.parameters(), schedule.rate_max, weight_decay=schedule.weight_decay, fused=True)
+    rate = torch.optim.lr_scheduler.OneCycleLR(optimizer, schedule.rate_max, total_steps=max(schedule.steps_n, 2))
+    feed, watch = Feed(jobs, schedule.batch_n, device), Watch(net)
+    for first in range(0, schedule.steps_n, BLOCK_STEPS_N):
+        steps_n = min(BLOCK_STEPS_N, schedule.steps_n - first)
+        total = torch.zeros(len(jobs), device=device)
+        for batch in feed.draw(steps_n):
+            features = net.features(batch["labelled"])  # [m b 40]
+            error = loss = squared_error(net.answer(features), batch["targets"])  # [m]
+            if terms.triplet:
+                near, far = net.features(batch["near"]), net.features(batch["far"])
+                loss = loss + terms.triplet * triplet(features, near, far)
+            if terms.unlabelled:
+                poked, near, far = (net.features(batch[name]) for name in ("poked", "poked_near", "poked_far"))
+                loss = loss + terms.unlabelled * triplet(poked, near, far)
+            if terms.own:
+                loss = loss + terms.own * squared_error(net(batch["own"]), batch["own_targets"])
             optimizer.zero_grad()
-            loss.backward()
+            loss.sum().backward()  # of a sum, each network's gradient is its own
             optimizer.step()
-            schedule.step()
-            total += loss.detach()
-        curve.append(float(total) / steps_n)
-        if not torch.isfinite(total):
-            raise TrainingError(
-                complain(
-                    f"epoch {epoch_i + 1}",
-                    "the loss",
-                    "finite",
-                    curve[-1],
-                    f"Lower rate_max ({recipe.rate_max:g}), or look at the rows.",
-                )
-            )
-    return net, curve
+            rate.step()
+            total += error.detach()
+        if not watch.look(total / steps_n, first + steps_n):
+            break
+    return watch.outcomes()
 
 
-@torch.no_grad()
-def predict(net: SkinNet, inputs: Float[torch.Tensor, "n ch"]) -> Float[torch.Tensor, "n 3"]:
-    """Answer for many rows, a block at a time to bound memory."""
-    return torch.cat([net(block) for block in inputs.split(65_536)])
+class Watch:
+    """Remembers each network's curve and its last finite weights."""
+
+    def __init__(self, net: Stack) -> None:
+        self.net = net
+        self.last = [net.member(i) for i in range(net.members_n)]
+        self.curves: list[list[float]] = [[] for _ in self.last]
+        self.stopped: dict[int, int] = {}
+
+    def look(self, error: Float[torch.Tensor, " m"], step: int) -> bool:
+        """Note a block's mean errors; false when no network of the stack is finite any more."""
+        finite = (self.net.finite() & torch.isfinite(error)).tolist()
+        for i in set(range(len(finite))) - set(self.stopped):
+            if finite[i]:
+                self.curves[i].append(float(error[i]))
+                self.last[i] = self.net.member(i)
+            else:
+                self.stopped[i] = step
+        return len(self.stopped) < len(finite)
+
+    def outcomes(self) -> list[Outcome]:
+        """Give every network as it was when it was last finite."""
+        parts = zip(self.last, self.curves, strict=True)
+        return [Outcome(weights, curve, self.stopped.get(i)) for i, (weights, curve) in enumerate(parts)]

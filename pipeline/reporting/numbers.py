@@ -10,6 +10,7 @@ import numpy as np
 
 from pipeline.evaluation.metrics import summarise
 from pipeline.evaluation.summary import over_folds, over_test_skins
+from pipeline.reporting.learned import by_fold, learned
 
 SINGLE = ("single_random", "single_temporal")
 
@@ -17,7 +18,12 @@ Cards = Sequence[dict[str, Any]]
 
 
 def compose(
-    cards: Cards, accounts: Iterable[Mapping[str, int]], dropped: Mapping[str, int], *, headline: str
+    cards: Cards,
+    points: Mapping[str, Cards],
+    accounts: Iterable[Mapping[str, int]],
+    dropped: Mapping[str, int],
+    *,
+    headline: str,
 ) -> dict[str, Any]:
     """Compose what follows from the data alone; `headline` names the recipe that stands beside the paper's numbers."""
     numbers: dict[str, Any] = {"capture": add_up(accounts) | {"left_out": dict(dropped)}}
@@ -41,13 +47,15 @@ def compose(
                 for board, own in _group(pooled, "fold").items()
             },
         }
+    further = learned(cards, points, headline=headline)
     if table2:
-        numbers["table2"] = table2
+        numbers["table2"] = table2 | further.pop("table2", {})
+    numbers |= further
     for question in (name for name in SINGLE if name in by_question):
         numbers[question] = over_folds(_of(by_question[question], headline))
         numbers.setdefault("single_sensor", {"split": question} | numbers[question])
     numbers["variants"] = {
-        question: {recipe: _over(question)(own) for recipe, own in _group(all_, "recipe_name").items()}
+        question: {recipe: _over(question)(by_fold(own)) for recipe, own in _group(all_, "recipe_name").items()}
         for question, all_ in by_question.items()
     }
     return numbers

@@ -6,7 +6,7 @@ from typing import Any
 
 from pipeline import io
 from pipeline.learning.recipe import HEADLINE
-from pipeline.params import Scene, arms_of, check_planned, described_in, read_params, read_scene
+from pipeline.params import Scene, check_planned, described_in, modelled, read_params, read_scene, swept
 from pipeline.provenance import SECONDS, code_version, device, read_costs
 from pipeline.reporting.figures import error_grids
 from pipeline.reporting.numbers import answered, compose, rounded, runtime
@@ -28,11 +28,12 @@ def report(
     """Write the numbers, tables and figures of a scene."""
     asked = read_scene(settings)
     check_planned(scene, asked, read_params(params), str(settings))
-    arms, words = arms_of(asked), io.read_json(folds)
+    arms, words = modelled(asked), io.read_json(folds)
     cards = [io.read_json(file) for arm in arms for file in sorted((models / arm).glob("*.json"))]
     accounts = [io.read_account(indentations / f"{name}.parquet") for name in words["captures"]]
     numbers: dict[str, Any] = {"provenance": _provenance(scene, asked)}
-    numbers |= compose(cards, accounts, words["dropped"], headline=HEADLINE)
+    points = {question: io.read_json(answers / f"{file}.json") for question, file in swept(asked).items()}
+    numbers |= compose(cards, points, accounts, words["dropped"], headline=HEADLINE)
     numbers["described"] = {name: io.read_json(answers / f"described/{name}.json") for name in described_in(asked)}
     studied = {question: io.read_json(answers / f"{question}.json") for question in asked.studied}
     numbers |= answered(studied, runtime(cards, read_costs(COSTS / scene)), _seconds(scene))

@@ -6,8 +6,10 @@ from pipeline.learning.recipe import Recipe
 def recipe(**changes: object) -> Recipe:
     values = {
         "architecture": "paper",
+        "inputs": "raw",
         "scaling": "standard",
-        "epochs_n": 2,
+        "triplet_weight": 0.0,
+        "steps_n": 4,
         "batch_n": 16,
         "rate_max": 3e-3,
         "weight_decay": 0.0,

@@ -1,0 +1,205 @@
+"""One training: a recipe on one fold with one seed, or a trained network fine-tuned on a new skin. In: rows, settings.
+
+Out: what the loop needs (a `Job`), and a key that names the result by all that decides it. Refuses to know files,
+processes and scores.
+"""
+
+import hashlib
+import importlib.metadata
+import json
+import sys
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, Int64, Shaped
+
+from pipeline import seeds
+from pipeline.dataset import lines as lines_module
+from pipeline.dataset.lines import Lines
+from pipeline.learning.architecture import LAYERS, Weights, draw_weights
+from pipeline.learning.inputs import VIEW
+from pipeline.learning.job import Job, Labelled, Terms, Unlabelled
+from pipeline.learning.recipe import FineTuning, Labelling, Recipe, Schedule
+from pipeline.learning.standardise import FIT, Scaler
+from pipeline.learning.triplets import make_points
+
+SOURCES = Path(__file__).parent
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What trainings read of a scene: changes of field, targets, and the skin of each row (for triplets)."""
+
+    db_uT: Float32[np.ndarray, "f ch"]
+    target: Float32[np.ndarray, "f 3"]
+    skin: Shaped[np.ndarray, " f"]
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A finished training: weights by name, scaler, loss a block of steps, predictions (mm, mm, N) for the test rows.
+
+    `stopped_step` is set if its loss stopped being finite; the weights are then the last finite ones.
+    """
+
+    key: str
+    weights: Weights
+    scaler: Scaler
+    curve: list[float]
+    predicted: Float32[np.ndarray, "b 3"]
+    stopped_step: int | None
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Start:
+    """The trained network that fine-tuning starts from, and its key."""
+
+    key: str
+    weights: Weights
+    scaler: Scaler
+
+
+@dataclass(frozen=True)
+class Adapting:
+    """Fine-tuning to a new skin by its unlabelled pokes: lines name rows, and nothing else of them is looked at."""
+
+    start: Start
+    settings: FineTuning
+    lines: Lines
+
+
+@dataclass(frozen=True)
+class FewLabels:
+    """Fine-tuning to a new skin by a few labelled pokes, whose rows `own` names."""
+
+    start: Start
+    settings: Labelling
+    own: Int64[np.ndarray, " o"]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One training. `train` and `test` are row numbers; `skin` is the one adapted to, `what` tells its name apart."""
+
+    question: str
+    recipe_name: str
+    recipe: Recipe
+    fold: str
+    seed: int
+    seed_i: int
+    train: Int64[np.ndarray, " a"]
+    test: Int64[np.ndarray, " b"]
+    tuning: Adapting | FewLabels | None = None
+    skin: str = ""
+    what: str = ""
+
+    @property
+    def name(self) -> str:
+        """A name for files and for people, unique within a stage."""
+        parts = [self.question, self.recipe_name, self.fold, self.skin, self.what, f"seed{self.seed_i}"]
+        return ".".join(part for part in parts if part)
+
+    @property
+    def schedule(self) -> Schedule:
+        """How long and how fast it is trained."""
+        return self.recipe if self.tuning is None else self.tuning.settings
+
+    @property
+    def terms(self) -> Terms:
+        """The weights of the loss."""
+        match self.tuning:
+            case Adapting(settings=settings):
+                return Terms(self.recipe.triplet_weight, unlabelled=settings.unlabelled_weight)
+            case FewLabels(settings=settings):
+                return Terms(self.recipe.triplet_weight, own=settings.own_weight)
+        return Terms(self.recipe.triplet_weight)
+
+
+def make_job(cell: Cell, rows: Measured) -> tuple[Job, Scaler]:
+    """Scale what a cell learns from: by a scaler fitted on its training rows, or by that of the network it starts from.
+
+    Of a new skin's unlabelled pokes only the change of field and the order along lines is taken.
+    """
+    view = VIEW[cell.recipe.inputs](rows.db_uT[cell.train])
+    target = rows.target[cell.train]
+    # Without the recipe in its name: recipes are compared from equal starts on equal batches.
+    rng = seeds.rng_for(cell.seed, "train", cell.fold, cell.skin, cell.seed_i)
+    if cell.tuning is None:
+        scaler = FIT[cell.recipe.scaling](view, target)
+        start: Weights = draw_weights(LAYERS[cell.recipe.architecture](view.shape[1]), rng)
+    else:
+        scaler, start = cell.tuning.start.scaler, cell.tuning.start.weights
+    points = make_points(target[:, :2], rows.skin[cell.train]) if cell.recipe.triplet_weight else None
+    labelled = Labelled(scaler.encode(view), scaler.encode_target(target), points)
+    unlabelled = _unlabelled(cell, rows, scaler) if cell.terms.unlabelled else None
+    own = _own(cell, rows, scaler) if cell.terms.own else None
+    return Job(start, rng, labelled, unlabelled, own), scaler
+
+
+def _unlabelled(cell: Cell, rows: Measured, scaler: Scaler) -> Unlabelled:
+    assert isinstance(cell.tuning, Adapting)
+    lines = cell.tuning.lines
+    row, point_row = np.unique(lines.row, return_inverse=True)
+    view = VIEW[cell.recipe.inputs](rows.db_uT[row])
+    points = make_points(lines.order_i[:, None].astype(np.float64), lines.line_i)
+    return Unlabelled(scaler.encode(view), points, point_row.astype(np.int64))
+
+
+def _own(cell: Cell, rows: Measured, scaler: Scaler) -> Labelled:
+    assert isinstance(cell.tuning, FewLabels)
+    own = cell.tuning.own
+    view = VIEW[cell.recipe.inputs](rows.db_uT[own])
+    return Labelled(scaler.encode(view), scaler.encode_target(rows.target[own]), None)
+
+
+class Keys:
+    """Names cells by all that decides their results: rows, recipe, seed, start, code, torch; keeps what it hashed."""
+
+    def __init__(self, rows: Measured) -> None:
+        self.rows = rows
+        self.known: dict[int, tuple[np.ndarray, str]] = {}
+
+    def key(self, cell: Cell) -> str:
+        """Name a cell."""
+        words = [
+            cell.fold, cell.skin, cell.recipe.model_dump_json(), cell.seed, cell.seed_i,
+            self._labelled(cell.train), _digest(self.rows.db_uT[cell.test]),
+            _code_digest(), importlib.metadata.version("torch"), importlib.metadata.version("numpy"), sys.platform,
+        ]  # fmt: skip
+        if cell.tuning is not None:
+            words += [cell.tuning.start.key, cell.tuning.settings.model_dump_json()]
+        match cell.tuning:
+            case Adapting(lines=lines):
+                words += [_digest(self.rows.db_uT[lines.row], lines.line_i, lines.order_i)]
+            case FewLabels(own=own):
+                words += [_digest(self.rows.db_uT[own], self.rows.target[own])]
+        return hashlib.sha256(json.dumps(words).encode()).hexdigest()[:32]
+
+    def rows_digest(self) -> str:
+        """Name all rows."""
+        return _digest(self.rows.db_uT, self.rows.target)
+
+    def _labelled(self, train: np.ndarray) -> str:
+        if id(train) not in self.known:  # the array is kept, so that its id stays its own
+            skin = np.unique(self.rows.skin[train], return_inverse=True)[1]
+            self.known[id(train)] = (train, _digest(self.rows.db_uT[train], self.rows.target[train], skin))
+        return self.known[id(train)][1]
+
+
+def _digest(*arrays: np.ndarray) -> str:
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(f"{array.dtype}{array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()[:32]
+
+
+@lru_cache(maxsize=1)
+def _code_digest() -> str:
+    digest = hashlib.sha256()
+    for source in [*sorted(SOURCES.glob("*.py")), Path(seeds.__file__), Path(lines_module.__file__)]:
+        digest.update(source.read_bytes())
+    return digest.hexdigest()

@@ -1,0 +1,81 @@
+"""Triplets ordered by distance. In: points with a place in a group. Out: anchors' positives and negatives.
+
+A group is what one triplet is drawn from: the readings of one skin, placed in mm, or the pokes of one line, placed by
+their index. One sampler for both, so that it cannot know more of an unlabelled skin than the order along a line.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int64, Shaped
+
+from pipeline.errors import TrainingError, complain
+
+ROUNDS_MAX_N = 100  # with half of the draws tied, 1e-30 of the anchors are left after so many
+TIED = 1e-6  # of a squared distance; places are float32 numbers of a few mm
+
+Pairs = tuple[Int64[np.ndarray, " b"], Int64[np.ndarray, " b"]]
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points sorted by group: group g has `order[start[g] : start[g] + count[g]]`."""
+
+    place: Float[np.ndarray, "n d"]
+    group: Int64[np.ndarray, " n"]
+    order: Int64[np.ndarray, " n"]
+    start: Int64[np.ndarray, " g"]
+    count: Int64[np.ndarray, " g"]
+
+    def __len__(self) -> int:
+        return len(self.group)
+
+
+def make_points(place: Float[np.ndarray, "n d"], group: Shaped[np.ndarray, " n"]) -> Points:
+    """Sort points by group; raise if all points of a group lie on one place, where nothing is nearer than anything."""
+    names, codes = np.unique(group, return_inverse=True)
+    order = np.argsort(codes, kind="stable")
+    count = np.bincount(codes, minlength=len(names))
+    start = np.cumsum(count) - count
+    lowest = np.minimum.reduceat(place[order], start, axis=0)
+    highest = np.maximum.reduceat(place[order], start, axis=0)
+    flat = np.flatnonzero((lowest == highest).all(axis=1))
+    if len(flat):
+        raise TrainingError(
+            complain(
+                f"triplets of group {names[flat[0]]}", "the places of its points", "two or more",
+                f"{count[flat[0]]} points on one place", "Poke at several places, or leave the group out.",
+            )
+        )  # fmt: skip
+    return Points(place.astype(np.float64), codes.astype(np.int64), order, start, count)
+
+
+def draw_pairs(points: Points, anchor: Int64[np.ndarray, " b"], rng: np.random.Generator) -> Pairs:
+    """Draw a positive and a negative of the anchor's own group for every anchor, the positive strictly nearer.
+
+    Both are drawn uniformly from the other points of the group; draws in which they are equally near are drawn again.
+    """
+    positive, negative = anchor.copy(), anchor.copy()
+    left = np.arange(len(anchor))
+    for _ in range(ROUNDS_MAX_N):
+        own = anchor[left]
+        one, other = _of_group(points, own, rng), _of_group(points, own, rng)
+        one_d2 = ((points.place[one] - points.place[own]) ** 2).sum(axis=1)
+        other_d2 = ((points.place[other] - points.place[own]) ** 2).sum(axis=1)
+        near = one_d2 < other_d2
+        positive[left], negative[left] = np.where(near, one, other), np.where(near, other, one)
+        tied = (np.abs(one_d2 - other_d2) <= TIED) | (one == own) | (other == own)
+        left = left[tied]
+        if not len(left):
+            return positive, negative
+    raise TrainingError(
+        complain(
+            "triplets", "the distances from an anchor", "different ones",
+            f"ties in {ROUNDS_MAX_N} draws at place {points.place[anchor[left[0]]].tolist()}", "Poke at more places.",
+        )
+    )  # fmt: skip
+
+
+def _of_group(points: Points, anchor: np.ndarray, rng: np.random.Generator) -> Int64[np.ndarray, " b"]:
+    group = points.group[anchor]
+    return points.order[points.start[group] + rng.integers(points.count[group])]

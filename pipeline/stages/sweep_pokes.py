@@ -1,0 +1,46 @@
+"""Stage sweep_pokes: adaptation with few and many unlabelled pokes (paper figure 6a)."""
+
+from pathlib import Path
+from typing import Any
+
+from pipeline import io
+from pipeline.learning.recipe import HEADLINE
+from pipeline.stages._adapt import adaptations, read_starts
+from pipeline.stages._models import note_seconds, point_of
+from pipeline.stages._run import run
+from pipeline.stages._train import read_scenery, train_all
+
+
+def sweep_pokes(scene: str, settings: Path, indentations: Path, folds: Path, started: Path, scores: Path) -> None:
+    """Score every number of pokes; none at all is the network as it was trained."""
+    at, starts = read_scenery(scene, settings, indentations, folds), read_starts(started)
+    asked, own = at.asked.sweep_pokes, at.asked.adapt
+    assert asked is not None
+    assert own is not None
+    named, held_out = (HEADLINE, own.recipes[HEADLINE]), at.of("lobo")[-asked.boards_n :]
+    asked_of = [(fold, pokes_n) for fold in held_out for pokes_n in asked.pokes_n if pokes_n]
+    pairs = [
+        (cell, pokes_n)
+        for fold, pokes_n in asked_of
+        for cell in adaptations(at, fold, named, starts, question="pokes", pokes_n=pokes_n)
+    ]
+    cells = [cell for cell, _ in pairs]
+    trained = train_all(at, cells, "sweep_pokes")
+    points = [
+        point_of(at, cell, one, "adapted") | {"pokes_n": pokes_n}
+        for (cell, pokes_n), one in zip(pairs, trained, strict=True)
+    ]
+    points += [point | {"pokes_n": 0} for point in _unadapted(started, named[1].base, {fold.name for fold in held_out})]
+    io.write_json(scores, points)
+    note_seconds(scene, "sweep_pokes", cells, trained)
+
+
+def _unadapted(started: Path, base: str, held_out: set[str]) -> list[dict[str, Any]]:
+    cards = [io.read_json(file) for file in sorted(started.glob("*.json"))]
+    own = [card for card in cards if card["recipe_name"] == base and card["fold"] in held_out]
+    kept = ("key", "question", "fold", "seed_i", "stopped_step", "git", "scores")
+    return [{name: card[name] for name in kept} | {"method": "triplet"} for card in own]
+
+
+if __name__ == "__main__":
+    run(sweep_pokes)
