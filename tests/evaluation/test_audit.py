@@ -1,4 +1,4 @@
-"""The audit passes honest skins and fails by name on planted leaks: split, copy, pool."""
+"""The audit passes honest skins and fails by name on planted leaks: split, copy, scaler, settings, pool."""
 
 import doctest
 from dataclasses import replace
@@ -9,11 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import ParamsError
+from pipeline.errors import ParamsError, SchemaError
 from pipeline.evaluation.audit import copies, sides
 from pipeline.evaluation.audit.checks import holds, to_words
 from pipeline.evaluation.audit.copies import nearest_rays
+from pipeline.evaluation.audit.settings import audit_choice, audit_scaler
 from pipeline.evaluation.audit.sides import Labels, Sides, audit_fold
+from pipeline.learning.standardise import FIT
 from pipeline.seeds import rng_for
 
 NONE = np.zeros(0, np.int64)
@@ -243,6 +245,126 @@ def test_folds_that_cannot_be_judged_are_one_sentence(question):
     }
     with pytest.raises(ParamsError, match=sentence[question]):
         audited(fold, LABELS, DB_uT)
+
+
+TARGET = rng_for(3, "target").uniform(0.1, 16, (len(DB_uT), 3)).astype(np.float32)
+
+
+def scaler_check(arrays, fold: Sides, db_uT: np.ndarray, scaling: str):
+    def fit(db_uT, target):
+        return FIT[scaling](db_uT, target).arrays()
+
+    return audit_scaler("lobo.paper.b0.seed0", arrays, db_uT=db_uT, target=TARGET, sides=fold, fit=fit)
+
+
+@pytest.mark.parametrize("scaling", list(FIT))
+@given(st.integers(0, 1000))
+@settings(max_examples=20, deadline=None)
+def test_a_scaler_of_the_training_rows_passes_in_whatever_order_they_were_summed(scaling, draw):
+    fold = held_out(LABELS)
+    train = rng_for(draw, "order").permutation(fold.train)
+    assert scaler_check(FIT[scaling](DB_uT[train], TARGET[train]).arrays(), fold, DB_uT, scaling).holds
+
+
+@pytest.mark.parametrize("scaling", list(FIT))
+@pytest.mark.parametrize("seen_n", [1, 20, 360])
+def test_a_planted_scaler_leak_fails_even_by_one_row(scaling, seen_n):
+    fold = held_out(LABELS)
+    seen = np.concatenate([fold.train, fold.test[:seen_n]])
+    check = scaler_check(FIT[scaling](DB_uT[seen], TARGET[seen]).arrays(), fold, DB_uT, scaling)
+    assert not check.holds
+    assert check.what == "scaler"
+
+
+@pytest.mark.parametrize("scaling", list(FIT))
+def test_one_test_row_among_a_hundred_thousand_is_seen_in_the_scaler(scaling):
+    copies_n = 100_000 // len(DB_uT)
+    db_uT, target = np.tile(DB_uT, (copies_n, 1)), np.tile(TARGET, (copies_n, 1))
+    train = np.arange(len(db_uT) - 2)
+
+    def fit(db_uT, target):
+        return FIT[scaling](db_uT, target).arrays()
+
+    fold = Sides("lobo", "b0", train, NONE, np.arange(len(train), len(db_uT)))
+    checks = [
+        audit_scaler("m", fit(db_uT[seen], target[seen]), db_uT=db_uT, target=target, sides=fold, fit=fit)
+        for seen in (train, np.arange(len(train) + 1))
+    ]
+    assert [check.holds for check in checks] == [True, False]
+
+
+def test_the_last_bit_of_a_scaler_may_differ_between_machines():
+    fold = held_out(LABELS)
+    arrays = FIT["standard"](DB_uT[fold.train], TARGET[fold.train]).arrays()
+    turned = {name: np.nextafter(value, np.float32(np.inf)) for name, value in arrays.items()}
+    assert scaler_check(turned, fold, DB_uT, "standard").holds
+
+
+def test_a_scaler_within_the_tolerance_but_nearer_to_both_sides_fails():
+    fold = held_out(LABELS)
+
+    def fit(db_uT, target):
+        return {"shift": np.array([1 + 1e-10 * len(db_uT)])}
+
+    arrays = fit(DB_uT, TARGET)  # lobo: both sides are all rows
+    check = audit_scaler("m", arrays, db_uT=DB_uT, target=TARGET, sides=fold, fit=fit)
+    assert check.found == "off by 3.6e-08 from training rows alone, by 0 from both sides"
+    assert not check.holds
+
+
+def test_a_scaler_of_nan_does_not_pass_and_a_missing_array_is_one_sentence():
+    fold = held_out(LABELS)
+    arrays = FIT["standard"](DB_uT[fold.train], TARGET[fold.train]).arrays()
+    assert not scaler_check(arrays | {"target_shift": np.full(3, np.nan, np.float32)}, fold, DB_uT, "standard").holds
+    arrays.pop("input_scale")
+    with pytest.raises(SchemaError, match="lobo.paper.b0.seed0: scaler array input_scale must be there"):
+        scaler_check(arrays, fold, DB_uT, "standard")
+
+
+RECIPE = {"scaling": "standard", "steps_n": 4000, "rate_max": 0.003}
+CHOICE = {
+    "scene": "tuning", "source": "simulated", "seed": 777, "boards": ["b0", "b1"], "skins": ["b0_s0", "b1_s0"],
+    "chosen": {"train_multi": RECIPE, "train_single": RECIPE | {"steps_n": 500}}, "minutes": 12.5,
+}  # fmt: skip
+
+
+def choice_checks(choice=CHOICE, recipes=None, source="simulated", seed=2021):
+    recipes = {"train_multi": dict(RECIPE)} if recipes is None else recipes
+    names = {"test_boards": ["b0", "b2"], "test_skins": ["b0_s0", "b0_s1", "b2_s0"]}
+    return audit_choice(choice, recipes, source=source, seed=seed, **names)
+
+
+def test_settings_chosen_on_skins_of_another_draw_pass_though_names_are_alike():
+    assert failing(choice_checks()) == []
+    assert failing(choice_checks(source="recorded")) == []
+
+
+@pytest.mark.parametrize(("source", "seed"), [("simulated", 777), ("recorded", 5)])
+def test_a_planted_settings_leak_fails_and_names_the_skin(source, seed):
+    checks = choice_checks(CHOICE | {"source": source}, source=source, seed=seed)
+    assert failing(checks) == ["settings: boards", "settings: skins"]
+    assert checks[1].found == "1 of 3 tested were chosen on: b0_s0"
+    assert not holds(checks)
+
+
+@pytest.mark.parametrize(
+    ("recipe", "found"),
+    [
+        (RECIPE | {"rate_max": 0.001}, "rate_max 0.001 (chosen: 0.003)"),
+        (RECIPE | {"steps_n": 500}, "steps_n 500 (chosen: 4000)"),
+        ({"scaling": "standard", "rate_max": 0.003, "tau": 1}, "steps_n absent (chosen: 4000), tau 1 (chosen: absent)"),
+    ],
+)  # fmt: skip
+def test_a_recipe_other_than_the_chosen_one_fails_and_names_the_keys(recipe, found):
+    checks = choice_checks(recipes={"train_multi": recipe})
+    assert failing(checks) == ["settings: recipe"]
+    assert checks[-1].found.startswith(found)
+
+
+def test_an_arm_that_no_study_chose_for_fails_and_a_broken_record_is_one_sentence():
+    assert choice_checks(recipes={"adapt": RECIPE})[-1].found == "none was chosen for it"
+    with pytest.raises(ParamsError, match="skins must be given; got nothing"):
+        choice_checks({key: value for key, value in CHOICE.items() if key != "skins"})
 
 
 def test_checks_are_written_as_plain_words():
