@@ -21,7 +21,7 @@ HOMES = {
         "pipeline/seeds.py", "pipeline/learning/grid.py", "pipeline/learning/losses.py", "pipeline/learning/model.py",
         "pipeline/learning/train.py", "pipeline/learning/feed.py",
     },
-    r"from sklearn": {"pipeline/dataset/splits.py"},
+    r"from sklearn": {"pipeline/dataset/splits.py", "pipeline/learning/classical.py"},
     r"os\.environ": {"pipeline/learning/executors.py", "pipeline/server.py", "pipeline/tracking.py"},
     r"import pickle|torch\.load\(|allow_pickle=True": set(),
 }  # fmt: skip

@@ -1,0 +1,255 @@
+"""Classical methods on the networks' folds, by scikit-learn. In: settings, and rows as a view gives them. Out: a fit.
+
+A fit standardises by its own training rows and runs in one thread. Refuses to know folds, skins, views and scores.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, ClassVar, Literal, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float, Float32, Int64
+from pydantic import Field
+from sklearn.ensemble import HistGradientBoostingRegressor
+from sklearn.kernel_ridge import KernelRidge
+from sklearn.linear_model import Ridge as LinearRidge
+from sklearn.multioutput import MultiOutputRegressor
+from sklearn.neighbors import KNeighborsRegressor
+from sklearn.preprocessing import PolynomialFeatures
+from threadpoolctl import ThreadpoolController  # type: ignore[import-untyped]
+
+from pipeline.errors import TrainingError, complain
+from pipeline.learning.standardise import SCALE_FLOOR, Scaler, fit_standard
+from pipeline.strict import Strict
+
+THREADS = ThreadpoolController()  # of the libraries above: finding them takes 3 ms, limiting them 15 us
+BLOCK_ROWS_N = 4096  # answered at once, to bound memory: a kernel of them and 6000 rows is 200 MB
+
+
+@runtime_checkable
+class _Regressor(Protocol):
+    """What scikit-learn calls a regressor of several targets, taking weights of rows."""
+
+    def fit(self, inputs: np.ndarray, target: np.ndarray, weight: np.ndarray | None, /) -> Any: ...
+
+    def predict(self, inputs: np.ndarray, /) -> np.ndarray: ...
+
+
+class _Method(Strict):
+    """What all methods share: the view (pipeline.learning.inputs) that they are to be given."""
+
+    inputs: Literal["raw", "shape"]
+
+
+class Ridge(_Method):
+    """A plane; `alpha` stands against the squared errors summed over rows, here and in the next, all standardised."""
+
+    words: ClassVar[str] = "ridge"
+    method: Literal["ridge"]
+    alpha: Annotated[float, Field(gt=0)]
+
+    def regressor(self, rng: np.random.Generator) -> _Regressor:
+        """Make it, unfitted."""
+        return LinearRidge(self.alpha)
+
+
+class CubicRidge(_Method):
+    """All products of up to three inputs: 815 of 15, 968 of 16."""
+
+    words: ClassVar[str] = "cubic ridge"
+    method: Literal["cubic_ridge"]
+    alpha: Annotated[float, Field(gt=0)]
+
+    def regressor(self, rng: np.random.Generator) -> _Regressor:
+        """Make it, unfitted."""
+        return _Cubic(PolynomialFeatures(3, include_bias=False), LinearRidge(self.alpha, copy_X=False))
+
+
+class Neighbours(_Method):
+    """The mean of the nearest training rows, each counting its weight over its distance."""
+
+    words: ClassVar[str] = "k nearest neighbours"
+    method: Literal["knn"]
+    neighbours_n: Annotated[int, Field(ge=1)]
+
+    def regressor(self, rng: np.random.Generator) -> _Regressor:
+        """Make it, unfitted."""
+        # A tree, as few of the 15 directions are ever taken; scikit-learn's own choice is brute force from 16 on.
+        return _Voting(KNeighborsRegressor(self.neighbours_n, weights="distance", algorithm="kd_tree"))
+
+
+class RbfRidge(_Method):
+    """exp(-gamma d^2) around each of at most `rows_max_n` rows; d^2 is 2 an input on average."""
+
+    words: ClassVar[str] = "RBF kernel ridge"
+    method: Literal["rbf_ridge"]
+    alpha: Annotated[float, Field(gt=0)]
+    gamma: Annotated[float, Field(gt=0)]
+    rows_max_n: Annotated[int, Field(ge=1)]
+
+    def regressor(self, rng: np.random.Generator) -> _Regressor:
+        """Make it, unfitted."""
+        return KernelRidge(kernel="rbf", alpha=self.alpha, gamma=self.gamma)
+
+
+class Boosting(_Method):
+    """Trees on binned inputs, one row of trees a target; no early stop, whose hold-out would split indentations."""
+
+    words: ClassVar[str] = "gradient boosting"
+    method: Literal["boosting"]
+    rounds_n: Annotated[int, Field(ge=1)]
+    rate: Annotated[float, Field(gt=0)]
+    leaves_n: Annotated[int, Field(ge=2)]
+
+    def regressor(self, rng: np.random.Generator) -> _Regressor:
+        """Make it, unfitted."""
+        trees = HistGradientBoostingRegressor(
+            max_iter=self.rounds_n,
+            learning_rate=self.rate,
+            max_leaf_nodes=self.leaves_n,
+            early_stopping=False,
+            random_state=int(rng.integers(2**32)),
+        )
+        return MultiOutputRegressor(trees)
+
+
+Classical = Annotated[Ridge | CubicRidge | Neighbours | RbfRidge | Boosting, Field(discriminator="method")]
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A regressor of those targets (0, 1, 2) that are known in the same training rows."""
+
+    targets: list[int]
+    regressor: _Regressor
+    rows_n: int
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A fitted method with the scaler of its training rows."""
+
+    scaler: Scaler
+    parts: tuple[_Part, ...]
+
+    @property
+    def rows_n(self) -> int:
+        """Training rows that were used, by the target that is known in most of them."""
+        return max(part.rows_n for part in self.parts)
+
+    def predict(self, inputs: Float32[np.ndarray, "f c"]) -> Float32[np.ndarray, "f 3"]:
+        """Answer x_mm, y_mm and F_N; NaN where no training row knew the target."""
+        answer = np.full((len(inputs), 3), np.nan, np.float32)
+        encoded = self.scaler.encode(inputs).astype(np.float64)
+        with THREADS.limit(limits=1):
+            for block in (slice(i, i + BLOCK_ROWS_N) for i in range(0, len(inputs), BLOCK_ROWS_N)):
+                for part in self.parts:
+                    own = part.regressor.predict(encoded[block])
+                    answer[block, part.targets] = own.reshape(-1, len(part.targets))
+        return self.scaler.decode(answer)
+
+
+def fit(
+    asked: Classical,
+    inputs: Float32[np.ndarray, "n c"],
+    target: Float32[np.ndarray, "n 3"],
+    rng: np.random.Generator,
+    *,
+    weight: Float32[np.ndarray, " n"] | None,
+) -> Fitted:
+    """Fit to the rows that know a target (mm, mm, N), each target by itself where they differ.
+
+    `weight` counts a row as so many in the loss (in a vote, of neighbours); the scaler does not know it.
+    """
+    _check(asked, inputs, target)
+    scaler = _deaf_to_still_channels(fit_standard(inputs, target))
+    encoded = scaler.encode(inputs).astype(np.float64)
+    wanted = scaler.encode_target(target).astype(np.float64)
+    weights = None if weight is None else weight.astype(np.float64)
+    parts = []
+    for targets, rows in _known_together(target):
+        own = None if weights is None else weights[rows]
+        if isinstance(asked, RbfRidge) and len(rows) > asked.rows_max_n:
+            drawn, own = _draw(len(rows), asked.rows_max_n, own, rng)
+            rows = rows[drawn]
+        regressor = asked.regressor(rng)
+        with THREADS.limit(limits=1):
+            regressor.fit(encoded[rows], wanted[rows][:, targets], own)
+        parts.append(_Part(targets, regressor, len(rows)))
+    return Fitted(scaler, tuple(parts))
+
+
+@dataclass(frozen=True)
+class _Cubic:
+    lift: PolynomialFeatures
+    ridge: LinearRidge
+
+    def fit(self, inputs: np.ndarray, target: np.ndarray, weight: np.ndarray | None, /) -> None:
+        self.ridge.fit(self.lift.fit_transform(inputs), target, weight)
+
+    def predict(self, inputs: np.ndarray, /) -> np.ndarray:
+        return self.ridge.predict(self.lift.transform(inputs))
+
+
+@dataclass(frozen=True)
+class _Voting:
+    """scikit-learn's neighbours take no weights: sum(w y / d) / sum(w / d) is the ratio of two of its answers."""
+
+    neighbours: KNeighborsRegressor
+
+    def fit(self, inputs: np.ndarray, target: np.ndarray, weight: np.ndarray | None, /) -> None:
+        votes = np.ones(len(inputs)) if weight is None else weight
+        self.neighbours.fit(inputs, np.column_stack([votes[:, None] * target, votes]))
+
+    def predict(self, inputs: np.ndarray, /) -> np.ndarray:
+        voted = self.neighbours.predict(inputs)
+        return voted[:, :-1] / voted[:, -1:]
+
+
+def _deaf_to_still_channels(scaler: Scaler) -> Scaler:
+    """Read 0 from an input that never moved in training: at the floor's scale it would drown all others in use."""
+    still = scaler.input_scale <= SCALE_FLOOR
+    return replace(scaler, input_scale=np.where(still, np.float32(np.inf), scaler.input_scale))
+
+
+def _known_together(target: Float32[np.ndarray, "n 3"]) -> list[tuple[list[int], Int64[np.ndarray, " a"]]]:
+    """Gather the targets that are known in the same rows, with these rows."""
+    known = ~np.isnan(target)
+    together: dict[bytes, list[int]] = {}
+    for i in np.flatnonzero(known.any(axis=0)):
+        together.setdefault(known[:, i].tobytes(), []).append(int(i))
+    return [(targets, np.flatnonzero(known[:, targets[0]])) for targets in together.values()]
+
+
+def _draw(
+    rows_n: int, most_n: int, weight: Float[np.ndarray, " n"] | None, rng: np.random.Generator
+) -> tuple[Int64[np.ndarray, " a"], Float[np.ndarray, " a"] | None]:
+    """Draw `most_n` of more rows without replacement.
+
+    Rows above the least weight all stay, or few labelled rows of a new skin would be lost among all others; their
+    weight is lowered as the others' number is, so that they keep their share.
+    """
+    if weight is None:
+        return np.sort(rng.choice(rows_n, most_n, replace=False)), None
+    heavy = weight > weight.min()
+    light = np.flatnonzero(~heavy)
+    left_n = most_n - int(heavy.sum())
+    if left_n < 1:
+        raise TrainingError(
+            complain(
+                "rbf_ridge", "rows_max_n", f"more than the {heavy.sum()} rows of greater weight", most_n, "Raise it."
+            )
+        )
+    drawn = np.sort(np.concatenate([np.flatnonzero(heavy), rng.choice(light, left_n, replace=False)]))
+    return drawn, np.where(heavy, weight * left_n / len(light), weight)[drawn]
+
+
+def _check(asked: Classical, inputs: Float32[np.ndarray, "n c"], target: Float32[np.ndarray, "n 3"]) -> None:
+    known_n = (~np.isnan(target)).sum(axis=0)
+    fewest_n = min((int(n) for n in known_n if n), default=0)
+    least_n = asked.neighbours_n if isinstance(asked, Neighbours) else 1
+    if fewest_n < least_n:
+        rule = f"{least_n} or more for each target"
+        raise TrainingError(complain(asked.method, "training rows", rule, fewest_n, "Record more."))
+    if not np.isfinite(inputs).all():
+        broken_n = int((~np.isfinite(inputs)).any(axis=1).sum())
+        raise TrainingError(complain(asked.method, "inputs", "finite", f"{broken_n} rows that are not", "Drop them."))
