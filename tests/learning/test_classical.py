@@ -5,6 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import TypeAdapter, ValidationError
+from sklearn.linear_model import Ridge
+from sklearn.preprocessing import PolynomialFeatures
 
 from pipeline.errors import TrainingError
 from pipeline.learning.classical import BLOCK_ROWS_N, Classical, Fitted, fit
@@ -109,6 +111,18 @@ def test_rbf_is_the_kernel_solve(weighted):
 
     wanted = kernel(q, a) @ np.linalg.solve(kernel(a, a) + np.diag(0.1 / w), t)
     got = fit_to("rbf_ridge", db_uT, target, weight).predict(asked_uT)
+    np.testing.assert_allclose(got, unscaled(wanted, target), atol=ANSWER_ATOL_MM)
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_cubic_ridge_is_scikit_learns_on_all_products_at_once(weighted):
+    db_uT, target = rows(n=BLOCK_ROWS_N + 100)
+    weight = rng_for(0, "weight").uniform(1, 20, len(db_uT)).astype(np.float32) if weighted else None
+    asked_uT, _ = rows(1)
+    a, t, q = scaled(db_uT, target, asked_uT)
+    lift = PolynomialFeatures(3, include_bias=False)
+    wanted = Ridge(3.0).fit(lift.fit_transform(a), t, weight).predict(lift.transform(q))
+    got = fit_to("cubic_ridge", db_uT, target, weight, alpha=3.0).predict(asked_uT)
     np.testing.assert_allclose(got, unscaled(wanted, target), atol=ANSWER_ATOL_MM)
 
 
