@@ -160,6 +160,7 @@ def fit(
 
     `weight` counts a row as so many in the loss (in a vote, of neighbours); the scaler does not know it.
     """
+    assert weight is None or (weight > 0).all()
     _check(asked, inputs, target)
     scaler = _deaf_to_still_channels(fit_standard(inputs, target))
     encoded = scaler.encode(inputs).astype(np.float64)
