@@ -13,12 +13,13 @@ from jaxtyping import Int64
 from pydantic import Field, field_validator
 from sklearn.model_selection import LeaveOneGroupOut, ShuffleSplit, train_test_split
 
+from pipeline.dataset.lines import take_pokes
 from pipeline.dataset.rows import Rows
 from pipeline.errors import ParamsError, complain
 from pipeline.seeds import rng_for
 from pipeline.strict import Strict
 
-Question = Literal["lobo", "sensors", "transfer", "single_random", "single_temporal"]
+Question = Literal["lobo", "sensors", "labels", "transfer", "single_random", "single_temporal"]
 Count = Annotated[int, Field(ge=1)]
 
 
@@ -32,6 +33,8 @@ class Split(Strict):
     sensors_skins_n: Annotated[tuple[Count, ...], Field(min_length=1)] | None = None
     sensors_draws_n: Count | None = None
     pool_passes_n: Count | None = None  # of each held-out skin, its first ones
+    labels_pool_n: Count | None = None  # indentations of each held-out skin that may be labelled, of all depths
+    labels_draws_n: Count | None = None
 
     @field_validator("sensors_skins_n")
     @classmethod
@@ -127,6 +130,38 @@ def fewer_sensors(rows: Rows, split: Split, seed: int) -> list[Fold]:
         for draw_i, order in enumerate(orders):
             train = np.flatnonzero(np.isin(rows.skin, order[:skins_n]))
             folds.append(_hold_out(rows, "sensors", f"{skins_n:02d}skins-draw{draw_i}", (train, held), split))
+    return folds
+
+
+def few_labels(rows: Rows, split: Split, seed: int) -> list[Fold]:
+    """Hold a board out as in `lobo`, a drawn pool of its indentations to be labelled; one fold a board and draw.
+
+    What was drawn is not tested, whether its labels are used or not, so that all numbers of labels meet equal tests.
+    """
+    assert split.labels_pool_n is not None
+    assert split.labels_draws_n is not None
+    plain = split.model_copy(update={"pool_passes_n": None})
+    folds = []
+    for whole in leave_one_board_out(rows, plain, seed):
+        skins = np.unique(rows.skin[whole.test])
+        for draw_i in range(split.labels_draws_n):
+            taken = [
+                take_pokes(
+                    rows, whole.test[rows.skin[whole.test] == skin], split.labels_pool_n,
+                    rng_for(seed, "labels", str(skin), draw_i),
+                )
+                for skin in skins
+            ]  # fmt: skip
+            pool = np.sort(np.concatenate(taken))
+            test = np.setdiff1d(whole.test, pool)
+            if not len(test):
+                raise ParamsError(
+                    complain(
+                        f"fold labels/{whole.name}", "split.labels_pool_n", "less than its indentations",
+                        split.labels_pool_n, "Ask for fewer, or record more.",
+                    )
+                )  # fmt: skip
+            folds.append(Fold("labels", f"{whole.name}-draw{draw_i}", whole.train, test, pool))
     return folds
 
 
@@ -248,6 +283,7 @@ def _prove_apart(rows: Rows, fold: Fold) -> None:
 _DRAW: dict[str, Callable[[Rows, Split, int], list[Fold]]] = {
     "lobo": leave_one_board_out,
     "sensors": fewer_sensors,
+    "labels": few_labels,
     "transfer": one_skin_to_others,
     "single_random": random_readings,
     "single_temporal": last_passes,

@@ -1,0 +1,51 @@
+"""Stage few_labels: what no, a few and more labelled pokes of a new board are worth, for every method."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline import io
+from pipeline.evaluation.summary import score_groups
+from pipeline.learning.baselines import run_tasks
+from pipeline.learning.cell import Measured
+from pipeline.learning.comparison import FewLabels
+from pipeline.learning.executors import make_executor
+from pipeline.stages import _few
+from pipeline.stages._run import run, say
+from pipeline.stages._train import Scenery, read_scenery, train_all
+from pipeline.strict import parse
+
+
+def few_labels(scene: str, settings: Path, indentations: Path, folds: Path, scores: Path) -> None:
+    """Score networks, adapted networks and classical methods with every number of labels on the same rows."""
+    at = read_scenery(scene, settings, indentations, folds)
+    asked = parse(FewLabels, at.asked.few_labels, f"{settings}: few_labels")
+    done: list[Any] = []
+    for made in (
+        lambda: _few.networks(at, asked),
+        lambda: _few.adapted(at, asked, done),
+        lambda: _few.labelled(at, asked, list(done)),
+    ):
+        pairs = made()
+        trained = train_all(at, [cell for _, cell in pairs], "few_labels")
+        done += [(tried, cell, one) for (tried, cell), one in zip(pairs, trained, strict=True)]
+    points = [_point(at, tried, one.predicted) for tried, _, one in done]
+    pairs = _few.classical(at, asked)
+    rows = Measured(at.rows.db_uT, at.rows.target, at.rows.skin)
+    with make_executor() as executor:
+        fitted = run_tasks([t for _, t in pairs], rows, executor, lambda line: say(f"{scene} few_labels: {line}"))
+    points += [_point(at, tried, one.predicted) for (tried, _), one in zip(pairs, fitted, strict=True)]
+    io.write_json(scores, points)
+
+
+def _point(at: Scenery, tried: _few.Tried, predicted: np.ndarray) -> dict[str, Any]:
+    test = tried.fold.test
+    board, draw = tried.fold.name.rsplit("-draw", 1)
+    words = {"method": tried.method, "inputs": tried.inputs, "labels_n": tried.labels_n, "fold": board}
+    scores = score_groups(at.rows.target[test], predicted, at.rows.board[test], at.rows.skin[test])
+    return words | {"seed_i": int(draw), "scores": scores}
+
+
+if __name__ == "__main__":
+    run(few_labels)

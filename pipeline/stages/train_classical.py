@@ -1,0 +1,47 @@
+"""Stage train_classical: classical methods on the folds of the pooled networks."""
+
+from pathlib import Path
+
+import numpy as np
+
+from pipeline import io
+from pipeline.evaluation.summary import score_groups
+from pipeline.learning.baselines import Task, run_tasks
+from pipeline.learning.cell import Measured
+from pipeline.learning.comparison import Baselines
+from pipeline.learning.executors import make_executor
+from pipeline.provenance import SECONDS
+from pipeline.stages._run import run, say
+from pipeline.stages._train import read_scenery
+from pipeline.strict import parse
+
+NO_ROWS = np.zeros(0, np.int64)
+
+
+def train_classical(scene: str, settings: Path, indentations: Path, folds: Path, scores: Path) -> None:
+    """Fit every method of section train_classical with one board held out."""
+    at = read_scenery(scene, settings, indentations, folds)
+    asked, rows = parse(Baselines, at.asked.train_classical, f"{settings}: train_classical"), at.rows
+    pairs = [(fold, name) for fold in at.of("lobo") for name in asked.methods]
+    tasks = [
+        Task(f"{name}.{f.name}", asked.methods[name], f.train, f.test, NO_ROWS, asked.rows_max_n, at.asked.seed)
+        for f, name in pairs
+    ]
+    with make_executor() as executor:
+        done = run_tasks(
+            tasks, Measured(rows.db_uT, rows.target, rows.skin), executor, lambda line: say(f"{scene} classical: {line}")
+        )
+    points = []
+    for (fold, name), task, one in zip(pairs, tasks, done, strict=True):
+        true, board, skin = (values[fold.test] for values in (rows.target, rows.board, rows.skin))
+        words = {"name": name, "method": task.asked.words, "inputs": task.asked.inputs, "fold": fold.name, "seed_i": 0}
+        points.append(words | {"rows_n": one.rows_n, "scores": score_groups(true, one.predicted, board, skin)})
+    io.write_json(scores, points)
+    took = zip(pairs, done, strict=True)
+    io.write_json(
+        SECONDS / scene / "train_classical.json", [{"name": name, "train_s": one.seconds} for (_, name), one in took]
+    )
+
+
+if __name__ == "__main__":
+    run(train_classical)
