@@ -47,10 +47,11 @@ def error_grid(true_mm: Float[np.ndarray, "f 2"], predicted_mm: Float[np.ndarray
         figure.colorbar(points, label="mean place error / mm")
         axes.set(xlabel="x / mm", ylabel="y / mm", aspect="equal")
         axes.set_title(title, loc="left", fontsize=10, wrap=True)
-        return _svg(figure)
+        return svg(figure)
 
 
-def _svg(figure: Any) -> str:
+def svg(figure: Any) -> str:
+    """Write a figure as SVG text without date or version, so that the same data give the same bytes."""
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     return buffer.getvalue()

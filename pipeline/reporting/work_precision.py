@@ -13,7 +13,7 @@ import matplotlib as mpl
 import pandas as pd
 
 from pipeline.evaluation.work_precision.rows import CANDIDATES, ERROR_MAX, REFERENCE, Choice, Key, Precision, Seconds
-from pipeline.reporting.figures import STYLE, _svg
+from pipeline.reporting.figures import STYLE, svg
 from pipeline.reporting.tables import to_markdown
 
 # Okabe & Ito 2008, told apart by colour-blind readers; their yellow is left out, which is pale on white.
@@ -36,9 +36,9 @@ class Words:
 
 
 def pages(numbers: Mapping[str, Any], *, source: str) -> dict[str, str]:
-    """Draw both studies, and write them as tables: text by file name; nothing where nothing was timed here."""
+    """Draw and tabulate the studies that were asked for: text by file name; nothing where nothing was timed here."""
     texts: dict[str, str] = {}
-    for study in ("quadratures", "integrators"):
+    for study in (name for name in ("quadratures", "integrators") if name in numbers):
         rows = [Precision(**{name: row[name] for name in Precision.__dataclass_fields__}) for row in numbers[study]]
         timed = [row for row in numbers[study] if "median_s" in row]
         seconds = [Seconds(**{name: row[name] for name in Seconds.__dataclass_fields__}) for row in timed]
@@ -128,7 +128,7 @@ def draw(rows: Sequence[Precision], seconds: Sequence[Seconds], words: Words) ->
         _frame(figure, panels, len(studies), words.error)
         figure.suptitle(words.title, x=0.01, ha="left", fontsize=10)
         figure.supxlabel(caption, x=0.01, ha="left", fontsize=7)
-        return _svg(figure)
+        return svg(figure)
 
 
 def failures(rows: Sequence[Precision]) -> list[str]:

@@ -2,6 +2,7 @@
 
 import re
 import xml.etree.ElementTree as ET
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 from pipeline.evaluation.work_precision.choose import choose
 from pipeline.evaluation.work_precision.rows import REFERENCE, Precision, Seconds
 from pipeline.physics.nodes import CHOSEN
-from pipeline.reporting.work_precision import COLOURS, MARKERS, failures, front, integrators, quadratures
+from pipeline.reporting.work_precision import COLOURS, MARKERS, failures, front, integrators, pages, quadratures
 
 RULES = [("Gauss in z", "0.5 mm x 6", 10584, 0.004), ("Gauss in z", "0.7 mm x 5", 5120, 0.015)]
 RULES += [("Gauss in z", "1 mm x 4", 1936, 0.08), ("midpoint", "0.5 mm x 4", 6400, 0.4)]
@@ -94,6 +95,16 @@ def test_what_failed_is_no_point_of_the_figure():
 def test_a_row_that_was_not_timed_is_an_error_and_not_left_out():
     with pytest.raises(KeyError):
         quadratures(SUMS, timed(SUMS)[1:], choose(SUMS, used=CHOSEN), source="simulated")
+
+
+def test_pages_cope_with_a_scene_that_asked_for_one_study_or_none():
+    stages = {"stages": {"simulate": {"seconds": 1.0, "peak_process_memory_MB": 100.0}}}
+    assert set(pages(stages, source="simulated")) == {"stages.md"}
+    times = {one.key: one for one in timed(STIFF)}
+    rows = [asdict(row) | (asdict(times[row.key]) if row.key in times else {}) for row in STIFF]
+    assert set(pages(stages | {"integrators": rows}, source="simulated")) == {
+        "integrators.svg", "integrators.md", "stages.md",
+    }  # fmt: skip
 
 
 def test_same_rows_same_bytes_other_seconds_other_bytes():
