@@ -11,5 +11,23 @@ SINGLE_SENSOR: dict[str, Number] = {  # section 4: 50K samples, random 45K / 5K
 TABLE_2: dict[str, dict[str, Number]] = {
     "single": {"accuracy_pct": (25.24, 10.12), "mse_xy_mm2": (6.453, 3.363), "mse_f_N2": (0.420, 0.149)},
     "multi": {"accuracy_pct": (84.43, 12.88), "mse_xy_mm2": (0.733, 0.707), "mse_f_N2": (0.155, 0.025)},
+    "triplet": {"accuracy_pct": (81.03, 12.86), "mse_xy_mm2": (0.756, 0.718), "mse_f_N2": (0.155, 0.030)},
+    "adapted": {"accuracy_pct": (87.00, 11.81), "mse_xy_mm2": (0.514, 0.601), "mse_f_N2": (0.142, 0.025)},
 }
-TABLE_2_ROWS = {"single": "Single-sensor", "multi": "Multi-sensor without triplet loss"}
+TABLE_2_ROWS = {
+    "single": "Single-sensor",
+    "multi": "Multi-sensor without triplet loss",
+    "triplet": "Multi-sensor with triplet loss",
+    "adapted": "Multi-sensor with triplet loss, adapted using 390 indentations",
+}
+ADAPTED_POKES_N = 390  # table 2
+
+# Figure 6 is printed without numbers; the text below it says what it shows.
+FIGURE_6A = (
+    '"a significant improvement in performance between no self-supervision and using 780 points", which "seems to '
+    'plateau as we increase the data beyond this point"'
+)
+FIGURE_6B = (
+    '"performance improves as the amount of training data increases"; adaptation, "while always doing better than the '
+    'other models, offers a significant improvement in performance when using fewer sensors in training"'
+)

@@ -34,7 +34,7 @@ def blocks_of(
         f"seed {provenance['seed']}, {provenance['device']}; mean ± sd over n folds (for the "
         "single-sensor row, over n pairs of a training and a test skin)."
     )
-    results = [words] + [to_markdown(tables[name]) for name in ("table2", "single_sensor") if name in tables]
+    results = [words] + [to_markdown(tables[name]) for name in ("table2", "order", "single_sensor") if name in tables]
     skins = to_markdown(skins_table(dict(_main_skins([numbers, *others]))))
     return {"results": "\n\n".join(results), "skins": skins, "dag": dag, "stages": _stages(stages)}
 

@@ -9,13 +9,15 @@ from typing import Any
 import pandas as pd
 
 from pipeline.reporting.checks import stability_table, verification_table
+from pipeline.reporting.learning import learning_tables
 from pipeline.reporting.left_out import left_out_table
-from pipeline.reporting.paper import SINGLE_SENSOR, TABLE_2, TABLE_2_ROWS, Number
+from pipeline.reporting.order import models
+from pipeline.reporting.paper import SINGLE_SENSOR, Number
+from pipeline.reporting.shown import COLUMNS, scores, show
 from pipeline.reporting.skins import skins_table
 
-COLUMNS = {"accuracy_pct": "accuracy, %", "mse_xy_mm2": "MSE_xy, mm²", "mse_f_N2": "MSE_F, N²"}
-MEANING = (
-    "Accuracy: the part of held-out readings whose x and y are both within 1 mm. MSE_xy: mean over the two axes. "
+MEANING = "Accuracy: the part of held-out readings whose x and y are both within 1 mm. MSE_xy: mean over the two axes."
+SPREAD = (
     "± is the sd over n folds (over n pairs of a training and a test skin for one skin on others), or over seeds where "
     "it says so."
 )
@@ -31,6 +33,7 @@ def make_tables(numbers: Mapping[str, Any]) -> dict[str, pd.DataFrame]:
     tables = {}
     if "table2" in numbers:
         tables["table2"] = _beside_paper(_table_2_rows(numbers), source)
+    tables |= learning_tables(numbers, source)
     single = {SPLIT_WORDS[name]: (numbers[name], SINGLE_SENSOR) for name in SPLIT_WORDS if name in numbers}
     if single:
         tables["single_sensor"] = _beside_paper(single, source)
@@ -54,29 +57,17 @@ def to_markdown(table: pd.DataFrame) -> str:
     """Write a table as Markdown, empty where a number is not known, and say below what its numbers mean."""
     text = str(table.fillna("").to_markdown(index=False, disable_numparse=True)) + "\n"
     meanings = [table.attrs["meaning"]] if "meaning" in table.attrs else []
-    meanings += [MEANING] if any("accuracy" in str(column) for column in table.columns) else []
+    if any("accuracy" in str(column) for column in table.columns):
+        meanings.append(f"{MEANING} {table.attrs.get('spread', SPREAD)}")
     return text + "".join(f"\n{meaning}\n" for meaning in meanings)
 
 
-def show(value: Mapping[str, float] | None) -> str:
-    """Write a mean and its deviation with three significant digits."""
-    if value is None:
-        return "–"
-    mean = f"{value['mean']:.4g}" if value["mean"] >= 100 else f"{value['mean']:.3g}"
-    if "sd" in value:
-        return f"{mean} ± {value['sd']:.2g}"
-    return mean + (f" ± {value['sd_seeds']:.2g} (seeds)" if "sd_seeds" in value else "")
-
-
 def _table_2_rows(numbers: Mapping[str, Any]) -> dict[str, tuple[Mapping[str, Any], Mapping[str, Number]]]:
-    """Put each row beside the paper's row of the same kind: with one training skin, nothing was pooled."""
-    rows: dict[str, tuple[Mapping[str, Any], Mapping[str, Number]]] = {}
-    for row, value in numbers["table2"].items():
-        skins_n = [one["trained_on_skins_n"] for one in numbers["lobo"]["by_board"].values()] if row == "multi" else []
-        alone = bool(skins_n) and max(skins_n) == 1
-        name = "Leave-one-board-out, one training skin (paper: single-sensor)" if alone else TABLE_2_ROWS[row]
-        rows[name] = (value, TABLE_2["single" if alone else row])
-    return rows
+    """Put each row beside the paper's row of the same kind, in the paper's order; the control is ours."""
+    ours = dict(numbers["table2"])
+    if "adapt" in numbers:
+        ours["control"] = numbers["adapt"]["control"]
+    return {model.title: (ours[row], model.paper) for row, model in models(numbers).items() if row in ours}
 
 
 def _beside_paper(rows: Mapping[str, tuple[Mapping[str, Any], Mapping[str, Number]]], source: str) -> pd.DataFrame:
@@ -85,7 +76,7 @@ def _beside_paper(rows: Mapping[str, tuple[Mapping[str, Any], Mapping[str, Numbe
         line = {"model": name, "source": source}
         for metric, title in COLUMNS.items():
             line[f"{title} (ours)"] = show(ours.get(metric))
-            line[f"{title} (paper)"] = "{:g} ± {:g}".format(*paper[metric])
+            line[f"{title} (paper)"] = "{:g} ± {:g}".format(*paper[metric]) if metric in paper else "–"
         line["n"] = str(ours["accuracy_pct"]["n"])
         lines.append(line)
     return pd.DataFrame(lines)
@@ -107,8 +98,7 @@ def _variants(variants: Mapping[str, Any], source: str) -> pd.DataFrame:
     lines = []
     for question, recipes in variants.items():
         for recipe, metrics in recipes.items():
-            line = {"question": question, "recipe": recipe, "source": source}
-            line |= {title: show(metrics.get(metric)) for metric, title in COLUMNS.items()}
+            line = {"question": question, "recipe": recipe, "source": source} | scores(metrics)
             lines.append(line | {"n": str(metrics["accuracy_pct"]["n"])})
     return pd.DataFrame(lines)
 

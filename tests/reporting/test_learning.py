@@ -1,0 +1,256 @@
+"""Tables of learning on many skins show the numbers they were given, and say where the paper's order does not hold."""
+
+import statistics
+from itertools import pairwise
+from math import sqrt
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.reporting.learning import (
+    adaptation_costs_table,
+    audit_table,
+    baselines_table,
+    chosen_table,
+    labels_table,
+    learning_tables,
+    methods_costs_table,
+    sweep_pokes_table,
+    sweep_sensors_table,
+)
+from pipeline.reporting.order import CONTROL, FAR_SDS, order_table, paired_table
+from pipeline.reporting.paper import TABLE_2
+from pipeline.reporting.readme import blocks_of
+from pipeline.reporting.tables import make_tables, to_markdown
+
+
+def stat(mean: float, sd: float | None = 1.0, n: int = 6) -> dict:
+    return {"mean": float(mean), "n": n} | ({} if sd is None else {"sd": sd})
+
+
+def row(accuracy_pct: float, mse_xy_mm2: float = 0.5, sd: float | None = 1.0, n: int = 6) -> dict:
+    return {"accuracy_pct": stat(accuracy_pct, sd, n), "mse_xy_mm2": stat(mse_xy_mm2, sd, n)}
+
+
+def paired(of: str, over: str, **scores) -> dict:
+    return {"of": of, "over": over, **scores}
+
+
+BOARDS = {f"b{i}": {"trained_on_skins_n": 15} for i in range(6)}
+ALONE = {f"b{i}": {"trained_on_skins_n": 1} for i in range(2)}
+PAPER_AS_OURS = {name: {metric: stat(*value) for metric, value in metrics.items()} for name, metrics in TABLE_2.items()}
+PAIRED = [
+    paired("triplet", "multi", **row(-3.4, 0.023, n=18)),
+    paired("adapted", "triplet", **row(6.0, -0.2, n=18)),
+    paired("adapted", "control", **row(0.1, 0.1, sd=3.0, n=18)),
+]
+NUMBERS = {"table2": PAPER_AS_OURS, "lobo": {"by_board": BOARDS}, "paired": PAIRED}
+
+
+def verdicts(numbers: dict) -> dict[str, list[str]]:
+    table = order_table(numbers, "simulated")
+    scores = [title for title in table if title not in ("claim", "n", "source")]
+    return {line["claim"]: [line[title] for title in scores] for _, line in table.iterrows()}
+
+
+def test_the_papers_own_means_fulfil_its_claim_that_many_sensors_are_far_better_than_one():
+    cells = verdicts(NUMBERS)["multi-sensor far better than single-sensor"]
+    assert [cell.split(":")[0] for cell in cells] == ["yes"] * 3
+    assert cells[0] == "yes: +59.2 (5.1 sd)"
+    assert cells[1].startswith("yes: -5.72")
+
+
+def test_the_order_table_tells_what_holds_what_may_be_chance_and_what_does_not_hold():
+    found = verdicts(NUMBERS)
+    assert found["multi-sensor + triplet within a few points of multi-sensor"] == ["yes: -3.4 ± 1", "–", "–"]
+    assert found["adapted better than multi-sensor + triplet"][:2] == [
+        "yes: +6 ± 1",
+        "yes, within 2 standard errors: -0.2 ± 1",
+    ]
+    assert found["adapted better than control (ours)"][:2] == [
+        "yes, within 2 standard errors: +0.1 ± 3",
+        "no: +0.1 ± 3",  # an error that rises is no improvement
+    ]
+
+
+@pytest.mark.parametrize(("points", "word"), [(-5.1, "no"), (-4.9, "yes"), (4.9, "yes"), (5.1, "no")])
+def test_a_few_points_are_five_up_or_down(points, word):
+    pair = paired("triplet", "multi", **row(points))
+    (cells,) = verdicts({"paired": [pair]}).values()
+    assert cells[0].split(":")[0] == word
+
+
+@given(st.lists(st.integers(-20, 20), min_size=2, max_size=18))
+def test_better_means_a_positive_mean_and_surely_better_one_beyond_two_standard_errors(differences):
+    mean, sd, n = statistics.mean(differences), statistics.stdev(differences), len(differences)
+    (cells,) = verdicts({"paired": [paired("adapted", "triplet", **row(mean, -mean, sd, n))]}).values()
+    word = "no" if mean <= 0 else "yes" if mean > 2 * sd / sqrt(n) else "yes, within 2 standard errors"
+    assert [cell.split(":")[0] for cell in cells[:2]] == [word, word]
+
+
+@pytest.mark.parametrize(("gain", "word"), [(20.1, "yes"), (19.9, "better, not far"), (-1.0, "no")])
+def test_far_better_is_measured_by_the_sd_of_both_rows(gain, word):
+    # The root mean square of 2 and 14 is 10.
+    table2 = {"single": row(50.0, sd=2.0), "multi": row(50.0 + gain, sd=14.0)}
+    (cells,) = verdicts({"table2": table2, "lobo": {"by_board": BOARDS}, "paired": []}).values()
+    assert FAR_SDS == 2
+    assert cells[0].split(":")[0] == word
+
+
+def test_one_pair_tells_no_spread_and_the_verdict_says_so():
+    (cells,) = verdicts({"paired": [paired("adapted", "triplet", **row(3.0, -0.1, sd=None, n=1))]}).values()
+    assert cells[:2] == ["yes, but of one: +3", "yes, but of one: -0.1"]
+
+
+def test_a_claim_whose_rows_were_not_asked_for_is_absent():
+    assert list(verdicts({"paired": PAIRED[:1]})) == ["multi-sensor + triplet within a few points of multi-sensor"]
+
+
+def test_where_nothing_was_claimed_there_is_no_table_of_the_order():
+    numbers = {"paired": [paired("multi", "single", **row(0.1))], "lobo": {"by_board": ALONE}}
+    assert set(learning_tables(numbers, "recorded")) == {"paired"}
+
+
+def test_paired_differences_stand_beside_the_difference_of_the_papers_means():
+    table = paired_table(NUMBERS, "simulated")
+    assert table["difference"].tolist() == [
+        "multi-sensor + triplet − multi-sensor", "adapted − multi-sensor + triplet", "adapted − control",
+    ]  # fmt: skip
+    assert table["accuracy, % (ours)"].tolist() == ["-3.4 ± 1", "+6 ± 1", "+0.1 ± 3"]
+    # 81.03 - 84.43, 87.00 - 81.03 of table 2; it has no control.
+    assert table["accuracy, % (paper: difference of means)"].tolist() == ["-3.4", "+5.97", "–"]
+    assert table["MSE_xy, mm² (paper: difference of means)"].tolist() == ["+0.023", "-0.242", "–"]
+    assert table["MSE_F, N² (ours)"].tolist() == ["–"] * 3
+    assert "over n held-out skins" in to_markdown(table)
+
+
+def test_with_one_training_skin_nothing_is_called_multi_sensor_and_no_pooled_number_stands_beside_it():
+    numbers = NUMBERS | {"lobo": {"by_board": ALONE}}
+    for table in (paired_table(numbers, "recorded"), order_table(numbers, "recorded")):
+        text = to_markdown(table)
+        assert "multi-sensor" not in text
+        assert "one training skin + triplet" in text
+    assert set(paired_table(numbers, "recorded")["accuracy, % (paper: difference of means)"]) == {"–"}
+
+
+def test_table_2_has_the_papers_rows_in_its_order_and_the_control_below():
+    numbers = everything() | {"adapt": {"pokes_n": 390, "control": row(82.0)}}
+    table = make_tables(numbers)["table2"]
+    assert table["model"].tolist() == [
+        "Single-sensor", "Multi-sensor without triplet loss", "Multi-sensor with triplet loss",
+        "Multi-sensor with triplet loss, adapted using 390 indentations", CONTROL,
+    ]  # fmt: skip
+    assert table["accuracy, % (paper)"].tolist() == [
+        "25.24 ± 10.12",
+        "84.43 ± 12.88",
+        "81.03 ± 12.86",
+        "87 ± 11.81",
+        "–",
+    ]
+    assert table["accuracy, % (ours)"].tolist()[-1] == "82 ± 1"
+
+
+def test_another_number_of_pokes_than_the_papers_is_named():
+    numbers = everything() | {"adapt": {"pokes_n": 65, "control": row(82.0)}}
+    (name,) = [name for name in make_tables(numbers)["table2"]["model"] if "adapted" in name]
+    assert name.endswith("adapted using 65 indentations (paper: 390)")
+
+
+def test_sweeps_are_in_order_of_their_counts_beside_the_two_numbers_that_the_paper_prints():
+    table = sweep_pokes_table([{"pokes_n": n, **row(80.0 + n / 100)} for n in (390, 0, 65)], "simulated")
+    assert table["pokes"].tolist() == ["0", "65", "390"]
+    assert table["accuracy, % (ours)"].tolist() == ["80 ± 1", "80.7 ± 1", "83.9 ± 1"]
+    assert table["accuracy, % (paper, table 2)"].tolist() == ["81.03 ± 12.86", "–", "87 ± 11.81"]
+    rows = [{"method": m, "skins_n": n, **row(n)} for m in ("adapted", "multi") for n in (15, 3)]
+    table = sweep_sensors_table(rows, "simulated")
+    assert table["training skins"].tolist() == ["3", "3", "15", "15"]
+    assert table["method"].tolist() == ["multi-sensor", "adapted"] * 2
+
+
+@given(st.lists(st.floats(0, 100), min_size=1, max_size=9))
+def test_baselines_are_sorted_by_accuracy_and_none_is_lost(accuracies):
+    rows = [{"method": f"m{i}", "inputs": "raw", **row(value)} for i, value in enumerate(accuracies)]
+    methods = baselines_table(rows, "recorded")["method"].tolist()
+    assert sorted(methods) == sorted(f"m{i}" for i in range(len(rows)))
+    shown = [accuracies[int(name[1:])] for name in methods]
+    assert all(a >= b for a, b in pairwise(shown))
+
+
+def test_labelled_pokes_show_both_ways_of_scoring_places():
+    one = {"method": "ridge", "inputs": "shape", "labels_n": 20, "as_labelled": row(30.0), "registered": row(42.0, 0.2)}
+    (line,) = labels_table([one], "recorded").to_dict("records")
+    assert line == {
+        "method": "ridge", "inputs": "shape", "labels": "20", "source": "recorded", "accuracy, %": "30 ± 1",
+        "MSE_xy, mm²": "0.5 ± 1", "MSE_F, N²": "–", "accuracy, % (registered)": "42 ± 1",
+        "MSE_xy, mm² (registered)": "0.2 ± 1", "n": "6",
+    }  # fmt: skip
+
+
+def test_a_leak_that_nobody_knew_of_stands_out():
+    check = {"what": "skins", "where": "lobo", "rule": "on one side", "found": 0, "holds": True, "known": False}
+    rows = [check, check | {"holds": False, "known": True, "found": 6}, check | {"holds": False}]
+    table = audit_table(rows, "simulated")
+    assert table["holds"].tolist() == ["yes", "no, known", "NO"]
+    assert table["found"].tolist() == ["0", "6", "0"]
+
+
+def test_all_candidates_are_listed_and_the_chosen_one_is_marked_with_what_decided():
+    candidates = [{"recipe_name": name, **row(80.0, error)} for name, error in (("slow", 0.4), ("fast", 0.3))]
+    arms = {"triplet": {"recipe_name": "fast", "by": "mse_xy_mm2", "candidates": candidates}}
+    table = chosen_table(arms, "simulated")
+    assert dict(zip(table["candidate"], table["chosen"], strict=True)) == {"slow": "", "fast": "yes, by MSE_xy, mm²"}
+
+
+def test_what_was_not_timed_here_has_a_dash():
+    timed = {"method": "ridge", "inputs": "raw", "train_s": 0.0123, "inference_us": 4.56, **row(30.0)}
+    untimed = {name: value for name, value in timed.items() if name not in ("train_s", "inference_us")}
+    table = methods_costs_table([timed, untimed], "simulated")
+    assert table["training, s"].tolist() == ["0.0123", "–"]
+    assert table["one reading, µs"].tolist() == ["4.56", "–"]
+    rows = [{"pokes_n": 390, **row(87.0)}, {"pokes_n": 65, "seconds": 1.5, **row(85.0)}]
+    assert adaptation_costs_table(rows, "simulated")["adaptation, s"].tolist() == ["1.5", "–"]
+
+
+def everything() -> dict:
+    provenance = {"source": "simulated", "scene": "x", "git": "y", "seed": 1, "device": "z", "seconds": 1.0}
+    one = {"method": "ridge", "inputs": "raw"}
+    check = {"what": "skins", "where": "lobo", "rule": "on one side", "found": 0, "holds": True, "known": False}
+    return NUMBERS | {
+        "provenance": provenance,
+        "lobo": {"by_board": {board: one | part() for board, one in BOARDS.items()}},
+        "variants": {"lobo": {"paper": row(84.0)}},
+        "capture": {"captures_n": 18, "left_out": {}},
+        "sweep_pokes": [{"pokes_n": 0, **row(81.0)}],
+        "sweep_sensors": [{"method": "multi", "skins_n": 3, **row(60.0)}],
+        "baselines": [one | row(30.0)],
+        "labels": [one | {"labels_n": 0, "as_labelled": row(30.0), "registered": row(42.0)}],
+        "audit": [check],
+        "chosen": {"multi": {"recipe_name": "a", "by": "mse_xy_mm2", "candidates": [{"recipe_name": "a"} | row(80.0)]}},
+    }
+
+
+def part() -> dict:
+    scores = {"accuracy_pct": 80.0, "mse_xy_mm2": 0.5}
+    return {"as_labelled": scores, "registered": scores}
+
+
+def test_a_question_that_was_asked_has_its_table_and_every_row_says_where_it_comes_from():
+    tables = learning_tables(everything(), "simulated")
+    assert set(tables) == {
+        "order", "paired", "sweep_pokes", "sweep_sensors", "baselines", "labels", "audit", "chosen",
+    }  # fmt: skip
+    assert set(tables) < set(make_tables(everything()))
+    for table in tables.values():
+        assert set(table["source"]) == {"simulated"}
+    assert learning_tables({"variants": {}}, "simulated") == {}
+
+
+def test_in_the_readme_the_order_stands_right_below_table_2():
+    described = {
+        "grid": {"source": "simulated", "over_skins": {"step_z_uT": {"mean": 1.0, "least": 1.0, "most": 1.0, "n": 1}}}
+    }
+    tables = make_tables(everything())
+    results = blocks_of(everything() | {"described": described}, [], "", {})["results"]
+    table2, order = to_markdown(tables["table2"]), to_markdown(tables["order"])
+    assert f"{table2}\n\n{order}" in results
