@@ -10,7 +10,10 @@ SOURCES = {str(file.relative_to(ROOT)): file.read_text() for file in (ROOT / "pi
 
 HOMES = {
     r"\bimport mlflow|from mlflow": {"pipeline/tracking.py"},
-    r"\bimport matplotlib|from matplotlib": {"pipeline/reporting/figures.py", "pipeline/reporting/work_precision.py"},
+    r"\bimport matplotlib|from matplotlib": {
+        "pipeline/reporting/figures.py", "pipeline/reporting/sweeps.py", "pipeline/reporting/trade_offs.py",
+        "pipeline/reporting/work_precision.py",
+    },
     r"\bimport argparse|from argparse": {"pipeline/stages/_run.py"},
     r"\bimport typer|from typer": {"pipeline/cli.py"},
     r"optimizer\.step\(": {"pipeline/learning/train.py"},

@@ -1,0 +1,118 @@
+"""Figures of an error against what it costs: methods, and pokes of an adaptation. In: rows. Out: SVG text.
+
+Same rows, same bytes. Refuses to know how errors and times were found, and paths.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+
+from pipeline.reporting.figures import STYLE, svg
+from pipeline.reporting.placing import place_labels
+from pipeline.reporting.work_precision import COLOURS, MARKERS, front
+
+LETTER = np.array([0.018, 0.045])  # width and height of a letter of a label, in parts of the axes
+MARK = np.array([0.026, 0.04])
+LEAD = 1.5  # a label farther than so many of its own sizes from its point has a line to it
+ROOM = 1.6  # factor beyond the outermost points on a logarithmic axis
+
+
+@dataclass(frozen=True)
+class Point:
+    """One method or setting: its name, the label at its mark, what it costs, its error, and how it is drawn."""
+
+    name: str
+    label: str
+    place: tuple[float, float]
+    look: Mapping[str, Any]
+
+
+def trade_off(rows: Sequence[Mapping[str, Any]], key: str, *, title: str, cost: str) -> str:
+    """Draw errors of methods against the cost `key`, log-log; a step joins the Pareto front, its members numbered."""
+    points = trade_off_points(rows, key)
+    members = [point for point in points if point.label]
+    with mpl.rc_context(STYLE):
+        figure, axes = _axes(title, xscale="log", xlabel=cost)
+        _limit(axes, points)
+        for point in points:
+            mark = axes.plot(*point.place, **point.look, linestyle="none")[0]
+            mark.set_label(f"{point.label}  {point.name}" if point.label else point.name)
+        steps = zip(*(point.place for point in members), strict=True)
+        axes.step(*steps, where="post", color="0.4", linewidth=1, zorder=1, label="Pareto front (numbers)")
+        _label(axes, points)
+        figure.legend(loc="outside right upper", frameon=False, fontsize=8)
+        return svg(figure)
+
+
+def trade_off_points(rows: Sequence[Mapping[str, Any]], key: str) -> list[Point]:
+    """List the timed methods, those of the Pareto front first, by cost, and numbered; one look for each."""
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    inputs = list(dict.fromkeys(row["inputs"] for row in rows))
+    timed = sorted((row for row in rows if key in row), key=lambda row: (row[key], row["mse_xy_mm2"]["mean"]))
+    places = [(row[key], row["mse_xy_mm2"]["mean"]) for row in timed]
+    best = front(places)
+    points = []
+    for row, place in zip(timed, places, strict=True):
+        look = look_of(methods.index(row["method"]))
+        if row["inputs"] != inputs[0]:
+            look["markerfacecolor"] = "white"
+        label = str(best.index(place) + 1) if place in best else ""
+        points.append(Point(f"{row['method']} ({row['inputs']})", label, place, look))
+    return sorted(points, key=lambda point: not point.label)
+
+
+def adaptation(rows: Sequence[Mapping[str, Any]], source: str) -> str:
+    """Draw the error after adaptation against its seconds, every point with its number of pokes."""
+    timed = sorted((row for row in rows if "seconds" in row), key=lambda row: row["pokes_n"])
+    points = [Point("", str(row["pokes_n"]), (row["seconds"], row["mse_xy_mm2"]["mean"]), look_of(1)) for row in timed]
+    with mpl.rc_context(STYLE):
+        title = f"Error on a new skin against adaptation time ({source})"
+        figure, axes = _axes(title, xscale="linear", xlabel="median time of an adaptation / s")
+        _limit(axes, points)
+        for point in points:
+            axes.plot(*point.place, **point.look, linestyle="none")
+        _label(axes, points)
+        figure.supxlabel("A number: unlabelled pokes of the new skin.", x=0.01, ha="left", fontsize=7)
+        return svg(figure)
+
+
+def _axes(title: str, *, xscale: str, xlabel: str) -> tuple[Any, Any]:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.6, 4.2), layout="constrained")
+    axes = figure.subplots()
+    axes.set(xscale=xscale, yscale="log", xlabel=xlabel, ylabel="MSE_xy / mm²")
+    axes.grid(alpha=0.25)
+    figure.suptitle(title, x=0.01, ha="left", fontsize=10)
+    return figure, axes
+
+
+def _limit(axes: Any, points: Sequence[Point]) -> None:
+    """Leave room around the points for their labels; a linear axis begins at 0."""
+    costs, errors = np.array([point.place for point in points]).T
+    axes.set_ylim(errors.min() / ROOM, errors.max() * ROOM)
+    if axes.get_xscale() == "log":
+        axes.set_xlim(costs.min() / ROOM, costs.max() * ROOM)
+    else:
+        axes.set_xlim(0.0, 1.15 * costs.max())
+
+
+def _label(axes: Any, points: Sequence[Point]) -> None:
+    to_parts = axes.transScale + axes.transLimits
+    parts = to_parts.transform([point.place for point in points])
+    labelled = [i for i, point in enumerate(points) if point.label]
+    size = LETTER * (max(len(points[i].label) for i in labelled), 1)
+    for i, place in zip(labelled, place_labels(parts, parts[labelled], label=size, mark=MARK), strict=True):
+        far = (np.abs(place - parts[i]) > LEAD * (size + MARK) / 2).any()
+        line = {"arrowprops": {"arrowstyle": "-", "color": "0.6", "linewidth": 0.6, "shrinkA": 0}} if far else {}
+        where = {"xytext": place, "textcoords": "axes fraction", "ha": "center", "va": "center", "fontsize": 8}
+        axes.annotate(points[i].label, points[i].place, **where, **line)
+
+
+def look_of(i: int) -> dict[str, Any]:
+    """A colour and a marker for each of the first 49 methods, no two alike."""
+    marker = MARKERS[(i + i // len(COLOURS)) % len(MARKERS)]
+    return {"color": COLOURS[i % len(COLOURS)], "marker": marker, "markersize": 6}
