@@ -1,0 +1,137 @@
+"""Figures of learning on many skins: sweeps over pokes and training skins. In: rows. Out: SVG text by file name.
+
+Same rows, same bytes. Refuses to know how a model learnt, and paths.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+
+from pipeline.reporting.figures import STYLE, svg
+from pipeline.reporting.learning import adaptation_costs_table, methods_costs_table
+from pipeline.reporting.order import SHORT
+from pipeline.reporting.paper import ADAPTED_POKES_N, TABLE_2
+from pipeline.reporting.shown import COLUMNS
+from pipeline.reporting.tables import to_markdown
+from pipeline.reporting.trade_offs import adaptation, trade_off
+from pipeline.reporting.work_precision import COLOURS, MARKERS
+
+DRAWN = {"accuracy_pct": (0.0, 100.0), "mse_xy_mm2": (0.0, np.inf)}  # what is drawn, and what is possible
+LINEAR_BELOW_N = 65  # pokes: a logarithm has no place for none
+METHODS = ("multi", "triplet", "adapted")
+
+
+@dataclass(frozen=True)
+class Line:
+    """Points of one line of a sweep: counts and scores, and how they are drawn."""
+
+    name: str
+    counts: Sequence[int]
+    scores: Sequence[Mapping[str, Any]]
+    look: Mapping[str, Any]
+    shift_pt: float = 0.0  # to the right, so that bars at one count stand beside each other
+
+
+def learning_figures(numbers: Mapping[str, Any], source: str) -> Iterator[tuple[str, str]]:
+    """Draw the sweeps that were asked for: file name and SVG text."""
+    for name, draw in {"sweep_pokes": sweep_pokes, "sweep_sensors": sweep_sensors}.items():
+        if name in numbers:
+            yield f"{name}.svg", draw(numbers[name], source)
+
+
+def learning_pages(runtime: Mapping[str, Any], source: str) -> dict[str, str]:
+    """Draw and tabulate errors against costs: text by file name; no figure where nothing was timed here."""
+    texts = {}
+    if "learning" in runtime:
+        texts["learning.md"] = to_markdown(methods_costs_table(runtime["learning"], source))
+        for name, (key, cost) in {
+            "training": ("train_s", "median time of a training / s"),
+            "inference": ("inference_us", "median time of one reading / µs"),
+        }.items():
+            if any(key in row for row in runtime["learning"]):
+                title = f"Error on new skins against {name} time ({source})"
+                texts[f"{name}.svg"] = trade_off(runtime["learning"], key, title=title, cost=cost)
+    if "adaptation" in runtime:
+        texts["adaptation.md"] = to_markdown(adaptation_costs_table(runtime["adaptation"], source))
+        if any("seconds" in row for row in runtime["adaptation"]):
+            texts["adaptation.svg"] = adaptation(runtime["adaptation"], source)
+    return texts
+
+
+def sweep_pokes(rows: Sequence[Mapping[str, Any]], source: str) -> str:
+    """Draw scores against the number of unlabelled pokes (figure 6a), beside the two that the paper prints."""
+    ordered = sorted(rows, key=lambda row: row["pokes_n"])
+    paper = [{m: {"mean": mean, "sd": sd} for m, (mean, sd) in TABLE_2[row].items()} for row in ("triplet", "adapted")]
+    hollow = {"color": COLOURS[2], "marker": MARKERS[1], "markerfacecolor": "white", "linestyle": "none"}
+    lines = [
+        Line("ours", [row["pokes_n"] for row in ordered], ordered, {"color": COLOURS[1], "marker": MARKERS[0]}),
+        Line("paper (table 2)", [0, ADAPTED_POKES_N], paper, hollow, shift_pt=5.0),
+    ]
+    return _sweep(lines, f"Adapted to a new skin by unlabelled pokes ({source})", "pokes of the new skin", log=True)
+
+
+def sweep_sensors(rows: Sequence[Mapping[str, Any]], source: str) -> str:
+    """Draw scores against the number of training skins (figure 6b), a line for each method."""
+    lines = []
+    for i, method in enumerate(METHODS):
+        own = sorted((row for row in rows if row["method"] == method), key=lambda row: row["skins_n"])
+        look = {"color": COLOURS[1 + i], "marker": MARKERS[i]}
+        if own:
+            lines.append(Line(SHORT[method], [row["skins_n"] for row in own], own, look, shift_pt=4.0 * (i - 1)))
+    return _sweep(lines, f"Scores on new skins by the number of training skins ({source})", "training skins", log=False)
+
+
+def bars(scores: Sequence[Mapping[str, Any]], metric: str) -> tuple[np.ndarray, np.ndarray]:
+    """Find means and the lengths of their bars (down, up): one sd, cut at what is possible, as 100 % accuracy."""
+    means = np.array([one[metric]["mean"] for one in scores])
+    sd = np.array([one[metric].get("sd", one[metric].get("sd_seeds", 0.0)) for one in scores])
+    least, most = DRAWN[metric]
+    return means, np.stack([np.minimum(sd, means - least), np.minimum(sd, most - means)])
+
+
+def _sweep(lines: Sequence[Line], title: str, xlabel: str, *, log: bool) -> str:
+    from matplotlib.figure import Figure
+
+    counts = sorted({count for line in lines for count in line.counts})
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(9.4, 3.8), layout="constrained")
+        for axes, metric in zip(figure.subplots(1, len(DRAWN)), DRAWN, strict=True):
+            if log:
+                axes.set_xscale("symlog", linthresh=LINEAR_BELOW_N, linscale=0.5)
+                axes.set_xlim(-LINEAR_BELOW_N / 4, 1.3 * counts[-1])
+            else:
+                axes.set_xlim(counts[0] - 1, counts[-1] + 1)
+            axes.set_xticks(counts, [str(count) for count in counts], rotation=90 if log else 0)
+            axes.set_xticks([], minor=True)
+            axes.set(xlabel=xlabel, ylabel=COLUMNS[metric].replace(", ", " / "))
+            axes.grid(alpha=0.25)
+            _bars(axes, lines, metric)
+        figure.legend(*axes.get_legend_handles_labels(), loc="outside right upper", frameon=False, fontsize=8)
+        figure.suptitle(title, x=0.01, ha="left", fontsize=10)
+        figure.supxlabel(_about_bars(lines), x=0.01, ha="left", fontsize=7)
+        return svg(figure)
+
+
+def _bars(axes: Any, lines: Sequence[Line], metric: str) -> None:
+    from matplotlib.transforms import ScaledTranslation
+
+    ends: list[float] = []
+    for line in lines:
+        means, lengths = bars(line.scores, metric)
+        shift = ScaledTranslation(line.shift_pt / 72, 0, axes.figure.dpi_scale_trans)
+        style = {"linewidth": 1, "markersize": 5, "capsize": 2, "elinewidth": 0.8, **line.look}
+        axes.errorbar(line.counts, means, lengths, transform=axes.transData + shift, label=line.name, **style)
+        ends += [*(means - lengths[0]), *(means + lengths[1])]
+    # What is shifted does not set the limits by itself.
+    room = 0.05 * (max(ends) - min(ends)) or 1.0
+    axes.set_ylim(min(ends) - room, max(ends) + room)
+
+
+def _about_bars(lines: Sequence[Line]) -> str:
+    ours = [one["accuracy_pct"] for line in lines for one in line.scores if "n" in one["accuracy_pct"]]
+    kinds = {f"sd over n = {one['n']} folds" for one in ours if "sd" in one}
+    kinds |= {"sd over seeds" for one in ours if "sd" not in one and "sd_seeds" in one}
+    return f"Bars: {', '.join(sorted(kinds))}; cut at what is possible." if kinds else "No bars: one training each."
