@@ -14,9 +14,10 @@ from pipeline.reporting.figures import STYLE, svg
 from pipeline.reporting.placing import place_labels
 from pipeline.reporting.work_precision import COLOURS, MARKERS, front
 
-LETTER = np.array([0.018, 0.045])  # width and height of a letter of a label, in parts of the axes
+LETTER = np.array([0.016, 0.04])  # width and height of a letter of a label, in parts of the axes
 MARK = np.array([0.026, 0.04])
-LEAD = 1.5  # a label farther than so many of its own sizes from its point has a line to it
+LOWER_LEFT = np.array([-1.0, -1.0])  # of a member of the front no point stands there
+LEFT = np.array([-1.0, 0.0])
 ROOM = 1.6  # factor beyond the outermost points on a logarithmic axis
 
 
@@ -42,7 +43,7 @@ def trade_off(rows: Sequence[Mapping[str, Any]], key: str, *, title: str, cost: 
             mark.set_label(f"{point.label}  {point.name}" if point.label else point.name)
         steps = zip(*(point.place for point in members), strict=True)
         axes.step(*steps, where="post", color="0.4", linewidth=1, zorder=1, label="Pareto front (numbers)")
-        _label(axes, points)
+        _label(axes, points, LOWER_LEFT)
         figure.legend(loc="outside right upper", frameon=False, fontsize=8)
         return svg(figure)
 
@@ -74,7 +75,7 @@ def adaptation(rows: Sequence[Mapping[str, Any]], source: str) -> str:
         _limit(axes, points)
         for point in points:
             axes.plot(*point.place, **point.look, linestyle="none")
-        _label(axes, points)
+        _label(axes, points, LEFT)
         figure.supxlabel("A number: unlabelled pokes of the new skin.", x=0.01, ha="left", fontsize=7)
         return svg(figure)
 
@@ -100,16 +101,19 @@ def _limit(axes: Any, points: Sequence[Point]) -> None:
         axes.set_xlim(0.0, 1.15 * costs.max())
 
 
-def _label(axes: Any, points: Sequence[Point]) -> None:
+def _label(axes: Any, points: Sequence[Point], side: np.ndarray) -> None:
+    """Write labels on one side of their points; one that finds no place there has a line to its point."""
     to_parts = axes.transScale + axes.transLimits
     parts = to_parts.transform([point.place for point in points])
-    labelled = [i for i, point in enumerate(points) if point.label]
-    size = LETTER * (max(len(points[i].label) for i in labelled), 1)
-    for i, place in zip(labelled, place_labels(parts, parts[labelled], label=size, mark=MARK), strict=True):
-        far = (np.abs(place - parts[i]) > LEAD * (size + MARK) / 2).any()
-        line = {"arrowprops": {"arrowstyle": "-", "color": "0.6", "linewidth": 0.6, "shrinkA": 0}} if far else {}
+    labelled = [point for point in points if point.label]
+    size = LETTER * (max(len(point.label) for point in labelled), 1)
+    wished = to_parts.transform([point.place for point in labelled]) + side * (size + MARK) / 2
+    places = place_labels(parts, wished, label=size, mark=MARK)
+    for point, place, wish in zip(labelled, places, wished, strict=True):
+        moved = (np.abs(place - wish) > size / 2).any()
+        line = {"arrowprops": {"arrowstyle": "-", "color": "0.6", "linewidth": 0.6, "shrinkA": 0}} if moved else {}
         where = {"xytext": place, "textcoords": "axes fraction", "ha": "center", "va": "center", "fontsize": 8}
-        axes.annotate(points[i].label, points[i].place, **where, **line)
+        axes.annotate(point.label, point.place, **where, **line)
 
 
 def look_of(i: int) -> dict[str, Any]:
