@@ -27,6 +27,10 @@ class TrainingError(ReskinError):
     """A training that cannot go on: no rows, or a loss that is no longer finite."""
 
 
+class LeakError(ReskinError):
+    """A result that would rest on rows it is tested on."""
+
+
 def complain(where: object, what: str, rule: str, got: object, remedy: str) -> str:
     """Compose the one sentence pattern that every error of this project follows."""
     return f"{where}: {what} must be {rule}; got {got}. {remedy}"

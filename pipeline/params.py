@@ -12,11 +12,11 @@ from pydantic import Field, model_validator
 from pipeline.dataset.rows import Selection
 from pipeline.dataset.splits import Question, Split
 from pipeline.errors import ParamsError, complain
-from pipeline.learning.recipe import Adaptations, PokesSweep, Training
+from pipeline.learning.recipe import Adaptations, AuditSettings, PokesSweep, Training
 from pipeline.strict import Strict, parse, read_yaml
 
 Study = Literal["verification", "stability", "runtime", "left_out"]
-Further = Literal["triplet", "adapt", "pokes", "baselines", "audit"]
+Further = Literal["triplet", "adapt", "pokes", "baselines", "audit", "choice"]
 
 # question -> the stage that answers it, and the keys of `split` that draw its folds
 ANSWERED_BY: dict[str, str] = {
@@ -51,13 +51,14 @@ NEEDS: dict[str, set[str]] = {
     "baselines": {"lobo"},
     "labels": {"triplet"},
     "audit": {"lobo"},
+    "choice": {"lobo", "triplet", "adapt"},  # answered by the report: it only reads scores
 }
 POOLED_BY = "adapt"  # takes pokes of the held-out skins, so a part of these is kept from every test
 ARMS = (
     "train_single", "train_multi", "train_triplet", "adapt", "sweep_pokes", "sweep_sensors", "train_classical",
     "few_labels", "audit",
 )  # fmt: skip
-WITHOUT_SECTION = {"sweep_sensors", "audit"}  # settings of others are all they need
+WITHOUT_SECTION = {"sweep_sensors"}  # settings of others are all they need
 # questions about the physics of a simulated scene -> the stage that answers it
 STUDIED_BY: dict[str, str] = {
     "verification": "verify",
@@ -101,6 +102,7 @@ class Scene(Strict):
     sweep_pokes: PokesSweep | None = None
     train_classical: dict[str, Any] | None = None  # checked by the stage, as `simulate` is
     few_labels: dict[str, Any] | None = None
+    audit: AuditSettings | None = None
 
     @model_validator(mode="after")
     def _sections_follow_questions(self) -> "Scene":

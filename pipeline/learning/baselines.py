@@ -42,11 +42,19 @@ class Answered:
     seconds: float
 
 
-def run_tasks(
-    tasks: Sequence[Task], rows: Measured, executor: Executor, tell: Callable[[str], None]
-) -> list[Answered]:
+@dataclass(frozen=True)
+class _Seen:
+    """What one task sees of the rows, small enough for another process."""
+
+    inputs: Float32[np.ndarray, "a c"]
+    target: Float32[np.ndarray, "a 3"]
+    weight: Float32[np.ndarray, " a"] | None
+    tested: Float32[np.ndarray, "b c"]
+
+
+def run_tasks(tasks: Sequence[Task], rows: Measured, executor: Executor, tell: Callable[[str], None]) -> list[Answered]:
     """Fit and predict; every task by itself."""
-    running = [executor.submit(_answer, task.asked, task.name, task.seed, *_arrays(task, rows)) for task in tasks]
+    running = [executor.submit(_answer, task.asked, task.name, task.seed, _see(task, rows)) for task in tasks]
     answered = []
     for task, future in zip(tasks, running, strict=True):
         answered.append(future.result())
@@ -54,8 +62,8 @@ def run_tasks(
     return answered
 
 
-def _arrays(task: Task, rows: Measured) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray]:
-    train, weight = task.train, None
+def _see(task: Task, rows: Measured) -> _Seen:
+    train, weight, view = task.train, None, VIEW[task.asked.inputs]
     if len(train) > task.rows_max_n:
         drawn = rng_for(task.seed, "thin", task.name).choice(len(train), task.rows_max_n, replace=False)
         train = train[np.sort(drawn)]
@@ -63,15 +71,11 @@ def _arrays(task: Task, rows: Measured) -> tuple[np.ndarray, np.ndarray, np.ndar
         share = len(train) / len(task.own)
         weight = np.concatenate([np.ones(len(train)), np.full(len(task.own), share)]).astype(np.float32)
         train = np.concatenate([train, task.own])
-    view = VIEW[task.asked.inputs]
-    return view(rows.db_uT[train]), rows.target[train], weight, view(rows.db_uT[task.test])
+    return _Seen(view(rows.db_uT[train]), rows.target[train], weight, view(rows.db_uT[task.test]))
 
 
-def _answer(
-    asked: Classical, name: str, seed: int, inputs: np.ndarray, target: np.ndarray, weight: np.ndarray | None,
-    tested: np.ndarray,
-) -> Answered:  # fmt: skip
+def _answer(asked: Classical, name: str, seed: int, seen: _Seen) -> Answered:
     start_s = time.monotonic()
-    fitted = fit(asked, inputs, target, rng_for(seed, "baseline", name), weight=weight)
+    fitted = fit(asked, seen.inputs, seen.target, rng_for(seed, "baseline", name), weight=seen.weight)
     seconds = time.monotonic() - start_s
-    return Answered(fitted.predict(tested), fitted.rows_n, seconds)
+    return Answered(fitted.predict(seen.tested), fitted.rows_n, seconds)

@@ -86,6 +86,12 @@ class Training(Strict):
         return _headed(self)
 
 
+class AuditSettings(Strict):
+    """Whether the scene's settings were chosen, so that a study must vouch for them, or are for speed alone."""
+
+    settings: Literal["chosen", "for speed"]
+
+
 Headed = TypeVar("Headed", Training, Adaptations)
 
 

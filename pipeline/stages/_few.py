@@ -1,4 +1,4 @@
-"""What stage few_labels tries: folds and settings -> networks, their adapted ones, and labelled pokes. Knows no argv."""
+"""What stage few_labels tries: folds and settings -> networks, adapted and labelled ones. Knows no argv."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -27,7 +27,10 @@ class Tried:
     fold: Fold
 
 
-def networks(at: Scenery, asked: Asked) -> list[tuple[Tried, Cell]]:
+Done = tuple[Tried, Cell, Trained]
+
+
+def networks(at: Scenery, asked: Asked, done: Sequence[Done]) -> list[tuple[Tried, Cell]]:
     """Train every recipe on every fold."""
     return [
         (
@@ -39,7 +42,7 @@ def networks(at: Scenery, asked: Asked) -> list[tuple[Tried, Cell]]:
     ]
 
 
-def adapted(at: Scenery, asked: Asked, done: Sequence[tuple[Tried, Cell, Trained]]) -> list[tuple[Tried, Cell]]:
+def adapted(at: Scenery, asked: Asked, done: Sequence[Done]) -> list[tuple[Tried, Cell]]:
     """Adapt the named recipes by all pokes of the pool, unlabelled."""
     return [
         (
@@ -51,7 +54,7 @@ def adapted(at: Scenery, asked: Asked, done: Sequence[tuple[Tried, Cell, Trained
     ]
 
 
-def labelled(at: Scenery, asked: Asked, done: Sequence[tuple[Tried, Cell, Trained]]) -> list[tuple[Tried, Cell]]:
+def labelled(at: Scenery, asked: Asked, done: Sequence[Done]) -> list[tuple[Tried, Cell]]:
     """Fine-tune every network on every number of labelled pokes."""
     return [
         (

@@ -21,21 +21,17 @@ def few_labels(scene: str, settings: Path, indentations: Path, folds: Path, scor
     """Score networks, adapted networks and classical methods with every number of labels on the same rows."""
     at = read_scenery(scene, settings, indentations, folds)
     asked = parse(FewLabels, at.asked.few_labels, f"{settings}: few_labels")
-    done: list[Any] = []
-    for made in (
-        lambda: _few.networks(at, asked),
-        lambda: _few.adapted(at, asked, done),
-        lambda: _few.labelled(at, asked, list(done)),
-    ):
-        pairs = made()
+    done: list[_few.Done] = []
+    for step in (_few.networks, _few.adapted, _few.labelled):  # each goes on from what the last ones trained
+        pairs = step(at, asked, done)
         trained = train_all(at, [cell for _, cell in pairs], "few_labels")
-        done += [(tried, cell, one) for (tried, cell), one in zip(pairs, trained, strict=True)]
+        done = [*done, *((tried, cell, one) for (tried, cell), one in zip(pairs, trained, strict=True))]
     points = [_point(at, tried, one.predicted) for tried, _, one in done]
-    pairs = _few.classical(at, asked)
+    tasks = _few.classical(at, asked)
     rows = Measured(at.rows.db_uT, at.rows.target, at.rows.skin)
     with make_executor() as executor:
-        fitted = run_tasks([t for _, t in pairs], rows, executor, lambda line: say(f"{scene} few_labels: {line}"))
-    points += [_point(at, tried, one.predicted) for (tried, _), one in zip(pairs, fitted, strict=True)]
+        fitted = run_tasks([task for _, task in tasks], rows, executor, lambda line: say(f"{scene} few_labels: {line}"))
+    points += [_point(at, tried, one.predicted) for (tried, _), one in zip(tasks, fitted, strict=True)]
     io.write_json(scores, points)
 
 

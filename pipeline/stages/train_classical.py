@@ -29,7 +29,10 @@ def train_classical(scene: str, settings: Path, indentations: Path, folds: Path,
     ]
     with make_executor() as executor:
         done = run_tasks(
-            tasks, Measured(rows.db_uT, rows.target, rows.skin), executor, lambda line: say(f"{scene} classical: {line}")
+            tasks,
+            Measured(rows.db_uT, rows.target, rows.skin),
+            executor,
+            lambda line: say(f"{scene} classical: {line}"),
         )
     points = []
     for (fold, name), task, one in zip(pairs, tasks, done, strict=True):

@@ -1,0 +1,63 @@
+"""Which settings were best on the boards of a study? In: cards of its trainings. Out: the choice, and its candidates.
+
+By the mean squared error of places over the boards held out in turn; the paper's inputs only, as its method is what is
+set. The base of adaptation is chosen with it: alone, the triplet term only costs. Refuses to know who uses a choice.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+from pipeline.errors import ParamsError, complain
+from pipeline.evaluation.summary import over_folds, pool_skins
+
+BY = "mse_xy_mm2"
+PAPER_INPUTS = "raw"
+BUDGET = ("steps_n", "base")  # how long is a scene's budget; what a base is called is no setting
+
+Cards = Sequence[dict[str, Any]]
+
+
+def choose(cards: Cards) -> dict[str, dict[str, Any]]:
+    """Choose for every stage: `recipe_name`, its settings, `by` which number, `candidates` with their scores."""
+    own = [card for card in cards if card["recipe"]["inputs"] == PAPER_INPUTS]
+    adapted = [card for card in own if card["question"] == "adapt" and _settings(card)["unlabelled_weight"] > 0]
+    chosen = {"train_multi": _best([card for card in own if card["question"] == "lobo"], "train_multi")}
+    chosen["adapt"] = _best(adapted, "adapt")
+    base = next(card for card in adapted if card["recipe_name"] == chosen["adapt"]["recipe_name"])
+    triplets = [card for card in own if card["question"] == "triplet"]
+    chosen["train_triplet"] = {
+        "recipe_name": _settings(base)["base"],
+        "settings": _trimmed(base["recipe"]),
+        "by": f"{BY} of the networks adapted from it",
+        "candidates": _candidates(triplets),
+    }
+    return chosen
+
+
+def _best(cards: Cards, stage: str) -> dict[str, Any]:
+    if not cards:
+        raise ParamsError(
+            complain("choice of settings", f"candidates of {stage}", "one or more", "none", "Ask lobo, triplet, adapt.")
+        )
+    candidates = _candidates(cards)
+    best = min(candidates, key=lambda one: one[BY]["mean"])["recipe_name"]
+    card = next(card for card in cards if card["recipe_name"] == best)
+    return {"recipe_name": best, "settings": _trimmed(_settings(card)), "by": BY, "candidates": candidates}
+
+
+def _candidates(cards: Cards) -> list[dict[str, Any]]:
+    names = dict.fromkeys(card["recipe_name"] for card in cards)
+    by_name = {name: [card for card in cards if card["recipe_name"] == name] for name in names}
+    return [
+        {"recipe_name": name, **over_folds(pool_skins(own) if "tuning" in own[0] else own)}
+        for name, own in by_name.items()
+    ]
+
+
+def _settings(card: dict[str, Any]) -> dict[str, Any]:
+    settings: dict[str, Any] = card["tuning"]["settings"] if "tuning" in card else card["recipe"]
+    return settings
+
+
+def _trimmed(settings: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in settings.items() if name not in BUDGET}
