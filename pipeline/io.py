@@ -84,6 +84,14 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
+def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
+    """Write a folder of texts by file name, in place of what it held."""
+    with replacing(folder) as temporary:
+        temporary.mkdir()
+        for name, text in texts.items():
+            write_text(temporary / name, text)
+
+
 def write_json(path: Path, value: Any) -> None:
     """Write JSON with two-space indent; NaN and infinity are refused, as JSON has neither."""
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")

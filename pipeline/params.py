@@ -49,7 +49,7 @@ NEEDS: dict[str, set[str]] = {
     "pokes": {"adapt"},
     "sensors": {"adapt"},
     "baselines": {"lobo"},
-    "labels": {"triplet"},
+    "labels": {"lobo"},
     "audit": {"lobo"},
     "choice": {"lobo", "triplet", "adapt"},  # answered by the report: it only reads scores
 }
@@ -68,7 +68,7 @@ STUDIED_BY: dict[str, str] = {
 }
 STUDIES = tuple(STUDIED_BY.values())
 MODELLED = {"train_single", "train_multi", "train_triplet", "adapt"}
-SWEPT = {"pokes": "sweep_pokes", "sensors": "sweep_sensors"}
+SWEPT = {"pokes": "sweep_pokes", "sensors": "sweep_sensors", "baselines": "train_classical", "labels": "few_labels"}
 _STAGES = ANSWERED_BY | CONTINUED_BY
 MAIN_PROTOCOL = "grid"  # folds are drawn on its captures
 

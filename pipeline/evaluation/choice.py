@@ -4,7 +4,7 @@ By the mean squared error of places over the boards held out in turn; the paper'
 set. The base of adaptation is chosen with it: alone, the triplet term only costs. Refuses to know who uses a choice.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pipeline.errors import ParamsError, complain
@@ -32,6 +32,18 @@ def choose(cards: Cards) -> dict[str, dict[str, Any]]:
         "candidates": _candidates(triplets),
     }
     return chosen
+
+
+def to_record(chosen: Mapping[str, Mapping[str, Any]], cards: Cards, *, source: str, seed: int) -> dict[str, Any]:
+    """Write down what was chosen on which boards and skins, for the audit of the scenes that use it."""
+    return {
+        "scene": cards[0]["scene"],
+        "source": source,
+        "seed": seed,
+        "boards": sorted({board for card in cards for board in card["test_boards"]}),
+        "skins": sorted({skin for card in cards for skin in card["test_skins"]}),
+        "chosen": {stage: one["settings"] for stage, one in chosen.items()},
+    }
 
 
 def _best(cards: Cards, stage: str) -> dict[str, Any]:

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float32, Int64
@@ -14,6 +15,7 @@ from jaxtyping import Float32, Int64
 from pipeline.learning.cell import Measured
 from pipeline.learning.classical import Classical, fit
 from pipeline.learning.inputs import VIEW
+from pipeline.learning.stopwatch import median_s
 from pipeline.seeds import rng_for
 
 
@@ -35,11 +37,12 @@ class Task:
 
 @dataclass(frozen=True)
 class Answered:
-    """Predictions (mm, mm, N) for the test rows, the training rows that were used, and the seconds of the fit."""
+    """Predictions (mm, mm, N) for the test rows, the training rows that were used, and seconds of fit and answer."""
 
     predicted: Float32[np.ndarray, "b 3"]
     rows_n: int
     seconds: float
+    one_reading_s: float  # median, to answer for a single reading
 
 
 @dataclass(frozen=True)
@@ -78,4 +81,5 @@ def _answer(asked: Classical, name: str, seed: int, seen: _Seen) -> Answered:
     start_s = time.monotonic()
     fitted = fit(asked, seen.inputs, seen.target, rng_for(seed, "baseline", name), weight=seen.weight)
     seconds = time.monotonic() - start_s
-    return Answered(fitted.predict(seen.tested), fitted.rows_n, seconds)
+    answer_s = median_s(partial(fitted.predict, seen.tested[:1]))
+    return Answered(fitted.predict(seen.tested), fitted.rows_n, seconds, answer_s)

@@ -50,7 +50,8 @@ class Trained:
     curve: list[float]
     predicted: Float32[np.ndarray, "b 3"]
     stopped_step: int | None
-    seconds: float
+    seconds: float  # of its training, its part of the stack's
+    one_reading_s: float  # median, to answer for a single reading
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ it was, and one more seed costs one seed. Refuses to know stages, scores and pag
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, as_completed
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ from pipeline.learning.cell import Cell, Keys, Measured, Trained, make_job
 from pipeline.learning.executors import device
 from pipeline.learning.inputs import VIEW
 from pipeline.learning.standardise import Scaler
+from pipeline.learning.stopwatch import median_s
 
 STACK_N = {"cpu": 3, "cuda": 64}  # networks trained side by side; on a CPU more gain nothing, and two processes share
 
@@ -26,7 +27,7 @@ def train_stack(cells: Sequence[Cell], rows: Measured) -> list[Trained]:
     """Train cells of equal settings side by side, and predict their test rows."""
     import torch  # late: only a process that trains pays for it
 
-    from pipeline.learning.model import predict
+    from pipeline.learning.model import Predictor
     from pipeline.learning.train import train
 
     torch.set_num_threads(1)  # the same sums in the same order, however many processes run beside this one
@@ -38,8 +39,14 @@ def train_stack(cells: Sequence[Cell], rows: Measured) -> list[Trained]:
     trained = []
     for cell, scaler, outcome in zip(cells, scalers, outcomes, strict=True):
         inputs = scaler.encode(VIEW[cell.recipe.inputs](rows.db_uT[cell.test]))
-        predicted = scaler.decode(predict(outcome.weights, architecture, inputs, on))
-        trained.append(Trained("", outcome.weights, scaler, outcome.curve, predicted, outcome.stopped_step, seconds))
+        predict = Predictor(outcome.weights, architecture, on)
+        trained.append(
+            Trained(
+                key="", weights=outcome.weights, scaler=scaler, curve=outcome.curve,
+                predicted=scaler.decode(predict(inputs)), stopped_step=outcome.stopped_step, seconds=seconds,
+                one_reading_s=median_s(partial(predict, inputs[:1])),
+            )
+        )  # fmt: skip
     return trained
 
 
@@ -97,7 +104,7 @@ def _stack_to_files(rows_file: Path, cells: Sequence[Cell], files: Sequence[Path
     for cell, file, one in zip(cells, files, train_stack(cells, _read_rows(rows_file)), strict=True):
         tensors = {f"weights.{name}": value for name, value in one.weights.items()} | one.scaler.arrays()
         tensors |= {"curve": np.array(one.curve), "predicted": one.predicted}
-        words = {"seconds": f"{one.seconds:.3f}", "cell": cell.name}
+        words = {"seconds": f"{one.seconds:.3f}", "one_reading_s": f"{one.one_reading_s:.3g}", "cell": cell.name}
         if one.stopped_step is not None:
             words["stopped_step"] = str(one.stopped_step)
         io.write_tensors(file, tensors, words)
@@ -119,4 +126,5 @@ def _read_trained(file: Path) -> Trained:
         predicted=tensors["predicted"],
         stopped_step=int(words["stopped_step"]) if "stopped_step" in words else None,
         seconds=float(words["seconds"]),
+        one_reading_s=float(words["one_reading_s"]),
     )

@@ -60,14 +60,18 @@ class Stack(nn.Module):
         return values
 
 
-@torch.no_grad()
-def predict(
-    weights: Weights, architecture: str, inputs: Float32[np.ndarray, "n c"], device: str
-) -> Float32[np.ndarray, "n 3"]:
-    """Answer for many rows by one network, a block at a time to bound memory."""
-    net = Stack(LAYERS[architecture](inputs.shape[1]), [weights]).to(device)
-    blocks = torch.from_numpy(inputs).split(BLOCK_ROWS_N)
-    return torch.cat([net(block[None].to(device))[0].cpu() for block in blocks]).numpy()
+class Predictor:
+    """One trained network, ready to answer; rows are answered a block at a time to bound memory."""
+
+    def __init__(self, weights: Weights, architecture: str, device: str) -> None:
+        layers = LAYERS[architecture](weights["layer1.weight"].shape[1])
+        self.net, self.device = Stack(layers, [weights]).to(device), device
+
+    @torch.no_grad()
+    def __call__(self, inputs: Float32[np.ndarray, "n c"]) -> Float32[np.ndarray, "n 3"]:
+        """Answer for scaled rows."""
+        blocks = torch.from_numpy(inputs).split(BLOCK_ROWS_N)
+        return torch.cat([self.net(block[None].to(self.device))[0].cpu() for block in blocks]).numpy()
 
 
 def _stacked(members: Sequence[Weights], name: str) -> torch.Tensor:

@@ -6,9 +6,12 @@ A question that was not asked is absent.
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from pipeline.evaluation.summary import over_folds, paired, pool_skins
 
 Cards = Sequence[dict[str, Any]]
+Seconds = Sequence[Mapping[str, Any]]
 PAIRS = (
     ("triplet", "multi"),
     ("adapted", "triplet"),
@@ -16,6 +19,8 @@ PAIRS = (
     ("control", "triplet"),
     ("adapted", "multi"),
 )
+NETWORKS = {"lobo": "network", "triplet": "network + triplet", "adapt": "network, adapted"}  # by question
+TRAINED_IN = {"lobo": "train_multi", "triplet": "train_triplet", "adapt": "adapt"}
 CONTROL = "control"  # the recipe of adaptation that fine-tunes as long, without the new skin's pokes
 
 
@@ -33,7 +38,25 @@ def learned(cards: Cards, points: Mapping[str, Cards], *, headline: str) -> dict
         numbers["sweep_pokes"] = list(_pokes(points["pokes"]))
     if "sensors" in points:
         numbers["sweep_sensors"] = list(_sensors(points["sensors"]))
+    if "baselines" in points:
+        numbers["baselines"] = [*_networks(cards), *_classical(points["baselines"])]
+    if "labels" in points:
+        numbers["labels"] = list(_labels(points["labels"]))
     return numbers
+
+
+def timed_learning(numbers: Mapping[str, Any], seconds: Mapping[str, Seconds]) -> dict[str, Any]:
+    """Put what was timed here, by stage and name of a training, beside the errors; what was not has no time."""
+    joined: dict[str, Any] = {}
+    if "baselines" in numbers:
+        joined["learning"] = [row | _times(row, seconds) for row in numbers["baselines"]]
+    if "sweep_pokes" in numbers:
+        took = seconds.get("sweep_pokes", [])
+        joined["adaptation"] = []
+        for row in numbers["sweep_pokes"]:
+            own = [one["train_s"] for one in took if f".{row['pokes_n']}pokes." in one["name"]]
+            joined["adaptation"].append(row | ({"seconds": float(np.median(own))} if own else {}))
+    return joined
 
 
 def by_fold(cards: Cards) -> Cards:
@@ -55,6 +78,44 @@ def _rows(cards: Cards, headline: str) -> dict[str, Cards]:
 
 def _pokes_n(cards: Cards, headline: str) -> int:
     return next(c["tuning"]["pokes_n"] for c in cards if (c["question"], c["recipe_name"]) == ("adapt", headline))
+
+
+def _networks(cards: Cards) -> Iterable[dict[str, Any]]:
+    for question, method in NETWORKS.items():
+        own = [card for card in cards if card["question"] == question and card["recipe"]["architecture"] == "paper"]
+        for name in dict.fromkeys(card["recipe_name"] for card in own if card["recipe_name"] != CONTROL):
+            named = [card for card in own if card["recipe_name"] == name]
+            words = {"method": method, "inputs": named[0]["recipe"]["inputs"], "name": name}
+            yield {**words, **over_folds(by_fold(named))}
+
+
+def _classical(points: Cards) -> Iterable[dict[str, Any]]:
+    for name in dict.fromkeys(point["name"] for point in points):
+        own = [point for point in points if point["name"] == name]
+        yield {"method": own[0]["method"], "inputs": own[0]["inputs"], "name": name, **over_folds(own)}
+
+
+def _labels(points: Cards) -> Iterable[dict[str, Any]]:
+    for method, inputs in dict.fromkeys((point["method"], point["inputs"]) for point in points):
+        for labels_n in sorted({point["labels_n"] for point in points}):
+            key = (method, inputs, labels_n)
+            own = [point for point in points if (point["method"], point["inputs"], point["labels_n"]) == key]
+            parts = {"as_labelled": over_folds(own), "registered": over_folds(own, "registered")}
+            yield {"method": method, "inputs": inputs, "labels_n": labels_n, **parts}
+
+
+def _times(row: Mapping[str, Any], seconds: Mapping[str, Seconds]) -> dict[str, float]:
+    question = next((q for q, method in NETWORKS.items() if method == row["method"]), None)
+    stage, start = (
+        (TRAINED_IN[question], f"{question}.{row['name']}.") if question else ("train_classical", row["name"])
+    )
+    own = [one for one in seconds.get(stage, []) if one["name"].startswith(start)]
+    if not own:
+        return {}
+    return {
+        "train_s": float(np.median([one["train_s"] for one in own])),
+        "inference_us": 1e6 * float(np.median([one["one_reading_s"] for one in own])),
+    }
 
 
 def _pokes(points: Cards) -> Iterable[dict[str, Any]]:

@@ -91,11 +91,11 @@ def runtime(cards: Cards, costs: Mapping[str, Mapping[str, float]]) -> dict[str,
 
 
 def answered(
-    studied: Mapping[str, Any], cost: Mapping[str, Any], seconds: Sequence[Mapping[str, Any]]
+    studied: Mapping[str, Any], cost: Mapping[str, Any], seconds: Mapping[str, Sequence[Mapping[str, Any]]]
 ) -> dict[str, Any]:
     """Put the answers to questions about physics beside each other; those about run time stand with what all cost."""
     others = {question: answer for question, answer in studied.items() if question != "runtime"}
-    own = timed(studied["runtime"], seconds) if "runtime" in studied else {}
+    own = timed(studied["runtime"], seconds.get("runtime", [])) if "runtime" in studied else {}
     return others | {"runtime": {**cost, **own}}
 
 

@@ -44,8 +44,11 @@ def point_of(at: Scenery, cell: Cell, one: Trained, method: str) -> dict[str, An
 
 def note_seconds(scene: str, stage: str, cells: Sequence[Cell], trained: Sequence[Trained]) -> None:
     """Keep what trainings took here."""
-    pairs = zip(cells, trained, strict=True)
-    io.write_json(SECONDS / scene / f"{stage}.json", [{"name": c.name, "train_s": one.seconds} for c, one in pairs])
+    took = [
+        {"name": cell.name, "train_s": one.seconds, "one_reading_s": one.one_reading_s}
+        for cell, one in zip(cells, trained, strict=True)
+    ]
+    io.write_json(SECONDS / scene / f"{stage}.json", took)
 
 
 def _predictions(cells: Sequence[Cell], trained: Sequence[Trained], rows: Rows) -> pa.Table:

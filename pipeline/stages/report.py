@@ -1,15 +1,17 @@
 """Stage report: models' cards, predictions and accounts -> numbers.json, tables, figures."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from pipeline import io
+from pipeline.evaluation.choice import choose, to_record
 from pipeline.learning.recipe import HEADLINE
 from pipeline.params import Scene, check_planned, described_in, modelled, read_params, read_scene, swept
 from pipeline.provenance import SECONDS, code_version, device, read_costs
 from pipeline.reporting.figures import error_grids
+from pipeline.reporting.learned import timed_learning
 from pipeline.reporting.numbers import answered, compose, rounded, runtime
+from pipeline.reporting.sweeps import learning_figures, learning_pages
 from pipeline.reporting.tables import make_tables, to_markdown
 from pipeline.reporting.work_precision import pages
 from pipeline.stages._run import COSTS, run, say
@@ -34,18 +36,30 @@ def report(
     numbers: dict[str, Any] = {"provenance": _provenance(scene, asked)}
     points = {question: io.read_json(answers / f"{file}.json") for question, file in swept(asked).items()}
     numbers |= compose(cards, points, accounts, words["dropped"], headline=HEADLINE)
+    numbers |= {"audit": io.read_json(answers / "audit.json")} if "audit" in asked.questions else {}
+    if "choice" in asked.questions:
+        numbers["chosen"] = choose(cards)
+        io.write_json(
+            reports / "choice.json", to_record(numbers["chosen"], cards, source=asked.source, seed=asked.seed)
+        )
     numbers["described"] = {name: io.read_json(answers / f"described/{name}.json") for name in described_in(asked)}
     studied = {question: io.read_json(answers / f"{question}.json") for question in asked.studied}
-    numbers |= answered(studied, runtime(cards, read_costs(COSTS / scene)), _seconds(scene))
+    took = _seconds(scene)
+    numbers |= answered(studied, runtime(cards, read_costs(COSTS / scene)), took)
+    numbers["runtime"] |= timed_learning(numbers, took)
     numbers = rounded(numbers)
     io.write_json(reports / "numbers.json", numbers)
     tables = make_tables(numbers)
     texts = {f"{name}.md": to_markdown(table) for name, table in tables.items()}
-    _write(reports / "tables", texts | {f"{name}.csv": table.to_csv(index=False) for name, table in tables.items()})
+    io.write_texts(
+        reports / "tables", texts | {f"{name}.csv": table.to_csv(index=False) for name, table in tables.items()}
+    )
     predictions = [io.read_table(models / arm / "predictions.parquet") for arm in arms]
-    _write(reports / "figures", dict(error_grids(predictions, HEADLINE, f"{scene} ({asked.source})")))
-    if "runtime" in studied:  # seconds differ between identical runs, so what shows them is no DVC output
-        _write(reports / "runtime", pages(numbers["runtime"], source=asked.source))
+    drawn = dict(error_grids(predictions, HEADLINE, f"{scene} ({asked.source})"))
+    io.write_texts(reports / "figures", drawn | dict(learning_figures(numbers, asked.source)))
+    # Seconds differ between identical runs, so what shows them is no DVC output.
+    costs = pages(numbers["runtime"], source=asked.source) | learning_pages(numbers["runtime"], asked.source)
+    io.write_texts(reports / "runtime", costs)
     say(f"{scene}: {reports}/numbers.json, tables, figures")
 
 
@@ -55,16 +69,9 @@ def _provenance(scene: str, asked: Scene) -> dict[str, Any]:
     return known | {"device": device(), "seconds": seconds}
 
 
-def _seconds(scene: str) -> list[dict[str, Any]]:
-    file = SECONDS / scene / "runtime.json"
-    return io.read_json(file) if file.is_file() else []
-
-
-def _write(folder: Path, texts: Mapping[str, str]) -> None:
-    with io.replacing(folder) as temporary:
-        temporary.mkdir()
-        for name, text in texts.items():
-            io.write_text(temporary / name, text)
+def _seconds(scene: str) -> dict[str, list[dict[str, Any]]]:
+    """Read what was timed here, by stage; what was not timed here is absent."""
+    return {file.stem: io.read_json(file) for file in sorted((SECONDS / scene).glob("*.json"))}
 
 
 if __name__ == "__main__":

@@ -40,10 +40,11 @@ def train_classical(scene: str, settings: Path, indentations: Path, folds: Path,
         words = {"name": name, "method": task.asked.words, "inputs": task.asked.inputs, "fold": fold.name, "seed_i": 0}
         points.append(words | {"rows_n": one.rows_n, "scores": score_groups(true, one.predicted, board, skin)})
     io.write_json(scores, points)
-    took = zip(pairs, done, strict=True)
-    io.write_json(
-        SECONDS / scene / "train_classical.json", [{"name": name, "train_s": one.seconds} for (_, name), one in took]
-    )
+    took = [
+        {"name": task.name, "train_s": one.seconds, "one_reading_s": one.one_reading_s}
+        for task, one in zip(tasks, done, strict=True)
+    ]
+    io.write_json(SECONDS / scene / "train_classical.json", took)
 
 
 if __name__ == "__main__":
