@@ -24,7 +24,8 @@ class Stack(nn.Module):
         self.relus = [layer.relu for layer in layers]
         self.members_n = len(members)
         numbers = range(1, len(layers) + 1)
-        self.weights = nn.ParameterList(_stacked(members, f"layer{i}.weight").transpose(1, 2) for i in numbers)
+        # In one piece: autograd and AdamW would copy gradients to the order of a merely transposed weight.
+        self.weights = nn.ParameterList(_stacked(members, f"layer{i}.weight").mT.contiguous() for i in numbers)
         self.biases = nn.ParameterList(_stacked(members, f"layer{i}.bias")[:, None] for i in numbers)
 
     def features(self, inputs: Float[torch.Tensor, "m b c"]) -> Float[torch.Tensor, "m b 40"]:
@@ -52,11 +53,9 @@ class Stack(nn.Module):
         return torch.stack([torch.isfinite(one.detach()).flatten(1).all(1) for one in self.parameters()]).all(0)
 
     def _run(self, values: torch.Tensor, first: int, last: int) -> torch.Tensor:
-        for weight, bias, relu in zip(
-            self.weights[first:last], self.biases[first:last], self.relus[first:last], strict=True
-        ):
-            values = torch.baddbmm(bias, values, weight)
-            values = torch.relu_(values) if relu else values
+        for i in range(first, last):
+            values = torch.baddbmm(self.biases[i], values, self.weights[i])
+            values = torch.relu_(values) if self.relus[i] else values
         return values
 
 
