@@ -1,0 +1,248 @@
+"""What the fold grid costs: this engine, a plain loop over a DataLoader, and one over index tensors, in one run.
+
+`OMP_NUM_THREADS=1 pytest -s -o addopts= tests/benchmarks/test_training_benchmark.py`. Only that training went well is
+asserted. Ratios are formed within a repeat, whose parts meet about the same load of the machine.
+"""
+
+import os
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Executor
+from contextlib import contextmanager
+from dataclasses import replace
+from itertools import chain, islice, repeat
+from pathlib import Path
+from statistics import harmonic_mean, median
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+from torch.utils.data import DataLoader, TensorDataset
+
+from pipeline.learning import train as train_module
+from pipeline.learning.architecture import FEATURE_LAYERS_N, paper_layers
+from pipeline.learning.cell import Cell, Measured
+from pipeline.learning.executors import make_executor
+from pipeline.learning.feed import Feed
+from pipeline.learning.grid import STACK_N, run_cells, train_stack
+from pipeline.learning.model import Stack
+from pipeline.learning.recipe import Recipe
+from pipeline.learning.train import Watch
+from pipeline.seeds import rng_for
+
+BOARDS_N, SKINS_PER_BOARD_N, SEEDS_N = 6, 3, 3
+ROWS_N, CHANNELS_N = 100_000, 15
+STEPS_N, BATCH_N = 400, 128
+PLAIN_N = 2  # networks of the plain loops, which train one after another: their time is scaled
+REPEATS_N = 3
+LAYERS = paper_layers(CHANNELS_N)
+
+
+def recipe(triplet_weight: float, steps_n: int = STEPS_N) -> Recipe:
+    return Recipe(
+        architecture="paper", inputs="raw", scaling="standard", triplet_weight=triplet_weight, steps_n=steps_n,
+        batch_n=BATCH_N, rate_max=3e-3, weight_decay=0.0,
+    )  # fmt: skip
+
+
+def measured() -> Measured:
+    rng = rng_for(0, "training benchmark")
+    place_mm = 2.0 * rng.integers(0, 9, (ROWS_N, 2))
+    target = np.column_stack([place_mm, rng.uniform(0, 3, ROWS_N)])
+    db_uT = 50 * np.tanh(target @ rng.normal(0, 0.1, (3, CHANNELS_N))) + rng.normal(0, 3, (ROWS_N, CHANNELS_N))
+    skin = np.arange(ROWS_N) * BOARDS_N * SKINS_PER_BOARD_N // ROWS_N
+    return Measured(db_uT.astype(np.float32), target.astype(np.float32), skin)
+
+
+def fold_grid(rows: Measured, triplet_weight: float) -> list[Cell]:
+    board = rows.skin // SKINS_PER_BOARD_N
+    return [
+        Cell("lobo", "paper", recipe(triplet_weight), f"b{held}", 0, seed_i,
+             np.flatnonzero(board != held), np.flatnonzero(board == held))
+        for held in range(BOARDS_N)
+        for seed_i in range(SEEDS_N)
+    ]  # fmt: skip
+
+
+def flop(triplet_weight: float) -> float:
+    """Count the products of one step of one network, a multiplication and an addition each as one operation.
+
+    Forward, gradient of the weights, gradient of the inputs but for the first layer's: 2 b (3 sum(in out) - in1 out1);
+    with triplets two more passes through the first three layers. No bias, ReLU, loss or optimiser.
+    """
+
+    def passes(layers: Sequence) -> float:
+        return 2.0 * BATCH_N * (3 * sum(one.in_n * one.out_n for one in layers) - layers[0].in_n * layers[0].out_n)
+
+    return passes(LAYERS) + (2 * passes(LAYERS[:FEATURE_LAYERS_N]) if triplet_weight else 0.0)
+
+
+def sgemm_flop_per_s(repeats_n: int = 8, n: int = 1024) -> list[float]:
+    torch.set_num_threads(1)
+    one, other = torch.rand(2, n, n)
+    return [2 * n**3 / seconds(lambda: one @ other) for _ in range(repeats_n)]
+
+
+def seconds(call: Callable[[], object]) -> float:
+    start_s = time.perf_counter()
+    call()
+    return time.perf_counter() - start_s
+
+
+def started(cell: Cell, rows: Measured) -> int:
+    train_stack([cell], rows)
+    return os.getpid()
+
+
+def start(executor: Executor, workers_n: int = 2) -> None:
+    """Start the workers with a step of training each: the first step of a process loads most of PyTorch."""
+    few = Measured(*(values[:BATCH_N] for values in (measured().db_uT, measured().target, measured().skin)))
+    cell = replace(fold_grid(few, 0.0)[0], recipe=recipe(0.0, 1), train=np.arange(64), test=np.arange(64, BATCH_N))
+    running = [executor.submit(started, cell, few) for _ in range(workers_n)]
+    assert len({one.result() for one in running}) == workers_n
+
+
+def run_grid(cells: list[Cell], rows: Measured, executor: Executor, cache: Path) -> tuple[float, float]:
+    """Train the grid; give its seconds, and the seconds of all networks together, each within its process."""
+    start_s = time.perf_counter()
+    trained = run_cells(cells, rows, executor=executor, cache=cache, tell=lambda line: None)
+    took_s = time.perf_counter() - start_s
+    assert all(one.stopped_step is None and one.curve[-1] < one.curve[0] for one in trained)
+    return took_s, sum(one.seconds for one in trained)
+
+
+def plain_network() -> nn.Sequential:
+    layers = [(nn.Linear(one.in_n, one.out_n), *([nn.ReLU()] if one.relu else [])) for one in LAYERS]
+    return nn.Sequential(*chain.from_iterable(layers))
+
+
+def plain_loop(batches: Iterable[Sequence[torch.Tensor]]) -> None:
+    network = plain_network()
+    optimizer, criterion = torch.optim.AdamW(network.parameters(), lr=3e-3, weight_decay=0.0), nn.MSELoss()
+    for inputs, targets in batches:
+        optimizer.zero_grad()
+        loss = criterion(network(inputs), targets)
+        loss.backward()
+        optimizer.step()
+    assert torch.isfinite(loss)
+
+
+def plain_grid(rows: Measured, threads_n: int, batches_of: Callable[[TensorDataset], Iterable]) -> float:
+    """Train a part of the grid one network at a time, as a user would without this engine; scale to the whole."""
+    torch.set_num_threads(threads_n)
+    cells = fold_grid(rows, 0.0)
+
+    def train() -> None:
+        for cell in cells[:: len(cells) // PLAIN_N]:
+            view, target = (torch.from_numpy(one[cell.train]) for one in (rows.db_uT, rows.target))
+            data = TensorDataset((view - view.mean(0)) / view.std(0), (target - target.mean(0)) / target.std(0))
+            plain_loop(islice(batches_of(data), STEPS_N))
+
+    took_s = seconds(train)
+    torch.set_num_threads(1)
+    return took_s * len(cells) / PLAIN_N
+
+
+def by_loader(data: TensorDataset) -> Iterable:
+    loader = DataLoader(data, batch_size=BATCH_N, shuffle=True, drop_last=True)
+    return chain.from_iterable(repeat(loader))
+
+
+def by_index(data: TensorDataset) -> Iterable:
+    while True:
+        yield from (data[chosen] for chosen in torch.randperm(len(data)).split(BATCH_N) if len(chosen) == BATCH_N)
+
+
+@contextmanager
+def clocked(parts: dict[str, list[tuple[object, str]]]):
+    """Sum the seconds spent in named functions, none of which calls another."""
+    spent_s: dict[str, float] = defaultdict(float)
+
+    def timed(call: Callable, part: str) -> Callable:
+        def run(*args, **kwargs):
+            start_s = time.perf_counter()
+            try:
+                return call(*args, **kwargs)
+            finally:
+                spent_s[part] += time.perf_counter() - start_s
+
+        return run
+
+    with pytest.MonkeyPatch.context() as patch:
+        for part, functions in parts.items():
+            for owner, name in functions:
+                patch.setattr(owner, name, timed(getattr(owner, name), part))
+        yield spent_s
+
+
+STEP = {
+    "draw and gather batches": [(Feed, "draw")],
+    "forward": [(Stack, "features"), (Stack, "answer")],
+    "losses": [(train_module, "squared_error"), (train_module, "triplet")],
+    "backward": [(torch.Tensor, "backward")],
+    "AdamW": [(torch.optim.AdamW, "step"), (torch.optim.AdamW, "zero_grad")],
+    "one-cycle rate": [(torch.optim.lr_scheduler.OneCycleLR, "step")],
+    "watch for finite weights, keep them": [(Watch, "look")],
+}
+
+
+@pytest.mark.timeout(1800)
+def test_the_fold_grid_is_timed_beside_plain_loops_and_sgemm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for variable in ("RESKIN_EXECUTOR", "RESKIN_DEVICE"):
+        monkeypatch.delenv(variable, raising=False)
+    rows = measured()
+    plain_loop(islice(by_index(TensorDataset(torch.rand(BATCH_N, CHANNELS_N), torch.rand(BATCH_N, 3))), 3))  # loads
+    columns: dict[str, list[float]] = defaultdict(list)
+    for i in range(REPEATS_N):
+        sgemm = max(sgemm_flop_per_s())
+        columns["sgemm, one thread, GFLOP/s"].append(1e-9 * sgemm)
+        with make_executor() as executor:
+            start_s = seconds(lambda: start(executor))
+            beside = [executor.submit(sgemm_flop_per_s, 100) for _ in range(2)]  # a quarter of a second each
+            both = harmonic_mean(list(chain.from_iterable(one.result() for one in beside)))
+            columns["sgemm, in both processes at once, GFLOP/s"].append(1e-9 * both)
+            for what, weight in (("grid", 0.0), ("grid with triplets", 0.1)):
+                cells = fold_grid(rows, weight)
+                took_s, within_s = run_grid(cells, rows, executor, tmp_path / f"{i}{weight}")
+                columns[f"{what}, s"].append(took_s)
+                rate = len(cells) * STEPS_N * flop(weight) / within_s
+                columns[f"{what}, % of one thread's sgemm"].append(100 * rate / sgemm)
+                columns[f"{what}, % of sgemm in both processes"].append(100 * rate / both)
+        loader_s, index_s = plain_grid(rows, 2, by_loader), plain_grid(rows, 1, by_index)
+        grid_s = columns["grid, s"][-1]
+        columns["start of both workers, s"].append(start_s)
+        columns["plain DataLoader loop, 2 threads, s (scaled)"].append(loader_s)
+        columns["plain loop over index tensors, 1 thread, s (scaled)"].append(index_s)
+        columns["DataLoader loop / grid"].append(loader_s / grid_s)
+        columns["DataLoader loop / grid with start of workers"].append(loader_s / (grid_s + start_s))
+        columns["index loop / grid"].append(index_s / grid_s)
+    print(
+        f"\n{len(cells)} networks, {STEPS_N} steps of {BATCH_N} of {ROWS_N:,} rows x {CHANNELS_N}; two processes;",
+        end=" ",
+    )
+    print(f"plain loops: {PLAIN_N} networks timed, scaled to {len(cells)}; {REPEATS_N} repeats")
+    print(f"{'':55}{'lowest':>8} {'median':>8} {'highest':>8}")
+    for name, values in columns.items():
+        print(f"  {name:53}{min(values):8.2f} {median(values):8.2f} {max(values):8.2f}")
+
+
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("triplet_weight", [0.0, 0.1])
+def test_a_step_is_taken_apart(triplet_weight: float) -> None:
+    rows = measured()
+    cells = [replace(one, test=one.test[:1]) for one in fold_grid(rows, triplet_weight)[: STACK_N["cpu"]]]
+    train_stack([replace(cells[0], recipe=recipe(triplet_weight, 1))], rows)  # loads
+    sgemm, best_s, best = sgemm_flop_per_s(), np.inf, {}
+    for _ in range(REPEATS_N):
+        with clocked({"all": [(train_module, "train")]}) as whole, clocked(STEP) as spent_s:
+            assert all(one.stopped_step is None for one in train_stack(cells, rows))
+        if whole["all"] < best_s:
+            best_s, best = whole["all"], dict(spent_s)
+    best["rest: slices of batches, sums, the loop, the first copies of rows"] = best_s - sum(best.values())
+    rate = len(cells) * STEPS_N * flop(triplet_weight) / best_s
+    print(f"\na step of {len(cells)} networks{' with triplets' if triplet_weight else ''}: ", end="")
+    print(f"{1e3 * best_s / STEPS_N:.2f} ms, {100 * rate / sgemm:.0f} % of sgemm; best of {REPEATS_N}")
+    for part, part_s in best.items():
+        print(f"  {part:66}{1e3 * part_s / STEPS_N:7.3f} ms {100 * part_s / best_s:5.1f} %")
