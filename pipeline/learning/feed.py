@@ -4,7 +4,7 @@ Every network's batches come from its own generator, so its neighbours in the st
 losses and optimisers.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -22,6 +22,8 @@ class Feed:
 
     def __init__(self, jobs: Sequence[Job], batch_n: int, device: str) -> None:
         self.jobs, self.batch_n, self.device = jobs, batch_n, device
+        # A stream for each kind of draw: one more term of the loss leaves all other batches as they are.
+        self.rngs = [dict(zip(_STREAMS, job.rng.spawn(len(_STREAMS)), strict=True)) for job in jobs]
         sets: dict[str, list[np.ndarray]] = {
             "labelled": [job.labelled.inputs for job in jobs],
             "targets": [job.labelled.targets for job in jobs],
@@ -38,7 +40,7 @@ class Feed:
         `near` and `far` are the positives and negatives of the labelled rows, `poked`, `poked_near` and `poked_far` a
         triplet of unlabelled ones, `own` and `own_targets` the new skin's labelled rows.
         """
-        chosen = [_choose(job, steps_n, self.batch_n) for job in self.jobs]
+        chosen = [_choose(job, (steps_n, self.batch_n), rngs) for job, rngs in zip(self.jobs, self.rngs, strict=True)]
         block = {name: self._gather(name, [one[name] for one in chosen]) for name in chosen[0]}
         return ({name: values[i] for name, values in block.items()} for i in range(steps_n))
 
@@ -53,22 +55,22 @@ _SOURCE = {
     "labelled": "labelled", "targets": "targets", "near": "labelled", "far": "labelled", "poked": "poked",
     "poked_near": "poked", "poked_far": "poked", "own": "own", "own_targets": "own_targets",
 }  # fmt: skip
+_STREAMS = ("labelled", "pairs", "poked", "own")
 
 
-def _choose(job: Job, steps_n: int, batch_n: int) -> Chosen:
-    shape = (steps_n, batch_n)
-    rows = job.rng.integers(len(job.labelled.inputs), size=shape)
+def _choose(job: Job, shape: tuple[int, int], rngs: Mapping[str, np.random.Generator]) -> Chosen:
+    rows = rngs["labelled"].integers(len(job.labelled.inputs), size=shape)
     chosen = {"labelled": rows, "targets": rows}
     if job.labelled.points is not None:
-        near, far = draw_pairs(job.labelled.points, rows.ravel(), job.rng)
+        near, far = draw_pairs(job.labelled.points, rows.ravel(), rngs["pairs"])
         chosen |= {"near": near.reshape(shape), "far": far.reshape(shape)}
     if job.unlabelled is not None:
         points, row = job.unlabelled.points, job.unlabelled.row
-        anchor = job.rng.integers(len(points), size=steps_n * batch_n)
-        near, far = draw_pairs(points, anchor, job.rng)
+        anchor = rngs["poked"].integers(len(points), size=shape[0] * shape[1])
+        near, far = draw_pairs(points, anchor, rngs["poked"])
         names = ("poked", "poked_near", "poked_far")
         chosen |= {name: row[one].reshape(shape) for name, one in zip(names, (anchor, near, far), strict=True)}
     if job.own is not None:
-        own = job.rng.integers(len(job.own.inputs), size=shape)
+        own = rngs["own"].integers(len(job.own.inputs), size=shape)
         chosen |= {"own": own, "own_targets": own}
     return chosen
