@@ -1,46 +1,123 @@
+import numpy as np
 import pytest
 import torch
 from torch import nn
 
-from pipeline.learning.model import BUILD, paper_net, released_net
-from pipeline.seeds import torch_generator_for
+from pipeline.learning import model
+from pipeline.learning.architecture import LAYERS, draw_weights
+from pipeline.learning.model import Stack, predict
+from pipeline.seeds import rng_for
+from tests.learning.plain import features_of, plain_net, weights_of
+
+# float32 sums of up to 200 terms, in another order, six layers deep; numbers near 1
+CLOSE = {"rtol": 1e-4, "atol": 1e-6}
 
 
-def words(net: nn.Module) -> list[str]:
-    layers = [*net.feat, *net.head]
-    return [f"{one.in_features}-{one.out_features}" if isinstance(one, nn.Linear) else "ReLU" for one in layers]
+def drawn(architecture: str = "paper", name: int = 0) -> dict[str, np.ndarray]:
+    return draw_weights(LAYERS[architecture](15), rng_for(0, "net", name))
 
 
-def test_the_network_is_the_one_that_the_paper_prints():
-    # paper section 4: B(15) -> MLP+ReLU(200) -> MLP(200) -> MLP(40) -> MLP+ReLU(200) -> MLP+ReLU(200) -> xyF(3)
-    expected = ["15-200", "ReLU", "200-200", "200-40", "40-200", "ReLU", "200-200", "ReLU", "200-3"]
-    assert words(paper_net(15, torch_generator_for(0, "net"))) == expected
+def batch(members_n: int, b: int = 16) -> torch.Tensor:
+    return torch.from_numpy(rng_for(0, "batch").normal(size=(members_n, b, 15)).astype(np.float32))
 
 
-def test_the_released_network_has_two_more_relus():
-    net = released_net(15, torch_generator_for(0, "net"))
-    expected = ["15-200", "ReLU", "200-200", "ReLU", "200-40", "40-200", "ReLU", "200-200", "ReLU", "200-3", "ReLU"]
-    assert words(net) == expected
-    assert (net(torch.randn(64, 15, generator=torch_generator_for(0, "x"))) >= 0).all()
+def stack(members_n: int, architecture: str = "paper") -> Stack:
+    return Stack(LAYERS[architecture](15), [drawn(architecture, i) for i in range(members_n)])
 
 
-def test_features_are_the_forty_numbers_after_the_third_layer():
-    net = paper_net(15, torch_generator_for(0, "net"))
-    assert net.feat(torch.zeros(2, 15)).shape == (2, 40)
+def descend(net: nn.Module, inputs: torch.Tensor) -> tuple[torch.Tensor, list[torch.Tensor]]:
+    answer = net(inputs)
+    (answer**2).sum().backward()
+    return answer.detach(), [one.grad for one in net.parameters()]
 
 
-@pytest.mark.parametrize("name", sorted(BUILD))
-def test_weights_come_from_the_generator_alone(name):
-    torch.rand(3)  # global dice
-    one = BUILD[name](15, torch_generator_for(0, "net"))
-    torch.rand(5)
-    other = BUILD[name](15, torch_generator_for(0, "net"))
-    third = BUILD[name](15, torch_generator_for(1, "net"))
-    assert all(torch.equal(a, b) for a, b in zip(one.parameters(), other.parameters(), strict=True))
-    assert not torch.equal(next(one.parameters()), next(third.parameters()))
+@pytest.mark.parametrize("architecture", sorted(LAYERS))
+@pytest.mark.parametrize("members_n", [1, 3])
+def test_each_network_of_a_stack_is_the_plain_network_that_is_printed(architecture, members_n):
+    net, inputs = stack(members_n, architecture), batch(members_n)
+    answers, _ = descend(net, inputs)
+    for i in range(members_n):
+        alone = plain_net(architecture, drawn(architecture, i))
+        answer, _ = descend(alone, inputs[i])
+        torch.testing.assert_close(answers[i], answer, **CLOSE)
+        features = features_of(alone)(inputs[i])
+        torch.testing.assert_close(net.features(inputs)[i], features, **CLOSE)
+        gradients = _with_gradients_for_weights(net).member(i)
+        for name, values in weights_of(alone, gradient=True).items():
+            # gradients are sums over the batch, too
+            np.testing.assert_allclose(gradients[name], values, rtol=1e-3, atol=1e-5, err_msg=name)
 
 
-def test_weights_lie_within_one_over_root_fan_in():
-    layer = paper_net(15, torch_generator_for(0, "net")).feat[2]
-    assert float(layer.weight.detach().abs().max()) <= 200**-0.5
-    assert float(layer.weight.detach().std()) == pytest.approx(200**-0.5 / 3**0.5, rel=0.02)  # 40,000 draws
+def _with_gradients_for_weights(net: Stack) -> Stack:
+    twin = Stack(LAYERS["paper"](15), [net.member(i) for i in range(net.members_n)])
+    for own, one in zip(twin.parameters(), net.parameters(), strict=True):
+        own.data = one.grad
+    return twin
+
+
+def test_networks_of_a_stack_never_touch_each_other():
+    inputs = batch(3)
+    answers, gradients = descend(stack(3), inputs)
+    others = Stack(LAYERS["paper"](15), [drawn(name=0), drawn(name=9), drawn(name=2)])
+    inputs[1] = 1e3 * inputs[1] + 5
+    again, again_gradients = descend(others, inputs)
+    for i, same in enumerate([True, False, True]):
+        assert torch.equal(again[i], answers[i]) == same
+        assert all(torch.equal(a[i], b[i]) == same for a, b in zip(again_gradients, gradients, strict=True))
+
+
+def test_numbers_that_are_not_finite_stay_in_their_network():
+    inputs = batch(3)
+    _, gradients = descend(stack(3), inputs)
+    inputs[1] = torch.nan
+    answers, poisoned = descend(stack(3), inputs)
+    assert torch.isfinite(answers).flatten(1).all(1).tolist() == [True, False, True]
+    assert all(torch.equal(a[[0, 2]], b[[0, 2]]) for a, b in zip(poisoned, gradients, strict=True))
+
+
+def test_a_network_is_taken_out_of_a_stack_as_it_was_put_in():
+    net = stack(3)
+    for i in range(3):
+        put, taken = drawn(name=i), net.member(i)
+        assert list(taken) == list(put)
+        assert all((taken[name] == put[name]).all() for name in put)
+
+
+def test_what_is_taken_out_does_not_change_when_the_stack_goes_on():
+    net = stack(2)
+    taken = net.member(1)
+    with torch.no_grad():
+        for one in net.parameters():
+            one += 1
+    assert all((taken[name] == values).all() for name, values in drawn(name=1).items())
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_one_weight_that_is_not_finite_tells_on_its_network_alone(bad):
+    members = [drawn(name=i) for i in range(3)]
+    members[1]["layer4.bias"][7] = bad
+    assert Stack(LAYERS["paper"](15), members).finite().tolist() == [True, False, True]
+
+
+def test_features_are_forty_numbers_and_the_answer_is_made_of_them_alone():
+    net, inputs = stack(2), batch(2)
+    features = net.features(inputs)
+    assert features.shape == (2, 16, 40)
+    assert (features < 0).any()  # no ReLU stands behind the bottleneck
+    assert torch.equal(net.answer(features), net(inputs))
+
+
+def test_the_released_network_answers_no_number_below_zero():
+    answers, plain = stack(1, "released")(batch(1)), stack(1)(batch(1))
+    assert (answers >= 0).all()
+    assert (plain < 0).any()
+
+
+@pytest.mark.parametrize("block_n", [1, 7, 16, 100])
+def test_prediction_does_not_depend_on_the_block(monkeypatch, block_n):
+    inputs = batch(1)[0].numpy()
+    monkeypatch.setattr(model, "BLOCK_ROWS_N", block_n)
+    answers = predict(drawn(), "paper", inputs, "cpu")
+    one_by_one = np.concatenate([predict(drawn(), "paper", row[None], "cpu") for row in inputs])
+    np.testing.assert_allclose(answers, one_by_one, **CLOSE)
+    np.testing.assert_allclose(answers, plain_net("paper", drawn())(torch.from_numpy(inputs)).detach(), **CLOSE)

@@ -1,0 +1,80 @@
+"""The network of the paper and its loop in PyTorch's own words, one network at a time: what stacks must equal."""
+
+from collections.abc import Callable, Iterable, Mapping
+
+import numpy as np
+import torch
+from torch import nn
+
+from pipeline.learning.feed import Batch
+from pipeline.learning.job import Terms
+from pipeline.learning.recipe import Schedule
+
+# paper section 4: B(15) -> MLP+ReLU(200) -> MLP(200) -> MLP(40) -> MLP+ReLU(200) -> MLP+ReLU(200) -> xyF(3)
+PAPER = ("15-200", "ReLU", "200-200", "200-40", "40-200", "ReLU", "200-200", "ReLU", "200-3")
+RELEASED = ("15-200", "ReLU", "200-200", "ReLU", "200-40", "40-200", "ReLU", "200-200", "ReLU", "200-3", "ReLU")
+PRINTED = {"paper": PAPER, "released": RELEASED}
+
+
+def plain_net(architecture: str, weights: Mapping[str, np.ndarray]) -> nn.Sequential:
+    """A plain network, with these weights in its linear layers."""
+    parts: list[nn.Module] = []
+    layer_n = 0
+    for word in PRINTED[architecture]:
+        if word == "ReLU":
+            parts.append(nn.ReLU())
+            continue
+        layer_n += 1
+        linear = nn.Linear(*map(int, word.split("-")))
+        linear.load_state_dict({p: torch.tensor(weights[f"layer{layer_n}.{p}"]) for p in ("weight", "bias")})
+        parts.append(linear)
+    return nn.Sequential(*parts)
+
+
+def features_of(net: nn.Sequential) -> nn.Sequential:
+    """The part of a plain network up to its 40 features."""
+    forty = next(i for i, part in enumerate(net) if isinstance(part, nn.Linear) and part.out_features == 40)
+    return net[: forty + 1]
+
+
+def weights_of(net: nn.Sequential, gradient: bool = False) -> dict[str, np.ndarray]:
+    """The weights of a plain network, or their gradients, named as models name them."""
+    linear = [part for part in net if isinstance(part, nn.Linear)]
+    return {
+        f"layer{i}.{name}": (values.grad if gradient else values.detach()).numpy().copy()
+        for i, layer in enumerate(linear, 1)
+        for name, values in layer.named_parameters()
+    }
+
+
+def plain_train(
+    start: Mapping[str, np.ndarray], batches: Iterable[Batch], schedule: Schedule, terms: Terms
+) -> dict[str, np.ndarray]:
+    """The plainest loop that trains one network by autograd, on the batches of a stack of one."""
+    net = plain_net("paper", start)
+    features = features_of(net)
+    optimizer = torch.optim.AdamW(net.parameters(), lr=schedule.rate_max, weight_decay=schedule.weight_decay)
+    rate = torch.optim.lr_scheduler.OneCycleLR(optimizer, max_lr=schedule.rate_max, total_steps=schedule.steps_n)
+    for stacked in batches:
+        batch = {name: values[0] for name, values in stacked.items()}
+        loss = nn.functional.mse_loss(net(batch["labelled"]), batch["targets"])
+        if terms.triplet:
+            loss = loss + terms.triplet * hinge(features, batch["labelled"], batch["near"], batch["far"])
+        if terms.unlabelled:
+            loss = loss + terms.unlabelled * hinge(features, batch["poked"], batch["poked_near"], batch["poked_far"])
+        if terms.own:
+            loss = loss + terms.own * nn.functional.mse_loss(net(batch["own"]), batch["own_targets"])
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        rate.step()
+    return weights_of(net)
+
+
+def hinge(
+    features: Callable[[torch.Tensor], torch.Tensor], anchor: torch.Tensor, near: torch.Tensor, far: torch.Tensor
+) -> torch.Tensor:
+    """Mean over a batch of the printed triplet loss, a row at a time."""
+    a, p, n = features(anchor), features(near), features(far)
+    rows = [torch.clamp((a[i] - p[i]).dot(a[i] - p[i]) - (a[i] - n[i]).dot(a[i] - n[i]), min=0) for i in range(len(a))]
+    return torch.stack(rows).mean()
