@@ -1,40 +1,142 @@
 import math
 
+import numpy as np
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.stats import special_ortho_group
 
-from pipeline.learning.losses import squared_error
-from pipeline.seeds import torch_generator_for
+from pipeline.learning.losses import squared_error, triplet
+from pipeline.seeds import rng_for
+
+M, B, D = 3, 7, 40
+SUM_RTOL = 1e-5  # float32 sums of up to 280 terms
 
 
-def batch(*names: str) -> torch.Tensor:
-    return torch.randn(7, 3, generator=torch_generator_for(0, *names))
+def answers(*names: str | int) -> torch.Tensor:
+    return torch.from_numpy(rng_for(0, *names).normal(size=(M, B, 3)).astype(np.float32))
 
 
-def test_the_loss_is_the_mean_of_squares_as_two_loops_find():
-    answer, truth = batch("answer"), batch("truth")
-    total = sum((float(answer[i, j]) - float(truth[i, j])) ** 2 for i in range(7) for j in range(3))
-    # float32 sum of 21 terms
-    assert math.isclose(float(squared_error(answer, truth)), total / 21, rel_tol=1e-5)
+def features(name: str, seed: int = 0) -> torch.Tensor:
+    return torch.from_numpy(rng_for(seed, "features", name).normal(size=(M, B, D)).astype(np.float32))
+
+
+def three(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    return features("anchor", seed), features("positive", seed), features("negative", seed)
+
+
+def looped_triplet(anchor: torch.Tensor, positive: torch.Tensor, negative: torch.Tensor) -> list[float]:
+    """Max(0, |a - p|^2 - |a - n|^2) as printed, in float64, by three nested loops."""
+    losses = []
+    for member_i in range(len(anchor)):
+        total = 0.0
+        for row_i in range(len(anchor[member_i])):
+            nearer = farther = 0.0
+            for k in range(len(anchor[member_i][row_i])):
+                a, p, n = (float(one[member_i, row_i, k]) for one in (anchor, positive, negative))
+                nearer += (a - p) ** 2
+                farther += (a - n) ** 2
+            total += max(0.0, nearer - farther)
+        losses.append(total / len(anchor[member_i]))
+    return losses
+
+
+def test_the_l2_loss_is_the_mean_of_squares_as_nested_loops_find():
+    answer, truth = answers("answer"), answers("truth")
+    for i in range(M):
+        total = sum((float(answer[i, j, k]) - float(truth[i, j, k])) ** 2 for j in range(B) for k in range(3))
+        assert math.isclose(float(squared_error(answer, truth)[i]), total / (3 * B), rel_tol=SUM_RTOL)
 
 
 def test_unknown_targets_neither_count_nor_pull():
-    answer = batch("answer").requires_grad_()
-    truth = batch("truth")
-    truth[:, 2] = math.nan
+    answer, truth = answers("answer").requires_grad_(), answers("truth")
+    truth[1, :, 2] = math.nan
+    truth[2, :4] = math.nan
     loss = squared_error(answer, truth)
-    loss.backward()
-    # 14 of 21 terms are left; float32 rounding
-    assert math.isclose(loss.item(), float(((answer.detach()[:, :2] - truth[:, :2]) ** 2).mean()), rel_tol=1e-5)
+    loss.sum().backward()
+    for i in range(M):
+        known = [(j, k) for j in range(B) for k in range(3) if not math.isnan(truth[i, j, k])]
+        total = sum((float(answer[i, j, k].detach()) - float(truth[i, j, k])) ** 2 for j, k in known)
+        assert math.isclose(loss[i].item(), total / len(known), rel_tol=SUM_RTOL)
+    unknown = torch.isnan(truth)
+    assert (answer.grad[unknown] == 0).all()
+    assert (answer.grad[~unknown] != 0).all()
     assert torch.isfinite(answer.grad).all()
-    assert (answer.grad[:, 2] == 0).all()
+
+
+def test_known_targets_pull_towards_themselves():
+    answer, truth = answers("answer").requires_grad_(), answers("truth")
+    squared_error(answer, truth).sum().backward()
+    torch.testing.assert_close(answer.grad, 2 * (answer.detach() - truth) / (3 * B), rtol=SUM_RTOL, atol=1e-7)
 
 
 @given(st.floats(-100, 100))
-def test_a_shift_of_both_changes_nothing(shift):
-    answer, truth = batch("answer"), batch("truth")
+def test_a_shift_of_answer_and_truth_changes_nothing(shift):
+    answer, truth = answers("answer"), answers("truth")
     # float32 numbers up to 100 carry about 1e-5 of absolute rounding
-    assert math.isclose(
-        float(squared_error(answer + shift, truth + shift)), float(squared_error(answer, truth)), rel_tol=1e-3
+    torch.testing.assert_close(
+        squared_error(answer + shift, truth + shift), squared_error(answer, truth), rtol=1e-3, atol=0
     )
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_triplet_loss_is_what_three_nested_loops_find(seed):
+    anchor, positive, negative = three(seed)
+    assert any(0 < one for one in looped_triplet(anchor, positive, negative))
+    np.testing.assert_allclose(
+        triplet(anchor, positive, negative), looped_triplet(anchor, positive, negative), rtol=SUM_RTOL
+    )
+
+
+def test_a_positive_that_is_nearer_by_however_little_costs_nothing():
+    anchor = torch.zeros(1, 1, 2)
+    positive, negative = torch.tensor([[[1.0, 0.0]]]), torch.tensor([[[0.0, 1.0 + 1e-6]]])
+    assert float(triplet(anchor, positive, negative)) == 0  # no margin
+    assert float(triplet(anchor, negative, positive)) > 0
+
+
+def test_a_violated_triplet_pulls_the_positive_in_and_pushes_the_negative_out():
+    # loss 2^2 - 1^2: d/dp = -2 (a - p), d/dn = 2 (a - n), d/da = 2 (a - p) - 2 (a - n)
+    a, p, n = (torch.tensor([[[x]]], requires_grad=True) for x in (0.0, 2.0, 1.0))
+    loss = triplet(a, p, n)
+    loss.sum().backward()
+    assert [float(one) for one in (loss.detach(), a.grad, p.grad, n.grad)] == [3.0, -2.0, 4.0, -2.0]
+
+
+def test_identical_points_cost_nothing_and_pull_nowhere():
+    points = [features("anchor").clone().requires_grad_() for _ in range(3)]
+    loss = triplet(*points)
+    loss.sum().backward()
+    assert (loss == 0).all()
+    assert all((one.grad == 0).all() for one in points)
+
+
+def test_networks_of_a_stack_are_each_charged_their_own_triplets():
+    anchor, positive, negative = three()
+    before = triplet(anchor, positive, negative)
+    positive[1] += 10
+    after = triplet(anchor, positive, negative)
+    assert (after == before).tolist() == [True, False, True]
+
+
+@given(st.integers(0, 1000), st.floats(-5, 5))
+def test_turning_and_shifting_the_features_changes_nothing(seed, shift):
+    turn = torch.from_numpy(special_ortho_group.rvs(D, random_state=rng_for(seed, "turn")).astype(np.float32))
+    moved = [one @ turn + shift for one in three()]
+    # differences of sums of about 80, in float32 numbers of up to 10
+    torch.testing.assert_close(triplet(*moved), triplet(*three()), rtol=1e-4, atol=1e-4)
+
+
+@given(st.floats(0.01, 100))
+def test_the_triplet_loss_grows_with_the_square_of_the_features(k):
+    stretched = [one * k for one in three()]
+    torch.testing.assert_close(triplet(*stretched), triplet(*three()) * k**2, rtol=1e-4, atol=0)  # float32 rounding
+
+
+@given(st.integers(0, 1000))
+def test_swapping_positive_and_negative_changes_the_sign_of_what_is_hinged(seed):
+    anchor, positive, negative = three(seed)
+    both = triplet(anchor, positive, negative) - triplet(anchor, negative, positive)
+    mean = ((anchor - positive) ** 2).sum(-1).mean(-1) - ((anchor - negative) ** 2).sum(-1).mean(-1)
+    torch.testing.assert_close(both, mean, rtol=1e-4, atol=1e-4)  # float32 sums of about 80

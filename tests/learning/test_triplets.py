@@ -1,0 +1,135 @@
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from pipeline.errors import TrainingError
+from pipeline.learning.triplets import Points, draw_pairs, make_points
+from pipeline.seeds import rng_for
+
+DRAWN_N = 400
+ROW = np.arange(5, dtype=np.float64)[:, None]  # five pokes of a line, placed by index
+
+
+def draw(points: Points, anchor: np.ndarray, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    return draw_pairs(points, anchor, rng_for(seed, "pairs"))
+
+
+def distances(place: np.ndarray, anchor: int) -> list[float]:
+    """The true squared distances of all points from one, plainly."""
+    return [sum((float(a) - float(b)) ** 2 for a, b in zip(one, place[anchor], strict=True)) for one in place]
+
+
+@st.composite
+def placed(draw_one: st.DrawFn) -> tuple[np.ndarray, np.ndarray, int]:
+    """Points in up to four groups, on few integer places: ties abound. Every place is visited twice at least."""
+    axes_n = draw_one(st.sampled_from([1, 2]))
+    place, group = [], []
+    for name in draw_one(st.lists(st.integers(0, 99), min_size=1, max_size=4, unique=True)):
+        steps = st.tuples(*[st.integers(0, 3)] * axes_n)
+        for one in draw_one(st.lists(steps, min_size=2, max_size=12, unique=True)):
+            visits_n = draw_one(st.integers(2, 3))
+            place += [one] * visits_n
+            group += [name] * visits_n
+    seed = draw_one(st.integers(0, 10_000))
+    shuffled = rng_for(seed, "shuffle").permutation(len(group))
+    return np.array(place, np.float64)[shuffled], np.array(group)[shuffled], seed
+
+
+@given(placed())
+def test_pairs_lie_in_the_anchors_group_and_the_positive_is_strictly_nearer(case):
+    place, group, seed = case
+    anchor = rng_for(seed, "anchors").integers(len(group), size=64)
+    positive, negative = draw(make_points(place, group), anchor, seed)
+    for a, p, n in zip(anchor, positive, negative, strict=True):
+        away = distances(place, a)
+        assert group[a] == group[p] == group[n]
+        assert away[p] < away[n]
+        assert a not in (p, n)
+
+
+@given(placed(), st.floats(-100, 100), st.sampled_from([0.25, 2.0, 8.0]))
+def test_moving_and_stretching_a_skin_changes_no_triplet(case, shift, times):
+    place, group, seed = case
+    anchor = rng_for(seed, "anchors").integers(len(group), size=32)
+    one = draw(make_points(place, group), anchor, seed)
+    other = draw(make_points(place * times + round(shift), group), anchor, seed)
+    assert all((a == b).all() for a, b in zip(one, other, strict=True))
+
+
+@given(placed())
+def test_what_groups_are_called_changes_no_triplet(case):
+    place, group, seed = case
+    anchor = np.arange(len(group))
+    one = draw(make_points(place, group), anchor, seed)
+    other = draw(make_points(place, np.array([f"skin{name:03d}" for name in group])), anchor, seed)
+    assert all((a == b).all() for a, b in zip(one, other, strict=True))
+
+
+def test_places_on_skins_in_mm_are_compared_over_both_axes():
+    # from the corner: 3 mm along x is nearer than 2 mm and 3 mm along both
+    place = np.array([[0, 0], [3, 0], [2, 3]], np.float32)
+    positive, negative = draw(make_points(place, np.zeros(3, int)), np.zeros(DRAWN_N, int))
+    assert set(positive) == {1}
+    assert set(negative) == {2}
+
+
+def test_two_places_suffice_where_each_has_two_visits():
+    points = make_points(np.array([[0.0], [0.0], [1.0], [1.0]]), np.zeros(4, int))
+    positive, negative = draw(points, np.tile(np.arange(4), 50))
+    assert (positive == np.tile([1, 0, 3, 2], 50)).all()  # the other visit of the anchor's own place
+    assert all(set(negative[i::4]) == ({2, 3} if i < 2 else {0, 1}) for i in range(4))
+
+
+def test_a_group_on_one_place_is_named():
+    place = np.array([[1.0, 2.0], [0.0, 0.0], [1.0, 2.0], [3.0, 0.0], [1.0, 2.0]])
+    skins = np.array(["b3_s2", "b1_s1", "b3_s2", "b1_s1", "b3_s2"])
+    with pytest.raises(TrainingError, match=r"group b3_s2: the places of its points must be two or more; got 3 points"):
+        make_points(place, skins)
+
+
+def test_places_that_differ_along_one_axis_only_are_two():
+    assert len(make_points(np.array([[0.0, 5.0], [0.0, 6.0]]), np.zeros(2, int))) == 2
+
+
+def test_an_anchor_that_is_equally_far_from_all_others_is_one_sentence_and_no_endless_loop():
+    three_pokes = make_points(np.arange(3.0)[:, None], np.zeros(3, int))
+    with pytest.raises(
+        TrainingError, match=r"distances from an anchor must be different ones; got ties .* at place \[1.0\]"
+    ):
+        draw(three_pokes, np.array([0, 1, 2]))
+
+
+def test_the_same_state_of_the_generator_draws_the_same():
+    points, anchor = make_points(ROW, np.zeros(5, int)), np.tile(np.arange(5), 20)
+    one, again, other = draw(points, anchor, 1), draw(points, anchor, 1), draw(points, anchor, 2)
+    assert all((a == b).all() for a, b in zip(one, again, strict=True))
+    assert any((a != b).any() for a, b in zip(one, other, strict=True))
+
+
+def test_every_ordered_pair_of_other_points_is_drawn_equally_often():
+    # from index 0 of a line of five, all distances differ: six pairs of the four others
+    n = 6000
+    positive, negative = draw(make_points(ROW, np.zeros(5, int)), np.zeros(n, int))
+    pairs, times = np.unique(np.stack([positive, negative]), axis=1, return_counts=True)
+    assert pairs.T.tolist() == [[1, 2], [1, 3], [1, 4], [2, 3], [2, 4], [3, 4]]
+    assert (np.abs(times - n / 6) < 6 * (n * 5 / 36) ** 0.5).all()  # six binomial sd
+
+
+@given(placed())
+def test_every_other_point_of_the_group_takes_part(case):
+    place, group, seed = case
+    mates = np.flatnonzero(group == group[0])
+    assume(len(mates) <= 12)
+    others = mates[mates != 0]
+    away = np.array(distances(place, 0))[others]
+    positive, negative = draw(make_points(place, group), np.zeros(3000, int), seed)
+    # at the worst, one point in eleven ordered against one other only: (1 - 2 / 121)^3000 = 1e-22
+    assert set(positive) == set(others[away < away.max()])
+    assert set(negative) == set(others[away > away.min()])
+
+
+def test_the_anchors_passed_in_are_left_as_they_are():
+    anchor = np.arange(5)
+    draw(make_points(ROW, np.zeros(5, int)), anchor)
+    assert (anchor == np.arange(5)).all()
