@@ -55,25 +55,26 @@ def run_cells(
 ) -> list[Trained]:
     """Train what `cache` does not hold yet, and return every cell's result in the order of `cells`."""
     keys = Keys(rows)
-    files = {cell.name: cache / f"{keys.key(cell)}.safetensors" for cell in cells}
-    missing = [cell for cell in cells if not files[cell.name].exists()]
-    if len(missing) < len(cells):
-        tell(f"{len(cells) - len(missing)} of {len(cells)} trainings were finished before")
+    files = {id(cell): cache / f"{keys.key(cell)}.safetensors" for cell in cells}  # not by name: it decides no result
+    unfinished = {files[id(cell)]: cell for cell in cells if not files[id(cell)].exists()}
+    finished_n, missing = sum(files[id(cell)] not in unfinished for cell in cells), list(unfinished.values())
+    if finished_n:
+        tell(f"{finished_n} of {len(cells)} trainings were finished before")
     if missing:
         rows_file = cache / "rows" / f"{keys.rows_digest()}.safetensors"
         skin = np.unique(rows.skin, return_inverse=True)[1].astype(np.int64)
         io.write_tensors(rows_file, {"db_uT": rows.db_uT, "target": rows.target, "skin": skin}, {})
         _run_stacks(missing, rows_file, files, executor, tell)
         io.remove(rows_file)
-    return [_read_trained(files[cell.name]) for cell in cells]
+    return [_read_trained(files[id(cell)]) for cell in cells]
 
 
 def _run_stacks(
-    cells: Sequence[Cell], rows_file: Path, files: Mapping[str, Path], executor: Executor, tell: Callable[[str], None]
+    cells: Sequence[Cell], rows_file: Path, files: Mapping[int, Path], executor: Executor, tell: Callable[[str], None]
 ) -> None:
     start_s, done_n, running = time.monotonic(), 0, {}
     for stack in stacks(cells, STACK_N[device()]):
-        running[executor.submit(_stack_to_files, rows_file, stack, [files[cell.name] for cell in stack])] = stack
+        running[executor.submit(_stack_to_files, rows_file, stack, [files[id(cell)] for cell in stack])] = stack
     for future in as_completed(running):
         try:
             future.result()
