@@ -1,0 +1,275 @@
+from collections.abc import Callable
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from pipeline.dataset.lines import Lines
+from pipeline.learning import cell as cell_module
+from pipeline.learning.cell import Cell, Keys, Measured, Trained, make_job
+from pipeline.learning.feed import Feed
+from pipeline.learning.grid import train_stack
+from pipeline.learning.job import Terms
+from tests.learning.cells import (
+    OWN,
+    POKED,
+    ROWS_N,
+    TEST,
+    TRAIN,
+    adapting,
+    changed,
+    few_labels,
+    lines,
+    measured,
+    pooled,
+    start,
+    without_triplets,
+)
+
+NEW = np.arange(24, ROWS_N)  # every row of a skin that is not trained on
+KINDS = {"pooled": pooled, "adapting": adapting, "few labels": few_labels}
+
+
+def trained(cell: Cell, rows: Measured) -> Trained:
+    return train_stack([cell], rows)[0]
+
+
+def alike(one: Trained, other: Trained) -> bool:
+    """Bit for bit: weights, scaler, curve."""
+    weights = all((one.weights[name] == other.weights[name]).all() for name in one.weights)
+    scaler, again = one.scaler.arrays(), other.scaler.arrays()
+    return weights and one.curve == other.curve and all((scaler[name] == again[name]).all() for name in scaler)
+
+
+# What adaptation may see
+
+
+@pytest.mark.parametrize("new", [np.nan, 1e3, -7.0], ids=str)
+@pytest.mark.parametrize("at", [POKED, TEST, NEW], ids=["poked", "tested", "all"])
+def test_adaptation_cannot_see_places_and_forces_of_the_new_skin(at, new):
+    once, blind = trained(adapting(), measured()), trained(adapting(), changed(measured(), "target", at, new))
+    assert alike(once, blind)
+    assert (once.predicted == blind.predicted).all()
+
+
+def test_adaptation_cannot_see_which_skin_its_pokes_are_on():
+    assert alike(trained(adapting(), measured()), trained(adapting(), changed(measured(), "skin", NEW, "b0_s0")))
+
+
+def test_adaptation_sees_fields_and_order_of_the_pokes_that_lines_name():
+    once, along = trained(adapting(), measured()), lines()
+    backwards = replace(along, row=along.row[[0, 2, 4, 1, 3, 5]])
+    assert not alike(once, trained(adapting(along=backwards), measured()))
+    assert not alike(once, trained(adapting(), changed(measured(), "db_uT", POKED[0], 0)))
+    assert not alike(once, trained(adapting(), changed(measured(), "target", TRAIN[0], 0)))
+
+
+def test_lines_have_no_place_and_no_force():
+    assert [field.name for field in fields(Lines)] == ["row", "line_i", "order_i"]
+
+
+def test_pokes_are_scaled_as_the_start_was_and_each_point_names_its_row():
+    along = replace(lines(), row=np.array([40, 36, 40, 38, 36, 41]))
+    scaler = replace(start().scaler, input_shift=np.arange(15, dtype=np.float32))
+    job, used = make_job(tuned(adapting(along=along), start=replace(start(), scaler=scaler)), measured())
+    assert used is scaler
+    db_uT = measured().db_uT
+    for point, row in enumerate(along.row):
+        expected = [(db_uT[row, ch] - scaler.input_shift[ch]) / scaler.input_scale[ch] for ch in range(15)]
+        assert job.unlabelled.inputs[job.unlabelled.row[point]].tolist() == expected
+    assert job.unlabelled.points.place[:, 0].tolist() == along.order_i.tolist()
+    assert len(job.unlabelled.inputs) == 4
+
+
+@pytest.mark.parametrize("at", [POKED, NEW], ids=["poked", "all"])
+def test_the_control_looks_at_nothing_of_the_new_skin(at):
+    control = adapting(unlabelled_weight=0.0)
+    once = trained(control, measured())
+    for part, new in (("db_uT", 1e4), ("target", np.nan)):
+        assert alike(once, trained(control, changed(measured(), part, at, new)))
+    assert not alike(once, trained(adapting(), measured()))
+
+
+def test_a_few_labels_are_seen_and_no_others():
+    once = trained(few_labels(), measured())
+    others = np.setdiff1d(NEW, OWN)
+    assert alike(once, trained(few_labels(), changed(measured(), "target", others, np.nan)))
+    assert not alike(once, trained(few_labels(), changed(measured(), "target", OWN, 0)))
+    assert not alike(once, trained(few_labels(own_weight=0.0), measured()))
+
+
+# What is held out
+
+
+@pytest.mark.parametrize("scaling", ["standard", "released"])
+@pytest.mark.parametrize("view", ["raw", "shape"])
+def test_a_planted_leak_would_show_nothing_of_a_test_row_reaches_the_model(scaling, view):
+    cell = pooled(scaling=scaling, inputs=view)
+    once = trained(cell, measured())
+    planted = changed(changed(measured(), "db_uT", TEST, 1e4), "target", TEST, -1e4)
+    again = trained(cell, planted)
+    assert alike(once, again)
+    assert (once.predicted != again.predicted).any()
+
+
+@pytest.mark.parametrize("kind", sorted(KINDS))
+def test_a_scaler_is_that_of_the_rows_trained_on(kind):
+    _, scaler = make_job(KINDS[kind](), changed(measured(), "db_uT", NEW, 1e6))
+    np.testing.assert_allclose(scaler.input_shift, measured().db_uT[TRAIN].mean(axis=0, dtype=float), rtol=1e-6)
+    np.testing.assert_allclose(scaler.target_scale, measured().target[TRAIN].std(axis=0, dtype=float), rtol=1e-6)
+
+
+def test_labelled_triplets_are_by_place_on_each_skin_in_mm():
+    rows = measured()
+    job, _ = make_job(pooled(), rows)
+    assert (job.labelled.points.place == rows.target[TRAIN, :2]).all()
+    assert job.labelled.points.group.tolist() == [0] * 12 + [1] * 12
+    assert (
+        make_job(replace(pooled(), recipe=pooled().recipe.model_copy(update={"triplet_weight": 0.0})), rows)[
+            0
+        ].labelled.points
+        is None
+    )
+
+
+def test_terms_weigh_what_the_recipe_and_the_tuning_say():
+    assert pooled().terms == Terms(0.5)
+    assert adapting(unlabelled_weight=0.25).terms == Terms(0.5, unlabelled=0.25)
+    assert few_labels(own_weight=0.75).terms == Terms(0.5, own=0.75)
+    assert adapting().schedule == adapting().tuning.settings
+    assert pooled().schedule == pooled().recipe
+
+
+# Pairs
+
+
+def first_batches(cell: Cell) -> list[np.ndarray]:
+    feed = Feed([make_job(cell, measured())[0]], 16, "cpu")
+    return [step["labelled"].numpy() for _ in range(3) for step in feed.draw(5)]
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        replace(pooled(), recipe_name="variant", question="lobo", what="multi"),
+        pooled(weight_decay=0.5, rate_max=1e-4),
+        without_triplets(),
+    ],
+    ids=["another name", "another schedule", "no triplets"],
+)
+def test_recipes_are_compared_from_equal_starts_on_equal_batches(other):
+    one, two = (make_job(cell, measured())[0].start for cell in (pooled(), other))
+    assert all((one[name] == two[name]).all() for name in one)
+    assert all((a == b).all() for a, b in zip(first_batches(pooled()), first_batches(other), strict=True))
+
+
+def test_adaptation_is_compared_with_its_control_on_equal_batches():
+    pairs = zip(first_batches(adapting()), first_batches(adapting(unlabelled_weight=0.0)), strict=True)
+    assert all((a == b).all() for a, b in pairs)
+
+
+@pytest.mark.parametrize("changes", [{"seed": 8}, {"seed_i": 1}, {"fold": "b0"}], ids=str)
+def test_folds_and_seeds_start_and_draw_differently(changes):
+    other = replace(pooled(), **changes)
+    assert (
+        make_job(pooled(), measured())[0].start["layer1.weight"]
+        != make_job(other, measured())[0].start["layer1.weight"]
+    ).any()
+    assert any((a != b).any() for a, b in zip(first_batches(pooled()), first_batches(other), strict=True))
+
+
+# Keys
+
+
+def key(cell: Cell, rows: Measured | None = None) -> str:
+    return Keys(rows or measured()).key(cell)
+
+
+def tuned(cell: Cell, **changes: object) -> Cell:
+    return replace(cell, tuning=replace(cell.tuning, **changes))
+
+
+def with_row(part: str, row: int, to: object) -> Callable[[], Measured]:
+    return lambda: changed(measured(), part, np.array([row]), to)
+
+
+DECISIVE_ROWS = {
+    "a trained field": ("pooled", with_row("db_uT", TRAIN[3], 1.0)),
+    "a trained place": ("pooled", with_row("target", TRAIN[3], 1.0)),
+    "the skin of a trained row": ("pooled", with_row("skin", TRAIN[3], "b0_s1")),
+    "a tested field": ("pooled", with_row("db_uT", TEST[3], 1.0)),
+    "a poked field": ("adapting", with_row("db_uT", POKED[3], 1.0)),
+    "an own field": ("few labels", with_row("db_uT", OWN[1], 1.0)),
+    "an own label": ("few labels", with_row("target", OWN[1], 1.0)),
+}
+IDLE_ROWS = {
+    "a tested place": ("pooled", with_row("target", TEST[3], 1.0)),
+    "a field that nobody uses": ("pooled", with_row("db_uT", 30, 1.0)),
+    "the name of all skins": ("pooled", lambda: replace(measured(), skin=np.char.add("x", measured().skin))),
+    "the skin of a tested row": ("pooled", with_row("skin", TEST[3], "b0_s1")),
+    "a poked place": ("adapting", with_row("target", POKED[3], np.nan)),
+    "a label that is not its own": ("few labels", with_row("target", POKED[5], 1.0)),
+}
+
+
+@pytest.mark.parametrize("what", sorted(DECISIVE_ROWS))
+def test_a_key_changes_with_every_row_that_decides_the_result(what):
+    kind, rows = DECISIVE_ROWS[what]
+    assert key(KINDS[kind](), rows()) != key(KINDS[kind]())
+
+
+@pytest.mark.parametrize("what", sorted(IDLE_ROWS))
+def test_a_key_does_not_change_with_what_decides_nothing(what):
+    kind, rows = IDLE_ROWS[what]
+    assert key(KINDS[kind](), rows()) == key(KINDS[kind]())
+
+
+def finer(cell: Cell, **changes: object) -> Cell:
+    return tuned(cell, settings=cell.tuning.settings.model_copy(update=changes))
+
+
+def test_no_two_settings_share_a_key():
+    along = lines()
+    cells = [
+        pooled(), adapting(), few_labels(), replace(pooled(), train=TRAIN[1:]), replace(pooled(), test=TEST[1:]),
+        *[pooled(**one) for one in (
+            {"architecture": "released"}, {"inputs": "shape"}, {"scaling": "released"}, {"steps_n": 5}, {"batch_n": 8},
+            {"rate_max": 1e-3}, {"weight_decay": 0.1},
+        )],
+        without_triplets(),
+        replace(pooled(), seed=8), replace(pooled(), seed_i=1), replace(pooled(), fold="b0"),
+        replace(adapting(), skin="b1_s0"), tuned(adapting(), start=start("another")), finer(adapting(), steps_n=5),
+        finer(adapting(), unlabelled_weight=0.25), finer(adapting(), rate_max=1e-4),
+        adapting(along=replace(along, order_i=along.order_i[::-1].copy())),
+        adapting(along=replace(along, line_i=np.array([0, 0, 0, 1, 1, 1], np.int32))),
+        adapting(along=replace(along, row=along.row[::-1].copy())),
+        tuned(few_labels(), own=OWN[:2]), finer(few_labels(), own_weight=0.25),
+    ]  # fmt: skip
+    assert len({key(cell) for cell in cells}) == len(cells)
+
+
+def test_questions_and_names_do_not_enter_a_key():
+    assert key(replace(pooled(), question="sensors", recipe_name="other", what="multi")) == key(pooled())
+
+
+def test_rows_that_nobody_uses_may_come_and_go():
+    rows = measured()
+    fewer = Measured(*(getattr(rows, field.name)[6:] for field in fields(rows)))
+    moved = replace(pooled(), train=TRAIN[6:] - 6, test=TEST - 6)
+    assert key(moved, fewer) == key(replace(pooled(), train=TRAIN[6:]))
+
+
+def test_keys_are_the_same_from_one_book_of_keys_and_from_many():
+    book, cells = Keys(measured()), [pooled(), replace(pooled(), train=TRAIN[1:]), pooled(), adapting()]
+    assert [book.key(cell) for cell in cells] == [key(cell) for cell in cells]
+
+
+def test_a_key_changes_with_the_code_that_trains(monkeypatch):
+    before = key(pooled())
+    monkeypatch.setattr(cell_module, "_code_digest", lambda: "another loop")
+    assert key(pooled()) != before
+
+
+def test_a_name_says_what_tells_a_cell_apart():
+    assert pooled().name == "triplet.paper.b1.seed0"
+    assert replace(adapting(), what="65pokes").name == "adapt.paper.b1.b1_s1.65pokes.seed0"
