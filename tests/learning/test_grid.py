@@ -1,110 +1,207 @@
 from concurrent.futures import Executor, Future
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from pipeline import io
-from pipeline.errors import TrainingError
-from pipeline.learning.grid import Cell, cell_key, run_cells, train_cell
-from pipeline.seeds import rng_for
-from tests.learning.recipes import recipe
+from pipeline.errors import ReskinError, TrainingError
+from pipeline.learning.cell import Cell, Keys, Trained
+from pipeline.learning.executors import make_executor
+from pipeline.learning.grid import STACK_N, run_cells, stacks, train_stack
+from tests.learning.cells import adapting, few_labels, measured, pooled, without_triplets
+
+SIZE_N = STACK_N["cpu"]
+STACKED_ATOL = 1e-3  # mm, N: a cell in another stack is the same to float32 rounding of its weights (test_train.py)
 
 
 class Here(Executor):
-    """Runs at once, in this process, and counts; fails from the `die_after`-th call on."""
+    """Runs at once, in this process, and counts; from the `die_after`-th call on, workers are dead."""
 
-    def __init__(self, die_after: int = 10**9) -> None:
+    def __init__(self, die_after: int = 10**9, error: type[Exception] = BrokenProcessPool) -> None:
         self.calls_n = 0
         self.die_after = die_after
+        self.error = error
 
     def submit(self, fn, /, *args, **kwargs):
         self.calls_n += 1
         future: Future = Future()
         if self.calls_n > self.die_after:
-            future.set_exception(TrainingError("killed"))
+            future.set_exception(self.error("killed"))
             return future
         try:
             future.set_result(fn(*args, **kwargs))
-        except TrainingError as error:
+        except ReskinError as error:
             future.set_exception(error)
         return future
 
 
-def rows() -> tuple[np.ndarray, np.ndarray]:
-    rng = rng_for(0, "rows")
-    return rng.normal(0, 50, (40, 15)).astype(np.float32), rng.uniform(0, 16, (40, 3)).astype(np.float32)
+def cells(folds_n: int = 3, **changes: object) -> list[Cell]:
+    """A fold leaves some rows of each of two skins out."""
+    everyone = np.arange(24)
+    held = [np.array([i, i + 12]) for i in range(folds_n)]
+    one = replace(pooled(**changes), question="lobo")
+    return [replace(one, fold=f"b{i}", train=np.setdiff1d(everyone, test), test=test) for i, test in enumerate(held)]
 
 
-def cells(folds_n: int = 3, **changes) -> list[Cell]:
-    everyone = np.arange(40)
-    held = [np.arange(i * 10, (i + 1) * 10) for i in range(folds_n)]
-    return [
-        Cell("lobo", "paper", recipe(epochs_n=1, **changes), f"b{i}", 7, 0, np.setdiff1d(everyone, test), test)
-        for i, test in enumerate(held)
-    ]
+def run(
+    some: list[Cell], cache: Path, executor: Executor | None = None, said: list[str] | None = None
+) -> list[Trained]:
+    tell = (lambda line: None) if said is None else said.append
+    return run_cells(some, measured(), executor=executor or Here(), cache=cache, tell=tell)
 
 
-def run(some: list[Cell], cache, executor: Executor):
-    return run_cells(some, *rows(), executor=executor, cache=cache, tell=lambda line: None)
+def trainings_n(some: list[Cell], cache: Path) -> int:
+    """How many stacks are trained."""
+    executor = Here()
+    run(some, cache, executor)
+    return executor.calls_n
+
+
+def alike(one: Trained, other: Trained) -> bool:
+    weights = all((one.weights[name] == other.weights[name]).all() for name in one.weights)
+    return weights and (one.predicted == other.predicted).all() and one.curve == other.curve
 
 
 def test_results_come_in_the_order_of_cells_with_a_prediction_a_test_row(tmp_path):
-    done = run(cells(), tmp_path, Here())
-    assert [one.predicted.shape for one in done] == [(10, 3)] * 3
-    assert [one.key for one in done] == [cell_key(cell, *rows()) for cell in cells()]
+    some = [*cells(2), pooled(), *cells(5, steps_n=3), without_triplets(), adapting(), few_labels()]
+    done, keys = run(some, tmp_path), Keys(measured())
+    assert [one.key for one in done] == [keys.key(cell) for cell in some]
+    assert [one.predicted.shape for one in done] == [(len(cell.test), 3) for cell in some]
+    again = run(some[::-1], tmp_path)
+    assert all(alike(a, b) for a, b in zip(done, again[::-1], strict=True))
+
+
+def test_a_result_is_that_of_its_own_cell_whatever_it_was_stacked_with(tmp_path):
+    some = [*cells(2), pooled(), adapting(), cells(3)[2]]
+    for cell, one in zip(some, run(some, tmp_path), strict=True):
+        (alone,) = train_stack([cell], measured())
+        np.testing.assert_allclose(one.predicted, alone.predicted, rtol=0, atol=STACKED_ATOL)
+        assert (one.scaler.input_shift == alone.scaler.input_shift).all()
 
 
 def test_a_killed_grid_loses_no_finished_cell(tmp_path):
-    with pytest.raises(TrainingError, match="killed"):
-        run(cells(), tmp_path, Here(die_after=2))
-    again = Here()
-    done = run(cells(), tmp_path, again)
-    assert again.calls_n == 1
-    fresh = run(cells(), tmp_path / "other", Here())
-    assert all((a.predicted == b.predicted).all() for a, b in zip(done, fresh, strict=True))
+    some = cells(2 * SIZE_N + 1)
+    with pytest.raises(TrainingError):
+        run(some, tmp_path / "killed", Here(die_after=1))
+    assert trainings_n(some, tmp_path / "killed") == 2  # of three stacks
+    done, fresh = run(some, tmp_path / "killed"), run(some, tmp_path / "fresh")
+    assert all(alike(a, b) for a, b in zip(done, fresh, strict=True))
 
 
-def test_one_more_fold_costs_one_fold(tmp_path):
-    run(cells(2), tmp_path, Here())
-    more = Here()
-    run(cells(3), tmp_path, more)
-    assert more.calls_n == 1
+def test_a_dead_worker_is_one_sentence(tmp_path):
+    with pytest.raises(TrainingError, match=r"^training: a worker process must be alive to its end; got .* Run again"):
+        run(cells(), tmp_path, Here(die_after=0))
 
 
-def test_a_cell_is_known_by_all_that_decides_it():
-    cell = cells(1)[0]
-    db_uT, target = rows()
-    keys = {cell_key(cell, db_uT, target), cell_key(cells(1, batch_n=8)[0], db_uT, target)}
-    for changed in ("train", "test"):
-        other = db_uT.copy()
-        other[getattr(cell, changed)[0], 0] += 1
-        keys.add(cell_key(cell, other, target))
-    assert len(keys) == 4
+def test_a_training_that_cannot_be_is_one_sentence_that_names_its_cell(tmp_path):
+    with pytest.raises(TrainingError, match=r"^lobo.paper.b0.seed0, triplets of group 0: the places of its points"):
+        run([replace(cell, train=np.array([0, 0, 12])) for cell in cells(1)], tmp_path)
+
+
+def test_what_is_finished_is_not_trained_again(tmp_path):
+    said: list[str] = []
+    first = run(cells(), tmp_path)
+    again = run(cells(), tmp_path, Here(die_after=0), said)
+    assert all(alike(a, b) for a, b in zip(first, again, strict=True))
+    assert said == ["3 of 3 trainings were finished before"]
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        cells(3)[2],
+        replace(cells(1)[0], seed_i=1),
+        cells(1, steps_n=5)[0],
+        replace(cells(1)[0], recipe=without_triplets().recipe),
+    ],
+    ids=["fold", "seed", "schedule", "terms"],
+)
+def test_one_more_costs_one_training(tmp_path, more):
+    run(cells(2), tmp_path)
+    assert trainings_n([*cells(2), more], tmp_path) == 1
+    assert len(list(tmp_path.glob("*.safetensors"))) == 3
+
+
+def test_the_same_training_under_another_name_costs_none(tmp_path):
+    run(cells(1), tmp_path)
+    renamed = replace(cells(1)[0], question="sensors", recipe_name="twin", what="multi")
+    assert trainings_n([renamed], tmp_path) == 0
+
+
+def test_equal_trainings_of_one_run_are_trained_once(tmp_path):
+    one = cells(1)[0]
+    some = [one, replace(one, recipe_name="twin"), one]
+    done = run(some, tmp_path)
+    assert len(list(tmp_path.glob("*.safetensors"))) == 1
+    assert all(alike(done[0], other) for other in done[1:])
+
+
+def test_different_trainings_of_one_name_are_not_mixed_up(tmp_path):
+    one, other = cells(1)[0], cells(1, steps_n=3)[0]
+    assert one.name == other.name
+    done = run([one, other], tmp_path)
+    assert not alike(*done)
+    assert [training.key for training in done] == [Keys(measured()).key(cell) for cell in (one, other)]
+
+
+def test_rows_are_left_in_no_cache(tmp_path):
+    run(cells(), tmp_path)
+    assert [one for one in tmp_path.rglob("*.safetensors") if one.parent != tmp_path] == []
 
 
 def test_what_is_left_in_the_cache_opens_without_pickle(tmp_path):
-    run(cells(1), tmp_path, Here())
+    run(cells(1), tmp_path)
     (file,) = tmp_path.glob("*.safetensors")
     tensors, metadata = io.read_tensors(file)
-    assert tensors["weights.feat.0.weight"].shape == (200, 15)
+    assert tensors["weights.layer1.weight"].shape == (200, 15)
+    assert metadata["cell"] == "lobo.paper.b0.seed0"
     assert float(metadata["seconds"]) > 0
 
 
-def test_a_planted_leak_would_show_nothing_of_a_test_row_reaches_the_model():
-    (cell,) = cells(1)
-    db_uT, target = rows()
-    weights, scaler, curve, predicted = train_cell(cell, db_uT, target)
-    db_uT[cell.test] += 1e4
-    target[cell.test] -= 1e4
-    again, again_scaler, again_curve, again_predicted = train_cell(cell, db_uT, target)
-    assert all((weights[name] == again[name]).all() for name in weights)
-    assert all((a == b).all() for a, b in zip(scaler.arrays().values(), again_scaler.arrays().values(), strict=True))
-    assert curve == again_curve
-    assert (predicted != again_predicted).any()
+@pytest.mark.parametrize("cell", [pooled(), adapting(), few_labels()], ids=["pooled", "adapting", "few labels"])
+def test_a_result_survives_the_cache_whole(tmp_path, cell):
+    (direct,), (read,) = train_stack([cell], measured()), run([cell], tmp_path)
+    assert alike(direct, read)
+    assert all((a == read.scaler.arrays()[name]).all() for name, a in direct.scaler.arrays().items())
+    assert read.stopped_step is direct.stopped_step is None
 
 
-def test_a_cell_that_diverges_is_named_and_ends_the_grid(tmp_path):
-    with pytest.raises(
-        TrainingError, match=r"lobo.paper.b[012].seed0, epoch 1: the loss must be finite.*rate_max \(1e\+30\)"
-    ):
-        run(cells(rate_max=1e30, batch_n=4), tmp_path, Here())
+def test_a_cell_that_explodes_stands_with_its_last_finite_weights_and_says_so(tmp_path):
+    wild = cells(2, rate_max=1e30, batch_n=4)
+    for done in (run(wild, tmp_path), run(wild, tmp_path)):
+        assert [one.stopped_step for one in done] == [4, 4]
+        assert [one.curve for one in done] == [[], []]
+        assert all(np.isfinite(one.predicted).all() for one in done)
+
+
+def test_trainings_in_a_process_of_their_own_are_the_same(tmp_path, monkeypatch):
+    monkeypatch.setenv("RESKIN_EXECUTOR", "processes:1")
+    some = [adapting(), few_labels()]
+    with make_executor() as executor:
+        apart = run(some, tmp_path / "apart", executor)
+    assert all(alike(a, b) for a, b in zip(apart, run(some, tmp_path / "here"), strict=True))
+
+
+def test_recipes_of_equal_settings_are_stacked_and_others_are_not():
+    twin = [replace(cell, recipe_name="twin") for cell in cells(1)]
+    assert [len(stack) for stack in stacks([*cells(2), *twin], 3)] == [3]
+    others = [cells(1, steps_n=5)[0], without_triplets(), adapting(), adapting(unlabelled_weight=0.0), few_labels()]
+    assert [len(stack) for stack in stacks([*cells(1), *others], 3)] == [1] * 6
+
+
+@given(st.lists(st.integers(0, 4), max_size=20), st.integers(1, 5))
+def test_stacks_cover_every_cell_once_and_are_no_larger_than_asked(kinds, size_n):
+    settings = [{"steps_n": 3}, {"steps_n": 4}, {"rate_max": 1e-3}, {"architecture": "released"}, {"batch_n": 8}]
+    some = [replace(pooled(**settings[kind]), seed_i=i) for i, kind in enumerate(kinds)]
+    found = stacks(some, size_n)
+    assert sorted(cell.seed_i for stack in found for cell in stack) == list(range(len(some)))
+    for stack in found:
+        assert 1 <= len(stack) <= size_n
+        assert len({(kinds[cell.seed_i]) for cell in stack}) == 1
+    counts = [kinds.count(kind) for kind in set(kinds)]
+    assert len(found) == sum(-(-count // size_n) for count in counts)  # no stack is split without need
