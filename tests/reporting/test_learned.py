@@ -1,0 +1,128 @@
+"""Numbers of the questions about many skins, from cards small enough to be added up by hand."""
+
+import json
+
+import pytest
+
+from pipeline.reporting.learned import PAIRS, by_fold, learned
+
+HELD_OUT = {"b0": ("s0", "s1"), "b1": ("s2", "s3")}
+BETTER = {"s0": 2.0, "s1": 4.0, "s2": 6.0, "s3": 8.0}  # points that adaptation gains on each skin
+
+
+def scores(by_skin: dict[str, float]) -> dict:
+    own = {skin: {"accuracy_pct": pct, "mse_xy_mm2": 1.0, "mse_f_N2": 0.5} for skin, pct in by_skin.items()}
+    every = {"accuracy_pct": sum(by_skin.values()) / len(by_skin), "mse_xy_mm2": 1.0, "mse_f_N2": 0.5}
+    return {"all": every, "registered": every, "by_skin": own, "rows_n": 10 * len(own)}
+
+
+def card(question: str, fold: str, by_skin: dict[str, float], recipe: str = "paper", seed_i: int = 0) -> dict:
+    words = {"question": question, "recipe_name": recipe, "fold": fold, "seed_i": seed_i, "scores": scores(by_skin)}
+    return words | ({"tuning": {"pokes_n": 390}} if question == "adapt" else {})
+
+
+def of_boards(question: str, pct: float, recipe: str = "paper") -> list[dict]:
+    return [card(question, fold, dict.fromkeys(skins, pct), recipe) for fold, skins in HELD_OUT.items()]
+
+
+def of_skins(recipe: str, base_pct: float, times: float) -> list[dict]:
+    return [
+        card("adapt", fold, {skin: base_pct + times * BETTER[skin]}, recipe)
+        for fold, skins in HELD_OUT.items()
+        for skin in skins
+    ]
+
+
+CARDS = [
+    *of_boards("lobo", 80.0), *of_boards("triplet", 78.0),
+    *of_skins("paper", 78.0, 1.0), *of_skins("control", 78.0, 0.5),
+    *of_boards("lobo", 1.0, "released"), *of_boards("triplet", 2.0, "other"), *of_skins("other", 3.0, 1.0),
+]  # fmt: skip
+
+
+def numbers(cards: list[dict] = CARDS, **points: list[dict]) -> dict:
+    return learned(cards, points, headline="paper")
+
+
+def paired(of: str, over: str) -> dict:
+    (one,) = [one for one in numbers()["paired"] if (one["of"], one["over"]) == (of, over)]
+    return one
+
+
+def test_table_2_is_over_boards_and_adapted_skins_are_pooled_by_board():
+    table2 = numbers()["table2"]
+    assert table2.keys() == {"triplet", "adapted"}
+    assert table2["triplet"]["accuracy_pct"] == {"mean": 78.0, "n": 2, "sd": 0.0}
+    # board b0: 80 and 82, board b1: 84 and 86
+    assert table2["adapted"]["accuracy_pct"] == {"mean": 83.0, "n": 2, "sd": pytest.approx(8**0.5)}
+
+
+def test_the_control_stands_beside_adaptation_with_the_number_of_pokes():
+    assert numbers()["adapt"]["pokes_n"] == 390
+    assert numbers()["adapt"]["control"]["accuracy_pct"] == {"mean": 80.5, "n": 2, "sd": pytest.approx(2**0.5)}
+
+
+def test_pairs_are_over_the_held_out_skins_and_of_one_method_over_another():
+    assert [(one["of"], one["over"]) for one in numbers()["paired"]] == list(PAIRS)
+    # gains of 2, 4, 6 and 8 points
+    gain = {"mean": 5.0, "n": 4, "sd": pytest.approx((20 / 3) ** 0.5)}
+    assert paired("adapted", "triplet")["accuracy_pct"] == gain
+    assert paired("adapted", "control")["accuracy_pct"] == {"mean": 2.5, "n": 4, "sd": pytest.approx((5 / 3) ** 0.5)}
+    assert paired("triplet", "multi")["accuracy_pct"] == {"mean": -2.0, "n": 4, "sd": 0.0}
+    assert paired("adapted", "multi")["accuracy_pct"]["mean"] == 3.0
+    assert paired("control", "triplet")["accuracy_pct"]["mean"] == 2.5
+
+
+def test_a_question_that_was_not_asked_is_absent_and_not_null():
+    assert numbers([]) == {}
+    assert numbers(of_boards("lobo", 80.0)) == {}
+    without = numbers([*of_boards("lobo", 80.0), *of_boards("triplet", 78.0)])
+    assert without.keys() == {"table2", "paired"}
+    assert [(one["of"], one["over"]) for one in without["paired"]] == [("triplet", "multi")]
+    assert numbers(of_skins("paper", 78.0, 1.0)).keys() == {"table2"}
+    assert "null" not in json.dumps(numbers())
+
+
+def test_other_recipes_are_in_no_number():
+    assert numbers() == numbers([one for one in CARDS if one["recipe_name"] in ("paper", "control")])
+
+
+def test_cards_of_adapted_networks_are_given_by_fold_and_others_as_they_are():
+    assert [one["fold"] for one in by_fold(of_skins("paper", 78.0, 1.0))] == ["b0", "b1"]
+    assert by_fold(of_boards("lobo", 80.0)) == of_boards("lobo", 80.0)
+    assert by_fold([]) == []
+
+
+def point(pokes_n: int, skin_pct: dict[str, float], seed_i: int = 0) -> dict:
+    return card("pokes", "b1", skin_pct, seed_i=seed_i) | {"pokes_n": pokes_n}
+
+
+def test_a_sweep_over_pokes_is_in_their_order_and_starts_with_none():
+    points = [
+        point(390, {"s2": 90.0}), point(390, {"s3": 94.0}), point(65, {"s2": 80.0}), point(65, {"s3": 86.0}),
+        point(0, {"s2": 70.0, "s3": 72.0}), point(0, {"s2": 74.0, "s3": 76.0}, seed_i=1),
+    ]  # fmt: skip
+    sweep = numbers([], pokes=points)["sweep_pokes"]
+    assert [(one["pokes_n"], one["accuracy_pct"]["mean"]) for one in sweep] == [(0, 73.0), (65, 83.0), (390, 92.0)]
+    assert sweep[0]["accuracy_pct"] == {"mean": 73.0, "n": 1, "sd_seeds": pytest.approx(8**0.5)}
+
+
+def test_a_sweep_over_sensors_has_a_curve_for_each_method_over_draws():
+    points = [
+        card("sensors", f"{skins_n:02d}skins-draw{draw_i}", by_skin) | {"method": method, "trained_on_skins_n": skins_n}
+        for method, step_pct in (("multi", 0.0), ("triplet", 1.0), ("adapted", 2.0))
+        for skins_n in (3, 1)
+        for draw_i in range(2)
+        for by_skin in (
+            [{"s2": 50.0 + skins_n + step_pct + draw_i}, {"s3": 60.0 + skins_n + step_pct + draw_i}]
+            if method == "adapted"
+            else [{"s2": 50.0 + skins_n + step_pct + draw_i, "s3": 60.0 + skins_n + step_pct + draw_i}]
+        )
+    ]
+    sweep = numbers([], sensors=points)["sweep_sensors"]
+    assert [(one["method"], one["skins_n"], one["accuracy_pct"]["mean"]) for one in sweep] == [
+        ("multi", 1, 56.5), ("multi", 3, 58.5), ("triplet", 1, 57.5), ("triplet", 3, 59.5), ("adapted", 1, 58.5),
+        ("adapted", 3, 60.5),
+    ]  # fmt: skip
+    assert all(one["accuracy_pct"]["n"] == 2 for one in sweep)
+    assert all(one["accuracy_pct"]["sd"] == pytest.approx(0.5**0.5) for one in sweep)
