@@ -5,7 +5,7 @@ from torch import nn
 
 from pipeline.learning import model
 from pipeline.learning.architecture import LAYERS, draw_weights
-from pipeline.learning.model import Stack, predict
+from pipeline.learning.model import Predictor, Stack
 from pipeline.seeds import rng_for
 from tests.learning.plain import features_of, plain_net, weights_of
 
@@ -117,7 +117,8 @@ def test_the_released_network_answers_no_number_below_zero():
 def test_prediction_does_not_depend_on_the_block(monkeypatch, block_n):
     inputs = batch(1)[0].numpy()
     monkeypatch.setattr(model, "BLOCK_ROWS_N", block_n)
-    answers = predict(drawn(), "paper", inputs, "cpu")
-    one_by_one = np.concatenate([predict(drawn(), "paper", row[None], "cpu") for row in inputs])
+    predict = Predictor(drawn(), "paper", "cpu")
+    answers = predict(inputs)
+    one_by_one = np.concatenate([predict(row[None]) for row in inputs])
     np.testing.assert_allclose(answers, one_by_one, **CLOSE)
     np.testing.assert_allclose(answers, plain_net("paper", drawn())(torch.from_numpy(inputs)).detach(), **CLOSE)
