@@ -28,7 +28,7 @@ def choose(cards: Cards) -> dict[str, dict[str, Any]]:
     chosen["train_triplet"] = {
         "recipe_name": _settings(base)["base"],
         "settings": _trimmed(base["recipe"]),
-        "by": f"{BY} of the networks adapted from it",
+        "by": "MSE_xy of the networks adapted from it",
         "candidates": _candidates(triplets),
     }
     return chosen
@@ -54,7 +54,7 @@ def _best(cards: Cards, stage: str) -> dict[str, Any]:
     candidates = _candidates(cards)
     best = min(candidates, key=lambda one: one[BY]["mean"])["recipe_name"]
     card = next(card for card in cards if card["recipe_name"] == best)
-    return {"recipe_name": best, "settings": _trimmed(_settings(card)), "by": BY, "candidates": candidates}
+    return {"recipe_name": best, "settings": _trimmed(_settings(card)), "by": "MSE_xy", "candidates": candidates}
 
 
 def _candidates(cards: Cards) -> list[dict[str, Any]]:

@@ -94,7 +94,7 @@ def chosen_table(arms: Mapping[str, Any], source: str) -> pd.DataFrame:
     lines = []
     for arm, choice in arms.items():
         for row in choice["candidates"]:
-            chosen = "yes, by " + COLUMNS[choice["by"]] if row["recipe_name"] == choice["recipe_name"] else ""
+            chosen = f"yes, by {choice['by']}" if row["recipe_name"] == choice["recipe_name"] else ""
             line = {"arm": arm, "candidate": row["recipe_name"], "chosen": chosen, "source": source}
             lines.append(line | scores(row) | {"n": n_of(row)})
     return tabulate(lines)

@@ -197,9 +197,9 @@ def test_a_leak_that_nobody_knew_of_stands_out():
 
 def test_all_candidates_are_listed_and_the_chosen_one_is_marked_with_what_decided():
     candidates = [{"recipe_name": name, **row(80.0, error)} for name, error in (("slow", 0.4), ("fast", 0.3))]
-    arms = {"triplet": {"recipe_name": "fast", "by": "mse_xy_mm2", "candidates": candidates}}
+    arms = {"triplet": {"recipe_name": "fast", "by": "MSE_xy", "candidates": candidates}}
     table = chosen_table(arms, "simulated")
-    assert dict(zip(table["candidate"], table["chosen"], strict=True)) == {"slow": "", "fast": "yes, by MSE_xy, mm²"}
+    assert dict(zip(table["candidate"], table["chosen"], strict=True)) == {"slow": "", "fast": "yes, by MSE_xy"}
 
 
 def test_what_was_not_timed_here_has_a_dash():
@@ -226,7 +226,7 @@ def everything() -> dict:
         "baselines": [one | row(30.0)],
         "labels": [one | {"labels_n": 0, "as_labelled": row(30.0), "registered": row(42.0)}],
         "audit": [check],
-        "chosen": {"multi": {"recipe_name": "a", "by": "mse_xy_mm2", "candidates": [{"recipe_name": "a"} | row(80.0)]}},
+        "chosen": {"multi": {"recipe_name": "a", "by": "MSE_xy", "candidates": [{"recipe_name": "a"} | row(80.0)]}},
     }
 
 
