@@ -144,6 +144,22 @@ def scaled(job: Job, times: float) -> Job:
     return replace(job, labelled=replace(job.labelled, inputs=(job.labelled.inputs * times).astype(np.float32)))
 
 
+def test_weights_that_break_at_the_last_step_are_found_though_its_loss_was_finite():
+    """Pokes of 1e30 break the triplet term: the L2 loss of the same step knows nothing of it yet."""
+    job = some_job(terms=True)
+    job.unlabelled.inputs[:] *= 1e30
+    (outcome,) = run([job], recipe(steps_n=1), Terms(0.0, unlabelled=1.0))
+    assert (outcome.stopped_step, outcome.curve) == (1, [])
+    assert all((outcome.weights[name] == job.start[name]).all() for name in job.start)
+
+
+def test_a_loss_that_overflows_is_found_though_the_weights_are_finite():
+    job = some_job()
+    job.labelled.targets[:] *= 1e20  # squares are beyond float32, gradients are not
+    (outcome,) = run([job], recipe(steps_n=1))
+    assert (outcome.stopped_step, outcome.curve) == (1, [])
+
+
 def test_a_network_that_stops_late_is_as_it_was_a_block_before(monkeypatch):
     """Row 0 breaks the network, and is first drawn in the second block: until then nobody can tell."""
     n, schedule = 60, recipe(steps_n=170, batch_n=1)
