@@ -69,7 +69,8 @@ def test_lines_have_no_place_and_no_force():
 
 
 def test_pokes_are_scaled_as_the_start_was_and_each_point_names_its_row():
-    along = replace(lines(), row=np.array([40, 36, 40, 38, 36, 41]))
+    line_i, order_i = np.array([[0, 0, 0, 1, 1, 1], [0, 1, 2, 0, 2, 3]], np.int32)
+    along = Lines(np.array([40, 36, 38, 40, 36, 41]), line_i, order_i)
     scaler = replace(start().scaler, input_shift=np.arange(15, dtype=np.float32))
     job, used = make_job(tuned(adapting(along=along), start=replace(start(), scaler=scaler)), measured())
     assert used is scaler
@@ -77,7 +78,8 @@ def test_pokes_are_scaled_as_the_start_was_and_each_point_names_its_row():
     for point, row in enumerate(along.row):
         expected = [(db_uT[row, ch] - scaler.input_shift[ch]) / scaler.input_scale[ch] for ch in range(15)]
         assert job.unlabelled.inputs[job.unlabelled.row[point]].tolist() == expected
-    assert job.unlabelled.points.place[:, 0].tolist() == along.order_i.tolist()
+    assert job.unlabelled.points.place[:, 0].tolist() == order_i.tolist()
+    assert job.unlabelled.points.group.tolist() == line_i.tolist()
     assert len(job.unlabelled.inputs) == 4
 
 

@@ -190,8 +190,10 @@ def test_trainings_in_a_process_of_their_own_are_the_same(tmp_path, monkeypatch)
 def test_recipes_of_equal_settings_are_stacked_and_others_are_not():
     twin = [replace(cell, recipe_name="twin") for cell in cells(1)]
     assert [len(stack) for stack in stacks([*cells(2), *twin], 3)] == [3]
-    others = [cells(1, steps_n=5)[0], without_triplets(), adapting(), adapting(unlabelled_weight=0.0), few_labels()]
-    assert [len(stack) for stack in stacks([*cells(1), *others], 3)] == [1] * 6
+    released = replace(adapting(), recipe=pooled(architecture="released").recipe)
+    tuned = [adapting(), released, adapting(unlabelled_weight=0.0), few_labels()]
+    others = [cells(1, steps_n=5)[0], without_triplets(), *tuned]
+    assert [len(stack) for stack in stacks([*cells(1), *others], 3)] == [1] * 7
 
 
 @given(st.lists(st.integers(0, 4), max_size=20), st.integers(1, 5))
