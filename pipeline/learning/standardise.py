@@ -1,6 +1,6 @@
 """The scaler between uT, mm, N and what a network sees. In: training rows. Out: shifts and scales.
 
-Fitted on training rows only (tests/learning/test_grid.py plants the leak). Refuses to know networks and folds.
+Fitted on training rows only (tests/learning/test_cell.py plants the leak). Refuses to know networks and folds.
 """
 
 from collections.abc import Callable, Mapping
