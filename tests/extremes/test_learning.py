@@ -1,0 +1,117 @@
+"""Extreme trainings end as they should, and an engine that lets one through is found out."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.dataset import splits
+from pipeline.extremes import learning
+from pipeline.extremes.learning import fold_cases, learning_cases, loop_cases, scaling_cases, triplet_cases
+from pipeline.learning import feed, grid, model, standardise, train
+
+SEED = 2021
+DIVERGES_UNSEEN = "bottleneck scaled 1e3, learning rate 10"
+
+
+def broken(cases):
+    return {case.case for case in cases if not case.holds}
+
+
+@pytest.fixture(scope="module")
+def cases():
+    return learning_cases(SEED)
+
+
+def test_every_case_but_one_ends_as_it_should(cases):
+    assert broken(cases) <= {DIVERGES_UNSEEN}
+
+
+@pytest.mark.xfail(
+    strict=True,
+    raises=AssertionError,
+    reason="a loss that rises to 1e19 and falls to 1e2, as ReLUs die, is always finite",
+)
+def test_a_training_that_diverges_without_overflow_is_stopped(cases):
+    assert DIVERGES_UNSEEN not in broken(cases)
+
+
+def test_every_row_is_its_own_and_says_what_happened(cases):
+    assert len({case.case for case in cases}) == len(cases)
+    assert {case.area for case in cases} == {"learning"}
+    assert all(case.should and case.happened for case in cases)
+    assert all((case.error is None) == (case.limit is None) for case in cases)
+
+
+def test_the_same_seed_gives_the_same_words(cases):
+    assert set(triplet_cases(SEED)) <= set(cases)
+
+
+# Each fault is planted where the product has its guard.
+
+
+@pytest.mark.filterwarnings("ignore:invalid value encountered")
+@pytest.mark.filterwarnings("ignore:divide by zero encountered")
+def test_a_scale_without_a_floor_is_found_out(monkeypatch):
+    monkeypatch.setattr(standardise, "SCALE_FLOOR", np.float32(0))
+    constant = {"a channel that never moves", "no channel ever moves, as without a magnet"}
+    assert broken(scaling_cases(SEED)) == constant
+
+
+def test_a_floor_so_high_that_labels_stay_small_is_found_out(monkeypatch):
+    monkeypatch.setattr(standardise, "SCALE_FLOOR", np.float32(1e-3))
+    assert broken(scaling_cases(SEED)) == {"labels times 1e-06"}
+
+
+def test_a_triplet_loss_of_roots_is_found_out(monkeypatch):
+    def of_roots(anchor, positive, negative):
+        nearer, farther = ((anchor - one).pow(2).sum(-1).sqrt() for one in (positive, negative))
+        return torch.relu(nearer - farther + 1e-3).mean(-1)
+
+    monkeypatch.setattr(train, "triplet", of_roots)
+    assert broken(triplet_cases(SEED)) == {"triplets of identical readings, weighed 1000"}
+
+
+def test_a_sampler_that_takes_ties_is_found_out(monkeypatch):
+    monkeypatch.setattr(feed, "draw_pairs", lambda points, anchor, rng: (anchor, anchor))
+    assert broken(triplet_cases(SEED)) == {"two pokes a skin: from each, only the other one"}
+
+
+def test_a_loop_that_never_looks_at_its_loss_is_found_out(monkeypatch):
+    def blind(self, error, step):
+        for i in range(len(error)):
+            self.curves[i].append(float(error[i]))
+            self.last[i] = self.net.member(i)
+        return True
+
+    monkeypatch.setattr(train.Watch, "look", blind)
+    stops = {"bottleneck scaled 1e3, learning rate 1e+10", "a network that overflows beside one that does not"}
+    assert broken(loop_cases(SEED)) - {DIVERGES_UNSEEN} == stops
+
+
+def test_a_network_that_touches_its_neighbour_is_found_out(monkeypatch):
+    right = model.Stack.features
+
+    def mixed(self, inputs):
+        features = right(self, inputs)
+        return features + 0 * features.sum(0, keepdim=True)
+
+    monkeypatch.setattr(model.Stack, "features", mixed)
+    assert broken(loop_cases(SEED)) - {DIVERGES_UNSEEN} == {"a network that overflows beside one that does not"}
+
+
+def test_a_batch_that_ignores_the_seed_is_found_out(monkeypatch):
+    right = grid.make_job
+
+    def of_no_seed(cell, rows):
+        job, scaler = right(replace(cell, seed_i=0), rows)
+        return job, scaler
+
+    monkeypatch.setattr(grid, "make_job", of_no_seed)
+    assert broken(loop_cases(SEED)) - {DIVERGES_UNSEEN} == {"trained twice from one seed"}
+
+
+def test_folds_that_are_drawn_from_too_few_groups_are_found_out(monkeypatch):
+    monkeypatch.setattr(learning, "draw_folds", lambda *_: [splits.NO_POOL])
+    assert len(broken(fold_cases())) == 3
