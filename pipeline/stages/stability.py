@@ -1,18 +1,22 @@
-"""Stage stability: stiff and extreme cases of skins, chips and wires -> the rows of one table."""
+"""Stage stability: stiff and extreme cases of skins, chips, wires and learning -> the rows of one table."""
 
 from dataclasses import asdict
 from pathlib import Path
 
 from pipeline import io
 from pipeline.evaluation.stability.survey import survey
+from pipeline.extremes.learning import learning_cases
 from pipeline.stages._run import run, say
 from pipeline.stages._simulated import read_synthesis
 
 
 def stability(scene: str, settings: Path, answer: Path) -> None:
-    """Try every case on the scene's own skins and chips, and write down what happened."""
+    """Try every case on the scene's own skins and chips and on small trainings, and write down what happened."""
     of, seed = read_synthesis(settings)
-    cases = survey(of.main_boards.design, of.spreads, skin=of.skin, chip=of.chip, seed=seed)
+    cases = [
+        *survey(of.main_boards.design, of.spreads, skin=of.skin, chip=of.chip, seed=seed),
+        *learning_cases(seed),
+    ]
     io.write_json(answer, [asdict(case) for case in cases])
     for case in cases:
         if not case.holds:
