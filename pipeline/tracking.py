@@ -8,13 +8,13 @@ one child a training. Published after training and from files, so a server that 
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from pipeline import io
-from pipeline.evaluation.summary import over_folds
+from pipeline.evaluation.summary import over_folds, pool_skins
 from pipeline.server import TrackingAway, probe, server_uri
 
 STORE = "mlflow.db"
@@ -26,10 +26,14 @@ def tracking_uri(root: Path) -> str:
     return server_uri() or f"sqlite:///{(root / STORE).resolve()}"
 
 
-def publish(arms: Mapping[str, Path], figures: Path, *, scene: str, root: Path) -> dict[str, int]:
+# of a sweep: its points, each the name of its curve, its step (pokes, skins) and its means
+Curves = Mapping[str, Sequence[tuple[str, int, Mapping[str, float]]]]
+
+
+def publish(arms: Mapping[str, Path], curves: Curves, figures: Path, *, scene: str, root: Path) -> dict[str, int]:
     """Write every training of a scene to MLflow once, and its figures to the parents; `arms` maps stage to models.
 
-    Returns counts of new, kept and superseded runs; raises `TrackingAway` if the server does not answer.
+    A sweep is one run whose metrics go over its steps: hundreds of children would hide the others. Returns counts of new, kept and superseded runs; raises `TrackingAway` if the server does not answer.
     """
     uri = tracking_uri(root)
     probe(uri)
@@ -49,6 +53,10 @@ def publish(arms: Mapping[str, Path], figures: Path, *, scene: str, root: Path) 
             _log_means(client, parent_id, list(cards.values()))
             client.log_artifacts(parent_id, str(figures), "figures")
             client.set_terminated(parent_id)
+        for stage, points in curves.items():
+            key = hashlib.sha256(json.dumps([stage, points]).encode()).hexdigest()[:32]
+            _publish_curve(client, _open_parent(client, experiment_id, stage, scene, key), points, figures)
+            current.add(key)
         counts["superseded_n"] = _mark_superseded(client, experiment_id, current)
     return counts
 
@@ -129,7 +137,8 @@ def _log(client: Any, run_id: str, card: dict[str, Any]) -> None:
     from mlflow.entities import Metric, Param
 
     known = {"fold": card["fold"], "seed_i": card["seed_i"], "seed": card["seed"], **card["recipe"]}
-    known |= {name: card[name] for name in ("train_rows_n", "train_boards", "test_boards")}
+    known |= {name: card[name] for name in ("train_rows_n", "train_boards", "test_boards", "test_skins")}
+    known |= {f"adapt_{name}": value for name, value in card.get("tuning", {}).get("settings", {}).items()}
     parameters = [Param(name, str(value)[:500]) for name, value in known.items()]
     curve = [Metric("train_loss", value, 0, step) for step, value in enumerate(card["curve"])]
     parts = (("", "all"), ("registered_", "registered"))
@@ -137,6 +146,17 @@ def _log(client: Any, run_id: str, card: dict[str, Any]) -> None:
     client.log_batch(run_id, metrics=scores, params=parameters)
     for start in range(0, len(curve), 1000):  # MLflow takes at most 1000 metrics a call
         client.log_batch(run_id, metrics=curve[start : start + 1000])
+
+
+def _publish_curve(
+    client: Any, run_id: str, points: Sequence[tuple[str, int, Mapping[str, float]]], figures: Path
+) -> None:
+    from mlflow.entities import Metric
+
+    metrics = [Metric(f"{curve}.{name}", value, 0, step) for curve, step, own in points for name, value in own.items()]
+    client.log_batch(run_id, metrics=metrics)
+    client.log_artifacts(run_id, str(figures), "figures")
+    client.set_terminated(run_id)
 
 
 def _set_tags(client: Any, run: Any, tags: dict[str, str]) -> None:
@@ -152,7 +172,7 @@ def _log_means(client: Any, run_id: str, cards: list[dict[str, Any]]) -> None:
     metrics = []
     for question, recipe in sorted({(card["question"], card["recipe_name"]) for card in cards}):
         own = [card for card in cards if (card["question"], card["recipe_name"]) == (question, recipe)]
-        for name, summary in over_folds(own).items():
+        for name, summary in over_folds(pool_skins(own) if "tuning" in own[0] else own).items():
             metrics += [Metric(f"{question}.{recipe}.{name}.{key}", value, 0, 0) for key, value in summary.items()]
     client.log_batch(run_id, metrics=metrics)
 

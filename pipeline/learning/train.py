@@ -18,13 +18,15 @@ from pipeline.learning.model import Stack
 from pipeline.learning.recipe import Schedule
 
 BLOCK_STEPS_N = 50  # batches drawn at once, and how often the loss is looked at
+LOST = 1e8  # mean squared error past which a network is lost, where answering the mean has 1; few come back from it
 
 
 @dataclass(frozen=True)
 class Outcome:
     """A trained network, and the mean L2 loss of every block of steps (scaled units).
 
-    `stopped_step` says when a loss or a weight was no longer finite; the weights are then the last finite ones.
+    `stopped_step` says when a loss or a weight was no longer finite, or the loss past `LOST`; the weights are then the
+    last ones before.
     """
 
     weights: Weights
@@ -63,7 +65,7 @@ def train(jobs: Sequence[Job], architecture: str, schedule: Schedule, terms: Ter
 
 
 class Watch:
-    """Remembers each network's curve and its last finite weights."""
+    """Remembers each network's curve and its last sound weights."""
 
     def __init__(self, net: Stack) -> None:
         self.net = net
@@ -72,17 +74,17 @@ class Watch:
         self.stopped: dict[int, int] = {}
 
     def look(self, error: Float[torch.Tensor, " m"], step: int) -> bool:
-        """Note a block's mean errors; false when no network of the stack is finite any more."""
-        finite = (self.net.finite() & torch.isfinite(error)).tolist()
-        for i in set(range(len(finite))) - set(self.stopped):
-            if finite[i]:
+        """Note a block's mean errors; false when no network of the stack is sound any more."""
+        sound = (self.net.finite() & (error <= LOST)).tolist()  # of NaN, nothing is true
+        for i in set(range(len(sound))) - set(self.stopped):
+            if sound[i]:
                 self.curves[i].append(float(error[i]))
                 self.last[i] = self.net.member(i)
             else:
                 self.stopped[i] = step
-        return len(self.stopped) < len(finite)
+        return len(self.stopped) < len(sound)
 
     def outcomes(self) -> list[Outcome]:
-        """Give every network as it was when it was last finite."""
+        """Give every network as it was when it was last sound."""
         parts = zip(self.last, self.curves, strict=True)
         return [Outcome(weights, curve, self.stopped.get(i)) for i, (weights, curve) in enumerate(parts)]

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int64, Shaped
 from pipeline.errors import TrainingError, complain
 
 ROUNDS_MAX_N = 100  # with half of the draws tied, 1e-30 of the anchors are left after so many
-TIED = 1e-6  # of a squared distance; places are float32 numbers of a few mm
+TIED = 1e-5  # of the sum of both squared distances; places are float32 numbers, equal distances differ by 1e-6
 
 Pairs = tuple[Int64[np.ndarray, " b"], Int64[np.ndarray, " b"]]
 
@@ -64,7 +64,7 @@ def draw_pairs(points: Points, anchor: Int64[np.ndarray, " b"], rng: np.random.G
         other_d2 = ((points.place[other] - points.place[own]) ** 2).sum(axis=1)
         near = one_d2 < other_d2
         positive[left], negative[left] = np.where(near, one, other), np.where(near, other, one)
-        tied = (np.abs(one_d2 - other_d2) <= TIED) | (one == own) | (other == own)
+        tied = (np.abs(one_d2 - other_d2) <= TIED * (one_d2 + other_d2)) | (one == own) | (other == own)
         left = left[tied]
         if not len(left):
             return positive, negative

@@ -58,5 +58,5 @@ def train_all(at: Scenery, cells: Sequence[Cell], stage: str) -> list[Trained]:
         )
     for cell, one in zip(cells, trained, strict=True):
         if one.stopped_step is not None:
-            say(f"warning: {at.scene} {stage}: {cell.name} was not finite at step {one.stopped_step}: kept as before")
+            say(f"warning: {at.scene} {stage}: {cell.name} diverged by step {one.stopped_step}: kept as it was before")
     return trained

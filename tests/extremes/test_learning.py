@@ -12,7 +12,7 @@ from pipeline.extremes.learning import fold_cases, learning_cases, loop_cases, s
 from pipeline.learning import feed, grid, model, standardise, train
 
 SEED = 2021
-DIVERGES_UNSEEN = "bottleneck scaled 1e3, learning rate 10"
+DIVERGES = "bottleneck scaled 1e3, learning rate 10"
 
 
 def broken(cases):
@@ -25,16 +25,7 @@ def cases():
 
 
 def test_every_case_but_one_ends_as_it_should(cases):
-    assert broken(cases) <= {DIVERGES_UNSEEN}
-
-
-@pytest.mark.xfail(
-    strict=True,
-    raises=AssertionError,
-    reason="a loss that rises to 1e19 and falls to 1e2, as ReLUs die, is always finite",
-)
-def test_a_training_that_diverges_without_overflow_is_stopped(cases):
-    assert DIVERGES_UNSEEN not in broken(cases)
+    assert broken(cases) == set()
 
 
 def test_every_row_is_its_own_and_says_what_happened(cases):
@@ -87,7 +78,7 @@ def test_a_loop_that_never_looks_at_its_loss_is_found_out(monkeypatch):
 
     monkeypatch.setattr(train.Watch, "look", blind)
     stops = {"bottleneck scaled 1e3, learning rate 1e+10", "a network that overflows beside one that does not"}
-    assert broken(loop_cases(SEED)) - {DIVERGES_UNSEEN} == stops
+    assert broken(loop_cases(SEED)) - {DIVERGES} == stops
 
 
 def test_a_network_that_touches_its_neighbour_is_found_out(monkeypatch):
@@ -98,7 +89,7 @@ def test_a_network_that_touches_its_neighbour_is_found_out(monkeypatch):
         return features + 0 * features.sum(0, keepdim=True)
 
     monkeypatch.setattr(model.Stack, "features", mixed)
-    assert broken(loop_cases(SEED)) - {DIVERGES_UNSEEN} == {"a network that overflows beside one that does not"}
+    assert broken(loop_cases(SEED)) - {DIVERGES} == {"a network that overflows beside one that does not"}
 
 
 def test_a_batch_that_ignores_the_seed_is_found_out(monkeypatch):
@@ -109,7 +100,7 @@ def test_a_batch_that_ignores_the_seed_is_found_out(monkeypatch):
         return job, scaler
 
     monkeypatch.setattr(grid, "make_job", of_no_seed)
-    assert broken(loop_cases(SEED)) - {DIVERGES_UNSEEN} == {"trained twice from one seed"}
+    assert broken(loop_cases(SEED)) - {DIVERGES} == {"trained twice from one seed"}
 
 
 def test_folds_that_are_drawn_from_too_few_groups_are_found_out(monkeypatch):
