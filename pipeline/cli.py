@@ -12,7 +12,7 @@ import typer
 
 from pipeline import adding, io, plan, preparing
 from pipeline.errors import ParamsError, ReskinError, complain
-from pipeline.params import arms_of, read_scene
+from pipeline.params import modelled, read_scene, swept
 from pipeline.server import TrackingAway
 from pipeline.strict import read_yaml
 
@@ -151,15 +151,20 @@ def decode(
 @app.command()
 def publish() -> None:
     """Write to MLflow what is not there yet, from the models of the scenes that run."""
+    from pipeline.stages.publish import read_curves
     from pipeline.tracking import publish as write
 
     for scene in plan.check(ROOT).scenes:
-        arms = {arm: ROOT / "data/models" / scene / arm for arm in arms_of(read_scene(plan.scene_file(ROOT, scene)))}
-        if not all(models.is_dir() for models in arms.values()):
-            typer.echo(f"{scene}: no models yet; run dvc repro first")
+        asked, answers = read_scene(plan.scene_file(ROOT, scene)), ROOT / "data/answers" / scene
+        arms = {arm: ROOT / "data/models" / scene / arm for arm in modelled(asked)}
+        missing = [path for path in [*arms.values(), *(answers / f"{one}.json" for one in swept(asked).values())]
+                   if not path.exists()]  # fmt: skip
+        if missing:
+            typer.echo(f"{scene}: {missing[0].relative_to(ROOT)} is not there yet; run dvc repro first")
             continue
         try:
-            counts = write(arms, ROOT / "reports" / scene / "figures", scene=scene, root=ROOT)
+            curves = read_curves(asked, answers)
+            counts = write(arms, curves, ROOT / "reports" / scene / "figures", scene=scene, root=ROOT)
         except TrackingAway as away:
             typer.echo(f"error: {away}", err=True)
             sys.exit(3)

@@ -33,7 +33,8 @@ Curves = Mapping[str, Sequence[tuple[str, int, Mapping[str, float]]]]
 def publish(arms: Mapping[str, Path], curves: Curves, figures: Path, *, scene: str, root: Path) -> dict[str, int]:
     """Write every training of a scene to MLflow once, and its figures to the parents; `arms` maps stage to models.
 
-    A sweep is one run whose metrics go over its steps: hundreds of children would hide the others. Returns counts of new, kept and superseded runs; raises `TrackingAway` if the server does not answer.
+    A sweep is one run whose metrics go over its steps: hundreds of children would hide the others.
+    Returns counts of new, kept and superseded runs; raises `TrackingAway` if the server does not answer.
     """
     uri = tracking_uri(root)
     probe(uri)
@@ -55,7 +56,8 @@ def publish(arms: Mapping[str, Path], curves: Curves, figures: Path, *, scene: s
             client.set_terminated(parent_id)
         for stage, points in curves.items():
             key = hashlib.sha256(json.dumps([stage, points]).encode()).hexdigest()[:32]
-            _publish_curve(client, _open_parent(client, experiment_id, stage, scene, key), points, figures)
+            if _find(client, experiment_id, stage, key) is None:
+                _publish_curve(client, _open_parent(client, experiment_id, stage, scene, key), points, figures)
             current.add(key)
         counts["superseded_n"] = _mark_superseded(client, experiment_id, current)
     return counts

@@ -38,7 +38,8 @@ def dead_address() -> str:
 def write_model(models: Path, name: str, key: str, accuracy_pct: float = 50.0) -> None:
     card = {
         "scene": "ci", "question": "lobo", "recipe_name": "paper", "fold": name, "git": "abc", "key": key, "seed": 1,
-        "seed_i": 0, "recipe": {"epochs_n": 3}, "train_rows_n": 4, "train_boards": ["b1"], "test_boards": ["b0"],
+        "seed_i": 0, "recipe": {"steps_n": 3}, "train_rows_n": 4, "train_boards": ["b1"], "test_boards": ["b0"],
+        "test_skins": ["s0"],
         "curve": [3.0, 2.0, 1.0],
         "scores": {"all": {"accuracy_pct": accuracy_pct}, "registered": {"accuracy_pct": 60.0}, "by_skin": {}},
     }  # fmt: skip
@@ -52,7 +53,7 @@ def write(root: Path, **keys: str) -> dict[str, int]:
         write_model(root / "models", name, key)
     (root / "figures").mkdir(exist_ok=True)
     (root / "figures/a.svg").write_text("<svg/>")
-    return publish({"train_multi": root / "models"}, root / "figures", scene="ci", root=root)
+    return publish({"train_multi": root / "models"}, {}, root / "figures", scene="ci", root=root)
 
 
 def runs(root: Path, query: str) -> list:
@@ -73,7 +74,7 @@ def test_every_training_is_a_child_run_once_however_often_it_is_published(tmp_pa
     client = mlflow.MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
     run = children[0]
     assert run.data.metrics == {"accuracy_pct": 50.0, "registered_accuracy_pct": 60.0, "train_loss": 1.0}
-    assert run.data.params["epochs_n"] == "3"
+    assert run.data.params["steps_n"] == "3"
     assert [point.value for point in client.get_metric_history(run.info.run_id, "train_loss")] == [3.0, 2.0, 1.0]
     assert len(client.list_artifacts(run.info.run_id, "model")) == 2
     assert [one.path for one in client.list_artifacts(parent.info.run_id, "figures")] == ["figures/a.svg"]
@@ -95,14 +96,26 @@ def test_a_new_score_replaces_the_old_one_and_a_dropped_question_is_not_current(
     write(tmp_path, b0="k0", b1="k1")
     # The same training, scored anew: the old score is not what is shown.
     write_model(tmp_path / "models", "b1", "k1", accuracy_pct=77.0)
-    counts = publish({"train_multi": tmp_path / "models"}, tmp_path / "figures", scene="ci", root=tmp_path)
+    counts = publish({"train_multi": tmp_path / "models"}, {}, tmp_path / "figures", scene="ci", root=tmp_path)
     assert counts == {"new_n": 1, "kept_n": 1, "superseded_n": 2}
     current = runs(tmp_path, "tags.kind = 'training' and tags.current = 'true'")
     assert sorted(run.data.metrics["accuracy_pct"] for run in current) == [50.0, 77.0]
 
     # A question that is asked no more has no current runs.
-    publish({}, tmp_path / "figures", scene="ci", root=tmp_path)
+    publish({}, {}, tmp_path / "figures", scene="ci", root=tmp_path)
     assert runs(tmp_path, "tags.current = 'true'") == []
+
+
+def test_a_sweep_is_one_run_whose_metrics_go_over_its_steps(tmp_path):
+    (tmp_path / "figures").mkdir()
+    (tmp_path / "figures/a.svg").write_text("<svg/>")
+    curves = {"sweep_pokes": [("adapted", 0, {"accuracy_pct": 60.0}), ("adapted", 65, {"accuracy_pct": 70.0})]}
+    publish({}, curves, tmp_path / "figures", scene="ci", root=tmp_path)
+    publish({}, curves, tmp_path / "figures", scene="ci", root=tmp_path)
+    (run,) = runs(tmp_path, "tags.stage = 'sweep_pokes' and tags.current = 'true'")
+    client = mlflow.MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
+    history = client.get_metric_history(run.info.run_id, "adapted.accuracy_pct")
+    assert [(point.step, point.value) for point in history] == [(0, 60.0), (65, 70.0)]
 
 
 def test_a_store_that_is_broken_costs_no_result(tmp_path):

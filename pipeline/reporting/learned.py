@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.evaluation.metrics import METRICS
 from pipeline.evaluation.summary import over_folds, paired, pool_skins
 
 Cards = Sequence[dict[str, Any]]
@@ -45,6 +46,21 @@ def learned(cards: Cards, points: Mapping[str, Cards], *, headline: str) -> dict
     return numbers
 
 
+def curves_of(points: Mapping[str, Cards]) -> dict[str, list[tuple[str, int, dict[str, float]]]]:
+    """Give the points of sweeps as curves: by question, the method, the step on its axis, the mean of each score."""
+    numbers = learned([], points, headline="")
+    axes = {
+        "pokes": ("sweep_pokes", "pokes_n"),
+        "sensors": ("sweep_sensors", "skins_n"),
+        "labels": ("labels", "labels_n"),
+    }
+    curves = {}
+    for question, (key, axis) in axes.items():
+        if key in numbers:
+            curves[question] = [(_curve_name(row), row[axis], _score_means(row)) for row in numbers[key]]
+    return curves
+
+
 def timed_learning(numbers: Mapping[str, Any], seconds: Mapping[str, Seconds]) -> dict[str, Any]:
     """Put what was timed here, by stage and name of a training, beside the errors; what was not has no time."""
     joined: dict[str, Any] = {}
@@ -62,6 +78,15 @@ def timed_learning(numbers: Mapping[str, Any], seconds: Mapping[str, Seconds]) -
 def by_fold(cards: Cards) -> Cards:
     """Give cards by fold: those of networks adapted to one skin each are put together."""
     return pool_skins(cards) if cards and cards[0]["question"] == "adapt" else cards
+
+
+def _curve_name(row: Mapping[str, Any]) -> str:
+    words = (row.get("method", "adapted"), row.get("inputs", ""))
+    return "_".join(word for word in words if word).replace(", ", "_").replace(" ", "_").replace("+", "and")
+
+
+def _score_means(row: Mapping[str, Any]) -> dict[str, float]:
+    return {name: row.get("as_labelled", row)[name]["mean"] for name in METRICS if name in row.get("as_labelled", row)}
 
 
 def _rows(cards: Cards, headline: str) -> dict[str, Cards]:

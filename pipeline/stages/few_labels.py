@@ -7,11 +7,11 @@ import numpy as np
 
 from pipeline import io
 from pipeline.evaluation.summary import score_groups
+from pipeline.learning import few_labels as few
 from pipeline.learning.baselines import run_tasks
 from pipeline.learning.cell import Measured
 from pipeline.learning.comparison import FewLabels
 from pipeline.learning.executors import make_executor
-from pipeline.stages import _few
 from pipeline.stages._run import run, say
 from pipeline.stages._train import Scenery, read_scenery, train_all
 from pipeline.strict import parse
@@ -21,13 +21,14 @@ def few_labels(scene: str, settings: Path, indentations: Path, folds: Path, scor
     """Score networks, adapted networks and classical methods with every number of labels on the same rows."""
     at = read_scenery(scene, settings, indentations, folds)
     asked = parse(FewLabels, at.asked.few_labels, f"{settings}: few_labels")
-    done: list[_few.Done] = []
-    for step in (_few.networks, _few.adapted, _few.labelled):  # each goes on from what the last ones trained
-        pairs = step(at, asked, done)
+    study = few.Study(at.rows, at.of(few.QUESTION), at.asked.seed, asked)
+    done: list[few.Done] = []
+    for step in (few.networks, few.adapted, few.labelled):  # each goes on from what the last ones trained
+        pairs = step(study, done)
         trained = train_all(at, [cell for _, cell in pairs], "few_labels")
         done = [*done, *((tried, cell, one) for (tried, cell), one in zip(pairs, trained, strict=True))]
     points = [_point(at, tried, one.predicted) for tried, _, one in done]
-    tasks = _few.classical(at, asked)
+    tasks = few.classical(study)
     rows = Measured(at.rows.db_uT, at.rows.target, at.rows.skin)
     with make_executor() as executor:
         fitted = run_tasks([task for _, task in tasks], rows, executor, lambda line: say(f"{scene} few_labels: {line}"))
@@ -35,7 +36,7 @@ def few_labels(scene: str, settings: Path, indentations: Path, folds: Path, scor
     io.write_json(scores, points)
 
 
-def _point(at: Scenery, tried: _few.Tried, predicted: np.ndarray) -> dict[str, Any]:
+def _point(at: Scenery, tried: few.Tried, predicted: np.ndarray) -> dict[str, Any]:
     test = tried.fold.test
     board, draw = tried.fold.name.rsplit("-draw", 1)
     words = {"method": tried.method, "inputs": tried.inputs, "labels_n": tried.labels_n, "fold": board}

@@ -1,20 +1,31 @@
-"""Stage publish: models and figures -> the MLflow diary. No output: nothing reads the diary back."""
+"""Stage publish: models, points of sweeps and figures -> the MLflow diary. No output: nothing reads the diary back."""
 
 from pathlib import Path
 
-from pipeline.params import modelled, read_scene
+from pipeline import io
+from pipeline.params import Scene, modelled, read_scene, swept
+from pipeline.reporting.learned import curves_of
 from pipeline.server import TrackingAway
 from pipeline.stages._run import run, say
+from pipeline.tracking import Curves
 from pipeline.tracking import publish as write
 
 
-def publish(scene: str, settings: Path, models: Path, figures: Path) -> None:
+def publish(scene: str, settings: Path, models: Path, answers: Path, figures: Path) -> None:
     """Write every training of a scene to MLflow once; if the server is away, say so and go on."""
-    arms = {arm: models / arm for arm in modelled(read_scene(settings))}
+    asked = read_scene(settings)
+    arms = {arm: models / arm for arm in modelled(asked)}
     try:
-        say(f"{scene}: MLflow runs {write(arms, figures, scene=scene, root=Path())}")
+        say(f"{scene}: MLflow runs {write(arms, read_curves(asked, answers), figures, scene=scene, root=Path())}")
     except TrackingAway as away:
         say(f"warning: {scene} is not in MLflow: {away}")
+
+
+def read_curves(asked: Scene, answers: Path) -> Curves:
+    """Read the points of every sweep, as curves by stage."""
+    stages = swept(asked)
+    points = {question: io.read_json(answers / f"{stage}.json") for question, stage in stages.items()}
+    return {stages[question]: rows for question, rows in curves_of(points).items()}
 
 
 if __name__ == "__main__":

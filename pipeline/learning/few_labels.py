@@ -1,0 +1,111 @@
+"""What a few labels of a new board are tried on. In: rows, folds, settings. Out: networks, adapted and labelled ones.
+
+Refuses to know how they are run and scored.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Int64
+
+from pipeline.dataset.lines import grid_lines
+from pipeline.dataset.rows import Rows
+from pipeline.dataset.splits import Fold
+from pipeline.learning.baselines import Task
+from pipeline.learning.cell import Adapting, Cell, FewLabels, Start, Trained
+from pipeline.learning.comparison import FewLabels as Settings
+from pipeline.seeds import rng_for
+
+QUESTION = "labels"
+
+
+@dataclass(frozen=True)
+class Study:
+    """Rows, the folds of the question, the scene's seed, and what is at.asked."""
+
+    rows: Rows
+    folds: Sequence[Fold]
+    seed: int
+    asked: Settings
+
+
+@dataclass(frozen=True)
+class Tried:
+    """One entry of the table: a method on a fold with so many labels."""
+
+    method: str
+    inputs: str
+    labels_n: int
+    fold: Fold
+
+
+Done = tuple[Tried, Cell, Trained]
+
+
+def networks(at: Study, done: Sequence[Done]) -> list[tuple[Tried, Cell]]:
+    """Train every recipe on every fold."""
+    return [
+        (
+            Tried(name, recipe.inputs, 0, fold),
+            Cell(QUESTION, name, recipe, fold.name, at.seed, 0, fold.train, fold.test),
+        )
+        for fold in at.folds
+        for name, recipe in at.asked.recipes.items()
+    ]
+
+
+def adapted(at: Study, done: Sequence[Done]) -> list[tuple[Tried, Cell]]:
+    """Adapt the named recipes by all pokes of the pool, unlabelled."""
+    return [
+        (
+            Tried(f"{tried.method}, adapted", tried.inputs, 0, tried.fold),
+            _tuned(at, cell, Adapting(_start(one), at.asked.adapting, grid_lines(at.rows, tried.fold.pool)), "adapted"),
+        )
+        for tried, cell, one in done
+        if cell.recipe_name in at.asked.adapted
+    ]
+
+
+def labelled(at: Study, done: Sequence[Done]) -> list[tuple[Tried, Cell]]:
+    """Fine-tune every network on every number of labelled pokes."""
+    return [
+        (
+            Tried(tried.method, tried.inputs, labels_n, tried.fold),
+            _tuned(at, cell, FewLabels(_start(one), at.asked.labelling, own), f"{cell.what}{labels_n}labels"),
+        )
+        for tried, cell, one in done
+        for labels_n, own in _own(at, tried.fold).items()
+        if labels_n
+    ]
+
+
+def classical(at: Study) -> list[tuple[Tried, Task]]:
+    """Fit every classical method with every number of labelled pokes."""
+    return [
+        (
+            Tried(one.words, one.inputs, labels_n, fold),
+            Task(f"{name}.{fold.name}.{labels_n}", one, fold.train, fold.test, own, at.asked.rows_max_n, at.seed),
+        )
+        for fold in at.folds
+        for name, one in at.asked.methods.items()
+        for labels_n, own in _own(at, fold).items()
+    ]
+
+
+def _own(at: Study, fold: Fold) -> Mapping[int, Int64[np.ndarray, " o"]]:
+    """Choose the labelled pokes of the pool at random, the fewer among the more; give their rows."""
+    indentations = np.unique(at.rows.indentation[fold.pool])
+    order = rng_for(at.seed, "labelled", fold.name).permutation(indentations)
+    return {n: fold.pool[np.isin(at.rows.indentation[fold.pool], order[:n])] for n in at.asked.labels_n}
+
+
+def _start(one: Trained) -> Start:
+    return Start(one.key, one.weights, one.scaler)
+
+
+def _tuned(at: Study, cell: Cell, tuning: Adapting | FewLabels, what: str) -> Cell:
+    return Cell(
+        QUESTION, cell.recipe_name, cell.recipe, cell.fold, at.seed, cell.seed_i, cell.train, cell.test, tuning,
+        cell.skin, what,
+    )  # fmt: skip

@@ -1,0 +1,53 @@
+"""What stage audit asks of models and settings: cards and scalers on disk -> checks. Knows no argv."""
+
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from pipeline import io
+from pipeline.evaluation.audit.checks import Check
+from pipeline.evaluation.audit.settings import audit_choice, audit_scaler
+from pipeline.evaluation.audit.sides import Sides
+from pipeline.evaluation.choice import BUDGET
+from pipeline.learning.inputs import VIEW
+from pipeline.learning.recipe import HEADLINE
+from pipeline.learning.standardise import FIT
+from pipeline.params import modelled
+from pipeline.stages._train import Scenery
+
+
+def scaler_checks(at: Scenery, sides: dict[tuple[str, str], Sides], models: Path) -> Iterator[Check]:
+    """Fit the scaler of every network that was trained from nothing again; an adapted one keeps its base's."""
+    for arm in modelled(at.asked):
+        for file in sorted((models / arm).glob("*.json")):
+            card = io.read_json(file)
+            if "tuning" in card:
+                continue
+            question = "lobo" if card["question"] == "triplet" else card["question"]
+            view = VIEW[card["recipe"]["inputs"]]
+            yield audit_scaler(
+                file.stem, io.read_tensors(file.with_suffix(".safetensors"))[0], db_uT=view(at.rows.db_uT),
+                target=at.rows.target, sides=sides[question, card["fold"]],
+                fit=partial(_fit, card["recipe"]["scaling"]),
+            )  # fmt: skip
+
+
+def _fit(scaling: str, db_uT: np.ndarray, target: np.ndarray) -> dict[str, np.ndarray]:
+    return FIT[scaling](db_uT, target).arrays()
+
+
+def settings_checks(at: Scenery, choice: Path) -> list[Check]:
+    """Compare the scene's headline recipes with the record of what was chosen, and where."""
+    sections = {arm: getattr(at.asked, arm) for arm in ("train_multi", "train_triplet", "adapt")}
+    recipes = {
+        arm: {k: v for k, v in section.recipes[HEADLINE].model_dump(mode="json").items() if k not in BUDGET}
+        for arm, section in sections.items()
+        if section is not None
+    }
+    held_out = np.unique(np.concatenate([fold.test for fold in at.folds]))
+    return audit_choice(
+        io.read_json(choice), recipes, source=at.asked.source, seed=at.asked.seed,
+        test_boards=np.unique(at.rows.board[held_out]).tolist(), test_skins=np.unique(at.rows.skin[held_out]).tolist(),
+    )  # fmt: skip
