@@ -19,9 +19,10 @@ from pipeline import seeds
 from pipeline.dataset import lines as lines_module
 from pipeline.dataset.lines import Lines
 from pipeline.learning.architecture import LAYERS, Weights, draw_weights
+from pipeline.learning.augment import virtual_boards
 from pipeline.learning.inputs import VIEW
 from pipeline.learning.job import Job, Labelled, Terms, Unlabelled
-from pipeline.learning.recipe import FineTuning, Labelling, Recipe, Schedule
+from pipeline.learning.recipe import AugmentedRecipe, FineTuning, Labelling, Recipe, Schedule
 from pipeline.learning.standardise import FIT, Scaler
 from pipeline.learning.triplets import make_points
 
@@ -133,11 +134,23 @@ def make_job(cell: Cell, rows: Measured) -> tuple[Job, Scaler]:
         start: Weights = draw_weights(LAYERS[cell.recipe.architecture](view.shape[1]), rng)
     else:
         scaler, start = cell.tuning.start.scaler, cell.tuning.start.weights
-    points = make_points(target[:, :2], rows.skin[cell.train]) if cell.recipe.triplet_weight else None
-    labelled = Labelled(scaler.encode(view), scaler.encode_target(target), points)
+    labelled = _labelled(cell, rows, scaler)
     unlabelled = _unlabelled(cell, rows, scaler) if cell.terms.unlabelled else None
     own = _own(cell, rows, scaler) if cell.terms.own else None
     return Job(start, rng, labelled, unlabelled, own), scaler
+
+
+def _labelled(cell: Cell, rows: Measured, scaler: Scaler) -> Labelled:
+    db_uT, target, skin = (values[cell.train] for values in (rows.db_uT, rows.target, rows.skin))
+    if isinstance(cell.recipe, AugmentedRecipe):
+        rng = seeds.rng_for(cell.seed, "augment", cell.fold, cell.seed_i)
+        copies_uT, copied = virtual_boards(db_uT, skin, cell.recipe.augmentation, rng)
+        own = np.unique(skin, return_inverse=True)[1]
+        skin = np.concatenate([own, copied + own.max() + 1])
+        db_uT = np.concatenate([db_uT, copies_uT])
+        target = np.tile(target, (1 + cell.recipe.augmentation.copies_n, 1))
+    points = make_points(target[:, :2], skin) if cell.recipe.triplet_weight else None
+    return Labelled(scaler.encode(VIEW[cell.recipe.inputs](db_uT)), scaler.encode_target(target), points)
 
 
 def _unlabelled(cell: Cell, rows: Measured, scaler: Scaler) -> Unlabelled:

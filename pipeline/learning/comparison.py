@@ -5,7 +5,7 @@ from typing import Annotated
 from pydantic import Field, model_validator
 
 from pipeline.learning.classical import Classical
-from pipeline.learning.recipe import FineTuning, Labelling, Name, Recipe
+from pipeline.learning.recipe import AugmentedRecipe, FineTuning, Labelling, Name, Recipe
 from pipeline.strict import Strict
 
 
@@ -23,7 +23,7 @@ class FewLabels(Strict):
     """
 
     labels_n: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
-    recipes: dict[Name, Recipe]
+    recipes: dict[Name, Recipe | AugmentedRecipe]
     adapted: tuple[Name, ...]
     adapting: FineTuning
     labelling: Labelling

@@ -36,6 +36,21 @@ class Recipe(Schedule):
     triplet_weight: Weight
 
 
+class Augmentation(Strict):
+    """Copies of every training skin as other boards would read it; standard deviations of what differs."""
+
+    copies_n: Annotated[int, Field(ge=1, le=100)]
+    gain_sd: Weight  # of each channel
+    lean_sd_deg: Annotated[float, Field(ge=0, le=45)]  # of each chip, about each axis
+    noise_uT: Weight  # of each channel of a reading
+
+
+class AugmentedRecipe(Recipe):
+    """Ours: a recipe that is also trained on boards that might have been."""
+
+    augmentation: Augmentation
+
+
 class FineTuning(Schedule):
     """How a trained network is adapted to a new skin: its recipe's loss goes on, beside a term on the skin's pokes.
 
@@ -78,7 +93,7 @@ class PokesSweep(Strict):
 class Training(Strict):
     """What a training stage runs: every recipe on every fold with every seed."""
 
-    recipes: dict[Name, Recipe]
+    recipes: dict[Name, Recipe | AugmentedRecipe]
     seeds_n: Annotated[int, Field(ge=1)]
 
     @model_validator(mode="after")

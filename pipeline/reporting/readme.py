@@ -1,7 +1,7 @@
 """Generated parts of README.md: text with marked blocks + their contents -> text. No number there is typed."""
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from pipeline.errors import SchemaError, complain
@@ -24,19 +24,28 @@ def fill(text: str, blocks: Mapping[str, str]) -> str:
 
 
 def blocks_of(
-    numbers: Mapping[str, Any], others: Iterable[Mapping[str, Any]], dag: str, stages: Mapping[str, Any]
+    results: Sequence[Mapping[str, Any]], recorded: Iterable[Mapping[str, Any]], dag: str, stages: Mapping[str, Any]
 ) -> dict[str, str]:
-    """Make the blocks: results beside the paper's, skins beside recorded ones, the flow as DVC sees it, its code."""
+    """Make the blocks: results beside the paper's, skins beside recorded ones, the flow as DVC sees it, its code.
+
+    The last of `results` is the scene that runs, whose skins are compared.
+    """
+    others = list(recorded)
+    shown = [_results(numbers, ("table2", "order", "single_sensor")) for numbers in results]
+    labels = [_results(numbers, ("labels",)) for numbers in others if "labels" in numbers]
+    skins = to_markdown(skins_table(dict(_main_skins([results[-1], *others]))))
+    blocks = {"results": "\n\n".join(shown), "labels": "\n\n".join(labels) or "No recorded scene asked yet."}
+    return blocks | {"skins": skins, "dag": dag, "stages": _stages(stages)}
+
+
+def _results(numbers: Mapping[str, Any], names: Sequence[str]) -> str:
     provenance = numbers["provenance"]
     tables = make_tables(numbers)
     words = (
         f"Scene `{provenance['scene']}`, **{provenance['source']}**; code {provenance['git']}, "
-        f"seed {provenance['seed']}, {provenance['device']}; mean ± sd over n folds (for the "
-        "single-sensor row, over n pairs of a training and a test skin)."
+        f"seed {provenance['seed']}, {provenance['device']}:"
     )
-    results = [words] + [to_markdown(tables[name]) for name in ("table2", "order", "single_sensor") if name in tables]
-    skins = to_markdown(skins_table(dict(_main_skins([numbers, *others]))))
-    return {"results": "\n\n".join(results), "skins": skins, "dag": dag, "stages": _stages(stages)}
+    return "\n\n".join([words] + [to_markdown(tables[name]) for name in names if name in tables])
 
 
 def _main_skins(scenes: Iterable[Mapping[str, Any]]) -> Iterator[tuple[str, Mapping[str, Any]]]:

@@ -251,6 +251,6 @@ def test_in_the_readme_the_order_stands_right_below_table_2():
         "grid": {"source": "simulated", "over_skins": {"step_z_uT": {"mean": 1.0, "least": 1.0, "most": 1.0, "n": 1}}}
     }
     tables = make_tables(everything())
-    results = blocks_of(everything() | {"described": described}, [], "", {})["results"]
+    results = blocks_of([everything() | {"described": described}], [], "", {})["results"]
     table2, order = to_markdown(tables["table2"]), to_markdown(tables["order"])
     assert f"{table2}\n\n{order}" in results
