@@ -19,7 +19,13 @@ def lab(tmp_path_factory, shared_data) -> Iterator[Path]:
     scene = root / plan.SCENES / "lab.yaml"
     settings = YAML(typ="safe").load(scene.read_text())
     settings["train_multi"]["seeds_n"] = 1
-    settings["train_multi"]["recipes"] = {"paper": settings["train_multi"]["recipes"]["paper"] | {"epochs_n": 4}}
+    settings["train_multi"]["recipes"] = {"paper": settings["train_multi"]["recipes"]["paper"] | {"steps_n": 100}}
+    settings["split"]["labels_draws_n"] = 1
+    few = settings["few_labels"]
+    few["recipes"] = {"network": few["recipes"]["network-triplet"] | {"steps_n": 20}}
+    few |= {"adapted": ["network"], "methods": {"knn": few["methods"]["knn-shape"]}, "labels_n": [0, 10]}
+    for part in ("adapting", "labelling"):
+        few[part]["steps_n"] = 5
     with scene.open("w") as stream:
         YAML().dump(settings, stream)
     params = YAML(typ="safe").load((root / plan.PARAMS).read_text())

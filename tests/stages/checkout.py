@@ -7,7 +7,10 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 LEFT_OUT = {".git", ".venv", ".reskin", "data", "reports", "mlflow.db", "mlartifacts", ".ci"}
-ENVIRONMENT = {"OMP_NUM_THREADS": "1", "MLFLOW_DISABLE_TELEMETRY": "true", "DVC_NO_ANALYTICS": "1"}
+ENVIRONMENT = {
+    "OMP_NUM_THREADS": "1", "MLFLOW_DISABLE_TELEMETRY": "true", "DVC_NO_ANALYTICS": "1",
+    "RESKIN_EXECUTOR": "processes:1",  # a worker spends longer on its imports than on such trainings
+}  # fmt: skip
 
 
 def copy_checkout(folder: Path) -> Path:
@@ -20,6 +23,8 @@ def copy_checkout(folder: Path) -> Path:
         else:
             shutil.copy(path, folder)
     (folder / "dvc.lock").unlink(missing_ok=True)
+    (folder / "reports/tuning").mkdir(parents=True)
+    shutil.copy(ROOT / "reports/tuning/choice.json", folder / "reports/tuning")  # the audit compares recipes with it
     (folder / "data").mkdir()
     (folder / "data/captures.yaml").write_text("captures: {}\n")
     (folder / ".venv").symlink_to(ROOT / ".venv")

@@ -17,6 +17,10 @@ from pipeline import io
 from pipeline.learning.standardise import Scaler
 from tests.stages.checkout import ENVIRONMENT, copy_checkout, run
 
+LEARNING = (
+    "train_single", "train_multi", "train_triplet", "adapt", "sweep_pokes", "sweep_sensors", "train_classical",
+    "few_labels", "audit",
+)  # fmt: skip
 pytestmark = pytest.mark.timeout(420)
 
 
@@ -32,7 +36,7 @@ def test_every_number_of_the_first_tables_is_there_and_says_that_it_is_simulated
     numbers = json.loads((story / "reports/ci/numbers.json").read_text())
     assert numbers["provenance"]["source"] == "simulated"
     assert {"git", "seed", "device", "seconds"} <= set(numbers["provenance"])
-    for row in ("single", "multi"):
+    for row in ("single", "multi", "triplet", "adapted"):
         for metric in ("accuracy_pct", "mse_xy_mm2", "mse_f_N2"):
             assert {"mean", "sd", "n"} <= set(numbers["table2"][row][metric])
     assert numbers["table2"]["multi"]["accuracy_pct"]["n"] == 3  # boards, from the data
@@ -59,6 +63,28 @@ def test_every_protocol_goes_through_the_wire_into_a_folder_of_its_own(story):
     assert wear.n_contacts.max() == 2 * 2 * 65 - 1
 
 
+def test_every_question_about_many_skins_is_answered_on_the_same_test_rows(story):
+    numbers = json.loads((story / "reports/ci/numbers.json").read_text())
+    assert [row["pokes_n"] for row in numbers["sweep_pokes"]] == [0, 30, 65]
+    assert {(row["method"], row["skins_n"]) for row in numbers["sweep_sensors"]} == {
+        (method, skins_n) for method in ("multi", "triplet", "adapted") for skins_n in (1, 4)
+    }
+    assert {(row["of"], row["over"]) for row in numbers["paired"]} >= {("triplet", "multi"), ("adapted", "triplet")}
+    assert all(row["accuracy_pct"]["n"] == 6 for row in numbers["paired"])  # held-out skins
+    assert {row["method"] for row in numbers["baselines"]} >= {"network", "network, adapted", "ridge"}
+    assert {row["labels_n"] for row in numbers["labels"]} == {0, 10}
+    assert all(check["holds"] or check["known"] for check in numbers["audit"])
+    rows_n = {
+        json.loads(file.read_text())["scores"]["rows_n"]
+        for arm in ("train_multi", "train_triplet")
+        for file in (story / f"data/models/ci/{arm}").glob("*.json")
+    }
+    assert rows_n == {2 * 130 * 5}  # two skins, the second pass, five readings
+    for name in ("sweep_pokes", "sweep_sensors"):
+        assert "<svg" in (story / f"reports/ci/figures/{name}.svg").read_text()
+    assert "<svg" in (story / "reports/ci/runtime/training.svg").read_text()
+
+
 def test_the_physics_is_answered_for_and_says_that_it_is_simulated(story):
     numbers = json.loads((story / "reports/ci/numbers.json").read_text())
     assert {row["term"] for row in numbers["left_out"] if row["done"] == "left out"} >= {"ageing", "temperature"}
@@ -83,7 +109,7 @@ def test_a_score_is_what_a_naive_loop_over_the_held_out_readings_finds(story):
     truths = []
     for skin in ("b1_s0", "b1_s1"):
         for reading in pq.read_table(story / f"data/indentations/ci/{skin}.parquet").to_pylist():
-            if reading["Fz_N"] >= 0:  # what the scene's selection asks for
+            if reading["pass_i"] >= 1 and reading["Fz_N"] >= 0:  # the first pass is the pool; the scene's selection
                 truths.append((skin, reading["x_mm"], reading["y_mm"], reading["Fz_N"]))
     assert [(row["skin"], row["true_x_mm"], row["true_y_mm"], row["true_Fz_N"]) for row in own] == truths
     hits = sum(
@@ -96,12 +122,13 @@ def test_a_score_is_what_a_naive_loop_over_the_held_out_readings_finds(story):
 def test_predictions_follow_from_the_saved_model_alone(story):
     folder = story / "data/models/ci/train_multi"
     tensors, _ = io.read_tensors(folder / "lobo.paper.b1.seed0.safetensors")
-    reading = pq.read_table(story / "data/indentations/ci/b1_s0.parquet").slice(0, 1).to_pylist()[0]
+    reading = pq.read_table(story / "data/indentations/ci/b1_s0.parquet").filter(pc.field("pass_i") == 1).slice(0, 1)
+    reading = reading.to_pylist()[0]
     scaler = Scaler.of_arrays(tensors)
     features = scaler.encode(np.array([reading["b_uT"]], np.float32) - np.array([reading["noload_uT"]], np.float32))[0]
-    for i, layer in enumerate(("feat.0", "feat.2", "feat.3", "head.0", "head.2", "head.4")):
-        features = tensors[f"{layer}.weight"] @ features + tensors[f"{layer}.bias"]
-        features = np.maximum(features, 0) if i in (0, 3, 4) else features  # ReLU where the paper has one
+    for i in range(1, 7):
+        features = tensors[f"layer{i}.weight"] @ features + tensors[f"layer{i}.bias"]
+        features = np.maximum(features, 0) if i in (1, 4, 5) else features  # ReLU where the paper has one
     expected = scaler.decode(features[None].astype(np.float32))[0]
     first = pq.read_table(folder / "predictions.parquet").filter(pc.field("fold") == "b1").slice(0, 1).to_pylist()[0]
     # float32 sums in another order
@@ -116,7 +143,8 @@ def test_training_again_from_nothing_gives_the_same_lock_file(story):
     before = (story / "dvc.lock").read_text()
     for file in (story / ".reskin/cells").glob("*.safetensors"):
         file.unlink()  # else finished trainings would be reused, and prove nothing
-    run(story, "dvc", "repro", "-f")
+    stages = [f"{name}@ci" for name in ("simulate", "ingest_simulated", "split", *LEARNING, "report")]
+    run(story, "dvc", "repro", "--force", "--single-item", *stages)
     assert (story / "dvc.lock").read_text() == before
 
 
@@ -136,7 +164,7 @@ def test_a_stage_killed_in_the_middle_loses_no_finished_fold(story):
     models = story / "data/models/killed"
     words = ["--scene", "ci", "--settings", "pipeline/scenes/ci.yaml", "--indentations", "data/indentations/ci",
              "--folds", "data/folds/ci.json", "--models", str(models)]  # fmt: skip
-    command = [str(story / ".venv/bin/python"), "-m", "pipeline.stages.train_multi", *words]
+    command = [str(story / ".venv/bin/python"), "-m", "pipeline.stages.train_triplet", *words]
     environment = {**os.environ, **ENVIRONMENT, "PYTHONPATH": str(story), "RESKIN_EXECUTOR": "processes:1"}
     cells = story / ".reskin/cells"
     for file in cells.glob("*.safetensors"):
@@ -150,14 +178,14 @@ def test_a_stage_killed_in_the_middle_loses_no_finished_fold(story):
     finished_n = len(list(cells.glob("*.safetensors")))
     assert not models.exists()
     again = subprocess.run(command, cwd=story, env=environment, capture_output=True, text=True, check=True)
-    assert f"{finished_n} of 3 trainings were finished before" in again.stderr
-    assert len(list(models.glob("*.safetensors"))) == 3
+    assert f"{finished_n} of 6 trainings were finished before" in again.stderr
+    assert len(list(models.glob("*.safetensors"))) == 6
 
 
 def test_a_dead_tracking_server_is_said_and_costs_no_result(story):
     start_s = time.monotonic()
     words = ["--scene", "ci", "--settings", "pipeline/scenes/ci.yaml", "--models", "data/models/ci",
-             "--figures", "reports/ci/figures"]  # fmt: skip
+             "--answers", "data/answers/ci", "--figures", "reports/ci/figures"]  # fmt: skip
     done = run(story, "python", "-m", "pipeline.stages.publish", *words, MLFLOW_TRACKING_URI="http://127.0.0.1:9")
     assert "does not answer" in done.stderr
     assert time.monotonic() - start_s < 20  # not MLflow's own minutes; two cores may be busy
