@@ -7,12 +7,8 @@ another board, skin or fold is added before it.
 from __future__ import annotations
 
 import hashlib
-from typing import TYPE_CHECKING
 
 import numpy as np
-
-if TYPE_CHECKING:
-    import torch
 
 
 def seed_for(seed: int, *names: str | int) -> int:
@@ -25,10 +21,3 @@ def seed_for(seed: int, *names: str | int) -> int:
 def rng_for(seed: int, *names: str | int) -> np.random.Generator:
     """Make the generator that belongs to `names` under `seed` (PCG64)."""
     return np.random.Generator(np.random.PCG64(seed_for(seed, *names)))
-
-
-def torch_generator_for(seed: int, *names: str | int) -> torch.Generator:
-    """Make the CPU torch generator that belongs to `names` under `seed`."""
-    import torch  # late: takes seconds, and only training needs it
-
-    return torch.Generator().manual_seed(seed_for(seed, *names))

@@ -21,7 +21,7 @@ HOMES = {
     r"\bimport serial|from serial": {"pipeline/capture/port.py"},
     r"ruamel": {"pipeline/strict.py", "pipeline/plan.py", "pipeline/registry.py"},
     r"\bimport torch|from torch": {
-        "pipeline/seeds.py", "pipeline/learning/grid.py", "pipeline/learning/losses.py", "pipeline/learning/model.py",
+        "pipeline/learning/grid.py", "pipeline/learning/losses.py", "pipeline/learning/model.py",
         "pipeline/learning/train.py", "pipeline/learning/feed.py",
     },
     r"from sklearn": {"pipeline/dataset/splits.py", "pipeline/learning/classical.py"},

@@ -1,8 +1,7 @@
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.seeds import rng_for, seed_for, torch_generator_for
+from pipeline.seeds import rng_for, seed_for
 
 names = st.lists(st.text(max_size=5), max_size=3)
 
@@ -21,8 +20,3 @@ def test_other_names_or_seeds_give_other_streams(seed, one, other):
 
 def test_a_name_cannot_be_split_in_another_way():
     assert seed_for(0, "a", "bc") != seed_for(0, "ab", "c")
-
-
-def test_torch_draws_from_the_named_stream():
-    draws = [torch.rand(3, generator=torch_generator_for(1, "x")) for _ in range(2)]
-    assert torch.equal(*draws)
