@@ -7,7 +7,9 @@ what is run.
 import multiprocessing
 import os
 import threading
-from concurrent.futures import Executor, ProcessPoolExecutor
+from collections.abc import Callable
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from typing import Any
 
 from pipeline.errors import ParamsError, complain
 
@@ -18,15 +20,30 @@ DEVICES = ("cpu", "cuda")
 
 
 def make_executor() -> Executor:
-    """Make the executor that RESKIN_EXECUTOR names: `processes:N` (default N = 2, one thread each)."""
+    """Make the executor that RESKIN_EXECUTOR names: `processes:N` (default N = 2, one thread each), or `here`."""
     word = os.environ.get(VARIABLE, DEFAULT)
+    if word == "here":
+        return Here()
     kind, _, count = word.partition(":")
     if kind != "processes" or not count.isdecimal() or int(count) < 1:
         raise ParamsError(
-            complain(VARIABLE, "the executor", "processes:N with N >= 1", repr(word), "Unset it for two.")
+            complain(VARIABLE, "the executor", "processes:N with N >= 1, or here", repr(word), "Unset it for two.")
         )
     # spawn: a forked child of a threaded parent can hang in BLAS.
     return ProcessPoolExecutor(int(count), multiprocessing.get_context("spawn"), _end_with_parent)
+
+
+class Here(Executor):
+    """Runs each call at once in this process: for a debugger, and for trainings shorter than a worker's imports."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Call it, and give what came of it as a finished future."""
+        future: Future[Any] = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
 
 
 def device() -> str:

@@ -17,3 +17,11 @@ def test_an_unknown_executor_is_one_sentence(monkeypatch, word):
     monkeypatch.setenv("RESKIN_EXECUTOR", word)
     with pytest.raises(ParamsError, match="RESKIN_EXECUTOR: the executor must be processes:N"):
         make_executor()
+
+
+def test_trainings_can_run_here_and_fail_as_they_would_elsewhere(monkeypatch):
+    monkeypatch.setenv("RESKIN_EXECUTOR", "here")
+    with make_executor() as executor:
+        assert executor.submit(os.getpid).result() == os.getpid()
+        with pytest.raises(ZeroDivisionError):
+            executor.submit(lambda: 1 // 0).result()
