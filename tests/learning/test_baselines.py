@@ -1,0 +1,178 @@
+import pickle
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import TypeAdapter
+from sklearn.linear_model import Ridge
+
+from pipeline.learning import baselines
+from pipeline.learning.baselines import Answered, Task, run_tasks
+from pipeline.learning.cell import Measured
+from pipeline.learning.classical import Classical, fit
+from pipeline.seeds import rng_for
+
+SETTINGS = {
+    "ridge": {"method": "ridge", "alpha": 1.0},
+    "cubic_ridge": {"method": "cubic_ridge", "alpha": 1.0},
+    "knn": {"method": "knn", "neighbours_n": 4},
+    "rbf_ridge": {"method": "rbf_ridge", "alpha": 0.1, "gamma": 0.1, "rows_max_n": 30},
+    "boosting": {"method": "boosting", "rounds_n": 5, "rate": 0.2, "leaves_n": 7},
+}
+ROWS_N, CH_N = 90, 5
+TRAIN, OWN, TEST = np.arange(0, 60, 2), np.arange(60, 66), np.arange(70, 90)
+NONE = np.zeros(0, np.int64)
+
+
+class Elsewhere(Executor):
+    """Runs a call as another process would: by a copy that went through pickle."""
+
+    def submit(self, call: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        done: Future[Any] = Future()
+        call, args = pickle.loads(pickle.dumps((call, args)))
+        done.set_result(call(*args))
+        return done
+
+
+def measured() -> Measured:
+    rng = rng_for(0, "baselines")
+    db_uT = rng.normal(0, 50, (ROWS_N, CH_N)).astype(np.float32)
+    target = (np.tanh(db_uT[:, :3] / 50) + rng.normal(0, 0.1, (ROWS_N, 3))).astype(np.float32)
+    return Measured(db_uT, target, np.array(["s0"] * ROWS_N))
+
+
+ROWS = measured()
+
+
+def asked(method: str = "ridge", inputs: str = "raw") -> Classical:
+    return TypeAdapter(Classical).validate_python(SETTINGS[method] | {"inputs": inputs})
+
+
+def task(one: Classical | None = None, *, own: np.ndarray = NONE, rows_max_n: int = 1000, **changes: Any) -> Task:
+    values = {"name": "one", "asked": one or asked(), "train": TRAIN, "test": TEST, "own": own, "seed": 3}
+    return Task(**values | {"rows_max_n": rows_max_n} | changes)
+
+
+def answered(*tasks: Task, rows: Measured = ROWS) -> list[Answered]:
+    return run_tasks(tasks, rows, Elsewhere(), lambda line: None)
+
+
+@pytest.fixture
+def fits(monkeypatch) -> list[dict[str, Any]]:
+    """What every method was fitted to, in turn."""
+    seen: list[dict[str, Any]] = []
+
+    def listening(one, inputs, target, rng, *, weight):
+        seen.append({"inputs": inputs, "target": target, "weight": weight})
+        return fit(one, inputs, target, rng, weight=weight)
+
+    monkeypatch.setattr(baselines, "fit", listening)
+    return seen
+
+
+def seen_by_hand(inputs: str, db_uT: np.ndarray) -> np.ndarray:
+    if inputs == "raw":
+        return db_uT
+    length_uT = np.sqrt((db_uT.astype(float) ** 2).sum(axis=1))[:, None]
+    return np.hstack([db_uT / length_uT, np.log(length_uT)]).astype(np.float32)
+
+
+@pytest.mark.parametrize("inputs", ["raw", "shape"])
+@pytest.mark.parametrize("method", SETTINGS)
+def test_a_task_answers_as_its_method_called_by_hand(method, inputs):
+    one = asked(method, inputs)
+    (got,) = answered(task(one))
+    train, test = (seen_by_hand(inputs, ROWS.db_uT[rows]) for rows in (TRAIN, TEST))
+    by_hand = fit(one, train, ROWS.target[TRAIN], rng_for(3, "baseline", "one"), weight=None)
+    # the last bit of a float32 input of 1 uT to 200 uT may differ; no place is taken to more than 1e-5 of a unit
+    np.testing.assert_allclose(got.predicted, by_hand.predict(test), atol=1e-5)
+    assert got.rows_n == 30
+    assert got.seconds > 0
+    assert got.one_reading_s > 0
+
+
+def test_labelled_rows_of_a_new_skin_weigh_together_as_much_as_all_others():
+    (got,) = answered(task(own=OWN))
+    train = np.concatenate([TRAIN, OWN])
+    mean, sd = ROWS.db_uT[train].mean(axis=0, dtype=float), ROWS.db_uT[train].std(axis=0, dtype=float)
+    middle, spread = ROWS.target[train].mean(axis=0, dtype=float), ROWS.target[train].std(axis=0, dtype=float)
+    weight = [1.0] * 30 + [5.0] * 6  # 6 of 5 are the 30 others
+    plane = Ridge(1.0).fit((ROWS.db_uT[train] - mean) / sd, (ROWS.target[train] - middle) / spread, weight)
+    wanted = plane.predict((ROWS.db_uT[TEST] - mean) / sd) * spread + middle
+    np.testing.assert_allclose(got.predicted, wanted, atol=1e-5)  # float32 of some units
+    assert got.rows_n == 36
+    assert np.abs(got.predicted - answered(task())[0].predicted).max() > 1e-3
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(1, 30), st.integers(1, 40))
+def test_the_weights_of_both_kinds_sum_to_the_same_however_many_there_are(own_n, rows_max_n):
+    with pytest.MonkeyPatch.context() as patch:
+        weights = []
+
+        def listening(one, inputs, target, rng, *, weight):
+            weights.append(weight)
+            return fit(one, inputs, target, rng, weight=weight)
+
+        patch.setattr(baselines, "fit", listening)
+        answered(task(own=np.arange(60, 60 + own_n), rows_max_n=rows_max_n))
+    (weight,) = weights
+    others, own = weight[:-own_n], weight[-own_n:]
+    assert len(others) == min(30, rows_max_n)
+    assert (others == 1).all()
+    assert own.sum() == pytest.approx(len(others), rel=1e-6)  # sums of float32
+
+
+def test_without_labels_of_a_new_skin_no_row_is_weighed(fits):
+    answered(task())
+    assert fits[0]["weight"] is None
+
+
+def rows_of(fits: list[dict[str, Any]]) -> list[list[int]]:
+    """The row numbers that each fit was given, told by their fields."""
+    return [[int(np.flatnonzero((ROWS.db_uT == row).all(axis=1))[0]) for row in one["inputs"]] for one in fits]
+
+
+def test_many_rows_are_thinned_to_different_training_rows_of_the_number_asked(fits):
+    done = answered(task(rows_max_n=12), task(rows_max_n=12, own=OWN), task(rows_max_n=30))
+    thinned, with_own, whole = rows_of(fits)
+    assert len(set(thinned)) == len(thinned) == 12
+    assert set(thinned) < set(TRAIN)
+    assert with_own == [*thinned, *OWN]  # labels of a new skin are never thinned
+    assert whole == TRAIN.tolist()
+    assert [one.rows_n for one in done] == [12, 18, 30]
+    for one, numbers in zip(fits, (thinned, with_own, whole), strict=True):
+        assert (one["target"] == ROWS.target[numbers]).all()
+
+
+def test_thinning_is_drawn_by_seed_and_name_alone(fits):
+    others = {"seed": 4}, {"name": "other"}
+    answered(task(rows_max_n=12), task(rows_max_n=12, asked=asked("knn")))
+    answered(*(task(rows_max_n=12, **other) for other in others))
+    first, same, *different = rows_of(fits)
+    assert same == first
+    assert all(numbers != first for numbers in different)
+
+
+def test_answers_come_in_the_order_of_tasks_and_each_is_told_of():
+    lines: list[str] = []
+    names = {"first": TEST, "second": TEST[:5], "third": TEST[5:]}
+    tasks = [task(name=name, test=test) for name, test in names.items()]
+    done = run_tasks(tasks, ROWS, Elsewhere(), lines.append)
+    assert lines == ["1/3 first", "2/3 second", "3/3 third"]
+    np.testing.assert_array_equal(np.concatenate([one.predicted for one in done[1:]]), done[0].predicted)
+
+
+@pytest.mark.parametrize("method", SETTINGS)
+def test_no_target_but_those_of_training_rows_and_labels_changes_an_answer(method):
+    used = np.concatenate([TRAIN, OWN])
+    others = ROWS.target.copy()
+    others[np.setdiff1d(np.arange(ROWS_N), used)] = 1e6
+    (got,), (other,) = (
+        answered(task(asked(method), own=OWN), rows=rows) for rows in (ROWS, Measured(ROWS.db_uT, others, ROWS.skin))
+    )
+    assert (got.predicted == other.predicted).all()
