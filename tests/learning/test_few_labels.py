@@ -1,0 +1,252 @@
+"""What a few labels of a new board are tried on: equal tests for all, labels of its pool alone, none for scalers."""
+
+from collections import Counter
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.dataset.rows import Rows
+from pipeline.dataset.splits import Split, draw_folds
+from pipeline.errors import ParamsError
+from pipeline.learning import few_labels as few
+from pipeline.learning.baselines import Task
+from pipeline.learning.cell import Adapting, Cell, FewLabels, Keys, Measured, Trained, make_job
+from pipeline.learning.comparison import Baselines
+from pipeline.learning.comparison import FewLabels as Settings
+from pipeline.seeds import rng_for
+from pipeline.strict import parse
+from tests.scenes import RECIPE
+
+SKINS = ("b0_s0", "b0_s1", "b1_s0", "b2_s0")
+PLACES_N, PASSES_N, READINGS_N = 9, 2, 2
+SCHEDULE = {"steps_n": 1, "batch_n": 8, "rate_max": 1e-3, "weight_decay": 0.0}
+ASKED = {
+    "labels_n": [0, 2, 5],
+    "recipes": {"plain": RECIPE, "triplet": RECIPE | {"inputs": "shape", "triplet_weight": 0.1}},
+    "adapted": ["triplet"],
+    "adapting": SCHEDULE | {"unlabelled_weight": 0.1},
+    "labelling": SCHEDULE | {"own_weight": 1.0},
+    "rows_max_n": 40,
+    "methods": {
+        "ridge": {"method": "ridge", "inputs": "raw", "alpha": 1.0},
+        "knn-shape": {"method": "knn", "inputs": "shape", "neighbours_n": 3},
+    },
+}
+METHODS = [
+    ("plain", "raw"), ("triplet", "shape"), ("triplet, adapted", "shape"), ("ridge", "raw"),
+    ("k nearest neighbours", "shape"),
+]  # fmt: skip
+
+
+def poked() -> Rows:
+    """Two skins on the first board, one on each other; a grid of 3 x 3 places, two passes, two readings each."""
+    own_n = PLACES_N * PASSES_N * READINGS_N
+    rng, f = rng_for(0, "few labels"), len(SKINS) * own_n
+    place_i = np.tile(np.arange(PLACES_N).repeat(READINGS_N), len(SKINS) * PASSES_N)
+    target = np.stack([4 * (place_i % 3), 4 * (place_i // 3), rng.uniform(0.5, 3, f)], axis=1)
+    skin = np.repeat(SKINS, own_n)
+    return Rows(
+        np.char.add("c_", skin), np.array([name[:2] for name in skin]), skin,
+        rng.normal(0, 50, (f, 15)).astype(np.float32), target.astype(np.float32),
+        np.tile(np.arange(PASSES_N).repeat(PLACES_N * READINGS_N), len(SKINS)).astype(np.int32),
+        np.arange(f) // READINGS_N, {},
+    )  # fmt: skip
+
+
+ROWS = poked()
+
+
+def study(seed: int = 5, rows: Rows = ROWS, **changes: object) -> few.Study:
+    folds = draw_folds(ROWS, ["labels"], Split(labels_pool_n=8, labels_draws_n=2), seed)
+    return few.Study(rows, folds, seed, parse(Settings, ASKED | changes, "scene: few_labels"))
+
+
+def of(rows: Rows) -> Measured:
+    return Measured(rows.db_uT, rows.target, rows.skin)
+
+
+def as_drawn(cell: Cell) -> Trained:
+    """A network that was not trained: what it starts from, scaled as it will be."""
+    job, scaler = make_job(cell, of(ROWS))
+    return Trained(f"key of {cell.name}", job.start, scaler, [1.0], np.zeros((0, 3), np.float32), None, 0.0, 0.0)
+
+
+def networks_of(at: few.Study) -> list[few.Done]:
+    """Every network of the study, each step going on from those before, as the stage does."""
+    done: list[few.Done] = []
+    for step in (few.networks, few.adapted, few.labelled):
+        done = [*done, *((tried, cell, as_drawn(cell)) for tried, cell in step(at, done))]
+    return done
+
+
+STUDY = study()
+NETWORKS = networks_of(STUDY)
+TASKS = few.classical(STUDY)
+ADAPTED = [cell for _, cell, _ in NETWORKS if isinstance(cell.tuning, Adapting)]
+LABELLED = [(tried, cell) for tried, cell, _ in NETWORKS if isinstance(cell.tuning, FewLabels)]
+
+
+def all_tried(at: few.Study, networks: list[few.Done]) -> list[tuple[few.Tried, Cell | Task]]:
+    return [*((tried, cell) for tried, cell, _ in networks), *few.classical(at)]
+
+
+def test_every_method_is_tried_once_on_every_fold_with_every_number_of_labels():
+    folds = [f"b{board}-draw{draw}" for board in range(3) for draw in range(2)]
+    assert [fold.name for fold in STUDY.folds] == folds
+    tried = Counter((one.method, one.inputs, one.fold.name, one.labels_n) for one, _ in all_tried(STUDY, NETWORKS))
+    assert tried == Counter((*method, fold, n) for method in METHODS for fold in folds for n in (0, 2, 5))
+
+
+def test_no_two_trainings_share_a_name():
+    names = [one.name for _, one in all_tried(STUDY, NETWORKS)]
+    assert len(set(names)) == len(names) == 3 * 2 * 3 * len(METHODS)
+
+
+def test_all_methods_and_numbers_of_labels_are_tested_on_the_same_rows_and_train_on_the_same_boards():
+    for tried, one in all_tried(STUDY, NETWORKS):
+        assert (one.test == tried.fold.test).all()
+        assert (one.train == tried.fold.train).all()
+        assert {*ROWS.board[one.test]} == {tried.fold.name[:2]}
+        assert tried.fold.name[:2] not in {*ROWS.board[one.train]}
+
+
+def labels_of(one: Cell | Task) -> np.ndarray:
+    return one.own if isinstance(one, Task) else one.tuning.own
+
+
+def with_labels(at: few.Study, networks: list[few.Done]) -> list[tuple[few.Tried, Cell | Task]]:
+    return [(tried, one) for tried, one in all_tried(at, networks) if tried.labels_n]
+
+
+def test_labels_are_whole_indentations_of_the_pool_as_many_as_asked():
+    for tried, one in with_labels(STUDY, NETWORKS):
+        own = labels_of(one)
+        assert {*own} <= {*tried.fold.pool}
+        labelled = np.unique(ROWS.indentation[own])
+        assert len(labelled) == tried.labels_n
+        assert {*own} == {*np.flatnonzero(np.isin(ROWS.indentation, labelled))}  # none of its readings left out
+        assert not {*labelled} & {*ROWS.indentation[one.test]}
+
+
+def test_without_labels_there_are_none():
+    for tried, one in all_tried(STUDY, NETWORKS):
+        if not tried.labels_n:
+            assert len(one.own) == 0 if isinstance(one, Task) else not isinstance(one.tuning, FewLabels)
+
+
+def test_every_method_is_given_the_same_labels_and_every_fold_others():
+    given_labels: dict[tuple[str, int], set[tuple[int, ...]]] = {}
+    for tried, one in with_labels(STUDY, NETWORKS):
+        given_labels.setdefault((tried.fold.name, tried.labels_n), set()).add(tuple(labels_of(one)))
+    assert {len(labels) for labels in given_labels.values()} == {1}
+    assert len(set.union(*given_labels.values())) == 3 * 2 * 2
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**32), st.lists(st.integers(0, 8), min_size=2, max_size=4, unique=True))
+def test_the_fewer_labels_are_among_the_more(seed, labels_n):
+    at = study(seed, labels_n=labels_n)
+    own = {(tried.fold.name, tried.labels_n): {*task.own} for tried, task in few.classical(at) if "ridge" in task.name}
+    fewer = sorted(labels_n)
+    for fold in at.folds:
+        for less, more in pairwise(fewer):
+            assert own[fold.name, less] < own[fold.name, more]
+
+
+def test_labels_are_drawn_by_the_seed_and_not_by_the_order_of_numbers():
+    first, again, other, turned = (
+        [sorted(task.own.tolist()) for tried, task in few.classical(at) if tried.labels_n == 5]
+        for at in (study(), study(), replace(study(), seed=6), study(labels_n=[5, 0]))
+    )
+    assert first == again == turned
+    assert all(one != changed for one, changed in zip(first, other, strict=True))
+
+
+def unknown(what: np.ndarray, rows: Rows = ROWS) -> Rows:
+    """The same scene, with places and forces of some rows unknown."""
+    target = rows.target.copy()
+    target[what] = np.nan
+    return replace(rows, target=target)
+
+
+def test_labels_of_a_new_board_change_no_scaler():
+    pooled = {(tried.method, tried.fold.name): one.scaler for tried, cell, one in NETWORKS if cell.tuning is None}
+    for tried, cell in LABELLED:
+        changed = of(ROWS).db_uT.copy()
+        changed[cell.tuning.own] += 500
+        (job, scaler), (other, same) = (make_job(cell, one) for one in (of(ROWS), replace(of(ROWS), db_uT=changed)))
+        for name, values in pooled[tried.method.removesuffix(", adapted"), tried.fold.name].arrays().items():
+            assert (scaler.arrays()[name] == values).all()
+            assert (same.arrays()[name] == values).all()
+        assert (other.own.inputs != job.own.inputs).any()  # learned from they are
+        assert len(job.own.inputs) == READINGS_N * tried.labels_n
+
+
+def test_labels_go_on_from_the_network_of_the_same_method_and_fold():
+    by_key = {one.key: tried for tried, _, one in NETWORKS}
+    for tried, cell in LABELLED:
+        base = by_key[cell.tuning.start.key]
+        assert (base.method, base.inputs, base.fold, base.labels_n) == (tried.method, tried.inputs, tried.fold, 0)
+
+
+def test_only_the_networks_named_are_adapted_by_all_pokes_of_their_pool():
+    assert [(cell.recipe_name, cell.fold) for cell in ADAPTED] == [("triplet", fold.name) for fold in STUDY.folds]
+    for cell, fold in zip(ADAPTED, STUDY.folds, strict=True):
+        assert {*cell.tuning.lines.row} == {*fold.pool}  # no place of 8 pokes on a 3 x 3 grid is alone on its lines
+    assert few.adapted(study(adapted=[]), few_done(study(adapted=[]))) == []
+
+
+def few_done(at: few.Study) -> list[few.Done]:
+    return [(tried, cell, as_drawn(cell)) for tried, cell in few.networks(at, [])]
+
+
+def test_adaptation_sees_no_label_of_the_new_board():
+    for cell in ADAPTED:
+        blind = of(unknown(ROWS.board == cell.fold[:2]))
+        job, other = make_job(cell, of(ROWS))[0], make_job(cell, blind)[0]
+        assert job.own is other.own is None
+        assert (job.labelled.inputs == other.labelled.inputs).all()
+        assert (job.labelled.targets == other.labelled.targets).all()
+        assert (job.unlabelled.inputs == other.unlabelled.inputs).all()
+        assert (job.unlabelled.row == other.unlabelled.row).all()
+        assert job.rng.integers(2**63) == other.rng.integers(2**63)
+        assert Keys(of(ROWS)).key(cell) == Keys(blind).key(cell)
+
+
+def test_of_places_only_the_order_along_lines_reaches_adaptation():
+    stretched = replace(ROWS, target=(ROWS.target * np.float32([3, 0.5, 0]) + np.float32([7, -2, 1])))
+    done = few_done(STUDY)
+    for (_, cell), (_, other) in zip(few.adapted(STUDY, done), few.adapted(study(rows=stretched), done), strict=True):
+        for name, values in vars(cell.tuning.lines).items():
+            assert (values == getattr(other.tuning.lines, name)).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"adapted": ["network"]}, r"adapted names recipes of few_labels, not \['network'\]"),
+        ({"labels_n": []}, "labels_n must"),
+        ({"labels_n": [-1]}, "labels_n.0 must be greater than or equal to 0; got -1"),
+        ({"rows_max_n": 0}, "rows_max_n must be greater than or equal to 1; got 0"),
+        ({"methods": {"tree": {"method": "tree", "inputs": "raw"}}}, "methods.tree must"),
+    ],
+)
+def test_a_wrong_setting_of_few_labels_is_one_sentence(changes, sentence):
+    with pytest.raises(ParamsError, match=sentence):
+        study(**changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"rows_max_n": 0}, "train_classical: rows_max_n must be greater than or equal to 1; got 0"),
+        ({"methods": {"a b": ASKED["methods"]["ridge"]}}, "methods.a b.* must"),
+    ],
+)
+def test_a_wrong_setting_of_the_baselines_is_one_sentence(changes, sentence):
+    with pytest.raises(ParamsError, match=sentence):
+        parse(Baselines, {"rows_max_n": 5, "methods": ASKED["methods"]} | changes, "train_classical")
