@@ -175,6 +175,79 @@ def test_a_number_of_sensors_asked_twice_is_refused_as_its_folds_would_share_a_n
         parse(Split, {"sensors_skins_n": [3, 3]}, "scene")
 
 
+LABELS = Split(labels_pool_n=5, labels_draws_n=3)
+PLACES_N = 4
+PLACE = np.array([0, 0, 0, 1, 1, 1, 2, 2, 3, 3])  # of ten indentations: unequal visits, as recordings have
+
+
+def poked(boards_n: int = 3, readings_n: int = 2):
+    """Two skins a board, each with ten indentations at four places, in two passes."""
+    labels = [
+        (f"b{board}", f"b{board}_s{skin}", place, i, i // 5)
+        for board in range(boards_n) for skin in range(2) for i, place in enumerate(PLACE) for _ in range(readings_n)
+    ]  # fmt: skip
+    boards, skins, places, _, passes = (list(column) for column in zip(*labels, strict=True))
+    target = np.stack([2.0 * np.array(places), np.zeros(len(places)), np.ones(len(places))], axis=1)
+    indentation = np.arange(len(labels)) // readings_n
+    return replace(rows(boards, skins, passes), target=target.astype(np.float32), indentation=indentation)
+
+
+@given(st.integers(0, 2**32), st.integers(1, 9), st.integers(1, 3))
+def test_a_board_is_held_out_whole_and_a_pool_drawn_from_each_of_its_skins(seed, pool_n, draws_n):
+    table = poked()
+    folds = draw_folds(table, ["labels"], Split(labels_pool_n=pool_n, labels_draws_n=draws_n), seed)
+    assert [fold.name for fold in folds] == [f"b{board}-draw{draw}" for board in range(3) for draw in range(draws_n)]
+    for fold in folds:
+        held = np.flatnonzero(table.board == fold.name[:2])
+        assert sorted([*fold.pool, *fold.test]) == held.tolist()  # apart, and nothing is lost
+        assert sorted([*fold.train, *held]) == list(range(len(table)))
+        assert not {*table.indentation[fold.pool]} & {*table.indentation[fold.test]}
+        for skin in np.unique(table.skin[held]):
+            assert len(np.unique(table.indentation[fold.pool[table.skin[fold.pool] == skin]])) == pool_n
+
+
+@given(st.integers(0, 2**32), st.integers(1, 8))
+def test_a_pool_of_labels_takes_every_place_equally_often(seed, pool_n):
+    table = poked()
+    for fold in draw_folds(table, ["labels"], Split(labels_pool_n=pool_n, labels_draws_n=2), seed):
+        for skin in np.unique(table.skin[fold.pool]):
+            own = fold.pool[table.skin[fold.pool] == skin]
+            first = own[np.unique(table.indentation[own], return_index=True)[1]]
+            visits = np.bincount((table.target[first, 0] / 2).astype(int), minlength=PLACES_N)
+            assert visits.max() <= -(-pool_n // PLACES_N)
+
+
+def test_draws_of_a_pool_of_labels_differ_and_follow_from_the_seed_alone():
+    table = poked()
+    first, again, other = (draw_folds(table, ["labels"], LABELS, seed) for seed in (1, 1, 2))
+    fewer = draw_folds(table, ["labels"], Split(labels_pool_n=5, labels_draws_n=1), 1)
+    assert [fold.pool.tolist() for fold in first] == [fold.pool.tolist() for fold in again]
+    assert len({tuple(fold.pool) for fold in [*first, *other]}) == 2 * len(first)
+    assert [fold.pool.tolist() for fold in fewer] == [fold.pool.tolist() for fold in first[::3]]
+
+
+def test_two_skins_of_a_board_are_labelled_at_pokes_of_their_own():
+    table = poked(boards_n=2)
+    own_n = len(PLACE)
+    for fold in draw_folds(table, ["labels"], LABELS, 0):
+        one, other = (
+            {*table.indentation[fold.pool[table.skin[fold.pool] == skin]] % own_n}
+            for skin in np.unique(table.skin[fold.pool])
+        )
+        assert one != other
+
+
+def test_a_pool_for_adaptation_is_another_and_does_not_shrink_the_folds_of_labels():
+    table = poked()
+    plain, pooled = (
+        draw_folds(table, ["labels"], LABELS.model_copy(update={"pool_passes_n": passes_n}), 0)
+        for passes_n in (None, 1)
+    )
+    for one, other in zip(plain, pooled, strict=True):
+        for side in ("train", "pool", "test"):
+            assert (getattr(one, side) == getattr(other, side)).all()
+
+
 ALMOST_ALL = Split(random_test_fraction=0.95, random_repeats_n=1)
 POOL_OF_2 = Split(pool_passes_n=2)
 MANY_SENSORS = Split(sensors_skins_n=(3, 16), sensors_draws_n=1)
@@ -193,6 +266,15 @@ TWO_CAPTURES = replace(ONE_BOARD, capture=np.array(["run2", "run10", "run10"]))
         (six_by_three_in_passes(2), "sensors", SENSORS, "passes of held-out skin b5_s0 must be more than .*, 2; got 2"),
         (six_by_three_in_passes(1), "sensors", MANY_SENSORS, "at most the 15 skins beside held-out board b5; got 16"),
         (ONE_BOARD, "sensors", SENSORS, "at most the 0 skins beside held-out board b0; got 15"),
+        (ONE_BOARD, "labels", LABELS, "question lobo: boards must be two or more; got 1"),
+        (
+            poked(), "labels", Split(labels_pool_n=10, labels_draws_n=1),
+            "fold labels/b0: split.labels_pool_n must be less than its indentations; got 10",
+        ),
+        (
+            poked(), "labels", Split(labels_pool_n=11, labels_draws_n=1),
+            "skin b0_s0: pokes to choose must be at most the 10 indentations of its pool; got 11",
+        ),
         (TWO_CAPTURES, "single_temporal", TEMPORAL, "the captures of skin s0 must be one, .*; got run10, run2"),
     ],
 )  # fmt: skip
