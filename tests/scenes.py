@@ -12,3 +12,42 @@ def recorded(**changes: object) -> dict[str, object]:
         "train_multi": {"seeds_n": 1, "recipes": {"paper": RECIPE}},
     }  # fmt: skip
     return scene | changes
+
+
+TRAINING = {"seeds_n": 1, "recipes": {"paper": RECIPE}}
+SCHEDULE = {"steps_n": 1, "batch_n": 64, "rate_max": 1e-3, "weight_decay": 0.0}
+ADAPTATION = {"base": "paper", "unlabelled_weight": 0.1} | SCHEDULE
+
+# what a scene holds, beside the question, for each question about learning
+SECTIONS: dict[str, dict[str, object]] = {
+    "lobo": {"train_multi": TRAINING},
+    "transfer": {"train_single": TRAINING},
+    "single_random": {"train_single": TRAINING},
+    "single_temporal": {"train_single": TRAINING},
+    "triplet": {"train_triplet": TRAINING},
+    "adapt": {"adapt": {"pokes_n": 8, "recipes": {"paper": ADAPTATION}}},
+    "pokes": {"sweep_pokes": {"pokes_n": [0, 8], "boards_n": 1}},
+    "sensors": {},
+    "labels": {"few_labels": {"labels_n": [0]}},  # checked by its stage
+    "baselines": {"train_classical": {"methods": {}}},  # checked by its stage
+    "audit": {"audit": {"settings": "chosen"}},
+    "choice": {},
+}
+DRAWN_WITH: dict[str, dict[str, object]] = {
+    "transfer": {"transfer_skins_n": 1},
+    "single_random": {"random_test_fraction": 0.1, "random_repeats_n": 1},
+    "single_temporal": {"temporal_test_fraction": 0.1},
+    "adapt": {"pool_passes_n": 1},
+    "sensors": {"sensors_skins_n": [1], "sensors_draws_n": 1},
+    "labels": {"labels_pool_n": 8, "labels_draws_n": 1},
+}
+
+
+def asking(*questions: str, **changes: object) -> dict[str, object]:
+    """A recorded scene with what these questions need, and nothing else."""
+    scene = {name: value for name, value in recorded().items() if name != "train_multi"}
+    split: dict[str, object] = {}
+    for question in questions:
+        scene |= SECTIONS[question]
+        split |= DRAWN_WITH.get(question, {})
+    return scene | {"questions": list(questions), "split": split} | changes

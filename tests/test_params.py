@@ -3,12 +3,12 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import ParamsError
-from pipeline.params import Scene, read_params, read_scene
+from pipeline.params import Scene, arms_of, modelled, read_params, read_scene, swept
 from pipeline.strict import parse, read_yaml
-from tests.scenes import RECIPE, recorded
+from tests.scenes import ADAPTATION, DRAWN_WITH, RECIPE, SECTIONS, TRAINING, asking, recorded
 
 ROOT = Path(__file__).resolve().parents[1]
-TRAINING = {"seeds_n": 1, "recipes": {"paper": RECIPE}}
+PAPERS_CLAIM = ("lobo", "triplet", "adapt")  # the questions that those of adaptation go on from
 
 
 @pytest.mark.parametrize("file", sorted((ROOT / "pipeline/scenes").glob("*.yaml")), ids=lambda file: file.stem)
@@ -44,18 +44,110 @@ def test_a_wrong_scene_is_one_sentence_that_names_the_parameter(changes, sentenc
         parse(Scene, recorded(**changes), "scene.yaml")
 
 
+def scene(*questions: str, **changes: object) -> Scene:
+    return parse(Scene, asking(*questions, **changes), "scene.yaml")
+
+
+@pytest.mark.parametrize(
+    ("question", "others"),
+    [
+        ("triplet", ("lobo",)),
+        ("adapt", ("lobo", "triplet")),
+        ("pokes", PAPERS_CLAIM),
+        ("sensors", PAPERS_CLAIM),
+        ("baselines", ("lobo",)),
+        ("labels", ("lobo",)),
+        ("audit", ("lobo",)),
+        ("choice", PAPERS_CLAIM),
+    ],
+)
+def test_a_question_that_goes_on_from_others_is_legal_with_them_and_refused_without_the_last(question, others):
+    assert question in scene(*others, question).questions
+    with pytest.raises(ParamsError) as refused:
+        scene(*others[:-1], question)
+    assert str(refused.value) == (
+        f"scene.yaml: a scene that asks {question} also asks ['{others[-1]}'], on which it goes on. Mend it there."
+    )
+
+
+def test_all_that_a_question_lacks_is_named_at_once():
+    with pytest.raises(ParamsError, match=r"asks choice also asks \['adapt', 'triplet'\], on which it goes on"):
+        scene("lobo", "choice")
+
+
+ALL = (*PAPERS_CLAIM, "transfer", "pokes", "sensors", "labels", "baselines", "audit", "choice")
+
+
+def test_a_scene_may_ask_everything_and_names_the_stages_that_answer():
+    asked = scene(*ALL)
+    assert set(arms_of(asked)) == {
+        "train_single", "train_multi", "train_triplet", "adapt", "sweep_pokes", "sweep_sensors", "train_classical",
+        "few_labels", "audit",
+    }  # fmt: skip
+    assert modelled(asked) == ["train_single", "train_multi", "train_triplet", "adapt"]
+    assert swept(asked) == {
+        "pokes": "sweep_pokes", "sensors": "sweep_sensors", "baselines": "train_classical", "labels": "few_labels"
+    }  # fmt: skip
+    assert set(asked.trained) == {"lobo", "transfer", "sensors", "labels"}  # these have folds of their own
+
+
+def test_a_scene_that_asks_one_question_has_one_stage_and_no_curve():
+    asked = scene("lobo")
+    assert (arms_of(asked), modelled(asked), swept(asked)) == (["train_multi"], ["train_multi"], {})
+
+
+@pytest.mark.parametrize("question", [one for one in ALL if SECTIONS[one]])
+def test_a_section_stands_in_a_scene_if_and_only_if_its_question_is_asked(question):
+    ((section, words),) = SECTIONS[question].items()
+    sentence = f"section {section} stands in a scene if and only if it asks one of .*'{question}'"
+    lacking = {name: value for name, value in asking(*ALL).items() if name != section}
+    with pytest.raises(ParamsError, match=sentence):
+        parse(Scene, lacking, "scene.yaml")
+    with pytest.raises(ParamsError, match=sentence):
+        scene("single_temporal" if question == "lobo" else "lobo", **{section: words})
+
+
+@pytest.mark.parametrize("question", DRAWN_WITH)
+def test_split_holds_what_draws_the_folds_of_a_question_and_nothing_else(question):
+    own, others = DRAWN_WITH[question], ("lobo", "triplet", *(["adapt"] if question == "sensors" else []))
+    asked = asking(*others, question)
+    parse(Scene, asked, "scene.yaml")
+    unasked = asking(*others)
+    for key, value in own.items():
+        lacking = {name: value for name, value in asked["split"].items() if name != key}
+        with pytest.raises(ParamsError, match=f"split holds exactly what the questions need, .*'{key}'"):
+            parse(Scene, asked | {"split": lacking}, "scene.yaml")
+        with pytest.raises(ParamsError, match="split holds exactly what the questions need"):
+            parse(Scene, unasked | {"split": unasked["split"] | {key: value}}, "scene.yaml")
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"audit": {"settings": "guessed"}}, "audit.settings must be 'chosen' or 'for speed'; got 'guessed'"),
+        ({"adapt": {"pokes_n": 0, "recipes": {"paper": ADAPTATION}}}, "adapt.pokes_n must be greater than or equal"),
+        ({"adapt": {"pokes_n": 8, "recipes": {"other": ADAPTATION}}}, "adapt: recipes hold a recipe named paper"),
+        ({"sweep_pokes": {"pokes_n": [], "boards_n": 1}}, "sweep_pokes.pokes_n must"),
+        ({"sweep_pokes": {"pokes_n": [8], "boards_n": 0}}, "sweep_pokes.boards_n must be greater than or equal to 1"),
+    ],
+)
+def test_a_wrong_setting_of_a_question_is_one_sentence(changes, sentence):
+    with pytest.raises(ParamsError, match=sentence):
+        scene(*ALL, **changes)
+
+
 def test_what_is_not_written_is_an_error_and_no_default():
-    scene = recorded()
-    del scene["seed"]
+    words = recorded()
+    del words["seed"]
     with pytest.raises(ParamsError, match="scene.yaml: seed must be given; got nothing"):
-        parse(Scene, scene, "scene.yaml")
+        parse(Scene, words, "scene.yaml")
 
 
 def test_a_misspelt_parameter_is_named_as_it_was_written():
     recipe = {name: value for name, value in RECIPE.items() if name != "steps_n"} | {"step_n": 4}
-    scene = recorded(train_multi={"seeds_n": 1, "recipes": {"paper": recipe}})
+    words = recorded(train_multi={"seeds_n": 1, "recipes": {"paper": recipe}})
     with pytest.raises(ParamsError, match=r"recipes.paper.step_n must be a known parameter; got 4"):
-        parse(Scene, scene, "scene.yaml")
+        parse(Scene, words, "scene.yaml")
 
 
 def test_yaml_reads_exponents_as_numbers(tmp_path):
