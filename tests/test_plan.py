@@ -8,7 +8,7 @@ from pipeline.errors import ParamsError
 from pipeline.params import Scene, Stages, check_planned, read_params, read_scene
 from pipeline.registry import Entry, Registry
 from pipeline.strict import parse
-from tests.scenes import recorded
+from tests.scenes import asking, recorded
 
 ROOT = Path(__file__).resolve().parents[1]
 ENTRY = Entry(board="b", skin="s", layout="lab", chips_n=5, fingerprints=("0",), copy_of=None)
@@ -27,6 +27,47 @@ def test_a_question_that_no_scene_asks_has_no_stage():
     assert made["train_multi"] == ["lab"]
     assert made["train_single"] == made["verify"] == made["runtime"] == []
     assert made["simulate"] == made["ingest_simulated"] == {}
+
+
+ADAPTED = ("lobo", "triplet", "adapt")
+
+
+@pytest.mark.parametrize(
+    ("stage", "questions"),
+    [
+        ("train_triplet", ("lobo", "triplet")),
+        ("adapt", ADAPTED),
+        ("sweep_pokes", (*ADAPTED, "pokes")),
+        ("sweep_sensors", (*ADAPTED, "sensors")),
+        ("train_classical", ("lobo", "baselines")),
+        ("few_labels", ("lobo", "labels")),
+        ("audit", ("lobo", "audit")),
+    ],
+)
+def test_a_stage_about_learning_runs_for_the_scenes_that_ask_it_and_for_no_other(stage, questions):
+    asked, plain = (parse(Scene, asking(*own), "scene.yaml") for own in (questions, ("lobo",)))
+    captures = Registry(captures={"one": {"c0": ENTRY}, "two": {"c0": ENTRY}})
+    made = plan.make_plan({"one": plain, "two": asked}, captures)
+    assert made[stage] == ["two"]
+    assert made["train_multi"] == made["report"] == made["publish"] == ["one", "two"]
+    parse(Stages, made, "plan")
+    assert plan.make_plan({"one": plain}, captures)[stage] == []
+
+
+def test_a_choice_of_settings_needs_no_stage_of_its_own():
+    chosen, plain = (parse(Scene, asking(*own), "scene.yaml") for own in ((*ADAPTED, "choice"), ADAPTED))
+    captures = Registry(captures={"lab": {"c0": ENTRY}})
+    assert plan.make_plan({"lab": chosen}, captures) == plan.make_plan({"lab": plain}, captures)
+
+
+def test_a_question_that_was_added_since_is_noticed_by_the_stages(tmp_path):
+    root = checkout(tmp_path, EMPTY)
+    plan.use(root, ["one"])
+    params = read_params(root / plan.PARAMS)
+    check_planned("one", scene(), params, "one.yaml")
+    asked = parse(Scene, asking("lobo", "baselines", "audit"), "one.yaml")
+    with pytest.raises(ParamsError, match="train_classical, audit only in one. Try: reskin scenes use one"):
+        check_planned("one", asked, params, "one.yaml")
 
 
 def test_every_recorded_capture_has_an_ingest_of_its_own():
