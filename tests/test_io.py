@@ -1,3 +1,5 @@
+from pathlib import Path
+
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -51,6 +53,27 @@ def test_a_failure_in_the_middle_leaves_the_old_file(tmp_path):
         temporary.write_text("half")
         raise RuntimeError
     assert [file.read_text() for file in tmp_path.iterdir()] == ["old"]
+
+
+def texts(folder: Path) -> dict[str, str]:
+    return {file.name: file.read_text(encoding="utf-8") for file in folder.iterdir()}
+
+
+def test_a_folder_of_texts_holds_them_and_nothing_of_what_was_there_before(tmp_path):
+    io.write_texts(tmp_path / "tables", {"a.md": "old", "gone.md": "old"})
+    io.write_texts(tmp_path / "tables", {"a.md": "±1 µT", "b.md": ""})
+    assert texts(tmp_path / "tables") == {"a.md": "±1 µT", "b.md": ""}
+    io.write_texts(tmp_path / "tables", {})
+    assert texts(tmp_path / "tables") == {}
+    assert [path.name for path in tmp_path.iterdir()] == ["tables"]
+
+
+def test_a_text_that_cannot_be_written_leaves_the_whole_old_folder(tmp_path):
+    io.write_texts(tmp_path / "tables", {"a.md": "old", "b.md": "old"})
+    with pytest.raises(UnicodeEncodeError):
+        io.write_texts(tmp_path / "tables", {"a.md": "new", "b.md": "half a pair: \ud800"})
+    assert texts(tmp_path / "tables") == {"a.md": "old", "b.md": "old"}
+    assert [path.name for path in tmp_path.iterdir()] == ["tables"]
 
 
 @pytest.mark.parametrize("content", [b"", b"x", bytes(range(256)) * 9])
