@@ -3,7 +3,7 @@ import os
 import pytest
 
 from pipeline.errors import ParamsError
-from pipeline.learning.executors import make_executor
+from pipeline.learning.executors import device, make_executor
 
 
 def test_trainings_run_in_processes_of_their_own(monkeypatch):
@@ -25,3 +25,21 @@ def test_trainings_can_run_here_and_fail_as_they_would_elsewhere(monkeypatch):
         assert executor.submit(os.getpid).result() == os.getpid()
         with pytest.raises(ZeroDivisionError):
             executor.submit(lambda: 1 // 0).result()
+
+
+def test_networks_are_trained_on_the_cpu_unless_told_otherwise(monkeypatch):
+    monkeypatch.delenv("RESKIN_DEVICE", raising=False)
+    assert device() == "cpu"
+    for word in ("cpu", "cuda"):
+        monkeypatch.setenv("RESKIN_DEVICE", word)
+        assert device() == word
+
+
+@pytest.mark.parametrize("word", ["", "gpu", "CUDA", "cuda:0", "cpu "])
+def test_an_unknown_device_is_one_sentence(monkeypatch, word):
+    monkeypatch.setenv("RESKIN_DEVICE", word)
+    with pytest.raises(ParamsError) as refused:
+        device()
+    assert str(refused.value) == (
+        f"RESKIN_DEVICE: the device must be one of ('cpu', 'cuda'); got {word!r}. Unset it for cpu."
+    )
