@@ -92,7 +92,9 @@ def test_skins_adapted_to_by_themselves_are_one_score_of_their_board():
         for fold, skin, error in (("b0", "b0_s0", 0.2), ("b0", "b0_s1", 0.4), ("b1", "b1_s0", 0.9))
     ]
     chosen = choose([one for one in CARDS if one["question"] != "adapt"] + skins)["adapt"]
-    assert chosen["candidates"][0]["mse_xy_mm2"]["mean"] == pytest.approx(0.6)
+    told = chosen["candidates"][0]["mse_xy_mm2"]
+    assert told["mean"] == pytest.approx(0.6)
+    assert "sd_seeds" not in told  # skins are no seeds
 
 
 SHAPED = {"inputs": "shape"}

@@ -146,6 +146,16 @@ def test_every_method_is_given_the_same_labels_and_every_fold_others():
     assert len(set.union(*given_labels.values())) == 3 * 2 * 2
 
 
+def test_which_pokes_of_a_pool_are_labelled_is_drawn_anew_in_every_fold():
+    numbers = [
+        tuple(np.flatnonzero(np.isin(np.unique(ROWS.indentation[fold.pool]), ROWS.indentation[labels_of(one)])))
+        for fold in STUDY.folds
+        for tried, one in with_labels(STUDY, [])
+        if tried.fold is fold and tried.method == "ridge" and tried.labels_n == 5
+    ]
+    assert len(set(numbers)) == len(numbers) == len(STUDY.folds)
+
+
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32), st.lists(st.integers(0, 8), min_size=2, max_size=4, unique=True))
 def test_the_fewer_labels_are_among_the_more(seed, labels_n):
