@@ -12,6 +12,7 @@ from jaxtyping import Int64
 from pipeline.dataset.lines import grid_lines
 from pipeline.dataset.rows import Rows
 from pipeline.dataset.splits import Fold
+from pipeline.errors import ParamsError, complain
 from pipeline.learning.baselines import Task
 from pipeline.learning.cell import Adapting, Cell, FewLabels, Start, Trained
 from pipeline.learning.comparison import FewLabels as Settings
@@ -96,6 +97,13 @@ def classical(at: Study) -> list[tuple[Tried, Task]]:
 def _own(at: Study, fold: Fold) -> Mapping[int, Int64[np.ndarray, " o"]]:
     """Choose the labelled pokes of the pool at random, the fewer among the more; give their rows."""
     indentations = np.unique(at.rows.indentation[fold.pool])
+    if max(at.asked.labels_n) > len(indentations):
+        raise ParamsError(
+            complain(
+                f"fold labels/{fold.name}", "few_labels.labels_n", f"at most the {len(indentations)} pokes of its pool",
+                max(at.asked.labels_n), "Ask for fewer, or raise split.labels_pool_n.",
+            )
+        )  # fmt: skip
     order = rng_for(at.seed, "labelled", fold.name).permutation(indentations)
     return {n: fold.pool[np.isin(at.rows.indentation[fold.pool], order[:n])] for n in at.asked.labels_n}
 

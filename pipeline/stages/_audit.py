@@ -17,25 +17,32 @@ from pipeline.learning.standardise import FIT
 from pipeline.params import modelled
 from pipeline.stages._train import Scenery
 
+Fits = dict[tuple[str, str, str, str, int], dict[str, np.ndarray]]  # by fold, view, scaling and rows
+
 
 def scaler_checks(at: Scenery, sides: dict[tuple[str, str], Sides], models: Path) -> Iterator[Check]:
-    """Fit the scaler of every network that was trained from nothing again; an adapted one keeps its base's."""
+    """Fit the scaler of every network again, from its fold's training rows; networks of one fold share the fits."""
+    views = {name: view(at.rows.db_uT) for name, view in VIEW.items()}
+    fits: Fits = {}
     for arm in modelled(at.asked):
         for file in sorted((models / arm).glob("*.json")):
             card = io.read_json(file)
-            if "tuning" in card:
-                continue
-            question = "lobo" if card["question"] == "triplet" else card["question"]
-            view = VIEW[card["recipe"]["inputs"]]
+            question = "lobo" if card["question"] in ("triplet", "adapt") else card["question"]
+            inputs, scaling = card["recipe"]["inputs"], card["recipe"]["scaling"]
             yield audit_scaler(
-                file.stem, io.read_tensors(file.with_suffix(".safetensors"))[0], db_uT=view(at.rows.db_uT),
+                file.stem, io.read_tensors(file.with_suffix(".safetensors"))[0], db_uT=views[inputs],
                 target=at.rows.target, sides=sides[question, card["fold"]],
-                fit=partial(_fit, card["recipe"]["scaling"]),
+                fit=partial(_fit_once, fits, (question, card["fold"], inputs, scaling)),
             )  # fmt: skip
 
 
-def _fit(scaling: str, db_uT: np.ndarray, target: np.ndarray) -> dict[str, np.ndarray]:
-    return FIT[scaling](db_uT, target).arrays()
+def _fit_once(
+    fits: Fits, key: tuple[str, str, str, str], db_uT: np.ndarray, target: np.ndarray
+) -> dict[str, np.ndarray]:
+    of = (*key, len(db_uT))  # a fold's training rows are fewer than those of both sides
+    if of not in fits:
+        fits[of] = FIT[key[-1]](db_uT, target).arrays()
+    return fits[of]
 
 
 def settings_checks(at: Scenery, choice: Path) -> list[Check]:

@@ -154,6 +154,7 @@ def test_honest_files_pass_and_every_fold_network_and_arm_was_looked_at(scene, c
     }  # fmt: skip
     trained = {"single_random.paper.repeat0.seed0"}
     trained |= {f"{arm}.b{i}.seed0" for arm in ("lobo.paper", "lobo.shape", "triplet.paper") for i in range(3)}
+    trained |= {f"adapt.paper.{skin}.8pokes.seed0" for skin in ("b0.b0_s0", "b0.b0_s1", "b1.b1_s0", "b2.b2_s0")}
     assert {check["where"] for check in checks if check["what"] == "scaler"} == trained
     arms = {check["where"] for check in checks if check["what"] == "settings: recipe"}
     assert arms == {"train_multi", "train_triplet", "adapt"}
