@@ -106,6 +106,6 @@ def _check_pool(rows: Rows, pool: Int64[np.ndarray, " c"], indentations_n: int) 
         raise ParamsError(
             complain(
                 f"skin {', '.join(skins)}", "pokes to choose", f"at most the {pool_n} indentations of its pool",
-                indentations_n, "Ask for fewer, or raise split.pool_passes_n.",
+                indentations_n, "Ask for fewer, or let section split keep a larger pool.",
             )
         )  # fmt: skip

@@ -41,10 +41,7 @@ def over_test_skins(cards: Sequence[dict[str, Any]]) -> dict[str, dict[str, floa
 
 
 def pool_skins(cards: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Put the cards of networks that were adapted to one skin each together: one a fold and seed, the mean over skins.
-
-    The test skins of a fold have equally many rows, so that this is the score of all its rows.
-    """
+    """Put the cards of networks adapted to one skin each together: one a fold and seed, over all their rows."""
     together: dict[tuple[str, int], list[dict[str, Any]]] = {}
     for card in cards:
         together.setdefault((card["fold"], card["seed_i"]), []).append(card)
@@ -77,8 +74,12 @@ def _by_held_out_skin(cards: Sequence[dict[str, Any]]) -> dict[tuple[str, str], 
 
 def _pool(scores: Sequence[dict[str, Any]]) -> dict[str, Any]:
     by_skin = {skin: one for own in scores for skin, one in own["by_skin"].items()}
-    parts = {part: _means([own[part] for own in scores]) for part in ("all", "registered")}
-    return parts | {"by_skin": by_skin, "rows_n": sum(own["rows_n"] for own in scores)}
+    rows_n = np.array([own["rows_n"] for own in scores])
+    parts = {
+        part: {name: float(np.average([own[part][name] for own in scores], weights=rows_n)) for name in scores[0][part]}
+        for part in ("all", "registered")
+    }
+    return parts | {"by_skin": by_skin, "rows_n": int(rows_n.sum())}
 
 
 def _means(scores: Sequence[dict[str, float]]) -> dict[str, float]:

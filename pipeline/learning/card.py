@@ -49,5 +49,6 @@ def _tuning(tuning: Adapting | FewLabels, rows: Rows) -> dict[str, Any]:
     return words | {
         "kind": "unlabelled" if isinstance(tuning, Adapting) else "labelled",
         "skins": np.unique(rows.skin[used]).tolist(),
+        "indentations": np.unique(rows.indentation[used]).tolist(),
         "pokes_n": len(np.unique(rows.indentation[used])),
     }

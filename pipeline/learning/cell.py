@@ -20,6 +20,7 @@ from pipeline.dataset import lines as lines_module
 from pipeline.dataset.lines import Lines
 from pipeline.learning.architecture import LAYERS, Weights, draw_weights
 from pipeline.learning.augment import virtual_boards
+from pipeline.learning.executors import device
 from pipeline.learning.inputs import VIEW
 from pipeline.learning.job import Job, Labelled, Terms, Unlabelled
 from pipeline.learning.recipe import AugmentedRecipe, FineTuning, Labelling, Recipe, Schedule
@@ -179,7 +180,7 @@ class Keys:
     def key(self, cell: Cell) -> str:
         """Name a cell."""
         words = [
-            cell.fold, cell.skin, cell.recipe.model_dump_json(), cell.seed, cell.seed_i,
+            device(), cell.fold, cell.skin, cell.recipe.model_dump_json(), cell.seed, cell.seed_i,
             self._labelled(cell.train), _digest(self.rows.db_uT[cell.test]),
             _code_digest(), importlib.metadata.version("torch"), importlib.metadata.version("numpy"), sys.platform,
         ]  # fmt: skip

@@ -66,7 +66,7 @@ def _choose(job: Job, shape: tuple[int, int], rngs: Mapping[str, np.random.Gener
         chosen |= {"near": near.reshape(shape), "far": far.reshape(shape)}
     if job.unlabelled is not None:
         points, row = job.unlabelled.points, job.unlabelled.row
-        anchor = rngs["poked"].integers(len(points), size=shape[0] * shape[1])
+        anchor = points.anchors[rngs["poked"].integers(len(points.anchors), size=shape[0] * shape[1])]
         near, far = draw_pairs(points, anchor, rngs["poked"])
         names = ("poked", "poked_near", "poked_far")
         chosen |= {name: row[one].reshape(shape) for name, one in zip(names, (anchor, near, far), strict=True)}

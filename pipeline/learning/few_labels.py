@@ -23,7 +23,7 @@ QUESTION = "labels"
 
 @dataclass(frozen=True)
 class Study:
-    """Rows, the folds of the question, the scene's seed, and what is at.asked."""
+    """Rows, the folds of the question, the scene's seed, and what is asked."""
 
     rows: Rows
     folds: Sequence[Fold]
@@ -115,5 +115,5 @@ def _start(one: Trained) -> Start:
 def _tuned(at: Study, cell: Cell, tuning: Adapting | FewLabels, what: str) -> Cell:
     return Cell(
         QUESTION, cell.recipe_name, cell.recipe, cell.fold, at.seed, cell.seed_i, cell.train, cell.test, tuning,
-        cell.skin, what,
+        cell.fold.rsplit("-draw", 1)[0], what,
     )  # fmt: skip

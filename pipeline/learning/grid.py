@@ -1,9 +1,12 @@
 """Many trainings at once: recipes x folds x seeds. In: rows and cells. Out: one finished file a cell.
 
-Cells of equal settings are trained as one stack. A finished cell is never trained again: a killed stage goes on where
-it was, and one more seed costs one seed. Refuses to know stages, scores and pages.
+Cells of equal settings and seed are trained as one stack. Where a network lies in a stack shows in the last bits of
+its sums, so stacks are made of all cells that are asked for, done or not, and are known by all their members: a killed
+stage goes on at the stacks that were not whole, and gives what it would have given; one more seed costs one seed.
+Refuses to know stages, scores and pages.
 """
 
+import hashlib
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, as_completed
@@ -32,22 +35,28 @@ def train_stack(cells: Sequence[Cell], rows: Measured) -> list[Trained]:
 
     torch.set_num_threads(1)  # the same sums in the same order, however many processes run beside this one
     start_s, on, first = time.monotonic(), device(), cells[0]
+    if on == "cuda" and not torch.cuda.is_available():
+        raise TrainingError(complain("RESKIN_DEVICE", "cuda", "there", "none that torch finds", "Unset it for cpu."))
     jobs, scalers = zip(*(make_job(cell, rows) for cell in cells), strict=True)
     architecture = first.recipe.architecture
     outcomes = train(jobs, architecture, first.schedule, first.terms, on)
     seconds = (time.monotonic() - start_s) / len(cells)
     trained = []
     for cell, scaler, outcome in zip(cells, scalers, outcomes, strict=True):
-        inputs = scaler.encode(VIEW[cell.recipe.inputs](rows.db_uT[cell.test]))
+        view = VIEW[cell.recipe.inputs](rows.db_uT[cell.test])
         predict = Predictor(outcome.weights, architecture, on)
         trained.append(
             Trained(
                 key="", weights=outcome.weights, scaler=scaler, curve=outcome.curve,
-                predicted=scaler.decode(predict(inputs)), stopped_step=outcome.stopped_step, seconds=seconds,
-                one_reading_s=median_s(partial(predict, inputs[:1])),
+                predicted=_answer(scaler, predict, view), stopped_step=outcome.stopped_step, seconds=seconds,
+                one_reading_s=median_s(partial(_answer, scaler, predict, view[:1])),
             )
         )  # fmt: skip
     return trained
+
+
+def _answer(scaler: Scaler, predict: Callable[[np.ndarray], np.ndarray], view: np.ndarray) -> np.ndarray:
+    return scaler.decode(predict(scaler.encode(view)))
 
 
 def run_cells(
@@ -55,26 +64,46 @@ def run_cells(
 ) -> list[Trained]:
     """Train what `cache` does not hold yet, and return every cell's result in the order of `cells`."""
     keys = Keys(rows)
-    files = {id(cell): cache / f"{keys.key(cell)}.safetensors" for cell in cells}  # not by name: it decides no result
-    unfinished = {files[id(cell)]: cell for cell in cells if not files[id(cell)].exists()}
-    finished_n, missing = sum(files[id(cell)] not in unfinished for cell in cells), list(unfinished.values())
-    if finished_n:
-        tell(f"{finished_n} of {len(cells)} trainings were finished before")
+    names = [keys.key(cell) for cell in cells]  # not the cell's own name: it decides no result
+    members = dict(zip(names, cells, strict=True))  # equal trainings are one
+    planned = [
+        (stack, [cache / f"{one}.safetensors" for one in _files_of(stack)])
+        for stack in stacks(members, STACK_N[device()])
+    ]
+    missing = [(stack, files) for stack, files in planned if not all(file.exists() for file in files)]
+    missing_n = sum(len(stack) for stack, _ in missing)
+    if missing_n < len(members):
+        tell(f"{len(members) - missing_n} of {len(members)} trainings were finished before")
     if missing:
         rows_file = cache / "rows" / f"{keys.rows_digest()}.safetensors"
         skin = np.unique(rows.skin, return_inverse=True)[1].astype(np.int64)
         io.write_tensors(rows_file, {"db_uT": rows.db_uT, "target": rows.target, "skin": skin}, {})
-        _run_stacks(missing, rows_file, files, executor, tell)
+        _run_stacks([([members[key] for key in stack], files) for stack, files in missing], rows_file, executor, tell)
         io.remove(rows_file)
-    return [_read_trained(files[id(cell)]) for cell in cells]
+    file_of = {key: file for stack, files in planned for key, file in zip(stack, files, strict=True)}
+    return [_read_trained(file_of[key]) for key in names]
+
+
+def stacks(members: Mapping[str, Cell], size_n: int) -> list[list[str]]:
+    """Put keys of cells of equal settings and seed together, in order, at most so many."""
+    alike: dict[tuple[object, ...], list[str]] = {}
+    for key, cell in members.items():
+        alike.setdefault((cell.recipe, cell.schedule, cell.terms, cell.seed, cell.seed_i), []).append(key)
+    return [group[i : i + size_n] for group in alike.values() for i in range(0, len(group), size_n)]
+
+
+def _files_of(stack: Sequence[str]) -> list[str]:
+    """Name each member's result by all members and its place among them."""
+    digest = hashlib.sha256("".join(stack).encode()).hexdigest()[:32]
+    return [f"{digest}-{i}" for i in range(len(stack))]
 
 
 def _run_stacks(
-    cells: Sequence[Cell], rows_file: Path, files: Mapping[int, Path], executor: Executor, tell: Callable[[str], None]
-) -> None:
-    start_s, done_n, running = time.monotonic(), 0, {}
-    for stack in stacks(cells, STACK_N[device()]):
-        running[executor.submit(_stack_to_files, rows_file, stack, [files[id(cell)] for cell in stack])] = stack
+    planned: Sequence[tuple[Sequence[Cell], Sequence[Path]]], rows_file: Path, executor: Executor,
+    tell: Callable[[str], None],
+) -> None:  # fmt: skip
+    start_s, done_n, all_n = time.monotonic(), 0, sum(len(stack) for stack, _ in planned)
+    running = {executor.submit(_stack_to_files, rows_file, stack, files): stack for stack, files in planned}
     for future in as_completed(running):
         try:
             future.result()
@@ -89,16 +118,8 @@ def _run_stacks(
                 )
             ) from None  # fmt: skip
         done_n += len(running[future])
-        left_s = (time.monotonic() - start_s) / done_n * (len(cells) - done_n)
-        tell(f"{done_n}/{len(cells)} {running[future][-1].name}, about {left_s:.0f} s left")
-
-
-def stacks(cells: Sequence[Cell], size_n: int) -> list[list[Cell]]:
-    """Put cells of equal settings together, at most so many; what a cell becomes does not depend on it."""
-    alike: dict[tuple[object, ...], list[Cell]] = {}
-    for cell in cells:
-        alike.setdefault((cell.recipe, cell.schedule, cell.terms), []).append(cell)
-    return [group[i : i + size_n] for group in alike.values() for i in range(0, len(group), size_n)]
+        left_s = (time.monotonic() - start_s) / done_n * (all_n - done_n)
+        tell(f"{done_n}/{all_n} {running[future][-1].name}, about {left_s:.0f} s left")
 
 
 def _stack_to_files(rows_file: Path, cells: Sequence[Cell], files: Sequence[Path]) -> None:

@@ -1,7 +1,6 @@
 """The one training loop, for a stack of networks. In: what each learns from, a schedule. Out: weights and curves.
 
-Read it from top to bottom. What a network becomes does not depend on its neighbours in the stack. Refuses to know
-folds, files and scores.
+Read it from top to bottom. Networks of a stack never touch each other. Refuses to know folds, files and scores.
 """
 
 from collections.abc import Sequence
@@ -35,7 +34,7 @@ class Outcome:
 
 
 def train(jobs: Sequence[Job], architecture: str, schedule: Schedule, terms: Terms, device: str) -> list[Outcome]:
-    """Descend the L2 loss and what stands beside it; AdamW under a one-cycle rate, as the paper names neither."""
+    """Descend the L2 loss and what stands beside it; AdamW under torch's one-cycle rate and momentum are our choice."""
     net = Stack(LAYERS[architecture](jobs[0].labelled.inputs.shape[1]), [job.start for job in jobs]).to(device)
     optimizer = torch.optim.AdamW(net.parameters(), schedule.rate_max, weight_decay=schedule.weight_decay, fused=True)
     rate = torch.optim.lr_scheduler.OneCycleLR(optimizer, schedule.rate_max, total_steps=max(schedule.steps_n, 2))

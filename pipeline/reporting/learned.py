@@ -111,13 +111,15 @@ def _networks(cards: Cards) -> Iterable[dict[str, Any]]:
         for name in dict.fromkeys(card["recipe_name"] for card in own if card["recipe_name"] != CONTROL):
             named = [card for card in own if card["recipe_name"] == name]
             words = {"method": method, "inputs": named[0]["recipe"]["inputs"], "name": name}
-            yield {**words, **over_folds(by_fold(named))}
+            words |= {"base": named[0]["tuning"]["settings"]["base"]} if "tuning" in named[0] else {}
+            yield {**words, "rows_n": named[0]["train_rows_n"], **over_folds(by_fold(named))}
 
 
 def _classical(points: Cards) -> Iterable[dict[str, Any]]:
     for name in dict.fromkeys(point["name"] for point in points):
         own = [point for point in points if point["name"] == name]
-        yield {"method": own[0]["method"], "inputs": own[0]["inputs"], "name": name, **over_folds(own)}
+        words = {"method": own[0]["method"], "inputs": own[0]["inputs"], "name": name, "rows_n": own[0]["rows_n"]}
+        yield {**words, **over_folds(own)}
 
 
 def _labels(points: Cards) -> Iterable[dict[str, Any]]:
@@ -130,11 +132,19 @@ def _labels(points: Cards) -> Iterable[dict[str, Any]]:
 
 
 def _times(row: Mapping[str, Any], seconds: Mapping[str, Seconds]) -> dict[str, float]:
+    """Give the median seconds of a method's trainings; an adapted network was also trained before."""
     question = next((q for q, method in NETWORKS.items() if method == row["method"]), None)
-    stage, start = (
-        (TRAINED_IN[question], f"{question}.{row['name']}.") if question else ("train_classical", row["name"])
-    )
-    own = [one for one in seconds.get(stage, []) if one["name"].startswith(start)]
+    if question is None:
+        return _median_times(seconds.get("train_classical", []), f"{row['name']}.")
+    own = _median_times(seconds.get(TRAINED_IN[question], []), f"{question}.{row['name']}.")
+    if question != "adapt" or not own:
+        return own
+    base = _median_times(seconds.get("train_triplet", []), f"triplet.{row['base']}.")
+    return own | {"train_s": own["train_s"] + base["train_s"]} if base else {}
+
+
+def _median_times(took: Seconds, start: str) -> dict[str, float]:
+    own = [one for one in took if one["name"].startswith(start)]
     if not own:
         return {}
     return {

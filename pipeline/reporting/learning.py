@@ -12,7 +12,19 @@ from pipeline.reporting.order import SHORT, order_table, paired_table
 from pipeline.reporting.paper import ADAPTED_POKES_N, FIGURE_6A, FIGURE_6B, TABLE_2
 from pipeline.reporting.shown import COLUMNS, n_of, scores, show, tabulate
 
-PLACES = "Registered: after one offset a board (uses its labels: a diagnosis)."
+PLACES = (
+    "Registered: after one offset a board (uses its labels: a diagnosis). Labels and unlabelled pokes are indentations "
+    "of the new board at places where it is also tested, at other depths."
+)
+ROWS = (
+    "Training rows of the first fold; a classical method is given at most so many, drawn at random. Settings of "
+    "classical methods were not searched."
+)
+CONTROLLED = (
+    "0 is the network as it was trained, all others are fine-tuned: what that does without pokes is the control of "
+    "table 2."
+)
+DRAWS = "± is the sd over n draws of training skins with seeds of their own, on one held-out board."
 
 Rows = Sequence[Mapping[str, Any]]
 
@@ -46,7 +58,7 @@ def sweep_pokes_table(rows: Rows, source: str) -> pd.DataFrame:
             line[f"{title} (ours)"] = show(row.get(metric))
             line[f"{title} (paper, table 2)"] = "{:g} ± {:g}".format(*paper[metric]) if paper else "–"
         lines.append(line | {"n": n_of(row)})
-    return tabulate(lines, meaning=f"The paper on its figure 6a: {FIGURE_6A}.")
+    return tabulate(lines, meaning=f"The paper on its figure 6a: {FIGURE_6A}. {CONTROLLED}")
 
 
 def sweep_sensors_table(rows: Rows, source: str) -> pd.DataFrame:
@@ -57,17 +69,19 @@ def sweep_sensors_table(rows: Rows, source: str) -> pd.DataFrame:
         | {"n": n_of(row)}
         for row in sorted(rows, key=lambda row: (row["skins_n"], list(SHORT).index(row["method"])))
     ]
-    return tabulate(lines, meaning=f"The paper on its figure 6b: {FIGURE_6B}.")
+    return tabulate(lines, meaning=f"The paper on its figure 6b: {FIGURE_6B}.", spread=DRAWS)
 
 
 def baselines_table(rows: Rows, source: str) -> pd.DataFrame:
     """List classical methods and networks on the same folds, the most accurate first."""
     ordered = sorted(rows, key=lambda row: -row["accuracy_pct"]["mean"])
     lines = [
-        {"method": row["method"], "inputs": row["inputs"], "source": source} | scores(row) | {"n": n_of(row)}
+        {"method": row["method"], "inputs": row["inputs"], "training rows": str(row["rows_n"]), "source": source}
+        | scores(row)
+        | {"n": n_of(row)}
         for row in ordered
     ]
-    return tabulate(lines)
+    return tabulate(lines, meaning=ROWS)
 
 
 def labels_table(rows: Rows, source: str) -> pd.DataFrame:
@@ -90,7 +104,7 @@ def audit_table(rows: Rows, source: str) -> pd.DataFrame:
 
 
 def chosen_table(arms: Mapping[str, Any], source: str) -> pd.DataFrame:
-    """List the candidates of each arm and which was chosen, by leave-one-board-out inside the training boards."""
+    """List the candidates of each arm and which was chosen, by leave-one-board-out on boards of their own."""
     lines = []
     for arm, choice in arms.items():
         for row in choice["candidates"]:

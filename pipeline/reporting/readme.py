@@ -42,7 +42,7 @@ def _results(numbers: Mapping[str, Any], names: Sequence[str]) -> str:
     provenance = numbers["provenance"]
     tables = make_tables(numbers)
     words = (
-        f"Scene `{provenance['scene']}`, **{provenance['source']}**; code {provenance['git']}, "
+        f"Scene `{provenance['scene']}`, **{provenance['source']}**; trained by code {provenance['trained']}, "
         f"seed {provenance['seed']}, {provenance['device']}:"
     )
     return "\n\n".join([words] + [to_markdown(tables[name]) for name in names if name in tables])

@@ -111,7 +111,7 @@ def _sweep(lines: Sequence[Line], title: str, xlabel: str, *, log: bool) -> str:
             _bars(axes, lines, metric)
         figure.legend(*axes.get_legend_handles_labels(), loc="outside right upper", frameon=False, fontsize=8)
         figure.suptitle(title, x=0.01, ha="left", fontsize=10)
-        figure.supxlabel(_about_bars(lines), x=0.01, ha="left", fontsize=7)
+        figure.supxlabel(_about_bars(lines, "folds" if log else "draws of skins"), x=0.01, ha="left", fontsize=7)
         return svg(figure)
 
 
@@ -130,8 +130,8 @@ def _bars(axes: Any, lines: Sequence[Line], metric: str) -> None:
     axes.set_ylim(min(ends) - room, max(ends) + room)
 
 
-def _about_bars(lines: Sequence[Line]) -> str:
+def _about_bars(lines: Sequence[Line], over: str) -> str:
     ours = [one["accuracy_pct"] for line in lines for one in line.scores if "n" in one["accuracy_pct"]]
-    kinds = {f"sd over n = {one['n']} folds" for one in ours if "sd" in one}
+    kinds = {f"sd over n = {one['n']} {over}" for one in ours if "sd" in one}
     kinds |= {"sd over seeds" for one in ours if "sd" not in one and "sd_seeds" in one}
     return f"Bars: {', '.join(sorted(kinds))}; cut at what is possible." if kinds else "No bars: one training each."

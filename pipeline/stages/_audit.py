@@ -10,6 +10,7 @@ from pipeline import io
 from pipeline.evaluation.audit.checks import Check
 from pipeline.evaluation.audit.settings import audit_choice, audit_scaler
 from pipeline.evaluation.audit.sides import Sides
+from pipeline.evaluation.audit.tuning import audit_tuning
 from pipeline.evaluation.choice import BUDGET
 from pipeline.learning.inputs import VIEW
 from pipeline.learning.recipe import HEADLINE
@@ -20,10 +21,11 @@ from pipeline.stages._train import Scenery
 Fits = dict[tuple[str, str, str, str, int], dict[str, np.ndarray]]  # by fold, view, scaling and rows
 
 
-def scaler_checks(at: Scenery, sides: dict[tuple[str, str], Sides], models: Path) -> Iterator[Check]:
-    """Fit the scaler of every network again, from its fold's training rows; networks of one fold share the fits."""
+def model_checks(at: Scenery, sides: dict[tuple[str, str], Sides], models: Path) -> Iterator[Check]:
+    """Fit the scaler of every network again, from its fold's training rows, and look at what it was adapted with."""
     views = {name: view(at.rows.db_uT) for name, view in VIEW.items()}
     fits: Fits = {}
+    keys: dict[tuple[str, int], set[str]] = {}  # of the networks that may be adapted, by fold and seed
     for arm in modelled(at.asked):
         for file in sorted((models / arm).glob("*.json")):
             card = io.read_json(file)
@@ -34,6 +36,14 @@ def scaler_checks(at: Scenery, sides: dict[tuple[str, str], Sides], models: Path
                 target=at.rows.target, sides=sides[question, card["fold"]],
                 fit=partial(_fit_once, fits, (question, card["fold"], inputs, scaling)),
             )  # fmt: skip
+            bases = keys.setdefault((card["fold"], card["seed_i"]), set())
+            if "tuning" in card:
+                side = sides[question, card["fold"]]
+                yield from audit_tuning(
+                    file.stem, card["tuning"], bases=bases, sides=side, indentation=at.rows.indentation
+                )
+            elif card["question"] == "triplet":
+                bases.add(card["key"])
 
 
 def _fit_once(

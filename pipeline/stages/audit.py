@@ -7,7 +7,7 @@ from pipeline.errors import LeakError, complain
 from pipeline.evaluation.audit.checks import holds, to_words
 from pipeline.evaluation.audit.sides import Labels, Sides, audit_fold
 from pipeline.seeds import rng_for
-from pipeline.stages._audit import scaler_checks, settings_checks
+from pipeline.stages._audit import model_checks, settings_checks
 from pipeline.stages._run import run, say
 from pipeline.stages._train import read_scenery
 
@@ -26,7 +26,7 @@ def audit(
             side, labels, db_uT=at.rows.db_uT, rng=rng_for(at.asked.seed, "audit", side.question, side.name)
         )
     ]
-    checks += list(scaler_checks(at, {(side.question, side.name): side for side in sides}, models))
+    checks += list(model_checks(at, {(side.question, side.name): side for side in sides}, models))
     checks += settings_checks(at, choice) if at.asked.audit and at.asked.audit.settings == "chosen" else []
     if not holds(checks):
         first = next(check for check in checks if not (check.holds or check.known))

@@ -1,10 +1,12 @@
 """Stage report: models' cards, predictions and accounts -> numbers.json, tables, figures."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from pipeline import io
 from pipeline.evaluation.choice import choose, to_record
+from pipeline.learning.executors import device as trained_on
 from pipeline.learning.recipe import HEADLINE
 from pipeline.params import Scene, check_planned, described_in, modelled, read_params, read_scene, swept
 from pipeline.provenance import SECONDS, code_version, device, read_costs
@@ -33,7 +35,7 @@ def report(
     arms, words = modelled(asked), io.read_json(folds)
     cards = [io.read_json(file) for arm in arms for file in sorted((models / arm).glob("*.json"))]
     accounts = [io.read_account(indentations / f"{name}.parquet") for name in words["captures"]]
-    numbers: dict[str, Any] = {"provenance": _provenance(scene, asked)}
+    numbers: dict[str, Any] = {"provenance": _provenance(scene, asked, cards)}
     points = {question: io.read_json(answers / f"{file}.json") for question, file in swept(asked).items()}
     numbers |= compose(cards, points, accounts, words["dropped"], headline=HEADLINE)
     numbers |= {"audit": io.read_json(answers / "audit.json")} if "audit" in asked.questions else {}
@@ -63,10 +65,11 @@ def report(
     say(f"{scene}: {reports}/numbers.json, tables, figures")
 
 
-def _provenance(scene: str, asked: Scene) -> dict[str, Any]:
+def _provenance(scene: str, asked: Scene, cards: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     seconds = round(sum(cost["seconds"] for cost in read_costs(COSTS / scene).values()), 1)
     known = {"scene": scene, "source": asked.source, "git": code_version(), "seed": asked.seed}
-    return known | {"device": device(), "seconds": seconds}
+    known |= {"trained": ", ".join(sorted({card["git"] for card in cards}))}
+    return known | {"device": f"{device()}, networks on {trained_on()}", "seconds": seconds}
 
 
 def _seconds(scene: str) -> dict[str, list[dict[str, Any]]]:

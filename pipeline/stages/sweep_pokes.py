@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline import io
+from pipeline.errors import ParamsError, complain
 from pipeline.learning.recipe import HEADLINE
 from pipeline.stages._adapt import adaptations, read_starts
 from pipeline.stages._models import note_seconds, point_of
@@ -18,6 +19,9 @@ def sweep_pokes(scene: str, settings: Path, indentations: Path, folds: Path, sta
     assert asked is not None
     assert own is not None
     named, held_out = (HEADLINE, own.recipes[HEADLINE]), at.of("lobo")[-asked.boards_n :]
+    if asked.boards_n > len(held_out):
+        rule = f"at most the {len(held_out)} boards of the scene"
+        raise ParamsError(complain(str(settings), "sweep_pokes.boards_n", rule, asked.boards_n, "Ask for fewer."))
     asked_of = [(fold, pokes_n) for fold in held_out for pokes_n in asked.pokes_n if pokes_n]
     pairs = [
         (cell, pokes_n)

@@ -10,6 +10,7 @@ from pipeline.learning.cell import Cell, Keys, Measured, Trained, make_job
 from pipeline.learning.feed import Feed
 from pipeline.learning.grid import train_stack
 from pipeline.learning.job import Terms
+from pipeline.learning.recipe import AugmentedRecipe
 from tests.learning.cells import (
     OWN,
     POKED,
@@ -275,3 +276,28 @@ def test_a_key_changes_with_the_code_that_trains(monkeypatch):
 def test_a_name_says_what_tells_a_cell_apart():
     assert pooled().name == "triplet.paper.b1.seed0"
     assert replace(adapting(), what="65pokes").name == "adapt.paper.b1.b1_s1.65pokes.seed0"
+
+
+def test_copies_of_rows_keep_their_targets_and_are_skins_of_their_own():
+    words = {"copies_n": 2, "gain_sd": 0.0, "lean_sd_deg": 0.0, "noise_uT": 0.0}
+    plain = pooled()
+    recipe = AugmentedRecipe.model_validate(plain.recipe.model_dump() | {"augmentation": words})
+    (one, _), (more, _) = (make_job(cell, measured()) for cell in (plain, replace(plain, recipe=recipe)))
+    # Boards that do not differ: the same rows three times over, with the same targets.
+    np.testing.assert_array_equal(more.labelled.inputs, np.tile(one.labelled.inputs, (3, 1)))
+    np.testing.assert_array_equal(more.labelled.targets, np.tile(one.labelled.targets, (3, 1)))
+    assert more.labelled.points.group.tolist() == np.repeat(range(6), 12).tolist()
+
+
+def test_copies_are_drawn_anew_in_every_fold_and_seed_and_enter_the_key():
+    words = {"copies_n": 1, "gain_sd": 0.1, "lean_sd_deg": 5.0, "noise_uT": 1.0}
+    recipe = AugmentedRecipe.model_validate(pooled().recipe.model_dump() | {"augmentation": words})
+    other = AugmentedRecipe.model_validate(pooled().recipe.model_dump() | {"augmentation": words | {"gain_sd": 0.2}})
+    cell = replace(pooled(), recipe=recipe)
+    drawn = [
+        make_job(one, measured())[0].labelled.inputs
+        for one in (cell, cell, replace(cell, fold="b9"), replace(cell, seed_i=5))
+    ]
+    assert (drawn[0] == drawn[1]).all()
+    assert not any((drawn[0] == one).all() for one in drawn[2:])
+    assert key(cell) != key(replace(cell, recipe=other)) != key(pooled())

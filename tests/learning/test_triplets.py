@@ -89,15 +89,30 @@ def test_a_group_on_one_place_is_named():
 
 
 def test_places_that_differ_along_one_axis_only_are_two():
-    assert len(make_points(np.array([[0.0, 5.0], [0.0, 6.0]]), np.zeros(2, int))) == 2
+    assert len(make_points(np.array([[0.0, 5.0], [0.0, 6.0], [0.0, 5.0]]), np.zeros(3, int))) == 3
 
 
-def test_an_anchor_that_is_equally_far_from_all_others_is_one_sentence_and_no_endless_loop():
+def test_a_point_from_which_all_others_are_equally_far_is_no_anchor_and_pulls_nowhere():
     three_pokes = make_points(np.arange(3.0)[:, None], np.zeros(3, int))
-    with pytest.raises(
-        TrainingError, match=r"distances from an anchor must be different ones; got ties .* at place \[1.0\]"
-    ):
-        draw(three_pokes, np.array([0, 1, 2]))
+    assert three_pokes.anchors.tolist() == [0, 2]
+    near, far = draw(three_pokes, np.array([0, 1, 2]))
+    assert (near.tolist(), far.tolist()) == ([1, 1, 1], [2, 1, 0])
+
+
+def test_points_that_are_all_equally_far_are_one_sentence_and_no_endless_loop():
+    with pytest.raises(TrainingError, match="some nearer to one than others are; got 2 that are equally far"):
+        make_points(np.array([[0.0], [1.0]]), np.zeros(2, int))
+
+
+@given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 3)), min_size=3, max_size=12))
+def test_anchors_are_the_points_with_two_distances_to_others_as_a_double_loop_finds(places):
+    expected = [
+        len({(x - u) ** 2 + (y - v) ** 2 for j, (u, v) in enumerate(places) if j != i}) > 1
+        for i, (x, y) in enumerate(places)
+    ]
+    assume(len(set(places)) > 1)
+    assume(any(expected))
+    assert make_points(np.array(places, float), np.zeros(len(places), int)).is_anchor.tolist() == expected
 
 
 def test_the_same_state_of_the_generator_draws_the_same():

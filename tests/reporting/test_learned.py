@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from pipeline.reporting.learned import PAIRS, by_fold, learned
+from pipeline.reporting.learned import PAIRS, by_fold, learned, timed_learning
 
 HELD_OUT = {"b0": ("s0", "s1"), "b1": ("s2", "s3")}
 BETTER = {"s0": 2.0, "s1": 4.0, "s2": 6.0, "s3": 8.0}  # points that adaptation gains on each skin
@@ -126,3 +126,30 @@ def test_a_sweep_over_sensors_has_a_curve_for_each_method_over_draws():
     ]  # fmt: skip
     assert all(one["accuracy_pct"]["n"] == 2 for one in sweep)
     assert all(one["accuracy_pct"]["sd"] == pytest.approx(0.5**0.5) for one in sweep)
+
+
+def test_a_method_has_its_own_times_and_an_adapted_network_those_of_its_base_too():
+    rows = [
+        {"method": "ridge", "inputs": "raw", "name": "ridge"},
+        {"method": "ridge", "inputs": "shape", "name": "ridge-shape"},
+        {"method": "network, adapted", "inputs": "raw", "name": "long", "base": "paper"},
+        {"method": "network", "inputs": "raw", "name": "paper"},
+    ]
+
+    def took(name: str, seconds: float) -> dict:
+        return {"name": name, "train_s": seconds, "one_reading_s": 1e-6 * seconds}
+
+    seconds = {
+        "train_classical": [took("ridge.b0", 1), took("ridge.b1", 2), took("ridge.b2", 9), took("ridge-shape.b0", 100)],
+        "train_triplet": [took("triplet.paper.b0.seed0", 30), took("triplet.other.b0.seed0", 999)],
+        "adapt": [took("adapt.long.b0.s.390pokes.seed0", 5)],
+    }
+    timed = timed_learning({"baselines": rows}, seconds)["learning"]
+    assert [row.get("train_s") for row in timed] == [2, 100, 35, None]  # medians; what was not timed has no time
+    assert [row["inference_us"] for row in timed[:3]] == pytest.approx([2, 100, 5])
+
+
+def test_an_adaptation_is_timed_by_its_number_of_pokes():
+    numbers = {"sweep_pokes": [{"pokes_n": 0}, {"pokes_n": 6}, {"pokes_n": 65}]}
+    seconds = {"sweep_pokes": [{"name": f"pokes.paper.b0.s.{n}pokes.seed0", "train_s": float(n)} for n in (6, 65)]}
+    assert [row.get("seconds") for row in timed_learning(numbers, seconds)["adaptation"]] == [None, 6.0, 65.0]

@@ -170,7 +170,7 @@ def test_sweeps_are_in_order_of_their_counts_beside_the_two_numbers_that_the_pap
 
 @given(st.lists(st.floats(0, 100), min_size=1, max_size=9))
 def test_baselines_are_sorted_by_accuracy_and_none_is_lost(accuracies):
-    rows = [{"method": f"m{i}", "inputs": "raw", **row(value)} for i, value in enumerate(accuracies)]
+    rows = [{"method": f"m{i}", "inputs": "raw", "rows_n": 9, **row(value)} for i, value in enumerate(accuracies)]
     methods = baselines_table(rows, "recorded")["method"].tolist()
     assert sorted(methods) == sorted(f"m{i}" for i in range(len(rows)))
     shown = [accuracies[int(name[1:])] for name in methods]
@@ -213,7 +213,15 @@ def test_what_was_not_timed_here_has_a_dash():
 
 
 def everything() -> dict:
-    provenance = {"source": "simulated", "scene": "x", "git": "y", "seed": 1, "device": "z", "seconds": 1.0}
+    provenance = {
+        "source": "simulated",
+        "scene": "x",
+        "git": "y",
+        "trained": "y",
+        "seed": 1,
+        "device": "z",
+        "seconds": 1.0,
+    }
     one = {"method": "ridge", "inputs": "raw"}
     check = {"what": "skins", "where": "lobo", "rule": "on one side", "found": 0, "holds": True, "known": False}
     return NUMBERS | {
@@ -223,7 +231,7 @@ def everything() -> dict:
         "capture": {"captures_n": 18, "left_out": {}},
         "sweep_pokes": [{"pokes_n": 0, **row(81.0)}],
         "sweep_sensors": [{"method": "multi", "skins_n": 3, **row(60.0)}],
-        "baselines": [one | row(30.0)],
+        "baselines": [one | {"rows_n": 9} | row(30.0)],
         "labels": [one | {"labels_n": 0, "as_labelled": row(30.0), "registered": row(42.0)}],
         "audit": [check],
         "chosen": {"multi": {"recipe_name": "a", "by": "MSE_xy", "candidates": [{"recipe_name": "a"} | row(80.0)]}},

@@ -67,7 +67,7 @@ def test_bars_are_one_sd_cut_where_no_score_can_be():
 @pytest.mark.parametrize(
     ("spread", "words"),
     [
-        ({"sd": 1.0, "n": 18}, "sd over n = 18 folds"),
+        ({"sd": 1.0, "n": 18}, "sd over n = 18 draws of skins"),
         ({"sd_seeds": 1.0, "n": 1}, "sd over seeds"),
         ({"n": 1}, "No bars"),
     ],

@@ -34,7 +34,7 @@ ACCOUNTS = [
 
 def numbers(cards: list[dict] = CARDS, source: str = "recorded") -> dict:
     provenance = {"source": source, "scene": "x", "git": "y", "seed": 1, "device": "z", "seconds": 1.0}
-    return {"provenance": provenance, **compose(cards, ACCOUNTS, {"low_force_rows_n": 3}, headline="paper")}
+    return {"provenance": provenance, **compose(cards, {}, ACCOUNTS, {"low_force_rows_n": 3}, headline="paper")}
 
 
 def test_pooled_numbers_are_over_folds_and_single_ones_over_pairs_of_skins():

@@ -258,3 +258,23 @@ def test_a_capture_copied_under_another_name_is_named_though_its_labels_are_apar
 def test_settings_chosen_on_what_is_tested_or_not_those_of_the_choice_are_named(scene, changes, sentence):
     io.write_json(scene / "choice.json", CHOICE | changes)
     refused(scene, f"audit of tiny, {sentence}")
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda tuning, at: tuning | {"from": "key of another fold"}, "base must be a network of its fold and seed"),
+        (lambda tuning, at: tuning | {"indentations": at["tested"]}, "pokes must be of the pool, and none tested"),
+        (lambda tuning, at: tuning | {"indentations": at["trained"]}, "pokes must be of the pool, and none tested"),
+    ],
+    ids=["a network that saw the board", "pokes that are tested", "pokes of a training skin"],
+)
+def test_adaptation_with_what_it_may_not_have_is_named(scene, change, sentence):
+    file = next((scene / "models/adapt").glob("*.json"))
+    card = io.read_json(file)
+    at = scenery(scene)
+    fold = next(fold for fold in at.of("lobo") if fold.name == card["fold"])
+    sides = {"tested": fold.test, "trained": fold.train}
+    own = {name: np.unique(at.rows.indentation[rows])[:3].tolist() for name, rows in sides.items()}
+    io.write_json(file, card | {"tuning": change(card["tuning"], own)})
+    refused(scene, f"{file.stem}: {sentence}")
