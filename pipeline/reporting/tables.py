@@ -53,6 +53,13 @@ def make_tables(numbers: Mapping[str, Any]) -> dict[str, pd.DataFrame]:
     return tables
 
 
+def table_texts(numbers: Mapping[str, Any]) -> dict[str, str]:
+    """Write every table twice, by file name: as Markdown for people and as CSV for programs."""
+    tables = make_tables(numbers)
+    texts = {f"{name}.md": to_markdown(table) for name, table in tables.items()}
+    return texts | {f"{name}.csv": table.to_csv(index=False) for name, table in tables.items()}
+
+
 def to_markdown(table: pd.DataFrame) -> str:
     """Write a table as Markdown, empty where a number is not known, and say below what its numbers mean."""
     text = str(table.fillna("").to_markdown(index=False, disable_numparse=True)) + "\n"

@@ -14,7 +14,7 @@ from pipeline.reporting.figures import error_grids
 from pipeline.reporting.learned import timed_learning
 from pipeline.reporting.numbers import answered, compose, rounded, runtime
 from pipeline.reporting.sweeps import learning_figures, learning_pages
-from pipeline.reporting.tables import make_tables, to_markdown
+from pipeline.reporting.tables import table_texts
 from pipeline.reporting.work_precision import pages
 from pipeline.stages._run import COSTS, run, say
 
@@ -51,11 +51,7 @@ def report(
     numbers["runtime"] |= timed_learning(numbers, took)
     numbers = rounded(numbers)
     io.write_json(reports / "numbers.json", numbers)
-    tables = make_tables(numbers)
-    texts = {f"{name}.md": to_markdown(table) for name, table in tables.items()}
-    io.write_texts(
-        reports / "tables", texts | {f"{name}.csv": table.to_csv(index=False) for name, table in tables.items()}
-    )
+    io.write_texts(reports / "tables", table_texts(numbers))
     predictions = [io.read_table(models / arm / "predictions.parquet") for arm in arms]
     drawn = dict(error_grids(predictions, HEADLINE, f"{scene} ({asked.source})"))
     io.write_texts(reports / "figures", drawn | dict(learning_figures(numbers, asked.source)))
@@ -66,10 +62,10 @@ def report(
 
 
 def _provenance(scene: str, asked: Scene, cards: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    seconds = round(sum(cost["seconds"] for cost in read_costs(COSTS / scene).values()), 1)
     known = {"scene": scene, "source": asked.source, "git": code_version(), "seed": asked.seed}
     known |= {"trained": ", ".join(sorted({card["git"] for card in cards}))}
-    return known | {"device": f"{device()}, networks on {trained_on()}", "seconds": seconds}
+    known |= {"device": f"{device()}, networks on {trained_on()}"}
+    return known | {"seconds": round(sum(cost["seconds"] for cost in read_costs(COSTS / scene).values()), 1)}
 
 
 def _seconds(scene: str) -> dict[str, list[dict[str, Any]]]:
