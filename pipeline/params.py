@@ -108,18 +108,26 @@ class Scene(Strict):
     def _sections_follow_questions(self) -> "Scene":
         if (self.simulate is not None) != (self.source == "simulated"):
             raise ValueError("section simulate stands in a scene if and only if its source is simulated")
+        for question in self.questions:
+            if lacking := NEEDS.get(question, set()) - set(self.questions):
+                raise ValueError(f"a scene that asks {question} also asks {sorted(lacking)}, on which it goes on")
         asked = set(arms_of(self))
         for arm in ARMS:
             if arm not in WITHOUT_SECTION and (getattr(self, arm) is not None) != (arm in asked):
                 asking = [question for question, stage in _STAGES.items() if stage == arm]
                 raise ValueError(f"section {arm} stands in a scene if and only if it asks one of {asking}")
-        for question in self.questions:
-            if lacking := NEEDS.get(question, set()) - set(self.questions):
-                raise ValueError(f"a scene that asks {question} also asks {sorted(lacking)}, on which it goes on")
         needed = set().union(*(DRAWN_WITH[question] for question in self.trained))
         needed |= {"pool_passes_n"} if POOLED_BY in self.questions else set()
         if needed != self.split.model_fields_set:
             raise ValueError(f"split holds exactly what the questions need, {sorted(needed)}")
+        return self
+
+    @model_validator(mode="after")
+    def _adaptation_has_its_bases(self) -> "Scene":
+        bases = self.train_triplet.recipes if self.train_triplet else {}
+        for name, one in self.adapt.recipes.items() if self.adapt else ():
+            if one.base not in bases:
+                raise ValueError(f"adapt.recipes.{name}.base is one of {sorted(bases)}, not {one.base!r}")
         return self
 
     @model_validator(mode="after")

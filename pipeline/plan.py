@@ -137,6 +137,12 @@ def _read(file: Path) -> Scene:
         from pipeline.synthesis.capture import Synthesis
 
         parse(Synthesis, scene.simulate.model_dump(), f"{file}: simulate")
+    if scene.train_classical is not None or scene.few_labels is not None:
+        from pipeline.learning.comparison import Baselines, FewLabels  # scikit-learn, for a scene that compares
+
+        for model, section in ((Baselines, "train_classical"), (FewLabels, "few_labels")):
+            if getattr(scene, section) is not None:
+                parse(model, getattr(scene, section), f"{file}: {section}")
     return scene
 
 

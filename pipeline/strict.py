@@ -5,6 +5,7 @@ put together to a scene in `pipeline.params`.
 """
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -43,7 +44,7 @@ def parse(model: type[Model], value: Any, where: str) -> Model:
     except ValidationError as error:
         # A misspelt name is also a missing one: name what was written first.
         first = min(error.errors(include_url=False), key=lambda one: one["type"] != "extra_forbidden")
-        name = ".".join(map(str, first["loc"])) or "the file"
+        name = ".".join(_written(first["loc"], value)) or "the file"
         got = "nothing" if first["type"] == "missing" else repr(first.get("input"))[:80]
         rule = {"missing": "given", "extra_forbidden": "a known parameter"}.get(first["type"])
         rule = rule or first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
@@ -53,3 +54,14 @@ def parse(model: type[Model], value: Any, where: str) -> Model:
             place = f"{where}: {name}" if first["loc"] else where
             raise ParamsError(f"{place}: {rule}. Mend it there.") from None
         raise ParamsError(complain(where, name, rule, got, "Mend it there.")) from None
+
+
+def _written(loc: Sequence[int | str], value: Any) -> list[str]:
+    """Keep of a place what a file can say: pydantic also names the kind of section that it tried."""
+    kept = []
+    for i, part in enumerate(loc):
+        known = part in value if isinstance(value, dict) else isinstance(value, list | tuple) and isinstance(part, int)
+        if known or i == len(loc) - 1:
+            kept.append(str(part))
+        value = value[part] if known else value
+    return kept

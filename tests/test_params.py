@@ -1,3 +1,4 @@
+import copy
 from pathlib import Path
 
 import pytest
@@ -165,3 +166,17 @@ def test_broken_yaml_is_one_sentence(tmp_path, content):
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(ParamsError, match="none.yaml: the file must be there"):
         read_yaml(tmp_path / "none.yaml")
+
+
+def test_a_base_that_is_no_recipe_of_train_triplet_is_refused_at_once():
+    scene = copy.deepcopy(asking("lobo", "triplet", "adapt"))
+    scene["adapt"]["recipes"]["paper"]["base"] = "nope"
+    with pytest.raises(ParamsError, match=r"adapt.recipes.paper.base is one of \['paper'\], not 'nope'"):
+        parse(Scene, scene, "scene.yaml")
+
+
+def test_a_question_without_the_one_it_goes_on_from_names_that_one():
+    scene = asking("lobo", "triplet", "adapt")
+    scene["questions"] = ["lobo", "adapt"]
+    with pytest.raises(ParamsError, match=r"a scene that asks adapt also asks \['triplet'\]"):
+        parse(Scene, scene, "scene.yaml")

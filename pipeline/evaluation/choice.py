@@ -12,6 +12,7 @@ from pipeline.evaluation.summary import over_folds, pool_skins
 
 BY = "mse_xy_mm2"
 PAPER_INPUTS = "raw"
+VARIED = ("steps_n", "batch_n", "rate_max", "weight_decay", "triplet_weight", "base", "unlabelled_weight")
 BUDGET = ("steps_n", "base")  # how long is a scene's budget; what a base is called is no setting
 
 Cards = Sequence[dict[str, Any]]
@@ -61,7 +62,11 @@ def _candidates(cards: Cards) -> list[dict[str, Any]]:
     names = dict.fromkeys(card["recipe_name"] for card in cards)
     by_name = {name: [card for card in cards if card["recipe_name"] == name] for name in names}
     return [
-        {"recipe_name": name, **over_folds(pool_skins(own) if "tuning" in own[0] else own)}
+        {
+            "recipe_name": name,
+            "settings": ", ".join(f"{key} {value}" for key, value in _settings(own[0]).items() if key in VARIED),
+            **over_folds(pool_skins(own) if "tuning" in own[0] else own),
+        }
         for name, own in by_name.items()
     ]
 

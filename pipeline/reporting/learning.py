@@ -24,6 +24,7 @@ CONTROLLED = (
     "0 is the network as it was trained, all others are fine-tuned: what that does without pokes is the control of "
     "table 2."
 )
+BUDGETS = "How many steps there are is a budget of each scene, and no part of the choice."
 DRAWS = "± is the sd over n draws of training skins with seeds of their own, on one held-out board."
 
 Rows = Sequence[Mapping[str, Any]]
@@ -109,9 +110,9 @@ def chosen_table(arms: Mapping[str, Any], source: str) -> pd.DataFrame:
     for arm, choice in arms.items():
         for row in choice["candidates"]:
             chosen = f"yes, by {choice['by']}" if row["recipe_name"] == choice["recipe_name"] else ""
-            line = {"arm": arm, "candidate": row["recipe_name"], "chosen": chosen, "source": source}
-            lines.append(line | scores(row) | {"n": n_of(row)})
-    return tabulate(lines)
+            line = {"arm": arm, "candidate": row["recipe_name"], "settings": row["settings"], "chosen": chosen}
+            lines.append(line | {"source": source} | scores(row) | {"n": n_of(row)})
+    return tabulate(lines, meaning=BUDGETS)
 
 
 def methods_costs_table(rows: Rows, source: str) -> pd.DataFrame:

@@ -92,7 +92,7 @@ def order_table(numbers: Mapping[str, Any], source: str) -> pd.DataFrame:
         line = {"claim": f"{known['triplet'].short} within a few points of {known['multi'].short}"}
         line |= {t: _few(row[m]) if m == "accuracy_pct" else "–" for m, t in COLUMNS.items()}
         lines.append(line | {"n": n_of(row)})
-    for over in ("triplet", "control"):
+    for over in ("triplet", "multi", "control"):
         if ("adapted", over) in pairs:
             row = pairs["adapted", over]
             line = {"claim": f"adapted better than {known[over].short}" + (" (ours)" if over == "control" else "")}

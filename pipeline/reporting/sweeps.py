@@ -81,7 +81,9 @@ def sweep_sensors(rows: Sequence[Mapping[str, Any]], source: str) -> str:
         look = {"color": COLOURS[1 + i], "marker": MARKERS[i]}
         if own:
             lines.append(Line(SHORT[method], [row["skins_n"] for row in own], own, look, shift_pt=4.0 * (i - 1)))
-    return _sweep(lines, f"Scores on new skins by the number of training skins ({source})", "training skins", log=False)
+    return _sweep(
+        lines, f"Scores on one board held out, by the number of training skins ({source})", "training skins", log=False
+    )
 
 
 def bars(scores: Sequence[Mapping[str, Any]], metric: str) -> tuple[np.ndarray, np.ndarray]:

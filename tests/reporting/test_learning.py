@@ -196,7 +196,9 @@ def test_a_leak_that_nobody_knew_of_stands_out():
 
 
 def test_all_candidates_are_listed_and_the_chosen_one_is_marked_with_what_decided():
-    candidates = [{"recipe_name": name, **row(80.0, error)} for name, error in (("slow", 0.4), ("fast", 0.3))]
+    candidates = [
+        {"recipe_name": name, "settings": "", **row(80.0, error)} for name, error in (("slow", 0.4), ("fast", 0.3))
+    ]
     arms = {"triplet": {"recipe_name": "fast", "by": "MSE_xy", "candidates": candidates}}
     table = chosen_table(arms, "simulated")
     assert dict(zip(table["candidate"], table["chosen"], strict=True)) == {"slow": "", "fast": "yes, by MSE_xy"}
@@ -234,7 +236,13 @@ def everything() -> dict:
         "baselines": [one | {"rows_n": 9} | row(30.0)],
         "labels": [one | {"labels_n": 0, "as_labelled": row(30.0), "registered": row(42.0)}],
         "audit": [check],
-        "chosen": {"multi": {"recipe_name": "a", "by": "MSE_xy", "candidates": [{"recipe_name": "a"} | row(80.0)]}},
+        "chosen": {
+            "multi": {
+                "recipe_name": "a",
+                "by": "MSE_xy",
+                "candidates": [{"recipe_name": "a", "settings": "steps_n 9"} | row(80.0)],
+            }
+        },
     }
 
 
