@@ -20,7 +20,7 @@ def lab(tmp_path_factory, shared_data) -> Iterator[Path]:
     settings = YAML(typ="safe").load(scene.read_text())
     settings["train_multi"]["seeds_n"] = 1
     settings["train_multi"]["recipes"] = {"paper": settings["train_multi"]["recipes"]["paper"] | {"steps_n": 100}}
-    settings["split"]["labels_draws_n"] = 1
+    settings["split"] = {"labels_draws_n": 1, "labels_pool_n": 20}  # of 65: one depth is added here
     few = settings["few_labels"]
     few["recipes"] = {"network": few["recipes"]["network-triplet"] | {"steps_n": 20}}
     few |= {"adapted": ["network"], "methods": {"knn": few["methods"]["knn-shape"]}, "labels_n": [0, 10]}
