@@ -15,6 +15,7 @@ from pipeline.capture.probe import ProbeLog
 from pipeline.capture.wire import encode
 from pipeline.dataset.captures import open_capture, read_header
 from pipeline.errors import ReskinError
+from pipeline.params import Stages
 from pipeline.preparing import Dump, Labels
 from pipeline.registry import read_registry
 from tests.capture.headers import make_header
@@ -23,9 +24,8 @@ from tests.capture.signals import make_frames
 from tests.scenes import recorded
 from tests.stages.checkout import copy_checkout, run
 
-NOTHING = {"simulate": {}, "ingest_simulated": {}, "ingest": {}, "describe": {}, "split": {}, "train_single": [],
-           "train_multi": [], "verify": [], "stability": [], "runtime": [], "leave_out": [],
-           "report": [], "publish": []}  # fmt: skip
+BY_NAME = {"simulate", "ingest_simulated", "ingest", "describe", "split"}  # the others are lists of scenes
+NOTHING = {name: {} if name in BY_NAME else [] for name in Stages.model_fields}
 
 
 @pytest.fixture(scope="module")
