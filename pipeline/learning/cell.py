@@ -32,25 +32,26 @@ SOURCES = Path(__file__).parent
 
 @dataclass(frozen=True)
 class Measured:
-    """What trainings read of a scene: changes of field, targets, and the skin of each row (for triplets)."""
+    """What trainings read: changes of field, targets (x, y, F or x, y, Fx, Fy, Fz), each row's skin (for triplets)."""
 
     db_uT: Float32[np.ndarray, "f ch"]
-    target: Float32[np.ndarray, "f 3"]
+    target: Float32[np.ndarray, "f t"]
     skin: Shaped[np.ndarray, " f"]
 
 
 @dataclass(frozen=True)
 class Trained:
-    """A finished training: weights by name, scaler, loss a block of steps, predictions (mm, mm, N) for the test rows.
+    """A finished training: weights by name, scaler, loss a block of steps, predictions for the test rows.
 
-    `stopped_step` is set if its loss stopped being finite; the weights are then the last finite ones.
+    Predictions are in mm, mm and N. `stopped_step` is set if its loss stopped being finite; the weights are then the
+    last finite ones.
     """
 
     key: str
     weights: Weights
     scaler: Scaler
     curve: list[float]
-    predicted: Float32[np.ndarray, "b 3"]
+    predicted: Float32[np.ndarray, "b t"]
     stopped_step: int | None
     seconds: float  # of its training, its part of the stack's
     one_reading_s: float  # median, to answer for a single reading
@@ -132,7 +133,7 @@ def make_job(cell: Cell, rows: Measured) -> tuple[Job, Scaler]:
     rng = seeds.rng_for(cell.seed, "train", cell.fold, cell.skin, cell.seed_i)
     if cell.tuning is None:
         scaler = FIT[cell.recipe.scaling](view, target)
-        start: Weights = draw_weights(LAYERS[cell.recipe.architecture](view.shape[1]), rng)
+        start: Weights = draw_weights(LAYERS[cell.recipe.architecture](view.shape[1], target.shape[1]), rng)
     else:
         scaler, start = cell.tuning.start.scaler, cell.tuning.start.weights
     labelled = _labelled(cell, rows, scaler)

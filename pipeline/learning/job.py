@@ -23,7 +23,7 @@ class Labelled:
     """Rows with scaled targets; `points` orders them, for a recipe with a triplet term."""
 
     inputs: Float32[np.ndarray, "n c"]
-    targets: Float32[np.ndarray, "n 3"]
+    targets: Float32[np.ndarray, "n t"]
     points: Points | None
 
 

@@ -8,12 +8,12 @@ from jaxtyping import Float
 
 
 def squared_error(
-    answer: Float[torch.Tensor, "m b 3"], truth: Float[torch.Tensor, "m b 3"]
+    answer: Float[torch.Tensor, "m b t"], truth: Float[torch.Tensor, "m b t"]
 ) -> Float[torch.Tensor, " m"]:
     """Mean of squared errors over all known targets of a batch; an unknown target (NaN) pulls nowhere."""
     known = ~torch.isnan(truth)
-    # Fill before the difference: NaN times zero is NaN, in the gradient too.
-    difference = torch.where(known, answer - torch.where(known, truth, answer.detach()), 0.0)
+    # Filled before it is squared: NaN times zero is NaN, in the gradient too.
+    difference = torch.where(known, answer - truth, 0.0)
     return (difference**2).sum((1, 2)) / known.sum((1, 2))
 
 

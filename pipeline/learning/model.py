@@ -32,11 +32,11 @@ class Stack(nn.Module):
         """What the first three layers make of a batch for each network."""
         return self._run(inputs, 0, FEATURE_LAYERS_N)
 
-    def answer(self, features: Float[torch.Tensor, "m b 40"]) -> Float[torch.Tensor, "m b 3"]:
+    def answer(self, features: Float[torch.Tensor, "m b 40"]) -> Float[torch.Tensor, "m b t"]:
         """Turn features into scaled x, y, F."""
         return self._run(features, FEATURE_LAYERS_N, len(self.relus))
 
-    def forward(self, inputs: Float[torch.Tensor, "m b c"]) -> Float[torch.Tensor, "m b 3"]:
+    def forward(self, inputs: Float[torch.Tensor, "m b c"]) -> Float[torch.Tensor, "m b t"]:
         """Answer for a batch of each network."""
         return self.answer(self.features(inputs))
 
@@ -63,11 +63,12 @@ class Predictor:
     """One trained network, ready to answer; rows are answered a block at a time to bound memory."""
 
     def __init__(self, weights: Weights, architecture: str, device: str) -> None:
-        layers = LAYERS[architecture](weights["layer1.weight"].shape[1])
+        inputs_n, outputs_n = weights["layer1.weight"].shape[1], len(weights[f"layer{len(weights) // 2}.bias"])
+        layers = LAYERS[architecture](inputs_n, outputs_n)
         self.net, self.device = Stack(layers, [weights]).to(device), device
 
     @torch.no_grad()
-    def __call__(self, inputs: Float32[np.ndarray, "n c"]) -> Float32[np.ndarray, "n 3"]:
+    def __call__(self, inputs: Float32[np.ndarray, "n c"]) -> Float32[np.ndarray, "n t"]:
         """Answer for scaled rows."""
         blocks = torch.from_numpy(inputs).split(BLOCK_ROWS_N)
         return torch.cat([self.net(block[None].to(self.device))[0].cpu() for block in blocks]).numpy()

@@ -12,27 +12,27 @@ from jaxtyping import Float32
 # A channel that never moves in training must not blow up in use: its scale is at least this.
 SCALE_FLOOR = np.float32(1e-6)
 RELEASED_INPUT_SDS = np.float32(5.0)  # the released weights divide by about five standard deviations
-RELEASED_TARGET = np.array([16.0, 16.0, 3.0], np.float32)  # mm, mm, N
+RELEASED_PLACE_MM, RELEASED_FORCE_N = 16.0, 3.0
 
 
 @dataclass(frozen=True)
 class Scaler:
-    """`(db - input_shift) / input_scale` goes in, `out * target_scale + target_shift` is x_mm, y_mm, F_N."""
+    """`(db - input_shift) / input_scale` goes in, `out * target_scale + target_shift` is x_mm, y_mm and force in N."""
 
     input_shift: Float32[np.ndarray, " ch"]
     input_scale: Float32[np.ndarray, " ch"]
-    target_shift: Float32[np.ndarray, " 3"]
-    target_scale: Float32[np.ndarray, " 3"]
+    target_shift: Float32[np.ndarray, " t"]
+    target_scale: Float32[np.ndarray, " t"]
 
     def encode(self, db_uT: Float32[np.ndarray, "f ch"]) -> Float32[np.ndarray, "f ch"]:
         """Turn changes of field into network inputs."""
         return (db_uT - self.input_shift) / self.input_scale
 
-    def encode_target(self, target: Float32[np.ndarray, "f 3"]) -> Float32[np.ndarray, "f 3"]:
+    def encode_target(self, target: Float32[np.ndarray, "f t"]) -> Float32[np.ndarray, "f t"]:
         """Turn places and forces into what the network is to answer."""
         return (target - self.target_shift) / self.target_scale
 
-    def decode(self, answer: Float32[np.ndarray, "f 3"]) -> Float32[np.ndarray, "f 3"]:
+    def decode(self, answer: Float32[np.ndarray, "f t"]) -> Float32[np.ndarray, "f t"]:
         """Turn the network's answers into mm, mm, N."""
         return answer * self.target_scale + self.target_shift
 
@@ -46,10 +46,10 @@ class Scaler:
         return cls(**{name: arrays[name] for name in cls.__dataclass_fields__})
 
 
-def fit_standard(db_uT: Float32[np.ndarray, "f ch"], target: Float32[np.ndarray, "f 3"]) -> Scaler:
+def fit_standard(db_uT: Float32[np.ndarray, "f ch"], target: Float32[np.ndarray, "f t"]) -> Scaler:
     """Zero mean and unit deviation of every channel and target over the training rows."""
     known = ~np.isnan(target).all(axis=0)
-    shift, scale = np.zeros(3, np.float32), np.ones(3, np.float32)
+    shift, scale = np.zeros(target.shape[1], np.float32), np.ones(target.shape[1], np.float32)
     shift[known] = np.nanmean(target[:, known], axis=0, dtype=np.float64)
     scale[known] = np.nanstd(target[:, known], axis=0, dtype=np.float64)
     return Scaler(
@@ -60,13 +60,13 @@ def fit_standard(db_uT: Float32[np.ndarray, "f ch"], target: Float32[np.ndarray,
     )
 
 
-def fit_released(db_uT: Float32[np.ndarray, "f ch"], target: Float32[np.ndarray, "f 3"]) -> Scaler:
+def fit_released(db_uT: Float32[np.ndarray, "f ch"], target: Float32[np.ndarray, "f t"]) -> Scaler:
     """The scaling of the authors' released network: 5 sd of each channel, no mean removed; x/16, y/16, F/3."""
     return Scaler(
         input_shift=np.zeros(db_uT.shape[1], np.float32),
         input_scale=_floored(RELEASED_INPUT_SDS * db_uT.std(axis=0, dtype=np.float64)),
-        target_shift=np.zeros(3, np.float32),
-        target_scale=RELEASED_TARGET,
+        target_shift=np.zeros(target.shape[1], np.float32),
+        target_scale=np.array([RELEASED_PLACE_MM] * 2 + [RELEASED_FORCE_N] * (target.shape[1] - 2), np.float32),
     )
 
 

@@ -35,7 +35,8 @@ class Outcome:
 
 def train(jobs: Sequence[Job], architecture: str, schedule: Schedule, terms: Terms, device: str) -> list[Outcome]:
     """Descend the L2 loss and what stands beside it; AdamW under torch's one-cycle rate and momentum are our choice."""
-    net = Stack(LAYERS[architecture](jobs[0].labelled.inputs.shape[1]), [job.start for job in jobs]).to(device)
+    layers = LAYERS[architecture](jobs[0].labelled.inputs.shape[1], jobs[0].labelled.targets.shape[1])
+    net = Stack(layers, [job.start for job in jobs]).to(device)
     optimizer = torch.optim.AdamW(net.parameters(), schedule.rate_max, weight_decay=schedule.weight_decay, fused=True)
     rate = torch.optim.lr_scheduler.OneCycleLR(optimizer, schedule.rate_max, total_steps=max(schedule.steps_n, 2))
     feed, watch = Feed(jobs, schedule.batch_n, device), Watch(net)

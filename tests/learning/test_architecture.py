@@ -25,6 +25,11 @@ def test_inputs_may_have_any_number_of_channels():
     assert [layer.in_n for layer in paper_layers(120)] == [120, 200, 200, 40, 200, 200]
 
 
+def test_a_network_that_also_feels_shear_has_five_outputs_and_is_the_same_before_them():
+    assert paper_layers(15, 5)[:-1] == paper_layers(15)[:-1]
+    assert paper_layers(15, 5)[-1].out_n == 5
+
+
 def test_the_third_layer_ends_in_forty_features_without_a_relu():
     for layers in LAYERS.values():
         third = layers(15)[FEATURE_LAYERS_N - 1]

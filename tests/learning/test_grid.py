@@ -14,6 +14,7 @@ from pipeline.learning.cell import Cell, Trained
 from pipeline.learning.executors import make_executor
 from pipeline.learning.grid import STACK_N, run_cells, stacks, train_stack
 from tests.learning.cells import adapting, few_labels, measured, pooled, without_triplets
+from tests.learning.recipes import recipe
 
 SIZE_N = STACK_N["cpu"]
 STACKED_ATOL = 1e-3  # mm, N: a cell in another stack is the same to float32 rounding of its weights (test_train.py)
@@ -217,3 +218,15 @@ def test_stacks_cover_every_cell_once_and_are_no_larger_than_asked(kinds, size_n
         assert len({kinds[int(key.removeprefix("key"))] for key in stack}) == 1
     counts = [kinds.count(kind) for kind in set(kinds)]
     assert len(found) == sum(-(-count // size_n) for count in counts)  # no stack is split without need
+
+
+def test_a_network_learns_five_targets_as_it_learns_three():
+    own = measured()
+    shear_N = own.target[:, 2:] * np.array([0.5, -0.25], np.float32)
+    five = replace(own, target=np.hstack([own.target, shear_N]))
+    many = replace(without_triplets(), recipe=recipe(steps_n=400))
+    (one,) = train_stack([replace(many, test=many.train)], five)
+    assert one.predicted.shape == (len(many.train), 5)
+    # what it was trained on, learnt by heart: shear is a fixed share of the third target
+    rms_N = np.sqrt(((one.predicted - five.target[many.train]) ** 2).mean(axis=0))
+    assert (rms_N < 0.5 * five.target.std(axis=0)).all()
