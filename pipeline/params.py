@@ -13,64 +13,27 @@ from pipeline.dataset.rows import Selection
 from pipeline.dataset.splits import Question, Split
 from pipeline.errors import ParamsError, complain
 from pipeline.learning.recipe import Adaptations, AuditSettings, PokesSweep, Training
+from pipeline.questions import (
+    ANSWERED_BY,
+    ARMS,
+    DRAWN_WITH,
+    EXPERIMENTS,
+    MAIN_PROTOCOL,
+    MODELLED,
+    NEEDS,
+    OF_RECORDED,
+    POOLED_BY,
+    STAGE_OF,
+    STUDIED_BY,
+    SWEPT,
+    WITH_SECTION,
+    WITHOUT_SECTION,
+    Experiment,
+    Further,
+    Study,
+)
+from pipeline.sections import Ambient, Contacts, Drift, Shear, Sleeve, Variation
 from pipeline.strict import Strict, parse, read_yaml
-
-Study = Literal["verification", "stability", "runtime", "left_out"]
-Further = Literal["triplet", "adapt", "pokes", "baselines", "audit", "choice"]
-
-# question -> the stage that answers it, and the keys of `split` that draw its folds
-ANSWERED_BY: dict[str, str] = {
-    "lobo": "train_multi",
-    "transfer": "train_single",
-    "single_random": "train_single",
-    "single_temporal": "train_single",
-    "sensors": "sweep_sensors",
-    "labels": "few_labels",
-}
-DRAWN_WITH: dict[str, set[str]] = {
-    "lobo": set(),
-    "transfer": {"transfer_skins_n"},
-    "single_random": {"random_test_fraction", "random_repeats_n"},
-    "single_temporal": {"temporal_test_fraction"},
-    "sensors": {"sensors_skins_n", "sensors_draws_n"},
-    "labels": {"labels_pool_n", "labels_draws_n"},
-}
-# questions about the folds of others -> the stage that answers it, and the questions that it goes on from
-CONTINUED_BY: dict[str, str] = {
-    "triplet": "train_triplet",
-    "adapt": "adapt",
-    "pokes": "sweep_pokes",
-    "baselines": "train_classical",
-    "audit": "audit",
-}
-NEEDS: dict[str, set[str]] = {
-    "triplet": {"lobo"},
-    "adapt": {"triplet"},
-    "pokes": {"adapt"},
-    "sensors": {"adapt"},
-    "baselines": {"lobo"},
-    "labels": {"lobo"},
-    "audit": {"lobo"},
-    "choice": {"lobo", "triplet", "adapt"},  # answered by the report: it only reads scores
-}
-POOLED_BY = "adapt"  # takes pokes of the held-out skins, so a part of these is kept from every test
-ARMS = (
-    "train_single", "train_multi", "train_triplet", "adapt", "sweep_pokes", "sweep_sensors", "train_classical",
-    "few_labels", "audit",
-)  # fmt: skip
-WITHOUT_SECTION = {"sweep_sensors"}  # settings of others are all they need
-# questions about the physics of a simulated scene -> the stage that answers it
-STUDIED_BY: dict[str, str] = {
-    "verification": "verify",
-    "stability": "stability",
-    "runtime": "runtime",
-    "left_out": "leave_out",
-}
-STUDIES = tuple(STUDIED_BY.values())
-MODELLED = {"train_single", "train_multi", "train_triplet", "adapt"}
-SWEPT = {"pokes": "sweep_pokes", "sensors": "sweep_sensors", "baselines": "train_classical", "labels": "few_labels"}
-_STAGES = ANSWERED_BY | CONTINUED_BY
-MAIN_PROTOCOL = "grid"  # folds are drawn on its captures
 
 
 class OnBoards(Strict, extra="allow"):
@@ -90,7 +53,7 @@ class Scene(Strict):
 
     source: Literal["simulated", "recorded"]
     seed: Annotated[int, Field(ge=0)]
-    questions: Annotated[tuple[Literal[Question, Further, Study], ...], Field(min_length=1)]
+    questions: Annotated[tuple[Literal[Question, Further, Study, Experiment], ...], Field(min_length=1)]
     selection: Selection
     split: Split
     simulate: Simulation | None = None
@@ -103,6 +66,12 @@ class Scene(Strict):
     train_classical: dict[str, Any] | None = None  # checked by the stage, as `simulate` is
     few_labels: dict[str, Any] | None = None
     audit: AuditSettings | None = None
+    drift: Drift | None = None
+    variation: Variation | None = None
+    shear: Shear | None = None
+    sleeve: Sleeve | None = None
+    contacts: Contacts | None = None
+    ambient: Ambient | None = None
 
     @model_validator(mode="after")
     def _sections_follow_questions(self) -> "Scene":
@@ -114,7 +83,7 @@ class Scene(Strict):
         asked = set(arms_of(self))
         for arm in ARMS:
             if arm not in WITHOUT_SECTION and (getattr(self, arm) is not None) != (arm in asked):
-                asking = [question for question, stage in _STAGES.items() if stage == arm]
+                asking = [question for question, stage in STAGE_OF.items() if stage == arm]
                 raise ValueError(f"section {arm} stands in a scene if and only if it asks one of {asking}")
         needed = set().union(*(DRAWN_WITH[question] for question in self.trained))
         needed |= {"pool_passes_n"} if POOLED_BY in self.questions else set()
@@ -136,11 +105,29 @@ class Scene(Strict):
             raise ValueError(f"questions holds at least one of {sorted(ANSWERED_BY)}")
         if self.simulate is None and self.studied:
             raise ValueError(f"questions {list(self.studied)} are about physics: only a simulated scene asks them")
-        if self.simulate is not None and self.trained and MAIN_PROTOCOL not in self.simulate.protocols:
-            raise ValueError(f"a scene that asks {list(self.trained)} has a protocol named {MAIN_PROTOCOL}")
         if (self.runtime is not None) != ("runtime" in self.questions):
             raise ValueError("section runtime stands in a scene if and only if it asks runtime")
         return self
+
+    @model_validator(mode="after")
+    def _experiments_have_what_they_need(self) -> "Scene":
+        for question in sorted(WITH_SECTION):
+            if (getattr(self, question) is not None) != (question in self.questions):
+                raise ValueError(f"section {question} stands in a scene if and only if it asks {question}")
+        if self.simulate is None:
+            if beyond := sorted(set(self.experiments) - OF_RECORDED):
+                raise ValueError(f"questions {beyond} are asked of simulated scenes only, so far")
+            return self
+        needed = {MAIN_PROTOCOL} | {EXPERIMENTS[question] for question in self.experiments} - {None}
+        if needed != set(self.simulate.protocols):
+            have, want = sorted(self.simulate.protocols), sorted(map(str, needed))
+            raise ValueError(f"simulate.protocols holds exactly what the questions need, {want}; it holds {have}")
+        return self
+
+    @property
+    def experiments(self) -> tuple[str, ...]:
+        """The paper's further experiments among the questions."""
+        return tuple(question for question in self.questions if question in EXPERIMENTS)
 
     @property
     def trained(self) -> tuple[str, ...]:
@@ -175,6 +162,13 @@ class DescribeItem(Strict):
     protocol: str
 
 
+class ExperimentItem(Strict):
+    """One scene that asks for an experiment, and the folder of the captures that it is asked of."""
+
+    scene: str
+    folder: str
+
+
 class Stages(Strict):
     """Which scenes each stage of dvc.yaml runs for; made from the scenes by `reskin scenes use`, never by hand."""
 
@@ -192,6 +186,17 @@ class Stages(Strict):
     train_classical: tuple[str, ...]
     few_labels: tuple[str, ...]
     audit: tuple[str, ...]
+    drift: dict[str, ExperimentItem]
+    variation: dict[str, ExperimentItem]
+    shear: dict[str, ExperimentItem]
+    manual: dict[str, ExperimentItem]
+    flexible: dict[str, ExperimentItem]
+    sleeve: dict[str, ExperimentItem]
+    sensitivity: dict[str, ExperimentItem]
+    logs: dict[str, ExperimentItem]
+    contacts: dict[str, ExperimentItem]
+    ambient: dict[str, ExperimentItem]
+    dynamics: dict[str, ExperimentItem]
     verify: tuple[str, ...]
     stability: tuple[str, ...]
     runtime: tuple[str, ...]
@@ -222,6 +227,7 @@ def check_planned(name: str, scene: Scene, params: Params, where: str) -> None:
     """Raise if `params.yaml` has other stages than the scene's questions and protocols ask for: it was edited since."""
     wanted = arms_of(scene) + [STUDIED_BY[question] for question in scene.studied]
     unplanned = [stage for stage in wanted if name not in getattr(params.stages, stage)]
+    unplanned += [stage for stage in scene.experiments if name not in getattr(params.stages, stage)]
     if scene.simulate is not None:
         planned = {item.protocol for item in params.stages.simulate.values() if item.scene == name}
         unplanned += [f"protocol {one}" for one in sorted(planned ^ set(scene.simulate.protocols))]
@@ -236,7 +242,7 @@ def check_planned(name: str, scene: Scene, params: Params, where: str) -> None:
 
 def arms_of(scene: Scene) -> list[str]:
     """Name the stages that answer a scene's questions about learning."""
-    asked = {_STAGES[question] for question in scene.questions if question in _STAGES}
+    asked = {STAGE_OF[question] for question in scene.questions if question in STAGE_OF}
     return [arm for arm in ARMS if arm in asked]
 
 
@@ -251,8 +257,8 @@ def swept(scene: Scene) -> dict[str, str]:
 
 
 def described_in(scene: Scene) -> list[str]:
-    """Name the descriptions of a scene's captures: one a protocol, or that of the recorded ones."""
-    return ["recorded"] if scene.simulate is None else list(scene.simulate.protocols)
+    """Name the descriptions of a scene's captures: that of its main protocol, or of the recorded ones."""
+    return ["recorded"] if scene.simulate is None else [MAIN_PROTOCOL]
 
 
 def captures_of(scene: str, params: Params, indentations: Path) -> list[str]:

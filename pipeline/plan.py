@@ -12,18 +12,8 @@ from ruamel.yaml import YAML
 
 from pipeline import io
 from pipeline.errors import ParamsError, complain
-from pipeline.params import (
-    ARMS,
-    MAIN_PROTOCOL,
-    STUDIED_BY,
-    STUDIES,
-    Params,
-    Scene,
-    arms_of,
-    described_in,
-    read_params,
-    read_scene,
-)
+from pipeline.params import Params, Scene, arms_of, described_in, read_params, read_scene
+from pipeline.questions import ARMS, EXPERIMENTS, MAIN_PROTOCOL, STUDIED_BY, STUDIES
 from pipeline.registry import Registry, read_registry
 from pipeline.strict import parse, read_yaml
 
@@ -53,14 +43,13 @@ def make_plan(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, Any]
             complain("stage ingest", "scene-capture", "unlike any other", "two that read the same", "Rename a scene.")
         )
     simulated = _folders(scenes)
-    described = {key: {"scene": item["scene"], "protocol": item["protocol"]} for key, item in simulated.items()} | {
-        name: {"scene": name, "protocol": described_in(scene)[0]} for name, scene in scenes.items() if captures[name]
-    }
+    described = {name: {"scene": name, "protocol": described_in(scene)[0]} for name, scene in scenes.items()}
     plan: dict[str, Any] = {
         "simulate": simulated, "ingest_simulated": simulated, "ingest": ingest, "describe": described,
         "split": captures,
     }  # fmt: skip
     plan |= {stage: [name for name in scenes if stage in asked[name]] for stage in (*ARMS, *STUDIES)}
+    plan |= {question: _experiments(scenes, question) for question in EXPERIMENTS}
     return plan | {"report": list(scenes), "publish": list(scenes)}
 
 
@@ -68,12 +57,26 @@ def _stages_of(scene: Scene) -> set[str]:
     return {*arms_of(scene), *(STUDIED_BY[question] for question in scene.studied)}
 
 
+def _experiments(scenes: Mapping[str, Scene], question: str) -> dict[str, dict[str, str]]:
+    """Name the folder of captures that an experiment is asked of, by scene."""
+    protocol = EXPERIMENTS[question]
+    return {
+        name: {"scene": name, "folder": name if scene.simulate is None else _folder(name, protocol or MAIN_PROTOCOL)}
+        for name, scene in scenes.items()
+        if question in scene.experiments
+    }
+
+
+def _folder(scene: str, protocol: str) -> str:
+    return scene if protocol == MAIN_PROTOCOL else f"{scene}-{protocol}"
+
+
 def _folders(scenes: Mapping[str, Scene]) -> dict[str, dict[str, str]]:
     """Name the folder of each protocol's captures: the scene's own for the main one."""
     folders: dict[str, dict[str, str]] = {}
     for name, scene in scenes.items():
         for protocol, own in scene.simulate.protocols.items() if scene.simulate is not None else ():
-            folder = name if protocol == MAIN_PROTOCOL else f"{name}-{protocol}"
+            folder = _folder(name, protocol)
             if folder in folders or (folder in scenes and folder != name):
                 rule = "unlike any scene and any other's protocol"
                 raise ParamsError(complain(f"scene {name}", "a protocol's folder", rule, folder, "Rename one."))

@@ -19,7 +19,9 @@ from pipeline.errors import ParamsError, complain
 from pipeline.seeds import rng_for
 from pipeline.strict import Strict
 
-Question = Literal["lobo", "sensors", "labels", "transfer", "single_random", "single_temporal"]
+Question = Literal[
+    "lobo", "sensors", "labels", "transfer", "single_random", "single_indentation", "single_pass", "single_temporal"
+]
 Count = Annotated[int, Field(ge=1)]
 
 

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from pipeline.params import ANSWERED_BY
+from pipeline.questions import ANSWERED_BY
 from pipeline.stages._models import write_models
 from pipeline.stages._run import run
 from pipeline.stages._train import cells_of, read_scenery, train_all

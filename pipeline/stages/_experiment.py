@@ -1,0 +1,22 @@
+"""What the stages of the paper's experiments share: the captures of one folder, and the answer. Knows no argv."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pipeline import io
+from pipeline.errors import SchemaError, complain
+from pipeline.schema import Readings
+
+
+def read_folder(indentations: Path, names: tuple[str, ...] = ()) -> list[Readings]:
+    """Read the named captures of a folder in order of name; without names, all that its one stage wrote."""
+    files = [indentations / f"{name}.parquet" for name in sorted(names)] or sorted(indentations.glob("*.parquet"))
+    if not files:
+        raise SchemaError(complain(str(indentations), "captures", "one or more", "none", "Ingest them again."))
+    return [io.read_readings(file) for file in files]
+
+
+def write_answer(answer: Path, numbers: Mapping[str, Any], drawn: Mapping[str, Any]) -> None:
+    """Write what numbers.json takes over as it is, and beside it what only figures show."""
+    io.write_json(answer, {"numbers": dict(numbers), "drawn": dict(drawn)})
