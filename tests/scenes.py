@@ -33,10 +33,23 @@ SECTIONS: dict[str, dict[str, object]] = {
     "audit": {"audit": {"settings": "chosen"}},
     "choice": {},
 }
+SECTIONS |= {
+    "single_indentation": {"train_single": TRAINING},
+    "single_pass": {"train_single": TRAINING},
+    "drift": {
+        "drift": {
+            "unit": "pass", "train_n": 1, "test_n": 1, "every_n": 1, "policies": ["initial", "each"],
+            "training": TRAINING,
+        },
+    },
+    "contacts": {"contacts": {"pairs_n": 10, "separations_mm": [8.0], "false_alarm_fraction": 0.05}},
+}  # fmt: skip
 DRAWN_WITH: dict[str, dict[str, object]] = {
     "transfer": {"transfer_skins_n": 1},
     "single_random": {"random_test_fraction": 0.1, "random_repeats_n": 1},
     "single_temporal": {"temporal_test_fraction": 0.1},
+    "single_indentation": {"random_test_fraction": 0.1, "random_repeats_n": 1},
+    "single_pass": {"random_test_fraction": 0.1, "random_repeats_n": 1},
     "adapt": {"pool_passes_n": 1},
     "sensors": {"sensors_skins_n": [1], "sensors_draws_n": 1},
     "labels": {"labels_pool_n": 8, "labels_draws_n": 1},

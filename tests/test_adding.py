@@ -17,6 +17,7 @@ from pipeline.dataset.captures import open_capture, read_header
 from pipeline.errors import ReskinError
 from pipeline.params import Stages
 from pipeline.preparing import Dump, Labels
+from pipeline.questions import EXPERIMENTS
 from pipeline.registry import read_registry
 from tests.capture.headers import make_header
 from tests.capture.readers.test_lab import PRESSES, write
@@ -24,7 +25,8 @@ from tests.capture.signals import make_frames
 from tests.scenes import recorded
 from tests.stages.checkout import copy_checkout, run
 
-BY_NAME = {"simulate", "ingest_simulated", "ingest", "describe", "split"}  # the others are lists of scenes
+# by name of a folder or a scene; the others are lists of scenes
+BY_NAME = {"simulate", "ingest_simulated", "ingest", "describe", "split", *EXPERIMENTS}
 NOTHING = {name: {} if name in BY_NAME else [] for name in Stages.model_fields}
 
 

@@ -60,6 +60,7 @@ def scene(*questions: str, **changes: object) -> Scene:
         ("labels", ("lobo",)),
         ("audit", ("lobo",)),
         ("choice", PAPERS_CLAIM),
+        ("contacts", ("lobo",)),
     ],
 )
 def test_a_question_that_goes_on_from_others_is_legal_with_them_and_refused_without_the_last(question, others):
@@ -69,6 +70,40 @@ def test_a_question_that_goes_on_from_others_is_legal_with_them_and_refused_with
     assert str(refused.value) == (
         f"scene.yaml: a scene that asks {question} also asks ['{others[-1]}'], on which it goes on. Mend it there."
     )
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"train_n": 2}, "train_n is at most every_n, 1"),
+        ({"test_n": 2}, "test_n is at most every_n, 1"),
+        ({"regular_n": 5}, "regular_n stands there if and only if policies holds regular"),
+        ({"policies": ["regular"]}, "regular_n stands there if and only if policies holds regular"),
+        ({"policies": ["each", "each"]}, "policies names each policy once"),
+    ],
+)
+def test_windows_that_contradict_each_other_are_refused(changes, sentence):
+    with pytest.raises(ParamsError, match=sentence):
+        scene("lobo", "drift", drift=SECTIONS["drift"]["drift"] | changes)
+
+
+def test_an_experiment_on_skins_that_only_a_simulator_has_is_refused_for_recorded_ones():
+    with pytest.raises(ParamsError, match=r"questions \['sensitivity'\] are asked of simulated scenes only"):
+        parse(Scene, recorded(questions=["lobo", "sensitivity"]), "scene.yaml")
+
+
+@pytest.mark.parametrize("dropped", ["drift", "shear"])
+def test_an_experiment_that_is_switched_off_takes_its_section_and_its_captures_along(dropped):
+    own = read_yaml(ROOT / "pipeline/scenes/ci.yaml")
+    own["questions"].remove(dropped)
+    own.pop(dropped)
+    if dropped == "drift":  # its captures are asked for variation as well
+        parse(Scene, own, "ci.yaml")
+        return
+    with pytest.raises(ParamsError, match=r"protocols holds exactly what the questions need, \[[^]]*\]; it holds"):
+        parse(Scene, own, "ci.yaml")
+    own["simulate"]["protocols"].pop("drag")
+    parse(Scene, own, "ci.yaml")
 
 
 def test_all_that_a_question_lacks_is_named_at_once():

@@ -6,6 +6,7 @@ from ruamel.yaml import YAML
 from pipeline import plan
 from pipeline.errors import ParamsError
 from pipeline.params import Scene, Stages, check_planned, read_params, read_scene
+from pipeline.questions import EXPERIMENTS
 from pipeline.registry import Entry, Registry
 from pipeline.strict import parse
 from tests.scenes import asking, recorded
@@ -52,6 +53,15 @@ def test_a_stage_about_learning_runs_for_the_scenes_that_ask_it_and_for_no_other
     assert made["train_multi"] == made["report"] == made["publish"] == ["one", "two"]
     parse(Stages, made, "plan")
     assert plan.make_plan({"one": plain}, captures)[stage] == []
+
+
+def test_an_experiment_of_a_recorded_scene_is_asked_of_its_own_captures_and_of_no_other_scene():
+    asked, plain = (parse(Scene, asking(*own), "scene.yaml") for own in (("lobo", "drift"), ("lobo",)))
+    captures = Registry(captures={"one": {"c0": ENTRY}, "two": {"c0": ENTRY}})
+    made = plan.make_plan({"one": plain, "two": asked}, captures)
+    assert made["drift"] == {"two": {"scene": "two", "folder": "two"}}
+    assert all(made[question] == {} for question in EXPERIMENTS if question != "drift")
+    parse(Stages, made, "plan")
 
 
 def test_a_choice_of_settings_needs_no_stage_of_its_own():
