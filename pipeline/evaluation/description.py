@@ -29,6 +29,7 @@ def describe(one: Readings) -> dict[str, float]:
         **_rest(one.noload_uT),
         **_noise(one, touched),
         **_steps(one),
+        **_rate(one),
         **_forces(one.Fz_N[touched]),
         **_changes(change_uT[touched], one.Fz_N[touched]),
     }
@@ -80,6 +81,13 @@ def _steps(one: Readings) -> dict[str, float]:
     lsb_uT = find_lsb(one.b_uT[:STEP_READINGS_N])
     known = {"step_xy_uT": lsb_uT[:, 0], "step_z_uT": lsb_uT[:, 1]}
     return {name: float(np.nanmedian(steps)) for name, steps in known.items() if np.isfinite(steps).any()}
+
+
+def _rate(one: Readings) -> dict[str, float]:
+    """Give the rate at which readings of one stop followed each other, where a clock tells."""
+    between_s = np.diff(one.t_s)[(np.diff(one.indentation) == 0) & (np.diff(one.reading_i) == 1)]
+    known_s = between_s[between_s > 0]  # NaN, no clock, is not
+    return {"rate_hz": float(1 / np.median(known_s))} if len(known_s) >= ENOUGH_N else {}
 
 
 def _forces(force_N: Float[np.ndarray, " f"]) -> dict[str, float]:

@@ -22,6 +22,7 @@ QUANTITIES = {
     "noise_z_uT": "noise of one reading, z, µT",
     "step_xy_uT": "step of a chip, x and y, µT",
     "step_z_uT": "step of a chip, z, µT",
+    "rate_hz": "readings a second at one stop",
     "force_median_N": "force, median, N",
     "force_max_N": "force, largest, N",
 }

@@ -9,6 +9,7 @@ from typing import Any
 import pandas as pd
 
 from pipeline.reporting.checks import stability_table, verification_table
+from pipeline.reporting.experiments.parts import experiment_tables
 from pipeline.reporting.learning import learning_tables
 from pipeline.reporting.left_out import left_out_table
 from pipeline.reporting.order import models
@@ -39,6 +40,7 @@ def make_tables(numbers: Mapping[str, Any]) -> dict[str, pd.DataFrame]:
         tables["single_sensor"] = _beside_paper(single, source)
     if "lobo" in numbers:
         tables["lobo_boards"] = _boards(numbers["lobo"]["by_board"], source)
+    tables |= experiment_tables(numbers, source)
     if "verification" in numbers:
         tables["verification"] = verification_table(numbers["verification"], source)
     if "stability" in numbers:

@@ -44,6 +44,11 @@ def test_fields_noise_steps_and_forces_are_those_it_was_made_of():
     assert found["force_median_N"] == pytest.approx(2.0, rel=0.02)
     assert found["change_at_2_N_uT"] == pytest.approx(200, rel=0.02)
     assert found["weakest_over_strongest_chip"] == pytest.approx(0.25, rel=0.1)
+    assert found["rate_hz"] == pytest.approx(400.0)
+
+
+def test_a_recording_without_a_clock_has_no_rate():
+    assert "rate_hz" not in describe(replace(made(), t_s=np.full(INDENTATIONS_N * READINGS_N, np.nan)))
 
 
 def test_what_moves_between_stops_of_one_indentation_is_no_noise():

@@ -1,0 +1,64 @@
+"""What stage report reads: cards, answers and accounts of a scene on disk -> numbers, and what only figures show."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline import io
+from pipeline.evaluation.choice import choose
+from pipeline.learning.executors import device as trained_on
+from pipeline.learning.recipe import HEADLINE
+from pipeline.params import Scene, described_in, modelled, swept
+from pipeline.provenance import SECONDS, code_version, device, read_costs
+from pipeline.reporting.learned import timed_learning
+from pipeline.reporting.numbers import answered, compose, rounded, runtime
+from pipeline.stages._run import COSTS
+
+Cards = Sequence[Mapping[str, Any]]
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where a scene's results lie."""
+
+    indentations: Path
+    folds: Path
+    models: Path
+    answers: Path
+
+
+def read_cards(asked: Scene, models: Path) -> list[dict[str, Any]]:
+    """Read the cards of all models that the scene keeps."""
+    return [io.read_json(file) for arm in modelled(asked) for file in sorted((models / arm).glob("*.json"))]
+
+
+def read_numbers(scene: str, asked: Scene, at: Places) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Read what numbers.json says, and by experiment what only its figures show."""
+    words, cards = io.read_json(at.folds), read_cards(asked, at.models)
+    accounts = [io.read_account(at.indentations / f"{name}.parquet") for name in words["captures"]]
+    points = {question: io.read_json(at.answers / f"{file}.json") for question, file in swept(asked).items()}
+    numbers: dict[str, Any] = {"provenance": _provenance(scene, asked, cards)}
+    numbers |= compose(cards, points, accounts, words["dropped"], headline=HEADLINE)
+    numbers |= {"audit": io.read_json(at.answers / "audit.json")} if "audit" in asked.questions else {}
+    numbers |= {"chosen": choose(cards)} if "choice" in asked.questions else {}
+    numbers["described"] = {name: io.read_json(at.answers / f"described/{name}.json") for name in described_in(asked)}
+    experiments = {question: io.read_json(at.answers / f"{question}.json") for question in asked.experiments}
+    numbers |= {question: answer["numbers"] for question, answer in experiments.items()}
+    studied = {question: io.read_json(at.answers / f"{question}.json") for question in asked.studied}
+    took = _seconds(scene)
+    numbers |= answered(studied, runtime(cards, read_costs(COSTS / scene)), took)
+    numbers["runtime"] |= timed_learning(numbers, took)
+    return rounded(numbers), {question: answer["drawn"] for question, answer in experiments.items()}
+
+
+def _provenance(scene: str, asked: Scene, cards: Cards) -> dict[str, Any]:
+    known = {"scene": scene, "source": asked.source, "git": code_version(), "seed": asked.seed}
+    known |= {"trained": ", ".join(sorted({card["git"] for card in cards}))}
+    known |= {"device": f"{device()}, networks on {trained_on()}"}
+    return known | {"seconds": round(sum(cost["seconds"] for cost in read_costs(COSTS / scene).values()), 1)}
+
+
+def _seconds(scene: str) -> dict[str, list[dict[str, Any]]]:
+    """Read what was timed here, by stage; what was not timed here is absent."""
+    return {file.stem: io.read_json(file) for file in sorted((SECONDS / scene).glob("*.json"))}
