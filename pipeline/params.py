@@ -37,8 +37,9 @@ from pipeline.strict import Strict, parse, read_yaml
 
 
 class OnBoards(Strict, extra="allow"):
-    """A protocol, as far as the plan must know it: on which kind of boards it runs."""
+    """A protocol, as far as the plan must know it: its kind, and on which kind of boards it runs."""
 
+    kind: str
     boards: str
 
 

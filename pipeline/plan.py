@@ -13,7 +13,7 @@ from ruamel.yaml import YAML
 from pipeline import io
 from pipeline.errors import ParamsError, complain
 from pipeline.params import Params, Scene, arms_of, described_in, read_params, read_scene
-from pipeline.questions import ARMS, EXPERIMENTS, MAIN_PROTOCOL, STUDIED_BY, STUDIES
+from pipeline.questions import ARMS, EXPERIMENTS, MAIN_PROTOCOL, NOT_INGESTED, STUDIED_BY, STUDIES
 from pipeline.registry import Registry, read_registry
 from pipeline.strict import parse, read_yaml
 
@@ -45,8 +45,8 @@ def make_plan(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, Any]
     simulated = _folders(scenes)
     described = {name: {"scene": name, "protocol": described_in(scene)[0]} for name, scene in scenes.items()}
     plan: dict[str, Any] = {
-        "simulate": simulated, "ingest_simulated": simulated, "ingest": ingest, "describe": described,
-        "split": captures,
+        "simulate": simulated, "ingest_simulated": _ingested(scenes, simulated), "ingest": ingest,
+        "describe": described, "split": captures,
     }  # fmt: skip
     plan |= {stage: [name for name in scenes if stage in asked[name]] for stage in (*ARMS, *STUDIES)}
     plan |= {question: _experiments(scenes, question) for question in EXPERIMENTS}
@@ -55,6 +55,16 @@ def make_plan(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, Any]
 
 def _stages_of(scene: Scene) -> set[str]:
     return {*arms_of(scene), *(STUDIED_BY[question] for question in scene.studied)}
+
+
+def _ingested(scenes: Mapping[str, Scene], folders: Mapping[str, dict[str, str]]) -> dict[str, dict[str, str]]:
+    """Keep the folders whose captures become rows."""
+    return {key: item for key, item in folders.items() if _kind(scenes[item["scene"]], item) not in NOT_INGESTED}
+
+
+def _kind(scene: Scene, item: Mapping[str, str]) -> str:
+    assert scene.simulate is not None, "only a simulated scene has folders by protocol"
+    return scene.simulate.protocols[item["protocol"]].kind
 
 
 def _experiments(scenes: Mapping[str, Scene], question: str) -> dict[str, dict[str, str]]:

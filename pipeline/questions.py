@@ -100,5 +100,6 @@ EXPERIMENTS: dict[str, str | None] = {
     "ambient": None,
     "dynamics": "press",
 }
+NOT_INGESTED = {"walk"}  # kinds of protocols whose captures are read as they are: an SD card knows no probe
 OF_RECORDED = {"drift", "contacts"}  # the experiments that recorded captures can answer too
 WITH_SECTION = {"drift", "variation", "shear", "sleeve", "contacts", "ambient"}
