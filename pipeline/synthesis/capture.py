@@ -23,7 +23,7 @@ from pipeline.strict import Strict
 from pipeline.synthesis.felt import Felt, Terms, feel
 from pipeline.synthesis.frames import read_frames, switch_on
 from pipeline.synthesis.protocols import Grid, Hand, Protocol, make_plan
-from pipeline.synthesis.rig import Rig, chunks, draw_clock, misplace, probe_log, timeline
+from pipeline.synthesis.rig import Rig, chunks, draw_clock, misplace, paced, probe_log, timeline
 
 MAIN = "grid"  # its captures bear the names of their skins alone
 # What is drawn for a capture, each by a name of its own: a term more leaves all other draws as they are.
@@ -117,7 +117,8 @@ def roster(parameters: Synthesis, protocol: str) -> list[tuple[str, str]]:
 
 def record(parameters: Synthesis, protocol: str, *, board: str, skin: str, seed: int) -> SyntheticCapture:
     """Draw the board and the skin of these names, take the skin through the protocol, and record it."""
-    asked, rig = parameters.protocols[protocol], parameters.rig
+    asked = parameters.protocols[protocol]
+    rig = paced(parameters.rig, asked.rate_hz)
     terms = parameters.terms.only(asked.terms)
     rngs = {part: rng_for(seed, "recording", protocol, board, skin, part) for part in PARTS}
     kind = parameters.boards[asked.boards]

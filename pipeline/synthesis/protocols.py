@@ -22,6 +22,7 @@ class _Shared(Strict):
     boards: str  # the kind of board, one of `boards` of the scene
     skins_n: Count  # so many, the first skin of each board before the second of any
     terms: tuple[Literal["ageing", "friction", "relaxation", "temperature"], ...]  # physics that it needs (PHYSICS 8)
+    rate_hz: Annotated[float, Field(gt=0, le=1e4)] | None = None  # the rig's unless given: more chips take longer
 
 
 class Grid(_Shared):

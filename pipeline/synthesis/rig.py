@@ -37,6 +37,11 @@ class Rig(Strict):
     probe_clock_rate_error: Annotated[float, Field(ge=0, le=0.01)]  # sd
 
 
+def paced(rig: Rig, rate_hz: float | None) -> Rig:
+    """Give the rig at a protocol's own rate, if it has one."""
+    return rig if rate_hz is None else rig.model_copy(update={"rate_hz": rate_hz})
+
+
 @dataclass(frozen=True)
 class Timeline:
     """The frames of one indentation, axis t: the stop that each sees, and what share of its change of field."""

@@ -97,6 +97,17 @@ def test_with_a_perfect_robot_passes_repeat_the_field_and_differ_by_noise(captur
     np.testing.assert_allclose(differences.std(axis=(0, 1, 2)), (3.3, 3.3, 5.0), rtol=0.05)  # 7000 draws: 0.8 %
 
 
+def test_a_protocol_with_a_rate_of_its_own_is_recorded_at_it_and_another_at_the_rigs():
+    slow, usual = (
+        capture_of(with_protocol("other", GRID | {"passes_n": 1} | own), "other") for own in ({"rate_hz": 133.0}, {})
+    )
+    for capture, rate_hz in ((slow, 133.0), (usual, 400.0)):
+        frames_n, log = 130 * FRAMES_N, capture.probe
+        # A chunk comes a few tenths of a millisecond late, of 3 s and more.
+        assert capture.arrived_s[-1] == pytest.approx(frames_n / rate_hz, rel=1e-3)
+        np.testing.assert_allclose((log.t_end_s - log.t_start_s)[log.contact], 3 / rate_hz, rtol=1e-3)
+
+
 def test_a_hand_leaves_no_label_but_a_field_that_changes():
     one = capture_of(with_protocol("hand", HAND), "hand")
     for name in ("x_mm", "y_mm", "depth_mm", "Fx_N", "Fy_N", "Fz_N"):
