@@ -143,7 +143,7 @@ def _free_edge(on: Subject) -> list[Omission]:
     depth_m = float(on.tip_m[..., 2].max())
     poke_m = np.array([[*on.skin.seat_m, depth_m]])
     [(_, before, after)] = moved_dipoles(on.skin, poke_m)
-    edge_m = nodes.SKIN_SIDE_M / 2
+    edge_m = min(on.skin.sides_m) / 2
     away_m, then_m = (part[0][:, :2] - on.skin.seat_m for part in (before, after))
     far = np.argmax(np.hypot(*away_m.T))
     grown_m2 = float((then_m[far] ** 2).sum() - (away_m[far] ** 2).sum())

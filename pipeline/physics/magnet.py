@@ -1,10 +1,11 @@
-"""How a skin is magnetised. In: the authors' array of magnets, places in the slab. Out: field and magnetisation in T.
+"""How a skin is magnetised. In: an array of magnets as wide as it, places in the slab. Out: field, magnetisation in T.
 
 The powder's own field is left out (<= 2.5 %, PHYSICS 8), and so are tolerances of the array.
 Refuses to know quadrature, chips, pokes and what differs from skin to skin.
 """
 
 from itertools import product
+from math import ceil
 from typing import Literal
 
 import numpy as np
@@ -14,7 +15,7 @@ from scipy.constants import mu_0
 from pipeline.errors import ParamsError, complain
 
 CUBE_SIDE_M = 6.35e-3  # 0.25 in cubes
-CUBES_N = 4  # along x and along y
+CUBES_N = (4, 4)  # along x and along y, under the authors' skin of 20 x 20 mm
 ARRAY_BELOW_M = 0.50e-3  # from the skin's base down to the lower cubes' faces, authors' CAD
 ARRAY_ABOVE_M = 0.25e-3  # from the skin's top up to the upper cubes' faces, authors' CAD
 ARRAY_REMANENCE_T = 1.32  # N42 cubes, assumed
@@ -44,15 +45,28 @@ def cuboid_field(
     return b_T
 
 
-def array_field(nodes_m: Float[np.ndarray, "s 3"], thickness_m: float, polarity: Polarity) -> Float[np.ndarray, "s 3"]:
-    """Sum the field of the 4x4 cubes below and the 4x4 above at places in the slab, in tesla."""
+def cubes_along(side_m: float) -> int:
+    """Count the cubes along a side of a skin: enough to cover it, as the authors' four do (assumed of other skins)."""
+    return ceil(side_m / CUBE_SIDE_M - 1e-9)
+
+
+def seams_m(side_m: float) -> tuple[float, ...]:
+    """Say where two cubes touch along a side, from the skin's middle; there the magnetisation bends."""
+    n = cubes_along(side_m)
+    return tuple(CUBE_SIDE_M * (i - n / 2) for i in range(1, n))
+
+
+def array_field(
+    nodes_m: Float[np.ndarray, "s 3"], thickness_m: float, polarity: Polarity, *, cubes_n: tuple[int, int] = CUBES_N
+) -> Float[np.ndarray, "s 3"]:
+    """Sum the field of so many cubes below, and as many above, at places in the slab, in tesla."""
     if not (nodes_m[:, 2].min() >= 0 and nodes_m[:, 2].max() <= thickness_m):
         got = f"{nodes_m[:, 2].min():.3g} ... {nodes_m[:, 2].max():.3g} m"
         raise ParamsError(complain("magnet array", "places", "inside the slab", got, "Magnetise the skin at rest."))
-    middles_m = (np.arange(CUBES_N) - (CUBES_N - 1) / 2) * CUBE_SIDE_M
+    middles_m = [(np.arange(n) - (n - 1) / 2) * CUBE_SIDE_M for n in cubes_n]
     heights_m = (-ARRAY_BELOW_M - CUBE_SIDE_M / 2, thickness_m + ARRAY_ABOVE_M + CUBE_SIDE_M / 2)
     b_T = np.zeros_like(nodes_m)
-    for (i, x_m), (j, y_m) in product(enumerate(middles_m), repeat=2):
+    for (i, x_m), (j, y_m) in product(*map(enumerate, middles_m)):
         sign = -1 if polarity == "checkerboard" and (i + j) % 2 else 1
         for z_m in heights_m:
             b_T += cuboid_field(nodes_m - (x_m, y_m, z_m), sign * ARRAY_REMANENCE_T, sides_m=(CUBE_SIDE_M,) * 3)

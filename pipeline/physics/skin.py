@@ -17,7 +17,7 @@ from pipeline.errors import ParamsError, complain
 from pipeline.physics import dipole, flow_map, layer, magnet
 from pipeline.physics.board import Board, Spreads
 from pipeline.physics.change import change_of_field
-from pipeline.physics.nodes import CHOSEN, SKIN_SIDE_M, Quadrature, place_nodes
+from pipeline.physics.nodes import CHOSEN, SKIN_SIDES_M, Quadrature, place_nodes
 from pipeline.seeds import rng_for
 from pipeline.strict import Strict
 
@@ -46,6 +46,7 @@ class Skin:
     nodes_m: Float[np.ndarray, "s 3"]
     moments_A_m2: Float[np.ndarray, "s 3"]
     seat_m: Float[np.ndarray, " 2"]  # the skin's middle
+    sides_m: tuple[float, float]
     thickness_m: float
     modulus_Pa: float
     tip_radius_m: float
@@ -53,8 +54,19 @@ class Skin:
     base: layer.Base
 
 
-def draw_skin(design: SkinDesign, spreads: Spreads, *, seed: int, name: str, rule: Quadrature = CHOSEN) -> Skin:
-    """Draw the skin called `name`, as it sits on its board; another rule of quadrature sees the same skin."""
+def draw_skin(
+    design: SkinDesign,
+    spreads: Spreads,
+    *,
+    seed: int,
+    name: str,
+    rule: Quadrature = CHOSEN,
+    sides_m: tuple[float, float] = SKIN_SIDES_M,
+) -> Skin:
+    """Draw the skin called `name`, as it sits on its board; another rule of quadrature sees the same skin.
+
+    An array of magnets that covers a skin of other sides magnetises it.
+    """
     rng = rng_for(seed, "skin", name)
     amplitude, thickness, modulus = np.exp(
         np.array([spreads.skin_amplitude, spreads.skin_thickness, spreads.skin_modulus]) * rng.standard_normal(3)
@@ -62,8 +74,9 @@ def draw_skin(design: SkinDesign, spreads: Spreads, *, seed: int, name: str, rul
     seat_m = spreads.skin_seat_mm * milli * rng.standard_normal(2)
     depth_zero_mm = spreads.skin_depth_zero_mm * rng.standard_normal()
     thickness_m = float(design.thickness_mm * milli * thickness)
-    rest = place_nodes(thickness_m, rule)
-    b_T = magnet.array_field(rest.nodes_m, thickness_m, design.polarity)
+    rest = place_nodes(thickness_m, rule, sides_m=sides_m)
+    cubes_n = (magnet.cubes_along(sides_m[0]), magnet.cubes_along(sides_m[1]))
+    b_T = magnet.array_field(rest.nodes_m, thickness_m, design.polarity, cubes_n=cubes_n)
     j_T = magnet.magnetise(b_T, saturation_T=amplitude * design.saturation_T, half_field_T=design.half_field_T)
     filler = _filler(rest.nodes_m[:, :2], spreads, rng)
     return Skin(
@@ -71,6 +84,7 @@ def draw_skin(design: SkinDesign, spreads: Spreads, *, seed: int, name: str, rul
         nodes_m=rest.nodes_m + np.append(seat_m, 0.0),
         moments_A_m2=magnet.moments(j_T * filler[:, None], rest.volumes_m3),
         seat_m=seat_m,
+        sides_m=sides_m,
         thickness_m=thickness_m,
         modulus_Pa=float(design.modulus_kPa * kilo * modulus),
         tip_radius_m=design.tip_radius_mm * milli,
@@ -86,7 +100,8 @@ def changes_of_field(
 
     No contact (true depth of zero or less): exactly zero. A poke beside the skin is refused.
     """
-    rest_T = dipole.field(skin.nodes_m, skin.moments_A_m2, board.chips_m)
+    # Chip by chip, to bound memory: a large skin under many chips has millions of pairs.
+    rest_T = np.concatenate([dipole.field(skin.nodes_m, skin.moments_A_m2, chip_m[None]) for chip_m in board.chips_m])
     changes_T = np.zeros((len(pokes_m), *board.chips_m.shape))
     for poke_i, before, after in moved_dipoles(skin, pokes_m):
         changes_T[poke_i] = change_of_field(before, after, board.chips_m)
@@ -129,10 +144,11 @@ def forces(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, " 
 
 def _refuse_beside(pokes_m: Float[np.ndarray, "n 3"], skin: Skin) -> None:
     # The layer is endless in the model: past the skin's edge it would press on material that is not there.
-    off = ~(np.abs(pokes_m[:, :2] - skin.seat_m) <= SKIN_SIDE_M / 2).all(axis=1)
+    half_m = np.array(skin.sides_m) / 2
+    off = ~(np.abs(pokes_m[:, :2] - skin.seat_m) <= half_m).all(axis=1)
     if off.any():
         x_mm, y_mm = pokes_m[np.argmax(off), :2] / milli
-        rule = f"on the skin, within {SKIN_SIDE_M / 2 / milli:.3g} mm of its middle"
+        rule = "on the skin, within {:.4g} and {:.4g} mm of its middle along x and y".format(*half_m / milli)
         remedy = "Poke elsewhere, or lower skin_seat_mm."
         raise ParamsError(complain(f"skin {skin.name}", "poke", rule, f"({x_mm:.3g}, {y_mm:.3g}) mm", remedy))
 

@@ -26,7 +26,7 @@ def jacobian(point_m, polarity):
     return (b_T[:, 0] - b_T[:, 1]) / (2 * step_m)
 
 
-def their_array(polarity):
+def their_array(polarity, cubes_n=(4, 4)):
     magpylib = pytest.importorskip("magpylib", reason="needs magpylib, of the dev dependencies")
     side_m = magnet.CUBE_SIDE_M
     heights_m = (-magnet.ARRAY_BELOW_M - side_m / 2, THICKNESS_M + magnet.ARRAY_ABOVE_M + side_m / 2)
@@ -34,10 +34,10 @@ def their_array(polarity):
         magpylib.magnet.Cuboid(
             polarization=(0, 0, magnet.ARRAY_REMANENCE_T * ((-1) ** (i + j) if polarity == "checkerboard" else 1)),
             dimension=(side_m, side_m, side_m),
-            position=((i - 1.5) * side_m, (j - 1.5) * side_m, z_m),
+            position=((i - (cubes_n[0] - 1) / 2) * side_m, (j - (cubes_n[1] - 1) / 2) * side_m, z_m),
         )
-        for i in range(4)
-        for j in range(4)
+        for i in range(cubes_n[0])
+        for j in range(cubes_n[1])
         for z_m in heights_m
     ]
 
@@ -56,6 +56,27 @@ def test_the_array_has_the_field_of_magpylibs_32_cuboids(polarity):
     magpylib = pytest.importorskip("magpylib", reason="needs magpylib, of the dev dependencies")
     theirs_T = magpylib.getB(their_array(polarity), NODES_M, sumup=True)
     np.testing.assert_allclose(magnet.array_field(NODES_M, THICKNESS_M, polarity), theirs_T, atol=1e-11)
+
+
+@pytest.mark.parametrize("polarity", ["checkerboard", "same"])
+def test_the_array_of_a_sleeve_has_the_field_of_magpylibs_256_cuboids(polarity):
+    magpylib = pytest.importorskip("magpylib", reason="needs magpylib, of the dev dependencies")
+    half_m = np.array([25.4e-3, 50.8e-3])
+    places_m = np.column_stack([rng_for(0, "sleeve").uniform(-half_m, half_m, (60, 2)), np.linspace(1e-4, 1.9e-3, 60)])
+    theirs_T = magpylib.getB(their_array(polarity, (8, 16)), places_m, sumup=True)
+    ours_T = magnet.array_field(places_m, THICKNESS_M, polarity, cubes_n=(8, 16))
+    np.testing.assert_allclose(ours_T, theirs_T, atol=1e-11)
+
+
+@pytest.mark.parametrize(("side_mm", "n"), [(20.0, 4), (25.4, 4), (50.8, 8), (101.6, 16), (101.7, 17), (3.0, 1)])
+def test_so_many_cubes_cover_a_side_and_their_seams_lie_evenly_around_its_middle(side_mm, n):
+    side_m = 1e-3 * side_mm
+    assert magnet.cubes_along(side_m) == n
+    seams_m = magnet.seams_m(side_m)
+    assert len(seams_m) == n - 1
+    np.testing.assert_allclose(seams_m, [-s for s in reversed(seams_m)], atol=1e-18)
+    np.testing.assert_allclose(np.diff(seams_m), magnet.CUBE_SIDE_M)
+    assert np.abs(seams_m).max(initial=0) < side_m / 2
 
 
 def test_far_from_a_cube_its_error_as_a_dipole_falls_with_the_fourth_power_of_the_distance():

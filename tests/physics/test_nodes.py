@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import ParamsError
-from pipeline.physics.magnet import CUBE_SIDE_M
+from pipeline.physics.magnet import CUBE_SIDE_M, seams_m
 from pipeline.physics.nodes import CHOSEN, SEAMS_M, SKIN_SIDE_M, Quadrature, place_nodes
 
 THICKNESS_M = 2e-3
@@ -36,6 +36,29 @@ def test_no_cell_is_wider_than_asked_and_none_crosses_a_seam(rule):
 
 def test_the_seams_are_those_of_the_array_of_cubes():
     np.testing.assert_allclose(SEAMS_M, CUBE_SIDE_M * np.array([-1, 0, 1]))
+
+
+@given(st.floats(1e-3, 60e-3), st.floats(1e-3, 60e-3), rules)
+def test_a_skin_of_any_sides_is_filled_and_cut_at_the_seams_of_its_own_array(x_m, y_m, rule):
+    rest = place_nodes(THICKNESS_M, rule, sides_m=(x_m, y_m))
+    np.testing.assert_allclose(rest.volumes_m3.sum(), x_m * y_m * THICKNESS_M, rtol=1e-12)
+    for axis, side_m in enumerate((x_m, y_m)):
+        marks_m = np.array([-side_m / 2, *seams_m(side_m), side_m / 2])
+        along_m = np.unique(rest.nodes_m[:, axis])
+        for a_m, b_m in pairwise(marks_m):
+            inside_m = along_m[(a_m < along_m) & (along_m < b_m)]
+            cells_n = round((b_m - a_m) / (2 * (inside_m[0] - a_m)))  # the first middle lies half a cell in
+            assert cells_n == len(inside_m)
+            assert (b_m - a_m) / cells_n <= rule.cell_m * (1 + 1e-6)
+
+
+def test_the_authors_skin_keeps_its_nodes_to_the_last_bit():
+    rest, marks_m = place_nodes(THICKNESS_M, CHOSEN), (-10e-3, -6.35e-3, 0.0, 6.35e-3, 10e-3)
+    spans = [np.linspace(a, b, n + 1) for (a, b), n in zip(pairwise(marks_m), (8, 13, 13, 8), strict=True)]
+    x_m = np.concatenate([(edges[1:] + edges[:-1]) / 2 for edges in spans])
+    heights_m = (1 + np.polynomial.legendre.leggauss(6)[0]) / 2 * THICKNESS_M
+    naive_m = [(x, y, z) for x in x_m for y in x_m for z in heights_m]
+    np.testing.assert_array_equal(rest.nodes_m, naive_m)
 
 
 def test_six_layers_integrate_every_polynomial_of_degree_eleven_over_the_thickness():

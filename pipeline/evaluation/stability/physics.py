@@ -18,7 +18,7 @@ from pipeline.physics import dipole, layer
 from pipeline.physics.board import Board, BoardDesign, Spreads, draw_board
 from pipeline.physics.change import change_of_field
 from pipeline.physics.force_sensor import RANGE_N, read_force
-from pipeline.physics.nodes import SKIN_SIDE_M, Quadrature
+from pipeline.physics.nodes import Quadrature
 from pipeline.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, forces
 from pipeline.seeds import rng_for
 
@@ -138,7 +138,7 @@ def _place(board: Board, one: Skin) -> list[Case]:
     sides_m = (magnet.CUBE_SIDE_M,) * 3
     found_T = magnet.cuboid_field(inside_m, 1.0, sides_m=sides_m)
     error = worst(found_T, Cuboid(polarization=(0, 0, 1.0), dimension=sides_m).getB(inside_m))
-    beside_m = np.array([[one.seat_m[0] + 0.51 * SKIN_SIDE_M, one.seat_m[1], DEPTH * one.thickness_m]])
+    beside_m = np.array([[one.seat_m[0] + 0.51 * one.sides_m[0], one.seat_m[1], DEPTH * one.thickness_m]])
     on_dipoles = replace(board, chips_m=one.nodes_m[: len(board.chips_m)].copy())
     return [
         refused(AREA, "a poke beside the skin, 0.2 mm past its edge",
