@@ -17,21 +17,53 @@ from pipeline.errors import ParamsError, complain
 from pipeline.seeds import rng_for
 from pipeline.strict import Strict
 
+CHIPS_MAX_N = 64
 Share = Annotated[float, Field(ge=0, le=0.5)]
 
 
-class BoardDesign(Strict):
-    """Where the chips sit, seen from the middle of the board, and how each is turned about z (authors' board file)."""
+class Tiles(Strict):
+    """Several boards side by side under one skin, their middles on a lattice around its middle."""
 
-    chips_xy_mm: Annotated[tuple[tuple[float, float], ...], Field(min_length=1, max_length=64)]
+    columns_n: Annotated[int, Field(ge=1, le=CHIPS_MAX_N)]  # along x
+    rows_n: Annotated[int, Field(ge=1, le=CHIPS_MAX_N)]  # along y
+    pitch_mm: Annotated[float, Field(gt=0, le=500)]
+
+    @property
+    def middles_mm(self) -> list[tuple[float, float]]:
+        """Give the middles of the boards, row by row."""
+        x_mm, y_mm = (self.pitch_mm * (np.arange(n) - (n - 1) / 2) for n in (self.columns_n, self.rows_n))
+        return [(float(x), float(y)) for y in y_mm for x in x_mm]
+
+
+class BoardDesign(Strict):
+    """Where the chips sit, seen from the middle of the board, and how each is turned about z (authors' board file).
+
+    With `tiles`, this is one board of many; chips are then numbered board by board.
+    """
+
+    chips_xy_mm: Annotated[tuple[tuple[float, float], ...], Field(min_length=1, max_length=CHIPS_MAX_N)]
     chips_turn_deg: tuple[float, ...]
     gap_mm: Annotated[float, Field(gt=0, le=10)]  # sensing plane below the skin: rigid 1.1, flexible 0.6
+    tiles: Tiles | None = None
 
     @model_validator(mode="after")
     def _each_chip_is_turned(self) -> "BoardDesign":
         if len(self.chips_xy_mm) != len(self.chips_turn_deg):
             raise ValueError("chips_turn_deg needs one turn for each of chips_xy_mm")
+        if len(self.places_mm) > CHIPS_MAX_N:
+            raise ValueError(f"tiles make at most {CHIPS_MAX_N} chips in all, not {len(self.places_mm)}")
         return self
+
+    @property
+    def places_mm(self) -> list[tuple[float, float]]:
+        """Give the places of all chips of all boards, seen from the middle of the skin."""
+        boards_mm = [(0.0, 0.0)] if self.tiles is None else self.tiles.middles_mm
+        return [(x + chip_x, y + chip_y) for x, y in boards_mm for chip_x, chip_y in self.chips_xy_mm]
+
+    @property
+    def turns_deg(self) -> list[float]:
+        """Give the turns of all chips of all boards."""
+        return [*self.chips_turn_deg] * (len(self.places_mm) // len(self.chips_xy_mm))
 
 
 class Spreads(Strict):
@@ -66,15 +98,15 @@ class Board:
 
 
 def draw_board(design: BoardDesign, spreads: Spreads, *, seed: int, name: str) -> Board:
-    """Draw the board called `name`."""
+    """Draw the board called `name`; boards side by side lie at one gap (assumed: one skin holds them down)."""
     rng = rng_for(seed, "board", name)
-    chips_n = len(design.chips_xy_mm)
+    chips_n = len(design.places_mm)
     gap_mm = design.gap_mm + spreads.board_gap_mm * rng.standard_normal()
     if gap_mm <= 0:
         raise ParamsError(complain(f"board {name}", "gap", "above 0 mm", f"{gap_mm:.3g}", "Lower board_gap_mm."))
-    chips_mm = np.column_stack([np.array(design.chips_xy_mm), np.full(chips_n, -gap_mm)])
+    chips_mm = np.column_stack([np.array(design.places_mm), np.full(chips_n, -gap_mm)])
     tilt_deg = spreads.chip_tilt_deg * rng.standard_normal((chips_n, 2))
-    turn = Rotation.from_euler("ZYX", np.column_stack([design.chips_turn_deg, tilt_deg]), degrees=True)
+    turn = Rotation.from_euler("ZYX", np.column_stack([design.turns_deg, tilt_deg]), degrees=True)
     gain = np.exp(spreads.chip_gain * rng.standard_normal((chips_n, 3)))
     cross = spreads.chip_cross_axis * rng.standard_normal((chips_n, 3, 3))
     return Board(

@@ -16,7 +16,7 @@ from pipeline.physics.skin import SkinDesign
 
 def survey(board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, chip: ChipDesign, seed: int) -> list[Case]:
     """Try every case of physics, chip and wire on the designs of a scene."""
-    chips_n = len(board.chips_xy_mm)
+    chips_n = len(board.places_mm)
     return [
         *survey_relaxing(),
         *survey_physics(board, spreads, skin=skin, seed=seed),

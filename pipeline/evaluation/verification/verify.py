@@ -42,5 +42,5 @@ def verify(of: Designs, *, depths_m: tuple[float, ...], seed: int) -> list[Check
         *check_poke(of.board, of.spreads, skin=of.skin, depths_m=depths_m, seed=seed),
         *check_relaxation(),
         *check_electronics(of.chip, seed),
-        *check_frames(of.chip.gain_sel, len(of.board.chips_xy_mm), seed),
+        *check_frames(of.chip.gain_sel, len(of.board.places_mm), seed),
     ]
