@@ -23,7 +23,8 @@ from pipeline.physics.wear import Ageing
 from pipeline.seeds import rng_for
 from pipeline.synthesis.capture import MAIN, Synthesis, roster
 from pipeline.synthesis.felt import Felt, Terms, feel
-from pipeline.synthesis.protocols import Plan, make_plan
+from pipeline.synthesis.plans import Plan
+from pipeline.synthesis.protocols import make_plan
 from pipeline.synthesis.sideways import push
 
 # Sizes of the terms that a scene leaves out: the design values of PHYSICS 5 (assumed there).

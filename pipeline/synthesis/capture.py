@@ -12,7 +12,6 @@ from pydantic import Field, model_validator
 from scipy.constants import milli
 
 from pipeline.capture.probe import ProbeLog
-from pipeline.dataset.grid import CENTRE_MM
 from pipeline.physics.board import BoardDesign, Spreads, draw_board
 from pipeline.physics.force_sensor import read_force
 from pipeline.physics.nodes import Rule
@@ -22,13 +21,14 @@ from pipeline.seeds import rng_for
 from pipeline.strict import Strict
 from pipeline.synthesis.felt import Felt, Terms, feel
 from pipeline.synthesis.frames import read_frames, switch_on
-from pipeline.synthesis.protocols import Grid, Hand, Protocol, make_plan
+from pipeline.synthesis.protocols import SKIN_MM, Grid, Hand, Protocol, make_plan
 from pipeline.synthesis.rig import Rig, chunks, draw_clock, misplace, paced, probe_log, timeline
 
 MAIN = "grid"  # its captures bear the names of their skins alone
 # What is drawn for a capture, each by a name of its own: a term more leaves all other draws as they are.
 PARTS = ("plan", "robot", "drift", "chips", "noise", "warmth", "port", "probe")
 Count = Annotated[int, Field(ge=1, le=1000)]
+Side_mm = Annotated[float, Field(gt=0, le=500)]
 
 
 class BoardKind(Strict):
@@ -38,7 +38,13 @@ class BoardKind(Strict):
     boards_n: Count
     skins_per_board_n: Count
     design: BoardDesign
+    skin_mm: tuple[Side_mm, Side_mm]  # along x and y
     quadrature: Rule
+
+    @property
+    def skin_m(self) -> tuple[float, float]:
+        """Give the skin's sides in SI."""
+        return self.skin_mm[0] * milli, self.skin_mm[1] * milli
 
 
 class Synthesis(Strict):
@@ -72,8 +78,14 @@ class Synthesis(Strict):
                 )
         if len({kind.letter for kind in self.boards.values()}) < len(self.boards):
             raise ValueError("kinds of boards need different letters")
+        return self
+
+    @model_validator(mode="after")
+    def _folds_are_drawn_on_the_papers_protocol(self) -> "Synthesis":
         if MAIN not in self.protocols or not isinstance(self.protocols[MAIN], Grid):
             raise ValueError(f"protocols holds a grid named {MAIN}")
+        if self.main_boards.skin_mm != SKIN_MM:  # the studies of physics are of the authors' skin
+            raise ValueError(f"skin_mm of the boards of protocol {MAIN} is {list(SKIN_MM)}")
         return self
 
     @property
@@ -124,9 +136,9 @@ def record(parameters: Synthesis, protocol: str, *, board: str, skin: str, seed:
     kind = parameters.boards[asked.boards]
     own_board = draw_board(kind.design, parameters.spreads, seed=seed, name=board)
     rule = kind.quadrature.quadrature()
-    own_skin = draw_skin(parameters.skin, parameters.spreads, seed=seed, name=skin, rule=rule)
-    plan = make_plan(asked, rngs["plan"])
-    tip_m = (misplace(plan, rig, rngs["robot"]) - (CENTRE_MM, CENTRE_MM, 0)) * milli
+    own_skin = draw_skin(parameters.skin, parameters.spreads, seed=seed, name=skin, rule=rule, sides_m=kind.skin_m)
+    plan = make_plan(asked, rngs["plan"], skin_mm=kind.skin_mm)
+    tip_m = (misplace(plan, rig, rngs["robot"]) - (*plan.centre_mm, 0)) * milli
     felt = feel(own_board, own_skin, tip_m, tilt=plan.tilt, terms=terms, rng=rngs["drift"])
     reader = switch_on(
         own_board, parameters.chip, rate_hz=rig.rate_hz, temperature=terms.temperature, rng=rngs["chips"]

@@ -4,28 +4,17 @@ Places are labels: mm from 0 to 16, the middle of the skin at (8, 8). A stop is 
 are taken; an indentation is one stop, or the many of a dragged line. Refuses to know robots' errors, clocks and fields.
 """
 
-from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
-from jaxtyping import Float64, Int32
 from pydantic import Field, model_validator
 
 from pipeline.dataset.grid import CENTRE_MM, PITCH_MM, SIDE_POINTS_N, protocol
-from pipeline.strict import Strict
-
-Count = Annotated[int, Field(ge=1, le=100_000)]
-Depth_mm = Annotated[float, Field(gt=0, le=10)]
+from pipeline.synthesis.plans import Count, Depth_mm, Plan, Shared
+from pipeline.synthesis.scattering import Scatter, scatter
 
 
-class _Shared(Strict):
-    boards: str  # the kind of board, one of `boards` of the scene
-    skins_n: Count  # so many, the first skin of each board before the second of any
-    terms: tuple[Literal["ageing", "friction", "relaxation", "temperature"], ...]  # physics that it needs (PHYSICS 8)
-    rate_hz: Annotated[float, Field(gt=0, le=1e4)] | None = None  # the rig's unless given: more chips take longer
-
-
-class Grid(_Shared):
+class Grid(Shared):
     """The paper's grid: 65 places, depth by depth, pass by pass (section 3)."""
 
     kind: Literal["grid"]
@@ -33,7 +22,7 @@ class Grid(_Shared):
     depths_mm: Annotated[tuple[Depth_mm, ...], Field(min_length=1)]
 
 
-class Drag(_Shared):
+class Drag(Shared):
     """Drag lines every 2 mm, along x and along y, over the whole grid (section 4, shear)."""
 
     kind: Literal["drag"]
@@ -42,7 +31,7 @@ class Drag(_Shared):
     step_mm: Annotated[float, Field(gt=0, le=4)]  # between stops
 
 
-class Hand(_Shared):
+class Hand(Shared):
     """Pokes by hand along lines: only their order is known, not their place, depth or force (section 5.2)."""
 
     kind: Literal["hand"]
@@ -59,27 +48,14 @@ class Hand(_Shared):
         return self
 
 
-Protocol = Annotated[Grid | Drag | Hand, Field(discriminator="kind")]
+SKIN_MM = (20.0, 20.0)  # authors' CAD
+Protocol = Annotated[Grid | Drag | Hand | Scatter, Field(discriminator="kind")]
 
 
-@dataclass(frozen=True)
-class Plan:
-    """Stops in order of time, axes n indentations and p stops of each; `tilt` is the stylus' lean, x and y over z."""
-
-    pass_i: Int32[np.ndarray, " n"]
-    x_mm: Float64[np.ndarray, "n p"]
-    y_mm: Float64[np.ndarray, "n p"]
-    depth_mm: Float64[np.ndarray, "n p"]
-    tilt: Float64[np.ndarray, "n 2"]
-    labelled: bool  # whether anybody knows places, depths and forces
-    words: str
-
-    def __len__(self) -> int:
-        return len(self.pass_i)
-
-
-def make_plan(asked: Grid | Drag | Hand, rng: np.random.Generator) -> Plan:
-    """Lay out the stops of a protocol; only a hand is random."""
+def make_plan(
+    asked: Grid | Drag | Hand | Scatter, rng: np.random.Generator, *, skin_mm: tuple[float, float] = SKIN_MM
+) -> Plan:
+    """Lay out the stops of a protocol on a skin of these sides; a hand's and scattered ones are random."""
     match asked:
         case Grid():
             return _grid(asked)
@@ -87,6 +63,8 @@ def make_plan(asked: Grid | Drag | Hand, rng: np.random.Generator) -> Plan:
             return _drag(asked)
         case Hand():
             return _hand(asked, rng)
+        case Scatter():
+            return scatter(asked, skin_mm, rng)
 
 
 def _grid(asked: Grid) -> Plan:

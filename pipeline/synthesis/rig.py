@@ -14,7 +14,7 @@ from pydantic import Field
 
 from pipeline.capture.probe import ProbeLog
 from pipeline.strict import Strict
-from pipeline.synthesis.protocols import Plan
+from pipeline.synthesis.plans import Plan
 
 Frames = Annotated[int, Field(ge=1, le=1000)]
 Spread = Annotated[float, Field(ge=0, le=1)]

@@ -12,7 +12,16 @@ AGEING = {"settling": 0.1, "ageing": 0.01, "fading_per_decade": 0.005, "wanderin
 TEMPERATURE = {"warming_K": 3.0, "warming_s": 5.0, "swing_K": 0.0, "swing_s": 1.0, "chip_sensitivity_per_K": 0.0}
 RELAXATION = {"approach_s": 0.5, "hold_s": 0.5}
 SECTIONS = {
-    "boards": {"rigid": {"letter": "b", "boards_n": 2, "skins_per_board_n": 2, "design": RIGID, "quadrature": RULE}},
+    "boards": {
+        "rigid": {
+            "letter": "b",
+            "boards_n": 2,
+            "skins_per_board_n": 2,
+            "design": RIGID,
+            "skin_mm": (20.0, 20.0),
+            "quadrature": RULE,
+        }
+    },
     "protocols": {"grid": GRID},
     "rig": {
         "noload_frames_n": 4,

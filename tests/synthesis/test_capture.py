@@ -3,12 +3,15 @@
 import numpy as np
 import pytest
 
+from pipeline.capture.stream import FrameStream
+from pipeline.capture.wire import concatenate
 from pipeline.dataset.grid import points_mm
 from pipeline.errors import ParamsError
 from pipeline.physics.board import draw_board
 from pipeline.physics.skin import changes_of_field, draw_skin, forces
 from pipeline.synthesis.capture import record, roster
-from tests.synthesis.scene import AGEING, GRID, RELAXATION, RIGID, RULE, TEMPERATURE, synthesis, with_protocol
+from pipeline.synthesis.files import to_files
+from tests.synthesis.scene import AGEING, GRID, RELAXATION, RIGID, SECTIONS, TEMPERATURE, synthesis, with_protocol
 
 LIFTED_N, MOVING_N, DWELL_N = 1 + 4, 2, 1 + 3
 FRAMES_N = LIFTED_N + MOVING_N + DWELL_N + MOVING_N
@@ -108,6 +111,51 @@ def test_a_protocol_with_a_rate_of_its_own_is_recorded_at_it_and_another_at_the_
         np.testing.assert_allclose((log.t_end_s - log.t_start_s)[log.contact], 3 / rate_hz, rtol=1e-3)
 
 
+SLEEVE = {
+    "letter": "v", "boards_n": 1, "skins_per_board_n": 1,
+    "design": RIGID | {"tiles": {"columns_n": 2, "rows_n": 4, "pitch_mm": 25.4}},
+    "skin_mm": (50.8, 101.6), "quadrature": {"cell_mm": 2.2, "layers_n": 2},
+}  # fmt: skip
+SCATTER = {
+    "kind": "scatter", "boards": "sleeve", "skins_n": 1, "pokes_n": 6, "depth_mm": (0.6, 1.2), "margin_mm": 4.0,
+    "terms": [],
+}  # fmt: skip
+
+
+def sleeve(**changes):
+    return with_protocol("sleeve", SCATTER, boards=SECTIONS["boards"] | {"sleeve": SLEEVE}, **changes)
+
+
+def test_scattered_pokes_lie_where_their_labels_say_from_the_skins_corner():
+    of = sleeve(chip=SECTIONS["chip"] | {"noise_xy_uT": 0.0, "noise_z_uT": 0.0})
+    one = capture_of(of, "sleeve", board="v0", skin="v0_s0")
+    place_mm = np.column_stack([touched(one, "x_mm"), touched(one, "y_mm")]).astype(float)
+    board = draw_board(of.boards["sleeve"].design, of.spreads, seed=1, name="v0")
+    rule = of.boards["sleeve"].quadrature.quadrature()
+    skin = draw_skin(of.skin, of.spreads, seed=1, name="v0_s0", rule=rule, sides_m=(50.8e-3, 101.6e-3))
+    pokes_m = np.column_stack([place_mm - (25.4, 50.8), touched(one, "depth_mm")]) * 1e-3
+    _, changes_T = changes_of_field(board, skin, pokes_m)
+    truth_uT = 1e6 * np.einsum("kij,klj,nkl->nki", board.sensitivity, board.turn, changes_T)
+    b_uT = one.b_uT.astype(np.float64).reshape(-1, FRAMES_N, 40, 3)
+    # a step of z, lost twice by half; a label is written as float32, 4 nm, which moves no field
+    assert np.abs(b_uT[:, READ] - b_uT[:, 1:2] - truth_uT[:, None]).max() < 0.75
+
+
+def test_the_frames_of_forty_chips_come_through_the_wire_as_they_went_in():
+    one = capture_of(sleeve(), "sleeve", board="v0", skin="v0_s0")
+    header, files = to_files(one, sleeve())
+    assert (header.chips_n, len(files["stream.bin"])) == (40, 6 * FRAMES_N * (16 * 40 + 2))
+    stream = FrameStream("binary", 40)
+    frames = concatenate([stream.feed(files["stream.bin"]), stream.close()], 40)
+    np.testing.assert_array_equal(frames.b_uT, one.b_uT)
+    np.testing.assert_array_equal(frames.temperature_degC, one.temperature_degC)
+
+
+def test_the_papers_protocol_is_refused_on_a_skin_that_is_not_the_papers():
+    with pytest.raises(ParamsError, match="skin_mm of the boards of protocol grid is .20.0, 20.0."):
+        synthesis("boards", rigid=SECTIONS["boards"]["rigid"] | {"skin_mm": (50.8, 101.6)})
+
+
 def test_a_hand_leaves_no_label_but_a_field_that_changes():
     one = capture_of(with_protocol("hand", HAND), "hand")
     for name in ("x_mm", "y_mm", "depth_mm", "Fx_N", "Fy_N", "Fz_N"):
@@ -157,7 +205,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_another_skin(captur
 
 
 def test_more_boards_skins_and_protocols_leave_the_others_as_they_are(capture):
-    boards = {"rigid": {"letter": "b", "boards_n": 3, "skins_per_board_n": 5, "design": RIGID, "quadrature": RULE}}
+    boards = {"rigid": SECTIONS["boards"]["rigid"] | {"boards_n": 3, "skins_per_board_n": 5}}
     more = with_protocol("hand", HAND, boards=boards)
     assert set(roster(synthesis(), "grid")) < {(f"b{b}", f"b{b}_s{s}") for b in range(3) for s in range(5)}
     assert same(capture, capture_of(more))

@@ -1,0 +1,46 @@
+"""What every protocol has: settings that all share, and the plan of stops that it becomes. In and out: plain values.
+
+Refuses to know any one protocol, robots' errors, clocks and fields.
+"""
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+from jaxtyping import Float64, Int32
+from pydantic import Field
+
+from pipeline.dataset.grid import CENTRE_MM
+from pipeline.strict import Strict
+
+Count = Annotated[int, Field(ge=1, le=100_000)]
+Depth_mm = Annotated[float, Field(gt=0, le=10)]
+
+
+class Shared(Strict):
+    """What the settings of every protocol say."""
+
+    boards: str  # the kind of board, one of `boards` of the scene
+    skins_n: Count  # so many, the first skin of each board before the second of any
+    terms: tuple[Literal["ageing", "friction", "relaxation", "temperature"], ...]  # physics that it needs (PHYSICS 8)
+    rate_hz: Annotated[float, Field(gt=0, le=1e4)] | None = None  # the rig's unless given: more chips take longer
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Stops in order of time, axes n indentations and p stops of each; `tilt` is the stylus' lean, x and y over z.
+
+    `centre_mm` is the label of the skin's middle.
+    """
+
+    pass_i: Int32[np.ndarray, " n"]
+    x_mm: Float64[np.ndarray, "n p"]
+    y_mm: Float64[np.ndarray, "n p"]
+    depth_mm: Float64[np.ndarray, "n p"]
+    tilt: Float64[np.ndarray, "n 2"]
+    labelled: bool  # whether anybody knows places, depths and forces
+    words: str
+    centre_mm: tuple[float, float] = (CENTRE_MM, CENTRE_MM)
+
+    def __len__(self) -> int:
+        return len(self.pass_i)
