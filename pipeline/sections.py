@@ -63,6 +63,7 @@ class Sleeve(Strict):
     """Many boards under one skin (paper section 6); the last part of the pokes is held out."""
 
     test_fraction: Fraction
+    neighbours_n: Count  # of the k nearest neighbours that stand beside the networks
     training: Training
 
 

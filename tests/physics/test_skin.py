@@ -239,8 +239,8 @@ def test_far_from_its_edges_a_skin_is_as_one_that_is_wider_still():
     )
     poke_m = (1.3e-3, -2.1e-3, DEPTH_M)
     once_T, again_T = change(poke_m, wide), change(poke_m, wider)
-    # Only the magnets past the edge act there; they alternate, so that their fields nearly cancel. On the authors' 20 mm,
-    # whose outer chips lie 3 mm from an edge, the same poke is told from one on an endless skin.
+    # Only the magnets past the edge act there; they alternate, so that their fields nearly cancel. On the authors'
+    # 20 mm, whose outer chips lie 3 mm from an edge, the same poke is told from one on an endless skin.
     assert np.linalg.norm(once_T - again_T) < 1e-4 * np.linalg.norm(again_T)
     assert np.linalg.norm(change(poke_m) - again_T) > 3e-3 * np.linalg.norm(again_T)
 
