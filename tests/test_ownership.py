@@ -12,7 +12,7 @@ HOMES = {
     r"\bimport mlflow|from mlflow": {"pipeline/tracking.py"},
     r"\bimport matplotlib|from matplotlib": {
         "pipeline/reporting/figures.py", "pipeline/reporting/sweeps.py", "pipeline/reporting/trade_offs.py",
-        "pipeline/reporting/work_precision.py",
+        "pipeline/reporting/work_precision.py", "pipeline/reporting/experiments/sleeve.py",
     },
     r"\bimport argparse|from argparse": {"pipeline/stages/_run.py"},
     r"\bimport typer|from typer": {"pipeline/cli.py"},

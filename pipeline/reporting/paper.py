@@ -31,3 +31,6 @@ FIGURE_6B = (
     '"performance improves as the amount of training data increases"; adaptation, "while always doing better than the '
     'other models, offers a significant improvement in performance when using fewer sensors in training"'
 )
+
+SLEEVE = {"chips": "40", "rate, Hz": "133", "skin, mm": "2 in x 4 in (50.8 x 101.6)"}  # section 6, arm sleeve
+SLEEVE_WORDS = 'it shows "contact localization across larger surface areas" in a video (section 6, figure 1E)'
