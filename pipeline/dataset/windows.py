@@ -15,7 +15,7 @@ from pipeline.schema import LABELS, Readings
 
 @dataclass(frozen=True)
 class Windows:
-    """Half-open ranges of units: those trained on, and each test's; units of a window that was cut short are left out."""
+    """Half-open ranges of units: those trained on, and each test's; a window that was cut short is left out."""
 
     train: tuple[int, int]
     tests: tuple[tuple[int, int], ...]

@@ -1,0 +1,152 @@
+"""How a model ages with its skin: scores of test windows under each no-load policy. In: answers. Out: plain numbers.
+
+Refuses to know networks, captures and pages.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import ceil
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, Shaped
+
+from pipeline.evaluation.metrics import METRICS, score
+
+LATE_CONTACTS_N = 45_000  # paper figure 5b: "after 45,000 interactions"
+FORCE = 2  # column of a target
+POINTS_MAX_N = 2000
+DECIMALS = 3  # of a newton or millimetre
+
+
+@dataclass(frozen=True)
+class Answers:
+    """What one network said of the readings of one test window of one skin, and what was true."""
+
+    policy: str
+    skin: str
+    seed_i: int
+    window_i: int
+    contacts_n: int  # that the skin had felt when the window began
+    noload_off_uT: float  # rms over rows and channels: the policy's no-load field less that read before the contact
+    indentation: Int[np.ndarray, " f"]
+    true: Float[np.ndarray, "f 3"]
+    predicted: Float[np.ndarray, "f 3"]
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """One point an indentation: the means of its readings, and over networks; where no force is known there is none."""
+
+    skin: Shaped[np.ndarray, " n"]
+    true_N: Float[np.ndarray, " n"]
+    predicted_N: Float[np.ndarray, " n"]
+
+
+def score_window(one: Answers) -> dict[str, float]:
+    """Score a window, and give the mean of predicted less true force where it is known."""
+    numbers = score(one.true, one.predicted)
+    error_N = (one.predicted.astype(float) - one.true)[:, FORCE]
+    if not np.isnan(error_N).all():
+        numbers["bias_f_N"] = float(np.nanmean(error_N))
+    return numbers
+
+
+def over_windows(answers: Sequence[Answers], policy: str) -> list[dict[str, Any]]:
+    """Give a row for each window: means over skins and seeds, and their sd where there are several."""
+    rows = []
+    for window_i in sorted({one.window_i for one in answers}):
+        own = [one for one in answers if (one.window_i, one.policy) == (window_i, policy)]
+        scores = [score_window(one) for one in own]
+        values = {name: np.array([one[name] for one in scores]) for name in (*METRICS, "bias_f_N") if name in scores[0]}
+        row: dict[str, Any] = {"contacts_n": round(float(np.mean([one.contacts_n for one in own])))}
+        row |= {name: float(of.mean()) for name, of in values.items()}
+        row["noload_off_uT"] = float(np.mean([one.noload_off_uT for one in own]))
+        row["spread"] = {name: float(of.std(ddof=1)) for name, of in values.items() if len(of) > 1}
+        rows.append(row)
+    return rows
+
+
+def late_window(rows: Sequence[dict[str, Any]]) -> int:
+    """Find the first window after the paper's 45,000 contacts, or else the last one."""
+    late = [i for i, row in enumerate(rows) if row["contacts_n"] >= LATE_CONTACTS_N]
+    return late[0] if late else len(rows) - 1
+
+
+def by_contact(answers: Sequence[Answers]) -> Contacts:
+    """Take the readings of an indentation together, and the networks that were asked of it: they are not independent.
+
+    All answers are of one window.
+    """
+    skin = np.concatenate([np.full(len(one.indentation), one.skin) for one in answers])
+    indentation = np.concatenate([one.indentation for one in answers])
+    true_N, predicted_N = (
+        np.concatenate([getattr(one, side)[:, FORCE].astype(float) for one in answers])
+        for side in ("true", "predicted")
+    )
+    known = ~np.isnan(true_N)
+    skins, skin_i = np.unique(skin[known], return_inverse=True)
+    pairs, which = np.unique(np.stack([skin_i, indentation[known]], axis=1), axis=0, return_inverse=True)
+    n = np.bincount(which.ravel(), minlength=len(pairs))
+    means = [np.bincount(which.ravel(), values[known], len(pairs)) / n for values in (true_N, predicted_N)]
+    return Contacts(skins[pairs[:, 0]], *means)
+
+
+def force_bias(contacts: Contacts) -> dict[str, float]:
+    """Give the mean of predicted less true force, its standard error over contacts, and the least-squares slope."""
+    error_N = contacts.predicted_N - contacts.true_N
+    away_N = contacts.true_N - contacts.true_N.mean()
+    return {
+        "bias_N": float(error_N.mean()),
+        "bias_pct": float(100 * error_N.mean() / contacts.true_N.mean()),
+        "bias_se_N": float(error_N.std(ddof=1) / np.sqrt(len(error_N))),
+        "slope": float(away_N @ contacts.predicted_N / (away_N @ away_N)),
+        "indentations_n": len(error_N),
+    }
+
+
+def force_left(
+    at: Float[np.ndarray, "f 3"], force_N: Float[np.ndarray, " f"], late: Bool[np.ndarray, " f"]
+) -> float | None:
+    """Give late force over early force at equal places and depths: what softening leaves, in %.
+
+    `at` is x, y and depth in mm. None where no place and depth was met both early and late.
+    """
+    _, where = np.unique(np.round(at, DECIMALS), axis=0, return_inverse=True)
+    where, size = where.ravel(), len(at)
+    sums_N = [np.bincount(where, force_N * side, size) for side in (~late, late)]
+    counts = [np.bincount(where, side, size) for side in (~late, late)]
+    both = (counts[0] > 0) & (counts[1] > 0)
+    if not both.any():
+        return None
+    early_N, late_N = (total[both] / n[both] for total, n in zip(sums_N, counts, strict=True))
+    return float(100 * late_N.sum() / early_N.sum())
+
+
+def late_force(
+    answers: Sequence[Answers], policy: str, window_i: int
+) -> tuple[dict[str, float], dict[str, list[float]]] | None:
+    """Give the force bias of one window and its points to draw; None if fewer than two contacts have a known force."""
+    contacts = by_contact([one for one in answers if (one.policy, one.window_i) == (policy, window_i)])
+    return None if len(contacts.true_N) < 2 else (force_bias(contacts), points(contacts))
+
+
+def points(contacts: Contacts) -> dict[str, list[float]]:
+    """Give true and predicted forces to draw, to 1 mN; of very many every second, third, ..."""
+    every_n = ceil(len(contacts.true_N) / POINTS_MAX_N)
+    sides = {"true_N": contacts.true_N, "predicted_N": contacts.predicted_N}
+    return {name: np.round(values[::every_n], DECIMALS).tolist() for name, values in sides.items()}
+
+
+def field_sizes(db_uT: Float32[np.ndarray, "f ch"], noload_uT: Float32[np.ndarray, "n ch"]) -> dict[str, float]:
+    """Give, rms over channels, the change that a contact makes, and the noise of a no-load reading.
+
+    `noload_uT` holds one reading before each indentation; noise is taken from each to the next, where drift is small.
+    """
+    steps_uT = np.diff(noload_uT.astype(float), axis=0)
+    return {"contact_uT": rms(db_uT), "noload_noise_uT": rms(steps_uT) / float(np.sqrt(2)) if len(steps_uT) else 0.0}
+
+
+def rms(values: Float[np.ndarray, "..."]) -> float:
+    """Give the root of the mean square."""
+    return float(np.sqrt(np.mean(values.astype(float) ** 2)))

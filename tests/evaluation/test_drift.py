@@ -1,0 +1,111 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import linregress, sem
+
+from pipeline.evaluation.drift import (
+    POINTS_MAX_N,
+    Answers,
+    by_contact,
+    field_sizes,
+    force_bias,
+    force_left,
+    late_force,
+    late_window,
+    over_windows,
+    points,
+)
+from pipeline.evaluation.metrics import score
+from pipeline.seeds import rng_for
+
+
+def answers(policy="each", skin="s0", seed_i=0, window_i=0, n=40, bias_N=0.1, **changes) -> Answers:
+    """Two readings of each indentation; a network that errs by half a millimetre and `bias_N`."""
+    rng = rng_for(0, "answers", policy, skin, window_i)
+    true = np.repeat(rng.uniform(0.5, 3, (n // 2, 3)), 2, axis=0).astype(np.float32)
+    error = rng_for(seed_i, "errors", policy, window_i).normal(0, 0.5, true.shape) + [0, 0, bias_N]
+    values = {
+        "contacts_n": 5000 * (window_i + 1), "noload_off_uT": 2.0, "indentation": np.repeat(np.arange(n // 2), 2),
+        "true": true, "predicted": (true + error).astype(np.float32),
+    }  # fmt: skip
+    return Answers(policy, skin, seed_i, window_i, **(values | changes))
+
+
+def test_a_window_has_the_mean_of_its_skins_and_seeds_and_their_deviation():
+    own = [answers(skin=skin, seed_i=seed_i) for skin in ("s0", "s1") for seed_i in (0, 1)]
+    [row] = over_windows([*own, answers("initial")], "each")
+    for name in ("accuracy_pct", "mse_xy_mm2", "mse_f_N2"):
+        values = [score(one.true, one.predicted)[name] for one in own]
+        assert row[name] == pytest.approx(sum(values) / 4)
+        assert row["spread"][name] == pytest.approx(np.std(values, ddof=1))
+    errors_N = [float(p[2]) - float(t[2]) for one in own for t, p in zip(one.true, one.predicted, strict=True)]
+    assert row["bias_f_N"] == pytest.approx(sum(errors_N) / len(errors_N))
+    assert row["contacts_n"] == 5000
+
+
+def test_without_known_forces_a_window_has_no_word_of_force_and_a_single_run_no_deviation():
+    true = answers().true.copy()
+    true[:, 2] = np.nan
+    [row] = over_windows([answers(true=true)], "each")
+    assert set(row) == {"contacts_n", "accuracy_pct", "mse_xy_mm2", "noload_off_uT", "spread"}
+    assert row["spread"] == {}
+    assert late_force([answers(true=true)], "each", 0) is None
+
+
+def test_late_is_the_first_window_after_45000_contacts_or_else_the_last():
+    assert late_window([{"contacts_n": n} for n in (40_000, 45_000, 50_000)]) == 1
+    assert late_window([{"contacts_n": n} for n in (10_000, 20_000)]) == 1
+
+
+def test_the_bias_is_what_scipy_finds_over_indentations_and_not_over_readings():
+    own = [answers(seed_i=0), answers(seed_i=1), answers(skin="s1")]
+    true_N, predicted_N = [], []
+    for skin in ("s0", "s1"):
+        for press in range(20):
+            rows = [(one, one.indentation == press) for one in own if one.skin == skin]
+            true_N.append(np.mean([one.true[at, 2] for one, at in rows]))
+            predicted_N.append(np.mean([one.predicted[at, 2] for one, at in rows]))
+    bias = force_bias(by_contact(own))
+    errors_N = np.array(predicted_N) - np.array(true_N)
+    assert bias["indentations_n"] == 40
+    # float32 readings of newtons carry 1e-7 each
+    assert bias["bias_N"] == pytest.approx(errors_N.mean(), rel=1e-5)
+    assert bias["bias_se_N"] == pytest.approx(sem(errors_N), rel=1e-5)
+    assert bias["slope"] == pytest.approx(linregress(true_N, predicted_N).slope, rel=1e-5)
+    assert bias["bias_pct"] == pytest.approx(100 * errors_N.mean() / np.mean(true_N), rel=1e-5)
+
+
+@given(st.floats(-0.5, 0.5))
+def test_what_is_added_to_every_answer_is_added_to_the_bias_alone(more_N):
+    plain, more = (force_bias(by_contact([answers(bias_N=of)])) for of in (0.0, more_N))
+    assert more["bias_N"] - plain["bias_N"] == pytest.approx(more_N, abs=1e-6)  # float32 newtons
+    assert more["slope"] == pytest.approx(plain["slope"], abs=1e-6)
+
+
+@given(st.floats(0.5, 1.0), st.permutations(range(6)))
+def test_softening_is_found_at_equal_places_and_depths_whatever_else_was_poked(left, order):
+    at = np.array([[0, 0, 1], [2, 0, 1], [0, 0, 2], [4, 4, 1]], float)
+    early_N, late_N = np.array([1.0, 2.0, 4.0, 9.0]), left * np.array([1.0, 2.0])
+    order = np.array(order)
+    places, force_N = np.concatenate([at, at[:2]])[order], np.concatenate([early_N, late_N])[order]
+    assert force_left(places, force_N, order >= 4) == pytest.approx(100 * left)
+
+
+def test_where_no_place_is_met_again_no_softening_is_told():
+    assert force_left(np.eye(3), np.ones(3), np.array([False, False, True])) is None
+
+
+def test_points_are_the_contacts_to_a_millinewton_and_not_too_many():
+    contacts = by_contact([answers(n=6000)])
+    drawn = points(contacts)
+    assert len(drawn["true_N"]) == len(drawn["predicted_N"]) == 1500 <= POINTS_MAX_N
+    np.testing.assert_allclose(drawn["true_N"], contacts.true_N[::2], atol=5e-4)  # rounded
+
+
+def test_field_sizes_are_those_that_were_put_in():
+    rng = rng_for(0, "field")
+    noload_uT = rng.normal(0, 1.5, (4000, 15)).astype(np.float32) + np.linspace(0, 100, 4000, dtype=np.float32)[:, None]
+    sizes = field_sizes(np.full((7, 15), -3, np.float32), noload_uT)
+    assert sizes["contact_uT"] == pytest.approx(3)
+    assert sizes["noload_noise_uT"] == pytest.approx(1.5, rel=0.02)  # 60,000 draws: 0.4 %, five of them
