@@ -17,9 +17,7 @@ def rank(label: Shaped[np.ndarray, " f"]) -> Int64[np.ndarray, " f"]:
     return np.cumsum(np.concatenate([[0], label[1:] != label[:-1]])).astype(np.int64)[: len(label)]
 
 
-def initial(
-    noload_uT: Float32[np.ndarray, "f ch"], indentation: Int[np.ndarray, " f"]
-) -> Float32[np.ndarray, "f ch"]:
+def initial(noload_uT: Float32[np.ndarray, "f ch"], indentation: Int[np.ndarray, " f"]) -> Float32[np.ndarray, "f ch"]:
     """Take the no-load reading of the first indentation for all (paper section 4: "a single no-load measurement")."""
     return np.broadcast_to(noload_uT[:1], noload_uT.shape).copy()
 

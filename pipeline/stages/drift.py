@@ -1,0 +1,70 @@
+"""Stage drift: one network a no-load policy, trained on a skin's first contacts, tested on later ones (section 4)."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.dataset.baseline import rank
+from pipeline.dataset.windows import check_one_each
+from pipeline.evaluation.drift import Answers, field_sizes, late_force, late_window, over_windows
+from pipeline.evaluation.drift_findings import findings
+from pipeline.learning.recipe import HEADLINE
+from pipeline.params import captures_of, read_params, read_scene
+from pipeline.schema import Readings
+from pipeline.sections import Drift
+from pipeline.stages import _drift as work
+from pipeline.stages._experiment import read_folder, write_answer
+from pipeline.stages._run import run
+from pipeline.stages._train import train_all
+
+
+def drift(scene: str, params: Path, settings: Path, indentations: Path, answer: Path) -> None:
+    """Train and test under every no-load policy, on every capture of a folder."""
+    asked = read_scene(settings)
+    assert asked.drift is not None
+    captures = read_folder(indentations, tuple(captures_of(scene, read_params(params), indentations)))
+    check_one_each(captures)
+    windows = work.windows_of(captures, asked.drift)
+    parts = work.stack(captures, asked.drift, windows, asked.selection)
+    pairs = list(work.cells(parts, asked.drift, asked.seed))
+    at = work.scenery(scene, asked, parts)
+    said: dict[str, list[Answers]] = {}
+    for (cell, tests), one in zip(pairs, train_all(at, [cell for cell, _ in pairs], "drift"), strict=True):
+        said.setdefault(cell.recipe_name, []).extend(work.answers(cell, one, tests))
+    rows: dict[str, dict[str, Any]] = {
+        name: {policy: over_windows(own, policy) for policy in asked.drift.policies} for name, own in said.items()
+    }
+    told, drawn = _tell(asked.drift, said[HEADLINE], rows[HEADLINE], parts, _field(captures, at.rows.db_uT))
+    counts = {"skins_n": len(captures), "seeds_n": asked.drift.training.seeds_n, "dropped": at.rows.dropped}
+    words = asked.drift.model_dump(mode="json", include={"unit", "train_n", "test_n", "every_n", "regular_n"})
+    numbers = {name: value for name, value in words.items() if value is not None} | counts
+    variants = {name: own for name, own in rows.items() if name != HEADLINE}
+    numbers |= {"left_out_units_n": windows.left_out_units_n} | told | ({"variants": variants} if variants else {})
+    write_answer(answer, numbers, drawn)
+
+
+def _tell(
+    asked: Drift, said: Sequence[Answers], rows: dict[str, Any], parts: Sequence[work.Part], field: dict[str, float]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Put the windows together with late forces and findings; the paper does not say of which policy figure 5b is."""
+    policy = "regular" if "regular" in rows else asked.policies[0]
+    window_i = late_window(rows[policy])
+    numbers, drawn, late = rows | {"field": field}, {}, late_force(said, policy, window_i)
+    if late is not None:
+        left_pct = work.force_left_pct(parts, policy, window_i)
+        where = {"policy": policy, "contacts_n": rows[policy][window_i]["contacts_n"]}
+        numbers["late"] = where | late[0] | ({} if left_pct is None else {"force_left_pct": left_pct})
+        drawn = {"late": late[1]}
+    return numbers | {"findings": findings(rows, field, numbers.get("late"))}, drawn
+
+
+def _field(captures: Sequence[Readings], db_uT: np.ndarray) -> dict[str, float]:
+    one = captures[0]
+    _, first_i = np.unique(rank(one.indentation), return_index=True)
+    return field_sizes(db_uT, one.noload_uT[first_i])
+
+
+if __name__ == "__main__":
+    run(drift)
