@@ -60,8 +60,8 @@ def _higher_and_faster(initial: Sequence[Row], other: Sequence[Row], name: str, 
         high, fast = ([measure(rows, metric) for rows in (initial, other)] for measure in (mean, rate))
         holds &= high[0] > high[1] and fast[0] > fast[1]
         parts.append(
-            f"{word} is {high[0]:.3g} against {high[1]:.3g} {unit} with {OTHERWISE[name]}, mean over windows, and changes by "
-            f"{fast[0]:.2g} against {fast[1]:.2g} {unit} in {PER_CONTACTS_N:,} contacts (least squares, linear)"
+            f"{word} is {high[0]:.3g} against {high[1]:.3g} {unit} with {OTHERWISE[name]}, mean over windows, "
+            f"and changes by {fast[0]:.2g} against {fast[1]:.2g} {unit} in {PER_CONTACTS_N:,} contacts (linear fit)"
         )
     return _finding(HIGHER_AND_FASTER, holds, "; ".join(parts), lambda: _off(initial, field))
 

@@ -1,0 +1,46 @@
+"""Stage variation: how the field of equal pokes differs over time and from skin to skin (paper figure 3)."""
+
+from pathlib import Path
+from typing import Any
+
+from pipeline import io
+from pipeline.evaluation.variation import Visits, find_visits, first_of_each_board, over_skins, over_time
+from pipeline.params import captures_of, read_params, read_scene
+from pipeline.sections import Variation
+from pipeline.stages._experiment import read_folder, write_answer
+from pipeline.stages._run import run
+
+
+def variation(scene: str, params: Path, settings: Path, main: Path, indentations: Path, answer: Path) -> None:
+    """Compare visits of equal places: of the worn skin in `indentations`, and of several skins in `main`."""
+    asked = read_scene(settings).variation
+    assert asked is not None
+    worn = read_folder(indentations)[0]
+    names = captures_of(scene, read_params(params), main)
+    of_skins = _visits(main, names, asked)
+    places: list[dict[str, Any]] = []
+    drawn: list[dict[str, Any]] = []
+    for place_i, (x_mm, y_mm) in enumerate(asked.places_mm):
+        over = {
+            "time": over_time(find_visits(worn, (x_mm, y_mm), asked.depth_mm), asked.contacts_n),
+            "skins": over_skins({skin: own[place_i] for skin, own in of_skins.items()}),
+        }
+        where = {"x_mm": x_mm, "y_mm": y_mm}
+        places.append(where | {name: told for name, (told, _) in over.items()})
+        drawn.append(where | {name: lines for name, (_, lines) in over.items()})
+    write_answer(answer, {"depth_mm": asked.depth_mm, "worn_skin": worn.skin, "places": places}, {"places": drawn})
+
+
+def _visits(main: Path, names: list[str], asked: Variation) -> dict[str, list[Visits]]:
+    """Find each asked skin's visits of each place, one capture in memory at a time."""
+    boards: dict[str, str] = {}
+    visits: dict[str, list[Visits]] = {}
+    for name in names:
+        one = io.read_readings(main / f"{name}.parquet")
+        boards[one.skin] = one.board
+        visits[one.skin] = [find_visits(one, place_mm, asked.depth_mm) for place_mm in asked.places_mm]
+    return {skin: visits[skin] for skin in first_of_each_board(boards, asked.skins_n)}
+
+
+if __name__ == "__main__":
+    run(variation)
