@@ -13,6 +13,8 @@ HOMES = {
     r"\bimport matplotlib|from matplotlib": {
         "pipeline/reporting/figures.py", "pipeline/reporting/sweeps.py", "pipeline/reporting/trade_offs.py",
         "pipeline/reporting/work_precision.py", "pipeline/reporting/experiments/sleeve.py",
+        "pipeline/reporting/work_precision.py", "pipeline/reporting/experiments/drift.py",
+        "pipeline/reporting/experiments/variation.py",
     },
     r"\bimport argparse|from argparse": {"pipeline/stages/_run.py"},
     r"\bimport typer|from typer": {"pipeline/cli.py"},

@@ -9,9 +9,10 @@ from math import ceil
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, Shaped
+from jaxtyping import Float, Float32, Int, Shaped
 
 from pipeline.evaluation.metrics import METRICS, score
+from pipeline.schema import Readings
 
 LATE_CONTACTS_N = 45_000  # paper figure 5b: "after 45,000 interactions"
 FORCE = 2  # column of a target
@@ -105,21 +106,24 @@ def force_bias(contacts: Contacts) -> dict[str, float]:
     }
 
 
-def force_left(
-    at: Float[np.ndarray, "f 3"], force_N: Float[np.ndarray, " f"], late: Bool[np.ndarray, " f"]
-) -> float | None:
-    """Give late force over early force at equal places and depths: what softening leaves, in %.
+def force_left(early: Readings, late: Readings) -> float | None:
+    """Give late force over early force at equal places and depths, in %: what softening leaves.
 
-    `at` is x, y and depth in mm. None where no place and depth was met both early and late.
+    None where no place and depth with a known force was met both early and late.
     """
-    _, where = np.unique(np.round(at, DECIMALS), axis=0, return_inverse=True)
-    where, size = where.ravel(), len(at)
-    sums_N = [np.bincount(where, force_N * side, size) for side in (~late, late)]
-    counts = [np.bincount(where, side, size) for side in (~late, late)]
-    both = (counts[0] > 0) & (counts[1] > 0)
+    sides = []
+    for one in (early, late):
+        stop = np.stack([one.x_mm, one.y_mm, one.depth_mm], axis=1).round(DECIMALS)
+        known = ~np.isnan(stop).any(axis=1) & ~np.isnan(one.Fz_N)
+        sides.append((stop[known], one.Fz_N[known].astype(float)))
+    stops, where = np.unique(np.concatenate([stop for stop, _ in sides]), axis=0, return_inverse=True)
+    at = np.split(where.ravel(), [len(sides[0][0])])
+    n = [np.bincount(own, minlength=len(stops)) for own in at]
+    both = (n[0] > 0) & (n[1] > 0)
     if not both.any():
         return None
-    early_N, late_N = (total[both] / n[both] for total, n in zip(sums_N, counts, strict=True))
+    sums_N = [np.bincount(own, force_N, len(stops)) for own, (_, force_N) in zip(at, sides, strict=True)]
+    early_N, late_N = (total_N[both] / own_n[both] for total_N, own_n in zip(sums_N, n, strict=True))
     return float(100 * late_N.sum() / early_N.sum())
 
 

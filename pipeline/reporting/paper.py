@@ -34,3 +34,9 @@ FIGURE_6B = (
 
 SLEEVE = {"chips": "40", "rate, Hz": "133", "skin, mm": "2 in x 4 in (50.8 x 101.6)"}  # section 6, arm sleeve
 SLEEVE_WORDS = 'it shows "contact localization across larger surface areas" in a video (section 6, figure 1E)'
+# Figures 3 and 5 are printed without numbers too.
+FIGURE_3 = (
+    '"while the general properties of the individual sensors overlap, there is still obvious variation across the '
+    'samples"'
+)
+FIGURE_5 = "Figure 5 of the paper is printed without numbers; what its text says of it is the table of findings."

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.dataset.baseline import rank
-from pipeline.dataset.windows import check_one_each
+from pipeline.dataset.parts import Part, stack
 from pipeline.evaluation.drift import Answers, field_sizes, late_force, late_window, over_windows
 from pipeline.evaluation.drift_findings import findings
 from pipeline.learning.recipe import HEADLINE
@@ -17,7 +17,7 @@ from pipeline.sections import Drift
 from pipeline.stages import _drift as work
 from pipeline.stages._experiment import read_folder, write_answer
 from pipeline.stages._run import run
-from pipeline.stages._train import train_all
+from pipeline.stages._train import Scenery, train_all
 
 
 def drift(scene: str, params: Path, settings: Path, indentations: Path, answer: Path) -> None:
@@ -25,11 +25,9 @@ def drift(scene: str, params: Path, settings: Path, indentations: Path, answer: 
     asked = read_scene(settings)
     assert asked.drift is not None
     captures = read_folder(indentations, tuple(captures_of(scene, read_params(params), indentations)))
-    check_one_each(captures)
-    windows = work.windows_of(captures, asked.drift)
-    parts = work.stack(captures, asked.drift, windows, asked.selection)
+    windows, parts = work.cut(captures, asked.drift, asked.selection)
     pairs = list(work.cells(parts, asked.drift, asked.seed))
-    at = work.scenery(scene, asked, parts)
+    at = Scenery(scene, asked, stack(parts), [])
     said: dict[str, list[Answers]] = {}
     for (cell, tests), one in zip(pairs, train_all(at, [cell for cell, _ in pairs], "drift"), strict=True):
         said.setdefault(cell.recipe_name, []).extend(work.answers(cell, one, tests))
@@ -46,7 +44,7 @@ def drift(scene: str, params: Path, settings: Path, indentations: Path, answer: 
 
 
 def _tell(
-    asked: Drift, said: Sequence[Answers], rows: dict[str, Any], parts: Sequence[work.Part], field: dict[str, float]
+    asked: Drift, said: Sequence[Answers], rows: dict[str, Any], parts: Sequence[Part], field: dict[str, float]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Put the windows together with late forces and findings; the paper does not say of which policy figure 5b is."""
     policy = "regular" if "regular" in rows else asked.policies[0]

@@ -18,6 +18,7 @@ from pipeline.evaluation.drift import (
 )
 from pipeline.evaluation.metrics import score
 from pipeline.seeds import rng_for
+from tests.dataset.tables import readings
 
 
 def answers(policy="each", skin="s0", seed_i=0, window_i=0, n=40, bias_N=0.1, **changes) -> Answers:
@@ -83,17 +84,23 @@ def test_what_is_added_to_every_answer_is_added_to_the_bias_alone(more_N):
     assert more["slope"] == pytest.approx(plain["slope"], abs=1e-6)
 
 
-@given(st.floats(0.5, 1.0), st.permutations(range(6)))
+def pressed(at: list, force_N: list):
+    """Readings at x, y and depth in mm."""
+    x_mm, y_mm, depth_mm = np.array(at, np.float32).T
+    return readings(f=len(at), x_mm=x_mm, y_mm=y_mm, depth_mm=depth_mm, Fz_N=np.array(force_N, np.float32))
+
+
+@given(st.floats(0.5, 1.0), st.permutations(range(4)))
 def test_softening_is_found_at_equal_places_and_depths_whatever_else_was_poked(left, order):
-    at = np.array([[0, 0, 1], [2, 0, 1], [0, 0, 2], [4, 4, 1]], float)
-    early_N, late_N = np.array([1.0, 2.0, 4.0, 9.0]), left * np.array([1.0, 2.0])
-    order = np.array(order)
-    places, force_N = np.concatenate([at, at[:2]])[order], np.concatenate([early_N, late_N])[order]
-    assert force_left(places, force_N, order >= 4) == pytest.approx(100 * left)
+    at, force_N = [[0, 0, 1], [2, 0, 1], [0, 0, 2], [4, 4, 1]], [1.0, 2.0, 4.0, np.nan]
+    early = pressed([at[i] for i in order], [force_N[i] for i in order])
+    late = pressed([at[1], at[0], at[0], at[3], [6, 6, 1]], [2 * left, left, left, 9.0, 9.0])
+    assert force_left(early, late) == pytest.approx(100 * left, rel=1e-6)  # float32 newtons
 
 
-def test_where_no_place_is_met_again_no_softening_is_told():
-    assert force_left(np.eye(3), np.ones(3), np.array([False, False, True])) is None
+def test_where_no_place_and_depth_is_met_again_or_known_no_softening_is_told():
+    assert force_left(pressed([[0, 0, 1]], [1]), pressed([[0, 0, 2]], [1])) is None
+    assert force_left(pressed([[0, 0, np.nan]], [1]), pressed([[0, 0, np.nan]], [1])) is None
 
 
 def test_points_are_the_contacts_to_a_millinewton_and_not_too_many():

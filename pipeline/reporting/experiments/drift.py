@@ -1,0 +1,134 @@
+"""Tables and figures of question drift (paper figure 5). In: its numbers and points. Out: tables, SVG by file name.
+
+Same numbers, same bytes. Refuses to know networks and paths.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import matplotlib as mpl
+import pandas as pd
+
+from pipeline.reporting.figures import STYLE, svg
+from pipeline.reporting.paper import FIGURE_5
+from pipeline.reporting.shown import COLUMNS, show, tabulate
+from pipeline.reporting.work_precision import COLOURS, MARKERS
+
+POLICIES = ("initial", "regular", "each")
+MARGIN = 0.05  # of the largest force
+
+
+def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
+    """Make a table of scores against contacts, and one of the paper's findings."""
+    named, error = _policies(numbers), _error(numbers)
+    lines = []
+    for i, first in enumerate(next(iter(named.values()))[1]):
+        line = {"contacts": f"{first['contacts_n']:,}", "source": source}
+        for words, rows in named.values():
+            for metric in ("accuracy_pct", error):
+                line[f"{COLUMNS[metric]} ({words})"] = show(_stat(rows[i], metric))
+        lines.append(line)
+    seeds = f"± is the sd over {numbers['skins_n']} skin(s) of {numbers['seeds_n']} seeds each"
+    spread = seeds if any(row["spread"] for _, rows in named.values() for row in rows) else "One network each."
+    found = [
+        {
+            "finding (paper)": one["finding"], "holds": "yes" if one["holds"] else "NO", "measured": one["measured"],
+            "why not": one.get("why", "–"), "source": source,
+        }
+        for one in numbers["findings"]
+    ]  # fmt: skip
+    return {
+        "drift": tabulate(lines, meaning=f"{_protocol(numbers)} {FIGURE_5}", spread=spread),
+        "drift_findings": tabulate(found),
+    }
+
+
+def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
+    """Draw scores against contacts (figure 5a), and where force is known predicted against true force (figure 5b)."""
+    texts = {"drift.svg": _scores(numbers, source)}
+    return texts | ({"drift_force.svg": _forces(numbers["late"], drawn["late"], source)} if "late" in numbers else {})
+
+
+def _scores(numbers: Mapping[str, Any], source: str) -> str:
+    from matplotlib.figure import Figure
+
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(7.6, 4.0), layout="constrained")
+        error = _error(numbers)
+        for axes, metric in zip(figure.subplots(1, 2), ("accuracy_pct", error), strict=True):
+            for policy, (words, rows) in _policies(numbers).items():
+                i = POLICIES.index(policy)
+                contacts_n, values = ([row[name] for row in rows] for name in ("contacts_n", metric))
+                bars = [row["spread"].get(metric, 0.0) for row in rows] if rows[0]["spread"] else None
+                look = {"color": COLOURS[i], "marker": MARKERS[i], "markersize": 5, "linewidth": 1.2, "capsize": 2}
+                axes.errorbar(contacts_n, values, bars, label=words, **look)
+            axes.set(xlabel="contacts the skin has felt", ylabel=COLUMNS[metric].replace(", ", " / "))
+            axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k" if value else "0")
+            axes.set_xlim(left=0)
+            axes.grid(alpha=0.25)
+        axes.set_yscale("log")
+        figure.axes[0].set_ylim(0, 102)
+        names = figure.axes[0].get_legend_handles_labels()
+        figure.legend(*names, loc="outside lower center", ncols=3, frameon=False, title="no-load reading")
+        figure.suptitle(f"Trained on first contacts, tested on later ones ({source})", x=0.01, ha="left", fontsize=11)
+        return svg(figure)
+
+
+def _forces(late: Mapping[str, Any], points: Mapping[str, Sequence[float]], source: str) -> str:
+    from matplotlib.figure import Figure
+
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(5.2, 5.0), layout="constrained")
+        axes = figure.subplots()
+        ends = min(0.0, *points["true_N"], *points["predicted_N"]), max(*points["true_N"], *points["predicted_N"])
+        room = MARGIN * (ends[1] - ends[0])
+        limits = (ends[0] - room, ends[1] + room)
+        axes.plot(limits, limits, color="0.5", linewidth=1, linestyle="--", label="predicted = true")
+        axes.scatter(points["true_N"], points["predicted_N"], s=9, color=COLOURS[1], alpha=0.5, linewidths=0)
+        axes.set(xlabel="true force / N", ylabel="predicted force / N", xlim=limits, ylim=limits, aspect="equal")
+        said = (
+            f"bias {late['bias_N']:+.3g} ± {late['bias_se_N']:.1g} N ({late['bias_pct']:+.2g} %)\n"
+            f"slope {late['slope']:.3g}, {late['indentations_n']:,} indentations\n"
+            f"no-load reading: policy {late['policy']}"
+        )
+        axes.text(0.03, 0.97, said, transform=axes.transAxes, va="top", fontsize=10)
+        axes.legend(loc="lower right", frameon=False)
+        axes.grid(alpha=0.25)
+        figure.suptitle(f"Force after {late['contacts_n']:,} contacts ({source})", x=0.01, ha="left", fontsize=11)
+        return svg(figure)
+
+
+def _policies(numbers: Mapping[str, Any]) -> dict[str, tuple[str, Sequence[Mapping[str, Any]]]]:
+    """Name the policies that were tried in words, each with its rows."""
+    words = {
+        "initial": "once at the start",
+        "regular": f"every {numbers.get('regular_n')} indentations",
+        "each": "before every contact",
+    }
+    return {policy: (words[policy], numbers[policy]) for policy in POLICIES if policy in numbers}
+
+
+def _error(numbers: Mapping[str, Any]) -> str:
+    """Choose what is shown beside accuracy: places where no force is known."""
+    [(_, rows), *_] = _policies(numbers).values()
+    return "mse_f_N2" if "mse_f_N2" in rows[0] else "mse_xy_mm2"
+
+
+def _stat(row: Mapping[str, Any], metric: str) -> dict[str, float]:
+    return {"mean": row[metric]} | ({"sd": row["spread"][metric]} if metric in row["spread"] else {})
+
+
+def _protocol(numbers: Mapping[str, Any]) -> str:
+    train, test, every, left = (
+        _count(numbers[name], numbers["unit"]) for name in ("train_n", "test_n", "every_n", "left_out_units_n")
+    )
+    said = (
+        f"Trained on the first {train} of each skin, tested on {test} after every {every}; one network for each "
+        "policy of the no-load reading. Contacts: what the skin had felt before the test."
+    )
+    return said + (f" The last {left} fill no whole test, and are left out." if numbers["left_out_units_n"] else "")
+
+
+def _count(n: int, unit: str) -> str:
+    several = {"indentation": "indentations", "pass": "passes"}[unit]
+    return f"{n:,} {unit if n == 1 else several}"

@@ -1,0 +1,99 @@
+import re
+import xml.etree.ElementTree as ET
+
+import pytest
+
+from pipeline.reporting.experiments.drift import figures, tables
+from pipeline.reporting.tables import to_markdown
+
+
+def numbers(force: bool = True, spread: bool = True, **changed) -> dict:
+    """Two windows of three policies, errors apart; two seeds if there is a spread."""
+    policies = {}
+    for i, policy in enumerate(("initial", "regular", "each")):
+        metrics = {"accuracy_pct": 50.0 + i, "mse_xy_mm2": 2.0 - i / 2} | (
+            {"mse_f_N2": 0.03 - i / 100} if force else {}
+        )
+        deviation = {name: value / 50 for name, value in metrics.items()} if spread else {}
+        policies[policy] = [{"contacts_n": n, **metrics, "spread": deviation} for n in (5000, 10_000)]
+    late = {
+        "policy": "regular", "contacts_n": 45_000, "bias_N": 0.0157, "bias_pct": 1.3, "bias_se_N": 8e-4, "slope": 1.01,
+        "indentations_n": 1000,
+    }  # fmt: skip
+    found = [
+        {"finding": "errors grow", "holds": True, "measured": "They do."},
+        {"finding": "each is worse", "holds": False, "measured": "It is not.", "why": "It is never stale."},
+    ]
+    own = {
+        "unit": "indentation", "train_n": 5000, "test_n": 1000, "every_n": 5000, "regular_n": 390, "skins_n": 1,
+        "seeds_n": 2, "left_out_units_n": 90, "findings": found,
+    }  # fmt: skip
+    return own | policies | ({"late": late} if force else {}) | changed
+
+
+DRAWN = {"late": {"true_N": [0.1, 1.0, 2.0], "predicted_N": [0.12, 1.02, 2.02]}}
+
+
+@pytest.mark.parametrize("source", ["simulated", "recorded"])
+def test_a_row_a_window_shows_every_policy_and_where_it_is_from(source):
+    table = tables(numbers(), source)["drift"]
+    assert table["contacts"].tolist() == ["5,000", "10,000"]
+    assert table["MSE_F, N² (every 390 indentations)"].tolist() == ["0.02 ± 0.0004"] * 2
+    assert table["accuracy, % (once at the start)"].tolist() == ["50 ± 1"] * 2
+    assert set(table["source"]) == {source}
+
+
+def test_a_finding_that_does_not_hold_stands_there_in_capitals_and_with_its_reason():
+    table = tables(numbers(), "simulated")["drift_findings"]
+    assert table["holds"].tolist() == ["yes", "NO"]
+    assert table["why not"].tolist() == ["–", "It is never stale."]
+    assert set(table["source"]) == {"simulated"}
+
+
+def test_below_the_table_stand_the_protocol_and_what_was_left_out():
+    assert "first 5,000 indentations of each skin, tested on 1,000 indentations after every 5,000" in to_markdown(
+        tables(numbers(), "simulated")["drift"]
+    )
+    assert "The last 90 indentations fill no whole test" in to_markdown(tables(numbers(), "simulated")["drift"])
+    whole = numbers(unit="pass", train_n=1, test_n=1, every_n=1, left_out_units_n=0)
+    said = to_markdown(tables(whole, "recorded")["drift"])
+    assert "first 1 pass of each skin" in said
+    assert "left out" not in said
+
+
+def test_one_network_has_no_spread_and_says_so():
+    said = to_markdown(tables(numbers(spread=False), "simulated")["drift"])
+    assert "One network each" in said
+    assert "±" not in said
+
+
+def test_where_no_force_is_known_places_are_shown_and_no_force_is_drawn():
+    unknown = numbers(force=False)
+    assert "MSE_xy, mm² (before every contact)" in tables(unknown, "recorded")["drift"]
+    assert list(drawn := figures(unknown, {}, "recorded")) == ["drift.svg"]
+    assert "MSE_xy / mm²" in drawn["drift.svg"]
+
+
+def test_figures_are_svg_with_units_source_and_the_stated_bias():
+    drawn = figures(numbers(), DRAWN, "simulated")
+    for text in drawn.values():
+        ET.fromstring(text)
+        assert "(simulated)" in text
+    for word in ("accuracy / %", "MSE_F / N²", "contacts the skin has felt", "every 390 indentations"):
+        assert word in drawn["drift.svg"]
+    for word in ("true force / N", "predicted force / N", "bias +0.0157 ± 0.0008 N (+1.3 %)", "45,000 contacts"):
+        assert word in drawn["drift_force.svg"]
+
+
+def test_a_policy_has_its_colour_whichever_others_there_are():
+    both = numbers()
+    del both["regular"], both["late"]
+    colours = set(re.findall(r"stroke: (#\w{6})", figures(both, {}, "recorded")["drift.svg"]))
+    assert "#d55e00" in colours  # before every contact, the third
+    assert "#0072b2" not in colours
+
+
+def test_same_numbers_same_bytes_other_points_other_bytes():
+    other = {"late": DRAWN["late"] | {"predicted_N": [0.1, 0.9, 2.1]}}
+    assert figures(numbers(), DRAWN, "simulated") == figures(numbers(), DRAWN, "simulated")
+    assert figures(numbers(), DRAWN, "simulated") != figures(numbers(), other, "simulated")
