@@ -1,0 +1,49 @@
+"""Drift on a real recording: which no-load reading is subtracted decides what a network knows of later passes."""
+
+from pathlib import Path
+
+import pytest
+from ruamel.yaml import YAML
+
+from pipeline import io
+from pipeline.capture.readers import eflesh
+from pipeline.stages.drift import drift
+from tests.recordings.test_recordings import SPATIAL, ingest
+
+ROOT = Path(__file__).resolve().parents[2]
+# FACTS 3: another network, trained on pass 1 and tested on passes 2 to 5, accuracies in %.
+FRESH_PCT, INITIAL_PCT = (89, 88, 86, 84), (55, 19, 13, 10)
+# Network and length of training differ: the same tale, each pass within so many points.
+TOLERANCE_PCT = 15
+
+
+def test_fresh_no_load_readings_keep_eflesh_accurate_and_a_single_one_loses_it(shared_data, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("RESKIN_EXECUTOR", "here")
+    (tmp_path / "capture").mkdir()
+    readings, account = ingest(eflesh, shared_data / SPATIAL, tmp_path / "capture")
+    io.write_readings(tmp_path / "indentations" / f"{readings.capture}.parquet", [readings], account)
+    yaml = YAML(typ="safe")
+    settings = yaml.load((ROOT / "pipeline/scenes/eflesh.yaml").read_text())
+    recipe = settings["train_single"]["recipes"]["paper"] | {"steps_n": 1200}
+    settings["questions"] = ["single_temporal", "drift"]
+    settings["drift"] = {
+        "unit": "pass", "train_n": 1, "test_n": 1, "every_n": 1, "policies": ["initial", "each"],
+        "training": {"seeds_n": 1, "recipes": {"paper": recipe}},
+    }  # fmt: skip
+    params = yaml.load((ROOT / "params.yaml").read_text())
+    params["stages"]["split"]["eflesh"] = [readings.capture]
+    for name, words in {"eflesh.yaml": settings, "params.yaml": params}.items():
+        with (tmp_path / name).open("w") as stream:
+            YAML().dump(words, stream)
+    drift(
+        scene="eflesh", params=tmp_path / "params.yaml", settings=tmp_path / "eflesh.yaml",
+        indentations=tmp_path / "indentations", answer=tmp_path / "answer.json",
+    )  # fmt: skip
+    numbers = io.read_json(tmp_path / "answer.json")["numbers"]
+    assert [row["accuracy_pct"] for row in numbers["each"]] == pytest.approx(FRESH_PCT, abs=TOLERANCE_PCT)
+    assert [row["accuracy_pct"] for row in numbers["initial"]] == pytest.approx(INITIAL_PCT, abs=TOLERANCE_PCT)
+    assert [row["contacts_n"] for row in numbers["each"]] == [961, 2 * 961, 3 * 961, 4 * 961]
+    assert all("mse_f_N2" not in row for row in numbers["each"])
+    assert "late" not in numbers
+    assert [one["holds"] for one in numbers["findings"]] == [True, True]
