@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 HIGHER_AND_FASTER = (
     '"prediction errors are higher and increase faster when we only make a single no-load measurement at the start"'
@@ -80,8 +81,11 @@ def _each_is_worse(rows: Mapping[str, Sequence[Row]], field: Row) -> dict[str, A
     parts, holds = [], True
     for metric, (word, unit) in _known(rows["each"]).items():
         own, regular = mean(rows["each"], metric), mean(rows["regular"], metric)
+        more = np.array([one[metric] - other[metric] for one, other in zip(rows["each"], rows["regular"], strict=True)])
         holds &= own > regular
-        parts.append(f"{word} is {own:.3g} against {regular:.3g} {unit} with regular ones, mean over windows")
+        parts.append(
+            f"{word} is {own:.3g} against {regular:.3g} {unit} with regular ones, mean over windows{_se(more)}"
+        )
 
     def why() -> str:
         noise_uT = field["noload_noise_uT"]
@@ -94,6 +98,14 @@ def _each_is_worse(rows: Mapping[str, Sequence[Row]], field: Row) -> dict[str, A
         )
 
     return _finding(EACH_IS_WORSE, holds, "; ".join(parts), why)
+
+
+def _se(differences: Float[np.ndarray, " w"]) -> str:
+    """Say a mean difference with its standard error over windows, if there are several."""
+    if len(differences) < 2:
+        return ""
+    se = differences.std(ddof=1) / np.sqrt(len(differences))
+    return f" (difference {differences.mean():+.2g}, standard error over windows {se:.1g})"
 
 
 def _overestimates(late: Row) -> dict[str, Any]:

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.stats import sem
 
 from pipeline.evaluation.drift_findings import EACH_IS_WORSE, HIGHER_AND_FASTER, OFFSET, OVERESTIMATES, findings, rate
 
@@ -81,5 +82,15 @@ def test_measured_sentences_hold_the_numbers_of_the_run():
         "After 20,000 contacts MSE_xy is 0.23 mm² with regular ones, 2.5 with a single no-load reading"
     )
     assert "MSE_F is 0.00315 against 0.00215 N²" in third
+    assert "MSE_xy is 0.315 against 0.215 mm² with regular ones, mean over windows (difference +0.1" in third
     assert "bias +0.02 ± 0.0007 N (+1.7 %)" in late
     assert "98.1 % of its early force" in late
+
+
+def test_a_difference_comes_with_its_standard_error_over_windows():
+    changed = [row | {"mse_xy_mm2": value} for row, value in zip(PAPER["each"], (0.1, 0.2, 0.4, 0.9), strict=True)]
+    [third] = [one for one in findings(PAPER | {"each": changed}, FIELD, LATE) if one["finding"] == EACH_IS_WORSE]
+    differences = [
+        own["mse_xy_mm2"] - other["mse_xy_mm2"] for own, other in zip(changed, PAPER["regular"], strict=True)
+    ]
+    assert f"{np.mean(differences):+.2g}, standard error over windows {sem(differences):.1g}" in third["measured"]
