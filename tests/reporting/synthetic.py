@@ -1,0 +1,52 @@
+"""A numbers.json that has every question's contract keys, with values that no run made."""
+
+from pipeline.evaluation.metrics import METRICS
+
+
+def stat(mean: float = 1.0, sd: float = 0.5, n: int = 3) -> dict:
+    return {"mean": mean, "sd": sd, "n": n}
+
+
+def scores(names: tuple[str, ...] = METRICS) -> dict:
+    return {name: stat() for name in names}
+
+
+def all_questions(source: str = "simulated") -> dict:
+    plain = dict.fromkeys(METRICS, 1.0)
+    windows = [{"contacts_n": 5000, "accuracy_pct": 90.0, "mse_xy_mm2": 0.1, "mse_f_N2": 0.1}]
+    finding = {"finding": "errors grow", "holds": True, "measured": "+3 points", "why": ""}
+    return {
+        "provenance": {
+            "scene": "x", "source": source, "git": "abc", "seed": 1, "trained": "abc", "device": "z", "seconds": 1.0,
+        },
+        "capture": {"captures_n": 2, "frames_n": 10, "indentations_n": 5, "left_out": {"low_force_rows_n": 3}},
+        "lobo": {
+            "registered": scores(),
+            "by_board": {"b0": {"trained_on_skins_n": 15, "as_labelled": plain, "registered": plain}},
+        },
+        "table2": {arm: scores() for arm in ("single", "multi", "triplet", "adapted")},
+        "adapt": {"pokes_n": 390, "control": scores()},
+        "paired": [{"of": "adapted", "over": "triplet", **scores()}],
+        "sweep_pokes": [{"pokes_n": pokes_n, **scores()} for pokes_n in (0, 390, 780)],
+        "sweep_sensors": [{"method": "multi", "skins_n": 1, **scores()}],
+        "single_random": scores(), "single_indentation": scores(), "single_pass": scores(),
+        "single_sensor": {"split": "single_random", **scores()},
+        "variants": {"lobo": {"paper": scores()}},
+        "described": {"grid": {"source": source, "counts": {}, "over_skins": {}}},
+        "drift": {
+            "initial": windows, "regular": windows, "each": windows, "findings": [finding],
+            "late": {"contacts_n": 45000, "bias_N": 0.1, "bias_pct": 5.0},
+        },
+        "variation": {"contacts_n": 10000},
+        "shear": scores(("mse_xy_mm2", "mse_fxy_N2", "mse_fz_N2", "accuracy_pct")),
+        "manual": {"before": scores(), "after": scores(), "control": scores()},
+        "flexible": {"before": scores(), "after": scores(), "bias_f_N": {"before": stat(), "after": stat()}},
+        "sleeve": {"chips_n": 40, "rate_hz": 133.0, "accuracy_pct": 90.0, "median_error_mm": 0.5},
+        "sensitivity": {
+            "smallest_step_N": {"one_reading": 0.05, "five_readings": 0.02},
+            "monotonic": {"holds": True, "spearman": 0.99},
+        },
+        "logs": {"rate_hz": 250.0, "accuracy_pct": 80.0, "mse_f_N2": 0.1},
+        "contacts": {"pairs_n": 3}, "ambient": {"fields_uT": [1.0]}, "dynamics": {"presses_n": 3},
+        "runtime": {"stages": {"report": {"seconds": 1.0, "peak_process_memory_MB": 2.0}}, "trainings_n": 1},
+    }  # fmt: skip
