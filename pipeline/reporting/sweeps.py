@@ -9,6 +9,7 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+import pandas as pd
 
 from pipeline.reporting.figures import STYLE, svg
 from pipeline.reporting.learning import adaptation_costs_table, methods_costs_table
@@ -44,21 +45,23 @@ def learning_figures(numbers: Mapping[str, Any], source: str) -> Iterator[tuple[
 
 def learning_pages(runtime: Mapping[str, Any], source: str) -> dict[str, str]:
     """Draw and tabulate errors against costs: text by file name; no figure where nothing was timed here."""
-    texts = {}
-    if "learning" in runtime:
-        texts["learning.md"] = to_markdown(methods_costs_table(runtime["learning"], source))
-        for name, (key, cost) in {
-            "training": ("train_s", "median time of a training / s"),
-            "inference": ("inference_us", "median time of one reading / µs"),
-        }.items():
-            if any(key in row for row in runtime["learning"]):
-                title = f"Error on new skins against {name} time ({source})"
-                texts[f"{name}.svg"] = trade_off(runtime["learning"], key, title=title, cost=cost)
-    if "adaptation" in runtime:
-        texts["adaptation.md"] = to_markdown(adaptation_costs_table(runtime["adaptation"], source))
-        if any("seconds" in row for row in runtime["adaptation"]):
-            texts["adaptation.svg"] = adaptation(runtime["adaptation"], source)
+    texts = {f"{name}.md": to_markdown(table) for name, table in learning_costs(runtime, source).items()}
+    for name, (key, cost) in {
+        "training": ("train_s", "median time of a training / s"),
+        "inference": ("inference_us", "median time of one reading / µs"),
+    }.items():
+        if any(key in row for row in runtime.get("learning", [])):
+            title = f"Error on new skins against {name} time ({source})"
+            texts[f"{name}.svg"] = trade_off(runtime["learning"], key, title=title, cost=cost)
+    if any("seconds" in row for row in runtime.get("adaptation", [])):
+        texts["adaptation.svg"] = adaptation(runtime["adaptation"], source)
     return texts
+
+
+def learning_costs(runtime: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
+    """Tabulate errors beside costs, by name: of methods, and of adaptation to pokes."""
+    makers = {"learning": methods_costs_table, "adaptation": adaptation_costs_table}
+    return {name: make(runtime[name], source) for name, make in makers.items() if name in runtime}
 
 
 def sweep_pokes(rows: Sequence[Mapping[str, Any]], source: str) -> str:
@@ -99,8 +102,8 @@ def _sweep(lines: Sequence[Line], title: str, xlabel: str, *, log: bool) -> str:
 
     counts = sorted({count for line in lines for count in line.counts})
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(9.4, 3.8), layout="constrained")
-        for axes, metric in zip(figure.subplots(1, len(DRAWN)), DRAWN, strict=True):
+        figure = Figure(figsize=(5.6, 6.4), layout="constrained")
+        for axes, metric in zip(figure.subplots(len(DRAWN), 1), DRAWN, strict=True):
             if log:
                 axes.set_xscale("symlog", linthresh=LINEAR_BELOW_N, linscale=0.5)
                 axes.set_xlim(-LINEAR_BELOW_N / 4, 1.3 * counts[-1])
@@ -111,9 +114,11 @@ def _sweep(lines: Sequence[Line], title: str, xlabel: str, *, log: bool) -> str:
             axes.set(xlabel=xlabel, ylabel=COLUMNS[metric].replace(", ", " / "))
             axes.grid(alpha=0.25)
             _bars(axes, lines, metric)
-        figure.legend(*axes.get_legend_handles_labels(), loc="outside right upper", frameon=False, fontsize=8)
+        figure.align_ylabels()
+        look = {"loc": "outside lower left", "ncols": 2, "frameon": False, "fontsize": 9, "alignment": "left"}
+        bars_are = _about_bars(lines, "folds" if log else "draws of skins")
+        figure.legend(*axes.get_legend_handles_labels(), title=bars_are, title_fontsize=9, **look)
         figure.suptitle(title, x=0.01, ha="left", fontsize=10)
-        figure.supxlabel(_about_bars(lines, "folds" if log else "draws of skins"), x=0.01, ha="left", fontsize=7)
         return svg(figure)
 
 

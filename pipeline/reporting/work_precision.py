@@ -48,8 +48,16 @@ def pages(numbers: Mapping[str, Any], *, source: str) -> dict[str, str]:
             drawn = quadratures(rows, seconds, Choice(**numbers["choice"]), source=source)
         else:
             drawn = integrators(rows, seconds)
-        texts |= {f"{study}.svg": drawn, f"{study}.md": to_markdown(table(numbers[study], source))}
-    return texts | {"stages.md": to_markdown(costs(numbers["stages"]))}
+        texts[f"{study}.svg"] = drawn
+    return texts | {f"{name}.md": to_markdown(one) for name, one in cost_tables(numbers, source).items()}
+
+
+def cost_tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
+    """Tabulate what stages cost, and the studies of which something was timed here, by name."""
+    studies = [
+        name for name in ("quadratures", "integrators") if any("median_s" in row for row in numbers.get(name, []))
+    ]
+    return {name: table(numbers[name], source) for name in studies} | {"stages": costs(numbers["stages"])}
 
 
 def costs(stages: Mapping[str, Mapping[str, float]]) -> pd.DataFrame:
