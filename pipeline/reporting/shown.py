@@ -10,6 +10,11 @@ import pandas as pd
 
 COLUMNS = {"accuracy_pct": "accuracy, %", "mse_xy_mm2": "MSE_xy, mm²", "mse_f_N2": "MSE_F, N²"}
 Stat = Mapping[str, float]
+MEANING = "Accuracy: the part of held-out readings whose x and y are both within 1 mm. MSE_xy: mean over the two axes."
+SPREAD = (
+    "± is the sd over n folds (over n pairs of a training and a test skin for one skin on others), or over seeds where "
+    "it says so."
+)
 
 
 def show(value: Stat | None) -> str:
@@ -42,3 +47,11 @@ def tabulate(lines: Sequence[Mapping[str, str]], **said: str) -> pd.DataFrame:
     table = pd.DataFrame(lines)
     table.attrs.update(said)
     return table
+
+
+def notes(table: pd.DataFrame) -> list[str]:
+    """Give the sentences that stand below a table: what its numbers mean."""
+    meanings = [table.attrs["meaning"]] if "meaning" in table.attrs else []
+    if any("accuracy" in str(column) for column in table.columns):
+        meanings.append(f"{MEANING} {table.attrs.get('spread', SPREAD)}")
+    return meanings

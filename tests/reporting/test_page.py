@@ -1,0 +1,162 @@
+import re
+from collections import Counter
+from html.parser import HTMLParser
+
+import pandas as pd
+import pytest
+
+from pipeline.reporting import page_order
+from pipeline.reporting.checklist import checklist
+from pipeline.reporting.page import arrange, lay_out, page
+from pipeline.reporting.tables import make_tables
+from tests.reporting.synthetic import all_questions
+
+SVG = '<svg xmlns="http://www.w3.org/2000/svg" width="{}pt"><defs><path id="same"/></defs><text>é</text></svg>'
+VOID = {"meta", "img", "br"}
+
+
+class Reader(HTMLParser):
+    """Every element with its attributes and ancestors; raises where tags do not nest."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.elements: list[tuple[str, dict, tuple[str, ...]]] = []
+        self.words: list[str] = []
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.elements.append((tag, dict(attrs), tuple(self.open)))
+        if tag not in VOID:
+            self.open.append(f"{tag}.{dict(attrs).get('class', '')}")
+
+    def handle_endtag(self, tag):
+        assert self.open.pop().split(".")[0] == tag
+
+    def handle_data(self, data):
+        self.words.append(data.strip())
+
+    def all(self, tag: str) -> list[tuple[dict, tuple[str, ...]]]:
+        return [(attributes, above) for name, attributes, above in self.elements if name == tag]
+
+
+def render(numbers: dict | None = None, **more: pd.DataFrame) -> str:
+    numbers = all_questions() if numbers is None else numbers
+    tables = make_tables(numbers) | {"checklist": checklist(numbers)} | more
+    figures = {"drift.svg": SVG.format(300), "sweep_pokes.svg": SVG.format(600), "unheard_of.svg": SVG.format(300)}
+    return page(numbers, tables, figures, {"training.svg": SVG.format(300), "stages.md": "| a |"})
+
+
+@pytest.fixture(scope="module")
+def read() -> Reader:
+    return Reader(render(surprise=pd.DataFrame({"<b>": ["a & b", None], "n": ["1", "2"]})))
+
+
+def test_the_page_needs_no_network_and_no_script(read):
+    assert [one for one in ("script", "link", "iframe", "object", "svg") if read.all(one)] == []
+    fetched = [attributes[name] for _, attributes, _ in read.elements for name in ("src", "href") if name in attributes]
+    assert all(address.startswith(("data:image/svg+xml;base64,", "#")) for address in fetched)
+    assert "url(" not in render()
+    assert "@import" not in render()
+
+
+def test_links_lead_to_ids_and_no_id_stands_twice(read):
+    ids = Counter(attributes["id"] for _, attributes, _ in read.elements if "id" in attributes)
+    assert max(ids.values()) == 1
+    assert {attributes["href"][1:] for attributes, _ in read.all("a")} <= set(ids)
+    labels = {attributes["aria-labelledby"] for _, attributes, _ in read.elements if "aria-labelledby" in attributes}
+    assert labels <= set(ids)
+
+
+def test_every_table_scrolls_in_its_own_box_and_names_its_columns(read):
+    tables = read.all("table")
+    assert len(tables) > 8
+    assert all(above[-1] == "div.box" for _, above in tables)
+    assert len(read.all("caption")) == len(tables)
+    assert all(attributes.get("scope") in ("col", "row") for attributes, _ in read.all("th"))
+
+
+def test_every_figure_is_an_image_on_a_white_card_with_words_for_it(read):
+    images = read.all("img")
+    assert len(images) == 4
+    assert all(attributes["alt"].strip() and above[-1] == "div.card" for attributes, above in images)
+    assert [attributes.get("class") for attributes, _ in read.all("figure")].count("wide") == 1
+
+
+@pytest.mark.parametrize("source", ["simulated", "recorded"])
+def test_the_badge_says_where_the_readings_come_from(source):
+    text = render(all_questions(source))
+    assert f'<strong class="badge {source}">{source.upper()}</strong>' in text
+    assert {"simulated": "RECORDED", "recorded": "SIMULATED"}[source] not in text
+
+
+def test_what_no_section_names_is_still_shown(read):
+    assert "Surprise" in read.words
+    assert "<b>" in read.words  # as text, not as a tag
+    assert "a & b" in read.words
+    assert "Unheard of (simulated)" in read.words
+
+
+def test_a_question_that_was_not_asked_leaves_no_section():
+    keys = [section.key for section in arrange(["table2", "captures"], [])]
+    assert keys == ["headline", "captures"]
+    assert [section.key for section in arrange(["shear", "paired", "drift"], ["training.svg"])] == [
+        "shear", "drift", "skins", "costs",
+    ]  # fmt: skip
+
+
+def test_every_key_of_the_provenance_is_shown(read):
+    provenance = all_questions()["provenance"]
+    assert set(provenance) <= set(read.words)
+    assert {str(value) for value in provenance.values()} <= set(read.words)
+
+
+def test_the_same_inputs_give_the_same_bytes():
+    assert render() == render()
+
+
+def test_numbers_stand_on_the_right_and_words_on_the_left():
+    table = pd.DataFrame({"a": ["x"], "b": ["1.5 ± 0.2"], "c": ["–"], "d": ["3 of 4"], "e": ["-0.1 mm²"]})
+    looks = {column.title: column.look for column in lay_out("t", table).columns}
+    assert looks == {"a": "text", "b": "number", "c": "text", "d": "text", "e": "number"}
+
+
+def test_notes_of_a_table_stand_below_it(read):
+    assert any("within 1 mm" in words for words in read.words)
+
+
+def test_no_table_or_figure_stands_in_two_sections():
+    order = page_order
+    sections = (order.HEADLINE, *order.QUESTIONS, order.FURTHER, order.LEFT_OUT, order.COSTS, order.CAPTURES)
+    named = Counter(name for one in sections for name in (*one.tables, *one.figures, *one.folded))
+    assert max(named.values()) == 1
+    assert len({one.key for one in sections}) == len(sections)
+
+
+def luminance(colour: str) -> float:
+    """WCAG 2.2, relative luminance."""
+    parts = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+    linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts]
+    return sum(weight * part for weight, part in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
+
+
+def test_letters_stand_out_from_what_is_behind_them():
+    text = render()
+    light, dark = (dict(zip(*[iter(part)] * 2, strict=True)) for part in colours(text))
+    for theme in (light, light | dark):
+        pairs = [(ink, ground) for ink in ("ink", "soft", "link") for ground in ("paper",)] + [("ink", "band")]
+        for ink, ground in pairs:
+            assert contrast(theme[ink], theme[ground]) >= 4.5  # WCAG 2.2 AA
+        for source in ("simulated", "recorded"):
+            assert contrast("#ffffff", theme[source]) >= 4.5
+
+
+def contrast(one: str, other: str) -> float:
+    bright, dim = sorted((luminance(one), luminance(other)), reverse=True)
+    return (bright + 0.05) / (dim + 0.05)
+
+
+def colours(text: str) -> list[list[str]]:
+    blocks = re.findall(r":root \{(.*?)\}", text, re.DOTALL)
+    return [[word for pair in re.findall(r"--(\w+): (#\w{6})", block) for word in pair] for block in blocks]
