@@ -45,13 +45,18 @@ SHEAR: dict[str, Number] = {  # section 4: dragged lines
     "mse_fz_N2": (0.003, 0.001),
     "mse_xy_mm2": (0.085, 0.006),
 }
-# Section 5 prints no sd with these.
-MANUAL_BEFORE = {"accuracy_pct": 79.86, "mse_xy_mm2": 0.676, "mse_f_N2": 0.268}
-MANUAL_AFTER = {"accuracy_pct": 84.84, "mse_xy_mm2": 0.489, "mse_f_N2": 0.192}
-FLEXIBLE = {"accuracy_pct": 75.0, "mse_xy_mm2": 0.72, "mse_f_N2": 0.54}  # after adaptation; accuracy: "~75 %"
-LOG_RATE_HZ = 250.0  # section 6: dog shoe and glove
-SLEEVE = {"rate_hz": 133.0, "chips_n": 40}  # section 6
-STEP_MAX_N = 0.2  # section 6: "forces as small as the weight of less than 20 mL"
+MANUAL_POKES_N = 325  # section 5, manual indentations; without deviations
+MANUAL: dict[str, dict[str, float]] = {
+    "before": {"accuracy_pct": 79.86, "mse_xy_mm2": 0.676, "mse_f_N2": 0.268},
+    "after": {"accuracy_pct": 84.84, "mse_xy_mm2": 0.489, "mse_f_N2": 0.192},
+}
+FLEXIBLE: dict[str, float] = {"accuracy_pct": 75.0, "mse_xy_mm2": 0.72, "mse_f_N2": 0.54}  # section 5: about, adapted
+FLEXIBLE_GAP_LESS_PCT = 80.0  # section 5: distance between skin and circuit board
+SENSITIVITY_N = 0.2  # section 6, water in a shot glass: "less than 20 mL (< 0.2N) of water"
+SENSITIVITY_ML = 20.0
+LOG_RATE_HZ = 250.0  # section 6, dog shoe and glove: "logged to an SD card at 250 Hz"
+SLEEVE: dict[str, float] = {"rate_hz": 133.0, "chips_n": 40}  # section 6: "samples all 40 magnetometers at 133 Hz"
+RATE_HZ = 400.0  # sections 1 and 2: "up to 400Hz"
 FORCE_RESOLUTION_MAX_N = 0.1  # section 1: what a good skin should reach
 PLACE_ACCURACY_MIN_PCT = 90.0  # section 1: "spatial resolution (1mm with 90% accuracy)"
 PLATEAU_POKES_N = 780  # section 5: no great gain beyond

@@ -39,7 +39,7 @@ def all_questions(source: str = "simulated") -> dict:
         },
         "variation": {"contacts_n": 10000},
         "shear": scores(("mse_xy_mm2", "mse_fxy_N2", "mse_fz_N2", "accuracy_pct")),
-        "manual": {"before": scores(), "after": scores(), "control": scores()},
+        "manual": {"pokes_n": 325, "before": scores(), "after": scores(), "control": scores()},
         "flexible": {"before": scores(), "after": scores(), "bias_f_N": {"before": stat(), "after": stat()}},
         "sleeve": {"chips_n": 40, "rate_hz": 133.0, "accuracy_pct": 90.0, "median_error_mm": 0.5},
         "sensitivity": {
@@ -47,6 +47,6 @@ def all_questions(source: str = "simulated") -> dict:
             "monotonic": {"holds": True, "spearman": 0.99},
         },
         "logs": {"rate_hz": 250.0, "accuracy_pct": 80.0, "mse_f_N2": 0.1},
-        "contacts": {"pairs_n": 3}, "ambient": {"fields_uT": [1.0]}, "dynamics": {"presses_n": 3},
+        "contacts": {"pairs_n": 3}, "ambient": {"fields_uT": [1.0]}, "dynamics": {"presses_n": 3, "rate_hz": 400.0},
         "runtime": {"stages": {"report": {"seconds": 1.0, "peak_process_memory_MB": 2.0}}, "trainings_n": 1},
     }  # fmt: skip
