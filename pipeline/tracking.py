@@ -1,13 +1,15 @@
 """The diary: writes finished trainings to MLflow. The only module that says mlflow; nothing reads it back.
 
-In: the cards and weights in `data/models`. Out: one experiment a scene, one parent run a stage and set of trainings,
-one child a training. Published after training and from files, so a server that is away costs nothing but the entry, and
-`reskin publish` sends later what is missing.
+In: the cards and weights in `data/models`, and the report. Out: one experiment a scene, one parent run a stage and set
+of trainings, one child a training, and one run `report` with the page, its tables and figures, and their numbers.
+Published after training and from files, so a server that is away costs nothing but the entry, and `reskin publish` sends
+later what is missing.
 """
 
 import hashlib
 import json
 import os
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,6 +21,7 @@ from pipeline.server import TrackingAway, probe, server_uri
 
 STORE = "mlflow.db"
 ARTIFACTS = "mlartifacts"
+ELSEWHERE = {"provenance", "runtime", "described", "variants"}  # of numbers.json: costs, and what trainings hold
 
 
 def tracking_uri(root: Path) -> str:
@@ -30,8 +33,8 @@ def tracking_uri(root: Path) -> str:
 Curves = Mapping[str, Sequence[tuple[str, int, Mapping[str, float]]]]
 
 
-def publish(arms: Mapping[str, Path], curves: Curves, figures: Path, *, scene: str, root: Path) -> dict[str, int]:
-    """Write every training of a scene to MLflow once, and its figures to the parents; `arms` maps stage to models.
+def publish(arms: Mapping[str, Path], curves: Curves, reports: Path, *, scene: str, root: Path) -> dict[str, int]:
+    """Write every training of a scene to MLflow once, and its report; `arms` maps stage to models.
 
     A sweep is one run whose metrics go over its steps: hundreds of children would hide the others.
     Returns counts of new, kept and superseded runs; raises `TrackingAway` if the server does not answer.
@@ -52,13 +55,13 @@ def publish(arms: Mapping[str, Path], curves: Curves, figures: Path, *, scene: s
                 counts["new_n" if fresh else "kept_n"] += 1
             current |= {parent_key, *keys.values()}
             _log_means(client, parent_id, list(cards.values()))
-            client.log_artifacts(parent_id, str(figures), "figures")
             client.set_terminated(parent_id)
         for stage, points in curves.items():
             key = hashlib.sha256(json.dumps([stage, points]).encode()).hexdigest()[:32]
             if _find(client, experiment_id, stage, key) is None:
-                _publish_curve(client, _open_parent(client, experiment_id, stage, scene, key), points, figures)
+                _publish_curve(client, _open_parent(client, experiment_id, stage, scene, key), points)
             current.add(key)
+        current.add(_publish_report(client, experiment_id, scene, reports))
         counts["superseded_n"] = _mark_superseded(client, experiment_id, current)
     return counts
 
@@ -150,15 +153,54 @@ def _log(client: Any, run_id: str, card: dict[str, Any]) -> None:
         client.log_batch(run_id, metrics=curve[start : start + 1000])
 
 
-def _publish_curve(
-    client: Any, run_id: str, points: Sequence[tuple[str, int, Mapping[str, float]]], figures: Path
-) -> None:
+def _publish_curve(client: Any, run_id: str, points: Sequence[tuple[str, int, Mapping[str, float]]]) -> None:
     from mlflow.entities import Metric
 
     metrics = [Metric(f"{curve}.{name}", value, 0, step) for curve, step, own in points for name, value in own.items()]
     client.log_batch(run_id, metrics=metrics)
-    client.log_artifacts(run_id, str(figures), "figures")
     client.set_terminated(run_id)
+
+
+def _publish_report(client: Any, experiment_id: str, scene: str, reports: Path) -> str:
+    """Write the report's numbers once, and its files; give its key: what it says but for costs and commits."""
+    from mlflow.entities import Metric
+
+    metrics = [Metric(name, value, 0, step) for name, value, step in metrics_of(io.read_json(reports / "numbers.json"))]
+    said = [[one.key, one.value, one.step] for one in metrics]
+    files = [file for part in ("figures", "tables") for file in sorted((reports / part).glob("*"))]
+    said += [[file.name, io.sha256(file), 0] for file in files]
+    key = hashlib.sha256(json.dumps(said).encode()).hexdigest()[:32]
+    found = _find(client, experiment_id, "report", key)
+    run_id = _open_parent(client, experiment_id, "report", scene, key)
+    if found is None:
+        for start in range(0, len(metrics), 1000):  # MLflow takes at most 1000 metrics a call
+            client.log_batch(run_id, metrics=metrics[start : start + 1000])
+    client.log_artifacts(run_id, str(reports))  # again: words on the page and costs may be new
+    client.set_terminated(run_id)
+    return key
+
+
+def metrics_of(numbers: Mapping[str, Any]) -> list[tuple[str, float, int]]:
+    """Flatten numbers.json to name, value and step: a list of rows that begin with a count is a curve over it.
+
+    Other lists, words, costs and what other runs hold are left out.
+    """
+    asked = {name: value for name, value in numbers.items() if name not in ELSEWHERE}
+    return [(re.sub(r"[^A-Za-z0-9_.\- ]", "_", name), value, step) for name, value, step in _flat(asked, "", 0)]
+
+
+def _flat(value: Any, name: str, step: int) -> Iterator[tuple[str, float, int]]:
+    if isinstance(value, dict):
+        for key, own in value.items():
+            yield from _flat(own, f"{name}.{key}" if name else key, step)
+    elif isinstance(value, list):
+        for row in value:
+            axis = next(iter(row), "") if isinstance(row, dict) else ""
+            if axis.endswith("_n"):
+                rest = {key: own for key, own in row.items() if key != axis}
+                yield from _flat(rest, name, int(row[axis]))
+    elif isinstance(value, int | float):
+        yield name, float(value), step
 
 
 def _set_tags(client: Any, run: Any, tags: dict[str, str]) -> None:

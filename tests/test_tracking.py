@@ -51,9 +51,22 @@ def write(root: Path, **keys: str) -> dict[str, int]:
     io.remove(root / "models")
     for name, key in keys.items():
         write_model(root / "models", name, key)
-    (root / "figures").mkdir(exist_ok=True)
-    (root / "figures/a.svg").write_text("<svg/>")
-    return publish({"train_multi": root / "models"}, {}, root / "figures", scene="ci", root=root)
+    write_report(root / "reports")
+    return publish({"train_multi": root / "models"}, {}, root / "reports", scene="ci", root=root)
+
+
+def write_report(reports: Path, accuracy_pct: float = 50.0, seconds: float = 1.0) -> None:
+    numbers = {
+        "provenance": {"seed": 1, "seconds": seconds}, "runtime": {"stages": {"report": {"seconds": seconds}}},
+        "table2": {"multi": {"accuracy_pct": {"mean": accuracy_pct, "n": 2}}},
+        "drift": {
+            "each": [{"contacts_n": 5, "accuracy_pct": 90.0}, {"contacts_n": 10, "accuracy_pct": 80.0}],
+            "findings": [{"finding": "f", "holds": True}], "policy": "each",
+        },
+    }  # fmt: skip
+    io.write_json(reports / "numbers.json", numbers)
+    io.write_text(reports / "index.html", f"<p>{seconds}</p>")
+    io.write_text(reports / "figures/a.svg", "<svg/>")
 
 
 def runs(root: Path, query: str) -> list:
@@ -65,7 +78,7 @@ def test_every_training_is_a_child_run_once_however_often_it_is_published(tmp_pa
     assert write(tmp_path, b0="k0", b1="k1") == {"new_n": 2, "kept_n": 0, "superseded_n": 0}
     assert write(tmp_path, b0="k0", b1="k1") == {"new_n": 0, "kept_n": 2, "superseded_n": 0}
     children = runs(tmp_path, "tags.kind = 'training'")
-    (parent,) = runs(tmp_path, "tags.kind = 'stage'")
+    (parent,) = runs(tmp_path, "tags.stage = 'train_multi' and tags.kind = 'stage'")
     assert sorted(run.data.tags["fold"] for run in children) == ["b0", "b1"]
     assert {run.data.tags["mlflow.parentRunId"] for run in children} == {parent.info.run_id}
     assert {run.info.status for run in [*children, parent]} == {"FINISHED"}
@@ -77,7 +90,6 @@ def test_every_training_is_a_child_run_once_however_often_it_is_published(tmp_pa
     assert run.data.params["steps_n"] == "3"
     assert [point.value for point in client.get_metric_history(run.info.run_id, "train_loss")] == [3.0, 2.0, 1.0]
     assert len(client.list_artifacts(run.info.run_id, "model")) == 2
-    assert [one.path for one in client.list_artifacts(parent.info.run_id, "figures")] == ["figures/a.svg"]
 
     # Other settings: the new result is shown, the old one is kept and marked.
     assert write(tmp_path, b0="k0", b1="k9") == {"new_n": 1, "kept_n": 1, "superseded_n": 2}
@@ -96,22 +108,46 @@ def test_a_new_score_replaces_the_old_one_and_a_dropped_question_is_not_current(
     write(tmp_path, b0="k0", b1="k1")
     # The same training, scored anew: the old score is not what is shown.
     write_model(tmp_path / "models", "b1", "k1", accuracy_pct=77.0)
-    counts = publish({"train_multi": tmp_path / "models"}, {}, tmp_path / "figures", scene="ci", root=tmp_path)
+    counts = publish({"train_multi": tmp_path / "models"}, {}, tmp_path / "reports", scene="ci", root=tmp_path)
     assert counts == {"new_n": 1, "kept_n": 1, "superseded_n": 2}
     current = runs(tmp_path, "tags.kind = 'training' and tags.current = 'true'")
     assert sorted(run.data.metrics["accuracy_pct"] for run in current) == [50.0, 77.0]
 
     # A question that is asked no more has no current runs.
-    publish({}, {}, tmp_path / "figures", scene="ci", root=tmp_path)
-    assert runs(tmp_path, "tags.current = 'true'") == []
+    publish({}, {}, tmp_path / "reports", scene="ci", root=tmp_path)
+    assert [run.data.tags["stage"] for run in runs(tmp_path, "tags.current = 'true'")] == ["report"]
+
+
+def test_the_report_is_one_run_with_every_figure_the_page_and_its_numbers(tmp_path):
+    client = mlflow.MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
+    write(tmp_path)
+    (run,) = runs(tmp_path, "tags.stage = 'report'")
+    assert run.info.status == "FINISHED"
+    assert {one.path for one in client.list_artifacts(run.info.run_id)} == {"figures", "index.html", "numbers.json"}
+    assert [one.path for one in client.list_artifacts(run.info.run_id, "figures")] == ["figures/a.svg"]
+    assert run.data.metrics == {
+        "table2.multi.accuracy_pct.mean": 50.0, "table2.multi.accuracy_pct.n": 2, "drift.each.accuracy_pct": 80.0,
+    }  # fmt: skip
+    curve = client.get_metric_history(run.info.run_id, "drift.each.accuracy_pct")
+    assert [(point.step, point.value) for point in curve] == [(5, 90.0), (10, 80.0)]
+
+    # Other costs are the same report, whose files are renewed; another number is another report.
+    write_report(tmp_path / "reports", seconds=2.0)
+    publish({}, {}, tmp_path / "reports", scene="ci", root=tmp_path)
+    (same,) = runs(tmp_path, "tags.stage = 'report'")
+    assert len(client.get_metric_history(same.info.run_id, "drift.each.accuracy_pct")) == 2
+    assert Path(client.download_artifacts(same.info.run_id, "index.html")).read_text() == "<p>2.0</p>"
+    write_report(tmp_path / "reports", accuracy_pct=60.0)
+    assert publish({}, {}, tmp_path / "reports", scene="ci", root=tmp_path)["superseded_n"] == 1
+    (current,) = runs(tmp_path, "tags.stage = 'report' and tags.current = 'true'")
+    assert current.data.metrics["table2.multi.accuracy_pct.mean"] == 60.0
 
 
 def test_a_sweep_is_one_run_whose_metrics_go_over_its_steps(tmp_path):
-    (tmp_path / "figures").mkdir()
-    (tmp_path / "figures/a.svg").write_text("<svg/>")
+    write_report(tmp_path / "reports")
     curves = {"sweep_pokes": [("adapted", 0, {"accuracy_pct": 60.0}), ("adapted", 65, {"accuracy_pct": 70.0})]}
-    publish({}, curves, tmp_path / "figures", scene="ci", root=tmp_path)
-    publish({}, curves, tmp_path / "figures", scene="ci", root=tmp_path)
+    publish({}, curves, tmp_path / "reports", scene="ci", root=tmp_path)
+    publish({}, curves, tmp_path / "reports", scene="ci", root=tmp_path)
     (run,) = runs(tmp_path, "tags.stage = 'sweep_pokes' and tags.current = 'true'")
     client = mlflow.MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
     history = client.get_metric_history(run.info.run_id, "adapted.accuracy_pct")

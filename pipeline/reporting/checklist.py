@@ -150,7 +150,7 @@ def _judge_near(ours: float, printed: Any, path: str) -> Verdict:
 
 def _judge_findings(found: Sequence[Mapping[str, Any]]) -> Verdict:
     missing = [
-        f"not here: {one['finding']} ({one['why']})" for one in found if not one["holds"]
+        f"not here: {one['finding']} ({one['why'].rstrip('.')})" for one in found if not one["holds"]
     ]  # what holds has no why
     return Verdict("; ".join([f"{len(found) - len(missing)} of {len(found)} hold", *missing]), bool(missing))
 

@@ -1,4 +1,4 @@
-"""Stage publish: models, points of sweeps and figures -> the MLflow diary. No output: nothing reads the diary back."""
+"""Stage publish: models, points of sweeps and the report -> the MLflow diary. No output: nothing reads it back."""
 
 from pathlib import Path
 
@@ -11,12 +11,12 @@ from pipeline.tracking import Curves
 from pipeline.tracking import publish as write
 
 
-def publish(scene: str, settings: Path, models: Path, answers: Path, figures: Path) -> None:
-    """Write every training of a scene to MLflow once; if the server is away, say so and go on."""
+def publish(scene: str, settings: Path, models: Path, answers: Path, reports: Path) -> None:
+    """Write every training of a scene and its report to MLflow once; if the server is away, say so and go on."""
     asked = read_scene(settings)
     arms = {arm: models / arm for arm in modelled(asked)}
     try:
-        say(f"{scene}: MLflow runs {write(arms, read_curves(asked, answers), figures, scene=scene, root=Path())}")
+        say(f"{scene}: MLflow runs {write(arms, read_curves(asked, answers), reports, scene=scene, root=Path())}")
     except TrackingAway as away:
         say(f"warning: {scene} is not in MLflow: {away}")
 

@@ -185,7 +185,7 @@ def test_a_stage_killed_in_the_middle_loses_no_finished_fold(story):
 def test_a_dead_tracking_server_is_said_and_costs_no_result(story):
     start_s = time.monotonic()
     words = ["--scene", "ci", "--settings", "pipeline/scenes/ci.yaml", "--models", "data/models/ci",
-             "--answers", "data/answers/ci", "--figures", "reports/ci/figures"]  # fmt: skip
+             "--answers", "data/answers/ci", "--reports", "reports/ci"]  # fmt: skip
     done = run(story, "python", "-m", "pipeline.stages.publish", *words, MLFLOW_TRACKING_URI="http://127.0.0.1:9")
     assert "does not answer" in done.stderr
     assert time.monotonic() - start_s < 20  # not MLflow's own minutes; two cores may be busy
