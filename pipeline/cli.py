@@ -165,7 +165,7 @@ def publish() -> None:
             continue
         try:
             curves = read_curves(asked, answers)
-            counts = write(arms, curves, ROOT / "reports" / scene / "figures", scene=scene, root=ROOT)
+            counts = write(arms, curves, ROOT / "reports" / scene, scene=scene, root=ROOT)
         except TrackingAway as away:
             typer.echo(f"error: {away}", err=True)
             sys.exit(3)

@@ -2,8 +2,8 @@
 
 In: the cards and weights in `data/models`, and the report. Out: one experiment a scene, one parent run a stage and set
 of trainings, one child a training, and one run `report` with the page, its tables and figures, and their numbers.
-Published after training and from files, so a server that is away costs nothing but the entry, and `reskin publish` sends
-later what is missing.
+Published after training and from files, so a server that is away costs nothing but the entry, and `reskin publish`
+sends later what is missing.
 """
 
 import hashlib
