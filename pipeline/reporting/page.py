@@ -21,9 +21,12 @@ from pipeline.reporting.work_precision import cost_tables
 
 NUMBER = re.compile(r"[-+−]?\d[\d.,]*(e[-+]?\d+)?( ± [\d.e+-]+)?( \(seeds\))?( (%|mm|N|mm²|N²|Hz|s|µT))?|–?")
 SVG_WIDTH_PT = re.compile(r'<svg [^>]*?width="([\d.]+)pt"')
-WIDE_PT = 560.0  # a figure that wide would have letters too small on a telephone: it scrolls in its card there
+WIDE_PT = 500.0  # a figure that wide would have letters too small on a telephone: it scrolls in its card there
 LONG = 40  # letters of a cell that needs a wide column
-MEANT = {"simulated": "simulated: no number on it was measured on hardware", "recorded": "recorded from hardware"}
+MEANT = {
+    "simulated": "Every reading of this scene was simulated: no number on this page was measured on hardware.",
+    "recorded": "Every reading of this scene was recorded from hardware.",
+}
 
 
 @dataclass(frozen=True)
@@ -101,14 +104,10 @@ def arrange(tables: Iterable[str], figures: Iterable[str]) -> Iterator[Section]:
 
 
 def about(numbers: Mapping[str, Any]) -> str:
-    """Say in one sentence what a scene is: where its readings come from, and how many there are."""
-    provenance, capture = numbers["provenance"], numbers["capture"]
-    counts = ", ".join(
-        f"{capture[key]:,} {word}"
-        for key, word in {"captures_n": "captures", "indentations_n": "indentations", "frames_n": "frames"}.items()
-        if key in capture
-    )
-    return f"All results of this page are {MEANT[provenance['source']]}. The scene's main captures: {counts}."
+    """Say what a scene is: where its readings come from, and how many of them its main captures hold."""
+    counts = next(iter(numbers["described"].values()))["counts"]
+    held = ", ".join(f"{n:,} {name.removesuffix('_n').replace('_', ' ')}" for name, n in counts.items() if n)
+    return f"{MEANT[numbers['provenance']['source']]} Its main captures hold {held}."
 
 
 def lay_out(name: str, table: pd.DataFrame) -> Table:

@@ -32,7 +32,7 @@ def all_questions(source: str = "simulated") -> dict:
         "single_random": scores(), "single_indentation": scores(), "single_pass": scores(),
         "single_sensor": {"split": "single_random", **scores()},
         "variants": {"lobo": {"paper": scores()}},
-        "described": {"grid": {"source": source, "counts": {}, "over_skins": {}}},
+        "described": {"grid": {"source": source, "counts": {"captures_n": 2, "readings_n": 1000}, "over_skins": {}}},
         "drift": {
             "initial": windows, "regular": windows, "each": windows, "findings": [finding],
             "late": {"contacts_n": 45000, "bias_N": 0.1, "bias_pct": 5.0},

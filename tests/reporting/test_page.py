@@ -91,6 +91,11 @@ def test_the_badge_says_where_the_readings_come_from(source):
     assert {"simulated": "RECORDED", "recorded": "SIMULATED"}[source] not in text
 
 
+def test_the_page_says_first_what_the_scene_is(read):
+    words = next(i for i, word in enumerate(read.words) if "2 captures, 1,000 readings" in word)
+    assert words < read.words.index("Contents")
+
+
 def test_what_no_section_names_is_still_shown(read):
     assert "Surprise" in read.words
     assert "<b>" in read.words  # as text, not as a tag
