@@ -1,0 +1,111 @@
+"""A ball of iron against magpylib's sphere, the conditions on its surface, and the laws of what it induces."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from magpylib.core import magnet_sphere_Bfield
+
+from pipeline.physics import dipole
+from pipeline.physics.ambient import EARTH_SIZE_T, EARTH_T, ball_field, ball_images, directions
+from pipeline.seeds import rng_for
+
+RADIUS_M = 5e-3
+CENTRE_M = np.array([1e-3, -2e-3, 12e-3])
+B_T = np.array([20e-6, 10e-6, -45e-6])
+ROUNDING = 1e-10  # places in mm, subtracted
+MU_R = st.floats(1.0, 1e5)
+NEAR = np.array([[3e-3, 1e-3, 2e-3], [-4e-3, -1e-3, 4e-3]]), np.array([[0.0, 1e-3, 5e-3], [2e-3, 0.0, -1e-3]])
+
+
+def on_sphere(radius_m, n=40):
+    return CENTRE_M + radius_m * directions(n, rng_for(0, "sphere"))
+
+
+def field(observers_m, b_T=B_T, mu_r=1000.0):
+    return ball_field(observers_m, b_T, centre_m=CENTRE_M, radius_m=RADIUS_M, mu_r=mu_r)
+
+
+def images(observers_m, dipoles=NEAR):
+    return ball_images(observers_m, dipoles, centre_m=CENTRE_M, radius_m=RADIUS_M)
+
+
+def outward(observers_m):
+    away = observers_m - CENTRE_M
+    return away / np.linalg.norm(away, axis=1, keepdims=True)
+
+
+@given(MU_R)
+def test_outside_the_ball_is_magpylibs_sphere_of_its_polarisation(mu_r):
+    observers_m = on_sphere(1.7 * RADIUS_M)
+    polarisation_T = np.tile(3 * (mu_r - 1) / (mu_r + 2) * B_T, (len(observers_m), 1))
+    diameters_m = np.full(len(observers_m), 2 * RADIUS_M)
+    theirs_T = magnet_sphere_Bfield(
+        observers=observers_m - CENTRE_M, diameters=diameters_m, polarizations=polarisation_T
+    )
+    np.testing.assert_allclose(field(observers_m, mu_r=mu_r), theirs_T, rtol=1e-9, atol=1e-18)  # rounding, 50 uT
+
+
+@given(MU_R)
+def test_across_its_surface_the_normal_field_and_the_tangential_h_go_on(mu_r):
+    observers_m = on_sphere(RADIUS_M)
+    normal = outward(observers_m)
+    outside_T, inside_T = B_T + field(observers_m, mu_r=mu_r), 3 * mu_r / (mu_r + 2) * B_T
+    np.testing.assert_allclose((outside_T * normal).sum(1), normal @ inside_T, rtol=0, atol=ROUNDING * 1e-4)
+    h_outside, h_inside = np.cross(outside_T, normal), np.cross(inside_T / mu_r, normal)
+    np.testing.assert_allclose(h_outside, h_inside, rtol=0, atol=ROUNDING * 1e-4)
+
+
+@given(st.floats(-3, 3), st.floats(1.5, 20))
+def test_it_is_linear_in_the_field_and_falls_as_one_over_r3(factor, times):
+    near_m, far_m = on_sphere(1.5 * RADIUS_M), on_sphere(1.5 * times * RADIUS_M)
+    np.testing.assert_allclose(field(near_m, factor * B_T), factor * field(near_m), rtol=1e-9, atol=1e-18)
+    np.testing.assert_allclose(field(far_m) * times**3, field(near_m), rtol=1e-9, atol=1e-16)
+
+
+def test_a_ball_as_permeable_as_air_is_not_there():
+    assert not field(on_sphere(2 * RADIUS_M), mu_r=1.0).any()
+
+
+def test_lines_of_dipoles_and_images_together_meet_the_surface_upright():
+    observers_m = on_sphere(RADIUS_M)
+    together_T = dipole.field(*NEAR, observers_m) + images(observers_m)
+    sideways_T = np.cross(together_T, outward(observers_m))
+    assert np.abs(sideways_T).max() < 1e-9 * np.abs(together_T).max()  # rounding
+    without_T = np.cross(dipole.field(*NEAR, observers_m), outward(observers_m))
+    assert np.abs(without_T).max() > 0.1 * np.abs(together_T).max()  # the ball does bend them
+
+
+def test_what_images_add_has_no_pole_as_nothing_magnetic_has():
+    # Gauss's law, over a sphere of the ball's size and half as much again: exact for polynomials of 31st degree.
+    cos, weights = np.polynomial.legendre.leggauss(60)
+    angles = np.linspace(0, 2 * np.pi, 120, endpoint=False)
+    sin = np.sqrt(1 - cos**2)
+    normal = np.stack(
+        [np.outer(sin, np.cos(angles)), np.outer(sin, np.sin(angles)), np.outer(cos, np.ones(120))], axis=-1
+    )
+    through_T = (images((CENTRE_M + 1.5 * RADIUS_M * normal).reshape(-1, 3)) * normal.reshape(-1, 3)).sum(1)
+    flux = (through_T.reshape(60, 120).mean(axis=1) * weights).sum() / 2
+    assert abs(flux) < 1e-9 * np.abs(through_T).max()
+
+
+def test_images_of_a_far_dipole_are_those_of_its_uniform_field():
+    far = np.array([[0.4, -0.6, 0.9]]), np.array([[1.0, 2.0, -3.0]])
+    observers_m = on_sphere(2 * RADIUS_M)
+    uniform_T = dipole.field(*far, CENTRE_M[None])[0]
+    of_uniform_T = field(observers_m, uniform_T, mu_r=1e12)
+    np.testing.assert_allclose(  # over 5 mm the field of a dipole 1 m away varies by 3 * 5 mm / 1 m
+        images(observers_m, far), of_uniform_T, rtol=0, atol=0.02 * np.abs(of_uniform_T).max()
+    )
+
+
+def test_directions_are_unit_vectors_that_favour_none():
+    drawn = directions(20_000, rng_for(0, "directions"))
+    np.testing.assert_allclose(np.linalg.norm(drawn, axis=1), 1, rtol=1e-12)
+    np.testing.assert_allclose(drawn.mean(axis=0), 0, atol=5 / np.sqrt(3 * 20_000))  # five sd of a mean
+    np.testing.assert_allclose(drawn.T @ drawn / 20_000, np.eye(3) / 3, atol=0.012)  # five sd: 0.3 / sqrt(n)
+
+
+def test_the_earths_field_has_its_size_and_dips():
+    assert np.linalg.norm(EARTH_T) == pytest.approx(EARTH_SIZE_T)
+    assert EARTH_T[2] < 0 < EARTH_T[0]
