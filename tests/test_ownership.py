@@ -15,6 +15,8 @@ HOMES = {
         "pipeline/reporting/work_precision.py", "pipeline/reporting/experiments/sleeve.py",
         "pipeline/reporting/work_precision.py", "pipeline/reporting/experiments/drift.py",
         "pipeline/reporting/experiments/variation.py",
+        "pipeline/reporting/work_precision.py", "pipeline/reporting/experiments/ambient.py",
+        "pipeline/reporting/experiments/contacts.py",
     },
     r"\bimport argparse|from argparse": {"pipeline/stages/_run.py"},
     r"\bimport typer|from typer": {"pipeline/cli.py"},
@@ -26,7 +28,9 @@ HOMES = {
         "pipeline/learning/grid.py", "pipeline/learning/losses.py", "pipeline/learning/model.py",
         "pipeline/learning/train.py", "pipeline/learning/feed.py",
     },
-    r"from sklearn": {"pipeline/dataset/splits.py", "pipeline/learning/classical.py"},
+    r"from sklearn": {
+        "pipeline/dataset/splits.py", "pipeline/evaluation/oddness.py", "pipeline/learning/classical.py",
+    },
     r"os\.environ": {"pipeline/learning/executors.py", "pipeline/server.py", "pipeline/tracking.py"},
     r"import pickle|torch\.load\(|allow_pickle=True": set(),
 }  # fmt: skip
