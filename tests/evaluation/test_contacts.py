@@ -1,0 +1,152 @@
+"""Pairs as they are asked for, answers against hand-made truths, thresholds that no test contact can move."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.dataset.grid import points_mm
+from pipeline.errors import ParamsError
+from pipeline.evaluation.contacts import (
+    TOLERANCE_MM,
+    along_the_line,
+    detect,
+    draw_pairs,
+    keep_aside,
+    over_boards,
+    where_it_falls,
+)
+from pipeline.seeds import rng_for
+from tests.dataset import tables
+
+SKINS = ("b0_s0", "b0_s1", "b1_s0")
+
+
+def grid_rows(force=True):
+    """Every place of the grid twice on each skin, at a force of its own."""
+    skins = np.repeat(SKINS, 130)
+    rows = tables.rows([name[:2] for name in skins], skins)
+    target = np.column_stack([np.tile(points_mm(), (6, 1)), rng_for(0, "force").uniform(0, 3, len(skins))])
+    target[:, 2] = target[:, 2] if force else np.nan
+    return replace(rows, target=target.astype(np.float32))
+
+
+ROWS = grid_rows()
+OWN = np.flatnonzero(ROWS.board == "b0")
+
+
+def pairs_at(separation_mm, rows=ROWS, own=OWN, pairs_n=80):
+    return draw_pairs(rows, own, separation_mm, pairs_n=pairs_n, rng=rng_for(0, "pairs", f"{separation_mm}"))
+
+
+@given(st.sampled_from([2.0, 4.2, 6.0, 8.5, 12.0, 16.0]))
+def test_pairs_lie_on_one_skin_of_the_board_as_far_apart_as_is_asked(separation_mm):
+    pairs = pairs_at(separation_mm)
+    assert (ROWS.skin[pairs.weaker] == ROWS.skin[pairs.stronger]).all()
+    assert set(ROWS.board[pairs.weaker]) == {"b0"}
+    apart_mm = np.linalg.norm(ROWS.target[pairs.weaker, :2] - ROWS.target[pairs.stronger, :2], axis=1)
+    assert np.abs(apart_mm - separation_mm).max() <= TOLERANCE_MM + 1e-5  # float32 of 16 mm
+    assert (ROWS.target[pairs.weaker, 2] <= ROWS.target[pairs.stronger, 2]).all()
+    assert len(pairs.weaker) == 80
+
+
+def test_zero_is_one_place_twice_and_a_small_distance_never_is():
+    same = pairs_at(0.0)
+    np.testing.assert_array_equal(ROWS.target[same.weaker, :2], ROWS.target[same.stronger, :2])
+    close = replace(ROWS, target=(ROWS.target * [0.2, 0.2, 1]).astype(np.float32))  # places 0.4 mm apart
+    pairs = pairs_at(0.4, rows=close)
+    assert (close.target[pairs.weaker, :2] != close.target[pairs.stronger, :2]).any(axis=1).all()
+
+
+def test_without_forces_the_weaker_one_is_that_of_the_smaller_field():
+    rows = grid_rows(force=False)
+    pairs = pairs_at(4.0, rows=rows)
+    length = [np.linalg.norm(rows.db_uT[side], axis=1) for side in (pairs.weaker, pairs.stronger)]
+    assert (length[0] <= length[1]).all()
+    numbers = where_it_falls(rows.target[pairs.weaker], rows.target[pairs.stronger], ROWS.target[pairs.weaker])
+    assert not {"force_over_sum", "force_over_larger"} & set(numbers)
+
+
+def test_what_is_read_is_the_sum_row_by_row():
+    pairs = pairs_at(6.0)
+    for i in range(5):
+        both = ROWS.db_uT[pairs.weaker[i]] + ROWS.db_uT[pairs.stronger[i]]
+        np.testing.assert_array_equal(pairs.sum_uT(ROWS.db_uT)[i], both)
+
+
+def test_places_that_are_not_there_are_refused_with_the_way_out():
+    with pytest.raises(ParamsError, match=r"31 mm apart, within 0.5 mm; got none. Mend contacts.separations_mm"):
+        pairs_at(31.0)
+
+
+def three(*rows):
+    return np.array(rows, np.float32)
+
+
+def test_an_answer_is_placed_between_two_known_contacts():
+    weaker, stronger = three([0, 0, 1], [0, 0, 1]), three([4, 0, 3], [0, 8, 3])
+    answer = three([3, 0.5, 4], [0, 5, 2])
+    numbers = where_it_falls(weaker, stronger, answer)
+    assert numbers["near_either_pct"] == 50  # the first: 1 mm and 0.5 mm from the stronger
+    assert numbers["nearest_mm"] == pytest.approx((np.hypot(1, 0.5) + 3) / 2)
+    assert numbers["along"] == pytest.approx((3 / 4 + 5 / 8) / 2)
+    assert numbers["nearer_the_stronger_pct"] == 100
+    assert numbers["force_over_sum"] == pytest.approx(6 / 8)
+    assert numbers["force_over_larger"] == pytest.approx(6 / 6)
+
+
+@given(st.floats(-1, 2), st.floats(-5, 5))
+def test_what_is_off_the_line_does_not_move_the_foot(share, aside_mm):
+    weaker, stronger = three([2, 3, 1]), three([5, 7, 2])
+    foot = weaker[0] + share * (stronger - weaker)[0]
+    answer = three(foot + aside_mm * np.array([-0.8, 0.6, 0]))
+    assert along_the_line(weaker, stronger, answer)[0] == pytest.approx(share, abs=1e-5)  # float32
+
+
+@pytest.mark.parametrize(
+    ("boards", "skins", "passes", "aside", "what"),
+    [
+        (["b0", "b1", "b2"], ["s0", "s1", "s2"], [0, 0, 0], [2], "board"),
+        (["b0", "b0", "b0"], ["s0", "s1", "s1"], [0, 0, 1], [1, 2], "skin"),
+        (["b0", "b0", "b0"], ["s0", "s0", "s0"], [0, 1, 2], [2], "pass"),
+    ],
+)
+def test_a_board_is_kept_aside_else_a_skin_else_a_pass(boards, skins, passes, aside, what):
+    fit, kept, said = keep_aside(tables.rows(boards, skins, passes), np.arange(3))
+    assert (kept.tolist(), said) == (aside, what)
+    assert sorted([*fit, *kept]) == [0, 1, 2]
+
+
+def test_one_pass_of_one_skin_has_nothing_to_keep_aside():
+    with pytest.raises(ParamsError, match="two boards, skins or passes; got one"):
+        keep_aside(tables.rows(["b0"] * 2, ["s0"] * 2), np.arange(2))
+
+
+def scores(name, shift=0.0, n=400):
+    return {"odd": rng_for(0, "scores", name).normal(shift, 1, n)}
+
+
+def test_a_threshold_is_set_on_what_was_kept_aside_and_on_nothing_else():
+    aside, double = scores("aside"), {0.0: scores("same"), 4.0: scores("four", 2)}
+    one = detect(aside, scores("single"), double, 0.1)
+    other = detect(aside, scores("single", 5), double, 0.1)
+    assert one["by_separation"][4.0]["detected_pct"] == other["by_separation"][4.0]["detected_pct"]
+    assert detect(aside, aside, double, 0.1)["false_alarm_pct"]["odd"] == pytest.approx(10, abs=100 / 400)
+
+
+def test_the_area_over_all_pairs_leaves_out_those_at_one_place():
+    single, apart = scores("single"), scores("four", 2)
+    found = detect(scores("aside"), single, {0.0: scores("same", -9), 4.0: apart}, 0.1)
+    assert found["auc"] == found["by_separation"][4.0]["auc"]
+    assert found["by_separation"][0.0]["auc"]["odd"] < 0.01
+
+
+def test_boards_are_put_together_leaf_by_leaf():
+    trees = [{"a": {"b": 1.0}, "c": 4.0}, {"a": {"b": 3.0}, "c": 6.0}]
+    assert over_boards(trees) == {
+        "a": {"b": {"mean": 2.0, "n": 2, "sd": pytest.approx(np.sqrt(2))}},
+        "c": {"mean": 5.0, "n": 2, "sd": pytest.approx(np.sqrt(2))},
+    }
+    assert over_boards(trees[:1])["c"] == {"mean": 4.0, "n": 1}
