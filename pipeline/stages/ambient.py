@@ -1,0 +1,57 @@
+"""Stage ambient: error against a field from outside and a ball of iron nearby, and what subtracting regains."""
+
+from pathlib import Path
+from typing import Any
+
+from scipy.constants import micro
+
+from pipeline.evaluation.ambient import REFERENCE_ASIDE_MM, over_boards, take_board
+from pipeline.physics.ambient import EARTH_DIP_DEG, EARTH_SIZE_T
+from pipeline.stages._ambient import AS_IT_IS, ASIDE, OWN, networks_of_common_part, on_board
+from pipeline.stages._experiment import write_answer
+from pipeline.stages._networks import networks_without
+from pipeline.stages._run import run
+from pipeline.stages._simulated import read_synthesis
+from pipeline.stages._train import read_scenery
+
+
+def ambient(scene: str, settings: Path, folds: Path, indentations: Path, models: Path, answer: Path) -> None:
+    """Test every held-out board in fields that came up after its no-load readings; train one arm on the last board."""
+    at, (of, seed) = read_scenery(scene, settings, indentations, folds), read_synthesis(settings)
+    asked, training = at.asked.ambient, at.asked.train_multi
+    assert asked is not None
+    assert training is not None
+    held_out = at.of("lobo")
+    boards = [fold.name for fold in held_out]
+    points: list[dict[str, Any]] = []
+    for fold in held_out:
+        own = take_board(of, fold.name, seed=seed)
+        networks = {arm: networks_without(models, fold.name) for arm in (AS_IT_IS, ASIDE)}
+        if fold is held_out[-1]:
+            networks[OWN] = networks_of_common_part(at, fold, training, own)
+        points += on_board(at, fold, asked, of=of, own=own, networks=networks)
+    last = boards[-1:]
+    numbers = {
+        "arms": {
+            AS_IT_IS: "the paper's network",
+            ASIDE: f"a chip {REFERENCE_ASIDE_MM:g} mm aside reads the ambient field, and its mean reading is taken off",
+            OWN: "the uniform field that fits a board's own chips best is taken off, in training as in use",
+        },
+        "boards_n": len(boards),
+        "directions": "a random one for each poke",
+        "earth_uT": EARTH_SIZE_T / micro,
+        "earth_dip_deg": EARTH_DIP_DEG,
+        "iron_radius_mm": asked.iron.radius_mm,
+        "uniform": over_boards(points, "field_uT", boards),
+        "iron": over_boards(points, "distance_mm", boards),
+        "last_board": {
+            "board": boards[-1],
+            "uniform": over_boards(points, "field_uT", last),
+            "iron": over_boards(points, "distance_mm", last),
+        },
+    }
+    write_answer(answer, numbers, {})
+
+
+if __name__ == "__main__":
+    run(ambient)
