@@ -1,0 +1,49 @@
+"""What the report says of two contacts: every distance and detector, the false alarms, and the source of each row."""
+
+from pipeline.reporting.experiments.contacts import figures, tables
+from tests.reporting.test_work_precision import said
+
+
+def stat(mean):
+    return {"mean": mean, "sd": mean / 10, "n": 3}
+
+
+def row(separation_mm, **more):
+    told = {name: stat(10.0 * separation_mm + i) for i, name in enumerate(("direction", "residual"))}
+    falls = {"near_either_pct": stat(42.0), "nearest_mm": stat(1.5)} | more
+    return {"separation_mm": separation_mm, "detected_pct": told, "auc": {"direction": stat(0.5)}} | falls
+
+
+NUMBERS = {
+    "by_separation": [row(4.0, along=stat(0.75), force_over_sum=stat(0.9), force_over_larger=stat(1.3)), row(8.0)],
+    "same_place": row(0.0),
+    "false_alarm_pct": {
+        "direction": {"asked": 5.0, "realised": stat(3.0)}, "residual": {"asked": 5.0, "realised": stat(17.0)},
+    },
+}  # fmt: skip
+SUPERPOSED = [{"depth_mm": 1.2, "separation_mm": 4.0, "pairs_n": 6, "error_pct": 13.2, "orders_differ_pct": 7.3}]
+DRAWN = {"along": {"4": [0.5, 0.6, 1.1], "8": [0.2, 0.9, 0.7]}}
+
+
+def test_a_row_a_distance_and_one_of_single_contacts_all_with_their_source():
+    table = tables(NUMBERS, "recorded")["contacts"]
+    assert table["distance of the two, mm"].tolist() == ["0", "4", "8", "single contacts"]
+    assert set(table["source"]) == {"recorded"}
+    assert table["along the line (0 weaker, 1 stronger)"].tolist() == ["–", "0.75 ± 0.07", "–", "–"]
+    assert table["detected by residual, %"].tolist()[-1] == "17.0 ± 1.7"
+    assert "noise is that of two readings" in table.attrs["meaning"]
+    assert "5 % false alarms" in table.attrs["meaning"]
+
+
+def test_how_far_fields_add_is_told_of_simulated_scenes_alone():
+    assert set(tables(NUMBERS, "recorded")) == {"contacts"}
+    table = tables(NUMBERS | {"superposition": SUPERPOSED}, "simulated")["superposition"]
+    assert table["error of the sum, % of the change of field"].tolist() == ["13.2"]
+
+
+def test_the_figure_names_detectors_units_and_source_and_is_the_same_twice():
+    drawn = figures(NUMBERS, DRAWN, "recorded")
+    words = said(drawn["contacts.svg"])
+    for word in ("direction", "residual", "stronger contact", "distance of the two / mm", "%", "(recorded)"):
+        assert word in words
+    assert figures(NUMBERS, DRAWN, "recorded") == drawn
