@@ -1,0 +1,64 @@
+"""The paper's table 1 from its data file, our measured column beside it. In: YAML, measured words. Out: one table.
+
+The paper's cells are never overwritten. Refuses to know where measured words come from.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated
+
+import pandas as pd
+from pydantic import Field, model_validator
+
+from pipeline.errors import ParamsError, complain
+from pipeline.strict import Strict, parse, read_yaml
+
+PRINTED = Path(__file__).with_name("table1.yaml")
+LOCALISATION = "Localisation (within 1 mm, new skin)"  # our row: the paper's table has none
+OURS = "ours, measured"
+NOT_GIVEN = "–"
+
+
+class Column(Strict):
+    """One sensor of the table, and what the paper cites for it."""
+
+    source: Annotated[str, Field(min_length=1)]
+
+
+class Table1(Strict):
+    """The table as printed: a cell of each row for each column."""
+
+    columns: Annotated[dict[str, Column], Field(min_length=1)]
+    rows: Annotated[dict[str, tuple[str, ...]], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _rows_fill_the_columns(self) -> "Table1":
+        for name, cells in self.rows.items():
+            if len(cells) != len(self.columns):
+                raise ValueError(f"row {name!r} has {len(self.columns)} cells, one a column, not {len(cells)}")
+        if OURS in self.columns or LOCALISATION in self.rows:
+            raise ValueError(f"{OURS!r} and {LOCALISATION!r} are ours: the paper's table has neither")
+        return self
+
+
+def read_table1(path: Path = PRINTED) -> Table1:
+    """Read and check the data file."""
+    return parse(Table1, read_yaml(path), str(path))
+
+
+def table1(data: Table1, measured: Mapping[str, str]) -> pd.DataFrame:
+    """Put what we measured, by row, beside the paper's columns; rows we measured nothing of have a dash."""
+    rows = data.rows | {LOCALISATION: (NOT_GIVEN,) * len(data.columns)}
+    if unknown := sorted(measured.keys() - rows.keys()):
+        raise ParamsError(
+            complain("table 1", "measured rows", f"among {sorted(rows)}", unknown, "Name them as the table does.")
+        )
+    table = pd.DataFrame(
+        {"": name, **dict(zip(data.columns, cells, strict=True)), OURS: measured.get(name, NOT_GIVEN)}
+        for name, cells in rows.items()
+    )
+    sources = " ".join(f"{name}: {column.source}" for name, column in data.columns.items())
+    table.attrs["meaning"] = (
+        f"As printed in the paper (table 1); ? is its own. The last row and column are ours. {sources}"
+    )
+    return table
