@@ -17,11 +17,12 @@ HEADER_FILE = "header.json"
 STREAM_FILE = "stream.bin"
 ARRIVALS_FILE = "arrivals.csv"
 PROBE_FILE = "probe.csv"
+LOG_FILE = "log.csv"
 
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$"
 
 Name = Annotated[str, Field(pattern=NAME)]
-Layout = Literal["native", "lab", "ini", "eflesh"]
+Layout = Literal["native", "lab", "ini", "eflesh", "sd-card"]
 Wire = Literal["binary", "binary-clock", "text-xyzt", "text-txyz"]
 
 

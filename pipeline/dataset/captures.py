@@ -52,6 +52,9 @@ def open_capture(folder: Path) -> Opened:
             )
     if header.layout == "native":
         return Opened(header, *read_native(folder, header))
+    if header.layout not in READERS:
+        remedy = "An SD card's log has no labels to learn from; try: reskin predict."
+        raise CaptureError(complain(folder, "layout", f"native or one of {sorted(READERS)}", header.layout, remedy))
     readings, account = READERS[header.layout].read(folder, header)
     return Opened(header, [readings], account)
 

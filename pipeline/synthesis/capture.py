@@ -16,13 +16,15 @@ from pipeline.physics.board import BoardDesign, Spreads, draw_board
 from pipeline.physics.force_sensor import read_force
 from pipeline.physics.nodes import Rule
 from pipeline.physics.sensor import ChipDesign
-from pipeline.physics.skin import SkinDesign, draw_skin
+from pipeline.physics.skin import Skin, SkinDesign, draw_skin
 from pipeline.seeds import rng_for
 from pipeline.strict import Strict
 from pipeline.synthesis.felt import Felt, Terms, feel
 from pipeline.synthesis.frames import read_frames, switch_on
-from pipeline.synthesis.protocols import SKIN_MM, Grid, Hand, Protocol, make_plan
-from pipeline.synthesis.rig import Rig, chunks, draw_clock, misplace, paced, probe_log, timeline
+from pipeline.synthesis.plans import Plan
+from pipeline.synthesis.pressing import depths_under
+from pipeline.synthesis.protocols import SKIN_MM, Grid, Hand, Protocol, Walk, make_plan
+from pipeline.synthesis.rig import Rig, chunks, draw_clock, misplace, probe_log, suit, timeline
 
 MAIN = "grid"  # its captures bear the names of their skins alone
 # What is drawn for a capture, each by a name of its own: a term more leaves all other draws as they are.
@@ -116,6 +118,7 @@ class SyntheticCapture:
     marks: tuple[tuple[float, float], ...]  # (stream_s, probe_s) of the same event
     words: str  # the protocol
     overruns: dict[str, int]  # what went past a range, counted
+    card_rate_hz: float | None  # of frames that went to an SD card; None: they came through a port
 
 
 def roster(parameters: Synthesis, protocol: str) -> list[tuple[str, str]]:
@@ -130,7 +133,7 @@ def roster(parameters: Synthesis, protocol: str) -> list[tuple[str, str]]:
 def record(parameters: Synthesis, protocol: str, *, board: str, skin: str, seed: int) -> SyntheticCapture:
     """Draw the board and the skin of these names, take the skin through the protocol, and record it."""
     asked = parameters.protocols[protocol]
-    rig = paced(parameters.rig, asked.rate_hz)
+    rig = suit(parameters.rig, asked)
     terms = parameters.terms.only(asked.terms)
     rngs = {part: rng_for(seed, "recording", protocol, board, skin, part) for part in PARTS}
     kind = parameters.boards[asked.boards]
@@ -138,7 +141,7 @@ def record(parameters: Synthesis, protocol: str, *, board: str, skin: str, seed:
     rule = kind.quadrature.quadrature()
     own_skin = draw_skin(parameters.skin, parameters.spreads, seed=seed, name=skin, rule=rule, sides_m=kind.skin_m)
     plan = make_plan(asked, rngs["plan"], skin_mm=kind.skin_mm)
-    tip_m = (misplace(plan, rig, rngs["robot"]) - (*plan.centre_mm, 0)) * milli
+    tip_m = _put_tip(plan, rig, own_skin, rngs["robot"])
     felt = feel(own_board, own_skin, tip_m, tilt=plan.tilt, terms=terms, rng=rngs["drift"])
     reader = switch_on(
         own_board, parameters.chip, rate_hz=rig.rate_hz, temperature=terms.temperature, rng=rngs["chips"]
@@ -167,7 +170,16 @@ def record(parameters: Synthesis, protocol: str, *, board: str, skin: str, seed:
             "force past the sensor": past_range_n,
             "stops past 0.6 of the thickness": felt.beyond_verified_n,
         },
+        card_rate_hz=rig.rate_hz if isinstance(asked, Walk) else None,
     )
+
+
+def _put_tip(plan: Plan, rig: Rig, skin: Skin, rng: np.random.Generator) -> Float64[np.ndarray, "n p 3"]:
+    """Give where the tip is in the board's frame, in m; a weight sinks as deep as the skin lets it."""
+    tip_m = (misplace(plan, rig, rng) - (*plan.centre_mm, 0)) * milli
+    if plan.weight_N is not None:
+        tip_m[:, :, 2] = depths_under(skin, plan.weight_N)
+    return tip_m
 
 
 def _feel_force(felt: Felt, rig: Rig, rng: np.random.Generator) -> tuple[Float32[np.ndarray, "n d 3"], int]:

@@ -10,7 +10,8 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from pipeline.dataset.grid import CENTRE_MM, PITCH_MM, SIDE_POINTS_N, protocol
-from pipeline.synthesis.plans import Count, Depth_mm, Plan, Shared
+from pipeline.synthesis import pressing
+from pipeline.synthesis.plans import Count, Depth_mm, Duration_s, Plan, Rate_hz, Shared
 from pipeline.synthesis.scattering import Scatter, scatter
 
 
@@ -48,14 +49,62 @@ class Hand(Shared):
         return self
 
 
+class _Pressed(Shared):
+    # Ageing and relaxation would change the force between stops, which no model here follows; nothing goes sideways.
+    terms: tuple[Literal["temperature"], ...]
+
+    @model_validator(mode="after")
+    def _ranges_rise(self) -> "_Pressed":
+        for name, value in self:
+            if isinstance(value, tuple) and len(value) == 2 and value[0] > value[1]:
+                raise ValueError(f"{name} goes from the lower to the higher, not {value}")
+        return self
+
+
+class Load(_Pressed):
+    """A glass that is filled step by step at the skin's middle (section 6); its foot taken as the rig's round tip."""
+
+    kind: Literal["load"]
+    passes_n: Count  # fillings
+    force_max_N: Annotated[float, Field(gt=0, le=100)]
+    step_N: Annotated[float, Field(gt=0, le=100)]
+
+    @model_validator(mode="after")
+    def _steps_fill_it(self) -> "Load":
+        steps = self.force_max_N / self.step_N
+        if round(steps) < 1 or abs(steps - round(steps)) > 1e-6:
+            raise ValueError(f"force_max_N is a whole number of step_N, not {steps:.4g}")
+        return self
+
+
+class Press(_Pressed):
+    """Presses that never rest: each frame is a stop (section 7, dynamic data), so the frames' rate belongs to it."""
+
+    kind: Literal["press"]
+    presses_n: Count
+    duration_s: tuple[Duration_s, Duration_s]  # from, to: evenly in the logarithm
+    depth_mm: tuple[Depth_mm, Depth_mm]
+    rate_hz: Rate_hz
+
+
+class Walk(_Pressed):
+    """Steps of a shoe or touches of a glove, in one log without labels (section 6: dog shoe, glove)."""
+
+    kind: Literal["walk"]
+    steps_n: Count
+    stance_s: tuple[Duration_s, Duration_s]
+    swing_s: tuple[Duration_s, Duration_s]
+    quiet_s: Duration_s  # before the first step
+    depth_mm: tuple[Depth_mm, Depth_mm]
+    rate_hz: Rate_hz
+
+
 SKIN_MM = (20.0, 20.0)  # authors' CAD
-Protocol = Annotated[Grid | Drag | Hand | Scatter, Field(discriminator="kind")]
+Protocol = Annotated[Grid | Drag | Hand | Scatter | Load | Press | Walk, Field(discriminator="kind")]
 
 
-def make_plan(
-    asked: Grid | Drag | Hand | Scatter, rng: np.random.Generator, *, skin_mm: tuple[float, float] = SKIN_MM
-) -> Plan:
-    """Lay out the stops of a protocol on a skin of these sides; a hand's and scattered ones are random."""
+def make_plan(asked: Protocol, rng: np.random.Generator, *, skin_mm: tuple[float, float] = SKIN_MM) -> Plan:
+    """Lay out the stops of a protocol on a skin of these sides; grid, drag and load are not random."""
     match asked:
         case Grid():
             return _grid(asked)
@@ -65,6 +114,12 @@ def make_plan(
             return _hand(asked, rng)
         case Scatter():
             return scatter(asked, skin_mm, rng)
+        case Load():
+            return _load(asked)
+        case Press():
+            return _press(asked, rng)
+        case Walk():
+            return _walk(asked, rng)
 
 
 def _grid(asked: Grid) -> Plan:
@@ -118,3 +173,40 @@ def _hand(asked: Hand, rng: np.random.Generator) -> Plan:
         labelled=False,
         words=f"by hand, {asked.lines_n} lines of {asked.pokes_per_line_n} pokes, order known only",
     )
+
+
+def _load(asked: Load) -> Plan:
+    weight_N = np.tile(pressing.weights_N(asked.force_max_N, asked.step_N), (asked.passes_n, 1))
+    middle_mm = np.full(weight_N.shape, CENTRE_MM)
+    return Plan(
+        pass_i=np.arange(asked.passes_n, dtype=np.int32),
+        x_mm=middle_mm,
+        y_mm=middle_mm,
+        depth_mm=np.full(weight_N.shape, np.nan),
+        tilt=np.zeros((asked.passes_n, 2)),
+        labelled=True,
+        words=f"{asked.passes_n} fillings of a glass, to {asked.force_max_N:g} N by {asked.step_N:g} N",
+        weight_N=weight_N,
+    )
+
+
+def _press(asked: Press, rng: np.random.Generator) -> Plan:
+    stops = pressing.presses(
+        asked.presses_n, duration_s=asked.duration_s, depth_mm=asked.depth_mm, rate_hz=asked.rate_hz, rng=rng
+    )
+    least_s, most_s = asked.duration_s
+    return _of_stops(stops, f"{asked.presses_n} presses of {least_s:g} to {most_s:g} s, read throughout")
+
+
+def _walk(asked: Walk, rng: np.random.Generator) -> Plan:
+    stops = pressing.footfalls(
+        asked.steps_n, stance_s=asked.stance_s, swing_s=asked.swing_s, depth_mm=asked.depth_mm, rate_hz=asked.rate_hz,
+        rng=rng,
+    )  # fmt: skip
+    return _of_stops(stops, f"a walk of {asked.steps_n} steps")
+
+
+def _of_stops(stops: pressing.Stops, words: str) -> Plan:
+    n = len(stops.depth_mm)
+    passes = np.zeros(n, np.int32)
+    return Plan(passes, stops.x_mm, stops.y_mm, stops.depth_mm, np.zeros((n, 2)), labelled=True, words=words)

@@ -15,6 +15,7 @@ from pydantic import Field
 from pipeline.capture.probe import ProbeLog
 from pipeline.strict import Strict
 from pipeline.synthesis.plans import Plan
+from pipeline.synthesis.protocols import Press, Protocol, Walk
 
 Frames = Annotated[int, Field(ge=1, le=1000)]
 Spread = Annotated[float, Field(ge=0, le=1)]
@@ -37,11 +38,6 @@ class Rig(Strict):
     probe_clock_rate_error: Annotated[float, Field(ge=0, le=0.01)]  # sd
 
 
-def paced(rig: Rig, rate_hz: float | None) -> Rig:
-    """Give the rig at a protocol's own rate, if it has one."""
-    return rig if rate_hz is None else rig.model_copy(update={"rate_hz": rate_hz})
-
-
 @dataclass(frozen=True)
 class Timeline:
     """The frames of one indentation, axis t: the stop that each sees, and what share of its change of field."""
@@ -53,6 +49,23 @@ class Timeline:
 
     def __len__(self) -> int:
         return len(self.stop_i)
+
+
+def suit(rig: Rig, asked: Protocol) -> Rig:
+    """Set the rig up for a protocol: its rate; a stop a frame where nothing rests; no robot, one clock in a walk."""
+    changes: dict[str, float] = {} if asked.rate_hz is None else {"rate_hz": asked.rate_hz}
+    if isinstance(asked, Press | Walk):
+        changes |= {"moving_frames_n": 0, "settling_frames_n": 0, "readings_n": 1}
+    if isinstance(asked, Walk):
+        exact = (
+            "robot_place_sd_mm",
+            "robot_depth_sd_mm",
+            "force_noise_N",
+            "probe_clock_offset_s",
+            "probe_clock_rate_error",
+        )
+        changes |= {"noload_frames_n": max(round(asked.quiet_s * asked.rate_hz), 1)} | dict.fromkeys(exact, 0.0)
+    return rig.model_copy(update=changes)
 
 
 def timeline(rig: Rig, stops_n: int) -> Timeline:
@@ -99,7 +112,7 @@ def draw_clock(rig: Rig, rng: np.random.Generator) -> tuple[float, float]:
 def probe_log(plan: Plan, felt_N: Float[np.ndarray, "n d 3"], rig: Rig, clock: tuple[float, float]) -> ProbeLog:
     """Write what robot and force sensor log: for each indentation its no-load dwell, then its stops (d = 1 + p).
 
-    A dwell runs from half a frame before its first frame to half a frame after its last.
+    A dwell runs from half a frame before its first frame to half a frame after its last. Above the skin there is none.
     """
     stops_n = plan.x_mm.shape[1]
     frames = timeline(rig, stops_n)
@@ -113,7 +126,7 @@ def probe_log(plan: Plan, felt_N: Float[np.ndarray, "n d 3"], rig: Rig, clock: t
     places_mm = (np.hstack([one[:, :1], one]) + unknown for one in (plan.x_mm, plan.y_mm))
     force_N = (felt_N + unknown).reshape(-1, 3)
     labels = [one.astype(np.float32).ravel() for one in (*places_mm, depth_mm, *force_N.T)]
-    return ProbeLog(
+    dwells = (
         np.repeat(np.arange(len(plan), dtype=np.int32), 1 + stops_n),
         np.repeat(plan.pass_i, 1 + stops_n),
         contact,
@@ -121,3 +134,5 @@ def probe_log(plan: Plan, felt_N: Float[np.ndarray, "n d 3"], rig: Rig, clock: t
         offset_s + rate * (start_i + long_n + 0.5).ravel() / rig.rate_hz,
         *labels,
     )
+    logged = np.hstack([np.ones((len(plan), 1), bool), ~(plan.depth_mm < 0)]).ravel()
+    return ProbeLog(*(one[logged] for one in dwells))

@@ -1,0 +1,131 @@
+"""The log that a board writes to an SD card (section 6: dog shoe, glove). In: a CSV. Out: timed readings, an account.
+
+One line a frame: seconds of the board's clock, then T, Bx, By, Bz of each chip in degC and uT, as the text firmware
+prints them. Refuses to know contacts, places and forces: the log does not either.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+from jaxtyping import Bool, Float, Float32, Float64
+
+from pipeline.capture import columns, faults
+from pipeline.capture.readers.chips import GRID_ROWS_N
+from pipeline.errors import CaptureError, complain
+
+TIME = "t_s"
+CHIP_COLUMNS = ("T", "Bx", "By", "Bz")
+FIRST_ROW = 2  # row 1 is the header
+HEADER_LETTERS_MAX = 10_000  # a line of 64 chips has 1,500
+GAP_FRAMES = 1.5  # times the usual step of time; in between, a frame or more is missing
+
+
+def column_names(chips_n: int) -> list[str]:
+    """Name the columns of a log."""
+    return [TIME, *(f"{name}{chip_i}" for chip_i in range(chips_n) for name in CHIP_COLUMNS)]
+
+
+def render(
+    t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"], temperature_degC: Float32[np.ndarray, "f k"]
+) -> str:
+    """Write a log: times to 0.1 ms, readings with the two decimals of the text firmware."""
+    frames_n, chips_n = temperature_degC.shape
+    chips = np.concatenate([temperature_degC[:, :, None], b_uT.reshape(frames_n, chips_n, 3)], axis=2)
+    line = ",".join(["%.4f", *["%.2f"] * (4 * chips_n)])
+    rows = np.column_stack([t_s, chips.reshape(frames_n, -1)]).tolist()
+    return "\n".join([",".join(column_names(chips_n)), *(line % tuple(row) for row in rows)]) + "\n"
+
+
+def read_log(
+    path: Path,
+) -> tuple[Float64[np.ndarray, " f"], Float32[np.ndarray, "f ch"], Float32[np.ndarray, "f k"], dict[str, int]]:
+    """Read time in s, field in uT and temperature in degC of the frames in which every chip was read, and an account.
+
+    Failed reads and stuck chips cost a frame and are counted; a chip that lost its settings costs the log. `gaps_n`
+    counts the places where time goes on by more than the usual step, `gap_frames_n` the frames that fit in there.
+    """
+    where = str(path)
+    chips_n = _chips_n(path, where)
+    table = columns.parse(path, dict.fromkeys(column_names(chips_n), pa.float64()), where)
+    if not len(table):
+        raise CaptureError(complain(where, "the log", "one line a frame", "no lines", "Copy the log again."))
+    numbers = np.column_stack([_finite(table, name, where) for name in table.column_names])
+    t_s, chips = numbers[:, 0], numbers[:, 1:].reshape(len(numbers), chips_n, 4)
+    _check_time(t_s, where)
+    b_uT = chips[:, :, 1:].reshape(len(chips), -1).astype(np.float32)
+    temperature_degC = chips[:, :, 0].astype(np.float32)
+    failed, stuck = _faults(b_uT, temperature_degC, where)
+    whole = ~failed & ~stuck
+    account = _gaps(t_s) | {
+        "rows_read_n": len(t_s),
+        "dropped_failed_read_rows_n": int(failed.sum()),
+        "dropped_stuck_chip_rows_n": int(stuck.sum()),
+        "rows_n": int(whole.sum()),
+    }
+    return t_s[whole], b_uT[whole], temperature_degC[whole], account
+
+
+def _chips_n(path: Path, where: str) -> int:
+    """Count the chips that the header line names; a last line without an end was cut."""
+    try:
+        with path.open("rb") as file:
+            first = file.readline(HEADER_LETTERS_MAX)
+            file.seek(-1, 2)
+            last = file.read(1)
+    except OSError as error:
+        got = "an empty file" if path.is_file() and not path.stat().st_size else error.strerror
+        raise CaptureError(complain(where, "the log", "a readable file", got, "Check the name.")) from None
+    names = first.decode("ascii", errors="replace").strip().split(",")
+    chips_n = (len(names) - 1) // len(CHIP_COLUMNS)
+    if chips_n < 1 or names != column_names(chips_n):
+        rule, got = f"{','.join(column_names(1))}, then T1 and so on", repr(",".join(names)[:60])
+        raise CaptureError(complain(where, "row 1, the column names,", rule, got, "Write this line on top."))
+    if last != b"\n":
+        rule, remedy = "complete and end in a line feed", "Remove it, if the board was switched off there."
+        raise CaptureError(complain(where, "the last line", rule, "a line that was cut", remedy))
+    return chips_n
+
+
+def _finite(table: pa.Table, name: str, where: str) -> Float64[np.ndarray, " f"]:
+    values = np.asarray(table.column(name), np.float64)  # an empty cell is NaN
+    bad = ~np.isfinite(values)
+    if bad.any():
+        row = int(bad.argmax()) + FIRST_ROW
+        remedy = "Remove that line; the gap is counted."
+        raise CaptureError(complain(f"{where} row {row}", name, "a finite number", values[row - FIRST_ROW], remedy))
+    return values
+
+
+def _check_time(t_s: Float64[np.ndarray, " f"], where: str) -> None:
+    if len(t_s) < 2:
+        raise CaptureError(complain(where, "the log", "two lines or more", len(t_s), "Copy the log again."))
+    back = np.diff(t_s) <= 0
+    if back.any():
+        row = int(back.argmax()) + FIRST_ROW + 1
+        got = f"{t_s[row - FIRST_ROW]:.4f} after {t_s[row - FIRST_ROW - 1]:.4f}"
+        remedy = "Was the board reset? Cut the log there."
+        raise CaptureError(complain(f"{where} row {row}", TIME, "later than the line above", got, remedy))
+
+
+def _faults(
+    b_uT: Float32[np.ndarray, "f ch"], temperature_degC: Float32[np.ndarray, "f k"], where: str
+) -> tuple[Bool[np.ndarray, " f"], Bool[np.ndarray, " f"]]:
+    failed = np.asarray(faults.failed_reads(b_uT, temperature_degC).any(axis=1))
+    if failed.all():
+        remedy = "Mend the wiring, and log again."
+        raise CaptureError(complain(where, "lines", "read from every chip", "failed I2C reads in all of them", remedy))
+    read = np.flatnonzero(~failed)
+    for block in np.array_split(read, max(1, len(read) // GRID_ROWS_N)):
+        odd = np.flatnonzero(faults.reset_chips(b_uT[block], None))
+        if len(odd):
+            what = f"the step of chip {', '.join(map(str, odd))} from row {block[0] + FIRST_ROW} on"
+            rule, remedy = "that of the other chips", "It lost its settings: reset the board, log again."
+            raise CaptureError(complain(where, what, rule, "another", remedy))
+    return failed, np.asarray(faults.stuck_chips(b_uT).any(axis=1)) & ~failed
+
+
+def _gaps(t_s: Float[np.ndarray, " f"]) -> dict[str, int]:
+    steps = np.diff(t_s) / np.median(np.diff(t_s))
+    wide = steps > GAP_FRAMES
+    return {"gaps_n": int(wide.sum()), "gap_frames_n": int((np.round(steps[wide]) - 1).sum())}
