@@ -1,0 +1,80 @@
+"""The glass that is filled: numbers -> one table and one figure. Sees no readings and no path."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import pandas as pd
+
+from pipeline.reporting import paper
+from pipeline.reporting.figures import STYLE, svg
+from pipeline.reporting.work_precision import COLOURS
+
+MEANING = (
+    "A weight at the skin's middle goes up step by step; the glass's flat foot is taken as the rig's round tip. Two "
+    "weights are told apart where at least 95 % of the pairs of readings within a filling, in fillings that fitted "
+    "nothing, are in the order of the weights, and so are those of all larger differences. The response is the change "
+    "of field along its mean direction in the other half of the fillings."
+)
+READINGS = {"one_reading": "one reading", "five_readings": "mean of a stop's readings"}
+TOLD_PCT = 95.0
+
+
+def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
+    """Show the smallest step told apart, in newtons and in water, and whether the response is monotonic."""
+    rows = []
+    for name, words in READINGS.items():
+        rows += [
+            (f"smallest step told apart, {words}, N", _show(numbers["smallest_step_N"], name, numbers), "< 0.2"),
+            (f"smallest step told apart, {words}, mL of water", _show_mL(numbers["smallest_step_mL"], name), "< 20"),
+            (f"the same by |dB| alone, {words}, N", _show(numbers["by_length_N"], name, numbers), "–"),
+        ]
+    rise, steps_n = numbers["monotonic"], numbers["levels_n"] - 1
+    held = "yes" if rise["holds"] else "no"
+    found = f"{held}: {steps_n - rise['falls_n']} of {steps_n} steps, rank correlation {rise['spearman']:.4f}"
+    rows += [
+        ("mean response rises at every step", found, paper.MONOTONIC),
+        ("gain, straight line, µT/N", f"{numbers['gain_uT_per_N']:.3g}", "–"),
+        ("noise of one reading along the response, µT", f"{numbers['noise_uT']:.2g}", "–"),
+    ]
+    table = pd.DataFrame(
+        [{"what": what, "ours": ours, "paper": theirs, "source": source} for what, ours, theirs in rows]
+    )
+    table.attrs["meaning"] = MEANING
+    return {"sensitivity": table}
+
+
+def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
+    """Draw the response against weight, and how sure a difference is told."""
+    from matplotlib.figure import Figure
+
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(7.6, 3.6), layout="constrained")
+        left, right = figure.subplots(1, 2)
+        weight_N, response_uT, sd_uT = (np.array(drawn[name]) for name in ("weight_N", "response_uT", "sd_uT"))
+        left.fill_between(weight_N, response_uT - sd_uT, response_uT + sd_uT, color=COLOURS[6], linewidth=0)
+        left.plot(weight_N, response_uT, color=COLOURS[1])
+        left.set(xlabel="weight / N", ylabel="response / µT (mean, sd of a reading)")
+        difference_N = numbers["step_N"] * np.arange(1, len(weight_N))
+        for colour, (name, words) in zip(COLOURS[1:], READINGS.items(), strict=False):
+            share_pct = 100 * np.array(drawn["told"][name])
+            right.plot(difference_N, share_pct, "o-", color=colour, markersize=3, linewidth=1.2, label=words)
+        right.axhline(TOLD_PCT, color="0.3", linestyle="--", linewidth=1, label=f"{TOLD_PCT:g} %")
+        right.axvline(paper.SENSITIVITY_N, color="0.6", linestyle=":", linewidth=1.2, label="paper: less than this")
+        right.set(xscale="log", xlabel="difference of weight / N", ylabel="pairs in the right order / %")
+        right.set_ylim(48, 102)  # half is chance
+        right.legend(frameon=True, framealpha=1, edgecolor="none", fontsize=9, loc="lower right")
+        figure.suptitle(f"A glass is filled on the skin ({source})", x=0.01, ha="left", fontsize=11)
+        return {"sensitivity.svg": svg(figure)}
+
+
+def _show(steps_N: Mapping[str, float], name: str, numbers: Mapping[str, Any]) -> str:
+    if name not in steps_N:
+        return f"none up to {numbers['range_N']:g}"
+    least = "at most " if steps_N[name] <= numbers["step_N"] else ""
+    return f"{least}{steps_N[name]:.3g}"
+
+
+def _show_mL(steps_mL: Mapping[str, float], name: str) -> str:
+    return f"{steps_mL[name]:.2g}" if name in steps_mL else "none"

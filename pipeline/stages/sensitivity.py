@@ -1,0 +1,29 @@
+"""Stage sensitivity: a glass that is filled on a skin -> the smallest weight told apart (section 6)."""
+
+from pathlib import Path
+
+from pipeline.dataset.baseline import subtract
+from pipeline.evaluation.sensitivity import answer_of, levels_of
+from pipeline.stages._experiment import read_folder, write_answer
+from pipeline.stages._run import run, say
+from pipeline.stages._simulated import read_synthesis
+from pipeline.synthesis.pressing import weights_N
+from pipeline.synthesis.protocols import Load
+
+
+def sensitivity(scene: str, settings: Path, indentations: Path, answer: Path) -> None:
+    """Take the first skin that was loaded: all are filled alike."""
+    synthesis, _ = read_synthesis(settings)
+    asked = synthesis.protocols["glass"]
+    assert isinstance(asked, Load), "the plan names it"
+    one = read_folder(indentations)[0]
+    weight_N = weights_N(asked.force_max_N, asked.step_N)
+    change_uT = subtract(one.b_uT, one.noload_uT)
+    levels_uT = levels_of(change_uT, one.indentation, one.Fz_N, levels_n=len(weight_N), where=one.capture)
+    numbers, drawn = answer_of(levels_uT, weight_N)
+    write_answer(answer, numbers, drawn)
+    say(f"{scene}: weights {numbers['smallest_step_N']} N apart are told, in {numbers['fillings_n']} fillings")
+
+
+if __name__ == "__main__":
+    run(sensitivity)
