@@ -17,6 +17,8 @@ HOMES = {
         "pipeline/reporting/experiments/variation.py",
         "pipeline/reporting/work_precision.py", "pipeline/reporting/experiments/ambient.py",
         "pipeline/reporting/experiments/contacts.py",
+        "pipeline/reporting/work_precision.py", "pipeline/reporting/experiments/dynamics.py",
+        "pipeline/reporting/experiments/logs.py", "pipeline/reporting/experiments/sensitivity.py",
     },
     r"\bimport argparse|from argparse": {"pipeline/stages/_run.py"},
     r"\bimport typer|from typer": {"pipeline/cli.py"},

@@ -1,0 +1,26 @@
+"""Stage dynamics: presses that never rest -> errors of single readings and of the last five's mean (section 7)."""
+
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.dataset.baseline import subtract
+from pipeline.dataset.rows import TARGETS
+from pipeline.evaluation.dynamics import compare, presses_of
+from pipeline.stages._experiment import read_folder, write_answer
+from pipeline.stages._networks import networks_without
+from pipeline.stages._run import run, say
+
+
+def dynamics(scene: str, settings: Path, indentations: Path, models: Path, answer: Path) -> None:
+    """Ask the networks of train_multi that never saw the pressed skin's board."""
+    one = read_folder(indentations)[0]
+    true = np.stack([getattr(one, name) for name in TARGETS], axis=1)
+    presses = presses_of(subtract(one.b_uT, one.noload_uT), true, one.t_s, one.indentation)
+    numbers = compare(presses, networks_without(models, one.board))
+    write_answer(answer, numbers, {})
+    say(f"{scene}: {numbers['readings_n']} readings of {numbers['presses_n']} presses at {numbers['rate_hz']:.0f} Hz")
+
+
+if __name__ == "__main__":
+    run(dynamics)
