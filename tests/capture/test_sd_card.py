@@ -1,0 +1,103 @@
+"""Logs that were written are read again; each way to break one is told, or counted, with its place."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.capture.faults import FAILED_B_uT, FAILED_TEMPERATURE_degC
+from pipeline.capture.sd_card import column_names, read_log, render
+from pipeline.errors import CaptureError
+from pipeline.seeds import rng_for
+
+
+def made(frames_n=60, chips_n=2):
+    rng = rng_for(0, "card", chips_n)
+    step_uT = np.tile([0.2, 0.2, 0.32], chips_n)
+    b_uT = (np.rint(rng.normal(0, 12, (frames_n, 3 * chips_n))) * step_uT + 500).astype(np.float32)
+    t_s = (1 + np.arange(frames_n)) / 250
+    return t_s, b_uT, rng.normal(25, 0.1, (frames_n, chips_n)).astype(np.float32)
+
+
+@pytest.fixture
+def log(tmp_path):
+    file = tmp_path / "log.csv"
+    file.write_text(render(*made()))
+    return file
+
+
+def lines(file):
+    return file.read_text().splitlines(keepends=True)
+
+
+@given(chips_n=st.integers(1, 8))
+def test_a_log_of_any_number_of_chips_is_read_as_it_was_written(tmp_path_factory, chips_n):
+    t_s, b_uT, temperature_degC = made(chips_n=chips_n)
+    file = tmp_path_factory.mktemp("card") / "log.csv"
+    file.write_text(render(t_s, b_uT, temperature_degC))
+    read_s, read_uT, read_degC, account = read_log(file)
+    np.testing.assert_allclose(read_s, t_s, atol=5.1e-5)  # four decimals
+    np.testing.assert_allclose(read_uT, b_uT, atol=5.1e-3)  # two decimals
+    np.testing.assert_allclose(read_degC, temperature_degC, atol=5.1e-3)
+    assert account["rows_n"] == account["rows_read_n"] == 60
+
+
+def test_the_header_is_that_of_the_text_firmware(log):
+    assert column_names(2) == ["t_s", "T0", "Bx0", "By0", "Bz0", "T1", "Bx1", "By1", "Bz1"]
+    assert lines(log)[0] == "t_s,T0,Bx0,By0,Bz0,T1,Bx1,By1,Bz1\n"
+
+
+@pytest.mark.parametrize(
+    ("breaking", "message"),
+    [
+        (lambda all_: all_[1:], r"log\.csv: row 1, the column names, must be t_s,T0,Bx0,By0,Bz0"),
+        (lambda all_: [all_[0].replace("Bx0,By0", "By0,Bx0"), *all_[1:]], "row 1, the column names"),
+        (lambda all_: [*all_[:-1], all_[-1].rstrip()], "the last line must be complete"),
+        (lambda all_: [*all_[:-1], all_[-1][:20] + "\n"], "the table must be CSV with columns"),
+        (lambda all_: [*all_[:9], all_[9].replace("0.0360", "0.0300"), *all_[10:]], "row 10: t_s must be later"),
+        (lambda all_: [*all_[:9], all_[8], *all_[9:]], "row 10: t_s must be later"),
+        (lambda all_: [*all_[:5], all_[5][: all_[5].rindex(",")] + ",nan\n", *all_[6:]], "row 6: Bz1 must be a finite"),
+        (lambda all_: [*all_[:5], all_[5][: all_[5].rindex(",")] + ",\n", *all_[6:]], "row 6: Bz1 must be a finite"),
+        (lambda all_: [*all_[:5], all_[5].replace(".", "x"), *all_[6:]], "the table must be CSV"),
+        (lambda all_: all_[:1], "the log must be one line a frame; got no lines"),
+        (lambda all_: all_[:2], "the log must be two lines or more"),
+        (lambda _: [], "got an empty file"),
+    ],
+)
+def test_a_broken_log_is_refused_in_one_sentence_that_names_the_place(log, breaking, message):
+    log.write_text("".join(breaking(lines(log))))
+    with pytest.raises(CaptureError, match=message) as refused:
+        read_log(log)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_log_that_is_not_there_is_refused(tmp_path):
+    with pytest.raises(CaptureError, match="No such file"):
+        read_log(tmp_path / "log.csv")
+
+
+def test_missing_frames_are_counted_as_gaps_in_time(log):
+    all_ = lines(log)
+    log.write_text("".join([*all_[:10], *all_[13:30], *all_[31:]]))
+    account = read_log(log)[3]
+    assert (account["gaps_n"], account["gap_frames_n"]) == (2, 4)
+
+
+def test_failed_reads_and_stuck_chips_cost_their_frames_and_are_counted(log):
+    t_s, b_uT, temperature_degC = made()
+    b_uT[3, :3], temperature_degC[3, 0] = FAILED_B_uT, FAILED_TEMPERATURE_degC
+    b_uT[30:, 3:] = b_uT[30, 3:]  # 30 frames of one value: the last 11 are stuck for sure
+    log.write_text(render(t_s, b_uT, temperature_degC))
+    read_s, _, _, account = read_log(log)
+    assert account["dropped_failed_read_rows_n"] == 1
+    assert account["dropped_stuck_chip_rows_n"] == 11
+    assert len(read_s) == account["rows_n"] == 60 - 12
+    assert not np.isclose(read_s, t_s[3]).any()
+
+
+def test_a_chip_that_lost_its_settings_costs_the_log(log):
+    t_s, b_uT, temperature_degC = made(frames_n=400, chips_n=3)
+    b_uT[:, 3:6] = (500 + (b_uT[:, 3:6] - 500) / [0.2, 0.2, 0.32] * [0.98, 0.98, 1.58]).astype(np.float32)
+    log.write_text(render(t_s, b_uT, temperature_degC))
+    with pytest.raises(CaptureError, match=r"the step of chip 1 from row 2 on must be that of the other chips"):
+        read_log(log)
