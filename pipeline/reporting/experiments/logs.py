@@ -1,0 +1,75 @@
+"""An SD card's log: numbers and series -> one table and one figure. Sees no readings, no models and no path."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import pandas as pd
+
+from pipeline.reporting import paper
+from pipeline.reporting.figures import STYLE, svg
+from pipeline.reporting.work_precision import COLOURS
+
+MEANING = (
+    "A log at 250 Hz with nothing but times and readings, as a board writes it to an SD card: a quiet start, then "
+    "footfalls at random places. The quiet start is the no-load reading; contact is a change of field well above its "
+    "noise; places and forces are the mean of networks that never saw the board. Errors are over the readings found in "
+    "contact, against the truth that the simulator keeps."
+)
+
+
+def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
+    """Show what was found in the log, and how well where that is known; the paper shows its logs as videos."""
+    account = numbers["account"]
+    rows = [
+        ("rate, Hz", f"{numbers['rate_hz']:.0f}", f"{paper.LOG_RATE_HZ:.0f}"),
+        ("duration, s", f"{numbers['duration_s']:.1f}", "–"),
+        ("readings", f"{numbers['readings_n']}", "–"),
+        ("readings lost to failed reads and stuck chips", f"{account['rows_read_n'] - account['rows_n']}", "–"),
+        ("frames missing in gaps of time", f"{account['gap_frames_n']}", "–"),
+        ("contacts found", f"{numbers['contacts_n']}", "–"),
+        ("contacts made", _show(numbers, "contacts_true_n"), "–"),
+        ("readings in contact", f"{numbers['contact_readings_n']}", "–"),
+        ("readings in contact that were missed", _show(numbers, "missed_readings_n"), "–"),
+        ("largest force of a missed reading, N", _show(numbers, "missed_force_max_N"), "–"),
+        ("readings without contact taken for one", _show(numbers, "false_readings_n"), "–"),
+        ("largest force found, N", _show(numbers, "force_max_N"), "–"),
+        ("largest force made, N", _show(numbers, "force_true_max_N"), "–"),
+        ("accuracy, %", _show(numbers, "accuracy_pct"), "–"),
+        ("MSE_xy, mm²", _show(numbers, "mse_xy_mm2"), "–"),
+        ("MSE_F, N²", _show(numbers, "mse_f_N2"), "–"),
+    ]
+    table = pd.DataFrame(
+        [{"what": what, "ours": ours, "paper": theirs, "source": source} for what, ours, theirs in rows]
+    )
+    table.attrs["meaning"] = MEANING
+    return {"logs": table}
+
+
+def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
+    """Draw force, x and y over time, in contact only."""
+    from matplotlib.figure import Figure
+
+    t_s = np.array(drawn["t_s"])
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(7.0, 5.0), layout="constrained")
+        panels = figure.subplots(3, 1, sharex=True, height_ratios=(2, 1, 1))
+        for axes, name, label in zip(panels, ("F_N", "x_mm", "y_mm"), ("F / N", "x / mm", "y / mm"), strict=True):
+            for which, colour, width in (("estimated", COLOURS[1], 1.8), ("true", COLOURS[2], 0.9)):
+                if which in drawn:
+                    axes.plot(t_s, np.array(drawn[which][name], float), color=colour, linewidth=width, label=which)
+            axes.set_ylabel(label)
+        panels[0].set_ylim(bottom=0)
+        panels[1].set_ylim(-2, 18)  # the grid is 16 mm wide
+        panels[2].set_ylim(-2, 18)
+        panels[2].set_xlabel("time / s")
+        panels[0].legend(frameon=False, fontsize=9, ncols=2, loc="lower right", bbox_to_anchor=(1, 1))
+        panels[0].set_title(f"A log at {numbers['rate_hz']:.0f} Hz ({source})", loc="left", fontsize=11)
+        return {"logs.svg": svg(figure)}
+
+
+def _show(numbers: Mapping[str, Any], name: str) -> str:
+    if name not in numbers:
+        return "unknown"
+    return f"{numbers[name]}" if isinstance(numbers[name], int) else f"{numbers[name]:.3g}"

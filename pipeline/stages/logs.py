@@ -1,0 +1,34 @@
+"""Stage logs: an SD card's log -> contacts, places and forces over time (section 6, dog shoe and glove)."""
+
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.capture import probe, sd_card
+from pipeline.capture.header import LOG_FILE, PROBE_FILE
+from pipeline.dataset.captures import read_header
+from pipeline.evaluation.logs import describe, estimate, score_contacts, thin, truth_at
+from pipeline.stages._experiment import write_answer
+from pipeline.stages._networks import networks_without
+from pipeline.stages._run import run, say
+
+
+def logs(scene: str, settings: Path, raw: Path, models: Path, answer: Path) -> None:
+    """Read the first walk of a folder with the networks that never saw its board; score it where the truth is kept."""
+    folder = min(child for child in raw.iterdir() if child.is_dir())
+    t_s, b_uT, _, account = sd_card.read_log(folder / LOG_FILE)
+    networks = networks_without(models, read_header(folder).board)
+    found = estimate(t_s, b_uT, networks, where=str(folder / LOG_FILE))
+    numbers, true = describe(found) | {"networks_n": len(networks), "account": account}, None
+    if (folder / PROBE_FILE).is_file():
+        log = probe.parse(folder / PROBE_FILE, str(folder / PROBE_FILE))
+        known = np.stack([log.x_mm, log.y_mm, log.Fz_N], axis=1)
+        known[~log.contact] = np.nan
+        true = truth_at(t_s, log.t_start_s, log.t_end_s, known)
+        numbers |= score_contacts(found, true)
+    write_answer(answer, numbers, thin(found, true))
+    say(f"{scene}: {numbers['contacts_n']} contacts in {numbers['duration_s']:.1f} s of log")
+
+
+if __name__ == "__main__":
+    run(logs)
