@@ -150,6 +150,19 @@ def decode(
 
 
 @app.command()
+def predict(
+    log: Annotated[Path, typer.Argument(help="A log as an SD card holds it: t_s,T0,Bx0,By0,Bz0,T1,...; degC and uT.")],
+    model: Annotated[Path, typer.Option(help="A trained model (.safetensors), its card (.json) beside it.")],
+    out: Annotated[Path, typer.Option(help="The CSV to write: t_s,x_mm,y_mm,F_N,contact.")],
+) -> None:
+    """Turn a board's log into contacts, places and forces; it begins with a second without contact."""
+    from pipeline.predicting import predict as write
+
+    counts = write(log, model, out)
+    typer.echo(f"predicted {out}: " + ", ".join(f"{key} {count:.6g}" for key, count in counts.items()))
+
+
+@app.command()
 def publish() -> None:
     """Write to MLflow what is not there yet, from the models of the scenes that run."""
     from pipeline.stages.publish import read_curves

@@ -4,7 +4,8 @@ from pipeline.reporting.experiments.logs import figures, tables
 
 ACCOUNT = {"rows_read_n": 101, "rows_n": 100, "gap_frames_n": 2, "gaps_n": 1}
 NUMBERS = {
-    "rate_hz": 250.0, "duration_s": 4.0, "readings_n": 100, "contacts_n": 3, "contact_readings_n": 40, "account": ACCOUNT,
+    "rate_hz": 250.0, "duration_s": 4.0, "readings_n": 100, "contacts_n": 3, "contact_readings_n": 40,
+    "account": ACCOUNT,
 }  # fmt: skip
 SERIES = {name: [None, 1.0, 2.0] for name in ("x_mm", "y_mm", "F_N")}
 

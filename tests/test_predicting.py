@@ -1,0 +1,98 @@
+"""From a log and a model to a CSV of places and forces; a network of zeros, whose answer is known; refusals."""
+
+import json
+
+import numpy as np
+import pytest
+
+from pipeline import io
+from pipeline.capture.sd_card import render
+from pipeline.errors import CaptureError, ReskinError
+from pipeline.learning.architecture import draw_weights, paper_layers
+from pipeline.predicting import predict
+from pipeline.seeds import rng_for
+
+RATE_HZ, QUIET_N, TOUCHED_N = 250.0, 400, 100
+ANSWER = np.array([8.0, 4.0, 1.5], np.float32)
+CARD = {
+    "format": "reskin-model/2", "recipe": {"inputs": "raw", "architecture": "paper"},
+    "input": {"channels_n": 15}, "output": {"x_mm": "mm", "y_mm": "mm", "Fz_N": "N"},
+}  # fmt: skip
+
+
+@pytest.fixture
+def model(tmp_path):
+    weights = {name: 0 * value for name, value in draw_weights(paper_layers(15), rng_for(0, "net")).items()}
+    scaler = {"input_shift": np.zeros(15, np.float32), "input_scale": np.ones(15, np.float32)}
+    scaler |= {"target_shift": ANSWER, "target_scale": np.ones(3, np.float32)}
+    io.write_tensors(tmp_path / "model.safetensors", weights | scaler, {})
+    io.write_json(tmp_path / "model.json", CARD)
+    return tmp_path / "model.safetensors"
+
+
+def write_log(folder, chips_n=5):
+    frames_n = QUIET_N + TOUCHED_N
+    touched = np.arange(frames_n) >= QUIET_N
+    noise_uT = 3 * rng_for(0, "log").standard_normal((frames_n, 3 * chips_n))
+    b_uT = (500 + 200 * touched[:, None] + noise_uT).astype(np.float32)
+    (folder / "log.csv").write_text(
+        render((1 + np.arange(frames_n)) / RATE_HZ, b_uT, np.full((frames_n, chips_n), 25, np.float32))
+    )
+    return folder / "log.csv"
+
+
+def test_every_line_is_answered_and_only_contacts_have_places_and_forces(tmp_path, model):
+    counts = predict(write_log(tmp_path), model, tmp_path / "out.csv")
+    names, *rows = [line.split(",") for line in (tmp_path / "out.csv").read_text().splitlines()]
+    assert names == ["t_s", "x_mm", "y_mm", "F_N", "contact"]
+    assert len(rows) == QUIET_N + TOUCHED_N == counts["rows_n"]
+    assert all(row[1:] == ["", "", "", "0"] for row in rows[:QUIET_N])
+    np.testing.assert_array_equal(
+        [[float(cell) for cell in row[1:]] for row in rows[QUIET_N:]], [[*ANSWER, 1]] * TOUCHED_N
+    )
+    np.testing.assert_allclose([float(row[0]) for row in rows], (1 + np.arange(len(rows))) / RATE_HZ)
+
+
+def test_what_does_not_fit_is_refused_and_nothing_is_written(tmp_path, model):
+    log, out = write_log(tmp_path), tmp_path / "out.csv"
+    four = tmp_path / "four"
+    four.mkdir()
+    refusals = [
+        (write_log(four, chips_n=4), model, out, "channels must be the 15 of the model; got 12"),
+        (log, tmp_path / "other.safetensors", out, "the model must be there"),
+        (log, model, log, "the file to write must be another than the log"),
+        (tmp_path / "none.csv", model, out, "the log must be a readable file"),
+    ]
+    before = log.read_text()
+    for *paths, message in refusals:
+        with pytest.raises(ReskinError, match=message):
+            predict(*paths)
+    assert not out.exists()
+    assert log.read_text() == before
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"format": "reskin-model/1"}, "format must be reskin-model/2; got reskin-model/1"),
+        ({"output": {"x_mm": "mm", "y_mm": "mm"}}, "the model's answers must be for x_mm, y_mm, Fz_N"),
+    ],
+)
+def test_a_card_that_says_otherwise_is_refused(tmp_path, model, change, message):
+    model.with_suffix(".json").write_text(json.dumps(CARD | change))
+    with pytest.raises(ReskinError, match=message):
+        predict(write_log(tmp_path), model, tmp_path / "out.csv")
+
+
+def test_a_model_without_its_card_is_refused(tmp_path, model):
+    model.with_suffix(".json").unlink()
+    with pytest.raises(ReskinError, match="the card beside the model must be there"):
+        predict(write_log(tmp_path), model, tmp_path / "out.csv")
+
+
+def test_a_log_that_begins_in_contact_is_refused(tmp_path, model):
+    log = write_log(tmp_path)
+    first, *rows = log.read_text().splitlines(keepends=True)
+    log.write_text("".join([first, *rows[QUIET_N - 50 :]]))
+    with pytest.raises(CaptureError, match="the start without contact must be"):
+        predict(log, model, tmp_path / "out.csv")
