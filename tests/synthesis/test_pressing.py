@@ -5,10 +5,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.errors import ParamsError
+from pipeline.capture.folder import write_capture
+from pipeline.capture.sd_card import read_log
+from pipeline.dataset.captures import open_capture
+from pipeline.errors import CaptureError, ParamsError
 from pipeline.physics.skin import draw_skin, forces
 from pipeline.seeds import rng_for
 from pipeline.synthesis.capture import record
+from pipeline.synthesis.files import to_files
 from pipeline.synthesis.pressing import LIFTED_MM, depths_under, footfalls, half_sine, presses, weights_N
 from pipeline.synthesis.protocols import Press, make_plan
 from tests.synthesis.scene import synthesis, with_protocol
@@ -153,3 +157,29 @@ def test_what_is_pressed_refuses_physics_that_would_change_its_force():
         with_protocol("press", PRESS | {"duration_s": (1.0, 0.05)})
     with pytest.raises(ParamsError, match="whole number of step_N"):
         with_protocol("glass", GLASS | {"step_N": 0.3})
+
+
+def test_a_walk_leaves_the_log_of_an_sd_card_and_its_truth_and_is_no_capture_to_learn_from(tmp_path):
+    capture = capture_of("log", WALK)
+    header = write_capture(tmp_path / capture.name, *to_files(capture, with_protocol("log", WALK)))
+    assert sorted(header.files) == ["log.csv", "probe.csv"]
+    assert (header.layout, header.wire, header.source) == ("sd-card", None, "simulated")
+    t_s, b_uT, temperature_degC, account = read_log(tmp_path / capture.name / "log.csv")
+    np.testing.assert_allclose(t_s, (1 + np.arange(len(capture.b_uT))) / 250)
+    np.testing.assert_allclose(b_uT, capture.b_uT, atol=5.1e-3)  # two decimals
+    np.testing.assert_allclose(temperature_degC, capture.temperature_degC, atol=5.1e-3)
+    assert account["rows_n"] == len(t_s)
+    with pytest.raises(CaptureError, match="layout must be native or one of .*; got sd-card"):
+        open_capture(tmp_path / capture.name)
+
+
+def test_presses_and_fillings_come_through_the_same_door_as_everything(tmp_path):
+    for name, protocol in (("press", PRESS), ("glass", GLASS)):
+        capture = capture_of(name, protocol)
+        write_capture(tmp_path / capture.name, *to_files(capture, with_protocol(name, protocol)))
+        opened = open_capture(tmp_path / capture.name)
+        blocks = list(opened.blocks)
+        logged_N = capture.probe.Fz_N[capture.probe.contact]
+        readings_n = 1 if name == "press" else 3
+        np.testing.assert_array_equal(np.concatenate([one.Fz_N for one in blocks]), np.repeat(logged_N, readings_n))
+        assert opened.account["indentations_n"] == protocol.get("presses_n", protocol.get("passes_n"))
