@@ -80,7 +80,9 @@ def _chips_n(path: Path, where: str) -> int:
     chips_n = (len(names) - 1) // len(CHIP_COLUMNS)
     if chips_n < 1 or names != column_names(chips_n):
         rule, got = f"{','.join(column_names(1))}, then T1 and so on", repr(",".join(names)[:60])
-        raise CaptureError(complain(where, "row 1, the column names,", rule, got, "If it is a board's log, write that line on top."))
+        raise CaptureError(
+            complain(where, "row 1, the column names,", rule, got, "If it is a board's log, write that line on top.")
+        )
     if last != b"\n":
         rule, remedy = "complete and end in a line feed", "Remove it, if the board was switched off there."
         raise CaptureError(complain(where, "the last line", rule, "a line that was cut", remedy))

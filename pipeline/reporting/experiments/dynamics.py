@@ -14,7 +14,8 @@ MEANING = (
     "Half-sine presses at random places of the grid, every frame read. The model is the paper's network, trained on "
     "readings at rest of other boards. Scored are readings with four before them in the press and some force. The mean "
     "of the last five readings is the paper's protocol at rest; in a press the five see different depths. Against the "
-    "force of its middle reading the same mean shows what of its error is lag: an answer that comes two frames late."
+    "force of its middle reading the same mean shows what of its error is lag: an answer that comes two frames late. "
+    "Presses of one duration differ from those of another in depth and place too: compare the ways, at each duration."
 )
 WAYS = {
     "one": "each reading alone",
@@ -72,8 +73,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
             axes.set(xscale="log", xlabel="duration of the press / s", ylabel=METRICS[name])
             axes.set_xticks(TICKS_S, [f"{one:g}" for one in TICKS_S])
             axes.minorticks_off()
-        panels[0].set_yscale("log")
-        panels[1].set_ylim(bottom=0)
+            axes.set_ylim(bottom=0)
         handles, labels = panels[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
         figure.suptitle(f"Presses read at {numbers['rate_hz']:.0f} Hz ({source})", x=0.01, ha="left", fontsize=11)
