@@ -7,6 +7,7 @@ import numpy as np
 from pipeline.capture import probe, sd_card
 from pipeline.capture.header import LOG_FILE, PROBE_FILE
 from pipeline.dataset.captures import read_header
+from pipeline.errors import SchemaError, complain
 from pipeline.evaluation.logs import describe, estimate, score_contacts, thin, truth_at
 from pipeline.stages._experiment import write_answer
 from pipeline.stages._networks import networks_without
@@ -15,7 +16,10 @@ from pipeline.stages._run import run, say
 
 def logs(scene: str, settings: Path, raw: Path, models: Path, answer: Path) -> None:
     """Read the first walk of a folder with the networks that never saw its board; score it where the truth is kept."""
-    folder = min(child for child in raw.iterdir() if child.is_dir())
+    walks = sorted(child for child in raw.iterdir() if child.is_dir())
+    if not walks:
+        raise SchemaError(complain(str(raw), "captures", "one or more", "none", "Simulate them again."))
+    folder = walks[0]
     t_s, b_uT, _, account = sd_card.read_log(folder / LOG_FILE)
     networks = networks_without(models, read_header(folder).board)
     found = estimate(t_s, b_uT, networks, where=str(folder / LOG_FILE))
