@@ -43,7 +43,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
     from matplotlib.figure import Figure
 
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(7.2, 4.0), layout="constrained")
+        figure = Figure(figsize=(6.2, 3.5), layout="constrained")
         axes = figure.subplots()
         _under_the_skin(axes, drawn)
         most_mm = numbers["p95_error_mm"]["mean"]
@@ -57,7 +57,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
         bar.ax.tick_params(labelsize=9)
         axes.set(xlabel="y / mm", ylabel="x / mm", aspect="equal")
         median = show(numbers["median_error_mm"])
-        title = f"Held-out pokes on one skin over {numbers['chips_n']} chips ({source}): median error {median} mm"
+        title = f"Held-out pokes over {numbers['chips_n']} chips ({source}): median error {median} mm"
         figure.suptitle(title, x=0.01, ha="left", fontsize=10)
         figure.legend(loc="outside lower left", ncols=3, frameon=False, fontsize=9)
         return {"sleeve.svg": svg(figure)}
