@@ -1,8 +1,11 @@
+import doctest
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.dataset import windows as documented
 from pipeline.dataset.windows import check_one_each, lay_windows, take
 from pipeline.errors import ParamsError
 from tests.dataset.tables import readings
@@ -59,3 +62,8 @@ def test_two_captures_of_one_skin_are_refused_in_one_sentence():
     with pytest.raises(ParamsError, match="captures of skin s0 must be one, as no clock orders several; got c0, c1"):
         check_one_each([readings("c0"), readings("c1")])
     check_one_each([readings("c0"), readings("c1", skin="s1")])
+
+
+def test_the_documented_windows_are_what_is_laid():
+    outcome = doctest.testmod(documented)
+    assert (outcome.attempted, outcome.failed) == (2, 0)

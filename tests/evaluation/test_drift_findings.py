@@ -94,3 +94,10 @@ def test_a_difference_comes_with_its_standard_error_over_windows():
         own["mse_xy_mm2"] - other["mse_xy_mm2"] for own, other in zip(changed, PAPER["regular"], strict=True)
     ]
     assert f"{np.mean(differences):+.2g}, standard error over windows {sem(differences):.1g}" in third["measured"]
+
+
+def test_what_shows_in_one_error_alone_is_said_to():
+    lower = [row | {"mse_xy_mm2": 0.1} for row in PAPER["each"]]
+    [third] = [one for one in findings(PAPER | {"each": lower}, FIELD, LATE) if one["finding"] == EACH_IS_WORSE]
+    assert not third["holds"]
+    assert third["why"].startswith("It shows in MSE_F alone. ")
