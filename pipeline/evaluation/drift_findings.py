@@ -92,8 +92,8 @@ def _each_is_worse(rows: Mapping[str, Sequence[Row]], field: Row) -> dict[str, A
         stale_uT = np.sqrt(max(0.0, mean(rows["regular"], "noload_off_uT") ** 2 - 2 * noise_uT**2))
         alone = f"It shows in {', '.join(shows)} alone. " if shows else ""
         return (
-            f"{alone}A no-load reading has the same noise under both policies, {noise_uT:.2g} µT rms over channels. One right "
-            f"before the contact is never stale, while a regular one is off by {stale_uT:.2g} µT of drift as well; a "
+            f"{alone}A no-load reading has the same noise under both policies, {noise_uT:.2g} µT rms over channels. "
+            f"One right before the contact is never stale, a regular one is off by {stale_uT:.2g} µT of drift; a "
             f"contact changes the field by {field['contact_uT']:.3g} µT. The paper suspects overfitting to training "
             "data, and saw later experiments gain from a reading before every contact"
         )
