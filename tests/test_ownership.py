@@ -33,6 +33,7 @@ HOMES = {
     r"from sklearn": {
         "pipeline/dataset/splits.py", "pipeline/evaluation/oddness.py", "pipeline/learning/classical.py",
     },
+    r"from sklearn": {"pipeline/dataset/single.py", "pipeline/dataset/splits.py", "pipeline/learning/classical.py"},
     r"os\.environ": {"pipeline/learning/executors.py", "pipeline/server.py", "pipeline/tracking.py"},
     r"import pickle|torch\.load\(|allow_pickle=True": set(),
 }  # fmt: skip

@@ -1,66 +1,22 @@
-"""Who is held out: leave-one-board-out, fewer sensors, one skin to others, random, temporal. In: rows. Out: folds.
+"""Who is held out: leave-one-board-out, fewer sensors, few labels, one skin to others. In: rows. Out: folds.
 
 The drawing is scikit-learn's; this module names the groups and proves that no skin or board is on both sides of
-a fold that claims so. Refuses to know what is trained on a fold.
+a fold that claims so; `single` draws within one skin. Refuses to know what is trained on a fold.
 """
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from typing import Annotated, Literal
 
 import numpy as np
-from jaxtyping import Int64
-from pydantic import Field, field_validator
-from sklearn.model_selection import LeaveOneGroupOut, ShuffleSplit, train_test_split
+from sklearn.model_selection import LeaveOneGroupOut
 
+from pipeline.dataset.hold_out import NO_POOL, Fold, Question, Split
 from pipeline.dataset.lines import take_pokes
 from pipeline.dataset.rows import Rows
+from pipeline.dataset.single import last_passes, random_indentations, random_passes, random_readings
 from pipeline.errors import ParamsError, complain
 from pipeline.seeds import rng_for
-from pipeline.strict import Strict
 
-Question = Literal[
-    "lobo", "sensors", "labels", "transfer", "single_random", "single_indentation", "single_pass", "single_temporal"
-]
-Count = Annotated[int, Field(ge=1)]
-
-
-class Split(Strict):
-    """How folds are drawn; each part is there if, and only if, its question is asked."""
-
-    random_test_fraction: Annotated[float, Field(gt=0, lt=1)] | None = None
-    random_repeats_n: Count | None = None
-    temporal_test_fraction: Annotated[float, Field(gt=0, lt=1)] | None = None
-    transfer_skins_n: Count | None = None
-    sensors_skins_n: Annotated[tuple[Count, ...], Field(min_length=1)] | None = None
-    sensors_draws_n: Count | None = None
-    pool_passes_n: Count | None = None  # of each held-out skin, its first ones
-    labels_pool_n: Count | None = None  # indentations of each held-out skin that may be labelled, of all depths
-    labels_draws_n: Count | None = None
-
-    @field_validator("sensors_skins_n")
-    @classmethod
-    def _sensors_differ(cls, skins_n: tuple[int, ...] | None) -> tuple[int, ...] | None:
-        if skins_n is not None and len(set(skins_n)) < len(skins_n):
-            raise ValueError(f"sensors_skins_n names each number of skins once, not {list(skins_n)}")
-        return skins_n
-
-
-@dataclass(frozen=True)
-class Fold:
-    """Row numbers (of `Rows`): the two sides of one hold-out, and the pool of unlabelled pokes on the held-out skins.
-
-    Adaptation may poke in the pool; nothing is scored there, so that every method is scored on the same rows.
-    """
-
-    question: str
-    name: str
-    train: Int64[np.ndarray, " a"]
-    test: Int64[np.ndarray, " b"]
-    pool: Int64[np.ndarray, " c"]
-
-
-NO_POOL = np.zeros(0, np.int64)
+__all__ = ["NO_POOL", "Fold", "Question", "Split", "draw_folds"]
 
 
 def draw_folds(rows: Rows, questions: Iterable[str], split: Split, seed: int) -> list[Fold]:
@@ -192,48 +148,6 @@ def one_skin_to_others(rows: Rows, split: Split, seed: int) -> list[Fold]:
     return folds
 
 
-def random_readings(rows: Rows, split: Split, seed: int) -> list[Fold]:
-    """Random readings of the first skin held out, repeatedly (paper section 4).
-
-    Readings of one indentation fall on both sides: the paper's way, which flatters the model.
-    """
-    assert split.random_test_fraction is not None
-    assert split.random_repeats_n is not None
-    own = np.flatnonzero(rows.skin == np.unique(rows.skin)[0])
-    test_n = _test_n(len(own), split.random_test_fraction, f"readings of skin {rows.skin[own[0]]}", "single_random")
-    shuffle = ShuffleSplit(split.random_repeats_n, test_size=test_n, random_state=seed % 2**32)
-    return [
-        Fold("single_random", f"repeat{i}", np.sort(own[train]), np.sort(own[test]), NO_POOL)
-        for i, (train, test) in enumerate(shuffle.split(own))
-    ]
-
-
-def last_passes(rows: Rows, split: Split, seed: int) -> list[Fold]:
-    """Train on the first passes of a skin, test on its last; one fold a skin."""
-    assert split.temporal_test_fraction is not None
-    folds = []
-    for skin in np.unique(rows.skin):
-        own = np.flatnonzero(rows.skin == skin)
-        captures = np.unique(rows.capture[own])
-        if len(captures) > 1:
-            raise ParamsError(
-                complain(
-                    "question single_temporal", f"the captures of skin {skin}", "one, as no clock orders several",
-                    ", ".join(captures), "Record the passes in one capture, or ask single_random.",
-                )
-            )  # fmt: skip
-        passes = np.unique(rows.pass_i[own])
-        test_n = _test_n(len(passes), split.temporal_test_fraction, f"passes of skin {skin}", "single_temporal")
-        first, last = train_test_split(passes, test_size=test_n, shuffle=False)
-        folds.append(
-            Fold(
-                "single_temporal", str(skin),
-                own[np.isin(rows.pass_i[own], first)], own[np.isin(rows.pass_i[own], last)], NO_POOL,
-            )
-        )  # fmt: skip
-    return folds
-
-
 def _hold_out(rows: Rows, question: str, name: str, sides: tuple[np.ndarray, np.ndarray], split: Split) -> Fold:
     """Make a fold of train and held-out rows; the first passes of each held-out skin are its pool, if one is asked."""
     train, held = sides
@@ -256,19 +170,6 @@ def _hold_out(rows: Rows, question: str, name: str, sides: tuple[np.ndarray, np.
     return fold
 
 
-def _test_n(all_n: int, fraction: float, what: str, question: str) -> int:
-    """Round the number held out to the nearest; both sides need one at least."""
-    test_n = round(fraction * all_n)
-    if not 0 < test_n < all_n:
-        raise ParamsError(
-            complain(
-                f"question {question}", what, "enough for both sides", f"{all_n}, of which {fraction:g} are {test_n}",
-                f"Record more, change the fraction, or take {question} out of the scene's questions.",
-            )
-        )  # fmt: skip
-    return test_n
-
-
 def _prove_apart(rows: Rows, fold: Fold) -> None:
     held = np.concatenate([fold.test, fold.pool])
     for what, labels in (("board", rows.board), ("skin", rows.skin)):
@@ -288,5 +189,7 @@ _DRAW: dict[str, Callable[[Rows, Split, int], list[Fold]]] = {
     "labels": few_labels,
     "transfer": one_skin_to_others,
     "single_random": random_readings,
+    "single_indentation": random_indentations,
+    "single_pass": random_passes,
     "single_temporal": last_passes,
 }

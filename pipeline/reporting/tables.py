@@ -24,6 +24,8 @@ SPREAD = (
 )
 SPLIT_WORDS = {
     "single_random": "random readings held out (the paper's way: readings of one indentation on both sides)",
+    "single_indentation": "random indentations held out (all readings of one on the same side)",
+    "single_pass": "random passes held out (each visits every place and depth again)",
     "single_temporal": "first passes → last passes",
 }
 

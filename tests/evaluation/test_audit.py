@@ -111,7 +111,7 @@ def test_the_papers_random_readings_are_a_known_leak_that_does_not_fail_the_whol
     assert holds(checks)
 
 
-@pytest.mark.parametrize("question", ["single_temporal", "single_indentation"])
+@pytest.mark.parametrize("question", ["single_temporal", "single_indentation", "single_pass"])
 def test_within_one_skin_indentations_are_apart_or_the_audit_fails(question):
     own = np.flatnonzero(LABELS.skin == "b0_s0")
     fold = Sides(question, "b0_s0", own[: 20 * READINGS_N], NONE, own[20 * READINGS_N :])

@@ -51,6 +51,19 @@ def test_a_question_that_was_not_asked_is_absent_and_not_null():
     assert "null" not in json.dumps(only_single)
 
 
+def test_three_ways_to_split_one_skin_stand_side_by_side_and_the_papers_first():
+    ways = {"single_pass": 70.0, "single_indentation": 80.0, "single_random": 90.0}
+    shown = numbers([card(question, "repeat0", accuracy_pct) for question, accuracy_pct in ways.items()])
+    single = shown["single_sensor"]
+    assert single["split"] == "single_random"
+    means = [one["accuracy_pct"]["mean"] for one in (single, single["by_indentation"], single["by_pass"])]
+    assert means == [90.0, 80.0, 70.0]
+    table = make_tables(shown)["single_sensor"]
+    assert table["accuracy, % (ours)"].tolist() == ["90", "80", "70"]
+    assert all(table["accuracy, % (paper)"] == "99.58 ± 0.34")
+    assert "the paper's way" in table["model"][0]
+
+
 def test_variants_stand_apart_from_the_headline():
     assert numbers()["variants"]["lobo"]["released"]["accuracy_pct"]["mean"] == 1.0
 

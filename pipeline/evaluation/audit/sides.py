@@ -14,7 +14,7 @@ from pipeline.evaluation.audit.checks import Check
 from pipeline.evaluation.audit.copies import COPIED_SHARE_MAX, liken, strong_indentations
 
 SKINS_UNSEEN = ("lobo", "sensors", "labels", "transfer")
-SKIN_SHARED = ("single_temporal", "single_indentation")
+SKIN_SHARED = ("single_temporal", "single_indentation", "single_pass")
 PAPERS_WAY = "single_random"  # readings of one indentation on both sides, as in the paper's section 4
 
 
