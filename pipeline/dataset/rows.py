@@ -16,6 +16,7 @@ from pipeline.schema import Readings
 from pipeline.strict import Strict
 
 TARGETS = ("x_mm", "y_mm", "Fz_N")
+SHEAR_TARGETS = ("x_mm", "y_mm", "Fx_N", "Fy_N", "Fz_N")  # of dragged lines (paper section 4)
 
 
 class Selection(Strict):
@@ -29,15 +30,15 @@ class Rows:
     """Stacked rows of a scene, captures in order of name.
 
     `db_uT` is the change of field against the no-load reading of the same indentation; `target` holds x_mm, y_mm and
-    Fz_N (NaN where a recording has no force); `pass_i` counts on over the captures of one skin; `indentation` counts on
-    over the captures of the scene, and the readings of one indentation share it.
+    Fz_N (NaN where a recording has no force), unless others were gathered; `pass_i` counts on over the captures of one
+    skin; `indentation` counts on over the captures of the scene, and the readings of one indentation share it.
     """
 
     capture: np.ndarray
     board: np.ndarray
     skin: np.ndarray
     db_uT: Float32[np.ndarray, "f ch"]
-    target: Float32[np.ndarray, "f 3"]
+    target: Float32[np.ndarray, "f t"]
     pass_i: Int32[np.ndarray, " f"]
     indentation: Int64[np.ndarray, " f"]
     dropped: dict[str, int]
@@ -54,8 +55,8 @@ class Rows:
         return cls(*labels, empty, empty, passes, np.arange(f), {})
 
 
-def gather(captures: Sequence[Readings], selection: Selection) -> Rows:
-    """Stack the captures of a scene into rows, and count what is no contact."""
+def gather(captures: Sequence[Readings], selection: Selection, *, targets: Sequence[str] = TARGETS) -> Rows:
+    """Stack the captures of a scene into rows, and count what is no contact; `targets` name columns of `Readings`."""
     if not captures:
         raise ParamsError(complain("the scene", "captures", "one or more", "none", "Add one with `reskin add`."))
     _check_one_kind(captures)
@@ -84,7 +85,7 @@ def gather(captures: Sequence[Readings], selection: Selection) -> Rows:
         db_uT=np.concatenate(
             [subtract(o.b_uT[keep], o.noload_uT[keep]) for o, keep in zip(captures, kept, strict=True)]
         ),
-        target=np.concatenate([_targets(one)[keep] for one, keep in zip(captures, kept, strict=True)]),
+        target=np.concatenate([_targets(one, targets)[keep] for one, keep in zip(captures, kept, strict=True)]),
         pass_i=np.concatenate(pass_i),
         indentation=_count_on([one.indentation[keep] for one, keep in zip(captures, kept, strict=True)]),
         dropped={"no_contact_rows_n": places_unknown_n, "low_force_rows_n": all_n - kept_n - places_unknown_n},
@@ -97,8 +98,8 @@ def _contacts(one: Readings, selection: Selection) -> np.ndarray:
     return placed & ~weak
 
 
-def _targets(one: Readings) -> Float32[np.ndarray, "f 3"]:
-    return np.stack([getattr(one, name) for name in TARGETS], axis=1)
+def _targets(one: Readings, names: Sequence[str]) -> Float32[np.ndarray, "f t"]:
+    return np.stack([getattr(one, name) for name in names], axis=1)
 
 
 def _repeat(labels: list[str], kept: list[np.ndarray]) -> np.ndarray:

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from pipeline.dataset.rows import Selection, gather
+from pipeline.dataset.rows import SHEAR_TARGETS, Selection, gather
 from pipeline.errors import ParamsError
 from tests.dataset.tables import readings
 
@@ -74,3 +74,11 @@ def test_a_capture_that_would_vanish_is_an_error_and_no_silent_loss():
 def test_a_scene_without_captures_says_how_to_get_some():
     with pytest.raises(ParamsError, match="reskin add"):
         gather([], ALL)
+
+
+def test_other_columns_can_be_targets_and_places_come_first():
+    rows = gather(
+        [readings(Fx_N=np.full(6, 0.5, np.float32), Fy_N=np.full(6, -0.25, np.float32))], ALL, targets=SHEAR_TARGETS
+    )
+    assert rows.target.tolist() == [[i, 2, 0.5, -0.25, 1] for i in range(6)]
+    assert gather([readings()], ALL).target.tolist() == [[i, 2, 1] for i in range(6)]
