@@ -19,6 +19,8 @@ HOMES = {
         "pipeline/reporting/experiments/contacts.py",
         "pipeline/reporting/work_precision.py", "pipeline/reporting/experiments/dynamics.py",
         "pipeline/reporting/experiments/logs.py", "pipeline/reporting/experiments/sensitivity.py",
+        "pipeline/reporting/work_precision.py", "pipeline/reporting/experiments/shear.py",
+        "pipeline/reporting/experiments/flexible.py",
     },
     r"\bimport argparse|from argparse": {"pipeline/stages/_run.py"},
     r"\bimport typer|from typer": {"pipeline/cli.py"},

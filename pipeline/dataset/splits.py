@@ -16,7 +16,7 @@ from pipeline.dataset.single import last_passes, random_indentations, random_pas
 from pipeline.errors import ParamsError, complain
 from pipeline.seeds import rng_for
 
-__all__ = ["NO_POOL", "Fold", "Question", "Split", "draw_folds"]
+__all__ = ["NO_POOL", "Fold", "Question", "Split", "draw_folds", "hold_out_skins"]
 
 
 def draw_folds(rows: Rows, questions: Iterable[str], split: Split, seed: int) -> list[Fold]:
@@ -62,7 +62,7 @@ def leave_one_board_out(rows: Rows, split: Split, seed: int) -> list[Fold]:
             )
         )  # fmt: skip
     drawn = LeaveOneGroupOut().split(np.empty((len(rows), 0)), groups=rows.board)
-    return [_hold_out(rows, "lobo", str(rows.board[held[0]]), (train, held), split) for train, held in drawn]
+    return [hold_out_skins(rows, "lobo", str(rows.board[held[0]]), (train, held), split) for train, held in drawn]
 
 
 def fewer_sensors(rows: Rows, split: Split, seed: int) -> list[Fold]:
@@ -87,7 +87,7 @@ def fewer_sensors(rows: Rows, split: Split, seed: int) -> list[Fold]:
     for skins_n in split.sensors_skins_n:
         for draw_i, order in enumerate(orders):
             train = np.flatnonzero(np.isin(rows.skin, order[:skins_n]))
-            folds.append(_hold_out(rows, "sensors", f"{skins_n:02d}skins-draw{draw_i}", (train, held), split))
+            folds.append(hold_out_skins(rows, "sensors", f"{skins_n:02d}skins-draw{draw_i}", (train, held), split))
     return folds
 
 
@@ -148,7 +148,7 @@ def one_skin_to_others(rows: Rows, split: Split, seed: int) -> list[Fold]:
     return folds
 
 
-def _hold_out(rows: Rows, question: str, name: str, sides: tuple[np.ndarray, np.ndarray], split: Split) -> Fold:
+def hold_out_skins(rows: Rows, question: str, name: str, sides: tuple[np.ndarray, np.ndarray], split: Split) -> Fold:
     """Make a fold of train and held-out rows; the first passes of each held-out skin are its pool, if one is asked."""
     train, held = sides
     pooled = np.zeros(len(held), bool)

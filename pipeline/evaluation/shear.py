@@ -38,10 +38,14 @@ def answer_shear(
     *,
     target: Float[np.ndarray, "f 5"],
     lines_n: int,
+    passes_n: int,
 ) -> dict[str, Any]:
-    """Summarise (fold, score) pairs of both splits over folds, each the mean of its seeds, with the forces' size."""
+    """Summarise (fold, score) pairs of both splits over folds, each the mean of its seeds, with the forces' size.
+
+    Of `lines_n` dragged lines in all, each place and depth was dragged along in each of `passes_n`.
+    """
     rms_N = np.sqrt((target.astype(float) ** 2).mean(axis=0))
     sizes = {"fx_rms_N": float(rms_N[2]), "fy_rms_N": float(rms_N[3]), "fz_rms_N": float(rms_N[4])}
     return over_units(by_reading) | {
-        "by_line": over_units(by_line), "readings_n": len(target), "lines_n": lines_n, **sizes,
+        "by_line": over_units(by_line), "readings_n": len(target), "lines_n": lines_n, "passes_n": passes_n, **sizes,
     }  # fmt: skip

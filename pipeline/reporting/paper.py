@@ -44,6 +44,10 @@ SHEAR: dict[str, Number] = {  # section 4: dragged lines
     "mse_fxy_N2": (0.0011, 0.0002),
     "mse_fz_N2": (0.003, 0.001),
     "mse_xy_mm2": (0.085, 0.006),
+SHEAR: dict[str, Number] = {  # section 4: dragged lines
+    "mse_xy_mm2": (0.085, 0.006),
+    "mse_fxy_N2": (0.0011, 0.0002),
+    "mse_fz_N2": (0.003, 0.001),
 }
 MANUAL_POKES_N = 325  # section 5, manual indentations; without deviations
 MANUAL: dict[str, dict[str, float]] = {
@@ -66,3 +70,4 @@ SENSITIVITY = '"less than 20 mL (< 0.2N) of water"'
 MONOTONIC = '"monotonically increasing sensor measurements"'
 DYNAMICS = '"ReSkin can stream data up to 400 Hz and we aim to leverage this capability": future work'  # section 7
 LOG_RATE_HZ = 250.0  # section 6, dog shoe and glove: "logged to an SD card at 250 Hz"
+FLEXIBLE_BIAS = '"an overestimation bias resulting from signals appearing stronger"'

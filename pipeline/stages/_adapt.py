@@ -1,12 +1,13 @@
 """What the stages that adapt share: a held-out skin's pool of pokes and a trained network -> a cell. Knows no argv."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from pipeline import io
-from pipeline.dataset.lines import grid_lines, take_pokes
+from pipeline.dataset.lines import Lines, grid_lines, take_pokes
 from pipeline.dataset.splits import Fold
 from pipeline.errors import SchemaError, complain
 from pipeline.learning.cell import Adapting, Cell, Start
@@ -25,9 +26,8 @@ def read_starts(models: Path) -> Starts:
         card = io.read_json(file)
         tensors, _ = io.read_tensors(file.with_suffix(".safetensors"))
         weights = {name: values for name, values in tensors.items() if name.startswith("layer")}
-        starts[card["recipe_name"], card["fold"], card["seed_i"]] = Start(
-            card["key"], weights, Scaler.of_arrays(tensors)
-        )
+        start = Start(card["key"], weights, Scaler.of_arrays(tensors))
+        starts[card["recipe_name"], card["fold"], card["seed_i"]] = start
     return starts
 
 
@@ -35,22 +35,45 @@ def adaptations(
     at: Scenery, fold: Fold, named: tuple[str, Adaptation], starts: Starts, *, question: str, pokes_n: int
 ) -> Iterator[Cell]:
     """Adapt to each skin of a fold by itself: so many indentations of its pool, of which only lines are passed on."""
+    for skin in np.unique(at.rows.skin[fold.test]):
+        for seed_i in own_starts(starts, named[1].base, fold):
+            lines = pool_lines(at, fold, str(skin), pokes_n=pokes_n, seed_i=seed_i)
+            yield adaptation(at, fold, named, starts, Pokes(question, str(skin), seed_i, f"{pokes_n}pokes", lines))
+
+
+@dataclass(frozen=True)
+class Pokes:
+    """What one network is adapted by: lines on one skin; `question` and `what` name the training."""
+
+    question: str
+    skin: str
+    seed_i: int
+    what: str
+    lines: Lines
+
+
+def adaptation(at: Scenery, fold: Fold, named: tuple[str, Adaptation], starts: Starts, pokes: Pokes) -> Cell:
+    """Adapt the fold's network of one seed to one skin, whose rows of the fold's test side are tested."""
     assert at.asked.train_triplet is not None
     name, settings = named
-    recipe = at.asked.train_triplet.recipes[settings.base]
-    own = {seed_i: start for (base, of, seed_i), start in starts.items() if (base, of) == (settings.base, fold.name)}
+    test = fold.test[at.rows.skin[fold.test] == pokes.skin]
+    start = own_starts(starts, settings.base, fold)[pokes.seed_i]
+    return Cell(
+        pokes.question, name, at.asked.train_triplet.recipes[settings.base], fold.name, at.asked.seed, pokes.seed_i,
+        fold.train, test, Adapting(start, settings, pokes.lines), pokes.skin, pokes.what,
+    )  # fmt: skip
+
+
+def pool_lines(at: Scenery, fold: Fold, skin: str, *, pokes_n: int, seed_i: int) -> Lines:
+    """Draw so many indentations of a skin's pool, and index them along the robot's grid."""
+    pool = fold.pool[at.rows.skin[fold.pool] == skin]
+    return grid_lines(at.rows, take_pokes(at.rows, pool, pokes_n, rng_for(at.asked.seed, "pokes", skin, seed_i)))
+
+
+def own_starts(starts: Starts, base: str, fold: Fold) -> dict[int, Start]:
+    """Choose the networks of one recipe and fold, by seed."""
+    own = {seed_i: start for (recipe, of, seed_i), start in starts.items() if (recipe, of) == (base, fold.name)}
     if not own:
-        raise SchemaError(
-            complain(
-                f"fold {fold.name}", "networks to adapt", f"those of recipe {settings.base}", "none", "Train them."
-            )
-        )
-    for skin in np.unique(at.rows.skin[fold.test]):
-        pool, test = (side[at.rows.skin[side] == skin] for side in (fold.pool, fold.test))
-        for seed_i, start in own.items():
-            rng = rng_for(at.asked.seed, "pokes", str(skin), seed_i)
-            lines = grid_lines(at.rows, take_pokes(at.rows, pool, pokes_n, rng))
-            yield Cell(
-                question, name, recipe, fold.name, at.asked.seed, seed_i, fold.train, test,
-                Adapting(start, settings, lines), str(skin), f"{pokes_n}pokes",
-            )  # fmt: skip
+        where, rule = f"fold {fold.name}", f"those of recipe {base}"
+        raise SchemaError(complain(where, "networks to adapt", rule, "none", "Train them."))
+    return own

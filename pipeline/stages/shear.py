@@ -37,7 +37,7 @@ def shear(scene: str, settings: Path, indentations: Path, answer: Path) -> None:
     names = {fold.name for fold in by_line}
     numbers = answer_shear(
         [one for one in scores if one[0] not in names], [one for one in scores if one[0] in names],
-        target=rows.target, lines_n=len(np.unique(rows.indentation)),
+        target=rows.target, lines_n=len(np.unique(rows.indentation)), passes_n=len(np.unique(rows.pass_i)),
     )  # fmt: skip
     first_i = next(i for i, cell in enumerate(cells) if cell.fold in names)
     shown = rng_for(asked.seed, "shear", "drawn").permutation(len(cells[first_i].test))[:DRAWN_N]

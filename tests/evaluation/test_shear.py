@@ -55,7 +55,7 @@ def test_seeds_are_averaged_within_a_fold_before_folds_are():
 def test_both_ways_stand_beside_each_other_with_the_size_of_the_forces():
     true, predicted = drawn(1)
     score = score5(true, predicted)
-    answer = answer_shear([("a", score)], [("b", {**score, "accuracy_pct": 7.0})], target=true, lines_n=3)
+    answer = answer_shear([("a", score)], [("b", {**score, "accuracy_pct": 7.0})], target=true, lines_n=3, passes_n=1)
     assert answer["accuracy_pct"]["mean"] == score["accuracy_pct"]
     assert answer["by_line"]["accuracy_pct"]["mean"] == 7.0
     assert (answer["readings_n"], answer["lines_n"]) == (40, 3)
