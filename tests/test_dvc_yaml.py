@@ -45,7 +45,7 @@ def test_a_stage_names_no_code_that_it_does_not_import(name, graph):
 @pytest.mark.parametrize("name", sorted(STAGES))
 def test_every_path_that_a_command_takes_is_declared(name):
     stage = STAGES[name]["do"]
-    outs = [one if isinstance(one, str) else next(iter(one)) for one in stage.get("outs", [])]
+    outs = [one if isinstance(one, str) else next(iter(one)) for key in ("outs", "plots") for one in stage.get(key, [])]
     params = [next(iter(one)) for one in stage.get("params", [])]
     declared = [*stage["deps"], *outs, *params]
     words = [word for word in stage["cmd"].split() if "/" in word and not word.startswith(".venv")]
@@ -53,5 +53,5 @@ def test_every_path_that_a_command_takes_is_declared(name):
     assert unknown == []
 
 
-def test_the_flow_stays_far_below_forty_stages():
-    assert len(STAGES) < 30
+def test_the_flow_stays_below_forty_stages():
+    assert len(STAGES) < 40

@@ -32,7 +32,7 @@ FIGURE_6B = (
     'other models, offers a significant improvement in performance when using fewer sensors in training"'
 )
 
-SLEEVE = {"chips": "40", "rate, Hz": "133", "skin, mm": "2 in x 4 in (50.8 x 101.6)"}  # section 6, arm sleeve
+SLEEVE_SKIN = "2 in x 4 in (50.8 x 101.6)"  # section 6, arm sleeve
 SLEEVE_WORDS = 'it shows "contact localization across larger surface areas" in a video (section 6, figure 1E)'
 # Figures 3 and 5 are printed without numbers too.
 FIGURE_3 = (
@@ -40,10 +40,6 @@ FIGURE_3 = (
     'samples"'
 )
 FIGURE_5 = "Figure 5 of the paper is printed without numbers; what its text says of it is the table of findings."
-SHEAR: dict[str, Number] = {  # section 4: dragged lines
-    "mse_fxy_N2": (0.0011, 0.0002),
-    "mse_fz_N2": (0.003, 0.001),
-    "mse_xy_mm2": (0.085, 0.006),
 SHEAR: dict[str, Number] = {  # section 4: dragged lines
     "mse_xy_mm2": (0.085, 0.006),
     "mse_fxy_N2": (0.0011, 0.0002),
@@ -64,10 +60,7 @@ RATE_HZ = 400.0  # sections 1 and 2: "up to 400Hz"
 FORCE_RESOLUTION_MAX_N = 0.1  # section 1: what a good skin should reach
 PLACE_ACCURACY_MIN_PCT = 90.0  # section 1: "spatial resolution (1mm with 90% accuracy)"
 PLATEAU_POKES_N = 780  # section 5: no great gain beyond
-SENSITIVITY_N = 0.2  # section 6, water in a shot glass: "less than 20 mL (< 0.2N) of water"
-SENSITIVITY_ML = 20.0
 SENSITIVITY = '"less than 20 mL (< 0.2N) of water"'
 MONOTONIC = '"monotonically increasing sensor measurements"'
 DYNAMICS = '"ReSkin can stream data up to 400 Hz and we aim to leverage this capability": future work'  # section 7
-LOG_RATE_HZ = 250.0  # section 6, dog shoe and glove: "logged to an SD card at 250 Hz"
 FLEXIBLE_BIAS = '"an overestimation bias resulting from signals appearing stronger"'

@@ -5,8 +5,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from pipeline.errors import SchemaError, complain
+from pipeline.reporting.shown import to_markdown
 from pipeline.reporting.skins import skins_table
-from pipeline.reporting.tables import make_tables, to_markdown
+from pipeline.reporting.tables import make_tables
 
 
 def fill(text: str, blocks: Mapping[str, str]) -> str:
@@ -58,7 +59,11 @@ def _main_skins(scenes: Iterable[Mapping[str, Any]]) -> Iterator[tuple[str, Mapp
 def _stages(stages: Mapping[str, Any]) -> str:
     lines = ["| stage | code | writes |", "|---|---|---|"]
     for name, stage in stages.items():
-        outs = [out if isinstance(out, str) else next(iter(out)) for out in stage["do"].get("outs", [])]
+        outs = [
+            out if isinstance(out, str) else next(iter(out))
+            for key in ("outs", "plots")
+            for out in stage["do"].get(key, [])
+        ]
         written = ", ".join(f"`{re.sub(r'[$]{[^}]*}', '…', out)}`" for out in outs) or "MLflow runs"
         lines.append(f"| {name} | [pipeline/stages/{name}.py](pipeline/stages/{name}.py) | {written} |")
     return "\n".join(lines)

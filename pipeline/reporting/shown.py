@@ -55,3 +55,9 @@ def notes(table: pd.DataFrame) -> list[str]:
     if any("accuracy" in str(column) for column in table.columns):
         meanings.append(f"{MEANING} {table.attrs.get('spread', SPREAD)}")
     return meanings
+
+
+def to_markdown(table: pd.DataFrame) -> str:
+    """Write a table as Markdown, empty where a number is not known, and say below what its numbers mean."""
+    text = str(table.fillna("").to_markdown(index=False, disable_numparse=True)) + "\n"
+    return text + "".join(f"\n{note}\n" for note in notes(table))

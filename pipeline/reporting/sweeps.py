@@ -15,8 +15,7 @@ from pipeline.reporting.figures import STYLE, svg
 from pipeline.reporting.learning import adaptation_costs_table, methods_costs_table
 from pipeline.reporting.order import SHORT
 from pipeline.reporting.paper import ADAPTED_POKES_N, TABLE_2
-from pipeline.reporting.shown import COLUMNS
-from pipeline.reporting.tables import to_markdown
+from pipeline.reporting.shown import COLUMNS, to_markdown
 from pipeline.reporting.trade_offs import adaptation, trade_off
 from pipeline.reporting.work_precision import COLOURS, MARKERS
 

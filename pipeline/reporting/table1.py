@@ -5,12 +5,13 @@ The paper's cells are never overwritten. Refuses to know where measured words co
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import pandas as pd
 from pydantic import Field, model_validator
 
 from pipeline.errors import ParamsError, complain
+from pipeline.reporting.shown import show
 from pipeline.strict import Strict, parse, read_yaml
 
 PRINTED = Path(__file__).with_name("table1.yaml")
@@ -62,3 +63,28 @@ def table1(data: Table1, measured: Mapping[str, str]) -> pd.DataFrame:
         f"As printed in the paper (table 1); ? is its own. The last row and column are ours. {sources}"
     )
     return table
+
+
+def measured(numbers: Mapping[str, Any]) -> dict[str, str]:
+    """Say what a scene measured of the table's rows, and on which kind of skins; of what it did not ask, nothing."""
+    source = numbers["provenance"]["source"]
+    described = next(iter(numbers.get("described", {}).values()), {"over_skins": {}})
+    rate = described["over_skins"].get("rate_hz")
+    words = {"Frequency": f"{rate['mean']:.4g} Hz"} if rate else {}
+    if "sleeve" in numbers:
+        own = numbers["sleeve"]
+        words["Area coverage"] = f"{own['chips_n']} chips under {' x '.join(f'{side:g}' for side in own['area_mm'])} mm"
+    if "drift" in numbers:
+        words["Durable (> 50k contacts)"] = _durable(numbers["drift"])
+    best = next((row for row in ("adapted", "triplet", "multi") if row in numbers.get("table2", {})), None)
+    if best:
+        words[LOCALISATION] = f"{show(numbers['table2'][best]['accuracy_pct'])} % ({best})"
+    return {row: f"{text}, {source}" for row, text in words.items()}
+
+
+def _durable(drift: Mapping[str, Any]) -> str:
+    policy = next(one for one in ("each", "regular", "initial") if one in drift)
+    last = drift[policy][-1]
+    return (
+        f"{last['accuracy_pct']:.3g} % within 1 mm after {last['contacts_n']:,.0f} contacts, no-load reading: {policy}"
+    )

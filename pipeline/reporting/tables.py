@@ -8,20 +8,17 @@ from typing import Any
 
 import pandas as pd
 
+from pipeline.reporting.checklist import checklist
 from pipeline.reporting.checks import stability_table, verification_table
 from pipeline.reporting.experiments.parts import experiment_tables
 from pipeline.reporting.learning import learning_tables
 from pipeline.reporting.left_out import left_out_table
 from pipeline.reporting.order import models
 from pipeline.reporting.paper import SINGLE_SENSOR, Number
-from pipeline.reporting.shown import COLUMNS, scores, show
+from pipeline.reporting.shown import COLUMNS, scores, show, to_markdown
 from pipeline.reporting.skins import skins_table
+from pipeline.reporting.table1 import measured, read_table1, table1
 
-MEANING = "Accuracy: the part of held-out readings whose x and y are both within 1 mm. MSE_xy: mean over the two axes."
-SPREAD = (
-    "± is the sd over n folds (over n pairs of a training and a test skin for one skin on others), or over seeds where "
-    "it says so."
-)
 SPLIT_WORDS = {
     "single_random": "random readings held out (the paper's way: readings of one indentation on both sides)",
     "single_indentation": "random indentations held out (all readings of one on the same side)",
@@ -54,23 +51,15 @@ def make_tables(numbers: Mapping[str, Any]) -> dict[str, pd.DataFrame]:
         tables["skins"] = skins_table(titled)
     tables["variants"] = _variants(numbers["variants"], source)
     tables["captures"] = _captures(numbers["capture"], source)
+    tables["table1"] = table1(read_table1(), measured(numbers))
+    tables["checklist"] = checklist(numbers)
     return tables
 
 
-def table_texts(numbers: Mapping[str, Any]) -> dict[str, str]:
+def table_texts(tables: Mapping[str, pd.DataFrame]) -> dict[str, str]:
     """Write every table twice, by file name: as Markdown for people and as CSV for programs."""
-    tables = make_tables(numbers)
     texts = {f"{name}.md": to_markdown(table) for name, table in tables.items()}
     return texts | {f"{name}.csv": table.to_csv(index=False) for name, table in tables.items()}
-
-
-def to_markdown(table: pd.DataFrame) -> str:
-    """Write a table as Markdown, empty where a number is not known, and say below what its numbers mean."""
-    text = str(table.fillna("").to_markdown(index=False, disable_numparse=True)) + "\n"
-    meanings = [table.attrs["meaning"]] if "meaning" in table.attrs else []
-    if any("accuracy" in str(column) for column in table.columns):
-        meanings.append(f"{MEANING} {table.attrs.get('spread', SPREAD)}")
-    return text + "".join(f"\n{meaning}\n" for meaning in meanings)
 
 
 def _table_2_rows(numbers: Mapping[str, Any]) -> dict[str, tuple[Mapping[str, Any], Mapping[str, Number]]]:

@@ -14,7 +14,7 @@ import pandas as pd
 
 from pipeline.evaluation.work_precision.rows import CANDIDATES, ERROR_MAX, REFERENCE, Choice, Key, Precision, Seconds
 from pipeline.reporting.figures import STYLE, svg
-from pipeline.reporting.tables import to_markdown
+from pipeline.reporting.shown import to_markdown
 
 # Okabe & Ito 2008, told apart by colour-blind readers; their yellow is left out, which is pale on white.
 COLOURS = ("#000000", "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")

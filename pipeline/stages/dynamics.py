@@ -12,7 +12,7 @@ from pipeline.stages._networks import networks_without
 from pipeline.stages._run import run, say
 
 
-def dynamics(scene: str, settings: Path, indentations: Path, models: Path, answer: Path) -> None:
+def dynamics(scene: str, indentations: Path, models: Path, answer: Path) -> None:
     """Ask the networks of train_multi that never saw the pressed skin's board."""
     one = read_folder(indentations)[0]
     true = np.stack([getattr(one, name) for name in TARGETS], axis=1)

@@ -14,7 +14,7 @@ from pipeline.stages._networks import networks_without
 from pipeline.stages._run import run, say
 
 
-def logs(scene: str, settings: Path, raw: Path, models: Path, answer: Path) -> None:
+def logs(scene: str, raw: Path, models: Path, answer: Path) -> None:
     """Read the first walk of a folder with the networks that never saw its board; score it where the truth is kept."""
     walks = sorted(child for child in raw.iterdir() if child.is_dir())
     if not walks:

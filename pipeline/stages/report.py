@@ -1,4 +1,4 @@
-"""Stage report: models' cards, predictions, answers and accounts -> numbers.json, tables, figures."""
+"""Stage report: models' cards, predictions, answers and accounts -> numbers.json, tables, figures, index.html."""
 
 from pathlib import Path
 
@@ -8,8 +8,9 @@ from pipeline.learning.recipe import HEADLINE
 from pipeline.params import check_planned, modelled, read_params, read_scene
 from pipeline.reporting.experiments.parts import experiment_figures
 from pipeline.reporting.figures import error_grids
+from pipeline.reporting.page import page
 from pipeline.reporting.sweeps import learning_figures, learning_pages
-from pipeline.reporting.tables import table_texts
+from pipeline.reporting.tables import make_tables, table_texts
 from pipeline.reporting.work_precision import pages
 from pipeline.stages._report import Places, read_cards, read_numbers
 from pipeline.stages._run import run, say
@@ -25,7 +26,7 @@ def report(
     answers: Path,
     reports: Path,
 ) -> None:
-    """Write the numbers, tables and figures of a scene."""
+    """Write the numbers, tables, figures and the page of a scene."""
     asked = read_scene(settings)
     check_planned(scene, asked, read_params(params), str(settings))
     numbers, drawn = read_numbers(scene, asked, Places(indentations, folds, models, answers))
@@ -33,7 +34,8 @@ def report(
         record = to_record(numbers["chosen"], read_cards(asked, models), source=asked.source, seed=asked.seed)
         io.write_json(reports / "choice.json", record)
     io.write_json(reports / "numbers.json", numbers)
-    io.write_texts(reports / "tables", table_texts(numbers))
+    tables = make_tables(numbers)
+    io.write_texts(reports / "tables", table_texts(tables))
     predictions = [io.read_table(models / arm / "predictions.parquet") for arm in modelled(asked)]
     figures = dict(error_grids(predictions, HEADLINE, f"{scene} ({asked.source})"))
     figures |= dict(learning_figures(numbers, asked.source)) | experiment_figures(numbers, drawn, asked.source)
@@ -41,7 +43,8 @@ def report(
     # Seconds differ between identical runs, so what shows them is no DVC output.
     costs = pages(numbers["runtime"], source=asked.source) | learning_pages(numbers["runtime"], asked.source)
     io.write_texts(reports / "runtime", costs)
-    say(f"{scene}: {reports}/numbers.json, tables, figures")
+    io.write_text(reports / "index.html", page(numbers, tables, figures, costs))
+    say(f"{scene}: {reports}/index.html, numbers.json, tables, figures")
 
 
 if __name__ == "__main__":

@@ -143,12 +143,14 @@ def _drag(asked: Drag) -> Plan:
     across_mm = np.repeat(PITCH_MM * np.arange(SIDE_POINTS_N)[:, None], stops_n, axis=1)
     one_x_mm, one_y_mm = np.concatenate([there, across_mm]), np.concatenate([across_mm, there])
     lines_n, depths_n = len(one_x_mm), len(asked.depths_mm)
-    repeats = (asked.passes_n * depths_n, 1)
+    x_mm, y_mm = (np.tile(one, (depths_n, 1)) for one in (one_x_mm, one_y_mm))
+    # Every second pass goes back along the lines, or where the tip is would tell which way it is pushed.
+    turned = [slice(None, None, -1 if pass_i % 2 else 1) for pass_i in range(asked.passes_n)]
     depth_mm = np.tile(np.repeat(np.array(asked.depths_mm), lines_n), asked.passes_n)
     return Plan(
         pass_i=np.repeat(np.arange(asked.passes_n, dtype=np.int32), depths_n * lines_n),
-        x_mm=np.tile(one_x_mm, repeats),
-        y_mm=np.tile(one_y_mm, repeats),
+        x_mm=np.concatenate([x_mm[:, way] for way in turned]),
+        y_mm=np.concatenate([y_mm[:, way] for way in turned]),
         depth_mm=np.repeat(depth_mm[:, None], stops_n, axis=1),
         tilt=np.zeros((len(depth_mm), 2)),
         labelled=True,

@@ -22,7 +22,8 @@ from pipeline.reporting.learning import (
 from pipeline.reporting.order import CONTROL, FAR_SDS, order_table, paired_table
 from pipeline.reporting.paper import TABLE_2
 from pipeline.reporting.readme import blocks_of
-from pipeline.reporting.tables import make_tables, to_markdown
+from pipeline.reporting.shown import to_markdown
+from pipeline.reporting.tables import make_tables
 
 
 def stat(mean: float, sd: float | None = 1.0, n: int = 6) -> dict:

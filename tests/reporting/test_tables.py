@@ -7,7 +7,9 @@ from pipeline.evaluation.metrics import METRICS
 from pipeline.reporting.numbers import add_up, compose, rounded
 from pipeline.reporting.paper import TABLE_2
 from pipeline.reporting.readme import fill
-from pipeline.reporting.tables import make_tables, show, to_markdown
+from pipeline.reporting.shown import show, to_markdown
+from pipeline.reporting.table1 import NOT_GIVEN, OURS
+from pipeline.reporting.tables import make_tables
 
 
 def card(question: str, fold: str, accuracy_pct: float, recipe: str = "paper") -> dict:
@@ -77,7 +79,11 @@ def test_accounts_add_up():
 
 def test_every_table_says_where_its_rows_come_from():
     for source in ("simulated", "recorded"):
-        for table in make_tables(numbers(source=source)).values():
+        tables = make_tables(numbers(source=source))
+        ours = tables.pop("table1")[OURS]  # the paper's own table, our column beside it
+        assert all(cell == NOT_GIVEN or cell.endswith(f", {source}") for cell in ours)
+        assert any(cell != NOT_GIVEN for cell in ours)
+        for table in tables.values():
             assert set(table["source"]) == {source}
 
 

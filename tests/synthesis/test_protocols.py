@@ -41,6 +41,18 @@ def test_each_next_line_is_dragged_the_other_way():
     np.testing.assert_array_equal(np.sign(steps_mm), np.where(np.arange(9) % 2 == 0, 1, -1))
 
 
+def test_every_second_pass_drags_the_same_lines_backwards():
+    one, two = plan_of(DRAG), plan_of(DRAG.model_copy(update={"passes_n": 3}))
+    n = len(one)
+    for name in ("x_mm", "y_mm"):
+        first, back, third = np.split(getattr(two, name), [n, 2 * n])
+        np.testing.assert_array_equal(first, getattr(one, name))
+        np.testing.assert_array_equal(back, first[:, ::-1])
+        np.testing.assert_array_equal(third, first)
+    np.testing.assert_array_equal(two.depth_mm, np.tile(one.depth_mm, (3, 1)))
+    np.testing.assert_array_equal(two.pass_i, np.repeat([0, 1, 2], n))
+
+
 def test_a_hand_pokes_325_times_in_order_along_lines_and_nobody_knows_where():
     plan = plan_of(HAND)
     assert len(plan) == 325  # paper section 5.2

@@ -8,6 +8,20 @@ from typing import Any, Protocol
 
 import pandas as pd
 
+from pipeline.reporting.experiments import (
+    ambient,
+    contacts,
+    drift,
+    dynamics,
+    flexible,
+    logs,
+    manual,
+    sensitivity,
+    shear,
+    sleeve,
+    variation,
+)
+
 
 class Part(Protocol):
     """What each module of an experiment offers."""
@@ -19,7 +33,19 @@ class Part(Protocol):
         """Draw its figures: SVG text by file name."""
 
 
-PARTS: dict[str, Part] = {}
+PARTS: dict[str, Part] = {
+    "variation": variation,
+    "drift": drift,
+    "shear": shear,
+    "manual": manual,
+    "flexible": flexible,
+    "sensitivity": sensitivity,
+    "logs": logs,
+    "sleeve": sleeve,
+    "contacts": contacts,
+    "ambient": ambient,
+    "dynamics": dynamics,
+}
 
 
 def experiment_tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from pipeline.reporting.figures import STYLE, svg
-from pipeline.reporting.paper import SLEEVE, SLEEVE_WORDS
+from pipeline.reporting.paper import SLEEVE, SLEEVE_SKIN, SLEEVE_WORDS
 from pipeline.reporting.shown import COLUMNS, scores, show, tabulate
 from pipeline.reporting.work_precision import COLOURS
 
@@ -84,11 +84,12 @@ def _line(name: str, one: Mapping[str, Any], source: str) -> dict[str, str]:
 
 
 def _set_up(numbers: Mapping[str, Any], source: str) -> pd.DataFrame:
+    printed = {"chips": str(SLEEVE["chips_n"]), "rate, Hz": f"{SLEEVE['rate_hz']:g}", "skin, mm": SLEEVE_SKIN}
     ours = {
         "chips": str(numbers["chips_n"]),
         "rate, Hz": f"{numbers['rate_hz']:.1f}",
         "skin, mm": "{:g} x {:g}".format(*numbers["area_mm"]),
     }
     return tabulate(
-        [{"what": what, "ours": one, "paper": SLEEVE[what], "source": source} for what, one in ours.items()]
+        [{"what": what, "ours": one, "paper": printed[what], "source": source} for what, one in ours.items()]
     )

@@ -6,7 +6,7 @@ import pytest
 
 from pipeline.reporting.experiments import flexible, manual, shear
 from pipeline.reporting.paper import FLEXIBLE, MANUAL, SHEAR
-from pipeline.reporting.tables import to_markdown
+from pipeline.reporting.shown import to_markdown
 from tests.reporting.test_work_precision import said
 
 

@@ -1,7 +1,7 @@
 import xml.etree.ElementTree as ET
 
 from pipeline.reporting.experiments.variation import figures, tables
-from pipeline.reporting.tables import to_markdown
+from pipeline.reporting.shown import to_markdown
 
 
 def numbers(skins: tuple[str, ...] = ("s0", "s1")) -> dict:
