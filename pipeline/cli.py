@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from pipeline import adding, io, plan, preparing
+from pipeline import adding, io, plan, preparing, tidying
 from pipeline.errors import ParamsError, ReskinError, complain
 from pipeline.params import modelled, read_scene, swept
 from pipeline.server import TrackingAway
@@ -224,6 +224,20 @@ def use(names: list[str]) -> None:
     """Let `dvc repro` run exactly these scenes."""
     plan.use(ROOT, names)
     typer.echo(f"dvc repro now runs: {', '.join(names)}")
+    if stale := tidying.left_over(ROOT, plan.check(ROOT)):
+        typer.echo(f"switched off since it ran: {', '.join(stale)}; `reskin scenes tidy` removes their files")
+
+
+@scenes.command()
+def tidy() -> None:
+    """Remove the files of questions that were switched off since they ran, of the scenes that run."""
+    stale = tidying.tidy(ROOT, plan.check(ROOT))
+    for stage, paths in stale.items():
+        typer.echo(
+            f"removed {stage}: {', '.join(str(path.relative_to(ROOT)) for path in paths) or 'no file of its own'}"
+        )
+    if not stale:
+        typer.echo("nothing is left over")
 
 
 @scenes.command()

@@ -25,6 +25,7 @@ from pipeline.questions import (
     POOLED_BY,
     STAGE_OF,
     STUDIED_BY,
+    STUDIES,
     SWEPT,
     WITH_SECTION,
     WITHOUT_SECTION,
@@ -245,6 +246,14 @@ def arms_of(scene: Scene) -> list[str]:
     """Name the stages that answer a scene's questions about learning."""
     asked = {STAGE_OF[question] for question in scene.questions if question in STAGE_OF}
     return [arm for arm in ARMS if arm in asked]
+
+
+def runs(scene: Scene, unit: str) -> bool:
+    """Tell whether a stage still runs for a scene, named as its cost is: `drift`, `simulate-wear`."""
+    stage, _, part = unit.partition("-")
+    if stage in {*ARMS, *EXPERIMENTS, *STUDIES}:
+        return stage in {*arms_of(scene), *scene.experiments, *(STUDIED_BY[question] for question in scene.studied)}
+    return not part or scene.simulate is None or part in scene.simulate.protocols
 
 
 def modelled(scene: Scene) -> list[str]:

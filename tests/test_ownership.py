@@ -24,7 +24,7 @@ HOMES = {
     r"optimizer\.step\(": {"pipeline/learning/train.py"},
     r"np\.random\.(?!Generator\b)|default_rng|\.manual_seed\(": {"pipeline/seeds.py"},
     r"\bimport serial|from serial": {"pipeline/capture/port.py"},
-    r"ruamel": {"pipeline/strict.py", "pipeline/plan.py", "pipeline/registry.py"},
+    r"ruamel": {"pipeline/strict.py", "pipeline/plan.py", "pipeline/registry.py", "pipeline/tidying.py"},
     r"\bimport torch|from torch": {
         "pipeline/learning/grid.py", "pipeline/learning/losses.py", "pipeline/learning/model.py",
         "pipeline/learning/train.py", "pipeline/learning/feed.py",

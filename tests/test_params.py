@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import ParamsError
-from pipeline.params import Scene, arms_of, modelled, read_params, read_scene, swept
+from pipeline.params import Scene, arms_of, modelled, read_params, read_scene, runs, swept
 from pipeline.strict import parse, read_yaml
 from tests.scenes import ADAPTATION, DRAWN_WITH, RECIPE, SECTIONS, TRAINING, asking, recorded
 
@@ -104,6 +104,21 @@ def test_an_experiment_that_is_switched_off_takes_its_section_and_its_captures_a
         parse(Scene, own, "ci.yaml")
     own["simulate"]["protocols"].pop("drag")
     parse(Scene, own, "ci.yaml")
+
+
+@pytest.mark.parametrize(
+    "unit", ["train_multi", "drift", "simulate-wear", "ingest_simulated-wear", "simulate", "report", "leave_out"]
+)
+def test_what_a_stage_cost_counts_as_long_as_its_question_is_asked(unit):
+    own = read_yaml(ROOT / "pipeline/scenes/ci.yaml")
+    assert runs(parse(Scene, own, "ci.yaml"), unit)
+    gone = ("drift", "variation")
+    own["questions"] = [question for question in own["questions"] if question not in (*gone, "left_out")]
+    own = {name: section for name, section in own.items() if name not in gone}
+    own["simulate"]["protocols"].pop("wear")
+    own["simulate"]["terms"].pop("ageing")
+    left = parse(Scene, own, "ci.yaml")
+    assert runs(left, unit) == (unit in ("train_multi", "simulate", "report"))
 
 
 def test_all_that_a_question_lacks_is_named_at_once():

@@ -68,8 +68,8 @@ def table1(data: Table1, measured: Mapping[str, str]) -> pd.DataFrame:
 def measured(numbers: Mapping[str, Any]) -> dict[str, str]:
     """Say what a scene measured of the table's rows, and on which kind of skins; of what it did not ask, nothing."""
     source = numbers["provenance"]["source"]
-    described = next(iter(numbers.get("described", {}).values()), {"over_skins": {}})
-    rate = described["over_skins"].get("rate_hz")
+    described = [*numbers.get("described", {}).values()]
+    rate = described[0]["over_skins"].get("rate_hz") if described else None
     words = {"Frequency": f"{rate['mean']:.4g} Hz"} if rate else {}
     if "sleeve" in numbers:
         own = numbers["sleeve"]

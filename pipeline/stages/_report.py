@@ -9,7 +9,7 @@ from pipeline import io
 from pipeline.evaluation.choice import choose
 from pipeline.learning.executors import device as trained_on
 from pipeline.learning.recipe import HEADLINE
-from pipeline.params import Scene, described_in, modelled, swept
+from pipeline.params import Scene, described_in, modelled, runs, swept
 from pipeline.provenance import SECONDS, code_version, device, read_costs
 from pipeline.reporting.learned import timed_learning
 from pipeline.reporting.numbers import answered, compose, rounded, runtime
@@ -47,7 +47,7 @@ def read_numbers(scene: str, asked: Scene, at: Places) -> tuple[dict[str, Any], 
     numbers |= {question: answer["numbers"] for question, answer in experiments.items()}
     studied = {question: io.read_json(at.answers / f"{question}.json") for question in asked.studied}
     took = _seconds(scene)
-    numbers |= answered(studied, runtime(cards, read_costs(COSTS / scene)), took)
+    numbers |= answered(studied, runtime(cards, _costs(scene, asked)), took)
     numbers["runtime"] |= timed_learning(numbers, took)
     return rounded(numbers), {question: answer["drawn"] for question, answer in experiments.items()}
 
@@ -56,7 +56,12 @@ def _provenance(scene: str, asked: Scene, cards: Cards) -> dict[str, Any]:
     known = {"scene": scene, "source": asked.source, "git": code_version(), "seed": asked.seed}
     known |= {"trained": ", ".join(sorted({card["git"] for card in cards}))}
     known |= {"device": f"{device()}, networks on {trained_on()}"}
-    return known | {"seconds": round(sum(cost["seconds"] for cost in read_costs(COSTS / scene).values()), 1)}
+    return known | {"seconds": round(sum(cost["seconds"] for cost in _costs(scene, asked).values()), 1)}
+
+
+def _costs(scene: str, asked: Scene) -> dict[str, dict[str, float]]:
+    """Read what each stage cost here; one whose question was switched off costs nothing any more."""
+    return {unit: cost for unit, cost in read_costs(COSTS / scene).items() if runs(asked, unit)}
 
 
 def _seconds(scene: str) -> dict[str, list[dict[str, Any]]]:

@@ -1,0 +1,64 @@
+"""What switched-off questions left behind. In: dvc.lock, the plan. Out: stages and their files, removed when told.
+
+Of scenes that run only: what another scene made may have taken hours, and it may run again. Refuses to know what a
+file holds.
+"""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from ruamel.yaml import YAML
+
+from pipeline import io
+from pipeline.params import Params
+from pipeline.plan import scene_names
+from pipeline.strict import read_yaml
+
+LOCK = "dvc.lock"
+
+
+def left_over(root: Path, params: Params) -> dict[str, list[Path]]:
+    """List stages that ran and are not planned any more, and the files that only they wrote, by stage."""
+    if not (root / LOCK).exists():
+        return {}
+    stages: Mapping[str, Any] = read_yaml(root / LOCK).get("stages", {})
+    planned = {f"{stage}@{key}" for stage, keys in params.stages.model_dump().items() for key in keys}
+    kept = {path for name, stage in stages.items() if name in planned for path in _outs(stage)}
+    known = scene_names(root)
+    return {
+        name: [root / path for path in _outs(stage) if not _touches(path, kept)]
+        for name, stage in stages.items()
+        if name not in planned and _scene_of(name, known) in params.scenes
+    }
+
+
+def tidy(root: Path, params: Params) -> dict[str, list[Path]]:
+    """Remove what is left over, and forget its stages; give what was removed."""
+    stale = left_over(root, params)
+    for paths in stale.values():
+        for path in paths:
+            io.remove(path)
+    if stale:
+        yaml = YAML()
+        document = yaml.load((root / LOCK).read_text(encoding="utf-8"))
+        for name in stale:
+            del document["stages"][name]
+        with io.replacing(root / LOCK) as temporary, temporary.open("w", encoding="utf-8") as stream:
+            yaml.dump(document, stream)
+    return stale
+
+
+def _outs(stage: Mapping[str, Any]) -> list[Path]:
+    return [Path(out["path"]) for out in stage.get("outs", [])]
+
+
+def _touches(path: Path, others: Iterable[Path]) -> bool:
+    """Tell whether a path is one of others, lies in one or holds one."""
+    return any(path == one or path in one.parents or one in path.parents for one in others)
+
+
+def _scene_of(stage: str, known: Iterable[str]) -> str:
+    """Name the scene of `stage@scene` or `stage@scene-part`: the longest name that fits."""
+    key = stage.partition("@")[2]
+    return max((one for one in known if key == one or key.startswith(f"{one}-")), key=len, default="")

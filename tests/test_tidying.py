@@ -1,0 +1,75 @@
+"""What a switched-off question left is found and removed; all else stays: other scenes' results, DVC's own words."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+from ruamel.yaml import YAML
+
+from pipeline import plan, tidying
+from tests.scenes import asking
+from tests.test_plan import EMPTY, checkout
+
+WRITTEN = {
+    "drift@one": "data/answers/one/drift.json",
+    "train_multi@one": "data/models/one/train_multi",
+    "simulate@one-gone": "data/raw/one-gone",
+    "drift@two": "data/answers/two/drift.json",
+    "split@one": "data/folds/one.json",
+}
+
+
+@pytest.fixture
+def root(tmp_path) -> Path:
+    """Scene one ran with drift and a protocol `gone`, and asks lobo alone now; scene two ran once, and does not run."""
+    folder = checkout(tmp_path / "checkout", EMPTY)
+    plan.use(folder, ["one"])
+    for path in WRITTEN.values():
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        (folder / path).write_text("made")
+    stages = {name: {"cmd": "x", "outs": [{"path": path}]} for name, path in WRITTEN.items()}
+    with (folder / tidying.LOCK).open("w") as stream:
+        YAML().dump({"schema": "2.0", "stages": stages}, stream)
+    return folder
+
+
+def test_what_a_question_left_is_named_with_its_files(root):
+    assert tidying.left_over(root, plan.check(root)) == {
+        "drift@one": [root / WRITTEN["drift@one"]],
+        "simulate@one-gone": [root / WRITTEN["simulate@one-gone"]],
+    }
+
+
+def test_tidying_removes_that_and_nothing_else(root):
+    tidying.tidy(root, plan.check(root))
+    there = {name for name, path in WRITTEN.items() if (root / path).exists()}
+    assert there == {"train_multi@one", "drift@two", "split@one"}
+    lock = YAML(typ="safe").load((root / tidying.LOCK).read_text())
+    assert set(lock["stages"]) == there
+    assert lock["schema"] == "2.0"
+    assert tidying.left_over(root, plan.check(root)) == {}
+
+
+def test_a_file_that_a_planned_stage_writes_too_stays(root):
+    lock = YAML(typ="safe").load((root / tidying.LOCK).read_text())
+    lock["stages"]["drift@one"]["outs"] = [{"path": "data/models/one"}]  # holds what train_multi writes
+    with (root / tidying.LOCK).open("w") as stream:
+        YAML().dump(lock, stream)
+    assert tidying.left_over(root, plan.check(root))["drift@one"] == []
+
+
+def test_a_scene_whose_name_begins_like_another_is_its_own(root):
+    shutil.copy(root / plan.SCENES / "one.yaml", root / plan.SCENES / "one-gone.yaml")
+    assert set(tidying.left_over(root, plan.check(root))) == {"drift@one"}
+
+
+def test_a_question_that_is_asked_leaves_nothing_over(root):
+    with (root / plan.SCENES / "one.yaml").open("w") as stream:
+        YAML().dump(asking("lobo", "drift"), stream)
+    plan.use(root, ["one"])
+    assert set(tidying.left_over(root, plan.check(root))) == {"simulate@one-gone"}
+
+
+def test_a_checkout_that_never_ran_has_nothing_over(root):
+    (root / tidying.LOCK).unlink()
+    assert tidying.left_over(root, plan.check(root)) == tidying.tidy(root, plan.check(root)) == {}
