@@ -5,23 +5,27 @@ import os
 import signal
 import subprocess
 import time
+from base64 import b64encode
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
+from ruamel.yaml import YAML
 
 from pipeline import io
 from pipeline.learning.standardise import Scaler
+from pipeline.questions import EXPERIMENTS
 from tests.stages.checkout import ENVIRONMENT, copy_checkout, run
 
 LEARNING = (
     "train_single", "train_multi", "train_triplet", "adapt", "sweep_pokes", "sweep_sensors", "train_classical",
     "few_labels", "audit",
 )  # fmt: skip
-pytestmark = pytest.mark.timeout(420)
+pytestmark = pytest.mark.timeout(600)
 
 
 @pytest.fixture(scope="module")
@@ -85,12 +89,43 @@ def test_every_question_about_many_skins_is_answered_on_the_same_test_rows(story
     assert "<svg" in (story / "reports/ci/runtime/training.svg").read_text()
 
 
+def test_every_experiment_of_the_paper_is_answered_shown_and_found_by_the_checklist(story):
+    numbers = json.loads((story / "reports/ci/numbers.json").read_text())
+    assert set(EXPERIMENTS) <= set(numbers)
+    for policy in ("initial", "regular", "each"):
+        assert [row["contacts_n"] for row in numbers["drift"][policy]] == [100, 200]
+        assert all({"accuracy_pct", "mse_f_N2"} <= set(row) for row in numbers["drift"][policy])
+    assert all("mean" in numbers["shear"][name] for name in ("mse_xy_mm2", "mse_fxy_N2", "mse_fz_N2"))
+    for question, parts in {"manual": ("before", "after", "control"), "flexible": ("before", "after")}.items():
+        assert all("mean" in numbers[question][part]["accuracy_pct"] for part in parts)
+    assert {"by_indentation", "by_pass"} <= set(numbers["single_sensor"])
+    tables = story / "reports/ci/tables"
+    assert {file.stem for file in tables.glob("*.md")} >= set(EXPERIMENTS) | {"table1", "checklist", "single_sensor"}
+    assert "not asked in this scene" not in (tables / "checklist.md").read_text()
+    page = (story / "reports/ci/index.html").read_text()
+    figures = sorted((story / "reports/ci/figures").glob("*.svg"))
+    assert {file.stem for file in figures} >= set(EXPERIMENTS) - {"drift", "variation", "manual"}
+    for figure in figures:
+        assert b64encode(figure.read_bytes()).decode() in page  # the very same figure
+
+
+def test_a_log_of_a_card_is_predicted_by_a_model_of_the_scene(story):
+    model = min((story / "data/models/ci/train_multi").glob("lobo.paper.b0.*.safetensors"))
+    (log,) = (story / "data/raw/ci-log").glob("*/log.csv")
+    run(story, "reskin", "predict", str(log), "--model", str(model), "--out", "contacts.csv")
+    found, readings = (pd.read_csv(file) for file in (story / "contacts.csv", log))
+    assert len(found) == len(readings)
+    contact = found["contact"].astype(bool)
+    assert 0.1 < contact.mean() < 0.9  # a walk: quiet, steps and swings
+    assert np.isfinite(found.loc[contact, ["x_mm", "y_mm", "F_N"]]).all(axis=None)
+
+
 def test_the_physics_is_answered_for_and_says_that_it_is_simulated(story):
     numbers = json.loads((story / "reports/ci/numbers.json").read_text())
     assert {row["term"] for row in numbers["left_out"] if row["done"] == "left out"} >= {"ageing", "temperature"}
     rows = numbers["runtime"]["quadratures"] + numbers["runtime"]["integrators"]
     assert all(("median_s" in row) == (row["failure"] is None and row["method"] != "reference") for row in rows)
-    assert set(numbers["described"]) == {"grid", "wear", "flexible", "hand", "drag"}
+    assert set(numbers["described"]) == {"grid"}
     for name in ("left_out", "skins"):
         assert "simulated" in (story / f"reports/ci/tables/{name}.md").read_text()
     assert "<svg" in (story / "reports/ci/runtime/quadratures.svg").read_text()
@@ -143,7 +178,7 @@ def test_training_again_from_nothing_gives_the_same_lock_file(story):
     before = (story / "dvc.lock").read_text()
     for file in (story / ".reskin/cells").glob("*.safetensors"):
         file.unlink()  # else finished trainings would be reused, and prove nothing
-    stages = [f"{name}@ci" for name in ("simulate", "ingest_simulated", "split", *LEARNING, "report")]
+    stages = [f"{name}@ci" for name in ("simulate", "ingest_simulated", "split", *LEARNING, *EXPERIMENTS, "report")]
     run(story, "dvc", "repro", "--force", "--single-item", *stages)
     assert (story / "dvc.lock").read_text() == before
 
@@ -201,3 +236,23 @@ def test_a_parameter_that_nobody_knows_is_one_sentence(story):
     said = done.stdout + done.stderr
     assert "split.random_repeets_n must be a known parameter; got 2" in said
     assert "Traceback" not in said
+
+
+def test_an_experiment_that_is_switched_off_leaves_no_stage_no_file_and_no_cost(story):
+    scene = story / "pipeline/scenes/ci.yaml"
+    own = YAML(typ="safe").load(scene.read_text())
+    own["questions"].remove("sleeve")
+    own.pop("sleeve")
+    for part in ("boards", "protocols"):
+        own["simulate"][part].pop("sleeve")
+    with scene.open("w") as stream:
+        YAML().dump(own, stream)
+    assert "sleeve@ci" in run(story, "reskin", "scenes", "use", "ci").stdout
+    assert "removed sleeve@ci: data/answers/ci/sleeve.json" in run(story, "reskin", "scenes", "tidy").stdout
+    assert not any("sleeve" in stage for stage in run(story, "dvc", "stage", "list", "--name-only").stdout.split())
+    run(story, "dvc", "repro", "--single-item", "report@ci")
+    assert [*story.glob("data/**/*sleeve*"), *story.glob("reports/ci/**/*sleeve*")] == []
+    numbers = json.loads((story / "reports/ci/numbers.json").read_text())
+    assert "sleeve" not in numbers
+    assert not any("sleeve" in unit for unit in numbers["runtime"]["stages"])
+    assert not any("sleeve" in stage for stage in YAML(typ="safe").load((story / "dvc.lock").read_text())["stages"])
