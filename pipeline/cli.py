@@ -171,8 +171,8 @@ def publish() -> None:
     for scene in plan.check(ROOT).scenes:
         asked, answers = read_scene(plan.scene_file(ROOT, scene)), ROOT / "data/answers" / scene
         arms = {arm: ROOT / "data/models" / scene / arm for arm in modelled(asked)}
-        missing = [path for path in [*arms.values(), *(answers / f"{one}.json" for one in swept(asked).values())]
-                   if not path.exists()]  # fmt: skip
+        written = [answers / f"{stage}.json" for stage in (*swept(asked).values(), *asked.experiments)]
+        missing = [path for path in (*arms.values(), *written) if not path.exists()]
         if missing:
             typer.echo(f"{scene}: {missing[0].relative_to(ROOT)} is not there yet; run dvc repro first")
             continue

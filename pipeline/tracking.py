@@ -29,14 +29,14 @@ def tracking_uri(root: Path) -> str:
     return server_uri() or f"sqlite:///{(root / STORE).resolve()}"
 
 
-# of a sweep: its points, each the name of its curve, its step (pokes, skins) and its means
+# of a sweep or an experiment: its points, each the name of its curve, its step (pokes, skins, contacts), its means
 Curves = Mapping[str, Sequence[tuple[str, int, Mapping[str, float]]]]
 
 
 def publish(arms: Mapping[str, Path], curves: Curves, reports: Path, *, scene: str, root: Path) -> dict[str, int]:
     """Write every training of a scene to MLflow once, and its report; `arms` maps stage to models.
 
-    A sweep is one run whose metrics go over its steps: hundreds of children would hide the others.
+    A sweep or an experiment is one run whose metrics go over its steps: hundreds of children would hide the others.
     Returns counts of new, kept and superseded runs; raises `TrackingAway` if the server does not answer.
     """
     uri = tracking_uri(root)
@@ -149,16 +149,20 @@ def _log(client: Any, run_id: str, card: dict[str, Any]) -> None:
     parts = (("", "all"), ("registered_", "registered"))
     scores = [Metric(f"{p}{name}", v, 0, 0) for p, part in parts for name, v in card["scores"][part].items()]
     client.log_batch(run_id, metrics=scores, params=parameters)
-    for start in range(0, len(curve), 1000):  # MLflow takes at most 1000 metrics a call
-        client.log_batch(run_id, metrics=curve[start : start + 1000])
+    _log_all(client, run_id, curve)
 
 
 def _publish_curve(client: Any, run_id: str, points: Sequence[tuple[str, int, Mapping[str, float]]]) -> None:
     from mlflow.entities import Metric
 
     metrics = [Metric(f"{curve}.{name}", value, 0, step) for curve, step, own in points for name, value in own.items()]
-    client.log_batch(run_id, metrics=metrics)
+    _log_all(client, run_id, metrics)
     client.set_terminated(run_id)
+
+
+def _log_all(client: Any, run_id: str, metrics: Sequence[Any]) -> None:
+    for start in range(0, len(metrics), 1000):  # MLflow takes at most 1000 metrics a call
+        client.log_batch(run_id, metrics=metrics[start : start + 1000])
 
 
 def _publish_report(client: Any, experiment_id: str, scene: str, reports: Path) -> str:
@@ -173,8 +177,7 @@ def _publish_report(client: Any, experiment_id: str, scene: str, reports: Path) 
     found = _find(client, experiment_id, "report", key)
     run_id = _open_parent(client, experiment_id, "report", scene, key)
     if found is None:
-        for start in range(0, len(metrics), 1000):  # MLflow takes at most 1000 metrics a call
-            client.log_batch(run_id, metrics=metrics[start : start + 1000])
+        _log_all(client, run_id, metrics)
     client.log_artifacts(run_id, str(reports))  # again: words on the page and costs may be new
     client.set_terminated(run_id)
     return key

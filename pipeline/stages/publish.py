@@ -7,7 +7,7 @@ from pipeline.params import Scene, modelled, read_scene, swept
 from pipeline.reporting.learned import curves_of
 from pipeline.server import TrackingAway
 from pipeline.stages._run import run, say
-from pipeline.tracking import Curves
+from pipeline.tracking import Curves, metrics_of
 from pipeline.tracking import publish as write
 
 
@@ -22,10 +22,16 @@ def publish(scene: str, settings: Path, models: Path, answers: Path, reports: Pa
 
 
 def read_curves(asked: Scene, answers: Path) -> Curves:
-    """Read the points of every sweep, as curves by stage."""
+    """Read the points of every sweep and the numbers of every experiment, as curves by stage."""
     stages = swept(asked)
     points = {question: io.read_json(answers / f"{stage}.json") for question, stage in stages.items()}
-    return {stages[question]: rows for question, rows in curves_of(points).items()}
+    curves: dict[str, list[tuple[str, int, dict[str, float]]]]
+    curves = {stages[question]: rows for question, rows in curves_of(points).items()}
+    for question in asked.experiments:
+        numbers = io.read_json(answers / f"{question}.json")["numbers"]
+        named = [(name.rpartition("."), value, step) for name, value, step in metrics_of({question: numbers})]
+        curves[question] = [(head, step, {tail: value}) for (head, _, tail), value, step in named]
+    return curves
 
 
 if __name__ == "__main__":
