@@ -25,6 +25,7 @@ LEARNING = (
     "train_single", "train_multi", "train_triplet", "adapt", "sweep_pokes", "sweep_sensors", "train_classical",
     "few_labels", "audit",
 )  # fmt: skip
+DRAWING = ("drift", "manual", "contacts", "ambient")  # experiments that draw at random in ways of their own
 pytestmark = pytest.mark.timeout(600)
 
 
@@ -178,7 +179,7 @@ def test_training_again_from_nothing_gives_the_same_lock_file(story):
     before = (story / "dvc.lock").read_text()
     for file in (story / ".reskin/cells").glob("*.safetensors"):
         file.unlink()  # else finished trainings would be reused, and prove nothing
-    stages = [f"{name}@ci" for name in ("simulate", "ingest_simulated", "split", *LEARNING, *EXPERIMENTS, "report")]
+    stages = [f"{name}@ci" for name in ("simulate", "ingest_simulated", "split", *LEARNING, *DRAWING, "report")]
     run(story, "dvc", "repro", "--force", "--single-item", *stages)
     assert (story / "dvc.lock").read_text() == before
 
@@ -226,18 +227,6 @@ def test_a_dead_tracking_server_is_said_and_costs_no_result(story):
     assert time.monotonic() - start_s < 20  # not MLflow's own minutes; two cores may be busy
 
 
-def test_a_parameter_that_nobody_knows_is_one_sentence(story):
-    scene = story / "pipeline/scenes/ci.yaml"
-    before = scene.read_text()
-    scene.write_text(before.replace("random_repeats_n:", "random_repeets_n:"))
-    done = run(story, "dvc", "repro", check=False)
-    scene.write_text(before)
-    assert done.returncode != 0
-    said = done.stdout + done.stderr
-    assert "split.random_repeets_n must be a known parameter; got 2" in said
-    assert "Traceback" not in said
-
-
 def test_an_experiment_that_is_switched_off_leaves_no_stage_no_file_and_no_cost(story):
     scene = story / "pipeline/scenes/ci.yaml"
     own = YAML(typ="safe").load(scene.read_text())
@@ -256,3 +245,15 @@ def test_an_experiment_that_is_switched_off_leaves_no_stage_no_file_and_no_cost(
     assert "sleeve" not in numbers
     assert not any("sleeve" in unit for unit in numbers["runtime"]["stages"])
     assert not any("sleeve" in stage for stage in YAML(typ="safe").load((story / "dvc.lock").read_text())["stages"])
+
+
+def test_a_parameter_that_nobody_knows_is_one_sentence(story):
+    scene = story / "pipeline/scenes/ci.yaml"
+    before = scene.read_text()
+    scene.write_text(before.replace("random_repeats_n:", "random_repeets_n:"))
+    done = run(story, "dvc", "repro", check=False)
+    scene.write_text(before)
+    assert done.returncode != 0
+    said = done.stdout + done.stderr
+    assert "split.random_repeets_n must be a known parameter; got 2" in said
+    assert "Traceback" not in said
