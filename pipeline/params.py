@@ -113,17 +113,21 @@ class Scene(Strict):
 
     @model_validator(mode="after")
     def _experiments_have_what_they_need(self) -> "Scene":
-        for question in sorted(WITH_SECTION):
-            if (getattr(self, question) is not None) != (question in self.questions):
-                raise ValueError(f"section {question} stands in a scene if and only if it asks {question}")
+        there = {question for question in WITH_SECTION if getattr(self, question) is not None}
+        if surplus := sorted(there - set(self.questions)):
+            raise ValueError(f"sections {surplus} stand there, but questions does not hold them: take them out")
+        if lacking := sorted(WITH_SECTION & set(self.questions) - there):
+            raise ValueError(f"questions {lacking} need sections of their names: write them, or do not ask")
         if self.simulate is None:
             if beyond := sorted(set(self.experiments) - OF_RECORDED):
                 raise ValueError(f"questions {beyond} are asked of simulated scenes only, so far")
             return self
         needed = {MAIN_PROTOCOL} | {EXPERIMENTS[question] for question in self.experiments} - {None}
         if needed != set(self.simulate.protocols):
-            have, want = sorted(self.simulate.protocols), sorted(map(str, needed))
-            raise ValueError(f"simulate.protocols holds exactly what the questions need, {want}; it holds {have}")
+            have, want = set(self.simulate.protocols), set(map(str, needed))
+            wrong = [f"lacks {sorted(want - have)}"] * bool(want - have)
+            wrong += [f"holds {sorted(have - want)}, of which nothing is asked"] * bool(have - want)
+            raise ValueError(f"simulate.protocols holds exactly what the questions need; it {' and '.join(wrong)}")
         return self
 
     @property
