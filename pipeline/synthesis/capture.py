@@ -23,10 +23,18 @@ from pipeline.synthesis.felt import Felt, Terms, feel
 from pipeline.synthesis.frames import read_frames, switch_on
 from pipeline.synthesis.plans import Plan
 from pipeline.synthesis.pressing import depths_under
-from pipeline.synthesis.protocols import SKIN_MM, Grid, Hand, Protocol, Walk, make_plan
+from pipeline.synthesis.protocols import SKIN_MM, Drag, Grid, Hand, Protocol, Walk, make_plan
 from pipeline.synthesis.rig import Rig, chunks, draw_clock, misplace, probe_log, suit, timeline
 
 MAIN = "grid"  # its captures bear the names of their skins alone
+# The protocols that questions are asked of, and the kind that each question can read.
+KINDS: dict[str, str] = {
+    MAIN: "grid", "wear": "grid", "flexible": "grid", "drag": "drag", "hand": "hand", "sleeve": "scatter",
+    "glass": "load", "press": "press", "log": "walk",
+}  # fmt: skip
+ON_MAIN_BOARDS = ("wear", "drag", "hand", "glass", "press", "log")  # compared with, or read by networks of, these
+ON_OTHER_BOARDS = ("flexible",)
+OF_ONE_SKIN = ("wear", "glass", "press", "log")  # a question about the protocol reads one capture
 # What is drawn for a capture, each by a name of its own: a term more leaves all other draws as they are.
 PARTS = ("plan", "robot", "drift", "chips", "noise", "warmth", "port", "probe")
 Count = Annotated[int, Field(ge=1, le=1000)]
@@ -88,6 +96,22 @@ class Synthesis(Strict):
             raise ValueError(f"protocols holds a grid named {MAIN}")
         if self.main_boards.skin_mm != SKIN_MM:  # the studies of physics are of the authors' skin
             raise ValueError(f"skin_mm of the boards of protocol {MAIN} is {list(SKIN_MM)}")
+        return self
+
+    @model_validator(mode="after")
+    def _protocols_suit_their_questions(self) -> "Synthesis":
+        for name, protocol in self.protocols.items():
+            kind, boards, skins_n = KINDS.get(name, protocol.kind), protocol.boards, protocol.skins_n
+            if protocol.kind != kind:
+                raise ValueError(f"protocol {name}: kind is {kind}, which its question reads, not {protocol.kind}")
+            if isinstance(protocol, Drag) and "friction" not in protocol.terms:
+                raise ValueError(f"protocol {name}: terms of a drag hold friction, without which there is no shear")
+            if name in ON_MAIN_BOARDS and boards != self.main.boards:
+                raise ValueError(f"protocol {name}: boards is {self.main.boards}, as of {MAIN}, not {boards}")
+            if name in ON_OTHER_BOARDS and boards == self.main.boards:
+                raise ValueError(f"protocol {name}: boards is another kind than that of {MAIN}, not {boards} too")
+            if name in OF_ONE_SKIN and skins_n != 1:
+                raise ValueError(f"protocol {name}: skins_n is 1, as its question reads one skin, not {skins_n}")
         return self
 
     @property

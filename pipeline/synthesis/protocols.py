@@ -65,7 +65,8 @@ class Load(_Pressed):
     """A glass that is filled step by step at the skin's middle (section 6); its foot taken as the rig's round tip."""
 
     kind: Literal["load"]
-    passes_n: Count  # fillings
+    # Fillings: a direction is fitted on one half of them, and tested on the other.
+    passes_n: Annotated[int, Field(ge=2, le=100_000)]
     force_max_N: Annotated[float, Field(gt=0, le=100)]
     step_N: Annotated[float, Field(gt=0, le=100)]
 

@@ -254,3 +254,51 @@ def test_a_scene_that_contradicts_itself_is_refused(protocol, changes, sentence)
 def test_a_depth_that_the_skin_cannot_take_is_refused():
     with pytest.raises(ParamsError, match="depth must be"):
         capture_of(with_protocol("deep", GRID | {"depths_mm": (2.5,)}), "deep")
+
+
+FLEXIBLE = SECTIONS["boards"] | {"flexible": SECTIONS["boards"]["rigid"] | {"letter": "f"}}
+DRAG = {
+    "kind": "drag", "boards": "rigid", "skins_n": 1, "passes_n": 1, "depths_mm": (0.6,), "step_mm": 2.0,
+    "terms": ["friction"],
+}  # fmt: skip
+FRICTION = {"boards": FLEXIBLE, "terms": {"friction": {"coefficient": 0.8}}}
+LOAD = {"kind": "load", "boards": "rigid", "skins_n": 1, "passes_n": 2, "force_max_N": 1.0, "step_N": 0.5, "terms": []}
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("wear", "grid"), ("flexible", "grid"), ("drag", "drag"), ("hand", "hand"), ("sleeve", "scatter"),
+        ("glass", "load"), ("press", "press"), ("log", "walk"),
+    ],
+)  # fmt: skip
+def test_a_protocol_of_a_kind_that_its_question_cannot_read_is_refused(name, kind):
+    other = HAND if kind == "grid" else GRID | {"skins_n": 1}
+    sentence = f"test: protocol {name}: kind is {kind}, which its question reads, not {other['kind']}. "
+    with pytest.raises(ParamsError, match=sentence) as refused:
+        with_protocol(name, other)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "protocol", "changes", "sentence"),
+    [
+        ("wear", GRID | {"skins_n": 2}, {}, "protocol wear: skins_n is 1, .*, not 2"),
+        ("glass", LOAD | {"skins_n": 2}, {}, "protocol glass: skins_n is 1, .*, not 2"),
+        ("glass", LOAD | {"passes_n": 1}, {}, "protocols.glass.passes_n must be greater than or equal to 2; got 1"),
+        ("glass", LOAD | {"boards": "flexible"}, {"boards": FLEXIBLE}, "protocol glass: boards is rigid, .* flexible"),
+        ("hand", HAND | {"boards": "flexible"}, {"boards": FLEXIBLE}, "protocol hand: boards is rigid, .* flexible"),
+        ("drag", DRAG | {"boards": "flexible"}, FRICTION, "protocol drag: boards is rigid, as of grid, not flexible"),
+        ("drag", DRAG | {"terms": []}, {}, "protocol drag: terms of a drag hold friction"),
+        ("flexible", GRID, {"boards": FLEXIBLE}, "protocol flexible: boards is another kind .*, not rigid too"),
+    ],
+)
+def test_a_protocol_that_its_question_cannot_be_asked_of_is_refused(name, protocol, changes, sentence):
+    with pytest.raises(ParamsError, match=sentence):
+        with_protocol(name, protocol, **changes)
+
+
+def test_protocols_that_suit_their_questions_are_taken():
+    assert with_protocol("drag", DRAG, **FRICTION).protocols["drag"].skins_n == 1
+    assert with_protocol("glass", LOAD).protocols["glass"].kind == "load"
+    assert with_protocol("flexible", GRID | {"boards": "flexible"}, boards=FLEXIBLE).protocols["flexible"].skins_n == 4
