@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int32
-from scipy.stats import rankdata
+from scipy.stats import norm, rankdata
 
 from pipeline.errors import SchemaError, complain
 
@@ -55,11 +55,12 @@ def answer_of(
         "held_out_n": len(held),
         "readings_per_stop_n": db_uT.shape[2],
         "step_N": step_N,
+        "told_pct": 100 * TOLD_SHARE,
         "range_N": float(weight_N[-1]),
         "smallest_step_N": steps_N,
         "smallest_step_mL": {name: value_N / WATER_N_PER_ML for name, value_N in steps_N.items()},
         "by_length_N": _known({name: smallest_step_N(share, step_N) for name, share in by_length.items()}),
-        "monotonic": monotonic(response_uT),
+        "monotonic": monotonic(along_uT.mean(axis=2), weight_N),
         "noise_uT": float(np.sqrt(along_uT.var(axis=2, ddof=1).mean())),
         "gain_uT_per_N": float(np.polyfit(weight_N, response_uT, 1)[0]),
     }
@@ -103,8 +104,30 @@ def smallest_step_N(share: Float[np.ndarray, " d"], step_N: float) -> float | No
     return None if last_i == len(share) - 1 else step_N * (last_i + 2)
 
 
-def monotonic(response_uT: Float64[np.ndarray, " p"]) -> dict[str, Any]:
-    """Tell whether the mean response rises at every step, how often it does not, and its rank correlation."""
-    falls_n = int((np.diff(response_uT) <= 0).sum())
-    ranks = np.corrcoef(np.arange(len(response_uT)), rankdata(response_uT))[0, 1]
-    return {"holds": falls_n == 0, "falls_n": falls_n, "spearman": float(ranks)}
+def monotonic(response_uT: Float64[np.ndarray, "n p"], weight_N: Float64[np.ndarray, " p"]) -> dict[str, Any]:
+    """Tell whether the fillings' mean response rises from every weight to the one `step_N` above it.
+
+    The step is the least of whole ones whose mean rise noise hides from one filling in no more than 5 % of cases:
+    pouring finer does not make a skin fall. It comes from noise and gain, not from the order found, or a fall would
+    lengthen the step until it hides. Where no step is as long, no rise is shown, and there is no `step_N`.
+    """
+    mean_uT, rise_uT = response_uT.mean(axis=0), np.diff(response_uT, axis=1)
+    noise_uT = float(np.sqrt(rise_uT.var(axis=0, ddof=1).mean())) if len(rise_uT) > 1 else np.nan  # of one rise
+    gain_uT = float(np.polyfit(np.arange(len(mean_uT)), mean_uT, 1)[0])  # a step
+    found: dict[str, Any] = {
+        "holds": False,
+        "falls_n": 0,
+        "pairs_n": 0,
+        "spearman": float(np.corrcoef(weight_N, rankdata(mean_uT))[0, 1]),
+        "neighbours": {"falls_n": int((np.diff(mean_uT) <= 0).sum())},
+    }
+    needed = norm.ppf(TOLD_SHARE) * noise_uT / gain_uT if gain_uT > 0 else np.inf
+    if needed <= len(mean_uT) - 1:
+        steps_n = max(int(np.ceil(needed)), 1)
+        falls_n, pairs_n = int((mean_uT[steps_n:] <= mean_uT[:-steps_n]).sum()), len(mean_uT) - steps_n
+        step_N = steps_n * float(weight_N[1] - weight_N[0])
+        found |= {"holds": falls_n == 0, "falls_n": falls_n, "pairs_n": pairs_n, "step_N": step_N}
+    if noise_uT > 0:  # of an even, straight rise with the standard error of a mean one
+        z = -gain_uT / (noise_uT / np.sqrt(len(rise_uT)))
+        found["neighbours"]["expected_falls_n"] = float(rise_uT.shape[1] * norm.cdf(z))
+    return found

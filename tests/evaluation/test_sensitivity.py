@@ -6,10 +6,17 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.stats import norm, spearmanr
+from scipy.stats import linregress, norm, spearmanr
 
 from pipeline.errors import SchemaError
-from pipeline.evaluation.sensitivity import answer_of, direction, levels_of, monotonic, smallest_step_N, told_apart
+from pipeline.evaluation.sensitivity import (
+    answer_of,
+    direction,
+    levels_of,
+    monotonic,
+    smallest_step_N,
+    told_apart,
+)
 from pipeline.seeds import rng_for
 
 STEP_N = 0.02
@@ -82,14 +89,62 @@ def test_a_skin_that_tells_nothing_has_no_smallest_step():
     numbers, _ = answer_of(fillings(noise_uT=1e6), WEIGHT_N)
     assert numbers["smallest_step_N"] == numbers["smallest_step_mL"] == {}
     assert not numbers["monotonic"]["holds"]
+    assert "step_N" not in numbers["monotonic"]
 
 
-@given(st.lists(st.integers(-5, 5), min_size=3, max_size=20).filter(lambda values: len(set(values)) > 1))
-def test_falls_are_counted_and_ranks_correlate_as_scipy_says(values):
-    found = monotonic(np.array(values, float))
-    assert found["falls_n"] == sum(after <= before for before, after in pairwise(values))
-    assert found["holds"] == (found["falls_n"] == 0)
+def alike(values, spread):
+    """Two fillings whose mean is `values`, told in steps of 0.1 N; every rise differs by as much."""
+    wobble = spread / 2 * (-1.0) ** np.arange(len(values)) / 2
+    return np.array([values + wobble, values - wobble]), 0.1 * np.arange(len(values))
+
+
+@given(
+    st.lists(st.integers(-5, 5), min_size=4, max_size=20).filter(lambda values: values[-1] > values[0]),
+    st.floats(0.1, 5.0),
+)
+def test_falls_are_counted_at_a_step_that_stands_out_of_noise_and_ranks_correlate_as_scipy_says(values, spread):
+    found = monotonic(*alike(np.array(values, float), spread))
+    gain = linregress(np.arange(len(values)), values).slope  # a step
+    noise = spread / np.sqrt(2)  # two rises, `spread` apart
+    steps_n = int(np.ceil(1.6448536 * noise / gain)) if gain > 0 else len(values)
+    if steps_n < len(values):
+        pairs = list(zip(values, values[steps_n:], strict=False))
+        assert found["falls_n"] == sum(after <= before for before, after in pairs)
+        assert found["pairs_n"] == len(pairs)
+        assert found["step_N"] == pytest.approx(0.1 * steps_n)
+    else:
+        assert "step_N" not in found
+    assert found["holds"] == (found["falls_n"] == 0 and "step_N" in found)
+    assert found["neighbours"]["falls_n"] == sum(after <= before for before, after in pairwise(values))
     assert found["spearman"] == pytest.approx(spearmanr(np.arange(len(values)), values).statistic)
+
+
+def test_a_skin_is_judged_alike_however_finely_the_glass_is_filled():
+    fine_N = 0.002 * np.arange(251)  # up to 0.5 N, as WEIGHT_N, ten times as fine
+    noise = NOISE_uT * rng_for(0, "fine").standard_normal((40, len(fine_N), 5, 3))
+    fine = (GAIN_uT_PER_N * fine_N[:, None, None] * ALONG + noise).astype(np.float32)
+    pourings = ((fine, fine_N), (fillings(), WEIGHT_N))
+    found, coarse = (answer_of(uT, weight_N)[0]["monotonic"] for uT, weight_N in pourings)
+    assert found["neighbours"]["falls_n"] > 0  # noise of a mean rise: 5 sqrt(2 / 100) = 0.7 uT, as much as a step's 0.6
+    assert found["holds"]
+    assert coarse["holds"]
+    assert found["step_N"] <= coarse["step_N"] == pytest.approx(0.02)
+
+
+def test_a_response_that_falls_by_more_than_is_told_apart_is_not_monotonic():
+    uT = fillings()
+    uT[:, 13:] -= uT[:, 13:].mean(axis=(0, 1, 2)) / 2  # drops by half of what it had reached
+    assert not answer_of(uT, WEIGHT_N)[0]["monotonic"]["holds"]
+
+
+def test_falls_that_noise_makes_are_as_many_as_expected():
+    rng = rng_for(0, "falls")
+    rise_uT, noise_uT, fillings_n = 0.5, 2.0, 10
+    response_uT = rise_uT * np.arange(2001) + noise_uT * rng.standard_normal((fillings_n, 2001))
+    found = monotonic(response_uT, 0.01 * np.arange(2001))["neighbours"]
+    expected_n = 2000 * norm.cdf(-rise_uT / (noise_uT * np.sqrt(2 / fillings_n)))  # 576
+    assert found["expected_falls_n"] == pytest.approx(expected_n, rel=0.02)  # noise known to 1 %
+    assert found["falls_n"] == pytest.approx(expected_n, abs=4 * np.sqrt(expected_n))
 
 
 def test_readings_are_sorted_by_filling_weight_and_reading():
