@@ -3,20 +3,48 @@
 Refuses to know scenes and folds: whether the model ever saw the log's board is for its user to know.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import pyarrow as pa
+from pydantic import Field
 
 from pipeline import io
 from pipeline.capture import columns, sd_card
 from pipeline.errors import ParamsError, SchemaError, complain
 from pipeline.evaluation.logs import Estimates, describe, estimate
 from pipeline.learning.card import FORMAT
+from pipeline.learning.inputs import VIEW
 from pipeline.stages._networks import Network
+from pipeline.strict import Strict, parse
 
 ANSWERS = ("x_mm", "y_mm", "Fz_N")
+
+
+class CardRecipe(Strict, extra="ignore"):
+    """What of its recipe a network needs to answer."""
+
+    architecture: Literal["paper", "released"]
+    inputs: Literal["raw", "shape"]
+
+
+class CardInput(Strict, extra="ignore"):
+    """What a network is shown."""
+
+    quantity: Literal["change of field"]
+    unit: Literal["uT"]
+    channels_n: Annotated[int, Field(ge=3, le=192, multiple_of=3)]  # of at most 64 chips
+
+
+class Card(Strict, extra="ignore"):
+    """What of a model's card its use depends on; the rest tells people where it comes from."""
+
+    format: str
+    recipe: CardRecipe
+    input: CardInput
+    output: dict[str, str]
 
 
 def predict(log: Path, model: Path, out: Path) -> dict[str, Any]:
@@ -25,8 +53,10 @@ def predict(log: Path, model: Path, out: Path) -> dict[str, Any]:
     Places and forces are left empty where there is no contact.
     """
     network = read_network(model)
-    if out.resolve() == log.resolve():
-        raise ParamsError(complain("--out", "the file to write", "another than the log", out, "Choose another --out."))
+    read = (log, model, model.with_suffix(".json"))
+    if out.resolve() in {file.resolve() for file in read}:
+        rule = "another than the log, the model and its card"
+        raise ParamsError(complain("--out", "the file to write", rule, out, "Choose another --out."))
     t_s, b_uT, _, account = sd_card.read_log(log)
     channels_n = network.card["input"]["channels_n"]
     if b_uT.shape[1] != channels_n:
@@ -43,14 +73,26 @@ def read_network(model: Path) -> Network:
     for file, what in ((model, "the model"), (card_file, "the card beside the model")):
         if not file.is_file():
             raise ParamsError(complain(file, what, "there", "nothing", "Give --model a trained .safetensors file."))
-    card = io.read_json(card_file)
-    form, answers = (card.get(name) if isinstance(card, dict) else None for name in ("format", "output"))
+    content = io.read_json(card_file)
+    form = content.get("format") if isinstance(content, dict) else None
     if form != FORMAT:
         raise SchemaError(complain(card_file, "format", FORMAT, form, "Train the model again."))
-    if tuple(answers or ()) != ANSWERS:
-        rule = f"for {', '.join(ANSWERS)}"
-        raise SchemaError(complain(card_file, "the model's answers", rule, list(answers or ()), "Take another model."))
-    return Network(card, io.read_tensors(model)[0])
+    card, tensors = parse(Card, content, str(card_file)), io.read_tensors(model)[0]
+    if tuple(card.output) != ANSWERS:
+        rule, got = f"for {', '.join(ANSWERS)}", ", ".join(card.output) or "none"
+        raise SchemaError(complain(card_file, "the model's answers", rule, got, "Take another model."))
+    _check_inputs(card, tensors, card_file)
+    return Network(content, tensors)
+
+
+def _check_inputs(card: Card, tensors: Mapping[str, np.ndarray], where: Path) -> None:
+    """Raise if the network does not take what its card says that it is shown."""
+    shown_n = VIEW[card.recipe.inputs](np.zeros((1, card.input.channels_n), np.float32)).shape[1]
+    taken_n = tensors["input_shift"].size if "input_shift" in tensors else 0
+    if shown_n != taken_n:
+        what = f"inputs of {card.input.channels_n} channels shown as {card.recipe.inputs}"
+        rule = f"the {taken_n} that the network beside it takes"
+        raise SchemaError(complain(where, what, rule, shown_n, "Take the card of this model."))
 
 
 def render(found: Estimates) -> str:

@@ -16,7 +16,8 @@ RATE_HZ, QUIET_N, TOUCHED_N = 250.0, 400, 100
 ANSWER = np.array([8.0, 4.0, 1.5], np.float32)
 CARD = {
     "format": "reskin-model/2", "recipe": {"inputs": "raw", "architecture": "paper"},
-    "input": {"channels_n": 15}, "output": {"x_mm": "mm", "y_mm": "mm", "Fz_N": "N"},
+    "input": {"quantity": "change of field", "unit": "uT", "channels_n": 15},
+    "output": {"x_mm": "mm", "y_mm": "mm", "Fz_N": "N"},
 }  # fmt: skip
 
 
@@ -60,27 +61,55 @@ def test_what_does_not_fit_is_refused_and_nothing_is_written(tmp_path, model):
     refusals = [
         (write_log(four, chips_n=4), model, out, "channels must be the 15 of the model; got 12"),
         (log, tmp_path / "other.safetensors", out, "the model must be there"),
-        (log, model, log, "the file to write must be another than the log"),
+        (log, model, log, "the file to write must be another than the log, the model and its card"),
+        (log, model, model, "the file to write must be another"),
+        (log, model, model.with_suffix(".json"), "the file to write must be another"),
+        (log, model, tmp_path / "four" / ".." / "model.json", "the file to write must be another"),
         (tmp_path / "none.csv", model, out, "the log must be a readable file"),
     ]
-    before = log.read_text()
+    files = (log, model, model.with_suffix(".json"))
+    before = [file.read_bytes() for file in files]
     for *paths, message in refusals:
         with pytest.raises(ReskinError, match=message):
             predict(*paths)
     assert not out.exists()
-    assert log.read_text() == before
+    assert [file.read_bytes() for file in files] == before
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"format": "reskin-model/1"}, "format must be reskin-model/2; got reskin-model/1"),
-        ({"output": {"x_mm": "mm", "y_mm": "mm"}}, "the model's answers must be for x_mm, y_mm, Fz_N"),
+        ({"format": 2}, "format must be reskin-model/2; got 2"),
+        ({"output": {"x_mm": "mm", "y_mm": "mm"}}, "the model's answers must be for x_mm, y_mm, Fz_N; got x_mm, y_mm"),
+        ({"input": None}, r"model\.json: input must be"),
+        ({"input": {}}, "input.quantity must be given; got nothing"),
+        ({"input": CARD["input"] | {"unit": "T"}}, "input.unit must be 'uT'; got 'T'"),
+        ({"input": CARD["input"] | {"channels_n": "15"}}, "input.channels_n must be a valid integer; got '15'"),
+        ({"input": CARD["input"] | {"channels_n": 14}}, "input.channels_n must be a multiple of 3; got 14"),
+        ({"input": CARD["input"] | {"channels_n": 12}}, "12 channels shown as raw must be the 15 that .*; got 12"),
+        ({"recipe": {"inputs": "shape", "architecture": "paper"}}, "15 channels shown as shape must be .*; got 16"),
+        ({"recipe": {"inputs": "spectrum", "architecture": "paper"}}, "recipe.inputs must be 'raw' or 'shape'"),
+        ({"recipe": {"inputs": "raw"}}, "recipe.architecture must be given; got nothing"),
     ],
 )
 def test_a_card_that_says_otherwise_is_refused(tmp_path, model, change, message):
     model.with_suffix(".json").write_text(json.dumps(CARD | change))
-    with pytest.raises(ReskinError, match=message):
+    with pytest.raises(ReskinError, match=message) as refused:
+        predict(write_log(tmp_path), model, tmp_path / "out.csv")
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("lacking", ["input", "recipe", "output", "format"])
+def test_a_card_that_says_too_little_is_refused(tmp_path, model, lacking):
+    model.with_suffix(".json").write_text(json.dumps({name: CARD[name] for name in CARD if name != lacking}))
+    with pytest.raises(ReskinError, match=f"{lacking} must be (given|reskin-model/2); got (nothing|None)"):
+        predict(write_log(tmp_path), model, tmp_path / "out.csv")
+
+
+def test_a_card_that_is_no_card_is_refused(tmp_path, model):
+    model.with_suffix(".json").write_text("[1]")
+    with pytest.raises(ReskinError, match="format must be reskin-model/2; got None"):
         predict(write_log(tmp_path), model, tmp_path / "out.csv")
 
 

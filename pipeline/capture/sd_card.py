@@ -4,6 +4,7 @@ One line a frame: seconds of the board's clock, then T, Bx, By, Bz of each chip 
 prints them. Refuses to know contacts, places and forces: the log does not either.
 """
 
+from codecs import BOM_UTF8
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,8 @@ TIME = "t_s"
 CHIP_COLUMNS = ("T", "Bx", "By", "Bz")
 FIRST_ROW = 2  # row 1 is the header
 HEADER_LETTERS_MAX = 10_000  # a line of 64 chips has 1,500
+RATE_MIN_HZ, RATE_MAX_HZ = 1.0, 10_000.0  # assumed: no board logs slower, and a chip reads no faster
+KEPT_SHARE_MIN = 0.5  # assumed: less than this is no log of what was touched
 GAP_FRAMES = 1.5  # times the usual step of time; in between, a frame or more is missing
 
 
@@ -42,8 +45,9 @@ def read_log(
 ) -> tuple[Float64[np.ndarray, " f"], Float32[np.ndarray, "f ch"], Float32[np.ndarray, "f k"], dict[str, int]]:
     """Read time in s, field in uT and temperature in degC of the frames in which every chip was read, and an account.
 
-    Failed reads and stuck chips cost a frame and are counted; a chip that lost its settings costs the log. `gaps_n`
-    counts the places where time goes on by more than the usual step, `gap_frames_n` the frames that fit in there.
+    Failed reads and stuck chips cost a frame and are counted; if they leave less than half of the log, it is refused,
+    as is one of a chip that lost its settings. `gaps_n` counts the places where time goes on by more than the usual
+    step, `gap_frames_n` the frames that fit in there.
     """
     where = str(path)
     chips_n = _chips_n(path, where)
@@ -63,7 +67,18 @@ def read_log(
         "dropped_stuck_chip_rows_n": int(stuck.sum()),
         "rows_n": int(whole.sum()),
     }
+    _check_kept(account, where)
     return t_s[whole], b_uT[whole], temperature_degC[whole], account
+
+
+def _check_kept(account: dict[str, int], where: str) -> None:
+    """Raise if faults left too little of a log; say which."""
+    read_n, kept_n = account["rows_read_n"], account["rows_n"]
+    if kept_n < max(2, KEPT_SHARE_MIN * read_n):
+        failed_n, stuck_n = account["dropped_failed_read_rows_n"], account["dropped_stuck_chip_rows_n"]
+        got = f"{kept_n} of {read_n}: {failed_n} had failed I2C reads, {stuck_n} stuck chips"
+        rule = f"read from every chip in {100 * KEPT_SHARE_MIN:g} % of them or more"
+        raise CaptureError(complain(where, "lines", rule, got, "Mend the wiring, and log again."))
 
 
 def _chips_n(path: Path, where: str) -> int:
@@ -76,7 +91,8 @@ def _chips_n(path: Path, where: str) -> int:
     except OSError as error:
         got = "an empty file" if path.is_file() and not path.stat().st_size else error.strerror
         raise CaptureError(complain(where, "the log", "a readable file", got, "Check the name.")) from None
-    names = first.decode("ascii", errors="replace").strip().split(",")
+    # A text editor or a spreadsheet may have put a byte order mark first; the CSV reader skips it too.
+    names = first.removeprefix(BOM_UTF8).decode("ascii", errors="replace").strip().split(",")
     chips_n = (len(names) - 1) // len(CHIP_COLUMNS)
     if chips_n < 1 or names != column_names(chips_n):
         rule, got = f"{','.join(column_names(1))}, then T1 and so on", repr(",".join(names)[:60])
@@ -108,6 +124,11 @@ def _check_time(t_s: Float64[np.ndarray, " f"], where: str) -> None:
         got = f"{t_s[row - FIRST_ROW]:.4f} after {t_s[row - FIRST_ROW - 1]:.4f}"
         remedy = "Was the board reset? Cut the log there."
         raise CaptureError(complain(f"{where} row {row}", TIME, "later than the line above", got, remedy))
+    rate_hz = 1 / float(np.median(np.diff(t_s)))
+    if not RATE_MIN_HZ <= rate_hz <= RATE_MAX_HZ:
+        rule = f"{RATE_MIN_HZ:g} to {RATE_MAX_HZ:g} lines a second"
+        remedy = f"{TIME} is in seconds: was it written in milliseconds?"
+        raise CaptureError(complain(where, "the rate", rule, f"{rate_hz:.3g}", remedy))
 
 
 def _faults(

@@ -101,3 +101,43 @@ def test_a_chip_that_lost_its_settings_costs_the_log(log):
     log.write_text(render(t_s, b_uT, temperature_degC))
     with pytest.raises(CaptureError, match=r"the step of chip 1 from row 2 on must be that of the other chips"):
         read_log(log)
+
+
+@pytest.mark.parametrize(
+    ("factor", "rate"),
+    [(1e3, "0.25"), (1 / 100, r"2.5e\+04")],
+)
+def test_a_log_whose_time_cannot_be_seconds_is_refused_with_a_hint_at_the_unit(log, factor, rate):
+    header, *rows = lines(log)
+    rows = [f"{factor * float(t_s):.7f},{rest}" for t_s, rest in (row.split(",", 1) for row in rows)]
+    log.write_text("".join([header, *rows]))
+    rule = "the rate must be 1 to 10000 lines a second; got " + rate
+    with pytest.raises(CaptureError, match=rule + ". t_s is in seconds: was it written in milliseconds?"):
+        read_log(log)
+
+
+def test_a_byte_order_mark_changes_nothing(log):
+    plain = read_log(log)
+    log.write_bytes(b"\xef\xbb\xbf" + log.read_bytes())
+    marked = read_log(log)
+    for one, other in zip(plain[:3], marked[:3], strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert plain[3] == marked[3]
+
+
+def failing(failed_n, stuck_n, frames_n=60):
+    t_s, b_uT, temperature_degC = made(frames_n)
+    b_uT[:failed_n, :3], temperature_degC[:failed_n, 0] = FAILED_B_uT, FAILED_TEMPERATURE_degC
+    b_uT[frames_n - stuck_n :, 3:] = b_uT[-1, 3:]
+    return t_s, b_uT, temperature_degC
+
+
+def test_a_log_of_which_faults_leave_little_is_refused_and_says_why(log):
+    log.write_text(render(*failing(40, 0)))
+    with pytest.raises(CaptureError, match="50 % of them or more; got 20 of 60: 40 had failed I2C reads, 0 stuck"):
+        read_log(log)
+    log.write_text(render(*failing(5, 50)))
+    with pytest.raises(CaptureError, match=r"got \d+ of 60: 5 had failed I2C reads, \d+ stuck chips. Mend the wiring"):
+        read_log(log)
+    log.write_text(render(*failing(30, 0)))
+    assert read_log(log)[3]["rows_n"] == 30
