@@ -39,7 +39,13 @@ def estimate(
     t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"], networks: Sequence[Answers], *, where: str
 ) -> Estimates:
     """Find the quiet start, take it off, and let the networks answer for every reading."""
-    quiet_n = quiet_start(t_s, b_uT, where=where)
+    return estimate_after(quiet_start(t_s, b_uT, where=where), t_s, b_uT, networks)
+
+
+def estimate_after(
+    quiet_n: int, t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"], networks: Sequence[Answers]
+) -> Estimates:
+    """Take off the mean of a quiet start of so many readings, and let the networks answer for every reading."""
     noload_uT = b_uT[:quiet_n].mean(axis=0, dtype=np.float64)
     db_uT = (b_uT - noload_uT).astype(np.float32)
     noise_uT = float(np.sqrt((db_uT[:quiet_n].astype(np.float64) ** 2).mean()))

@@ -9,12 +9,13 @@ from pipeline.dataset.rows import TARGETS
 from pipeline.evaluation.dynamics import compare, presses_of
 from pipeline.stages._experiment import read_folder, write_answer
 from pipeline.stages._networks import networks_without
+from pipeline.stages._only import only
 from pipeline.stages._run import run, say
 
 
 def dynamics(scene: str, indentations: Path, models: Path, answer: Path) -> None:
     """Ask the networks of train_multi that never saw the pressed skin's board."""
-    one = read_folder(indentations)[0]
+    one = only(read_folder(indentations), indentations)
     true = np.stack([getattr(one, name) for name in TARGETS], axis=1)
     presses = presses_of(subtract(one.b_uT, one.noload_uT), true, one.t_s, one.indentation)
     numbers = compare(presses, networks_without(models, one.board))

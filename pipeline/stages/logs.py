@@ -7,21 +7,21 @@ import numpy as np
 from pipeline.capture import probe, sd_card
 from pipeline.capture.header import LOG_FILE, PROBE_FILE
 from pipeline.dataset.captures import read_header
-from pipeline.errors import SchemaError, complain
 from pipeline.evaluation.logs import describe, estimate, score_contacts, thin, truth_at
+from pipeline.evaluation.turning import Log
 from pipeline.stages._experiment import write_answer
+from pipeline.stages._logs import turned
 from pipeline.stages._networks import networks_without
+from pipeline.stages._only import only
 from pipeline.stages._run import run, say
 
 
-def logs(scene: str, raw: Path, models: Path, answer: Path) -> None:
-    """Read the first walk of a folder with the networks that never saw its board; score it where the truth is kept."""
-    walks = sorted(child for child in raw.iterdir() if child.is_dir())
-    if not walks:
-        raise SchemaError(complain(str(raw), "captures", "one or more", "none", "Simulate them again."))
-    folder = walks[0]
+def logs(scene: str, settings: Path, raw: Path, models: Path, answer: Path) -> None:
+    """Read a folder's walk with networks that never saw its board; score it where its truth is kept, and turn it."""
+    folder = only(sorted(child for child in raw.iterdir() if child.is_dir()), raw)
     t_s, b_uT, _, account = sd_card.read_log(folder / LOG_FILE)
-    networks = networks_without(models, read_header(folder).board)
+    board = read_header(folder).board
+    networks = networks_without(models, board)
     found = estimate(t_s, b_uT, networks, where=str(folder / LOG_FILE))
     numbers, true = describe(found) | {"networks_n": len(networks), "account": account}, None
     if (folder / PROBE_FILE).is_file():
@@ -29,7 +29,7 @@ def logs(scene: str, raw: Path, models: Path, answer: Path) -> None:
         known = np.stack([log.x_mm, log.y_mm, log.Fz_N], axis=1)
         known[~log.contact] = np.nan
         true = truth_at(t_s, log.t_start_s, log.t_end_s, known)
-        numbers |= score_contacts(found, true)
+        numbers |= score_contacts(found, true) | turned(Log(t_s, b_uT, true, found.quiet_n), board, settings, networks)
     write_answer(answer, numbers, thin(found, true))
     say(f"{scene}: {numbers['contacts_n']} contacts in {numbers['duration_s']:.1f} s of log")
 

@@ -5,6 +5,7 @@ from pathlib import Path
 from pipeline.dataset.baseline import subtract
 from pipeline.evaluation.sensitivity import answer_of, levels_of
 from pipeline.stages._experiment import read_folder, write_answer
+from pipeline.stages._only import only
 from pipeline.stages._run import run, say
 from pipeline.stages._simulated import read_synthesis
 from pipeline.synthesis.pressing import weights_N
@@ -12,11 +13,11 @@ from pipeline.synthesis.protocols import Load
 
 
 def sensitivity(scene: str, settings: Path, indentations: Path, answer: Path) -> None:
-    """Take the first skin that was loaded: all are filled alike."""
+    """Tell how small a weight the one skin tells that was loaded."""
     synthesis, _ = read_synthesis(settings)
     asked = synthesis.protocols["glass"]
     assert isinstance(asked, Load), "the plan names it"
-    one = read_folder(indentations)[0]
+    one = only(read_folder(indentations), indentations)
     weight_N = weights_N(asked.force_max_N, asked.step_N)
     change_uT = subtract(one.b_uT, one.noload_uT)
     levels_uT = levels_of(change_uT, one.indentation, one.Fz_N, levels_n=len(weight_N), where=one.capture)

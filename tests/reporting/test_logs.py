@@ -17,6 +17,27 @@ def test_a_log_without_truth_has_no_scores_and_says_so():
     assert table["contacts found"] == "3"
 
 
+FOUND = {"contacts_n": 5, "false_readings_n": 7, "missed_readings_n": 2, "mse_f_N2": 0.25}
+
+
+def test_a_log_that_was_turned_has_a_table_of_its_own_with_the_remedy_beside_it():
+    told = {"pitch_deg": 20.0} | FOUND | {"accuracy_pct": 50.0, "reference_chip": FOUND | {"false_readings_n": 0}}
+    numbers = NUMBERS | {"contacts_true_n": 3, "turning": [told], "turning_period_s": 0.7, "earth_uT": 50.0}
+    table = tables(numbers, "simulated")["logs_turning"]
+    assert list(table["readings without contact taken for one"]) == ["7", "0"]
+    assert list(table["contacts made"]) == ["3", "3"]
+    assert list(table["accuracy / %"]) == ["50", "unknown"]
+    assert set(table["source"]) == {"simulated"}
+    assert "once a step (0.7 s) in the earth's field of 50 µT" in table.attrs["meaning"]
+    assert "logs_turning" not in tables(NUMBERS, "recorded")
+
+
+def test_the_rate_in_the_words_is_that_of_the_log():
+    table = tables(NUMBERS | {"rate_hz": 133.0}, "recorded")["logs"]
+    assert "A log at 133 Hz with" in table.attrs["meaning"]
+    assert "The board keeps its place" in table.attrs["meaning"]
+
+
 def test_the_figure_draws_the_truth_where_there_is_one():
     drawn = {"t_s": [0.0, 0.1, 0.2], "estimated": SERIES}
     assert ">true<" not in figures(NUMBERS, drawn, "recorded")["logs.svg"]
