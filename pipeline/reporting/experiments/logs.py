@@ -15,8 +15,8 @@ MEANING = (  # {rate_hz} comes from the numbers
     "A log at {rate_hz:.0f} Hz with nothing but times and readings, as a board writes it to an SD card: a quiet start, "
     "then footfalls at random places. The quiet start is the no-load reading; contact is a change of field well above "
     "its noise; places and forces are the mean of networks that never saw the board. Errors are over the readings "
-    "found in contact, against the truth that the simulator keeps. The board keeps its place: the earth's field is part "
-    "of the no-load reading and stays as it is, which it does not in a dog's shoe or on a hand."
+    "found in contact, against the truth that the simulator keeps. The board keeps its place: the earth's field is "
+    "part of the no-load reading and stays as it is, which it does not in a dog's shoe or on a hand."
 )
 TURNING = (
     "The same log, as if the board pitched to either side by so much, as a sine once a step ({turning_period_s:.2g} s) "
