@@ -172,6 +172,8 @@ def test_every_protocol_has_a_folder_and_stages_of_its_own(tmp_path):
         ({"skin__base": "glued"}, "skin.base must be 'bonded' or 'slipping'; got 'glued'"),
         ({"protocols__wear__terms": ["ageing"]}, r"terms holds exactly what a protocol needs, .*; it holds"),
         ({"protocols__wear__skins_n": 99}, "protocol wear: skins_n 99 is more than rigid boards have, 6"),
+        ({"protocols__press__skins_n": 3}, "protocol press: skins_n is 1, as its question reads one skin, not 3"),
+        ({"protocols__flexible__boards": "rigid"}, "protocol flexible: boards is another kind than that of grid"),
     ],
 )
 def test_a_scene_that_cannot_be_simulated_is_refused_before_anything_runs(tmp_path, changes, sentence):

@@ -34,6 +34,7 @@ def glass(noise_uT):
 def test_a_step_finer_than_was_tried_is_said_to_be_an_upper_limit():
     table = sensitivity.tables(glass(0.0)[0], "simulated")["sensitivity"]
     assert table["ours"][0] == "at most 0.1"
+    assert table["ours"][1] == "at most 10"  # 0.1 N is 10.2 mL
     assert set(table["source"]) == {"simulated"}
     assert table["paper"][0] == "< 0.2"
 

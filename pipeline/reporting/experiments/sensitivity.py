@@ -34,7 +34,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
             ),
             (
                 f"smallest step told apart, {words}, mL of water",
-                _show_mL(numbers["smallest_step_mL"], name),
+                _show_mL(name, numbers),
                 f"< {paper.SENSITIVITY_ML:g}",
             ),
             (f"the same by |dB| alone, {words}, N", _show(numbers["by_length_N"], name, numbers), "–"),
@@ -88,16 +88,21 @@ def _rises(rise: Mapping[str, Any]) -> str:
 
 
 def _falls(found: Mapping[str, Any], numbers: Mapping[str, Any]) -> str:
-    expected = f", {found['expected_falls_n']:.2g} expected of noise" if "expected_falls_n" in found else ""
+    expected = f", {found['expected_falls_n']:.1f} expected of noise" if "expected_falls_n" in found else ""
     return f"{found['falls_n']} of {numbers['levels_n'] - 1}{expected}"
 
 
 def _show(steps_N: Mapping[str, float], name: str, numbers: Mapping[str, Any]) -> str:
     if name not in steps_N:
         return f"none up to {numbers['range_N']:g}"
-    least = "at most " if steps_N[name] <= numbers["step_N"] else ""
-    return f"{least}{steps_N[name]:.3g}"
+    return f"{_least(steps_N[name], numbers)}{steps_N[name]:.3g}"
 
 
-def _show_mL(steps_mL: Mapping[str, float], name: str) -> str:
-    return f"{steps_mL[name]:.2g}" if name in steps_mL else "none"
+def _show_mL(name: str, numbers: Mapping[str, Any]) -> str:
+    if name not in numbers["smallest_step_mL"]:
+        return "none"
+    return f"{_least(numbers['smallest_step_N'][name], numbers)}{numbers['smallest_step_mL'][name]:.2g}"
+
+
+def _least(step_N: float, numbers: Mapping[str, Any]) -> str:
+    return "at most " if step_N <= numbers["step_N"] else ""  # no finer one was tried
