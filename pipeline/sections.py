@@ -43,7 +43,7 @@ class Drift(Strict):
 
 
 class Variation(Strict):
-    """How the field of equal pokes differs over time and from skin to skin (paper figure 3)."""
+    """How the field of equal pokes differs over time and from skin to skin (paper figure 4)."""
 
     places_mm: Annotated[tuple[Place_mm, ...], Field(min_length=1, max_length=4)]
     depth_mm: Annotated[float, Field(gt=0)]

@@ -9,8 +9,9 @@ from math import ceil
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32, Int, Shaped
+from jaxtyping import Float, Int, Int64, Shaped
 
+from pipeline.dataset.baseline import rank, subtract
 from pipeline.evaluation.metrics import METRICS, score
 from pipeline.schema import Readings
 
@@ -68,6 +69,15 @@ def over_windows(answers: Sequence[Answers], policy: str) -> list[dict[str, Any]
     return rows
 
 
+def of_networks(answers: Sequence[Answers], policy: str) -> dict[str, Float[np.ndarray, "u w"]]:
+    """Give the scores of each network, a row for each skin and seed, in each window: rows of two policies are pairs."""
+    own = {(one.skin, one.seed_i, one.window_i): score_window(one) for one in answers if one.policy == policy}
+    units = sorted({(skin, seed_i) for skin, seed_i, _ in own})
+    windows = sorted({window_i for _, _, window_i in own})
+    named = [name for name in METRICS if all(name in scores for scores in own.values())]
+    return {name: np.array([[own[(*unit, i)][name] for i in windows] for unit in units]) for name in named}
+
+
 def late_window(rows: Sequence[dict[str, Any]]) -> int:
     """Find the first window after the paper's 45,000 contacts, or else the last one."""
     late = [i for i, row in enumerate(rows) if row["contacts_n"] >= LATE_CONTACTS_N]
@@ -93,7 +103,7 @@ def by_contact(answers: Sequence[Answers]) -> Contacts:
     return Contacts(skins[pairs[:, 0]], *means)
 
 
-def force_bias(contacts: Contacts) -> dict[str, float]:
+def force_bias(contacts: Contacts) -> dict[str, Any]:
     """Give the mean of predicted less true force, its standard error over contacts, and the least-squares slope."""
     error_N = contacts.predicted_N - contacts.true_N
     away_N = contacts.true_N - contacts.true_N.mean()
@@ -129,10 +139,17 @@ def force_left(early: Readings, late: Readings) -> float | None:
 
 def late_force(
     answers: Sequence[Answers], policy: str, window_i: int
-) -> tuple[dict[str, float], dict[str, list[float]]] | None:
-    """Give the force bias of one window and its points to draw; None if fewer than two contacts have a known force."""
-    contacts = by_contact([one for one in answers if (one.policy, one.window_i) == (policy, window_i)])
-    return None if len(contacts.true_N) < 2 else (force_bias(contacts), points(contacts))
+) -> tuple[dict[str, Any], dict[str, list[float]]] | None:
+    """Give the force bias of one window, of its mean network and of each, and its points to draw.
+
+    None if fewer than two contacts have a known force.
+    """
+    own = [one for one in answers if (one.policy, one.window_i) == (policy, window_i)]
+    contacts = by_contact(own)
+    if len(contacts.true_N) < 2:
+        return None
+    each_N = [force_bias(by_contact([one]))["bias_N"] for one in own]
+    return force_bias(contacts) | {"network_bias_N": each_N}, points(contacts)
 
 
 def points(contacts: Contacts) -> dict[str, list[float]]:
@@ -142,13 +159,37 @@ def points(contacts: Contacts) -> dict[str, list[float]]:
     return {name: np.round(values[::every_n], DECIMALS).tolist() for name, values in sides.items()}
 
 
-def field_sizes(db_uT: Float32[np.ndarray, "f ch"], noload_uT: Float32[np.ndarray, "n ch"]) -> dict[str, float]:
+def field_sizes(captures: Sequence[Readings]) -> dict[str, float]:
     """Give, rms over channels, the change that a contact makes, and the noise of a no-load reading.
 
-    `noload_uT` holds one reading before each indentation; noise is taken from each to the next, where drift is small.
+    The change is against the no-load reading before that contact, whatever policy is tried. Noise is taken from each
+    no-load reading to the next, where drift is small.
     """
-    steps_uT = np.diff(noload_uT.astype(float), axis=0)
-    return {"contact_uT": rms(db_uT), "noload_noise_uT": rms(steps_uT) / float(np.sqrt(2)) if len(steps_uT) else 0.0}
+    changes_uT = [subtract(one.b_uT, one.noload_uT)[~np.isnan(one.x_mm)] for one in captures]
+    steps_uT = [np.diff(one.noload_uT[_first_i(one)].astype(float), axis=0) for one in captures]
+    pairs_n = sum(len(own) for own in steps_uT)
+    noise_uT = rms(np.concatenate(steps_uT)) / float(np.sqrt(2)) if pairs_n else 0.0
+    return {"contact_uT": rms(np.concatenate(changes_uT)), "noload_noise_uT": noise_uT}
+
+
+def pace(captures: Sequence[Readings]) -> dict[str, float]:
+    """Give the median time from one indentation to the next, and how long the longest capture lasts.
+
+    Nothing is given where a recording knows no time, or has one indentation.
+    """
+    timed = [one for one in captures if np.isfinite(one.t_s).all()]
+    steps_s = [step_s for one in timed for step_s in np.diff(one.t_s[_first_i(one)])]
+    if not steps_s:
+        return {}
+    return {
+        "contact_every_s": float(np.median(steps_s)),
+        "lasts_s": max(float(one.t_s[-1] - one.t_s[0]) for one in timed),
+    }
+
+
+def _first_i(readings: Readings) -> Int64[np.ndarray, " n"]:
+    """Find the first row of each indentation."""
+    return np.unique(rank(readings.indentation), return_index=True)[1]
 
 
 def rms(values: Float[np.ndarray, "..."]) -> float:

@@ -4,10 +4,12 @@ Every number in a sentence is one of the run's. Refuses to know networks, captur
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from scipy.stats import t
 
 HIGHER_AND_FASTER = (
     '"prediction errors are higher and increase faster when we only make a single no-load measurement at the start"'
@@ -18,78 +20,119 @@ OVERESTIMATES = (
     '"the model, on average, overestimates the applied force"; "attributed to the softening of the elastomer"'
 )
 
+YES, NO, UNTOLD = "yes", "no", "not told apart"
+CONFIDENCE = 0.95  # convention
+INDENTATION_SES = 2.0  # about that confidence for the many indentations of a window
 ERRORS = {"mse_xy_mm2": ("MSE_xy", "mm²"), "mse_f_N2": ("MSE_F", "N²")}  # force last; absent where it is unknown
 OTHERWISE = {"regular": "regular ones", "each": "one before every contact"}  # no-load readings
 PER_CONTACTS_N = 10_000
 Row = Mapping[str, Any]
+Found = dict[str, Any]
+Networks = Mapping[str, Float[np.ndarray, "u w"]]  # errors by metric; rows: skins and seeds; columns: windows
 
 
-def findings(rows: Mapping[str, Sequence[Row]], field: Mapping[str, float], late: Row | None) -> list[dict[str, Any]]:
+@dataclass(frozen=True)
+class Gap:
+    """A mean over networks, positive where it is as the paper says, and its error bar."""
+
+    word: str
+    unit: str
+    mean: float
+    reach: float | None  # half an error bar; None: one network alone has none
+
+    @property
+    def verdict(self) -> str:
+        """Tell which side of 0 it is on, if its error bar leaves 0 out."""
+        if self.reach is None or abs(self.mean) <= self.reach:
+            return UNTOLD
+        return YES if self.mean > 0 else NO
+
+    def __str__(self) -> str:
+        return f"{self.mean:+.2g}" + ("" if self.reach is None else f" ± {self.reach:.2g}") + f" {self.unit}"
+
+
+def findings(
+    rows: Mapping[str, Sequence[Row]], networks: Mapping[str, Networks], *, field: Mapping[str, float], late: Row | None
+) -> list[Found]:
     """Test each finding that the policies and the known quantities allow.
 
-    `rows` are the windows of each policy; `field` holds rms values over channels in uT: `contact_uT`, the change that a
-    contact makes, and `noload_noise_uT`, the noise of one no-load reading.
+    `rows` are the windows of each policy, `networks` the errors of each of its networks there: equal rows of two
+    policies are a pair. `field` holds rms values over channels in uT: `contact_uT`, the change that a contact makes,
+    and `noload_noise_uT`, the noise of one no-load reading.
     """
     frequent = [policy for policy in ("regular", "each") if policy in rows]
     found = []
     if "initial" in rows and frequent and len(rows["initial"]) > 1:
-        found.append(_higher_and_faster(rows["initial"], rows[frequent[0]], frequent[0], field))
+        found.append(_higher_and_faster(rows["initial"], networks, frequent[0], field))
     if "initial" in rows and frequent:
-        found.append(_offset(rows["initial"], rows[frequent[0]], frequent[0], field))
+        found.append(_offset(rows["initial"], networks, frequent[0], field))
     if len(frequent) == 2:
-        found.append(_each_is_worse(rows, field))
+        found.append(_each_is_worse(rows["regular"], networks, field))
     if late is not None:
         found.append(_overestimates(late))
     return found
 
 
-def rate(rows: Sequence[Row], metric: str) -> float:
-    """Give the least-squares slope of an error against contacts, linear, for 10,000 of them."""
-    contacts_n = np.array([row["contacts_n"] for row in rows], float) / PER_CONTACTS_N
-    away = contacts_n - contacts_n.mean()
-    return float(away @ np.array([row[metric] for row in rows]) / (away @ away))
+def reach_of(values: Float[np.ndarray, " u"]) -> float | None:
+    """Give half the 95 % interval of a mean over networks, by Student's t; None for one network."""
+    if len(values) < 2:
+        return None
+    return float(t.ppf((1 + CONFIDENCE) / 2, len(values) - 1) * values.std(ddof=1) / np.sqrt(len(values)))
 
 
-def mean(rows: Sequence[Row], metric: str) -> float:
-    """Give the mean of an error over the windows."""
-    return float(np.mean([row[metric] for row in rows]))
+def rates(contacts_n: Sequence[int], errors: Float[np.ndarray, "u w"]) -> Float[np.ndarray, " u"]:
+    """Give each network's least-squares slope of errors against contacts, linear, for 10,000 of them."""
+    tens = np.array(contacts_n, float) / PER_CONTACTS_N
+    away = tens - tens.mean()
+    return errors @ away / (away @ away)
 
 
-def _higher_and_faster(initial: Sequence[Row], other: Sequence[Row], name: str, field: Row) -> dict[str, Any]:
-    parts, holds = [], True
-    for metric, (word, unit) in _known(initial).items():
-        high, fast = ([measure(rows, metric) for rows in (initial, other)] for measure in (mean, rate))
-        holds &= high[0] > high[1] and fast[0] > fast[1]
+def _higher_and_faster(initial: Sequence[Row], networks: Mapping[str, Networks], name: str, field: Row) -> Found:
+    parts, gaps = [], []
+    contacts_n = [row["contacts_n"] for row in initial]
+    for metric, (word, unit) in _known(networks["initial"]).items():
+        single, other = networks["initial"][metric], networks[name][metric]
+        higher = _gap(word, unit, single.mean(axis=1), other.mean(axis=1))
+        rate, other_rate = rates(contacts_n, single), rates(contacts_n, other)
+        faster = _gap(f"the growth of {word}", unit, rate, other_rate)
         parts.append(
-            f"{word} is {high[0]:.3g} against {high[1]:.3g} {unit} with {OTHERWISE[name]}, mean over windows, "
-            f"and changes by {fast[0]:.2g} against {fast[1]:.2g} {unit} in {PER_CONTACTS_N:,} contacts (linear fit)"
+            f"{word} is {single.mean():.3g} against {other.mean():.3g} {unit} with {OTHERWISE[name]}, mean over "
+            f"windows (difference {higher}), and changes by {rate.mean():.2g} against {other_rate.mean():.2g} {unit} "
+            f"in {PER_CONTACTS_N:,} contacts, linear fit (difference {faster})"
         )
-    return _finding(HIGHER_AND_FASTER, holds, "; ".join(parts), lambda: _off(initial, field))
+        gaps += [higher, faster]
+    measured = "; ".join(parts) + _bars(single)
+    return _finding(HIGHER_AND_FASTER, gaps, measured, lambda: _off(initial, field))
 
 
-def _offset(initial: Sequence[Row], other: Sequence[Row], name: str, field: Row) -> dict[str, Any]:
-    parts, holds = [], True
-    for metric, (word, unit) in _known(initial).items():
-        single, more = initial[-1][metric], other[-1][metric]
-        holds &= more < single
-        parts.append(f"{word} is {more:.3g} {unit} with {OTHERWISE[name]}, {single:.3g} with a single no-load reading")
-    measured = f"after {initial[-1]['contacts_n']:,} contacts " + "; ".join(parts)
-    return _finding(OFFSET, holds, measured, lambda: _off(initial, field))
-
-
-def _each_is_worse(rows: Mapping[str, Sequence[Row]], field: Row) -> dict[str, Any]:
-    parts, shows = [], list[str]()
-    for metric, (word, unit) in _known(rows["each"]).items():
-        own, regular = mean(rows["each"], metric), mean(rows["regular"], metric)
-        more = np.array([one[metric] - other[metric] for one, other in zip(rows["each"], rows["regular"], strict=True)])
-        shows += [word] if own > regular else []
+def _offset(initial: Sequence[Row], networks: Mapping[str, Networks], name: str, field: Row) -> Found:
+    parts, gaps = [], []
+    for metric, (word, unit) in _known(networks["initial"]).items():
+        single, more = networks["initial"][metric], networks[name][metric]
+        gaps.append(_gap(word, unit, single.mean(axis=1), more.mean(axis=1)))
         parts.append(
-            f"{word} is {own:.3g} against {regular:.3g} {unit} with regular ones, mean over windows{_se(more)}"
+            f"{word} is {more.mean():.3g} {unit} with {OTHERWISE[name]}, {single.mean():.3g} with a single no-load "
+            f"reading (gain {gaps[-1]})"
         )
+    measured = "mean over windows: " + "; ".join(parts) + _bars(single)
+    return _finding(OFFSET, gaps, measured, lambda: _off(initial, field))
+
+
+def _each_is_worse(regular: Sequence[Row], networks: Mapping[str, Networks], field: Row) -> Found:
+    parts, gaps = [], []
+    for metric, (word, unit) in _known(networks["each"]).items():
+        own, other = networks["each"][metric], networks["regular"][metric]
+        gaps.append(_gap(word, unit, own.mean(axis=1), other.mean(axis=1)))
+        parts.append(
+            f"{word} is {own.mean():.3g} against {other.mean():.3g} {unit} with regular ones, mean over windows "
+            f"(difference {gaps[-1]})"
+        )
+    shows = [gap.word for gap in gaps if gap.verdict == YES]
 
     def why() -> str:
         noise_uT = field["noload_noise_uT"]
-        stale_uT = np.sqrt(max(0.0, mean(rows["regular"], "noload_off_uT") ** 2 - 2 * noise_uT**2))
+        off_uT = np.mean([row["noload_off_uT"] for row in regular])
+        stale_uT = np.sqrt(max(0.0, off_uT**2 - 2 * noise_uT**2))
         alone = f"It shows in {', '.join(shows)} alone. " if shows else ""
         return (
             f"{alone}A no-load reading has the same noise under both policies, {noise_uT:.2g} µT rms over channels. "
@@ -98,36 +141,44 @@ def _each_is_worse(rows: Mapping[str, Sequence[Row]], field: Row) -> dict[str, A
             "data, and saw later experiments gain from a reading before every contact"
         )
 
-    return _finding(EACH_IS_WORSE, len(shows) == len(parts), "; ".join(parts), why)
+    return _finding(EACH_IS_WORSE, gaps, "; ".join(parts) + _bars(own), why)
 
 
-def _se(differences: Float[np.ndarray, " w"]) -> str:
-    """Say a mean difference with its standard error over windows, if there are several."""
-    if len(differences) < 2:
-        return ""
-    se = differences.std(ddof=1) / np.sqrt(len(differences))
-    return f" (difference {differences.mean():+.2g}, standard error over windows {se:.1g})"
-
-
-def _overestimates(late: Row) -> dict[str, Any]:
+def _overestimates(late: Row) -> Found:
+    """Ask that the bias be clear of both what indentations and what trainings vary by: one network cannot tell."""
+    biases_N = np.array(late["network_bias_N"])
+    among_N = reach_of(biases_N)
+    reach_N = None if among_N is None else max(INDENTATION_SES * late["bias_se_N"], among_N)
     measured = (
         f"policy {late['policy']} after {late['contacts_n']:,} contacts: bias {late['bias_N']:+.3g} ± "
         f"{late['bias_se_N']:.2g} N ({late['bias_pct']:+.2g} %), standard error over {late['indentations_n']} "
-        f"indentations; slope {late['slope']:.3g}"
+        f"indentations of the mean over {len(biases_N)} network(s)"
     )
-    if "force_left_pct" in late:
-        measured += f"; at equal places and depths the skin gives {late['force_left_pct']:.4g} % of its early force"
+    measured += "" if among_N is None else f"; ± {among_N:.2g} N from network to network (95 %, Student's t)"
+    measured += f"; slope {late['slope']:.3g}"
+    left_pct = late.get("force_left_pct")
+    if left_pct is not None:
+        measured += f"; at equal places and depths the skin gives {left_pct:.4g} % of its early force"
 
     def why() -> str:
-        if "force_left_pct" not in late:
+        if left_pct is None:
             return "No depth is known, so it cannot be told whether the skin softened"
         return (
-            f"At equal places and depths the skin gives {late['force_left_pct']:.4g} % of the force of the training "
-            f"contacts, so softening explains a bias of {100 - late['force_left_pct']:+.2g} % of force and no more; "
-            f"what the network adds by itself, {late['bias_pct']:+.2g} % in all, outweighs it"
+            f"At equal places and depths the skin gives {left_pct:.4g} % of the force of the training contacts, so "
+            f"softening explains a bias of {100 - left_pct:+.2g} % of force and no more; what the network adds by "
+            f"itself makes it {late['bias_pct']:+.2g} % in all"
         )
 
-    return _finding(OVERESTIMATES, late["bias_N"] > 0, measured, why)
+    return _finding(OVERESTIMATES, [Gap("the bias", "N", late["bias_N"], reach_N)], measured, why)
+
+
+def _gap(word: str, unit: str, own: Float[np.ndarray, " u"], other: Float[np.ndarray, " u"]) -> Gap:
+    return Gap(word, unit, float((own - other).mean()), reach_of(own - other))
+
+
+def _bars(errors: Float[np.ndarray, "u w"]) -> str:
+    pairs_n = len(errors)
+    return f" (±: 95 %, Student's t over {pairs_n} pairs of networks)" if pairs_n > 1 else " (one network each)"
 
 
 def _off(initial: Sequence[Row], field: Row) -> str:
@@ -138,10 +189,23 @@ def _off(initial: Sequence[Row], field: Row) -> str:
     )
 
 
-def _known(rows: Sequence[Row]) -> dict[str, tuple[str, str]]:
-    return {metric: words for metric, words in ERRORS.items() if metric in rows[0]}
+def _known(networks: Networks) -> dict[str, tuple[str, str]]:
+    return {metric: words for metric, words in ERRORS.items() if metric in networks}
 
 
-def _finding(finding: str, holds: bool, measured: str, why: Callable[[], str]) -> dict[str, Any]:
-    row = {"finding": finding, "holds": bool(holds), "measured": measured[0].upper() + measured[1:] + "."}
-    return row if holds else row | {"why": f"{why()}."}
+def _finding(finding: str, gaps: Sequence[Gap], measured: str, why: Callable[[], str]) -> Found:
+    """Say yes if every gap is clear of 0 on the paper's side, no if one is clear on the other, else not told apart."""
+    told = {gap.verdict for gap in gaps}
+    verdict = NO if NO in told else UNTOLD if UNTOLD in told else YES
+    row = {
+        "finding": finding, "holds": verdict == YES, "verdict": verdict,
+        "measured": measured[0].upper() + measured[1:] + ".",
+    }  # fmt: skip
+    return row if verdict == YES else row | {"why": f"{_untold(gaps) if verdict == UNTOLD else ''}{why()}."}
+
+
+def _untold(gaps: Sequence[Gap]) -> str:
+    if any(gap.reach is None for gap in gaps):
+        return "Not told apart: one network each, and another training might answer otherwise. "
+    covered = "; ".join(f"{gap.word}, {gap}" for gap in gaps if gap.verdict == UNTOLD)
+    return f"Not told apart: the error bar covers 0 ({covered}). "

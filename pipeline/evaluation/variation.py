@@ -1,4 +1,4 @@
-"""How the field of equal pokes differs over time and from skin to skin (paper figure 3). In: readings. Out: numbers.
+"""How the field of equal pokes differs over time and from skin to skin (paper figure 4). In: readings. Out: numbers.
 
 Refuses to know models, folders and pages.
 """
@@ -71,6 +71,16 @@ def over_time(visits: Visits, contacts_n: int) -> tuple[dict[str, Any], dict[str
     shown = np.unique(np.linspace(0, len(felt_n) - 1, LINES_MAX_N).round().astype(int))
     lines = np.round(b_uT[shown] - b_uT[0], DECIMALS)
     return numbers, {"contacts_n": felt_n[shown].tolist(), "b_uT": lines.tolist()}
+
+
+def meanwhile(readings: Readings, contacts_n: int) -> dict[str, float]:
+    """Give how long a skin's first contacts take, and by how much its chips grow warmer, mean over them; if known."""
+    early = readings.n_contacts - readings.n_contacts[0] < contacts_n
+    t_s, temperature_degC = readings.t_s[early], readings.temperature_degC[early].astype(float)
+    order = rank(readings.indentation[early])
+    warmer_K = float(temperature_degC[order == order[-1]].mean() - temperature_degC[order == 0].mean())
+    told = {"shown_s": float(t_s[-1] - t_s[0]), "warmer_K": warmer_K}
+    return {name: value for name, value in told.items() if np.isfinite(value)}
 
 
 def over_skins(visits: Mapping[str, Visits]) -> tuple[dict[str, Any], dict[str, Any]]:

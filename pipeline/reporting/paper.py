@@ -34,8 +34,8 @@ FIGURE_6B = (
 
 SLEEVE_SKIN = "2 in x 4 in (50.8 x 101.6)"  # section 6, arm sleeve
 SLEEVE_WORDS = 'it shows "contact localization across larger surface areas" in a video (section 6, figure 1E)'
-# Figures 3 and 5 are printed without numbers too.
-FIGURE_3 = (
+# Figures 4 and 5 are printed without numbers too.
+FIGURE_4 = (
     '"while the general properties of the individual sensors overlap, there is still obvious variation across the '
     'samples"'
 )

@@ -4,15 +4,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from pipeline.dataset.baseline import rank
 from pipeline.dataset.parts import Part, stack
-from pipeline.evaluation.drift import Answers, field_sizes, late_force, late_window, over_windows
+from pipeline.evaluation.drift import Answers, field_sizes, late_force, late_window, of_networks, over_windows, pace
 from pipeline.evaluation.drift_findings import findings
 from pipeline.learning.recipe import HEADLINE
 from pipeline.params import captures_of, read_params, read_scene
-from pipeline.schema import Readings
 from pipeline.sections import Drift
 from pipeline.stages import _drift as work
 from pipeline.stages._experiment import read_folder, write_answer
@@ -34,10 +30,10 @@ def drift(scene: str, params: Path, settings: Path, indentations: Path, answer: 
     rows: dict[str, dict[str, Any]] = {
         name: {policy: over_windows(own, policy) for policy in asked.drift.policies} for name, own in said.items()
     }
-    told, drawn = _tell(asked.drift, said[HEADLINE], rows[HEADLINE], parts, _field(captures, at.rows.db_uT))
+    told, drawn = _tell(asked.drift, said[HEADLINE], rows[HEADLINE], parts, field_sizes(captures))
     counts = {"skins_n": len(captures), "seeds_n": asked.drift.training.seeds_n, "dropped": at.rows.dropped}
     words = asked.drift.model_dump(mode="json", include={"unit", "train_n", "test_n", "every_n", "regular_n"})
-    numbers = {name: value for name, value in words.items() if value is not None} | counts
+    numbers = {name: value for name, value in words.items() if value is not None} | counts | pace(captures)
     variants = {name: own for name, own in rows.items() if name != HEADLINE}
     numbers |= {"left_out_units_n": windows.left_out_units_n} | told | ({"variants": variants} if variants else {})
     write_answer(answer, numbers, drawn)
@@ -55,13 +51,8 @@ def _tell(
         where = {"policy": policy, "contacts_n": rows[policy][window_i]["contacts_n"]}
         numbers["late"] = where | late[0] | ({} if left_pct is None else {"force_left_pct": left_pct})
         drawn = {"late": late[1]}
-    return numbers | {"findings": findings(rows, field, numbers.get("late"))}, drawn
-
-
-def _field(captures: Sequence[Readings], db_uT: np.ndarray) -> dict[str, float]:
-    one = captures[0]
-    _, first_i = np.unique(rank(one.indentation), return_index=True)
-    return field_sizes(db_uT, one.noload_uT[first_i])
+    networks: dict[str, Any] = {name: of_networks(said, name) for name in asked.policies}
+    return numbers | {"findings": findings(rows, networks, field=field, late=numbers.get("late"))}, drawn
 
 
 if __name__ == "__main__":

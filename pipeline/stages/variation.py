@@ -1,10 +1,11 @@
-"""Stage variation: how the field of equal pokes differs over time and from skin to skin (paper figure 3)."""
+"""Stage variation: how the field of equal pokes differs over time and from skin to skin (paper figure 4)."""
 
 from pathlib import Path
 from typing import Any
 
 from pipeline import io
-from pipeline.evaluation.variation import Visits, find_visits, first_of_each_board, over_skins, over_time
+from pipeline.evaluation.drift import pace
+from pipeline.evaluation.variation import Visits, find_visits, first_of_each_board, meanwhile, over_skins, over_time
 from pipeline.params import captures_of, read_params, read_scene
 from pipeline.sections import Variation
 from pipeline.stages._experiment import read_folder, write_answer
@@ -28,7 +29,9 @@ def variation(scene: str, params: Path, settings: Path, main: Path, indentations
         where = {"x_mm": x_mm, "y_mm": y_mm}
         places.append(where | {name: told for name, (told, _) in over.items()})
         drawn.append(where | {name: lines for name, (_, lines) in over.items()})
-    write_answer(answer, {"depth_mm": asked.depth_mm, "worn_skin": worn.skin, "places": places}, {"places": drawn})
+    when = pace([worn]) | meanwhile(worn, asked.contacts_n)
+    numbers = {"depth_mm": asked.depth_mm, "worn_skin": worn.skin} | when | {"places": places}
+    write_answer(answer, numbers, {"places": drawn})
 
 
 def _visits(main: Path, names: list[str], asked: Variation) -> dict[str, list[Visits]]:

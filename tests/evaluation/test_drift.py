@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -13,7 +15,9 @@ from pipeline.evaluation.drift import (
     force_left,
     late_force,
     late_window,
+    of_networks,
     over_windows,
+    pace,
     points,
 )
 from pipeline.evaluation.metrics import score
@@ -110,9 +114,52 @@ def test_points_are_the_contacts_to_a_millinewton_and_not_too_many():
     np.testing.assert_allclose(drawn["true_N"], contacts.true_N[::2], atol=5e-4)  # rounded
 
 
-def test_field_sizes_are_those_that_were_put_in():
+def test_each_network_has_its_own_row_so_that_policies_pair_by_skin_and_seed():
+    units = [(skin, seed_i) for skin in ("s0", "s1") for seed_i in (0, 1)]
+    own = [
+        answers(skin=skin, seed_i=seed_i, window_i=window_i, bias_N=0.1 * i)
+        for i, (skin, seed_i) in enumerate(units)
+        for window_i in (0, 1)
+    ]
+    found = of_networks([*reversed(own), answers("initial")], "each")
+    assert set(found) == {"accuracy_pct", "mse_xy_mm2", "mse_f_N2"}
+    want = [[score(one.true, one.predicted)["mse_f_N2"] for one in own[2 * i : 2 * i + 2]] for i in range(4)]
+    np.testing.assert_allclose(found["mse_f_N2"], want)
+
+
+def test_the_late_force_has_a_bias_for_every_network_whose_mean_is_the_bias():
+    own = [answers(seed_i=seed_i, bias_N=bias_N) for seed_i, bias_N in enumerate((0.1, -0.2, 0.4))]
+    numbers, _ = late_force(own, "each", 0)
+    assert len(numbers["network_bias_N"]) == 3
+    errors_N = [float((one.predicted - one.true)[:, 2].mean()) for one in own]
+    assert numbers["network_bias_N"] == pytest.approx(errors_N, abs=1e-6)  # float32 newtons
+    assert numbers["bias_N"] == pytest.approx(np.mean(errors_N), abs=1e-6)
+
+
+def timed(indentation: list, t_s: list):
+    return readings(f=len(t_s), indentation=np.array(indentation, np.int32), t_s=np.array(t_s, float))
+
+
+def test_the_pace_is_from_one_indentation_to_the_next_whatever_its_readings_do():
+    first = timed([0, 0, 0, 1, 1, 2], [10.0, 10.1, 10.9, 12.0, 12.1, 17.0])
+    assert pace([first]) == pytest.approx({"contact_every_s": 3.5, "lasts_s": 7.0})
+    assert pace([first, timed([0, 1], [0, 1])]) == pytest.approx({"contact_every_s": 2.0, "lasts_s": 7.0})
+
+
+def test_a_recording_without_a_clock_has_no_pace():
+    assert pace([timed([0, 1], [np.nan, np.nan])]) == {}
+
+
+def test_field_sizes_are_those_that_were_put_in_and_free_air_is_no_contact():
     rng = rng_for(0, "field")
     noload_uT = rng.normal(0, 1.5, (4000, 15)).astype(np.float32) + np.linspace(0, 100, 4000, dtype=np.float32)[:, None]
-    sizes = field_sizes(np.full((7, 15), -3, np.float32), noload_uT)
-    assert sizes["contact_uT"] == pytest.approx(3)
+    x_mm = np.where(np.arange(4000) % 2, 3, np.nan).astype(np.float32)
+    b_uT = noload_uT + np.where(np.isnan(x_mm), 50, -3).astype(np.float32)[:, None]
+    one = readings(
+        f=4000, indentation=np.arange(4000, dtype=np.int32), b_uT=b_uT, noload_uT=noload_uT, x_mm=x_mm,
+    )  # fmt: skip
+    sizes = field_sizes([one])
+    assert sizes["contact_uT"] == pytest.approx(3, rel=1e-5)  # float32 fields of 100 uT
     assert sizes["noload_noise_uT"] == pytest.approx(1.5, rel=0.02)  # 60,000 draws: 0.4 %, five of them
+    both = field_sizes([one, replace(one, b_uT=noload_uT + np.float32(4))])
+    assert both["contact_uT"] == pytest.approx(np.sqrt((3**2 + 4**2) / 2), rel=1e-5)

@@ -20,6 +20,7 @@ from tests.dataset.tables import readings
 
 ROOT = Path(__file__).resolve().parents[2]
 DEPTHS_MM, PASSES_N, DRIFT_uT = (0.6, 1.2), 3, 0.3  # 390 contacts; drift of each channel a contact
+EVERY_s, WARMING_K_PER_s = 0.5, 0.01
 
 
 def capture(name: str, board: str = "b0", skin: str = "s0", gain: float = 1.0, pokes_n: int | None = None) -> Readings:
@@ -36,7 +37,8 @@ def capture(name: str, board: str = "b0", skin: str = "s0", gain: float = 1.0, p
         readings(name, board, skin, f=2 * n), source="simulated", indentation=poke_i, n_contacts=poke_i,
         pass_i=poke_i // 130, reading_i=np.tile(np.arange(2, dtype=np.int32), n), x_mm=x_mm, y_mm=y_mm, Fz_N=Fz_N,
         depth_mm=np.repeat(depth_mm, 2).astype(np.float32), b_uT=(noload_uT + target @ mix).astype(np.float32),
-        noload_uT=noload_uT.astype(np.float32), temperature_degC=np.full((2 * n, 5), 25, np.float32),
+        noload_uT=noload_uT.astype(np.float32), t_s=EVERY_s * poke_i,
+        temperature_degC=(25 + WARMING_K_PER_s * EVERY_s * poke_i[:, None] * np.ones(5)).astype(np.float32),
     )  # fmt: skip
 
 
@@ -81,6 +83,13 @@ def test_a_drifting_skin_is_answered_in_every_window_and_a_single_no_load_readin
     assert last["initial"] > 2 * max(last["regular"], last["each"])
     assert numbers["late"]["force_left_pct"] == pytest.approx(100)  # this skin does not soften
     assert numbers["late"]["indentations_n"] == len(answer["drawn"]["late"]["true_N"]) == 30
+    assert len(numbers["late"]["network_bias_N"]) == 1
+    assert {one["verdict"] for one in numbers["findings"]} == {"not told apart"}  # one network each
+    # Whatever is subtracted under a policy, a contact changes the field by what a reading before it shows.
+    db_uT = capture("s0-wear").b_uT - capture("s0-wear").noload_uT
+    assert numbers["field"]["contact_uT"] == pytest.approx(np.sqrt(np.mean(db_uT.astype(float) ** 2)), rel=1e-6)
+    assert numbers["contact_every_s"] == pytest.approx(EVERY_s)
+    assert numbers["lasts_s"] == pytest.approx(389 * EVERY_s)
     assert len(numbers["findings"]) == 4
     assert set(drift_pages.tables(numbers, "simulated")) == {"drift", "drift_findings"}
     assert set(drift_pages.figures(numbers, answer["drawn"], "simulated")) == {"drift.svg", "drift_force.svg"}
@@ -109,6 +118,9 @@ def test_variation_finds_the_drift_in_what_is_read_and_the_gain_between_skins(sc
     )
     variation(scene="ci", main=main, indentations=worn, **scene)
     answer = io.read_json(scene["answer"])
+    assert answer["numbers"]["contact_every_s"] == pytest.approx(EVERY_s)
+    assert answer["numbers"]["shown_s"] == pytest.approx(199 * EVERY_s)  # the first 200 contacts
+    assert answer["numbers"]["warmer_K"] == pytest.approx(199 * EVERY_s * WARMING_K_PER_s, rel=1e-4)  # float32 degrees
     for place in answer["numbers"]["places"]:
         assert place["time"]["visits_n"] == 2  # of three, in the first 200 contacts
         assert place["time"]["raw_change_uT"] == pytest.approx(DRIFT_uT * 130, rel=1e-3)

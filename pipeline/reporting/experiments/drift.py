@@ -16,6 +16,11 @@ from pipeline.reporting.work_precision import COLOURS, MARKERS
 
 POLICIES = ("initial", "regular", "each")
 MARGIN = 0.05  # of the largest force
+VERDICTS = (
+    "Yes or no: the error bars of all that a finding compares leave 0 out, at 95 % over pairs of networks (policies "
+    "trained from the same seed on the same skin), of the mean over windows; several trainings on one skin say how "
+    "much trainings vary, not how much skins do. Not told apart: an error bar covers 0, or there is one network each."
+)
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
@@ -32,14 +37,14 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     spread = seeds if any(row["spread"] for _, rows in named.values() for row in rows) else "One network each."
     found = [
         {
-            "finding (paper)": one["finding"], "holds": "yes" if one["holds"] else "NO", "measured": one["measured"],
+            "finding (paper)": one["finding"], "holds": one["verdict"], "measured": one["measured"],
             "why not": one.get("why", "–"), "source": source,
         }
         for one in numbers["findings"]
     ]  # fmt: skip
     return {
-        "drift": tabulate(lines, meaning=f"{_protocol(numbers)} {FIGURE_5}", spread=spread),
-        "drift_findings": tabulate(found),
+        "drift": tabulate(lines, meaning=f"{_protocol(numbers)} {say_pace(numbers, source)} {FIGURE_5}", spread=spread),
+        "drift_findings": tabulate(found, meaning=VERDICTS),
     }
 
 
@@ -47,6 +52,17 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
     """Draw scores against contacts (figure 5a), and where force is known predicted against true force (figure 5b)."""
     texts = {"drift.svg": _scores(numbers, source)}
     return texts | ({"drift_force.svg": _forces(numbers["late"], drawn["late"], source)} if "late" in numbers else {})
+
+
+def say_pace(numbers: Mapping[str, Any], source: str) -> str:
+    """Say how fast contacts follow each other by the capture's own clock, and what that does to a simulated one."""
+    if "lasts_s" not in numbers:
+        return "When the contacts were is not known."
+    every = f"A contact follows the one before after {numbers['contact_every_s']:.3g} s (median)"
+    said = f"{every}; the whole capture lasts {numbers['lasts_s']:,.0f} s."
+    if source != "simulated":
+        return said
+    return f"{said} A real rig takes seconds a contact: temperature wanders here over many more contacts than there."
 
 
 def _scores(numbers: Mapping[str, Any], source: str) -> str:

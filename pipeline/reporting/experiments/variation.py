@@ -1,4 +1,4 @@
-"""Tables and figures of question variation (paper figure 3). In: its numbers and lines. Out: tables, SVG text.
+"""Tables and figures of question variation (paper figure 4). In: its numbers and lines. Out: tables, SVG text.
 
 Same numbers, same bytes. Refuses to know captures and paths.
 """
@@ -10,8 +10,9 @@ from typing import Any
 import matplotlib as mpl
 import pandas as pd
 
+from pipeline.reporting.experiments.drift import say_pace
 from pipeline.reporting.figures import STYLE, svg
-from pipeline.reporting.paper import FIGURE_3
+from pipeline.reporting.paper import FIGURE_4
 from pipeline.reporting.shown import tabulate
 from pipeline.reporting.work_precision import COLOURS, MARKERS
 
@@ -34,13 +35,21 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
         if "spread_uT" in skins:
             over = f"between {len(skins['skins'])} skins: change of field"
             lines.append(at | _line(over, skins["spread_uT"], skins["spread_pct"]))
-    return {
-        "variation": tabulate([line | {"source": source} for line in lines], meaning=f"{MEANING} Paper: {FIGURE_3}.")
-    }
+    meaning = f"{MEANING} {say_pace(numbers, source)}{_say_shown(numbers)} Paper: {FIGURE_4}."
+    return {"variation": tabulate([line | {"source": source} for line in lines], meaning=meaning)}
+
+
+def _say_shown(numbers: Mapping[str, Any]) -> str:
+    if "shown_s" not in numbers or "warmer_K" not in numbers:
+        return ""
+    return (
+        f" The contacts compared over time take {numbers['shown_s']:,.0f} s, in which the "
+        f"chips' temperature changes by {numbers['warmer_K']:+.2g} K: that is in the field, beside the skin's own wear."
+    )
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw how the field varies over time (figure 3a) and from skin to skin (figure 3b), a panel a place."""
+    """Draw how the field varies over time (figure 4a) and from skin to skin (figure 4b), a panel a place."""
     return {
         "variation_time.svg": _over_time(numbers, drawn["places"], source),
         "variation_skins.svg": _over_skins(numbers, drawn["places"], source),

@@ -21,12 +21,19 @@ def numbers(force: bool = True, spread: bool = True, **changed) -> dict:
         "indentations_n": 1000,
     }  # fmt: skip
     found = [
-        {"finding": "errors grow", "holds": True, "measured": "They do."},
-        {"finding": "each is worse", "holds": False, "measured": "It is not.", "why": "It is never stale."},
+        {"finding": "errors grow", "holds": True, "verdict": "yes", "measured": "They do."},
+        {"finding": "each is worse", "holds": False, "verdict": "no", "measured": "It is not.", "why": "Never stale."},
+        {
+            "finding": "too much force",
+            "holds": False,
+            "verdict": "not told apart",
+            "measured": "A little.",
+            "why": "The error bar covers 0.",
+        },
     ]
     own = {
         "unit": "indentation", "train_n": 5000, "test_n": 1000, "every_n": 5000, "regular_n": 390, "skins_n": 1,
-        "seeds_n": 2, "left_out_units_n": 90, "findings": found,
+        "seeds_n": 2, "left_out_units_n": 90, "contact_every_s": 0.0575, "lasts_s": 1166.2, "findings": found,
     }  # fmt: skip
     return own | policies | ({"late": late} if force else {}) | changed
 
@@ -43,10 +50,11 @@ def test_a_row_a_window_shows_every_policy_and_where_it_is_from(source):
     assert set(table["source"]) == {source}
 
 
-def test_a_finding_that_does_not_hold_stands_there_in_capitals_and_with_its_reason():
+def test_a_finding_that_does_not_hold_or_cannot_be_told_says_which_and_gives_its_reason():
     table = tables(numbers(), "simulated")["drift_findings"]
-    assert table["holds"].tolist() == ["yes", "NO"]
-    assert table["why not"].tolist() == ["–", "It is never stale."]
+    assert table["holds"].tolist() == ["yes", "no", "not told apart"]
+    assert table["why not"].tolist() == ["–", "Never stale.", "The error bar covers 0."]
+    assert "95 % over pairs of networks" in to_markdown(table)
     assert set(table["source"]) == {"simulated"}
 
 
@@ -59,6 +67,16 @@ def test_below_the_table_stand_the_protocol_and_what_was_left_out():
     said = to_markdown(tables(whole, "recorded")["drift"])
     assert "first 1 pass of each skin" in said
     assert "left out" not in said
+
+
+def test_the_pace_of_the_capture_stands_below_and_a_simulated_one_is_said_to_be_faster_than_a_rig():
+    simulated, recorded = (to_markdown(tables(numbers(), source)["drift"]) for source in ("simulated", "recorded"))
+    for said in (simulated, recorded):
+        assert "after 0.0575 s (median); the whole capture lasts 1,166 s." in said
+    assert "A real rig takes seconds a contact" in simulated
+    assert "A real rig" not in recorded
+    unknown = {name: value for name, value in numbers().items() if name not in ("contact_every_s", "lasts_s")}
+    assert "When the contacts were is not known." in to_markdown(tables(unknown, "recorded")["drift"])
 
 
 def test_one_network_has_no_spread_and_says_so():

@@ -14,7 +14,8 @@ def numbers(skins: tuple[str, ...] = ("s0", "s1")) -> dict:
         {"x_mm": x_mm, "y_mm": 8.0, "time": time, "skins": {"skins": list(skins), "mean_db_uT": 250.0, **spread}}
         for x_mm in (8.0, 4.0)
     ]
-    return {"depth_mm": 1.2, "worn_skin": "s0", "places": places}
+    when = {"contact_every_s": 0.0575, "lasts_s": 1166.2, "shown_s": 575.0, "warmer_K": 1.85}
+    return {"depth_mm": 1.2, "worn_skin": "s0", "places": places} | when
 
 
 def drawn(last_uT: float = 40.0) -> dict:
@@ -30,6 +31,15 @@ def test_each_place_has_what_changes_as_read_what_a_model_sees_and_the_spread_of
     assert table["difference, % of the change"].tolist() == ["8.98", "1.97", "96.1"] * 2
     assert set(table["source"]) == {"simulated"}
     assert "obvious variation across the samples" in to_markdown(table)
+
+
+def test_the_pace_and_the_warmth_of_the_contacts_shown_stand_below():
+    said = to_markdown(tables(numbers(), "simulated")["variation"])
+    assert "after 0.0575 s (median); the whole capture lasts 1,166 s." in said
+    assert "A real rig takes seconds a contact" in said
+    assert "take 575 s, in which the chips' temperature changes by +1.9 K" in said
+    cold = {name: value for name, value in numbers().items() if name != "warmer_K"}
+    assert "temperature changes" not in to_markdown(tables(cold, "recorded")["variation"])
 
 
 def test_one_skin_has_no_spread_between_skins():
