@@ -17,9 +17,10 @@ from pipeline.reporting.work_precision import COLOURS, MARKERS
 POLICIES = ("initial", "regular", "each")
 MARGIN = 0.05  # of the largest force
 VERDICTS = (
-    "Yes or no: the error bars of all that a finding compares leave 0 out, at 95 % over pairs of networks (policies "
-    "trained from the same seed on the same skin), of the mean over windows; several trainings on one skin say how "
-    "much trainings vary, not how much skins do. Not told apart: an error bar covers 0, or there is one network each."
+    "Yes: every error bar leaves 0 out, on the paper's side. No: one leaves it out on the other side. Not told apart: "
+    "otherwise, or with one network each. Error bars: 95 % over pairs of networks (policies trained from the same seed "
+    "on the same skin), each network's value the mean over its windows; for the bias of the force also two standard "
+    "errors over indentations. Several trainings on one skin say how much trainings vary, not how much skins do."
 )
 
 
@@ -33,7 +34,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
             for metric in ("accuracy_pct", error):
                 line[f"{COLUMNS[metric]} ({words})"] = show(_stat(rows[i], metric))
         lines.append(line)
-    seeds = f"± is the sd over {numbers['skins_n']} skin(s) of {numbers['seeds_n']} seeds each"
+    seeds = f"± is the sd over {numbers['skins_n']} skin(s) of {numbers['seeds_n']} seeds each."
     spread = seeds if any(row["spread"] for _, rows in named.values() for row in rows) else "One network each."
     found = [
         {
@@ -139,8 +140,8 @@ def _protocol(numbers: Mapping[str, Any]) -> str:
         _count(numbers[name], numbers["unit"]) for name in ("train_n", "test_n", "every_n", "left_out_units_n")
     )
     said = (
-        f"Trained on the first {train} of each skin, tested on {test} after every {every}; one network for each "
-        "policy of the no-load reading. Contacts: what the skin had felt before the test."
+        f"Trained on the first {train} of each skin, tested on {test} after every {every}; each policy of "
+        "the no-load reading has networks of its own. Contacts: what the skin had felt before the test."
     )
     return said + (f" The last {left} fill no whole test, and are left out." if numbers["left_out_units_n"] else "")
 
