@@ -43,8 +43,8 @@ def _say_shown(numbers: Mapping[str, Any]) -> str:
     if "shown_s" not in numbers or "warmer_K" not in numbers:
         return ""
     return (
-        f" The contacts compared over time take {numbers['shown_s']:,.0f} s, in which the "
-        f"chips' temperature changes by {numbers['warmer_K']:+.2g} K: that is in the field, beside the skin's own wear."
+        f" The contacts compared over time take {numbers['shown_s']:,.0f} s, in which the chips' temperature changes "
+        f"by {numbers['warmer_K']:+.2g} K: the field shows that too, beside the skin's own wear."
     )
 
 
