@@ -49,6 +49,8 @@ class Omission:
     rest_uT: float | None
     force_pct: float | None
     how: str
+    left_out_by: tuple[str, ...] = ()  # protocols; none of a term that is no protocol's to ask for
+    computed_by: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -67,10 +69,13 @@ def measure(of: Synthesis, *, seed: int) -> list[Omission]:
     """Measure every term of PHYSICS 8 on a scene."""
     subject = _subject(of, seed)
     without = _feel(subject, Terms(), seed)
-    return [
+    asked_for = (
         *_over_time(subject, without, seed),
         _temperature(subject, without),
         _friction(subject),
+    )
+    return [
+        *(_sorted_out(omission, of) for omission in asked_for),
         _earth(without),
         *_inside(subject),
         *_free_edge(subject),
@@ -78,6 +83,16 @@ def measure(of: Synthesis, *, seed: int) -> list[Omission]:
         _own_field(subject, of),
         _too_deep(of, seed),
     ]
+
+
+def _sorted_out(omission: Omission, of: Synthesis) -> Omission:
+    """Name the protocols that leave a term out, and those that compute it."""
+    computed = {name: omission.term in protocol.terms for name, protocol in of.protocols.items()}
+    return replace(
+        omission,
+        left_out_by=tuple(name for name, used in computed.items() if not used),
+        computed_by=tuple(name for name, used in computed.items() if used),
+    )
 
 
 def _subject(of: Synthesis, seed: int) -> Subject:

@@ -157,7 +157,7 @@ FURTHER = Section("further", "Further", "What no section above names.", folded=(
 LEFT_OUT = Section(
     "left-out",
     "What was left out, and what that costs",
-    "The terms of physics that this scene does without, and the error that each makes.",
+    "The terms of physics that protocols of this scene do without, and the error that each makes.",
     ("left_out",),
 )
 COSTS = Section(
@@ -187,7 +187,7 @@ CAPTIONS = {
     "labels": "Scores by labelled indentations of the new board",
     "chosen": "Candidates, and which was chosen",
     "audit": "Search for leaks",
-    "left_out": "Terms of physics that were left out",
+    "left_out": "Terms of physics: left out by which protocols, computed for which",
     "captures": "What was read, and what was lost",
     "stages": "What each stage cost",
     "learning": "Methods: error beside time",

@@ -10,12 +10,12 @@ from pipeline.stages._simulated import read_synthesis
 
 
 def leave_out(scene: str, settings: Path, answer: Path) -> None:
-    """Measure every term on the scene's own first skin."""
+    """Measure every term on the scene's own first skin, and name the protocols that do without it."""
     of, seed = read_synthesis(settings)
     omissions = measure(of, seed=seed)
     io.write_json(answer, [asdict(omission) for omission in omissions])
     left = ", ".join(omission.term for omission in omissions if omission.done == "left out")
-    say(f"{scene}: left out, and measured: {left}")
+    say(f"{scene}: left out by the main protocol, and measured: {left}")
 
 
 if __name__ == "__main__":

@@ -43,6 +43,16 @@ def test_terms_that_a_scene_does_without_are_left_out_and_others_are_kept(rows):
     assert aged["ageing"].done == "kept"
 
 
+def test_a_term_names_the_protocols_that_leave_it_out_and_those_that_compute_it(rows):
+    wear = FEW | {"skins_n": 1, "terms": ["ageing"]}
+    found = rows_of(with_protocol("wear", wear, protocols={"grid": FEW, "wear": wear}, terms={"ageing": SIZES}))
+    assert (found["ageing"].left_out_by, found["ageing"].computed_by) == (("grid",), ("wear",))
+    assert found["ageing"].done == "left out"  # by the main protocol, which costs are measured on
+    assert found["ageing"].force_pct == rows["ageing"].force_pct
+    assert (found["friction"].left_out_by, found["friction"].computed_by) == (("grid", "wear"), ())
+    assert found["the powder's own field"].left_out_by == found["the chips' steps"].computed_by == ()
+
+
 def test_ageing_and_relaxation_cost_the_force_what_their_formulas_say(rows):
     left = softening(np.array([INDENTATIONS_N - 1]), settling=AGEING.settling, ageing=AGEING.ageing)[0]
     assert rows["ageing"].force_pct == pytest.approx(100 * (1 / left - 1), rel=1e-9)
