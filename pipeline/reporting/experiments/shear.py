@@ -22,9 +22,9 @@ FORCES = ("Fx", "Fy", "Fz")
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Show both splits, the paper's way first."""
+    """Show both splits, the paper's numbers beside each: it names none."""
     ways = {
-        "random readings held out (the paper's way: a stop has five readings)": numbers,
+        "random readings held out (ours; the paper names no split)": numbers,
         "whole lines held out": numbers["by_line"],
     }
     lines = []
