@@ -17,9 +17,10 @@ MEANING = (
     "Two contacts are the sum of two changes of field that were read of one held-out skin, so their noise is that of "
     "two readings. A network that knows single contacts answers one place and one force. Detected: odder, by a "
     "detector, than all but the asked share of single contacts of training skins; of the held-out boards' single "
-    "contacts the share called so too is the realised false alarm. The networks that disagree were trained on those "
-    "skins, and disagree less there. At 0 mm both pokes are at one place: what strength and noise alone do. "
-    "± is the sd over held-out boards. The paper gives no number (section 7: future work)."
+    "contacts the share called so too is the realised false alarm. The networks behind residual and networks disagree "
+    "were trained on the contacts that thresholds are set on, so their thresholds may be too low. At 0 mm both pokes "
+    "are at one place: what strength and noise alone do. ± is the sd over held-out boards. The paper gives no number "
+    "(section 7: future work)."
 )
 TWO_TIPS = "Two tips cannot stand nearer than they are wide; smaller distances are sums all the same."
 
@@ -68,15 +69,19 @@ def _draw_places(axes: Any, along: Mapping[str, Sequence[float]]) -> None:
 
 
 def _draw_detection(axes: Any, numbers: Mapping[str, Any]) -> None:
-    rows = numbers["by_separation"]
+    rows, together = numbers["by_separation"], numbers["same_place"]
     distance_mm = [row["separation_mm"] for row in rows]
     for i, (name, alarm) in enumerate(numbers["false_alarm_pct"].items()):
         told = [row["detected_pct"][name]["mean"] for row in rows]
         colour, marker = COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)]
         axes.plot(distance_mm, told, color=colour, marker=marker, label=name)
+        at_one = together["detected_pct"][name]["mean"]
+        axes.plot(
+            together["separation_mm"], at_one, color=colour, marker=marker, markerfacecolor="white", clip_on=False
+        )
         axes.axhline(alarm["realised"]["mean"], color=colour, linestyle=":", linewidth=1)
     axes.set(xlabel="distance of the two / mm", ylabel="called two contacts / %", ylim=(0, 100))
-    axes.set_title("Told as two (dotted: one called two)", loc="left", fontsize=10)
+    axes.set_title("Told as two (dotted: one called two;\nhollow: both at one place)", loc="left", fontsize=10)
     axes.legend(frameon=False, loc="upper left", fontsize=9)
 
 

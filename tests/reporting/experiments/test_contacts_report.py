@@ -32,6 +32,7 @@ def test_a_row_a_distance_and_one_of_single_contacts_all_with_their_source():
     assert table["along the line (0 weaker, 1 stronger)"].tolist() == ["–", "0.75 ± 0.07", "–", "–"]
     assert table["detected by residual, %"].tolist()[-1] == "17.0 ± 1.7"
     assert "noise is that of two readings" in table.attrs["meaning"]
+    assert "residual and networks disagree were trained on" in table.attrs["meaning"]
     assert "5 % false alarms" in table.attrs["meaning"]
 
 
@@ -47,3 +48,5 @@ def test_the_figure_names_detectors_units_and_source_and_is_the_same_twice():
     for word in ("direction", "residual", "stronger contact", "distance of the two / mm", "%", "(recorded)"):
         assert word in words
     assert figures(NUMBERS, DRAWN, "recorded") == drawn
+    nearer = figures(NUMBERS | {"same_place": row(2.0)}, DRAWN, "recorded")
+    assert nearer != drawn  # what two contacts at one place give is drawn too
