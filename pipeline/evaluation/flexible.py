@@ -31,6 +31,11 @@ def strength_ratio(flexible: Sequence[ByDepth], rigid: Sequence[ByDepth]) -> dic
     return statistic([_median_uT(flexible, depth) / _median_uT(rigid, depth) for depth in sorted(both)])
 
 
+def gap_less_pct(gap_mm: Mapping[str, float]) -> float:
+    """By how much nearer chips of flexible boards are to their skins than those of rigid ones, in % of the latter."""
+    return 100 * (1 - gap_mm["flexible"] / gap_mm["rigid"])
+
+
 def answer_flexible(answers: Sequence[Answered]) -> dict[str, Any]:
     """Summarise over skins, by arm; the force bias apart."""
     return over_skins(answers) | biases(answers)

@@ -10,6 +10,7 @@ import numpy as np
 
 from pipeline.evaluation.metrics import summarise
 from pipeline.evaluation.summary import over_folds, over_test_skins
+from pipeline.questions import EXPERIMENTS
 from pipeline.reporting.learned import by_fold, learned
 
 SINGLE = ("single_random", "single_temporal")  # the first of these stands beside the paper's numbers
@@ -88,6 +89,18 @@ def add_up(accounts: Iterable[Mapping[str, int]]) -> dict[str, int]:
     if skipped:
         total["lost_bytes_n"] = sum(skipped)
     return total
+
+
+def lost_by_protocol(losses: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Add the counts of each further protocol's captures, and what questions of it left out of their rows."""
+    found: dict[str, dict[str, Any]] = {}
+    for question, own in losses.items():
+        protocol = EXPERIMENTS[question]
+        if protocol is None or not own["accounts"]:
+            continue
+        left_out = found.get(protocol, {"left_out": {}})["left_out"]
+        found[protocol] = add_up(own["accounts"]) | {"left_out": left_out | dict(own["left_out"])}
+    return found
 
 
 def runtime(cards: Cards, costs: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:

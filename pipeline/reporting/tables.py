@@ -50,7 +50,7 @@ def make_tables(numbers: Mapping[str, Any]) -> dict[str, pd.DataFrame]:
         titled = {f"{protocol} ({one['source']})": one for protocol, one in numbers["described"].items()}
         tables["skins"] = skins_table(titled)
     tables["variants"] = _variants(numbers["variants"], source)
-    tables["captures"] = _captures(numbers["capture"], source)
+    tables["captures"] = _captures(numbers, source)
     tables["table1"] = table1(read_table1(), measured(numbers))
     tables["checklist"] = checklist(numbers)
     return tables
@@ -103,8 +103,21 @@ def _variants(variants: Mapping[str, Any], source: str) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
-def _captures(account: Mapping[str, Any], source: str) -> pd.DataFrame:
+def _captures(numbers: Mapping[str, Any], source: str) -> pd.DataFrame:
+    further = numbers.get("capture_by_protocol", {})
+    lines = _counts("main", numbers["capture"], source)
+    for protocol, account in further.items():
+        lines += [line for line in _counts(protocol, account, source) if line["count"] != "0"]
+    table = pd.DataFrame(lines)
+    if further:
+        table.attrs["meaning"] = "Main: the captures that folds are drawn on. Of other protocols no 0 is listed."
+    return table
+
+
+def _counts(protocol: str, account: Mapping[str, Any], source: str) -> list[dict[str, str]]:
     flat = {**account, **{f"left out of training: {key}": n for key, n in account["left_out"].items()}}
-    return pd.DataFrame(
-        [{"what": key, "count": str(value), "source": source} for key, value in flat.items() if key != "left_out"]
-    )
+    return [
+        {"protocol": protocol, "what": key, "count": str(value), "source": source}
+        for key, value in flat.items()
+        if key != "left_out"
+    ]

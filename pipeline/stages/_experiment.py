@@ -8,6 +8,8 @@ from pipeline import io
 from pipeline.errors import SchemaError, complain
 from pipeline.schema import Readings
 
+NO_CAPTURES: Mapping[str, Any] = {"accounts": [], "left_out": {}}  # of its own: it asks the main ones
+
 
 def read_folder(indentations: Path, names: tuple[str, ...] = ()) -> list[Readings]:
     """Read the named captures of a folder in order of name; without names, all that its one stage wrote."""
@@ -17,6 +19,14 @@ def read_folder(indentations: Path, names: tuple[str, ...] = ()) -> list[Reading
     return [io.read_readings(file) for file in files]
 
 
-def write_answer(answer: Path, numbers: Mapping[str, Any], drawn: Mapping[str, Any]) -> None:
-    """Write what numbers.json takes over as it is, and beside it what only figures show."""
-    io.write_json(answer, {"numbers": dict(numbers), "drawn": dict(drawn)})
+def read_losses(indentations: Path, left_out: Mapping[str, int]) -> dict[str, Any]:
+    """Read the account of every capture of a folder, and note what was left out of its rows."""
+    accounts = [io.read_account(file) for file in sorted(indentations.glob("*.parquet"))]
+    return {"accounts": accounts, "left_out": dict(left_out)}
+
+
+def write_answer(
+    answer: Path, numbers: Mapping[str, Any], drawn: Mapping[str, Any], losses: Mapping[str, Any] = NO_CAPTURES
+) -> None:
+    """Write what numbers.json takes over as it is, what only figures show, and what was lost of captures of its own."""
+    io.write_json(answer, {"numbers": dict(numbers), "drawn": dict(drawn), "losses": dict(losses)})

@@ -12,7 +12,7 @@ from pipeline.learning.recipe import HEADLINE
 from pipeline.params import Scene, described_in, modelled, runs, swept
 from pipeline.provenance import SECONDS, code_version, device, read_costs
 from pipeline.reporting.learned import timed_learning
-from pipeline.reporting.numbers import answered, compose, rounded, runtime
+from pipeline.reporting.numbers import answered, compose, lost_by_protocol, rounded, runtime
 from pipeline.stages._run import COSTS
 
 Cards = Sequence[Mapping[str, Any]]
@@ -39,11 +39,13 @@ def read_numbers(scene: str, asked: Scene, at: Places) -> tuple[dict[str, Any], 
     accounts = [io.read_account(at.indentations / f"{name}.parquet") for name in words["captures"]]
     points = {question: io.read_json(at.answers / f"{file}.json") for question, file in swept(asked).items()}
     numbers: dict[str, Any] = {"provenance": _provenance(scene, asked, cards)}
+    experiments = {question: io.read_json(at.answers / f"{question}.json") for question in asked.experiments}
     numbers |= compose(cards, points, accounts, words["dropped"], headline=HEADLINE)
+    losses = {question: answer["losses"] for question, answer in experiments.items()}
+    numbers |= {"capture_by_protocol": lost_by_protocol(losses)} if asked.simulate else {}
     numbers |= {"audit": io.read_json(at.answers / "audit.json")} if "audit" in asked.questions else {}
     numbers |= {"chosen": choose(cards)} if "choice" in asked.questions else {}
     numbers["described"] = {name: io.read_json(at.answers / f"described/{name}.json") for name in described_in(asked)}
-    experiments = {question: io.read_json(at.answers / f"{question}.json") for question in asked.experiments}
     numbers |= {question: answer["numbers"] for question, answer in experiments.items()}
     studied = {question: io.read_json(at.answers / f"{question}.json") for question in asked.studied}
     took = _seconds(scene)

@@ -11,14 +11,14 @@ from pipeline.dataset.rows import gather
 from pipeline.dataset.splits import hold_out_skins
 from pipeline.dataset.stacked import stack
 from pipeline.evaluation.adapted import AFTER, CONTROL
-from pipeline.evaluation.flexible import answer_flexible, by_depth, forces_drawn, strength_ratio
+from pipeline.evaluation.flexible import answer_flexible, by_depth, forces_drawn, gap_less_pct, strength_ratio
 from pipeline.learning.recipe import HEADLINE
 from pipeline.questions import EXPERIMENTS, MAIN_PROTOCOL
 from pipeline.schema import Readings
 from pipeline.seeds import rng_for
 from pipeline.stages._adapt import adaptations, read_starts
 from pipeline.stages._answers import answers_after, answers_before
-from pipeline.stages._experiment import read_folder, write_answer
+from pipeline.stages._experiment import read_folder, read_losses, write_answer
 from pipeline.stages._run import run
 from pipeline.stages._train import Scenery, read_scenery
 
@@ -32,7 +32,8 @@ def flexible(
     at, starts, captures = read_scenery(scene, settings, main, folds), read_starts(started), read_folder(indentations)
     asked, first, trained_n = at.asked.adapt, at.of("lobo")[0], len(at.rows)
     assert asked is not None
-    at = replace(at, rows=stack(at.rows, gather(captures, at.asked.selection)))
+    poked = gather(captures, at.asked.selection)
+    at = replace(at, rows=stack(at.rows, poked))
     sides = (first.train, np.arange(trained_n, len(at.rows)))
     fold = hold_out_skins(at.rows, "flexible", first.name, sides, at.asked.split)
     arms = {name: arm for name, arm in ((HEADLINE, AFTER), (CONTROL, CONTROL), (SHAPE, SHAPE)) if name in asked.recipes}
@@ -53,25 +54,26 @@ def flexible(
     numbers: dict[str, Any] = {
         "skins_n": len(skins), "boards_n": len(np.unique(at.rows.board[fold.test])),
         "seeds_n": len({one.seed_i for one in own}), "pokes_n": asked.pokes_n, "fold": first.name,
-        "trained_on_skins_n": len(np.unique(at.rows.skin[fold.train])), "gap_mm": _gaps(at),
+        "trained_on_skins_n": len(np.unique(at.rows.skin[fold.train])),
         "strength_ratio": strength_ratio(_by_depth(captures), _by_depth(read_folder(main))),
-    } | answer_flexible(own)  # fmt: skip
+    } | _gaps(at) | answer_flexible(own)  # fmt: skip
     if SHAPE in arms:
         numbers[SHAPE] = answer_flexible(before[SHAPE] + [replace(one, arm=AFTER) for one in after if one.arm == SHAPE])
-    write_answer(answer, numbers, forces_drawn(own, rng_for(at.asked.seed, "flexible", "drawn")))
+    drawn = forces_drawn(own, rng_for(at.asked.seed, "flexible", "drawn"))
+    write_answer(answer, numbers, drawn, read_losses(indentations, poked.dropped))
 
 
 def _by_depth(captures: Sequence[Readings]) -> list[dict[float, np.ndarray]]:
     return [by_depth(one.depth_mm, one.b_uT - one.noload_uT) for one in captures]
 
 
-def _gaps(at: Scenery) -> dict[str, float]:
-    """Tell the gaps between skin and chips of both kinds of boards."""
+def _gaps(at: Scenery) -> dict[str, Any]:
+    """Tell the gaps between skin and chips of both kinds of boards, and by how much one is less."""
     assert at.asked.simulate is not None
     words = at.asked.simulate.model_dump()
-    kinds = {name: words["protocols"][name]["boards"] for name in (MAIN_PROTOCOL, str(EXPERIMENTS["flexible"]))}
-    return {"rigid": words["boards"][kinds[MAIN_PROTOCOL]]["design"]["gap_mm"],
-            "flexible": words["boards"][kinds["flexible"]]["design"]["gap_mm"]}  # fmt: skip
+    kinds = {"rigid": MAIN_PROTOCOL, "flexible": str(EXPERIMENTS["flexible"])}
+    gap_mm = {kind: words["boards"][words["protocols"][of]["boards"]]["design"]["gap_mm"] for kind, of in kinds.items()}
+    return {"gap_mm": gap_mm, "gap_less_pct": gap_less_pct(gap_mm)}
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from pipeline.learning.cell import Cell
 from pipeline.learning.recipe import HEADLINE, Adaptations
 from pipeline.stages._adapt import Pokes, Starts, adaptation, own_starts, pool_lines, read_starts
 from pipeline.stages._answers import answers_after, answers_before
-from pipeline.stages._experiment import read_folder, write_answer
+from pipeline.stages._experiment import read_folder, read_losses, write_answer
 from pipeline.stages._run import run
 from pipeline.stages._train import Scenery, read_scenery
 
@@ -39,7 +39,8 @@ def manual(
         cells += _cells(at, fold, asked, starts, (skin, own))
     answers += answers_after(at, cells, "manual")
     pokes_n, lines_n = zip(*((_pokes_n(at, own), len(np.unique(own.line_i))) for own in lines.values()), strict=True)
-    write_answer(answer, answer_manual(answers, pokes_n=pokes_n, lines_n=lines_n), {})
+    numbers = answer_manual(answers, pokes_n=pokes_n, lines_n=lines_n)
+    write_answer(answer, numbers, {}, read_losses(indentations, poked.dropped))
 
 
 def _cells(

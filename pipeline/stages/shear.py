@@ -11,7 +11,7 @@ from pipeline.evaluation.shear import answer_shear, score5
 from pipeline.params import read_scene
 from pipeline.sections import Shear
 from pipeline.seeds import rng_for, seed_for
-from pipeline.stages._experiment import read_folder, write_answer
+from pipeline.stages._experiment import read_folder, read_losses, write_answer
 from pipeline.stages._models import note_seconds
 from pipeline.stages._run import run
 from pipeline.stages._train import Scenery, cells_of, train_all
@@ -42,7 +42,8 @@ def shear(scene: str, settings: Path, indentations: Path, answer: Path) -> None:
     first_i = next(i for i, cell in enumerate(cells) if cell.fold in names)
     shown = rng_for(asked.seed, "shear", "drawn").permutation(len(cells[first_i].test))[:DRAWN_N]
     true, predicted = rows.target[cells[first_i].test], trained[first_i].predicted
-    write_answer(answer, numbers, {"true": _forces(true[shown]), "predicted": _forces(predicted[shown])})
+    drawn = {"true": _forces(true[shown]), "predicted": _forces(predicted[shown])}
+    write_answer(answer, numbers, drawn, read_losses(indentations, rows.dropped))
 
 
 def _folds(rows: Rows, group: np.ndarray, by: str, asked: Shear, seed: int) -> list[Fold]:

@@ -14,7 +14,7 @@ from pipeline.learning.recipe import HEADLINE
 from pipeline.params import read_scene
 from pipeline.questions import EXPERIMENTS
 from pipeline.sections import Sleeve
-from pipeline.stages._experiment import read_folder, write_answer
+from pipeline.stages._experiment import read_folder, read_losses, write_answer
 from pipeline.stages._models import note_seconds
 from pipeline.stages._run import run, say
 from pipeline.stages._simulated import read_synthesis
@@ -46,7 +46,8 @@ def sleeve(scene: str, settings: Path, indentations: Path, answer: Path) -> None
         **scored.pop(HEADLINE), "variants": scored,
     }  # fmt: skip
     error_mm = evaluation.errors_mm(true, answers[HEADLINE][0])
-    write_answer(answer, numbers, evaluation.to_draw(area, true, error_mm, indentation))
+    drawn = evaluation.to_draw(area, true, error_mm, indentation)
+    write_answer(answer, numbers, drawn, read_losses(indentations, at.rows.dropped))
 
 
 def _area(settings: Path) -> evaluation.Area:

@@ -8,7 +8,7 @@ from pipeline.evaluation.drift import pace
 from pipeline.evaluation.variation import Visits, find_visits, first_of_each_board, meanwhile, over_skins, over_time
 from pipeline.params import captures_of, read_params, read_scene
 from pipeline.sections import Variation
-from pipeline.stages._experiment import read_folder, write_answer
+from pipeline.stages._experiment import read_folder, read_losses, write_answer
 from pipeline.stages._run import run
 
 
@@ -31,7 +31,7 @@ def variation(scene: str, params: Path, settings: Path, main: Path, indentations
         drawn.append(where | {name: lines for name, (_, lines) in over.items()})
     when = pace([worn]) | meanwhile(worn, asked.contacts_n)
     numbers = {"depth_mm": asked.depth_mm, "worn_skin": worn.skin} | when | {"places": places}
-    write_answer(answer, numbers, {"places": drawn})
+    write_answer(answer, numbers, {"places": drawn}, read_losses(indentations, {}))
 
 
 def _visits(main: Path, names: list[str], asked: Variation) -> dict[str, list[Visits]]:

@@ -4,7 +4,7 @@ import pytest
 
 from pipeline.errors import SchemaError
 from pipeline.evaluation.metrics import METRICS
-from pipeline.reporting.numbers import add_up, compose, rounded
+from pipeline.reporting.numbers import add_up, compose, lost_by_protocol, rounded
 from pipeline.reporting.paper import TABLE_2
 from pipeline.reporting.readme import fill
 from pipeline.reporting.shown import show, to_markdown
@@ -75,6 +75,25 @@ def test_accounts_add_up():
         "captures_n": 2, "bytes_n": 249, "frames_n": 3, "skipped_resync_bytes_n": 1, "skipped_truncated_bytes_n": 2,
         "lost_bytes_n": 3,
     }  # fmt: skip
+
+
+def test_losses_of_further_protocols_stand_under_their_names_and_not_under_the_main_ones():
+    wear = {"accounts": ACCOUNTS, "left_out": {}}
+    losses = {
+        "drift": wear | {"left_out": {"low_force_rows_n": 4}},
+        "variation": wear,  # of the same captures: counted once
+        "shear": {"accounts": ACCOUNTS[1:], "left_out": {"low_force_rows_n": 7}},
+        "contacts": {"accounts": [], "left_out": {}},  # asks the main captures
+    }
+    found = lost_by_protocol(losses)
+    assert set(found) == {"wear", "drag"}
+    assert found["wear"] == add_up(ACCOUNTS) | {"left_out": {"low_force_rows_n": 4}}
+    assert (found["drag"]["captures_n"], found["drag"]["bytes_n"]) == (1, 164)
+    shown = make_tables(numbers() | {"capture_by_protocol": found})["captures"].set_index(["protocol", "what"])["count"]
+    assert shown["main", "bytes_n"] == shown["wear", "bytes_n"] == "249"
+    assert shown["drag", "left out of training: low_force_rows_n"] == "7"
+    assert ("drag", "lost_bytes_n") not in shown  # nothing was lost
+    assert shown["wear", "lost_bytes_n"] == "3"
 
 
 def test_every_table_says_where_its_rows_come_from():

@@ -50,15 +50,14 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
 
 def _meaning(numbers: Mapping[str, Any]) -> str:
     gap_mm = numbers["gap_mm"]
-    less_pct = 100 * (1 - gap_mm["flexible"] / gap_mm["rigid"])
     return (
         f"Networks of fold {numbers['fold']}, trained on {numbers['trained_on_skins_n']} skins of rigid boards, on "
         f"{numbers['skins_n']} skins of {numbers['boards_n']} flexible boards; adapted by {numbers['pokes_n']} pokes. "
         "Bias: mean of predicted less true force, and as a part of the mean force; the paper names "
         f"{FLEXIBLE_BIAS} after adaptation, without a number. Ours: |dB| is {show(numbers['strength_ratio'])} times as "
         f"strong at equal depth (± over depths). Skins lie {gap_mm['flexible']:g} mm over the chips instead of "
-        f"{gap_mm['rigid']:g} mm, {less_pct:.0f} % less; the paper's {FLEXIBLE_GAP_LESS_PCT:g} % less. The paper's "
-        "numbers are after adaptation, its accuracy about."
+        f"{gap_mm['rigid']:g} mm, {numbers['gap_less_pct']:.0f} % less; the paper's {FLEXIBLE_GAP_LESS_PCT:g} % less. "
+        "The paper's numbers are after adaptation, its accuracy about."
     )
 
 

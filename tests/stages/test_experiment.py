@@ -1,0 +1,24 @@
+"""What every experiment's stage writes: its numbers, what is drawn, and what was lost of captures of its own."""
+
+import json
+
+from pipeline import io
+from pipeline.stages._experiment import read_losses, write_answer
+from tests.dataset import tables
+
+
+def test_every_capture_of_the_folder_is_accounted_for_beside_what_rows_lost(tmp_path):
+    for i in range(2):
+        account = {"bytes_n": 82 * (i + 1), "skipped_resync_bytes_n": i}
+        io.write_readings(tmp_path / f"b{i}_s0-wear.parquet", [tables.readings()], account)
+    losses = read_losses(tmp_path, {"low_force_rows_n": 3})
+    assert [account["bytes_n"] for account in losses["accounts"]] == [82, 164]
+    assert [account["skipped_resync_bytes_n"] for account in losses["accounts"]] == [0, 1]
+    assert losses["left_out"] == {"low_force_rows_n": 3}
+
+
+def test_an_answer_about_the_main_captures_counts_none_of_its_own(tmp_path):
+    write_answer(tmp_path / "contacts.json", {"pairs_n": 3}, {"along": [1.0]})
+    written = json.loads((tmp_path / "contacts.json").read_text())
+    assert written["losses"] == {"accounts": [], "left_out": {}}
+    assert (written["numbers"], written["drawn"]) == ({"pairs_n": 3}, {"along": [1.0]})
