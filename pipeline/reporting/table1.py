@@ -18,6 +18,7 @@ PRINTED = Path(__file__).with_name("table1.yaml")
 LOCALISATION = "Localisation (within 1 mm, new skin)"  # our row: the paper's table has none
 OURS = "ours, measured"
 NOT_GIVEN = "–"
+READ_BACK = ", a setting read back from the captures"  # of a simulated rig: no result
 
 
 class Column(Strict):
@@ -66,14 +67,16 @@ def table1(data: Table1, measured: Mapping[str, str]) -> pd.DataFrame:
 
 
 def measured(numbers: Mapping[str, Any]) -> dict[str, str]:
-    """Say what a scene measured of the table's rows, and on which kind of skins; of what it did not ask, nothing."""
+    """Say what a scene measured of the table's rows, or was set to, on which kind of skins; else nothing."""
     source = numbers["provenance"]["source"]
     described = [*numbers.get("described", {}).values()]
     rate = described[0]["over_skins"].get("rate_hz") if described else None
-    words = {"Frequency": f"{rate['mean']:.4g} Hz"} if rate else {}
+    simulated = source == "simulated"
+    words = {"Frequency": f"{rate['mean']:.4g} Hz{READ_BACK if simulated else ''}"} if rate else {}
     if "sleeve" in numbers:
         own = numbers["sleeve"]
-        words["Area coverage"] = f"{own['chips_n']} chips under {' x '.join(f'{side:g}' for side in own['area_mm'])} mm"
+        area = " x ".join(f"{side:g}" for side in own["area_mm"])
+        words["Area coverage"] = f"{own['chips_n']} chips under {area} mm{', a setting' if simulated else ''}"
     if "drift" in numbers:
         words["Durable (> 50k contacts)"] = _durable(numbers["drift"])
     best = next((row for row in ("adapted", "triplet", "multi") if row in numbers.get("table2", {})), None)

@@ -5,7 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import ParamsError
-from pipeline.reporting.table1 import LOCALISATION, NOT_GIVEN, OURS, read_table1, table1
+from pipeline.reporting.table1 import LOCALISATION, NOT_GIVEN, OURS, measured, read_table1, table1
+from tests.reporting.synthetic import all_questions, stat
 
 DATA = read_table1()
 ROWS = (*DATA.rows, LOCALISATION)
@@ -32,6 +33,19 @@ def test_the_papers_cells_are_never_overwritten(measured):
         assert row[OURS] == measured.get(name, NOT_GIVEN)
     assert set(table.iloc[-1][list(DATA.columns)]) == {NOT_GIVEN}
     assert table.iloc[-1][""] == LOCALISATION
+
+
+def test_what_was_set_in_a_simulated_rig_is_not_called_measured():
+    for source, rate, area in (
+        ("simulated", "400 Hz, a setting read back from the captures, simulated", "mm, a setting, simulated"),
+        ("recorded", "400 Hz, recorded", "mm, recorded"),
+    ):
+        numbers = all_questions(source)
+        numbers["described"]["grid"]["over_skins"]["rate_hz"] = stat(400.0)
+        numbers["sleeve"]["area_mm"] = [50.8, 101.6]
+        words = measured(numbers)
+        assert words["Frequency"] == rate
+        assert words["Area coverage"] == f"40 chips under 50.8 x 101.6 {area}"
 
 
 def test_every_source_is_told_beside_the_table():
