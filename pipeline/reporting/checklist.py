@@ -4,8 +4,10 @@ Which results there are is data, `checklist.yaml`; the paper's numbers are const
 know how ours were found.
 """
 
+import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,8 +27,19 @@ ONE_SKIN = "ours learnt from one skin only: not the same question"
 POOLED = ("table2.multi.", "table2.triplet.", "table2.adapted.")
 MEANING = (
     f"A result differs where it is outside the paper's sd, or by more than {100 * NEAR:g} % where the paper gives "
-    "none; within it, nothing is claimed about why. Where no number can be compared, the file named last shows ours."
+    "none; within it, nothing is claimed about why. Reasons are guesses: no run measured them. Where no number can be "
+    "compared, the file named last shows ours."
 )
+INPUT = "an input of the simulated rig, read back from the captures"
+NAMED = re.compile(r"\{([\w.]+)\}")  # a number that a reason names: a constant of the paper, or a path of ours
+
+
+class Reach(Strict):
+    """How far in the paper had gone when it looked, and the path of how far in ours had."""
+
+    paper: str
+    ours: str
+    of: str  # what is counted
 
 
 class Row(Strict):
@@ -38,10 +51,13 @@ class Row(Strict):
     paper: str | None = None  # a constant of `reporting.paper`, its parts separated by dots
     says: str | None = None  # the paper's words, where it gives no number
     ours: str | None = None
-    rule: Literal["near", "at_most", "at_least", "positive", "view"] = "near"  # view: a figure is to be looked at
+    # view: a figure is to be looked at; input: where simulated, a setting that came back over the wire
+    rule: Literal["near", "at_most", "at_least", "positive", "plateau", "input", "view"] = "near"
+    reach: Reach | None = None
     stage: str | None = None
     shown: tuple[str, ...] = ()
-    why: str = ""  # said only where ours differs
+    why: str = ""  # said only where ours differs; numbers by their names in braces
+    simulated_only: bool = False  # the reason is about simulation: recorded scenes have none
 
 
 @dataclass(frozen=True)
@@ -64,14 +80,16 @@ def checklist(numbers: Mapping[str, Any], rows: Sequence[Row] | None = None) -> 
     for row in read_rows() if rows is None else rows:
         printed = constant(row.paper) if row.paper else None
         found = resolve(numbers, row.ours) if row.ours else None
-        verdict = judge(row, printed, found, pooled=is_pooled(numbers))
+        verdict = judge(row, printed, found, pooled=is_pooled(numbers), simulated=source == "simulated")
+        if row.reach and verdict.sentence != NOT_ASKED:
+            verdict = _after(verdict, row.reach, numbers)
         lines.append(
             {
                 "in the paper": row.where,
                 "result": row.what,
                 "paper": row.says if printed is None else _shown(printed, row.ours),
                 "ours": _ours(row, found),
-                "difference": f"{verdict.sentence}. {row.why}" if verdict.differs and row.why else verdict.sentence,
+                "difference": _with_reason(verdict, row, numbers),
                 "stage": row.stage or "–",
                 "shown in": ", ".join(row.shown) if row.shown and (found is not None or not row.ours) else "–",
                 "source": source,
@@ -107,7 +125,7 @@ def constant(path: str) -> Any:
     return here
 
 
-def judge(row: Row, printed: Any, ours: Any, *, pooled: bool) -> Verdict:
+def judge(row: Row, printed: Any, ours: Any, *, pooled: bool, simulated: bool) -> Verdict:
     """Say in one sentence how ours stands to the paper's."""
     if row.ours is None:
         return Verdict("–")
@@ -115,15 +133,22 @@ def judge(row: Row, printed: Any, ours: Any, *, pooled: bool) -> Verdict:
         return Verdict(NOT_ASKED)
     if not pooled and row.ours.startswith(POOLED):
         return Verdict(ONE_SKIN)
+    if row.rule == "input" and simulated:
+        return Verdict(INPUT, False)
+    if row.rule == "plateau":
+        return Verdict(_plateau(ours, printed))
     if isinstance(ours, bool):
         return Verdict("holds" if ours else "does not hold", not ours)
-    if _is_findings(ours):
-        return _judge_findings(ours)
+    return _judge_findings(ours) if _is_findings(ours) else _judge_number(row, printed, ours)
+
+
+def _judge_number(row: Row, printed: Any, ours: Any) -> Verdict:
     value = _mean(ours)
     if row.rule == "view" or value is None or (printed is None and row.rule != "positive"):
         return Verdict("–")
-    if row.rule == "near":
-        return _judge_near(value, printed, row.ours)
+    if row.rule in ("near", "input"):
+        near = _judge_near(value, printed, str(row.ours))
+        return replace(near, sentence=near.sentence + _own_spread(ours, printed))
     limit = 0.0 if row.rule == "positive" else float(_mean(printed) or 0.0)
     holds = value <= limit if row.rule == "at_most" else value >= limit if row.rule == "at_least" else value > 0
     words = {"at_most": f"at most {limit:g}", "at_least": f"at least {limit:g}", "positive": "above 0"}[row.rule]
@@ -138,7 +163,7 @@ def _judge_near(ours: float, printed: Any, path: str) -> Verdict:
     percent = "accuracy" in path
     size = f"{abs(gap):.2g} points {side}" if percent else f"{100 * abs(gap / mean):.2g} % {side}"
     if not percent and ours >= 2 * mean:
-        size = f"{ours / mean:.2g} times the paper's"
+        size = f"{ours / mean:{'.2g' if ours < 100 * mean else '.0f'}} times the paper's"
     good = {True: " (better)", False: " (worse)"}
     word = good[(gap > 0) == percent] if percent or ".mse_" in f".{path}" else ""
     within = "within" if abs(gap) <= reach else "outside"
@@ -146,6 +171,43 @@ def _judge_near(ours: float, printed: Any, path: str) -> Verdict:
     if gap == 0:
         return Verdict("the same", False)
     return Verdict(f"ours is {size}{word}; {within} {yard}", within == "outside")
+
+
+def _own_spread(ours: Any, printed: Any) -> str:
+    """Where only ours has an sd, say whether the paper's number is within it too."""
+    if isinstance(printed, tuple) or not isinstance(ours, Mapping) or "sd" not in ours:
+        return ""
+    side = "within" if abs(ours["mean"] - printed) <= ours["sd"] else "outside"
+    return f"; {side} one sd of ours (n = {ours['n']:g})"
+
+
+def _plateau(points: Sequence[Mapping[str, Any]], printed: int) -> str:
+    """Give the accuracy without pokes, with the paper's pass of them, where it sees a plateau, and at our last."""
+    at = {point["pokes_n"]: point["accuracy_pct"]["mean"] for point in points}
+    shown = [pokes_n for pokes_n in sorted(at) if pokes_n in {0, paper.ADAPTED_POKES_N, printed, max(at)}]
+    said = ", ".join(f"{at[pokes_n]:.3g} % at {pokes_n}" for pokes_n in shown)
+    gains = ", ".join(f"{at[b] - at[a]:+.2g} points from {a} to {b}" for a, b in pairwise(shown))
+    missed = "" if max(at) >= printed else f"not reached: ours up to {max(at)} pokes; "
+    return f"{missed}accuracy is {said} pokes" + (f": {gains}" if gains else "")
+
+
+def _after(verdict: Verdict, reach: Reach, numbers: Mapping[str, Any]) -> Verdict:
+    """Say first how far in ours was looked at, and whether that is as far as in the paper."""
+    ours_n, paper_n = resolve(numbers, reach.ours), constant(reach.paper)
+    missed = "" if ours_n >= paper_n else "not reached: ours "
+    return replace(verdict, sentence=f"{missed}after {ours_n:,.0f} {reach.of}; {verdict.sentence}")
+
+
+def _with_reason(verdict: Verdict, row: Row, numbers: Mapping[str, Any]) -> str:
+    said = not row.simulated_only or numbers["provenance"]["source"] == "simulated"
+    if not (verdict.differs and row.why and said):
+        return verdict.sentence
+
+    def number(name: re.Match[str]) -> str:
+        own = constant(name[1]) if name[1][0].isupper() else resolve(numbers, name[1])
+        return f"{own:.3g}"
+
+    return f"{verdict.sentence}. {NAMED.sub(number, row.why)}"
 
 
 def _judge_findings(found: Sequence[Mapping[str, Any]]) -> Verdict:

@@ -59,6 +59,7 @@ SLEEVE: dict[str, float] = {"rate_hz": 133.0, "chips_n": 40}  # section 6: "samp
 RATE_HZ = 400.0  # sections 1 and 2: "up to 400Hz"
 FORCE_RESOLUTION_MAX_N = 0.1  # section 1: what a good skin should reach
 PLACE_ACCURACY_MIN_PCT = 90.0  # section 1: "spatial resolution (1mm with 90% accuracy)"
+LATE_CONTACTS_N = 45_000  # figure 5b: "after 45,000 interactions"
 PLATEAU_POKES_N = 780  # section 5: no great gain beyond
 SENSITIVITY = '"less than 20 mL (< 0.2N) of water"'
 MONOTONIC = '"monotonically increasing sensor measurements"'

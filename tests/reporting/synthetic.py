@@ -40,10 +40,14 @@ def all_questions(source: str = "simulated") -> dict:
         "variation": {"contacts_n": 10000},
         "shear": scores(("mse_xy_mm2", "mse_fxy_N2", "mse_fz_N2", "accuracy_pct")),
         "manual": {"pokes_n": 325, "before": scores(), "after": scores(), "control": scores()},
-        "flexible": {"before": scores(), "after": scores(), "bias_f_N": {"before": stat(), "after": stat()}},
+        "flexible": {
+            "before": scores(), "after": scores(), "bias_f_N": {"before": stat(), "after": stat()},
+            "gap_less_pct": 45.0,
+        },
         "sleeve": {"chips_n": 40, "rate_hz": 133.0, "accuracy_pct": 90.0, "median_error_mm": 0.5},
         "sensitivity": {
             "smallest_step_N": {"one_reading": 0.05, "five_readings": 0.02},
+            "smallest_step_mL": {"one_reading": 5.0, "five_readings": 2.0},
             "monotonic": {"holds": True, "spearman": 0.99},
         },
         "logs": {"rate_hz": 250.0, "accuracy_pct": 80.0, "mse_f_N2": 0.1},

@@ -28,8 +28,9 @@ def row(**words: Any) -> Row:
     return Row(**{"id": "a", "where": "section 9", "what": "b", "paper": "SINGLE_SENSOR.accuracy_pct"} | words)
 
 
-def sentence(found: Any, printed: Any, pooled: bool = True, **words: Any) -> str:
-    return judge(row(**{"ours": "a.accuracy_pct"} | words), printed, found, pooled=pooled).sentence
+def sentence(found: Any, printed: Any, pooled: bool = True, simulated: bool = True, **words: Any) -> str:
+    mine = row(**{"ours": "a.accuracy_pct"} | words)
+    return judge(mine, printed, found, pooled=pooled, simulated=simulated).sentence
 
 
 @pytest.mark.parametrize("one", ROWS, ids=lambda one: one.id)
@@ -42,7 +43,8 @@ def test_every_row_finds_its_number_in_a_scene_that_asks_everything(one):
 def test_every_number_of_the_paper_is_used_by_a_row():
     named = {name: value for name, value in vars(paper).items() if name.isupper()}
     printed = {leaf for name, value in named.items() for leaf in leaves(name, value)}
-    assert printed - {one.paper for one in ROWS} == set()
+    used = {one.paper for one in ROWS} | {one.reach.paper for one in ROWS if one.reach}
+    assert printed - used == set()
     assert len(printed) > 30  # the walk above finds them
 
 
@@ -72,6 +74,7 @@ def test_better_and_worse_follow_the_metric():
     assert (
         sentence(stat(3.0), (1.0, 0.1), **mse) == "ours is 3 times the paper's (worse); outside one sd of the paper's"
     )
+    assert sentence(stat(200.4), (1.0, 0.1), **mse).startswith("ours is 200 times the paper's")
     assert sentence(105.0, 100.0, ours="a.rate_hz") == "ours is 5 % higher; within 10 % of the paper's"
 
 
@@ -79,9 +82,9 @@ def test_better_and_worse_follow_the_metric():
     mean=st.floats(1, 100), sd=st.floats(0.1, 50), ours=st.floats(0, 200), path=st.sampled_from(["accuracy_pct", "mse"])
 )
 def test_a_result_differs_exactly_outside_the_papers_sd(mean, sd, ours, path):
-    verdict = judge(row(ours=f"a.{path}"), (mean, sd), stat(ours), pooled=True)
+    verdict = judge(row(ours=f"a.{path}"), (mean, sd), stat(ours), pooled=True, simulated=True)
     assert verdict.differs == (abs(ours - mean) > sd)
-    alone = judge(row(ours=f"a.{path}"), mean, stat(ours), pooled=True)
+    alone = judge(row(ours=f"a.{path}"), mean, stat(ours), pooled=True, simulated=True)
     assert alone.differs == (abs(ours - mean) > 0.1 * mean)
 
 
@@ -107,6 +110,68 @@ def test_a_reason_is_given_only_where_ours_differs():
     assert checklist(numbers, mine)["difference"][0].endswith("Because.")
     numbers["single_random"]["accuracy_pct"] = stat(99.5)
     assert "Because" not in checklist(numbers, mine)["difference"][0]
+
+
+def difference(numbers: dict, name: str) -> str:
+    (one,) = [one for one in ROWS if one.id == name]
+    return checklist(numbers, [one])["difference"][0]
+
+
+def test_what_is_seen_earlier_than_in_the_paper_is_said_first():
+    numbers = all_questions()
+    assert difference(numbers, "figure-5b") == "after 45,000 contacts; holds: ours is above 0"
+    numbers["drift"]["late"]["contacts_n"] = 18_000
+    assert difference(numbers, "figure-5b") == "not reached: ours after 18,000 contacts; holds: ours is above 0"
+    numbers["drift"]["late"]["bias_N"] = -0.1
+    assert difference(numbers, "figure-5b").startswith(
+        "not reached: ours after 18,000 contacts; does not hold: ours is not above 0. The paper explains"
+    )
+    del numbers["drift"]
+    assert difference(numbers, "figure-5b") == "not asked in this scene"
+
+
+@pytest.mark.parametrize("name", ["rate", "temporal-resolution", "logs", "sleeve-chips", "sleeve-rate"])
+def test_settings_of_a_simulated_rig_are_no_agreement_with_the_paper(name):
+    said = difference(all_questions("simulated"), name)
+    assert said == "an input of the simulated rig, read back from the captures"
+    assert difference(all_questions("recorded"), name) in ("the same", "–")
+
+
+def test_the_flexible_bias_is_judged_after_adaptation():
+    numbers = all_questions()
+    numbers["flexible"]["bias_f_N"] = {"before": stat(1.0), "after": stat(-0.2)}
+    assert difference(numbers, "flexible-bias").startswith("does not hold: ours is not above 0")
+
+
+def test_reasons_about_simulation_are_given_of_simulated_scenes_alone():
+    simulation = ("simulat", "assumed", "that may be why")
+    for source in ("simulated", "recorded"):
+        found = checklist(all_questions(source))["difference"]
+        said = found[[one.rule != "input" for one in ROWS]].str.contains("|".join(simulation))
+        assert said.any() == (source == "simulated")
+    assert all(one.simulated_only for one in ROWS if any(word in one.why for word in simulation))
+
+
+def test_a_reason_names_numbers_of_the_paper_and_of_ours():
+    said = difference(all_questions(), "flexible-accuracy_pct")
+    assert "The chips of the paper's flexible board are 80 % nearer, ours 45 %" in said
+
+
+def test_where_only_ours_has_a_spread_the_papers_number_is_held_against_it():
+    assert sentence(stat(80.0, 6.0), 85.0).endswith("within 10 % of the paper's; within one sd of ours (n = 3)")
+    assert sentence(stat(80.0, 4.0), 85.0).endswith("outside one sd of ours (n = 3)")
+    assert "ours (n" not in sentence(stat(80.0, 6.0), (85.0, 1.0))
+    assert "ours (n" not in sentence({"mean": 80.0, "n": 1}, 85.0)
+
+
+def test_a_plateau_is_told_by_what_further_pokes_gain():
+    points = [
+        {"pokes_n": pokes_n, "accuracy_pct": stat(mean)} for pokes_n, mean in ((0, 70), (65, 72), (390, 80), (780, 81))
+    ]
+    said = "accuracy is 70 % at 0, 80 % at 390, 81 % at 780 pokes: +10 points from 0 to 390, +1 points from 390 to 780"
+    assert sentence(points, 780, rule="plateau") == said
+    few = sentence(points[:2], 780, rule="plateau")
+    assert few == "not reached: ours up to 65 pokes; accuracy is 70 % at 0, 72 % at 65 pokes: +2 points from 0 to 65"
 
 
 def test_a_misspelt_constant_is_one_sentence():
