@@ -19,6 +19,7 @@ from ruamel.yaml import YAML
 from pipeline import io
 from pipeline.learning.standardise import Scaler
 from pipeline.questions import EXPERIMENTS
+from pipeline.reporting.checklist import read_rows, resolve
 from tests.stages.checkout import ENVIRONMENT, copy_checkout, run
 
 LEARNING = (
@@ -108,6 +109,26 @@ def test_every_experiment_of_the_paper_is_answered_shown_and_found_by_the_checkl
     assert {file.stem for file in figures} >= set(EXPERIMENTS) - {"drift", "variation", "manual"}
     for figure in figures:
         assert b64encode(figure.read_bytes()).decode() in page  # the very same figure
+
+
+def test_every_row_of_the_checklist_finds_its_number_and_its_files(story):
+    reports = story / "reports/ci"
+    numbers = json.loads((reports / "numbers.json").read_text())
+    rows = read_rows()
+    assert [row.id for row in rows if row.ours and resolve(numbers, row.ours) is None] == []
+    assert [row.id for row in rows if row.reach and resolve(numbers, row.reach.ours) is None] == []
+    there = {file.name for file in (reports / "figures").iterdir()}
+    there |= {file.stem for file in (reports / "tables").glob("*.md")}
+    assert {name for row in rows for name in row.shown} - there == set()
+
+
+def test_losses_of_every_further_protocol_are_counted(story):
+    numbers = json.loads((story / "reports/ci/numbers.json").read_text())
+    for protocol in ("wear", "drag", "hand", "flexible", "sleeve"):
+        account = numbers["capture_by_protocol"][protocol]
+        files = list((story / f"data/indentations/ci-{protocol}").glob("*.parquet"))
+        assert account["captures_n"] == len(files)
+        assert account["frames_n"] == sum(io.read_account(file)["frames_n"] for file in files)
 
 
 def test_a_log_of_a_card_is_predicted_by_a_model_of_the_scene(story):
