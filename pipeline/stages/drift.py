@@ -11,7 +11,7 @@ from pipeline.learning.recipe import HEADLINE
 from pipeline.params import captures_of, read_params, read_scene
 from pipeline.sections import Drift
 from pipeline.stages import _drift as work
-from pipeline.stages._experiment import read_folder, write_answer
+from pipeline.stages._experiment import read_folder, read_losses, write_answer
 from pipeline.stages._run import run
 from pipeline.stages._train import Scenery, train_all
 
@@ -36,7 +36,7 @@ def drift(scene: str, params: Path, settings: Path, indentations: Path, answer: 
     numbers = {name: value for name, value in words.items() if value is not None} | counts | pace(captures)
     variants = {name: own for name, own in rows.items() if name != HEADLINE}
     numbers |= {"left_out_units_n": windows.left_out_units_n} | told | ({"variants": variants} if variants else {})
-    write_answer(answer, numbers, drawn)
+    write_answer(answer, numbers, drawn, read_losses(indentations, numbers["dropped"]))
 
 
 def _tell(

@@ -7,7 +7,7 @@ import numpy as np
 from pipeline.dataset.baseline import subtract
 from pipeline.dataset.rows import TARGETS
 from pipeline.evaluation.dynamics import compare, presses_of
-from pipeline.stages._experiment import read_folder, write_answer
+from pipeline.stages._experiment import read_folder, read_losses, write_answer
 from pipeline.stages._networks import networks_without
 from pipeline.stages._only import only
 from pipeline.stages._run import run, say
@@ -19,7 +19,7 @@ def dynamics(scene: str, indentations: Path, models: Path, answer: Path) -> None
     true = np.stack([getattr(one, name) for name in TARGETS], axis=1)
     presses = presses_of(subtract(one.b_uT, one.noload_uT), true, one.t_s, one.indentation)
     numbers = compare(presses, networks_without(models, one.board))
-    write_answer(answer, numbers, {})
+    write_answer(answer, numbers, {}, read_losses(indentations, {}))
     say(f"{scene}: {numbers['readings_n']} readings of {numbers['presses_n']} presses at {numbers['rate_hz']:.0f} Hz")
 
 

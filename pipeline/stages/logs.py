@@ -30,7 +30,8 @@ def logs(scene: str, settings: Path, raw: Path, models: Path, answer: Path) -> N
         known[~log.contact] = np.nan
         true = truth_at(t_s, log.t_start_s, log.t_end_s, known)
         numbers |= score_contacts(found, true) | turned(Log(t_s, b_uT, true, found.quiet_n), board, settings, networks)
-    write_answer(answer, numbers, thin(found, true))
+    losses = {"accounts": [numbers["account"]], "left_out": {}}
+    write_answer(answer, numbers, thin(found, true), losses)
     say(f"{scene}: {numbers['contacts_n']} contacts in {numbers['duration_s']:.1f} s of log")
 
 

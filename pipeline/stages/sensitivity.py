@@ -4,7 +4,7 @@ from pathlib import Path
 
 from pipeline.dataset.baseline import subtract
 from pipeline.evaluation.sensitivity import answer_of, levels_of
-from pipeline.stages._experiment import read_folder, write_answer
+from pipeline.stages._experiment import read_folder, read_losses, write_answer
 from pipeline.stages._only import only
 from pipeline.stages._run import run, say
 from pipeline.stages._simulated import read_synthesis
@@ -22,7 +22,7 @@ def sensitivity(scene: str, settings: Path, indentations: Path, answer: Path) ->
     change_uT = subtract(one.b_uT, one.noload_uT)
     levels_uT = levels_of(change_uT, one.indentation, one.Fz_N, levels_n=len(weight_N), where=one.capture)
     numbers, drawn = answer_of(levels_uT, weight_N)
-    write_answer(answer, numbers, drawn)
+    write_answer(answer, numbers, drawn, read_losses(indentations, {}))
     say(f"{scene}: weights {numbers['smallest_step_N']} N apart are told, in {numbers['fillings_n']} fillings")
 
 

@@ -57,7 +57,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
             axes.plot([low, high], [low, high], color=COLOURS[0], linewidth=0.8)
             axes.scatter(true_N, predicted_N, s=7, color=COLOURS[1], alpha=0.6, linewidths=0)
             axes.set(xlabel=f"true {name} / N", ylabel=f"predicted {name} / N")
-            axes.locator_params(nbins=5)
+            axes.locator_params(nbins=4)
         explained = {part: numbers["by_line"][f"explained_{part}"]["mean"] for part in ("fxy", "fz")}
         title = (
             f"Forces of dragged lines held out whole ({source})\n"

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 import pandas as pd
 
 from pipeline.reporting.experiments.drift import say_pace
@@ -60,7 +61,9 @@ def _over_time(numbers: Mapping[str, Any], places: Sequence[Mapping[str, Any]], 
     most_n = max(place["time"]["contacts_n"][-1] for place in places)
     title = f"Field over time at {numbers['depth_mm']:g} mm depth, first visit subtracted ({source})"
     with _panels(places, title, "field less the first / µT") as (figure, panels):
-        colours = mpl.colormaps["viridis"]
+        colours = mpl.colors.ListedColormap(
+            mpl.colormaps["viridis"](np.linspace(0, 0.85, 256))
+        )  # its yellow is pale on white
         scale = mpl.colors.Normalize(0, most_n)
         for axes, place in zip(panels, places, strict=True):
             for contacts_n, line_uT in zip(place["time"]["contacts_n"], place["time"]["b_uT"], strict=True):
