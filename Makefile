@@ -1,5 +1,6 @@
 # make repro   everything from nothing: environment, then `dvc repro` on the scenes of params.yaml
 # make test    lint, types, layers, tests
+# make test-processors   the tests that train, under the instructions of four kinds of processors
 # make ui      the MLflow UI on the embedded store
 # make bench   benchmarks (not part of the tests)
 # make clean   removes what the targets above made, but no data and no results
@@ -15,7 +16,8 @@ export DVC_NO_ANALYTICS = 1
 # One thread a process: steadier on few cores, and the same sums in the same order everywhere.
 export OMP_NUM_THREADS = 1
 
-.PHONY: repro test lint ui bench readme clean
+.PHONY: repro test test-processors lint ui bench readme clean
+TRAINING_TESTS := tests/extremes tests/learning tests/evaluation tests/stages tests/test_numerics.py
 .DEFAULT_GOAL := repro
 
 $(STAMP): pyproject.toml constraints.txt
@@ -30,6 +32,12 @@ repro: $(STAMP)
 
 test: lint
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
+
+# The tests that train, with the instructions of other processors: what passes here must pass there.
+test-processors: $(STAMP)
+	@for setting in RESKIN=any MKL_CBWR=COMPATIBLE MKL_ENABLE_INSTRUCTIONS=AVX2 OPENBLAS_CORETYPE=Haswell OPENBLAS_CORETYPE=SkylakeX; do \
+	  echo "== $$setting"; env $$setting $(BIN)/python -m pytest -q -n 2 --dist loadfile $(TRAINING_TESTS) || exit 1; \
+	done
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

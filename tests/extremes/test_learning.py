@@ -52,7 +52,7 @@ def test_a_scale_without_a_floor_is_found_out(monkeypatch):
 
 def test_a_floor_so_high_that_labels_stay_small_is_found_out(monkeypatch):
     monkeypatch.setattr(standardise, "SCALE_FLOOR", np.float32(1e-3))
-    assert broken(scaling_cases(SEED)) == {"labels times 1e-06"}
+    assert broken(scaling_cases(SEED)) == {"labels times 2^-20"}
 
 
 def test_a_triplet_loss_of_roots_is_found_out(monkeypatch):
