@@ -55,6 +55,11 @@ def pinned(flags: frozenset[str], environment: Mapping[str, str]) -> dict[str, s
     return {name: value for name, value in chosen.items() if name not in environment}
 
 
+def signature() -> tuple[str, ...]:
+    """What may give a training other bits on this machine: how products of matrices are summed, here and now."""
+    return tuple(os.environ.get(name, "") for name in ("MKL_CBWR", "ATEN_CPU_CAPABILITY"))
+
+
 def cpu_flags(cpuinfo: Path = CPUINFO) -> frozenset[str]:
     """Read the instruction sets of this processor; empty where the system does not list them, or it is no x86."""
     if platform.machine().lower() not in ("x86_64", "amd64") or not cpuinfo.is_file():

@@ -2,7 +2,7 @@
 
 RECIPE = {
     "architecture": "paper", "inputs": "raw", "scaling": "standard", "triplet_weight": 0.0, "steps_n": 1, "batch_n": 64,
-    "rate_max": 3e-3, "weight_decay": 0.0,
+    "rate_max": 3e-3, "gradient_norm_max": 1.0, "weight_decay": 0.0,
 }  # fmt: skip
 
 
@@ -15,7 +15,7 @@ def recorded(**changes: object) -> dict[str, object]:
 
 
 TRAINING = {"seeds_n": 1, "recipes": {"paper": RECIPE}}
-SCHEDULE = {"steps_n": 1, "batch_n": 64, "rate_max": 1e-3, "weight_decay": 0.0}
+SCHEDULE = {"steps_n": 1, "batch_n": 64, "rate_max": 1e-3, "gradient_norm_max": 1.0, "weight_decay": 0.0}
 ADAPTATION = {"base": "paper", "unlabelled_weight": 0.1} | SCHEDULE
 
 # what a scene holds, beside the question, for each question about learning

@@ -31,7 +31,7 @@ ROUNDING = 1e-4  # of weights near 0.1: float32 sums of another order differ by 
 SCALE_POWERS = (-20, -10, 10, 20)  # of two, about 1e-6 to 1e6: float32 holds labels of these scales without rounding
 RECIPE = Recipe(
     architecture="paper", inputs="raw", scaling="standard", triplet_weight=0.0, steps_n=STEPS_N, batch_n=32,
-    rate_max=3e-3, weight_decay=0.0,
+    rate_max=3e-3, gradient_norm_max=1.0, weight_decay=0.0,
 )  # fmt: skip
 
 
@@ -208,7 +208,10 @@ def _start(cell: Cell, rows: Measured, scale: float) -> Start:
 
 
 def _tuned(cell: Cell, start: Start, *, steps_n: int = STEPS_N, rate_max: float = RECIPE.rate_max) -> Cell:
-    settings = Labelling(steps_n=steps_n, batch_n=RECIPE.batch_n, rate_max=rate_max, weight_decay=0.0, own_weight=1.0)
+    settings = Labelling(
+        steps_n=steps_n, batch_n=RECIPE.batch_n, rate_max=rate_max, gradient_norm_max=RECIPE.gradient_norm_max,
+        weight_decay=0.0, own_weight=1.0,
+    )  # fmt: skip
     return replace(cell, tuning=FewLabels(start, settings, cell.test[:20]))
 
 

@@ -4,6 +4,7 @@ Out: what the loop needs (a `Job`), and a key that names the result by all that 
 processes and scores.
 """
 
+import ast
 import hashlib
 import importlib.metadata
 import json
@@ -26,8 +27,14 @@ from pipeline.learning.job import Job, Labelled, Terms, Unlabelled
 from pipeline.learning.recipe import AugmentedRecipe, FineTuning, Labelling, Recipe, Schedule
 from pipeline.learning.standardise import FIT, Scaler
 from pipeline.learning.triplets import make_points
+from pipeline.numerics import signature
 
-SOURCES = Path(__file__).parent
+COLLAPSED = 0.05  # of a target's variance over a network's own training rows; sound ones explain more than 0.9
+# The modules whose code decides what a training results in; recipes decide by their values.
+DECIDING = (
+    "architecture", "augment", "cell", "feed", "grid", "inputs", "job", "losses", "model", "standardise", "train",
+    "triplets",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -53,8 +60,15 @@ class Trained:
     curve: list[float]
     predicted: Float32[np.ndarray, "b t"]
     stopped_step: int | None
+    explained_min: float | None  # the least part of a target's variance over its training rows; None: too short to tell
     seconds: float  # of its training, its part of the stack's
     one_reading_s: float  # median, to answer for a single reading
+    collapsed_before_n: int = 0  # trainings of the same cell before this one, that collapsed
+
+    @property
+    def collapsed(self) -> bool:
+        """Whether it answers nearly the same to any input: its loss never fell, at least for one target."""
+        return self.explained_min is not None and self.explained_min < COLLAPSED
 
 
 @dataclass(frozen=True)
@@ -99,6 +113,7 @@ class Cell:
     tuning: Adapting | FewLabels | None = None
     skin: str = ""
     what: str = ""
+    attempt_i: int = 0  # trainings of it that collapsed before
 
     @property
     def name(self) -> str:
@@ -130,16 +145,28 @@ def make_job(cell: Cell, rows: Measured) -> tuple[Job, Scaler]:
     view = VIEW[cell.recipe.inputs](rows.db_uT[cell.train])
     target = rows.target[cell.train]
     # Without the recipe in its name: recipes are compared from equal starts on equal batches.
-    rng = seeds.rng_for(cell.seed, "train", cell.fold, cell.skin, cell.seed_i)
+    again = ("again", cell.attempt_i) if cell.attempt_i else ()
+    rng = seeds.rng_for(cell.seed, "train", cell.fold, cell.skin, cell.seed_i, *again)
     if cell.tuning is None:
         scaler = FIT[cell.recipe.scaling](view, target)
-        start: Weights = draw_weights(LAYERS[cell.recipe.architecture](view.shape[1], target.shape[1]), rng)
+        layers = LAYERS[cell.recipe.architecture](view.shape[1], target.shape[1])
+        # A ReLU on the output (the released network) begins dead for some target in about every third network if its
+        # bias is drawn too, and what is dead never learns.
+        start: Weights = draw_weights(layers, rng) | {f"layer{len(layers)}.bias": _mean_answer(scaler, target)}
     else:
         scaler, start = cell.tuning.start.scaler, cell.tuning.start.weights
     labelled = _labelled(cell, rows, scaler)
     unlabelled = _unlabelled(cell, rows, scaler) if cell.terms.unlabelled else None
     own = _own(cell, rows, scaler) if cell.terms.own else None
     return Job(start, rng, labelled, unlabelled, own), scaler
+
+
+def _mean_answer(scaler: Scaler, target: np.ndarray) -> Float32[np.ndarray, " t"]:
+    """Give the mean of every scaled target; 0 for one that is not known."""
+    known = ~np.isnan(target).all(axis=0)
+    mean = np.zeros(target.shape[1], np.float32)
+    mean[known] = np.nanmean(scaler.encode_target(target)[:, known], axis=0, dtype=np.float64)
+    return mean
 
 
 def _labelled(cell: Cell, rows: Measured, scaler: Scaler) -> Labelled:
@@ -181,7 +208,8 @@ class Keys:
     def key(self, cell: Cell) -> str:
         """Name a cell."""
         words = [
-            device(), cell.fold, cell.skin, cell.recipe.model_dump_json(), cell.seed, cell.seed_i,
+            device(), *signature(), cell.fold, cell.skin, cell.recipe.model_dump_json(), cell.seed, cell.seed_i,
+            cell.attempt_i,
             self._labelled(cell.train), _digest(self.rows.db_uT[cell.test]),
             _code_digest(), importlib.metadata.version("torch"), importlib.metadata.version("numpy"), sys.platform,
         ]  # fmt: skip
@@ -216,6 +244,20 @@ def _digest(*arrays: np.ndarray) -> str:
 @lru_cache(maxsize=1)
 def _code_digest() -> str:
     digest = hashlib.sha256()
-    for source in [*sorted(SOURCES.glob("*.py")), Path(seeds.__file__), Path(lines_module.__file__)]:
-        digest.update(source.read_bytes())
+    folder = Path(__file__).parent
+    for source in [*(folder / f"{name}.py" for name in DECIDING), Path(seeds.__file__), Path(lines_module.__file__)]:
+        digest.update(code_of(source.read_text(encoding="utf-8")).encode())
     return digest.hexdigest()
+
+
+def code_of(source: str) -> str:
+    """Give a module's code without comments and docstrings: what its words say changes no result.
+
+    >>> code_of("x = 1  # metres\\n\\ndef twice(y):\\n    'Double it.'\\n    return 2 * y").split("\\n")
+    ['x = 1', '', 'def twice(y):', '    return 2 * y']
+    """
+    tree = ast.parse(source)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node, clean=False):
+            node.body = node.body[1:] or [ast.Pass()]
+    return ast.unparse(tree)

@@ -10,6 +10,7 @@ import hashlib
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, as_completed
+from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
 
@@ -23,6 +24,9 @@ from pipeline.learning.inputs import VIEW
 from pipeline.learning.standardise import Scaler
 from pipeline.learning.stopwatch import median_s
 
+ATTEMPTS_MAX_N = 3  # trainings of one cell; what collapses in all of them is kept, told, and refused by `predict`
+JUDGED_STEPS_N = 200  # a shorter training from drawn weights may not have left its start
+JUDGED_ROWS_N = 2000  # of the training rows, evenly spaced
 STACK_N = {"cpu": 3, "cuda": 64}  # networks trained side by side; on a CPU more gain nothing, and two processes share
 
 
@@ -49,10 +53,23 @@ def train_stack(cells: Sequence[Cell], rows: Measured) -> list[Trained]:
             Trained(
                 key="", weights=outcome.weights, scaler=scaler, curve=outcome.curve,
                 predicted=_answer(scaler, predict, view), stopped_step=outcome.stopped_step, seconds=seconds,
+                explained_min=_explained(cell, rows, scaler, predict),
                 one_reading_s=median_s(partial(_answer, scaler, predict, view[:1])),
             )
         )  # fmt: skip
     return trained
+
+
+def _explained(cell: Cell, rows: Measured, scaler: Scaler, predict: Callable[[np.ndarray], np.ndarray]) -> float | None:
+    """Give the least part of a known target's variance over the training rows that the answers explain."""
+    if cell.schedule.steps_n < JUDGED_STEPS_N:
+        return None
+    some = cell.train[:: -(-len(cell.train) // JUDGED_ROWS_N)]
+    off = (_answer(scaler, predict, VIEW[cell.recipe.inputs](rows.db_uT[some])) - rows.target[some]).astype(np.float64)
+    told = np.nanvar(rows.target[some].astype(np.float64), axis=0) > 0 if len(some) > 1 else np.zeros(0, bool)
+    if not told.any():
+        return None
+    return float((1 - np.nanmean(off[:, told] ** 2, axis=0) / np.nanvar(rows.target[some][:, told], axis=0)).min())
 
 
 def _answer(scaler: Scaler, predict: Callable[[np.ndarray], np.ndarray], view: np.ndarray) -> np.ndarray:
@@ -62,7 +79,25 @@ def _answer(scaler: Scaler, predict: Callable[[np.ndarray], np.ndarray], view: n
 def run_cells(
     cells: Sequence[Cell], rows: Measured, *, executor: Executor, cache: Path, tell: Callable[[str], None]
 ) -> list[Trained]:
-    """Train what `cache` does not hold yet, and return every cell's result in the order of `cells`."""
+    """Train what `cache` does not hold yet, and return every cell's result in the order of `cells`.
+
+    What collapsed is trained again with draws of its own, at most `ATTEMPTS_MAX_N` times in all.
+    """
+    done = _run_once(cells, rows, executor=executor, cache=cache, tell=tell)
+    for attempt_i in range(1, ATTEMPTS_MAX_N):
+        again = [i for i, one in enumerate(done) if one.collapsed]
+        if not again:
+            break
+        tell(f"{len(again)} of {len(cells)} trainings collapsed: once more with other draws")
+        others = [replace(cells[i], attempt_i=attempt_i) for i in again]
+        for i, one in zip(again, _run_once(others, rows, executor=executor, cache=cache, tell=tell), strict=True):
+            done[i] = replace(one, collapsed_before_n=attempt_i)
+    return done
+
+
+def _run_once(
+    cells: Sequence[Cell], rows: Measured, *, executor: Executor, cache: Path, tell: Callable[[str], None]
+) -> list[Trained]:
     keys = Keys(rows)
     names = [keys.key(cell) for cell in cells]  # not the cell's own name: it decides no result
     members = dict(zip(names, cells, strict=True))  # equal trainings are one
@@ -127,8 +162,11 @@ def _stack_to_files(rows_file: Path, cells: Sequence[Cell], files: Sequence[Path
         tensors = {f"weights.{name}": value for name, value in one.weights.items()} | one.scaler.arrays()
         tensors |= {"curve": np.array(one.curve), "predicted": one.predicted}
         words = {"seconds": f"{one.seconds:.3f}", "one_reading_s": f"{one.one_reading_s:.3g}", "cell": cell.name}
-        if one.stopped_step is not None:
-            words["stopped_step"] = str(one.stopped_step)
+        words |= {
+            name: repr(value)
+            for name, value in (("stopped_step", one.stopped_step), ("explained_min", one.explained_min))
+            if value is not None
+        }
         io.write_tensors(file, tensors, words)
 
 
@@ -147,6 +185,7 @@ def _read_trained(file: Path) -> Trained:
         curve=[float(value) for value in tensors["curve"]],
         predicted=tensors["predicted"],
         stopped_step=int(words["stopped_step"]) if "stopped_step" in words else None,
+        explained_min=float(words["explained_min"]) if "explained_min" in words else None,
         seconds=float(words["seconds"]),
         one_reading_s=float(words["one_reading_s"]),
     )

@@ -13,11 +13,15 @@ Weight = Annotated[float, Field(ge=0)]
 
 
 class Schedule(Strict):
-    """How the loop descends: AdamW under a one-cycle rate whose peak is `rate_max`; a batch is drawn at every step."""
+    """How the loop descends: AdamW under a one-cycle rate whose peak is `rate_max`; a batch is drawn at every step.
+
+    A gradient longer than `gradient_norm_max` (all weights of a network as one vector, scaled units) is cut to it.
+    """
 
     steps_n: Annotated[int, Field(ge=1)]
     batch_n: Annotated[int, Field(ge=1)]
     rate_max: Annotated[float, Field(gt=0)]
+    gradient_norm_max: Annotated[float, Field(gt=0)]
     weight_decay: Weight
 
 

@@ -56,12 +56,24 @@ def train(jobs: Sequence[Job], architecture: str, schedule: Schedule, terms: Ter
                 loss = loss + terms.own * squared_error(net(batch["own"]), batch["own_targets"])
             optimizer.zero_grad()
             loss.sum().backward()  # of a sum, each network's gradient is its own
+            clip(net, schedule.gradient_norm_max)  # one step too long can leave all ReLUs of a layer dead for good
             optimizer.step()
             rate.step()
             total += error.detach()
         if not watch.look(total / steps_n, first + steps_n):
             break
     return watch.outcomes()
+
+
+def clip(net: Stack, norm_max: float) -> None:
+    """Shorten the gradient of each network of a stack, all its weights as one vector, to at most `norm_max`."""
+    gradients = [parameter.grad for parameter in net.parameters() if parameter.grad is not None]  # [m i o]
+    norm = torch.linalg.vector_norm(
+        torch.stack([torch.linalg.vector_norm(one, dim=(1, 2)) for one in gradients]), dim=0
+    )
+    part = (norm_max / norm).clamp(max=1.0)[:, None, None]  # of a gradient of 0, 1
+    for one in gradients:
+        one.mul_(part)
 
 
 class Watch:

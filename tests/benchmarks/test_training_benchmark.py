@@ -44,7 +44,7 @@ LAYERS = paper_layers(CHANNELS_N)
 def recipe(triplet_weight: float, steps_n: int = STEPS_N) -> Recipe:
     return Recipe(
         architecture="paper", inputs="raw", scaling="standard", triplet_weight=triplet_weight, steps_n=steps_n,
-        batch_n=BATCH_N, rate_max=3e-3, weight_decay=0.0,
+        batch_n=BATCH_N, rate_max=3e-3, gradient_norm_max=1.0, weight_decay=0.0,
     )  # fmt: skip
 
 

@@ -14,7 +14,7 @@ from tests.learning.recipes import recipe
 
 ROWS_N = 48  # twelve a skin
 TRAIN, TEST, POKED, OWN = np.arange(24), np.arange(42, 48), np.arange(36, 42), np.arange(36, 39)
-SETTINGS = {"steps_n": 4, "batch_n": 16, "rate_max": 3e-3, "weight_decay": 0.0}
+SETTINGS = {"steps_n": 4, "batch_n": 16, "rate_max": 3e-3, "gradient_norm_max": 1.0, "weight_decay": 0.0}
 
 
 def measured() -> Measured:

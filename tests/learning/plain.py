@@ -66,6 +66,7 @@ def plain_train(
             loss = loss + terms.own * nn.functional.mse_loss(net(batch["own"]), batch["own_targets"])
         optimizer.zero_grad()
         loss.backward()
+        nn.utils.clip_grad_norm_(net.parameters(), schedule.gradient_norm_max)
         optimizer.step()
         rate.step()
     return weights_of(net)

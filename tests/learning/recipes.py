@@ -12,6 +12,7 @@ def recipe(**changes: object) -> Recipe:
         "steps_n": 4,
         "batch_n": 16,
         "rate_max": 3e-3,
+        "gradient_norm_max": 1.0,
         "weight_decay": 0.0,
     }
     return Recipe.model_validate(values | changes)

@@ -1,12 +1,14 @@
 from collections.abc import Callable
 from dataclasses import fields, replace
+from pathlib import Path
 
+import grimp
 import numpy as np
 import pytest
 
 from pipeline.dataset.lines import Lines
 from pipeline.learning import cell as cell_module
-from pipeline.learning.cell import Cell, Keys, Measured, Trained, make_job
+from pipeline.learning.cell import DECIDING, Cell, Keys, Measured, Trained, code_of, make_job
 from pipeline.learning.feed import Feed
 from pipeline.learning.grid import train_stack
 from pipeline.learning.job import Terms
@@ -26,6 +28,7 @@ from tests.learning.cells import (
     start,
     without_triplets,
 )
+from tests.learning.recipes import recipe
 
 NEW = np.arange(24, ROWS_N)  # every row of a skin that is not trained on
 KINDS = {"pooled": pooled, "adapting": adapting, "few labels": few_labels}
@@ -237,7 +240,7 @@ def test_no_two_settings_share_a_key():
         pooled(), adapting(), few_labels(), replace(pooled(), train=TRAIN[1:]), replace(pooled(), test=TEST[1:]),
         *[pooled(**one) for one in (
             {"architecture": "released"}, {"inputs": "shape"}, {"scaling": "released"}, {"steps_n": 5}, {"batch_n": 8},
-            {"rate_max": 1e-3}, {"weight_decay": 0.1},
+            {"rate_max": 1e-3}, {"weight_decay": 0.1}, {"gradient_norm_max": 0.5},
         )],
         without_triplets(),
         replace(pooled(), seed=8), replace(pooled(), seed_i=1), replace(pooled(), fold="b0"),
@@ -249,6 +252,41 @@ def test_no_two_settings_share_a_key():
         tuned(few_labels(), own=OWN[:2]), finer(few_labels(), own_weight=0.25),
     ]  # fmt: skip
     assert len({key(cell) for cell in cells}) == len(cells)
+
+
+def test_a_training_after_one_that_collapsed_has_a_key_a_start_and_batches_of_its_own():
+    again = replace(pooled(), attempt_i=1)
+    assert key(again) != key(pooled())
+    (one, _), (other, _) = make_job(pooled(), measured()), make_job(again, measured())
+    assert (one.start["layer1.weight"] != other.start["layer1.weight"]).all()
+    assert one.rng.integers(1 << 60) != other.rng.integers(1 << 60)
+
+
+@pytest.mark.parametrize("scaling", ["standard", "released"])
+def test_a_network_begins_with_the_mean_of_the_targets_as_its_last_bias(scaling):
+    cell = replace(without_triplets(), recipe=recipe(scaling=scaling))
+    rows = changed(measured(), "target", np.arange(3), np.nan)
+    job, scaler = make_job(cell, changed(rows, "target", (slice(None), 2), np.nan))
+    told = scaler.decode(job.start["layer6.bias"][None])[0]
+    np.testing.assert_allclose(told[:2], rows.target[TRAIN[3:], :2].mean(axis=0), rtol=1e-5)
+    assert job.start["layer6.bias"][2] == 0  # a target that nobody knows
+
+
+def test_words_about_code_decide_no_result_and_code_does():
+    source = Path(cell_module.__file__).read_text()
+    assert code_of(source.replace("Refuses to know files", "Knows no files")) == code_of(f"# more\n{source}")
+    assert code_of(source.replace("COLLAPSED = 0.05", "COLLAPSED = 0.06")) != code_of(source)
+
+
+def test_all_code_that_a_training_runs_through_is_part_of_its_key():
+    """What `train_stack` imports of this package, but for words, values that are part of the key, and the clock."""
+    graph = grimp.build_graph("pipeline", cache_dir=None)
+    names = {
+        module.removeprefix("pipeline.learning.")
+        for module in {"pipeline.learning.grid", *graph.find_upstream_modules("pipeline.learning.grid")}
+        if module.startswith("pipeline.learning.")
+    }
+    assert names - {"recipe", "executors", "stopwatch"} == set(DECIDING)
 
 
 def test_questions_and_names_do_not_enter_a_key():

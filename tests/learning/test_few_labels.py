@@ -23,7 +23,7 @@ from tests.scenes import RECIPE
 
 SKINS = ("b0_s0", "b0_s1", "b1_s0", "b2_s0")
 PLACES_N, PASSES_N, READINGS_N = 9, 2, 2
-SCHEDULE = {"steps_n": 1, "batch_n": 8, "rate_max": 1e-3, "weight_decay": 0.0}
+SCHEDULE = {"steps_n": 1, "batch_n": 8, "rate_max": 1e-3, "gradient_norm_max": 1.0, "weight_decay": 0.0}
 ASKED = {
     "labels_n": [0, 2, 5],
     "recipes": {"plain": RECIPE, "triplet": RECIPE | {"inputs": "shape", "triplet_weight": 0.1}},
@@ -72,7 +72,7 @@ def of(rows: Rows) -> Measured:
 def as_drawn(cell: Cell) -> Trained:
     """A network that was not trained: what it starts from, scaled as it will be."""
     job, scaler = make_job(cell, of(ROWS))
-    return Trained(f"key of {cell.name}", job.start, scaler, [1.0], np.zeros((0, 3), np.float32), None, 0.0, 0.0)
+    return Trained(f"key of {cell.name}", job.start, scaler, [1.0], np.zeros((0, 3), np.float32), None, None, 0.0, 0.0)
 
 
 def networks_of(at: few.Study) -> list[few.Done]:

@@ -10,10 +10,11 @@ from hypothesis import strategies as st
 
 from pipeline import io
 from pipeline.errors import ReskinError, TrainingError
-from pipeline.learning.cell import Cell, Trained
+from pipeline.learning import grid
+from pipeline.learning.cell import Cell, Trained, make_job
 from pipeline.learning.executors import make_executor
-from pipeline.learning.grid import STACK_N, run_cells, stacks, train_stack
-from tests.learning.cells import adapting, few_labels, measured, pooled, without_triplets
+from pipeline.learning.grid import JUDGED_STEPS_N, STACK_N, run_cells, stacks, train_stack
+from tests.learning.cells import TRAIN, adapting, few_labels, measured, pooled, without_triplets
 from tests.learning.recipes import recipe
 
 SIZE_N = STACK_N["cpu"]
@@ -184,6 +185,55 @@ def test_a_cell_that_explodes_stands_with_its_last_finite_weights_and_says_so(tm
         assert [one.stopped_step for one in done] == [4, 4]
         assert [one.curve for one in done] == [[], []]
         assert all(np.isfinite(one.predicted).all() for one in done)
+
+
+DEAD = {"layer1.weight": 0, "layer1.bias": 0}  # answers the same to any input, and a ReLU of 0 hands no gradient on
+
+
+def dies(attempts: set[int]) -> object:
+    """Start some attempts of fold b0 dead; what is dead stays dead."""
+
+    def make(cell: Cell, rows: object) -> object:
+        job, scaler = make_job(cell, rows)
+        if cell.fold == "b0" and cell.attempt_i in attempts:
+            start = {name: value * DEAD.get(name, 1) for name, value in job.start.items()}
+            start["layer2.weight"] = 0 * start["layer2.weight"]
+            job = replace(job, start=start)
+        return job, scaler
+
+    return make
+
+
+@pytest.mark.parametrize(
+    ("dead", "before_n", "collapsed"), [(set(), 0, 0), ({0}, 1, 0), ({0, 1}, 2, 0), ({0, 1, 2}, 2, 1)]
+)
+def test_what_collapses_is_trained_again_at_most_twice_and_counted(tmp_path, monkeypatch, dead, before_n, collapsed):
+    monkeypatch.setattr(grid, "make_job", dies(dead))
+    some, said = cells(2, steps_n=JUDGED_STEPS_N, rate_max=1e-2), []
+    for _ in range(2):  # the second time, from the cache
+        first, second = run(some, tmp_path, said=said)
+        assert (first.collapsed_before_n, first.collapsed) == (before_n, bool(collapsed))
+        assert (second.collapsed_before_n, second.collapsed) == (0, False)
+        assert second.explained_min > 0.5
+    assert any("collapsed" in line for line in said) == bool(dead)
+
+
+def test_a_training_too_short_to_have_left_its_start_is_not_judged(tmp_path, monkeypatch):
+    monkeypatch.setattr(grid, "make_job", dies({0, 1, 2}))
+    first, _ = run(cells(2, steps_n=JUDGED_STEPS_N - 1), tmp_path)
+    assert (first.explained_min, first.collapsed) == (None, False)
+
+
+def test_a_target_that_is_unknown_or_never_changes_judges_nobody(tmp_path):
+    rows = measured()
+    flat, unknown = rows.target.copy(), rows.target.copy()
+    flat[:, 2], unknown[:, 2] = 1.5, np.nan
+    one = replace(without_triplets(), recipe=recipe(steps_n=JUDGED_STEPS_N, rate_max=1e-2), test=TRAIN)
+    for target in (flat, unknown):
+        (trained,) = train_stack([one], replace(rows, target=target))
+        off = (trained.predicted - target[TRAIN])[:, :2].astype(float)
+        truth = 1 - (off**2).mean(axis=0) / target[TRAIN, :2].var(axis=0)
+        assert trained.explained_min == pytest.approx(truth.min(), rel=1e-5)
 
 
 def test_trainings_in_a_process_of_their_own_are_the_same(tmp_path, monkeypatch):

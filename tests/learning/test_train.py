@@ -6,20 +6,23 @@ import pytest
 import torch
 from torch import nn
 
+from pipeline.learning.architecture import Weights, paper_layers
 from pipeline.learning.feed import Feed
 from pipeline.learning.job import Job, Labelled, Terms
+from pipeline.learning.model import Stack
 from pipeline.learning.recipe import Recipe
-from pipeline.learning.train import BLOCK_STEPS_N, Outcome, Watch, train
-from tests.learning.jobs import some_job
+from pipeline.learning.train import BLOCK_STEPS_N, Outcome, Watch, clip, train
+from pipeline.seeds import rng_for
+from tests.learning.jobs import some_job, some_weights
 from tests.learning.plain import plain_net, plain_train
 from tests.learning.recipes import recipe
 
 ALL_TERMS = Terms(0.5, unlabelled=0.7, own=0.3)
 NO_TERMS = Terms(0.0)
-# Sums in another order: batched products of few rows depend on whether a network's weights start at a multiple of 64
-# bytes. That is float32 rounding (6e-8 of a term), but AdamW divides a gradient by its own size, so that where a
-# gradient is itself little more than rounding, a part of a step of up to 3e-3 is rounding, too.
-WEIGHT_ATOL = 2e-4
+# Sums in another order: batched products of few rows depend on the processor and on where a network's weights lie. That
+# is float32 rounding (6e-8 of a term), but AdamW divides a gradient by its own size, so that some weights move by a
+# part of a step of mere rounding. All weights together move as they should to this part of their way.
+WAY = 2e-3
 
 
 def run(jobs: list[Job], schedule: Recipe, terms: Terms = NO_TERMS) -> list[Outcome]:
@@ -33,6 +36,34 @@ def same(one: Outcome, other: Outcome) -> bool:
 
 def block_sizes(steps_n: int) -> list[int]:
     return [BLOCK_STEPS_N] * (steps_n // BLOCK_STEPS_N) + [steps_n % BLOCK_STEPS_N] * (steps_n % BLOCK_STEPS_N > 0)
+
+
+def test_a_gradient_is_cut_to_its_longest_network_by_network():
+    net = Stack(paper_layers(15), [some_weights(i) for i in range(3)])
+    lengths = torch.tensor([0.0, 0.5, 70.0])
+    for parameter in net.parameters():
+        drawn = torch.from_numpy(rng_for(0, "gradient", str(tuple(parameter.shape))).normal(size=parameter.shape))
+        parameter.grad = drawn.float()
+    whole = torch.cat([one.grad.flatten(1) for one in net.parameters()], dim=1).norm(dim=1)
+    for parameter in net.parameters():
+        parameter.grad *= (lengths / whole)[:, None, None]
+    before = [parameter.grad.clone() for parameter in net.parameters()]
+    clip(net, 1.0)
+    after = torch.cat([one.grad.flatten(1) for one in net.parameters()], dim=1)
+    torch.testing.assert_close(after.norm(dim=1), torch.tensor([0.0, 0.5, 1.0]))
+    torch.testing.assert_close(after[2] * 70, torch.cat([one.flatten(1) for one in before], dim=1)[2])
+
+
+def test_a_rate_at_which_networks_die_without_it_trains_with_short_gradients():
+    """Found on simulated skins: at four times the rate in use all ReLUs of a layer die in most networks."""
+    jobs = [some_job(i, n=400) for i in range(3)]
+    schedule = recipe(steps_n=400, batch_n=64, rate_max=2.4e-2)
+    free, cut = (run(jobs_of(jobs), schedule.model_copy(update={"gradient_norm_max": one})) for one in (1e9, 1.0))
+    assert max(one.curve[-1] for one in cut) < 0.2 < 0.3 < max(one.curve[-1] for one in free)
+
+
+def jobs_of(jobs: list[Job]) -> list[Job]:
+    return [replace(job, rng=some_job(i).rng) for i, job in enumerate(jobs)]
 
 
 def test_thirty_two_rows_are_learned_by_heart():
@@ -56,12 +87,11 @@ def test_same_seed_same_weights_and_another_seed_others(terms):
 
 @pytest.mark.parametrize(("terms", "batch_n"), [(NO_TERMS, 1), (ALL_TERMS, 16), (NO_TERMS, 128)])
 def test_a_network_becomes_the_same_in_a_stack_and_alone(terms, batch_n):
-    schedule = recipe(steps_n=60, batch_n=batch_n)
+    schedule = recipe(steps_n=60, rate_max=5e-4, batch_n=batch_n)
     together = run([some_job(i, terms=True) for i in range(3)], schedule, terms)
     for i in range(3):
         (alone,) = run([some_job(i, terms=True)], schedule, terms)
-        for name in alone.weights:
-            np.testing.assert_allclose(together[i].weights[name], alone.weights[name], rtol=0, atol=WEIGHT_ATOL)
+        assert off_the_way(together[i].weights, alone.weights, some_job(i, terms=True).start) < WAY
         np.testing.assert_allclose(together[i].curve, alone.curve, rtol=1e-3)
 
 
@@ -70,15 +100,19 @@ def test_a_network_becomes_the_same_in_a_stack_and_alone(terms, batch_n):
     "terms", [NO_TERMS, Terms(0.5), Terms(0.0, unlabelled=0.7), Terms(0.0, own=0.3), ALL_TERMS], ids=str
 )
 def test_the_stack_descends_as_the_plainest_pytorch_loop_does(terms, decay):
-    schedule, steps_n = recipe(steps_n=70, weight_decay=decay), 70
+    schedule, steps_n = recipe(steps_n=70, rate_max=5e-4, weight_decay=decay), 70
     (outcome,) = run([some_job(terms=True)], schedule, terms)
     feed = Feed([some_job(terms=True)], schedule.batch_n, "cpu")
     batches = chain.from_iterable(feed.draw(n) for n in block_sizes(steps_n))
     truth = plain_train(some_job().start, batches, schedule, terms)
-    moved = {name: np.abs(truth[name] - some_job().start[name]) for name in truth}
-    for name, values in truth.items():
-        np.testing.assert_allclose(outcome.weights[name], values, rtol=0, atol=WEIGHT_ATOL, err_msg=name)
-        assert moved[name].max() > 10 * WEIGHT_ATOL
+    assert off_the_way(outcome.weights, truth, some_job(terms=True).start) < WAY
+
+
+def off_the_way(weights: Weights, truth: Weights, start: Weights) -> float:
+    """How far weights end from the truth, as a part of the way there: of the worst layer."""
+    return max(
+        float(np.linalg.norm(weights[name] - truth[name]) / np.linalg.norm(truth[name] - start[name])) for name in truth
+    )
 
 
 @pytest.mark.parametrize("name", ["triplet", "unlabelled", "own"])
@@ -101,8 +135,9 @@ def test_what_a_term_stands_on_decides_the_weights(part, name):
 
 
 def test_unlabelled_pokes_move_the_feature_layers_only():
-    (outcome,) = run([some_job(terms=True)], recipe(steps_n=1, rate_max=1e-2), Terms(0.0, unlabelled=1e6))
-    (plain,) = run([some_job(terms=True)], recipe(steps_n=1, rate_max=1e-2))
+    far = recipe(steps_n=1, rate_max=1e-2, gradient_norm_max=1e12)  # a cut gradient is shorter in all layers
+    (outcome,) = run([some_job(terms=True)], far, Terms(0.0, unlabelled=1e6))
+    (plain,) = run([some_job(terms=True)], far)
     for i in range(1, 7):
         name = f"layer{i}.weight"
         assert (outcome.weights[name] != plain.weights[name]).any() == (i <= 3)

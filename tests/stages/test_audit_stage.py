@@ -31,7 +31,8 @@ SKINS = ("b0_s0", "b0_s1", "b1_s0", "b2_s0")
 COPY = "b3_s0"  # b0_s0 again, under the name of another board's skin
 TRIPLET = RECIPE | {"triplet_weight": 0.1}
 ADAPTATION = {
-    "base": "paper", "unlabelled_weight": 0.1, "steps_n": 1, "batch_n": 64, "rate_max": 1e-3, "weight_decay": 0.0
+    "base": "paper", "unlabelled_weight": 0.1, "steps_n": 1, "batch_n": 64, "rate_max": 1e-3,
+    "gradient_norm_max": 1.0, "weight_decay": 0.0,
 }  # fmt: skip
 SCENE = recorded(
     source="simulated",
@@ -108,7 +109,7 @@ def write(folder: Path, arm: str, at: Scenery, cells: list[Cell]) -> None:
 def as_drawn(cell: Cell, at: Scenery) -> Trained:
     job, scaler = make_job(cell, Measured(at.rows.db_uT, at.rows.target, at.rows.skin))
     predicted = np.zeros((len(cell.test), 3), np.float32)
-    return Trained(f"key of {cell.name}", job.start, scaler, [1.0], predicted, None, 0.0, 0.0)
+    return Trained(f"key of {cell.name}", job.start, scaler, [1.0], predicted, None, None, 0.0, 0.0)
 
 
 @pytest.fixture(autouse=True)
