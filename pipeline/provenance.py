@@ -5,12 +5,20 @@ import platform
 import resource
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 from pipeline import io
 
 CODE = Path(__file__).parent
 SECONDS = Path(".reskin/seconds")  # what was timed here: beside the pipeline, as costs are
+CPUINFO = Path("/proc/cpuinfo")  # Linux only
+INSTRUCTIONS = {"avx2": "AVX2", "avx512f": "AVX-512", "amx_tile": "AMX", "asimd": "NEON", "sve": "SVE"}  # by CPU flag
+# A different instruction set adds in a different order: these variables hold libraries to one.
+CAPS = (
+    "ATEN_CPU_CAPABILITY", "MKL_CBWR", "MKL_ENABLE_INSTRUCTIONS", "ONEDNN_MAX_CPU_ISA", "OPENBLAS_CORETYPE",
+    "NPY_DISABLE_CPU_FEATURES", "NUMBA_CPU_NAME",
+)  # fmt: skip
 
 
 def code_version() -> str:
@@ -25,9 +33,27 @@ def code_version() -> str:
 
 
 def device() -> str:
-    """The machine in words: processor kind, cores that this process may use, Python."""
+    """The machine in words: processor and instruction sets, cores that this process may use, Python."""
     cores_n = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return f"cpu {platform.machine()}, {cores_n} cores, Python {platform.python_version()}"
+    said = CPUINFO.read_text(encoding="utf-8", errors="replace") if CPUINFO.exists() else ""
+    named = processor(said, os.environ, otherwise=platform.processor())
+    return f"cpu {platform.machine()} {named}, {cores_n} cores, Python {platform.python_version()}"
+
+
+def processor(cpuinfo: str, environ: Mapping[str, str], *, otherwise: str) -> str:
+    """The processor's model, the instruction sets that it offers, and the variables that hold libraries to fewer.
+
+    `cpuinfo` is Linux's /proc/cpuinfo; where it names no model, `otherwise` does.
+    """
+    lines = [line.partition(":") for line in cpuinfo.splitlines()]
+    words = {name.strip().lower(): value.strip() for name, _, value in reversed(lines)}  # the first processor's
+    flags = set(words.get("flags", words.get("features", "")).split())
+    model = words.get("model name") or otherwise or "unknown processor"
+    offered = [name for flag, name in INSTRUCTIONS.items() if flag in flags]
+    held = [f"{name}={environ[name]}" for name in CAPS if environ.get(name)]
+    plain = " ".join(model.replace("(R)", "").replace("(TM)", "").split())
+    told = "; ".join(part for part in (", ".join(offered), ", ".join(held)) if part)
+    return f"{plain} ({told})" if told else plain
 
 
 def note_cost(folder: Path, stage: str, seconds: float) -> None:

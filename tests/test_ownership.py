@@ -33,7 +33,9 @@ HOMES = {
         "pipeline/dataset/single.py", "pipeline/dataset/splits.py", "pipeline/evaluation/oddness.py",
         "pipeline/learning/classical.py",
     },
-    r"os\.environ": {"pipeline/learning/executors.py", "pipeline/server.py", "pipeline/tracking.py"},
+    r"os\.environ": {
+        "pipeline/learning/executors.py", "pipeline/provenance.py", "pipeline/server.py", "pipeline/tracking.py",
+    },
     r"import pickle|torch\.load\(|allow_pickle=True": set(),
 }  # fmt: skip
 

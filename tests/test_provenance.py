@@ -1,6 +1,12 @@
 import re
 
-from pipeline.provenance import code_version, device, note_cost, read_costs
+import pytest
+
+from pipeline import provenance
+from pipeline.provenance import CAPS, INSTRUCTIONS, code_version, device, note_cost, processor, read_costs
+
+XEON = "processor\t: 0\nmodel name\t: Intel(R) Xeon(R) Gold 6442Y\nflags\t\t: fpu sse2 avx2 avx512f amx_tile\n\n"
+OLD = "processor\t: 1\nmodel name\t: Another one\nflags\t\t: fpu sse2\n"
 
 
 def test_a_result_names_the_commit_of_its_code_or_says_that_it_cannot():
@@ -8,6 +14,39 @@ def test_a_result_names_the_commit_of_its_code_or_says_that_it_cannot():
 
 
 def test_the_machine_is_told_in_words():
+    assert re.search(r"cpu .*, \d+ cores, Python 3\.", device())
+
+
+def test_a_processor_is_named_with_its_instruction_sets_and_what_holds_libraries_to_fewer():
+    assert processor(XEON, {}, otherwise="") == "Intel Xeon Gold 6442Y (AVX2, AVX-512, AMX)"
+    held = {"MKL_CBWR": "COMPATIBLE", "ATEN_CPU_CAPABILITY": "", "HOME": "/home/me"}
+    assert processor(XEON, held, otherwise="") == "Intel Xeon Gold 6442Y (AVX2, AVX-512, AMX; MKL_CBWR=COMPATIBLE)"
+
+
+def test_the_first_processor_is_named_where_a_machine_has_two_kinds():
+    assert processor(XEON + OLD, {}, otherwise="") == processor(XEON, {}, otherwise="")
+    assert processor(OLD + XEON, {}, otherwise="") == "Another one"
+
+
+@pytest.mark.parametrize("cpuinfo", ["", "\n\n", "no colon here", "model name:\nflags:"])
+def test_a_machine_that_tells_nothing_is_named_by_what_python_knows(cpuinfo):
+    assert processor(cpuinfo, {}, otherwise="arm") == "arm"
+    assert processor(cpuinfo, {}, otherwise="") == "unknown processor"
+
+
+@pytest.mark.parametrize("name", CAPS)
+def test_every_variable_that_changes_sums_is_told(name):
+    assert f"{name}=x" in processor(XEON, {name: "x"}, otherwise="")
+
+
+@pytest.mark.parametrize(("flag", "name"), INSTRUCTIONS.items())
+def test_every_instruction_set_is_told_if_and_only_if_it_is_offered(flag, name):
+    assert name in processor(f"Features : {flag}", {}, otherwise="arm")
+    assert processor("Features : fp", {}, otherwise="arm") == "arm"
+
+
+def test_a_machine_without_cpuinfo_is_told_all_the_same(tmp_path, monkeypatch):
+    monkeypatch.setattr(provenance, "CPUINFO", tmp_path / "none")
     assert re.search(r"cpu .*, \d+ cores, Python 3\.", device())
 
 
