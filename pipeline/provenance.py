@@ -5,8 +5,9 @@ import platform
 import resource
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 from pipeline import io
 
@@ -56,19 +57,73 @@ def processor(cpuinfo: str, environ: Mapping[str, str], *, otherwise: str) -> st
     return f"{plain} ({told})" if told else plain
 
 
-def note_cost(folder: Path, stage: str, seconds: float) -> None:
-    """Keep what a stage cost beside the pipeline, never in an output: it differs between identical runs."""
-    peaks = (resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    unit = 1 if sys.platform == "darwin" else 1024  # bytes on macOS, KiB elsewhere
+def begin_cost(folder: Path, stage: str) -> None:
+    """Forget the trainings of a stage's last run, which begins anew."""
+    io.remove(_trainings_file(folder, stage))
+
+
+def note_trainings(folder: Path, stage: str, trained: Mapping[str, tuple[float, bool]], waited_s: float) -> None:
+    """Add trainings to those of a stage's run: by key the seconds when computed, and whether an earlier run did.
+
+    `waited_s` is what the stage waited for them.
+    """
+    before = _read_trainings(folder, stage)
+    reused = {key for key, (_, again) in trained.items() if again} - set(before["computed_s"])
     io.write_json(
-        folder / f"{stage}.json",
-        {"seconds": round(seconds, 2), "peak_process_memory_MB": round(max(peaks) * unit / 1e6, 1)},
+        _trainings_file(folder, stage),
+        {
+            "waited_s": before["waited_s"] + waited_s,
+            "computed_s": before["computed_s"] | {key: seconds for key, (seconds, _) in trained.items()},
+            "reused": sorted({*before["reused"], *reused}),
+        },
     )
 
 
-def read_costs(folder: Path) -> dict[str, dict[str, float]]:
-    """Read the costs of the stages that ran here, by stage."""
-    return {file.stem: io.read_json(file) for file in sorted(folder.glob("*.json"))}
+def note_cost(folder: Path, stage: str, seconds: float) -> None:
+    """Keep what a stage cost beside the pipeline, never in an output: it differs between identical runs.
+
+    A stage that does not run, or that DVC restores, keeps the cost that it had when it ran.
+    """
+    peaks = (resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    unit = 1 if sys.platform == "darwin" else 1024  # bytes on macOS, KiB elsewhere
+    own = _read_trainings(folder, stage)
+    io.write_json(
+        folder / f"{stage}.json",
+        {
+            "seconds": round(seconds, 2),
+            "other_s": round(max(seconds - own["waited_s"], 0.0), 2),
+            "trainings_s": own["computed_s"],
+            "reused_n": len(own["reused"]),
+            "peak_process_memory_MB": round(max(peaks) * unit / 1e6, 1),
+        },
+    )
+    io.remove(_trainings_file(folder, stage))
+
+
+def read_costs(folder: Path) -> dict[str, dict[str, Any]]:
+    """Read the costs of the stages that ran here, by stage; those of an older form tell nothing of trainings."""
+    costs = {file.stem: io.read_json(file) for file in sorted(folder.glob("*.json"))}
+    return {stage: cost for stage, cost in costs.items() if "trainings_s" in cost}
+
+
+def add_up_costs(costs: Iterable[Mapping[str, Any]]) -> float:
+    """Add what stages cost when they were computed, in seconds; a training that two of them share counts once.
+
+    Trainings are added as if one ran after another: where two run side by side, less time passes.
+    """
+    own = list(costs)
+    trainings_s = {key: seconds for cost in own for key, seconds in cost["trainings_s"].items()}
+    return float(sum(cost["other_s"] for cost in own) + sum(trainings_s.values()))
+
+
+def _trainings_file(folder: Path, stage: str) -> Path:
+    return folder / "running" / f"{stage}.json"
+
+
+def _read_trainings(folder: Path, stage: str) -> dict[str, Any]:
+    file = _trainings_file(folder, stage)
+    none: dict[str, Any] = {"waited_s": 0.0, "computed_s": {}, "reused": []}
+    return io.read_json(file) if file.exists() else none
 
 
 def _git(*words: str) -> str:

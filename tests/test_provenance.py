@@ -3,7 +3,18 @@ import re
 import pytest
 
 from pipeline import provenance
-from pipeline.provenance import CAPS, INSTRUCTIONS, code_version, device, note_cost, processor, read_costs
+from pipeline.provenance import (
+    CAPS,
+    INSTRUCTIONS,
+    add_up_costs,
+    begin_cost,
+    code_version,
+    device,
+    note_cost,
+    note_trainings,
+    processor,
+    read_costs,
+)
 
 XEON = "processor\t: 0\nmodel name\t: Intel(R) Xeon(R) Gold 6442Y\nflags\t\t: fpu sse2 avx2 avx512f amx_tile\n\n"
 OLD = "processor\t: 1\nmodel name\t: Another one\nflags\t\t: fpu sse2\n"
@@ -57,3 +68,47 @@ def test_costs_are_kept_a_stage_in_seconds_and_megabytes(tmp_path):
     assert list(costs) == ["split"]
     assert costs["split"]["seconds"] == 2.35 or costs["split"]["seconds"] == 2.34  # halves round to even
     assert 10 < costs["split"]["peak_process_memory_MB"] < 100_000  # a Python process; not KiB, not bytes
+
+
+def test_a_stage_costs_what_its_trainings_cost_when_they_were_computed_reused_or_not(tmp_path):
+    begin_cost(tmp_path, "train")
+    note_trainings(tmp_path, "train", {"a": (8.0, False), "b": (9.0, False)}, waited_s=10.0)
+    note_cost(tmp_path, "train", 12.0)
+    first = read_costs(tmp_path)["train"]
+    assert first["seconds"] == 12.0
+    assert first["reused_n"] == 0
+    assert add_up_costs([first]) == 8.0 + 9.0 + 2.0  # and what the stage did besides
+
+    begin_cost(tmp_path, "train")
+    note_trainings(tmp_path, "train", {"a": (8.0, True), "b": (9.0, True)}, waited_s=0.5)
+    note_cost(tmp_path, "train", 2.5)
+    again = read_costs(tmp_path)["train"]
+    assert (again["seconds"], again["reused_n"]) == (2.5, 2)
+    assert add_up_costs([again]) == add_up_costs([first])
+
+
+def test_trainings_that_one_run_asks_for_twice_are_neither_counted_twice_nor_reused(tmp_path):
+    begin_cost(tmp_path, "sweep")
+    note_trainings(tmp_path, "sweep", {"a": (8.0, False)}, waited_s=4.0)
+    note_trainings(tmp_path, "sweep", {"a": (8.0, True), "c": (1.0, True)}, waited_s=1.0)
+    note_cost(tmp_path, "sweep", 6.0)
+    cost = read_costs(tmp_path)["sweep"]
+    assert cost["trainings_s"] == {"a": 8.0, "c": 1.0}
+    assert cost["reused_n"] == 1
+    assert add_up_costs([cost]) == 10.0
+
+
+def test_a_training_that_two_stages_share_costs_once(tmp_path):
+    for stage in ("one", "other"):
+        begin_cost(tmp_path, stage)
+        note_trainings(tmp_path, stage, {"a": (8.0, stage == "other")}, waited_s=1.0)
+        note_cost(tmp_path, stage, 3.0)
+    assert add_up_costs(read_costs(tmp_path).values()) == 8.0 + 2 * 2.0
+
+
+def test_what_a_killed_run_left_is_forgotten(tmp_path):
+    begin_cost(tmp_path, "train")
+    note_trainings(tmp_path, "train", {"old": (8.0, False)}, waited_s=1.0)
+    begin_cost(tmp_path, "train")  # killed before its end, and begun anew
+    note_cost(tmp_path, "train", 2.0)
+    assert read_costs(tmp_path)["train"]["trainings_s"] == {}

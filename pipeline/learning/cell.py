@@ -55,6 +55,7 @@ class Trained:
     stopped_step: int | None
     seconds: float  # of its training, its part of the stack's
     one_reading_s: float  # median, to answer for a single reading
+    reused: bool = False  # finished by an earlier run
 
 
 @dataclass(frozen=True)
