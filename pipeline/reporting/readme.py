@@ -61,7 +61,7 @@ def _stages(stages: Mapping[str, Any]) -> str:
     for name, stage in stages.items():
         outs = [
             out if isinstance(out, str) else next(iter(out))
-            for key in ("outs", "plots")
+            for key in ("outs", "metrics", "plots")
             for out in stage["do"].get(key, [])
         ]
         written = ", ".join(f"`{re.sub(r'[$]{[^}]*}', '…', out)}`" for out in outs) or "MLflow runs"
