@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.evaluation.reproduced import compare, leaves
@@ -16,10 +16,16 @@ NAMES = ("table2", "shear", "provenance", "accuracy_pct", "mse_xy_mm2", "rows_n"
 VALUES = st.one_of(
     st.booleans(), st.integers(-9, 9), st.floats(-100, 100), st.text("ab 1", max_size=3), st.none(),
 )  # fmt: skip
-NESTED = st.recursive(VALUES, lambda own: st.lists(own, max_size=3) | st.dictionaries(st.sampled_from(NAMES), own))
-NUMBERS = st.dictionaries(st.sampled_from(NAMES), NESTED)
+NESTED = st.recursive(
+    VALUES,
+    lambda own: st.lists(own, max_size=3) | st.dictionaries(st.sampled_from(NAMES), own, max_size=3),
+    max_leaves=9,
+)
+NUMBERS = st.dictionaries(st.sampled_from(NAMES), NESTED, max_size=4)
+FEW = settings(max_examples=40, deadline=None)  # a nest of values takes milliseconds to draw
 
 
+@FEW
 @given(NUMBERS)
 def test_a_run_is_itself(numbers):
     done = compare(numbers, numbers)
@@ -28,6 +34,7 @@ def test_a_run_is_itself(numbers):
     assert done.within_n == 0
 
 
+@FEW
 @given(NUMBERS, NUMBERS)
 def test_every_value_is_counted_once_and_sides_may_be_exchanged(one, other):
     there, back = compare(one, other), compare(other, one)
