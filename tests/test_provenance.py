@@ -1,6 +1,8 @@
 import re
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from pipeline import provenance
 from pipeline.provenance import (
@@ -84,7 +86,16 @@ def test_a_stage_costs_what_its_trainings_cost_when_they_were_computed_reused_or
     note_cost(tmp_path, "train", 2.5)
     again = read_costs(tmp_path)["train"]
     assert (again["seconds"], again["reused_n"]) == (2.5, 2)
-    assert add_up_costs([again]) == add_up_costs([first])
+    assert add_up_costs([again]) == 8.0 + 9.0 + 2.5
+
+
+@given(st.floats(0, 9), st.floats(0, 9), st.lists(st.tuples(st.floats(0, 9), st.booleans()), max_size=4))
+def test_a_stage_never_costs_less_than_its_last_run_took(tmp_path_factory, waited_s, other_s, trained):
+    folder = tmp_path_factory.mktemp("costs")
+    note_trainings(folder, "train", {str(i): one for i, one in enumerate(trained)}, waited_s)
+    note_cost(folder, "train", waited_s + other_s)
+    cost = read_costs(folder)["train"]
+    assert add_up_costs([cost]) >= cost["seconds"] - 0.02  # both are rounded to 0.01 s
 
 
 def test_trainings_that_one_run_asks_for_twice_are_neither_counted_twice_nor_reused(tmp_path):
@@ -103,7 +114,7 @@ def test_a_training_that_two_stages_share_costs_once(tmp_path):
         begin_cost(tmp_path, stage)
         note_trainings(tmp_path, stage, {"a": (8.0, stage == "other")}, waited_s=1.0)
         note_cost(tmp_path, stage, 3.0)
-    assert add_up_costs(read_costs(tmp_path).values()) == 8.0 + 2 * 2.0
+    assert add_up_costs(read_costs(tmp_path).values()) == 8.0 + 2.0 + 3.0  # the one that reused it waited, too
 
 
 def test_what_a_killed_run_left_is_forgotten(tmp_path):
