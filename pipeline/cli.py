@@ -186,6 +186,29 @@ def publish() -> None:
 
 
 @app.command()
+def compare(
+    scene: Annotated[str | None, typer.Argument(help="A scene; without one, all that run.")] = None,
+    against: Annotated[str, typer.Option(help="A git revision, a folder or a numbers.json.")] = "HEAD",
+) -> None:
+    """Hold fresh numbers against the committed ones; exit status 1 if any differs by more than it may."""
+    from pipeline.comparing import compare_scene, table_of, verdict  # pandas, for this command only
+
+    worst = 0
+    for name in [scene] if scene else plan.check(ROOT).scenes:
+        try:
+            done = compare_scene(ROOT, name, against)
+        except ReskinError as error:
+            typer.echo(f"error: {error}", err=True)
+            worst = max(worst, error.exit_code)
+            continue
+        if table := table_of(done):
+            typer.echo(table)
+        typer.echo(verdict(name, against, done))
+        worst = max(worst, 0 if done.reproduced else 1)
+    sys.exit(worst)
+
+
+@app.command()
 def readme(check: Annotated[bool, typer.Option("--check", help="Only tell whether it is up to date.")] = False) -> None:
     """Fill in the generated parts of README.md from the results of the scenes that run."""
     from pipeline.reporting.readme import blocks_of, fill

@@ -55,6 +55,19 @@ def pinned(flags: frozenset[str], environment: Mapping[str, str]) -> dict[str, s
     return {name: value for name, value in chosen.items() if name not in environment}
 
 
+def departures(environment: Mapping[str, str]) -> list[str]:
+    """Name the variables that hold libraries to other code paths than `pin` does: results may differ in the last bits.
+
+    >>> departures({"MKL_CBWR": "COMPATIBLE", "NUMBA_CPU_NAME": "haswell"})
+    ['MKL_CBWR=COMPATIBLE']
+    """
+    usual = {name: {value} for name, value in PINNED.items()}
+    told = " ".join(BEYOND_AVX2)  # of a processor that has some of them only, a part
+    usual["NPY_DISABLE_CPU_FEATURES"] = {told[:end].rstrip() for end in range(len(told) + 1)}
+    said = {name: environment.get(name, "") for name in VARIABLES}
+    return [f"{name}={value}" for name, value in said.items() if value and value not in usual.get(name, set())]
+
+
 def signature() -> tuple[str, ...]:
     """What may give a training other bits on this machine: how products of matrices are summed, here and now."""
     return tuple(os.environ.get(name, "") for name in ("MKL_CBWR", "ATEN_CPU_CAPABILITY"))

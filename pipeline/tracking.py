@@ -12,6 +12,7 @@ import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -37,38 +38,64 @@ def publish(arms: Mapping[str, Path], curves: Curves, reports: Path, *, scene: s
     """Write every training of a scene to MLflow once, and its report; `arms` maps stage to models.
 
     A sweep or an experiment is one run whose metrics go over its steps: hundreds of children would hide the others.
-    Returns counts of new, kept and superseded runs; raises `TrackingAway` if the server does not answer.
+    `current` follows what lies there now: results that were restored, and were written before, are tagged and not
+    written again. Returns counts of new, kept and superseded runs; raises `TrackingAway` if the server does not answer.
     """
     uri = tracking_uri(root)
     probe(uri)
     counts = {"new_n": 0, "kept_n": 0, "superseded_n": 0}
     with _client(uri) as client:
-        experiment_id = _experiment(client, scene, root)
+        diary = Diary(client, _experiment(client, scene, root), scene)
         current: set[str] = set()
         for stage, models in arms.items():
-            cards = {file: io.read_json(file) for file in sorted(models.glob("*.json"))}
-            keys = {file: run_key(card) for file, card in cards.items()}
-            parent_key = hashlib.sha256("".join(sorted(keys.values())).encode()).hexdigest()[:32]
-            parent_id = _open_parent(client, experiment_id, stage, scene, parent_key)
-            for file, card in cards.items():
-                fresh = _publish_one(client, experiment_id, stage, parent_id, file, card)
-                counts["new_n" if fresh else "kept_n"] += 1
-            current |= {parent_key, *keys.values()}
-            _log_means(client, parent_id, list(cards.values()))
-            client.set_terminated(parent_id)
-        for stage, points in curves.items():
-            key = hashlib.sha256(json.dumps([stage, points]).encode()).hexdigest()[:32]
-            if _find(client, experiment_id, stage, key) is None:
-                _publish_curve(client, _open_parent(client, experiment_id, stage, scene, key), points)
-            current.add(key)
-        current.add(_publish_report(client, experiment_id, scene, reports))
-        counts["superseded_n"] = _mark_superseded(client, experiment_id, current)
+            keys, fresh = _publish_arm(diary, stage, models)
+            current |= keys
+            counts["new_n"] += sum(fresh)
+            counts["kept_n"] += len(fresh) - sum(fresh)
+        current |= {_publish_curve(diary, stage, points) for stage, points in curves.items()}
+        current |= _publish_report(diary, reports, _digest(sorted(current)))
+        counts["superseded_n"] = _mark_superseded(client, diary.experiment_id, current)
     return counts
+
+
+@dataclass(frozen=True)
+class Diary:
+    """A scene's experiment in a store that answers."""
+
+    client: Any
+    experiment_id: str
+    scene: str
+
+    def find(self, stage: str, **tags: str) -> Any:
+        """Find a stage's newest run with these tags."""
+        words = " and ".join(f"tags.{name} = '{value}'" for name, value in {"stage": stage, **tags}.items())
+        found = self.client.search_runs([self.experiment_id], words, max_results=1)
+        return found[0] if found else None
+
+    def open(self, stage: str, key: str) -> tuple[str, bool]:
+        """Give the run of a stage, and whether it is yet to be written; one that a killed process left is replaced."""
+        found = self.find(stage, run_key=key)
+        if found and found.info.status == "FINISHED":
+            self.tag(found, {"current": "true"})
+            return str(found.info.run_id), False
+        if found:
+            self.client.delete_run(found.info.run_id)
+        tags = {"run_key": key, "stage": stage, "scene": self.scene, "kind": "stage", "current": "true"}
+        return str(self.client.create_run(self.experiment_id, tags=tags, run_name=stage).info.run_id), True
+
+    def tag(self, run: Any, tags: Mapping[str, str]) -> None:
+        """Set tags that differ."""
+        for name, value in tags.items():
+            if run.data.tags.get(name) != value:
+                self.client.set_tag(run.info.run_id, name, value)
 
 
 def run_key(card: Mapping[str, Any]) -> str:
     """Name a result by all that its card says, scores included, but for the commit: equal results are one."""
-    words = {name: value for name, value in card.items() if name != "git"}
+    return _digest({name: value for name, value in card.items() if name != "git"})
+
+
+def _digest(words: Any) -> str:
     return hashlib.sha256(json.dumps(words, sort_keys=True).encode()).hexdigest()[:32]
 
 
@@ -105,22 +132,26 @@ def _experiment(client: Any, scene: str, root: Path) -> str:
     return str(client.create_experiment(scene, artifact_location=location, tags=kind))
 
 
-def _open_parent(client: Any, experiment_id: str, stage: str, scene: str, key: str) -> str:
-    found = _find(client, experiment_id, stage, key)
-    if found:
-        _set_tags(client, found, {"current": "true"})
-        return str(found.info.run_id)
-    tags = {"run_key": key, "stage": stage, "scene": scene, "kind": "stage", "current": "true"}
-    return str(client.create_run(experiment_id, tags=tags, run_name=stage).info.run_id)
+def _publish_arm(diary: Diary, stage: str, models: Path) -> tuple[set[str], list[bool]]:
+    """Write a stage's trainings below a run of the stage; give all keys, and of each training whether it is new."""
+    cards = {file: io.read_json(file) for file in sorted(models.glob("*.json"))}
+    keys = [run_key(card) for card in cards.values()]
+    parent_key = hashlib.sha256("".join(sorted(keys)).encode()).hexdigest()[:32]
+    parent_id, unwritten = diary.open(stage, parent_key)
+    fresh = [_publish_one(diary, stage, parent_id, file, card) for file, card in cards.items()]
+    if unwritten:
+        _log_means(diary.client, parent_id, list(cards.values()))
+        diary.client.set_terminated(parent_id)
+    return {parent_key, *keys}, fresh
 
 
-def _publish_one(client: Any, experiment_id: str, stage: str, parent_id: str, file: Path, card: dict[str, Any]) -> bool:
+def _publish_one(diary: Diary, stage: str, parent_id: str, file: Path, card: dict[str, Any]) -> bool:
     """Write one training; True if it was not there yet. A half-written run of a killed process is replaced."""
     parent_tag = "mlflow.parentRunId"
-    key = run_key(card)
-    found = _find(client, experiment_id, stage, key)
+    client, key = diary.client, run_key(card)
+    found = diary.find(stage, run_key=key)
     if found and found.info.status == "FINISHED":
-        _set_tags(client, found, {parent_tag: parent_id, "current": "true"})
+        diary.tag(found, {parent_tag: parent_id, "current": "true"})
         return False
     if found:
         client.delete_run(found.info.run_id)
@@ -130,7 +161,7 @@ def _publish_one(client: Any, experiment_id: str, stage: str, parent_id: str, fi
         parent_tag: parent_id, "mlflow.source.name": f"pipeline.stages.{stage}",
         "mlflow.source.git.commit": card["git"],
     }  # fmt: skip
-    run_id = client.create_run(experiment_id, tags=tags, run_name=file.stem).info.run_id
+    run_id = client.create_run(diary.experiment_id, tags=tags, run_name=file.stem).info.run_id
     _log(client, run_id, card)
     for artifact in (file, file.with_suffix(".safetensors")):
         client.log_artifact(run_id, str(artifact), "model")
@@ -152,12 +183,17 @@ def _log(client: Any, run_id: str, card: dict[str, Any]) -> None:
     _log_all(client, run_id, curve)
 
 
-def _publish_curve(client: Any, run_id: str, points: Sequence[tuple[str, int, Mapping[str, float]]]) -> None:
+def _publish_curve(diary: Diary, stage: str, points: Sequence[tuple[str, int, Mapping[str, float]]]) -> str:
+    """Write the points of a sweep or an experiment once; give their key."""
     from mlflow.entities import Metric
 
-    metrics = [Metric(f"{curve}.{name}", value, 0, step) for curve, step, own in points for name, value in own.items()]
-    _log_all(client, run_id, metrics)
-    client.set_terminated(run_id)
+    key = _digest([stage, points])
+    run_id, unwritten = diary.open(stage, key)
+    if unwritten:
+        rows = [(f"{curve}.{name}", value, step) for curve, step, own in points for name, value in own.items()]
+        _log_all(diary.client, run_id, [Metric(name, value, 0, step) for name, value, step in rows])
+        diary.client.set_terminated(run_id)
+    return key
 
 
 def _log_all(client: Any, run_id: str, metrics: Sequence[Any]) -> None:
@@ -165,22 +201,37 @@ def _log_all(client: Any, run_id: str, metrics: Sequence[Any]) -> None:
         client.log_batch(run_id, metrics=metrics[start : start + 1000])
 
 
-def _publish_report(client: Any, experiment_id: str, scene: str, reports: Path) -> str:
-    """Write the report's numbers once, and its files; give its key: what it says but for costs and commits."""
+def _publish_report(diary: Diary, reports: Path, inputs: str) -> set[str]:
+    """Write the report's numbers once, and its files; give its key: what it says but for costs and commits.
+
+    `inputs` names the results that it shows. Where those were restored and the report was not (`dvc checkout` brings
+    no report back), the report that was written with them is the current one.
+    """
     from mlflow.entities import Metric
 
-    metrics = [Metric(name, value, 0, step) for name, value, step in metrics_of(io.read_json(reports / "numbers.json"))]
-    said = [[one.key, one.value, one.step] for one in metrics]
+    before = diary.find("report", inputs=inputs)
+    said = _said(reports) if (reports / "numbers.json").exists() else None
+    key = None if said is None else _digest(said[0] + said[1])
+    there = None if key is None else diary.find("report", run_key=key)
+    restored = before is not None and (key is None or (there is not None and there.data.tags.get("inputs") != inputs))
+    if restored:
+        diary.tag(before, {"current": "true"})
+        return {before.data.tags["run_key"]}
+    if key is None or said is None:
+        return set()
+    run_id, unwritten = diary.open("report", key)
+    if unwritten:
+        _log_all(diary.client, run_id, [Metric(name, value, 0, step) for name, value, step in said[0]])
+    diary.client.set_tag(run_id, "inputs", inputs)
+    diary.client.log_artifacts(run_id, str(reports))  # again: words on the page and costs may be new
+    diary.client.set_terminated(run_id)
+    return {key}
+
+
+def _said(reports: Path) -> tuple[list[tuple[str, float, int]], list[tuple[str, str, int]]]:
+    """List a report's numbers, and its figures and tables by hash."""
     files = [file for part in ("figures", "tables") for file in sorted((reports / part).glob("*"))]
-    said += [[file.name, io.sha256(file), 0] for file in files]
-    key = hashlib.sha256(json.dumps(said).encode()).hexdigest()[:32]
-    found = _find(client, experiment_id, "report", key)
-    run_id = _open_parent(client, experiment_id, "report", scene, key)
-    if found is None:
-        _log_all(client, run_id, metrics)
-    client.log_artifacts(run_id, str(reports))  # again: words on the page and costs may be new
-    client.set_terminated(run_id)
-    return key
+    return metrics_of(io.read_json(reports / "numbers.json")), [(file.name, io.sha256(file), 0) for file in files]
 
 
 def metrics_of(numbers: Mapping[str, Any]) -> list[tuple[str, float, int]]:
@@ -206,12 +257,6 @@ def _flat(value: Any, name: str, step: int) -> Iterator[tuple[str, float, int]]:
         yield name, float(value), step
 
 
-def _set_tags(client: Any, run: Any, tags: dict[str, str]) -> None:
-    for name, value in tags.items():
-        if run.data.tags.get(name) != value:
-            client.set_tag(run.info.run_id, name, value)
-
-
 def _log_means(client: Any, run_id: str, cards: list[dict[str, Any]]) -> None:
     """Write to the parent what its children say together: mean and sd of each question and recipe."""
     from mlflow.entities import Metric
@@ -222,11 +267,6 @@ def _log_means(client: Any, run_id: str, cards: list[dict[str, Any]]) -> None:
         for name, summary in over_folds(pool_skins(own) if "tuning" in own[0] else own).items():
             metrics += [Metric(f"{question}.{recipe}.{name}.{key}", value, 0, 0) for key, value in summary.items()]
     client.log_batch(run_id, metrics=metrics)
-
-
-def _find(client: Any, experiment_id: str, stage: str, key: str) -> Any:
-    found = client.search_runs([experiment_id], f"tags.run_key = '{key}' and tags.stage = '{stage}'", max_results=1)
-    return found[0] if found else None
 
 
 def _mark_superseded(client: Any, experiment_id: str, current: set[str]) -> int:

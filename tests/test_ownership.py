@@ -34,7 +34,8 @@ HOMES = {
         "pipeline/learning/classical.py",
     },
     r"os\.environ": {
-        "pipeline/learning/executors.py", "pipeline/numerics.py", "pipeline/server.py", "pipeline/tracking.py",
+        "pipeline/learning/executors.py", "pipeline/numerics.py", "pipeline/provenance.py", "pipeline/server.py",
+        "pipeline/tracking.py",
     },
     r"import pickle|torch\.load\(|allow_pickle=True": set(),
 }  # fmt: skip

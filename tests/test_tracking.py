@@ -1,3 +1,4 @@
+import shutil
 import socket
 import threading
 import time
@@ -13,9 +14,18 @@ from pipeline.server import TrackingAway, probe
 from pipeline.tracking import publish
 
 
+@pytest.fixture(scope="module")
+def empty_store(tmp_path_factory) -> Path:
+    """A store without runs: to make one takes seconds, to copy it none."""
+    store = tmp_path_factory.mktemp("store") / "mlflow.db"
+    mlflow.MlflowClient(f"sqlite:///{store}").search_experiments()
+    return store
+
+
 @pytest.fixture(autouse=True)
-def _embedded(monkeypatch):
+def _embedded(monkeypatch, tmp_path, empty_store):
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    shutil.copy(empty_store, tmp_path / "mlflow.db")
 
 
 @pytest.fixture
@@ -152,6 +162,68 @@ def test_a_sweep_is_one_run_whose_metrics_go_over_its_steps(tmp_path):
     client = mlflow.MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
     history = client.get_metric_history(run.info.run_id, "adapted.accuracy_pct")
     assert [(point.step, point.value) for point in history] == [(0, 60.0), (65, 70.0)]
+
+
+CURVES = {old: {"sweep_pokes": [("adapted", 0, {"accuracy_pct": pct})]} for old, pct in ((True, 60.0), (False, 61.0))}
+
+
+def leave(root: Path, old: bool, reported: bool = True) -> dict:
+    """Let a state of the workspace lie there, as `git checkout` and `dvc checkout` do, or `dvc checkout` alone."""
+    io.remove(root / "models")
+    write_model(root / "models", "b0", "k0" if old else "k9", accuracy_pct=50.0 if old else 51.0)
+    if reported:
+        write_report(root / "reports", accuracy_pct=50.0 if old else 51.0)
+    return publish({"train_multi": root / "models"}, CURVES[old], root / "reports", scene="ci", root=root)
+
+
+def current(root: Path) -> set[str]:
+    return {run.info.run_id for run in runs(root, "tags.current = 'true'")}
+
+
+def test_current_follows_a_restored_state_and_nothing_is_written_again(tmp_path):
+    leave(tmp_path, old=True)
+    first = current(tmp_path)
+    leave(tmp_path, old=False)
+    assert len(first) == 4  # a training, its stage, a sweep, the report
+    assert current(tmp_path) & first == set()
+    client = mlflow.MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
+    counted = {run.info.run_id: history_n(client, run) for run in runs(tmp_path, "")}
+    assert leave(tmp_path, old=True) == {"new_n": 0, "kept_n": 1, "superseded_n": 4}
+    assert current(tmp_path) == first
+    assert {run.info.run_id: history_n(client, run) for run in runs(tmp_path, "")} == counted
+
+
+def history_n(client: mlflow.MlflowClient, run) -> int:
+    return sum(len(client.get_metric_history(run.info.run_id, name)) for name in run.data.metrics)
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_a_report_that_dvc_does_not_restore_is_found_by_the_results_that_it_showed(tmp_path, there):
+    leave(tmp_path, old=True)
+    first = current(tmp_path)
+    leave(tmp_path, old=False)
+    if not there:
+        io.remove(tmp_path / "reports")
+    leave(tmp_path, old=True, reported=False)
+    assert current(tmp_path) == first
+
+
+def test_results_that_were_never_reported_are_published_without_a_report(tmp_path):
+    leave(tmp_path, old=True)
+    io.remove(tmp_path / "reports")
+    leave(tmp_path, old=False, reported=False)
+    assert {run.data.tags["stage"] for run in runs(tmp_path, "tags.current = 'true'")} == {"train_multi", "sweep_pokes"}
+
+
+def test_a_curve_that_a_killed_process_left_is_written_again(tmp_path):
+    leave(tmp_path, old=True)
+    client = mlflow.MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
+    for run in runs(tmp_path, "tags.kind = 'stage'"):
+        client.set_terminated(run.info.run_id, "KILLED")
+    leave(tmp_path, old=True)
+    again = runs(tmp_path, "tags.current = 'true'")
+    assert len(again) == 4
+    assert {run.info.status for run in again} == {"FINISHED"}
 
 
 def test_a_store_that_is_broken_costs_no_result(tmp_path):

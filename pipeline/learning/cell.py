@@ -63,6 +63,7 @@ class Trained:
     explained_min: float | None  # the least part of a target's variance over its training rows; None: too short to tell
     seconds: float  # of its training, its part of the stack's
     one_reading_s: float  # median, to answer for a single reading
+    reused: bool = False  # finished by an earlier run
     collapsed_before_n: int = 0  # trainings of the same cell before this one, that collapsed
 
     @property

@@ -106,9 +106,9 @@ def _run_once(
         for stack in stacks(members, STACK_N[device()])
     ]
     missing = [(stack, files) for stack, files in planned if not all(file.exists() for file in files)]
-    missing_n = sum(len(stack) for stack, _ in missing)
-    if missing_n < len(members):
-        tell(f"{len(members) - missing_n} of {len(members)} trainings were finished before")
+    fresh = {key for stack, _ in missing for key in stack}
+    if len(fresh) < len(members):
+        tell(f"{len(members) - len(fresh)} of {len(members)} trainings were finished before")
     if missing:
         rows_file = cache / "rows" / f"{keys.rows_digest()}.safetensors"
         skin = np.unique(rows.skin, return_inverse=True)[1].astype(np.int64)
@@ -116,7 +116,7 @@ def _run_once(
         _run_stacks([([members[key] for key in stack], files) for stack, files in missing], rows_file, executor, tell)
         io.remove(rows_file)
     file_of = {key: file for stack, files in planned for key, file in zip(stack, files, strict=True)}
-    return [_read_trained(file_of[key]) for key in names]
+    return [replace(_read_trained(file_of[key]), reused=key not in fresh) for key in names]
 
 
 def stacks(members: Mapping[str, Cell], size_n: int) -> list[list[str]]:

@@ -103,9 +103,21 @@ def lost_by_protocol(losses: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[
     return found
 
 
-def runtime(cards: Cards, costs: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
+def runtime(cards: Cards, costs: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """What it cost, where it ran here: seconds and memory a stage, and networks trained."""
-    return {"stages": {stage: dict(cost) for stage, cost in costs.items()}, "trainings_n": len(cards)}
+    return {"stages": {stage: _cost(own) for stage, own in costs.items()}, "trainings_n": len(cards)}
+
+
+def _cost(own: Mapping[str, Any]) -> dict[str, float]:
+    """Tell what a stage cost when it was computed, its trainings added up, from what its last run took."""
+    trainings_s = own["trainings_s"].values()
+    return {
+        "computed_s": own["other_s"] + sum(trainings_s),
+        "seconds": own["seconds"],
+        "trainings_n": len(trainings_s),
+        "reused_n": own["reused_n"],
+        "peak_process_memory_MB": own["peak_process_memory_MB"],
+    }
 
 
 def answered(

@@ -35,7 +35,8 @@ def blocks_of(
     shown = [_results(numbers, ("table2", "order", "single_sensor")) for numbers in results]
     labels = [_results(numbers, ("labels",)) for numbers in others if "labels" in numbers]
     skins = to_markdown(skins_table(dict(_main_skins([results[-1], *others]))))
-    blocks = {"results": "\n\n".join(shown), "labels": "\n\n".join(labels) or "No recorded scene asked yet."}
+    blocks = {"results": "\n\n".join(shown), "costs": _costs([*results, *others])}
+    blocks |= {"labels": "\n\n".join(labels) or "No recorded scene asked yet."}
     return blocks | {"skins": skins, "dag": dag, "stages": _stages(stages)}
 
 
@@ -47,6 +48,18 @@ def _results(numbers: Mapping[str, Any], names: Sequence[str]) -> str:
         f"seed {provenance['seed']}, {provenance['device']}:"
     )
     return "\n\n".join([words] + [to_markdown(tables[name]) for name in names if name in tables])
+
+
+def _costs(scenes: Iterable[Mapping[str, Any]]) -> str:
+    """Say what each scene costs when all of it is computed, on the machine that computed it."""
+    by_device: dict[str, list[str]] = {}
+    for own in (numbers["provenance"] for numbers in scenes):
+        by_device.setdefault(own["device"], []).append(f"`{own['scene']}` {own['seconds'] / 60:.2g} min")
+    said = "; ".join(f"{', '.join(costs)} ({device})" for device, costs in by_device.items())
+    return (
+        f"Computed from nothing, trainings added up as if one ran after another: {said}. Two run side by side "
+        "by default, so that less time passes."
+    )
 
 
 def _main_skins(scenes: Iterable[Mapping[str, Any]]) -> Iterator[tuple[str, Mapping[str, Any]]]:
@@ -61,7 +74,7 @@ def _stages(stages: Mapping[str, Any]) -> str:
     for name, stage in stages.items():
         outs = [
             out if isinstance(out, str) else next(iter(out))
-            for key in ("outs", "plots")
+            for key in ("outs", "metrics", "plots")
             for out in stage["do"].get(key, [])
         ]
         written = ", ".join(f"`{re.sub(r'[$]{[^}]*}', '…', out)}`" for out in outs) or "MLflow runs"

@@ -14,13 +14,18 @@ import pandas as pd
 
 from pipeline.evaluation.work_precision.rows import CANDIDATES, ERROR_MAX, REFERENCE, Choice, Key, Precision, Seconds
 from pipeline.reporting.figures import STYLE, svg
-from pipeline.reporting.shown import to_markdown
+from pipeline.reporting.shown import tabulate, to_markdown
 
 # Okabe & Ito 2008, told apart by colour-blind readers; their yellow is left out, which is pale on white.
 COLOURS = ("#000000", "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 LOWEST = 1e-16  # rounding: no error is drawn below it, for the axis is logarithmic
 COLUMNS_N = 3
+COMPUTED = (
+    "Computed: what the stage cost when its results were computed, its trainings added up as if one ran after another "
+    "(two run side by side, so that less time passes). Last run: what passed when it ran last; trainings that were "
+    "finished before are reused."
+)
 CAPTION_LETTERS = 48  # in the width of a panel, and in that of the legend
 
 
@@ -61,16 +66,19 @@ def cost_tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFra
 
 
 def costs(stages: Mapping[str, Mapping[str, float]]) -> pd.DataFrame:
-    """List what each stage cost where it ran last."""
+    """List what each stage cost when it was computed, and what its last run took."""
     rows = [
         {
             "stage": name,
-            "s": f"{one['seconds']:.1f}",
+            "computed, s": f"{one['computed_s']:.1f}",
+            "last run, s": f"{one['seconds']:.1f}",
+            "trainings": str(one["trainings_n"]),
+            "of them reused": str(one["reused_n"]),
             "peak memory of a process, MB": f"{one['peak_process_memory_MB']:.0f}",
         }
         for name, one in stages.items()
     ]
-    return pd.DataFrame(rows)
+    return tabulate(rows, meaning=COMPUTED)
 
 
 def table(rows: Sequence[Mapping[str, Any]], source: str) -> pd.DataFrame:

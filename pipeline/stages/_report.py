@@ -10,7 +10,7 @@ from pipeline.evaluation.choice import choose
 from pipeline.learning.executors import device as trained_on
 from pipeline.learning.recipe import HEADLINE
 from pipeline.params import Scene, described_in, modelled, runs, swept
-from pipeline.provenance import SECONDS, code_version, device, read_costs
+from pipeline.provenance import SECONDS, add_up_costs, code_version, device, read_costs
 from pipeline.reporting.learned import timed_learning
 from pipeline.reporting.numbers import answered, compose, lost_by_protocol, rounded, runtime
 from pipeline.stages._run import COSTS
@@ -58,10 +58,10 @@ def _provenance(scene: str, asked: Scene, cards: Cards) -> dict[str, Any]:
     known = {"scene": scene, "source": asked.source, "git": code_version(), "seed": asked.seed}
     known |= {"trained": ", ".join(sorted({card["git"] for card in cards}))}
     known |= {"device": f"{device()}, networks on {trained_on()}"}
-    return known | {"seconds": round(sum(cost["seconds"] for cost in _costs(scene, asked).values()), 1)}
+    return known | {"seconds": round(add_up_costs(_costs(scene, asked).values()), 1)}
 
 
-def _costs(scene: str, asked: Scene) -> dict[str, dict[str, float]]:
+def _costs(scene: str, asked: Scene) -> dict[str, dict[str, Any]]:
     """Read what each stage cost here; one whose question was switched off costs nothing any more."""
     return {unit: cost for unit, cost in read_costs(COSTS / scene).items() if runs(asked, unit)}
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import ReskinError
-from pipeline.provenance import note_cost
+from pipeline.provenance import begin_cost, note_cost
 from pipeline.server import TrackingAway, probe, server_uri
 
 COSTS = Path(".reskin/costs")
@@ -29,13 +29,14 @@ def run(work: Callable[..., None]) -> None:
         probe(server_uri())
     except TrackingAway as away:
         say(f"warning: {away}")
-    start_s = time.monotonic()
+    start_s, costs, unit = time.monotonic(), COSTS / arguments["scene"], _unit(stage, arguments)
+    begin_cost(costs, unit)
     try:
         work(**arguments)
     except ReskinError as error:
         say(f"error: {error}")
         sys.exit(error.exit_code)
-    note_cost(COSTS / arguments["scene"], _unit(stage, arguments), time.monotonic() - start_s)
+    note_cost(costs, unit, time.monotonic() - start_s)
 
 
 def _unit(stage: str, arguments: Mapping[str, Any]) -> str:

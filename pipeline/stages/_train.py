@@ -1,5 +1,6 @@
 """What the training stages share: a scene's rows and folds -> cells -> finished trainings. Knows no argv."""
 
+import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,8 @@ from pipeline.learning.executors import make_executor
 from pipeline.learning.grid import run_cells
 from pipeline.learning.recipe import Training
 from pipeline.params import Scene, read_scene
-from pipeline.stages._run import say
+from pipeline.provenance import note_trainings
+from pipeline.stages._run import COSTS, say
 
 CELLS = Path(".reskin/cells")  # finished trainings: a cache, and no output
 
@@ -51,11 +53,13 @@ def cells_of(at: Scenery, training: Training, folds: Iterable[Fold], *, question
 
 def train_all(at: Scenery, cells: Sequence[Cell], stage: str) -> list[Trained]:
     """Train what is not finished yet; say what stopped early, for it is used as it last was."""
-    rows = Measured(at.rows.db_uT, at.rows.target, at.rows.skin)
+    rows, start_s = Measured(at.rows.db_uT, at.rows.target, at.rows.skin), time.monotonic()
     with make_executor() as executor:
         trained = run_cells(
             cells, rows, executor=executor, cache=CELLS, tell=lambda line: say(f"{at.scene} {stage}: {line}")
         )
+    took = {one.key: (one.seconds, one.reused) for one in trained}
+    note_trainings(COSTS / at.scene, stage, took, time.monotonic() - start_s)
     for cell, one in zip(cells, trained, strict=True):
         if one.stopped_step is not None:
             say(f"warning: {at.scene} {stage}: {cell.name} diverged by step {one.stopped_step}: kept as it was before")

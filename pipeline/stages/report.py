@@ -1,4 +1,4 @@
-"""Stage report: models' cards, predictions, answers and accounts -> numbers.json, tables, figures, index.html."""
+"""Stage report: models' cards, predictions, answers and accounts -> numbers, scores, tables, figures, index.html."""
 
 from pathlib import Path
 
@@ -9,6 +9,7 @@ from pipeline.params import check_planned, modelled, read_params, read_scene
 from pipeline.reporting.experiments.parts import experiment_figures
 from pipeline.reporting.figures import error_grids
 from pipeline.reporting.page import page
+from pipeline.reporting.scores import headline_scores
 from pipeline.reporting.sweeps import learning_figures, learning_pages
 from pipeline.reporting.tables import make_tables, table_texts
 from pipeline.reporting.work_precision import pages
@@ -34,6 +35,7 @@ def report(
         record = to_record(numbers["chosen"], read_cards(asked, models), source=asked.source, seed=asked.seed)
         io.write_json(reports / "choice.json", record)
     io.write_json(reports / "numbers.json", numbers)
+    io.write_json(reports / "scores.json", headline_scores(numbers))
     tables = make_tables(numbers)
     io.write_texts(reports / "tables", table_texts(tables))
     predictions = [io.read_table(models / arm / "predictions.parquet") for arm in modelled(asked)]
@@ -44,7 +46,7 @@ def report(
     costs = pages(numbers["runtime"], source=asked.source) | learning_pages(numbers["runtime"], asked.source)
     io.write_texts(reports / "runtime", costs)
     io.write_text(reports / "index.html", page(numbers, tables, figures, costs))
-    say(f"{scene}: {reports}/index.html, numbers.json, tables, figures")
+    say(f"{scene}: {reports}/index.html, numbers.json, scores.json, tables, figures")
 
 
 if __name__ == "__main__":

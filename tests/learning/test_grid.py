@@ -69,6 +69,14 @@ def alike(one: Trained, other: Trained) -> bool:
     return weights and (one.predicted == other.predicted).all() and one.curve == other.curve
 
 
+def test_a_training_says_whether_an_earlier_run_finished_it(tmp_path):
+    first = run(cells(2), tmp_path)
+    both = run([*cells(2), *cells(2, steps_n=3)], tmp_path)
+    assert [one.reused for one in first] == [False, False]
+    assert [one.reused for one in both] == [True, True, False, False]
+    assert [one.seconds for one in both[:2]] == pytest.approx([one.seconds for one in first])  # when it was computed
+
+
 def test_results_come_in_the_order_of_cells_with_a_prediction_a_test_row(tmp_path):
     some = [*cells(2), pooled(), *cells(5, steps_n=3), without_triplets(), adapting(), few_labels()]
     done = run(some, tmp_path)

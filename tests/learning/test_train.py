@@ -19,10 +19,10 @@ from tests.learning.recipes import recipe
 
 ALL_TERMS = Terms(0.5, unlabelled=0.7, own=0.3)
 NO_TERMS = Terms(0.0)
-# Sums in another order: batched products of few rows depend on the processor and on where a network's weights lie. That
-# is float32 rounding (6e-8 of a term), but AdamW divides a gradient by its own size, so that some weights move by a
-# part of a step of mere rounding. All weights together move as they should to this part of their way.
-WAY = 2e-3
+# Sums in another order, on another processor or at another place in memory, round otherwise: 6e-8 of a term. AdamW
+# divides a gradient by its own size, so a ReLU that rounding opens for one row moves all weights of its unit by a
+# whole step: one unit of 200 is at most 7 % of the way there, a term left out more than that.
+WAY = 2e-2
 
 
 def run(jobs: list[Job], schedule: Recipe, terms: Terms = NO_TERMS) -> list[Outcome]:
@@ -95,7 +95,7 @@ def test_a_network_becomes_the_same_in_a_stack_and_alone(terms, batch_n):
         np.testing.assert_allclose(together[i].curve, alone.curve, rtol=1e-3)
 
 
-@pytest.mark.parametrize("decay", [0.0, 0.1])
+@pytest.mark.parametrize("decay", [0.0, 10.0])
 @pytest.mark.parametrize(
     "terms", [NO_TERMS, Terms(0.5), Terms(0.0, unlabelled=0.7), Terms(0.0, own=0.3), ALL_TERMS], ids=str
 )

@@ -11,6 +11,12 @@ def scores(names: tuple[str, ...] = METRICS) -> dict:
     return {name: stat() for name in names}
 
 
+def cost(seconds: float = 1.0) -> dict:
+    return {
+        "computed_s": 3.0, "seconds": seconds, "trainings_n": 2, "reused_n": 1, "peak_process_memory_MB": 2.0,
+    }  # fmt: skip
+
+
 def all_questions(source: str = "simulated") -> dict:
     plain = dict.fromkeys(METRICS, 1.0)
     windows = [{"contacts_n": 5000, "accuracy_pct": 90.0, "mse_xy_mm2": 0.1, "mse_f_N2": 0.1}]
@@ -52,5 +58,5 @@ def all_questions(source: str = "simulated") -> dict:
         },
         "logs": {"rate_hz": 250.0, "accuracy_pct": 80.0, "mse_f_N2": 0.1},
         "contacts": {"pairs_n": 3}, "ambient": {"fields_uT": [1.0]}, "dynamics": {"presses_n": 3, "rate_hz": 400.0},
-        "runtime": {"stages": {"report": {"seconds": 1.0, "peak_process_memory_MB": 2.0}}, "trainings_n": 1},
+        "runtime": {"stages": {"report": cost()}, "trainings_n": 1},
     }  # fmt: skip

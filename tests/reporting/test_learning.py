@@ -271,3 +271,10 @@ def test_in_the_readme_the_order_stands_right_below_table_2():
     results = blocks_of([everything() | {"described": described}], [], "", {})["results"]
     table2, order = to_markdown(tables["table2"]), to_markdown(tables["order"])
     assert f"{table2}\n\n{order}" in results
+
+
+def test_the_readme_takes_what_a_scene_costs_from_its_provenance():
+    described = {"grid": {"source": "simulated", "over_skins": {}}}
+    numbers = everything() | {"described": described}
+    numbers["provenance"] |= {"seconds": 5400.0, "scene": "paper"}
+    assert "`paper` 90 min" in blocks_of([numbers], [], "", {})["costs"]

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from pipeline.evaluation.work_precision.choose import choose
 from pipeline.evaluation.work_precision.rows import REFERENCE, Precision, Seconds
 from pipeline.physics.nodes import CHOSEN
-from pipeline.reporting.work_precision import COLOURS, MARKERS, failures, front, integrators, pages, quadratures
+from pipeline.reporting.work_precision import COLOURS, MARKERS, costs, failures, front, integrators, pages, quadratures
+from tests.reporting.synthetic import cost
 
 RULES = [("Gauss in z", "0.5 mm x 6", 10584, 0.004), ("Gauss in z", "0.7 mm x 5", 5120, 0.015)]
 RULES += [("Gauss in z", "1 mm x 4", 1936, 0.08), ("midpoint", "0.5 mm x 4", 6400, 0.4)]
@@ -98,12 +99,20 @@ def test_a_row_that_was_not_timed_is_an_error_and_not_left_out():
 
 
 def test_pages_cope_with_a_scene_that_asked_for_one_study_or_none():
-    stages = {"stages": {"simulate": {"seconds": 1.0, "peak_process_memory_MB": 100.0}}}
+    stages = {"stages": {"simulate": cost()}}
     assert set(pages(stages, source="simulated")) == {"stages.md"}
     times = {one.key: one for one in timed(STIFF)}
     rows = [asdict(row) | (asdict(times[row.key]) if row.key in times else {}) for row in STIFF]
     assert set(pages(stages | {"integrators": rows}, source="simulated")) == {
         "integrators.svg", "integrators.md", "stages.md",
+    }  # fmt: skip
+
+
+def test_what_a_stage_cost_stands_beside_its_last_run_and_what_that_reused():
+    (row,) = costs({"train_multi": cost(seconds=0.25)}).to_dict("records")
+    assert row == {
+        "stage": "train_multi", "computed, s": "3.0", "last run, s": "0.2", "trainings": "2", "of them reused": "1",
+        "peak memory of a process, MB": "2",
     }  # fmt: skip
 
 

@@ -54,6 +54,25 @@ def test_every_number_of_the_first_tables_is_there_and_says_that_it_is_simulated
     assert "<svg" in (story / "reports/ci/figures/error_grid_lobo.svg").read_text()
 
 
+def test_dvc_shows_a_few_scores_which_are_numbers_of_numbers_json(story):
+    numbers = json.loads((story / "reports/ci/numbers.json").read_text())
+    shown = json.loads(run(story, "dvc", "metrics", "show", "--json").stdout)
+    scores = shown[""]["data"]["reports/ci/scores.json"]["data"]
+    assert set(scores) == {"table2", "single_sensor", "drift_end", "shear"}
+    assert set(scores["table2"]) == {"single", "multi", "triplet", "adapted", "control"}
+    assert scores["table2"]["multi"]["mse_xy_mm2"] == numbers["table2"]["multi"]["mse_xy_mm2"]["mean"]
+
+
+def test_a_stage_costs_what_its_trainings_cost_and_says_what_it_reused(story):
+    stages = json.loads((story / "reports/ci/numbers.json").read_text())["runtime"]["stages"]
+    for arm in ("train_single", "train_multi", "train_triplet", "adapt", "sweep_sensors", "drift", "few_labels"):
+        assert stages[arm]["trainings_n"] > 0
+        assert stages[arm]["computed_s"] > 0
+    assert stages["train_multi"]["reused_n"] == 0
+    assert stages["split"]["trainings_n"] == 0
+    assert stages["split"]["computed_s"] == stages["split"]["seconds"]
+
+
 def test_every_protocol_goes_through_the_wire_into_a_folder_of_its_own(story):
     names = {"ci-wear": "b0_s0-wear", "ci-flexible": "f0_s0-flexible", "ci-hand": "b0_s0-hand", "ci-drag": "b0_s0-drag"}
     for folder, capture in names.items():

@@ -1,0 +1,96 @@
+"""Holds a fresh run against committed numbers. In: a scene, a revision or a folder. Out: a comparison, and words of it.
+
+Refuses to know tolerances, and what a number means.
+"""
+
+import json
+import re
+import subprocess
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from pipeline import io
+from pipeline.errors import SchemaError, complain
+from pipeline.evaluation.reproduced import Comparison, compare
+
+SHOWN_N = 40  # rows of a table in a terminal
+
+
+def compare_scene(root: Path, scene: str, against: str) -> Comparison:
+    """Compare the numbers that lie in `reports/` with those of a revision, a folder or a file."""
+    file = root / "reports" / scene / "numbers.json"
+    if not file.exists():
+        remedy = f"Try: reskin scenes use {scene}, then dvc repro."
+        raise SchemaError(complain(file, "the file", "there", "none", remedy))
+    return compare(read_committed(root, scene, against), io.read_json(file))
+
+
+def read_committed(root: Path, scene: str, against: str) -> dict[str, Any]:
+    """Read the numbers to compare with: from a path if there is one of that name, else from git."""
+    place = Path(against)
+    if place.exists():
+        tried = [
+            place,
+            place / "numbers.json",
+            place / scene / "numbers.json",
+            place / "reports" / scene / "numbers.json",
+        ]
+        found = next((one for one in tried if one.is_file()), None)
+        if found is None:
+            remedy = "Name reports/<scene> of another checkout, or a numbers.json."
+            raise SchemaError(complain(against, "the folder", f"one that holds {scene}/numbers.json", "none", remedy))
+        return io.read_json(found)
+    text = _show(root, f"{against}:./reports/{scene}/numbers.json")
+    if text is None:
+        remedy = "Try: reskin compare SCENE --against REVISION-OR-FOLDER."
+        where = f"git revision {against}"
+        raise SchemaError(complain(where, f"reports/{scene}/numbers.json", "committed", "none", remedy))
+    return json.loads(text)
+
+
+def table_of(done: Comparison) -> str:
+    """Tabulate what differs by more than it may, and name what only one side has; empty if there is nothing."""
+    rows = [
+        {
+            "number": one.name, "committed": _short(one.committed), "fresh": _short(one.fresh), "difference": one.off,
+            "tolerance": one.tolerance,
+        }
+        for one in done.beyond[:SHOWN_N]
+    ]  # fmt: skip
+    lines = [str(pd.DataFrame(rows).to_markdown(index=False, disable_numparse=True))] if rows else []
+    lines += [f"and {len(done.beyond) - SHOWN_N} more"] * (len(done.beyond) > SHOWN_N)
+    for word, names in (("only committed", done.missing), ("only fresh", done.new)):
+        questions = Counter(re.split(r"[.\[]", name)[0] for name in names)
+        lines += [f"{word}: {', '.join(f'{name} ({n} values)' for name, n in questions.items())}"] * bool(names)
+    return "\n".join(lines)
+
+
+def verdict(scene: str, against: str, done: Comparison) -> str:
+    """Say in one sentence whether the run is the committed one."""
+    counts = f"{done.equal_n} values equal those of {against}, {done.within_n} differ within their tolerance"
+    if done.reproduced and not done.within_n:
+        return f"{scene}: reproduced: all {counts.partition(',')[0]}."
+    if done.reproduced:
+        files = f"changed files of reports/{scene} are this machine's arithmetic; `git checkout reports/{scene}`"
+        return f"{scene}: reproduced within tolerance: {counts}, none beyond ({files} takes them back)."
+    lone_n = len(done.missing) + len(done.new)
+    return (
+        f"{scene}: not reproduced: {counts}, {len(done.beyond)} beyond it, {lone_n} on one side only "
+        "(other settings or code do that; with the same, please report it)."
+    )
+
+
+def _short(value: object) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)[:40]
+
+
+def _show(root: Path, path: str) -> str | None:
+    """Read a file of a revision; None outside git, or where there is none."""
+    try:
+        done = subprocess.run(["git", "show", path], cwd=root, capture_output=True, text=True, check=False)
+    except OSError:
+        return None
+    return done.stdout if done.returncode == 0 else None
