@@ -5,8 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline import provenance
+from pipeline.numerics import VARIABLES, pinned
 from pipeline.provenance import (
-    CAPS,
     INSTRUCTIONS,
     add_up_costs,
     begin_cost,
@@ -47,9 +47,14 @@ def test_a_machine_that_tells_nothing_is_named_by_what_python_knows(cpuinfo):
     assert processor(cpuinfo, {}, otherwise="") == "unknown processor"
 
 
-@pytest.mark.parametrize("name", CAPS)
+@pytest.mark.parametrize("name", VARIABLES)
 def test_every_variable_that_changes_sums_is_told(name):
     assert f"{name}=x" in processor(XEON, {name: "x"}, otherwise="")
+
+
+def test_what_every_run_sets_by_itself_is_not_told():
+    flags = frozenset({"avx2", "avx512vl", "avx512_vbmi2"})
+    assert processor(XEON, pinned(flags, {}), otherwise="") == processor(XEON, {}, otherwise="")
 
 
 @pytest.mark.parametrize(("flag", "name"), INSTRUCTIONS.items())

@@ -1,36 +1,48 @@
 """Which settings were best on the boards of a study? In: cards of its trainings. Out: the choice, and its candidates.
 
 By the mean squared error of places over the boards held out in turn; the paper's inputs only, as its method is what is
-set. The base of adaptation is chosen with it: alone, the triplet term only costs. Refuses to know who uses a choice.
+set. How many steps there are is a scene's budget: every candidate is tried with the same budgets, and its errors are
+averaged over them, so that no setting wins by training longer. Settings of adaptation are chosen together with the
+triplet weight of the network that they start from: alone, the triplet term only costs.
+Refuses to know who uses a choice.
 """
 
 from collections.abc import Mapping, Sequence
 from typing import Any
+
+import numpy as np
 
 from pipeline.errors import ParamsError, complain
 from pipeline.evaluation.summary import over_folds, pool_skins
 
 BY = "mse_xy_mm2"
 PAPER_INPUTS = "raw"
-VARIED = ("steps_n", "batch_n", "rate_max", "weight_decay", "triplet_weight", "base", "unlabelled_weight")
+VARIED = (
+    "steps_n", "batch_n", "rate_max", "gradient_norm_max", "weight_decay", "triplet_weight", "base",
+    "unlabelled_weight",
+)  # fmt: skip
 BUDGET = ("steps_n", "base")  # how long is a scene's budget; what a base is called is no setting
 
 Cards = Sequence[dict[str, Any]]
 
 
 def choose(cards: Cards) -> dict[str, dict[str, Any]]:
-    """Choose for every stage: `recipe_name`, its settings, `by` which number, `candidates` with their scores."""
+    """Choose for every stage: `recipe_name`, its settings, `by` which number, `candidates` with their scores.
+
+    An adaptation's `control` is what it must beat: fine-tuned as long from the same network, without the pokes.
+    """
     own = [card for card in cards if card["recipe"]["inputs"] == PAPER_INPUTS]
-    adapted = [card for card in own if card["question"] == "adapt" and _settings(card)["unlabelled_weight"] > 0]
+    tuned = [card for card in own if card["question"] == "adapt"]
     chosen = {"train_multi": _best([card for card in own if card["question"] == "lobo"], "train_multi")}
-    chosen["adapt"] = _best(adapted, "adapt")
-    base = next(card for card in adapted if card["recipe_name"] == chosen["adapt"]["recipe_name"])
-    triplets = [card for card in own if card["question"] == "triplet"]
+    chosen["adapt"] = _best(tuned, "adapt", [card for card in tuned if _settings(card)["unlabelled_weight"] > 0])
+    best = next(card for card in tuned if card["recipe_name"] == chosen["adapt"]["recipe_name"])
+    control = [card for card in tuned if _key(card) == _key(best) | {"unlabelled_weight": 0.0}]
+    chosen["adapt"] |= {"error": _error(tuned, best)} | ({"control": _error(tuned, control[0])} if control else {})
     chosen["train_triplet"] = {
-        "recipe_name": _settings(base)["base"],
-        "settings": _trimmed(base["recipe"]),
+        "recipe_name": _settings(best)["base"],
+        "settings": _trimmed(best["recipe"]),
         "by": "MSE_xy of the networks adapted from it",
-        "candidates": _candidates(triplets),
+        "candidates": _candidates([card for card in own if card["question"] == "triplet"]),
     }
     return chosen
 
@@ -47,15 +59,45 @@ def to_record(chosen: Mapping[str, Mapping[str, Any]], cards: Cards, *, source: 
     }
 
 
-def _best(cards: Cards, stage: str) -> dict[str, Any]:
-    if not cards:
+def _best(cards: Cards, stage: str, eligible: Cards | None = None) -> dict[str, Any]:
+    """Find the settings of the least error among `eligible` (all, if it is not given); list all."""
+    among = cards if eligible is None else eligible
+    if not among:
         raise ParamsError(
             complain("choice of settings", f"candidates of {stage}", "one or more", "none", "Ask lobo, triplet, adapt.")
         )
-    candidates = _candidates(cards)
-    best = min(candidates, key=lambda one: one[BY]["mean"])["recipe_name"]
-    card = next(card for card in cards if card["recipe_name"] == best)
-    return {"recipe_name": best, "settings": _trimmed(_settings(card)), "by": "MSE_xy", "candidates": candidates}
+    _check_budgets(cards, stage)
+    card = min(among, key=lambda one: _error(cards, one))
+    words = {"recipe_name": card["recipe_name"], "settings": _trimmed(_settings(card))}
+    return words | {"by": "MSE_xy, mean over all budgets of steps", "candidates": _candidates(cards)}
+
+
+def _error(cards: Cards, of: dict[str, Any]) -> float:
+    """Mean over budgets of the error of all cards with the settings of one."""
+    alike = [card for card in cards if _key(card) == _key(of)]
+    budgets = [[card for card in alike if _budget(card) == one] for one in sorted({*map(_budget, alike)})]
+    return float(np.mean([over_folds(pool_skins(own) if "tuning" in of else own)[BY]["mean"] for own in budgets]))
+
+
+def _check_budgets(cards: Cards, stage: str) -> None:
+    tried = {card["recipe_name"]: {_budget(one) for one in cards if _key(one) == _key(card)} for card in cards}
+    every = set().union(*tried.values())
+    for name, budgets in tried.items():
+        if budgets != every:
+            got = f"{sorted(budgets)} of {sorted(every)}"
+            raise ParamsError(
+                complain("choice of settings", f"steps of {stage}'s {name}", "those of all candidates", got,
+                         "Try every candidate with every number of steps.")
+            )  # fmt: skip
+
+
+def _key(card: dict[str, Any]) -> dict[str, Any]:
+    """Name settings without their budget; an adaptation's with those of the network that it starts from."""
+    return _trimmed(card["recipe"]) | (_trimmed(_settings(card)) if "tuning" in card else {})
+
+
+def _budget(card: dict[str, Any]) -> tuple[int, int]:
+    return (card["recipe"]["steps_n"], card["tuning"]["settings"]["steps_n"] if "tuning" in card else 0)
 
 
 def _candidates(cards: Cards) -> list[dict[str, Any]]:

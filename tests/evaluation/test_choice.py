@@ -73,8 +73,8 @@ def test_every_candidate_is_told_with_its_score():
 def test_the_mean_over_boards_decides_each_the_mean_of_its_seeds():
     """Two seeds of a board do not count twice: (0.4 + 0.9) / 2 is less than 0.695, (0.4 + 0.9 + 0.9) / 3 is not."""
     boards = [
-        card("lobo", "fast", 0.29, "b0"),
-        card("lobo", "fast", 1.1, "b1"),
+        card("lobo", "fast", 0.29, "b0", recipe=RECIPE | {"rate_max": 6e-3}),
+        card("lobo", "fast", 1.1, "b1", recipe=RECIPE | {"rate_max": 6e-3}),
         card("lobo", "even", 0.4, "b0"),
         card("lobo", "even", 0.85, "b1"),
         card("lobo", "even", 0.95, "b1", seed_i=1),
@@ -106,12 +106,11 @@ SHAPED = {"inputs": "shape"}
         card("lobo", "shaped", 0.001, recipe=RECIPE | SHAPED),
         card("triplet", "shaped", 0.001, recipe=RECIPE | SHAPED),
         adapted("shaped", 0.001, "light") | {"recipe": RECIPE | SHAPED},
-        adapted("control", 0.001, "light", unlabelled_weight=0.0),
         card("single_random", "single", 0.001),
     ],
-    ids=["shape", "triplet shape", "adapted shape", "control", "another question"],
+    ids=["shape", "triplet shape", "adapted shape", "another question"],
 )
-def test_other_inputs_controls_and_other_questions_are_no_candidates_however_good(better):
+def test_other_inputs_and_other_questions_are_no_candidates_however_good(better):
     assert choose([better, *CARDS]) == choose(CARDS)
 
 
@@ -145,3 +144,29 @@ def test_the_record_names_every_board_and_skin_that_was_looked_at_and_the_settin
     assert (record["scene"], record["source"], record["seed"]) == ("tuning", "simulated", 777)
     assert (record["boards"], record["skins"]) == (["b0", "b1", "b2"], ["b0_s0", "b1_s0", "b2_s0"])
     assert record["chosen"] == {stage: one["settings"] for stage, one in choose(CARDS).items()}
+
+
+def longer(one: Card, steps_n: int, **scores: float) -> Card:
+    """The same settings with another budget of steps, and another error."""
+    return card(one["question"], f"{one['recipe_name']}-{steps_n}", scores["mse_xy_mm2"],
+                recipe=one["recipe"] | {"steps_n": steps_n})  # fmt: skip
+
+
+def test_no_setting_wins_by_training_longer():
+    slow, fast = (card("lobo", name, mse, recipe=RECIPE | {"rate_max": rate, "steps_n": 100})
+                  for name, mse, rate in (("slow", 0.5, 1e-3), ("fast", 0.4, 6e-3)))  # fmt: skip
+    others = [one for one in CARDS if one["question"] != "lobo"]
+    unfair = [slow, fast, longer(slow, 900, mse_xy_mm2=0.1)]
+    with pytest.raises(ParamsError, match="steps of train_multi's fast must be those of all candidates"):
+        choose([*unfair, *others])
+    chosen = choose([*unfair, longer(fast, 900, mse_xy_mm2=0.15), *others])["train_multi"]
+    assert chosen["recipe_name"] == "fast" or chosen["settings"]["rate_max"] == 6e-3  # 0.275 against 0.3
+
+
+def test_a_control_is_a_candidate_that_is_listed_and_never_chosen():
+    control = adapted("from-heavy-control", 0.2, "heavy", unlabelled_weight=0.0)
+    chosen = choose([*CARDS, control])["adapt"]
+    assert chosen["recipe_name"] == "from-heavy"
+    assert (chosen["error"], chosen["control"]) == (pytest.approx(0.25), pytest.approx(0.2))
+    assert "from-heavy-control" in {one["recipe_name"] for one in chosen["candidates"]}
+    assert "control" not in choose(CARDS)["adapt"]
