@@ -21,14 +21,14 @@ Cards = Sequence[dict[str, Any]]
 def choose(cards: Cards) -> dict[str, dict[str, Any]]:
     """Choose for every stage: `recipe_name`, its settings, `by` which number, `candidates` with their scores."""
     own = [card for card in cards if card["recipe"]["inputs"] == PAPER_INPUTS]
-    adapted = [card for card in own if card["question"] == "adapt" and _settings(card)["unlabelled_weight"] > 0]
+    adapted = [card for card in own if card["question"] == "adapt" and settings_of(card)["unlabelled_weight"] > 0]
     chosen = {"train_multi": _best([card for card in own if card["question"] == "lobo"], "train_multi")}
     chosen["adapt"] = _best(adapted, "adapt")
     base = next(card for card in adapted if card["recipe_name"] == chosen["adapt"]["recipe_name"])
     triplets = [card for card in own if card["question"] == "triplet"]
     chosen["train_triplet"] = {
-        "recipe_name": _settings(base)["base"],
-        "settings": _trimmed(base["recipe"]),
+        "recipe_name": settings_of(base)["base"],
+        "settings": trimmed(base["recipe"]),
         "by": "MSE_xy of the networks adapted from it",
         "candidates": _candidates(triplets),
     }
@@ -55,7 +55,7 @@ def _best(cards: Cards, stage: str) -> dict[str, Any]:
     candidates = _candidates(cards)
     best = min(candidates, key=lambda one: one[BY]["mean"])["recipe_name"]
     card = next(card for card in cards if card["recipe_name"] == best)
-    return {"recipe_name": best, "settings": _trimmed(_settings(card)), "by": "MSE_xy", "candidates": candidates}
+    return {"recipe_name": best, "settings": trimmed(settings_of(card)), "by": "MSE_xy", "candidates": candidates}
 
 
 def _candidates(cards: Cards) -> list[dict[str, Any]]:
@@ -64,17 +64,19 @@ def _candidates(cards: Cards) -> list[dict[str, Any]]:
     return [
         {
             "recipe_name": name,
-            "settings": ", ".join(f"{key} {value}" for key, value in _settings(own[0]).items() if key in VARIED),
+            "settings": ", ".join(f"{key} {value}" for key, value in settings_of(own[0]).items() if key in VARIED),
             **over_folds(pool_skins(own) if "tuning" in own[0] else own),
         }
         for name, own in by_name.items()
     ]
 
 
-def _settings(card: dict[str, Any]) -> dict[str, Any]:
+def settings_of(card: dict[str, Any]) -> dict[str, Any]:
+    """Give what a training was set to: its recipe, or how it went on from one."""
     settings: dict[str, Any] = card["tuning"]["settings"] if "tuning" in card else card["recipe"]
     return settings
 
 
-def _trimmed(settings: dict[str, Any]) -> dict[str, Any]:
+def trimmed(settings: dict[str, Any]) -> dict[str, Any]:
+    """Leave out what is no setting of the method."""
     return {name: value for name, value in settings.items() if name not in BUDGET}

@@ -5,15 +5,17 @@ from pathlib import Path
 from pipeline import io
 from pipeline.capture.folder import write_capture
 from pipeline.learning.executors import make_executor
+from pipeline.settings import Files, read_settings
 from pipeline.stages._run import run, say
-from pipeline.stages._simulated import read_synthesis
+from pipeline.stages._simulated import synthesis_of
 from pipeline.synthesis.capture import Synthesis, record, roster
 from pipeline.synthesis.files import to_files
 
 
-def simulate(scene: str, settings: Path, protocol: str, raw: Path) -> None:
+def simulate(scene: str, settings: Path, params: Path, plan: Path, protocol: str, raw: Path) -> None:
     """Record every skin of one protocol of a simulated scene."""
-    synthesis, seed = read_synthesis(settings)
+    asked = read_settings("simulate", raw.name, Files(settings, params, plan))
+    synthesis, seed = synthesis_of(asked), asked.seed
     pairs = roster(synthesis, protocol)
     with io.replacing(raw) as folder, make_executor() as executor:
         folder.mkdir()
