@@ -9,12 +9,10 @@ from pipeline.stages._run import run
 from pipeline.stages._train import read_scenery, train_all
 
 
-def adapt(
-    scene: str, settings: Path, params: Path, plan: Path, indentations: Path, folds: Path, started: Path, models: Path
-) -> None:
+def adapt(scene: str, files: Files, indentations: Path, folds: Path, started: Path, models: Path) -> None:
     """Fine-tune by every recipe of section adapt."""
     at, starts = (
-        read_scenery(read_settings("adapt", scene, Files(settings, params, plan)), indentations, folds),
+        read_scenery(read_settings("adapt", scene, files), indentations, folds),
         read_starts(started),
     )
     asked = at.asked.adapt

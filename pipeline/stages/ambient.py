@@ -16,11 +16,9 @@ from pipeline.stages._simulated import synthesis_of
 from pipeline.stages._train import read_scenery
 
 
-def ambient(
-    scene: str, settings: Path, params: Path, plan: Path, folds: Path, indentations: Path, models: Path, answer: Path
-) -> None:
+def ambient(scene: str, files: Files, folds: Path, indentations: Path, models: Path, answer: Path) -> None:
     """Test every held-out board in fields that came up after its no-load readings; train one arm on the last board."""
-    at = read_scenery(read_settings("ambient", scene, Files(settings, params, plan)), indentations, folds)
+    at = read_scenery(read_settings("ambient", scene, files), indentations, folds)
     of, seed = synthesis_of(at.asked), at.asked.seed
     asked, training = at.asked.ambient, at.asked.train_multi
     held_out = at.of("lobo")

@@ -13,19 +13,9 @@ from pipeline.stages._run import run, say
 from pipeline.stages._train import read_scenery
 
 
-def audit(
-    scene: str,
-    settings: Path,
-    params: Path,
-    plan: Path,
-    indentations: Path,
-    folds: Path,
-    models: Path,
-    choice: Path,
-    answer: Path,
-) -> None:
+def audit(scene: str, files: Files, indentations: Path, folds: Path, models: Path, choice: Path, answer: Path) -> None:
     """Check every fold, the scaler of every network and the settings; a leak fails the stage and names itself."""
-    at = read_scenery(read_settings("audit", scene, Files(settings, params, plan)), indentations, folds)
+    at = read_scenery(read_settings("audit", scene, files), indentations, folds)
     labels = Labels(at.rows.board, at.rows.skin, at.rows.indentation, at.rows.capture)
     sides = [Sides(fold.question, fold.name, fold.train, fold.pool, fold.test) for fold in at.folds]
     checks = [

@@ -20,11 +20,9 @@ KEPT_ASIDE = (
 )
 
 
-def contacts(
-    scene: str, settings: Path, params: Path, plan: Path, folds: Path, indentations: Path, models: Path, answer: Path
-) -> None:
+def contacts(scene: str, files: Files, folds: Path, indentations: Path, models: Path, answer: Path) -> None:
     """Add pokes of every held-out board in pairs, and ask the networks that never saw it."""
-    at = read_scenery(read_settings("contacts", scene, Files(settings, params, plan)), indentations, folds)
+    at = read_scenery(read_settings("contacts", scene, files), indentations, folds)
     asked = at.asked.contacts
     boards, drawn = zip(
         *(on_board(at, fold, asked, networks_without(models, fold.name)) for fold in at.of("lobo")), strict=True

@@ -16,9 +16,9 @@ from pipeline.stages._run import run
 from pipeline.stages._train import Scenery, train_all
 
 
-def drift(scene: str, settings: Path, params: Path, plan: Path, indentations: Path, answer: Path) -> None:
+def drift(scene: str, files: Files, indentations: Path, answer: Path) -> None:
     """Train and test under every no-load policy, on every capture of a folder."""
-    asked = read_settings("drift", scene, Files(settings, params, plan))
+    asked = read_settings("drift", scene, files)
     captures = read_folder(indentations, tuple(asked.captures_in(indentations)))
     windows, parts = work.cut(captures, asked.drift, asked.selection)
     pairs = list(work.cells(parts, asked.drift, asked.seed))

@@ -17,12 +17,10 @@ from pipeline.stages._run import run, say
 from pipeline.stages._train import Scenery, read_scenery, train_all
 
 
-def few_labels(
-    scene: str, settings: Path, params: Path, plan: Path, indentations: Path, folds: Path, scores: Path
-) -> None:
+def few_labels(scene: str, files: Files, indentations: Path, folds: Path, scores: Path) -> None:
     """Score networks, adapted networks and classical methods with every number of labels on the same rows."""
-    at = read_scenery(read_settings("few_labels", scene, Files(settings, params, plan)), indentations, folds)
-    asked = resolve_few_labels(at.asked.words("few_labels"), at.asked.named, f"{settings}: few_labels")
+    at = read_scenery(read_settings("few_labels", scene, files), indentations, folds)
+    asked = resolve_few_labels(at.asked.words("few_labels"), at.asked.named, f"{at.asked.where}: few_labels")
     study = few.Study(at.rows, at.of(few.QUESTION), at.asked.seed, asked)
     done: list[few.Done] = []
     for step in (few.networks, few.adapted, few.labelled):  # each goes on from what the last ones trained

@@ -27,18 +27,10 @@ SHAPE = "shape"  # the recipe on directions, if the scene has one: it ought to c
 
 
 def flexible(
-    scene: str,
-    settings: Path,
-    params: Path,
-    plan: Path,
-    folds: Path,
-    main: Path,
-    indentations: Path,
-    started: Path,
-    answer: Path,
+    scene: str, files: Files, folds: Path, main: Path, indentations: Path, started: Path, answer: Path
 ) -> None:
     """Adapt the networks of the first fold of lobo to every flexible skin, and test on its later passes."""
-    at = read_scenery(read_settings("flexible", scene, Files(settings, params, plan)), main, folds)
+    at = read_scenery(read_settings("flexible", scene, files), main, folds)
     starts, captures = read_starts(started), read_folder(indentations)
     asked, first, trained_n = at.asked.adapt, at.of("lobo")[0], len(at.rows)
     poked = gather(captures, at.asked.selection)

@@ -10,9 +10,9 @@ from pipeline.stages._run import run, say
 from pipeline.stages._simulated import synthesis_of
 
 
-def leave_out(scene: str, settings: Path, params: Path, plan: Path, answer: Path) -> None:
+def leave_out(scene: str, files: Files, answer: Path) -> None:
     """Measure every term on the scene's own first skin, and name the protocols that do without it."""
-    asked = read_settings("leave_out", scene, Files(settings, params, plan))
+    asked = read_settings("leave_out", scene, files)
     of, seed = synthesis_of(asked), asked.seed
     omissions = measure(of, seed=seed)
     io.write_json(answer, [asdict(omission) for omission in omissions])

@@ -17,9 +17,9 @@ from pipeline.stages._only import only
 from pipeline.stages._run import run, say
 
 
-def logs(scene: str, settings: Path, params: Path, plan: Path, raw: Path, models: Path, answer: Path) -> None:
+def logs(scene: str, files: Files, raw: Path, models: Path, answer: Path) -> None:
     """Read a folder's walk with networks that never saw its board; score it where its truth is kept, and turn it."""
-    asked = read_settings("logs", scene, Files(settings, params, plan))
+    asked = read_settings("logs", scene, files)
     folder = only(sorted(child for child in raw.iterdir() if child.is_dir()), raw)
     t_s, b_uT, _, account = sd_card.read_log(folder / LOG_FILE)
     board = read_header(folder).board

@@ -22,19 +22,9 @@ from pipeline.stages._run import run
 from pipeline.stages._train import Scenery, read_scenery
 
 
-def manual(
-    scene: str,
-    settings: Path,
-    params: Path,
-    plan: Path,
-    folds: Path,
-    main: Path,
-    indentations: Path,
-    started: Path,
-    answer: Path,
-) -> None:
+def manual(scene: str, files: Files, folds: Path, main: Path, indentations: Path, started: Path, answer: Path) -> None:
     """Adapt to every skin that was poked by hand, and by as many pokes of the robot; test on the robot's grid."""
-    at = read_scenery(read_settings("manual", scene, Files(settings, params, plan)), main, folds)
+    at = read_scenery(read_settings("manual", scene, files), main, folds)
     starts = read_starts(started)
     asked = at.asked.adapt
     poked, found = hand_rows(read_folder(indentations))

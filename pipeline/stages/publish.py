@@ -13,9 +13,9 @@ from pipeline.tracking import Curves, metrics_of
 from pipeline.tracking import publish as write
 
 
-def publish(scene: str, settings: Path, params: Path, plan: Path, models: Path, answers: Path, reports: Path) -> None:
+def publish(scene: str, files: Files, models: Path, answers: Path, reports: Path) -> None:
     """Write every training of a scene and its report to MLflow once; if the server is away, say so and go on."""
-    asked = read_settings("publish", scene, Files(settings, params, plan)).asking
+    asked = read_settings("publish", scene, files).asking
     arms = {arm: models / arm for arm in modelled(asked)}
     name = (
         f"{scene} (dvc exp)" if is_experiment() else scene

@@ -18,18 +18,10 @@ from pipeline.stages._run import run, say
 
 
 def report(
-    scene: str,
-    settings: Path,
-    params: Path,
-    plan: Path,
-    indentations: Path,
-    folds: Path,
-    models: Path,
-    answers: Path,
-    reports: Path,
+    scene: str, files: Files, indentations: Path, folds: Path, models: Path, answers: Path, reports: Path
 ) -> None:
     """Write the numbers, tables, figures and the page of a scene."""
-    known = read_settings("report", scene, Files(settings, params, plan))
+    known = read_settings("report", scene, files)
     known.check_questions()
     asked = known.asking
     numbers, drawn = read_numbers(known, Places(indentations, folds, models, answers))

@@ -20,11 +20,11 @@ from pipeline.strict import parse
 from pipeline.synthesis.capture import MAIN, Synthesis, roster
 
 
-def runtime(scene: str, settings: Path, params: Path, plan: Path, answer: Path) -> None:
+def runtime(scene: str, files: Files, answer: Path) -> None:
     """Compare quadratures and integrators; seconds differ between identical runs, so they are no output."""
-    asked = read_settings("runtime", scene, Files(settings, params, plan))
+    asked = read_settings("runtime", scene, files)
     of, seed = synthesis_of(asked), asked.seed
-    tried = parse(RunTime, asked.words("runtime"), f"{settings}: runtime")
+    tried = parse(RunTime, asked.words("runtime"), f"{asked.where}: runtime")
     rows, calls = study_quadratures(_trials(of, tried, seed), tried.quadratures.rules_of())
     more, more_calls = study_integrators(tried.integrators.sweep())
     choice = choose(rows, used=of.main_boards.quadrature.quadrature())

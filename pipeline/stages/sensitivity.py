@@ -13,10 +13,10 @@ from pipeline.synthesis.pressing import weights_N
 from pipeline.synthesis.protocols import Load
 
 
-def sensitivity(scene: str, settings: Path, params: Path, plan: Path, indentations: Path, answer: Path) -> None:
+def sensitivity(scene: str, files: Files, indentations: Path, answer: Path) -> None:
     """Tell how small a weight the one skin tells that was loaded."""
-    glass = read_settings("sensitivity", scene, Files(settings, params, plan)).words("simulate.protocols.glass")
-    asked = parse_parts(Load, glass, f"{settings}: simulate.protocols.glass")
+    glass = read_settings("sensitivity", scene, files).words("simulate.protocols.glass")
+    asked = parse_parts(Load, glass, "simulate.protocols.glass")
     one = only(read_folder(indentations), indentations)
     weight_N = weights_N(asked.force_max_N, asked.step_N)
     change_uT = subtract(one.b_uT, one.noload_uT)

@@ -20,9 +20,9 @@ DRAWN_N = 400  # more points than these are not told apart in a panel
 MILLI = 3  # decimals of a force in the figure: more than are seen
 
 
-def shear(scene: str, settings: Path, params: Path, plan: Path, indentations: Path, answer: Path) -> None:
+def shear(scene: str, files: Files, indentations: Path, answer: Path) -> None:
     """Train with five targets on both splits of every skin, and score what was held out."""
-    asked = read_settings("shear", scene, Files(settings, params, plan))
+    asked = read_settings("shear", scene, files)
     rows = gather(read_folder(indentations), asked.selection, targets=SHEAR_TARGETS)
     by_reading = _folds(rows, np.arange(len(rows)), "reading", asked.shear, asked.seed)
     by_line = _folds(rows, rows.indentation, "line", asked.shear, asked.seed)

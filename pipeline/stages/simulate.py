@@ -12,9 +12,9 @@ from pipeline.synthesis.capture import Synthesis, record, roster
 from pipeline.synthesis.files import to_files
 
 
-def simulate(scene: str, settings: Path, params: Path, plan: Path, protocol: str, raw: Path) -> None:
+def simulate(scene: str, files: Files, protocol: str, raw: Path) -> None:
     """Record every skin of one protocol of a simulated scene."""
-    asked = read_settings("simulate", raw.name, Files(settings, params, plan))
+    asked = read_settings("simulate", raw.name, files)
     synthesis, seed = synthesis_of(asked), asked.seed
     pairs = roster(synthesis, protocol)
     with io.replacing(raw) as folder, make_executor() as executor:

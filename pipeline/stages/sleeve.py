@@ -21,9 +21,9 @@ from pipeline.stages._simulated import synthesis_of
 from pipeline.stages._train import Scenery, train_all
 
 
-def sleeve(scene: str, settings: Path, params: Path, plan: Path, indentations: Path, answer: Path) -> None:
+def sleeve(scene: str, files: Files, indentations: Path, answer: Path) -> None:
     """Train the recipes of section sleeve on the first pokes, score them and nearest neighbours on the last."""
-    asked = read_settings("sleeve", scene, Files(settings, params, plan))
+    asked = read_settings("sleeve", scene, files)
     section, captures, area = asked.sleeve, read_folder(indentations), _area(asked)
     at = Scenery(scene, asked, gather(captures, asked.selection), [])
     train, test = evaluation.hold_out_last(at.rows, section.test_fraction)

@@ -10,9 +10,9 @@ from pipeline.settings import Files, read_settings
 from pipeline.stages._run import run, say
 
 
-def split(scene: str, settings: Path, params: Path, plan: Path, indentations: Path, folds: Path) -> None:
+def split(scene: str, files: Files, indentations: Path, folds: Path) -> None:
     """Draw the folds of every question that the scene asks."""
-    asked = read_settings("split", scene, Files(settings, params, plan))
+    asked = read_settings("split", scene, files)
     asked.check_questions()
     captures = asked.captures_in(indentations)
     rows = load_rows([indentations / f"{name}.parquet" for name in captures], asked.selection)

@@ -11,9 +11,9 @@ from pipeline.stages._run import run, say
 from pipeline.stages._simulated import synthesis_of
 
 
-def stability(scene: str, settings: Path, params: Path, plan: Path, answer: Path) -> None:
+def stability(scene: str, files: Files, answer: Path) -> None:
     """Try every case on the scene's own skins and chips and on small trainings, and write down what happened."""
-    asked = read_settings("stability", scene, Files(settings, params, plan))
+    asked = read_settings("stability", scene, files)
     of, seed = synthesis_of(asked), asked.seed
     cases = [
         *survey(of.main_boards.design, of.spreads, skin=of.skin, chip=of.chip, seed=seed),

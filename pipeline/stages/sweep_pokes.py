@@ -13,19 +13,17 @@ from pipeline.stages._run import run
 from pipeline.stages._train import read_scenery, train_all
 
 
-def sweep_pokes(
-    scene: str, settings: Path, params: Path, plan: Path, indentations: Path, folds: Path, started: Path, scores: Path
-) -> None:
+def sweep_pokes(scene: str, files: Files, indentations: Path, folds: Path, started: Path, scores: Path) -> None:
     """Score every number of pokes; none at all is the network as it was trained."""
     at, starts = (
-        read_scenery(read_settings("sweep_pokes", scene, Files(settings, params, plan)), indentations, folds),
+        read_scenery(read_settings("sweep_pokes", scene, files), indentations, folds),
         read_starts(started),
     )
     asked, own = at.asked.sweep_pokes, at.asked.adapt
     named, held_out = (HEADLINE, own.recipes[HEADLINE]), at.of("lobo")[-asked.boards_n :]
     if asked.boards_n > len(held_out):
         rule = f"at most the {len(held_out)} boards of the scene"
-        raise ParamsError(complain(str(settings), "sweep_pokes.boards_n", rule, asked.boards_n, "Ask for fewer."))
+        raise ParamsError(complain(at.asked.where, "sweep_pokes.boards_n", rule, asked.boards_n, "Ask for fewer."))
     asked_of = [(fold, pokes_n) for fold in held_out for pokes_n in asked.pokes_n if pokes_n]
     pairs = [
         (cell, pokes_n)

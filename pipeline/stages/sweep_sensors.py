@@ -12,11 +12,9 @@ from pipeline.stages._run import run
 from pipeline.stages._train import Scenery, read_scenery, train_all
 
 
-def sweep_sensors(
-    scene: str, settings: Path, params: Path, plan: Path, indentations: Path, folds: Path, scores: Path
-) -> None:
+def sweep_sensors(scene: str, files: Files, indentations: Path, folds: Path, scores: Path) -> None:
     """Train the headline recipes on every draw of skins, adapt to each held-out skin, and score."""
-    at = read_scenery(read_settings("sweep_sensors", scene, Files(settings, params, plan)), indentations, folds)
+    at = read_scenery(read_settings("sweep_sensors", scene, files), indentations, folds)
     multi, triplet, own = at.asked.train_multi, at.asked.train_triplet, at.asked.adapt
     fine = own.recipes[HEADLINE]
     plain = _cells(at, multi.recipes[HEADLINE], "multi")

@@ -18,13 +18,11 @@ from pipeline.stages._train import read_scenery
 NO_ROWS = np.zeros(0, np.int64)
 
 
-def train_classical(
-    scene: str, settings: Path, params: Path, plan: Path, indentations: Path, folds: Path, scores: Path
-) -> None:
+def train_classical(scene: str, files: Files, indentations: Path, folds: Path, scores: Path) -> None:
     """Fit every method of section train_classical with one board held out."""
-    at = read_scenery(read_settings("train_classical", scene, Files(settings, params, plan)), indentations, folds)
+    at = read_scenery(read_settings("train_classical", scene, files), indentations, folds)
     asked, rows = (
-        resolve_baselines(at.asked.words("train_classical"), at.asked.named, f"{settings}: train_classical"),
+        resolve_baselines(at.asked.words("train_classical"), at.asked.named, f"{at.asked.where}: train_classical"),
         at.rows,
     )
     pairs = [(fold, name) for fold in at.of("lobo") for name in asked.methods]

@@ -8,11 +8,9 @@ from pipeline.stages._run import run
 from pipeline.stages._train import cells_of, read_scenery, train_all
 
 
-def train_multi(
-    scene: str, settings: Path, params: Path, plan: Path, indentations: Path, folds: Path, models: Path
-) -> None:
+def train_multi(scene: str, files: Files, indentations: Path, folds: Path, models: Path) -> None:
     """Train the recipes of section train_multi with one board held out."""
-    at = read_scenery(read_settings("train_multi", scene, Files(settings, params, plan)), indentations, folds)
+    at = read_scenery(read_settings("train_multi", scene, files), indentations, folds)
     cells = cells_of(at, at.asked.train_multi, at.of("lobo"))
     write_models(models, at, cells, train_all(at, cells, "train_multi"), "train_multi")
 

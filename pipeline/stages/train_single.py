@@ -9,11 +9,9 @@ from pipeline.stages._run import run
 from pipeline.stages._train import cells_of, read_scenery, train_all
 
 
-def train_single(
-    scene: str, settings: Path, params: Path, plan: Path, indentations: Path, folds: Path, models: Path
-) -> None:
+def train_single(scene: str, files: Files, indentations: Path, folds: Path, models: Path) -> None:
     """Train the recipes of section train_single on every fold of the questions about one skin."""
-    at = read_scenery(read_settings("train_single", scene, Files(settings, params, plan)), indentations, folds)
+    at = read_scenery(read_settings("train_single", scene, files), indentations, folds)
     own = [fold for fold in at.folds if ANSWERED_BY[fold.question] == "train_single"]
     cells = cells_of(at, at.asked.train_single, own)
     write_models(models, at, cells, train_all(at, cells, "train_single"), "train_single")

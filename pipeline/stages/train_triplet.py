@@ -8,11 +8,9 @@ from pipeline.stages._run import run
 from pipeline.stages._train import cells_of, read_scenery, train_all
 
 
-def train_triplet(
-    scene: str, settings: Path, params: Path, plan: Path, indentations: Path, folds: Path, models: Path
-) -> None:
+def train_triplet(scene: str, files: Files, indentations: Path, folds: Path, models: Path) -> None:
     """Train the recipes of section train_triplet on the folds of question lobo."""
-    at = read_scenery(read_settings("train_triplet", scene, Files(settings, params, plan)), indentations, folds)
+    at = read_scenery(read_settings("train_triplet", scene, files), indentations, folds)
     cells = cells_of(at, at.asked.train_triplet, at.of("lobo"), question="triplet")
     write_models(models, at, cells, train_all(at, cells, "train_triplet"), "train_triplet")
 

@@ -12,11 +12,9 @@ from pipeline.stages._experiment import read_folder, read_losses, write_answer
 from pipeline.stages._run import run
 
 
-def variation(
-    scene: str, settings: Path, params: Path, plan: Path, main: Path, indentations: Path, answer: Path
-) -> None:
+def variation(scene: str, files: Files, main: Path, indentations: Path, answer: Path) -> None:
     """Compare visits of equal places: of the worn skin in `indentations`, and of several skins in `main`."""
-    own = read_settings("variation", scene, Files(settings, params, plan))
+    own = read_settings("variation", scene, files)
     asked = own.variation
     worn = read_folder(indentations)[0]
     of_skins = _visits(main, own.captures_in(main), asked)

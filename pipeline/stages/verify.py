@@ -13,9 +13,9 @@ from pipeline.stages._run import run, say
 from pipeline.stages._simulated import synthesis_of
 
 
-def verify(scene: str, settings: Path, params: Path, plan: Path, answer: Path) -> None:
+def verify(scene: str, files: Files, answer: Path) -> None:
     """Check the scene's own skins, pokes and chips."""
-    asked = read_settings("verify", scene, Files(settings, params, plan))
+    asked = read_settings("verify", scene, files)
     of, seed = synthesis_of(asked), asked.seed
     depths_m = tuple(milli * depth_mm for depth_mm in of.main.depths_mm)
     designs = Designs(of.main_boards.design, of.spreads, of.skin, of.chip, of.main_boards.quadrature.quadrature())
