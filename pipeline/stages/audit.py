@@ -5,6 +5,7 @@ from pathlib import Path
 from pipeline import io
 from pipeline.errors import LeakError, complain
 from pipeline.evaluation.audit.checks import holds, to_words
+from pipeline.evaluation.audit.settings import NOT_CHOSEN
 from pipeline.evaluation.audit.sides import Labels, Sides, audit_fold
 from pipeline.seeds import rng_for
 from pipeline.settings import Files, read_settings
@@ -35,7 +36,11 @@ def audit(scene: str, files: Files, indentations: Path, folds: Path, models: Pat
             )
         )
     io.write_json(answer, to_words(checks))
-    say(f"{scene}: {len(checks)} checks, no leak; {sum(check.known for check in checks)} known, the paper's own")
+    unchosen_n = sum(check.found.startswith(NOT_CHOSEN) for check in checks)
+    say(
+        f"{scene}: {len(checks)} checks, no leak; {sum(check.known for check in checks)} known, the paper's own; "
+        f"{unchosen_n} settings that the study did not choose"
+    )
 
 
 if __name__ == "__main__":

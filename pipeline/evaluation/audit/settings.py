@@ -19,6 +19,8 @@ from pipeline.strict import Strict, parse
 # most; 4 of them are 5e-7. One foreign row in 100,000 moves a mean by some 1e-5 of its deviation.
 SCALER_TOLERANCE = 4 * float(np.finfo(np.float32).eps)
 
+NOT_CHOSEN = "not chosen by the study"  # begins what is stated of such a setting
+
 Arrays = Mapping[str, np.ndarray]
 Words = Mapping[str, Any]
 
@@ -81,8 +83,8 @@ def _as_chosen(arm: str, recipe: Words, record: Choice) -> Check:
     chosen = record.chosen.get(arm, {})
     pairs = {key: (_said(recipe, key), _said(chosen, key)) for key in sorted({*recipe, *chosen})}
     differing = [f"{key} {used} (study: {best})" for key, (used, best) in pairs.items() if used != best]
-    found = f"not chosen by the study: {', '.join(differing)}" if differing else "equal"
-    found = found if arm in record.chosen else "not chosen by the study: it chose none for this"
+    found = f"{NOT_CHOSEN}: {', '.join(differing)}" if differing else "equal"
+    found = found if arm in record.chosen else f"{NOT_CHOSEN}: it chose none for this"
     return Check("settings: recipe", arm, rule, found, holds=True, known=False)
 
 
