@@ -2,14 +2,13 @@
 
 import json
 import re
-from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
 import pytest
 from ruamel.yaml import YAML
 
-from pipeline import plan
+from pipeline import plan, settings
 from pipeline.errors import ParamsError
 from pipeline.learning import comparison
 from pipeline.reads import READS
@@ -21,6 +20,7 @@ from tests.stages.checkout import copy_checkout
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENE, SHARED = "pipeline/scenes/ci.yaml", "params.yaml"
+VALUES: dict[tuple[str, str, bytes], Any] = {}  # by file, key and content
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of DVC's own libraries
 
 
@@ -38,7 +38,7 @@ def files_of(root: Path) -> Files:
 
 def items(root: Path) -> dict[str, tuple[str, str, dict[str, Any]]]:
     """Every stage that reads settings by DVC's name of it: its module, its key and its item in the plan."""
-    stages = read_yaml(root / plan.PLAN)["stages"]
+    stages = settings.read_yaml(root / plan.PLAN)["stages"]
     return {f"{stage}@{key}": (stage, key, item) for stage in READS for key, item in stages[stage].items()}
 
 
@@ -69,11 +69,27 @@ def stages_of(root: Path) -> list[Any]:
         return list(repo.index.stages)
 
 
+def value_of(fs: Any, path: str, key: str) -> Any:
+    """Read what DVC reads under one key; equal keys of many stages are looked up once."""
+    from dvc.dependency.param import read_param_file
+
+    at = path, key, Path(path).read_bytes()
+    if at not in VALUES:
+        VALUES[at] = read_param_file(fs, path, [key], flatten=True)[key]
+    return VALUES[at]
+
+
 def tracked(root: Path, stages: list[Any]) -> dict[str, dict[str, Any]]:
     """What DVC goes by, for every stage: the values of its parameters and its command, as DVC itself reads them."""
     return {
         stage.name: {"cmd": stage.cmd}
-        | {str(Path(dep.fs_path).relative_to(root)): dep.read_params() for dep in stage.deps if hasattr(dep, "params")}
+        | {
+            str(Path(dep.fs_path).relative_to(root)): {
+                key: value_of(dep.repo.fs, dep.fs_path, key) for key in dep.params
+            }
+            for dep in stage.deps
+            if hasattr(dep, "params")
+        }
         for stage in stages
     }
 
@@ -157,8 +173,6 @@ def _each_content_is_parsed_once():
     """Thirty stages read the same three files at every override."""
     import dvc.dependency.param as of_dvc
 
-    from pipeline import settings as ours
-
     def once(read):
         known: dict[tuple[str, bytes], Any] = {}
 
@@ -166,13 +180,13 @@ def _each_content_is_parsed_once():
             key = str(path), Path(path).read_bytes()
             if key not in known:
                 known[key] = read(path, *rest, **words)
-            return deepcopy(known[key])
+            return known[key]
 
         return cached
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(of_dvc, "load_path", once(of_dvc.load_path))
-        patch.setattr(ours, "read_yaml", once(ours.read_yaml))
+        patch.setattr(settings, "read_yaml", once(settings.read_yaml))
         yield
 
 
