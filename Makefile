@@ -1,4 +1,4 @@
-# make repro   everything from nothing: environment, then `dvc repro` on the scenes of params.yaml
+# make repro   everything from nothing: environment, then `dvc repro` on the scenes of pipeline/plan.yaml
 # make test    lint, types, layers, tests
 # make test-processors   the tests that train, under the instructions of four kinds of processors
 # make ui      the MLflow UI on the embedded store

@@ -16,7 +16,7 @@ from pipeline.capture.folder import write_capture
 from pipeline.capture.header import STREAM_FILE, Header
 from pipeline.dataset.captures import check_losses, open_capture
 from pipeline.errors import CaptureError, ReskinError, complain
-from pipeline.params import read_params, read_scene
+from pipeline.params import read_plan, read_scene, read_shared
 from pipeline.preparing import Prepared
 from pipeline.registry import REGISTRY, read_registry, with_capture, without_capture, write_registry
 
@@ -27,7 +27,7 @@ INDENTATIONS = "data/indentations"
 def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Header:
     """Check a prepared recording, write it, track it with DVC, register it, and plan its scene; all, or nothing."""
     header, files = prepared
-    settings = read_scene(plan.scene_file(root, scene))
+    settings = read_scene(plan.scene_file(root, scene), root / plan.PARAMS)
     if settings.source != header.source:
         raise CaptureError(
             complain(
@@ -35,27 +35,27 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
                 "Simulated and recorded captures belong to different scenes.",
             )
         )  # fmt: skip
-    params, before = read_params(root / plan.PARAMS), read_registry(root)
+    limit, before = read_shared(root / plan.PARAMS)["lost_fraction_max"], read_registry(root)
     target = root / RAW / scene / header.capture
     _check_free(target, header.capture in before.captures.get(scene, {}))
-    with io.restoring(root / REGISTRY, root / plan.PARAMS), _forgetting_on_failure(target):
+    with io.restoring(root / REGISTRY, root / plan.PLAN), _forgetting_on_failure(target):
         with _naming_sources(target, files):
             complete = write_capture(target, header, files)
-            fingerprints = _read_through(target, complete, params.lost_fraction_max)
+            fingerprints = _read_through(target, complete, limit)
         after = with_capture(before, scene, complete, fingerprints, allow_copy=allow_copy)
         _dvc(root, "add", "--quiet", str(target.relative_to(root)))
         write_registry(root, after)
-        plan.use(root, [*params.scenes, scene])
+        plan.use(root, [*read_plan(root / plan.PLAN).scenes, scene])
     return complete
 
 
 def remove(root: Path, scene: str, capture: str) -> None:
     """Take a capture out again: its entry and its stage, then its raw files and its readings."""
     after = without_capture(read_registry(root), scene, capture)
-    params = read_params(root / plan.PARAMS)
-    with io.restoring(root / REGISTRY, root / plan.PARAMS):
+    running = read_plan(root / plan.PLAN).scenes
+    with io.restoring(root / REGISTRY, root / plan.PLAN):
         write_registry(root, after)
-        plan.use(root, [name for name in params.scenes if name != scene or scene in after.captures])
+        plan.use(root, [name for name in running if name != scene or scene in after.captures])
     _forget(root / RAW / scene / capture)
     io.remove(root / INDENTATIONS / scene / f"{capture}.parquet")
 

@@ -11,8 +11,9 @@ from typing import Annotated
 import typer
 
 from pipeline import adding, io, plan, preparing, tidying
+from pipeline.asking import modelled, swept
 from pipeline.errors import ParamsError, ReskinError, complain
-from pipeline.params import modelled, read_scene, swept
+from pipeline.params import read_scene
 from pipeline.server import TrackingAway
 from pipeline.strict import read_yaml
 
@@ -169,7 +170,7 @@ def publish() -> None:
     from pipeline.tracking import publish as write
 
     for scene in plan.check(ROOT).scenes:
-        asked, answers = read_scene(plan.scene_file(ROOT, scene)), ROOT / "data/answers" / scene
+        asked, answers = read_scene(plan.scene_file(ROOT, scene), ROOT / plan.PARAMS), ROOT / "data/answers" / scene
         arms = {arm: ROOT / "data/models" / scene / arm for arm in modelled(asked)}
         written = [answers / f"{stage}.json" for stage in (*swept(asked).values(), *asked.experiments)]
         missing = [path for path in (*arms.values(), *written) if not path.exists()]
@@ -213,9 +214,9 @@ def readme(check: Annotated[bool, typer.Option("--check", help="Only tell whethe
     """Fill in the generated parts of README.md from the results of the scenes that run."""
     from pipeline.reporting.readme import blocks_of, fill
 
-    running = plan.check(ROOT).scenes
+    running = list(plan.check(ROOT).scenes)
     if not running:
-        raise ParamsError(complain("params.yaml", "scenes", "one or more", "none", "Try: reskin scenes use quick"))
+        raise ParamsError(complain(plan.PLAN, "scenes", "one or more", "none", "Try: reskin scenes use quick"))
     scene = running[0]
     dag = subprocess.run(
         [sys.executable, "-m", "dvc", "dag", "--md"], capture_output=True, text=True, check=True
@@ -265,7 +266,7 @@ def tidy() -> None:
 
 @scenes.command()
 def check() -> None:
-    """Fail if params.yaml is not what its scenes ask for."""
+    """Fail if a scene or params.yaml is wrong, or the plan is not what the scenes ask for."""
     plan.check(ROOT)
 
 

@@ -7,9 +7,9 @@ put together to a scene in `pipeline.params`.
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
@@ -54,6 +54,16 @@ def parse(model: type[Model], value: Any, where: str) -> Model:
             place = f"{where}: {name}" if first["loc"] else where
             raise ParamsError(f"{place}: {rule}. Mend it there.") from None
         raise ParamsError(complain(where, name, rule, got, "Mend it there.")) from None
+
+
+def parse_parts(model: type[Model], value: Any, where: str) -> Model:
+    """Check what is there of a model; for a stage that reads a part of a section. What is absent is no attribute."""
+    fields = {name: field for name, field in model.model_fields.items() if name in value}
+    if all(name in value or not field.is_required() for name, field in model.model_fields.items()):
+        return parse(model, value, where)
+    asked: dict[str, Any] = {name: (field.annotation, field) for name, field in fields.items()}
+    part: Strict = parse(create_model(model.__name__, __base__=Strict, **asked), value, where)
+    return cast(Model, model.model_construct(**{name: getattr(part, name) for name in fields}))
 
 
 def _written(loc: Sequence[int | str], value: Any) -> list[str]:

@@ -11,31 +11,31 @@ from typing import Any
 from ruamel.yaml import YAML
 
 from pipeline import io
-from pipeline.params import Params
+from pipeline.params import Plan
 from pipeline.plan import scene_names
 from pipeline.strict import read_yaml
 
 LOCK = "dvc.lock"
 
 
-def left_over(root: Path, params: Params) -> dict[str, list[Path]]:
+def left_over(root: Path, plan: Plan) -> dict[str, list[Path]]:
     """List stages that ran and are not planned any more, and the files that only they wrote, by stage."""
     if not (root / LOCK).exists():
         return {}
     stages: Mapping[str, Any] = read_yaml(root / LOCK).get("stages", {})
-    planned = {f"{stage}@{key}" for stage, keys in params.stages.model_dump().items() for key in keys}
+    planned = {f"{stage}@{key}" for stage, keys in plan.stages.items() for key in keys}
     kept = {path for name, stage in stages.items() if name in planned for path in _outs(stage)}
     known = scene_names(root)
     return {
         name: [root / path for path in _outs(stage) if not _touches(path, kept)]
         for name, stage in stages.items()
-        if name not in planned and _scene_of(name, known) in params.scenes
+        if name not in planned and _scene_of(name, known) in plan.scenes
     }
 
 
-def tidy(root: Path, params: Params) -> dict[str, list[Path]]:
+def tidy(root: Path, plan: Plan) -> dict[str, list[Path]]:
     """Remove what is left over, and forget its stages; give what was removed."""
-    stale = left_over(root, params)
+    stale = left_over(root, plan)
     for paths in stale.values():
         for path in paths:
             io.remove(path)

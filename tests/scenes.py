@@ -1,4 +1,8 @@
-"""Scenes for tests, as plain words."""
+"""Scenes for tests, as plain words, and the settings that a stage has of them."""
+
+from pipeline.params import Scene
+from pipeline.settings import Settings
+from pipeline.strict import parse
 
 RECIPE = {
     "architecture": "paper", "inputs": "raw", "scaling": "standard", "triplet_weight": 0.0, "steps_n": 1, "batch_n": 64,
@@ -6,17 +10,29 @@ RECIPE = {
 }  # fmt: skip
 
 
+SHARED_RECIPE = {name: value for name, value in RECIPE.items() if name != "steps_n"}
+TRAINING = {"recipe": "paper", "steps_n": 1, "seeds_n": 1, "variants": {}}
+
+
 def recorded(**changes: object) -> dict[str, object]:
     scene: dict[str, object] = {
         "source": "recorded", "seed": 1, "questions": ["lobo"], "selection": {"force_min_N": 0.0}, "split": {},
-        "train_multi": {"seeds_n": 1, "recipes": {"paper": RECIPE}},
+        "train_multi": TRAINING,
     }  # fmt: skip
     return scene | changes
 
 
-TRAINING = {"seeds_n": 1, "recipes": {"paper": RECIPE}}
-SCHEDULE = {"steps_n": 1, "batch_n": 64, "rate_max": 1e-3, "gradient_norm_max": 1.0, "weight_decay": 0.0}
-ADAPTATION = {"base": "paper", "unlabelled_weight": 0.1} | SCHEDULE
+SCHEDULE = {"batch_n": 64, "rate_max": 1e-3, "gradient_norm_max": 1.0, "weight_decay": 0.0}
+ADAPTATIONS = {"adaptation": "paper", "base": "paper", "steps_n": 1, "pokes_n": 8, "variants": {}}
+# what scenes of tests share
+SHARED: dict[str, object] = {
+    "lost_fraction_max": 0.05,
+    "recipes": {"paper": SHARED_RECIPE, "triplet": SHARED_RECIPE | {"triplet_weight": 0.1}},
+    "adaptations": {"paper": {"unlabelled_weight": 0.1} | SCHEDULE},
+    "labellings": {"few": {"own_weight": 1.0} | SCHEDULE},
+    "methods": {"all": {"ridge": {"method": "ridge", "inputs": "raw", "alpha": 1.0}}},
+    "skin": {}, "rig": {}, "chip": {}, "spreads": {}, "terms": {},
+}  # fmt: skip
 
 # what a scene holds, beside the question, for each question about learning
 SECTIONS: dict[str, dict[str, object]] = {
@@ -25,14 +41,20 @@ SECTIONS: dict[str, dict[str, object]] = {
     "single_random": {"train_single": TRAINING},
     "single_temporal": {"train_single": TRAINING},
     "triplet": {"train_triplet": TRAINING},
-    "adapt": {"adapt": {"pokes_n": 8, "recipes": {"paper": ADAPTATION}}},
+    "adapt": {"adapt": ADAPTATIONS},
     "pokes": {"sweep_pokes": {"pokes_n": [0, 8], "boards_n": 1}},
     "sensors": {},
-    "labels": {"few_labels": {"labels_n": [0]}},  # checked by its stage
-    "baselines": {"train_classical": {"methods": {}}},  # checked by its stage
+    "labels": {
+        "few_labels": {
+            "labels_n": [0], "recipe": "paper", "steps_n": 1, "recipes": {"network": {}}, "adapted": [],
+            "adapting": {"adaptation": "paper", "steps_n": 1}, "labelling": {"labelling": "few", "steps_n": 1},
+            "rows_max_n": 10, "methods": "all",
+        },
+    },
+    "baselines": {"train_classical": {"rows_max_n": 10, "methods": "all"}},
     "audit": {"audit": {"settings": "chosen"}},
     "choice": {},
-}
+}  # fmt: skip
 SECTIONS |= {
     "single_indentation": {"train_single": TRAINING},
     "single_pass": {"train_single": TRAINING},
@@ -64,3 +86,15 @@ def asking(*questions: str, **changes: object) -> dict[str, object]:
         scene |= SECTIONS[question]
         split |= DRAWN_WITH.get(question, {})
     return scene | {"questions": list(questions), "split": split} | changes
+
+
+def settings(scene: dict[str, object], name: str = "tiny", **shared: object) -> Settings:
+    """All settings of a scene, as a stage that declares everything would read them."""
+    return Settings(name, f"{name}.yaml", scene, SHARED | shared, {"stages": {"split": {name: {"captures": []}}}})
+
+
+def check(words: dict[str, object]) -> Scene:
+    """Check a scene as `reskin scenes check` does."""
+    scene = parse(Scene, words, "scene.yaml")
+    Settings("scene", "scene.yaml", words, SHARED, {}).check_all()
+    return scene

@@ -15,9 +15,7 @@ from pipeline.capture.probe import ProbeLog
 from pipeline.capture.wire import encode
 from pipeline.dataset.captures import open_capture, read_header
 from pipeline.errors import ReskinError
-from pipeline.params import Stages
 from pipeline.preparing import Dump, Labels
-from pipeline.questions import EXPERIMENTS
 from pipeline.registry import read_registry
 from tests.capture.headers import make_header
 from tests.capture.readers.test_lab import PRESSES, write
@@ -25,17 +23,12 @@ from tests.capture.signals import make_frames
 from tests.scenes import recorded
 from tests.stages.checkout import copy_checkout, run
 
-# by name of a folder or a scene; the others are lists of scenes
-BY_NAME = {"simulate", "ingest_simulated", "ingest", "describe", "split", *EXPERIMENTS}
-NOTHING = {name: {} if name in BY_NAME else [] for name in Stages.model_fields}
-
 
 @pytest.fixture(scope="module")
 def empty(tmp_path_factory) -> Path:
     """A checkout that runs no scene yet."""
     root = copy_checkout(tmp_path_factory.mktemp("checkout"))
-    with (root / plan.PARAMS).open("w") as stream:
-        YAML().dump({"scenes": [], "lost_fraction_max": 0.05, "stages": NOTHING}, stream)
+    plan.use(root, [])
     with (root / plan.SCENES / "small.yaml").open("w") as stream:
         YAML().dump(recorded(), stream)
     return root
@@ -81,10 +74,10 @@ def test_a_recording_that_was_added_is_tracked_registered_and_planned(root, lab_
     assert (root / "data/raw/small/board1_skin1_readings.dvc").exists()
     assert read_registry(root).captures["small"]["board1_skin1_readings"].board == "board1"
     params = plan.check(root)
-    assert params.scenes == ("small",)
-    assert list(params.stages.ingest) == ["small-board1_skin1_readings"]
+    assert list(params.scenes) == ["small"]
+    assert list(params.stages["ingest"]) == ["small-board1_skin1_readings"]
     adding.remove(root, "small", "board1_skin1_readings")
-    assert plan.check(root).scenes == ()
+    assert plan.check(root).scenes == {}
     assert not list((root / "data/raw").rglob("*readings*"))
 
 
@@ -95,7 +88,7 @@ def test_the_same_recording_twice_is_refused_and_another_label_needs_a_word(root
     refuse(root, lambda: add_lab(root, lab_file, board="board2", skin="skin2"), "--allow-copy")
     refuse(root, lambda: add_lab(root, lab_file, board="board2", name="x"), "the readings of")
     add_lab(root, lab_file, board="board2", skin="skin2", allow_copy=True)
-    assert len(plan.check(root).stages.ingest) == 2
+    assert len(plan.check(root).stages["ingest"]) == 2
 
 
 def test_a_copy_written_with_a_digit_more_is_still_a_copy(root, lab_file, tmp_path):
@@ -106,10 +99,8 @@ def test_a_copy_written_with_a_digit_more_is_still_a_copy(root, lab_file, tmp_pa
 
 def test_a_removal_that_cannot_be_planned_changes_nothing(root, lab_file):
     add_lab(root, lab_file)
-    params = root / plan.PARAMS
-    params.write_text(
-        params.read_text().replace("- small", "- small\n- nowhere").replace("[small]", "[small, nowhere]")
-    )
+    file = root / plan.PLAN
+    file.write_text(file.read_text().replace("  small: [lobo]\n", "  small: [lobo]\n  nowhere: [lobo]\n", 1))
     refuse(root, lambda: adding.remove(root, "small", "board1_skin1_readings"), "nowhere")
 
 

@@ -3,10 +3,11 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.asking import arms_of, modelled, runs, swept
 from pipeline.errors import ParamsError
-from pipeline.params import Scene, arms_of, modelled, read_params, read_scene, runs, swept
+from pipeline.params import Scene, read_plan, read_scene, read_shared
 from pipeline.strict import parse, read_yaml
-from tests.scenes import ADAPTATION, DRAWN_WITH, RECIPE, SECTIONS, TRAINING, asking, recorded
+from tests.scenes import ADAPTATIONS, DRAWN_WITH, SECTIONS, TRAINING, asking, check, recorded
 
 ROOT = Path(__file__).resolve().parents[1]
 PAPERS_CLAIM = ("lobo", "triplet", "adapt")  # the questions that those of adaptation go on from
@@ -14,11 +15,12 @@ PAPERS_CLAIM = ("lobo", "triplet", "adapt")  # the questions that those of adapt
 
 @pytest.mark.parametrize("file", sorted((ROOT / "pipeline/scenes").glob("*.yaml")), ids=lambda file: file.stem)
 def test_every_scene_of_the_checkout_is_legal(file):
-    read_scene(file)
+    read_scene(file, ROOT / "params.yaml")
 
 
 def test_the_params_of_the_checkout_are_legal():
-    read_params(ROOT / "params.yaml")
+    read_shared(ROOT / "params.yaml")
+    read_plan(ROOT / "pipeline/plan.yaml")
 
 
 @pytest.mark.parametrize(
@@ -33,20 +35,22 @@ def test_the_params_of_the_checkout_are_legal():
         ({"train_single": TRAINING}, "section train_single stands in a scene if and only if it asks one of"),
         ({"questions": ["lobo", "transfer"], "train_single": TRAINING}, "split holds exactly what the questions need"),
         ({"split": {"transfer_skins_n": 3}}, "split holds exactly what the questions need"),
-        ({"train_multi": {"seeds_n": 1, "recipes": {"other": RECIPE}}}, "a recipe named paper"),
+        ({"train_multi": TRAINING | {"recipe": "other"}}, "params.yaml: recipes.other must be given"),
+        ({"train_multi": TRAINING | {"steps_n": 0}}, "train_multi.steps_n must be greater than or equal to 1; got 0"),
         (
-            {"train_multi": {"seeds_n": 1, "recipes": {"paper": RECIPE | {"rate_max": 0}}}},
-            "rate_max must be greater than 0",
+            {"train_multi": TRAINING | {"variants": {"fast": {"rate_max": 0}}}},
+            "recipes.fast.rate_max must be greater than 0",
         ),
+        ({"train_multi": TRAINING | {"variants": {"paper": {}}}}, "a name must be unlike the headline"),
     ],
 )
 def test_a_wrong_scene_is_one_sentence_that_names_the_parameter(changes, sentence):
     with pytest.raises(ParamsError, match=sentence):
-        parse(Scene, recorded(**changes), "scene.yaml")
+        check(recorded(**changes))
 
 
 def scene(*questions: str, **changes: object) -> Scene:
-    return parse(Scene, asking(*questions, **changes), "scene.yaml")
+    return check(asking(*questions, **changes))
 
 
 @pytest.mark.parametrize(
@@ -116,7 +120,6 @@ def test_what_a_stage_cost_counts_as_long_as_its_question_is_asked(unit):
     own["questions"] = [question for question in own["questions"] if question not in (*gone, "left_out")]
     own = {name: section for name, section in own.items() if name not in gone}
     own["simulate"]["protocols"].pop("wear")
-    own["simulate"]["terms"].pop("ageing")
     left = parse(Scene, own, "ci.yaml")
     assert runs(left, unit) == (unit in ("train_multi", "simulate", "report"))
 
@@ -185,8 +188,8 @@ def test_split_holds_what_draws_the_folds_of_a_question_and_nothing_else(questio
     ("changes", "sentence"),
     [
         ({"audit": {"settings": "guessed"}}, "audit.settings must be 'chosen' or 'for speed'; got 'guessed'"),
-        ({"adapt": {"pokes_n": 0, "recipes": {"paper": ADAPTATION}}}, "adapt.pokes_n must be greater than or equal"),
-        ({"adapt": {"pokes_n": 8, "recipes": {"other": ADAPTATION}}}, "adapt: recipes hold a recipe named paper"),
+        ({"adapt": ADAPTATIONS | {"pokes_n": 0}}, "adapt.pokes_n must be greater than or equal"),
+        ({"adapt": ADAPTATIONS | {"adaptation": "other"}}, "params.yaml: adaptations.other must be given"),
         ({"sweep_pokes": {"pokes_n": [], "boards_n": 1}}, "sweep_pokes.pokes_n must"),
         ({"sweep_pokes": {"pokes_n": [8], "boards_n": 0}}, "sweep_pokes.boards_n must be greater than or equal to 1"),
     ],
@@ -204,10 +207,11 @@ def test_what_is_not_written_is_an_error_and_no_default():
 
 
 def test_a_misspelt_parameter_is_named_as_it_was_written():
-    recipe = {name: value for name, value in RECIPE.items() if name != "steps_n"} | {"step_n": 4}
-    words = recorded(train_multi={"seeds_n": 1, "recipes": {"paper": recipe}})
-    with pytest.raises(ParamsError, match=r"recipes.paper.step_n must be a known parameter; got 4"):
-        parse(Scene, words, "scene.yaml")
+    with pytest.raises(ParamsError, match=r"recipes.fast.rat_max must be a known parameter; got 4"):
+        check(recorded(train_multi=TRAINING | {"variants": {"fast": {"rat_max": 4}}}))
+    words = {name: value for name, value in TRAINING.items() if name != "steps_n"} | {"step_n": 4}
+    with pytest.raises(ParamsError, match=r"train_multi.step_n must be a known parameter; got 4"):
+        check(recorded(train_multi=words))
 
 
 def test_yaml_reads_exponents_as_numbers(tmp_path):
@@ -229,9 +233,9 @@ def test_a_missing_file_is_named(tmp_path):
 
 def test_a_base_that_is_no_recipe_of_train_triplet_is_refused_at_once():
     scene = copy.deepcopy(asking("lobo", "triplet", "adapt"))
-    scene["adapt"]["recipes"]["paper"]["base"] = "nope"
-    with pytest.raises(ParamsError, match=r"adapt.recipes.paper.base is one of \['paper'\], not 'nope'"):
-        parse(Scene, scene, "scene.yaml")
+    scene["adapt"]["base"] = "nope"
+    with pytest.raises(ParamsError, match=r"adapt: base of paper must be one of \['paper'\]; got 'nope'"):
+        check(scene)
 
 
 def test_a_question_without_the_one_it_goes_on_from_names_that_one():

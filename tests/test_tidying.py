@@ -8,7 +8,7 @@ from ruamel.yaml import YAML
 
 from pipeline import plan, tidying
 from tests.scenes import asking
-from tests.test_plan import EMPTY, checkout
+from tests.test_plan import checkout
 
 WRITTEN = {
     "drift@one": "data/answers/one/drift.json",
@@ -22,7 +22,7 @@ WRITTEN = {
 @pytest.fixture
 def root(tmp_path) -> Path:
     """Scene one ran with drift and a protocol `gone`, and asks lobo alone now; scene two ran once, and does not run."""
-    folder = checkout(tmp_path / "checkout", EMPTY)
+    folder = checkout(tmp_path / "checkout")
     plan.use(folder, ["one"])
     for path in WRITTEN.values():
         (folder / path).parent.mkdir(parents=True, exist_ok=True)

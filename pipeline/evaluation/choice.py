@@ -34,13 +34,13 @@ def choose(cards: Cards) -> dict[str, dict[str, Any]]:
     own = [card for card in cards if card["recipe"]["inputs"] == PAPER_INPUTS]
     tuned = [card for card in own if card["question"] == "adapt"]
     chosen = {"train_multi": _best([card for card in own if card["question"] == "lobo"], "train_multi")}
-    chosen["adapt"] = _best(tuned, "adapt", [card for card in tuned if _settings(card)["unlabelled_weight"] > 0])
+    chosen["adapt"] = _best(tuned, "adapt", [card for card in tuned if settings_of(card)["unlabelled_weight"] > 0])
     best = next(card for card in tuned if card["recipe_name"] == chosen["adapt"]["recipe_name"])
     control = [card for card in tuned if _key(card) == _key(best) | {"unlabelled_weight": 0.0}]
     chosen["adapt"] |= {"error": _error(tuned, best)} | ({"control": _error(tuned, control[0])} if control else {})
     chosen["train_triplet"] = {
-        "recipe_name": _settings(best)["base"],
-        "settings": _trimmed(best["recipe"]),
+        "recipe_name": settings_of(best)["base"],
+        "settings": trimmed(best["recipe"]),
         "by": "MSE_xy of the networks adapted from it",
         "candidates": _candidates([card for card in own if card["question"] == "triplet"]),
     }
@@ -68,7 +68,7 @@ def _best(cards: Cards, stage: str, eligible: Cards | None = None) -> dict[str, 
         )
     _check_budgets(cards, stage)
     card = min(among, key=lambda one: _error(cards, one))
-    words = {"recipe_name": card["recipe_name"], "settings": _trimmed(_settings(card))}
+    words = {"recipe_name": card["recipe_name"], "settings": trimmed(settings_of(card))}
     return words | {"by": "MSE_xy, mean over all budgets of steps", "candidates": _candidates(cards)}
 
 
@@ -93,7 +93,7 @@ def _check_budgets(cards: Cards, stage: str) -> None:
 
 def _key(card: dict[str, Any]) -> dict[str, Any]:
     """Name settings without their budget; an adaptation's with those of the network that it starts from."""
-    return _trimmed(card["recipe"]) | (_trimmed(_settings(card)) if "tuning" in card else {})
+    return trimmed(card["recipe"]) | (trimmed(settings_of(card)) if "tuning" in card else {})
 
 
 def _budget(card: dict[str, Any]) -> tuple[int, int]:
@@ -106,17 +106,19 @@ def _candidates(cards: Cards) -> list[dict[str, Any]]:
     return [
         {
             "recipe_name": name,
-            "settings": ", ".join(f"{key} {value}" for key, value in _settings(own[0]).items() if key in VARIED),
+            "settings": ", ".join(f"{key} {value}" for key, value in settings_of(own[0]).items() if key in VARIED),
             **over_folds(pool_skins(own) if "tuning" in own[0] else own),
         }
         for name, own in by_name.items()
     ]
 
 
-def _settings(card: dict[str, Any]) -> dict[str, Any]:
+def settings_of(card: dict[str, Any]) -> dict[str, Any]:
+    """Give what a training was set to: its recipe, or how it went on from one."""
     settings: dict[str, Any] = card["tuning"]["settings"] if "tuning" in card else card["recipe"]
     return settings
 
 
-def _trimmed(settings: dict[str, Any]) -> dict[str, Any]:
+def trimmed(settings: dict[str, Any]) -> dict[str, Any]:
+    """Leave out what is no setting of the method."""
     return {name: value for name, value in settings.items() if name not in BUDGET}

@@ -7,6 +7,7 @@ Refuses to know stages, scores and pages.
 """
 
 import hashlib
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, as_completed
@@ -110,7 +111,7 @@ def _run_once(
     if len(fresh) < len(members):
         tell(f"{len(members) - len(fresh)} of {len(members)} trainings were finished before")
     if missing:
-        rows_file = cache / "rows" / f"{keys.rows_digest()}.safetensors"
+        rows_file = cache / "rows" / f"{keys.rows_digest()}-{os.getpid()}.safetensors"  # an experiment may run beside
         skin = np.unique(rows.skin, return_inverse=True)[1].astype(np.int64)
         io.write_tensors(rows_file, {"db_uT": rows.db_uT, "target": rows.target, "skin": skin}, {})
         _run_stacks([([members[key] for key in stack], files) for stack, files in missing], rows_file, executor, tell)

@@ -1,9 +1,15 @@
-"""A recipe: one row of settings for the one training loop. Knows no data and no network."""
+"""A recipe: one row of settings for the one training loop. Knows no data and no network.
 
-from typing import Annotated, Literal, TypeVar
+A section of a scene names a shared row, says how many steps, and what its variants do differently; `Training` and
+`Adaptations` are what follows: whole recipes by name.
+"""
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field, model_validator
 
+from pipeline.errors import ParamsError, complain
 from pipeline.strict import Strict
 
 HEADLINE = "paper"  # the recipe whose numbers stand beside the paper's; others are variants
@@ -118,3 +124,48 @@ def _headed(section: Headed) -> Headed:
     if HEADLINE not in section.recipes:
         raise ValueError(f"recipes hold a recipe named {HEADLINE}, which stands beside the paper's numbers")
     return section
+
+
+Words = Mapping[str, Any]
+Steps = Annotated[int, Field(ge=1)]
+Variants = dict[Name, dict[str, Any]]  # what each does differently from the row that its section names
+
+
+class TrainingRow(Strict):
+    """Training as a scene writes it: the shared recipe that is the headline, and what variants do differently."""
+
+    recipe: Name
+    steps_n: Steps
+    seeds_n: Annotated[int, Field(ge=1)]
+    variants: Variants
+
+
+class AdaptationsRow(Strict):
+    """Section adapt as a scene writes it: the shared adaptation that is the headline, its base, its variants."""
+
+    adaptation: Name
+    base: Name
+    steps_n: Steps
+    pokes_n: Annotated[int, Field(ge=1)]
+    variants: Variants
+
+
+def resolve_training(words: Words, recipes: Words, where: str) -> dict[str, Any]:
+    """Write every recipe of a section in full: the headline as it is shared, variants with their differences."""
+    rows = _in_full(words, recipes[words["recipe"]], {}, where)
+    return {"recipes": rows} | {name: words[name] for name in ("seeds_n",) if name in words}
+
+
+def resolve_adaptations(words: Words, adaptations: Words, where: str) -> dict[str, Any]:
+    """Write every adaptation of section adapt in full; the control follows what it controls."""
+    rows = _in_full(words, adaptations[words["adaptation"]], {"base": words["base"]}, where)
+    return {"recipes": rows} | {name: words[name] for name in ("pokes_n",) if name in words}
+
+
+def _in_full(words: Words, shared: Words, own: Words, where: str) -> dict[str, dict[str, Any]]:
+    headline = dict(shared) | dict(own) | {"steps_n": words["steps_n"]}
+    variants = words.get("variants", {})
+    if HEADLINE in variants:
+        rule = "unlike the headline, which is the shared row as it is"
+        raise ParamsError(complain(f"{where}.variants", "a name", rule, HEADLINE, "Choose another name."))
+    return {HEADLINE: headline} | {name: headline | changes for name, changes in variants.items()}

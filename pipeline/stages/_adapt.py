@@ -54,7 +54,6 @@ class Pokes:
 
 def adaptation(at: Scenery, fold: Fold, named: tuple[str, Adaptation], starts: Starts, pokes: Pokes) -> Cell:
     """Adapt the fold's network of one seed to one skin, whose rows of the fold's test side are tested."""
-    assert at.asked.train_triplet is not None
     name, settings = named
     test = fold.test[at.rows.skin[fold.test] == pokes.skin]
     start = own_starts(starts, settings.base, fold)[pokes.seed_i]

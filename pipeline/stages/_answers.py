@@ -17,7 +17,6 @@ def answers_before(at: Scenery, fold: Fold, settings: Adaptation, starts: Starts
     """Answer on a skin's tested rows as the networks do before they are adapted."""
     from pipeline.learning.model import Predictor  # torch, late: only a stage that answers pays for it
 
-    assert at.asked.train_triplet is not None
     recipe, test = at.asked.train_triplet.recipes[settings.base], fold.test[at.rows.skin[fold.test] == skin]
     view = VIEW[recipe.inputs](at.rows.db_uT[test])
     for seed_i, start in own_starts(starts, settings.base, fold).items():

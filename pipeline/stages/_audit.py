@@ -3,19 +3,20 @@
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from pipeline import io
+from pipeline.asking import modelled
 from pipeline.evaluation.audit.checks import Check
 from pipeline.evaluation.audit.settings import audit_choice, audit_scaler
 from pipeline.evaluation.audit.sides import Sides
 from pipeline.evaluation.audit.tuning import audit_tuning
-from pipeline.evaluation.choice import BUDGET
+from pipeline.evaluation.choice import settings_of, trimmed
 from pipeline.learning.inputs import VIEW
 from pipeline.learning.recipe import HEADLINE
 from pipeline.learning.standardise import FIT
-from pipeline.params import modelled
 from pipeline.stages._train import Scenery
 
 Fits = dict[tuple[str, str, str, str, int], dict[str, np.ndarray]]  # by fold, view, scaling and rows
@@ -26,7 +27,7 @@ def model_checks(at: Scenery, sides: dict[tuple[str, str], Sides], models: Path)
     views = {name: view(at.rows.db_uT) for name, view in VIEW.items()}
     fits: Fits = {}
     keys: dict[tuple[str, int], set[str]] = {}  # of the networks that may be adapted, by fold and seed
-    for arm in modelled(at.asked):
+    for arm in modelled(at.asked.asking):
         for file in sorted((models / arm).glob("*.json")):
             card = io.read_json(file)
             question = "lobo" if card["question"] in ("triplet", "adapt") else card["question"]
@@ -55,16 +56,18 @@ def _fit_once(
     return fits[of]
 
 
-def settings_checks(at: Scenery, choice: Path) -> list[Check]:
-    """Compare the scene's headline recipes with the record of what was chosen, and where."""
-    sections = {arm: getattr(at.asked, arm) for arm in ("train_multi", "train_triplet", "adapt")}
-    recipes = {
-        arm: {k: v for k, v in section.recipes[HEADLINE].model_dump(mode="json").items() if k not in BUDGET}
-        for arm, section in sections.items()
-        if section is not None
-    }
+def settings_checks(at: Scenery, choice: Path, models: Path) -> list[Check]:
+    """Compare the headline recipes that were trained with the record of what was chosen, and where."""
+    arms = [arm for arm in modelled(at.asked.asking) if arm != "train_single"]
+    recipes = {arm: trimmed(_headline(models / arm)) for arm in arms}
     held_out = np.unique(np.concatenate([fold.test for fold in at.folds]))
     return audit_choice(
         io.read_json(choice), recipes, source=at.asked.source, seed=at.asked.seed,
         test_boards=np.unique(at.rows.board[held_out]).tolist(), test_skins=np.unique(at.rows.skin[held_out]).tolist(),
     )  # fmt: skip
+
+
+def _headline(models: Path) -> dict[str, Any]:
+    """Read the settings of a stage's headline: its networks' cards say what they were trained with."""
+    cards = (io.read_json(file) for file in sorted(models.glob("*.json")))
+    return settings_of(next(card for card in cards if card["recipe_name"] == HEADLINE))

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,12 +12,13 @@ from pipeline.evaluation.logs import Answers
 from pipeline.evaluation.turning import Log, step_period_s, turn_log
 from pipeline.physics.ambient import EARTH_SIZE_T
 from pipeline.seeds import rng_for
-from pipeline.stages._simulated import read_synthesis
+from pipeline.settings import Settings
+from pipeline.stages._simulated import synthesis_of
 
 
-def turned(log: Log, board: str, settings: Path, networks: Sequence[Answers]) -> dict[str, Any]:
+def turned(log: Log, board: str, asked: Settings, networks: Sequence[Answers]) -> dict[str, Any]:
     """Tell what the networks find in the log if its board turns in the earth's field."""
-    of, seed = read_synthesis(settings)
+    of, seed = synthesis_of(asked), asked.seed
     noise_uT = np.array([of.chip.noise_xy_uT, of.chip.noise_xy_uT, of.chip.noise_z_uT])  # a log's readings are single
     own = replace(take_board(of, board, seed=seed), noise_uT=noise_uT)
     return {

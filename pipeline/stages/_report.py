@@ -6,13 +6,14 @@ from pathlib import Path
 from typing import Any
 
 from pipeline import io
+from pipeline.asking import Asking, described_in, modelled, runs, swept
 from pipeline.evaluation.choice import choose
 from pipeline.learning.executors import device as trained_on
 from pipeline.learning.recipe import HEADLINE
-from pipeline.params import Scene, described_in, modelled, runs, swept
 from pipeline.provenance import SECONDS, add_up_costs, code_version, device, read_costs
 from pipeline.reporting.learned import timed_learning
 from pipeline.reporting.numbers import answered, compose, lost_by_protocol, rounded, runtime
+from pipeline.settings import Settings
 from pipeline.stages._run import COSTS
 
 Cards = Sequence[Mapping[str, Any]]
@@ -28,21 +29,22 @@ class Places:
     answers: Path
 
 
-def read_cards(asked: Scene, models: Path) -> list[dict[str, Any]]:
+def read_cards(asked: Asking, models: Path) -> list[dict[str, Any]]:
     """Read the cards of all models that the scene keeps."""
     return [io.read_json(file) for arm in modelled(asked) for file in sorted((models / arm).glob("*.json"))]
 
 
-def read_numbers(scene: str, asked: Scene, at: Places) -> tuple[dict[str, Any], dict[str, Any]]:
+def read_numbers(known: Settings, at: Places) -> tuple[dict[str, Any], dict[str, Any]]:
     """Read what numbers.json says, and by experiment what only its figures show."""
+    scene, asked = known.scene, known.asking
     words, cards = io.read_json(at.folds), read_cards(asked, at.models)
     accounts = [io.read_account(at.indentations / f"{name}.parquet") for name in words["captures"]]
     points = {question: io.read_json(at.answers / f"{file}.json") for question, file in swept(asked).items()}
-    numbers: dict[str, Any] = {"provenance": _provenance(scene, asked, cards)}
+    numbers: dict[str, Any] = {"provenance": _provenance(known, cards)}
     experiments = {question: io.read_json(at.answers / f"{question}.json") for question in asked.experiments}
     numbers |= compose(cards, points, accounts, words["dropped"], headline=HEADLINE)
     losses = {question: answer["losses"] for question, answer in experiments.items()}
-    numbers |= {"capture_by_protocol": lost_by_protocol(losses)} if asked.simulate else {}
+    numbers |= {"capture_by_protocol": lost_by_protocol(losses)} if asked.source == "simulated" else {}
     numbers |= {"audit": io.read_json(at.answers / "audit.json")} if "audit" in asked.questions else {}
     numbers |= {"chosen": choose(cards)} if "choice" in asked.questions else {}
     numbers["described"] = {name: io.read_json(at.answers / f"described/{name}.json") for name in described_in(asked)}
@@ -54,14 +56,14 @@ def read_numbers(scene: str, asked: Scene, at: Places) -> tuple[dict[str, Any], 
     return rounded(numbers), {question: answer["drawn"] for question, answer in experiments.items()}
 
 
-def _provenance(scene: str, asked: Scene, cards: Cards) -> dict[str, Any]:
-    known = {"scene": scene, "source": asked.source, "git": code_version(), "seed": asked.seed}
+def _provenance(of: Settings, cards: Cards) -> dict[str, Any]:
+    known = {"scene": of.scene, "source": of.source, "git": code_version(), "seed": of.seed}
     known |= {"trained": ", ".join(sorted({card["git"] for card in cards}))}
     known |= {"device": f"{device()}, networks on {trained_on()}"}
-    return known | {"seconds": round(add_up_costs(_costs(scene, asked).values()), 1)}
+    return known | {"seconds": round(add_up_costs(_costs(of.scene, of.asking).values()), 1)}
 
 
-def _costs(scene: str, asked: Scene) -> dict[str, dict[str, Any]]:
+def _costs(scene: str, asked: Asking) -> dict[str, dict[str, Any]]:
     """Read what each stage cost here; one whose question was switched off costs nothing any more."""
     return {unit: cost for unit, cost in read_costs(COSTS / scene).items() if runs(asked, unit)}
 

@@ -8,6 +8,7 @@ import inspect
 import sys
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +20,17 @@ COSTS = Path(".reskin/costs")
 
 
 def run(work: Callable[..., None]) -> None:
-    """Call `work` with options of its own names (`--scene quick`); all are required."""
+    """Call `work` with options of its own names (`--scene quick`), or of a bundle those within; all are required."""
     stage = Path(inspect.getfile(work)).stem
     parser = argparse.ArgumentParser(prog=f"python -m pipeline.stages.{stage}", description=work.__doc__)
-    for parameter in inspect.signature(work).parameters.values():
-        parser.add_argument(f"--{parameter.name.replace('_', '-')}", type=parameter.annotation, required=True)
+    kinds = {name: parameter.annotation for name, parameter in inspect.signature(work).parameters.items()}
+    bundles = {name: [one.name for one in fields(kind)] for name, kind in kinds.items() if is_dataclass(kind)}
+    for name, kind in kinds.items():
+        for option in bundles.get(name, [name]):
+            parser.add_argument(f"--{option.replace('_', '-')}", type=Path if name in bundles else kind, required=True)
     arguments = vars(parser.parse_args())
+    for name, options in bundles.items():
+        arguments[name] = kinds[name](*(arguments.pop(option) for option in options))
     try:
         probe(server_uri())
     except TrackingAway as away:

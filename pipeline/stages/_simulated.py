@@ -1,14 +1,38 @@
-"""What the stages about physics share: a simulated scene's file -> how its skins are made, and its seed."""
+"""What the stages about physics share: settings that a stage declares -> how skins are made. Knows no argv."""
 
-from pathlib import Path
+from collections.abc import Mapping
+from typing import Any
 
-from pipeline.params import read_scene
-from pipeline.strict import parse
-from pipeline.synthesis.capture import Synthesis
+from pipeline.physics.board import Spreads
+from pipeline.physics.sensor import ChipDesign
+from pipeline.physics.skin import SkinDesign
+from pipeline.settings import Settings
+from pipeline.strict import Strict, parse_parts
+from pipeline.synthesis.capture import BoardKind, Synthesis
+from pipeline.synthesis.protocols import Grid
+from pipeline.synthesis.rig import Rig
+
+MODELS: dict[str, type[Strict]] = {"skin": SkinDesign, "rig": Rig, "chip": ChipDesign, "spreads": Spreads}
 
 
-def read_synthesis(settings: Path) -> tuple[Synthesis, int]:
-    """Read section `simulate` of a scene, and the scene's seed."""
-    asked = read_scene(settings)
-    assert asked.simulate is not None, "the plan names simulated scenes only"
-    return parse(Synthesis, asked.simulate.model_dump(), f"{settings}: simulate"), asked.seed
+def synthesis_of(asked: Settings) -> Synthesis:
+    """Put together what the stage declares of section `simulate` and of what scenes share; the rest is not there."""
+    words: Mapping[str, Any] = asked.words("simulate")
+    parts: dict[str, Any] = {
+        name: parse_parts(model, asked.shared[name], f"params.yaml: {name}")
+        for name, model in MODELS.items() if name in asked.shared
+    }  # fmt: skip
+    where = f"{asked.where}: simulate"
+    kinds = words.get("boards", {}).items()
+    parts["boards"] = {name: parse_parts(BoardKind, kind, f"{where}.boards.{name}") for name, kind in kinds}
+    protocols = words.get("protocols", {})
+    whole = {name: own for name, own in protocols.items() if "kind" in own}
+    parts["protocols"] = dict(parse_parts(Synthesis, {"protocols": whole}, where).protocols) if whole else {}
+    for name, own in protocols.items():
+        if name not in whole:  # a few numbers of the main protocol
+            parts["protocols"][name] = parse_parts(Grid, own, f"{where}.protocols.{name}")
+    named = {term for protocol in whole.values() for term in protocol["terms"]}
+    if "rig" in asked.shared and whole:  # what is recorded, and not only looked at, has terms
+        terms = {term: asked.named("terms", term) for term in sorted(named)}
+        parts |= parse_parts(Synthesis, {"terms": terms}, "params.yaml").__dict__
+    return Synthesis.model_construct(**parts)

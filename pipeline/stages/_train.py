@@ -9,23 +9,24 @@ from pipeline import io
 from pipeline.dataset.folds import load_rows, parse_folds
 from pipeline.dataset.rows import Rows
 from pipeline.dataset.splits import Fold
+from pipeline.home import home
 from pipeline.learning.cell import Cell, Measured, Trained
 from pipeline.learning.executors import make_executor
 from pipeline.learning.grid import run_cells
 from pipeline.learning.recipe import Training
-from pipeline.params import Scene, read_scene
 from pipeline.provenance import note_trainings
+from pipeline.settings import Settings
 from pipeline.stages._run import COSTS, say
 
-CELLS = Path(".reskin/cells")  # finished trainings: a cache, and no output
+CELLS = ".reskin/cells"  # finished trainings: a cache, and no output
 
 
 @dataclass(frozen=True)
 class Scenery:
-    """What a stage that trains reads: the scene, its rows and its folds."""
+    """What a stage that trains reads: the scene's settings, its rows and its folds."""
 
     scene: str
-    asked: Scene
+    asked: Settings
     rows: Rows
     folds: list[Fold]
 
@@ -34,11 +35,11 @@ class Scenery:
         return [fold for fold in self.folds if fold.question == question]
 
 
-def read_scenery(scene: str, settings: Path, indentations: Path, folds: Path) -> Scenery:
-    """Read what a stage that trains needs."""
-    asked, words = read_scene(settings), io.read_json(folds)
+def read_scenery(asked: Settings, indentations: Path, folds: Path) -> Scenery:
+    """Read the rows and folds that a stage trains on."""
+    words = io.read_json(folds)
     rows = load_rows([indentations / f"{name}.parquet" for name in words["captures"]], asked.selection)
-    return Scenery(scene, asked, rows, parse_folds(words, rows, str(folds)))
+    return Scenery(asked.scene, asked, rows, parse_folds(words, rows, str(folds)))
 
 
 def cells_of(at: Scenery, training: Training, folds: Iterable[Fold], *, question: str | None = None) -> list[Cell]:
@@ -56,7 +57,7 @@ def train_all(at: Scenery, cells: Sequence[Cell], stage: str) -> list[Trained]:
     rows, start_s = Measured(at.rows.db_uT, at.rows.target, at.rows.skin), time.monotonic()
     with make_executor() as executor:
         trained = run_cells(
-            cells, rows, executor=executor, cache=CELLS, tell=lambda line: say(f"{at.scene} {stage}: {line}")
+            cells, rows, executor=executor, cache=home() / CELLS, tell=lambda line: say(f"{at.scene} {stage}: {line}")
         )
     took = {one.key: (one.seconds, one.reused) for one in trained}
     note_trainings(COSTS / at.scene, stage, took, time.monotonic() - start_s)

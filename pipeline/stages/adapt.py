@@ -2,17 +2,20 @@
 
 from pathlib import Path
 
+from pipeline.settings import Files, read_settings
 from pipeline.stages._adapt import adaptations, read_starts
 from pipeline.stages._models import write_models
 from pipeline.stages._run import run
 from pipeline.stages._train import read_scenery, train_all
 
 
-def adapt(scene: str, settings: Path, indentations: Path, folds: Path, started: Path, models: Path) -> None:
+def adapt(scene: str, files: Files, indentations: Path, folds: Path, started: Path, models: Path) -> None:
     """Fine-tune by every recipe of section adapt."""
-    at, starts = read_scenery(scene, settings, indentations, folds), read_starts(started)
+    at, starts = (
+        read_scenery(read_settings("adapt", scene, files), indentations, folds),
+        read_starts(started),
+    )
     asked = at.asked.adapt
-    assert asked is not None
     cells = [
         cell
         for fold in at.of("lobo")

@@ -7,20 +7,20 @@ from scipy.constants import micro
 
 from pipeline.evaluation.ambient import REFERENCE_ASIDE_MM, over_boards, take_board
 from pipeline.physics.ambient import EARTH_DIP_DEG, EARTH_SIZE_T
+from pipeline.settings import Files, read_settings
 from pipeline.stages._ambient import AS_IT_IS, ASIDE, OWN, networks_of_common_part, on_board
 from pipeline.stages._experiment import write_answer
 from pipeline.stages._networks import networks_without
 from pipeline.stages._run import run
-from pipeline.stages._simulated import read_synthesis
+from pipeline.stages._simulated import synthesis_of
 from pipeline.stages._train import read_scenery
 
 
-def ambient(scene: str, settings: Path, folds: Path, indentations: Path, models: Path, answer: Path) -> None:
+def ambient(scene: str, files: Files, folds: Path, indentations: Path, models: Path, answer: Path) -> None:
     """Test every held-out board in fields that came up after its no-load readings; train one arm on the last board."""
-    at, (of, seed) = read_scenery(scene, settings, indentations, folds), read_synthesis(settings)
+    at = read_scenery(read_settings("ambient", scene, files), indentations, folds)
+    of, seed = synthesis_of(at.asked), at.asked.seed
     asked, training = at.asked.ambient, at.asked.train_multi
-    assert asked is not None
-    assert training is not None
     held_out = at.of("lobo")
     boards = [fold.name for fold in held_out]
     points: list[dict[str, Any]] = []

@@ -5,18 +5,18 @@ from pathlib import Path
 from pipeline import io
 from pipeline.errors import LeakError, complain
 from pipeline.evaluation.audit.checks import holds, to_words
+from pipeline.evaluation.audit.settings import NOT_CHOSEN
 from pipeline.evaluation.audit.sides import Labels, Sides, audit_fold
 from pipeline.seeds import rng_for
+from pipeline.settings import Files, read_settings
 from pipeline.stages._audit import model_checks, settings_checks
 from pipeline.stages._run import run, say
 from pipeline.stages._train import read_scenery
 
 
-def audit(
-    scene: str, settings: Path, indentations: Path, folds: Path, models: Path, choice: Path, answer: Path
-) -> None:
+def audit(scene: str, files: Files, indentations: Path, folds: Path, models: Path, choice: Path, answer: Path) -> None:
     """Check every fold, the scaler of every network and the settings; a leak fails the stage and names itself."""
-    at = read_scenery(scene, settings, indentations, folds)
+    at = read_scenery(read_settings("audit", scene, files), indentations, folds)
     labels = Labels(at.rows.board, at.rows.skin, at.rows.indentation, at.rows.capture)
     sides = [Sides(fold.question, fold.name, fold.train, fold.pool, fold.test) for fold in at.folds]
     checks = [
@@ -27,7 +27,7 @@ def audit(
         )
     ]
     checks += list(model_checks(at, {(side.question, side.name): side for side in sides}, models))
-    checks += settings_checks(at, choice) if at.asked.audit and at.asked.audit.settings == "chosen" else []
+    checks += settings_checks(at, choice, models) if at.asked.audit.settings == "chosen" else []
     if not holds(checks):
         first = next(check for check in checks if not (check.holds or check.known))
         raise LeakError(
@@ -36,7 +36,11 @@ def audit(
             )
         )
     io.write_json(answer, to_words(checks))
-    say(f"{scene}: {len(checks)} checks, no leak; {sum(check.known for check in checks)} known, the paper's own")
+    unchosen_n = sum(check.found.startswith(NOT_CHOSEN) for check in checks)
+    say(
+        f"{scene}: {len(checks)} checks, no leak; {sum(check.known for check in checks)} known, the paper's own; "
+        f"{unchosen_n} settings that the study did not choose"
+    )
 
 
 if __name__ == "__main__":

@@ -5,11 +5,12 @@ from typing import Any
 
 from pipeline.evaluation.contacts import over_boards
 from pipeline.evaluation.superposition import superposition
+from pipeline.settings import Files, read_settings
 from pipeline.stages._contacts import SAME_PLACE, on_board
 from pipeline.stages._experiment import write_answer
 from pipeline.stages._networks import networks_without
 from pipeline.stages._run import run
-from pipeline.stages._simulated import read_synthesis
+from pipeline.stages._simulated import synthesis_of
 from pipeline.stages._train import read_scenery
 
 # The networks behind two of the detectors were trained on all that the held-out board leaves, so on this part as well.
@@ -19,11 +20,10 @@ KEPT_ASIDE = (
 )
 
 
-def contacts(scene: str, settings: Path, folds: Path, indentations: Path, models: Path, answer: Path) -> None:
+def contacts(scene: str, files: Files, folds: Path, indentations: Path, models: Path, answer: Path) -> None:
     """Add pokes of every held-out board in pairs, and ask the networks that never saw it."""
-    at = read_scenery(scene, settings, indentations, folds)
+    at = read_scenery(read_settings("contacts", scene, files), indentations, folds)
     asked = at.asked.contacts
-    assert asked is not None
     boards, drawn = zip(
         *(on_board(at, fold, asked, networks_without(models, fold.name)) for fold in at.of("lobo")), strict=True
     )
@@ -41,9 +41,8 @@ def contacts(scene: str, settings: Path, folds: Path, indentations: Path, models
         },
         "auc": stats["auc"],
     }
-    if at.asked.simulate is not None:
-        of, seed = read_synthesis(settings)
-        numbers["superposition"] = superposition(of, asked.separations_mm, seed=seed)
+    if "simulate" in at.asked.own:
+        numbers["superposition"] = superposition(synthesis_of(at.asked), asked.separations_mm, seed=at.asked.seed)
     along = {s: [value for one in drawn for value in one["along"][s]] for s in drawn[0]["along"]}
     write_answer(answer, numbers, {"along": along})
 

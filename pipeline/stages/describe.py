@@ -5,13 +5,13 @@ from pathlib import Path
 from pipeline import io
 from pipeline.evaluation.description import describe as describe_one
 from pipeline.evaluation.description import over_skins
-from pipeline.params import captures_of, read_params
+from pipeline.settings import Files, read_settings
 from pipeline.stages._run import run, say
 
 
-def describe(scene: str, params: Path, indentations: Path, description: Path) -> None:
+def describe(scene: str, files: Files, indentations: Path, description: Path) -> None:
     """Describe every capture of a folder, and put them together over skins."""
-    names = captures_of(scene, read_params(params), indentations)
+    names = read_settings("describe", scene, files).captures_in(indentations)
     captures = [io.read_readings(indentations / f"{name}.parquet") for name in names]
     together = over_skins([(one.skin, describe_one(one)) for one in captures])
     accounts = {one.capture: io.read_account(indentations / f"{one.capture}.parquet") for one in captures}

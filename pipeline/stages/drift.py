@@ -8,19 +8,18 @@ from pipeline.dataset.parts import Part, stack
 from pipeline.evaluation.drift import Answers, field_sizes, late_force, late_window, of_networks, over_windows, pace
 from pipeline.evaluation.drift_findings import findings
 from pipeline.learning.recipe import HEADLINE
-from pipeline.params import captures_of, read_params, read_scene
 from pipeline.sections import Drift
+from pipeline.settings import Files, read_settings
 from pipeline.stages import _drift as work
 from pipeline.stages._experiment import read_folder, read_losses, write_answer
 from pipeline.stages._run import run
 from pipeline.stages._train import Scenery, train_all
 
 
-def drift(scene: str, params: Path, settings: Path, indentations: Path, answer: Path) -> None:
+def drift(scene: str, files: Files, indentations: Path, answer: Path) -> None:
     """Train and test under every no-load policy, on every capture of a folder."""
-    asked = read_scene(settings)
-    assert asked.drift is not None
-    captures = read_folder(indentations, tuple(captures_of(scene, read_params(params), indentations)))
+    asked = read_settings("drift", scene, files)
+    captures = read_folder(indentations, tuple(asked.captures_in(indentations)))
     windows, parts = work.cut(captures, asked.drift, asked.selection)
     pairs = list(work.cells(parts, asked.drift, asked.seed))
     at = Scenery(scene, asked, stack(parts), [])

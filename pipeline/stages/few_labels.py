@@ -10,17 +10,17 @@ from pipeline.evaluation.summary import score_groups
 from pipeline.learning import few_labels as few
 from pipeline.learning.baselines import run_tasks
 from pipeline.learning.cell import Measured
-from pipeline.learning.comparison import FewLabels
+from pipeline.learning.comparison import resolve_few_labels
 from pipeline.learning.executors import make_executor
+from pipeline.settings import Files, read_settings
 from pipeline.stages._run import run, say
 from pipeline.stages._train import Scenery, read_scenery, train_all
-from pipeline.strict import parse
 
 
-def few_labels(scene: str, settings: Path, indentations: Path, folds: Path, scores: Path) -> None:
+def few_labels(scene: str, files: Files, indentations: Path, folds: Path, scores: Path) -> None:
     """Score networks, adapted networks and classical methods with every number of labels on the same rows."""
-    at = read_scenery(scene, settings, indentations, folds)
-    asked = parse(FewLabels, at.asked.few_labels, f"{settings}: few_labels")
+    at = read_scenery(read_settings("few_labels", scene, files), indentations, folds)
+    asked = resolve_few_labels(at.asked.words("few_labels"), at.asked.named, f"{at.asked.where}: few_labels")
     study = few.Study(at.rows, at.of(few.QUESTION), at.asked.seed, asked)
     done: list[few.Done] = []
     for step in (few.networks, few.adapted, few.labelled):  # each goes on from what the last ones trained

@@ -16,6 +16,7 @@ from pipeline.learning.recipe import HEADLINE
 from pipeline.questions import EXPERIMENTS, MAIN_PROTOCOL
 from pipeline.schema import Readings
 from pipeline.seeds import rng_for
+from pipeline.settings import Files, read_settings
 from pipeline.stages._adapt import adaptations, read_starts
 from pipeline.stages._answers import answers_after, answers_before
 from pipeline.stages._experiment import read_folder, read_losses, write_answer
@@ -26,12 +27,12 @@ SHAPE = "shape"  # the recipe on directions, if the scene has one: it ought to c
 
 
 def flexible(
-    scene: str, settings: Path, folds: Path, main: Path, indentations: Path, started: Path, answer: Path
+    scene: str, files: Files, folds: Path, main: Path, indentations: Path, started: Path, answer: Path
 ) -> None:
     """Adapt the networks of the first fold of lobo to every flexible skin, and test on its later passes."""
-    at, starts, captures = read_scenery(scene, settings, main, folds), read_starts(started), read_folder(indentations)
+    at = read_scenery(read_settings("flexible", scene, files), main, folds)
+    starts, captures = read_starts(started), read_folder(indentations)
     asked, first, trained_n = at.asked.adapt, at.of("lobo")[0], len(at.rows)
-    assert asked is not None
     poked = gather(captures, at.asked.selection)
     at = replace(at, rows=stack(at.rows, poked))
     sides = (first.train, np.arange(trained_n, len(at.rows)))
@@ -69,10 +70,9 @@ def _by_depth(captures: Sequence[Readings]) -> list[dict[float, np.ndarray]]:
 
 def _gaps(at: Scenery) -> dict[str, Any]:
     """Tell the gaps between skin and chips of both kinds of boards, and by how much one is less."""
-    assert at.asked.simulate is not None
-    words = at.asked.simulate.model_dump()
     kinds = {"rigid": MAIN_PROTOCOL, "flexible": str(EXPERIMENTS["flexible"])}
-    gap_mm = {kind: words["boards"][words["protocols"][of]["boards"]]["design"]["gap_mm"] for kind, of in kinds.items()}
+    boards = {kind: at.asked.words(f"simulate.protocols.{of}.boards") for kind, of in kinds.items()}
+    gap_mm = {kind: float(at.asked.words(f"simulate.boards.{of}.design.gap_mm")) for kind, of in boards.items()}
     return {"gap_mm": gap_mm, "gap_less_pct": gap_less_pct(gap_mm)}
 
 

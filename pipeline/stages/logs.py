@@ -9,6 +9,7 @@ from pipeline.capture.header import LOG_FILE, PROBE_FILE
 from pipeline.dataset.captures import read_header
 from pipeline.evaluation.logs import describe, estimate, score_contacts, thin, truth_at
 from pipeline.evaluation.turning import Log
+from pipeline.settings import Files, read_settings
 from pipeline.stages._experiment import write_answer
 from pipeline.stages._logs import turned
 from pipeline.stages._networks import networks_without
@@ -16,8 +17,9 @@ from pipeline.stages._only import only
 from pipeline.stages._run import run, say
 
 
-def logs(scene: str, settings: Path, raw: Path, models: Path, answer: Path) -> None:
+def logs(scene: str, files: Files, raw: Path, models: Path, answer: Path) -> None:
     """Read a folder's walk with networks that never saw its board; score it where its truth is kept, and turn it."""
+    asked = read_settings("logs", scene, files)
     folder = only(sorted(child for child in raw.iterdir() if child.is_dir()), raw)
     t_s, b_uT, _, account = sd_card.read_log(folder / LOG_FILE)
     board = read_header(folder).board
@@ -29,7 +31,7 @@ def logs(scene: str, settings: Path, raw: Path, models: Path, answer: Path) -> N
         known = np.stack([log.x_mm, log.y_mm, log.Fz_N], axis=1)
         known[~log.contact] = np.nan
         true = truth_at(t_s, log.t_start_s, log.t_end_s, known)
-        numbers |= score_contacts(found, true) | turned(Log(t_s, b_uT, true, found.quiet_n), board, settings, networks)
+        numbers |= score_contacts(found, true) | turned(Log(t_s, b_uT, true, found.quiet_n), board, asked, networks)
     losses = {"accounts": [numbers["account"]], "left_out": {}}
     write_answer(answer, numbers, thin(found, true), losses)
     say(f"{scene}: {numbers['contacts_n']} contacts in {numbers['duration_s']:.1f} s of log")

@@ -14,6 +14,7 @@ from pipeline.evaluation.adapted import AFTER, CONTROL, Answered
 from pipeline.evaluation.manual import GRID, answer_manual
 from pipeline.learning.cell import Cell
 from pipeline.learning.recipe import HEADLINE, Adaptations
+from pipeline.settings import Files, read_settings
 from pipeline.stages._adapt import Pokes, Starts, adaptation, own_starts, pool_lines, read_starts
 from pipeline.stages._answers import answers_after, answers_before
 from pipeline.stages._experiment import read_folder, read_losses, write_answer
@@ -21,13 +22,11 @@ from pipeline.stages._run import run
 from pipeline.stages._train import Scenery, read_scenery
 
 
-def manual(
-    scene: str, settings: Path, folds: Path, main: Path, indentations: Path, started: Path, answer: Path
-) -> None:
+def manual(scene: str, files: Files, folds: Path, main: Path, indentations: Path, started: Path, answer: Path) -> None:
     """Adapt to every skin that was poked by hand, and by as many pokes of the robot; test on the robot's grid."""
-    at, starts = read_scenery(scene, settings, main, folds), read_starts(started)
+    at = read_scenery(read_settings("manual", scene, files), main, folds)
+    starts = read_starts(started)
     asked = at.asked.adapt
-    assert asked is not None
     poked, found = hand_rows(read_folder(indentations))
     lines = {skin: shifted(own, len(at.rows)) for skin, own in found.items()}
     at = replace(at, rows=stack(at.rows, poked))

@@ -3,25 +3,30 @@
 from pathlib import Path
 
 from pipeline import io
-from pipeline.params import Scene, modelled, read_scene, swept
+from pipeline.asking import Asking, modelled, swept
+from pipeline.home import home, is_experiment
 from pipeline.reporting.learned import curves_of
 from pipeline.server import TrackingAway
+from pipeline.settings import Files, read_settings
 from pipeline.stages._run import run, say
 from pipeline.tracking import Curves, metrics_of
 from pipeline.tracking import publish as write
 
 
-def publish(scene: str, settings: Path, models: Path, answers: Path, reports: Path) -> None:
+def publish(scene: str, files: Files, models: Path, answers: Path, reports: Path) -> None:
     """Write every training of a scene and its report to MLflow once; if the server is away, say so and go on."""
-    asked = read_scene(settings)
+    asked = read_settings("publish", scene, files).asking
     arms = {arm: models / arm for arm in modelled(asked)}
+    name = (
+        f"{scene} (dvc exp)" if is_experiment() else scene
+    )  # beside the checkout's own results, and not in their place
     try:
-        say(f"{scene}: MLflow runs {write(arms, read_curves(asked, answers), reports, scene=scene, root=Path())}")
+        say(f"{name}: MLflow runs {write(arms, read_curves(asked, answers), reports, scene=name, root=home())}")
     except TrackingAway as away:
         say(f"warning: {scene} is not in MLflow: {away}")
 
 
-def read_curves(asked: Scene, answers: Path) -> Curves:
+def read_curves(asked: Asking, answers: Path) -> Curves:
     """Read the points of every sweep and the numbers of every experiment, as curves by stage."""
     stages = swept(asked)
     points = {question: io.read_json(answers / f"{stage}.json") for question, stage in stages.items()}

@@ -3,9 +3,9 @@
 from pathlib import Path
 
 from pipeline import io
+from pipeline.asking import modelled
 from pipeline.evaluation.choice import to_record
 from pipeline.learning.recipe import HEADLINE
-from pipeline.params import check_planned, modelled, read_params, read_scene
 from pipeline.reporting.experiments.parts import experiment_figures
 from pipeline.reporting.figures import error_grids
 from pipeline.reporting.page import page
@@ -13,26 +13,21 @@ from pipeline.reporting.scores import headline_scores
 from pipeline.reporting.sweeps import learning_figures, learning_pages
 from pipeline.reporting.tables import make_tables, table_texts
 from pipeline.reporting.work_precision import pages
+from pipeline.settings import Files, read_settings
 from pipeline.stages._report import Places, read_cards, read_numbers
 from pipeline.stages._run import run, say
 
 
 def report(
-    scene: str,
-    params: Path,
-    settings: Path,
-    indentations: Path,
-    folds: Path,
-    models: Path,
-    answers: Path,
-    reports: Path,
+    scene: str, files: Files, indentations: Path, folds: Path, models: Path, answers: Path, reports: Path
 ) -> None:
     """Write the numbers, tables, figures and the page of a scene."""
-    asked = read_scene(settings)
-    check_planned(scene, asked, read_params(params), str(settings))
-    numbers, drawn = read_numbers(scene, asked, Places(indentations, folds, models, answers))
+    known = read_settings("report", scene, files)
+    known.check_questions()
+    asked = known.asking
+    numbers, drawn = read_numbers(known, Places(indentations, folds, models, answers))
     if "choice" in asked.questions:
-        record = to_record(numbers["chosen"], read_cards(asked, models), source=asked.source, seed=asked.seed)
+        record = to_record(numbers["chosen"], read_cards(asked, models), source=asked.source, seed=known.seed)
         io.write_json(reports / "choice.json", record)
     io.write_json(reports / "numbers.json", numbers)
     io.write_json(reports / "scores.json", headline_scores(numbers))

@@ -11,24 +11,25 @@ from pipeline.evaluation.work_precision.quadrature import study_quadratures
 from pipeline.evaluation.work_precision.settings import RunTime
 from pipeline.evaluation.work_precision.stopwatch import race
 from pipeline.evaluation.work_precision.trials import Trial, draw_trial
-from pipeline.params import read_scene
 from pipeline.physics.board import draw_board
 from pipeline.provenance import SECONDS
+from pipeline.settings import Files, read_settings
 from pipeline.stages._run import run, say
-from pipeline.stages._simulated import read_synthesis
+from pipeline.stages._simulated import synthesis_of
 from pipeline.strict import parse
 from pipeline.synthesis.capture import MAIN, Synthesis, roster
 
 
-def runtime(scene: str, settings: Path, answer: Path) -> None:
+def runtime(scene: str, files: Files, answer: Path) -> None:
     """Compare quadratures and integrators; seconds differ between identical runs, so they are no output."""
-    of, seed = read_synthesis(settings)
-    asked = parse(RunTime, read_scene(settings).runtime, f"{settings}: runtime")
-    rows, calls = study_quadratures(_trials(of, asked, seed), asked.quadratures.rules_of())
-    more, more_calls = study_integrators(asked.integrators.sweep())
+    asked = read_settings("runtime", scene, files)
+    of, seed = synthesis_of(asked), asked.seed
+    tried = parse(RunTime, asked.words("runtime"), f"{asked.where}: runtime")
+    rows, calls = study_quadratures(_trials(of, tried, seed), tried.quadratures.rules_of())
+    more, more_calls = study_integrators(tried.integrators.sweep())
     choice = choose(rows, used=of.main_boards.quadrature.quadrature())
     io.write_json(
-        SECONDS / scene / "runtime.json", [asdict(one) for one in race([*calls, *more_calls], asked.repeats_n)]
+        SECONDS / scene / "runtime.json", [asdict(one) for one in race([*calls, *more_calls], tried.repeats_n)]
     )
     words: dict[str, Any] = {"choice": asdict(choice)}
     words |= {"quadratures": [asdict(row) for row in rows], "integrators": [asdict(row) for row in more]}

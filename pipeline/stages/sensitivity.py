@@ -4,19 +4,19 @@ from pathlib import Path
 
 from pipeline.dataset.baseline import subtract
 from pipeline.evaluation.sensitivity import answer_of, levels_of
+from pipeline.settings import Files, read_settings
 from pipeline.stages._experiment import read_folder, read_losses, write_answer
 from pipeline.stages._only import only
 from pipeline.stages._run import run, say
-from pipeline.stages._simulated import read_synthesis
+from pipeline.strict import parse_parts
 from pipeline.synthesis.pressing import weights_N
 from pipeline.synthesis.protocols import Load
 
 
-def sensitivity(scene: str, settings: Path, indentations: Path, answer: Path) -> None:
+def sensitivity(scene: str, files: Files, indentations: Path, answer: Path) -> None:
     """Tell how small a weight the one skin tells that was loaded."""
-    synthesis, _ = read_synthesis(settings)
-    asked = synthesis.protocols["glass"]
-    assert isinstance(asked, Load), "the plan names it"
+    glass = read_settings("sensitivity", scene, files).words("simulate.protocols.glass")
+    asked = parse_parts(Load, glass, "simulate.protocols.glass")
     one = only(read_folder(indentations), indentations)
     weight_N = weights_N(asked.force_max_N, asked.step_N)
     change_uT = subtract(one.b_uT, one.noload_uT)

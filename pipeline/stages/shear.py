@@ -8,9 +8,9 @@ from pipeline.dataset.hold_out import NO_POOL, Fold
 from pipeline.dataset.rows import SHEAR_TARGETS, Rows, gather
 from pipeline.dataset.single import draw_sides
 from pipeline.evaluation.shear import answer_shear, score5
-from pipeline.params import read_scene
 from pipeline.sections import Shear
 from pipeline.seeds import rng_for, seed_for
+from pipeline.settings import Files, read_settings
 from pipeline.stages._experiment import read_folder, read_losses, write_answer
 from pipeline.stages._models import note_seconds
 from pipeline.stages._run import run
@@ -20,10 +20,9 @@ DRAWN_N = 400  # more points than these are not told apart in a panel
 MILLI = 3  # decimals of a force in the figure: more than are seen
 
 
-def shear(scene: str, settings: Path, indentations: Path, answer: Path) -> None:
+def shear(scene: str, files: Files, indentations: Path, answer: Path) -> None:
     """Train with five targets on both splits of every skin, and score what was held out."""
-    asked = read_scene(settings)
-    assert asked.shear is not None
+    asked = read_settings("shear", scene, files)
     rows = gather(read_folder(indentations), asked.selection, targets=SHEAR_TARGETS)
     by_reading = _folds(rows, np.arange(len(rows)), "reading", asked.shear, asked.seed)
     by_line = _folds(rows, rows.indentation, "line", asked.shear, asked.seed)

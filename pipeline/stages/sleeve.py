@@ -11,21 +11,21 @@ from pipeline.learning.cell import Cell, Measured
 from pipeline.learning.classical import Neighbours
 from pipeline.learning.executors import make_executor
 from pipeline.learning.recipe import HEADLINE
-from pipeline.params import read_scene
 from pipeline.questions import EXPERIMENTS
 from pipeline.sections import Sleeve
+from pipeline.settings import Files, Settings, read_settings
 from pipeline.stages._experiment import read_folder, read_losses, write_answer
 from pipeline.stages._models import note_seconds
 from pipeline.stages._run import run, say
-from pipeline.stages._simulated import read_synthesis
+from pipeline.stages._simulated import synthesis_of
 from pipeline.stages._train import Scenery, train_all
 
 
-def sleeve(scene: str, settings: Path, indentations: Path, answer: Path) -> None:
+def sleeve(scene: str, files: Files, indentations: Path, answer: Path) -> None:
     """Train the recipes of section sleeve on the first pokes, score them and nearest neighbours on the last."""
-    section, captures, area = read_scene(settings).sleeve, read_folder(indentations), _area(settings)
-    assert section is not None
-    at = Scenery(scene, read_scene(settings), gather(captures, read_scene(settings).selection), [])
+    asked = read_settings("sleeve", scene, files)
+    section, captures, area = asked.sleeve, read_folder(indentations), _area(asked)
+    at = Scenery(scene, asked, gather(captures, asked.selection), [])
     train, test = evaluation.hold_out_last(at.rows, section.test_fraction)
     cells = [
         Cell("sleeve", name, recipe, "last", at.asked.seed, seed_i, train, test)
@@ -50,11 +50,9 @@ def sleeve(scene: str, settings: Path, indentations: Path, answer: Path) -> None
     write_answer(answer, numbers, drawn, read_losses(indentations, at.rows.dropped))
 
 
-def _area(settings: Path) -> evaluation.Area:
-    synthesis, _ = read_synthesis(settings)
+def _area(asked: Settings) -> evaluation.Area:
     protocol = EXPERIMENTS["sleeve"]
-    assert protocol is not None
-    kind = synthesis.boards[synthesis.protocols[protocol].boards]
+    kind = synthesis_of(asked).boards[asked.words(f"simulate.protocols.{protocol}.boards")]
     tiles = kind.design.tiles
     boards_n, pitch_mm = ((1, 1), 0.0) if tiles is None else ((tiles.columns_n, tiles.rows_n), tiles.pitch_mm)
     return evaluation.lay_out(kind.skin_mm, kind.design.places_mm, boards_n=boards_n, pitch_mm=pitch_mm)

@@ -6,13 +6,15 @@ from pathlib import Path
 from pipeline import io
 from pipeline.evaluation.stability.survey import survey
 from pipeline.extremes.learning import learning_cases
+from pipeline.settings import Files, read_settings
 from pipeline.stages._run import run, say
-from pipeline.stages._simulated import read_synthesis
+from pipeline.stages._simulated import synthesis_of
 
 
-def stability(scene: str, settings: Path, answer: Path) -> None:
+def stability(scene: str, files: Files, answer: Path) -> None:
     """Try every case on the scene's own skins and chips and on small trainings, and write down what happened."""
-    of, seed = read_synthesis(settings)
+    asked = read_settings("stability", scene, files)
+    of, seed = synthesis_of(asked), asked.seed
     cases = [
         *survey(of.main_boards.design, of.spreads, skin=of.skin, chip=of.chip, seed=seed),
         *learning_cases(seed),

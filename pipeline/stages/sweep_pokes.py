@@ -6,22 +6,24 @@ from typing import Any
 from pipeline import io
 from pipeline.errors import ParamsError, complain
 from pipeline.learning.recipe import HEADLINE
+from pipeline.settings import Files, read_settings
 from pipeline.stages._adapt import adaptations, read_starts
 from pipeline.stages._models import note_seconds, point_of
 from pipeline.stages._run import run
 from pipeline.stages._train import read_scenery, train_all
 
 
-def sweep_pokes(scene: str, settings: Path, indentations: Path, folds: Path, started: Path, scores: Path) -> None:
+def sweep_pokes(scene: str, files: Files, indentations: Path, folds: Path, started: Path, scores: Path) -> None:
     """Score every number of pokes; none at all is the network as it was trained."""
-    at, starts = read_scenery(scene, settings, indentations, folds), read_starts(started)
+    at, starts = (
+        read_scenery(read_settings("sweep_pokes", scene, files), indentations, folds),
+        read_starts(started),
+    )
     asked, own = at.asked.sweep_pokes, at.asked.adapt
-    assert asked is not None
-    assert own is not None
     named, held_out = (HEADLINE, own.recipes[HEADLINE]), at.of("lobo")[-asked.boards_n :]
     if asked.boards_n > len(held_out):
         rule = f"at most the {len(held_out)} boards of the scene"
-        raise ParamsError(complain(str(settings), "sweep_pokes.boards_n", rule, asked.boards_n, "Ask for fewer."))
+        raise ParamsError(complain(at.asked.where, "sweep_pokes.boards_n", rule, asked.boards_n, "Ask for fewer."))
     asked_of = [(fold, pokes_n) for fold in held_out for pokes_n in asked.pokes_n if pokes_n]
     pairs = [
         (cell, pokes_n)

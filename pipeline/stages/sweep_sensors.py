@@ -5,19 +5,17 @@ from pathlib import Path
 from pipeline import io
 from pipeline.learning.cell import Cell, Start
 from pipeline.learning.recipe import HEADLINE, Recipe
+from pipeline.settings import Files, read_settings
 from pipeline.stages._adapt import adaptations
 from pipeline.stages._models import note_seconds, point_of
 from pipeline.stages._run import run
 from pipeline.stages._train import Scenery, read_scenery, train_all
 
 
-def sweep_sensors(scene: str, settings: Path, indentations: Path, folds: Path, scores: Path) -> None:
+def sweep_sensors(scene: str, files: Files, indentations: Path, folds: Path, scores: Path) -> None:
     """Train the headline recipes on every draw of skins, adapt to each held-out skin, and score."""
-    at = read_scenery(scene, settings, indentations, folds)
+    at = read_scenery(read_settings("sweep_sensors", scene, files), indentations, folds)
     multi, triplet, own = at.asked.train_multi, at.asked.train_triplet, at.asked.adapt
-    assert multi is not None
-    assert triplet is not None
-    assert own is not None
     fine = own.recipes[HEADLINE]
     plain = _cells(at, multi.recipes[HEADLINE], "multi")
     based = _cells(at, triplet.recipes[fine.base], "triplet")

@@ -8,20 +8,23 @@ from pipeline import io
 from pipeline.evaluation.summary import score_groups
 from pipeline.learning.baselines import Task, run_tasks
 from pipeline.learning.cell import Measured
-from pipeline.learning.comparison import Baselines
+from pipeline.learning.comparison import resolve_baselines
 from pipeline.learning.executors import make_executor
 from pipeline.provenance import SECONDS
+from pipeline.settings import Files, read_settings
 from pipeline.stages._run import run, say
 from pipeline.stages._train import read_scenery
-from pipeline.strict import parse
 
 NO_ROWS = np.zeros(0, np.int64)
 
 
-def train_classical(scene: str, settings: Path, indentations: Path, folds: Path, scores: Path) -> None:
+def train_classical(scene: str, files: Files, indentations: Path, folds: Path, scores: Path) -> None:
     """Fit every method of section train_classical with one board held out."""
-    at = read_scenery(scene, settings, indentations, folds)
-    asked, rows = parse(Baselines, at.asked.train_classical, f"{settings}: train_classical"), at.rows
+    at = read_scenery(read_settings("train_classical", scene, files), indentations, folds)
+    asked, rows = (
+        resolve_baselines(at.asked.words("train_classical"), at.asked.named, f"{at.asked.where}: train_classical"),
+        at.rows,
+    )
     pairs = [(fold, name) for fold in at.of("lobo") for name in asked.methods]
     tasks = [
         Task(f"{name}.{f.name}", asked.methods[name], f.train, f.test, NO_ROWS, asked.rows_max_n, at.asked.seed)

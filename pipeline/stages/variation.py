@@ -6,25 +6,24 @@ from typing import Any
 from pipeline import io
 from pipeline.evaluation.drift import pace
 from pipeline.evaluation.variation import Visits, find_visits, first_of_each_board, meanwhile, over_skins, over_time
-from pipeline.params import captures_of, read_params, read_scene
 from pipeline.sections import Variation
+from pipeline.settings import Files, read_settings
 from pipeline.stages._experiment import read_folder, read_losses, write_answer
 from pipeline.stages._run import run
 
 
-def variation(scene: str, params: Path, settings: Path, main: Path, indentations: Path, answer: Path) -> None:
+def variation(scene: str, files: Files, main: Path, indentations: Path, answer: Path) -> None:
     """Compare visits of equal places: of the worn skin in `indentations`, and of several skins in `main`."""
-    asked = read_scene(settings).variation
-    assert asked is not None
+    own = read_settings("variation", scene, files)
+    asked = own.variation
     worn = read_folder(indentations)[0]
-    names = captures_of(scene, read_params(params), main)
-    of_skins = _visits(main, names, asked)
+    of_skins = _visits(main, own.captures_in(main), asked)
     places: list[dict[str, Any]] = []
     drawn: list[dict[str, Any]] = []
     for place_i, (x_mm, y_mm) in enumerate(asked.places_mm):
         over = {
             "time": over_time(find_visits(worn, (x_mm, y_mm), asked.depth_mm), asked.contacts_n),
-            "skins": over_skins({skin: own[place_i] for skin, own in of_skins.items()}),
+            "skins": over_skins({skin: visits[place_i] for skin, visits in of_skins.items()}),
         }
         where = {"x_mm": x_mm, "y_mm": y_mm}
         places.append(where | {name: told for name, (told, _) in over.items()})

@@ -8,13 +8,15 @@ from scipy.constants import milli
 from pipeline import io
 from pipeline.evaluation.verification.verify import Designs
 from pipeline.evaluation.verification.verify import verify as check_all
+from pipeline.settings import Files, read_settings
 from pipeline.stages._run import run, say
-from pipeline.stages._simulated import read_synthesis
+from pipeline.stages._simulated import synthesis_of
 
 
-def verify(scene: str, settings: Path, answer: Path) -> None:
+def verify(scene: str, files: Files, answer: Path) -> None:
     """Check the scene's own skins, pokes and chips."""
-    of, seed = read_synthesis(settings)
+    asked = read_settings("verify", scene, files)
+    of, seed = synthesis_of(asked), asked.seed
     depths_m = tuple(milli * depth_mm for depth_mm in of.main.depths_mm)
     designs = Designs(of.main_boards.design, of.spreads, of.skin, of.chip, of.main_boards.quadrature.quadrature())
     checks = check_all(designs, depths_m=depths_m, seed=seed)

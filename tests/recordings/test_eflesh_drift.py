@@ -7,6 +7,7 @@ from ruamel.yaml import YAML
 
 from pipeline import io
 from pipeline.capture.readers import eflesh
+from pipeline.settings import Files
 from pipeline.stages.drift import drift
 from tests.recordings.test_recordings import SPATIAL, ingest
 
@@ -25,14 +26,15 @@ def test_fresh_no_load_readings_keep_eflesh_accurate_and_a_single_one_loses_it(s
     io.write_readings(tmp_path / "indentations" / f"{readings.capture}.parquet", [readings], account)
     yaml = YAML(typ="safe")
     settings = yaml.load((ROOT / "pipeline/scenes/eflesh.yaml").read_text())
-    settings["drift"]["training"]["recipes"]["paper"] |= {"steps_n": 1200}
+    settings["drift"]["training"]["steps_n"] = 1200
     params = yaml.load((ROOT / "params.yaml").read_text())
-    params["stages"]["split"]["eflesh"] = [readings.capture]
-    for name, words in {"eflesh.yaml": settings, "params.yaml": params}.items():
+    stages = {"drift": {"eflesh": {"scene": "eflesh", "recipe": settings["drift"]["training"]["recipe"]}}}
+    plan = {"stages": stages | {"split": {"eflesh": {"captures": [readings.capture]}}}}
+    for name, words in {"eflesh.yaml": settings, "params.yaml": params, "plan.yaml": plan}.items():
         with (tmp_path / name).open("w") as stream:
             YAML().dump(words, stream)
     drift(
-        scene="eflesh", params=tmp_path / "params.yaml", settings=tmp_path / "eflesh.yaml",
+        scene="eflesh", files=Files(tmp_path / "eflesh.yaml", tmp_path / "params.yaml", tmp_path / "plan.yaml"),
         indentations=tmp_path / "indentations", answer=tmp_path / "answer.json",
     )  # fmt: skip
     numbers = io.read_json(tmp_path / "answer.json")["numbers"]

@@ -19,20 +19,16 @@ def lab(tmp_path_factory, shared_data) -> Iterator[Path]:
     scene = root / plan.SCENES / "lab.yaml"
     settings = YAML(typ="safe").load(scene.read_text())
     settings["train_multi"]["seeds_n"] = 1
-    settings["train_multi"]["recipes"] = {"paper": settings["train_multi"]["recipes"]["paper"] | {"steps_n": 100}}
+    settings["train_multi"] |= {"steps_n": 100, "variants": {}}
     settings["split"] = {"labels_draws_n": 1, "labels_pool_n": 20}  # of 65: one depth is added here
     few = settings["few_labels"]
-    few["recipes"] = {"network": few["recipes"]["network-triplet"] | {"steps_n": 20}}
-    few |= {"adapted": ["network"], "methods": {"knn": few["methods"]["knn-shape"]}, "labels_n": [0, 10]}
+    few |= {"recipes": {"network": few["recipes"]["network-triplet"]}, "steps_n": 20}
+    few |= {"adapted": ["network"], "methods": "tiny", "labels_n": [0, 10]}
     for part in ("adapting", "labelling"):
         few[part]["steps_n"] = 5
     with scene.open("w") as stream:
         YAML().dump(settings, stream)
-    params = YAML(typ="safe").load((root / plan.PARAMS).read_text())
-    params["scenes"] = []
-    params["stages"] = {name: {} if isinstance(of, dict) else [] for name, of in params["stages"].items()}
-    with (root / plan.PARAMS).open("w") as stream:
-        YAML().dump(params, stream)
+    plan.use(root, [])
     for board in (1, 2):
         add(root, shared_data / f"lab/board{board}_depth2.csv", f"board{board}", f"skin{board}")
     run(root, "dvc", "repro")

@@ -7,11 +7,12 @@ import numpy as np
 
 from pipeline.dataset.grid import points_mm
 from pipeline.dataset.splits import Fold
-from pipeline.params import read_scene
 from pipeline.sections import Contacts
 from pipeline.seeds import rng_for
+from pipeline.settings import Settings
 from pipeline.stages._contacts import on_board
 from pipeline.stages._train import Scenery
+from pipeline.strict import read_yaml
 from tests.dataset import tables
 
 ASKED = Contacts(pairs_n=40, separations_mm=(4.0, 8.0), false_alarm_fraction=0.1)
@@ -28,7 +29,9 @@ def scenery():
     near = np.exp(-((places_mm[:, None] - spots_mm) ** 2).sum(axis=2) / 50)
     db_uT = (200 * force_N[:, None] * near).astype(np.float32)
     target = np.column_stack([places_mm, force_N]).astype(np.float32)
-    return Scenery("test", read_scene(CI), replace(rows, db_uT=db_uT, target=target), [])
+    return Scenery(
+        "test", Settings("ci", "ci.yaml", read_yaml(CI), {}, {}), replace(rows, db_uT=db_uT, target=target), []
+    )
 
 
 def nearest(at):

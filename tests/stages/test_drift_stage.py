@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from pipeline.reporting.experiments import drift as drift_pages
 from pipeline.reporting.experiments import variation as variation_pages
 from pipeline.schema import Readings
 from pipeline.seeds import rng_for
+from pipeline.settings import Files
 from pipeline.stages.drift import drift
 from pipeline.stages.variation import variation
 from tests.dataset.tables import readings
@@ -49,19 +51,21 @@ def write(folder: Path, *captures: Readings) -> Path:
 
 
 @pytest.fixture
-def scene(tmp_path, monkeypatch) -> dict[str, Path]:
+def scene(tmp_path, monkeypatch) -> dict[str, Any]:
     """Options that both stages take: scene ci with longer trainings, which are kept in the folder of the test."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("RESKIN_EXECUTOR", "here")
     settings = YAML(typ="safe").load((ROOT / "pipeline/scenes/ci.yaml").read_text())
-    settings["drift"]["training"]["recipes"]["paper"] |= {"steps_n": 300}
+    settings["drift"]["training"]["steps_n"] = 300
     settings["variation"]["skins_n"] = 2
     shared = YAML(typ="safe").load((ROOT / "params.yaml").read_text())
-    shared["stages"]["split"] |= {"ci": []}
-    for name, words in {"ci.yaml": settings, "params.yaml": shared}.items():
+    stages = {"drift": {"ci": {"scene": "ci", "recipe": "paper"}}, "variation": {"ci": {"scene": "ci"}}}
+    plan = {"stages": stages | {"split": {"ci": {"captures": []}}}}
+    for name, words in {"ci.yaml": settings, "params.yaml": shared, "plan.yaml": plan}.items():
         with (tmp_path / name).open("w") as stream:
             YAML().dump(words, stream)
-    return {"settings": tmp_path / "ci.yaml", "params": tmp_path / "params.yaml", "answer": tmp_path / "answer.json"}
+    files = Files(tmp_path / "ci.yaml", tmp_path / "params.yaml", tmp_path / "plan.yaml")
+    return {"files": files, "answer": tmp_path / "answer.json"}
 
 
 def test_a_drifting_skin_is_answered_in_every_window_and_a_single_no_load_reading_is_worst(scene, tmp_path):

@@ -1,0 +1,318 @@
+"""Settings obey: an override by DVC changes the effective value, and exactly the stages that read it."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from ruamel.yaml import YAML
+
+from pipeline import plan, settings
+from pipeline.errors import ParamsError
+from pipeline.learning import comparison
+from pipeline.reads import READS
+from pipeline.registry import Entry, Registry
+from pipeline.settings import EAGER, Files, Settings, keys_of, read_settings
+from pipeline.stages._simulated import synthesis_of
+from pipeline.strict import read_yaml
+from tests.stages.checkout import copy_checkout
+
+ROOT = Path(__file__).resolve().parents[1]
+SCENE, SHARED = "pipeline/scenes/ci.yaml", "params.yaml"
+VALUES: dict[tuple[str, str, bytes], Any] = {}  # by file, key and content
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of DVC's own libraries
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory) -> Path:
+    """A checkout that runs scene ci."""
+    folder = copy_checkout(tmp_path_factory.mktemp("settings"))
+    plan.use(folder, ["ci"])
+    return folder
+
+
+def files_of(root: Path) -> Files:
+    return Files(root / SCENE, root / SHARED, root / plan.PLAN)
+
+
+def items(root: Path) -> dict[str, tuple[str, str, dict[str, Any]]]:
+    """Every stage that reads settings by DVC's name of it: its module, its key and its item in the plan."""
+    stages = settings.read_yaml(root / plan.PLAN)["stages"]
+    return {f"{stage}@{key}": (stage, key, item) for stage in READS for key, item in stages[stage].items()}
+
+
+def effective(asked: Settings) -> str:
+    """All that a stage gets of its settings, parsed and put together as its code does it."""
+    found = {name: getattr(asked, name) for name in EAGER if name in asked.own}
+    words = {name: one.model_dump(mode="json") if hasattr(one, "model_dump") else one for name, one in found.items()}
+    words["simulate"] = asked.own.get("simulate")
+    if {"skin", "spreads"} & set(asked.shared):  # else a stage takes one or two numbers of section simulate
+        words["making"] = {name: repr(part) for name, part in synthesis_of(asked).__dict__.items()}
+    if "train_classical" in asked.own:
+        words["train_classical"] = repr(comparison.resolve_baselines(asked.words("train_classical"), asked.named, ""))
+    if "few_labels" in asked.own:
+        words["few_labels"] = repr(comparison.resolve_few_labels(asked.words("few_labels"), asked.named, ""))
+    words["runtime"] = asked.own.get("runtime")
+    return json.dumps(words | {"planned": asked.planned}, sort_keys=True, default=str)
+
+
+def read_all(root: Path) -> dict[str, str]:
+    return {name: effective(read_settings(stage, key, files_of(root))) for name, (stage, key, _) in items(root).items()}
+
+
+def stages_of(root: Path) -> list[Any]:
+    """The stages as DVC makes them of dvc.yaml and the plan."""
+    from dvc.repo import Repo
+
+    with Repo(str(root)) as repo:
+        return list(repo.index.stages)
+
+
+def value_of(fs: Any, path: str, key: str) -> Any:
+    """Read what DVC reads under one key; equal keys of many stages are looked up once."""
+    from dvc.dependency.param import read_param_file
+
+    at = path, key, Path(path).read_bytes()
+    if at not in VALUES:
+        VALUES[at] = read_param_file(fs, path, [key], flatten=True)[key]
+    return VALUES[at]
+
+
+def tracked(root: Path, stages: list[Any]) -> dict[str, dict[str, Any]]:
+    """What DVC goes by, for every stage: the values of its parameters and its command, as DVC itself reads them."""
+    return {
+        stage.name: {"cmd": stage.cmd}
+        | {
+            str(Path(dep.fs_path).relative_to(root)): {
+                key: value_of(dep.repo.fs, dep.fs_path, key) for key in dep.params
+            }
+            for dep in stage.deps
+            if hasattr(dep, "params")
+        }
+        for stage in stages
+    }
+
+
+def override(file: Path, words: str) -> None:
+    """Do what `dvc exp run -S file:words` does to a file."""
+    from dvc.utils.hydra import apply_overrides
+
+    apply_overrides(file, [words])
+
+
+ENTRY = Entry(board="b", skin="s", layout="lab", chips_n=5, fingerprints=("0",), copy_of=None)
+CAPTURES = Registry(captures={scene: {"c0": ENTRY} for scene in ("lab", "ini", "eflesh")})
+SIMULATED = ("ci", "ci-wear", "ci-flexible", "ci-hand", "ci-drag", "ci-sleeve", "ci-glass", "ci-press", "ci-log")
+ALL_SIMULATE = {f"simulate@{key}" for key in SIMULATED}
+RIGID = ALL_SIMULATE - {"simulate@ci-flexible", "simulate@ci-sleeve"}
+PLAIN = {"train_single", "train_multi", "sweep_sensors", "drift", "shear", "sleeve", "ambient"}
+BASED = {"adapt", "sweep_pokes", "sweep_sensors", "manual", "flexible"}
+DRAWN = {"logs", "ambient", "contacts", "runtime", "leave_out"}
+SEEDED = {stage for stage, reads in READS.items() if "seed" in reads.own} - {"simulate", "verify", "stability"}
+SELECTED = {stage for stage, reads in READS.items() if "selection" in reads.own}
+
+OVERRIDES: list[tuple[str, str, set[str]]] = [
+    (SHARED, "recipes.paper.rate_max=0.001", PLAIN),
+    (SHARED, "recipes.paper.inputs=shape", PLAIN),
+    (SHARED, "recipes.triplet.triplet_weight=0.2", {"train_triplet", "few_labels", *BASED}),
+    (SHARED, "recipes.triplet.batch_n=32", {"train_triplet", "few_labels", *BASED}),
+    (SHARED, "recipes.slow.rate_max=0.001", set()),  # of other scenes
+    (SHARED, "adaptations.paper.rate_max=0.0005", {"few_labels", *BASED}),
+    (SHARED, "labellings.few.own_weight=2.0", {"few_labels"}),
+    (SHARED, "methods.tiny.ridge.alpha=2.0", {"train_classical", "few_labels"}),
+    (SHARED, "methods.all.ridge.alpha=2.0", set()),
+    (SHARED, "skin.modulus_kPa=300.0", ALL_SIMULATE | DRAWN - {"logs"}),
+    (SHARED, "chip.noise_xy_uT=4.0", ALL_SIMULATE | {"logs", "ambient"}),
+    (SHARED, "chip.gain_sel=5", ALL_SIMULATE | {"logs", "ambient", "leave_out"}),
+    (SHARED, "rig.rate_hz=200.0", ALL_SIMULATE),
+    (SHARED, "rig.readings_n=3", ALL_SIMULATE | {"logs", "ambient"}),
+    (SHARED, "spreads.chip_tilt_deg=1.0", ALL_SIMULATE | DRAWN),
+    (SHARED, "terms.ageing.settling=0.2", {"simulate@ci-wear"}),
+    (SHARED, "terms.friction.coefficient=0.5", {"simulate@ci-hand", "simulate@ci-drag"}),
+    (SHARED, "terms.relaxation.hold_s=1.0", {"simulate@ci-wear", "simulate@ci-hand"}),
+    (SCENE, "seed=7", ALL_SIMULATE | SEEDED),
+    (SCENE, "selection.force_min_N=0.1", SELECTED),
+    (SCENE, "split.random_test_fraction=0.2", {"split"}),
+    (SCENE, "split.pool_passes_n=2", {"split", "flexible"}),
+    (SCENE, "simulate.protocols.grid.passes_n=3", {"simulate@ci", "leave_out"}),
+    (SCENE, "simulate.protocols.grid.depths_mm=[0.5]", {"simulate@ci", "leave_out", "contacts"}),
+    (SCENE, "simulate.protocols.drag.step_mm=1.0", {"simulate@ci-drag", "leave_out"}),
+    (SCENE, "simulate.protocols.glass.step_N=0.1", {"simulate@ci-glass", "sensitivity", "leave_out"}),
+    (SCENE, "simulate.boards.rigid.design.gap_mm=1.0", RIGID | DRAWN | {"flexible"}),
+    (SCENE, "simulate.boards.flexible.design.gap_mm=0.5", {"simulate@ci-flexible", "flexible"}),
+    (SCENE, "simulate.boards.sleeve.design.tiles.pitch_mm=25.0", {"simulate@ci-sleeve", "sleeve"}),
+    (SCENE, "simulate.boards.rigid.quadrature.cell_mm=1.0", RIGID | DRAWN - {"logs"}),
+    (SCENE, "train_single.steps_n=10", {"train_single"}),
+    (SCENE, "train_multi.steps_n=10", {"train_multi", "sweep_sensors", "ambient"}),
+    (SCENE, "train_multi.seeds_n=2", {"train_multi", "ambient"}),
+    (SCENE, "train_triplet.steps_n=10", {"train_triplet", *BASED}),
+    (SCENE, "train_triplet.seeds_n=1", {"train_triplet"}),
+    (SCENE, "adapt.steps_n=4", BASED),
+    (SCENE, "adapt.pokes_n=30", {"adapt", "sweep_sensors", "flexible"}),
+    (SCENE, "adapt.variants.control.unlabelled_weight=0.01", {"adapt", "manual", "flexible"}),
+    (SCENE, "sweep_pokes.pokes_n=[0,10]", {"sweep_pokes"}),
+    (SCENE, "train_classical.rows_max_n=400", {"train_classical"}),
+    (SCENE, "few_labels.adapting.steps_n=4", {"few_labels"}),
+    (SCENE, "few_labels.recipes.network.inputs=raw", {"few_labels"}),
+    (SCENE, "audit.settings=chosen", {"audit"}),
+    (SCENE, "drift.test_n=20", {"drift"}),
+    (SCENE, "drift.training.steps_n=10", {"drift"}),
+    (SCENE, "variation.contacts_n=100", {"variation"}),
+    (SCENE, "shear.repeats_n=1", {"shear"}),
+    (SCENE, "sleeve.neighbours_n=4", {"sleeve"}),
+    (SCENE, "sleeve.training.seeds_n=2", {"sleeve"}),
+    (SCENE, "contacts.pairs_n=10", {"contacts"}),
+    (SCENE, "ambient.iron.radius_mm=5.0", {"ambient"}),
+    (SCENE, "runtime.repeats_n=2", {"runtime"}),
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _each_content_is_parsed_once():
+    """Thirty stages read the same three files at every override."""
+    import dvc.dependency.param as of_dvc
+
+    def once(read):
+        known: dict[tuple[str, bytes], Any] = {}
+
+        def cached(path, *rest, **words):
+            key = str(path), Path(path).read_bytes()
+            if key not in known:
+                known[key] = read(path, *rest, **words)
+            return known[key]
+
+        return cached
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(of_dvc, "load_path", once(of_dvc.load_path))
+        patch.setattr(settings, "read_yaml", once(settings.read_yaml))
+        yield
+
+
+@pytest.fixture(scope="module")
+def stages(root) -> list[Any]:
+    return stages_of(root)
+
+
+@pytest.fixture(scope="module")
+def before(root, stages) -> tuple[dict[str, str], dict[str, dict[str, Any]]]:
+    return read_all(root), tracked(root, stages)
+
+
+@pytest.mark.parametrize(("file", "words", "readers"), OVERRIDES, ids=[words for _, words, _ in OVERRIDES])
+def test_an_override_changes_what_exactly_the_stages_that_read_it_get(root, stages, before, file, words, readers):
+    written = (root / file).read_bytes()
+    try:
+        override(root / file, words)
+        read, known = read_all(root), tracked(root, stages)
+    finally:
+        (root / file).write_bytes(written)
+    expected = {name if "@" in name else f"{name}@ci" for name in readers}
+    assert {name for name in read if read[name] != before[0][name]} == expected  # what the code gets
+    assert {name for name in known if known[name] != before[1][name]} == expected  # what DVC runs again
+
+
+def test_an_override_of_what_ingest_may_lose_re_runs_ingest_alone(root, before):
+    written = (root / SHARED).read_bytes()
+    try:
+        override(root / SHARED, "lost_fraction_max=0.1")
+        known = tracked(root, stages_of(root))
+    finally:
+        (root / SHARED).write_bytes(written)
+    changed = {name for name in known if known[name] != before[1][name]}
+    assert changed == {f"ingest_simulated@{key}" for key in SIMULATED if key != "ci-log"}
+
+
+@pytest.mark.parametrize("scene", sorted(file.stem for file in (ROOT / plan.SCENES).glob("*.yaml")))
+def test_dvc_tracks_the_keys_that_a_stage_reads_and_no_other(root, scene):
+    template = read_yaml(root / "dvc.yaml")["stages"]
+    made = plan.make_plan({scene: plan.read_scene(root / plan.SCENES / f"{scene}.yaml", root / SHARED)}, CAPTURES)
+    for stage in READS:
+        for key, item in made["stages"][stage].items():
+            listed = fill(template[stage]["do"]["params"], key, item)
+            own, shared, planned = keys_of(stage, item)
+            files = {f"{plan.SCENES}/{scene}.yaml": own, SHARED: shared, plan.PLAN: planned}
+            assert listed == {file: set(keys) for file, keys in files.items() if keys}, f"{stage}@{key}"
+
+
+def fill(params: list[Any], key: str, item: dict[str, Any]) -> dict[str, set[str]]:
+    """Put the words of an item into a stage's parameters, as DVC does."""
+
+    def put(text: str) -> str:
+        def value(match: re.Match[str]) -> str:
+            name, i = re.fullmatch(r"(\w+)(?:\[(\d)\])?", match[1]).groups()
+            return item[name] if i is None else item[name][int(i)]
+
+        return re.sub(r"\$\{item\.([^}]+)\}", value, text.replace("${key}", key))
+
+    return {put(file): {put(one) for one in keys} for entry in params for file, keys in entry.items()}
+
+
+YAML_OF_DVC = [ROOT / "dvc.yaml", ROOT / SHARED, ROOT / plan.PLAN, *sorted((ROOT / plan.SCENES).glob("*.yaml"))]
+
+
+@pytest.mark.parametrize("file", YAML_OF_DVC, ids=lambda file: file.name)
+def test_no_file_that_dvc_reads_holds_an_anchor_an_alias_or_a_merge_key(file):
+    # An override reaches one copy of what an alias names, or all of them.
+    tokens = [type(token).__name__ for token in YAML(pure=True).scan(file.read_text())]
+    assert {"AnchorToken", "AliasToken"} & set(tokens) == set()
+    assert not re.search(r"^\s*<<\s*:|[{,]\s*<<\s*:", file.read_text(), re.MULTILINE)
+
+
+def test_a_row_that_the_plan_does_not_know_is_refused_with_both_remedies(root):
+    written = (root / SCENE).read_bytes()
+    try:
+        override(root / SCENE, "train_multi.recipe=slow")
+        with pytest.raises(
+            ParamsError, match=r"train_multi.recipe must be paper, as planned; got slow. Try: reskin"
+        ) as e:
+            read_settings("train_multi", "ci", files_of(root))
+        assert "plan.yaml:stages.train_multi.ci.recipe=slow" in str(e.value)
+        read_settings("train_single", "ci", files_of(root))  # which does not read that section
+    finally:
+        (root / SCENE).write_bytes(written)
+
+
+def test_a_row_that_is_planned_along_by_a_second_override_is_taken(root):
+    files = {file: (root / file).read_bytes() for file in (SCENE, plan.PLAN)}
+    try:
+        override(root / SCENE, "train_multi.recipe=slow")
+        override(root / plan.PLAN, "stages.train_multi.ci.recipe=slow")
+        assert read_settings("train_multi", "ci", files_of(root)).train_multi.recipes["paper"].rate_max == 0.003
+        assert "recipes.slow" in tracked(root, stages_of(root))["train_multi@ci"][SHARED]
+    finally:
+        for file, content in files.items():
+            (root / file).write_bytes(content)
+
+
+def test_a_stage_that_reads_a_key_which_it_does_not_declare_is_told_so(root):
+    asked = read_settings("train_single", "ci", files_of(root))
+    with pytest.raises(ParamsError, match="train_multi must be given, and declared by its stage; got nothing"):
+        _ = asked.train_multi
+    with pytest.raises(ParamsError, match="params.yaml: recipes.triplet must be given"):
+        asked.named("recipes", "triplet")
+
+
+def test_a_mistake_elsewhere_in_a_scene_does_not_stop_a_stage_but_its_own_does(root):
+    written = (root / SCENE).read_bytes()
+    try:
+        override(root / SCENE, "shear.repeats_n=0")
+        read_settings("train_multi", "ci", files_of(root))
+        with pytest.raises(ParamsError, match="shear: repeats_n must be greater than or equal to 1; got 0"):
+            read_settings("shear", "ci", files_of(root))
+        with pytest.raises(ParamsError, match="shear: repeats_n must be"):
+            plan.check(root)
+    finally:
+        (root / SCENE).write_bytes(written)
+
+
+def test_the_control_of_an_adaptation_follows_it(root):
+    written = (root / SHARED).read_bytes()
+    try:
+        override(root / SHARED, "adaptations.paper.rate_max=0.5")
+        adapt = read_settings("adapt", "ci", files_of(root)).adapt
+    finally:
+        (root / SHARED).write_bytes(written)
+    assert {name: one.rate_max for name, one in adapt.recipes.items()} == {"paper": 0.5, "control": 0.5}
+    assert adapt.recipes["control"].unlabelled_weight == 0
