@@ -1,6 +1,6 @@
 from dataclasses import replace
 from itertools import product
-from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -138,9 +138,7 @@ def test_without_a_pool_all_rows_of_the_held_out_board_are_tested():
             assert fold.test.tolist() == np.flatnonzero(table.board == table.board[fold.test[0]]).tolist()
 
 
-@pytest.mark.parametrize(
-    ("question", "split"), [("single_random", RANDOM), ("single_temporal", TEMPORAL)]
-)
+@pytest.mark.parametrize(("question", "split"), [("single_random", RANDOM), ("single_temporal", TEMPORAL)])
 def test_questions_that_adapt_nothing_have_no_pool_even_where_others_have_one(question, split):
     table = six_by_three_in_passes(5)
     pooled = draw_folds(table, [question], split.model_copy(update={"pool_passes_n": 1}), 0)
@@ -179,8 +177,10 @@ def test_another_draw_of_sensors_takes_other_skins_and_no_more_draws_change_it()
 def test_boards_draw_their_training_skins_each_by_itself():
     table = six_by_three_in_passes(1)
     folds = draw_folds(table, ["sensors"], Split(sensors_skins_n=(3,), sensors_draws_n=1), 0)
-    ranks = {tuple(np.flatnonzero(np.isin(np.unique(np.delete(table.skin, fold.test)), table.skin[fold.train])))
-             for fold in folds}
+    ranks = {
+        tuple(np.flatnonzero(np.isin(np.unique(np.delete(table.skin, fold.test)), table.skin[fold.train])))
+        for fold in folds
+    }
     assert len(ranks) > 1  # not the same three of the fifteen that each board leaves
 
 

@@ -68,9 +68,7 @@ def test_differences_are_of_skins_then_boards_each_the_mean_of_its_networks():
 def test_more_skins_or_networks_of_equal_scores_make_no_board_surer():
     once, thrice = ({f"b{i}": [[float(i)]] * n for i in range(3)} for n in (1, 3))
     nothing = {board: [[0.0]] * 3 for board in thrice}
-    assert paired(scored(thrice), scored(nothing)) == paired(
-        scored(once), scored({board: [[0.0]] for board in once})
-    )
+    assert paired(scored(thrice), scored(nothing)) == paired(scored(once), scored({board: [[0.0]] for board in once}))
 
 
 @given(VALUES, st.randoms())
