@@ -58,7 +58,8 @@ def all_questions(source: str = "simulated") -> dict:
         "variants": {"lobo": {"paper": scores()}},
         "described": {"grid": {"source": source, "counts": {"captures_n": 2, "readings_n": 1000}, "over_skins": {}}},
         "drift": {
-            "initial": windows, "regular": windows, "each": windows, "findings": [said | {"id": name} for name in names], "last_window": {"each": last},
+            "initial": windows, "regular": windows, "each": windows, "last_window": {"each": last},
+            "findings": [said | {"id": name} for name in names],
             "late": {"contacts_n": 45000, "bias_N": 0.1, "bias_pct": 5.0},
         },
         "variation": {"contacts_n": 10000},

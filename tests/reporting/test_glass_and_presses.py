@@ -15,7 +15,8 @@ def score(error):
     return {"accuracy_pct": error, "mse_xy_mm2": error, "mse_f_N2": error}
 
 
-WAYS = {"one": score(ERROR), "mean5": score(BETTER), "mean5_of_middle": score(ERROR)}
+LESS = {"mean5_minus_one": score({"mean": -0.25, "n": 1})}
+WAYS = {"one": score(ERROR), "mean5": score(BETTER), "mean5_of_middle": score(ERROR), "paired": LESS}
 NUMBERS = {
     "readings_n": 20, "presses_n": 3, "rate_hz": 400.0, "window_n": 5, "force_min_N": 0.2,
     "by_duration": [
@@ -54,9 +55,11 @@ def test_the_verdict_on_rising_says_at_which_step_it_was_judged():
     assert "at least 95 % of the pairs" in table.attrs["meaning"]
 
 
-def test_the_better_way_is_marked_in_every_row_group_and_unknown_lags_are_dashes():
+def test_both_ways_are_compared_in_every_row_group_and_unknown_lags_are_dashes():
     table = dynamics.tables(NUMBERS, "simulated")["dynamics"]
-    assert list(table.loc[table["less force error"] == "yes", "answered by"].unique()) == ["mean of the last five"]
+    judged = table[dynamics.LESS] != ""
+    assert list(table.loc[judged, "answered by"].unique()) == ["mean of the last five"]
+    assert set(table.loc[judged, dynamics.LESS]) == {"inconclusive (one board): -0.25"}
     assert list(table["lag / ms"][-3:]) == ["0.9", "–", "–"]
     assert table["MSE_F / N²"][0] == "0.5 ± 0.1"
 

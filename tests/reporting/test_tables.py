@@ -14,7 +14,8 @@ from pipeline.reporting.tables import make_tables
 
 def card(question: str, fold: str, accuracy_pct: float, recipe: str = "paper") -> dict:
     one = {"accuracy_pct": accuracy_pct, "mse_xy_mm2": 1.0, "mse_f_N2": 0.5}
-    scores = {"all": one, "registered": one, "by_skin": {"s0": one, "s1": {**one, "accuracy_pct": accuracy_pct + 10}}}
+    skins = {"s0": one, "s1": {**one, "accuracy_pct": accuracy_pct + 10}}
+    scores = {"all": one, "registered": one, "by_skin": skins, "board_of": dict.fromkeys(skins, fold)}
     return {"question": question, "fold": fold, "recipe_name": recipe, "scores": scores, "train_skins": ["s8", "s9"]}
 
 
