@@ -82,7 +82,9 @@ def resolve(numbers: Any, path: str) -> Any:
     for part in path.split("."):
         if isinstance(here, list) and "=" in part:
             wanted = dict(one.split("=", 1) for one in part.split(","))
-            here = next((row for row in here if {name: str(row[name]) for name in wanted} == wanted), None)
+            here = next(
+                (row for row in here if {name: str(row[name]) for name in wanted if name in row} == wanted), None
+            )
         elif isinstance(here, Mapping) and part in here:
             here = here[part]
         else:

@@ -95,7 +95,7 @@ def bars(scores: Sequence[Mapping[str, Any]], metric: str) -> tuple[np.ndarray, 
     """
     means = np.array([one[metric]["mean"] for one in scores])
     ends = np.array([_ends(one[metric]) for one in scores]).clip(*DRAWN[metric])
-    return means, np.stack([means - ends[:, 0], ends[:, 1] - means])
+    return means, np.stack([means - ends[:, 0], ends[:, 1] - means]).clip(min=0)  # rounded numbers
 
 
 def _ends(stat: Mapping[str, Any]) -> Sequence[float]:

@@ -86,8 +86,10 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
 
 def _less(one: Mapping[str, Any]) -> str:
     """Judge whether the mean of the last five readings has less force error than each reading alone."""
-    difference = one["paired"]["mean5_minus_one"].get("mse_f_N2")
-    return "–" if difference is None else f"{verdict(negated(difference))}: {show_difference(difference)}"
+    if "paired" not in one or "mse_f_N2" not in one["paired"]["mean5_minus_one"]:
+        return "–"  # no force is known, or an older run
+    difference = one["paired"]["mean5_minus_one"]["mse_f_N2"]
+    return f"{verdict(negated(difference))}: {show_difference(difference)}"
 
 
 def _lag(numbers: Mapping[str, Any], way: str) -> Mapping[str, float] | None:
