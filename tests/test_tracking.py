@@ -51,7 +51,8 @@ def write_model(models: Path, name: str, key: str, accuracy_pct: float = 50.0) -
         "seed_i": 0, "recipe": {"steps_n": 3}, "train_rows_n": 4, "train_boards": ["b1"], "test_boards": ["b0"],
         "test_skins": ["s0"],
         "curve": [3.0, 2.0, 1.0],
-        "scores": {"all": {"accuracy_pct": accuracy_pct}, "registered": {"accuracy_pct": 60.0}, "by_skin": {}},
+        "scores": {"all": {"accuracy_pct": accuracy_pct}, "registered": {"accuracy_pct": 60.0},
+                   "by_skin": {}, "board_of": {}},
     }  # fmt: skip
     io.write_json(models / f"{name}.json", card)
     io.write_tensors(models / f"{name}.safetensors", {"weights.a": np.zeros(2, np.float32)}, {})

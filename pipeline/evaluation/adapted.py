@@ -1,21 +1,23 @@
-"""Networks before and after they are adapted to a skin, side by side. In: answers by arm, skin, seed. Out: numbers.
+"""Networks before and after they are adapted to a skin, side by side. In: answers by arm and board. Out: numbers.
 
 An arm is one way to treat the same networks: left as they were, adapted, adapted without the skin's pokes, ...
 Refuses to know networks, pokes and files.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.evaluation import inference
+from pipeline.evaluation.inference import Scored, board_means, summarise_boards
 from pipeline.evaluation.metrics import score
-from pipeline.evaluation.statistic import over_units, statistic
 
 FORCE = 2  # column
 BEFORE, AFTER, CONTROL = "before", "after", "control"  # arms: as it was, adapted, as long without the skin's pokes
+Judge = Callable[[np.ndarray, np.ndarray], dict[str, float]]  # of true and predicted x_mm, y_mm, F_N
 
 
 @dataclass(frozen=True)
@@ -23,6 +25,7 @@ class Answered:
     """What one network answers on one skin's tested rows, axes x_mm, y_mm, F_N."""
 
     arm: str
+    board: str
     skin: str
     seed_i: int
     true: Float[np.ndarray, "b 3"]
@@ -36,41 +39,25 @@ def bias(true: Float[np.ndarray, "b 3"], predicted: Float[np.ndarray, "b 3"]) ->
     return {"bias_f_N": over_N, "bias_f_pct": 100 * over_N / float(true_N.mean())}
 
 
-def over_skins(answers: Sequence[Answered]) -> dict[str, dict[str, Any]]:
-    """Mean, sd and number over skins of every metric, each skin the mean of its seeds; by arm."""
-    return {
-        arm: over_units([(one.skin, score(one.true, one.predicted)) for one in own])
-        for arm, own in _by_arm(answers).items()
-    }
+def over_boards(answers: Sequence[Answered]) -> dict[str, dict[str, Any]]:
+    """Summarise every metric over boards, each the mean of its skins, each of these of its seeds; by arm."""
+    return {arm: summarise_boards(board_means(_scored(own, score))) for arm, own in _by_arm(answers).items()}
 
 
 def biases(answers: Sequence[Answered]) -> dict[str, dict[str, Any]]:
-    """Both ways to say the force bias, each by arm, over skins."""
-    by_arm = {
-        arm: over_units([(one.skin, bias(one.true, one.predicted)) for one in own])
-        for arm, own in _by_arm(answers).items()
-    }
+    """Both ways to say the force bias, each by arm, over boards."""
+    by_arm = {arm: summarise_boards(board_means(_scored(own, bias))) for arm, own in _by_arm(answers).items()}
     return {name: {arm: one[name] for arm, one in by_arm.items()} for name in ("bias_f_N", "bias_f_pct")}
 
 
 def paired(answers: Sequence[Answered], arm: str, other: str) -> dict[str, Any]:
-    """Mean, sd and number over skins of the differences `arm` less `other`, both the mean of their seeds."""
+    """Compare two arms skin by skin, `arm` less `other`: over boards, and `by_board`."""
     by_arm = _by_arm(answers)
-    ours, theirs = (_means(by_arm[name]) for name in (arm, other))
-    assert ours.keys() == theirs.keys(), "every arm answers on the same skins"
-    names = next(iter(ours.values()))
-    return {name: statistic([ours[skin][name] - theirs[skin][name] for skin in ours]) for name in names}
+    return inference.paired(_scored(by_arm[arm], score), _scored(by_arm[other], score))
 
 
-def _means(answers: Sequence[Answered]) -> dict[str, Mapping[str, float]]:
-    """Mean over seeds of every metric, by skin."""
-    return {
-        skin: {
-            name: one["mean"]
-            for name, one in over_units([(skin, score(a.true, a.predicted)) for a in answers if a.skin == skin]).items()
-        }
-        for skin in sorted({one.skin for one in answers})
-    }
+def _scored(answers: Sequence[Answered], judge: Judge) -> list[Scored]:
+    return [(one.board, one.skin, judge(one.true, one.predicted)) for one in answers]
 
 
 def _by_arm(answers: Sequence[Answered]) -> dict[str, list[Answered]]:

@@ -13,7 +13,7 @@ from jaxtyping import Float, Float32, Int64
 from scipy.constants import micro, milli
 from scipy.spatial.transform import Rotation
 
-from pipeline.evaluation.metrics import summarise
+from pipeline.evaluation.inference import summarise_boards
 from pipeline.physics.ambient import EARTH_T, ball_field, ball_images, directions
 from pipeline.physics.board import Board, BoardDesign, draw_board
 from pipeline.physics.skin import Skin
@@ -132,7 +132,7 @@ def over_boards(points: Sequence[dict[str, Any]], case: str, boards: Sequence[st
             if size in here[0]:
                 row[name] = float(np.sqrt(np.mean([point[size] ** 2 for point in here])))
         for arm in dict.fromkeys(point["arm"] for point in here):
-            row[arm] = summarise([point["scores"] for point in here if point["arm"] == arm])
+            row[arm] = summarise_boards({point["board"]: point["scores"] for point in here if point["arm"] == arm})
         rows.append(row)
     return rows
 

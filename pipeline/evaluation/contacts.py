@@ -12,6 +12,7 @@ from jaxtyping import Float, Float32, Int64
 
 from pipeline.dataset.rows import Rows
 from pipeline.errors import ParamsError, complain
+from pipeline.evaluation import inference
 from pipeline.evaluation.metrics import ACCURACY_LIMIT_MM
 from pipeline.evaluation.oddness import roc_area
 
@@ -134,9 +135,8 @@ def _above_pct(scores: np.ndarray, limit: float) -> float:
 
 
 def over_boards(boards: Sequence[Any]) -> Any:
-    """Turn equal trees of numbers, one a board, into one tree of mean, sd (n - 1; absent for one) and number."""
+    """Turn equal trees of numbers, one a board, into one tree of summaries over boards (`inference.over_boards`)."""
     first = boards[0]
     if isinstance(first, Mapping):
         return {key: over_boards([one[key] for one in boards if key in one]) for key in first}
-    stat = {"mean": float(np.mean(boards)), "n": len(boards)}
-    return stat | ({"sd": float(np.std(boards, ddof=1))} if len(boards) > 1 else {})
+    return inference.over_boards(boards)

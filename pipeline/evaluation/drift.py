@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int, Int64, Shaped
 
 from pipeline.dataset.baseline import rank, subtract
+from pipeline.evaluation.inference import board_means, summarise_boards
 from pipeline.evaluation.metrics import METRICS, score
 from pipeline.schema import Readings
 
@@ -26,6 +27,7 @@ class Answers:
     """What one network said of the readings of one test window of one skin, and what was true."""
 
     policy: str
+    board: str
     skin: str
     seed_i: int
     window_i: int
@@ -76,6 +78,21 @@ def of_networks(answers: Sequence[Answers], policy: str) -> dict[str, Float[np.n
     windows = sorted({window_i for _, _, window_i in own})
     named = [name for name in METRICS if all(name in scores for scores in own.values())]
     return {name: np.array([[own[(*unit, i)][name] for i in windows] for unit in units]) for name in named}
+
+
+def boards_of(answers: Sequence[Answers], policy: str) -> list[str]:
+    """Give the board of each network, in the order of `of_networks`."""
+    units = {(one.skin, one.seed_i): one.board for one in answers if one.policy == policy}
+    return [units[unit] for unit in sorted(units)]
+
+
+def last_window(answers: Sequence[Answers], policy: str) -> dict[str, Any]:
+    """Summarise the scores of the last window over boards."""
+    last_i = max(one.window_i for one in answers)
+    own = [one for one in answers if (one.policy, one.window_i) == (policy, last_i)]
+    contacts_n = round(float(np.mean([one.contacts_n for one in own])))
+    scored = [(one.board, one.skin, score_window(one)) for one in own]
+    return {"contacts_n": contacts_n, **summarise_boards(board_means(scored))}
 
 
 def late_window(rows: Sequence[dict[str, Any]]) -> int:
@@ -149,7 +166,8 @@ def late_force(
     if len(contacts.true_N) < 2:
         return None
     each_N = [force_bias(by_contact([one]))["bias_N"] for one in own]
-    return force_bias(contacts) | {"network_bias_N": each_N}, points(contacts)
+    networks = {"network_bias_N": each_N, "network_board": [one.board for one in own]}
+    return force_bias(contacts) | networks, points(contacts)
 
 
 def points(contacts: Contacts) -> dict[str, list[float]]:

@@ -4,12 +4,24 @@ Every number in a sentence is one of the run's. Refuses to know networks, captur
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import t
+
+from pipeline.evaluation.inference import (
+    INCONCLUSIVE,
+    NO,
+    ONE_BOARD,
+    YES,
+    Stat,
+    all_of,
+    board_means,
+    interval,
+    over_boards,
+    verdict,
+)  # fmt: skip
 
 HIGHER_AND_FASTER = (
     '"prediction errors are higher and increase faster when we only make a single no-load measurement at the start"'
@@ -20,9 +32,7 @@ OVERESTIMATES = (
     '"the model, on average, overestimates the applied force"; "attributed to the softening of the elastomer"'
 )
 
-YES, NO, UNTOLD = "yes", "no", "not told apart"
-CONFIDENCE = 0.95  # convention
-INDENTATION_SES = 2.0  # about that confidence for the many indentations of a window
+INDENTATION_SES = 2.0  # about 95 % confidence for the many indentations of a window
 ERRORS = {"mse_xy_mm2": ("MSE_xy", "mm²"), "mse_f_N2": ("MSE_F", "N²")}  # force last; absent where it is unknown
 OTHERWISE = {"regular": "regular ones", "each": "one before every contact"}  # no-load readings
 PER_CONTACTS_N = 10_000
@@ -33,51 +43,78 @@ Networks = Mapping[str, Float[np.ndarray, "u w"]]  # errors by metric; rows: ski
 
 @dataclass(frozen=True)
 class Gap:
-    """A mean over networks, positive where it is as the paper says, and its error bar."""
+    """A mean over networks, positive where it is as the paper says: over boards, and over trainings on these boards."""
 
     word: str
     unit: str
-    mean: float
-    reach: float | None  # half an error bar; None: one network alone has none
+    boards: Stat
+    trainings: list[float] | None  # 95 % interval over networks; None: one network alone has none
 
     @property
     def verdict(self) -> str:
-        """Tell which side of 0 it is on, if its error bar leaves 0 out."""
-        if self.reach is None or abs(self.mean) <= self.reach:
-            return UNTOLD
-        return YES if self.mean > 0 else NO
+        """Judge over boards which side of 0 it is on."""
+        return verdict(self.boards)
+
+    @property
+    def of_trainings(self) -> str:
+        """Judge by the interval over networks on these very boards: how much trainings vary, not how much boards do."""
+        if self.trainings is None:
+            return INCONCLUSIVE
+        return verdict({"ci95": self.trainings})
 
     def __str__(self) -> str:
-        return f"{self.mean:+.2g}" + ("" if self.reach is None else f" ± {self.reach:.2g}") + f" {self.unit}"
+        ends = self.boards["ci95"] if "ci95" in self.boards else self.trainings
+        shown = "" if ends is None else f" [{ends[0]:+.2g}, {ends[1]:+.2g}]"
+        return f"{self.boards['mean']:+.2g}{shown} {self.unit}"
 
 
 def findings(
-    rows: Mapping[str, Sequence[Row]], networks: Mapping[str, Networks], *, field: Mapping[str, float], late: Row | None
+    rows: Mapping[str, Sequence[Row]],
+    networks: Mapping[str, Networks],
+    *,
+    boards: Sequence[str],
+    field: Mapping[str, float],
+    late: Row | None,
 ) -> list[Found]:
     """Test each finding that the policies and the known quantities allow.
 
     `rows` are the windows of each policy, `networks` the errors of each of its networks there: equal rows of two
-    policies are a pair. `field` holds rms values over channels in uT: `contact_uT`, the change that a contact makes,
-    and `noload_noise_uT`, the noise of one no-load reading.
+    policies are a pair, `boards` their boards. `field` holds rms values over channels in uT: `contact_uT`, the change
+    that a contact makes, and `noload_noise_uT`, the noise of one no-load reading.
     """
     frequent = [policy for policy in ("regular", "each") if policy in rows]
     found = []
+    pairs = Pairs(networks, boards)
     if "initial" in rows and frequent and len(rows["initial"]) > 1:
-        found.append(_higher_and_faster(rows["initial"], networks, frequent[0], field))
+        found.append(_higher_and_faster(rows["initial"], pairs, frequent[0], field))
     if "initial" in rows and frequent:
-        found.append(_offset(rows["initial"], networks, frequent[0], field))
+        found.append(_offset(rows["initial"], pairs, frequent[0], field))
     if len(frequent) == 2:
-        found.append(_each_is_worse(rows["regular"], networks, field))
+        found.append(_each_is_worse(rows["regular"], pairs, field))
     if late is not None:
         found.append(_overestimates(late))
     return found
 
 
-def reach_of(values: Float[np.ndarray, " u"]) -> float | None:
-    """Give half the 95 % interval of a mean over networks, by Student's t; None for one network."""
-    if len(values) < 2:
-        return None
-    return float(t.ppf((1 + CONFIDENCE) / 2, len(values) - 1) * values.std(ddof=1) / np.sqrt(len(values)))
+@dataclass(frozen=True)
+class Pairs:
+    """Errors of networks by policy and metric: equal rows of two policies are a pair, on the board of that row."""
+
+    networks: Mapping[str, Networks]
+    boards: Sequence[str]
+
+    def gap(self, words: tuple[str, str], own: Float[np.ndarray, " u"], other: Float[np.ndarray, " u"]) -> Gap:
+        """Compare values of networks in pairs."""
+        return _gap(words, own - other, self.boards)
+
+    @property
+    def bars(self) -> str:
+        """Say what brackets are."""
+        boards_n = len(set(self.boards))
+        if boards_n > 1:
+            return f" ([low, high]: 95 %, Student's t over {boards_n} boards)"
+        pairs_n = len(self.boards)
+        return f" ([low, high]: 95 %, over {pairs_n} networks of one board)" if pairs_n > 1 else " (one network)"
 
 
 def rates(contacts_n: Sequence[int], errors: Float[np.ndarray, "u w"]) -> Float[np.ndarray, " u"]:
@@ -87,47 +124,47 @@ def rates(contacts_n: Sequence[int], errors: Float[np.ndarray, "u w"]) -> Float[
     return errors @ away / (away @ away)
 
 
-def _higher_and_faster(initial: Sequence[Row], networks: Mapping[str, Networks], name: str, field: Row) -> Found:
+def _higher_and_faster(initial: Sequence[Row], pairs: Pairs, name: str, field: Row) -> Found:
     parts, gaps = [], []
     contacts_n = [row["contacts_n"] for row in initial]
-    for metric, (word, unit) in _known(networks["initial"]).items():
-        single, other = networks["initial"][metric], networks[name][metric]
-        higher = _gap(word, unit, single.mean(axis=1), other.mean(axis=1))
+    for metric, (word, unit) in _known(pairs.networks["initial"]).items():
+        single, other = pairs.networks["initial"][metric], pairs.networks[name][metric]
+        higher = pairs.gap((word, unit), single.mean(axis=1), other.mean(axis=1))
         rate, other_rate = rates(contacts_n, single), rates(contacts_n, other)
-        faster = _gap(f"the growth of {word}", unit, rate, other_rate)
+        faster = pairs.gap((f"the growth of {word}", unit), rate, other_rate)
         parts.append(
             f"{word} is {single.mean():.3g} against {other.mean():.3g} {unit} with {OTHERWISE[name]}, mean over "
             f"windows (difference {higher}), and changes by {rate.mean():.2g} against {other_rate.mean():.2g} {unit} "
             f"in {PER_CONTACTS_N:,} contacts, linear fit (difference {faster})"
         )
         gaps += [higher, faster]
-    measured = "; ".join(parts) + _bars(single)
-    return _finding(HIGHER_AND_FASTER, gaps, measured, lambda: _off(initial, field))
+    measured = "; ".join(parts) + pairs.bars
+    return _finding("higher_and_faster", HIGHER_AND_FASTER, gaps, measured, lambda: _off(initial, field))
 
 
-def _offset(initial: Sequence[Row], networks: Mapping[str, Networks], name: str, field: Row) -> Found:
+def _offset(initial: Sequence[Row], pairs: Pairs, name: str, field: Row) -> Found:
     parts, gaps = [], []
-    for metric, (word, unit) in _known(networks["initial"]).items():
-        single, more = networks["initial"][metric], networks[name][metric]
-        gaps.append(_gap(word, unit, single.mean(axis=1), more.mean(axis=1)))
+    for metric, (word, unit) in _known(pairs.networks["initial"]).items():
+        single, more = pairs.networks["initial"][metric], pairs.networks[name][metric]
+        gaps.append(pairs.gap((word, unit), single.mean(axis=1), more.mean(axis=1)))
         parts.append(
             f"{word} is {more.mean():.3g} {unit} with {OTHERWISE[name]}, {single.mean():.3g} with a single no-load "
             f"reading (gain {gaps[-1]})"
         )
-    measured = "mean over windows: " + "; ".join(parts) + _bars(single)
-    return _finding(OFFSET, gaps, measured, lambda: _off(initial, field))
+    measured = "mean over windows: " + "; ".join(parts) + pairs.bars
+    return _finding("offset", OFFSET, gaps, measured, lambda: _off(initial, field))
 
 
-def _each_is_worse(regular: Sequence[Row], networks: Mapping[str, Networks], field: Row) -> Found:
+def _each_is_worse(regular: Sequence[Row], pairs: Pairs, field: Row) -> Found:
     parts, gaps = [], []
-    for metric, (word, unit) in _known(networks["each"]).items():
-        own, other = networks["each"][metric], networks["regular"][metric]
-        gaps.append(_gap(word, unit, own.mean(axis=1), other.mean(axis=1)))
+    for metric, (word, unit) in _known(pairs.networks["each"]).items():
+        own, other = pairs.networks["each"][metric], pairs.networks["regular"][metric]
+        gaps.append(pairs.gap((word, unit), own.mean(axis=1), other.mean(axis=1)))
         parts.append(
             f"{word} is {own.mean():.3g} against {other.mean():.3g} {unit} with regular ones, mean over windows "
             f"(difference {gaps[-1]})"
         )
-    shows = [gap.word for gap in gaps if gap.verdict == YES]
+    shows = [gap.word for gap in gaps if gap.of_trainings == YES]
 
     def why() -> str:
         noise_uT = field["noload_noise_uT"]
@@ -141,20 +178,22 @@ def _each_is_worse(regular: Sequence[Row], networks: Mapping[str, Networks], fie
             "data, and saw later experiments gain from a reading before every contact"
         )
 
-    return _finding(EACH_IS_WORSE, gaps, "; ".join(parts) + _bars(own), why)
+    return _finding("each_is_worse", EACH_IS_WORSE, gaps, "; ".join(parts) + pairs.bars, why)
 
 
 def _overestimates(late: Row) -> Found:
     """Ask that the bias be clear of both what indentations and what trainings vary by: one network cannot tell."""
     biases_N = np.array(late["network_bias_N"])
-    among_N = reach_of(biases_N)
-    reach_N = None if among_N is None else max(INDENTATION_SES * late["bias_se_N"], among_N)
+    gap = _gap(("the bias", "N"), biases_N, late["network_board"])
+    if gap.trainings is not None:
+        reach_N = INDENTATION_SES * late["bias_se_N"]
+        ends_N = [min(gap.trainings[0], late["bias_N"] - reach_N), max(gap.trainings[1], late["bias_N"] + reach_N)]
+        gap = replace(gap, trainings=ends_N)
     measured = (
         f"policy {late['policy']} after {late['contacts_n']:,} contacts: bias {late['bias_N']:+.3g} ± "
         f"{late['bias_se_N']:.2g} N ({late['bias_pct']:+.2g} %), standard error over {late['indentations_n']} "
-        f"indentations of the mean over {len(biases_N)} network(s)"
+        f"indentations of the mean over {len(biases_N)} network(s); {gap}{Pairs({}, late['network_board']).bars}"
     )
-    measured += "" if among_N is None else f"; ± {among_N:.2g} N from network to network (95 %, Student's t)"
     measured += f"; slope {late['slope']:.3g}"
     left_pct = late.get("force_left_pct")
     if left_pct is not None:
@@ -169,16 +208,15 @@ def _overestimates(late: Row) -> Found:
             f"itself makes it {late['bias_pct']:+.2g} % in all"
         )
 
-    return _finding(OVERESTIMATES, [Gap("the bias", "N", late["bias_N"], reach_N)], measured, why)
+    return _finding("overestimates", OVERESTIMATES, [gap], measured, why)
 
 
-def _gap(word: str, unit: str, own: Float[np.ndarray, " u"], other: Float[np.ndarray, " u"]) -> Gap:
-    return Gap(word, unit, float((own - other).mean()), reach_of(own - other))
-
-
-def _bars(errors: Float[np.ndarray, "u w"]) -> str:
-    pairs_n = len(errors)
-    return f" (±: 95 %, Student's t over {pairs_n} pairs of networks)" if pairs_n > 1 else " (one network each)"
+def _gap(words: tuple[str, str], values: Float[np.ndarray, " u"], boards: Sequence[str]) -> Gap:
+    """Summarise values of networks, each on its board."""
+    word, unit = words
+    of_boards = board_means([(board, "", {word: float(value)}) for board, value in zip(boards, values, strict=True)])
+    stat = over_boards([one[word] for one in of_boards.values()])
+    return Gap(word, unit, stat, interval([float(value) for value in values]))
 
 
 def _off(initial: Sequence[Row], field: Row) -> str:
@@ -193,19 +231,22 @@ def _known(networks: Networks) -> dict[str, tuple[str, str]]:
     return {metric: words for metric, words in ERRORS.items() if metric in networks}
 
 
-def _finding(finding: str, gaps: Sequence[Gap], measured: str, why: Callable[[], str]) -> Found:
-    """Say yes if every gap is clear of 0 on the paper's side, no if one is clear on the other, else not told apart."""
-    told = {gap.verdict for gap in gaps}
-    verdict = NO if NO in told else UNTOLD if UNTOLD in told else YES
+def _finding(name: str, finding: str, gaps: Sequence[Gap], measured: str, why: Callable[[], str]) -> Found:
+    """Judge a finding by all of its parts, over boards; and of trainings, by the networks of these boards alone."""
+    judged = all_of([gap.verdict for gap in gaps])
     row = {
-        "finding": finding, "holds": verdict == YES, "verdict": verdict,
+        "id": name, "finding": finding, "holds": judged == YES, "verdict": judged,
+        "of_trainings": all_of([gap.of_trainings for gap in gaps]),
         "measured": measured[0].upper() + measured[1:] + ".",
     }  # fmt: skip
-    return row if verdict == YES else row | {"why": f"{_untold(gaps) if verdict == UNTOLD else ''}{why()}."}
+    return row if judged == YES else row | {"why": f"{_inconclusive(judged, gaps)}{why()}."}
 
 
-def _untold(gaps: Sequence[Gap]) -> str:
-    if any(gap.reach is None for gap in gaps):
-        return "Not told apart: one network each, and another training might answer otherwise. "
-    covered = "; ".join(f"{gap.word}, {gap}" for gap in gaps if gap.verdict == UNTOLD)
-    return f"Not told apart: the error bar covers 0 ({covered}). "
+def _inconclusive(judged: str, gaps: Sequence[Gap]) -> str:
+    """Say of which parts nothing can be concluded."""
+    if judged == NO:
+        return ""
+    if judged == ONE_BOARD:
+        return "Inconclusive: one board says nothing of others. "
+    covered = "; ".join(f"{gap.word}, {gap}" for gap in gaps if gap.verdict == INCONCLUSIVE)
+    return f"Inconclusive: the 95 % interval over boards includes 0 ({covered}). "

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
 
+from pipeline.evaluation.inference import paired
 from pipeline.evaluation.metrics import score, summarise
 
 WINDOW_N = 5  # readings that the paper takes at rest (section 3)
@@ -65,8 +66,11 @@ def running_mean(values: Float[np.ndarray, "f c"]) -> Float64[np.ndarray, "f c"]
     return (total[end] - total[start]) / (end - start)[:, None]
 
 
-def compare(of: Presses, networks: Sequence[Answers]) -> dict[str, Any]:
-    """Score each reading alone, the mean of the last five, and that mean against the middle one's truth."""
+def compare(of: Presses, networks: Sequence[Answers], *, board: str) -> dict[str, Any]:
+    """Score each reading alone, the mean of the last five, and that mean against the middle one's truth.
+
+    All presses are on one skin of this `board`: `paired` compares both ways that answer at once, and has no interval.
+    """
     mean_uT = running_mean(of.db_uT).astype(np.float32)
     alone, meant = ([network(one) for network in networks] for one in (of.db_uT, mean_uT))
     answers = {"one": alone, "mean5": meant, "mean5_of_middle": meant}
@@ -77,7 +81,7 @@ def compare(of: Presses, networks: Sequence[Answers]) -> dict[str, Any]:
         if own.any():
             presses_n = len(np.unique(of.press_i[own]))
             words = {"duration_s": float(np.sqrt(low_s * high_s)), "n": int(own.sum()), "presses_n": presses_n}
-            by_duration.append(words | _scores(of, answers, own))
+            by_duration.append(words | _scores(of, answers, own, board))
     return {
         "readings_n": int(of.scored.sum()),
         "presses_n": len(np.unique(of.press_i[of.scored])),
@@ -85,7 +89,7 @@ def compare(of: Presses, networks: Sequence[Answers]) -> dict[str, Any]:
         "window_n": WINDOW_N,
         "force_min_N": FORCE_MIN_N,
         "by_duration": by_duration,
-        "all": _scores(of, answers, of.scored),
+        "all": _scores(of, answers, of.scored, board),
         "lag_ms": {way: lags(of, [one[:, 2] for one in answers[way]]) for way in ("one", "mean5")},
     }
 
@@ -117,8 +121,12 @@ def lag_ms(
     return float(LAGS_MS[int(np.argmax(explained))])
 
 
-def _scores(of: Presses, answers: Mapping[str, Sequence[Any]], rows: Bool[np.ndarray, " f"]) -> dict[str, Any]:
+def _scores(
+    of: Presses, answers: Mapping[str, Sequence[Any]], rows: Bool[np.ndarray, " f"], board: str
+) -> dict[str, Any]:
     # The middle of the last five readings is two before the last, and in the same press where a row is scored.
     middle = np.flatnonzero(rows) - WINDOW_N // 2
     true = {"one": of.true[rows], "mean5": of.true[rows], "mean5_of_middle": of.true[middle]}
-    return {way: summarise([score(true[way], one[rows]) for one in answers[way]]) for way in WAYS}
+    scores = {way: [score(true[way], one[rows]) for one in answers[way]] for way in WAYS}
+    sides = ([(board, "", one) for one in scores[way]] for way in ("mean5", "one"))
+    return {way: summarise(own) for way, own in scores.items()} | {"paired": {"mean5_minus_one": paired(*sides)}}

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.evaluation.adapted import AFTER, BEFORE, FORCE, Answered, biases, over_skins
+from pipeline.evaluation.adapted import AFTER, BEFORE, FORCE, Answered, biases, over_boards, paired
 from pipeline.evaluation.statistic import statistic
 
 DEPTH_DECIMALS = 2  # of a commanded depth in mm: nearer ones are one
@@ -37,8 +37,9 @@ def gap_less_pct(gap_mm: Mapping[str, float]) -> float:
 
 
 def answer_flexible(answers: Sequence[Answered]) -> dict[str, Any]:
-    """Summarise over skins, by arm; the force bias apart."""
-    return over_skins(answers) | biases(answers)
+    """Summarise over boards, by arm; the force bias and the gain by adaptation apart."""
+    differences = {f"{AFTER}_minus_{BEFORE}": paired(answers, AFTER, BEFORE)}
+    return over_boards(answers) | biases(answers) | {"paired": differences}
 
 
 def forces_drawn(answers: Sequence[Answered], rng: np.random.Generator) -> dict[str, dict[str, list[float]]]:

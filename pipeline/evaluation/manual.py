@@ -8,18 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.evaluation.adapted import AFTER, BEFORE, CONTROL, Answered, over_skins, paired
+from pipeline.evaluation.adapted import AFTER, BEFORE, CONTROL, Answered, over_boards, paired
 
 GRID = "grid"  # as many pokes, by the robot
 
 
 def answer_manual(answers: Sequence[Answered], *, pokes_n: Sequence[int], lines_n: Sequence[int]) -> dict[str, Any]:
-    """Summarise over skins; `pokes_n` and `lines_n` are those of each skin, and what is told is their mean."""
-    arms = over_skins(answers)
+    """Summarise over boards; `pokes_n` and `lines_n` are those of each skin, and what is told is their mean."""
+    arms = over_boards(answers)
     counts = {
         "pokes_n": round(np.mean(pokes_n)),
         "lines_n": round(np.mean(lines_n)),
         "skins_n": len({one.skin for one in answers}),
+        "boards_n": len({one.board for one in answers}),
         "seeds_n": len({one.seed_i for one in answers}),
     }
     differences = {

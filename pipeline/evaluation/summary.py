@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.errors import SchemaError, complain
 from pipeline.evaluation.metrics import register, score, summarise
 
 
@@ -24,6 +23,7 @@ def score_groups(
         "all": score(true, predicted),
         "registered": score(true, registered),
         "by_skin": {str(name): score(true[skin == name], predicted[skin == name]) for name in np.unique(skin)},
+        "board_of": {str(name): str(board[skin == name][0]) for name in np.unique(skin)},
         "rows_n": len(true),
     }
 
@@ -51,39 +51,15 @@ def pool_skins(cards: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     ]
 
 
-def paired(cards: Sequence[dict[str, Any]], others: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """Mean, sd and number of the differences on each held-out skin, both sides the mean over seeds."""
-    one, other = _by_held_out_skin(cards), _by_held_out_skin(others)
-    if one.keys() != other.keys():
-        raise SchemaError(
-            complain(
-                "a paired difference", "held-out skins", "the same on both sides", sorted(one.keys() ^ other.keys()),
-                "Train both on the same folds.",
-            )
-        )  # fmt: skip
-    return summarise([{name: one[key][name] - other[key][name] for name in one[key]} for key in one])
-
-
-def _by_held_out_skin(cards: Sequence[dict[str, Any]]) -> dict[tuple[str, str], dict[str, float]]:
-    scores: dict[tuple[str, str], list[dict[str, float]]] = {}
-    for card in cards:
-        for skin, one in card["scores"]["by_skin"].items():
-            scores.setdefault((card["fold"], skin), []).append(one)
-    return {key: _means(own) for key, own in scores.items()}
-
-
 def _pool(scores: Sequence[dict[str, Any]]) -> dict[str, Any]:
     by_skin = {skin: one for own in scores for skin, one in own["by_skin"].items()}
+    board_of = {skin: board for own in scores for skin, board in own["board_of"].items()}
     rows_n = np.array([own["rows_n"] for own in scores])
     parts = {
         part: {name: float(np.average([own[part][name] for own in scores], weights=rows_n)) for name in scores[0][part]}
         for part in ("all", "registered")
     }
-    return parts | {"by_skin": by_skin, "rows_n": int(rows_n.sum())}
-
-
-def _means(scores: Sequence[dict[str, float]]) -> dict[str, float]:
-    return {name: value["mean"] for name, value in summarise(scores).items()}
+    return parts | {"by_skin": by_skin, "board_of": board_of, "rows_n": int(rows_n.sum())}
 
 
 def _over_units(scores: Sequence[tuple[Any, dict[str, float]]]) -> dict[str, dict[str, float]]:

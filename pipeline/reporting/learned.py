@@ -8,12 +8,15 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.evaluation.comparison import over_boards, paired, paired_where_tested
 from pipeline.evaluation.metrics import METRICS
-from pipeline.evaluation.summary import over_folds, paired, pool_skins
+from pipeline.evaluation.summary import pool_skins
+from pipeline.reporting.contrasts import contrasts_of_pokes, contrasts_of_sensors
 
 Cards = Sequence[dict[str, Any]]
 Seconds = Sequence[Mapping[str, Any]]
 PAIRS = (
+    ("multi", "single"),
     ("triplet", "multi"),
     ("adapted", "triplet"),
     ("adapted", "control"),
@@ -28,17 +31,19 @@ CONTROL = "control"  # the recipe of adaptation that fine-tunes as long, without
 def learned(cards: Cards, points: Mapping[str, Cards], *, headline: str) -> dict[str, Any]:
     """Compose what the pooled, triplet and adapted networks say together; `points` are those of the sweeps."""
     rows = _rows(cards, headline)
-    table2 = {name: over_folds(own) for name, own in rows.items() if name in ("triplet", "adapted")}
+    table2 = {name: over_boards(own) for name, own in rows.items() if name in ("triplet", "adapted")}
     numbers: dict[str, Any] = {"table2": table2} if table2 else {}
     if CONTROL in rows:
-        numbers["adapt"] = {"pokes_n": _pokes_n(cards, headline), "control": over_folds(rows[CONTROL])}
+        numbers["adapt"] = {"pokes_n": _pokes_n(cards, headline), "control": over_boards(rows[CONTROL])}
     pairs = [(of, over) for of, over in PAIRS if of in rows and over in rows]
     if pairs:
-        numbers["paired"] = [{"of": of, "over": over, **paired(rows[of], rows[over])} for of, over in pairs]
+        numbers["paired"] = [{"of": of, "over": over, **_compare(rows, of, over)} for of, over in pairs]
     if "pokes" in points:
         numbers["sweep_pokes"] = list(_pokes(points["pokes"]))
+        numbers["contrasts"] = contrasts_of_pokes(points["pokes"])
     if "sensors" in points:
         numbers["sweep_sensors"] = list(_sensors(points["sensors"]))
+        numbers["contrasts"] = numbers.get("contrasts", {}) | contrasts_of_sensors(points["sensors"])
     if "baselines" in points:
         numbers["baselines"] = [*_networks(cards), *_classical(points["baselines"])]
     if "labels" in points:
@@ -91,14 +96,19 @@ def _score_means(row: Mapping[str, Any]) -> dict[str, float]:
 
 def _rows(cards: Cards, headline: str) -> dict[str, Cards]:
     wanted = {
-        "multi": ("lobo", headline), "triplet": ("triplet", headline), "adapted": ("adapt", headline),
-        CONTROL: ("adapt", CONTROL),
+        "single": ("transfer", headline), "multi": ("lobo", headline), "triplet": ("triplet", headline),
+        "adapted": ("adapt", headline), CONTROL: ("adapt", CONTROL),
     }  # fmt: skip
     rows = {
         name: by_fold([card for card in cards if (card["question"], card["recipe_name"]) == key])
         for name, key in wanted.items()
     }
     return {name: own for name, own in rows.items() if own}
+
+
+def _compare(rows: Mapping[str, Cards], of: str, over: str) -> dict[str, Any]:
+    """Compare on the same test rows: one skin on others was tested on some boards only."""
+    return (paired_where_tested if over == "single" else paired)(rows[of], rows[over])
 
 
 def _pokes_n(cards: Cards, headline: str) -> int:
@@ -112,14 +122,14 @@ def _networks(cards: Cards) -> Iterable[dict[str, Any]]:
             named = [card for card in own if card["recipe_name"] == name]
             words = {"method": method, "inputs": named[0]["recipe"]["inputs"], "name": name}
             words |= {"base": named[0]["tuning"]["settings"]["base"]} if "tuning" in named[0] else {}
-            yield {**words, "rows_n": named[0]["train_rows_n"], **over_folds(by_fold(named))}
+            yield {**words, "rows_n": named[0]["train_rows_n"], **over_boards(by_fold(named))}
 
 
 def _classical(points: Cards) -> Iterable[dict[str, Any]]:
     for name in dict.fromkeys(point["name"] for point in points):
         own = [point for point in points if point["name"] == name]
         words = {"method": own[0]["method"], "inputs": own[0]["inputs"], "name": name, "rows_n": own[0]["rows_n"]}
-        yield {**words, **over_folds(own)}
+        yield {**words, **over_boards(own)}
 
 
 def _labels(points: Cards) -> Iterable[dict[str, Any]]:
@@ -127,7 +137,7 @@ def _labels(points: Cards) -> Iterable[dict[str, Any]]:
         for labels_n in sorted({point["labels_n"] for point in points}):
             key = (method, inputs, labels_n)
             own = [point for point in points if (point["method"], point["inputs"], point["labels_n"]) == key]
-            parts = {"as_labelled": over_folds(own), "registered": over_folds(own, "registered")}
+            parts = {"as_labelled": over_boards(own), "registered": over_boards(own, "registered")}
             yield {"method": method, "inputs": inputs, "labels_n": labels_n, **parts}
 
 
@@ -156,11 +166,11 @@ def _median_times(took: Seconds, start: str) -> dict[str, float]:
 def _pokes(points: Cards) -> Iterable[dict[str, Any]]:
     for pokes_n in sorted({point["pokes_n"] for point in points}):
         own = [point for point in points if point["pokes_n"] == pokes_n]
-        yield {"pokes_n": pokes_n, **over_folds(pool_skins(own) if pokes_n else own)}
+        yield {"pokes_n": pokes_n, **over_boards(pool_skins(own) if pokes_n else own)}
 
 
 def _sensors(points: Cards) -> Iterable[dict[str, Any]]:
     for method in ("multi", "triplet", "adapted"):
         for skins_n in sorted({point["trained_on_skins_n"] for point in points}):
             own = [point for point in points if (point["method"], point["trained_on_skins_n"]) == (method, skins_n)]
-            yield {"method": method, "skins_n": skins_n, **over_folds(pool_skins(own))}
+            yield {"method": method, "skins_n": skins_n, **over_boards(pool_skins(own))}

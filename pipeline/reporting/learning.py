@@ -8,7 +8,7 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.reporting.order import SHORT, order_table, paired_table
+from pipeline.reporting.order import SHORT, order_table, paired_boards_table, paired_table
 from pipeline.reporting.paper import ADAPTED_POKES_N, FIGURE_6A, FIGURE_6B, TABLE_2
 from pipeline.reporting.shown import COLUMNS, n_of, scores, show, tabulate
 
@@ -25,7 +25,11 @@ CONTROLLED = (
     "table 2."
 )
 BUDGETS = "How many steps there are is a budget of each scene, and no part of the choice."
-DRAWS = "± is the sd over n draws of training skins with seeds of their own, on one held-out board."
+DRAWS = (
+    "[low, high] is the 95 % interval over n held-out boards (Student's t), each with its own draw of training skins; "
+    "networks of one board are averaged first."
+)
+OF_BOARDS = "± is the sd over n boards."
 
 Rows = Sequence[Mapping[str, Any]]
 
@@ -45,6 +49,8 @@ def learning_tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.Dat
         order = order_table(numbers, source)
         tables |= {} if order.empty else {"order": order}  # only pairs about which the paper claims nothing
         tables["paired"] = paired_table(numbers, source)
+        boards = paired_boards_table(numbers, source)
+        tables |= {} if boards.empty else {"paired_boards": boards}
     return tables | {name: make(numbers[name], source) for name, make in makers.items() if name in numbers}
 
 
@@ -112,7 +118,7 @@ def chosen_table(arms: Mapping[str, Any], source: str) -> pd.DataFrame:
             chosen = f"yes, by {choice['by']}" if row["recipe_name"] == choice["recipe_name"] else ""
             line = {"arm": arm, "candidate": row["recipe_name"], "settings": row["settings"], "chosen": chosen}
             lines.append(line | {"source": source} | scores(row) | {"n": n_of(row)})
-    return tabulate(lines, meaning=BUDGETS)
+    return tabulate(lines, meaning=BUDGETS, spread=OF_BOARDS)
 
 
 def methods_costs_table(rows: Rows, source: str) -> pd.DataFrame:

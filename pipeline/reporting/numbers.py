@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.evaluation.comparison import over_boards, over_pairs
 from pipeline.evaluation.metrics import summarise
-from pipeline.evaluation.summary import over_folds, over_test_skins
+from pipeline.evaluation.summary import over_folds
 from pipeline.questions import EXPERIMENTS
 from pipeline.reporting.learned import by_fold, learned
 
@@ -34,12 +35,12 @@ def compose(
         by_question.setdefault(card["question"], []).append(card)
     table2 = {}
     if "transfer" in by_question:
-        table2["single"] = over_test_skins(_of(by_question["transfer"], headline))
+        table2["single"] = over_pairs(_of(by_question["transfer"], headline))
     if "lobo" in by_question:
         pooled = _of(by_question["lobo"], headline)
-        table2["multi"] = over_folds(pooled)
+        table2["multi"] = over_boards(pooled)
         numbers["lobo"] = {
-            "registered": over_folds(pooled, "registered"),
+            "registered": over_boards(pooled, "registered"),
             "by_board": {
                 board: {
                     "trained_on_skins_n": len(own[0]["train_skins"]),
@@ -67,8 +68,11 @@ def compose(
     return numbers
 
 
-def _over(question: str) -> Callable[[Cards], dict[str, dict[str, float]]]:
-    return over_test_skins if question == "transfer" else over_folds
+def _over(question: str) -> Callable[[Cards], dict[str, dict[str, Any]]]:
+    """Choose what a question's scores are summarised over: repeats on one skin are no boards."""
+    if question == "transfer":
+        return over_pairs
+    return over_folds if question.startswith("single_") else over_boards
 
 
 def summarise_means(cards: Cards, part: str) -> dict[str, float]:

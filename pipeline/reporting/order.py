@@ -1,35 +1,36 @@
-"""The order of the paper's rows: numbers.json -> tables of paired differences, and a verdict on each claim.
+"""The order of the paper's rows: numbers.json -> tables of paired differences over boards, and verdicts.
 
 Refuses to know why a claim does not hold.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from math import sqrt
 from typing import Any
 
 import pandas as pd
 
+from pipeline.evaluation.inference import VERDICTS, negated, verdict, verdict_within
 from pipeline.reporting.paper import ADAPTED_POKES_N, TABLE_2, TABLE_2_ROWS, Number
 from pipeline.reporting.shown import COLUMNS, Stat, n_of, show_difference, tabulate
 
 FEW_POINTS = 5.0  # assumed: the paper's own drop is 3.4 points, "slightly affects performance"
-FAR_SDS = 2.0  # assumed: the paper's own means are 5.1 of these apart
-SURE_ERRORS = 2.0  # standard errors: about 95 %
+FAR_SHARE = 0.5  # assumed: of the difference of the paper's own means
 ALONE = "Leave-one-board-out, one training skin"
 CONTROL = "Control: fine-tuned as long, without the new skin's pokes (ours)"
 SHORT = {
     "single": "single-sensor", "multi": "multi-sensor", "triplet": "multi-sensor + triplet", "adapted": "adapted",
     "control": "control",
 }  # fmt: skip
-SPREAD_OF_PAIRS = "± is the sd over n held-out skins, each the mean of its seeds."
-ORDER = (
-    f"The verdict stands before the difference of the means. Far better: the difference is more than {FAR_SDS:g} times "
-    f"the root mean square of both rows' sd. Within a few points: at most {FEW_POINTS:g} points of accuracy. Better: "
-    "the mean of the paired differences is on the right side of 0; the verdict says where that is within "
-    f"{SURE_ERRORS:g} standard errors of 0 (sd over the root of n, as if skins of one board, which share a model, were "
-    "independent)."
+PAIRED = (
+    "Differences on the same test rows, skin by skin, each side the mean of its networks on a skin and a board the "
+    "mean of its skins; [low, high] is the 95 % interval over n boards (Student's t)."
 )
+ORDER = (
+    f"{VERDICTS} The verdict stands before the mean difference. Better: threshold 0. Far better: "
+    f"{100 * FAR_SHARE:g} % of the difference of the paper's means. Within a few points: less than {FEW_POINTS:g} "
+    "points of accuracy up or down. One skin on others is compared on the boards that it was tested on."
+)
+CHANGE = "difference"  # column
 
 
 @dataclass(frozen=True)
@@ -64,72 +65,86 @@ def is_pooled(numbers: Mapping[str, Any]) -> bool:
 
 
 def paired_table(numbers: Mapping[str, Any], source: str) -> pd.DataFrame:
-    """List the differences a held-out skin between two models, beside the difference of the paper's means."""
+    """List the differences between two models over boards, beside the difference of the paper's means."""
     known = models(numbers)
     lines = []
     for row in numbers["paired"]:
-        line = {"difference": f"{known[row['of']].short} − {known[row['over']].short}", "source": source}
+        line = {CHANGE: _name(row, known), "source": source}
         of, over = known[row["of"]].paper, known[row["over"]].paper
         for metric, title in COLUMNS.items():
             line[f"{title} (ours)"] = show_difference(row.get(metric))
             both = metric in of and metric in over and of != over
             line[f"{title} (paper: difference of means)"] = f"{of[metric][0] - over[metric][0]:+.4g}" if both else "–"
         lines.append(line | {"n": n_of(row)})
-    return tabulate(lines, spread=SPREAD_OF_PAIRS)
+    return tabulate(lines, spread=PAIRED)
+
+
+def paired_boards_table(numbers: Mapping[str, Any], source: str) -> pd.DataFrame:
+    """List the difference between two models on each held-out board."""
+    known = models(numbers)
+    lines = [
+        {CHANGE: _name(row, known), "held-out board": board, "source": source}
+        | {title: show_difference({"mean": own[m]}) for m, title in COLUMNS.items() if m in own}
+        for row in numbers["paired"]
+        if "by_board" in row
+        for board, own in row["by_board"].items()
+    ]
+    return tabulate(lines, spread=PAIRED)
 
 
 def order_table(numbers: Mapping[str, Any], source: str) -> pd.DataFrame:
-    """Say for each claim of the paper about the order of its rows, and for our control, whether it holds here."""
-    table2, known = numbers.get("table2", {}), models(numbers)
+    """Judge each claim of the paper about the order of its rows, and our control, by differences over boards."""
+    known = models(numbers)
     pairs = {(row["of"], row["over"]): row for row in numbers["paired"]}
-    lines = []
-    if {"single", "multi"} <= set(table2) and is_pooled(numbers):
-        line = {"claim": "multi-sensor far better than single-sensor"}
-        line |= {t: _far(table2["multi"].get(m), table2["single"].get(m), m) for m, t in COLUMNS.items()}
-        lines.append(line | {"n": f"{n_of(table2['multi'])}; {n_of(table2['single'])}"})
-    if ("triplet", "multi") in pairs:
-        row = pairs["triplet", "multi"]
-        line = {"claim": f"{known['triplet'].short} within a few points of {known['multi'].short}"}
-        line |= {t: _few(row[m]) if m == "accuracy_pct" else "–" for m, t in COLUMNS.items()}
-        lines.append(line | {"n": n_of(row)})
+    claims: list[tuple[str, tuple[str, str], Callable[[Stat, str], str]]] = []
+    if is_pooled(numbers):
+        claims += [
+            ("multi-sensor better than single-sensor", ("multi", "single"), _better),
+            ("multi-sensor far better than single-sensor", ("multi", "single"), _far),
+        ]
+    few = f"{known['triplet'].short} within a few points of {known['multi'].short}"
+    claims.append((few, ("triplet", "multi"), _few))
     for over in ("triplet", "multi", "control"):
-        if ("adapted", over) in pairs:
-            row = pairs["adapted", over]
-            line = {"claim": f"adapted better than {known[over].short}" + (" (ours)" if over == "control" else "")}
-            line |= {t: _better(row.get(m), m) for m, t in COLUMNS.items()}
-            lines.append(line | {"n": n_of(row)})
-    return tabulate([line | {"source": source} for line in lines], meaning=ORDER, spread=SPREAD_OF_PAIRS)
+        words = f"adapted better than {known[over].short}" + (" (ours)" if over == "control" else "")
+        claims.append((words, ("adapted", over), _better))
+    lines = [
+        {"claim": words}
+        | {
+            title: judge(pairs[key][metric], metric) if metric in pairs[key] else "–"
+            for metric, title in COLUMNS.items()
+        }
+        | {"n": n_of(pairs[key]), "source": source}
+        for words, key, judge in claims
+        if key in pairs
+    ]
+    return tabulate(lines, meaning=ORDER, spread=PAIRED)
 
 
-def _far(better: Stat | None, worse: Stat | None, metric: str) -> str:
-    """Judge whether two means are far apart: by more than `FAR_SDS` times the root mean square of their sd."""
-    if better is None or worse is None:
-        return "–"
-    gain = _gain(better["mean"] - worse["mean"], metric)
-    shown = show_difference({"mean": better["mean"] - worse["mean"]})
-    if "sd" not in better or "sd" not in worse:
-        return f"{'yes, but of one' if gain > 0 else 'no'}: {shown}"
-    sd = sqrt((better["sd"] ** 2 + worse["sd"] ** 2) / 2)
-    word = "yes" if gain > FAR_SDS * sd else "better, not far" if gain > 0 else "no"
-    return f"{word}: {shown} ({abs(gain) / sd:.2g} sd)" if sd > 0 else f"{word}: {shown}"
+def far_beyond(metric: str) -> float:
+    """Give the gain beyond which many skins are far better than one: a share of the difference of the paper's means."""
+    return FAR_SHARE * abs(TABLE_2["multi"][metric][0] - TABLE_2["single"][metric][0])
 
 
-def _few(difference: Stat) -> str:
-    return f"{'yes' if abs(difference['mean']) <= FEW_POINTS else 'no'}: {show_difference(difference)}"
+def gain(difference: Stat, metric: str) -> Stat:
+    """Turn the difference of an error round, so that more is better."""
+    return difference if metric == "accuracy_pct" else negated(difference)
 
 
-def _better(difference: Stat | None, metric: str) -> str:
-    """Judge whether a paired difference is an improvement, and one of more than `SURE_ERRORS` standard errors."""
-    if difference is None:
-        return "–"
-    gain = _gain(difference["mean"], metric)
-    word = "yes" if gain > 0 else "no"
-    if gain > 0 and "sd" not in difference:
-        word = "yes, but of one"
-    elif gain > 0 and gain <= SURE_ERRORS * difference["sd"] / sqrt(difference["n"]):
-        word = f"yes, within {SURE_ERRORS:g} standard errors"
+def _far(difference: Stat, metric: str) -> str:
+    return _said(verdict(gain(difference, metric), above=far_beyond(metric)), difference)
+
+
+def _better(difference: Stat, metric: str) -> str:
+    return _said(verdict(gain(difference, metric)), difference)
+
+
+def _few(difference: Stat, metric: str) -> str:
+    return _said(verdict_within(difference, FEW_POINTS), difference) if metric == "accuracy_pct" else "–"
+
+
+def _said(word: str, difference: Stat) -> str:
     return f"{word}: {show_difference(difference)}"
 
 
-def _gain(difference: float, metric: str) -> float:
-    return difference if metric == "accuracy_pct" else -difference
+def _name(row: Mapping[str, Any], known: Mapping[str, Model]) -> str:
+    return f"{known[row['of']].short} − {known[row['over']].short}"

@@ -59,7 +59,7 @@ QUESTIONS = (
         "skins",
         "New skins and boards (section 5, table 2)",
         "How networks answer for boards and skins that they never saw, and how much methods differ there.",
-        ("paired", "lobo_boards"),
+        ("paired", "paired_boards", "lobo_boards"),
         ("error_grid_transfer.svg", "error_grid_lobo.svg", "error_grid_triplet.svg", "error_grid_adapt.svg"),
     ),
     Section(
@@ -179,7 +179,8 @@ CAPTIONS = {
     "checklist": "Each result of the paper, and ours",
     "table1": "Table 1: tactile sensors",
     "single_sensor": "One skin, by what is held out",
-    "paired": "Paired differences between methods, over held-out skins",
+    "paired": "Paired differences between methods, over held-out boards",
+    "paired_boards": "Paired differences between methods, board by board",
     "lobo_boards": "Each board held out in turn",
     "sweep_pokes": "Scores by unlabelled pokes",
     "sweep_sensors": "Scores by training skins",

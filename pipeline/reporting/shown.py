@@ -9,22 +9,42 @@ from typing import Any
 import pandas as pd
 
 COLUMNS = {"accuracy_pct": "accuracy, %", "mse_xy_mm2": "MSE_xy, mm²", "mse_f_N2": "MSE_F, N²"}
-Stat = Mapping[str, float]
+Stat = Mapping[str, Any]  # mean, n, and where known sd and ci95: [low, high]
 MEANING = "Accuracy: the part of held-out readings whose x and y are both within 1 mm. MSE_xy: mean over the two axes."
-SPREAD = (
-    "± is the sd over n folds (over n pairs of a training and a test skin for one skin on others), or over seeds where "
-    "it says so."
+INTERVAL = (
+    "[low, high] is the 95 % interval over held-out boards (Student's t), each the mean of its skins and networks"
 )
+SPREAD = f"{INTERVAL}; ± is the sd over n repeats on one skin, or over seeds where it says so."
 
 
 def show(value: Stat | None) -> str:
-    """Write a mean and its deviation with three significant digits."""
+    """Write a mean with three significant digits: with its interval over boards, or else with its deviation."""
     if value is None:
         return "–"
-    mean = f"{value['mean']:.4g}" if value["mean"] >= 100 else f"{value['mean']:.3g}"
+    if "ci95" in value:
+        return f"{_three(value['mean'])} {show_interval(value)}"
+    return show_deviation(value)
+
+
+def show_deviation(value: Stat) -> str:
+    """Write a mean and its standard deviation over n, or over seeds where there is one unit."""
+    mean = _three(value["mean"])
     if "sd" in value:
         return f"{mean} ± {value['sd']:.2g}"
     return mean + (f" ± {value['sd_seeds']:.2g} (seeds)" if "sd_seeds" in value else "")
+
+
+def show_interval(value: Stat) -> str:
+    """Write the 95 % interval over boards alone."""
+    low, high = value["ci95"]
+    return f"[{_three(low)}, {_three(high)}]"
+
+
+def show_both(value: Stat | None) -> str:
+    """Write a mean, its standard deviation as the paper does, and its interval over boards."""
+    if value is None or "ci95" not in value:
+        return show(value)
+    return f"{show_deviation(value)} {show_interval(value)}"
 
 
 def show_difference(value: Stat | None) -> str:
@@ -42,8 +62,12 @@ def n_of(row: Mapping[str, Any]) -> str:
     return str(row["accuracy_pct"]["n"])
 
 
+def _three(value: float) -> str:
+    return f"{value:.4g}" if abs(value) >= 100 else f"{value:.3g}"
+
+
 def tabulate(lines: Sequence[Mapping[str, str]], **said: str) -> pd.DataFrame:
-    """Make a table, and keep what is said below it: its `meaning`, and its `spread`, which is what ± stands for."""
+    """Make a table, and keep what is said below it: its `meaning`, and its `spread`: what ± and brackets are."""
     table = pd.DataFrame(lines)
     table.attrs.update(said)
     return table

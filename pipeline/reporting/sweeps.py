@@ -84,16 +84,26 @@ def sweep_sensors(rows: Sequence[Mapping[str, Any]], source: str) -> str:
         if own:
             lines.append(Line(SHORT[method], [row["skins_n"] for row in own], own, look, shift_pt=4.0 * (i - 1)))
     return _sweep(
-        lines, f"Scores on one board held out, by the number of training skins ({source})", "training skins", log=False
+        lines, f"Scores on boards held out, by the number of training skins ({source})", "training skins", log=False
     )
 
 
 def bars(scores: Sequence[Mapping[str, Any]], metric: str) -> tuple[np.ndarray, np.ndarray]:
-    """Find means and the lengths of their bars (down, up): one sd, cut at what is possible, as 100 % accuracy."""
+    """Find means and the lengths of their bars (down, up): the interval over boards, cut at what is possible.
+
+    Without one (one board, the paper) bars are one sd.
+    """
     means = np.array([one[metric]["mean"] for one in scores])
-    sd = np.array([one[metric].get("sd", one[metric].get("sd_seeds", 0.0)) for one in scores])
-    least, most = DRAWN[metric]
-    return means, np.stack([np.minimum(sd, means - least), np.minimum(sd, most - means)])
+    ends = np.array([_ends(one[metric]) for one in scores]).clip(*DRAWN[metric])
+    return means, np.stack([means - ends[:, 0], ends[:, 1] - means]).clip(min=0)  # rounded numbers
+
+
+def _ends(stat: Mapping[str, Any]) -> Sequence[float]:
+    if "ci95" in stat:
+        ends: Sequence[float] = stat["ci95"]
+        return ends
+    sd = stat.get("sd", stat.get("sd_seeds", 0.0))
+    return stat["mean"] - sd, stat["mean"] + sd
 
 
 def _sweep(lines: Sequence[Line], title: str, xlabel: str, *, log: bool) -> str:
@@ -115,7 +125,7 @@ def _sweep(lines: Sequence[Line], title: str, xlabel: str, *, log: bool) -> str:
             _bars(axes, lines, metric)
         figure.align_ylabels()
         look = {"loc": "outside lower left", "ncols": 2, "frameon": False, "fontsize": 9, "alignment": "left"}
-        bars_are = _about_bars(lines, "folds" if log else "draws of skins")
+        bars_are = _about_bars(lines)
         figure.legend(*axes.get_legend_handles_labels(), title=bars_are, title_fontsize=9, **look)
         figure.suptitle(title, x=0.01, ha="left", fontsize=10)
         return svg(figure)
@@ -136,8 +146,11 @@ def _bars(axes: Any, lines: Sequence[Line], metric: str) -> None:
     axes.set_ylim(min(ends) - room, max(ends) + room)
 
 
-def _about_bars(lines: Sequence[Line], over: str) -> str:
-    ours = [one["accuracy_pct"] for line in lines for one in line.scores if "n" in one["accuracy_pct"]]
-    kinds = {f"sd over n = {one['n']} {over}" for one in ours if "sd" in one}
-    kinds |= {"sd over seeds" for one in ours if "sd" not in one and "sd_seeds" in one}
-    return f"Bars: {', '.join(sorted(kinds))}; cut at what is possible." if kinds else "No bars: one training each."
+def _about_bars(lines: Sequence[Line]) -> str:
+    stats = [one["accuracy_pct"] for line in lines for one in line.scores]
+    kinds = {f"95 % interval over {one['n']} boards" for one in stats if "ci95" in one}
+    kinds |= {"sd over seeds (one board)" for one in stats if "sd" not in one and "sd_seeds" in one}
+    if not kinds:
+        return "No bars: one training each."
+    of_paper = " (paper: sd)" if any("n" not in one for one in stats) else ""
+    return f"Bars: {', '.join(sorted(kinds))}{of_paper}; cut at what is possible."

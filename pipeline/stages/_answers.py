@@ -22,7 +22,7 @@ def answers_before(at: Scenery, fold: Fold, settings: Adaptation, starts: Starts
     for seed_i, start in own_starts(starts, settings.base, fold).items():
         predict = Predictor(start.weights, recipe.architecture, device())
         predicted = start.scaler.decode(predict(start.scaler.encode(view)))
-        yield Answered(BEFORE, skin, seed_i, at.rows.target[test], predicted)
+        yield Answered(BEFORE, str(at.rows.board[test[0]]), skin, seed_i, at.rows.target[test], predicted)
 
 
 def answers_after(at: Scenery, cells: Sequence[tuple[str, Cell]], stage: str) -> list[Answered]:
@@ -31,6 +31,8 @@ def answers_after(at: Scenery, cells: Sequence[tuple[str, Cell]], stage: str) ->
     trained = train_all(at, own, stage)
     note_seconds(at.scene, stage, own, trained)
     return [
-        Answered(arm, cell.skin, cell.seed_i, at.rows.target[cell.test], one.predicted)
+        Answered(
+            arm, str(at.rows.board[cell.test[0]]), cell.skin, cell.seed_i, at.rows.target[cell.test], one.predicted
+        )
         for (arm, cell), one in zip(cells, trained, strict=True)
     ]

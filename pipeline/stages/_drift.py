@@ -48,8 +48,8 @@ def answers(cell: Cell, trained: Trained, tests: Sequence[Part]) -> Iterator[Ans
     cuts = np.cumsum([len(part.rows) for part in tests])[:-1]
     for part, predicted in zip(tests, np.split(trained.predicted, cuts), strict=True):
         yield Answers(
-            part.policy, part.readings.skin, cell.seed_i, part.window_i, int(part.readings.n_contacts[0]),
-            part.noload_off_uT, part.rows.indentation, part.rows.target, predicted,
+            part.policy, part.readings.board, part.readings.skin, cell.seed_i, part.window_i,
+            int(part.readings.n_contacts[0]), part.noload_off_uT, part.rows.indentation, part.rows.target, predicted,
         )  # fmt: skip
 
 

@@ -5,7 +5,17 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.dataset.parts import Part, stack
-from pipeline.evaluation.drift import Answers, field_sizes, late_force, late_window, of_networks, over_windows, pace
+from pipeline.evaluation.drift import (
+    Answers,
+    boards_of,
+    field_sizes,
+    last_window,
+    late_force,
+    late_window,
+    of_networks,
+    over_windows,
+    pace,
+)  # fmt: skip
 from pipeline.evaluation.drift_findings import findings
 from pipeline.learning.recipe import HEADLINE
 from pipeline.sections import Drift
@@ -51,7 +61,10 @@ def _tell(
         numbers["late"] = where | late[0] | ({} if left_pct is None else {"force_left_pct": left_pct})
         drawn = {"late": late[1]}
     networks: dict[str, Any] = {name: of_networks(said, name) for name in asked.policies}
-    return numbers | {"findings": findings(rows, networks, field=field, late=numbers.get("late"))}, drawn
+    boards = boards_of(said, policy)
+    found = findings(rows, networks, boards=boards, field=field, late=numbers.get("late"))
+    last = {name: last_window(said, name) for name in asked.policies}
+    return numbers | {"findings": found, "last_window": last}, drawn
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ def dynamics(scene: str, indentations: Path, models: Path, answer: Path) -> None
     one = only(read_folder(indentations), indentations)
     true = np.stack([getattr(one, name) for name in TARGETS], axis=1)
     presses = presses_of(subtract(one.b_uT, one.noload_uT), true, one.t_s, one.indentation)
-    numbers = compare(presses, networks_without(models, one.board))
+    numbers = compare(presses, networks_without(models, one.board), board=one.board)
     write_answer(answer, numbers, {}, read_losses(indentations, {}))
     say(f"{scene}: {numbers['readings_n']} readings of {numbers['presses_n']} presses at {numbers['rate_hz']:.0f} Hz")
 

@@ -5,15 +5,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.evaluation.adapted import AFTER, BEFORE, CONTROL, Answered, bias, biases, over_skins, paired
+from pipeline.evaluation.adapted import AFTER, BEFORE, CONTROL, Answered, bias, biases, over_boards, paired
+from pipeline.evaluation.comparison import paired as paired_cards
 from pipeline.evaluation.flexible import DRAWN_N, answer_flexible, by_depth, forces_drawn, strength_ratio
+from pipeline.evaluation.inference import interval
 from pipeline.evaluation.manual import GRID, answer_manual
-from pipeline.evaluation.metrics import score, summarise
-from pipeline.evaluation.summary import paired as paired_cards
+from pipeline.evaluation.metrics import score
 from pipeline.evaluation.summary import score_groups
 from pipeline.seeds import rng_for
 
 SINGLE = 1e-4  # sums of single-precision forces of some newtons
+
+
+BOARD = {"s0": "b0", "s1": "b0", "s2": "b1"}
 
 
 def truth(skin: str, f: int = 30) -> np.ndarray:
@@ -23,7 +27,7 @@ def truth(skin: str, f: int = 30) -> np.ndarray:
 def answered(arm: str, skin: str, seed_i: int, spread: float = 1.0) -> Answered:
     true = truth(skin)
     noise = rng_for(0, arm, skin, seed_i).normal(0, spread, true.shape)
-    return Answered(arm, skin, seed_i, true, (true + noise).astype(np.float32))
+    return Answered(arm, BOARD[skin], skin, seed_i, true, (true + noise).astype(np.float32))
 
 
 ANSWERS = [
@@ -43,36 +47,42 @@ def test_the_bias_is_what_was_added_to_every_force(over_N):
 
 def test_forces_half_as_large_again_are_a_bias_of_fifty_percent_in_each_arm_by_itself():
     true = truth("s0")
-    answers = [Answered(BEFORE, "s0", 0, true, true * np.float32(1.5)), Answered(AFTER, "s0", 0, true, true)]
+    answers = [
+        Answered(BEFORE, "b0", "s0", 0, true, true * np.float32(1.5)),
+        Answered(AFTER, "b0", "s0", 0, true, true),
+    ]
     assert biases(answers)["bias_f_pct"][BEFORE]["mean"] == pytest.approx(50, abs=100 * SINGLE)
     assert biases(answers)["bias_f_N"][AFTER]["mean"] == 0
 
 
-def test_each_skin_counts_once_as_the_mean_of_its_seeds():
+def test_each_board_counts_once_as_the_mean_of_its_skins_and_each_skin_as_that_of_its_seeds():
     own = [one for one in ANSWERS if one.arm == AFTER]
-    by_skin = [[score(one.true, one.predicted) for one in own if one.skin == skin] for skin in ("s0", "s1", "s2")]
-    naive = summarise([{name: np.mean([one[name] for one in seeds]) for name in seeds[0]} for seeds in by_skin])
-    ours = over_skins(ANSWERS)[AFTER]
-    for name, value in naive.items():
-        assert ours[name] == pytest.approx(value)
+    skins = {
+        skin: np.mean([score(one.true, one.predicted)["mse_xy_mm2"] for one in own if one.skin == skin])
+        for skin in BOARD
+    }
+    boards = [(skins["s0"] + skins["s1"]) / 2, skins["s2"]]
+    ours = over_boards(ANSWERS)[AFTER]["mse_xy_mm2"]
+    assert ours["mean"] == pytest.approx(np.mean(boards))
+    assert ours["ci95"] == pytest.approx(interval(boards))
+    assert ours["n"] == 2
 
 
 def test_differences_are_those_of_the_summary_of_cards():
     cards = {
         arm: [
-            {"fold": "b0", "scores": score_groups(a.true, a.predicted, np.full(30, "b0"), np.full(30, a.skin))}
+            {"fold": a.board, "scores": score_groups(a.true, a.predicted, np.full(30, a.board), np.full(30, a.skin))}
             for a in ANSWERS if a.arm == arm
         ]
         for arm in (BEFORE, AFTER)
     }  # fmt: skip
-    for name, value in paired_cards(cards[AFTER], cards[BEFORE]).items():
-        assert paired(ANSWERS, AFTER, BEFORE)[name] == pytest.approx(value)
+    assert paired(ANSWERS, AFTER, BEFORE) == paired_cards(cards[AFTER], cards[BEFORE])
 
 
 def test_adaptation_by_hand_is_told_with_its_counts_its_control_and_its_price():
     answer = answer_manual(ANSWERS, pokes_n=[325, 324, 325], lines_n=[13, 13, 13])
-    counts = ("pokes_n", "lines_n", "skins_n", "seeds_n")
-    assert {name: answer[name] for name in counts} == dict(zip(counts, (325, 13, 3, 2), strict=True))
+    counts = ("pokes_n", "lines_n", "skins_n", "boards_n", "seeds_n")
+    assert {name: answer[name] for name in counts} == dict(zip(counts, (325, 13, 3, 2, 2), strict=True))
     for other in (BEFORE, CONTROL, GRID):
         difference = answer["paired"][f"after_minus_{other}"]["accuracy_pct"]["mean"]
         after, before = (answer[arm]["accuracy_pct"]["mean"] for arm in (AFTER, other))
@@ -103,7 +113,7 @@ def test_depths_that_only_one_kind_of_board_has_are_not_compared():
 
 
 def test_the_figure_shows_equal_readings_of_both_arms_and_no_more_than_are_seen():
-    many = [Answered(arm, "s0", 0, truth("s0", 900), truth("s0", 900)) for arm in (BEFORE, AFTER)]
+    many = [Answered(arm, "b0", "s0", 0, truth("s0", 900), truth("s0", 900)) for arm in (BEFORE, AFTER)]
     drawn = forces_drawn(many, rng_for(0, "drawn"))
     assert drawn[BEFORE]["true_N"] == drawn[AFTER]["true_N"] == drawn[AFTER]["predicted_N"]
     assert len(drawn[BEFORE]["true_N"]) == DRAWN_N

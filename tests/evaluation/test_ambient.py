@@ -21,6 +21,7 @@ from pipeline.evaluation.ambient import (
     uniform_cases,
     without_common_part,
 )
+from pipeline.evaluation.inference import interval
 from pipeline.physics.sensor import ChipDesign, read_field, steps_uT
 from pipeline.physics.skin import draw_skin
 from pipeline.seeds import rng_for
@@ -137,7 +138,9 @@ def test_arms_are_put_together_over_the_boards_that_they_were_tried_on():
     ]  # fmt: skip
     rows = over_boards(points, "field_uT", ["b0", "b1"])
     assert [row["field_uT"] for row in rows] == [0.0, 5.0]
-    assert rows[1]["a"]["accuracy_pct"] == {"mean": 70.0, "n": 2, "sd": pytest.approx(np.sqrt(200))}
+    assert rows[1]["a"]["accuracy_pct"] == {
+        "mean": 70.0, "n": 2, "sd": pytest.approx(np.sqrt(200)), "ci95": interval([60.0, 80.0]),
+    }  # fmt: skip
     assert rows[1]["b"]["accuracy_pct"] == {"mean": 50.0, "n": 1}
     (iron,) = over_boards(points, "distance_mm", ["b0", "b1"])
     assert iron["field_uT"] == pytest.approx(np.sqrt(12.5))

@@ -16,7 +16,13 @@ Card = dict[str, Any]
 def card(question: str, name: str, mse_xy_mm2: float, fold: str = "b0", **changes: Any) -> Card:
     """A card with one skin a board; accuracy and force speak for the worst place."""
     score = {"accuracy_pct": mse_xy_mm2, "mse_xy_mm2": mse_xy_mm2, "mse_f_N2": 1 / mse_xy_mm2}
-    scores = {"all": score, "registered": score, "by_skin": {f"{fold}_s0": score}, "rows_n": 4}
+    scores = {
+        "all": score,
+        "registered": score,
+        "by_skin": {f"{fold}_s0": score},
+        "board_of": {f"{fold}_s0": fold},
+        "rows_n": 4,
+    }
     own = {"scene": "tuning", "question": question, "recipe_name": name, "recipe": dict(RECIPE), "fold": fold}
     who = {"seed_i": 0, "test_boards": [fold], "test_skins": [f"{fold}_s0"]}
     return own | who | {"scores": scores} | changes

@@ -18,6 +18,7 @@ from pipeline.evaluation.contacts import (
     over_boards,
     where_it_falls,
 )
+from pipeline.evaluation.inference import interval
 from pipeline.seeds import rng_for
 from tests.dataset import tables
 
@@ -146,7 +147,7 @@ def test_the_area_over_all_pairs_leaves_out_those_at_one_place():
 def test_boards_are_put_together_leaf_by_leaf():
     trees = [{"a": {"b": 1.0}, "c": 4.0}, {"a": {"b": 3.0}, "c": 6.0}]
     assert over_boards(trees) == {
-        "a": {"b": {"mean": 2.0, "n": 2, "sd": pytest.approx(np.sqrt(2))}},
-        "c": {"mean": 5.0, "n": 2, "sd": pytest.approx(np.sqrt(2))},
+        "a": {"b": {"mean": 2.0, "n": 2, "sd": pytest.approx(np.sqrt(2)), "ci95": interval([1.0, 3.0])}},
+        "c": {"mean": 5.0, "n": 2, "sd": pytest.approx(np.sqrt(2)), "ci95": interval([4.0, 6.0])},
     }
     assert over_boards(trees[:1])["c"] == {"mean": 4.0, "n": 1}

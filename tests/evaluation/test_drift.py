@@ -34,7 +34,7 @@ def answers(policy="each", skin="s0", seed_i=0, window_i=0, n=40, bias_N=0.1, **
         "contacts_n": 5000 * (window_i + 1), "noload_off_uT": 2.0, "indentation": np.repeat(np.arange(n // 2), 2),
         "true": true, "predicted": (true + error).astype(np.float32),
     }  # fmt: skip
-    return Answers(policy, skin, seed_i, window_i, **(values | changes))
+    return Answers(policy, f"board of {skin}", skin, seed_i, window_i, **(values | changes))
 
 
 def test_a_window_has_the_mean_of_its_skins_and_seeds_and_their_deviation():

@@ -1,9 +1,8 @@
 import numpy as np
 import pytest
 
-from pipeline.errors import SchemaError
 from pipeline.evaluation.metrics import METRICS, score
-from pipeline.evaluation.summary import over_folds, over_test_skins, paired, pool_skins, score_groups
+from pipeline.evaluation.summary import over_folds, over_test_skins, pool_skins, score_groups
 from pipeline.seeds import rng_for
 
 RNG = rng_for(0, "summary")
@@ -78,6 +77,7 @@ def test_networks_adapted_to_one_skin_each_are_pooled_to_one_a_fold_and_seed():
                     total += one["scores"][part][name]
                 assert card["scores"][part][name] == pytest.approx(total / 2, rel=1e-12)  # float64
         assert card["scores"]["by_skin"] == {**own[0]["scores"]["by_skin"], **own[1]["scores"]["by_skin"]}
+        assert card["scores"]["board_of"] == {skin: card["fold"] for skin in card["scores"]["by_skin"]}
         assert card["scores"]["rows_n"] == 20
 
 
@@ -99,58 +99,3 @@ def test_skins_of_equally_many_rows_pool_to_the_score_of_all_their_rows():
 def test_pooling_what_is_of_all_skins_already_changes_nothing():
     once = pool_skins(every())
     assert pool_skins(once) == once
-
-
-def looped_pairs(cards: list[dict], others: list[dict], name: str) -> list[float]:
-    """Per held-out skin, the mean over seeds of one side less that of the other, plainly."""
-    differences = []
-    for fold, skin in [("b0", "s0"), ("b0", "s1"), ("b1", "s2"), ("b1", "s3")]:
-        means = []
-        for side in (cards, others):
-            found = [
-                one["scores"]["by_skin"][skin][name]
-                for one in side
-                if one["fold"] == fold and skin in one["scores"]["by_skin"]
-            ]
-            means.append(sum(found) / len(found))
-        differences.append(means[0] - means[1])
-    return differences
-
-
-def test_paired_differences_are_those_of_naive_loops():
-    cards, others = every(), every(off_mm=2.0)
-    summary = paired(cards, others)
-    for name in METRICS:
-        looped = looped_pairs(cards, others, name)
-        mean = sum(looped) / 4
-        sd = (sum((one - mean) ** 2 for one in looped) / 3) ** 0.5
-        assert summary[name] == {"mean": pytest.approx(mean), "sd": pytest.approx(sd), "n": 4}
-    assert summary["mse_xy_mm2"]["mean"] < 0  # the first side is the better one
-
-
-def test_swapping_the_sides_of_a_pair_negates_its_mean_and_keeps_its_spread():
-    one, other = paired(every(), every(off_mm=2.0)), paired(every(off_mm=2.0), every())
-    for name in METRICS:
-        assert one[name]["mean"] == pytest.approx(-other[name]["mean"], rel=1e-12)  # float64
-        assert one[name]["sd"] == pytest.approx(other[name]["sd"], rel=1e-12)
-
-
-def test_nothing_differs_from_itself_and_pooling_changes_no_pair():
-    assert paired(every(), every())["accuracy_pct"] == {"mean": 0.0, "sd": 0.0, "n": 4}
-    assert paired(pool_skins(every()), every(off_mm=2.0)) == paired(every(), every(off_mm=2.0))
-
-
-def test_the_order_of_cards_and_another_number_of_seeds_are_no_matter_for_pairs():
-    cards, others = every(), every(off_mm=2.0)
-    for name, one in paired(cards, others).items():
-        assert paired(cards[::-1], others[::-1])[name] == pytest.approx(one, rel=1e-12)  # float64
-    assert paired(cards, others[:4])["accuracy_pct"]["n"] == 4
-
-
-def test_a_force_that_no_recording_has_is_absent_from_pairs():
-    assert set(paired(every(force=False), every(force=False))) == {"accuracy_pct", "mse_xy_mm2"}
-
-
-def test_sides_that_do_not_hold_the_same_skins_out_make_no_pair():
-    with pytest.raises(SchemaError, match=r"held-out skins must be the same on both sides; got .*'b1', 's3'"):
-        paired(every(), [card for card in every() if "s3" not in card["scores"]["by_skin"]])

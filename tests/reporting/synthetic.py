@@ -1,10 +1,24 @@
 """A numbers.json that has every question's contract keys, with values that no run made."""
 
+from scipy.stats import t
+
 from pipeline.evaluation.metrics import METRICS
 
 
 def stat(mean: float = 1.0, sd: float = 0.5, n: int = 3) -> dict:
     return {"mean": mean, "sd": sd, "n": n}
+
+
+def over_boards(low: float = 0.5, high: float = 1.5, n: int = 6) -> dict:
+    """A summary over boards with this 95 % interval."""
+    reach = (high - low) / 2
+    return {"mean": (low + high) / 2, "sd": reach * n**0.5 / t.ppf(0.975, n - 1), "n": n, "ci95": [low, high]}
+
+
+def difference(low: float = 0.5, high: float = 1.5) -> dict:
+    """A paired difference, of every metric alike."""
+    by_board = {board: dict.fromkeys(METRICS, (low + high) / 2) for board in ("b0", "b1")}
+    return {name: over_boards(low, high) for name in METRICS} | {"by_board": by_board}
 
 
 def scores(names: tuple[str, ...] = METRICS) -> dict:
@@ -20,7 +34,12 @@ def cost(seconds: float = 1.0) -> dict:
 def all_questions(source: str = "simulated") -> dict:
     plain = dict.fromkeys(METRICS, 1.0)
     windows = [{"contacts_n": 5000, "accuracy_pct": 90.0, "mse_xy_mm2": 0.1, "mse_f_N2": 0.1}]
-    finding = {"finding": "errors grow", "holds": True, "measured": "+3 points", "why": ""}
+    names = ("higher_and_faster", "offset", "each_is_worse", "overestimates")
+    said = {"finding": "errors grow", "holds": True, "verdict": "yes", "of_trainings": "yes", "measured": "+3 points"}
+    last = {"contacts_n": 49000, "accuracy_pct": {"mean": 90.0, "n": 1}}
+    contrasts = ("pokes_first", "pokes_gain", "pokes_plateau", "sensors_gain_fewer")
+    contrasts += tuple(f"sensors_more_{method}" for method in ("multi", "triplet", "adapted"))
+    counts = {"from_pokes_n": 780, "to_pokes_n": 780}
     return {
         "provenance": {
             "scene": "x", "source": source, "git": "abc", "seed": 1, "trained": "abc", "device": "z", "seconds": 1.0,
@@ -32,7 +51,12 @@ def all_questions(source: str = "simulated") -> dict:
         },
         "table2": {arm: scores() for arm in ("single", "multi", "triplet", "adapted")},
         "adapt": {"pokes_n": 390, "control": scores()},
-        "paired": [{"of": "adapted", "over": "triplet", **scores()}],
+        "paired": [
+            {"of": of, "over": over, **difference()}
+            for of, over in (("multi", "single"), ("triplet", "multi"), ("adapted", "triplet"), ("adapted", "multi"))
+        ],
+        "contrasts": {name: counts | difference() for name in contrasts}
+        | {f"sensors_adapted_over_{name}": [{"skins_n": 1, **difference()}] for name in ("multi", "triplet")},
         "sweep_pokes": [{"pokes_n": pokes_n, **scores()} for pokes_n in (0, 390, 780)],
         "sweep_sensors": [{"method": "multi", "skins_n": 1, **scores()}],
         "single_random": scores(), "single_indentation": scores(), "single_pass": scores(),
@@ -40,12 +64,16 @@ def all_questions(source: str = "simulated") -> dict:
         "variants": {"lobo": {"paper": scores()}},
         "described": {"grid": {"source": source, "counts": {"captures_n": 2, "readings_n": 1000}, "over_skins": {}}},
         "drift": {
-            "initial": windows, "regular": windows, "each": windows, "findings": [finding],
+            "initial": windows, "regular": windows, "each": windows, "last_window": {"each": last},
+            "findings": [said | {"id": name} for name in names],
             "late": {"contacts_n": 45000, "bias_N": 0.1, "bias_pct": 5.0},
         },
         "variation": {"contacts_n": 10000},
         "shear": scores(("mse_xy_mm2", "mse_fxy_N2", "mse_fz_N2", "accuracy_pct")),
-        "manual": {"pokes_n": 325, "before": scores(), "after": scores(), "control": scores()},
+        "manual": {
+            "pokes_n": 325, "before": scores(), "after": scores(), "control": scores(),
+            "paired": {"after_minus_before": difference()},
+        },
         "flexible": {
             "before": scores(), "after": scores(), "bias_f_N": {"before": stat(), "after": stat()},
             "gap_less_pct": 45.0,

@@ -7,10 +7,12 @@ from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
 from pipeline.errors import SchemaError
+from pipeline.evaluation.inference import INCONCLUSIVE, NO, ONE_BOARD, YES
 from pipeline.questions import EXPERIMENTS
 from pipeline.reporting import paper
-from pipeline.reporting.checklist import Row, checklist, constant, judge, read_rows, resolve
-from tests.reporting.synthetic import all_questions, stat
+from pipeline.reporting.checklist import checklist, constant, read_rows, resolve
+from pipeline.reporting.judging import Row, judge
+from tests.reporting.synthetic import all_questions, over_boards, stat
 
 ROOT = Path(__file__).resolve().parents[2]
 STAGES = set(YAML(typ="safe").load((ROOT / "dvc.yaml").read_text())["stages"]) | set(EXPERIMENTS)
@@ -89,13 +91,90 @@ def test_a_result_differs_exactly_outside_the_papers_sd(mean, sd, ours, path):
 
 
 def test_limits_findings_and_words_are_judged_by_what_they_say():
-    assert sentence(0.05, 0.2, rule="at_most") == "holds: ours is at most 0.2"
-    assert sentence(0.3, 0.2, rule="at_most") == "does not hold: ours is not at most 0.2"
-    assert sentence(80.0, 90.0, rule="at_least") == "does not hold: ours is not at least 90"
-    assert sentence(-0.1, None, rule="positive") == "does not hold: ours is not above 0"
-    assert sentence(False, None) == "does not hold"
-    found = [{"finding": "f", "holds": False, "why": "w"}, {"finding": "g", "holds": True, "why": ""}]
-    assert sentence(found, None) == "1 of 2 hold; not here: f (w)"
+    assert sentence(0.05, 0.2, rule="at_most") == "ours is at most 0.2"
+    assert sentence(0.3, 0.2, rule="at_most") == "ours is not at most 0.2"
+    assert sentence(80.0, 90.0, rule="at_least") == "ours is not at least 90"
+    assert sentence(-0.1, None, rule="positive") == "ours is not above 0"
+    assert sentence(False, None) == "does not hold on the one that was measured"
+    found = {"verdict": "no", "of_trainings": "yes", "why": "Because."}
+    assert sentence(found, None, rule="finding") == "of these trainings: yes. Because"
+
+
+def word(found: Any, printed: Any = None, **words: Any) -> str:
+    mine = row(**{"ours": "a.accuracy_pct"} | words)
+    return judge(mine, printed, found, pooled=True, simulated=True).word
+
+
+@pytest.mark.parametrize(
+    ("rule", "low", "high", "said"),
+    [
+        ("gain", 0.1, 3.0, YES), ("gain", -3.0, -0.1, NO), ("gain", -0.1, 3.0, INCONCLUSIVE),
+        ("slight", -4.9, 1.0, YES), ("slight", -9.0, -5.1, NO), ("slight", -6.0, 1.0, INCONCLUSIVE),
+        ("plateau", -0.9, 0.9, YES), ("plateau", 1.1, 3.0, NO), ("plateau", -1.1, 0.9, INCONCLUSIVE),
+        ("positive", 0.1, 3.0, YES), ("positive", -3.0, -0.1, NO), ("positive", -1.0, 3.0, INCONCLUSIVE),
+    ],
+)  # fmt: skip
+def test_claims_are_judged_by_their_interval_over_boards(rule, low, high, said):
+    assert word(over_boards(low, high), rule=rule) == said
+    assert word({"mean": (low + high) / 2, "n": 1}, rule=rule) == ONE_BOARD
+
+
+@given(low=st.floats(50, 99), width=st.floats(0.1, 20), limit=st.floats(60, 99))
+def test_limits_are_judged_from_both_sides_alike(low, width, limit):
+    stat = over_boards(low, low + width)
+    least, most = word(stat, limit, rule="at_least"), word(stat, limit, rule="at_most")
+    assert (least, most) in {(YES, NO), (NO, YES), (INCONCLUSIVE, INCONCLUSIVE)}
+    assert (least == YES) == (low > limit)
+
+
+def test_less_of_an_error_is_a_gain():
+    assert word(over_boards(-0.3, -0.1), ours="paired.x.mse_xy_mm2", rule="gain") == YES
+    assert word(over_boards(0.1, 0.3), ours="paired.x.mse_xy_mm2", rule="gain") == NO
+
+
+def test_a_claim_says_whether_the_papers_difference_lies_in_our_interval():
+    said = sentence(over_boards(-0.5, 4.3), 5.97, rule="gain")
+    assert said == "the 95 % interval over 6 boards includes 0; the paper's is outside our 95 % interval"
+    assert sentence(over_boards(2.0, 8.0), 5.97, rule="gain").endswith("the paper's is inside our 95 % interval")
+
+
+def test_a_score_on_repeats_of_one_skin_is_one_board_however_many_repeats():
+    assert word(stat(96.3, 0.1, 5), 90.0, rule="at_least") == ONE_BOARD
+
+
+def test_what_is_to_hold_at_every_number_of_skins_fails_where_one_fails():
+    sweep = [
+        {"skins_n": n, "accuracy_pct": over_boards(*ends)} for n, ends in ((1, (1, 2)), (6, (-1, 2)), (15, (2, 3)))
+    ]
+    assert word(sweep, rule="each") == INCONCLUSIVE
+    assert sentence(sweep, None, rule="each") == "yes with 1, 15; inconclusive with 6 training skins"
+    sweep[0]["accuracy_pct"] = over_boards(-2, -1)
+    assert word(sweep, rule="each") == NO
+
+
+def test_a_calibration_target_is_no_evidence_where_it_was_simulated():
+    one = {"ours": "table2.single.accuracy_pct", "rule": "target"}
+    assert sentence(stat(25.0), (25.0, 10.0), **one).startswith("a calibration target of the simulated spreads")
+    assert sentence(stat(25.0), (25.0, 10.0), simulated=False, **one) == "the same"
+    assert {one.id for one in ROWS if one.rule == "target"} == {
+        f"table-2-single-{metric}" for metric in ("accuracy_pct", "mse_xy_mm2", "mse_f_N2")
+    }
+
+
+def test_every_claim_of_the_paper_has_a_verdict_in_the_one_vocabulary():
+    table = checklist(all_questions())
+    claims = table["result"].str.startswith("claim")
+    assert set(table.loc[claims, "verdict"]) <= {YES, NO, INCONCLUSIVE, ONE_BOARD}
+    assert claims.sum() > 20
+    assert set(table["verdict"]) <= {YES, NO, INCONCLUSIVE, ONE_BOARD, "–"}
+
+
+def test_a_sweep_that_does_not_go_as_far_as_a_claim_says_so():
+    numbers = all_questions()
+    del numbers["contrasts"]["pokes_plateau"]
+    assert difference(numbers, "plateau") == "not reached in this scene"
+    del numbers["sweep_pokes"]
+    assert difference(numbers, "plateau") == "not asked in this scene"
 
 
 def test_one_training_skin_is_not_compared_with_pooled_networks():
@@ -119,12 +198,12 @@ def difference(numbers: dict, name: str) -> str:
 
 def test_what_is_seen_earlier_than_in_the_paper_is_said_first():
     numbers = all_questions()
-    assert difference(numbers, "figure-5b") == "after 45,000 contacts; holds: ours is above 0"
+    assert difference(numbers, "figure-5b") == "after 45,000 contacts; ours is above 0"
     numbers["drift"]["late"]["contacts_n"] = 18_000
-    assert difference(numbers, "figure-5b") == "not reached: ours after 18,000 contacts; holds: ours is above 0"
+    assert difference(numbers, "figure-5b") == "not reached: ours after 18,000 contacts; ours is above 0"
     numbers["drift"]["late"]["bias_N"] = -0.1
     assert difference(numbers, "figure-5b").startswith(
-        "not reached: ours after 18,000 contacts; does not hold: ours is not above 0. The paper explains"
+        "not reached: ours after 18,000 contacts; ours is not above 0. The paper explains"
     )
     del numbers["drift"]
     assert difference(numbers, "figure-5b") == "not asked in this scene"
@@ -140,14 +219,14 @@ def test_settings_of_a_simulated_rig_are_no_agreement_with_the_paper(name):
 def test_the_flexible_bias_is_judged_after_adaptation():
     numbers = all_questions()
     numbers["flexible"]["bias_f_N"] = {"before": stat(1.0), "after": stat(-0.2)}
-    assert difference(numbers, "flexible-bias").startswith("does not hold: ours is not above 0")
+    assert difference(numbers, "flexible-bias").startswith("ours is not above 0")
 
 
 def test_reasons_about_simulation_are_given_of_simulated_scenes_alone():
     simulation = ("simulat", "assumed", "that may be why")
     for source in ("simulated", "recorded"):
         found = checklist(all_questions(source))["difference"]
-        said = found[[one.rule != "input" for one in ROWS]].str.contains("|".join(simulation))
+        said = found[[one.rule not in ("input", "target") for one in ROWS]].str.contains("|".join(simulation))
         assert said.any() == (source == "simulated")
     assert all(one.simulated_only for one in ROWS if any(word in one.why for word in simulation))
 
@@ -157,21 +236,12 @@ def test_a_reason_names_numbers_of_the_paper_and_of_ours():
     assert "The chips of the paper's flexible board are 80 % nearer, ours 45 %" in said
 
 
-def test_where_only_ours_has_a_spread_the_papers_number_is_held_against_it():
-    assert sentence(stat(80.0, 6.0), 85.0).endswith("within 10 % of the paper's; within one sd of ours (n = 3)")
-    assert sentence(stat(80.0, 4.0), 85.0).endswith("outside one sd of ours (n = 3)")
-    assert "ours (n" not in sentence(stat(80.0, 6.0), (85.0, 1.0))
-    assert "ours (n" not in sentence({"mean": 80.0, "n": 1}, 85.0)
-
-
-def test_a_plateau_is_told_by_what_further_pokes_gain():
-    points = [
-        {"pokes_n": pokes_n, "accuracy_pct": stat(mean)} for pokes_n, mean in ((0, 70), (65, 72), (390, 80), (780, 81))
-    ]
-    said = "accuracy is 70 % at 0, 80 % at 390, 81 % at 780 pokes: +10 points from 0 to 390, +1 points from 390 to 780"
-    assert sentence(points, 780, rule="plateau") == said
-    few = sentence(points[:2], 780, rule="plateau")
-    assert few == "not reached: ours up to 65 pokes; accuracy is 70 % at 0, 72 % at 65 pokes: +2 points from 0 to 65"
+def test_the_papers_number_is_held_against_our_interval_over_boards():
+    inside = "within 10 % of the paper's; the paper's is inside our 95 % interval"
+    assert sentence(over_boards(74.0, 86.0), 85.0).endswith(inside)
+    assert sentence(over_boards(76.0, 84.0), (85.0, 9.0)).endswith("the paper's is outside our 95 % interval")
+    assert "our 95 %" not in sentence(stat(80.0, 6.0, 5), 85.0)  # repeats are no boards
+    assert "our 95 %" not in sentence({"mean": 80.0, "n": 1}, 85.0)
 
 
 def test_a_misspelt_constant_is_one_sentence():
@@ -181,4 +251,5 @@ def test_a_misspelt_constant_is_one_sentence():
 
 def test_a_row_of_a_list_is_picked_by_its_value():
     assert resolve(all_questions(), "sweep_pokes.pokes_n=390.accuracy_pct") == stat()
+    assert resolve(all_questions(), "paired.of=adapted,over=multi.over") == "multi"
     assert resolve(all_questions(), "sweep_pokes.pokes_n=391.accuracy_pct") is None

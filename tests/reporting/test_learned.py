@@ -4,16 +4,22 @@ import json
 
 import pytest
 
+from pipeline.evaluation.inference import interval
 from pipeline.reporting.learned import PAIRS, by_fold, learned, timed_learning
 
 HELD_OUT = {"b0": ("s0", "s1"), "b1": ("s2", "s3")}
 BETTER = {"s0": 2.0, "s1": 4.0, "s2": 6.0, "s3": 8.0}  # points that adaptation gains on each skin
 
 
+BOARD_OF = {skin: board for board, skins in HELD_OUT.items() for skin in skins}
+
+
 def scores(by_skin: dict[str, float]) -> dict:
     own = {skin: {"accuracy_pct": pct, "mse_xy_mm2": 1.0, "mse_f_N2": 0.5} for skin, pct in by_skin.items()}
     every = {"accuracy_pct": sum(by_skin.values()) / len(by_skin), "mse_xy_mm2": 1.0, "mse_f_N2": 0.5}
-    return {"all": every, "registered": every, "by_skin": own, "rows_n": 10 * len(own)}
+    return {"all": every, "registered": every, "by_skin": own, "rows_n": 10 * len(own)} | {
+        "board_of": {skin: BOARD_OF[skin] for skin in own}
+    }
 
 
 def card(question: str, fold: str, by_skin: dict[str, float], recipe: str = "paper", seed_i: int = 0) -> dict:
@@ -52,25 +58,38 @@ def paired(of: str, over: str) -> dict:
 def test_table_2_is_over_boards_and_adapted_skins_are_pooled_by_board():
     table2 = numbers()["table2"]
     assert table2.keys() == {"triplet", "adapted"}
-    assert table2["triplet"]["accuracy_pct"] == {"mean": 78.0, "n": 2, "sd": 0.0}
+    assert table2["triplet"]["accuracy_pct"] == {"mean": 78.0, "n": 2, "sd": 0.0, "ci95": [78.0, 78.0]}
     # board b0: 80 and 82, board b1: 84 and 86
-    assert table2["adapted"]["accuracy_pct"] == {"mean": 83.0, "n": 2, "sd": pytest.approx(8**0.5)}
+    assert table2["adapted"]["accuracy_pct"] == over(81.0, 85.0)
 
 
 def test_the_control_stands_beside_adaptation_with_the_number_of_pokes():
     assert numbers()["adapt"]["pokes_n"] == 390
-    assert numbers()["adapt"]["control"]["accuracy_pct"] == {"mean": 80.5, "n": 2, "sd": pytest.approx(2**0.5)}
+    assert numbers()["adapt"]["control"]["accuracy_pct"] == over(79.5, 81.5)
 
 
-def test_pairs_are_over_the_held_out_skins_and_of_one_method_over_another():
-    assert [(one["of"], one["over"]) for one in numbers()["paired"]] == list(PAIRS)
-    # gains of 2, 4, 6 and 8 points
-    gain = {"mean": 5.0, "n": 4, "sd": pytest.approx((20 / 3) ** 0.5)}
-    assert paired("adapted", "triplet")["accuracy_pct"] == gain
-    assert paired("adapted", "control")["accuracy_pct"] == {"mean": 2.5, "n": 4, "sd": pytest.approx((5 / 3) ** 0.5)}
-    assert paired("triplet", "multi")["accuracy_pct"] == {"mean": -2.0, "n": 4, "sd": 0.0}
+def over(*boards: float) -> dict:
+    sd = (boards[1] - boards[0]) / 2**0.5
+    return {"mean": sum(boards) / 2, "n": 2, "sd": pytest.approx(sd), "ci95": pytest.approx(interval(boards))}
+
+
+def test_pairs_are_over_the_held_out_boards_and_of_one_method_over_another():
+    assert [(one["of"], one["over"]) for one in numbers()["paired"]] == [one for one in PAIRS if "single" not in one]
+    # gains of 2 and 4 points on the skins of b0, of 6 and 8 on those of b1
+    assert paired("adapted", "triplet")["accuracy_pct"] == over(3.0, 7.0)
+    by_board = paired("adapted", "triplet")["by_board"]
+    assert {board: own["accuracy_pct"] for board, own in by_board.items()} == {"b0": 3.0, "b1": 7.0}
+    assert paired("adapted", "control")["accuracy_pct"] == over(1.5, 3.5)
+    assert paired("triplet", "multi")["accuracy_pct"] == {"mean": -2.0, "n": 2, "sd": 0.0, "ci95": [-2.0, -2.0]}
     assert paired("adapted", "multi")["accuracy_pct"]["mean"] == 3.0
     assert paired("control", "triplet")["accuracy_pct"]["mean"] == 2.5
+
+
+def test_many_skins_are_compared_with_one_on_the_skins_that_one_was_tested_on():
+    single = [card("transfer", "s0", {"s2": 20.0, "s3": 30.0}), card("transfer", "s9", {"s2": 40.0, "s3": 30.0})]
+    (one,) = [one for one in numbers([*CARDS, *single])["paired"] if one["over"] == "single"]
+    assert {board: own["accuracy_pct"] for board, own in one["by_board"].items()} == {"b1": 80.0 - 30.0}
+    assert one["accuracy_pct"] == {"mean": 50.0, "n": 1}
 
 
 def test_a_question_that_was_not_asked_is_absent_and_not_null():
@@ -109,7 +128,8 @@ def test_a_sweep_over_pokes_is_in_their_order_and_starts_with_none():
 
 def test_a_sweep_over_sensors_has_a_curve_for_each_method_over_draws():
     points = [
-        card("sensors", f"{skins_n:02d}skins-draw{draw_i}", by_skin) | {"method": method, "trained_on_skins_n": skins_n}
+        card("sensors", f"b1-{skins_n:02d}skins-draw{draw_i}", by_skin)
+        | {"method": method, "trained_on_skins_n": skins_n}
         for method, step_pct in (("multi", 0.0), ("triplet", 1.0), ("adapted", 2.0))
         for skins_n in (3, 1)
         for draw_i in range(2)
@@ -124,8 +144,8 @@ def test_a_sweep_over_sensors_has_a_curve_for_each_method_over_draws():
         ("multi", 1, 56.5), ("multi", 3, 58.5), ("triplet", 1, 57.5), ("triplet", 3, 59.5), ("adapted", 1, 58.5),
         ("adapted", 3, 60.5),
     ]  # fmt: skip
-    assert all(one["accuracy_pct"]["n"] == 2 for one in sweep)
-    assert all(one["accuracy_pct"]["sd"] == pytest.approx(0.5**0.5) for one in sweep)
+    assert all(one["accuracy_pct"]["n"] == 1 for one in sweep)  # two draws for one board
+    assert all(one["accuracy_pct"]["sd_seeds"] == pytest.approx(0.5**0.5) for one in sweep)
 
 
 def test_a_method_has_its_own_times_and_an_adapted_network_those_of_its_base_too():

@@ -1,8 +1,6 @@
 """Tables of learning on many skins show the numbers they were given, and say where the paper's order does not hold."""
 
-import statistics
 from itertools import pairwise
-from math import sqrt
 
 import pytest
 from hypothesis import given
@@ -19,11 +17,12 @@ from pipeline.reporting.learning import (
     sweep_pokes_table,
     sweep_sensors_table,
 )
-from pipeline.reporting.order import CONTROL, FAR_SDS, order_table, paired_table
+from pipeline.reporting.order import CONTROL, FAR_SHARE, order_table, paired_boards_table, paired_table
 from pipeline.reporting.paper import TABLE_2
 from pipeline.reporting.readme import blocks_of
 from pipeline.reporting.shown import to_markdown
 from pipeline.reporting.tables import make_tables
+from tests.reporting.synthetic import over_boards
 
 
 def stat(mean: float, sd: float | None = 1.0, n: int = 6) -> dict:
@@ -38,13 +37,21 @@ def paired(of: str, over: str, **scores) -> dict:
     return {"of": of, "over": over, **scores}
 
 
+def between(accuracy_pct: tuple[float, float], error: tuple[float, float]) -> dict:
+    """Paired differences with these 95 % intervals over boards; of both errors alike."""
+    own = {"accuracy_pct": accuracy_pct, "mse_xy_mm2": error, "mse_f_N2": error}
+    by_board = {board: {name: ends[i] for name, ends in own.items()} for i, board in enumerate(("b0", "b1"))}
+    return {name: over_boards(*ends) for name, ends in own.items()} | {"by_board": by_board}
+
+
 BOARDS = {f"b{i}": {"trained_on_skins_n": 15} for i in range(6)}
 ALONE = {f"b{i}": {"trained_on_skins_n": 1} for i in range(2)}
 PAPER_AS_OURS = {name: {metric: stat(*value) for metric, value in metrics.items()} for name, metrics in TABLE_2.items()}
 PAIRED = [
-    paired("triplet", "multi", **row(-3.4, 0.023, n=18)),
-    paired("adapted", "triplet", **row(6.0, -0.2, n=18)),
-    paired("adapted", "control", **row(0.1, 0.1, sd=3.0, n=18)),
+    paired("multi", "single", **between((40.0, 70.0), (-6.0, -4.0))),
+    paired("triplet", "multi", **between((-4.4, -2.4), (-0.1, 0.2))),
+    paired("adapted", "triplet", **between((5.0, 7.0), (-0.3, 0.1))),
+    paired("adapted", "control", **between((-2.9, 3.1), (0.05, 0.15))),
 ]
 NUMBERS = {"table2": PAPER_AS_OURS, "lobo": {"by_board": BOARDS}, "paired": PAIRED}
 
@@ -55,79 +62,88 @@ def verdicts(numbers: dict) -> dict[str, list[str]]:
     return {line["claim"]: [line[title] for title in scores] for _, line in table.iterrows()}
 
 
-def test_the_papers_own_means_fulfil_its_claim_that_many_sensors_are_far_better_than_one():
-    cells = verdicts(NUMBERS)["multi-sensor far better than single-sensor"]
-    assert [cell.split(":")[0] for cell in cells] == ["yes"] * 3
-    assert cells[0] == "yes: +59.2 (5.1 sd)"
-    assert cells[1].startswith("yes: -5.72")
-
-
-def test_the_order_table_tells_what_holds_what_may_be_chance_and_what_does_not_hold():
+def test_the_order_table_tells_what_holds_what_is_inconclusive_and_what_does_not_hold():
     found = verdicts(NUMBERS)
-    assert found["multi-sensor + triplet within a few points of multi-sensor"] == ["yes: -3.4 ± 1", "–", "–"]
+    assert found["multi-sensor better than single-sensor"][0] == "yes: +55 [40, 70]"
+    assert found["multi-sensor + triplet within a few points of multi-sensor"] == ["yes: -3.4 [-4.4, -2.4]", "–", "–"]
     assert found["adapted better than multi-sensor + triplet"][:2] == [
-        "yes: +6 ± 1",
-        "yes, within 2 standard errors: -0.2 ± 1",
+        "yes: +6 [5, 7]",
+        "inconclusive: -0.1 [-0.3, 0.1]",
     ]
     assert found["adapted better than control (ours)"][:2] == [
-        "yes, within 2 standard errors: +0.1 ± 3",
-        "no: +0.1 ± 3",  # an error that rises is no improvement
+        "inconclusive: +0.1 [-2.9, 3.1]",
+        "no: +0.1 [0.05, 0.15]",  # an error that rises is no improvement
     ]
 
 
-@pytest.mark.parametrize(("points", "word"), [(-5.1, "no"), (-4.9, "yes"), (4.9, "yes"), (5.1, "no")])
-def test_a_few_points_are_five_up_or_down(points, word):
-    pair = paired("triplet", "multi", **row(points))
-    (cells,) = verdicts({"paired": [pair]}).values()
+@pytest.mark.parametrize(
+    ("ends", "word"),
+    [((-5.1, -4.9), "inconclusive"), ((-4.9, 4.9), "yes"), ((5.1, 9.0), "no"), ((-9.0, -5.1), "no")],
+)
+def test_a_few_points_are_five_up_or_down(ends, word):
+    (cells,) = verdicts({"paired": [paired("triplet", "multi", **between(ends, (0.0, 1.0)))]}).values()
     assert cells[0].split(":")[0] == word
 
 
-@given(st.lists(st.integers(-20, 20), min_size=2, max_size=18))
-def test_better_means_a_positive_mean_and_surely_better_one_beyond_two_standard_errors(differences):
-    mean, sd, n = statistics.mean(differences), statistics.stdev(differences), len(differences)
-    (cells,) = verdicts({"paired": [paired("adapted", "triplet", **row(mean, -mean, sd, n))]}).values()
-    word = "no" if mean <= 0 else "yes" if mean > 2 * sd / sqrt(n) else "yes, within 2 standard errors"
-    assert [cell.split(":")[0] for cell in cells[:2]] == [word, word]
+@given(st.floats(-20, 20), st.floats(0.01, 20))
+def test_better_means_an_interval_on_the_right_side_of_0_whatever_is_right_for_the_metric(low, width):
+    ends = (low, low + width)
+    turned = (-ends[1], -ends[0])
+    (cells,) = verdicts({"paired": [paired("adapted", "triplet", **between(ends, turned))]}).values()
+    word = "yes" if low > 0 else "no" if low + width < 0 else "inconclusive"
+    assert [cell.split(":")[0] for cell in cells] == [word] * 3
 
 
-@pytest.mark.parametrize(("gain", "word"), [(20.1, "yes"), (19.9, "better, not far"), (-1.0, "no")])
-def test_far_better_is_measured_by_the_sd_of_both_rows(gain, word):
-    # The root mean square of 2 and 14 is 10.
-    table2 = {"single": row(50.0, sd=2.0), "multi": row(50.0 + gain, sd=14.0)}
-    (cells,) = verdicts({"table2": table2, "lobo": {"by_board": BOARDS}, "paired": []}).values()
-    assert FAR_SDS == 2
-    assert cells[0].split(":")[0] == word
+@pytest.mark.parametrize(("ends", "word"), [((29.7, 70.0), "yes"), ((29.5, 70.0), "inconclusive"), ((1.0, 29.5), "no")])
+def test_far_better_is_more_than_half_of_the_difference_of_the_papers_means(ends, word):
+    # 84.43 - 25.24 is 59.19 points
+    cells = verdicts({"paired": [paired("multi", "single", **between(ends, (-1.0, 1.0)))]})
+    assert FAR_SHARE == 0.5
+    assert cells["multi-sensor far better than single-sensor"][0].split(":")[0] == word
+    assert cells["multi-sensor better than single-sensor"][0].split(":")[0] == "yes"
 
 
-def test_one_pair_tells_no_spread_and_the_verdict_says_so():
+def test_one_board_has_no_interval_and_the_verdict_says_so():
     (cells,) = verdicts({"paired": [paired("adapted", "triplet", **row(3.0, -0.1, sd=None, n=1))]}).values()
-    assert cells[:2] == ["yes, but of one: +3", "yes, but of one: -0.1"]
+    assert cells[:2] == ["inconclusive (one board): +3", "inconclusive (one board): -0.1"]
+
+
+def test_differences_are_published_board_by_board():
+    table = paired_boards_table(NUMBERS, "simulated")
+    own = table[table["difference"] == "adapted − multi-sensor + triplet"]
+    assert own["held-out board"].tolist() == ["b0", "b1"]
+    assert own["accuracy, %"].tolist() == ["+5", "+7"]
 
 
 def test_a_claim_whose_rows_were_not_asked_for_is_absent():
-    assert list(verdicts({"paired": PAIRED[:1]})) == ["multi-sensor + triplet within a few points of multi-sensor"]
+    assert list(verdicts({"paired": PAIRED[1:2]})) == ["multi-sensor + triplet within a few points of multi-sensor"]
 
 
 def test_where_nothing_was_claimed_there_is_no_table_of_the_order():
     numbers = {"paired": [paired("multi", "single", **row(0.1))], "lobo": {"by_board": ALONE}}
-    assert set(learning_tables(numbers, "recorded")) == {"paired"}
+    assert set(learning_tables(numbers, "recorded")) == {"paired"}  # and no differences by board either
 
 
 def test_paired_differences_stand_beside_the_difference_of_the_papers_means():
     table = paired_table(NUMBERS, "simulated")
     assert table["difference"].tolist() == [
-        "multi-sensor + triplet − multi-sensor", "adapted − multi-sensor + triplet", "adapted − control",
+        "multi-sensor − single-sensor", "multi-sensor + triplet − multi-sensor", "adapted − multi-sensor + triplet",
+        "adapted − control",
     ]  # fmt: skip
-    assert table["accuracy, % (ours)"].tolist() == ["-3.4 ± 1", "+6 ± 1", "+0.1 ± 3"]
+    assert table["accuracy, % (ours)"].tolist() == [
+        "+55 [40, 70]",
+        "-3.4 [-4.4, -2.4]",
+        "+6 [5, 7]",
+        "+0.1 [-2.9, 3.1]",
+    ]
     # 81.03 - 84.43, 87.00 - 81.03 of table 2; it has no control.
-    assert table["accuracy, % (paper: difference of means)"].tolist() == ["-3.4", "+5.97", "–"]
-    assert table["MSE_xy, mm² (paper: difference of means)"].tolist() == ["+0.023", "-0.242", "–"]
-    assert table["MSE_F, N² (ours)"].tolist() == ["–"] * 3
-    assert "over n held-out skins" in to_markdown(table)
+    assert table["accuracy, % (paper: difference of means)"].tolist() == ["+59.19", "-3.4", "+5.97", "–"]
+    assert table["MSE_xy, mm² (paper: difference of means)"].tolist() == ["-5.72", "+0.023", "-0.242", "–"]
+    assert "95 % interval over n boards" in to_markdown(table)
 
 
 def test_with_one_training_skin_nothing_is_called_multi_sensor_and_no_pooled_number_stands_beside_it():
-    numbers = NUMBERS | {"lobo": {"by_board": ALONE}}
+    numbers = NUMBERS | {"lobo": {"by_board": ALONE}, "paired": PAIRED[1:]}
     for table in (paired_table(numbers, "recorded"), order_table(numbers, "recorded")):
         text = to_markdown(table)
         assert "multi-sensor" not in text
@@ -255,7 +271,7 @@ def part() -> dict:
 def test_a_question_that_was_asked_has_its_table_and_every_row_says_where_it_comes_from():
     tables = learning_tables(everything(), "simulated")
     assert set(tables) == {
-        "order", "paired", "sweep_pokes", "sweep_sensors", "baselines", "labels", "audit", "chosen",
+        "order", "paired", "paired_boards", "sweep_pokes", "sweep_sensors", "baselines", "labels", "audit", "chosen",
     }  # fmt: skip
     assert set(tables) < set(make_tables(everything()))
     for table in tables.values():

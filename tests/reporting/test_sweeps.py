@@ -67,7 +67,7 @@ def test_bars_are_one_sd_cut_where_no_score_can_be():
 @pytest.mark.parametrize(
     ("spread", "words"),
     [
-        ({"sd": 1.0, "n": 18}, "sd over n = 18 draws of skins"),
+        ({"sd": 1.0, "n": 6, "ci95": [48.0, 52.0]}, "95 % interval over 6 boards"),
         ({"sd_seeds": 1.0, "n": 1}, "sd over seeds"),
         ({"n": 1}, "No bars"),
     ],

@@ -3,6 +3,7 @@ import json
 import pytest
 
 from pipeline.errors import SchemaError
+from pipeline.evaluation.inference import interval
 from pipeline.evaluation.metrics import METRICS
 from pipeline.reporting.numbers import add_up, compose, lost_by_protocol, rounded
 from pipeline.reporting.paper import TABLE_2
@@ -14,7 +15,9 @@ from pipeline.reporting.tables import make_tables
 
 def card(question: str, fold: str, accuracy_pct: float, recipe: str = "paper") -> dict:
     one = {"accuracy_pct": accuracy_pct, "mse_xy_mm2": 1.0, "mse_f_N2": 0.5}
-    scores = {"all": one, "registered": one, "by_skin": {"s0": one, "s1": {**one, "accuracy_pct": accuracy_pct + 10}}}
+    skins = {"s0": one, "s1": {**one, "accuracy_pct": accuracy_pct + 10}}
+    board = fold if question == "lobo" else "b0"
+    scores = {"all": one, "registered": one, "by_skin": skins, "board_of": dict.fromkeys(skins, board)}
     return {"question": question, "fold": fold, "recipe_name": recipe, "scores": scores, "train_skins": ["s8", "s9"]}
 
 
@@ -39,9 +42,10 @@ def numbers(cards: list[dict] = CARDS, source: str = "recorded") -> dict:
     return {"provenance": provenance, **compose(cards, {}, ACCOUNTS, {"low_force_rows_n": 3}, headline="paper")}
 
 
-def test_pooled_numbers_are_over_folds_and_single_ones_over_pairs_of_skins():
+def test_pooled_numbers_are_over_boards_and_single_ones_over_pairs_of_skins():
     table2 = numbers()["table2"]
-    assert table2["multi"]["accuracy_pct"] == {"mean": 85.0, "n": 2, "sd": pytest.approx(50**0.5)}
+    ends = pytest.approx(interval([80.0, 90.0]))
+    assert table2["multi"]["accuracy_pct"] == {"mean": 85.0, "n": 2, "sd": pytest.approx(50**0.5), "ci95": ends}
     assert table2["single"]["accuracy_pct"] == {"mean": 25.0, "n": 2, "sd": pytest.approx(50**0.5)}
 
 

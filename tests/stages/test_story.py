@@ -96,7 +96,11 @@ def test_every_question_about_many_skins_is_answered_on_the_same_test_rows(story
         (method, skins_n) for method in ("multi", "triplet", "adapted") for skins_n in (1, 4)
     }
     assert {(row["of"], row["over"]) for row in numbers["paired"]} >= {("triplet", "multi"), ("adapted", "triplet")}
-    assert all(row["accuracy_pct"]["n"] == 6 for row in numbers["paired"])  # held-out skins
+    boards_n = {(row["of"], row["over"]): row["accuracy_pct"]["n"] for row in numbers["paired"]}
+    assert boards_n.pop(("multi", "single")) == 1  # one skin of each of two boards was tested on the third
+    assert set(boards_n.values()) == {3}
+    assert all(len(row["by_board"]) == row["accuracy_pct"]["n"] for row in numbers["paired"])
+    assert all(row["accuracy_pct"]["n"] == 3 for row in [*numbers["sweep_sensors"], *numbers["sweep_pokes"]])
     assert {row["method"] for row in numbers["baselines"]} >= {"network", "network, adapted", "ridge"}
     assert {row["labels_n"] for row in numbers["labels"]} == {0, 10}
     assert all(check["holds"] or check["known"] for check in numbers["audit"])

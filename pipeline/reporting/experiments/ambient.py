@@ -38,7 +38,8 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
         f"field: {numbers['directions']}. The ball of iron, {2 * numbers['iron_radius_mm']:g} mm across, "
         f"lies right above the skin's middle, in the earth's field ({numbers['earth_uT']:g} µT, dipping "
         f"{numbers['earth_dip_deg']:g}°) and the skin's own. {meanings}. The last arm is trained for board "
-        f"{last['board']} alone: compare arms there. ± is the sd over held-out boards. The paper gives no number "
+        f"{last['board']} alone: compare arms there. [low, high] is the 95 % interval over held-out boards (Student's "
+        "t). The paper gives no number "
         "(section 7: future work)."
     )
     return {"ambient": table}
@@ -83,10 +84,12 @@ def _field(kind: str, row: Mapping[str, Any]) -> str:
     return f"iron at {row['distance_mm']:g} mm ({row['field_uT']:.2g} µT at the chips)"
 
 
-def _scores(stats: Mapping[str, Mapping[str, float]]) -> dict[str, str]:
-    return {
-        words: f"{stats[name]['mean']:.{digits}f}"
-        + (f" ± {stats[name]['sd']:.{digits}f}" if "sd" in stats[name] else "")
-        for name, (words, digits) in COLUMNS.items()
-        if name in stats
-    }
+def _scores(stats: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
+    return {words: _show(stats[name], digits) for name, (words, digits) in COLUMNS.items() if name in stats}
+
+
+def _show(stat: Mapping[str, Any], digits: int) -> str:
+    if "ci95" not in stat:
+        return f"{stat['mean']:.{digits}f}"
+    low, high = stat["ci95"]
+    return f"{stat['mean']:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"

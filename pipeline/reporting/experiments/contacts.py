@@ -19,8 +19,8 @@ MEANING = (
     "detector, than all but the asked share of single contacts of training skins; of the held-out boards' single "
     "contacts the share called so too is the realised false alarm. The networks behind residual and networks disagree "
     "were trained on the contacts that thresholds are set on, so their thresholds may be too low. At 0 mm both pokes "
-    "are at one place: what strength and noise alone do. ± is the sd over held-out boards. The paper gives no number "
-    "(section 7: future work)."
+    "are at one place: what strength and noise alone do. [low, high] is the 95 % interval over "
+    "held-out boards (Student's t). The paper gives no number (section 7: future work)."
 )
 TWO_TIPS = "Two tips cannot stand nearer than they are wide; smaller distances are sums all the same."
 
@@ -120,6 +120,8 @@ def _superposition(rows: Sequence[Mapping[str, Any]], source: str) -> pd.DataFra
     return table
 
 
-def _show(stat: Mapping[str, float], digits: int) -> str:
-    spread = f" ± {stat['sd']:.{digits}f}" if "sd" in stat else ""
-    return f"{stat['mean']:.{digits}f}{spread}"
+def _show(stat: Mapping[str, Any], digits: int) -> str:
+    if "ci95" not in stat:
+        return f"{stat['mean']:.{digits}f}"
+    low, high = stat["ci95"]
+    return f"{stat['mean']:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"

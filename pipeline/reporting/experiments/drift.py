@@ -9,6 +9,7 @@ from typing import Any
 import matplotlib as mpl
 import pandas as pd
 
+from pipeline.evaluation.inference import VERDICTS
 from pipeline.reporting.figures import STYLE, svg
 from pipeline.reporting.paper import FIGURE_5
 from pipeline.reporting.shown import COLUMNS, show, tabulate
@@ -16,11 +17,11 @@ from pipeline.reporting.work_precision import COLOURS, MARKERS
 
 POLICIES = ("initial", "regular", "each")
 MARGIN = 0.05  # of the largest force
-VERDICTS = (
-    "Yes: every error bar leaves 0 out, on the paper's side. No: one leaves it out on the other side. Not told apart: "
-    "otherwise, or with one network each. Error bars: 95 % over pairs of networks (policies trained from the same seed "
-    "on the same skin), each network's value the mean over its windows; for the bias of the force also two standard "
-    "errors over indentations. Several trainings on one skin say how much trainings vary, not how much skins do."
+JUDGED = (
+    f"{VERDICTS} A finding of several parts: no, if one part is no; yes, if all are. Of these trainings: judged in the "
+    "same words by the 95 % interval over pairs of networks (policies trained from the same seed on the same skin), "
+    "each network's value the mean over its windows; for the bias of the force also by two standard errors over "
+    "indentations. Several trainings on one skin say how much trainings vary, not how much boards do."
 )
 
 
@@ -38,15 +39,19 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     spread = seeds if any(row["spread"] for _, rows in named.values() for row in rows) else "One network each."
     found = [
         {
-            "finding (paper)": one["finding"], "holds": one["verdict"], "measured": one["measured"],
-            "why not": one.get("why", "–"), "source": source,
+            "finding (paper)": one["finding"], "holds": one["verdict"], **_of_trainings(one),
+            "measured": one["measured"], "why not": one.get("why", "–"), "source": source,
         }
         for one in numbers["findings"]
     ]  # fmt: skip
     return {
         "drift": tabulate(lines, meaning=f"{_protocol(numbers)} {say_pace(numbers, source)} {FIGURE_5}", spread=spread),
-        "drift_findings": tabulate(found, meaning=VERDICTS),
+        "drift_findings": tabulate(found, meaning=JUDGED),
     }
+
+
+def _of_trainings(one: Mapping[str, Any]) -> dict[str, str]:
+    return {"of these trainings": one["of_trainings"]} if "of_trainings" in one else {}
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:

@@ -6,8 +6,10 @@ from typing import Any
 import matplotlib as mpl
 import pandas as pd
 
+from pipeline.evaluation.inference import VERDICTS, negated, verdict
 from pipeline.reporting import paper
 from pipeline.reporting.figures import STYLE, svg
+from pipeline.reporting.shown import show_difference
 from pipeline.reporting.work_precision import COLOURS, MARKERS
 
 MEANING = (
@@ -15,13 +17,15 @@ MEANING = (
     "readings at rest of other boards. Scored are readings with four before them in the press and some force. The mean "
     "of the last five readings is the paper's protocol at rest; in a press the five see different depths. Against the "
     "force of its middle reading the same mean shows what of its error is lag: an answer that comes two frames late. "
-    "Presses of one duration differ from those of another in depth and place too: compare the ways, at each duration."
+    "Presses of one duration differ from those of another in depth and place too: compare the ways, at each duration. "
+    f"± is the sd over networks; all presses are on one board. {VERDICTS}"
 )
 WAYS = {
     "one": "each reading alone",
     "mean5": "mean of the last five",
     "mean5_of_middle": "the same, two frames late",
 }
+LESS = "less force error than each reading alone, N²"  # column
 TICKS_S = (0.05, 0.1, 0.2, 0.5, 1.0)
 METRICS = {
     "accuracy_pct": "accuracy / %",
@@ -42,7 +46,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
             "answered by": words,
             **{title: _show(one[way].get(name)) for name, title in METRICS.items()},
             "lag / ms": _show(_lag(numbers, way)) if label == "all" else "",
-            "less force error": "yes" if _best(one) == way else "",
+            LESS: _less(one) if way == "mean5" else "",
             "paper": paper.DYNAMICS if label == "all" and way == "one" else "",
             "source": source,
         }
@@ -80,10 +84,12 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
         return {"dynamics.svg": svg(figure)}
 
 
-def _best(one: Mapping[str, Any]) -> str | None:
-    """Name the better of the two ways that answer at once."""
-    known = {way: one[way]["mse_f_N2"]["mean"] for way in ("one", "mean5") if "mse_f_N2" in one[way]}
-    return min(known, key=lambda way: known[way]) if known else None
+def _less(one: Mapping[str, Any]) -> str:
+    """Judge whether the mean of the last five readings has less force error than each reading alone."""
+    if "paired" not in one or "mse_f_N2" not in one["paired"]["mean5_minus_one"]:
+        return "–"  # no force is known, or an older run
+    difference = one["paired"]["mean5_minus_one"]["mse_f_N2"]
+    return f"{verdict(negated(difference))}: {show_difference(difference)}"
 
 
 def _lag(numbers: Mapping[str, Any], way: str) -> Mapping[str, float] | None:

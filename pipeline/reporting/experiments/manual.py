@@ -5,8 +5,10 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.reporting.paper import MANUAL, MANUAL_POKES_N
-from pipeline.reporting.shown import COLUMNS, show, show_difference, tabulate
+from pipeline.evaluation.inference import VERDICTS, verdict
+from pipeline.reporting.order import gain
+from pipeline.reporting.paper import GAINS, MANUAL, MANUAL_POKES_N
+from pipeline.reporting.shown import COLUMNS, Stat, show, show_difference, tabulate
 
 ARMS = {
     "before": "before",
@@ -14,6 +16,7 @@ ARMS = {
     "control": "as long, without pokes",
     "grid": "adapted by as many pokes of the robot",
 }
+GAINED = {"after_minus_before": GAINS["by_hand"]}
 PAIRED = {
     "after_minus_before": "by hand less before, on the same skin",
     "after_minus_control": "by hand less without pokes, on the same skin",
@@ -23,22 +26,32 @@ PAIRED = {
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     """Show the arms, then their differences skin by skin."""
-    shown = [(ARMS[arm], numbers[arm], MANUAL.get(arm, {}), show) for arm in ARMS if arm in numbers]
+    shown = [(ARMS[arm], numbers[arm], MANUAL.get(arm, {}), _shown) for arm in ARMS if arm in numbers]
     differences = numbers["paired"]
-    shown += [(PAIRED[one], differences[one], {}, show_difference) for one in PAIRED if one in differences]
+    shown += [(PAIRED[one], differences[one], GAINED.get(one, {}), _judged) for one in PAIRED if one in differences]
     lines = []
     for name, ours, paper, words in shown:
         line = {"networks": name, "source": source}
         for metric, title in COLUMNS.items():
-            line[f"{title} (ours)"] = words(ours.get(metric))
+            line[f"{title} (ours)"] = words(ours.get(metric), metric)
             line[f"{title} (paper)"] = f"{paper[metric]:g}" if metric in paper else "–"
         lines.append(line | {"n": str(ours["accuracy_pct"]["n"])})
     meaning = (
         f"{numbers['pokes_n']} pokes by hand a skin, along {numbers['lines_n']} lines of which only the order is known "
-        f"(paper: {MANUAL_POKES_N}); tested on the robot's grid of the same skin, by networks that never saw its board."
+        f"(paper: {MANUAL_POKES_N}); tested on the robot's grid of the same skin, by networks that never saw its "
+        f"board. Differences: whether by hand is better. {VERDICTS}"
     )
-    spread = f"± is the sd over n skins, each the mean of {numbers['seeds_n']} networks."
+    spread = f"[low, high] is the 95 % interval over n boards, each skin the mean of {numbers['seeds_n']} networks."
     return {"manual": tabulate(lines, meaning=meaning, spread=spread)}
+
+
+def _shown(stat: Stat | None, metric: str) -> str:
+    return show(stat)
+
+
+def _judged(stat: Stat | None, metric: str) -> str:
+    """Say whether a difference is a gain, before its size."""
+    return "–" if stat is None else f"{verdict(gain(stat, metric))}: {show_difference(stat)}"
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:

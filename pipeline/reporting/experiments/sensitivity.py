@@ -7,6 +7,7 @@ import matplotlib as mpl
 import numpy as np
 import pandas as pd
 
+from pipeline.evaluation.inference import INCONCLUSIVE, ONE_BOARD
 from pipeline.reporting import paper
 from pipeline.reporting.figures import STYLE, svg
 from pipeline.reporting.work_precision import COLOURS
@@ -81,10 +82,12 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
 def _rises(rise: Mapping[str, Any]) -> str:
     ranks = f"rank correlation {rise['spearman']:.4f}"
     if "step_N" not in rise:
-        return f"not shown: no step stands out of noise; {ranks}"
-    held = "yes" if rise["holds"] else "no"
+        return f"{INCONCLUSIVE}: no step stands out of noise; {ranks}"
+    here = "rises" if rise["holds"] else "does not rise"
     rises_n = rise["pairs_n"] - rise["falls_n"]
-    return f"{held}: {rises_n} of {rise['pairs_n']} pairs {rise['step_N']:.3g} N apart, {ranks}"
+    return (
+        f"{ONE_BOARD}; {here} on this one: {rises_n} of {rise['pairs_n']} pairs {rise['step_N']:.3g} N apart, {ranks}"
+    )
 
 
 def _falls(found: Mapping[str, Any], numbers: Mapping[str, Any]) -> str:

@@ -5,7 +5,7 @@ from tests.reporting.test_work_precision import said
 
 
 def stat(mean):
-    return {"mean": mean, "sd": mean / 10, "n": 3}
+    return {"mean": mean, "sd": mean / 10, "n": 3, "ci95": [0.8 * mean, 1.2 * mean]}
 
 
 def row(separation_mm, **more):
@@ -29,8 +29,8 @@ def test_a_row_a_distance_and_one_of_single_contacts_all_with_their_source():
     table = tables(NUMBERS, "recorded")["contacts"]
     assert table["distance of the two, mm"].tolist() == ["0", "4", "8", "single contacts"]
     assert set(table["source"]) == {"recorded"}
-    assert table["along the line (0 weaker, 1 stronger)"].tolist() == ["–", "0.75 ± 0.07", "–", "–"]
-    assert table["detected by residual, %"].tolist()[-1] == "17.0 ± 1.7"
+    assert table["along the line (0 weaker, 1 stronger)"].tolist() == ["–", "0.75 [0.60, 0.90]", "–", "–"]
+    assert table["detected by residual, %"].tolist()[-1] == "17.0 [13.6, 20.4]"
     assert "noise is that of two readings" in table.attrs["meaning"]
     assert "residual and networks disagree were trained on" in table.attrs["meaning"]
     assert "5 % false alarms" in table.attrs["meaning"]

@@ -21,14 +21,22 @@ def numbers(force: bool = True, spread: bool = True, **changed) -> dict:
         "indentations_n": 1000,
     }  # fmt: skip
     found = [
-        {"finding": "errors grow", "holds": True, "verdict": "yes", "measured": "They do."},
-        {"finding": "each is worse", "holds": False, "verdict": "no", "measured": "It is not.", "why": "Never stale."},
+        {"finding": "errors grow", "holds": True, "verdict": "yes", "of_trainings": "yes", "measured": "They do."},
+        {
+            "finding": "each is worse",
+            "holds": False,
+            "verdict": "no",
+            "of_trainings": "no",
+            "measured": "It is not.",
+            "why": "Never stale.",
+        },
         {
             "finding": "too much force",
             "holds": False,
-            "verdict": "not told apart",
+            "verdict": "inconclusive (one board)",
+            "of_trainings": "yes",
             "measured": "A little.",
-            "why": "The error bar covers 0.",
+            "why": "One board.",
         },
     ]
     own = {
@@ -52,9 +60,10 @@ def test_a_row_a_window_shows_every_policy_and_where_it_is_from(source):
 
 def test_a_finding_that_does_not_hold_or_cannot_be_told_says_which_and_gives_its_reason():
     table = tables(numbers(), "simulated")["drift_findings"]
-    assert table["holds"].tolist() == ["yes", "no", "not told apart"]
-    assert table["why not"].tolist() == ["–", "Never stale.", "The error bar covers 0."]
-    assert "95 % over pairs of networks" in to_markdown(table)
+    assert table["holds"].tolist() == ["yes", "no", "inconclusive (one board)"]
+    assert table["of these trainings"].tolist() == ["yes", "no", "yes"]
+    assert table["why not"].tolist() == ["–", "Never stale.", "One board."]
+    assert "95 % interval over pairs of networks" in to_markdown(table)
     assert set(table["source"]) == {"simulated"}
 
 
