@@ -26,7 +26,7 @@ HOMES = {
     r"\bimport serial|from serial": {"pipeline/capture/port.py"},
     r"ruamel": {"pipeline/strict.py", "pipeline/plan.py", "pipeline/registry.py", "pipeline/tidying.py"},
     r"\bimport torch|from torch": {
-        "pipeline/learning/grid.py", "pipeline/learning/losses.py", "pipeline/learning/model.py",
+        "pipeline/learning/stack.py", "pipeline/learning/losses.py", "pipeline/learning/model.py",
         "pipeline/learning/train.py", "pipeline/learning/feed.py",
     },
     r"from sklearn": {

@@ -15,8 +15,8 @@ from pipeline.dataset.splits import Split, draw_folds
 from pipeline.evaluation.metrics import METRICS, score
 from pipeline.evaluation.stability.cases import Case, measured, refused, told
 from pipeline.learning.cell import Cell, FewLabels, Measured, Start, Trained
-from pipeline.learning.grid import train_stack
 from pipeline.learning.recipe import Labelling, Recipe
+from pipeline.learning.stack import train_stack
 from pipeline.learning.train import BLOCK_STEPS_N
 from pipeline.seeds import rng_for
 

@@ -32,7 +32,7 @@ from pipeline.numerics import signature
 COLLAPSED = 0.05  # of a target's variance over a network's own training rows; sound ones explain more than 0.9
 # The modules whose code decides what a training results in; recipes decide by their values.
 DECIDING = (
-    "architecture", "augment", "cell", "feed", "grid", "inputs", "job", "losses", "model", "standardise", "train",
+    "architecture", "augment", "cell", "feed", "inputs", "job", "losses", "model", "stack", "standardise", "train",
     "triplets",
 )  # fmt: skip
 

@@ -12,69 +12,20 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, as_completed
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
 from pipeline import io
 from pipeline.errors import TrainingError, complain
-from pipeline.learning.cell import Cell, Keys, Measured, Trained, make_job
+from pipeline.learning.cell import Cell, Keys, Measured, Trained
 from pipeline.learning.executors import device
-from pipeline.learning.inputs import VIEW
+from pipeline.learning.stack import train_stack
 from pipeline.learning.standardise import Scaler
-from pipeline.learning.stopwatch import median_s
 
 ATTEMPTS_MAX_N = 3  # trainings of one cell; what collapses in all of them is kept, told, and refused by `predict`
-JUDGED_STEPS_N = 200  # a shorter training from drawn weights may not have left its start
-JUDGED_ROWS_N = 2000  # of the training rows, evenly spaced
 STACK_N = {"cpu": 3, "cuda": 64}  # networks trained side by side; on a CPU more gain nothing, and two processes share
-
-
-def train_stack(cells: Sequence[Cell], rows: Measured) -> list[Trained]:
-    """Train cells of equal settings side by side, and predict their test rows."""
-    import torch  # late: only a process that trains pays for it
-
-    from pipeline.learning.model import Predictor
-    from pipeline.learning.train import train
-
-    torch.set_num_threads(1)  # the same sums in the same order, however many processes run beside this one
-    start_s, on, first = time.monotonic(), device(), cells[0]
-    if on == "cuda" and not torch.cuda.is_available():
-        raise TrainingError(complain("RESKIN_DEVICE", "cuda", "there", "none that torch finds", "Unset it for cpu."))
-    jobs, scalers = zip(*(make_job(cell, rows) for cell in cells), strict=True)
-    architecture = first.recipe.architecture
-    outcomes = train(jobs, architecture, first.schedule, first.terms, on)
-    seconds = (time.monotonic() - start_s) / len(cells)
-    trained = []
-    for cell, scaler, outcome in zip(cells, scalers, outcomes, strict=True):
-        view = VIEW[cell.recipe.inputs](rows.db_uT[cell.test])
-        predict = Predictor(outcome.weights, architecture, on)
-        trained.append(
-            Trained(
-                key="", weights=outcome.weights, scaler=scaler, curve=outcome.curve,
-                predicted=_answer(scaler, predict, view), stopped_step=outcome.stopped_step, seconds=seconds,
-                explained_min=_explained(cell, rows, scaler, predict),
-                one_reading_s=median_s(partial(_answer, scaler, predict, view[:1])),
-            )
-        )  # fmt: skip
-    return trained
-
-
-def _explained(cell: Cell, rows: Measured, scaler: Scaler, predict: Callable[[np.ndarray], np.ndarray]) -> float | None:
-    """Give the least part of a known target's variance over the training rows that the answers explain."""
-    if cell.schedule.steps_n < JUDGED_STEPS_N:
-        return None
-    some = cell.train[:: -(-len(cell.train) // JUDGED_ROWS_N)]
-    off = (_answer(scaler, predict, VIEW[cell.recipe.inputs](rows.db_uT[some])) - rows.target[some]).astype(np.float64)
-    told = np.nanvar(rows.target[some].astype(np.float64), axis=0) > 0 if len(some) > 1 else np.zeros(0, bool)
-    if not told.any():
-        return None
-    return float((1 - np.nanmean(off[:, told] ** 2, axis=0) / np.nanvar(rows.target[some][:, told], axis=0)).min())
-
-
-def _answer(scaler: Scaler, predict: Callable[[np.ndarray], np.ndarray], view: np.ndarray) -> np.ndarray:
-    return scaler.decode(predict(scaler.encode(view)))
 
 
 def run_cells(

@@ -27,9 +27,10 @@ from pipeline.learning.architecture import FEATURE_LAYERS_N, paper_layers
 from pipeline.learning.cell import Cell, Measured
 from pipeline.learning.executors import make_executor
 from pipeline.learning.feed import Feed
-from pipeline.learning.grid import STACK_N, run_cells, train_stack
+from pipeline.learning.grid import STACK_N, run_cells
 from pipeline.learning.model import Stack
 from pipeline.learning.recipe import Recipe
+from pipeline.learning.stack import train_stack
 from pipeline.learning.train import Watch
 from pipeline.seeds import rng_for
 

@@ -9,7 +9,7 @@ import torch
 from pipeline.dataset import splits
 from pipeline.extremes import learning
 from pipeline.extremes.learning import fold_cases, learning_cases, loop_cases, scaling_cases, triplet_cases
-from pipeline.learning import feed, grid, model, standardise, train, triplets
+from pipeline.learning import feed, model, stack, standardise, train, triplets
 
 SEED = 2021
 DIVERGES = "bottleneck scaled 1e3, learning rate 10"
@@ -94,13 +94,13 @@ def test_a_network_that_touches_its_neighbour_is_found_out(monkeypatch):
 
 
 def test_a_batch_that_ignores_the_seed_is_found_out(monkeypatch):
-    right = grid.make_job
+    right = stack.make_job
 
     def of_no_seed(cell, rows):
         job, scaler = right(replace(cell, seed_i=0), rows)
         return job, scaler
 
-    monkeypatch.setattr(grid, "make_job", of_no_seed)
+    monkeypatch.setattr(stack, "make_job", of_no_seed)
     assert broken(loop_cases(SEED)) - {DIVERGES} == {"trained twice from one seed"}
 
 

@@ -6,7 +6,7 @@ import pytest
 from pipeline.dataset.rows import Rows
 from pipeline.learning.card import describe
 from pipeline.learning.cell import Cell, Trained
-from pipeline.learning.grid import train_stack
+from pipeline.learning.stack import train_stack
 from tests.learning.cells import OWN, POKED, ROWS_N, TEST, TRAIN, adapting, few_labels, measured, pooled
 
 

@@ -10,9 +10,9 @@ from pipeline.dataset.lines import Lines
 from pipeline.learning import cell as cell_module
 from pipeline.learning.cell import DECIDING, Cell, Keys, Measured, Trained, code_of, make_job
 from pipeline.learning.feed import Feed
-from pipeline.learning.grid import train_stack
 from pipeline.learning.job import Terms
 from pipeline.learning.recipe import AugmentedRecipe
+from pipeline.learning.stack import train_stack
 from tests.learning.cells import (
     OWN,
     POKED,
@@ -283,7 +283,7 @@ def test_all_code_that_a_training_runs_through_is_part_of_its_key():
     graph = grimp.build_graph("pipeline", cache_dir=None)
     names = {
         module.removeprefix("pipeline.learning.")
-        for module in {"pipeline.learning.grid", *graph.find_upstream_modules("pipeline.learning.grid")}
+        for module in {"pipeline.learning.stack", *graph.find_upstream_modules("pipeline.learning.stack")}
         if module.startswith("pipeline.learning.")
     }
     assert names - {"recipe", "executors", "stopwatch"} == set(DECIDING)

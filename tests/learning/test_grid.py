@@ -10,10 +10,11 @@ from hypothesis import strategies as st
 
 from pipeline import io
 from pipeline.errors import ReskinError, TrainingError
-from pipeline.learning import grid
+from pipeline.learning import stack
 from pipeline.learning.cell import Cell, Trained, make_job
 from pipeline.learning.executors import make_executor
-from pipeline.learning.grid import JUDGED_STEPS_N, STACK_N, run_cells, stacks, train_stack
+from pipeline.learning.grid import STACK_N, run_cells, stacks
+from pipeline.learning.stack import JUDGED_STEPS_N, train_stack
 from tests.learning.cells import TRAIN, adapting, few_labels, measured, pooled, without_triplets
 from tests.learning.recipes import recipe
 
@@ -216,7 +217,7 @@ def dies(attempts: set[int]) -> object:
     ("dead", "before_n", "collapsed"), [(set(), 0, 0), ({0}, 1, 0), ({0, 1}, 2, 0), ({0, 1, 2}, 2, 1)]
 )
 def test_what_collapses_is_trained_again_at_most_twice_and_counted(tmp_path, monkeypatch, dead, before_n, collapsed):
-    monkeypatch.setattr(grid, "make_job", dies(dead))
+    monkeypatch.setattr(stack, "make_job", dies(dead))
     some, said = cells(2, steps_n=JUDGED_STEPS_N, rate_max=1e-2), []
     for _ in range(2):  # the second time, from the cache
         first, second = run(some, tmp_path, said=said)
@@ -227,7 +228,7 @@ def test_what_collapses_is_trained_again_at_most_twice_and_counted(tmp_path, mon
 
 
 def test_a_training_too_short_to_have_left_its_start_is_not_judged(tmp_path, monkeypatch):
-    monkeypatch.setattr(grid, "make_job", dies({0, 1, 2}))
+    monkeypatch.setattr(stack, "make_job", dies({0, 1, 2}))
     first, _ = run(cells(2, steps_n=JUDGED_STEPS_N - 1), tmp_path)
     assert (first.explained_min, first.collapsed) == (None, False)
 
@@ -270,10 +271,10 @@ def test_stacks_cover_every_cell_once_and_are_no_larger_than_asked(kinds, size_n
     settings = [{"steps_n": 3}, {"steps_n": 4}, {"rate_max": 1e-3}, {"architecture": "released"}, {"batch_n": 8}]
     some = keyed([pooled(**settings[kind]) for kind in kinds])
     found = stacks(some, size_n)
-    assert sorted(key for stack in found for key in stack) == sorted(some)
-    for stack in found:
-        assert 1 <= len(stack) <= size_n
-        assert len({kinds[int(key.removeprefix("key"))] for key in stack}) == 1
+    assert sorted(key for one in found for key in one) == sorted(some)
+    for one in found:
+        assert 1 <= len(one) <= size_n
+        assert len({kinds[int(key.removeprefix("key"))] for key in one}) == 1
     counts = [kinds.count(kind) for kind in set(kinds)]
     assert len(found) == sum(-(-count // size_n) for count in counts)  # no stack is split without need
 
