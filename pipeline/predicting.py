@@ -45,6 +45,7 @@ class Card(Strict, extra="ignore"):
     recipe: CardRecipe
     input: CardInput
     output: dict[str, str]
+    collapsed: bool
 
 
 def predict(log: Path, model: Path, out: Path) -> dict[str, Any]:
@@ -81,6 +82,9 @@ def read_network(model: Path) -> Network:
     if tuple(card.output) != ANSWERS:
         rule, got = f"for {', '.join(ANSWERS)}", ", ".join(card.output) or "none"
         raise SchemaError(complain(card_file, "the model's answers", rule, got, "Take another model."))
+    if card.collapsed:
+        rule, got = "one that learnt", "one that answers nearly the same to any input"
+        raise SchemaError(complain(card_file, "the model", rule, got, "Take the model of another seed."))
     _check_inputs(card, tensors, card_file)
     return Network(content, tensors)
 

@@ -15,9 +15,9 @@ from pipeline.seeds import rng_for
 RATE_HZ, QUIET_N, TOUCHED_N = 250.0, 400, 100
 ANSWER = np.array([8.0, 4.0, 1.5], np.float32)
 CARD = {
-    "format": "reskin-model/2", "recipe": {"inputs": "raw", "architecture": "paper"},
+    "format": "reskin-model/3", "recipe": {"inputs": "raw", "architecture": "paper"},
     "input": {"quantity": "change of field", "unit": "uT", "channels_n": 15},
-    "output": {"x_mm": "mm", "y_mm": "mm", "Fz_N": "N"},
+    "output": {"x_mm": "mm", "y_mm": "mm", "Fz_N": "N"}, "collapsed": False,
 }  # fmt: skip
 
 
@@ -52,6 +52,13 @@ def test_every_line_is_answered_and_only_contacts_have_places_and_forces(tmp_pat
         [[float(cell) for cell in row[1:]] for row in rows[QUIET_N:]], [[*ANSWER, 1]] * TOUCHED_N
     )
     np.testing.assert_allclose([float(row[0]) for row in rows], (1 + np.arange(len(rows))) / RATE_HZ)
+
+
+def test_a_model_that_answers_one_place_to_any_input_is_refused_and_nothing_is_written(tmp_path, model):
+    io.write_json(model.with_suffix(".json"), CARD | {"collapsed": True})
+    with pytest.raises(ReskinError, match=r"the model must be one that learnt; got .* Take the model of another seed"):
+        predict(write_log(tmp_path), model, tmp_path / "out.csv")
+    assert not (tmp_path / "out.csv").exists()
 
 
 def test_what_does_not_fit_is_refused_and_nothing_is_written(tmp_path, model):

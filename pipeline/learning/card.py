@@ -7,7 +7,7 @@ import numpy as np
 from pipeline.dataset.rows import TARGETS, Rows
 from pipeline.learning.cell import Adapting, Cell, FewLabels, Trained
 
-FORMAT = "reskin-model/2"
+FORMAT = "reskin-model/3"
 
 
 def describe(cell: Cell, trained: Trained, rows: Rows, scene: str, code: str) -> dict[str, Any]:
@@ -33,6 +33,8 @@ def describe(cell: Cell, trained: Trained, rows: Rows, scene: str, code: str) ->
         "output": {name: name.rsplit("_", 1)[1] for name in TARGETS},
         "scaler": {name: value.tolist() for name, value in trained.scaler.arrays().items()},
         "stopped_step": trained.stopped_step,
+        "explained_min": None if trained.explained_min is None else round(trained.explained_min, 6),
+        **went(trained),
         "train_boards": np.unique(rows.board[cell.train]).tolist(),
         "train_skins": np.unique(rows.skin[cell.train]).tolist(),
         "train_rows_n": len(cell.train),
@@ -41,6 +43,11 @@ def describe(cell: Cell, trained: Trained, rows: Rows, scene: str, code: str) ->
         "curve": [round(value, 9) for value in trained.curve],
     }
     return card if cell.tuning is None else card | {"tuning": _tuning(cell.tuning, rows)}
+
+
+def went(trained: Trained) -> dict[str, Any]:
+    """Say of a training whether it collapsed, and how often it did before, with other draws."""
+    return {"collapsed": trained.collapsed, "collapsed_before_n": trained.collapsed_before_n}
 
 
 def _tuning(tuning: Adapting | FewLabels, rows: Rows) -> dict[str, Any]:

@@ -11,6 +11,7 @@ import numpy as np
 from pipeline.evaluation.comparison import over_boards, over_pairs
 from pipeline.evaluation.metrics import summarise
 from pipeline.evaluation.summary import over_folds
+from pipeline.evaluation.tally import tally
 from pipeline.questions import EXPERIMENTS
 from pipeline.reporting.learned import by_fold, learned
 
@@ -93,6 +94,19 @@ def add_up(accounts: Iterable[Mapping[str, int]]) -> dict[str, int]:
     if skipped:
         total["lost_bytes_n"] = sum(skipped)
     return total
+
+
+def count_trainings(
+    cards: Cards, points: Mapping[str, Cards], experiments: Mapping[str, Mapping[str, Any]]
+) -> dict[str, dict[str, int]]:
+    """Count networks by question: trainings in all, those that collapsed, and those of them that had to be kept."""
+    told: dict[str, list[Mapping[str, Any]]] = {}
+    for question, own in [(card["question"], card) for card in cards] + [
+        (question, point) for question, all_ in points.items() for point in all_ if "collapsed" in point
+    ]:
+        told.setdefault(question, []).append(own)
+    counted = {question: tally(own) for question, own in told.items()}
+    return counted | {name: dict(answer["trainings"]) for name, answer in experiments.items() if "trainings" in answer}
 
 
 def lost_by_protocol(losses: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:

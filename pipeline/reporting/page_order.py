@@ -144,7 +144,7 @@ QUESTIONS = (
         "checks",
         "Verification, stability and leaks",
         "Whether the physics follows its laws, stiff and extreme cases end well, and no result rests on its test rows.",
-        folded=("verification", "stability", "audit"),
+        folded=("verification", "stability", "audit", "trainings"),
     ),
     Section(
         "checklist",
@@ -188,6 +188,7 @@ CAPTIONS = {
     "labels": "Scores by labelled indentations of the new board",
     "chosen": "Candidates, and which was chosen",
     "audit": "Search for leaks",
+    "trainings": "Trainings that collapsed",
     "left_out": "Terms of physics: left out by which protocols, computed for which",
     "captures": "What was read, and what was lost",
     "stages": "What each stage cost",

@@ -15,7 +15,7 @@ from pipeline.reporting.learning import learning_tables
 from pipeline.reporting.left_out import left_out_table
 from pipeline.reporting.order import models
 from pipeline.reporting.paper import SINGLE_SENSOR, Number
-from pipeline.reporting.shown import COLUMNS, INTERVAL, scores, show_both, to_markdown
+from pipeline.reporting.shown import COLUMNS, INTERVAL, scores, show_both, tabulate, to_markdown
 from pipeline.reporting.skins import skins_table
 from pipeline.reporting.table1 import measured, read_table1, table1
 
@@ -32,6 +32,13 @@ TABLE_2_SPREAD = (
 TARGET = (
     "The row of one skin on others was a calibration target: the simulated spreads were set with it in view, so its "
     "agreement with the paper is no evidence."
+)
+
+
+COLLAPSED_MEANING = (
+    "Collapsed: a network that explains next to nothing of some target on its own training rows, as it answers nearly "
+    "the same to any input. It is trained again with other draws, at most twice; what collapses every time is kept in all "
+    "means, and named in the audit. Trainings too short to have left their start are not judged."
 )
 
 
@@ -58,6 +65,7 @@ def make_tables(numbers: Mapping[str, Any]) -> dict[str, pd.DataFrame]:
     if "described" in numbers:
         titled = {f"{protocol} ({one['source']})": one for protocol, one in numbers["described"].items()}
         tables["skins"] = skins_table(titled)
+    tables["trainings"] = _trainings(numbers["trainings"], source)
     tables["variants"] = _variants(numbers["variants"], source)
     tables["captures"] = _captures(numbers, source)
     tables["table1"] = table1(read_table1(), measured(numbers))
@@ -101,6 +109,18 @@ def _boards(by_board: Mapping[str, Any], source: str) -> pd.DataFrame:
             line = {"held-out board": board, "trained on skins": skins_n, "places": words[part], "source": source}
             lines.append(line | {title: f"{metrics[m]:.3g}" for m, title in COLUMNS.items() if m in metrics})
     return pd.DataFrame(lines)
+
+
+def _trainings(counts: Mapping[str, Mapping[str, int]], source: str) -> pd.DataFrame:
+    """List how many networks were trained, how many of those collapsed, and how many of them had to be kept."""
+    lines = [
+        {
+            "question": question, "source": source, "trainings": str(own["trainings_n"]),
+            "collapsed": str(own["collapsed_n"]), "collapsed every time, kept": str(own["kept_collapsed_n"]),
+        }
+        for question, own in counts.items()
+    ]  # fmt: skip
+    return tabulate(lines, meaning=COLLAPSED_MEANING)
 
 
 def _variants(variants: Mapping[str, Any], source: str) -> pd.DataFrame:

@@ -17,6 +17,8 @@ from pipeline.evaluation.ambient import (
     without_common_part,
 )
 from pipeline.evaluation.metrics import score, summarise
+from pipeline.evaluation.tally import tally
+from pipeline.learning.card import went
 from pipeline.learning.recipe import HEADLINE, Training
 from pipeline.physics.skin import draw_skin
 from pipeline.sections import Ambient
@@ -29,16 +31,19 @@ AS_IT_IS, ASIDE, OWN = "as it is", "reference chip subtracted", "own chips' comm
 Networks = Mapping[str, Sequence[Network]]  # by arm
 
 
-def networks_of_common_part(at: Scenery, fold: Fold, training: Training, own: Instrument) -> list[Network]:
-    """Train the headline recipe anew on inputs whose common part is taken off, as it is taken off in use."""
+def networks_of_common_part(
+    at: Scenery, fold: Fold, training: Training, own: Instrument
+) -> tuple[list[Network], dict[str, int]]:
+    """Train the headline recipe anew on inputs whose common part is taken off, as in use; count what collapsed."""
     without = project(at.rows.db_uT, without_common_part(own.turn))
     headline = training.model_copy(update={"recipes": {HEADLINE: training.recipes[HEADLINE]}})
     cells = cells_of(at, headline, [fold], question="ambient")
     trained = train_all(replace(at, rows=replace(at.rows, db_uT=without)), cells, "ambient")
-    return [
+    networks = [
         Network({"recipe": cell.recipe.model_dump(mode="json")}, {**one.weights, **one.scaler.arrays()})
         for cell, one in zip(cells, trained, strict=True)
     ]
+    return networks, tally(map(went, trained))
 
 
 def on_board(

@@ -4,6 +4,8 @@ from collections.abc import Iterator, Sequence
 
 from pipeline.dataset.splits import Fold
 from pipeline.evaluation.adapted import BEFORE, Answered
+from pipeline.evaluation.tally import tally
+from pipeline.learning.card import went
 from pipeline.learning.cell import Cell
 from pipeline.learning.executors import device
 from pipeline.learning.inputs import VIEW
@@ -25,14 +27,15 @@ def answers_before(at: Scenery, fold: Fold, settings: Adaptation, starts: Starts
         yield Answered(BEFORE, str(at.rows.board[test[0]]), skin, seed_i, at.rows.target[test], predicted)
 
 
-def answers_after(at: Scenery, cells: Sequence[tuple[str, Cell]], stage: str) -> list[Answered]:
-    """Adapt by (arm, cell), and answer on each cell's tested rows."""
+def answers_after(at: Scenery, cells: Sequence[tuple[str, Cell]], stage: str) -> tuple[list[Answered], dict[str, int]]:
+    """Adapt by (arm, cell), and answer on each cell's tested rows; count what collapsed."""
     own = [cell for _, cell in cells]
     trained = train_all(at, own, stage)
     note_seconds(at.scene, stage, own, trained)
-    return [
+    answered = [
         Answered(
             arm, str(at.rows.board[cell.test[0]]), cell.skin, cell.seed_i, at.rows.target[cell.test], one.predicted
         )
         for (arm, cell), one in zip(cells, trained, strict=True)
     ]
+    return answered, tally(map(went, trained))

@@ -10,6 +10,7 @@ import numpy as np
 from pipeline import io
 from pipeline.asking import modelled
 from pipeline.evaluation.audit.checks import Check
+from pipeline.evaluation.audit.collapse import audit_collapse
 from pipeline.evaluation.audit.settings import audit_choice, audit_scaler
 from pipeline.evaluation.audit.sides import Sides
 from pipeline.evaluation.audit.tuning import audit_tuning
@@ -28,8 +29,9 @@ def model_checks(at: Scenery, sides: dict[tuple[str, str], Sides], models: Path)
     fits: Fits = {}
     keys: dict[tuple[str, int], set[str]] = {}  # of the networks that may be adapted, by fold and seed
     for arm in modelled(at.asked.asking):
-        for file in sorted((models / arm).glob("*.json")):
-            card = io.read_json(file)
+        cards = {file: io.read_json(file) for file in sorted((models / arm).glob("*.json"))}
+        yield audit_collapse(arm, list(cards.values()))
+        for file, card in cards.items():
             question = "lobo" if card["question"] in ("triplet", "adapt") else card["question"]
             inputs, scaling = card["recipe"]["inputs"], card["recipe"]["scaling"]
             yield audit_scaler(

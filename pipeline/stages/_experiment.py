@@ -26,7 +26,12 @@ def read_losses(indentations: Path, left_out: Mapping[str, int]) -> dict[str, An
 
 
 def write_answer(
-    answer: Path, numbers: Mapping[str, Any], drawn: Mapping[str, Any], losses: Mapping[str, Any] = NO_CAPTURES
-) -> None:
-    """Write what numbers.json takes over as it is, what only figures show, and what was lost of captures of its own."""
-    io.write_json(answer, {"numbers": dict(numbers), "drawn": dict(drawn), "losses": dict(losses)})
+    answer: Path, numbers: Mapping[str, Any], drawn: Mapping[str, Any], losses: Mapping[str, Any] = NO_CAPTURES,
+    trainings: Mapping[str, int] | None = None,
+) -> None:  # fmt: skip
+    """Write what numbers.json takes over as it is, what only figures show, what was lost of captures of its own.
+
+    `trainings` counts the networks that the stage trained, and those that collapsed.
+    """
+    words = {"numbers": dict(numbers), "drawn": dict(drawn), "losses": dict(losses)}
+    io.write_json(answer, words if trainings is None else words | {"trainings": dict(trainings)})

@@ -9,7 +9,7 @@ import pyarrow as pa
 from pipeline import io
 from pipeline.dataset.rows import TARGETS, Rows
 from pipeline.evaluation.summary import score_groups
-from pipeline.learning.card import describe
+from pipeline.learning.card import describe, went
 from pipeline.learning.cell import Cell, Trained
 from pipeline.provenance import SECONDS, code_version
 from pipeline.stages._train import Scenery
@@ -39,7 +39,7 @@ def point_of(at: Scenery, cell: Cell, one: Trained, method: str) -> dict[str, An
     """Keep of a training in a sweep what its curve needs: no weights, no predictions."""
     card = card_of(at, cell, one)
     words = {name: card[name] for name in ("key", "question", "fold", "seed_i", "stopped_step", "git", "scores")}
-    return words | {"method": method, "trained_on_skins_n": len(card["train_skins"])}
+    return words | went(one) | {"method": method, "trained_on_skins_n": len(card["train_skins"])}
 
 
 def note_seconds(scene: str, stage: str, cells: Sequence[Cell], trained: Sequence[Trained]) -> None:

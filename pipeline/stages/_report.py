@@ -12,7 +12,7 @@ from pipeline.learning.executors import device as trained_on
 from pipeline.learning.recipe import HEADLINE
 from pipeline.provenance import SECONDS, add_up_costs, code_version, device, read_costs
 from pipeline.reporting.learned import timed_learning
-from pipeline.reporting.numbers import answered, compose, lost_by_protocol, rounded, runtime
+from pipeline.reporting.numbers import answered, compose, count_trainings, lost_by_protocol, rounded, runtime
 from pipeline.settings import Settings
 from pipeline.stages._run import COSTS
 
@@ -43,6 +43,7 @@ def read_numbers(known: Settings, at: Places) -> tuple[dict[str, Any], dict[str,
     numbers: dict[str, Any] = {"provenance": _provenance(known, cards)}
     experiments = {question: io.read_json(at.answers / f"{question}.json") for question in asked.experiments}
     numbers |= compose(cards, points, accounts, words["dropped"], headline=HEADLINE)
+    numbers |= {"trainings": count_trainings(cards, points, experiments)}
     losses = {question: answer["losses"] for question, answer in experiments.items()}
     numbers |= {"capture_by_protocol": lost_by_protocol(losses)} if asked.source == "simulated" else {}
     numbers |= {"audit": io.read_json(at.answers / "audit.json")} if "audit" in asked.questions else {}

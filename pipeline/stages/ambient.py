@@ -28,7 +28,7 @@ def ambient(scene: str, files: Files, folds: Path, indentations: Path, models: P
         own = take_board(of, fold.name, seed=seed)
         networks = {arm: networks_without(models, fold.name) for arm in (AS_IT_IS, ASIDE)}
         if fold is held_out[-1]:
-            networks[OWN] = networks_of_common_part(at, fold, training, own)
+            networks[OWN], trainings = networks_of_common_part(at, fold, training, own)
         points += on_board(at, fold, asked, of=of, own=own, networks=networks)
     last = boards[-1:]
     numbers = {
@@ -50,7 +50,7 @@ def ambient(scene: str, files: Files, folds: Path, indentations: Path, models: P
             "iron": over_boards(points, "distance_mm", last),
         },
     }
-    write_answer(answer, numbers, {})
+    write_answer(answer, numbers, {}, trainings=trainings)
 
 
 if __name__ == "__main__":

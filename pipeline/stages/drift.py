@@ -17,6 +17,8 @@ from pipeline.evaluation.drift import (
     pace,
 )  # fmt: skip
 from pipeline.evaluation.drift_findings import findings
+from pipeline.evaluation.tally import tally
+from pipeline.learning.card import went
 from pipeline.learning.recipe import HEADLINE
 from pipeline.sections import Drift
 from pipeline.settings import Files, read_settings
@@ -34,7 +36,8 @@ def drift(scene: str, files: Files, indentations: Path, answer: Path) -> None:
     pairs = list(work.cells(parts, asked.drift, asked.seed))
     at = Scenery(scene, asked, stack(parts), [])
     said: dict[str, list[Answers]] = {}
-    for (cell, tests), one in zip(pairs, train_all(at, [cell for cell, _ in pairs], "drift"), strict=True):
+    trained = train_all(at, [cell for cell, _ in pairs], "drift")
+    for (cell, tests), one in zip(pairs, trained, strict=True):
         said.setdefault(cell.recipe_name, []).extend(work.answers(cell, one, tests))
     rows: dict[str, dict[str, Any]] = {
         name: {policy: over_windows(own, policy) for policy in asked.drift.policies} for name, own in said.items()
@@ -45,7 +48,7 @@ def drift(scene: str, files: Files, indentations: Path, answer: Path) -> None:
     numbers = {name: value for name, value in words.items() if value is not None} | counts | pace(captures)
     variants = {name: own for name, own in rows.items() if name != HEADLINE}
     numbers |= {"left_out_units_n": windows.left_out_units_n} | told | ({"variants": variants} if variants else {})
-    write_answer(answer, numbers, drawn, read_losses(indentations, numbers["dropped"]))
+    write_answer(answer, numbers, drawn, read_losses(indentations, numbers["dropped"]), tally(map(went, trained)))
 
 
 def _tell(

@@ -9,6 +9,7 @@ from pipeline import io
 from pipeline.evaluation.summary import score_groups
 from pipeline.learning import few_labels as few
 from pipeline.learning.baselines import run_tasks
+from pipeline.learning.card import went
 from pipeline.learning.cell import Measured
 from pipeline.learning.comparison import resolve_few_labels
 from pipeline.learning.executors import make_executor
@@ -27,7 +28,7 @@ def few_labels(scene: str, files: Files, indentations: Path, folds: Path, scores
         pairs = step(study, done)
         trained = train_all(at, [cell for _, cell in pairs], "few_labels")
         done = [*done, *((tried, cell, one) for (tried, cell), one in zip(pairs, trained, strict=True))]
-    points = [_point(at, tried, one.predicted) for tried, _, one in done]
+    points = [_point(at, tried, one.predicted) | went(one) for tried, _, one in done]
     tasks = few.classical(study)
     rows = Measured(at.rows.db_uT, at.rows.target, at.rows.skin)
     with make_executor() as executor:

@@ -50,7 +50,7 @@ def flexible(
         name: [one for skin in skins for one in answers_before(at, fold, asked.recipes[name], starts, skin)]
         for name in arms if name != CONTROL
     }  # fmt: skip
-    after = answers_after(at, cells, "flexible")
+    after, trainings = answers_after(at, cells, "flexible")
     own = before[HEADLINE] + [one for one in after if one.arm != SHAPE]
     numbers: dict[str, Any] = {
         "skins_n": len(skins), "boards_n": len(np.unique(at.rows.board[fold.test])),
@@ -61,7 +61,7 @@ def flexible(
     if SHAPE in arms:
         numbers[SHAPE] = answer_flexible(before[SHAPE] + [replace(one, arm=AFTER) for one in after if one.arm == SHAPE])
     drawn = forces_drawn(own, rng_for(at.asked.seed, "flexible", "drawn"))
-    write_answer(answer, numbers, drawn, read_losses(indentations, poked.dropped))
+    write_answer(answer, numbers, drawn, read_losses(indentations, poked.dropped), trainings)
 
 
 def _by_depth(captures: Sequence[Readings]) -> list[dict[float, np.ndarray]]:

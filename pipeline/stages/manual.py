@@ -36,10 +36,10 @@ def manual(scene: str, files: Files, folds: Path, main: Path, indentations: Path
         fold = _fold_without(at, str(poked.board[poked.skin == skin][0]))
         answers += answers_before(at, fold, asked.recipes[HEADLINE], starts, skin)
         cells += _cells(at, fold, asked, starts, (skin, own))
-    answers += answers_after(at, cells, "manual")
+    after, trainings = answers_after(at, cells, "manual")
     pokes_n, lines_n = zip(*((_pokes_n(at, own), len(np.unique(own.line_i))) for own in lines.values()), strict=True)
-    numbers = answer_manual(answers, pokes_n=pokes_n, lines_n=lines_n)
-    write_answer(answer, numbers, {}, read_losses(indentations, poked.dropped))
+    numbers = answer_manual([*answers, *after], pokes_n=pokes_n, lines_n=lines_n)
+    write_answer(answer, numbers, {}, read_losses(indentations, poked.dropped), trainings)
 
 
 def _cells(

@@ -8,6 +8,8 @@ from pipeline.dataset.hold_out import NO_POOL, Fold
 from pipeline.dataset.rows import SHEAR_TARGETS, Rows, gather
 from pipeline.dataset.single import draw_sides
 from pipeline.evaluation.shear import answer_shear, score5
+from pipeline.evaluation.tally import tally
+from pipeline.learning.card import went
 from pipeline.sections import Shear
 from pipeline.seeds import rng_for, seed_for
 from pipeline.settings import Files, read_settings
@@ -42,7 +44,7 @@ def shear(scene: str, files: Files, indentations: Path, answer: Path) -> None:
     shown = rng_for(asked.seed, "shear", "drawn").permutation(len(cells[first_i].test))[:DRAWN_N]
     true, predicted = rows.target[cells[first_i].test], trained[first_i].predicted
     drawn = {"true": _forces(true[shown]), "predicted": _forces(predicted[shown])}
-    write_answer(answer, numbers, drawn, read_losses(indentations, rows.dropped))
+    write_answer(answer, numbers, drawn, read_losses(indentations, rows.dropped), tally(map(went, trained)))
 
 
 def _folds(rows: Rows, group: np.ndarray, by: str, asked: Shear, seed: int) -> list[Fold]:

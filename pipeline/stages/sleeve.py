@@ -6,7 +6,9 @@ import numpy as np
 
 from pipeline.dataset.rows import gather
 from pipeline.evaluation import sleeve as evaluation
+from pipeline.evaluation.tally import tally
 from pipeline.learning.baselines import Task, run_tasks
+from pipeline.learning.card import went
 from pipeline.learning.cell import Cell, Measured
 from pipeline.learning.classical import Neighbours
 from pipeline.learning.executors import make_executor
@@ -47,7 +49,8 @@ def sleeve(scene: str, files: Files, indentations: Path, answer: Path) -> None:
     }  # fmt: skip
     error_mm = evaluation.errors_mm(true, answers[HEADLINE][0])
     drawn = evaluation.to_draw(area, true, error_mm, indentation)
-    write_answer(answer, numbers, drawn, read_losses(indentations, at.rows.dropped))
+    losses = read_losses(indentations, at.rows.dropped)
+    write_answer(answer, numbers, drawn, losses, tally(map(went, trained)))
 
 
 def _area(asked: Settings) -> evaluation.Area:

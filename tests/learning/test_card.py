@@ -52,6 +52,12 @@ def test_a_card_is_json_that_reads_back_as_it_was(cell):
     assert json.loads(json.dumps(words, allow_nan=False)) == words
 
 
+@pytest.mark.parametrize(("explained", "collapsed"), [(None, False), (0.9, False), (0.049, True), (-3.0, True)])
+def test_a_card_says_whether_its_network_learnt_and_how_often_it_was_trained(explained, collapsed):
+    words = card(pooled(), explained_min=explained, collapsed_before_n=1)
+    assert (words["explained_min"], words["collapsed"], words["collapsed_before_n"]) == (explained, collapsed, 1)
+
+
 def test_an_early_stop_stands_on_the_card():
     assert card(pooled())["stopped_step"] is None
     assert card(pooled(), stopped_step=150)["stopped_step"] == 150
