@@ -2,9 +2,9 @@
 
 By the mean squared error of places over the boards held out in turn; the paper's inputs only, as its method is what is
 set. How many steps there are is a scene's budget: every candidate is tried with the same budgets, and its errors are
-averaged over them, so that no setting wins by training longer. Settings of adaptation are chosen together with the
-triplet weight of the network that they start from: alone, the triplet term only costs.
-Refuses to know who uses a choice.
+averaged over them, so that no setting wins by training longer. Settings with which a training collapsed are not
+chosen. Settings of adaptation are chosen together with the triplet weight of the network that they start from: alone,
+the triplet term only costs. Refuses to know who uses a choice.
 """
 
 from collections.abc import Mapping, Sequence
@@ -67,9 +67,17 @@ def _best(cards: Cards, stage: str, eligible: Cards | None = None) -> dict[str, 
             complain("choice of settings", f"candidates of {stage}", "one or more", "none", "Ask lobo, triplet, adapt.")
         )
     _check_budgets(cards, stage)
-    card = min(among, key=lambda one: _error(cards, one))
+    sound = [card for card in among if not any(_has_collapsed(one) for one in cards if _key(one) == _key(card))]
+    if not sound:
+        rule = "one or more without a collapsed training"
+        raise ParamsError(complain("choice of settings", f"candidates of {stage}", rule, "none", "Try lower rates."))
+    card = min(sound, key=lambda one: _error(cards, one))
     words = {"recipe_name": card["recipe_name"], "settings": trimmed(settings_of(card))}
     return words | {"by": "MSE_xy, mean over all budgets of steps", "candidates": _candidates(cards)}
+
+
+def _has_collapsed(card: dict[str, Any]) -> bool:
+    return bool(card["collapsed"] or card["collapsed_before_n"])
 
 
 def _error(cards: Cards, of: dict[str, Any]) -> float:

@@ -37,8 +37,8 @@ TARGET = (
 
 COLLAPSED_MEANING = (
     "Collapsed: a network that explains next to nothing of some target on its own training rows, as it answers nearly "
-    "the same to any input. It is trained again with other draws, at most twice; what collapses every time is kept in all "
-    "means, and named in the audit. Trainings too short to have left their start are not judged."
+    "the same to any input. It is trained again with other draws, at most twice; what collapses every time is kept in "
+    "all means, and named in the audit. Trainings too short to have left their start are not judged."
 )
 
 

@@ -24,7 +24,13 @@ def card(question: str, name: str, mse_xy_mm2: float, fold: str = "b0", **change
         "rows_n": 4,
     }
     own = {"scene": "tuning", "question": question, "recipe_name": name, "recipe": dict(RECIPE), "fold": fold}
-    who = {"seed_i": 0, "test_boards": [fold], "test_skins": [f"{fold}_s0"]}
+    who = {
+        "collapsed": False,
+        "collapsed_before_n": 0,
+        "seed_i": 0,
+        "test_boards": [fold],
+        "test_skins": [f"{fold}_s0"],
+    }
     return own | who | {"scores": scores} | changes
 
 
@@ -176,3 +182,13 @@ def test_a_control_is_a_candidate_that_is_listed_and_never_chosen():
     assert (chosen["error"], chosen["control"]) == (pytest.approx(0.25), pytest.approx(0.2))
     assert "from-heavy-control" in {one["recipe_name"] for one in chosen["candidates"]}
     assert "control" not in choose(CARDS)["adapt"]
+
+
+@pytest.mark.parametrize("fate", [{"collapsed": True}, {"collapsed_before_n": 1}])
+def test_settings_with_which_a_training_collapsed_are_not_chosen_however_good(fate):
+    """Another board went well with the same settings; that one did not is enough."""
+    again = card("lobo", "fast", 0.1, "b1", recipe=RECIPE | {"rate_max": 6e-3}, **fate)
+    assert names(choose([*CARDS, again]))["train_multi"] == "fastest"
+    every = [one | fate if one["question"] == "lobo" else one for one in CARDS]
+    with pytest.raises(ParamsError, match="candidates of train_multi must be one or more without a collapsed"):
+        choose(every)

@@ -27,6 +27,6 @@ def test_a_dead_network_is_named_in_the_audit_and_is_no_leak():
     check = audit_collapse(
         "train_multi", [card(0, collapsed_before_n=2), card(1, collapsed=True, collapsed_before_n=2)]
     )
-    assert check.found == "1 of 2 collapsed: lobo.paper.b0.1; 4 trained again"
+    assert check.found == "1 of 2 collapsed: lobo.paper.b0.seed1; 4 trained again"
     assert (check.holds, check.known) == (False, True)
     assert audit_collapse("train_multi", [card(0)]).holds
