@@ -35,13 +35,20 @@ def blocks_of(
     shown = [_results(numbers, ("table2", "order", "single_sensor")) for numbers in results]
     labels = [_results(numbers, ("labels",)) for numbers in others if "labels" in numbers]
     skins = to_markdown(skins_table(dict(_main_skins([results[-1], *others]))))
-    blocks = {"results": "\n\n".join(shown), "costs": _costs([*results, *others])}
+    blocks = {"results": "\n\n".join(shown), "costs": _costs(one for one in (*results, *others) if "trainings" in one)}
     blocks |= {"labels": "\n\n".join(labels) or "No recorded scene asked yet."}
     return blocks | {"skins": skins, "dag": dag, "stages": _stages(stages)}
 
 
 def _results(numbers: Mapping[str, Any], names: Sequence[str]) -> str:
     provenance = numbers["provenance"]
+    if "trainings" not in numbers:
+        scene, code = provenance["scene"], provenance["git"]
+        return (
+            f"Scene `{scene}`, **{provenance['source']}**: stale. `reports/{scene}` was made by code {code}, with "
+            "other settings and before collapsed networks were found out; no number of it is shown here. Run it again: "
+            f"`reskin scenes use {scene}`, `dvc repro`."
+        )
     tables = make_tables(numbers)
     words = (
         f"Scene `{provenance['scene']}`, **{provenance['source']}**; trained by code {provenance['trained']}, "

@@ -3,7 +3,7 @@
 Every table says whether its rows are simulated or recorded.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import pandas as pd
@@ -56,16 +56,14 @@ def make_tables(numbers: Mapping[str, Any]) -> dict[str, pd.DataFrame]:
     if "lobo" in numbers:
         tables["lobo_boards"] = _boards(numbers["lobo"]["by_board"], source)
     tables |= experiment_tables(numbers, source)
-    if "verification" in numbers:
-        tables["verification"] = verification_table(numbers["verification"], source)
-    if "stability" in numbers:
-        tables["stability"] = stability_table(numbers["stability"], source)
-    if "left_out" in numbers:
-        tables["left_out"] = left_out_table(numbers["left_out"], source)
+    makers: dict[str, Callable[[Any, str], pd.DataFrame]] = {
+        "verification": verification_table, "stability": stability_table, "left_out": left_out_table,
+        "trainings": _trainings,
+    }  # fmt: skip
+    tables |= {name: make(numbers[name], source) for name, make in makers.items() if name in numbers}
     if "described" in numbers:
         titled = {f"{protocol} ({one['source']})": one for protocol, one in numbers["described"].items()}
         tables["skins"] = skins_table(titled)
-    tables["trainings"] = _trainings(numbers["trainings"], source)
     tables["variants"] = _variants(numbers["variants"], source)
     tables["captures"] = _captures(numbers, source)
     tables["table1"] = table1(read_table1(), measured(numbers))
