@@ -71,7 +71,7 @@ def _best(cards: Cards, stage: str, eligible: Cards | None = None) -> dict[str, 
     if not sound:
         rule = "one or more without a collapsed training"
         raise ParamsError(complain("choice of settings", f"candidates of {stage}", rule, "none", "Try lower rates."))
-    card = min(sound, key=lambda one: _error(cards, one))
+    card = min(sound, key=lambda one: (_error(cards, one), _budget(one)))
     words = {"recipe_name": card["recipe_name"], "settings": trimmed(settings_of(card))}
     return words | {"by": "MSE_xy, mean over all budgets of steps", "candidates": _candidates(cards)}
 
