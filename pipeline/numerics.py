@@ -1,4 +1,4 @@
-"""The same sums on every x86 processor: variables that libraries read when they load. In: the environment. Out: same.
+"""The same sums with AVX2 and AVX-512: variables that libraries read when they load. In: the environment. Out: same.
 
 AVX2 and AVX-512 code paths round sums in another order, and hundreds of steps of training make tenths of a point of
 accuracy of that. Measured: with these variables a training gives the same bits with AVX-512 and with AVX2 instructions,
@@ -70,7 +70,8 @@ def departures(environment: Mapping[str, str]) -> list[str]:
 
 def signature() -> tuple[str, ...]:
     """What may give a training other bits on this machine: how products of matrices are summed, here and now."""
-    return tuple(os.environ.get(name, "") for name in ("MKL_CBWR", "ATEN_CPU_CAPABILITY"))
+    sums = (os.environ.get(name, "") for name in ("MKL_CBWR", "ATEN_CPU_CAPABILITY"))
+    return (*sums, *departures(os.environ))
 
 
 def cpu_flags(cpuinfo: Path = CPUINFO) -> frozenset[str]:

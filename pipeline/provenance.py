@@ -13,20 +13,22 @@ from pipeline import io
 from pipeline.numerics import departures
 
 CODE = Path(__file__).parent
+NO_CODE = ("plan.yaml", "scenes")  # settings, which stand beside the code: they decide results by their values
 SECONDS = Path(".reskin/seconds")  # what was timed here: beside the pipeline, as costs are
 CPUINFO = Path("/proc/cpuinfo")  # Linux only
 INSTRUCTIONS = {"avx2": "AVX2", "avx512f": "AVX-512", "amx_tile": "AMX", "asimd": "NEON", "sve": "SVE"}  # by CPU flag
 
 
 def code_version() -> str:
-    """The last commit that changed `pipeline/`, `+dirty` when it was changed since, `unknown` outside git.
+    """The last commit that changed code in `pipeline/`, `+dirty` when it was changed since, `unknown` outside git.
 
     Not the checkout's HEAD: a later commit of results must not make equal results look different.
     """
-    commit = _git("log", "-1", "--format=%h", "--abbrev=12", "--", str(CODE))
+    of_code = (str(CODE), *(f":(exclude){CODE / name}" for name in NO_CODE))
+    commit = _git("log", "-1", "--format=%h", "--abbrev=12", "--", *of_code)
     if not commit:
         return "unknown"
-    return commit + ("+dirty" if _git("status", "--porcelain", "--", str(CODE)) else "")
+    return commit + ("+dirty" if _git("status", "--porcelain", "--", *of_code) else "")
 
 
 def device() -> str:

@@ -1,6 +1,6 @@
 """Which settings each stage reads: keys of its scene's file, of `params.yaml` and of the plan. Words only.
 
-`{recipe}` in a key stands for a word of the stage's item in the plan, and NAMED tells which key of the scene's file
+`{recipe}` in a key stands for a word of the stage's item in the plan, and `named` tells which key of the scene's file
 that word was taken from. dvc.yaml lists the same keys (tests/test_settings.py compares them), so that an override
 re-runs exactly the stages that read it. Refuses to know files and values.
 """

@@ -281,7 +281,8 @@ def _check_names(stage: str, key: str, item: Words, scene: Words, files: Files) 
                 f"Try: reskin scenes use {item['scene']}, beside the others that run; or, for an experiment, also "
                 f"-S {files.plan}:stages.{stage}.{key}.{word}={said}"
             )
-            raise ParamsError(complain(files.settings, at, f"{item[word]}, as planned", said, remedy))
+            got = "nothing" if said is NOTHING else said
+            raise ParamsError(complain(files.settings, at, f"{item[word]}, as planned", got, remedy))
 
 
 def _covers(key: str, inner: str) -> bool:

@@ -34,7 +34,9 @@ def choose(cards: Cards) -> dict[str, dict[str, Any]]:
     own = [card for card in cards if card["recipe"]["inputs"] == PAPER_INPUTS]
     tuned = [card for card in own if card["question"] == "adapt"]
     chosen = {"train_multi": _best([card for card in own if card["question"] == "lobo"], "train_multi")}
-    chosen["adapt"] = _best(tuned, "adapt", [card for card in tuned if settings_of(card)["unlabelled_weight"] > 0])
+    dead = [trimmed(card["recipe"]) for card in own if card["question"] == "triplet" and _has_collapsed(card)]
+    eligible = [card for card in tuned if trimmed(card["recipe"]) not in dead]
+    chosen["adapt"] = _best(tuned, "adapt", [one for one in eligible if settings_of(one)["unlabelled_weight"] > 0])
     best = next(card for card in tuned if card["recipe_name"] == chosen["adapt"]["recipe_name"])
     control = [card for card in tuned if _key(card) == _key(best) | {"unlabelled_weight": 0.0}]
     chosen["adapt"] |= {"error": _error(tuned, best)} | ({"control": _error(tuned, control[0])} if control else {})

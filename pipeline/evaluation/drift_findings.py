@@ -57,7 +57,7 @@ class Gap:
 
     @property
     def of_trainings(self) -> str:
-        """Judge by the interval over networks on these very boards: how much trainings vary, not how much boards do."""
+        """Judge by the interval over all networks: on one board, how much trainings vary; on several, boards too."""
         if self.trainings is None:
             return INCONCLUSIVE
         return verdict({"ci95": self.trainings})

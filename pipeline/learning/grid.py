@@ -43,7 +43,7 @@ def run_cells(
         tell(f"{len(again)} of {len(cells)} trainings collapsed: once more with other draws")
         others = [replace(cells[i], attempt_i=attempt_i) for i in again]
         for i, one in zip(again, _run_once(others, rows, executor=executor, cache=cache, tell=tell), strict=True):
-            done[i] = replace(one, collapsed_before_n=attempt_i)
+            done[i] = replace(one, collapsed_before_n=attempt_i, seconds=done[i].seconds + one.seconds)
     return done
 
 
@@ -65,8 +65,12 @@ def _run_once(
         rows_file = cache / "rows" / f"{keys.rows_digest()}-{os.getpid()}.safetensors"  # an experiment may run beside
         skin = np.unique(rows.skin, return_inverse=True)[1].astype(np.int64)
         io.write_tensors(rows_file, {"db_uT": rows.db_uT, "target": rows.target, "skin": skin}, {})
-        _run_stacks([([members[key] for key in stack], files) for stack, files in missing], rows_file, executor, tell)
-        io.remove(rows_file)
+        try:
+            _run_stacks(
+                [([members[key] for key in stack], files) for stack, files in missing], rows_file, executor, tell
+            )
+        finally:
+            io.remove(rows_file)
     file_of = {key: file for stack, files in planned for key, file in zip(stack, files, strict=True)}
     return [replace(_read_trained(file_of[key]), reused=key not in fresh) for key in names]
 

@@ -122,7 +122,7 @@ def _judge_difference(row: Row, printed: Any, ours: Stat, _: bool) -> Verdict:
 def _judge_limit(row: Row, printed: Any, ours: Any, _: bool) -> Verdict:
     """Judge whether a number is beyond a limit; one that has no interval over boards says so of its one board."""
     stat: Stat = ours if isinstance(ours, Mapping) else {"mean": float(ours)}
-    limit = 0.0 if row.rule == "positive" else float(mean_of(printed) or 0.0)
+    limit = 0.0 if row.rule == "positive" else _printed(printed)
     word = verdict(negated(stat), above=-limit) if row.rule == "at_most" else verdict(stat, above=limit)
     at_limit = row.rule != "positive" and stat["mean"] == limit
     beyond = stat["mean"] < limit if row.rule == "at_most" else stat["mean"] > limit
@@ -131,6 +131,12 @@ def _judge_limit(row: Row, printed: Any, ours: Any, _: bool) -> Verdict:
     if word == INCONCLUSIVE:
         sentence += f"; {_interval(stat)} includes {limit:g}"
     return Verdict(sentence, not (beyond or at_limit), word)
+
+
+def _printed(printed: Any) -> float:
+    value = mean_of(printed)
+    assert value is not None, "a row that is judged by a limit prints one"
+    return value
 
 
 def _judge_each(_: Row, __: Any, contrasts: Sequence[Mapping[str, Any]], ___: bool) -> Verdict:

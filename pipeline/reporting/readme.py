@@ -60,12 +60,15 @@ def _results(numbers: Mapping[str, Any], names: Sequence[str]) -> str:
 def _costs(scenes: Iterable[Mapping[str, Any]]) -> str:
     """Say what each scene costs when all of it is computed, on the machine that computed it."""
     by_device: dict[str, list[str]] = {}
-    for own in (numbers["provenance"] for numbers in scenes):
+    shown = list(scenes)
+    for own in (numbers["provenance"] for numbers in shown):
         by_device.setdefault(own["device"], []).append(f"`{own['scene']}` {own['seconds'] / 60:.2g} min")
     said = "; ".join(f"{', '.join(costs)} ({device})" for device, costs in by_device.items())
+    counts = [count for numbers in shown for count in numbers["trainings"].values()]
+    trained_n, collapsed_n = (sum(one[name] for one in counts) for name in ("trainings_n", "collapsed_n"))
     return (
         f"Computed from nothing, trainings added up as if one ran after another: {said}. Two run side by side "
-        "by default, so that less time passes."
+        f"by default, so that less time passes. Of the {trained_n:,} trainings of these scenes {collapsed_n} collapsed."
     )
 
 

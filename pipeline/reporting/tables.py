@@ -38,7 +38,8 @@ TARGET = (
 COLLAPSED_MEANING = (
     "Collapsed: a network that explains next to nothing of some target on its own training rows, as it answers nearly "
     "the same to any input. It is trained again with other draws, at most twice; what collapses every time is kept in "
-    "all means, and named in the audit. Trainings too short to have left their start are not judged."
+    "all means; those of train_* and adapt are also named in the audit. Trainings too short to have left their start "
+    "are not judged."
 )
 
 
@@ -48,7 +49,8 @@ def make_tables(numbers: Mapping[str, Any]) -> dict[str, pd.DataFrame]:
     tables = {}
     if "table2" in numbers:
         tables["table2"] = _beside_paper(_table_2_rows(numbers), source)
-        tables["table2"].attrs |= {"spread": TABLE_2_SPREAD} | ({"meaning": TARGET} if source == "simulated" else {})
+        words = [TARGET] * (source == "simulated") + _dead(numbers.get("trainings", {}))
+        tables["table2"].attrs |= {"spread": TABLE_2_SPREAD} | ({"meaning": " ".join(words)} if words else {})
     tables |= learning_tables(numbers, source)
     single = {SPLIT_WORDS[name]: (numbers[name], SINGLE_SENSOR) for name in SPLIT_WORDS if name in numbers}
     if single:
@@ -107,6 +109,14 @@ def _boards(by_board: Mapping[str, Any], source: str) -> pd.DataFrame:
             line = {"held-out board": board, "trained on skins": skins_n, "places": words[part], "source": source}
             lines.append(line | {title: f"{metrics[m]:.3g}" for m, title in COLUMNS.items() if m in metrics})
     return pd.DataFrame(lines)
+
+
+def _dead(trainings: Mapping[str, Mapping[str, int]]) -> list[str]:
+    """Say how many networks behind table 2 answer nearly the same to any input, if any does."""
+    kept_n = sum(
+        trainings[name]["kept_collapsed_n"] for name in ("transfer", "lobo", "triplet", "adapt") if name in trainings
+    )
+    return [f"{kept_n} networks collapsed every time that they were trained, and are in these means."] * (kept_n > 0)
 
 
 def _trainings(counts: Mapping[str, Mapping[str, int]], source: str) -> pd.DataFrame:

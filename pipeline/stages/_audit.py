@@ -60,8 +60,7 @@ def _fit_once(
 
 def settings_checks(at: Scenery, choice: Path, models: Path) -> list[Check]:
     """Compare the headline recipes that were trained with the record of what was chosen, and where."""
-    arms = [arm for arm in modelled(at.asked.asking) if arm != "train_single"]
-    recipes = {arm: trimmed(_headline(models / arm)) for arm in arms}
+    recipes = {arm: trimmed(_headline(models / arm)) for arm in modelled(at.asked.asking)}
     held_out = np.unique(np.concatenate([fold.test for fold in at.folds]))
     return audit_choice(
         io.read_json(choice), recipes, source=at.asked.source, seed=at.asked.seed,

@@ -5,6 +5,7 @@ from pathlib import Path
 from pipeline import io
 from pipeline.errors import LeakError, complain
 from pipeline.evaluation.audit.checks import holds, to_words
+from pipeline.evaluation.audit.collapse import COLLAPSE
 from pipeline.evaluation.audit.settings import NOT_CHOSEN
 from pipeline.evaluation.audit.sides import Labels, Sides, audit_fold
 from pipeline.seeds import rng_for
@@ -37,9 +38,11 @@ def audit(scene: str, files: Files, indentations: Path, folds: Path, models: Pat
         )
     io.write_json(answer, to_words(checks))
     unchosen_n = sum(check.found.startswith(NOT_CHOSEN) for check in checks)
+    dead_n = sum(check.known and check.what == COLLAPSE for check in checks)
+    papers_n = sum(check.known for check in checks) - dead_n
     say(
-        f"{scene}: {len(checks)} checks, no leak; {sum(check.known for check in checks)} known, the paper's own; "
-        f"{unchosen_n} settings that the study did not choose"
+        f"{scene}: {len(checks)} checks, no leak; {papers_n} known, the paper's own; "
+        f"{dead_n} arms with collapsed networks; {unchosen_n} settings that the study did not choose"
     )
 
 

@@ -192,3 +192,8 @@ def test_settings_with_which_a_training_collapsed_are_not_chosen_however_good(fa
     every = [one | fate if one["question"] == "lobo" else one for one in CARDS]
     with pytest.raises(ParamsError, match="candidates of train_multi must be one or more without a collapsed"):
         choose(every)
+
+
+def test_a_network_that_collapsed_is_chosen_for_no_adaptation():
+    cards = [one | {"collapsed_before_n": 1} if one["recipe_name"] == "heavy" else one for one in CARDS]
+    assert names(choose(cards)) == {"train_multi": "fast", "adapt": "from-light", "train_triplet": "light"}

@@ -1,6 +1,6 @@
 """One row of the leak audit. In: what was looked at and what was found. Out: a `Check`, which holds, is known, or not.
 
-A known leak is one that the paper's own protocol has: it is told, and the audit does not fail by it.
+What is known is told, and fails nothing: a leak that the paper's own protocol has, a network that collapsed.
 Refuses to know what is looked at.
 """
 

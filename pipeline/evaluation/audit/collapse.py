@@ -9,6 +9,8 @@ from typing import Any
 
 from pipeline.evaluation.audit.checks import Check
 
+COLLAPSE = "collapse"
+
 
 def audit_collapse(arm: str, cards: Sequence[Mapping[str, Any]]) -> Check:
     """Count the networks of an arm that answer nearly the same to any input, and trainings that were done again."""
@@ -18,4 +20,4 @@ def audit_collapse(arm: str, cards: Sequence[Mapping[str, Any]]) -> Check:
     again_n = sum(one["collapsed_before_n"] for one in cards)
     found = f"{len(kept)} of {len(cards)} collapsed{': ' if kept else ''}{', '.join(kept)}; {again_n} trained again"
     rule = "no network answers nearly the same to any input"
-    return Check("collapse", arm, rule, found, holds=not kept, known=bool(kept))
+    return Check(COLLAPSE, arm, rule, found, holds=not kept, known=bool(kept))

@@ -25,6 +25,9 @@ Arrays = Mapping[str, np.ndarray]
 Words = Mapping[str, Any]
 
 
+SAME_AS = {"train_single": "train_multi"}  # one recipe for networks of one skin and of many
+
+
 class Choice(Strict, extra="allow"):
     """The record of a study of settings: on whose readings, and the recipe chosen for each arm."""
 
@@ -80,11 +83,12 @@ def audit_choice(
 def _as_chosen(arm: str, recipe: Words, record: Choice) -> Check:
     """State how a recipe differs from the chosen one: that is no leak, whoever set it."""
     rule = f"the recipe chosen on scene {record.scene}, or one that is stated here"
-    chosen = record.chosen.get(arm, {})
+    studied = SAME_AS.get(arm, arm)
+    chosen = record.chosen.get(studied, {})
     pairs = {key: (_said(recipe, key), _said(chosen, key)) for key in sorted({*recipe, *chosen})}
     differing = [f"{key} {used} (study: {best})" for key, (used, best) in pairs.items() if used != best]
     found = f"{NOT_CHOSEN}: {', '.join(differing)}" if differing else "equal"
-    found = found if arm in record.chosen else f"{NOT_CHOSEN}: it chose none for this"
+    found = found if studied in record.chosen else f"{NOT_CHOSEN}: it chose none for this"
     return Check("settings: recipe", arm, rule, found, holds=True, known=False)
 
 

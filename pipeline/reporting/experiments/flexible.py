@@ -23,7 +23,10 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     lines = [_line(ARMS[arm], numbers, arm, source) for arm in ARMS if arm in numbers]
     if "shape" in numbers:
         lines += [_line(OF_SHAPE + ARMS[arm], numbers["shape"], arm, source) for arm in ARMS if arm in numbers["shape"]]
-    spread = f"[low, high] is the 95 % interval over n boards, each skin the mean of {numbers['seeds_n']} networks."
+    spread = (
+        f"[low, high] is the 95 % interval over n boards, each skin the mean of {numbers['seeds_n']} networks; one "
+        "fold's networks answer for all these boards, so it says nothing of other training boards."
+    )
     return {"flexible": tabulate(lines, meaning=_meaning(numbers), spread=spread)}
 
 
