@@ -86,8 +86,8 @@ def test_what_does_not_fit_is_refused_and_nothing_is_written(tmp_path, model):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"format": "reskin-model/1"}, "format must be reskin-model/2; got reskin-model/1"),
-        ({"format": 2}, "format must be reskin-model/2; got 2"),
+        ({"format": "reskin-model/1"}, "format must be reskin-model/3; got reskin-model/1"),
+        ({"format": 2}, "format must be reskin-model/3; got 2"),
         ({"output": {"x_mm": "mm", "y_mm": "mm"}}, "the model's answers must be for x_mm, y_mm, Fz_N; got x_mm, y_mm"),
         ({"input": None}, r"model\.json: input must be"),
         ({"input": {}}, "input.quantity must be given; got nothing"),
@@ -110,13 +110,13 @@ def test_a_card_that_says_otherwise_is_refused(tmp_path, model, change, message)
 @pytest.mark.parametrize("lacking", ["input", "recipe", "output", "format"])
 def test_a_card_that_says_too_little_is_refused(tmp_path, model, lacking):
     model.with_suffix(".json").write_text(json.dumps({name: CARD[name] for name in CARD if name != lacking}))
-    with pytest.raises(ReskinError, match=f"{lacking} must be (given|reskin-model/2); got (nothing|None)"):
+    with pytest.raises(ReskinError, match=f"{lacking} must be (given|reskin-model/3); got (nothing|None)"):
         predict(write_log(tmp_path), model, tmp_path / "out.csv")
 
 
 def test_a_card_that_is_no_card_is_refused(tmp_path, model):
     model.with_suffix(".json").write_text("[1]")
-    with pytest.raises(ReskinError, match="format must be reskin-model/2; got None"):
+    with pytest.raises(ReskinError, match="format must be reskin-model/3; got None"):
         predict(write_log(tmp_path), model, tmp_path / "out.csv")
 
 

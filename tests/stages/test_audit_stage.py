@@ -158,7 +158,7 @@ def test_honest_files_pass_and_every_fold_network_and_arm_was_looked_at(scene, c
     trained |= {f"adapt.paper.{skin}.8pokes.seed0" for skin in ("b0.b0_s0", "b0.b0_s1", "b1.b1_s0", "b2.b2_s0")}
     assert {check["where"] for check in checks if check["what"] == "scaler"} == trained
     arms = {check["where"] for check in checks if check["what"] == "settings: recipe"}
-    assert arms == {"train_multi", "train_triplet", "adapt"}
+    assert arms == {"train_single", "train_multi", "train_triplet", "adapt"}
     assert [check["where"] for check in checks if not check["holds"]] == ["single_random/repeat0"]  # the paper's way
     assert f"tiny: {len(checks)} checks, no leak; 1 known" in capsys.readouterr().err
 
