@@ -10,7 +10,7 @@ from ruamel.yaml import YAML
 from pipeline import plan
 from tests.stages.checkout import copy_checkout, run
 
-pytestmark = pytest.mark.timeout(420)
+pytestmark = pytest.mark.timeout(1800)
 
 
 @pytest.fixture(scope="module")

@@ -28,7 +28,7 @@ LEARNING = (
 )  # fmt: skip
 DRAWING = ("drift", "manual", "contacts", "ambient")  # experiments that draw at random in ways of their own
 FILES = ("--settings", "pipeline/scenes/ci.yaml", "--params", "params.yaml", "--plan", "pipeline/plan.yaml")
-pytestmark = pytest.mark.timeout(600)
+pytestmark = pytest.mark.timeout(1800)  # a guard against a hang; a busy machine takes four times as long as a quiet one
 
 
 @pytest.fixture(scope="module")
