@@ -18,8 +18,9 @@ from pipeline.physics import force_sensor, layer, sensor, viscoelastic
 from pipeline.strict import parse, read_yaml
 from pipeline.synthesis.capture import Synthesis
 
-SCENE = Path(__file__).resolve().parents[2] / "pipeline" / "scenes" / "quick.yaml"
-DESIGN = parse(Synthesis, read_yaml(SCENE)["simulate"], "simulate")
+ROOT = Path(__file__).resolve().parents[2]
+SHARED = {name: read_yaml(ROOT / "params.yaml")[name] for name in ("rig", "skin", "chip", "spreads", "terms")}
+DESIGN = parse(Synthesis, SHARED | read_yaml(ROOT / "pipeline" / "scenes" / "quick.yaml")["simulate"], "simulate")
 BOARD = DESIGN.boards["rigid"].design
 SEED = 2021
 
