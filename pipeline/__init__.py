@@ -1,5 +1,5 @@
 """Learning for magnetic tactile skins: from raw serial captures to the tables of the ReSkin paper."""
 
-from pipeline.numerics import pin
+from pipeline.core.numerics import pin
 
 pin()  # before any module of the package imports NumPy

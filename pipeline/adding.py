@@ -11,11 +11,12 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
-from pipeline import io, plan
+from pipeline import plan
 from pipeline.capture.folder import write_capture
 from pipeline.capture.header import STREAM_FILE, Header
+from pipeline.core import io
+from pipeline.core.errors import CaptureError, ReskinError, complain
 from pipeline.dataset.captures import check_losses, open_capture
-from pipeline.errors import CaptureError, ReskinError, complain
 from pipeline.params import read_plan, read_scene, read_shared
 from pipeline.preparing import Prepared
 from pipeline.registry import REGISTRY, read_registry, with_capture, without_capture, write_registry

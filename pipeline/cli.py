@@ -10,12 +10,12 @@ from typing import Annotated
 
 import typer
 
-from pipeline import adding, io, plan, preparing, tidying
-from pipeline.asking import modelled, swept
-from pipeline.errors import ParamsError, ReskinError, complain
+from pipeline import adding, plan, preparing, tidying
+from pipeline.core import io
+from pipeline.core.config import read_yaml
+from pipeline.core.errors import ParamsError, ReskinError, complain
+from pipeline.core.server import TrackingAway
 from pipeline.params import read_scene
-from pipeline.server import TrackingAway
-from pipeline.strict import read_yaml
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -171,8 +171,8 @@ def publish() -> None:
 
     for scene in plan.check(ROOT).scenes:
         asked, answers = read_scene(plan.scene_file(ROOT, scene), ROOT / plan.PARAMS), ROOT / "data/answers" / scene
-        arms = {arm: ROOT / "data/models" / scene / arm for arm in modelled(asked)}
-        written = [answers / f"{stage}.json" for stage in (*swept(asked).values(), *asked.experiments)]
+        arms = {arm: ROOT / "data/models" / scene / arm for arm in asked.modelled}
+        written = [answers / f"{stage}.json" for stage in (*asked.curves.values(), *asked.experiments)]
         missing = [path for path in (*arms.values(), *written) if not path.exists()]
         if missing:
             typer.echo(f"{scene}: {missing[0].relative_to(ROOT)} is not there yet; run dvc repro first")

@@ -12,8 +12,8 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline import io
-from pipeline.errors import SchemaError, complain
+from pipeline.core import io
+from pipeline.core.errors import SchemaError, complain
 from pipeline.evaluation.reproduced import Comparison, compare
 
 SHOWN_N = 40  # rows of a table in a terminal

@@ -1,47 +1,38 @@
 """The legal values of `params.yaml`, of every scene and of the plan. In: YAML. Out: frozen, checked models.
 
-Whole files are checked here, for the command line; a stage reads only what it declares (`pipeline.settings`).
-A section stands in a scene's file if, and only if, a question of the scene needs it: what a scene does not ask costs
-nothing. Refuses to know what is done with a value.
+Whole files are checked here, for the command line; a stage reads only what dvc.yaml declares for it. A section stands
+in a scene's file if, and only if, a question of the scene needs it: what a scene does not ask costs nothing. Refuses to
+know what is done with a value.
 """
 
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any
+from types import ModuleType
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from pipeline.asking import Asking, arms_of
+from pipeline.core.config import Seeded, Settings, Strict, parse, read_yaml
+from pipeline.core.errors import ParamsError, complain
 from pipeline.dataset.rows import Selection
 from pipeline.dataset.splits import Split
-from pipeline.errors import ParamsError, complain
-from pipeline.learning.recipe import (
-    AdaptationsRow,
-    AuditSettings,
-    FineTuning,
-    Labelling,
-    Name,
-    PokesSweep,
-    Recipe,
-    Schedule,
-    TrainingRow,
-)
+from pipeline.learning.recipe import FineTuning, Labelling, Name, Recipe, Schedule
 from pipeline.questions import (
-    ANSWERED_BY,
-    ARMS,
-    DRAWN_WITH,
-    NEEDS,
-    OF_RECORDED,
+    LEARNING,
+    MAIN_PROTOCOL,
     POOLED_BY,
-    STAGE_OF,
-    WITH_SECTION,
-    WITHOUT_SECTION,
-)
-from pipeline.settings import Settings
-from pipeline.strict import Strict, parse, read_yaml
+    QUESTIONS,
+    ROWS,
+    SECTIONS,
+    Question,
+    stages,
+)  # fmt: skip
 
-ROWS: dict[str, type[Schedule]] = {"recipes": Recipe, "adaptations": FineTuning, "labellings": Labelling}
+SHARED_ROWS: dict[str, type[Schedule]] = {"recipes": Recipe, "adaptations": FineTuning, "labellings": Labelling}
 STEPS = "How many steps is a scene's budget: write them in its sections."
-Section = dict[str, Any]  # checked where it is read: by `Settings`, or by a stage that knows physics or scikit-learn
+Section = dict[str, Any]  # checked by the stage that reads it
+Source = Literal["simulated", "recorded"]
 
 
 class OnBoards(Strict, extra="allow"):
@@ -59,69 +50,102 @@ class Simulation(Strict):
     protocols: Annotated[dict[str, OnBoards], Field(min_length=1)]
 
 
-class Scene(Asking):
-    """One named set-up: its captures (or how to simulate them), its protocol, and the questions it asks."""
+class Asking(Strict, extra="ignore"):
+    """The two settings of a scene that say which stages it has."""
 
-    seed: Annotated[int, Field(ge=0)]
+    source: Source
+    questions: Annotated[tuple[Literal[tuple(QUESTIONS)], ...], Field(min_length=1)]  # type: ignore[valid-type]
+
+    @property
+    def rows(self) -> list[Question]:
+        """The rows of the table of questions that the scene asks, in the order that it asks them."""
+        return [QUESTIONS[name] for name in self.questions]
+
+    @property
+    def experiments(self) -> tuple[str, ...]:
+        """The experiments among the questions."""
+        return tuple(row.name for row in self.rows if row.kind == "experiment")
+
+    @property
+    def studied(self) -> tuple[str, ...]:
+        """The questions about the physics."""
+        return tuple(row.name for row in self.rows if row.kind == "study")
+
+    @property
+    def with_folds(self) -> tuple[str, ...]:
+        """The questions that have folds of their own."""
+        return tuple(row.name for row in self.rows if row.folds is not None)
+
+    @property
+    def learning(self) -> list[str]:
+        """The stages that answer questions about learning."""
+        return stages(self.questions, *LEARNING)
+
+    @property
+    def modelled(self) -> list[str]:
+        """The stages that leave models, with cards and predictions."""
+        return stages(self.questions, "models")
+
+    @property
+    def curves(self) -> dict[str, str]:
+        """The questions whose answers are points of a curve, and the stage that finds them."""
+        return {row.name: row.stage for row in ROWS if row.kind == "curve" and row.name in self.questions}
+
+    @property
+    def protocols(self) -> set[str]:
+        """The protocols that a simulated scene needs for its questions."""
+        return {MAIN_PROTOCOL} | {row.protocol for row in self.rows if row.protocol is not None}
+
+    @property
+    def described(self) -> str:
+        """The name of the description of a scene's captures."""
+        return "recorded" if self.source == "recorded" else MAIN_PROTOCOL
+
+    def runs(self, unit: str) -> bool:
+        """Tell whether a stage still runs for the scene, named as its cost is: `drift`, `simulate-wear`."""
+        stage, _, part = unit.partition("-")
+        if stage in {row.stage for row in ROWS if row.kind != "report"}:
+            return stage in {row.stage for row in self.rows}
+        return not part or self.source == "recorded" or part in self.protocols
+
+
+class Scene(Asking, Seeded, extra="allow"):
+    """One named set-up: its captures (or how to simulate them), the questions it asks, and a section for each."""
+
     selection: Selection
     split: Split
     simulate: Simulation | None = None
-    runtime: Section | None = None
-    train_single: TrainingRow | None = None
-    train_multi: TrainingRow | None = None
-    train_triplet: TrainingRow | None = None
-    adapt: AdaptationsRow | None = None
-    sweep_pokes: PokesSweep | None = None
-    train_classical: Section | None = None
-    few_labels: Section | None = None
-    audit: AuditSettings | None = None
-    drift: Section | None = None
-    variation: Section | None = None
-    shear: Section | None = None
-    sleeve: Section | None = None
-    contacts: Section | None = None
-    ambient: Section | None = None
 
     @model_validator(mode="after")
     def _sections_follow_questions(self) -> "Scene":
         if (self.simulate is not None) != (self.source == "simulated"):
             raise ValueError("section simulate stands in a scene if and only if its source is simulated")
-        for question in self.questions:
-            if lacking := NEEDS.get(question, set()) - set(self.questions):
-                raise ValueError(f"a scene that asks {question} also asks {sorted(lacking)}, on which it goes on")
-        asked = set(arms_of(self))
-        for arm in ARMS:
-            if arm not in WITHOUT_SECTION and (getattr(self, arm) is not None) != (arm in asked):
-                asking = [question for question, stage in STAGE_OF.items() if stage == arm]
-                raise ValueError(f"section {arm} stands in a scene if and only if it asks one of {asking}")
-        needed = set().union(*(DRAWN_WITH[question] for question in self.trained))
-        needed |= {"pool_passes_n"} if POOLED_BY in self.questions else set()
-        if needed != self.split.model_fields_set:
-            raise ValueError(f"split holds exactly what the questions need, {sorted(needed)}")
+        for row in self.rows:
+            if lacking := set(row.needs) - set(self.questions):
+                raise ValueError(f"a scene that asks {row.name} also asks {sorted(lacking)}, on which it goes on")
+        there, needed = set(self.model_extra or ()), {row.stage for row in self.rows if row.section}
+        for section in SECTIONS:
+            if (section in there) != (section in needed):
+                asking = [row.name for row in ROWS if row.stage == section]
+                raise ValueError(f"section {section} stands in a scene if and only if it asks one of {asking}")
+        keys = {key for row in self.rows for key in row.folds or ()}
+        keys |= {"pool_passes_n"} if POOLED_BY in self.questions else set()
+        if keys != self.split.model_fields_set:
+            raise ValueError(f"split holds exactly what the questions need, {sorted(keys)}")
         return self
 
     @model_validator(mode="after")
     def _questions_fit_the_source(self) -> "Scene":
-        if not self.trained:
-            raise ValueError(f"questions holds at least one of {sorted(ANSWERED_BY)}")
-        if self.simulate is None and self.studied:
-            raise ValueError(f"questions {list(self.studied)} are about physics: only a simulated scene asks them")
-        if (self.runtime is not None) != ("runtime" in self.questions):
-            raise ValueError("section runtime stands in a scene if and only if it asks runtime")
-        return self
-
-    @model_validator(mode="after")
-    def _experiments_have_what_they_need(self) -> "Scene":
-        there = {question for question in WITH_SECTION if getattr(self, question) is not None}
-        if surplus := sorted(there - set(self.questions)):
-            raise ValueError(f"sections {surplus} stand there, but questions does not hold them: take them out")
-        if lacking := sorted(WITH_SECTION & set(self.questions) - there):
-            raise ValueError(f"questions {lacking} need sections of their names: write them, or do not ask")
+        if not self.with_folds:
+            raise ValueError(
+                f"questions holds at least one of {sorted(row.name for row in ROWS if row.folds is not None)}"
+            )
         if self.simulate is None:
-            if beyond := sorted(set(self.experiments) - OF_RECORDED):
+            if self.studied:
+                raise ValueError(f"questions {list(self.studied)} are about physics: only a simulated scene asks them")
+            if beyond := sorted(row.name for row in self.rows if not row.recorded):
                 raise ValueError(f"questions {beyond} are asked of simulated scenes only, so far")
-            return self
-        if self.protocols != set(self.simulate.protocols):
+        elif self.protocols != set(self.simulate.protocols):
             have, want = set(self.simulate.protocols), self.protocols
             wrong = [f"lacks {sorted(want - have)}"] * bool(want - have)
             wrong += [f"holds {sorted(have - want)}, of which nothing is asked"] * bool(have - want)
@@ -154,9 +178,36 @@ class Plan(Strict):
 def read_scene(path: Path, params: Path) -> Scene:
     """Read and check `pipeline/scenes/<name>.yaml`, with the rows of `params.yaml` that it names."""
     words = read_yaml(path)
-    scene = parse(Scene, words, str(path))
-    Settings(path.stem, str(path), words, read_shared(params), {}).check_all()
+    return check_scene(path.stem, str(path), words, read_shared(params))
+
+
+def check_scene(name: str, where: str, words: dict[str, Any], shared: dict[str, Any]) -> Scene:
+    """Check a scene, and every section as the stage that reads it does."""
+    scene, settings = parse_scene(words, where), Settings(name, where, words, shared, {})
+    for stage in dict.fromkeys(["split", *(row.stage for row in scene.rows if row.kind != "report")]):
+        if read := getattr(module_of(stage), "read", None):
+            read(settings)
+    if scene.simulate is not None:
+        from pipeline.synthesis.of_settings import check_synthesis  # the physics, for a simulated scene only
+
+        check_synthesis(settings)
     return scene
+
+
+def parse_scene(words: dict[str, Any], where: str) -> Scene:
+    """Check what a scene asks, and that it has the sections for it; what stands in these, their stages check."""
+    for name, value in words.items():
+        if name not in {*Scene.model_fields, *SECTIONS}:
+            raise ParamsError(complain(where, name, "a known parameter", repr(value)[:80], "Mend it there."))
+        if name in SECTIONS and not isinstance(value, dict):
+            raise ParamsError(complain(where, name, "a valid dictionary", repr(value)[:80], "Mend it there."))
+    return parse(Scene, words, where)
+
+
+def module_of(stage: str) -> ModuleType:
+    """Import the module of a stage: `experiments.<stage>.run`, or `stages.<stage>`."""
+    experiment = f"pipeline.experiments.{stage}"
+    return import_module(f"{experiment}.run" if find_spec(experiment) else f"pipeline.stages.{stage}")
 
 
 def read_shared(path: Path) -> dict[str, Any]:
@@ -168,7 +219,7 @@ def read_shared(path: Path) -> dict[str, Any]:
         for name, row in own.items():
             if "steps_n" in row:
                 raise ParamsError(complain(f"{path}: {section}", name, "without steps_n", "one", STEPS))
-            parse(ROWS[section], row | {"steps_n": 1}, f"{path}: {section}.{name}")
+            parse(SHARED_ROWS[section], row | {"steps_n": 1}, f"{path}: {section}.{name}")
     return words
 
 

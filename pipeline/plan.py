@@ -4,24 +4,20 @@ DVC expands stages from what stands there and cannot look into a scene's questio
 know what a stage does.
 """
 
-from collections.abc import Mapping, Sequence
-from functools import reduce
-from operator import getitem
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ruamel.yaml import YAML
 
-from pipeline import io
-from pipeline.asking import arms_of, described_in
-from pipeline.errors import ParamsError, complain
-from pipeline.params import Plan, Scene, read_plan, read_scene, read_shared
-from pipeline.questions import ARMS, EXPERIMENTS, MAIN_PROTOCOL, NOT_INGESTED, STUDIED_BY, STUDIES
-from pipeline.reads import IDLE, PHYSICS_OWN, PHYSICS_SHARED, READS, TERMS_N
+from pipeline.core import io
+from pipeline.core.config import NOTHING, PLACE, declared, fill, find, put, read_yaml
+from pipeline.core.errors import ParamsError, complain
+from pipeline.params import OnBoards, Plan, Scene, read_plan, read_scene
+from pipeline.questions import EXPERIMENTS, LEARNING, MAIN_PROTOCOL, NOT_INGESTED, QUESTIONS, stages
 from pipeline.registry import Registry, read_registry
-from pipeline.settings import Settings
-from pipeline.strict import parse, read_yaml
 
+FLOW = "dvc.yaml"
 PLAN = "pipeline/plan.yaml"
 PARAMS = "params.yaml"
 SCENES = "pipeline/scenes"
@@ -29,15 +25,22 @@ HEADER = """\
 # Which scenes run, what they ask, and what each stage of dvc.yaml takes. Written by `reskin scenes use` and `add`
 # from pipeline/scenes and data/captures.yaml; not for hands.
 """
+TERMS_N = 4  # terms of physics that a protocol may name
+IDLE = "lost_fraction_max"  # a key of params.yaml that re-runs what a stage rests on anyhow
+# What stage contacts reads of a simulated scene, and a recorded one does not have.
+PHYSICS_OF_SCENE = tuple(
+    key.replace("MAIN", f"simulate.protocols.{MAIN_PROTOCOL}")
+    for key in ("MAIN.boards", "MAIN.depths_mm", "MAIN.skins_n", "simulate.boards.${item.MAIN.boards}")
+)
+PHYSICS_SHARED = ("skin", "spreads")
 
 
-def make_plan(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, Any]:
-    """Derive `pipeline/plan.yaml`: a question that no scene asks leaves its stage without items."""
-    captures = {name: sorted(registry.captures.get(name, {})) for name in scenes}
-    for name, scene in scenes.items():
-        if scene.source == "recorded" and not captures[name]:
-            remedy = f"Try: reskin add RECORDING --scene {name} ..."
-            raise ParamsError(complain(f"scene {name}", "recorded captures", "one or more", "none", remedy))
+def make_plan(scenes: Mapping[str, Scene], registry: Registry, flow: Mapping[str, Any]) -> dict[str, Any]:
+    """Derive `pipeline/plan.yaml`: a question that no scene asks leaves its stage without items.
+
+    `flow` is dvc.yaml: words of a scene that its stages name (`${item.train_multi.recipe}`) are copied into the plan.
+    """
+    captures = _captures(scenes, registry)
     pairs = [(name, capture) for name in scenes for capture in captures[name]]
     ingest = {f"{name}-{capture}": {"scene": name, "capture": capture} for name, capture in pairs}
     if len(ingest) < len(pairs):
@@ -45,65 +48,89 @@ def make_plan(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, Any]
             complain("stage ingest", "scene-capture", "unlike any other", "two that read the same", "Rename a scene.")
         )
     simulated = _folders(scenes)
-    described = {name: {"scene": name, "protocol": described_in(scene)[0]} for name, scene in scenes.items()}
-    split = {name: {"scene": name, "captures": captures[name]} for name in scenes}
-    stages: dict[str, Any] = {
+    items: dict[str, Any] = {
         "simulate": {key: _simulated(scenes[item["scene"]], item) for key, item in simulated.items()},
-        "ingest_simulated": _ingested(scenes, simulated), "ingest": ingest, "describe": described, "split": split,
-    }  # fmt: skip
-    asked = {name: _stages_of(scene) for name, scene in scenes.items()}
-    stages |= {stage: {name: {"scene": name} for name in scenes if stage in asked[name]} for stage in (*ARMS, *STUDIES)}
-    stages |= {question: _experiments(scenes, question) for question in EXPERIMENTS}
-    stages |= {stage: {name: {"scene": name} for name in scenes} for stage in ("report", "publish")}
-    named = {
-        stage: {key: _with_names(stage, scenes, item) for key, item in own.items()} for stage, own in stages.items()
+        "ingest_simulated": {key: item for key, item in simulated.items() if _is_ingested(scenes, item)},
+        "ingest": ingest,
+        "describe": {name: {"scene": name, "protocol": scene.described} for name, scene in scenes.items()},
+        "split": {name: {"scene": name, "folds": list(scene.with_folds)} for name, scene in scenes.items()},
     }
-    return {"scenes": {name: list(scene.questions) for name, scene in scenes.items()}, "stages": named}
+    for stage in stages(QUESTIONS, *LEARNING, "study"):
+        items[stage] = {name: {"scene": name} for name, scene in scenes.items() if scene.runs(stage)}
+    items |= {question: _experiments(scenes, question) for question in EXPERIMENTS}
+    items |= {stage: {name: {"scene": name} for name in scenes} for stage in ("report", "publish")}
+    for stage, own in items.items():
+        for item in own.values():
+            scene = scenes[item["scene"]]
+            item |= _more(stage, scene, captures[item["scene"]])
+            for name, word in _words(flow, stage, item, scene.model_dump(mode="json", exclude_none=True)):
+                put(item, name, word)
+    return {"scenes": {name: list(scene.questions) for name, scene in scenes.items()}, "stages": items}
 
 
-def _with_names(stage: str, scenes: Mapping[str, Scene], item: dict[str, Any]) -> dict[str, Any]:
-    """Add to an item the words that its scene names: the rows of params.yaml and the boards that the stage reads."""
-    if stage not in READS:
-        return item
-    reads, scene = READS[stage], scenes[item["scene"]]
-    words = scene.model_dump(mode="json", exclude_none=True)
-    item = item | {word: reduce(getitem, key.format(**item).split("."), words) for word, key in reads.named}
-    if not reads.physics:
-        return item
+def _captures(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, list[str]]:
+    captures = {name: sorted(registry.captures.get(name, {})) for name in scenes}
+    for name, scene in scenes.items():
+        if scene.source == "recorded" and not captures[name]:
+            remedy = f"Try: reskin add RECORDING --scene {name} ..."
+            raise ParamsError(complain(f"scene {name}", "recorded captures", "one or more", "none", remedy))
+    return captures
+
+
+def _more(stage: str, scene: Scene, captures: list[str]) -> dict[str, Any]:
+    """Give what a stage must know of the scene beyond its own settings."""
+    match stage:
+        case "describe" | "split" | "drift" | "variation":
+            return {"captures": captures}
+        case "audit":
+            return {"models": scene.modelled}
+        case "contacts":
+            return _physics(scene)
+        case "report" | "publish":
+            return {"questions": list(scene.questions)}
+    return {}
+
+
+def _words(
+    flow: Mapping[str, Any], stage: str, item: Mapping[str, Any], scene: Mapping[str, Any]
+) -> Iterator[tuple[str, Any]]:
+    """Find the words of a scene that a stage's parameters name in dvc.yaml: rows of params.yaml, kinds of boards."""
+    for template in (one for own in declared(flow, stage).values() for one in own):
+        for match in PLACE.finditer(template):
+            if match[1] and find(item, match[2]) is NOTHING:
+                yield match[2], find(scene, match[2])
+
+
+def _physics(scene: Scene) -> dict[str, list[str]]:
     if scene.simulate is None:  # nothing to read there: keys that it reads anyhow stand in
-        return item | {"own": ["seed"] * len(PHYSICS_OWN), "shared": [IDLE] * len(PHYSICS_SHARED)}
-    item |= {"boards": scene.simulate.protocols[MAIN_PROTOCOL].boards}
-    return item | {"own": [key.format(**item) for key in PHYSICS_OWN], "shared": list(PHYSICS_SHARED)}
+        return {"of_scene": ["seed"] * len(PHYSICS_OF_SCENE), "shared": [IDLE] * len(PHYSICS_SHARED)}
+    words = scene.model_dump(mode="json")
+    return {"of_scene": [fill(key, "", words) for key in PHYSICS_OF_SCENE], "shared": list(PHYSICS_SHARED)}
 
 
 def _simulated(scene: Scene, item: dict[str, str]) -> dict[str, Any]:
-    """Add the terms of a protocol: four keys, as DVC cannot take a list; `chip`, which it reads anyhow, fills up."""
+    """Add a protocol's boards and terms: four keys, as DVC cannot take a list; `chip`, which it reads too, fills up."""
+    protocol = _protocol(scene, item)
+    terms = [f"terms.{term}" for term in protocol.terms]
+    return {**item, "boards": protocol.boards, "shared": terms + ["chip"] * (TERMS_N - len(terms))}
+
+
+def _is_ingested(scenes: Mapping[str, Scene], item: Mapping[str, str]) -> bool:
+    return _protocol(scenes[item["scene"]], item).kind not in NOT_INGESTED
+
+
+def _protocol(scene: Scene, item: Mapping[str, str]) -> OnBoards:
     assert scene.simulate is not None, "only a simulated scene has folders by protocol"
-    terms = [f"terms.{term}" for term in scene.simulate.protocols[item["protocol"]].terms]
-    return {**item, "shared": terms + ["chip"] * (TERMS_N - len(terms))}
+    return scene.simulate.protocols[item["protocol"]]
 
 
-def _stages_of(scene: Scene) -> set[str]:
-    return {*arms_of(scene), *(STUDIED_BY[question] for question in scene.studied)}
-
-
-def _ingested(scenes: Mapping[str, Scene], folders: Mapping[str, dict[str, str]]) -> dict[str, dict[str, str]]:
-    """Keep the folders whose captures become rows."""
-    return {key: item for key, item in folders.items() if _kind(scenes[item["scene"]], item) not in NOT_INGESTED}
-
-
-def _kind(scene: Scene, item: Mapping[str, str]) -> str:
-    assert scene.simulate is not None, "only a simulated scene has folders by protocol"
-    return scene.simulate.protocols[item["protocol"]].kind
-
-
-def _experiments(scenes: Mapping[str, Scene], question: str) -> dict[str, dict[str, str]]:
+def _experiments(scenes: Mapping[str, Scene], question: str) -> dict[str, dict[str, Any]]:
     """Name the folder of captures that an experiment is asked of, by scene."""
-    protocol = EXPERIMENTS[question]
+    protocol = QUESTIONS[question].protocol or MAIN_PROTOCOL
     return {
-        name: {"scene": name, "folder": name if scene.simulate is None else _folder(name, protocol or MAIN_PROTOCOL)}
+        name: {"scene": name, "folder": name if scene.simulate is None else _folder(name, protocol)}
         for name, scene in scenes.items()
-        if question in scene.experiments
+        if question in scene.questions
     }
 
 
@@ -160,33 +187,8 @@ def check(root: Path) -> Plan:
 
 
 def _plan_of(root: Path, names: Sequence[str]) -> dict[str, Any]:
-    scenes = {name: _read(scene_file(root, name), root / PARAMS) for name in dict.fromkeys(names)}
-    return make_plan(scenes, read_registry(root))
-
-
-def _read(file: Path, params: Path) -> Scene:
-    """Read a scene, and how its skins are made: the physics is imported for a simulated one only."""
-    scene, shared = read_scene(file, params), read_shared(params)
-    settings = Settings(file.stem, str(file), read_yaml(file), shared, {})
-    if scene.simulate is not None:
-        from pipeline.synthesis.capture import Synthesis
-
-        terms = {term for protocol in scene.simulate.protocols.values() for term in protocol.terms}
-        words = settings.words("simulate") | {name: shared[name] for name in ("skin", "rig", "chip", "spreads")}
-        words["terms"] = {term: settings.named("terms", term) for term in sorted(terms)}
-        parse(Synthesis, words, f"{file}: simulate")
-    if scene.train_classical is not None or scene.few_labels is not None:
-        from pipeline.learning import comparison  # scikit-learn, for a scene that compares
-
-        if scene.train_classical is not None:
-            comparison.resolve_baselines(scene.train_classical, settings.named, f"{file}: train_classical")
-        if scene.few_labels is not None:
-            comparison.resolve_few_labels(scene.few_labels, settings.named, f"{file}: few_labels")
-    if scene.runtime is not None:
-        from pipeline.evaluation.work_precision.settings import RunTime
-
-        parse(RunTime, scene.runtime, f"{file}: runtime")
-    return scene
+    scenes = {name: read_scene(scene_file(root, name), root / PARAMS) for name in dict.fromkeys(names)}
+    return make_plan(scenes, read_registry(root), read_yaml(root / FLOW))
 
 
 def _flow(value: Any) -> Any:

@@ -11,14 +11,14 @@ import numpy as np
 import pyarrow as pa
 from pydantic import Field
 
-from pipeline import io
 from pipeline.capture import columns, sd_card
-from pipeline.errors import ParamsError, SchemaError, complain
-from pipeline.evaluation.logs import Estimates, describe, estimate
+from pipeline.core import io
+from pipeline.core.config import Strict, parse
+from pipeline.core.errors import ParamsError, SchemaError, complain
+from pipeline.experiments.logs.estimates import Estimates, describe, estimate
 from pipeline.learning.card import FORMAT
 from pipeline.learning.inputs import VIEW
-from pipeline.stages._networks import Network
-from pipeline.strict import Strict, parse
+from pipeline.trials.networks import Network
 
 ANSWERS = ("x_mm", "y_mm", "Fz_N")
 

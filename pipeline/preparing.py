@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pipeline import io
 from pipeline.capture import header as headers
 from pipeline.capture.header import Clock, Header
 from pipeline.capture.readers import READERS
+from pipeline.core import io
+from pipeline.core.errors import CaptureError, complain
 from pipeline.dataset.captures import read_header
-from pipeline.errors import CaptureError, complain
 
 NATIVE_FILES = (headers.STREAM_FILE, headers.ARRIVALS_FILE, headers.PROBE_FILE)
 RECORDINGS_OWN = Clock(kind="recording", rate_hz=None, marks=())

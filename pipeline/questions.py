@@ -1,105 +1,99 @@
-"""Which questions a scene may ask: who answers each, what it goes on from, what it needs. Words only.
+"""The questions that a scene may ask, in one table: who answers each, what it needs, on which captures. Words only.
 
-A new question is a row here, a section in `sections`, a stage and a part of the report. Refuses to know files.
+A new experiment is a row here, a folder in `experiments`, a stage in dvc.yaml, and its name in a scene. Refuses to know
+files, settings and results.
 """
 
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import Literal
 
-Study = Literal["verification", "stability", "runtime", "left_out"]
-Further = Literal["triplet", "adapt", "pokes", "baselines", "audit", "choice"]
-Experiment = Literal[
-    "drift",
-    "variation",
-    "shear",
-    "manual",
-    "flexible",
-    "sleeve",
-    "sensitivity",
-    "logs",
-    "contacts",
-    "ambient",
-    "dynamics",
-]
-
-# question -> the stage that answers it, and the keys of `split` that draw its folds
-ANSWERED_BY: dict[str, str] = {
-    "lobo": "train_multi",
-    "transfer": "train_single",
-    "single_random": "train_single",
-    "single_indentation": "train_single",
-    "single_pass": "train_single",
-    "single_temporal": "train_single",
-    "sensors": "sweep_sensors",
-    "labels": "few_labels",
-}
-DRAWN_WITH: dict[str, set[str]] = {
-    "lobo": set(),
-    "transfer": {"transfer_skins_n"},
-    "single_random": {"random_test_fraction", "random_repeats_n"},
-    "single_indentation": {"random_test_fraction", "random_repeats_n"},
-    "single_pass": {"random_test_fraction", "random_repeats_n"},
-    "single_temporal": {"temporal_test_fraction"},
-    "sensors": {"sensors_skins_n", "sensors_draws_n"},
-    "labels": {"labels_pool_n", "labels_draws_n"},
-}
-# questions about the folds of others -> the stage that answers it, and the questions that it goes on from
-CONTINUED_BY: dict[str, str] = {
-    "triplet": "train_triplet",
-    "adapt": "adapt",
-    "pokes": "sweep_pokes",
-    "baselines": "train_classical",
-    "audit": "audit",
-}
-NEEDS: dict[str, set[str]] = {
-    "triplet": {"lobo"},
-    "adapt": {"triplet"},
-    "pokes": {"adapt"},
-    "sensors": {"adapt"},
-    "baselines": {"lobo"},
-    "labels": {"lobo"},
-    "audit": {"lobo"},
-    "choice": {"lobo", "triplet", "adapt"},  # answered by the report: it only reads scores
-    "manual": {"adapt"},
-    "flexible": {"adapt"},
-    "logs": {"lobo"},
-    "contacts": {"lobo"},
-    "ambient": {"lobo"},
-    "dynamics": {"lobo"},
-}
-POOLED_BY = "adapt"  # takes pokes of the held-out skins, so a part of these is kept from every test
-ARMS = (
-    "train_single", "train_multi", "train_triplet", "adapt", "sweep_pokes", "sweep_sensors", "train_classical",
-    "few_labels", "audit",
-)  # fmt: skip
-WITHOUT_SECTION = {"sweep_sensors"}  # settings of others are all they need
-# questions about the physics of a simulated scene -> the stage that answers it
-STUDIED_BY: dict[str, str] = {
-    "verification": "verify",
-    "stability": "stability",
-    "runtime": "runtime",
-    "left_out": "leave_out",
-}
-STUDIES = tuple(STUDIED_BY.values())
-MODELLED = {"train_single", "train_multi", "train_triplet", "adapt"}
-SWEPT = {"pokes": "sweep_pokes", "sensors": "sweep_sensors", "baselines": "train_classical", "labels": "few_labels"}
-STAGE_OF = ANSWERED_BY | CONTINUED_BY  # of the questions about learning
 MAIN_PROTOCOL = "grid"  # folds are drawn on its captures
-
-# The paper's further experiments, each answered by the stage of its name -> the protocol that it is asked of. None: the
-# main captures. A recorded scene has all its captures in one folder.
-EXPERIMENTS: dict[str, str | None] = {
-    "drift": "wear",
-    "variation": "wear",
-    "shear": "drag",
-    "manual": "hand",
-    "flexible": "flexible",
-    "sleeve": "sleeve",
-    "sensitivity": "glass",
-    "logs": "log",
-    "contacts": None,
-    "ambient": None,
-    "dynamics": "press",
-}
 NOT_INGESTED = {"walk"}  # kinds of protocols whose captures are read as they are: an SD card knows no probe
-OF_RECORDED = {"drift", "contacts"}  # the experiments that recorded captures can answer too
-WITH_SECTION = {"drift", "variation", "shear", "sleeve", "contacts", "ambient"}
+POOLED_BY = "adapt"  # takes pokes of the held-out skins, so a part of these is kept from every test
+RANDOM = ("random_test_fraction", "random_repeats_n")
+
+Kind = Literal["models", "curve", "other", "experiment", "study", "report"]
+
+
+@dataclass(frozen=True)
+class Question:
+    """One row: a question, the stage that answers it and the questions it goes on from.
+
+    `kind` tells what the answer is: models with cards, points of a curve, another file about learning, an experiment
+    with a folder of its own, a study of the physics, or words of the report. `protocol` is that of the captures it is
+    asked of; None: the main ones. `folds` are the keys of `split` that its folds are drawn with; None: it has no folds
+    of its own. `section`: the scene's file holds settings for it, named as the stage.
+    """
+
+    name: str
+    kind: Kind
+    stage: str = ""
+    needs: tuple[str, ...] = ()
+    protocol: str | None = None
+    folds: tuple[str, ...] | None = None
+    section: bool = False
+    recorded: bool = True  # a scene of recordings may ask it too
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "stage", self.stage or self.name)
+
+
+def _experiment(
+    name: str, protocol: str | None, *needs: str, section: bool = False, recorded: bool = False
+) -> Question:
+    return Question(name, "experiment", needs=needs, protocol=protocol, section=section, recorded=recorded)
+
+
+def _study(name: str, *, section: bool = False) -> Question:
+    return Question(name, "study", section=section, recorded=False)
+
+
+ROWS = (
+    Question("single_random", "models", "train_single", folds=RANDOM, section=True),
+    Question("single_indentation", "models", "train_single", folds=RANDOM, section=True),
+    Question("single_pass", "models", "train_single", folds=RANDOM, section=True),
+    Question("single_temporal", "models", "train_single", folds=("temporal_test_fraction",), section=True),
+    Question("transfer", "models", "train_single", folds=("transfer_skins_n",), section=True),
+    Question("lobo", "models", "train_multi", folds=(), section=True),
+    Question("triplet", "models", "train_triplet", needs=("lobo",), section=True),
+    Question("adapt", "models", needs=("triplet",), section=True),
+    Question("pokes", "curve", "sweep_pokes", needs=("adapt",), section=True),
+    Question("sensors", "curve", "sweep_sensors", needs=("adapt",), folds=("sensors_skins_n", "sensors_draws_n")),
+    Question("baselines", "curve", "train_classical", needs=("lobo",), section=True),
+    Question("labels", "curve", "few_labels", needs=("lobo",), folds=("labels_pool_n", "labels_draws_n"), section=True),
+    Question("audit", "other", needs=("lobo",), section=True),
+    Question("choice", "report", "report", needs=("lobo", "triplet", "adapt")),
+    _experiment("drift", "wear", section=True, recorded=True),
+    _experiment("variation", "wear", section=True),
+    _experiment("shear", "drag", section=True),
+    _experiment("manual", "hand", "adapt"),
+    _experiment("flexible", "flexible", "adapt"),
+    _experiment("sleeve", "sleeve", section=True),
+    _experiment("sensitivity", "glass"),
+    _experiment("logs", "log", "lobo"),
+    _experiment("contacts", None, "lobo", section=True, recorded=True),
+    _experiment("ambient", None, "lobo", section=True),
+    _experiment("dynamics", "press", "lobo"),
+    _study("verification"),
+    _study("stability"),
+    _study("runtime", section=True),
+    _study("left_out"),
+)
+QUESTIONS: Mapping[str, Question] = {row.name: row for row in ROWS}
+
+
+def of_kind(*kinds: Kind) -> tuple[str, ...]:
+    """Name the questions of some kinds."""
+    return tuple(row.name for row in ROWS if row.kind in kinds)
+
+
+def stages(names: Iterable[str], *kinds: Kind) -> list[str]:
+    """Name the stages that answer questions of some kinds, in the order of the table; each once."""
+    asked = set(names)
+    return list(dict.fromkeys(row.stage for row in ROWS if row.name in asked and row.kind in kinds))
+
+
+LEARNING: tuple[Kind, ...] = ("models", "curve", "other")
+EXPERIMENTS = of_kind("experiment")
+SECTIONS = tuple(dict.fromkeys(row.stage for row in ROWS if row.section))

@@ -7,11 +7,11 @@ killed recorder leaves a `.part` that can still be added. Refuses to know ports 
 import threading
 from pathlib import Path
 
-from pipeline import io
 from pipeline.capture.folder import seal
 from pipeline.capture.header import HEADER_FILE, Clock, Header, parse, render
 from pipeline.capture.port import PortSettings, Recording, record
-from pipeline.errors import CaptureError, complain
+from pipeline.core import io
+from pipeline.core.errors import CaptureError, complain
 
 
 def record_capture(port: str, folder: Path, *, board: str, skin: str, settings: PortSettings) -> Recording:

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from ruamel.yaml import YAML
 
-from pipeline import io
 from pipeline.capture.header import Header
-from pipeline.errors import CaptureError, complain
-from pipeline.strict import Strict, parse, read_yaml
+from pipeline.core import io
+from pipeline.core.config import Strict, parse, read_yaml
+from pipeline.core.errors import CaptureError, complain
 
 REGISTRY = "data/captures.yaml"
 

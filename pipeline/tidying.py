@@ -10,10 +10,10 @@ from typing import Any
 
 from ruamel.yaml import YAML
 
-from pipeline import io
+from pipeline.core import io
+from pipeline.core.config import read_yaml
 from pipeline.params import Plan
 from pipeline.plan import scene_names
-from pipeline.strict import read_yaml
 
 LOCK = "dvc.lock"
 

@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline import io
+from pipeline.core import io
+from pipeline.core.server import TrackingAway, probe, server_uri
 from pipeline.evaluation.summary import over_folds, pool_skins
-from pipeline.server import TrackingAway, probe, server_uri
 
 STORE = "mlflow.db"
 ARTIFACTS = "mlartifacts"

@@ -1,8 +1,7 @@
 """Scenes for tests, as plain words, and the settings that a stage has of them."""
 
-from pipeline.params import Scene
-from pipeline.settings import Settings
-from pipeline.strict import parse
+from pipeline.core.config import Settings, parse
+from pipeline.params import Asking, Scene, check_scene
 
 RECIPE = {
     "architecture": "paper", "inputs": "raw", "scaling": "standard", "triplet_weight": 0.0, "steps_n": 1, "batch_n": 64,
@@ -90,11 +89,15 @@ def asking(*questions: str, **changes: object) -> dict[str, object]:
 
 def settings(scene: dict[str, object], name: str = "tiny", **shared: object) -> Settings:
     """All settings of a scene, as a stage that declares everything would read them."""
-    return Settings(name, f"{name}.yaml", scene, SHARED | shared, {"stages": {"split": {name: {"captures": []}}}})
+    return Settings(name, f"{name}.yaml", scene, SHARED | shared, {"captures": [], **planned(scene)})
+
+
+def planned(scene: dict[str, object]) -> dict[str, object]:
+    """What the plan says of a scene to the stages that ask it."""
+    words = {name: scene[name] for name in ("source", "questions")}
+    return {"questions": scene["questions"], "models": parse(Asking, words, "scene.yaml").modelled}
 
 
 def check(words: dict[str, object]) -> Scene:
     """Check a scene as `reskin scenes check` does."""
-    scene = parse(Scene, words, "scene.yaml")
-    Settings("scene", "scene.yaml", words, SHARED, {}).check_all()
-    return scene
+    return check_scene("scene", "scene.yaml", words, SHARED)

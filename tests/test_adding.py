@@ -13,8 +13,8 @@ from pipeline.capture.folder import write_capture
 from pipeline.capture.header import Clock
 from pipeline.capture.probe import ProbeLog
 from pipeline.capture.wire import encode
+from pipeline.core.errors import ReskinError
 from pipeline.dataset.captures import open_capture, read_header
-from pipeline.errors import ReskinError
 from pipeline.preparing import Dump, Labels
 from pipeline.registry import read_registry
 from tests.capture.headers import make_header

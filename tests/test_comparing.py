@@ -3,10 +3,11 @@ import subprocess
 import pytest
 from typer.testing import CliRunner
 
-from pipeline import cli, comparing, io
+from pipeline import cli, comparing
 from pipeline.cli import app
 from pipeline.comparing import compare_scene
-from pipeline.errors import SchemaError
+from pipeline.core import io
+from pipeline.core.errors import SchemaError
 
 
 def numbers(accuracy_pct: float) -> dict:

@@ -15,6 +15,14 @@ def graph() -> grimp.ImportGraph:
     return grimp.build_graph("pipeline", cache_dir=None)
 
 
+def module_of(stage: str) -> str:
+    return (
+        f"pipeline.experiments.{stage}.run"
+        if (ROOT / "pipeline/experiments" / stage).is_dir()
+        else f"pipeline.stages.{stage}"
+    )
+
+
 def file_of(module: str) -> Path:
     path = ROOT / module.replace(".", "/")
     return path / "__init__.py" if path.is_dir() and (path / "__init__.py").exists() else path.with_suffix(".py")
@@ -22,8 +30,8 @@ def file_of(module: str) -> Path:
 
 @pytest.mark.parametrize("name", sorted(STAGES))
 def test_a_stage_names_all_the_code_that_it_imports(name, graph):
-    needed = {file_of(module) for module in graph.find_upstream_modules(f"pipeline.stages.{name}")}
-    needed.add(ROOT / f"pipeline/stages/{name}.py")
+    needed = {file_of(module) for module in graph.find_upstream_modules(module_of(name))}
+    needed.add(file_of(module_of(name)))
     listed = [ROOT / one for one in STAGES[name]["do"]["deps"] if one.startswith("pipeline/")]
     # Packages' own __init__ files hold docstrings only, but for the table of readers.
     missing = {
@@ -35,8 +43,8 @@ def test_a_stage_names_all_the_code_that_it_imports(name, graph):
 
 @pytest.mark.parametrize("name", sorted(STAGES))
 def test_a_stage_names_no_code_that_it_does_not_import(name, graph):
-    needed = {file_of(module) for module in graph.find_upstream_modules(f"pipeline.stages.{name}")}
-    needed.add(ROOT / f"pipeline/stages/{name}.py")
+    needed = {file_of(module) for module in graph.find_upstream_modules(module_of(name))}
+    needed.add(file_of(module_of(name)))
     listed = [one for one in STAGES[name]["do"]["deps"] if one.startswith("pipeline/")]
     idle = [one for one in listed if not any(f == ROOT / one or ROOT / one in f.parents for f in needed)]
     assert idle == []

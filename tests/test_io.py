@@ -4,9 +4,9 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from pipeline import io
-from pipeline.errors import SchemaError
-from pipeline.schema import UNITS
+from pipeline.core import io
+from pipeline.core.errors import SchemaError
+from pipeline.core.schema import UNITS
 from tests.dataset.tables import readings
 
 

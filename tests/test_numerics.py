@@ -7,11 +7,11 @@ import sys
 
 import pytest
 
-from pipeline.numerics import BEYOND_AVX2, PINNED, cpu_flags, pinned
+from pipeline.core.numerics import BEYOND_AVX2, PINNED, cpu_flags, pinned
 
 AVX2, NEWEST = frozenset({"avx2"}), frozenset({"avx2", *BEYOND_AVX2.values()})
 TRAIN = """
-from pipeline.extremes.learning import _cell, _changed, _rows
+from pipeline.experiments.stability.learning import _cell, _changed, _rows
 from pipeline.learning.stack import train_stack
 import hashlib, sys
 cells = [_changed(_cell(i), triplet_weight=0.1) for i in range(3)]

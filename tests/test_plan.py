@@ -6,19 +6,27 @@ import pytest
 from ruamel.yaml import YAML
 
 from pipeline import plan
-from pipeline.errors import ParamsError
-from pipeline.params import Plan, Scene
+from pipeline.core.config import parse, read_yaml
+from pipeline.core.errors import ParamsError
+from pipeline.params import Plan, Scene, parse_scene
 from pipeline.questions import EXPERIMENTS
 from pipeline.registry import Entry, Registry
-from pipeline.strict import parse
+from pipeline.stages._report import asking as read_asking
 from tests.scenes import SHARED, asking, recorded, settings
 
 ROOT = Path(__file__).resolve().parents[1]
 ENTRY = Entry(board="b", skin="s", layout="lab", chips_n=5, fingerprints=("0",), copy_of=None)
 
 
+FLOW = read_yaml(ROOT / plan.FLOW)
+
+
+def make_plan(scenes, registry):
+    return plan.make_plan(scenes, registry, FLOW)
+
+
 def scene(**changes: object) -> Scene:
-    return parse(Scene, recorded(**changes), "scene.yaml")
+    return parse_scene(recorded(**changes), "scene.yaml")
 
 
 def test_the_plan_of_the_checkout_is_what_its_scenes_ask_for():
@@ -26,9 +34,9 @@ def test_the_plan_of_the_checkout_is_what_its_scenes_ask_for():
 
 
 def test_a_question_that_no_scene_asks_has_no_stage():
-    made = plan.make_plan({"lab": scene()}, Registry(captures={"lab": {"c0": ENTRY}}))["stages"]
-    assert made["train_multi"] == {"lab": {"scene": "lab", "recipe": "paper"}}
-    assert made["train_single"] == made["verify"] == made["runtime"] == {}
+    made = make_plan({"lab": scene()}, Registry(captures={"lab": {"c0": ENTRY}}))["stages"]
+    assert made["train_multi"] == {"lab": {"scene": "lab", "train_multi": {"recipe": "paper"}}}
+    assert made["train_single"] == made["verification"] == made["runtime"] == {}
     assert made["simulate"] == made["ingest_simulated"] == {}
 
 
@@ -48,51 +56,54 @@ ADAPTED = ("lobo", "triplet", "adapt")
     ],
 )
 def test_a_stage_about_learning_runs_for_the_scenes_that_ask_it_and_for_no_other(stage, questions):
-    asked, plain = (parse(Scene, asking(*own), "scene.yaml") for own in (questions, ("lobo",)))
+    asked, plain = (parse_scene(asking(*own), "scene.yaml") for own in (questions, ("lobo",)))
     captures = Registry(captures={"one": {"c0": ENTRY}, "two": {"c0": ENTRY}})
-    made = plan.make_plan({"one": plain, "two": asked}, captures)
+    made = make_plan({"one": plain, "two": asked}, captures)
     parse(Plan, made, "plan")
     assert list(made["stages"][stage]) == ["two"]
     assert all(list(made["stages"][every]) == ["one", "two"] for every in ("train_multi", "report", "publish"))
-    assert plan.make_plan({"one": plain}, captures)["stages"][stage] == {}
+    assert make_plan({"one": plain}, captures)["stages"][stage] == {}
 
 
 def test_an_experiment_of_a_recorded_scene_is_asked_of_its_own_captures_and_of_no_other_scene():
-    asked, plain = (parse(Scene, asking(*own), "scene.yaml") for own in (("lobo", "drift"), ("lobo",)))
+    asked, plain = (parse_scene(asking(*own), "scene.yaml") for own in (("lobo", "drift"), ("lobo",)))
     captures = Registry(captures={"one": {"c0": ENTRY}, "two": {"c0": ENTRY}})
-    made = plan.make_plan({"one": plain, "two": asked}, captures)
+    made = make_plan({"one": plain, "two": asked}, captures)
     parse(Plan, made, "plan")
-    assert made["stages"]["drift"] == {"two": {"scene": "two", "folder": "two", "recipe": "paper"}}
+    assert made["stages"]["drift"] == {
+        "two": {"scene": "two", "folder": "two", "captures": ["c0"], "drift": {"training": {"recipe": "paper"}}}
+    }
     assert all(made["stages"][question] == {} for question in EXPERIMENTS if question != "drift")
 
 
 def test_a_choice_of_settings_needs_no_stage_of_its_own():
-    chosen, plain = (parse(Scene, asking(*own), "scene.yaml") for own in ((*ADAPTED, "choice"), ADAPTED))
+    chosen, plain = (parse_scene(asking(*own), "scene.yaml") for own in ((*ADAPTED, "choice"), ADAPTED))
     captures = Registry(captures={"lab": {"c0": ENTRY}})
-    with_choice, without = (plan.make_plan({"lab": one}, captures)["stages"] for one in (chosen, plain))
-    assert with_choice == without
+    with_choice, without = (make_plan({"lab": one}, captures)["stages"] for one in (chosen, plain))
+    named = {stage for stage in with_choice if with_choice[stage] != without[stage]}
+    assert named == {"report", "publish"}  # which are told what is asked
 
 
 def test_a_question_that_was_added_since_is_noticed_by_the_stages():
-    asked = settings(asking("lobo", "baselines"))
-    replace(asked, planned={"scenes": {"tiny": ["lobo", "baselines"]}}).check_questions()
+    own = settings(asking("lobo", "baselines"))
+    assert read_asking(own).questions == ("lobo", "baselines")
     with pytest.raises(ParamsError, match="baselines only in one. Try: reskin scenes use tiny"):
-        replace(asked, planned={"scenes": {"tiny": ["lobo"]}}).check_questions()
+        read_asking(replace(own, planned={"questions": ["lobo"]}))
 
 
 def test_every_recorded_capture_has_an_ingest_of_its_own():
-    made = plan.make_plan({"lab": scene()}, Registry(captures={"lab": {"c1": ENTRY, "c0": ENTRY}, "ini": {"x": ENTRY}}))
+    made = make_plan({"lab": scene()}, Registry(captures={"lab": {"c1": ENTRY, "c0": ENTRY}, "ini": {"x": ENTRY}}))
     parse(Plan, made, "plan")
     assert made["stages"]["ingest"] == {
         "lab-c0": {"scene": "lab", "capture": "c0"},
         "lab-c1": {"scene": "lab", "capture": "c1"},
     }
-    assert made["stages"]["split"] == {"lab": {"scene": "lab", "captures": ["c0", "c1"]}}
+    assert made["stages"]["split"] == {"lab": {"scene": "lab", "folds": ["lobo"], "captures": ["c0", "c1"]}}
 
 
 def test_a_recorded_scene_without_recordings_says_how_to_add_one():
     with pytest.raises(ParamsError, match="reskin add RECORDING --scene lab"):
-        plan.make_plan({"lab": scene()}, Registry(captures={}))
+        make_plan({"lab": scene()}, Registry(captures={}))
 
 
 def checkout(folder: Path, running: str = "{}") -> Path:
@@ -105,6 +116,7 @@ def checkout(folder: Path, running: str = "{}") -> Path:
         YAML().dump({"captures": {"one": {"c0": ENTRY.model_dump()}, "two": {"c0": ENTRY.model_dump()}}}, stream)
     with (folder / plan.PARAMS).open("w") as stream:
         YAML().dump(SHARED, stream)
+    shutil.copy(ROOT / plan.FLOW, folder)
     (folder / plan.PLAN).write_text(f"scenes: {running}\nstages: {{}}\n")
     return folder
 

@@ -5,12 +5,12 @@ import json
 import numpy as np
 import pytest
 
-from pipeline import io
 from pipeline.capture.sd_card import render
-from pipeline.errors import CaptureError, ReskinError
+from pipeline.core import io
+from pipeline.core.errors import CaptureError, ReskinError
+from pipeline.core.seeds import rng_for
 from pipeline.learning.architecture import draw_weights, paper_layers
 from pipeline.predicting import predict
-from pipeline.seeds import rng_for
 
 RATE_HZ, QUIET_N, TOUCHED_N = 250.0, 400, 100
 ANSWER = np.array([8.0, 4.0, 1.5], np.float32)

@@ -4,9 +4,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline import provenance
-from pipeline.numerics import VARIABLES, pinned
-from pipeline.provenance import (
+from pipeline.core import provenance
+from pipeline.core.numerics import VARIABLES, pinned
+from pipeline.core.provenance import (
     INSTRUCTIONS,
     add_up_costs,
     begin_cost,

@@ -1,7 +1,7 @@
 import pytest
 
 from pipeline.capture.header import Clock, Header
-from pipeline.errors import CaptureError
+from pipeline.core.errors import CaptureError
 from pipeline.registry import Registry, with_capture, without_capture
 
 EMPTY = Registry(captures={})

@@ -8,17 +8,21 @@ from typing import Any
 import pytest
 from ruamel.yaml import YAML
 
-from pipeline import plan, settings
-from pipeline.errors import ParamsError
-from pipeline.learning import comparison
-from pipeline.reads import READS
+from pipeline import plan
+from pipeline.core import config
+from pipeline.core.config import Files, Settings, declared, read_settings, read_yaml
+from pipeline.core.errors import ParamsError
+from pipeline.learning.recipe import adaptations, training
+from pipeline.params import module_of, read_scene
 from pipeline.registry import Entry, Registry
-from pipeline.settings import EAGER, Files, Settings, keys_of, read_settings
-from pipeline.stages._simulated import synthesis_of
-from pipeline.strict import read_yaml
+from pipeline.synthesis.of_settings import synthesis_of
 from tests.stages.checkout import copy_checkout
 
 ROOT = Path(__file__).resolve().parents[1]
+FLOW = read_yaml(ROOT / "dvc.yaml")
+READING = [
+    stage for stage, words in FLOW["stages"].items() if "params" in words["do"] and not stage.startswith("ingest")
+]
 SCENE, SHARED = "pipeline/scenes/ci.yaml", "params.yaml"
 VALUES: dict[tuple[str, str, bytes], Any] = {}  # by file, key and content
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of DVC's own libraries
@@ -38,27 +42,30 @@ def files_of(root: Path) -> Files:
 
 def items(root: Path) -> dict[str, tuple[str, str, dict[str, Any]]]:
     """Every stage that reads settings by DVC's name of it: its module, its key and its item in the plan."""
-    stages = settings.read_yaml(root / plan.PLAN)["stages"]
-    return {f"{stage}@{key}": (stage, key, item) for stage in READS for key, item in stages[stage].items()}
+    stages = config.read_yaml(root / plan.PLAN)["stages"]
+    return {f"{stage}@{key}": (stage, key, item) for stage in READING for key, item in stages[stage].items()}
 
 
-def effective(asked: Settings) -> str:
+def effective(stage: str, asked: Settings) -> str:
     """All that a stage gets of its settings, parsed and put together as its code does it."""
-    found = {name: getattr(asked, name) for name in EAGER if name in asked.own}
-    words = {name: one.model_dump(mode="json") if hasattr(one, "model_dump") else one for name, one in found.items()}
-    words["simulate"] = asked.own.get("simulate")
+    words: dict[str, Any] = {"scene": asked.of_scene, "planned": asked.planned}
+    if read := getattr(module_of(stage), "read", None):
+        words["section"] = read(asked).model_dump(mode="json")
+    for section in ("train_multi", "train_triplet"):  # whose networks others go on from
+        if "recipe" in asked.of_scene.get(section, {}):
+            words[section] = training(asked, section).model_dump(mode="json")
+    if "adapt" in asked.of_scene:
+        words["adapt"] = adaptations(asked).model_dump(mode="json")
     if {"skin", "spreads"} & set(asked.shared):  # else a stage takes one or two numbers of section simulate
         words["making"] = {name: repr(part) for name, part in synthesis_of(asked).__dict__.items()}
-    if "train_classical" in asked.own:
-        words["train_classical"] = repr(comparison.resolve_baselines(asked.words("train_classical"), asked.named, ""))
-    if "few_labels" in asked.own:
-        words["few_labels"] = repr(comparison.resolve_few_labels(asked.words("few_labels"), asked.named, ""))
-    words["runtime"] = asked.own.get("runtime")
-    return json.dumps(words | {"planned": asked.planned}, sort_keys=True, default=str)
+    return json.dumps(words, sort_keys=True, default=str)
 
 
 def read_all(root: Path) -> dict[str, str]:
-    return {name: effective(read_settings(stage, key, files_of(root))) for name, (stage, key, _) in items(root).items()}
+    return {
+        name: effective(stage, read_settings(stage, key, files_of(root)))
+        for name, (stage, key, _) in items(root).items()
+    }
 
 
 def stages_of(root: Path) -> list[Any]:
@@ -108,9 +115,13 @@ ALL_SIMULATE = {f"simulate@{key}" for key in SIMULATED}
 RIGID = ALL_SIMULATE - {"simulate@ci-flexible", "simulate@ci-sleeve"}
 PLAIN = {"train_single", "train_multi", "sweep_sensors", "drift", "shear", "sleeve", "ambient"}
 BASED = {"adapt", "sweep_pokes", "sweep_sensors", "manual", "flexible"}
-DRAWN = {"logs", "ambient", "contacts", "runtime", "leave_out"}
-SEEDED = {stage for stage, reads in READS.items() if "seed" in reads.own} - {"simulate", "verify", "stability"}
-SELECTED = {stage for stage, reads in READS.items() if "selection" in reads.own}
+DRAWN = {"logs", "ambient", "contacts", "runtime", "left_out"}
+SEEDED = {stage for stage in READING if "seed" in declared(FLOW, stage)["scene"]} - {
+    "simulate",
+    "verification",
+    "stability",
+}
+SELECTED = {stage for stage in READING if "selection" in declared(FLOW, stage)["scene"]}
 
 OVERRIDES: list[tuple[str, str, set[str]]] = [
     (SHARED, "recipes.paper.rate_max=0.001", PLAIN),
@@ -124,7 +135,7 @@ OVERRIDES: list[tuple[str, str, set[str]]] = [
     (SHARED, "methods.all.ridge.alpha=2.0", set()),
     (SHARED, "skin.modulus_kPa=300.0", ALL_SIMULATE | DRAWN - {"logs"}),
     (SHARED, "chip.noise_xy_uT=4.0", ALL_SIMULATE | {"logs", "ambient"}),
-    (SHARED, "chip.gain_sel=5", ALL_SIMULATE | {"logs", "ambient", "leave_out"}),
+    (SHARED, "chip.gain_sel=5", ALL_SIMULATE | {"logs", "ambient", "left_out"}),
     (SHARED, "rig.rate_hz=200.0", ALL_SIMULATE),
     (SHARED, "rig.readings_n=3", ALL_SIMULATE | {"logs", "ambient"}),
     (SHARED, "spreads.chip_tilt_deg=1.0", ALL_SIMULATE | DRAWN),
@@ -135,10 +146,10 @@ OVERRIDES: list[tuple[str, str, set[str]]] = [
     (SCENE, "selection.force_min_N=0.1", SELECTED),
     (SCENE, "split.random_test_fraction=0.2", {"split"}),
     (SCENE, "split.pool_passes_n=2", {"split", "flexible"}),
-    (SCENE, "simulate.protocols.grid.passes_n=3", {"simulate@ci", "leave_out"}),
-    (SCENE, "simulate.protocols.grid.depths_mm=[0.5]", {"simulate@ci", "leave_out", "contacts"}),
-    (SCENE, "simulate.protocols.drag.step_mm=1.0", {"simulate@ci-drag", "leave_out"}),
-    (SCENE, "simulate.protocols.glass.step_N=0.1", {"simulate@ci-glass", "sensitivity", "leave_out"}),
+    (SCENE, "simulate.protocols.grid.passes_n=3", {"simulate@ci", "left_out"}),
+    (SCENE, "simulate.protocols.grid.depths_mm=[0.5]", {"simulate@ci", "left_out", "contacts"}),
+    (SCENE, "simulate.protocols.drag.step_mm=1.0", {"simulate@ci-drag", "left_out"}),
+    (SCENE, "simulate.protocols.glass.step_N=0.1", {"simulate@ci-glass", "sensitivity", "left_out"}),
     (SCENE, "simulate.boards.rigid.design.gap_mm=1.0", RIGID | DRAWN | {"flexible"}),
     (SCENE, "simulate.boards.flexible.design.gap_mm=0.5", {"simulate@ci-flexible", "flexible"}),
     (SCENE, "simulate.boards.sleeve.design.tiles.pitch_mm=25.0", {"simulate@ci-sleeve", "sleeve"}),
@@ -186,7 +197,7 @@ def _each_content_is_parsed_once():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(of_dvc, "load_path", once(of_dvc.load_path))
-        patch.setattr(settings, "read_yaml", once(settings.read_yaml))
+        patch.setattr(config, "read_yaml", once(config.read_yaml))
         yield
 
 
@@ -225,28 +236,17 @@ def test_an_override_of_what_ingest_may_lose_re_runs_ingest_alone(root, before):
 
 
 @pytest.mark.parametrize("scene", sorted(file.stem for file in (ROOT / plan.SCENES).glob("*.yaml")))
-def test_dvc_tracks_the_keys_that_a_stage_reads_and_no_other(root, scene):
-    template = read_yaml(root / "dvc.yaml")["stages"]
-    made = plan.make_plan({scene: plan.read_scene(root / plan.SCENES / f"{scene}.yaml", root / SHARED)}, CAPTURES)
-    for stage in READS:
+def test_dvc_tracks_the_keys_that_a_stage_is_given_and_no_other(root, scene):
+    own = read_scene(root / plan.SCENES / f"{scene}.yaml", root / SHARED)
+    made = plan.make_plan({scene: own}, CAPTURES, FLOW)
+    words, shared = read_yaml(root / plan.SCENES / f"{scene}.yaml"), read_yaml(root / SHARED)
+    for stage in READING:
         for key, item in made["stages"][stage].items():
-            listed = fill(template[stage]["do"]["params"], key, item)
-            own, shared, planned = keys_of(stage, item)
-            files = {f"{plan.SCENES}/{scene}.yaml": own, SHARED: shared, plan.PLAN: planned}
-            assert listed == {file: set(keys) for file, keys in files.items() if keys}, f"{stage}@{key}"
-
-
-def fill(params: list[Any], key: str, item: dict[str, Any]) -> dict[str, set[str]]:
-    """Put the words of an item into a stage's parameters, as DVC does."""
-
-    def put(text: str) -> str:
-        def value(match: re.Match[str]) -> str:
-            name, i = re.fullmatch(r"(\w+)(?:\[(\d)\])?", match[1]).groups()
-            return item[name] if i is None else item[name][int(i)]
-
-        return re.sub(r"\$\{item\.([^}]+)\}", value, text.replace("${key}", key))
-
-    return {put(file): {put(one) for one in keys} for entry in params for file, keys in entry.items()}
+            for kind, source in (("scene", words), ("shared", shared), ("plan", made)):
+                for template in declared(FLOW, stage)[kind]:
+                    name = config.fill(template, key, item)
+                    optional = name in ("split.pool_passes_n",)
+                    assert optional or config.find(source, name) is not config.NOTHING, f"{stage}@{key}: {name}"
 
 
 YAML_OF_DVC = [ROOT / "dvc.yaml", ROOT / SHARED, ROOT / plan.PLAN, *sorted((ROOT / plan.SCENES).glob("*.yaml"))]
@@ -268,7 +268,7 @@ def test_a_row_that_the_plan_does_not_know_is_refused_with_both_remedies(root):
             ParamsError, match=r"train_multi.recipe must be paper, as planned; got slow. Try: reskin"
         ) as e:
             read_settings("train_multi", "ci", files_of(root))
-        assert "plan.yaml:stages.train_multi.ci.recipe=slow" in str(e.value)
+        assert "plan.yaml:stages.train_multi.ci.train_multi.recipe=slow" in str(e.value)
         read_settings("train_single", "ci", files_of(root))  # which does not read that section
     finally:
         (root / SCENE).write_bytes(written)
@@ -278,8 +278,11 @@ def test_a_row_that_is_planned_along_by_a_second_override_is_taken(root):
     files = {file: (root / file).read_bytes() for file in (SCENE, plan.PLAN)}
     try:
         override(root / SCENE, "train_multi.recipe=slow")
-        override(root / plan.PLAN, "stages.train_multi.ci.recipe=slow")
-        assert read_settings("train_multi", "ci", files_of(root)).train_multi.recipes["paper"].rate_max == 0.003
+        override(root / plan.PLAN, "stages.train_multi.ci.train_multi.recipe=slow")
+        assert (
+            training(read_settings("train_multi", "ci", files_of(root)), "train_multi").recipes["paper"].rate_max
+            == 0.003
+        )
         assert "recipes.slow" in tracked(root, stages_of(root))["train_multi@ci"][SHARED]
     finally:
         for file, content in files.items():
@@ -289,18 +292,18 @@ def test_a_row_that_is_planned_along_by_a_second_override_is_taken(root):
 def test_a_stage_that_reads_a_key_which_it_does_not_declare_is_told_so(root):
     asked = read_settings("train_single", "ci", files_of(root))
     with pytest.raises(ParamsError, match="train_multi must be given, and declared by its stage; got nothing"):
-        _ = asked.train_multi
+        training(asked, "train_multi")
     with pytest.raises(ParamsError, match="params.yaml: recipes.triplet must be given"):
-        asked.named("recipes", "triplet")
+        asked.row("recipes", "triplet")
 
 
 def test_a_mistake_elsewhere_in_a_scene_does_not_stop_a_stage_but_its_own_does(root):
     written = (root / SCENE).read_bytes()
     try:
         override(root / SCENE, "shear.repeats_n=0")
-        read_settings("train_multi", "ci", files_of(root))
+        training(read_settings("train_multi", "ci", files_of(root)), "train_multi")
         with pytest.raises(ParamsError, match="shear: repeats_n must be greater than or equal to 1; got 0"):
-            read_settings("shear", "ci", files_of(root))
+            module_of("shear").read(read_settings("shear", "ci", files_of(root)))
         with pytest.raises(ParamsError, match="shear: repeats_n must be"):
             plan.check(root)
     finally:
@@ -311,7 +314,7 @@ def test_the_control_of_an_adaptation_follows_it(root):
     written = (root / SHARED).read_bytes()
     try:
         override(root / SHARED, "adaptations.paper.rate_max=0.5")
-        adapt = read_settings("adapt", "ci", files_of(root)).adapt
+        adapt = adaptations(read_settings("adapt", "ci", files_of(root)))
     finally:
         (root / SHARED).write_bytes(written)
     assert {name: one.rate_max for name, one in adapt.recipes.items()} == {"paper": 0.5, "control": 0.5}

@@ -9,8 +9,8 @@ import mlflow
 import numpy as np
 import pytest
 
-from pipeline import io
-from pipeline.server import TrackingAway, probe
+from pipeline.core import io
+from pipeline.core.server import TrackingAway, probe
 from pipeline.tracking import publish
 
 

@@ -12,7 +12,7 @@ import pyarrow as pa
 from jaxtyping import Bool, Float64, Int64
 
 from pipeline.capture import columns
-from pipeline.errors import CaptureError, complain
+from pipeline.core.errors import CaptureError, complain
 
 FIRST_ROW = 2  # row 1 of the file is the header
 TYPES = {"byte_end": pa.int64(), "t_s": pa.float64()}

@@ -9,7 +9,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.csv as pacsv
 
-from pipeline.errors import CaptureError, complain
+from pipeline.core.errors import CaptureError, complain
 
 
 def parse(source: str | Path, types: Mapping[str, pa.DataType], where: str) -> pa.Table:

@@ -7,8 +7,8 @@ import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
-from pipeline import io
 from pipeline.capture.header import HEADER_FILE, Header, render
+from pipeline.core import io
 
 
 def write_capture(folder: Path, header: Header, contents: Mapping[str, bytes | Path]) -> Header:

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from pipeline.errors import CaptureError, complain
+from pipeline.core.errors import CaptureError, complain
 
 RATE_MAX_HZ = 1e5
 HEADER_FILE = "header.json"

@@ -22,7 +22,7 @@ from serial.tools import list_ports
 from pipeline.capture.header import ARRIVALS_FILE, STREAM_FILE, Wire
 from pipeline.capture.stream import FrameStream, no_frame
 from pipeline.capture.wire import TEXT_WIRES
-from pipeline.errors import CaptureError, complain
+from pipeline.core.errors import CaptureError, complain
 
 READ_TIMEOUT_s = 0.1  # how late a stop, a silence or the end of the duration may be noticed
 HEAD_BYTES_N = 16384  # the first bytes are kept to say what fits, should no frame come

@@ -13,7 +13,7 @@ import pyarrow.compute as pc
 from jaxtyping import Bool, Float32, Float64, Int32
 
 from pipeline.capture import columns
-from pipeline.errors import CaptureError, complain
+from pipeline.core.errors import CaptureError, complain
 
 NOLOAD, CONTACT = "noload", "contact"
 FIRST_ROW = 2  # row 1 of the file is the header

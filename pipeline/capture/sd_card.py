@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Float32, Float64
 
 from pipeline.capture import columns, faults
 from pipeline.capture.readers.chips import GRID_ROWS_N
-from pipeline.errors import CaptureError, complain
+from pipeline.core.errors import CaptureError, complain
 
 TIME = "t_s"
 CHIP_COLUMNS = ("T", "Bx", "By", "Bz")

@@ -16,7 +16,7 @@ from pipeline.capture import bursts
 from pipeline.capture import wire as wires
 from pipeline.capture.header import Wire
 from pipeline.capture.wire import LF, Frames
-from pipeline.errors import CaptureError, complain
+from pipeline.core.errors import CaptureError, complain
 
 BLOCK_LINES_N = 8192
 CHIPS_MAX_N = 64  # as in the header

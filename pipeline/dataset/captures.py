@@ -7,12 +7,12 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from pipeline import io
 from pipeline.capture.header import HEADER_FILE, Header, check_same_capture, parse
 from pipeline.capture.readers import READERS
+from pipeline.core import io
+from pipeline.core.errors import CaptureError, complain
+from pipeline.core.schema import Readings
 from pipeline.dataset.native import read_native
-from pipeline.errors import CaptureError, complain
-from pipeline.schema import Readings
 
 # What lies between dwells is no loss.
 LOST_FRAMES = (

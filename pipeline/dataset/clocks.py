@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float32, Float64, Int8
 from scipy.signal import correlate
 
 from pipeline.capture.probe import ProbeLog
-from pipeline.errors import CaptureError, complain
+from pipeline.core.errors import CaptureError, complain
 
 RATE_LIMIT = 0.1  # a nominal rate may be some per cent off; more is a mark in milliseconds, or of another event
 STEPS_PER_DWELL_N = 16

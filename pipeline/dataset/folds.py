@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int64
 
-from pipeline import io
+from pipeline.core import io
+from pipeline.core.errors import SchemaError, complain
 from pipeline.dataset.rows import Rows, Selection, gather
 from pipeline.dataset.splits import Fold
-from pipeline.errors import SchemaError, complain
 
 
 def load_rows(files: Sequence[Path], selection: Selection) -> Rows:

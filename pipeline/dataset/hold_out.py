@@ -7,11 +7,18 @@ import numpy as np
 from jaxtyping import Int64
 from pydantic import Field, field_validator
 
-from pipeline.strict import Strict
+from pipeline.core.config import Strict
 
 Question = Literal[
     "lobo", "sensors", "labels", "transfer", "single_random", "single_indentation", "single_pass", "single_temporal"
 ]
+ONE_SKIN = {
+    "transfer",
+    "single_random",
+    "single_indentation",
+    "single_pass",
+    "single_temporal",
+}  # of those: trained on one
 Count = Annotated[int, Field(ge=1)]
 
 

@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float32, Float64, Int32, Int64
 from pipeline.capture.header import Header
 from pipeline.capture.probe import LABELS, ProbeLog
 from pipeline.capture.wire import Frames
+from pipeline.core.schema import Readings
 from pipeline.dataset.clocks import ClockMap
-from pipeline.schema import Readings
 
 COUNTS = (
     "frames_n",

@@ -10,8 +10,8 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float32, Int32, Int64
 
+from pipeline.core.errors import ParamsError, complain
 from pipeline.dataset.rows import TARGETS, Rows
-from pipeline.errors import ParamsError, complain
 
 PLACE_STEP_MM = 0.1  # assumed: places nearer than this are one, however a recording wrote them
 PLACES_MIN_N = 2  # one place orders nothing

@@ -16,10 +16,10 @@ from pipeline.capture.probe import ProbeLog
 from pipeline.capture.readers.watch import Watch, check_log
 from pipeline.capture.stream import FrameStream, no_frame
 from pipeline.capture.wire import Frames
+from pipeline.core.errors import CaptureError, complain
+from pipeline.core.schema import Readings
 from pipeline.dataset.clocks import ClockMap, from_contacts, from_marks
 from pipeline.dataset.indentations import TimedFrames, join
-from pipeline.errors import CaptureError, complain
-from pipeline.schema import Readings
 
 BLOCK_BYTES_N = 2**22
 

@@ -9,9 +9,9 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from jaxtyping import Int64
 
+from pipeline.core.schema import Readings
 from pipeline.dataset.rows import Rows, Selection, gather
 from pipeline.dataset.windows import Windows, take
-from pipeline.schema import Readings
 
 Policy = Callable[[np.ndarray, np.ndarray], np.ndarray]  # no-load fields and indentations of the rows -> no-load fields
 TRAIN = -1

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
+from pipeline.core.config import Strict
+from pipeline.core.errors import ParamsError, complain
+from pipeline.core.schema import Readings
 from pipeline.dataset.baseline import subtract
-from pipeline.errors import ParamsError, complain
-from pipeline.schema import Readings
-from pipeline.strict import Strict
 
 TARGETS = ("x_mm", "y_mm", "Fz_N")
 SHEAR_TARGETS = ("x_mm", "y_mm", "Fx_N", "Fy_N", "Fz_N")  # of dragged lines (paper section 4)

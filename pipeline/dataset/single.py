@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Int64, Shaped
 from sklearn.model_selection import GroupShuffleSplit, train_test_split
 
+from pipeline.core.errors import ParamsError, complain
+from pipeline.core.seeds import seed_for
 from pipeline.dataset.hold_out import NO_POOL, Fold, Split
 from pipeline.dataset.rows import Rows
-from pipeline.errors import ParamsError, complain
-from pipeline.seeds import seed_for
 
 STATES_N = 2**32  # scikit-learn's seeds are below it
 

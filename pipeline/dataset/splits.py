@@ -9,14 +9,14 @@ from collections.abc import Callable, Iterable
 import numpy as np
 from sklearn.model_selection import LeaveOneGroupOut
 
-from pipeline.dataset.hold_out import NO_POOL, Fold, Question, Split
+from pipeline.core.errors import ParamsError, complain
+from pipeline.core.seeds import rng_for
+from pipeline.dataset.hold_out import NO_POOL, ONE_SKIN, Fold, Question, Split
 from pipeline.dataset.lines import take_pokes
 from pipeline.dataset.rows import Rows
 from pipeline.dataset.single import last_passes, random_indentations, random_passes, random_readings
-from pipeline.errors import ParamsError, complain
-from pipeline.seeds import rng_for
 
-__all__ = ["NO_POOL", "Fold", "Question", "Split", "draw_folds", "hold_out_skins"]
+__all__ = ["NO_POOL", "ONE_SKIN", "Fold", "Question", "Split", "draw_folds", "hold_out_skins"]
 
 
 def draw_folds(rows: Rows, questions: Iterable[str], split: Split, seed: int) -> list[Fold]:

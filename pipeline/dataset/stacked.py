@@ -8,11 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from pipeline.core.errors import ParamsError, complain
+from pipeline.core.schema import Readings
 from pipeline.dataset.baseline import subtract
 from pipeline.dataset.lines import Lines, hand_lines
 from pipeline.dataset.rows import TARGETS, Rows
-from pipeline.errors import ParamsError, complain
-from pipeline.schema import Readings
 
 COLUMNS = ("capture", "board", "skin", "db_uT", "target", "pass_i")  # columns that are stacked as they are
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool
 
-from pipeline.errors import ParamsError, complain
-from pipeline.schema import LABELS, Readings
+from pipeline.core.errors import ParamsError, complain
+from pipeline.core.schema import LABELS, Readings
 
 
 @dataclass(frozen=True)

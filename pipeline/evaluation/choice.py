@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError, complain
 from pipeline.evaluation.summary import over_folds, pool_skins
 
 BY = "mse_xy_mm2"

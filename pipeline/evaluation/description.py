@@ -10,8 +10,8 @@ import pandas as pd
 from jaxtyping import Bool, Float
 
 from pipeline.capture.faults import find_lsb
+from pipeline.core.schema import AXES_PER_CHIP_N, Readings
 from pipeline.dataset.baseline import subtract
-from pipeline.schema import AXES_PER_CHIP_N, Readings
 
 FORCES_N = (0.5, 1.0, 2.0, 3.0)  # at which changes of field are compared
 NEAR = 0.2  # of the force

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import t
 
-from pipeline.errors import SchemaError, complain
+from pipeline.core.errors import SchemaError, complain
 
 CONFIDENCE = 0.95  # convention
 YES, NO, INCONCLUSIVE = "yes", "no", "inconclusive"

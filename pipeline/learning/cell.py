@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Int64, Shaped
 
-from pipeline import seeds
+from pipeline.core import seeds
+from pipeline.core.numerics import signature
 from pipeline.dataset import lines as lines_module
 from pipeline.dataset.lines import Lines
 from pipeline.learning.architecture import LAYERS, Weights, draw_weights
@@ -27,7 +28,6 @@ from pipeline.learning.job import Job, Labelled, Terms, Unlabelled
 from pipeline.learning.recipe import AugmentedRecipe, FineTuning, Labelling, Recipe, Schedule
 from pipeline.learning.standardise import FIT, Scaler
 from pipeline.learning.triplets import make_points
-from pipeline.numerics import signature
 
 COLLAPSED = 0.05  # of a target's variance over a network's own training rows; sound ones explain more than 0.9
 # The modules whose code decides what a training results in; recipes decide by their values.

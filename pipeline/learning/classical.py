@@ -17,9 +17,9 @@ from sklearn.neighbors import KNeighborsRegressor
 from sklearn.preprocessing import PolynomialFeatures
 from threadpoolctl import ThreadpoolController  # type: ignore[import-untyped]
 
-from pipeline.errors import TrainingError, complain
+from pipeline.core.config import Strict
+from pipeline.core.errors import TrainingError, complain
 from pipeline.learning.standardise import SCALE_FLOOR, Scaler, fit_standard
-from pipeline.strict import Strict
 
 THREADS = ThreadpoolController()  # of the libraries above: finding them takes 3 ms, limiting them 15 us
 BLOCK_ROWS_N = 4096  # handled at once, to bound memory: a kernel of them and 6000 rows is 200 MB

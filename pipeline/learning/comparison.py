@@ -1,13 +1,12 @@
 """Settings of what stands beside the paper's networks: classical methods, and a few labels of a new skin. No data."""
 
-from collections.abc import Callable
-from typing import Annotated, Any
+from typing import Annotated
 
 from pydantic import Field, model_validator
 
+from pipeline.core.config import Settings, Strict, parse
 from pipeline.learning.classical import Classical
-from pipeline.learning.recipe import AugmentedRecipe, FineTuning, Labelling, Name, Recipe, Steps, Variants, Words
-from pipeline.strict import Strict, parse
+from pipeline.learning.recipe import AugmentedRecipe, FineTuning, Labelling, Name, Recipe, Steps, Variants
 
 
 class Baselines(Strict):
@@ -73,21 +72,20 @@ class FewLabelsRow(Strict):
     methods: Name
 
 
-Named = Callable[[str, str], Any]  # section and name -> a row of params.yaml
-
-
-def resolve_baselines(words: Words, named: Named, where: str) -> Baselines:
-    """Put the section and the set that it names together."""
+def baselines(settings: Settings) -> Baselines:
+    """Read section train_classical, with the set of methods that it names."""
+    words, where = settings.words("train_classical"), f"{settings.where}: train_classical"
     row = parse(BaselinesRow, words, where)
-    return parse(Baselines, dict(words) | {"methods": named("methods", row.methods)}, where)
+    return parse(Baselines, dict(words) | {"methods": settings.row("methods", row.methods)}, where)
 
 
-def resolve_few_labels(words: Words, named: Named, where: str) -> FewLabels:
-    """Put the section and the rows that it names together."""
+def few_labels(settings: Settings) -> FewLabels:
+    """Read section few_labels, with the rows that it names."""
+    words, where = settings.words("few_labels"), f"{settings.where}: few_labels"
     row = parse(FewLabelsRow, words, where)
-    base = named("recipes", row.recipe) | {"steps_n": row.steps_n}
-    own = {name: words[name] for name in ("labels_n", "adapted", "rows_max_n")}
-    own["recipes"] = {name: base | changes for name, changes in row.recipes.items()}
-    own["adapting"] = named("adaptations", row.adapting.adaptation) | {"steps_n": row.adapting.steps_n}
-    own["labelling"] = named("labellings", row.labelling.labelling) | {"steps_n": row.labelling.steps_n}
-    return parse(FewLabels, own | {"methods": named("methods", row.methods)}, where)
+    base = settings.row("recipes", row.recipe) | {"steps_n": row.steps_n}
+    full = {name: words[name] for name in ("labels_n", "adapted", "rows_max_n")}
+    full["recipes"] = {name: base | changes for name, changes in row.recipes.items()}
+    full["adapting"] = settings.row("adaptations", row.adapting.adaptation) | {"steps_n": row.adapting.steps_n}
+    full["labelling"] = settings.row("labellings", row.labelling.labelling) | {"steps_n": row.labelling.steps_n}
+    return parse(FewLabels, full | {"methods": settings.row("methods", row.methods)}, where)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from typing import Any
 
-from pipeline.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError, complain
 
 VARIABLE = "RESKIN_EXECUTOR"
 DEFAULT = "processes:2"

@@ -9,14 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Int64
 
+from pipeline.core.errors import ParamsError, complain
+from pipeline.core.seeds import rng_for
 from pipeline.dataset.lines import grid_lines
 from pipeline.dataset.rows import Rows
 from pipeline.dataset.splits import Fold
-from pipeline.errors import ParamsError, complain
 from pipeline.learning.baselines import Task
 from pipeline.learning.cell import Adapting, Cell, FewLabels, Start, Trained
 from pipeline.learning.comparison import FewLabels as Settings
-from pipeline.seeds import rng_for
 
 QUESTION = "labels"
 

@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline import io
-from pipeline.errors import TrainingError, complain
+from pipeline.core import io
+from pipeline.core.errors import TrainingError, complain
 from pipeline.learning.cell import Cell, Keys, Measured, Trained
 from pipeline.learning.executors import device
 from pipeline.learning.stack import train_stack

@@ -4,13 +4,12 @@ A section of a scene names a shared row, says how many steps, and what its varia
 `Adaptations` are what follows: whole recipes by name.
 """
 
-from collections.abc import Mapping
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field, model_validator
 
-from pipeline.errors import ParamsError, complain
-from pipeline.strict import Strict
+from pipeline.core.config import Settings, Strict, Words, parse, parse_parts
+from pipeline.core.errors import ParamsError, complain
 
 HEADLINE = "paper"  # the recipe whose numbers stand beside the paper's; others are variants
 
@@ -126,7 +125,6 @@ def _headed(section: Headed) -> Headed:
     return section
 
 
-Words = Mapping[str, Any]
 Steps = Annotated[int, Field(ge=1)]
 Variants = dict[Name, dict[str, Any]]  # what each does differently from the row that its section names
 
@@ -150,20 +148,49 @@ class AdaptationsRow(Strict):
     variants: Variants
 
 
-def resolve_training(words: Words, recipes: Words, where: str) -> dict[str, Any]:
-    """Write every recipe of a section in full: the headline as it is shared, variants with their differences."""
-    rows = _in_full(words, recipes[words["recipe"]], {}, where)
+Model = TypeVar("Model", bound=Strict)
+
+
+def training(settings: Settings, section: str) -> Training:
+    """Read a section that trains, every recipe in full; of what the stage does not declare, nothing is there."""
+    words, where = settings.words(section), f"{settings.where}: {section}"
+    parse_parts(TrainingRow, words, where)
+    return parse_parts(Training, _recipes(settings, words, where), where)
+
+
+def with_training(settings: Settings, model: type[Model], section: str) -> Model:
+    """Read a section that holds a `training`, every recipe in full."""
+    words, where = dict(settings.words(section)), f"{settings.where}: {section}"
+    own = words.get("training", {})
+    parse(TrainingRow, own, f"{where}.training")
+    return parse(model, words | {"training": _recipes(settings, own, f"{where}.training")}, where)
+
+
+def adaptations(settings: Settings) -> Adaptations:
+    """Read section adapt, every adaptation in full: the control follows what it controls.
+
+    Every base is a recipe of train_triplet.
+    """
+    words, where = settings.words("adapt"), f"{settings.where}: adapt"
+    parse_parts(AdaptationsRow, words, where)
+    shared = {**settings.row("adaptations", words["adaptation"]), "base": words["base"]}
+    rows = {"recipes": _in_full(words, shared, where)} | {name: words[name] for name in ("pokes_n",) if name in words}
+    section = parse_parts(Adaptations, rows, where)
+    known = sorted(training(settings, "train_triplet").recipes)
+    for name, row in section.recipes.items():
+        if row.base not in known:
+            raise ParamsError(complain(where, f"base of {name}", f"one of {known}", repr(row.base), "Mend it there."))
+    return section
+
+
+def _recipes(settings: Settings, words: Words, where: str) -> dict[str, Any]:
+    rows = _in_full(words, settings.row("recipes", words["recipe"]), where)
     return {"recipes": rows} | {name: words[name] for name in ("seeds_n",) if name in words}
 
 
-def resolve_adaptations(words: Words, adaptations: Words, where: str) -> dict[str, Any]:
-    """Write every adaptation of section adapt in full; the control follows what it controls."""
-    rows = _in_full(words, adaptations[words["adaptation"]], {"base": words["base"]}, where)
-    return {"recipes": rows} | {name: words[name] for name in ("pokes_n",) if name in words}
-
-
-def _in_full(words: Words, shared: Words, own: Words, where: str) -> dict[str, dict[str, Any]]:
-    headline = dict(shared) | dict(own) | {"steps_n": words["steps_n"]}
+def _in_full(words: Words, shared: Words, where: str) -> dict[str, dict[str, Any]]:
+    """Write every row of a section in full: the headline as it is shared, variants with their differences."""
+    headline = dict(shared) | {"steps_n": words["steps_n"]}
     variants = words.get("variants", {})
     if HEADLINE in variants:
         rule = "unlike the headline, which is the shared row as it is"

@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 
-from pipeline.errors import TrainingError, complain
+from pipeline.core.errors import TrainingError, complain
 from pipeline.learning.cell import Cell, Measured, Trained, make_job
 from pipeline.learning.executors import device
 from pipeline.learning.inputs import VIEW

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int64, Shaped
 
-from pipeline.errors import TrainingError, complain
+from pipeline.core.errors import TrainingError, complain
 
 ROUNDS_MAX_N = 100  # with half of the draws tied, 1e-30 of the anchors are left after so many
 TIED = 1e-5  # of the sum of both squared distances; places are float32 numbers, equal distances differ by 1e-6

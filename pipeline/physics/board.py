@@ -13,9 +13,9 @@ from pydantic import Field, model_validator
 from scipy.constants import micro, milli
 from scipy.spatial.transform import Rotation
 
-from pipeline.errors import ParamsError, complain
-from pipeline.seeds import rng_for
-from pipeline.strict import Strict
+from pipeline.core.config import Strict
+from pipeline.core.errors import ParamsError, complain
+from pipeline.core.seeds import rng_for
 
 CHIPS_MAX_N = 64
 Share = Annotated[float, Field(ge=0, le=0.5)]

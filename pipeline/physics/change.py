@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from numba import njit
 
-from pipeline.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError, complain
 from pipeline.physics.dipole import MU0_4PI
 
 

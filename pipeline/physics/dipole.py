@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.constants import mu_0
 
-from pipeline.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError, complain
 
 MU0_4PI = mu_0 / (4 * np.pi)  # CODATA, T m / A; not exactly 1e-7 since 2019
 

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError, complain
 from pipeline.physics import layer
 
 STEP = 0.025  # of `depth_unit`: 0.05 mm in a skin of 2 mm; half of it changes dB by 0.3 % (slipping), 0.6 % (bonded)

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from numba import njit
 from scipy.interpolate import CubicSpline
 
-from pipeline.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError, complain
 from pipeline.physics import layer
 from pipeline.physics.flow import LADDER, Material, Press, angle, depth_unit, sink, with_marks, without_marks
 

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from pydantic import Field
 
-from pipeline.errors import ParamsError, complain
-from pipeline.strict import Strict
+from pipeline.core.config import Strict
+from pipeline.core.errors import ParamsError, complain
 
 
 class Friction(Strict):

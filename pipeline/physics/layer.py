@@ -14,7 +14,7 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
 from scipy.special import j0, j1
 
-from pipeline.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError, complain
 from pipeline.physics import slip
 
 Base = Literal["bonded", "slipping"]

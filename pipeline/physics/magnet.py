@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.constants import mu_0
 
-from pipeline.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError, complain
 
 CUBE_SIDE_M = 6.35e-3  # 0.25 in cubes
 CUBES_N = (4, 4)  # along x and along y, under the authors' skin of 20 x 20 mm

@@ -14,9 +14,9 @@ from jaxtyping import Float
 from pydantic import Field
 from scipy.constants import milli
 
-from pipeline.errors import ParamsError, complain
+from pipeline.core.config import Strict
+from pipeline.core.errors import ParamsError, complain
 from pipeline.physics.magnet import seams_m
-from pipeline.strict import Strict
 
 SKIN_SIDE_M = 20e-3  # authors' CAD
 SKIN_SIDES_M = (SKIN_SIDE_M, SKIN_SIDE_M)

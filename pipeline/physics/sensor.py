@@ -12,8 +12,8 @@ from jaxtyping import Float, Float32
 from pydantic import Field
 from scipy.constants import micro
 
+from pipeline.core.config import Strict
 from pipeline.physics.board import Board
-from pipeline.strict import Strict
 
 GAINS = (5.0, 4.0, 3.0, 2.5, 2.0, 5 / 3, 4 / 3, 1.0)  # by GAIN_SEL (data sheet, table 17)
 STEP_AT_GAIN_ONE_uT = (0.150, 0.150, 0.242)  # RES 0; x, y, z

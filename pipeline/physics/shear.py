@@ -14,7 +14,7 @@ from jaxtyping import Float
 from numba import njit
 from scipy.special import j0, j1
 
-from pipeline.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError, complain
 from pipeline.physics import layer
 
 REACH = 5.0  # in thicknesses, past the contact, as in `flow`: what lies beyond does not move

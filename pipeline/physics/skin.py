@@ -13,13 +13,13 @@ from jaxtyping import Float
 from pydantic import Field
 from scipy.constants import kilo, milli
 
-from pipeline.errors import ParamsError, complain
+from pipeline.core.config import Strict
+from pipeline.core.errors import ParamsError, complain
+from pipeline.core.seeds import rng_for
 from pipeline.physics import dipole, flow_map, layer, magnet
 from pipeline.physics.board import Board, Spreads
 from pipeline.physics.change import change_of_field
 from pipeline.physics.nodes import CHOSEN, SKIN_SIDES_M, Quadrature, place_nodes
-from pipeline.seeds import rng_for
-from pipeline.strict import Strict
 
 Dipoles = tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]  # positions in m, moments in A m^2
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import Field
 
-from pipeline.strict import Strict
+from pipeline.core.config import Strict
 
 ROOM_DEGC = 25.0
 REMANENCE_PER_K = -0.12e-2  # NdFeB powder: Br falls by 0.12 % for each kelvin (PHYSICS 5)

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from pydantic import Field
 
-from pipeline.errors import ParamsError, complain
-from pipeline.strict import Strict
+from pipeline.core.config import Strict
+from pipeline.core.errors import ParamsError, complain
 
 SETTLING_CONTACTS = 300  # the first softening is over after a few times as many
 AGEING_CONTACTS = 1e3

@@ -12,7 +12,8 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.errors import SchemaError, complain
+from pipeline.core.config import parse, read_yaml
+from pipeline.core.errors import SchemaError, complain
 from pipeline.evaluation.inference import VERDICTS
 from pipeline.reporting import paper
 from pipeline.reporting.judging import (
@@ -27,7 +28,6 @@ from pipeline.reporting.judging import (
 )  # fmt: skip
 from pipeline.reporting.order import FEW_POINTS, is_pooled
 from pipeline.reporting.shown import show, show_difference
-from pipeline.strict import parse, read_yaml
 
 FILE = Path(__file__).with_name("checklist.yaml")
 UNITS = {"pct": "%", "mm2": "mm²", "N2": "N²", "mm": "mm", "N": "N", "hz": "Hz"}

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from pipeline.core.config import Strict
 from pipeline.evaluation.inference import (
     INCONCLUSIVE,
     NO,
@@ -19,7 +20,6 @@ from pipeline.evaluation.inference import (
     verdict_within,
 )  # fmt: skip
 from pipeline.reporting.order import FEW_POINTS, gain
-from pipeline.strict import Strict
 
 NEAR = 0.10  # assumed: how far ours may be where the paper gives no sd
 PLATEAU_POINTS = 1.0  # assumed: "seems to plateau"

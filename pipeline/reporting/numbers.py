@@ -12,7 +12,7 @@ from pipeline.evaluation.comparison import over_boards, over_pairs
 from pipeline.evaluation.metrics import summarise
 from pipeline.evaluation.summary import over_folds
 from pipeline.evaluation.tally import tally
-from pipeline.questions import EXPERIMENTS
+from pipeline.questions import QUESTIONS
 from pipeline.reporting.learned import by_fold, learned
 
 SINGLE = ("single_random", "single_temporal")  # the first of these stands beside the paper's numbers
@@ -113,7 +113,7 @@ def lost_by_protocol(losses: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[
     """Add the counts of each further protocol's captures, and what questions of it left out of their rows."""
     found: dict[str, dict[str, Any]] = {}
     for question, own in losses.items():
-        protocol = EXPERIMENTS[question]
+        protocol = QUESTIONS[question].protocol
         if protocol is None or not own["accounts"]:
             continue
         left_out = found.get(protocol, {"left_out": {}})["left_out"]

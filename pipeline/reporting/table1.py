@@ -10,9 +10,9 @@ from typing import Annotated, Any
 import pandas as pd
 from pydantic import Field, model_validator
 
-from pipeline.errors import ParamsError, complain
+from pipeline.core.config import Strict, parse, read_yaml
+from pipeline.core.errors import ParamsError, complain
 from pipeline.reporting.shown import show
-from pipeline.strict import Strict, parse, read_yaml
 
 PRINTED = Path(__file__).with_name("table1.yaml")
 LOCALISATION = "Localisation (within 1 mm, new skin)"  # our row: the paper's table has none

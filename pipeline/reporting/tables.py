@@ -8,13 +8,13 @@ from typing import Any
 
 import pandas as pd
 
+from pipeline.experiments.left_out.show import left_out_table
 from pipeline.reporting.checklist import checklist
 from pipeline.reporting.checks import stability_table, verification_table
-from pipeline.reporting.experiments.parts import experiment_tables
 from pipeline.reporting.learning import learning_tables
-from pipeline.reporting.left_out import left_out_table
 from pipeline.reporting.order import models
 from pipeline.reporting.paper import SINGLE_SENSOR, Number
+from pipeline.reporting.parts import experiment_tables
 from pipeline.reporting.shown import COLUMNS, INTERVAL, scores, show_both, tabulate, to_markdown
 from pipeline.reporting.skins import skins_table
 from pipeline.reporting.table1 import measured, read_table1, table1

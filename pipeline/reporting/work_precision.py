@@ -12,7 +12,7 @@ from typing import Any
 import matplotlib as mpl
 import pandas as pd
 
-from pipeline.evaluation.work_precision.rows import CANDIDATES, ERROR_MAX, REFERENCE, Choice, Key, Precision, Seconds
+from pipeline.experiments.runtime.rows import CANDIDATES, ERROR_MAX, REFERENCE, Choice, Key, Precision, Seconds
 from pipeline.reporting.figures import STYLE, svg
 from pipeline.reporting.shown import tabulate, to_markdown
 

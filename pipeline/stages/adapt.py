@@ -2,27 +2,34 @@
 
 from pathlib import Path
 
-from pipeline.settings import Files, read_settings
-from pipeline.stages._adapt import adaptations, read_starts
-from pipeline.stages._models import write_models
-from pipeline.stages._run import run
-from pipeline.stages._train import read_scenery, train_all
+from pipeline.core.config import Files, Settings, read_settings
+from pipeline.core.stage import run
+from pipeline.learning.recipe import Adaptations
+from pipeline.learning.recipe import adaptations as adaptations_of
+from pipeline.trials.adapting import adaptations, read_starts
+from pipeline.trials.data import read_data, train_all
+from pipeline.trials.models import write_models
+
+
+def read(settings: Settings) -> Adaptations:
+    """Read section adapt."""
+    return adaptations_of(settings)
 
 
 def adapt(scene: str, files: Files, indentations: Path, folds: Path, started: Path, models: Path) -> None:
     """Fine-tune by every recipe of section adapt."""
-    at, starts = (
-        read_scenery(read_settings("adapt", scene, files), indentations, folds),
+    data, starts = (
+        read_data(read_settings("adapt", scene, files), indentations, folds),
         read_starts(started),
     )
-    asked = at.asked.adapt
+    settings = read(data.settings)
     cells = [
         cell
-        for fold in at.of("lobo")
-        for named in asked.recipes.items()
-        for cell in adaptations(at, fold, named, starts, question="adapt", pokes_n=asked.pokes_n)
+        for fold in data.folds_of("lobo")
+        for named in settings.recipes.items()
+        for cell in adaptations(data, fold, named, starts, question="adapt", pokes_n=settings.pokes_n)
     ]
-    write_models(models, at, cells, train_all(at, cells, "adapt"), "adapt")
+    write_models(models, data, cells, train_all(data, cells, "adapt"), "adapt")
 
 
 if __name__ == "__main__":

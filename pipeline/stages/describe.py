@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-from pipeline import io
+from pipeline.core import io
+from pipeline.core.config import Files, read_settings
+from pipeline.core.stage import run, say
 from pipeline.evaluation.description import describe as describe_one
 from pipeline.evaluation.description import over_skins
-from pipeline.settings import Files, read_settings
-from pipeline.stages._run import run, say
 
 
 def describe(scene: str, files: Files, indentations: Path, description: Path) -> None:

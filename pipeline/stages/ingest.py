@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from pipeline import io
+from pipeline.core import io
+from pipeline.core.stage import run, say
 from pipeline.dataset.captures import check_losses, open_capture
-from pipeline.stages._run import run, say
 
 
 def ingest(scene: str, raw: Path, lost_fraction_max: float, indentations: Path) -> None:

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from pipeline import io
-from pipeline.stages._run import run
+from pipeline.core import io
+from pipeline.core.stage import run
 from pipeline.stages.ingest import ingest
 
 

@@ -2,21 +2,22 @@
 
 from pathlib import Path
 
-from pipeline import io
-from pipeline.asking import Asking, modelled, swept
-from pipeline.home import home, is_experiment
+from pipeline.core import io
+from pipeline.core.config import Files, read_settings
+from pipeline.core.home import home, is_experiment
+from pipeline.core.server import TrackingAway
+from pipeline.core.stage import run, say
+from pipeline.params import Asking
 from pipeline.reporting.learned import curves_of
-from pipeline.server import TrackingAway
-from pipeline.settings import Files, read_settings
-from pipeline.stages._run import run, say
+from pipeline.stages._report import asking
 from pipeline.tracking import Curves, metrics_of
 from pipeline.tracking import publish as write
 
 
 def publish(scene: str, files: Files, models: Path, answers: Path, reports: Path) -> None:
     """Write every training of a scene and its report to MLflow once; if the server is away, say so and go on."""
-    asked = read_settings("publish", scene, files).asking
-    arms = {arm: models / arm for arm in modelled(asked)}
+    asked = asking(read_settings("publish", scene, files))
+    arms = {arm: models / arm for arm in asked.modelled}
     name = (
         f"{scene} (dvc exp)" if is_experiment() else scene
     )  # beside the checkout's own results, and not in their place
@@ -28,7 +29,7 @@ def publish(scene: str, files: Files, models: Path, answers: Path, reports: Path
 
 def read_curves(asked: Asking, answers: Path) -> Curves:
     """Read the points of every sweep and the numbers of every experiment, as curves by stage."""
-    stages = swept(asked)
+    stages = asked.curves
     points = {question: io.read_json(answers / f"{stage}.json") for question, stage in stages.items()}
     curves: dict[str, list[tuple[str, int, dict[str, float]]]]
     curves = {stages[question]: rows for question, rows in curves_of(points).items()}

@@ -2,20 +2,19 @@
 
 from pathlib import Path
 
-from pipeline import io
-from pipeline.asking import modelled
+from pipeline.core import io
+from pipeline.core.config import Files, read_settings
+from pipeline.core.stage import run, say
 from pipeline.evaluation.choice import to_record
 from pipeline.learning.recipe import HEADLINE
-from pipeline.reporting.experiments.parts import experiment_figures
 from pipeline.reporting.figures import error_grids
 from pipeline.reporting.page import page
+from pipeline.reporting.parts import experiment_figures
 from pipeline.reporting.scores import headline_scores
 from pipeline.reporting.sweeps import learning_figures, learning_pages
 from pipeline.reporting.tables import make_tables, table_texts
 from pipeline.reporting.work_precision import pages
-from pipeline.settings import Files, read_settings
-from pipeline.stages._report import Places, read_cards, read_numbers
-from pipeline.stages._run import run, say
+from pipeline.stages._report import Places, asking, read_cards, read_numbers
 
 
 def report(
@@ -23,9 +22,8 @@ def report(
 ) -> None:
     """Write the numbers, tables, figures and the page of a scene."""
     known = read_settings("report", scene, files)
-    known.check_questions()
-    asked = known.asking
-    numbers, drawn = read_numbers(known, Places(indentations, folds, models, answers))
+    asked = asking(known)
+    numbers, drawn = read_numbers(known, asked, Places(indentations, folds, models, answers))
     if "choice" in asked.questions:
         record = to_record(numbers["chosen"], read_cards(asked, models), source=asked.source, seed=known.seed)
         io.write_json(reports / "choice.json", record)
@@ -33,7 +31,7 @@ def report(
     io.write_json(reports / "scores.json", headline_scores(numbers))
     tables = make_tables(numbers)
     io.write_texts(reports / "tables", table_texts(tables))
-    predictions = [io.read_table(models / arm / "predictions.parquet") for arm in modelled(asked)]
+    predictions = [io.read_table(models / arm / "predictions.parquet") for arm in asked.modelled]
     figures = dict(error_grids(predictions, HEADLINE, f"{scene} ({asked.source})"))
     figures |= dict(learning_figures(numbers, asked.source)) | experiment_figures(numbers, drawn, asked.source)
     io.write_texts(reports / "figures", figures)

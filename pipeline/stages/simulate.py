@@ -2,25 +2,25 @@
 
 from pathlib import Path
 
-from pipeline import io
 from pipeline.capture.folder import write_capture
-from pipeline.errors import ParamsError, complain
+from pipeline.core import io
+from pipeline.core.config import Files, read_settings
+from pipeline.core.errors import ParamsError, complain
+from pipeline.core.stage import run, say
 from pipeline.learning.executors import make_executor
-from pipeline.settings import Files, read_settings
-from pipeline.stages._run import run, say
-from pipeline.stages._simulated import synthesis_of
 from pipeline.synthesis.capture import Synthesis, record, roster
 from pipeline.synthesis.files import to_files
+from pipeline.synthesis.of_settings import synthesis_of
 
 
 def simulate(scene: str, files: Files, protocol: str, raw: Path) -> None:
     """Record every skin of one protocol of a simulated scene."""
-    asked = read_settings("simulate", raw.name, files)
-    synthesis, seed = synthesis_of(asked), asked.seed
+    settings = read_settings("simulate", raw.name, files)
+    synthesis, seed = synthesis_of(settings), settings.seed
     pairs, skins_n = roster(synthesis, protocol), synthesis.protocols[protocol].skins_n
     if len(pairs) < skins_n:
         rule = f"at most the {len(pairs)} that its boards have"
-        raise ParamsError(complain(asked.where, f"skins_n of protocol {protocol}", rule, skins_n, "Ask for fewer."))
+        raise ParamsError(complain(settings.where, f"skins_n of protocol {protocol}", rule, skins_n, "Ask for fewer."))
     with io.replacing(raw) as folder, make_executor() as executor:
         folder.mkdir()
         waiting = [executor.submit(_record, synthesis, protocol, pair, seed, folder) for pair in pairs]

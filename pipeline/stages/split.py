@@ -2,21 +2,25 @@
 
 from pathlib import Path
 
-from pipeline import io
-from pipeline.asking import folds_of
+from pipeline.core import io
+from pipeline.core.config import Files, Settings, parse_parts, read_settings
+from pipeline.core.stage import run, say
 from pipeline.dataset.folds import load_rows, render_folds
-from pipeline.dataset.splits import draw_folds
-from pipeline.settings import Files, read_settings
-from pipeline.stages._run import run, say
+from pipeline.dataset.rows import Selection
+from pipeline.dataset.splits import Split, draw_folds
+
+
+def read(settings: Settings) -> Split:
+    """Read section split."""
+    return parse_parts(Split, settings.words("split"), f"{settings.where}: split")
 
 
 def split(scene: str, files: Files, indentations: Path, folds: Path) -> None:
     """Draw the folds of every question that the scene asks."""
-    asked = read_settings("split", scene, files)
-    asked.check_questions()
-    captures = asked.captures_in(indentations)
-    rows = load_rows([indentations / f"{name}.parquet" for name in captures], asked.selection)
-    drawn = draw_folds(rows, folds_of(asked.questions), asked.split, asked.seed)
+    settings = read_settings("split", scene, files)
+    captures = settings.captures_in(indentations)
+    rows = load_rows([indentations / f"{name}.parquet" for name in captures], settings.section(Selection, "selection"))
+    drawn = draw_folds(rows, settings.plan("folds"), read(settings), settings.seed)
     io.write_json(folds, render_folds(captures, rows, drawn))
     say(f"{scene}: {len(rows)} rows of {len(captures)} captures, {len(drawn)} folds; left out: {rows.dropped}")
 

@@ -3,37 +3,43 @@
 from pathlib import Path
 from typing import Any
 
-from pipeline import io
-from pipeline.errors import ParamsError, complain
-from pipeline.learning.recipe import HEADLINE
-from pipeline.settings import Files, read_settings
-from pipeline.stages._adapt import adaptations, read_starts
-from pipeline.stages._models import note_seconds, point_of
-from pipeline.stages._run import run
-from pipeline.stages._train import read_scenery, train_all
+from pipeline.core import io
+from pipeline.core.config import Files, Settings, read_settings
+from pipeline.core.errors import ParamsError, complain
+from pipeline.core.stage import run
+from pipeline.learning.recipe import HEADLINE, PokesSweep
+from pipeline.learning.recipe import adaptations as adaptations_of
+from pipeline.trials.adapting import adaptations, read_starts
+from pipeline.trials.data import read_data, train_all
+from pipeline.trials.models import note_seconds, point_of
+
+
+def read(settings: Settings) -> PokesSweep:
+    """Read section sweep_pokes."""
+    return settings.section(PokesSweep, "sweep_pokes")
 
 
 def sweep_pokes(scene: str, files: Files, indentations: Path, folds: Path, started: Path, scores: Path) -> None:
     """Score every number of pokes; none at all is the network as it was trained."""
-    at, starts = (
-        read_scenery(read_settings("sweep_pokes", scene, files), indentations, folds),
+    data, starts = (
+        read_data(read_settings("sweep_pokes", scene, files), indentations, folds),
         read_starts(started),
     )
-    asked, own = at.asked.sweep_pokes, at.asked.adapt
-    named, held_out = (HEADLINE, own.recipes[HEADLINE]), at.of("lobo")[-asked.boards_n :]
+    asked, own = read(data.settings), adaptations_of(data.settings)
+    named, held_out = (HEADLINE, own.recipes[HEADLINE]), data.folds_of("lobo")[-asked.boards_n :]
     if asked.boards_n > len(held_out):
         rule = f"at most the {len(held_out)} boards of the scene"
-        raise ParamsError(complain(at.asked.where, "sweep_pokes.boards_n", rule, asked.boards_n, "Ask for fewer."))
+        raise ParamsError(complain(data.settings.where, "sweep_pokes.boards_n", rule, asked.boards_n, "Ask for fewer."))
     asked_of = [(fold, pokes_n) for fold in held_out for pokes_n in asked.pokes_n if pokes_n]
     pairs = [
         (cell, pokes_n)
         for fold, pokes_n in asked_of
-        for cell in adaptations(at, fold, named, starts, question="pokes", pokes_n=pokes_n)
+        for cell in adaptations(data, fold, named, starts, question="pokes", pokes_n=pokes_n)
     ]
     cells = [cell for cell, _ in pairs]
-    trained = train_all(at, cells, "sweep_pokes")
+    trained = train_all(data, cells, "sweep_pokes")
     points = [
-        point_of(at, cell, one, "adapted") | {"pokes_n": pokes_n}
+        point_of(data, cell, one, "adapted") | {"pokes_n": pokes_n}
         for (cell, pokes_n), one in zip(pairs, trained, strict=True)
     ]
     points += [point | {"pokes_n": 0} for point in _unadapted(started, named[1].base, {fold.name for fold in held_out})]

@@ -4,30 +4,35 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline import io
+from pipeline.core import io
+from pipeline.core.config import Files, Settings, read_settings
+from pipeline.core.provenance import SECONDS
+from pipeline.core.stage import run, say
 from pipeline.evaluation.summary import score_groups
 from pipeline.learning.baselines import Task, run_tasks
 from pipeline.learning.cell import Measured
-from pipeline.learning.comparison import resolve_baselines
+from pipeline.learning.comparison import Baselines, baselines
 from pipeline.learning.executors import make_executor
-from pipeline.provenance import SECONDS
-from pipeline.settings import Files, read_settings
-from pipeline.stages._run import run, say
-from pipeline.stages._train import read_scenery
+from pipeline.trials.data import read_data
 
 NO_ROWS = np.zeros(0, np.int64)
 
 
+def read(settings: Settings) -> Baselines:
+    """Read section train_classical."""
+    return baselines(settings)
+
+
 def train_classical(scene: str, files: Files, indentations: Path, folds: Path, scores: Path) -> None:
     """Fit every method of section train_classical with one board held out."""
-    at = read_scenery(read_settings("train_classical", scene, files), indentations, folds)
+    data = read_data(read_settings("train_classical", scene, files), indentations, folds)
     asked, rows = (
-        resolve_baselines(at.asked.words("train_classical"), at.asked.named, f"{at.asked.where}: train_classical"),
-        at.rows,
+        read(data.settings),
+        data.rows,
     )
-    pairs = [(fold, name) for fold in at.of("lobo") for name in asked.methods]
+    pairs = [(fold, name) for fold in data.folds_of("lobo") for name in asked.methods]
     tasks = [
-        Task(f"{name}.{f.name}", asked.methods[name], f.train, f.test, NO_ROWS, asked.rows_max_n, at.asked.seed)
+        Task(f"{name}.{f.name}", asked.methods[name], f.train, f.test, NO_ROWS, asked.rows_max_n, data.settings.seed)
         for f, name in pairs
     ]
     with make_executor() as executor:

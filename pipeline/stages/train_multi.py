@@ -2,17 +2,23 @@
 
 from pathlib import Path
 
-from pipeline.settings import Files, read_settings
-from pipeline.stages._models import write_models
-from pipeline.stages._run import run
-from pipeline.stages._train import cells_of, read_scenery, train_all
+from pipeline.core.config import Files, Settings, read_settings
+from pipeline.core.stage import run
+from pipeline.learning.recipe import Training, training
+from pipeline.trials.data import cells_of, read_data, train_all
+from pipeline.trials.models import write_models
+
+
+def read(settings: Settings) -> Training:
+    """Read section train_multi."""
+    return training(settings, "train_multi")
 
 
 def train_multi(scene: str, files: Files, indentations: Path, folds: Path, models: Path) -> None:
     """Train the recipes of section train_multi with one board held out."""
-    at = read_scenery(read_settings("train_multi", scene, files), indentations, folds)
-    cells = cells_of(at, at.asked.train_multi, at.of("lobo"))
-    write_models(models, at, cells, train_all(at, cells, "train_multi"), "train_multi")
+    data = read_data(read_settings("train_multi", scene, files), indentations, folds)
+    cells = cells_of(data, read(data.settings), data.folds_of("lobo"))
+    write_models(models, data, cells, train_all(data, cells, "train_multi"), "train_multi")
 
 
 if __name__ == "__main__":

@@ -2,19 +2,25 @@
 
 from pathlib import Path
 
-from pipeline.questions import ANSWERED_BY
-from pipeline.settings import Files, read_settings
-from pipeline.stages._models import write_models
-from pipeline.stages._run import run
-from pipeline.stages._train import cells_of, read_scenery, train_all
+from pipeline.core.config import Files, Settings, read_settings
+from pipeline.core.stage import run
+from pipeline.dataset.splits import ONE_SKIN
+from pipeline.learning.recipe import Training, training
+from pipeline.trials.data import cells_of, read_data, train_all
+from pipeline.trials.models import write_models
+
+
+def read(settings: Settings) -> Training:
+    """Read section train_single."""
+    return training(settings, "train_single")
 
 
 def train_single(scene: str, files: Files, indentations: Path, folds: Path, models: Path) -> None:
     """Train the recipes of section train_single on every fold of the questions about one skin."""
-    at = read_scenery(read_settings("train_single", scene, files), indentations, folds)
-    own = [fold for fold in at.folds if ANSWERED_BY[fold.question] == "train_single"]
-    cells = cells_of(at, at.asked.train_single, own)
-    write_models(models, at, cells, train_all(at, cells, "train_single"), "train_single")
+    data = read_data(read_settings("train_single", scene, files), indentations, folds)
+    own = [fold for fold in data.folds if fold.question in ONE_SKIN]
+    cells = cells_of(data, read(data.settings), own)
+    write_models(models, data, cells, train_all(data, cells, "train_single"), "train_single")
 
 
 if __name__ == "__main__":

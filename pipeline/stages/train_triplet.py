@@ -2,17 +2,23 @@
 
 from pathlib import Path
 
-from pipeline.settings import Files, read_settings
-from pipeline.stages._models import write_models
-from pipeline.stages._run import run
-from pipeline.stages._train import cells_of, read_scenery, train_all
+from pipeline.core.config import Files, Settings, read_settings
+from pipeline.core.stage import run
+from pipeline.learning.recipe import Training, training
+from pipeline.trials.data import cells_of, read_data, train_all
+from pipeline.trials.models import write_models
+
+
+def read(settings: Settings) -> Training:
+    """Read section train_triplet."""
+    return training(settings, "train_triplet")
 
 
 def train_triplet(scene: str, files: Files, indentations: Path, folds: Path, models: Path) -> None:
     """Train the recipes of section train_triplet on the folds of question lobo."""
-    at = read_scenery(read_settings("train_triplet", scene, files), indentations, folds)
-    cells = cells_of(at, at.asked.train_triplet, at.of("lobo"), question="triplet")
-    write_models(models, at, cells, train_all(at, cells, "train_triplet"), "train_triplet")
+    data = read_data(read_settings("train_triplet", scene, files), indentations, folds)
+    cells = cells_of(data, read(data.settings), data.folds_of("lobo"), question="triplet")
+    write_models(models, data, cells, train_all(data, cells, "train_triplet"), "train_triplet")
 
 
 if __name__ == "__main__":

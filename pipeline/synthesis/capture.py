@@ -12,13 +12,13 @@ from pydantic import Field, model_validator
 from scipy.constants import milli
 
 from pipeline.capture.probe import ProbeLog
+from pipeline.core.config import Strict
+from pipeline.core.seeds import rng_for
 from pipeline.physics.board import BoardDesign, Spreads, draw_board
 from pipeline.physics.force_sensor import read_force
 from pipeline.physics.nodes import Rule
 from pipeline.physics.sensor import ChipDesign
 from pipeline.physics.skin import Skin, SkinDesign, draw_skin
-from pipeline.seeds import rng_for
-from pipeline.strict import Strict
 from pipeline.synthesis.felt import Felt, Terms, feel
 from pipeline.synthesis.frames import read_frames, switch_on
 from pipeline.synthesis.plans import Plan

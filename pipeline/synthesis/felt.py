@@ -11,13 +11,13 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.constants import micro
 
+from pipeline.core.config import Strict
 from pipeline.physics.board import Board
 from pipeline.physics.friction import Friction
 from pipeline.physics.skin import Skin, beyond_verified_n, changes_of_field, forces
 from pipeline.physics.viscoelastic import Relaxation, force_left
 from pipeline.physics.warmth import Temperature
 from pipeline.physics.wear import Ageing, fading, softening, wandering
-from pipeline.strict import Strict
 from pipeline.synthesis.sideways import push
 
 

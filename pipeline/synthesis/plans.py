@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float64, Int32
 from pydantic import Field
 
+from pipeline.core.config import Strict
 from pipeline.dataset.grid import CENTRE_MM
-from pipeline.strict import Strict
 
 Count = Annotated[int, Field(ge=1, le=100_000)]
 Depth_mm = Annotated[float, Field(gt=0, le=10)]

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float, Float64, Int64
 from scipy.optimize import brentq
 
+from pipeline.core.errors import ParamsError, complain
 from pipeline.dataset.grid import points_mm
-from pipeline.errors import ParamsError, complain
 from pipeline.physics.skin import Skin, forces
 
 LIFTED_MM = -1.0  # depth of a stop above the skin: no contact, and no dwell of the robot's log

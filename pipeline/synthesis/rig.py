@@ -13,7 +13,7 @@ from jaxtyping import Float, Float64, Int64
 from pydantic import Field
 
 from pipeline.capture.probe import ProbeLog
-from pipeline.strict import Strict
+from pipeline.core.config import Strict
 from pipeline.synthesis.plans import Plan
 from pipeline.synthesis.protocols import Press, Protocol, Walk
 

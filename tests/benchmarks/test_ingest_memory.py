@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline import io
 from pipeline.capture import probe
 from pipeline.capture.header import PROBE_FILE, STREAM_FILE, Clock
 from pipeline.capture.probe import LABELS, ProbeLog
 from pipeline.capture.wire import Frames, encode
+from pipeline.core import io
+from pipeline.core.seeds import rng_for
 from pipeline.dataset.native import read_native
-from pipeline.seeds import rng_for
 from tests.capture.headers import make_header
 
 INDENTATIONS_N = 1_000_000

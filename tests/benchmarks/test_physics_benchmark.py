@@ -14,12 +14,12 @@ import pytest
 from scipy.constants import mu_0
 from scipy.spatial.transform import Rotation
 
+from pipeline.core.seeds import rng_for
 from pipeline.dataset.grid import CENTRE_MM, protocol
 from pipeline.physics import dipole, flow_map, layer
 from pipeline.physics.board import Board, draw_board
 from pipeline.physics.change import change_of_field
 from pipeline.physics.skin import Skin, changes_of_field, draw_skin
-from pipeline.seeds import rng_for
 from tests.physics.test_board import design as board_design
 from tests.physics.test_board import no_spread, spreads
 from tests.physics.test_skin import design

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.strict import read_yaml
+from pipeline.core.config import read_yaml
 
 ROOT = Path(__file__).resolve().parents[2]
 PASSES_N = 26  # x 390 = 10,140 indentations

@@ -22,6 +22,7 @@ import torch
 from torch import nn
 from torch.utils.data import DataLoader, TensorDataset
 
+from pipeline.core.seeds import rng_for
 from pipeline.learning import train as train_module
 from pipeline.learning.architecture import FEATURE_LAYERS_N, paper_layers
 from pipeline.learning.cell import Cell, Measured
@@ -32,7 +33,6 @@ from pipeline.learning.model import Stack
 from pipeline.learning.recipe import Recipe
 from pipeline.learning.stack import train_stack
 from pipeline.learning.train import Watch
-from pipeline.seeds import rng_for
 
 BOARDS_N, SKINS_PER_BOARD_N, SEEDS_N = 6, 3, 3
 ROWS_N, CHANNELS_N = 100_000, 15

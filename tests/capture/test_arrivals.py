@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from pipeline.capture import arrivals
 from pipeline.capture.arrivals import Arrivals
-from pipeline.errors import CaptureError
+from pipeline.core.errors import CaptureError
 
 GOOD = "byte_end,t_s\n0,10.0\n100,10.5\n300,10.5\n400,11.5\n"
 STEPS = st.lists(st.tuples(st.integers(1, 10_000), st.floats(0, 10)), min_size=1, max_size=30)

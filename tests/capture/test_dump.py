@@ -3,7 +3,7 @@ import pytest
 
 from pipeline.capture.dump import decode_dump
 from pipeline.capture.wire import encode
-from pipeline.errors import CaptureError
+from pipeline.core.errors import CaptureError
 from tests.capture.signals import make_frames
 
 

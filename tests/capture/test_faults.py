@@ -4,8 +4,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline import seeds
 from pipeline.capture import faults
+from pipeline.core import seeds
 from tests.capture.signals import frames_of
 
 NOISE_uT = 5.0  # FACTS: 3.0 to 5.0 uT on real boards

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.capture.header import Clock, check_same_capture, parse, render
-from pipeline.errors import CaptureError
+from pipeline.core.errors import CaptureError
 from tests.capture.headers import make_header
 
 

@@ -20,7 +20,7 @@ from pipeline.capture import arrivals, port, stream
 from pipeline.capture.header import ARRIVALS_FILE, STREAM_FILE
 from pipeline.capture.port import PortSettings, Recording
 from pipeline.capture.wire import encode
-from pipeline.errors import CaptureError
+from pipeline.core.errors import CaptureError
 from tests.capture.signals import make_frames
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo-terminals")

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from pipeline.capture.faults import FAILED_B_uT, FAILED_TEMPERATURE_degC
 from pipeline.capture.sd_card import column_names, read_log, render
-from pipeline.errors import CaptureError
-from pipeline.seeds import rng_for
+from pipeline.core.errors import CaptureError
+from pipeline.core.seeds import rng_for
 
 
 def made(frames_n=60, chips_n=2):

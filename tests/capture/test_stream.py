@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pipeline.capture import bursts, stream
 from pipeline.capture.stream import FrameStream, decode_all
 from pipeline.capture.wire import Frames, concatenate, encode, line_bytes_max_n, record_type
-from pipeline.errors import CaptureError
+from pipeline.core.errors import CaptureError
 from tests.capture.signals import BINARY_WIRES, TEXT_WIRES, WIRES, CRLF_TEMPERATURE_degC, frames_strategy, make_frames
 
 EVERY_WIRE = st.sampled_from(WIRES)

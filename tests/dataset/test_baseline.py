@@ -2,8 +2,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.core.seeds import rng_for
 from pipeline.dataset.baseline import each, initial, rank, regular, subtract
-from pipeline.seeds import rng_for
 
 B_uT, NOLOAD_uT = (rng_for(0, name).normal(0, 500, (5, 15)).astype(np.float32) for name in ("b", "noload"))
 

@@ -2,8 +2,8 @@ import pytest
 
 from pipeline.capture.folder import write_capture
 from pipeline.capture.readers import READERS, lab
+from pipeline.core.errors import CaptureError
 from pipeline.dataset.captures import check_losses, open_capture, read_header
-from pipeline.errors import CaptureError
 from tests.capture.headers import make_header
 from tests.capture.readers.test_lab import NAMES, PRESSES
 

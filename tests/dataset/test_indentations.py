@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 
 from pipeline.capture.probe import LABELS, ProbeLog
 from pipeline.capture.wire import Frames
+from pipeline.core.schema import Readings
+from pipeline.core.seeds import rng_for
 from pipeline.dataset.clocks import ClockMap
 from pipeline.dataset.indentations import Joiner, TimedFrames, join
-from pipeline.schema import Readings
-from pipeline.seeds import rng_for
 from tests.capture.headers import make_header
 
 CHIPS_N = 2

@@ -6,11 +6,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.core.errors import ParamsError
+from pipeline.core.seeds import rng_for
 from pipeline.dataset.grid import points_mm, protocol
 from pipeline.dataset.lines import Lines, grid_lines, hand_lines, take_pokes
 from pipeline.dataset.rows import Rows
-from pipeline.errors import ParamsError
-from pipeline.seeds import rng_for
 from pipeline.synthesis.protocols import Hand, make_plan
 from tests.dataset.tables import rows as labelled
 

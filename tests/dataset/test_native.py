@@ -7,18 +7,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline import io
 from pipeline.capture import arrivals, probe
 from pipeline.capture.arrivals import Arrivals
 from pipeline.capture.faults import STUCK_FRAMES_MIN_N, FAILED_B_uT, FAILED_TEMPERATURE_degC
 from pipeline.capture.header import ARRIVALS_FILE, PROBE_FILE, STREAM_FILE, Clock, Header, Wire
 from pipeline.capture.probe import LABELS, ProbeLog
 from pipeline.capture.wire import Frames, encode
+from pipeline.core import io
+from pipeline.core.errors import CaptureError
+from pipeline.core.schema import Readings
+from pipeline.core.seeds import rng_for
 from pipeline.dataset import native
 from pipeline.dataset.native import read_native
-from pipeline.errors import CaptureError
-from pipeline.schema import Readings
-from pipeline.seeds import rng_for
 from tests.capture.headers import make_header
 
 RATE_HZ = 100.0

@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.core.errors import ParamsError
 from pipeline.dataset.lines import hand_lines
 from pipeline.dataset.rows import Selection, gather
 from pipeline.dataset.stacked import hand_rows, shifted, stack
-from pipeline.errors import ParamsError
 from tests.dataset.tables import readings
 
 ALL = Selection(force_min_N=0.0)

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.core.errors import ParamsError
 from pipeline.dataset import windows as documented
 from pipeline.dataset.windows import check_one_each, lay_windows, take
-from pipeline.errors import ParamsError
 from tests.dataset.tables import readings
 
 sizes = st.tuples(st.integers(1, 60), st.integers(1, 10), st.integers(0, 10), st.integers(0, 9))

@@ -5,14 +5,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.evaluation.adapted import AFTER, BEFORE, CONTROL, Answered, bias, biases, over_boards, paired
+from pipeline.core.seeds import rng_for
 from pipeline.evaluation.comparison import paired as paired_cards
-from pipeline.evaluation.flexible import DRAWN_N, answer_flexible, by_depth, forces_drawn, strength_ratio
 from pipeline.evaluation.inference import interval
-from pipeline.evaluation.manual import GRID, answer_manual
 from pipeline.evaluation.metrics import score
 from pipeline.evaluation.summary import score_groups
-from pipeline.seeds import rng_for
+from pipeline.experiments.flexible.boards import DRAWN_N, answer_flexible, by_depth, forces_drawn, strength_ratio
+from pipeline.experiments.manual.parts import GRID, answer_manual
+from pipeline.trials.arms import AFTER, BEFORE, CONTROL, Answered, bias, biases, over_boards, paired
 
 SINGLE = 1e-4  # sums of single-precision forces of some newtons
 

@@ -8,7 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.constants import micro
 
-from pipeline.evaluation.ambient import (
+from pipeline.core.seeds import rng_for
+from pipeline.evaluation.inference import interval
+from pipeline.experiments.ambient.fields import (
     guessed_uT,
     iron_cases,
     iron_fields,
@@ -21,10 +23,8 @@ from pipeline.evaluation.ambient import (
     uniform_cases,
     without_common_part,
 )
-from pipeline.evaluation.inference import interval
 from pipeline.physics.sensor import ChipDesign, read_field, steps_uT
 from pipeline.physics.skin import draw_skin
-from pipeline.seeds import rng_for
 from tests.synthesis.scene import SECTIONS, synthesis
 
 NO_SPREAD = {name: 0.0 for name in SECTIONS["spreads"] if name != "skin_filler_length_mm"}

@@ -9,14 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import ParamsError, SchemaError
-from pipeline.evaluation.audit import copies, sides
-from pipeline.evaluation.audit.checks import holds, to_words
-from pipeline.evaluation.audit.copies import nearest_rays
-from pipeline.evaluation.audit.settings import audit_choice, audit_scaler
-from pipeline.evaluation.audit.sides import Labels, Sides, audit_fold
+from pipeline.core.errors import ParamsError, SchemaError
+from pipeline.core.seeds import rng_for
+from pipeline.experiments.audit import copies, sides
+from pipeline.experiments.audit.checks import holds, to_words
+from pipeline.experiments.audit.copies import nearest_rays
+from pipeline.experiments.audit.settings import audit_choice, audit_scaler
+from pipeline.experiments.audit.sides import Labels, Sides, audit_fold
 from pipeline.learning.standardise import FIT
-from pipeline.seeds import rng_for
 
 NONE = np.zeros(0, np.int64)
 READINGS_N = 3

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
+from pipeline.core.errors import SchemaError
+from pipeline.core.seeds import rng_for
 from pipeline.dataset.splits import Split, draw_folds
-from pipeline.errors import SchemaError
 from pipeline.evaluation.comparison import over_boards, over_pairs, paired, paired_where_tested
 from pipeline.evaluation.inference import interval
 from pipeline.evaluation.metrics import METRICS
 from pipeline.evaluation.summary import over_folds, pool_skins, score_groups
-from pipeline.seeds import rng_for
 from tests.dataset.test_splits import six_by_three_in_passes
 from tests.evaluation.test_summary import every
 

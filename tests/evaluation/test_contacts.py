@@ -7,9 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.core.errors import ParamsError
+from pipeline.core.seeds import rng_for
 from pipeline.dataset.grid import points_mm
-from pipeline.errors import ParamsError
-from pipeline.evaluation.contacts import (
+from pipeline.evaluation.inference import interval
+from pipeline.experiments.contacts.pairs import (
     TOLERANCE_MM,
     along_the_line,
     detect,
@@ -18,8 +20,6 @@ from pipeline.evaluation.contacts import (
     over_boards,
     where_it_falls,
 )
-from pipeline.evaluation.inference import interval
-from pipeline.seeds import rng_for
 from tests.dataset import tables
 
 SKINS = ("b0_s0", "b0_s1", "b1_s0")

@@ -6,7 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import linregress, sem
 
-from pipeline.evaluation.drift import (
+from pipeline.core.seeds import rng_for
+from pipeline.evaluation.metrics import score
+from pipeline.experiments.drift.windows import (
     POINTS_MAX_N,
     Answers,
     by_contact,
@@ -20,8 +22,6 @@ from pipeline.evaluation.drift import (
     pace,
     points,
 )
-from pipeline.evaluation.metrics import score
-from pipeline.seeds import rng_for
 from tests.dataset.tables import readings
 
 

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import ttest_rel
 
-from pipeline.evaluation.drift_findings import (
+from pipeline.experiments.drift.findings import (
     EACH_IS_WORSE,
     HIGHER_AND_FASTER,
     OFFSET,

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.evaluation.flexible import gap_less_pct
+from pipeline.experiments.flexible.boards import gap_less_pct
 
 
 def test_a_gap_of_a_fifth_is_80_percent_less():

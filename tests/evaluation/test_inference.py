@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import t, ttest_rel
 
-from pipeline.errors import SchemaError
+from pipeline.core.errors import SchemaError
 from pipeline.evaluation.inference import (
     INCONCLUSIVE,
     NO,

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pipeline.evaluation import left_out
-from pipeline.evaluation.left_out import AGEING, RELAXATION, measure
+from pipeline.experiments.left_out import terms as left_out
+from pipeline.experiments.left_out.terms import AGEING, RELAXATION, measure
 from pipeline.physics.board import draw_board
 from pipeline.physics.nodes import Quadrature
 from pipeline.physics.skin import changes_of_field, draw_skin

@@ -5,9 +5,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.errors import CaptureError
-from pipeline.evaluation.logs import contacts_n, describe, estimate, quiet_start, score_contacts, thin, truth_at
-from pipeline.seeds import rng_for
+from pipeline.core.errors import CaptureError
+from pipeline.core.seeds import rng_for
+from pipeline.experiments.logs.estimates import (
+    contacts_n,
+    describe,
+    estimate,
+    quiet_start,
+    score_contacts,
+    thin,
+    truth_at,
+)
 
 RATE_HZ = 250.0
 NOISE_uT = 3.0

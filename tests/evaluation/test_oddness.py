@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.metrics import roc_auc_score
 
-from pipeline.evaluation.oddness import (
+from pipeline.core.seeds import rng_for
+from pipeline.experiments.contacts.oddness import (
     NEIGHBOURS_N,
     NOISE_uT,
     direction_distance,
@@ -15,7 +16,6 @@ from pipeline.evaluation.oddness import (
     residual,
     roc_area,
 )
-from pipeline.seeds import rng_for
 
 SCORES = st.lists(st.integers(0, 9), min_size=1, max_size=30).map(lambda values: np.array(values, float))
 

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline.core.io import read_json
 from pipeline.evaluation.reproduced import compare, leaves
 from pipeline.evaluation.tolerance import IGNORED, TOLERANCES, ignored, tolerance_of
-from pipeline.io import read_json
 from tests.reporting.synthetic import all_questions, cost
 from tests.stages.checkout import ROOT
 

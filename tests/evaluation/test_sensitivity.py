@@ -8,8 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import linregress, norm, spearmanr
 
-from pipeline.errors import SchemaError
-from pipeline.evaluation.sensitivity import (
+from pipeline.core.errors import SchemaError
+from pipeline.core.seeds import rng_for
+from pipeline.experiments.sensitivity.weights import (
     answer_of,
     direction,
     levels_of,
@@ -17,7 +18,6 @@ from pipeline.evaluation.sensitivity import (
     smallest_step_N,
     told_apart,
 )
-from pipeline.seeds import rng_for
 
 STEP_N = 0.02
 WEIGHT_N = STEP_N * np.arange(26)

@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.metrics import mean_squared_error, r2_score
 
-from pipeline.evaluation.shear import answer_shear, score5
+from pipeline.core.seeds import rng_for
 from pipeline.evaluation.statistic import over_units, statistic
-from pipeline.seeds import rng_for
+from pipeline.experiments.shear.scores import answer_shear, score5
 
 
 def drawn(seed: int, f: int = 40) -> tuple[np.ndarray, np.ndarray]:

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from pipeline.capture import faults, stream
-from pipeline.errors import CaptureError
-from pipeline.evaluation.stability import physics
-from pipeline.evaluation.stability.cases import measured, peak_bytes, refused
-from pipeline.evaluation.stability.chip import survey_chip
-from pipeline.evaluation.stability.physics import survey_physics
-from pipeline.evaluation.stability.relaxing import survey_relaxing
-from pipeline.evaluation.stability.survey import survey
-from pipeline.evaluation.stability.wire import survey_wire
+from pipeline.core.config import parse, read_yaml
+from pipeline.core.errors import CaptureError
+from pipeline.experiments.stability import physics
+from pipeline.experiments.stability.cases import measured, peak_bytes, refused
+from pipeline.experiments.stability.chip import survey_chip
+from pipeline.experiments.stability.physics import survey_physics
+from pipeline.experiments.stability.relaxing import survey_relaxing
+from pipeline.experiments.stability.survey import survey
+from pipeline.experiments.stability.wire import survey_wire
 from pipeline.physics import force_sensor, layer, sensor, viscoelastic
-from pipeline.strict import parse, read_yaml
 from pipeline.synthesis.capture import Synthesis
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
+from pipeline.core.seeds import rng_for
 from pipeline.evaluation.metrics import METRICS, score
 from pipeline.evaluation.summary import over_folds, over_test_skins, pool_skins, score_groups
-from pipeline.seeds import rng_for
 
 RNG = rng_for(0, "summary")
 TRUE = RNG.uniform(0, 16, (30, 3))

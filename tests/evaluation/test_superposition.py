@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pipeline.evaluation import superposition as module
-from pipeline.evaluation.superposition import press_on, superposition
+from pipeline.experiments.contacts import superposition as module
+from pipeline.experiments.contacts.superposition import press_on, superposition
 from pipeline.physics.board import draw_board
 from pipeline.physics.change import change_of_field
 from pipeline.physics.skin import draw_skin, moved_dipoles

@@ -5,12 +5,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.evaluation.ambient import Instrument
-from pipeline.evaluation.logs import contacts_n, estimate, score_contacts
-from pipeline.evaluation.turning import PERIOD_S, PITCHES_DEG, Log, earth_T, step_period_s, swing, turn_log
+from pipeline.core.seeds import rng_for
+from pipeline.experiments.ambient.fields import Instrument
+from pipeline.experiments.logs.estimates import contacts_n, estimate, score_contacts
+from pipeline.experiments.logs.turning import PERIOD_S, PITCHES_DEG, Log, earth_T, step_period_s, swing, turn_log
 from pipeline.physics.ambient import EARTH_DIP_DEG, EARTH_SIZE_T, EARTH_T
 from pipeline.physics.board import Board
-from pipeline.seeds import rng_for
 from tests.evaluation.test_logs import answers, truth, walk
 
 

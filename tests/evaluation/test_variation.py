@@ -3,9 +3,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.errors import ParamsError
-from pipeline.evaluation.variation import LINES_MAX_N, Visits, find_visits, first_of_each_board, over_skins, over_time
-from pipeline.seeds import rng_for
+from pipeline.core.errors import ParamsError
+from pipeline.core.seeds import rng_for
+from pipeline.experiments.variation.visits import (
+    LINES_MAX_N,
+    Visits,
+    find_visits,
+    first_of_each_board,
+    over_skins,
+    over_time,
+)
 from tests.dataset.tables import readings
 
 

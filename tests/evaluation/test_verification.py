@@ -6,18 +6,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.evaluation.verification import frames, poke, reference
-from pipeline.evaluation.verification.checks import Check, no_spread
-from pipeline.evaluation.verification.contact import check_contact
-from pipeline.evaluation.verification.electronics import check_electronics
-from pipeline.evaluation.verification.field import check_field
-from pipeline.evaluation.verification.frames import check_frames
-from pipeline.evaluation.verification.kinematics import check_kinematics
-from pipeline.evaluation.verification.poke import check_poke
-from pipeline.evaluation.verification.relaxation import check_relaxation
-from pipeline.evaluation.verification.verify import Designs, verify
+from pipeline.core.config import parse, read_yaml
+from pipeline.experiments.verification import frames, poke, reference
+from pipeline.experiments.verification.checks import Check, no_spread
+from pipeline.experiments.verification.contact import check_contact
+from pipeline.experiments.verification.electronics import check_electronics
+from pipeline.experiments.verification.field import check_field
+from pipeline.experiments.verification.frames import check_frames
+from pipeline.experiments.verification.kinematics import check_kinematics
+from pipeline.experiments.verification.poke import check_poke
+from pipeline.experiments.verification.relaxation import check_relaxation
+from pipeline.experiments.verification.survey import Designs, verify
 from pipeline.physics import change, layer, magnet, sensor, viscoelastic
-from pipeline.strict import parse, read_yaml
 from pipeline.synthesis.capture import Synthesis
 
 ROOT = Path(__file__).resolve().parents[2]

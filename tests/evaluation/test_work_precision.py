@@ -10,18 +10,18 @@ from hypothesis import strategies as st
 from scipy.constants import mu_0
 from scipy.integrate import quad
 
-from pipeline.errors import ParamsError
-from pipeline.evaluation.work_precision import integrators, methods
-from pipeline.evaluation.work_precision.choose import CANDIDATES, ERROR_MAX, choose
-from pipeline.evaluation.work_precision.history import exact_forces, poke_often, stiff
-from pipeline.evaluation.work_precision.integrators import EULER, EXACT, SOLVERS, Sweep, study_integrators
-from pipeline.evaluation.work_precision.lattices import box_m, gauss_everywhere, midpoints, written
-from pipeline.evaluation.work_precision.methods import METHODS, whole
-from pipeline.evaluation.work_precision.motion import Path, paths
-from pipeline.evaluation.work_precision.quadrature import ALL, Reference, errors, study_quadratures
-from pipeline.evaluation.work_precision.rows import REFERENCE, Contestant, Precision
-from pipeline.evaluation.work_precision.stopwatch import race
-from pipeline.evaluation.work_precision.trials import Pokes, Trial, draw_trial, laid
+from pipeline.core.errors import ParamsError
+from pipeline.experiments.runtime import integrators, methods
+from pipeline.experiments.runtime.choose import CANDIDATES, ERROR_MAX, choose
+from pipeline.experiments.runtime.history import exact_forces, poke_often, stiff
+from pipeline.experiments.runtime.integrators import EULER, EXACT, SOLVERS, Sweep, study_integrators
+from pipeline.experiments.runtime.lattices import box_m, gauss_everywhere, midpoints, written
+from pipeline.experiments.runtime.methods import METHODS, whole
+from pipeline.experiments.runtime.motion import Path, paths
+from pipeline.experiments.runtime.quadrature import ALL, Reference, errors, study_quadratures
+from pipeline.experiments.runtime.rows import REFERENCE, Contestant, Precision
+from pipeline.experiments.runtime.stopwatch import race
+from pipeline.experiments.runtime.trials import Pokes, Trial, draw_trial, laid
 from pipeline.physics import flow
 from pipeline.physics.magnet import cuboid_field
 from pipeline.physics.nodes import CHOSEN, SKIN_SIDE_M, Quadrature, place_nodes

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from pipeline.dataset import splits
-from pipeline.extremes import learning
-from pipeline.extremes.learning import fold_cases, learning_cases, loop_cases, scaling_cases, triplet_cases
+from pipeline.experiments.stability import learning
+from pipeline.experiments.stability.learning import fold_cases, learning_cases, loop_cases, scaling_cases, triplet_cases
 from pipeline.learning import feed, model, stack, standardise, train, triplets
 
 SEED = 2021

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from pipeline.core.seeds import rng_for
 from pipeline.dataset.lines import Lines, hand_lines
 from pipeline.learning.architecture import draw_weights, paper_layers
 from pipeline.learning.cell import Adapting, Cell, FewLabels, Measured, Start
 from pipeline.learning.recipe import FineTuning, Labelling
 from pipeline.learning.standardise import fit_standard
-from pipeline.seeds import rng_for
 from tests.learning.recipes import recipe
 
 ROWS_N = 48  # twelve a skin

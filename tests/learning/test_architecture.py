@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from torch import nn
 
+from pipeline.core.seeds import rng_for
 from pipeline.learning.architecture import (
     FEATURE_LAYERS_N,
     FEATURES_N,
@@ -9,7 +10,6 @@ from pipeline.learning.architecture import (
     draw_weights,
     paper_layers,
 )
-from pipeline.seeds import rng_for
 from tests.learning.plain import PRINTED
 
 

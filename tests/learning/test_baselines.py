@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter
 from sklearn.linear_model import Ridge
 
+from pipeline.core.seeds import rng_for
 from pipeline.learning import baselines
 from pipeline.learning.baselines import Answered, Task, run_tasks
 from pipeline.learning.cell import Measured
 from pipeline.learning.classical import Classical, fit
-from pipeline.seeds import rng_for
 
 SETTINGS = {
     "ridge": {"method": "ridge", "alpha": 1.0},

@@ -8,9 +8,9 @@ from pydantic import TypeAdapter, ValidationError
 from sklearn.linear_model import Ridge
 from sklearn.preprocessing import PolynomialFeatures
 
-from pipeline.errors import TrainingError
+from pipeline.core.errors import TrainingError
+from pipeline.core.seeds import rng_for
 from pipeline.learning.classical import BLOCK_ROWS_N, Classical, Fitted, fit
-from pipeline.seeds import rng_for
 
 SETTINGS = {
     "ridge": {"method": "ridge", "alpha": 1.0},

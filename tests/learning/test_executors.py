@@ -2,7 +2,7 @@ import os
 
 import pytest
 
-from pipeline.errors import ParamsError
+from pipeline.core.errors import ParamsError
 from pipeline.learning.executors import device, make_executor
 
 

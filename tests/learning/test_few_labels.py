@@ -9,16 +9,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline.core.config import parse
+from pipeline.core.errors import ParamsError
+from pipeline.core.seeds import rng_for
 from pipeline.dataset.rows import Rows
 from pipeline.dataset.splits import Split, draw_folds
-from pipeline.errors import ParamsError
 from pipeline.learning import few_labels as few
 from pipeline.learning.baselines import Task
 from pipeline.learning.cell import Adapting, Cell, FewLabels, Keys, Measured, Trained, make_job
 from pipeline.learning.comparison import Baselines
 from pipeline.learning.comparison import FewLabels as Settings
-from pipeline.seeds import rng_for
-from pipeline.strict import parse
 from tests.scenes import RECIPE
 
 SKINS = ("b0_s0", "b0_s1", "b1_s0", "b2_s0")
@@ -162,7 +162,7 @@ def test_the_fewer_labels_are_among_the_more(seed, labels_n):
     at = study(seed, labels_n=labels_n)
     own = {(tried.fold.name, tried.labels_n): {*task.own} for tried, task in few.classical(at) if "ridge" in task.name}
     fewer = sorted(labels_n)
-    for fold in at.folds:
+    for fold in data.folds:
         for less, more in pairwise(fewer):
             assert own[fold.name, less] < own[fold.name, more]
 
@@ -211,7 +211,7 @@ def test_only_the_networks_named_are_adapted_by_all_pokes_of_their_pool():
 
 
 def few_done(at: few.Study) -> list[few.Done]:
-    return [(tried, cell, as_drawn(cell)) for tried, cell in few.networks(at, [])]
+    return [(tried, cell, as_drawn(cell)) for tried, cell in few.networks(data, [])]
 
 
 def test_adaptation_sees_no_label_of_the_new_board():

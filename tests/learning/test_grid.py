@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline import io
-from pipeline.errors import ReskinError, TrainingError
+from pipeline.core import io
+from pipeline.core.errors import ReskinError, TrainingError
 from pipeline.learning import stack
 from pipeline.learning.cell import Cell, Trained, make_job
 from pipeline.learning.executors import make_executor

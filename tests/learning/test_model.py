@@ -3,10 +3,10 @@ import pytest
 import torch
 from torch import nn
 
+from pipeline.core.seeds import rng_for
 from pipeline.learning import model
 from pipeline.learning.architecture import LAYERS, draw_weights
 from pipeline.learning.model import Predictor, Stack
-from pipeline.seeds import rng_for
 from tests.learning.plain import features_of, plain_net, weights_of
 
 # float32 sums of up to 200 terms, in another order, six layers deep; numbers near 1

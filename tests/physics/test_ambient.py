@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from magpylib.core import magnet_sphere_Bfield
 
+from pipeline.core.seeds import rng_for
 from pipeline.physics import dipole
 from pipeline.physics.ambient import EARTH_SIZE_T, EARTH_T, ball_field, ball_images, directions
-from pipeline.seeds import rng_for
 
 RADIUS_M = 5e-3
 CENTRE_M = np.array([1e-3, -2e-3, 12e-3])

@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.errors import ParamsError
+from pipeline.core.errors import ParamsError
+from pipeline.core.seeds import rng_for
 from pipeline.physics import dipole
 from pipeline.physics.change import change_of_field
-from pipeline.seeds import rng_for
 
 ROUNDING = 1e-12  # a few thousand operations in float64, of like sign in the sum of sizes
 seeds = st.integers(0, 10**6)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import ParamsError
+from pipeline.core.errors import ParamsError
 from pipeline.physics import flow, flow_map, layer
 
 H_M, TIP_M = 2e-3, 3e-3

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.special import ellipe, ellipk, j0, j1
 
-from pipeline.errors import ParamsError
+from pipeline.core.errors import ParamsError
 from pipeline.physics import layer
 
 SKIN = {"thickness_m": 2e-3, "tip_radius_m": 3e-3, "base": "bonded"}

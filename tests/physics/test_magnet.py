@@ -6,11 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.constants import mu_0
 
-from pipeline.errors import ParamsError
+from pipeline.core.errors import ParamsError
+from pipeline.core.seeds import rng_for
 from pipeline.physics import magnet
 from pipeline.physics.dipole import MU0_4PI, field
 from pipeline.physics.nodes import Quadrature, place_nodes
-from pipeline.seeds import rng_for
 
 THICKNESS_M = 2e-3
 SIDES_M = (6e-3, 4e-3, 3e-3)

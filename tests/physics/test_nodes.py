@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.errors import ParamsError
+from pipeline.core.errors import ParamsError
 from pipeline.physics.magnet import CUBE_SIDE_M, seams_m
 from pipeline.physics.nodes import CHOSEN, SEAMS_M, SKIN_SIDE_M, Quadrature, place_nodes
 

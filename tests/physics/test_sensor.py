@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.core.seeds import rng_for
 from pipeline.physics.board import Board
 from pipeline.physics.sensor import ChipDesign, Overruns, read_field, read_temperature, steps_uT
-from pipeline.seeds import rng_for
 
 QUARTER = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
 QUIET = ChipDesign(gain_sel=7, noise_xy_uT=0.0, noise_z_uT=0.0, noise_temperature_degC=0.0)

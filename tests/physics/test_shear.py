@@ -9,7 +9,7 @@ from scipy.integrate import quad, solve_bvp
 from scipy.linalg import polar
 from scipy.special import jv
 
-from pipeline.errors import ParamsError
+from pipeline.core.errors import ParamsError
 from pipeline.physics import layer, shear
 from pipeline.physics.shear import Traction
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from pipeline.errors import ParamsError
+from pipeline.core.errors import ParamsError
 from pipeline.physics import dipole, flow, flow_map
 from pipeline.physics.board import Board
 from pipeline.physics.change import change_of_field

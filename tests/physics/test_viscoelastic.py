@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.errors import ParamsError
+from pipeline.core.errors import ParamsError
 from pipeline.physics.viscoelastic import SKIN, Prony, Relaxation, advance, force_left, relax
 
 ROUNDING = 1e-14  # a few dozen operations on doubles

@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
-from pipeline import io
 from pipeline.capture.readers import eflesh
-from pipeline.settings import Files
-from pipeline.stages.drift import drift
+from pipeline.core import io
+from pipeline.core.config import Files
+from pipeline.experiments.drift.run import drift
 from tests.recordings.test_recordings import SPATIAL, ingest
 
 ROOT = Path(__file__).resolve().parents[2]

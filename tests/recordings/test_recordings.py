@@ -13,8 +13,8 @@ import pytest
 from pipeline.capture.header import Header
 from pipeline.capture.readers import eflesh, ini, lab
 from pipeline.capture.readers.table import read_cells
-from pipeline.errors import CaptureError
-from pipeline.schema import Readings
+from pipeline.core.errors import CaptureError
+from pipeline.core.schema import Readings
 from tests.capture.headers import make_header
 
 SPATIAL = "eflesh/spatial_resolution/20250316_155729_probe"

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
-from pipeline.errors import SchemaError
+from pipeline.core.errors import SchemaError
 from pipeline.evaluation.inference import INCONCLUSIVE, NO, ONE_BOARD, YES
 from pipeline.questions import EXPERIMENTS
 from pipeline.reporting import paper

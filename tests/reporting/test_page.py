@@ -7,8 +7,8 @@ import pytest
 
 from pipeline.reporting import page_order
 from pipeline.reporting.checklist import checklist
-from pipeline.reporting.experiments.parts import PARTS
 from pipeline.reporting.page import arrange, lay_out, page
+from pipeline.reporting.parts import PARTS
 from pipeline.reporting.tables import make_tables
 from tests.reporting.synthetic import all_questions
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.io import read_json
+from pipeline.core.io import read_json
 from pipeline.questions import EXPERIMENTS
 from pipeline.reporting.scores import headline_scores
 from tests.reporting.synthetic import all_questions, scores, stat

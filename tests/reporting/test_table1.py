@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.errors import ParamsError
+from pipeline.core.errors import ParamsError
 from pipeline.reporting.table1 import LOCALISATION, NOT_GIVEN, OURS, measured, read_table1, table1
 from tests.reporting.synthetic import all_questions, stat
 

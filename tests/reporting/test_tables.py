@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from pipeline.errors import SchemaError
+from pipeline.core.errors import SchemaError
 from pipeline.evaluation.inference import interval
 from pipeline.evaluation.metrics import METRICS
 from pipeline.reporting.numbers import add_up, compose, lost_by_protocol, rounded

@@ -7,27 +7,32 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline import io
-from pipeline.asking import folds_of
+from pipeline.core import io
+from pipeline.core.config import Files
+from pipeline.core.errors import LeakError
+from pipeline.core.schema import Readings
+from pipeline.core.seeds import rng_for
 from pipeline.dataset.folds import load_rows, parse_folds, render_folds
+from pipeline.dataset.rows import Selection
 from pipeline.dataset.splits import Fold, draw_folds
-from pipeline.errors import LeakError
+from pipeline.experiments.audit.run import audit
 from pipeline.learning.cell import Cell, Measured, Trained, make_job
 from pipeline.learning.inputs import VIEW
+from pipeline.learning.recipe import adaptations as adaptations_of
+from pipeline.learning.recipe import training
 from pipeline.learning.standardise import FIT
-from pipeline.schema import Readings
-from pipeline.seeds import rng_for
-from pipeline.settings import Files
-from pipeline.stages import _models
-from pipeline.stages._adapt import adaptations, read_starts
-from pipeline.stages._models import write_models
-from pipeline.stages._train import Scenery, cells_of, read_scenery
-from pipeline.stages.audit import audit
+from pipeline.stages import split
+from pipeline.trials import models as _models
+from pipeline.trials.adapting import adaptations, read_starts
+from pipeline.trials.data import SceneData, cells_of, read_data
+from pipeline.trials.models import write_models
 from tests.dataset.tables import readings
 from tests.scenes import ADAPTATIONS, RECIPE, SHARED, TRAINING, recorded, settings
 
 PLACES_N, PASSES_N, READINGS_N, CH_N = 16, 2, 2, 15
 SEED = 2021
+ROOT = Path(__file__).resolve().parents[2]
+MODELS = ("train_single", "train_multi", "train_triplet", "adapt")
 SKINS = ("b0_s0", "b0_s1", "b1_s0", "b2_s0")
 COPY = "b3_s0"  # b0_s0 again, under the name of another board's skin
 TRIPLET = RECIPE | {"triplet_weight": 0.1}
@@ -78,35 +83,43 @@ def build(folder: Path, skins: tuple[str, ...] = SKINS) -> Path:
         io.write_readings(folder / f"indentations/{skin}.parquet", [capture(skin)], {})
     io.write_json(folder / "tiny.yaml", SCENE)  # JSON is YAML
     io.write_json(folder / "params.yaml", SHARED)
-    io.write_json(folder / "plan.yaml", {"scenes": {}, "stages": {"audit": {"tiny": {"scene": "tiny"}}}})
+    io.write_json(
+        folder / "plan.yaml", {"scenes": {}, "stages": {"audit": {"tiny": {"scene": "tiny", "models": list(MODELS)}}}}
+    )
+    (folder / "dvc.yaml").write_text((ROOT / "dvc.yaml").read_text())
     asked = settings(SCENE)
-    rows = load_rows([folder / f"indentations/{skin}.parquet" for skin in skins], asked.selection)
-    drawn = draw_folds(rows, folds_of(asked.questions), asked.split, asked.seed)
+    rows = load_rows([folder / f"indentations/{skin}.parquet" for skin in skins], asked.section(Selection, "selection"))
+    drawn = draw_folds(rows, ("single_random", "lobo"), split.read(asked), asked.seed)
     io.write_json(folder / "folds.json", render_folds(skins, rows, drawn))
-    at = scenery(folder)
-    for arm, training, question in (
-        ("train_single", asked.train_single, "single_random"),
-        ("train_multi", asked.train_multi, "lobo"),
+    data = scenery(folder)
+    for arm, section, question in (
+        ("train_single", training(asked, "train_single"), "single_random"),
+        ("train_multi", training(asked, "train_multi"), "lobo"),
     ):
-        write(folder, arm, at, cells_of(at, training, at.of(question)))
-    write(folder, "train_triplet", at, cells_of(at, asked.train_triplet, at.of("lobo"), question="triplet"))
-    starts, named = read_starts(folder / "models/train_triplet"), ("paper", asked.adapt.recipes["paper"])
-    adapted = [adaptations(at, fold, named, starts, question="adapt", pokes_n=8) for fold in at.of("lobo")]
-    write(folder, "adapt", at, [cell for cells in adapted for cell in cells])
+        write(folder, arm, data, cells_of(data, section, data.folds_of(question)))
+    write(
+        folder,
+        "train_triplet",
+        data,
+        cells_of(data, training(asked, "train_triplet"), data.folds_of("lobo"), question="triplet"),
+    )
+    starts, named = read_starts(folder / "models/train_triplet"), ("paper", adaptations_of(asked).recipes["paper"])
+    adapted = [adaptations(data, fold, named, starts, question="adapt", pokes_n=8) for fold in data.folds_of("lobo")]
+    write(folder, "adapt", data, [cell for cells in adapted for cell in cells])
     io.write_json(folder / "choice.json", CHOICE)
     return folder
 
 
-def scenery(folder: Path) -> Scenery:
-    return read_scenery(settings(SCENE), folder / "indentations", folder / "folds.json")
+def scenery(folder: Path) -> SceneData:
+    return read_data(settings(SCENE), folder / "indentations", folder / "folds.json")
 
 
-def write(folder: Path, arm: str, at: Scenery, cells: list[Cell]) -> None:
-    write_models(folder / "models" / arm, at, cells, [as_drawn(cell, at) for cell in cells], arm)
+def write(folder: Path, arm: str, data: SceneData, cells: list[Cell]) -> None:
+    write_models(folder / "models" / arm, data, cells, [as_drawn(cell, data) for cell in cells], arm)
 
 
-def as_drawn(cell: Cell, at: Scenery) -> Trained:
-    job, scaler = make_job(cell, Measured(at.rows.db_uT, at.rows.target, at.rows.skin))
+def as_drawn(cell: Cell, data: SceneData) -> Trained:
+    job, scaler = make_job(cell, Measured(data.rows.db_uT, data.rows.target, data.rows.skin))
     predicted = np.zeros((len(cell.test), 3), np.float32)
     return Trained(f"key of {cell.name}", job.start, scaler, [1.0], predicted, None, None, 0.0, 0.0)
 
@@ -179,42 +192,44 @@ def test_a_scene_whose_settings_are_for_speed_needs_no_record_of_a_choice(scene)
     ],
 )
 def test_a_network_whose_scaler_saw_test_rows_is_named(scene, arm, name, seen_n):
-    file, at = scene / f"models/{arm}/{name}.safetensors", scenery(scene)
-    (fold,) = (one for one in at.of("lobo") if one.name == "b1")
+    file, data = scene / f"models/{arm}/{name}.safetensors", scenery(scene)
+    (fold,) = (one for one in data.folds_of("lobo") if one.name == "b1")
     seen = np.concatenate([fold.train, fold.test[:seen_n]])
-    view = VIEW["shape" if ".shape." in name else "raw"](at.rows.db_uT[seen])
-    leaked = FIT["standard"](view, at.rows.target[seen]).arrays()
+    view = VIEW["shape" if ".shape." in name else "raw"](data.rows.db_uT[seen])
+    leaked = FIT["standard"](view, data.rows.target[seen]).arrays()
     io.write_tensors(file, io.read_tensors(file)[0] | leaked, {})
     refused(scene, f"audit of tiny, {name}: scaler must be that of the training rows, .*; got off by")
 
 
-def replant(folder: Path, change: Callable[[Fold, Scenery], Fold]) -> None:
+def replant(folder: Path, change: Callable[[Fold, SceneData], Fold]) -> None:
     """Change the fold of board b0 in folds.json, and leave the others."""
-    at = scenery(folder)
-    folds = [change(fold, at) if (fold.question, fold.name) == ("lobo", "b0") else fold for fold in at.folds]
-    io.write_json(folder / "folds.json", render_folds(io.read_json(folder / "folds.json")["captures"], at.rows, folds))
-    assert len(parse_folds(io.read_json(folder / "folds.json"), at.rows, "folds.json")) == len(at.folds)
+    data = scenery(folder)
+    folds = [change(fold, data) if (fold.question, fold.name) == ("lobo", "b0") else fold for fold in data.folds]
+    io.write_json(
+        folder / "folds.json", render_folds(io.read_json(folder / "folds.json")["captures"], data.rows, folds)
+    )
+    assert len(parse_folds(io.read_json(folder / "folds.json"), data.rows, "folds.json")) == len(data.folds)
 
 
-def a_skin_trained_on(fold: Fold, at: Scenery) -> Fold:
-    own = at.rows.skin[fold.test] == "b0_s0"
-    pool = fold.pool[at.rows.skin[fold.pool] != "b0_s0"]
+def a_skin_trained_on(fold: Fold, data: SceneData) -> Fold:
+    own = data.rows.skin[fold.test] == "b0_s0"
+    pool = fold.pool[data.rows.skin[fold.pool] != "b0_s0"]
     return Fold(fold.question, fold.name, np.union1d(fold.train, fold.test[own]), fold.test[~own], pool)
 
 
-def a_reading_on_both_sides(fold: Fold, at: Scenery) -> Fold:
+def a_reading_on_both_sides(fold: Fold, data: SceneData) -> Fold:
     return Fold(fold.question, fold.name, np.union1d(fold.train, fold.test[:1]), fold.test, fold.pool)
 
 
-def a_tested_reading_adapted_to(fold: Fold, at: Scenery) -> Fold:
+def a_tested_reading_adapted_to(fold: Fold, data: SceneData) -> Fold:
     return Fold(fold.question, fold.name, fold.train, fold.test, np.union1d(fold.pool, fold.test[:1]))
 
 
-def a_tested_indentation_adapted_to(fold: Fold, at: Scenery) -> Fold:
+def a_tested_indentation_adapted_to(fold: Fold, data: SceneData) -> Fold:
     return Fold(fold.question, fold.name, fold.train, fold.test[1:], np.union1d(fold.pool, fold.test[:1]))
 
 
-def a_stranger_adapted_to(fold: Fold, at: Scenery) -> Fold:
+def a_stranger_adapted_to(fold: Fold, data: SceneData) -> Fold:
     return Fold(fold.question, fold.name, fold.train[1:], fold.test, np.union1d(fold.pool, fold.train[:1]))
 
 
@@ -286,9 +301,9 @@ def test_a_setting_that_the_study_did_not_choose_is_a_stated_row_and_no_leak(sce
 def test_adaptation_with_what_it_may_not_have_is_named(scene, change, sentence):
     file = next((scene / "models/adapt").glob("*.json"))
     card = io.read_json(file)
-    at = scenery(scene)
-    fold = next(fold for fold in at.of("lobo") if fold.name == card["fold"])
+    data = scenery(scene)
+    fold = next(fold for fold in data.folds_of("lobo") if fold.name == card["fold"])
     sides = {"tested": fold.test, "trained": fold.train}
-    own = {name: np.unique(at.rows.indentation[rows])[:3].tolist() for name, rows in sides.items()}
+    own = {name: np.unique(data.rows.indentation[rows])[:3].tolist() for name, rows in sides.items()}
     io.write_json(file, card | {"tuning": change(card["tuning"], own)})
     refused(scene, f"{file.stem}: {sentence}")

@@ -5,14 +5,13 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.core.config import Settings, read_yaml
+from pipeline.core.seeds import rng_for
 from pipeline.dataset.grid import points_mm
 from pipeline.dataset.splits import Fold
-from pipeline.sections import Contacts
-from pipeline.seeds import rng_for
-from pipeline.settings import Settings
-from pipeline.stages._contacts import on_board
-from pipeline.stages._train import Scenery
-from pipeline.strict import read_yaml
+from pipeline.experiments.contacts.on_board import on_board
+from pipeline.experiments.contacts.settings import Contacts
+from pipeline.trials.data import SceneData
 from tests.dataset import tables
 
 ASKED = Contacts(pairs_n=40, separations_mm=(4.0, 8.0), false_alarm_fraction=0.1)
@@ -29,19 +28,19 @@ def scenery():
     near = np.exp(-((places_mm[:, None] - spots_mm) ** 2).sum(axis=2) / 50)
     db_uT = (200 * force_N[:, None] * near).astype(np.float32)
     target = np.column_stack([places_mm, force_N]).astype(np.float32)
-    return Scenery(
+    return SceneData(
         "test", Settings("ci", "ci.yaml", read_yaml(CI), {}, {}), replace(rows, db_uT=db_uT, target=target), []
     )
 
 
-def nearest(at):
+def nearest(data):
     """An exact network, for single contacts: of the row that looks most alike."""
 
     def answer(db_uT):
-        known = at.rows.db_uT / np.linalg.norm(at.rows.db_uT, axis=1, keepdims=True)
+        known = data.rows.db_uT / np.linalg.norm(data.rows.db_uT, axis=1, keepdims=True)
         which = (db_uT @ known.T).argmax(axis=1)
-        force_N = np.linalg.norm(db_uT, axis=1) / np.linalg.norm(at.rows.db_uT[which], axis=1)
-        return np.column_stack([at.rows.target[which, :2], force_N * at.rows.target[which, 2]]).astype(np.float32)
+        force_N = np.linalg.norm(db_uT, axis=1) / np.linalg.norm(data.rows.db_uT[which], axis=1)
+        return np.column_stack([data.rows.target[which, :2], force_N * data.rows.target[which, 2]]).astype(np.float32)
 
     return answer
 

@@ -1,5 +1,6 @@
 """Stages drift and variation on a skin whose field is known in closed form, with the settings of scene ci."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -8,16 +9,16 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from pipeline import io
+from pipeline.core import io
+from pipeline.core.config import Files
+from pipeline.core.errors import ParamsError
+from pipeline.core.schema import Readings
+from pipeline.core.seeds import rng_for
 from pipeline.dataset.grid import points_mm
-from pipeline.errors import ParamsError
-from pipeline.reporting.experiments import drift as drift_pages
-from pipeline.reporting.experiments import variation as variation_pages
-from pipeline.schema import Readings
-from pipeline.seeds import rng_for
-from pipeline.settings import Files
-from pipeline.stages.drift import drift
-from pipeline.stages.variation import variation
+from pipeline.experiments.drift import show as drift_pages
+from pipeline.experiments.drift.run import drift
+from pipeline.experiments.variation import show as variation_pages
+from pipeline.experiments.variation.run import variation
 from tests.dataset.tables import readings
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -59,8 +60,10 @@ def scene(tmp_path, monkeypatch) -> dict[str, Any]:
     settings["drift"]["training"]["steps_n"] = 300
     settings["variation"]["skins_n"] = 2
     shared = YAML(typ="safe").load((ROOT / "params.yaml").read_text())
-    stages = {"drift": {"ci": {"scene": "ci", "recipe": "paper"}}, "variation": {"ci": {"scene": "ci"}}}
-    plan = {"stages": stages | {"split": {"ci": {"captures": []}}}}
+    item = {"scene": "ci", "captures": []}
+    stages = {"drift": {"ci": item | {"drift": {"training": {"recipe": "paper"}}}}, "variation": {"ci": item}}
+    plan = {"stages": stages}
+    shutil.copy(ROOT / "dvc.yaml", tmp_path)
     for name, words in {"ci.yaml": settings, "params.yaml": shared, "plan.yaml": plan}.items():
         with (tmp_path / name).open("w") as stream:
             YAML().dump(words, stream)

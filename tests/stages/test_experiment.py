@@ -2,8 +2,8 @@
 
 import json
 
-from pipeline import io
-from pipeline.stages._experiment import read_losses, write_answer
+from pipeline.core import io
+from pipeline.experiments.answer import read_losses, write_answer
 from tests.dataset import tables
 
 

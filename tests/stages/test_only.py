@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.errors import SchemaError
-from pipeline.stages._only import only
+from pipeline.core.errors import SchemaError
+from pipeline.experiments.only import only
 
 
 def test_the_one_capture_of_a_folder_is_given():

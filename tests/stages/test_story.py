@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 from ruamel.yaml import YAML
 
-from pipeline import io
+from pipeline.core import io
 from pipeline.learning.standardise import Scaler
 from pipeline.questions import EXPERIMENTS
 from pipeline.reporting.checklist import read_rows, resolve

@@ -1,6 +1,6 @@
 """A small scene to simulate, as plain words, and small changes of it."""
 
-from pipeline.strict import parse
+from pipeline.core.config import parse
 from pipeline.synthesis.capture import Synthesis
 from tests.physics.test_board import SPREADS
 

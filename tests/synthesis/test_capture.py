@@ -5,8 +5,8 @@ import pytest
 
 from pipeline.capture.stream import FrameStream
 from pipeline.capture.wire import concatenate
+from pipeline.core.errors import ParamsError
 from pipeline.dataset.grid import points_mm
-from pipeline.errors import ParamsError
 from pipeline.physics.board import draw_board
 from pipeline.physics.skin import changes_of_field, draw_skin, forces
 from pipeline.synthesis.capture import record, roster

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
+from pipeline.core.seeds import rng_for
 from pipeline.physics.board import draw_board
 from pipeline.physics.friction import Friction
 from pipeline.physics.skin import changes_of_field, draw_skin, forces
 from pipeline.physics.viscoelastic import Relaxation, force_left
 from pipeline.physics.wear import Ageing
-from pipeline.seeds import rng_for
 from pipeline.synthesis.felt import Terms, feel
 from tests.synthesis.scene import synthesis
 

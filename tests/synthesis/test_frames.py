@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from pipeline.core.seeds import rng_for
 from pipeline.physics.board import Board
 from pipeline.physics.sensor import ChipDesign
 from pipeline.physics.warmth import REMANENCE_PER_K, Temperature
-from pipeline.seeds import rng_for
 from pipeline.synthesis import frames
 from pipeline.synthesis.felt import Felt
 from pipeline.synthesis.frames import Reader, read_frames

@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 
 from pipeline.capture.folder import write_capture
 from pipeline.capture.sd_card import read_log
+from pipeline.core.errors import CaptureError, ParamsError
+from pipeline.core.seeds import rng_for
 from pipeline.dataset.captures import open_capture
-from pipeline.errors import CaptureError, ParamsError
 from pipeline.physics.skin import draw_skin, forces
-from pipeline.seeds import rng_for
 from pipeline.synthesis.capture import record
 from pipeline.synthesis.files import to_files
 from pipeline.synthesis.pressing import LIFTED_MM, depths_under, footfalls, half_sine, presses, weights_N

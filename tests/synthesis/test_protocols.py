@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from pipeline.core.seeds import rng_for
 from pipeline.dataset.grid import points_mm
-from pipeline.seeds import rng_for
 from pipeline.synthesis.protocols import Drag, Grid, Hand, make_plan
 
 SHARED = {"boards": "rigid", "skins_n": 1, "terms": ()}

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.seeds import rng_for
+from pipeline.core.seeds import rng_for
 from pipeline.synthesis.protocols import Drag, Grid, make_plan
 from pipeline.synthesis.rig import Rig, chunks, draw_clock, misplace, probe_log, timeline
 from tests.synthesis.scene import SECTIONS

@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import kstest
 
-from pipeline.errors import ParamsError
-from pipeline.seeds import rng_for
-from pipeline.strict import parse
+from pipeline.core.config import parse
+from pipeline.core.errors import ParamsError
+from pipeline.core.seeds import rng_for
 from pipeline.synthesis.protocols import Scatter, make_plan
 
 SCATTER = {

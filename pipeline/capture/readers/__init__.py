@@ -6,7 +6,7 @@ from typing import Protocol
 
 from pipeline.capture.header import Header
 from pipeline.capture.readers import eflesh, ini, lab
-from pipeline.schema import Readings
+from pipeline.core.schema import Readings
 
 
 class Reader(Protocol):

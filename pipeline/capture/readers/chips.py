@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 
 from pipeline.capture import faults
 from pipeline.capture.header import Header
-from pipeline.errors import CaptureError, complain
+from pipeline.core.errors import CaptureError, complain
 
 GRID_ROWS_N = 1000  # real recordings show each sound chip's grid in blocks of 400 rows; in 200 it may hide
 

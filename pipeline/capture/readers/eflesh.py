@@ -15,8 +15,8 @@ from pipeline.capture.readers.chips import find_whole_rows
 from pipeline.capture.readers.passes import find_passes
 from pipeline.capture.readers.table import read_cells, to_numbers
 from pipeline.capture.readers.units import check_depths, check_fields, check_forces, check_places, check_touch
-from pipeline.errors import CaptureError, complain
-from pipeline.schema import AXES_PER_CHIP_N, Readings
+from pipeline.core.errors import CaptureError, complain
+from pipeline.core.schema import AXES_PER_CHIP_N, Readings
 
 SENSOR = "sensor.csv"
 CHANGES = "sensor_post_baselines.csv"

@@ -17,8 +17,8 @@ from pipeline.capture.header import Header
 from pipeline.capture.readers.chips import find_whole_rows
 from pipeline.capture.readers.table import read_cells, to_numbers
 from pipeline.capture.readers.units import check_fields, check_forces, check_places, check_touch
-from pipeline.errors import CaptureError, complain
-from pipeline.schema import Readings
+from pipeline.core.errors import CaptureError, complain
+from pipeline.core.schema import Readings
 
 READINGS = "readings.csv"
 FILES = (READINGS,)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from pipeline.errors import CaptureError, complain
+from pipeline.core.errors import CaptureError, complain
 
 # No reading, place or unix time of these recordings comes near it; float32 holds it without overflow.
 MAGNITUDE_MAX = 1e10

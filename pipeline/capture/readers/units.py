@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.capture import faults
-from pipeline.errors import CaptureError, complain
+from pipeline.core.errors import CaptureError, complain
 
 # MLX90393 data sheet, table 17: 16 bits of the coarsest step, 9.680 uT (z, GAIN_SEL 0, RES 3).
 FULL_SCALE_uT = 32768 * 9.680

@@ -15,7 +15,7 @@ from pipeline.capture.header import Header
 from pipeline.capture.probe import FIRST_ROW, ProbeLog
 from pipeline.capture.readers.units import check_depths, check_fields, check_forces, check_places, check_touch
 from pipeline.capture.wire import Frames
-from pipeline.errors import CaptureError, complain
+from pipeline.core.errors import CaptureError, complain
 
 SCALE_FRAMES_N = 400  # real recordings show each sound chip's grid in so many frames; in 200 it may hide
 ORDER_OF_OTHER: Mapping[str | None, tuple[str, int]] = {

@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline import seeds
 from pipeline.capture import faults
 from pipeline.capture.readers.chips import GRID_ROWS_N, find_whole_rows
-from pipeline.errors import CaptureError
+from pipeline.core import seeds
+from pipeline.core.errors import CaptureError
 from tests.capture.headers import make_header
 
 HEADER = make_header()

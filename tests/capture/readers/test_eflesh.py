@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from pipeline.capture.header import Header
 from pipeline.capture.readers import eflesh
-from pipeline.errors import CaptureError
+from pipeline.core.errors import CaptureError
 from tests.capture.headers import make_header
 
 CHIPS_N = 2

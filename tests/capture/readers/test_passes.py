@@ -7,8 +7,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline import seeds
 from pipeline.capture.readers.passes import find_passes
+from pipeline.core import seeds
 
 
 def raster(columns_n: int, rows_n: int, presses_n: int) -> np.ndarray:

@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline import seeds
 from pipeline.capture.readers import READERS
 from pipeline.capture.readers.units import check_depths, check_fields, check_forces, check_places, check_touch
-from pipeline.errors import CaptureError
+from pipeline.core import seeds
+from pipeline.core.errors import CaptureError
 
 SKIN_uT = np.array([[-541.2, 917.2, 44.9], [120.0, -3600.0, 700.0]])
 # Step and usual field of real boards: ReSkin with its own skins, eFlesh, and eFlesh at another gain.

@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline import seeds
 from pipeline.capture import faults, probe
 from pipeline.capture.header import Firmware
 from pipeline.capture.readers.watch import SCALE_FRAMES_N, Watch, check_log
 from pipeline.capture.wire import Frames
-from pipeline.errors import CaptureError
+from pipeline.core import seeds
+from pipeline.core.errors import CaptureError
 from tests.capture.headers import make_header
 from tests.capture.signals import frames_of
 

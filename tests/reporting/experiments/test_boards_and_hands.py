@@ -4,7 +4,9 @@ import xml.etree.ElementTree as ET
 
 import pytest
 
-from pipeline.reporting.experiments import flexible, manual, shear
+from pipeline.experiments.flexible import show as flexible
+from pipeline.experiments.manual import show as manual
+from pipeline.experiments.shear import show as shear
 from pipeline.reporting.paper import FLEXIBLE, MANUAL, SHEAR
 from pipeline.reporting.shown import to_markdown
 from tests.reporting.test_work_precision import said

@@ -3,7 +3,7 @@ import xml.etree.ElementTree as ET
 
 import pytest
 
-from pipeline.reporting.experiments.drift import figures, tables
+from pipeline.experiments.drift.show import figures, tables
 from pipeline.reporting.shown import to_markdown
 
 

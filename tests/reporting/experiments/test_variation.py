@@ -1,6 +1,6 @@
 import xml.etree.ElementTree as ET
 
-from pipeline.reporting.experiments.variation import figures, tables
+from pipeline.experiments.variation.show import figures, tables
 from pipeline.reporting.shown import to_markdown
 
 

@@ -1,0 +1,36 @@
+"""The errors a user can cause: one class a boundary, one sentence each.
+
+Every message reads `<where>: <what> must be <rule>; got <value>. <what to try>`.
+Raised at the door and shown without a traceback; `assert` is for our own mistakes.
+"""
+
+
+class ReskinError(ValueError):
+    """Bad input from outside: a recording, a parameter or a file that breaks a contract."""
+
+    exit_code = 2
+
+
+class CaptureError(ReskinError):
+    """Bytes, headers or recordings that cannot be read."""
+
+
+class SchemaError(ReskinError):
+    """A table whose columns, types or units are not those of `pipeline.core.schema`."""
+
+
+class ParamsError(ReskinError):
+    """A YAML file, a scene or a command line that asks for what cannot be."""
+
+
+class TrainingError(ReskinError):
+    """A training that cannot go on: no rows, or a loss that is no longer finite."""
+
+
+class LeakError(ReskinError):
+    """A result that would rest on rows it is tested on."""
+
+
+def complain(where: object, what: str, rule: str, got: object, remedy: str) -> str:
+    """Compose the one sentence pattern that every error of this project follows."""
+    return f"{where}: {what} must be {rule}; got {got}. {remedy}"

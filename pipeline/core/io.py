@@ -1,0 +1,169 @@
+"""Path <-> object: Parquet, safetensors, JSON, CSV. The only module of the core that opens files for writing.
+
+Everything is written to a temporary name beside its target and renamed, so a killed process leaves either the
+old file or the new one, never half of it. Refuses to know what the objects mean.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import safetensors
+import safetensors.numpy
+
+from pipeline.core.errors import SchemaError, complain
+from pipeline.core.schema import Readings, arrow_schema, from_table, to_table
+
+ACCOUNT_KEY = b"reskin.account"
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Give a temporary sibling of `path` to write (a file or a folder); rename it when the block ends well."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    remove(temporary)
+    try:
+        yield temporary
+        if temporary.is_dir():
+            remove(path)
+        elif path.is_dir():
+            raise SchemaError(complain(path, "a file to write", "no folder", "a folder", "Choose another name."))
+        temporary.replace(path)
+    finally:
+        remove(temporary)
+
+
+@contextmanager
+def restoring(*files: Path) -> Iterator[None]:
+    """Give files their old content back if the block fails, Ctrl-C included."""
+    before = {file: file.read_bytes() for file in files}
+    try:
+        yield
+    except BaseException:
+        for file, content in before.items():
+            if file.read_bytes() != content:
+                with replacing(file) as temporary:
+                    temporary.write_bytes(content)
+        raise
+
+
+def remove(path: Path) -> None:
+    """Delete a file or a folder, if it is there."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def sha256(path: Path) -> str:
+    """Hash a file."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def read_bytes(path: Path) -> bytes:
+    """Read a whole file; raise `SchemaError` if it is not one."""
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise SchemaError(complain(path, "the file", "readable", error.strerror, "Check the path.")) from None
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file, UTF-8."""
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
+    """Write a folder of texts by file name, in place of what it held."""
+    with replacing(folder) as temporary:
+        temporary.mkdir()
+        for name, text in texts.items():
+            write_text(temporary / name, text)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write JSON with two-space indent; NaN and infinity are refused, as JSON has neither."""
+    write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
+
+
+def read_json(path: Path) -> Any:
+    """Read JSON; raise `SchemaError` with the place of the first fault."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise SchemaError(complain(path, "the file", "JSON", error, "Run its stage again.")) from None
+
+
+def write_tensors(path: Path, tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> None:
+    """Write named arrays and a few words about them as safetensors."""
+    with replacing(path) as temporary:
+        dense = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
+        safetensors.numpy.save_file(dense, temporary, dict(metadata))
+
+
+def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """Read what `write_tensors` wrote; no pickle is ever opened."""
+    try:
+        with safetensors.safe_open(path, framework="numpy") as file:
+            return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}
+    except (safetensors.SafetensorError, OSError) as error:
+        raise SchemaError(complain(path, "the file", "safetensors", error, "Delete it, and train again.")) from None
+
+
+def write_table(path: Path, table: pa.Table) -> None:
+    """Write an Arrow table as Parquet (zstd)."""
+    with replacing(path) as temporary:
+        pq.write_table(table, temporary, compression="zstd")
+
+
+def read_table(path: Path) -> pa.Table:
+    """Read an Arrow table."""
+    return _open_parquet(path).read()
+
+
+def write_readings(path: Path, blocks: Iterable[Readings], account: Mapping[str, int]) -> None:
+    """Write the readings of one capture block by block; `account` may still fill while blocks arrive."""
+    with replacing(path) as temporary:
+        writer: pq.ParquetWriter | None = None
+        for block in blocks:
+            if writer is None:
+                writer = pq.ParquetWriter(temporary, arrow_schema(block.chips_n), compression="zstd")
+            writer.write_table(to_table(block))
+        if writer is None:
+            raise SchemaError(
+                complain(path, "a capture", "at least one reading", "none", "See what was dropped, and why.")
+            )
+        writer.add_key_value_metadata({ACCOUNT_KEY.decode(): json.dumps(dict(account), sort_keys=True)})
+        writer.close()
+
+
+def read_readings(path: Path) -> Readings:
+    """Read one capture's readings."""
+    return from_table(_open_parquet(path).read(), str(path))
+
+
+def read_account(path: Path) -> dict[str, int]:
+    """Read what ingest counted for one capture: bytes, frames, rows, and what was dropped, by reason."""
+    metadata = _open_parquet(path).metadata.metadata or {}
+    if ACCOUNT_KEY not in metadata:
+        raise SchemaError(complain(path, "the file's metadata", "an account of losses", "none", "Ingest it again."))
+    account: dict[str, int] = json.loads(metadata[ACCOUNT_KEY])
+    return account
+
+
+def _open_parquet(path: Path) -> pq.ParquetFile:
+    try:
+        return pq.ParquetFile(path)
+    except (pa.ArrowInvalid, OSError) as error:
+        raise SchemaError(complain(path, "the file", "readable Parquet", error, "Run ingest again.")) from None

@@ -1,0 +1,134 @@
+"""Where a result came from: the commit of the code, the machine, the seconds. Knows no result."""
+
+import os
+import platform
+import resource
+import subprocess
+import sys
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from pipeline.core import io
+from pipeline.core.numerics import departures
+
+CODE = Path(__file__).parents[1]
+NO_CODE = ("plan.yaml", "scenes")  # settings, which stand beside the code: they decide results by their values
+SECONDS = Path(".reskin/seconds")  # what was timed here: beside the pipeline, as costs are
+CPUINFO = Path("/proc/cpuinfo")  # Linux only
+INSTRUCTIONS = {"avx2": "AVX2", "avx512f": "AVX-512", "amx_tile": "AMX", "asimd": "NEON", "sve": "SVE"}  # by CPU flag
+
+
+def code_version() -> str:
+    """The last commit that changed code in `pipeline/`, `+dirty` when it was changed since, `unknown` outside git.
+
+    Not the checkout's HEAD: a later commit of results must not make equal results look different.
+    """
+    of_code = (str(CODE), *(f":(exclude){CODE / name}" for name in NO_CODE))
+    commit = _git("log", "-1", "--format=%h", "--abbrev=12", "--", *of_code)
+    if not commit:
+        return "unknown"
+    return commit + ("+dirty" if _git("status", "--porcelain", "--", *of_code) else "")
+
+
+def device() -> str:
+    """The machine in words: processor and instruction sets, cores that this process may use, Python."""
+    cores_n = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    said = CPUINFO.read_text(encoding="utf-8", errors="replace") if CPUINFO.exists() else ""
+    named = processor(said, os.environ, otherwise=platform.processor())
+    return f"cpu {platform.machine()} {named}, {cores_n} cores, Python {platform.python_version()}"
+
+
+def processor(cpuinfo: str, environ: Mapping[str, str], *, otherwise: str) -> str:
+    """The processor's model, the instruction sets that it offers, and what of `numerics` the user has set.
+
+    `cpuinfo` is Linux's /proc/cpuinfo; where it names no model, `otherwise` does.
+    """
+    lines = [line.partition(":") for line in cpuinfo.splitlines()]
+    words = {name.strip().lower(): value.strip() for name, _, value in reversed(lines)}  # the first processor's
+    flags = set(words.get("flags", words.get("features", "")).split())
+    model = words.get("model name") or otherwise or "unknown processor"
+    offered = [name for flag, name in INSTRUCTIONS.items() if flag in flags]
+    held = departures(environ)
+    plain = " ".join(model.replace("(R)", "").replace("(TM)", "").split())
+    told = "; ".join(part for part in (", ".join(offered), ", ".join(held)) if part)
+    return f"{plain} ({told})" if told else plain
+
+
+def begin_cost(folder: Path, stage: str) -> None:
+    """Forget the trainings of a stage's last run, which begins anew."""
+    io.remove(_trainings_file(folder, stage))
+
+
+def note_trainings(folder: Path, stage: str, trained: Mapping[str, tuple[float, bool]], waited_s: float) -> None:
+    """Add trainings to those of a stage's run: by key the seconds when computed, and whether an earlier run did.
+
+    `waited_s` is what the stage waited for them.
+    """
+    before = _read_trainings(folder, stage)
+    reused = {key for key, (_, again) in trained.items() if again} - set(before["computed_s"])
+    io.write_json(
+        _trainings_file(folder, stage),
+        {
+            "waited_s": before["waited_s"] + waited_s,
+            "computed_s": before["computed_s"] | {key: seconds for key, (seconds, _) in trained.items()},
+            "reused": sorted({*before["reused"], *reused}),
+        },
+    )
+
+
+def note_cost(folder: Path, stage: str, seconds: float) -> None:
+    """Keep what a stage cost beside the pipeline, never in an output: it differs between identical runs.
+
+    A stage that does not run, or that DVC restores, keeps the cost that it had when it ran.
+    """
+    peaks = (resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    unit = 1 if sys.platform == "darwin" else 1024  # bytes on macOS, KiB elsewhere
+    own = _read_trainings(folder, stage)
+    fresh_s = sum(computed_s for key, computed_s in own["computed_s"].items() if key not in own["reused"])
+    io.write_json(
+        folder / f"{stage}.json",
+        {
+            "seconds": round(seconds, 2),
+            # Side by side they took less than their sum; what else passed meanwhile, as imports, counts here.
+            "other_s": round(max(seconds - min(own["waited_s"], fresh_s), 0.0), 2),
+            "trainings_s": own["computed_s"],
+            "reused_n": len(own["reused"]),
+            "peak_process_memory_MB": round(max(peaks) * unit / 1e6, 1),
+        },
+    )
+    io.remove(_trainings_file(folder, stage))
+
+
+def read_costs(folder: Path) -> dict[str, dict[str, Any]]:
+    """Read the costs of the stages that ran here, by stage; those of an older form tell nothing of trainings."""
+    costs = {file.stem: io.read_json(file) for file in sorted(folder.glob("*.json"))}
+    return {stage: cost for stage, cost in costs.items() if "trainings_s" in cost}
+
+
+def add_up_costs(costs: Iterable[Mapping[str, Any]]) -> float:
+    """Add what stages cost when they were computed, in seconds; a training that two of them share counts once.
+
+    Trainings are added as if one ran after another: where two run side by side, less time passes.
+    """
+    own = list(costs)
+    trainings_s = {key: seconds for cost in own for key, seconds in cost["trainings_s"].items()}
+    return float(sum(cost["other_s"] for cost in own) + sum(trainings_s.values()))
+
+
+def _trainings_file(folder: Path, stage: str) -> Path:
+    return folder / "running" / f"{stage}.json"
+
+
+def _read_trainings(folder: Path, stage: str) -> dict[str, Any]:
+    file = _trainings_file(folder, stage)
+    none: dict[str, Any] = {"waited_s": 0.0, "computed_s": {}, "reused": []}
+    return io.read_json(file) if file.exists() else none
+
+
+def _git(*words: str) -> str:
+    try:
+        done = subprocess.run(["git", *words], cwd=CODE, capture_output=True, text=True, check=False)
+    except OSError:
+        return ""  # no git on this machine: the version is reported as unknown
+    return done.stdout.strip() if done.returncode == 0 else ""

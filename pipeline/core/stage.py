@@ -1,0 +1,59 @@
+"""What every stage does around its work: argv, a word if MLflow is away, one-sentence errors, its cost.
+
+In: the stage's function; its parameters are its options. Refuses to know what the stage does.
+"""
+
+import argparse
+import inspect
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.core.errors import ReskinError
+from pipeline.core.provenance import begin_cost, note_cost
+from pipeline.core.server import TrackingAway, probe, server_uri
+
+COSTS = Path(".reskin/costs")
+
+
+def run(work: Callable[..., None]) -> None:
+    """Call `work` with options of its own names (`--scene quick`), or of a bundle those within; all are required."""
+    stage = work.__name__
+    parser = argparse.ArgumentParser(prog=f"sh pipeline/run.sh {stage}", description=work.__doc__)
+    kinds = {name: parameter.annotation for name, parameter in inspect.signature(work).parameters.items()}
+    bundles = {name: [one.name for one in fields(kind)] for name, kind in kinds.items() if is_dataclass(kind)}
+    for name, kind in kinds.items():
+        for option in bundles.get(name, [name]):
+            parser.add_argument(f"--{option.replace('_', '-')}", type=Path if name in bundles else kind, required=True)
+    arguments = vars(parser.parse_args())
+    for name, options in bundles.items():
+        arguments[name] = kinds[name](*(arguments.pop(option) for option in options))
+    try:
+        probe(server_uri())
+    except TrackingAway as away:
+        say(f"warning: {away}")
+    start_s, costs, unit = time.monotonic(), COSTS / arguments["scene"], _unit(stage, arguments)
+    begin_cost(costs, unit)
+    try:
+        work(**arguments)
+    except ReskinError as error:
+        say(f"error: {error}")
+        sys.exit(error.exit_code)
+    note_cost(costs, unit, time.monotonic() - start_s)
+
+
+def _unit(stage: str, arguments: Mapping[str, Any]) -> str:
+    """Name what ran: some stages run for each recorded capture, or for each protocol's folder."""
+    of = {"ingest": "indentations", "ingest_simulated": "indentations", "describe": "indentations", "simulate": "raw"}
+    if stage not in of:
+        return stage
+    own = arguments[of[stage]].stem.removeprefix(arguments["scene"]).strip("-")
+    return f"{stage}-{own}" if own else stage
+
+
+def say(sentence: str) -> None:
+    """Tell the person in front of the terminal, at once."""
+    print(sentence, file=sys.stderr, flush=True)

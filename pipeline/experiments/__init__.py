@@ -1,0 +1,1 @@
+"""One folder an experiment: `run.py` computes its answer, `show.py` makes tables and figures of it."""

@@ -1,0 +1,1 @@
+"""Fields from outside, and iron nearby (paper section 7)."""

@@ -1,0 +1,37 @@
+"""What the stages of the paper's experiments share: the captures of one folder, and the answer. Knows no argv."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pipeline.core import io
+from pipeline.core.errors import SchemaError, complain
+from pipeline.core.schema import Readings
+
+NO_CAPTURES: Mapping[str, Any] = {"accounts": [], "left_out": {}}  # of its own: it asks the main ones
+
+
+def read_folder(indentations: Path, names: tuple[str, ...] = ()) -> list[Readings]:
+    """Read the named captures of a folder in order of name; without names, all that its one stage wrote."""
+    files = [indentations / f"{name}.parquet" for name in sorted(names)] or sorted(indentations.glob("*.parquet"))
+    if not files:
+        raise SchemaError(complain(str(indentations), "captures", "one or more", "none", "Ingest them again."))
+    return [io.read_readings(file) for file in files]
+
+
+def read_losses(indentations: Path, left_out: Mapping[str, int]) -> dict[str, Any]:
+    """Read the account of every capture of a folder, and note what was left out of its rows."""
+    accounts = [io.read_account(file) for file in sorted(indentations.glob("*.parquet"))]
+    return {"accounts": accounts, "left_out": dict(left_out)}
+
+
+def write_answer(
+    answer: Path, numbers: Mapping[str, Any], drawn: Mapping[str, Any], losses: Mapping[str, Any] = NO_CAPTURES,
+    trainings: Mapping[str, int] | None = None,
+) -> None:  # fmt: skip
+    """Write what numbers.json takes over as it is, what only figures show, what was lost of captures of its own.
+
+    `trainings` counts the networks that the stage trained, and those that collapsed.
+    """
+    words = {"numbers": dict(numbers), "drawn": dict(drawn), "losses": dict(losses)}
+    io.write_json(answer, words if trainings is None else words | {"trainings": dict(trainings)})

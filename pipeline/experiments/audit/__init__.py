@@ -1,0 +1,1 @@
+"""Whether test rows leaked into training: folds, copies, scalers, settings."""

@@ -1,0 +1,1 @@
+"""Two contacts at once (paper section 7)."""

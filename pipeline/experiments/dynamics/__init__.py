@@ -1,0 +1,1 @@
+"""Presses that never rest (paper section 7)."""

@@ -1,0 +1,1 @@
+"""Networks of rigid boards on flexible ones (paper section 5)."""

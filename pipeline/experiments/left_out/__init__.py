@@ -1,0 +1,1 @@
+"""What the physics leaves out, and what that costs."""

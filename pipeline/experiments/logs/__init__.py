@@ -1,0 +1,1 @@
+"""Force and place from an SD card's log (paper section 6)."""

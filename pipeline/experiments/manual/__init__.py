@@ -1,0 +1,1 @@
+"""Networks adapted by hand pokes (paper section 5)."""

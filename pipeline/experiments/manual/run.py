@@ -1,0 +1,73 @@
+"""Stage manual: networks adapted to new skins by pokes along lines by hand (paper section 5, manual indentations)."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.core.config import Files, read_settings
+from pipeline.core.errors import SchemaError, complain
+from pipeline.core.stage import run
+from pipeline.dataset.lines import Lines
+from pipeline.dataset.splits import Fold
+from pipeline.dataset.stacked import hand_rows, shifted, stack
+from pipeline.experiments.answer import read_folder, read_losses, write_answer
+from pipeline.experiments.manual.parts import GRID, answer_manual
+from pipeline.learning.cell import Cell
+from pipeline.learning.recipe import HEADLINE, Adaptations
+from pipeline.learning.recipe import adaptations as adaptations_of
+from pipeline.trials.adapting import Pokes, Starts, adaptation, own_starts, pool_lines, read_starts
+from pipeline.trials.answers import answers_after, answers_before
+from pipeline.trials.arms import AFTER, CONTROL, Answered
+from pipeline.trials.data import SceneData, read_data
+
+
+def manual(scene: str, files: Files, folds: Path, main: Path, indentations: Path, started: Path, answer: Path) -> None:
+    """Adapt to every skin that was poked by hand, and by as many pokes of the robot; test on the robot's grid."""
+    data = read_data(read_settings("manual", scene, files), main, folds)
+    starts = read_starts(started)
+    asked = adaptations_of(data.settings)
+    poked, found = hand_rows(read_folder(indentations))
+    lines = {skin: shifted(own, len(data.rows)) for skin, own in found.items()}
+    data = replace(data, rows=stack(data.rows, poked))
+    cells: list[tuple[str, Cell]] = []
+    answers: list[Answered] = []
+    for skin, own in lines.items():
+        fold = _fold_without(data, str(poked.board[poked.skin == skin][0]))
+        answers += answers_before(data, fold, asked.recipes[HEADLINE], starts, skin)
+        cells += _cells(data, fold, asked, starts, (skin, own))
+    after, trainings = answers_after(data, cells, "manual")
+    pokes_n, lines_n = zip(*((_pokes_n(data, own), len(np.unique(own.line_i))) for own in lines.values()), strict=True)
+    numbers = answer_manual([*answers, *after], pokes_n=pokes_n, lines_n=lines_n)
+    write_answer(answer, numbers, {}, read_losses(indentations, poked.dropped), trainings)
+
+
+def _cells(
+    data: SceneData, fold: Fold, asked: Adaptations, starts: Starts, poked: tuple[str, Lines]
+) -> Iterator[tuple[str, Cell]]:
+    """Make the arms of one skin: by hand, by the robot, and as long without pokes if there is such a recipe."""
+    (skin, by_hand), headline = poked, (HEADLINE, asked.recipes[HEADLINE])
+    for seed_i in own_starts(starts, headline[1].base, fold):
+        by_robot = pool_lines(data, fold, skin, pokes_n=_pokes_n(data, by_hand), seed_i=seed_i)
+        pokes = Pokes("manual", skin, seed_i, "hand", by_hand)
+        yield AFTER, adaptation(data, fold, headline, starts, pokes)
+        yield GRID, adaptation(data, fold, headline, starts, replace(pokes, what="grid", lines=by_robot))
+        if CONTROL in asked.recipes:
+            yield CONTROL, adaptation(data, fold, (CONTROL, asked.recipes[CONTROL]), starts, pokes)
+
+
+def _pokes_n(data: SceneData, lines: Lines) -> int:
+    return len(np.unique(data.rows.indentation[lines.row]))
+
+
+def _fold_without(data: SceneData, board: str) -> Fold:
+    folds = {fold.name: fold for fold in data.folds_of("lobo")}
+    if board not in folds:
+        remedy = "Poke skins by hand that the grid knows too."
+        raise SchemaError(complain("question manual", f"board {board}", f"one of {sorted(folds)}", "none", remedy))
+    return folds[board]
+
+
+if __name__ == "__main__":
+    run(manual)

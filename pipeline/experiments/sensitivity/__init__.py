@@ -1,0 +1,1 @@
+"""The smallest weight told apart (paper section 6)."""

@@ -1,0 +1,1 @@
+"""Place and all three forces of dragged lines (paper section 4)."""

@@ -1,0 +1,1 @@
+"""Many boards under one skin (paper section 6)."""

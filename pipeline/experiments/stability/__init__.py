@@ -1,0 +1,1 @@
+"""What the stiff, the extreme and the broken do to physics, chip, wire and learning."""

@@ -1,0 +1,234 @@
+"""What the extreme does to learning (PHYSICS 10). In: a seed. Out: cases, tried on small trainings of the real engine.
+
+Refuses to know simulated skins: rows are made up, in uT, mm and N. Leaks between folds are the audit's.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from jaxtyping import Float32
+
+from pipeline.core.seeds import rng_for
+from pipeline.dataset.rows import Rows
+from pipeline.dataset.splits import Split, draw_folds
+from pipeline.evaluation.metrics import METRICS, score
+from pipeline.experiments.stability.cases import Case, measured, refused, told
+from pipeline.learning.cell import Cell, FewLabels, Measured, Start, Trained
+from pipeline.learning.recipe import Labelling, Recipe
+from pipeline.learning.stack import train_stack
+from pipeline.learning.train import BLOCK_STEPS_N
+
+AREA = "learning"
+ROWS_N, TRAIN_N, CHANNELS_N = 240, 160, 15
+SIGNAL_uT = 50.0
+MIDDLE, REACH = np.array([8.0, 8.0, 5.0]), np.array([8.0, 8.0, 4.4])  # mm, mm, N: 0.6 to 9.4 N, as recorded (FACTS 3)
+STEPS_N = BLOCK_STEPS_N  # the loop looks at its loss once
+CONSTANT_uT = 12.3
+BOTTLENECK = "layer3.weight"
+ROUNDING = 1e-4  # of weights near 0.1: float32 sums of another order differ by 6e-8, and 50 steps amplify it
+SCALE_POWERS = (-20, -10, 10, 20)  # of two, about 1e-6 to 1e6: float32 holds labels of these scales without rounding
+RECIPE = Recipe(
+    architecture="paper", inputs="raw", scaling="standard", triplet_weight=0.0, steps_n=STEPS_N, batch_n=32,
+    rate_max=3e-3, gradient_norm_max=1.0, weight_decay=0.0,
+)  # fmt: skip
+
+
+def learning_cases(seed: int) -> list[Case]:
+    """Try every extreme case of scalers, triplets, the loop and folds."""
+    return [*scaling_cases(seed), *triplet_cases(seed), *loop_cases(seed), *fold_cases()]
+
+
+def scaling_cases(seed: int) -> list[Case]:
+    """Try channels that never move, and labels of other scales."""
+    cell, rows = _cell(seed), _rows(seed)
+    return [
+        _constant(cell, rows, [7], "a channel that never moves"),
+        _constant(cell, rows, list(range(CHANNELS_N)), "no channel ever moves, as without a magnet"),
+        *_label_scales(cell, rows),
+    ]
+
+
+def triplet_cases(seed: int) -> list[Case]:
+    """Try readings that are all alike, and places that are all equally far."""
+    cell, rows = _cell(seed), _rows(seed)
+    return [_alike(cell, rows), *_tied(cell, rows)]
+
+
+def loop_cases(seed: int) -> list[Case]:
+    """Try rates and weights that overflow, hardly any rows, and the same seed twice."""
+    cell, rows = _cell(seed), _rows(seed)
+    return [
+        *(_explodes(cell, rows, rate) for rate in (1e1, 1e10)),
+        _beside_one_that_overflows(cell, rows),
+        *_few(cell, rows),
+        _again(cell, rows),
+    ]
+
+
+def fold_cases() -> list[Case]:
+    """Ask for folds of more groups than there are."""
+    asked = {
+        "one board, to be left out": ("lobo", ["b1"], Split()),
+        "two boards, of which two are trained on to test others": ("transfer", ["b1", "b2"], Split(transfer_skins_n=2)),
+        "three skins to train on where two are": (
+            "sensors", ["b1", "b2", "b3"], Split(sensors_skins_n=(3,), sensors_draws_n=1),
+        ),
+    }  # fmt: skip
+    return [
+        refused(AREA, case, should="refused, with what there is",
+                attempt=partial(draw_folds, Rows.of_labels(boards, skins=boards), [question], split, 0))
+        for case, (question, boards, split) in asked.items()
+    ]  # fmt: skip
+
+
+def _cell(seed: int) -> Cell:
+    return Cell("stability", "paper", RECIPE, "f", seed, 0, np.arange(TRAIN_N), np.arange(TRAIN_N, ROWS_N))
+
+
+def _rows(seed: int) -> Measured:
+    signal = rng_for(seed, "stability", "learning").normal(0, 1, (ROWS_N, CHANNELS_N))
+    target = MIDDLE + REACH * np.tanh(signal[:, :3])
+    return Measured((SIGNAL_uT * signal).astype(np.float32), target.astype(np.float32), np.arange(ROWS_N) % 2)
+
+
+def _constant(cell: Cell, rows: Measured, channels: list[int], case: str) -> Case:
+    db_uT = rows.db_uT.copy()
+    db_uT[:, channels] = CONSTANT_uT
+    trained = _train(cell, replace(rows, db_uT=db_uT))
+    seen = float(np.abs(trained.scaler.encode(db_uT)[:, channels]).max())
+    scale_uT = trained.scaler.input_scale[channels].min()
+    happened = f"its scale {scale_uT:.0e} uT, at most {seen:g} seen; {_words(trained)}"
+    return measured(AREA, case, should="seen as 0 by a floor under its scale; trained as ever", happened=happened,
+                    error=seen if _is_sound(trained) else np.inf, limit=0.0)  # fmt: skip
+
+
+def _alike(cell: Cell, rows: Measured) -> Case:
+    same = replace(rows, db_uT=np.full_like(rows.db_uT, CONSTANT_uT))
+    plain, pulled = (_train(_changed(cell, triplet_weight=weight), same) for weight in (0.0, 1e3))
+    apart = _apart(plain.weights, pulled.weights)
+    happened = f"weights {apart:g} apart from those without triplets after {STEPS_N} steps; {_words(pulled)}"
+    should = "loss 0 and a finite gradient of 0: whatever its weight, it pulls nowhere"
+    return measured(AREA, "triplets of identical readings, weighed 1000", should=should, happened=happened,
+                    error=apart if _is_sound(pulled) else np.inf, limit=0.0)  # fmt: skip
+
+
+def _tied(cell: Cell, rows: Measured) -> list[Case]:
+    cell = _changed(cell, triplet_weight=0.1)
+    target = rows.target.copy()
+    target[:, :2] = MIDDLE[:2]
+    attempts = {
+        "all pokes of a skin on one place": (cell, replace(rows, target=target)),
+        "two pokes a skin: from each, only the other one": (replace(cell, train=np.arange(4)), rows),
+    }
+    should = "refused: nothing is nearer than anything, and no sampler is endless"
+    return [refused(AREA, case, should=should, attempt=partial(_train, *at)) for case, at in attempts.items()]
+
+
+def _explodes(cell: Cell, rows: Measured, rate: float) -> Case:
+    start, steps_n = _start(cell, rows, 1e3), 3 * STEPS_N
+    trained = _train(_tuned(cell, start, steps_n=steps_n, rate_max=rate), rows)
+    kept_step = STEPS_N * len(trained.curve)
+    stopped = "never stopped" if trained.stopped_step is None else f"not finite at step {trained.stopped_step}"
+    losses = f", losses {max(trained.curve):.1e} at most, {trained.curve[-1]:.2g} at last" if trained.curve else ""
+    sound = all(np.isfinite(value).all() for value in trained.weights.values())
+    happened = f"{stopped}; weights of step {kept_step} of {steps_n}, {'all' if sound else 'not all'} finite{losses}"
+    case = f"bottleneck scaled 1e3, learning rate {rate:g}"
+    return told(AREA, case, should="stops, says where, and keeps the last finite weights", happened=happened,
+                holds=sound and trained.stopped_step == kept_step + STEPS_N)  # fmt: skip
+
+
+def _beside_one_that_overflows(cell: Cell, rows: Measured) -> Case:
+    sound, broken = (_tuned(cell, _start(cell, rows, scale)) for scale in (1.0, 1e30))
+    alone = _train(sound, rows)
+    one, other = train_stack([sound, broken], rows)
+    apart = _apart(alone.weights, one.weights)
+    happened = f"{_words(other)}; its neighbour: {_words(one)}, {apart:g} from what it becomes alone"
+    return measured(AREA, "a network that overflows beside one that does not", should="its neighbour: as if alone",
+                    happened=happened, limit=ROUNDING,
+                    error=apart if _is_sound(one) and other.stopped_step == STEPS_N else np.inf)  # fmt: skip
+
+
+def _few(cell: Cell, rows: Measured) -> list[Case]:
+    single = _train(replace(cell, train=cell.train[:1], test=cell.train[:1]), rows)
+    error = float(np.abs(single.predicted - rows.target[cell.train[:1]]).max())
+    by_one = _train(_changed(cell, batch_n=1), rows)
+    return [
+        told(AREA, "batches of one row", should="trained as ever", happened=_words(by_one), holds=_is_sound(by_one)),
+        measured(AREA, "one training row", should="answers that row's place and force",
+                 happened=f"off by {error:.1e} (mm, mm, N); {_words(single)}",
+                 error=error if _is_sound(single) else np.inf, limit=ROUNDING),
+        refused(AREA, "one training row, with triplets", should="refused: no triplet is in it",
+                attempt=partial(_train, _changed(replace(cell, train=cell.train[:1]), triplet_weight=0.1), rows)),
+    ]  # fmt: skip
+
+
+def _label_scales(cell: Cell, rows: Measured) -> list[Case]:
+    true = rows.target[cell.test]
+    as_ever = score(true, _train(cell, rows).predicted)
+    cases = []
+    for power in SCALE_POWERS:
+        scale = 2.0**power
+        trained = _train(cell, replace(rows, target=_times(rows.target, scale)))
+        back = score(true, _times(trained.predicted, 1 / scale))
+        error = max(abs(back[name] / as_ever[name] - 1) for name in METRICS)
+        happened = ", ".join(f"{name} {back[name]:.4g}, was {as_ever[name]:.4g}" for name in METRICS)
+        cases.append(measured(AREA, f"labels times 2^{power}", should="taken back to mm and N: exactly as ever",
+                              happened=happened, error=error, limit=0.0))  # fmt: skip
+    return cases
+
+
+def _again(cell: Cell, rows: Measured) -> Case:
+    cell = _changed(cell, triplet_weight=0.1)
+    one, other = (
+        {**trained.weights, "predicted": trained.predicted} for trained in (_train(cell, rows), _train(cell, rows))
+    )
+    same_n = sum(value.tobytes() == other[name].tobytes() for name, value in one.items())
+    third = _train(replace(cell, seed_i=1), rows).weights
+    away = _apart(one, third)
+    happened = f"{same_n} of {len(one)} arrays identical bit for bit; another seed's weights {away:.2g} away"
+    return told(AREA, "trained twice from one seed", should="the same bytes, and others from another seed",
+                happened=happened, holds=same_n == len(one) and away > 0)  # fmt: skip
+
+
+def _train(cell: Cell, rows: Measured) -> Trained:
+    return train_stack([cell], rows)[0]
+
+
+def _changed(cell: Cell, **settings: float | int) -> Cell:
+    return replace(cell, recipe=RECIPE.model_copy(update=settings))
+
+
+def _start(cell: Cell, rows: Measured, scale: float) -> Start:
+    """Train a network, and scale its bottleneck."""
+    trained = _train(cell, rows)
+    weights = {**trained.weights, BOTTLENECK: trained.weights[BOTTLENECK] * np.float32(scale)}
+    return Start("", weights, trained.scaler)
+
+
+def _tuned(cell: Cell, start: Start, *, steps_n: int = STEPS_N, rate_max: float = RECIPE.rate_max) -> Cell:
+    settings = Labelling(
+        steps_n=steps_n, batch_n=RECIPE.batch_n, rate_max=rate_max, gradient_norm_max=RECIPE.gradient_norm_max,
+        weight_decay=0.0, own_weight=1.0,
+    )  # fmt: skip
+    return replace(cell, tuning=FewLabels(start, settings, cell.test[:20]))
+
+
+def _times(target: Float32[np.ndarray, "f 3"], scale: float) -> Float32[np.ndarray, "f 3"]:
+    return (target.astype(np.float64) * scale).astype(np.float32)
+
+
+def _apart(one: Mapping[str, np.ndarray], other: Mapping[str, np.ndarray]) -> float:
+    return max(float(np.abs(other[name] - one[name]).max()) for name in other)
+
+
+def _is_sound(trained: Trained) -> bool:
+    return trained.stopped_step is None and bool(np.isfinite(trained.predicted).all())
+
+
+def _words(trained: Trained) -> str:
+    if trained.stopped_step is not None:
+        return f"not finite at step {trained.stopped_step}"
+    finite_n = int(np.isfinite(trained.predicted).all(axis=1).sum())
+    return f"loss {trained.curve[-1]:.2g}, {finite_n} of {len(trained.predicted)} answers finite"

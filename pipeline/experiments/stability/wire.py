@@ -1,0 +1,158 @@
+"""Broken streams (PHYSICS 10). In: a chip's settings. Out: cases, for every wire format that they concern.
+
+What comes back is compared with what the whole stream gave. Refuses to know chips' faults (`chip`).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import get_args
+
+import numpy as np
+
+from pipeline.capture.header import Wire
+from pipeline.capture.stream import FrameStream, decode_all
+from pipeline.capture.wire import BLOCK_FRAMES_N, TEXT_WIRES, Frames, concatenate, encode
+from pipeline.core.seeds import rng_for
+from pipeline.experiments.stability.cases import Case, measured, peak_bytes, refused
+from pipeline.experiments.verification.frames import CRLF_degC, make_frames
+
+AREA = "wire"
+FRAMES_N = 40
+CUT_I = 20  # the frame in which a stream is damaged
+RUBBISH = b"\r\n\0\xff9.99\t\n" * 5
+BLOCKS_N = 3  # and four times as many
+
+
+@dataclass(frozen=True)
+class Damage:
+    """What is done to a stream, and what that may cost; all bytes must be accounted for in any case."""
+
+    case: str
+    should: str
+    portions: Sequence[bytes]
+    lost_n: int = 0
+    false_n: int = 0
+    not_finite_n: int = 0
+
+
+def survey_wire(gain_sel: int, chips_n: int, seed: int) -> list[Case]:
+    """Damage a stream in every way, in every wire format, and count what comes back."""
+    frames = make_frames(FRAMES_N, chips_n, gain_sel=gain_sel, rng=rng_for(seed, "stability", "wire"))
+    full = replace(frames, temperature_degC=np.full_like(frames.temperature_degC, CRLF_degC))
+    wires = get_args(Wire)
+    return [
+        *(_suffer(damage, frames, wire) for wire in wires for damage in _damages(frames, wire)),
+        *(_suffer(_held(full, wire), full, wire) for wire in wires if wire not in TEXT_WIRES),
+        *_refusals(frames),
+        *(_memory(frames, wire) for wire in ("binary", "text-xyzt")),
+    ]
+
+
+def _damages(frames: Frames, wire: Wire) -> list[Damage]:
+    whole = encode(frames, wire)
+    ends = _clean(whole, wire, frames).end_byte.tolist()
+    begin, middle, end = ends[CUT_I - 1], (ends[CUT_I - 1] + ends[CUT_I]) // 2, ends[CUT_I]
+    late, same = end + 3 * (middle - begin) // 2, ends[CUT_I + 1] - (end - middle)
+    return [
+        Damage("joined in the middle of a frame", "that frame lost and counted", [whole[ends[0] // 2 :]], lost_n=1),
+        Damage("last frame truncated", "that frame lost, its bytes counted", [whole[:-5]], lost_n=1),
+        Damage("two frames merged", "those two lost and counted", [whole[:middle] + whole[late:]], lost_n=2),
+        Damage("two frames merged, exactly a frame's bytes missing",
+               "at most one false frame: no format has a checksum or a counter, so nothing tells it from a true one",
+               [whole[:middle] + whole[same:]], lost_n=2, false_n=1),
+        Damage("rubbish inside a frame", "no more than two lost, all bytes accounted for",
+               [whole[:middle], RUBBISH, whole[middle:]], lost_n=2),
+        Damage("byte by byte", "the same frames as in one piece", [whole[i : i + 1] for i in range(len(whole))]),
+        Damage("NaN in one frame, Inf in another", "both lost, counted as not finite", [_with_not_finite(frames, wire)],
+               lost_n=2, not_finite_n=2),
+    ]  # fmt: skip
+
+
+def _held(full: Frames, wire: Wire) -> Damage:
+    data = encode(full, wire)
+    first_end = _clean(data, wire, full).end_byte.tolist()[0]
+    case, should = "CR LF inside every temperature, joined in the middle", "in step again: that frame lost, no other"
+    return Damage(case, should, [data[first_end // 2 :]], lost_n=1)
+
+
+def _suffer(damage: Damage, frames: Frames, wire: Wire) -> Case:
+    sent = _records(_clean(encode(frames, wire), wire, frames))
+    kept, account = _deliver(damage.portions, wire, frames)
+    got = _records(kept)
+    missing_n, false_n = len(set(sent) - set(got)), sum(record not in set(sent) for record in got)
+    skipped_n = sum(n for name, n in account.items() if name.startswith("skipped_"))
+    open_n, not_finite_n = account["bytes_n"] - account["frame_bytes_n"] - skipped_n, account["not_finite_frames_n"]
+    happened = (
+        f"{len(got) - false_n} of {len(sent)} frames back, {false_n} false, {not_finite_n} not finite; "
+        f"{skipped_n} bytes counted as lost, {open_n} unaccounted for"
+    )
+    holds = missing_n <= damage.lost_n and false_n <= damage.false_n and open_n == 0
+    holds = holds and not_finite_n == damage.not_finite_n
+    return Case(AREA, f"{damage.case} ({wire})", damage.should, happened, float(missing_n), float(damage.lost_n), holds)
+
+
+def _refusals(frames: Frames) -> list[Case]:
+    chips_n = frames.temperature_degC.shape[1]
+    # At room temperature no CR LF stands in a float, where a frame of another length could end by chance.
+    data = encode(replace(frames, temperature_degC=np.full_like(frames.temperature_degC, 25.0)), "binary")
+    attempts: dict[str, tuple[Callable[[], object], str]] = {
+        "a stream without a byte": (lambda: decode_all(b"", "binary", chips_n, "stream.bin"), "refused"),
+        "a stream read for one chip more than it has": (
+            lambda: decode_all(data, "binary", chips_n + 1, "stream.bin"),
+            "refused, with what would fit",
+        ),
+        "binary read as text": (
+            lambda: decode_all(data, "text-xyzt", chips_n, "stream.bin"),
+            "refused, with what would fit",
+        ),
+    }
+    return [refused(AREA, case, should=should, attempt=attempt) for case, (attempt, should) in attempts.items()]
+
+
+def _memory(frames: Frames, wire: Wire) -> Case:
+    data = encode(frames, wire)
+    block = data * (BLOCK_FRAMES_N // len(frames))
+    chips_n = frames.temperature_degC.shape[1]
+
+    def decode(blocks_n: int) -> None:
+        stream = FrameStream(wire, chips_n)
+        for _ in range(blocks_n):
+            stream.feed(block)
+        stream.close()
+
+    decode(1)
+    few_n, many_n = (peak_bytes(partial(decode, n)) for n in (BLOCKS_N, 4 * BLOCKS_N))
+    frames_n = BLOCK_FRAMES_N // len(frames) * len(frames)
+    happened = (
+        f"blocks of {frames_n} frames: {BLOCKS_N} need {few_n / 1e6:.1f} MB, {4 * BLOCKS_N} need {many_n / 1e6:.1f} MB"
+    )
+    return measured(AREA, f"a stream of any length ({wire})", should="no more memory for a longer stream, within 2 %",
+                    happened=happened, error=many_n / few_n - 1, limit=0.02)  # fmt: skip
+
+
+def _with_not_finite(frames: Frames, wire: Wire) -> bytes:
+    if wire in TEXT_WIRES:
+        lines = encode(frames, wire).splitlines(keepends=True)
+        for i, word in ((10, b"nan"), (30, b"inf")):
+            number_n = lines[i].index(b".") + 3
+            lines[i] = word + lines[i][number_n:]
+        return b"".join(lines)
+    b_uT, temperature_degC = frames.b_uT.copy(), frames.temperature_degC.copy()
+    b_uT[10, 2], temperature_degC[30, 0] = np.nan, np.inf
+    return encode(replace(frames, b_uT=b_uT, temperature_degC=temperature_degC), wire)
+
+
+def _clean(data: bytes, wire: Wire, frames: Frames) -> Frames:
+    return decode_all(data, wire, frames.temperature_degC.shape[1], "stability")[0]
+
+
+def _deliver(portions: Sequence[bytes], wire: Wire, frames: Frames) -> tuple[Frames, dict[str, int]]:
+    chips_n = frames.temperature_degC.shape[1]
+    stream = FrameStream(wire, chips_n)
+    parts = [stream.feed(portion) for portion in portions]
+    return concatenate([*parts, stream.close()], chips_n), stream.account()
+
+
+def _records(frames: Frames) -> list[bytes]:
+    return [row.tobytes() for row in np.hstack([frames.temperature_degC, frames.b_uT])]

@@ -1,1 +1,0 @@
-"""Extreme cases that judge learning by evaluation's measures, two that know nothing of each other. Knows no page."""

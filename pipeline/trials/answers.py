@@ -1,0 +1,44 @@
+"""What the experiments with adapted networks share: their answers on a skin's rows, before and after. Knows no argv."""
+
+from collections.abc import Iterator, Sequence
+
+from pipeline.dataset.splits import Fold
+from pipeline.evaluation.tally import tally
+from pipeline.learning.card import went
+from pipeline.learning.cell import Cell
+from pipeline.learning.executors import device
+from pipeline.learning.inputs import VIEW
+from pipeline.learning.recipe import Adaptation, training
+from pipeline.trials.adapting import Starts, own_starts
+from pipeline.trials.arms import BEFORE, Answered
+from pipeline.trials.data import SceneData, train_all
+from pipeline.trials.models import note_seconds
+
+
+def answers_before(data: SceneData, fold: Fold, settings: Adaptation, starts: Starts, skin: str) -> Iterator[Answered]:
+    """Answer on a skin's tested rows as the networks do before they are adapted."""
+    from pipeline.learning.model import Predictor  # torch, late: only a stage that answers pays for it
+
+    recipe = training(data.settings, "train_triplet").recipes[settings.base]
+    test = fold.test[data.rows.skin[fold.test] == skin]
+    view = VIEW[recipe.inputs](data.rows.db_uT[test])
+    for seed_i, start in own_starts(starts, settings.base, fold).items():
+        predict = Predictor(start.weights, recipe.architecture, device())
+        predicted = start.scaler.decode(predict(start.scaler.encode(view)))
+        yield Answered(BEFORE, str(data.rows.board[test[0]]), skin, seed_i, data.rows.target[test], predicted)
+
+
+def answers_after(
+    data: SceneData, cells: Sequence[tuple[str, Cell]], stage: str
+) -> tuple[list[Answered], dict[str, int]]:
+    """Adapt by (arm, cell), and answer on each cell's tested rows; count what collapsed."""
+    own = [cell for _, cell in cells]
+    trained = train_all(data, own, stage)
+    note_seconds(data.scene, stage, own, trained)
+    answered = [
+        Answered(
+            arm, str(data.rows.board[cell.test[0]]), cell.skin, cell.seed_i, data.rows.target[cell.test], one.predicted
+        )
+        for (arm, cell), one in zip(cells, trained, strict=True)
+    ]
+    return answered, tally(map(went, trained))

@@ -1,0 +1,46 @@
+"""Trained networks at work on new changes of field: cards and weights of train_multi -> answers. Knows no argv."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32
+
+from pipeline.core import io
+from pipeline.core.errors import SchemaError, complain
+from pipeline.learning.executors import device
+from pipeline.learning.inputs import VIEW
+from pipeline.learning.recipe import HEADLINE
+from pipeline.learning.standardise import Scaler
+
+
+@dataclass(frozen=True)
+class Network:
+    """A finished network: call it with changes of field in uT, and it answers x and y in mm and F in N."""
+
+    card: Mapping[str, Any]
+    tensors: Mapping[str, np.ndarray]
+
+    def __call__(self, db_uT: Float32[np.ndarray, "f ch"]) -> Float32[np.ndarray, "f 3"]:
+        """Answer for changes of field, row by row."""
+        from pipeline.learning.model import Predictor  # torch, late: only a stage that answers pays for it
+
+        scaler, recipe = Scaler.of_arrays(self.tensors), self.card["recipe"]
+        weights = {name: values for name, values in self.tensors.items() if name.startswith("layer")}
+        view = VIEW[recipe["inputs"]](db_uT)
+        return scaler.decode(Predictor(weights, recipe["architecture"], device())(scaler.encode(view)))
+
+
+def networks_without(models: Path, board: str, *, recipe: str = HEADLINE) -> list[Network]:
+    """Read the networks of train_multi that never saw this board, one a seed."""
+    found = []
+    for file in sorted(models.glob("*.json")):
+        card = io.read_json(file)
+        if (card["question"], card["fold"], card["recipe_name"]) == ("lobo", board, recipe):
+            found.append(Network(card, io.read_tensors(file.with_suffix(".safetensors"))[0]))
+    if not found:
+        rule = f"some of recipe {recipe} with board {board} held out"
+        raise SchemaError(complain(str(models), "networks", rule, "none", "Train them: ask lobo of this scene."))
+    return found
