@@ -15,7 +15,7 @@ from pipeline import plan
 from pipeline.capture.folder import write_capture
 from pipeline.capture.header import STREAM_FILE, Header
 from pipeline.core import io
-from pipeline.core.errors import CaptureError, ReskinError, complain
+from pipeline.core.errors import CaptureError, ReskinError
 from pipeline.dataset.captures import check_losses, open_capture
 from pipeline.params import read_plan, read_scene, read_shared
 from pipeline.preparing import Prepared
@@ -31,11 +31,9 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
     settings = read_scene(plan.scene_file(root, scene), root / plan.PARAMS)
     if settings.source != header.source:
         raise CaptureError(
-            complain(
                 f"capture {header.capture}", "source", f"{settings.source}, as scene {scene} is", header.source,
                 "Simulated and recorded captures belong to different scenes.",
-            )
-        )  # fmt: skip
+            )  # fmt: skip
     limit, before = read_shared(root / plan.PARAMS)["lost_fraction_max"], read_registry(root)
     target = root / RAW / scene / header.capture
     _check_free(target, header.capture in before.captures.get(scene, {}))
@@ -64,12 +62,10 @@ def remove(root: Path, scene: str, capture: str) -> None:
 def _check_free(target: Path, registered: bool) -> None:
     if registered:
         remedy = "Is it the same recording? It is in already. Otherwise choose another --name."
-        raise CaptureError(
-            complain(f"capture {target.name}", "its name", "new to its scene", "one that is taken", remedy)
-        )
+        raise CaptureError(f"capture {target.name}", "its name", "new to its scene", "one that is taken", remedy)
     if target.exists():
         remedy = "It is in no scene: an add was killed there. Delete the folder, or choose another --name."
-        raise CaptureError(complain(target, "a new capture's folder", "free", "one that is there", remedy))
+        raise CaptureError(target, "a new capture's folder", "free", "one that is there", remedy)
 
 
 def _read_through(folder: Path, header: Header, limit: float) -> tuple[str, ...]:
@@ -82,7 +78,7 @@ def _read_through(folder: Path, header: Header, limit: float) -> tuple[str, ...]
     check_losses(account, limit, folder.name)
     if rows_n == 0:
         counts = f"none; counted {dict(account)}"
-        raise CaptureError(complain(folder.name, "a capture", "one reading or more", counts, "Check its files."))
+        raise CaptureError(folder.name, "a capture", "one reading or more", counts, "Check its files.")
     return (readings.hexdigest(), *(header.files[name] for name in (STREAM_FILE,) if name in header.files))
 
 
@@ -124,5 +120,5 @@ def _dvc(root: Path, *words: str) -> None:
     done = subprocess.run([sys.executable, "-m", "dvc", *words], cwd=root, capture_output=True, text=True, check=False)
     if done.returncode:
         raise CaptureError(
-            complain("dvc " + " ".join(words), "DVC", "able to track it", done.stderr.strip()[-300:], "See above.")
+            "dvc " + " ".join(words), "DVC", "able to track it", done.stderr.strip()[-300:], "See above."
         )

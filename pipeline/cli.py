@@ -13,7 +13,7 @@ import typer
 from pipeline import adding, plan, preparing, tidying
 from pipeline.core import io
 from pipeline.core.config import read_yaml
-from pipeline.core.errors import ParamsError, ReskinError, complain
+from pipeline.core.errors import ParamsError, ReskinError
 from pipeline.core.server import TrackingAway
 from pipeline.params import read_scene
 
@@ -216,7 +216,7 @@ def readme(check: Annotated[bool, typer.Option("--check", help="Only tell whethe
 
     running = list(plan.check(ROOT).scenes)
     if not running:
-        raise ParamsError(complain(plan.PLAN, "scenes", "one or more", "none", "Try: reskin scenes use quick"))
+        raise ParamsError(plan.PLAN, "scenes", "one or more", "none", "Try: reskin scenes use quick")
     scene = running[0]
     dag = subprocess.run(
         [sys.executable, "-m", "dvc", "dag", "--md"], capture_output=True, text=True, check=True

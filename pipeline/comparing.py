@@ -13,7 +13,7 @@ from typing import Any
 import pandas as pd
 
 from pipeline.core import io
-from pipeline.core.errors import SchemaError, complain
+from pipeline.core.errors import SchemaError
 from pipeline.evaluation.reproduced import Comparison, compare
 
 SHOWN_N = 40  # rows of a table in a terminal
@@ -24,7 +24,7 @@ def compare_scene(root: Path, scene: str, against: str) -> Comparison:
     file = root / "reports" / scene / "numbers.json"
     if not file.exists():
         remedy = f"Try: reskin scenes use {scene}, then dvc repro."
-        raise SchemaError(complain(file, "the file", "there", "none", remedy))
+        raise SchemaError(file, "the file", "there", "none", remedy)
     return compare(read_committed(root, scene, against), io.read_json(file))
 
 
@@ -41,13 +41,13 @@ def read_committed(root: Path, scene: str, against: str) -> dict[str, Any]:
         found = next((one for one in tried if one.is_file()), None)
         if found is None:
             remedy = "Name reports/<scene> of another checkout, or a numbers.json."
-            raise SchemaError(complain(against, "the folder", f"one that holds {scene}/numbers.json", "none", remedy))
+            raise SchemaError(against, "the folder", f"one that holds {scene}/numbers.json", "none", remedy)
         return io.read_json(found)
     text = _show(root, f"{against}:./reports/{scene}/numbers.json")
     if text is None:
         remedy = "Try: reskin compare SCENE --against REVISION-OR-FOLDER."
         where = f"git revision {against}"
-        raise SchemaError(complain(where, f"reports/{scene}/numbers.json", "committed", "none", remedy))
+        raise SchemaError(where, f"reports/{scene}/numbers.json", "committed", "none", remedy)
     return json.loads(text)
 
 

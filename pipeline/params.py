@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from pipeline.core.config import Seeded, Settings, Strict, parse, read_yaml
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 from pipeline.dataset.rows import Selection
 from pipeline.dataset.splits import Split
 from pipeline.learning.recipe import FineTuning, Labelling, Name, Recipe, Schedule
@@ -198,9 +198,9 @@ def parse_scene(words: dict[str, Any], where: str) -> Scene:
     """Check what a scene asks, and that it has the sections for it; what stands in these, their stages check."""
     for name, value in words.items():
         if name not in {*Scene.model_fields, *SECTIONS}:
-            raise ParamsError(complain(where, name, "a known parameter", repr(value)[:80], "Mend it there."))
+            raise ParamsError(where, name, "a known parameter", repr(value)[:80], "Mend it there.")
         if name in SECTIONS and not isinstance(value, dict):
-            raise ParamsError(complain(where, name, "a valid dictionary", repr(value)[:80], "Mend it there."))
+            raise ParamsError(where, name, "a valid dictionary", repr(value)[:80], "Mend it there.")
     return parse(Scene, words, where)
 
 
@@ -218,7 +218,7 @@ def read_shared(path: Path) -> dict[str, Any]:
     for section, own in rows.items():
         for name, row in own.items():
             if "steps_n" in row:
-                raise ParamsError(complain(f"{path}: {section}", name, "without steps_n", "one", STEPS))
+                raise ParamsError(f"{path}: {section}", name, "without steps_n", "one", STEPS)
             parse(SHARED_ROWS[section], row | {"steps_n": 1}, f"{path}: {section}.{name}")
     return words
 

@@ -12,7 +12,7 @@ from ruamel.yaml import YAML
 
 from pipeline.core import io
 from pipeline.core.config import NOTHING, PLACE, declared, fill, find, put, read_yaml
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 from pipeline.params import OnBoards, Plan, Scene, read_plan, read_scene
 from pipeline.questions import EXPERIMENTS, LEARNING, MAIN_PROTOCOL, NOT_INGESTED, QUESTIONS, stages
 from pipeline.registry import Registry, read_registry
@@ -45,7 +45,7 @@ def make_plan(scenes: Mapping[str, Scene], registry: Registry, flow: Mapping[str
     ingest = {f"{name}-{capture}": {"scene": name, "capture": capture} for name, capture in pairs}
     if len(ingest) < len(pairs):
         raise ParamsError(
-            complain("stage ingest", "scene-capture", "unlike any other", "two that read the same", "Rename a scene.")
+            "stage ingest", "scene-capture", "unlike any other", "two that read the same", "Rename a scene."
         )
     simulated = _folders(scenes)
     items: dict[str, Any] = {
@@ -73,7 +73,7 @@ def _captures(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, list
     for name, scene in scenes.items():
         if scene.source == "recorded" and not captures[name]:
             remedy = f"Try: reskin add RECORDING --scene {name} ..."
-            raise ParamsError(complain(f"scene {name}", "recorded captures", "one or more", "none", remedy))
+            raise ParamsError(f"scene {name}", "recorded captures", "one or more", "none", remedy)
     return captures
 
 
@@ -146,7 +146,7 @@ def _folders(scenes: Mapping[str, Scene]) -> dict[str, dict[str, str]]:
             folder = _folder(name, protocol)
             if folder in folders or (folder in scenes and folder != name):
                 rule = "unlike any scene and any other's protocol"
-                raise ParamsError(complain(f"scene {name}", "a protocol's folder", rule, folder, "Rename one."))
+                raise ParamsError(f"scene {name}", "a protocol's folder", rule, folder, "Rename one.")
             folders[folder] = {"scene": name, "protocol": protocol}
     return folders
 
@@ -154,7 +154,7 @@ def _folders(scenes: Mapping[str, Scene]) -> dict[str, dict[str, str]]:
 def scene_names(root: Path) -> list[str]:
     """The scenes that this checkout has."""
     if not (root / SCENES).is_dir():
-        raise ParamsError(complain(root / SCENES, "the folder", "there", "nothing", "Run this in the checkout."))
+        raise ParamsError(root / SCENES, "the folder", "there", "nothing", "Run this in the checkout.")
     return sorted(file.stem for file in (root / SCENES).glob("*.yaml"))
 
 
@@ -163,7 +163,7 @@ def scene_file(root: Path, name: str) -> Path:
     known = scene_names(root)
     if name not in known:
         remedy = f"Check the name, or write {SCENES}/{name}.yaml."
-        raise ParamsError(complain("scenes", "a scene", f"one of {', '.join(known)}", name, remedy))
+        raise ParamsError("scenes", "a scene", f"one of {', '.join(known)}", name, remedy)
     return root / SCENES / f"{name}.yaml"
 
 
@@ -182,7 +182,7 @@ def check(root: Path) -> Plan:
     plan = read_plan(root / PLAN)
     if plan.model_dump(mode="json") != _plan_of(root, list(plan.scenes)):
         remedy = f"Try: reskin scenes use {' '.join(plan.scenes)}"
-        raise ParamsError(complain(root / PLAN, "the plan", "what its scenes ask for", "an older one", remedy))
+        raise ParamsError(root / PLAN, "the plan", "what its scenes ask for", "an older one", remedy)
     return plan
 
 

@@ -14,7 +14,7 @@ from pydantic import Field
 from pipeline.capture import columns, sd_card
 from pipeline.core import io
 from pipeline.core.config import Strict, parse
-from pipeline.core.errors import ParamsError, SchemaError, complain
+from pipeline.core.errors import ParamsError, SchemaError
 from pipeline.experiments.logs.estimates import Estimates, describe, estimate
 from pipeline.learning.card import FORMAT
 from pipeline.learning.inputs import VIEW
@@ -57,12 +57,12 @@ def predict(log: Path, model: Path, out: Path) -> dict[str, Any]:
     read = (log, model, model.with_suffix(".json"))
     if out.resolve() in {file.resolve() for file in read}:
         rule = "another than the log, the model and its card"
-        raise ParamsError(complain("--out", "the file to write", rule, out, "Choose another --out."))
+        raise ParamsError("--out", "the file to write", rule, out, "Choose another --out.")
     t_s, b_uT, _, account = sd_card.read_log(log)
     channels_n = network.card["input"]["channels_n"]
     if b_uT.shape[1] != channels_n:
         remedy = "Take a model of such boards."
-        raise SchemaError(complain(log, "channels", f"the {channels_n} of the model", b_uT.shape[1], remedy))
+        raise SchemaError(log, "channels", f"the {channels_n} of the model", b_uT.shape[1], remedy)
     found = estimate(t_s, b_uT, [network], where=str(log))
     io.write_text(out, render(found))
     return describe(found) | account
@@ -73,18 +73,18 @@ def read_network(model: Path) -> Network:
     card_file = model.with_suffix(".json")
     for file, what in ((model, "the model"), (card_file, "the card beside the model")):
         if not file.is_file():
-            raise ParamsError(complain(file, what, "there", "nothing", "Give --model a trained .safetensors file."))
+            raise ParamsError(file, what, "there", "nothing", "Give --model a trained .safetensors file.")
     content = io.read_json(card_file)
     form = content.get("format") if isinstance(content, dict) else None
     if form != FORMAT:
-        raise SchemaError(complain(card_file, "format", FORMAT, form, "Train the model again."))
+        raise SchemaError(card_file, "format", FORMAT, form, "Train the model again.")
     card, tensors = parse(Card, content, str(card_file)), io.read_tensors(model)[0]
     if tuple(card.output) != ANSWERS:
         rule, got = f"for {', '.join(ANSWERS)}", ", ".join(card.output) or "none"
-        raise SchemaError(complain(card_file, "the model's answers", rule, got, "Take another model."))
+        raise SchemaError(card_file, "the model's answers", rule, got, "Take another model.")
     if card.collapsed:
         rule, got = "one that learnt", "one that answers nearly the same to any input"
-        raise SchemaError(complain(card_file, "the model", rule, got, "Take the model of another seed."))
+        raise SchemaError(card_file, "the model", rule, got, "Take the model of another seed.")
     _check_inputs(card, tensors, card_file)
     return Network(content, tensors)
 
@@ -96,7 +96,7 @@ def _check_inputs(card: Card, tensors: Mapping[str, np.ndarray], where: Path) ->
     if shown_n != taken_n:
         what = f"inputs of {card.input.channels_n} channels shown as {card.recipe.inputs}"
         rule = f"the {taken_n} that the network beside it takes"
-        raise SchemaError(complain(where, what, rule, shown_n, "Take the card of this model."))
+        raise SchemaError(where, what, rule, shown_n, "Take the card of this model.")
 
 
 def render(found: Estimates) -> str:

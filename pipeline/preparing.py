@@ -13,7 +13,7 @@ from pipeline.capture import header as headers
 from pipeline.capture.header import Clock, Header
 from pipeline.capture.readers import READERS
 from pipeline.core import io
-from pipeline.core.errors import CaptureError, complain
+from pipeline.core.errors import CaptureError
 from pipeline.dataset.captures import read_header
 
 NATIVE_FILES = (headers.STREAM_FILE, headers.ARRIVALS_FILE, headers.PROBE_FILE)
@@ -53,9 +53,7 @@ def parse_marks(words: list[str]) -> Marks:
     marks = []
     for word in words:
         if not re.fullmatch(r"-?[0-9.]+(e[0-9]+)?,-?[0-9.]+(e[0-9]+)?", word):
-            raise CaptureError(
-                complain("--mark", "a mark", "STREAM_S,PROBE_S in seconds", repr(word), "Try: --mark 0,12.5")
-            )
+            raise CaptureError("--mark", "a mark", "STREAM_S,PROBE_S in seconds", repr(word), "Try: --mark 0,12.5")
         stream_s, probe_s = map(float, word.split(","))
         marks.append((stream_s, probe_s))
     return tuple(marks)
@@ -72,21 +70,17 @@ def dump(recording: Path, labels: Labels, what: Dump) -> Prepared:
     """Prepare a bare dump of a port with the robot's log; frames get their time from a constant rate."""
     if what.probe is None:
         raise CaptureError(
-            complain(
-                recording,
-                "a serial dump",
-                "accompanied by its probe log",
-                "none",
-                "Add --probe PROBE.csv (columns in data/README.md).",
-            )
+            recording,
+            "a serial dump",
+            "accompanied by its probe log",
+            "none",
+            "Add --probe PROBE.csv (columns in data/README.md).",
         )
     _need_file(recording)
     _need_file(what.probe)
     if not 0 < what.rate_hz <= headers.RATE_MAX_HZ:
         raise CaptureError(
-            complain(
-                "--rate-hz", "the rate", f"above 0, at most {headers.RATE_MAX_HZ:g}", what.rate_hz, "Count frames."
-            )
+            "--rate-hz", "the rate", f"above 0, at most {headers.RATE_MAX_HZ:g}", what.rate_hz, "Count frames."
         )
     clock = Clock(kind="rate", rate_hz=what.rate_hz, marks=what.marks)
     special = {"wire": what.wire, "clock": clock}
@@ -100,7 +94,7 @@ def native(recording: Path, labels: Labels, probe: Path | None, marks: Marks) ->
     for what, said, written in (("board", labels.board, found.board), ("skin", labels.skin, found.skin)):
         if said != written:
             raise CaptureError(
-                complain(recording, f"--{what}", f"{written!r}, as its header says", repr(said), "Which is right?")
+                recording, f"--{what}", f"{written!r}, as its header says", repr(said), "Which is right?"
             )
     # A recorder that was killed has not hashed its files into the header; they are there all the same.
     files = {name: recording / name for name in NATIVE_FILES if (recording / name).exists() or name in found.files}
@@ -108,15 +102,11 @@ def native(recording: Path, labels: Labels, probe: Path | None, marks: Marks) ->
         _need_file(probe)
         files[headers.PROBE_FILE] = probe
     if headers.PROBE_FILE not in files:
-        raise CaptureError(
-            complain(recording, "a capture", "labelled by a probe log", "none", "Add --probe PROBE.csv.")
-        )
+        raise CaptureError(recording, "a capture", "labelled by a probe log", "none", "Add --probe PROBE.csv.")
     for name, file in files.items():
         _need_file(file)
         if file.parent == recording and found.files.get(name, io.sha256(file)) != io.sha256(file):
-            raise CaptureError(
-                complain(file, "the file", "unchanged since it was recorded", "another hash", "Record it again.")
-            )
+            raise CaptureError(file, "the file", "unchanged since it was recorded", "another hash", "Record it again.")
     _check_names(labels)
     clock = found.clock.model_copy(update={"marks": (*found.clock.marks, *marks)})
     return found.model_copy(update={"capture": labels.name or found.capture, "clock": clock}), files
@@ -125,7 +115,7 @@ def native(recording: Path, labels: Labels, probe: Path | None, marks: Marks) ->
 def _check_names(labels: Labels) -> None:
     for option, word in (("--board", labels.board), ("--skin", labels.skin), ("--name", labels.name)):
         if word is not None and not re.fullmatch(headers.NAME, word):
-            raise CaptureError(complain(option, "a name", "1 to 64 of A-Z a-z 0-9 _ -", repr(word), "Choose another."))
+            raise CaptureError(option, "a name", "1 to 64 of A-Z a-z 0-9 _ -", repr(word), "Choose another.")
 
 
 def _header(
@@ -149,4 +139,4 @@ def _header(
 
 def _need_file(path: Path) -> None:
     if not path.is_file():
-        raise CaptureError(complain(path, "the file", "there", "nothing", "Check the path."))
+        raise CaptureError(path, "the file", "there", "nothing", "Check the path.")

@@ -11,7 +11,7 @@ from pipeline.capture.folder import seal
 from pipeline.capture.header import HEADER_FILE, Clock, Header, parse, render
 from pipeline.capture.port import PortSettings, Recording, record
 from pipeline.core import io
-from pipeline.core.errors import CaptureError, complain
+from pipeline.core.errors import CaptureError
 
 
 def record_capture(port: str, folder: Path, *, board: str, skin: str, settings: PortSettings) -> Recording:
@@ -19,9 +19,7 @@ def record_capture(port: str, folder: Path, *, board: str, skin: str, settings: 
     part = folder.with_name(f"{folder.name}.part")
     for path in (folder, part):
         if path.exists():
-            raise CaptureError(
-                complain(path, "the capture's folder", "new", "one that is there", "Choose another --out.")
-            )
+            raise CaptureError(path, "the capture's folder", "new", "one that is there", "Choose another --out.")
     header = _header(folder.name, board, skin, settings)
     part.mkdir(parents=True)
     io.write_text(part / HEADER_FILE, render(header))

@@ -10,7 +10,7 @@ from ruamel.yaml import YAML
 from pipeline.capture.header import Header
 from pipeline.core import io
 from pipeline.core.config import Strict, parse, read_yaml
-from pipeline.core.errors import CaptureError, complain
+from pipeline.core.errors import CaptureError
 
 REGISTRY = "data/captures.yaml"
 
@@ -47,22 +47,16 @@ def with_capture(
     if twin is not None:
         _refuse_copy(where, twin, own[twin], header, allow_copy)
     if header.capture in own:
-        raise CaptureError(
-            complain(where, "its name", "new to its scene", "one that is taken", "Choose another with --name.")
-        )
+        raise CaptureError(where, "its name", "new to its scene", "one that is taken", "Choose another with --name.")
     for name, entry in own.items():
         if entry.skin == header.skin and entry.board != header.board:
             raise CaptureError(
-                complain(
                     where, f"the board of skin {header.skin}", f"{entry.board}, as in {name}", header.board,
                     "A skin that moves to another board gets a new name, or it would stand on both sides of a fold.",
-                )
-            )  # fmt: skip
+                )  # fmt: skip
         if entry.chips_n != header.chips_n:
             raise CaptureError(
-                complain(
-                    where, "chips", f"the {entry.chips_n} of {name}", header.chips_n, "Add it to a scene of its own."
-                )
+                where, "chips", f"the {entry.chips_n} of {name}", header.chips_n, "Add it to a scene of its own."
             )
     entry = Entry(
         board=header.board,
@@ -80,9 +74,7 @@ def without_capture(registry: Registry, scene: str, capture: str) -> Registry:
     own = dict(registry.captures.get(scene, {}))
     if capture not in own:
         known = ", ".join(sorted(own)) or "none"
-        raise CaptureError(
-            complain(f"scene {scene}", "a capture", f"one of its own ({known})", capture, "Check the name.")
-        )
+        raise CaptureError(f"scene {scene}", "a capture", f"one of its own ({known})", capture, "Check the name.")
     del own[capture]
     rest = {name: all_ for name, all_ in registry.captures.items() if name != scene}
     return Registry(captures=rest | ({scene: own} if own else {}))
@@ -105,4 +97,4 @@ def _refuse_copy(where: str, twin: str, entry: Entry, header: Header, allow_copy
     remedy = "It is in the scene already."
     if relabelled:
         remedy = "Under two labels it would stand on both sides of a fold; to try that knowingly, add --allow-copy."
-    raise CaptureError(complain(where, "a recording", "new to its scene", f"the readings of {twin}", remedy))
+    raise CaptureError(where, "a recording", "new to its scene", f"the readings of {twin}", remedy)

@@ -11,12 +11,12 @@ from pipeline.core.numerics import BEYOND_AVX2, PINNED, cpu_flags, pinned
 
 AVX2, NEWEST = frozenset({"avx2"}), frozenset({"avx2", *BEYOND_AVX2.values()})
 TRAIN = """
-from pipeline.experiments.stability.learning import _cell, _changed, _rows
+from pipeline.experiments.stability.learning import _trial, _changed, _rows
 from pipeline.learning.stack import train_stack
 import hashlib, sys
-cells = [_changed(_cell(i), triplet_weight=0.1) for i in range(3)]
+trials = [_changed(_trial(i), triplet_weight=0.1) for i in range(3)]
 digest = hashlib.sha256()
-for one in train_stack(cells, _rows(0)):
+for one in train_stack(trials, _rows(0)):
     for name, value in sorted(one.weights.items()):
         digest.update(value.tobytes())
     digest.update(one.predicted.tobytes())

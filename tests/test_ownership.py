@@ -54,7 +54,7 @@ def test_a_module_fits_on_a_few_screens(name):
 
 @pytest.mark.parametrize("name", sorted(name for name in SOURCES if name.startswith("pipeline/stages/")))
 def test_a_stage_is_thin(name):
-    assert len(SOURCES[name].splitlines()) <= 80
+    assert len(SOURCES[name].splitlines()) <= 90
 
 
 def test_every_module_says_what_it_is_for():

@@ -12,7 +12,7 @@ import pyarrow as pa
 from jaxtyping import Bool, Float64, Int64
 
 from pipeline.capture import columns
-from pipeline.core.errors import CaptureError, complain
+from pipeline.core.errors import CaptureError
 
 FIRST_ROW = 2  # row 1 of the file is the header
 TYPES = {"byte_end": pa.int64(), "t_s": pa.float64()}
@@ -33,7 +33,7 @@ def parse(source: str | Path, where: str) -> Arrivals:
     """Read arrivals from CSV text, or from the file at a path; raise `CaptureError` naming the first bad row."""
     table = columns.parse(source, TYPES, where)
     if len(table) < 2:
-        raise CaptureError(complain(where, "arrivals", "two rows or more", len(table), "Give a rate in the header."))
+        raise CaptureError(where, "arrivals", "two rows or more", len(table), "Give a rate in the header.")
     byte_end, t_s = (table.column(name).to_numpy() for name in TYPES)
     _refuse(~np.isfinite(byte_end), where, "byte_end", "known", byte_end)  # Arrow gives NaN for an empty field
     _refuse(~np.isfinite(t_s), where, "t_s", "a finite time", t_s)
@@ -42,7 +42,7 @@ def parse(source: str | Path, where: str) -> Arrivals:
     _refuse(np.diff(t_s, prepend=t_s[0]) < 0, where, "t_s", "not before the row above", t_s)
     if t_s[-1] == t_s[0]:
         got = f"{t_s[0]} in every row"
-        raise CaptureError(complain(where, "arrivals", "spread in time", got, "Mend the recorder's clock."))
+        raise CaptureError(where, "arrivals", "spread in time", got, "Mend the recorder's clock.")
     return Arrivals(byte_end, t_s)
 
 
@@ -76,5 +76,5 @@ def constant_rate(frame: Float64[np.ndarray, " f"], rate_hz: float) -> Float64[n
 def _refuse(bad: Bool[np.ndarray, " c"], where: str, what: str, rule: str, values: np.ndarray) -> None:
     if bad.any():
         row_i = int(bad.argmax())
-        message = complain(f"{where} row {row_i + FIRST_ROW}", what, rule, values[row_i], "Record the capture again.")
-        raise CaptureError(message)
+        row = f"{where} row {row_i + FIRST_ROW}"
+        raise CaptureError(row, what, rule, values[row_i], "Record the capture again.")

@@ -9,7 +9,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.csv as pacsv
 
-from pipeline.core.errors import CaptureError, complain
+from pipeline.core.errors import CaptureError
 
 
 def parse(source: str | Path, types: Mapping[str, pa.DataType], where: str) -> pa.Table:
@@ -28,9 +28,9 @@ def parse(source: str | Path, types: Mapping[str, pa.DataType], where: str) -> p
     except (pa.ArrowInvalid, UnicodeDecodeError) as error:
         got = ascii(" ".join(str(error).split()))[1:-1][:200]  # a row of rubbish is no message
         rule = f"CSV with columns {_list(types)}"
-        raise CaptureError(complain(where, "the table", rule, got, "Mend that row.")) from None
+        raise CaptureError(where, "the table", rule, got, "Mend that row.") from None
     except FileNotFoundError:
-        raise CaptureError(complain(where, "the file", "there", "nothing", "Copy the whole capture folder.")) from None
+        raise CaptureError(where, "the file", "there", "nothing", "Copy the whole capture folder.") from None
     _check_names(table.column_names, types, where)
     return table.select(list(types)).combine_chunks()
 
@@ -47,7 +47,7 @@ def _check_names(names: list[str], types: Mapping[str, pa.DataType], where: str)
     unknown = [name for name in names if name not in types]
     if missing or unknown or len(names) != len(types):
         got = f"missing {_list(missing)}, unknown {ascii(_list(unknown))[1:-1][:80]}, {len(names)} in all"
-        raise CaptureError(complain(where, "row 1, the column names,", _list(types), got, "Rename or remove columns."))
+        raise CaptureError(where, "row 1, the column names,", _list(types), got, "Rename or remove columns.")
 
 
 def _list(names: Mapping[str, pa.DataType] | list[str]) -> str:

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from pipeline.core.errors import CaptureError, complain
+from pipeline.core.errors import CaptureError
 
 RATE_MAX_HZ = 1e5
 HEADER_FILE = "header.json"
@@ -106,11 +106,9 @@ def check_same_capture(header: Header, folder: str) -> None:
     """Raise if a capture folder was renamed by hand, which would give two names to one thing."""
     if header.capture != folder:
         raise CaptureError(
-            complain(
-                f"{folder}/{HEADER_FILE}",
-                "capture",
-                f"the folder's name {folder!r}",
-                repr(header.capture),
-                "Rename it back.",
-            )
+            f"{folder}/{HEADER_FILE}",
+            "capture",
+            f"the folder's name {folder!r}",
+            repr(header.capture),
+            "Rename it back.",
         )

@@ -22,7 +22,7 @@ from serial.tools import list_ports
 from pipeline.capture.header import ARRIVALS_FILE, STREAM_FILE, Wire
 from pipeline.capture.stream import FrameStream, no_frame
 from pipeline.capture.wire import TEXT_WIRES
-from pipeline.core.errors import CaptureError, complain
+from pipeline.core.errors import CaptureError
 
 READ_TIMEOUT_s = 0.1  # how late a stop, a silence or the end of the duration may be noticed
 HEAD_BYTES_N = 16384  # the first bytes are kept to say what fits, should no frame come
@@ -108,7 +108,7 @@ class _Recorder:
         duration_s = time.monotonic() - self._start_s
         if not self._head:
             got, remedy = f"none in {duration_s:.1f} s", f"Is the board running, and this its port? {_found_ports()}"
-            raise CaptureError(complain(self._port, "bytes", "coming in", got, remedy))
+            raise CaptureError(self._port, "bytes", "coming in", got, remedy)
         if not account["frames_n"]:
             raise no_frame(self._port, self._head, self._settings.wire, self._settings.chips_n)
         return Recording(ended, duration_s, self._bytes_n, account["frames_n"], self._partial_line_bytes_n, account)
@@ -153,7 +153,7 @@ def _open(port: str, baud: int) -> serial.Serial:
     try:
         return serial.Serial(port, baud, timeout=READ_TIMEOUT_s, exclusive=True)
     except (OSError, ValueError) as error:
-        raise CaptureError(complain(port, "the port", "one that opens", error, _found_ports())) from None
+        raise CaptureError(port, "the port", "one that opens", error, _found_ports()) from None
 
 
 def _found_ports() -> str:

@@ -13,7 +13,7 @@ import pyarrow.compute as pc
 from jaxtyping import Bool, Float32, Float64, Int32
 
 from pipeline.capture import columns
-from pipeline.core.errors import CaptureError, complain
+from pipeline.core.errors import CaptureError
 
 NOLOAD, CONTACT = "noload", "contact"
 FIRST_ROW = 2  # row 1 of the file is the header
@@ -55,7 +55,7 @@ def parse(source: str | Path, where: str) -> ProbeLog:
     """Read a probe log from CSV text, or from the file at a path; raise `CaptureError` naming the first bad row."""
     table = columns.parse(source, TYPES, where)
     if not len(table):
-        raise CaptureError(complain(where, "the log", "one row a dwell", "no rows", "Record the capture again."))
+        raise CaptureError(where, "the log", "one row a dwell", "no rows", "Record the capture again.")
     for name in ("indentation", "pass_i", "phase", "t_start_s", "t_end_s"):
         unknown = np.asarray(table.column(name).is_null())
         _refuse(unknown, where, name, "known", ["an empty field"], "Only labels may be left empty.")
@@ -111,4 +111,4 @@ def _refuse(bad: Bool[np.ndarray, " d"], where: str, what: str, rule: str, value
     if bad.any():
         row_i = int(bad.argmax())
         got = values[row_i if len(values) > 1 else 0]  # type: ignore[index,arg-type]
-        raise CaptureError(complain(f"{where} row {row_i + FIRST_ROW}", what, rule, got, remedy))
+        raise CaptureError(f"{where} row {row_i + FIRST_ROW}", what, rule, got, remedy)

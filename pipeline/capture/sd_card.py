@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Float32, Float64
 
 from pipeline.capture import columns, faults
 from pipeline.capture.readers.chips import GRID_ROWS_N
-from pipeline.core.errors import CaptureError, complain
+from pipeline.core.errors import CaptureError
 
 TIME = "t_s"
 CHIP_COLUMNS = ("T", "Bx", "By", "Bz")
@@ -53,7 +53,7 @@ def read_log(
     chips_n = _chips_n(path, where)
     table = columns.parse(path, dict.fromkeys(column_names(chips_n), pa.float64()), where)
     if not len(table):
-        raise CaptureError(complain(where, "the log", "one line a frame", "no lines", "Copy the log again."))
+        raise CaptureError(where, "the log", "one line a frame", "no lines", "Copy the log again.")
     numbers = np.column_stack([_finite(table, name, where) for name in table.column_names])
     t_s, chips = numbers[:, 0], numbers[:, 1:].reshape(len(numbers), chips_n, 4)
     _check_time(t_s, where)
@@ -78,7 +78,7 @@ def _check_kept(account: dict[str, int], where: str) -> None:
         failed_n, stuck_n = account["dropped_failed_read_rows_n"], account["dropped_stuck_chip_rows_n"]
         got = f"{kept_n} of {read_n}: {failed_n} had failed I2C reads, {stuck_n} stuck chips"
         rule = f"read from every chip in {100 * KEPT_SHARE_MIN:g} % of them or more"
-        raise CaptureError(complain(where, "lines", rule, got, "Mend the wiring, and log again."))
+        raise CaptureError(where, "lines", rule, got, "Mend the wiring, and log again.")
 
 
 def _chips_n(path: Path, where: str) -> int:
@@ -90,18 +90,18 @@ def _chips_n(path: Path, where: str) -> int:
             last = file.read(1)
     except OSError as error:
         got = "an empty file" if path.is_file() and not path.stat().st_size else error.strerror
-        raise CaptureError(complain(where, "the log", "a readable file", got, "Check the name.")) from None
+        raise CaptureError(where, "the log", "a readable file", got, "Check the name.") from None
     # A text editor or a spreadsheet may have put a byte order mark first; the CSV reader skips it too.
     names = first.removeprefix(BOM_UTF8).decode("ascii", errors="replace").strip().split(",")
     chips_n = (len(names) - 1) // len(CHIP_COLUMNS)
     if chips_n < 1 or names != column_names(chips_n):
         rule, got = f"{','.join(column_names(1))}, then T1 and so on", repr(",".join(names)[:60])
         raise CaptureError(
-            complain(where, "row 1, the column names,", rule, got, "If it is a board's log, write that line on top.")
+            where, "row 1, the column names,", rule, got, "If it is a board's log, write that line on top."
         )
     if last != b"\n":
         rule, remedy = "complete and end in a line feed", "Remove it, if the board was switched off there."
-        raise CaptureError(complain(where, "the last line", rule, "a line that was cut", remedy))
+        raise CaptureError(where, "the last line", rule, "a line that was cut", remedy)
     return chips_n
 
 
@@ -111,24 +111,24 @@ def _finite(table: pa.Table, name: str, where: str) -> Float64[np.ndarray, " f"]
     if bad.any():
         row = int(bad.argmax()) + FIRST_ROW
         remedy = "Remove that line; the gap is counted."
-        raise CaptureError(complain(f"{where} row {row}", name, "a finite number", values[row - FIRST_ROW], remedy))
+        raise CaptureError(f"{where} row {row}", name, "a finite number", values[row - FIRST_ROW], remedy)
     return values
 
 
 def _check_time(t_s: Float64[np.ndarray, " f"], where: str) -> None:
     if len(t_s) < 2:
-        raise CaptureError(complain(where, "the log", "two lines or more", len(t_s), "Copy the log again."))
+        raise CaptureError(where, "the log", "two lines or more", len(t_s), "Copy the log again.")
     back = np.diff(t_s) <= 0
     if back.any():
         row = int(back.argmax()) + FIRST_ROW + 1
         got = f"{t_s[row - FIRST_ROW]:.4f} after {t_s[row - FIRST_ROW - 1]:.4f}"
         remedy = "Was the board reset? Cut the log there."
-        raise CaptureError(complain(f"{where} row {row}", TIME, "later than the line above", got, remedy))
+        raise CaptureError(f"{where} row {row}", TIME, "later than the line above", got, remedy)
     rate_hz = 1 / float(np.median(np.diff(t_s)))
     if not RATE_MIN_HZ <= rate_hz <= RATE_MAX_HZ:
         rule = f"{RATE_MIN_HZ:g} to {RATE_MAX_HZ:g} lines a second"
         remedy = f"{TIME} is in seconds: was it written in milliseconds?"
-        raise CaptureError(complain(where, "the rate", rule, f"{rate_hz:.3g}", remedy))
+        raise CaptureError(where, "the rate", rule, f"{rate_hz:.3g}", remedy)
 
 
 def _faults(
@@ -137,14 +137,14 @@ def _faults(
     failed = np.asarray(faults.failed_reads(b_uT, temperature_degC).any(axis=1))
     if failed.all():
         remedy = "Mend the wiring, and log again."
-        raise CaptureError(complain(where, "lines", "read from every chip", "failed I2C reads in all of them", remedy))
+        raise CaptureError(where, "lines", "read from every chip", "failed I2C reads in all of them", remedy)
     read = np.flatnonzero(~failed)
     for block in np.array_split(read, max(1, len(read) // GRID_ROWS_N)):
         odd = np.flatnonzero(faults.reset_chips(b_uT[block], None))
         if len(odd):
             what = f"the step of chip {', '.join(map(str, odd))} from row {block[0] + FIRST_ROW} on"
             rule, remedy = "that of the other chips", "It lost its settings: reset the board, log again."
-            raise CaptureError(complain(where, what, rule, "another", remedy))
+            raise CaptureError(where, what, rule, "another", remedy)
     return failed, np.asarray(faults.stuck_chips(b_uT).any(axis=1)) & ~failed
 
 

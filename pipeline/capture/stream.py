@@ -16,7 +16,7 @@ from pipeline.capture import bursts
 from pipeline.capture import wire as wires
 from pipeline.capture.header import Wire
 from pipeline.capture.wire import LF, Frames
-from pipeline.core.errors import CaptureError, complain
+from pipeline.core.errors import CaptureError
 
 BLOCK_LINES_N = 8192
 CHIPS_MAX_N = 64  # as in the header
@@ -91,7 +91,7 @@ def no_frame(where: str, data: bytes, wire: Wire, chips_n: int) -> CaptureError:
     remedy = "Wrong baud rate, chip count or wire format?" + (f" It fits {hint}." if hint else "")
     if not data:
         remedy = "Is the board running and sending?"
-    return CaptureError(complain(where, "the stream", rule, got, remedy))
+    return CaptureError(where, "the stream", rule, got, remedy)
 
 
 def _fits(data: bytes) -> list[tuple[Wire, int]]:

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 
 
 class Strict(BaseModel):
@@ -33,10 +33,10 @@ def read_yaml(path: Path) -> Any:
     try:
         return YAML(typ="safe").load(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise ParamsError(complain(path, "the file", "there", "nothing", "Check the name.")) from None
+        raise ParamsError(path, "the file", "there", "nothing", "Check the name.") from None
     except (YAMLError, UnicodeDecodeError) as error:
         problem = " ".join(str(error).split())
-        raise ParamsError(complain(path, "the file", "YAML", problem, "Mend the line it names.")) from None
+        raise ParamsError(path, "the file", "YAML", problem, "Mend the line it names.") from None
 
 
 def parse(model: type[Model], value: Any, where: str) -> Model:
@@ -56,7 +56,7 @@ def parse(model: type[Model], value: Any, where: str) -> Model:
         ):  # parameters that contradict each other: the rule names them and their values
             place = f"{where}: {name}" if first["loc"] else where
             raise ParamsError(f"{place}: {rule}. Mend it there.") from None
-        raise ParamsError(complain(where, name, rule, got, "Mend it there.")) from None
+        raise ParamsError(where, name, rule, got, "Mend it there.") from None
 
 
 def parse_parts(model: type[Model], value: Any, where: str) -> Model:
@@ -145,7 +145,7 @@ class Settings:
         value = find(words, key)
         if value is NOTHING:
             remedy = f"Write it there; if it is, the plan is older: reskin scenes use {self.scene}, beside the others."
-            raise ParamsError(complain(where, key, "given, and declared by its stage", "nothing", remedy))
+            raise ParamsError(where, key, "given, and declared by its stage", "nothing", remedy)
         return value
 
 
@@ -155,7 +155,7 @@ def read_settings(stage: str, key: str, files: Files) -> Settings:
     item = find(plan, f"stages.{stage}.{key}")
     if item is NOTHING:
         remedy = f"Try: reskin scenes use {key}"
-        raise ParamsError(complain(files.plan, f"stages.{stage}", "planned for it", key, remedy))
+        raise ParamsError(files.plan, f"stages.{stage}", "planned for it", key, remedy)
     templates = declared(read_yaml(files.params.with_name("dvc.yaml")), stage)
     _check_names(f"stages.{stage}.{key}", item, scene, files)
     keys = {kind: [fill(one, key, item) for one in own] for kind, own in templates.items()}
@@ -227,7 +227,7 @@ def _check_names(at: str, item: Words, scene: Words, files: Files) -> None:
                 f"-S {files.plan}:{at}.{key}={said}"
             )
             got = "nothing" if said is NOTHING else said
-            raise ParamsError(complain(files.settings, key, f"{planned}, as planned", got, remedy))
+            raise ParamsError(files.settings, key, f"{planned}, as planned", got, remedy)
 
 
 def _leaves(words: Words, at: str = "") -> Iterator[tuple[str, Any]]:

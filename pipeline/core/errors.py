@@ -1,14 +1,21 @@
 """The errors a user can cause: one class a boundary, one sentence each.
 
-Every message reads `<where>: <what> must be <rule>; got <value>. <what to try>`.
-Raised at the door and shown without a traceback; `assert` is for our own mistakes.
+Every message reads `<where>: <what> must be <rule>; got <value>. <what to try>`; an error that passes on somebody's
+sentence takes it whole. Raised at the door and shown without a traceback; `assert` is for our own mistakes.
 """
 
 
 class ReskinError(ValueError):
-    """Bad input from outside: a recording, a parameter or a file that breaks a contract."""
+    """Bad input from outside: a recording, a parameter or a file that breaks a contract.
+
+    >>> print(ReskinError("b3_s2/stream.bin @8192", "frame", "whole", "40 bytes", "Wrong baud rate?"))
+    b3_s2/stream.bin @8192: frame must be whole; got 40 bytes. Wrong baud rate?
+    """
 
     exit_code = 2
+
+    def __init__(self, where: object, what: str = "", rule: str = "", got: object = "", remedy: str = "") -> None:
+        super().__init__(f"{where}: {what} must be {rule}; got {got}. {remedy}" if what else str(where))
 
 
 class CaptureError(ReskinError):
@@ -29,8 +36,3 @@ class TrainingError(ReskinError):
 
 class LeakError(ReskinError):
     """A result that would rest on rows it is tested on."""
-
-
-def complain(where: object, what: str, rule: str, got: object, remedy: str) -> str:
-    """Compose the one sentence pattern that every error of this project follows."""
-    return f"{where}: {what} must be {rule}; got {got}. {remedy}"

@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 import safetensors
 import safetensors.numpy
 
-from pipeline.core.errors import SchemaError, complain
+from pipeline.core.errors import SchemaError
 from pipeline.core.schema import Readings, arrow_schema, from_table, to_table
 
 ACCOUNT_KEY = b"reskin.account"
@@ -36,7 +36,7 @@ def replacing(path: Path) -> Iterator[Path]:
         if temporary.is_dir():
             remove(path)
         elif path.is_dir():
-            raise SchemaError(complain(path, "a file to write", "no folder", "a folder", "Choose another name."))
+            raise SchemaError(path, "a file to write", "no folder", "a folder", "Choose another name.")
         temporary.replace(path)
     finally:
         remove(temporary)
@@ -75,7 +75,7 @@ def read_bytes(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise SchemaError(complain(path, "the file", "readable", error.strerror, "Check the path.")) from None
+        raise SchemaError(path, "the file", "readable", error.strerror, "Check the path.") from None
 
 
 def write_text(path: Path, text: str) -> None:
@@ -102,7 +102,7 @@ def read_json(path: Path) -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise SchemaError(complain(path, "the file", "JSON", error, "Run its stage again.")) from None
+        raise SchemaError(path, "the file", "JSON", error, "Run its stage again.") from None
 
 
 def write_tensors(path: Path, tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> None:
@@ -118,7 +118,7 @@ def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
         with safetensors.safe_open(path, framework="numpy") as file:
             return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}
     except (safetensors.SafetensorError, OSError) as error:
-        raise SchemaError(complain(path, "the file", "safetensors", error, "Delete it, and train again.")) from None
+        raise SchemaError(path, "the file", "safetensors", error, "Delete it, and train again.") from None
 
 
 def write_table(path: Path, table: pa.Table) -> None:
@@ -141,9 +141,7 @@ def write_readings(path: Path, blocks: Iterable[Readings], account: Mapping[str,
                 writer = pq.ParquetWriter(temporary, arrow_schema(block.chips_n), compression="zstd")
             writer.write_table(to_table(block))
         if writer is None:
-            raise SchemaError(
-                complain(path, "a capture", "at least one reading", "none", "See what was dropped, and why.")
-            )
+            raise SchemaError(path, "a capture", "at least one reading", "none", "See what was dropped, and why.")
         writer.add_key_value_metadata({ACCOUNT_KEY.decode(): json.dumps(dict(account), sort_keys=True)})
         writer.close()
 
@@ -157,7 +155,7 @@ def read_account(path: Path) -> dict[str, int]:
     """Read what ingest counted for one capture: bytes, frames, rows, and what was dropped, by reason."""
     metadata = _open_parquet(path).metadata.metadata or {}
     if ACCOUNT_KEY not in metadata:
-        raise SchemaError(complain(path, "the file's metadata", "an account of losses", "none", "Ingest it again."))
+        raise SchemaError(path, "the file's metadata", "an account of losses", "none", "Ingest it again.")
     account: dict[str, int] = json.loads(metadata[ACCOUNT_KEY])
     return account
 
@@ -166,4 +164,4 @@ def _open_parquet(path: Path) -> pq.ParquetFile:
     try:
         return pq.ParquetFile(path)
     except (pa.ArrowInvalid, OSError) as error:
-        raise SchemaError(complain(path, "the file", "readable Parquet", error, "Run ingest again.")) from None
+        raise SchemaError(path, "the file", "readable Parquet", error, "Run ingest again.") from None

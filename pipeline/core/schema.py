@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import Float32, Float64, Int32
 
-from pipeline.core.errors import SchemaError, complain
+from pipeline.core.errors import SchemaError
 
 SCHEMA_VERSION = "1"
 AXES_PER_CHIP_N = 3
@@ -117,7 +117,7 @@ def from_table(table: pa.Table, where: str) -> Readings:
         distinct = table.column(name).unique().to_pylist()
         if len(distinct) != 1:
             raise SchemaError(
-                complain(where, f"column {name}", "one value in the file", distinct[:3], "Write one capture a file.")
+                where, f"column {name}", "one value in the file", distinct[:3], "Write one capture a file."
             )
         values[name] = distinct[0]
     for name in UNITS:
@@ -135,22 +135,20 @@ def check_schema(schema: pa.Schema, where: str) -> int:
     missing = [field.name for field in fields(Readings) if field.name not in schema.names]
     if missing:
         raise SchemaError(
-            complain(where, "columns", "those of pipeline/core/schema.py", f"none named {missing}", "Ingest it again.")
+            where, "columns", "those of pipeline/core/schema.py", f"none named {missing}", "Ingest it again."
         )
     b_type = schema.field("b_uT").type
     if not pa.types.is_fixed_size_list(b_type) or b_type.list_size % AXES_PER_CHIP_N:
-        raise SchemaError(complain(where, "b_uT", "a fixed list of 3 values a chip", b_type, "Ingest it again."))
+        raise SchemaError(where, "b_uT", "a fixed list of 3 values a chip", b_type, "Ingest it again.")
     chips_n = b_type.list_size // AXES_PER_CHIP_N
     for want in arrow_schema(chips_n):
         have = schema.field(want.name)
         if have.type != want.type:
-            raise SchemaError(complain(where, f"column {want.name}", want.type, have.type, "Ingest it again."))
+            raise SchemaError(where, f"column {want.name}", want.type, have.type, "Ingest it again.")
         unit, want_unit = (have.metadata or {}).get(b"unit"), (want.metadata or {})[b"unit"]
         if unit != want_unit:
             got = "no unit" if unit is None else unit.decode()
             raise SchemaError(
-                complain(
-                    where, f"unit of {want.name}", repr(want_unit.decode()), got, "Convert it, then write the unit."
-                )
+                where, f"unit of {want.name}", repr(want_unit.decode()), got, "Convert it, then write the unit."
             )
     return chips_n

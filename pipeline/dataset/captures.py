@@ -10,7 +10,7 @@ from typing import NamedTuple
 from pipeline.capture.header import HEADER_FILE, Header, check_same_capture, parse
 from pipeline.capture.readers import READERS
 from pipeline.core import io
-from pipeline.core.errors import CaptureError, complain
+from pipeline.core.errors import CaptureError
 from pipeline.core.schema import Readings
 from pipeline.dataset.native import read_native
 
@@ -37,24 +37,20 @@ def open_capture(folder: Path) -> Opened:
     check_same_capture(header, folder.name)
     for name, digest in header.files.items():
         if not (folder / name).is_file():
-            raise CaptureError(
-                complain(folder / name, "the file", "there, as the header says", "nothing", "Add it again.")
-            )
+            raise CaptureError(folder / name, "the file", "there, as the header says", "nothing", "Add it again.")
         if io.sha256(folder / name) != digest:
             raise CaptureError(
-                complain(
-                    folder / name,
-                    "the file",
-                    "unchanged since it was added",
-                    "another hash",
-                    "Remove it and add it again.",
-                )
+                folder / name,
+                "the file",
+                "unchanged since it was added",
+                "another hash",
+                "Remove it and add it again.",
             )
     if header.layout == "native":
         return Opened(header, *read_native(folder, header))
     if header.layout not in READERS:
         remedy = "An SD card's log has no labels to learn from; try: reskin predict."
-        raise CaptureError(complain(folder, "layout", f"native or one of {sorted(READERS)}", header.layout, remedy))
+        raise CaptureError(folder, "layout", f"native or one of {sorted(READERS)}", header.layout, remedy)
     readings, account = READERS[header.layout].read(folder, header)
     return Opened(header, [readings], account)
 
@@ -63,9 +59,7 @@ def read_header(folder: Path) -> Header:
     """Read and check a capture's header."""
     file = folder / HEADER_FILE
     if not file.is_file():
-        raise CaptureError(
-            complain(file, "a capture", f"a folder with {HEADER_FILE}", "none", "Is it another --layout?")
-        )
+        raise CaptureError(file, "a capture", f"a folder with {HEADER_FILE}", "none", "Is it another --layout?")
     return parse(file.read_text(encoding="utf-8", errors="replace"), str(file))
 
 
@@ -84,8 +78,6 @@ def check_losses(account: Mapping[str, int], limit: float, where: str) -> None:
         if lost_n > limit * account.get(whole, 0):
             reasons = ", ".join(f"{account[key]} {key.removesuffix('_n')}" for key in lost if account[key])
             raise CaptureError(
-                complain(
                     where, f"lost {whole.removesuffix('_n')}", f"at most {limit:.0%} of {account[whole]}", reasons,
                     "Mend the recording, or raise lost_fraction_max in params.yaml.",
-                )
-            )  # fmt: skip
+                )  # fmt: skip

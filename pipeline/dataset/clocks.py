@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float32, Float64, Int8
 from scipy.signal import correlate
 
 from pipeline.capture.probe import ProbeLog
-from pipeline.core.errors import CaptureError, complain
+from pipeline.core.errors import CaptureError
 
 RATE_LIMIT = 0.1  # a nominal rate may be some per cent off; more is a mark in milliseconds, or of another event
 STEPS_PER_DWELL_N = 16
@@ -55,9 +55,9 @@ def from_marks(marks: Float64[np.ndarray, "m 2"], where: str) -> ClockMap:
     """Draw the line through sync marks (stream time, probe time): one gives the offset, more also the rate."""
     given = marks.tolist()
     if not given or not np.isfinite(marks).all():
-        raise CaptureError(complain(where, "clock.marks", "one or more pairs of finite times", given, "Mend them."))
+        raise CaptureError(where, "clock.marks", "one or more pairs of finite times", given, "Mend them.")
     if len(np.unique(marks[:, 0])) < len(marks):
-        raise CaptureError(complain(where, "clock.marks", "of different stream times", given, "Keep one of them."))
+        raise CaptureError(where, "clock.marks", "of different stream times", given, "Keep one of them.")
     return _line(marks[:, 0], marks[:, 1] - marks[:, 0], 1.0, where)
 
 
@@ -67,7 +67,7 @@ def from_contacts(blocks: Iterable[Block], log: ProbeLog, where: str) -> ClockMa
     The stream begins with the robot lifted. Memory: 1 byte a sixteenth of a dwell.
     """
     if not log.contact.any():
-        raise CaptureError(complain(where, "the probe log", "one with contacts", "none", "Record the capture again."))
+        raise CaptureError(where, "the probe log", "one with contacts", "none", "Record the capture again.")
     step_s = float(np.median((log.t_end_s - log.t_start_s)[log.contact])) / STEPS_PER_DWELL_N
     pattern = _Pattern(log)
     start_s, signal = _contact_signal(blocks, pattern, step_s, where)
@@ -83,8 +83,8 @@ def from_contacts(blocks: Iterable[Block], log: ProbeLog, where: str) -> ClockMa
             offsets_s.append(offset_s)
         window_s += len(window) * step_s
     if matched <= EXPLAINED_MIN * dwelt:
-        raise CaptureError(complain(where, "dwells that the field agrees with", f"over {EXPLAINED_MIN:.0%}",
-                                    f"{matched / max(dwelt, 1e-9):.0%}", _REMEDY))  # fmt: skip
+        raise CaptureError(where, "dwells that the field agrees with", f"over {EXPLAINED_MIN:.0%}",
+                                    f"{matched / max(dwelt, 1e-9):.0%}", _REMEDY)  # fmt: skip
     return _line(np.array(mid_s), np.array(offsets_s), matched / dwelt, where)
 
 
@@ -133,7 +133,7 @@ def _search(signal: Int8[np.ndarray, " g"], pattern: _Pattern, start_s: float, s
     unexplained = (1 - EXPLAINED_MIN) * seen[top_i] - score[top_i]  # matched less than seen; a dwell amiss counts twice
     if margin < MARGIN_MIN + unexplained / 2:
         got = f"two fits {margin:.2g} indentations apart, of {dwelt.sum():.0f}"
-        raise CaptureError(complain(where, "the fit of field and dwells", "better than any other", got, _REMEDY))
+        raise CaptureError(where, "the fit of field and dwells", "better than any other", got, _REMEDY)
     return pattern.start_s + (top_i - (len(signal) - 1)) * step_s - start_s
 
 
@@ -174,11 +174,11 @@ def _contact_signal(
         step_i = (t_s - start_s) / step_s
         if step_i[-1] > STEPS_MAX_N:
             rule = f"at most {STEPS_MAX_N * step_s:.0f} s long for dwells this short"
-            raise CaptureError(complain(where, "the stream", rule, f"{t_s[-1] - start_s:.0f} s", _REMEDY))
+            raise CaptureError(where, "the stream", rule, f"{t_s[-1] - start_s:.0f} s", _REMEDY)
         first_i, here_i = int(step_i[0]), step_i.astype(np.int64) - int(step_i[0])
         parts.append((first_i, np.sign(np.bincount(here_i, np.where(contact, 1, -1))).astype(np.int8)))
     if start_s is None:
-        raise CaptureError(complain(where, "the stream", "one with frames", "none", "Record the capture again."))
+        raise CaptureError(where, "the stream", "one with frames", "none", "Record the capture again.")
     signal = np.zeros(parts[-1][0] + len(parts[-1][1]), np.int8)
     for first_i, part in parts:
         signal[first_i : first_i + len(part)] = part
@@ -226,5 +226,5 @@ def _line(
     residual_s = float(np.abs(offset_s - mean_s - slope * (at_s - mid_s)).max())
     if abs(slope) > RATE_LIMIT:
         rule = f"in seconds of one event each, so that their rate is 1 within {RATE_LIMIT}"
-        raise CaptureError(complain(where, "clock.marks", rule, f"rate {1 + slope:.6g}", "Check the marks."))
+        raise CaptureError(where, "clock.marks", rule, f"rate {1 + slope:.6g}", "Check the marks.")
     return ClockMap(float(mean_s - slope * mid_s), 1 + slope, residual_s, explained)

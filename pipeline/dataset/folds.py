@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from pipeline.core import io
-from pipeline.core.errors import SchemaError, complain
+from pipeline.core.errors import SchemaError
 from pipeline.dataset.rows import Rows, Selection, gather
 from pipeline.dataset.splits import Fold
 
@@ -47,9 +47,7 @@ def render_folds(captures: Sequence[str], rows: Rows, folds: Sequence[Fold]) -> 
 def parse_folds(words: dict[str, Any], rows: Rows, where: str) -> list[Fold]:
     """Read folds back, for the rows they were drawn from."""
     if words["rows_n"] != len(rows):
-        raise SchemaError(
-            complain(where, "rows_n", f"the {len(rows)} rows of its captures", words["rows_n"], "Split again.")
-        )
+        raise SchemaError(where, "rows_n", f"the {len(rows)} rows of its captures", words["rows_n"], "Split again.")
     return [
         Fold(one["question"], one["name"], *(from_ranges(one[side]) for side in ("train", "test", "pool")))
         for one in words["folds"]

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float32, Int32, Int64
 
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 from pipeline.dataset.rows import TARGETS, Rows
 
 PLACE_STEP_MM = 0.1  # assumed: places nearer than this are one, however a recording wrote them
@@ -100,12 +100,10 @@ def _check_pool(rows: Rows, pool: Int64[np.ndarray, " c"], indentations_n: int) 
     skins, pool_n = np.unique(rows.skin[pool]), len(np.unique(rows.indentation[pool]))
     if len(skins) > 1:
         raise ParamsError(
-            complain("a choice of pokes", "its pool", "of one skin", ", ".join(skins), "Choose on each skin by itself.")
+            "a choice of pokes", "its pool", "of one skin", ", ".join(skins), "Choose on each skin by itself."
         )
     if indentations_n > pool_n:
         raise ParamsError(
-            complain(
                 f"skin {', '.join(skins)}", "pokes to choose", f"at most the {pool_n} indentations of its pool",
                 indentations_n, "Ask for fewer, or let section split keep a larger pool.",
-            )
-        )  # fmt: skip
+            )  # fmt: skip

@@ -16,7 +16,7 @@ from pipeline.capture.probe import ProbeLog
 from pipeline.capture.readers.watch import Watch, check_log
 from pipeline.capture.stream import FrameStream, no_frame
 from pipeline.capture.wire import Frames
-from pipeline.core.errors import CaptureError, complain
+from pipeline.core.errors import CaptureError
 from pipeline.core.schema import Readings
 from pipeline.dataset.clocks import ClockMap, from_contacts, from_marks
 from pipeline.dataset.indentations import TimedFrames, join
@@ -33,7 +33,7 @@ def read_native(folder: Path, header: Header) -> tuple[Iterator[Readings], dict[
     """
     stream = folder / STREAM_FILE
     if not stream.is_file():
-        raise CaptureError(complain(stream, "the file", "there", "nothing", "Copy the whole capture folder."))
+        raise CaptureError(stream, "the file", "there", "nothing", "Copy the whole capture folder.")
     log = probe.parse(folder / PROBE_FILE, str(folder / PROBE_FILE))
     check_log(log, str(folder / PROBE_FILE))
     times_of = _timer(folder, header)
@@ -83,7 +83,7 @@ def _timer(folder: Path, header: Header) -> Timer:
         return lambda frames, _: arrivals.times_of(frames.end_byte, table)
     if rate_hz is None:
         got = repr(header.clock.kind)
-        raise CaptureError(complain(folder, "clock.kind", "'arrivals' or 'rate' for a port's stream", got, "Mend it."))
+        raise CaptureError(folder, "clock.kind", "'arrivals' or 'rate' for a port's stream", got, "Mend it.")
     if header.wire in wire.TEXT_WIRES:
         return lambda frames, before_n: arrivals.constant_rate(before_n + 1.0 + np.arange(len(frames)), rate_hz)
     frame_bytes_n = wire.record_type(_wire(header), header.chips_n).itemsize
@@ -96,7 +96,7 @@ def _arrivals(folder: Path) -> Arrivals:
     bytes_n, arrived_n = (folder / STREAM_FILE).stat().st_size, int(table.byte_end[-1])
     if bytes_n < arrived_n:
         rule = f"the {arrived_n} bytes long that {ARRIVALS_FILE} says"
-        raise CaptureError(complain(folder / STREAM_FILE, "the stream", rule, bytes_n, "Copy the capture again."))
+        raise CaptureError(folder / STREAM_FILE, "the stream", rule, bytes_n, "Copy the capture again.")
     return table
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
 from pipeline.core.config import Strict
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 from pipeline.core.schema import Readings
 from pipeline.dataset.baseline import subtract
 
@@ -58,18 +58,16 @@ class Rows:
 def gather(captures: Sequence[Readings], selection: Selection, *, targets: Sequence[str] = TARGETS) -> Rows:
     """Stack the captures of a scene into rows, and count what is no contact; `targets` name columns of `Readings`."""
     if not captures:
-        raise ParamsError(complain("the scene", "captures", "one or more", "none", "Add one with `reskin add`."))
+        raise ParamsError("the scene", "captures", "one or more", "none", "Add one with `reskin add`.")
     _check_one_kind(captures)
     captures = sorted(captures, key=lambda one: one.capture)
     kept = [_contacts(one, selection) for one in captures]
     for one, keep in zip(captures, kept, strict=True):
         if not keep.any():
             raise ParamsError(
-                complain(
                     f"capture {one.capture}", f"readings with a known place and at least {selection.force_min_N} N",
                     "one or more", f"none of {len(one)}", "Look at its places and at the sign of its force.",
-                )
-            )  # fmt: skip
+                )  # fmt: skip
     passes_n: dict[str, int] = {}
     pass_i = []
     for one, keep in zip(captures, kept, strict=True):
@@ -122,23 +120,17 @@ def _check_one_kind(captures: Sequence[Readings]) -> None:
     for one in captures:
         if one.chips_n != first.chips_n:
             raise ParamsError(
-                complain(
                     f"capture {one.capture}", "chips of a scene's captures", f"the {first.chips_n} of {first.capture}",
                     one.chips_n, "Add it to a scene of its own.",
-                )
-            )  # fmt: skip
+                )  # fmt: skip
         if one.source != first.source:
             raise ParamsError(
-                complain(
                     f"capture {one.capture}", "source", f"{first.source}, as {first.capture} is", one.source,
                     "Simulated and recorded captures belong to different scenes.",
-                )
-            )  # fmt: skip
+                )  # fmt: skip
         if boards.setdefault(one.skin, one.board) != one.board:
             raise ParamsError(
-                complain(
                     f"capture {one.capture}", f"the board of skin {one.skin}", f"{boards[one.skin]}, as before",
                     one.board,
                     "A skin moved to another board is a new skin here: give it a new name.",
-                )
-            )  # fmt: skip
+                )  # fmt: skip

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Int64, Shaped
 from sklearn.model_selection import GroupShuffleSplit, train_test_split
 
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 from pipeline.core.seeds import seed_for
 from pipeline.dataset.hold_out import NO_POOL, Fold, Split
 from pipeline.dataset.rows import Rows
@@ -45,11 +45,9 @@ def last_passes(rows: Rows, split: Split, seed: int) -> list[Fold]:
         captures = np.unique(rows.capture[own])
         if len(captures) > 1:
             raise ParamsError(
-                complain(
                     "question single_temporal", f"the captures of skin {skin}", "one, as no clock orders several",
                     ", ".join(captures), "Record the passes in one capture, or ask single_random.",
-                )
-            )  # fmt: skip
+                )  # fmt: skip
         passes = np.unique(rows.pass_i[own])
         test_n = _test_n(
             len(passes), split.temporal_test_fraction, f"passes of skin {skin}", "question single_temporal"
@@ -94,9 +92,7 @@ def _test_n(all_n: int, fraction: float, what: str, where: str) -> int:
     test_n = round(fraction * all_n)
     if not 0 < test_n < all_n:
         raise ParamsError(
-            complain(
                 where, what, "enough for both sides", f"{all_n}, of which {fraction:g} are {test_n}",
                 "Record more, change the fraction, or take the question out of the scene's.",
-            )
-        )  # fmt: skip
+            )  # fmt: skip
     return test_n

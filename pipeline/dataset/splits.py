@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 from sklearn.model_selection import LeaveOneGroupOut
 
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 from pipeline.core.seeds import rng_for
 from pipeline.dataset.hold_out import NO_POOL, ONE_SKIN, Fold, Question, Split
 from pipeline.dataset.lines import take_pokes
@@ -55,11 +55,9 @@ def leave_one_board_out(rows: Rows, split: Split, seed: int) -> list[Fold]:
     boards = np.unique(rows.board)
     if len(boards) < 2:
         raise ParamsError(
-            complain(
                 "question lobo", "boards", "two or more", f"{len(boards)} ({', '.join(boards)})",
                 "Add another board's recording, or take lobo out of the scene's questions.",
-            )
-        )  # fmt: skip
+            )  # fmt: skip
     drawn = LeaveOneGroupOut().split(np.empty((len(rows), 0)), groups=rows.board)
     return [hold_out_skins(rows, "lobo", str(rows.board[held[0]]), (train, held), split) for train, held in drawn]
 
@@ -77,12 +75,10 @@ def fewer_sensors(rows: Rows, split: Split, seed: int) -> list[Fold]:
         held, skins = np.flatnonzero(rows.board == board), np.unique(rows.skin[rows.board != board])
         if max(split.sensors_skins_n) > len(skins):
             raise ParamsError(
-                complain(
                     "question sensors", "split.sensors_skins_n",
                     f"at most the {len(skins)} skins beside held-out board {board}", max(split.sensors_skins_n),
                     "Ask for fewer, or add another board's recording.",
-                )
-            )  # fmt: skip
+                )  # fmt: skip
         draws = range(split.sensors_draws_n)
         orders = [rng_for(seed, "sensors", str(board), draw_i).permutation(skins) for draw_i in draws]
         for skins_n in split.sensors_skins_n:
@@ -116,11 +112,9 @@ def few_labels(rows: Rows, split: Split, seed: int) -> list[Fold]:
             test = np.setdiff1d(whole.test, pool)
             if not len(test):
                 raise ParamsError(
-                    complain(
                         f"fold labels/{whole.name}", "split.labels_pool_n", "less than its indentations",
                         split.labels_pool_n, "Ask for fewer, or record more.",
-                    )
-                )  # fmt: skip
+                    )  # fmt: skip
             folds.append(Fold("labels", f"{whole.name}-draw{draw_i}", whole.train, test, pool))
     return folds
 
@@ -137,11 +131,9 @@ def one_skin_to_others(rows: Rows, split: Split, seed: int) -> list[Fold]:
     boards, train_n = np.unique(rows.board), split.transfer_skins_n
     if train_n >= len(boards):
         raise ParamsError(
-            complain(
                 "question transfer", "split.transfer_skins_n", f"less than the scene's {len(boards)} boards", train_n,
                 "Each training skin takes a board; another must be left to test on.",
-            )
-        )  # fmt: skip
+            )  # fmt: skip
     held = np.flatnonzero(np.isin(rows.board, boards[train_n:]))
     folds = []
     for board in boards[:train_n]:
@@ -161,12 +153,10 @@ def hold_out_skins(rows: Rows, question: str, name: str, sides: tuple[np.ndarray
             passes = np.unique(rows.pass_i[held[own]])
             if len(passes) <= split.pool_passes_n:
                 raise ParamsError(
-                    complain(
                         f"question {question}", f"passes of held-out skin {skin}",
                         f"more than split.pool_passes_n, {split.pool_passes_n}", len(passes),
                         "Record more passes, or make the pool smaller.",
-                    )
-                )  # fmt: skip
+                    )  # fmt: skip
             pooled |= own & np.isin(rows.pass_i[held], passes[: split.pool_passes_n])
     fold = Fold(question, name, train, held[~pooled], held[pooled])
     _prove_apart(rows, fold)
@@ -179,11 +169,9 @@ def _prove_apart(rows: Rows, fold: Fold) -> None:
         both = np.intersect1d(np.unique(labels[fold.train]), np.unique(labels[held]))
         if len(both):
             raise ParamsError(
-                complain(
                     f"fold {fold.question}/{fold.name}", f"a {what}", "on one side only",
                     f"{', '.join(both)} on both", "Give every skin its own name, and each skin one board.",
-                )
-            )  # fmt: skip
+                )  # fmt: skip
 
 
 _DRAW: dict[str, Callable[[Rows, Split, int], list[Fold]]] = {

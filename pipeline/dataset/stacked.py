@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 from pipeline.core.schema import Readings
 from pipeline.dataset.baseline import subtract
 from pipeline.dataset.lines import Lines, hand_lines
@@ -22,7 +22,7 @@ def stack(above: Rows, below: Rows) -> Rows:
     if below.db_uT.shape[1:] != above.db_uT.shape[1:]:
         rule = f"the {above.db_uT.shape[1]} of {above.capture[0]}"
         raise ParamsError(
-            complain(f"capture {below.capture[0]}", "channels", rule, below.db_uT.shape[1], "Use boards of one kind.")
+            f"capture {below.capture[0]}", "channels", rule, below.db_uT.shape[1], "Use boards of one kind."
         )
     stacked = {name: np.concatenate([getattr(above, name), getattr(below, name)]) for name in COLUMNS}
     indentation = np.concatenate([above.indentation, below.indentation + above.indentation.max() + 1])
@@ -38,7 +38,7 @@ def hand_rows(captures: Sequence[Readings]) -> tuple[Rows, dict[str, Lines]]:
     for one in captures:
         if one.skin in lines:
             raise ParamsError(
-                complain(f"capture {one.capture}", "its skin", "poked by hand in one capture", one.skin, "Drop one.")
+                f"capture {one.capture}", "its skin", "poked by hand in one capture", one.skin, "Drop one."
             )
         own = _unplaced(one)
         rows.append(own)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool
 
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 from pipeline.core.schema import LABELS, Readings
 
 
@@ -35,11 +35,9 @@ def lay_windows(units_n: Sequence[int], *, train_n: int, test_n: int, every_n: i
     windows_n = max(0, (min(units_n) - test_n) // every_n)
     if not windows_n:
         raise ParamsError(
-            complain(
                 "question drift", "the shortest capture", f"at least drift.every_n + test_n = {every_n + test_n} long",
                 min(units_n), "Record more, or make the windows smaller.",
-            )
-        )  # fmt: skip
+            )  # fmt: skip
     tests = tuple((i * every_n, i * every_n + test_n) for i in range(1, windows_n + 1))
     left_out_n = sum(max(0, one_n - (windows_n + 1) * every_n) for one_n in units_n)
     return Windows((0, train_n), tests, left_out_n)
@@ -59,8 +57,6 @@ def check_one_each(captures: Sequence[Readings]) -> None:
     for skin, names in of.items():
         if len(names) > 1:
             raise ParamsError(
-                complain(
                     "question drift", f"the captures of skin {skin}", "one, as no clock orders several",
                     ", ".join(names), "Record its contacts in one capture, or give each skin its own name.",
-                )
-            )  # fmt: skip
+                )  # fmt: skip

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 from pipeline.evaluation.summary import over_folds, pool_skins
 
 BY = "mse_xy_mm2"
@@ -66,13 +66,13 @@ def _best(cards: Cards, stage: str, eligible: Cards | None = None) -> dict[str, 
     among = cards if eligible is None else eligible
     if not among:
         raise ParamsError(
-            complain("choice of settings", f"candidates of {stage}", "one or more", "none", "Ask lobo, triplet, adapt.")
+            "choice of settings", f"candidates of {stage}", "one or more", "none", "Ask lobo, triplet, adapt."
         )
     _check_budgets(cards, stage)
     sound = [card for card in among if not any(_has_collapsed(one) for one in cards if _key(one) == _key(card))]
     if not sound:
         rule = "one or more without a collapsed training"
-        raise ParamsError(complain("choice of settings", f"candidates of {stage}", rule, "none", "Try lower rates."))
+        raise ParamsError("choice of settings", f"candidates of {stage}", rule, "none", "Try lower rates.")
     card = min(sound, key=lambda one: (_error(cards, one), _budget(one)))
     words = {"recipe_name": card["recipe_name"], "settings": trimmed(settings_of(card))}
     return words | {"by": "MSE_xy, mean over all budgets of steps", "candidates": _candidates(cards)}
@@ -95,10 +95,8 @@ def _check_budgets(cards: Cards, stage: str) -> None:
     for name, budgets in tried.items():
         if budgets != every:
             got = f"{sorted(budgets)} of {sorted(every)}"
-            raise ParamsError(
-                complain("choice of settings", f"steps of {stage}'s {name}", "those of all candidates", got,
-                         "Try every candidate with every number of steps.")
-            )  # fmt: skip
+            raise ParamsError("choice of settings", f"steps of {stage}'s {name}", "those of all candidates", got,
+                         "Try every candidate with every number of steps.")  # fmt: skip
 
 
 def _key(card: dict[str, Any]) -> dict[str, Any]:

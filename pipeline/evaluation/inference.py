@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import t
 
-from pipeline.core.errors import SchemaError, complain
+from pipeline.core.errors import SchemaError
 
 CONFIDENCE = 0.95  # convention
 YES, NO, INCONCLUSIVE = "yes", "no", "inconclusive"
@@ -72,7 +72,7 @@ def paired(of: Iterable[Scored], over: Iterable[Scored]) -> dict[str, Any]:
     if ours.keys() != theirs.keys():
         unpaired = sorted(ours.keys() ^ theirs.keys())
         remedy = "Train both on the same folds."
-        raise SchemaError(complain("a paired difference", "held-out skins", "the same on both sides", unpaired, remedy))
+        raise SchemaError("a paired difference", "held-out skins", "the same on both sides", unpaired, remedy)
     differences = [
         (board, skin, {name: own[name] - theirs[board, skin][name] for name in own if name in theirs[board, skin]})
         for (board, skin), own in ours.items()

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.core import io
-from pipeline.core.errors import SchemaError, complain
+from pipeline.core.errors import SchemaError
 from pipeline.core.schema import Readings
 
 NO_CAPTURES: Mapping[str, Any] = {"accounts": [], "left_out": {}}  # of its own: it asks the main ones
@@ -15,7 +15,7 @@ def read_folder(indentations: Path, names: tuple[str, ...] = ()) -> list[Reading
     """Read the named captures of a folder in order of name; without names, all that its one stage wrote."""
     files = [indentations / f"{name}.parquet" for name in sorted(names)] or sorted(indentations.glob("*.parquet"))
     if not files:
-        raise SchemaError(complain(str(indentations), "captures", "one or more", "none", "Ingest them again."))
+        raise SchemaError(str(indentations), "captures", "one or more", "none", "Ingest them again.")
     return [io.read_readings(file) for file in files]
 
 

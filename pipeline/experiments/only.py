@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeVar
 
-from pipeline.core.errors import SchemaError, complain
+from pipeline.core.errors import SchemaError
 
 Capture = TypeVar("Capture")
 
@@ -13,5 +13,5 @@ def only(captures: Sequence[Capture], folder: Path) -> Capture:
     """Give the capture of a folder that holds one."""
     if len(captures) != 1:
         remedy = "Ask its protocol of one skin (skins_n), and simulate it again."
-        raise SchemaError(complain(folder, "captures", "one, as its question reads no more", len(captures), remedy))
+        raise SchemaError(folder, "captures", "one, as its question reads no more", len(captures), remedy)
     return captures[0]

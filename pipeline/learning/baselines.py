@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Float32, Int64
 
 from pipeline.core.seeds import rng_for
-from pipeline.learning.cell import Measured
 from pipeline.learning.classical import Classical, fit
 from pipeline.learning.inputs import VIEW
 from pipeline.learning.stopwatch import median_s
+from pipeline.learning.trial import Measured
 
 
 @dataclass(frozen=True)

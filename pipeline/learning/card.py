@@ -5,22 +5,22 @@ from typing import Any
 import numpy as np
 
 from pipeline.dataset.rows import TARGETS, Rows
-from pipeline.learning.cell import Adapting, Cell, FewLabels, Trained
+from pipeline.learning.trial import Adapting, FewLabels, Trained, Trial
 
 FORMAT = "reskin-model/3"
 
 
-def describe(cell: Cell, trained: Trained, rows: Rows, scene: str, code: str) -> dict[str, Any]:
-    """Describe a trained cell; `scores` are added by whoever knows the truth."""
+def describe(trial: Trial, trained: Trained, rows: Rows, scene: str, code: str) -> dict[str, Any]:
+    """Describe a trained trial; `scores` are added by whoever knows the truth."""
     card = {
         "format": FORMAT,
         "scene": scene,
-        "question": cell.question,
-        "recipe_name": cell.recipe_name,
-        "recipe": cell.recipe.model_dump(mode="json"),
-        "fold": cell.fold,
-        "seed": cell.seed,
-        "seed_i": cell.seed_i,
+        "question": trial.question,
+        "recipe_name": trial.recipe_name,
+        "recipe": trial.recipe.model_dump(mode="json"),
+        "fold": trial.fold,
+        "seed": trial.seed,
+        "seed_i": trial.seed_i,
         "key": trained.key,
         "git": code,
         "architecture": {name: list(value.shape) for name, value in trained.weights.items()},
@@ -28,21 +28,21 @@ def describe(cell: Cell, trained: Trained, rows: Rows, scene: str, code: str) ->
             "quantity": "change of field",
             "unit": "uT",
             "channels_n": rows.db_uT.shape[1],
-            "view": cell.recipe.inputs,
+            "view": trial.recipe.inputs,
         },
         "output": {name: name.rsplit("_", 1)[1] for name in TARGETS},
         "scaler": {name: value.tolist() for name, value in trained.scaler.arrays().items()},
         "stopped_step": trained.stopped_step,
         "explained_min": None if trained.explained_min is None else round(trained.explained_min, 6),
         **went(trained),
-        "train_boards": np.unique(rows.board[cell.train]).tolist(),
-        "train_skins": np.unique(rows.skin[cell.train]).tolist(),
-        "train_rows_n": len(cell.train),
-        "test_boards": np.unique(rows.board[cell.test]).tolist(),
-        "test_skins": np.unique(rows.skin[cell.test]).tolist(),
+        "train_boards": np.unique(rows.board[trial.train]).tolist(),
+        "train_skins": np.unique(rows.skin[trial.train]).tolist(),
+        "train_rows_n": len(trial.train),
+        "test_boards": np.unique(rows.board[trial.test]).tolist(),
+        "test_skins": np.unique(rows.skin[trial.test]).tolist(),
         "curve": [round(value, 9) for value in trained.curve],
     }
-    return card if cell.tuning is None else card | {"tuning": _tuning(cell.tuning, rows)}
+    return card if trial.tuning is None else card | {"tuning": _tuning(trial.tuning, rows)}
 
 
 def went(trained: Trained) -> dict[str, Any]:

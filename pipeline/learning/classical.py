@@ -18,7 +18,7 @@ from sklearn.preprocessing import PolynomialFeatures
 from threadpoolctl import ThreadpoolController  # type: ignore[import-untyped]
 
 from pipeline.core.config import Strict
-from pipeline.core.errors import TrainingError, complain
+from pipeline.core.errors import TrainingError
 from pipeline.learning.standardise import SCALE_FLOOR, Scaler, fit_standard
 
 THREADS = ThreadpoolController()  # of the libraries above: finding them takes 3 ms, limiting them 15 us
@@ -249,9 +249,7 @@ def _draw(
     left_n = most_n - int(heavy.sum())
     if left_n < 1:
         raise TrainingError(
-            complain(
-                "rbf_ridge", "rows_max_n", f"more than the {heavy.sum()} rows of greater weight", most_n, "Raise it."
-            )
+            "rbf_ridge", "rows_max_n", f"more than the {heavy.sum()} rows of greater weight", most_n, "Raise it."
         )
     drawn = np.sort(np.concatenate([np.flatnonzero(heavy), rng.choice(light, left_n, replace=False)]))
     return drawn, np.where(heavy, weight * left_n / len(light), weight)[drawn]
@@ -263,7 +261,7 @@ def _check(asked: Classical, inputs: Float32[np.ndarray, "n c"], target: Float32
     least_n = asked.neighbours_n if isinstance(asked, Neighbours) else 1
     if fewest_n < least_n:
         rule = f"{least_n} or more for each target"
-        raise TrainingError(complain(asked.method, "training rows", rule, fewest_n, "Record more."))
+        raise TrainingError(asked.method, "training rows", rule, fewest_n, "Record more.")
     if not np.isfinite(inputs).all():
         broken_n = int((~np.isfinite(inputs)).any(axis=1).sum())
-        raise TrainingError(complain(asked.method, "inputs", "finite", f"{broken_n} rows that are not", "Drop them."))
+        raise TrainingError(asked.method, "inputs", "finite", f"{broken_n} rows that are not", "Drop them.")

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from typing import Any
 
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 
 VARIABLE = "RESKIN_EXECUTOR"
 DEFAULT = "processes:2"
@@ -26,9 +26,7 @@ def make_executor() -> Executor:
         return Here()
     kind, _, count = word.partition(":")
     if kind != "processes" or not count.isdecimal() or int(count) < 1:
-        raise ParamsError(
-            complain(VARIABLE, "the executor", "processes:N with N >= 1, or here", repr(word), "Unset it for two.")
-        )
+        raise ParamsError(VARIABLE, "the executor", "processes:N with N >= 1, or here", repr(word), "Unset it for two.")
     # spawn: a forked child of a threaded parent can hang in BLAS.
     return ProcessPoolExecutor(int(count), multiprocessing.get_context("spawn"), _end_with_parent)
 
@@ -50,7 +48,7 @@ def device() -> str:
     """Where networks are trained: RESKIN_DEVICE, `cpu` if it is not set; one code path for all."""
     word = os.environ.get(DEVICE_VARIABLE, DEVICES[0])
     if word not in DEVICES:
-        raise ParamsError(complain(DEVICE_VARIABLE, "the device", f"one of {DEVICES}", repr(word), "Unset it for cpu."))
+        raise ParamsError(DEVICE_VARIABLE, "the device", f"one of {DEVICES}", repr(word), "Unset it for cpu.")
     return word
 
 

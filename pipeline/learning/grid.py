@@ -1,7 +1,7 @@
-"""Many trainings at once: recipes x folds x seeds. In: rows and cells. Out: one finished file a cell.
+"""Many trainings at once: recipes x folds x seeds. In: rows and trials. Out: one finished file a trial.
 
-Cells of equal settings and seed are trained as one stack. Where a network lies in a stack shows in the last bits of
-its sums, so stacks are made of all cells that are asked for, done or not, and are known by all their members: a killed
+Trials of equal settings and seed are trained as one stack. Where a network lies in a stack shows in the last bits of
+its sums, so stacks are made of all trials that are asked for, done or not, and are known by all their members: a killed
 stage goes on at the stacks that were not whole, and gives what it would have given; one more seed costs one seed.
 Refuses to know stages, scores and pages.
 """
@@ -18,41 +18,41 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.core import io
-from pipeline.core.errors import TrainingError, complain
-from pipeline.learning.cell import Cell, Keys, Measured, Trained
+from pipeline.core.errors import TrainingError
 from pipeline.learning.executors import device
 from pipeline.learning.stack import train_stack
 from pipeline.learning.standardise import Scaler
+from pipeline.learning.trial import Keys, Measured, Trained, Trial
 
-ATTEMPTS_MAX_N = 3  # trainings of one cell; what collapses in all of them is kept, told, and refused by `predict`
+ATTEMPTS_MAX_N = 3  # trainings of one trial; what collapses in all of them is kept, told, and refused by `predict`
 STACK_N = {"cpu": 3, "cuda": 64}  # networks trained side by side; on a CPU more gain nothing, and two processes share
 
 
-def run_cells(
-    cells: Sequence[Cell], rows: Measured, *, executor: Executor, cache: Path, tell: Callable[[str], None]
+def run_trials(
+    trials: Sequence[Trial], rows: Measured, *, executor: Executor, cache: Path, tell: Callable[[str], None]
 ) -> list[Trained]:
-    """Train what `cache` does not hold yet, and return every cell's result in the order of `cells`.
+    """Train what `cache` does not hold yet, and return every trial's result in the order of `trials`.
 
     What collapsed is trained again with draws of its own, at most `ATTEMPTS_MAX_N` times in all.
     """
-    done = _run_once(cells, rows, executor=executor, cache=cache, tell=tell)
+    done = _run_once(trials, rows, executor=executor, cache=cache, tell=tell)
     for attempt_i in range(1, ATTEMPTS_MAX_N):
         again = [i for i, one in enumerate(done) if one.collapsed]
         if not again:
             break
-        tell(f"{len(again)} of {len(cells)} trainings collapsed: once more with other draws")
-        others = [replace(cells[i], attempt_i=attempt_i) for i in again]
+        tell(f"{len(again)} of {len(trials)} trainings collapsed: once more with other draws")
+        others = [replace(trials[i], attempt_i=attempt_i) for i in again]
         for i, one in zip(again, _run_once(others, rows, executor=executor, cache=cache, tell=tell), strict=True):
             done[i] = replace(one, collapsed_before_n=attempt_i, seconds=done[i].seconds + one.seconds)
     return done
 
 
 def _run_once(
-    cells: Sequence[Cell], rows: Measured, *, executor: Executor, cache: Path, tell: Callable[[str], None]
+    trials: Sequence[Trial], rows: Measured, *, executor: Executor, cache: Path, tell: Callable[[str], None]
 ) -> list[Trained]:
     keys = Keys(rows)
-    names = [keys.key(cell) for cell in cells]  # not the cell's own name: it decides no result
-    members = dict(zip(names, cells, strict=True))  # equal trainings are one
+    names = [keys.key(trial) for trial in trials]  # not the trial's own name: it decides no result
+    members = dict(zip(names, trials, strict=True))  # equal trainings are one
     planned = [
         (stack, [cache / f"{one}.safetensors" for one in _files_of(stack)])
         for stack in stacks(members, STACK_N[device()])
@@ -75,11 +75,11 @@ def _run_once(
     return [replace(_read_trained(file_of[key]), reused=key not in fresh) for key in names]
 
 
-def stacks(members: Mapping[str, Cell], size_n: int) -> list[list[str]]:
-    """Put keys of cells of equal settings and seed together, in order, at most so many."""
+def stacks(members: Mapping[str, Trial], size_n: int) -> list[list[str]]:
+    """Put keys of trials of equal settings and seed together, in order, at most so many."""
     alike: dict[tuple[object, ...], list[str]] = {}
-    for key, cell in members.items():
-        alike.setdefault((cell.recipe, cell.schedule, cell.terms, cell.seed, cell.seed_i), []).append(key)
+    for key, trial in members.items():
+        alike.setdefault((trial.recipe, trial.schedule, trial.terms, trial.seed, trial.seed_i), []).append(key)
     return [group[i : i + size_n] for group in alike.values() for i in range(0, len(group), size_n)]
 
 
@@ -90,7 +90,7 @@ def _files_of(stack: Sequence[str]) -> list[str]:
 
 
 def _run_stacks(
-    planned: Sequence[tuple[Sequence[Cell], Sequence[Path]]], rows_file: Path, executor: Executor,
+    planned: Sequence[tuple[Sequence[Trial], Sequence[Path]]], rows_file: Path, executor: Executor,
     tell: Callable[[str], None],
 ) -> None:  # fmt: skip
     start_s, done_n, all_n = time.monotonic(), 0, sum(len(stack) for stack, _ in planned)
@@ -103,21 +103,19 @@ def _run_stacks(
             raise TrainingError(f"{running[future][0].name}, {error}") from None
         except BrokenExecutor:
             raise TrainingError(
-                complain(
                     "training", "a worker process", "alive to its end", "one that died",
                     "Out of memory? Run again: what was finished is kept.",
-                )
-            ) from None  # fmt: skip
+                ) from None  # fmt: skip
         done_n += len(running[future])
         left_s = (time.monotonic() - start_s) / done_n * (all_n - done_n)
         tell(f"{done_n}/{all_n} {running[future][-1].name}, about {left_s:.0f} s left")
 
 
-def _stack_to_files(rows_file: Path, cells: Sequence[Cell], files: Sequence[Path]) -> None:
-    for cell, file, one in zip(cells, files, train_stack(cells, _read_rows(rows_file)), strict=True):
+def _stack_to_files(rows_file: Path, trials: Sequence[Trial], files: Sequence[Path]) -> None:
+    for trial, file, one in zip(trials, files, train_stack(trials, _read_rows(rows_file)), strict=True):
         tensors = {f"weights.{name}": value for name, value in one.weights.items()} | one.scaler.arrays()
         tensors |= {"curve": np.array(one.curve), "predicted": one.predicted}
-        words = {"seconds": f"{one.seconds:.3f}", "one_reading_s": f"{one.one_reading_s:.3g}", "cell": cell.name}
+        words = {"seconds": f"{one.seconds:.3f}", "one_reading_s": f"{one.one_reading_s:.3g}", "trial": trial.name}
         words |= {
             name: repr(value)
             for name, value in (("stopped_step", one.stopped_step), ("explained_min", one.explained_min))

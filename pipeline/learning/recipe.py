@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import Field, model_validator
 
 from pipeline.core.config import Settings, Strict, Words, parse, parse_parts
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 
 HEADLINE = "paper"  # the recipe whose numbers stand beside the paper's; others are variants
 
@@ -179,7 +179,7 @@ def adaptations(settings: Settings) -> Adaptations:
     known = sorted(training(settings, "train_triplet").recipes)
     for name, row in section.recipes.items():
         if row.base not in known:
-            raise ParamsError(complain(where, f"base of {name}", f"one of {known}", repr(row.base), "Mend it there."))
+            raise ParamsError(where, f"base of {name}", f"one of {known}", repr(row.base), "Mend it there.")
     return section
 
 
@@ -194,5 +194,5 @@ def _in_full(words: Words, shared: Words, where: str) -> dict[str, dict[str, Any
     variants = words.get("variants", {})
     if HEADLINE in variants:
         rule = "unlike the headline, which is the shared row as it is"
-        raise ParamsError(complain(f"{where}.variants", "a name", rule, HEADLINE, "Choose another name."))
+        raise ParamsError(f"{where}.variants", "a name", rule, HEADLINE, "Choose another name.")
     return {HEADLINE: headline} | {name: headline | changes for name, changes in variants.items()}

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int64, Shaped
 
-from pipeline.core.errors import TrainingError, complain
+from pipeline.core.errors import TrainingError
 
 ROUNDS_MAX_N = 100  # with half of the draws tied, 1e-30 of the anchors are left after so many
 TIED = 1e-5  # of the sum of both squared distances; places are float32 numbers, equal distances differ by 1e-6
@@ -53,21 +53,17 @@ def make_points(place: Float[np.ndarray, "n d"], group: Shaped[np.ndarray, " n"]
     flat = np.flatnonzero((lowest == highest).all(axis=1))
     if len(flat):
         raise TrainingError(
-            complain(
                 f"triplets of group {names[flat[0]]}", "the places of its points", "two or more",
                 f"{count[flat[0]]} points on one place", "Poke at several places, or leave the group out.",
-            )
-        )  # fmt: skip
+            )  # fmt: skip
     is_anchor = np.zeros(len(place), bool)
     for first, n in zip(start, count, strict=True):
         is_anchor[order[first : first + n]] = _tells(place[order[first : first + n]])
     if not is_anchor.any():
         raise TrainingError(
-            complain(
                 "triplets", "points", "some nearer to one than others are", f"{len(place)} that are equally far",
                 "Poke at more places.",
-            )
-        )  # fmt: skip
+            )  # fmt: skip
     return Points(place.astype(np.float64), codes.astype(np.int64), order, start, count, is_anchor)
 
 
@@ -91,11 +87,9 @@ def draw_pairs(points: Points, anchor: Int64[np.ndarray, " b"], rng: np.random.G
         if not len(left):
             return positive, negative
     raise TrainingError(
-        complain(
             "triplets", "the distances from an anchor", "different ones",
             f"ties in {ROUNDS_MAX_N} draws at place {points.place[anchor[left[0]]].tolist()}", "Poke at more places.",
-        )
-    )  # fmt: skip
+        )  # fmt: skip
 
 
 def _tells(place: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, " n"]:

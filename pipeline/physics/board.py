@@ -14,7 +14,7 @@ from scipy.constants import micro, milli
 from scipy.spatial.transform import Rotation
 
 from pipeline.core.config import Strict
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 from pipeline.core.seeds import rng_for
 
 CHIPS_MAX_N = 64
@@ -103,7 +103,7 @@ def draw_board(design: BoardDesign, spreads: Spreads, *, seed: int, name: str) -
     chips_n = len(design.places_mm)
     gap_mm = design.gap_mm + spreads.board_gap_mm * rng.standard_normal()
     if gap_mm <= 0:
-        raise ParamsError(complain(f"board {name}", "gap", "above 0 mm", f"{gap_mm:.3g}", "Lower board_gap_mm."))
+        raise ParamsError(f"board {name}", "gap", "above 0 mm", f"{gap_mm:.3g}", "Lower board_gap_mm.")
     chips_mm = np.column_stack([np.array(design.places_mm), np.full(chips_n, -gap_mm)])
     tilt_deg = spreads.chip_tilt_deg * rng.standard_normal((chips_n, 2))
     turn = Rotation.from_euler("ZYX", np.column_stack([design.turns_deg, tilt_deg]), degrees=True)

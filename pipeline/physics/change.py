@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from numba import njit
 
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 from pipeline.physics.dipole import MU0_4PI
 
 
@@ -27,7 +27,7 @@ def change_of_field(
     rows = [np.ascontiguousarray(part.T) for part in (*rest, *moved)]
     change_T = MU0_4PI * _sum_of_changes(*rows, np.ascontiguousarray(observers_m))
     if not np.isfinite(change_T).all():
-        raise ParamsError(complain("change of field", "distance to a chip", "above 0 m", "0 or NaN", "Move the chip."))
+        raise ParamsError("change of field", "distance to a chip", "above 0 m", "0 or NaN", "Move the chip.")
     return change_T
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.constants import mu_0
 
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 
 MU0_4PI = mu_0 / (4 * np.pi)  # CODATA, T m / A; not exactly 1e-7 since 2019
 
@@ -29,7 +29,7 @@ def field_of_each(
     moment = moments_A_m2.T[:, None, :]
     r2 = (separation * separation).sum(axis=0)
     if r2.size and not r2.min() > 0:
-        raise ParamsError(complain("dipole field", "distance to a chip", "above 0 m", "0 or NaN", "Move the chip."))
+        raise ParamsError("dipole field", "distance to a chip", "above 0 m", "0 or NaN", "Move the chip.")
     along = 3 * (moment * separation).sum(axis=0) / r2
     each = (along * separation - moment) * (MU0_4PI / (r2 * np.sqrt(r2)))
     return np.moveaxis(each, 0, 2)

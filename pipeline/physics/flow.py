@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 from pipeline.physics import layer
 
 STEP = 0.025  # of `depth_unit`: 0.05 mm in a skin of 2 mm; half of it changes dB by 0.3 % (slipping), 0.6 % (bonded)
@@ -70,7 +70,7 @@ def sink(material: Material, depth_m: float, press: Press) -> Material:
     if not sunken.z_m.max() < RIM_MAX * press.thickness_m:
         rule = f"such that the rim stays below {RIM_MAX} of the skin's thickness"
         got = f"{depth_m / press.thickness_m:.3g} of the thickness"
-        raise ParamsError(complain("poke", "depth", rule, got, "Poke less deep."))
+        raise ParamsError("poke", "depth", rule, got, "Poke less deep.")
     return sunken
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from numba import njit
 from scipy.interpolate import CubicSpline
 
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 from pipeline.physics import layer
 from pipeline.physics.flow import LADDER, Material, Press, angle, depth_unit, sink, with_marks, without_marks
 
@@ -78,7 +78,7 @@ def tabulate(
     depth_m = thickness_m * depth_unit(size) * LADDER
     if not 0 < deepest_m <= depth_m[-1]:
         rule = f"above 0 mm and at most {1e3 * depth_m[-1]:.3g} mm, the deepest that is followed"
-        raise ParamsError(complain("poke", "deepest depth", rule, f"{1e3 * deepest_m:.3g} mm", "Poke less deep."))
+        raise ParamsError("poke", "deepest depth", rule, f"{1e3 * deepest_m:.3g} mm", "Poke less deep.")
     rungs_n = 1 + max(int(np.searchsorted(depth_m, deepest_m)), STENCIL_N - 1)
     at = np.log(size) / SIZE_STEP
     tables_i = int(np.floor(at)) - 1 + np.arange(STENCIL_N)
@@ -116,7 +116,7 @@ def at_depth(flow: FlowMap, depth_m: float) -> Float[np.ndarray, "l i 3"]:
     """
     if not -np.inf < depth_m <= flow.depth_m[-1]:
         rule = f"finite and at most {1e3 * flow.depth_m[-1]:.4g} mm, the deepest that is tabulated"
-        raise ParamsError(complain("poke", "depth", rule, f"{1e3 * depth_m:.4g} mm", "Tabulate deeper."))
+        raise ParamsError("poke", "depth", rule, f"{1e3 * depth_m:.4g} mm", "Tabulate deeper.")
     if depth_m <= 0:
         return flow.moved[0]
     first = max(int(np.searchsorted(flow.depth_m, depth_m)) + 1, STENCIL_N) - STENCIL_N
@@ -147,7 +147,7 @@ def _rung(table_i: int, heights: tuple[float, ...], rung_i: int, base: layer.Bas
     at = sink(_rung(table_i, heights, rung_i - 1, base), depth, press)
     if not np.abs(np.linalg.det(at.f) * at.hoop - 1).max() <= DET_F_ERROR_MAX:
         rule = f"such that material keeps its volume within {DET_F_ERROR_MAX:.0%}"
-        raise ParamsError(complain("poke", "depth", rule, f"{depth:.3g} of the thickness", "Poke less deep."))
+        raise ParamsError("poke", "depth", rule, f"{depth:.3g} of the thickness", "Poke less deep.")
     return at
 
 

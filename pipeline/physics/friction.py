@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from pydantic import Field
 
 from pipeline.core.config import Strict
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 
 
 class Friction(Strict):
@@ -66,10 +66,10 @@ def _refuse(
     friction: float,
 ) -> None:
     if not np.isfinite(path_m).all():
-        raise ParamsError(complain("drag", "every place", "finite", "NaN or infinity", "Mend the path."))
+        raise ParamsError("drag", "every place", "finite", "NaN or infinity", "Mend the path.")
     for what, unit, values in (("normal force", "N", normal_N), ("stiffness", "N/m", stiffness)):
         if not (np.isfinite(values) & (values >= 0)).all():
             worst = values[~(np.isfinite(values) & (values >= 0))][0]
-            raise ParamsError(complain("drag", what, f"0 {unit} or more and finite", f"{worst}", "Check its sign."))
+            raise ParamsError("drag", what, f"0 {unit} or more and finite", f"{worst}", "Check its sign.")
     if not 0 <= friction < np.inf:
-        raise ParamsError(complain("drag", "friction", "0 or more and finite", f"{friction}", "Check the scene."))
+        raise ParamsError("drag", "friction", "0 or more and finite", f"{friction}", "Check the scene.")

@@ -14,7 +14,7 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
 from scipy.special import j0, j1
 
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 from pipeline.physics import slip
 
 Base = Literal["bonded", "slipping"]
@@ -125,7 +125,7 @@ def force(
     """Give the force on the tip in newtons; a depth of zero or less is no contact: no force."""
     refuse_layer(depth_m, thickness_m, tip_radius_m)
     if not (np.isfinite(modulus_Pa) and modulus_Pa >= 0):
-        raise ParamsError(complain("layer", "modulus", "0 Pa or more", f"{modulus_Pa}", "Check the skin's modulus."))
+        raise ParamsError("layer", "modulus", "0 Pa or more", f"{modulus_Pa}", "Check the skin's modulus.")
     root_m = np.sqrt(np.maximum(depth_m, 0.0))
     return modulus_Pa * root_m**3 * _force_curve(thickness_m, tip_radius_m, base)(root_m)
 
@@ -134,11 +134,11 @@ def refuse_layer(depth_m: Float[np.ndarray, " n"], thickness_m: float, tip_radiu
     """Raise for a layer or a tip that cannot be, and for a poke through the layer or past the tip's half."""
     for what, size_m in (("thickness", thickness_m), ("tip radius", tip_radius_m)):
         if not 0 < size_m < np.inf:
-            raise ParamsError(complain("layer", what, "above 0 m and finite", f"{size_m}", "Check its unit."))
+            raise ParamsError("layer", what, "above 0 m and finite", f"{size_m}", "Check its unit.")
     limit_m = min(thickness_m, tip_radius_m)
     if not (np.isfinite(depth_m) & (depth_m < limit_m)).all():
         rule = f"finite and below {1e3 * limit_m:.3g} mm, the lesser of thickness and tip radius"
-        raise ParamsError(complain("poke", "depth", rule, f"{1e3 * np.max(depth_m):.3g} mm", "Poke less deep."))
+        raise ParamsError("poke", "depth", rule, f"{1e3 * np.max(depth_m):.3g} mm", "Poke less deep.")
 
 
 def waves(contact: Contact, thickness_m: float, base: Base) -> Waves:

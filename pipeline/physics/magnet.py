@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.constants import mu_0
 
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 
 CUBE_SIDE_M = 6.35e-3  # 0.25 in cubes
 CUBES_N = (4, 4)  # along x and along y, under the authors' skin of 20 x 20 mm
@@ -62,7 +62,7 @@ def array_field(
     """Sum the field of so many cubes below, and as many above, at places in the slab, in tesla."""
     if not (nodes_m[:, 2].min() >= 0 and nodes_m[:, 2].max() <= thickness_m):
         got = f"{nodes_m[:, 2].min():.3g} ... {nodes_m[:, 2].max():.3g} m"
-        raise ParamsError(complain("magnet array", "places", "inside the slab", got, "Magnetise the skin at rest."))
+        raise ParamsError("magnet array", "places", "inside the slab", got, "Magnetise the skin at rest.")
     middles_m = [(np.arange(n) - (n - 1) / 2) * CUBE_SIDE_M for n in cubes_n]
     heights_m = (-ARRAY_BELOW_M - CUBE_SIDE_M / 2, thickness_m + ARRAY_ABOVE_M + CUBE_SIDE_M / 2)
     b_T = np.zeros_like(nodes_m)

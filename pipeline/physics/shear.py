@@ -14,7 +14,7 @@ from jaxtyping import Float
 from numba import njit
 from scipy.special import j0, j1
 
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 from pipeline.physics import layer
 
 REACH = 5.0  # in thicknesses, past the contact, as in `flow`: what lies beyond does not move
@@ -109,7 +109,7 @@ def tabulate_depth(depth_m: float, *, thickness_m: float, tip_radius_m: float, b
     """
     layer.refuse_layer(np.array([depth_m]), thickness_m, tip_radius_m)
     if not depth_m > 0:
-        raise ParamsError(complain("drag", "depth", "above 0 m", f"{depth_m}", "Touch the skin."))
+        raise ParamsError("drag", "depth", "above 0 m", f"{depth_m}", "Touch the skin.")
     contact = layer.contact_of_depth(depth_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m, base=base)
     return tabulate(slip(contact), thickness_m)
 
@@ -118,7 +118,7 @@ def tabulate(traction: Traction, thickness_m: float) -> ShearMap:
     """Sum the waves of a traction at every place of a table out to `REACH`."""
     if not 0 < traction.radius_m <= WIDEST * thickness_m < np.inf:
         rule, got = f"above 0 m and at most {WIDEST} thicknesses", f"{traction.radius_m} m on {thickness_m} m"
-        raise ParamsError(complain("drag", "contact radius", rule, got, "Press less deep."))
+        raise ParamsError("drag", "contact radius", rule, got, "Press less deep.")
     r_m = np.linspace(0, traction.radius_m + REACH * thickness_m, TABLE_R_N)
     z_m = np.linspace(0, thickness_m, TABLE_Z_N)
     parts = parts_at(traction, r_m, z_m, thickness_m=thickness_m)
@@ -186,7 +186,7 @@ def shear(
     lowest_m, highest_m = places_m[:, 2].min(initial=0.0), places_m[:, 2].max(initial=0.0)
     if not (0 <= lowest_m and highest_m <= RIM_MAX * of.z_m[-1]):
         rule, got = f"0 to {RIM_MAX} of the thickness", f"{lowest_m:.3g} to {highest_m:.3g} m"
-        raise ParamsError(complain("drag", "height of nodes", rule, got, "Press less deep."))
+        raise ParamsError("drag", "height of nodes", rule, got, "Press less deep.")
     shear_m2 = _over_modulus(force_N, modulus_Pa)
     return Sheared(*_at_places(of.parts, (of.r_m[1], of.z_m[1]), places_m, centre_m, shear_m2))
 
@@ -210,7 +210,7 @@ def carry(
     steepest = of.steepest_per_m2 * float(np.hypot(*shear_m2))
     if not steepest <= STEEPEST:
         rule, remedy = f"at most {STEEPEST} anywhere", "Drag with less friction, or less far before it slips."
-        raise ParamsError(complain("drag", "half of the curl", rule, f"{steepest:.3g}", remedy))
+        raise ParamsError("drag", "half of the curl", rule, f"{steepest:.3g}", remedy)
     steps_n = max(1, int(np.ceil(steepest / STEP)))
     part_N, ahead_m = force_N / steps_n, shear_m2 / of.stiffness_m / steps_n
     moved_m, half_curl = np.zeros_like(places_m), np.zeros_like(places_m)
@@ -234,7 +234,7 @@ def angle_and_axis(half_curl: Float[np.ndarray, "s 3"]) -> tuple[Float[np.ndarra
 
 def _over_modulus(force_N: Float[np.ndarray, "2"], modulus_Pa: float) -> Float[np.ndarray, "2"]:
     if not 0 < modulus_Pa < np.inf:
-        raise ParamsError(complain("drag", "modulus", "above 0 Pa and finite", f"{modulus_Pa}", "Drag a solid skin."))
+        raise ParamsError("drag", "modulus", "above 0 Pa and finite", f"{modulus_Pa}", "Drag a solid skin.")
     return force_N * (3 / modulus_Pa)  # incompressible: G = E / 3
 
 

@@ -14,7 +14,7 @@ from pydantic import Field
 from scipy.constants import kilo, milli
 
 from pipeline.core.config import Strict
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 from pipeline.core.seeds import rng_for
 from pipeline.physics import dipole, flow_map, layer, magnet
 from pipeline.physics.board import Board, Spreads
@@ -150,7 +150,7 @@ def _refuse_beside(pokes_m: Float[np.ndarray, "n 3"], skin: Skin) -> None:
         x_mm, y_mm = pokes_m[np.argmax(off), :2] / milli
         rule = "on the skin, within {:.4g} and {:.4g} mm of its middle along x and y".format(*half_m / milli)
         remedy = "Poke elsewhere, or lower skin_seat_mm."
-        raise ParamsError(complain(f"skin {skin.name}", "poke", rule, f"({x_mm:.3g}, {y_mm:.3g}) mm", remedy))
+        raise ParamsError(f"skin {skin.name}", "poke", rule, f"({x_mm:.3g}, {y_mm:.3g}) mm", remedy)
 
 
 def _filler(xy_m: Float[np.ndarray, "s 2"], spreads: Spreads, rng: np.random.Generator) -> Float[np.ndarray, " s"]:

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from pydantic import Field
 
 from pipeline.core.config import Strict
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 
 
 @dataclass(frozen=True)
@@ -25,11 +25,9 @@ class Prony:
     def __post_init__(self) -> None:
         """Refuse times that are no times, and shares that leave nothing or add to the force."""
         if not (np.isfinite(self.tau_s) & (self.tau_s > 0)).all():
-            raise ParamsError(
-                complain("prony", "every tau", "above 0 s and finite", f"{self.tau_s}", "Check its unit.")
-            )
+            raise ParamsError("prony", "every tau", "above 0 s and finite", f"{self.tau_s}", "Check its unit.")
         if not ((self.share >= 0).all() and self.share.sum() <= 1):
-            raise ParamsError(complain("prony", "share", "0 or more, 1 in sum", f"{self.share}", "Lower the shares."))
+            raise ParamsError("prony", "share", "0 or more, 1 in sum", f"{self.share}", "Lower the shares.")
 
 
 SKIN = Prony(tau_s=np.array([1e-3, 1e-1, 1e1, 1e3, 1e4]), share=np.array([0.05, 0.05, 0.05, 0.03, 0.02]))  # assumed
@@ -56,7 +54,7 @@ def advance(state: Float[np.ndarray, " p"], change: float, dt_s: float, prony: P
     """
     if not (np.isfinite(dt_s) and dt_s >= 0):
         rule = "0 s or more and finite"
-        raise ParamsError(complain("relaxation", "time step", rule, f"{dt_s}", "Sort the times."))
+        raise ParamsError("relaxation", "time step", rule, f"{dt_s}", "Sort the times.")
     x = dt_s / prony.tau_s
     return np.exp(-x) * state + prony.share * change * _mean_decay(x)
 

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from pydantic import Field
 
 from pipeline.core.config import Strict
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 
 SETTLING_CONTACTS = 300  # the first softening is over after a few times as many
 AGEING_CONTACTS = 1e3
@@ -33,7 +33,7 @@ def softening(contacts_n: Int[np.ndarray, " n"], *, settling: float, ageing: flo
     left = 1 - settling * settled - ageing * np.log10(1 + contacts_n / AGEING_CONTACTS)
     if not (left > 0).all():
         got = f"{left.min():.3g} after {contacts_n.max()} contacts"
-        raise ParamsError(complain("wear", "stiffness left", "above 0", got, "Lower settling or ageing."))
+        raise ParamsError("wear", "stiffness left", "above 0", got, "Lower settling or ageing.")
     return left
 
 
@@ -53,11 +53,11 @@ def wandering(
     _refuse_counts(contacts_n)
     new_n = np.diff(contacts_n, prepend=0)
     if (new_n < 0).any():
-        raise ParamsError(complain("wear", "contact count", "never falling", f"{new_n.min()}", "Sort the contacts."))
+        raise ParamsError("wear", "contact count", "never falling", f"{new_n.min()}", "Sort the contacts.")
     steps_T = step_T * np.sqrt(new_n)[:, None] * rng.standard_normal((len(contacts_n), channels_n))
     return np.cumsum(steps_T, axis=0)
 
 
 def _refuse_counts(contacts_n: Int[np.ndarray, " n"]) -> None:
     if contacts_n.size and contacts_n.min() < 0:
-        raise ParamsError(complain("wear", "contact count", "0 or more", f"{contacts_n.min()}", "Count from 0."))
+        raise ParamsError("wear", "contact count", "0 or more", f"{contacts_n.min()}", "Count from 0.")

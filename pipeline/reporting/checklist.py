@@ -13,7 +13,7 @@ from typing import Any
 import pandas as pd
 
 from pipeline.core.config import parse, read_yaml
-from pipeline.core.errors import SchemaError, complain
+from pipeline.core.errors import SchemaError
 from pipeline.evaluation.inference import VERDICTS
 from pipeline.reporting import paper
 from pipeline.reporting.judging import (
@@ -99,7 +99,7 @@ def constant(path: str) -> Any:
     for part in parts:
         here = here.get(part) if isinstance(here, Mapping) else None
     if here is None:
-        raise SchemaError(complain(FILE.name, "paper", "a constant of reporting.paper", path, "Mend the name."))
+        raise SchemaError(FILE.name, "paper", "a constant of reporting.paper", path, "Mend the name.")
     return here
 
 

@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from pipeline.core.errors import SchemaError, complain
+from pipeline.core.errors import SchemaError
 from pipeline.reporting.shown import to_markdown
 from pipeline.reporting.skins import skins_table
 from pipeline.reporting.tables import make_tables
@@ -16,9 +16,7 @@ def fill(text: str, blocks: Mapping[str, str]) -> str:
         pattern = re.compile(rf"(<!-- {name} -->\n).*?(<!-- /{name} -->)", re.DOTALL)
         found = pattern.search(text)
         if not found:
-            raise SchemaError(
-                complain("README.md", f"the block {name}", "between its two marks", "none", "Put them back.")
-            )
+            raise SchemaError("README.md", f"the block {name}", "between its two marks", "none", "Put them back.")
         # Not as a template: a backslash in the content is a backslash.
         text = "".join([text[: found.end(1)], content.strip("\n"), "\n", text[found.start(2) :]])
     return text

@@ -11,7 +11,7 @@ import pandas as pd
 from pydantic import Field, model_validator
 
 from pipeline.core.config import Strict, parse, read_yaml
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 from pipeline.reporting.shown import show
 
 PRINTED = Path(__file__).with_name("table1.yaml")
@@ -52,9 +52,7 @@ def table1(data: Table1, measured: Mapping[str, str]) -> pd.DataFrame:
     """Put what we measured, by row, beside the paper's columns; rows we measured nothing of have a dash."""
     rows = data.rows | {LOCALISATION: (NOT_GIVEN,) * len(data.columns)}
     if unknown := sorted(measured.keys() - rows.keys()):
-        raise ParamsError(
-            complain("table 1", "measured rows", f"among {sorted(rows)}", unknown, "Name them as the table does.")
-        )
+        raise ParamsError("table 1", "measured rows", f"among {sorted(rows)}", unknown, "Name them as the table does.")
     table = pd.DataFrame(
         {"": name, **dict(zip(data.columns, cells, strict=True)), OURS: measured.get(name, NOT_GIVEN)}
         for name, cells in rows.items()

@@ -7,7 +7,7 @@ from typing import Any
 
 from pipeline.core import io
 from pipeline.core.config import Settings, parse
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 from pipeline.core.provenance import SECONDS, add_up_costs, code_version, device, read_costs
 from pipeline.core.stage import COSTS
 from pipeline.evaluation.choice import choose
@@ -37,7 +37,7 @@ def asking(settings: Settings) -> Asking:
         differing = ", ".join(sorted(set(asked) ^ set(planned))) or "another order"
         remedy = f"Try: reskin scenes use {settings.scene}, beside the others that run."
         rule, got = "those of pipeline/plan.yaml", f"{differing} only in one"
-        raise ParamsError(complain(settings.where, "questions", rule, got, remedy))
+        raise ParamsError(settings.where, "questions", rule, got, remedy)
     return parse(Asking, {name: settings.words(name) for name in ("source", "questions")}, settings.where)
 
 

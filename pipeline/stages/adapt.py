@@ -23,13 +23,13 @@ def adapt(scene: str, files: Files, indentations: Path, folds: Path, started: Pa
         read_starts(started),
     )
     settings = read(data.settings)
-    cells = [
-        cell
+    trials = [
+        trial
         for fold in data.folds_of("lobo")
         for named in settings.recipes.items()
-        for cell in adaptations(data, fold, named, starts, question="adapt", pokes_n=settings.pokes_n)
+        for trial in adaptations(data, fold, named, starts, question="adapt", pokes_n=settings.pokes_n)
     ]
-    write_models(models, data, cells, train_all(data, cells, "adapt"), "adapt")
+    write_models(models, data, trials, train_all(data, trials, "adapt"), "adapt")
 
 
 if __name__ == "__main__":

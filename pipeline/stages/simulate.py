@@ -5,7 +5,7 @@ from pathlib import Path
 from pipeline.capture.folder import write_capture
 from pipeline.core import io
 from pipeline.core.config import Files, read_settings
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 from pipeline.core.stage import run, say
 from pipeline.learning.executors import make_executor
 from pipeline.synthesis.capture import Synthesis, record, roster
@@ -20,7 +20,7 @@ def simulate(scene: str, files: Files, protocol: str, raw: Path) -> None:
     pairs, skins_n = roster(synthesis, protocol), synthesis.protocols[protocol].skins_n
     if len(pairs) < skins_n:
         rule = f"at most the {len(pairs)} that its boards have"
-        raise ParamsError(complain(settings.where, f"skins_n of protocol {protocol}", rule, skins_n, "Ask for fewer."))
+        raise ParamsError(settings.where, f"skins_n of protocol {protocol}", rule, skins_n, "Ask for fewer.")
     with io.replacing(raw) as folder, make_executor() as executor:
         folder.mkdir()
         waiting = [executor.submit(_record, synthesis, protocol, pair, seed, folder) for pair in pairs]

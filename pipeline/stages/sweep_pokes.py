@@ -5,7 +5,7 @@ from typing import Any
 
 from pipeline.core import io
 from pipeline.core.config import Files, Settings, read_settings
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 from pipeline.core.stage import run
 from pipeline.learning.recipe import HEADLINE, PokesSweep
 from pipeline.learning.recipe import adaptations as adaptations_of
@@ -29,22 +29,22 @@ def sweep_pokes(scene: str, files: Files, indentations: Path, folds: Path, start
     named, held_out = (HEADLINE, own.recipes[HEADLINE]), data.folds_of("lobo")[-asked.boards_n :]
     if asked.boards_n > len(held_out):
         rule = f"at most the {len(held_out)} boards of the scene"
-        raise ParamsError(complain(data.settings.where, "sweep_pokes.boards_n", rule, asked.boards_n, "Ask for fewer."))
+        raise ParamsError(data.settings.where, "sweep_pokes.boards_n", rule, asked.boards_n, "Ask for fewer.")
     asked_of = [(fold, pokes_n) for fold in held_out for pokes_n in asked.pokes_n if pokes_n]
     pairs = [
-        (cell, pokes_n)
+        (trial, pokes_n)
         for fold, pokes_n in asked_of
-        for cell in adaptations(data, fold, named, starts, question="pokes", pokes_n=pokes_n)
+        for trial in adaptations(data, fold, named, starts, question="pokes", pokes_n=pokes_n)
     ]
-    cells = [cell for cell, _ in pairs]
-    trained = train_all(data, cells, "sweep_pokes")
+    trials = [trial for trial, _ in pairs]
+    trained = train_all(data, trials, "sweep_pokes")
     points = [
-        point_of(data, cell, one, "adapted") | {"pokes_n": pokes_n}
-        for (cell, pokes_n), one in zip(pairs, trained, strict=True)
+        point_of(data, trial, one, "adapted") | {"pokes_n": pokes_n}
+        for (trial, pokes_n), one in zip(pairs, trained, strict=True)
     ]
     points += [point | {"pokes_n": 0} for point in _unadapted(started, named[1].base, {fold.name for fold in held_out})]
     io.write_json(scores, points)
-    note_seconds(scene, "sweep_pokes", cells, trained)
+    note_seconds(scene, "sweep_pokes", trials, trained)
 
 
 def _unadapted(started: Path, base: str, held_out: set[str]) -> list[dict[str, Any]]:

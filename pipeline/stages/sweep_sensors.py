@@ -5,9 +5,9 @@ from pathlib import Path
 from pipeline.core import io
 from pipeline.core.config import Files, read_settings
 from pipeline.core.stage import run
-from pipeline.learning.cell import Cell, Start
 from pipeline.learning.recipe import HEADLINE, Recipe, training
 from pipeline.learning.recipe import adaptations as adaptations_of
+from pipeline.learning.trial import Start, Trial
 from pipeline.trials.adapting import adaptations
 from pipeline.trials.data import SceneData, read_data, train_all
 from pipeline.trials.models import note_seconds, point_of
@@ -19,30 +19,30 @@ def sweep_sensors(scene: str, files: Files, indentations: Path, folds: Path, sco
     multi, triplet = (training(data.settings, section) for section in ("train_multi", "train_triplet"))
     own = adaptations_of(data.settings)
     fine = own.recipes[HEADLINE]
-    plain = _cells(data, multi.recipes[HEADLINE], "multi")
-    based = _cells(data, triplet.recipes[fine.base], "triplet")
+    plain = _trials(data, multi.recipes[HEADLINE], "multi")
+    based = _trials(data, triplet.recipes[fine.base], "triplet")
     trained = train_all(data, [*plain, *based], "sweep_sensors")
     starts = {
-        (fine.base, cell.fold, cell.seed_i): Start(one.key, one.weights, one.scaler)
-        for cell, one in zip(based, trained[len(plain) :], strict=True)
+        (fine.base, trial.fold, trial.seed_i): Start(one.key, one.weights, one.scaler)
+        for trial, one in zip(based, trained[len(plain) :], strict=True)
     }
     adapted = [
-        cell
+        trial
         for fold in data.folds_of("sensors")
-        for cell in adaptations(data, fold, (HEADLINE, fine), starts, question="sensors", pokes_n=own.pokes_n)
+        for trial in adaptations(data, fold, (HEADLINE, fine), starts, question="sensors", pokes_n=own.pokes_n)
     ]
     trained += train_all(data, adapted, "sweep_sensors")
-    cells = [*plain, *based, *adapted]
-    methods = [cell.what for cell in [*plain, *based]] + ["adapted"] * len(adapted)
-    three = zip(cells, trained, methods, strict=True)
-    io.write_json(scores, [point_of(data, cell, one, method) for cell, one, method in three])
-    note_seconds(scene, "sweep_sensors", cells, trained)
+    trials = [*plain, *based, *adapted]
+    methods = [trial.what for trial in [*plain, *based]] + ["adapted"] * len(adapted)
+    three = zip(trials, trained, methods, strict=True)
+    io.write_json(scores, [point_of(data, trial, one, method) for trial, one, method in three])
+    note_seconds(scene, "sweep_sensors", trials, trained)
 
 
-def _cells(data: SceneData, recipe: Recipe, method: str) -> list[Cell]:
-    """One cell a draw of skins; the draw is its seed too, as the fold's name is part of the generator's."""
+def _trials(data: SceneData, recipe: Recipe, method: str) -> list[Trial]:
+    """One trial a draw of skins; the draw is its seed too, as the fold's name is part of the generator's."""
     return [
-        Cell("sensors", HEADLINE, recipe, one.name, data.settings.seed, 0, one.train, one.test, what=method)
+        Trial("sensors", HEADLINE, recipe, one.name, data.settings.seed, 0, one.train, one.test, what=method)
         for one in data.folds_of("sensors")
     ]
 

@@ -10,9 +10,9 @@ from pipeline.core.provenance import SECONDS
 from pipeline.core.stage import run, say
 from pipeline.evaluation.summary import score_groups
 from pipeline.learning.baselines import Task, run_tasks
-from pipeline.learning.cell import Measured
 from pipeline.learning.comparison import Baselines, baselines
 from pipeline.learning.executors import make_executor
+from pipeline.learning.trial import Measured
 from pipeline.trials.data import read_data
 
 NO_ROWS = np.zeros(0, np.int64)

@@ -5,7 +5,7 @@ from pathlib import Path
 from pipeline.core.config import Files, Settings, read_settings
 from pipeline.core.stage import run
 from pipeline.learning.recipe import Training, training
-from pipeline.trials.data import cells_of, read_data, train_all
+from pipeline.trials.data import read_data, train_all, trials_of
 from pipeline.trials.models import write_models
 
 
@@ -17,8 +17,8 @@ def read(settings: Settings) -> Training:
 def train_multi(scene: str, files: Files, indentations: Path, folds: Path, models: Path) -> None:
     """Train the recipes of section train_multi with one board held out."""
     data = read_data(read_settings("train_multi", scene, files), indentations, folds)
-    cells = cells_of(data, read(data.settings), data.folds_of("lobo"))
-    write_models(models, data, cells, train_all(data, cells, "train_multi"), "train_multi")
+    trials = trials_of(data, read(data.settings), data.folds_of("lobo"))
+    write_models(models, data, trials, train_all(data, trials, "train_multi"), "train_multi")
 
 
 if __name__ == "__main__":

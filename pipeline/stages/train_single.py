@@ -6,7 +6,7 @@ from pipeline.core.config import Files, Settings, read_settings
 from pipeline.core.stage import run
 from pipeline.dataset.splits import ONE_SKIN
 from pipeline.learning.recipe import Training, training
-from pipeline.trials.data import cells_of, read_data, train_all
+from pipeline.trials.data import read_data, train_all, trials_of
 from pipeline.trials.models import write_models
 
 
@@ -19,8 +19,8 @@ def train_single(scene: str, files: Files, indentations: Path, folds: Path, mode
     """Train the recipes of section train_single on every fold of the questions about one skin."""
     data = read_data(read_settings("train_single", scene, files), indentations, folds)
     own = [fold for fold in data.folds if fold.question in ONE_SKIN]
-    cells = cells_of(data, read(data.settings), own)
-    write_models(models, data, cells, train_all(data, cells, "train_single"), "train_single")
+    trials = trials_of(data, read(data.settings), own)
+    write_models(models, data, trials, train_all(data, trials, "train_single"), "train_single")
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from pathlib import Path
 from pipeline.core.config import Files, Settings, read_settings
 from pipeline.core.stage import run
 from pipeline.learning.recipe import Training, training
-from pipeline.trials.data import cells_of, read_data, train_all
+from pipeline.trials.data import read_data, train_all, trials_of
 from pipeline.trials.models import write_models
 
 
@@ -17,8 +17,8 @@ def read(settings: Settings) -> Training:
 def train_triplet(scene: str, files: Files, indentations: Path, folds: Path, models: Path) -> None:
     """Train the recipes of section train_triplet on the folds of question lobo."""
     data = read_data(read_settings("train_triplet", scene, files), indentations, folds)
-    cells = cells_of(data, read(data.settings), data.folds_of("lobo"), question="triplet")
-    write_models(models, data, cells, train_all(data, cells, "train_triplet"), "train_triplet")
+    trials = trials_of(data, read(data.settings), data.folds_of("lobo"), question="triplet")
+    write_models(models, data, trials, train_all(data, trials, "train_triplet"), "train_triplet")
 
 
 if __name__ == "__main__":

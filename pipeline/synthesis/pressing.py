@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Float64, Int64
 from scipy.optimize import brentq
 
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 from pipeline.dataset.grid import points_mm
 from pipeline.physics.skin import Skin, forces
 
@@ -105,5 +105,5 @@ def _depth_under(skin: Skin, weight_N: float) -> float:
 
     if missing_N(deepest_m) < 0:
         rule = f"at most {missing_N(deepest_m) + weight_N:.3g} N, which the skin bears at its deepest"
-        raise ParamsError(complain(f"skin {skin.name}", "weight", rule, f"{weight_N:.3g} N", "Lower force_max_N."))
+        raise ParamsError(f"skin {skin.name}", "weight", rule, f"{weight_N:.3g} N", "Lower force_max_N.")
     return float(brentq(missing_N, -skin.depth_zero_m, deepest_m, xtol=DEPTH_STEP_M))

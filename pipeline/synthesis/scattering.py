@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 from pipeline.synthesis.plans import Count, Depth_mm, Plan, Shared
 
 
@@ -31,7 +31,7 @@ def scatter(asked: Scatter, skin_mm: tuple[float, float], rng: np.random.Generat
     """Draw places and depths, uniform within the margin."""
     if not 2 * asked.margin_mm < min(skin_mm):
         rule = f"less than half of the skin's shorter side, {min(skin_mm) / 2:g} mm"
-        raise ParamsError(complain("protocol scatter", "margin_mm", rule, asked.margin_mm, "Lower it."))
+        raise ParamsError("protocol scatter", "margin_mm", rule, asked.margin_mm, "Lower it.")
     most_mm = np.array(skin_mm) - asked.margin_mm
     place_mm = rng.uniform(asked.margin_mm, most_mm, size=(asked.pokes_n, 2))
     return Plan(

@@ -1,4 +1,4 @@
-"""What the stages that adapt share: a held-out skin's pool of pokes and a trained network -> a cell. Knows no argv."""
+"""What the stages that adapt share: a held-out skin's pool of pokes and a trained network -> a trial. Knows no argv."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.core import io
-from pipeline.core.errors import SchemaError, complain
+from pipeline.core.errors import SchemaError
 from pipeline.core.seeds import rng_for
 from pipeline.dataset.lines import Lines, grid_lines, take_pokes
 from pipeline.dataset.splits import Fold
-from pipeline.learning.cell import Adapting, Cell, Start
 from pipeline.learning.recipe import Adaptation, training
 from pipeline.learning.standardise import Scaler
+from pipeline.learning.trial import Adapting, Start, Trial
 from pipeline.trials.data import SceneData
 
 Starts = dict[tuple[str, str, int], Start]  # by recipe, fold and seed
@@ -33,7 +33,7 @@ def read_starts(models: Path) -> Starts:
 
 def adaptations(
     data: SceneData, fold: Fold, named: tuple[str, Adaptation], starts: Starts, *, question: str, pokes_n: int
-) -> Iterator[Cell]:
+) -> Iterator[Trial]:
     """Adapt to each skin of a fold by itself: so many indentations of its pool, of which only lines are passed on."""
     for skin in np.unique(data.rows.skin[fold.test]):
         for seed_i in own_starts(starts, named[1].base, fold):
@@ -52,13 +52,13 @@ class Pokes:
     lines: Lines
 
 
-def adaptation(data: SceneData, fold: Fold, named: tuple[str, Adaptation], starts: Starts, pokes: Pokes) -> Cell:
+def adaptation(data: SceneData, fold: Fold, named: tuple[str, Adaptation], starts: Starts, pokes: Pokes) -> Trial:
     """Adapt the fold's network of one seed to one skin, whose rows of the fold's test side are tested."""
     name, settings = named
     test = fold.test[data.rows.skin[fold.test] == pokes.skin]
     start = own_starts(starts, settings.base, fold)[pokes.seed_i]
     recipe = training(data.settings, "train_triplet").recipes[settings.base]
-    return Cell(
+    return Trial(
         pokes.question, name, recipe, fold.name, data.settings.seed, pokes.seed_i, fold.train, test,
         Adapting(start, settings, pokes.lines), pokes.skin, pokes.what,
     )  # fmt: skip
@@ -77,5 +77,5 @@ def own_starts(starts: Starts, base: str, fold: Fold) -> dict[int, Start]:
     own = {seed_i: start for (recipe, of, seed_i), start in starts.items() if (recipe, of) == (base, fold.name)}
     if not own:
         where, rule = f"fold {fold.name}", f"those of recipe {base}"
-        raise SchemaError(complain(where, "networks to adapt", rule, "none", "Train them."))
+        raise SchemaError(where, "networks to adapt", rule, "none", "Train them.")
     return own

@@ -5,10 +5,10 @@ from collections.abc import Iterator, Sequence
 from pipeline.dataset.splits import Fold
 from pipeline.evaluation.tally import tally
 from pipeline.learning.card import went
-from pipeline.learning.cell import Cell
 from pipeline.learning.executors import device
 from pipeline.learning.inputs import VIEW
 from pipeline.learning.recipe import Adaptation, training
+from pipeline.learning.trial import Trial
 from pipeline.trials.adapting import Starts, own_starts
 from pipeline.trials.arms import BEFORE, Answered
 from pipeline.trials.data import SceneData, train_all
@@ -29,16 +29,21 @@ def answers_before(data: SceneData, fold: Fold, settings: Adaptation, starts: St
 
 
 def answers_after(
-    data: SceneData, cells: Sequence[tuple[str, Cell]], stage: str
+    data: SceneData, trials: Sequence[tuple[str, Trial]], stage: str
 ) -> tuple[list[Answered], dict[str, int]]:
-    """Adapt by (arm, cell), and answer on each cell's tested rows; count what collapsed."""
-    own = [cell for _, cell in cells]
+    """Adapt by (arm, trial), and answer on each trial's tested rows; count what collapsed."""
+    own = [trial for _, trial in trials]
     trained = train_all(data, own, stage)
     note_seconds(data.scene, stage, own, trained)
     answered = [
         Answered(
-            arm, str(data.rows.board[cell.test[0]]), cell.skin, cell.seed_i, data.rows.target[cell.test], one.predicted
+            arm,
+            str(data.rows.board[trial.test[0]]),
+            trial.skin,
+            trial.seed_i,
+            data.rows.target[trial.test],
+            one.predicted,
         )
-        for (arm, cell), one in zip(cells, trained, strict=True)
+        for (arm, trial), one in zip(trials, trained, strict=True)
     ]
     return answered, tally(map(went, trained))

@@ -1,4 +1,4 @@
-"""What the training stages share: a scene's rows and folds -> cells -> finished trainings. Knows no argv."""
+"""What the training stages share: a scene's rows and folds -> trials -> finished trainings. Knows no argv."""
 
 import time
 from collections.abc import Iterable, Sequence
@@ -13,12 +13,12 @@ from pipeline.core.stage import COSTS, say
 from pipeline.dataset.folds import load_rows, parse_folds
 from pipeline.dataset.rows import Rows, Selection
 from pipeline.dataset.splits import Fold
-from pipeline.learning.cell import Cell, Measured, Trained
 from pipeline.learning.executors import make_executor
-from pipeline.learning.grid import run_cells
+from pipeline.learning.grid import run_trials
 from pipeline.learning.recipe import Training
+from pipeline.learning.trial import Measured, Trained, Trial
 
-CELLS = ".reskin/cells"  # finished trainings: a cache, and no output
+CACHE = ".reskin/cells"  # finished trainings: a cache, and no output
 
 
 @dataclass(frozen=True)
@@ -44,28 +44,35 @@ def read_data(settings: Settings, indentations: Path, folds: Path) -> SceneData:
     return SceneData(settings.scene, settings, rows, parse_folds(words, rows, str(folds)))
 
 
-def cells_of(data: SceneData, training: Training, folds: Iterable[Fold], *, question: str | None = None) -> list[Cell]:
-    """Make a cell of every recipe, fold and seed; they answer the folds' own question, or the one that is named."""
+def trials_of(
+    data: SceneData, training: Training, folds: Iterable[Fold], *, question: str | None = None
+) -> list[Trial]:
+    """Make a trial of every recipe, fold and seed; they answer the folds' own question, or the one that is named."""
     return [
-        Cell(question or fold.question, name, recipe, fold.name, data.settings.seed, seed_i, fold.train, fold.test)
+        Trial(question or fold.question, name, recipe, fold.name, data.settings.seed, seed_i, fold.train, fold.test)
         for fold in folds
         for name, recipe in training.recipes.items()
         for seed_i in range(training.seeds_n)
     ]
 
 
-def train_all(data: SceneData, cells: Sequence[Cell], stage: str) -> list[Trained]:
+def train_all(data: SceneData, trials: Sequence[Trial], stage: str) -> list[Trained]:
     """Train what is not finished yet; say what stopped early, for it is used as it last was."""
     rows, start_s = Measured(data.rows.db_uT, data.rows.target, data.rows.skin), time.monotonic()
     with make_executor() as executor:
-        trained = run_cells(
-            cells, rows, executor=executor, cache=home() / CELLS, tell=lambda line: say(f"{data.scene} {stage}: {line}")
+        trained = run_trials(
+            trials,
+            rows,
+            executor=executor,
+            cache=home() / CACHE,
+            tell=lambda line: say(f"{data.scene} {stage}: {line}"),
         )
     took = {one.key: (one.seconds, one.reused) for one in trained}
     note_trainings(COSTS / data.scene, stage, took, time.monotonic() - start_s)
-    for cell, one in zip(cells, trained, strict=True):
+    for trial, one in zip(trials, trained, strict=True):
         if one.stopped_step is not None:
             say(
-                f"warning: {data.scene} {stage}: {cell.name} diverged by step {one.stopped_step}: kept as it was before"
+                f"warning: {data.scene} {stage}: {trial.name} diverged by step {one.stopped_step}: "
+                "kept as it was before"
             )
     return trained

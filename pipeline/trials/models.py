@@ -11,57 +11,60 @@ from pipeline.core.provenance import SECONDS, code_version
 from pipeline.dataset.rows import TARGETS, Rows
 from pipeline.evaluation.summary import score_groups
 from pipeline.learning.card import describe, went
-from pipeline.learning.cell import Cell, Trained
+from pipeline.learning.trial import Trained, Trial
 from pipeline.trials.data import SceneData
 
 
-def write_models(models: Path, data: SceneData, cells: Sequence[Cell], trained: Sequence[Trained], stage: str) -> None:
+def write_models(
+    models: Path, data: SceneData, trials: Sequence[Trial], trained: Sequence[Trained], stage: str
+) -> None:
     """Write models, their cards and predictions; what they took here stands beside, as it is no result."""
-    cards = [card_of(data, cell, one) for cell, one in zip(cells, trained, strict=True)]
+    cards = [card_of(data, trial, one) for trial, one in zip(trials, trained, strict=True)]
     with io.replacing(models) as folder:
         folder.mkdir()
-        for cell, one, card in zip(cells, trained, cards, strict=True):
+        for trial, one, card in zip(trials, trained, cards, strict=True):
             tensors = dict(one.weights) | one.scaler.arrays()
-            io.write_tensors(folder / f"{cell.name}.safetensors", tensors, {"format": card["format"]})
-            io.write_json(folder / f"{cell.name}.json", card)
-        io.write_table(folder / "predictions.parquet", _predictions(cells, trained, data.rows))
-    note_seconds(data.scene, stage, cells, trained)
+            io.write_tensors(folder / f"{trial.name}.safetensors", tensors, {"format": card["format"]})
+            io.write_json(folder / f"{trial.name}.json", card)
+        io.write_table(folder / "predictions.parquet", _predictions(trials, trained, data.rows))
+    note_seconds(data.scene, stage, trials, trained)
 
 
-def card_of(data: SceneData, cell: Cell, one: Trained) -> dict[str, Any]:
+def card_of(data: SceneData, trial: Trial, one: Trained) -> dict[str, Any]:
     """Describe a training, with its scores on the rows that it was not trained on."""
-    card = describe(cell, one, data.rows, data.scene, code_version())
-    true, board, skin = (values[cell.test] for values in (data.rows.target, data.rows.board, data.rows.skin))
+    card = describe(trial, one, data.rows, data.scene, code_version())
+    true, board, skin = (values[trial.test] for values in (data.rows.target, data.rows.board, data.rows.skin))
     return card | {"scores": score_groups(true, one.predicted, board, skin)}
 
 
-def point_of(data: SceneData, cell: Cell, one: Trained, method: str) -> dict[str, Any]:
+def point_of(data: SceneData, trial: Trial, one: Trained, method: str) -> dict[str, Any]:
     """Keep of a training in a sweep what its curve needs: no weights, no predictions."""
-    card = card_of(data, cell, one)
+    card = card_of(data, trial, one)
     words = {name: card[name] for name in ("key", "question", "fold", "seed_i", "stopped_step", "git", "scores")}
     return words | went(one) | {"method": method, "trained_on_skins_n": len(card["train_skins"])}
 
 
-def note_seconds(scene: str, stage: str, cells: Sequence[Cell], trained: Sequence[Trained]) -> None:
+def note_seconds(scene: str, stage: str, trials: Sequence[Trial], trained: Sequence[Trained]) -> None:
     """Keep what trainings took here."""
     took = [
-        {"name": cell.name, "train_s": one.seconds, "one_reading_s": one.one_reading_s}
-        for cell, one in zip(cells, trained, strict=True)
+        {"name": trial.name, "train_s": one.seconds, "one_reading_s": one.one_reading_s}
+        for trial, one in zip(trials, trained, strict=True)
     ]
     io.write_json(SECONDS / scene / f"{stage}.json", took)
 
 
-def _predictions(cells: Sequence[Cell], trained: Sequence[Trained], rows: Rows) -> pa.Table:
+def _predictions(trials: Sequence[Trial], trained: Sequence[Trained], rows: Rows) -> pa.Table:
     """One row a test row and training: the truth and the prediction, side by side."""
     tables = []
-    for cell, one in zip(cells, trained, strict=True):
+    for trial, one in zip(trials, trained, strict=True):
         columns = {
-            "question": pa.repeat(cell.question, len(cell.test)), "recipe": pa.repeat(cell.recipe_name, len(cell.test)),
-            "fold": pa.repeat(cell.fold, len(cell.test)), "seed_i": pa.repeat(cell.seed_i, len(cell.test)),
-            "skin": pa.array(rows.skin[cell.test].tolist()),
+            "question": pa.repeat(trial.question, len(trial.test)),
+            "recipe": pa.repeat(trial.recipe_name, len(trial.test)),
+            "fold": pa.repeat(trial.fold, len(trial.test)), "seed_i": pa.repeat(trial.seed_i, len(trial.test)),
+            "skin": pa.array(rows.skin[trial.test].tolist()),
         }  # fmt: skip
         for i, name in enumerate(TARGETS):
-            columns[f"true_{name}"] = pa.array(rows.target[cell.test, i])
+            columns[f"true_{name}"] = pa.array(rows.target[trial.test, i])
             columns[f"predicted_{name}"] = pa.array(one.predicted[:, i])
         tables.append(pa.table(columns))
     return pa.concat_tables(tables)

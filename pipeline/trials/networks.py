@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from pipeline.core import io
-from pipeline.core.errors import SchemaError, complain
+from pipeline.core.errors import SchemaError
 from pipeline.learning.executors import device
 from pipeline.learning.inputs import VIEW
 from pipeline.learning.recipe import HEADLINE
@@ -42,5 +42,5 @@ def networks_without(models: Path, board: str, *, recipe: str = HEADLINE) -> lis
             found.append(Network(card, io.read_tensors(file.with_suffix(".safetensors"))[0]))
     if not found:
         rule = f"some of recipe {recipe} with board {board} held out"
-        raise SchemaError(complain(str(models), "networks", rule, "none", "Train them: ask lobo of this scene."))
+        raise SchemaError(str(models), "networks", rule, "none", "Train them: ask lobo of this scene.")
     return found

@@ -25,14 +25,14 @@ from torch.utils.data import DataLoader, TensorDataset
 from pipeline.core.seeds import rng_for
 from pipeline.learning import train as train_module
 from pipeline.learning.architecture import FEATURE_LAYERS_N, paper_layers
-from pipeline.learning.cell import Cell, Measured
 from pipeline.learning.executors import make_executor
 from pipeline.learning.feed import Feed
-from pipeline.learning.grid import STACK_N, run_cells
+from pipeline.learning.grid import STACK_N, run_trials
 from pipeline.learning.model import Stack
 from pipeline.learning.recipe import Recipe
 from pipeline.learning.stack import train_stack
 from pipeline.learning.train import Watch
+from pipeline.learning.trial import Measured, Trial
 
 BOARDS_N, SKINS_PER_BOARD_N, SEEDS_N = 6, 3, 3
 ROWS_N, CHANNELS_N = 100_000, 15
@@ -58,10 +58,10 @@ def measured() -> Measured:
     return Measured(db_uT.astype(np.float32), target.astype(np.float32), skin)
 
 
-def fold_grid(rows: Measured, triplet_weight: float) -> list[Cell]:
+def fold_grid(rows: Measured, triplet_weight: float) -> list[Trial]:
     board = rows.skin // SKINS_PER_BOARD_N
     return [
-        Cell("lobo", "paper", recipe(triplet_weight), f"b{held}", 0, seed_i,
+        Trial("lobo", "paper", recipe(triplet_weight), f"b{held}", 0, seed_i,
              np.flatnonzero(board != held), np.flatnonzero(board == held))
         for held in range(BOARDS_N)
         for seed_i in range(SEEDS_N)
@@ -93,23 +93,23 @@ def seconds(call: Callable[[], object]) -> float:
     return time.perf_counter() - start_s
 
 
-def started(cell: Cell, rows: Measured) -> int:
-    train_stack([cell], rows)
+def started(trial: Trial, rows: Measured) -> int:
+    train_stack([trial], rows)
     return os.getpid()
 
 
 def start(executor: Executor, workers_n: int = 2) -> None:
     """Start the workers with a step of training each: the first step of a process loads most of PyTorch."""
     few = Measured(*(values[:BATCH_N] for values in (measured().db_uT, measured().target, measured().skin)))
-    cell = replace(fold_grid(few, 0.0)[0], recipe=recipe(0.0, 1), train=np.arange(64), test=np.arange(64, BATCH_N))
-    running = [executor.submit(started, cell, few) for _ in range(workers_n)]
+    trial = replace(fold_grid(few, 0.0)[0], recipe=recipe(0.0, 1), train=np.arange(64), test=np.arange(64, BATCH_N))
+    running = [executor.submit(started, trial, few) for _ in range(workers_n)]
     assert len({one.result() for one in running}) == workers_n
 
 
-def run_grid(cells: list[Cell], rows: Measured, executor: Executor, cache: Path) -> tuple[float, float]:
+def run_grid(trials: list[Trial], rows: Measured, executor: Executor, cache: Path) -> tuple[float, float]:
     """Train the grid; give its seconds, and the seconds of all networks together, each within its process."""
     start_s = time.perf_counter()
-    trained = run_cells(cells, rows, executor=executor, cache=cache, tell=lambda line: None)
+    trained = run_trials(trials, rows, executor=executor, cache=cache, tell=lambda line: None)
     took_s = time.perf_counter() - start_s
     assert all(one.stopped_step is None and one.curve[-1] < one.curve[0] for one in trained)
     return took_s, sum(one.seconds for one in trained)
@@ -134,23 +134,23 @@ def plain_loop(batches: Iterable[Sequence[torch.Tensor]]) -> None:
 def plain_grid(rows: Measured, threads_n: int, batches_of: Callable[[TensorDataset], Iterable]) -> tuple[float, float]:
     """Train a part of the grid one network at a time, as a user would; give wall and CPU seconds for the whole."""
     torch.set_num_threads(threads_n)
-    cells = fold_grid(rows, 0.0)
+    trials = fold_grid(rows, 0.0)
     start_s, start_cpu_s = time.perf_counter(), time.process_time()
-    for cell in cells[:: len(cells) // PLAIN_N]:
-        view, target = (torch.from_numpy(one[cell.train]) for one in (rows.db_uT, rows.target))
+    for trial in trials[:: len(trials) // PLAIN_N]:
+        view, target = (torch.from_numpy(one[trial.train]) for one in (rows.db_uT, rows.target))
         data = TensorDataset((view - view.mean(0)) / view.std(0), (target - target.mean(0)) / target.std(0))
         plain_loop(islice(batches_of(data), STEPS_N))
     took_s, took_cpu_s = time.perf_counter() - start_s, time.process_time() - start_cpu_s
     torch.set_num_threads(1)
-    return took_s * len(cells) / PLAIN_N, took_cpu_s * len(cells) / PLAIN_N
+    return took_s * len(trials) / PLAIN_N, took_cpu_s * len(trials) / PLAIN_N
 
 
 def engine_cpu_s(rows: Measured) -> float:
     """Train one stack in this process; give CPU seconds for the whole grid: a busy machine leaves them alone."""
-    cells = [replace(one, test=one.test[:1]) for one in fold_grid(rows, 0.0)]
+    trials = [replace(one, test=one.test[:1]) for one in fold_grid(rows, 0.0)]
     start_s = time.process_time()
-    train_stack(cells[: STACK_N["cpu"]], rows)
-    return (time.process_time() - start_s) * len(cells) / STACK_N["cpu"]
+    train_stack(trials[: STACK_N["cpu"]], rows)
+    return (time.process_time() - start_s) * len(trials) / STACK_N["cpu"]
 
 
 def by_loader(data: TensorDataset) -> Iterable:
@@ -217,10 +217,10 @@ def test_the_fold_grid_is_timed_beside_plain_loops_and_sgemm(tmp_path: Path) -> 
             both = harmonic_mean(list(chain.from_iterable(one.result() for one in beside)))
             columns["sgemm, in both processes at once, GFLOP/s"].append(1e-9 * both)
             for what, weight in (("grid", 0.0), ("grid with triplets", 0.1)):
-                cells = fold_grid(rows, weight)
-                took_s, within_s = run_grid(cells, rows, executor, tmp_path / f"{i}{weight}")
+                trials = fold_grid(rows, weight)
+                took_s, within_s = run_grid(trials, rows, executor, tmp_path / f"{i}{weight}")
                 columns[f"{what}, s"].append(took_s)
-                rate = len(cells) * STEPS_N * flop(weight) / within_s
+                rate = len(trials) * STEPS_N * flop(weight) / within_s
                 columns[f"{what}, % of one thread's sgemm"].append(100 * rate / sgemm)
                 columns[f"{what}, % of sgemm in both processes"].append(100 * rate / both)
         plain = {
@@ -238,10 +238,10 @@ def test_the_fold_grid_is_timed_beside_plain_loops_and_sgemm(tmp_path: Path) -> 
             columns[f"{what} / grid with start of workers"].append(plain_s / (grid_s + start_s))
             columns[f"{what} / grid, CPU s"].append(plain_cpu_s / grid_cpu_s)
     print(
-        f"\n{len(cells)} networks, {STEPS_N} steps of {BATCH_N} of {ROWS_N:,} rows x {CHANNELS_N}; two processes;",
+        f"\n{len(trials)} networks, {STEPS_N} steps of {BATCH_N} of {ROWS_N:,} rows x {CHANNELS_N}; two processes;",
         end=" ",
     )
-    print(f"plain loops: {PLAIN_N} networks timed, scaled to {len(cells)}; {REPEATS_N} repeats")
+    print(f"plain loops: {PLAIN_N} networks timed, scaled to {len(trials)}; {REPEATS_N} repeats")
     print(f"{'':67}{'lowest':>8} {'median':>8} {'highest':>8}")
     for name, values in columns.items():
         print(f"  {name:65}{min(values):8.2f} {median(values):8.2f} {max(values):8.2f}")
@@ -251,17 +251,17 @@ def test_the_fold_grid_is_timed_beside_plain_loops_and_sgemm(tmp_path: Path) -> 
 @pytest.mark.parametrize("triplet_weight", [0.0, 0.1])
 def test_a_step_is_taken_apart(triplet_weight: float) -> None:
     rows = measured()
-    cells = [replace(one, test=one.test[:1]) for one in fold_grid(rows, triplet_weight)[: STACK_N["cpu"]]]
-    train_stack([replace(cells[0], recipe=recipe(triplet_weight, 1))], rows)  # loads
+    trials = [replace(one, test=one.test[:1]) for one in fold_grid(rows, triplet_weight)[: STACK_N["cpu"]]]
+    train_stack([replace(trials[0], recipe=recipe(triplet_weight, 1))], rows)  # loads
     sgemm, best_s, best = max(sgemm_flop_per_s()), np.inf, {}
     for _ in range(REPEATS_N):
         with clocked({"all": [(train_module, "train")]}) as whole, clocked(STEP) as spent_s:
-            assert all(one.stopped_step is None for one in train_stack(cells, rows))
+            assert all(one.stopped_step is None for one in train_stack(trials, rows))
         if whole["all"] < best_s:
             best_s, best = whole["all"], dict(spent_s)
     best["rest: slices of batches, sums, the loop, the first copies of rows"] = best_s - sum(best.values())
-    rate = len(cells) * STEPS_N * flop(triplet_weight) / best_s
-    print(f"\na step of {len(cells)} networks{' with triplets' if triplet_weight else ''}: ", end="")
+    rate = len(trials) * STEPS_N * flop(triplet_weight) / best_s
+    print(f"\na step of {len(trials)} networks{' with triplets' if triplet_weight else ''}: ", end="")
     print(f"{1e3 * best_s / STEPS_N:.2f} ms, {100 * rate / sgemm:.0f} % of sgemm; best of {REPEATS_N}")
     for part, part_s in best.items():
         print(f"  {part:66}{1e3 * part_s / STEPS_N:7.3f} ms {100 * part_s / best_s:5.1f} %")

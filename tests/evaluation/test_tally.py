@@ -9,7 +9,7 @@ OF_ONE = st.fixed_dictionaries({"collapsed": st.booleans(), "collapsed_before_n"
 
 @given(st.lists(OF_ONE))
 def test_every_training_is_counted_once(done):
-    """Counted one by one: each cell as often as it was trained, each collapse of it."""
+    """Counted one by one: each trial as often as it was trained, each collapse of it."""
     attempts = [[True] * one["collapsed_before_n"] + [one["collapsed"]] for one in done]
     assert tally(done) == {
         "trainings_n": sum(map(len, attempts)),

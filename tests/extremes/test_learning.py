@@ -96,8 +96,8 @@ def test_a_network_that_touches_its_neighbour_is_found_out(monkeypatch):
 def test_a_batch_that_ignores_the_seed_is_found_out(monkeypatch):
     right = stack.make_job
 
-    def of_no_seed(cell, rows):
-        job, scaler = right(replace(cell, seed_i=0), rows)
+    def of_no_seed(trial, rows):
+        job, scaler = right(replace(trial, seed_i=0), rows)
         return job, scaler
 
     monkeypatch.setattr(stack, "make_job", of_no_seed)

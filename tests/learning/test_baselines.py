@@ -13,8 +13,8 @@ from sklearn.linear_model import Ridge
 from pipeline.core.seeds import rng_for
 from pipeline.learning import baselines
 from pipeline.learning.baselines import Answered, Task, run_tasks
-from pipeline.learning.cell import Measured
 from pipeline.learning.classical import Classical, fit
+from pipeline.learning.trial import Measured
 
 SETTINGS = {
     "ridge": {"method": "ridge", "alpha": 1.0},

@@ -16,9 +16,9 @@ from pipeline.dataset.rows import Rows
 from pipeline.dataset.splits import Split, draw_folds
 from pipeline.learning import few_labels as few
 from pipeline.learning.baselines import Task
-from pipeline.learning.cell import Adapting, Cell, FewLabels, Keys, Measured, Trained, make_job
 from pipeline.learning.comparison import Baselines
 from pipeline.learning.comparison import FewLabels as Settings
+from pipeline.learning.trial import Adapting, FewLabels, Keys, Measured, Trained, Trial, make_job
 from tests.scenes import RECIPE
 
 SKINS = ("b0_s0", "b0_s1", "b1_s0", "b2_s0")
@@ -69,29 +69,29 @@ def of(rows: Rows) -> Measured:
     return Measured(rows.db_uT, rows.target, rows.skin)
 
 
-def as_drawn(cell: Cell) -> Trained:
+def as_drawn(trial: Trial) -> Trained:
     """A network that was not trained: what it starts from, scaled as it will be."""
-    job, scaler = make_job(cell, of(ROWS))
-    return Trained(f"key of {cell.name}", job.start, scaler, [1.0], np.zeros((0, 3), np.float32), None, None, 0.0, 0.0)
+    job, scaler = make_job(trial, of(ROWS))
+    return Trained(f"key of {trial.name}", job.start, scaler, [1.0], np.zeros((0, 3), np.float32), None, None, 0.0, 0.0)
 
 
 def networks_of(at: few.Study) -> list[few.Done]:
     """Every network of the study, each step going on from those before, as the stage does."""
     done: list[few.Done] = []
     for step in (few.networks, few.adapted, few.labelled):
-        done = [*done, *((tried, cell, as_drawn(cell)) for tried, cell in step(at, done))]
+        done = [*done, *((tried, trial, as_drawn(trial)) for tried, trial in step(at, done))]
     return done
 
 
 STUDY = study()
 NETWORKS = networks_of(STUDY)
 TASKS = few.classical(STUDY)
-ADAPTED = [cell for _, cell, _ in NETWORKS if isinstance(cell.tuning, Adapting)]
-LABELLED = [(tried, cell) for tried, cell, _ in NETWORKS if isinstance(cell.tuning, FewLabels)]
+ADAPTED = [trial for _, trial, _ in NETWORKS if isinstance(trial.tuning, Adapting)]
+LABELLED = [(tried, trial) for tried, trial, _ in NETWORKS if isinstance(trial.tuning, FewLabels)]
 
 
-def all_tried(at: few.Study, networks: list[few.Done]) -> list[tuple[few.Tried, Cell | Task]]:
-    return [*((tried, cell) for tried, cell, _ in networks), *few.classical(at)]
+def all_tried(at: few.Study, networks: list[few.Done]) -> list[tuple[few.Tried, Trial | Task]]:
+    return [*((tried, trial) for tried, trial, _ in networks), *few.classical(at)]
 
 
 def test_every_method_is_tried_once_on_every_fold_with_every_number_of_labels():
@@ -114,11 +114,11 @@ def test_all_methods_and_numbers_of_labels_are_tested_on_the_same_rows_and_train
         assert tried.fold.name[:2] not in {*ROWS.board[one.train]}
 
 
-def labels_of(one: Cell | Task) -> np.ndarray:
+def labels_of(one: Trial | Task) -> np.ndarray:
     return one.own if isinstance(one, Task) else one.tuning.own
 
 
-def with_labels(at: few.Study, networks: list[few.Done]) -> list[tuple[few.Tried, Cell | Task]]:
+def with_labels(at: few.Study, networks: list[few.Done]) -> list[tuple[few.Tried, Trial | Task]]:
     return [(tried, one) for tried, one in all_tried(at, networks) if tried.labels_n]
 
 
@@ -184,11 +184,11 @@ def unknown(what: np.ndarray, rows: Rows = ROWS) -> Rows:
 
 
 def test_labels_of_a_new_board_change_no_scaler():
-    pooled = {(tried.method, tried.fold.name): one.scaler for tried, cell, one in NETWORKS if cell.tuning is None}
-    for tried, cell in LABELLED:
+    pooled = {(tried.method, tried.fold.name): one.scaler for tried, trial, one in NETWORKS if trial.tuning is None}
+    for tried, trial in LABELLED:
         changed = of(ROWS).db_uT.copy()
-        changed[cell.tuning.own] += 500
-        (job, scaler), (other, same) = (make_job(cell, one) for one in (of(ROWS), replace(of(ROWS), db_uT=changed)))
+        changed[trial.tuning.own] += 500
+        (job, scaler), (other, same) = (make_job(trial, one) for one in (of(ROWS), replace(of(ROWS), db_uT=changed)))
         for name, values in pooled[tried.method.removesuffix(", adapted"), tried.fold.name].arrays().items():
             assert (scaler.arrays()[name] == values).all()
             assert (same.arrays()[name] == values).all()
@@ -198,40 +198,40 @@ def test_labels_of_a_new_board_change_no_scaler():
 
 def test_labels_go_on_from_the_network_of_the_same_method_and_fold():
     by_key = {one.key: tried for tried, _, one in NETWORKS}
-    for tried, cell in LABELLED:
-        base = by_key[cell.tuning.start.key]
+    for tried, trial in LABELLED:
+        base = by_key[trial.tuning.start.key]
         assert (base.method, base.inputs, base.fold, base.labels_n) == (tried.method, tried.inputs, tried.fold, 0)
 
 
 def test_only_the_networks_named_are_adapted_by_all_pokes_of_their_pool():
-    assert [(cell.recipe_name, cell.fold) for cell in ADAPTED] == [("triplet", fold.name) for fold in STUDY.folds]
-    for cell, fold in zip(ADAPTED, STUDY.folds, strict=True):
-        assert {*cell.tuning.lines.row} == {*fold.pool}  # no place of 8 pokes on a 3 x 3 grid is alone on its lines
+    assert [(trial.recipe_name, trial.fold) for trial in ADAPTED] == [("triplet", fold.name) for fold in STUDY.folds]
+    for trial, fold in zip(ADAPTED, STUDY.folds, strict=True):
+        assert {*trial.tuning.lines.row} == {*fold.pool}  # no place of 8 pokes on a 3 x 3 grid is alone on its lines
     assert few.adapted(study(adapted=[]), few_done(study(adapted=[]))) == []
 
 
 def few_done(at: few.Study) -> list[few.Done]:
-    return [(tried, cell, as_drawn(cell)) for tried, cell in few.networks(data, [])]
+    return [(tried, trial, as_drawn(trial)) for tried, trial in few.networks(data, [])]
 
 
 def test_adaptation_sees_no_label_of_the_new_board():
-    for cell in ADAPTED:
-        blind = of(unknown(ROWS.board == cell.fold[:2]))
-        job, other = make_job(cell, of(ROWS))[0], make_job(cell, blind)[0]
+    for trial in ADAPTED:
+        blind = of(unknown(ROWS.board == trial.fold[:2]))
+        job, other = make_job(trial, of(ROWS))[0], make_job(trial, blind)[0]
         assert job.own is other.own is None
         assert (job.labelled.inputs == other.labelled.inputs).all()
         assert (job.labelled.targets == other.labelled.targets).all()
         assert (job.unlabelled.inputs == other.unlabelled.inputs).all()
         assert (job.unlabelled.row == other.unlabelled.row).all()
         assert job.rng.integers(2**63) == other.rng.integers(2**63)
-        assert Keys(of(ROWS)).key(cell) == Keys(blind).key(cell)
+        assert Keys(of(ROWS)).key(trial) == Keys(blind).key(trial)
 
 
 def test_of_places_only_the_order_along_lines_reaches_adaptation():
     stretched = replace(ROWS, target=(ROWS.target * np.float32([3, 0.5, 0]) + np.float32([7, -2, 1])))
     done = few_done(STUDY)
-    for (_, cell), (_, other) in zip(few.adapted(STUDY, done), few.adapted(study(rows=stretched), done), strict=True):
-        for name, values in vars(cell.tuning.lines).items():
+    for (_, trial), (_, other) in zip(few.adapted(STUDY, done), few.adapted(study(rows=stretched), done), strict=True):
+        for name, values in vars(trial.tuning.lines).items():
             assert (values == getattr(other.tuning.lines, name)).all()
 
 

@@ -11,15 +11,15 @@ from hypothesis import strategies as st
 from pipeline.core import io
 from pipeline.core.errors import ReskinError, TrainingError
 from pipeline.learning import stack
-from pipeline.learning.cell import Cell, Trained, make_job
 from pipeline.learning.executors import make_executor
-from pipeline.learning.grid import STACK_N, run_cells, stacks
+from pipeline.learning.grid import STACK_N, run_trials, stacks
 from pipeline.learning.stack import JUDGED_STEPS_N, train_stack
-from tests.learning.cells import TRAIN, adapting, few_labels, measured, pooled, without_triplets
+from pipeline.learning.trial import Trained, Trial, make_job
 from tests.learning.recipes import recipe
+from tests.learning.trials import TRAIN, adapting, few_labels, measured, pooled, without_triplets
 
 SIZE_N = STACK_N["cpu"]
-STACKED_ATOL = 1e-3  # mm, N: a cell in another stack is the same to float32 rounding of its weights (test_train.py)
+STACKED_ATOL = 1e-3  # mm, N: a trial in another stack is the same to float32 rounding of its weights (test_train.py)
 
 
 class Here(Executor):
@@ -43,7 +43,7 @@ class Here(Executor):
         return future
 
 
-def cells(folds_n: int = 3, **changes: object) -> list[Cell]:
+def trials(folds_n: int = 3, **changes: object) -> list[Trial]:
     """A fold leaves some rows of each of two skins out."""
     everyone = np.arange(24)
     held = [np.array([i, i + 12]) for i in range(folds_n)]
@@ -52,13 +52,13 @@ def cells(folds_n: int = 3, **changes: object) -> list[Cell]:
 
 
 def run(
-    some: list[Cell], cache: Path, executor: Executor | None = None, said: list[str] | None = None
+    some: list[Trial], cache: Path, executor: Executor | None = None, said: list[str] | None = None
 ) -> list[Trained]:
     tell = (lambda line: None) if said is None else said.append
-    return run_cells(some, measured(), executor=executor or Here(), cache=cache, tell=tell)
+    return run_trials(some, measured(), executor=executor or Here(), cache=cache, tell=tell)
 
 
-def trainings_n(some: list[Cell], cache: Path) -> int:
+def trainings_n(some: list[Trial], cache: Path) -> int:
     """How many stacks are trained."""
     executor = Here()
     run(some, cache, executor)
@@ -71,30 +71,30 @@ def alike(one: Trained, other: Trained) -> bool:
 
 
 def test_a_training_says_whether_an_earlier_run_finished_it(tmp_path):
-    first = run(cells(2), tmp_path)
-    both = run([*cells(2), *cells(2, steps_n=3)], tmp_path)
+    first = run(trials(2), tmp_path)
+    both = run([*trials(2), *trials(2, steps_n=3)], tmp_path)
     assert [one.reused for one in first] == [False, False]
     assert [one.reused for one in both] == [True, True, False, False]
     assert [one.seconds for one in both[:2]] == pytest.approx([one.seconds for one in first])  # when it was computed
 
 
-def test_results_come_in_the_order_of_cells_with_a_prediction_a_test_row(tmp_path):
-    some = [*cells(2), pooled(), *cells(5, steps_n=3), without_triplets(), adapting(), few_labels()]
+def test_results_come_in_the_order_of_trials_with_a_prediction_a_test_row(tmp_path):
+    some = [*trials(2), pooled(), *trials(5, steps_n=3), without_triplets(), adapting(), few_labels()]
     done = run(some, tmp_path)
     assert len({one.key for one in done}) == len(some)
-    assert [one.predicted.shape for one in done] == [(len(cell.test), 3) for cell in some]
+    assert [one.predicted.shape for one in done] == [(len(trial.test), 3) for trial in some]
 
 
 def test_a_result_is_that_of_its_own_cell_whatever_it_was_stacked_with(tmp_path):
-    some = [*cells(2), pooled(), adapting(), cells(3)[2]]
-    for cell, one in zip(some, run(some, tmp_path), strict=True):
-        (alone,) = train_stack([cell], measured())
+    some = [*trials(2), pooled(), adapting(), trials(3)[2]]
+    for trial, one in zip(some, run(some, tmp_path), strict=True):
+        (alone,) = train_stack([trial], measured())
         np.testing.assert_allclose(one.predicted, alone.predicted, rtol=0, atol=STACKED_ATOL)
         assert (one.scaler.input_shift == alone.scaler.input_shift).all()
 
 
 def test_a_killed_grid_loses_no_finished_cell(tmp_path):
-    some = cells(2 * SIZE_N + 1)
+    some = trials(2 * SIZE_N + 1)
     with pytest.raises(TrainingError):
         run(some, tmp_path / "killed", Here(die_after=1))
     assert trainings_n(some, tmp_path / "killed") == 2  # of three stacks
@@ -104,7 +104,7 @@ def test_a_killed_grid_loses_no_finished_cell(tmp_path):
 
 def test_a_stack_killed_while_it_was_written_gives_what_it_would_have_given(tmp_path):
     # Batches of 1 and many steps: here the place in a stack shows in the last bits, and those grow.
-    some = cells(SIZE_N, steps_n=60, batch_n=1)
+    some = trials(SIZE_N, steps_n=60, batch_n=1)
     done = run(some, tmp_path)
     (tmp_path / f"{done[1].key}.safetensors").unlink()
     assert all(alike(a, b) for a, b in zip(done, run(some, tmp_path), strict=True))
@@ -112,18 +112,18 @@ def test_a_stack_killed_while_it_was_written_gives_what_it_would_have_given(tmp_
 
 def test_a_dead_worker_is_one_sentence(tmp_path):
     with pytest.raises(TrainingError, match=r"^training: a worker process must be alive to its end; got .* Run again"):
-        run(cells(), tmp_path, Here(die_after=0))
+        run(trials(), tmp_path, Here(die_after=0))
 
 
 def test_a_training_that_cannot_be_is_one_sentence_that_names_its_cell(tmp_path):
     with pytest.raises(TrainingError, match=r"^lobo.paper.b0.seed0, triplets of group 0: the places of its points"):
-        run([replace(cell, train=np.array([0, 0, 12])) for cell in cells(1)], tmp_path)
+        run([replace(trial, train=np.array([0, 0, 12])) for trial in trials(1)], tmp_path)
 
 
 def test_what_is_finished_is_not_trained_again(tmp_path):
     said: list[str] = []
-    first = run(cells(), tmp_path)
-    again = run(cells(), tmp_path, Here(die_after=0), said)
+    first = run(trials(), tmp_path)
+    again = run(trials(), tmp_path, Here(die_after=0), said)
     assert all(alike(a, b) for a, b in zip(first, again, strict=True))
     assert said == ["3 of 3 trainings were finished before"]
 
@@ -131,27 +131,27 @@ def test_what_is_finished_is_not_trained_again(tmp_path):
 @pytest.mark.parametrize(
     ("more", "trained_n"),
     [
-        (replace(cells(1)[0], seed_i=1), 1),
-        (cells(1, steps_n=5)[0], 1),
-        (replace(cells(1)[0], recipe=without_triplets().recipe), 1),
-        (cells(3)[2], 3),  # a fold more joins the stack of the others
+        (replace(trials(1)[0], seed_i=1), 1),
+        (trials(1, steps_n=5)[0], 1),
+        (replace(trials(1)[0], recipe=without_triplets().recipe), 1),
+        (trials(3)[2], 3),  # a fold more joins the stack of the others
     ],
     ids=["seed", "schedule", "terms", "fold"],
 )
 def test_one_more_costs_one_stack(tmp_path, more, trained_n):
-    run(cells(2), tmp_path)
-    assert trainings_n([*cells(2), more], tmp_path) == 1
+    run(trials(2), tmp_path)
+    assert trainings_n([*trials(2), more], tmp_path) == 1
     assert len(list(tmp_path.glob("*.safetensors"))) == 2 + trained_n
 
 
 def test_the_same_training_under_another_name_costs_none(tmp_path):
-    run(cells(1), tmp_path)
-    renamed = replace(cells(1)[0], question="sensors", recipe_name="twin", what="multi")
+    run(trials(1), tmp_path)
+    renamed = replace(trials(1)[0], question="sensors", recipe_name="twin", what="multi")
     assert trainings_n([renamed], tmp_path) == 0
 
 
 def test_equal_trainings_of_one_run_are_trained_once(tmp_path):
-    one = cells(1)[0]
+    one = trials(1)[0]
     some = [one, replace(one, recipe_name="twin"), one]
     done = run(some, tmp_path)
     assert len(list(tmp_path.glob("*.safetensors"))) == 1
@@ -159,37 +159,37 @@ def test_equal_trainings_of_one_run_are_trained_once(tmp_path):
 
 
 def test_different_trainings_of_one_name_are_not_mixed_up(tmp_path):
-    one, other = cells(1)[0], cells(1, steps_n=3)[0]
+    one, other = trials(1)[0], trials(1, steps_n=3)[0]
     assert one.name == other.name
     done = run([one, other], tmp_path)
     assert not alike(*done)
-    assert [training.curve for training in done] == [run([cell], tmp_path)[0].curve for cell in (one, other)]
+    assert [training.curve for training in done] == [run([trial], tmp_path)[0].curve for trial in (one, other)]
 
 
 def test_rows_are_left_in_no_cache(tmp_path):
-    run(cells(), tmp_path)
+    run(trials(), tmp_path)
     assert [one for one in tmp_path.rglob("*.safetensors") if one.parent != tmp_path] == []
 
 
 def test_what_is_left_in_the_cache_opens_without_pickle(tmp_path):
-    run(cells(1), tmp_path)
+    run(trials(1), tmp_path)
     (file,) = tmp_path.glob("*.safetensors")
     tensors, metadata = io.read_tensors(file)
     assert tensors["weights.layer1.weight"].shape == (200, 15)
-    assert metadata["cell"] == "lobo.paper.b0.seed0"
+    assert metadata["trial"] == "lobo.paper.b0.seed0"
     assert float(metadata["seconds"]) > 0
 
 
-@pytest.mark.parametrize("cell", [pooled(), adapting(), few_labels()], ids=["pooled", "adapting", "few labels"])
-def test_a_result_survives_the_cache_whole(tmp_path, cell):
-    (direct,), (read,) = train_stack([cell], measured()), run([cell], tmp_path)
+@pytest.mark.parametrize("trial", [pooled(), adapting(), few_labels()], ids=["pooled", "adapting", "few labels"])
+def test_a_result_survives_the_cache_whole(tmp_path, trial):
+    (direct,), (read,) = train_stack([trial], measured()), run([trial], tmp_path)
     assert alike(direct, read)
     assert all((a == read.scaler.arrays()[name]).all() for name, a in direct.scaler.arrays().items())
     assert read.stopped_step is direct.stopped_step is None
 
 
 def test_a_cell_that_explodes_stands_with_its_last_finite_weights_and_says_so(tmp_path):
-    wild = cells(2, rate_max=1e30, batch_n=4)
+    wild = trials(2, rate_max=1e30, batch_n=4)
     for done in (run(wild, tmp_path), run(wild, tmp_path)):
         assert [one.stopped_step for one in done] == [4, 4]
         assert [one.curve for one in done] == [[], []]
@@ -202,9 +202,9 @@ DEAD = {"layer1.weight": 0, "layer1.bias": 0}  # answers the same to any input, 
 def dies(attempts: set[int]) -> object:
     """Start some attempts of fold b0 dead; what is dead stays dead."""
 
-    def make(cell: Cell, rows: object) -> object:
-        job, scaler = make_job(cell, rows)
-        if cell.fold == "b0" and cell.attempt_i in attempts:
+    def make(trial: Trial, rows: object) -> object:
+        job, scaler = make_job(trial, rows)
+        if trial.fold == "b0" and trial.attempt_i in attempts:
             start = {name: value * DEAD.get(name, 1) for name, value in job.start.items()}
             start["layer2.weight"] = 0 * start["layer2.weight"]
             job = replace(job, start=start)
@@ -218,7 +218,7 @@ def dies(attempts: set[int]) -> object:
 )
 def test_what_collapses_is_trained_again_at_most_twice_and_counted(tmp_path, monkeypatch, dead, before_n, collapsed):
     monkeypatch.setattr(stack, "make_job", dies(dead))
-    some, said = cells(2, steps_n=JUDGED_STEPS_N, rate_max=1e-2), []
+    some, said = trials(2, steps_n=JUDGED_STEPS_N, rate_max=1e-2), []
     for _ in range(2):  # the second time, from the cache
         first, second = run(some, tmp_path, said=said)
         assert (first.collapsed_before_n, first.collapsed) == (before_n, bool(collapsed))
@@ -229,7 +229,7 @@ def test_what_collapses_is_trained_again_at_most_twice_and_counted(tmp_path, mon
 
 def test_a_training_too_short_to_have_left_its_start_is_not_judged(tmp_path, monkeypatch):
     monkeypatch.setattr(stack, "make_job", dies({0, 1, 2}))
-    first, _ = run(cells(2, steps_n=JUDGED_STEPS_N - 1), tmp_path)
+    first, _ = run(trials(2, steps_n=JUDGED_STEPS_N - 1), tmp_path)
     assert (first.explained_min, first.collapsed) == (None, False)
 
 
@@ -253,17 +253,17 @@ def test_trainings_in_a_process_of_their_own_are_the_same(tmp_path, monkeypatch)
     assert all(alike(a, b) for a, b in zip(apart, run(some, tmp_path / "here"), strict=True))
 
 
-def keyed(some: list[Cell]) -> dict[str, Cell]:
-    return {f"key{i}": cell for i, cell in enumerate(some)}
+def keyed(some: list[Trial]) -> dict[str, Trial]:
+    return {f"key{i}": trial for i, trial in enumerate(some)}
 
 
 def test_recipes_of_equal_settings_are_stacked_and_others_are_not():
-    twin = [replace(cell, recipe_name="twin") for cell in cells(1)]
-    assert [len(stack) for stack in stacks(keyed([*cells(2), *twin]), 3)] == [3]
+    twin = [replace(trial, recipe_name="twin") for trial in trials(1)]
+    assert [len(stack) for stack in stacks(keyed([*trials(2), *twin]), 3)] == [3]
     released = replace(adapting(), recipe=pooled(architecture="released").recipe)
     tuned = [adapting(), released, adapting(unlabelled_weight=0.0), few_labels()]
-    others = [cells(1, steps_n=5)[0], without_triplets(), replace(cells(1)[0], seed_i=1), *tuned]
-    assert [len(stack) for stack in stacks(keyed([*cells(1), *others]), 3)] == [1] * 8
+    others = [trials(1, steps_n=5)[0], without_triplets(), replace(trials(1)[0], seed_i=1), *tuned]
+    assert [len(stack) for stack in stacks(keyed([*trials(1), *others]), 3)] == [1] * 8
 
 
 @given(st.lists(st.integers(0, 4), max_size=20), st.integers(1, 5))

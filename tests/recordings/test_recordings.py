@@ -71,8 +71,8 @@ def test_the_lab_forces_reach_from_a_touch_to_ten_newtons(shared_data: Path, tmp
 @pytest.mark.parametrize("name", LAB)
 def test_the_lab_chips_are_as_noisy_as_the_data_sheet_says(shared_data: Path, name: str) -> None:
     # Noise about the press's own mean, 65 x 9 degrees of freedom a channel: a standard deviation is known to 3 %.
-    cells = read_cells(shared_data / "lab" / f"{name}.csv", name, separator=",")
-    names, rows = cells[0], [row for row in cells[1:] if row[1] == "noload"]
+    trials = read_cells(shared_data / "lab" / f"{name}.csv", name, separator=",")
+    names, rows = trials[0], [row for row in trials[1:] if row[1] == "noload"]
     columns = [names.index(f"B{axis}{chip}") for chip in range(5) for axis in "xyz"]
     b_uT = np.array([[float(row[i]) for i in columns] for row in rows]).reshape(65, 10, 15)
     sd_uT = np.sqrt(b_uT.var(axis=1, ddof=1).mean(axis=0)).reshape(5, 3)

@@ -5,10 +5,10 @@ from html.parser import HTMLParser
 import pandas as pd
 import pytest
 
+from pipeline.questions import EXPERIMENTS
 from pipeline.reporting import page_order
 from pipeline.reporting.checklist import checklist
 from pipeline.reporting.page import arrange, lay_out, page
-from pipeline.reporting.parts import PARTS
 from pipeline.reporting.tables import make_tables
 from tests.reporting.synthetic import all_questions
 
@@ -45,7 +45,7 @@ class Reader(HTMLParser):
 def render(numbers: dict | None = None, **more: pd.DataFrame) -> str:
     numbers = all_questions() if numbers is None else numbers
     # Experiments have synthetic numbers here, which no real table could be made of.
-    plain = {name: value for name, value in numbers.items() if name not in PARTS}
+    plain = {name: value for name, value in numbers.items() if name not in EXPERIMENTS}
     drift = pd.DataFrame({"contacts": ["0"], "accuracy, %": ["90"]})
     tables = make_tables(plain) | {"checklist": checklist(numbers), "drift": drift} | more
     figures = {"drift.svg": SVG.format(300), "sweep_pokes.svg": SVG.format(600), "unheard_of.svg": SVG.format(300)}

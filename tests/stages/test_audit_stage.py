@@ -16,15 +16,15 @@ from pipeline.dataset.folds import load_rows, parse_folds, render_folds
 from pipeline.dataset.rows import Selection
 from pipeline.dataset.splits import Fold, draw_folds
 from pipeline.experiments.audit.run import audit
-from pipeline.learning.cell import Cell, Measured, Trained, make_job
 from pipeline.learning.inputs import VIEW
 from pipeline.learning.recipe import adaptations as adaptations_of
 from pipeline.learning.recipe import training
 from pipeline.learning.standardise import FIT
+from pipeline.learning.trial import Measured, Trained, Trial, make_job
 from pipeline.stages import split
 from pipeline.trials import models as _models
 from pipeline.trials.adapting import adaptations, read_starts
-from pipeline.trials.data import SceneData, cells_of, read_data
+from pipeline.trials.data import SceneData, read_data, trials_of
 from pipeline.trials.models import write_models
 from tests.dataset.tables import readings
 from tests.scenes import ADAPTATIONS, RECIPE, SHARED, TRAINING, recorded, settings
@@ -96,16 +96,16 @@ def build(folder: Path, skins: tuple[str, ...] = SKINS) -> Path:
         ("train_single", training(asked, "train_single"), "single_random"),
         ("train_multi", training(asked, "train_multi"), "lobo"),
     ):
-        write(folder, arm, data, cells_of(data, section, data.folds_of(question)))
+        write(folder, arm, data, trials_of(data, section, data.folds_of(question)))
     write(
         folder,
         "train_triplet",
         data,
-        cells_of(data, training(asked, "train_triplet"), data.folds_of("lobo"), question="triplet"),
+        trials_of(data, training(asked, "train_triplet"), data.folds_of("lobo"), question="triplet"),
     )
     starts, named = read_starts(folder / "models/train_triplet"), ("paper", adaptations_of(asked).recipes["paper"])
     adapted = [adaptations(data, fold, named, starts, question="adapt", pokes_n=8) for fold in data.folds_of("lobo")]
-    write(folder, "adapt", data, [cell for cells in adapted for cell in cells])
+    write(folder, "adapt", data, [trial for trials in adapted for trial in trials])
     io.write_json(folder / "choice.json", CHOICE)
     return folder
 
@@ -114,14 +114,14 @@ def scenery(folder: Path) -> SceneData:
     return read_data(settings(SCENE), folder / "indentations", folder / "folds.json")
 
 
-def write(folder: Path, arm: str, data: SceneData, cells: list[Cell]) -> None:
-    write_models(folder / "models" / arm, data, cells, [as_drawn(cell, data) for cell in cells], arm)
+def write(folder: Path, arm: str, data: SceneData, trials: list[Trial]) -> None:
+    write_models(folder / "models" / arm, data, trials, [as_drawn(trial, data) for trial in trials], arm)
 
 
-def as_drawn(cell: Cell, data: SceneData) -> Trained:
-    job, scaler = make_job(cell, Measured(data.rows.db_uT, data.rows.target, data.rows.skin))
-    predicted = np.zeros((len(cell.test), 3), np.float32)
-    return Trained(f"key of {cell.name}", job.start, scaler, [1.0], predicted, None, None, 0.0, 0.0)
+def as_drawn(trial: Trial, data: SceneData) -> Trained:
+    job, scaler = make_job(trial, Measured(data.rows.db_uT, data.rows.target, data.rows.skin))
+    predicted = np.zeros((len(trial.test), 3), np.float32)
+    return Trained(f"key of {trial.name}", job.start, scaler, [1.0], predicted, None, None, 0.0, 0.0)
 
 
 @pytest.fixture(autouse=True)

@@ -247,16 +247,16 @@ def test_a_stage_killed_in_the_middle_loses_no_finished_fold(story):
              "--folds", "data/folds/ci.json", "--models", str(models)]  # fmt: skip
     command = [str(story / ".venv/bin/python"), "-m", "pipeline.stages.train_triplet", *words]
     environment = {**os.environ, **ENVIRONMENT, "PYTHONPATH": str(story), "RESKIN_EXECUTOR": "processes:1"}
-    cells = story / ".reskin/cells"
-    for file in cells.glob("*.safetensors"):
+    trials = story / ".reskin/cells"
+    for file in trials.glob("*.safetensors"):
         file.unlink()
     stage = subprocess.Popen(command, cwd=story, env=environment, stderr=subprocess.DEVNULL)
-    while not list(cells.glob("*.safetensors")):
+    while not list(trials.glob("*.safetensors")):
         time.sleep(0.005)
         assert stage.poll() is None, "the stage ended before it could be killed"
     stage.send_signal(signal.SIGKILL)
     stage.wait()
-    finished_n = len(list(cells.glob("*.safetensors")))
+    finished_n = len(list(trials.glob("*.safetensors")))
     assert not models.exists()
     again = subprocess.run(command, cwd=story, env=environment, capture_output=True, text=True, check=True)
     assert f"{finished_n} of 6 trainings were finished before" in again.stderr

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 
 from pipeline.capture import faults
 from pipeline.capture.header import Header
-from pipeline.core.errors import CaptureError, complain
+from pipeline.core.errors import CaptureError
 
 GRID_ROWS_N = 1000  # real recordings show each sound chip's grid in blocks of 400 rows; in 200 it may hide
 
@@ -42,7 +42,7 @@ def find_whole_rows(
     failed = np.asarray(faults.failed_reads(b_uT, temperature_degC).any(axis=1))
     if failed.all():
         remedy = "Mend the wiring, and record again."
-        raise CaptureError(complain(where, "rows", "read from every chip", "failed I2C reads in all of them", remedy))
+        raise CaptureError(where, "rows", "read from every chip", "failed I2C reads in all of them", remedy)
     rows = np.flatnonzero(~failed)
     for block in np.array_split(rows, max(1, len(rows) // GRID_ROWS_N)):
         _check_scale(b_uT[block], header, where=f"{where} from row {block[0] + 1}")
@@ -64,6 +64,4 @@ def _check_scale(b_uT: Float[np.ndarray, "f ch"], header: Header, *, where: str)
         got = (
             "no one step" if without[strange[0]] else "{:.3g} uT in x, y and {:.3g} uT in z".format(*lsb_uT[strange[0]])
         )
-        raise CaptureError(
-            complain(where, names, rule, got, "A chip lost its settings: reset the board, record again.")
-        )
+        raise CaptureError(where, names, rule, got, "A chip lost its settings: reset the board, record again.")

@@ -15,7 +15,7 @@ from pipeline.capture.readers.chips import find_whole_rows
 from pipeline.capture.readers.passes import find_passes
 from pipeline.capture.readers.table import read_cells, to_numbers
 from pipeline.capture.readers.units import check_depths, check_fields, check_forces, check_places, check_touch
-from pipeline.core.errors import CaptureError, complain
+from pipeline.core.errors import CaptureError
 from pipeline.core.schema import AXES_PER_CHIP_N, Readings
 
 SENSOR = "sensor.csv"
@@ -40,9 +40,7 @@ def collect(recording: Path) -> dict[str, Path]:
     missing = [name for name in FILES if not (recording / name).is_file()]
     if missing:
         rule = f"a folder with {', '.join(FILES)}"
-        raise CaptureError(
-            complain(recording, "an eflesh recording", rule, f"no {', '.join(missing)}", "Fetch it whole.")
-        )
+        raise CaptureError(recording, "an eflesh recording", rule, f"no {', '.join(missing)}", "Fetch it whole.")
     return {name: recording / name for name in FILES}
 
 
@@ -51,7 +49,7 @@ def count_chips(files: Mapping[str, Path]) -> int:
     where = str(files[SENSOR])
     columns_n = len(read_cells(files[SENSOR], where, separator=",")[0])
     if columns_n < 1 + AXES_PER_CHIP_N or (columns_n - 1) % AXES_PER_CHIP_N:
-        raise CaptureError(complain(where, "columns", "a time and 3 a chip", columns_n, "Is this layout eflesh?"))
+        raise CaptureError(where, "columns", "a time and 3 a chip", columns_n, "Is this layout eflesh?")
     return (columns_n - 1) // AXES_PER_CHIP_N
 
 
@@ -111,7 +109,7 @@ def _read_fields(
     if len(differ):
         got = f"another in line {differ[0] + 1}"
         where = f"{header.capture}/{CHANGES}"
-        raise CaptureError(complain(where, "time", f"that of {SENSOR}", got, "Take both files of one recording."))
+        raise CaptureError(where, "time", f"that of {SENSOR}", got, "Take both files of one recording.")
     check_fields(sensor[:, 1:], f"{header.capture}/{SENSOR}", first_line_n=1)
     return sensor[:, 0], sensor[:, 1:], sensor[:, 1:] - changes[:, 1:]
 
@@ -135,7 +133,7 @@ def _read_numbers(folder: Path, header: Header, name: str, names: list[str]) -> 
 def _check_rows_n(rows_n: Mapping[str, int], header: Header) -> None:
     if len(set(rows_n.values())) != 1:
         got = " and ".join(f"{count} in {name}" for name, count in rows_n.items())
-        raise CaptureError(complain(header.capture, "rows", "equal in number", got, "Was one of the files cut?"))
+        raise CaptureError(header.capture, "rows", "equal in number", got, "Was one of the files cut?")
 
 
 def _check_clocks(sensor_s: Float64[np.ndarray, " f"], states_s: Float64[np.ndarray, " f"], header: Header) -> None:
@@ -145,12 +143,12 @@ def _check_clocks(sensor_s: Float64[np.ndarray, " f"], states_s: Float64[np.ndar
         got = f"{states_s[apart[0]] - sensor_s[apart[0]]:.3f} s in line {apart[0] + 1}"
         rule = f"within {CLOCKS_APART_MAX_s} s of {SENSOR}"
         where = f"{header.capture}/{STATES}"
-        raise CaptureError(complain(where, "time", rule, got, "Is a row missing in one of the files?"))
+        raise CaptureError(where, "time", rule, got, "Is a row missing in one of the files?")
     back = np.flatnonzero(np.diff(sensor_s) <= 0)
     if len(back):
         where = f"{header.capture}/{SENSOR}"
         got = f"an earlier one in line {back[0] + 2}"
-        raise CaptureError(complain(where, "time", "later in each line", got, "Were two recordings joined?"))
+        raise CaptureError(where, "time", "later in each line", got, "Were two recordings joined?")
 
 
 def _number_passes(
@@ -177,7 +175,7 @@ def _read_force(states: Float64[np.ndarray, "f c"], header: Header) -> dict[str,
     if "force_axis" not in header.options or header.options["force_axis"] not in FORCE_AXES:
         got = header.options if header.options else "no option"
         remedy = "Say which force the gauge measured."
-        raise CaptureError(complain(header.capture, "option force_axis", "x, y or z", got, remedy))
+        raise CaptureError(header.capture, "option force_axis", "x, y or z", got, remedy)
     weight_g = states[:, WEIGHT_COLUMN]
     weight_N = np.where(weight_g == NO_NEW_WEIGHT, np.nan, weight_g * NEWTON_PER_GRAM)
     where = f"{header.capture}/{STATES}"

@@ -17,7 +17,7 @@ from pipeline.capture.readers.chips import Rows, find_whole_rows
 from pipeline.capture.readers.passes import find_passes
 from pipeline.capture.readers.table import read_cells, to_numbers
 from pipeline.capture.readers.units import check_fields, check_forces, check_places, check_touch
-from pipeline.core.errors import CaptureError, complain
+from pipeline.core.errors import CaptureError
 from pipeline.core.schema import Readings
 
 READINGS = "readings.txt"
@@ -45,16 +45,12 @@ def collect(recording: Path) -> dict[str, Path]:
     """Find the readings file and its truths beside it: `b20_NAME.txt` goes with `truths_NAME.txt`."""
     if not recording.is_file() or recording.name.startswith("truths_"):
         rule = "the text file of readings"
-        raise CaptureError(
-            complain(recording, "an ini recording", rule, recording.name, "Name the file, not truths_*.")
-        )
+        raise CaptureError(recording, "an ini recording", rule, recording.name, "Name the file, not truths_*.")
     names = [f"truths_{recording.name.partition('_')[2]}", f"truths_{recording.name}"]
     found = [recording.with_name(name) for name in names if recording.with_name(name).is_file()]
     if not found:
         got = f"no {' or '.join(names)}"
-        raise CaptureError(
-            complain(recording, "the truths", "in the same folder", got, "Fetch or rename the truths file.")
-        )
+        raise CaptureError(recording, "the truths", "in the same folder", got, "Fetch or rename the truths file.")
     return {READINGS: recording, TRUTHS: found[0]}
 
 
@@ -63,7 +59,7 @@ def count_chips(files: Mapping[str, Path]) -> int:
     where = str(files[READINGS])
     columns_n = len(read_cells(files[READINGS], where, separator=None)[0])
     if columns_n == 0 or columns_n % VALUES_PER_CHIP_N:
-        raise CaptureError(complain(where, "columns", "X, Y, Z, T a chip", columns_n, "Is this layout ini?"))
+        raise CaptureError(where, "columns", "X, Y, Z, T a chip", columns_n, "Is this layout ini?")
     return columns_n // VALUES_PER_CHIP_N
 
 
@@ -154,19 +150,17 @@ def _read_truths(folder: Path, header: Header) -> Float64[np.ndarray, "f 3"]:
 def _check_rows_n(readings_n: int, truths_n: int, rows_late_n: int, header: Header) -> None:
     if readings_n <= rows_late_n:
         rule = f"more than the {rows_late_n} of option rows_late"
-        raise CaptureError(complain(header.capture, "rows", rule, readings_n, "Was the recording cut?"))
+        raise CaptureError(header.capture, "rows", rule, readings_n, "Was the recording cut?")
     if readings_n != truths_n:
         got = f"{readings_n} in {READINGS} and {truths_n} in {TRUTHS}"
-        raise CaptureError(
-            complain(header.capture, "rows", "equal in number", got, "Is this the truths file of this one?")
-        )
+        raise CaptureError(header.capture, "rows", "equal in number", got, "Is this the truths file of this one?")
 
 
 def _rows_late(header: Header) -> int:
     rows_late = header.options.get("rows_late", "0")
     if rows_late not in ROWS_LATE:
         remedy = "Say by how many rows the fields come late."
-        raise CaptureError(complain(header.capture, "option rows_late", f"0 to {ROWS_LATE[-1]}", rows_late, remedy))
+        raise CaptureError(header.capture, "option rows_late", f"0 to {ROWS_LATE[-1]}", rows_late, remedy)
     return int(rows_late)
 
 
@@ -206,9 +200,7 @@ def _noload_field(
         got = f"none in the pass from line {int(np.argmax(pass_i == without[0])) + 1}"
         where = f"{header.capture}/{TRUTHS}"
         rule = f"begun by a whole row without contact (F < {CONTACT_MIN_N} N)"
-        raise CaptureError(
-            complain(where, "each pass", rule, got, "Start each pass off the skin, or cut this pass out.")
-        )
+        raise CaptureError(where, "each pass", rule, got, "Start each pass off the skin, or cut this pass out.")
     sums_uT = np.zeros((passes_n, b_uT.shape[1]))
     np.add.at(sums_uT, pass_i[corner], b_uT[corner])
     return (sums_uT / rows_n[:, None])[pass_i]

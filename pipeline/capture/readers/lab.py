@@ -17,7 +17,7 @@ from pipeline.capture.header import Header
 from pipeline.capture.readers.chips import find_whole_rows
 from pipeline.capture.readers.table import read_cells, to_numbers
 from pipeline.capture.readers.units import check_fields, check_forces, check_places, check_touch
-from pipeline.core.errors import CaptureError, complain
+from pipeline.core.errors import CaptureError
 from pipeline.core.schema import Readings
 
 READINGS = "readings.csv"
@@ -44,9 +44,7 @@ class _Table:
 def collect(recording: Path) -> dict[str, Path]:
     """Find the file of a recording: the CSV file itself, one depth of one skin."""
     if not recording.is_file():
-        raise CaptureError(
-            complain(recording, "a lab recording", "one CSV file", "none", "Add each depth's file by itself.")
-        )
+        raise CaptureError(recording, "a lab recording", "one CSV file", "none", "Add each depth's file by itself.")
     return {READINGS: recording}
 
 
@@ -61,7 +59,7 @@ def read(folder: Path, header: Header) -> tuple[Readings, Account]:
     table = _read_table(folder / READINGS, where)
     if table.temperature_degC.shape[1] != header.chips_n:
         got = table.temperature_degC.shape[1]
-        raise CaptureError(complain(where, "chips", f"{header.chips_n}, as in the header", got, "Mend header or file."))
+        raise CaptureError(where, "chips", f"{header.chips_n}, as in the header", got, "Mend header or file.")
     rows = find_whole_rows(table.b_uT, table.temperature_degC, header, where=where)
     keep, noload = table.contact & rows.whole, ~table.contact & rows.whole
     noload_uT = _noload_field(table, noload, where)
@@ -135,21 +133,19 @@ def _check_columns(names: list[str], wanted: list[str], where: str) -> None:
     missing = [name for name in wanted if name not in names]
     if missing:
         got = f"none named {', '.join(missing)}"
-        raise CaptureError(
-            complain(where, "columns", "those of data/README.md", got, "Is this layout lab, line 1 its names?")
-        )
+        raise CaptureError(where, "columns", "those of data/README.md", got, "Is this layout lab, line 1 its names?")
     twice = [name for name, times_n in Counter(names).items() if times_n > 1]
     if twice:
-        raise CaptureError(complain(where, "names of columns", "unique", f"{twice[0]} twice", "Remove one of the two."))
+        raise CaptureError(where, "names of columns", "unique", f"{twice[0]} twice", "Remove one of the two.")
 
 
 def _contact_rows(phases: list[str], where: str) -> Bool[np.ndarray, " f"]:
     for row_i, phase in enumerate(phases):
         if phase not in PHASES:
             place = f"phase in line {FIRST_LINE_N + row_i}"
-            raise CaptureError(complain(where, place, "noload or contact", repr(phase[:20]), "Mend the word."))
+            raise CaptureError(where, place, "noload or contact", repr(phase[:20]), "Mend the word.")
     if "contact" not in phases:
-        raise CaptureError(complain(where, "the file", "rows of phase contact", "none", "Was the recording cut?"))
+        raise CaptureError(where, "the file", "rows of phase contact", "none", "Was the recording cut?")
     return np.array([phase == "contact" for phase in phases])
 
 
@@ -159,9 +155,7 @@ def _number_presses(indent: Float64[np.ndarray, " f"], where: str) -> Int[np.nda
     for row_i in begins:
         if indent[row_i] in seen:
             got = f"{indent[row_i]:g} once more in line {FIRST_LINE_N + row_i}"
-            raise CaptureError(
-                complain(where, "indent", "one block of rows a number", got, "Was the file joined twice?")
-            )
+            raise CaptureError(where, "indent", "one block of rows a number", got, "Was the file joined twice?")
         seen.add(indent[row_i])
     return np.repeat(np.arange(len(begins)), np.diff(begins, append=len(indent)))
 
@@ -175,15 +169,13 @@ def _check_table(table: _Table, where: str) -> None:
     pressed_N = float(np.median(table.force_N[table.contact, 2]))
     if pressed_N > 0:
         remedy = "Is compression negative Fz in this file? Turn its sign."
-        raise CaptureError(complain(where, "the usual Fz in contact", "negative", f"{pressed_N:.4g} N", remedy))
+        raise CaptureError(where, "the usual Fz in contact", "negative", f"{pressed_N:.4g} N", remedy)
     check_places(table.place_mm, where)
     begins = np.flatnonzero(np.diff(table.press, prepend=-1))
     moved = np.flatnonzero((table.place_mm != table.place_mm[begins][table.press]).any(axis=1))
     if len(moved):
         got = f"another in line {FIRST_LINE_N + moved[0]}"
-        raise CaptureError(
-            complain(where, "an indent's place", "one x_mm, y_mm", got, "Give each press its own indent.")
-        )
+        raise CaptureError(where, "an indent's place", "one x_mm, y_mm", got, "Give each press its own indent.")
 
 
 def _noload_field(table: _Table, noload: Bool[np.ndarray, " f"], where: str) -> Float64[np.ndarray, "n ch"]:
@@ -194,7 +186,7 @@ def _noload_field(table: _Table, noload: Bool[np.ndarray, " f"], where: str) -> 
     if len(without):
         got = f"none in the block from line {FIRST_LINE_N + int(np.argmax(table.press == without[0]))}"
         remedy = "Remove the block, or record it again."
-        raise CaptureError(complain(where, "each indent", "given noload rows that were read", got, remedy))
+        raise CaptureError(where, "each indent", "given noload rows that were read", got, remedy)
     sums_uT = np.zeros((len(rows_n), table.b_uT.shape[1]))
     np.add.at(sums_uT, of_press, table.b_uT[noload])
     return sums_uT / rows_n[:, None]

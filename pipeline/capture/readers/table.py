@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from pipeline.core.errors import CaptureError, complain
+from pipeline.core.errors import CaptureError
 
 # No reading, place or unix time of these recordings comes near it; float32 holds it without overflow.
 MAGNITUDE_MAX = 1e10
@@ -23,9 +23,7 @@ def read_cells(path: Path, where: str, *, separator: str | None) -> list[list[st
     for line_i, row in enumerate(cells):
         if len(row) != len(cells[0]):
             got = f"{len(row)} in line {line_i + 1}"
-            raise CaptureError(
-                complain(where, "columns", f"{len(cells[0])}, as in line 1", got, "Was the file cut or edited?")
-            )
+            raise CaptureError(where, "columns", f"{len(cells[0])}, as in line 1", got, "Was the file cut or edited?")
     return cells
 
 
@@ -35,19 +33,15 @@ def to_numbers(
     """Turn cells into finite numbers; `names` are the columns', `first_line_n` the file's line of `cells[0]`."""
     if cells and len(cells[0]) != len(names):
         rule = f"{len(names)} a line ({names[0]} ... {names[-1]})"
-        raise CaptureError(
-            complain(where, "columns", rule, len(cells[0]), "Is the layout right, and the number of chips?")
-        )
+        raise CaptureError(where, "columns", rule, len(cells[0]), "Is the layout right, and the number of chips?")
     if not cells:
-        raise CaptureError(
-            complain(where, "the file", "at least one row of numbers", "none", "Copy the recording again.")
-        )
+        raise CaptureError(where, "the file", "at least one row of numbers", "none", "Copy the recording again.")
     try:
         numbers = np.array(cells, dtype=np.float64)
     except ValueError:
-        raise CaptureError(_first_fault(cells, where, names, first_line_n)) from None
+        raise _first_fault(cells, where, names, first_line_n) from None
     if not (np.abs(numbers) < MAGNITUDE_MAX).all():
-        raise CaptureError(_first_fault(cells, where, names, first_line_n))
+        raise _first_fault(cells, where, names, first_line_n)
     return numbers
 
 
@@ -56,25 +50,23 @@ def _read_text(path: Path, where: str) -> str:
         text = path.read_bytes().decode("utf-8")
     except UnicodeDecodeError as error:
         got = f"byte {error.object[error.start]:#04x} at {error.start}"
-        raise CaptureError(complain(where, "the file", "text", got, "Is it another file under this name?")) from None
+        raise CaptureError(where, "the file", "text", got, "Is it another file under this name?") from None
     except OSError as error:
-        raise CaptureError(
-            complain(where, "the file", "readable", error.strerror, "Copy the recording again.")
-        ) from None
+        raise CaptureError(where, "the file", "readable", error.strerror, "Copy the recording again.") from None
     if not text.endswith("\n"):
         got = "no bytes" if not text else f"{text[-12:]!r}"
         remedy = "Copy the recording again; if it is whole, end it with an empty line."
-        raise CaptureError(complain(where, "the last line", "complete and end in a line feed", got, remedy))
+        raise CaptureError(where, "the last line", "complete and end in a line feed", got, remedy)
     return text
 
 
-def _first_fault(cells: list[list[str]], where: str, names: Sequence[str], first_line_n: int) -> str:
+def _first_fault(cells: list[list[str]], where: str, names: Sequence[str], first_line_n: int) -> CaptureError:
     for row_i, row in enumerate(cells):
         for name, cell in zip(names, row, strict=True):
             if not _is_number(cell):
                 place = f"{name} in line {first_line_n + row_i}"
                 rule = f"a finite number below {MAGNITUDE_MAX:g}"
-                return complain(where, place, rule, repr(cell[:20]), "Mend or remove this row, then add it again.")
+                return CaptureError(where, place, rule, repr(cell[:20]), "Mend or remove this row, then add it again.")
     raise AssertionError("numbers refused, though every cell is one")
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.capture import faults
-from pipeline.core.errors import CaptureError, complain
+from pipeline.core.errors import CaptureError
 
 # MLX90393 data sheet, table 17: 16 bits of the coarsest step, 9.680 uT (z, GAIN_SEL 0, RES 3).
 FULL_SCALE_uT = 32768 * 9.680
@@ -35,16 +35,16 @@ def check_fields(b_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n: i
         place = f"line {first_line_n + int(b_max_uT.argmax())}"
         rule = f"below the full scale of {FULL_SCALE_uT:.0f} uT"
         got = f"{b_max_uT.max():.6g} in {place}"
-        raise CaptureError(complain(where, "field", rule, got, "Are the columns in order, and in uT?"))
+        raise CaptureError(where, "field", rule, got, "Are the columns in order, and in uT?")
     usual_uT = float(np.median(np.linalg.norm(b_uT.reshape(len(b_uT), -1, 3).astype(np.float64), axis=2)))
     if usual_uT < WEAKEST_uT:
         rule = f"{WEAKEST_uT:g} uT or more at most chips, as the earth's field is"
-        raise CaptureError(complain(where, "field", rule, f"{usual_uT:.4g}", "Convert mT or G to uT."))
+        raise CaptureError(where, "field", rule, f"{usual_uT:.4g}", "Convert mT or G to uT.")
     step_uT = _find_step(b_uT)
     if step_uT > NANO_STEP_MIN or (usual_uT < GAUSS_MAX and step_uT < faults.STEP_MIN_uT):
         unit = "nT" if step_uT > NANO_STEP_MIN else "G"
         rule = "in the steps of an MLX90393, 0.15 to 9.68 uT"
-        raise CaptureError(complain(where, "field", rule, f"steps of {step_uT:.3g}", f"Convert {unit} to uT."))
+        raise CaptureError(where, "field", rule, f"steps of {step_uT:.3g}", f"Convert {unit} to uT.")
 
 
 def check_forces(force_N: Float[np.ndarray, " f"], where: str, *, first_line_n: int) -> None:
@@ -52,7 +52,7 @@ def check_forces(force_N: Float[np.ndarray, " f"], where: str, *, first_line_n: 
     too_strong = np.flatnonzero(np.abs(force_N) > FORCE_MAX_N)
     if len(too_strong):
         got = f"{force_N[too_strong[0]]:.6g} in line {first_line_n + int(too_strong[0])}"
-        raise CaptureError(complain(where, "force", f"below {FORCE_MAX_N:g} N", got, "Convert grams or mN to N."))
+        raise CaptureError(where, "force", f"below {FORCE_MAX_N:g} N", got, "Convert grams or mN to N.")
 
 
 def check_touch(force_N: Float[np.ndarray, "*f"], where: str) -> None:
@@ -61,7 +61,7 @@ def check_touch(force_N: Float[np.ndarray, "*f"], where: str) -> None:
     if 0 < strongest_N < FORCE_MIN_N:
         got = f"{strongest_N:.3g} at most"
         rule = f"{FORCE_MIN_N:g} N or more somewhere in contact"
-        raise CaptureError(complain(where, "force", rule, got, "Convert kg or kN to N, or press the skin."))
+        raise CaptureError(where, "force", rule, got, "Convert kg or kN to N, or press the skin.")
 
 
 def check_places(place_mm: Float[np.ndarray, "f axes"], where: str) -> None:
@@ -70,7 +70,7 @@ def check_places(place_mm: Float[np.ndarray, "f axes"], where: str) -> None:
     extent_mm = float(np.ptp(known_mm, axis=0).max()) if len(known_mm) else 0.0
     if extent_mm > SAME_PLACE_mm and not EXTENT_MIN_mm <= extent_mm <= EXTENT_MAX_mm:
         rule = f"one, or spread over {EXTENT_MIN_mm:g} to {EXTENT_MAX_mm:g} mm"
-        raise CaptureError(complain(where, "places", rule, f"{extent_mm:.4g}", "Convert m or um to mm."))
+        raise CaptureError(where, "places", rule, f"{extent_mm:.4g}", "Convert m or um to mm.")
 
 
 def check_depths(depth_mm: Float[np.ndarray, " f"], where: str) -> None:
@@ -78,7 +78,7 @@ def check_depths(depth_mm: Float[np.ndarray, " f"], where: str) -> None:
     deepest_mm = np.abs(depth_mm[np.isfinite(depth_mm)]).max(initial=0.0)
     if deepest_mm and not DEPTH_MIN_mm <= deepest_mm <= DEPTH_MAX_mm:
         rule = f"{DEPTH_MIN_mm:g} to {DEPTH_MAX_mm:g} mm where it is greatest"
-        raise CaptureError(complain(where, "depth", rule, f"{deepest_mm:.4g}", "Convert m or um to mm."))
+        raise CaptureError(where, "depth", rule, f"{deepest_mm:.4g}", "Convert m or um to mm.")
 
 
 def _find_step(b_uT: Float[np.ndarray, "f ch"]) -> float:

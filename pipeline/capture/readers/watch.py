@@ -15,7 +15,7 @@ from pipeline.capture.header import Header
 from pipeline.capture.probe import FIRST_ROW, ProbeLog
 from pipeline.capture.readers.units import check_depths, check_fields, check_forces, check_places, check_touch
 from pipeline.capture.wire import Frames
-from pipeline.core.errors import CaptureError, complain
+from pipeline.core.errors import CaptureError
 
 SCALE_FRAMES_N = 400  # real recordings show each sound chip's grid in so many frames; in 200 it may hide
 ORDER_OF_OTHER: Mapping[str | None, tuple[str, int]] = {
@@ -37,7 +37,7 @@ def check_log(log: ProbeLog, where: str) -> None:
     known_N = log.Fz_N[contact & np.isfinite(log.Fz_N)]
     if len(known_N) and np.median(known_N) < 0:
         got = f"{np.median(known_N):.4g} N"
-        raise CaptureError(complain(where, "the usual Fz_N in contact", "positive", got, "Turn its sign."))
+        raise CaptureError(where, "the usual Fz_N in contact", "positive", got, "Turn its sign.")
 
 
 class Watch:
@@ -74,9 +74,7 @@ class Watch:
                 low, high = np.percentile(frames.temperature_degC, [5, 95])
                 rule = f"{TEMPERATURE_MIN_degC:g} to {TEMPERATURE_MAX_degC:g} degC, and alike on all chips"
                 remedy = f"Is the wire format {other}?"
-                raise CaptureError(
-                    complain(self._where, f"temperatures of {wire}", rule, f"{low:.4g} to {high:.4g}", remedy)
-                )
+                raise CaptureError(self._where, f"temperatures of {wire}", rule, f"{low:.4g} to {high:.4g}", remedy)
         check_fields(frames.b_uT, self._where, first_line_n=1)
 
     def _check_scales(self, b_uT: Float32[np.ndarray, "f ch"]) -> None:
@@ -102,7 +100,7 @@ class Watch:
             got = "{:.3g} uT in x, y and {:.3g} uT in z".format(*lsb_uT[strange[0]])
             where = f"{self._where} from sound frame {self._checked_n + 1}"
             remedy = "A chip lost its settings: reset the board, record again."
-            raise CaptureError(complain(where, names, rule, got, remedy))
+            raise CaptureError(where, names, rule, got, remedy)
         self._lsb_uT = np.where(np.isnan(self._lsb_uT), lsb_uT, self._lsb_uT)
 
 

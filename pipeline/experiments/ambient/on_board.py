@@ -24,7 +24,7 @@ from pipeline.learning.card import went
 from pipeline.learning.recipe import HEADLINE, Training
 from pipeline.physics.skin import draw_skin
 from pipeline.synthesis.capture import Synthesis
-from pipeline.trials.data import SceneData, cells_of, train_all
+from pipeline.trials.data import SceneData, train_all, trials_of
 from pipeline.trials.networks import Network
 
 AS_IT_IS, ASIDE, OWN = "as it is", "reference chip subtracted", "own chips' common part subtracted"
@@ -37,11 +37,11 @@ def networks_of_common_part(
     """Train the headline recipe anew on inputs whose common part is taken off, as in use; count what collapsed."""
     without = project(data.rows.db_uT, without_common_part(own.turn))
     headline = training.model_copy(update={"recipes": {HEADLINE: training.recipes[HEADLINE]}})
-    cells = cells_of(data, headline, [fold], question="ambient")
-    trained = train_all(replace(data, rows=replace(data.rows, db_uT=without)), cells, "ambient")
+    trials = trials_of(data, headline, [fold], question="ambient")
+    trained = train_all(replace(data, rows=replace(data.rows, db_uT=without)), trials, "ambient")
     networks = [
-        Network({"recipe": cell.recipe.model_dump(mode="json")}, {**one.weights, **one.scaler.arrays()})
-        for cell, one in zip(cells, trained, strict=True)
+        Network({"recipe": trial.recipe.model_dump(mode="json")}, {**one.weights, **one.scaler.arrays()})
+        for trial, one in zip(trials, trained, strict=True)
     ]
     return networks, tally(map(went, trained))
 

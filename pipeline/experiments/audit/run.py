@@ -4,7 +4,7 @@ from pathlib import Path
 
 from pipeline.core import io
 from pipeline.core.config import Files, Settings, read_settings
-from pipeline.core.errors import LeakError, complain
+from pipeline.core.errors import LeakError
 from pipeline.core.seeds import rng_for
 from pipeline.core.stage import run, say
 from pipeline.experiments.audit.checks import holds, to_words
@@ -38,9 +38,7 @@ def audit(scene: str, files: Files, indentations: Path, folds: Path, models: Pat
     if not holds(checks):
         first = next(check for check in checks if not (check.holds or check.known))
         raise LeakError(
-            complain(
-                f"audit of {scene}, {first.where}", first.what, first.rule, first.found, "Look at who is held out."
-            )
+            f"audit of {scene}, {first.where}", first.what, first.rule, first.found, "Look at who is held out."
         )
     io.write_json(answer, to_words(checks))
     unchosen_n = sum(check.found.startswith(NOT_CHOSEN) for check in checks)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.core.config import Strict, parse
-from pipeline.core.errors import SchemaError, complain
+from pipeline.core.errors import SchemaError
 from pipeline.experiments.audit.checks import Check
 from pipeline.experiments.audit.sides import Sides
 
@@ -102,7 +102,7 @@ def _gap(where: str, arrays: Arrays, fitted: Arrays) -> float:
     for name, value in fitted.items():
         if name not in arrays or arrays[name].shape != value.shape:
             raise SchemaError(
-                complain(where, f"scaler array {name}", f"there, of shape {value.shape}", "none", "Train it again.")
+                where, f"scaler array {name}", f"there, of shape {value.shape}", "none", "Train it again."
             )
         size = np.where(value == 0, 1.0, np.abs(value))
         gaps.append(np.max(np.abs(arrays[name].astype(np.float64) - value) / size))

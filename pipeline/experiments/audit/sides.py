@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 from pipeline.experiments.audit.checks import Check
 from pipeline.experiments.audit.copies import COPIED_SHARE_MAX, liken, strong_indentations
 
@@ -79,14 +79,12 @@ def _check_question(sides: Sides) -> None:
     known = (*SKINS_UNSEEN, *SKIN_SHARED, PAPERS_WAY)
     if sides.question not in known:
         raise ParamsError(
-            complain(
                 f"fold {sides.where}", "the question", f"one of {', '.join(known)}", sides.question,
                 "Say in the audit what its two sides may share.",
-            )
-        )  # fmt: skip
+            )  # fmt: skip
     if not (len(sides.train) and len(sides.test)):
         got = f"{len(sides.train)} to train on, {len(sides.test)} to test on"
-        raise ParamsError(complain(f"fold {sides.where}", "rows", "on both sides", got, "Split again."))
+        raise ParamsError(f"fold {sides.where}", "rows", "on both sides", got, "Split again.")
 
 
 def _readings(sides: Sides) -> Check:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32, Int64
 
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 from pipeline.dataset.rows import Rows
 from pipeline.evaluation import inference
 from pipeline.evaluation.metrics import ACCURACY_LIMIT_MM
@@ -40,9 +40,7 @@ def draw_pairs(
     sides = [(rows_at[i], rows_at[j]) for rows_at, pairs in found for i, j in pairs]
     if not sides:
         rule = f"such that two of one skin lie {separation_mm:g} mm apart, within {TOLERANCE_MM:g} mm"
-        raise ParamsError(
-            complain("contacts", "held-out places", rule, "none", "Mend contacts.separations_mm of the scene.")
-        )
+        raise ParamsError("contacts", "held-out places", rule, "none", "Mend contacts.separations_mm of the scene.")
     drawn = [sides[k] for k in rng.integers(len(sides), size=pairs_n)]
     one, other = (np.array([rng.choice(side) for side in both]) for both in zip(*drawn, strict=True))
     force_N, length_uT = rows.target[:, 2], np.linalg.norm(rows.db_uT, axis=1)
@@ -75,7 +73,7 @@ def keep_aside(rows: Rows, train: Int64[np.ndarray, " a"]) -> tuple[np.ndarray, 
             last = labels[train] == kinds[-1]
             return train[~last], train[last], what
     raise ParamsError(
-        complain("contacts", "training rows", "of two boards, skins or passes", "one", "Record more, or do not ask.")
+        "contacts", "training rows", "of two boards, skins or passes", "one", "Record more, or do not ask."
     )
 
 

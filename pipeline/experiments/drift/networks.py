@@ -1,4 +1,4 @@
-"""What stage drift trains: parts of captures -> cells, and their answers window by window. Knows no argv."""
+"""What stage drift trains: parts of captures -> trials, and their answers window by window. Knows no argv."""
 
 from collections.abc import Iterator, Sequence
 from functools import partial
@@ -13,7 +13,7 @@ from pipeline.dataset.rows import Selection
 from pipeline.dataset.windows import Windows, check_one_each, lay_windows
 from pipeline.experiments.drift.settings import Drift
 from pipeline.experiments.drift.windows import Answers, force_left
-from pipeline.learning.cell import Cell, Trained
+from pipeline.learning.trial import Trained, Trial
 
 UNIT = {"indentation": "indentation", "pass": "pass_i"}
 
@@ -32,23 +32,23 @@ def cut(captures: Sequence[Readings], asked: Drift, selection: Selection) -> tup
     return windows, laid
 
 
-def cells(parts: Sequence[Part], asked: Drift, seed: int) -> Iterator[tuple[Cell, list[Part]]]:
-    """Make a cell of every recipe, skin, policy and seed, beside its test windows."""
+def trials(parts: Sequence[Part], asked: Drift, seed: int) -> Iterator[tuple[Trial, list[Part]]]:
+    """Make a trial of every recipe, skin, policy and seed, beside its test windows."""
     starts = [i for i, part in enumerate(parts) if part.window_i == TRAIN]
     for start, end in pairwise([*starts, len(parts)]):
         train, tests = parts[start], list(parts[start + 1 : end])
         fold, test = f"{train.readings.skin}-{train.policy}", np.concatenate([part.row_i for part in tests])
         for name, recipe in asked.training.recipes.items():
             for seed_i in range(asked.training.seeds_n):
-                yield Cell("drift", name, recipe, fold, seed, seed_i, train.row_i, test), tests
+                yield Trial("drift", name, recipe, fold, seed, seed_i, train.row_i, test), tests
 
 
-def answers(cell: Cell, trained: Trained, tests: Sequence[Part]) -> Iterator[Answers]:
+def answers(trial: Trial, trained: Trained, tests: Sequence[Part]) -> Iterator[Answers]:
     """Cut a network's answers into its windows."""
     cuts = np.cumsum([len(part.rows) for part in tests])[:-1]
     for part, predicted in zip(tests, np.split(trained.predicted, cuts), strict=True):
         yield Answers(
-            part.policy, part.readings.board, part.readings.skin, cell.seed_i, part.window_i,
+            part.policy, part.readings.board, part.readings.skin, trial.seed_i, part.window_i,
             int(part.readings.n_contacts[0]), part.noload_off_uT, part.rows.indentation, part.rows.target, predicted,
         )  # fmt: skip
 

@@ -40,12 +40,12 @@ def drift(scene: str, files: Files, indentations: Path, answer: Path) -> None:
     section, selection = read(settings), settings.section(Selection, "selection")
     captures = read_folder(indentations, tuple(settings.captures_in(indentations)))
     windows, parts = work.cut(captures, section, selection)
-    pairs = list(work.cells(parts, section, settings.seed))
+    pairs = list(work.trials(parts, section, settings.seed))
     data = SceneData(scene, settings, stack(parts), [])
     said: dict[str, list[Answers]] = {}
-    trained = train_all(data, [cell for cell, _ in pairs], "drift")
-    for (cell, tests), one in zip(pairs, trained, strict=True):
-        said.setdefault(cell.recipe_name, []).extend(work.answers(cell, one, tests))
+    trained = train_all(data, [trial for trial, _ in pairs], "drift")
+    for (trial, tests), one in zip(pairs, trained, strict=True):
+        said.setdefault(trial.recipe_name, []).extend(work.answers(trial, one, tests))
     rows: dict[str, dict[str, Any]] = {
         name: {policy: over_windows(own, policy) for policy in section.policies} for name, own in said.items()
     }

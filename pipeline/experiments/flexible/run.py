@@ -40,10 +40,10 @@ def flexible(
         data.rows, "flexible", first.name, sides, parse_parts(Split, data.settings.words("split"), "split")
     )
     arms = {name: arm for name, arm in ((HEADLINE, AFTER), (CONTROL, CONTROL), (SHAPE, SHAPE)) if name in asked.recipes}
-    cells = [
-        (arm, cell)
+    trials = [
+        (arm, trial)
         for name, arm in arms.items()
-        for cell in adaptations(
+        for trial in adaptations(
             data, fold, (name, asked.recipes[name]), starts, question="flexible", pokes_n=asked.pokes_n
         )
     ]
@@ -52,7 +52,7 @@ def flexible(
         name: [one for skin in skins for one in answers_before(data, fold, asked.recipes[name], starts, skin)]
         for name in arms if name != CONTROL
     }  # fmt: skip
-    after, trainings = answers_after(data, cells, "flexible")
+    after, trainings = answers_after(data, trials, "flexible")
     own = before[HEADLINE] + [one for one in after if one.arm != SHAPE]
     numbers: dict[str, Any] = {
         "skins_n": len(skins), "boards_n": len(np.unique(data.rows.board[fold.test])),

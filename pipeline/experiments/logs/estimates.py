@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64
 
-from pipeline.core.errors import CaptureError, complain
+from pipeline.core.errors import CaptureError
 from pipeline.evaluation.metrics import score
 
 WINDOW_S = 0.1  # assumed: windows whose means are compared with the start's
@@ -77,7 +77,7 @@ def quiet_start(t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"
     if quiet_n * step_s(t_s) < QUIET_MIN_S:
         got = f"{quiet_n * step_s(t_s):.2g} s"
         remedy = "Log the skin untouched for a second first."
-        raise CaptureError(complain(where, "the start without contact", f"{QUIET_MIN_S:g} s or more", got, remedy))
+        raise CaptureError(where, "the start without contact", f"{QUIET_MIN_S:g} s or more", got, remedy)
     return quiet_n
 
 

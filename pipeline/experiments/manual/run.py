@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.core.config import Files, read_settings
-from pipeline.core.errors import SchemaError, complain
+from pipeline.core.errors import SchemaError
 from pipeline.core.stage import run
 from pipeline.dataset.lines import Lines
 from pipeline.dataset.splits import Fold
 from pipeline.dataset.stacked import hand_rows, shifted, stack
 from pipeline.experiments.answer import read_folder, read_losses, write_answer
 from pipeline.experiments.manual.parts import GRID, answer_manual
-from pipeline.learning.cell import Cell
 from pipeline.learning.recipe import HEADLINE, Adaptations
 from pipeline.learning.recipe import adaptations as adaptations_of
+from pipeline.learning.trial import Trial
 from pipeline.trials.adapting import Pokes, Starts, adaptation, own_starts, pool_lines, read_starts
 from pipeline.trials.answers import answers_after, answers_before
 from pipeline.trials.arms import AFTER, CONTROL, Answered
@@ -31,21 +31,21 @@ def manual(scene: str, files: Files, folds: Path, main: Path, indentations: Path
     poked, found = hand_rows(read_folder(indentations))
     lines = {skin: shifted(own, len(data.rows)) for skin, own in found.items()}
     data = replace(data, rows=stack(data.rows, poked))
-    cells: list[tuple[str, Cell]] = []
+    trials: list[tuple[str, Trial]] = []
     answers: list[Answered] = []
     for skin, own in lines.items():
         fold = _fold_without(data, str(poked.board[poked.skin == skin][0]))
         answers += answers_before(data, fold, asked.recipes[HEADLINE], starts, skin)
-        cells += _cells(data, fold, asked, starts, (skin, own))
-    after, trainings = answers_after(data, cells, "manual")
+        trials += _trials(data, fold, asked, starts, (skin, own))
+    after, trainings = answers_after(data, trials, "manual")
     pokes_n, lines_n = zip(*((_pokes_n(data, own), len(np.unique(own.line_i))) for own in lines.values()), strict=True)
     numbers = answer_manual([*answers, *after], pokes_n=pokes_n, lines_n=lines_n)
     write_answer(answer, numbers, {}, read_losses(indentations, poked.dropped), trainings)
 
 
-def _cells(
+def _trials(
     data: SceneData, fold: Fold, asked: Adaptations, starts: Starts, poked: tuple[str, Lines]
-) -> Iterator[tuple[str, Cell]]:
+) -> Iterator[tuple[str, Trial]]:
     """Make the arms of one skin: by hand, by the robot, and as long without pokes if there is such a recipe."""
     (skin, by_hand), headline = poked, (HEADLINE, asked.recipes[HEADLINE])
     for seed_i in own_starts(starts, headline[1].base, fold):
@@ -65,7 +65,7 @@ def _fold_without(data: SceneData, board: str) -> Fold:
     folds = {fold.name: fold for fold in data.folds_of("lobo")}
     if board not in folds:
         remedy = "Poke skins by hand that the grid knows too."
-        raise SchemaError(complain("question manual", f"board {board}", f"one of {sorted(folds)}", "none", remedy))
+        raise SchemaError("question manual", f"board {board}", f"one of {sorted(folds)}", "none", remedy)
     return folds[board]
 
 

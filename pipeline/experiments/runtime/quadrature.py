@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 from pipeline.experiments.runtime.lattices import gauss_everywhere, written
 from pipeline.experiments.runtime.methods import METHODS, Prepared, whole
 from pipeline.experiments.runtime.rows import REFERENCE, Contestant, Precision
@@ -46,7 +46,7 @@ def study_quadratures(
     """
     if not trials or (unknown := set(rules) - set(METHODS)):
         got = unknown if trials else "no trial"
-        raise ParamsError(complain(STUDY, "methods", f"among {list(METHODS)}", got, "Mend the rules."))
+        raise ParamsError(STUDY, "methods", f"among {list(METHODS)}", got, "Mend the rules.")
     truths_T = [_reference(trial, reference.finer, reference.per_cell_n).call() for trial in trials]
     coarser = [_reference(trial, reference.coarser, reference.per_cell_n) for trial in trials]
     found_T = [one.call() for one in coarser]

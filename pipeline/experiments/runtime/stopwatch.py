@@ -8,7 +8,7 @@ from time import perf_counter
 
 import numpy as np
 
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 from pipeline.experiments.runtime.rows import Contestant, Seconds
 
 
@@ -18,7 +18,7 @@ def race(contestants: Sequence[Contestant], repeats_n: int) -> list[Seconds]:
     Each has run before, when its error was found: compilation and caches are not part of an indentation.
     """
     if repeats_n < 1:
-        raise ParamsError(complain("stopwatch", "repeats_n", "1 or more", repeats_n, "Repeat."))
+        raise ParamsError("stopwatch", "repeats_n", "1 or more", repeats_n, "Repeat.")
     times_s = np.empty((repeats_n, len(contestants)))
     for round_i in range(repeats_n):
         # Every other round runs backwards, so that nobody always inherits the caches of the same neighbour.

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.constants import milli
 
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 from pipeline.physics import magnet
 from pipeline.physics.board import Board, Spreads
 from pipeline.physics.nodes import Nodes, Quadrature
@@ -47,7 +47,7 @@ def draw_trial(board: Board, design: SkinDesign, *, spreads: Spreads, seed: int,
     pokes_m[:, :2] += skin.seat_m
     if not (pokes_m[:, 2] + skin.depth_zero_m > 0).all():
         got = f"{pokes_m[:, 2].min() + skin.depth_zero_m:.3g} m"
-        raise ParamsError(complain(f"skin {name}", "true depth of every poke", "above 0 m", got, "Poke deeper."))
+        raise ParamsError(f"skin {name}", "true depth of every poke", "above 0 m", got, "Poke deeper.")
     return Trial(board, design, skin, pokes.depths_mm, pokes_m)
 
 

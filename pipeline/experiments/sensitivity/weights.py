@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, Int32
 from scipy.stats import norm, rankdata
 
-from pipeline.core.errors import SchemaError, complain
+from pipeline.core.errors import SchemaError
 
 TOLD_SHARE = 0.95  # of pairs ordered rightly: told apart
 WATER_N_PER_ML = 9.81e-3  # 1 g at 9.81 m/s^2
@@ -32,7 +32,7 @@ def levels_of(
     if len(stops) != fillings_n * levels_n or len(lengths) != 1:
         got = f"{len(stops)} stops of {sorted(lengths)} readings in {fillings_n} fillings"
         rule = f"{levels_n} a filling, all of as many readings"
-        raise SchemaError(complain(where, "stops", rule, got, "Simulate and ingest it again."))
+        raise SchemaError(where, "stops", rule, got, "Simulate and ingest it again.")
     return db_uT[np.stack(stops)].reshape(fillings_n, levels_n, lengths.pop(), -1)
 
 

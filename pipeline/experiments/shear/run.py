@@ -16,7 +16,7 @@ from pipeline.experiments.shear.scores import answer_shear, score5
 from pipeline.experiments.shear.settings import Shear
 from pipeline.learning.card import went
 from pipeline.learning.recipe import with_training
-from pipeline.trials.data import SceneData, cells_of, train_all
+from pipeline.trials.data import SceneData, train_all, trials_of
 from pipeline.trials.models import note_seconds
 
 DRAWN_N = 400  # more points than these are not told apart in a panel
@@ -36,20 +36,20 @@ def shear(scene: str, files: Files, indentations: Path, answer: Path) -> None:
     by_reading = _folds(rows, np.arange(len(rows)), "reading", section, settings.seed)
     by_line = _folds(rows, rows.indentation, "line", section, settings.seed)
     data = SceneData(scene, settings, rows, [*by_reading, *by_line])
-    cells = cells_of(data, section.training, data.folds)
-    trained = train_all(data, cells, "shear")
-    note_seconds(scene, "shear", cells, trained)
+    trials = trials_of(data, section.training, data.folds)
+    trained = train_all(data, trials, "shear")
+    note_seconds(scene, "shear", trials, trained)
     scores = [
-        (one.fold, score5(rows.target[one.test], done.predicted)) for one, done in zip(cells, trained, strict=True)
+        (one.fold, score5(rows.target[one.test], done.predicted)) for one, done in zip(trials, trained, strict=True)
     ]
     names = {fold.name for fold in by_line}
     numbers = answer_shear(
         [one for one in scores if one[0] not in names], [one for one in scores if one[0] in names],
         target=rows.target, lines_n=len(np.unique(rows.indentation)), passes_n=len(np.unique(rows.pass_i)),
     )  # fmt: skip
-    first_i = next(i for i, cell in enumerate(cells) if cell.fold in names)
-    shown = rng_for(settings.seed, "shear", "drawn").permutation(len(cells[first_i].test))[:DRAWN_N]
-    true, predicted = rows.target[cells[first_i].test], trained[first_i].predicted
+    first_i = next(i for i, trial in enumerate(trials) if trial.fold in names)
+    shown = rng_for(settings.seed, "shear", "drawn").permutation(len(trials[first_i].test))[:DRAWN_N]
+    true, predicted = rows.target[trials[first_i].test], trained[first_i].predicted
     drawn = {"true": _forces(true[shown]), "predicted": _forces(predicted[shown])}
     write_answer(answer, numbers, drawn, read_losses(indentations, rows.dropped), tally(map(went, trained)))
 

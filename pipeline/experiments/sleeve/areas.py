@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int64, Shaped
 
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 from pipeline.core.schema import Readings
 from pipeline.dataset.rows import Rows
 from pipeline.evaluation.metrics import score
@@ -61,7 +61,7 @@ def hold_out_last(rows: Rows, test_fraction: float) -> tuple[Int64[np.ndarray, "
         if not 0 < test_n < len(indentations):
             got = f"{test_n} of the {len(indentations)} of {capture}"
             rule = "one or more, and not all"
-            raise ParamsError(complain("question sleeve", "indentations held out", rule, got, "Poke more often."))
+            raise ParamsError("question sleeve", "indentations held out", rule, got, "Poke more often.")
         held |= own & (rows.indentation >= indentations[-test_n])
     return np.flatnonzero(~held), np.flatnonzero(held)
 
@@ -75,7 +75,7 @@ def rate_hz(captures: Sequence[Readings]) -> float:
         steps_s += float(np.diff(one.t_s)[same].sum())
     if not steps_s > 0:
         rule, remedy = "two or more an indentation, at known times", "Record more than one reading."
-        raise ParamsError(complain("question sleeve", "readings", rule, f"{steps_n} steps of time", remedy))
+        raise ParamsError("question sleeve", "readings", rule, f"{steps_n} steps of time", remedy)
     return steps_n / steps_s
 
 

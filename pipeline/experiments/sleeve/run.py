@@ -13,10 +13,10 @@ from pipeline.experiments.sleeve import areas as evaluation
 from pipeline.experiments.sleeve.settings import Sleeve
 from pipeline.learning.baselines import Task, run_tasks
 from pipeline.learning.card import went
-from pipeline.learning.cell import Cell, Measured
 from pipeline.learning.classical import Neighbours
 from pipeline.learning.executors import make_executor
 from pipeline.learning.recipe import HEADLINE, with_training
+from pipeline.learning.trial import Measured, Trial
 from pipeline.synthesis.of_settings import synthesis_of
 from pipeline.trials.data import SceneData, train_all
 from pipeline.trials.models import note_seconds
@@ -33,14 +33,14 @@ def sleeve(scene: str, files: Files, indentations: Path, answer: Path) -> None:
     section, captures, area = read(settings), read_folder(indentations), _area(settings)
     data = SceneData(scene, settings, gather(captures, settings.section(Selection, "selection")), [])
     train, test = evaluation.hold_out_last(data.rows, section.test_fraction)
-    cells = [
-        Cell("sleeve", name, recipe, "last", data.settings.seed, seed_i, train, test)
+    trials = [
+        Trial("sleeve", name, recipe, "last", data.settings.seed, seed_i, train, test)
         for name, recipe in section.training.recipes.items()
         for seed_i in range(section.training.seeds_n)
     ]
-    trained = train_all(data, cells, "sleeve")
-    note_seconds(scene, "sleeve", cells, trained)
-    answers = {name: [o.predicted for c, o in zip(cells, trained, strict=True) if c.recipe_name == name]
+    trained = train_all(data, trials, "sleeve")
+    note_seconds(scene, "sleeve", trials, trained)
+    answers = {name: [o.predicted for c, o in zip(trials, trained, strict=True) if c.recipe_name == name]
                for name in section.training.recipes}  # fmt: skip
     answers |= _neighbours(data, section, train, test)
     true, indentation = data.rows.target[test], data.rows.indentation[test]

@@ -15,10 +15,10 @@ from pipeline.dataset.rows import Rows
 from pipeline.dataset.splits import Split, draw_folds
 from pipeline.evaluation.metrics import METRICS, score
 from pipeline.experiments.stability.cases import Case, measured, refused, told
-from pipeline.learning.cell import Cell, FewLabels, Measured, Start, Trained
 from pipeline.learning.recipe import Labelling, Recipe
 from pipeline.learning.stack import train_stack
 from pipeline.learning.train import BLOCK_STEPS_N
+from pipeline.learning.trial import FewLabels, Measured, Start, Trained, Trial
 
 AREA = "learning"
 ROWS_N, TRAIN_N, CHANNELS_N = 240, 160, 15
@@ -42,28 +42,28 @@ def learning_cases(seed: int) -> list[Case]:
 
 def scaling_cases(seed: int) -> list[Case]:
     """Try channels that never move, and labels of other scales."""
-    cell, rows = _cell(seed), _rows(seed)
+    trial, rows = _trial(seed), _rows(seed)
     return [
-        _constant(cell, rows, [7], "a channel that never moves"),
-        _constant(cell, rows, list(range(CHANNELS_N)), "no channel ever moves, as without a magnet"),
-        *_label_scales(cell, rows),
+        _constant(trial, rows, [7], "a channel that never moves"),
+        _constant(trial, rows, list(range(CHANNELS_N)), "no channel ever moves, as without a magnet"),
+        *_label_scales(trial, rows),
     ]
 
 
 def triplet_cases(seed: int) -> list[Case]:
     """Try readings that are all alike, and places that are all equally far."""
-    cell, rows = _cell(seed), _rows(seed)
-    return [_alike(cell, rows), *_tied(cell, rows)]
+    trial, rows = _trial(seed), _rows(seed)
+    return [_alike(trial, rows), *_tied(trial, rows)]
 
 
 def loop_cases(seed: int) -> list[Case]:
     """Try rates and weights that overflow, hardly any rows, and the same seed twice."""
-    cell, rows = _cell(seed), _rows(seed)
+    trial, rows = _trial(seed), _rows(seed)
     return [
-        *(_explodes(cell, rows, rate) for rate in (1e1, 1e10)),
-        _beside_one_that_overflows(cell, rows),
-        *_few(cell, rows),
-        _again(cell, rows),
+        *(_explodes(trial, rows, rate) for rate in (1e1, 1e10)),
+        _beside_one_that_overflows(trial, rows),
+        *_few(trial, rows),
+        _again(trial, rows),
     ]
 
 
@@ -83,8 +83,8 @@ def fold_cases() -> list[Case]:
     ]  # fmt: skip
 
 
-def _cell(seed: int) -> Cell:
-    return Cell("stability", "paper", RECIPE, "f", seed, 0, np.arange(TRAIN_N), np.arange(TRAIN_N, ROWS_N))
+def _trial(seed: int) -> Trial:
+    return Trial("stability", "paper", RECIPE, "f", seed, 0, np.arange(TRAIN_N), np.arange(TRAIN_N, ROWS_N))
 
 
 def _rows(seed: int) -> Measured:
@@ -93,10 +93,10 @@ def _rows(seed: int) -> Measured:
     return Measured((SIGNAL_uT * signal).astype(np.float32), target.astype(np.float32), np.arange(ROWS_N) % 2)
 
 
-def _constant(cell: Cell, rows: Measured, channels: list[int], case: str) -> Case:
+def _constant(trial: Trial, rows: Measured, channels: list[int], case: str) -> Case:
     db_uT = rows.db_uT.copy()
     db_uT[:, channels] = CONSTANT_uT
-    trained = _train(cell, replace(rows, db_uT=db_uT))
+    trained = _train(trial, replace(rows, db_uT=db_uT))
     seen = float(np.abs(trained.scaler.encode(db_uT)[:, channels]).max())
     scale_uT = trained.scaler.input_scale[channels].min()
     happened = f"its scale {scale_uT:.0e} uT, at most {seen:g} seen; {_words(trained)}"
@@ -104,9 +104,9 @@ def _constant(cell: Cell, rows: Measured, channels: list[int], case: str) -> Cas
                     error=seen if _is_sound(trained) else np.inf, limit=0.0)  # fmt: skip
 
 
-def _alike(cell: Cell, rows: Measured) -> Case:
+def _alike(trial: Trial, rows: Measured) -> Case:
     same = replace(rows, db_uT=np.full_like(rows.db_uT, CONSTANT_uT))
-    plain, pulled = (_train(_changed(cell, triplet_weight=weight), same) for weight in (0.0, 1e3))
+    plain, pulled = (_train(_changed(trial, triplet_weight=weight), same) for weight in (0.0, 1e3))
     apart = _apart(plain.weights, pulled.weights)
     happened = f"weights {apart:g} apart from those without triplets after {STEPS_N} steps; {_words(pulled)}"
     should = "loss 0 and a finite gradient of 0: whatever its weight, it pulls nowhere"
@@ -114,21 +114,21 @@ def _alike(cell: Cell, rows: Measured) -> Case:
                     error=apart if _is_sound(pulled) else np.inf, limit=0.0)  # fmt: skip
 
 
-def _tied(cell: Cell, rows: Measured) -> list[Case]:
-    cell = _changed(cell, triplet_weight=0.1)
+def _tied(trial: Trial, rows: Measured) -> list[Case]:
+    trial = _changed(trial, triplet_weight=0.1)
     target = rows.target.copy()
     target[:, :2] = MIDDLE[:2]
     attempts = {
-        "all pokes of a skin on one place": (cell, replace(rows, target=target)),
-        "two pokes a skin: from each, only the other one": (replace(cell, train=np.arange(4)), rows),
+        "all pokes of a skin on one place": (trial, replace(rows, target=target)),
+        "two pokes a skin: from each, only the other one": (replace(trial, train=np.arange(4)), rows),
     }
     should = "refused: nothing is nearer than anything, and no sampler is endless"
     return [refused(AREA, case, should=should, attempt=partial(_train, *at)) for case, at in attempts.items()]
 
 
-def _explodes(cell: Cell, rows: Measured, rate: float) -> Case:
-    start, steps_n = _start(cell, rows, 1e3), 3 * STEPS_N
-    trained = _train(_tuned(cell, start, steps_n=steps_n, rate_max=rate), rows)
+def _explodes(trial: Trial, rows: Measured, rate: float) -> Case:
+    start, steps_n = _start(trial, rows, 1e3), 3 * STEPS_N
+    trained = _train(_tuned(trial, start, steps_n=steps_n, rate_max=rate), rows)
     kept_step = STEPS_N * len(trained.curve)
     stopped = "never stopped" if trained.stopped_step is None else f"not finite at step {trained.stopped_step}"
     losses = f", losses {max(trained.curve):.1e} at most, {trained.curve[-1]:.2g} at last" if trained.curve else ""
@@ -139,8 +139,8 @@ def _explodes(cell: Cell, rows: Measured, rate: float) -> Case:
                 holds=sound and trained.stopped_step == kept_step + STEPS_N)  # fmt: skip
 
 
-def _beside_one_that_overflows(cell: Cell, rows: Measured) -> Case:
-    sound, broken = (_tuned(cell, _start(cell, rows, scale)) for scale in (1.0, 1e30))
+def _beside_one_that_overflows(trial: Trial, rows: Measured) -> Case:
+    sound, broken = (_tuned(trial, _start(trial, rows, scale)) for scale in (1.0, 1e30))
     alone = _train(sound, rows)
     one, other = train_stack([sound, broken], rows)
     apart = _apart(alone.weights, one.weights)
@@ -150,27 +150,27 @@ def _beside_one_that_overflows(cell: Cell, rows: Measured) -> Case:
                     error=apart if _is_sound(one) and other.stopped_step == STEPS_N else np.inf)  # fmt: skip
 
 
-def _few(cell: Cell, rows: Measured) -> list[Case]:
-    single = _train(replace(cell, train=cell.train[:1], test=cell.train[:1]), rows)
-    error = float(np.abs(single.predicted - rows.target[cell.train[:1]]).max())
-    by_one = _train(_changed(cell, batch_n=1), rows)
+def _few(trial: Trial, rows: Measured) -> list[Case]:
+    single = _train(replace(trial, train=trial.train[:1], test=trial.train[:1]), rows)
+    error = float(np.abs(single.predicted - rows.target[trial.train[:1]]).max())
+    by_one = _train(_changed(trial, batch_n=1), rows)
     return [
         told(AREA, "batches of one row", should="trained as ever", happened=_words(by_one), holds=_is_sound(by_one)),
         measured(AREA, "one training row", should="answers that row's place and force",
                  happened=f"off by {error:.1e} (mm, mm, N); {_words(single)}",
                  error=error if _is_sound(single) else np.inf, limit=ROUNDING),
         refused(AREA, "one training row, with triplets", should="refused: no triplet is in it",
-                attempt=partial(_train, _changed(replace(cell, train=cell.train[:1]), triplet_weight=0.1), rows)),
+                attempt=partial(_train, _changed(replace(trial, train=trial.train[:1]), triplet_weight=0.1), rows)),
     ]  # fmt: skip
 
 
-def _label_scales(cell: Cell, rows: Measured) -> list[Case]:
-    true = rows.target[cell.test]
-    as_ever = score(true, _train(cell, rows).predicted)
+def _label_scales(trial: Trial, rows: Measured) -> list[Case]:
+    true = rows.target[trial.test]
+    as_ever = score(true, _train(trial, rows).predicted)
     cases = []
     for power in SCALE_POWERS:
         scale = 2.0**power
-        trained = _train(cell, replace(rows, target=_times(rows.target, scale)))
+        trained = _train(trial, replace(rows, target=_times(rows.target, scale)))
         back = score(true, _times(trained.predicted, 1 / scale))
         error = max(abs(back[name] / as_ever[name] - 1) for name in METRICS)
         happened = ", ".join(f"{name} {back[name]:.4g}, was {as_ever[name]:.4g}" for name in METRICS)
@@ -179,40 +179,40 @@ def _label_scales(cell: Cell, rows: Measured) -> list[Case]:
     return cases
 
 
-def _again(cell: Cell, rows: Measured) -> Case:
-    cell = _changed(cell, triplet_weight=0.1)
+def _again(trial: Trial, rows: Measured) -> Case:
+    trial = _changed(trial, triplet_weight=0.1)
     one, other = (
-        {**trained.weights, "predicted": trained.predicted} for trained in (_train(cell, rows), _train(cell, rows))
+        {**trained.weights, "predicted": trained.predicted} for trained in (_train(trial, rows), _train(trial, rows))
     )
     same_n = sum(value.tobytes() == other[name].tobytes() for name, value in one.items())
-    third = _train(replace(cell, seed_i=1), rows).weights
+    third = _train(replace(trial, seed_i=1), rows).weights
     away = _apart(one, third)
     happened = f"{same_n} of {len(one)} arrays identical bit for bit; another seed's weights {away:.2g} away"
     return told(AREA, "trained twice from one seed", should="the same bytes, and others from another seed",
                 happened=happened, holds=same_n == len(one) and away > 0)  # fmt: skip
 
 
-def _train(cell: Cell, rows: Measured) -> Trained:
-    return train_stack([cell], rows)[0]
+def _train(trial: Trial, rows: Measured) -> Trained:
+    return train_stack([trial], rows)[0]
 
 
-def _changed(cell: Cell, **settings: float | int) -> Cell:
-    return replace(cell, recipe=RECIPE.model_copy(update=settings))
+def _changed(trial: Trial, **settings: float | int) -> Trial:
+    return replace(trial, recipe=RECIPE.model_copy(update=settings))
 
 
-def _start(cell: Cell, rows: Measured, scale: float) -> Start:
+def _start(trial: Trial, rows: Measured, scale: float) -> Start:
     """Train a network, and scale its bottleneck."""
-    trained = _train(cell, rows)
+    trained = _train(trial, rows)
     weights = {**trained.weights, BOTTLENECK: trained.weights[BOTTLENECK] * np.float32(scale)}
     return Start("", weights, trained.scaler)
 
 
-def _tuned(cell: Cell, start: Start, *, steps_n: int = STEPS_N, rate_max: float = RECIPE.rate_max) -> Cell:
+def _tuned(trial: Trial, start: Start, *, steps_n: int = STEPS_N, rate_max: float = RECIPE.rate_max) -> Trial:
     settings = Labelling(
         steps_n=steps_n, batch_n=RECIPE.batch_n, rate_max=rate_max, gradient_norm_max=RECIPE.gradient_norm_max,
         weight_decay=0.0, own_weight=1.0,
     )  # fmt: skip
-    return replace(cell, tuning=FewLabels(start, settings, cell.test[:20]))
+    return replace(trial, tuning=FewLabels(start, settings, trial.test[:20]))
 
 
 def _times(target: Float32[np.ndarray, "f 3"], scale: float) -> Float32[np.ndarray, "f 3"]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipeline.core.errors import ParamsError, complain
+from pipeline.core.errors import ParamsError
 from pipeline.core.schema import Readings
 from pipeline.dataset.baseline import rank, subtract
 from pipeline.experiments.drift.windows import rms
@@ -36,11 +36,9 @@ def find_visits(readings: Readings, place_mm: tuple[float, float], depth_mm: flo
     at = _at(readings, place_mm, depth_mm)
     if not at.any():
         raise ParamsError(
-            complain(
                 f"question variation, capture {readings.capture}", "variation.places_mm and depth_mm", "visited",
                 f"{place_mm[0]:g}, {place_mm[1]:g} mm at {depth_mm:g} mm, never", _visited(readings, place_mm),
-            )
-        )  # fmt: skip
+            )  # fmt: skip
     b_uT = readings.b_uT[at]
     visit_i, n_contacts = rank(readings.indentation[at]), readings.n_contacts[at]
     _, first_i, n = np.unique(visit_i, return_index=True, return_counts=True)
@@ -102,10 +100,8 @@ def first_of_each_board(boards: Mapping[str, str], skins_n: int) -> list[str]:
         ranked.append((order.setdefault(boards[skin], 0), boards[skin], skin))
         order[boards[skin]] += 1
     if skins_n > len(ranked):
-        raise ParamsError(
-            complain("question variation", "variation.skins_n", f"at most the {len(ranked)} skins of the main captures",
-                     skins_n, "Ask for fewer.")
-        )  # fmt: skip
+        rule = f"at most the {len(ranked)} skins of the main captures"
+        raise ParamsError("question variation", "variation.skins_n", rule, skins_n, "Ask for fewer.")
     return [skin for *_, skin in sorted(ranked)[:skins_n]]
 
 

@@ -32,7 +32,7 @@ from pipeline.learning.triplets import make_points
 COLLAPSED = 0.05  # of a target's variance over a network's own training rows; sound ones explain more than 0.9
 # The modules whose code decides what a training results in; recipes decide by their values.
 DECIDING = (
-    "architecture", "augment", "cell", "feed", "inputs", "job", "losses", "model", "stack", "standardise", "train",
+    "architecture", "augment", "trial", "feed", "inputs", "job", "losses", "model", "stack", "standardise", "train",
     "triplets",
 )  # fmt: skip
 
@@ -64,7 +64,7 @@ class Trained:
     seconds: float  # of its training, its part of the stack's
     one_reading_s: float  # median, to answer for a single reading
     reused: bool = False  # finished by an earlier run
-    collapsed_before_n: int = 0  # trainings of the same cell before this one, that collapsed
+    collapsed_before_n: int = 0  # trainings of the same trial before this one, that collapsed
 
     @property
     def collapsed(self) -> bool:
@@ -100,7 +100,7 @@ class FewLabels:
 
 
 @dataclass(frozen=True)
-class Cell:
+class Trial:
     """One training. `train` and `test` are row numbers; `skin` is the one adapted to, `what` tells its name apart."""
 
     question: str
@@ -138,27 +138,27 @@ class Cell:
         return Terms(self.recipe.triplet_weight)
 
 
-def make_job(cell: Cell, rows: Measured) -> tuple[Job, Scaler]:
-    """Scale what a cell learns from: by a scaler fitted on its training rows, or by that of the network it starts from.
+def make_job(trial: Trial, rows: Measured) -> tuple[Job, Scaler]:
+    """Scale what a trial learns from: by a scaler fitted on its training rows, or by that of its first network.
 
     Of a new skin's unlabelled pokes only the change of field and the order along lines is taken.
     """
-    view = VIEW[cell.recipe.inputs](rows.db_uT[cell.train])
-    target = rows.target[cell.train]
+    view = VIEW[trial.recipe.inputs](rows.db_uT[trial.train])
+    target = rows.target[trial.train]
     # Without the recipe in its name: recipes are compared from equal starts on equal batches.
-    again = ("again", cell.attempt_i) if cell.attempt_i else ()
-    rng = seeds.rng_for(cell.seed, "train", cell.fold, cell.skin, cell.seed_i, *again)
-    if cell.tuning is None:
-        scaler = FIT[cell.recipe.scaling](view, target)
-        layers = LAYERS[cell.recipe.architecture](view.shape[1], target.shape[1])
+    again = ("again", trial.attempt_i) if trial.attempt_i else ()
+    rng = seeds.rng_for(trial.seed, "train", trial.fold, trial.skin, trial.seed_i, *again)
+    if trial.tuning is None:
+        scaler = FIT[trial.recipe.scaling](view, target)
+        layers = LAYERS[trial.recipe.architecture](view.shape[1], target.shape[1])
         # A ReLU on the output (the released network) begins dead for some target in about every third network if its
         # bias is drawn too, and what is dead never learns.
         start: Weights = draw_weights(layers, rng) | {f"layer{len(layers)}.bias": _mean_answer(scaler, target)}
     else:
-        scaler, start = cell.tuning.start.scaler, cell.tuning.start.weights
-    labelled = _labelled(cell, rows, scaler)
-    unlabelled = _unlabelled(cell, rows, scaler) if cell.terms.unlabelled else None
-    own = _own(cell, rows, scaler) if cell.terms.own else None
+        scaler, start = trial.tuning.start.scaler, trial.tuning.start.weights
+    labelled = _labelled(trial, rows, scaler)
+    unlabelled = _unlabelled(trial, rows, scaler) if trial.terms.unlabelled else None
+    own = _own(trial, rows, scaler) if trial.terms.own else None
     return Job(start, rng, labelled, unlabelled, own), scaler
 
 
@@ -170,53 +170,53 @@ def _mean_answer(scaler: Scaler, target: np.ndarray) -> Float32[np.ndarray, " t"
     return mean
 
 
-def _labelled(cell: Cell, rows: Measured, scaler: Scaler) -> Labelled:
-    db_uT, target, skin = (values[cell.train] for values in (rows.db_uT, rows.target, rows.skin))
-    if isinstance(cell.recipe, AugmentedRecipe):
-        rng = seeds.rng_for(cell.seed, "augment", cell.fold, cell.seed_i)
-        copies_uT, copied = virtual_boards(db_uT, skin, cell.recipe.augmentation, rng)
+def _labelled(trial: Trial, rows: Measured, scaler: Scaler) -> Labelled:
+    db_uT, target, skin = (values[trial.train] for values in (rows.db_uT, rows.target, rows.skin))
+    if isinstance(trial.recipe, AugmentedRecipe):
+        rng = seeds.rng_for(trial.seed, "augment", trial.fold, trial.seed_i)
+        copies_uT, copied = virtual_boards(db_uT, skin, trial.recipe.augmentation, rng)
         own = np.unique(skin, return_inverse=True)[1]
         skin = np.concatenate([own, copied + own.max() + 1])
         db_uT = np.concatenate([db_uT, copies_uT])
-        target = np.tile(target, (1 + cell.recipe.augmentation.copies_n, 1))
-    points = make_points(target[:, :2], skin) if cell.recipe.triplet_weight else None
-    return Labelled(scaler.encode(VIEW[cell.recipe.inputs](db_uT)), scaler.encode_target(target), points)
+        target = np.tile(target, (1 + trial.recipe.augmentation.copies_n, 1))
+    points = make_points(target[:, :2], skin) if trial.recipe.triplet_weight else None
+    return Labelled(scaler.encode(VIEW[trial.recipe.inputs](db_uT)), scaler.encode_target(target), points)
 
 
-def _unlabelled(cell: Cell, rows: Measured, scaler: Scaler) -> Unlabelled:
-    assert isinstance(cell.tuning, Adapting)
-    lines = cell.tuning.lines
+def _unlabelled(trial: Trial, rows: Measured, scaler: Scaler) -> Unlabelled:
+    assert isinstance(trial.tuning, Adapting)
+    lines = trial.tuning.lines
     row, point_row = np.unique(lines.row, return_inverse=True)
-    view = VIEW[cell.recipe.inputs](rows.db_uT[row])
+    view = VIEW[trial.recipe.inputs](rows.db_uT[row])
     points = make_points(lines.order_i[:, None].astype(np.float64), lines.line_i)
     return Unlabelled(scaler.encode(view), points, point_row.astype(np.int64))
 
 
-def _own(cell: Cell, rows: Measured, scaler: Scaler) -> Labelled:
-    assert isinstance(cell.tuning, FewLabels)
-    own = cell.tuning.own
-    view = VIEW[cell.recipe.inputs](rows.db_uT[own])
+def _own(trial: Trial, rows: Measured, scaler: Scaler) -> Labelled:
+    assert isinstance(trial.tuning, FewLabels)
+    own = trial.tuning.own
+    view = VIEW[trial.recipe.inputs](rows.db_uT[own])
     return Labelled(scaler.encode(view), scaler.encode_target(rows.target[own]), None)
 
 
 class Keys:
-    """Names cells by all that decides their results: rows, recipe, seed, start, code, torch; keeps what it hashed."""
+    """Names trials by all that decides their results: rows, recipe, seed, start, code, torch; keeps what it hashed."""
 
     def __init__(self, rows: Measured) -> None:
         self.rows = rows
         self.known: dict[int, tuple[np.ndarray, str]] = {}
 
-    def key(self, cell: Cell) -> str:
-        """Name a cell."""
+    def key(self, trial: Trial) -> str:
+        """Name a trial."""
         words = [
-            device(), *signature(), cell.fold, cell.skin, cell.recipe.model_dump_json(), cell.seed, cell.seed_i,
-            cell.attempt_i,
-            self._labelled(cell.train), _digest(self.rows.db_uT[cell.test]),
+            device(), *signature(), trial.fold, trial.skin, trial.recipe.model_dump_json(), trial.seed, trial.seed_i,
+            trial.attempt_i,
+            self._labelled(trial.train), _digest(self.rows.db_uT[trial.test]),
             _code_digest(), importlib.metadata.version("torch"), importlib.metadata.version("numpy"), sys.platform,
         ]  # fmt: skip
-        if cell.tuning is not None:
-            words += [cell.tuning.start.key, cell.tuning.settings.model_dump_json()]
-        match cell.tuning:
+        if trial.tuning is not None:
+            words += [trial.tuning.start.key, trial.tuning.settings.model_dump_json()]
+        match trial.tuning:
             case Adapting(lines=lines):
                 words += [_digest(self.rows.db_uT[lines.row], lines.line_i, lines.order_i)]
             case FewLabels(own=own):

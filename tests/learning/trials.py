@@ -1,4 +1,4 @@
-"""A scene of four skins and its cells, small enough for tests: two skins are trained on, the last one is new."""
+"""A scene of four skins and its trials, small enough for tests: two skins are trained on, the last one is new."""
 
 from dataclasses import replace
 
@@ -7,9 +7,9 @@ import numpy as np
 from pipeline.core.seeds import rng_for
 from pipeline.dataset.lines import Lines, hand_lines
 from pipeline.learning.architecture import draw_weights, paper_layers
-from pipeline.learning.cell import Adapting, Cell, FewLabels, Measured, Start
 from pipeline.learning.recipe import FineTuning, Labelling
 from pipeline.learning.standardise import fit_standard
+from pipeline.learning.trial import Adapting, FewLabels, Measured, Start, Trial
 from tests.learning.recipes import recipe
 
 ROWS_N = 48  # twelve a skin
@@ -31,11 +31,11 @@ def changed(rows: Measured, part: str, at: np.ndarray, to: object) -> Measured:
     return replace(rows, **{part: values})
 
 
-def pooled(**changes: object) -> Cell:
-    return Cell("triplet", "paper", recipe(triplet_weight=0.5, **changes), "b1", 7, 0, TRAIN, TEST)
+def pooled(**changes: object) -> Trial:
+    return Trial("triplet", "paper", recipe(triplet_weight=0.5, **changes), "b1", 7, 0, TRAIN, TEST)
 
 
-def without_triplets() -> Cell:
+def without_triplets() -> Trial:
     return replace(pooled(), recipe=recipe())
 
 
@@ -51,11 +51,11 @@ def start(key: str = "start") -> Start:
     return Start(key, weights, fit_standard(rows.db_uT[TRAIN], rows.target[TRAIN]))
 
 
-def adapting(*, unlabelled_weight: float = 0.5, along: Lines | None = None) -> Cell:
+def adapting(*, unlabelled_weight: float = 0.5, along: Lines | None = None) -> Trial:
     settings = FineTuning(unlabelled_weight=unlabelled_weight, **SETTINGS)
     return replace(pooled(), question="adapt", skin="b1_s1", tuning=Adapting(start(), settings, along or lines()))
 
 
-def few_labels(*, own_weight: float = 0.5) -> Cell:
+def few_labels(*, own_weight: float = 0.5) -> Trial:
     tuning = FewLabels(start(), Labelling(own_weight=own_weight, **SETTINGS), OWN)
     return replace(pooled(), question="labels", skin="b1_s1", tuning=tuning)

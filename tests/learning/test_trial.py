@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 
 from pipeline.dataset.lines import Lines
-from pipeline.learning import cell as cell_module
-from pipeline.learning.cell import DECIDING, Cell, Keys, Measured, Trained, code_of, make_job
+from pipeline.learning import trial as cell_module
 from pipeline.learning.feed import Feed
 from pipeline.learning.job import Terms
 from pipeline.learning.recipe import AugmentedRecipe
 from pipeline.learning.stack import train_stack
-from tests.learning.cells import (
+from pipeline.learning.trial import DECIDING, Keys, Measured, Trained, Trial, code_of, make_job
+from tests.learning.recipes import recipe
+from tests.learning.trials import (
     OWN,
     POKED,
     ROWS_N,
@@ -28,14 +29,13 @@ from tests.learning.cells import (
     start,
     without_triplets,
 )
-from tests.learning.recipes import recipe
 
 NEW = np.arange(24, ROWS_N)  # every row of a skin that is not trained on
 KINDS = {"pooled": pooled, "adapting": adapting, "few labels": few_labels}
 
 
-def trained(cell: Cell, rows: Measured) -> Trained:
-    return train_stack([cell], rows)[0]
+def trained(trial: Trial, rows: Measured) -> Trained:
+    return train_stack([trial], rows)[0]
 
 
 def alike(one: Trained, other: Trained) -> bool:
@@ -110,10 +110,10 @@ def test_a_few_labels_are_seen_and_no_others():
 @pytest.mark.parametrize("scaling", ["standard", "released"])
 @pytest.mark.parametrize("view", ["raw", "shape"])
 def test_a_planted_leak_would_show_nothing_of_a_test_row_reaches_the_model(scaling, view):
-    cell = pooled(scaling=scaling, inputs=view)
-    once = trained(cell, measured())
+    trial = pooled(scaling=scaling, inputs=view)
+    once = trained(trial, measured())
     planted = changed(changed(measured(), "db_uT", TEST, 1e4), "target", TEST, -1e4)
-    again = trained(cell, planted)
+    again = trained(trial, planted)
     assert alike(once, again)
     assert (once.predicted != again.predicted).any()
 
@@ -149,8 +149,8 @@ def test_terms_weigh_what_the_recipe_and_the_tuning_say():
 # Pairs
 
 
-def first_batches(cell: Cell) -> list[np.ndarray]:
-    feed = Feed([make_job(cell, measured())[0]], 16, "cpu")
+def first_batches(trial: Trial) -> list[np.ndarray]:
+    feed = Feed([make_job(trial, measured())[0]], 16, "cpu")
     return [step["labelled"].numpy() for _ in range(3) for step in feed.draw(5)]
 
 
@@ -164,7 +164,7 @@ def first_batches(cell: Cell) -> list[np.ndarray]:
     ids=["another name", "another schedule", "no triplets"],
 )
 def test_recipes_are_compared_from_equal_starts_on_equal_batches(other):
-    one, two = (make_job(cell, measured())[0].start for cell in (pooled(), other))
+    one, two = (make_job(trial, measured())[0].start for trial in (pooled(), other))
     assert all((one[name] == two[name]).all() for name in one)
     assert all((a == b).all() for a, b in zip(first_batches(pooled()), first_batches(other), strict=True))
 
@@ -187,12 +187,12 @@ def test_folds_and_seeds_start_and_draw_differently(changes):
 # Keys
 
 
-def key(cell: Cell, rows: Measured | None = None) -> str:
-    return Keys(rows or measured()).key(cell)
+def key(trial: Trial, rows: Measured | None = None) -> str:
+    return Keys(rows or measured()).key(trial)
 
 
-def tuned(cell: Cell, **changes: object) -> Cell:
-    return replace(cell, tuning=replace(cell.tuning, **changes))
+def tuned(trial: Trial, **changes: object) -> Trial:
+    return replace(trial, tuning=replace(trial.tuning, **changes))
 
 
 def with_row(part: str, row: int, to: object) -> Callable[[], Measured]:
@@ -230,13 +230,13 @@ def test_a_key_does_not_change_with_what_decides_nothing(what):
     assert key(KINDS[kind](), rows()) == key(KINDS[kind]())
 
 
-def finer(cell: Cell, **changes: object) -> Cell:
-    return tuned(cell, settings=cell.tuning.settings.model_copy(update=changes))
+def finer(trial: Trial, **changes: object) -> Trial:
+    return tuned(trial, settings=trial.tuning.settings.model_copy(update=changes))
 
 
 def test_no_two_settings_share_a_key():
     along = lines()
-    cells = [
+    trials = [
         pooled(), adapting(), few_labels(), replace(pooled(), train=TRAIN[1:]), replace(pooled(), test=TEST[1:]),
         *[pooled(**one) for one in (
             {"architecture": "released"}, {"inputs": "shape"}, {"scaling": "released"}, {"steps_n": 5}, {"batch_n": 8},
@@ -251,7 +251,7 @@ def test_no_two_settings_share_a_key():
         adapting(along=replace(along, row=along.row[::-1].copy())),
         tuned(few_labels(), own=OWN[:2]), finer(few_labels(), own_weight=0.25),
     ]  # fmt: skip
-    assert len({key(cell) for cell in cells}) == len(cells)
+    assert len({key(trial) for trial in trials}) == len(trials)
 
 
 def test_a_training_after_one_that_collapsed_has_a_key_a_start_and_batches_of_its_own():
@@ -264,9 +264,9 @@ def test_a_training_after_one_that_collapsed_has_a_key_a_start_and_batches_of_it
 
 @pytest.mark.parametrize("scaling", ["standard", "released"])
 def test_a_network_begins_with_the_mean_of_the_targets_as_its_last_bias(scaling):
-    cell = replace(without_triplets(), recipe=recipe(scaling=scaling))
+    trial = replace(without_triplets(), recipe=recipe(scaling=scaling))
     rows = changed(measured(), "target", np.arange(3), np.nan)
-    job, scaler = make_job(cell, changed(rows, "target", (slice(None), 2), np.nan))
+    job, scaler = make_job(trial, changed(rows, "target", (slice(None), 2), np.nan))
     told = scaler.decode(job.start["layer6.bias"][None])[0]
     np.testing.assert_allclose(told[:2], rows.target[TRAIN[3:], :2].mean(axis=0), rtol=1e-5)
     assert job.start["layer6.bias"][2] == 0  # a target that nobody knows
@@ -301,8 +301,8 @@ def test_rows_that_nobody_uses_may_come_and_go():
 
 
 def test_keys_are_the_same_from_one_book_of_keys_and_from_many():
-    book, cells = Keys(measured()), [pooled(), replace(pooled(), train=TRAIN[1:]), pooled(), adapting()]
-    assert [book.key(cell) for cell in cells] == [key(cell) for cell in cells]
+    book, trials = Keys(measured()), [pooled(), replace(pooled(), train=TRAIN[1:]), pooled(), adapting()]
+    assert [book.key(trial) for trial in trials] == [key(trial) for trial in trials]
 
 
 def test_a_key_changes_with_the_code_that_trains(monkeypatch):
@@ -320,7 +320,7 @@ def test_copies_of_rows_keep_their_targets_and_are_skins_of_their_own():
     words = {"copies_n": 2, "gain_sd": 0.0, "lean_sd_deg": 0.0, "noise_uT": 0.0}
     plain = pooled()
     recipe = AugmentedRecipe.model_validate(plain.recipe.model_dump() | {"augmentation": words})
-    (one, _), (more, _) = (make_job(cell, measured()) for cell in (plain, replace(plain, recipe=recipe)))
+    (one, _), (more, _) = (make_job(trial, measured()) for trial in (plain, replace(plain, recipe=recipe)))
     # Boards that do not differ: the same rows three times over, with the same targets.
     np.testing.assert_array_equal(more.labelled.inputs, np.tile(one.labelled.inputs, (3, 1)))
     np.testing.assert_array_equal(more.labelled.targets, np.tile(one.labelled.targets, (3, 1)))
@@ -331,11 +331,11 @@ def test_copies_are_drawn_anew_in_every_fold_and_seed_and_enter_the_key():
     words = {"copies_n": 1, "gain_sd": 0.1, "lean_sd_deg": 5.0, "noise_uT": 1.0}
     recipe = AugmentedRecipe.model_validate(pooled().recipe.model_dump() | {"augmentation": words})
     other = AugmentedRecipe.model_validate(pooled().recipe.model_dump() | {"augmentation": words | {"gain_sd": 0.2}})
-    cell = replace(pooled(), recipe=recipe)
+    trial = replace(pooled(), recipe=recipe)
     drawn = [
         make_job(one, measured())[0].labelled.inputs
-        for one in (cell, cell, replace(cell, fold="b9"), replace(cell, seed_i=5))
+        for one in (trial, trial, replace(trial, fold="b9"), replace(trial, seed_i=5))
     ]
     assert (drawn[0] == drawn[1]).all()
     assert not any((drawn[0] == one).all() for one in drawn[2:])
-    assert key(cell) != key(replace(cell, recipe=other)) != key(pooled())
+    assert key(trial) != key(replace(trial, recipe=other)) != key(pooled())
