@@ -82,6 +82,7 @@ def _written(loc: Sequence[int | str], value: Any) -> list[str]:
 
 Words = Mapping[str, Any]
 NOTHING = object()
+FLOW, PARAMS, PLAN, SCENES = "dvc.yaml", "params.yaml", "pipeline/plan.yaml", "pipeline/scenes"
 PLACE = re.compile(
     r"\$\{(item\.)?([^}\[]+)(?:\[(\d+)\])?\}"
 )  # in dvc.yaml: ${key}, ${item.train_multi.recipe}, ${item.terms[0]}
@@ -100,6 +101,11 @@ class Files:
     settings: Path
     params: Path
     plan: Path
+
+    @classmethod
+    def of(cls, scene: str) -> "Files":
+        """Give those of a scene of this checkout."""
+        return cls(Path(SCENES) / f"{scene}.yaml", Path(PARAMS), Path(PLAN))
 
 
 @dataclass(frozen=True)
@@ -156,7 +162,7 @@ def read_settings(stage: str, key: str, files: Files) -> Settings:
     if item is NOTHING:
         remedy = f"Try: reskin scenes use {key}"
         raise ParamsError(files.plan, f"stages.{stage}", "planned for it", key, remedy)
-    templates = declared(read_yaml(files.params.with_name("dvc.yaml")), stage)
+    templates = declared(read_yaml(files.params.with_name(FLOW)), stage)
     _check_names(f"stages.{stage}.{key}", item, scene, files)
     keys = {kind: [fill(one, key, item) for one in own] for kind, own in templates.items()}
     planned = find(take(plan, keys["plan"]), f"stages.{stage}.{key}")
@@ -171,7 +177,7 @@ def declared(flow: Words, stage: str) -> dict[str, list[str]]:
     keys: dict[str, list[str]] = {"scene": [], "shared": [], "plan": []}
     for entry in flow["stages"][stage]["do"].get("params", []):
         for file, own in entry.items():
-            kind = {"params.yaml": "shared", "pipeline/plan.yaml": "plan"}.get(file, "scene")
+            kind = {PARAMS: "shared", PLAN: "plan"}.get(file, "scene")
             keys[kind] += own
     return keys
 
