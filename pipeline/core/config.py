@@ -189,11 +189,12 @@ def fill(template: str, key: str, item: Words) -> str:
     'recipes.paper'
     """
 
-    def word(match: re.Match[str]) -> str:
-        value = find(item, match[2]) if match[1] else key
-        return str(value if match[3] is None else value[int(match[3])])
+    return PLACE.sub(lambda place: _word(place, key, item), template)
 
-    return PLACE.sub(word, template)
+
+def _word(place: re.Match[str], key: str, item: Words) -> str:
+    value = find(item, place[2]) if place[1] else key
+    return str(value if place[3] is None else value[int(place[3])])
 
 
 def take(words: Words, keys: Iterable[str]) -> dict[str, Any]:
