@@ -87,15 +87,16 @@ def decode_all(data: bytes, wire: Wire, chips_n: int, where: str) -> tuple[Frame
 def no_frame(where: str, data: bytes, wire: Wire, chips_n: int) -> CaptureError:
     """Make the error for a stream without a frame, from its bytes or the first of them; say what fits them instead."""
     rule, got = f"frames of {chips_n} chips in wire format {wire}", f"no frame found in {len(data)} bytes"
-    hint = " or ".join(f"{fit} with {k} chips" for fit, k in _fits(data[:16384]))
+    hint = " or ".join(f"{fit} with {k} chips" for fit, k in fitting(data))
     remedy = "Wrong baud rate, chip count or wire format?" + (f" It fits {hint}." if hint else "")
     if not data:
         remedy = "Is the board running and sending?"
     return CaptureError(where, "the stream", rule, got, remedy)
 
 
-def _fits(data: bytes) -> list[tuple[Wire, int]]:
-    """List the formats, of the fewest chips that do, in which most of `data` is frames."""
+def fitting(data: bytes) -> list[tuple[Wire, int]]:
+    """List the formats, of the fewest chips that do, in which most of the first 16 KiB of `data` is frames."""
+    data = data[:16384]
     for chips_n in range(1, min(CHIPS_MAX_N, len(data) // 16) + 1):  # no format has less than 16 bytes a chip
         streams = {wire: FrameStream(wire, chips_n) for wire in get_args(Wire)}
         for stream in streams.values():

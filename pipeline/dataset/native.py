@@ -36,7 +36,7 @@ def read_native(folder: Path, header: Header) -> tuple[Iterator[Readings], dict[
         raise CaptureError(stream, "the file", "there", "nothing", "Copy the whole capture folder.")
     log = probe.parse(folder / PROBE_FILE, str(folder / PROBE_FILE))
     check_log(log, str(folder / PROBE_FILE))
-    times_of = _timer(folder, header)
+    times_of = timer(folder, header)
     clock = _clock(folder, header, log, times_of)
     account = {
         "clock_residual_us": round(1e6 * clock.residual_s),
@@ -75,7 +75,7 @@ def _timed(frames: Frames, t_s: Float64[np.ndarray, " f"], watch: Watch) -> Time
     return TimedFrames(frames, t_s, failed, watch.stuck(frames, failed))
 
 
-def _timer(folder: Path, header: Header) -> Timer:
+def timer(folder: Path, header: Header) -> Timer:
     """Choose how frames get a time, as the header's clock says."""
     rate_hz = header.clock.rate_hz
     if header.clock.kind == "arrivals":
