@@ -12,8 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from pipeline import plan
-from pipeline.capture.folder import write_capture
-from pipeline.capture.header import STREAM_FILE, Header
+from pipeline.capture.header import STREAM_FILE, Header, write_capture
 from pipeline.core import io
 from pipeline.core.errors import CaptureError, ReskinError
 from pipeline.dataset.captures import check_losses, open_capture

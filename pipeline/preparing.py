@@ -21,7 +21,6 @@ from pipeline.core.errors import CaptureError, ReskinError
 from pipeline.dataset.captures import read_header
 
 NATIVE_FILES = (headers.STREAM_FILE, headers.ARRIVALS_FILE, headers.PROBE_FILE)
-RECORDINGS_OWN = Clock(kind="recording", rate_hz=None, marks=())
 
 Foreign = Literal["lab", "ini", "eflesh"]
 Marks = tuple[tuple[float, float], ...]
@@ -105,28 +104,21 @@ def foreign(recording: Path, layout: Foreign, labels: Labels, options: Mapping[s
     _need(recording, folder=True)
     files = READERS[layout].collect(recording)
     chips_n = READERS[layout].count_chips(files)
-    return _header(labels, recording, layout=layout, chips_n=chips_n, special={"options": dict(options)}), files
+    return _header(labels, recording, layout=layout, chips_n=chips_n, options=dict(options)), files
 
 
 def dump(recording: Path, labels: Labels, what: Dump) -> Prepared:
     """Prepare a bare dump of a port with the robot's log; frames get their time from a constant rate."""
     if what.probe is None:
-        raise CaptureError(
-            recording,
-            "a serial dump",
-            "accompanied by its probe log",
-            "none",
-            "Add --probe PROBE.csv (columns in data/README.md).",
-        )
+        remedy = "Add --probe PROBE.csv (columns in data/README.md)."
+        raise CaptureError(recording, "a serial dump", "accompanied by its probe log", "none", remedy)
     _need(recording)
     _need(what.probe)
     if not 0 < what.rate_hz <= headers.RATE_MAX_HZ:
-        raise CaptureError(
-            "--rate-hz", "the rate", f"above 0, at most {headers.RATE_MAX_HZ:g}", what.rate_hz, "Count frames."
-        )
+        rule = f"above 0, at most {headers.RATE_MAX_HZ:g}"
+        raise CaptureError("--rate-hz", "the rate", rule, what.rate_hz, "Count frames.")
     clock = Clock(kind="rate", rate_hz=what.rate_hz, marks=what.marks)
-    special = {"wire": what.wire, "clock": clock}
-    header = _header(labels, recording, layout="native", chips_n=what.chips_n, special=special)
+    header = _header(labels, recording, layout="native", chips_n=what.chips_n, wire=what.wire, clock=clock)
     return header, {headers.STREAM_FILE: recording, headers.PROBE_FILE: what.probe}
 
 
@@ -136,9 +128,8 @@ def native(recording: Path, labels: Labels, probe: Path | None, marks: Marks) ->
     found = read_header(recording)
     for what, said, written in (("board", labels.board, found.board), ("skin", labels.skin, found.skin)):
         if said != written:
-            raise CaptureError(
-                recording, f"--{what}", f"{written!r}, as its header says", repr(said), "Which is right?"
-            )
+            rule = f"{written!r}, as its header says"
+            raise CaptureError(recording, f"--{what}", rule, repr(said), "Which is right?")
     # A recorder that was killed has not hashed its files into the header; they are there all the same.
     files = {name: recording / name for name in NATIVE_FILES if (recording / name).exists() or name in found.files}
     if probe is not None:
@@ -161,23 +152,14 @@ def _check_names(labels: Labels) -> None:
             raise CaptureError(option, "a name", "1 to 64 of A-Z a-z 0-9 _ -", repr(word), "Choose another.")
 
 
-def _header(
-    labels: Labels,
-    recording: Path,
-    *,
-    layout: headers.Layout,
-    chips_n: int,
-    special: Mapping[str, Any],
-) -> Header:
+def _header(labels: Labels, recording: Path, *, layout: headers.Layout, chips_n: int, **fields: Any) -> Header:
     _check_names(labels)
     stem = re.sub(r"[^A-Za-z0-9_-]", "_", recording.resolve().stem)
-    header = Header.model_construct(
-        format="reskin-capture/1", capture=labels.name or f"{labels.board}_{labels.skin}_{stem}"[:64],
-        board=labels.board, skin=labels.skin, source="recorded", layout=layout, wire=None, chips_n=chips_n,
-        unit_b="uT", unit_force="N", unit_place="mm", firmware=None, clock=RECORDINGS_OWN,
-        protocol=f"as recorded in {stem}", contacts_before_n=0, options={}, files={}, note="added by reskin add",
+    return headers.recorded(
+        str(recording), capture=labels.name or f"{labels.board}_{labels.skin}_{stem}"[:64], board=labels.board,
+        skin=labels.skin, layout=layout, chips_n=chips_n, protocol=f"as recorded in {stem}", note="added by reskin add",
+        **fields,
     )  # fmt: skip
-    return headers.parse(headers.render(header.model_copy(update=dict(special))), str(recording))
 
 
 def _need(path: Path, *, folder: bool = False) -> None:

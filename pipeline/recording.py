@@ -10,8 +10,7 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
-from pipeline.capture.folder import seal
-from pipeline.capture.header import HEADER_FILE, Clock, Header, parse, render
+from pipeline.capture.header import HEADER_FILE, Clock, recorded, render, seal
 from pipeline.capture.port import PortSettings, Recording, Report, record
 from pipeline.core import io
 from pipeline.core.errors import CaptureError
@@ -27,7 +26,12 @@ def record_capture(
     for path in (folder, part):
         if path.exists():
             raise CaptureError(path, "the capture's folder", "new", "one that is there", "Choose another --out.")
-    header = _header(folder.name, board, skin, settings)
+    header = recorded(
+        f"--out {folder.name}", capture=folder.name, board=board, skin=skin, layout="native", wire=settings.wire,
+        chips_n=settings.chips_n, clock=Clock(kind="arrivals", rate_hz=None, marks=()),
+        protocol="as the probe log says",
+        note="recorded by reskin record; arrival times are unix seconds of the host",
+    )  # fmt: skip
     part.mkdir(parents=True)
     io.write_text(part / HEADER_FILE, render(header))
     try:
@@ -57,13 +61,3 @@ def print_progress() -> Report:
         last_s, last_n = now_s, frames_n
 
     return report
-
-
-def _header(capture: str, board: str, skin: str, settings: PortSettings) -> Header:
-    header = Header.model_construct(
-        format="reskin-capture/1", capture=capture, board=board, skin=skin, source="recorded", layout="native",
-        wire=settings.wire, chips_n=settings.chips_n, unit_b="uT", unit_force="N", unit_place="mm", firmware=None,
-        clock=Clock(kind="arrivals", rate_hz=None, marks=()), protocol="as the probe log says", contacts_before_n=0,
-        options={}, files={}, note="recorded by reskin record; arrival times are unix seconds of the host",
-    )  # fmt: skip
-    return parse(render(header), f"--out {capture}")

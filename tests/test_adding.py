@@ -10,8 +10,7 @@ from typer.testing import CliRunner
 
 from pipeline import adding, plan, preparing
 from pipeline.capture import probe
-from pipeline.capture.folder import write_capture
-from pipeline.capture.header import Clock
+from pipeline.capture.header import Clock, write_capture
 from pipeline.capture.probe import ProbeLog
 from pipeline.capture.wire import encode
 from pipeline.cli import app

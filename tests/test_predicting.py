@@ -9,8 +9,7 @@ import pytest
 from pipeline.capture import arrivals
 from pipeline.capture.arrivals import Arrivals
 from pipeline.capture.dump import decode_dump
-from pipeline.capture.folder import write_capture
-from pipeline.capture.header import ARRIVALS_FILE, STREAM_FILE, Clock
+from pipeline.capture.header import ARRIVALS_FILE, STREAM_FILE, Clock, write_capture
 from pipeline.capture.sd_card import render
 from pipeline.capture.wire import Frames, encode, record_type
 from pipeline.core import io

@@ -12,13 +12,13 @@ import pyarrow as pa
 from jaxtyping import Bool, Float, Float32, Float64
 
 from pipeline.capture import columns, faults
+from pipeline.capture.columns import FIRST_ROW
 from pipeline.capture.readers.chips import GRID_ROWS_N
 from pipeline.capture.readers.units import check_fields
 from pipeline.core.errors import CaptureError
 
 TIME = "t_s"
 CHIP_COLUMNS = ("T", "Bx", "By", "Bz")
-FIRST_ROW = 2  # row 1 is the header
 HEADER_LETTERS_MAX = 10_000  # a line of 64 chips has 1,500
 RATE_MIN_HZ, RATE_MAX_HZ = 1.0, 10_000.0  # assumed: no board logs slower, and a chip reads no faster
 KEPT_SHARE_MIN = 0.5  # assumed: less than this is no log of what was touched
@@ -123,11 +123,8 @@ def _chips_n(path: Path, where: str) -> int:
 
 def _finite(table: pa.Table, name: str, where: str) -> Float64[np.ndarray, " f"]:
     values = np.asarray(table.column(name), np.float64)  # an empty cell is NaN
-    bad = ~np.isfinite(values)
-    if bad.any():
-        row = int(bad.argmax()) + FIRST_ROW
-        remedy = "Remove that line; the gap is counted."
-        raise CaptureError(f"{where} row {row}", name, "a finite number", values[row - FIRST_ROW], remedy)
+    remedy = "Remove that line; the gap is counted."
+    columns.refuse(~np.isfinite(values), where, name, "a finite number", values, remedy)
     return values
 
 

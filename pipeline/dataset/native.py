@@ -13,7 +13,8 @@ from pipeline.capture import arrivals, faults, probe, wire
 from pipeline.capture.arrivals import Arrivals
 from pipeline.capture.header import ARRIVALS_FILE, PROBE_FILE, STREAM_FILE, Header, Wire
 from pipeline.capture.probe import ProbeLog
-from pipeline.capture.readers.watch import Watch, check_log
+from pipeline.capture.readers.chips import Watch
+from pipeline.capture.readers.units import check_log
 from pipeline.capture.stream import FrameStream, no_frame
 from pipeline.capture.wire import Frames
 from pipeline.core.errors import CaptureError

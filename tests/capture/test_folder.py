@@ -2,7 +2,7 @@ import hashlib
 
 import pytest
 
-from pipeline.capture.folder import write_capture
+from pipeline.capture.header import write_capture
 from tests.capture.headers import make_header
 
 
