@@ -7,7 +7,6 @@ If the header says that fields come late (`rows_late`), row i of the truths goes
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int32
@@ -28,17 +27,6 @@ VALUES_PER_CHIP_N = 4
 ROWS_LATE = ("0", "1", "2", "3", "4", "5")
 
 Account = dict[str, int]
-
-
-class _Pairs(NamedTuple):
-    """Rows of both files that belong together; those without a partner are left out."""
-
-    b_uT: Float64[np.ndarray, "f ch"]
-    temperature_degC: Float64[np.ndarray, "f k"]
-    truths: Float64[np.ndarray, "f 3"]  # x mm, y mm, F N
-    rows: Rows
-    rows_late_n: int
-    best_rows_late_n: int
 
 
 def collect(recording: Path) -> dict[str, Path]:
@@ -65,17 +53,17 @@ def count_chips(files: Mapping[str, Path]) -> int:
 
 def read(folder: Path, header: Header) -> tuple[Readings, Account]:
     """Read all rows but those with a failed chip; the no-load field of a row is the mean of its pass's corner rows."""
-    pairs = _read_pairs(folder, header)
-    b_uT, truths, keep = pairs.b_uT, pairs.truths, pairs.rows.whole
+    late_n = _rows_late(header)
+    b_uT, temperature_degC = _read_fields(folder, header)
+    truths = _read_truths(folder, header)
+    _check_rows_n(len(b_uT), len(truths), late_n, header)
+    rows = find_whole_rows(b_uT, temperature_degC, header, where=f"{header.capture}/{READINGS}")
+    best_late_n = _best_rows_late(b_uT, truths[:, 2], rows)
+    truths, rows = truths[: len(truths) - late_n], rows.part(slice(late_n, None))
+    b_uT, temperature_degC, keep = b_uT[late_n:], temperature_degC[late_n:], rows.whole
     contact = truths[:, 2] >= CONTACT_MIN_N
     pass_i = find_passes(truths[:, :2], contact)
     corner = _corner_rows(pass_i, contact)
-    noload_uT = mean_by_group(b_uT[corner & keep], pass_i[corner & keep], int(pass_i.max()) + 1)
-    without = np.flatnonzero(np.isnan(noload_uT[:, 0]))
-    if len(without):
-        got = f"none in the pass from line {int(np.argmax(pass_i == without[0])) + 1}"
-        where, rule = f"{header.capture}/{TRUTHS}", f"begun by a whole row without contact (F < {CONTACT_MIN_N} N)"
-        raise CaptureError(where, "each pass", rule, got, "Start each pass off the skin, or cut this pass out.")
     place_mm = np.where(contact[:, None], truths[:, :2], np.nan)
     readings = make_readings(
         header,
@@ -86,39 +74,21 @@ def read(folder: Path, header: Header) -> tuple[Readings, Account]:
         y_mm=place_mm[:, 1],
         Fz_N=np.where(contact, truths[:, 2], 0.0),
         b_uT=b_uT,
-        noload_uT=noload_uT[pass_i],
-        temperature_degC=pairs.temperature_degC,
+        noload_uT=_noload_field(b_uT, pass_i, corner & keep, header),
+        temperature_degC=temperature_degC,
         n_contacts=header.contacts_before_n + np.cumsum(contact) - contact,
     )
     return readings, {
         "rows_n": len(readings),
-        "rows_read_n": len(keep) + pairs.rows_late_n,
-        **pairs.rows.losses(),
-        "dropped_no_partner_rows_n": pairs.rows_late_n,
+        "rows_read_n": len(keep) + late_n,
+        **rows.losses(),
+        "dropped_no_partner_rows_n": late_n,
         "noload_rows_n": 0,
         "no_contact_rows_n": int((keep & ~contact).sum()),
         "corner_rows_n": int((keep & corner).sum()),
         "passes_n": int(pass_i.max()) + 1,
-        "best_rows_late_n": pairs.best_rows_late_n,
+        "best_rows_late_n": best_late_n,
     }
-
-
-def _read_pairs(folder: Path, header: Header) -> _Pairs:
-    """Read both files, and pair their rows as the header says."""
-    rows_late_n = _rows_late(header)
-    b_uT, temperature_degC = _read_fields(folder, header)
-    truths = _read_truths(folder, header)
-    _check_rows_n(len(b_uT), len(truths), rows_late_n, header)
-    rows = find_whole_rows(b_uT, temperature_degC, header, where=f"{header.capture}/{READINGS}")
-    late = slice(rows_late_n, None)
-    return _Pairs(
-        b_uT=b_uT[late],
-        temperature_degC=temperature_degC[late],
-        truths=truths[: len(truths) - rows_late_n],
-        rows=rows.part(late),
-        rows_late_n=rows_late_n,
-        best_rows_late_n=_best_rows_late(b_uT, truths[:, 2], rows),
-    )
 
 
 def _read_fields(folder: Path, header: Header) -> tuple[Float64[np.ndarray, "f ch"], Float64[np.ndarray, "f k"]]:
@@ -179,3 +149,16 @@ def _corner_rows(pass_i: Int32[np.ndarray, " f"], contact: Bool[np.ndarray, " f"
     begins = np.flatnonzero(np.diff(pass_i, prepend=-1))
     before_pass_n = (touches_before_n - contact)[begins]
     return np.asarray(touches_before_n == before_pass_n[pass_i])
+
+
+def _noload_field(
+    b_uT: Float64[np.ndarray, "f ch"], pass_i: Int32[np.ndarray, " f"], corner: Bool[np.ndarray, " f"], header: Header
+) -> Float64[np.ndarray, "f ch"]:
+    """Give each row the mean field of the corner rows of its pass."""
+    noload_uT = mean_by_group(b_uT[corner], pass_i[corner], int(pass_i.max()) + 1)
+    without = np.flatnonzero(np.isnan(noload_uT[:, 0]))
+    if len(without):
+        got = f"none in the pass from line {int(np.argmax(pass_i == without[0])) + 1}"
+        where, rule = f"{header.capture}/{TRUTHS}", f"begun by a whole row without contact (F < {CONTACT_MIN_N} N)"
+        raise CaptureError(where, "each pass", rule, got, "Start each pass off the skin, or cut this pass out.")
+    return noload_uT[pass_i]
