@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from pipeline.capture import faults
-from pipeline.capture.bursts import TEMPERATURE_MAX_degC, TEMPERATURE_MIN_degC
 from pipeline.capture.header import Header
 from pipeline.capture.readers.units import check_fields
+from pipeline.capture.stream import TEMPERATURE_MAX_degC, TEMPERATURE_MIN_degC
 from pipeline.capture.wire import Frames
 from pipeline.core.errors import CaptureError
 
