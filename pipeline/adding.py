@@ -12,8 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from pipeline import plan
-from pipeline.capture.folder import write_capture
-from pipeline.capture.header import STREAM_FILE, Header
+from pipeline.capture.header import STREAM_FILE, Header, write_capture
 from pipeline.core import io
 from pipeline.core.errors import CaptureError, ReskinError
 from pipeline.dataset.captures import check_losses, open_capture
@@ -30,10 +29,11 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
     header, files = prepared
     settings = read_scene(plan.scene_file(root, scene), root / plan.PARAMS)
     if settings.source != header.source:
-        raise CaptureError(
-                f"capture {header.capture}", "source", f"{settings.source}, as scene {scene} is", header.source,
-                "Simulated and recorded captures belong to different scenes.",
-            )  # fmt: skip
+        rule, remedy = (
+            f"{settings.source}, as scene {scene} is",
+            "Simulated and recorded captures belong to different scenes.",
+        )
+        raise CaptureError(f"capture {header.capture}", "source", rule, header.source, remedy)
     limit, before = read_shared(root / plan.PARAMS)["lost_fraction_max"], read_registry(root)
     target = root / RAW / scene / header.capture
     _check_free(target, header.capture in before.captures.get(scene, {}))
@@ -119,6 +119,5 @@ def _forget(target: Path) -> None:
 def _dvc(root: Path, *words: str) -> None:
     done = subprocess.run([sys.executable, "-m", "dvc", *words], cwd=root, capture_output=True, text=True, check=False)
     if done.returncode:
-        raise CaptureError(
-            "dvc " + " ".join(words), "DVC", "able to track it", done.stderr.strip()[-300:], "See above."
-        )
+        got = done.stderr.strip()[-300:]
+        raise CaptureError("dvc " + " ".join(words), "DVC", "able to track it", got, "See above.")

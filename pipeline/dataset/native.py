@@ -13,7 +13,8 @@ from pipeline.capture import arrivals, faults, probe, wire
 from pipeline.capture.arrivals import Arrivals
 from pipeline.capture.header import ARRIVALS_FILE, PROBE_FILE, STREAM_FILE, Header, Wire
 from pipeline.capture.probe import ProbeLog
-from pipeline.capture.readers.watch import Watch, check_log
+from pipeline.capture.readers.chips import Watch
+from pipeline.capture.readers.units import check_log
 from pipeline.capture.stream import FrameStream, no_frame
 from pipeline.capture.wire import Frames
 from pipeline.core.errors import CaptureError
@@ -36,7 +37,7 @@ def read_native(folder: Path, header: Header) -> tuple[Iterator[Readings], dict[
         raise CaptureError(stream, "the file", "there", "nothing", "Copy the whole capture folder.")
     log = probe.parse(folder / PROBE_FILE, str(folder / PROBE_FILE))
     check_log(log, str(folder / PROBE_FILE))
-    times_of = _timer(folder, header)
+    times_of = timer(folder, header)
     clock = _clock(folder, header, log, times_of)
     account = {
         "clock_residual_us": round(1e6 * clock.residual_s),
@@ -75,7 +76,7 @@ def _timed(frames: Frames, t_s: Float64[np.ndarray, " f"], watch: Watch) -> Time
     return TimedFrames(frames, t_s, failed, watch.stuck(frames, failed))
 
 
-def _timer(folder: Path, header: Header) -> Timer:
+def timer(folder: Path, header: Header) -> Timer:
     """Choose how frames get a time, as the header's clock says."""
     rate_hz = header.clock.rate_hz
     if header.clock.kind == "arrivals":

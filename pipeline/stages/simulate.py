@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from pipeline.capture.folder import write_capture
+from pipeline.capture.header import write_capture
 from pipeline.core import io
 from pipeline.core.config import Files, read_settings
 from pipeline.core.errors import ParamsError

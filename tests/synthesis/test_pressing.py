@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.capture.folder import write_capture
+from pipeline.capture.header import write_capture
 from pipeline.capture.sd_card import read_log
 from pipeline.core.errors import CaptureError, ParamsError
 from pipeline.core.seeds import rng_for

@@ -9,7 +9,7 @@ from scipy.constants import milli
 
 from pipeline.capture import faults
 from pipeline.capture.header import Clock, Firmware, Header
-from pipeline.capture.readers.watch import Watch
+from pipeline.capture.readers.chips import Watch
 from pipeline.capture.wire import Frames
 from pipeline.core.seeds import rng_for
 from pipeline.experiments.stability.cases import Case, measured, refused, told
