@@ -23,7 +23,7 @@ from pipeline.experiments.ambient.settings import Ambient
 from pipeline.learning.card import went
 from pipeline.learning.recipe import HEADLINE, Training
 from pipeline.physics.skin import draw_skin
-from pipeline.synthesis.capture import Synthesis
+from pipeline.synthesis.settings import Synthesis
 from pipeline.trials.data import SceneData, train_all, trials_of
 from pipeline.trials.networks import Network
 

@@ -17,7 +17,7 @@ from pipeline.learning.classical import Neighbours
 from pipeline.learning.executors import make_executor
 from pipeline.learning.recipe import HEADLINE, with_training
 from pipeline.learning.trial import Measured, Trial
-from pipeline.synthesis.of_settings import synthesis_of
+from pipeline.synthesis.settings import synthesis_of
 from pipeline.trials.data import SceneData, train_all
 from pipeline.trials.models import note_seconds
 
