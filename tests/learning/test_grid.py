@@ -13,8 +13,9 @@ from pipeline.core.errors import ReskinError, TrainingError
 from pipeline.learning import stack
 from pipeline.learning.executors import make_executor
 from pipeline.learning.grid import STACK_N, run_trials, stacks
-from pipeline.learning.stack import JUDGED_STEPS_N, train_stack
-from pipeline.learning.trial import Trained, Trial, make_job
+from pipeline.learning.job import make_job
+from pipeline.learning.train import JUDGED_STEPS_N, train_stack
+from pipeline.learning.trial import Trained, Trial
 from tests.learning.recipes import recipe
 from tests.learning.trials import TRAIN, adapting, few_labels, measured, pooled, without_triplets
 
