@@ -1,4 +1,4 @@
-"""What every stage does around its work: argv, a word if MLflow is away, one-sentence errors, its cost.
+"""What every stage does around its work: argv, a warning if MLflow is away, one-sentence errors, its cost.
 
 In: the stage's function; its parameters are its options. Refuses to know what the stage does.
 """
@@ -24,7 +24,7 @@ def run(work: Callable[..., None]) -> None:
     stage = work.__name__
     parser = argparse.ArgumentParser(prog=f"sh pipeline/run.sh {stage}", description=work.__doc__)
     kinds = {name: parameter.annotation for name, parameter in inspect.signature(work).parameters.items()}
-    bundles = {name: [one.name for one in fields(kind)] for name, kind in kinds.items() if is_dataclass(kind)}
+    bundles = {name: [field.name for field in fields(kind)] for name, kind in kinds.items() if is_dataclass(kind)}
     for name, kind in kinds.items():
         for option in bundles.get(name, [name]):
             parser.add_argument(f"--{option.replace('_', '-')}", type=Path if name in bundles else kind, required=True)
@@ -50,10 +50,10 @@ def _unit(stage: str, arguments: Mapping[str, Any]) -> str:
     of = {"ingest": "indentations", "ingest_simulated": "indentations", "describe": "indentations", "simulate": "raw"}
     if stage not in of:
         return stage
-    own = arguments[of[stage]].stem.removeprefix(arguments["scene"]).strip("-")
-    return f"{stage}-{own}" if own else stage
+    part = arguments[of[stage]].stem.removeprefix(arguments["scene"]).strip("-")
+    return f"{stage}-{part}" if part else stage
 
 
 def say(sentence: str) -> None:
-    """Tell the person in front of the terminal, at once."""
+    """Print a sentence to standard error at once."""
     print(sentence, file=sys.stderr, flush=True)

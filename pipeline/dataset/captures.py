@@ -1,4 +1,4 @@
-"""A capture becomes readings, whatever its layout. In: a folder with `header.json`. Out: blocks of readings, an account.
+"""A capture becomes readings, whatever its layout. In: a folder with `header.json`. Out: readings, an account.
 
 A native capture (`stream.bin`, `arrivals.csv`, `probe.csv`) is read in bounded memory, every byte accounted for.
 Refuses to know how to decode, to time or to join, and what is done with readings.

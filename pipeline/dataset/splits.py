@@ -265,11 +265,9 @@ def _prove_apart(rows: Rows, fold: Fold) -> None:
     for what, labels in (("board", rows.board), ("skin", rows.skin)):
         both = np.intersect1d(np.unique(labels[fold.train]), np.unique(labels[held]))
         if len(both):
-            where, remedy = (
-                f"fold {fold.question}/{fold.name}",
-                "Give every skin its own name, and each skin one board.",
-            )
-            raise ParamsError(where, f"a {what}", "on one side only", f"{', '.join(both)} on both", remedy)
+            where, got = f"fold {fold.question}/{fold.name}", f"{', '.join(both)} on both"
+            remedy = "Give every skin its own name, and each skin one board."
+            raise ParamsError(where, f"a {what}", "on one side only", got, remedy)
 
 
 _DRAW: dict[str, Callable[[Rows, Split, int], list[Fold]]] = {
