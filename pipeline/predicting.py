@@ -18,8 +18,7 @@ from pipeline.capture.stream import decode_all
 from pipeline.core import io
 from pipeline.core.config import Strict, parse
 from pipeline.core.errors import CaptureError, ParamsError, SchemaError
-from pipeline.dataset.captures import read_header
-from pipeline.dataset.native import timer
+from pipeline.dataset.captures import read_header, timer
 from pipeline.experiments.logs.estimates import Estimates, describe, estimate
 from pipeline.learning.card import FORMAT
 from pipeline.learning.inputs import VIEW

@@ -18,7 +18,7 @@ from pipeline.core.errors import ParamsError
 from pipeline.learning.recipe import adaptations, training
 from pipeline.params import module_of, read_scene
 from pipeline.registry import Entry, Registry
-from pipeline.synthesis.of_settings import synthesis_of
+from pipeline.synthesis.settings import synthesis_of
 from tests.stages.checkout import copy_checkout
 
 ROOT = Path(__file__).resolve().parents[1]

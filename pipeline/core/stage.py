@@ -1,4 +1,4 @@
-"""What every stage does around its work: argv, a word if MLflow is away, one-sentence errors, its cost.
+"""What every stage does around its work: argv, a warning if MLflow is away, one-sentence errors, its cost.
 
 In: the stage's function; its parameters are its options. Refuses to know what the stage does.
 """
@@ -48,10 +48,10 @@ def _unit(stage: str, arguments: Mapping[str, Any]) -> str:
     of = {"ingest": "indentations", "ingest_simulated": "indentations", "describe": "indentations", "simulate": "raw"}
     if stage not in of:
         return stage
-    own = arguments[of[stage]].stem.removeprefix(arguments["scene"]).strip("-")
-    return f"{stage}-{own}" if own else stage
+    part = arguments[of[stage]].stem.removeprefix(arguments["scene"]).strip("-")
+    return f"{stage}-{part}" if part else stage
 
 
 def say(sentence: str) -> None:
-    """Tell the person in front of the terminal, at once."""
+    """Print a sentence to standard error at once."""
     print(sentence, file=sys.stderr, flush=True)

@@ -12,9 +12,8 @@ from jaxtyping import Float32
 from pipeline.core import io
 from pipeline.core.errors import SchemaError
 from pipeline.learning.executors import device
-from pipeline.learning.inputs import VIEW
+from pipeline.learning.inputs import VIEW, Scaler
 from pipeline.learning.recipe import HEADLINE
-from pipeline.learning.standardise import Scaler
 
 if TYPE_CHECKING:
     from pipeline.learning.model import Predictor

@@ -16,7 +16,7 @@ from pipeline.experiments.audit.checks import holds, to_words
 from pipeline.experiments.audit.copies import nearest_rays
 from pipeline.experiments.audit.settings import audit_choice, audit_scaler
 from pipeline.experiments.audit.sides import Labels, Sides, audit_fold
-from pipeline.learning.standardise import FIT
+from pipeline.learning.inputs import FIT
 
 NONE = np.zeros(0, np.int64)
 READINGS_N = 3

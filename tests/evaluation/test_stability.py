@@ -16,7 +16,7 @@ from pipeline.experiments.stability.relaxing import survey_relaxing
 from pipeline.experiments.stability.survey import survey
 from pipeline.experiments.stability.wire import survey_wire
 from pipeline.physics import force_sensor, layer, sensor, viscoelastic
-from pipeline.synthesis.capture import Synthesis
+from pipeline.synthesis.settings import Synthesis
 
 ROOT = Path(__file__).resolve().parents[2]
 SHARED = {name: read_yaml(ROOT / "params.yaml")[name] for name in ("rig", "skin", "chip", "spreads", "terms")}

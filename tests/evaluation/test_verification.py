@@ -18,7 +18,7 @@ from pipeline.experiments.verification.poke import check_poke
 from pipeline.experiments.verification.relaxation import check_relaxation
 from pipeline.experiments.verification.survey import Designs, verify
 from pipeline.physics import change, layer, magnet, sensor, viscoelastic
-from pipeline.synthesis.capture import Synthesis
+from pipeline.synthesis.settings import Synthesis
 
 ROOT = Path(__file__).resolve().parents[2]
 SHARED = {name: read_yaml(ROOT / "params.yaml")[name] for name in ("rig", "skin", "chip", "spreads", "terms")}

@@ -17,7 +17,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from pipeline.core import io
-from pipeline.learning.standardise import Scaler
+from pipeline.learning.inputs import Scaler
 from pipeline.questions import EXPERIMENTS
 from pipeline.reporting.checklist import read_rows, resolve
 from tests.stages.checkout import ENVIRONMENT, copy_checkout, run

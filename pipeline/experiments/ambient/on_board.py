@@ -20,10 +20,10 @@ from pipeline.experiments.ambient.fields import (
     without_common_part,
 )
 from pipeline.experiments.ambient.settings import Ambient
-from pipeline.learning.card import went
+from pipeline.learning.card import collapse_record
 from pipeline.learning.recipe import HEADLINE, Training
 from pipeline.physics.skin import draw_skin
-from pipeline.synthesis.capture import Synthesis
+from pipeline.synthesis.settings import Synthesis
 from pipeline.trials.data import SceneData, train_all, trials_of
 from pipeline.trials.networks import Network
 
@@ -43,7 +43,7 @@ def networks_of_common_part(
         Network({"recipe": trial.recipe.model_dump(mode="json")}, {**one.weights, **one.scaler.arrays()})
         for trial, one in zip(trials, trained, strict=True)
     ]
-    return networks, tally(map(went, trained))
+    return networks, tally(map(collapse_record, trained))
 
 
 def on_board(

@@ -13,7 +13,7 @@ from pipeline.experiments.ambient.settings import Ambient
 from pipeline.experiments.answer import write_answer
 from pipeline.learning.recipe import training
 from pipeline.physics.ambient import EARTH_DIP_DEG, EARTH_SIZE_T
-from pipeline.synthesis.of_settings import synthesis_of
+from pipeline.synthesis.settings import synthesis_of
 from pipeline.trials.data import read_data
 from pipeline.trials.networks import networks_without
 

@@ -14,9 +14,8 @@ from pipeline.experiments.audit.collapse import audit_collapse
 from pipeline.experiments.audit.settings import audit_choice, audit_scaler
 from pipeline.experiments.audit.sides import Sides
 from pipeline.experiments.audit.tuning import audit_tuning
-from pipeline.learning.inputs import VIEW
+from pipeline.learning.inputs import FIT, VIEW
 from pipeline.learning.recipe import HEADLINE
-from pipeline.learning.standardise import FIT
 from pipeline.trials.data import SceneData
 
 Fits = dict[tuple[str, str, str, str, int], dict[str, np.ndarray]]  # by fold, view, scaling and rows

@@ -10,7 +10,7 @@ from pipeline.experiments.contacts.on_board import SAME_PLACE, on_board
 from pipeline.experiments.contacts.pairs import over_boards
 from pipeline.experiments.contacts.settings import Contacts
 from pipeline.experiments.contacts.superposition import superposition
-from pipeline.synthesis.of_settings import synthesis_of
+from pipeline.synthesis.settings import synthesis_of
 from pipeline.trials.data import read_data
 from pipeline.trials.networks import networks_without
 

@@ -8,9 +8,8 @@ import numpy as np
 
 from pipeline.core.schema import Readings
 from pipeline.dataset import baseline
-from pipeline.dataset.parts import TRAIN, Part, Policy, lay_parts
 from pipeline.dataset.rows import Selection
-from pipeline.dataset.windows import Windows, check_one_each, lay_windows
+from pipeline.dataset.windows import TRAIN, Part, Policy, Windows, check_one_each, lay_parts, lay_windows
 from pipeline.experiments.drift.settings import Drift
 from pipeline.experiments.drift.windows import Answers, force_left
 from pipeline.learning.trial import Trained, Trial

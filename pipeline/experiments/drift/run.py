@@ -6,8 +6,8 @@ from typing import Any
 
 from pipeline.core.config import Files, Settings, read_settings
 from pipeline.core.stage import run
-from pipeline.dataset.parts import Part, stack
 from pipeline.dataset.rows import Selection
+from pipeline.dataset.windows import Part, stack
 from pipeline.evaluation.tally import tally
 from pipeline.experiments.answer import read_folder, read_losses, write_answer
 from pipeline.experiments.drift import networks as work
@@ -24,7 +24,7 @@ from pipeline.experiments.drift.windows import (
     over_windows,
     pace,
 )  # fmt: skip
-from pipeline.learning.card import went
+from pipeline.learning.card import collapse_record
 from pipeline.learning.recipe import HEADLINE, with_training
 from pipeline.trials.data import SceneData, train_all
 
@@ -55,7 +55,9 @@ def drift(scene: str, files: Files, indentations: Path, answer: Path) -> None:
     numbers = {name: value for name, value in words.items() if value is not None} | counts | pace(captures)
     variants = {name: own for name, own in rows.items() if name != HEADLINE}
     numbers |= {"left_out_units_n": windows.left_out_units_n} | told | ({"variants": variants} if variants else {})
-    write_answer(answer, numbers, drawn, read_losses(indentations, numbers["dropped"]), tally(map(went, trained)))
+    write_answer(
+        answer, numbers, drawn, read_losses(indentations, numbers["dropped"]), tally(map(collapse_record, trained))
+    )
 
 
 def _tell(

@@ -21,11 +21,10 @@ from pipeline.physics.friction import Friction
 from pipeline.physics.skin import Skin, beyond_verified_n, changes_of_field, draw_skin, forces, moved_dipoles
 from pipeline.physics.viscoelastic import Relaxation
 from pipeline.physics.wear import Ageing
-from pipeline.synthesis.capture import MAIN, Synthesis, roster
-from pipeline.synthesis.felt import Felt, Terms, feel
-from pipeline.synthesis.plans import Plan
-from pipeline.synthesis.protocols import make_plan
-from pipeline.synthesis.sideways import push
+from pipeline.synthesis.capture import roster
+from pipeline.synthesis.contact import Response, Terms, push, respond
+from pipeline.synthesis.protocols import Plan
+from pipeline.synthesis.settings import MAIN, Synthesis
 
 # Sizes of the terms that a scene leaves out: the design values of PHYSICS 5 (assumed there).
 AGEING = Ageing(settling=0.10, ageing=0.01, fading_per_decade=0.005, wandering_uT=0.2)
@@ -98,7 +97,7 @@ def _sorted_out(omission: Omission, of: Synthesis) -> Omission:
 def _subject(of: Synthesis, seed: int) -> Subject:
     protocol, kind = of.main, of.main_boards
     board, skin = roster(of, MAIN)[0]
-    plan = make_plan(protocol, rng_for(seed, "left out"))
+    plan = protocol.plan(rng_for(seed, "left out"), kind.skin_mm)
     tip_mm = np.stack([plan.x_mm - CENTRE_MM, plan.y_mm - CENTRE_MM, plan.depth_mm], axis=2)
     return Subject(
         draw_board(kind.design, of.spreads, seed=seed, name=board),
@@ -110,7 +109,7 @@ def _subject(of: Synthesis, seed: int) -> Subject:
     )
 
 
-def _over_time(on: Subject, without: Felt, seed: int) -> list[Omission]:
+def _over_time(on: Subject, without: Response, seed: int) -> list[Omission]:
     """Feel the whole protocol with a term, and compare with what was felt without."""
     n, slack = len(on.plan), RELAXATION
     rows = []
@@ -126,7 +125,7 @@ def _over_time(on: Subject, without: Felt, seed: int) -> list[Omission]:
     return rows
 
 
-def _temperature(on: Subject, without: Felt) -> Omission:
+def _temperature(on: Subject, without: Response) -> Omission:
     factor = warmth.remanence(np.array([WARMER_K]))[0]
     rest_uT = float(np.abs((factor - 1) * without.rest_T).max() / micro)
     field_pct = _error_pct(without.change_T, factor * without.change_T)
@@ -143,7 +142,7 @@ def _friction(on: Subject) -> Omission:
     return Omission("friction", _done("friction", on), field_pct, 0.0, force_pct, how)
 
 
-def _earth(without: Felt) -> Omission:
+def _earth(without: Response) -> Omission:
     """Add a steady field to no-load reading and contact alike, and take one from the other."""
     rest_T = without.rest_T[:, None] + EARTH_T
     seen_T = (rest_T + without.change_T) - rest_T
@@ -230,7 +229,7 @@ def _base_pct(skin: Skin, depth_m: float, other: layer.Base) -> float:
     return _error_pct(force_N(other), force_N(skin.base))
 
 
-def _steps(without: Felt, of: Synthesis) -> Omission:
+def _steps(without: Response, of: Synthesis) -> Omission:
     change_uT = without.change_T / micro
     step_uT = sensor.steps_uT(of.chip.gain_sel)
     share = np.sqrt((step_uT**2 / 12).mean() / (change_uT**2).mean())
@@ -264,15 +263,15 @@ def _own_field(on: Subject, of: Synthesis) -> Omission:
 
 def _too_deep(of: Synthesis, seed: int) -> Omission:
     """Count, over all skins, the stops that are deeper than any published solution vouches for."""
-    depth_m = milli * make_plan(of.main, rng_for(seed, "left out")).depth_mm.ravel()
+    depth_m = milli * of.main.plan(rng_for(seed, "left out"), of.main_boards.skin_mm).depth_mm.ravel()
     skins = [draw_skin(of.skin, of.spreads, seed=seed, name=skin, rule=COARSE) for _, skin in roster(of, MAIN)]
     share_pct = 100 * sum(beyond_verified_n(skin, depth_m) for skin in skins) / (len(depth_m) * len(skins))
     how = f"{share_pct:.3g} % of the stops of {len(skins)} skins are past 0.6 of the thickness: nothing published there"
     return Omission("depths past 0.6 of the thickness", "kept", None, None, None, how)
 
 
-def _feel(on: Subject, terms: Terms, seed: int) -> Felt:
-    return feel(on.board, on.skin, on.tip_m, tilt=on.plan.tilt, terms=terms, rng=rng_for(seed, "left out", "walk"))
+def _feel(on: Subject, terms: Terms, seed: int) -> Response:
+    return respond(on.board, on.skin, on.tip_m, tilt=on.plan.tilt, terms=terms, rng=rng_for(seed, "left out", "walk"))
 
 
 def _done(term: str, on: Subject) -> str:

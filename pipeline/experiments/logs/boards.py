@@ -13,7 +13,7 @@ from pipeline.experiments.ambient.fields import take_board
 from pipeline.experiments.logs.estimates import Answers
 from pipeline.experiments.logs.turning import Log, step_period_s, turn_log
 from pipeline.physics.ambient import EARTH_SIZE_T
-from pipeline.synthesis.of_settings import synthesis_of
+from pipeline.synthesis.settings import synthesis_of
 
 
 def turned(log: Log, board: str, settings: Settings, networks: Sequence[Answers]) -> dict[str, Any]:

@@ -15,8 +15,8 @@ from pipeline.experiments.runtime.settings import RunTime
 from pipeline.experiments.runtime.stopwatch import race
 from pipeline.experiments.runtime.trials import Trial, draw_trial
 from pipeline.physics.board import draw_board
-from pipeline.synthesis.capture import MAIN, Synthesis, roster
-from pipeline.synthesis.of_settings import synthesis_of
+from pipeline.synthesis.capture import roster
+from pipeline.synthesis.settings import MAIN, Synthesis, synthesis_of
 
 
 def read(settings: Settings) -> RunTime:

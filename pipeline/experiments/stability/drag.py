@@ -1,6 +1,6 @@
 """A tip dragged without friction, and with more than any skin has (PHYSICS 10). In: a skin's design. Out: cases.
 
-Refuses to know fields: they follow the force (`synthesis.sideways`).
+Refuses to know fields: they follow the force (`synthesis.contact`).
 """
 
 import numpy as np

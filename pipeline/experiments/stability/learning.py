@@ -16,8 +16,7 @@ from pipeline.dataset.splits import Split, draw_folds
 from pipeline.evaluation.metrics import METRICS, score
 from pipeline.experiments.stability.cases import Case, measured, refused, told
 from pipeline.learning.recipe import Labelling, Recipe
-from pipeline.learning.stack import train_stack
-from pipeline.learning.train import BLOCK_STEPS_N
+from pipeline.learning.train import BLOCK_STEPS_N, train_stack
 from pipeline.learning.trial import FewLabels, Measured, Start, Trained, Trial
 
 AREA = "learning"

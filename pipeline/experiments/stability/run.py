@@ -8,7 +8,7 @@ from pipeline.core.config import Files, read_settings
 from pipeline.core.stage import run, say
 from pipeline.experiments.stability.learning import learning_cases
 from pipeline.experiments.stability.survey import survey
-from pipeline.synthesis.of_settings import synthesis_of
+from pipeline.synthesis.settings import synthesis_of
 
 
 def stability(scene: str, files: Files, answer: Path) -> None:

@@ -10,7 +10,7 @@ from pipeline.core.config import Files, read_settings
 from pipeline.core.stage import run, say
 from pipeline.experiments.verification.survey import Designs
 from pipeline.experiments.verification.survey import verify as check_all
-from pipeline.synthesis.of_settings import synthesis_of
+from pipeline.synthesis.settings import synthesis_of
 
 
 def verification(scene: str, files: Files, answer: Path) -> None:
