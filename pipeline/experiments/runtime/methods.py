@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from pipeline.experiments.runtime.lattices import box_m, gauss_everywhere, midpoints
 from pipeline.experiments.runtime.motion import Path, paths
 from pipeline.experiments.runtime.trials import Trial, laid
-from pipeline.experiments.verification.magpylib_sum import field_of
+from pipeline.experiments.verification.field import field_of
 from pipeline.physics.change import change_of_field
 from pipeline.physics.nodes import Nodes, Quadrature, place_nodes
 from pipeline.physics.skin import Skin, changes_of_field
