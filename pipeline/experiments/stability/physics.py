@@ -184,7 +184,8 @@ def amplitude(board: Board, usual: Skin, bare: Skin, strong: Skin) -> list[Case]
 
 def single_precision(board: Board, fine: Skin) -> Case:
     rest = fine.nodes_m, fine.moments_A_m2
-    moved = kinematics.followed(fine, np.array([*PLACES_M[0], 0.5 * fine.thickness_m]), steps_n=1)
+    depths_m = kinematics.descent(0.5 * fine.thickness_m + fine.depth_zero_m, 1)
+    moved = kinematics.followed(fine, PLACES_M[0], depths_m)
     double_T = change_of_field(rest, moved, board.chips_m)
     x, m, moved_x, moved_m, chips = (part.astype(np.float32) for part in (*rest, *moved, board.chips_m))
     # Node by node, as the product does: the difference of two large sums would lose more.

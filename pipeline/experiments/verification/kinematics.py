@@ -113,17 +113,17 @@ def _places(h_m: float, r_n: int, z_n: int) -> tuple[Float[np.ndarray, " s"], Fl
     return r_m.ravel(), z_m.ravel()
 
 
-def followed(skin: Skin, poke_m: Float[np.ndarray, "3"], steps_n: int) -> Dipoles:
-    """Carry all dipoles of a skin through a poke (x, y, depth) without a table, in so many steps.
+def followed(skin: Skin, place_m: Float[np.ndarray, "2"], depths_m: Float[np.ndarray, " d"]) -> Dipoles:
+    """Carry all dipoles of a skin through a poke down to true depths, without a table.
 
     Each moment turns by the R of F = R U from a singular value decomposition. None may lie on the poke's axis.
     """
-    away_m = skin.nodes_m[:, :2] - poke_m[:2]
+    away_m = skin.nodes_m[:, :2] - place_m
     r_m = np.linalg.norm(away_m, axis=1)
     press = flow.Press(skin.thickness_m, skin.tip_radius_m, skin.base)
-    end = flow.follow(r_m, skin.nodes_m[:, 2], descent(float(poke_m[2]) + skin.depth_zero_m, steps_n), press=press)[-1]
+    end = flow.follow(r_m, skin.nodes_m[:, 2], depths_m, press=press)[-1]
     outward = np.column_stack([away_m / r_m[:, None], np.zeros_like(r_m)])
-    places_m = np.column_stack([poke_m[:2] + end.r_m[:, None] * outward[:, :2], end.z_m])
+    places_m = np.column_stack([place_m + end.r_m[:, None] * outward[:, :2], end.z_m])
     u, _, vt = np.linalg.svd(end.f)
     plane = np.stack([(skin.moments_A_m2 * outward).sum(axis=1), skin.moments_A_m2[:, 2]], axis=1)
     turned = np.einsum("sij,sj->si", u @ vt, plane)

@@ -83,7 +83,8 @@ def shortcuts(board: Board, skin: Skin, depth_m: float, kind: str, places_m: Pla
     pokes_m = each_depth(places_m, (depth_m,))
     _, found_T = changes_of_field(board, skin, pokes_m)
     before_T = field_of((skin.nodes_m, skin.moments_A_m2), board.chips_m)
-    moved = [kinematics.followed(skin, poke_m, REFERENCE_STEPS_N) for poke_m in pokes_m]
+    depths_m = kinematics.descent(depth_m + skin.depth_zero_m, REFERENCE_STEPS_N)
+    moved = [kinematics.followed(skin, place_m, depths_m) for place_m in places_m]
     truth_T = np.stack([field_of(dipoles, board.chips_m) - before_T for dipoles in moved])
     return Check("dB of pokes", f"table, steps and kernel, {kind} depth ({depth_m / milli:g} mm)",
                  f"each node followed in {REFERENCE_STEPS_N} steps, F = R U by SVD, magpylib's dipoles",
