@@ -110,7 +110,7 @@ def simulate_pokes(
 
     from pipeline.dataset.grid import CENTRE_MM
     from pipeline.physics.sensor import ChipDesign, read_field
-    from pipeline.synthesis.felt import Terms, feel
+    from pipeline.synthesis.contact import Terms, respond
 
     places_mm = np.asarray(pokes, np.float64)
     if places_mm.ndim != 2 or places_mm.shape[1] != 3:
@@ -120,11 +120,11 @@ def simulate_pokes(
     board = board or draw_board(seed=seed)
     rngs = {part: rng_for(seed, "poking", skin.name, part) for part in ("drift", "noload", "contact")}
     no_tilt = np.zeros((len(tip_m), 2))
-    felt = feel(board, skin, tip_m[:, None], tilt=no_tilt, terms=Terms(), rng=rngs["drift"])
+    response = respond(board, skin, tip_m[:, None], tilt=no_tilt, terms=Terms(), rng=rngs["drift"])
     design = parse(ChipDesign, _shared("chip", chip), "chip")
-    noload_uT, _ = read_field(felt.rest_T, board, design=design, rng=rngs["noload"])
-    b_uT, _ = read_field(felt.rest_T + felt.change_T[:, 0], board, design=design, rng=rngs["contact"])
-    return Pokes(noload_uT, b_uT, felt.force_N[:, 0, 2])
+    noload_uT, _ = read_field(response.rest_T, board, design=design, rng=rngs["noload"])
+    b_uT, _ = read_field(response.rest_T + response.change_T[:, 0], board, design=design, rng=rngs["contact"])
+    return Pokes(noload_uT, b_uT, response.force_N[:, 0, 2])
 
 
 class Model:

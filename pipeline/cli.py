@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 from typer import Argument, Option
 
+from pipeline.core import config
 from pipeline.core.errors import ParamsError, ReskinError
 
 if TYPE_CHECKING:
@@ -86,11 +87,11 @@ def add(
     allow_copy: Annotated[bool, Option("--allow-copy", help="Accept bytes that another label has.")] = False,
 ) -> None:
     """Add a recording to a scene; then `dvc repro` uses it."""
-    from pipeline import adding, plan, preparing
+    from pipeline import adding, preparing
     from pipeline.params import read_plan
 
     root, labels, marks = checkout(), preparing.Labels(board, skin, name), preparing.parse_marks(mark or [])
-    running = read_plan(root / plan.PLAN).scenes
+    running = read_plan(root / config.PLAN).scenes
     with preparing.suggesting_layout(recording, layout):
         if layout == "capture":
             prepared = preparing.native(recording, labels, probe, marks)
@@ -103,7 +104,7 @@ def add(
         header = adding.add(root, scene, prepared, allow_copy=allow_copy)
     typer.echo(f"added {scene}/{header.capture} (board {board}, skin {skin}); now: dvc repro")
     if scene not in running:
-        typer.echo(f"switched scene {scene} on in {plan.PLAN}, beside {', '.join(running) or 'no other'}")
+        typer.echo(f"switched scene {scene} on in {config.PLAN}, beside {', '.join(running) or 'no other'}")
 
 
 @app.command()
@@ -177,7 +178,7 @@ def publish() -> None:
 
     root = checkout()
     for name in checked_plan().scenes:
-        scene, answers = read_scene(plan.scene_file(root, name), root / plan.PARAMS), root / "data/answers" / name
+        scene, answers = read_scene(plan.scene_file(root, name), root / config.PARAMS), root / "data/answers" / name
         arms = {arm: root / "data/models" / name / arm for arm in scene.modelled}
         written = [answers / f"{stage}.json" for stage in (*scene.curves.values(), *scene.experiments)]
         missing = [path for path in (*arms.values(), *written) if not path.exists()]
@@ -218,14 +219,13 @@ def compare(
 @app.command()
 def readme(check: Annotated[bool, Option("--check", help="Only tell whether it is up to date.")] = False) -> None:
     """Fill in the generated parts of README.md from the results of the scenes that run."""
-    from pipeline import plan
     from pipeline.core import io
     from pipeline.core.config import read_yaml
     from pipeline.reporting.readme import blocks_of, fill
 
     root, running = checkout(), list(checked_plan().scenes)
     if not running:
-        raise ParamsError(plan.PLAN, "scenes", "one or more", "none", "Try: reskin scenes use quick")
+        raise ParamsError(config.PLAN, "scenes", "one or more", "none", "Try: reskin scenes use quick")
     words = [sys.executable, "-m", "dvc", "dag", "--md"]
     dag = subprocess.run(words, capture_output=True, text=True, check=True).stdout
     numbers = {file.parent.name: io.read_json(file) for file in sorted((root / "reports").glob("*/numbers.json"))}

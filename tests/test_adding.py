@@ -14,6 +14,7 @@ from pipeline.capture.header import Clock, write_capture
 from pipeline.capture.probe import ProbeLog
 from pipeline.capture.wire import encode
 from pipeline.cli import app
+from pipeline.core import config
 from pipeline.core.errors import ReskinError
 from pipeline.dataset.captures import open_capture, read_header
 from pipeline.preparing import Dump, Labels
@@ -30,7 +31,7 @@ def empty(tmp_path_factory) -> Path:
     """A checkout that runs no scene yet."""
     root = copy_checkout(tmp_path_factory.mktemp("checkout"))
     plan.use(root, [])
-    with (root / plan.SCENES / "small.yaml").open("w") as stream:
+    with (root / config.SCENES / "small.yaml").open("w") as stream:
         YAML().dump(recorded(), stream)
     return root
 
@@ -100,7 +101,7 @@ def test_a_copy_written_with_a_digit_more_is_still_a_copy(root, lab_file, tmp_pa
 
 def test_a_removal_that_cannot_be_planned_changes_nothing(root, lab_file):
     add_lab(root, lab_file)
-    file = root / plan.PLAN
+    file = root / config.PLAN
     file.write_text(file.read_text().replace("  small: [lobo]\n", "  small: [lobo]\n  nowhere: [lobo]\n", 1))
     refuse(root, lambda: adding.remove(root, "small", "board1_skin1_readings"), "nowhere")
 

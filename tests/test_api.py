@@ -16,7 +16,7 @@ from pipeline.dataset.folds import load_rows
 from pipeline.dataset.rows import Selection
 from pipeline.predicting import read_network
 from pipeline.synthesis.capture import record
-from pipeline.synthesis.of_settings import check_synthesis
+from pipeline.synthesis.settings import check_synthesis
 from tests.test_io import readings
 from tests.test_predicting import model  # noqa: F401 (a fixture)
 

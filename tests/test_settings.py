@@ -39,12 +39,12 @@ def root(tmp_path_factory) -> Path:
 
 
 def files_of(root: Path) -> Files:
-    return Files(root / SCENE, root / SHARED, root / plan.PLAN)
+    return Files(root / SCENE, root / SHARED, root / config.PLAN)
 
 
 def items(root: Path) -> dict[str, tuple[str, str, dict[str, Any]]]:
     """Every stage that reads settings by DVC's name of it: its module, its key and its item in the plan."""
-    stages = config.read_yaml(root / plan.PLAN)["stages"]
+    stages = config.read_yaml(root / config.PLAN)["stages"]
     return {f"{stage}@{key}": (stage, key, item) for stage in READING for key, item in stages[stage].items()}
 
 
@@ -242,11 +242,11 @@ def test_an_override_of_what_ingest_may_lose_re_runs_ingest_alone(root, before):
     assert changed == {name for name in known if name.startswith("ingest_simulated@")} != set()
 
 
-@pytest.mark.parametrize("scene", sorted(file.stem for file in (ROOT / plan.SCENES).glob("*.yaml")))
+@pytest.mark.parametrize("scene", sorted(file.stem for file in (ROOT / config.SCENES).glob("*.yaml")))
 def test_dvc_tracks_the_keys_that_a_stage_is_given_and_no_other(root, scene):
-    own = read_scene(root / plan.SCENES / f"{scene}.yaml", root / SHARED)
+    own = read_scene(root / config.SCENES / f"{scene}.yaml", root / SHARED)
     made = plan.make_plan({scene: own}, CAPTURES, FLOW)
-    words, shared = read_yaml(root / plan.SCENES / f"{scene}.yaml"), read_yaml(root / SHARED)
+    words, shared = read_yaml(root / config.SCENES / f"{scene}.yaml"), read_yaml(root / SHARED)
     for stage in READING:
         for key, item in made["stages"][stage].items():
             for kind, source in (("scene", words), ("shared", shared), ("plan", made)):
@@ -256,7 +256,7 @@ def test_dvc_tracks_the_keys_that_a_stage_is_given_and_no_other(root, scene):
                     assert optional or config.find(source, name) is not config.NOTHING, f"{stage}@{key}: {name}"
 
 
-YAML_OF_DVC = [ROOT / "dvc.yaml", ROOT / SHARED, ROOT / plan.PLAN, *sorted((ROOT / plan.SCENES).glob("*.yaml"))]
+YAML_OF_DVC = [ROOT / "dvc.yaml", ROOT / SHARED, ROOT / config.PLAN, *sorted((ROOT / config.SCENES).glob("*.yaml"))]
 
 
 @pytest.mark.parametrize("file", YAML_OF_DVC, ids=lambda file: file.name)
@@ -278,7 +278,7 @@ def test_a_row_that_the_plan_does_not_know_is_refused_with_both_remedies(root):
 
 
 def test_a_row_that_is_planned_along_by_a_second_override_is_taken(root):
-    planned = (plan.PLAN, "stages.train_multi.ci.train_multi.recipe=slow")
+    planned = (config.PLAN, "stages.train_multi.ci.train_multi.recipe=slow")
     with overridden(root, (SCENE, "train_multi.recipe=slow"), planned):
         asked = read_settings("train_multi", "ci", files_of(root))
         assert training(asked, "train_multi").recipes["paper"].rate_max == 0.003
