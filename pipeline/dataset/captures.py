@@ -23,6 +23,7 @@ from pipeline.capture.header import (
     check_same_capture,
     parse,
 )
+from pipeline.capture.probe import ProbeLog
 from pipeline.capture.readers import READERS
 from pipeline.capture.readers.chips import Watch
 from pipeline.capture.readers.units import check_log
