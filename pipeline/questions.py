@@ -90,8 +90,8 @@ def of_kind(*kinds: Kind) -> tuple[str, ...]:
 
 def stages(names: Iterable[str], *kinds: Kind) -> list[str]:
     """Name the stages that answer questions of some kinds, in the order of the table; each once."""
-    asked = set(names)
-    return list(dict.fromkeys(row.stage for row in ROWS if row.name in asked and row.kind in kinds))
+    chosen = set(names)
+    return list(dict.fromkeys(row.stage for row in ROWS if row.name in chosen and row.kind in kinds))
 
 
 LEARNING: tuple[Kind, ...] = ("models", "curve", "other")

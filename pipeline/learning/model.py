@@ -1,7 +1,7 @@
-"""Perceptrons at work, many copies at once. In: scaled inputs [m b c]. Out: scaled x, y, F, and the 40 features.
+"""Perceptrons, many at once. In: scaled inputs [m b c]. Out: scaled x, y, F, and the 40 features.
 
-A stack of m networks is one tensor a layer, and a batched product does what m small products did: a small network costs
-more in calls than in sums. Refuses to know how it is trained, and in which units.
+A stack of m networks is one tensor a layer, and a batched product replaces m small ones: for small networks calls cost
+more than sums. Refuses to know how it is trained, and in which units.
 """
 
 from collections.abc import Sequence
@@ -50,7 +50,7 @@ class Stack(nn.Module):
 
     def finite(self) -> Bool[torch.Tensor, " m"]:
         """Tell which networks have finite weights only."""
-        return torch.stack([torch.isfinite(one.detach()).flatten(1).all(1) for one in self.parameters()]).all(0)
+        return torch.stack([torch.isfinite(values.detach()).flatten(1).all(1) for values in self.parameters()]).all(0)
 
     def _run(self, values: torch.Tensor, first: int, last: int) -> torch.Tensor:
         for i in range(first, last):
