@@ -18,7 +18,7 @@ from pipeline.core.errors import ParamsError
 from pipeline.dataset.rows import Selection
 from pipeline.dataset.splits import Split
 from pipeline.learning.recipe import FineTuning, Labelling, Name, Recipe, Schedule
-from pipeline.questions import LEARNING, MAIN_PROTOCOL, POOLED_BY, QUESTIONS, ROWS, SECTIONS, Question, stages
+from pipeline.questions import MAIN_PROTOCOL, POOLED_BY, QUESTIONS, ROWS, SECTIONS, Question, stages
 
 SHARED_ROWS: dict[str, type[Schedule]] = {"recipes": Recipe, "adaptations": FineTuning, "labellings": Labelling}
 STEPS = "How many steps is a scene's budget: write them in its sections."
@@ -54,23 +54,15 @@ class Asking(Strict, extra="ignore"):
 
     @property
     def experiments(self) -> tuple[str, ...]:
-        """The experiments among the questions."""
         return tuple(row.name for row in self.rows if row.kind == "experiment")
 
     @property
     def studied(self) -> tuple[str, ...]:
-        """The questions about the physics."""
         return tuple(row.name for row in self.rows if row.kind == "study")
 
     @property
     def with_folds(self) -> tuple[str, ...]:
-        """The questions that have folds of their own."""
         return tuple(row.name for row in self.rows if row.folds is not None)
-
-    @property
-    def learning(self) -> list[str]:
-        """The stages that answer questions about learning."""
-        return stages(self.questions, *LEARNING)
 
     @property
     def modelled(self) -> list[str]:
@@ -212,5 +204,4 @@ def read_shared(path: Path) -> dict[str, Any]:
 
 
 def read_plan(path: Path) -> Plan:
-    """Read and check `pipeline/plan.yaml`."""
     return parse(Plan, read_yaml(path), str(path))

@@ -152,7 +152,6 @@ def _folders(scenes: Mapping[str, Scene]) -> dict[str, dict[str, str]]:
 
 
 def scene_names(root: Path) -> list[str]:
-    """The scenes that this checkout has."""
     if not (root / SCENES).is_dir():
         raise ParamsError(root / SCENES, "the folder", "there", "nothing", "Run this in the checkout.")
     return sorted(file.stem for file in (root / SCENES).glob("*.yaml"))

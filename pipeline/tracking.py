@@ -88,7 +88,6 @@ class Diary:
         return str(run.info.run_id), True
 
     def tag(self, run: Any, tags: Mapping[str, str]) -> None:
-        """Set tags that differ."""
         for name, value in tags.items():
             if run.data.tags.get(name) != value:
                 self.client.set_tag(run.info.run_id, name, value)
@@ -185,7 +184,6 @@ def _publish_curve(diary: Diary, stage: str, points: Sequence[tuple[str, int, Ma
 
 
 def _log(client: Any, run_id: str, rows: Iterable[tuple[str, float, int]]) -> None:
-    """Write metrics: name, value and step."""
     from mlflow.entities import Metric
 
     metrics = [Metric(name, value, 0, step) for name, value, step in rows]

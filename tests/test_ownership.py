@@ -26,12 +26,10 @@ HOMES = {
     r"\bimport serial|from serial": {"pipeline/capture/port.py"},
     r"ruamel": {"pipeline/core/config.py", "pipeline/plan.py", "pipeline/registry.py", "pipeline/tidying.py"},
     r"\bimport torch|from torch": {
-        "pipeline/learning/stack.py", "pipeline/learning/losses.py", "pipeline/learning/model.py",
-        "pipeline/learning/train.py", "pipeline/learning/feed.py",
+        "pipeline/learning/model.py", "pipeline/learning/train.py", "pipeline/learning/feed.py",
     },
     r"from sklearn": {
-        "pipeline/dataset/single.py", "pipeline/dataset/splits.py", "pipeline/experiments/contacts/oddness.py",
-        "pipeline/learning/classical.py",
+        "pipeline/dataset/splits.py", "pipeline/experiments/contacts/oddness.py", "pipeline/learning/classical.py",
     },
     r"os\.environ": {
         "pipeline/core/numerics.py", "pipeline/core/provenance.py", "pipeline/core/server.py",

@@ -23,6 +23,7 @@ from pipeline.capture.header import (
     check_same_capture,
     parse,
 )
+from pipeline.capture.probe import ProbeLog
 from pipeline.capture.readers import READERS
 from pipeline.capture.readers.watch import Watch, check_log
 from pipeline.capture.stream import FrameStream, no_frame
@@ -75,7 +76,6 @@ def open_capture(folder: Path) -> Opened:
 
 
 def read_header(folder: Path) -> Header:
-    """Read and check a capture's header."""
     file = folder / HEADER_FILE
     if not file.is_file():
         raise CaptureError(file, "a capture", f"a folder with {HEADER_FILE}", "none", "Is it another --layout?")

@@ -64,7 +64,6 @@ def to_ranges(numbers: Int64[np.ndarray, " n"]) -> list[list[int]]:
 
 
 def from_ranges(ranges: Sequence[Sequence[int]]) -> Int64[np.ndarray, " n"]:
-    """Read half-open ranges back."""
     return np.concatenate([np.arange(start, stop) for start, stop in ranges] or [np.zeros(0, np.int64)])
 
 

@@ -33,11 +33,9 @@ class Stack(nn.Module):
         return self._run(inputs, 0, FEATURE_LAYERS_N)
 
     def answer(self, features: Float[torch.Tensor, "m b 40"]) -> Float[torch.Tensor, "m b t"]:
-        """Turn features into scaled x, y, F."""
         return self._run(features, FEATURE_LAYERS_N, len(self.relus))
 
     def forward(self, inputs: Float[torch.Tensor, "m b c"]) -> Float[torch.Tensor, "m b t"]:
-        """Answer for a batch of each network."""
         return self.answer(self.features(inputs))
 
     def member(self, i: int) -> dict[str, np.ndarray]:
@@ -49,7 +47,6 @@ class Stack(nn.Module):
         return taken
 
     def finite(self) -> Bool[torch.Tensor, " m"]:
-        """Tell which networks have finite weights only."""
         return torch.stack([torch.isfinite(values.detach()).flatten(1).all(1) for values in self.parameters()]).all(0)
 
     def _run(self, values: torch.Tensor, first: int, last: int) -> torch.Tensor:
@@ -69,7 +66,6 @@ class Predictor:
 
     @torch.no_grad()
     def __call__(self, inputs: Float32[np.ndarray, "n c"]) -> Float32[np.ndarray, "n t"]:
-        """Answer for scaled rows."""
         blocks = torch.from_numpy(inputs).split(BLOCK_ROWS_N)
         return torch.cat([self.net(block[None].to(self.device))[0].cpu() for block in blocks]).numpy()
 

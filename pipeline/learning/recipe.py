@@ -3,7 +3,7 @@
 A section names a shared row, its number of steps, and the differences of its variants. Knows no data and no network.
 """
 
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field, model_validator
 
@@ -84,7 +84,7 @@ class _Recipes(Strict):
     recipes: dict[Name, Any]
 
     @model_validator(mode="after")
-    def _has_a_headline(self) -> Self:
+    def _has_a_headline(self) -> "_Recipes":
         if HEADLINE not in self.recipes:
             raise ValueError(f"recipes hold a recipe named {HEADLINE}, which stands beside the paper's numbers")
         return self
