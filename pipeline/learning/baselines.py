@@ -81,7 +81,6 @@ def baselines(settings: Settings) -> Baselines:
 
 
 def run_tasks(tasks: Sequence[Task], rows: Measured, executor: Executor, tell: Callable[[str], None]) -> list[Fit]:
-    """Fit and predict; every task by itself."""
     running = [executor.submit(_fit, task.method, task.name, task.seed, _inputs(task, rows)) for task in tasks]
     fits = []
     for task, future in zip(tasks, running, strict=True):

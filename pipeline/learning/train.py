@@ -152,7 +152,6 @@ class Watch:
         return len(self.stopped) < len(sound)
 
     def outcomes(self) -> list[Outcome]:
-        """Give every network as it was when it was last finite."""
         parts = zip(self.last, self.curves, strict=True)
         return [Outcome(weights, curve, self.stopped.get(i)) for i, (weights, curve) in enumerate(parts)]
 

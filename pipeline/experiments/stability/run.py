@@ -11,8 +11,7 @@ from pipeline.experiments.stability.chip import chip_cases
 from pipeline.experiments.stability.learning import learning_cases
 from pipeline.experiments.stability.physics import drag_cases, physics_cases, time_cases
 from pipeline.experiments.stability.wire import wire_cases
-from pipeline.synthesis.settings import Synthesis
-from pipeline.synthesis.settings import synthesis_of
+from pipeline.synthesis.settings import Synthesis, synthesis_of
 
 
 def survey(of: Synthesis, seed: int) -> list[Case]:

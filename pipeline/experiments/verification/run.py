@@ -17,8 +17,7 @@ from pipeline.experiments.verification.kinematics import check_kinematics
 from pipeline.experiments.verification.poke import check_poke
 from pipeline.experiments.verification.relaxation import check_relaxation
 from pipeline.physics.flow import Press
-from pipeline.synthesis.settings import Synthesis
-from pipeline.synthesis.settings import synthesis_of
+from pipeline.synthesis.settings import Synthesis, synthesis_of
 
 
 def verify(of: Synthesis, *, depths_m: tuple[float, ...], seed: int) -> list[Check]:
