@@ -24,7 +24,7 @@ HOMES = {
         "core/numerics.py",
         "core/provenance.py",
         "core/server.py",
-        "learning/executors.py",
+        "core/executors.py",
         "tracking.py",
     ],
     r"import pickle|torch\.load\(|allow_pickle=True": [],

@@ -15,9 +15,9 @@ from jaxtyping import Float32, Int64
 from pydantic import Field
 
 from pipeline.core.config import Settings, Strict, parse
+from pipeline.core.executors import median_s
 from pipeline.core.seeds import rng_for
 from pipeline.learning.classical import Classical, fit
-from pipeline.learning.executors import median_s
 from pipeline.learning.inputs import VIEW
 from pipeline.learning.recipe import Name, Steps
 from pipeline.learning.trial import Measured

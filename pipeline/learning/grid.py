@@ -19,7 +19,7 @@ import numpy as np
 
 from pipeline.core import io
 from pipeline.core.errors import TrainingError
-from pipeline.learning.executors import device
+from pipeline.core.executors import device
 from pipeline.learning.inputs import Scaler
 from pipeline.learning.trial import Keys, Measured, Trained, Trial
 

@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Float
 
 from pipeline.core.errors import TrainingError
+from pipeline.core.executors import device, median_s
 from pipeline.learning.architecture import LAYERS, Weights
-from pipeline.learning.executors import device, median_s
 from pipeline.learning.feed import UNLABELLED, Feed
 from pipeline.learning.inputs import VIEW, Scaler
 from pipeline.learning.job import Job, make_job

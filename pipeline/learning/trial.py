@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Int64, Shaped
 
+from pipeline.core.executors import device
 from pipeline.core.numerics import signature
 from pipeline.dataset.lines import Lines
 from pipeline.learning.architecture import Weights
-from pipeline.learning.executors import device
 from pipeline.learning.inputs import Scaler
 from pipeline.learning.recipe import FineTuning, Labelling, Recipe, Schedule
 

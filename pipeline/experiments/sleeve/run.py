@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.core.config import Files, Settings, read_settings
+from pipeline.core.executors import make_executor
 from pipeline.core.stage import run, say
 from pipeline.dataset.rows import Selection, gather
 from pipeline.evaluation.tally import tally
@@ -14,7 +15,6 @@ from pipeline.experiments.sleeve.settings import Sleeve
 from pipeline.learning.baselines import Task, run_tasks
 from pipeline.learning.card import collapse_record
 from pipeline.learning.classical import Neighbours
-from pipeline.learning.executors import make_executor
 from pipeline.learning.recipe import HEADLINE, with_training
 from pipeline.learning.trial import Measured, Trial
 from pipeline.synthesis.settings import synthesis_of
