@@ -2,10 +2,15 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import kstest
 
+from pipeline.core.config import parse
+from pipeline.core.errors import ParamsError
 from pipeline.core.seeds import rng_for
 from pipeline.dataset.grid import points_mm
-from pipeline.synthesis.protocols import SKIN_MM, Drag, Grid, Hand
+from pipeline.synthesis.protocols import SKIN_MM, Drag, Grid, Hand, Scatter
 
 SHARED = {"boards": "rigid", "skins_n": 1, "terms": ()}
 GRID = Grid(kind="grid", passes_n=2, depths_mm=(0.2, 0.4, 0.6, 0.8, 1.0, 1.2), **SHARED)
@@ -72,3 +77,48 @@ def test_only_a_hand_is_random():
         one, other = plan_of(protocol, "one"), plan_of(protocol, "other")
         assert np.array_equal(one.x_mm, other.x_mm) == alike
         assert np.array_equal(plan_of(protocol, "one").depth_mm, one.depth_mm)
+
+
+SCATTER = {
+    "kind": "scatter", "boards": "sleeve", "skins_n": 1, "pokes_n": 3000, "depth_mm": [0.4, 1.2], "margin_mm": 4.0,
+    "terms": [], "rate_hz": 133.0,
+}  # fmt: skip
+SLEEVE_MM = (50.8, 101.6)
+
+
+def scattered(name="plan", skin_mm=SLEEVE_MM, **changes):
+    return parse(Scatter, SCATTER | changes, "test").plan(rng_for(0, name), skin_mm)
+
+
+def test_places_and_depths_are_uniform_within_the_margin():
+    plan = scattered()
+    for drawn, low, high in ((plan.x_mm, 4.0, 46.8), (plan.y_mm, 4.0, 97.6), (plan.depth_mm, 0.4, 1.2)):
+        # One honest draw in a thousand is further off than this.
+        assert kstest(drawn.ravel(), "uniform", args=(low, high - low)).pvalue > 1e-3
+    assert abs(np.corrcoef(plan.x_mm.ravel(), plan.y_mm.ravel())[0, 1]) < 4 / np.sqrt(3000)
+
+
+@given(st.tuples(st.floats(5, 200), st.floats(5, 200)), st.floats(0, 2.4))
+def test_no_poke_is_nearer_to_an_edge_than_the_margin_and_the_middle_is_half_of_the_sides(skin_mm, margin_mm):
+    plan = scattered(skin_mm=skin_mm, margin_mm=margin_mm, pokes_n=50)
+    place_mm = np.hstack([plan.x_mm, plan.y_mm])
+    to_edge_mm = np.minimum(place_mm, np.array(skin_mm) - place_mm)
+    assert to_edge_mm.min() >= margin_mm * (1 - 1e-9)
+    assert plan.centre_mm == (skin_mm[0] / 2, skin_mm[1] / 2)
+    assert plan.labelled
+    assert not plan.tilt.any()
+
+
+def test_other_draws_give_other_places():
+    assert not np.array_equal(scattered("one").x_mm, scattered("other").x_mm)
+    assert np.array_equal(scattered("one").x_mm, scattered("one").x_mm)
+
+
+def test_a_margin_that_leaves_nothing_is_refused():
+    with pytest.raises(ParamsError, match="less than half of the skin's shorter side, 25.4 mm; got 25.4"):
+        scattered(margin_mm=25.4)
+
+
+def test_depths_that_fall_are_refused():
+    with pytest.raises(ParamsError, match="from the shallower to the deeper"):
+        scattered(depth_mm=[1.2, 0.4])
