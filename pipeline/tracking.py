@@ -18,7 +18,7 @@ from typing import Any
 
 from pipeline.core import io
 from pipeline.core.server import TrackingAway, probe, server_uri
-from pipeline.evaluation.summary import over_folds, pool_skins
+from pipeline.evaluation.scores import over_folds, tidy
 
 STORE = "mlflow.db"
 ARTIFACTS = "mlartifacts"
@@ -262,9 +262,8 @@ def _log_means(client: Any, run_id: str, cards: list[dict[str, Any]]) -> None:
     from mlflow.entities import Metric
 
     metrics = []
-    for question, recipe in sorted({(card["question"], card["recipe_name"]) for card in cards}):
-        own = [card for card in cards if (card["question"], card["recipe_name"]) == (question, recipe)]
-        for name, summary in over_folds(pool_skins(own) if "tuning" in own[0] else own).items():
+    for (question, recipe), rows in tidy(cards).groupby(["question", "recipe"]):
+        for name, summary in over_folds(rows).items():
             metrics += [Metric(f"{question}.{recipe}.{name}.{key}", value, 0, 0) for key, value in summary.items()]
     client.log_batch(run_id, metrics=metrics)
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.core.errors import ParamsError
-from pipeline.evaluation.summary import over_folds, pool_skins
+from pipeline.evaluation.scores import over_folds, tidy
 
 BY = "mse_xy_mm2"
 PAPER_INPUTS = "raw"
@@ -86,7 +86,7 @@ def _error(cards: Cards, of: dict[str, Any]) -> float:
     """Mean over budgets of the error of all cards with the settings of one."""
     alike = [card for card in cards if _key(card) == _key(of)]
     budgets = [[card for card in alike if _budget(card) == one] for one in sorted({*map(_budget, alike)})]
-    return float(np.mean([over_folds(pool_skins(own) if "tuning" in of else own)[BY]["mean"] for own in budgets]))
+    return float(np.mean([over_folds(tidy(own))[BY]["mean"] for own in budgets]))
 
 
 def _check_budgets(cards: Cards, stage: str) -> None:
@@ -115,7 +115,7 @@ def _candidates(cards: Cards) -> list[dict[str, Any]]:
         {
             "recipe_name": name,
             "settings": ", ".join(f"{key} {value}" for key, value in settings_of(own[0]).items() if key in VARIED),
-            **over_folds(pool_skins(own) if "tuning" in own[0] else own),
+            **over_folds(tidy(own)),
         }
         for name, own in by_name.items()
     ]

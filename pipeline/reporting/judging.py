@@ -1,6 +1,6 @@
 """How one row of the checklist is judged: a rule, the paper's number, ours -> a verdict and a sentence.
 
-Verdicts are of `evaluation.inference`, by intervals over boards. Refuses to know which results there are.
+Verdicts are of `evaluation.scores`, by intervals over boards. Refuses to know which results there are.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from pipeline.core.config import Strict
-from pipeline.evaluation.inference import (
+from pipeline.evaluation.scores import (
     INCONCLUSIVE,
     NO,
     ONE_BOARD,

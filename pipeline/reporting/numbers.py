@@ -1,84 +1,26 @@
-"""`numbers.json`: every number that any text shows, nested by question. In: cards, accounts, costs. Out: plain words.
+"""`numbers.json`: every number that any text shows, nested by question. In: scores, accounts, costs. Out: plain words.
 
 A question that was not asked is absent. Refuses to know how a number is shown.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
-from pipeline.evaluation.comparison import over_boards, over_pairs
-from pipeline.evaluation.metrics import summarise
-from pipeline.evaluation.summary import over_folds
-from pipeline.evaluation.tally import tally
+from pipeline.evaluation.scores import tally
 from pipeline.questions import QUESTIONS
-from pipeline.reporting.learned import by_fold, learned
-
-SINGLE = ("single_random", "single_temporal")  # the first of these stands beside the paper's numbers
-HONEST = {"by_indentation": "single_indentation", "by_pass": "single_pass"}  # the same skin, more of it held out
+from pipeline.reporting.learned import learned
 
 Cards = Sequence[dict[str, Any]]
 
 
 def compose(
-    cards: Cards,
-    points: Mapping[str, Cards],
-    accounts: Iterable[Mapping[str, int]],
-    dropped: Mapping[str, int],
-    *,
-    headline: str,
+    table: pd.DataFrame, accounts: Iterable[Mapping[str, int]], dropped: Mapping[str, int], *, headline: str
 ) -> dict[str, Any]:
     """Compose what follows from the data alone; `headline` names the recipe that stands beside the paper's numbers."""
-    numbers: dict[str, Any] = {"capture": add_up(accounts) | {"left_out": dict(dropped)}}
-    by_question: dict[str, list[dict[str, Any]]] = {}
-    for card in cards:
-        by_question.setdefault(card["question"], []).append(card)
-    table2 = {}
-    if "transfer" in by_question:
-        table2["single"] = over_pairs(_of(by_question["transfer"], headline))
-    if "lobo" in by_question:
-        pooled = _of(by_question["lobo"], headline)
-        table2["multi"] = over_boards(pooled)
-        numbers["lobo"] = {
-            "registered": over_boards(pooled, "registered"),
-            "by_board": {
-                board: {
-                    "trained_on_skins_n": len(own[0]["train_skins"]),
-                    "as_labelled": summarise_means(own, "all"),
-                    "registered": summarise_means(own, "registered"),
-                }
-                for board, own in _group(pooled, "fold").items()
-            },
-        }
-    further = learned(cards, points, headline=headline)
-    if table2:
-        numbers["table2"] = table2 | further.pop("table2", {})
-    numbers |= further
-    for question in (name for name in SINGLE if name in by_question):
-        numbers[question] = over_folds(_of(by_question[question], headline))
-        numbers.setdefault("single_sensor", {"split": question} | numbers[question])
-    for name, question in HONEST.items():
-        if question in by_question:
-            numbers[question] = over_folds(_of(by_question[question], headline))
-            numbers.setdefault("single_sensor", {})[name] = numbers[question]
-    numbers["variants"] = {
-        question: {recipe: _over(question)(by_fold(own)) for recipe, own in _group(all_, "recipe_name").items()}
-        for question, all_ in by_question.items()
-    }
-    return numbers
-
-
-def _over(question: str) -> Callable[[Cards], dict[str, dict[str, Any]]]:
-    """Choose what a question's scores are summarised over: repeats on one skin are no boards."""
-    if question == "transfer":
-        return over_pairs
-    return over_folds if question.startswith("single_") else over_boards
-
-
-def summarise_means(cards: Cards, part: str) -> dict[str, float]:
-    """Mean over seeds of each metric."""
-    return {name: value["mean"] for name, value in summarise([card["scores"][part] for card in cards]).items()}
+    return {"capture": add_up(accounts) | {"left_out": dict(dropped)}, **learned(table, headline=headline)}
 
 
 def add_up(accounts: Iterable[Mapping[str, int]]) -> dict[str, int]:
@@ -167,14 +109,3 @@ def rounded(value: Any, digits: int = 6) -> Any:
     if isinstance(value, float):
         return float(np.format_float_positional(value, digits, unique=False, fractional=False, trim="-"))
     return value
-
-
-def _of(cards: Cards, recipe: str) -> list[dict[str, Any]]:
-    return [card for card in cards if card["recipe_name"] == recipe]
-
-
-def _group(cards: Cards, key: str) -> dict[str, list[dict[str, Any]]]:
-    groups: dict[str, list[dict[str, Any]]] = {}
-    for card in cards:
-        groups.setdefault(card[key], []).append(card)
-    return groups

@@ -9,7 +9,7 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.evaluation.inference import VERDICTS, negated, verdict, verdict_within
+from pipeline.evaluation.scores import VERDICTS, negated, verdict, verdict_within
 from pipeline.reporting.paper import ADAPTED_POKES_N, TABLE_2, TABLE_2_ROWS, Number
 from pipeline.reporting.shown import COLUMNS, Stat, n_of, show_difference, tabulate
 

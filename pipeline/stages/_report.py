@@ -5,12 +5,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from pipeline.core import io
 from pipeline.core.config import Settings, parse
 from pipeline.core.errors import ParamsError
 from pipeline.core.provenance import SECONDS, add_up_costs, code_version, device, read_costs
 from pipeline.core.stage import COSTS
 from pipeline.evaluation.choice import choose
+from pipeline.evaluation.scores import tidy
 from pipeline.learning.executors import device as trained_on
 from pipeline.learning.recipe import HEADLINE
 from pipeline.params import Asking
@@ -46,15 +49,18 @@ def read_cards(asked: Asking, models: Path) -> list[dict[str, Any]]:
     return [io.read_json(file) for arm in asked.modelled for file in sorted((models / arm).glob("*.json"))]
 
 
-def read_numbers(known: Settings, asked: Asking, at: Places) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Read what numbers.json says, and by experiment what only its figures show."""
+def read_numbers(
+    known: Settings, asked: Asking, at: Places
+) -> tuple[dict[str, Any], dict[str, Any], pd.DataFrame]:
+    """Read what numbers.json says, by experiment what only its figures show, and the table of scores."""
     scene = known.scene
     words, cards = io.read_json(at.folds), read_cards(asked, at.models)
     accounts = [io.read_account(at.indentations / f"{name}.parquet") for name in words["captures"]]
     points = {question: io.read_json(at.answers / f"{file}.json") for question, file in asked.curves.items()}
     numbers: dict[str, Any] = {"provenance": _provenance(known, asked, cards)}
     experiments = {question: io.read_json(at.answers / f"{question}.json") for question in asked.experiments}
-    numbers |= compose(cards, points, accounts, words["dropped"], headline=HEADLINE)
+    table = tidy(cards, points)
+    numbers |= compose(table, accounts, words["dropped"], headline=HEADLINE)
     numbers |= {"trainings": count_trainings(cards, points, experiments)}
     losses = {question: answer["losses"] for question, answer in experiments.items()}
     numbers |= {"capture_by_protocol": lost_by_protocol(losses)} if asked.source == "simulated" else {}
@@ -66,7 +72,7 @@ def read_numbers(known: Settings, asked: Asking, at: Places) -> tuple[dict[str, 
     took = _seconds(scene)
     numbers |= answered(studied, runtime(cards, _costs(scene, asked)), took)
     numbers["runtime"] |= timed_learning(numbers, took)
-    return rounded(numbers), {question: answer["drawn"] for question, answer in experiments.items()}
+    return rounded(numbers), {question: answer["drawn"] for question, answer in experiments.items()}, table
 
 
 def _provenance(of: Settings, asked: Asking, cards: Cards) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import pyarrow as pa
 from pipeline.core import io
 from pipeline.core.provenance import SECONDS, code_version
 from pipeline.dataset.rows import TARGETS, Rows
-from pipeline.evaluation.summary import score_groups
+from pipeline.evaluation.metrics import score_groups
 from pipeline.learning.card import describe, went
 from pipeline.learning.trial import Trained, Trial
 from pipeline.trials.data import SceneData
