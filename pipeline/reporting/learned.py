@@ -20,7 +20,6 @@ from pipeline.evaluation.scores import (
     over_folds,
     over_pairs,
     paired,
-    records,
     select,
     tidy,
     whole,
@@ -51,11 +50,12 @@ def learned(table: pd.DataFrame, *, headline: str) -> dict[str, Any]:
     models = {row: own for row, own in {**models, CONTROL: select(table, question="adapt", recipe=CONTROL)}.items()
               if len(own)}  # fmt: skip
     numbers: dict[str, Any] = {
-        "table2": {row: (over_pairs if row == "single" else over_boards)(models[row]) for row in TABLE_2 if row in models},
+        "table2": {
+            row: (over_pairs if row == "single" else over_boards)(models[row]) for row in TABLE_2 if row in models
+        },
         "lobo": _lobo(models["multi"]) if "multi" in models else {},
         "paired": [
-            {"of": of, "over": over}
-            | paired(by_skin(models[of]), by_skin(models[over]), where_tested=over == "single")
+            {"of": of, "over": over} | paired(by_skin(models[of]), by_skin(models[over]), where_tested=over == "single")
             for of, over in PAIRS
             if of in models and over in models
         ],
@@ -95,7 +95,10 @@ def _lobo(rows: pd.DataFrame) -> dict[str, Any]:
     by_board = {
         str(board): {
             "trained_on_skins_n": int(own["trained_on_skins_n"].iloc[0]),
-            **{places: whole(own, places)[list(METRICS)].mean().dropna().to_dict() for places in (AS_LABELLED, REGISTERED)},
+            **{
+                places: whole(own, places)[list(METRICS)].mean().dropna().to_dict()
+                for places in (AS_LABELLED, REGISTERED)
+            },
         }
         for board, own in rows.groupby("fold", sort=False)
     }
@@ -117,13 +120,17 @@ def _variants(table: pd.DataFrame) -> dict[str, dict[str, Any]]:
     numbers: dict[str, dict[str, Any]] = {}
     models = table[table["question"].isin(of_kind("models"))]
     for (question, recipe), own in models.groupby(["question", "recipe"], sort=False):
-        summarise = over_pairs if question == "transfer" else over_folds if question.startswith("single_") else over_boards
+        summarise = (
+            over_pairs if question == "transfer" else over_folds if question.startswith("single_") else over_boards
+        )
         numbers.setdefault(question, {})[recipe] = summarise(own)
     return numbers
 
 
 def _curves(table: pd.DataFrame) -> dict[str, Any]:
-    pokes, sensors, classical, labels = (select(table, question=name) for name in ("pokes", "sensors", "baselines", "labels"))
+    pokes, sensors, classical, labels = (
+        select(table, question=name) for name in ("pokes", "sensors", "baselines", "labels")
+    )
     numbers: dict[str, Any] = {}
     if len(pokes):
         numbers["sweep_pokes"] = [{"pokes_n": int(n), **over_boards(own)} for n, own in pokes.groupby("pokes_n")]

@@ -49,9 +49,7 @@ def read_cards(asked: Asking, models: Path) -> list[dict[str, Any]]:
     return [io.read_json(file) for arm in asked.modelled for file in sorted((models / arm).glob("*.json"))]
 
 
-def read_numbers(
-    known: Settings, asked: Asking, at: Places
-) -> tuple[dict[str, Any], dict[str, Any], pd.DataFrame]:
+def read_numbers(known: Settings, asked: Asking, at: Places) -> tuple[dict[str, Any], dict[str, Any], pd.DataFrame]:
     """Read what numbers.json says, by experiment what only its figures show, and the table of scores."""
     scene = known.scene
     words, cards = io.read_json(at.folds), read_cards(asked, at.models)

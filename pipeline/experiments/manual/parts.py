@@ -24,6 +24,8 @@ def answer_manual(answers: Sequence[Answered], *, pokes_n: Sequence[int], lines_
         "seeds_n": len({one.seed_i for one in answers}),
     }
     differences = {
-        f"{AFTER}_minus_{other}": compare_arms(answers, AFTER, other) for other in (BEFORE, CONTROL, GRID) if other in arms
+        f"{AFTER}_minus_{other}": compare_arms(answers, AFTER, other)
+        for other in (BEFORE, CONTROL, GRID)
+        if other in arms
     }
     return counts | arms | {"paired": differences}
