@@ -68,7 +68,7 @@ def read_numbers(known: Settings, asked: Asking, at: Places) -> tuple[dict[str, 
     numbers |= {question: answer["numbers"] for question, answer in experiments.items()}
     studied = {question: io.read_json(at.answers / f"{question}.json") for question in asked.studied}
     took = _seconds(scene)
-    numbers |= answered(studied, runtime(cards, _costs(scene, asked)), took)
+    numbers |= answered(studied, runtime(len(cards), _costs(scene, asked)), took)
     numbers["runtime"] |= timed_learning(numbers, took)
     return rounded(numbers), {question: answer["drawn"] for question, answer in experiments.items()}, table
 

@@ -8,9 +8,9 @@ from pipeline.core.stage import run, say
 from pipeline.evaluation.choice import to_record
 from pipeline.learning.recipe import HEADLINE
 from pipeline.reporting.figures import error_grids
+from pipeline.reporting.numbers import headline_scores
 from pipeline.reporting.page import page
 from pipeline.reporting.parts import experiment_figures
-from pipeline.reporting.scores import headline_scores
 from pipeline.reporting.sweeps import learning_figures, learning_pages
 from pipeline.reporting.tables import make_tables, table_texts
 from pipeline.reporting.work_precision import pages
