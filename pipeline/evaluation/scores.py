@@ -4,11 +4,12 @@ A row is one training on one skin, or on all skins that it was tested on. The un
 share it and the network that never saw it. Refuses to know networks, files, and who claims what.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from jaxtyping import Float
 from scipy.stats import t
 
 from pipeline.core.errors import SchemaError
@@ -32,6 +33,7 @@ VERDICTS = (
 )
 
 Cards = Sequence[Mapping[str, Any]]
+Values = Sequence[float] | Float[np.ndarray, " n"] | pd.Series
 Stat = Mapping[str, Any]  # mean, n; where n > 1 also sd, and where n are boards ci95: [low, high]
 
 
@@ -44,11 +46,17 @@ def tidy(cards: Cards, points: Mapping[str, Cards] | None = None) -> pd.DataFram
     keyed += [
         (_keys_of_point(question, point), point["scores"]) for question, own in (points or {}).items() for point in own
     ]
-    rows = [row for keys, scores in keyed for row in _rows(keys, scores)]
-    table = pd.DataFrame(rows, columns=[*KEYS, *METRICS])
-    table = table.fillna(dict.fromkeys(NAMES, "")).astype(dict.fromkeys((*COUNTS, *METRICS), float))
-    whole = table[table.skin == ALL_SKINS]
-    return pd.concat([_pool(whole), table[table.skin != ALL_SKINS]], ignore_index=True)
+    rows = [dict.fromkeys(NAMES, "") | row for keys, scores in keyed for row in _rows(keys, scores)]
+    alike: dict[Hashable, list[dict[str, Any]]] = {}  # for all skins: one training, or one for each skin
+    for row in (row for row in rows if row["skin"] == ALL_SKINS):
+        alike.setdefault(tuple(row.get(key) for key in KEYS if key != "rows_n"), []).append(row)
+    kept = [*map(_pool, alike.values()), *(row for row in rows if row["skin"] != ALL_SKINS)]
+    return pd.DataFrame(kept, columns=[*KEYS, *METRICS]).astype(dict.fromkeys((*COUNTS, *METRICS), float))
+
+
+def to_csv(table: pd.DataFrame) -> str:
+    """Write the table with six significant digits, as numbers.json has."""
+    return table.convert_dtypes().to_csv(index=False, float_format="%.6g")
 
 
 def select(rows: pd.DataFrame, **words: str | float) -> pd.DataFrame:
@@ -68,7 +76,7 @@ def by_skin(rows: pd.DataFrame) -> pd.DataFrame:
     return rows[rows["skin"] != ALL_SKINS]
 
 
-def interval(values: Sequence[float] | pd.Series) -> list[float] | None:
+def interval(values: Values) -> list[float] | None:
     """Give the two-sided 95 % interval of a mean by Student's t with n - 1 degrees of freedom; None below two values.
 
     >>> interval([1.0]) is None
@@ -84,7 +92,7 @@ def interval(values: Sequence[float] | pd.Series) -> list[float] | None:
     return [mean - reach, mean + reach]
 
 
-def statistic(values: Sequence[float] | pd.Series, *, boards: bool = False) -> dict[str, Any]:
+def statistic(values: Values, *, boards: bool = False) -> dict[str, Any]:
     """Give mean and number, and of two values or more sd (n - 1) and, if they are `boards`, the interval `ci95`."""
     stat = {"mean": float(np.mean(values)), "n": len(values)}
     if len(values) < 2:
@@ -239,11 +247,10 @@ def _rows(keys: Mapping[str, Any], scores: Mapping[str, Any]) -> list[dict[str, 
     return rows
 
 
-def _pool(rows: pd.DataFrame) -> pd.DataFrame:
-    """Put trainings of one fold and seed together that were tested on a skin each, by their numbers of rows."""
-    keys, metrics = [key for key in KEYS if key != "rows_n"], list(METRICS)
-    known_n = rows[metrics].notna().mul(rows["rows_n"], axis=0)
-    weighted = rows[metrics].mul(rows["rows_n"], axis=0)
-    parts = [part.assign(**rows[keys]) for part in (rows[["rows_n"]], weighted, known_n)]
-    rows_n, sums, known_n = (part.groupby(keys, dropna=False, sort=False).sum() for part in parts)
-    return rows_n.join(sums / known_n).reset_index()
+def _pool(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Put the scores of one fold and seed together that were tested on a skin each, by their numbers of rows."""
+    rows_n = [row["rows_n"] for row in rows]
+    scores = {
+        name: float(np.average([row[name] for row in rows], weights=rows_n)) for name in METRICS if name in rows[0]
+    }
+    return {**rows[0], **scores, "rows_n": sum(rows_n)}

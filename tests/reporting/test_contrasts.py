@@ -1,9 +1,9 @@
 """Contrasts of the sweeps of figure 6, from points small enough to be subtracted by hand."""
 
 import pytest
-
 from pipeline.evaluation.inference import interval
 from pipeline.reporting.contrasts import contrasts_of_pokes, contrasts_of_sensors
+
 from tests.reporting.test_learned import HELD_OUT, card
 
 

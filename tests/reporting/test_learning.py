@@ -5,7 +5,6 @@ from itertools import pairwise
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
 from pipeline.reporting.learning import (
     adaptation_costs_table,
     audit_table,
@@ -17,6 +16,7 @@ from pipeline.reporting.learning import (
     sweep_pokes_table,
     sweep_sensors_table,
 )
+
 from pipeline.reporting.order import CONTROL, FAR_SHARE, order_table, paired_boards_table, paired_table
 from pipeline.reporting.paper import TABLE_2
 from pipeline.reporting.readme import blocks_of
