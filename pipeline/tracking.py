@@ -17,7 +17,7 @@ from typing import Any
 
 from pipeline.core import io
 from pipeline.core.server import TrackingAway, probe, server_uri
-from pipeline.evaluation.summary import over_folds, pool_skins
+from pipeline.evaluation.scores import over_folds, tidy
 
 STORE = "mlflow.db"
 ARTIFACTS = "mlartifacts"
@@ -245,12 +245,11 @@ def _flat(value: Any, name: str, step: int) -> Iterator[tuple[str, float, int]]:
 
 def _log_means(client: Any, run_id: str, cards: list[dict[str, Any]]) -> None:
     """Write to the parent mean and sd over its children, for each question and recipe."""
-    rows = []
-    for question, recipe in sorted({(card["question"], card["recipe_name"]) for card in cards}):
-        alike = [card for card in cards if (card["question"], card["recipe_name"]) == (question, recipe)]
-        for name, summary in over_folds(pool_skins(alike) if "tuning" in alike[0] else alike).items():
-            rows += [(f"{question}.{recipe}.{name}.{key}", value, 0) for key, value in summary.items()]
-    _log(client, run_id, rows)
+    means = []
+    for (question, recipe), rows in tidy(cards).groupby(["question", "recipe"]):
+        for name, summary in over_folds(rows).items():
+            means += [(f"{question}.{recipe}.{name}.{key}", value, 0) for key, value in summary.items()]
+    _log(client, run_id, means)
 
 
 def _mark_superseded(client: Any, experiment_id: str, current: set[str]) -> int:

@@ -1,1 +1,1 @@
-"""From predictions to scores. NumPy only: knows no network and no picture."""
+"""From predictions to scores and their statistics. Knows no network and no picture."""

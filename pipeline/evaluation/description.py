@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from pipeline.capture.faults import find_lsb
 from pipeline.core.schema import AXES_PER_CHIP_N, Readings
 from pipeline.dataset.baseline import subtract
+from pipeline.evaluation.scores import summarise
 
 FORCES_N = (0.5, 1.0, 2.0, 3.0)  # at which changes of field are compared
 NEAR = 0.2  # of the force
@@ -20,41 +21,31 @@ STEP_READINGS_N = 2000  # show the chips' steps
 PRESSED_N = 0.5  # below, a weak chip shows its noise
 
 
-def describe(one: Readings) -> dict[str, float]:
+def describe(readings: Readings) -> dict[str, float]:
     """Describe one capture; what it does not hold, or hardly, is absent."""
     # A row with a force but no place is no contact; one with neither is a contact that nobody labelled.
-    touched = ~(one.Fz_N <= 0) & ~(np.isnan(one.x_mm) & ~np.isnan(one.Fz_N))
-    change_uT = subtract(one.b_uT, one.noload_uT).astype(np.float64)
+    touched = ~(readings.Fz_N <= 0) & ~(np.isnan(readings.x_mm) & ~np.isnan(readings.Fz_N))
+    change_uT = subtract(readings.b_uT, readings.noload_uT).astype(np.float64)
     return {
-        **_rest(one.noload_uT),
-        **_noise(one, touched),
-        **_steps(one),
-        **_rate(one),
-        **_forces(one.Fz_N[touched]),
-        **_changes(change_uT[touched], one.Fz_N[touched]),
+        **_rest(readings.noload_uT),
+        **_noise(readings, touched),
+        **_steps(readings),
+        **_rate(readings),
+        **_forces(readings.Fz_N[touched]),
+        **_changes(change_uT[touched], readings.Fz_N[touched]),
     }
 
 
 def over_skins(described: Sequence[tuple[str, Mapping[str, float]]]) -> dict[str, dict[str, float]]:
     """Give mean, sd, least and most over skins of every quantity of (skin, description); a skin's captures averaged."""
-    by_skin: dict[str, dict[str, list[float]]] = {}
-    for skin, numbers in described:
-        for name, value in numbers.items():
-            by_skin.setdefault(skin, {}).setdefault(name, []).append(value)
-    skins = [_with_growth({name: float(np.mean(own)) for name, own in one.items()}) for one in by_skin.values()]
-    together = {}
-    for name in dict.fromkeys(name for one in skins for name in one):
-        means = np.array([one[name] for one in skins if name in one])
-        together[name] = {"mean": float(means.mean()), "least": float(means.min()), "most": float(means.max())}
-        together[name] |= {"sd": float(means.std(ddof=1))} if len(means) > 1 else {}
-        together[name]["n"] = len(means)
-    return together
-
-
-def _with_growth(skin: dict[str, float]) -> dict[str, float]:
-    # Captures of one skin may each hold one force alone, so this is asked of the skin.
+    rows = pd.DataFrame([numbers for _, numbers in described])
+    skins = rows.groupby([skin for skin, _ in described], sort=False).mean()
     weak, strong = "change_at_1_N_uT", "change_at_3_N_uT"
-    return skin | ({"change_at_3_N_over_1_N": skin[strong] / skin[weak]} if weak in skin and strong in skin else {})
+    if {weak, strong} <= set(skins):  # captures of one skin may each hold one force alone, so this is asked of the skin
+        skins["change_at_3_N_over_1_N"] = skins[strong] / skins[weak]
+    found = summarise(skins)
+    return {name: stat | {"least": float(skins[name].min()), "most": float(skins[name].max())}
+            for name, stat in found.items()}  # fmt: skip
 
 
 def _rest(noload_uT: Float[np.ndarray, "f ch"]) -> dict[str, float]:
@@ -65,27 +56,27 @@ def _rest(noload_uT: Float[np.ndarray, "f ch"]) -> dict[str, float]:
     }
 
 
-def _noise(one: Readings, touched: Bool[np.ndarray, " f"]) -> dict[str, float]:
+def _noise(readings: Readings, touched: Bool[np.ndarray, " f"]) -> dict[str, float]:
     # At one stop of one indentation nothing moves: what is left is noise. Pooled over stops.
-    stops = [part[touched] for part in (one.indentation, one.x_mm, one.y_mm)]
-    by_stop = pd.DataFrame(one.b_uT[touched].astype(np.float64)).groupby(stops, dropna=False, sort=False)
+    stops = [part[touched] for part in (readings.indentation, readings.x_mm, readings.y_mm)]
+    by_stop = pd.DataFrame(readings.b_uT[touched].astype(np.float64)).groupby(stops, dropna=False, sort=False)
     freedom_n = int(touched.sum()) - by_stop.ngroups
     if freedom_n < ENOUGH_N:
         return {}
-    left_uT = one.b_uT[touched] - by_stop.transform("mean").to_numpy()
+    left_uT = readings.b_uT[touched] - by_stop.transform("mean").to_numpy()
     sd_uT = np.sqrt((left_uT**2).sum(axis=0) / freedom_n).reshape(-1, AXES_PER_CHIP_N)
     return {"noise_xy_uT": float(np.median(sd_uT[:, :2])), "noise_z_uT": float(np.median(sd_uT[:, 2]))}
 
 
-def _steps(one: Readings) -> dict[str, float]:
-    lsb_uT = find_lsb(one.b_uT[:STEP_READINGS_N])
+def _steps(readings: Readings) -> dict[str, float]:
+    lsb_uT = find_lsb(readings.b_uT[:STEP_READINGS_N])
     known = {"step_xy_uT": lsb_uT[:, 0], "step_z_uT": lsb_uT[:, 1]}
     return {name: float(np.nanmedian(steps)) for name, steps in known.items() if np.isfinite(steps).any()}
 
 
-def _rate(one: Readings) -> dict[str, float]:
+def _rate(readings: Readings) -> dict[str, float]:
     """Give the rate at which readings of one stop followed each other, where a clock tells."""
-    between_s = np.diff(one.t_s)[(np.diff(one.indentation) == 0) & (np.diff(one.reading_i) == 1)]
+    between_s = np.diff(readings.t_s)[(np.diff(readings.indentation) == 0) & (np.diff(readings.reading_i) == 1)]
     known_s = between_s[between_s > 0]  # NaN, no clock, is not
     return {"rate_hz": float(1 / np.median(known_s))} if len(known_s) >= ENOUGH_N else {}
 

@@ -3,7 +3,7 @@
 Refuses to know models, folds and files. NaN in the truth means unknown, and is left out of that number.
 """
 
-from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -41,13 +41,17 @@ def register(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]
     return shifted
 
 
-def summarise(scores: Sequence[Mapping[str, float]]) -> dict[str, dict[str, float]]:
-    """Mean, standard deviation (n - 1; absent for one score) and number of each metric over folds."""
-    summary: dict[str, dict[str, float]] = {}
-    for name in METRICS:
-        values = np.array([one[name] for one in scores if name in one])
-        if len(values):
-            summary[name] = {"mean": float(values.mean()), "n": len(values)}
-            if len(values) > 1:
-                summary[name]["sd"] = float(values.std(ddof=1))
-    return summary
+def score_groups(
+    true: Float[np.ndarray, "b 3"], predicted: Float[np.ndarray, "b 3"], board: np.ndarray, skin: np.ndarray
+) -> dict[str, Any]:
+    """Score all test rows, each test skin, and all rows after one offset a test board (a diagnosis)."""
+    registered = predicted.copy()
+    for name in np.unique(board):
+        registered[board == name] = register(true[board == name], predicted[board == name])
+    return {
+        "all": score(true, predicted),
+        "registered": score(true, registered),
+        "by_skin": {str(name): score(true[skin == name], predicted[skin == name]) for name in np.unique(skin)},
+        "board_of": {str(name): str(board[skin == name][0]) for name in np.unique(skin)},
+        "rows_n": len(true),
+    }

@@ -14,7 +14,7 @@ import pandas as pd
 
 from pipeline.core.config import parse, read_yaml
 from pipeline.core.errors import SchemaError
-from pipeline.evaluation.inference import VERDICTS
+from pipeline.evaluation.scores import VERDICTS
 from pipeline.reporting import judging, paper
 from pipeline.reporting.judging import NONE, Row, Verdict, judge, mean_of
 from pipeline.reporting.order import FEW_POINTS, is_pooled

@@ -1,6 +1,6 @@
 """How a row of the checklist is judged: a rule, the paper's number and ours -> a verdict and a sentence.
 
-Verdicts follow 95 % intervals over boards (`evaluation.inference`). Refuses to know which results there are.
+Verdicts are of `evaluation.scores`, by intervals over boards. Refuses to know which results there are.
 """
 
 from collections.abc import Mapping, Sequence
@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from pipeline.core.config import Strict
-from pipeline.evaluation import inference
-from pipeline.evaluation.inference import INCONCLUSIVE, NO, ONE_BOARD, YES, Stat, negated
+from pipeline.evaluation import scores as inference
+from pipeline.evaluation.scores import INCONCLUSIVE, NO, ONE_BOARD, YES, Stat, negated
 from pipeline.reporting.order import FEW_POINTS, gain
 
 NEAR = 0.10  # assumed: relative tolerance where the paper gives no sd

@@ -1,69 +1,80 @@
-"""Numbers of the questions about many skins: cards and points of sweeps -> plain words. Refuses to know how they show.
+"""Numbers of the questions about learning: the scene's table of scores -> plain words. Refuses to know how they show.
 
-A question that was not asked is absent.
+A question that was not asked, and a contrast that a sweep does not reach, is absent.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
-from pipeline.evaluation.comparison import over_boards, paired, paired_where_tested
 from pipeline.evaluation.metrics import METRICS
-from pipeline.evaluation.summary import pool_skins
-from pipeline.reporting.contrasts import contrasts_of_pokes, contrasts_of_sensors
+from pipeline.evaluation.scores import (
+    AS_LABELLED,
+    METHODS,
+    REGISTERED,
+    by_skin,
+    differences,
+    over_boards,
+    over_folds,
+    over_pairs,
+    paired,
+    select,
+    tidy,
+    whole,
+    with_boards,
+)  # fmt: skip
+from pipeline.questions import ROWS
+from pipeline.reporting.paper import PLATEAU_POKES_N
 
-Cards = Sequence[dict[str, Any]]
+Points = Mapping[str, Sequence[dict[str, Any]]]
 Seconds = Sequence[Mapping[str, Any]]
-PAIRS = (
-    ("multi", "single"),
-    ("triplet", "multi"),
-    ("adapted", "triplet"),
-    ("adapted", "control"),
-    ("control", "triplet"),
-    ("adapted", "multi"),
-)
-NETWORKS = {"lobo": "network", "triplet": "network + triplet", "adapt": "network, adapted"}  # by question
-TRAINED_IN = {"lobo": "train_multi", "triplet": "train_triplet", "adapt": "adapt"}
 CONTROL = "control"  # the recipe of adaptation that fine-tunes as long, without the new skin's pokes
+TABLE_2 = {"single": "transfer", "multi": "lobo", "triplet": "triplet", "adapted": "adapt"}  # rows: questions
+PAIRS = (
+    ("multi", "single"), ("triplet", "multi"), ("adapted", "triplet"), ("adapted", CONTROL), (CONTROL, "triplet"),
+    ("adapted", "multi"),
+)  # fmt: skip
+PAPERS_SPLITS = ("single_random", "single_temporal")  # the first of these stands beside the paper's numbers
+HONEST = {"by_indentation": "single_indentation", "by_pass": "single_pass"}  # the same skin, more of it held out
+SWEPT = ("multi", "triplet", "adapted")
+TRAINED_IN = {"lobo": "train_multi", "triplet": "train_triplet", "adapt": "adapt"}
+NETWORKS = {METHODS.get(question, "network"): question for question in TRAINED_IN}  # by method
+AXES = {"pokes": ("sweep_pokes", "pokes_n"), "sensors": ("sweep_sensors", "skins_n"), "labels": ("labels", "labels_n")}
 
 
-def learned(cards: Cards, points: Mapping[str, Cards], *, headline: str) -> dict[str, Any]:
-    """Compose what the pooled, triplet and adapted networks say together; `points` are those of the sweeps."""
-    rows = _rows(cards, headline)
-    table2 = {name: over_boards(own) for name, own in rows.items() if name in ("triplet", "adapted")}
-    numbers: dict[str, Any] = {"table2": table2} if table2 else {}
-    if CONTROL in rows:
-        numbers["adapt"] = {"pokes_n": _pokes_n(cards, headline), "control": over_boards(rows[CONTROL])}
-    pairs = [(of, over) for of, over in PAIRS if of in rows and over in rows]
-    if pairs:
-        numbers["paired"] = [{"of": of, "over": over, **_compare(rows, of, over)} for of, over in pairs]
-    if "pokes" in points:
-        numbers["sweep_pokes"] = list(_pokes(points["pokes"]))
-        numbers["contrasts"] = contrasts_of_pokes(points["pokes"])
-    if "sensors" in points:
-        numbers["sweep_sensors"] = list(_sensors(points["sensors"]))
-        numbers["contrasts"] = numbers.get("contrasts", {}) | contrasts_of_sensors(points["sensors"])
-    if "baselines" in points:
-        numbers["baselines"] = [*_networks(cards), *_classical(points["baselines"])]
-    if "labels" in points:
-        numbers["labels"] = list(_labels(points["labels"]))
-    return numbers
-
-
-def curves_of(points: Mapping[str, Cards]) -> dict[str, list[tuple[str, int, dict[str, float]]]]:
-    """Give the points of sweeps as curves: by question, the method, the step on its axis, the mean of each score."""
-    numbers = learned([], points, headline="")
-    axes = {
-        "pokes": ("sweep_pokes", "pokes_n"),
-        "sensors": ("sweep_sensors", "skins_n"),
-        "labels": ("labels", "labels_n"),
+def learned(table: pd.DataFrame, *, headline: str) -> dict[str, Any]:
+    """Compose what the scores say; `headline` names the recipe that stands beside the paper's numbers."""
+    models = {row: select(table, question=question, recipe=headline) for row, question in TABLE_2.items()}
+    models = {row: own for row, own in {**models, CONTROL: select(table, question="adapt", recipe=CONTROL)}.items()
+              if len(own)}  # fmt: skip
+    numbers: dict[str, Any] = {
+        "table2": {
+            row: (over_pairs if row == "single" else over_boards)(models[row]) for row in TABLE_2 if row in models
+        },
+        "lobo": _lobo(models["multi"]) if "multi" in models else {},
+        "paired": [
+            {"of": of, "over": over} | paired(by_skin(models[of]), by_skin(models[over]), where_tested=over == "single")
+            for of, over in PAIRS
+            if of in models and over in models
+        ],
     }
-    curves = {}
-    for question, (key, axis) in axes.items():
-        if key in numbers:
-            curves[question] = [(_curve_name(row), row[axis], _score_means(row)) for row in numbers[key]]
-    return curves
+    if CONTROL in models:
+        pokes_n = int(models[CONTROL]["pokes_n"].iloc[0])
+        numbers["adapt"] = {"pokes_n": pokes_n, "control": over_boards(models[CONTROL])}
+    numbers |= _single(table, headline) | _curves(table)
+    return {name: value for name, value in numbers.items() if value} | {"variants": _variants(table)}
+
+
+def curves_of(points: Points) -> dict[str, list[tuple[str, int, dict[str, float]]]]:
+    """Give the points of sweeps as curves: by question, the method, the step on its axis, the mean of each score."""
+    numbers = _curves(tidy([], points))
+    return {
+        question: [(_curve_name(row), row[axis], _score_means(row)) for row in numbers[key]]
+        for question, (key, axis) in AXES.items()
+        if key in numbers
+    }
 
 
 def timed_learning(numbers: Mapping[str, Any], seconds: Mapping[str, Seconds]) -> dict[str, Any]:
@@ -80,9 +91,119 @@ def timed_learning(numbers: Mapping[str, Any], seconds: Mapping[str, Seconds]) -
     return joined
 
 
-def by_fold(cards: Cards) -> Cards:
-    """Give cards by fold: those of networks adapted to one skin each are put together."""
-    return pool_skins(cards) if cards and cards[0]["question"] == "adapt" else cards
+def _lobo(rows: pd.DataFrame) -> dict[str, Any]:
+    by_board = {
+        str(board): {
+            "trained_on_skins_n": int(own["trained_on_skins_n"].iloc[0]),
+            **{
+                places: whole(own, places)[list(METRICS)].mean().dropna().to_dict()
+                for places in (AS_LABELLED, REGISTERED)
+            },
+        }
+        for board, own in rows.groupby("fold", sort=False)
+    }
+    return {REGISTERED: over_boards(rows, REGISTERED), "by_board": by_board}
+
+
+def _single(table: pd.DataFrame, headline: str) -> dict[str, Any]:
+    """Summarise one skin by how it was split; `single_sensor` is what stands beside the paper's numbers."""
+    questions = (*PAPERS_SPLITS, *HONEST.values())
+    numbers = {question: over_folds(select(table, question=question, recipe=headline)) for question in questions}
+    numbers = {question: own for question, own in numbers.items() if own}
+    papers = next(({"split": question} | numbers[question] for question in PAPERS_SPLITS if question in numbers), {})
+    honest = {name: numbers[question] for name, question in HONEST.items() if question in numbers}
+    return numbers | {"single_sensor": papers | honest}
+
+
+def _variants(table: pd.DataFrame) -> dict[str, dict[str, Any]]:
+    """Summarise every recipe of every question that leaves models; repeats on one skin are no boards."""
+    numbers: dict[str, dict[str, Any]] = {}
+    models = table[table["question"].isin([row.name for row in ROWS if row.kind == "models"])]
+    for (question, recipe), own in models.groupby(["question", "recipe"], sort=False):
+        summarise = (
+            over_pairs if question == "transfer" else over_folds if question.startswith("single_") else over_boards
+        )
+        numbers.setdefault(question, {})[recipe] = summarise(own)
+    return numbers
+
+
+def _curves(table: pd.DataFrame) -> dict[str, Any]:
+    pokes, sensors, classical, labels = (
+        select(table, question=name) for name in ("pokes", "sensors", "baselines", "labels")
+    )
+    numbers: dict[str, Any] = {}
+    if len(pokes):
+        numbers["sweep_pokes"] = [{"pokes_n": int(n), **over_boards(own)} for n, own in pokes.groupby("pokes_n")]
+        numbers["contrasts"] = contrasts_of_pokes(pokes)
+    if len(sensors):
+        numbers["sweep_sensors"] = [
+            {"method": method, "skins_n": int(n), **over_boards(own)}
+            for method in SWEPT
+            for n, own in select(sensors, method=method).groupby("trained_on_skins_n")
+        ]
+        numbers["contrasts"] = numbers.get("contrasts", {}) | contrasts_of_sensors(sensors)
+    if len(classical):
+        networks = select(table[table["question"].isin(list(TRAINED_IN))], architecture="paper")
+        networks = networks[networks["recipe"] != CONTROL]
+        numbers["baselines"] = list(_methods(pd.concat([networks, classical])))
+    if len(labels):
+        numbers["labels"] = list(_labels(labels))
+    return numbers
+
+
+def contrasts_of_pokes(rows: pd.DataFrame) -> dict[str, Any]:
+    """Compare none with the fewest pokes, with those where the paper sees its plateau, and these with the most.
+
+    What the paper says of its figure 6a, as paired differences a board.
+    """
+    at = {int(n): own for n, own in by_skin(rows).groupby("pokes_n")}
+    if 0 not in at or len(at) < 2:
+        return {}
+    known = sorted(at)
+    plateau_n = max((pokes_n for pokes_n in known if 0 < pokes_n <= PLATEAU_POKES_N), default=known[1])
+    steps = {"pokes_first": (0, known[1]), "pokes_gain": (0, plateau_n), "pokes_plateau": (plateau_n, known[-1])}
+    return {
+        name: {"from_pokes_n": few, "to_pokes_n": many, **paired(at[many], at[few])}
+        for name, (few, many) in steps.items()
+        if few < many and (name != "pokes_plateau" or plateau_n == PLATEAU_POKES_N)
+    }
+
+
+def contrasts_of_sensors(rows: pd.DataFrame) -> dict[str, Any]:
+    """Compare most with fewest training skins, adapted networks with others, and their gain with few and many skins.
+
+    What the paper says of its figure 6b, as paired differences a board.
+    """
+    at = {(method, int(n)): own for (method, n), own in by_skin(rows).groupby(["method", "trained_on_skins_n"])}
+    counts = sorted({skins_n for _, skins_n in at})
+    adapted = {
+        f"sensors_adapted_over_{method}": [
+            {"skins_n": skins_n, **paired(at["adapted", skins_n], at[method, skins_n])} for skins_n in counts
+        ]
+        for method in ("multi", "triplet")
+    }
+    if len(counts) < 2:
+        return adapted
+    few, many = counts[0], counts[-1]
+    words = {"from_skins_n": few, "to_skins_n": many}
+    more = {f"sensors_more_{method}": words | paired(at[method, many], at[method, few]) for method in SWEPT}
+    gain_few, gain_many = (differences(at["adapted", n], at["triplet", n]) for n in (few, many))
+    return adapted | more | {"sensors_gain_fewer": words | with_boards(gain_few - gain_many)}
+
+
+def _methods(rows: pd.DataFrame) -> Iterator[dict[str, Any]]:
+    for (_, recipe), own in rows.groupby(["question", "recipe"], sort=False):
+        first = own.iloc[0]
+        words = {"method": first["method"], "inputs": first["inputs"], "name": recipe}
+        words |= {"base": first["base"]} if first["base"] else {}
+        yield {**words, "rows_n": int(first["trained_on_rows_n"]), **over_boards(own)}
+
+
+def _labels(rows: pd.DataFrame) -> Iterator[dict[str, Any]]:
+    for (method, inputs), own in rows.groupby(["method", "inputs"], sort=False):
+        for labels_n, scored in own.groupby("labels_n"):
+            parts = {places: over_boards(scored, places) for places in (AS_LABELLED, REGISTERED)}
+            yield {"method": method, "inputs": inputs, "labels_n": int(labels_n), **parts}
 
 
 def _curve_name(row: Mapping[str, Any]) -> str:
@@ -91,59 +212,13 @@ def _curve_name(row: Mapping[str, Any]) -> str:
 
 
 def _score_means(row: Mapping[str, Any]) -> dict[str, float]:
-    return {name: row.get("as_labelled", row)[name]["mean"] for name in METRICS if name in row.get("as_labelled", row)}
-
-
-def _rows(cards: Cards, headline: str) -> dict[str, Cards]:
-    wanted = {
-        "single": ("transfer", headline), "multi": ("lobo", headline), "triplet": ("triplet", headline),
-        "adapted": ("adapt", headline), CONTROL: ("adapt", CONTROL),
-    }  # fmt: skip
-    rows = {
-        name: by_fold([card for card in cards if (card["question"], card["recipe_name"]) == key])
-        for name, key in wanted.items()
-    }
-    return {name: own for name, own in rows.items() if own}
-
-
-def _compare(rows: Mapping[str, Cards], of: str, over: str) -> dict[str, Any]:
-    """Compare on the same test rows: one skin on others was tested on some boards only."""
-    return (paired_where_tested if over == "single" else paired)(rows[of], rows[over])
-
-
-def _pokes_n(cards: Cards, headline: str) -> int:
-    return next(c["tuning"]["pokes_n"] for c in cards if (c["question"], c["recipe_name"]) == ("adapt", headline))
-
-
-def _networks(cards: Cards) -> Iterable[dict[str, Any]]:
-    for question, method in NETWORKS.items():
-        own = [card for card in cards if card["question"] == question and card["recipe"]["architecture"] == "paper"]
-        for name in dict.fromkeys(card["recipe_name"] for card in own if card["recipe_name"] != CONTROL):
-            named = [card for card in own if card["recipe_name"] == name]
-            words = {"method": method, "inputs": named[0]["recipe"]["inputs"], "name": name}
-            words |= {"base": named[0]["tuning"]["settings"]["base"]} if "tuning" in named[0] else {}
-            yield {**words, "rows_n": named[0]["train_rows_n"], **over_boards(by_fold(named))}
-
-
-def _classical(points: Cards) -> Iterable[dict[str, Any]]:
-    for name in dict.fromkeys(point["name"] for point in points):
-        own = [point for point in points if point["name"] == name]
-        words = {"method": own[0]["method"], "inputs": own[0]["inputs"], "name": name, "rows_n": own[0]["rows_n"]}
-        yield {**words, **over_boards(own)}
-
-
-def _labels(points: Cards) -> Iterable[dict[str, Any]]:
-    for method, inputs in dict.fromkeys((point["method"], point["inputs"]) for point in points):
-        for labels_n in sorted({point["labels_n"] for point in points}):
-            key = (method, inputs, labels_n)
-            own = [point for point in points if (point["method"], point["inputs"], point["labels_n"]) == key]
-            parts = {"as_labelled": over_boards(own), "registered": over_boards(own, "registered")}
-            yield {"method": method, "inputs": inputs, "labels_n": labels_n, **parts}
+    scores = row.get(AS_LABELLED, row)
+    return {name: scores[name]["mean"] for name in METRICS if name in scores}
 
 
 def _times(row: Mapping[str, Any], seconds: Mapping[str, Seconds]) -> dict[str, float]:
     """Give the median seconds of a method's trainings; an adapted network was also trained before."""
-    question = next((q for q, method in NETWORKS.items() if method == row["method"]), None)
+    question = NETWORKS.get(row["method"])
     if question is None:
         return _median_times(seconds.get("train_classical", []), f"{row['name']}.")
     own = _median_times(seconds.get(TRAINED_IN[question], []), f"{question}.{row['name']}.")
@@ -161,16 +236,3 @@ def _median_times(took: Seconds, start: str) -> dict[str, float]:
         "train_s": float(np.median([one["train_s"] for one in own])),
         "inference_us": 1e6 * float(np.median([one["one_reading_s"] for one in own])),
     }
-
-
-def _pokes(points: Cards) -> Iterable[dict[str, Any]]:
-    for pokes_n in sorted({point["pokes_n"] for point in points}):
-        own = [point for point in points if point["pokes_n"] == pokes_n]
-        yield {"pokes_n": pokes_n, **over_boards(pool_skins(own) if pokes_n else own)}
-
-
-def _sensors(points: Cards) -> Iterable[dict[str, Any]]:
-    for method in ("multi", "triplet", "adapted"):
-        for skins_n in sorted({point["trained_on_skins_n"] for point in points}):
-            own = [point for point in points if (point["method"], point["trained_on_skins_n"]) == (method, skins_n)]
-            yield {"method": method, "skins_n": skins_n, **over_boards(pool_skins(own))}

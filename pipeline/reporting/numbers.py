@@ -1,161 +1,105 @@
-"""`numbers.json`: every number that any text shows, nested by question. In: cards, accounts, costs. Out: plain words.
+"""`numbers.json`: every number that any text shows, nested by question. In: scores, accounts, costs. Out: plain words.
 
-A question that was not asked is absent. Refuses to know how a number is shown.
+`scores.json` holds a few of them, for `dvc metrics`. A question that was not asked is absent. Refuses to know how a
+number is shown.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
-from pipeline.evaluation.comparison import over_boards, over_pairs
-from pipeline.evaluation.metrics import summarise
-from pipeline.evaluation.summary import over_folds
-from pipeline.evaluation.tally import tally
+from pipeline.evaluation.metrics import METRICS
+from pipeline.evaluation.scores import tally
 from pipeline.questions import QUESTIONS
-from pipeline.reporting.learned import by_fold, learned
+from pipeline.reporting.learned import learned
 
-SINGLE = ("single_random", "single_temporal")  # the first of these stands beside the paper's numbers
-HONEST = {"by_indentation": "single_indentation", "by_pass": "single_pass"}  # the same skin, more of it held out
+SINGLE = {
+    "by_reading": "single_random", "by_indentation": "single_indentation", "by_pass": "single_pass",
+    "by_time": "single_temporal",
+}  # fmt: skip
+POLICIES = ("initial", "regular", "each")
+OF_DRIFT = ("accuracy_pct", "mse_f_N2")
+OF_SHEAR = ("mse_xy_mm2", "mse_fxy_N2", "mse_fz_N2")
 
-Cards = Sequence[dict[str, Any]]
+Row = Mapping[str, Any]
 
 
 def compose(
-    cards: Cards,
-    points: Mapping[str, Cards],
-    accounts: Iterable[Mapping[str, int]],
-    dropped: Mapping[str, int],
-    *,
-    headline: str,
+    table: pd.DataFrame, accounts: Iterable[Mapping[str, int]], dropped: Mapping[str, int], *, headline: str
 ) -> dict[str, Any]:
     """Compose what follows from the data alone; `headline` names the recipe that stands beside the paper's numbers."""
-    numbers: dict[str, Any] = {"capture": add_up(accounts) | {"left_out": dict(dropped)}}
-    by_question: dict[str, list[dict[str, Any]]] = {}
-    for card in cards:
-        by_question.setdefault(card["question"], []).append(card)
-    table2 = {}
-    if "transfer" in by_question:
-        table2["single"] = over_pairs(_of(by_question["transfer"], headline))
-    if "lobo" in by_question:
-        pooled = _of(by_question["lobo"], headline)
-        table2["multi"] = over_boards(pooled)
-        numbers["lobo"] = {
-            "registered": over_boards(pooled, "registered"),
-            "by_board": {
-                board: {
-                    "trained_on_skins_n": len(own[0]["train_skins"]),
-                    "as_labelled": summarise_means(own, "all"),
-                    "registered": summarise_means(own, "registered"),
-                }
-                for board, own in _group(pooled, "fold").items()
-            },
-        }
-    further = learned(cards, points, headline=headline)
-    if table2:
-        numbers["table2"] = table2 | further.pop("table2", {})
-    numbers |= further
-    for question in (name for name in SINGLE if name in by_question):
-        numbers[question] = over_folds(_of(by_question[question], headline))
-        numbers.setdefault("single_sensor", {"split": question} | numbers[question])
-    for name, question in HONEST.items():
-        if question in by_question:
-            numbers[question] = over_folds(_of(by_question[question], headline))
-            numbers.setdefault("single_sensor", {})[name] = numbers[question]
-    numbers["variants"] = {
-        question: {recipe: _over(question)(by_fold(own)) for recipe, own in _group(all_, "recipe_name").items()}
-        for question, all_ in by_question.items()
-    }
-    return numbers
-
-
-def _over(question: str) -> Callable[[Cards], dict[str, dict[str, Any]]]:
-    """Choose what a question's scores are summarised over: repeats on one skin are no boards."""
-    if question == "transfer":
-        return over_pairs
-    return over_folds if question.startswith("single_") else over_boards
-
-
-def summarise_means(cards: Cards, part: str) -> dict[str, float]:
-    """Mean over seeds of each metric."""
-    return {name: value["mean"] for name, value in summarise([card["scores"][part] for card in cards]).items()}
+    return {"capture": add_up(accounts) | {"left_out": dict(dropped)}, **learned(table, headline=headline)}
 
 
 def add_up(accounts: Iterable[Mapping[str, int]]) -> dict[str, int]:
-    """Add the counts of all captures."""
-    total: dict[str, int] = {"captures_n": 0}
+    """Add the counts of all captures; a quality of one capture's clock is no count."""
+    total = Counter({"captures_n": 0})
     for account in accounts:
-        total["captures_n"] += 1
-        for name, count in account.items():
-            if not name.endswith("_n"):
-                continue  # a quality of one capture's clock is no count
-            total[name] = total.get(name, 0) + count
+        total.update({"captures_n": 1} | {name: count for name, count in account.items() if name.endswith("_n")})
     skipped = [count for name, count in total.items() if name.startswith("skipped_") and name.endswith("_bytes_n")]
-    if skipped:
-        total["lost_bytes_n"] = sum(skipped)
-    return total
+    return {**total, "lost_bytes_n": sum(skipped)} if skipped else dict(total)
 
 
 def count_trainings(
-    cards: Cards, points: Mapping[str, Cards], experiments: Mapping[str, Mapping[str, Any]]
+    cards: Sequence[Row], points: Mapping[str, Sequence[Row]], experiments: Mapping[str, Row]
 ) -> dict[str, dict[str, int]]:
     """Count networks by question: trainings in all, those that collapsed, and those of them that had to be kept."""
-    told: dict[str, list[Mapping[str, Any]]] = {}
-    for question, own in [(card["question"], card) for card in cards] + [
-        (question, point) for question, all_ in points.items() for point in all_ if "collapsed" in point
-    ]:
-        told.setdefault(question, []).append(own)
-    counted = {question: tally(own) for question, own in told.items()}
+    trainings: dict[str, list[Row]] = {}
+    for card in cards:
+        trainings.setdefault(card["question"], []).append(card)
+    for question, swept in points.items():
+        trainings[question] = [point for point in swept if "collapsed" in point]
+    counted = {question: tally(trained) for question, trained in trainings.items() if trained}
     return counted | {name: dict(answer["trainings"]) for name, answer in experiments.items() if "trainings" in answer}
 
 
-def lost_by_protocol(losses: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+def lost_by_protocol(losses: Mapping[str, Row]) -> dict[str, dict[str, Any]]:
     """Add the counts of each further protocol's captures, and what questions of it left out of their rows."""
     found: dict[str, dict[str, Any]] = {}
-    for question, own in losses.items():
+    for question, lost in losses.items():
         protocol = QUESTIONS[question].protocol
-        if protocol is None or not own["accounts"]:
+        if protocol is None or not lost["accounts"]:
             continue
         left_out = found.get(protocol, {"left_out": {}})["left_out"]
-        found[protocol] = add_up(own["accounts"]) | {"left_out": left_out | dict(own["left_out"])}
+        found[protocol] = add_up(lost["accounts"]) | {"left_out": left_out | dict(lost["left_out"])}
     return found
 
 
-def runtime(cards: Cards, costs: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+def runtime(trainings_n: int, costs: Mapping[str, Row]) -> dict[str, Any]:
     """What it cost, where it ran here: seconds and memory a stage, and networks trained."""
-    return {"stages": {stage: _cost(own) for stage, own in costs.items()}, "trainings_n": len(cards)}
+    return {"stages": {stage: _cost(cost) for stage, cost in costs.items()}, "trainings_n": trainings_n}
 
 
-def _cost(own: Mapping[str, Any]) -> dict[str, float]:
+def _cost(cost: Row) -> dict[str, float]:
     """Tell what a stage cost when it was computed, its trainings added up, from what its last run took."""
-    trainings_s = own["trainings_s"].values()
+    trainings_s = cost["trainings_s"].values()
     return {
-        "computed_s": own["other_s"] + sum(trainings_s),
-        "seconds": own["seconds"],
+        "computed_s": cost["other_s"] + sum(trainings_s),
         "trainings_n": len(trainings_s),
-        "reused_n": own["reused_n"],
-        "peak_process_memory_MB": own["peak_process_memory_MB"],
+        **{name: cost[name] for name in ("seconds", "reused_n", "peak_process_memory_MB")},
     }
 
 
-def answered(
-    studied: Mapping[str, Any], cost: Mapping[str, Any], seconds: Mapping[str, Sequence[Mapping[str, Any]]]
-) -> dict[str, Any]:
+def answered(studied: Mapping[str, Any], cost: Row, seconds: Mapping[str, Sequence[Row]]) -> dict[str, Any]:
     """Put the answers to questions about physics beside each other; those about run time stand with what all cost."""
     others = {question: answer for question, answer in studied.items() if question != "runtime"}
-    own = timed(studied["runtime"], seconds.get("runtime", [])) if "runtime" in studied else {}
-    return others | {"runtime": {**cost, **own}}
+    studies = timed(studied["runtime"], seconds.get("runtime", [])) if "runtime" in studied else {}
+    return others | {"runtime": {**cost, **studies}}
 
 
-def timed(answer: Mapping[str, Any], seconds: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def timed(answer: Row, seconds: Sequence[Row]) -> dict[str, Any]:
     """Put what was timed here beside the errors of the studies of run time; what was not timed has no time."""
-    key = ("study", "method", "setting")
-    times = {tuple(one[part] for part in key): one for one in seconds}
-    joined: dict[str, Any] = {"choice": answer["choice"]}
-    for study in ("quadratures", "integrators"):
-        rows = [(row, tuple(row[part] for part in key)) for row in answer[study]]
-        joined[study] = [row | times[own] if own in times else row for row, own in rows]
-    return joined
+
+    def key(row: Row) -> tuple[Any, ...]:
+        return row["study"], row["method"], row["setting"]
+
+    times = {key(took): took for took in seconds}
+    studies = ("quadratures", "integrators")
+    joined = {study: [row | times.get(key(row), {}) for row in answer[study]] for study in studies}
+    return {"choice": answer["choice"], **joined}
 
 
 def rounded(value: Any, digits: int = 6) -> Any:
@@ -169,12 +113,45 @@ def rounded(value: Any, digits: int = 6) -> Any:
     return value
 
 
-def _of(cards: Cards, recipe: str) -> list[dict[str, Any]]:
-    return [card for card in cards if card["recipe_name"] == recipe]
+def headline_scores(numbers: Row) -> dict[str, Any]:
+    """Take a scene's headline scores, nested by question: means, a place's and a force's, with units in their names.
+
+    Nothing that differs between identical runs: no seconds, no commit, no machine.
+    """
+    recorded = {
+        name for name in ("lobo", "labels") if name in numbers and numbers["provenance"]["source"] == "recorded"
+    }
+    table2 = numbers.get("table2", {}) | ({"control": numbers["adapt"]["control"]} if "adapt" in numbers else {})
+    parts = {
+        "table2": {name: _means(row) for name, row in table2.items()},
+        "lobo": {"registered": _means(numbers["lobo"]["registered"])} if "lobo" in recorded else {},
+        "labels": _best_of_labels(numbers["labels"]) if "labels" in recorded else {},
+        "single_sensor": {name: _means(numbers[question]) for name, question in SINGLE.items() if question in numbers},
+        "drift_end": _drift_end(numbers.get("drift", {})),
+        "shear": _means(numbers["shear"], OF_SHEAR) if "shear" in numbers else {},
+    }
+    return {name: part for name, part in parts.items() if part}
 
 
-def _group(cards: Cards, key: str) -> dict[str, list[dict[str, Any]]]:
-    groups: dict[str, list[dict[str, Any]]] = {}
-    for card in cards:
-        groups.setdefault(card[key], []).append(card)
-    return groups
+def _means(row: Row, names: Sequence[str] = METRICS) -> dict[str, float]:
+    return {name: row[name]["mean"] for name in names if name in row}
+
+
+def _drift_end(drift: Row) -> dict[str, Any]:
+    """Take the last window of each policy, which is a mean over networks already."""
+    last = {policy: drift[policy][-1] for policy in POLICIES if policy in drift}
+    return {policy: {name: row[name] for name in OF_DRIFT if name in row} for policy, row in last.items()}
+
+
+def _best_of_labels(rows: Sequence[Row]) -> dict[str, Any]:
+    """Take the most accurate method without labels of the new board, and with the most of them."""
+    found = {}
+    counts = [row["labels_n"] for row in rows]
+    for labels_n in sorted({min(counts), max(counts)}):
+        best = max(
+            (row for row in rows if row["labels_n"] == labels_n),
+            key=lambda row: row["as_labelled"]["accuracy_pct"]["mean"],
+        )
+        method = f"{best['method']} ({best['inputs']})"
+        found[f"best_of_{labels_n}_labels"] = {"method": method} | _means(best["as_labelled"])
+    return found

@@ -9,9 +9,9 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.evaluation.inference import VERDICTS, negated, verdict, verdict_within
+from pipeline.evaluation.scores import VERDICTS, negated, verdict, verdict_within
 from pipeline.reporting.paper import ADAPTED_POKES_N, TABLE_2, TABLE_2_ROWS, Number
-from pipeline.reporting.shown import COLUMNS, Stat, n_of, show_difference, tabulate
+from pipeline.reporting.shown import COLUMNS, Stat, beside, n_of, show_difference, tabulate
 
 FEW_POINTS = 5.0  # assumed: the paper's own drop is 3.4 points, "slightly affects performance"
 FAR_SHARE = 0.5  # assumed: of the difference of the paper's own means
@@ -32,6 +32,9 @@ ORDER = (
 )
 CHANGE = "difference"  # column
 
+Numbers = Mapping[str, Any]
+Judge = Callable[[Stat, str], str]  # of a difference and its metric
+
 
 @dataclass(frozen=True)
 class Model:
@@ -42,77 +45,71 @@ class Model:
     paper: Mapping[str, Number]
 
 
-def models(numbers: Mapping[str, Any]) -> dict[str, Model]:
+def models(numbers: Numbers) -> dict[str, Model]:
     """Name the rows of table 2 in the paper's order; names say so where nothing was pooled, with one training skin."""
     titles = TABLE_2_ROWS | {"control": CONTROL}
     if "adapt" in numbers and numbers["adapt"]["pokes_n"] != ADAPTED_POKES_N:
-        own = f"{numbers['adapt']['pokes_n']} indentations (paper: {ADAPTED_POKES_N})"
-        titles["adapted"] = titles["adapted"].replace(f"{ADAPTED_POKES_N} indentations", own)
+        pokes = f"{numbers['adapt']['pokes_n']} indentations (paper: {ADAPTED_POKES_N})"
+        titles["adapted"] = titles["adapted"].replace(f"{ADAPTED_POKES_N} indentations", pokes)
     named = {row: Model(title, SHORT[row], TABLE_2.get(row, {})) for row, title in titles.items()}
     if is_pooled(numbers):
         return named
     alone = {row: titles[row].replace("Multi-sensor", ALONE) for row in ("triplet", "adapted")}
-    named["multi"] = Model(f"{ALONE} (paper: single-sensor)", "one training skin", TABLE_2["single"])
-    named["triplet"] = Model(alone["triplet"], "one training skin + triplet", {})
-    named["adapted"] = Model(alone["adapted"], SHORT["adapted"], {})
-    return named
+    return named | {
+        "multi": Model(f"{ALONE} (paper: single-sensor)", "one training skin", TABLE_2["single"]),
+        "triplet": Model(alone["triplet"], "one training skin + triplet", {}),
+        "adapted": Model(alone["adapted"], SHORT["adapted"], {}),
+    }
 
 
-def is_pooled(numbers: Mapping[str, Any]) -> bool:
+def is_pooled(numbers: Numbers) -> bool:
     """Tell whether some model of the leave-one-board-out question learnt from more than one skin."""
     boards = numbers["lobo"]["by_board"].values() if "lobo" in numbers else ()
-    return not boards or max(one["trained_on_skins_n"] for one in boards) > 1
+    return not boards or max(board["trained_on_skins_n"] for board in boards) > 1
 
 
-def paired_table(numbers: Mapping[str, Any], source: str) -> pd.DataFrame:
+def paired_table(numbers: Numbers, source: str) -> pd.DataFrame:
     """List the differences between two models over boards, beside the difference of the paper's means."""
     known = models(numbers)
     lines = []
     for row in numbers["paired"]:
-        line = {CHANGE: _name(row, known), "source": source}
         of, over = known[row["of"]].paper, known[row["over"]].paper
-        for metric, title in COLUMNS.items():
-            line[f"{title} (ours)"] = show_difference(row.get(metric))
-            both = metric in of and metric in over and of != over
-            line[f"{title} (paper: difference of means)"] = f"{of[metric][0] - over[metric][0]:+.4g}" if both else "–"
-        lines.append(line | {"n": n_of(row)})
+        printed = {m: f"{of[m][0] - over[m][0]:+.4g}" for m in of if m in over and of != over}
+        cells = beside(row, printed, show_difference, paper="paper: difference of means")
+        lines.append({CHANGE: _name(row, known), "source": source} | cells)
     return tabulate(lines, spread=PAIRED)
 
 
-def paired_boards_table(numbers: Mapping[str, Any], source: str) -> pd.DataFrame:
+def paired_boards_table(numbers: Numbers, source: str) -> pd.DataFrame:
     """List the difference between two models on each held-out board."""
     known = models(numbers)
     lines = [
         {CHANGE: _name(row, known), "held-out board": board, "source": source}
-        | {title: show_difference({"mean": own[m]}) for m, title in COLUMNS.items() if m in own}
+        | {title: show_difference({"mean": means[m]}) for m, title in COLUMNS.items() if m in means}
         for row in numbers["paired"]
-        if "by_board" in row
-        for board, own in row["by_board"].items()
+        for board, means in row.get("by_board", {}).items()
     ]
     return tabulate(lines, spread=PAIRED)
 
 
-def order_table(numbers: Mapping[str, Any], source: str) -> pd.DataFrame:
-    """Judge each claim of the paper about the order of its rows, and our control, by differences over boards."""
+def order_table(numbers: Numbers, source: str) -> pd.DataFrame:
+    """Judge each claim of the paper about the order of its rows, and our control, by differences over boards.
+
+    Empty where there are only pairs about which the paper claims nothing.
+    """
     known = models(numbers)
     pairs = {(row["of"], row["over"]): row for row in numbers["paired"]}
-    claims: list[tuple[str, tuple[str, str], Callable[[Stat, str], str]]] = []
-    if is_pooled(numbers):
-        claims += [
-            ("multi-sensor better than single-sensor", ("multi", "single"), _better),
-            ("multi-sensor far better than single-sensor", ("multi", "single"), _far),
-        ]
+    pooled: list[tuple[str, tuple[str, str], Judge]] = [
+        ("multi-sensor better than single-sensor", ("multi", "single"), _better),
+        ("multi-sensor far better than single-sensor", ("multi", "single"), _far),
+    ]
     few = f"{known['triplet'].short} within a few points of {known['multi'].short}"
-    claims.append((few, ("triplet", "multi"), _few))
-    for over in ("triplet", "multi", "control"):
-        words = f"adapted better than {known[over].short}" + (" (ours)" if over == "control" else "")
-        claims.append((words, ("adapted", over), _better))
+    claims = [*(pooled if is_pooled(numbers) else []), (few, ("triplet", "multi"), _few)]
+    for over, ours in (("triplet", ""), ("multi", ""), ("control", " (ours)")):
+        claims.append((f"adapted better than {known[over].short}{ours}", ("adapted", over), _better))
     lines = [
         {"claim": words}
-        | {
-            title: judge(pairs[key][metric], metric) if metric in pairs[key] else "–"
-            for metric, title in COLUMNS.items()
-        }
+        | {title: judge(pairs[key][m], m) if m in pairs[key] else "–" for m, title in COLUMNS.items()}
         | {"n": n_of(pairs[key]), "source": source}
         for words, key, judge in claims
         if key in pairs
@@ -131,19 +128,16 @@ def gain(difference: Stat, metric: str) -> Stat:
 
 
 def _far(difference: Stat, metric: str) -> str:
-    return _said(verdict(gain(difference, metric), above=far_beyond(metric)), difference)
+    return f"{verdict(gain(difference, metric), above=far_beyond(metric))}: {show_difference(difference)}"
 
 
 def _better(difference: Stat, metric: str) -> str:
-    return _said(verdict(gain(difference, metric)), difference)
+    return f"{verdict(gain(difference, metric))}: {show_difference(difference)}"
 
 
 def _few(difference: Stat, metric: str) -> str:
-    return _said(verdict_within(difference, FEW_POINTS), difference) if metric == "accuracy_pct" else "–"
-
-
-def _said(word: str, difference: Stat) -> str:
-    return f"{word}: {show_difference(difference)}"
+    words = f"{verdict_within(difference, FEW_POINTS)}: {show_difference(difference)}"
+    return words if metric == "accuracy_pct" else "–"
 
 
 def _name(row: Mapping[str, Any], known: Mapping[str, Model]) -> str:

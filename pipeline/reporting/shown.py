@@ -3,7 +3,7 @@
 Refuses to know what a score is of.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import pandas as pd
@@ -55,6 +55,21 @@ def show_difference(value: Stat | None) -> str:
 def scores(row: Mapping[str, Any], titles: Mapping[str, str] = COLUMNS) -> dict[str, str]:
     """Show every metric of a row under its title."""
     return {title: show(row.get(metric)) for metric, title in titles.items()}
+
+
+def scored(row: Mapping[str, Any]) -> dict[str, str]:
+    """Show every metric of a row, and over how many it is."""
+    return scores(row) | {"n": n_of(row)}
+
+
+def beside(
+    row: Mapping[str, Any], printed: Mapping[str, str], show: Callable[[Stat | None], str], *, paper: str = "paper"
+) -> dict[str, str]:
+    """Show every metric of a row beside what the paper prints, and over how many ours is."""
+    cells = {}
+    for metric, title in COLUMNS.items():
+        cells |= {f"{title} (ours)": show(row.get(metric)), f"{title} ({paper})": printed.get(metric, "–")}
+    return cells | {"n": n_of(row)}
 
 
 def n_of(row: Mapping[str, Any]) -> str:

@@ -1,4 +1,4 @@
-"""Figures of learning on many skins: sweeps over pokes and training skins. In: rows. Out: SVG text by file name.
+"""Figures of learning on many skins, and its errors beside costs. In: rows. Out: SVG text and tables by file name.
 
 Same rows, same bytes. Refuses to know how a model learnt, and paths.
 """
@@ -12,16 +12,19 @@ import numpy as np
 import pandas as pd
 
 from pipeline.reporting.figures import STYLE, svg
-from pipeline.reporting.learning import adaptation_costs_table, methods_costs_table
 from pipeline.reporting.order import SHORT
 from pipeline.reporting.paper import ADAPTED_POKES_N, TABLE_2
-from pipeline.reporting.shown import COLUMNS, to_markdown
+from pipeline.reporting.shown import COLUMNS, scored, tabulate, to_markdown
 from pipeline.reporting.trade_offs import adaptation, trade_off
 from pipeline.reporting.work_precision import COLOURS, MARKERS
 
 DRAWN = {"accuracy_pct": (0.0, 100.0), "mse_xy_mm2": (0.0, np.inf)}  # what is drawn, and what is possible
 LINEAR_BELOW_N = 65  # pokes: a logarithm has no place for none
 METHODS = ("multi", "triplet", "adapted")
+COSTS = {"training": ("train_s", "median time of a training / s"),
+         "inference": ("inference_us", "median time of one reading / µs")}  # fmt: skip
+
+Rows = Sequence[Mapping[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -30,7 +33,7 @@ class Line:
 
     name: str
     counts: Sequence[int]
-    scores: Sequence[Mapping[str, Any]]
+    scores: Rows
     look: Mapping[str, Any]
     shift_pt: float = 0.0  # to the right, so that bars at one count stand beside each other
 
@@ -45,10 +48,7 @@ def learning_figures(numbers: Mapping[str, Any], source: str) -> Iterator[tuple[
 def learning_pages(runtime: Mapping[str, Any], source: str) -> dict[str, str]:
     """Draw and tabulate errors against costs: text by file name; no figure where nothing was timed here."""
     texts = {f"{name}.md": to_markdown(table) for name, table in learning_costs(runtime, source).items()}
-    for name, (key, cost) in {
-        "training": ("train_s", "median time of a training / s"),
-        "inference": ("inference_us", "median time of one reading / µs"),
-    }.items():
+    for name, (key, cost) in COSTS.items():
         if any(key in row for row in runtime.get("learning", [])):
             title = f"Error on new skins against {name} time ({source})"
             texts[f"{name}.svg"] = trade_off(runtime["learning"], key, title=title, cost=cost)
@@ -58,12 +58,22 @@ def learning_pages(runtime: Mapping[str, Any], source: str) -> dict[str, str]:
 
 
 def learning_costs(runtime: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate errors beside costs, by name: of methods, and of adaptation to pokes."""
-    makers = {"learning": methods_costs_table, "adaptation": adaptation_costs_table}
-    return {name: make(runtime[name], source) for name, make in makers.items() if name in runtime}
+    """Tabulate errors beside costs, where those were measured: of methods, and of adaptation by its pokes."""
+    methods = [
+        {"method": row["method"], "inputs": row["inputs"], "training, s": _time(row, "train_s")}
+        | {"one reading, µs": _time(row, "inference_us"), "source": source}
+        | scored(row)
+        for row in runtime.get("learning", [])
+    ]
+    adaptations = [
+        {"pokes": str(row["pokes_n"]), "adaptation, s": _time(row, "seconds"), "source": source} | scored(row)
+        for row in sorted(runtime.get("adaptation", []), key=lambda row: row["pokes_n"])
+    ]
+    lines = {"learning": methods, "adaptation": adaptations}
+    return {name: tabulate(lines[name]) for name in lines if name in runtime}
 
 
-def sweep_pokes(rows: Sequence[Mapping[str, Any]], source: str) -> str:
+def sweep_pokes(rows: Rows, source: str) -> str:
     """Draw scores against the number of unlabelled pokes (figure 6a), beside the two that the paper prints."""
     ordered = sorted(rows, key=lambda row: row["pokes_n"])
     paper = [{m: {"mean": mean, "sd": sd} for m, (mean, sd) in TABLE_2[row].items()} for row in ("triplet", "adapted")]
@@ -75,35 +85,32 @@ def sweep_pokes(rows: Sequence[Mapping[str, Any]], source: str) -> str:
     return _sweep(lines, f"Adapted to a new skin by unlabelled pokes ({source})", "pokes of the new skin", log=True)
 
 
-def sweep_sensors(rows: Sequence[Mapping[str, Any]], source: str) -> str:
+def sweep_sensors(rows: Rows, source: str) -> str:
     """Draw scores against the number of training skins (figure 6b), a line for each method."""
     lines = []
     for i, method in enumerate(METHODS):
-        own = sorted((row for row in rows if row["method"] == method), key=lambda row: row["skins_n"])
+        swept = sorted((row for row in rows if row["method"] == method), key=lambda row: row["skins_n"])
         look = {"color": COLOURS[1 + i], "marker": MARKERS[i]}
-        if own:
-            lines.append(Line(SHORT[method], [row["skins_n"] for row in own], own, look, shift_pt=4.0 * (i - 1)))
-    return _sweep(
-        lines, f"Scores on boards held out, by the number of training skins ({source})", "training skins", log=False
-    )
+        if swept:
+            lines.append(Line(SHORT[method], [row["skins_n"] for row in swept], swept, look, shift_pt=4.0 * (i - 1)))
+    title = f"Scores on boards held out, by the number of training skins ({source})"
+    return _sweep(lines, title, "training skins", log=False)
 
 
-def bars(scores: Sequence[Mapping[str, Any]], metric: str) -> tuple[np.ndarray, np.ndarray]:
+def bars(scores: Rows, metric: str) -> tuple[np.ndarray, np.ndarray]:
     """Find means and the lengths of their bars (down, up): the interval over boards, cut at what is possible.
 
     Without one (one board, the paper) bars are one sd.
     """
-    means = np.array([one[metric]["mean"] for one in scores])
-    ends = np.array([_ends(one[metric]) for one in scores]).clip(*DRAWN[metric])
+    means = np.array([row[metric]["mean"] for row in scores])
+    ends = np.array([_ends(row[metric]) for row in scores]).clip(*DRAWN[metric])
     return means, np.stack([means - ends[:, 0], ends[:, 1] - means]).clip(min=0)  # rounded numbers
 
 
-def _ends(stat: Mapping[str, Any]) -> Sequence[float]:
-    if "ci95" in stat:
-        ends: Sequence[float] = stat["ci95"]
-        return ends
+def _ends(stat: Mapping[str, Any]) -> tuple[float, float]:
     sd = stat.get("sd", stat.get("sd_seeds", 0.0))
-    return stat["mean"] - sd, stat["mean"] + sd
+    low, high = stat.get("ci95", (stat["mean"] - sd, stat["mean"] + sd))
+    return low, high
 
 
 def _sweep(lines: Sequence[Line], title: str, xlabel: str, *, log: bool) -> str:
@@ -125,8 +132,7 @@ def _sweep(lines: Sequence[Line], title: str, xlabel: str, *, log: bool) -> str:
             _bars(axes, lines, metric)
         figure.align_ylabels()
         look = {"loc": "outside lower left", "ncols": 2, "frameon": False, "fontsize": 9, "alignment": "left"}
-        bars_are = _about_bars(lines)
-        figure.legend(*axes.get_legend_handles_labels(), title=bars_are, title_fontsize=9, **look)
+        figure.legend(*axes.get_legend_handles_labels(), title=_about_bars(lines), title_fontsize=9, **look)
         figure.suptitle(title, x=0.01, ha="left", fontsize=10)
         return svg(figure)
 
@@ -147,10 +153,14 @@ def _bars(axes: Any, lines: Sequence[Line], metric: str) -> None:
 
 
 def _about_bars(lines: Sequence[Line]) -> str:
-    stats = [one["accuracy_pct"] for line in lines for one in line.scores]
-    kinds = {f"95 % interval over {one['n']} boards" for one in stats if "ci95" in one}
-    kinds |= {"sd over seeds (one board)" for one in stats if "sd" not in one and "sd_seeds" in one}
+    stats = [row["accuracy_pct"] for line in lines for row in line.scores]
+    kinds = {f"95 % interval over {stat['n']} boards" for stat in stats if "ci95" in stat}
+    kinds |= {"sd over seeds (one board)" for stat in stats if "sd" not in stat and "sd_seeds" in stat}
     if not kinds:
         return "No bars: one training each."
-    of_paper = " (paper: sd)" if any("n" not in one for one in stats) else ""
+    of_paper = " (paper: sd)" if any("n" not in stat for stat in stats) else ""
     return f"Bars: {', '.join(sorted(kinds))}{of_paper}; cut at what is possible."
+
+
+def _time(row: Mapping[str, Any], name: str) -> str:
+    return f"{row[name]:.3g}" if name in row else "–"

@@ -1,9 +1,9 @@
 """Tables of a scene: numbers.json -> rows, as Markdown for people and CSV for programs. Sees no model.
 
-Every table says whether its rows are simulated or recorded.
+Every table says whether its rows are simulated or recorded; a question that was not asked has no table.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import pandas as pd
@@ -11,11 +11,21 @@ import pandas as pd
 from pipeline.experiments.left_out.show import left_out_table
 from pipeline.reporting.checklist import checklist
 from pipeline.reporting.checks import stability_table, verification_table
-from pipeline.reporting.learning import learning_tables
-from pipeline.reporting.order import models
-from pipeline.reporting.paper import SINGLE_SENSOR, Number
+from pipeline.reporting.order import SHORT, models, order_table, paired_boards_table, paired_table
+from pipeline.reporting.paper import ADAPTED_POKES_N, FIGURE_6A, FIGURE_6B, SINGLE_SENSOR, TABLE_2, Number
 from pipeline.reporting.parts import experiment_tables
-from pipeline.reporting.shown import COLUMNS, INTERVAL, scores, show_both, tabulate, to_markdown
+from pipeline.reporting.shown import (
+    COLUMNS,
+    INTERVAL,
+    beside,
+    n_of,
+    scored,
+    scores,
+    show,
+    show_both,
+    tabulate,
+    to_markdown,
+)
 from pipeline.reporting.skins import skins_table
 from pipeline.reporting.table1 import measured, read_table1, table1
 
@@ -33,40 +43,60 @@ TARGET = (
     "The row of one skin on others was a calibration target: the simulated spreads were set with it in view, so its "
     "agreement with the paper is no evidence."
 )
-
-
 COLLAPSED_MEANING = (
     "Collapsed: a network that explains next to nothing of some target on its own training rows, as it answers nearly "
     "the same to any input. It is trained again with other draws, at most twice; what collapses every time is kept in "
     "all means; those of train_* and adapt are also named in the audit. Trainings too short to have left their start "
     "are not judged."
 )
+PLACES = (
+    "Registered: after one offset a board (uses its labels: a diagnosis). Labels and unlabelled pokes are indentations "
+    "of the new board at places where it is also tested, at other depths."
+)
+TRAINING_ROWS = (
+    "Training rows of the first fold; a classical method is given at most so many, drawn at random. Settings of "
+    "classical methods were not searched."
+)
+CONTROLLED = (
+    "0 is the network as it was trained, all others are fine-tuned: what that does without pokes is the control of "
+    "table 2."
+)
+BUDGETS = "How many steps there are is a budget of each scene, and no part of the choice."
+DRAWS = (
+    "[low, high] is the 95 % interval over n held-out boards (Student's t), each with its own draw of training skins; "
+    "networks of one board are averaged first."
+)
+OF_BOARDS = "± is the sd over n boards."
+
+Numbers = Mapping[str, Any]
+Rows = Sequence[Mapping[str, Any]]
 
 
-def make_tables(numbers: Mapping[str, Any]) -> dict[str, pd.DataFrame]:
+def make_tables(numbers: Numbers) -> dict[str, pd.DataFrame]:
     """Make every table that the numbers can fill, by name."""
     source = numbers["provenance"]["source"]
     tables = {}
     if "table2" in numbers:
-        tables["table2"] = _beside_paper(_table_2_rows(numbers), source)
-        words = [TARGET] * (source == "simulated") + _dead(numbers.get("trainings", {}))
-        tables["table2"].attrs |= {"spread": TABLE_2_SPREAD} | ({"meaning": " ".join(words)} if words else {})
-    tables |= learning_tables(numbers, source)
+        tables["table2"] = _table_2(numbers, source)
+    if "paired" in numbers:
+        orders = {"order": order_table, "paired": paired_table, "paired_boards": paired_boards_table}
+        made = {name: make(numbers, source) for name, make in orders.items()}
+        tables |= {name: table for name, table in made.items() if not table.empty}
     single = {SPLIT_WORDS[name]: (numbers[name], SINGLE_SENSOR) for name in SPLIT_WORDS if name in numbers}
     if single:
         tables["single_sensor"] = _beside_paper(single, source)
-    if "lobo" in numbers:
-        tables["lobo_boards"] = _boards(numbers["lobo"]["by_board"], source)
     tables |= experiment_tables(numbers, source)
     makers: dict[str, Callable[[Any, str], pd.DataFrame]] = {
-        "verification": verification_table, "stability": stability_table, "left_out": left_out_table,
-        "trainings": _trainings,
+        "sweep_pokes": sweep_pokes_table, "sweep_sensors": sweep_sensors_table, "baselines": baselines_table,
+        "labels": labels_table, "audit": audit_table, "chosen": chosen_table, "verification": verification_table,
+        "stability": stability_table, "left_out": left_out_table, "trainings": _trainings, "variants": _variants,
     }  # fmt: skip
     tables |= {name: make(numbers[name], source) for name, make in makers.items() if name in numbers}
+    if "lobo" in numbers:
+        tables["lobo_boards"] = _boards(numbers["lobo"]["by_board"], source)
     if "described" in numbers:
-        titled = {f"{protocol} ({one['source']})": one for protocol, one in numbers["described"].items()}
+        titled = {f"{protocol} ({skins['source']})": skins for protocol, skins in numbers["described"].items()}
         tables["skins"] = skins_table(titled)
-    tables["variants"] = _variants(numbers["variants"], source)
     tables["captures"] = _captures(numbers, source)
     tables["table1"] = table1(read_table1(), measured(numbers))
     tables["checklist"] = checklist(numbers)
@@ -79,82 +109,142 @@ def table_texts(tables: Mapping[str, pd.DataFrame]) -> dict[str, str]:
     return texts | {f"{name}.csv": table.to_csv(index=False) for name, table in tables.items()}
 
 
-def _table_2_rows(numbers: Mapping[str, Any]) -> dict[str, tuple[Mapping[str, Any], Mapping[str, Number]]]:
+def sweep_pokes_table(rows: Rows, source: str) -> pd.DataFrame:
+    """List scores by the number of unlabelled pokes of the new skin; the paper gives numbers for two of them."""
+    printed = {0: TABLE_2["triplet"], ADAPTED_POKES_N: TABLE_2["adapted"]}
+    lines = [
+        {"pokes": str(row["pokes_n"]), "source": source}
+        | beside(row, _printed(printed.get(row["pokes_n"], {})), show, paper="paper, table 2")
+        for row in sorted(rows, key=lambda row: row["pokes_n"])
+    ]
+    return tabulate(lines, meaning=f"The paper on its figure 6a: {FIGURE_6A}. {CONTROLLED}")
+
+
+def sweep_sensors_table(rows: Rows, source: str) -> pd.DataFrame:
+    """List scores by the number of training skins for each method."""
+    lines = [
+        {"training skins": str(row["skins_n"]), "method": SHORT[row["method"]], "source": source} | scored(row)
+        for row in sorted(rows, key=lambda row: (row["skins_n"], list(SHORT).index(row["method"])))
+    ]
+    return tabulate(lines, meaning=f"The paper on its figure 6b: {FIGURE_6B}.", spread=DRAWS)
+
+
+def baselines_table(rows: Rows, source: str) -> pd.DataFrame:
+    """List classical methods and networks on the same folds, the most accurate first."""
+    lines = [
+        {"method": row["method"], "inputs": row["inputs"], "training rows": str(row["rows_n"]), "source": source}
+        | scored(row)
+        for row in sorted(rows, key=lambda row: -row["accuracy_pct"]["mean"])
+    ]
+    return tabulate(lines, meaning=TRAINING_ROWS)
+
+
+def labels_table(rows: Rows, source: str) -> pd.DataFrame:
+    """List scores by how many labelled indentations of the new skin were at hand."""
+    places = {metric: f"{title} (registered)" for metric, title in COLUMNS.items() if metric != "mse_f_N2"}
+    lines = [
+        {"method": row["method"], "inputs": row["inputs"], "labels": str(row["labels_n"]), "source": source}
+        | scores(row["as_labelled"])
+        | scores(row["registered"], places)
+        | {"n": n_of(row["as_labelled"])}
+        for row in rows
+    ]
+    return tabulate(lines, meaning=PLACES)
+
+
+def audit_table(rows: Rows, source: str) -> pd.DataFrame:
+    """List what was searched for leaks; a leak that is known and stated is told from one that is not."""
+    lines = [
+        {name: str(row[name]) for name in ("what", "where", "rule", "found")}
+        | {"holds": "yes" if row["holds"] else "no, known" if row["known"] else "NO", "source": source}
+        for row in rows
+    ]
+    return tabulate(lines)
+
+
+def chosen_table(arms: Mapping[str, Any], source: str) -> pd.DataFrame:
+    """List the candidates of each arm and which was chosen, by leave-one-board-out on boards of their own."""
+    lines = []
+    for arm, choice in arms.items():
+        for row in choice["candidates"]:
+            chosen = f"yes, by {choice['by']}" if row["recipe_name"] == choice["recipe_name"] else ""
+            words = {"arm": arm, "candidate": row["recipe_name"], "settings": row["settings"], "chosen": chosen}
+            lines.append(words | {"source": source} | scored(row))
+    return tabulate(lines, meaning=BUDGETS, spread=OF_BOARDS)
+
+
+def _table_2(numbers: Numbers, source: str) -> pd.DataFrame:
     """Put each row beside the paper's row of the same kind, in the paper's order; the control is ours."""
-    ours = dict(numbers["table2"])
-    if "adapt" in numbers:
-        ours["control"] = numbers["adapt"]["control"]
-    return {model.title: (ours[row], model.paper) for row, model in models(numbers).items() if row in ours}
+    ours = numbers["table2"] | ({"control": numbers["adapt"]["control"]} if "adapt" in numbers else {})
+    rows = {model.title: (ours[row], model.paper) for row, model in models(numbers).items() if row in ours}
+    table = _beside_paper(rows, source)
+    trainings = numbers.get("trainings", {})
+    asked = [trainings[name] for name in ("transfer", "lobo", "triplet", "adapt") if name in trainings]
+    words = [TARGET] * (source == "simulated")
+    if kept_n := sum(counts["kept_collapsed_n"] for counts in asked):
+        words.append(f"{kept_n} networks collapsed every time that they were trained, and are in these means.")
+    table.attrs |= {"spread": TABLE_2_SPREAD} | ({"meaning": " ".join(words)} if words else {})
+    return table
 
 
 def _beside_paper(rows: Mapping[str, tuple[Mapping[str, Any], Mapping[str, Number]]], source: str) -> pd.DataFrame:
-    lines = []
-    for name, (ours, paper) in rows.items():
-        line = {"model": name, "source": source}
-        for metric, title in COLUMNS.items():
-            line[f"{title} (ours)"] = show_both(ours.get(metric))
-            line[f"{title} (paper)"] = "{:g} ± {:g}".format(*paper[metric]) if metric in paper else "–"
-        line["n"] = str(ours["accuracy_pct"]["n"])
-        lines.append(line)
+    lines = [
+        {"model": name, "source": source} | beside(ours, _printed(paper), show_both)
+        for name, (ours, paper) in rows.items()
+    ]
     return pd.DataFrame(lines)
+
+
+def _printed(paper: Mapping[str, Number]) -> dict[str, str]:
+    return {metric: f"{mean:g} ± {sd:g}" for metric, (mean, sd) in paper.items()}
 
 
 def _boards(by_board: Mapping[str, Any], source: str) -> pd.DataFrame:
-    words = {"as_labelled": "as labelled", "registered": "after one offset a board (uses its labels: a diagnosis)"}
-    lines = []
-    for board, parts in by_board.items():
-        for part in words:
-            metrics = parts[part]
-            skins_n = str(parts["trained_on_skins_n"])
-            line = {"held-out board": board, "trained on skins": skins_n, "places": words[part], "source": source}
-            lines.append(line | {title: f"{metrics[m]:.3g}" for m, title in COLUMNS.items() if m in metrics})
+    places = {"as_labelled": "as labelled", "registered": "after one offset a board (uses its labels: a diagnosis)"}
+    lines = [
+        {"held-out board": board, "trained on skins": str(parts["trained_on_skins_n"]), "places": words}
+        | {"source": source}
+        | {title: f"{parts[part][metric]:.3g}" for metric, title in COLUMNS.items() if metric in parts[part]}
+        for board, parts in by_board.items()
+        for part, words in places.items()
+    ]
     return pd.DataFrame(lines)
-
-
-def _dead(trainings: Mapping[str, Mapping[str, int]]) -> list[str]:
-    """Say how many networks behind table 2 answer nearly the same to any input, if any does."""
-    kept_n = sum(
-        trainings[name]["kept_collapsed_n"] for name in ("transfer", "lobo", "triplet", "adapt") if name in trainings
-    )
-    return [f"{kept_n} networks collapsed every time that they were trained, and are in these means."] * (kept_n > 0)
 
 
 def _trainings(counts: Mapping[str, Mapping[str, int]], source: str) -> pd.DataFrame:
     """List how many networks were trained, how many of those collapsed, and how many of them had to be kept."""
+    columns = {
+        "trainings": "trainings_n", "collapsed": "collapsed_n", "collapsed every time, kept": "kept_collapsed_n",
+    }  # fmt: skip
     lines = [
-        {
-            "question": question, "source": source, "trainings": str(own["trainings_n"]),
-            "collapsed": str(own["collapsed_n"]), "collapsed every time, kept": str(own["kept_collapsed_n"]),
-        }
-        for question, own in counts.items()
-    ]  # fmt: skip
+        {"question": question, "source": source} | {title: str(counted[name]) for title, name in columns.items()}
+        for question, counted in counts.items()
+    ]
     return tabulate(lines, meaning=COLLAPSED_MEANING)
 
 
 def _variants(variants: Mapping[str, Any], source: str) -> pd.DataFrame:
-    lines = []
-    for question, recipes in variants.items():
-        for recipe, metrics in recipes.items():
-            line = {"question": question, "recipe": recipe, "source": source} | scores(metrics)
-            lines.append(line | {"n": str(metrics["accuracy_pct"]["n"])})
+    lines = [
+        {"question": question, "recipe": recipe, "source": source} | scored(row)
+        for question, recipes in variants.items()
+        for recipe, row in recipes.items()
+    ]
     return pd.DataFrame(lines)
 
 
-def _captures(numbers: Mapping[str, Any], source: str) -> pd.DataFrame:
+def _captures(numbers: Numbers, source: str) -> pd.DataFrame:
+    """List what was read and lost, of the main captures and of each further protocol's; of these, no 0."""
     further = numbers.get("capture_by_protocol", {})
-    lines = _counts("main", numbers["capture"], source)
-    for protocol, account in further.items():
-        lines += [line for line in _counts(protocol, account, source) if line["count"] != "0"]
-    table = pd.DataFrame(lines)
-    if further:
-        table.attrs["meaning"] = "Main: the captures that folds are drawn on. Of other protocols no 0 is listed."
-    return table
-
-
-def _counts(protocol: str, account: Mapping[str, Any], source: str) -> list[dict[str, str]]:
-    flat = {**account, **{f"left out of training: {key}": n for key, n in account["left_out"].items()}}
-    return [
-        {"protocol": protocol, "what": key, "count": str(value), "source": source}
-        for key, value in flat.items()
-        if key != "left_out"
+    lines = [
+        {"protocol": protocol, "what": what, "count": str(count), "source": source}
+        for protocol, account in {"main": numbers["capture"], **further}.items()
+        for what, count in _counts(account).items()
+        if protocol == "main" or count
     ]
+    meaning = {"meaning": "Main: the captures that folds are drawn on. Of other protocols no 0 is listed."}
+    return tabulate(lines, **(meaning if further else {}))
+
+
+def _counts(account: Mapping[str, Any]) -> dict[str, int]:
+    counts = {name: count for name, count in account.items() if name != "left_out"}
+    return counts | {f"left out of training: {name}": count for name, count in account["left_out"].items()}

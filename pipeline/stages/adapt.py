@@ -18,10 +18,7 @@ def read(settings: Settings) -> Adaptations:
 
 def adapt(scene: str, files: Files, indentations: Path, folds: Path, started: Path, models: Path) -> None:
     """Fine-tune by every recipe of section adapt."""
-    data, starts = (
-        read_data(read_settings("adapt", scene, files), indentations, folds),
-        read_starts(started),
-    )
+    data, starts = read_data(read_settings("adapt", scene, files), indentations, folds), read_starts(started)
     settings = read(data.settings)
     trials = [
         trial

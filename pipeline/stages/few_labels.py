@@ -9,14 +9,13 @@ from pipeline.core import io
 from pipeline.core.config import Files, Settings, read_settings
 from pipeline.core.executors import make_executor
 from pipeline.core.stage import run, say
-from pipeline.evaluation.summary import score_groups
 from pipeline.learning import few_labels as few
 from pipeline.learning.baselines import run_tasks
 from pipeline.learning.card import collapse_record
 from pipeline.learning.few_labels import FewLabels
 from pipeline.learning.few_labels import few_labels as few_labels_of
-from pipeline.learning.trial import Measured
-from pipeline.trials.data import SceneData, read_data, train_all
+from pipeline.trials.data import SceneData, measured, read_data, train_all
+from pipeline.trials.models import score_test
 
 
 def read(settings: Settings) -> FewLabels:
@@ -27,28 +26,26 @@ def read(settings: Settings) -> FewLabels:
 def few_labels(scene: str, files: Files, indentations: Path, folds: Path, scores: Path) -> None:
     """Score networks, adapted networks and classical methods with every number of labels on the same rows."""
     data = read_data(read_settings("few_labels", scene, files), indentations, folds)
-    asked = read(data.settings)
-    study = few.Study(data.rows, data.folds_of(few.QUESTION), data.settings.seed, asked)
+    study = few.Study(data.rows, data.folds_of(few.QUESTION), data.settings.seed, read(data.settings))
     done: list[few.Done] = []
     for step in (few.networks, few.adapted, few.labelled):  # each goes on from what the last ones trained
         pairs = step(study, done)
         trained = train_all(data, [trial for _, trial in pairs], "few_labels")
-        done = [*done, *((tried, trial, one) for (tried, trial), one in zip(pairs, trained, strict=True))]
-    points = [_point(data, tried, one.predicted) | collapse_record(one) for tried, _, one in done]
+        done = [*done, *((tried, trial, result) for (tried, trial), result in zip(pairs, trained, strict=True))]
     tasks = few.classical(study)
-    rows = Measured(data.rows.db_uT, data.rows.target, data.rows.skin)
     with make_executor() as executor:
-        fitted = run_tasks([task for _, task in tasks], rows, executor, lambda line: say(f"{scene} few_labels: {line}"))
-    points += [_point(data, tried, one.predicted) for (tried, _), one in zip(tasks, fitted, strict=True)]
+        fitted = run_tasks(
+            [task for _, task in tasks], measured(data), executor, lambda line: say(f"{scene} few_labels: {line}")
+        )
+    points = [_point(data, tried, trained.predicted) | collapse_record(trained) for tried, _, trained in done]
+    points += [_point(data, tried, answer.predicted) for (tried, _), answer in zip(tasks, fitted, strict=True)]
     io.write_json(scores, points)
 
 
 def _point(data: SceneData, tried: few.Tried, predicted: np.ndarray) -> dict[str, Any]:
-    test = tried.fold.test
     board, draw = tried.fold.name.rsplit("-draw", 1)
     words = {"method": tried.method, "inputs": tried.inputs, "labels_n": tried.labels_n, "fold": board}
-    scores = score_groups(data.rows.target[test], predicted, data.rows.board[test], data.rows.skin[test])
-    return words | {"seed_i": int(draw), "scores": scores}
+    return words | {"seed_i": int(draw), "scores": score_test(data, tried.fold.test, predicted)}
 
 
 if __name__ == "__main__":

@@ -6,11 +6,12 @@ from pipeline.core import io
 from pipeline.core.config import Files, read_settings
 from pipeline.core.stage import run, say
 from pipeline.evaluation.choice import to_record
+from pipeline.evaluation.scores import to_csv
 from pipeline.learning.recipe import HEADLINE
 from pipeline.reporting.figures import error_grids
+from pipeline.reporting.numbers import headline_scores
 from pipeline.reporting.page import page
 from pipeline.reporting.parts import experiment_figures
-from pipeline.reporting.scores import headline_scores
 from pipeline.reporting.sweeps import learning_figures, learning_pages
 from pipeline.reporting.tables import make_tables, table_texts
 from pipeline.reporting.work_precision import pages
@@ -21,16 +22,16 @@ def report(
     scene: str, files: Files, indentations: Path, folds: Path, models: Path, answers: Path, reports: Path
 ) -> None:
     """Write the numbers, tables, figures and the page of a scene."""
-    known = read_settings("report", scene, files)
-    asked = asking(known)
-    numbers, drawn = read_numbers(known, asked, Places(indentations, folds, models, answers))
+    settings = read_settings("report", scene, files)
+    asked = asking(settings)
+    numbers, drawn, scores = read_numbers(settings, asked, Places(indentations, folds, models, answers))
     if "choice" in asked.questions:
-        record = to_record(numbers["chosen"], read_cards(asked, models), source=asked.source, seed=known.seed)
+        record = to_record(numbers["chosen"], read_cards(asked, models), source=asked.source, seed=settings.seed)
         io.write_json(reports / "choice.json", record)
     io.write_json(reports / "numbers.json", numbers)
     io.write_json(reports / "scores.json", headline_scores(numbers))
     tables = make_tables(numbers)
-    io.write_texts(reports / "tables", table_texts(tables))
+    io.write_texts(reports / "tables", table_texts(tables) | {"scores.csv": to_csv(scores)})
     predictions = [io.read_table(models / arm / "predictions.parquet") for arm in asked.modelled]
     figures = dict(error_grids(predictions, HEADLINE, f"{scene} ({asked.source})"))
     figures |= dict(learning_figures(numbers, asked.source)) | experiment_figures(numbers, drawn, asked.source)

@@ -21,37 +21,37 @@ def read(settings: Settings) -> PokesSweep:
 
 def sweep_pokes(scene: str, files: Files, indentations: Path, folds: Path, started: Path, scores: Path) -> None:
     """Score every number of pokes; none at all is the network as it was trained."""
-    data, starts = (
-        read_data(read_settings("sweep_pokes", scene, files), indentations, folds),
-        read_starts(started),
-    )
-    asked, own = read(data.settings), adaptations_of(data.settings)
-    named, held_out = (HEADLINE, own.recipes[HEADLINE]), data.folds_of("lobo")[-asked.boards_n :]
-    if asked.boards_n > len(held_out):
+    data, starts = read_data(read_settings("sweep_pokes", scene, files), indentations, folds), read_starts(started)
+    sweep, recipe = read(data.settings), adaptations_of(data.settings).recipes[HEADLINE]
+    held_out = data.folds_of("lobo")[-sweep.boards_n :]
+    if sweep.boards_n > len(held_out):
         rule = f"at most the {len(held_out)} boards of the scene"
-        raise ParamsError(data.settings.where, "sweep_pokes.boards_n", rule, asked.boards_n, "Ask for fewer.")
-    asked_of = [(fold, pokes_n) for fold in held_out for pokes_n in asked.pokes_n if pokes_n]
+        raise ParamsError(data.settings.where, "sweep_pokes.boards_n", rule, sweep.boards_n, "Ask for fewer.")
     pairs = [
         (trial, pokes_n)
-        for fold, pokes_n in asked_of
-        for trial in adaptations(data, fold, named, starts, question="pokes", pokes_n=pokes_n)
+        for fold in held_out
+        for pokes_n in sweep.pokes_n
+        if pokes_n
+        for trial in adaptations(data, fold, (HEADLINE, recipe), starts, question="pokes", pokes_n=pokes_n)
     ]
     trials = [trial for trial, _ in pairs]
     trained = train_all(data, trials, "sweep_pokes")
     points = [
-        point_of(data, trial, one, "adapted") | {"pokes_n": pokes_n}
-        for (trial, pokes_n), one in zip(pairs, trained, strict=True)
+        point_of(data, trial, result, "adapted") | {"pokes_n": pokes_n}
+        for (trial, pokes_n), result in zip(pairs, trained, strict=True)
     ]
-    points += [point | {"pokes_n": 0} for point in _unadapted(started, named[1].base, {fold.name for fold in held_out})]
-    io.write_json(scores, points)
+    io.write_json(scores, points + _unadapted(started, recipe.base, {fold.name for fold in held_out}))
     note_seconds(scene, "sweep_pokes", trials, trained)
 
 
 def _unadapted(started: Path, base: str, held_out: set[str]) -> list[dict[str, Any]]:
     cards = [io.read_json(file) for file in sorted(started.glob("*.json"))]
-    own = [card for card in cards if card["recipe_name"] == base and card["fold"] in held_out]
     kept = ("key", "question", "fold", "seed_i", "stopped_step", "git", "scores")
-    return [{name: card[name] for name in kept} | {"method": "triplet"} for card in own]
+    return [
+        {name: card[name] for name in kept} | {"method": "triplet", "pokes_n": 0}
+        for card in cards
+        if card["recipe_name"] == base and card["fold"] in held_out
+    ]
 
 
 if __name__ == "__main__":

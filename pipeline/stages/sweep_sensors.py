@@ -16,34 +16,33 @@ from pipeline.trials.models import note_seconds, point_of
 def sweep_sensors(scene: str, files: Files, indentations: Path, folds: Path, scores: Path) -> None:
     """Train the headline recipes on every draw of skins, adapt to each held-out skin, and score."""
     data = read_data(read_settings("sweep_sensors", scene, files), indentations, folds)
-    multi, triplet = (training(data.settings, section) for section in ("train_multi", "train_triplet"))
-    own = adaptations_of(data.settings)
-    fine = own.recipes[HEADLINE]
-    plain = _trials(data, multi.recipes[HEADLINE], "multi")
-    based = _trials(data, triplet.recipes[fine.base], "triplet")
-    trained = train_all(data, [*plain, *based], "sweep_sensors")
+    multi, triplet = (training(data.settings, section).recipes for section in ("train_multi", "train_triplet"))
+    settings = adaptations_of(data.settings)
+    recipe = settings.recipes[HEADLINE]
+    trials = _trials(data, multi[HEADLINE], "multi") + _trials(data, triplet[recipe.base], "triplet")
+    trained = train_all(data, trials, "sweep_sensors")
     starts = {
-        (fine.base, trial.fold, trial.seed_i): Start(one.key, one.weights, one.scaler)
-        for trial, one in zip(based, trained[len(plain) :], strict=True)
+        (recipe.base, trial.fold, trial.seed_i): Start(result.key, result.weights, result.scaler)
+        for trial, result in zip(trials, trained, strict=True)
+        if trial.what == "triplet"
     }
     adapted = [
         trial
         for fold in data.folds_of("sensors")
-        for trial in adaptations(data, fold, (HEADLINE, fine), starts, question="sensors", pokes_n=own.pokes_n)
+        for trial in adaptations(data, fold, (HEADLINE, recipe), starts, question="sensors", pokes_n=settings.pokes_n)
     ]
-    trained += train_all(data, adapted, "sweep_sensors")
-    trials = [*plain, *based, *adapted]
-    methods = [trial.what for trial in [*plain, *based]] + ["adapted"] * len(adapted)
+    methods = [trial.what for trial in trials] + ["adapted"] * len(adapted)
+    trials, trained = trials + adapted, trained + train_all(data, adapted, "sweep_sensors")
     three = zip(trials, trained, methods, strict=True)
-    io.write_json(scores, [point_of(data, trial, one, method) for trial, one, method in three])
+    io.write_json(scores, [point_of(data, trial, result, method) for trial, result, method in three])
     note_seconds(scene, "sweep_sensors", trials, trained)
 
 
 def _trials(data: SceneData, recipe: Recipe, method: str) -> list[Trial]:
     """One trial a draw of skins; the draw is its seed too, as the fold's name is part of the generator's."""
     return [
-        Trial("sensors", HEADLINE, recipe, one.name, data.settings.seed, 0, one.train, one.test, what=method)
-        for one in data.folds_of("sensors")
+        Trial("sensors", HEADLINE, recipe, fold.name, data.settings.seed, 0, fold.train, fold.test, what=method)
+        for fold in data.folds_of("sensors")
     ]
 
 

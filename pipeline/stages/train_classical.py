@@ -7,12 +7,10 @@ import numpy as np
 from pipeline.core import io
 from pipeline.core.config import Files, Settings, read_settings
 from pipeline.core.executors import make_executor
-from pipeline.core.provenance import SECONDS
 from pipeline.core.stage import run, say
-from pipeline.evaluation.summary import score_groups
 from pipeline.learning.baselines import Baselines, Task, baselines, run_tasks
-from pipeline.learning.trial import Measured
-from pipeline.trials.data import read_data
+from pipeline.trials.data import measured, read_data
+from pipeline.trials.models import note_seconds, score_test
 
 NO_ROWS = np.zeros(0, np.int64)
 
@@ -25,34 +23,21 @@ def read(settings: Settings) -> Baselines:
 def train_classical(scene: str, files: Files, indentations: Path, folds: Path, scores: Path) -> None:
     """Fit every method of section train_classical with one board held out."""
     data = read_data(read_settings("train_classical", scene, files), indentations, folds)
-    asked, rows = (
-        read(data.settings),
-        data.rows,
-    )
-    pairs = [(fold, name) for fold in data.folds_of("lobo") for name in asked.methods]
+    settings, seed = read(data.settings), data.settings.seed
+    pairs = [(fold, name, method) for fold in data.folds_of("lobo") for name, method in settings.methods.items()]
     tasks = [
-        Task(f"{name}.{f.name}", asked.methods[name], f.train, f.test, NO_ROWS, asked.rows_max_n, data.settings.seed)
-        for f, name in pairs
+        Task(f"{name}.{fold.name}", method, fold.train, fold.test, NO_ROWS, settings.rows_max_n, seed)
+        for fold, name, method in pairs
     ]
     with make_executor() as executor:
-        done = run_tasks(
-            tasks,
-            Measured(rows.db_uT, rows.target, rows.skin),
-            executor,
-            lambda line: say(f"{scene} classical: {line}"),
-        )
-    points = []
-    for (fold, name), task, one in zip(pairs, tasks, done, strict=True):
-        true, board, skin = (values[fold.test] for values in (rows.target, rows.board, rows.skin))
-        method = {"name": name, "method": task.method.title, "inputs": task.method.inputs}
-        scored = {"rows_n": one.rows_n, "scores": score_groups(true, one.predicted, board, skin)}
-        points.append(method | {"fold": fold.name, "seed_i": 0} | scored)
-    io.write_json(scores, points)
-    took = [
-        {"name": task.name, "train_s": one.seconds, "one_reading_s": one.one_reading_s}
-        for task, one in zip(tasks, done, strict=True)
+        fitted = run_tasks(tasks, measured(data), executor, lambda line: say(f"{scene} classical: {line}"))
+    points = [
+        {"name": name, "method": method.title, "inputs": method.inputs, "fold": fold.name, "seed_i": 0}
+        | {"rows_n": answer.rows_n, "scores": score_test(data, fold.test, answer.predicted)}
+        for (fold, name, method), answer in zip(pairs, fitted, strict=True)
     ]
-    io.write_json(SECONDS / scene / "train_classical.json", took)
+    io.write_json(scores, points)
+    note_seconds(scene, "train_classical", tasks, fitted)
 
 
 if __name__ == "__main__":

@@ -1,19 +1,28 @@
-"""Networks before and after they are adapted to a skin, side by side. In: answers by arm and board. Out: numbers.
+"""Networks before and after they are adapted to a skin: their answers on its rows by arm, and scores over boards.
 
 An arm is one way to treat the same networks: left as they were, adapted, adapted without the skin's pokes, ...
-Refuses to know networks, pokes and files.
+Refuses to know pokes and files.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Float
 
-from pipeline.evaluation import inference
-from pipeline.evaluation.inference import Scored, board_means, summarise_boards
+from pipeline.core.executors import device
+from pipeline.dataset.splits import Fold
+from pipeline.evaluation import scores
 from pipeline.evaluation.metrics import score
+from pipeline.learning.card import collapse_record
+from pipeline.learning.inputs import VIEW
+from pipeline.learning.recipe import Adaptation, training
+from pipeline.learning.trial import Trial
+from pipeline.trials.adapting import Starts, own_starts
+from pipeline.trials.data import SceneData, train_all
+from pipeline.trials.models import note_seconds
 
 FORCE = 2  # column
 BEFORE, AFTER, CONTROL = "before", "after", "control"  # arms: as it was, adapted, as long without the skin's pokes
@@ -32,6 +41,33 @@ class Answered:
     predicted: Float[np.ndarray, "b 3"]
 
 
+def answers_before(data: SceneData, fold: Fold, settings: Adaptation, starts: Starts, skin: str) -> Iterator[Answered]:
+    """Answer on a skin's tested rows as the networks do before they are adapted."""
+    from pipeline.learning.model import Predictor  # torch, late: only a stage that answers pays for it
+
+    recipe = training(data.settings, "train_triplet").recipes[settings.base]
+    test = fold.test[data.rows.skin[fold.test] == skin]
+    view = VIEW[recipe.inputs](data.rows.db_uT[test])
+    for seed_i, start in own_starts(starts, settings.base, fold).items():
+        predict = Predictor(start.weights, recipe.architecture, device())
+        predicted = start.scaler.decode(predict(start.scaler.encode(view)))
+        yield Answered(BEFORE, str(data.rows.board[test[0]]), skin, seed_i, data.rows.target[test], predicted)
+
+
+def answers_after(
+    data: SceneData, trials: Sequence[tuple[str, Trial]], stage: str
+) -> tuple[list[Answered], dict[str, int]]:
+    """Adapt by (arm, trial), and answer on each trial's tested rows; count what collapsed."""
+    adapted = [trial for _, trial in trials]
+    trained = train_all(data, adapted, stage)
+    note_seconds(data.scene, stage, adapted, trained)
+    answered = []
+    for (arm, trial), done in zip(trials, trained, strict=True):
+        board, true = str(data.rows.board[trial.test[0]]), data.rows.target[trial.test]
+        answered.append(Answered(arm, board, trial.skin, trial.seed_i, true, done.predicted))
+    return answered, scores.tally(map(collapse_record, trained))
+
+
 def bias(true: Float[np.ndarray, "b 3"], predicted: Float[np.ndarray, "b 3"]) -> dict[str, float]:
     """By how much force is over-estimated, in newtons and as a part of the mean force; negative is too little."""
     true_N = true[:, FORCE].astype(float)
@@ -39,29 +75,28 @@ def bias(true: Float[np.ndarray, "b 3"], predicted: Float[np.ndarray, "b 3"]) ->
     return {"bias_f_N": over_N, "bias_f_pct": 100 * over_N / float(true_N.mean())}
 
 
-def over_boards(answers: Sequence[Answered]) -> dict[str, dict[str, Any]]:
+def summarise_arms(answers: Sequence[Answered], judge: Judge = score) -> dict[str, dict[str, Any]]:
     """Summarise every metric over boards, each the mean of its skins, each of these of its seeds; by arm."""
-    return {arm: summarise_boards(board_means(_scored(own, score))) for arm, own in _by_arm(answers).items()}
+    arms = _tidy(answers, judge).groupby("method", sort=False)
+    return {str(arm): scores.summarise(scores.board_means(rows), boards=True) for arm, rows in arms}
 
 
 def biases(answers: Sequence[Answered]) -> dict[str, dict[str, Any]]:
     """Both ways to say the force bias, each by arm, over boards."""
-    by_arm = {arm: summarise_boards(board_means(_scored(own, bias))) for arm, own in _by_arm(answers).items()}
-    return {name: {arm: one[name] for arm, one in by_arm.items()} for name in ("bias_f_N", "bias_f_pct")}
+    by_arm = summarise_arms(answers, bias)
+    return {name: {arm: found[name] for arm, found in by_arm.items()} for name in ("bias_f_N", "bias_f_pct")}
 
 
-def paired(answers: Sequence[Answered], arm: str, other: str) -> dict[str, Any]:
-    """Compare two arms skin by skin, `arm` less `other`: over boards, and `by_board`."""
-    by_arm = _by_arm(answers)
-    return inference.paired(_scored(by_arm[arm], score), _scored(by_arm[other], score))
+def compare_arms(answers: Sequence[Answered], of: str, over: str) -> dict[str, Any]:
+    """Compare two arms skin by skin, `of` less `over`: over boards, and `by_board`."""
+    rows = _tidy(answers, score)
+    return scores.paired(*(scores.select(rows, method=arm) for arm in (of, over)))
 
 
-def _scored(answers: Sequence[Answered], judge: Judge) -> list[Scored]:
-    return [(one.board, one.skin, judge(one.true, one.predicted)) for one in answers]
-
-
-def _by_arm(answers: Sequence[Answered]) -> dict[str, list[Answered]]:
-    arms: dict[str, list[Answered]] = {}
-    for one in answers:
-        arms.setdefault(one.arm, []).append(one)
-    return arms
+def _tidy(answers: Sequence[Answered], judge: Judge) -> pd.DataFrame:
+    rows = (
+        {"method": answer.arm, "board": answer.board, "skin": answer.skin, "seed": answer.seed_i}
+        | judge(answer.true, answer.predicted)
+        for answer in answers
+    )
+    return pd.DataFrame(rows)

@@ -55,23 +55,24 @@ def trials_of(
     ]
 
 
+def measured(data: SceneData) -> Measured:
+    """Give of the rows what trainings read."""
+    return Measured(data.rows.db_uT, data.rows.target, data.rows.skin)
+
+
 def train_all(data: SceneData, trials: Sequence[Trial], stage: str) -> list[Trained]:
     """Train what is not finished yet; say what stopped early, for it is used as it last was."""
-    rows, start_s = Measured(data.rows.db_uT, data.rows.target, data.rows.skin), time.monotonic()
+    start_s, stage_words = time.monotonic(), f"{data.scene} {stage}"
+
+    def tell(line: str) -> None:
+        say(f"{stage_words}: {line}")
+
     with make_executor() as executor:
-        trained = run_trials(
-            trials,
-            rows,
-            executor=executor,
-            cache=home() / CACHE,
-            tell=lambda line: say(f"{data.scene} {stage}: {line}"),
-        )
-    took = {one.key: (one.seconds, one.reused) for one in trained}
+        trained = run_trials(trials, measured(data), executor=executor, cache=home() / CACHE, tell=tell)
+    took = {result.key: (result.seconds, result.reused) for result in trained}
     note_trainings(COSTS / data.scene, stage, took, time.monotonic() - start_s)
-    for trial, one in zip(trials, trained, strict=True):
-        if one.stopped_step is not None:
-            say(
-                f"warning: {data.scene} {stage}: {trial.name} diverged by step {one.stopped_step}: "
-                "kept as it was before"
-            )
+    for trial, result in zip(trials, trained, strict=True):
+        if result.stopped_step is not None:
+            diverged = f"{trial.name} diverged by step {result.stopped_step}: kept as it was before"
+            say(f"warning: {stage_words}: {diverged}")
     return trained

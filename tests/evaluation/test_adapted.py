@@ -6,13 +6,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.core.seeds import rng_for
-from pipeline.evaluation.comparison import paired as paired_cards
-from pipeline.evaluation.inference import interval
-from pipeline.evaluation.metrics import score
-from pipeline.evaluation.summary import score_groups
+from pipeline.evaluation.metrics import score, score_groups
+from pipeline.evaluation.scores import by_skin, interval, paired, tidy
 from pipeline.experiments.flexible.boards import DRAWN_N, answer_flexible, by_depth, forces_drawn, strength_ratio
 from pipeline.experiments.manual.parts import GRID, answer_manual
-from pipeline.trials.arms import AFTER, BEFORE, CONTROL, Answered, bias, biases, over_boards, paired
+from pipeline.trials.arms import AFTER, BEFORE, CONTROL, Answered, bias, biases, compare_arms, summarise_arms
+from tests.evaluation.cards import card
 
 SINGLE = 1e-4  # sums of single-precision forces of some newtons
 
@@ -62,7 +61,7 @@ def test_each_board_counts_once_as_the_mean_of_its_skins_and_each_skin_as_that_o
         for skin in BOARD
     }
     boards = [(skins["s0"] + skins["s1"]) / 2, skins["s2"]]
-    ours = over_boards(ANSWERS)[AFTER]["mse_xy_mm2"]
+    ours = summarise_arms(ANSWERS)[AFTER]["mse_xy_mm2"]
     assert ours["mean"] == pytest.approx(np.mean(boards))
     assert ours["ci95"] == pytest.approx(interval(boards))
     assert ours["n"] == 2
@@ -71,12 +70,13 @@ def test_each_board_counts_once_as_the_mean_of_its_skins_and_each_skin_as_that_o
 def test_differences_are_those_of_the_summary_of_cards():
     cards = {
         arm: [
-            {"fold": a.board, "scores": score_groups(a.true, a.predicted, np.full(30, a.board), np.full(30, a.skin))}
+            card("adapt", a.board, score_groups(a.true, a.predicted, np.full(30, a.board), np.full(30, a.skin)))
             for a in ANSWERS if a.arm == arm
         ]
         for arm in (BEFORE, AFTER)
     }  # fmt: skip
-    assert paired(ANSWERS, AFTER, BEFORE) == paired_cards(cards[AFTER], cards[BEFORE])
+    of, over = (by_skin(tidy(cards[arm])) for arm in (AFTER, BEFORE))
+    assert compare_arms(ANSWERS, AFTER, BEFORE) == paired(of, over)
 
 
 def test_adaptation_by_hand_is_told_with_its_counts_its_control_and_its_price():

@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 from scipy.constants import micro
 
 from pipeline.core.seeds import rng_for
-from pipeline.evaluation.inference import interval
+from pipeline.evaluation.scores import interval
 from pipeline.experiments.ambient.fields import (
+    by_step,
     guessed_uT,
     iron_cases,
     iron_fields,
     one_a_poke,
-    over_boards,
     project,
     rms_uT,
     seen_uT,
@@ -136,15 +136,15 @@ def test_arms_are_put_together_over_the_boards_that_they_were_tried_on():
         point("b0", "a", 70.0, distance_mm=2.0, rms_uT=3.0, aside_rms_uT=1.0),
         point("b1", "a", 70.0, distance_mm=2.0, rms_uT=4.0, aside_rms_uT=1.0),
     ]  # fmt: skip
-    rows = over_boards(points, "field_uT", ["b0", "b1"])
+    rows = by_step(points, "field_uT", ["b0", "b1"])
     assert [row["field_uT"] for row in rows] == [0.0, 5.0]
     assert rows[1]["a"]["accuracy_pct"] == {
         "mean": 70.0, "n": 2, "sd": pytest.approx(np.sqrt(200)), "ci95": interval([60.0, 80.0]),
     }  # fmt: skip
     assert rows[1]["b"]["accuracy_pct"] == {"mean": 50.0, "n": 1}
-    (iron,) = over_boards(points, "distance_mm", ["b0", "b1"])
+    (iron,) = by_step(points, "distance_mm", ["b0", "b1"])
     assert iron["field_uT"] == pytest.approx(np.sqrt(12.5))
-    assert over_boards(points, "field_uT", ["b0"])[1]["a"]["accuracy_pct"]["mean"] == 80.0
+    assert by_step(points, "field_uT", ["b0"])[1]["a"]["accuracy_pct"]["mean"] == 80.0
 
 
 def test_a_fields_size_is_that_of_its_vectors():

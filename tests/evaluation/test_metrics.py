@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.evaluation.metrics import register, score, summarise
+from pipeline.evaluation.metrics import register, score, score_groups
 
 TRUE = np.array([[2.0, 2.0, 1.0], [4.0, 6.0, 2.0], [8.0, 8.0, 3.0], [16.0, 0.0, 0.5]])
 
@@ -51,11 +51,20 @@ def test_force_error_scales_with_the_square_of_the_unit(scale):
     assert scaled["mse_f_N2"] == pytest.approx(scale**2 * score(TRUE, predicted)["mse_f_N2"], rel=1e-9)
 
 
-def test_summary_is_mean_and_sample_deviation():
-    summary = summarise([{"accuracy_pct": 80.0, "mse_xy_mm2": 1.0}, {"accuracy_pct": 90.0, "mse_xy_mm2": 3.0}])
-    assert summary["accuracy_pct"] == {"mean": 85.0, "n": 2, "sd": pytest.approx(50**0.5)}
-    assert "mse_f_N2" not in summary
+BOARD = np.repeat(["b0", "b1"], 2)
+SKIN = np.array(["s0", "s1", "s1", "s2"])
 
 
-def test_one_fold_has_no_deviation():
-    assert summarise([{"accuracy_pct": 80.0}]) == {"accuracy_pct": {"mean": 80.0, "n": 1}}
+def test_groups_are_scored_as_if_they_were_alone():
+    predicted = TRUE + np.random.default_rng(1).normal(size=TRUE.shape)
+    scores = score_groups(TRUE, predicted, BOARD, SKIN)
+    assert scores["rows_n"] == 4
+    assert scores["all"] == score(TRUE, predicted)
+    assert scores["by_skin"]["s1"] == score(TRUE[1:3], predicted[1:3])
+
+
+def test_one_offset_a_board_is_registration_and_the_true_places_do_not_change_the_result():
+    offset = np.where(BOARD == "b0", 3.0, -2.0)[:, None] * [1.0, 1.0, 0.0]
+    scores = score_groups(TRUE, TRUE + offset, BOARD, SKIN)
+    assert scores["all"]["accuracy_pct"] == 0.0
+    assert scores["registered"]["accuracy_pct"] == 100.0

@@ -7,8 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.core.io import read_json
-from pipeline.evaluation.reproduced import compare, leaves
-from pipeline.evaluation.tolerance import IGNORED, TOLERANCES, ignored, tolerance_of
+from pipeline.evaluation.reproduced import IGNORED, TOLERANCES, compare, ignored, leaves, tolerance_of
 from tests.reporting.synthetic import all_questions, cost
 from tests.stages.checkout import ROOT
 

@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 from sklearn.metrics import mean_squared_error, r2_score
 
 from pipeline.core.seeds import rng_for
-from pipeline.evaluation.statistic import over_units, statistic
 from pipeline.experiments.shear.scores import answer_shear, score5
 
 
@@ -48,8 +47,8 @@ def test_the_truth_explains_all_and_its_mean_nothing():
 
 def test_seeds_are_averaged_within_a_fold_before_folds_are():
     scores = [("a", {"mse": 1.0}), ("a", {"mse": 3.0}), ("b", {"mse": 6.0})]
-    assert over_units(scores) == {"mse": {"mean": 4.0, "n": 2, "sd": pytest.approx(8**0.5)}}
-    assert statistic([5.0]) == {"mean": 5.0, "n": 1}  # one value has no spread
+    answer = answer_shear(scores, scores[:1], target=drawn(0)[0], lines_n=3, passes_n=1)
+    assert answer["mse"] == {"mean": 4.0, "n": 2, "sd": pytest.approx(8**0.5)}
 
 
 def test_both_ways_stand_beside_each_other_with_the_size_of_the_forces():

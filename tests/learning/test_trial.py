@@ -288,7 +288,7 @@ NOT_DECIDING = {
     "dataset.baseline": "makes rows, whose values are part of the key",
     "dataset.lines": "makes lines, whose values are part of the key",
     "dataset.rows": "makes rows, whose values are part of the key",
-    "learning.executors": "where it runs, and the clock; the device is part of the key",
+    "core.executors": "where it runs, and the clock; the device is part of the key",
     "learning.recipe": "settings, whose values are part of the key",
 }
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
 from pipeline.core.errors import SchemaError
-from pipeline.evaluation.inference import INCONCLUSIVE, NO, ONE_BOARD, YES
+from pipeline.evaluation.scores import INCONCLUSIVE, NO, ONE_BOARD, YES
 from pipeline.questions import EXPERIMENTS
 from pipeline.reporting import paper
 from pipeline.reporting.checklist import checklist, look_up, read_rows, resolve

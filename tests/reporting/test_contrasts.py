@@ -2,18 +2,26 @@
 
 import pytest
 
-from pipeline.evaluation.inference import interval
-from pipeline.reporting.contrasts import contrasts_of_pokes, contrasts_of_sensors
-from tests.reporting.test_learned import HELD_OUT, card
+from pipeline.evaluation.scores import interval, tidy
+from pipeline.reporting import learned
+from tests.reporting.test_learned import HELD_OUT, point
 
 
 def points(key: str, by_count: dict[int, tuple[float, float]], **words: str) -> list[dict]:
     """Points of two boards, by count the accuracy of each."""
     return [
-        card("sweep", board, dict.fromkeys(skins, float(pct))) | {key: count} | words
+        point(dict.fromkeys(skins, float(pct)), board, **{key: count}, **words)
         for count, both in by_count.items()
         for (board, skins), pct in zip(HELD_OUT.items(), both, strict=True)
     ]
+
+
+def contrasts_of_pokes(points: list[dict]) -> dict:
+    return learned.contrasts_of_pokes(tidy([], {"pokes": points}))
+
+
+def contrasts_of_sensors(points: list[dict]) -> dict:
+    return learned.contrasts_of_sensors(tidy([], {"sensors": points}))
 
 
 def gains(contrast: dict) -> dict[str, float]:

@@ -4,8 +4,9 @@ import json
 
 import pytest
 
-from pipeline.evaluation.inference import interval
-from pipeline.reporting.learned import PAIRS, by_fold, learned, timed_learning
+from pipeline.evaluation.scores import interval, tidy
+from pipeline.reporting.learned import PAIRS, learned, timed_learning
+from tests.evaluation import cards
 
 HELD_OUT = {"b0": ("s0", "s1"), "b1": ("s2", "s3")}
 BETTER = {"s0": 2.0, "s1": 4.0, "s2": 6.0, "s3": 8.0}  # points that adaptation gains on each skin
@@ -23,8 +24,11 @@ def scores(by_skin: dict[str, float]) -> dict:
 
 
 def card(question: str, fold: str, by_skin: dict[str, float], recipe: str = "paper", seed_i: int = 0) -> dict:
-    words = {"question": question, "recipe_name": recipe, "fold": fold, "seed_i": seed_i, "scores": scores(by_skin)}
-    return words | ({"tuning": {"pokes_n": 390}} if question == "adapt" else {})
+    return cards.card(question, fold, scores(by_skin), recipe, seed_i)
+
+
+def point(by_skin: dict[str, float], fold: str = "b1", seed_i: int = 0, **words: object) -> dict:
+    return {"fold": fold, "seed_i": seed_i, "scores": scores(by_skin)} | words
 
 
 def of_boards(question: str, pct: float, recipe: str = "paper") -> list[dict]:
@@ -46,8 +50,8 @@ CARDS = [
 ]  # fmt: skip
 
 
-def numbers(cards: list[dict] = CARDS, **points: list[dict]) -> dict:
-    return learned(cards, points, headline="paper")
+def numbers(made: list[dict] = CARDS, **points: list[dict]) -> dict:
+    return learned(tidy(made, points), headline="paper")
 
 
 def paired(of: str, over: str) -> dict:
@@ -57,7 +61,7 @@ def paired(of: str, over: str) -> dict:
 
 def test_table_2_is_over_boards_and_adapted_skins_are_pooled_by_board():
     table2 = numbers()["table2"]
-    assert table2.keys() == {"triplet", "adapted"}
+    assert table2.keys() == {"multi", "triplet", "adapted"}
     assert table2["triplet"]["accuracy_pct"] == {"mean": 78.0, "n": 2, "sd": 0.0, "ci95": [78.0, 78.0]}
     # board b0: 80 and 82, board b1: 84 and 86
     assert table2["adapted"]["accuracy_pct"] == over(81.0, 85.0)
@@ -93,33 +97,27 @@ def test_many_skins_are_compared_with_one_on_the_skins_that_one_was_tested_on():
 
 
 def test_a_question_that_was_not_asked_is_absent_and_not_null():
-    assert numbers([]) == {}
-    assert numbers(of_boards("lobo", 80.0)) == {}
+    assert numbers([]) == {"variants": {}}
+    assert numbers(of_boards("lobo", 80.0)).keys() == {"table2", "lobo", "variants"}
     without = numbers([*of_boards("lobo", 80.0), *of_boards("triplet", 78.0)])
-    assert without.keys() == {"table2", "paired"}
+    assert without.keys() == {"table2", "lobo", "paired", "variants"}
     assert [(one["of"], one["over"]) for one in without["paired"]] == [("triplet", "multi")]
-    assert numbers(of_skins("paper", 78.0, 1.0)).keys() == {"table2"}
+    assert numbers(of_skins("paper", 78.0, 1.0)).keys() == {"table2", "variants"}
     assert "null" not in json.dumps(numbers())
 
 
-def test_other_recipes_are_in_no_number():
-    assert numbers() == numbers([one for one in CARDS if one["recipe_name"] in ("paper", "control")])
-
-
-def test_cards_of_adapted_networks_are_given_by_fold_and_others_as_they_are():
-    assert [one["fold"] for one in by_fold(of_skins("paper", 78.0, 1.0))] == ["b0", "b1"]
-    assert by_fold(of_boards("lobo", 80.0)) == of_boards("lobo", 80.0)
-    assert by_fold([]) == []
-
-
-def point(pokes_n: int, skin_pct: dict[str, float], seed_i: int = 0) -> dict:
-    return card("pokes", "b1", skin_pct, seed_i=seed_i) | {"pokes_n": pokes_n}
+def test_other_recipes_are_in_no_number_but_the_variants():
+    alone = numbers([one for one in CARDS if one["recipe_name"] in ("paper", "control")])
+    assert numbers() == alone | {"variants": numbers()["variants"]}
+    assert numbers()["variants"].keys() == {"lobo", "triplet", "adapt"}
+    assert numbers()["variants"]["adapt"]["other"]["accuracy_pct"] == over(6.0, 10.0)
 
 
 def test_a_sweep_over_pokes_is_in_their_order_and_starts_with_none():
     points = [
-        point(390, {"s2": 90.0}), point(390, {"s3": 94.0}), point(65, {"s2": 80.0}), point(65, {"s3": 86.0}),
-        point(0, {"s2": 70.0, "s3": 72.0}), point(0, {"s2": 74.0, "s3": 76.0}, seed_i=1),
+        *(point({skin: pct}, pokes_n=n) for n, skin, pct in ((390, "s2", 90.0), (390, "s3", 94.0))),
+        *(point({skin: pct}, pokes_n=n) for n, skin, pct in ((65, "s2", 80.0), (65, "s3", 86.0))),
+        point({"s2": 70.0, "s3": 72.0}, pokes_n=0), point({"s2": 74.0, "s3": 76.0}, seed_i=1, pokes_n=0),
     ]  # fmt: skip
     sweep = numbers([], pokes=points)["sweep_pokes"]
     assert [(one["pokes_n"], one["accuracy_pct"]["mean"]) for one in sweep] == [(0, 73.0), (65, 83.0), (390, 92.0)]
@@ -128,8 +126,7 @@ def test_a_sweep_over_pokes_is_in_their_order_and_starts_with_none():
 
 def test_a_sweep_over_sensors_has_a_curve_for_each_method_over_draws():
     points = [
-        card("sensors", f"b1-{skins_n:02d}skins-draw{draw_i}", by_skin)
-        | {"method": method, "trained_on_skins_n": skins_n}
+        point(by_skin, f"b1-{skins_n:02d}skins-draw{draw_i}", method=method, trained_on_skins_n=skins_n)
         for method, step_pct in (("multi", 0.0), ("triplet", 1.0), ("adapted", 2.0))
         for skins_n in (3, 1)
         for draw_i in range(2)

@@ -6,22 +6,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.reporting.learning import (
-    adaptation_costs_table,
-    audit_table,
-    baselines_table,
-    chosen_table,
-    labels_table,
-    learning_tables,
-    methods_costs_table,
-    sweep_pokes_table,
-    sweep_sensors_table,
-)
 from pipeline.reporting.order import CONTROL, FAR_SHARE, order_table, paired_boards_table, paired_table
 from pipeline.reporting.paper import TABLE_2
 from pipeline.reporting.readme import blocks_of
 from pipeline.reporting.shown import to_markdown
-from pipeline.reporting.tables import make_tables
+from pipeline.reporting.sweeps import learning_costs
+from pipeline.reporting.tables import (
+    audit_table,
+    baselines_table,
+    chosen_table,
+    labels_table,
+    make_tables,
+    sweep_pokes_table,
+    sweep_sensors_table,
+)
 from tests.reporting.synthetic import over_boards
 
 
@@ -120,8 +118,9 @@ def test_a_claim_whose_rows_were_not_asked_for_is_absent():
 
 
 def test_where_nothing_was_claimed_there_is_no_table_of_the_order():
-    numbers = {"paired": [paired("multi", "single", **row(0.1))], "lobo": {"by_board": ALONE}}
-    assert set(learning_tables(numbers, "recorded")) == {"paired"}  # and no differences by board either
+    alone = {"by_board": {board: one | part() for board, one in ALONE.items()}}
+    tables = make_tables(everything() | {"paired": [paired("multi", "single", **row(0.1))], "lobo": alone})
+    assert {"order", "paired", "paired_boards"} & set(tables) == {"paired"}  # and no differences by board either
 
 
 def test_paired_differences_stand_beside_the_difference_of_the_papers_means():
@@ -224,11 +223,11 @@ def test_all_candidates_are_listed_and_the_chosen_one_is_marked_with_what_decide
 def test_what_was_not_timed_here_has_a_dash():
     timed = {"method": "ridge", "inputs": "raw", "train_s": 0.0123, "inference_us": 4.56, **row(30.0)}
     untimed = {name: value for name, value in timed.items() if name not in ("train_s", "inference_us")}
-    table = methods_costs_table([timed, untimed], "simulated")
-    assert table["training, s"].tolist() == ["0.0123", "–"]
-    assert table["one reading, µs"].tolist() == ["4.56", "–"]
     rows = [{"pokes_n": 390, **row(87.0)}, {"pokes_n": 65, "seconds": 1.5, **row(85.0)}]
-    assert adaptation_costs_table(rows, "simulated")["adaptation, s"].tolist() == ["1.5", "–"]
+    tables = learning_costs({"learning": [timed, untimed], "adaptation": rows}, "simulated")
+    assert tables["learning"]["training, s"].tolist() == ["0.0123", "–"]
+    assert tables["learning"]["one reading, µs"].tolist() == ["4.56", "–"]
+    assert tables["adaptation"]["adaptation, s"].tolist() == ["1.5", "–"]
 
 
 def everything() -> dict:
@@ -269,14 +268,23 @@ def part() -> dict:
 
 
 def test_a_question_that_was_asked_has_its_table_and_every_row_says_where_it_comes_from():
-    tables = learning_tables(everything(), "simulated")
-    assert set(tables) == {
-        "order", "paired", "paired_boards", "sweep_pokes", "sweep_sensors", "baselines", "labels", "audit", "chosen",
-    }  # fmt: skip
-    assert set(tables) < set(make_tables(everything()))
-    for table in tables.values():
-        assert set(table["source"]) == {"simulated"}
-    assert learning_tables({"variants": {}}, "simulated") == {}
+    asked = {
+        "order",
+        "paired",
+        "paired_boards",
+        "sweep_pokes",
+        "sweep_sensors",
+        "baselines",
+        "labels",
+        "audit",
+        "chosen",
+    }
+    tables = make_tables(everything())
+    assert asked < set(tables)
+    for name in asked:
+        assert set(tables[name]["source"]) == {"simulated"}
+    nothing = {name: everything()[name] for name in ("provenance", "variants", "capture")}
+    assert not asked & set(make_tables(nothing))
 
 
 def test_in_the_readme_the_order_stands_right_below_table_2():

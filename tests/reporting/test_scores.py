@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.core.io import read_json
 from pipeline.questions import EXPERIMENTS
-from pipeline.reporting.scores import headline_scores
+from pipeline.reporting.numbers import headline_scores
 from tests.reporting.synthetic import all_questions, scores, stat
 from tests.stages.checkout import ROOT
 

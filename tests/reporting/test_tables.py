@@ -3,14 +3,15 @@ import json
 import pytest
 
 from pipeline.core.errors import SchemaError
-from pipeline.evaluation.inference import interval
 from pipeline.evaluation.metrics import METRICS
+from pipeline.evaluation.scores import interval, tidy
 from pipeline.reporting.numbers import add_up, compose, lost_by_protocol, rounded
 from pipeline.reporting.paper import TABLE_2
 from pipeline.reporting.readme import fill
 from pipeline.reporting.shown import show, to_markdown
 from pipeline.reporting.table1 import NOT_GIVEN, OURS
 from pipeline.reporting.tables import make_tables
+from tests.evaluation import cards
 
 
 def card(question: str, fold: str, accuracy_pct: float, recipe: str = "paper") -> dict:
@@ -18,7 +19,7 @@ def card(question: str, fold: str, accuracy_pct: float, recipe: str = "paper") -
     skins = {"s0": one, "s1": {**one, "accuracy_pct": accuracy_pct + 10}}
     board = fold if question == "lobo" else "b0"
     scores = {"all": one, "registered": one, "by_skin": skins, "board_of": dict.fromkeys(skins, board)}
-    return {"question": question, "fold": fold, "recipe_name": recipe, "scores": scores, "train_skins": ["s8", "s9"]}
+    return cards.card(question, fold, scores | {"rows_n": 20}, recipe)
 
 
 CARDS = [
@@ -37,9 +38,9 @@ ACCOUNTS = [
 ]
 
 
-def numbers(cards: list[dict] = CARDS, source: str = "recorded") -> dict:
+def numbers(made: list[dict] = CARDS, source: str = "recorded") -> dict:
     provenance = {"source": source, "scene": "x", "git": "y", "seed": 1, "device": "z", "seconds": 1.0}
-    return {"provenance": provenance, **compose(cards, {}, ACCOUNTS, {"low_force_rows_n": 3}, headline="paper")}
+    return {"provenance": provenance, **compose(tidy(made), ACCOUNTS, {"low_force_rows_n": 3}, headline="paper")}
 
 
 def test_pooled_numbers_are_over_boards_and_single_ones_over_pairs_of_skins():
@@ -118,10 +119,10 @@ def test_the_papers_numbers_stand_beside_ours():
 
 
 def test_one_training_skin_is_not_called_pooled():
-    cards = [{**one, "train_skins": ["s9"]} for one in CARDS]
-    (row,) = [name for name in make_tables(numbers(cards))["table2"]["model"] if "board" in name]
+    alone = numbers([{**one, "train_skins": ["s9"]} for one in CARDS])
+    (row,) = [name for name in make_tables(alone)["table2"]["model"] if "board" in name]
     assert row == "Leave-one-board-out, one training skin (paper: single-sensor)"
-    assert "84.43" not in to_markdown(make_tables(numbers(cards))["table2"])
+    assert "84.43" not in to_markdown(make_tables(alone)["table2"])
 
 
 def test_a_table_of_scores_says_what_they_mean():
@@ -131,9 +132,9 @@ def test_a_table_of_scores_says_what_they_mean():
 
 
 def test_a_number_that_is_not_known_is_a_dash():
-    cards = [card("single_temporal", "s0", 99.0)]
-    del cards[0]["scores"]["all"]["mse_f_N2"]
-    table = make_tables(numbers(cards))["single_sensor"]
+    unknown = card("single_temporal", "s0", 99.0)
+    del unknown["scores"]["all"]["mse_f_N2"]
+    table = make_tables(numbers([unknown]))["single_sensor"]
     assert table["MSE_F, N² (ours)"].tolist() == ["–"]
 
 

@@ -9,11 +9,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Float, Float32, Int64
 from scipy.constants import micro, milli
 from scipy.spatial.transform import Rotation
 
-from pipeline.evaluation.inference import summarise_boards
+from pipeline.evaluation.scores import summarise
 from pipeline.physics.ambient import EARTH_T, ball_field, ball_images, directions
 from pipeline.physics.board import Board, BoardDesign, draw_board
 from pipeline.physics.skin import Skin
@@ -121,7 +122,7 @@ def one_a_poke(
     return np.sort(drawn[np.unique(indentation[drawn], return_index=True)[1]])
 
 
-def over_boards(points: Sequence[dict[str, Any]], case: str, boards: Sequence[str]) -> list[dict[str, Any]]:
+def by_step(points: Sequence[dict[str, Any]], case: str, boards: Sequence[str]) -> list[dict[str, Any]]:
     """Summarise scores over boards: a row a step of the `case`, in it each arm (of the boards that it was tried on)."""
     own = [point for point in points if case in point and point["board"] in boards]
     rows = []
@@ -132,7 +133,7 @@ def over_boards(points: Sequence[dict[str, Any]], case: str, boards: Sequence[st
             if size in here[0]:
                 row[name] = float(np.sqrt(np.mean([point[size] ** 2 for point in here])))
         for arm in dict.fromkeys(point["arm"] for point in here):
-            row[arm] = summarise_boards({point["board"]: point["scores"] for point in here if point["arm"] == arm})
+            row[arm] = summarise(pd.DataFrame([point["scores"] for point in here if point["arm"] == arm]), boards=True)
         rows.append(row)
     return rows
 

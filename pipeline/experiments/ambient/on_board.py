@@ -5,11 +5,12 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from pipeline.core.seeds import rng_for
 from pipeline.dataset.splits import Fold
-from pipeline.evaluation.metrics import score, summarise
-from pipeline.evaluation.tally import tally
+from pipeline.evaluation.metrics import score
+from pipeline.evaluation.scores import tally
 from pipeline.experiments.ambient.fields import (
     Case,
     Instrument,
@@ -65,8 +66,7 @@ def on_board(
     ):
         for arm, trained in networks.items():
             shown = arms[arm](case).astype(np.float32)
-            each = summarise([score(true, network(shown)) for network in trained])
-            scores = {name: value["mean"] for name, value in each.items()}
+            scores = pd.DataFrame([score(true, network(shown)) for network in trained]).mean().to_dict()
             yield {"board": fold.name, "arm": arm, **case.words, "scores": scores}
 
 

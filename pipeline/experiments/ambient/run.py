@@ -7,7 +7,7 @@ from scipy.constants import micro
 
 from pipeline.core.config import Files, Settings, read_settings
 from pipeline.core.stage import run
-from pipeline.experiments.ambient.fields import REFERENCE_ASIDE_MM, over_boards, take_board
+from pipeline.experiments.ambient.fields import REFERENCE_ASIDE_MM, by_step, take_board
 from pipeline.experiments.ambient.on_board import AS_IT_IS, ASIDE, OWN, networks_of_common_part, on_board
 from pipeline.experiments.ambient.settings import Ambient
 from pipeline.experiments.answer import write_answer
@@ -49,12 +49,12 @@ def ambient(scene: str, files: Files, folds: Path, indentations: Path, models: P
         "earth_uT": EARTH_SIZE_T / micro,
         "earth_dip_deg": EARTH_DIP_DEG,
         "iron_radius_mm": asked.iron.radius_mm,
-        "uniform": over_boards(points, "field_uT", boards),
-        "iron": over_boards(points, "distance_mm", boards),
+        "uniform": by_step(points, "field_uT", boards),
+        "iron": by_step(points, "distance_mm", boards),
         "last_board": {
             "board": boards[-1],
-            "uniform": over_boards(points, "field_uT", last),
-            "iron": over_boards(points, "distance_mm", last),
+            "uniform": by_step(points, "field_uT", last),
+            "iron": by_step(points, "distance_mm", last),
         },
     }
     write_answer(answer, numbers, {}, trainings=trainings)

@@ -12,8 +12,8 @@ from jaxtyping import Float, Float32, Int64
 
 from pipeline.core.errors import ParamsError
 from pipeline.dataset.rows import Rows
-from pipeline.evaluation import inference
 from pipeline.evaluation.metrics import ACCURACY_LIMIT_MM
+from pipeline.evaluation.scores import statistic
 from pipeline.experiments.contacts.oddness import roc_area
 
 TOLERANCE_MM = 0.5  # assumed: a pair's distance may differ by so much from what is asked, as places lie on a grid
@@ -132,9 +132,9 @@ def _above_pct(scores: np.ndarray, limit: float) -> float:
     return 100 * float((scores > limit).mean())
 
 
-def over_boards(boards: Sequence[Any]) -> Any:
-    """Turn equal trees of numbers, one a board, into one tree of summaries over boards (`inference.over_boards`)."""
+def summarise_nested(boards: Sequence[Any]) -> Any:
+    """Summarise over boards each number of nested mappings, one a board."""
     first = boards[0]
     if isinstance(first, Mapping):
-        return {key: over_boards([one[key] for one in boards if key in one]) for key in first}
-    return inference.over_boards(boards)
+        return {key: summarise_nested([board[key] for board in boards if key in board]) for key in first}
+    return statistic(boards, boards=True)

@@ -7,7 +7,7 @@ from pipeline.core.config import Files, Settings, read_settings
 from pipeline.core.stage import run
 from pipeline.experiments.answer import write_answer
 from pipeline.experiments.contacts.on_board import SAME_PLACE, on_board
-from pipeline.experiments.contacts.pairs import over_boards
+from pipeline.experiments.contacts.pairs import summarise_nested
 from pipeline.experiments.contacts.settings import Contacts
 from pipeline.experiments.contacts.superposition import superposition
 from pipeline.synthesis.settings import synthesis_of
@@ -35,7 +35,7 @@ def contacts(scene: str, files: Files, folds: Path, indentations: Path, models: 
         *(on_board(data, fold, asked, networks_without(models, fold.name)) for fold in held_out),
         strict=True,
     )
-    stats = over_boards(boards)
+    stats = summarise_nested(boards)
     numbers: dict[str, Any] = {
         "pairs_n": asked.pairs_n,
         "boards_n": len(boards),

@@ -8,18 +8,18 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Float
 
-from pipeline.evaluation.inference import (
+from pipeline.evaluation.scores import (
     INCONCLUSIVE,
     NO,
     ONE_BOARD,
     YES,
     Stat,
     all_of,
-    board_means,
     interval,
-    over_boards,
+    statistic,
     verdict,
 )  # fmt: skip
 
@@ -214,9 +214,8 @@ def _overestimates(late: Row) -> Found:
 def _gap(words: tuple[str, str], values: Float[np.ndarray, " u"], boards: Sequence[str]) -> Gap:
     """Summarise values of networks, each on its board."""
     word, unit = words
-    of_boards = board_means([(board, "", {word: float(value)}) for board, value in zip(boards, values, strict=True)])
-    stat = over_boards([one[word] for one in of_boards.values()])
-    return Gap(word, unit, stat, interval([float(value) for value in values]))
+    of_boards = pd.Series(values, dtype=float).groupby(list(boards)).mean()
+    return Gap(word, unit, statistic(of_boards, boards=True), interval(values.astype(float)))
 
 
 def _off(initial: Sequence[Row], field: Row) -> str:

@@ -8,7 +8,7 @@ from pipeline.core.config import Files, Settings, read_settings
 from pipeline.core.stage import run
 from pipeline.dataset.rows import Selection
 from pipeline.dataset.windows import Part, stack
-from pipeline.evaluation.tally import tally
+from pipeline.evaluation.scores import tally
 from pipeline.experiments.answer import read_folder, read_losses, write_answer
 from pipeline.experiments.drift import networks as work
 from pipeline.experiments.drift.findings import findings

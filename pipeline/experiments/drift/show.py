@@ -9,7 +9,7 @@ from typing import Any
 import matplotlib as mpl
 import pandas as pd
 
-from pipeline.evaluation.inference import VERDICTS
+from pipeline.evaluation.scores import VERDICTS
 from pipeline.reporting.figures import STYLE, svg
 from pipeline.reporting.paper import FIGURE_5
 from pipeline.reporting.shown import COLUMNS, show, tabulate

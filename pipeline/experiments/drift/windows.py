@@ -9,12 +9,13 @@ from math import ceil
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Float, Int, Int64, Shaped
 
 from pipeline.core.schema import Readings
 from pipeline.dataset.baseline import rank, subtract
-from pipeline.evaluation.inference import board_means, summarise_boards
 from pipeline.evaluation.metrics import METRICS, score
+from pipeline.evaluation.scores import board_means, summarise
 
 LATE_CONTACTS_N = 45_000  # paper figure 5b: "after 45,000 interactions"
 FORCE = 2  # column of a target
@@ -91,8 +92,8 @@ def last_window(answers: Sequence[Answers], policy: str) -> dict[str, Any]:
     last_i = max(one.window_i for one in answers)
     own = [one for one in answers if (one.policy, one.window_i) == (policy, last_i)]
     contacts_n = round(float(np.mean([one.contacts_n for one in own])))
-    scored = [(one.board, one.skin, score_window(one)) for one in own]
-    return {"contacts_n": contacts_n, **summarise_boards(board_means(scored))}
+    rows = pd.DataFrame([{"board": one.board, "skin": one.skin, **score_window(one)} for one in own])
+    return {"contacts_n": contacts_n, **summarise(board_means(rows), boards=True)}
 
 
 def late_window(rows: Sequence[dict[str, Any]]) -> int:

@@ -10,10 +10,11 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
 
-from pipeline.evaluation.inference import paired
-from pipeline.evaluation.metrics import score, summarise
+from pipeline.evaluation.metrics import score
+from pipeline.evaluation.scores import paired, statistic, summarise
 
 WINDOW_N = 5  # readings that the paper takes at rest (section 3)
 FORCE_MIN_N = 0.2  # assumed: below it there is little contact to place, and a press's first and last readings lie there
@@ -103,10 +104,7 @@ def lags(of: Presses, force_N: Sequence[Float[np.ndarray, " f"]]) -> dict[str, f
         if rows.sum() > WINDOW_N
         for answer_N in force_N
     ]
-    if not found_ms:
-        return {"n": 0}
-    one = {"mean": float(np.mean(found_ms)), "n": len(found_ms)}
-    return one | ({"sd": float(np.std(found_ms, ddof=1))} if len(found_ms) > 1 else {})
+    return statistic(found_ms) if found_ms else {"n": 0}
 
 
 def lag_ms(
@@ -127,6 +125,6 @@ def _scores(
     # The middle of the last five readings is two before the last, and in the same press where a row is scored.
     middle = np.flatnonzero(rows) - WINDOW_N // 2
     true = {"one": of.true[rows], "mean5": of.true[rows], "mean5_of_middle": of.true[middle]}
-    scores = {way: [score(true[way], one[rows]) for one in answers[way]] for way in WAYS}
-    sides = ([(board, "", one) for one in scores[way]] for way in ("mean5", "one"))
+    scores = {way: pd.DataFrame([score(true[way], one[rows]) for one in answers[way]]) for way in WAYS}
+    sides = (scores[way].assign(board=board, skin="") for way in ("mean5", "one"))
     return {way: summarise(own) for way, own in scores.items()} | {"paired": {"mean5_minus_one": paired(*sides)}}

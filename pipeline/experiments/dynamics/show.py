@@ -6,7 +6,7 @@ from typing import Any
 import matplotlib as mpl
 import pandas as pd
 
-from pipeline.evaluation.inference import VERDICTS, negated, verdict
+from pipeline.evaluation.scores import VERDICTS, negated, verdict
 from pipeline.reporting import paper
 from pipeline.reporting.figures import STYLE, svg
 from pipeline.reporting.shown import show_difference

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.evaluation.statistic import statistic
-from pipeline.trials.arms import AFTER, BEFORE, FORCE, Answered, biases, over_boards, paired
+from pipeline.evaluation.scores import statistic
+from pipeline.trials.arms import AFTER, BEFORE, FORCE, Answered, biases, compare_arms, summarise_arms
 
 DEPTH_DECIMALS = 2  # of a commanded depth in mm: nearer ones are one
 DRAWN_N = 400  # more points than these are not told apart in a panel
@@ -38,8 +38,8 @@ def gap_less_pct(gap_mm: Mapping[str, float]) -> float:
 
 def answer_flexible(answers: Sequence[Answered]) -> dict[str, Any]:
     """Summarise over boards, by arm; the force bias and the gain by adaptation apart."""
-    differences = {f"{AFTER}_minus_{BEFORE}": paired(answers, AFTER, BEFORE)}
-    return over_boards(answers) | biases(answers) | {"paired": differences}
+    differences = {f"{AFTER}_minus_{BEFORE}": compare_arms(answers, AFTER, BEFORE)}
+    return summarise_arms(answers) | biases(answers) | {"paired": differences}
 
 
 def forces_drawn(answers: Sequence[Answered], rng: np.random.Generator) -> dict[str, dict[str, list[float]]]:

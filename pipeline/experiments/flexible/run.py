@@ -18,8 +18,7 @@ from pipeline.experiments.flexible.boards import answer_flexible, by_depth, forc
 from pipeline.learning.recipe import HEADLINE
 from pipeline.learning.recipe import adaptations as adaptations_of
 from pipeline.trials.adapting import adaptations, read_starts
-from pipeline.trials.answers import answers_after, answers_before
-from pipeline.trials.arms import AFTER, CONTROL
+from pipeline.trials.arms import AFTER, CONTROL, answers_after, answers_before
 from pipeline.trials.data import SceneData, read_data
 
 SHAPE = "shape"  # the recipe on directions, if the scene has one: it ought to care less about the gap

@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.trials.arms import AFTER, BEFORE, CONTROL, Answered, over_boards, paired
+from pipeline.trials.arms import AFTER, BEFORE, CONTROL, Answered, compare_arms, summarise_arms
 
 GRID = "grid"  # as many pokes, by the robot
 
 
 def answer_manual(answers: Sequence[Answered], *, pokes_n: Sequence[int], lines_n: Sequence[int]) -> dict[str, Any]:
     """Summarise over boards; `pokes_n` and `lines_n` are those of each skin, and what is told is their mean."""
-    arms = over_boards(answers)
+    arms = summarise_arms(answers)
     counts = {
         "pokes_n": round(np.mean(pokes_n)),
         "lines_n": round(np.mean(lines_n)),
@@ -24,6 +24,8 @@ def answer_manual(answers: Sequence[Answered], *, pokes_n: Sequence[int], lines_
         "seeds_n": len({one.seed_i for one in answers}),
     }
     differences = {
-        f"{AFTER}_minus_{other}": paired(answers, AFTER, other) for other in (BEFORE, CONTROL, GRID) if other in arms
+        f"{AFTER}_minus_{other}": compare_arms(answers, AFTER, other)
+        for other in (BEFORE, CONTROL, GRID)
+        if other in arms
     }
     return counts | arms | {"paired": differences}

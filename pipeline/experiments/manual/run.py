@@ -18,8 +18,7 @@ from pipeline.learning.recipe import HEADLINE, Adaptations
 from pipeline.learning.recipe import adaptations as adaptations_of
 from pipeline.learning.trial import Trial
 from pipeline.trials.adapting import Pokes, Starts, adaptation, own_starts, pool_lines, read_starts
-from pipeline.trials.answers import answers_after, answers_before
-from pipeline.trials.arms import AFTER, CONTROL, Answered
+from pipeline.trials.arms import AFTER, CONTROL, Answered, answers_after, answers_before
 from pipeline.trials.data import SceneData, read_data
 
 

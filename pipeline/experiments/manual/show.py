@@ -5,7 +5,7 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.evaluation.inference import VERDICTS, verdict
+from pipeline.evaluation.scores import VERDICTS, verdict
 from pipeline.reporting.order import gain
 from pipeline.reporting.paper import GAINS, MANUAL, MANUAL_POKES_N
 from pipeline.reporting.shown import COLUMNS, Stat, show, show_difference, tabulate

@@ -7,7 +7,7 @@ import matplotlib as mpl
 import numpy as np
 import pandas as pd
 
-from pipeline.evaluation.inference import INCONCLUSIVE, ONE_BOARD
+from pipeline.evaluation.scores import INCONCLUSIVE, ONE_BOARD
 from pipeline.reporting import paper
 from pipeline.reporting.figures import STYLE, svg
 from pipeline.reporting.work_precision import COLOURS

@@ -9,7 +9,7 @@ from pipeline.core.seeds import rng_for, seed_for
 from pipeline.core.stage import run
 from pipeline.dataset.rows import SHEAR_TARGETS, Rows, Selection, gather
 from pipeline.dataset.splits import NO_POOL, Fold, draw_sides
-from pipeline.evaluation.tally import tally
+from pipeline.evaluation.scores import tally
 from pipeline.experiments.answer import read_folder, read_losses, write_answer
 from pipeline.experiments.shear.scores import answer_shear, score5
 from pipeline.experiments.shear.settings import Shear

@@ -8,10 +8,11 @@ from collections.abc import Hashable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Float
 
 from pipeline.evaluation.metrics import ACCURACY_LIMIT_MM
-from pipeline.evaluation.statistic import over_units
+from pipeline.evaluation.scores import summarise
 
 PLACE, SIDEWAYS, NORMAL = slice(0, 2), slice(2, 4), slice(4, 5)
 PARTS = {"xy": (PLACE, "mse_xy_mm2"), "fxy": (SIDEWAYS, "mse_fxy_N2"), "fz": (NORMAL, "mse_fz_N2")}
@@ -46,6 +47,10 @@ def answer_shear(
     """
     rms_N = np.sqrt((target.astype(float) ** 2).mean(axis=0))
     sizes = {"fx_rms_N": float(rms_N[2]), "fy_rms_N": float(rms_N[3]), "fz_rms_N": float(rms_N[4])}
-    return over_units(by_reading) | {
-        "by_line": over_units(by_line), "readings_n": len(target), "lines_n": lines_n, "passes_n": passes_n, **sizes,
+    return _over_folds(by_reading) | {
+        "by_line": _over_folds(by_line), "readings_n": len(target), "lines_n": lines_n, "passes_n": passes_n, **sizes,
     }  # fmt: skip
+
+
+def _over_folds(scored: Sequence[tuple[Hashable, Mapping[str, float]]]) -> dict[str, Any]:
+    return summarise(pd.DataFrame([scores for _, scores in scored]).groupby([fold for fold, _ in scored]).mean())

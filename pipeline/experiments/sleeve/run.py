@@ -8,7 +8,7 @@ from pipeline.core.config import Files, Settings, read_settings
 from pipeline.core.executors import make_executor
 from pipeline.core.stage import run, say
 from pipeline.dataset.rows import Selection, gather
-from pipeline.evaluation.tally import tally
+from pipeline.evaluation.scores import tally
 from pipeline.experiments.answer import read_folder, read_losses, write_answer
 from pipeline.experiments.sleeve import areas as evaluation
 from pipeline.experiments.sleeve.settings import Sleeve
