@@ -1,7 +1,11 @@
+import re
 import subprocess
 
 import pytest
 
+from pipeline.core.config import read_yaml
+from pipeline.reporting.readme import blocks_of
+from tests.reporting.synthetic import all_questions
 from tests.stages.checkout import ROOT, run
 
 OWN = ["reports", "params.yaml", "data/captures.yaml", "dvc.yaml", "README.md"]
@@ -15,3 +19,10 @@ def test_the_readme_shows_what_the_committed_results_say():
         pytest.skip("this checkout has results or scenes of its own; `reskin readme` would show those")
     done = run(ROOT, "reskin", "readme", "--check", check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_the_readme_links_the_code_of_every_stage():
+    stages = read_yaml(ROOT / "dvc.yaml")["stages"]
+    links = re.findall(r"\]\((\S+)\)", blocks_of([all_questions()], [], "", stages)["stages"])
+    assert len(links) == len(stages)
+    assert [link for link in links if not (ROOT / link).is_file()] == []

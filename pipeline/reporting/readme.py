@@ -88,5 +88,7 @@ def _stages(stages: Mapping[str, Any]) -> str:
             for out in stage["do"].get(key, [])
         ]
         written = ", ".join(f"`{re.sub(r'[$]{[^}]*}', '…', out)}`" for out in outs) or "MLflow runs"
-        lines.append(f"| {name} | [pipeline/stages/{name}.py](pipeline/stages/{name}.py) | {written} |")
+        homes = (f"pipeline/stages/{name}.py", f"pipeline/experiments/{name}/run.py")
+        code = next(path for path in stage["do"]["deps"] if path in homes)
+        lines.append(f"| {name} | [{code}]({code}) | {written} |")
     return "\n".join(lines)
