@@ -81,11 +81,9 @@ class Adaptation(FineTuning):
 
 
 class _Recipes(Strict):
-    recipes: dict[Name, Any]
-
     @model_validator(mode="after")
     def _has_a_headline(self) -> "_Recipes":
-        if HEADLINE not in self.recipes:
+        if HEADLINE not in self.recipes:  # type: ignore[attr-defined]
             raise ValueError(f"recipes hold a recipe named {HEADLINE}, which stands beside the paper's numbers")
         return self
 
