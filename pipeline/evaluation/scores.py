@@ -172,7 +172,8 @@ def paired(of: pd.DataFrame, over: pd.DataFrame, *, where_tested: bool = False) 
 
 def records(rows: pd.DataFrame) -> dict[str, dict[str, float]]:
     """Give known numbers by index and column."""
-    return {str(index): row.dropna().to_dict() for index, row in rows.iterrows()}
+    known = {str(index): row.dropna() for index, row in rows.iterrows()}
+    return {index: {str(name): float(value) for name, value in row.items()} for index, row in known.items()}
 
 
 def verdict(stat: Stat, *, above: float = 0.0) -> str:
@@ -216,7 +217,7 @@ def tally(trainings: Iterable[Mapping[str, Any]]) -> dict[str, int]:
 
 
 def _metrics(rows: pd.DataFrame) -> list[str]:
-    return [name for name in rows if name not in KEYS]
+    return [str(name) for name in rows if name not in KEYS]
 
 
 def _skin_means(rows: pd.DataFrame) -> pd.DataFrame:

@@ -46,25 +46,24 @@ AXES = {"pokes": ("sweep_pokes", "pokes_n"), "sensors": ("sweep_sensors", "skins
 
 def learned(table: pd.DataFrame, *, headline: str) -> dict[str, Any]:
     """Compose what the scores say; `headline` names the recipe that stands beside the paper's numbers."""
-    models = {row: select(table, question=question, recipe=headline) for row, question in TABLE_2.items()}
-    models = {row: own for row, own in {**models, CONTROL: select(table, question="adapt", recipe=CONTROL)}.items()
-              if len(own)}  # fmt: skip
+    recipes = {row: (question, headline) for row, question in TABLE_2.items()} | {CONTROL: ("adapt", CONTROL)}
+    models = {row: select(table, question=question, recipe=recipe) for row, (question, recipe) in recipes.items()}
+    models = {row: group for row, group in models.items() if len(group)}
+    table2 = {row: over_pairs(group) if row == "single" else over_boards(group) for row, group in models.items()}
+    control = table2.pop(CONTROL, None)
     numbers: dict[str, Any] = {
-        "table2": {
-            row: (over_pairs if row == "single" else over_boards)(models[row]) for row in TABLE_2 if row in models
-        },
+        "table2": table2,
         "lobo": _lobo(models["multi"]) if "multi" in models else {},
+        "adapt": {"pokes_n": int(models[CONTROL]["pokes_n"].iloc[0]), "control": control} if control else {},
         "paired": [
             {"of": of, "over": over} | paired(by_skin(models[of]), by_skin(models[over]), where_tested=over == "single")
             for of, over in PAIRS
             if of in models and over in models
         ],
+        **_single(table, headline),
     }
-    if CONTROL in models:
-        pokes_n = int(models[CONTROL]["pokes_n"].iloc[0])
-        numbers["adapt"] = {"pokes_n": pokes_n, "control": over_boards(models[CONTROL])}
-    numbers |= _single(table, headline) | _curves(table)
-    return {name: value for name, value in numbers.items() if value} | {"variants": _variants(table)}
+    numbers = {name: value for name, value in numbers.items() if value}
+    return numbers | _curves(table) | {"variants": _variants(table)}
 
 
 def curves_of(points: Points) -> dict[str, list[tuple[str, int, dict[str, float]]]]:
@@ -86,21 +85,21 @@ def timed_learning(numbers: Mapping[str, Any], seconds: Mapping[str, Seconds]) -
         took = seconds.get("sweep_pokes", [])
         joined["adaptation"] = []
         for row in numbers["sweep_pokes"]:
-            own = [one["train_s"] for one in took if f".{row['pokes_n']}pokes." in one["name"]]
-            joined["adaptation"].append(row | ({"seconds": float(np.median(own))} if own else {}))
+            times_s = [training["train_s"] for training in took if f".{row['pokes_n']}pokes." in training["name"]]
+            joined["adaptation"].append(row | ({"seconds": float(np.median(times_s))} if times_s else {}))
     return joined
 
 
 def _lobo(rows: pd.DataFrame) -> dict[str, Any]:
     by_board = {
         str(board): {
-            "trained_on_skins_n": int(own["trained_on_skins_n"].iloc[0]),
+            "trained_on_skins_n": int(group["trained_on_skins_n"].iloc[0]),
             **{
-                places: whole(own, places)[list(METRICS)].mean().dropna().to_dict()
+                places: whole(group, places)[list(METRICS)].mean().dropna().to_dict()
                 for places in (AS_LABELLED, REGISTERED)
             },
         }
-        for board, own in rows.groupby("fold", sort=False)
+        for board, group in _parts(rows, "fold", sort=False)
     }
     return {REGISTERED: over_boards(rows, REGISTERED), "by_board": by_board}
 
@@ -109,7 +108,7 @@ def _single(table: pd.DataFrame, headline: str) -> dict[str, Any]:
     """Summarise one skin by how it was split; `single_sensor` is what stands beside the paper's numbers."""
     questions = (*PAPERS_SPLITS, *HONEST.values())
     numbers = {question: over_folds(select(table, question=question, recipe=headline)) for question in questions}
-    numbers = {question: own for question, own in numbers.items() if own}
+    numbers = {question: group for question, group in numbers.items() if group}
     papers = next(({"split": question} | numbers[question] for question in PAPERS_SPLITS if question in numbers), {})
     honest = {name: numbers[question] for name, question in HONEST.items() if question in numbers}
     return numbers | {"single_sensor": papers | honest}
@@ -119,11 +118,11 @@ def _variants(table: pd.DataFrame) -> dict[str, dict[str, Any]]:
     """Summarise every recipe of every question that leaves models; repeats on one skin are no boards."""
     numbers: dict[str, dict[str, Any]] = {}
     models = table[table["question"].isin([row.name for row in ROWS if row.kind == "models"])]
-    for (question, recipe), own in models.groupby(["question", "recipe"], sort=False):
+    for (question, recipe), group in _parts(models, ["question", "recipe"], sort=False):
         summarise = (
             over_pairs if question == "transfer" else over_folds if question.startswith("single_") else over_boards
         )
-        numbers.setdefault(question, {})[recipe] = summarise(own)
+        numbers.setdefault(question, {})[recipe] = summarise(group)
     return numbers
 
 
@@ -133,13 +132,13 @@ def _curves(table: pd.DataFrame) -> dict[str, Any]:
     )
     numbers: dict[str, Any] = {}
     if len(pokes):
-        numbers["sweep_pokes"] = [{"pokes_n": int(n), **over_boards(own)} for n, own in pokes.groupby("pokes_n")]
+        numbers["sweep_pokes"] = [{"pokes_n": int(n), **over_boards(group)} for n, group in _parts(pokes, "pokes_n")]
         numbers["contrasts"] = contrasts_of_pokes(pokes)
     if len(sensors):
         numbers["sweep_sensors"] = [
-            {"method": method, "skins_n": int(n), **over_boards(own)}
+            {"method": method, "skins_n": int(n), **over_boards(group)}
             for method in SWEPT
-            for n, own in select(sensors, method=method).groupby("trained_on_skins_n")
+            for n, group in _parts(select(sensors, method=method), "trained_on_skins_n")
         ]
         numbers["contrasts"] = numbers.get("contrasts", {}) | contrasts_of_sensors(sensors)
     if len(classical):
@@ -156,7 +155,7 @@ def contrasts_of_pokes(rows: pd.DataFrame) -> dict[str, Any]:
 
     What the paper says of its figure 6a, as paired differences a board.
     """
-    at = {int(n): own for n, own in by_skin(rows).groupby("pokes_n")}
+    at = {int(n): group for n, group in _parts(by_skin(rows), "pokes_n")}
     if 0 not in at or len(at) < 2:
         return {}
     known = sorted(at)
@@ -174,7 +173,7 @@ def contrasts_of_sensors(rows: pd.DataFrame) -> dict[str, Any]:
 
     What the paper says of its figure 6b, as paired differences a board.
     """
-    at = {(method, int(n)): own for (method, n), own in by_skin(rows).groupby(["method", "trained_on_skins_n"])}
+    at = {(method, int(n)): group for (method, n), group in _parts(by_skin(rows), ["method", "trained_on_skins_n"])}
     counts = sorted({skins_n for _, skins_n in at})
     adapted = {
         f"sensors_adapted_over_{method}": [
@@ -192,16 +191,16 @@ def contrasts_of_sensors(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def _methods(rows: pd.DataFrame) -> Iterator[dict[str, Any]]:
-    for (_, recipe), own in rows.groupby(["question", "recipe"], sort=False):
-        first = own.iloc[0]
+    for (_, recipe), group in _parts(rows, ["question", "recipe"], sort=False):
+        first = group.iloc[0]
         words = {"method": first["method"], "inputs": first["inputs"], "name": recipe}
         words |= {"base": first["base"]} if first["base"] else {}
-        yield {**words, "rows_n": int(first["trained_on_rows_n"]), **over_boards(own)}
+        yield {**words, "rows_n": int(first["trained_on_rows_n"]), **over_boards(group)}
 
 
 def _labels(rows: pd.DataFrame) -> Iterator[dict[str, Any]]:
-    for (method, inputs), own in rows.groupby(["method", "inputs"], sort=False):
-        for labels_n, scored in own.groupby("labels_n"):
+    for (method, inputs), group in _parts(rows, ["method", "inputs"], sort=False):
+        for labels_n, scored in _parts(group, "labels_n"):
             parts = {places: over_boards(scored, places) for places in (AS_LABELLED, REGISTERED)}
             yield {"method": method, "inputs": inputs, "labels_n": int(labels_n), **parts}
 
@@ -216,23 +215,28 @@ def _score_means(row: Mapping[str, Any]) -> dict[str, float]:
     return {name: scores[name]["mean"] for name in METRICS if name in scores}
 
 
+def _parts(rows: pd.DataFrame, by: str | list[str], *, sort: bool = True) -> Iterator[tuple[Any, pd.DataFrame]]:
+    """Part rows by what columns say; unsorted ones come as they appear."""
+    yield from rows.groupby(by, sort=sort)
+
+
 def _times(row: Mapping[str, Any], seconds: Mapping[str, Seconds]) -> dict[str, float]:
     """Give the median seconds of a method's trainings; an adapted network was also trained before."""
     question = NETWORKS.get(row["method"])
     if question is None:
         return _median_times(seconds.get("train_classical", []), f"{row['name']}.")
-    own = _median_times(seconds.get(TRAINED_IN[question], []), f"{question}.{row['name']}.")
-    if question != "adapt" or not own:
-        return own
+    times = _median_times(seconds.get(TRAINED_IN[question], []), f"{question}.{row['name']}.")
+    if question != "adapt" or not times:
+        return times
     base = _median_times(seconds.get("train_triplet", []), f"triplet.{row['base']}.")
-    return own | {"train_s": own["train_s"] + base["train_s"]} if base else {}
+    return times | {"train_s": times["train_s"] + base["train_s"]} if base else {}
 
 
 def _median_times(took: Seconds, start: str) -> dict[str, float]:
-    own = [one for one in took if one["name"].startswith(start)]
-    if not own:
+    timed = [training for training in took if training["name"].startswith(start)]
+    if not timed:
         return {}
     return {
-        "train_s": float(np.median([one["train_s"] for one in own])),
-        "inference_us": 1e6 * float(np.median([one["one_reading_s"] for one in own])),
+        "train_s": float(np.median([training["train_s"] for training in timed])),
+        "inference_us": 1e6 * float(np.median([training["one_reading_s"] for training in timed])),
     }

@@ -66,7 +66,7 @@ def beside(
     row: Mapping[str, Any], printed: Mapping[str, str], show: Callable[[Stat | None], str], *, paper: str = "paper"
 ) -> dict[str, str]:
     """Show every metric of a row beside what the paper prints, and over how many ours is."""
-    cells = {}
+    cells: dict[str, str] = {}
     for metric, title in COLUMNS.items():
         cells |= {f"{title} (ours)": show(row.get(metric)), f"{title} ({paper})": printed.get(metric, "–")}
     return cells | {"n": n_of(row)}
