@@ -30,7 +30,7 @@ HOMES = {
         "pipeline/learning/train.py", "pipeline/learning/feed.py",
     },
     r"from sklearn": {
-        "pipeline/dataset/single.py", "pipeline/dataset/splits.py", "pipeline/experiments/contacts/oddness.py",
+        "pipeline/dataset/single.py", "pipeline/dataset/splits.py", "pipeline/experiments/contacts/pairs.py",
         "pipeline/learning/classical.py",
     },
     r"os\.environ": {

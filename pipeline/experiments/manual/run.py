@@ -1,8 +1,9 @@
-"""Stage manual: networks adapted to new skins by pokes along lines by hand (paper section 5, manual indentations)."""
+"""Stage manual: networks adapted to new skins by pokes along lines by hand (section 5, manual indentations)."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,14 +14,31 @@ from pipeline.dataset.lines import Lines
 from pipeline.dataset.splits import Fold
 from pipeline.dataset.stacked import hand_rows, shifted, stack
 from pipeline.experiments.answer import read_folder, read_losses, write_answer
-from pipeline.experiments.manual.parts import GRID, answer_manual
 from pipeline.learning.recipe import HEADLINE, Adaptations
 from pipeline.learning.recipe import adaptations as adaptations_of
 from pipeline.learning.trial import Trial
 from pipeline.trials.adapting import Pokes, Starts, adaptation, own_starts, pool_lines, read_starts
 from pipeline.trials.answers import answers_after, answers_before
-from pipeline.trials.arms import AFTER, CONTROL, Answered
+from pipeline.trials.arms import AFTER, BEFORE, CONTROL, Answered, over_boards, paired
 from pipeline.trials.data import SceneData, read_data
+
+GRID = "grid"  # as many pokes, by the robot
+
+
+def answer_manual(answers: Sequence[Answered], *, pokes_n: Sequence[int], lines_n: Sequence[int]) -> dict[str, Any]:
+    """Summarise over boards; `pokes_n` and `lines_n` are those of each skin, and what is told is their mean."""
+    arms = over_boards(answers)
+    counts = {
+        "pokes_n": round(np.mean(pokes_n)),
+        "lines_n": round(np.mean(lines_n)),
+        "skins_n": len({one.skin for one in answers}),
+        "boards_n": len({one.board for one in answers}),
+        "seeds_n": len({one.seed_i for one in answers}),
+    }
+    differences = {
+        f"{AFTER}_minus_{other}": paired(answers, AFTER, other) for other in (BEFORE, CONTROL, GRID) if other in arms
+    }
+    return counts | arms | {"paired": differences}
 
 
 def manual(scene: str, files: Files, folds: Path, main: Path, indentations: Path, started: Path, answer: Path) -> None:

@@ -10,8 +10,15 @@ from pipeline.evaluation.comparison import paired as paired_cards
 from pipeline.evaluation.inference import interval
 from pipeline.evaluation.metrics import score
 from pipeline.evaluation.summary import score_groups
-from pipeline.experiments.flexible.boards import DRAWN_N, answer_flexible, by_depth, forces_drawn, strength_ratio
-from pipeline.experiments.manual.parts import GRID, answer_manual
+from pipeline.experiments.flexible.run import (
+    DRAWN_N,
+    answer_flexible,
+    by_depth,
+    forces_drawn,
+    gap_less_pct,
+    strength_ratio,
+)
+from pipeline.experiments.manual.run import GRID, answer_manual
 from pipeline.trials.arms import AFTER, BEFORE, CONTROL, Answered, bias, biases, over_boards, paired
 
 SINGLE = 1e-4  # sums of single-precision forces of some newtons
@@ -123,3 +130,13 @@ def test_the_figure_shows_equal_readings_of_both_arms_and_no_more_than_are_seen(
 def test_flexible_numbers_hold_every_arm_and_its_bias():
     answer = answer_flexible(ANSWERS)
     assert set(answer["bias_f_N"]) == {BEFORE, AFTER, CONTROL, GRID} < set(answer)
+
+
+def test_a_gap_of_a_fifth_is_80_percent_less():
+    assert gap_less_pct({"rigid": 2.0, "flexible": 0.4}) == pytest.approx(80.0)
+
+
+@given(rigid=st.floats(0.1, 10), share=st.floats(0, 3), unit=st.floats(0.01, 100))
+def test_it_is_a_share_whatever_the_unit(rigid, share, unit):
+    found = gap_less_pct({"rigid": unit * rigid, "flexible": unit * share * rigid})
+    assert found == pytest.approx(100 * (1 - share), abs=1e-9)  # rounding

@@ -9,13 +9,12 @@ from pipeline.core.config import Settings, read_yaml
 from pipeline.core.seeds import rng_for
 from pipeline.dataset.grid import points_mm
 from pipeline.dataset.splits import Fold
-from pipeline.experiments.contacts.on_board import on_board
-from pipeline.experiments.contacts.settings import Contacts
+from pipeline.experiments.contacts.run import Contacts, on_board
 from pipeline.trials.data import SceneData
 from tests.dataset import tables
 
 ASKED = Contacts(pairs_n=40, separations_mm=(4.0, 8.0), false_alarm_fraction=0.1)
-CI = Path(__file__).resolve().parents[2] / "pipeline/scenes/ci.yaml"
+CI = Path(__file__).resolve().parents[3] / "pipeline/scenes/ci.yaml"
 
 
 def scenery():

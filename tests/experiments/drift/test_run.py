@@ -21,7 +21,7 @@ from pipeline.experiments.variation import show as variation_pages
 from pipeline.experiments.variation.run import variation
 from tests.dataset.tables import readings
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 DEPTHS_MM, PASSES_N, DRIFT_uT = (0.6, 1.2), 3, 0.3  # 390 contacts; drift of each channel a contact
 EVERY_s, WARMING_K_PER_s = 0.5, 0.01
 

@@ -1,9 +1,13 @@
-"""What every experiment's stage writes: its numbers, what is drawn, and what was lost of captures of its own."""
+"""What every experiment's stage reads and writes: its captures, its numbers, what figures draw, and what was lost."""
 
 import json
+from pathlib import Path
+
+import pytest
 
 from pipeline.core import io
-from pipeline.experiments.answer import read_losses, write_answer
+from pipeline.core.errors import SchemaError
+from pipeline.experiments.answer import only, read_losses, write_answer
 from tests.dataset import tables
 
 
@@ -22,3 +26,14 @@ def test_an_answer_about_the_main_captures_counts_none_of_its_own(tmp_path):
     written = json.loads((tmp_path / "contacts.json").read_text())
     assert written["losses"] == {"accounts": [], "left_out": {}}
     assert (written["numbers"], written["drawn"]) == ({"pairs_n": 3}, {"along": [1.0]})
+
+
+def test_the_one_capture_of_a_folder_is_given():
+    assert only(["b0_s0-glass"], Path("ci-glass")) == "b0_s0-glass"
+
+
+@pytest.mark.parametrize("captures", [[], ["b0_s0-glass", "b1_s0-glass"]])
+def test_none_or_several_captures_are_refused_and_counted(captures):
+    with pytest.raises(SchemaError, match=f"ci-glass: captures must be one, as .*; got {len(captures)}. Ask its") as no:
+        only(captures, Path("ci-glass"))
+    assert "\n" not in str(no.value)

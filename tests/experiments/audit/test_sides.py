@@ -12,10 +12,9 @@ from hypothesis import strategies as st
 from pipeline.core.errors import ParamsError, SchemaError
 from pipeline.core.seeds import rng_for
 from pipeline.experiments.audit import copies, sides
-from pipeline.experiments.audit.checks import holds, to_words
 from pipeline.experiments.audit.copies import nearest_rays
-from pipeline.experiments.audit.settings import audit_choice, audit_scaler
-from pipeline.experiments.audit.sides import Labels, Sides, audit_fold
+from pipeline.experiments.audit.run import audit_choice, audit_scaler
+from pipeline.experiments.audit.sides import Labels, Sides, audit_fold, holds, to_words
 from pipeline.learning.standardise import FIT
 
 NONE = np.zeros(0, np.int64)

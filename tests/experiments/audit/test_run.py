@@ -31,7 +31,7 @@ from tests.scenes import ADAPTATIONS, RECIPE, SHARED, TRAINING, recorded, settin
 
 PLACES_N, PASSES_N, READINGS_N, CH_N = 16, 2, 2, 15
 SEED = 2021
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 MODELS = ("train_single", "train_multi", "train_triplet", "adapt")
 SKINS = ("b0_s0", "b0_s1", "b1_s0", "b2_s0")
 COPY = "b3_s0"  # b0_s0 again, under the name of another board's skin

@@ -6,9 +6,9 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from pipeline.experiments.sleeve.areas import NEAR_MM, errors_mm, score_places, to_draw
+from pipeline.experiments.sleeve.run import NEAR_MM, errors_mm, score_places, to_draw
 from pipeline.experiments.sleeve.show import figures, tables
-from tests.evaluation.test_sleeve import AREA, answered
+from tests.experiments.test_sleeve import AREA, answered
 
 SVG = "{http://www.w3.org/2000/svg}"
 

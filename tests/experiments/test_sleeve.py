@@ -10,7 +10,7 @@ from pipeline.core.errors import ParamsError
 from pipeline.core.schema import Readings
 from pipeline.core.seeds import rng_for
 from pipeline.dataset.rows import Rows
-from pipeline.experiments.sleeve.areas import (
+from pipeline.experiments.sleeve.run import (
     NEAR_MM,
     Area,
     errors_mm,

@@ -10,7 +10,7 @@ from scipy.stats import linregress, norm, spearmanr
 
 from pipeline.core.errors import SchemaError
 from pipeline.core.seeds import rng_for
-from pipeline.experiments.sensitivity.weights import (
+from pipeline.experiments.sensitivity.run import (
     answer_of,
     direction,
     levels_of,

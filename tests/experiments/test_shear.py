@@ -8,7 +8,7 @@ from sklearn.metrics import mean_squared_error, r2_score
 
 from pipeline.core.seeds import rng_for
 from pipeline.evaluation.statistic import over_units, statistic
-from pipeline.experiments.shear.scores import answer_shear, score5
+from pipeline.experiments.shear.run import answer_shear, score5
 
 
 def drawn(seed: int, f: int = 40) -> tuple[np.ndarray, np.ndarray]:

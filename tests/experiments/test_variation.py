@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from pipeline.core.errors import ParamsError
 from pipeline.core.seeds import rng_for
-from pipeline.experiments.variation.visits import (
+from pipeline.experiments.variation.run import (
     LINES_MAX_N,
     Visits,
     find_visits,

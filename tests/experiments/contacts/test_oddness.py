@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from sklearn.metrics import roc_auc_score
 
 from pipeline.core.seeds import rng_for
-from pipeline.experiments.contacts.oddness import (
+from pipeline.experiments.contacts.pairs import (
     NEIGHBOURS_N,
     NOISE_uT,
     direction_distance,

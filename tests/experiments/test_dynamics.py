@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.core.seeds import rng_for
-from pipeline.experiments.dynamics.presses import WINDOW_N, compare, lag_ms, presses_of, running_mean
+from pipeline.experiments.dynamics.run import WINDOW_N, compare, lag_ms, presses_of, running_mean
 
 RATE_HZ = 400.0
 
