@@ -12,9 +12,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from pipeline import plan
-from pipeline.capture.folder import write_capture
-from pipeline.capture.header import STREAM_FILE, Header
-from pipeline.core import io
+from pipeline.capture.header import STREAM_FILE, Header, write_capture
+from pipeline.core import config, io
 from pipeline.core.errors import CaptureError, ReskinError
 from pipeline.dataset.captures import check_losses, open_capture
 from pipeline.params import read_plan, read_scene, read_shared
@@ -28,31 +27,32 @@ INDENTATIONS = "data/indentations"
 def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Header:
     """Check a prepared recording, write it, track it with DVC, register it, and plan its scene; all, or nothing."""
     header, files = prepared
-    settings = read_scene(plan.scene_file(root, scene), root / plan.PARAMS)
+    settings = read_scene(plan.scene_file(root, scene), root / config.PARAMS)
     if settings.source != header.source:
-        raise CaptureError(
-                f"capture {header.capture}", "source", f"{settings.source}, as scene {scene} is", header.source,
-                "Simulated and recorded captures belong to different scenes.",
-            )  # fmt: skip
-    limit, before = read_shared(root / plan.PARAMS)["lost_fraction_max"], read_registry(root)
+        rule, remedy = (
+            f"{settings.source}, as scene {scene} is",
+            "Simulated and recorded captures belong to different scenes.",
+        )
+        raise CaptureError(f"capture {header.capture}", "source", rule, header.source, remedy)
+    limit, before = read_shared(root / config.PARAMS)["lost_fraction_max"], read_registry(root)
     target = root / RAW / scene / header.capture
     _check_free(target, header.capture in before.captures.get(scene, {}))
-    with io.restoring(root / REGISTRY, root / plan.PLAN), _forgetting_on_failure(target):
+    with io.restoring(root / REGISTRY, root / config.PLAN), _forgetting_on_failure(target):
         with _naming_sources(target, files):
             complete = write_capture(target, header, files)
             fingerprints = _read_through(target, complete, limit)
         after = with_capture(before, scene, complete, fingerprints, allow_copy=allow_copy)
         _dvc(root, "add", "--quiet", str(target.relative_to(root)))
         write_registry(root, after)
-        plan.use(root, [*read_plan(root / plan.PLAN).scenes, scene])
+        plan.use(root, [*read_plan(root / config.PLAN).scenes, scene])
     return complete
 
 
 def remove(root: Path, scene: str, capture: str) -> None:
     """Take a capture out again: its entry and its stage, then its raw files and its readings."""
     after = without_capture(read_registry(root), scene, capture)
-    running = read_plan(root / plan.PLAN).scenes
-    with io.restoring(root / REGISTRY, root / plan.PLAN):
+    running = read_plan(root / config.PLAN).scenes
+    with io.restoring(root / REGISTRY, root / config.PLAN):
         write_registry(root, after)
         plan.use(root, [name for name in running if name != scene or scene in after.captures])
     _forget(root / RAW / scene / capture)
@@ -119,6 +119,5 @@ def _forget(target: Path) -> None:
 def _dvc(root: Path, *words: str) -> None:
     done = subprocess.run([sys.executable, "-m", "dvc", *words], cwd=root, capture_output=True, text=True, check=False)
     if done.returncode:
-        raise CaptureError(
-            "dvc " + " ".join(words), "DVC", "able to track it", done.stderr.strip()[-300:], "See above."
-        )
+        got = done.stderr.strip()[-300:]
+        raise CaptureError("dvc " + " ".join(words), "DVC", "able to track it", got, "See above.")

@@ -8,6 +8,7 @@ import re
 import subprocess
 from collections import Counter
 from pathlib import Path
+from shutil import which
 from typing import Any
 
 import pandas as pd
@@ -23,8 +24,7 @@ def compare_scene(root: Path, scene: str, against: str) -> Comparison:
     """Compare the numbers that lie in `reports/` with those of a revision, a folder or a file."""
     file = root / "reports" / scene / "numbers.json"
     if not file.exists():
-        remedy = f"Try: reskin scenes use {scene}, then dvc repro."
-        raise SchemaError(file, "the file", "there", "none", remedy)
+        raise SchemaError(file, "the file", "there", "none", f"Try: reskin scenes use {scene}, then dvc repro.")
     return compare(read_committed(root, scene, against), io.read_json(file))
 
 
@@ -32,35 +32,26 @@ def read_committed(root: Path, scene: str, against: str) -> dict[str, Any]:
     """Read the numbers to compare with: from a path if there is one of that name, else from git."""
     place = Path(against)
     if place.exists():
-        tried = [
-            place,
-            place / "numbers.json",
-            place / scene / "numbers.json",
-            place / "reports" / scene / "numbers.json",
-        ]
-        found = next((one for one in tried if one.is_file()), None)
+        names = ("", "numbers.json", f"{scene}/numbers.json", f"reports/{scene}/numbers.json")
+        found = next((place / name for name in names if (place / name).is_file()), None)
         if found is None:
             remedy = "Name reports/<scene> of another checkout, or a numbers.json."
             raise SchemaError(against, "the folder", f"one that holds {scene}/numbers.json", "none", remedy)
         return io.read_json(found)
-    text = _show(root, f"{against}:./reports/{scene}/numbers.json")
-    if text is None:
+    words = ["git", "show", f"{against}:./reports/{scene}/numbers.json"]
+    done = subprocess.run(words, cwd=root, capture_output=True, text=True, check=False) if which("git") else None
+    if done is None or done.returncode:
         remedy = "Try: reskin compare SCENE --against REVISION-OR-FOLDER."
-        where = f"git revision {against}"
-        raise SchemaError(where, f"reports/{scene}/numbers.json", "committed", "none", remedy)
-    return json.loads(text)
+        raise SchemaError(f"git revision {against}", f"reports/{scene}/numbers.json", "committed", "none", remedy)
+    return json.loads(done.stdout)
 
 
 def table_of(done: Comparison) -> str:
     """Tabulate what differs by more than it may, and name what only one side has; empty if there is nothing."""
-    rows = [
-        {
-            "number": one.name, "committed": _short(one.committed), "fresh": _short(one.fresh), "difference": one.off,
-            "tolerance": one.tolerance,
-        }
-        for one in done.beyond[:SHOWN_N]
-    ]  # fmt: skip
-    lines = [str(pd.DataFrame(rows).to_markdown(index=False, disable_numparse=True))] if rows else []
+    names = ("number", "committed", "fresh", "difference", "tolerance")
+    rows = [(x.name, _short(x.committed), _short(x.fresh), x.off, x.tolerance) for x in done.beyond[:SHOWN_N]]
+    table = pd.DataFrame(rows, columns=names)
+    lines = [str(table.to_markdown(index=False, disable_numparse=True))] if rows else []
     lines += [f"and {len(done.beyond) - SHOWN_N} more"] * (len(done.beyond) > SHOWN_N)
     for word, names in (("only committed", done.missing), ("only fresh", done.new)):
         questions = Counter(re.split(r"[.\[]", name)[0] for name in names)
@@ -85,12 +76,3 @@ def verdict(scene: str, against: str, done: Comparison) -> str:
 
 def _short(value: object) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)[:40]
-
-
-def _show(root: Path, path: str) -> str | None:
-    """Read a file of a revision; None outside git, or where there is none."""
-    try:
-        done = subprocess.run(["git", "show", path], cwd=root, capture_output=True, text=True, check=False)
-    except OSError:
-        return None
-    return done.stdout if done.returncode == 0 else None

@@ -188,7 +188,7 @@ def check_scene(name: str, where: str, words: dict[str, Any], shared: dict[str, 
         if read := getattr(module_of(stage), "read", None):
             read(settings)
     if scene.simulate is not None:
-        from pipeline.synthesis.of_settings import check_synthesis  # the physics, for a simulated scene only
+        from pipeline.synthesis.settings import check_synthesis  # the physics, for a simulated scene only
 
         check_synthesis(settings)
     return scene

@@ -11,16 +11,12 @@ from typing import Any
 from ruamel.yaml import YAML
 
 from pipeline.core import io
-from pipeline.core.config import NOTHING, PLACE, declared, fill, find, put, read_yaml
+from pipeline.core.config import FLOW, NOTHING, PARAMS, PLACE, PLAN, SCENES, declared, fill, find, put, read_yaml
 from pipeline.core.errors import ParamsError
 from pipeline.params import OnBoards, Plan, Scene, read_plan, read_scene
 from pipeline.questions import EXPERIMENTS, LEARNING, MAIN_PROTOCOL, NOT_INGESTED, QUESTIONS, stages
 from pipeline.registry import Registry, read_registry
 
-FLOW = "dvc.yaml"
-PLAN = "pipeline/plan.yaml"
-PARAMS = "params.yaml"
-SCENES = "pipeline/scenes"
 HEADER = """\
 # Which scenes run, what they ask, and what each stage of dvc.yaml takes. Written by `reskin scenes use` and `add`
 # from pipeline/scenes and data/captures.yaml; not for hands.

@@ -1,4 +1,4 @@
-"""A log and a model -> contacts, places and forces over time, as a CSV. The path of stage logs, for anybody's files.
+"""Frames and a model -> contacts, places and forces over time, as a CSV. The path of stage logs, for anybody's files.
 
 Refuses to know scenes and folds: whether the model ever saw the log's board is for its user to know.
 """
@@ -12,14 +12,19 @@ import pyarrow as pa
 from pydantic import Field
 
 from pipeline.capture import columns, sd_card
+from pipeline.capture.dump import read_frames
+from pipeline.capture.header import LOG_FILE, RATE_MAX_HZ, STREAM_FILE
+from pipeline.capture.stream import decode_all
 from pipeline.core import io
 from pipeline.core.config import Strict, parse
-from pipeline.core.errors import ParamsError, SchemaError
+from pipeline.core.errors import CaptureError, ParamsError, SchemaError
+from pipeline.dataset.captures import read_header, timer
 from pipeline.experiments.logs.estimates import Estimates, describe, estimate
 from pipeline.learning.card import FORMAT
 from pipeline.learning.inputs import VIEW
 from pipeline.trials.networks import Network
 
+PARQUET_MAGIC = b"PAR1"
 ANSWERS = ("x_mm", "y_mm", "Fz_N")
 
 
@@ -48,17 +53,17 @@ class Card(Strict, extra="ignore"):
     collapsed: bool
 
 
-def predict(log: Path, model: Path, out: Path) -> dict[str, Any]:
-    """Write t_s, x_mm, y_mm, F_N and contact of every sound line of a log; give the account of what was read.
+def predict(log: Path, model: Path, out: Path, *, rate_hz: float = 400.0) -> dict[str, Any]:
+    """Write t_s, x_mm, y_mm, F_N and contact of every sound frame of a log; give the account of what was read.
 
-    Places and forces are left empty where there is no contact.
+    Places and forces are left empty where there is no contact. `rate_hz` gives a decoded dump without a clock its time.
     """
     network = read_network(model)
     read = (log, model, model.with_suffix(".json"))
     if out.resolve() in {file.resolve() for file in read}:
         rule = "another than the log, the model and its card"
         raise ParamsError("--out", "the file to write", rule, out, "Choose another --out.")
-    t_s, b_uT, _, account = sd_card.read_log(log)
+    t_s, b_uT, _, account = read_any_log(log, rate_hz)
     channels_n = network.card["input"]["channels_n"]
     if b_uT.shape[1] != channels_n:
         remedy = "Take a model of such boards."
@@ -66,6 +71,40 @@ def predict(log: Path, model: Path, out: Path) -> dict[str, Any]:
     found = estimate(t_s, b_uT, [network], where=str(log))
     io.write_text(out, render(found))
     return describe(found) | account
+
+
+def read_any_log(log: Path, rate_hz: float) -> sd_card.Log:
+    """Read the frames of a capture's folder, of a table that `reskin decode` wrote, or of an SD card's log."""
+    if log.is_dir():
+        return _read_capture(log)
+    if not 0 < rate_hz <= RATE_MAX_HZ:
+        raise ParamsError("--rate-hz", "the rate", f"above 0, at most {RATE_MAX_HZ:g}", rate_hz, "Count frames.")
+    if _is_parquet(log):
+        return sd_card.keep_whole(*read_frames(io.read_table(log), rate_hz, str(log)), str(log))
+    return sd_card.read_log(log)
+
+
+def _is_parquet(file: Path) -> bool:
+    if not file.is_file():
+        return False
+    with file.open("rb") as stream:
+        return stream.read(len(PARQUET_MAGIC)) == PARQUET_MAGIC
+
+
+def _read_capture(folder: Path) -> sd_card.Log:
+    """Read what `reskin record` wrote; frames past the last known arrival have no time, and are dropped."""
+    header = read_header(folder)
+    if header.layout == "sd-card":
+        return sd_card.read_log(folder / LOG_FILE)
+    if header.wire is None:
+        raise CaptureError(folder, "layout", "native or sd-card", header.layout, "Give what reskin record wrote.")
+    stream = folder / STREAM_FILE
+    frames, account = decode_all(io.read_bytes(stream), header.wire, header.chips_n, str(stream))
+    t_s = timer(folder, header)(frames, 0)
+    timed = np.isfinite(t_s)
+    kept = frames.where(timed)
+    *log, counts = sd_card.keep_whole(t_s[timed], kept.b_uT, kept.temperature_degC, str(stream))
+    return *log, account | {"dropped_no_time_frames_n": int((~timed).sum())} | counts  # type: ignore[return-value]
 
 
 def read_network(model: Path) -> Network:

@@ -4,20 +4,23 @@ Nothing is written here. Refuses to know scenes, DVC and where captures are kept
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from tempfile import TemporaryDirectory
+from typing import Any, Literal, get_args
 
 from pipeline.capture import header as headers
+from pipeline.capture import stream
 from pipeline.capture.header import Clock, Header
 from pipeline.capture.readers import READERS
+from pipeline.capture.wire import TEXT_WIRES
 from pipeline.core import io
-from pipeline.core.errors import CaptureError
+from pipeline.core.errors import CaptureError, ReskinError
 from pipeline.dataset.captures import read_header
 
 NATIVE_FILES = (headers.STREAM_FILE, headers.ARRIVALS_FILE, headers.PROBE_FILE)
-RECORDINGS_OWN = Clock(kind="recording", rate_hz=None, marks=())
 
 Foreign = Literal["lab", "ini", "eflesh"]
 Marks = tuple[tuple[float, float], ...]
@@ -59,52 +62,83 @@ def parse_marks(words: list[str]) -> Marks:
     return tuple(marks)
 
 
+@contextmanager
+def suggesting_layout(recording: Path, layout: str) -> Iterator[None]:
+    """Let an error about a recording name the layouts that it can be read in, if `layout` is none of them."""
+    try:
+        yield
+    except ReskinError as error:
+        fitting = layouts_of(recording)
+        if not fitting or layout in fitting:
+            raise
+        raise type(error)(
+            f"{error} It can be read with {' or '.join(f'--layout {name}' for name in fitting)}."
+        ) from None
+
+
+def layouts_of(recording: Path) -> list[str]:
+    """List the layouts that a recording can be read in."""
+    if (recording / headers.HEADER_FILE).is_file():
+        return ["capture"]
+    if found := [layout for layout in get_args(Foreign) if _reads(recording, layout)]:
+        return found
+    fits = stream.fitting(io.read_bytes(recording)) if recording.is_file() else []
+    return sorted({"serial-text" if wire in TEXT_WIRES else "serial-binary" for wire, _ in fits})
+
+
+def _reads(recording: Path, layout: Foreign) -> bool:
+    options = {"force_axis": "z"} if layout == "eflesh" else {}
+    try:
+        header, files = foreign(recording, layout, Labels("board", "skin", None), options)
+        with TemporaryDirectory() as folder:
+            for name, file in files.items():
+                (Path(folder) / name).symlink_to(Path(file).resolve())
+            READERS[layout].read(Path(folder), header)
+    except ReskinError:
+        return False
+    return True
+
+
 def foreign(recording: Path, layout: Foreign, labels: Labels, options: Mapping[str, str]) -> Prepared:
     """Prepare somebody else's recording: its own files, untouched, under a header."""
+    _need(recording, folder=True)
     files = READERS[layout].collect(recording)
     chips_n = READERS[layout].count_chips(files)
-    return _header(labels, recording, layout=layout, chips_n=chips_n, special={"options": dict(options)}), files
+    return _header(labels, recording, layout=layout, chips_n=chips_n, options=dict(options)), files
 
 
 def dump(recording: Path, labels: Labels, what: Dump) -> Prepared:
     """Prepare a bare dump of a port with the robot's log; frames get their time from a constant rate."""
     if what.probe is None:
-        raise CaptureError(
-            recording,
-            "a serial dump",
-            "accompanied by its probe log",
-            "none",
-            "Add --probe PROBE.csv (columns in data/README.md).",
-        )
-    _need_file(recording)
-    _need_file(what.probe)
+        remedy = "Add --probe PROBE.csv (columns in data/README.md)."
+        raise CaptureError(recording, "a serial dump", "accompanied by its probe log", "none", remedy)
+    _need(recording)
+    _need(what.probe)
     if not 0 < what.rate_hz <= headers.RATE_MAX_HZ:
-        raise CaptureError(
-            "--rate-hz", "the rate", f"above 0, at most {headers.RATE_MAX_HZ:g}", what.rate_hz, "Count frames."
-        )
+        rule = f"above 0, at most {headers.RATE_MAX_HZ:g}"
+        raise CaptureError("--rate-hz", "the rate", rule, what.rate_hz, "Count frames.")
     clock = Clock(kind="rate", rate_hz=what.rate_hz, marks=what.marks)
-    special = {"wire": what.wire, "clock": clock}
-    header = _header(labels, recording, layout="native", chips_n=what.chips_n, special=special)
+    header = _header(labels, recording, layout="native", chips_n=what.chips_n, wire=what.wire, clock=clock)
     return header, {headers.STREAM_FILE: recording, headers.PROBE_FILE: what.probe}
 
 
 def native(recording: Path, labels: Labels, probe: Path | None, marks: Marks) -> Prepared:
     """Prepare a capture folder that `reskin record` wrote; `probe` adds the robot's log to it."""
+    _need(recording, folder=True)
     found = read_header(recording)
     for what, said, written in (("board", labels.board, found.board), ("skin", labels.skin, found.skin)):
         if said != written:
-            raise CaptureError(
-                recording, f"--{what}", f"{written!r}, as its header says", repr(said), "Which is right?"
-            )
+            rule = f"{written!r}, as its header says"
+            raise CaptureError(recording, f"--{what}", rule, repr(said), "Which is right?")
     # A recorder that was killed has not hashed its files into the header; they are there all the same.
     files = {name: recording / name for name in NATIVE_FILES if (recording / name).exists() or name in found.files}
     if probe is not None:
-        _need_file(probe)
+        _need(probe)
         files[headers.PROBE_FILE] = probe
     if headers.PROBE_FILE not in files:
         raise CaptureError(recording, "a capture", "labelled by a probe log", "none", "Add --probe PROBE.csv.")
     for name, file in files.items():
-        _need_file(file)
+        _need(file)
         if file.parent == recording and found.files.get(name, io.sha256(file)) != io.sha256(file):
             raise CaptureError(file, "the file", "unchanged since it was recorded", "another hash", "Record it again.")
     _check_names(labels)
@@ -118,25 +152,19 @@ def _check_names(labels: Labels) -> None:
             raise CaptureError(option, "a name", "1 to 64 of A-Z a-z 0-9 _ -", repr(word), "Choose another.")
 
 
-def _header(
-    labels: Labels,
-    recording: Path,
-    *,
-    layout: headers.Layout,
-    chips_n: int,
-    special: Mapping[str, Any],
-) -> Header:
+def _header(labels: Labels, recording: Path, *, layout: headers.Layout, chips_n: int, **fields: Any) -> Header:
     _check_names(labels)
     stem = re.sub(r"[^A-Za-z0-9_-]", "_", recording.resolve().stem)
-    header = Header.model_construct(
-        format="reskin-capture/1", capture=labels.name or f"{labels.board}_{labels.skin}_{stem}"[:64],
-        board=labels.board, skin=labels.skin, source="recorded", layout=layout, wire=None, chips_n=chips_n,
-        unit_b="uT", unit_force="N", unit_place="mm", firmware=None, clock=RECORDINGS_OWN,
-        protocol=f"as recorded in {stem}", contacts_before_n=0, options={}, files={}, note="added by reskin add",
+    return headers.recorded(
+        str(recording), capture=labels.name or f"{labels.board}_{labels.skin}_{stem}"[:64], board=labels.board,
+        skin=labels.skin, layout=layout, chips_n=chips_n, protocol=f"as recorded in {stem}", note="added by reskin add",
+        **fields,
     )  # fmt: skip
-    return headers.parse(headers.render(header.model_copy(update=dict(special))), str(recording))
 
 
-def _need_file(path: Path) -> None:
-    if not path.is_file():
+def _need(path: Path, *, folder: bool = False) -> None:
+    """Raise if there is nothing at a path, or a folder where a file is needed."""
+    if not path.exists():
         raise CaptureError(path, "the file", "there", "nothing", "Check the path.")
+    if path.is_dir() and not folder:
+        raise CaptureError(path, "the file", "a file", "a folder", "Check the path.")

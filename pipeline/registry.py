@@ -13,6 +13,7 @@ from pipeline.core.config import Strict, parse, read_yaml
 from pipeline.core.errors import CaptureError
 
 REGISTRY = "data/captures.yaml"
+COMMENT = "# The recorded captures of this checkout, by scene; written by `reskin add` and `reskin remove`.\n"
 
 
 class Entry(Strict):
@@ -41,52 +42,41 @@ def with_capture(
     registry: Registry, scene: str, header: Header, fingerprints: tuple[str, ...], *, allow_copy: bool
 ) -> Registry:
     """Add a capture, or raise if it is there already or contradicts what is there."""
-    own = registry.captures.get(scene, {})
-    where = f"capture {header.capture}"
-    twin = next((name for name, entry in own.items() if set(entry.fingerprints) & set(fingerprints)), None)
+    captures, where = registry.captures.get(scene, {}), f"capture {header.capture}"
+    twin = next((name for name, entry in captures.items() if set(entry.fingerprints) & set(fingerprints)), None)
     if twin is not None:
-        _refuse_copy(where, twin, own[twin], header, allow_copy)
-    if header.capture in own:
+        _refuse_copy(where, twin, captures[twin], header, allow_copy)
+    if header.capture in captures:
         raise CaptureError(where, "its name", "new to its scene", "one that is taken", "Choose another with --name.")
-    for name, entry in own.items():
+    for name, entry in captures.items():
         if entry.skin == header.skin and entry.board != header.board:
-            raise CaptureError(
-                    where, f"the board of skin {header.skin}", f"{entry.board}, as in {name}", header.board,
-                    "A skin that moves to another board gets a new name, or it would stand on both sides of a fold.",
-                )  # fmt: skip
+            what, rule = f"the board of skin {header.skin}", f"{entry.board}, as in {name}"
+            remedy = "A skin that moves to another board gets a new name, or it would stand on both sides of a fold."
+            raise CaptureError(where, what, rule, header.board, remedy)
         if entry.chips_n != header.chips_n:
-            raise CaptureError(
-                where, "chips", f"the {entry.chips_n} of {name}", header.chips_n, "Add it to a scene of its own."
-            )
-    entry = Entry(
-        board=header.board,
-        skin=header.skin,
-        layout=header.layout,
-        chips_n=header.chips_n,
-        fingerprints=fingerprints,
-        copy_of=twin,
-    )
-    return Registry(captures={**registry.captures, scene: {**own, header.capture: entry}})
+            rule, remedy = f"the {entry.chips_n} of {name}", "Add it to a scene of its own."
+            raise CaptureError(where, "chips", rule, header.chips_n, remedy)
+    labels = {name: getattr(header, name) for name in ("board", "skin", "layout", "chips_n")}
+    entry = Entry(**labels, fingerprints=fingerprints, copy_of=twin)
+    return Registry(captures={**registry.captures, scene: {**captures, header.capture: entry}})
 
 
 def without_capture(registry: Registry, scene: str, capture: str) -> Registry:
     """Take a capture out; a scene without captures goes too."""
-    own = dict(registry.captures.get(scene, {}))
-    if capture not in own:
-        known = ", ".join(sorted(own)) or "none"
+    captures = registry.captures.get(scene, {})
+    if capture not in captures:
+        known = ", ".join(sorted(captures)) or "none"
         raise CaptureError(f"scene {scene}", "a capture", f"one of its own ({known})", capture, "Check the name.")
-    del own[capture]
-    rest = {name: all_ for name, all_ in registry.captures.items() if name != scene}
-    return Registry(captures=rest | ({scene: own} if own else {}))
+    left = {name: entry for name, entry in captures.items() if name != capture}
+    others = {name: entries for name, entries in registry.captures.items() if name != scene}
+    return Registry(captures=others | ({scene: left} if left else {}))
 
 
 def write_registry(root: Path, registry: Registry) -> None:
     """Write `data/captures.yaml`."""
     yaml = YAML()
     with io.replacing(root / REGISTRY) as temporary, temporary.open("w", encoding="utf-8") as stream:
-        stream.write(
-            "# The recorded captures of this checkout, by scene; written by `reskin add` and `reskin remove`.\n"
-        )
+        stream.write(COMMENT)
         yaml.dump(registry.model_dump(mode="json"), stream)
 
 

@@ -55,10 +55,10 @@ def _outs(stage: Mapping[str, Any]) -> list[Path]:
 
 def _touches(path: Path, others: Iterable[Path]) -> bool:
     """Tell whether a path is one of others, lies in one or holds one."""
-    return any(path == one or path in one.parents or one in path.parents for one in others)
+    return any(path.is_relative_to(other) or other.is_relative_to(path) for other in others)
 
 
 def _scene_of(stage: str, known: Iterable[str]) -> str:
     """Name the scene of `stage@scene` or `stage@scene-part`: the longest name that fits."""
     key = stage.partition("@")[2]
-    return max((one for one in known if key == one or key.startswith(f"{one}-")), key=len, default="")
+    return max((name for name in known if f"{key}-".startswith(f"{name}-")), key=len, default="")

@@ -6,13 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from ruamel.yaml import YAML
+from typer.testing import CliRunner
 
 from pipeline import adding, plan, preparing
 from pipeline.capture import probe
-from pipeline.capture.folder import write_capture
-from pipeline.capture.header import Clock
+from pipeline.capture.header import Clock, write_capture
 from pipeline.capture.probe import ProbeLog
 from pipeline.capture.wire import encode
+from pipeline.cli import app
+from pipeline.core import config
 from pipeline.core.errors import ReskinError
 from pipeline.dataset.captures import open_capture, read_header
 from pipeline.preparing import Dump, Labels
@@ -29,7 +31,7 @@ def empty(tmp_path_factory) -> Path:
     """A checkout that runs no scene yet."""
     root = copy_checkout(tmp_path_factory.mktemp("checkout"))
     plan.use(root, [])
-    with (root / plan.SCENES / "small.yaml").open("w") as stream:
+    with (root / config.SCENES / "small.yaml").open("w") as stream:
         YAML().dump(recorded(), stream)
     return root
 
@@ -99,7 +101,7 @@ def test_a_copy_written_with_a_digit_more_is_still_a_copy(root, lab_file, tmp_pa
 
 def test_a_removal_that_cannot_be_planned_changes_nothing(root, lab_file):
     add_lab(root, lab_file)
-    file = root / plan.PLAN
+    file = root / config.PLAN
     file.write_text(file.read_text().replace("  small: [lobo]\n", "  small: [lobo]\n  nowhere: [lobo]\n", 1))
     refuse(root, lambda: adding.remove(root, "small", "board1_skin1_readings"), "nowhere")
 
@@ -141,8 +143,31 @@ def test_a_broken_recording_leaves_nothing_behind(root, tmp_path, content):
     refuse(root, lambda: add_lab(root, tmp_path / "broken.csv"), "broken.csv|readings.csv")
 
 
-def test_a_recording_that_is_not_there_is_named(root, tmp_path):
-    refuse(root, lambda: add_lab(root, tmp_path / "none.csv"), "none.csv")
+def test_a_recording_that_is_not_there_is_called_missing(root, tmp_path):
+    missing = "none: the file must be there; got nothing"
+    for layout in ("lab", "ini", "eflesh"):
+        refuse(root, lambda: preparing.foreign(tmp_path / "none", layout, labels(), {}), missing)  # noqa: B023
+    refuse(root, lambda: preparing.native(tmp_path / "none", labels(), None, ()), missing)
+
+
+def test_the_wrong_layout_suggests_the_right_one(lab_file, tmp_path):
+    (tmp_path / "dump.bin").write_bytes(encode(FRAMES, "binary"))
+    cases = {
+        lab_file: ("ini", "lab"),
+        native_folder(tmp_path / "run1"): ("eflesh", "capture"),
+        tmp_path / "dump.bin": ("lab", "serial-binary"),
+    }
+    for recording, (said, right) in cases.items():
+        with (
+            pytest.raises(ReskinError, match=f"It can be read with --layout {right}."),
+            preparing.suggesting_layout(recording, said),
+        ):
+            preparing.foreign(recording, said, labels(), {})
+    with (
+        pytest.raises(ReskinError, match=r"one that is taken\. Choose another\.$"),
+        preparing.suggesting_layout(lab_file, "lab"),
+    ):
+        raise ReskinError("capture c", "its name", "new", "one that is taken", "Choose another.")
 
 
 def test_a_recording_in_the_wrong_layout_is_refused(root, lab_file):
@@ -269,6 +294,26 @@ def test_the_command_line_says_what_is_wrong_without_a_traceback(root, tmp_path)
     assert done.returncode == 2
     assert done.stderr.startswith("error: ")
     assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_the_command_line_says_that_a_scene_was_switched_on(root, lab_file):
+    words = ["add", str(lab_file), "--layout", "lab", "--board", "b", "--skin", "s", "--scene", "small"]
+    assert "switched scene small on in pipeline/plan.yaml" in run(root, "reskin", *words).stdout
+    again = run(root, "reskin", *words, "--name", "again", "--board", "b2", "--skin", "s2", "--allow-copy").stdout
+    assert "added small/again" in again
+    assert "switched" not in again
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["remove s c", "publish", "compare s", "readme", "scenes list", "scenes use s", "scenes tidy", "scenes check"],
+)
+def test_outside_a_checkout_a_command_says_so(tmp_path, monkeypatch, words):
+    monkeypatch.chdir(tmp_path)
+    done = CliRunner().invoke(app, words.split())
+    assert f"the working directory must be a checkout of the project, with dvc.yaml in it; got {tmp_path}" in str(
+        done.exception
+    )
 
 
 def test_a_scene_that_asks_for_folds_its_data_cannot_give_says_so(root, lab_file):

@@ -3,7 +3,7 @@ import subprocess
 import pytest
 from typer.testing import CliRunner
 
-from pipeline import cli, comparing
+from pipeline import comparing, plan
 from pipeline.cli import app
 from pipeline.comparing import compare_scene
 from pipeline.core import io
@@ -18,6 +18,7 @@ def numbers(accuracy_pct: float) -> dict:
 def checkout(tmp_path, monkeypatch):
     """A checkout whose committed accuracy is 80 %."""
     io.write_json(tmp_path / "reports/quick/numbers.json", numbers(80.0))
+    io.write_text(tmp_path / "dvc.yaml", "stages: {}\n")
     author = ("-c", "user.name=a", "-c", "user.email=a@b")
     for words in (["init", "-q"], ["add", "."], [*author, "commit", "-qm", "x"], ["tag", "first"]):
         subprocess.run(["git", *words], cwd=tmp_path, check=True)
@@ -75,7 +76,7 @@ def test_outside_git_nothing_is_committed(tmp_path):
 
 
 def test_without_a_scene_all_that_run_are_compared_and_the_worst_is_told(checkout, monkeypatch):
-    monkeypatch.setattr(cli.plan, "check", lambda root: type("Plan", (), {"scenes": ("lab", "quick")}))
+    monkeypatch.setattr(plan, "check", lambda root: type("Plan", (), {"scenes": ("lab", "quick")}))
     code, output = said()
     assert code == 2
     assert "lab" in output

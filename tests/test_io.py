@@ -110,3 +110,9 @@ def test_broken_safetensors_are_one_sentence(tmp_path):
     (tmp_path / "m.safetensors").write_bytes(b"junk")
     with pytest.raises(SchemaError, match="must be safetensors"):
         io.read_tensors(tmp_path / "m.safetensors")
+
+
+@pytest.mark.parametrize("read", [io.read_bytes, io.read_json, io.read_table, io.read_readings, io.read_tensors])
+def test_a_missing_file_is_called_missing(tmp_path, read):
+    with pytest.raises(SchemaError, match="none: the file must be there; got nothing"):
+        read(tmp_path / "none")

@@ -12,7 +12,7 @@ from pipeline.core.numerics import BEYOND_AVX2, PINNED, cpu_flags, pinned
 AVX2, NEWEST = frozenset({"avx2"}), frozenset({"avx2", *BEYOND_AVX2.values()})
 TRAIN = """
 from pipeline.experiments.stability.learning import _trial, _changed, _rows
-from pipeline.learning.stack import train_stack
+from pipeline.learning.train import train_stack
 import hashlib, sys
 trials = [_changed(_trial(i), triplet_weight=0.1) for i in range(3)]
 digest = hashlib.sha256()

@@ -6,6 +6,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from pipeline import plan
+from pipeline.core import config
 from pipeline.core.config import parse, read_yaml
 from pipeline.core.errors import ParamsError
 from pipeline.params import Plan, Scene, parse_scene
@@ -18,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[1]
 ENTRY = Entry(board="b", skin="s", layout="lab", chips_n=5, fingerprints=("0",), copy_of=None)
 
 
-FLOW = read_yaml(ROOT / plan.FLOW)
+FLOW = read_yaml(ROOT / config.FLOW)
 
 
 def make_plan(scenes, registry):
@@ -107,29 +108,29 @@ def test_a_recorded_scene_without_recordings_says_how_to_add_one():
 
 
 def checkout(folder: Path, running: str = "{}") -> Path:
-    (folder / plan.SCENES).mkdir(parents=True)
+    (folder / config.SCENES).mkdir(parents=True)
     (folder / "data").mkdir()
     for name, questions in (("one", ["lobo"]), ("two", ["lobo"])):
-        with (folder / plan.SCENES / f"{name}.yaml").open("w") as stream:
+        with (folder / config.SCENES / f"{name}.yaml").open("w") as stream:
             YAML().dump(recorded(questions=questions), stream)
     with (folder / "data/captures.yaml").open("w") as stream:
         YAML().dump({"captures": {"one": {"c0": ENTRY.model_dump()}, "two": {"c0": ENTRY.model_dump()}}}, stream)
-    with (folder / plan.PARAMS).open("w") as stream:
+    with (folder / config.PARAMS).open("w") as stream:
         YAML().dump(SHARED, stream)
-    shutil.copy(ROOT / plan.FLOW, folder)
-    (folder / plan.PLAN).write_text(f"scenes: {running}\nstages: {{}}\n")
+    shutil.copy(ROOT / config.FLOW, folder)
+    (folder / config.PLAN).write_text(f"scenes: {running}\nstages: {{}}\n")
     return folder
 
 
 def test_use_writes_the_plan_and_no_file_of_hands(tmp_path):
     root = checkout(tmp_path)
-    by_hand = [root / plan.PARAMS, *(root / plan.SCENES).iterdir()]
+    by_hand = [root / config.PARAMS, *(root / config.SCENES).iterdir()]
     before = [file.read_bytes() for file in by_hand]
     plan.use(root, ["two", "one", "two"])
     made = plan.check(root)
     assert list(made.scenes) == ["two", "one"]
     assert list(made.stages["train_multi"]) == ["two", "one"]
-    assert "not for hands" in (root / plan.PLAN).read_text()
+    assert "not for hands" in (root / config.PLAN).read_text()
     assert [file.read_bytes() for file in by_hand] == before
 
 
@@ -147,12 +148,12 @@ def test_an_unknown_scene_is_named_beside_the_known_ones(tmp_path):
 def simulated(tmp_path, **changes):
     """A checkout whose scene `one` is the tiny one, changed: in its section simulate, or in what scenes share."""
     root = checkout(tmp_path)
-    shutil.copy(ROOT / plan.PARAMS, root)
-    shutil.copy(ROOT / plan.SCENES / "ci.yaml", root / plan.SCENES / "one.yaml")
+    shutil.copy(ROOT / config.PARAMS, root)
+    shutil.copy(ROOT / config.SCENES / "ci.yaml", root / config.SCENES / "one.yaml")
     for path, value in changes.items():
         *sections, name = path.split("__")
         shared = sections[0] == "skin"
-        changed = root / plan.PARAMS if shared else root / plan.SCENES / "one.yaml"
+        changed = root / config.PARAMS if shared else root / config.SCENES / "one.yaml"
         words = YAML(typ="safe").load(changed.read_text())
         section = words if shared else words["simulate"]
         for part in sections:
@@ -187,7 +188,7 @@ def test_every_protocol_has_a_folder_and_stages_of_its_own(tmp_path):
 )
 def test_a_scene_that_cannot_be_simulated_is_refused_before_anything_runs(tmp_path, changes, sentence):
     root = simulated(tmp_path, **changes)
-    before = (root / plan.PLAN).read_text()
+    before = (root / config.PLAN).read_text()
     with pytest.raises(ParamsError, match=sentence):
         plan.use(root, ["one"])
-    assert (root / plan.PLAN).read_text() == before
+    assert (root / config.PLAN).read_text() == before

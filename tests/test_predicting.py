@@ -3,14 +3,21 @@
 import json
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
+from pipeline.capture import arrivals
+from pipeline.capture.arrivals import Arrivals
+from pipeline.capture.dump import decode_dump
+from pipeline.capture.header import ARRIVALS_FILE, STREAM_FILE, Clock, write_capture
 from pipeline.capture.sd_card import render
+from pipeline.capture.wire import Frames, encode, record_type
 from pipeline.core import io
 from pipeline.core.errors import CaptureError, ReskinError
 from pipeline.core.seeds import rng_for
 from pipeline.learning.architecture import draw_weights, paper_layers
 from pipeline.predicting import predict
+from tests.capture.headers import make_header
 
 RATE_HZ, QUIET_N, TOUCHED_N = 250.0, 400, 100
 ANSWER = np.array([8.0, 4.0, 1.5], np.float32)
@@ -31,15 +38,59 @@ def model(tmp_path):
     return tmp_path / "model.safetensors"
 
 
-def write_log(folder, chips_n=5):
+def log_of(chips_n=5):
+    """Time, field to two decimals and temperature of the frames of a log."""
     frames_n = QUIET_N + TOUCHED_N
     touched = np.arange(frames_n) >= QUIET_N
     noise_uT = 3 * rng_for(0, "log").standard_normal((frames_n, 3 * chips_n))
-    b_uT = (500 + 200 * touched[:, None] + noise_uT).astype(np.float32)
-    (folder / "log.csv").write_text(
-        render((1 + np.arange(frames_n)) / RATE_HZ, b_uT, np.full((frames_n, chips_n), 25, np.float32))
-    )
+    b_uT = np.round(500 + 200 * touched[:, None] + noise_uT, 2).astype(np.float32)
+    return (1 + np.arange(frames_n)) / RATE_HZ, b_uT, np.full((frames_n, chips_n), 25, np.float32)
+
+
+def write_log(folder, chips_n=5, scale=1.0):
+    t_s, b_uT, temperature_degC = log_of(chips_n)
+    (folder / "log.csv").write_text(render(t_s, b_uT * np.float32(scale), temperature_degC))
     return folder / "log.csv"
+
+
+def write_stream(folder, wire):
+    """The same frames as bytes of a port, in a capture folder as `reskin record` leaves it."""
+    t_s, b_uT, temperature_degC = log_of()
+    stream = encode(Frames(b_uT, temperature_degC, t_s, np.zeros(len(t_s), np.int64)), wire)
+    ends = np.cumsum([len(line) + 1 for line in stream.split(b"\n")[:-1]])
+    if wire.startswith("binary"):
+        ends = record_type(wire, 5).itemsize * np.arange(1, len(t_s) + 1)
+    arrived = Arrivals(np.append(0, ends), np.append(0.0, t_s))
+    clock = Clock(kind="arrivals", rate_hz=None, marks=())
+    header = make_header(capture="run1", layout="native", wire=wire, chips_n=5, clock=clock)
+    files = {STREAM_FILE: stream, ARRIVALS_FILE: arrivals.render(arrived).encode()}
+    write_capture(folder / "run1", header, files)
+    return folder / "run1"
+
+
+@pytest.mark.parametrize("wire", ["binary", "binary-clock", "text-xyzt"])
+def test_a_recorded_stream_and_its_decoded_table_give_what_the_same_log_gives(tmp_path, model, wire):
+    folder, table = write_stream(tmp_path, wire), tmp_path / "frames.parquet"
+    io.write_table(table, decode_dump((folder / STREAM_FILE).read_bytes(), wire, 5, "stream")[0])
+    outs = [tmp_path / f"{name}.csv" for name in ("log_out", "folder_out", "table_out")]
+    for source, out in zip((write_log(tmp_path), folder, table), outs, strict=True):
+        counts = predict(source, model, out, rate_hz=RATE_HZ)
+        assert counts["rows_n"] == QUIET_N + TOUCHED_N
+    assert outs[0].read_text() == outs[1].read_text() == outs[2].read_text()
+
+
+def test_fields_in_mT_are_refused(tmp_path, model):
+    with pytest.raises(CaptureError, match="field must be 20 uT or more .* Convert mT or G to uT"):
+        predict(write_log(tmp_path, scale=1e-3), model, tmp_path / "out.csv")
+
+
+def test_a_table_of_something_else_and_a_recording_with_labels_are_refused(tmp_path, model):
+    io.write_table(tmp_path / "x.parquet", pa.table({"x": [1.0]}))
+    with pytest.raises(CaptureError, match="columns must be those of reskin decode; got x"):
+        predict(tmp_path / "x.parquet", model, tmp_path / "out.csv")
+    write_capture(tmp_path / "c0", make_header(capture="c0"), {})
+    with pytest.raises(CaptureError, match="layout must be native or sd-card; got"):
+        predict(tmp_path / "c0", model, tmp_path / "out.csv")
 
 
 def test_every_line_is_answered_and_only_contacts_have_places_and_forces(tmp_path, model):
@@ -72,7 +123,7 @@ def test_what_does_not_fit_is_refused_and_nothing_is_written(tmp_path, model):
         (log, model, model, "the file to write must be another"),
         (log, model, model.with_suffix(".json"), "the file to write must be another"),
         (log, model, tmp_path / "four" / ".." / "model.json", "the file to write must be another"),
-        (tmp_path / "none.csv", model, out, "the log must be a readable file"),
+        (tmp_path / "none.csv", model, out, r"none\.csv: the file must be there; got nothing"),
     ]
     files = (log, model, model.with_suffix(".json"))
     before = [file.read_bytes() for file in files]

@@ -3,6 +3,7 @@
 import os
 import signal
 import subprocess
+import sys
 import time
 import tty
 from collections.abc import Iterator
@@ -13,6 +14,7 @@ import pytest
 from pipeline.capture.header import HEADER_FILE, parse
 from pipeline.capture.wire import encode
 from pipeline.preparing import Labels, native
+from pipeline.recording import print_progress
 from tests.capture.signals import make_frames
 from tests.stages.checkout import ROOT
 
@@ -29,19 +31,8 @@ def terminal() -> Iterator[tuple[int, str]]:
 
 
 def start(name: str, out: Path, *words: str) -> subprocess.Popen:
-    command = [
-        ROOT / ".venv/bin/reskin",
-        "record",
-        "--port",
-        name,
-        "--board",
-        "b0",
-        "--skin",
-        "s0",
-        "--out",
-        out,
-        *words,
-    ]
+    labels = ["--port", name, "--board", "b0", "--skin", "s0", "--out", out]
+    command = [ROOT / ".venv/bin/reskin", "record", *labels, *words]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
@@ -63,6 +54,7 @@ def test_ctrl_c_ends_a_recording_that_can_be_added(terminal, tmp_path):
     recorder.send_signal(signal.SIGINT)
     said, complained = recorder.communicate(timeout=20)
     assert recorder.returncode == 0, complained
+    assert complained == ""
     assert "stopped" in said
     header = parse((tmp_path / "run1" / HEADER_FILE).read_text(), "header")
     assert set(header.files) == {"stream.bin", "arrivals.csv"}
@@ -70,6 +62,17 @@ def test_ctrl_c_ends_a_recording_that_can_be_added(terminal, tmp_path):
     probe.write_text("")
     _, files = native(tmp_path / "run1", Labels("b0", "s0", None), probe, ())
     assert set(files) == {"stream.bin", "arrivals.csv", "probe.csv"}
+
+
+def test_a_terminal_is_told_rate_frames_and_losses_and_a_file_only_the_end(monkeypatch, capsys):
+    now_s = iter([0.0, 0.5, 1.0, 1.5, 3.0])
+    monkeypatch.setattr(time, "monotonic", lambda: next(now_s))
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    report = print_progress()
+    for frames_n in (200, 400, 600, 1200):
+        report({"bytes_n": 1, "frames_n": frames_n, "skipped_resync_bytes_n": frames_n // 10})
+    lines = ["1 s: 400.0 frames/s, 400 frames, 40 bytes lost", "3 s: 400.0 frames/s, 1200 frames, 120 bytes lost"]
+    assert capsys.readouterr().err.splitlines() == lines
 
 
 def test_what_a_killed_recorder_had_read_can_still_be_added(terminal, tmp_path):

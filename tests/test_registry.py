@@ -1,19 +1,15 @@
 import pytest
 
-from pipeline.capture.header import Clock, Header
+from pipeline.capture.header import Header
 from pipeline.core.errors import CaptureError
 from pipeline.registry import Registry, with_capture, without_capture
+from tests.capture.headers import make_header
 
 EMPTY = Registry(captures={})
 
 
 def header(capture: str = "c0", board: str = "b0", skin: str = "s0", chips_n: int = 5) -> Header:
-    return Header(
-        format="reskin-capture/1", capture=capture, board=board, skin=skin, source="recorded", layout="lab", wire=None,
-        chips_n=chips_n, unit_b="uT", unit_force="N", unit_place="mm", firmware=None,
-        clock=Clock(kind="recording", rate_hz=None, marks=()), protocol="", contacts_before_n=0, options={}, files={},
-        note="",
-    )  # fmt: skip
+    return make_header(capture=capture, board=board, skin=skin, chips_n=chips_n)
 
 
 def added(registry: Registry, one: Header, fingerprint: str, *, allow_copy: bool = False) -> Registry:

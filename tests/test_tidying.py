@@ -7,6 +7,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from pipeline import plan, tidying
+from pipeline.core import config
 from tests.scenes import asking
 from tests.test_plan import checkout
 
@@ -59,12 +60,12 @@ def test_a_file_that_a_planned_stage_writes_too_stays(root):
 
 
 def test_a_scene_whose_name_begins_like_another_is_its_own(root):
-    shutil.copy(root / plan.SCENES / "one.yaml", root / plan.SCENES / "one-gone.yaml")
+    shutil.copy(root / config.SCENES / "one.yaml", root / config.SCENES / "one-gone.yaml")
     assert set(tidying.left_over(root, plan.check(root))) == {"drift@one"}
 
 
 def test_a_question_that_is_asked_leaves_nothing_over(root):
-    with (root / plan.SCENES / "one.yaml").open("w") as stream:
+    with (root / config.SCENES / "one.yaml").open("w") as stream:
         YAML().dump(asking("lobo", "drift"), stream)
     plan.use(root, ["one"])
     assert set(tidying.left_over(root, plan.check(root))) == {"simulate@one-gone"}

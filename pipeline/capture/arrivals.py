@@ -9,12 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Float64, Int64
 
 from pipeline.capture import columns
 from pipeline.core.errors import CaptureError
 
-FIRST_ROW = 2  # row 1 of the file is the header
 TYPES = {"byte_end": pa.int64(), "t_s": pa.float64()}
 
 
@@ -35,11 +34,14 @@ def parse(source: str | Path, where: str) -> Arrivals:
     if len(table) < 2:
         raise CaptureError(where, "arrivals", "two rows or more", len(table), "Give a rate in the header.")
     byte_end, t_s = (table.column(name).to_numpy() for name in TYPES)
-    _refuse(~np.isfinite(byte_end), where, "byte_end", "known", byte_end)  # Arrow gives NaN for an empty field
-    _refuse(~np.isfinite(t_s), where, "t_s", "a finite time", t_s)
-    _refuse(byte_end < 0, where, "byte_end", "0 or more", byte_end)
-    _refuse(np.diff(byte_end, prepend=-1) <= 0, where, "byte_end", "more than in the row above", byte_end)
-    _refuse(np.diff(t_s, prepend=t_s[0]) < 0, where, "t_s", "not before the row above", t_s)
+    for bad, name, rule in (
+        (~np.isfinite(byte_end), "byte_end", "known"),  # Arrow gives NaN for an empty field
+        (~np.isfinite(t_s), "t_s", "a finite time"),
+        (byte_end < 0, "byte_end", "0 or more"),
+        (np.diff(byte_end, prepend=-1) <= 0, "byte_end", "more than in the row above"),
+        (np.diff(t_s, prepend=t_s[0]) < 0, "t_s", "not before the row above"),
+    ):
+        columns.refuse(bad, where, name, rule, {"byte_end": byte_end, "t_s": t_s}[name], "Record the capture again.")
     if t_s[-1] == t_s[0]:
         got = f"{t_s[0]} in every row"
         raise CaptureError(where, "arrivals", "spread in time", got, "Mend the recorder's clock.")
@@ -71,10 +73,3 @@ def constant_rate(frame: Float64[np.ndarray, " f"], rate_hz: float) -> Float64[n
     broken bytes keep their time; else a running count. Frames lost before the dump shift all that follow.
     """
     return frame / rate_hz
-
-
-def _refuse(bad: Bool[np.ndarray, " c"], where: str, what: str, rule: str, values: np.ndarray) -> None:
-    if bad.any():
-        row_i = int(bad.argmax())
-        row = f"{where} row {row_i + FIRST_ROW}"
-        raise CaptureError(row, what, rule, values[row_i], "Record the capture again.")

@@ -5,11 +5,16 @@ Refuses to know what the columns mean; knows only their names, their types and t
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.csv as pacsv
+from jaxtyping import Bool
 
 from pipeline.core.errors import CaptureError
+
+FIRST_ROW = 2  # row 1 of the file is the header
 
 
 def parse(source: str | Path, types: Mapping[str, pa.DataType], where: str) -> pa.Table:
@@ -40,6 +45,14 @@ def render(table: pa.Table) -> str:
     sink = pa.BufferOutputStream()
     pacsv.write_csv(table, sink, pacsv.WriteOptions(include_header=False, quoting_style="none"))
     return ",".join(table.column_names) + "\n" + sink.getvalue().to_pybytes().decode()
+
+
+def refuse(bad: Bool[np.ndarray, " rows"], where: str, what: str, rule: str, values: Any, remedy: str) -> None:
+    """Raise for the first row that `bad` marks, if any; `values` are those of all rows, or one word for all."""
+    if bad.any():
+        row_i = int(bad.argmax())
+        got = values if isinstance(values, str) else values[row_i]
+        raise CaptureError(f"{where} row {row_i + FIRST_ROW}", what, rule, got, remedy)
 
 
 def _check_names(names: list[str], types: Mapping[str, pa.DataType], where: str) -> None:

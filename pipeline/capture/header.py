@@ -1,4 +1,4 @@
-"""The header of a capture: who, what, in which units, on which clock. In: JSON text. Out: a checked `Header`.
+"""The header of a capture: who, what, in which units, on which clock. In: JSON text. Out: a checked `Header`, a folder.
 
 A capture is a folder `data/raw/<scene>/<capture>/` that holds `header.json` and either the byte stream of a
 port (`stream.bin`, `arrivals.csv`, `probe.csv`) or the untouched files of somebody else's recording.
@@ -6,10 +6,14 @@ Refuses to know what the bytes mean (`wire`, `readers`).
 """
 
 import json
-from typing import Annotated, Literal
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from pipeline.core import io
 from pipeline.core.errors import CaptureError
 
 RATE_MAX_HZ = 1e5
@@ -97,6 +101,17 @@ def parse(text: str, where: str) -> Header:
         raise CaptureError(f"{where}: {field}: {rule}; got {got}. Mend the header or record again.") from None
 
 
+def recorded(where: str, **fields: Any) -> Header:
+    """Make and check the header of a recording; what is not given is that of one whose own files say all."""
+    usual = {
+        "format": "reskin-capture/1", "source": "recorded", "wire": None, "unit_b": "uT", "unit_force": "N",
+        "unit_place": "mm", "firmware": None, "clock": Clock(kind="recording", rate_hz=None, marks=()),
+        "contacts_before_n": 0, "options": {}, "files": {},
+    }  # fmt: skip
+    given = usual | fields
+    return parse(render(Header.model_construct(**{name: given[name] for name in Header.model_fields})), where)
+
+
 def render(header: Header) -> str:
     """Write a header as JSON, two-space indented, keys in the order of `Header`."""
     return json.dumps(header.model_dump(mode="json"), indent=2) + "\n"
@@ -105,10 +120,25 @@ def render(header: Header) -> str:
 def check_same_capture(header: Header, folder: str) -> None:
     """Raise if a capture folder was renamed by hand, which would give two names to one thing."""
     if header.capture != folder:
-        raise CaptureError(
-            f"{folder}/{HEADER_FILE}",
-            "capture",
-            f"the folder's name {folder!r}",
-            repr(header.capture),
-            "Rename it back.",
-        )
+        rule = f"the folder's name {folder!r}"
+        raise CaptureError(f"{folder}/{HEADER_FILE}", "capture", rule, repr(header.capture), "Rename it back.")
+
+
+def write_capture(folder: Path, header: Header, contents: Mapping[str, bytes | Path]) -> Header:
+    """Write a capture's files (bytes, or copies of paths), hash them into the header, and write that last."""
+    with io.replacing(folder) as temporary:
+        temporary.mkdir()
+        for name, content in contents.items():
+            if isinstance(content, Path):
+                shutil.copyfile(content, temporary / name)
+            else:
+                (temporary / name).write_bytes(content)
+        return seal(temporary, header)
+
+
+def seal(folder: Path, header: Header) -> Header:
+    """Hash the files that a folder holds into its header, and write that."""
+    names = sorted(path.name for path in folder.iterdir() if path.name != HEADER_FILE)
+    complete = header.model_copy(update={"files": {name: io.sha256(folder / name) for name in names}})
+    io.write_text(folder / HEADER_FILE, render(complete))
+    return complete

@@ -9,7 +9,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +27,7 @@ from pipeline.core.errors import CaptureError
 READ_TIMEOUT_s = 0.1  # how late a stop, a silence or the end of the duration may be noticed
 HEAD_BYTES_N = 16384  # the first bytes are kept to say what fits, should no frame come
 
+Report = Callable[[Mapping[str, int]], None]  # called with the account many times a second
 Ended = Literal["duration", "bytes", "stopped", "unplugged", "silent", "no frame"]
 
 
@@ -55,7 +56,9 @@ class Recording:
     account: dict[str, int]
 
 
-def record(port: str, folder: Path, *, settings: PortSettings, stop: threading.Event) -> Recording:
+def record(
+    port: str, folder: Path, *, settings: PortSettings, stop: threading.Event, report: Report = lambda account: None
+) -> Recording:
     """Write what a port sends until `stop` is set, Ctrl-C, SIGTERM, unplugging, or the settings say so.
 
     Raises `CaptureError` if the port does not open or not one frame comes. A port that falls silent after its first
@@ -68,7 +71,7 @@ def record(port: str, folder: Path, *, settings: PortSettings, stop: threading.E
         (folder / ARRIVALS_FILE).open("x", buffering=1, encoding="ascii", newline="\n") as arrivals,
     ):
         recorder = _Recorder(port, settings, stream, arrivals)
-        ended = recorder.listen(device, stop)
+        ended = recorder.listen(device, stop, report)
     return recorder.finish(ended)
 
 
@@ -89,9 +92,10 @@ class _Recorder:
         self._arrivals.write("byte_end,t_s\n")
         self._note_arrival()
 
-    def listen(self, device: serial.Serial, stop: threading.Event) -> Ended:
+    def listen(self, device: serial.Serial, stop: threading.Event, report: Report) -> Ended:
         """Read until there is a reason to end."""
         while not (ended := self._reason_to_end(stop)):
+            report(self._frames.account())
             try:
                 # What waits, or else one byte: then the read sleeps until it comes.
                 chunk = device.read(max(1, min(device.in_waiting, self._room_n())))

@@ -13,10 +13,10 @@ import pyarrow.compute as pc
 from jaxtyping import Bool, Float32, Float64, Int32
 
 from pipeline.capture import columns
+from pipeline.capture.columns import refuse
 from pipeline.core.errors import CaptureError
 
 NOLOAD, CONTACT = "noload", "contact"
-FIRST_ROW = 2  # row 1 of the file is the header
 LABELS = ("x_mm", "y_mm", "depth_mm", "Fx_N", "Fy_N", "Fz_N")
 TYPES = {
     "indentation": pa.int32(),
@@ -58,10 +58,10 @@ def parse(source: str | Path, where: str) -> ProbeLog:
         raise CaptureError(where, "the log", "one row a dwell", "no rows", "Record the capture again.")
     for name in ("indentation", "pass_i", "phase", "t_start_s", "t_end_s"):
         unknown = np.asarray(table.column(name).is_null())
-        _refuse(unknown, where, name, "known", ["an empty field"], "Only labels may be left empty.")
+        refuse(unknown, where, name, "known", "an empty field", "Only labels may be left empty.")
     phases = table.column("phase")
     foreign = np.asarray(pc.invert(pc.is_in(phases, pa.array([NOLOAD, CONTACT]))))
-    _refuse(foreign, where, "phase", f"{NOLOAD} or {CONTACT}", phases, "Write one of the two words.")
+    refuse(foreign, where, "phase", f"{NOLOAD} or {CONTACT}", phases, "Write one of the two words.")
     numbers = {name: np.asarray(table.column(name)) for name in TYPES if name != "phase"}
     log = ProbeLog(contact=np.asarray(pc.equal(phases, CONTACT)), **numbers)
     _check_numbers(log, where)
@@ -81,34 +81,23 @@ def render(log: ProbeLog) -> str:
 def _check_numbers(log: ProbeLog, where: str) -> None:
     for name in LABELS:
         values = getattr(log, name)
-        _refuse(np.isinf(values), where, name, "finite, or empty if unknown", values, "Leave it empty.")
+        refuse(np.isinf(values), where, name, "finite, or empty if unknown", values, "Leave it empty.")
     for name in ("t_start_s", "t_end_s"):
         values = getattr(log, name)
-        _refuse(~np.isfinite(values), where, name, "a finite time", values, "Remove a dwell without times.")
+        refuse(~np.isfinite(values), where, name, "a finite time", values, "Remove a dwell without times.")
     for name in ("indentation", "pass_i"):
         values = getattr(log, name)
-        _refuse(values < 0, where, name, "0 or more", values, "Count from 0.")
+        refuse(values < 0, where, name, "0 or more", values, "Count from 0.")
 
 
 def _check_order(log: ProbeLog, where: str) -> None:
     end_s = log.t_end_s
-    _refuse(end_s <= log.t_start_s, where, "t_end_s", "later than t_start_s of its row", end_s, "Mend the times.")
-    overlaps = _later(log.t_start_s[1:] < end_s[:-1])
-    _refuse(overlaps, where, "t_start_s", "not before the dwell above has ended", log.t_start_s, "Sort dwells by time.")
-    falls = _later(log.indentation[1:] < log.indentation[:-1])
-    _refuse(falls, where, "indentation", "rising with time", log.indentation, "Number indentations on over the passes.")
-    opens = np.concatenate([[True], log.indentation[1:] != log.indentation[:-1]])
+    refuse(end_s <= log.t_start_s, where, "t_end_s", "later than t_start_s of its row", end_s, "Mend the times.")
+    overlaps = np.append(False, log.t_start_s[1:] < end_s[:-1])
+    refuse(overlaps, where, "t_start_s", "not before the dwell above has ended", log.t_start_s, "Sort dwells by time.")
+    falls = np.diff(log.indentation, prepend=log.indentation[0]) < 0
+    refuse(falls, where, "indentation", "rising with time", log.indentation, "Number indentations on over the passes.")
+    opens = np.diff(log.indentation, prepend=-1) != 0
     remedy = "Log one no-load dwell, and then the contact, of every indentation."
-    _refuse(opens & log.contact, where, "an indentation's first dwell", NOLOAD, [CONTACT], remedy)
-    _refuse(~opens & ~log.contact, where, "an indentation's later dwells", CONTACT, [NOLOAD], remedy)
-
-
-def _later(bad: Bool[np.ndarray, " e"]) -> Bool[np.ndarray, " d"]:
-    return np.concatenate([[False], bad])
-
-
-def _refuse(bad: Bool[np.ndarray, " d"], where: str, what: str, rule: str, values: object, remedy: str) -> None:
-    if bad.any():
-        row_i = int(bad.argmax())
-        got = values[row_i if len(values) > 1 else 0]  # type: ignore[index,arg-type]
-        raise CaptureError(f"{where} row {row_i + FIRST_ROW}", what, rule, got, remedy)
+    refuse(opens & log.contact, where, "an indentation's first dwell", NOLOAD, CONTACT, remedy)
+    refuse(~opens & ~log.contact, where, "an indentation's later dwells", CONTACT, NOLOAD, remedy)

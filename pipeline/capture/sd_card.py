@@ -12,15 +12,19 @@ import pyarrow as pa
 from jaxtyping import Bool, Float, Float32, Float64
 
 from pipeline.capture import columns, faults
+from pipeline.capture.columns import FIRST_ROW
 from pipeline.capture.readers.chips import GRID_ROWS_N
+from pipeline.capture.readers.units import check_fields
 from pipeline.core.errors import CaptureError
 
 TIME = "t_s"
 CHIP_COLUMNS = ("T", "Bx", "By", "Bz")
-FIRST_ROW = 2  # row 1 is the header
 HEADER_LETTERS_MAX = 10_000  # a line of 64 chips has 1,500
 RATE_MIN_HZ, RATE_MAX_HZ = 1.0, 10_000.0  # assumed: no board logs slower, and a chip reads no faster
 KEPT_SHARE_MIN = 0.5  # assumed: less than this is no log of what was touched
+Log = tuple[
+    Float64[np.ndarray, " rows"], Float32[np.ndarray, "rows ch"], Float32[np.ndarray, "rows k"], dict[str, int]
+]  # s, uT, degC, an account
 GAP_FRAMES = 1.5  # times the usual step of time; in between, a frame or more is missing
 
 
@@ -40,9 +44,7 @@ def render(
     return "\n".join([",".join(column_names(chips_n)), *(line % tuple(row) for row in rows)]) + "\n"
 
 
-def read_log(
-    path: Path,
-) -> tuple[Float64[np.ndarray, " f"], Float32[np.ndarray, "f ch"], Float32[np.ndarray, "f k"], dict[str, int]]:
+def read_log(path: Path) -> Log:
     """Read time in s, field in uT and temperature in degC of the frames in which every chip was read, and an account.
 
     Failed reads and stuck chips cost a frame and are counted; if they leave less than half of the log, it is refused,
@@ -55,11 +57,23 @@ def read_log(
     if not len(table):
         raise CaptureError(where, "the log", "one line a frame", "no lines", "Copy the log again.")
     numbers = np.column_stack([_finite(table, name, where) for name in table.column_names])
-    t_s, chips = numbers[:, 0], numbers[:, 1:].reshape(len(numbers), chips_n, 4)
-    _check_time(t_s, where)
+    chips = numbers[:, 1:].reshape(len(numbers), chips_n, 4)
     b_uT = chips[:, :, 1:].reshape(len(chips), -1).astype(np.float32)
-    temperature_degC = chips[:, :, 0].astype(np.float32)
-    failed, stuck = _faults(b_uT, temperature_degC, where)
+    return keep_whole(numbers[:, 0], b_uT, chips[:, :, 0].astype(np.float32), where, first_row=FIRST_ROW)
+
+
+def keep_whole(
+    t_s: Float64[np.ndarray, " f"],
+    b_uT: Float32[np.ndarray, "f ch"],
+    temperature_degC: Float32[np.ndarray, "f k"],
+    where: str,
+    *,
+    first_row: int = 1,
+) -> Log:
+    """Keep the frames in which every chip was read, and count the others; `first_row` numbers the first in errors."""
+    _check_time(t_s, where, first_row)
+    check_fields(b_uT, where, first_line_n=first_row)
+    failed, stuck = _faults(b_uT, temperature_degC, where, first_row)
     whole = ~failed & ~stuck
     account = _gaps(t_s) | {
         "rows_read_n": len(t_s),
@@ -88,6 +102,8 @@ def _chips_n(path: Path, where: str) -> int:
             first = file.readline(HEADER_LETTERS_MAX)
             file.seek(-1, 2)
             last = file.read(1)
+    except FileNotFoundError:
+        raise CaptureError(where, "the file", "there", "nothing", "Check the path.") from None
     except OSError as error:
         got = "an empty file" if path.is_file() and not path.stat().st_size else error.strerror
         raise CaptureError(where, "the log", "a readable file", got, "Check the name.") from None
@@ -107,23 +123,20 @@ def _chips_n(path: Path, where: str) -> int:
 
 def _finite(table: pa.Table, name: str, where: str) -> Float64[np.ndarray, " f"]:
     values = np.asarray(table.column(name), np.float64)  # an empty cell is NaN
-    bad = ~np.isfinite(values)
-    if bad.any():
-        row = int(bad.argmax()) + FIRST_ROW
-        remedy = "Remove that line; the gap is counted."
-        raise CaptureError(f"{where} row {row}", name, "a finite number", values[row - FIRST_ROW], remedy)
+    remedy = "Remove that line; the gap is counted."
+    columns.refuse(~np.isfinite(values), where, name, "a finite number", values, remedy)
     return values
 
 
-def _check_time(t_s: Float64[np.ndarray, " f"], where: str) -> None:
+def _check_time(t_s: Float64[np.ndarray, " f"], where: str, first_row: int) -> None:
     if len(t_s) < 2:
         raise CaptureError(where, "the log", "two lines or more", len(t_s), "Copy the log again.")
     back = np.diff(t_s) <= 0
     if back.any():
-        row = int(back.argmax()) + FIRST_ROW + 1
-        got = f"{t_s[row - FIRST_ROW]:.4f} after {t_s[row - FIRST_ROW - 1]:.4f}"
+        row_i = int(back.argmax()) + 1
+        got = f"{t_s[row_i]:.4f} after {t_s[row_i - 1]:.4f}"
         remedy = "Was the board reset? Cut the log there."
-        raise CaptureError(f"{where} row {row}", TIME, "later than the line above", got, remedy)
+        raise CaptureError(f"{where} row {row_i + first_row}", TIME, "later than the line above", got, remedy)
     rate_hz = 1 / float(np.median(np.diff(t_s)))
     if not RATE_MIN_HZ <= rate_hz <= RATE_MAX_HZ:
         rule = f"{RATE_MIN_HZ:g} to {RATE_MAX_HZ:g} lines a second"
@@ -132,7 +145,7 @@ def _check_time(t_s: Float64[np.ndarray, " f"], where: str) -> None:
 
 
 def _faults(
-    b_uT: Float32[np.ndarray, "f ch"], temperature_degC: Float32[np.ndarray, "f k"], where: str
+    b_uT: Float32[np.ndarray, "f ch"], temperature_degC: Float32[np.ndarray, "f k"], where: str, first_row: int
 ) -> tuple[Bool[np.ndarray, " f"], Bool[np.ndarray, " f"]]:
     failed = np.asarray(faults.failed_reads(b_uT, temperature_degC).any(axis=1))
     if failed.all():
@@ -142,7 +155,7 @@ def _faults(
     for block in np.array_split(read, max(1, len(read) // GRID_ROWS_N)):
         odd = np.flatnonzero(faults.reset_chips(b_uT[block], None))
         if len(odd):
-            what = f"the step of chip {', '.join(map(str, odd))} from row {block[0] + FIRST_ROW} on"
+            what = f"the step of chip {', '.join(map(str, odd))} from row {block[0] + first_row} on"
             rule, remedy = "that of the other chips", "It lost its settings: reset the board, log again."
             raise CaptureError(where, what, rule, "another", remedy)
     return failed, np.asarray(faults.stuck_chips(b_uT).any(axis=1)) & ~failed

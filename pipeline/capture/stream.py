@@ -10,18 +10,25 @@ from dataclasses import dataclass, replace
 from typing import get_args
 
 import numpy as np
-from jaxtyping import Bool, Int64, UInt8
+from jaxtyping import Bool, Float32, Int64, UInt8
 
-from pipeline.capture import bursts
 from pipeline.capture import wire as wires
 from pipeline.capture.header import Wire
-from pipeline.capture.wire import LF, Frames
+from pipeline.capture.wire import BLOCK_FRAMES_N, CR, LF, Frames, Run
 from pipeline.core.errors import CaptureError
 
 BLOCK_LINES_N = 8192
 CHIPS_MAX_N = 64  # as in the header
 ACCOUNT = ("bytes_n", "frames_n", "frame_bytes_n", "not_finite_frames_n", "skipped_not_finite_bytes_n",
            "skipped_resync_bytes_n", "skipped_truncated_bytes_n")  # fmt: skip
+
+# An MLX90393 measures up to 50 mT (data sheet) in steps above 0.1 uT. Only where CR LF leaves two ways to lay frames do
+# these limits decide: a value outside them is no reason to drop a frame (failed reads are outside, see `faults`).
+TEMPERATURE_MIN_degC, TEMPERATURE_MAX_degC = -50.0, 125.0
+B_MAX_uT = 6e4
+VALUE_MIN = 1e-3  # what is nearer to 0, in uT or degC, is below the chip's LSB
+
+SEARCH_FRAMES_N = 64  # a search looks at so many frames' bytes at once
 
 
 @dataclass(frozen=True)
@@ -37,8 +44,8 @@ class _Scan:
 class FrameStream:
     """Remembers the bytes that are not settled yet; returns frames as soon as they are certain.
 
-    `bursts` says which bytes are a binary frame; a text frame is a line of exactly 4 k numbers of two decimals. A
-    stream is believed to begin with a frame: a first line cut inside its first number is a frame with a wrong number.
+    `_lay_frames` says which bytes are a binary frame; a text frame is a line of exactly 4 k numbers of two decimals.
+    A stream is believed to begin with a frame: a first line cut inside its first number is a frame with a wrong number.
     """
 
     def __init__(self, wire: Wire, chips_n: int) -> None:
@@ -87,15 +94,16 @@ def decode_all(data: bytes, wire: Wire, chips_n: int, where: str) -> tuple[Frame
 def no_frame(where: str, data: bytes, wire: Wire, chips_n: int) -> CaptureError:
     """Make the error for a stream without a frame, from its bytes or the first of them; say what fits them instead."""
     rule, got = f"frames of {chips_n} chips in wire format {wire}", f"no frame found in {len(data)} bytes"
-    hint = " or ".join(f"{fit} with {k} chips" for fit, k in _fits(data[:16384]))
+    hint = " or ".join(f"{fit} with {k} chips" for fit, k in fitting(data))
     remedy = "Wrong baud rate, chip count or wire format?" + (f" It fits {hint}." if hint else "")
     if not data:
         remedy = "Is the board running and sending?"
     return CaptureError(where, "the stream", rule, got, remedy)
 
 
-def _fits(data: bytes) -> list[tuple[Wire, int]]:
-    """List the formats, of the fewest chips that do, in which most of `data` is frames."""
+def fitting(data: bytes) -> list[tuple[Wire, int]]:
+    """List the formats, of the fewest chips that do, in which most of the first 16 KiB of `data` is frames."""
+    data = data[:16384]
     for chips_n in range(1, min(CHIPS_MAX_N, len(data) // 16) + 1):  # no format has less than 16 bytes a chip
         streams = {wire: FrameStream(wire, chips_n) for wire in get_args(Wire)}
         for stream in streams.values():
@@ -110,7 +118,7 @@ def _scan_binary(
     octets: UInt8[np.ndarray, " bytes"], at_boundary: bool, final: bool, wire: Wire, chips_n: int
 ) -> _Scan:
     record = wires.record_type(wire, chips_n)
-    runs, settled_n, at_boundary = bursts.lay_frames(octets, at_boundary, final, record)
+    runs, settled_n, at_boundary = _lay_frames(octets, at_boundary, final, record)
     frames, finite = wires.decode_runs(octets, runs, wire, chips_n)
     lost_n = len(frames) - int(np.count_nonzero(finite))
     if lost_n:
@@ -121,6 +129,113 @@ def _scan_binary(
         skipped_not_finite_bytes_n=lost_n * record.itemsize,
     )
     return _Scan(frames, count, settled_n, at_boundary)
+
+
+def _lay_frames(
+    octets: UInt8[np.ndarray, " bytes"], at_boundary: bool, final: bool, record: np.dtype[np.void]
+) -> tuple[list[Run], int, bool]:
+    """Find the runs of frames; also how many bytes are settled and whether a frame is known to begin there.
+
+    A frame is taken at once where the one before ended (or the stream began) and CR LF closes it, unless CR LF stands
+    in its payload too *and* its values make no sense. Then, and after a break, the next frame is searched for: CR LF
+    stands before it and closes it. If several layouts fit, the one with most plausible chips in two frames wins, then
+    the first.
+    """
+    runs: list[Run] = []
+    position = 0
+    while True:
+        if at_boundary:
+            frames_n = _sure_frames_n(octets[position:], record)
+            runs.append((position, frames_n))
+            position += frames_n * record.itemsize
+            if len(octets) - position < record.itemsize:
+                break
+        window = octets[position : position + SEARCH_FRAMES_N * record.itemsize]
+        reaches_end = position + len(window) == len(octets)
+        skip_n, found = _search(window, at_boundary, final and reaches_end, record)
+        position += skip_n
+        at_boundary = found or (at_boundary and skip_n == 0)
+        if found:
+            runs.append((position, 1))
+            position += record.itemsize
+        elif reaches_end:
+            break
+    return [run for run in runs if run[1]], position, at_boundary
+
+
+def _sure_frames_n(octets: UInt8[np.ndarray, " bytes"], record: np.dtype[np.void]) -> int:
+    """Count the frames from the first byte on that need no look at what follows them."""
+    sure_n, frames_n = 0, len(octets) // record.itemsize
+    while sure_n < frames_n:
+        block_n = min(frames_n - sure_n, BLOCK_FRAMES_N)
+        block = octets[sure_n * record.itemsize : (sure_n + block_n) * record.itemsize]
+        sure_in_block_n = _sure_in_block_n(block, record)
+        sure_n += sure_in_block_n
+        if sure_in_block_n < block_n:
+            break
+    return sure_n
+
+
+def _sure_in_block_n(block: UInt8[np.ndarray, " bytes"], record: np.dtype[np.void]) -> int:
+    rows = block.reshape(-1, record.itemsize)
+    closed = (rows[:, -2] == CR) & (rows[:, -1] == LF)
+    closed_n = len(rows) if closed.all() else int(closed.argmin())
+    ends = _terminators(block[: closed_n * record.itemsize])
+    if np.count_nonzero(ends) == closed_n:  # none but those that close a frame
+        return closed_n
+    inside = np.flatnonzero(ends)
+    inside = inside[inside % record.itemsize != record.itemsize - 2]
+    suspect_i = np.unique(inside // record.itemsize)
+    sane = _plausible(block.view(record)["txyz"][suspect_i]).all(axis=1)
+    return closed_n if sane.all() else int(suspect_i[sane.argmin()])
+
+
+def _search(
+    window: UInt8[np.ndarray, " bytes"], at_boundary: bool, final: bool, record: np.dtype[np.void]
+) -> tuple[int, bool]:
+    """Give the number of bytes to skip, and whether a frame begins there (else: more bytes must tell).
+
+    If a window is searched again with more bytes, the two before the first undecided start are kept: they may close
+    a frame before it.
+    """
+    length_n, window_n = record.itemsize, len(window)
+    ended = np.zeros(window_n + 2 * length_n + 1, bool)  # a frame may have ended before this byte
+    ended[0] = at_boundary
+    ended[2 : window_n + 1] = _terminators(window)[: max(window_n - 1, 0)]
+    fits = ended[:-length_n] & ended[length_n:]
+    first = int(fits.argmax())
+    if not fits[first]:
+        return (window_n if final else max(window_n - length_n - 1, 0)), False
+    if not final and window_n < first + 3 * length_n:  # rivals may follow
+        return max(first - 2, 0), False
+    starts = first + np.flatnonzero(fits[first : first + length_n])
+    here_n, next_n = (
+        np.array([_plausible_n(window[start:], record) if fits[start] else 0 for start in starts + shift])
+        for shift in (0, length_n)
+    )
+    best_i = int((here_n + next_n).argmax())
+    start = int(starts[best_i])
+    # A frame's end behind a CR LF that ended nothing looks like a frame; the one after it is more plausible.
+    is_tail = next_n[best_i] > here_n[best_i] and not (at_boundary and start == 0)
+    return start + length_n * int(is_tail), True
+
+
+def _terminators(octets: UInt8[np.ndarray, " bytes"]) -> Bool[np.ndarray, " pairs"]:
+    """Mark the bytes that begin a CR LF."""
+    return (octets[:-1] == CR) & (octets[1:] == LF)
+
+
+def _plausible_n(octets: UInt8[np.ndarray, " bytes"], record: np.dtype[np.void]) -> int:
+    """Count the plausible chips of the frame at the first byte."""
+    return int(np.count_nonzero(_plausible(octets[: record.itemsize].view(record)["txyz"])))
+
+
+def _plausible(txyz: Float32[np.ndarray, "f k 4"]) -> Bool[np.ndarray, "f k"]:
+    """Mark the chips whose values a magnetometer can give."""
+    temperature_degC, b_uT = txyz[..., 0], txyz[..., 1:]
+    warm = (temperature_degC >= TEMPERATURE_MIN_degC) & (temperature_degC <= TEMPERATURE_MAX_degC)
+    no_dust = ((txyz == 0) | (np.abs(txyz) >= VALUE_MIN)).all(axis=-1)
+    return warm & no_dust & (np.abs(b_uT) <= B_MAX_uT).all(axis=-1)
 
 
 def _scan_lines(octets: UInt8[np.ndarray, " bytes"], at_boundary: bool, final: bool, wire: Wire, chips_n: int) -> _Scan:

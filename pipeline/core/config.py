@@ -46,14 +46,12 @@ def parse(model: type[Model], value: Any, where: str) -> Model:
         return model.model_validate_json(json.dumps(value, default=str))
     except ValidationError as error:
         # A misspelt name is also a missing one: name what was written first.
-        first = min(error.errors(include_url=False), key=lambda one: one["type"] != "extra_forbidden")
+        first = min(error.errors(include_url=False), key=lambda found: found["type"] != "extra_forbidden")
         name = ".".join(_written(first["loc"], value)) or "the file"
         got = "nothing" if first["type"] == "missing" else repr(first.get("input"))[:80]
         rule = {"missing": "given", "extra_forbidden": "a known parameter"}.get(first["type"])
         rule = rule or first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
-        if (
-            first["type"] == "value_error"
-        ):  # parameters that contradict each other: the rule names them and their values
+        if first["type"] == "value_error":  # parameters contradict each other: the rule names them and their values
             place = f"{where}: {name}" if first["loc"] else where
             raise ParamsError(f"{place}: {rule}. Mend it there.") from None
         raise ParamsError(where, name, rule, got, "Mend it there.") from None
@@ -64,8 +62,8 @@ def parse_parts(model: type[Model], value: Any, where: str) -> Model:
     fields = {name: field for name, field in model.model_fields.items() if name in value}
     if all(name in value or not field.is_required() for name, field in model.model_fields.items()):
         return parse(model, value, where)
-    asked: dict[str, Any] = {name: (field.annotation, field) for name, field in fields.items()}
-    part: Strict = parse(create_model(model.__name__, __base__=Strict, **asked), value, where)
+    declared: dict[str, Any] = {name: (field.annotation, field) for name, field in fields.items()}
+    part: Strict = parse(create_model(model.__name__, __base__=Strict, **declared), value, where)
     return cast(Model, model.model_construct(**{name: getattr(part, name) for name in fields}))
 
 
@@ -82,9 +80,9 @@ def _written(loc: Sequence[int | str], value: Any) -> list[str]:
 
 Words = Mapping[str, Any]
 NOTHING = object()
-PLACE = re.compile(
-    r"\$\{(item\.)?([^}\[]+)(?:\[(\d+)\])?\}"
-)  # in dvc.yaml: ${key}, ${item.train_multi.recipe}, ${item.terms[0]}
+FLOW, PARAMS, PLAN, SCENES = "dvc.yaml", "params.yaml", "pipeline/plan.yaml", "pipeline/scenes"
+# In dvc.yaml: ${key}, ${item.train_multi.recipe}, ${item.terms[0]}.
+PLACE = re.compile(r"\$\{(item\.)?([^}\[]+)(?:\[(\d+)\])?\}")
 
 
 class Seeded(Strict):
@@ -101,6 +99,11 @@ class Files:
     params: Path
     plan: Path
 
+    @classmethod
+    def of(cls, scene: str) -> "Files":
+        """Give those of a scene of this checkout."""
+        return cls(Path(SCENES) / f"{scene}.yaml", Path(PARAMS), Path(PLAN))
+
 
 @dataclass(frozen=True)
 class Settings:
@@ -113,7 +116,7 @@ class Settings:
     planned: Words  # of the stage's item in the plan
 
     def words(self, key: str) -> Any:
-        """Take what the scene's file says under a key, `simulate.boards.rigid`; the caller checks it."""
+        """Take the value under a key of the scene's file, `simulate.boards.rigid`; the caller checks it."""
         return self._declared(self.of_scene, key, self.where)
 
     def row(self, section: str, name: str) -> Any:
@@ -156,9 +159,9 @@ def read_settings(stage: str, key: str, files: Files) -> Settings:
     if item is NOTHING:
         remedy = f"Try: reskin scenes use {key}"
         raise ParamsError(files.plan, f"stages.{stage}", "planned for it", key, remedy)
-    templates = declared(read_yaml(files.params.with_name("dvc.yaml")), stage)
+    templates = declared(read_yaml(files.params.with_name(FLOW)), stage)
     _check_names(f"stages.{stage}.{key}", item, scene, files)
-    keys = {kind: [fill(one, key, item) for one in own] for kind, own in templates.items()}
+    keys = {kind: [fill(template, key, item) for template in rows] for kind, rows in templates.items()}
     planned = find(take(plan, keys["plan"]), f"stages.{stage}.{key}")
     return Settings(
         scene=item["scene"], where=str(files.settings), of_scene=take(scene, keys["scene"]),
@@ -170,9 +173,9 @@ def declared(flow: Words, stage: str) -> dict[str, list[str]]:
     """List the keys that dvc.yaml declares for a stage: of the scene's file, of params.yaml (`shared`), of the plan."""
     keys: dict[str, list[str]] = {"scene": [], "shared": [], "plan": []}
     for entry in flow["stages"][stage]["do"].get("params", []):
-        for file, own in entry.items():
-            kind = {"params.yaml": "shared", "pipeline/plan.yaml": "plan"}.get(file, "scene")
-            keys[kind] += own
+        for file, of_file in entry.items():
+            kind = {PARAMS: "shared", PLAN: "plan"}.get(file, "scene")
+            keys[kind] += of_file
     return keys
 
 
@@ -183,11 +186,12 @@ def fill(template: str, key: str, item: Words) -> str:
     'recipes.paper'
     """
 
-    def word(match: re.Match[str]) -> str:
-        value = find(item, match[2]) if match[1] else key
-        return str(value if match[3] is None else value[int(match[3])])
+    return PLACE.sub(lambda place: _word(place, key, item), template)
 
-    return PLACE.sub(word, template)
+
+def _word(place: re.Match[str], key: str, item: Words) -> str:
+    value = find(item, place[2]) if place[1] else key
+    return str(value if place[3] is None else value[int(place[3])])
 
 
 def take(words: Words, keys: Iterable[str]) -> dict[str, Any]:
@@ -217,22 +221,22 @@ def put(words: dict[str, Any], key: str, value: Any) -> None:
     words[name] = value
 
 
-def _check_names(at: str, item: Words, scene: Words, files: Files) -> None:
+def _check_names(place: str, item: Words, scene: Words, files: Files) -> None:
     """Raise if the scene's file names another row than the plan, which DVC goes by: its keys would not be tracked."""
     for key, planned in _leaves(item):
-        said = find(scene, key)
-        if "." in key and said != planned:
+        named = find(scene, key)
+        if "." in key and named != planned:
             remedy = (
                 f"Try: reskin scenes use {item['scene']}, beside the others that run; or, for an experiment, also "
-                f"-S {files.plan}:{at}.{key}={said}"
+                f"-S {files.plan}:{place}.{key}={named}"
             )
-            got = "nothing" if said is NOTHING else said
+            got = "nothing" if named is NOTHING else named
             raise ParamsError(files.settings, key, f"{planned}, as planned", got, remedy)
 
 
-def _leaves(words: Words, at: str = "") -> Iterator[tuple[str, Any]]:
+def _leaves(words: Words, prefix: str = "") -> Iterator[tuple[str, Any]]:
     for name, value in words.items():
         if isinstance(value, Mapping):
-            yield from _leaves(value, f"{at}{name}.")
+            yield from _leaves(value, f"{prefix}{name}.")
         else:
-            yield f"{at}{name}", value
+            yield f"{prefix}{name}", value

@@ -72,6 +72,7 @@ def sha256(path: Path) -> str:
 
 def read_bytes(path: Path) -> bytes:
     """Read a whole file; raise `SchemaError` if it is not one."""
+    _need(path)
     try:
         return path.read_bytes()
     except OSError as error:
@@ -99,6 +100,7 @@ def write_json(path: Path, value: Any) -> None:
 
 def read_json(path: Path) -> Any:
     """Read JSON; raise `SchemaError` with the place of the first fault."""
+    _need(path)
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
@@ -114,11 +116,12 @@ def write_tensors(path: Path, tensors: Mapping[str, np.ndarray], metadata: Mappi
 
 def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """Read what `write_tensors` wrote; no pickle is ever opened."""
+    _need(path)
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
             return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}
     except (safetensors.SafetensorError, OSError) as error:
-        raise SchemaError(path, "the file", "safetensors", error, "Delete it, and train again.") from None
+        raise SchemaError(path, "the file", "safetensors", error, "Is it a trained model, copied whole?") from None
 
 
 def write_table(path: Path, table: pa.Table) -> None:
@@ -160,7 +163,13 @@ def read_account(path: Path) -> dict[str, int]:
     return account
 
 
+def _need(path: Path) -> None:
+    if not path.exists():
+        raise SchemaError(path, "the file", "there", "nothing", "Check the path, or run the stage that writes it.")
+
+
 def _open_parquet(path: Path) -> pq.ParquetFile:
+    _need(path)
     try:
         return pq.ParquetFile(path)
     except (pa.ArrowInvalid, OSError) as error:

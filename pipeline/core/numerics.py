@@ -1,9 +1,7 @@
 """The same sums with AVX2 and AVX-512: variables that libraries read when they load. In: the environment. Out: same.
 
-AVX2 and AVX-512 code paths round sums in another order, and hundreds of steps of training make tenths of a point of
-accuracy of that. Measured: with these variables a training gives the same bits with AVX-512 and with AVX2 instructions,
-at no cost in CPU time; `MKL_CBWR=COMPATIBLE` alone would cost a factor of four. What the user has set stays as it is.
-Must come before NumPy, and therefore imports nothing that needs it. Refuses to know what is computed.
+AVX2 and AVX-512 code paths add in another order, and training amplifies the rounding. With these variables a training
+gives the same bits on both (tests/test_numerics.py). Imports nothing that needs NumPy, as it must run before it.
 """
 
 import os
@@ -22,7 +20,7 @@ VARIABLES = (
     "NUMBA_CPU_NAME",
 )  # all that this module sets, or that changes its effect
 PINNED = {
-    "MKL_CBWR": "AUTO,STRICT",  # products of matrices: the fastest code path, in the order of sums of all others
+    "MKL_CBWR": "AUTO,STRICT",  # products of matrices: a fast code path, in the same order of sums on all
     "ATEN_CPU_CAPABILITY": "avx2",
     "ONEDNN_MAX_CPU_ISA": "AVX2",
     "OPENBLAS_CORETYPE": "Haswell",
@@ -34,7 +32,10 @@ BEYOND_AVX2 = {"X86_V4": "avx512vl", "AVX512_ICL": "avx512_vbmi2", "AVX512_SPR":
 
 
 def pin() -> None:
-    """Set what is not set yet, in this process and those that it starts; nothing on processors without AVX2."""
+    """Set what is not set yet, in this process and those that it starts; nothing on processors without AVX2.
+
+    What the user has set stays as it is.
+    """
     for name, value in pinned(cpu_flags(), os.environ).items():
         os.environ[name] = value
 
@@ -61,15 +62,15 @@ def departures(environment: Mapping[str, str]) -> list[str]:
     >>> departures({"MKL_CBWR": "COMPATIBLE", "NUMBA_CPU_NAME": "haswell"})
     ['MKL_CBWR=COMPATIBLE']
     """
-    usual = {name: {value} for name, value in PINNED.items()}
-    told = " ".join(BEYOND_AVX2)  # of a processor that has some of them only, a part
-    usual["NPY_DISABLE_CPU_FEATURES"] = {told[:end].rstrip() for end in range(len(told) + 1)}
-    said = {name: environment.get(name, "") for name in VARIABLES}
-    return [f"{name}={value}" for name, value in said.items() if value and value not in usual.get(name, set())]
+    pinned_to = {name: {value} for name, value in PINNED.items()}
+    features = " ".join(BEYOND_AVX2)  # a processor that has some of them only: a part
+    pinned_to["NPY_DISABLE_CPU_FEATURES"] = {features[:end].rstrip() for end in range(len(features) + 1)}
+    values = {name: environment.get(name, "") for name in VARIABLES}
+    return [f"{name}={value}" for name, value in values.items() if value and value not in pinned_to.get(name, set())]
 
 
 def signature() -> tuple[str, ...]:
-    """What may give a training other bits on this machine: how products of matrices are summed, here and now."""
+    """What may give a training other bits on this machine: variables that set how matrix products are summed."""
     sums = (os.environ.get(name, "") for name in ("MKL_CBWR", "ATEN_CPU_CAPABILITY"))
     return (*sums, *departures(os.environ))
 

@@ -1,4 +1,4 @@
-"""Where a result came from: the commit of the code, the machine, the seconds. Knows no result."""
+"""Where a result came from: the checkout, the commit of the code, the machine, the cost in seconds. Knows no result."""
 
 import os
 import platform
@@ -12,11 +12,24 @@ from typing import Any
 from pipeline.core import io
 from pipeline.core.numerics import departures
 
+EXPERIMENTS = (".dvc", "tmp", "exps")  # where DVC makes copies of a checkout for experiments, and deletes them
 CODE = Path(__file__).parents[1]
 NO_CODE = ("plan.yaml", "scenes")  # settings, which stand beside the code: they decide results by their values
 SECONDS = Path(".reskin/seconds")  # what was timed here: beside the pipeline, as costs are
 CPUINFO = Path("/proc/cpuinfo")  # Linux only
 INSTRUCTIONS = {"avx2": "AVX2", "avx512f": "AVX-512", "amx_tile": "AMX", "asimd": "NEON", "sve": "SVE"}  # by CPU flag
+
+
+def home() -> Path:
+    """Give the checkout, where caches lie: the working directory, or the one around a copy of DVC for an experiment."""
+    here = Path.cwd()
+    around = [parent for parent in here.parents if here.relative_to(parent).parts[:3] == EXPERIMENTS]
+    return around[-1] if around else Path()
+
+
+def is_experiment() -> bool:
+    """Tell whether this runs in such a copy."""
+    return home() != Path()
 
 
 def code_version() -> str:
@@ -34,8 +47,8 @@ def code_version() -> str:
 def device() -> str:
     """The machine in words: processor and instruction sets, cores that this process may use, Python."""
     cores_n = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    said = CPUINFO.read_text(encoding="utf-8", errors="replace") if CPUINFO.exists() else ""
-    named = processor(said, os.environ, otherwise=platform.processor())
+    cpuinfo = CPUINFO.read_text(encoding="utf-8", errors="replace") if CPUINFO.exists() else ""
+    named = processor(cpuinfo, os.environ, otherwise=platform.processor())
     return f"cpu {platform.machine()} {named}, {cores_n} cores, Python {platform.python_version()}"
 
 
@@ -45,14 +58,13 @@ def processor(cpuinfo: str, environ: Mapping[str, str], *, otherwise: str) -> st
     `cpuinfo` is Linux's /proc/cpuinfo; where it names no model, `otherwise` does.
     """
     lines = [line.partition(":") for line in cpuinfo.splitlines()]
-    words = {name.strip().lower(): value.strip() for name, _, value in reversed(lines)}  # the first processor's
-    flags = set(words.get("flags", words.get("features", "")).split())
-    model = words.get("model name") or otherwise or "unknown processor"
-    offered = [name for flag, name in INSTRUCTIONS.items() if flag in flags]
-    held = departures(environ)
+    values = {name.strip().lower(): value.strip() for name, _, value in reversed(lines)}  # the first processor's
+    flags = set(values.get("flags", values.get("features", "")).split())
+    model = values.get("model name") or otherwise or "unknown processor"
     plain = " ".join(model.replace("(R)", "").replace("(TM)", "").split())
-    told = "; ".join(part for part in (", ".join(offered), ", ".join(held)) if part)
-    return f"{plain} ({told})" if told else plain
+    instructions = ", ".join(name for flag, name in INSTRUCTIONS.items() if flag in flags)
+    details = "; ".join(part for part in (instructions, ", ".join(departures(environ))) if part)
+    return f"{plain} ({details})" if details else plain
 
 
 def begin_cost(folder: Path, stage: str) -> None:
@@ -84,16 +96,17 @@ def note_cost(folder: Path, stage: str, seconds: float) -> None:
     """
     peaks = (resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     unit = 1 if sys.platform == "darwin" else 1024  # bytes on macOS, KiB elsewhere
-    own = _read_trainings(folder, stage)
-    fresh_s = sum(computed_s for key, computed_s in own["computed_s"].items() if key not in own["reused"])
+    trained = _read_trainings(folder, stage)
+    computed_s = trained["computed_s"]
+    fresh_s = sum(seconds for key, seconds in computed_s.items() if key not in trained["reused"])
     io.write_json(
         folder / f"{stage}.json",
         {
             "seconds": round(seconds, 2),
             # Side by side they took less than their sum; what else passed meanwhile, as imports, counts here.
-            "other_s": round(max(seconds - min(own["waited_s"], fresh_s), 0.0), 2),
-            "trainings_s": own["computed_s"],
-            "reused_n": len(own["reused"]),
+            "other_s": round(max(seconds - min(trained["waited_s"], fresh_s), 0.0), 2),
+            "trainings_s": computed_s,
+            "reused_n": len(trained["reused"]),
             "peak_process_memory_MB": round(max(peaks) * unit / 1e6, 1),
         },
     )
@@ -111,9 +124,9 @@ def add_up_costs(costs: Iterable[Mapping[str, Any]]) -> float:
 
     Trainings are added as if one ran after another: where two run side by side, less time passes.
     """
-    own = list(costs)
-    trainings_s = {key: seconds for cost in own for key, seconds in cost["trainings_s"].items()}
-    return float(sum(cost["other_s"] for cost in own) + sum(trainings_s.values()))
+    stages = list(costs)
+    trainings_s = {key: seconds for cost in stages for key, seconds in cost["trainings_s"].items()}
+    return float(sum(cost["other_s"] for cost in stages) + sum(trainings_s.values()))
 
 
 def _trainings_file(folder: Path, stage: str) -> Path:
@@ -122,8 +135,7 @@ def _trainings_file(folder: Path, stage: str) -> Path:
 
 def _read_trainings(folder: Path, stage: str) -> dict[str, Any]:
     file = _trainings_file(folder, stage)
-    none: dict[str, Any] = {"waited_s": 0.0, "computed_s": {}, "reused": []}
-    return io.read_json(file) if file.exists() else none
+    return io.read_json(file) if file.exists() else {"waited_s": 0.0, "computed_s": {}, "reused": []}
 
 
 def _git(*words: str) -> str:

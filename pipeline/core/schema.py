@@ -22,10 +22,9 @@ AXES_PER_CHIP_N = 3
 class Readings:
     """The readings of one capture, one row each; NaN where a recording does not know a value.
 
-    Force is what the skin feels: `Fz_N` is positive in compression. `b_uT` is the field as read,
-    `noload_uT` the mean field of the no-load reading that belongs to the row's indentation.
-    `x_mm`, `y_mm` are NaN on a row without contact. `n_contacts` counts the contacts that the skin
-    had felt before this one.
+    Force acts on the skin: `Fz_N` is positive in compression. `b_uT` is the field as read, `noload_uT` the mean field
+    of the no-load reading that belongs to the row's indentation. `x_mm`, `y_mm` are NaN on a row without contact.
+    `n_contacts` counts the skin's contacts before this one.
     """
 
     capture: str
@@ -57,23 +56,13 @@ class Readings:
 
 
 LABELS = ("capture", "board", "skin", "source")
+# Of every column of numbers: the suffix of its name where that is a unit.
 UNITS = {
-    "indentation": "1",
-    "pass_i": "1",
-    "reading_i": "1",
-    "x_mm": "mm",
-    "y_mm": "mm",
-    "depth_mm": "mm",
-    "Fx_N": "N",
-    "Fy_N": "N",
-    "Fz_N": "N",
-    "b_uT": "uT",
-    "noload_uT": "uT",
-    "temperature_degC": "degC",
-    "t_s": "s",
-    "n_contacts": "1",
+    field.name: suffix if (suffix := field.name.rpartition("_")[2]) in ("mm", "N", "uT", "degC", "s") else "1"
+    for field in fields(Readings)
+    if field.name not in LABELS
 }
-_INTEGERS = {"indentation", "pass_i", "reading_i", "n_contacts"}
+_INTEGERS = ("indentation", "pass_i", "reading_i", "n_contacts")
 _PER_CHIP_N = {"b_uT": AXES_PER_CHIP_N, "noload_uT": AXES_PER_CHIP_N, "temperature_degC": 1}
 
 
@@ -102,8 +91,7 @@ def to_table(readings: Readings) -> pa.Table:
         if field.name in LABELS:
             columns.append(pa.array([value] * len(readings), pa.string()))
         elif field.name in _PER_CHIP_N:
-            width = field.type.list_size
-            columns.append(pa.FixedSizeListArray.from_arrays(pa.array(value.ravel()), width))
+            columns.append(pa.FixedSizeListArray.from_arrays(pa.array(value.ravel()), field.type.list_size))
         else:
             columns.append(pa.array(value, field.type))
     return pa.Table.from_arrays(columns, schema=schema)
@@ -116,15 +104,13 @@ def from_table(table: pa.Table, where: str) -> Readings:
     for name in LABELS:
         distinct = table.column(name).unique().to_pylist()
         if len(distinct) != 1:
-            raise SchemaError(
-                where, f"column {name}", "one value in the file", distinct[:3], "Write one capture a file."
-            )
+            remedy = "Write one capture a file."
+            raise SchemaError(where, f"column {name}", "one value in the file", distinct[:3], remedy)
         values[name] = distinct[0]
     for name in UNITS:
         column = table.column(name).combine_chunks()
         if name in _PER_CHIP_N:
-            flat = np.asarray(column.flatten())
-            values[name] = flat.reshape(len(table), _PER_CHIP_N[name] * chips_n)
+            values[name] = np.asarray(column.flatten()).reshape(len(table), _PER_CHIP_N[name] * chips_n)
         else:
             values[name] = np.asarray(column)
     return Readings(**values)  # type: ignore[arg-type]
@@ -134,9 +120,8 @@ def check_schema(schema: pa.Schema, where: str) -> int:
     """Check names, types and units against `arrow_schema`; return the number of chips."""
     missing = [field.name for field in fields(Readings) if field.name not in schema.names]
     if missing:
-        raise SchemaError(
-            where, "columns", "those of pipeline/core/schema.py", f"none named {missing}", "Ingest it again."
-        )
+        rule, got = "those of pipeline/core/schema.py", f"none named {missing}"
+        raise SchemaError(where, "columns", rule, got, "Ingest it again.")
     b_type = schema.field("b_uT").type
     if not pa.types.is_fixed_size_list(b_type) or b_type.list_size % AXES_PER_CHIP_N:
         raise SchemaError(where, "b_uT", "a fixed list of 3 values a chip", b_type, "Ingest it again.")
@@ -148,7 +133,6 @@ def check_schema(schema: pa.Schema, where: str) -> int:
         unit, want_unit = (have.metadata or {}).get(b"unit"), (want.metadata or {})[b"unit"]
         if unit != want_unit:
             got = "no unit" if unit is None else unit.decode()
-            raise SchemaError(
-                where, f"unit of {want.name}", repr(want_unit.decode()), got, "Convert it, then write the unit."
-            )
+            remedy = "Convert it, then write the unit."
+            raise SchemaError(where, f"unit of {want.name}", repr(want_unit.decode()), got, remedy)
     return chips_n

@@ -1,4 +1,4 @@
-"""Asks a tracking server for a sign of life, in seconds and not minutes. Knows nothing of what is written there."""
+"""Whether the tracking server answers, within seconds. Knows nothing of what is written there."""
 
 import http.client
 import os

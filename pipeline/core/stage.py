@@ -1,4 +1,4 @@
-"""What every stage does around its work: argv, a word if MLflow is away, one-sentence errors, its cost.
+"""What every stage does around its work: argv, a warning if MLflow is away, one-sentence errors, its cost.
 
 In: the stage's function; its parameters are its options. Refuses to know what the stage does.
 """
@@ -8,10 +8,10 @@ import inspect
 import sys
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
+from pipeline.core.config import Files
 from pipeline.core.errors import ReskinError
 from pipeline.core.provenance import begin_cost, note_cost
 from pipeline.core.server import TrackingAway, probe, server_uri
@@ -20,17 +20,15 @@ COSTS = Path(".reskin/costs")
 
 
 def run(work: Callable[..., None]) -> None:
-    """Call `work` with options of its own names (`--scene quick`), or of a bundle those within; all are required."""
+    """Call `work` with options of its own names (`--scene quick`), all required; `files` follows from the scene."""
     stage = work.__name__
     parser = argparse.ArgumentParser(prog=f"sh pipeline/run.sh {stage}", description=work.__doc__)
     kinds = {name: parameter.annotation for name, parameter in inspect.signature(work).parameters.items()}
-    bundles = {name: [one.name for one in fields(kind)] for name, kind in kinds.items() if is_dataclass(kind)}
     for name, kind in kinds.items():
-        for option in bundles.get(name, [name]):
-            parser.add_argument(f"--{option.replace('_', '-')}", type=Path if name in bundles else kind, required=True)
+        if kind is not Files:
+            parser.add_argument(f"--{name.replace('_', '-')}", type=kind, required=True)
     arguments = vars(parser.parse_args())
-    for name, options in bundles.items():
-        arguments[name] = kinds[name](*(arguments.pop(option) for option in options))
+    arguments |= {name: Files.of(arguments["scene"]) for name, kind in kinds.items() if kind is Files}
     try:
         probe(server_uri())
     except TrackingAway as away:
@@ -50,10 +48,10 @@ def _unit(stage: str, arguments: Mapping[str, Any]) -> str:
     of = {"ingest": "indentations", "ingest_simulated": "indentations", "describe": "indentations", "simulate": "raw"}
     if stage not in of:
         return stage
-    own = arguments[of[stage]].stem.removeprefix(arguments["scene"]).strip("-")
-    return f"{stage}-{own}" if own else stage
+    part = arguments[of[stage]].stem.removeprefix(arguments["scene"]).strip("-")
+    return f"{stage}-{part}" if part else stage
 
 
 def say(sentence: str) -> None:
-    """Tell the person in front of the terminal, at once."""
+    """Print a sentence to standard error at once."""
     print(sentence, file=sys.stderr, flush=True)

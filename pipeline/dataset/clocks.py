@@ -28,7 +28,7 @@ AWAY_NOISES = 1.5  # times the median distance of no-load: 2.7 sd for the 15 cha
 STRETCH_PERIODS_N = 32
 START_FRAMES_N = 4
 REFERENCE_FRAMES_N = 4096
-_REMEDY = "Add sync marks to the header's clock."
+_REMEDY = "Add sync marks: reskin add ... --mark STREAM_S,PROBE_S, one event on both clocks."
 
 # Stream times [f] and fields in uT [f ch]; the axes have no letters, as f differs from block to block.
 Block = tuple[Float64[np.ndarray, "_"], Float32[np.ndarray, "_ _"]]

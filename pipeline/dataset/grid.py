@@ -13,7 +13,7 @@ from jaxtyping import Float64, Int32
 # "a 9x9 grid (excluding 4 points per corner; a total of 65 indentations)"; its "16cm" is a typo for 16 mm.
 SIDE_POINTS_N = 9
 PITCH_MM = 2.0
-CORNER_SIDE_POINTS_N = 2
+BETWEEN_CORNERS = range(2, SIDE_POINTS_N - 2)  # rows, and columns
 CENTRE_MM = (SIDE_POINTS_N - 1) * PITCH_MM / 2
 
 
@@ -35,8 +35,8 @@ def points_mm() -> Float64[np.ndarray, "65 2"]:
     """Give (x, y) of the grid points in snake order: along x, every second row backwards."""
     points = []
     for row_i in range(SIDE_POINTS_N):
-        columns = [column_i for column_i in range(SIDE_POINTS_N) if not _cut_off(column_i, row_i)]
-        points += [(column_i, row_i) for column_i in (columns if row_i % 2 == 0 else columns[::-1])]
+        row = range(SIDE_POINTS_N)[:: -1 if row_i % 2 else 1]
+        points += [(column_i, row_i) for column_i in row if column_i in BETWEEN_CORNERS or row_i in BETWEEN_CORNERS]
     return np.array(points) * PITCH_MM
 
 
@@ -52,9 +52,3 @@ def protocol(depths_mm: Sequence[float], passes_n: int) -> Protocol:
         y_mm=np.tile(xy_mm[:, 1], passes_n * depths_n),
         depth_mm=np.tile(np.repeat(np.array(depths_mm, dtype=np.float64), points_n), passes_n),
     )
-
-
-def _cut_off(column_i: int, row_i: int) -> bool:
-    # A point is missing where both its row and its column lie within a corner's two.
-    inner = range(CORNER_SIDE_POINTS_N, SIDE_POINTS_N - CORNER_SIDE_POINTS_N)
-    return column_i not in inner and row_i not in inner

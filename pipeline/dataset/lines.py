@@ -1,17 +1,21 @@
-"""Pokes along lines, all that an unlabelled recording knows. In: rows, or the order of pokes by hand. Out: `Lines`.
+"""Pokes along lines, all that an unlabelled recording knows. In: rows, or readings of pokes by hand. Out: `Lines`.
 
 The paper's way (section 5): "indent in a straight line and incrementally index these points". Places serve here to
 index the robot's grid, and stay here: row, line and index leave. Refuses to know fields, forces and trainings.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import reduce
 
 import numpy as np
 import pandas as pd
 from jaxtyping import Float32, Int32, Int64
 
 from pipeline.core.errors import ParamsError
-from pipeline.dataset.rows import TARGETS, Rows
+from pipeline.core.schema import Readings
+from pipeline.dataset.baseline import subtract
+from pipeline.dataset.rows import TARGETS, Rows, stack
 
 PLACE_STEP_MM = 0.1  # assumed: places nearer than this are one, however a recording wrote them
 PLACES_MIN_N = 2  # one place orders nothing
@@ -41,11 +45,12 @@ def grid_lines(rows: Rows, chosen: Int64[np.ndarray, " c"]) -> Lines:
     """
     row, line, order_i = [chosen[:0]], [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)]
     for skin_i, skin in enumerate(np.unique(rows.skin[chosen])):
-        own = chosen[rows.skin[chosen] == skin]
-        x_i, y_i = (np.unique(steps, return_inverse=True)[1] for steps in _steps(rows.target[own]).T)
+        on_skin = chosen[rows.skin[chosen] == skin]
+        x_i, y_i = (np.unique(steps, return_inverse=True)[1] for steps in _steps(rows.target[on_skin]).T)
         for direction, (across_i, along_i) in enumerate(((y_i, x_i), (x_i, y_i))):
-            row.append(own)
-            line.append(np.stack([np.full(len(own), skin_i), np.full(len(own), direction), across_i], axis=1))
+            row.append(on_skin)
+            key = np.broadcast_to([skin_i, direction], (len(on_skin), 2))
+            line.append(np.column_stack([key, across_i]))
             order_i.append(along_i)
     return _number(np.concatenate(row), np.concatenate(line), np.concatenate(order_i))
 
@@ -57,9 +62,40 @@ def hand_lines(pass_i: Int32[np.ndarray, " f"], indentation: Int32[np.ndarray, "
     gap; a line of one indentation orders nothing and is left out.
     """
     order_i = indentation.astype(np.int64)
-    for one in np.unique(pass_i):
-        order_i[pass_i == one] -= order_i[pass_i == one].min()
+    for line in np.unique(pass_i):
+        order_i[pass_i == line] -= order_i[pass_i == line].min()
     return _number(np.arange(len(pass_i)), pass_i[:, None].astype(np.int64), order_i)
+
+
+def hand_rows(captures: Sequence[Readings]) -> tuple[Rows, dict[str, Lines]]:
+    """Make rows of pokes by hand, whose places and forces are unknown, and index each skin's along its lines.
+
+    The lines name rows of the returned stack.
+    """
+    parts: list[Rows] = []
+    lines: dict[str, Lines] = {}
+    for readings in captures:
+        if readings.skin in lines:
+            rule = "poked by hand in one capture"
+            raise ParamsError(f"capture {readings.capture}", "its skin", rule, readings.skin, "Drop one.")
+        lines[readings.skin] = shifted(hand_lines(readings.pass_i, readings.indentation), sum(map(len, parts)))
+        f = len(readings)
+        parts.append(
+            Rows(
+                *(np.repeat(label, f) for label in (readings.capture, readings.board, readings.skin)),
+                db_uT=subtract(readings.b_uT, readings.noload_uT),
+                target=np.full((f, len(TARGETS)), np.nan, np.float32),
+                pass_i=readings.pass_i,
+                indentation=readings.indentation.astype(np.int64),
+                dropped={},
+            )
+        )
+    return reduce(stack, parts), lines
+
+
+def shifted(lines: Lines, rows_n: int) -> Lines:
+    """Give the lines of rows that are stacked below `rows_n` others."""
+    return replace(lines, row=lines.row + rows_n)
 
 
 def take_pokes(
@@ -99,11 +135,9 @@ def _number(row: Int64[np.ndarray, " p"], line: Int64[np.ndarray, "p key"], orde
 def _check_pool(rows: Rows, pool: Int64[np.ndarray, " c"], indentations_n: int) -> None:
     skins, pool_n = np.unique(rows.skin[pool]), len(np.unique(rows.indentation[pool]))
     if len(skins) > 1:
-        raise ParamsError(
-            "a choice of pokes", "its pool", "of one skin", ", ".join(skins), "Choose on each skin by itself."
-        )
+        remedy = "Choose on each skin by itself."
+        raise ParamsError("a choice of pokes", "its pool", "of one skin", ", ".join(skins), remedy)
     if indentations_n > pool_n:
-        raise ParamsError(
-                f"skin {', '.join(skins)}", "pokes to choose", f"at most the {pool_n} indentations of its pool",
-                indentations_n, "Ask for fewer, or let section split keep a larger pool.",
-            )  # fmt: skip
+        rule = f"at most the {pool_n} indentations of its pool"
+        remedy = "Ask for fewer, or let section split keep a larger pool."
+        raise ParamsError(f"skin {', '.join(skins)}", "pokes to choose", rule, indentations_n, remedy)

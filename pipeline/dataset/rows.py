@@ -16,6 +16,7 @@ from pipeline.core.schema import Readings
 from pipeline.dataset.baseline import subtract
 
 TARGETS = ("x_mm", "y_mm", "Fz_N")
+AS_THEY_ARE = ("capture", "board", "skin", "db_uT", "target", "pass_i")  # columns that are stacked unchanged
 SHEAR_TARGETS = ("x_mm", "y_mm", "Fx_N", "Fy_N", "Fz_N")  # of dragged lines (paper section 4)
 
 
@@ -60,56 +61,60 @@ def gather(captures: Sequence[Readings], selection: Selection, *, targets: Seque
     if not captures:
         raise ParamsError("the scene", "captures", "one or more", "none", "Add one with `reskin add`.")
     _check_one_kind(captures)
-    captures = sorted(captures, key=lambda one: one.capture)
-    kept = [_contacts(one, selection) for one in captures]
-    for one, keep in zip(captures, kept, strict=True):
+    captures = sorted(captures, key=lambda readings: readings.capture)
+    kept = [_contacts(readings, selection) for readings in captures]
+    pairs = list(zip(captures, kept, strict=True))
+    for readings, keep in pairs:
         if not keep.any():
-            raise ParamsError(
-                    f"capture {one.capture}", f"readings with a known place and at least {selection.force_min_N} N",
-                    "one or more", f"none of {len(one)}", "Look at its places and at the sign of its force.",
-                )  # fmt: skip
+            what = f"readings with a known place and at least {selection.force_min_N} N"
+            remedy = "Look at its places and at the sign of its force."
+            raise ParamsError(f"capture {readings.capture}", what, "one or more", f"none of {len(readings)}", remedy)
     passes_n: dict[str, int] = {}
     pass_i = []
-    for one, keep in zip(captures, kept, strict=True):
-        before_n = passes_n.get(one.skin, 0)
-        pass_i.append(one.pass_i[keep] + np.int32(before_n))
-        passes_n[one.skin] = before_n + int(one.pass_i.max()) + 1
-    places_unknown_n = sum(int(np.isnan(one.x_mm).sum()) for one in captures)
-    all_n, kept_n = sum(map(len, captures)), sum(int(keep.sum()) for keep in kept)
+    for readings, keep in pairs:
+        before_n = passes_n.get(readings.skin, 0)
+        pass_i.append(readings.pass_i[keep] + np.int32(before_n))
+        passes_n[readings.skin] = before_n + int(readings.pass_i.max()) + 1
+    kept_n = [int(keep.sum()) for keep in kept]
+    places_unknown_n = sum(int(np.isnan(readings.x_mm).sum()) for readings in captures)
+    weak_n = sum(map(len, captures)) - sum(kept_n) - places_unknown_n
+    columns = [np.stack([getattr(readings, name) for name in targets], axis=1)[keep] for readings, keep in pairs]
     return Rows(
-        capture=_repeat([one.capture for one in captures], kept),
-        board=_repeat([one.board for one in captures], kept),
-        skin=_repeat([one.skin for one in captures], kept),
-        db_uT=np.concatenate(
-            [subtract(o.b_uT[keep], o.noload_uT[keep]) for o, keep in zip(captures, kept, strict=True)]
-        ),
-        target=np.concatenate([_targets(one, targets)[keep] for one, keep in zip(captures, kept, strict=True)]),
+        capture=np.repeat(np.array([readings.capture for readings in captures]), kept_n),
+        board=np.repeat(np.array([readings.board for readings in captures]), kept_n),
+        skin=np.repeat(np.array([readings.skin for readings in captures]), kept_n),
+        db_uT=np.concatenate([subtract(readings.b_uT[keep], readings.noload_uT[keep]) for readings, keep in pairs]),
+        target=np.concatenate(columns),
         pass_i=np.concatenate(pass_i),
-        indentation=_count_on([one.indentation[keep] for one, keep in zip(captures, kept, strict=True)]),
-        dropped={"no_contact_rows_n": places_unknown_n, "low_force_rows_n": all_n - kept_n - places_unknown_n},
+        indentation=_count_on([readings.indentation[keep] for readings, keep in pairs]),
+        dropped={"no_contact_rows_n": places_unknown_n, "low_force_rows_n": weak_n},
     )
 
 
-def _contacts(one: Readings, selection: Selection) -> np.ndarray:
-    placed = ~(np.isnan(one.x_mm) | np.isnan(one.y_mm))
-    weak = one.Fz_N < selection.force_min_N  # unknown force (NaN) is not weak
+def stack(above: Rows, below: Rows) -> Rows:
+    """Put rows below others, whose numbers stay what they were; indentations below are numbered after those above."""
+    if below.db_uT.shape[1:] != above.db_uT.shape[1:]:
+        rule = f"the {above.db_uT.shape[1]} of {above.capture[0]}"
+        raise ParamsError(
+            f"capture {below.capture[0]}", "channels", rule, below.db_uT.shape[1], "Use boards of one kind."
+        )
+    stacked = {name: np.concatenate([getattr(above, name), getattr(below, name)]) for name in AS_THEY_ARE}
+    indentation = np.concatenate([above.indentation, below.indentation + above.indentation.max() + 1])
+    return Rows(**stacked, indentation=indentation, dropped=above.dropped)
+
+
+def _contacts(readings: Readings, selection: Selection) -> np.ndarray:
+    placed = ~(np.isnan(readings.x_mm) | np.isnan(readings.y_mm))
+    weak = readings.Fz_N < selection.force_min_N  # unknown force (NaN) is not weak
     return placed & ~weak
-
-
-def _targets(one: Readings, names: Sequence[str]) -> Float32[np.ndarray, "f t"]:
-    return np.stack([getattr(one, name) for name in names], axis=1)
-
-
-def _repeat(labels: list[str], kept: list[np.ndarray]) -> np.ndarray:
-    return np.repeat(np.array(labels), [int(keep.sum()) for keep in kept])
 
 
 def _count_on(indentations: list[np.ndarray]) -> Int64[np.ndarray, " f"]:
     """Number the indentations of each capture after those of the one before."""
     before_n, counted = 0, []
-    for own in indentations:
-        distinct, own_i = np.unique(own, return_inverse=True)
-        counted.append(before_n + own_i)
+    for numbers in indentations:
+        distinct, index = np.unique(numbers, return_inverse=True)
+        counted.append(before_n + index)
         before_n += len(distinct)
     return np.concatenate(counted)
 
@@ -117,20 +122,15 @@ def _count_on(indentations: list[np.ndarray]) -> Int64[np.ndarray, " f"]:
 def _check_one_kind(captures: Sequence[Readings]) -> None:
     first = captures[0]
     boards: dict[str, str] = {}
-    for one in captures:
-        if one.chips_n != first.chips_n:
-            raise ParamsError(
-                    f"capture {one.capture}", "chips of a scene's captures", f"the {first.chips_n} of {first.capture}",
-                    one.chips_n, "Add it to a scene of its own.",
-                )  # fmt: skip
-        if one.source != first.source:
-            raise ParamsError(
-                    f"capture {one.capture}", "source", f"{first.source}, as {first.capture} is", one.source,
-                    "Simulated and recorded captures belong to different scenes.",
-                )  # fmt: skip
-        if boards.setdefault(one.skin, one.board) != one.board:
-            raise ParamsError(
-                    f"capture {one.capture}", f"the board of skin {one.skin}", f"{boards[one.skin]}, as before",
-                    one.board,
-                    "A skin moved to another board is a new skin here: give it a new name.",
-                )  # fmt: skip
+    for readings in captures:
+        where, skin = f"capture {readings.capture}", readings.skin
+        if readings.chips_n != first.chips_n:
+            what, rule = "chips of a scene's captures", f"the {first.chips_n} of {first.capture}"
+            raise ParamsError(where, what, rule, readings.chips_n, "Add it to a scene of its own.")
+        if readings.source != first.source:
+            rule = f"{first.source}, as {first.capture} is"
+            remedy = "Simulated and recorded captures belong to different scenes."
+            raise ParamsError(where, "source", rule, readings.source, remedy)
+        if boards.setdefault(skin, readings.board) != readings.board:
+            remedy = "A skin moved to another board is a new skin here: give it a new name."
+            raise ParamsError(where, f"the board of skin {skin}", f"{boards[skin]}, as before", readings.board, remedy)

@@ -8,78 +8,103 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float32, Int64
+from pydantic import Field
 
+from pipeline.core.config import Settings, Strict, parse
 from pipeline.core.seeds import rng_for
 from pipeline.learning.classical import Classical, fit
+from pipeline.learning.executors import median_s
 from pipeline.learning.inputs import VIEW
-from pipeline.learning.stopwatch import median_s
+from pipeline.learning.recipe import Name, Steps
 from pipeline.learning.trial import Measured
+
+
+class Baselines(Strict):
+    """Section train_classical: methods on the folds of question lobo, each on at most so many training rows."""
+
+    rows_max_n: Annotated[int, Field(ge=1)]
+    methods: dict[Name, Classical]
+
+
+class BaselinesRow(Strict):
+    """Section train_classical as a scene writes it: `methods` names a set of params.yaml."""
+
+    rows_max_n: Steps
+    methods: Name
 
 
 @dataclass(frozen=True)
 class Task:
-    """A method on one fold; `own` are labelled rows of a new skin, which together weigh as much as all others.
+    """A method on one fold; `few_labels` are labelled rows of a new skin, which together weigh as much as all others.
 
-    Of more than `rows_max_n` training rows so many are drawn.
+    More than `rows_max_n` training rows are thinned to this number at random.
     """
 
     name: str
-    asked: Classical
+    method: Classical
     train: Int64[np.ndarray, " a"]
     test: Int64[np.ndarray, " b"]
-    own: Int64[np.ndarray, " o"]
+    few_labels: Int64[np.ndarray, " o"]
     rows_max_n: int
     seed: int
 
 
 @dataclass(frozen=True)
-class Answered:
-    """Predictions (mm, mm, N) for the test rows, the training rows that were used, and seconds of fit and answer."""
+class Fit:
+    """Predictions (mm, mm, N) for the test rows, the number of training rows, and times of fit and prediction."""
 
     predicted: Float32[np.ndarray, "b 3"]
     rows_n: int
     seconds: float
-    one_reading_s: float  # median, to answer for a single reading
+    one_reading_s: float  # median time of a prediction for a single reading
 
 
 @dataclass(frozen=True)
-class _Seen:
-    """What one task sees of the rows, small enough for another process."""
+class _Inputs:
+    """The rows of one task, as its method sees them: small enough for another process."""
 
-    inputs: Float32[np.ndarray, "a c"]
+    train: Float32[np.ndarray, "a c"]
     target: Float32[np.ndarray, "a 3"]
     weight: Float32[np.ndarray, " a"] | None
-    tested: Float32[np.ndarray, "b c"]
+    test: Float32[np.ndarray, "b c"]
 
 
-def run_tasks(tasks: Sequence[Task], rows: Measured, executor: Executor, tell: Callable[[str], None]) -> list[Answered]:
+def baselines(settings: Settings) -> Baselines:
+    """Read section train_classical, with the set of methods that it names."""
+    section, where = settings.words("train_classical"), f"{settings.where}: train_classical"
+    row = parse(BaselinesRow, section, where)
+    return parse(Baselines, dict(section) | {"methods": settings.row("methods", row.methods)}, where)
+
+
+def run_tasks(tasks: Sequence[Task], rows: Measured, executor: Executor, tell: Callable[[str], None]) -> list[Fit]:
     """Fit and predict; every task by itself."""
-    running = [executor.submit(_answer, task.asked, task.name, task.seed, _see(task, rows)) for task in tasks]
-    answered = []
+    running = [executor.submit(_fit, task.method, task.name, task.seed, _inputs(task, rows)) for task in tasks]
+    fits = []
     for task, future in zip(tasks, running, strict=True):
-        answered.append(future.result())
-        tell(f"{len(answered)}/{len(tasks)} {task.name}")
-    return answered
+        fits.append(future.result())
+        tell(f"{len(fits)}/{len(tasks)} {task.name}")
+    return fits
 
 
-def _see(task: Task, rows: Measured) -> _Seen:
-    train, weight, view = task.train, None, VIEW[task.asked.inputs]
+def _inputs(task: Task, rows: Measured) -> _Inputs:
+    train, weight, view = task.train, None, VIEW[task.method.inputs]
     if len(train) > task.rows_max_n:
-        drawn = rng_for(task.seed, "thin", task.name).choice(len(train), task.rows_max_n, replace=False)
-        train = train[np.sort(drawn)]
-    if len(task.own):
-        share = len(train) / len(task.own)
-        weight = np.concatenate([np.ones(len(train)), np.full(len(task.own), share)]).astype(np.float32)
-        train = np.concatenate([train, task.own])
-    return _Seen(view(rows.db_uT[train]), rows.target[train], weight, view(rows.db_uT[task.test]))
+        kept = rng_for(task.seed, "thin", task.name).choice(len(train), task.rows_max_n, replace=False)
+        train = train[np.sort(kept)]
+    if len(task.few_labels):
+        share = len(train) / len(task.few_labels)
+        weight = np.concatenate([np.ones(len(train)), np.full(len(task.few_labels), share)]).astype(np.float32)
+        train = np.concatenate([train, task.few_labels])
+    return _Inputs(view(rows.db_uT[train]), rows.target[train], weight, view(rows.db_uT[task.test]))
 
 
-def _answer(asked: Classical, name: str, seed: int, seen: _Seen) -> Answered:
+def _fit(method: Classical, name: str, seed: int, inputs: _Inputs) -> Fit:
     start_s = time.monotonic()
-    fitted = fit(asked, seen.inputs, seen.target, rng_for(seed, "baseline", name), weight=seen.weight)
+    fitted = fit(method, inputs.train, inputs.target, rng_for(seed, "baseline", name), weight=inputs.weight)
     seconds = time.monotonic() - start_s
-    answer_s = median_s(partial(fitted.predict, seen.tested[:1]))
-    return Answered(fitted.predict(seen.tested), fitted.rows_n, seconds, answer_s)
+    one_reading_s = median_s(partial(fitted.predict, inputs.test[:1]))
+    return Fit(fitted.predict(inputs.test), fitted.rows_n, seconds, one_reading_s)

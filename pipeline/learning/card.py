@@ -1,4 +1,4 @@
-"""The card of a model: all that somebody needs to use it, and to know what it was trained on. JSON-ready words only."""
+"""The card of a model: all that its use needs, and what it was trained on. In: a training. Out: values for JSON."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ FORMAT = "reskin-model/3"
 
 
 def describe(trial: Trial, trained: Trained, rows: Rows, scene: str, code: str) -> dict[str, Any]:
-    """Describe a trained trial; `scores` are added by whoever knows the truth."""
+    """Describe a trained trial; `scores` are added where the truth is known."""
     card = {
         "format": FORMAT,
         "scene": scene,
@@ -34,7 +34,7 @@ def describe(trial: Trial, trained: Trained, rows: Rows, scene: str, code: str) 
         "scaler": {name: value.tolist() for name, value in trained.scaler.arrays().items()},
         "stopped_step": trained.stopped_step,
         "explained_min": None if trained.explained_min is None else round(trained.explained_min, 6),
-        **went(trained),
+        **collapse_record(trained),
         "train_boards": np.unique(rows.board[trial.train]).tolist(),
         "train_skins": np.unique(rows.skin[trial.train]).tolist(),
         "train_rows_n": len(trial.train),
@@ -45,17 +45,19 @@ def describe(trial: Trial, trained: Trained, rows: Rows, scene: str, code: str) 
     return card if trial.tuning is None else card | {"tuning": _tuning(trial.tuning, rows)}
 
 
-def went(trained: Trained) -> dict[str, Any]:
-    """Say of a training whether it collapsed, and how often it did before, with other draws."""
+def collapse_record(trained: Trained) -> dict[str, Any]:
+    """Record whether a training collapsed, and how often the same trial did before, with other draws."""
     return {"collapsed": trained.collapsed, "collapsed_before_n": trained.collapsed_before_n}
 
 
 def _tuning(tuning: Adapting | FewLabels, rows: Rows) -> dict[str, Any]:
-    used = tuning.lines.row if isinstance(tuning, Adapting) else tuning.own
-    words = {"from": tuning.start.key, "settings": tuning.settings.model_dump(mode="json")}
-    return words | {
+    row = tuning.lines.row if isinstance(tuning, Adapting) else tuning.row
+    indentations = np.unique(rows.indentation[row])
+    return {
+        "from": tuning.start.key,
+        "settings": tuning.settings.model_dump(mode="json"),
         "kind": "unlabelled" if isinstance(tuning, Adapting) else "labelled",
-        "skins": np.unique(rows.skin[used]).tolist(),
-        "indentations": np.unique(rows.indentation[used]).tolist(),
-        "pokes_n": len(np.unique(rows.indentation[used])),
+        "skins": np.unique(rows.skin[row]).tolist(),
+        "indentations": indentations.tolist(),
+        "pokes_n": len(indentations),
     }

@@ -4,7 +4,7 @@ A fit standardises by its own training rows and runs in one thread. Refuses to k
 """
 
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, ClassVar, Literal, Protocol, runtime_checkable
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from jaxtyping import Float, Float32, Int64
@@ -19,19 +19,10 @@ from threadpoolctl import ThreadpoolController  # type: ignore[import-untyped]
 
 from pipeline.core.config import Strict
 from pipeline.core.errors import TrainingError
-from pipeline.learning.standardise import SCALE_FLOOR, Scaler, fit_standard
+from pipeline.learning.inputs import SCALE_FLOOR, Scaler, fit_standard
 
 THREADS = ThreadpoolController()  # of the libraries above: finding them takes 3 ms, limiting them 15 us
 BLOCK_ROWS_N = 4096  # handled at once, to bound memory: a kernel of them and 6000 rows is 200 MB
-
-
-@runtime_checkable
-class _Regressor(Protocol):
-    """What scikit-learn calls a regressor of several targets, taking weights of rows."""
-
-    def fit(self, inputs: np.ndarray, target: np.ndarray, weight: np.ndarray | None, /) -> Any: ...
-
-    def predict(self, inputs: np.ndarray, /) -> np.ndarray: ...
 
 
 class _Method(Strict):
@@ -41,75 +32,47 @@ class _Method(Strict):
 
 
 class Ridge(_Method):
-    """A plane; `alpha` stands against the squared errors summed over rows, here and in the next, all standardised."""
+    """Linear least squares; `alpha` weighs the penalty against squared errors summed over rows, all standardised."""
 
-    words: ClassVar[str] = "ridge"
+    title: ClassVar[str] = "ridge"
     method: Literal["ridge"]
     alpha: Annotated[float, Field(gt=0)]
 
-    def regressor(self, rng: np.random.Generator) -> _Regressor:
-        """Make it, unfitted."""
-        return LinearRidge(self.alpha)
-
 
 class CubicRidge(_Method):
-    """All products of up to three inputs: 815 of 15, 968 of 16."""
+    """Ridge on all products of up to three inputs: 815 of 15, 968 of 16."""
 
-    words: ClassVar[str] = "cubic ridge"
+    title: ClassVar[str] = "cubic ridge"
     method: Literal["cubic_ridge"]
     alpha: Annotated[float, Field(gt=0)]
-
-    def regressor(self, rng: np.random.Generator) -> _Regressor:
-        """Make it, unfitted."""
-        return _Cubic(self.alpha)
 
 
 class Neighbours(_Method):
     """The mean of the nearest training rows, each counting its weight over its distance."""
 
-    words: ClassVar[str] = "k nearest neighbours"
+    title: ClassVar[str] = "k nearest neighbours"
     method: Literal["knn"]
     neighbours_n: Annotated[int, Field(ge=1)]
-
-    def regressor(self, rng: np.random.Generator) -> _Regressor:
-        """Make it, unfitted."""
-        # A tree, as few of the 15 directions are ever taken; scikit-learn's own choice is brute force from 16 on.
-        return _Voting(KNeighborsRegressor(self.neighbours_n, weights="distance", algorithm="kd_tree"))
 
 
 class RbfRidge(_Method):
     """exp(-gamma d^2) around each of at most `rows_max_n` rows; d^2 is 2 an input on average."""
 
-    words: ClassVar[str] = "RBF kernel ridge"
+    title: ClassVar[str] = "RBF kernel ridge"
     method: Literal["rbf_ridge"]
     alpha: Annotated[float, Field(gt=0)]
     gamma: Annotated[float, Field(gt=0)]
     rows_max_n: Annotated[int, Field(ge=1)]
 
-    def regressor(self, rng: np.random.Generator) -> _Regressor:
-        """Make it, unfitted."""
-        return KernelRidge(kernel="rbf", alpha=self.alpha, gamma=self.gamma)
-
 
 class Boosting(_Method):
     """Trees on binned inputs, one row of trees a target; no early stop, whose hold-out would split indentations."""
 
-    words: ClassVar[str] = "gradient boosting"
+    title: ClassVar[str] = "gradient boosting"
     method: Literal["boosting"]
     rounds_n: Annotated[int, Field(ge=1)]
     rate: Annotated[float, Field(gt=0)]
     leaves_n: Annotated[int, Field(ge=2)]
-
-    def regressor(self, rng: np.random.Generator) -> _Regressor:
-        """Make it, unfitted."""
-        trees = HistGradientBoostingRegressor(
-            max_iter=self.rounds_n,
-            learning_rate=self.rate,
-            max_leaf_nodes=self.leaves_n,
-            early_stopping=False,
-            random_state=int(rng.integers(2**32)),
-        )
-        return MultiOutputRegressor(trees)
 
 
 Classical = Annotated[Ridge | CubicRidge | Neighbours | RbfRidge | Boosting, Field(discriminator="method")]
@@ -120,7 +83,7 @@ class _Part:
     """A regressor of those targets (0, 1, 2) that are known in the same training rows."""
 
     targets: list[int]
-    regressor: _Regressor
+    regressor: Any  # fit(inputs, target, weight), predict(inputs)
     rows_n: int
 
 
@@ -137,19 +100,19 @@ class Fitted:
         return max(part.rows_n for part in self.parts)
 
     def predict(self, inputs: Float32[np.ndarray, "f c"]) -> Float32[np.ndarray, "f 3"]:
-        """Answer x_mm, y_mm and F_N; NaN where no training row knew the target."""
-        answer = np.full((len(inputs), 3), np.nan, np.float32)
+        """Predict x_mm, y_mm and F_N; NaN where no training row knew the target."""
+        predicted = np.full((len(inputs), 3), np.nan, np.float32)
         encoded = self.scaler.encode(inputs).astype(np.float64)
         with THREADS.limit(limits=1):
             for block in _blocks(len(inputs)):
                 for part in self.parts:
-                    own = part.regressor.predict(encoded[block])
-                    answer[block, part.targets] = own.reshape(-1, len(part.targets))
-        return self.scaler.decode(answer)
+                    values = part.regressor.predict(encoded[block])
+                    predicted[block, part.targets] = values.reshape(-1, len(part.targets))
+        return self.scaler.decode(predicted)
 
 
 def fit(
-    asked: Classical,
+    settings: Classical,
     inputs: Float32[np.ndarray, "n c"],
     target: Float32[np.ndarray, "n 3"],
     rng: np.random.Generator,
@@ -161,22 +124,44 @@ def fit(
     `weight` counts a row as so many in the loss (in a vote, of neighbours); the scaler does not know it.
     """
     assert weight is None or (weight > 0).all()
-    _check(asked, inputs, target)
-    scaler = _deaf_to_still_channels(fit_standard(inputs, target))
+    _check(settings, inputs, target)
+    scaler = _without_constant_channels(fit_standard(inputs, target))
     encoded = scaler.encode(inputs).astype(np.float64)
-    wanted = scaler.encode_target(target).astype(np.float64)
+    encoded_target = scaler.encode_target(target).astype(np.float64)
     weights = None if weight is None else weight.astype(np.float64)
     parts = []
     for targets, rows in _known_together(target):
-        own = None if weights is None else weights[rows]
-        if isinstance(asked, RbfRidge) and len(rows) > asked.rows_max_n:
-            drawn, own = _draw(len(rows), asked.rows_max_n, own, rng)
-            rows = rows[drawn]
-        regressor = asked.regressor(rng)
+        row_weights = None if weights is None else weights[rows]
+        if isinstance(settings, RbfRidge) and len(rows) > settings.rows_max_n:
+            kept, row_weights = _thin(len(rows), settings.rows_max_n, row_weights, rng)
+            rows = rows[kept]
+        regressor = _regressor(settings, rng)
         with THREADS.limit(limits=1):
-            regressor.fit(encoded[rows], wanted[rows][:, targets], own)
+            regressor.fit(encoded[rows], encoded_target[rows][:, targets], row_weights)
         parts.append(_Part(targets, regressor, len(rows)))
     return Fitted(scaler, tuple(parts))
+
+
+def _regressor(settings: Classical, rng: np.random.Generator) -> Any:
+    match settings:
+        case Ridge():
+            return LinearRidge(settings.alpha)
+        case CubicRidge():
+            return _Cubic(settings.alpha)
+        case Neighbours(neighbours_n=k):
+            # A tree, as few of the 15 directions are ever taken; scikit-learn's choice is brute force from 16 on.
+            return _Voting(KNeighborsRegressor(k, weights="distance", algorithm="kd_tree"))
+        case RbfRidge():
+            return KernelRidge(kernel="rbf", alpha=settings.alpha, gamma=settings.gamma)
+        case Boosting():
+            trees = HistGradientBoostingRegressor(
+                max_iter=settings.rounds_n,
+                learning_rate=settings.rate,
+                max_leaf_nodes=settings.leaves_n,
+                early_stopping=False,
+                random_state=int(rng.integers(2**32)),
+            )
+            return MultiOutputRegressor(trees)
 
 
 class _Cubic:
@@ -219,10 +204,10 @@ def _blocks(rows_n: int) -> list[slice]:
     return [slice(i, i + BLOCK_ROWS_N) for i in range(0, rows_n, BLOCK_ROWS_N)]
 
 
-def _deaf_to_still_channels(scaler: Scaler) -> Scaler:
-    """Read 0 from an input that never moved in training: at the floor's scale it would drown all others in use."""
-    still = scaler.input_scale <= SCALE_FLOOR
-    return replace(scaler, input_scale=np.where(still, np.float32(np.inf), scaler.input_scale))
+def _without_constant_channels(scaler: Scaler) -> Scaler:
+    """Scale an input that is constant in training to 0: at the floor's scale it would dominate all others in use."""
+    constant = scaler.input_scale <= SCALE_FLOOR
+    return replace(scaler, input_scale=np.where(constant, np.float32(np.inf), scaler.input_scale))
 
 
 def _known_together(target: Float32[np.ndarray, "n 3"]) -> list[tuple[list[int], Int64[np.ndarray, " a"]]]:
@@ -234,7 +219,7 @@ def _known_together(target: Float32[np.ndarray, "n 3"]) -> list[tuple[list[int],
     return [(targets, np.flatnonzero(known[:, targets[0]])) for targets in together.values()]
 
 
-def _draw(
+def _thin(
     rows_n: int, most_n: int, weight: Float[np.ndarray, " n"] | None, rng: np.random.Generator
 ) -> tuple[Int64[np.ndarray, " a"], Float[np.ndarray, " a"] | None]:
     """Draw `most_n` of more rows without replacement.
@@ -251,17 +236,17 @@ def _draw(
         raise TrainingError(
             "rbf_ridge", "rows_max_n", f"more than the {heavy.sum()} rows of greater weight", most_n, "Raise it."
         )
-    drawn = np.sort(np.concatenate([np.flatnonzero(heavy), rng.choice(light, left_n, replace=False)]))
-    return drawn, np.where(heavy, weight * left_n / len(light), weight)[drawn]
+    kept = np.sort(np.concatenate([np.flatnonzero(heavy), rng.choice(light, left_n, replace=False)]))
+    return kept, np.where(heavy, weight * left_n / len(light), weight)[kept]
 
 
-def _check(asked: Classical, inputs: Float32[np.ndarray, "n c"], target: Float32[np.ndarray, "n 3"]) -> None:
+def _check(settings: Classical, inputs: Float32[np.ndarray, "n c"], target: Float32[np.ndarray, "n 3"]) -> None:
     known_n = (~np.isnan(target)).sum(axis=0)
     fewest_n = min((int(n) for n in known_n if n), default=0)
-    least_n = asked.neighbours_n if isinstance(asked, Neighbours) else 1
+    least_n = settings.neighbours_n if isinstance(settings, Neighbours) else 1
     if fewest_n < least_n:
         rule = f"{least_n} or more for each target"
-        raise TrainingError(asked.method, "training rows", rule, fewest_n, "Record more.")
+        raise TrainingError(settings.method, "training rows", rule, fewest_n, "Record more.")
     if not np.isfinite(inputs).all():
         broken_n = int((~np.isfinite(inputs)).any(axis=1).sum())
-        raise TrainingError(asked.method, "inputs", "finite", f"{broken_n} rows that are not", "Drop them.")
+        raise TrainingError(settings.method, "inputs", "finite", f"{broken_n} rows that are not", "Drop them.")

@@ -1,4 +1,4 @@
-"""Where trainings run. In: the environment variable RESKIN_EXECUTOR. Out: a `concurrent.futures` executor.
+"""Where trainings run, and how long a call takes. In: RESKIN_EXECUTOR. Out: a `concurrent.futures` executor.
 
 An environment variable and no parameter, because where a training ran must not change its hash. Refuses to know
 what is run.
@@ -9,7 +9,10 @@ import os
 import threading
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from time import perf_counter
 from typing import Any
+
+import numpy as np
 
 from pipeline.core.errors import ParamsError
 
@@ -17,16 +20,17 @@ VARIABLE = "RESKIN_EXECUTOR"
 DEFAULT = "processes:2"
 DEVICE_VARIABLE = "RESKIN_DEVICE"
 DEVICES = ("cpu", "cuda")
+REPEATS_N = 25
 
 
 def make_executor() -> Executor:
     """Make the executor that RESKIN_EXECUTOR names: `processes:N` (default N = 2, one thread each), or `here`."""
-    word = os.environ.get(VARIABLE, DEFAULT)
-    if word == "here":
+    name = os.environ.get(VARIABLE, DEFAULT)
+    if name == "here":
         return Here()
-    kind, _, count = word.partition(":")
+    kind, _, count = name.partition(":")
     if kind != "processes" or not count.isdecimal() or int(count) < 1:
-        raise ParamsError(VARIABLE, "the executor", "processes:N with N >= 1, or here", repr(word), "Unset it for two.")
+        raise ParamsError(VARIABLE, "the executor", "processes:N with N >= 1, or here", repr(name), "Unset it for two.")
     # spawn: a forked child of a threaded parent can hang in BLAS.
     return ProcessPoolExecutor(int(count), multiprocessing.get_context("spawn"), _end_with_parent)
 
@@ -46,10 +50,21 @@ class Here(Executor):
 
 def device() -> str:
     """Where networks are trained: RESKIN_DEVICE, `cpu` if it is not set; one code path for all."""
-    word = os.environ.get(DEVICE_VARIABLE, DEVICES[0])
-    if word not in DEVICES:
-        raise ParamsError(DEVICE_VARIABLE, "the device", f"one of {DEVICES}", repr(word), "Unset it for cpu.")
-    return word
+    name = os.environ.get(DEVICE_VARIABLE, DEVICES[0])
+    if name not in DEVICES:
+        raise ParamsError(DEVICE_VARIABLE, "the device", f"one of {DEVICES}", repr(name), "Unset it for cpu.")
+    return name
+
+
+def median_s(call: Callable[[], object]) -> float:
+    """Time a call `REPEATS_N` times in s, after one that warms the caches."""
+    call()
+    times_s = []
+    for _ in range(REPEATS_N):
+        start_s = perf_counter()
+        call()
+        times_s.append(perf_counter() - start_s)
+    return float(np.median(times_s))
 
 
 def _end_with_parent() -> None:

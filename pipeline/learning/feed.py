@@ -27,35 +27,34 @@ class Feed:
         sets: dict[str, list[np.ndarray]] = {
             "labelled": [job.labelled.inputs for job in jobs],
             "targets": [job.labelled.targets for job in jobs],
-            "poked": [job.unlabelled.inputs for job in jobs if job.unlabelled],
-            "own": [job.own.inputs for job in jobs if job.own],
-            "own_targets": [job.own.targets for job in jobs if job.own],
+            "unlabelled": [job.unlabelled.inputs for job in jobs if job.unlabelled],
+            "few_labels": [job.few_labels.inputs for job in jobs if job.few_labels],
+            "few_labels_targets": [job.few_labels.targets for job in jobs if job.few_labels],
         }
-        self.rows = {name: torch.from_numpy(np.concatenate(own)).to(device) for name, own in sets.items() if own}
-        self.first = {name: np.cumsum([0, *map(len, own)])[:-1] for name, own in sets.items()}
+        self.rows = {name: torch.from_numpy(np.concatenate(rows)).to(device) for name, rows in sets.items() if rows}
+        self.first = {name: np.cumsum([0, *map(len, rows)])[:-1] for name, rows in sets.items()}
 
     def draw(self, steps_n: int) -> Iterator[Batch]:
         """Draw the batches of so many steps: `labelled`, `targets`, and what else the jobs hold.
 
-        `near` and `far` are the positives and negatives of the labelled rows, `poked`, `poked_near` and `poked_far` a
-        triplet of unlabelled ones, `own` and `own_targets` the new skin's labelled rows.
+        `near` and `far` are the positives and negatives of the labelled rows, those in `UNLABELLED` a triplet of
+        unlabelled ones, `few_labels` and `few_labels_targets` the new skin's labelled rows.
         """
         chosen = [_choose(job, (steps_n, self.batch_n), rngs) for job, rngs in zip(self.jobs, self.rngs, strict=True)]
-        block = {name: self._gather(name, [one[name] for one in chosen]) for name in chosen[0]}
+        block = {name: self._gather(name, [rows[name] for rows in chosen]) for name in chosen[0]}
         return ({name: values[i] for name, values in block.items()} for i in range(steps_n))
 
     def _gather(self, name: str, chosen: list[np.ndarray]) -> torch.Tensor:
-        source = _SOURCE[name]
-        rows = np.stack([one + first for one, first in zip(chosen, self.first[source], strict=True)], axis=1)  # [s m b]
+        source = _SOURCE.get(name, name)
+        pairs = zip(chosen, self.first[source], strict=True)
+        rows = np.stack([row + first for row, first in pairs], axis=1)  # [s m b]
         return self.rows[source][torch.from_numpy(rows).to(self.device)]
 
 
-# batch -> the rows that it is drawn from
-_SOURCE = {
-    "labelled": "labelled", "targets": "targets", "near": "labelled", "far": "labelled", "poked": "poked",
-    "poked_near": "poked", "poked_far": "poked", "own": "own", "own_targets": "own_targets",
-}  # fmt: skip
-_STREAMS = ("labelled", "pairs", "poked", "own")
+UNLABELLED = ("unlabelled", "unlabelled_near", "unlabelled_far")
+# batch -> the rows that it is drawn from, where they are named differently
+_SOURCE = {"near": "labelled", "far": "labelled", "unlabelled_near": "unlabelled", "unlabelled_far": "unlabelled"}
+_STREAMS = ("labelled", "pairs", "unlabelled", "few_labels")
 
 
 def _choose(job: Job, shape: tuple[int, int], rngs: Mapping[str, np.random.Generator]) -> Chosen:
@@ -66,11 +65,10 @@ def _choose(job: Job, shape: tuple[int, int], rngs: Mapping[str, np.random.Gener
         chosen |= {"near": near.reshape(shape), "far": far.reshape(shape)}
     if job.unlabelled is not None:
         points, row = job.unlabelled.points, job.unlabelled.row
-        anchor = points.anchors[rngs["poked"].integers(len(points.anchors), size=shape[0] * shape[1])]
-        near, far = draw_pairs(points, anchor, rngs["poked"])
-        names = ("poked", "poked_near", "poked_far")
-        chosen |= {name: row[one].reshape(shape) for name, one in zip(names, (anchor, near, far), strict=True)}
-    if job.own is not None:
-        own = rngs["own"].integers(len(job.own.inputs), size=shape)
-        chosen |= {"own": own, "own_targets": own}
+        anchor = points.anchors[rngs["unlabelled"].integers(len(points.anchors), size=shape[0] * shape[1])]
+        triplet = (anchor, *draw_pairs(points, anchor, rngs["unlabelled"]))
+        chosen |= {name: row[point].reshape(shape) for name, point in zip(UNLABELLED, triplet, strict=True)}
+    if job.few_labels is not None:
+        rows = rngs["few_labels"].integers(len(job.few_labels.inputs), size=shape)
+        chosen |= {"few_labels": rows, "few_labels_targets": rows}
     return chosen

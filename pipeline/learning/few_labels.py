@@ -1,34 +1,90 @@
-"""What a few labels of a new board are tried on. In: rows, folds, settings. Out: networks, adapted and labelled ones.
+"""Question labels: what a few labels of a new board are worth. In: rows, folds, settings. Out: what to run.
 
-Refuses to know how they are run and scored.
+Networks are trained, adapted by unlabelled pokes, and fine-tuned on labelled ones; classical methods are fitted with
+them. Refuses to know how they are run and scored.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Int64
+from pydantic import Field, model_validator
 
+from pipeline.core.config import Settings, Strict, parse
 from pipeline.core.errors import ParamsError
 from pipeline.core.seeds import rng_for
 from pipeline.dataset.lines import grid_lines
 from pipeline.dataset.rows import Rows
 from pipeline.dataset.splits import Fold
+from pipeline.learning import trial as trials
 from pipeline.learning.baselines import Task
-from pipeline.learning.comparison import FewLabels as Settings
-from pipeline.learning.trial import Adapting, FewLabels, Start, Trained, Trial
+from pipeline.learning.classical import Classical
+from pipeline.learning.recipe import AugmentedRecipe, FineTuning, Labelling, Name, Recipe, Steps, Variants
+from pipeline.learning.trial import Adapting, Start, Trained, Trial
 
 QUESTION = "labels"
+Labels = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
+
+
+class FewLabels(Strict):
+    """Section few_labels: networks and classical methods with so many labelled pokes of the held-out board.
+
+    `adapted` names the recipes that are also adapted by their unlabelled pokes, as `adapting` says.
+    """
+
+    labels_n: Labels
+    recipes: dict[Name, Recipe | AugmentedRecipe]
+    adapted: tuple[Name, ...]
+    adapting: FineTuning
+    labelling: Labelling
+    rows_max_n: Annotated[int, Field(ge=1)]
+    methods: dict[Name, Classical]
+
+    @model_validator(mode="after")
+    def _adapts_what_it_trains(self) -> "FewLabels":
+        if unknown := set(self.adapted) - set(self.recipes):
+            raise ValueError(f"adapted names recipes of few_labels, not {sorted(unknown)}")
+        return self
+
+
+class AdaptingRow(Strict):
+    """A shared adaptation, so many steps of it."""
+
+    adaptation: Name
+    steps_n: Steps
+
+
+class LabellingRow(Strict):
+    """A shared labelling, so many steps of it."""
+
+    labelling: Name
+    steps_n: Steps
+
+
+class FewLabelsRow(Strict):
+    """Section few_labels as a scene writes it: `recipes` say what each does differently from the shared `recipe`."""
+
+    labels_n: Labels
+    recipe: Name
+    steps_n: Steps
+    recipes: Variants
+    adapted: tuple[Name, ...]
+    adapting: AdaptingRow
+    labelling: LabellingRow
+    rows_max_n: Steps
+    methods: Name
 
 
 @dataclass(frozen=True)
 class Study:
-    """Rows, the folds of the question, the scene's seed, and what is asked."""
+    """Rows, the folds of the question, the scene's seed, and the settings."""
 
     rows: Rows
     folds: Sequence[Fold]
     seed: int
-    asked: Settings
+    settings: FewLabels
 
 
 @dataclass(frozen=True)
@@ -44,76 +100,83 @@ class Tried:
 Done = tuple[Tried, Trial, Trained]
 
 
-def networks(at: Study, done: Sequence[Done]) -> list[tuple[Tried, Trial]]:
+def few_labels(settings: Settings) -> FewLabels:
+    """Read section few_labels, with the rows that it names."""
+    section, where = settings.words("few_labels"), f"{settings.where}: few_labels"
+    row = parse(FewLabelsRow, section, where)
+    base = settings.row("recipes", row.recipe) | {"steps_n": row.steps_n}
+    full = {name: section[name] for name in ("labels_n", "adapted", "rows_max_n")}
+    full["recipes"] = {name: base | changes for name, changes in row.recipes.items()}
+    full["adapting"] = settings.row("adaptations", row.adapting.adaptation) | {"steps_n": row.adapting.steps_n}
+    full["labelling"] = settings.row("labellings", row.labelling.labelling) | {"steps_n": row.labelling.steps_n}
+    return parse(FewLabels, full | {"methods": settings.row("methods", row.methods)}, where)
+
+
+def networks(study: Study, done: Sequence[Done]) -> list[tuple[Tried, Trial]]:
     """Train every recipe on every fold."""
     return [
         (
             Tried(name, recipe.inputs, 0, fold),
-            Trial(QUESTION, name, recipe, fold.name, at.seed, 0, fold.train, fold.test),
+            Trial(QUESTION, name, recipe, fold.name, study.seed, 0, fold.train, fold.test),
         )
-        for fold in at.folds
-        for name, recipe in at.asked.recipes.items()
+        for fold in study.folds
+        for name, recipe in study.settings.recipes.items()
     ]
 
 
-def adapted(at: Study, done: Sequence[Done]) -> list[tuple[Tried, Trial]]:
+def adapted(study: Study, done: Sequence[Done]) -> list[tuple[Tried, Trial]]:
     """Adapt the named recipes by all pokes of the pool, unlabelled."""
-    return [
-        (
-            Tried(f"{tried.method}, adapted", tried.inputs, 0, tried.fold),
-            _tuned(
-                at, trial, Adapting(_start(one), at.asked.adapting, grid_lines(at.rows, tried.fold.pool)), "adapted"
-            ),
-        )
-        for tried, trial, one in done
-        if trial.recipe_name in at.asked.adapted
-    ]
+    pairs = []
+    for tried, trial, trained in done:
+        if trial.recipe_name in study.settings.adapted:
+            lines = grid_lines(study.rows, tried.fold.pool)
+            tuning = Adapting(_start(trained), study.settings.adapting, lines)
+            pair = Tried(f"{tried.method}, adapted", tried.inputs, 0, tried.fold)
+            pairs.append((pair, _tuned(trial, tuning, "adapted")))
+    return pairs
 
 
-def labelled(at: Study, done: Sequence[Done]) -> list[tuple[Tried, Trial]]:
+def labelled(study: Study, done: Sequence[Done]) -> list[tuple[Tried, Trial]]:
     """Fine-tune every network on every number of labelled pokes."""
-    return [
-        (
-            Tried(tried.method, tried.inputs, labels_n, tried.fold),
-            _tuned(at, trial, FewLabels(_start(one), at.asked.labelling, own), f"{trial.what}{labels_n}labels"),
-        )
-        for tried, trial, one in done
-        for labels_n, own in _own(at, tried.fold).items()
-        if labels_n
-    ]
+    pairs = []
+    for tried, trial, trained in done:
+        for labels_n, row in _labelled_rows(study, tried.fold).items():
+            if labels_n:
+                tuning = trials.FewLabels(_start(trained), study.settings.labelling, row)
+                pair = Tried(tried.method, tried.inputs, labels_n, tried.fold)
+                pairs.append((pair, _tuned(trial, tuning, f"{trial.what}{labels_n}labels")))
+    return pairs
 
 
-def classical(at: Study) -> list[tuple[Tried, Task]]:
+def classical(study: Study) -> list[tuple[Tried, Task]]:
     """Fit every classical method with every number of labelled pokes."""
+    most_n = study.settings.rows_max_n
     return [
         (
-            Tried(one.words, one.inputs, labels_n, fold),
-            Task(f"{name}.{fold.name}.{labels_n}", one, fold.train, fold.test, own, at.asked.rows_max_n, at.seed),
+            Tried(method.title, method.inputs, labels_n, fold),
+            Task(f"{name}.{fold.name}.{labels_n}", method, fold.train, fold.test, row, most_n, study.seed),
         )
-        for fold in at.folds
-        for name, one in at.asked.methods.items()
-        for labels_n, own in _own(at, fold).items()
+        for fold in study.folds
+        for name, method in study.settings.methods.items()
+        for labels_n, row in _labelled_rows(study, fold).items()
     ]
 
 
-def _own(at: Study, fold: Fold) -> Mapping[int, Int64[np.ndarray, " o"]]:
+def _labelled_rows(study: Study, fold: Fold) -> Mapping[int, Int64[np.ndarray, " o"]]:
     """Choose the labelled pokes of the pool at random, the fewer among the more; give their rows."""
-    indentations = np.unique(at.rows.indentation[fold.pool])
-    if max(at.asked.labels_n) > len(indentations):
-        raise ParamsError(
-                f"fold labels/{fold.name}", "few_labels.labels_n", f"at most the {len(indentations)} pokes of its pool",
-                max(at.asked.labels_n), "Ask for fewer, or raise split.labels_pool_n.",
-            )  # fmt: skip
-    order = rng_for(at.seed, "labelled", fold.name).permutation(indentations)
-    return {n: fold.pool[np.isin(at.rows.indentation[fold.pool], order[:n])] for n in at.asked.labels_n}
+    indentation, labels_n = study.rows.indentation[fold.pool], study.settings.labels_n
+    indentations = np.unique(indentation)
+    if max(labels_n) > len(indentations):
+        rule = f"at most the {len(indentations)} pokes of its pool"
+        remedy = "Ask for fewer, or raise split.labels_pool_n."
+        raise ParamsError(f"fold labels/{fold.name}", "few_labels.labels_n", rule, max(labels_n), remedy)
+    order = rng_for(study.seed, "labelled", fold.name).permutation(indentations)
+    return {n: fold.pool[np.isin(indentation, order[:n])] for n in labels_n}
 
 
-def _start(one: Trained) -> Start:
-    return Start(one.key, one.weights, one.scaler)
+def _start(trained: Trained) -> Start:
+    return Start(trained.key, trained.weights, trained.scaler)
 
 
-def _tuned(at: Study, trial: Trial, tuning: Adapting | FewLabels, what: str) -> Trial:
-    return Trial(
-        QUESTION, trial.recipe_name, trial.recipe, trial.fold, at.seed, trial.seed_i, trial.train, trial.test, tuning,
-        trial.fold.rsplit("-draw", 1)[0], what,
-    )  # fmt: skip
+def _tuned(trial: Trial, tuning: Adapting | trials.FewLabels, what: str) -> Trial:
+    return replace(trial, tuning=tuning, skin=trial.fold.rsplit("-draw", 1)[0], what=what)

@@ -20,8 +20,7 @@ import numpy as np
 from pipeline.core import io
 from pipeline.core.errors import TrainingError
 from pipeline.learning.executors import device
-from pipeline.learning.stack import train_stack
-from pipeline.learning.standardise import Scaler
+from pipeline.learning.inputs import Scaler
 from pipeline.learning.trial import Keys, Measured, Trained, Trial
 
 ATTEMPTS_MAX_N = 3  # trainings of one trial; what collapses in all of them is kept, told, and refused by `predict`
@@ -112,6 +111,8 @@ def _run_stacks(
 
 
 def _stack_to_files(rows_file: Path, trials: Sequence[Trial], files: Sequence[Path]) -> None:
+    from pipeline.learning.train import train_stack  # torch, late: only a process that trains pays for it
+
     for trial, file, one in zip(trials, files, train_stack(trials, _read_rows(rows_file)), strict=True):
         tensors = {f"weights.{name}": value for name, value in one.weights.items()} | one.scaler.arrays()
         tensors |= {"curve": np.array(one.curve), "predicted": one.predicted}

@@ -1,28 +1,96 @@
-"""What a method sees of a change of field. In: dB in uT. Out: dB itself, or its shape and the log of its length.
+"""What a method sees: a view of the change of field, and the scaler between uT, mm, N and the numbers of a network.
 
-A view is a fixed function of one row, so it cannot leak. Refuses to know skins, folds, scalers and networks.
+A view is a fixed function of one row, so it cannot leak; a scaler is fitted on training rows only
+(tests/learning/test_trial.py plants the leak). Refuses to know skins, folds and networks.
 """
 
 from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
 
 import numpy as np
 from jaxtyping import Float32
 
-# Assumed: a shorter |dB| is taken as this long. It cannot be told from none, as one channel's noise alone is 3 uT
-# (FACTS 3), all fifteen's together some 15 uT. Its log is 0, so that no change at all is zeros throughout.
+# Assumed: a shorter |dB| is taken as this long. It is below the noise: 3 uT of one channel (FACTS 3), some 15 uT of
+# fifteen. Its log is 0, so that no change at all is zeros throughout.
 DB_FLOOR_uT = 1.0
+# Least scale: a channel that is constant in training must not blow up in use.
+SCALE_FLOOR = np.float32(1e-6)
+RELEASED_INPUT_SDS = np.float32(5.0)  # the released weights divide by about five standard deviations
+RELEASED_PLACE_MM, RELEASED_FORCE_N = 16.0, 3.0
 
 
 def raw(db_uT: Float32[np.ndarray, "f ch"]) -> Float32[np.ndarray, "f ch"]:
-    """Show the change of field as it is."""
+    """Give the change of field as it is."""
     return db_uT
 
 
 def shape(db_uT: Float32[np.ndarray, "f ch"]) -> Float32[np.ndarray, "f c"]:
-    """Show dB / |dB|, which a magnet's strength leaves alone, and append the natural log of |dB| / uT."""
+    """Give dB / |dB|, which a magnet's strength leaves alone, and append the natural log of |dB| / uT."""
     length_uT = np.linalg.norm(db_uT.astype(np.float64), axis=1, keepdims=True)  # [f 1]
     floored_uT = np.maximum(length_uT, DB_FLOOR_uT)
     return np.hstack([db_uT / floored_uT, np.log(floored_uT)]).astype(np.float32)
 
 
 VIEW: Mapping[str, Callable[[Float32[np.ndarray, "f ch"]], Float32[np.ndarray, "f c"]]] = {"raw": raw, "shape": shape}
+
+
+@dataclass(frozen=True)
+class Scaler:
+    """`(db - input_shift) / input_scale` goes in, `out * target_scale + target_shift` is x_mm, y_mm and force in N."""
+
+    input_shift: Float32[np.ndarray, " ch"]
+    input_scale: Float32[np.ndarray, " ch"]
+    target_shift: Float32[np.ndarray, " t"]
+    target_scale: Float32[np.ndarray, " t"]
+
+    def encode(self, db_uT: Float32[np.ndarray, "f ch"]) -> Float32[np.ndarray, "f ch"]:
+        """Turn changes of field into network inputs."""
+        return (db_uT - self.input_shift) / self.input_scale
+
+    def encode_target(self, target: Float32[np.ndarray, "f t"]) -> Float32[np.ndarray, "f t"]:
+        """Turn places and forces into what the network is to answer."""
+        return (target - self.target_shift) / self.target_scale
+
+    def decode(self, answer: Float32[np.ndarray, "f t"]) -> Float32[np.ndarray, "f t"]:
+        """Turn the network's answers into mm, mm, N."""
+        return answer * self.target_scale + self.target_shift
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The four arrays by name, for saving."""
+        return asdict(self)
+
+    @classmethod
+    def of_arrays(cls, arrays: Mapping[str, np.ndarray]) -> "Scaler":
+        """Take the four arrays back out of a saved model."""
+        return cls(**{name: arrays[name] for name in cls.__dataclass_fields__})
+
+
+def fit_standard(db_uT: Float32[np.ndarray, "f ch"], target: Float32[np.ndarray, "f t"]) -> Scaler:
+    """Zero mean and unit deviation of every channel and target over the training rows."""
+    known = ~np.isnan(target).all(axis=0)
+    shift, scale = np.zeros(target.shape[1], np.float32), np.ones(target.shape[1], np.float32)
+    shift[known] = np.nanmean(target[:, known], axis=0, dtype=np.float64)
+    scale[known] = np.nanstd(target[:, known], axis=0, dtype=np.float64)
+    return Scaler(
+        input_shift=db_uT.mean(axis=0, dtype=np.float64).astype(np.float32),
+        input_scale=_floored(db_uT.std(axis=0, dtype=np.float64)),
+        target_shift=shift,
+        target_scale=_floored(scale),
+    )
+
+
+def fit_released(db_uT: Float32[np.ndarray, "f ch"], target: Float32[np.ndarray, "f t"]) -> Scaler:
+    """The scaling of the authors' released network: 5 sd of each channel, no mean removed; x/16, y/16, F/3."""
+    return Scaler(
+        input_shift=np.zeros(db_uT.shape[1], np.float32),
+        input_scale=_floored(RELEASED_INPUT_SDS * db_uT.std(axis=0, dtype=np.float64)),
+        target_shift=np.zeros(target.shape[1], np.float32),
+        target_scale=np.array([RELEASED_PLACE_MM] * 2 + [RELEASED_FORCE_N] * (target.shape[1] - 2), np.float32),
+    )
+
+
+FIT: Mapping[str, Callable[[np.ndarray, np.ndarray], Scaler]] = {"standard": fit_standard, "released": fit_released}
+
+
+def _floored(scale: np.ndarray) -> Float32[np.ndarray, " c"]:
+    return np.maximum(scale, SCALE_FLOOR).astype(np.float32)

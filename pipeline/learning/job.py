@@ -1,21 +1,22 @@
-"""What one network of a stack learns from. In: scaled rows. Out: a `Job`. Knows no loop, and no origin of rows."""
+"""What one network of a stack starts from and learns from. In: a trial and rows. Out: a `Job` of scaled rows, a scaler.
+
+Recipes may add virtual boards: the same pokes under other chips. Knows no loop.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Int64
+from jaxtyping import Float32, Int64, Shaped
+from scipy.spatial.transform import Rotation
 
-from pipeline.learning.architecture import Weights
-from pipeline.learning.triplets import Points
+from pipeline.core.seeds import rng_for
+from pipeline.learning.architecture import LAYERS, Weights, draw_weights
+from pipeline.learning.inputs import FIT, VIEW, Scaler
+from pipeline.learning.recipe import Augmentation, AugmentedRecipe
+from pipeline.learning.trial import Adapting, FewLabels, Measured, Trial
+from pipeline.learning.triplets import Points, make_points
 
-
-@dataclass(frozen=True)
-class Terms:
-    """Weights of what stands beside the L2 loss: triplets of labelled rows, of unlabelled pokes, a few labels."""
-
-    triplet: float
-    unlabelled: float = 0.0
-    own: float = 0.0
+AXES_N = 3
 
 
 @dataclass(frozen=True)
@@ -38,10 +39,101 @@ class Unlabelled:
 
 @dataclass(frozen=True)
 class Job:
-    """What one network starts from and learns from; `own` are a few labelled pokes of a new skin."""
+    """What one network starts from and learns from; `unlabelled` and `few_labels` are pokes of a new skin."""
 
     start: Weights
     rng: np.random.Generator
     labelled: Labelled
     unlabelled: Unlabelled | None = None
-    own: Labelled | None = None
+    few_labels: Labelled | None = None
+
+
+def make_job(trial: Trial, rows: Measured) -> tuple[Job, Scaler]:
+    """Scale what a trial learns from: by a scaler fitted on its training rows, or by that of its first network."""
+    recipe = trial.recipe
+    target = rows.target[trial.train]
+    # Without the recipe in its name: recipes are compared from equal starts on equal batches.
+    again = ("again", trial.attempt_i) if trial.attempt_i else ()
+    rng = rng_for(trial.seed, "train", trial.fold, trial.skin, trial.seed_i, *again)
+    if trial.tuning is None:
+        view = VIEW[recipe.inputs](rows.db_uT[trial.train])
+        scaler = FIT[recipe.scaling](view, target)
+        layers = LAYERS[recipe.architecture](view.shape[1], target.shape[1])
+        # A ReLU on the output (the released network) begins dead for some target in about every third network if its
+        # bias is random too, and what is dead never learns.
+        start: Weights = draw_weights(layers, rng) | {f"layer{len(layers)}.bias": _mean_target(scaler, target)}
+    else:
+        scaler, start = trial.tuning.start.scaler, trial.tuning.start.weights
+    job = Job(
+        start,
+        rng,
+        _labelled(trial, rows, scaler),
+        _unlabelled(trial, rows, scaler) if trial.terms.unlabelled else None,
+        _few_labels(trial, rows, scaler) if trial.terms.few_labels else None,
+    )
+    return job, scaler
+
+
+def virtual_boards(
+    db_uT: Float32[np.ndarray, "f ch"],
+    skin: Shaped[np.ndarray, " f"],
+    settings: Augmentation,
+    rng: np.random.Generator,
+) -> tuple[Float32[np.ndarray, "v ch"], Shaped[np.ndarray, " v"]]:
+    """Copy all rows `copies_n` times, every copy of a skin as another board would read it; also the copies' skins.
+
+    Copy c of row i is row c * f + i. Each copy of a skin has random gains for each channel and leans for each chip;
+    noise is random for each reading.
+    """
+    codes = np.unique(skin, return_inverse=True)[1]
+    skins_n, chips_n = codes.max() + 1, db_uT.shape[1] // AXES_N
+    copies = []
+    for _ in range(settings.copies_n):
+        lean = Rotation.from_rotvec(
+            np.radians(settings.lean_sd_deg) * rng.standard_normal((skins_n * chips_n, AXES_N))
+        ).as_matrix()
+        gain = 1.0 + settings.gain_sd * rng.standard_normal((skins_n, chips_n, AXES_N, 1))
+        read = (gain * lean.reshape(skins_n, chips_n, AXES_N, AXES_N)).astype(np.float32)
+        turned = np.einsum("fkij,fkj->fki", read[codes], db_uT.reshape(len(db_uT), chips_n, AXES_N))
+        noise = settings.noise_uT * rng.standard_normal(db_uT.shape, dtype=np.float32)
+        copies.append(turned.reshape(db_uT.shape) + noise)
+    names = [codes + copy_i * skins_n for copy_i in range(settings.copies_n)]
+    return np.concatenate(copies).astype(np.float32), np.concatenate(names)
+
+
+def _mean_target(scaler: Scaler, target: np.ndarray) -> Float32[np.ndarray, " t"]:
+    """Give the mean of every scaled target; 0 for one that is not known."""
+    known = ~np.isnan(target).all(axis=0)
+    mean = np.zeros(target.shape[1], np.float32)
+    mean[known] = np.nanmean(scaler.encode_target(target)[:, known], axis=0, dtype=np.float64)
+    return mean
+
+
+def _labelled(trial: Trial, rows: Measured, scaler: Scaler) -> Labelled:
+    db_uT, target, skin = (values[trial.train] for values in (rows.db_uT, rows.target, rows.skin))
+    if isinstance(trial.recipe, AugmentedRecipe):
+        rng = rng_for(trial.seed, "augment", trial.fold, trial.seed_i)
+        copies_uT, copied_skin = virtual_boards(db_uT, skin, trial.recipe.augmentation, rng)
+        skin_i = np.unique(skin, return_inverse=True)[1]
+        skin = np.concatenate([skin_i, copied_skin + skin_i.max() + 1])
+        db_uT = np.concatenate([db_uT, copies_uT])
+        target = np.tile(target, (1 + trial.recipe.augmentation.copies_n, 1))
+    points = make_points(target[:, :2], skin) if trial.recipe.triplet_weight else None
+    return Labelled(scaler.encode(VIEW[trial.recipe.inputs](db_uT)), scaler.encode_target(target), points)
+
+
+def _unlabelled(trial: Trial, rows: Measured, scaler: Scaler) -> Unlabelled:
+    """Take of a new skin's unlabelled pokes the change of field and the order along lines, and nothing else."""
+    assert isinstance(trial.tuning, Adapting)
+    lines = trial.tuning.lines
+    row, point_row = np.unique(lines.row, return_inverse=True)
+    view = VIEW[trial.recipe.inputs](rows.db_uT[row])
+    points = make_points(lines.order_i[:, None].astype(np.float64), lines.line_i)
+    return Unlabelled(scaler.encode(view), points, point_row.astype(np.int64))
+
+
+def _few_labels(trial: Trial, rows: Measured, scaler: Scaler) -> Labelled:
+    assert isinstance(trial.tuning, FewLabels)
+    row = trial.tuning.row
+    view = VIEW[trial.recipe.inputs](rows.db_uT[row])
+    return Labelled(scaler.encode(view), scaler.encode_target(rows.target[row]), None)

@@ -1,23 +1,56 @@
-"""The one training loop, for a stack of networks. In: what each learns from, a schedule. Out: weights and curves.
+"""The one training loop, for a stack of networks. In: trials of equal settings, rows. Out: a finished training of each.
 
-Read it from top to bottom. Networks of a stack never touch each other. Refuses to know folds, files and scores.
+Read it from top to bottom. Networks of a stack never touch each other. Refuses to know files, processes and scores.
 """
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
+import numpy as np
 import torch
 from jaxtyping import Float
 
+from pipeline.core.errors import TrainingError
 from pipeline.learning.architecture import LAYERS, Weights
-from pipeline.learning.feed import Feed
-from pipeline.learning.job import Job, Terms
-from pipeline.learning.losses import squared_error, triplet
-from pipeline.learning.model import Stack
+from pipeline.learning.executors import device, median_s
+from pipeline.learning.feed import UNLABELLED, Feed
+from pipeline.learning.inputs import VIEW, Scaler
+from pipeline.learning.job import Job, make_job
+from pipeline.learning.model import Predictor, Stack
 from pipeline.learning.recipe import Schedule
+from pipeline.learning.trial import Measured, Terms, Trained, Trial
 
 BLOCK_STEPS_N = 50  # batches drawn at once, and how often the loss is looked at
-LOST = 1e8  # mean squared error past which a network is lost, where answering the mean has 1; few come back from it
+LOST = 1e8  # mean squared error past which a network is lost, where predicting the mean has 1; few come back from it
+JUDGED_STEPS_N = 200  # a shorter training from random weights may not have left its start
+JUDGED_ROWS_N = 2000  # of the training rows, evenly spaced
+
+
+def train_stack(trials: Sequence[Trial], rows: Measured) -> list[Trained]:
+    """Train trials of equal settings side by side, and predict their test rows."""
+    torch.set_num_threads(1)  # the same sums in the same order, however many processes run beside this one
+    start_s, on, first = time.monotonic(), device(), trials[0]
+    if on == "cuda" and not torch.cuda.is_available():
+        raise TrainingError("RESKIN_DEVICE", "cuda", "there", "none that torch finds", "Unset it for cpu.")
+    jobs, scalers = zip(*(make_job(trial, rows) for trial in trials), strict=True)
+    architecture = first.recipe.architecture
+    outcomes = train(jobs, architecture, first.schedule, first.terms, on)
+    seconds = (time.monotonic() - start_s) / len(trials)
+    trained = []
+    for trial, scaler, outcome in zip(trials, scalers, outcomes, strict=True):
+        view = VIEW[trial.recipe.inputs](rows.db_uT[trial.test])
+        predict = Predictor(outcome.weights, architecture, on)
+        trained.append(
+            Trained(
+                key="", weights=outcome.weights, scaler=scaler, curve=outcome.curve,
+                predicted=_answer(scaler, predict, view), stopped_step=outcome.stopped_step, seconds=seconds,
+                explained_min=_explained(trial, rows, scaler, predict),
+                one_reading_s=median_s(partial(_answer, scaler, predict, view[:1])),
+            )
+        )  # fmt: skip
+    return trained
 
 
 @dataclass(frozen=True)
@@ -34,7 +67,7 @@ class Outcome:
 
 
 def train(jobs: Sequence[Job], architecture: str, schedule: Schedule, terms: Terms, device: str) -> list[Outcome]:
-    """Descend the L2 loss and what stands beside it; AdamW under torch's one-cycle rate and momentum are our choice."""
+    """Descend the L2 loss and the terms beside it; AdamW under torch's one-cycle rate and momentum are our choice."""
     layers = LAYERS[architecture](jobs[0].labelled.inputs.shape[1], jobs[0].labelled.targets.shape[1])
     net = Stack(layers, [job.start for job in jobs]).to(device)
     optimizer = torch.optim.AdamW(net.parameters(), schedule.rate_max, weight_decay=schedule.weight_decay, fused=True)
@@ -50,10 +83,10 @@ def train(jobs: Sequence[Job], architecture: str, schedule: Schedule, terms: Ter
                 near, far = net.features(batch["near"]), net.features(batch["far"])
                 loss = loss + terms.triplet * triplet(features, near, far)
             if terms.unlabelled:
-                poked, near, far = (net.features(batch[name]) for name in ("poked", "poked_near", "poked_far"))
-                loss = loss + terms.unlabelled * triplet(poked, near, far)
-            if terms.own:
-                loss = loss + terms.own * squared_error(net(batch["own"]), batch["own_targets"])
+                anchor, near, far = (net.features(batch[name]) for name in UNLABELLED)
+                loss = loss + terms.unlabelled * triplet(anchor, near, far)
+            if terms.few_labels:
+                loss = loss + terms.few_labels * squared_error(net(batch["few_labels"]), batch["few_labels_targets"])
             optimizer.zero_grad()
             loss.sum().backward()  # of a sum, each network's gradient is its own
             clip(net, schedule.gradient_norm_max)  # one step too long can leave all ReLUs of a layer dead for good
@@ -69,15 +102,37 @@ def clip(net: Stack, norm_max: float) -> None:
     """Shorten the gradient of each network of a stack, all its weights as one vector, to at most `norm_max`."""
     gradients = [parameter.grad for parameter in net.parameters() if parameter.grad is not None]  # [m i o]
     norm = torch.linalg.vector_norm(
-        torch.stack([torch.linalg.vector_norm(one, dim=(1, 2)) for one in gradients]), dim=0
+        torch.stack([torch.linalg.vector_norm(gradient, dim=(1, 2)) for gradient in gradients]), dim=0
     )
     part = (norm_max / norm).clamp(max=1.0)[:, None, None]  # of a gradient of 0, 1
-    for one in gradients:
-        one.mul_(part)
+    for gradient in gradients:
+        gradient.mul_(part)
+
+
+def squared_error(
+    predicted: Float[torch.Tensor, "m b t"], truth: Float[torch.Tensor, "m b t"]
+) -> Float[torch.Tensor, " m"]:
+    """Mean of squared errors over all known targets of a batch; an unknown target (NaN) has no gradient."""
+    known = ~torch.isnan(truth)
+    # Filled before it is squared: NaN times zero is NaN, in the gradient too.
+    difference = torch.where(known, predicted - truth, 0.0)
+    return (difference**2).sum((1, 2)) / known.sum((1, 2))
+
+
+def triplet(
+    anchor: Float[torch.Tensor, "m b d"], positive: Float[torch.Tensor, "m b d"], negative: Float[torch.Tensor, "m b d"]
+) -> Float[torch.Tensor, " m"]:
+    """Batch mean of max(0, |a - p|^2 - |a - n|^2), squared distances of features without a margin (section 5).
+
+    Squares, not roots: the gradient of identical points is 0 and finite.
+    """
+    nearer = ((anchor - positive) ** 2).sum(-1)
+    farther = ((anchor - negative) ** 2).sum(-1)
+    return torch.relu(nearer - farther).mean(-1)
 
 
 class Watch:
-    """Remembers each network's curve and its last sound weights."""
+    """Remembers each network's curve and its last finite weights."""
 
     def __init__(self, net: Stack) -> None:
         self.net = net
@@ -86,7 +141,7 @@ class Watch:
         self.stopped: dict[int, int] = {}
 
     def look(self, error: Float[torch.Tensor, " m"], step: int) -> bool:
-        """Note a block's mean errors; false when no network of the stack is sound any more."""
+        """Note a block's mean errors; false when no network of the stack is finite any more."""
         sound = (self.net.finite() & (error <= LOST)).tolist()  # of NaN, nothing is true
         for i in set(range(len(sound))) - set(self.stopped):
             if sound[i]:
@@ -97,6 +152,24 @@ class Watch:
         return len(self.stopped) < len(sound)
 
     def outcomes(self) -> list[Outcome]:
-        """Give every network as it was when it was last sound."""
+        """Give every network as it was when it was last finite."""
         parts = zip(self.last, self.curves, strict=True)
         return [Outcome(weights, curve, self.stopped.get(i)) for i, (weights, curve) in enumerate(parts)]
+
+
+def _explained(
+    trial: Trial, rows: Measured, scaler: Scaler, predict: Callable[[np.ndarray], np.ndarray]
+) -> float | None:
+    """Give the least explained variance (R2) over the known targets, on training rows."""
+    if trial.schedule.steps_n < JUDGED_STEPS_N:
+        return None
+    some = trial.train[:: -(-len(trial.train) // JUDGED_ROWS_N)]
+    target = rows.target[some].astype(np.float64)
+    off = _answer(scaler, predict, VIEW[trial.recipe.inputs](rows.db_uT[some])) - target
+    known = np.flatnonzero(~np.isnan(target).all(axis=0))
+    varying = [i for i in known if np.nanvar(target[:, i]) > 0]
+    return min((float(1 - np.nanmean(off[:, i] ** 2) / np.nanvar(target[:, i])) for i in varying), default=None)
+
+
+def _answer(scaler: Scaler, predict: Callable[[np.ndarray], np.ndarray], view: np.ndarray) -> np.ndarray:
+    return scaler.decode(predict(scaler.encode(view)))

@@ -1,7 +1,6 @@
 """One training: a recipe on one fold with one seed, or a trained network fine-tuned on a new skin. In: rows, settings.
 
-Out: what the loop needs (a `Job`), and a key that names the result by all that decides it. Refuses to know files,
-processes and scores.
+Out: a `Trial`, and a key that names its result by all that decides it. Refuses to know files, processes and scores.
 """
 
 import ast
@@ -16,25 +15,29 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Int64, Shaped
 
-from pipeline.core import seeds
 from pipeline.core.numerics import signature
-from pipeline.dataset import lines as lines_module
 from pipeline.dataset.lines import Lines
-from pipeline.learning.architecture import LAYERS, Weights, draw_weights
-from pipeline.learning.augment import virtual_boards
+from pipeline.learning.architecture import Weights
 from pipeline.learning.executors import device
-from pipeline.learning.inputs import VIEW
-from pipeline.learning.job import Job, Labelled, Terms, Unlabelled
-from pipeline.learning.recipe import AugmentedRecipe, FineTuning, Labelling, Recipe, Schedule
-from pipeline.learning.standardise import FIT, Scaler
-from pipeline.learning.triplets import make_points
+from pipeline.learning.inputs import Scaler
+from pipeline.learning.recipe import FineTuning, Labelling, Recipe, Schedule
 
 COLLAPSED = 0.05  # of a target's variance over a network's own training rows; sound ones explain more than 0.9
-# The modules whose code decides what a training results in; recipes decide by their values.
+# The modules whose code decides what a training results in (tests/learning/test_trial.py compares with imports).
 DECIDING = (
-    "architecture", "augment", "trial", "feed", "inputs", "job", "losses", "model", "stack", "standardise", "train",
-    "triplets",
+    "core.seeds", "learning.architecture", "learning.feed", "learning.inputs", "learning.job", "learning.model",
+    "learning.train", "learning.trial", "learning.triplets",
 )  # fmt: skip
+LIBRARIES = ("torch", "numpy", "scipy")
+
+
+@dataclass(frozen=True)
+class Terms:
+    """Weights of the terms beside the L2 loss: triplets of labelled rows, of unlabelled pokes, L2 of a few labels."""
+
+    triplet: float
+    unlabelled: float = 0.0
+    few_labels: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -62,13 +65,13 @@ class Trained:
     stopped_step: int | None
     explained_min: float | None  # the least part of a target's variance over its training rows; None: too short to tell
     seconds: float  # of its training, its part of the stack's
-    one_reading_s: float  # median, to answer for a single reading
+    one_reading_s: float  # median time of a prediction for a single reading
     reused: bool = False  # finished by an earlier run
     collapsed_before_n: int = 0  # trainings of the same trial before this one, that collapsed
 
     @property
     def collapsed(self) -> bool:
-        """Whether it answers nearly the same to any input: its loss never fell, at least for one target."""
+        """Whether the network predicts nearly the same for any input: its loss never fell, at least for one target."""
         return self.explained_min is not None and self.explained_min < COLLAPSED
 
 
@@ -83,7 +86,7 @@ class Start:
 
 @dataclass(frozen=True)
 class Adapting:
-    """Fine-tuning to a new skin by its unlabelled pokes: lines name rows, and nothing else of them is looked at."""
+    """Fine-tuning to a new skin by its unlabelled pokes: of the rows of `lines` it sees the field only."""
 
     start: Start
     settings: FineTuning
@@ -92,16 +95,16 @@ class Adapting:
 
 @dataclass(frozen=True)
 class FewLabels:
-    """Fine-tuning to a new skin by a few labelled pokes, whose rows `own` names."""
+    """Fine-tuning to a new skin by a few labelled pokes; `row` are their row numbers."""
 
     start: Start
     settings: Labelling
-    own: Int64[np.ndarray, " o"]
+    row: Int64[np.ndarray, " o"]
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One training. `train` and `test` are row numbers; `skin` is the one adapted to, `what` tells its name apart."""
+    """One training. `train` and `test` are row numbers; `skin` is the one adapted to, `what` a part of its name."""
 
     question: str
     recipe_name: str
@@ -134,69 +137,8 @@ class Trial:
             case Adapting(settings=settings):
                 return Terms(self.recipe.triplet_weight, unlabelled=settings.unlabelled_weight)
             case FewLabels(settings=settings):
-                return Terms(self.recipe.triplet_weight, own=settings.own_weight)
+                return Terms(self.recipe.triplet_weight, few_labels=settings.own_weight)
         return Terms(self.recipe.triplet_weight)
-
-
-def make_job(trial: Trial, rows: Measured) -> tuple[Job, Scaler]:
-    """Scale what a trial learns from: by a scaler fitted on its training rows, or by that of its first network.
-
-    Of a new skin's unlabelled pokes only the change of field and the order along lines is taken.
-    """
-    view = VIEW[trial.recipe.inputs](rows.db_uT[trial.train])
-    target = rows.target[trial.train]
-    # Without the recipe in its name: recipes are compared from equal starts on equal batches.
-    again = ("again", trial.attempt_i) if trial.attempt_i else ()
-    rng = seeds.rng_for(trial.seed, "train", trial.fold, trial.skin, trial.seed_i, *again)
-    if trial.tuning is None:
-        scaler = FIT[trial.recipe.scaling](view, target)
-        layers = LAYERS[trial.recipe.architecture](view.shape[1], target.shape[1])
-        # A ReLU on the output (the released network) begins dead for some target in about every third network if its
-        # bias is drawn too, and what is dead never learns.
-        start: Weights = draw_weights(layers, rng) | {f"layer{len(layers)}.bias": _mean_answer(scaler, target)}
-    else:
-        scaler, start = trial.tuning.start.scaler, trial.tuning.start.weights
-    labelled = _labelled(trial, rows, scaler)
-    unlabelled = _unlabelled(trial, rows, scaler) if trial.terms.unlabelled else None
-    own = _own(trial, rows, scaler) if trial.terms.own else None
-    return Job(start, rng, labelled, unlabelled, own), scaler
-
-
-def _mean_answer(scaler: Scaler, target: np.ndarray) -> Float32[np.ndarray, " t"]:
-    """Give the mean of every scaled target; 0 for one that is not known."""
-    known = ~np.isnan(target).all(axis=0)
-    mean = np.zeros(target.shape[1], np.float32)
-    mean[known] = np.nanmean(scaler.encode_target(target)[:, known], axis=0, dtype=np.float64)
-    return mean
-
-
-def _labelled(trial: Trial, rows: Measured, scaler: Scaler) -> Labelled:
-    db_uT, target, skin = (values[trial.train] for values in (rows.db_uT, rows.target, rows.skin))
-    if isinstance(trial.recipe, AugmentedRecipe):
-        rng = seeds.rng_for(trial.seed, "augment", trial.fold, trial.seed_i)
-        copies_uT, copied = virtual_boards(db_uT, skin, trial.recipe.augmentation, rng)
-        own = np.unique(skin, return_inverse=True)[1]
-        skin = np.concatenate([own, copied + own.max() + 1])
-        db_uT = np.concatenate([db_uT, copies_uT])
-        target = np.tile(target, (1 + trial.recipe.augmentation.copies_n, 1))
-    points = make_points(target[:, :2], skin) if trial.recipe.triplet_weight else None
-    return Labelled(scaler.encode(VIEW[trial.recipe.inputs](db_uT)), scaler.encode_target(target), points)
-
-
-def _unlabelled(trial: Trial, rows: Measured, scaler: Scaler) -> Unlabelled:
-    assert isinstance(trial.tuning, Adapting)
-    lines = trial.tuning.lines
-    row, point_row = np.unique(lines.row, return_inverse=True)
-    view = VIEW[trial.recipe.inputs](rows.db_uT[row])
-    points = make_points(lines.order_i[:, None].astype(np.float64), lines.line_i)
-    return Unlabelled(scaler.encode(view), points, point_row.astype(np.int64))
-
-
-def _own(trial: Trial, rows: Measured, scaler: Scaler) -> Labelled:
-    assert isinstance(trial.tuning, FewLabels)
-    own = trial.tuning.own
-    view = VIEW[trial.recipe.inputs](rows.db_uT[own])
-    return Labelled(scaler.encode(view), scaler.encode_target(rows.target[own]), None)
 
 
 class Keys:
@@ -208,27 +150,27 @@ class Keys:
 
     def key(self, trial: Trial) -> str:
         """Name a trial."""
-        words = [
+        decisive = [
             device(), *signature(), trial.fold, trial.skin, trial.recipe.model_dump_json(), trial.seed, trial.seed_i,
             trial.attempt_i,
             self._labelled(trial.train), _digest(self.rows.db_uT[trial.test]),
-            _code_digest(), importlib.metadata.version("torch"), importlib.metadata.version("numpy"), sys.platform,
+            _code_digest(), *map(importlib.metadata.version, LIBRARIES), sys.platform,
         ]  # fmt: skip
         if trial.tuning is not None:
-            words += [trial.tuning.start.key, trial.tuning.settings.model_dump_json()]
+            decisive += [trial.tuning.start.key, trial.tuning.settings.model_dump_json()]
         match trial.tuning:
             case Adapting(lines=lines):
-                words += [_digest(self.rows.db_uT[lines.row], lines.line_i, lines.order_i)]
-            case FewLabels(own=own):
-                words += [_digest(self.rows.db_uT[own], self.rows.target[own])]
-        return hashlib.sha256(json.dumps(words).encode()).hexdigest()[:32]
+                decisive += [_digest(self.rows.db_uT[lines.row], lines.line_i, lines.order_i)]
+            case FewLabels(row=row):
+                decisive += [_digest(self.rows.db_uT[row], self.rows.target[row])]
+        return hashlib.sha256(json.dumps(decisive).encode()).hexdigest()[:32]
 
     def rows_digest(self) -> str:
         """Name all rows."""
         return _digest(self.rows.db_uT, self.rows.target)
 
     def _labelled(self, train: np.ndarray) -> str:
-        if id(train) not in self.known:  # the array is kept, so that its id stays its own
+        if id(train) not in self.known:  # the array is kept, so that its id is not reused
             skin = np.unique(self.rows.skin[train], return_inverse=True)[1]
             self.known[id(train)] = (train, _digest(self.rows.db_uT[train], self.rows.target[train], skin))
         return self.known[id(train)][1]
@@ -244,21 +186,21 @@ def _digest(*arrays: np.ndarray) -> str:
 
 @lru_cache(maxsize=1)
 def _code_digest() -> str:
-    digest = hashlib.sha256()
-    folder = Path(__file__).parent
-    for source in [*(folder / f"{name}.py" for name in DECIDING), Path(seeds.__file__), Path(lines_module.__file__)]:
-        digest.update(code_of(source.read_text(encoding="utf-8")).encode())
-    return digest.hexdigest()
+    package = Path(__file__).parents[1]
+    sources = ((package / f"{name.replace('.', '/')}.py").read_text(encoding="utf-8") for name in DECIDING)
+    return hashlib.sha256("".join(map(code_of, sources)).encode()).hexdigest()
 
 
 def code_of(source: str) -> str:
-    """Give a module's code without comments and docstrings: what its words say changes no result.
+    """Give a module's code without comments, docstrings and imports, which change no result by themselves.
 
-    >>> code_of("x = 1  # metres\\n\\ndef twice(y):\\n    'Double it.'\\n    return 2 * y").split("\\n")
+    >>> code_of("import os\\nx = 1  # metres\\n\\ndef twice(y):\\n    'Double it.'\\n    return 2 * y").split("\\n")
     ['x = 1', '', 'def twice(y):', '    return 2 * y']
     """
     tree = ast.parse(source)
     for node in ast.walk(tree):
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node, clean=False):
-            node.body = node.body[1:] or [ast.Pass()]
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+            documented = ast.get_docstring(node, clean=False) is not None
+            code = [part for part in node.body[documented:] if not isinstance(part, ast.Import | ast.ImportFrom)]
+            node.body = code or [ast.Pass()]
     return ast.unparse(tree)

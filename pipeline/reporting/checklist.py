@@ -1,11 +1,11 @@
 """The checklist: each figure, table and numbered result of the paper beside ours. In: numbers.json. Out: one table.
 
-Which results there are is data, `checklist.yaml`; the paper's numbers are constants of `reporting.paper`. Refuses to
-know how ours were found.
+Its rows are data, `checklist.yaml`; the paper's numbers are constants of `reporting.paper`. Refuses to know how ours
+were computed.
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,35 +15,29 @@ import pandas as pd
 from pipeline.core.config import parse, read_yaml
 from pipeline.core.errors import SchemaError
 from pipeline.evaluation.inference import VERDICTS
-from pipeline.reporting import paper
-from pipeline.reporting.judging import (
-    DIFFERENCES,
-    NEAR,
-    NOT_REACHED,
-    PLATEAU_POINTS,
-    Row,
-    Verdict,
-    judge,
-    mean_of,
-)  # fmt: skip
+from pipeline.reporting import judging, paper
+from pipeline.reporting.judging import NONE, Row, Verdict, judge, mean_of
 from pipeline.reporting.order import FEW_POINTS, is_pooled
 from pipeline.reporting.shown import show, show_difference
 
 FILE = Path(__file__).with_name("checklist.yaml")
+METRICS = {
+    "accuracy_pct": "accuracy", "mse_xy_mm2": "MSE of the place", "mse_f_N2": "MSE of the force",
+    "mse_fxy_N2": "MSE of the shear force", "mse_fz_N2": "MSE of the normal force",
+}  # fmt: skip
 UNITS = {"pct": "%", "mm2": "mm²", "N2": "N²", "mm": "mm", "N": "N", "hz": "Hz"}
 MEANING = (
-    f"Verdicts are about claims. {VERDICTS} Numbers beside numbers have no verdict: a number differs where it is "
-    f"outside the paper's sd, or by more than {100 * NEAR:g} % where the paper gives none; within it, nothing is "
-    f"claimed about why. Slightly: less than {FEW_POINTS:g} points of accuracy up or down; a plateau: less than "
-    f"{PLATEAU_POINTS:g}. Reasons are guesses: no run measured them. Where no number can be compared, the file named "
-    "last shows ours."
+    f"Verdicts are on claims. {VERDICTS} Pairs of numbers have no verdict: a number differs where it is outside the "
+    f"paper's sd, or by more than {100 * judging.NEAR:g} % where the paper gives none. Slightly: less than "
+    f"{FEW_POINTS:g} points of accuracy up or down; a plateau: less than {judging.PLATEAU_POINTS:g}. Reasons are "
+    "assumed: no run tested them. Where there is no number to compare, see the file named last."
 )
-NAMED = re.compile(r"\{([\w.]+)\}")  # a number that a reason names: a constant of the paper, or a path of ours
+NAMED = re.compile(r"\{([\w.]+)\}")  # a number that a reason names
 
 
 def read_rows() -> list[Row]:
     """Read the rows of the checklist, in the paper's order."""
-    return [parse(Row, row, f"{FILE.name}, row {i}") for i, row in enumerate(read_yaml(FILE))]
+    return [parse(Row, row, f"{FILE.name}, row {row['id']}") for entry in read_yaml(FILE) for row in _by_metric(entry)]
 
 
 def checklist(numbers: Mapping[str, Any], rows: Sequence[Row] | None = None) -> pd.DataFrame:
@@ -51,23 +45,21 @@ def checklist(numbers: Mapping[str, Any], rows: Sequence[Row] | None = None) -> 
     source = numbers["provenance"]["source"]
     lines = []
     for row in read_rows() if rows is None else rows:
-        printed = constant(row.paper) if row.paper else None
-        found = resolve(numbers, row.ours) if row.ours else None
-        verdict = judge(row, printed, found, pooled=is_pooled(numbers), simulated=source == "simulated")
-        if found is None and row.asked and resolve(numbers, row.asked) is not None:
-            verdict = Verdict(NOT_REACHED)
-        if row.reach and found is not None:
-            verdict = _after(verdict, row, numbers)
+        printed = look_up(numbers, row.paper) if row.paper else None
+        ours = resolve(numbers, row.ours) if row.ours else None
+        verdict = judge(row, printed, ours, pooled=is_pooled(numbers), simulated=source == "simulated")
+        if ours is None and row.question in numbers:
+            verdict = Verdict(judging.NOT_REACHED)
         lines.append(
             {
                 "in the paper": row.where,
                 "result": row.what,
-                "paper": row.says if printed is None else _shown(row, printed),
-                "ours": _ours(row, found),
+                "paper": row.says if printed is None else _write(row, printed),
+                "ours": _write_ours(row, ours),
                 "verdict": verdict.word,
-                "difference": _with_reason(verdict, row, numbers),
-                "stage": row.stage or "–",
-                "shown in": ", ".join(row.shown) if row.shown and (found is not None or not row.ours) else "–",
+                "difference": _explain(verdict if ours is None else _after(verdict, row, numbers), row, numbers),
+                "stage": row.stage or NONE,
+                "shown in": ", ".join(row.shown) if row.shown and (ours is not None or not row.ours) else NONE,
                 "source": source,
             }
         )
@@ -81,10 +73,8 @@ def resolve(numbers: Any, path: str) -> Any:
     here = numbers
     for part in path.split("."):
         if isinstance(here, list) and "=" in part:
-            wanted = dict(one.split("=", 1) for one in part.split(","))
-            here = next(
-                (row for row in here if {name: str(row[name]) for name in wanted if name in row} == wanted), None
-            )
+            wanted = dict(pair.split("=", 1) for pair in part.split(","))
+            here = next((row for row in here if wanted.items() <= {key: str(row[key]) for key in row}.items()), None)
         elif isinstance(here, Mapping) and part in here:
             here = here[part]
         else:
@@ -92,55 +82,60 @@ def resolve(numbers: Any, path: str) -> Any:
     return here
 
 
-def constant(path: str) -> Any:
-    """Find a constant of `reporting.paper` by its dotted name."""
-    name, *parts = path.split(".")
-    here = getattr(paper, name, None)
-    for part in parts:
-        here = here.get(part) if isinstance(here, Mapping) else None
-    if here is None:
-        raise SchemaError(FILE.name, "paper", "a constant of reporting.paper", path, "Mend the name.")
-    return here
+def look_up(numbers: Mapping[str, Any], name: str) -> Any:
+    """Find a number by its dotted name: a constant of `reporting.paper` (`SHEAR.mse_fz_N2`), or one of ours."""
+    found = resolve(vars(paper) if name[0].isupper() else numbers, name)
+    if found is None:
+        rule = "a constant of reporting.paper, or a path in numbers.json"
+        raise SchemaError(FILE.name, "a number", rule, name, "Mend the name.")
+    return found
+
+
+def _by_metric(entry: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """Make a row for each metric that an entry of the file lists; an entry without metrics is one row."""
+    row = dict(entry)
+    metrics = row.pop("metrics", None)
+    if metrics is None:
+        yield row
+    for metric in metrics or ():
+        paths = {side: f"{row[side]}.{metric}" for side in ("paper", "ours")}
+        yield row | paths | {"id": f"{row['id']}-{metric}", "what": f"{row['what']}: {METRICS[metric]}"}
 
 
 def _after(verdict: Verdict, row: Row, numbers: Mapping[str, Any]) -> Verdict:
-    """Say first how far in ours was looked at, and whether that is as far as in the paper."""
-    assert row.reach is not None
-    ours_n, paper_n = resolve(numbers, row.reach.ours), constant(row.reach.paper)
+    """Say first how far ours looked, and whether that is as far as the paper did."""
+    if row.reach is None:
+        return verdict
+    ours_n, paper_n = resolve(numbers, row.reach.ours), look_up(numbers, row.reach.paper)
     missed = "" if ours_n >= paper_n else "not reached: ours "
     return replace(verdict, sentence=f"{missed}after {ours_n:,.0f} {row.reach.of}; {verdict.sentence}")
 
 
-def _with_reason(verdict: Verdict, row: Row, numbers: Mapping[str, Any]) -> str:
-    said = not row.simulated_only or numbers["provenance"]["source"] == "simulated"
-    if not (verdict.differs and row.why and said):
+def _explain(verdict: Verdict, row: Row, numbers: Mapping[str, Any]) -> str:
+    why = row.why or (row.why_simulated if numbers["provenance"]["source"] == "simulated" else "")
+    if not (verdict.differs and why):
         return verdict.sentence
-
-    def number(name: re.Match[str]) -> str:
-        own = constant(name[1]) if name[1][0].isupper() else resolve(numbers, name[1])
-        return f"{own:.3g}"
-
-    return f"{verdict.sentence}. {NAMED.sub(number, row.why)}"
+    return f"{verdict.sentence}. {NAMED.sub(lambda name: f'{look_up(numbers, name[1]):.3g}', why)}"
 
 
-def _ours(row: Row, found: Any) -> str:
-    if found is None:
-        return "see file" if row.shown and not row.ours else "–"
-    if isinstance(found, bool):
-        return "yes" if found else "no"
-    if isinstance(found, int):
-        return str(found)
-    return "see file" if mean_of(found) is None else _shown(row, found)
+def _write_ours(row: Row, ours: Any) -> str:
+    if ours is None:
+        return "see file" if row.shown and not row.ours else NONE
+    if isinstance(ours, bool):
+        return "yes" if ours else "no"
+    if isinstance(ours, int):
+        return str(ours)
+    return "see file" if mean_of(ours) is None else _write(row, ours)
 
 
-def _shown(row: Row, value: Any) -> str:
-    """Write a number with the unit that a name in the path of ours says; differences with their sign."""
+def _write(row: Row, value: Any) -> str:
+    """Write a number with the unit of the last name with one in the path of ours; differences with their sign."""
     ends = [part.rsplit("_", 1)[-1] for part in reversed((row.ours or "").split("."))]
     unit = next((UNITS[end] for end in ends if end in UNITS), "")
-    if row.rule in DIFFERENCES:
+    if row.rule in judging.DIFFERENCES:
+        text = show_difference(value if isinstance(value, Mapping) else {"mean": value})
         unit = "points" if unit == "%" else unit
-        return f"{show_difference(value if isinstance(value, Mapping) else {'mean': value})} {unit}".strip()
-    if isinstance(value, tuple):
+    elif isinstance(value, tuple):
         text = "{:g} ± {:g}".format(*value)
     else:
         text = show(value) if isinstance(value, Mapping) else f"{value:.4g}"

@@ -8,50 +8,34 @@ from typing import Any
 
 import pandas as pd
 
+CHECKS = {
+    "subject": "what", "law": "law", "against": "against", "error": "error", "tolerance": "allowed",
+    "reason": "why so much",
+}  # fmt: skip
+CASES = {
+    "area": "area", "case": "case", "should": "should", "happened": "happened", "error": "error", "limit": "allowed",
+}  # fmt: skip
+
 
 def verification_table(rows: Sequence[Mapping[str, Any]], source: str) -> pd.DataFrame:
     """Lay out checks: what was measured against what, its error, and why it may be so large."""
-    lines = [
-        {
-            "what": row["subject"],
-            "law": row["law"],
-            "against": row["against"],
-            "error": _with_unit(row["error"], row["unit"]),
-            "allowed": _with_unit(row["tolerance"], row["unit"]),
-            "why so much": row["reason"],
-            "holds": _holds(row),
-            "source": source,
-        }
-        for row in rows
-    ]
-    return pd.DataFrame(lines)
+    return _table(rows, CHECKS, source)
 
 
 def stability_table(rows: Sequence[Mapping[str, Any]], source: str) -> pd.DataFrame:
     """Lay out cases: what should happen, what happened, and by how much where that is a number."""
-    lines = [
-        {
-            "area": row["area"],
-            "case": row["case"],
-            "should": row["should"],
-            "happened": row["happened"],
-            "error": _number(row["error"]),
-            "allowed": _number(row["limit"]),
-            "holds": _holds(row),
-            "source": source,
-        }
+    return _table(rows, CASES, source)
+
+
+def _table(rows: Sequence[Mapping[str, Any]], titles: Mapping[str, str], source: str) -> pd.DataFrame:
+    return pd.DataFrame(
+        {title: _show(row[name], row.get("unit", "1")) for name, title in titles.items()}
+        | {"holds": "yes" if row["holds"] else "NO", "source": source}
         for row in rows
-    ]
-    return pd.DataFrame(lines)
+    )
 
 
-def _with_unit(value: float, unit: str) -> str:
-    return _number(value) if unit == "1" else f"{_number(value)} {unit}"
-
-
-def _number(value: float | None) -> str:
-    return "–" if value is None else f"{value:.2g}"
-
-
-def _holds(row: Mapping[str, Any]) -> str:
-    return "yes" if row["holds"] else "NO"
+def _show(value: str | float | None, unit: str) -> str:
+    if value is None or isinstance(value, str):
+        return value or "–"
+    return f"{value:.2g}" if unit == "1" else f"{value:.2g} {unit}"

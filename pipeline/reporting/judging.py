@@ -1,41 +1,31 @@
-"""How one row of the checklist is judged: a rule, the paper's number, ours -> a verdict and a sentence.
+"""How a row of the checklist is judged: a rule, the paper's number and ours -> a verdict and a sentence.
 
-Verdicts are of `evaluation.inference`, by intervals over boards. Refuses to know which results there are.
+Verdicts follow 95 % intervals over boards (`evaluation.inference`). Refuses to know which results there are.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 from pipeline.core.config import Strict
-from pipeline.evaluation.inference import (
-    INCONCLUSIVE,
-    NO,
-    ONE_BOARD,
-    YES,
-    Stat,
-    all_of,
-    negated,
-    verdict,
-    verdict_within,
-)  # fmt: skip
+from pipeline.evaluation import inference
+from pipeline.evaluation.inference import INCONCLUSIVE, NO, ONE_BOARD, YES, Stat, negated
 from pipeline.reporting.order import FEW_POINTS, gain
 
-NEAR = 0.10  # assumed: how far ours may be where the paper gives no sd
+NEAR = 0.10  # assumed: relative tolerance where the paper gives no sd
 PLATEAU_POINTS = 1.0  # assumed: "seems to plateau"
 NOT_ASKED = "not asked in this scene"
 NOT_REACHED = "not reached in this scene"
-ONE_SKIN = "ours learnt from one skin only: not the same question"
-INPUT = "an input of the simulated rig, read back from the captures"
-SETTING = "a setting of this scene, no result"
+ONE_SKIN = "ours has one training skin: not comparable"
+SETTING = "a setting of this scene, not a result"
 TARGET = "a calibration target of the simulated spreads: agreement is no evidence"
-POOLED = ("table2.multi.", "table2.triplet.", "table2.adapted.", "paired.", "contrasts.")
-NO_VERDICT = "–"
+POOLED = ("table2.multi.", "table2.triplet.", "table2.adapted.", "paired.", "contrasts.")  # networks of many skins
+NONE = "–"
 DIFFERENCES = ("gain", "slight", "plateau")  # rules about differences: shown with their sign
 
 
 class Reach(Strict):
-    """How far in the paper had gone when it looked, and the path of how far in ours had."""
+    """How far the paper looked (a constant of `reporting.paper`), and how far ours did (a path in numbers.json)."""
 
     paper: str
     ours: str
@@ -51,10 +41,10 @@ class Row(Strict):
     paper: str | None = None  # a constant of `reporting.paper`, its parts separated by dots
     says: str | None = None  # the paper's words, where it gives no number
     ours: str | None = None
-    asked: str | None = None  # a path that is there where the question was asked, though ours may not reach so far
+    question: str | None = None  # the question that ours follows from, where a small scene may not have ours
     # gain: a paired difference is an improvement; each: all of a list are; slight, plateau: it is small; finding:
-    # judged where it was found; view: a figure is to be looked at; input: where simulated, a setting that came back
-    # over the wire; setting: of the scene; target: where simulated, what the spreads were set by
+    # judged by its experiment; view: a figure to look at; input: a setting of simulated scenes; setting: of all scenes;
+    # target: where simulated, the calibration target of the spreads
     rule: Literal[
         "near", "at_most", "at_least", "positive", "gain", "each", "slight", "plateau", "finding", "input", "setting",
         "target", "view",
@@ -62,37 +52,53 @@ class Row(Strict):
     reach: Reach | None = None
     stage: str | None = None
     shown: tuple[str, ...] = ()
-    why: str = ""  # said only where ours differs; numbers by their names in braces
-    simulated_only: bool = False  # the reason is about simulation: recorded scenes have none
+    why: str = ""  # given where ours differs; numbers by their names in braces
+    why_simulated: str = ""  # the same, for simulated scenes only
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """One sentence about ours beside the paper's; `differs` is None where there is nothing to compare."""
+    """A sentence on ours beside the paper's, whether they differ, and for a claim the verdict on it."""
 
     sentence: str
-    differs: bool | None = None
-    word: str = NO_VERDICT
+    differs: bool = False
+    word: str = NONE
 
 
 def judge(row: Row, printed: Any, ours: Any, *, pooled: bool, simulated: bool) -> Verdict:
-    """Say how ours stands to the paper's: a verdict on a claim, or the distance of two numbers."""
+    """Judge ours against the paper's: a verdict on a claim, or the distance of two numbers."""
     if row.ours is None:
-        return Verdict("–")
+        return Verdict(NONE)
     if ours is None:
         return Verdict(NOT_ASKED)
     if not pooled and row.ours.startswith(POOLED):
         return Verdict(ONE_SKIN)
     if isinstance(ours, bool):
-        return Verdict(f"{'holds' if ours else 'does not hold'} on the one that was measured", not ours, ONE_BOARD)
-    return _read_back(row, simulated) or _JUDGED_BY[row.rule](row, printed, ours, simulated)
+        return Verdict(f"{'holds' if ours else 'does not hold'} on the board that was measured", not ours, ONE_BOARD)
+    if row.rule == "setting" or (row.rule == "input" and simulated):
+        return Verdict(SETTING)
+    return _judge_by_rule(row, printed, ours, simulated=simulated)
 
 
-def _read_back(row: Row, simulated: bool) -> Verdict | None:
-    """Tell what is no result: a setting, and what a simulated rig was given."""
-    if row.rule == "setting":
-        return Verdict(SETTING, False)
-    return Verdict(INPUT, False) if row.rule == "input" and simulated else None
+def _judge_by_rule(row: Row, printed: Any, ours: Any, *, simulated: bool) -> Verdict:
+    path = str(row.ours)
+    match row.rule:
+        case "view":
+            return Verdict(NONE)
+        case "gain" | "slight" | "plateau":
+            return _judge_difference(row.rule, path, mean_of(printed), ours)
+        case "at_most" | "at_least" | "positive":
+            limit = 0.0 if row.rule == "positive" else mean_of(printed)
+            assert limit is not None, "a row that is judged by a limit prints one"
+            return _judge_limit(row.rule, limit, ours if isinstance(ours, Mapping) else {"mean": float(ours)})
+        case "each":
+            return _judge_each(ours)
+        case "finding":
+            reason = f". {ours['why'].rstrip('.')}" if "why" in ours else ""
+            sentence = f"over these trainings: {ours['of_trainings']}{reason}"
+            return Verdict(sentence, ours["verdict"] == NO, ours["verdict"])
+        case _:
+            return _judge_number(path, printed, ours, target=row.rule == "target" and simulated)
 
 
 def mean_of(value: Any) -> float | None:
@@ -104,111 +110,81 @@ def mean_of(value: Any) -> float | None:
     return float(value) if isinstance(value, int | float) else None
 
 
-def _judge_difference(row: Row, printed: Any, ours: Stat, _: bool) -> Verdict:
-    """Judge a paired difference by its interval over boards, and say whether the paper's difference is inside it."""
-    if row.rule == "gain":
-        word = verdict(gain(ours, str(row.ours).rsplit(".", 1)[-1]))
-        side = {YES: "is wholly on the claim's side of 0", NO: "is wholly on the other side of 0"}
-        said = side.get(word, "includes 0")
+def _judge_difference(rule: str, path: str, printed: float | None, ours: Stat) -> Verdict:
+    """Judge a paired difference by its interval, and say whether the interval includes the paper's difference."""
+    if rule == "gain":
+        better = gain(ours, path.rsplit(".", 1)[-1])
+        word = inference.verdict(better)
+        words = {YES: "lies on the claimed side of 0", NO: "lies on the other side of 0", INCONCLUSIVE: "includes 0"}
+        alone = f"; ours {words[YES if better['mean'] > 0 else NO]}"
     else:
-        limit = FEW_POINTS if row.rule == "slight" else PLATEAU_POINTS
-        word = verdict_within(ours, limit)
-        side = {YES: f"is within ±{limit:g} points", NO: f"is beyond ±{limit:g} points"}
-        said = side.get(word, f"includes a limit of ±{limit:g} points")
-    sentence = f"one board: no interval{_way(row, ours)}" if word == ONE_BOARD else f"{_interval(ours)} {said}"
-    return Verdict(sentence + _inside(ours, mean_of(printed)), word == NO, word)
+        limit = FEW_POINTS if rule == "slight" else PLATEAU_POINTS
+        word = inference.verdict_within(ours, limit)
+        words = {YES: "is within", NO: "is beyond", INCONCLUSIVE: "includes a limit of"}
+        words = {key: f"{text} ±{limit:g} points" for key, text in words.items()}
+        alone = ""
+    sentence = f"one board: no interval{alone}" if word == ONE_BOARD else f"{_interval(ours)} {words[word]}"
+    return Verdict(sentence + _including(ours, printed), word == NO, word)
 
 
-def _judge_limit(row: Row, printed: Any, ours: Any, _: bool) -> Verdict:
-    """Judge whether a number is beyond a limit; one that has no interval over boards says so of its one board."""
-    stat: Stat = ours if isinstance(ours, Mapping) else {"mean": float(ours)}
-    limit = 0.0 if row.rule == "positive" else _printed(printed)
-    word = verdict(negated(stat), above=-limit) if row.rule == "at_most" else verdict(stat, above=limit)
-    at_limit = row.rule != "positive" and stat["mean"] == limit
-    beyond = stat["mean"] < limit if row.rule == "at_most" else stat["mean"] > limit
-    words = {"at_most": f"at most {limit:g}", "at_least": f"at least {limit:g}", "positive": "above 0"}[row.rule]
-    sentence = f"ours is {'' if beyond or at_limit else 'not '}{words}"
+def _judge_limit(rule: str, limit: float, ours: Stat) -> Verdict:
+    """Judge whether a number is beyond a limit (the paper's, or 0)."""
+    at_most = rule == "at_most"
+    word = inference.verdict(negated(ours), above=-limit) if at_most else inference.verdict(ours, above=limit)
+    mean = ours["mean"]
+    holds = {"at_most": mean <= limit, "at_least": mean >= limit, "positive": mean > 0}[rule]
+    words = "above 0" if rule == "positive" else f"{rule.replace('_', ' ')} {limit:g}"
+    sentence = f"ours is {'' if holds else 'not '}{words}"
     if word == INCONCLUSIVE:
-        sentence += f"; {_interval(stat)} includes {limit:g}"
-    return Verdict(sentence, not (beyond or at_limit), word)
+        sentence += f"; {_interval(ours)} includes {limit:g}"
+    return Verdict(sentence, not holds, word)
 
 
-def _printed(printed: Any) -> float:
-    value = mean_of(printed)
-    assert value is not None, "a row that is judged by a limit prints one"
-    return value
-
-
-def _judge_each(_: Row, __: Any, contrasts: Sequence[Mapping[str, Any]], ___: bool) -> Verdict:
+def _judge_each(contrasts: Sequence[Mapping[str, Any]]) -> Verdict:
     """Judge a claim that is to hold at every number of training skins, by accuracy."""
-    words = {one["skins_n"]: verdict(one["accuracy_pct"]) for one in contrasts}
-    by_word = {word: [str(n) for n, own in words.items() if own == word] for word in dict.fromkeys(words.values())}
-    sentence = "; ".join(f"{word} with {', '.join(counts)}" for word, counts in by_word.items()) + " training skins"
-    judged = all_of(list(words.values()))
-    return Verdict(sentence, judged == NO, judged)
+    words = {row["skins_n"]: inference.verdict(row["accuracy_pct"]) for row in contrasts}
+    counts = {word: ", ".join(str(n) for n in words if words[n] == word) for word in words.values()}
+    sentence = "; ".join(f"{word} with {ns}" for word, ns in counts.items()) + " training skins"
+    word = inference.all_of(list(words.values()))
+    return Verdict(sentence, word == NO, word)
 
 
-def _judge_finding(_: Row, __: Any, found: Mapping[str, Any], ___: bool) -> Verdict:
-    """Pass on what was judged where it was found, over boards and over trainings on these boards."""
-    sentence = f"of these trainings: {found['of_trainings']}"
-    sentence += f". {found['why'].rstrip('.')}" if "why" in found else ""
-    return Verdict(sentence, found["verdict"] == NO, found["verdict"])
+def _judge_number(path: str, printed: Any, ours: Any, *, target: bool) -> Verdict:
+    """Say how far our number is from the paper's, and whether the simulation was calibrated by it."""
+    value, mean = mean_of(ours), mean_of(printed)
+    if value is None or mean is None:
+        return Verdict(NONE)
+    tolerance = printed[1] if isinstance(printed, tuple) else NEAR * abs(mean)
+    near = abs(value - mean) <= tolerance
+    sentence = "the same"
+    if value != mean:
+        yard = "one sd of the paper's" if isinstance(printed, tuple) else f"{100 * NEAR:g} % of the paper's"
+        sentence = f"ours is {_distance(path, value, mean)}; {'within' if near else 'outside'} {yard}"
+    sentence += _including(ours, mean)
+    return Verdict(f"{TARGET}; {sentence}") if target else Verdict(sentence, not near)
 
 
-def _judge_number(row: Row, printed: Any, ours: Any, simulated: bool) -> Verdict:
-    """Say how far our number is from the paper's, and whether it was set by it."""
-    value = mean_of(ours)
-    if value is None or printed is None:
-        return Verdict("–")
-    near = _judge_near(value, printed, str(row.ours))
-    sentence = near.sentence + _inside(ours, mean_of(printed))
-    if row.rule == "target" and simulated:
-        return Verdict(f"{TARGET}; {sentence}", False)
-    return Verdict(sentence, near.differs)
-
-
-def _judge_near(ours: float, printed: Any, path: str) -> Verdict:
-    mean, sd = printed if isinstance(printed, tuple) else (printed, None)
-    gap = ours - mean
-    reach = NEAR * abs(mean) if sd is None else sd
+def _distance(path: str, ours: float, printed: float) -> str:
+    """Write how far ours is from the paper's: in points of accuracy, else relative; of scores whether it is better."""
+    accuracy, gap = "accuracy" in path, ours - printed
     side = "higher" if gap > 0 else "lower"
-    percent = "accuracy" in path
-    size = f"{abs(gap):.2g} points {side}" if percent else f"{100 * abs(gap / mean):.2g} % {side}"
-    if not percent and ours >= 2 * mean:
-        size = f"{ours / mean:{'.2g' if ours < 100 * mean else '.0f'}} times the paper's"
-    good = {True: " (better)", False: " (worse)"}
-    word = good[(gap > 0) == percent] if percent or ".mse_" in f".{path}" else ""
-    within = "within" if abs(gap) <= reach else "outside"
-    yard = f"{100 * NEAR:g} % of the paper's" if sd is None else "one sd of the paper's"
-    if gap == 0:
-        return Verdict("the same", False)
-    return Verdict(f"ours is {size}{word}; {within} {yard}", within == "outside")
+    if accuracy:
+        size = f"{abs(gap):.2g} points {side}"
+    elif ours >= 2 * printed:
+        size = f"{ours / printed:{'.2g' if ours < 100 * printed else '.0f'}} times the paper's"
+    else:
+        size = f"{100 * abs(gap / printed):.2g} % {side}"
+    better = (gap > 0) == accuracy
+    return size + (f" ({'better' if better else 'worse'})" if accuracy or ".mse_" in f".{path}" else "")
 
 
-def _inside(ours: Any, printed: float | None) -> str:
-    """Say whether the paper's number lies in our interval over boards, where there is one."""
+def _including(ours: Any, printed: float | None) -> str:
+    """Say whether our interval over boards includes the paper's number, where there is one."""
     if printed is None or not isinstance(ours, Mapping) or "ci95" not in ours:
         return ""
     low, high = ours["ci95"]
-    return f"; the paper's {'is inside' if low <= printed <= high else 'is outside'} our 95 % interval"
+    return f"; our 95 % interval {'includes' if low <= printed <= high else 'excludes'} the paper's"
 
 
 def _interval(stat: Stat) -> str:
     return f"the 95 % interval over {stat['n']} boards"
-
-
-def _way(row: Row, ours: Stat) -> str:
-    if row.rule != "gain":
-        return ""
-    better = gain(ours, str(row.ours).rsplit(".", 1)[-1])["mean"] > 0
-    return f"; ours is {'on the claim' if better else 'not on the claim'}'s side of 0"
-
-
-_JUDGED_BY: dict[str, Callable[[Row, Any, Any, bool], Verdict]] = {
-    **dict.fromkeys(("near", "input", "target"), _judge_number),
-    **dict.fromkeys(("at_most", "at_least", "positive"), _judge_limit),
-    **dict.fromkeys(DIFFERENCES, _judge_difference),
-    "each": _judge_each,
-    "finding": _judge_finding,
-    "view": lambda *_: Verdict("–"),
-}

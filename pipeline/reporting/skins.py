@@ -1,9 +1,6 @@
-"""What skins look like, scene beside scene: descriptions -> one table. Sees numbers, never readings.
+"""Descriptions of skins, scene beside scene -> one table. Sees numbers, never readings."""
 
-Simulated and recorded skins stand in columns of their own, each of which says what it is.
-"""
-
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -26,31 +23,29 @@ QUANTITIES = {
     "force_median_N": "force, median, N",
     "force_max_N": "force, largest, N",
 }
-ALIKE = 2.0  # a factor within which skins of different make count as alike
+ALIKE = 2.0  # assumed: means within this factor count as alike
 MEANING = (
     "Mean over skins [least … most] (number of skins); a change of field is the length of the vector of all channels, "
-    "the median over readings within 20 % of the force. – : too few readings tell."
+    "the median over readings within 20 % of the force. – : too few readings."
 )
 COMPARED = f" Alike: the means are within a factor of {ALIKE:g} of a recorded one."
 
 
 def skins_table(columns: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
-    """Put descriptions side by side by title; with simulated and recorded ones, say where they are alike."""
+    """Put descriptions side by side by title; compare simulated with recorded ones where there are both."""
+    both = {described["source"] for described in columns.values()} == {"simulated", "recorded"}
     lines = []
     for name, title in QUANTITIES.items():
         values = {column: described["over_skins"].get(name) for column, described in columns.items()}
         if not any(values.values()):
             continue
         line = {"quantity": title} | {column: _show(value) for column, value in values.items()}
-        sides = {
-            side: [v["mean"] for c, v in values.items() if v and columns[c]["source"] == side]
-            for side in ("simulated", "recorded")
-        }
-        if {described["source"] for described in columns.values()} == set(sides):
-            line["simulated against recorded"] = _compare(sides["simulated"], sides["recorded"])
+        if both:
+            means = [(columns[column]["source"], value["mean"]) for column, value in values.items() if value]
+            line["simulated against recorded"] = _compare(means)
         lines.append(line)
     table = pd.DataFrame(lines)
-    table.attrs["meaning"] = MEANING + (COMPARED if "simulated against recorded" in table else "")
+    table.attrs["meaning"] = MEANING + COMPARED * both
     return table
 
 
@@ -60,10 +55,11 @@ def _show(value: Mapping[str, float] | None) -> str:
     return f"{value['mean']:.3g} [{value['least']:.3g} … {value['most']:.3g}] ({value['n']})"
 
 
-def _compare(simulated: list[float], recorded: list[float]) -> str:
-    if not simulated or not recorded:
+def _compare(means: Sequence[tuple[str, float]]) -> str:
+    """Compare simulated with recorded means by the ratio that is nearest to 1."""
+    ratios = [a / b for side, a in means if side == "simulated" for of, b in means if of == "recorded"]
+    if not ratios:
         return "–"
-    ratios = [one / other for one in simulated for other in recorded]
     nearest = min(ratios, key=lambda ratio: abs(np.log(ratio)))
     if 1 / ALIKE <= nearest <= ALIKE:
         return "alike"

@@ -9,9 +9,9 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+from jaxtyping import Float
 
 from pipeline.reporting.figures import STYLE, svg
-from pipeline.reporting.placing import place_labels
 from pipeline.reporting.work_precision import COLOURS, MARKERS, front
 
 LETTER = np.array([0.016, 0.04])  # width and height of a letter of a label, in parts of the axes
@@ -19,6 +19,7 @@ MARK = np.array([0.026, 0.04])
 LOWER_LEFT = np.array([-1.0, -1.0])  # of a member of the front no point stands there
 LEFT = np.array([-1.0, 0.0])
 ROOM = 1.6  # factor beyond the outermost points on a logarithmic axis
+STEP = 0.01  # between places of labels, of the width and height of the axes
 
 
 @dataclass(frozen=True)
@@ -120,3 +121,25 @@ def look_of(i: int) -> dict[str, Any]:
     """A colour and a marker for each of the first 49 methods, no two alike."""
     marker = MARKERS[(i + i // len(COLOURS)) % len(MARKERS)]
     return {"color": COLOURS[i % len(COLOURS)], "marker": marker, "markersize": 6}
+
+
+def place_labels(
+    points: Float[np.ndarray, "b 2"],
+    wished: Float[np.ndarray, "o 2"],
+    *,
+    label: Float[np.ndarray, "2"],
+    mark: Float[np.ndarray, "2"],
+) -> Float[np.ndarray, "o 2"]:
+    """Give each label, in order, the free place nearest to where it is wished (middle of the label).
+
+    All in parts of the width and height of the axes; `label` and `mark` are the sizes of a label and of a point's mark.
+    """
+    sides = [np.arange(size / 2, 1 - size / 2, STEP) for size in label]
+    candidates = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 2)
+    free = ~(np.abs(candidates[:, None] - points) < (label + mark) / 2).all(axis=2).any(axis=1)
+    placed = np.empty_like(wished)
+    for i, wish in enumerate(wished):
+        distance = np.linalg.norm((candidates - wish) / label, axis=1)
+        placed[i] = candidates[np.argmin(np.where(free, distance, np.inf))]
+        free &= ~(np.abs(candidates - placed[i]) < label).all(axis=1)
+    return placed

@@ -4,10 +4,10 @@ Same rows and seconds, same bytes. Refuses to know how errors were found, and pa
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from math import ceil
 from textwrap import fill
-from typing import Any
+from typing import Any, TypeVar
 
 import matplotlib as mpl
 import pandas as pd
@@ -27,6 +27,8 @@ COMPUTED = (
     "finished before are reused."
 )
 CAPTION_LETTERS = 48  # in the width of a panel, and in that of the legend
+STUDIES = ("quadratures", "integrators")
+Kind = TypeVar("Kind", Precision, Seconds)
 
 
 @dataclass(frozen=True)
@@ -41,28 +43,28 @@ class Words:
 
 
 def pages(numbers: Mapping[str, Any], *, source: str) -> dict[str, str]:
-    """Draw and tabulate the studies that were asked for: text by file name; nothing where nothing was timed here."""
-    texts: dict[str, str] = {}
-    for study in (name for name in ("quadratures", "integrators") if name in numbers):
-        rows = [Precision(**{name: row[name] for name in Precision.__dataclass_fields__}) for row in numbers[study]]
-        timed = [row for row in numbers[study] if "median_s" in row]
-        seconds = [Seconds(**{name: row[name] for name in Seconds.__dataclass_fields__}) for row in timed]
-        if not seconds:
-            continue
-        if study == "quadratures":
-            drawn = quadratures(rows, seconds, Choice(**numbers["choice"]), source=source)
-        else:
-            drawn = integrators(rows, seconds)
-        texts[f"{study}.svg"] = drawn
-    return texts | {f"{name}.md": to_markdown(one) for name, one in cost_tables(numbers, source).items()}
+    """Draw and tabulate the studies that were done: text by file name; nothing where nothing was timed here."""
+    tables = cost_tables(numbers, source)
+    texts = {f"{name}.md": to_markdown(costs_table) for name, costs_table in tables.items()}
+    for study in STUDIES:
+        if study in tables:
+            rows = [_of(Precision, row) for row in numbers[study]]
+            seconds = [_of(Seconds, row) for row in numbers[study] if "median_s" in row]
+            if study == "quadratures":
+                texts["quadratures.svg"] = quadratures(rows, seconds, Choice(**numbers["choice"]), source=source)
+            else:
+                texts["integrators.svg"] = integrators(rows, seconds)
+    return texts
+
+
+def _of(kind: type[Kind], row: Mapping[str, Any]) -> Kind:
+    return kind(**{part.name: row[part.name] for part in fields(kind)})
 
 
 def cost_tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     """Tabulate what stages cost, and the studies of which something was timed here, by name."""
-    studies = [
-        name for name in ("quadratures", "integrators") if any("median_s" in row for row in numbers.get(name, []))
-    ]
-    return {name: table(numbers[name], source) for name in studies} | {"stages": costs(numbers["stages"])}
+    timed = [name for name in STUDIES if any("median_s" in row for row in numbers.get(name, []))]
+    return {name: table(numbers[name], source) for name in timed} | {"stages": costs(numbers["stages"])}
 
 
 def costs(stages: Mapping[str, Mapping[str, float]]) -> pd.DataFrame:
@@ -70,13 +72,13 @@ def costs(stages: Mapping[str, Mapping[str, float]]) -> pd.DataFrame:
     rows = [
         {
             "stage": name,
-            "computed, s": f"{one['computed_s']:.1f}",
-            "last run, s": f"{one['seconds']:.1f}",
-            "trainings": str(one["trainings_n"]),
-            "of them reused": str(one["reused_n"]),
-            "peak memory of a process, MB": f"{one['peak_process_memory_MB']:.0f}",
+            "computed, s": f"{cost['computed_s']:.1f}",
+            "last run, s": f"{cost['seconds']:.1f}",
+            "trainings": str(cost["trainings_n"]),
+            "of them reused": str(cost["reused_n"]),
+            "peak memory of a process, MB": f"{cost['peak_process_memory_MB']:.0f}",
         }
-        for name, one in stages.items()
+        for name, cost in stages.items()
     ]
     return tabulate(rows, meaning=COMPUTED)
 
@@ -101,13 +103,13 @@ def table(rows: Sequence[Mapping[str, Any]], source: str) -> pd.DataFrame:
 def quadratures(rows: Sequence[Precision], seconds: Sequence[Seconds], choice: Choice, *, source: str) -> str:
     """Draw the study of quadratures, with its limit, the rule to be chosen and the one in use."""
     study = rows[0].study
-    asked = {"cheapest below it": choice.setting, "in use": choice.used_setting if choice.used_error else None}
+    ringed = {"cheapest below it": choice.setting, "in use": choice.used_setting if choice.used_error else None}
     words = Words(
         title=f"Error of dB against run time ({source})",
         error="rms error / rms dB, worst skin and depth",
         note="Kernel alone and magpylib: the field only, their nodes were moved before. All else: flow and field.",
         limit=ERROR_MAX,
-        rings={f"{what}: {setting}": (study, CANDIDATES, setting) for what, setting in asked.items() if setting},
+        rings={f"{what}: {setting}": (study, CANDIDATES, setting) for what, setting in ringed.items() if setting},
     )
     return draw(rows, seconds, words)
 
@@ -170,18 +172,18 @@ def front(points: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
 
 
 def _points_ms(rows: Sequence[Precision], seconds: Sequence[Seconds]) -> dict[Key, tuple[float, float]]:
-    times_ms = {one.key: 1e3 * one.median_s for one in seconds}
+    times_ms = {time.key: 1e3 * time.median_s for time in seconds}
     timed = [row for row in rows if row.error is not None and row.method != REFERENCE]
     return {row.key: (times_ms[row.key], max(row.error or 0.0, LOWEST)) for row in timed}
 
 
 def _lines(axes: Any, points: Mapping[Key, tuple[float, float]], methods: Sequence[str]) -> None:
     for i, method in enumerate(methods):
-        own = [point for key, point in points.items() if key[1] == method]
-        if own:
+        of_method = [point for key, point in points.items() if key[1] == method]
+        if of_method:
             colour, marker = COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)]
-            axes.plot(*zip(*own, strict=True), marker, color=colour, markersize=4.5, label=method)
-            axes.plot(*zip(*front(own), strict=True), color=colour, linewidth=1)
+            axes.plot(*zip(*of_method, strict=True), marker, color=colour, markersize=4.5, label=method)
+            axes.plot(*zip(*front(of_method), strict=True), color=colour, linewidth=1)
 
 
 def _marks(

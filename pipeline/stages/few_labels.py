@@ -11,10 +11,10 @@ from pipeline.core.stage import run, say
 from pipeline.evaluation.summary import score_groups
 from pipeline.learning import few_labels as few
 from pipeline.learning.baselines import run_tasks
-from pipeline.learning.card import went
-from pipeline.learning.comparison import FewLabels
-from pipeline.learning.comparison import few_labels as few_labels_of
+from pipeline.learning.card import collapse_record
 from pipeline.learning.executors import make_executor
+from pipeline.learning.few_labels import FewLabels
+from pipeline.learning.few_labels import few_labels as few_labels_of
 from pipeline.learning.trial import Measured
 from pipeline.trials.data import SceneData, read_data, train_all
 
@@ -34,7 +34,7 @@ def few_labels(scene: str, files: Files, indentations: Path, folds: Path, scores
         pairs = step(study, done)
         trained = train_all(data, [trial for _, trial in pairs], "few_labels")
         done = [*done, *((tried, trial, one) for (tried, trial), one in zip(pairs, trained, strict=True))]
-    points = [_point(data, tried, one.predicted) | went(one) for tried, _, one in done]
+    points = [_point(data, tried, one.predicted) | collapse_record(one) for tried, _, one in done]
     tasks = few.classical(study)
     rows = Measured(data.rows.db_uT, data.rows.target, data.rows.skin)
     with make_executor() as executor:

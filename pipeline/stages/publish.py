@@ -4,7 +4,7 @@ from pathlib import Path
 
 from pipeline.core import io
 from pipeline.core.config import Files, read_settings
-from pipeline.core.home import home, is_experiment
+from pipeline.core.provenance import home, is_experiment
 from pipeline.core.server import TrackingAway
 from pipeline.core.stage import run, say
 from pipeline.params import Asking

@@ -2,15 +2,14 @@
 
 from pathlib import Path
 
-from pipeline.capture.folder import write_capture
+from pipeline.capture.header import write_capture
 from pipeline.core import io
 from pipeline.core.config import Files, read_settings
 from pipeline.core.errors import ParamsError
 from pipeline.core.stage import run, say
 from pipeline.learning.executors import make_executor
-from pipeline.synthesis.capture import Synthesis, record, roster
-from pipeline.synthesis.files import to_files
-from pipeline.synthesis.of_settings import synthesis_of
+from pipeline.synthesis.capture import record, roster, to_files
+from pipeline.synthesis.settings import Synthesis, synthesis_of
 
 
 def simulate(scene: str, files: Files, protocol: str, raw: Path) -> None:

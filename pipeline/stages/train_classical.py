@@ -9,8 +9,7 @@ from pipeline.core.config import Files, Settings, read_settings
 from pipeline.core.provenance import SECONDS
 from pipeline.core.stage import run, say
 from pipeline.evaluation.summary import score_groups
-from pipeline.learning.baselines import Task, run_tasks
-from pipeline.learning.comparison import Baselines, baselines
+from pipeline.learning.baselines import Baselines, Task, baselines, run_tasks
 from pipeline.learning.executors import make_executor
 from pipeline.learning.trial import Measured
 from pipeline.trials.data import read_data
@@ -45,8 +44,9 @@ def train_classical(scene: str, files: Files, indentations: Path, folds: Path, s
     points = []
     for (fold, name), task, one in zip(pairs, tasks, done, strict=True):
         true, board, skin = (values[fold.test] for values in (rows.target, rows.board, rows.skin))
-        words = {"name": name, "method": task.asked.words, "inputs": task.asked.inputs, "fold": fold.name, "seed_i": 0}
-        points.append(words | {"rows_n": one.rows_n, "scores": score_groups(true, one.predicted, board, skin)})
+        method = {"name": name, "method": task.method.title, "inputs": task.method.inputs}
+        scored = {"rows_n": one.rows_n, "scores": score_groups(true, one.predicted, board, skin)}
+        points.append(method | {"fold": fold.name, "seed_i": 0} | scored)
     io.write_json(scores, points)
     took = [
         {"name": task.name, "train_s": one.seconds, "one_reading_s": one.one_reading_s}

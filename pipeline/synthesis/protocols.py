@@ -1,49 +1,66 @@
-"""Where the tip goes, in what order: grid, drag lines, hand. In: a section of a scene. Out: a `Plan` of stops.
+"""Protocols: where the tip goes, in what order. In: a section of a scene. Out: a `Plan` of stops.
 
-Places are labels: mm from 0 to 16, the middle of the skin at (8, 8). A stop is a place and a depth at which readings
-are taken; an indentation is one stop, or the many of a dragged line. Refuses to know robots' errors, clocks and fields.
+Places are labels: mm from 0 to 16 on the paper's grid, or from the skin's corner. Refuses to know robots' errors,
+clocks and fields.
 """
 
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
+from jaxtyping import Float64, Int32
 from pydantic import Field, model_validator
 
+from pipeline.core.config import Strict
+from pipeline.core.errors import ParamsError
 from pipeline.dataset.grid import CENTRE_MM, PITCH_MM, SIDE_POINTS_N, protocol
 from pipeline.synthesis import pressing
-from pipeline.synthesis.plans import Count, Depth_mm, Duration_s, Plan, Rate_hz, Shared
-from pipeline.synthesis.scattering import Scatter, scatter
+
+SKIN_MM = (20.0, 20.0)  # authors' CAD
+Count = Annotated[int, Field(ge=1, le=100_000)]
+Depth_mm = Annotated[float, Field(gt=0, le=10)]
+Depths_mm = Annotated[tuple[Depth_mm, ...], Field(min_length=1)]
+Duration_s = Annotated[float, Field(gt=0, le=100)]
+Rate_hz = Annotated[float, Field(gt=0, le=1e4)]
+Sides_mm = tuple[float, float]
 
 
-class Grid(Shared):
-    """The paper's grid: 65 places, depth by depth, pass by pass (section 3)."""
+@dataclass(frozen=True)
+class Plan:
+    """Stops in order of time: a stop is a place and a depth at which readings are taken, an indentation has p of them.
 
-    kind: Literal["grid"]
-    passes_n: Count
-    depths_mm: Annotated[tuple[Depth_mm, ...], Field(min_length=1)]
+    A depth below zero is a stop above the skin; where a weight is commanded, the depth is unknown: NaN. `tilt` is the
+    lean of the stylus, x and y over z. `centre_mm` is the label of the skin's middle.
+    """
+
+    pass_i: Int32[np.ndarray, " n"]
+    x_mm: Float64[np.ndarray, "n p"]
+    y_mm: Float64[np.ndarray, "n p"]
+    depth_mm: Float64[np.ndarray, "n p"]
+    tilt: Float64[np.ndarray, "n 2"]
+    description: str
+    labelled: bool = True  # whether places, depths and forces are recorded
+    weight_N: Float64[np.ndarray, "n p"] | None = None
+    centre_mm: tuple[float, float] = (CENTRE_MM, CENTRE_MM)
+
+    def __len__(self) -> int:
+        return len(self.pass_i)
 
 
-class Drag(Shared):
-    """Drag lines every 2 mm, along x and along y, over the whole grid (section 4, shear)."""
+class Shared(Strict):
+    """Settings that all protocols have."""
 
-    kind: Literal["drag"]
-    passes_n: Count
-    depths_mm: Annotated[tuple[Depth_mm, ...], Field(min_length=1)]
-    step_mm: Annotated[float, Field(gt=0, le=4)]  # between stops
+    boards: str  # the kind of board, one of `boards` of the scene
+    skins_n: Count  # the first skin of each board before the second of any
+    terms: tuple[Literal["ageing", "friction", "relaxation", "temperature"], ...]  # physics that it needs (PHYSICS 8)
+    rate_hz: Rate_hz | None = None  # the rig's unless given: more chips take longer
 
 
-class Hand(Shared):
-    """Pokes by hand along lines: only their order is known, not their place, depth or force (section 5.2)."""
-
-    kind: Literal["hand"]
-    lines_n: Count
-    pokes_per_line_n: Annotated[int, Field(ge=2, le=1000)]
-    depth_mm: tuple[Depth_mm, Depth_mm]  # from, to: anything between them
-    place_sd_mm: Annotated[float, Field(ge=0, le=2)]  # off the line, and along it
-    tilt_sd_deg: Annotated[float, Field(ge=0, le=20)]  # of the stylus, about each axis
+class _Poked(Shared):
+    depth_mm: tuple[Depth_mm, Depth_mm]  # uniform between these
 
     @model_validator(mode="after")
-    def _depths_rise(self) -> "Hand":
+    def _depths_rise(self) -> "_Poked":
         if not self.depth_mm[0] <= self.depth_mm[1]:
             raise ValueError(f"depth_mm goes from the shallower to the deeper, not {self.depth_mm}")
         return self
@@ -59,6 +76,99 @@ class _Pressed(Shared):
             if isinstance(value, tuple) and len(value) == 2 and value[0] > value[1]:
                 raise ValueError(f"{name} goes from the lower to the higher, not {value}")
         return self
+
+
+class Grid(Shared):
+    """The paper's grid: 65 places, depth by depth, pass by pass (section 3)."""
+
+    kind: Literal["grid"]
+    passes_n: Count
+    depths_mm: Depths_mm
+
+    def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
+        """Poke every place at every depth, in every pass."""
+        pokes = protocol(self.depths_mm, self.passes_n)
+        stops = pressing.Stops(pokes.x_mm[:, None], pokes.y_mm[:, None], pokes.depth_mm[:, None])
+        return _upright(stops, f"65-point grid, {len(self.depths_mm)} depths, {self.passes_n} passes", pokes.pass_i)
+
+
+class Drag(Shared):
+    """Drag lines every 2 mm, along x and along y, over the whole grid (section 4, shear)."""
+
+    kind: Literal["drag"]
+    passes_n: Count
+    depths_mm: Depths_mm
+    step_mm: Annotated[float, Field(gt=0, le=4)]  # between stops
+
+    def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
+        """Drag in a snake: each next line the other way, along x on every row, then along y on every column."""
+        stops_n = round(2 * CENTRE_MM / self.step_mm) + 1
+        along_mm = np.linspace(0, 2 * CENTRE_MM, stops_n)
+        there = np.where((np.arange(SIDE_POINTS_N) % 2 == 0)[:, None], along_mm, along_mm[::-1])
+        across_mm = np.repeat(PITCH_MM * np.arange(SIDE_POINTS_N)[:, None], stops_n, axis=1)
+        lines_n, depths_n = 2 * SIDE_POINTS_N, len(self.depths_mm)
+        x_mm = np.tile(np.concatenate([there, across_mm]), (depths_n, 1))
+        y_mm = np.tile(np.concatenate([across_mm, there]), (depths_n, 1))
+        # Every second pass goes back along the lines, or where the tip is would tell which way it is pushed.
+        turned = [slice(None, None, -1 if pass_i % 2 else 1) for pass_i in range(self.passes_n)]
+        depth_mm = np.tile(np.repeat(np.array(self.depths_mm), lines_n), self.passes_n)
+        stops = pressing.Stops(
+            np.concatenate([x_mm[:, way] for way in turned]),
+            np.concatenate([y_mm[:, way] for way in turned]),
+            np.repeat(depth_mm[:, None], stops_n, axis=1),
+        )
+        description = f"drag lines every {PITCH_MM:g} mm, {depths_n} depths, {self.passes_n} passes, "
+        description += f"stops every {2 * CENTRE_MM / (stops_n - 1):g} mm"
+        pass_i = np.repeat(np.arange(self.passes_n, dtype=np.int32), depths_n * lines_n)
+        return _upright(stops, description, pass_i)
+
+
+class Hand(_Poked):
+    """Pokes by hand along lines: only their order is known, not their place, depth or force (section 5.2)."""
+
+    kind: Literal["hand"]
+    lines_n: Count
+    pokes_per_line_n: Annotated[int, Field(ge=2, le=1000)]
+    place_sd_mm: Annotated[float, Field(ge=0, le=2)]  # off the line, and along it
+    tilt_sd_deg: Annotated[float, Field(ge=0, le=20)]  # of the stylus, about each axis
+
+    def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
+        """Poke along lines side by side over the grid; the pass counts lines."""
+        across_mm = np.linspace(0, 2 * CENTRE_MM, self.lines_n) if self.lines_n > 1 else np.array([CENTRE_MM])
+        along_mm = np.linspace(0, 2 * CENTRE_MM, self.pokes_per_line_n)
+        pokes_n = self.lines_n * self.pokes_per_line_n
+        place_mm = np.stack([np.tile(along_mm, self.lines_n), np.repeat(across_mm, self.pokes_per_line_n)], axis=1)
+        place_mm = np.clip(place_mm + self.place_sd_mm * rng.standard_normal((pokes_n, 2)), 0, 2 * CENTRE_MM)
+        return Plan(
+            pass_i=np.repeat(np.arange(self.lines_n, dtype=np.int32), self.pokes_per_line_n),
+            x_mm=place_mm[:, :1],
+            y_mm=place_mm[:, 1:],
+            depth_mm=rng.uniform(*self.depth_mm, size=(pokes_n, 1)),
+            tilt=np.tan(np.radians(self.tilt_sd_deg) * rng.standard_normal((pokes_n, 2)).clip(-2, 2)),
+            description=f"by hand, {self.lines_n} lines of {self.pokes_per_line_n} pokes, order known only",
+            labelled=False,
+        )
+
+
+class Scatter(_Poked):
+    """Pokes anywhere on the skin, uniform (section 6, arm sleeve); labels in mm from the skin's corner."""
+
+    kind: Literal["scatter"]
+    pokes_n: Count
+    margin_mm: Annotated[float, Field(ge=0)]  # to every edge
+
+    def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
+        """Draw places and depths, uniform within the margin."""
+        if not 2 * self.margin_mm < min(skin_mm):
+            rule = f"less than half of the skin's shorter side, {min(skin_mm) / 2:g} mm"
+            raise ParamsError("protocol scatter", "margin_mm", rule, self.margin_mm, "Lower it.")
+        most_mm = np.array(skin_mm) - self.margin_mm
+        place_mm = rng.uniform(self.margin_mm, most_mm, size=(self.pokes_n, 2))
+        depth_mm = rng.uniform(*self.depth_mm, size=(self.pokes_n, 1))
+        description = f"{self.pokes_n} pokes scattered over {skin_mm[0]:g} x {skin_mm[1]:g} mm, "
+        description += f"{self.margin_mm:g} mm from its edges"
+        stops = pressing.Stops(place_mm[:, :1], place_mm[:, 1:], depth_mm)
+        return _upright(stops, description, centre_mm=(skin_mm[0] / 2, skin_mm[1] / 2))
 
 
 class Load(_Pressed):
@@ -77,15 +187,31 @@ class Load(_Pressed):
             raise ValueError(f"force_max_N is a whole number of step_N, not {steps:.4g}")
         return self
 
+    def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
+        """Fill the glass once in each pass; depths follow from the skin."""
+        weight_N = np.tile(pressing.weights_N(self.force_max_N, self.step_N), (self.passes_n, 1))
+        middle_mm = np.full(weight_N.shape, CENTRE_MM)
+        stops = pressing.Stops(middle_mm, middle_mm, np.full(weight_N.shape, np.nan))
+        description = f"{self.passes_n} fillings of a glass, to {self.force_max_N:g} N by {self.step_N:g} N"
+        return _upright(stops, description, np.arange(self.passes_n, dtype=np.int32), weight_N=weight_N)
+
 
 class Press(_Pressed):
     """Presses that never rest: each frame is a stop (section 7, dynamic data), so the frames' rate belongs to it."""
 
     kind: Literal["press"]
     presses_n: Count
-    duration_s: tuple[Duration_s, Duration_s]  # from, to: evenly in the logarithm
+    duration_s: tuple[Duration_s, Duration_s]  # log-uniform between these
     depth_mm: tuple[Depth_mm, Depth_mm]
     rate_hz: Rate_hz
+
+    def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
+        """Draw the presses."""
+        stops = pressing.presses(
+            self.presses_n, duration_s=self.duration_s, depth_mm=self.depth_mm, rate_hz=self.rate_hz, rng=rng
+        )
+        least_s, most_s = self.duration_s
+        return _upright(stops, f"{self.presses_n} presses of {least_s:g} to {most_s:g} s, read throughout")
 
 
 class Walk(_Pressed):
@@ -99,117 +225,27 @@ class Walk(_Pressed):
     depth_mm: tuple[Depth_mm, Depth_mm]
     rate_hz: Rate_hz
 
+    def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
+        """Draw the footfalls."""
+        sizes = {name: getattr(self, name) for name in ("stance_s", "swing_s", "depth_mm", "rate_hz")}
+        return _upright(pressing.footfalls(self.steps_n, **sizes, rng=rng), f"a walk of {self.steps_n} steps")
 
-SKIN_MM = (20.0, 20.0)  # authors' CAD
+
 Protocol = Annotated[Grid | Drag | Hand | Scatter | Load | Press | Walk, Field(discriminator="kind")]
 
 
-def make_plan(asked: Protocol, rng: np.random.Generator, *, skin_mm: tuple[float, float] = SKIN_MM) -> Plan:
-    """Lay out the stops of a protocol on a skin of these sides; grid, drag and load are not random."""
-    match asked:
-        case Grid():
-            return _grid(asked)
-        case Drag():
-            return _drag(asked)
-        case Hand():
-            return _hand(asked, rng)
-        case Scatter():
-            return scatter(asked, skin_mm, rng)
-        case Load():
-            return _load(asked)
-        case Press():
-            return _press(asked, rng)
-        case Walk():
-            return _walk(asked, rng)
-
-
-def _grid(asked: Grid) -> Plan:
-    pokes = protocol(asked.depths_mm, asked.passes_n)
-    return Plan(
-        pass_i=pokes.pass_i,
-        x_mm=pokes.x_mm[:, None],
-        y_mm=pokes.y_mm[:, None],
-        depth_mm=pokes.depth_mm[:, None],
-        tilt=np.zeros((len(pokes), 2)),
-        labelled=True,
-        words=f"65-point grid, {len(asked.depths_mm)} depths, {asked.passes_n} passes",
-    )
-
-
-def _drag(asked: Drag) -> Plan:
-    # Snake: each next line is dragged the other way, along x on every row, then along y on every column.
-    stops_n = round(2 * CENTRE_MM / asked.step_mm) + 1
-    along_mm = np.linspace(0, 2 * CENTRE_MM, stops_n)
-    there = np.where((np.arange(SIDE_POINTS_N) % 2 == 0)[:, None], along_mm, along_mm[::-1])
-    across_mm = np.repeat(PITCH_MM * np.arange(SIDE_POINTS_N)[:, None], stops_n, axis=1)
-    one_x_mm, one_y_mm = np.concatenate([there, across_mm]), np.concatenate([across_mm, there])
-    lines_n, depths_n = len(one_x_mm), len(asked.depths_mm)
-    x_mm, y_mm = (np.tile(one, (depths_n, 1)) for one in (one_x_mm, one_y_mm))
-    # Every second pass goes back along the lines, or where the tip is would tell which way it is pushed.
-    turned = [slice(None, None, -1 if pass_i % 2 else 1) for pass_i in range(asked.passes_n)]
-    depth_mm = np.tile(np.repeat(np.array(asked.depths_mm), lines_n), asked.passes_n)
-    return Plan(
-        pass_i=np.repeat(np.arange(asked.passes_n, dtype=np.int32), depths_n * lines_n),
-        x_mm=np.concatenate([x_mm[:, way] for way in turned]),
-        y_mm=np.concatenate([y_mm[:, way] for way in turned]),
-        depth_mm=np.repeat(depth_mm[:, None], stops_n, axis=1),
-        tilt=np.zeros((len(depth_mm), 2)),
-        labelled=True,
-        words=f"drag lines every {PITCH_MM:g} mm, {depths_n} depths, {asked.passes_n} passes, "
-        f"stops every {2 * CENTRE_MM / (stops_n - 1):g} mm",
-    )
-
-
-def _hand(asked: Hand, rng: np.random.Generator) -> Plan:
-    # Lines side by side over the grid; the pass counts lines, so that the order along one line is what is known.
-    across_mm = np.linspace(0, 2 * CENTRE_MM, asked.lines_n) if asked.lines_n > 1 else np.array([CENTRE_MM])
-    along_mm = np.linspace(0, 2 * CENTRE_MM, asked.pokes_per_line_n)
-    pokes_n = asked.lines_n * asked.pokes_per_line_n
-    place_mm = np.stack([np.tile(along_mm, asked.lines_n), np.repeat(across_mm, asked.pokes_per_line_n)], axis=1)
-    place_mm = np.clip(place_mm + asked.place_sd_mm * rng.standard_normal((pokes_n, 2)), 0, 2 * CENTRE_MM)
-    return Plan(
-        pass_i=np.repeat(np.arange(asked.lines_n, dtype=np.int32), asked.pokes_per_line_n),
-        x_mm=place_mm[:, :1],
-        y_mm=place_mm[:, 1:],
-        depth_mm=rng.uniform(*asked.depth_mm, size=(pokes_n, 1)),
-        tilt=np.tan(np.radians(asked.tilt_sd_deg) * rng.standard_normal((pokes_n, 2)).clip(-2, 2)),
-        labelled=False,
-        words=f"by hand, {asked.lines_n} lines of {asked.pokes_per_line_n} pokes, order known only",
-    )
-
-
-def _load(asked: Load) -> Plan:
-    weight_N = np.tile(pressing.weights_N(asked.force_max_N, asked.step_N), (asked.passes_n, 1))
-    middle_mm = np.full(weight_N.shape, CENTRE_MM)
-    return Plan(
-        pass_i=np.arange(asked.passes_n, dtype=np.int32),
-        x_mm=middle_mm,
-        y_mm=middle_mm,
-        depth_mm=np.full(weight_N.shape, np.nan),
-        tilt=np.zeros((asked.passes_n, 2)),
-        labelled=True,
-        words=f"{asked.passes_n} fillings of a glass, to {asked.force_max_N:g} N by {asked.step_N:g} N",
-        weight_N=weight_N,
-    )
-
-
-def _press(asked: Press, rng: np.random.Generator) -> Plan:
-    stops = pressing.presses(
-        asked.presses_n, duration_s=asked.duration_s, depth_mm=asked.depth_mm, rate_hz=asked.rate_hz, rng=rng
-    )
-    least_s, most_s = asked.duration_s
-    return _of_stops(stops, f"{asked.presses_n} presses of {least_s:g} to {most_s:g} s, read throughout")
-
-
-def _walk(asked: Walk, rng: np.random.Generator) -> Plan:
-    stops = pressing.footfalls(
-        asked.steps_n, stance_s=asked.stance_s, swing_s=asked.swing_s, depth_mm=asked.depth_mm, rate_hz=asked.rate_hz,
-        rng=rng,
-    )  # fmt: skip
-    return _of_stops(stops, f"a walk of {asked.steps_n} steps")
-
-
-def _of_stops(stops: pressing.Stops, words: str) -> Plan:
+def _upright(
+    stops: pressing.Stops,
+    description: str,
+    pass_i: Int32[np.ndarray, " n"] | None = None,
+    *,
+    weight_N: Float64[np.ndarray, "n p"] | None = None,
+    centre_mm: tuple[float, float] = (CENTRE_MM, CENTRE_MM),
+) -> Plan:
+    """Make the plan of a tip that does not lean; one pass unless given."""
     n = len(stops.depth_mm)
-    passes = np.zeros(n, np.int32)
-    return Plan(passes, stops.x_mm, stops.y_mm, stops.depth_mm, np.zeros((n, 2)), labelled=True, words=words)
+    passes = np.zeros(n, np.int32) if pass_i is None else pass_i
+    return Plan(
+        passes, stops.x_mm, stops.y_mm, stops.depth_mm, np.zeros((n, 2)), description, weight_N=weight_N,
+        centre_mm=centre_mm,
+    )  # fmt: skip

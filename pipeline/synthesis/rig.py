@@ -14,8 +14,7 @@ from pydantic import Field
 
 from pipeline.capture.probe import ProbeLog
 from pipeline.core.config import Strict
-from pipeline.synthesis.plans import Plan
-from pipeline.synthesis.protocols import Press, Protocol, Walk
+from pipeline.synthesis.protocols import Plan, Press, Protocol, Rate_hz, Walk
 
 Frames = Annotated[int, Field(ge=1, le=1000)]
 Spread = Annotated[float, Field(ge=0, le=1)]
@@ -28,7 +27,7 @@ class Rig(Strict):
     moving_frames_n: Annotated[int, Field(ge=0, le=1000)]  # on the way down, and as many on the way up
     settling_frames_n: Annotated[int, Field(ge=0, le=1000)]  # at rest, before each dwell
     readings_n: Frames
-    rate_hz: Annotated[float, Field(gt=0, le=1e4)]
+    rate_hz: Rate_hz
     robot_place_sd_mm: Spread  # each axis
     robot_depth_sd_mm: Annotated[float, Field(ge=0, le=0.2)]
     force_noise_N: Annotated[float, Field(ge=0, le=10)]
@@ -51,20 +50,20 @@ class Timeline:
         return len(self.stop_i)
 
 
-def suit(rig: Rig, asked: Protocol) -> Rig:
+def set_up(rig: Rig, protocol: Protocol) -> Rig:
     """Set the rig up for a protocol: its rate; a stop a frame where nothing rests; no robot, one clock in a walk."""
-    changes: dict[str, float] = {} if asked.rate_hz is None else {"rate_hz": asked.rate_hz}
-    if isinstance(asked, Press | Walk):
+    changes: dict[str, float] = {} if protocol.rate_hz is None else {"rate_hz": protocol.rate_hz}
+    if isinstance(protocol, Press | Walk):
         changes |= {"moving_frames_n": 0, "settling_frames_n": 0, "readings_n": 1}
-    if isinstance(asked, Walk):
-        exact = (
-            "robot_place_sd_mm",
-            "robot_depth_sd_mm",
-            "force_noise_N",
-            "probe_clock_offset_s",
-            "probe_clock_rate_error",
-        )
-        changes |= {"noload_frames_n": max(round(asked.quiet_s * asked.rate_hz), 1)} | dict.fromkeys(exact, 0.0)
+    if isinstance(protocol, Walk):
+        changes |= {
+            "noload_frames_n": max(round(protocol.quiet_s * protocol.rate_hz), 1),
+            "robot_place_sd_mm": 0.0,
+            "robot_depth_sd_mm": 0.0,
+            "force_noise_N": 0.0,
+            "probe_clock_offset_s": 0.0,
+            "probe_clock_rate_error": 0.0,
+        }
     return rig.model_copy(update=changes)
 
 
@@ -109,7 +108,7 @@ def draw_clock(rig: Rig, rng: np.random.Generator) -> tuple[float, float]:
     return float(offset_s), float(1 + error)
 
 
-def probe_log(plan: Plan, felt_N: Float[np.ndarray, "n d 3"], rig: Rig, clock: tuple[float, float]) -> ProbeLog:
+def probe_log(plan: Plan, read_N: Float[np.ndarray, "n d 3"], rig: Rig, clock: tuple[float, float]) -> ProbeLog:
     """Write what robot and force sensor log: for each indentation its no-load dwell, then its stops (d = 1 + p).
 
     A dwell runs from half a frame before its first frame to half a frame after its last. Above the skin there is none.
@@ -124,7 +123,7 @@ def probe_log(plan: Plan, felt_N: Float[np.ndarray, "n d 3"], rig: Rig, clock: t
     unknown = 0.0 if plan.labelled else np.nan
     depth_mm = np.hstack([np.zeros((len(plan), 1)), plan.depth_mm + unknown])
     places_mm = (np.hstack([one[:, :1], one]) + unknown for one in (plan.x_mm, plan.y_mm))
-    force_N = (felt_N + unknown).reshape(-1, 3)
+    force_N = (read_N + unknown).reshape(-1, 3)
     labels = [one.astype(np.float32).ravel() for one in (*places_mm, depth_mm, *force_N.T)]
     dwells = (
         np.repeat(np.arange(len(plan), dtype=np.int32), 1 + stops_n),

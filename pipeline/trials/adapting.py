@@ -11,8 +11,8 @@ from pipeline.core.errors import SchemaError
 from pipeline.core.seeds import rng_for
 from pipeline.dataset.lines import Lines, grid_lines, take_pokes
 from pipeline.dataset.splits import Fold
+from pipeline.learning.inputs import Scaler
 from pipeline.learning.recipe import Adaptation, training
-from pipeline.learning.standardise import Scaler
 from pipeline.learning.trial import Adapting, Start, Trial
 from pipeline.trials.data import SceneData
 

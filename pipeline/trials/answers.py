@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 
 from pipeline.dataset.splits import Fold
 from pipeline.evaluation.tally import tally
-from pipeline.learning.card import went
+from pipeline.learning.card import collapse_record
 from pipeline.learning.executors import device
 from pipeline.learning.inputs import VIEW
 from pipeline.learning.recipe import Adaptation, training
@@ -46,4 +46,4 @@ def answers_after(
         )
         for (arm, trial), one in zip(trials, trained, strict=True)
     ]
-    return answered, tally(map(went, trained))
+    return answered, tally(map(collapse_record, trained))

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from pipeline.core import io
 from pipeline.core.config import Settings
-from pipeline.core.home import home
-from pipeline.core.provenance import note_trainings
+from pipeline.core.provenance import home, note_trainings
 from pipeline.core.stage import COSTS, say
 from pipeline.dataset.folds import load_rows, parse_folds
 from pipeline.dataset.rows import Rows, Selection

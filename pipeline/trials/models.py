@@ -10,7 +10,7 @@ from pipeline.core import io
 from pipeline.core.provenance import SECONDS, code_version
 from pipeline.dataset.rows import TARGETS, Rows
 from pipeline.evaluation.summary import score_groups
-from pipeline.learning.card import describe, went
+from pipeline.learning.card import collapse_record, describe
 from pipeline.learning.trial import Trained, Trial
 from pipeline.trials.data import SceneData
 
@@ -41,7 +41,7 @@ def point_of(data: SceneData, trial: Trial, one: Trained, method: str) -> dict[s
     """Keep of a training in a sweep what its curve needs: no weights, no predictions."""
     card = card_of(data, trial, one)
     words = {name: card[name] for name in ("key", "question", "fold", "seed_i", "stopped_step", "git", "scores")}
-    return words | went(one) | {"method": method, "trained_on_skins_n": len(card["train_skins"])}
+    return words | collapse_record(one) | {"method": method, "trained_on_skins_n": len(card["train_skins"])}
 
 
 def note_seconds(scene: str, stage: str, trials: Sequence[Trial], trained: Sequence[Trained]) -> None:

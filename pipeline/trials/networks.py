@@ -2,8 +2,9 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float32
@@ -11,9 +12,11 @@ from jaxtyping import Float32
 from pipeline.core import io
 from pipeline.core.errors import SchemaError
 from pipeline.learning.executors import device
-from pipeline.learning.inputs import VIEW
+from pipeline.learning.inputs import VIEW, Scaler
 from pipeline.learning.recipe import HEADLINE
-from pipeline.learning.standardise import Scaler
+
+if TYPE_CHECKING:
+    from pipeline.learning.model import Predictor
 
 
 @dataclass(frozen=True)
@@ -25,12 +28,16 @@ class Network:
 
     def __call__(self, db_uT: Float32[np.ndarray, "f ch"]) -> Float32[np.ndarray, "f 3"]:
         """Answer for changes of field, row by row."""
+        scaler, view = Scaler.of_arrays(self.tensors), VIEW[self.card["recipe"]["inputs"]](db_uT)
+        return scaler.decode(self._predictor(scaler.encode(view)))
+
+    @cached_property
+    def _predictor(self) -> "Predictor":
+        """Put the network together once: a controller asks it for every frame."""
         from pipeline.learning.model import Predictor  # torch, late: only a stage that answers pays for it
 
-        scaler, recipe = Scaler.of_arrays(self.tensors), self.card["recipe"]
         weights = {name: values for name, values in self.tensors.items() if name.startswith("layer")}
-        view = VIEW[recipe["inputs"]](db_uT)
-        return scaler.decode(Predictor(weights, recipe["architecture"], device())(scaler.encode(view)))
+        return Predictor(weights, self.card["recipe"]["architecture"], device())
 
 
 def networks_without(models: Path, board: str, *, recipe: str = HEADLINE) -> list[Network]:

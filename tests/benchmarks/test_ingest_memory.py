@@ -16,7 +16,7 @@ from pipeline.capture.probe import LABELS, ProbeLog
 from pipeline.capture.wire import Frames, encode
 from pipeline.core import io
 from pipeline.core.seeds import rng_for
-from pipeline.dataset.native import read_native
+from pipeline.dataset.captures import read_native
 from tests.capture.headers import make_header
 
 INDENTATIONS_N = 1_000_000

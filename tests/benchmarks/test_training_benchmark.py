@@ -30,8 +30,7 @@ from pipeline.learning.feed import Feed
 from pipeline.learning.grid import STACK_N, run_trials
 from pipeline.learning.model import Stack
 from pipeline.learning.recipe import Recipe
-from pipeline.learning.stack import train_stack
-from pipeline.learning.train import Watch
+from pipeline.learning.train import Watch, train_stack
 from pipeline.learning.trial import Measured, Trial
 
 BOARDS_N, SKINS_PER_BOARD_N, SEEDS_N = 6, 3, 3

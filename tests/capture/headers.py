@@ -2,29 +2,11 @@
 
 from typing import Any
 
-from pipeline.capture.header import Clock, Header
+from pipeline.capture.header import Header, recorded
+
+LAB = {"board": "board1", "skin": "skin1", "layout": "lab", "chips_n": 5, "protocol": "", "note": ""}
 
 
 def make_header(**changed: Any) -> Header:
     """Make a header of a recorded lab capture with five chips; `changed` fields are checked like the rest."""
-    fields: dict[str, Any] = {
-        "format": "reskin-capture/1",
-        "capture": "a_capture",
-        "board": "board1",
-        "skin": "skin1",
-        "source": "recorded",
-        "layout": "lab",
-        "wire": None,
-        "chips_n": 5,
-        "unit_b": "uT",
-        "unit_force": "N",
-        "unit_place": "mm",
-        "firmware": None,
-        "clock": Clock(kind="recording", rate_hz=None, marks=()),
-        "protocol": "",
-        "contacts_before_n": 0,
-        "options": {},
-        "files": {},
-        "note": "",
-    }
-    return Header(**(fields | changed))
+    return recorded("test", **({"capture": "a_capture"} | LAB | changed))

@@ -1,10 +1,11 @@
+import hashlib
 import json
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.capture.header import Clock, check_same_capture, parse, render
+from pipeline.capture.header import Clock, check_same_capture, parse, render, write_capture
 from pipeline.core.errors import CaptureError
 from tests.capture.headers import make_header
 
@@ -52,3 +53,19 @@ def test_what_is_no_header_is_one_sentence(text):
 def test_a_folder_renamed_by_hand_is_noticed():
     with pytest.raises(CaptureError, match="capture must be the folder's name 'other'; got 'a_capture'"):
         check_same_capture(make_header(), "other")
+
+
+def test_a_capture_vouches_for_its_files(tmp_path):
+    (tmp_path / "source.csv").write_bytes(b"copied")
+    header = write_capture(tmp_path / "c0", make_header(), {"a.bin": b"bytes", "b.csv": tmp_path / "source.csv"})
+    assert header.files == {
+        name: hashlib.sha256(text).hexdigest() for name, text in (("a.bin", b"bytes"), ("b.csv", b"copied"))
+    }
+    assert (tmp_path / "c0/b.csv").read_bytes() == b"copied"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["c0", "source.csv"]
+
+
+def test_a_source_that_is_missing_leaves_no_folder(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        write_capture(tmp_path / "c0", make_header(), {"a.bin": b"bytes", "b.csv": tmp_path / "none.csv"})
+    assert list(tmp_path.iterdir()) == []

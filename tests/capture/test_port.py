@@ -95,6 +95,21 @@ def test_what_was_sent_is_what_is_written_and_stops_after_the_duration(board, tm
     check_files(tmp_path, recording, data)
 
 
+def test_a_report_counts_the_frames_while_they_come(board, tmp_path):
+    seen: list[int] = []
+    data = encode(FRAMES, "binary")
+    actor = threading.Timer(0.3, board.send, [data])
+    actor.start()
+    settings = replace(SETTINGS, bytes_max_n=len(data))
+    port.record(
+        board.name, tmp_path, settings=settings, stop=threading.Event(), report=lambda at: seen.append(at["frames_n"])
+    )
+    actor.join()
+    assert seen[0] == 0
+    assert seen == sorted(seen)
+    assert seen[-1] >= 1
+
+
 def test_arrivals_tell_when_bytes_came(board, tmp_path):
     data, pause_s = encode(FRAMES, "binary"), 0.4
     record(board, tmp_path, lambda _: board.send(data[:4100], data[4100:], pause_s=pause_s), bytes_max_n=len(data))

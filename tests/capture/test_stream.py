@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.capture import bursts, stream
+from pipeline.capture import stream
 from pipeline.capture.stream import FrameStream, decode_all
 from pipeline.capture.wire import Frames, concatenate, encode, line_bytes_max_n, record_type
 from pipeline.core.errors import CaptureError
@@ -249,7 +249,7 @@ def test_many_lines_are_read_in_pieces_and_each_ends_where_it_ends(monkeypatch):
 
 
 def test_a_long_stream_with_many_breaks_is_read_in_pieces():
-    frames = make_frames(3 * bursts.BLOCK_FRAMES_N, 5, 9, crlf_share=0.01)
+    frames = make_frames(3 * stream.BLOCK_FRAMES_N, 5, 9, crlf_share=0.01)
     data = encode(frames, "binary")
     data = b"".join(data[i + 7 : i + 82 * 100] for i in range(0, len(data), 82 * 100))
     kept, account = stream_in([data], "binary", 5)

@@ -1,6 +1,6 @@
 import pytest
 
-from pipeline.capture.folder import write_capture
+from pipeline.capture.header import write_capture
 from pipeline.capture.readers import READERS, lab
 from pipeline.core.errors import CaptureError
 from pipeline.dataset.captures import check_losses, open_capture, read_header

@@ -144,7 +144,7 @@ def test_a_part_of_the_stream_is_enough_when_travel_is_irregular() -> None:
 def test_a_periodic_protocol_fits_a_period_later_about_as_well_and_is_refused(part: slice) -> None:
     log = log_of(40, 0.25, (0.25, 0.25))
     t_s, b_uT = stream_of(log, line(7.0), margin_s=3.0)
-    with pytest.raises(CaptureError, match="better than any other; got two fits .* Add sync marks"):
+    with pytest.raises(CaptureError, match="better than any other; got two fits .* Add sync marks: .*--mark"):
         from_contacts([(t_s[part], b_uT[part])], log, "c")
 
 

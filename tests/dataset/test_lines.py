@@ -11,7 +11,7 @@ from pipeline.core.seeds import rng_for
 from pipeline.dataset.grid import points_mm, protocol
 from pipeline.dataset.lines import Lines, grid_lines, hand_lines, take_pokes
 from pipeline.dataset.rows import Rows
-from pipeline.synthesis.protocols import Hand, make_plan
+from pipeline.synthesis.protocols import SKIN_MM, Hand
 from tests.dataset.tables import rows as labelled
 
 READINGS_N = 2  # of one indentation
@@ -170,7 +170,7 @@ def test_a_simulated_hands_pokes_are_indexed_from_0_along_each_line():
         boards="rigid", skins_n=1, terms=(), kind="hand", lines_n=3, pokes_per_line_n=4, depth_mm=(0.5, 1.0),
         place_sd_mm=0.3, tilt_sd_deg=5.0,
     )  # fmt: skip
-    pass_i = make_plan(asked, rng_for(0, "hand")).pass_i
+    pass_i = asked.plan(rng_for(0, "hand"), SKIN_MM).pass_i
     readings = np.repeat(np.arange(12, dtype=np.int32), READINGS_N)
     lines = hand_lines(pass_i[readings], readings)
     assert lines.row.tolist() == list(range(24))

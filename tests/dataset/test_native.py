@@ -17,8 +17,8 @@ from pipeline.core import io
 from pipeline.core.errors import CaptureError
 from pipeline.core.schema import Readings
 from pipeline.core.seeds import rng_for
-from pipeline.dataset import native
-from pipeline.dataset.native import read_native
+from pipeline.dataset import captures
+from pipeline.dataset.captures import read_native
 from tests.capture.headers import make_header
 
 RATE_HZ = 100.0
@@ -200,7 +200,7 @@ def test_a_probe_log_in_another_unit_is_refused(tmp_path: Path) -> None:
 def test_a_smaller_block_gives_the_same_readings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     header = header_of("binary")
     whole, whole_account = read(write(tmp_path, "binary"), header)
-    monkeypatch.setattr(native, "BLOCK_BYTES_N", 1000)
+    monkeypatch.setattr(captures, "BLOCK_BYTES_N", 1000)
     parts, parts_account = read(tmp_path, header)
     assert parts_account == whole_account
     for name, column in whole.items():

@@ -3,9 +3,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.dataset.baseline import each, initial, rank
-from pipeline.dataset.parts import TRAIN, lay_parts, stack
 from pipeline.dataset.rows import Selection, gather
-from pipeline.dataset.windows import lay_windows
+from pipeline.dataset.windows import TRAIN, lay_parts, lay_windows, stack
 from tests.dataset.tables import readings
 
 POLICIES = {"initial": initial, "each": each}

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from sklearn.model_selection import ShuffleSplit
 
 from pipeline.core.errors import ParamsError
-from pipeline.dataset.single import draw_sides
-from pipeline.dataset.splits import Split, draw_folds
+from pipeline.dataset.splits import Split, draw_folds, draw_sides
 from tests.dataset.tables import rows
 
 TOGETHER = {"single_indentation": "indentation", "single_pass": "pass_i"}

@@ -6,9 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.core.errors import ParamsError
-from pipeline.dataset.lines import hand_lines
-from pipeline.dataset.rows import Selection, gather
-from pipeline.dataset.stacked import hand_rows, shifted, stack
+from pipeline.dataset.lines import hand_lines, hand_rows, shifted
+from pipeline.dataset.rows import Selection, gather, stack
 from tests.dataset.tables import readings
 
 ALL = Selection(force_min_N=0.0)

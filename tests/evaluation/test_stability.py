@@ -4,6 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pipeline.experiments.stability.relaxing import survey_relaxing
+from pipeline.experiments.stability.survey import survey
 
 from pipeline.capture import faults, stream
 from pipeline.core.config import parse, read_yaml
@@ -12,11 +14,9 @@ from pipeline.experiments.stability import physics
 from pipeline.experiments.stability.cases import measured, peak_bytes, refused
 from pipeline.experiments.stability.chip import survey_chip
 from pipeline.experiments.stability.physics import survey_physics
-from pipeline.experiments.stability.relaxing import survey_relaxing
-from pipeline.experiments.stability.survey import survey
 from pipeline.experiments.stability.wire import survey_wire
 from pipeline.physics import force_sensor, layer, sensor, viscoelastic
-from pipeline.synthesis.capture import Synthesis
+from pipeline.synthesis.settings import Synthesis
 
 ROOT = Path(__file__).resolve().parents[2]
 SHARED = {name: read_yaml(ROOT / "params.yaml")[name] for name in ("rig", "skin", "chip", "spreads", "terms")}

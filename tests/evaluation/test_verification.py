@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pipeline.experiments.verification.survey import Designs, verify
 
 from pipeline.core.config import parse, read_yaml
 from pipeline.experiments.verification import frames, poke, reference
@@ -16,9 +17,8 @@ from pipeline.experiments.verification.frames import check_frames
 from pipeline.experiments.verification.kinematics import check_kinematics
 from pipeline.experiments.verification.poke import check_poke
 from pipeline.experiments.verification.relaxation import check_relaxation
-from pipeline.experiments.verification.survey import Designs, verify
 from pipeline.physics import change, layer, magnet, sensor, viscoelastic
-from pipeline.synthesis.capture import Synthesis
+from pipeline.synthesis.settings import Synthesis
 
 ROOT = Path(__file__).resolve().parents[2]
 SHARED = {name: read_yaml(ROOT / "params.yaml")[name] for name in ("rig", "skin", "chip", "spreads", "terms")}

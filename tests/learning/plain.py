@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from torch import nn
 
-from pipeline.learning.feed import Batch
-from pipeline.learning.job import Terms
+from pipeline.learning.feed import UNLABELLED, Batch
 from pipeline.learning.recipe import Schedule
+from pipeline.learning.trial import Terms
 
 # paper section 4: B(15) -> MLP+ReLU(200) -> MLP(200) -> MLP(40) -> MLP+ReLU(200) -> MLP+ReLU(200) -> xyF(3)
 PAPER = ("15-200", "ReLU", "200-200", "200-40", "40-200", "ReLU", "200-200", "ReLU", "200-3")
@@ -61,9 +61,10 @@ def plain_train(
         if terms.triplet:
             loss = loss + terms.triplet * hinge(features, batch["labelled"], batch["near"], batch["far"])
         if terms.unlabelled:
-            loss = loss + terms.unlabelled * hinge(features, batch["poked"], batch["poked_near"], batch["poked_far"])
-        if terms.own:
-            loss = loss + terms.own * nn.functional.mse_loss(net(batch["own"]), batch["own_targets"])
+            loss = loss + terms.unlabelled * hinge(features, *(batch[name] for name in UNLABELLED))
+        if terms.few_labels:
+            predicted, targets = net(batch["few_labels"]), batch["few_labels_targets"]
+            loss = loss + terms.few_labels * nn.functional.mse_loss(predicted, targets)
         optimizer.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(net.parameters(), schedule.gradient_norm_max)

@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.core.seeds import rng_for
-from pipeline.learning.augment import virtual_boards
+from pipeline.learning.job import virtual_boards
 from pipeline.learning.recipe import Augmentation
 
 SKIN = np.array(["s1", "s1", "s2", "s1", "s2"])

@@ -12,7 +12,7 @@ from sklearn.linear_model import Ridge
 
 from pipeline.core.seeds import rng_for
 from pipeline.learning import baselines
-from pipeline.learning.baselines import Answered, Task, run_tasks
+from pipeline.learning.baselines import Fit, Task, run_tasks
 from pipeline.learning.classical import Classical, fit
 from pipeline.learning.trial import Measured
 
@@ -48,16 +48,16 @@ def measured() -> Measured:
 ROWS = measured()
 
 
-def asked(method: str = "ridge", inputs: str = "raw") -> Classical:
-    return TypeAdapter(Classical).validate_python(SETTINGS[method] | {"inputs": inputs})
+def method(name: str = "ridge", inputs: str = "raw") -> Classical:
+    return TypeAdapter(Classical).validate_python(SETTINGS[name] | {"inputs": inputs})
 
 
-def task(one: Classical | None = None, *, own: np.ndarray = NONE, rows_max_n: int = 1000, **changes: Any) -> Task:
-    values = {"name": "one", "asked": one or asked(), "train": TRAIN, "test": TEST, "own": own, "seed": 3}
-    return Task(**values | {"rows_max_n": rows_max_n} | changes)
+def task(one: Classical | None = None, **changes: Any) -> Task:
+    values = {"name": "one", "method": one or method(), "train": TRAIN, "test": TEST, "few_labels": NONE}
+    return Task(**values | {"rows_max_n": 1000, "seed": 3} | changes)
 
 
-def answered(*tasks: Task, rows: Measured = ROWS) -> list[Answered]:
+def answered(*tasks: Task, rows: Measured = ROWS) -> list[Fit]:
     return run_tasks(tasks, rows, Elsewhere(), lambda line: None)
 
 
@@ -82,9 +82,9 @@ def seen_by_hand(inputs: str, db_uT: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("inputs", ["raw", "shape"])
-@pytest.mark.parametrize("method", SETTINGS)
-def test_a_task_answers_as_its_method_called_by_hand(method, inputs):
-    one = asked(method, inputs)
+@pytest.mark.parametrize("name", SETTINGS)
+def test_a_task_answers_as_its_method_called_by_hand(name, inputs):
+    one = method(name, inputs)
     (got,) = answered(task(one))
     train, test = (seen_by_hand(inputs, ROWS.db_uT[rows]) for rows in (TRAIN, TEST))
     by_hand = fit(one, train, ROWS.target[TRAIN], rng_for(3, "baseline", "one"), weight=None)
@@ -96,7 +96,7 @@ def test_a_task_answers_as_its_method_called_by_hand(method, inputs):
 
 
 def test_labelled_rows_of_a_new_skin_weigh_together_as_much_as_all_others():
-    (got,) = answered(task(own=OWN))
+    (got,) = answered(task(few_labels=OWN))
     train = np.concatenate([TRAIN, OWN])
     mean, sd = ROWS.db_uT[train].mean(axis=0, dtype=float), ROWS.db_uT[train].std(axis=0, dtype=float)
     middle, spread = ROWS.target[train].mean(axis=0, dtype=float), ROWS.target[train].std(axis=0, dtype=float)
@@ -119,7 +119,7 @@ def test_the_weights_of_both_kinds_sum_to_the_same_however_many_there_are(own_n,
             return fit(one, inputs, target, rng, weight=weight)
 
         patch.setattr(baselines, "fit", listening)
-        answered(task(own=np.arange(60, 60 + own_n), rows_max_n=rows_max_n))
+        answered(task(few_labels=np.arange(60, 60 + own_n), rows_max_n=rows_max_n))
     (weight,) = weights
     others, own = weight[:-own_n], weight[-own_n:]
     assert len(others) == min(30, rows_max_n)
@@ -138,7 +138,7 @@ def rows_of(fits: list[dict[str, Any]]) -> list[list[int]]:
 
 
 def test_many_rows_are_thinned_to_different_training_rows_of_the_number_asked(fits):
-    done = answered(task(rows_max_n=12), task(rows_max_n=12, own=OWN), task(rows_max_n=30))
+    done = answered(task(rows_max_n=12), task(rows_max_n=12, few_labels=OWN), task(rows_max_n=30))
     thinned, with_own, whole = rows_of(fits)
     assert len(set(thinned)) == len(thinned) == 12
     assert set(thinned) < set(TRAIN)
@@ -151,7 +151,7 @@ def test_many_rows_are_thinned_to_different_training_rows_of_the_number_asked(fi
 
 def test_thinning_is_drawn_by_seed_and_name_alone(fits):
     others = {"seed": 4}, {"name": "other"}
-    answered(task(rows_max_n=12), task(rows_max_n=12, asked=asked("knn")))
+    answered(task(rows_max_n=12), task(rows_max_n=12, method=method("knn")))
     answered(*(task(rows_max_n=12, **other) for other in others))
     first, same, *different = rows_of(fits)
     assert same == first
@@ -167,12 +167,13 @@ def test_answers_come_in_the_order_of_tasks_and_each_is_told_of():
     np.testing.assert_array_equal(np.concatenate([one.predicted for one in done[1:]]), done[0].predicted)
 
 
-@pytest.mark.parametrize("method", SETTINGS)
-def test_no_target_but_those_of_training_rows_and_labels_changes_an_answer(method):
+@pytest.mark.parametrize("name", SETTINGS)
+def test_no_target_but_those_of_training_rows_and_labels_changes_an_answer(name):
     used = np.concatenate([TRAIN, OWN])
     others = ROWS.target.copy()
     others[np.setdiff1d(np.arange(ROWS_N), used)] = 1e6
     (got,), (other,) = (
-        answered(task(asked(method), own=OWN), rows=rows) for rows in (ROWS, Measured(ROWS.db_uT, others, ROWS.skin))
+        answered(task(method(name), few_labels=OWN), rows=rows)
+        for rows in (ROWS, Measured(ROWS.db_uT, others, ROWS.skin))
     )
     assert (got.predicted == other.predicted).all()

@@ -5,7 +5,7 @@ import pytest
 
 from pipeline.dataset.rows import Rows
 from pipeline.learning.card import describe
-from pipeline.learning.stack import train_stack
+from pipeline.learning.train import train_stack
 from pipeline.learning.trial import Trained, Trial
 from tests.learning.trials import OWN, POKED, ROWS_N, TEST, TRAIN, adapting, few_labels, measured, pooled
 

@@ -3,6 +3,7 @@ import os
 import pytest
 
 from pipeline.core.errors import ParamsError
+from pipeline.learning import executors
 from pipeline.learning.executors import device, make_executor
 
 
@@ -43,3 +44,26 @@ def test_an_unknown_device_is_one_sentence(monkeypatch, word):
     assert str(refused.value) == (
         f"RESKIN_DEVICE: the device must be one of ('cpu', 'cuda'); got {word!r}. Unset it for cpu."
     )
+
+
+def test_a_call_is_timed_after_one_that_warms_and_the_middle_time_counts(monkeypatch):
+    now_s, calls = [0.0], []
+
+    def call() -> None:
+        calls.append(len(calls))
+        now_s[0] += 1000.0 if len(calls) == 1 else float(len(calls))  # cold once, then 2 s, 3 s, ...
+
+    monkeypatch.setattr(executors, "perf_counter", lambda: now_s[0])
+    median_s = executors.median_s(call)
+    assert len(calls) == executors.REPEATS_N + 1
+    assert median_s == (2 + executors.REPEATS_N + 1) / 2  # of 2 .. 26 s
+
+
+def test_one_slow_call_changes_little(monkeypatch):
+    now_s, took_s = [0.0], iter([1.0] * 10 + [500.0] + [1.0] * executors.REPEATS_N)
+
+    def call() -> None:
+        now_s[0] += next(took_s)
+
+    monkeypatch.setattr(executors, "perf_counter", lambda: now_s[0])
+    assert executors.median_s(call) == 1.0

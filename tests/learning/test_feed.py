@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.learning.feed import Batch, Feed
+from pipeline.learning.feed import UNLABELLED, Batch, Feed
 from pipeline.learning.job import Job
 from tests.learning.jobs import some_job
 
@@ -26,7 +26,7 @@ def test_a_step_has_a_batch_of_every_kind_for_every_network():
     for step in steps:
         assert {name: tuple(values.shape) for name, values in step.items()} == {
             name: (3, BATCH_N, 3 if name.endswith("targets") else 15)
-            for name in ("labelled", "targets", "near", "far", "poked", "poked_near", "poked_far", "own", "own_targets")
+            for name in ("labelled", "targets", "near", "far", *UNLABELLED, "few_labels", "few_labels_targets")
         }
 
 
@@ -40,9 +40,9 @@ def test_targets_stand_beside_their_own_rows_and_networks_see_their_own_rows_onl
         for i, job in enumerate(jobs):
             chosen = rows_of(step["labelled"][i], job.labelled.inputs)
             assert (step["targets"][i].numpy() == job.labelled.targets[chosen]).all()
-            own = rows_of(step["own"][i], job.own.inputs)
-            assert (step["own_targets"][i].numpy() == job.own.targets[own]).all()
-            rows_of(step["poked"][i], job.unlabelled.inputs)
+            own = rows_of(step["few_labels"][i], job.few_labels.inputs)
+            assert (step["few_labels_targets"][i].numpy() == job.few_labels.targets[own]).all()
+            rows_of(step["unlabelled"][i], job.unlabelled.inputs)
 
 
 def test_near_and_far_are_triplets_of_the_labelled_rows():
@@ -61,8 +61,7 @@ def test_pokes_are_triplets_of_one_line_by_index_and_a_row_on_two_lines_takes_pa
     lines_of = {r: {(points.group[q], points.place[q, 0]) for q in np.flatnonzero(row == r)} for r in range(20)}
     met = set()
     for step in batches([job], 40):
-        names = ("poked", "poked_near", "poked_far")
-        for three in zip(*(rows_of(step[name][0], job.unlabelled.inputs) for name in names), strict=True):
+        for three in zip(*(rows_of(step[name][0], job.unlabelled.inputs) for name in UNLABELLED), strict=True):
             on_one_line = [
                 (line, abs(a - p), abs(a - n))
                 for line, a in lines_of[three[0]] for of_p, p in lines_of[three[1]] for of_n, n in lines_of[three[2]]
@@ -91,9 +90,9 @@ def test_one_more_term_leaves_all_other_batches_as_they_are():
     """Methods are compared in pairs: in every block, not only in the first."""
     full = some_job(terms=True)
     without = {
-        "triplet": Job(full.start, some_job().rng, some_job().labelled, full.unlabelled, full.own),
-        "unlabelled": Job(full.start, some_job().rng, full.labelled, None, full.own),
-        "own": Job(full.start, some_job().rng, full.labelled, full.unlabelled),
+        "triplet": Job(full.start, some_job().rng, some_job().labelled, full.unlabelled, full.few_labels),
+        "unlabelled": Job(full.start, some_job().rng, full.labelled, None, full.few_labels),
+        "few_labels": Job(full.start, some_job().rng, full.labelled, full.unlabelled),
     }
     feed = Feed([full], BATCH_N, "cpu")
     blocks = [list(feed.draw(STEPS_N)) for _ in range(3)]

@@ -15,10 +15,10 @@ from pipeline.core.seeds import rng_for
 from pipeline.dataset.rows import Rows
 from pipeline.dataset.splits import Split, draw_folds
 from pipeline.learning import few_labels as few
-from pipeline.learning.baselines import Task
-from pipeline.learning.comparison import Baselines
-from pipeline.learning.comparison import FewLabels as Settings
-from pipeline.learning.trial import Adapting, FewLabels, Keys, Measured, Trained, Trial, make_job
+from pipeline.learning.baselines import Baselines, Task
+from pipeline.learning.few_labels import FewLabels as Settings
+from pipeline.learning.job import make_job
+from pipeline.learning.trial import Adapting, FewLabels, Keys, Measured, Trained, Trial
 from tests.scenes import RECIPE
 
 SKINS = ("b0_s0", "b0_s1", "b1_s0", "b2_s0")
@@ -115,7 +115,7 @@ def test_all_methods_and_numbers_of_labels_are_tested_on_the_same_rows_and_train
 
 
 def labels_of(one: Trial | Task) -> np.ndarray:
-    return one.own if isinstance(one, Task) else one.tuning.own
+    return one.few_labels if isinstance(one, Task) else one.tuning.row
 
 
 def with_labels(at: few.Study, networks: list[few.Done]) -> list[tuple[few.Tried, Trial | Task]]:
@@ -135,7 +135,7 @@ def test_labels_are_whole_indentations_of_the_pool_as_many_as_asked():
 def test_without_labels_there_are_none():
     for tried, one in all_tried(STUDY, NETWORKS):
         if not tried.labels_n:
-            assert len(one.own) == 0 if isinstance(one, Task) else not isinstance(one.tuning, FewLabels)
+            assert len(one.few_labels) == 0 if isinstance(one, Task) else not isinstance(one.tuning, FewLabels)
 
 
 def test_every_method_is_given_the_same_labels_and_every_fold_others():
@@ -160,16 +160,16 @@ def test_which_pokes_of_a_pool_are_labelled_is_drawn_anew_in_every_fold():
 @given(st.integers(0, 2**32), st.lists(st.integers(0, 8), min_size=2, max_size=4, unique=True))
 def test_the_fewer_labels_are_among_the_more(seed, labels_n):
     at = study(seed, labels_n=labels_n)
-    own = {(tried.fold.name, tried.labels_n): {*task.own} for tried, task in few.classical(at) if "ridge" in task.name}
-    fewer = sorted(labels_n)
-    for fold in data.folds:
-        for less, more in pairwise(fewer):
-            assert own[fold.name, less] < own[fold.name, more]
+    tasks = few.classical(at)
+    rows = {(tried.fold.name, tried.labels_n): {*task.few_labels} for tried, task in tasks if "ridge" in task.name}
+    for fold in at.folds:
+        for less, more in pairwise(sorted(labels_n)):
+            assert rows[fold.name, less] < rows[fold.name, more]
 
 
 def test_labels_are_drawn_by_the_seed_and_not_by_the_order_of_numbers():
     first, again, other, turned = (
-        [sorted(task.own.tolist()) for tried, task in few.classical(at) if tried.labels_n == 5]
+        [sorted(task.few_labels.tolist()) for tried, task in few.classical(at) if tried.labels_n == 5]
         for at in (study(), study(), replace(study(), seed=6), study(labels_n=[5, 0]))
     )
     assert first == again == turned
@@ -187,13 +187,13 @@ def test_labels_of_a_new_board_change_no_scaler():
     pooled = {(tried.method, tried.fold.name): one.scaler for tried, trial, one in NETWORKS if trial.tuning is None}
     for tried, trial in LABELLED:
         changed = of(ROWS).db_uT.copy()
-        changed[trial.tuning.own] += 500
+        changed[trial.tuning.row] += 500
         (job, scaler), (other, same) = (make_job(trial, one) for one in (of(ROWS), replace(of(ROWS), db_uT=changed)))
         for name, values in pooled[tried.method.removesuffix(", adapted"), tried.fold.name].arrays().items():
             assert (scaler.arrays()[name] == values).all()
             assert (same.arrays()[name] == values).all()
-        assert (other.own.inputs != job.own.inputs).any()  # learned from they are
-        assert len(job.own.inputs) == READINGS_N * tried.labels_n
+        assert (other.few_labels.inputs != job.few_labels.inputs).any()  # learned from they are
+        assert len(job.few_labels.inputs) == READINGS_N * tried.labels_n
 
 
 def test_labels_go_on_from_the_network_of_the_same_method_and_fold():
@@ -211,14 +211,14 @@ def test_only_the_networks_named_are_adapted_by_all_pokes_of_their_pool():
 
 
 def few_done(at: few.Study) -> list[few.Done]:
-    return [(tried, trial, as_drawn(trial)) for tried, trial in few.networks(data, [])]
+    return [(tried, trial, as_drawn(trial)) for tried, trial in few.networks(at, [])]
 
 
 def test_adaptation_sees_no_label_of_the_new_board():
     for trial in ADAPTED:
         blind = of(unknown(ROWS.board == trial.fold[:2]))
         job, other = make_job(trial, of(ROWS))[0], make_job(trial, blind)[0]
-        assert job.own is other.own is None
+        assert job.few_labels is other.few_labels is None
         assert (job.labelled.inputs == other.labelled.inputs).all()
         assert (job.labelled.targets == other.labelled.targets).all()
         assert (job.unlabelled.inputs == other.unlabelled.inputs).all()

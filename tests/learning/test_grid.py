@@ -10,11 +10,12 @@ from hypothesis import strategies as st
 
 from pipeline.core import io
 from pipeline.core.errors import ReskinError, TrainingError
-from pipeline.learning import stack
+from pipeline.learning import train
 from pipeline.learning.executors import make_executor
 from pipeline.learning.grid import STACK_N, run_trials, stacks
-from pipeline.learning.stack import JUDGED_STEPS_N, train_stack
-from pipeline.learning.trial import Trained, Trial, make_job
+from pipeline.learning.job import make_job
+from pipeline.learning.train import JUDGED_STEPS_N, train_stack
+from pipeline.learning.trial import Trained, Trial
 from tests.learning.recipes import recipe
 from tests.learning.trials import TRAIN, adapting, few_labels, measured, pooled, without_triplets
 
@@ -217,7 +218,7 @@ def dies(attempts: set[int]) -> object:
     ("dead", "before_n", "collapsed"), [(set(), 0, 0), ({0}, 1, 0), ({0, 1}, 2, 0), ({0, 1, 2}, 2, 1)]
 )
 def test_what_collapses_is_trained_again_at_most_twice_and_counted(tmp_path, monkeypatch, dead, before_n, collapsed):
-    monkeypatch.setattr(stack, "make_job", dies(dead))
+    monkeypatch.setattr(train, "make_job", dies(dead))
     some, said = trials(2, steps_n=JUDGED_STEPS_N, rate_max=1e-2), []
     for _ in range(2):  # the second time, from the cache
         first, second = run(some, tmp_path, said=said)
@@ -228,7 +229,7 @@ def test_what_collapses_is_trained_again_at_most_twice_and_counted(tmp_path, mon
 
 
 def test_a_training_too_short_to_have_left_its_start_is_not_judged(tmp_path, monkeypatch):
-    monkeypatch.setattr(stack, "make_job", dies({0, 1, 2}))
+    monkeypatch.setattr(train, "make_job", dies({0, 1, 2}))
     first, _ = run(trials(2, steps_n=JUDGED_STEPS_N - 1), tmp_path)
     assert (first.explained_min, first.collapsed) == (None, False)
 

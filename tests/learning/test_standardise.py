@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.core.seeds import rng_for
-from pipeline.learning.standardise import SCALE_FLOOR, Scaler, fit_released, fit_standard
+from pipeline.learning.inputs import SCALE_FLOOR, Scaler, fit_released, fit_standard
 
 
 def rows(n: int = 50, ch: int = 6) -> tuple[np.ndarray, np.ndarray]:

@@ -9,15 +9,16 @@ from torch import nn
 from pipeline.core.seeds import rng_for
 from pipeline.learning.architecture import Weights, paper_layers
 from pipeline.learning.feed import Feed
-from pipeline.learning.job import Job, Labelled, Terms
+from pipeline.learning.job import Job, Labelled
 from pipeline.learning.model import Stack
 from pipeline.learning.recipe import Recipe
 from pipeline.learning.train import BLOCK_STEPS_N, Outcome, Watch, clip, train
+from pipeline.learning.trial import Terms
 from tests.learning.jobs import some_job, some_weights
 from tests.learning.plain import plain_net, plain_train
 from tests.learning.recipes import recipe
 
-ALL_TERMS = Terms(0.5, unlabelled=0.7, own=0.3)
+ALL_TERMS = Terms(0.5, unlabelled=0.7, few_labels=0.3)
 NO_TERMS = Terms(0.0)
 # Sums in another order, on another processor or at another place in memory, round otherwise: 6e-8 of a term. AdamW
 # divides a gradient by its own size, so a ReLU that rounding opens for one row moves all weights of its unit by a
@@ -97,7 +98,7 @@ def test_a_network_becomes_the_same_in_a_stack_and_alone(terms, batch_n):
 
 @pytest.mark.parametrize("decay", [0.0, 10.0])
 @pytest.mark.parametrize(
-    "terms", [NO_TERMS, Terms(0.5), Terms(0.0, unlabelled=0.7), Terms(0.0, own=0.3), ALL_TERMS], ids=str
+    "terms", [NO_TERMS, Terms(0.5), Terms(0.0, unlabelled=0.7), Terms(0.0, few_labels=0.3), ALL_TERMS], ids=str
 )
 def test_the_stack_descends_as_the_plainest_pytorch_loop_does(terms, decay):
     schedule, steps_n = recipe(steps_n=70, rate_max=5e-4, weight_decay=decay), 70

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from pipeline.dataset.lines import Lines
-from pipeline.learning import trial as cell_module
+from pipeline.learning import trial as trial_module
 from pipeline.learning.feed import Feed
-from pipeline.learning.job import Terms
+from pipeline.learning.job import make_job
 from pipeline.learning.recipe import AugmentedRecipe
-from pipeline.learning.stack import train_stack
-from pipeline.learning.trial import DECIDING, Keys, Measured, Trained, Trial, code_of, make_job
+from pipeline.learning.train import train_stack
+from pipeline.learning.trial import DECIDING, Keys, Measured, Terms, Trained, Trial, code_of
 from tests.learning.recipes import recipe
 from tests.learning.trials import (
     OWN,
@@ -141,7 +141,7 @@ def test_labelled_triplets_are_by_place_on_each_skin_in_mm():
 def test_terms_weigh_what_the_recipe_and_the_tuning_say():
     assert pooled().terms == Terms(0.5)
     assert adapting(unlabelled_weight=0.25).terms == Terms(0.5, unlabelled=0.25)
-    assert few_labels(own_weight=0.75).terms == Terms(0.5, own=0.75)
+    assert few_labels(own_weight=0.75).terms == Terms(0.5, few_labels=0.75)
     assert adapting().schedule == adapting().tuning.settings
     assert pooled().schedule == pooled().recipe
 
@@ -249,7 +249,7 @@ def test_no_two_settings_share_a_key():
         adapting(along=replace(along, order_i=along.order_i[::-1].copy())),
         adapting(along=replace(along, line_i=np.array([0, 0, 0, 1, 1, 1], np.int32))),
         adapting(along=replace(along, row=along.row[::-1].copy())),
-        tuned(few_labels(), own=OWN[:2]), finer(few_labels(), own_weight=0.25),
+        tuned(few_labels(), row=OWN[:2]), finer(few_labels(), own_weight=0.25),
     ]  # fmt: skip
     assert len({key(trial) for trial in trials}) == len(trials)
 
@@ -267,26 +267,38 @@ def test_a_network_begins_with_the_mean_of_the_targets_as_its_last_bias(scaling)
     trial = replace(without_triplets(), recipe=recipe(scaling=scaling))
     rows = changed(measured(), "target", np.arange(3), np.nan)
     job, scaler = make_job(trial, changed(rows, "target", (slice(None), 2), np.nan))
-    told = scaler.decode(job.start["layer6.bias"][None])[0]
-    np.testing.assert_allclose(told[:2], rows.target[TRAIN[3:], :2].mean(axis=0), rtol=1e-5)
+    predicted = scaler.decode(job.start["layer6.bias"][None])[0]
+    np.testing.assert_allclose(predicted[:2], rows.target[TRAIN[3:], :2].mean(axis=0), rtol=1e-5)
     assert job.start["layer6.bias"][2] == 0  # a target that nobody knows
 
 
-def test_words_about_code_decide_no_result_and_code_does():
-    source = Path(cell_module.__file__).read_text()
+def test_words_about_code_and_imports_decide_no_result_and_code_does():
+    source = Path(trial_module.__file__).read_text()
     assert code_of(source.replace("Refuses to know files", "Knows no files")) == code_of(f"# more\n{source}")
+    assert code_of(source.replace("import sys\n", "import os\nfrom re import sub\n")) == code_of(source)
+    assert code_of("def f():\n    import os") == code_of("def f():\n    pass")
     assert code_of(source.replace("COLLAPSED = 0.05", "COLLAPSED = 0.06")) != code_of(source)
 
 
+NOT_DECIDING = {
+    "core.config": "checks settings, whose values are part of the key",
+    "core.errors": "stops a training, and changes none",
+    "core.numerics": "its signature of the environment is part of the key",
+    "core.schema": "makes rows, whose values are part of the key",
+    "dataset.baseline": "makes rows, whose values are part of the key",
+    "dataset.lines": "makes lines, whose values are part of the key",
+    "dataset.rows": "makes rows, whose values are part of the key",
+    "learning.executors": "where it runs, and the clock; the device is part of the key",
+    "learning.recipe": "settings, whose values are part of the key",
+}
+
+
 def test_all_code_that_a_training_runs_through_is_part_of_its_key():
-    """What `train_stack` imports of this package, but for words, values that are part of the key, and the clock."""
     graph = grimp.build_graph("pipeline", cache_dir=None)
-    names = {
-        module.removeprefix("pipeline.learning.")
-        for module in {"pipeline.learning.stack", *graph.find_upstream_modules("pipeline.learning.stack")}
-        if module.startswith("pipeline.learning.")
-    }
-    assert names - {"recipe", "executors", "stopwatch"} == set(DECIDING)
+    modules = {"pipeline.learning.train", *graph.find_upstream_modules("pipeline.learning.train")}
+    imported = {module.removeprefix("pipeline.") for module in modules if not graph.find_children(module)}
+    assert imported - set(NOT_DECIDING) == set(DECIDING)
+    assert set(NOT_DECIDING) <= imported
 
 
 def test_questions_and_names_do_not_enter_a_key():
@@ -307,11 +319,11 @@ def test_keys_are_the_same_from_one_book_of_keys_and_from_many():
 
 def test_a_key_changes_with_the_code_that_trains(monkeypatch):
     before = key(pooled())
-    monkeypatch.setattr(cell_module, "_code_digest", lambda: "another loop")
+    monkeypatch.setattr(trial_module, "_code_digest", lambda: "another loop")
     assert key(pooled()) != before
 
 
-def test_a_name_says_what_tells_a_cell_apart():
+def test_a_name_says_what_tells_a_trial_apart():
     assert pooled().name == "triplet.paper.b1.seed0"
     assert replace(adapting(), what="65pokes").name == "adapt.paper.b1.b1_s1.65pokes.seed0"
 

@@ -1,69 +1,52 @@
 """The magnets against magpylib's Cuboid and Maxwell, and the law by which the powder keeps their field."""
 
+import magpylib
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.constants import mu_0
 
 from pipeline.core.errors import ParamsError
 from pipeline.core.seeds import rng_for
+from pipeline.experiments.verification import field as laws
 from pipeline.physics import magnet
 from pipeline.physics.dipole import MU0_4PI, field
 from pipeline.physics.nodes import Quadrature, place_nodes
+from tests.laws import broken
 
 THICKNESS_M = 2e-3
-SIDES_M = (6e-3, 4e-3, 3e-3)
 NODES_M = place_nodes(THICKNESS_M, Quadrature(1.5e-3, 3)).nodes_m
 places_m = st.tuples(st.floats(-9e-3, 9e-3), st.floats(-9e-3, 9e-3), st.floats(1e-4, 1.9e-3)).map(np.array)
+seeds = st.integers(0, 10**6)
 polarities = st.sampled_from(["checkerboard", "same"])
 
 
-def jacobian(point_m, polarity):
-    step_m = 1e-6
-    steps = (np.eye(3)[:, None] * np.array([step_m, -step_m])[:, None]).reshape(6, 3)
-    b_T = magnet.array_field(point_m + steps, THICKNESS_M, polarity).reshape(3, 2, 3)
-    return (b_T[:, 0] - b_T[:, 1]) / (2 * step_m)
+@given(seeds, st.floats(1e-4, 1e-2))
+def test_a_cube_has_the_field_of_magpylibs_and_far_away_that_of_a_dipole(seed, side_m):
+    assert not broken([*laws.boxes(seed, side_m), laws.octupole()])
 
 
-def their_array(polarity, cubes_n=(4, 4)):
-    magpylib = pytest.importorskip("magpylib", reason="needs magpylib, of the dev dependencies")
-    side_m = magnet.CUBE_SIDE_M
-    heights_m = (-magnet.ARRAY_BELOW_M - side_m / 2, THICKNESS_M + magnet.ARRAY_ABOVE_M + side_m / 2)
-    return [
-        magpylib.magnet.Cuboid(
-            polarization=(0, 0, magnet.ARRAY_REMANENCE_T * ((-1) ** (i + j) if polarity == "checkerboard" else 1)),
-            dimension=(side_m, side_m, side_m),
-            position=((i - (cubes_n[0] - 1) / 2) * side_m, (j - (cubes_n[1] - 1) / 2) * side_m, z_m),
-        )
-        for i in range(cubes_n[0])
-        for j in range(cubes_n[1])
-        for z_m in heights_m
-    ]
+def test_a_box_of_unequal_sides_has_the_field_of_magpylibs():
+    sides_m = (6e-3, 4e-3, 3e-3)
+    places_m = rng_for(0, "cuboid").uniform(-20e-3, 20e-3, (2000, 3)) * rng_for(1, "cuboid").uniform(size=(2000, 1))
+    theirs_T = magpylib.magnet.Cuboid(polarization=(0, 0, 1.3), dimension=sides_m).getB(places_m)
+    assert (np.abs(places_m) < np.array(sides_m) / 2).all(axis=1).sum() > 50
+    # of 1 T: rounding of 24 logarithms
+    np.testing.assert_allclose(magnet.cuboid_field(places_m, 1.3, sides_m=sides_m), theirs_T, atol=1e-12)
 
 
-def test_a_box_inside_and_outside_has_the_field_of_magpylibs_cuboid():
-    magpylib = pytest.importorskip("magpylib", reason="needs magpylib, of the dev dependencies")
-    places = rng_for(0, "cuboid").uniform(-20e-3, 20e-3, size=(2000, 3)) * rng_for(1, "cuboid").uniform(size=(2000, 1))
-    theirs_T = magpylib.magnet.Cuboid(polarization=(0, 0, 1.3), dimension=SIDES_M).getB(places)
-    ours_T = magnet.cuboid_field(places, 1.3, sides_m=SIDES_M)
-    assert (np.abs(places) < np.array(SIDES_M) / 2).all(axis=1).sum() > 50
-    np.testing.assert_allclose(ours_T, theirs_T, atol=1e-12)  # of 1 T: rounding of 24 logarithms
-
-
-@pytest.mark.parametrize("polarity", ["checkerboard", "same"])
-def test_the_array_has_the_field_of_magpylibs_32_cuboids(polarity):
-    magpylib = pytest.importorskip("magpylib", reason="needs magpylib, of the dev dependencies")
-    theirs_T = magpylib.getB(their_array(polarity), NODES_M, sumup=True)
-    np.testing.assert_allclose(magnet.array_field(NODES_M, THICKNESS_M, polarity), theirs_T, atol=1e-11)
+@settings(max_examples=10)
+@given(polarities, seeds)
+def test_the_array_has_the_field_of_magpylibs_obeys_maxwell_and_turns(polarity, seed):
+    assert not broken(laws.array(polarity, THICKNESS_M, seed))
 
 
 @pytest.mark.parametrize("polarity", ["checkerboard", "same"])
 def test_the_array_of_a_sleeve_has_the_field_of_magpylibs_256_cuboids(polarity):
-    magpylib = pytest.importorskip("magpylib", reason="needs magpylib, of the dev dependencies")
     half_m = np.array([25.4e-3, 50.8e-3])
     places_m = np.column_stack([rng_for(0, "sleeve").uniform(-half_m, half_m, (60, 2)), np.linspace(1e-4, 1.9e-3, 60)])
-    theirs_T = magpylib.getB(their_array(polarity, (8, 16)), places_m, sumup=True)
+    theirs_T = magpylib.getB(laws.cuboids(polarity, THICKNESS_M, (8, 16)), places_m, sumup=True)
     ours_T = magnet.array_field(places_m, THICKNESS_M, polarity, cubes_n=(8, 16))
     np.testing.assert_allclose(ours_T, theirs_T, atol=1e-11)
 
@@ -77,34 +60,6 @@ def test_so_many_cubes_cover_a_side_and_their_seams_lie_evenly_around_its_middle
     np.testing.assert_allclose(seams_m, [-s for s in reversed(seams_m)], atol=1e-18)
     np.testing.assert_allclose(np.diff(seams_m), magnet.CUBE_SIDE_M)
     assert np.abs(seams_m).max(initial=0) < side_m / 2
-
-
-def test_far_from_a_cube_its_error_as_a_dipole_falls_with_the_fourth_power_of_the_distance():
-    # By symmetry a cube has no quadrupole, and its octupole vanishes with equal sides: next is (cell / r)^4.
-    def error(distance):
-        place = distance * np.array([[0.3, -0.4, np.sqrt(0.75)]])
-        exact_T = magnet.cuboid_field(place, 1.0, sides_m=(1.0, 1.0, 1.0))
-        dipole_T = field(np.zeros((1, 3)), np.array([[0.0, 0.0, 1 / mu_0]]), place)
-        return np.linalg.norm(exact_T - dipole_T) / np.linalg.norm(exact_T)
-
-    assert error(4) / error(8) == pytest.approx(16, rel=0.05)  # next term: (cell / r)^6, 2 % at 4 cells
-    assert error(8) / error(16) == pytest.approx(16, rel=0.05)
-
-
-@given(places_m, polarities)
-def test_the_array_field_has_neither_divergence_nor_curl(point_m, polarity):
-    grad = jacobian(point_m, polarity)
-    size = np.abs(grad).max() + 1.0  # T/m; the field changes by about 300 T/m
-    assert abs(np.trace(grad)) < 1e-4 * size  # central differences over 1 um, 0.25 mm from an edge: (1/250)^2 and less
-    assert np.abs(grad - grad.T).max() < 1e-4 * size
-
-
-@given(places_m, polarities)
-def test_turning_the_place_by_90_degrees_turns_the_field_and_swaps_a_checkerboards_poles(point_m, polarity):
-    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    sign = -1 if polarity == "checkerboard" else 1
-    here_T, there_T = (magnet.array_field(p[None], THICKNESS_M, polarity)[0] for p in (point_m, turn @ point_m))
-    np.testing.assert_allclose(there_T, sign * turn @ here_T, atol=1e-12)
 
 
 @given(places_m, polarities)

@@ -8,6 +8,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from pipeline import plan
+from pipeline.core import config
 from tests.stages.checkout import copy_checkout, run
 
 pytestmark = pytest.mark.timeout(1800)
@@ -16,7 +17,7 @@ pytestmark = pytest.mark.timeout(1800)
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory, shared_data) -> Iterator[Path]:
     root = copy_checkout(tmp_path_factory.mktemp("lab"))
-    scene = root / plan.SCENES / "lab.yaml"
+    scene = root / config.SCENES / "lab.yaml"
     settings = YAML(typ="safe").load(scene.read_text())
     settings["train_multi"]["seeds_n"] = 1
     settings["train_multi"] |= {"steps_n": 100, "variants": {}}

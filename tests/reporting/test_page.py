@@ -6,9 +6,8 @@ import pandas as pd
 import pytest
 
 from pipeline.questions import EXPERIMENTS
-from pipeline.reporting import page_order
 from pipeline.reporting.checklist import checklist
-from pipeline.reporting.page import arrange, lay_out, page
+from pipeline.reporting.page import arrange, lay_out, page, read_sections
 from pipeline.reporting.tables import make_tables
 from tests.reporting.synthetic import all_questions
 
@@ -127,8 +126,7 @@ def test_the_same_inputs_give_the_same_bytes():
 
 def test_numbers_stand_on_the_right_and_words_on_the_left():
     table = pd.DataFrame({"a": ["x"], "b": ["1.5 ± 0.2"], "c": ["–"], "d": ["3 of 4"], "e": ["-0.1 mm²"]})
-    looks = {column.title: column.look for column in lay_out("t", table).columns}
-    assert looks == {"a": "text", "b": "number", "c": "text", "d": "text", "e": "number"}
+    assert lay_out("t", "T", table).looks == ["text", "number", "text", "text", "number"]
 
 
 def test_notes_of_a_table_stand_below_it(read):
@@ -136,11 +134,10 @@ def test_notes_of_a_table_stand_below_it(read):
 
 
 def test_no_table_or_figure_stands_in_two_sections():
-    order = page_order
-    sections = (order.HEADLINE, *order.QUESTIONS, order.FURTHER, order.LEFT_OUT, order.COSTS, order.CAPTURES)
-    named = Counter(name for one in sections for name in (*one.tables, *one.figures, *one.folded))
+    sections = read_sections()
+    named = Counter(name for section in sections for name in section.captions)
     assert max(named.values()) == 1
-    assert len({one.key for one in sections}) == len(sections)
+    assert len({section.key for section in sections}) == len(sections)
 
 
 def luminance(colour: str) -> float:

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.experiments.runtime.choose import choose
-from pipeline.experiments.runtime.rows import REFERENCE, Precision, Seconds
+from pipeline.experiments.runtime.rows import REFERENCE, Precision, Seconds, choose
 from pipeline.physics.nodes import CHOSEN
 from pipeline.reporting.work_precision import COLOURS, MARKERS, costs, failures, front, integrators, pages, quadratures
 from tests.reporting.synthetic import cost

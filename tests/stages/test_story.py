@@ -17,7 +17,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from pipeline.core import io
-from pipeline.learning.standardise import Scaler
+from pipeline.learning.inputs import Scaler
 from pipeline.questions import EXPERIMENTS
 from pipeline.reporting.checklist import read_rows, resolve
 from tests.stages.checkout import ENVIRONMENT, copy_checkout, run
@@ -27,7 +27,6 @@ LEARNING = (
     "few_labels", "audit",
 )  # fmt: skip
 DRAWING = ("drift", "manual", "contacts", "ambient")  # experiments that draw at random in ways of their own
-FILES = ("--settings", "pipeline/scenes/ci.yaml", "--params", "params.yaml", "--plan", "pipeline/plan.yaml")
 pytestmark = pytest.mark.timeout(1800)  # a guard against a hang; a busy machine takes four times as long as a quiet one
 
 
@@ -243,7 +242,7 @@ def test_deleted_models_are_restored_without_training(story):
 
 def test_a_stage_killed_in_the_middle_loses_no_finished_fold(story):
     models = story / "data/models/killed"
-    words = ["--scene", "ci", *FILES, "--indentations", "data/indentations/ci",
+    words = ["--scene", "ci", "--indentations", "data/indentations/ci",
              "--folds", "data/folds/ci.json", "--models", str(models)]  # fmt: skip
     command = [str(story / ".venv/bin/python"), "-m", "pipeline.stages.train_triplet", *words]
     environment = {**os.environ, **ENVIRONMENT, "PYTHONPATH": str(story), "RESKIN_EXECUTOR": "processes:1"}
@@ -265,7 +264,7 @@ def test_a_stage_killed_in_the_middle_loses_no_finished_fold(story):
 
 def test_a_dead_tracking_server_is_said_and_costs_no_result(story):
     start_s = time.monotonic()
-    words = ["--scene", "ci", *FILES, "--models", "data/models/ci",
+    words = ["--scene", "ci", "--models", "data/models/ci",
              "--answers", "data/answers/ci", "--reports", "reports/ci"]  # fmt: skip
     done = run(story, "python", "-m", "pipeline.stages.publish", *words, MLFLOW_TRACKING_URI="http://127.0.0.1:9")
     assert "does not answer" in done.stderr

@@ -9,8 +9,7 @@ from pipeline.core.errors import ParamsError
 from pipeline.dataset.grid import points_mm
 from pipeline.physics.board import draw_board
 from pipeline.physics.skin import changes_of_field, draw_skin, forces
-from pipeline.synthesis.capture import record, roster
-from pipeline.synthesis.files import to_files
+from pipeline.synthesis.capture import record, roster, to_files
 from tests.synthesis.scene import AGEING, GRID, RELAXATION, RIGID, SECTIONS, TEMPERATURE, synthesis, with_protocol
 
 LIFTED_N, MOVING_N, DWELL_N = 1 + 4, 2, 1 + 3

@@ -8,7 +8,7 @@ from pipeline.physics.board import Board
 from pipeline.physics.sensor import ChipDesign
 from pipeline.physics.warmth import REMANENCE_PER_K, Temperature
 from pipeline.synthesis import frames
-from pipeline.synthesis.felt import Felt
+from pipeline.synthesis.contact import Response
 from pipeline.synthesis.frames import Reader, read_frames
 from pipeline.synthesis.rig import Rig, timeline
 from tests.synthesis.scene import SECTIONS
@@ -21,16 +21,16 @@ QUIET = ChipDesign(gain_sel=7, noise_xy_uT=0.0, noise_z_uT=0.0, noise_temperatur
 WARMING = Temperature(warming_K=10.0, warming_s=1.0, swing_K=2.0, swing_s=3.0, chip_sensitivity_per_K=0.0)
 
 
-def felt():
+def response():
     rng = rng_for(0, "felt")
     rest_T = 1e-3 + 1e-4 * rng.standard_normal((N, CHIPS_N, 3))
-    return Felt(rest_T, 2e-4 * rng.standard_normal((N, 1, CHIPS_N, 3)), np.zeros((N, 1, 3)), 0)
+    return Response(rest_T, 2e-4 * rng.standard_normal((N, 1, CHIPS_N, 3)), np.zeros((N, 1, 3)), 0)
 
 
 def read(chip=LOUD, rate_hz=400.0, temperature=None, sensitivity_per_K=(0.0, 0.0), of=None):
     reader = Reader(BOARD, chip, rate_hz, np.array([0.2e-3, 1.5e-3]), temperature, np.array(sensitivity_per_K))
     line = timeline(Rig(**SECTIONS["rig"]), 1)
-    return read_frames(of or felt(), line, reader, noise=rng_for(0, "noise"), warmth_noise=rng_for(0, "warmth"))
+    return read_frames(of or response(), line, reader, noise=rng_for(0, "noise"), warmth_noise=rng_for(0, "warmth"))
 
 
 @pytest.mark.parametrize("rate_hz", [400.0, 1000.0])
@@ -50,7 +50,7 @@ def test_frames_repeat_where_they_outrun_the_chips_noise_included():
 
 
 def test_a_chip_reads_what_was_there_when_it_converted_and_not_later():
-    one = felt()
+    one = response()
     ramp = one.change_T[:, 0].copy()
     frames_n = len(timeline(Rig(**SECTIONS["rig"]), 1))
     found_uT = read(QUIET).b_uT.reshape(N, frames_n, CHIPS_N, 3)

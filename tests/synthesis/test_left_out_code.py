@@ -11,7 +11,7 @@ from tests.synthesis.scene import AGEING, GRID, RELAXATION, TEMPERATURE, with_pr
 
 TERMS = {
     "ageing": (AGEING, {"wear.py"}),
-    "friction": ({"coefficient": 0.5}, {"friction.py", "shear.py", "sideways.py"}),
+    "friction": ({"coefficient": 0.5}, {"friction.py", "shear.py"}),
     "relaxation": (RELAXATION, {"viscoelastic.py"}),
     "temperature": (TEMPERATURE, {"warmth.py"}),
 }

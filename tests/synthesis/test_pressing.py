@@ -5,16 +5,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.capture.folder import write_capture
+from pipeline.capture.header import write_capture
 from pipeline.capture.sd_card import read_log
 from pipeline.core.errors import CaptureError, ParamsError
 from pipeline.core.seeds import rng_for
 from pipeline.dataset.captures import open_capture
 from pipeline.physics.skin import draw_skin, forces
-from pipeline.synthesis.capture import record
-from pipeline.synthesis.files import to_files
+from pipeline.synthesis.capture import record, to_files
 from pipeline.synthesis.pressing import LIFTED_MM, depths_under, footfalls, half_sine, presses, weights_N
-from pipeline.synthesis.protocols import Press, make_plan
+from pipeline.synthesis.protocols import SKIN_MM, Press
 from tests.synthesis.scene import synthesis, with_protocol
 
 SHARED = {"boards": "rigid", "skins_n": 1, "terms": []}
@@ -109,7 +108,7 @@ def test_a_walk_has_a_footfall_and_a_swing_for_each_step():
 
 def test_every_frame_of_a_press_is_a_dwell_and_the_frames_above_the_skin_are_none():
     log = capture_of("press", PRESS).probe
-    plan = make_plan(Press(**PRESS | {"terms": ()}), rng_for(1, "recording", "press", "b0", "b0_s0", "plan"))
+    plan = Press(**PRESS | {"terms": ()}).plan(rng_for(1, "recording", "press", "b0", "b0_s0", "plan"), SKIN_MM)
     assert log.contact.sum() == (plan.depth_mm > 0).sum()
     dwell_s = (log.t_end_s - log.t_start_s)[log.contact]
     np.testing.assert_allclose(dwell_s, 1 / 400, rtol=1e-3)

@@ -5,7 +5,7 @@ import pytest
 
 from pipeline.core.seeds import rng_for
 from pipeline.dataset.grid import points_mm
-from pipeline.synthesis.protocols import Drag, Grid, Hand, make_plan
+from pipeline.synthesis.protocols import SKIN_MM, Drag, Grid, Hand
 
 SHARED = {"boards": "rigid", "skins_n": 1, "terms": ()}
 GRID = Grid(kind="grid", passes_n=2, depths_mm=(0.2, 0.4, 0.6, 0.8, 1.0, 1.2), **SHARED)
@@ -15,8 +15,8 @@ HAND = Hand(
 )
 
 
-def plan_of(asked, name="plan"):
-    return make_plan(asked, rng_for(0, name))
+def plan_of(protocol, name="plan"):
+    return protocol.plan(rng_for(0, name), SKIN_MM)
 
 
 def test_a_pass_over_the_grid_is_390_indentations_at_one_stop_each():
@@ -68,7 +68,7 @@ def test_a_hand_pokes_325_times_in_order_along_lines_and_nobody_knows_where():
 
 
 def test_only_a_hand_is_random():
-    for asked, alike in ((GRID, True), (DRAG, True), (HAND, False)):
-        one, other = plan_of(asked, "one"), plan_of(asked, "other")
+    for protocol, alike in ((GRID, True), (DRAG, True), (HAND, False)):
+        one, other = plan_of(protocol, "one"), plan_of(protocol, "other")
         assert np.array_equal(one.x_mm, other.x_mm) == alike
-        assert np.array_equal(plan_of(asked, "one").depth_mm, one.depth_mm)
+        assert np.array_equal(plan_of(protocol, "one").depth_mm, one.depth_mm)

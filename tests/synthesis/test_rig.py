@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.core.seeds import rng_for
-from pipeline.synthesis.protocols import Drag, Grid, make_plan
+from pipeline.synthesis.protocols import SKIN_MM, Drag, Grid
 from pipeline.synthesis.rig import Rig, chunks, draw_clock, misplace, probe_log, timeline
 from tests.synthesis.scene import SECTIONS
 
@@ -17,8 +17,9 @@ def rig(**changes):
     return Rig(**(SECTIONS["rig"] | changes))
 
 
-def plan(asked=None):
-    return make_plan(asked or Grid(kind="grid", passes_n=1, depths_mm=(0.6, 1.2), **SHARED), rng_for(0, "plan"))
+def plan(protocol=None):
+    protocol = protocol or Grid(kind="grid", passes_n=1, depths_mm=(0.6, 1.2), **SHARED)
+    return protocol.plan(rng_for(0, "plan"), SKIN_MM)
 
 
 DRAG = Drag(kind="drag", passes_n=1, depths_mm=(1.0,), step_mm=4.0, **SHARED)
@@ -51,9 +52,9 @@ def test_chunks_bring_every_frame_once_in_order_and_never_early(chunk_frames_max
     assert (arrived_s >= arrived_n / 400.0).all()
 
 
-@pytest.mark.parametrize("asked", [None, DRAG])
-def test_each_dwell_holds_its_frames_and_no_other_once_the_clocks_are_joined(asked):
-    how, one = rig(), plan(asked)
+@pytest.mark.parametrize("protocol", [None, DRAG])
+def test_each_dwell_holds_its_frames_and_no_other_once_the_clocks_are_joined(protocol):
+    how, one = rig(), plan(protocol)
     stops_n = one.x_mm.shape[1]
     frames = timeline(how, stops_n)
     offset_s, rate = clock = draw_clock(how, rng_for(1, "clock"))
@@ -68,12 +69,12 @@ def test_each_dwell_holds_its_frames_and_no_other_once_the_clocks_are_joined(ask
     np.testing.assert_array_equal(log.contact, np.tile([False] + [True] * stops_n, len(one)))
 
 
-def test_the_log_names_every_stop_of_a_line_and_the_force_felt_there():
+def test_the_log_names_every_stop_of_a_line_and_the_force_there():
     one = plan(DRAG)
-    felt_N = rng_for(0, "felt").standard_normal((len(one), 6, 3))
-    log = probe_log(one, felt_N, rig(), (0.0, 1.0))
+    force_N = rng_for(0, "force").standard_normal((len(one), 6, 3))
+    log = probe_log(one, force_N, rig(), (0.0, 1.0))
     np.testing.assert_allclose(log.x_mm[log.contact].reshape(one.x_mm.shape), one.x_mm)
-    np.testing.assert_allclose(log.Fy_N, felt_N[:, :, 1].ravel().astype(np.float32))
+    np.testing.assert_allclose(log.Fy_N, force_N[:, :, 1].ravel().astype(np.float32))
     assert not log.depth_mm[~log.contact].any()
     np.testing.assert_array_equal(log.indentation, np.repeat(np.arange(18), 6))
 

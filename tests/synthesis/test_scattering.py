@@ -9,7 +9,7 @@ from scipy.stats import kstest
 from pipeline.core.config import parse
 from pipeline.core.errors import ParamsError
 from pipeline.core.seeds import rng_for
-from pipeline.synthesis.protocols import Scatter, make_plan
+from pipeline.synthesis.protocols import Scatter
 
 SCATTER = {
     "kind": "scatter", "boards": "sleeve", "skins_n": 1, "pokes_n": 3000, "depth_mm": [0.4, 1.2], "margin_mm": 4.0,
@@ -19,7 +19,7 @@ SLEEVE_MM = (50.8, 101.6)
 
 
 def plan_of(name="plan", skin_mm=SLEEVE_MM, **changes):
-    return make_plan(parse(Scatter, SCATTER | changes, "test"), rng_for(0, name), skin_mm=skin_mm)
+    return parse(Scatter, SCATTER | changes, "test").plan(rng_for(0, name), skin_mm)
 
 
 def test_places_and_depths_are_uniform_within_the_margin():

@@ -9,7 +9,7 @@ from pipeline.physics.board import draw_board
 from pipeline.physics.change import change_of_field
 from pipeline.physics.friction import Friction
 from pipeline.physics.skin import changes_of_field, draw_skin, forces, moved_dipoles
-from pipeline.synthesis.sideways import push
+from pipeline.synthesis.contact import push
 from tests.synthesis.scene import SECTIONS, synthesis
 
 LENGTH = "skin_filler_length_mm"

@@ -8,12 +8,12 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int32
+from jaxtyping import Float64, Int32
 
 from pipeline.capture.header import Header
 from pipeline.capture.readers.chips import find_whole_rows
 from pipeline.capture.readers.passes import find_passes
-from pipeline.capture.readers.table import read_cells, to_numbers
+from pipeline.capture.readers.table import make_readings, read_cells, to_numbers
 from pipeline.capture.readers.units import check_depths, check_fields, check_forces, check_places, check_touch
 from pipeline.core.errors import CaptureError
 from pipeline.core.schema import AXES_PER_CHIP_N, Readings
@@ -61,38 +61,30 @@ def read(folder: Path, header: Header) -> tuple[Readings, Account]:
     _check_clocks(time_s, states[:, 0], header)
     temperature_degC = np.full((len(time_s), header.chips_n), np.nan, np.float32)
     rows = find_whole_rows(b_uT, temperature_degC, header, where=f"{header.capture}/{SENSOR}")
-    keep = rows.whole
     place_mm = np.round(states[:, 1:3], PLACE_DECIMALS)
     place_mm -= place_mm.min(axis=0)
     pass_i, touches_i = _number_passes(place_mm, noload_uT)
-    force_N = _read_force(states, header)
-    rows_n = int(keep.sum())
-    readings = Readings(
-        capture=header.capture,
-        board=header.board,
-        skin=header.skin,
-        source=header.source,
-        indentation=np.flatnonzero(keep).astype(np.int32),
-        pass_i=pass_i[keep],
-        reading_i=np.zeros(rows_n, np.int32),
-        x_mm=place_mm[keep, 0].astype(np.float32),
-        y_mm=place_mm[keep, 1].astype(np.float32),
-        depth_mm=_read_depth(states, header)[keep],
-        Fx_N=force_N["x"][keep],
-        Fy_N=force_N["y"][keep],
-        Fz_N=force_N["z"][keep],
-        b_uT=b_uT[keep].astype(np.float32),
-        noload_uT=noload_uT[keep].astype(np.float32),
-        temperature_degC=temperature_degC[keep],
-        t_s=time_s[keep],
-        n_contacts=(header.contacts_before_n + touches_i[keep]).astype(np.int32),
+    readings = make_readings(
+        header,
+        rows.whole,
+        indentation=np.arange(len(time_s)),
+        pass_i=pass_i,
+        x_mm=place_mm[:, 0],
+        y_mm=place_mm[:, 1],
+        **_read_force(states, header),
+        depth_mm=_read_depth(states, header),
+        b_uT=b_uT,
+        noload_uT=noload_uT,
+        temperature_degC=temperature_degC,
+        t_s=time_s,
+        n_contacts=header.contacts_before_n + touches_i,
     )
     return readings, {
-        "rows_n": rows_n,
-        "rows_read_n": len(keep),
+        "rows_n": len(readings),
+        "rows_read_n": len(time_s),
         "noload_rows_n": 0,
         **rows.losses(),
-        "no_new_force_rows_n": _count_no_new_force(states[keep]),
+        "no_new_force_rows_n": int((states[rows.whole, WEIGHT_COLUMN:] == NO_NEW_WEIGHT).sum()),
         "passes_n": int(pass_i.max()) + 1,
     }
 
@@ -101,9 +93,11 @@ def _read_fields(
     folder: Path, header: Header
 ) -> tuple[Float64[np.ndarray, " f"], Float64[np.ndarray, "f ch"], Float64[np.ndarray, "f ch"]]:
     """Read times, raw fields and no-load fields; both files of the sensor must hold the same times."""
-    channels = [f"B{axis}{chip}" for chip in range(header.chips_n) for axis in "xyz"]
-    sensor = _read_numbers(folder, header, SENSOR, ["time", *channels])
-    changes = _read_numbers(folder, header, CHANGES, ["time", *channels])
+    names = ["time", *(f"B{axis}{chip}" for chip in range(header.chips_n) for axis in "xyz")]
+    sensor, changes = (
+        to_numbers(read_cells(folder / name, where, separator=","), where, names=names)
+        for name, where in ((name, f"{header.capture}/{name}") for name in (SENSOR, CHANGES))
+    )
     _check_rows_n({SENSOR: len(sensor), CHANGES: len(changes)}, header)
     differ = np.flatnonzero(sensor[:, 0] != changes[:, 0])
     if len(differ):
@@ -119,15 +113,10 @@ def _read_states(folder: Path, header: Header) -> Float64[np.ndarray, "f c"]:
     where = f"{header.capture}/{STATES}"
     cells = read_cells(folder / STATES, where, separator=",")
     names = ["time", "x", "y", "z"] + (["weight"] if len(cells[0]) > WEIGHT_COLUMN else [])
-    states = to_numbers(cells, where, names=names, first_line_n=1)
+    states = to_numbers(cells, where, names=names)
     check_places(states[:, 1:3], where)
     check_depths(states[:, 3] - states[:, 3].min(), where)
     return states
-
-
-def _read_numbers(folder: Path, header: Header, name: str, names: list[str]) -> Float64[np.ndarray, "f c"]:
-    where = f"{header.capture}/{name}"
-    return to_numbers(read_cells(folder / name, where, separator=","), where, names=names, first_line_n=1)
 
 
 def _check_rows_n(rows_n: Mapping[str, int], header: Header) -> None:
@@ -140,14 +129,12 @@ def _check_clocks(sensor_s: Float64[np.ndarray, " f"], states_s: Float64[np.ndar
     """Rows pair in order, so the clocks must agree row by row, and go on."""
     apart = np.flatnonzero(np.abs(states_s - sensor_s) >= CLOCKS_APART_MAX_s)
     if len(apart):
+        where, rule = f"{header.capture}/{STATES}", f"within {CLOCKS_APART_MAX_s} s of {SENSOR}"
         got = f"{states_s[apart[0]] - sensor_s[apart[0]]:.3f} s in line {apart[0] + 1}"
-        rule = f"within {CLOCKS_APART_MAX_s} s of {SENSOR}"
-        where = f"{header.capture}/{STATES}"
         raise CaptureError(where, "time", rule, got, "Is a row missing in one of the files?")
     back = np.flatnonzero(np.diff(sensor_s) <= 0)
     if len(back):
-        where = f"{header.capture}/{SENSOR}"
-        got = f"an earlier one in line {back[0] + 2}"
+        where, got = f"{header.capture}/{SENSOR}", f"an earlier one in line {back[0] + 2}"
         raise CaptureError(where, "time", "later in each line", got, "Were two recordings joined?")
 
 
@@ -167,30 +154,22 @@ def _number_passes(
     return pass_i, pass_i
 
 
-def _read_force(states: Float64[np.ndarray, "f c"], header: Header) -> dict[str, Float32[np.ndarray, " f"]]:
-    """Give the force by axis, NaN where no gauge looked or had no new reading."""
-    force_N = {axis: np.full(len(states), np.nan, np.float32) for axis in FORCE_AXES}
+def _read_force(states: Float64[np.ndarray, "f c"], header: Header) -> dict[str, Float64[np.ndarray, " f"]]:
+    """Give the force along the gauge's axis by its column, NaN where it had no new reading; nothing without a gauge."""
     if states.shape[1] <= WEIGHT_COLUMN:
-        return force_N
+        return {}
     if "force_axis" not in header.options or header.options["force_axis"] not in FORCE_AXES:
         got = header.options if header.options else "no option"
         remedy = "Say which force the gauge measured."
         raise CaptureError(header.capture, "option force_axis", "x, y or z", got, remedy)
-    weight_g = states[:, WEIGHT_COLUMN]
+    weight_g, where = states[:, WEIGHT_COLUMN], f"{header.capture}/{STATES}"
     weight_N = np.where(weight_g == NO_NEW_WEIGHT, np.nan, weight_g * NEWTON_PER_GRAM)
-    where = f"{header.capture}/{STATES}"
     check_forces(weight_N, where, first_line_n=1)
     check_touch(weight_N, where)
-    force_N[header.options["force_axis"]] = weight_N.astype(np.float32)
-    return force_N
+    return {f"F{header.options['force_axis']}_N": weight_N}
 
 
-def _read_depth(states: Float64[np.ndarray, "f c"], header: Header) -> Float32[np.ndarray, " f"]:
+def _read_depth(states: Float64[np.ndarray, "f c"], header: Header) -> Float64[np.ndarray, " f"]:
     """Count down from the highest z; NaN where the gauge measured along the skin, as that stroke is no depth."""
     along = states.shape[1] > WEIGHT_COLUMN and header.options["force_axis"] != "z"
-    depth_mm = np.full(len(states), np.nan) if along else states[:, 3].max() - states[:, 3]
-    return depth_mm.astype(np.float32)
-
-
-def _count_no_new_force(states: Float64[np.ndarray, "f c"]) -> int:
-    return int((states[:, WEIGHT_COLUMN:] == NO_NEW_WEIGHT).sum())
+    return np.full(len(states), np.nan) if along else states[:, 3].max() - states[:, 3]

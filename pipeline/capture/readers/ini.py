@@ -7,7 +7,6 @@ If the header says that fields come late (`rows_late`), row i of the truths goes
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int32
@@ -15,7 +14,7 @@ from jaxtyping import Bool, Float64, Int32
 from pipeline.capture.header import Header
 from pipeline.capture.readers.chips import Rows, find_whole_rows
 from pipeline.capture.readers.passes import find_passes
-from pipeline.capture.readers.table import read_cells, to_numbers
+from pipeline.capture.readers.table import make_readings, mean_by_group, read_cells, to_numbers
 from pipeline.capture.readers.units import check_fields, check_forces, check_places, check_touch
 from pipeline.core.errors import CaptureError
 from pipeline.core.schema import Readings
@@ -28,17 +27,6 @@ VALUES_PER_CHIP_N = 4
 ROWS_LATE = ("0", "1", "2", "3", "4", "5")
 
 Account = dict[str, int]
-
-
-class _Pairs(NamedTuple):
-    """Rows of both files that belong together; those without a partner are left out."""
-
-    b_uT: Float64[np.ndarray, "f ch"]
-    temperature_degC: Float64[np.ndarray, "f k"]
-    truths: Float64[np.ndarray, "f 3"]  # x mm, y mm, F N
-    rows: Rows
-    rows_late_n: int
-    best_rows_late_n: int
 
 
 def collect(recording: Path) -> dict[str, Path]:
@@ -65,71 +53,49 @@ def count_chips(files: Mapping[str, Path]) -> int:
 
 def read(folder: Path, header: Header) -> tuple[Readings, Account]:
     """Read all rows but those with a failed chip; the no-load field of a row is the mean of its pass's corner rows."""
-    pairs = _read_pairs(folder, header)
-    b_uT, truths, keep = pairs.b_uT, pairs.truths, pairs.rows.whole
+    late_n = _rows_late(header)
+    b_uT, temperature_degC = _read_fields(folder, header)
+    truths = _read_truths(folder, header)
+    _check_rows_n(len(b_uT), len(truths), late_n, header)
+    rows = find_whole_rows(b_uT, temperature_degC, header, where=f"{header.capture}/{READINGS}")
+    best_late_n = _best_rows_late(b_uT, truths[:, 2], rows)
+    truths, rows = truths[: len(truths) - late_n], rows.part(slice(late_n, None))
+    b_uT, temperature_degC, keep = b_uT[late_n:], temperature_degC[late_n:], rows.whole
     contact = truths[:, 2] >= CONTACT_MIN_N
     pass_i = find_passes(truths[:, :2], contact)
     corner = _corner_rows(pass_i, contact)
-    noload_uT = _noload_field(b_uT, pass_i, corner & keep, header)
-    place_mm = np.where(contact[:, None], truths[:, :2], np.nan).astype(np.float32)
-    rows_n = int(keep.sum())
-    unknown = np.full(rows_n, np.nan)
-    readings = Readings(
-        capture=header.capture,
-        board=header.board,
-        skin=header.skin,
-        source=header.source,
-        indentation=np.flatnonzero(keep).astype(np.int32),
-        pass_i=pass_i[keep],
-        reading_i=np.zeros(rows_n, np.int32),
-        x_mm=place_mm[keep, 0],
-        y_mm=place_mm[keep, 1],
-        depth_mm=unknown.astype(np.float32),
-        Fx_N=unknown.astype(np.float32),
-        Fy_N=unknown.astype(np.float32),
-        Fz_N=np.where(contact, truths[:, 2], 0.0)[keep].astype(np.float32),
-        b_uT=b_uT[keep].astype(np.float32),
-        noload_uT=noload_uT[keep].astype(np.float32),
-        temperature_degC=pairs.temperature_degC[keep].astype(np.float32),
-        t_s=unknown,
-        n_contacts=(header.contacts_before_n + np.cumsum(contact) - contact)[keep].astype(np.int32),
+    place_mm = np.where(contact[:, None], truths[:, :2], np.nan)
+    readings = make_readings(
+        header,
+        keep,
+        indentation=np.arange(len(keep)),
+        pass_i=pass_i,
+        x_mm=place_mm[:, 0],
+        y_mm=place_mm[:, 1],
+        Fz_N=np.where(contact, truths[:, 2], 0.0),
+        b_uT=b_uT,
+        noload_uT=_noload_field(b_uT, pass_i, corner & keep, header),
+        temperature_degC=temperature_degC,
+        n_contacts=header.contacts_before_n + np.cumsum(contact) - contact,
     )
     return readings, {
-        "rows_n": rows_n,
-        "rows_read_n": len(keep) + pairs.rows_late_n,
-        **pairs.rows.losses(),
-        "dropped_no_partner_rows_n": pairs.rows_late_n,
+        "rows_n": len(readings),
+        "rows_read_n": len(keep) + late_n,
+        **rows.losses(),
+        "dropped_no_partner_rows_n": late_n,
         "noload_rows_n": 0,
         "no_contact_rows_n": int((keep & ~contact).sum()),
         "corner_rows_n": int((keep & corner).sum()),
         "passes_n": int(pass_i.max()) + 1,
-        "best_rows_late_n": pairs.best_rows_late_n,
+        "best_rows_late_n": best_late_n,
     }
-
-
-def _read_pairs(folder: Path, header: Header) -> _Pairs:
-    """Read both files, and pair their rows as the header says."""
-    rows_late_n = _rows_late(header)
-    b_uT, temperature_degC = _read_fields(folder, header)
-    truths = _read_truths(folder, header)
-    _check_rows_n(len(b_uT), len(truths), rows_late_n, header)
-    rows = find_whole_rows(b_uT, temperature_degC, header, where=f"{header.capture}/{READINGS}")
-    late = slice(rows_late_n, None)
-    return _Pairs(
-        b_uT=b_uT[late],
-        temperature_degC=temperature_degC[late],
-        truths=truths[: len(truths) - rows_late_n],
-        rows=rows.part(late),
-        rows_late_n=rows_late_n,
-        best_rows_late_n=_best_rows_late(b_uT, truths[:, 2], rows),
-    )
 
 
 def _read_fields(folder: Path, header: Header) -> tuple[Float64[np.ndarray, "f ch"], Float64[np.ndarray, "f k"]]:
     """Read fields and temperatures, chip by chip."""
     names = [f"{value}{chip}" for chip in range(header.chips_n) for value in ("Bx", "By", "Bz", "T")]
     where = f"{header.capture}/{READINGS}"
-    numbers = to_numbers(read_cells(folder / READINGS, where, separator=None), where, names=names, first_line_n=1)
+    numbers = to_numbers(read_cells(folder / READINGS, where, separator=None), where, names=names)
     per_chip = numbers.reshape(len(numbers), header.chips_n, VALUES_PER_CHIP_N)
     b_uT = per_chip[:, :, :3].reshape(len(numbers), -1)
     check_fields(b_uT, where, first_line_n=1)
@@ -139,8 +105,7 @@ def _read_fields(folder: Path, header: Header) -> tuple[Float64[np.ndarray, "f c
 def _read_truths(folder: Path, header: Header) -> Float64[np.ndarray, "f 3"]:
     """Read x mm, y mm, F N."""
     where = f"{header.capture}/{TRUTHS}"
-    cells = read_cells(folder / TRUTHS, where, separator=None)
-    truths = to_numbers(cells, where, names=["x_mm", "y_mm", "F_N"], first_line_n=1)
+    truths = to_numbers(read_cells(folder / TRUTHS, where, separator=None), where, names=["x_mm", "y_mm", "F_N"])
     check_forces(truths[:, 2], where, first_line_n=1)
     check_touch(truths[:, 2], where)
     check_places(truths[truths[:, 2] >= CONTACT_MIN_N, :2], where)
@@ -187,20 +152,13 @@ def _corner_rows(pass_i: Int32[np.ndarray, " f"], contact: Bool[np.ndarray, " f"
 
 
 def _noload_field(
-    b_uT: Float64[np.ndarray, "f ch"],
-    pass_i: Int32[np.ndarray, " f"],
-    corner: Bool[np.ndarray, " f"],
-    header: Header,
+    b_uT: Float64[np.ndarray, "f ch"], pass_i: Int32[np.ndarray, " f"], corner: Bool[np.ndarray, " f"], header: Header
 ) -> Float64[np.ndarray, "f ch"]:
     """Give each row the mean field of the corner rows of its pass."""
-    passes_n = int(pass_i.max()) + 1
-    rows_n = np.bincount(pass_i[corner], minlength=passes_n)
-    without = np.flatnonzero(rows_n == 0)
+    noload_uT = mean_by_group(b_uT[corner], pass_i[corner], int(pass_i.max()) + 1)
+    without = np.flatnonzero(np.isnan(noload_uT[:, 0]))
     if len(without):
         got = f"none in the pass from line {int(np.argmax(pass_i == without[0])) + 1}"
-        where = f"{header.capture}/{TRUTHS}"
-        rule = f"begun by a whole row without contact (F < {CONTACT_MIN_N} N)"
+        where, rule = f"{header.capture}/{TRUTHS}", f"begun by a whole row without contact (F < {CONTACT_MIN_N} N)"
         raise CaptureError(where, "each pass", rule, got, "Start each pass off the skin, or cut this pass out.")
-    sums_uT = np.zeros((passes_n, b_uT.shape[1]))
-    np.add.at(sums_uT, pass_i[corner], b_uT[corner])
-    return (sums_uT / rows_n[:, None])[pass_i]
+    return noload_uT[pass_i]

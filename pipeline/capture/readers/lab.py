@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float64, Int
 
 from pipeline.capture.header import Header
 from pipeline.capture.readers.chips import find_whole_rows
-from pipeline.capture.readers.table import read_cells, to_numbers
+from pipeline.capture.readers.table import make_readings, mean_by_group, read_cells, to_numbers
 from pipeline.capture.readers.units import check_fields, check_forces, check_places, check_touch
 from pipeline.core.errors import CaptureError
 from pipeline.core.schema import Readings
@@ -35,8 +35,8 @@ class _Table:
     press: Int[np.ndarray, " f"]
     contact: Bool[np.ndarray, " f"]
     place_mm: Float64[np.ndarray, "f 2"]
-    b_uT: Float64[np.ndarray, "f ch"]
     temperature_degC: Float64[np.ndarray, "f k"]
+    b_uT: Float64[np.ndarray, "f ch"]
     force_N: Float64[np.ndarray, "f 3"]
     ignored_columns_n: int
 
@@ -62,31 +62,32 @@ def read(folder: Path, header: Header) -> tuple[Readings, Account]:
         raise CaptureError(where, "chips", f"{header.chips_n}, as in the header", got, "Mend header or file.")
     rows = find_whole_rows(table.b_uT, table.temperature_degC, header, where=where)
     keep, noload = table.contact & rows.whole, ~table.contact & rows.whole
-    noload_uT = _noload_field(table, noload, where)
-    rows_n = int(keep.sum())
-    unknown = np.full(rows_n, np.nan)
-    readings = Readings(
-        capture=header.capture,
-        board=header.board,
-        skin=header.skin,
-        source=header.source,
-        indentation=table.press[keep].astype(np.int32),
-        pass_i=np.zeros(rows_n, np.int32),
-        reading_i=_count_within(table.press[keep]).astype(np.int32),
-        x_mm=table.place_mm[keep, 0].astype(np.float32),
-        y_mm=table.place_mm[keep, 1].astype(np.float32),
-        depth_mm=unknown.astype(np.float32),
-        Fx_N=table.force_N[keep, 0].astype(np.float32),
-        Fy_N=table.force_N[keep, 1].astype(np.float32),
-        Fz_N=-table.force_N[keep, 2].astype(np.float32),
-        b_uT=table.b_uT[keep].astype(np.float32),
-        noload_uT=noload_uT[table.press[keep]].astype(np.float32),
-        temperature_degC=table.temperature_degC[keep].astype(np.float32),
-        t_s=unknown,
-        n_contacts=(header.contacts_before_n + table.press[keep]).astype(np.int32),
+    noload_uT = mean_by_group(table.b_uT[noload], table.press[noload], int(table.press[-1]) + 1)
+    without = np.flatnonzero(np.isnan(noload_uT[:, 0]))
+    if len(without):
+        got = f"none in the block from line {FIRST_LINE_N + int(np.argmax(table.press == without[0]))}"
+        remedy = "Remove the block, or record it again."
+        raise CaptureError(where, "each indent", "given noload rows that were read", got, remedy)
+    reading_i = np.zeros(len(keep), int)
+    reading_i[keep] = _count_within(table.press[keep])
+    readings = make_readings(
+        header,
+        keep,
+        indentation=table.press,
+        pass_i=np.zeros(len(keep)),
+        reading_i=reading_i,
+        x_mm=table.place_mm[:, 0],
+        y_mm=table.place_mm[:, 1],
+        Fx_N=table.force_N[:, 0],
+        Fy_N=table.force_N[:, 1],
+        Fz_N=-table.force_N[:, 2],
+        b_uT=table.b_uT,
+        noload_uT=noload_uT[table.press],
+        temperature_degC=table.temperature_degC,
+        n_contacts=header.contacts_before_n + table.press,
     )
     return readings, {
-        "rows_n": rows_n,
+        "rows_n": len(readings),
         "rows_read_n": len(keep),
         "noload_rows_n": int(noload.sum()),
         **rows.losses(),
@@ -100,31 +101,18 @@ def _count_chips(names: list[str]) -> int:
 
 
 def _read_table(path: Path, where: str) -> _Table:
-    cells = read_cells(path, where, separator=",")
-    names = [name.strip() for name in cells[0]]
-    chips_n = _count_chips(names)
-    fields = [f"{axis}{chip}" for chip in range(chips_n) for axis in ("Bx", "By", "Bz")]
-    temperatures = [f"T{chip}" for chip in range(chips_n)]
-    wanted = ["indent", "phase", "x_mm", "y_mm", *temperatures, *fields, "Fx", "Fy", "Fz"]
-    _check_columns(names, wanted, where)
-    contact = _contact_rows([row[names.index("phase")].strip() for row in cells[1:]], where)
-    numeric = [name for name in wanted if name != "phase"]
+    header_cells, *cells = read_cells(path, where, separator=",")
+    names = [name.strip() for name in header_cells]
+    k = _count_chips(names)
+    fields = [f"{axis}{chip}" for chip in range(k) for axis in ("Bx", "By", "Bz")]
+    numeric = ["indent", "x_mm", "y_mm", *(f"T{chip}" for chip in range(k)), *fields, "Fx", "Fy", "Fz"]
+    _check_columns(names, [numeric[0], "phase", *numeric[1:]], where)
+    contact = _contact_rows([row[names.index("phase")].strip() for row in cells], where)
     columns = [names.index(name) for name in numeric]
-    picked = [[row[i] for i in columns] for row in cells[1:]]
+    picked = [[row[i] for i in columns] for row in cells]
     numbers = to_numbers(picked, where, names=numeric, first_line_n=FIRST_LINE_N)
-
-    def pick(chosen: list[str]) -> Float64[np.ndarray, "f c"]:
-        return numbers[:, [numeric.index(name) for name in chosen]]
-
-    table = _Table(
-        press=_number_presses(numbers[:, 0], where),
-        contact=contact,
-        place_mm=pick(["x_mm", "y_mm"]),
-        b_uT=pick(fields),
-        temperature_degC=pick(temperatures),
-        force_N=pick(["Fx", "Fy", "Fz"]),
-        ignored_columns_n=len(names) - len(wanted),
-    )
+    indent, *parts = np.split(numbers, [1, 3, 3 + k, 3 + 4 * k], axis=1)
+    table = _Table(_number_presses(indent[:, 0], where), contact, *parts, len(names) - len(numeric) - 1)
     _check_table(table, where)
     return table
 
@@ -176,20 +164,6 @@ def _check_table(table: _Table, where: str) -> None:
     if len(moved):
         got = f"another in line {FIRST_LINE_N + moved[0]}"
         raise CaptureError(where, "an indent's place", "one x_mm, y_mm", got, "Give each press its own indent.")
-
-
-def _noload_field(table: _Table, noload: Bool[np.ndarray, " f"], where: str) -> Float64[np.ndarray, "n ch"]:
-    """Give each press the mean field of its no-load rows."""
-    of_press = table.press[noload]
-    rows_n = np.bincount(of_press, minlength=table.press[-1] + 1)
-    without = np.flatnonzero(rows_n == 0)
-    if len(without):
-        got = f"none in the block from line {FIRST_LINE_N + int(np.argmax(table.press == without[0]))}"
-        remedy = "Remove the block, or record it again."
-        raise CaptureError(where, "each indent", "given noload rows that were read", got, remedy)
-    sums_uT = np.zeros((len(rows_n), table.b_uT.shape[1]))
-    np.add.at(sums_uT, of_press, table.b_uT[noload])
-    return sums_uT / rows_n[:, None]
 
 
 def _count_within(press: Int[np.ndarray, " f"]) -> Int[np.ndarray, " f"]:

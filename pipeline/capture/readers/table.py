@@ -1,16 +1,18 @@
 """The text tables of other people's recordings. In: a file. Out: its cells and numbers, or the line that is wrong.
 
-A recording that was cut, emptied or overwritten must never become a shorter one without a word.
-Refuses to know what a column means.
+A recording that was cut, emptied or overwritten must never become a shorter one without a word. Numbers that are known
+become `Readings`, all else NaN. Refuses to know what a column of a file means.
 """
 
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64, Int, Shaped
 
+from pipeline.capture.header import Header
 from pipeline.core.errors import CaptureError
+from pipeline.core.schema import UNITS, Readings
 
 # No reading, place or unix time of these recordings comes near it; float32 holds it without overflow.
 MAGNITUDE_MAX = 1e10
@@ -28,7 +30,7 @@ def read_cells(path: Path, where: str, *, separator: str | None) -> list[list[st
 
 
 def to_numbers(
-    cells: list[list[str]], where: str, *, names: Sequence[str], first_line_n: int
+    cells: list[list[str]], where: str, *, names: Sequence[str], first_line_n: int = 1
 ) -> Float64[np.ndarray, "f c"]:
     """Turn cells into finite numbers; `names` are the columns', `first_line_n` the file's line of `cells[0]`."""
     if cells and len(cells[0]) != len(names):
@@ -43,6 +45,32 @@ def to_numbers(
     if not (np.abs(numbers) < MAGNITUDE_MAX).all():
         raise _first_fault(cells, where, names, first_line_n)
     return numbers
+
+
+def make_readings(
+    header: Header, keep: Bool[np.ndarray, " rows"], **columns: Shaped[np.ndarray, "rows ..."]
+) -> Readings:
+    """Make readings of the rows to keep; a column that is not given is unknown, and `reading_i` 0."""
+    columns = {"reading_i": np.zeros(len(keep)), **columns}
+    unknown = np.full(len(keep), np.nan)
+    typed = {name: columns.get(name, unknown)[keep].astype(_dtype(name)) for name in UNITS}
+    return Readings(capture=header.capture, board=header.board, skin=header.skin, source=header.source, **typed)
+
+
+def mean_by_group(
+    b_uT: Float64[np.ndarray, "f ch"], group_i: Int[np.ndarray, " f"], groups_n: int
+) -> Float64[np.ndarray, "n ch"]:
+    """Give the mean field of each group of rows; NaN for a group without rows."""
+    sums_uT = np.zeros((groups_n, b_uT.shape[1]))
+    np.add.at(sums_uT, group_i, b_uT)
+    rows_n = np.bincount(group_i, minlength=groups_n)[:, None]
+    return np.divide(sums_uT, rows_n, out=np.full(sums_uT.shape, np.nan), where=rows_n > 0)
+
+
+def _dtype(name: str) -> type[np.generic]:
+    if name == "t_s":
+        return np.float64
+    return np.int32 if UNITS[name] == "1" else np.float32
 
 
 def _read_text(path: Path, where: str) -> str:

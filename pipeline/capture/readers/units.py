@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.capture import faults
+from pipeline.capture.columns import FIRST_ROW
+from pipeline.capture.probe import ProbeLog
 from pipeline.core.errors import CaptureError
 
 # MLX90393 data sheet, table 17: 16 bits of the coarsest step, 9.680 uT (z, GAIN_SEL 0, RES 3).
@@ -79,6 +81,21 @@ def check_depths(depth_mm: Float[np.ndarray, " f"], where: str) -> None:
     if deepest_mm and not DEPTH_MIN_mm <= deepest_mm <= DEPTH_MAX_mm:
         rule = f"{DEPTH_MIN_mm:g} to {DEPTH_MAX_mm:g} mm where it is greatest"
         raise CaptureError(where, "depth", rule, f"{deepest_mm:.4g}", "Convert m or um to mm.")
+
+
+def check_log(log: ProbeLog, where: str) -> None:
+    """Raise if places, depths or forces of the contacts are not in mm and N, or compression is negative."""
+    contact = log.contact
+    force_N = np.stack([log.Fx_N, log.Fy_N, log.Fz_N], axis=1)
+    for axis_N in force_N.T:
+        check_forces(axis_N, where, first_line_n=FIRST_ROW)
+    check_touch(force_N[contact], where)
+    check_places(np.stack([log.x_mm, log.y_mm], axis=1)[contact], where)
+    check_depths(log.depth_mm[contact], where)
+    known_N = log.Fz_N[contact & np.isfinite(log.Fz_N)]
+    if len(known_N) and np.median(known_N) < 0:
+        got = f"{np.median(known_N):.4g} N"
+        raise CaptureError(where, "the usual Fz_N in contact", "positive", got, "Turn its sign.")
 
 
 def _find_step(b_uT: Float[np.ndarray, "f ch"]) -> float:

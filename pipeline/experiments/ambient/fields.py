@@ -17,7 +17,7 @@ from pipeline.evaluation.inference import summarise_boards
 from pipeline.physics.ambient import EARTH_T, ball_field, ball_images, directions
 from pipeline.physics.board import Board, BoardDesign, draw_board
 from pipeline.physics.skin import Skin
-from pipeline.synthesis.capture import Synthesis
+from pipeline.synthesis.settings import Synthesis
 
 REFERENCE_ASIDE_MM = 30.0  # the lone chip, from the board's middle along x: assumed far enough to read no poke
 

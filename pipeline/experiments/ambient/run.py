@@ -28,12 +28,11 @@ from pipeline.experiments.ambient.fields import (
     without_common_part,
 )
 from pipeline.experiments.answer import write_answer
-from pipeline.learning.card import went
+from pipeline.learning.card import collapse_record
 from pipeline.learning.recipe import HEADLINE, Training, training
 from pipeline.physics.ambient import EARTH_DIP_DEG, EARTH_SIZE_T
 from pipeline.physics.skin import draw_skin
-from pipeline.synthesis.capture import Synthesis
-from pipeline.synthesis.of_settings import synthesis_of
+from pipeline.synthesis.settings import Synthesis, synthesis_of
 from pipeline.trials.data import SceneData, read_data, train_all, trials_of
 from pipeline.trials.networks import Network, networks_without
 
@@ -68,7 +67,7 @@ def networks_of_common_part(
         Network({"recipe": trial.recipe.model_dump(mode="json")}, {**one.weights, **one.scaler.arrays()})
         for trial, one in zip(trials, trained, strict=True)
     ]
-    return networks, tally(map(went, trained))
+    return networks, tally(map(collapse_record, trained))
 
 
 def on_board(

@@ -15,9 +15,8 @@ from pipeline.core.seeds import rng_for
 from pipeline.core.stage import run, say
 from pipeline.evaluation.choice import settings_of, trimmed
 from pipeline.experiments.audit.sides import Check, Labels, Sides, audit_fold, holds, to_words
-from pipeline.learning.inputs import VIEW
+from pipeline.learning.inputs import FIT, VIEW
 from pipeline.learning.recipe import HEADLINE, AuditSettings
-from pipeline.learning.standardise import FIT
 from pipeline.trials.data import SceneData, read_data
 
 # The same rows give the same scaler but for the order of float64 sums, and that turns the last bit of a float32 at

@@ -28,7 +28,7 @@ from pipeline.experiments.contacts.pairs import (
 )
 from pipeline.experiments.contacts.superposition import superposition
 from pipeline.learning.inputs import shape
-from pipeline.synthesis.of_settings import synthesis_of
+from pipeline.synthesis.settings import synthesis_of
 from pipeline.trials.data import SceneData, read_data
 from pipeline.trials.networks import networks_without
 

@@ -16,7 +16,8 @@ from pipeline.physics import flow_map
 from pipeline.physics.board import Board, draw_board
 from pipeline.physics.change import change_of_field
 from pipeline.physics.skin import Dipoles, Skin, draw_skin
-from pipeline.synthesis.capture import MAIN, Synthesis, roster
+from pipeline.synthesis.capture import roster
+from pipeline.synthesis.settings import MAIN, Synthesis
 
 PAIRS_N = 6  # of each distance, drawn
 MIDDLE_MM = 2.0  # a pair's middle lies so near the skin's, each axis

@@ -13,9 +13,8 @@ from pipeline.core.config import Files, Settings, Strict, read_settings
 from pipeline.core.schema import Readings
 from pipeline.core.stage import run
 from pipeline.dataset import baseline
-from pipeline.dataset.parts import TRAIN, Part, Policy, lay_parts, stack
 from pipeline.dataset.rows import Selection
-from pipeline.dataset.windows import Windows, check_one_each, lay_windows
+from pipeline.dataset.windows import TRAIN, Part, Policy, Windows, check_one_each, lay_parts, lay_windows, stack
 from pipeline.evaluation.tally import tally
 from pipeline.experiments.answer import read_folder, read_losses, write_answer
 from pipeline.experiments.drift.findings import findings
@@ -31,7 +30,7 @@ from pipeline.experiments.drift.windows import (
     over_windows,
     pace,
 )  # fmt: skip
-from pipeline.learning.card import went
+from pipeline.learning.card import collapse_record
 from pipeline.learning.recipe import HEADLINE, Training, with_training
 from pipeline.learning.trial import Trained, Trial
 from pipeline.trials.data import SceneData, train_all
@@ -135,7 +134,9 @@ def drift(scene: str, files: Files, indentations: Path, answer: Path) -> None:
     numbers = {name: value for name, value in words.items() if value is not None} | counts | pace(captures)
     variants = {name: own for name, own in rows.items() if name != HEADLINE}
     numbers |= {"left_out_units_n": windows.left_out_units_n} | told | ({"variants": variants} if variants else {})
-    write_answer(answer, numbers, drawn, read_losses(indentations, numbers["dropped"]), tally(map(went, trained)))
+    write_answer(
+        answer, numbers, drawn, read_losses(indentations, numbers["dropped"]), tally(map(collapse_record, trained))
+    )
 
 
 def _tell(

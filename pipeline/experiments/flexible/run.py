@@ -12,9 +12,8 @@ from pipeline.core.config import Files, parse_parts, read_settings
 from pipeline.core.schema import Readings
 from pipeline.core.seeds import rng_for
 from pipeline.core.stage import run
-from pipeline.dataset.rows import Selection, gather
+from pipeline.dataset.rows import Selection, gather, stack
 from pipeline.dataset.splits import Split, hold_out_skins
-from pipeline.dataset.stacked import stack
 from pipeline.evaluation.statistic import statistic
 from pipeline.experiments.answer import read_folder, read_losses, write_answer
 from pipeline.learning.recipe import HEADLINE

@@ -7,7 +7,7 @@ from pipeline.core import io
 from pipeline.core.config import Files, read_settings
 from pipeline.core.stage import run, say
 from pipeline.experiments.left_out.terms import measure
-from pipeline.synthesis.of_settings import synthesis_of
+from pipeline.synthesis.settings import synthesis_of
 
 
 def left_out(scene: str, files: Files, answer: Path) -> None:

@@ -4,16 +4,17 @@ In: a scene's synthesis. Out: `Omission`s, each measured on the scene's own firs
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
+from magpylib.core import magnet_cuboid_Bfield
 from scipy.constants import micro, milli
 from scipy.spatial.transform import Rotation
 
 from pipeline.core.seeds import rng_for
 from pipeline.dataset.grid import CENTRE_MM
-from pipeline.experiments.runtime import lattices
+from pipeline.experiments.runtime.trials import box_m, midpoints
 from pipeline.physics import flow, layer, magnet, nodes, sensor, warmth
 from pipeline.physics.board import Board, draw_board
 from pipeline.physics.change import change_of_field
@@ -21,11 +22,10 @@ from pipeline.physics.friction import Friction
 from pipeline.physics.skin import Skin, beyond_verified_n, changes_of_field, draw_skin, forces, moved_dipoles
 from pipeline.physics.viscoelastic import Relaxation
 from pipeline.physics.wear import Ageing
-from pipeline.synthesis.capture import MAIN, Synthesis, roster
-from pipeline.synthesis.felt import Felt, Terms, feel
-from pipeline.synthesis.plans import Plan
-from pipeline.synthesis.protocols import make_plan
-from pipeline.synthesis.sideways import push
+from pipeline.synthesis.capture import roster
+from pipeline.synthesis.contact import Response, Terms, push, respond
+from pipeline.synthesis.protocols import Plan
+from pipeline.synthesis.settings import MAIN, Synthesis
 
 # Sizes of the terms that a scene leaves out: the design values of PHYSICS 5 (assumed there).
 AGEING = Ageing(settling=0.10, ageing=0.01, fading_per_decade=0.005, wandering_uT=0.2)
@@ -69,48 +69,35 @@ def measure(of: Synthesis, *, seed: int) -> list[Omission]:
     """Measure every term of PHYSICS 8 on a scene."""
     subject = _subject(of, seed)
     without = _feel(subject, Terms(), seed)
-    asked_for = (
-        *_over_time(subject, without, seed),
-        _temperature(subject, without),
-        _friction(subject),
-    )
+    of_protocols = *_over_time(subject, without, seed), _temperature(subject, without), _friction(subject)
     return [
-        *(_sorted_out(omission, of) for omission in asked_for),
-        _earth(without),
-        *_inside(subject),
-        *_free_edge(subject),
-        _steps(without, of),
-        _own_field(subject, of),
+        *(_by_protocol(omission, of) for omission in of_protocols),
+        _earth(without), *_inside(subject), *_free_edge(subject), _steps(without, of), _own_field(subject, of),
         _too_deep(of, seed),
-    ]
+    ]  # fmt: skip
 
 
-def _sorted_out(omission: Omission, of: Synthesis) -> Omission:
+def _by_protocol(omission: Omission, of: Synthesis) -> Omission:
     """Name the protocols that leave a term out, and those that compute it."""
-    computed = {name: omission.term in protocol.terms for name, protocol in of.protocols.items()}
+    computed = tuple(name for name, protocol in of.protocols.items() if omission.term in protocol.terms)
     return replace(
-        omission,
-        left_out_by=tuple(name for name, used in computed.items() if not used),
-        computed_by=tuple(name for name, used in computed.items() if used),
+        omission, left_out_by=tuple(name for name in of.protocols if name not in computed), computed_by=computed
     )
 
 
 def _subject(of: Synthesis, seed: int) -> Subject:
-    protocol, kind = of.main, of.main_boards
-    board, skin = roster(of, MAIN)[0]
-    plan = make_plan(protocol, rng_for(seed, "left out"))
+    kind, (board, skin) = of.main_boards, roster(of, MAIN)[0]
+    plan = of.main.plan(rng_for(seed, "left out"), kind.skin_mm)
     tip_mm = np.stack([plan.x_mm - CENTRE_MM, plan.y_mm - CENTRE_MM, plan.depth_mm], axis=2)
-    return Subject(
-        draw_board(kind.design, of.spreads, seed=seed, name=board),
-        draw_skin(of.skin, of.spreads, seed=seed, name=skin, rule=kind.quadrature.quadrature()),
-        draw_skin(of.skin, of.spreads, seed=seed, name=skin, rule=COARSE),
-        plan,
-        tip_mm * milli,
-        protocol.terms,
+    full, coarse = (
+        draw_skin(of.skin, of.spreads, seed=seed, name=skin, rule=rule)
+        for rule in (kind.quadrature.quadrature(), COARSE)
     )
+    drawn = draw_board(kind.design, of.spreads, seed=seed, name=board)
+    return Subject(drawn, full, coarse, plan, tip_mm * milli, of.main.terms)
 
 
-def _over_time(on: Subject, without: Felt, seed: int) -> list[Omission]:
+def _over_time(on: Subject, without: Response, seed: int) -> list[Omission]:
     """Feel the whole protocol with a term, and compare with what was felt without."""
     n, slack = len(on.plan), RELAXATION
     rows = []
@@ -126,7 +113,7 @@ def _over_time(on: Subject, without: Felt, seed: int) -> list[Omission]:
     return rows
 
 
-def _temperature(on: Subject, without: Felt) -> Omission:
+def _temperature(on: Subject, without: Response) -> Omission:
     factor = warmth.remanence(np.array([WARMER_K]))[0]
     rest_uT = float(np.abs((factor - 1) * without.rest_T).max() / micro)
     field_pct = _error_pct(without.change_T, factor * without.change_T)
@@ -143,7 +130,7 @@ def _friction(on: Subject) -> Omission:
     return Omission("friction", _done("friction", on), field_pct, 0.0, force_pct, how)
 
 
-def _earth(without: Felt) -> Omission:
+def _earth(without: Response) -> Omission:
     """Add a steady field to no-load reading and contact alike, and take one from the other."""
     rest_T = without.rest_T[:, None] + EARTH_T
     seen_T = (rest_T + without.change_T) - rest_T
@@ -172,38 +159,43 @@ def _free_edge(on: Subject) -> list[Omission]:
 
 def _inside(on: Subject) -> list[Omission]:
     """Move the material of a few pokes as the scene does, and as it would without one part of the physics."""
-    depth_m = float(on.tip_m[..., 2].max()) + on.skin.depth_zero_m
-    other: layer.Base = "bonded" if on.skin.base == "slipping" else "slipping"
-    true = [_flow(on, place_m, depth_m, on.skin.base) for place_m in PLACES_M]
-    true_T = _change(on, true)
-    at = f"{len(PLACES_M)} pokes of {depth_m / milli:.2g} mm"
-    rows = []
-    for term, moved, how in (
-        ("rotation of the magnetisation", [(r, z, np.zeros_like(a)) for r, z, a in true], "moments do not turn"),
-        ("increments", [_one_shot(on, place_m, depth_m) for place_m in PLACES_M], "one linear step to the full depth"),
-        (f"{on.skin.base} base", [_flow(on, place_m, depth_m, other) for place_m in PLACES_M], f"a {other} base"),
-    ):
-        force_pct = _base_pct(on.skin, depth_m, other) if term.endswith("base") else 0.0
-        rows.append(Omission(term, "kept", _error_pct(_change(on, moved), true_T), 0.0, force_pct, f"{how}; {at}"))
-    return rows
+    skin, depth_m = on.skin, float(on.tip_m[..., 2].max()) + on.skin.depth_zero_m
+    base: layer.Base = "bonded" if skin.base == "slipping" else "slipping"
+    press = flow.Press(skin.thickness_m, skin.tip_radius_m, skin.base)
+    swapped = replace(press, base=base)
+    true = [_flow(on, place_m, depth_m, press) for place_m in PLACES_M]
+    wrong_N, true_N = (
+        layer.force(np.array([depth_m]), **asdict(pressed), modulus_Pa=skin.modulus_Pa) for pressed in (swapped, press)
+    )
+    cases: dict[str, tuple[list[Moved], float, str]] = {
+        "rotation of the magnetisation": ([(r, z, np.zeros_like(a)) for r, z, a in true], 0.0, "moments do not turn"),
+        "increments": (
+            [_one_shot(on, place_m, depth_m, press) for place_m in PLACES_M], 0.0, "one linear step to the full depth",
+        ),
+        f"{skin.base} base": (
+            [_flow(on, place_m, depth_m, swapped) for place_m in PLACES_M], _error_pct(wrong_N, true_N),
+            f"a {base} base",
+        ),
+    }  # fmt: skip
+    true_T, pokes = _change(on, true), f"{len(PLACES_M)} pokes of {depth_m / milli:.2g} mm"
+    return [
+        Omission(term, "kept", _error_pct(_change(on, moved), true_T), 0.0, force_pct, f"{how}; {pokes}")
+        for term, (moved, force_pct, how) in cases.items()
+    ]
 
 
 Moved = tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"], Float[np.ndarray, " s"]]  # r_m, z_m, angle_rad
 
 
-def _flow(on: Subject, place_m: tuple[float, float], depth_m: float, base: layer.Base) -> Moved:
-    skin = on.coarse
-    press = flow.Press(skin.thickness_m, skin.tip_radius_m, base)
-    r_m = np.hypot(*(skin.nodes_m[:, :2] - place_m).T)
-    end = flow.follow(r_m, skin.nodes_m[:, 2].copy(), flow.steps((depth_m,), press), press=press)[-1]
+def _flow(on: Subject, place_m: tuple[float, float], depth_m: float, press: flow.Press) -> Moved:
+    r_m = np.hypot(*(on.coarse.nodes_m[:, :2] - place_m).T)
+    end = flow.follow(r_m, on.coarse.nodes_m[:, 2].copy(), flow.steps((depth_m,), press), press=press)[-1]
     return end.r_m, end.z_m, flow.angle(end.f)
 
 
-def _one_shot(on: Subject, place_m: tuple[float, float], depth_m: float) -> Moved:
-    skin = on.coarse
-    contact = flow.Press(skin.thickness_m, skin.tip_radius_m, skin.base).contact(depth_m)
-    r_m, z_m = np.hypot(*(skin.nodes_m[:, :2] - place_m).T), skin.nodes_m[:, 2].copy()
-    u = layer.displacement(r_m, z_m, layer.waves(contact, skin.thickness_m, skin.base))
+def _one_shot(on: Subject, place_m: tuple[float, float], depth_m: float, press: flow.Press) -> Moved:
+    r_m, z_m = np.hypot(*(on.coarse.nodes_m[:, :2] - place_m).T), on.coarse.nodes_m[:, 2].copy()
+    u = layer.displacement(r_m, z_m, layer.waves(press.contact(depth_m), press.thickness_m, press.base))
     return r_m + u.r_m, z_m + u.z_m, (u.r_z - u.z_r) / 2
 
 
@@ -217,20 +209,11 @@ def _change(on: Subject, moved: Sequence[Moved]) -> Float[np.ndarray, "p k 3"]:
         moved_m = np.column_stack([place_m + out * moved_r_m[:, None], moved_z_m])
         axis = np.column_stack([-out[:, 1], out[:, 0], np.zeros(len(out))])
         moments = Rotation.from_rotvec(angle_rad[:, None] * axis).apply(skin.moments_A_m2)
-        before = skin.nodes_m, skin.moments_A_m2
-        changes_T.append(change_of_field(before, (moved_m, moments), on.board.chips_m))
+        changes_T.append(change_of_field((skin.nodes_m, skin.moments_A_m2), (moved_m, moments), on.board.chips_m))
     return np.array(changes_T)
 
 
-def _base_pct(skin: Skin, depth_m: float, other: layer.Base) -> float:
-    def force_N(base: layer.Base) -> Float[np.ndarray, " n"]:
-        of = {"thickness_m": skin.thickness_m, "tip_radius_m": skin.tip_radius_m, "modulus_Pa": skin.modulus_Pa}
-        return layer.force(np.array([depth_m]), **of, base=base)
-
-    return _error_pct(force_N(other), force_N(skin.base))
-
-
-def _steps(without: Felt, of: Synthesis) -> Omission:
+def _steps(without: Response, of: Synthesis) -> Omission:
     change_uT = without.change_T / micro
     step_uT = sensor.steps_uT(of.chip.gain_sel)
     share = np.sqrt((step_uT**2 / 12).mean() / (change_uT**2).mean())
@@ -239,23 +222,20 @@ def _steps(without: Felt, of: Synthesis) -> Omission:
 
 def _own_field(on: Subject, of: Synthesis) -> Omission:
     """Let the powder feel the field that it makes itself, once, and see what that changes (boxes, magpylib)."""
-    from magpylib.core import magnet_cuboid_Bfield
-
-    rest = lattices.midpoints(on.skin.thickness_m, BOXES)
+    rest = midpoints(on.skin.thickness_m, BOXES)
     b_T = magnet.array_field(rest.nodes_m, on.skin.thickness_m, of.skin.polarity)
     sizes = {"saturation_T": of.skin.saturation_T, "half_field_T": of.skin.half_field_T}
     j_T, boxes_n = magnet.magnetise(b_T, **sizes), len(b_T)
     away_m = (rest.nodes_m[:, None] - rest.nodes_m).reshape(-1, 3)
-    box_m = np.tile(lattices.box_m(on.skin.thickness_m, BOXES), (boxes_n**2, 1))
-    own_T = magnet_cuboid_Bfield(away_m, box_m, np.tile(j_T, (boxes_n, 1))).reshape(boxes_n, boxes_n, 3).sum(axis=1)
+    boxes_m = np.tile(box_m(on.skin.thickness_m, BOXES), (boxes_n**2, 1))
+    own_T = magnet_cuboid_Bfield(away_m, boxes_m, np.tile(j_T, (boxes_n, 1))).reshape(boxes_n, boxes_n, 3).sum(axis=1)
     with_own_T = magnet.magnetise(b_T + own_T - j_T, **sizes)  # B less J, mu0 H, is what acts on the powder
-    depth_m = float(on.tip_m[..., 2].max())
-    changes_T = []
-    for magnetised_T in (j_T, with_own_T):
-        moments = magnet.moments(magnetised_T, rest.volumes_m3)
-        skin = replace(on.skin, nodes_m=rest.nodes_m + np.append(on.skin.seat_m, 0.0), moments_A_m2=moments)
-        pokes_m = np.array([(*place_m, depth_m) for place_m in PLACES_M])
-        changes_T.append(changes_of_field(on.board, skin, pokes_m)[1])
+    pokes_m = np.array([(*place_m, float(on.tip_m[..., 2].max())) for place_m in PLACES_M])
+    bare = replace(on.skin, nodes_m=rest.nodes_m + np.append(on.skin.seat_m, 0.0))
+    changes_T = [
+        changes_of_field(on.board, replace(bare, moments_A_m2=magnet.moments(each_T, rest.volumes_m3)), pokes_m)[1]
+        for each_T in (j_T, with_own_T)
+    ]
     how = (
         f"{boxes_n} boxes, first order, {len(PLACES_M)} pokes; of the magnetisation {_error_pct(j_T, with_own_T):.2g} %"
     )
@@ -264,15 +244,15 @@ def _own_field(on: Subject, of: Synthesis) -> Omission:
 
 def _too_deep(of: Synthesis, seed: int) -> Omission:
     """Count, over all skins, the stops that are deeper than any published solution vouches for."""
-    depth_m = milli * make_plan(of.main, rng_for(seed, "left out")).depth_mm.ravel()
+    depth_m = milli * of.main.plan(rng_for(seed, "left out"), of.main_boards.skin_mm).depth_mm.ravel()
     skins = [draw_skin(of.skin, of.spreads, seed=seed, name=skin, rule=COARSE) for _, skin in roster(of, MAIN)]
     share_pct = 100 * sum(beyond_verified_n(skin, depth_m) for skin in skins) / (len(depth_m) * len(skins))
     how = f"{share_pct:.3g} % of the stops of {len(skins)} skins are past 0.6 of the thickness: nothing published there"
     return Omission("depths past 0.6 of the thickness", "kept", None, None, None, how)
 
 
-def _feel(on: Subject, terms: Terms, seed: int) -> Felt:
-    return feel(on.board, on.skin, on.tip_m, tilt=on.plan.tilt, terms=terms, rng=rng_for(seed, "left out", "walk"))
+def _feel(on: Subject, terms: Terms, seed: int) -> Response:
+    return respond(on.board, on.skin, on.tip_m, tilt=on.plan.tilt, terms=terms, rng=rng_for(seed, "left out", "walk"))
 
 
 def _done(term: str, on: Subject) -> str:

@@ -32,7 +32,7 @@ from pipeline.experiments.logs.estimates import (
     truth_at,
 )
 from pipeline.physics.ambient import EARTH_SIZE_T, EARTH_T
-from pipeline.synthesis.of_settings import synthesis_of
+from pipeline.synthesis.settings import synthesis_of
 from pipeline.trials.networks import networks_without
 
 PITCHES_DEG = (0.0, 10.0, 20.0, 45.0)  # assumed: how far a shoe leans to either side, once a step

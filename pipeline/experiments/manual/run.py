@@ -10,9 +10,9 @@ import numpy as np
 from pipeline.core.config import Files, read_settings
 from pipeline.core.errors import SchemaError
 from pipeline.core.stage import run
-from pipeline.dataset.lines import Lines
+from pipeline.dataset.lines import Lines, hand_rows, shifted
+from pipeline.dataset.rows import stack
 from pipeline.dataset.splits import Fold
-from pipeline.dataset.stacked import hand_rows, shifted, stack
 from pipeline.experiments.answer import read_folder, read_losses, write_answer
 from pipeline.learning.recipe import HEADLINE, Adaptations
 from pipeline.learning.recipe import adaptations as adaptations_of

@@ -1,11 +1,13 @@
 """The ways to sum a skin. In: a trial and a rule of quadrature. Out: how many nodes, and a call that gives dB.
 
 What a call leaves out: drawing the skin and tabulating its flow, done once for thousands of pokes; for magpylib also
-moving the nodes and making its objects. Refuses to know references and clocks.
+moving the nodes (by `flow`, its steps and its reach included, so that only what is summed differs) and making its
+objects. Refuses to know references and clocks.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -14,16 +16,17 @@ from magpylib import getB
 from magpylib.magnet import Cuboid
 from magpylib.misc import Dipole
 from scipy.constants import mu_0
+from scipy.interpolate import RectBivariateSpline
 from scipy.spatial.transform import Rotation
 
-from pipeline.experiments.runtime.lattices import box_m, gauss_everywhere, midpoints
-from pipeline.experiments.runtime.motion import Path, paths
-from pipeline.experiments.runtime.trials import Trial, laid
-from pipeline.experiments.verification.magpylib_sum import field_of
+from pipeline.experiments.runtime.trials import Trial, box_m, gauss_everywhere, laid, midpoints
+from pipeline.experiments.verification.field import field_of
+from pipeline.physics import flow, flow_map
 from pipeline.physics.change import change_of_field
 from pipeline.physics.nodes import Nodes, Quadrature, place_nodes
 from pipeline.physics.skin import Skin, changes_of_field
 
+RADII_N, HEIGHTS_N = 56, 16  # of the splines that move nodes; twice as many change dB by 0.1 %
 Changes = Float[np.ndarray, "n k 3"]
 
 
@@ -33,6 +36,14 @@ class Prepared:
 
     nodes_n: int
     call: Callable[[], Changes]
+
+
+@dataclass(frozen=True)
+class Path:
+    """Place and rotation vector of every node under every poke."""
+
+    nodes_m: Float[np.ndarray, "n s 3"]
+    turns_rad: Float[np.ndarray, "n s 3"]
 
 
 def whole(trial: Trial, rest: Nodes) -> Prepared:
@@ -66,10 +77,8 @@ def kernel_alone(trial: Trial, rule: Quadrature) -> Prepared:
     moments = _turned(path, skin.moments_A_m2)
 
     def call() -> Changes:
-        rest = skin.nodes_m, skin.moments_A_m2
-        return np.stack(
-            [change_of_field(rest, now, trial.board.chips_m) for now in zip(path.nodes_m, moments, strict=True)]
-        )
+        rest, poked = (skin.nodes_m, skin.moments_A_m2), zip(path.nodes_m, moments, strict=True)
+        return np.stack([change_of_field(rest, now, trial.board.chips_m) for now in poked])
 
     return Prepared(len(skin.nodes_m), call)
 
@@ -123,13 +132,58 @@ def _by_objects(trial: Trial, skin: Skin, at_origin: Callable[[int], Any]) -> Pr
     objects = []
     for i, place_m in enumerate(skin.nodes_m):
         # The first place of each path is rest, so that one call gives the field before and under every poke.
-        one = at_origin(i)
-        one.position = np.vstack([place_m, path.nodes_m[:, i]])
-        one.orientation = Rotation.from_rotvec(np.vstack([np.zeros(3), path.turns_rad[:, i]]))
-        objects.append(one)
+        source = at_origin(i)
+        source.position = np.vstack([place_m, path.nodes_m[:, i]])
+        source.orientation = Rotation.from_rotvec(np.vstack([np.zeros(3), path.turns_rad[:, i]]))
+        objects.append(source)
 
     def call() -> Changes:
         b_T = getB(objects, chips_m, sumup=True).reshape(-1, len(chips_m), 3)
         return b_T[1:] - b_T[0]
 
     return Prepared(len(objects), call)
+
+
+def paths(trial: Trial, skin: Skin) -> Path:
+    """Follow the skin's nodes through every poke of the trial."""
+    nodes_m = np.tile(skin.nodes_m, (len(trial.pokes_m), 1, 1))
+    turns_rad = np.zeros_like(nodes_m)
+    true_m = trial.pokes_m[:, 2] + skin.depth_zero_m
+    press = flow.Press(skin.thickness_m, skin.tip_radius_m, skin.base)
+    bends, reach_m = _bends(press, tuple(np.unique(true_m).tolist()))
+    for poke_i, (poke_m, depth_m) in enumerate(zip(trial.pokes_m, true_m, strict=True)):
+        bend = bends[float(depth_m)]
+        away_m = skin.nodes_m[:, :2] - poke_m[:2]
+        r_m = np.hypot(*away_m.T)
+        outward_m, up_m, angle_rad = np.sqrt(r_m**2 + bend.grown_m2) - r_m, np.zeros_like(r_m), np.zeros_like(r_m)
+        here = r_m < reach_m
+        for part, spline in zip((outward_m, up_m, angle_rad), bend.splines, strict=True):
+            part[here] = spline.ev(r_m[here], skin.nodes_m[here, 2])
+        cos, sin = (away_m / np.where(r_m > 0, r_m, 1.0)[:, None]).T
+        nodes_m[poke_i] += np.stack([outward_m * cos, outward_m * sin, up_m], axis=1)
+        turns_rad[poke_i] += angle_rad[:, None] * np.stack([-sin, cos, np.zeros_like(cos)], axis=1)
+    return Path(nodes_m, turns_rad)
+
+
+@dataclass(frozen=True)
+class _Bend:
+    """Splines of the change of r, of z and of the angle over (r, z); past their reach r^2 grows."""
+
+    splines: tuple[RectBivariateSpline, ...]
+    grown_m2: float
+
+
+@lru_cache(maxsize=8)
+def _bends(press: flow.Press, depths_m: tuple[float, ...]) -> tuple[dict[float, _Bend], float]:
+    reach_m = press.thickness_m * flow_map.reach(press.tip_radius_m / press.thickness_m, press.base)
+    r_m = reach_m * np.linspace(0, 1, RADII_N) ** 1.5
+    z_m = press.thickness_m * np.linspace(0, 1, HEIGHTS_N)
+    r0_m, z0_m = (part.ravel() for part in np.meshgrid(r_m, z_m, indexing="ij"))
+    steps_m = flow.steps(depths_m, press)
+    found = {}
+    for step_m, end in zip(steps_m, flow.follow(r0_m, z0_m, steps_m, press=press), strict=True):
+        changes = [part.reshape(RADII_N, HEIGHTS_N) for part in (end.r_m - r0_m, end.z_m - z0_m, flow.angle(end.f))]
+        edge_m = reach_m + float(changes[0][-1].mean())
+        grown_m2 = edge_m**2 - reach_m**2 if press.base == "slipping" else 0.0
+        found[float(step_m)] = _Bend(tuple(RectBivariateSpline(r_m, z_m, change) for change in changes), grown_m2)
+    return found, reach_m

@@ -6,19 +6,34 @@ most is a row too. Refuses to know clocks, pictures and which rule the product t
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
+from pydantic import Field
+from scipy.constants import milli
 
 from pipeline.core.errors import ParamsError
-from pipeline.experiments.runtime.lattices import gauss_everywhere, written
 from pipeline.experiments.runtime.methods import METHODS, Prepared, whole
-from pipeline.experiments.runtime.rows import REFERENCE, Contestant, Precision
-from pipeline.experiments.runtime.trials import Trial
+from pipeline.experiments.runtime.rows import REFERENCE, Contestant, Precision, written
+from pipeline.experiments.runtime.trials import Pokes, Trial, gauss_everywhere
 from pipeline.physics.nodes import Quadrature
 
 STUDY = "dB of an indentation"
 ALL = "all depths"
+Cell_mm = Annotated[float, Field(gt=0, le=20)]
+Layers = Annotated[int, Field(ge=1, le=100)]
+
+
+class Quadratures(Pokes):
+    """Pokes seen from the skin's middle, on so many skins, and (cell, layers) of every rule of every method."""
+
+    skins_n: Annotated[int, Field(ge=1, le=100)]
+    rules: Annotated[dict[str, tuple[tuple[Cell_mm, Layers], ...]], Field(min_length=1)]
+
+    def rules_of(self) -> dict[str, list[Quadrature]]:
+        """Give the rules of every method."""
+        return {name: [Quadrature(milli * cell, n) for cell, n in rules] for name, rules in self.rules.items()}
 
 
 @dataclass(frozen=True)
@@ -49,15 +64,14 @@ def study_quadratures(
         raise ParamsError(STUDY, "methods", f"among {list(METHODS)}", got, "Mend the rules.")
     truths_T = [_reference(trial, reference.finer, reference.per_cell_n).call() for trial in trials]
     coarser = [_reference(trial, reference.coarser, reference.per_cell_n) for trial in trials]
-    found_T = [one.call() for one in coarser]
+    found_T = [prepared.call() for prepared in coarser]
     rows = [_row(REFERENCE, reference.coarser, coarser[0].nodes_n, errors(trials, found_T, truths_T))]
     contestants = []
-    for method, own in rules.items():
-        for rule in own:
-            prepared = [METHODS[method](trial, rule) for trial in trials]
-            found_T = [one.call() for one in prepared]
-            rows.append(_row(method, rule, prepared[0].nodes_n, errors(trials, found_T, truths_T)))
-            contestants.append(Contestant(rows[-1].key, prepared[0].call, len(trials[0].pokes_m)))
+    for method, rule in ((method, rule) for method, of_method in rules.items() for rule in of_method):
+        skins = [METHODS[method](trial, rule) for trial in trials]
+        found_T = [prepared.call() for prepared in skins]
+        rows.append(_row(method, rule, skins[0].nodes_n, errors(trials, found_T, truths_T)))
+        contestants.append(Contestant(rows[-1].key, skins[0].call, len(trials[0].pokes_m)))
     return rows, contestants
 
 

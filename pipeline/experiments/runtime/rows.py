@@ -1,11 +1,19 @@
 """What a study of error against run time gives: errors, which are the same in every run, and seconds, which are not.
 
-In: one method with one setting. Out: a row of each kind, with equal keys. Refuses to know what was computed.
+In: one method with one setting, or a call to be timed. Out: a row of each kind, with equal keys, and the choice of a
+rule. `race` alone reads the clock. Refuses to know what was computed.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from time import perf_counter
 from typing import Any
+
+import numpy as np
+from scipy.constants import milli
+
+from pipeline.core.errors import ParamsError
+from pipeline.physics.nodes import Quadrature
 
 REFERENCE = "reference"  # the method of a row that says how wrong the reference of its study is at most
 CANDIDATES = "Gauss in z"  # the rules that `nodes.place_nodes` can lay
@@ -14,16 +22,12 @@ Key = tuple[str, str, str]  # study, method, setting
 
 
 @dataclass(frozen=True)
-class Precision:
-    """How wrong one method is with one setting, relative to the size of what it computes; or why it failed."""
+class Row:
+    """One method with one setting."""
 
     study: str
     method: str
     setting: str
-    work_n: int  # nodes that are summed, or right-hand sides that were called
-    error: float | None  # None: failed
-    failure: str | None = None
-    parts: dict[str, float] = field(default_factory=dict)  # the error of each depth, where a study has depths
 
     @property
     def key(self) -> Key:
@@ -31,18 +35,21 @@ class Precision:
 
 
 @dataclass(frozen=True)
-class Seconds:
+class Precision(Row):
+    """How wrong one method is with one setting, relative to the size of what it computes; or why it failed."""
+
+    work_n: int  # nodes that are summed, or right-hand sides that were called
+    error: float | None  # None: failed
+    failure: str | None = None
+    parts: dict[str, float] = field(default_factory=dict)  # the error of each depth, where a study has depths
+
+
+@dataclass(frozen=True)
+class Seconds(Row):
     """Median time of an indentation."""
 
-    study: str
-    method: str
-    setting: str
     median_s: float
     repeats_n: int
-
-    @property
-    def key(self) -> Key:
-        return (self.study, self.method, self.setting)
 
 
 @dataclass(frozen=True)
@@ -65,3 +72,42 @@ class Choice:
     used_nodes_n: int | None
     used_error: float | None
     differs: bool
+
+
+def written(rule: Quadrature) -> str:
+    """Write a rule as rows and figures do."""
+    return f"{rule.cell_m / milli:.3g} mm x {rule.layers_n}"
+
+
+def choose(rows: Sequence[Precision], *, used: Quadrature, error_max: float = ERROR_MAX) -> Choice:
+    """Take the rule with the fewest nodes among those whose error, of the worst depth, is below `error_max`.
+
+    Nodes stand for time, to which they are proportional, so that the choice is the same in every run.
+    """
+    tried = {row.setting: row for row in rows if row.method == CANDIDATES}
+    passing = [row for row in tried.values() if row.error is not None and row.error < error_max]
+    best = min(passing, key=lambda row: (row.work_n, row.error), default=None)
+    of_best = (best.setting, best.work_n, best.error) if best else (None, None, None)
+    now = tried.get(written(used))
+    of_used = (now.work_n, now.error) if now else (None, None)
+    return Choice(*of_best, written(used), *of_used, differs=of_best[0] != written(used))
+
+
+def race(contestants: Sequence[Contestant], repeats_n: int) -> list[Seconds]:
+    """Time all contestants in turn, `repeats_n` rounds of them, so that a busy moment of the machine hits all alike.
+
+    Each has run before, when its error was found: compilation and caches are not part of an indentation.
+    """
+    if repeats_n < 1:
+        raise ParamsError("stopwatch", "repeats_n", "1 or more", repeats_n, "Repeat.")
+    times_s = np.empty((repeats_n, len(contestants)))
+    for round_i in range(repeats_n):
+        # Every other round runs backwards, so that nobody always inherits the caches of the same neighbour.
+        for i in range(len(contestants))[:: -1 if round_i % 2 else 1]:
+            start_s = perf_counter()
+            contestants[i].call()
+            times_s[round_i, i] = perf_counter() - start_s
+    return [
+        Seconds(*contestant.key, median_s=float(np.median(laps_s)) / contestant.indentations_n, repeats_n=repeats_n)
+        for contestant, laps_s in zip(contestants, times_s.T, strict=True)
+    ]

@@ -2,21 +2,29 @@
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import Field
 
 from pipeline.core import io
-from pipeline.core.config import Files, Settings, read_settings
+from pipeline.core.config import Files, Settings, Strict, read_settings
 from pipeline.core.provenance import SECONDS
 from pipeline.core.stage import run, say
-from pipeline.experiments.runtime.choose import choose
-from pipeline.experiments.runtime.integrators import study_integrators
-from pipeline.experiments.runtime.quadrature import study_quadratures
-from pipeline.experiments.runtime.settings import RunTime
-from pipeline.experiments.runtime.stopwatch import race
+from pipeline.experiments.runtime.integrators import Integrators, study_integrators
+from pipeline.experiments.runtime.quadrature import Quadratures, study_quadratures
+from pipeline.experiments.runtime.rows import choose, race
 from pipeline.experiments.runtime.trials import Trial, draw_trial
 from pipeline.physics.board import draw_board
-from pipeline.synthesis.capture import MAIN, Synthesis, roster
-from pipeline.synthesis.of_settings import synthesis_of
+from pipeline.synthesis.capture import roster
+from pipeline.synthesis.settings import MAIN, Synthesis, synthesis_of
+
+
+class RunTime(Strict):
+    """Section `runtime`: both studies, and how often each call is timed."""
+
+    quadratures: Quadratures
+    integrators: Integrators
+    repeats_n: Annotated[int, Field(ge=1, le=1000)]
 
 
 def read(settings: Settings) -> RunTime:
@@ -27,14 +35,12 @@ def read(settings: Settings) -> RunTime:
 def runtime(scene: str, files: Files, answer: Path) -> None:
     """Compare quadratures and integrators; seconds differ between identical runs, so they are no output."""
     settings = read_settings("runtime", scene, files)
-    of, seed = synthesis_of(settings), settings.seed
-    tried = read(settings)
-    rows, calls = study_quadratures(_trials(of, tried, seed), tried.quadratures.rules_of())
-    more, more_calls = study_integrators(tried.integrators.sweep())
+    of, tried = synthesis_of(settings), read(settings)
+    rows, calls = study_quadratures(_trials(of, tried.quadratures, settings.seed), tried.quadratures.rules_of())
+    more, more_calls = study_integrators(tried.integrators)
     choice = choose(rows, used=of.main_boards.quadrature.quadrature())
-    io.write_json(
-        SECONDS / scene / "runtime.json", [asdict(one) for one in race([*calls, *more_calls], tried.repeats_n)]
-    )
+    seconds = race([*calls, *more_calls], tried.repeats_n)
+    io.write_json(SECONDS / scene / "runtime.json", [asdict(row) for row in seconds])
     words: dict[str, Any] = {"choice": asdict(choice)}
     words |= {"quadratures": [asdict(row) for row in rows], "integrators": [asdict(row) for row in more]}
     io.write_json(answer, words)
@@ -42,15 +48,14 @@ def runtime(scene: str, files: Files, answer: Path) -> None:
     say(f"{scene}: {len(rows) + len(more)} ways tried, {failed_n} failed; cheapest quadrature: {choice.setting}")
 
 
-def _trials(of: Synthesis, asked: RunTime, seed: int) -> list[Trial]:
+def _trials(of: Synthesis, tried: Quadratures, seed: int) -> list[Trial]:
     """Take the skins on the boards whose chips are nearest: there a quadrature has to be finest."""
     drawn = [
         (draw_board(of.main_boards.design, of.spreads, seed=seed, name=board), skin) for board, skin in roster(of, MAIN)
     ]
-    nearest = sorted(drawn, key=lambda pair: -pair[0].chips_m[0, 2])[: asked.quadratures.skins_n]
-    pokes = asked.quadratures.pokes()
+    nearest = sorted(drawn, key=lambda pair: -pair[0].chips_m[0, 2])[: tried.skins_n]
     return [
-        draw_trial(board, of.skin, spreads=of.spreads, seed=seed, name=skin, pokes=pokes) for board, skin in nearest
+        draw_trial(board, of.skin, spreads=of.spreads, seed=seed, name=skin, pokes=tried) for board, skin in nearest
     ]
 
 

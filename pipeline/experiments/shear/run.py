@@ -15,14 +15,13 @@ from pydantic import Field
 from pipeline.core.config import Files, Settings, Strict, read_settings
 from pipeline.core.seeds import rng_for, seed_for
 from pipeline.core.stage import run
-from pipeline.dataset.hold_out import NO_POOL, Fold
 from pipeline.dataset.rows import SHEAR_TARGETS, Rows, Selection, gather
-from pipeline.dataset.single import draw_sides
+from pipeline.dataset.splits import NO_POOL, Fold, draw_sides
 from pipeline.evaluation.metrics import ACCURACY_LIMIT_MM
 from pipeline.evaluation.statistic import over_units
 from pipeline.evaluation.tally import tally
 from pipeline.experiments.answer import read_folder, read_losses, write_answer
-from pipeline.learning.card import went
+from pipeline.learning.card import collapse_record
 from pipeline.learning.recipe import Training, with_training
 from pipeline.trials.data import SceneData, train_all, trials_of
 from pipeline.trials.models import note_seconds
@@ -109,7 +108,7 @@ def shear(scene: str, files: Files, indentations: Path, answer: Path) -> None:
     shown = rng_for(settings.seed, "shear", "drawn").permutation(len(trials[first_i].test))[:DRAWN_N]
     true, predicted = rows.target[trials[first_i].test], trained[first_i].predicted
     drawn = {"true": _forces(true[shown]), "predicted": _forces(predicted[shown])}
-    write_answer(answer, numbers, drawn, read_losses(indentations, rows.dropped), tally(map(went, trained)))
+    write_answer(answer, numbers, drawn, read_losses(indentations, rows.dropped), tally(map(collapse_record, trained)))
 
 
 def _folds(rows: Rows, group: np.ndarray, by: str, asked: Shear, seed: int) -> list[Fold]:

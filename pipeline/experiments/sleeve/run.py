@@ -18,12 +18,12 @@ from pipeline.evaluation.metrics import score
 from pipeline.evaluation.tally import tally
 from pipeline.experiments.answer import read_folder, read_losses, write_answer
 from pipeline.learning.baselines import Task, run_tasks
-from pipeline.learning.card import went
+from pipeline.learning.card import collapse_record
 from pipeline.learning.classical import Neighbours
 from pipeline.learning.executors import make_executor
 from pipeline.learning.recipe import HEADLINE, Training, with_training
 from pipeline.learning.trial import Measured, Trial
-from pipeline.synthesis.of_settings import synthesis_of
+from pipeline.synthesis.settings import synthesis_of
 from pipeline.trials.data import SceneData, train_all
 from pipeline.trials.models import note_seconds
 
@@ -193,7 +193,7 @@ def sleeve(scene: str, files: Files, indentations: Path, answer: Path) -> None:
     error_mm = errors_mm(true, answers[HEADLINE][0])
     drawn = to_draw(area, true, error_mm, indentation)
     losses = read_losses(indentations, data.rows.dropped)
-    write_answer(answer, numbers, drawn, losses, tally(map(went, trained)))
+    write_answer(answer, numbers, drawn, losses, tally(map(collapse_record, trained)))
 
 
 def _area(settings: Settings) -> Area:

@@ -1,6 +1,6 @@
-"""One row of the stability table. In: what was tried and what came of it. Out: a `Case`, which holds or does not.
+"""One row of the stability table: an extreme case, what came of it, and whether that is what should have.
 
-What happened is worded from what was measured, never typed. Refuses to know what is tried.
+Cases (the modules beside this one) are tried on any inputs: the stage tabulates those of a scene, tests draw others.
 """
 
 import tracemalloc
@@ -17,7 +17,7 @@ class Case:
     area: str
     case: str
     should: str
-    happened: str
+    happened: str  # worded from what was measured, never typed
     error: float | None
     limit: float | None
     holds: bool
@@ -28,7 +28,7 @@ def measured(area: str, case: str, *, should: str, happened: str, error: float, 
     return Case(area, case, should, happened, error, limit, holds=bool(error <= limit))
 
 
-def told(area: str, case: str, *, should: str, happened: str, holds: bool) -> Case:
+def observed(area: str, case: str, *, should: str, happened: str, holds: bool) -> Case:
     """Judge a case by a fact."""
     return Case(area, case, should, happened, None, None, holds=bool(holds))
 
@@ -38,8 +38,8 @@ def refused(area: str, case: str, *, should: str, attempt: Callable[[], object])
     try:
         attempt()
     except ReskinError as error:
-        return told(area, case, should=should, happened=f"refused: {error}", holds=True)
-    return told(area, case, should=should, happened="went on without a word", holds=False)
+        return observed(area, case, should=should, happened=f"refused: {error}", holds=True)
+    return observed(area, case, should=should, happened="went on without a word", holds=False)
 
 
 def peak_bytes(work: Callable[[], object]) -> int:

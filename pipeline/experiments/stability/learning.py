@@ -14,10 +14,9 @@ from pipeline.core.seeds import rng_for
 from pipeline.dataset.rows import Rows
 from pipeline.dataset.splits import Split, draw_folds
 from pipeline.evaluation.metrics import METRICS, score
-from pipeline.experiments.stability.cases import Case, measured, refused, told
+from pipeline.experiments.stability.cases import Case, measured, observed, refused
 from pipeline.learning.recipe import Labelling, Recipe
-from pipeline.learning.stack import train_stack
-from pipeline.learning.train import BLOCK_STEPS_N
+from pipeline.learning.train import BLOCK_STEPS_N, train_stack
 from pipeline.learning.trial import FewLabels, Measured, Start, Trained, Trial
 
 AREA = "learning"
@@ -59,27 +58,22 @@ def triplet_cases(seed: int) -> list[Case]:
 def loop_cases(seed: int) -> list[Case]:
     """Try rates and weights that overflow, hardly any rows, and the same seed twice."""
     trial, rows = _trial(seed), _rows(seed)
-    return [
-        *(_explodes(trial, rows, rate) for rate in (1e1, 1e10)),
-        _beside_one_that_overflows(trial, rows),
-        *_few(trial, rows),
-        _again(trial, rows),
-    ]
+    overflow = [_explodes(trial, rows, 1e1), _explodes(trial, rows, 1e10), _beside_one_that_overflows(trial, rows)]
+    return [*overflow, *_few(trial, rows), _again(trial, rows)]
 
 
 def fold_cases() -> list[Case]:
     """Ask for folds of more groups than there are."""
-    asked = {
-        "one board, to be left out": ("lobo", ["b1"], Split()),
-        "two boards, of which two are trained on to test others": ("transfer", ["b1", "b2"], Split(transfer_skins_n=2)),
-        "three skins to train on where two are": (
-            "sensors", ["b1", "b2", "b3"], Split(sensors_skins_n=(3,), sensors_draws_n=1),
-        ),
-    }  # fmt: skip
+    boards = ["b1", "b2", "b3"]
+    folds = {
+        "one board, to be left out": ("lobo", boards[:1], Split()),
+        "two boards, of which two are trained on to test others": ("transfer", boards[:2], Split(transfer_skins_n=2)),
+        "three skins to train on where two are": ("sensors", boards, Split(sensors_skins_n=(3,), sensors_draws_n=1)),
+    }
     return [
         refused(AREA, case, should="refused, with what there is",
-                attempt=partial(draw_folds, Rows.of_labels(boards, skins=boards), [question], split, 0))
-        for case, (question, boards, split) in asked.items()
+                attempt=partial(draw_folds, Rows.of_labels(groups, skins=groups), [question], split, 0))
+        for case, (question, groups, split) in folds.items()
     ]  # fmt: skip
 
 
@@ -97,9 +91,9 @@ def _constant(trial: Trial, rows: Measured, channels: list[int], case: str) -> C
     db_uT = rows.db_uT.copy()
     db_uT[:, channels] = CONSTANT_uT
     trained = _train(trial, replace(rows, db_uT=db_uT))
-    seen = float(np.abs(trained.scaler.encode(db_uT)[:, channels]).max())
-    scale_uT = trained.scaler.input_scale[channels].min()
-    happened = f"its scale {scale_uT:.0e} uT, at most {seen:g} seen; {_words(trained)}"
+    scaler = trained.scaler
+    seen = float(np.abs(scaler.encode(db_uT)[:, channels]).max())
+    happened = f"its scale {scaler.input_scale[channels].min():.0e} uT, at most {seen:g} seen; {_words(trained)}"
     return measured(AREA, case, should="seen as 0 by a floor under its scale; trained as ever", happened=happened,
                     error=seen if _is_sound(trained) else np.inf, limit=0.0)  # fmt: skip
 
@@ -135,19 +129,19 @@ def _explodes(trial: Trial, rows: Measured, rate: float) -> Case:
     sound = all(np.isfinite(value).all() for value in trained.weights.values())
     happened = f"{stopped}; weights of step {kept_step} of {steps_n}, {'all' if sound else 'not all'} finite{losses}"
     case = f"bottleneck scaled 1e3, learning rate {rate:g}"
-    return told(AREA, case, should="stops, says where, and keeps the last finite weights", happened=happened,
+    return observed(AREA, case, should="stops, says where, and keeps the last finite weights", happened=happened,
                 holds=sound and trained.stopped_step == kept_step + STEPS_N)  # fmt: skip
 
 
 def _beside_one_that_overflows(trial: Trial, rows: Measured) -> Case:
     sound, broken = (_tuned(trial, _start(trial, rows, scale)) for scale in (1.0, 1e30))
     alone = _train(sound, rows)
-    one, other = train_stack([sound, broken], rows)
-    apart = _apart(alone.weights, one.weights)
-    happened = f"{_words(other)}; its neighbour: {_words(one)}, {apart:g} from what it becomes alone"
+    beside, overflowing = train_stack([sound, broken], rows)
+    apart = _apart(alone.weights, beside.weights)
+    happened = f"{_words(overflowing)}; its neighbour: {_words(beside)}, {apart:g} from what it becomes alone"
     return measured(AREA, "a network that overflows beside one that does not", should="its neighbour: as if alone",
                     happened=happened, limit=ROUNDING,
-                    error=apart if _is_sound(one) and other.stopped_step == STEPS_N else np.inf)  # fmt: skip
+                    error=apart if _is_sound(beside) and overflowing.stopped_step == STEPS_N else np.inf)  # fmt: skip
 
 
 def _few(trial: Trial, rows: Measured) -> list[Case]:
@@ -155,7 +149,8 @@ def _few(trial: Trial, rows: Measured) -> list[Case]:
     error = float(np.abs(single.predicted - rows.target[trial.train[:1]]).max())
     by_one = _train(_changed(trial, batch_n=1), rows)
     return [
-        told(AREA, "batches of one row", should="trained as ever", happened=_words(by_one), holds=_is_sound(by_one)),
+        observed(AREA, "batches of one row", should="trained as ever", happened=_words(by_one),
+                 holds=_is_sound(by_one)),
         measured(AREA, "one training row", should="answers that row's place and force",
                  happened=f"off by {error:.1e} (mm, mm, N); {_words(single)}",
                  error=error if _is_sound(single) else np.inf, limit=ROUNDING),
@@ -181,15 +176,16 @@ def _label_scales(trial: Trial, rows: Measured) -> list[Case]:
 
 def _again(trial: Trial, rows: Measured) -> Case:
     trial = _changed(trial, triplet_weight=0.1)
-    one, other = (
-        {**trained.weights, "predicted": trained.predicted} for trained in (_train(trial, rows), _train(trial, rows))
-    )
-    same_n = sum(value.tobytes() == other[name].tobytes() for name, value in one.items())
-    third = _train(replace(trial, seed_i=1), rows).weights
-    away = _apart(one, third)
-    happened = f"{same_n} of {len(one)} arrays identical bit for bit; another seed's weights {away:.2g} away"
-    return told(AREA, "trained twice from one seed", should="the same bytes, and others from another seed",
-                happened=happened, holds=same_n == len(one) and away > 0)  # fmt: skip
+    first, again = (_train(trial, rows) for _ in range(2))
+    pairs = [
+        (first.predicted, again.predicted),
+        *((first.weights[name], again.weights[name]) for name in again.weights),
+    ]
+    same_n = sum(value.tobytes() == twin.tobytes() for value, twin in pairs)
+    away = _apart(first.weights, _train(replace(trial, seed_i=1), rows).weights)
+    happened = f"{same_n} of {len(pairs)} arrays identical bit for bit; another seed's weights {away:.2g} away"
+    return observed(AREA, "trained twice from one seed", should="the same bytes, and others from another seed",
+                happened=happened, holds=same_n == len(pairs) and away > 0)  # fmt: skip
 
 
 def _train(trial: Trial, rows: Measured) -> Trained:
@@ -219,8 +215,8 @@ def _times(target: Float32[np.ndarray, "f 3"], scale: float) -> Float32[np.ndarr
     return (target.astype(np.float64) * scale).astype(np.float32)
 
 
-def _apart(one: Mapping[str, np.ndarray], other: Mapping[str, np.ndarray]) -> float:
-    return max(float(np.abs(other[name] - one[name]).max()) for name in other)
+def _apart(weights: Mapping[str, np.ndarray], others: Mapping[str, np.ndarray]) -> float:
+    return max(float(np.abs(others[name] - weights[name]).max()) for name in others)
 
 
 def _is_sound(trained: Trained) -> bool:

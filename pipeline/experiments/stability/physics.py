@@ -1,26 +1,30 @@
-"""Extreme skins and pokes (PHYSICS 10). In: a scene's designs. Out: cases.
+"""Extreme skins, pokes, drags and times (PHYSICS 10). In: a scene's designs. Out: cases.
 
-Refuses to know chips' electronics, bytes and drags.
+Refuses to know chips' electronics and bytes.
 """
 
-from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 
 import numpy as np
 from jaxtyping import Float
-from scipy.constants import micro, milli
+from scipy.constants import kilo, micro, milli
 
 from pipeline.core.seeds import rng_for
-from pipeline.experiments.stability.cases import Case, measured, peak_bytes, refused, told
-from pipeline.experiments.verification import reference
+from pipeline.experiments.stability.cases import Case, measured, observed, peak_bytes, refused
+from pipeline.experiments.verification import kinematics, relaxation
 from pipeline.experiments.verification.checks import no_spread, worst
-from pipeline.physics import dipole, layer
+from pipeline.experiments.verification.contact import force_N
+from pipeline.experiments.verification.field import inside_a_box
+from pipeline.physics import dipole, friction, layer, shear
 from pipeline.physics.board import Board, BoardDesign, Spreads, draw_board
 from pipeline.physics.change import change_of_field
+from pipeline.physics.flow import Press
 from pipeline.physics.force_sensor import RANGE_N, read_force
+from pipeline.physics.magnet import CUBE_SIDE_M
 from pipeline.physics.nodes import Quadrature
 from pipeline.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, forces
+from pipeline.physics.viscoelastic import SKIN, advance
 
 AREA = "physics"
 COARSE = Quadrature(cell_m=2.2e-3, layers_n=4)
@@ -29,145 +33,161 @@ DEPTH = 0.3  # of the thickness
 FLAGGED_DEPTH = 0.6  # of the thickness (PHYSICS 10)
 POKES_N = 2000
 BYTES_MAX_N = 1000  # a poke: 1e6 pokes in 1 GB, 120 bytes of each its result
+PATH_MM = (0.0, 0.1, 0.5, 4.0)  # of a drag
+STICKY = 1e6  # a friction that never lets go
+STIFF = relaxation.stiff(1e8)
 
 
-def survey_physics(board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, seed: int) -> list[Case]:
+def time_cases() -> list[Case]:
+    """Try steps that no explicit integrator survives, steps of no length, and times that are none."""
+    state = np.array([1 / 3, -2e-308, 7e15, 0.0, -0.1])
+    same_n = int(np.count_nonzero(advance(state, 0.0, 0.0, SKIN).view(np.int64) == state.view(np.int64)))
+    return [
+        _step("tau_max / tau_min 1e8, dt / tau_min 1e8", 1e8, "as in 50 digits (mpmath), and finite"),
+        _step("dt / tau_min 1e-16", 1e-16, "as in 50 digits: (1 - exp(-x)) / x by expm1; plainly it is 11 % off"),
+        observed("time", "dt = 0", should="the state, bit for bit",
+                 happened=f"{same_n} of {len(state)} values identical bit for bit", holds=same_n == len(state)),
+        *(
+            refused("time", f"a time step of {dt_s:g} s", should="refused, with the step named",
+                    attempt=partial(advance, relaxation.STATE, 1.0, dt_s, STIFF))
+            for dt_s in (-1 * micro, np.nan, np.inf)
+        ),
+    ]  # fmt: skip
+
+
+def _step(case: str, dt_over_fastest: float, should: str) -> Case:
+    dt_s = dt_over_fastest * float(STIFF.tau_s[0])
+    found, error = advance(relaxation.STATE, 1.3, dt_s, STIFF), relaxation.step_error(dt_s, STIFF)
+    happened = f"relative error {error:.1e}, {np.count_nonzero(np.isfinite(found))} of {len(found)} values finite"
+    return measured("time", case, should=should, happened=happened, error=error, limit=relaxation.ROUNDING)
+
+
+def physics_cases(board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, seed: int) -> list[Case]:
     """Try a scene's first skin on its first board, and what else it might have been."""
     drawn = draw_board(board, spreads, seed=seed, name="b0")
 
     def skin_of(spread: Spreads = spreads, name: str = "b0_s0", **changes: float) -> Skin:
         return draw_skin(skin.model_copy(update=changes), spread, seed=seed, name=name, rule=COARSE)
 
-    one = skin_of()
+    usual = skin_of()
     return [
-        *_modulus(drawn, one, *(skin_of(modulus_kPa=modulus_kPa) for modulus_kPa in (0.0, 1e6))),
-        *_thickness(drawn, one, skin_of(no_spread(spreads), thickness_mm=0.2)),
-        *_depth(drawn, one),
-        *_place(drawn, one),
-        *_amplitude(drawn, one, skin_of(saturation_T=0.0), skin_of(saturation_T=5 * skin.saturation_T)),
-        _single_precision(drawn, draw_skin(skin, spreads, seed=seed, name="b0_s0")),
-        _same_seed(one, skin_of(), skin_of(name="b0_s1")),
-        _memory(drawn, one),
+        *modulus(drawn, usual, *(skin_of(modulus_kPa=modulus_kPa) for modulus_kPa in (0.0, 1e6))),
+        *thickness(drawn, usual, skin_of(no_spread(spreads), thickness_mm=0.2)),
+        *depth(drawn, usual),
+        *place(drawn, usual),
+        *amplitude(drawn, usual, skin_of(saturation_T=0.0), skin_of(saturation_T=5 * skin.saturation_T)),
+        single_precision(drawn, draw_skin(skin, spreads, seed=seed, name="b0_s0")),
+        same_seed(usual, skin_of(), skin_of(name="b0_s1")),
+        memory(drawn, usual),
     ]
 
 
-def _pokes_m(skin: Skin) -> Float[np.ndarray, "n 3"]:
-    return np.column_stack([PLACES_M, np.full(len(PLACES_M), DEPTH * skin.thickness_m)])
+def poke(board: Board, skin: Skin, share: float = DEPTH) -> Float[np.ndarray, "n k 3"]:
+    """Give dB of pokes to a share of the thickness."""
+    return changes_of_field(board, skin, _pokes_m(skin, share))[1]
 
 
-def _change(board: Board, skin: Skin) -> Float[np.ndarray, "n k 3"]:
-    return changes_of_field(board, skin, _pokes_m(skin))[1]
+def _pokes_m(skin: Skin, share: float = DEPTH) -> Float[np.ndarray, "n 3"]:
+    return np.column_stack([PLACES_M, np.full(len(PLACES_M), share * skin.thickness_m)])
 
 
-def _modulus(board: Board, one: Skin, soft: Skin, hard: Skin) -> list[Case]:
-    usual_T, soft_T, hard_T = (_change(board, skin) for skin in (one, soft, hard))
+def modulus(board: Board, usual: Skin, soft: Skin, hard: Skin) -> list[Case]:
+    usual_T, soft_T, hard_T = (poke(board, skin) for skin in (usual, soft, hard))
     soft_N, hard_N = (forces(skin, _pokes_m(skin)[:, 2]) for skin in (soft, hard))
-    force_N = np.column_stack([np.zeros((len(hard_N), 2)), hard_N])
-    read_N, clipped_n = read_force(force_N, noise_N=0.0, rng=rng_for(0, "stability"))
+    pushed_N = np.column_stack([np.zeros((len(hard_N), 2)), hard_N])
+    read_N, clipped_n = read_force(pushed_N, noise_N=0.0, rng=rng_for(0, "stability"))
     soft_off_T, hard_off_T = (float(np.abs(of_T - usual_T).max()) for of_T in (soft_T, hard_T))
     held = clipped_n == len(hard_N) and bool((read_N[:, 2] == RANGE_N[2]).all())
     return [
-        told(AREA, "a skin of no stiffness, E = 0", should="no force at all; dB as ever: the depth is prescribed",
-             happened=f"force {np.abs(soft_N).max():g} N; dB differs by {soft_off_T:g} T",
-             holds=not soft_N.any() and soft_off_T == 0),
-        told(AREA, "a stiff skin, E = 1 GPa", should="dB as ever; force held at the sensor's range, and counted",
-             happened=f"dB differs by {hard_off_T:g} T; {hard_N.max():.3g} N read as {read_N[:, 2].max():g} N, "
-                      f"{clipped_n} of {len(hard_N)} counted as clipped",
-             holds=hard_off_T == 0 and held),
+        observed(AREA, "a skin of no stiffness, E = 0", should="no force at all; dB as ever: the depth is prescribed",
+                 happened=f"force {np.abs(soft_N).max():g} N; dB differs by {soft_off_T:g} T",
+                 holds=not soft_N.any() and soft_off_T == 0),
+        observed(AREA, "a stiff skin, E = 1 GPa", should="dB as ever; force held at the sensor's range, and counted",
+                 happened=f"dB differs by {hard_off_T:g} T; {hard_N.max():.3g} N read as {read_N[:, 2].max():g} N, "
+                          f"{clipped_n} of {len(hard_N)} counted as clipped",
+                 holds=hard_off_T == 0 and held),
     ]  # fmt: skip
 
 
-def _thickness(board: Board, one: Skin, thin: Skin) -> list[Case]:
-    change_T, force_N = _change(board, thin), forces(thin, _pokes_m(thin)[:, 2])
-    impossible = [replace(one, thickness_m=sign * one.thickness_m) for sign in (0, -1)]
-    finite = bool(np.isfinite(change_T).all() and np.isfinite(force_N).all())
+def thickness(board: Board, usual: Skin, thin: Skin) -> list[Case]:
+    change_T, thin_N = poke(board, thin), forces(thin, _pokes_m(thin)[:, 2])
+    finite = bool(np.isfinite(change_T).all() and np.isfinite(thin_N).all())
     return [
         *(
             refused(AREA, f"a thickness of {skin.thickness_m / milli:.2g} mm", should="refused",
                     attempt=partial(forces, skin, np.array([1e-4])))
-            for skin in impossible
+            for skin in (replace(usual, thickness_m=sign * usual.thickness_m) for sign in (0, -1))
         ),
-        told(AREA, "a thickness of 0.2 mm", should="finite force and finite dB",
-             happened=f"{force_N.max():.3g} N and at most {np.abs(change_T).max() / micro:.3g} uT at "
-                      f"{_pokes_m(thin)[0, 2] / milli:g} mm; " + ("all finite" if finite else "not all finite"),
-             holds=finite),
+        observed(AREA, "a thickness of 0.2 mm", should="finite force and finite dB",
+                 happened=f"{thin_N.max():.3g} N and at most {np.abs(change_T).max() / micro:.3g} uT at "
+                          f"{_pokes_m(thin)[0, 2] / milli:g} mm; " + ("all finite" if finite else "not all finite"),
+                 holds=finite),
     ]  # fmt: skip
 
 
-def _depth(board: Board, one: Skin) -> list[Case]:
-    def poke(share: float) -> Float[np.ndarray, "n k 3"]:
-        pokes_m = np.column_stack([PLACES_M, np.full(len(PLACES_M), share * one.thickness_m)])
-        return changes_of_field(board, one, pokes_m)[1]
-
-    lifted_T = float(np.abs(poke(-0.2)).max())
-    lifted_N = float(np.abs(forces(one, np.array([-0.2 * one.thickness_m]))).max())
+def depth(board: Board, skin: Skin) -> list[Case]:
+    lifted_T = float(np.abs(poke(board, skin, -0.2)).max())
+    lifted_N = float(np.abs(forces(skin, np.array([-0.2 * skin.thickness_m]))).max())
     shares = np.array([0.2, 0.59, FLAGGED_DEPTH, 0.8])
-    flagged = layer.beyond_verified(shares * one.thickness_m, one.thickness_m)
-    force_N = forces(one, shares * one.thickness_m)
+    flagged = layer.beyond_verified(shares * skin.thickness_m, skin.thickness_m)
+    given_N = forces(skin, shares * skin.thickness_m)
     return [
-        told(AREA, "a tip above the skin, depth < 0", should="dB and force exactly 0",
-             happened=f"dB {lifted_T:g} T, force {lifted_N:g} N", holds=lifted_T == 0 and lifted_N == 0),
-        told(AREA, "depths of 0.2, 0.59, 0.6 and 0.8 of the thickness",
-             should="flagged from 0.6 on, where no published solution vouches; the force is given all the same",
-             happened=f"flagged: {', '.join(f'{s:g}' for s in shares[flagged])}; forces "
-                      f"{', '.join(f'{n:.3g}' for n in force_N)} N",
-             holds=bool((flagged == (shares >= FLAGGED_DEPTH)).all() and np.isfinite(force_N).all())),
+        observed(AREA, "a tip above the skin, depth < 0", should="dB and force exactly 0",
+                 happened=f"dB {lifted_T:g} T, force {lifted_N:g} N", holds=lifted_T == 0 and lifted_N == 0),
+        observed(AREA, "depths of 0.2, 0.59, 0.6 and 0.8 of the thickness",
+                 should="flagged from 0.6 on, where no published solution vouches; the force is given all the same",
+                 happened=f"flagged: {', '.join(f'{s:g}' for s in shares[flagged])}; forces "
+                          f"{', '.join(f'{n:.3g}' for n in given_N)} N",
+                 holds=bool((flagged == (shares >= FLAGGED_DEPTH)).all() and np.isfinite(given_N).all())),
         refused(AREA, "a poke through the skin, depth 1.5 of the thickness", should="refused",
-                attempt=lambda: poke(1.5)),
-        _almost_through(poke, one),
+                attempt=lambda: poke(board, skin, 1.5)),
+        _almost_through(board, skin),
     ]  # fmt: skip
 
 
-def _almost_through(poke: Callable[[float], Float[np.ndarray, "n k 3"]], one: Skin) -> Case:
-    case = "a poke to 0.95 of the thickness"
-    if one.base == "bonded":
-        return refused(AREA, case, should="refused, before the map folds or loses volume", attempt=lambda: poke(0.95))
-    largest_uT = float(np.abs(poke(0.95)).max() / micro)
-    beyond = bool(layer.beyond_verified(np.array([0.95 * one.thickness_m]), one.thickness_m).all())
-    return told(AREA, case, should="finite, for a sliding skin keeps its volume there; counted as beyond 0.6",
-                happened=f"dB of at most {largest_uT:.3g} uT; counted: {'yes' if beyond else 'no'}",
-                holds=beyond and 0 < largest_uT < np.inf)  # fmt: skip
+def _almost_through(board: Board, skin: Skin) -> Case:
+    case, attempt = "a poke to 0.95 of the thickness", partial(poke, board, skin, 0.95)
+    if skin.base == "bonded":
+        return refused(AREA, case, should="refused, before the map folds or loses volume", attempt=attempt)
+    largest_uT = float(np.abs(attempt()).max() / micro)
+    beyond = bool(layer.beyond_verified(np.array([0.95 * skin.thickness_m]), skin.thickness_m).all())
+    return observed(AREA, case, should="finite, for a sliding skin keeps its volume there; counted as beyond 0.6",
+                    happened=f"dB of at most {largest_uT:.3g} uT; counted: {'yes' if beyond else 'no'}",
+                    holds=beyond and 0 < largest_uT < np.inf)  # fmt: skip
 
 
-def _place(board: Board, one: Skin) -> list[Case]:
-    from magpylib.magnet import Cuboid
-
-    from pipeline.physics import magnet
-
-    inside_m = magnet.CUBE_SIDE_M * rng_for(0, "stability", "inside").uniform(-0.5, 0.5, (500, 3))
-    sides_m = (magnet.CUBE_SIDE_M,) * 3
-    found_T = magnet.cuboid_field(inside_m, 1.0, sides_m=sides_m)
-    error = worst(found_T, Cuboid(polarization=(0, 0, 1.0), dimension=sides_m).getB(inside_m))
-    beside_m = np.array([[one.seat_m[0] + 0.51 * one.sides_m[0], one.seat_m[1], DEPTH * one.thickness_m]])
-    on_dipoles = replace(board, chips_m=one.nodes_m[: len(board.chips_m)].copy())
+def place(board: Board, skin: Skin) -> list[Case]:
+    inside_m = CUBE_SIDE_M * rng_for(0, "stability", "inside").uniform(-0.5, 0.5, (500, 3))
+    error = inside_a_box(inside_m, CUBE_SIDE_M)
+    beside_m = np.array([[skin.seat_m[0] + 0.51 * skin.sides_m[0], skin.seat_m[1], DEPTH * skin.thickness_m]])
+    on_dipoles = replace(board, chips_m=skin.nodes_m[: len(board.chips_m)].copy())
     return [
         refused(AREA, "a poke beside the skin, 0.2 mm past its edge",
                 should="refused, never extrapolated: a flagged reading would need a field",
-                attempt=lambda: changes_of_field(board, one, beside_m)),
+                attempt=lambda: changes_of_field(board, skin, beside_m)),
         measured(AREA, "a place inside a magnet of the array", should="the field of the box, J included: as magpylib",
                  happened=f"{len(inside_m)} places, relative error {error:.1e}", error=error, limit=1e-12),
-        refused(AREA, "a chip on a dipole, r = 0", should="refused", attempt=lambda: _change(on_dipoles, one)),
+        refused(AREA, "a chip on a dipole, r = 0", should="refused", attempt=lambda: poke(on_dipoles, skin)),
     ]  # fmt: skip
 
 
-def _amplitude(board: Board, one: Skin, bare: Skin, strong: Skin) -> list[Case]:
-    once_T, bare_T, strong_T = (_change(board, skin) for skin in (one, bare, strong))
-    error = worst(strong_T, 5 * once_T)
-    left_T = float(np.abs(bare_T).max())
+def amplitude(board: Board, usual: Skin, bare: Skin, strong: Skin) -> list[Case]:
+    once_T, bare_T, strong_T = (poke(board, skin) for skin in (usual, bare, strong))
+    error, left_T = worst(strong_T, 5 * once_T), float(np.abs(bare_T).max())
     return [
-        told(AREA, "a skin without magnetisation", should="dB exactly 0", happened=f"at most {left_T:g} T",
-             holds=left_T == 0),
+        observed(AREA, "a skin without magnetisation", should="dB exactly 0", happened=f"at most {left_T:g} T",
+                 holds=left_T == 0),
         measured(AREA, "five times the magnetisation", should="five times dB", happened=f"relative error {error:.1e}",
                  error=error, limit=1e-12),
     ]  # fmt: skip
 
 
-def _single_precision(board: Board, fine: Skin) -> Case:
+def single_precision(board: Board, fine: Skin) -> Case:
     rest = fine.nodes_m, fine.moments_A_m2
-    moved = reference.moved_dipoles(fine, np.array([*PLACES_M[0], 0.5 * fine.thickness_m]), steps_n=1)
+    depths_m = kinematics.descent(0.5 * fine.thickness_m + fine.depth_zero_m, 1)
+    moved = kinematics.followed(fine, PLACES_M[0], depths_m)
     double_T = change_of_field(rest, moved, board.chips_m)
-    (x, m), (moved_x, moved_m), chips = rest, moved, board.chips_m
-    x, m, moved_x, moved_m, chips = (part.astype(np.float32) for part in (x, m, moved_x, moved_m, chips))
+    x, m, moved_x, moved_m, chips = (part.astype(np.float32) for part in (*rest, *moved, board.chips_m))
     # Node by node, as the product does: the difference of two large sums would lose more.
     each_T = dipole.field_of_each(moved_x, moved_m, chips) - dipole.field_of_each(x, m, chips)
     single_T = each_T.sum(axis=1)
@@ -177,22 +197,22 @@ def _single_precision(board: Board, fine: Skin) -> Case:
                     happened=happened, error=error_uT, limit=0.25)  # fmt: skip
 
 
-def _same_seed(one: Skin, again: Skin, other: Skin) -> Case:
-    first, second, third = (skin.nodes_m.tobytes() + skin.moments_A_m2.tobytes() for skin in (one, again, other))
-    same, differs = first == second, first != third
+def same_seed(first: Skin, again: Skin, renamed: Skin) -> Case:
+    bytes_of = [skin.nodes_m.tobytes() + skin.moments_A_m2.tobytes() for skin in (first, again, renamed)]
+    same, differs = bytes_of[0] == bytes_of[1], bytes_of[0] != bytes_of[2]
     words = {True: "the same bytes", False: "other bytes"}
-    happened = f"drawn again: {words[same]}; by another name: {words[not differs]}"
-    return told(AREA, "the same seed and name", should="the same bytes; another skin for another name",
-                happened=happened, holds=same and differs)  # fmt: skip
+    return observed(AREA, "the same seed and name", should="the same bytes; another skin for another name",
+                    happened=f"drawn again: {words[same]}; by another name: {words[not differs]}",
+                    holds=same and differs)  # fmt: skip
 
 
-def _memory(board: Board, one: Skin) -> Case:
+def memory(board: Board, skin: Skin) -> Case:
     rng = rng_for(0, "stability", "memory")
-    places_m = np.column_stack(
-        [rng.uniform(-8e-3, 8e-3, (4 * POKES_N, 2)), np.full(4 * POKES_N, DEPTH * one.thickness_m)]
+    pokes_m = np.column_stack(
+        [rng.uniform(-8e-3, 8e-3, (4 * POKES_N, 2)), np.full(4 * POKES_N, DEPTH * skin.thickness_m)]
     )
-    changes_of_field(board, one, places_m[:1])  # the table is made once for all
-    few_n, many_n = (peak_bytes(partial(changes_of_field, board, one, places_m[:n])) for n in (POKES_N, 4 * POKES_N))
+    changes_of_field(board, skin, pokes_m[:1])  # the table is made once for all
+    few_n, many_n = (peak_bytes(partial(changes_of_field, board, skin, pokes_m[:n])) for n in (POKES_N, 4 * POKES_N))
     each_n = (many_n - few_n) / (3 * POKES_N)
     happened = (
         f"{POKES_N} pokes {few_n / 1e6:.2f} MB, {4 * POKES_N} pokes {many_n / 1e6:.2f} MB: {each_n:.0f} bytes a poke, "
@@ -200,3 +220,23 @@ def _memory(board: Board, one: Skin) -> Case:
     )
     return measured(AREA, "1e6 pokes", should=f"memory grows by no more than {BYTES_MAX_N} bytes a poke",
                     happened=happened, error=each_n, limit=float(BYTES_MAX_N))  # fmt: skip
+
+
+def drag_cases(skin: SkinDesign) -> list[Case]:
+    """Drag the tip along a line without friction, and with a friction that never lets go."""
+    press = Press(skin.thickness_mm * milli, skin.tip_radius_mm * milli, skin.base)
+    depth_m, modulus_Pa = DEPTH * press.thickness_m, skin.modulus_kPa * kilo
+    stiffness = modulus_Pa / 3 * shear.tabulate_depth(depth_m, **asdict(press)).stiffness_m
+    normal_N = force_N(np.full(len(PATH_MM), depth_m), press, modulus_Pa)
+    path_m = np.column_stack([np.array(PATH_MM) * milli, np.zeros(len(PATH_MM))])
+    smooth, sticky = (
+        friction.drag(path_m, normal_N, stiffness_N_per_m=stiffness, friction=mu).force_N for mu in (0.0, STICKY)
+    )
+    error = float(np.abs(sticky[:, 0] - stiffness * path_m[:, 0]).max() / sticky.max())
+    return [
+        observed(AREA, "a drag without friction", should="no force sideways at all",
+                 happened=f"at most {np.abs(smooth).max():g} N over {PATH_MM[-1]:g} mm", holds=not smooth.any()),
+        measured(AREA, f"a drag with friction {STICKY:g}", should="sticks: force is stiffness times the way",
+                 happened=f"{sticky.max():.3g} N over {PATH_MM[-1]:g} mm, relative error {error:.1e}",
+                 error=error, limit=1e-12),
+    ]  # fmt: skip

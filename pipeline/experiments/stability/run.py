@@ -6,19 +6,31 @@ from pathlib import Path
 from pipeline.core import io
 from pipeline.core.config import Files, read_settings
 from pipeline.core.stage import run, say
+from pipeline.experiments.stability.cases import Case
+from pipeline.experiments.stability.chip import chip_cases
 from pipeline.experiments.stability.learning import learning_cases
-from pipeline.experiments.stability.survey import survey
-from pipeline.synthesis.of_settings import synthesis_of
+from pipeline.experiments.stability.physics import drag_cases, physics_cases, time_cases
+from pipeline.experiments.stability.wire import wire_cases
+from pipeline.synthesis.settings import Synthesis, synthesis_of
+
+
+def survey(of: Synthesis, seed: int) -> list[Case]:
+    """Try every case of physics, chip and wire on the designs of a scene."""
+    board = of.main_boards.design
+    chips_n = len(board.places_mm)
+    return [
+        *time_cases(),
+        *physics_cases(board, of.spreads, skin=of.skin, seed=seed),
+        *drag_cases(of.skin),
+        *chip_cases(of.chip, chips_n, seed),
+        *wire_cases(of.chip.gain_sel, chips_n, seed),
+    ]
 
 
 def stability(scene: str, files: Files, answer: Path) -> None:
     """Try every case on the scene's own skins and chips and on small trainings, and write down what happened."""
     settings = read_settings("stability", scene, files)
-    of, seed = synthesis_of(settings), settings.seed
-    cases = [
-        *survey(of.main_boards.design, of.spreads, skin=of.skin, chip=of.chip, seed=seed),
-        *learning_cases(seed),
-    ]
+    cases = [*survey(synthesis_of(settings), settings.seed), *learning_cases(settings.seed)]
     io.write_json(answer, [asdict(case) for case in cases])
     for case in cases:
         if not case.holds:

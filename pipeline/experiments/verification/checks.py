@@ -1,6 +1,6 @@
-"""One row of the verification table. In: what was measured against what. Out: a `Check`, which holds or does not.
+"""One row of the verification table: a law of the product, its error against a reference, and what that may be.
 
-Refuses to know what is checked.
+Laws (the modules beside this one) return it for any inputs: the stage tabulates those of a scene, tests draw others.
 """
 
 from dataclasses import dataclass
@@ -27,6 +27,16 @@ class Check:
     def holds(self) -> bool:
         """Tell whether the error is within its tolerance; NaN is not."""
         return bool(self.error <= self.tolerance)
+
+
+def farthest(found: Float[np.ndarray, "*any"], truth: Float[np.ndarray, "*any"] | float) -> float:
+    """Give the largest deviation, in the unit of both."""
+    return float(np.abs(found - truth).max())
+
+
+def relative(found: Float[np.ndarray, "*any"], truth: Float[np.ndarray, "*any"]) -> float:
+    """Give the largest deviation, each relative to its own truth."""
+    return float(np.abs(found / truth - 1).max())
 
 
 def worst(found: Float[np.ndarray, "*any"], truth: Float[np.ndarray, "*any"]) -> float:

@@ -1,12 +1,14 @@
-"""Fields of magnets and dipoles against magpylib and Maxwell. In: a design of skins. Out: checks.
+"""Laws of the fields of magnets and dipoles, against magpylib and Maxwell. In: sizes, a seed. Out: checks.
 
 magpylib's objects share no code with ours. Refuses to know pokes (`poke`) and chips (`electronics`).
 """
 
 from itertools import product
 
+import magpylib
 import numpy as np
 from jaxtyping import Float
+from magpylib.core import dipole_Hfield
 from scipy.constants import milli, mu_0
 
 from pipeline.core.seeds import rng_for
@@ -14,95 +16,95 @@ from pipeline.experiments.verification.checks import Check, worst
 from pipeline.physics import dipole, magnet
 from pipeline.physics.change import change_of_field
 from pipeline.physics.nodes import Quadrature, place_nodes
-from pipeline.physics.skin import SkinDesign
+from pipeline.physics.skin import Dipoles, SkinDesign
 
 NEAR_CELLS, FAR_CELLS = 0.6, 50.0  # distances, in sizes of a cell (PHYSICS 9)
 COARSE = Quadrature(cell_m=1.5e-3, layers_n=3)
 MU_0_DIGITS = 1e-8  # between CODATA years mu_0 differs by 1e-10 to 1e-9
+TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # a quarter turn about z
 
 
 def check_field(skin: SkinDesign, seed: int) -> list[Check]:
     """Check boxes, the magnetising array and dipoles, at rest and moved."""
-    return [*_boxes(seed), *_array(skin, seed), *_dipoles(seed)]
+    return [*boxes(seed), octupole(), *array(skin.polarity, skin.thickness_mm * milli, seed), *dipoles(seed)]
 
 
-def _boxes(seed: int) -> list[Check]:
-    from magpylib.magnet import Cuboid
-
-    side_m = 0.5 * milli
+def boxes(seed: int, side_m: float = 0.5 * milli) -> list[Check]:
     rng = rng_for(seed, "verification", "box")
     away = rng.standard_normal((2000, 3))
     away /= np.linalg.norm(away, axis=1, keepdims=True)
     places_m = side_m * away * np.geomspace(NEAR_CELLS, FAR_CELLS, len(away))[:, None]
     inside_m = side_m * rng.uniform(-0.5, 0.5, (500, 3))
-    theirs = Cuboid(polarization=(0, 0, 1.0), dimension=(side_m,) * 3)
-    found_T, inside_T = (magnet.cuboid_field(p, 1.0, sides_m=(side_m,) * 3) for p in (places_m, inside_m))
-    truth_T = theirs.getB(places_m)
+    found_T, truth_T = magnet.cuboid_field(places_m, 1.0, sides_m=(side_m,) * 3), cuboid(side_m).getB(places_m)
     relative = np.linalg.norm(found_T - truth_T, axis=1) / np.linalg.norm(truth_T, axis=1)
-    rounding = "rounding of 24 logarithms and arcus tangents of the size of J"
     return [
         Check("field of a box", f"outside, {NEAR_CELLS:g}-{FAR_CELLS:g} sides away", "magpylib Cuboid",
               float(relative.max()), "1", 1e-8,
               "they cancel to (side / r)^3 of J: rounding grows 1e5-fold on the way to 50 sides"),
-        Check("field of a box", "inside, J included", "magpylib Cuboid", worst(inside_T, theirs.getB(inside_m)), "1",
-              1e-12, rounding),
-        Check("dipole for a cube", "error falls with (side / r)^4", "ratio 16 for twice the distance", _octupole(), "1",
-              0.02, "next term: (side / r)^6, 1 % between 8 and 16 sides"),
+        Check("field of a box", "inside, J included", "magpylib Cuboid", inside_a_box(inside_m, side_m), "1", 1e-12,
+              "rounding of 24 logarithms and arcus tangents of the size of J"),
     ]  # fmt: skip
 
 
-def _octupole() -> float:
-    # A cube has no quadrupole, and its octupole vanishes with equal sides: next is (side / r)^4.
-    place = np.array([[0.3, -0.4, np.sqrt(0.75)]])
-    moment = np.array([[0.0, 0.0, 1 / mu_0]])
-
-    def error(sides: float) -> float:
-        exact_T = magnet.cuboid_field(sides * place, 1.0, sides_m=(1.0, 1.0, 1.0))
-        return worst(dipole.field(np.zeros((1, 3)), moment, sides * place), exact_T)
-
-    return abs(error(8.0) / error(16.0) / 16 - 1)
+def inside_a_box(places_m: Float[np.ndarray, "o 3"], side_m: float) -> float:
+    """Give the relative error of the field inside a cube."""
+    return worst(magnet.cuboid_field(places_m, 1.0, sides_m=(side_m,) * 3), cuboid(side_m).getB(places_m))
 
 
-def _array(skin: SkinDesign, seed: int) -> list[Check]:
-    import magpylib
+def cuboid(side_m: float, j_T: float = 1.0, place_m: tuple[float, ...] = (0, 0, 0)) -> magpylib.magnet.Cuboid:
+    """Make a cube of magpylib's that is magnetised along z."""
+    return magpylib.magnet.Cuboid(polarization=(0, 0, j_T), dimension=(side_m,) * 3, position=place_m)
 
-    thickness_m, side_m = skin.thickness_mm * milli, magnet.CUBE_SIDE_M
-    nodes_m = place_nodes(thickness_m, COARSE).nodes_m
+
+def octupole() -> Check:
+    place, moment = np.array([[0.3, -0.4, np.sqrt(0.75)]]), np.array([[0.0, 0.0, 1 / mu_0]])
+    near, far = (
+        worst(dipole.field(np.zeros((1, 3)), moment, sides * place),
+              magnet.cuboid_field(sides * place, 1.0, sides_m=(1.0, 1.0, 1.0)))
+        for sides in (8.0, 16.0)
+    )  # fmt: skip
+    return Check("dipole for a cube", "error falls with (side / r)^4", "ratio 16 for twice the distance",
+                 abs(near / far / 16 - 1), "1", 0.02, "next term: (side / r)^6, 1 % between 8 and 16 sides"
+                 )  # fmt: skip
+
+
+def cuboids(polarity: magnet.Polarity, thickness_m: float, cubes_n: tuple[int, int]) -> list[magpylib.magnet.Cuboid]:
+    """Lay out the magnetising array of magpylib's cubes."""
+    side_m, swaps = magnet.CUBE_SIDE_M, -1 if polarity == "checkerboard" else 1
     heights_m = (-magnet.ARRAY_BELOW_M - side_m / 2, thickness_m + magnet.ARRAY_ABOVE_M + side_m / 2)
-    swaps = -1 if skin.polarity == "checkerboard" else 1
-    cubes = [
-        magpylib.magnet.Cuboid(
-            polarization=(0, 0, magnet.ARRAY_REMANENCE_T * swaps ** (i + j)),
-            dimension=(side_m,) * 3,
-            position=((i - 1.5) * side_m, (j - 1.5) * side_m, z_m),
-        )
-        for i, j, z_m in product(range(4), range(4), heights_m)
-    ]
-    here_T = magnet.array_field(nodes_m, thickness_m, skin.polarity)
-    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    turned_T = magnet.array_field(nodes_m @ turn.T, thickness_m, skin.polarity)
-    divergence, curl = _slopes(rng_for(seed, "verification", "array"), thickness_m, skin)
-    differences = "central differences over 1 um, 0.25 mm and more from an edge: (1/250)^2"
-    name = f"magnetising array, {skin.polarity}"
     return [
-        Check(name, "field in the skin", "32 magpylib Cuboids",
-              worst(here_T, magpylib.getB(cubes, nodes_m, sumup=True)), "1", 1e-12,
+        cuboid(side_m, magnet.ARRAY_REMANENCE_T * swaps ** (i + j),
+               ((i - (cubes_n[0] - 1) / 2) * side_m, (j - (cubes_n[1] - 1) / 2) * side_m, z_m))
+        for i, j, z_m in product(*map(range, cubes_n), heights_m)
+    ]  # fmt: skip
+
+
+def array(polarity: magnet.Polarity, thickness_m: float, seed: int) -> list[Check]:
+    nodes_m = place_nodes(thickness_m, COARSE).nodes_m
+    here_T, turned_T = (magnet.array_field(places_m, thickness_m, polarity) for places_m in (nodes_m, nodes_m @ TURN.T))
+    swaps = -1 if polarity == "checkerboard" else 1
+    theirs_T = magpylib.getB(cuboids(polarity, thickness_m, magnet.CUBES_N), nodes_m, sumup=True)
+    divergence, curl = _slopes(rng_for(seed, "verification", "array"), thickness_m, polarity)
+    differences = "central differences over 1 um, 0.25 mm and more from an edge: (1/250)^2"
+    name = f"magnetising array, {polarity}"
+    return [
+        Check(name, "field in the skin", "32 magpylib Cuboids", worst(here_T, theirs_T), "1", 1e-12,
               "rounding, 32 boxes that nearly cancel at the seams"),
         Check(name, "div B = 0", "central differences", divergence, "1", 1e-4, differences),
         Check(name, "curl B = 0", "central differences", curl, "1", 1e-4, differences),
         Check(name, "a quarter turn turns the field" + (", and swaps the poles" if swaps < 0 else ""),
-              "itself, turned", worst(turned_T, swaps * here_T @ turn.T), "1", 1e-12, "rounding, as above"),
+              "itself, turned", worst(turned_T, swaps * here_T @ TURN.T), "1", 1e-12, "rounding, as above"),
     ]  # fmt: skip
 
 
-def _slopes(rng: np.random.Generator, thickness_m: float, skin: SkinDesign) -> tuple[float, float]:
+def _slopes(rng: np.random.Generator, thickness_m: float, polarity: magnet.Polarity) -> tuple[float, float]:
     """Give the worst divergence and curl relative to the steepest slope of the field there."""
     step_m = 1e-6
     low, high = np.array([-9e-3, -9e-3, 0.05 * thickness_m]), np.array([9e-3, 9e-3, 0.95 * thickness_m])
     places_m = rng.uniform(low, high, (200, 3))
     steps_m = (np.eye(3)[:, None] * np.array([step_m, -step_m])[:, None]).reshape(6, 3)
     around_m = (places_m[:, None] + steps_m).reshape(-1, 3)
-    b_T = magnet.array_field(around_m, thickness_m, skin.polarity).reshape(-1, 3, 2, 3)
+    b_T = magnet.array_field(around_m, thickness_m, polarity).reshape(-1, 3, 2, 3)
     slope = (b_T[:, :, 0] - b_T[:, :, 1]) / (2 * step_m)
     size = np.abs(slope).max(axis=(1, 2))
     divergence = np.abs(np.trace(slope, axis1=1, axis2=2)) / size
@@ -110,16 +112,20 @@ def _slopes(rng: np.random.Generator, thickness_m: float, skin: SkinDesign) -> t
     return float(divergence.max()), float(curl.max())
 
 
-def _dipoles(seed: int) -> list[Check]:
+def dipoles(seed: int, factor: float = 2.5) -> list[Check]:
     rng = rng_for(seed, "verification", "dipoles")
     # Off the origin, or a wrong sign of a separation could hide.
     nodes_m = rng.uniform((2e-3, -9e-3, 1e-3), (9e-3, 4e-3, 3e-3), (60, 3))
     moments = 1e-5 * rng.standard_normal((60, 3))
     moved_m, turned = nodes_m + 1e-4 * rng.standard_normal((60, 3)), moments + 1e-6 * rng.standard_normal((60, 3))
     observers_m = rng.uniform((-3e-3, -3e-3, -2e-3), (3e-3, 3e-3, -1e-3), (5, 3))
-    before_T, after_T = _their_dipoles(nodes_m, moments, observers_m), _their_dipoles(moved_m, turned, observers_m)
+    before_T, after_T = (
+        magpylib.getB([magpylib.misc.Dipole(moment=m, position=x) for x, m in zip(places_m, those, strict=True)],
+                      observers_m, sumup=True)
+        for places_m, those in ((nodes_m, moments), (moved_m, turned))
+    )  # fmt: skip
     change_T = change_of_field((nodes_m, moments), (moved_m, turned), observers_m)
-    scaled_T = change_of_field((nodes_m, 2.5 * moments), (moved_m, 2.5 * turned), observers_m)
+    scaled_T = change_of_field((nodes_m, factor * moments), (moved_m, factor * turned), observers_m)
     year = "rounding; a magpylib of another CODATA year has another mu_0"
     return [
         Check("field of dipoles", "at rest", "magpylib Dipole", worst(dipole.field(nodes_m, moments, observers_m),
@@ -127,15 +133,14 @@ def _dipoles(seed: int) -> list[Check]:
         Check("change of field", "dipoles that move and turn", "magpylib Dipole, after less before",
               worst(change_T, after_T - before_T), "1", 10 * MU_0_DIGITS,
               f"{year}, and the difference is a tenth of the sums"),
-        Check("change of field", "linear in the moments", "itself, 2.5 times", worst(scaled_T, 2.5 * change_T), "1",
-              1e-12, "rounding of a few thousand operations"),
+        Check("change of field", "linear in the moments", f"itself, {factor:g} times",
+              worst(scaled_T, factor * change_T), "1", 1e-12, "rounding of a few thousand operations"),
     ]  # fmt: skip
 
 
-def _their_dipoles(
-    places_m: Float[np.ndarray, "s 3"], moments: Float[np.ndarray, "s 3"], observers_m: Float[np.ndarray, "o 3"]
-) -> Float[np.ndarray, "o 3"]:
-    import magpylib
-
-    dipoles = [magpylib.misc.Dipole(moment=m, position=x) for x, m in zip(places_m, moments, strict=True)]
-    return magpylib.getB(dipoles, observers_m, sumup=True)
+def field_of(of: Dipoles, observers_m: Float[np.ndarray, "o 3"]) -> Float[np.ndarray, "o 3"]:
+    """Sum magpylib.core's field of dipoles at observers, in tesla: one call over every pair."""
+    places_m, moments = of
+    separation_m = (observers_m[:, None] - places_m).reshape(-1, 3)
+    h_A_m = dipole_Hfield(observers=separation_m, moments=np.tile(moments, (len(observers_m), 1)))
+    return mu_0 * h_A_m.reshape(len(observers_m), -1, 3).sum(axis=1)

@@ -1,4 +1,4 @@
-"""The bytes of frames against Python's struct and float. In: readings of a scene's chip. Out: checks.
+"""Laws of the bytes of frames, against Python's struct and float. In: readings of chips. Out: checks.
 
 The binary layouts are those of the authors' reader: struct "<20fcc" for five chips.
 Refuses to know losses (`stability`).
@@ -24,9 +24,8 @@ CRLF_SHARE = 0.05
 def check_frames(gain_sel: int, chips_n: int, seed: int) -> list[Check]:
     """Check what is written and what is read, for each wire format; an error is the largest difference of any value."""
     frames = make_frames(FRAMES_N, chips_n, gain_sel=gain_sel, rng=rng_for(seed, "verification", "frames"))
-    return [check for layout in ("binary", "binary-clock") for check in _binary(frames, layout)] + [
-        check for layout in ("text-xyzt", "text-txyz") for check in _text(frames, layout)
-    ]
+    laws = {"binary": binary, "binary-clock": binary, "text-xyzt": text, "text-txyz": text}
+    return [check for layout, law in laws.items() for check in law(frames, layout)]
 
 
 def make_frames(frames_n: int, chips_n: int, *, gain_sel: int, rng: np.random.Generator) -> Frames:
@@ -38,13 +37,10 @@ def make_frames(frames_n: int, chips_n: int, *, gain_sel: int, rng: np.random.Ge
     return Frames(b_uT, held_degC, np.arange(frames_n) / 512.0, np.zeros(frames_n, np.int64))
 
 
-def _binary(frames: Frames, layout: Wire) -> list[Check]:
-    values = _txyz(frames)
-    frames_n, numbers_n = values.shape
-    clock = "f" if layout == "binary-clock" else ""
-    form = struct.Struct(f"<{clock}{numbers_n}fcc")
-    clocks = frames.device_s.tolist() if clock else None
-    rows = [([clocks[i]] if clocks else []) + values[i].tolist() for i in range(frames_n)]
+def binary(frames: Frames, layout: Wire) -> list[Check]:
+    values, clock = _txyz(frames), "f" if layout == "binary-clock" else ""
+    form = struct.Struct(f"<{clock}{values.shape[1]}fcc")
+    rows = np.column_stack([frames.device_s, values]).tolist() if clock else values.tolist()
     theirs = b"".join(form.pack(*row, b"\r", b"\n") for row in rows)
     ours = wire.encode(frames, layout)
     unpacked = np.array([row[:-2] for row in form.iter_unpack(ours)])[:, len(clock) :]
@@ -60,7 +56,7 @@ def _binary(frames: Frames, layout: Wire) -> list[Check]:
     ]  # fmt: skip
 
 
-def _text(frames: Frames, layout: Wire) -> list[Check]:
+def text(frames: Frames, layout: Wire) -> list[Check]:
     values = _txyz(frames)
     numbers = values.reshape(len(frames), -1, 4)
     ordered = numbers if layout == "text-txyz" else np.roll(numbers, -1, axis=2)

@@ -8,18 +8,40 @@ from scipy.constants import milli
 from pipeline.core import io
 from pipeline.core.config import Files, read_settings
 from pipeline.core.stage import run, say
-from pipeline.experiments.verification.survey import Designs
-from pipeline.experiments.verification.survey import verify as check_all
-from pipeline.synthesis.of_settings import synthesis_of
+from pipeline.experiments.verification.checks import Check
+from pipeline.experiments.verification.contact import check_contact, check_sideways
+from pipeline.experiments.verification.electronics import check_electronics
+from pipeline.experiments.verification.field import check_field
+from pipeline.experiments.verification.frames import check_frames
+from pipeline.experiments.verification.kinematics import check_kinematics
+from pipeline.experiments.verification.poke import check_poke
+from pipeline.experiments.verification.relaxation import check_relaxation
+from pipeline.physics.flow import Press
+from pipeline.synthesis.settings import Synthesis, synthesis_of
+
+
+def verify(of: Synthesis, *, depths_m: tuple[float, ...], seed: int) -> list[Check]:
+    """Measure every law against its reference, for the designs of a scene, in the order of the simulator's chain."""
+    board, skin = of.main_boards, of.skin
+    press = Press(skin.thickness_mm * milli, skin.tip_radius_mm * milli, skin.base)
+    rule = board.quadrature.quadrature()
+    return [
+        *check_field(skin, seed),
+        *check_contact(skin),
+        *check_kinematics(press, max(depths_m)),
+        *check_sideways(skin),
+        *check_poke(board.design, of.spreads, skin=skin, rule=rule, depths_m=depths_m, seed=seed),
+        *check_relaxation(),
+        *check_electronics(of.chip, seed),
+        *check_frames(of.chip.gain_sel, len(board.design.places_mm), seed),
+    ]
 
 
 def verification(scene: str, files: Files, answer: Path) -> None:
     """Check the scene's own skins, pokes and chips."""
     settings = read_settings("verification", scene, files)
-    of, seed = synthesis_of(settings), settings.seed
-    depths_m = tuple(milli * depth_mm for depth_mm in of.main.depths_mm)
-    designs = Designs(of.main_boards.design, of.spreads, of.skin, of.chip, of.main_boards.quadrature.quadrature())
-    checks = check_all(designs, depths_m=depths_m, seed=seed)
+    of = synthesis_of(settings)
+    checks = verify(of, depths_m=tuple(milli * depth_mm for depth_mm in of.main.depths_mm), seed=settings.seed)
     io.write_json(answer, [asdict(check) | {"holds": check.holds} for check in checks])
     for check in checks:
         if not check.holds:

@@ -16,11 +16,11 @@ from pipeline.dataset.folds import load_rows, parse_folds, render_folds
 from pipeline.dataset.rows import Selection
 from pipeline.dataset.splits import Fold, draw_folds
 from pipeline.experiments.audit.run import audit
-from pipeline.learning.inputs import VIEW
+from pipeline.learning.inputs import FIT, VIEW
+from pipeline.learning.job import make_job
 from pipeline.learning.recipe import adaptations as adaptations_of
 from pipeline.learning.recipe import training
-from pipeline.learning.standardise import FIT
-from pipeline.learning.trial import Measured, Trained, Trial, make_job
+from pipeline.learning.trial import Measured, Trained, Trial
 from pipeline.stages import split
 from pipeline.trials import models as _models
 from pipeline.trials.adapting import adaptations, read_starts

@@ -15,7 +15,7 @@ from pipeline.experiments.audit import copies, sides
 from pipeline.experiments.audit.copies import nearest_rays
 from pipeline.experiments.audit.run import audit_choice, audit_scaler
 from pipeline.experiments.audit.sides import Labels, Sides, audit_fold, holds, to_words
-from pipeline.learning.standardise import FIT
+from pipeline.learning.inputs import FIT
 
 NONE = np.zeros(0, np.int64)
 READINGS_N = 3

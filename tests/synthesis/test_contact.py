@@ -1,4 +1,4 @@
-"""What a skin makes of contacts: the terms' own formulas as truth; nothing asked, nothing added as law."""
+"""The contact response: the terms' own formulas as truth; no term, no effect, as law."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from pipeline.physics.friction import Friction
 from pipeline.physics.skin import changes_of_field, draw_skin, forces
 from pipeline.physics.viscoelastic import Relaxation, force_left
 from pipeline.physics.wear import Ageing
-from pipeline.synthesis.felt import Terms, feel
+from pipeline.synthesis.contact import Terms, respond
 from tests.synthesis.scene import synthesis
 
 OF = synthesis()
@@ -19,13 +19,13 @@ TIP_M = np.tile([[[1e-3, 2e-3, 0.8e-3]]], (200, 1, 1))
 REST_T, CHANGE_T = changes_of_field(BOARD, SKIN, TIP_M[0])
 
 
-def felt(tilt=0.0, **terms):
+def response(tilt=0.0, **terms):
     lean = np.tile([tilt, 0.0], (len(TIP_M), 1))
-    return feel(BOARD, SKIN, TIP_M, tilt=lean, terms=Terms(**terms), rng=rng_for(0, "felt"))
+    return respond(BOARD, SKIN, TIP_M, tilt=lean, terms=Terms(**terms), rng=rng_for(0, "felt"))
 
 
 def test_without_terms_every_contact_is_the_first():
-    one = felt()
+    one = response()
     np.testing.assert_array_equal(one.rest_T, np.tile(REST_T, (200, 1, 1)))
     np.testing.assert_array_equal(one.change_T[:, 0], np.tile(CHANGE_T[0], (200, 1, 1)))
     np.testing.assert_allclose(one.force_N[:, 0, 2], forces(SKIN, np.array([0.8e-3]))[0])
@@ -33,21 +33,21 @@ def test_without_terms_every_contact_is_the_first():
 
 
 def test_the_field_at_rest_fades_with_every_decade_of_contacts():
-    one = felt(ageing=Ageing(settling=0.0, ageing=0.0, fading_per_decade=0.02, wandering_uT=0.0))
+    one = response(ageing=Ageing(settling=0.0, ageing=0.0, fading_per_decade=0.02, wandering_uT=0.0))
     np.testing.assert_allclose(one.rest_T[99], (1 - 0.02 * 2) * REST_T, rtol=1e-12)  # log10(1 + 99) = 2
 
 
 def test_force_softens_and_relaxes_in_every_direction():
     how, slack = Ageing(settling=0.2, ageing=0.0, fading_per_decade=0.0, wandering_uT=0.0), (0.1, 2.0)
     relaxation = Relaxation(approach_s=slack[0], hold_s=slack[1])
-    plain = felt(tilt=0.1, friction=Friction(coefficient=0.8))
-    worn = felt(tilt=0.1, friction=Friction(coefficient=0.8), ageing=how, relaxation=relaxation)
+    plain = response(tilt=0.1, friction=Friction(coefficient=0.8))
+    worn = response(tilt=0.1, friction=Friction(coefficient=0.8), ageing=how, relaxation=relaxation)
     left = (1 - 0.2 * -np.expm1(-199 / 300)) * force_left(relaxation)
     np.testing.assert_allclose(worn.force_N[199], left * plain.force_N[199], rtol=1e-12)
 
 
 def test_a_tip_that_leans_pushes_sideways_by_its_lean():
-    one = felt(tilt=0.1, friction=Friction(coefficient=0.8))
+    one = response(tilt=0.1, friction=Friction(coefficient=0.8))
     np.testing.assert_allclose(one.force_N[:, 0, 0], 0.1 * one.force_N[:, 0, 2])
     assert np.linalg.norm(one.change_T[0, 0] - CHANGE_T[0]) > 0.01 * np.linalg.norm(CHANGE_T[0])
 
@@ -55,5 +55,5 @@ def test_a_tip_that_leans_pushes_sideways_by_its_lean():
 @pytest.mark.parametrize(("depth_mm", "deep"), [(0.5, False), (1.4, True)])
 def test_stops_past_what_is_verified_are_counted(depth_mm, deep):
     tip_m = np.array([[[0.0, 0.0, depth_mm * 1e-3]]])
-    one = feel(BOARD, SKIN, tip_m, tilt=np.zeros((1, 2)), terms=Terms(), rng=rng_for(0, "felt"))
+    one = respond(BOARD, SKIN, tip_m, tilt=np.zeros((1, 2)), terms=Terms(), rng=rng_for(0, "felt"))
     assert one.beyond_verified_n == deep

@@ -1,0 +1,92 @@
+"""Every use of `import reskin` in at most three lines, from plain values, beside what the pipeline itself gives."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import reskin
+from pipeline import api
+from pipeline.core import io
+from pipeline.core.config import Settings, read_yaml
+from pipeline.core.errors import ReskinError
+from pipeline.core.seeds import rng_for
+from pipeline.dataset.folds import load_rows
+from pipeline.dataset.rows import Selection
+from pipeline.predicting import read_network
+from pipeline.synthesis.capture import record
+from pipeline.synthesis.settings import check_synthesis
+from tests.test_io import readings
+from tests.test_predicting import model  # noqa: F401 (a fixture)
+
+QUIET_CHIP = {"noise_xy_uT": 0.0, "noise_z_uT": 0.0}
+
+
+def test_the_import_is_cheap_and_finds_no_torch():
+    code = "import sys, reskin; print([name for name in ('torch', 'scipy', 'pandas', 'mlflow') if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], cwd=api.CHECKOUT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_rows_are_those_that_stages_read(tmp_path):
+    files = [tmp_path / f"data/indentations/small/c{i}.parquet" for i in range(2)]
+    for file in files:
+        io.write_readings(file, [readings()], {})
+    io.write_text(tmp_path / "pipeline/scenes/small.yaml", "selection: {force_min_N: 0.0}\n")
+    rows = reskin.load_rows("small", root=tmp_path)
+    expected = load_rows(files, Selection(force_min_N=0.0))
+    for name in ("capture", "board", "skin", "db_uT", "target", "pass_i", "indentation"):
+        np.testing.assert_array_equal(getattr(rows, name), getattr(expected, name))
+
+
+def test_pokes_are_read_as_a_simulated_capture_without_noise_is():
+    words, shared = read_yaml(api.CHECKOUT / "pipeline/scenes/quick.yaml"), read_yaml(api.CHECKOUT / "params.yaml")
+    words["simulate"]["protocols"]["grid"] |= {"passes_n": 1, "depths_mm": [1.0]}
+    exact = {name: 0.0 for name in ("robot_place_sd_mm", "robot_depth_sd_mm", "force_noise_N")}
+    shared |= {"chip": shared["chip"] | QUIET_CHIP, "rig": shared["rig"] | exact}
+    capture = record(
+        check_synthesis(Settings("quick", "quick", words, shared, {})), "grid", board="b0", skin="b0_s0", seed=3
+    )
+    contact = capture.probe.contact
+    places = np.stack([getattr(capture.probe, name)[contact] for name in ("x_mm", "y_mm", "depth_mm")], axis=1)
+
+    skin = reskin.draw_skin("b0_s0", seed=3)
+    board = reskin.draw_board("b0", seed=3)
+    noload_uT, b_uT, Fz_N = reskin.simulate_pokes(skin, places.tolist(), board=board, chip=QUIET_CHIP)
+
+    per_poke = capture.b_uT.reshape(len(places), -1, 15)
+    step_uT = 0.5  # the chip's own, at most; a float32 place moves a field by less
+    assert np.abs(per_poke[:, 1] - noload_uT).max() <= step_uT
+    last_contact_i = per_poke.shape[1] - 1 - shared["rig"]["moving_frames_n"]
+    assert np.abs(per_poke[:, last_contact_i] - b_uT).max() <= step_uT
+    assert np.abs(b_uT - noload_uT).max() > 100 * step_uT
+    np.testing.assert_allclose(Fz_N, capture.probe.Fz_N[contact], atol=0.01)  # the sensor's own steps
+
+
+def test_a_design_is_changed_with_plain_values_and_a_wrong_one_is_a_sentence():
+    spreads = {"chip_offset_uT": 0.0}
+    board = reskin.draw_board(chips_xy_mm=[[0, 0], [7, 0]], chips_turn_deg=[0, 90], spreads=spreads)
+    assert board.chips_m.shape == (2, 3)
+    assert reskin.simulate_pokes(reskin.draw_skin(thickness_mm=3), [[8, 8, 1]], board=board).b_uT.shape == (1, 6)
+    with pytest.raises(ReskinError, match="draw_skin: thickness_mm must be"):
+        reskin.draw_skin(thickness_mm="thick")
+    with pytest.raises(ReskinError, match="pokes must be rows of x_mm, y_mm, depth_mm; got shape"):
+        reskin.simulate_pokes(reskin.draw_skin(), [8, 8, 1])
+    with pytest.raises(ReskinError, match="the scene must be simulated; got recorded"):
+        reskin.draw_skin(scene="lab")
+
+
+def test_a_zeroed_model_answers_as_the_stages_network_does(model):  # noqa: F811
+    b_uT = rng_for(0, "api").normal(500, 100, (4, 15)).astype(np.float32)
+
+    loaded = reskin.load_model(str(model)).zero(b_uT[:2].tolist())
+    answer = loaded.predict(b_uT[2:].tolist())
+
+    noload_uT = b_uT[:2].mean(axis=0, dtype=np.float64)
+    np.testing.assert_array_equal(answer, read_network(model)((b_uT[2:] - noload_uT).astype(np.float32)))
+    np.testing.assert_array_equal(loaded.predict(b_uT[2].tolist()), answer[0])
+    with pytest.raises(ReskinError, match="the model must be zeroed"):
+        reskin.load_model(model).predict(b_uT)
+    with pytest.raises(ReskinError, match="channels must be the 15 of the model; got shape"):
+        loaded.predict([1.0, 2.0])
