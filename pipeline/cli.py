@@ -99,8 +99,9 @@ def add(
             usual: Wire = "binary" if layout == "serial-binary" else "text-xyzt"
             prepared = preparing.dump(recording, labels, preparing.Dump(wire or usual, chips_n, rate_hz, probe, marks))
         else:
-            options = {"eflesh": {"force_axis": force_axis}, "ini": {"rows_late": str(rows_late)}}
-            prepared = preparing.foreign(recording, layout, labels, options.get(layout, {}))
+            options = {"force_axis": str(force_axis)} if layout == "eflesh" else {}
+            options |= {"rows_late": str(rows_late)} if layout == "ini" else {}
+            prepared = preparing.foreign(recording, layout, labels, options)
         header = adding.add(root, scene, prepared, allow_copy=allow_copy)
     typer.echo(f"added {scene}/{header.capture} (board {board}, skin {skin}); now: dvc repro")
     if scene not in running:

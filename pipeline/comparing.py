@@ -48,9 +48,9 @@ def read_committed(root: Path, scene: str, against: str) -> dict[str, Any]:
 
 def table_of(done: Comparison) -> str:
     """Tabulate what differs by more than it may, and name what only one side has; empty if there is nothing."""
-    names = ("number", "committed", "fresh", "difference", "tolerance")
+    columns = ("number", "committed", "fresh", "difference", "tolerance")
     rows = [(x.name, _short(x.committed), _short(x.fresh), x.off, x.tolerance) for x in done.beyond[:SHOWN_N]]
-    table = pd.DataFrame(rows, columns=names)
+    table = pd.DataFrame(rows, columns=columns)
     lines = [str(table.to_markdown(index=False, disable_numparse=True))] if rows else []
     lines += [f"and {len(done.beyond) - SHOWN_N} more"] * (len(done.beyond) > SHOWN_N)
     for word, names in (("only committed", done.missing), ("only fresh", done.new)):

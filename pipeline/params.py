@@ -18,16 +18,7 @@ from pipeline.core.errors import ParamsError
 from pipeline.dataset.rows import Selection
 from pipeline.dataset.splits import Split
 from pipeline.learning.recipe import FineTuning, Labelling, Name, Recipe, Schedule
-from pipeline.questions import (
-    LEARNING,
-    MAIN_PROTOCOL,
-    POOLED_BY,
-    QUESTIONS,
-    ROWS,
-    SECTIONS,
-    Question,
-    stages,
-)  # fmt: skip
+from pipeline.questions import MAIN_PROTOCOL, POOLED_BY, QUESTIONS, ROWS, SECTIONS, Question, stages
 
 SHARED_ROWS: dict[str, type[Schedule]] = {"recipes": Recipe, "adaptations": FineTuning, "labellings": Labelling}
 STEPS = "How many steps is a scene's budget: write them in its sections."
@@ -36,7 +27,7 @@ Source = Literal["simulated", "recorded"]
 
 
 class OnBoards(Strict, extra="allow"):
-    """A protocol, as far as the plan must know it: its kind, on which kind of boards it runs, its terms."""
+    """A protocol, as far as the plan needs it: its kind, its kind of boards, its terms of physics."""
 
     kind: str
     boards: str
@@ -63,23 +54,15 @@ class Asking(Strict, extra="ignore"):
 
     @property
     def experiments(self) -> tuple[str, ...]:
-        """The experiments among the questions."""
         return tuple(row.name for row in self.rows if row.kind == "experiment")
 
     @property
     def studied(self) -> tuple[str, ...]:
-        """The questions about the physics."""
         return tuple(row.name for row in self.rows if row.kind == "study")
 
     @property
     def with_folds(self) -> tuple[str, ...]:
-        """The questions that have folds of their own."""
         return tuple(row.name for row in self.rows if row.folds is not None)
-
-    @property
-    def learning(self) -> list[str]:
-        """The stages that answer questions about learning."""
-        return stages(self.questions, *LEARNING)
 
     @property
     def modelled(self) -> list[str]:
@@ -137,9 +120,8 @@ class Scene(Asking, Seeded, extra="allow"):
     @model_validator(mode="after")
     def _questions_fit_the_source(self) -> "Scene":
         if not self.with_folds:
-            raise ValueError(
-                f"questions holds at least one of {sorted(row.name for row in ROWS if row.folds is not None)}"
-            )
+            with_folds = sorted(row.name for row in ROWS if row.folds is not None)
+            raise ValueError(f"questions holds at least one of {with_folds}")
         if self.simulate is None:
             if self.studied:
                 raise ValueError(f"questions {list(self.studied)} are about physics: only a simulated scene asks them")
@@ -177,8 +159,7 @@ class Plan(Strict):
 
 def read_scene(path: Path, params: Path) -> Scene:
     """Read and check `pipeline/scenes/<name>.yaml`, with the rows of `params.yaml` that it names."""
-    words = read_yaml(path)
-    return check_scene(path.stem, str(path), words, read_shared(params))
+    return check_scene(path.stem, str(path), read_yaml(path), read_shared(params))
 
 
 def check_scene(name: str, where: str, words: dict[str, Any], shared: dict[str, Any]) -> Scene:
@@ -195,7 +176,7 @@ def check_scene(name: str, where: str, words: dict[str, Any], shared: dict[str, 
 
 
 def parse_scene(words: dict[str, Any], where: str) -> Scene:
-    """Check what a scene asks, and that it has the sections for it; what stands in these, their stages check."""
+    """Check a scene's questions, and that it has the sections for them; their stages check what stands in these."""
     for name, value in words.items():
         if name not in {*Scene.model_fields, *SECTIONS}:
             raise ParamsError(where, name, "a known parameter", repr(value)[:80], "Mend it there.")
@@ -214,15 +195,13 @@ def read_shared(path: Path) -> dict[str, Any]:
     """Read and check `params.yaml`, as it is written."""
     words: dict[str, Any] = read_yaml(path)
     shared = parse(Shared, words, str(path))
-    rows = {"recipes": shared.recipes, "adaptations": shared.adaptations, "labellings": shared.labellings}
-    for section, own in rows.items():
-        for name, row in own.items():
+    for section, model in SHARED_ROWS.items():
+        for name, row in getattr(shared, section).items():
             if "steps_n" in row:
                 raise ParamsError(f"{path}: {section}", name, "without steps_n", "one", STEPS)
-            parse(SHARED_ROWS[section], row | {"steps_n": 1}, f"{path}: {section}.{name}")
+            parse(model, row | {"steps_n": 1}, f"{path}: {section}.{name}")
     return words
 
 
 def read_plan(path: Path) -> Plan:
-    """Read and check `pipeline/plan.yaml`."""
     return parse(Plan, read_yaml(path), str(path))

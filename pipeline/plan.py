@@ -5,6 +5,7 @@ know what a stage does.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -40,13 +41,16 @@ def make_plan(scenes: Mapping[str, Scene], registry: Registry, flow: Mapping[str
     pairs = [(name, capture) for name in scenes for capture in captures[name]]
     ingest = {f"{name}-{capture}": {"scene": name, "capture": capture} for name, capture in pairs}
     if len(ingest) < len(pairs):
-        raise ParamsError(
-            "stage ingest", "scene-capture", "unlike any other", "two that read the same", "Rename a scene."
-        )
+        rule, got = "unlike any other", "two that read the same"
+        raise ParamsError("stage ingest", "scene-capture", rule, got, "Rename a scene.")
     simulated = _folders(scenes)
     items: dict[str, Any] = {
         "simulate": {key: _simulated(scenes[item["scene"]], item) for key, item in simulated.items()},
-        "ingest_simulated": {key: item for key, item in simulated.items() if _is_ingested(scenes, item)},
+        "ingest_simulated": {
+            key: item
+            for key, item in simulated.items()
+            if _protocol(scenes[item["scene"]], item).kind not in NOT_INGESTED
+        },
         "ingest": ingest,
         "describe": {name: {"scene": name, "protocol": scene.described} for name, scene in scenes.items()},
         "split": {name: {"scene": name, "folds": list(scene.with_folds)} for name, scene in scenes.items()},
@@ -55,8 +59,8 @@ def make_plan(scenes: Mapping[str, Scene], registry: Registry, flow: Mapping[str
         items[stage] = {name: {"scene": name} for name, scene in scenes.items() if scene.runs(stage)}
     items |= {question: _experiments(scenes, question) for question in EXPERIMENTS}
     items |= {stage: {name: {"scene": name} for name in scenes} for stage in ("report", "publish")}
-    for stage, own in items.items():
-        for item in own.values():
+    for stage, of_stage in items.items():
+        for item in of_stage.values():
             scene = scenes[item["scene"]]
             item |= _more(stage, scene, captures[item["scene"]])
             for name, word in _words(flow, stage, item, scene.model_dump(mode="json", exclude_none=True)):
@@ -74,7 +78,7 @@ def _captures(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, list
 
 
 def _more(stage: str, scene: Scene, captures: list[str]) -> dict[str, Any]:
-    """Give what a stage must know of the scene beyond its own settings."""
+    """Give what a stage needs of the scene beyond its settings."""
     match stage:
         case "describe" | "split" | "drift" | "variation":
             return {"captures": captures}
@@ -91,7 +95,7 @@ def _words(
     flow: Mapping[str, Any], stage: str, item: Mapping[str, Any], scene: Mapping[str, Any]
 ) -> Iterator[tuple[str, Any]]:
     """Find the words of a scene that a stage's parameters name in dvc.yaml: rows of params.yaml, kinds of boards."""
-    for template in (one for own in declared(flow, stage).values() for one in own):
+    for template in chain.from_iterable(declared(flow, stage).values()):
         for match in PLACE.finditer(template):
             if match[1] and find(item, match[2]) is NOTHING:
                 yield match[2], find(scene, match[2])
@@ -109,10 +113,6 @@ def _simulated(scene: Scene, item: dict[str, str]) -> dict[str, Any]:
     protocol = _protocol(scene, item)
     terms = [f"terms.{term}" for term in protocol.terms]
     return {**item, "boards": protocol.boards, "shared": terms + ["chip"] * (TERMS_N - len(terms))}
-
-
-def _is_ingested(scenes: Mapping[str, Scene], item: Mapping[str, str]) -> bool:
-    return _protocol(scenes[item["scene"]], item).kind not in NOT_INGESTED
 
 
 def _protocol(scene: Scene, item: Mapping[str, str]) -> OnBoards:
@@ -148,7 +148,6 @@ def _folders(scenes: Mapping[str, Scene]) -> dict[str, dict[str, str]]:
 
 
 def scene_names(root: Path) -> list[str]:
-    """The scenes that this checkout has."""
     if not (root / SCENES).is_dir():
         raise ParamsError(root / SCENES, "the folder", "there", "nothing", "Run this in the checkout.")
     return sorted(file.stem for file in (root / SCENES).glob("*.yaml"))

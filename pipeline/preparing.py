@@ -89,11 +89,9 @@ def layouts_of(recording: Path) -> list[str]:
 def _reads(recording: Path, layout: Foreign) -> bool:
     options = {"force_axis": "z"} if layout == "eflesh" else {}
     try:
-        header, files = foreign(recording, layout, Labels("board", "skin", None), options)
+        prepared = foreign(recording, layout, Labels("board", "skin", None), options)
         with TemporaryDirectory() as folder:
-            for name, file in files.items():
-                (Path(folder) / name).symlink_to(Path(file).resolve())
-            READERS[layout].read(Path(folder), header)
+            READERS[layout].read(Path(folder) / "it", headers.write_capture(Path(folder) / "it", *prepared))
     except ReskinError:
         return False
     return True

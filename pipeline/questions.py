@@ -83,17 +83,12 @@ ROWS = (
 QUESTIONS: Mapping[str, Question] = {row.name: row for row in ROWS}
 
 
-def of_kind(*kinds: Kind) -> tuple[str, ...]:
-    """Name the questions of some kinds."""
-    return tuple(row.name for row in ROWS if row.kind in kinds)
-
-
 def stages(names: Iterable[str], *kinds: Kind) -> list[str]:
     """Name the stages that answer questions of some kinds, in the order of the table; each once."""
-    asked = set(names)
-    return list(dict.fromkeys(row.stage for row in ROWS if row.name in asked and row.kind in kinds))
+    chosen = set(names)
+    return list(dict.fromkeys(row.stage for row in ROWS if row.name in chosen and row.kind in kinds))
 
 
 LEARNING: tuple[Kind, ...] = ("models", "curve", "other")
-EXPERIMENTS = of_kind("experiment")
+EXPERIMENTS = tuple(row.name for row in ROWS if row.kind == "experiment")
 SECTIONS = tuple(dict.fromkeys(row.stage for row in ROWS if row.section))

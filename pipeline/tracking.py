@@ -1,19 +1,18 @@
-"""The diary: writes finished trainings to MLflow. The only module that says mlflow; nothing reads it back.
+"""The diary: writes finished trainings to MLflow, from files, so that it can be done later. Nothing reads it back.
 
 In: the cards and weights in `data/models`, and the report. Out: one experiment a scene, one parent run a stage and set
 of trainings, one child a training, and one run `report` with the page, its tables and figures, and their numbers.
-Published after training and from files, so a server that is away costs nothing but the entry, and `reskin publish`
-sends later what is missing.
 """
 
 import hashlib
 import json
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from pipeline.core import io
@@ -22,6 +21,7 @@ from pipeline.evaluation.summary import over_folds, pool_skins
 
 STORE = "mlflow.db"
 ARTIFACTS = "mlartifacts"
+PARENT = "mlflow.parentRunId"
 ELSEWHERE = {"provenance", "runtime", "described", "variants"}  # of numbers.json: costs, and what trainings hold
 
 
@@ -30,7 +30,7 @@ def tracking_uri(root: Path) -> str:
     return server_uri() or f"sqlite:///{(root / STORE).resolve()}"
 
 
-# of a sweep or an experiment: its points, each the name of its curve, its step (pokes, skins, contacts), its means
+# Of a sweep or an experiment its points: the name of the curve, the step (pokes, skins, contacts), means by name.
 Curves = Mapping[str, Sequence[tuple[str, int, Mapping[str, float]]]]
 
 
@@ -68,35 +68,38 @@ class Diary:
 
     def find(self, stage: str, **tags: str) -> Any:
         """Find a stage's newest run with these tags."""
-        words = " and ".join(f"tags.{name} = '{value}'" for name, value in {"stage": stage, **tags}.items())
-        found = self.client.search_runs([self.experiment_id], words, max_results=1)
+        query = " and ".join(f"tags.{name} = '{value}'" for name, value in {"stage": stage, **tags}.items())
+        found = self.client.search_runs([self.experiment_id], query, max_results=1)
         return found[0] if found else None
 
-    def open(self, stage: str, key: str) -> tuple[str, bool]:
-        """Give the run of a stage, and whether it is yet to be written; one that a killed process left is replaced."""
+    def open(
+        self, stage: str, key: str, *, name: str = "", parent: str = "", tags: Mapping[str, str] = MappingProxyType({})
+    ) -> tuple[str, bool]:
+        """Give a run, and whether it is yet to be written; one that a killed process left is replaced."""
         found = self.find(stage, run_key=key)
+        current = {"current": "true"} | ({PARENT: parent} if parent else {})
         if found and found.info.status == "FINISHED":
-            self.tag(found, {"current": "true"})
+            self.tag(found, current)
             return str(found.info.run_id), False
         if found:
             self.client.delete_run(found.info.run_id)
-        tags = {"run_key": key, "stage": stage, "scene": self.scene, "kind": "stage", "current": "true"}
-        return str(self.client.create_run(self.experiment_id, tags=tags, run_name=stage).info.run_id), True
+        all_tags = {"run_key": key, "stage": stage, "scene": self.scene, "kind": "stage", **current, **tags}
+        run = self.client.create_run(self.experiment_id, tags=all_tags, run_name=name or stage)
+        return str(run.info.run_id), True
 
     def tag(self, run: Any, tags: Mapping[str, str]) -> None:
-        """Set tags that differ."""
         for name, value in tags.items():
             if run.data.tags.get(name) != value:
                 self.client.set_tag(run.info.run_id, name, value)
 
 
 def run_key(card: Mapping[str, Any]) -> str:
-    """Name a result by all that its card says, scores included, but for the commit: equal results are one."""
+    """Name a result by its whole card, scores included, but for the commit: equal results are one."""
     return _digest({name: value for name, value in card.items() if name != "git"})
 
 
-def _digest(words: Any) -> str:
-    return hashlib.sha256(json.dumps(words, sort_keys=True).encode()).hexdigest()[:32]
+def _digest(value: Any) -> str:
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:32]
 
 
 @contextmanager
@@ -138,100 +141,83 @@ def _publish_arm(diary: Diary, stage: str, models: Path) -> tuple[set[str], list
     keys = [run_key(card) for card in cards.values()]
     parent_key = hashlib.sha256("".join(sorted(keys)).encode()).hexdigest()[:32]
     parent_id, unwritten = diary.open(stage, parent_key)
-    fresh = [_publish_one(diary, stage, parent_id, file, card) for file, card in cards.items()]
+    fresh = [_publish_training(diary, stage, parent_id, file, card) for file, card in cards.items()]
     if unwritten:
         _log_means(diary.client, parent_id, list(cards.values()))
         diary.client.set_terminated(parent_id)
     return {parent_key, *keys}, fresh
 
 
-def _publish_one(diary: Diary, stage: str, parent_id: str, file: Path, card: dict[str, Any]) -> bool:
-    """Write one training; True if it was not there yet. A half-written run of a killed process is replaced."""
-    parent_tag = "mlflow.parentRunId"
+def _publish_training(diary: Diary, stage: str, parent_id: str, file: Path, card: dict[str, Any]) -> bool:
+    """Write one training; True if it was not there yet."""
+    from mlflow.entities import Param
+
     client, key = diary.client, run_key(card)
-    found = diary.find(stage, run_key=key)
-    if found and found.info.status == "FINISHED":
-        diary.tag(found, {parent_tag: parent_id, "current": "true"})
+    tags = {name: card[name] for name in ("scene", "question", "recipe_name", "fold", "git")}
+    tags |= {"cell": card["key"], "kind": "training"}
+    tags |= {"mlflow.source.name": f"pipeline.stages.{stage}", "mlflow.source.git.commit": card["git"]}
+    run_id, unwritten = diary.open(stage, key, name=file.stem, parent=parent_id, tags=tags)
+    if not unwritten:
         return False
-    if found:
-        client.delete_run(found.info.run_id)
-    words = ("scene", "question", "recipe_name", "fold", "git")
-    tags = {name: card[name] for name in words} | {
-        "run_key": key, "cell": card["key"], "stage": stage, "kind": "training", "current": "true",
-        parent_tag: parent_id, "mlflow.source.name": f"pipeline.stages.{stage}",
-        "mlflow.source.git.commit": card["git"],
-    }  # fmt: skip
-    run_id = client.create_run(diary.experiment_id, tags=tags, run_name=file.stem).info.run_id
-    _log(client, run_id, card)
+    settings = {name: card[name] for name in ("fold", "seed_i", "seed")} | card["recipe"]
+    settings |= {name: card[name] for name in ("train_rows_n", "train_boards", "test_boards", "test_skins")}
+    settings |= {f"adapt_{name}": value for name, value in card.get("tuning", {}).get("settings", {}).items()}
+    client.log_batch(run_id, params=[Param(name, str(value)[:500]) for name, value in settings.items()])
+    metrics = [(name, value, 0) for name, value in card["scores"]["all"].items()]
+    metrics += [(f"registered_{name}", value, 0) for name, value in card["scores"]["registered"].items()]
+    _log(client, run_id, metrics + [("train_loss", value, step) for step, value in enumerate(card["curve"])])
     for artifact in (file, file.with_suffix(".safetensors")):
         client.log_artifact(run_id, str(artifact), "model")
     client.set_terminated(run_id)
     return True
 
 
-def _log(client: Any, run_id: str, card: dict[str, Any]) -> None:
-    from mlflow.entities import Metric, Param
-
-    known = {"fold": card["fold"], "seed_i": card["seed_i"], "seed": card["seed"], **card["recipe"]}
-    known |= {name: card[name] for name in ("train_rows_n", "train_boards", "test_boards", "test_skins")}
-    known |= {f"adapt_{name}": value for name, value in card.get("tuning", {}).get("settings", {}).items()}
-    parameters = [Param(name, str(value)[:500]) for name, value in known.items()]
-    curve = [Metric("train_loss", value, 0, step) for step, value in enumerate(card["curve"])]
-    parts = (("", "all"), ("registered_", "registered"))
-    scores = [Metric(f"{p}{name}", v, 0, 0) for p, part in parts for name, v in card["scores"][part].items()]
-    client.log_batch(run_id, metrics=scores, params=parameters)
-    _log_all(client, run_id, curve)
-
-
 def _publish_curve(diary: Diary, stage: str, points: Sequence[tuple[str, int, Mapping[str, float]]]) -> str:
     """Write the points of a sweep or an experiment once; give their key."""
-    from mlflow.entities import Metric
-
     key = _digest([stage, points])
     run_id, unwritten = diary.open(stage, key)
     if unwritten:
-        rows = [(f"{curve}.{name}", value, step) for curve, step, own in points for name, value in own.items()]
-        _log_all(diary.client, run_id, [Metric(name, value, 0, step) for name, value, step in rows])
+        rows = ((f"{curve}.{name}", value, step) for curve, step, means in points for name, value in means.items())
+        _log(diary.client, run_id, rows)
         diary.client.set_terminated(run_id)
     return key
 
 
-def _log_all(client: Any, run_id: str, metrics: Sequence[Any]) -> None:
+def _log(client: Any, run_id: str, rows: Iterable[tuple[str, float, int]]) -> None:
+    from mlflow.entities import Metric
+
+    metrics = [Metric(name, value, 0, step) for name, value, step in rows]
     for start in range(0, len(metrics), 1000):  # MLflow takes at most 1000 metrics a call
         client.log_batch(run_id, metrics=metrics[start : start + 1000])
 
 
 def _publish_report(diary: Diary, reports: Path, inputs: str) -> set[str]:
-    """Write the report's numbers once, and its files; give its key: what it says but for costs and commits.
+    """Write the report's numbers once, and its files; give its key: its numbers, figures and tables, but for costs.
 
     `inputs` names the results that it shows. Where those were restored and the report was not (`dvc checkout` brings
     no report back), the report that was written with them is the current one.
     """
-    from mlflow.entities import Metric
-
     before = diary.find("report", inputs=inputs)
-    said = _said(reports) if (reports / "numbers.json").exists() else None
-    key = None if said is None else _digest(said[0] + said[1])
-    there = None if key is None else diary.find("report", run_key=key)
+    there = key = None
+    metrics: list[tuple[str, float, int]] = []
+    if (reports / "numbers.json").exists():
+        metrics = metrics_of(io.read_json(reports / "numbers.json"))
+        files = [file for part in ("figures", "tables") for file in sorted((reports / part).glob("*"))]
+        key = _digest([*metrics, *((file.name, io.sha256(file), 0) for file in files)])
+        there = diary.find("report", run_key=key)
     restored = before is not None and (key is None or (there is not None and there.data.tags.get("inputs") != inputs))
     if restored:
         diary.tag(before, {"current": "true"})
         return {before.data.tags["run_key"]}
-    if key is None or said is None:
+    if key is None:
         return set()
     run_id, unwritten = diary.open("report", key)
     if unwritten:
-        _log_all(diary.client, run_id, [Metric(name, value, 0, step) for name, value, step in said[0]])
+        _log(diary.client, run_id, metrics)
     diary.client.set_tag(run_id, "inputs", inputs)
-    diary.client.log_artifacts(run_id, str(reports))  # again: words on the page and costs may be new
+    diary.client.log_artifacts(run_id, str(reports))  # again: text on the page and costs may be new
     diary.client.set_terminated(run_id)
     return {key}
-
-
-def _said(reports: Path) -> tuple[list[tuple[str, float, int]], list[tuple[str, str, int]]]:
-    """List a report's numbers, and its figures and tables by hash."""
-    files = [file for part in ("figures", "tables") for file in sorted((reports / part).glob("*"))]
-    return metrics_of(io.read_json(reports / "numbers.json")), [(file.name, io.sha256(file), 0) for file in files]
 
 
 def metrics_of(numbers: Mapping[str, Any]) -> list[tuple[str, float, int]]:
@@ -239,40 +225,37 @@ def metrics_of(numbers: Mapping[str, Any]) -> list[tuple[str, float, int]]:
 
     Other lists, words, costs and what other runs hold are left out.
     """
-    asked = {name: value for name, value in numbers.items() if name not in ELSEWHERE}
-    return [(re.sub(r"[^A-Za-z0-9_.\- ]", "_", name), value, step) for name, value, step in _flat(asked, "", 0)]
+    shown = {name: value for name, value in numbers.items() if name not in ELSEWHERE}
+    return [(re.sub(r"[^A-Za-z0-9_.\- ]", "_", name), value, step) for name, value, step in _flat(shown, "", 0)]
 
 
 def _flat(value: Any, name: str, step: int) -> Iterator[tuple[str, float, int]]:
     if isinstance(value, dict):
-        for key, own in value.items():
-            yield from _flat(own, f"{name}.{key}" if name else key, step)
+        for key, item in value.items():
+            yield from _flat(item, f"{name}.{key}" if name else key, step)
     elif isinstance(value, list):
         for row in value:
             axis = next(iter(row), "") if isinstance(row, dict) else ""
             if axis.endswith("_n"):
-                rest = {key: own for key, own in row.items() if key != axis}
+                rest = {key: item for key, item in row.items() if key != axis}
                 yield from _flat(rest, name, int(row[axis]))
     elif isinstance(value, int | float):
         yield name, float(value), step
 
 
 def _log_means(client: Any, run_id: str, cards: list[dict[str, Any]]) -> None:
-    """Write to the parent what its children say together: mean and sd of each question and recipe."""
-    from mlflow.entities import Metric
-
-    metrics = []
+    """Write to the parent mean and sd over its children, for each question and recipe."""
+    rows = []
     for question, recipe in sorted({(card["question"], card["recipe_name"]) for card in cards}):
-        own = [card for card in cards if (card["question"], card["recipe_name"]) == (question, recipe)]
-        for name, summary in over_folds(pool_skins(own) if "tuning" in own[0] else own).items():
-            metrics += [Metric(f"{question}.{recipe}.{name}.{key}", value, 0, 0) for key, value in summary.items()]
-    client.log_batch(run_id, metrics=metrics)
+        alike = [card for card in cards if (card["question"], card["recipe_name"]) == (question, recipe)]
+        for name, summary in over_folds(pool_skins(alike) if "tuning" in alike[0] else alike).items():
+            rows += [(f"{question}.{recipe}.{name}.{key}", value, 0) for key, value in summary.items()]
+    _log(client, run_id, rows)
 
 
 def _mark_superseded(client: Any, experiment_id: str, current: set[str]) -> int:
     """Tag runs that the scene's newest results replace, so that `tags.current = 'true'` shows each once."""
-    marked_n = 0
-    token = None
+    marked_n, token = 0, None
     while True:
         page = client.search_runs([experiment_id], "tags.current = 'true'", max_results=1000, page_token=token)
         for run in page:

@@ -6,6 +6,7 @@ import pytest
 from pipeline.core.config import read_yaml
 from pipeline.core.errors import ParamsError
 from pipeline.params import Scene, parse_scene, read_plan, read_scene, read_shared
+from pipeline.questions import LEARNING, stages
 from tests.scenes import ADAPTATIONS, DRAWN_WITH, SECTIONS, TRAINING, asking, check, recorded
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -133,7 +134,7 @@ ALL = (*PAPERS_CLAIM, "transfer", "pokes", "sensors", "labels", "baselines", "au
 
 def test_a_scene_may_ask_everything_and_names_the_stages_that_answer():
     asked = scene(*ALL)
-    assert set(asked.learning) == {
+    assert set(stages(asked.questions, *LEARNING)) == {
         "train_single", "train_multi", "train_triplet", "adapt", "sweep_pokes", "sweep_sensors", "train_classical",
         "few_labels", "audit",
     }  # fmt: skip
@@ -146,7 +147,7 @@ def test_a_scene_may_ask_everything_and_names_the_stages_that_answer():
 
 def test_a_scene_that_asks_one_question_has_one_stage_and_no_curve():
     asked = scene("lobo")
-    assert (asked.learning, asked.modelled, asked.curves) == (["train_multi"], ["train_multi"], {})
+    assert (stages(asked.questions, *LEARNING), asked.modelled, asked.curves) == (["train_multi"], ["train_multi"], {})
 
 
 @pytest.mark.parametrize("question", [one for one in ALL if SECTIONS[one]])

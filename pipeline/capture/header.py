@@ -103,7 +103,7 @@ def parse(text: str, where: str) -> Header:
 
 def recorded(where: str, **fields: Any) -> Header:
     """Make and check the header of a recording; what is not given is that of one whose own files say all."""
-    usual = {
+    usual: dict[str, Any] = {
         "format": "reskin-capture/1", "source": "recorded", "wire": None, "unit_b": "uT", "unit_force": "N",
         "unit_place": "mm", "firmware": None, "clock": Clock(kind="recording", rate_hz=None, marks=()),
         "contacts_before_n": 0, "options": {}, "files": {},

@@ -50,8 +50,6 @@ class Recording:
 
     ended: Ended
     duration_s: float
-    bytes_n: int
-    frames_n: int
     partial_line_bytes_n: int  # bytes before the first whole line, not written
     account: dict[str, int]
 
@@ -115,7 +113,7 @@ class _Recorder:
             raise CaptureError(self._port, "bytes", "coming in", got, remedy)
         if not account["frames_n"]:
             raise no_frame(self._port, self._head, self._settings.wire, self._settings.chips_n)
-        return Recording(ended, duration_s, self._bytes_n, account["frames_n"], self._partial_line_bytes_n, account)
+        return Recording(ended, duration_s, self._partial_line_bytes_n, account)
 
     def _reason_to_end(self, stop: threading.Event) -> Ended | None:
         settings, now_s = self._settings, time.monotonic()

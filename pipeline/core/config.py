@@ -128,12 +128,10 @@ class Settings:
         return self._declared(self.planned, key, "the plan")
 
     def section(self, model: type[Model], name: str) -> Model:
-        """Check a section of the scene's file."""
         return parse(model, self.words(name), f"{self.where}: {name}")
 
     @property
     def seed(self) -> int:
-        """The scene's seed."""
         return parse(Seeded, {"seed": self.words("seed")}, self.where).seed
 
     def captures_in(self, indentations: Path) -> list[str]:
@@ -214,7 +212,6 @@ def find(words: Any, key: str) -> Any:
 
 
 def put(words: dict[str, Any], key: str, value: Any) -> None:
-    """Write a value under a key into nested words."""
     *path, name = key.split(".")
     for part in path:
         words = words.setdefault(part, {})

@@ -65,7 +65,6 @@ def remove(path: Path) -> None:
 
 
 def sha256(path: Path) -> str:
-    """Hash a file."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
@@ -80,7 +79,6 @@ def read_bytes(path: Path) -> bytes:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file, UTF-8."""
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
@@ -125,13 +123,11 @@ def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
 
 
 def write_table(path: Path, table: pa.Table) -> None:
-    """Write an Arrow table as Parquet (zstd)."""
     with replacing(path) as temporary:
         pq.write_table(table, temporary, compression="zstd")
 
 
 def read_table(path: Path) -> pa.Table:
-    """Read an Arrow table."""
     return _open_parquet(path).read()
 
 
@@ -150,7 +146,6 @@ def write_readings(path: Path, blocks: Iterable[Readings], account: Mapping[str,
 
 
 def read_readings(path: Path) -> Readings:
-    """Read one capture's readings."""
     return from_table(_open_parquet(path).read(), str(path))
 
 

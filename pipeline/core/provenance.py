@@ -28,7 +28,6 @@ def home() -> Path:
 
 
 def is_experiment() -> bool:
-    """Tell whether this runs in such a copy."""
     return home() != Path()
 
 

@@ -51,7 +51,6 @@ class Readings:
 
     @property
     def chips_n(self) -> int:
-        """Number of magnetometers in a reading."""
         return self.b_uT.shape[1] // AXES_PER_CHIP_N
 
 

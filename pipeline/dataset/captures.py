@@ -23,6 +23,7 @@ from pipeline.capture.header import (
     check_same_capture,
     parse,
 )
+from pipeline.capture.probe import ProbeLog
 from pipeline.capture.readers import READERS
 from pipeline.capture.readers.chips import Watch
 from pipeline.capture.readers.units import check_log
@@ -76,7 +77,6 @@ def open_capture(folder: Path) -> Opened:
 
 
 def read_header(folder: Path) -> Header:
-    """Read and check a capture's header."""
     file = folder / HEADER_FILE
     if not file.is_file():
         raise CaptureError(file, "a capture", f"a folder with {HEADER_FILE}", "none", "Is it another --layout?")
@@ -118,7 +118,8 @@ def _clock(folder: Path, header: Header, log: ProbeLog, times_of: Timer) -> Cloc
     if header.clock.marks:
         return from_marks(np.array(header.clock.marks), str(folder))
     blocks = _timed_frames(folder, header, times_of, {})
-    return from_contacts(((one.t_s[one.sound], one.frames.b_uT[one.sound]) for one in blocks), log, str(folder))
+    pairs = ((block.t_s[block.sound], block.frames.b_uT[block.sound]) for block in blocks)
+    return from_contacts(pairs, log, str(folder))
 
 
 def _timed_frames(folder: Path, header: Header, times_of: Timer, account: dict[str, int]) -> Iterator[TimedFrames]:

@@ -21,7 +21,7 @@ STEPS_MAX_N = 2**27  # 128 MB; 1e6 indentations of 8 dwell lengths each
 SEARCH_STEPS_N = 2**16  # the first search sees 4,000 dwell lengths of either clock; 50 ppm blur it by a fifth of one
 WINDOW_STEPS_N = 2**14  # afterwards each 1,000 dwell lengths give an offset of their own, for the rate
 EXPLAINED_MIN = 0.5  # 0 is chance, 1 is every dwell
-MARGIN_MIN = 1.5  # indentations; shifted by one period, a periodic protocol loses one, and one may not have been felt
+MARGIN_MIN = 1.5  # indentations; shifted by one period, a periodic protocol loses one, and one may be too weak to see
 SEEN_MIN = 0.5  # of the dwells that any shift lays on the stream: a few fit somewhere by chance
 PEAK_DROP = 0.05  # the offset is the middle of the peak this far below its top: a top can be flat, flanks are steep
 AWAY_NOISES = 1.5  # times the median distance of no-load: 2.7 sd for the 15 channels of a board
@@ -188,7 +188,7 @@ def _contact_signal(
 def _touched(
     blocks: Iterable[Block], pattern: _Pattern
 ) -> Iterator[tuple[Float64[np.ndarray, "_"], Bool[np.ndarray, "_"]]]:
-    """Tell of each frame whether its field is away from a running no-load field by more than noise.
+    """Decide for each frame whether its field is away from a running no-load field by more than noise.
 
     The log says how much of the time the skin is not touched: so many of the frames, the nearest to the last no-load
     field, are no-load, and half of these surely so. They give the next no-load field, and their spread the noise.

@@ -1,7 +1,7 @@
 """`folds.json`: which rows are on which side or in the pool, for people. In: `Fold`s. Out: JSON words, and back.
 
 Row numbers stand as half-open ranges, because folds by board or pass are few long runs. Refuses to know how folds
-were drawn.
+are chosen.
 """
 
 from collections.abc import Sequence
@@ -15,6 +15,8 @@ from pipeline.core import io
 from pipeline.core.errors import SchemaError
 from pipeline.dataset.rows import Rows, Selection, gather
 from pipeline.dataset.splits import Fold
+
+SIDES = ("train", "test", "pool")
 
 
 def load_rows(files: Sequence[Path], selection: Selection) -> Rows:
@@ -32,12 +34,8 @@ def render_folds(captures: Sequence[str], rows: Rows, folds: Sequence[Fold]) -> 
             {
                 "question": fold.question,
                 "name": fold.name,
-                **_who("train", rows, fold.train),
-                **_who("test", rows, fold.test),
-                **_who("pool", rows, fold.pool),
-                "train": to_ranges(fold.train),
-                "test": to_ranges(fold.test),
-                "pool": to_ranges(fold.pool),
+                **{key: labels for side in SIDES for key, labels in _labels(side, rows, getattr(fold, side)).items()},
+                **{side: to_ranges(getattr(fold, side)) for side in SIDES},
             }
             for fold in folds
         ],
@@ -49,8 +47,7 @@ def parse_folds(words: dict[str, Any], rows: Rows, where: str) -> list[Fold]:
     if words["rows_n"] != len(rows):
         raise SchemaError(where, "rows_n", f"the {len(rows)} rows of its captures", words["rows_n"], "Split again.")
     return [
-        Fold(one["question"], one["name"], *(from_ranges(one[side]) for side in ("train", "test", "pool")))
-        for one in words["folds"]
+        Fold(fold["question"], fold["name"], *(from_ranges(fold[side]) for side in SIDES)) for fold in words["folds"]
     ]
 
 
@@ -67,11 +64,10 @@ def to_ranges(numbers: Int64[np.ndarray, " n"]) -> list[list[int]]:
 
 
 def from_ranges(ranges: Sequence[Sequence[int]]) -> Int64[np.ndarray, " n"]:
-    """Read half-open ranges back."""
     return np.concatenate([np.arange(start, stop) for start, stop in ranges] or [np.zeros(0, np.int64)])
 
 
-def _who(side: str, rows: Rows, numbers: np.ndarray) -> dict[str, list[str]]:
+def _labels(side: str, rows: Rows, numbers: np.ndarray) -> dict[str, list[str]]:
     return {
         f"{side}_boards": np.unique(rows.board[numbers]).tolist(),
         f"{side}_skins": np.unique(rows.skin[numbers]).tolist(),

@@ -82,7 +82,9 @@ def hand_rows(captures: Sequence[Readings]) -> tuple[Rows, dict[str, Lines]]:
         f = len(readings)
         parts.append(
             Rows(
-                *(np.repeat(label, f) for label in (readings.capture, readings.board, readings.skin)),
+                capture=np.repeat(readings.capture, f),
+                board=np.repeat(readings.board, f),
+                skin=np.repeat(readings.skin, f),
                 db_uT=subtract(readings.b_uT, readings.noload_uT),
                 target=np.full((f, len(TARGETS)), np.nan, np.float32),
                 pass_i=readings.pass_i,

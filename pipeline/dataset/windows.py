@@ -65,7 +65,6 @@ def lay_windows(units_n: Sequence[int], *, train_n: int, test_n: int, every_n: i
 
 
 def take(readings: Readings, rows: Bool[np.ndarray, " f"]) -> Readings:
-    """Keep some readings of a capture."""
     arrays = [name for name in Readings.__dataclass_fields__ if name not in LABELS]
     return replace(readings, **{name: getattr(readings, name)[rows] for name in arrays})
 

@@ -15,9 +15,9 @@ from jaxtyping import Float32, Int64
 from pydantic import Field
 
 from pipeline.core.config import Settings, Strict, parse
+from pipeline.core.executors import median_s
 from pipeline.core.seeds import rng_for
 from pipeline.learning.classical import Classical, fit
-from pipeline.learning.executors import median_s
 from pipeline.learning.inputs import VIEW
 from pipeline.learning.recipe import Name, Steps
 from pipeline.learning.trial import Measured
@@ -81,7 +81,6 @@ def baselines(settings: Settings) -> Baselines:
 
 
 def run_tasks(tasks: Sequence[Task], rows: Measured, executor: Executor, tell: Callable[[str], None]) -> list[Fit]:
-    """Fit and predict; every task by itself."""
     running = [executor.submit(_fit, task.method, task.name, task.seed, _inputs(task, rows)) for task in tasks]
     fits = []
     for task, future in zip(tasks, running, strict=True):

@@ -12,18 +12,18 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, as_completed
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
 
 from pipeline.core import io
 from pipeline.core.errors import TrainingError
-from pipeline.learning.executors import device
+from pipeline.core.executors import device
 from pipeline.learning.inputs import Scaler
 from pipeline.learning.trial import Keys, Measured, Trained, Trial
 
-ATTEMPTS_MAX_N = 3  # trainings of one trial; what collapses in all of them is kept, told, and refused by `predict`
+ATTEMPTS_MAX_N = 3  # trainings of one trial; what collapses in all of them is kept, recorded, and refused by `predict`
 STACK_N = {"cpu": 3, "cuda": 64}  # networks trained side by side; on a CPU more gain nothing, and two processes share
 
 
@@ -32,30 +32,28 @@ def run_trials(
 ) -> list[Trained]:
     """Train what `cache` does not hold yet, and return every trial's result in the order of `trials`.
 
-    What collapsed is trained again with draws of its own, at most `ATTEMPTS_MAX_N` times in all.
+    What collapsed is trained again with other random draws, at most `ATTEMPTS_MAX_N` times in all.
     """
-    done = _run_once(trials, rows, executor=executor, cache=cache, tell=tell)
+    run = partial(_run_once, rows=rows, executor=executor, cache=cache, tell=tell)
+    done = run(trials)
     for attempt_i in range(1, ATTEMPTS_MAX_N):
-        again = [i for i, one in enumerate(done) if one.collapsed]
+        again = [i for i, trained in enumerate(done) if trained.collapsed]
         if not again:
             break
         tell(f"{len(again)} of {len(trials)} trainings collapsed: once more with other draws")
-        others = [replace(trials[i], attempt_i=attempt_i) for i in again]
-        for i, one in zip(again, _run_once(others, rows, executor=executor, cache=cache, tell=tell), strict=True):
-            done[i] = replace(one, collapsed_before_n=attempt_i, seconds=done[i].seconds + one.seconds)
+        retrained = run([replace(trials[i], attempt_i=attempt_i) for i in again])
+        for i, trained in zip(again, retrained, strict=True):
+            done[i] = replace(trained, collapsed_before_n=attempt_i, seconds=done[i].seconds + trained.seconds)
     return done
 
 
 def _run_once(
-    trials: Sequence[Trial], rows: Measured, *, executor: Executor, cache: Path, tell: Callable[[str], None]
+    trials: Sequence[Trial], *, rows: Measured, executor: Executor, cache: Path, tell: Callable[[str], None]
 ) -> list[Trained]:
     keys = Keys(rows)
-    names = [keys.key(trial) for trial in trials]  # not the trial's own name: it decides no result
+    names = [keys.key(trial) for trial in trials]
     members = dict(zip(names, trials, strict=True))  # equal trainings are one
-    planned = [
-        (stack, [cache / f"{one}.safetensors" for one in _files_of(stack)])
-        for stack in stacks(members, STACK_N[device()])
-    ]
+    planned = [(stack, _files_of(stack, cache)) for stack in stacks(members, STACK_N[device()])]
     missing = [(stack, files) for stack, files in planned if not all(file.exists() for file in files)]
     fresh = {key for stack, _ in missing for key in stack}
     if len(fresh) < len(members):
@@ -64,10 +62,9 @@ def _run_once(
         rows_file = cache / "rows" / f"{keys.rows_digest()}-{os.getpid()}.safetensors"  # an experiment may run beside
         skin = np.unique(rows.skin, return_inverse=True)[1].astype(np.int64)
         io.write_tensors(rows_file, {"db_uT": rows.db_uT, "target": rows.target, "skin": skin}, {})
+        work = [([members[key] for key in stack], files) for stack, files in missing]
         try:
-            _run_stacks(
-                [([members[key] for key in stack], files) for stack, files in missing], rows_file, executor, tell
-            )
+            _run_stacks(work, rows_file, executor, tell)
         finally:
             io.remove(rows_file)
     file_of = {key: file for stack, files in planned for key, file in zip(stack, files, strict=True)}
@@ -75,17 +72,17 @@ def _run_once(
 
 
 def stacks(members: Mapping[str, Trial], size_n: int) -> list[list[str]]:
-    """Put keys of trials of equal settings and seed together, in order, at most so many."""
+    """Group keys of trials of equal settings and seed, in order, at most `size_n` in a stack."""
     alike: dict[tuple[object, ...], list[str]] = {}
     for key, trial in members.items():
         alike.setdefault((trial.recipe, trial.schedule, trial.terms, trial.seed, trial.seed_i), []).append(key)
     return [group[i : i + size_n] for group in alike.values() for i in range(0, len(group), size_n)]
 
 
-def _files_of(stack: Sequence[str]) -> list[str]:
-    """Name each member's result by all members and its place among them."""
+def _files_of(stack: Sequence[str], cache: Path) -> list[Path]:
+    """Name the file of each member's result by all members and its place among them."""
     digest = hashlib.sha256("".join(stack).encode()).hexdigest()[:32]
-    return [f"{digest}-{i}" for i in range(len(stack))]
+    return [cache / f"{digest}-{i}.safetensors" for i in range(len(stack))]
 
 
 def _run_stacks(
@@ -101,10 +98,8 @@ def _run_stacks(
             executor.shutdown(cancel_futures=True)
             raise TrainingError(f"{running[future][0].name}, {error}") from None
         except BrokenExecutor:
-            raise TrainingError(
-                    "training", "a worker process", "alive to its end", "one that died",
-                    "Out of memory? Run again: what was finished is kept.",
-                ) from None  # fmt: skip
+            remedy = "Out of memory? Run again: what was finished is kept."
+            raise TrainingError("training", "a worker process", "alive to its end", "one that died", remedy) from None
         done_n += len(running[future])
         left_s = (time.monotonic() - start_s) / done_n * (all_n - done_n)
         tell(f"{done_n}/{all_n} {running[future][-1].name}, about {left_s:.0f} s left")
@@ -113,16 +108,14 @@ def _run_stacks(
 def _stack_to_files(rows_file: Path, trials: Sequence[Trial], files: Sequence[Path]) -> None:
     from pipeline.learning.train import train_stack  # torch, late: only a process that trains pays for it
 
-    for trial, file, one in zip(trials, files, train_stack(trials, _read_rows(rows_file)), strict=True):
-        tensors = {f"weights.{name}": value for name, value in one.weights.items()} | one.scaler.arrays()
-        tensors |= {"curve": np.array(one.curve), "predicted": one.predicted}
-        words = {"seconds": f"{one.seconds:.3f}", "one_reading_s": f"{one.one_reading_s:.3g}", "trial": trial.name}
-        words |= {
-            name: repr(value)
-            for name, value in (("stopped_step", one.stopped_step), ("explained_min", one.explained_min))
-            if value is not None
-        }
-        io.write_tensors(file, tensors, words)
+    for trial, file, trained in zip(trials, files, train_stack(trials, _read_rows(rows_file)), strict=True):
+        tensors = {f"weights.{name}": value for name, value in trained.weights.items()} | trained.scaler.arrays()
+        tensors |= {"curve": np.array(trained.curve), "predicted": trained.predicted}
+        metadata = {"seconds": f"{trained.seconds:.3f}", "one_reading_s": f"{trained.one_reading_s:.3g}"}
+        metadata["trial"] = trial.name
+        optional = {"stopped_step": trained.stopped_step, "explained_min": trained.explained_min}
+        metadata |= {name: repr(value) for name, value in optional.items() if value is not None}
+        io.write_tensors(file, tensors, metadata)
 
 
 @lru_cache(maxsize=1)
@@ -131,7 +124,7 @@ def _read_rows(rows_file: Path) -> Measured:
 
 
 def _read_trained(file: Path) -> Trained:
-    tensors, words = io.read_tensors(file)
+    tensors, metadata = io.read_tensors(file)
     weights = {name.removeprefix("weights."): v for name, v in tensors.items() if name.startswith("weights.")}
     return Trained(
         key=file.stem,
@@ -139,8 +132,8 @@ def _read_trained(file: Path) -> Trained:
         scaler=Scaler.of_arrays(tensors),
         curve=[float(value) for value in tensors["curve"]],
         predicted=tensors["predicted"],
-        stopped_step=int(words["stopped_step"]) if "stopped_step" in words else None,
-        explained_min=float(words["explained_min"]) if "explained_min" in words else None,
-        seconds=float(words["seconds"]),
-        one_reading_s=float(words["one_reading_s"]),
+        stopped_step=int(metadata["stopped_step"]) if "stopped_step" in metadata else None,
+        explained_min=float(metadata["explained_min"]) if "explained_min" in metadata else None,
+        seconds=float(metadata["seconds"]),
+        one_reading_s=float(metadata["one_reading_s"]),
     )

@@ -20,7 +20,6 @@ RELEASED_PLACE_MM, RELEASED_FORCE_N = 16.0, 3.0
 
 
 def raw(db_uT: Float32[np.ndarray, "f ch"]) -> Float32[np.ndarray, "f ch"]:
-    """Give the change of field as it is."""
     return db_uT
 
 
@@ -44,7 +43,6 @@ class Scaler:
     target_scale: Float32[np.ndarray, " t"]
 
     def encode(self, db_uT: Float32[np.ndarray, "f ch"]) -> Float32[np.ndarray, "f ch"]:
-        """Turn changes of field into network inputs."""
         return (db_uT - self.input_shift) / self.input_scale
 
     def encode_target(self, target: Float32[np.ndarray, "f t"]) -> Float32[np.ndarray, "f t"]:
@@ -56,12 +54,10 @@ class Scaler:
         return answer * self.target_scale + self.target_shift
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The four arrays by name, for saving."""
         return asdict(self)
 
     @classmethod
     def of_arrays(cls, arrays: Mapping[str, np.ndarray]) -> "Scaler":
-        """Take the four arrays back out of a saved model."""
         return cls(**{name: arrays[name] for name in cls.__dataclass_fields__})
 
 

@@ -1,7 +1,7 @@
-"""Perceptrons at work, many copies at once. In: scaled inputs [m b c]. Out: scaled x, y, F, and the 40 features.
+"""Perceptrons, many at once. In: scaled inputs [m b c]. Out: scaled x, y, F, and the 40 features.
 
-A stack of m networks is one tensor a layer, and a batched product does what m small products did: a small network costs
-more in calls than in sums. Refuses to know how it is trained, and in which units.
+A stack of m networks is one tensor a layer, and a batched product replaces m small ones: for small networks calls cost
+more than sums. Refuses to know how it is trained, and in which units.
 """
 
 from collections.abc import Sequence
@@ -33,11 +33,9 @@ class Stack(nn.Module):
         return self._run(inputs, 0, FEATURE_LAYERS_N)
 
     def answer(self, features: Float[torch.Tensor, "m b 40"]) -> Float[torch.Tensor, "m b t"]:
-        """Turn features into scaled x, y, F."""
         return self._run(features, FEATURE_LAYERS_N, len(self.relus))
 
     def forward(self, inputs: Float[torch.Tensor, "m b c"]) -> Float[torch.Tensor, "m b t"]:
-        """Answer for a batch of each network."""
         return self.answer(self.features(inputs))
 
     def member(self, i: int) -> dict[str, np.ndarray]:
@@ -49,8 +47,7 @@ class Stack(nn.Module):
         return taken
 
     def finite(self) -> Bool[torch.Tensor, " m"]:
-        """Tell which networks have finite weights only."""
-        return torch.stack([torch.isfinite(one.detach()).flatten(1).all(1) for one in self.parameters()]).all(0)
+        return torch.stack([torch.isfinite(values.detach()).flatten(1).all(1) for values in self.parameters()]).all(0)
 
     def _run(self, values: torch.Tensor, first: int, last: int) -> torch.Tensor:
         for i in range(first, last):
@@ -69,7 +66,6 @@ class Predictor:
 
     @torch.no_grad()
     def __call__(self, inputs: Float32[np.ndarray, "n c"]) -> Float32[np.ndarray, "n t"]:
-        """Answer for scaled rows."""
         blocks = torch.from_numpy(inputs).split(BLOCK_ROWS_N)
         return torch.cat([self.net(block[None].to(self.device))[0].cpu() for block in blocks]).numpy()
 

@@ -1,7 +1,6 @@
-"""A recipe: one row of settings for the one training loop. Knows no data and no network.
+"""A recipe: a row of settings for the training loop. In: a section of a scene. Out: whole recipes by name.
 
-A section of a scene names a shared row, says how many steps, and what its variants do differently; `Training` and
-`Adaptations` are what follows: whole recipes by name.
+A section names a shared row, its number of steps, and the differences of its variants. Knows no data and no network.
 """
 
 from typing import Annotated, Any, Literal, TypeVar
@@ -81,48 +80,41 @@ class Adaptation(FineTuning):
     base: Name
 
 
-class Adaptations(Strict):
-    """What stage adapt runs on every held-out skin: so many indentations of its own, unlabelled."""
+class _Recipes(Strict):
+    recipes: dict[Name, Any]
+
+    @model_validator(mode="after")
+    def _has_a_headline(self) -> "_Recipes":
+        if HEADLINE not in self.recipes:
+            raise ValueError(f"recipes hold a recipe named {HEADLINE}, which stands beside the paper's numbers")
+        return self
+
+
+class Adaptations(_Recipes):
+    """What stage adapt runs on every held-out skin: adaptations by `pokes_n` of its indentations, unlabelled."""
 
     pokes_n: Annotated[int, Field(ge=1)]
     recipes: dict[Name, Adaptation]
 
-    @model_validator(mode="after")
-    def _has_a_headline(self) -> "Adaptations":
-        return _headed(self)
-
 
 class PokesSweep(Strict):
-    """Numbers of unlabelled indentations to adapt with, on the last so many boards held out; 0 is no adaptation."""
+    """Numbers of unlabelled indentations to adapt with, on the last `boards_n` boards held out; 0 is no adaptation."""
 
     pokes_n: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
     boards_n: Annotated[int, Field(ge=1)]
 
 
-class Training(Strict):
+class Training(_Recipes):
     """What a training stage runs: every recipe on every fold with every seed."""
 
     recipes: dict[Name, Recipe | AugmentedRecipe]
     seeds_n: Annotated[int, Field(ge=1)]
-
-    @model_validator(mode="after")
-    def _has_a_headline(self) -> "Training":
-        return _headed(self)
 
 
 class AuditSettings(Strict):
     """Whether the scene's settings were chosen, so that a study must vouch for them, or are for speed alone."""
 
     settings: Literal["chosen", "for speed"]
-
-
-Headed = TypeVar("Headed", Training, Adaptations)
-
-
-def _headed(section: Headed) -> Headed:
-    if HEADLINE not in section.recipes:
-        raise ValueError(f"recipes hold a recipe named {HEADLINE}, which stands beside the paper's numbers")
-    return section
 
 
 Steps = Annotated[int, Field(ge=1)]
@@ -153,17 +145,17 @@ Model = TypeVar("Model", bound=Strict)
 
 def training(settings: Settings, section: str) -> Training:
     """Read a section that trains, every recipe in full; of what the stage does not declare, nothing is there."""
-    words, where = settings.words(section), f"{settings.where}: {section}"
-    parse_parts(TrainingRow, words, where)
-    return parse_parts(Training, _recipes(settings, words, where), where)
+    row, where = settings.words(section), f"{settings.where}: {section}"
+    parse_parts(TrainingRow, row, where)
+    return parse_parts(Training, _recipes(settings, row, where), where)
 
 
 def with_training(settings: Settings, model: type[Model], section: str) -> Model:
     """Read a section that holds a `training`, every recipe in full."""
-    words, where = dict(settings.words(section)), f"{settings.where}: {section}"
-    own = words.get("training", {})
-    parse(TrainingRow, own, f"{where}.training")
-    return parse(model, words | {"training": _recipes(settings, own, f"{where}.training")}, where)
+    whole, where = dict(settings.words(section)), f"{settings.where}: {section}"
+    row = whole.get("training", {})
+    parse(TrainingRow, row, f"{where}.training")
+    return parse(model, whole | {"training": _recipes(settings, row, f"{where}.training")}, where)
 
 
 def adaptations(settings: Settings) -> Adaptations:
@@ -171,27 +163,27 @@ def adaptations(settings: Settings) -> Adaptations:
 
     Every base is a recipe of train_triplet.
     """
-    words, where = settings.words("adapt"), f"{settings.where}: adapt"
-    parse_parts(AdaptationsRow, words, where)
-    shared = {**settings.row("adaptations", words["adaptation"]), "base": words["base"]}
-    rows = {"recipes": _in_full(words, shared, where)} | {name: words[name] for name in ("pokes_n",) if name in words}
-    section = parse_parts(Adaptations, rows, where)
+    row, where = settings.words("adapt"), f"{settings.where}: adapt"
+    parse_parts(AdaptationsRow, row, where)
+    shared = {**settings.row("adaptations", row["adaptation"]), "base": row["base"]}
+    full = {"recipes": _in_full(row, shared, where)} | {name: row[name] for name in ("pokes_n",) if name in row}
+    section = parse_parts(Adaptations, full, where)
     known = sorted(training(settings, "train_triplet").recipes)
-    for name, row in section.recipes.items():
-        if row.base not in known:
-            raise ParamsError(where, f"base of {name}", f"one of {known}", repr(row.base), "Mend it there.")
+    for name, recipe in section.recipes.items():
+        if recipe.base not in known:
+            raise ParamsError(where, f"base of {name}", f"one of {known}", repr(recipe.base), "Mend it there.")
     return section
 
 
-def _recipes(settings: Settings, words: Words, where: str) -> dict[str, Any]:
-    rows = _in_full(words, settings.row("recipes", words["recipe"]), where)
-    return {"recipes": rows} | {name: words[name] for name in ("seeds_n",) if name in words}
+def _recipes(settings: Settings, row: Words, where: str) -> dict[str, Any]:
+    recipes = _in_full(row, settings.row("recipes", row["recipe"]), where)
+    return {"recipes": recipes} | {name: row[name] for name in ("seeds_n",) if name in row}
 
 
-def _in_full(words: Words, shared: Words, where: str) -> dict[str, dict[str, Any]]:
-    """Write every row of a section in full: the headline as it is shared, variants with their differences."""
-    headline = dict(shared) | {"steps_n": words["steps_n"]}
-    variants = words.get("variants", {})
+def _in_full(row: Words, shared: Words, where: str) -> dict[str, dict[str, Any]]:
+    """Write every recipe of a section in full: the headline as it is shared, variants with their differences."""
+    headline = dict(shared) | {"steps_n": row["steps_n"]}
+    variants = row.get("variants", {})
     if HEADLINE in variants:
         rule = "unlike the headline, which is the shared row as it is"
         raise ParamsError(f"{where}.variants", "a name", rule, HEADLINE, "Choose another name.")

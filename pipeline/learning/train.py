@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Float
 
 from pipeline.core.errors import TrainingError
+from pipeline.core.executors import device, median_s
 from pipeline.learning.architecture import LAYERS, Weights
-from pipeline.learning.executors import device, median_s
 from pipeline.learning.feed import UNLABELLED, Feed
 from pipeline.learning.inputs import VIEW, Scaler
 from pipeline.learning.job import Job, make_job
@@ -152,7 +152,6 @@ class Watch:
         return len(self.stopped) < len(sound)
 
     def outcomes(self) -> list[Outcome]:
-        """Give every network as it was when it was last finite."""
         parts = zip(self.last, self.curves, strict=True)
         return [Outcome(weights, curve, self.stopped.get(i)) for i, (weights, curve) in enumerate(parts)]
 

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Int64, Shaped
 
+from pipeline.core.executors import device
 from pipeline.core.numerics import signature
 from pipeline.dataset.lines import Lines
 from pipeline.learning.architecture import Weights
-from pipeline.learning.executors import device
 from pipeline.learning.inputs import Scaler
 from pipeline.learning.recipe import FineTuning, Labelling, Recipe, Schedule
 
@@ -127,12 +127,10 @@ class Trial:
 
     @property
     def schedule(self) -> Schedule:
-        """How long and how fast it is trained."""
         return self.recipe if self.tuning is None else self.tuning.settings
 
     @property
     def terms(self) -> Terms:
-        """The weights of the loss."""
         match self.tuning:
             case Adapting(settings=settings):
                 return Terms(self.recipe.triplet_weight, unlabelled=settings.unlabelled_weight)
@@ -149,7 +147,6 @@ class Keys:
         self.known: dict[int, tuple[np.ndarray, str]] = {}
 
     def key(self, trial: Trial) -> str:
-        """Name a trial."""
         decisive = [
             device(), *signature(), trial.fold, trial.skin, trial.recipe.model_dump_json(), trial.seed, trial.seed_i,
             trial.attempt_i,
@@ -166,7 +163,6 @@ class Keys:
         return hashlib.sha256(json.dumps(decisive).encode()).hexdigest()[:32]
 
     def rows_digest(self) -> str:
-        """Name all rows."""
         return _digest(self.rows.db_uT, self.rows.target)
 
     def _labelled(self, train: np.ndarray) -> str:

@@ -59,7 +59,7 @@ def measured(numbers: Mapping[str, Any]) -> dict[str, str]:
     """Write what a scene measured for rows of the table, or was set to, and whether on simulated skins."""
     source = numbers["provenance"]["source"]
     simulated = source == "simulated"
-    described = next(iter(numbers.get("described", {}).values()), {"over_skins": {}})
+    described: Mapping[str, Any] = next(iter(numbers.get("described", {}).values()), {"over_skins": {}})
     words = {}
     if rate := described["over_skins"].get("rate_hz"):
         words["Frequency"] = f"{rate['mean']:.4g} Hz" + ", a setting read back from the captures" * simulated

@@ -8,10 +8,10 @@ from typing import Any
 from pipeline.core import io
 from pipeline.core.config import Settings, parse
 from pipeline.core.errors import ParamsError
+from pipeline.core.executors import device as trained_on
 from pipeline.core.provenance import SECONDS, add_up_costs, code_version, device, read_costs
 from pipeline.core.stage import COSTS
 from pipeline.evaluation.choice import choose
-from pipeline.learning.executors import device as trained_on
 from pipeline.learning.recipe import HEADLINE
 from pipeline.params import Asking
 from pipeline.reporting.learned import timed_learning

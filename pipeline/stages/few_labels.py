@@ -7,12 +7,12 @@ import numpy as np
 
 from pipeline.core import io
 from pipeline.core.config import Files, Settings, read_settings
+from pipeline.core.executors import make_executor
 from pipeline.core.stage import run, say
 from pipeline.evaluation.summary import score_groups
 from pipeline.learning import few_labels as few
 from pipeline.learning.baselines import run_tasks
 from pipeline.learning.card import collapse_record
-from pipeline.learning.executors import make_executor
 from pipeline.learning.few_labels import FewLabels
 from pipeline.learning.few_labels import few_labels as few_labels_of
 from pipeline.learning.trial import Measured

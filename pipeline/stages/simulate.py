@@ -6,8 +6,8 @@ from pipeline.capture.header import write_capture
 from pipeline.core import io
 from pipeline.core.config import Files, read_settings
 from pipeline.core.errors import ParamsError
+from pipeline.core.executors import make_executor
 from pipeline.core.stage import run, say
-from pipeline.learning.executors import make_executor
 from pipeline.synthesis.capture import record, roster, to_files
 from pipeline.synthesis.settings import Synthesis, synthesis_of
 

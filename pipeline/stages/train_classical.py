@@ -6,11 +6,11 @@ import numpy as np
 
 from pipeline.core import io
 from pipeline.core.config import Files, Settings, read_settings
+from pipeline.core.executors import make_executor
 from pipeline.core.provenance import SECONDS
 from pipeline.core.stage import run, say
 from pipeline.evaluation.summary import score_groups
 from pipeline.learning.baselines import Baselines, Task, baselines, run_tasks
-from pipeline.learning.executors import make_executor
 from pipeline.learning.trial import Measured
 from pipeline.trials.data import read_data
 

@@ -35,11 +35,9 @@ class Terms(Strict):
     temperature: Temperature | None = None
 
     def named(self) -> set[str]:
-        """Name the terms that are there."""
         return {name for name in type(self).model_fields if getattr(self, name) is not None}
 
     def only(self, names: Collection[str]) -> "Terms":
-        """Keep the terms of these names."""
         return Terms(**{name: getattr(self, name) for name in names})
 
 

@@ -206,7 +206,6 @@ class Press(_Pressed):
     rate_hz: Rate_hz
 
     def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
-        """Draw the presses."""
         stops = pressing.presses(
             self.presses_n, duration_s=self.duration_s, depth_mm=self.depth_mm, rate_hz=self.rate_hz, rng=rng
         )
@@ -226,7 +225,6 @@ class Walk(_Pressed):
     rate_hz: Rate_hz
 
     def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
-        """Draw the footfalls."""
         sizes = {name: getattr(self, name) for name in ("stance_s", "swing_s", "depth_mm", "rate_hz")}
         return _upright(pressing.footfalls(self.steps_n, **sizes, rng=rng), f"a walk of {self.steps_n} steps")
 

@@ -122,9 +122,9 @@ def probe_log(plan: Plan, read_N: Float[np.ndarray, "n d 3"], rig: Rig, clock: t
     contact = np.tile(np.arange(1 + stops_n) > 0, len(plan))
     unknown = 0.0 if plan.labelled else np.nan
     depth_mm = np.hstack([np.zeros((len(plan), 1)), plan.depth_mm + unknown])
-    places_mm = (np.hstack([one[:, :1], one]) + unknown for one in (plan.x_mm, plan.y_mm))
+    places_mm = (np.hstack([stops_mm[:, :1], stops_mm]) + unknown for stops_mm in (plan.x_mm, plan.y_mm))
     force_N = (read_N + unknown).reshape(-1, 3)
-    labels = [one.astype(np.float32).ravel() for one in (*places_mm, depth_mm, *force_N.T)]
+    labels = [label.astype(np.float32).ravel() for label in (*places_mm, depth_mm, *force_N.T)]
     dwells = (
         np.repeat(np.arange(len(plan), dtype=np.int32), 1 + stops_n),
         np.repeat(plan.pass_i, 1 + stops_n),
@@ -134,4 +134,4 @@ def probe_log(plan: Plan, read_N: Float[np.ndarray, "n d 3"], rig: Rig, clock: t
         *labels,
     )
     logged = np.hstack([np.ones((len(plan), 1), bool), ~(plan.depth_mm < 0)]).ravel()
-    return ProbeLog(*(one[logged] for one in dwells))
+    return ProbeLog(*(column[logged] for column in dwells))

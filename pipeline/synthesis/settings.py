@@ -44,7 +44,6 @@ class BoardKind(Strict):
 
     @property
     def skin_m(self) -> tuple[float, float]:
-        """Give the skin's sides in SI."""
         return self.skin_mm[0] * milli, self.skin_mm[1] * milli
 
 
@@ -113,7 +112,6 @@ class Synthesis(Strict):
 
     @property
     def main_boards(self) -> BoardKind:
-        """The boards of the main protocol."""
         return self.boards[self.main.boards]
 
 
@@ -145,6 +143,5 @@ def check_synthesis(settings: Settings) -> Synthesis:
 
 
 def _terms(settings: Settings, protocols: Mapping[str, Any]) -> dict[str, Any]:
-    """Take the terms of physics that protocols name."""
     names = sorted({term for protocol in protocols.values() for term in protocol["terms"]})
     return {name: settings.row("terms", name) for name in names}

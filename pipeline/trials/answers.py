@@ -2,10 +2,10 @@
 
 from collections.abc import Iterator, Sequence
 
+from pipeline.core.executors import device
 from pipeline.dataset.splits import Fold
 from pipeline.evaluation.tally import tally
 from pipeline.learning.card import collapse_record
-from pipeline.learning.executors import device
 from pipeline.learning.inputs import VIEW
 from pipeline.learning.recipe import Adaptation, training
 from pipeline.learning.trial import Trial

@@ -11,7 +11,7 @@ from jaxtyping import Float32
 
 from pipeline.core import io
 from pipeline.core.errors import SchemaError
-from pipeline.learning.executors import device
+from pipeline.core.executors import device
 from pipeline.learning.inputs import VIEW, Scaler
 from pipeline.learning.recipe import HEADLINE
 

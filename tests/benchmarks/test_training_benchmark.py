@@ -22,10 +22,10 @@ import torch
 from torch import nn
 from torch.utils.data import DataLoader, TensorDataset
 
+from pipeline.core.executors import make_executor
 from pipeline.core.seeds import rng_for
 from pipeline.learning import train as train_module
 from pipeline.learning.architecture import FEATURE_LAYERS_N, paper_layers
-from pipeline.learning.executors import make_executor
 from pipeline.learning.feed import Feed
 from pipeline.learning.grid import STACK_N, run_trials
 from pipeline.learning.model import Stack

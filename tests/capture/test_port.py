@@ -79,10 +79,10 @@ def check_files(folder: Path, recording: Recording, sent: bytes) -> None:
     data = (folder / STREAM_FILE).read_bytes()
     rows = arrivals.parse(folder / ARRIVALS_FILE, "arrivals.csv")
     assert data == sent
-    assert recording.bytes_n == len(data) == rows.byte_end[-1]
+    assert recording.account["bytes_n"] == len(data) == rows.byte_end[-1]
     assert rows.byte_end[0] == 0
     assert abs(rows.t_s[-1] - time.time()) < 60
-    assert recording.frames_n == len(stream.decode_all(data, SETTINGS.wire, 5, "stream.bin")[0])
+    assert recording.account["frames_n"] == len(stream.decode_all(data, SETTINGS.wire, 5, "stream.bin")[0])
 
 
 def test_what_was_sent_is_what_is_written_and_stops_after_the_duration(board, tmp_path):
@@ -90,7 +90,7 @@ def test_what_was_sent_is_what_is_written_and_stops_after_the_duration(board, tm
     chunks = [data[i : i + 1000] for i in range(0, len(data), 1000)]
     recording = record(board, tmp_path, lambda _: board.send(*chunks, pause_s=0.01), duration_s=1.5)
     assert recording.ended == "duration"
-    assert recording.frames_n == len(FRAMES)
+    assert recording.account["frames_n"] == len(FRAMES)
     assert 1.5 <= recording.duration_s < 5
     check_files(tmp_path, recording, data)
 
@@ -135,7 +135,7 @@ def test_unplugging_keeps_what_came(board, tmp_path):
 
     recording = record(board, tmp_path, act)
     assert recording.ended == "unplugged"
-    assert recording.frames_n == len(FRAMES) - 1
+    assert recording.account["frames_n"] == len(FRAMES) - 1
     check_files(tmp_path, recording, data[:-7])
 
 

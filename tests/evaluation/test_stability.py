@@ -4,17 +4,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pipeline.experiments.stability.relaxing import survey_relaxing
-from pipeline.experiments.stability.survey import survey
 
 from pipeline.capture import faults, stream
 from pipeline.core.config import parse, read_yaml
 from pipeline.core.errors import CaptureError
 from pipeline.experiments.stability import physics
 from pipeline.experiments.stability.cases import measured, peak_bytes, refused
-from pipeline.experiments.stability.chip import survey_chip
-from pipeline.experiments.stability.physics import survey_physics
-from pipeline.experiments.stability.wire import survey_wire
+from pipeline.experiments.stability.chip import chip_cases
+from pipeline.experiments.stability.physics import physics_cases, time_cases
+from pipeline.experiments.stability.run import survey
+from pipeline.experiments.stability.wire import wire_cases
 from pipeline.physics import force_sensor, layer, sensor, viscoelastic
 from pipeline.synthesis.settings import Synthesis
 
@@ -33,7 +32,7 @@ def broken(cases):
 def cases():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(physics, "POKES_N", 100)  # checked types and traced memory are slow together
-        return survey(BOARD, DESIGN.spreads, skin=DESIGN.skin, chip=DESIGN.chip, seed=SEED)
+        return survey(DESIGN, SEED)
 
 
 def test_every_case_ends_as_it_should(cases):
@@ -48,13 +47,13 @@ def test_every_row_is_its_own_and_says_what_happened(cases):
 
 
 def test_the_same_seed_gives_the_same_words():
-    assert survey_chip(DESIGN.chip, 5, SEED) == survey_chip(DESIGN.chip, 5, SEED)
-    assert survey_relaxing() == survey_relaxing()
+    assert chip_cases(DESIGN.chip, 5, SEED) == chip_cases(DESIGN.chip, 5, SEED)
+    assert time_cases() == time_cases()
 
 
 @pytest.mark.parametrize(("chips_n", "gain_sel"), [(1, 7), (8, 0)])
 def test_streams_of_other_boards_are_surveyed_too(chips_n, gain_sel):
-    assert broken(survey_wire(gain_sel, chips_n, SEED)) == set()
+    assert broken(wire_cases(gain_sel, chips_n, SEED)) == set()
 
 
 def test_what_is_not_refused_and_what_is_no_number_does_not_hold():
@@ -84,19 +83,19 @@ def test_the_peak_is_what_is_held_at_once():
 
 def test_the_naive_quotient_of_a_small_step_is_found_out(monkeypatch):
     monkeypatch.setattr(viscoelastic, "_mean_decay", lambda x: (1 - np.exp(-x)) / np.where(x > 0, x, 1.0))
-    assert "dt / tau_min 1e-16" in broken(survey_relaxing())
+    assert "dt / tau_min 1e-16" in broken(time_cases())
 
 
 def test_time_that_may_run_backwards_is_found_out(monkeypatch):
     monkeypatch.setattr(viscoelastic.np, "isfinite", lambda _: np.True_)
-    assert "a time step of inf s" in broken(survey_relaxing())
+    assert "a time step of inf s" in broken(time_cases())
 
 
 def test_a_force_sensor_without_a_range_and_a_flag_that_never_rises_are_found_out(monkeypatch):
     monkeypatch.setattr(force_sensor, "RANGE_N", (np.inf,) * 3)
     monkeypatch.setattr(layer, "VERIFIED_DEPTH", 10.0)
     monkeypatch.setattr(physics, "POKES_N", 10)
-    wrong = broken(survey_physics(BOARD, DESIGN.spreads, skin=DESIGN.skin, seed=SEED))
+    wrong = broken(physics_cases(BOARD, DESIGN.spreads, skin=DESIGN.skin, seed=SEED))
     assert wrong == {
         "a stiff skin, E = 1 GPa",
         "depths of 0.2, 0.59, 0.6 and 0.8 of the thickness",
@@ -106,7 +105,7 @@ def test_a_force_sensor_without_a_range_and_a_flag_that_never_rises_are_found_ou
 
 def test_a_chip_that_never_saturates_is_found_out(monkeypatch):
     monkeypatch.setattr(sensor, "FIELD_MAX_T", 1.0)
-    assert broken(survey_chip(DESIGN.chip, 5, SEED)) == {"60, -4 and -70 mT at GAIN_SEL 7"}
+    assert broken(chip_cases(DESIGN.chip, 5, SEED)) == {"60, -4 and -70 mT at GAIN_SEL 7"}
 
 
 @pytest.mark.parametrize(
@@ -119,10 +118,10 @@ def test_a_chip_that_never_saturates_is_found_out(monkeypatch):
 )
 def test_a_fault_that_nobody_looks_for_is_found_out(monkeypatch, guard, blind, case):
     monkeypatch.setattr(faults, guard, blind)
-    assert any(name.startswith(case) for name in broken(survey_chip(DESIGN.chip, 5, SEED)))
+    assert any(name.startswith(case) for name in broken(chip_cases(DESIGN.chip, 5, SEED)))
 
 
 def test_a_stream_that_forgets_bytes_is_found_out(monkeypatch):
     right = stream.FrameStream.account
     monkeypatch.setattr(stream.FrameStream, "account", lambda self: right(self) | {"skipped_truncated_bytes_n": 0})
-    assert "last frame truncated (binary)" in broken(survey_wire(7, 5, SEED))
+    assert "last frame truncated (binary)" in broken(wire_cases(7, 5, SEED))

@@ -12,16 +12,13 @@ from scipy.integrate import quad
 
 from pipeline.core.errors import ParamsError
 from pipeline.experiments.runtime import integrators, methods
-from pipeline.experiments.runtime.choose import CANDIDATES, ERROR_MAX, choose
-from pipeline.experiments.runtime.history import exact_forces, poke_often, stiff
-from pipeline.experiments.runtime.integrators import EULER, EXACT, SOLVERS, Sweep, study_integrators
-from pipeline.experiments.runtime.lattices import box_m, gauss_everywhere, midpoints, written
-from pipeline.experiments.runtime.methods import METHODS, whole
-from pipeline.experiments.runtime.motion import Path, paths
+from pipeline.experiments.runtime.integrators import EULER, EXACT, SOLVERS, Integrators, poke_often, study_integrators
+from pipeline.experiments.runtime.methods import METHODS, Path, paths, whole
 from pipeline.experiments.runtime.quadrature import ALL, Reference, errors, study_quadratures
-from pipeline.experiments.runtime.rows import REFERENCE, Contestant, Precision
-from pipeline.experiments.runtime.stopwatch import race
-from pipeline.experiments.runtime.trials import Pokes, Trial, draw_trial, laid
+from pipeline.experiments.runtime.rows import CANDIDATES, ERROR_MAX, REFERENCE, Contestant, Precision, choose, race
+from pipeline.experiments.runtime.rows import written as name_of
+from pipeline.experiments.runtime.trials import Pokes, Trial, box_m, draw_trial, gauss_everywhere, laid, midpoints
+from pipeline.experiments.verification.relaxation import hereditary
 from pipeline.physics import flow
 from pipeline.physics.magnet import cuboid_field
 from pipeline.physics.nodes import CHOSEN, SKIN_SIDE_M, Quadrature, place_nodes
@@ -62,7 +59,7 @@ def quadratures():
 
 
 def error_of(rows, method, cell_mm=None, layers_n=None) -> float:
-    setting = None if cell_mm is None else written(Quadrature(1e-3 * cell_mm, layers_n))
+    setting = None if cell_mm is None else name_of(Quadrature(1e-3 * cell_mm, layers_n))
     (row,) = [row for row in rows if row.method == method and setting in (None, row.setting)]
     return row.error
 
@@ -87,7 +84,7 @@ def test_pokes_sit_on_the_skins_pattern_wherever_that_sits_on_the_board():
 
 def test_a_poke_that_would_not_touch_is_refused():
     with pytest.raises(ParamsError, match="skin s0: true depth of every poke must be above 0 m"):
-        trial(pokes=Pokes(((0.0, 0.0),), (0.0,)), skin_depth_zero_mm=0.0)
+        trial(pokes=Pokes.model_construct(places_mm=((0.0, 0.0),), depths_mm=(0.0,)), skin_depth_zero_mm=0.0)
 
 
 @pytest.mark.parametrize(("cell_mm", "layers_n"), [(0.5, 4), (3.0, 1)])
@@ -113,7 +110,9 @@ def test_a_box_that_is_lifted_changes_the_field_as_charged_faces_do(monkeypatch)
     # One box is the whole skin, far too wide for a dipole; in the middle of like poles it is magnetised along z.
     whole_skin, lift_m = Quadrature(SKIN_SIDE_M, 1), np.array([0.0, 0.0, 1e-3])
     like = design(polarity="same")
-    one = draw_trial(BOARD, like, spreads=no_spread(), seed=0, name="s0", pokes=Pokes(((0.0, 0.0),), (1.0,)))
+    one = draw_trial(
+        BOARD, like, spreads=no_spread(), seed=0, name="s0", pokes=Pokes(places_mm=((0.0, 0.0),), depths_mm=(1.0,))
+    )
     skin = laid(one, midpoints(one.skin.thickness_m, whole_skin))
     lifted = Path(skin.nodes_m[None] + lift_m, np.zeros((1, 1, 3)))
     monkeypatch.setattr(methods, "paths", lambda *_: lifted)
@@ -192,7 +191,7 @@ def test_the_reference_is_ten_times_as_good_as_a_rule_must_be(quadratures):
 
 def test_magpylib_and_the_kernel_say_the_same_of_the_same_nodes(quadratures):
     _, contestants = quadratures
-    calls = {one.key[1]: one.call for one in contestants if one.key[2] == written(COARSE)}
+    calls = {one.key[1]: one.call for one in contestants if one.key[2] == name_of(COARSE)}
     kernel_T = calls["kernel alone"]()
     for name in ("magpylib.core dipoles", "magpylib dipoles"):
         # The others lose digits to the difference of two sums, and magpylib's mu_0 is of another year.
@@ -217,13 +216,13 @@ def test_far_away_boxes_are_dipoles():
 
 def test_every_rule_has_one_row_and_may_be_timed(quadratures):
     rows, contestants = quadratures
-    asked = {(method, written(rule)) for method, own in TRIED.items() for rule in own}
+    asked = {(method, name_of(rule)) for method, own in TRIED.items() for rule in own}
     assert {(row.method, row.setting) for row in rows[1:]} == asked
     assert len(rows) == 1 + len(asked)
     assert [one.key for one in contestants] == [row.key for row in rows[1:]]
     assert all(row.error == max(row.parts.values()) for row in rows)
     nodes_n = {row.setting: row.work_n for row in rows if row.method == CANDIDATES}
-    assert nodes_n[written(CHOSEN)] == len(place_nodes(1e-3, CHOSEN).nodes_m)
+    assert nodes_n[name_of(CHOSEN)] == len(place_nodes(1e-3, CHOSEN).nodes_m)
 
 
 def test_a_method_nobody_knows_is_refused():
@@ -296,7 +295,12 @@ def test_a_race_without_rounds_is_refused():
 
 
 RATIOS = (1e3, 1e4, 1e5, 1e6, 1e7, 1e8)
-SMALL = Sweep(RATIOS, tolerances=(1e-3, 1e-6), euler_steps_s=(1e-2, 1e-3), pokes_n=1, calls_per_poke_max_n=5000)
+STEPS = {"tolerances": (1e-3, 1e-6), "euler_steps_s": (1e-2, 1e-3)}
+SMALL = Integrators(ratios=RATIOS, **STEPS, pokes_n=1, calls_per_poke_max_n=5000)
+
+
+def few(**changes) -> Integrators:
+    return SMALL.model_copy(update=changes)
 
 
 @pytest.fixture(scope="module")
@@ -309,12 +313,12 @@ def of(rows, ratio, method) -> list[Precision]:
 
 
 def test_the_skins_own_relaxation_has_its_own_stiffness():
-    np.testing.assert_allclose(stiff(1e7).tau_s, SKIN.tau_s, rtol=1e-12)
+    np.testing.assert_allclose(integrators.stiff(1e7).tau_s, SKIN.tau_s, rtol=1e-12)
 
 
 @pytest.mark.parametrize("ratio", RATIOS)
 def test_a_stiffness_is_the_ratio_of_the_slowest_relaxation_to_the_fastest(ratio):
-    prony = stiff(ratio)
+    prony = integrators.stiff(ratio)
     assert prony.tau_s.max() / prony.tau_s.min() == pytest.approx(ratio, rel=1e-9)
     assert prony.tau_s.max() == SKIN.tau_s.max()
     assert (prony.share == SKIN.share).all()
@@ -322,25 +326,25 @@ def test_a_stiffness_is_the_ratio_of_the_slowest_relaxation_to_the_fastest(ratio
 
 def test_the_exact_force_is_the_convolution_with_the_relaxation_function():
     # Lee & Radok 1960, by adaptive quadrature instead of by states
-    prony, history = stiff(1e5), poke_often(2)
-    speeds = np.diff(history.elastic) / np.diff(history.time_s)
+    prony, (time_s, elastic) = integrators.stiff(1e5), poke_often(2)
+    speeds = np.diff(elastic) / np.diff(time_s)
 
     def relaxation(t_s):
         return 1 - (prony.share * -np.expm1(-t_s / prony.tau_s)).sum()
 
-    for end_i, force in enumerate(exact_forces(history, prony), start=1):
-        end_s = history.time_s[end_i]
-        pieces = zip(history.time_s[:end_i], history.time_s[1 : end_i + 1], speeds[:end_i], strict=True)
+    for end_i, force in enumerate(hereditary(time_s, elastic, prony)[1:], start=1):
+        end_s = time_s[end_i]
+        pieces = zip(time_s[:end_i], time_s[1 : end_i + 1], speeds[:end_i], strict=True)
         parts = [v * quad(lambda s, t=end_s: relaxation(t - s), a, b, epsabs=1e-13)[0] for a, b, v in pieces]
         assert force == pytest.approx(sum(parts), rel=1e-10, abs=1e-12)
 
 
 def test_a_history_of_twenty_pokes_takes_thirty_seconds():
-    history = poke_often(20)
-    assert history.time_s[-1] == pytest.approx(30.0)
-    assert len(history.time_s) == 61
-    assert (np.diff(history.time_s) > 0).all()
-    assert (history.elastic[1:4] == [1.0, 1.0, 0.0]).all()
+    time_s, elastic = poke_often(20)
+    assert time_s[-1] == pytest.approx(30.0)
+    assert len(time_s) == 61
+    assert (np.diff(time_s) > 0).all()
+    assert (elastic[1:4] == [1.0, 1.0, 0.0]).all()
 
 
 @pytest.mark.parametrize("ratio", RATIOS)
@@ -377,7 +381,7 @@ def test_euler_is_of_first_order(relaxations):
 
 @pytest.mark.parametrize(("step_over_fastest", "stable"), [(1.9, True), (2.1, False)])
 def test_euler_diverges_above_twice_the_fastest_relaxation_and_is_listed(step_over_fastest, stable):
-    sweep = replace(SMALL, ratios=(1e7,), tolerances=(), euler_steps_s=(1e-3 * step_over_fastest,), pokes_n=4)
+    sweep = few(ratios=(1e7,), tolerances=(), euler_steps_s=(1e-3 * step_over_fastest,), pokes_n=4)
     rows, contestants = study_integrators(sweep)
     (euler,) = of(rows, 1e7, EULER)
     if stable:
@@ -394,7 +398,7 @@ def test_euler_beyond_any_number_is_listed_as_diverged(relaxations):
 
 @pytest.mark.parametrize("method", [*SOLVERS, EULER])
 def test_who_works_too_long_is_stopped_and_listed(method):
-    rows, _ = study_integrators(replace(SMALL, ratios=(1e6,), calls_per_poke_max_n=20))
+    rows, _ = study_integrators(few(ratios=(1e6,), calls_per_poke_max_n=20))
     for stopped in of(rows, 1e6, method):
         assert (stopped.error, stopped.work_n) == (None, 20)
         assert stopped.failure == "stopped after 20 right-hand sides"
@@ -410,16 +414,14 @@ def test_a_solver_that_reports_failure_is_listed_with_its_words(monkeypatch):
         success, message = False, "Required step size is less than spacing between numbers."
 
     monkeypatch.setattr(integrators, "solve_ivp", lambda *_, **__: Gone)
-    rows, _ = study_integrators(replace(SMALL, ratios=(1e7,)))
+    rows, _ = study_integrators(few(ratios=(1e7,)))
     assert {one.failure for one in of(rows, 1e7, "BDF")} == {Gone.message}
 
 
 def test_more_pokes_leave_the_error_and_the_work_of_a_poke_nearly_as_they_are():
     # So few pokes may stand for many; a factor of two, where errors span ten decades.
-    few, many = (
-        study_integrators(replace(SMALL, ratios=(1e7,), tolerances=(1e-5,), pokes_n=pokes_n))[0] for pokes_n in (2, 6)
-    )
-    for one, other in zip(few[1:], many[1:], strict=True):
+    once, thrice = (study_integrators(few(ratios=(1e7,), tolerances=(1e-5,), pokes_n=pokes_n))[0] for pokes_n in (2, 6))
+    for one, other in zip(once[1:], thrice[1:], strict=True):
         if one.failure is None:
             assert 0.5 < other.error / one.error < 2
             assert 0.8 < other.work_n / one.work_n / 3 < 1.25

@@ -282,5 +282,5 @@ def test_a_setting_has_no_default_and_a_method_a_name_for_tables():
         TypeAdapter(Classical).validate_python({"method": "ridge", "inputs": "raw"})
     with pytest.raises(ValidationError, match="extra"):
         asked("ridge", gamma=1.0)
-    words = [asked(method).words for method in SETTINGS]
-    assert words == ["ridge", "cubic ridge", "k nearest neighbours", "RBF kernel ridge", "gradient boosting"]
+    titles = [asked(method).title for method in SETTINGS]
+    assert titles == ["ridge", "cubic ridge", "k nearest neighbours", "RBF kernel ridge", "gradient boosting"]

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from pipeline.core import io
 from pipeline.core.errors import ReskinError, TrainingError
+from pipeline.core.executors import make_executor
 from pipeline.learning import train
-from pipeline.learning.executors import make_executor
 from pipeline.learning.grid import STACK_N, run_trials, stacks
 from pipeline.learning.job import make_job
 from pipeline.learning.train import JUDGED_STEPS_N, train_stack

@@ -111,8 +111,9 @@ def _read_table(path: Path, where: str) -> _Table:
     columns = [names.index(name) for name in numeric]
     picked = [[row[i] for i in columns] for row in cells]
     numbers = to_numbers(picked, where, names=numeric, first_line_n=FIRST_LINE_N)
-    indent, *parts = np.split(numbers, [1, 3, 3 + k, 3 + 4 * k], axis=1)
-    table = _Table(_number_presses(indent[:, 0], where), contact, *parts, len(names) - len(numeric) - 1)
+    indent, place_mm, temperature_degC, b_uT, force_N = np.split(numbers, [1, 3, 3 + k, 3 + 4 * k], axis=1)
+    press, ignored_n = _number_presses(indent[:, 0], where), len(names) - len(numeric) - 1
+    table = _Table(press, contact, place_mm, temperature_degC, b_uT, force_N, ignored_n)
     _check_table(table, where)
     return table
 

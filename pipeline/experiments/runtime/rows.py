@@ -87,10 +87,16 @@ def choose(rows: Sequence[Precision], *, used: Quadrature, error_max: float = ER
     tried = {row.setting: row for row in rows if row.method == CANDIDATES}
     passing = [row for row in tried.values() if row.error is not None and row.error < error_max]
     best = min(passing, key=lambda row: (row.work_n, row.error), default=None)
-    of_best = (best.setting, best.work_n, best.error) if best else (None, None, None)
     now = tried.get(written(used))
-    of_used = (now.work_n, now.error) if now else (None, None)
-    return Choice(*of_best, written(used), *of_used, differs=of_best[0] != written(used))
+    return Choice(
+        setting=best.setting if best else None,
+        nodes_n=best.work_n if best else None,
+        error=best.error if best else None,
+        used_setting=written(used),
+        used_nodes_n=now.work_n if now else None,
+        used_error=now.error if now else None,
+        differs=best is None or best.setting != written(used),
+    )
 
 
 def race(contestants: Sequence[Contestant], repeats_n: int) -> list[Seconds]:

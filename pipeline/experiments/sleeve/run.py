@@ -11,6 +11,7 @@ from pydantic import Field
 
 from pipeline.core.config import Files, Settings, Strict, read_settings
 from pipeline.core.errors import ParamsError
+from pipeline.core.executors import make_executor
 from pipeline.core.schema import Readings
 from pipeline.core.stage import run, say
 from pipeline.dataset.rows import Rows, Selection, gather
@@ -20,7 +21,6 @@ from pipeline.experiments.answer import read_folder, read_losses, write_answer
 from pipeline.learning.baselines import Task, run_tasks
 from pipeline.learning.card import collapse_record
 from pipeline.learning.classical import Neighbours
-from pipeline.learning.executors import make_executor
 from pipeline.learning.recipe import HEADLINE, Training, with_training
 from pipeline.learning.trial import Measured, Trial
 from pipeline.synthesis.settings import synthesis_of

@@ -3,6 +3,7 @@
 What comes back is compared with what the whole stream gave. Refuses to know chips' faults (`chip`).
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -79,14 +80,13 @@ def joined(frames: Frames, wire: Wire, where: float) -> Damage:
 
 def suffer(damage: Damage, frames: Frames, wire: Wire) -> Case:
     """Deliver what a stream has become, and count the frames that are lost and false, and the bytes."""
-    sent = records(_clean(encode(frames, wire), wire, frames))
     kept, account = deliver(damage.portions, wire, frames.temperature_degC.shape[1])
-    got = records(kept)
-    missing_n, false_n = len(set(sent) - set(got)), sum(record not in set(sent) for record in got)
+    sent, got = (Counter(records(of)) for of in (_clean(encode(frames, wire), wire, frames), kept))
+    missing_n, false_n = (sent - got).total(), (got - sent).total()
     skipped_n = sum(n for name, n in account.items() if name.startswith("skipped_"))
     open_n, not_finite_n = account["bytes_n"] - account["frame_bytes_n"] - skipped_n, account["not_finite_frames_n"]
     happened = (
-        f"{len(got) - false_n} of {len(sent)} frames back, {false_n} false, {not_finite_n} not finite; "
+        f"{got.total() - false_n} of {sent.total()} frames back, {false_n} false, {not_finite_n} not finite; "
         f"{skipped_n} bytes counted as lost, {open_n} unaccounted for"
     )
     holds = missing_n <= damage.lost_n and false_n <= damage.false_n and open_n == 0

@@ -5,6 +5,7 @@ Refuses to know losses (`stability`).
 """
 
 import struct
+from collections.abc import Callable
 
 import numpy as np
 
@@ -24,7 +25,12 @@ CRLF_SHARE = 0.05
 def check_frames(gain_sel: int, chips_n: int, seed: int) -> list[Check]:
     """Check what is written and what is read, for each wire format; an error is the largest difference of any value."""
     frames = make_frames(FRAMES_N, chips_n, gain_sel=gain_sel, rng=rng_for(seed, "verification", "frames"))
-    laws = {"binary": binary, "binary-clock": binary, "text-xyzt": text, "text-txyz": text}
+    laws: dict[Wire, Callable[[Frames, Wire], list[Check]]] = {
+        "binary": binary,
+        "binary-clock": binary,
+        "text-xyzt": text,
+        "text-txyz": text,
+    }
     return [check for layout, law in laws.items() for check in law(frames, layout)]
 
 

@@ -158,13 +158,6 @@ def test_unequal_rows_are_refused_with_both_numbers(tmp_path: Path, name: str) -
     assert "12 in" in message
 
 
-@pytest.mark.parametrize("name", eflesh.FILES)
-@pytest.mark.parametrize("content", [b"", b"1", b"\n", b"\x00\xff\xfe\n"], ids=repr)
-def test_a_file_without_rows_is_refused(tmp_path: Path, name: str, content: bytes) -> None:
-    (scan(tmp_path) / name).write_bytes(content)
-    assert name in complaint_of(tmp_path)
-
-
 @pytest.mark.parametrize(
     ("name", "cell", "expected"),
     [
@@ -233,24 +226,3 @@ def test_fields_in_other_units_are_refused(tmp_path: Path, of_a_uT: float) -> No
     for name in (eflesh.SENSOR, eflesh.CHANGES):
         rescale(tmp_path / name, slice(1, None), of_a_uT)
     assert "G to uT" in complaint_of(tmp_path)
-
-
-@settings(max_examples=50, deadline=None)
-@given(content=st.binary(max_size=200), name=st.sampled_from(eflesh.FILES))
-def test_random_bytes_are_refused_in_one_sentence(
-    tmp_path_factory: pytest.TempPathFactory, content: bytes, name: str
-) -> None:
-    folder = scan(tmp_path_factory.mktemp("eflesh"))
-    (folder / name).write_bytes(content)
-    complaint_of(folder)
-
-
-@settings(max_examples=60, deadline=None)
-@given(data=st.data(), name=st.sampled_from(eflesh.FILES))
-def test_a_file_cut_anywhere_is_never_read(
-    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject, name: str
-) -> None:
-    folder = scan(tmp_path_factory.mktemp("eflesh"))
-    whole = (folder / name).read_bytes()
-    (folder / name).write_bytes(whole[: data.draw(st.integers(0, len(whole) - 1))])
-    complaint_of(folder)

@@ -329,31 +329,3 @@ def test_another_number_of_chips_than_the_headers_is_refused(tmp_path: Path) -> 
 def test_forces_in_grams_are_refused(tmp_path: Path) -> None:
     edit(write(tmp_path, ONE_PASS) / ini.TRUTHS, 4, "2.0 4.0 153.0")
     assert "in line 4. Convert grams" in complaint_of(tmp_path)
-
-
-@pytest.mark.parametrize("name", ini.FILES)
-@pytest.mark.parametrize("content", [b"", b"1", b"\n", b"\x00\xff\xfe\n"], ids=repr)
-def test_a_file_without_rows_is_refused(tmp_path: Path, name: str, content: bytes) -> None:
-    (write(tmp_path, ONE_PASS) / name).write_bytes(content)
-    assert name in complaint_of(tmp_path)
-
-
-@settings(max_examples=50, deadline=None)
-@given(content=st.binary(max_size=200), name=st.sampled_from(ini.FILES))
-def test_random_bytes_are_refused_in_one_sentence(
-    tmp_path_factory: pytest.TempPathFactory, content: bytes, name: str
-) -> None:
-    folder = write(tmp_path_factory.mktemp("ini"), ONE_PASS)
-    (folder / name).write_bytes(content)
-    complaint_of(folder)
-
-
-@settings(max_examples=60, deadline=None)
-@given(data=st.data(), name=st.sampled_from(ini.FILES))
-def test_a_file_cut_anywhere_is_never_read(
-    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject, name: str
-) -> None:
-    folder = write(tmp_path_factory.mktemp("ini"), ONE_PASS)
-    whole = (folder / name).read_bytes()
-    (folder / name).write_bytes(whole[: data.draw(st.integers(0, len(whole) - 1))])
-    complaint_of(folder)

@@ -222,29 +222,5 @@ def test_another_number_of_chips_than_the_headers_is_refused(tmp_path: Path) -> 
     assert "got 2" in message
 
 
-@pytest.mark.parametrize("content", [b"", b"x", b"\n", NAMES.encode(), f"{NAMES}\n".encode()], ids=repr)
-def test_a_file_without_rows_is_refused(tmp_path: Path, content: bytes) -> None:
-    (tmp_path / lab.READINGS).write_bytes(content)
-    complaint_of(tmp_path)
-
-
 def test_a_recording_without_any_contact_is_refused(tmp_path: Path) -> None:
     assert "rows of phase contact" in complaint_of(write(tmp_path, PRESSES[0]))
-
-
-@settings(max_examples=50, deadline=None)
-@given(content=st.binary(max_size=200))
-def test_random_bytes_are_refused_in_one_sentence(tmp_path_factory: pytest.TempPathFactory, content: bytes) -> None:
-    folder = tmp_path_factory.mktemp("lab")
-    (folder / lab.READINGS).write_bytes(content)
-    complaint_of(folder)
-
-
-@settings(max_examples=60, deadline=None)
-@given(data=st.data())
-def test_a_file_cut_in_a_line_is_never_read(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
-    whole = ("\n".join([NAMES, *PRESSES]) + "\n").encode()
-    cut = data.draw(st.integers(0, len(whole) - 1).filter(lambda n: n == 0 or whole[n - 1 : n] != b"\n"))
-    folder = tmp_path_factory.mktemp("lab")
-    (folder / lab.READINGS).write_bytes(whole[:cut])
-    complaint_of(folder)

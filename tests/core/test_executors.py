@@ -2,9 +2,9 @@ import os
 
 import pytest
 
+from pipeline.core import executors
 from pipeline.core.errors import ParamsError
-from pipeline.learning import executors
-from pipeline.learning.executors import device, make_executor
+from pipeline.core.executors import device, make_executor
 
 
 def test_trainings_run_in_processes_of_their_own(monkeypatch):

@@ -1,0 +1,185 @@
+"""What an edit re-runs, by DVC's own index and hashes and without running a stage: no more than what rests on it."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline import plan
+from pipeline.core.config import find, read_yaml
+from pipeline.learning import trial
+from pipeline.learning.trial import DECIDING, Keys
+from tests.learning.trials import measured, pooled
+from tests.stages.checkout import ROOT, copy_checkout, run
+
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of DVC's own libraries
+QUESTION = '    _experiment("repeat", None, recorded=True),\n'
+STAGE = """\
+  repeat: # how much force differs from reading to reading
+    foreach: ${stages.repeat}
+    do:
+      cmd: >-
+        sh pipeline/run.sh repeat --scene ${item.scene}
+        --indentations data/indentations/${item.folder} --answer data/answers/${item.scene}/repeat.json
+      deps:
+        - data/indentations/${item.folder}
+        - pipeline/core
+        - pipeline/experiments/answer.py
+        - pipeline/experiments/repeat/run.py
+      outs:
+        - data/answers/${item.scene}/repeat.json
+
+"""
+FILES = {
+    "__init__.py": '"""How much force differs from reading to reading."""\n',
+    "run.py": '''"""Stage repeat: readings -> the spread of force."""
+
+from pathlib import Path
+
+from pipeline.core.stage import run
+from pipeline.experiments.answer import read_folder, write_answer
+
+
+def repeat(scene: str, indentations: Path, answer: Path) -> None:
+    """Write the standard deviation of force by capture."""
+    write_answer(answer, {one.capture: float(one.Fz_N.std()) for one in read_folder(indentations)}, {})
+
+
+if __name__ == "__main__":
+    run(repeat)
+''',
+    "show.py": '''"""Shows the spread of force: numbers -> one table."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import pandas as pd
+
+
+def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
+    """Show a row for each capture."""
+    lines = [{"capture": name, "sd of force, N": f"{sd_N:.3g}", "source": source} for name, sd_N in numbers.items()]
+    return {"repeat": pd.DataFrame(lines)}
+
+
+def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
+    """Draw nothing."""
+    return {}
+''',
+}
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory) -> Path:
+    """A checkout that runs scene ci."""
+    folder = copy_checkout(tmp_path_factory.mktemp("edited"))
+    run(folder, "reskin", "scenes", "use", "ci")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def before(root) -> dict[str, tuple[Any, ...]]:
+    return state(root)
+
+
+def state(root: Path) -> dict[str, tuple[Any, ...]]:
+    """By stage what DVC decides by: its command, its parameters, hashes of dependencies that exist; and its outputs."""
+    from dvc.repo import Repo
+
+    @cache
+    def words_of(path: str) -> Any:
+        return read_yaml(Path(path))
+
+    hashes: dict[str, str] = {}
+
+    def value(dep: Any) -> Any:
+        if hasattr(dep, "params"):
+            return {key: find(words_of(dep.fs_path), key) for key in dep.params}
+        if dep.fs_path not in hashes:
+            hashes[dep.fs_path] = str(dep.get_hash()) if dep.exists else ""
+        return hashes[dep.fs_path]
+
+    with Repo(str(root)) as repo:
+        return {
+            stage.name: (
+                stage.cmd,
+                {dep.fs_path: value(dep) for dep in stage.deps},
+                [out.fs_path for out in stage.outs],
+            )
+            for stage in repo.index.stages
+        }
+
+
+def run_again(before: dict[str, tuple[Any, ...]], after: dict[str, tuple[Any, ...]]) -> set[str]:
+    """Name the stages that changed, and those that read an output of one that runs again."""
+    stale: set[str] = set()
+    more = {name for name in after if after[name] != before.get(name)}
+    while more - stale:
+        stale |= more
+        outs = [Path(out) for name in stale for out in after[name][2]]
+        more = {name for name in after if any(_overlap(Path(dep), out) for dep in after[name][1] for out in outs)}
+    return stale
+
+
+def _overlap(path: Path, other: Path) -> bool:
+    return path.is_relative_to(other) or other.is_relative_to(path)
+
+
+@contextmanager
+def edited(root: Path, files: dict[str, str]) -> Iterator[None]:
+    """Write files, and undo it with the plan."""
+    held = {root / name: (root / name).read_text() for name in [plan.PLAN, *files] if (root / name).exists()}
+    try:
+        for name, text in files.items():
+            (root / name).parent.mkdir(exist_ok=True)
+            (root / name).write_text(text)
+        yield
+    finally:
+        for name in files:
+            (root / name).unlink()
+        for file, text in held.items():
+            file.write_text(text)
+
+
+def inserted(file: Path, line: str, text: str) -> str:
+    """Give the content of a file with a text before some line."""
+    assert line in file.read_text()
+    return file.read_text().replace(line, f"{text}{line}", 1)
+
+
+def test_a_new_experiment_runs_its_own_stage_and_the_report(root, before):
+    questions, scene = "pipeline/questions.py", f"{plan.SCENES}/ci.yaml"
+    files = {f"pipeline/experiments/repeat/{name}": text for name, text in FILES.items()} | {
+        questions: inserted(root / questions, '    _study("verification"),\n', QUESTION),
+        plan.FLOW: inserted(root / plan.FLOW, "  report: #", STAGE),
+        scene: inserted(root / scene, "single_random,", "repeat, "),
+    }
+    with edited(root, files):
+        run(root, "reskin", "scenes", "use", "ci")
+        after = state(root)
+    assert run_again(before, after) == {"repeat@ci", "report@ci", "publish@ci"}
+
+
+def test_a_new_figure_of_an_experiment_runs_the_report(root, before):
+    show = "pipeline/experiments/shear/show.py"
+    with edited(root, {show: (root / show).read_text() + "\n\nMORE = 1\n"}):
+        after = state(root)
+    assert run_again(before, after) == {"report@ci", "publish@ci"}
+
+
+def test_words_in_the_code_of_learning_change_no_key_of_a_training_and_code_does(tmp_path, monkeypatch):
+    monkeypatch.setattr(trial, "__file__", str(tmp_path / "trial.py"))
+    sources = {name: (ROOT / f"pipeline/learning/{name}.py").read_text() for name in DECIDING}
+
+    def key(sources: dict[str, str]) -> str:
+        for name, text in sources.items():
+            (tmp_path / f"{name}.py").write_text(text)
+        trial._code_digest.cache_clear()
+        return Keys(measured()).key(pooled())
+
+    told = {name: "# More.\n" + text.replace('"""', '"""More. ', 1) for name, text in sources.items()}
+    assert key(told) == key(sources) != key(sources | {"losses": sources["losses"] + "\nWEIGHT = 1.0\n"})
+    trial._code_digest.cache_clear()
