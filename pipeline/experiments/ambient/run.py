@@ -56,10 +56,10 @@ Networks = Mapping[str, Sequence[Network]]  # by arm
 
 
 def networks_of_common_part(
-    data: SceneData, fold: Fold, training: Training, own: Instrument
+    data: SceneData, fold: Fold, training: Training, instrument: Instrument
 ) -> tuple[list[Network], dict[str, int]]:
     """Train the headline recipe anew on inputs whose common part is taken off, as in use; count what collapsed."""
-    without = project(data.rows.db_uT, without_common_part(own.turn))
+    without = project(data.rows.db_uT, without_common_part(instrument.turn))
     headline = training.model_copy(update={"recipes": {HEADLINE: training.recipes[HEADLINE]}})
     trials = trials_of(data, headline, [fold], question="ambient")
     trained = train_all(replace(data, rows=replace(data.rows, db_uT=without)), trials, "ambient")
@@ -71,12 +71,12 @@ def networks_of_common_part(
 
 
 def on_board(
-    data: SceneData, fold: Fold, asked: Ambient, *, of: Synthesis, own: Instrument, networks: Networks
+    data: SceneData, fold: Fold, section: Ambient, *, of: Synthesis, instrument: Instrument, networks: Networks
 ) -> Iterator[dict[str, Any]]:
     """Score every arm that has networks in every field, on one reading of each of the board's held-out pokes."""
     test = one_a_poke(data.rows.indentation, fold.test, rng_for(data.settings.seed, "ambient", fold.name, "pokes"))
     db_uT, true = data.rows.db_uT[test], data.rows.target[test]
-    off = without_common_part(own.turn)
+    off = without_common_part(instrument.turn)
     arms: dict[str, Callable[[Case], np.ndarray]] = {
         AS_IT_IS: lambda case: db_uT + case.added_uT,
         ASIDE: lambda case: db_uT + case.added_uT - case.guessed_uT,
@@ -84,8 +84,8 @@ def on_board(
     }
     rng = rng_for(data.settings.seed, "ambient", fold.name, "uniform")
     for case in (
-        *uniform_cases(own, asked.fields_uT, rows_n=len(test), rng=rng),
-        *_iron(data, fold, test, asked, of, own),
+        *uniform_cases(instrument, section.fields_uT, rows_n=len(test), rng=rng),
+        *_iron(data, fold, test, section, of, instrument),
     ):
         for arm, trained in networks.items():
             shown = arms[arm](case).astype(np.float32)
@@ -95,13 +95,15 @@ def on_board(
 
 
 def _iron(
-    data: SceneData, fold: Fold, test: np.ndarray, asked: Ambient, of: Synthesis, own: Instrument
+    data: SceneData, fold: Fold, test: np.ndarray, section: Ambient, of: Synthesis, instrument: Instrument
 ) -> Iterator[Case]:
     names, which = np.unique(data.rows.skin[test], return_inverse=True)
     rule = of.main_boards.quadrature.quadrature()
     skins = [draw_skin(of.skin, of.spreads, seed=data.settings.seed, name=str(name), rule=rule) for name in names]
     rng = rng_for(data.settings.seed, "ambient", fold.name, "iron")
-    return iron_cases(own, skins, which, radius_mm=asked.iron.radius_mm, distances_mm=asked.iron.distances_mm, rng=rng)
+    return iron_cases(
+        instrument, skins, which, radius_mm=section.iron.radius_mm, distances_mm=section.iron.distances_mm, rng=rng
+    )
 
 
 def read(settings: Settings) -> Ambient:
@@ -113,16 +115,16 @@ def ambient(scene: str, files: Files, folds: Path, indentations: Path, models: P
     """Test every held-out board in fields that came up after its no-load readings; train one arm on the last board."""
     data = read_data(read_settings("ambient", scene, files), indentations, folds)
     of, seed = synthesis_of(data.settings), data.settings.seed
-    asked, trained = read(data.settings), training(data.settings, "train_multi")
+    section, trained = read(data.settings), training(data.settings, "train_multi")
     held_out = data.folds_of("lobo")
     boards = [fold.name for fold in held_out]
     points: list[dict[str, Any]] = []
     for fold in held_out:
-        own = take_board(of, fold.name, seed=seed)
+        instrument = take_board(of, fold.name, seed=seed)
         networks = {arm: networks_without(models, fold.name) for arm in (AS_IT_IS, ASIDE)}
         if fold is held_out[-1]:
-            networks[OWN], trainings = networks_of_common_part(data, fold, trained, own)
-        points += on_board(data, fold, asked, of=of, own=own, networks=networks)
+            networks[OWN], trainings = networks_of_common_part(data, fold, trained, instrument)
+        points += on_board(data, fold, section, of=of, instrument=instrument, networks=networks)
     last = boards[-1:]
     numbers = {
         "arms": {
@@ -134,7 +136,7 @@ def ambient(scene: str, files: Files, folds: Path, indentations: Path, models: P
         "directions": "a random one for each poke",
         "earth_uT": EARTH_SIZE_T / micro,
         "earth_dip_deg": EARTH_DIP_DEG,
-        "iron_radius_mm": asked.iron.radius_mm,
+        "iron_radius_mm": section.iron.radius_mm,
         "uniform": over_boards(points, "field_uT", boards),
         "iron": over_boards(points, "distance_mm", boards),
         "last_board": {

@@ -52,7 +52,7 @@ DRAWN_N = 60  # pairs a board and separation that the figure shows
 
 
 def on_board(
-    data: SceneData, fold: Fold, asked: Contacts, networks: Sequence[Answering]
+    data: SceneData, fold: Fold, section: Contacts, networks: Sequence[Answering]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Answer pairs of one held-out board: its numbers, and where answers fall for the figure."""
     rng = rng_for(data.settings.seed, "contacts", fold.name)
@@ -63,8 +63,8 @@ def on_board(
         for side, own in (("aside", aside), ("test", fold.test))
     }
     pairs = {
-        separation_mm: draw_pairs(data.rows, fold.test, separation_mm, pairs_n=asked.pairs_n, rng=rng)
-        for separation_mm in (SAME_PLACE, *asked.separations_mm)
+        separation_mm: draw_pairs(data.rows, fold.test, separation_mm, pairs_n=section.pairs_n, rng=rng)
+        for separation_mm in (SAME_PLACE, *section.separations_mm)
     }
     answers = {separation_mm: _answers(networks, one.sum_uT(data.rows.db_uT)) for separation_mm, one in pairs.items()}
     double = {
@@ -75,11 +75,11 @@ def on_board(
         side: _odd(data, known, data.rows.db_uT[own], _answers(networks, data.rows.db_uT[own]))
         for side, own in singles.items()
     }
-    numbers = detect(single["aside"], single["test"], double, asked.false_alarm_fraction)
+    numbers = detect(single["aside"], single["test"], double, section.false_alarm_fraction)
     numbers["falls"] = {s: _falls(data, pairs[s], answers[s]) for s in pairs}
     drawn = {
         f"{s:g}": along_the_line(*_truth(data, pairs[s]), answers[s][0])[:DRAWN_N].round(2).tolist()
-        for s in asked.separations_mm
+        for s in section.separations_mm
     }
     return numbers, {"kept_aside": what, "along": drawn}
 
@@ -123,28 +123,28 @@ def contacts(scene: str, files: Files, folds: Path, indentations: Path, models: 
     """Add pokes of every held-out board in pairs, and ask the networks that never saw it."""
     data = read_data(read_settings("contacts", scene, files), indentations, folds)
     settings, held_out = data.settings, data.folds_of("lobo")
-    asked = read(settings)
+    section = read(settings)
     boards, drawn = zip(
-        *(on_board(data, fold, asked, networks_without(models, fold.name)) for fold in held_out),
+        *(on_board(data, fold, section, networks_without(models, fold.name)) for fold in held_out),
         strict=True,
     )
     stats = over_boards(boards)
     numbers: dict[str, Any] = {
-        "pairs_n": asked.pairs_n,
+        "pairs_n": section.pairs_n,
         "boards_n": len(boards),
         "threshold_set_on": KEPT_ASIDE.format(drawn[0]["kept_aside"]),
         "noise": "that of two readings",
-        "by_separation": [_row(stats, separation_mm) for separation_mm in asked.separations_mm],
+        "by_separation": [_row(stats, separation_mm) for separation_mm in section.separations_mm],
         "same_place": _row(stats, SAME_PLACE),
         "false_alarm_pct": {
-            detector: {"asked": 100 * asked.false_alarm_fraction, "realised": realised}
+            detector: {"asked": 100 * section.false_alarm_fraction, "realised": realised}
             for detector, realised in stats["false_alarm_pct"].items()
         },
         "auc": stats["auc"],
     }
     if "simulate" in settings.of_scene:
         numbers["superposition"] = superposition(
-            synthesis_of(data.settings), asked.separations_mm, seed=data.settings.seed
+            synthesis_of(data.settings), section.separations_mm, seed=data.settings.seed
         )
     along = {s: [value for one in drawn for value in one["along"][s]] for s in drawn[0]["along"]}
     write_answer(answer, numbers, {"along": along})

@@ -66,28 +66,28 @@ class Drift(Strict):
 UNIT = {"indentation": "indentation", "pass": "pass_i"}
 
 
-def cut(captures: Sequence[Readings], asked: Drift, selection: Selection) -> tuple[Windows, list[Part]]:
+def cut(captures: Sequence[Readings], section: Drift, selection: Selection) -> tuple[Windows, list[Part]]:
     """Lay the windows that all captures have, and their rows under every policy."""
     check_one_each(captures)
-    units = [baseline.rank(getattr(one, UNIT[asked.unit])) for one in captures]
+    units = [baseline.rank(getattr(one, UNIT[section.unit])) for one in captures]
     units_n = [1 + int(own.max()) for own in units]
-    windows = lay_windows(units_n, train_n=asked.train_n, test_n=asked.test_n, every_n=asked.every_n)
+    windows = lay_windows(units_n, train_n=section.train_n, test_n=section.test_n, every_n=section.every_n)
     known: dict[str, Policy] = {"initial": baseline.initial, "each": baseline.each}
-    if asked.regular_n is not None:
-        known["regular"] = partial(baseline.regular, regular_n=asked.regular_n)
-    policies: dict[str, Policy] = {policy: known[policy] for policy in asked.policies}
+    if section.regular_n is not None:
+        known["regular"] = partial(baseline.regular, regular_n=section.regular_n)
+    policies: dict[str, Policy] = {policy: known[policy] for policy in section.policies}
     laid = lay_parts(list(zip(captures, units, strict=True)), policies, windows=windows, selection=selection)
     return windows, laid
 
 
-def trials(parts: Sequence[Part], asked: Drift, seed: int) -> Iterator[tuple[Trial, list[Part]]]:
+def trials(parts: Sequence[Part], section: Drift, seed: int) -> Iterator[tuple[Trial, list[Part]]]:
     """Make a trial of every recipe, skin, policy and seed, beside its test windows."""
     starts = [i for i, part in enumerate(parts) if part.window_i == TRAIN]
     for start, end in pairwise([*starts, len(parts)]):
         train, tests = parts[start], list(parts[start + 1 : end])
         fold, test = f"{train.readings.skin}-{train.policy}", np.concatenate([part.row_i for part in tests])
-        for name, recipe in asked.training.recipes.items():
-            for seed_i in range(asked.training.seeds_n):
+        for name, recipe in section.training.recipes.items():
+            for seed_i in range(section.training.seeds_n):
                 yield Trial("drift", name, recipe, fold, seed, seed_i, train.row_i, test), tests
 
 
@@ -121,40 +121,40 @@ def drift(scene: str, files: Files, indentations: Path, answer: Path) -> None:
     windows, parts = cut(captures, section, selection)
     pairs = list(trials(parts, section, settings.seed))
     data = SceneData(scene, settings, stack(parts), [])
-    said: dict[str, list[Answers]] = {}
+    answered: dict[str, list[Answers]] = {}
     trained = train_all(data, [trial for trial, _ in pairs], "drift")
     for (trial, tests), one in zip(pairs, trained, strict=True):
-        said.setdefault(trial.recipe_name, []).extend(answers(trial, one, tests))
+        answered.setdefault(trial.recipe_name, []).extend(answers(trial, one, tests))
     rows: dict[str, dict[str, Any]] = {
-        name: {policy: over_windows(own, policy) for policy in section.policies} for name, own in said.items()
+        name: {policy: over_windows(own, policy) for policy in section.policies} for name, own in answered.items()
     }
-    told, drawn = _tell(section, said[HEADLINE], rows[HEADLINE], parts, field_sizes(captures))
+    found, drawn = _tell(section, answered[HEADLINE], rows[HEADLINE], parts, field_sizes(captures))
     counts = {"skins_n": len(captures), "seeds_n": section.training.seeds_n, "dropped": data.rows.dropped}
     words = section.model_dump(mode="json", include={"unit", "train_n", "test_n", "every_n", "regular_n"})
     numbers = {name: value for name, value in words.items() if value is not None} | counts | pace(captures)
     variants = {name: own for name, own in rows.items() if name != HEADLINE}
-    numbers |= {"left_out_units_n": windows.left_out_units_n} | told | ({"variants": variants} if variants else {})
+    numbers |= {"left_out_units_n": windows.left_out_units_n} | found | ({"variants": variants} if variants else {})
     write_answer(
         answer, numbers, drawn, read_losses(indentations, numbers["dropped"]), tally(map(collapse_record, trained))
     )
 
 
 def _tell(
-    asked: Drift, said: Sequence[Answers], rows: dict[str, Any], parts: Sequence[Part], field: dict[str, float]
+    section: Drift, answered: Sequence[Answers], rows: dict[str, Any], parts: Sequence[Part], field: dict[str, float]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Put the windows together with late forces and findings; the paper does not say of which policy figure 5b is."""
-    policy = "regular" if "regular" in rows else asked.policies[0]
+    policy = "regular" if "regular" in rows else section.policies[0]
     window_i = late_window(rows[policy])
-    numbers, drawn, late = rows | {"field": field}, {}, late_force(said, policy, window_i)
+    numbers, drawn, late = rows | {"field": field}, {}, late_force(answered, policy, window_i)
     if late is not None:
         left_pct = force_left_pct(parts, policy, window_i)
         where = {"policy": policy, "contacts_n": rows[policy][window_i]["contacts_n"]}
         numbers["late"] = where | late[0] | ({} if left_pct is None else {"force_left_pct": left_pct})
         drawn = {"late": late[1]}
-    networks: dict[str, Any] = {name: of_networks(said, name) for name in asked.policies}
-    boards = boards_of(said, policy)
+    networks: dict[str, Any] = {name: of_networks(answered, name) for name in section.policies}
+    boards = boards_of(answered, policy)
     found = findings(rows, networks, boards=boards, field=field, late=numbers.get("late"))
-    last = {name: last_window(said, name) for name in asked.policies}
+    last = {name: last_window(answered, name) for name in section.policies}
     return numbers | {"findings": found, "last_window": last}, drawn
 
 

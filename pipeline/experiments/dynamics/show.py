@@ -3,12 +3,11 @@
 from collections.abc import Mapping
 from typing import Any
 
-import matplotlib as mpl
 import pandas as pd
 
 from pipeline.evaluation.inference import VERDICTS, negated, verdict
 from pipeline.reporting import paper
-from pipeline.reporting.figures import STYLE, svg
+from pipeline.reporting.figures import drawing, svg
 from pipeline.reporting.shown import show_difference
 from pipeline.reporting.work_precision import COLOURS, MARKERS
 
@@ -59,10 +58,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
     """Draw errors of force and place against the press's duration."""
-    from matplotlib.figure import Figure
-
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(7.6, 3.8), layout="constrained")
+    with drawing(7.6, 3.8) as figure:
         panels = figure.subplots(1, 2)
         # A press stays where it is: against the middle's place the mean is as good as against the last one's.
         for axes, name, ways_n in zip(panels, ("mse_f_N2", "mse_xy_mm2"), (3, 2), strict=True):

@@ -80,31 +80,33 @@ def flexible(
     """Adapt the networks of the first fold of lobo to every flexible skin, and test on its later passes."""
     data = read_data(read_settings("flexible", scene, files), main, folds)
     starts, captures = read_starts(started), read_folder(indentations)
-    asked, first, trained_n = adaptations_of(data.settings), data.folds_of("lobo")[0], len(data.rows)
+    adapting, first, trained_n = adaptations_of(data.settings), data.folds_of("lobo")[0], len(data.rows)
     poked = gather(captures, data.settings.section(Selection, "selection"))
     data = replace(data, rows=stack(data.rows, poked))
     sides = (first.train, np.arange(trained_n, len(data.rows)))
     fold = hold_out_skins(
         data.rows, "flexible", first.name, sides, parse_parts(Split, data.settings.words("split"), "split")
     )
-    arms = {name: arm for name, arm in ((HEADLINE, AFTER), (CONTROL, CONTROL), (SHAPE, SHAPE)) if name in asked.recipes}
+    arms = {
+        name: arm for name, arm in ((HEADLINE, AFTER), (CONTROL, CONTROL), (SHAPE, SHAPE)) if name in adapting.recipes
+    }
     trials = [
         (arm, trial)
         for name, arm in arms.items()
         for trial in adaptations(
-            data, fold, (name, asked.recipes[name]), starts, question="flexible", pokes_n=asked.pokes_n
+            data, fold, (name, adapting.recipes[name]), starts, question="flexible", pokes_n=adapting.pokes_n
         )
     ]
     skins = [str(skin) for skin in np.unique(data.rows.skin[fold.test])]
     before = {
-        name: [one for skin in skins for one in answers_before(data, fold, asked.recipes[name], starts, skin)]
+        name: [one for skin in skins for one in answers_before(data, fold, adapting.recipes[name], starts, skin)]
         for name in arms if name != CONTROL
     }  # fmt: skip
     after, trainings = answers_after(data, trials, "flexible")
     own = before[HEADLINE] + [one for one in after if one.arm != SHAPE]
     numbers: dict[str, Any] = {
         "skins_n": len(skins), "boards_n": len(np.unique(data.rows.board[fold.test])),
-        "seeds_n": len({one.seed_i for one in own}), "pokes_n": asked.pokes_n, "fold": first.name,
+        "seeds_n": len({one.seed_i for one in own}), "pokes_n": adapting.pokes_n, "fold": first.name,
         "trained_on_skins_n": len(np.unique(data.rows.skin[fold.train])),
         "strength_ratio": strength_ratio(_by_depth(captures), _by_depth(read_folder(main))),
     } | _gaps(data) | answer_flexible(own)  # fmt: skip

@@ -45,7 +45,7 @@ def manual(scene: str, files: Files, folds: Path, main: Path, indentations: Path
     """Adapt to every skin that was poked by hand, and by as many pokes of the robot; test on the robot's grid."""
     data = read_data(read_settings("manual", scene, files), main, folds)
     starts = read_starts(started)
-    asked = adaptations_of(data.settings)
+    adapting = adaptations_of(data.settings)
     poked, found = hand_rows(read_folder(indentations))
     lines = {skin: shifted(own, len(data.rows)) for skin, own in found.items()}
     data = replace(data, rows=stack(data.rows, poked))
@@ -53,8 +53,8 @@ def manual(scene: str, files: Files, folds: Path, main: Path, indentations: Path
     answers: list[Answered] = []
     for skin, own in lines.items():
         fold = _fold_without(data, str(poked.board[poked.skin == skin][0]))
-        answers += answers_before(data, fold, asked.recipes[HEADLINE], starts, skin)
-        trials += _trials(data, fold, asked, starts, (skin, own))
+        answers += answers_before(data, fold, adapting.recipes[HEADLINE], starts, skin)
+        trials += _trials(data, fold, adapting, starts, (skin, own))
     after, trainings = answers_after(data, trials, "manual")
     pokes_n, lines_n = zip(*((_pokes_n(data, own), len(np.unique(own.line_i))) for own in lines.values()), strict=True)
     numbers = answer_manual([*answers, *after], pokes_n=pokes_n, lines_n=lines_n)
@@ -62,17 +62,17 @@ def manual(scene: str, files: Files, folds: Path, main: Path, indentations: Path
 
 
 def _trials(
-    data: SceneData, fold: Fold, asked: Adaptations, starts: Starts, poked: tuple[str, Lines]
+    data: SceneData, fold: Fold, adapting: Adaptations, starts: Starts, poked: tuple[str, Lines]
 ) -> Iterator[tuple[str, Trial]]:
     """Make the arms of one skin: by hand, by the robot, and as long without pokes if there is such a recipe."""
-    (skin, by_hand), headline = poked, (HEADLINE, asked.recipes[HEADLINE])
+    (skin, by_hand), headline = poked, (HEADLINE, adapting.recipes[HEADLINE])
     for seed_i in own_starts(starts, headline[1].base, fold):
         by_robot = pool_lines(data, fold, skin, pokes_n=_pokes_n(data, by_hand), seed_i=seed_i)
         pokes = Pokes("manual", skin, seed_i, "hand", by_hand)
         yield AFTER, adaptation(data, fold, headline, starts, pokes)
         yield GRID, adaptation(data, fold, headline, starts, replace(pokes, what="grid", lines=by_robot))
-        if CONTROL in asked.recipes:
-            yield CONTROL, adaptation(data, fold, (CONTROL, asked.recipes[CONTROL]), starts, pokes)
+        if CONTROL in adapting.recipes:
+            yield CONTROL, adaptation(data, fold, (CONTROL, adapting.recipes[CONTROL]), starts, pokes)
 
 
 def _pokes_n(data: SceneData, lines: Lines) -> int:

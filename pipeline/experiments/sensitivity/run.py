@@ -142,9 +142,9 @@ def monotonic(response_uT: Float64[np.ndarray, "n p"], weight_N: Float64[np.ndar
 def sensitivity(scene: str, files: Files, indentations: Path, answer: Path) -> None:
     """Tell how small a weight the one skin tells that was loaded."""
     glass = read_settings("sensitivity", scene, files).words("simulate.protocols.glass")
-    asked = parse_parts(Load, glass, "simulate.protocols.glass")
+    load = parse_parts(Load, glass, "simulate.protocols.glass")
     one = only(read_folder(indentations), indentations)
-    weight_N = weights_N(asked.force_max_N, asked.step_N)
+    weight_N = weights_N(load.force_max_N, load.step_N)
     change_uT = subtract(one.b_uT, one.noload_uT)
     levels_uT = levels_of(change_uT, one.indentation, one.Fz_N, levels_n=len(weight_N), where=one.capture)
     numbers, drawn = answer_of(levels_uT, weight_N)

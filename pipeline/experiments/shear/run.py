@@ -111,13 +111,13 @@ def shear(scene: str, files: Files, indentations: Path, answer: Path) -> None:
     write_answer(answer, numbers, drawn, read_losses(indentations, rows.dropped), tally(map(collapse_record, trained)))
 
 
-def _folds(rows: Rows, group: np.ndarray, by: str, asked: Shear, seed: int) -> list[Fold]:
+def _folds(rows: Rows, group: np.ndarray, by: str, section: Shear, seed: int) -> list[Fold]:
     """Draw the folds of every skin by itself; rows of equal `group` stay together."""
     folds = []
     for skin in np.unique(rows.skin):
         own = np.flatnonzero(rows.skin == skin)
         drawn = draw_sides(
-            group[own], test_fraction=asked.test_fraction, repeats_n=asked.repeats_n,
+            group[own], test_fraction=section.test_fraction, repeats_n=section.repeats_n,
             state=seed_for(seed, "shear", by, str(skin)), what=f"{by}s of skin {skin}", where="question shear",
         )  # fmt: skip
         folds += [
