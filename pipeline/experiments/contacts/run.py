@@ -125,8 +125,7 @@ def contacts(scene: str, files: Files, folds: Path, indentations: Path, models: 
     settings, held_out = data.settings, data.folds_of("lobo")
     section = read(settings)
     boards, drawn = zip(
-        *(on_board(data, fold, section, networks_without(models, fold.name)) for fold in held_out),
-        strict=True,
+        *(on_board(data, fold, section, networks_without(models, fold.name)) for fold in held_out), strict=True
     )
     stats = over_boards(boards)
     numbers: dict[str, Any] = {

@@ -19,18 +19,10 @@ MEANING = (
     "Presses of one duration differ from those of another in depth and place too: compare the ways, at each duration. "
     f"± is the sd over networks; all presses are on one board. {VERDICTS}"
 )
-WAYS = {
-    "one": "each reading alone",
-    "mean5": "mean of the last five",
-    "mean5_of_middle": "the same, two frames late",
-}
+WAYS = {"one": "each reading alone", "mean5": "mean of the last five", "mean5_of_middle": "the same, two frames late"}
 LESS = "less force error than each reading alone, N²"  # column
 TICKS_S = (0.05, 0.1, 0.2, 0.5, 1.0)
-METRICS = {
-    "accuracy_pct": "accuracy / %",
-    "mse_xy_mm2": "MSE_xy / mm²",
-    "mse_f_N2": "MSE_F / N²",
-}
+METRICS = {"accuracy_pct": "accuracy / %", "mse_xy_mm2": "MSE_xy / mm²", "mse_f_N2": "MSE_F / N²"}
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:

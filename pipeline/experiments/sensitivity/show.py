@@ -32,11 +32,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
                 _show(numbers["smallest_step_N"], name, numbers),
                 f"< {paper.SENSITIVITY_N:g}",
             ),
-            (
-                f"smallest step told apart, {words}, mL of water",
-                _show_mL(name, numbers),
-                f"< {paper.SENSITIVITY_ML:g}",
-            ),
+            (f"smallest step told apart, {words}, mL of water", _show_mL(name, numbers), f"< {paper.SENSITIVITY_ML:g}"),
             (f"the same by |dB| alone, {words}, N", _show(numbers["by_length_N"], name, numbers), "–"),
         ]
     rise = numbers["monotonic"]

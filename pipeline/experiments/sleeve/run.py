@@ -146,10 +146,7 @@ def over_seeds(scores: Sequence[Mapping[str, float]]) -> Stats:
 
 
 def to_draw(
-    area: Area,
-    true: Float[np.ndarray, "f 3"],
-    error_mm: Shaped[np.ndarray, " f"],
-    indentation: Int[np.ndarray, " f"],
+    area: Area, true: Float[np.ndarray, "f 3"], error_mm: Shaped[np.ndarray, " f"], indentation: Int[np.ndarray, " f"]
 ) -> dict[str, Any]:
     """List every tested indentation with the mean error of its readings, and what lies under the skin."""
     _, first, which = np.unique(indentation, return_index=True, return_inverse=True)
