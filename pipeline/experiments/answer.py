@@ -1,13 +1,14 @@
-"""What the stages of the paper's experiments share: the captures of one folder, and the answer. Knows no argv."""
+"""What the stages of the experiments share: the captures of a folder, and the answer that they write."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from pipeline.core import io
 from pipeline.core.errors import SchemaError
 from pipeline.core.schema import Readings
 
+Capture = TypeVar("Capture")
 NO_CAPTURES: Mapping[str, Any] = {"accounts": [], "left_out": {}}  # of its own: it asks the main ones
 
 
@@ -17,6 +18,14 @@ def read_folder(indentations: Path, names: tuple[str, ...] = ()) -> list[Reading
     if not files:
         raise SchemaError(str(indentations), "captures", "one or more", "none", "Ingest them again.")
     return [io.read_readings(file) for file in files]
+
+
+def only(captures: Sequence[Capture], folder: Path) -> Capture:
+    """Give the one capture of a folder; more than one is an error, not a choice."""
+    if len(captures) != 1:
+        remedy = "Ask its protocol of one skin (skins_n), and simulate it again."
+        raise SchemaError(folder, "captures", "one, as its question reads no more", len(captures), remedy)
+    return captures[0]
 
 
 def read_losses(indentations: Path, left_out: Mapping[str, int]) -> dict[str, Any]:

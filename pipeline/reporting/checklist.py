@@ -1,7 +1,7 @@
 """The checklist: each figure, table and numbered result of the paper beside ours. In: numbers.json. Out: one table.
 
-Its rows are data, `checklist.yaml`; the paper's numbers are constants of `reporting.paper`. Refuses to know how ours
-were computed.
+Its rows are data, `checklist.yaml` and `show.yaml` of each experiment; the paper's numbers are constants of
+`reporting.paper`. Refuses to know how ours were computed.
 """
 
 import re
@@ -18,6 +18,7 @@ from pipeline.evaluation.scores import VERDICTS
 from pipeline.reporting import judging, paper
 from pipeline.reporting.judging import NONE, Row, Verdict, judge, mean_of
 from pipeline.reporting.order import FEW_POINTS, is_pooled
+from pipeline.reporting.parts import add_rows
 from pipeline.reporting.shown import show, show_difference
 
 FILE = Path(__file__).with_name("checklist.yaml")
@@ -37,7 +38,8 @@ NAMED = re.compile(r"\{([\w.]+)\}")  # a number that a reason names
 
 def read_rows() -> list[Row]:
     """Read the rows of the checklist, in the paper's order."""
-    return [parse(Row, row, f"{FILE.name}, row {row['id']}") for entry in read_yaml(FILE) for row in _by_metric(entry)]
+    entries = add_rows(read_yaml(FILE))
+    return [parse(Row, row, f"checklist, row {row['id']}") for entry in entries for row in _by_metric(entry)]
 
 
 def checklist(numbers: Mapping[str, Any], rows: Sequence[Row] | None = None) -> pd.DataFrame:

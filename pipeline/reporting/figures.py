@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import matplotlib as mpl
@@ -48,6 +49,15 @@ def error_grid(true_mm: Float[np.ndarray, "f 2"], predicted_mm: Float[np.ndarray
         axes.set(xlabel="x / mm", ylabel="y / mm", aspect="equal")
         axes.set_title(title, loc="left", fontsize=10, wrap=True)
         return svg(figure)
+
+
+@contextmanager
+def drawing(width_in: float, height_in: float) -> Iterator[Any]:
+    """Give an empty figure to draw on, in the style of all figures."""
+    from matplotlib.figure import Figure
+
+    with mpl.rc_context(STYLE):
+        yield Figure(figsize=(width_in, height_in), layout="constrained")
 
 
 def svg(figure: Any) -> str:

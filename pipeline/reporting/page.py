@@ -15,6 +15,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from pydantic import Field
 
 from pipeline.core.config import Strict, parse, read_yaml
+from pipeline.reporting.parts import add_sections
 from pipeline.reporting.shown import notes
 from pipeline.reporting.sweeps import learning_costs
 from pipeline.reporting.work_precision import cost_tables
@@ -86,7 +87,7 @@ def page(
 
 def read_sections() -> list[Section]:
     """Read the sections of a page, in order."""
-    return [parse(Section, words, f"{FILE.name}, section {words['key']}") for words in read_yaml(FILE)]
+    return [parse(Section, words, f"page, section {words['key']}") for words in add_sections(read_yaml(FILE))]
 
 
 def arrange(tables: Iterable[str], figures: Iterable[str]) -> list[Section]:

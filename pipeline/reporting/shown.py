@@ -40,6 +40,12 @@ def show_interval(value: Stat) -> str:
     return f"[{_three(low)}, {_three(high)}]"
 
 
+def show_digits(value: Stat, digits: int) -> str:
+    """Write a mean with so many decimals, and its interval over boards if it has one."""
+    numbers = [f"{number:.{digits}f}" for number in (value["mean"], *value.get("ci95", ()))]
+    return f"{numbers[0]} [{numbers[1]}, {numbers[2]}]" if len(numbers) > 1 else numbers[0]
+
+
 def show_both(value: Stat | None) -> str:
     """Write a mean, its standard deviation as the paper does, and its interval over boards."""
     if value is None or "ci95" not in value:

@@ -2,7 +2,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.evaluation.scores import tally
-from pipeline.experiments.audit.collapse import audit_collapse
+from pipeline.experiments.audit.run import audit_collapse
 
 OF_ONE = st.fixed_dictionaries({"collapsed": st.booleans(), "collapsed_before_n": st.integers(0, 2)})
 

@@ -6,10 +6,10 @@ The paper has no number to stand beside: it names the question as future work (s
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import matplotlib as mpl
 import pandas as pd
 
-from pipeline.reporting.figures import STYLE, svg
+from pipeline.reporting.figures import drawing, svg
+from pipeline.reporting.shown import show_digits
 from pipeline.reporting.work_precision import COLOURS, MARKERS
 
 COLUMNS = {
@@ -47,11 +47,8 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
     """Draw accuracy against the strength of a uniform field and the distance of the iron, on the last board."""
-    from matplotlib.figure import Figure
-
     last, arms = numbers["last_board"], list(numbers["arms"])
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(7.8, 4.6), layout="constrained")
+    with drawing(7.8, 4.6) as figure:
         left, right = figure.subplots(1, 2, sharey=True)
         _draw(left, last["uniform"], "field_uT", arms)
         _draw(right, last["iron"], "distance_mm", arms)
@@ -85,11 +82,4 @@ def _field(kind: str, row: Mapping[str, Any]) -> str:
 
 
 def _scores(stats: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
-    return {words: _show(stats[name], digits) for name, (words, digits) in COLUMNS.items() if name in stats}
-
-
-def _show(stat: Mapping[str, Any], digits: int) -> str:
-    if "ci95" not in stat:
-        return f"{stat['mean']:.{digits}f}"
-    low, high = stat["ci95"]
-    return f"{stat['mean']:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+    return {words: show_digits(stats[name], digits) for name, (words, digits) in COLUMNS.items() if name in stats}

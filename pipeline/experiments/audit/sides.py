@@ -1,17 +1,40 @@
-"""Are the two sides of a fold apart? In: row numbers of a fold, labels and dB of the scene. Out: `Check`s.
+"""Did training see the test side of a fold? In: row numbers, labels and dB of a scene. Out: `Check`s.
 
 What must be apart follows from the question; the paper's random readings share indentations, which is a known leak.
 Refuses to know how folds are drawn and what is trained on them.
 """
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from pipeline.core.errors import ParamsError
-from pipeline.experiments.audit.checks import Check
 from pipeline.experiments.audit.copies import COPIED_SHARE_MAX, liken, strong_indentations
+
+
+@dataclass(frozen=True)
+class Check:
+    """A rule that keeps training apart from testing, and what was found of it."""
+
+    what: str
+    where: str
+    rule: str
+    found: str
+    holds: bool
+    known: bool
+
+
+def holds(checks: Iterable[Check]) -> bool:
+    """Tell whether every rule holds, but for the leaks that are known."""
+    return all(check.holds or check.known for check in checks)
+
+
+def to_words(checks: Iterable[Check]) -> list[dict[str, str | bool]]:
+    """Write checks as JSON words."""
+    return [asdict(check) for check in checks]
+
 
 SKINS_UNSEEN = ("lobo", "sensors", "labels", "transfer")
 SKIN_SHARED = ("single_temporal", "single_indentation", "single_pass")

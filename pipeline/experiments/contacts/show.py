@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
-import matplotlib as mpl
 import pandas as pd
 
-from pipeline.reporting.figures import STYLE, svg
+from pipeline.reporting.figures import drawing, svg
+from pipeline.reporting.shown import show_digits
 from pipeline.reporting.work_precision import COLOURS, MARKERS
 
 MEANING = (
@@ -29,7 +29,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     """Tabulate what is answered and what is told, by distance; and how far fields are from adding."""
     rows = [_row(numbers["same_place"], numbers), *(_row(one, numbers) for one in numbers["by_separation"])]
     false_alarm = {"distance of the two, mm": "single contacts"} | {
-        f"detected by {name}, %": _show(one["realised"], 1) for name, one in numbers["false_alarm_pct"].items()
+        f"detected by {name}, %": show_digits(one["realised"], 1) for name, one in numbers["false_alarm_pct"].items()
     }
     table = pd.DataFrame([*rows, false_alarm]).fillna("–").assign(source=source)
     asked = next(iter(numbers["false_alarm_pct"].values()))["asked"]
@@ -42,10 +42,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
     """Draw where answers fall between two contacts, and how often two are told from one."""
-    from matplotlib.figure import Figure
-
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(7.8, 4.4), layout="constrained")
+    with drawing(7.8, 4.4) as figure:
         left, right = figure.subplots(1, 2)
         _draw_places(left, drawn["along"])
         _draw_detection(right, numbers)
@@ -88,16 +85,18 @@ def _draw_detection(axes: Any, numbers: Mapping[str, Any]) -> None:
 def _row(one: Mapping[str, Any], numbers: Mapping[str, Any]) -> dict[str, str]:
     row = {
         "distance of the two, mm": f"{one['separation_mm']:g}",
-        "answer within 1 mm of either, %": _show(one["near_either_pct"], 1),
-        "distance to the nearer, mm": _show(one["nearest_mm"], 2),
+        "answer within 1 mm of either, %": show_digits(one["near_either_pct"], 1),
+        "distance to the nearer, mm": show_digits(one["nearest_mm"], 2),
     }
     optional = {
         "along": "along the line (0 weaker, 1 stronger)",
         "force_over_sum": "force / sum of both",
         "force_over_larger": "force / larger of both",
     }
-    row |= {words: _show(one[name], 2) for name, words in optional.items() if name in one}
-    return row | {f"detected by {name}, %": _show(one["detected_pct"][name], 1) for name in numbers["false_alarm_pct"]}
+    row |= {words: show_digits(one[name], 2) for name, words in optional.items() if name in one}
+    return row | {
+        f"detected by {name}, %": show_digits(one["detected_pct"][name], 1) for name in numbers["false_alarm_pct"]
+    }
 
 
 def _superposition(rows: Sequence[Mapping[str, Any]], source: str) -> pd.DataFrame:
@@ -118,10 +117,3 @@ def _superposition(rows: Sequence[Mapping[str, Any]], source: str) -> pd.DataFra
         "left out."
     )
     return table
-
-
-def _show(stat: Mapping[str, Any], digits: int) -> str:
-    if "ci95" not in stat:
-        return f"{stat['mean']:.{digits}f}"
-    low, high = stat["ci95"]
-    return f"{stat['mean']:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"

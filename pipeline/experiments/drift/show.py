@@ -6,11 +6,10 @@ Same numbers, same bytes. Refuses to know networks and paths.
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import matplotlib as mpl
 import pandas as pd
 
 from pipeline.evaluation.scores import VERDICTS
-from pipeline.reporting.figures import STYLE, svg
+from pipeline.reporting.figures import drawing, svg
 from pipeline.reporting.paper import FIGURE_5
 from pipeline.reporting.shown import COLUMNS, show, tabulate
 from pipeline.reporting.work_precision import COLOURS, MARKERS
@@ -72,10 +71,7 @@ def say_pace(numbers: Mapping[str, Any], source: str) -> str:
 
 
 def _scores(numbers: Mapping[str, Any], source: str) -> str:
-    from matplotlib.figure import Figure
-
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(7.6, 4.0), layout="constrained")
+    with drawing(7.6, 4.0) as figure:
         error = _error(numbers)
         for axes, metric in zip(figure.subplots(1, 2), ("accuracy_pct", error), strict=True):
             for policy, (words, rows) in _policies(numbers).items():
@@ -97,10 +93,7 @@ def _scores(numbers: Mapping[str, Any], source: str) -> str:
 
 
 def _forces(late: Mapping[str, Any], points: Mapping[str, Sequence[float]], source: str) -> str:
-    from matplotlib.figure import Figure
-
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(5.2, 5.0), layout="constrained")
+    with drawing(5.2, 5.0) as figure:
         axes = figure.subplots()
         ends = min(0.0, *points["true_N"], *points["predicted_N"]), max(*points["true_N"], *points["predicted_N"])
         room = MARGIN * (ends[1] - ends[0])

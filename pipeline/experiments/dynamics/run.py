@@ -1,16 +1,138 @@
-"""Stage dynamics: presses that never rest -> errors of single readings and of the last five's mean (section 7)."""
+"""Stage dynamics: presses that never rest, read one by one or five at once -> errors by duration (section 7).
 
+The last five readings are what the paper averages at rest; in a press they are of five different depths.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
+from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
 
 from pipeline.core.stage import run, say
 from pipeline.dataset.baseline import subtract
 from pipeline.dataset.rows import TARGETS
-from pipeline.experiments.answer import read_folder, read_losses, write_answer
-from pipeline.experiments.dynamics.presses import compare, presses_of
-from pipeline.experiments.only import only
+from pipeline.evaluation.metrics import score
+from pipeline.evaluation.scores import paired, statistic, summarise
+from pipeline.experiments.answer import only, read_folder, read_losses, write_answer
 from pipeline.trials.networks import networks_without
+
+WINDOW_N = 5  # readings that the paper takes at rest (section 3)
+FORCE_MIN_N = 0.2  # assumed: below it there is little contact to place, and a press's first and last readings lie there
+BINS_N = 5
+LAGS_MS = np.arange(-5.0, 20.05, 0.1)  # that are tried
+WAYS = ("one", "mean5", "mean5_of_middle")
+
+Answers = Callable[[Float32[np.ndarray, "f ch"]], Float32[np.ndarray, "f 3"]]
+
+
+@dataclass(frozen=True)
+class Presses:
+    """Readings of presses in order of time; `press_i` counts from 0, `duration_s` is that of the row's press."""
+
+    db_uT: Float32[np.ndarray, "f ch"]
+    true: Float64[np.ndarray, "f 3"]  # x_mm, y_mm, F_N
+    t_s: Float64[np.ndarray, " f"]
+    press_i: Int64[np.ndarray, " f"]
+    duration_s: Float64[np.ndarray, " f"]
+    scored: Bool[np.ndarray, " f"]  # enough force, and four readings of the press before it
+
+    def __len__(self) -> int:
+        return len(self.t_s)
+
+
+def presses_of(
+    db_uT: Float32[np.ndarray, "f ch"],
+    true: Float[np.ndarray, "f 3"],
+    t_s: Float64[np.ndarray, " f"],
+    indentation: Int32[np.ndarray, " f"],
+) -> Presses:
+    """Tell the presses apart; each lasts from half a frame before its first reading to half one after its last."""
+    _, first_i, press_i, frames_n = np.unique(indentation, return_index=True, return_inverse=True, return_counts=True)
+    duration_s = (t_s[first_i + frames_n - 1] - t_s[first_i]) + 1 / rate_of(t_s, press_i)
+    place = np.arange(len(t_s)) - first_i[press_i]
+    scored = (true[:, 2] >= FORCE_MIN_N) & (place >= WINDOW_N - 1)
+    return Presses(db_uT, true.astype(np.float64), t_s, press_i, duration_s[press_i], scored)
+
+
+def rate_of(t_s: Float64[np.ndarray, " f"], press_i: Int64[np.ndarray, " f"]) -> float:
+    """Measure the rate in Hz at which readings of a press follow each other."""
+    return float(1 / np.median(np.diff(t_s)[np.diff(press_i) == 0]))
+
+
+def running_mean(values: Float[np.ndarray, "f c"]) -> Float64[np.ndarray, "f c"]:
+    """Average each row with the four before it; the first four with as many as there are."""
+    total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0, dtype=np.float64)])
+    end = np.arange(1, len(values) + 1)
+    start = np.maximum(end - WINDOW_N, 0)
+    return (total[end] - total[start]) / (end - start)[:, None]
+
+
+def compare(of: Presses, networks: Sequence[Answers], *, board: str) -> dict[str, Any]:
+    """Score each reading alone, the mean of the last five, and that mean against the middle one's truth.
+
+    All presses are on one skin of this `board`: `paired` compares both ways that answer at once, and has no interval.
+    """
+    mean_uT = running_mean(of.db_uT).astype(np.float32)
+    alone, meant = ([network(one) for network in networks] for one in (of.db_uT, mean_uT))
+    answers = {"one": alone, "mean5": meant, "mean5_of_middle": meant}
+    edges_s = np.geomspace(of.duration_s.min(), of.duration_s.max() * (1 + 1e-9), BINS_N + 1)
+    by_duration = []
+    for low_s, high_s in pairwise(edges_s):
+        own = of.scored & (of.duration_s >= low_s) & (of.duration_s < high_s)
+        if own.any():
+            presses_n = len(np.unique(of.press_i[own]))
+            words = {"duration_s": float(np.sqrt(low_s * high_s)), "n": int(own.sum()), "presses_n": presses_n}
+            by_duration.append(words | _scores(of, answers, own, board))
+    return {
+        "readings_n": int(of.scored.sum()),
+        "presses_n": len(np.unique(of.press_i[of.scored])),
+        "rate_hz": rate_of(of.t_s, of.press_i),
+        "window_n": WINDOW_N,
+        "force_min_N": FORCE_MIN_N,
+        "by_duration": by_duration,
+        "all": _scores(of, answers, of.scored, board),
+        "lag_ms": {way: lags(of, [one[:, 2] for one in answers[way]]) for way in ("one", "mean5")},
+    }
+
+
+def lags(of: Presses, force_N: Sequence[Float[np.ndarray, " f"]]) -> dict[str, float]:
+    """Find by how many ms the answered forces lag behind the true ones, over presses and networks."""
+    found_ms = [
+        lag_ms(of.t_s[rows], answer_N[rows], of.t_s[own], of.true[own, 2])
+        for own in (of.press_i == press_i for press_i in np.unique(of.press_i[of.scored]))
+        for rows in [own & of.scored]
+        if rows.sum() > WINDOW_N
+        for answer_N in force_N
+    ]
+    return statistic(found_ms) if found_ms else {"n": 0}
+
+
+def lag_ms(
+    t_s: Float64[np.ndarray, " f"],
+    answer_N: Float[np.ndarray, " f"],
+    true_t_s: Float64[np.ndarray, " g"],
+    true_N: Float64[np.ndarray, " g"],
+) -> float:
+    """Give the delay of the true force, times whatever factor, that lies nearest to the answers (least squares)."""
+    delayed_N = np.interp(t_s[None] - LAGS_MS[:, None] / 1e3, true_t_s, true_N)
+    explained = (delayed_N @ answer_N) ** 2 / (delayed_N**2).sum(axis=1)
+    return float(LAGS_MS[int(np.argmax(explained))])
+
+
+def _scores(
+    of: Presses, answers: Mapping[str, Sequence[Any]], rows: Bool[np.ndarray, " f"], board: str
+) -> dict[str, Any]:
+    # The middle of the last five readings is two before the last, and in the same press where a row is scored.
+    middle = np.flatnonzero(rows) - WINDOW_N // 2
+    true = {"one": of.true[rows], "mean5": of.true[rows], "mean5_of_middle": of.true[middle]}
+    scores = {way: pd.DataFrame([score(true[way], one[rows]) for one in answers[way]]) for way in WAYS}
+    sides = (scores[way].assign(board=board, skin="") for way in ("mean5", "one"))
+    return {way: summarise(own) for way, own in scores.items()} | {"paired": {"mean5_minus_one": paired(*sides)}}
 
 
 def dynamics(scene: str, indentations: Path, models: Path, answer: Path) -> None:

@@ -3,12 +3,11 @@
 from collections.abc import Mapping
 from typing import Any
 
-import matplotlib as mpl
 import pandas as pd
 
 from pipeline.evaluation.scores import VERDICTS, negated, verdict
 from pipeline.reporting import paper
-from pipeline.reporting.figures import STYLE, svg
+from pipeline.reporting.figures import drawing, svg
 from pipeline.reporting.shown import show_difference
 from pipeline.reporting.work_precision import COLOURS, MARKERS
 
@@ -20,18 +19,10 @@ MEANING = (
     "Presses of one duration differ from those of another in depth and place too: compare the ways, at each duration. "
     f"± is the sd over networks; all presses are on one board. {VERDICTS}"
 )
-WAYS = {
-    "one": "each reading alone",
-    "mean5": "mean of the last five",
-    "mean5_of_middle": "the same, two frames late",
-}
+WAYS = {"one": "each reading alone", "mean5": "mean of the last five", "mean5_of_middle": "the same, two frames late"}
 LESS = "less force error than each reading alone, N²"  # column
 TICKS_S = (0.05, 0.1, 0.2, 0.5, 1.0)
-METRICS = {
-    "accuracy_pct": "accuracy / %",
-    "mse_xy_mm2": "MSE_xy / mm²",
-    "mse_f_N2": "MSE_F / N²",
-}
+METRICS = {"accuracy_pct": "accuracy / %", "mse_xy_mm2": "MSE_xy / mm²", "mse_f_N2": "MSE_F / N²"}
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
@@ -59,10 +50,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
     """Draw errors of force and place against the press's duration."""
-    from matplotlib.figure import Figure
-
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(7.6, 3.8), layout="constrained")
+    with drawing(7.6, 3.8) as figure:
         panels = figure.subplots(1, 2)
         # A press stays where it is: against the middle's place the mean is as good as against the last one's.
         for axes, name, ways_n in zip(panels, ("mse_f_N2", "mse_xy_mm2"), (3, 2), strict=True):

@@ -1,11 +1,12 @@
-"""Stage flexible: networks of rigid boards on flexible ones, before and after they are adapted (paper section 5)."""
+"""Stage flexible: networks of rigid boards on flexible ones, before and after they are adapted (section 5)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from pipeline.core.config import Files, parse_parts, read_settings
 from pipeline.core.schema import Readings
@@ -13,13 +14,72 @@ from pipeline.core.seeds import rng_for
 from pipeline.core.stage import run
 from pipeline.dataset.rows import Selection, gather, stack
 from pipeline.dataset.splits import Split, hold_out_skins
+from pipeline.evaluation.scores import statistic
 from pipeline.experiments.answer import read_folder, read_losses, write_answer
-from pipeline.experiments.flexible.boards import answer_flexible, by_depth, forces_drawn, gap_less_pct, strength_ratio
 from pipeline.learning.recipe import HEADLINE
 from pipeline.learning.recipe import adaptations as adaptations_of
 from pipeline.trials.adapting import adaptations, read_starts
-from pipeline.trials.arms import AFTER, CONTROL, answers_after, answers_before
+from pipeline.trials.arms import (
+    AFTER,
+    BEFORE,
+    CONTROL,
+    FORCE,
+    Answered,
+    answers_after,
+    answers_before,
+    biases,
+    compare_arms,
+    summarise_arms,
+)  # fmt: skip
 from pipeline.trials.data import SceneData, read_data
+
+DEPTH_DECIMALS = 2  # of a commanded depth in mm: nearer ones are one
+DRAWN_N = 400  # more points than these are not told apart in a panel
+FORCE_DECIMALS = 3  # in newtons: more than are seen
+
+ByDepth = Mapping[float, Float[np.ndarray, " d"]]  # |dB| in uT by commanded depth in mm
+
+
+def by_depth(depth_mm: Float[np.ndarray, " f"], db_uT: Float[np.ndarray, "f ch"]) -> dict[float, np.ndarray]:
+    """Sort the lengths of changes of field by commanded depth."""
+    length_uT, depth_mm = np.linalg.norm(db_uT, axis=1), np.round(depth_mm.astype(float), DEPTH_DECIMALS)
+    return {float(depth): length_uT[depth_mm == depth] for depth in np.unique(depth_mm)}
+
+
+def strength_ratio(flexible: Sequence[ByDepth], rigid: Sequence[ByDepth]) -> dict[str, float]:
+    """Median |dB| of flexible boards' captures over that of rigid ones, at each depth that both have, over depths."""
+    both = set().union(*flexible) & set().union(*rigid)
+    return statistic([_median_uT(flexible, depth) / _median_uT(rigid, depth) for depth in sorted(both)])
+
+
+def gap_less_pct(gap_mm: Mapping[str, float]) -> float:
+    """By how much nearer chips of flexible boards are to their skins than those of rigid ones, in % of the latter."""
+    return 100 * (1 - gap_mm["flexible"] / gap_mm["rigid"])
+
+
+def answer_flexible(answers: Sequence[Answered]) -> dict[str, Any]:
+    """Summarise over boards, by arm; the force bias and the gain by adaptation apart."""
+    differences = {f"{AFTER}_minus_{BEFORE}": compare_arms(answers, AFTER, BEFORE)}
+    return summarise_arms(answers) | biases(answers) | {"paired": differences}
+
+
+def forces_drawn(answers: Sequence[Answered], rng: np.random.Generator) -> dict[str, dict[str, list[float]]]:
+    """Choose equal readings of both arms' first networks at random: true and predicted force, in newtons."""
+    arms = {arm: [one for one in answers if one.arm == arm and one.seed_i == 0] for arm in (BEFORE, AFTER)}
+    shown = rng.permutation(sum(len(one.true) for one in arms[BEFORE]))[:DRAWN_N]
+    return {
+        arm: {
+            f"{side}_N": np.round(np.concatenate([getattr(one, side)[:, FORCE] for one in own])[shown], FORCE_DECIMALS)
+            .astype(float).round(FORCE_DECIMALS).tolist()
+            for side in ("true", "predicted")
+        }
+        for arm, own in arms.items()
+    }  # fmt: skip
+
+
+def _median_uT(captures: Sequence[ByDepth], depth_mm: float) -> float:
+    return float(np.median(np.concatenate([one[depth_mm] for one in captures if depth_mm in one])))
+
 
 SHAPE = "shape"  # the recipe on directions, if the scene has one: it ought to care less about the gap
 
@@ -30,31 +90,33 @@ def flexible(
     """Adapt the networks of the first fold of lobo to every flexible skin, and test on its later passes."""
     data = read_data(read_settings("flexible", scene, files), main, folds)
     starts, captures = read_starts(started), read_folder(indentations)
-    asked, first, trained_n = adaptations_of(data.settings), data.folds_of("lobo")[0], len(data.rows)
+    adapting, first, trained_n = adaptations_of(data.settings), data.folds_of("lobo")[0], len(data.rows)
     poked = gather(captures, data.settings.section(Selection, "selection"))
     data = replace(data, rows=stack(data.rows, poked))
     sides = (first.train, np.arange(trained_n, len(data.rows)))
     fold = hold_out_skins(
         data.rows, "flexible", first.name, sides, parse_parts(Split, data.settings.words("split"), "split")
     )
-    arms = {name: arm for name, arm in ((HEADLINE, AFTER), (CONTROL, CONTROL), (SHAPE, SHAPE)) if name in asked.recipes}
+    arms = {
+        name: arm for name, arm in ((HEADLINE, AFTER), (CONTROL, CONTROL), (SHAPE, SHAPE)) if name in adapting.recipes
+    }
     trials = [
         (arm, trial)
         for name, arm in arms.items()
         for trial in adaptations(
-            data, fold, (name, asked.recipes[name]), starts, question="flexible", pokes_n=asked.pokes_n
+            data, fold, (name, adapting.recipes[name]), starts, question="flexible", pokes_n=adapting.pokes_n
         )
     ]
     skins = [str(skin) for skin in np.unique(data.rows.skin[fold.test])]
     before = {
-        name: [one for skin in skins for one in answers_before(data, fold, asked.recipes[name], starts, skin)]
+        name: [one for skin in skins for one in answers_before(data, fold, adapting.recipes[name], starts, skin)]
         for name in arms if name != CONTROL
     }  # fmt: skip
     after, trainings = answers_after(data, trials, "flexible")
     own = before[HEADLINE] + [one for one in after if one.arm != SHAPE]
     numbers: dict[str, Any] = {
         "skins_n": len(skins), "boards_n": len(np.unique(data.rows.board[fold.test])),
-        "seeds_n": len({one.seed_i for one in own}), "pokes_n": asked.pokes_n, "fold": first.name,
+        "seeds_n": len({one.seed_i for one in own}), "pokes_n": adapting.pokes_n, "fold": first.name,
         "trained_on_skins_n": len(np.unique(data.rows.skin[fold.train])),
         "strength_ratio": strength_ratio(_by_depth(captures), _by_depth(read_folder(main))),
     } | _gaps(data) | answer_flexible(own)  # fmt: skip

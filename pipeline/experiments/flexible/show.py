@@ -6,10 +6,9 @@ Refuses to know how networks were adapted, and paths.
 from collections.abc import Mapping
 from typing import Any
 
-import matplotlib as mpl
 import pandas as pd
 
-from pipeline.reporting.figures import STYLE, svg
+from pipeline.reporting.figures import drawing, svg
 from pipeline.reporting.paper import FLEXIBLE, FLEXIBLE_BIAS, FLEXIBLE_GAP_LESS_PCT
 from pipeline.reporting.shown import COLUMNS, show, show_difference, tabulate
 from pipeline.reporting.work_precision import COLOURS
@@ -32,12 +31,9 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
     """Draw predicted against true force before and after adaptation, with the diagonal and the bias."""
-    from matplotlib.figure import Figure
-
     every_N = [value for arm in drawn.values() for side in arm.values() for value in side]
     ends_N = [min(every_N), max(every_N)]
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(6.4, 3.7), layout="constrained")
+    with drawing(6.4, 3.7) as figure:
         panels = figure.subplots(1, len(drawn), sharex=True, sharey=True)
         for axes, (arm, forces), colour in zip(panels, drawn.items(), COLOURS[1:], strict=False):
             axes.plot(ends_N, ends_N, color=COLOURS[0], linewidth=0.8)

@@ -3,12 +3,11 @@
 from collections.abc import Mapping
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 import pandas as pd
 
 from pipeline.reporting import paper
-from pipeline.reporting.figures import STYLE, svg
+from pipeline.reporting.figures import drawing, svg
 from pipeline.reporting.work_precision import COLOURS
 
 MEANING = (  # {rate_hz} comes from the numbers
@@ -82,11 +81,8 @@ def _turning(numbers: Mapping[str, Any], source: str) -> pd.DataFrame:
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
     """Draw force, x and y over time, in contact only."""
-    from matplotlib.figure import Figure
-
     t_s = np.array(drawn["t_s"])
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(7.0, 5.0), layout="constrained")
+    with drawing(7.0, 5.0) as figure:
         panels = figure.subplots(3, 1, sharex=True, height_ratios=(2, 1, 1))
         for axes, name, label in zip(panels, ("F_N", "x_mm", "y_mm"), ("F / N", "x / mm", "y / mm"), strict=True):
             for which, colour, width in (("estimated", COLOURS[1], 1.8), ("true", COLOURS[2], 0.9)):

@@ -3,13 +3,12 @@
 from collections.abc import Mapping
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 import pandas as pd
 
 from pipeline.evaluation.scores import INCONCLUSIVE, ONE_BOARD
 from pipeline.reporting import paper
-from pipeline.reporting.figures import STYLE, svg
+from pipeline.reporting.figures import drawing, svg
 from pipeline.reporting.work_precision import COLOURS
 
 MEANING = (  # {told_pct} comes from the numbers
@@ -33,11 +32,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
                 _show(numbers["smallest_step_N"], name, numbers),
                 f"< {paper.SENSITIVITY_N:g}",
             ),
-            (
-                f"smallest step told apart, {words}, mL of water",
-                _show_mL(name, numbers),
-                f"< {paper.SENSITIVITY_ML:g}",
-            ),
+            (f"smallest step told apart, {words}, mL of water", _show_mL(name, numbers), f"< {paper.SENSITIVITY_ML:g}"),
             (f"the same by |dB| alone, {words}, N", _show(numbers["by_length_N"], name, numbers), "–"),
         ]
     rise = numbers["monotonic"]
@@ -56,10 +51,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
     """Draw the response against weight, and how sure a difference is told."""
-    from matplotlib.figure import Figure
-
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(7.6, 3.6), layout="constrained")
+    with drawing(7.6, 3.6) as figure:
         left, right = figure.subplots(1, 2)
         weight_N, response_uT, sd_uT = (np.array(drawn[name]) for name in ("weight_N", "response_uT", "sd_uT"))
         left.fill_between(weight_N, response_uT - sd_uT, response_uT + sd_uT, color=COLOURS[6], linewidth=0)

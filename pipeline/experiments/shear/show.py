@@ -6,10 +6,9 @@ Refuses to know how networks were trained, and paths.
 from collections.abc import Mapping
 from typing import Any
 
-import matplotlib as mpl
 import pandas as pd
 
-from pipeline.reporting.figures import STYLE, svg
+from pipeline.reporting.figures import drawing, svg
 from pipeline.reporting.paper import SHEAR
 from pipeline.reporting.shown import show, tabulate
 from pipeline.reporting.work_precision import COLOURS
@@ -47,10 +46,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
     """Draw predicted against true force of lines that were held out whole, a panel a direction."""
-    from matplotlib.figure import Figure
-
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(7.6, 3.1), layout="constrained")
+    with drawing(7.6, 3.1) as figure:
         panels = figure.subplots(1, len(FORCES))
         for axes, name, true_N, predicted_N in zip(panels, FORCES, drawn["true"], drawn["predicted"], strict=True):
             low, high = min(*true_N, *predicted_N), max(*true_N, *predicted_N)

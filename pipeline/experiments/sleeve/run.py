@@ -1,25 +1,161 @@
-"""Stage sleeve: places on one large skin over many boards, the last pokes held out (paper section 6, arm sleeve)."""
+"""Stage sleeve: places on one large skin over many boards, the last pokes held out (section 6, arm sleeve)."""
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
+from jaxtyping import Bool, Float, Int, Int64, Shaped
+from pydantic import Field
 
-from pipeline.core.config import Files, Settings, read_settings
+from pipeline.core.config import Files, Settings, Strict, read_settings
+from pipeline.core.errors import ParamsError
 from pipeline.core.executors import make_executor
+from pipeline.core.schema import Readings
 from pipeline.core.stage import run, say
-from pipeline.dataset.rows import Selection, gather
+from pipeline.dataset.rows import Rows, Selection, gather
+from pipeline.evaluation.metrics import score
 from pipeline.evaluation.scores import tally
 from pipeline.experiments.answer import read_folder, read_losses, write_answer
-from pipeline.experiments.sleeve import areas as evaluation
-from pipeline.experiments.sleeve.settings import Sleeve
 from pipeline.learning.baselines import Task, run_tasks
 from pipeline.learning.card import collapse_record
 from pipeline.learning.classical import Neighbours
-from pipeline.learning.recipe import HEADLINE, with_training
+from pipeline.learning.recipe import HEADLINE, Training, with_training
 from pipeline.learning.trial import Measured, Trial
 from pipeline.synthesis.settings import synthesis_of
 from pipeline.trials.data import SceneData, train_all
 from pipeline.trials.models import note_seconds
+
+Count = Annotated[int, Field(ge=1)]
+Fraction = Annotated[float, Field(gt=0, lt=1)]
+
+
+class Sleeve(Strict):
+    """Many boards under one skin (paper section 6); the last part of the pokes is held out."""
+
+    test_fraction: Fraction
+    neighbours_n: Count  # of the k nearest neighbours that stand beside the networks
+    training: Training
+
+
+NEAR_MM = 4.0  # what counts as near a border between two boards: about twice the skin's thickness, assumed
+Stats = dict[str, dict[str, float]]
+
+
+@dataclass(frozen=True)
+class Area:
+    """A skin and what lies under it, in labels: mm from the skin's corner."""
+
+    sides_mm: tuple[float, float]
+    chips_mm: Float[np.ndarray, "k 2"]
+    borders_mm: tuple[tuple[float, ...], tuple[float, ...]]  # between boards: x of upright ones, y of level ones
+
+    def near_border(self, place_mm: Float[np.ndarray, "f 2"]) -> Bool[np.ndarray, " f"]:
+        """Mark places nearer than `NEAR_MM` to a border between two boards."""
+        near = np.zeros(len(place_mm), bool)
+        for along_mm, borders_mm in zip(place_mm.T, self.borders_mm, strict=True):
+            for border_mm in borders_mm:
+                near |= np.abs(along_mm - border_mm) < NEAR_MM
+        return near
+
+
+def lay_out(
+    sides_mm: tuple[float, float],
+    chips_mm: Sequence[tuple[float, float]],
+    *,
+    boards_n: tuple[int, int],
+    pitch_mm: float,
+) -> Area:
+    """Move chips from the frame of the skin's middle to labels, and draw the borders between boards on a lattice."""
+    middle_mm = np.array(sides_mm) / 2
+    x_mm, y_mm = (
+        tuple(float(m + pitch_mm * (i - n / 2)) for i in range(1, n)) for m, n in zip(middle_mm, boards_n, strict=True)
+    )
+    return Area(sides_mm, np.array(chips_mm) + middle_mm, (x_mm, y_mm))
+
+
+def hold_out_last(rows: Rows, test_fraction: float) -> tuple[Int64[np.ndarray, " a"], Int64[np.ndarray, " b"]]:
+    """Give the rows of the first indentations of each capture, and of its last ones, which no training sees."""
+    held = np.zeros(len(rows), bool)
+    for capture in np.unique(rows.capture):
+        own = rows.capture == capture
+        indentations = np.unique(rows.indentation[own])  # in order of time
+        test_n = round(test_fraction * len(indentations))
+        if not 0 < test_n < len(indentations):
+            got = f"{test_n} of the {len(indentations)} of {capture}"
+            rule = "one or more, and not all"
+            raise ParamsError("question sleeve", "indentations held out", rule, got, "Poke more often.")
+        held |= own & (rows.indentation >= indentations[-test_n])
+    return np.flatnonzero(~held), np.flatnonzero(held)
+
+
+def rate_hz(captures: Sequence[Readings]) -> float:
+    """Measure how often frames came, from the times of readings that follow each other in one indentation."""
+    steps_n, steps_s = 0, 0.0
+    for one in captures:
+        same = (np.diff(one.indentation) == 0) & (np.diff(one.reading_i) == 1)
+        steps_n += int(same.sum())
+        steps_s += float(np.diff(one.t_s)[same].sum())
+    if not steps_s > 0:
+        rule, remedy = "two or more an indentation, at known times", "Record more than one reading."
+        raise ParamsError("question sleeve", "readings", rule, f"{steps_n} steps of time", remedy)
+    return steps_n / steps_s
+
+
+def errors_mm(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -> Float[np.ndarray, " f"]:
+    """Give the distance between true and predicted place of each reading."""
+    return np.linalg.norm(predicted[:, :2].astype(float) - true[:, :2], axis=1)
+
+
+def score_places(
+    true: Float[np.ndarray, "f 3"],
+    answers: Sequence[Float[np.ndarray, "f 3"]],
+    indentation: Int[np.ndarray, " f"],
+    area: Area,
+) -> dict[str, Any]:
+    """Score one method's answers, one a seed, on the same readings: overall, near borders between boards, elsewhere."""
+    near = area.near_border(true[:, :2])
+    each_mm = [errors_mm(true, predicted) for predicted in answers]
+    words: dict[str, Any] = over_seeds(
+        [
+            {
+                **score(true, predicted),
+                "median_error_mm": float(np.median(error_mm)),
+                "p95_error_mm": float(np.percentile(error_mm, 95)),
+            }
+            for predicted, error_mm in zip(answers, each_mm, strict=True)
+        ]
+    )
+    for name, part in (("near_seam", near), ("inside", ~near)):
+        if part.any():
+            medians = [{"median_error_mm": float(np.median(error_mm[part]))} for error_mm in each_mm]
+            words[name] = {**over_seeds(medians), "pokes_n": len(np.unique(indentation[part]))}
+    return words
+
+
+def over_seeds(scores: Sequence[Mapping[str, float]]) -> Stats:
+    """Mean, standard deviation (n - 1; absent for one) and number of each metric over trainings."""
+    stats: Stats = {}
+    for name in scores[0]:
+        values = np.array([one[name] for one in scores])
+        stats[name] = {"mean": float(values.mean()), "n": len(values)}
+        if len(values) > 1:
+            stats[name]["sd"] = float(values.std(ddof=1))
+    return stats
+
+
+def to_draw(
+    area: Area, true: Float[np.ndarray, "f 3"], error_mm: Shaped[np.ndarray, " f"], indentation: Int[np.ndarray, " f"]
+) -> dict[str, Any]:
+    """List every tested indentation with the mean error of its readings, and what lies under the skin."""
+    _, first, which = np.unique(indentation, return_index=True, return_inverse=True)
+    mean_mm = np.bincount(which, error_mm) / np.bincount(which)
+    (x_mm, y_mm), (chips_x_mm, chips_y_mm) = true[first, :2].T, area.chips_mm.T
+    columns = {"x_mm": x_mm, "y_mm": y_mm, "error_mm": mean_mm, "chips_x_mm": chips_x_mm, "chips_y_mm": chips_y_mm}
+    rounded: dict[str, Any] = {name: np.round(values.astype(float), 2).tolist() for name, values in columns.items()}
+    borders = dict(zip(("borders_x_mm", "borders_y_mm"), map(list, area.borders_mm), strict=True))
+    return rounded | borders | {"area_mm": list(area.sides_mm)}
 
 
 def read(settings: Settings) -> Sleeve:
@@ -32,7 +168,7 @@ def sleeve(scene: str, files: Files, indentations: Path, answer: Path) -> None:
     settings = read_settings("sleeve", scene, files)
     section, captures, area = read(settings), read_folder(indentations), _area(settings)
     data = SceneData(scene, settings, gather(captures, settings.section(Selection, "selection")), [])
-    train, test = evaluation.hold_out_last(data.rows, section.test_fraction)
+    train, test = hold_out_last(data.rows, section.test_fraction)
     trials = [
         Trial("sleeve", name, recipe, "last", data.settings.seed, seed_i, train, test)
         for name, recipe in section.training.recipes.items()
@@ -44,24 +180,24 @@ def sleeve(scene: str, files: Files, indentations: Path, answer: Path) -> None:
                for name in section.training.recipes}  # fmt: skip
     answers |= _neighbours(data, section, train, test)
     true, indentation = data.rows.target[test], data.rows.indentation[test]
-    scored = {name: evaluation.score_places(true, own, indentation, area) for name, own in answers.items()}
+    scored = {name: score_places(true, own, indentation, area) for name, own in answers.items()}
     trained_n, tested_n = (len(np.unique(data.rows.indentation[part])) for part in (train, test))
     numbers = {
-        "chips_n": captures[0].chips_n, "rate_hz": evaluation.rate_hz(captures), "area_mm": list(area.sides_mm),
-        "pokes_n": trained_n + tested_n, "trained_n": trained_n, "tested_n": tested_n, "near_mm": evaluation.NEAR_MM,
+        "chips_n": captures[0].chips_n, "rate_hz": rate_hz(captures), "area_mm": list(area.sides_mm),
+        "pokes_n": trained_n + tested_n, "trained_n": trained_n, "tested_n": tested_n, "near_mm": NEAR_MM,
         **scored.pop(HEADLINE), "variants": scored,
     }  # fmt: skip
-    error_mm = evaluation.errors_mm(true, answers[HEADLINE][0])
-    drawn = evaluation.to_draw(area, true, error_mm, indentation)
+    error_mm = errors_mm(true, answers[HEADLINE][0])
+    drawn = to_draw(area, true, error_mm, indentation)
     losses = read_losses(indentations, data.rows.dropped)
     write_answer(answer, numbers, drawn, losses, tally(map(collapse_record, trained)))
 
 
-def _area(settings: Settings) -> evaluation.Area:
+def _area(settings: Settings) -> Area:
     kind = synthesis_of(settings).boards[settings.words("simulate.protocols.sleeve.boards")]
     tiles = kind.design.tiles
     boards_n, pitch_mm = ((1, 1), 0.0) if tiles is None else ((tiles.columns_n, tiles.rows_n), tiles.pitch_mm)
-    return evaluation.lay_out(kind.skin_mm, kind.design.places_mm, boards_n=boards_n, pitch_mm=pitch_mm)
+    return lay_out(kind.skin_mm, kind.design.places_mm, boards_n=boards_n, pitch_mm=pitch_mm)
 
 
 def _neighbours(data: SceneData, section: Sleeve, train: np.ndarray, test: np.ndarray) -> dict[str, list[np.ndarray]]:

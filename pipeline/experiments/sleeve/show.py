@@ -6,11 +6,10 @@ Out: a table, SVG text. Refuses to know how places were learned.
 from collections.abc import Mapping
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 import pandas as pd
 
-from pipeline.reporting.figures import STYLE, svg
+from pipeline.reporting.figures import drawing, svg
 from pipeline.reporting.paper import SLEEVE, SLEEVE_SKIN, SLEEVE_WORDS
 from pipeline.reporting.shown import COLUMNS, scores, show, tabulate
 from pipeline.reporting.work_precision import COLOURS
@@ -40,10 +39,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
     """Map the whole skin: every tested poke, coloured by its error, over chips and borders of boards."""
-    from matplotlib.figure import Figure
-
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(6.2, 3.5), layout="constrained")
+    with drawing(6.2, 3.5) as figure:
         axes = figure.subplots()
         _under_the_skin(axes, drawn)
         most_mm = numbers["p95_error_mm"]["mean"]

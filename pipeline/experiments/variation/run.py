@@ -1,22 +1,144 @@
-"""Stage variation: how the field of equal pokes differs over time and from skin to skin (paper figure 4)."""
+"""Stage variation: how the field of equal pokes differs over time and from skin to skin (figure 4)."""
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from pydantic import Field
 
 from pipeline.core import io
-from pipeline.core.config import Files, Settings, read_settings
+from pipeline.core.config import Files, Settings, Strict, read_settings
+from pipeline.core.errors import ParamsError
+from pipeline.core.schema import Readings
 from pipeline.core.stage import run
+from pipeline.dataset.baseline import rank, subtract
 from pipeline.experiments.answer import read_folder, read_losses, write_answer
-from pipeline.experiments.drift.windows import pace
-from pipeline.experiments.variation.settings import Variation
-from pipeline.experiments.variation.visits import (
-    Visits,
-    find_visits,
-    first_of_each_board,
-    meanwhile,
-    over_skins,
-    over_time,
-)
+from pipeline.experiments.drift.windows import pace, rms
+
+Count = Annotated[int, Field(ge=1)]
+Place_mm = tuple[float, float]
+
+
+class Variation(Strict):
+    """How the field of equal pokes differs over time and from skin to skin (paper figure 4)."""
+
+    places_mm: Annotated[tuple[Place_mm, ...], Field(min_length=1, max_length=4)]
+    depth_mm: Annotated[float, Field(gt=0)]
+    skins_n: Count
+    contacts_n: Count  # over so many contacts of one skin
+
+
+SAME_MM = 1e-3  # labels are commanded values in float32
+LISTED_N = 8
+LINES_MAX_N = 40
+DECIMALS = 1  # of a microtesla that is drawn
+
+
+@dataclass(frozen=True)
+class Visits:
+    """The visits of one place at one depth in order of time, each the mean of its readings, in uT."""
+
+    contacts_n: Int[np.ndarray, " n"]  # felt before
+    b_uT: Float[np.ndarray, "n ch"]
+    db_uT: Float[np.ndarray, "n ch"]
+
+
+def find_visits(readings: Readings, place_mm: tuple[float, float], depth_mm: float) -> Visits:
+    """Take the indentations of a capture at one place and depth; raise if there are none."""
+    at = _at(readings, place_mm, depth_mm)
+    if not at.any():
+        raise ParamsError(
+                f"question variation, capture {readings.capture}", "variation.places_mm and depth_mm", "visited",
+                f"{place_mm[0]:g}, {place_mm[1]:g} mm at {depth_mm:g} mm, never", _visited(readings, place_mm),
+            )  # fmt: skip
+    b_uT = readings.b_uT[at]
+    visit_i, n_contacts = rank(readings.indentation[at]), readings.n_contacts[at]
+    _, first_i, n = np.unique(visit_i, return_index=True, return_counts=True)
+    means = [
+        np.add.reduceat(values, first_i, axis=0, dtype=np.float64) / n[:, None]
+        for values in (b_uT, subtract(b_uT, readings.noload_uT[at]))
+    ]
+    return Visits(n_contacts[first_i], *means)
+
+
+def over_time(visits: Visits, contacts_n: int) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Compare the visits of a skin's first contacts with the first of them: field as read, and change of field.
+
+    Gives rms values over channels at the last visit, and the lines to draw: each visit's change less the first's.
+    """
+    early = visits.contacts_n - visits.contacts_n[0] < contacts_n
+    felt_n, b_uT, db_uT = visits.contacts_n[early], visits.b_uT[early], visits.db_uT[early]
+    raw_uT, seen_uT, size_uT = rms(b_uT[-1] - b_uT[0]), rms(db_uT[-1] - db_uT[0]), rms(db_uT[0])
+    numbers = {
+        "visits_n": len(felt_n),
+        "contacts_n": int(felt_n[-1] - felt_n[0]),
+        "first_db_uT": size_uT,
+        "raw_change_uT": raw_uT,
+        "raw_change_pct": 100 * raw_uT / size_uT,
+        "db_change_uT": seen_uT,
+        "db_change_pct": 100 * seen_uT / size_uT,
+    }
+    shown = np.unique(np.linspace(0, len(felt_n) - 1, LINES_MAX_N).round().astype(int))
+    lines = np.round(b_uT[shown] - b_uT[0], DECIMALS)
+    return numbers, {"contacts_n": felt_n[shown].tolist(), "b_uT": lines.tolist()}
+
+
+def meanwhile(readings: Readings, contacts_n: int) -> dict[str, float]:
+    """Give how long a skin's first contacts take, and by how much its chips grow warmer, mean over them; if known."""
+    early = readings.n_contacts - readings.n_contacts[0] < contacts_n
+    t_s, temperature_degC = readings.t_s[early], readings.temperature_degC[early].astype(float)
+    order = rank(readings.indentation[early])
+    warmer_K = float(temperature_degC[order == order[-1]].mean() - temperature_degC[order == 0].mean())
+    told = {"shown_s": float(t_s[-1] - t_s[0]), "warmer_K": warmer_K}
+    return {name: value for name, value in told.items() if np.isfinite(value)}
+
+
+def over_skins(visits: Mapping[str, Visits]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Compare the mean changes of field of several skins: rms over channels and pairs, also relative to the change."""
+    mean_uT = {skin: of.db_uT.mean(axis=0) for skin, of in visits.items()}
+    size_uT = rms(np.array(list(mean_uT.values())))
+    numbers: dict[str, Any] = {"skins": list(mean_uT), "mean_db_uT": size_uT}
+    if len(mean_uT) > 1:
+        spread_uT = rms(np.array([one - other for one, other in combinations(mean_uT.values(), 2)]))
+        numbers |= {"spread_uT": spread_uT, "spread_pct": 100 * spread_uT / size_uT}
+    return numbers, {skin: np.round(line, DECIMALS).tolist() for skin, line in mean_uT.items()}
+
+
+def first_of_each_board(boards: Mapping[str, str], skins_n: int) -> list[str]:
+    """Choose skins, the first of each board before the second of any; `boards` holds each skin's board."""
+    order: dict[str, int] = {}
+    ranked = []
+    for skin in sorted(boards):
+        ranked.append((order.setdefault(boards[skin], 0), boards[skin], skin))
+        order[boards[skin]] += 1
+    if skins_n > len(ranked):
+        rule = f"at most the {len(ranked)} skins of the main captures"
+        raise ParamsError("question variation", "variation.skins_n", rule, skins_n, "Ask for fewer.")
+    return [skin for *_, skin in sorted(ranked)[:skins_n]]
+
+
+def _at(readings: Readings, place_mm: tuple[float, float], depth_mm: float | None) -> Bool[np.ndarray, " f"]:
+    near = (np.abs(readings.x_mm - place_mm[0]) < SAME_MM) & (np.abs(readings.y_mm - place_mm[1]) < SAME_MM)
+    return near if depth_mm is None else near & (np.abs(readings.depth_mm - depth_mm) < SAME_MM)
+
+
+def _visited(readings: Readings, place_mm: tuple[float, float]) -> str:
+    """Say what was visited: the depths of that place, or places that there are."""
+    at = _at(readings, place_mm, None)
+    if at.any():
+        return f"Visited depths there: {_list(np.unique(readings.depth_mm[at]))} mm."
+    places = np.unique(np.stack([readings.x_mm, readings.y_mm], axis=1), axis=0)
+    some = "; ".join(f"{x:g}, {y:g}" for x, y in places[:LISTED_N])
+    depths = _list(np.unique(readings.depth_mm))
+    return f"Visited: depths {depths} mm, and {len(places)} places, among them {some} mm."
+
+
+def _list(values: Sequence[float] | np.ndarray) -> str:
+    return ", ".join(f"{value:g}" for value in values[:LISTED_N])
 
 
 def read(settings: Settings) -> Variation:
@@ -27,33 +149,33 @@ def read(settings: Settings) -> Variation:
 def variation(scene: str, files: Files, main: Path, indentations: Path, answer: Path) -> None:
     """Compare visits of equal places: of the worn skin in `indentations`, and of several skins in `main`."""
     settings = read_settings("variation", scene, files)
-    asked = read(settings)
+    section = read(settings)
     worn = read_folder(indentations)[0]
-    of_skins = _visits(main, settings.captures_in(main), asked)
+    of_skins = _visits(main, settings.captures_in(main), section)
     places: list[dict[str, Any]] = []
     drawn: list[dict[str, Any]] = []
-    for place_i, (x_mm, y_mm) in enumerate(asked.places_mm):
+    for place_i, (x_mm, y_mm) in enumerate(section.places_mm):
         over = {
-            "time": over_time(find_visits(worn, (x_mm, y_mm), asked.depth_mm), asked.contacts_n),
+            "time": over_time(find_visits(worn, (x_mm, y_mm), section.depth_mm), section.contacts_n),
             "skins": over_skins({skin: visits[place_i] for skin, visits in of_skins.items()}),
         }
         where = {"x_mm": x_mm, "y_mm": y_mm}
         places.append(where | {name: told for name, (told, _) in over.items()})
         drawn.append(where | {name: lines for name, (_, lines) in over.items()})
-    when = pace([worn]) | meanwhile(worn, asked.contacts_n)
-    numbers = {"depth_mm": asked.depth_mm, "worn_skin": worn.skin} | when | {"places": places}
+    when = pace([worn]) | meanwhile(worn, section.contacts_n)
+    numbers = {"depth_mm": section.depth_mm, "worn_skin": worn.skin} | when | {"places": places}
     write_answer(answer, numbers, {"places": drawn}, read_losses(indentations, {}))
 
 
-def _visits(main: Path, names: list[str], asked: Variation) -> dict[str, list[Visits]]:
+def _visits(main: Path, names: list[str], section: Variation) -> dict[str, list[Visits]]:
     """Find each asked skin's visits of each place, one capture in memory at a time."""
     boards: dict[str, str] = {}
     visits: dict[str, list[Visits]] = {}
     for name in names:
         one = io.read_readings(main / f"{name}.parquet")
         boards[one.skin] = one.board
-        visits[one.skin] = [find_visits(one, place_mm, asked.depth_mm) for place_mm in asked.places_mm]
-    return {skin: visits[skin] for skin in first_of_each_board(boards, asked.skins_n)}
+        visits[one.skin] = [find_visits(one, place_mm, section.depth_mm) for place_mm in section.places_mm]
+    return {skin: visits[skin] for skin in first_of_each_board(boards, section.skins_n)}
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from pipeline.experiments.drift.show import say_pace
-from pipeline.reporting.figures import STYLE, svg
+from pipeline.reporting.figures import drawing, svg
 from pipeline.reporting.paper import FIGURE_4
 from pipeline.reporting.shown import tabulate
 from pipeline.reporting.work_precision import COLOURS, MARKERS
@@ -89,10 +89,7 @@ def _over_skins(numbers: Mapping[str, Any], places: Sequence[Mapping[str, Any]],
 @contextmanager
 def _panels(places: Sequence[Mapping[str, Any]], title: str, ylabel: str) -> Iterator[tuple[Any, Any]]:
     """Set up a panel a place, one below the other."""
-    from matplotlib.figure import Figure
-
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(7.2, 0.8 + 2.5 * len(places)), layout="constrained")
+    with drawing(7.2, 0.8 + 2.5 * len(places)) as figure:
         panels = figure.subplots(len(places), 1, squeeze=False)[:, 0]
         for axes, place in zip(panels, places, strict=True):
             axes.set_title(f"at x = {place['x_mm']:g} mm, y = {place['y_mm']:g} mm", loc="left", fontsize=10)

@@ -1,0 +1,309 @@
+"""The audit stage on a tiny scene's files: honest ones pass, and each planted leak fails it by the leak's own name."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.core import io
+from pipeline.core.config import Files
+from pipeline.core.errors import LeakError
+from pipeline.core.schema import Readings
+from pipeline.core.seeds import rng_for
+from pipeline.dataset.folds import load_rows, parse_folds, render_folds
+from pipeline.dataset.rows import Selection
+from pipeline.dataset.splits import Fold, draw_folds
+from pipeline.experiments.audit.run import audit
+from pipeline.learning.inputs import FIT, VIEW
+from pipeline.learning.job import make_job
+from pipeline.learning.recipe import adaptations as adaptations_of
+from pipeline.learning.recipe import training
+from pipeline.learning.trial import Measured, Trained, Trial
+from pipeline.stages import split
+from pipeline.trials import models as _models
+from pipeline.trials.adapting import adaptations, read_starts
+from pipeline.trials.data import SceneData, read_data, trials_of
+from pipeline.trials.models import write_models
+from tests.dataset.tables import readings
+from tests.scenes import ADAPTATIONS, RECIPE, SHARED, TRAINING, recorded, settings
+
+PLACES_N, PASSES_N, READINGS_N, CH_N = 16, 2, 2, 15
+SEED = 2021
+ROOT = Path(__file__).resolve().parents[3]
+MODELS = ("train_single", "train_multi", "train_triplet", "adapt")
+SKINS = ("b0_s0", "b0_s1", "b1_s0", "b2_s0")
+COPY = "b3_s0"  # b0_s0 again, under the name of another board's skin
+TRIPLET = RECIPE | {"triplet_weight": 0.1}
+ADAPTATION = SHARED["adaptations"]["paper"]
+SCENE = recorded(
+    source="simulated",
+    seed=SEED,
+    questions=["single_random", "lobo", "triplet", "adapt", "audit"],
+    split={"random_test_fraction": 0.1, "random_repeats_n": 1, "pool_passes_n": 1},
+    train_single=TRAINING,
+    train_multi=TRAINING | {"variants": {"shape": {"inputs": "shape"}}},
+    train_triplet=TRAINING | {"recipe": "triplet"},
+    adapt=ADAPTATIONS,
+    audit={"settings": "chosen"},
+)
+NOT_CHOSEN = {"steps_n", "base"}
+CHOICE = {
+    "scene": "tuning", "source": "simulated", "seed": 777, "boards": ["b0", "b1"], "skins": ["b0_s0", "b1_s0"],
+    "chosen": {
+        arm: {name: value for name, value in words.items() if name not in NOT_CHOSEN}
+        for arm, words in (("train_multi", RECIPE), ("train_triplet", TRIPLET), ("adapt", ADAPTATION))
+    },
+}  # fmt: skip
+
+
+def capture(skin: str) -> Readings:
+    """A grid poked twice: a field, strong against its noise, that is a skin's own function of the place."""
+    rng = rng_for(0, "skin", "b0_s0" if skin == COPY else skin)
+    place_i = np.tile(np.arange(PLACES_N), PASSES_N)
+    x, y = place_i // 4, place_i % 4
+    waves = np.stack([np.ones(len(x)), np.sin(x), np.cos(x), np.sin(y), np.cos(y)], axis=1)
+    still_uT = (waves @ rng.normal(0, 120, (5, CH_N))).repeat(READINGS_N, axis=0)
+    f = len(still_uT)
+    db_uT = (still_uT + rng_for(0, "noise", skin).normal(0, 3, still_uT.shape)).astype(np.float32)
+    indentation = np.arange(f, dtype=np.int32) // READINGS_N
+    return readings(
+        skin, skin[:2], skin, f, source="simulated", indentation=indentation, pass_i=indentation // PLACES_N,
+        x_mm=np.float32(4) * x.repeat(READINGS_N).astype(np.float32),
+        y_mm=np.float32(4) * y.repeat(READINGS_N).astype(np.float32),
+        b_uT=100 + db_uT, noload_uT=np.full((f, CH_N), 100, np.float32),
+        temperature_degC=np.full((f, CH_N // 3), 25, np.float32),
+    )  # fmt: skip
+
+
+def build(folder: Path, skins: tuple[str, ...] = SKINS) -> Path:
+    """Write a scene's files as its stages do, but that its networks stay as they were drawn."""
+    for skin in skins:
+        io.write_readings(folder / f"indentations/{skin}.parquet", [capture(skin)], {})
+    io.write_json(folder / "tiny.yaml", SCENE)  # JSON is YAML
+    io.write_json(folder / "params.yaml", SHARED)
+    io.write_json(
+        folder / "plan.yaml", {"scenes": {}, "stages": {"audit": {"tiny": {"scene": "tiny", "models": list(MODELS)}}}}
+    )
+    (folder / "dvc.yaml").write_text((ROOT / "dvc.yaml").read_text())
+    asked = settings(SCENE)
+    rows = load_rows([folder / f"indentations/{skin}.parquet" for skin in skins], asked.section(Selection, "selection"))
+    drawn = draw_folds(rows, ("single_random", "lobo"), split.read(asked), asked.seed)
+    io.write_json(folder / "folds.json", render_folds(skins, rows, drawn))
+    data = scenery(folder)
+    for arm, section, question in (
+        ("train_single", training(asked, "train_single"), "single_random"),
+        ("train_multi", training(asked, "train_multi"), "lobo"),
+    ):
+        write(folder, arm, data, trials_of(data, section, data.folds_of(question)))
+    write(
+        folder,
+        "train_triplet",
+        data,
+        trials_of(data, training(asked, "train_triplet"), data.folds_of("lobo"), question="triplet"),
+    )
+    starts, named = read_starts(folder / "models/train_triplet"), ("paper", adaptations_of(asked).recipes["paper"])
+    adapted = [adaptations(data, fold, named, starts, question="adapt", pokes_n=8) for fold in data.folds_of("lobo")]
+    write(folder, "adapt", data, [trial for trials in adapted for trial in trials])
+    io.write_json(folder / "choice.json", CHOICE)
+    return folder
+
+
+def scenery(folder: Path) -> SceneData:
+    return read_data(settings(SCENE), folder / "indentations", folder / "folds.json")
+
+
+def write(folder: Path, arm: str, data: SceneData, trials: list[Trial]) -> None:
+    write_models(folder / "models" / arm, data, trials, [as_drawn(trial, data) for trial in trials], arm)
+
+
+def as_drawn(trial: Trial, data: SceneData) -> Trained:
+    job, scaler = make_job(trial, Measured(data.rows.db_uT, data.rows.target, data.rows.skin))
+    predicted = np.zeros((len(trial.test), 3), np.float32)
+    return Trained(f"key of {trial.name}", job.start, scaler, [1.0], predicted, None, None, 0.0, 0.0)
+
+
+@pytest.fixture(autouse=True)
+def _at_home(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # seconds are noted in the working folder
+    monkeypatch.setattr(_models, "code_version", lambda: "abc")
+
+
+@pytest.fixture(scope="module")
+def honest(tmp_path_factory) -> Path:
+    with pytest.MonkeyPatch.context() as patch:
+        folder = tmp_path_factory.mktemp("honest")
+        patch.chdir(folder)
+        patch.setattr(_models, "code_version", lambda: "abc")
+        return build(folder / "scene")
+
+
+@pytest.fixture
+def scene(honest, tmp_path) -> Path:
+    return shutil.copytree(honest, tmp_path / "scene")
+
+
+def audited(folder: Path) -> list[dict]:
+    answer = folder / "audit.json"
+    files = Files(folder / "tiny.yaml", folder / "params.yaml", folder / "plan.yaml")
+    audit(
+        "tiny", files, folder / "indentations", folder / "folds.json", folder / "models", folder / "choice.json",
+        answer,
+    )  # fmt: skip
+    return io.read_json(answer)
+
+
+def refused(folder: Path, sentence: str) -> None:
+    with pytest.raises(LeakError, match=sentence):
+        audited(folder)
+    assert not (folder / "audit.json").exists()
+
+
+def test_honest_files_pass_and_every_fold_network_and_arm_was_looked_at(scene, capsys):
+    checks = audited(scene)
+    assert {check["where"] for check in checks if check["what"] == "copies"} == {"lobo/b0", "lobo/b1", "lobo/b2"}
+    assert {check["where"] for check in checks if check["what"] == "pool indentations"} == {
+        "lobo/b0", "lobo/b1", "lobo/b2"
+    }  # fmt: skip
+    trained = {"single_random.paper.repeat0.seed0"}
+    trained |= {f"{arm}.b{i}.seed0" for arm in ("lobo.paper", "lobo.shape", "triplet.paper") for i in range(3)}
+    trained |= {f"adapt.paper.{skin}.8pokes.seed0" for skin in ("b0.b0_s0", "b0.b0_s1", "b1.b1_s0", "b2.b2_s0")}
+    assert {check["where"] for check in checks if check["what"] == "scaler"} == trained
+    arms = {check["where"] for check in checks if check["what"] == "settings: recipe"}
+    assert arms == {"train_single", "train_multi", "train_triplet", "adapt"}
+    assert [check["where"] for check in checks if not check["holds"]] == ["single_random/repeat0"]  # the paper's way
+    assert f"tiny: {len(checks)} checks, no leak; 1 known" in capsys.readouterr().err
+
+
+def test_a_scene_whose_settings_are_for_speed_needs_no_record_of_a_choice(scene):
+    io.write_json(scene / "tiny.yaml", SCENE | {"audit": {"settings": "for speed"}})
+    (scene / "choice.json").unlink()
+    assert not any(check["what"].startswith("settings") for check in audited(scene))
+
+
+@pytest.mark.parametrize("seen_n", [1, 32])
+@pytest.mark.parametrize(
+    ("arm", "name"),
+    [
+        ("train_multi", "lobo.paper.b1.seed0"),
+        ("train_multi", "lobo.shape.b1.seed0"),
+        ("train_triplet", "triplet.paper.b1.seed0"),
+    ],
+)
+def test_a_network_whose_scaler_saw_test_rows_is_named(scene, arm, name, seen_n):
+    file, data = scene / f"models/{arm}/{name}.safetensors", scenery(scene)
+    (fold,) = (one for one in data.folds_of("lobo") if one.name == "b1")
+    seen = np.concatenate([fold.train, fold.test[:seen_n]])
+    view = VIEW["shape" if ".shape." in name else "raw"](data.rows.db_uT[seen])
+    leaked = FIT["standard"](view, data.rows.target[seen]).arrays()
+    io.write_tensors(file, io.read_tensors(file)[0] | leaked, {})
+    refused(scene, f"audit of tiny, {name}: scaler must be that of the training rows, .*; got off by")
+
+
+def replant(folder: Path, change: Callable[[Fold, SceneData], Fold]) -> None:
+    """Change the fold of board b0 in folds.json, and leave the others."""
+    data = scenery(folder)
+    folds = [change(fold, data) if (fold.question, fold.name) == ("lobo", "b0") else fold for fold in data.folds]
+    io.write_json(
+        folder / "folds.json", render_folds(io.read_json(folder / "folds.json")["captures"], data.rows, folds)
+    )
+    assert len(parse_folds(io.read_json(folder / "folds.json"), data.rows, "folds.json")) == len(data.folds)
+
+
+def a_skin_trained_on(fold: Fold, data: SceneData) -> Fold:
+    own = data.rows.skin[fold.test] == "b0_s0"
+    pool = fold.pool[data.rows.skin[fold.pool] != "b0_s0"]
+    return Fold(fold.question, fold.name, np.union1d(fold.train, fold.test[own]), fold.test[~own], pool)
+
+
+def a_reading_on_both_sides(fold: Fold, data: SceneData) -> Fold:
+    return Fold(fold.question, fold.name, np.union1d(fold.train, fold.test[:1]), fold.test, fold.pool)
+
+
+def a_tested_reading_adapted_to(fold: Fold, data: SceneData) -> Fold:
+    return Fold(fold.question, fold.name, fold.train, fold.test, np.union1d(fold.pool, fold.test[:1]))
+
+
+def a_tested_indentation_adapted_to(fold: Fold, data: SceneData) -> Fold:
+    return Fold(fold.question, fold.name, fold.train, fold.test[1:], np.union1d(fold.pool, fold.test[:1]))
+
+
+def a_stranger_adapted_to(fold: Fold, data: SceneData) -> Fold:
+    return Fold(fold.question, fold.name, fold.train[1:], fold.test, np.union1d(fold.pool, fold.train[:1]))
+
+
+@pytest.mark.parametrize(
+    ("leak", "sentence"),
+    [
+        (a_skin_trained_on, "boards must be apart; got 1 of 1 on both sides: b0"),
+        (a_reading_on_both_sides, "readings must be on one side only; got 1 of 64 test readings"),
+        (a_tested_reading_adapted_to, "readings must be on one side only; got 1 of 64 test readings"),
+        (a_tested_indentation_adapted_to, "pool indentations must be apart from the test; got 1 of 33 unlabelled"),
+        (a_stranger_adapted_to, "pool skins must be skins of the test; got 1 of 3 are not held out: b1_s0"),
+    ],
+)
+def test_a_fold_that_trains_on_or_adapts_to_what_it_tests_is_named(scene, leak, sentence):
+    replant(scene, leak)
+    refused(scene, f"audit of tiny, lobo/b0: {sentence}")
+
+
+def test_a_capture_copied_under_another_name_is_named_though_its_labels_are_apart(tmp_path):
+    refused(
+        build(tmp_path / "scene", (*SKINS, COPY)),
+        r"audit of tiny, lobo/b0: copies must be .*; got 2 of 2 captures compared; b0_s0 like b3_s0: 100.0 %",
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"seed": SEED}, "all folds: settings: boards must be none of those that scene tuning chose on .*: b0, b1"),
+        ({"seed": SEED, "boards": ["b9"]}, "all folds: settings: skins must be none of .*: b0_s0, b1_s0"),
+    ],
+    ids=["board", "skin"],
+)
+def test_settings_chosen_on_what_is_tested_are_named(scene, changes, sentence):
+    io.write_json(scene / "choice.json", CHOICE | changes)
+    refused(scene, f"audit of tiny, {sentence}")
+
+
+@pytest.mark.parametrize(
+    ("chosen", "arm", "found"),
+    [
+        (
+            CHOICE["chosen"] | {"adapt": CHOICE["chosen"]["adapt"] | {"rate_max": 3e-3}},
+            "adapt", "not chosen by the study: rate_max 0.001 (study: 0.003)",
+        ),
+        (
+            {"train_multi": CHOICE["chosen"]["train_multi"]},
+            "train_triplet", "not chosen by the study: it chose none for this",
+        ),
+    ],
+    ids=["another rate", "no choice"],
+)  # fmt: skip
+def test_a_setting_that_the_study_did_not_choose_is_a_stated_row_and_no_leak(scene, chosen, arm, found):
+    io.write_json(scene / "choice.json", CHOICE | {"chosen": chosen})
+    rows = {check["where"]: check for check in audited(scene) if check["what"] == "settings: recipe"}
+    assert (rows[arm]["found"], rows[arm]["holds"]) == (found, True)
+    assert rows["train_multi"]["found"] == "equal"
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda tuning, at: tuning | {"from": "key of another fold"}, "base must be a network of its fold and seed"),
+        (lambda tuning, at: tuning | {"indentations": at["tested"]}, "pokes must be of the pool, and none tested"),
+        (lambda tuning, at: tuning | {"indentations": at["trained"]}, "pokes must be of the pool, and none tested"),
+    ],
+    ids=["a network that saw the board", "pokes that are tested", "pokes of a training skin"],
+)
+def test_adaptation_with_what_it_may_not_have_is_named(scene, change, sentence):
+    file = next((scene / "models/adapt").glob("*.json"))
+    card = io.read_json(file)
+    data = scenery(scene)
+    fold = next(fold for fold in data.folds_of("lobo") if fold.name == card["fold"])
+    sides = {"tested": fold.test, "trained": fold.train}
+    own = {name: np.unique(data.rows.indentation[rows])[:3].tolist() for name, rows in sides.items()}
+    io.write_json(file, card | {"tuning": change(card["tuning"], own)})
+    refused(scene, f"{file.stem}: {sentence}")

@@ -1,0 +1,376 @@
+"""The audit passes honest skins and fails by name on planted leaks: split, copy, scaler, settings, pool."""
+
+import doctest
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.core.errors import ParamsError, SchemaError
+from pipeline.core.seeds import rng_for
+from pipeline.experiments.audit import copies, sides
+from pipeline.experiments.audit.copies import nearest_rays
+from pipeline.experiments.audit.run import audit_choice, audit_scaler
+from pipeline.experiments.audit.sides import Labels, Sides, audit_fold, holds, to_words
+from pipeline.learning.inputs import FIT
+
+NONE = np.zeros(0, np.int64)
+READINGS_N = 3
+NOISE_uT = np.tile([3.3, 3.3, 5.0], 5)  # measured on the lab's recordings
+UNSEEN = ("lobo", "sensors", "transfer")
+
+
+def poked(boards_n: int = 3, pokes_n: int = 60) -> tuple[Labels, np.ndarray]:
+    """Two skins a board, poked at random places: a response all share, and a third as much of each skin's own."""
+    rng = rng_for(0, "audit")
+    common, dbs_uT = rng.normal(0, 25, (9, 15)), []
+    for _ in range(2 * boards_n):
+        x, y = rng.uniform(0, 3, (2, pokes_n))
+        waves = [np.ones(pokes_n), np.sin(x), np.cos(x), np.sin(y), np.cos(y), x * y / 4, np.sin(x - y)]
+        shape = np.stack([*waves, np.sin(2 * x), np.sin(2 * y)], axis=1)
+        still_uT = rng.uniform(1, 3, (pokes_n, 1)) * (shape @ (common + rng.normal(0, 8, (9, 15))))
+        dbs_uT.append(np.repeat(still_uT, READINGS_N, axis=0) + rng.normal(0, NOISE_uT, (READINGS_N * pokes_n, 15)))
+    own_n = READINGS_N * pokes_n
+    board = np.repeat([f"b{i // 2}" for i in range(2 * boards_n)], own_n)
+    skin = np.repeat([f"b{i // 2}_s{i % 2}" for i in range(2 * boards_n)], own_n)
+    labels = Labels(board, skin, np.arange(len(board)) // READINGS_N, capture=np.char.add("c_", skin))
+    return labels, np.concatenate(dbs_uT).astype(np.float32)
+
+
+def held_out(labels: Labels, question: str = "lobo", board: str = "b0") -> Sides:
+    own = labels.board == board
+    return Sides(question, board, np.flatnonzero(~own), NONE, np.flatnonzero(own))
+
+
+def audited(fold: Sides, labels: Labels, db_uT: np.ndarray):
+    return audit_fold(fold, labels, db_uT=db_uT, rng=rng_for(0, "sample"))
+
+
+def failing(checks) -> list[str]:
+    return [check.what for check in checks if not check.holds]
+
+
+LABELS, DB_uT = poked()
+
+
+def test_a_fold_drawn_in_the_docstring_is_as_printed():
+    outcome = doctest.testmod(sides, extraglobs={"rng": rng_for(0, "doctest")})
+    assert outcome.attempted >= 4
+    assert outcome.failed == 0
+
+
+@pytest.mark.parametrize("question", UNSEEN)
+@pytest.mark.parametrize("board", ["b0", "b1", "b2"])
+def test_honest_folds_pass(question, board):
+    checks = audited(held_out(LABELS, question, board), LABELS, DB_uT)
+    assert failing(checks) == []
+    assert [check.what for check in checks] == ["readings", "boards", "skins", "indentations", "copies"]
+
+
+def moved_to_train(moved: np.ndarray) -> Sides:
+    fold = held_out(LABELS)
+    return replace(fold, train=np.union1d(fold.train, fold.test[moved]), test=fold.test[~moved])
+
+
+FIRST_SKIN = LABELS.skin[LABELS.board == "b0"] == "b0_s0"
+
+
+@pytest.mark.parametrize(
+    ("leak", "named"),
+    [
+        (FIRST_SKIN, ["boards"]),
+        (np.arange(len(FIRST_SKIN)) < 5 * READINGS_N, ["boards", "skins"]),
+        (np.arange(len(FIRST_SKIN)) < 1, ["boards", "skins", "indentations"]),
+    ],
+    ids=["a skin of the board", "five indentations of a skin", "one reading"],
+)
+def test_a_planted_split_leak_fails_and_is_named(leak, named):
+    checks = audited(moved_to_train(leak), LABELS, DB_uT)
+    assert not holds(checks)
+    assert failing(checks) == named
+    assert checks[1].found == "1 of 1 on both sides: b0"
+
+
+def test_a_reading_trained_and_tested_on_fails_even_where_indentations_may_be_shared():
+    own = np.flatnonzero(LABELS.skin == "b0_s0")
+    fold = Sides("single_random", "repeat0", own[:100], NONE, own[99:])
+    assert failing(audited(fold, LABELS, DB_uT)) == ["readings", "indentations"]
+    assert not holds(audited(fold, LABELS, DB_uT))
+
+
+def test_the_papers_random_readings_are_a_known_leak_that_does_not_fail_the_whole():
+    own = np.flatnonzero(LABELS.skin == "b0_s0")
+    checks = audited(Sides("single_random", "repeat0", own[::2], NONE, own[1::2]), LABELS, DB_uT)
+    (leak,) = [check for check in checks if not check.holds]
+    assert (leak.what, leak.known) == ("indentations", True)
+    assert leak.found.startswith("60 of 60 on both sides")  # 3 readings: one side has 2, the other 1
+    assert holds(checks)
+
+
+@pytest.mark.parametrize("question", ["single_temporal", "single_indentation", "single_pass"])
+def test_within_one_skin_indentations_are_apart_or_the_audit_fails(question):
+    own = np.flatnonzero(LABELS.skin == "b0_s0")
+    fold = Sides(question, "b0_s0", own[: 20 * READINGS_N], NONE, own[20 * READINGS_N :])
+    assert failing(audited(fold, LABELS, DB_uT)) == []
+    torn = replace(fold, train=own[:61], test=own[61:])
+    assert failing(audited(torn, LABELS, DB_uT)) == ["indentations"]
+    assert not holds(audited(torn, LABELS, DB_uT))
+
+
+def test_pokes_to_adapt_by_are_of_the_held_out_skins_and_not_tested():
+    fold = held_out(LABELS)
+    pool, test = fold.test[: 10 * READINGS_N], fold.test[10 * READINGS_N :]
+    assert failing(audited(replace(fold, pool=pool, test=test), LABELS, DB_uT)) == []
+    tested = audited(replace(fold, pool=fold.test[:4], test=fold.test[4:]), LABELS, DB_uT)
+    assert failing(tested) == ["pool indentations"]
+    trained = audited(replace(fold, pool=fold.train[:3]), LABELS, DB_uT)
+    assert failing(trained) == ["pool skins"]
+    assert trained[-1].found == "1 of 1 are not held out: b1_s0"
+
+
+def with_copy(db_uT: np.ndarray, labels: Labels, of: str, to: str, *, sd_uT: float, factor: float) -> np.ndarray:
+    rng = rng_for(1, "copy")
+    planted, source = db_uT.copy(), db_uT[labels.skin == of]
+    planted[labels.skin == to] = factor * source + rng.normal(0, sd_uT, source.shape)
+    return planted
+
+
+@pytest.mark.parametrize(("sd_uT", "factor"), [(0, 1), (3, 1), (5, 1), (5, 1.05), (3, 0.9), (0, 1.3)])
+def test_a_perturbed_copy_under_another_skins_name_fails_and_is_named(sd_uT, factor):
+    planted = with_copy(DB_uT, LABELS, "b2_s1", "b0_s1", sd_uT=sd_uT, factor=factor)
+    checks = audited(held_out(LABELS), LABELS, planted)
+    assert failing(checks) == ["copies"]
+    assert checks[-1].found.startswith("2 of 2 captures compared; c_b0_s1 like b2_s1:")
+    assert not holds(checks)
+
+
+def test_a_copied_capture_is_found_among_a_skins_many_own():
+    own, copied = (np.flatnonzero(LABELS.skin == skin) for skin in ("b0_s1", "b2_s1"))
+    few = own[: 8 * READINGS_N]
+    capture = LABELS.capture.astype("U20")
+    capture[few] = "c_b0_s1_more"
+    planted = DB_uT.copy()
+    planted[few] = DB_uT[copied[: len(few)]] + rng_for(1, "copy").normal(0, 4, (len(few), 15))
+    check = audited(held_out(LABELS), replace(LABELS, capture=capture), planted)[-1]
+    assert check.found.startswith("3 of 3 captures compared; c_b0_s1_more like b2_s1:")
+    assert not check.holds
+
+
+def test_a_copy_is_found_in_a_sample_as_well(monkeypatch):
+    monkeypatch.setattr(copies, "PAIRS_MAX_N", 12_000)
+    monkeypatch.setattr(copies, "SAMPLE_MIN_N", 1)
+    planted = with_copy(DB_uT, LABELS, "b2_s1", "b0_s1", sd_uT=5, factor=1)
+    check = audited(held_out(LABELS), LABELS, planted)[-1]
+    assert check.found.endswith("of 25 indentations")  # 12,000 pairs over 240 training indentations and 2 captures
+    assert not check.holds
+    assert audited(held_out(LABELS), LABELS, DB_uT)[-1].holds
+
+
+def test_the_same_directions_at_other_strengths_are_no_copy():
+    planted, own = DB_uT.copy(), LABELS.skin == "b0_s1"
+    factor = rng_for(4, "factor").uniform(1, 4, (own.sum() // READINGS_N, 1)).repeat(READINGS_N, axis=0)
+    planted[own] = factor * DB_uT[LABELS.skin == "b2_s1"]
+    assert audited(held_out(LABELS), LABELS, planted)[-1].holds
+
+
+def test_a_response_turned_by_ten_degrees_is_no_copy():
+    # Re-seating a skin turns it by more. Strengths stay; each row is off its ray by 0.17 |dB|, some 39 uT at the least.
+    planted, source = DB_uT.copy(), DB_uT[LABELS.skin == "b2_s1"]
+    one, other = source[:, :14:2], source[:, 1:14:2]
+    cos, sin = np.cos(np.radians(10)), np.sin(np.radians(10))
+    source[:, :14:2], source[:, 1:14:2] = cos * one - sin * other, sin * one + cos * other
+    planted[LABELS.skin == "b0_s1"] = source
+    assert audited(held_out(LABELS), LABELS, planted)[-1].holds
+
+
+def test_skins_that_cannot_be_told_from_noise_do_not_pass():
+    checks = audited(held_out(LABELS), LABELS, np.where((LABELS.skin == "b0_s1")[:, None], DB_uT / 1000, DB_uT))
+    assert failing(checks) == ["copies"]
+    assert checks[-1].found == "cannot be told: fields within the noise: b0_s1"
+
+
+@given(st.integers(0, 1000), st.booleans(), st.sampled_from([*UNSEEN, "single_random"]))
+@settings(max_examples=30, deadline=None)
+def test_the_order_of_rows_does_not_change_what_is_found(draw, copied, question):
+    db_uT = with_copy(DB_uT, LABELS, "b2_s1", "b0_s1", sd_uT=3, factor=1) if copied else DB_uT
+    order = rng_for(draw, "order").permutation(len(DB_uT))
+    place = np.argsort(order)  # where a row went
+    fold = held_out(LABELS, question)
+    shuffled = Labels(*(label[order] for label in vars(LABELS).values()))
+    moved = replace(fold, train=place[fold.train], test=place[fold.test])
+    assert audited(moved, shuffled, db_uT[order]) == audited(fold, LABELS, db_uT)
+
+
+def test_the_nearest_ray_is_that_of_the_smallest_angle(monkeypatch):
+    monkeypatch.setattr(copies, "CHUNK_PAIRS_N", 100)  # several chunks
+    rng = rng_for(2, "rays")
+    rows, others = (rng.normal(0, 100, (n, 6)).astype(np.float32) for n in (13, 40))
+    nearest, off_uT = nearest_rays(rows, others)
+    for row, i, off in zip(rows.astype(float), nearest, off_uT, strict=True):
+        angles = [np.arccos(row @ o / np.linalg.norm(row) / np.linalg.norm(o)) for o in others.astype(float)]
+        assert i == np.argmin(angles)
+        assert off == pytest.approx(np.linalg.norm(row) * np.sin(min(angles)), rel=1e-5)  # float32 rays
+
+
+def test_two_recorded_skins_pass_and_a_copy_of_one_fails(shared_data):
+    frames = {
+        board: pd.concat([pd.read_csv(shared_data / f"lab/{board}_depth{i}.csv").assign(depth_i=i) for i in (1, 3)])
+        for board in ("board1", "board2")
+    }
+    channels = [f"B{axis}{chip}" for chip in range(5) for axis in "xyz"]
+    tables = []
+    for frame in frames.values():
+        rest = frame[frame.phase == "noload"].groupby(["depth_i", "indent"])[channels].mean()
+        pressed = frame[frame.phase == "contact"].groupby(["depth_i", "indent"])[channels].mean()
+        tables.append((pressed - rest).to_numpy())
+    db_uT = np.concatenate(tables).astype(np.float32)
+    board = np.repeat(list(frames), [len(table) for table in tables])
+    labels = Labels(board, board, np.arange(len(db_uT)), capture=board)
+    fold = held_out(labels, board="board1")
+    assert failing(audited(fold, labels, db_uT)) == []
+    planted = with_copy(db_uT, labels, "board2", "board1", sd_uT=5, factor=0.95)
+    assert failing(audited(fold, labels, planted)) == ["copies"]
+
+
+@pytest.mark.parametrize("question", ["lobo", "by_weather"])
+def test_folds_that_cannot_be_judged_are_one_sentence(question):
+    fold = replace(held_out(LABELS, question), test=NONE)
+    sentence = {
+        "lobo": "rows must be on both sides; got 720 to train on, 0",
+        "by_weather": "must be one of .*; got by_weath",
+    }
+    with pytest.raises(ParamsError, match=sentence[question]):
+        audited(fold, LABELS, DB_uT)
+
+
+TARGET = rng_for(3, "target").uniform(0.1, 16, (len(DB_uT), 3)).astype(np.float32)
+
+
+def scaler_check(arrays, fold: Sides, db_uT: np.ndarray, scaling: str):
+    def fit(db_uT, target):
+        return FIT[scaling](db_uT, target).arrays()
+
+    return audit_scaler("lobo.paper.b0.seed0", arrays, db_uT=db_uT, target=TARGET, sides=fold, fit=fit)
+
+
+@pytest.mark.parametrize("scaling", list(FIT))
+@given(st.integers(0, 1000))
+@settings(max_examples=20, deadline=None)
+def test_a_scaler_of_the_training_rows_passes_in_whatever_order_they_were_summed(scaling, draw):
+    fold = held_out(LABELS)
+    train = rng_for(draw, "order").permutation(fold.train)
+    assert scaler_check(FIT[scaling](DB_uT[train], TARGET[train]).arrays(), fold, DB_uT, scaling).holds
+
+
+@pytest.mark.parametrize("scaling", list(FIT))
+@pytest.mark.parametrize("seen_n", [1, 20, 360])
+def test_a_planted_scaler_leak_fails_even_by_one_row(scaling, seen_n):
+    fold = held_out(LABELS)
+    seen = np.concatenate([fold.train, fold.test[:seen_n]])
+    check = scaler_check(FIT[scaling](DB_uT[seen], TARGET[seen]).arrays(), fold, DB_uT, scaling)
+    assert not check.holds
+    assert check.what == "scaler"
+
+
+@pytest.mark.parametrize("scaling", list(FIT))
+def test_one_test_row_among_a_hundred_thousand_is_seen_in_the_scaler(scaling):
+    copies_n = 100_000 // len(DB_uT)
+    db_uT, target = np.tile(DB_uT, (copies_n, 1)), np.tile(TARGET, (copies_n, 1))
+    train = np.arange(len(db_uT) - 2)
+
+    def fit(db_uT, target):
+        return FIT[scaling](db_uT, target).arrays()
+
+    fold = Sides("lobo", "b0", train, NONE, np.arange(len(train), len(db_uT)))
+    checks = [
+        audit_scaler("m", fit(db_uT[seen], target[seen]), db_uT=db_uT, target=target, sides=fold, fit=fit)
+        for seen in (train, np.arange(len(train) + 1))
+    ]
+    assert [check.holds for check in checks] == [True, False]
+
+
+def test_the_last_bit_of_a_scaler_may_differ_between_machines():
+    fold = held_out(LABELS)
+    arrays = FIT["standard"](DB_uT[fold.train], TARGET[fold.train]).arrays()
+    turned = {name: np.nextafter(value, np.float32(np.inf)) for name, value in arrays.items()}
+    assert scaler_check(turned, fold, DB_uT, "standard").holds
+
+
+def test_a_scaler_within_the_tolerance_but_nearer_to_both_sides_fails():
+    fold = held_out(LABELS)
+
+    def fit(db_uT, target):
+        return {"shift": np.array([1 + 1e-10 * len(db_uT)])}
+
+    arrays = fit(DB_uT, TARGET)  # lobo: both sides are all rows
+    check = audit_scaler("m", arrays, db_uT=DB_uT, target=TARGET, sides=fold, fit=fit)
+    assert check.found == "off by 3.6e-08 from training rows alone, by 0 from both sides"
+    assert not check.holds
+
+
+def test_a_scaler_of_nan_does_not_pass_and_a_missing_array_is_one_sentence():
+    fold = held_out(LABELS)
+    arrays = FIT["standard"](DB_uT[fold.train], TARGET[fold.train]).arrays()
+    assert not scaler_check(arrays | {"target_shift": np.full(3, np.nan, np.float32)}, fold, DB_uT, "standard").holds
+    arrays.pop("input_scale")
+    with pytest.raises(SchemaError, match="lobo.paper.b0.seed0: scaler array input_scale must be there"):
+        scaler_check(arrays, fold, DB_uT, "standard")
+
+
+RECIPE = {"scaling": "standard", "steps_n": 4000, "rate_max": 0.003}
+CHOICE = {
+    "scene": "tuning", "source": "simulated", "seed": 777, "boards": ["b0", "b1"], "skins": ["b0_s0", "b1_s0"],
+    "chosen": {"train_multi": RECIPE, "train_single": RECIPE | {"steps_n": 500}}, "minutes": 12.5,
+}  # fmt: skip
+
+
+def choice_checks(choice=CHOICE, recipes=None, source="simulated", seed=2021):
+    recipes = {"train_multi": dict(RECIPE)} if recipes is None else recipes
+    names = {"test_boards": ["b0", "b2"], "test_skins": ["b0_s0", "b0_s1", "b2_s0"]}
+    return audit_choice(choice, recipes, source=source, seed=seed, **names)
+
+
+def test_settings_chosen_on_skins_of_another_draw_pass_though_names_are_alike():
+    assert failing(choice_checks()) == []
+    assert failing(choice_checks(source="recorded")) == []
+
+
+@pytest.mark.parametrize(("source", "seed"), [("simulated", 777), ("recorded", 5)])
+def test_a_planted_settings_leak_fails_and_names_the_skin(source, seed):
+    checks = choice_checks(CHOICE | {"source": source}, source=source, seed=seed)
+    assert failing(checks) == ["settings: boards", "settings: skins"]
+    assert checks[1].found == "1 of 3 tested were chosen on: b0_s0"
+    assert not holds(checks)
+
+
+@pytest.mark.parametrize(
+    ("recipe", "found"),
+    [
+        (RECIPE | {"rate_max": 0.001}, "rate_max 0.001 (study: 0.003)"),
+        (RECIPE | {"steps_n": 500}, "steps_n 500 (study: 4000)"),
+        ({"scaling": "standard", "rate_max": 0.003, "tau": 1}, "steps_n absent (study: 4000), tau 1 (study: absent)"),
+    ],
+)  # fmt: skip
+def test_a_recipe_other_than_the_chosen_one_is_stated_key_by_key_and_is_no_leak(recipe, found):
+    checks = choice_checks(recipes={"train_multi": recipe})
+    assert holds(checks)
+    assert checks[-1].found == f"not chosen by the study: {found}"
+
+
+def test_an_arm_that_no_study_chose_for_is_stated_and_a_broken_record_is_one_sentence():
+    checks = choice_checks(recipes={"adapt": RECIPE})
+    assert holds(checks)
+    assert checks[-1].found == "not chosen by the study: it chose none for this"
+    with pytest.raises(ParamsError, match="skins must be given; got nothing"):
+        choice_checks({key: value for key, value in CHOICE.items() if key != "skins"})
+
+
+def test_checks_are_written_as_plain_words():
+    (words, *_) = to_words(audited(held_out(LABELS), LABELS, DB_uT))
+    assert words == {
+        "what": "readings", "where": "lobo/b0", "rule": "on one side only",
+        "found": "0 of 360 test readings trained on or adapted to", "holds": True, "known": False,
+    }  # fmt: skip

@@ -1,0 +1,74 @@
+"""Two contacts on a made-up linear skin whose network is exact: what it answers, and what test rows cannot decide."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.core.config import Settings, read_yaml
+from pipeline.core.seeds import rng_for
+from pipeline.dataset.grid import points_mm
+from pipeline.dataset.splits import Fold
+from pipeline.experiments.contacts.run import Contacts, on_board
+from pipeline.trials.data import SceneData
+from tests.dataset import tables
+
+ASKED = Contacts(pairs_n=40, separations_mm=(4.0, 8.0), false_alarm_fraction=0.1)
+CI = Path(__file__).resolve().parents[3] / "pipeline/scenes/ci.yaml"
+
+
+def scenery():
+    boards = np.repeat(["b0", "b1", "b2"], 260)
+    rows = tables.rows(boards, [f"{board}_s0" for board in boards])
+    force_N = rng_for(0, "forces").uniform(0.5, 3, len(boards))
+    places_mm = np.tile(points_mm(), (12, 1))
+    # Field sources lie under the places: each of nine channels sees force fall with distance from a spot of its own.
+    spots_mm = np.array([[x, y] for x in (2, 8, 14) for y in (2, 8, 14)])
+    near = np.exp(-((places_mm[:, None] - spots_mm) ** 2).sum(axis=2) / 50)
+    db_uT = (200 * force_N[:, None] * near).astype(np.float32)
+    target = np.column_stack([places_mm, force_N]).astype(np.float32)
+    return SceneData(
+        "test", Settings("ci", "ci.yaml", read_yaml(CI), {}, {}), replace(rows, db_uT=db_uT, target=target), []
+    )
+
+
+def nearest(data):
+    """An exact network, for single contacts: of the row that looks most alike."""
+
+    def answer(db_uT):
+        known = data.rows.db_uT / np.linalg.norm(data.rows.db_uT, axis=1, keepdims=True)
+        which = (db_uT @ known.T).argmax(axis=1)
+        force_N = np.linalg.norm(db_uT, axis=1) / np.linalg.norm(data.rows.db_uT[which], axis=1)
+        return np.column_stack([data.rows.target[which, :2], force_N * data.rows.target[which, 2]]).astype(np.float32)
+
+    return answer
+
+
+AT = scenery()
+TEST = np.flatnonzero(AT.rows.board == "b0")
+FOLD = Fold("lobo", "b0", np.flatnonzero(AT.rows.board != "b0"), TEST, np.zeros(0, np.int64))
+NUMBERS, DRAWN = on_board(AT, FOLD, ASKED, [nearest(AT)])
+
+
+def test_two_contacts_far_apart_are_odder_than_two_close_by_and_than_one():
+    found = NUMBERS["by_separation"]
+    for detector in ("direction and length", "direction above noise", "residual"):
+        assert found[8.0]["auc"][detector] > max(found[4.0]["auc"][detector], 0.7)  # 0.5 is guessing
+        assert NUMBERS["false_alarm_pct"][detector] < 25  # 10 asked, of as many again
+
+
+def test_the_answer_lies_between_the_two_and_nearer_the_stronger():
+    assert 0.5 < NUMBERS["falls"][8.0]["along"] < 1.0
+    assert NUMBERS["falls"][4.0]["nearest_mm"] < NUMBERS["falls"][8.0]["nearest_mm"]
+    assert NUMBERS["falls"][0.0]["near_either_pct"] == 100  # twice one place is one contact, twice as strong
+    assert [len(values) for values in DRAWN["along"].values()] == [40, 40]
+
+
+def test_one_network_cannot_disagree_with_itself_but_two_can():
+    assert "networks disagree" not in NUMBERS["auc"]
+    numbers, _ = on_board(AT, FOLD, ASKED, [nearest(AT), lambda db_uT: nearest(AT)(-db_uT)])
+    assert "networks disagree" in numbers["auc"]
+
+
+def test_the_same_board_gives_the_same_numbers():
+    assert on_board(AT, FOLD, ASKED, [nearest(AT)]) == (NUMBERS, DRAWN)

@@ -1,0 +1,142 @@
+"""Stages drift and variation on a skin whose field is known in closed form, with the settings of scene ci."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from ruamel.yaml import YAML
+
+from pipeline.core import io
+from pipeline.core.config import Files
+from pipeline.core.errors import ParamsError
+from pipeline.core.schema import Readings
+from pipeline.core.seeds import rng_for
+from pipeline.dataset.grid import points_mm
+from pipeline.experiments.drift import show as drift_pages
+from pipeline.experiments.drift.run import drift
+from pipeline.experiments.variation import show as variation_pages
+from pipeline.experiments.variation.run import variation
+from tests.dataset.tables import readings
+
+ROOT = Path(__file__).resolve().parents[3]
+DEPTHS_MM, PASSES_N, DRIFT_uT = (0.6, 1.2), 3, 0.3  # 390 contacts; drift of each channel a contact
+EVERY_s, WARMING_K_PER_s = 0.5, 0.01
+
+
+def capture(name: str, board: str = "b0", skin: str = "s0", gain: float = 1.0, pokes_n: int | None = None) -> Readings:
+    """Two readings a contact; a field that is linear in place and force, and drifts at rest."""
+    places = np.tile(points_mm(), (len(DEPTHS_MM) * PASSES_N, 1))[:pokes_n]
+    depth_mm = np.tile(np.repeat(DEPTHS_MM, 65), PASSES_N)[:pokes_n]
+    n = len(places)
+    target = np.repeat(np.column_stack([places, 2 * depth_mm]), 2, axis=0)
+    poke_i = np.repeat(np.arange(n, dtype=np.int32), 2)
+    mix = gain * rng_for(0, "mix").normal(0, 10, (3, 15))
+    noload_uT = 1000 + DRIFT_uT * poke_i[:, None] * np.ones(15)
+    x_mm, y_mm, Fz_N = target.T.astype(np.float32)
+    return replace(
+        readings(name, board, skin, f=2 * n), source="simulated", indentation=poke_i, n_contacts=poke_i,
+        pass_i=poke_i // 130, reading_i=np.tile(np.arange(2, dtype=np.int32), n), x_mm=x_mm, y_mm=y_mm, Fz_N=Fz_N,
+        depth_mm=np.repeat(depth_mm, 2).astype(np.float32), b_uT=(noload_uT + target @ mix).astype(np.float32),
+        noload_uT=noload_uT.astype(np.float32), t_s=EVERY_s * poke_i,
+        temperature_degC=(25 + WARMING_K_PER_s * EVERY_s * poke_i[:, None] * np.ones(5)).astype(np.float32),
+    )  # fmt: skip
+
+
+def write(folder: Path, *captures: Readings) -> Path:
+    for one in captures:
+        io.write_readings(folder / f"{one.capture}.parquet", [one], {})
+    return folder
+
+
+@pytest.fixture
+def scene(tmp_path, monkeypatch) -> dict[str, Any]:
+    """Options that both stages take: scene ci with longer trainings, which are kept in the folder of the test."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("RESKIN_EXECUTOR", "here")
+    settings = YAML(typ="safe").load((ROOT / "pipeline/scenes/ci.yaml").read_text())
+    settings["drift"]["training"]["steps_n"] = 300
+    settings["variation"]["skins_n"] = 2
+    shared = YAML(typ="safe").load((ROOT / "params.yaml").read_text())
+    item = {"scene": "ci", "captures": []}
+    stages = {"drift": {"ci": item | {"drift": {"training": {"recipe": "paper"}}}}, "variation": {"ci": item}}
+    plan = {"stages": stages}
+    shutil.copy(ROOT / "dvc.yaml", tmp_path)
+    for name, words in {"ci.yaml": settings, "params.yaml": shared, "plan.yaml": plan}.items():
+        with (tmp_path / name).open("w") as stream:
+            YAML().dump(words, stream)
+    files = Files(tmp_path / "ci.yaml", tmp_path / "params.yaml", tmp_path / "plan.yaml")
+    return {"files": files, "answer": tmp_path / "answer.json"}
+
+
+def test_a_drifting_skin_is_answered_in_every_window_and_a_single_no_load_reading_is_worst(scene, tmp_path):
+    drift(scene="ci", indentations=write(tmp_path / "wear", capture("s0-wear")), **scene)
+    answer = io.read_json(scene["answer"])
+    numbers = answer["numbers"]
+    assert {name: numbers[name] for name in ("skins_n", "seeds_n", "train_n", "left_out_units_n")} == {
+        "skins_n": 1, "seeds_n": 1, "train_n": 100, "left_out_units_n": 0,
+    }  # fmt: skip
+    for policy in ("initial", "regular", "each"):
+        assert [row["contacts_n"] for row in numbers[policy]] == [100, 200, 300]
+    # As read nothing of the drift is left; a single reading is off by it, a regular one by up to 20 contacts of it.
+    off_uT = {policy: numbers[policy][-1]["noload_off_uT"] for policy in ("initial", "regular", "each")}
+    assert off_uT["each"] == 0
+    assert off_uT["initial"] == pytest.approx(DRIFT_uT * np.sqrt(np.mean(np.arange(300, 330) ** 2.0)), rel=1e-3)
+    ranks = np.arange(300, 330) % 20
+    assert off_uT["regular"] == pytest.approx(DRIFT_uT * np.sqrt(np.mean(ranks**2.0)), rel=1e-3)
+    last = {policy: numbers[policy][-1]["mse_xy_mm2"] for policy in off_uT}
+    assert last["initial"] > 2 * max(last["regular"], last["each"])
+    assert numbers["late"]["force_left_pct"] == pytest.approx(100)  # this skin does not soften
+    assert numbers["late"]["indentations_n"] == len(answer["drawn"]["late"]["true_N"]) == 30
+    assert len(numbers["late"]["network_bias_N"]) == 1
+    assert {one["verdict"] for one in numbers["findings"]} == {"inconclusive (one board)"}
+    assert {one["of_trainings"] for one in numbers["findings"]} == {"inconclusive"}  # one network each
+    # Whatever is subtracted under a policy, a contact changes the field by what a reading before it shows.
+    db_uT = capture("s0-wear").b_uT - capture("s0-wear").noload_uT
+    assert numbers["field"]["contact_uT"] == pytest.approx(np.sqrt(np.mean(db_uT.astype(float) ** 2)), rel=1e-6)
+    assert numbers["contact_every_s"] == pytest.approx(EVERY_s)
+    assert numbers["lasts_s"] == pytest.approx(389 * EVERY_s)
+    assert len(numbers["findings"]) == 4
+    assert set(drift_pages.tables(numbers, "simulated")) == {"drift", "drift_findings"}
+    assert set(drift_pages.figures(numbers, answer["drawn"], "simulated")) == {"drift.svg", "drift_force.svg"}
+
+
+@pytest.mark.parametrize(
+    ("captures", "sentence"),
+    [
+        ([capture("c0"), capture("c1")], "the captures of skin s0 must be one, as no clock orders several"),
+        (
+            [capture("c0", pokes_n=129)],
+            "the shortest capture must be at least drift.every_n . test_n = 130 long; got 129",
+        ),
+    ],
+)
+def test_what_has_no_order_or_no_window_is_refused_before_anything_is_trained(scene, tmp_path, captures, sentence):
+    with pytest.raises(ParamsError, match=sentence):
+        drift(scene="ci", indentations=write(tmp_path / "wear", *captures), **scene)
+    assert not (tmp_path / ".reskin").exists()
+
+
+def test_variation_finds_the_drift_in_what_is_read_and_the_gain_between_skins(scene, tmp_path):
+    worn = write(tmp_path / "wear", capture("s0-wear"))
+    main = write(
+        tmp_path / "main", capture("s0"), capture("s1", "b1", "s1", gain=1.5), capture("s2", "b0", "s2", gain=9)
+    )
+    variation(scene="ci", main=main, indentations=worn, **scene)
+    answer = io.read_json(scene["answer"])
+    assert answer["numbers"]["contact_every_s"] == pytest.approx(EVERY_s)
+    assert answer["numbers"]["shown_s"] == pytest.approx(199 * EVERY_s)  # the first 200 contacts
+    assert answer["numbers"]["warmer_K"] == pytest.approx(199 * EVERY_s * WARMING_K_PER_s, rel=1e-4)  # float32 degrees
+    for place in answer["numbers"]["places"]:
+        assert place["time"]["visits_n"] == 2  # of three, in the first 200 contacts
+        assert place["time"]["raw_change_uT"] == pytest.approx(DRIFT_uT * 130, rel=1e-3)
+        assert place["time"]["db_change_uT"] < 1e-3  # float32 fields of 1000 uT
+        assert place["skins"]["skins"] == ["s0", "s1"]  # the first of each board
+        # Two skins, one 1.5 times the other: half of the weaker's field, over the rms of both.
+        assert place["skins"]["spread_pct"] == pytest.approx(100 * 0.5 / np.sqrt((1 + 1.5**2) / 2), rel=1e-4)
+    assert set(variation_pages.figures(answer["numbers"], answer["drawn"], "simulated")) == {
+        "variation_time.svg", "variation_skins.svg",
+    }  # fmt: skip
+    assert len(variation_pages.tables(answer["numbers"], "simulated")["variation"]) == 6

@@ -1,0 +1,142 @@
+"""Networks before and after: the bias is what was added, differences are of equal skins, and the hand has a price."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.core.seeds import rng_for
+from pipeline.evaluation.metrics import score, score_groups
+from pipeline.evaluation.scores import by_skin, interval, paired, tidy
+from pipeline.experiments.flexible.run import (
+    DRAWN_N,
+    answer_flexible,
+    by_depth,
+    forces_drawn,
+    gap_less_pct,
+    strength_ratio,
+)  # fmt: skip
+from pipeline.experiments.manual.run import GRID, answer_manual
+from pipeline.trials.arms import AFTER, BEFORE, CONTROL, Answered, bias, biases, compare_arms, summarise_arms
+from tests.evaluation.cards import card
+
+SINGLE = 1e-4  # sums of single-precision forces of some newtons
+
+
+BOARD = {"s0": "b0", "s1": "b0", "s2": "b1"}
+
+
+def truth(skin: str, f: int = 30) -> np.ndarray:
+    return rng_for(0, "truth", skin).uniform([0, 0, 0.2], [16, 16, 3], (f, 3)).astype(np.float32)
+
+
+def answered(arm: str, skin: str, seed_i: int, spread: float = 1.0) -> Answered:
+    true = truth(skin)
+    noise = rng_for(0, arm, skin, seed_i).normal(0, spread, true.shape)
+    return Answered(arm, BOARD[skin], skin, seed_i, true, (true + noise).astype(np.float32))
+
+
+ANSWERS = [
+    answered(arm, skin, seed_i, spread)
+    for arm, spread in ((BEFORE, 1.0), (AFTER, 0.5), (CONTROL, 1.0), (GRID, 0.3))
+    for skin in ("s0", "s1", "s2") for seed_i in (0, 1)
+]  # fmt: skip
+
+
+@given(st.floats(-2, 2))
+def test_the_bias_is_what_was_added_to_every_force(over_N):
+    true = truth("s0")
+    found = bias(true, true + np.array([5, -5, over_N], np.float32))
+    assert found["bias_f_N"] == pytest.approx(over_N, abs=SINGLE)
+    assert found["bias_f_pct"] == pytest.approx(100 * over_N / true[:, 2].mean(), abs=100 * SINGLE)
+
+
+def test_forces_half_as_large_again_are_a_bias_of_fifty_percent_in_each_arm_by_itself():
+    true = truth("s0")
+    answers = [
+        Answered(BEFORE, "b0", "s0", 0, true, true * np.float32(1.5)),
+        Answered(AFTER, "b0", "s0", 0, true, true),
+    ]
+    assert biases(answers)["bias_f_pct"][BEFORE]["mean"] == pytest.approx(50, abs=100 * SINGLE)
+    assert biases(answers)["bias_f_N"][AFTER]["mean"] == 0
+
+
+def test_each_board_counts_once_as_the_mean_of_its_skins_and_each_skin_as_that_of_its_seeds():
+    own = [one for one in ANSWERS if one.arm == AFTER]
+    skins = {
+        skin: np.mean([score(one.true, one.predicted)["mse_xy_mm2"] for one in own if one.skin == skin])
+        for skin in BOARD
+    }
+    boards = [(skins["s0"] + skins["s1"]) / 2, skins["s2"]]
+    ours = summarise_arms(ANSWERS)[AFTER]["mse_xy_mm2"]
+    assert ours["mean"] == pytest.approx(np.mean(boards))
+    assert ours["ci95"] == pytest.approx(interval(boards))
+    assert ours["n"] == 2
+
+
+def test_differences_are_those_of_the_summary_of_cards():
+    cards = {
+        arm: [
+            card("adapt", a.board, score_groups(a.true, a.predicted, np.full(30, a.board), np.full(30, a.skin)))
+            for a in ANSWERS if a.arm == arm
+        ]
+        for arm in (BEFORE, AFTER)
+    }  # fmt: skip
+    of, over = (by_skin(tidy(cards[arm])) for arm in (AFTER, BEFORE))
+    assert compare_arms(ANSWERS, AFTER, BEFORE) == paired(of, over)
+
+
+def test_adaptation_by_hand_is_told_with_its_counts_its_control_and_its_price():
+    answer = answer_manual(ANSWERS, pokes_n=[325, 324, 325], lines_n=[13, 13, 13])
+    counts = ("pokes_n", "lines_n", "skins_n", "boards_n", "seeds_n")
+    assert {name: answer[name] for name in counts} == dict(zip(counts, (325, 13, 3, 2, 2), strict=True))
+    for other in (BEFORE, CONTROL, GRID):
+        difference = answer["paired"][f"after_minus_{other}"]["accuracy_pct"]["mean"]
+        after, before = (answer[arm]["accuracy_pct"]["mean"] for arm in (AFTER, other))
+        assert difference == pytest.approx(after - before)
+
+
+def test_without_a_control_no_difference_to_it_is_told():
+    answer = answer_manual([one for one in ANSWERS if one.arm != CONTROL], pokes_n=[3], lines_n=[1])
+    assert CONTROL not in answer
+    assert "after_minus_control" not in answer["paired"]
+
+
+@given(st.floats(0.5, 3))
+def test_fields_so_many_times_as_strong_are_told_as_that_ratio_at_every_depth(ratio):
+    rng = rng_for(1, "fields")
+    depth_mm = np.tile(np.array([0.2, 0.8, 1.2], np.float32), 20)
+    db_uT = rng.normal(0, 50, (60, 15)).astype(np.float32)
+    rigid, flexible = by_depth(depth_mm, db_uT), by_depth(depth_mm + np.float32(1e-4), db_uT * np.float32(ratio))
+    found = strength_ratio([flexible], [rigid])
+    assert found["mean"] == pytest.approx(ratio, rel=SINGLE)
+    assert found["sd"] == pytest.approx(0, abs=SINGLE)
+    assert found["n"] == 3
+
+
+def test_depths_that_only_one_kind_of_board_has_are_not_compared():
+    one, other = ({d: np.array([float(i + d)]) for d in depths} for i, depths in ((1, (0.2, 0.4)), (3, (0.4, 0.6))))
+    assert strength_ratio([one], [other]) == {"mean": pytest.approx(1.4 / 3.4), "n": 1}
+
+
+def test_the_figure_shows_equal_readings_of_both_arms_and_no_more_than_are_seen():
+    many = [Answered(arm, "b0", "s0", 0, truth("s0", 900), truth("s0", 900)) for arm in (BEFORE, AFTER)]
+    drawn = forces_drawn(many, rng_for(0, "drawn"))
+    assert drawn[BEFORE]["true_N"] == drawn[AFTER]["true_N"] == drawn[AFTER]["predicted_N"]
+    assert len(drawn[BEFORE]["true_N"]) == DRAWN_N
+    assert set(np.round(truth("s0", 900)[:, 2].astype(float), 3)) >= set(drawn[BEFORE]["true_N"])
+
+
+def test_flexible_numbers_hold_every_arm_and_its_bias():
+    answer = answer_flexible(ANSWERS)
+    assert set(answer["bias_f_N"]) == {BEFORE, AFTER, CONTROL, GRID} < set(answer)
+
+
+def test_a_gap_of_a_fifth_is_80_percent_less():
+    assert gap_less_pct({"rigid": 2.0, "flexible": 0.4}) == pytest.approx(80.0)
+
+
+@given(rigid=st.floats(0.1, 10), share=st.floats(0, 3), unit=st.floats(0.01, 100))
+def test_it_is_a_share_whatever_the_unit(rigid, share, unit):
+    found = gap_less_pct({"rigid": unit * rigid, "flexible": unit * share * rigid})
+    assert found == pytest.approx(100 * (1 - share), abs=1e-9)  # rounding

@@ -1,0 +1,39 @@
+"""What every experiment's stage reads and writes: its captures, its numbers, what figures draw, and what was lost."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from pipeline.core import io
+from pipeline.core.errors import SchemaError
+from pipeline.experiments.answer import only, read_losses, write_answer
+from tests.dataset import tables
+
+
+def test_every_capture_of_the_folder_is_accounted_for_beside_what_rows_lost(tmp_path):
+    for i in range(2):
+        account = {"bytes_n": 82 * (i + 1), "skipped_resync_bytes_n": i}
+        io.write_readings(tmp_path / f"b{i}_s0-wear.parquet", [tables.readings()], account)
+    losses = read_losses(tmp_path, {"low_force_rows_n": 3})
+    assert [account["bytes_n"] for account in losses["accounts"]] == [82, 164]
+    assert [account["skipped_resync_bytes_n"] for account in losses["accounts"]] == [0, 1]
+    assert losses["left_out"] == {"low_force_rows_n": 3}
+
+
+def test_an_answer_about_the_main_captures_counts_none_of_its_own(tmp_path):
+    write_answer(tmp_path / "contacts.json", {"pairs_n": 3}, {"along": [1.0]})
+    written = json.loads((tmp_path / "contacts.json").read_text())
+    assert written["losses"] == {"accounts": [], "left_out": {}}
+    assert (written["numbers"], written["drawn"]) == ({"pairs_n": 3}, {"along": [1.0]})
+
+
+def test_the_one_capture_of_a_folder_is_given():
+    assert only(["b0_s0-glass"], Path("ci-glass")) == "b0_s0-glass"
+
+
+@pytest.mark.parametrize("captures", [[], ["b0_s0-glass", "b1_s0-glass"]])
+def test_none_or_several_captures_are_refused_and_counted(captures):
+    with pytest.raises(SchemaError, match=f"ci-glass: captures must be one, as .*; got {len(captures)}. Ask its") as no:
+        only(captures, Path("ci-glass"))
+    assert "\n" not in str(no.value)

@@ -1,0 +1,149 @@
+"""Places on a large skin against scikit-learn and plain loops; what is held out, borders and rates as laws."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from sklearn.metrics import mean_squared_error
+
+from pipeline.core.errors import ParamsError
+from pipeline.core.schema import Readings
+from pipeline.core.seeds import rng_for
+from pipeline.dataset.rows import Rows
+from pipeline.experiments.sleeve.run import (
+    NEAR_MM,
+    Area,
+    errors_mm,
+    hold_out_last,
+    lay_out,
+    over_seeds,
+    rate_hz,
+    score_places,
+    to_draw,
+)
+
+CROSS_MM = [(x + a, y + b) for y in (-38.1, -12.7, 12.7, 38.1) for x in (-12.7, 12.7) for a, b in ((0, 0), (7, 0))]
+AREA = lay_out((50.8, 101.6), CROSS_MM, boards_n=(2, 4), pitch_mm=25.4)
+SIDES_MM = np.array(AREA.sides_mm)
+
+
+def rows_of(*pokes_n, readings_n=3):
+    """Rows of captures c0, c1, ..., each of so many indentations."""
+    capture = np.repeat([f"c{i}" for i in range(len(pokes_n))], [readings_n * n for n in pokes_n])
+    f = len(capture)
+    empty, who = np.zeros((f, 3), np.float32), np.array(["b0"] * f)
+    indentation = np.repeat(np.arange(sum(pokes_n)), readings_n)
+    return Rows(capture, who, who, empty, empty, np.zeros(f, np.int32), indentation, {})
+
+
+def answered(seed=0, n=60, wrong_mm=1.0):
+    """True and predicted x, y, F of n indentations of three readings, and the number of each one's indentation."""
+    rng = rng_for(seed, "answers")
+    true = np.repeat(np.column_stack([rng.uniform((4, 4), SIDES_MM - 4, (n, 2)), rng.uniform(0, 3, n)]), 3, axis=0)
+    return true, true + wrong_mm * rng.standard_normal(true.shape), np.repeat(np.arange(n), 3)
+
+
+def readings_of(t_s, indentation, reading_i):
+    f = len(t_s)
+    column, empty = np.zeros(f, np.float32), np.zeros((f, 3), np.float32)
+    return Readings(
+        capture="c0", board="v0", skin="v0_s0", source="simulated", indentation=np.array(indentation, np.int32),
+        pass_i=np.zeros(f, np.int32), reading_i=np.array(reading_i, np.int32), x_mm=column, y_mm=column,
+        depth_mm=column, Fx_N=column, Fy_N=column, Fz_N=column, b_uT=empty, noload_uT=empty,
+        temperature_degC=column[:, None], t_s=np.array(t_s, np.float64), n_contacts=np.zeros(f, np.int32),
+    )  # fmt: skip
+
+
+def test_two_rows_of_four_boards_of_an_inch_have_one_border_along_and_three_across():
+    assert AREA.borders_mm[0] == pytest.approx((25.4,))
+    assert AREA.borders_mm[1] == pytest.approx((25.4, 50.8, 76.2))
+    np.testing.assert_allclose(AREA.chips_mm[:2], [(12.7, 12.7), (19.7, 12.7)])  # the middle and the right of board 0
+    np.testing.assert_allclose(AREA.chips_mm[-2:], [(38.1, 88.9), (45.1, 88.9)])
+
+
+def test_one_board_has_no_border():
+    assert lay_out((20.0, 20.0), [(0.0, 0.0)], boards_n=(1, 1), pitch_mm=0.0).borders_mm == ((), ())
+
+
+@given(st.floats(0, 50.8), st.floats(0, 101.6))
+def test_near_a_border_is_nearer_than_the_limit_to_any_of_them(x_mm, y_mm):
+    to_border_mm = min(abs(x_mm - 25.4), *(abs(y_mm - border_mm) for border_mm in AREA.borders_mm[1]))
+    assert AREA.near_border(np.array([[x_mm, y_mm]]))[0] == (to_border_mm < NEAR_MM)
+
+
+@given(st.lists(st.integers(6, 40), min_size=1, max_size=3), st.floats(0.1, 0.9))
+def test_the_last_indentations_of_each_capture_are_held_out_whole(pokes_n, test_fraction):
+    rows = rows_of(*pokes_n)
+    train, test = hold_out_last(rows, test_fraction)
+    np.testing.assert_array_equal(np.sort(np.concatenate([train, test])), np.arange(len(rows)))
+    for i, n in enumerate(pokes_n):
+        first, last = (np.unique(rows.indentation[part][rows.capture[part] == f"c{i}"]) for part in (train, test))
+        assert first.max() < last.min()
+        assert len(last) == round(test_fraction * n)
+
+
+@pytest.mark.parametrize("test_fraction", [0.05, 0.99])
+def test_a_side_without_indentations_is_refused(test_fraction):
+    with pytest.raises(ParamsError, match="indentations held out must be one or more, and not all"):
+        hold_out_last(rows_of(9), test_fraction)
+
+
+@given(st.floats(10, 400), st.floats(0, 1e3))
+def test_the_rate_is_that_of_readings_within_an_indentation_whatever_lies_between(rate, pause_s):
+    t_s = np.concatenate([np.arange(5), 5 + rate * pause_s + np.arange(5)]) / rate
+    reading_i = [0, 1, 2, 3, 4] * 2
+    found_hz = rate_hz([readings_of(t_s, [0] * 5 + [1] * 5, reading_i)])
+    assert found_hz == pytest.approx(rate, rel=1e-6)  # 1e3 s in double precision, over steps of 2.5 ms: 1e-10
+
+
+def test_a_rate_of_single_readings_is_refused():
+    with pytest.raises(ParamsError, match="readings must be two or more an indentation"):
+        rate_hz([readings_of([0.0, 1.0], [0, 1], [0, 0])])
+
+
+def test_scores_are_what_scikit_learn_and_a_loop_over_readings_give():
+    true, predicted, indentation = answered()
+    scored = score_places(true, [predicted], indentation, AREA)
+    far_mm = [np.hypot(p[0] - t[0], p[1] - t[1]) for t, p in zip(true, predicted, strict=True)]
+    assert scored["mse_xy_mm2"]["mean"] == pytest.approx(mean_squared_error(true[:, :2], predicted[:, :2]))
+    assert scored["mse_f_N2"]["mean"] == pytest.approx(mean_squared_error(true[:, 2], predicted[:, 2]))
+    assert scored["median_error_mm"]["mean"] == pytest.approx(np.sort(far_mm)[89:91].mean())  # of 180
+    assert scored["p95_error_mm"]["mean"] == pytest.approx(np.quantile(far_mm, 0.95))
+    near = [far for far, one in zip(far_mm, true, strict=True) if AREA.near_border(one[None, :2])[0]]
+    assert scored["near_seam"]["median_error_mm"]["mean"] == pytest.approx(np.median(near))
+    assert 3 * scored["near_seam"]["pokes_n"] == len(near)
+    assert scored["near_seam"]["pokes_n"] + scored["inside"]["pokes_n"] == 60
+
+
+@given(st.floats(0, 20), st.integers(0, 100))
+def test_an_answer_that_is_off_by_one_step_everywhere_is_off_by_that_in_every_number(off_mm, seed):
+    true, _, indentation = answered(seed)
+    scored = score_places(true, [true + (0.6 * off_mm, -0.8 * off_mm, 0.0)], indentation, AREA)
+    for part in (scored, scored["near_seam"], scored["inside"]):
+        assert part["median_error_mm"]["mean"] == pytest.approx(off_mm, abs=1e-9)
+    assert scored["p95_error_mm"]["mean"] == pytest.approx(off_mm, abs=1e-9)
+
+
+def test_without_a_poke_near_a_border_nothing_is_said_of_borders():
+    alone = lay_out((50.8, 101.6), [(0.0, 0.0)], boards_n=(1, 1), pitch_mm=0.0)
+    true, predicted, indentation = answered()
+    scored = score_places(true, [predicted], indentation, alone)
+    assert "near_seam" not in scored
+    assert scored["inside"]["pokes_n"] == 60
+
+
+def test_over_seeds_there_is_a_mean_and_from_two_on_a_deviation():
+    assert over_seeds([{"a": 1.0}]) == {"a": {"mean": 1.0, "n": 1}}
+    two = over_seeds([{"a": 1.0}, {"a": 3.0}])["a"]
+    assert (two["mean"], two["n"], two["sd"]) == (2.0, 2, pytest.approx(np.sqrt(2)))
+
+
+def test_each_tested_indentation_is_drawn_once_with_the_mean_error_of_its_readings():
+    true, predicted, indentation = answered(n=20)
+    order = rng_for(0, "order").permutation(60)
+    drawn = to_draw(AREA, true[order], errors_mm(true, predicted)[order], indentation[order])
+    np.testing.assert_allclose(drawn["x_mm"], true[::3, 0], atol=0.0051)  # rounded to 0.01 mm
+    np.testing.assert_allclose(drawn["error_mm"], errors_mm(true, predicted).reshape(20, 3).mean(axis=1), atol=0.0051)
+    assert len(drawn["chips_x_mm"]) == len(CROSS_MM)
+    assert (drawn["borders_x_mm"], drawn["area_mm"]) == ([pytest.approx(25.4)], [50.8, 101.6])
+    assert isinstance(AREA, Area)

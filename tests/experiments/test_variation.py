@@ -1,0 +1,111 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.core.errors import ParamsError
+from pipeline.core.seeds import rng_for
+from pipeline.experiments.variation.run import (
+    LINES_MAX_N,
+    Visits,
+    find_visits,
+    first_of_each_board,
+    over_skins,
+    over_time,
+)
+from tests.dataset.tables import readings
+
+
+def capture(passes_n: int = 4):
+    """Passes over three places at two depths, two readings a contact, fields at random."""
+    stops = [(x_mm, depth_mm) for _ in range(passes_n) for depth_mm in (0.6, 1.2) for x_mm in (0, 2, 4)]
+    x_mm, depth_mm = np.repeat(np.array(stops, np.float32), 2, axis=0).T
+    f = len(x_mm)
+    rng = rng_for(0, "visits")
+    return readings(
+        f=f, x_mm=x_mm, depth_mm=depth_mm, indentation=np.arange(f, dtype=np.int32) // 2,
+        n_contacts=np.arange(f, dtype=np.int32) // 2, b_uT=rng.normal(0, 100, (f, 3)).astype(np.float32),
+        noload_uT=rng.normal(0, 100, (f, 3)).astype(np.float32),
+    )  # fmt: skip
+
+
+def visits(b_uT: list, db_uT: list, contacts_n: list | None = None) -> Visits:
+    counted = np.array(contacts_n or range(len(b_uT)), np.int32)
+    return Visits(counted, np.array(b_uT, float), np.array(db_uT, float))
+
+
+def test_visits_are_what_a_loop_over_readings_finds():
+    one = capture()
+    found = find_visits(one, (2.0, 2.0), 1.2)
+    naive: dict[int, list[np.ndarray]] = {}
+    for i in range(len(one)):
+        if one.x_mm[i] == 2 and abs(one.depth_mm[i] - 1.2) < 1e-6:
+            naive.setdefault(int(one.n_contacts[i]), []).append(np.stack([one.b_uT[i], one.b_uT[i] - one.noload_uT[i]]))
+    assert found.contacts_n.tolist() == list(naive) == [4, 10, 16, 22]
+    expected = np.array([np.mean(pair, axis=0) for pair in naive.values()])
+    # float32 fields of 100 uT carry 1e-5 each
+    np.testing.assert_allclose(found.b_uT, expected[:, 0], atol=1e-4)
+    np.testing.assert_allclose(found.db_uT, expected[:, 1], atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("place_mm", "depth_mm", "listed"),
+    [
+        ((2.0, 2.0), 0.9, "Visited depths there: 0.6, 1.2 mm"),
+        ((3.0, 2.0), 1.2, "3 places, among them 0, 2; 2, 2; 4, 2"),
+    ],
+)
+def test_a_place_that_was_never_visited_is_refused_with_what_was(place_mm, depth_mm, listed):
+    with pytest.raises(ParamsError, match=listed) as caught:
+        find_visits(capture(), place_mm, depth_mm)
+    assert "\n" not in str(caught.value)
+
+
+def test_change_over_time_is_of_the_last_visit_among_the_first_contacts():
+    own = visits([[0, 0], [9, 9], [3, -1], [50, 50]], [[2, 2], [8, 8], [2, 4], [99, 99]], [7, 8, 9, 17])
+    numbers, drawn = over_time(own, 10)
+    assert numbers == {
+        "visits_n": 3, "contacts_n": 2, "first_db_uT": 2.0,
+        "raw_change_uT": pytest.approx(5**0.5), "raw_change_pct": pytest.approx(50 * 5**0.5),
+        "db_change_uT": pytest.approx(2**0.5), "db_change_pct": pytest.approx(50 * 2**0.5),
+    }  # fmt: skip
+    assert drawn == {"contacts_n": [7, 8, 9], "b_uT": [[0, 0], [9, 9], [3, -1]]}
+
+
+def test_of_many_visits_some_are_drawn_first_and_last_among_them():
+    _, drawn = over_time(visits([[i] for i in range(500)], [[1]] * 500), 10_000)
+    assert len(drawn["contacts_n"]) == LINES_MAX_N
+    assert (drawn["contacts_n"][0], drawn["contacts_n"][-1]) == (0, 499)
+
+
+@given(st.floats(-500, 500), st.floats(0.5, 3))
+def test_a_field_at_rest_that_drifts_changes_what_is_read_and_not_what_a_model_sees(drift_uT, scale):
+    db_uT = np.tile(rng_for(0, "db").normal(0, 100, (1, 6)), (5, 1))
+    rest_uT = drift_uT * np.arange(5)[:, None]
+    numbers, _ = over_time(Visits(np.arange(5), db_uT + rest_uT, scale * db_uT), 100)
+    assert numbers["raw_change_uT"] == pytest.approx(4 * abs(drift_uT), abs=1e-9)
+    assert numbers["db_change_uT"] == 0
+
+
+def test_spread_between_skins_is_the_rms_over_all_pairs_and_channels():
+    lines = {"s0": [1.0, 2.0], "s1": [4.0, 2.0], "s2": [1.0, 8.0]}
+    numbers, drawn = over_skins({skin: visits([line] * 2, [line] * 2) for skin, line in lines.items()})
+    pairs = [(one, other) for one in lines for other in lines if one < other]
+    squares = [(a - b) ** 2 for one, other in pairs for a, b in zip(lines[one], lines[other], strict=True)]
+    size_uT = np.sqrt(np.mean([value**2 for line in lines.values() for value in line]))
+    assert numbers["spread_uT"] == pytest.approx(np.sqrt(np.mean(squares)))
+    assert numbers["spread_pct"] == pytest.approx(100 * np.sqrt(np.mean(squares)) / size_uT)
+    assert drawn == lines
+
+
+def test_a_line_is_the_mean_over_a_skins_visits_and_one_skin_has_no_spread():
+    numbers, drawn = over_skins({"s0": visits([[0, 0]] * 2, [[1, 2], [3, 6]])})
+    assert drawn == {"s0": [2, 4]}
+    assert "spread_uT" not in numbers
+
+
+def test_the_first_skin_of_each_board_comes_before_the_second_of_any():
+    boards = {"b0_s0": "b0", "b0_s1": "b0", "b1_s0": "b1", "b2_s0": "b2", "b2_s1": "b2"}
+    assert first_of_each_board(boards, 4) == ["b0_s0", "b1_s0", "b2_s0", "b0_s1"]
+    with pytest.raises(ParamsError, match="at most the 5 skins of the main captures; got 6"):
+        first_of_each_board(boards, 6)
