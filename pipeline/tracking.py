@@ -183,7 +183,7 @@ def _publish_curve(diary: Diary, stage: str, points: Sequence[tuple[str, int, Ma
     return key
 
 
-def _log(client: Any, run_id: str, rows: Iterable[tuple[str, float, int]]) -> None:
+def _log(client: Any, run_id: str, rows: Iterable[tuple[str, int | float, int]]) -> None:
     from mlflow.entities import Metric
 
     metrics = [Metric(name, value, 0, step) for name, value, step in rows]
