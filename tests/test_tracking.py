@@ -48,11 +48,12 @@ def dead_address() -> str:
 def write_model(models: Path, name: str, key: str, accuracy_pct: float = 50.0) -> None:
     card = {
         "scene": "ci", "question": "lobo", "recipe_name": "paper", "fold": name, "git": "abc", "key": key, "seed": 1,
-        "seed_i": 0, "recipe": {"steps_n": 3}, "train_rows_n": 4, "train_boards": ["b1"], "test_boards": ["b0"],
+        "seed_i": 0, "recipe": {"steps_n": 3, "inputs": "raw", "architecture": "paper"}, "train_rows_n": 4,
+        "train_skins": ["b1_s0"], "train_boards": ["b1"], "test_boards": ["b0"],
         "test_skins": ["s0"],
         "curve": [3.0, 2.0, 1.0],
         "scores": {"all": {"accuracy_pct": accuracy_pct}, "registered": {"accuracy_pct": 60.0},
-                   "by_skin": {}, "board_of": {}},
+                   "by_skin": {}, "board_of": {}, "rows_n": 4},
     }  # fmt: skip
     io.write_json(models / f"{name}.json", card)
     io.write_tensors(models / f"{name}.safetensors", {"weights.a": np.zeros(2, np.float32)}, {})
