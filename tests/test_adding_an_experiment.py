@@ -171,15 +171,20 @@ def test_a_new_figure_of_an_experiment_runs_the_report(root, before):
 
 
 def test_words_in_the_code_of_learning_change_no_key_of_a_training_and_code_does(tmp_path, monkeypatch):
-    monkeypatch.setattr(trial, "__file__", str(tmp_path / "trial.py"))
-    sources = {name: (ROOT / f"pipeline/learning/{name}.py").read_text() for name in DECIDING}
+    files = {name: f"{name.replace('.', '/')}.py" for name in DECIDING}
+    sources = {name: (ROOT / "pipeline" / file).read_text() for name, file in files.items()}
+    monkeypatch.setattr(trial, "__file__", str(tmp_path / "learning/trial.py"))
+    for folder in ("core", "learning"):
+        (tmp_path / folder).mkdir()
 
     def key(sources: dict[str, str]) -> str:
         for name, text in sources.items():
-            (tmp_path / f"{name}.py").write_text(text)
+            (tmp_path / files[name]).write_text(text)
         trial._code_digest.cache_clear()
         return Keys(measured()).key(pooled())
 
     told = {name: "# More.\n" + text.replace('"""', '"""More. ', 1) for name, text in sources.items()}
-    assert key(told) == key(sources) != key(sources | {"losses": sources["losses"] + "\nWEIGHT = 1.0\n"})
+    assert (
+        key(told) == key(sources) != key(sources | {"learning.train": sources["learning.train"] + "\nWEIGHT = 1.0\n"})
+    )
     trial._code_digest.cache_clear()

@@ -9,7 +9,7 @@ import torch
 from pipeline.dataset import splits
 from pipeline.experiments.stability import learning
 from pipeline.experiments.stability.learning import fold_cases, learning_cases, loop_cases, scaling_cases, triplet_cases
-from pipeline.learning import feed, model, stack, standardise, train, triplets
+from pipeline.learning import feed, inputs, model, train, triplets
 
 SEED = 2021
 DIVERGES = "bottleneck scaled 1e3, learning rate 10"
@@ -45,13 +45,13 @@ def test_the_same_seed_gives_the_same_words(cases):
 @pytest.mark.filterwarnings("ignore:invalid value encountered")
 @pytest.mark.filterwarnings("ignore:divide by zero encountered")
 def test_a_scale_without_a_floor_is_found_out(monkeypatch):
-    monkeypatch.setattr(standardise, "SCALE_FLOOR", np.float32(0))
+    monkeypatch.setattr(inputs, "SCALE_FLOOR", np.float32(0))
     constant = {"a channel that never moves", "no channel ever moves, as without a magnet"}
     assert broken(scaling_cases(SEED)) == constant
 
 
 def test_a_floor_so_high_that_labels_stay_small_is_found_out(monkeypatch):
-    monkeypatch.setattr(standardise, "SCALE_FLOOR", np.float32(1e-3))
+    monkeypatch.setattr(inputs, "SCALE_FLOOR", np.float32(1e-3))
     assert broken(scaling_cases(SEED)) == {"labels times 2^-20"}
 
 
@@ -65,7 +65,7 @@ def test_a_triplet_loss_of_roots_is_found_out(monkeypatch):
 
 
 def test_a_sampler_that_takes_ties_is_found_out(monkeypatch):
-    monkeypatch.setattr(triplets, "_tells", lambda place: np.ones(len(place), bool))
+    monkeypatch.setattr(triplets, "_anchors", lambda place: np.ones(len(place), bool))
     monkeypatch.setattr(feed, "draw_pairs", lambda points, anchor, rng: (anchor, anchor))
     assert broken(triplet_cases(SEED)) == {"two pokes a skin: from each, only the other one"}
 
@@ -94,13 +94,13 @@ def test_a_network_that_touches_its_neighbour_is_found_out(monkeypatch):
 
 
 def test_a_batch_that_ignores_the_seed_is_found_out(monkeypatch):
-    right = stack.make_job
+    right = train.make_job
 
     def of_no_seed(trial, rows):
         job, scaler = right(replace(trial, seed_i=0), rows)
         return job, scaler
 
-    monkeypatch.setattr(stack, "make_job", of_no_seed)
+    monkeypatch.setattr(train, "make_job", of_no_seed)
     assert broken(loop_cases(SEED)) - {DIVERGES} == {"trained twice from one seed"}
 
 

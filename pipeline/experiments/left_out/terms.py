@@ -89,12 +89,14 @@ def _subject(of: Synthesis, seed: int) -> Subject:
     kind, (board, skin) = of.main_boards, roster(of, MAIN)[0]
     plan = of.main.plan(rng_for(seed, "left out"), kind.skin_mm)
     tip_mm = np.stack([plan.x_mm - CENTRE_MM, plan.y_mm - CENTRE_MM, plan.depth_mm], axis=2)
-    full, coarse = (
-        draw_skin(of.skin, of.spreads, seed=seed, name=skin, rule=rule)
-        for rule in (kind.quadrature.quadrature(), COARSE)
+    return Subject(
+        draw_board(kind.design, of.spreads, seed=seed, name=board),
+        draw_skin(of.skin, of.spreads, seed=seed, name=skin, rule=kind.quadrature.quadrature()),
+        draw_skin(of.skin, of.spreads, seed=seed, name=skin, rule=COARSE),
+        plan,
+        tip_mm * milli,
+        of.main.terms,
     )
-    drawn = draw_board(kind.design, of.spreads, seed=seed, name=board)
-    return Subject(drawn, full, coarse, plan, tip_mm * milli, of.main.terms)
 
 
 def _over_time(on: Subject, without: Response, seed: int) -> list[Omission]:
@@ -231,11 +233,10 @@ def _own_field(on: Subject, of: Synthesis) -> Omission:
     own_T = magnet_cuboid_Bfield(away_m, boxes_m, np.tile(j_T, (boxes_n, 1))).reshape(boxes_n, boxes_n, 3).sum(axis=1)
     with_own_T = magnet.magnetise(b_T + own_T - j_T, **sizes)  # B less J, mu0 H, is what acts on the powder
     pokes_m = np.array([(*place_m, float(on.tip_m[..., 2].max())) for place_m in PLACES_M])
-    bare = replace(on.skin, nodes_m=rest.nodes_m + np.append(on.skin.seat_m, 0.0))
-    changes_T = [
-        changes_of_field(on.board, replace(bare, moments_A_m2=magnet.moments(each_T, rest.volumes_m3)), pokes_m)[1]
-        for each_T in (j_T, with_own_T)
-    ]
+    nodes_m = rest.nodes_m + np.append(on.skin.seat_m, 0.0)
+    moments_A_m2 = [magnet.moments(each_T, rest.volumes_m3) for each_T in (j_T, with_own_T)]
+    skins = [replace(on.skin, nodes_m=nodes_m, moments_A_m2=each_A_m2) for each_A_m2 in moments_A_m2]
+    changes_T = [changes_of_field(on.board, skin, pokes_m)[1] for skin in skins]
     how = (
         f"{boxes_n} boxes, first order, {len(PLACES_M)} pokes; of the magnetisation {_error_pct(j_T, with_own_T):.2g} %"
     )
