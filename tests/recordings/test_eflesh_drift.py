@@ -1,5 +1,6 @@
 """Drift on a real recording: which no-load reading is subtracted decides what a network knows of later passes."""
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -28,8 +29,10 @@ def test_fresh_no_load_readings_keep_eflesh_accurate_and_a_single_one_loses_it(s
     settings = yaml.load((ROOT / "pipeline/scenes/eflesh.yaml").read_text())
     settings["drift"]["training"]["steps_n"] = 1200
     params = yaml.load((ROOT / "params.yaml").read_text())
-    stages = {"drift": {"eflesh": {"scene": "eflesh", "recipe": settings["drift"]["training"]["recipe"]}}}
-    plan = {"stages": stages | {"split": {"eflesh": {"captures": [readings.capture]}}}}
+    recipe = settings["drift"]["training"]["recipe"]
+    item = {"scene": "eflesh", "captures": [readings.capture], "drift": {"training": {"recipe": recipe}}}
+    plan = {"stages": {"drift": {"eflesh": item}}}
+    shutil.copy(ROOT / "dvc.yaml", tmp_path)
     for name, words in {"eflesh.yaml": settings, "params.yaml": params, "plan.yaml": plan}.items():
         with (tmp_path / name).open("w") as stream:
             YAML().dump(words, stream)
