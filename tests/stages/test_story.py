@@ -141,7 +141,7 @@ def test_every_row_of_the_checklist_finds_its_number_and_its_files(story):
     rows = read_rows()
     missing = [row for row in rows if row.ours and resolve(numbers, row.ours) is None]
     assert [row.id for row in missing] == ["plateau"]  # a sweep that is too short for it, and says so
-    assert all(row.asked and resolve(numbers, row.asked) is not None for row in missing)
+    assert all(row.question and resolve(numbers, row.question) is not None for row in missing)
     assert (reports / "tables/checklist.md").read_text().count(NOT_REACHED) == len(missing)
     found = [row for row in rows if row not in missing]
     assert [row.id for row in found if row.reach and resolve(numbers, row.reach.ours) is None] == []
