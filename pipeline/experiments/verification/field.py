@@ -34,15 +34,15 @@ def boxes(seed: int, side_m: float = 0.5 * milli) -> list[Check]:
     away = rng.standard_normal((2000, 3))
     away /= np.linalg.norm(away, axis=1, keepdims=True)
     places_m = side_m * away * np.geomspace(NEAR_CELLS, FAR_CELLS, len(away))[:, None]
-    inside_m = side_m * rng.uniform(-0.5, 0.5, (500, 3))
+    inside_m = side_m * rng.uniform(-0.49, 0.49, (500, 3))
     found_T, truth_T = magnet.cuboid_field(places_m, 1.0, sides_m=(side_m,) * 3), cuboid(side_m).getB(places_m)
     relative = np.linalg.norm(found_T - truth_T, axis=1) / np.linalg.norm(truth_T, axis=1)
     return [
         Check("field of a box", f"outside, {NEAR_CELLS:g}-{FAR_CELLS:g} sides away", "magpylib Cuboid",
               float(relative.max()), "1", 1e-8,
               "they cancel to (side / r)^3 of J: rounding grows 1e5-fold on the way to 50 sides"),
-        Check("field of a box", "inside, J included", "magpylib Cuboid", inside_a_box(inside_m, side_m), "1", 1e-12,
-              "rounding of 24 logarithms and arcus tangents of the size of J"),
+        Check("field of a box", "inside, J included", "magpylib Cuboid", inside_a_box(inside_m, side_m), "1", 1e-11,
+              "logarithms cancel as (side / distance to an edge)^2: eps grows 2e4-fold at 1 % of a side"),
     ]  # fmt: skip
 
 
