@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from pipeline import plan
+from pipeline.core import code
 from pipeline.core.config import find, read_yaml
-from pipeline.learning import trial
 from pipeline.learning.trial import DECIDING, Keys
 from tests.learning.trials import measured, pooled
 from tests.stages.checkout import ROOT, copy_checkout, run
@@ -25,10 +25,8 @@ STAGE = """\
         sh pipeline/run.sh repeat --scene ${item.scene}
         --indentations data/indentations/${item.folder} --answer data/answers/${item.scene}/repeat.json
       deps:
+        - data/code/repeat
         - data/indentations/${item.folder}
-        - pipeline/core
-        - pipeline/experiments/answer.py
-        - pipeline/experiments/repeat/run.py
       outs:
         - data/answers/${item.scene}/repeat.json
 
@@ -86,8 +84,13 @@ def before(root) -> dict[str, tuple[Any, ...]]:
 
 
 def state(root: Path) -> dict[str, tuple[Any, ...]]:
-    """By stage what DVC decides by: its command, its parameters, hashes of dependencies that exist; and its outputs."""
+    """By stage what DVC decides by: its command, its parameters, hashes of dependencies that exist; and its outputs.
+
+    Stage `code` has run: it follows every edit, and what it writes tells the others.
+    """
     from dvc.repo import Repo
+
+    run(root, "python", "-m", "pipeline.stages.code", "--digests", "data/code")
 
     @cache
     def words_of(path: str) -> Any:
@@ -110,6 +113,7 @@ def state(root: Path) -> dict[str, tuple[Any, ...]]:
                 [out.fs_path for out in stage.outs],
             )
             for stage in repo.index.stages
+            if stage.name != "code"
         }
 
 
@@ -170,21 +174,29 @@ def test_a_new_figure_of_an_experiment_runs_the_report(root, before):
     assert run_again(before, after) == {"report@ci", "publish@ci"}
 
 
+def test_words_in_a_module_that_every_stage_imports_run_nothing(root, before):
+    io = "pipeline/core/io.py"
+    with edited(root, {io: "# More.\n" + (root / io).read_text().replace('"""', '"""More. ', 1)}):
+        assert run_again(before, state(root)) == set()
+
+
 def test_words_in_the_code_of_learning_change_no_key_of_a_training_and_code_does(tmp_path, monkeypatch):
     files = {name: f"{name.replace('.', '/')}.py" for name in DECIDING}
-    sources = {name: (ROOT / "pipeline" / file).read_text() for name, file in files.items()}
-    monkeypatch.setattr(trial, "__file__", str(tmp_path / "learning/trial.py"))
+    sources = {name: (ROOT / file).read_text() for name, file in files.items()}
     for folder in ("core", "learning"):
-        (tmp_path / folder).mkdir()
+        (tmp_path / "pipeline" / folder).mkdir(parents=True)
+    monkeypatch.setattr(code, "ROOT", tmp_path)
 
     def key(sources: dict[str, str]) -> str:
         for name, text in sources.items():
             (tmp_path / files[name]).write_text(text)
-        trial._code_digest.cache_clear()
+        code.digest.cache_clear()
         return Keys(measured()).key(pooled())
 
     told = {name: "# More.\n" + text.replace('"""', '"""More. ', 1) for name, text in sources.items()}
     assert (
-        key(told) == key(sources) != key(sources | {"learning.train": sources["learning.train"] + "\nWEIGHT = 1.0\n"})
+        key(told)
+        == key(sources)
+        != key(sources | {"pipeline.learning.train": sources["pipeline.learning.train"] + "\nWEIGHT = 1.0\n"})
     )
-    trial._code_digest.cache_clear()
+    code.digest.cache_clear()

@@ -1,51 +1,48 @@
-"""DVC does not follow imports: these tests do, so that no edited module leaves a stage up to date."""
+"""DVC does not follow imports: stage `code` does. Every path of a command is one that DVC knows."""
 
 from pathlib import Path
 
-import grimp
 import pytest
 from ruamel.yaml import YAML
 
+from pipeline.core.code import file_of
 from pipeline.questions import EXPERIMENTS
+from pipeline.stages.code import entries, modules_of
 
 ROOT = Path(__file__).resolve().parents[1]
-STAGES = YAML(typ="safe").load((ROOT / "dvc.yaml").read_text())["stages"]
+FLOW = YAML(typ="safe").load((ROOT / "dvc.yaml").read_text())["stages"]
+STAGES = {name: stage.get("do", stage) for name, stage in FLOW.items()}
+OTHERS = sorted(STAGES.keys() - {"code"})
 
 
-@pytest.fixture(scope="module")
-def graph() -> grimp.ImportGraph:
-    return grimp.build_graph("pipeline", cache_dir=None)
+def test_stage_code_writes_what_every_other_stage_depends_on():
+    assert entries().keys() == STAGES.keys()
+    assert {name: [dep for dep in STAGES[name]["deps"] if "code/" in dep] for name in OTHERS} == {
+        name: [f"data/code/{name}"] for name in OTHERS
+    }
 
 
-def file_of(module: str) -> Path:
-    path = ROOT / module.replace(".", "/")
-    return path / "__init__.py" if path.is_dir() and (path / "__init__.py").exists() else path.with_suffix(".py")
+def test_stage_code_reads_every_module_that_a_stage_imports_and_idle_paths_are_not_named():
+    named = {ROOT / path for path in STAGES["code"]["deps"]}
+    needed = {file_of(name) for entry in entries().values() for name in modules_of(entry)}
+    homes = {next((path for path in (file, *file.parents) if path in named), file) for file in needed}
+    assert homes == named
 
 
-def code_of(stage: str, graph: grimp.ImportGraph) -> tuple[set[Path], list[Path]]:
-    """The files that a stage imports, and the paths of code that dvc.yaml names for it."""
-    module = f"pipeline.stages.{stage}"
-    if (ROOT / "pipeline/experiments" / stage).is_dir():
-        module = f"pipeline.experiments.{stage}.run"
-    listed = [ROOT / path for path in STAGES[stage]["do"]["deps"] if path.startswith("pipeline/")]
-    return {file_of(name) for name in {module, *graph.find_upstream_modules(module)}}, listed
-
-
-@pytest.mark.parametrize("name", sorted(STAGES))
-def test_a_stage_names_the_code_that_it_imports_and_no_other(name, graph):
-    needed, listed = code_of(name, graph)
-    # Packages' own __init__ files hold docstrings only, but for the table of readers.
-    missing = {
-        str(file.relative_to(ROOT)) for file in needed if not any(path in (file, *file.parents) for path in listed)
-        and not (file.name == "__init__.py" and len(file.read_text().splitlines()) <= 3)
-    }  # fmt: skip
-    assert missing == set()
-    assert [path for path in listed if not any(path in (file, *file.parents) for file in needed)] == []
+def test_a_stage_knows_the_modules_that_decide_its_results():
+    assert "pipeline.learning.train" in modules_of("pipeline.stages.train_multi")
+    assert "pipeline.learning.train" not in modules_of("pipeline.stages.simulate")
+    shown = {name for name in modules_of("pipeline.stages.report") if name.endswith(".show")}
+    assert shown == {
+        f"pipeline.experiments.{name}.show"
+        for name in entries()
+        if (ROOT / f"pipeline/experiments/{name}/show.py").exists()
+    }
 
 
 @pytest.mark.parametrize("name", sorted(STAGES))
 def test_every_path_that_a_command_takes_is_declared(name):
-    stage = STAGES[name]["do"]
+    stage = STAGES[name]
     outs = [one if isinstance(one, str) else next(iter(one)) for key in ("outs", "plots") for one in stage.get(key, [])]
     params = [next(iter(one)) for one in stage.get("params", [])]
     declared = [*stage["deps"], *outs, *params]

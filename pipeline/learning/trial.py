@@ -3,18 +3,16 @@
 Out: a `Trial`, and a key that names its result by all that decides it. Refuses to know files, processes and scores.
 """
 
-import ast
 import hashlib
 import importlib.metadata
 import json
 import sys
 from dataclasses import dataclass
-from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32, Int64, Shaped
 
+from pipeline.core.code import digest
 from pipeline.core.executors import device
 from pipeline.core.numerics import signature
 from pipeline.dataset.lines import Lines
@@ -24,9 +22,12 @@ from pipeline.learning.recipe import FineTuning, Labelling, Recipe, Schedule
 
 COLLAPSED = 0.05  # of a target's variance over a network's own training rows; sound ones explain more than 0.9
 # The modules whose code decides what a training results in (tests/learning/test_trial.py compares with imports).
-DECIDING = (
-    "core.seeds", "learning.architecture", "learning.feed", "learning.inputs", "learning.job", "learning.model",
-    "learning.train", "learning.trial", "learning.triplets",
+DECIDING = tuple(
+    f"pipeline.{name}"
+    for name in (
+        "core.seeds", "learning.architecture", "learning.feed", "learning.inputs", "learning.job", "learning.model",
+        "learning.train", "learning.trial", "learning.triplets",
+    )
 )  # fmt: skip
 LIBRARIES = ("torch", "numpy", "scipy")
 
@@ -151,7 +152,7 @@ class Keys:
             device(), *signature(), trial.fold, trial.skin, trial.recipe.model_dump_json(), trial.seed, trial.seed_i,
             trial.attempt_i,
             self._labelled(trial.train), _digest(self.rows.db_uT[trial.test]),
-            _code_digest(), *map(importlib.metadata.version, LIBRARIES), sys.platform,
+            *map(digest, DECIDING), *map(importlib.metadata.version, LIBRARIES), sys.platform,
         ]  # fmt: skip
         if trial.tuning is not None:
             decisive += [trial.tuning.start.key, trial.tuning.settings.model_dump_json()]
@@ -178,25 +179,3 @@ def _digest(*arrays: np.ndarray) -> str:
         digest.update(f"{array.dtype}{array.shape}".encode())
         digest.update(np.ascontiguousarray(array).data)
     return digest.hexdigest()[:32]
-
-
-@lru_cache(maxsize=1)
-def _code_digest() -> str:
-    package = Path(__file__).parents[1]
-    sources = ((package / f"{name.replace('.', '/')}.py").read_text(encoding="utf-8") for name in DECIDING)
-    return hashlib.sha256("".join(map(code_of, sources)).encode()).hexdigest()
-
-
-def code_of(source: str) -> str:
-    """Give a module's code without comments, docstrings and imports, which change no result by themselves.
-
-    >>> code_of("import os\\nx = 1  # metres\\n\\ndef twice(y):\\n    'Double it.'\\n    return 2 * y").split("\\n")
-    ['x = 1', '', 'def twice(y):', '    return 2 * y']
-    """
-    tree = ast.parse(source)
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
-            documented = ast.get_docstring(node, clean=False) is not None
-            code = [part for part in node.body[documented:] if not isinstance(part, ast.Import | ast.ImportFrom)]
-            node.body = code or [ast.Pass()]
-    return ast.unparse(tree)

@@ -4,6 +4,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from pipeline.core.code import ROOT
 from pipeline.core.errors import SchemaError
 from pipeline.reporting.shown import to_markdown
 from pipeline.reporting.skins import skins_table
@@ -85,10 +86,10 @@ def _stages(stages: Mapping[str, Any]) -> str:
         outs = [
             out if isinstance(out, str) else next(iter(out))
             for key in ("outs", "metrics", "plots")
-            for out in stage["do"].get(key, [])
+            for out in stage.get("do", stage).get(key, [])
         ]
         written = ", ".join(f"`{re.sub(r'[$]{[^}]*}', '…', out)}`" for out in outs) or "MLflow runs"
         homes = (f"pipeline/stages/{name}.py", f"pipeline/experiments/{name}/run.py")
-        code = next(path for path in stage["do"]["deps"] if path in homes)
+        code = next(home for home in homes if (ROOT / home).exists())
         lines.append(f"| {name} | [{code}]({code}) | {written} |")
     return "\n".join(lines)

@@ -1,0 +1,69 @@
+"""The code behind a result: which modules a stage imports, and a digest of each without comments and docstrings.
+
+In: the package's files. Refuses to know stages by name, settings and data.
+"""
+
+import ast
+import hashlib
+import json
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+PACKAGE = "pipeline"
+ROOT = Path(__file__).parents[2]
+
+
+@cache
+def digest(name: str) -> str:
+    """Give the digest of what a module does: of its syntax without docstrings, and of data files of the same name.
+
+    Formatting, comments and the version of Python change nothing. `show.yaml` belongs to `show.py` beside it.
+    """
+    file = file_of(name)
+    found = hashlib.sha256(json.dumps(_syntax(ast.parse(file.read_bytes()))).encode())
+    for beside in sorted(file.parent.glob(f"{file.stem}.*")):
+        if beside.suffix not in (".py", ".pyc"):
+            found.update(beside.read_bytes())
+    return found.hexdigest()[:32]
+
+
+def imported(*names: str) -> list[str]:
+    """Name the modules of this package that some modules import, directly or not, and these themselves; sorted.
+
+    Imports under `if TYPE_CHECKING:` run nothing and do not count.
+    """
+    return sorted(set(names).union(*map(_graph().find_upstream_modules, names)))
+
+
+@cache
+def _graph() -> Any:
+    import grimp  # late: only the stage that follows imports needs it
+
+    return grimp.build_graph(PACKAGE, exclude_type_checking_imports=True, cache_dir=None)
+
+
+def file_of(name: str) -> Path:
+    """Give the file of a module, `pipeline.core.io`."""
+    path = ROOT / name.replace(".", "/")
+    return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+
+
+def _syntax(node: Any) -> Any:
+    """Turn a syntax tree into lists; empty fields are left out, as which there are differs between Python versions.
+
+    >>> same = ["x = 1", "'Say.'\\nx = (1)  # metres"]
+    >>> len({json.dumps(_syntax(ast.parse(source))) for source in [*same, "x = 2"]})
+    2
+    """
+    if isinstance(node, list):
+        return [_syntax(part) for part in node]
+    if not isinstance(node, ast.AST):
+        return repr(node)
+    fields = dict(ast.iter_fields(node))
+    if (
+        isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
+        and ast.get_docstring(node, clean=False) is not None
+    ):
+        fields["body"] = node.body[1:]
+    return [type(node).__name__, *([key, _syntax(part)] for key, part in fields.items() if part not in (None, []))]

@@ -1,0 +1,59 @@
+"""The digest of a module: code changes it, words and line breaks do not."""
+
+import pytest
+
+from pipeline.core import code
+
+SOURCE = '''"""A module."""
+
+RATE = 2.0  # of what
+
+
+class Skin:
+    """A skin."""
+
+    def doubled(self, x, y=None):
+        """Double it."""
+        return 2 * x
+'''
+
+
+def digest(monkeypatch, folder, source: str, beside: str = "") -> str:
+    (folder / "pipeline").mkdir(exist_ok=True)
+    (folder / "pipeline/one.py").write_text(source)
+    (folder / "pipeline/one.yaml").write_text(beside)
+    monkeypatch.setattr(code, "ROOT", folder)
+    code.digest.cache_clear()
+    return code.digest("pipeline.one")
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('"""A module."""', '"""Another word."""'),
+        ('"""Double it."""\n', "\n"),
+        ("  # of what", ""),
+        ("2 * x", "(\n            2 * x)"),
+    ],
+)
+def test_words_and_line_breaks_change_no_digest(monkeypatch, tmp_path, old, new):
+    assert old in SOURCE
+    assert digest(monkeypatch, tmp_path, SOURCE.replace(old, new)) == digest(monkeypatch, tmp_path, SOURCE)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [("2.0", "2"), ("x, y=None", "x"), ("2 * x", "x * 2"), ("Skin:", "Skin(object):")]
+)
+def test_code_changes_the_digest(monkeypatch, tmp_path, old, new):
+    assert old in SOURCE
+    assert digest(monkeypatch, tmp_path, SOURCE.replace(old, new)) != digest(monkeypatch, tmp_path, SOURCE)
+
+
+def test_a_data_file_of_the_same_name_belongs_to_the_module(monkeypatch, tmp_path):
+    assert digest(monkeypatch, tmp_path, SOURCE, "a: 1") != digest(monkeypatch, tmp_path, SOURCE, "a: 2")
+
+
+def test_imports_are_followed_within_the_package():
+    names = code.imported("pipeline.learning.train")
+    assert {"pipeline.learning.train", "pipeline.core.seeds"} <= set(names)
+    assert all(name.startswith("pipeline.") for name in names)
