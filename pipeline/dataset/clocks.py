@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int8
-from scipy.signal import correlate
+from scipy.fft import irfft, next_fast_len, rfft
 
 from pipeline.capture.probe import ProbeLog
 from pipeline.core.errors import CaptureError
@@ -122,10 +122,10 @@ def _search(signal: Int8[np.ndarray, " g"], pattern: _Pattern, start_s: float, s
     steps_n = min(int((pattern.end_s - pattern.start_s) / step_s) + 1, SEARCH_STEPS_N)
     samples = signal / np.abs(signal).mean()  # most steps may lie between two frames
     weights, dwelt = (of(pattern.start_s, steps_n, step_s) for of in (pattern.signed, pattern.dwelt))
-    seen = correlate(dwelt, np.abs(samples), mode="full", method="fft")
+    seen = _correlate(dwelt, np.abs(samples))
     # What is matched, less what a poor fit would match: else a shift that loses a dwell here may win it back there,
     # by laying more of the log on the stream.
-    score = correlate(weights, samples, mode="full", method="fft") - EXPLAINED_MIN * seen
+    score = _correlate(weights, samples) - EXPLAINED_MIN * seen
     score[seen < SEEN_MIN * seen.max()] = 0.0
     top_i = int(score.argmax())
     away = np.abs(np.arange(len(score)) - top_i) * step_s > pattern.period_s / 2
@@ -144,10 +144,17 @@ def _follow(
     reach_n = int(pattern.period_s / step_s) // 2 + 1
     begin_s, steps_n = probe_s - reach_n * step_s, len(window) + 2 * reach_n
     samples = window.astype(np.float64)
-    score = correlate(pattern.signed(begin_s, steps_n, step_s), samples, mode="valid", method="fft")
+    score = _correlate(pattern.signed(begin_s, steps_n, step_s), samples)[len(samples) - 1 : steps_n]
     top_i = int(score.argmax())
     dwelt = pattern.dwelt(begin_s + top_i * step_s, len(window), step_s) @ np.abs(samples)
     return (_middle(score, top_i) - reach_n) * step_s, float(score[top_i]), float(dwelt)
+
+
+def _correlate(signal: Float64[np.ndarray, " a"], window: Float64[np.ndarray, " b"]) -> Float64[np.ndarray, " c"]:
+    """Correlate at every lag at which both overlap, by FFT: scipy.signal's without the second that its import takes."""
+    lags_n = len(signal) + len(window) - 1
+    size = next_fast_len(lags_n, real=True)
+    return irfft(rfft(signal, size) * rfft(window[::-1], size), size)[:lags_n]
 
 
 def _middle(score: Float64[np.ndarray, " g"], top_i: int) -> float:

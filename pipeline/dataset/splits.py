@@ -12,7 +12,6 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Int64, Shaped
 from pydantic import Field, field_validator
-from sklearn.model_selection import GroupShuffleSplit, LeaveOneGroupOut, train_test_split
 
 from pipeline.core.config import Strict
 from pipeline.core.errors import ParamsError
@@ -104,6 +103,8 @@ def leave_one_board_out(rows: Rows, split: Split, seed: int) -> list[Fold]:
     if len(boards) < 2:
         remedy = "Add another board's recording, or take lobo out of the scene's questions."
         raise ParamsError("question lobo", "boards", "two or more", f"{len(boards)} ({', '.join(boards)})", remedy)
+    from sklearn.model_selection import LeaveOneGroupOut  # late: stages that read folds need no scikit-learn
+
     sides = LeaveOneGroupOut().split(np.empty((len(rows), 0)), groups=rows.board)
     return [hold_out_skins(rows, "lobo", str(rows.board[held[0]]), (train, held), split) for train, held in sides]
 
@@ -231,8 +232,7 @@ def last_passes(rows: Rows, split: Split, seed: int) -> list[Fold]:
         pass_i = rows.pass_i[skin_rows]
         passes, what = np.unique(pass_i), f"passes of skin {skin}"
         test_n = _test_n(len(passes), split.temporal_test_fraction, what, "question single_temporal")
-        first, last = train_test_split(passes, test_size=test_n, shuffle=False)
-        train, test = (skin_rows[np.isin(pass_i, side)] for side in (first, last))
+        train, test = (skin_rows[np.isin(pass_i, side)] for side in (passes[:-test_n], passes[-test_n:]))
         folds.append(Fold("single_temporal", str(skin), train, test, NO_POOL))
     return folds
 
@@ -244,6 +244,8 @@ def draw_sides(
 
     `what` the groups are and `where` they are asked for stand in errors.
     """
+    from sklearn.model_selection import GroupShuffleSplit  # late, as above
+
     groups_n = len(np.unique(group))
     test_n = _test_n(groups_n, max(test_fraction, 1 / groups_n), what, where)
     shuffle = GroupShuffleSplit(repeats_n, test_size=test_n, random_state=state % STATES_N)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from jaxtyping import Float
-from scipy.stats import t
+from scipy.special import stdtrit
 
 from pipeline.core.errors import SchemaError
 from pipeline.evaluation.metrics import METRICS
@@ -88,7 +88,7 @@ def interval(values: Values) -> list[float] | None:
     if n < 2:
         return None
     mean = float(np.mean(values))
-    reach = float(t.ppf((1 + CONFIDENCE) / 2, n - 1) * np.std(values, ddof=1) / np.sqrt(n))
+    reach = float(stdtrit(n - 1, (1 + CONFIDENCE) / 2) * np.std(values, ddof=1) / np.sqrt(n))
     return [mean - reach, mean + reach]
 
 

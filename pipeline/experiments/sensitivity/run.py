@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Float, Float32, Float64, Int32
-from scipy.stats import norm, rankdata
+from scipy.special import ndtr, ndtri
 
 from pipeline.core.config import Files, parse_parts, read_settings
 from pipeline.core.errors import SchemaError
@@ -124,10 +125,10 @@ def monotonic(response_uT: Float64[np.ndarray, "n p"], weight_N: Float64[np.ndar
         "holds": False,
         "falls_n": 0,
         "pairs_n": 0,
-        "spearman": float(np.corrcoef(weight_N, rankdata(mean_uT))[0, 1]),
+        "spearman": float(np.corrcoef(weight_N, pd.Series(mean_uT).rank())[0, 1]),
         "neighbours": {"falls_n": int((np.diff(mean_uT) <= 0).sum())},
     }
-    needed = norm.ppf(TOLD_SHARE) * noise_uT / gain_uT if gain_uT > 0 else np.inf
+    needed = ndtri(TOLD_SHARE) * noise_uT / gain_uT if gain_uT > 0 else np.inf
     if needed <= len(mean_uT) - 1:
         steps_n = max(int(np.ceil(needed)), 1)
         falls_n, pairs_n = int((mean_uT[steps_n:] <= mean_uT[:-steps_n]).sum()), len(mean_uT) - steps_n
@@ -135,7 +136,7 @@ def monotonic(response_uT: Float64[np.ndarray, "n p"], weight_N: Float64[np.ndar
         found |= {"holds": falls_n == 0, "falls_n": falls_n, "pairs_n": pairs_n, "step_N": step_N}
     if noise_uT > 0:  # of an even, straight rise with the standard error of a mean one
         z = -gain_uT / (noise_uT / np.sqrt(len(rise_uT)))
-        found["neighbours"]["expected_falls_n"] = float(rise_uT.shape[1] * norm.cdf(z))
+        found["neighbours"]["expected_falls_n"] = float(rise_uT.shape[1] * ndtr(z))
     return found
 
 
