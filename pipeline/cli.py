@@ -5,7 +5,6 @@ Imports within the commands: `reskin --help` waits for none of what a command ne
 
 import math
 import signal
-import subprocess
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -219,7 +218,7 @@ def compare(
 
 @app.command()
 def readme(check: Annotated[bool, Option("--check", help="Only tell whether it is up to date.")] = False) -> None:
-    """Fill in the generated parts of README.md from the results of the scenes that run."""
+    """Fill in the generated parts of README.md and docs from the results of the scenes that run."""
     from pipeline.core import io
     from pipeline.core.config import read_yaml
     from pipeline.reporting.readme import blocks_of, fill
@@ -227,19 +226,18 @@ def readme(check: Annotated[bool, Option("--check", help="Only tell whether it i
     root, running = checkout(), list(checked_plan().scenes)
     if not running:
         raise ParamsError(config.PLAN, "scenes", "one or more", "none", "Try: reskin scenes use quick")
-    words = [sys.executable, "-m", "dvc", "dag", "--md"]
-    dag = subprocess.run(words, capture_output=True, text=True, check=True).stdout
     numbers = {file.parent.name: io.read_json(file) for file in sorted((root / "reports").glob("*/numbers.json"))}
     recorded = [result for result in numbers.values() if result["provenance"]["source"] == "recorded"]
     results = [numbers[name] for name in dict.fromkeys([FULL_SIZE, running[0]]) if name in numbers]
-    file = root / "README.md"
-    before = file.read_text(encoding="utf-8")
-    after = fill(before, blocks_of(results, recorded, dag, read_yaml(root / "dvc.yaml")["stages"]))
-    if check and after != before:
-        typer.echo("README.md is behind reports and dvc.yaml; run: reskin readme", err=True)
+    files = [root / "README.md", *sorted((root / "docs").glob("*.md"))]
+    before = {str(file): file.read_text(encoding="utf-8") for file in files}
+    after = fill(before, blocks_of(results, recorded, read_yaml(root / "dvc.yaml")["stages"]))
+    changed = {page: text for page, text in after.items() if text != before[page]}
+    if check and changed:
+        typer.echo(f"behind reports and dvc.yaml: {', '.join(changed)}; run: reskin readme", err=True)
         sys.exit(1)
-    if not check:
-        io.write_text(file, after)
+    for page, text in changed.items():
+        io.write_text(Path(page), text)
 
 
 @scenes.command("list")

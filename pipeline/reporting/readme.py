@@ -1,4 +1,4 @@
-"""Generated parts of README.md: text with marked blocks + their contents -> text. No number there is typed."""
+"""Generated parts of README.md and docs: text with marked blocks + their contents -> text. No number there is typed."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -6,6 +6,7 @@ from typing import Any
 
 from pipeline.core.code import ROOT
 from pipeline.core.errors import SchemaError
+from pipeline.reporting.headline import short_table
 from pipeline.reporting.shown import to_markdown
 from pipeline.reporting.skins import skins_table
 from pipeline.reporting.tables import make_tables
@@ -13,23 +14,26 @@ from pipeline.reporting.tables import make_tables
 Numbers = Mapping[str, Any]  # of one scene
 
 
-def fill(text: str, blocks: Mapping[str, str]) -> str:
-    """Put each block between its marks `<!-- name -->` and `<!-- /name -->`; a missing mark is an error."""
+def fill(texts: Mapping[str, str], blocks: Mapping[str, str]) -> dict[str, str]:
+    """Put each block between its marks `<!-- name -->` and `<!-- /name -->`, in the one page that has them."""
+    filled = dict(texts)
     for name, content in blocks.items():
-        found = re.search(rf"(<!-- {name} -->\n).*?(<!-- /{name} -->)", text, re.DOTALL)
-        if not found:
-            raise SchemaError("README.md", f"the block {name}", "between its two marks", "none", "Put them back.")
+        marks = re.compile(rf"(<!-- {name} -->\n).*?(<!-- /{name} -->)", re.DOTALL)
+        pages = {page: found for page, text in filled.items() if (found := marks.search(text))}
+        if len(pages) != 1:
+            got = ", ".join(pages) or "no page"
+            raise SchemaError("README.md and docs", f"the block {name}", "in one page", got, "Put its marks back.")
+        page, found = pages.popitem()
         # Not as a template: a backslash in the content is a backslash.
-        text = "".join([text[: found.end(1)], content.strip("\n"), "\n", text[found.start(2) :]])
-    return text
+        text = filled[page]
+        filled[page] = "".join([text[: found.end(1)], content.strip("\n"), "\n", text[found.start(2) :]])
+    return filled
 
 
-def blocks_of(
-    results: Sequence[Numbers], recorded: Sequence[Numbers], dag: str, stages: Mapping[str, Any]
-) -> dict[str, str]:
-    """Make the blocks: results beside the paper's, skins beside recorded ones, the flow as DVC sees it, its code.
+def blocks_of(results: Sequence[Numbers], recorded: Sequence[Numbers], stages: Mapping[str, Any]) -> dict[str, str]:
+    """Make the blocks: results beside the paper's, skins beside recorded ones, the stages and their code.
 
-    The last of `results` is the scene that runs, whose skins are compared.
+    The last of `results` is the scene that runs: its scores come first, and its skins are compared.
     """
     labels = [_results(numbers, ("labels",)) for numbers in recorded if "labels" in numbers]
     skins = {
@@ -39,11 +43,11 @@ def blocks_of(
         for numbers in (results[-1], *recorded)
     }
     return {
+        "headline": _headline(results[-1]),
         "results": "\n\n".join(_results(numbers, ("table2", "order", "single_sensor")) for numbers in results),
         "costs": _costs([numbers for numbers in (*results, *recorded) if "trainings" in numbers]),
         "labels": "\n\n".join(labels) or "No recorded scene asked yet.",
         "skins": to_markdown(skins_table(skins)),
-        "dag": dag,
         "stages": _stages(stages),
     }
 
@@ -63,6 +67,12 @@ def _results(numbers: Numbers, names: Sequence[str]) -> str:
         f"seed {provenance['seed']}, {provenance['device']}:"
     )
     return "\n\n".join([heading] + [to_markdown(tables[name]) for name in names if name in tables])
+
+
+def _headline(numbers: Numbers) -> str:
+    provenance = numbers["provenance"]
+    heading = f"Scene `{provenance['scene']}`, **{provenance['source']}**, code {provenance['trained']}:"
+    return f"{heading}\n\n{to_markdown(short_table(numbers))}"
 
 
 def _costs(scenes: Sequence[Numbers]) -> str:
@@ -91,5 +101,5 @@ def _stages(stages: Mapping[str, Any]) -> str:
         written = ", ".join(f"`{re.sub(r'[$]{[^}]*}', '…', out)}`" for out in outs) or "MLflow runs"
         homes = (f"pipeline/stages/{name}.py", f"pipeline/experiments/{name}/run.py")
         code = next(home for home in homes if (ROOT / home).exists())
-        lines.append(f"| {name} | [{code}]({code}) | {written} |")
+        lines.append(f"| {name} | [{code}](../{code}) | {written} |")
     return "\n".join(lines)

@@ -9,6 +9,7 @@ from pipeline.evaluation.choice import to_record
 from pipeline.evaluation.scores import to_csv
 from pipeline.learning.recipe import HEADLINE
 from pipeline.reporting.figures import error_grids
+from pipeline.reporting.headline import headline_figures
 from pipeline.reporting.numbers import headline_scores
 from pipeline.reporting.page import page
 from pipeline.reporting.parts import experiment_figures
@@ -34,6 +35,7 @@ def report(
     io.write_texts(reports / "tables", table_texts(tables) | {"scores.csv": to_csv(scores)})
     predictions = [io.read_table(models / arm / "predictions.parquet") for arm in asked.modelled]
     figures = dict(error_grids(predictions, HEADLINE, f"{scene} ({asked.source})"))
+    figures |= headline_figures(numbers, asked.source)
     figures |= dict(learning_figures(numbers, asked.source)) | experiment_figures(numbers, drawn, asked.source)
     io.write_texts(reports / "figures", figures)
     # Seconds differ between identical runs, so what shows them is no DVC output.

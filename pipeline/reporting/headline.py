@@ -1,0 +1,112 @@
+"""The answer of a scene: does it work on a board never seen? In: numbers.json. Out: a figure, and a short table of it.
+
+Ours and the paper's side by side. Refuses to know paths, and how anything was measured.
+"""
+
+from collections.abc import Mapping, Sequence
+from textwrap import fill
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from pipeline.reporting.figures import drawing, svg
+from pipeline.reporting.order import CONTROL, Model, models
+from pipeline.reporting.shown import COLUMNS, show, tabulate
+from pipeline.reporting.sweeps import DRAWN, bars
+from pipeline.reporting.work_precision import COLOURS, MARKERS
+
+FILE = "headline.svg"
+APART = 0.17  # of a row: ours above, the paper's below
+SHORT_TABLE = ("accuracy_pct", "mse_xy_mm2")
+
+
+def headline_figures(numbers: Mapping[str, Any], source: str) -> dict[str, str]:
+    """Draw what the scene asked: scores on boards held out, also with ever more labels of the board; else nothing."""
+    if "labels" in numbers:
+        return {FILE: labels_figure(numbers, source)}
+    return {FILE: table2_figure(numbers, source)} if numbers.get("table2") else {}
+
+
+def table2_figure(numbers: Mapping[str, Any], source: str) -> str:
+    """Draw accuracy and MSE of each row of table 2 on boards held out, ours beside the paper's."""
+    rows = _rows(numbers)
+    y = np.arange(len(rows))[::-1].astype(float)
+    boards_n = rows[-1][1]["accuracy_pct"]["n"]
+    with drawing(8.6, 0.9 + 0.55 * len(rows)) as figure:
+        panels = figure.subplots(1, len(DRAWN), sharey=True)
+        for axes, metric in zip(panels, DRAWN, strict=True):
+            _draw(axes, metric, y + APART, [row for _, row in rows], f"ours, {source} (95 % interval over boards)")
+            printed = [(at, model.paper) for at, (model, _) in zip(y, rows, strict=True) if model.paper]
+            if printed:
+                paper = [{metric: dict(zip(("mean", "sd"), words[metric], strict=True))} for _, words in printed]
+                _draw(axes, metric, np.array([at for at, _ in printed]) - APART, paper, "paper (mean, sd)", hollow=True)
+            axes.set(xlabel=COLUMNS[metric].replace(", ", " / "), xlim=(0, 100 if metric == "accuracy_pct" else None))
+            axes.grid(axis="x", alpha=0.25)
+        panels[0].set_yticks(y, [fill(model.title, 34) for model, _ in rows], fontsize=9)
+        panels[0].set_ylim(-0.6, len(rows) - 0.4)
+        handles = panels[0].get_legend_handles_labels()
+        figure.legend(*handles, loc="outside lower center", ncols=2, frameon=False, fontsize=9)
+        title = f"On boards never seen ({numbers['provenance']['scene']}, {source}, {boards_n} boards held out in turn)"
+        figure.suptitle(title, x=0.01, ha="left", fontsize=11)
+        return svg(figure)
+
+
+def labels_figure(numbers: Mapping[str, Any], source: str) -> str:
+    """Draw accuracy and MSE of each method on boards held out, a point for each number of labels of the new board."""
+    rows = numbers["labels"]
+    methods = list(dict.fromkeys((row["method"], row["inputs"]) for row in rows))
+    counts = sorted({row["labels_n"] for row in rows})
+    with drawing(8.6, 1.1 + 0.32 * len(methods)) as figure:
+        panels = figure.subplots(1, len(DRAWN), sharey=True)
+        for axes, metric in zip(panels, DRAWN, strict=True):
+            for i, count in enumerate(counts):
+                found = [
+                    (methods.index((row["method"], row["inputs"])), row) for row in rows if row["labels_n"] == count
+                ]
+                means = [row["as_labelled"][metric]["mean"] for _, row in found]
+                style = {"color": COLOURS[i % len(COLOURS)], "marker": MARKERS[i % len(MARKERS)], "linestyle": "none"}
+                axes.plot(means, [-at for at, _ in found], label=f"{count} labels", markersize=6, **style)
+            axes.set(xlabel=COLUMNS[metric].replace(", ", " / "), xlim=(0, 100 if metric == "accuracy_pct" else None))
+            axes.grid(alpha=0.25)
+        names = [f"{method} ({inputs})" for method, inputs in methods]
+        panels[0].set_yticks([-i for i in range(len(methods))], names, fontsize=9)
+        handles = panels[0].get_legend_handles_labels()
+        figure.legend(*handles, loc="outside lower center", ncols=len(counts), frameon=False, fontsize=9)
+        boards_n = rows[0]["as_labelled"]["accuracy_pct"]["n"]
+        about = f"means over {boards_n} boards held out in turn; intervals: table"
+        title = f"On boards never seen, as labelled ({numbers['provenance']['scene']}, {source}; {about})"
+        figure.suptitle(title, x=0.01, ha="left", fontsize=11)
+        return svg(figure)
+
+
+def short_table(numbers: Mapping[str, Any]) -> pd.DataFrame:
+    """Tabulate the same in five rows for a first look: means with intervals, and the paper's means."""
+    lines = []
+    for model, row in _rows(numbers, control=True):
+        line = {"boards never seen": model.title}
+        for metric in SHORT_TABLE:
+            paper = f"{model.paper[metric][0]:.3g}" if model.paper else "–"
+            line |= {f"{COLUMNS[metric]} (ours)": show(row[metric]), f"{COLUMNS[metric]} (paper)": paper}
+        lines.append(line)
+    return tabulate(lines, spread="[low, high] is the 95 % interval over boards held out")
+
+
+def _rows(numbers: Mapping[str, Any], *, control: bool = False) -> list[tuple[Model, Mapping[str, Any]]]:
+    known = models(numbers)
+    rows = {name: numbers["table2"][name] for name in known if name in numbers["table2"] and name != "control"}
+    found = [(known[name], row) for name, row in rows.items()]
+    adapt = numbers.get("adapt", {})
+    if control and "control" in adapt:
+        found.append((Model(CONTROL, "control", {}), adapt["control"]))
+    return found
+
+
+def _draw(
+    axes: Any, metric: str, y: np.ndarray, rows: Sequence[Mapping[str, Any]], label: str, *, hollow: bool = False
+) -> None:
+    means, lengths = bars(rows, metric)
+    colour = COLOURS[0] if hollow else COLOURS[1]
+    face = "white" if hollow else colour
+    style = {"color": colour, "markerfacecolor": face, "markersize": 6, "capsize": 3, "linewidth": 1.2}
+    axes.errorbar(means, y, xerr=lengths, fmt="s" if hollow else "o", label=label, **style)
