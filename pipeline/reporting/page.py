@@ -1,19 +1,19 @@
-"""The report page of a scene. In: its numbers, tables and figures. Out: one HTML file that needs nothing else.
+"""The report page of a scene. In: its numbers, tables and figures. Out: HTML that stands beside their files.
 
-Same inputs, same bytes; no script, no network. Refuses to know paths, and how anything was measured.
+Same inputs, same bytes; no script, no network, no figure twice. Refuses to know paths, and how anything was measured.
 """
 
 import re
-from base64 import b64encode
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from pydantic import Field
 
+from pipeline.core.code import ROOT
 from pipeline.core.config import Strict, parse, read_yaml
 from pipeline.reporting.parts import add_sections
 from pipeline.reporting.shown import notes
@@ -22,11 +22,14 @@ from pipeline.reporting.work_precision import cost_tables
 
 Captions = dict[str, str]  # by name of a table or figure
 FILE = Path(__file__).with_name("page.yaml")
+NOTHING = ("–", "see file", "")  # cells of the checklist that say no number
 FURTHER = "further"  # the section of what no other section names
 NUMBER = re.compile(r"[-+−]?\d[\d.,]*(e[-+]?\d+)?( ± [\d.e+-]+)?( \(seeds\))?( (%|mm|N|mm²|N²|Hz|s|µT))?|–?")
 SVG_WIDTH_PT = re.compile(r'<svg [^>]*?width="([\d.]+)pt"')
 WIDE_PT = 500.0  # above it, letters would be too small on a telephone: the figure scrolls there
 LONG = 40  # letters of a cell that needs a wide column
+FINDINGS_N = 4  # sentences at the head of a section; the checklist holds all
+OPEN = {"table2", "labels", "order"}  # tables that answer the first question; all others open on demand
 SOURCES = {
     "simulated": "Every reading of this scene was simulated: no number on this page was measured on hardware.",
     "recorded": "Every reading of this scene was recorded from hardware.",
@@ -68,21 +71,35 @@ def page(
     costs: Mapping[str, str],
 ) -> str:
     """Render the page of a scene; figures are SVG text by file name, `costs` the texts of the runtime folder."""
-    source, runtime = numbers["provenance"]["source"], numbers["runtime"]
+    source, scene, runtime = numbers["provenance"]["source"], numbers["provenance"]["scene"], numbers["runtime"]
     shown = {**tables, **cost_tables(runtime, source), **learning_costs(runtime, source)}
-    drawings = {name: text for name, text in {**figures, **costs}.items() if name.endswith(".svg")}
+    texts = {f"figures/{name}": text for name, text in figures.items()}
+    texts |= {f"runtime/{name}": text for name, text in costs.items() if name.endswith(".svg")}
+    drawings = {address.split("/")[1]: (address, _is_wide(text)) for address, text in texts.items()}
+    found = tables.get("checklist", pd.DataFrame())
+    provenance = pd.DataFrame([{"what": key, "value": str(value)} for key, value in numbers["provenance"].items()])
+    return template("page.html").render(
+        scene=scene,
+        source=source,
+        about=about(numbers),
+        sections=[
+            _fill(section, shown, drawings, source)
+            | {"findings": findings(section, found), "stages": stages_of(section, found)}
+            for section in arrange(shown, drawings)
+        ],
+        saved=[*tables],
+        opened=OPEN,
+        provenance=lay_out("provenance", "Provenance", provenance),
+    )
+
+
+def template(name: str) -> Template:
+    """Load a template of this folder."""
     environment = Environment(
         loader=PackageLoader("pipeline.reporting", "."), autoescape=True, undefined=StrictUndefined
     )
     environment.tests["number_text"] = NUMBER.fullmatch
-    provenance = pd.DataFrame([{"what": key, "value": str(value)} for key, value in numbers["provenance"].items()])
-    return environment.get_template("page.html").render(
-        scene=numbers["provenance"]["scene"],
-        source=source,
-        about=about(numbers),
-        sections=[_fill(section, shown, drawings, source) for section in arrange(shown, drawings)],
-        provenance=lay_out("provenance", "Provenance", provenance),
-    )
+    return environment.get_template(name)
 
 
 def read_sections() -> list[Section]:
@@ -106,6 +123,29 @@ def about(numbers: Mapping[str, Any]) -> str:
     return f"{SOURCES[numbers['provenance']['source']]} Its main captures hold {words}."
 
 
+def findings(section: Section, checklist: pd.DataFrame) -> list[str]:
+    """Say what the checklist says of what a section shows: ours with its interval, and the paper's; verdicts first."""
+    rows = [row for row in _rows_of(section, checklist) if row["ours"] not in NOTHING]
+    judged = sorted(rows, key=lambda row: row["verdict"] in NOTHING)
+    return [
+        f"{row['result']}: {row['ours']}; paper: {row['paper']}"
+        + ("" if row["verdict"] in NOTHING else f". {row['verdict'].capitalize()}.")
+        for row in judged[:FINDINGS_N]
+    ]
+
+
+def stages_of(section: Section, checklist: pd.DataFrame) -> list[tuple[str, str]]:
+    """Name the stages behind a section, and the files of their code."""
+    stages = dict.fromkeys(row["stage"] for row in _rows_of(section, checklist) if row["stage"] not in NOTHING)
+    homes = {stage: (f"pipeline/experiments/{stage}/run.py", f"pipeline/stages/{stage}.py") for stage in stages}
+    return [(stage, home) for stage, files in homes.items() for home in files if (ROOT / home).exists()]
+
+
+def _rows_of(section: Section, checklist: pd.DataFrame) -> list[dict[str, str]]:
+    rows = checklist.to_dict("records") if section.key != "checklist" else []
+    return [row for row in rows if section.captions.keys() & set(str(row["shown in"]).split(", "))]
+
+
 def lay_out(name: str, caption: str, table: pd.DataFrame) -> Table:
     """Lay a table out: the look of its columns, its cells as text, and its notes."""
     cells = table.fillna("").astype(str)
@@ -114,24 +154,19 @@ def lay_out(name: str, caption: str, table: pd.DataFrame) -> Table:
 
 
 def _fill(
-    section: Section, tables: Mapping[str, pd.DataFrame], figures: Mapping[str, str], source: str
+    section: Section, tables: Mapping[str, pd.DataFrame], figures: Mapping[str, tuple[str, bool]], source: str
 ) -> dict[str, Any]:
-    words = {name: getattr(section, name) for name in ("key", "title", "sentence")}
-    for kind in ("tables", "folded"):
-        captions = getattr(section, kind)
-        words[kind] = [lay_out(name, text, tables[name]) for name, text in captions.items() if name in tables]
-    captions = section.figures
-    words["figures"] = [
-        _figure(f"{text} ({source})", figures[name]) for name, text in captions.items() if name in figures
-    ]
+    words: dict[str, Any] = {name: getattr(section, name) for name in ("key", "title", "sentence")}
+    captions = section.tables | section.folded
+    words["tables"] = [lay_out(name, text, tables[name]) for name, text in captions.items() if name in tables]
+    shown = ((f"{text} ({source})", *figures[name]) for name, text in section.figures.items() if name in figures)
+    words["figures"] = [{"caption": caption, "file": file, "wide": wide} for caption, file, wide in shown]
     return words
 
 
-def _figure(caption: str, svg: str) -> dict[str, Any]:
-    """Embed a figure as an image of its own, so that ids of two figures never meet."""
+def _is_wide(svg: str) -> bool:
     width = SVG_WIDTH_PT.search(svg)
-    wide = width is not None and float(width[1]) > WIDE_PT
-    return {"data": b64encode(svg.encode()).decode(), "caption": caption, "wide": wide}
+    return width is not None and float(width[1]) > WIDE_PT
 
 
 def _look(cells: "pd.Series[str]") -> str:

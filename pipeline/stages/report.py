@@ -10,6 +10,7 @@ from pipeline.evaluation.scores import to_csv
 from pipeline.learning.recipe import HEADLINE
 from pipeline.reporting.figures import error_grids
 from pipeline.reporting.headline import headline_figures
+from pipeline.reporting.index import index
 from pipeline.reporting.numbers import headline_scores
 from pipeline.reporting.page import page
 from pipeline.reporting.parts import experiment_figures
@@ -42,6 +43,8 @@ def report(
     costs = pages(numbers["runtime"], source=asked.source) | learning_pages(numbers["runtime"], asked.source)
     io.write_texts(reports / "runtime", costs)
     io.write_text(reports / "index.html", page(numbers, tables, figures, costs))
+    results = (io.read_json(file) for file in sorted(reports.parent.glob("*/numbers.json")))
+    io.write_text(reports.parent / "index.html", index([result for result in results if "described" in result]))
     say(f"{scene}: {reports}/index.html, numbers.json, scores.json, tables, figures")
 
 

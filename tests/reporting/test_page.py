@@ -1,16 +1,18 @@
 import re
 from collections import Counter
 from html.parser import HTMLParser
+from pathlib import Path
 
 import pandas as pd
 import pytest
 
 from pipeline.questions import EXPERIMENTS
 from pipeline.reporting.checklist import checklist
-from pipeline.reporting.page import arrange, lay_out, page, read_sections
+from pipeline.reporting.page import FINDINGS_N, arrange, findings, lay_out, page, read_sections
 from pipeline.reporting.tables import make_tables
 from tests.reporting.synthetic import all_questions
 
+ROOT = Path(__file__).resolve().parents[2]
 SVG = '<svg xmlns="http://www.w3.org/2000/svg" width="{}pt"><defs><path id="same"/></defs><text>é</text></svg>'
 VOID = {"meta", "img", "br"}
 
@@ -59,7 +61,7 @@ def read() -> Reader:
 def test_the_page_needs_no_network_and_no_script(read):
     assert [one for one in ("script", "link", "iframe", "object", "svg") if read.all(one)] == []
     fetched = [attributes[name] for _, attributes, _ in read.elements for name in ("src", "href") if name in attributes]
-    assert all(address.startswith(("data:image/svg+xml;base64,", "#")) for address in fetched)
+    assert all(address.startswith(("figures/", "runtime/", "tables/", "../", "#")) for address in fetched)
     assert "url(" not in render()
     assert "@import" not in render()
 
@@ -67,7 +69,11 @@ def test_the_page_needs_no_network_and_no_script(read):
 def test_links_lead_to_ids_and_no_id_stands_twice(read):
     ids = Counter(attributes["id"] for _, attributes, _ in read.elements if "id" in attributes)
     assert max(ids.values()) == 1
-    assert {attributes["href"][1:] for attributes, _ in read.all("a")} <= set(ids)
+    links = {attributes["href"] for attributes, _ in read.all("a")}
+    assert {link[1:] for link in links if link.startswith("#")} <= set(ids)
+    assert [link for link in links if link.startswith("../../") and not (ROOT / link[6:]).exists()] == [
+        "../../pipeline/scenes/x.yaml"  # no such scene: its numbers are synthetic
+    ]
     labels = {attributes["aria-labelledby"] for _, attributes, _ in read.elements if "aria-labelledby" in attributes}
     assert labels <= set(ids)
 
@@ -87,6 +93,17 @@ def test_every_figure_is_an_image_on_a_white_card_with_words_for_it(read):
     assert [attributes.get("class") for attributes, _ in read.all("figure")].count("wide") == 1
 
 
+def test_a_section_says_what_was_found_beside_the_papers_and_verdicts_come_first():
+    numbers = all_questions()
+    table, section = checklist(numbers), next(one for one in read_sections() if one.key == "skins")
+    said = findings(section, table)
+    assert 0 < len(said) <= FINDINGS_N
+    assert all("paper: " in sentence for sentence in said)
+    judged = [sentence.endswith(".") for sentence in said]
+    assert judged == sorted(judged, reverse=True)
+    assert said == [sentence for sentence in said if any(row["result"] in sentence for row in table.to_dict("records"))]
+
+
 @pytest.mark.parametrize("source", ["simulated", "recorded"])
 def test_the_badge_says_where_the_readings_come_from(source):
     text = render(all_questions(source))
@@ -96,7 +113,7 @@ def test_the_badge_says_where_the_readings_come_from(source):
 
 def test_the_page_says_first_what_the_scene_is(read):
     words = next(i for i, word in enumerate(read.words) if "2 captures, 1,000 readings" in word)
-    assert words < read.words.index("Contents")
+    assert words < read.words.index("Headline")
 
 
 def test_what_no_section_names_is_still_shown(read):

@@ -1,0 +1,37 @@
+"""The page of all scenes: each in its place, simulated and recorded apart, nothing shown of what is out of date."""
+
+import re
+
+from pipeline.reporting.index import index
+from tests.reporting.synthetic import all_questions
+
+
+def numbers(scene: str, source: str, **changes) -> dict:
+    found = all_questions(source) | changes
+    return found | {"provenance": found["provenance"] | {"scene": scene}}
+
+
+def test_recorded_scenes_come_first_and_no_scene_stands_under_the_other_word():
+    text = index([numbers("here", "simulated"), numbers("there", "recorded")])
+    recorded, simulated = text.split('<section id="simulated">')
+    assert 'href="there/index.html"' in recorded
+    assert 'href="here/index.html"' in simulated
+    assert "there/" not in simulated
+    assert "here/" not in recorded.replace("there/", "")
+
+
+def test_a_scene_of_earlier_code_is_named_without_a_figure():
+    old = numbers("old", "simulated")
+    old.pop("trainings")
+    text = index([old])
+    assert "Out of date" in text
+    assert "<img" not in text
+
+
+def test_the_page_needs_nothing_but_the_pages_beside_it():
+    text = index([numbers("here", "simulated")])
+    addresses = re.findall(r'(?:src|href)="([^"]+)"', text)
+    assert addresses
+    assert all(address.startswith("here/") for address in addresses)
+    assert "<script" not in text
+    assert "url(" not in text
