@@ -142,8 +142,11 @@ def stages_of(section: Section, checklist: pd.DataFrame) -> list[tuple[str, str]
 
 
 def _rows_of(section: Section, checklist: pd.DataFrame) -> list[dict[str, str]]:
-    rows = checklist.to_dict("records") if section.key != "checklist" else []
-    return [row for row in rows if section.captions.keys() & set(str(row["shown in"]).split(", "))]
+    if section.key == "checklist" or checklist.empty:
+        return []
+    cells = checklist.astype(str)
+    rows = (dict(zip(cells.columns, row, strict=True)) for row in cells.itertuples(index=False))
+    return [row for row in rows if section.captions.keys() & set(row["shown in"].split(", "))]
 
 
 def lay_out(name: str, caption: str, table: pd.DataFrame) -> Table:
