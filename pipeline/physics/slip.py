@@ -1,11 +1,15 @@
 """A skin that lies on its board and can slide there: how one wave of pressure fades towards the base. In: k z, k h.
 
-Stands beside `layer.compliance` and `layer.depth_profile` of the bonded base: same surface, but below no height changes
+Stands beside `layer.compliance` and `layer.wave` of the bonded base: same surface, but below no height changes
 and no shear is felt. Refuses to know contacts, and which of the two a skin has.
 """
 
+from math import exp, expm1
+from typing import no_type_check
+
 import numpy as np
 from jaxtyping import Float
+from numba import njit
 
 
 def compliance(kh: Float[np.ndarray, " w"]) -> Float[np.ndarray, " w"]:
@@ -20,18 +24,25 @@ def compliance(kh: Float[np.ndarray, " w"]) -> Float[np.ndarray, " w"]:
     return np.where(long_waves, double / 4, np.expm1(-double) ** 2 / rest)
 
 
-def depth_profile(
-    kz: Float[np.ndarray, "s w"], kh: Float[np.ndarray, " w"]
-) -> tuple[Float[np.ndarray, "s w"], Float[np.ndarray, "s w"], Float[np.ndarray, "s w"]]:
-    """Give g at height z, and its first two derivatives by kz; g(kh) is the surface's `compliance`.
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def whole(kh):
+    """Give what `wave` needs of the layer as a whole; it is the same at every height."""
+    fade, second = exp(-2 * kh), -expm1(-2 * kh)
+    return second * (1 + fade) + 4 * kh * fade, (1 + kh) - (1 - kh) * fade, second
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def wave(kz, kh, of):
+    """Give g of one wave at height z, and its first two derivatives by kz; g(kh) is the surface's `compliance`.
 
     g = [(sinh A + A cosh A) sinh z' - z' sinh A cosh z'] / (sinh A cosh A + A): the odd solution, for at the base both
     W and W'' + W (the shear) vanish. All of it is multiplied by 4 exp(-2A), so that no exponent is positive inside.
     """
-    top, low, base = np.exp(kz - kh), np.exp(-kh - kz), np.exp(-2 * kh)
-    size = -np.expm1(-4 * kh) + 4 * kh * base
+    size, first, second = of
+    top, low = exp(kz - kh), exp(-kh - kz)
     odd, even = (top - low) / size, (top + low) / size
-    first, second = (1 + kh) - (1 - kh) * base, -np.expm1(-2 * kh)
     g = first * odd - kz * second * even
     slope = (first - second) * even - kz * second * odd
     bend = (first - 2 * second) * odd - kz * second * even

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.special import jv
 
 from pipeline.core.errors import ParamsError
 from pipeline.experiments.verification import contact, kinematics
@@ -144,3 +145,21 @@ def test_a_thin_skin_has_a_finite_force():
 def test_impossible_layers_and_pokes_are_refused(what, changes):
     with pytest.raises(ParamsError, match=f"{what} must be"):
         force(**({"depth_m": 1e-3} | changes))
+
+
+@pytest.mark.parametrize("base", ["bonded", "slipping"])
+def test_displacement_is_the_sum_of_its_waves(base):
+    h_m = 2e-3
+    waves = layer.waves(layer.contact_of_depth(0.8e-3, thickness_m=h_m, tip_radius_m=3e-3, base=base), h_m, base)
+    r_m, z_m = np.array([0.0, 0.4e-3, 2e-3, 40e-3]), np.array([1e-3, 2.1e-3, 0.0, 1.3e-3])
+    g, slope, bend = layer.depth_profile(np.outer(z_m, waves.k_per_m), h_m * waves.k_per_m, base)
+    zero, one = (jv(order, np.outer(r_m, waves.k_per_m)) for order in (0, 1))
+    truth = {
+        "r_m": (slope * one) @ waves.amplitude_m, "z_m": -(g * zero) @ waves.amplitude_m,
+        "z_z": -(slope * zero) @ (waves.amplitude_m * waves.k_per_m),
+        "r_z": (bend * one) @ (waves.amplitude_m * waves.k_per_m), "z_r": (g * one) @ (waves.amplitude_m * waves.k_per_m),
+    }  # fmt: skip
+    found = layer.displacement(r_m, z_m, waves)
+    for name, right in truth.items():
+        np.testing.assert_allclose(getattr(found, name), right, atol=1e-11 * np.abs(right).max())
+    np.testing.assert_allclose(found.r_r + found.hoop + found.z_z, 0.0, atol=1e-11 * np.abs(found.z_z).max())

@@ -19,7 +19,7 @@ def test_profile_and_compliance_are_those_of_a_dense_solve(kh, share):
     with mpmath.workdps(50):
         w, z = contact.dense_profile(mpmath.mpf(kh)), mpmath.mpf(kh) * mpmath.mpf(share)
         truth = [float(mpmath.diff(w, z, n)) for n in range(3)]
-    found = slip.depth_profile(np.array([[kh * share]]), np.array([kh]))
+    found = layer.depth_profile(np.array([[kh * share]]), np.array([kh]), "slipping")
     # 1e-10: of long waves the profile is a difference of numbers 1 / (kh)^2 as large
     np.testing.assert_allclose([part.item() for part in found], truth, atol=1e-10 * np.abs(truth).max())
     assert contact.sliding_compliance(np.array([kh])).holds
@@ -27,7 +27,7 @@ def test_profile_and_compliance_are_those_of_a_dense_solve(kh, share):
 
 @given(st.floats(1e-3, 300))
 def test_the_base_keeps_its_height_and_feels_no_shear_and_the_surface_none_either(kh):
-    g, _, bend = slip.depth_profile(np.array([[0.0], [kh]]), np.array([kh]))
+    g, _, bend = layer.depth_profile(np.array([[0.0], [kh]]), np.array([kh]), "slipping")
     assert g[0, 0] == 0.0
     np.testing.assert_allclose((g + bend)[:, 0], 0.0, atol=1e-12 * max(1.0, float(np.abs(bend).max())))
     np.testing.assert_allclose(g[1], slip.compliance(np.array([kh])), rtol=1e-9)
