@@ -113,7 +113,7 @@ def fewer_sensors(rows: Rows, split: Split, seed: int) -> list[Fold]:
     """Train on k skins of all boards but one, test on that board; one fold a board, k and draw (paper figure 6b).
 
     Every board is held out in turn and has draws of its own. Within a draw, the skins of a smaller k are among those of
-    a larger one.
+    a larger one. All of them are the fold of `lobo`, drawn once and named as there, so that its trainings are reused.
     """
     assert split.sensors_skins_n is not None
     assert split.sensors_draws_n is not None
@@ -127,9 +127,9 @@ def fewer_sensors(rows: Rows, split: Split, seed: int) -> list[Fold]:
         draws = range(split.sensors_draws_n)
         orders = [rng_for(seed, "sensors", str(board), draw_i).permutation(skins) for draw_i in draws]
         for skins_n in split.sensors_skins_n:
-            for draw_i, order in enumerate(orders):
+            for draw_i, order in enumerate(orders if skins_n < len(skins) else orders[:1]):
                 train = np.flatnonzero(np.isin(rows.skin, order[:skins_n]))
-                name = f"{board}-{skins_n:02d}skins-draw{draw_i}"
+                name = f"{board}-{skins_n:02d}skins-draw{draw_i}" if skins_n < len(skins) else str(board)
                 folds.append(hold_out_skins(rows, "sensors", name, (train, held), split))
     return folds
 

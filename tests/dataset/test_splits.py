@@ -153,15 +153,28 @@ def test_fewer_sensors_are_nested_within_a_draw_and_never_of_the_board_held_out(
     folds = {fold.name: fold for fold in draw_folds(table, ["sensors"], SENSORS, seed)}
     boards = [f"b{i}" for i in range(6)]
     assert list(folds) == [
-        f"{board}-{k:02d}skins-draw{draw_i}" for board in boards for k in (15, 1, 6) for draw_i in range(3)
+        name
+        for board in boards
+        for name in [board, *(f"{board}-{k:02d}skins-draw{draw_i}" for k in (1, 6) for draw_i in range(3))]
     ]
     for board, draw_i in product(boards, range(3)):
-        of_sizes = [folds[f"{board}-{k:02d}skins-draw{draw_i}"] for k in (1, 6, 15)]
+        of_sizes = [*(folds[f"{board}-{k:02d}skins-draw{draw_i}"] for k in (1, 6)), folds[board]]
         assert {skin for fold in of_sizes for skin in table.skin[fold.test]} == {f"{board}_s{i}" for i in range(3)}
         one, six, all_of_them = ({*table.skin[fold.train]} for fold in of_sizes)
         assert one < six < all_of_them
         assert (len(one), len(six), len(all_of_them)) == (1, 6, 15)
         assert board not in {skin[:2] for skin in all_of_them}
+
+
+def test_all_skins_but_those_of_a_board_are_its_fold_of_lobo():
+    table = six_by_three_in_passes(3)
+    split = Split(sensors_skins_n=(15,), sensors_draws_n=2, pool_passes_n=1)
+    for fold, whole in zip(
+        draw_folds(table, ["sensors"], split, 0), draw_folds(table, ["lobo"], split, 0), strict=True
+    ):
+        assert fold.name == whole.name
+        for rows in ("train", "test", "pool"):
+            np.testing.assert_array_equal(getattr(fold, rows), getattr(whole, rows))
 
 
 def test_another_draw_of_sensors_takes_other_skins_and_no_more_draws_change_it():
