@@ -173,8 +173,8 @@ def test_all_skins_but_those_of_a_board_are_its_fold_of_lobo():
         draw_folds(table, ["sensors"], split, 0), draw_folds(table, ["lobo"], split, 0), strict=True
     ):
         assert fold.name == whole.name
-        for rows in ("train", "test", "pool"):
-            np.testing.assert_array_equal(getattr(fold, rows), getattr(whole, rows))
+        for side in ("train", "test", "pool"):
+            np.testing.assert_array_equal(getattr(fold, side), getattr(whole, side))
 
 
 def test_another_draw_of_sensors_takes_other_skins_and_no_more_draws_change_it():

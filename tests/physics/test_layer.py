@@ -157,7 +157,8 @@ def test_displacement_is_the_sum_of_its_waves(base):
     truth = {
         "r_m": (slope * one) @ waves.amplitude_m, "z_m": -(g * zero) @ waves.amplitude_m,
         "z_z": -(slope * zero) @ (waves.amplitude_m * waves.k_per_m),
-        "r_z": (bend * one) @ (waves.amplitude_m * waves.k_per_m), "z_r": (g * one) @ (waves.amplitude_m * waves.k_per_m),
+        "r_z": (bend * one) @ (waves.amplitude_m * waves.k_per_m),
+        "z_r": (g * one) @ (waves.amplitude_m * waves.k_per_m),
     }  # fmt: skip
     found = layer.displacement(r_m, z_m, waves)
     for name, right in truth.items():
