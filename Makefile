@@ -3,6 +3,7 @@
 # make test-processors   the tests that train, under the instructions of four kinds of processors
 # make ui      the MLflow UI on the embedded store
 # make bench   benchmarks (not part of the tests)
+# make time-repro   `make repro` in three fresh clones: seconds, CPU seconds, disk -> reports/time.json
 # make clean   removes what the targets above made, but no data and no results
 
 PYTHON ?= python3
@@ -16,7 +17,7 @@ export DVC_NO_ANALYTICS = 1
 # One thread a process: steadier on few cores, and the same sums in the same order everywhere.
 export OMP_NUM_THREADS = 1
 
-.PHONY: repro test test-processors lint ui bench readme clean
+.PHONY: repro test test-processors lint ui bench time-repro readme clean
 TRAINING_TESTS := tests/extremes tests/learning tests/evaluation tests/stages tests/test_numerics.py
 .DEFAULT_GOAL := repro
 
@@ -52,6 +53,10 @@ ui: $(STAMP)
 
 bench: $(STAMP)
 	$(BIN)/python -m pytest tests/benchmarks -s -q --override-ini addopts= -p no:xdist
+
+# How long a newcomer waits, and what it takes on disk: three fresh clones.
+time-repro:
+	$(PYTHON) tests/benchmarks/time_repro.py --times 3
 
 readme: $(STAMP)
 	$(BIN)/reskin readme

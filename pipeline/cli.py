@@ -31,6 +31,7 @@ LOGS = (
     "A log as an SD card holds it: t_s,T0,Bx0,By0,Bz0,T1,...; degC and uT. "
     "Or a folder that `reskin record` wrote, or a Parquet file that `reskin decode` wrote."
 )
+TIMED = "reports/time.json"  # what `make time-repro` measured
 FULL_SIZE = "paper"  # the scene whose results the README shows first, where it was run
 
 Layout = Literal["capture", "serial-binary", "serial-text", "lab", "ini", "eflesh"]
@@ -229,9 +230,10 @@ def readme(check: Annotated[bool, Option("--check", help="Only tell whether it i
     numbers = {file.parent.name: io.read_json(file) for file in sorted((root / "reports").glob("*/numbers.json"))}
     recorded = [result for result in numbers.values() if result["provenance"]["source"] == "recorded"]
     results = [numbers[name] for name in dict.fromkeys([FULL_SIZE, running[0]]) if name in numbers]
+    timed = io.read_json(root / TIMED) if (root / TIMED).exists() else None
     files = [root / "README.md", *sorted((root / "docs").glob("*.md"))]
     before = {str(file): file.read_text(encoding="utf-8") for file in files}
-    after = fill(before, blocks_of(results, recorded, read_yaml(root / "dvc.yaml")["stages"]))
+    after = fill(before, blocks_of(results, recorded, read_yaml(root / "dvc.yaml")["stages"], timed))
     changed = {page: text for page, text in after.items() if text != before[page]}
     if check and changed:
         typer.echo(f"behind reports and dvc.yaml: {', '.join(changed)}; run: reskin readme", err=True)

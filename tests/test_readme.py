@@ -23,7 +23,7 @@ def test_the_readme_shows_what_the_committed_results_say():
 
 def test_the_readme_links_the_code_of_every_stage():
     stages = read_yaml(ROOT / "dvc.yaml")["stages"]
-    links = re.findall(r"\]\((\S+)\)", blocks_of([all_questions()], [], stages)["stages"])
+    links = re.findall(r"\]\((\S+)\)", blocks_of([all_questions()], [], stages, None)["stages"])
     assert len(links) == len(stages)
     assert [link for link in links if not (ROOT / "docs" / link).is_file()] == []
 

@@ -12,6 +12,11 @@ import pyarrow.compute as pc
 from jaxtyping import Float
 
 mpl.use("Agg")
+WORST_MM = 2.0  # end of the colour scale of all error maps: twice the distance that counts as right
+GRID_MM = 16.0  # the paper's grid of places, from 0 to here
+# The five chips under it, in the frame of the labels (paper section 2), and their package of 3 mm.
+CHIPS_MM = ((8.0, 8.0), (1.0, 8.0), (15.0, 8.0), (8.0, 1.0), (8.0, 15.0))
+CHIP_MM = 3.0
 STYLE = {
     "svg.hashsalt": "reskin",
     "svg.fonttype": "none",
@@ -32,8 +37,12 @@ def error_grids(predictions: Iterable[pa.Table], recipe: str, scene: str) -> Ite
 
 
 def error_grid(true_mm: Float[np.ndarray, "f 2"], predicted_mm: Float[np.ndarray, "f 2"], *, title: str) -> str:
-    """Draw the places of the indentations, coloured by the mean distance between true and predicted place."""
+    """Draw the places of the indentations, coloured by the mean distance between true and predicted place.
+
+    All maps have one colour scale. Where places lie on the paper's grid, the chips below the skin are drawn.
+    """
     from matplotlib.figure import Figure
+    from matplotlib.patches import Rectangle
 
     places, which = np.unique(np.round(true_mm, 2), axis=0, return_inverse=True)
     distance_mm = np.linalg.norm(predicted_mm - true_mm, axis=1)
@@ -43,9 +52,22 @@ def error_grid(true_mm: Float[np.ndarray, "f 2"], predicted_mm: Float[np.ndarray
         axes = figure.subplots()
         size = float(np.clip(12_000 / len(places), 6, 170))
         points = axes.scatter(
-            places[:, 0], places[:, 1], c=mean_mm, s=size, cmap="viridis", vmin=0.0, marker="s", linewidths=0
+            places[:, 0],
+            places[:, 1],
+            c=mean_mm,
+            s=size,
+            cmap="viridis",
+            vmin=0.0,
+            vmax=WORST_MM,
+            marker="s",
+            linewidths=0,
         )
-        figure.colorbar(points, label="mean place error / mm")
+        figure.colorbar(points, label="mean place error / mm", extend="max")
+        if places.min() >= 0 and places.max() <= GRID_MM:
+            for x_mm, y_mm in CHIPS_MM:
+                corner_mm = (x_mm - CHIP_MM / 2, y_mm - CHIP_MM / 2)
+                axes.add_patch(Rectangle(corner_mm, CHIP_MM, CHIP_MM, fill=False, edgecolor="black", linewidth=1.2))
+            axes.set(xlim=(-2, GRID_MM + 2), ylim=(-2, GRID_MM + 2))
         axes.set(xlabel="x / mm", ylabel="y / mm", aspect="equal")
         axes.set_title(title, loc="left", fontsize=10, wrap=True)
         return svg(figure)

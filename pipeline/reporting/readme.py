@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
+from statistics import median
 from typing import Any
 
 from pipeline.core.code import ROOT
@@ -30,7 +31,9 @@ def fill(texts: Mapping[str, str], blocks: Mapping[str, str]) -> dict[str, str]:
     return filled
 
 
-def blocks_of(results: Sequence[Numbers], recorded: Sequence[Numbers], stages: Mapping[str, Any]) -> dict[str, str]:
+def blocks_of(
+    results: Sequence[Numbers], recorded: Sequence[Numbers], stages: Mapping[str, Any], timed: Numbers | None
+) -> dict[str, str]:
     """Make the blocks: results beside the paper's, skins beside recorded ones, the stages and their code.
 
     The last of `results` is the scene that runs: its scores come first, and its skins are compared.
@@ -45,6 +48,7 @@ def blocks_of(results: Sequence[Numbers], recorded: Sequence[Numbers], stages: M
     return {
         "headline": _headline(results[-1]),
         "results": "\n\n".join(_results(numbers, ("table2", "order", "single_sensor")) for numbers in results),
+        "time": _time(timed),
         "costs": _costs([numbers for numbers in (*results, *recorded) if "trainings" in numbers]),
         "labels": "\n\n".join(labels) or "No recorded scene asked yet.",
         "skins": to_markdown(skins_table(skins)),
@@ -73,6 +77,25 @@ def _headline(numbers: Numbers) -> str:
     provenance = numbers["provenance"]
     heading = f"Scene `{provenance['scene']}`, **{provenance['source']}**, code {provenance['trained']}:"
     return f"{heading}\n\n{to_markdown(short_table(numbers))}"
+
+
+def _time(timed: Numbers | None) -> str:
+    """Write how long fresh clones took, the median of their runs."""
+    if timed is None:
+        return "Not timed yet: `make time-repro`."
+    runs = timed["runs"]
+    minutes = {
+        (part, unit): median(run[part][unit] for run in runs) / 60
+        for part in ("environment", "stages")
+        for unit in ("wall_s", "cpu_s")
+    }
+    disk = f"{median(run['all_MB'] for run in runs) / 1e3:.1f} GB on disk"
+    return (
+        f"Environment {minutes['environment', 'wall_s']:.1f} min, stages {minutes['stages', 'wall_s']:.1f} min "
+        f"({minutes['stages', 'cpu_s']:.1f} min of CPU), {disk}, of which the environment takes "
+        f"{median(run['environment_MB'] for run in runs) / 1e3:.1f} GB: median of {len(runs)} fresh clones on "
+        f"{timed['machine']} (`make time-repro`, code {timed['git']})."
+    )
 
 
 def _costs(scenes: Sequence[Numbers]) -> str:

@@ -1,0 +1,68 @@
+"""Time `make repro` as a newcomer runs it: a fresh clone in an empty folder, environment first, then all stages.
+
+python3 tests/benchmarks/time_repro.py --times 3 --out reports/time.json. Each time is a clone of the last commit, without
+environment and cache but pip's own. Needs nothing but Python and git. Keep the machine quiet.
+"""
+
+import argparse
+import json
+import os
+import platform
+import resource
+import shutil
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def run(command: list[str], folder: Path) -> dict[str, float]:
+    """Run a command to its end: wall time and CPU time of it and all that it started, in seconds."""
+    before, start_s = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
+    # DVC waits for every stage, and make for DVC, so that children's children are counted.
+    subprocess.run(command, cwd=folder, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return {"wall_s": round(time.monotonic() - start_s, 1), "cpu_s": round(cpu_s, 1)}
+
+
+def size_MB(folder: Path) -> float:
+    """Add up what the files of a folder take on disk."""
+    return round(sum(file.lstat().st_blocks * 512 for file in folder.rglob("*")) / 1e6)
+
+
+def once() -> dict[str, object]:
+    """Time one clone."""
+    folder = Path(tempfile.mkdtemp()) / "clone"
+    try:
+        subprocess.run(["git", "clone", "--quiet", str(ROOT), str(folder)], check=True)
+        environment = run(["make", ".venv/.installed"], folder)
+        stages = run(["make", "repro"], folder)
+        return {
+            "environment": environment, "stages": stages, "environment_MB": size_MB(folder / ".venv"),
+            "all_MB": size_MB(folder),
+        }  # fmt: skip
+    finally:
+        shutil.rmtree(folder.parent)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--times", type=int, default=3)
+    parser.add_argument("--out", type=Path, default=ROOT / "reports/time.json")
+    asked = parser.parse_args()
+    commit = subprocess.run(
+        ["git", "rev-parse", "--short=12", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    runs = []
+    for i in range(asked.times):
+        runs.append(once())
+        print(f"{i + 1}/{asked.times}: {runs[-1]}", flush=True)
+    machine = f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
+    asked.out.write_text(json.dumps({"git": commit.stdout.strip(), "machine": machine, "runs": runs}, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
