@@ -1,7 +1,7 @@
 """Time `make repro` as a newcomer runs it: a fresh clone in an empty folder, environment first, then all stages.
 
-python3 tests/benchmarks/time_repro.py --times 3 --out reports/time.json. Each time is a clone of the last commit, without
-environment and cache but pip's own. Needs nothing but Python and git. Keep the machine quiet.
+python3 tests/benchmarks/time_repro.py --times 3 --out reports/time.json. Each is a clone of the last commit, without
+any cache but pip's own. Needs nothing but Python and git. Keep the machine quiet.
 """
 
 import argparse
