@@ -23,9 +23,12 @@ DEVICES = ("cpu", "cuda")
 REPEATS_N = 25
 
 
-def make_executor() -> Executor:
-    """Make the executor that RESKIN_EXECUTOR names: `processes:N` (default N = 2, one thread each), or `here`."""
-    name = os.environ.get(VARIABLE, DEFAULT)
+def make_executor(tasks_n: int = 2) -> Executor:
+    """Make the executor that RESKIN_EXECUTOR names: `processes:N` (default N = 2, one thread each), or `here`.
+
+    One task by itself runs here: another process would only import everything again.
+    """
+    name = os.environ.get(VARIABLE, DEFAULT if tasks_n > 1 else "here")
     if name == "here":
         return Here()
     kind, _, count = name.partition(":")

@@ -65,7 +65,6 @@ def at_rest(nodes_m: Float[np.ndarray, "s 3"], moments_A_m2: Float[np.ndarray, "
     return Rest(np.asfortranarray(nodes_m), np.asfortranarray(moments_A_m2), height_i, tuple(heights.tolist()))
 
 
-@lru_cache(maxsize=4)
 def tabulate(
     thickness_m: float, tip_radius_m: float, deepest_m: float, *, heights: tuple[float, ...], base: layer.Base
 ) -> FlowMap:
@@ -80,6 +79,15 @@ def tabulate(
         rule = f"above 0 mm and at most {1e3 * depth_m[-1]:.3g} mm, the deepest that is followed"
         raise ParamsError("poke", "deepest depth", rule, f"{1e3 * deepest_m:.3g} mm", "Poke less deep.")
     rungs_n = 1 + max(int(np.searchsorted(depth_m, deepest_m)), STENCIL_N - 1)
+    return _tabulate(thickness_m, tip_radius_m, rungs_n, heights, base)
+
+
+@lru_cache(maxsize=16)
+def _tabulate(
+    thickness_m: float, tip_radius_m: float, rungs_n: int, heights: tuple[float, ...], base: layer.Base
+) -> FlowMap:
+    size = tip_radius_m / thickness_m
+    depth_m = thickness_m * depth_unit(size) * LADDER[:rungs_n]
     at = np.log(size) / SIZE_STEP
     tables_i = int(np.floor(at)) - 1 + np.arange(STENCIL_N)
     share = _lagrange(tables_i.astype(float), at)
@@ -90,7 +98,7 @@ def tabulate(
         here[:] = CubicSpline(COARSE_R, coarse, axis=1)(FINE_R)
     # What lies on the base keeps its height and, where that is bonded, its place; it may turn.
     moved[:, np.array(heights) == 0, :, 1 if base == "slipping" else slice(2)] = 0.0
-    return FlowMap(thickness_m, thickness_m * reach(size, base), depth_m[:rungs_n], moved, base)
+    return FlowMap(thickness_m, thickness_m * reach(size, base), depth_m, moved, base)
 
 
 def move(flow: FlowMap, rest: Rest, poke_m: Float[np.ndarray, "3"]) -> Moved:

@@ -39,7 +39,7 @@ def one_pass_m() -> np.ndarray:
 
 
 def forget_tables() -> None:
-    for cached in (flow_map.tabulate, flow_map._rung, layer.contact_of_depth):
+    for cached in (flow_map._tabulate, flow_map._rung, layer.contact_of_depth):
         cached.cache_clear()
 
 

@@ -79,8 +79,8 @@ def test_without_spreads_nothing_differs_but_the_length_is_kept():
 
 
 def test_a_field_of_the_wrong_sign_inside_magnets_is_seen(monkeypatch):
-    right = magnet.cuboid_field
-    monkeypatch.setattr(magnet, "cuboid_field", lambda at_m, j_T, *, sides_m: -right(at_m, j_T, sides_m=sides_m))
+    right = magnet._corner
+    monkeypatch.setattr(magnet, "_corner", lambda from_m: -right(from_m))
     wrong = broken(check_field(DESIGN.skin, SEED))
     assert "field of a box: inside, J included" in wrong
     assert f"magnetising array, {DESIGN.skin.polarity}: field in the skin" in wrong

@@ -114,3 +114,19 @@ def test_far_away_the_uniform_skin_is_one_dipole_of_j_times_volume_over_mu0():
     b_T = field(rest.nodes_m, magnet.moments(j_T, rest.volumes_m3), above_m)
     moment = 0.1 * 20e-3**2 * THICKNESS_M / mu_0
     np.testing.assert_allclose(b_T[0, 2], 2 * MU0_4PI * moment, rtol=5e-3)  # 1 mm / 1 m off centre, three times
+
+
+@pytest.mark.parametrize("polarity", ["checkerboard", "same"])
+def test_the_array_is_the_sum_of_its_cubes(polarity):
+    cubes_n, side_m = (3, 2), magnet.CUBE_SIDE_M
+    truth_T = np.zeros_like(NODES_M)
+    for i in range(cubes_n[0]):
+        for j in range(cubes_n[1]):
+            sign = -1 if polarity == "checkerboard" and (i + j) % 2 else 1
+            for z_m in (-magnet.ARRAY_BELOW_M - side_m / 2, THICKNESS_M + magnet.ARRAY_ABOVE_M + side_m / 2):
+                middle_m = ((i - (cubes_n[0] - 1) / 2) * side_m, (j - (cubes_n[1] - 1) / 2) * side_m, z_m)
+                truth_T += magnet.cuboid_field(
+                    NODES_M - middle_m, sign * magnet.ARRAY_REMANENCE_T, sides_m=(side_m,) * 3
+                )
+    found_T = magnet.array_field(NODES_M, THICKNESS_M, polarity, cubes_n=cubes_n)
+    np.testing.assert_allclose(found_T, truth_T, atol=1e-12)

@@ -14,12 +14,12 @@ ENVIRONMENT = {
 
 
 def copy_checkout(folder: Path) -> Path:
-    """Copy what a story needs; DVC works without git there."""
+    """Copy what a story needs, compiled code too; DVC works without git there."""
     for path in ROOT.iterdir():
         if path.name in LEFT_OUT or path.name.endswith(".egg-info"):
             continue
         if path.is_dir():
-            shutil.copytree(path, folder / path.name, ignore=shutil.ignore_patterns("__pycache__", "cache", "tmp"))
+            shutil.copytree(path, folder / path.name, ignore=shutil.ignore_patterns("cache", "tmp"))
         else:
             shutil.copy(path, folder)
     (folder / "dvc.lock").unlink(missing_ok=True)
