@@ -34,7 +34,7 @@ LOGS = (
 TIMED = "reports/time.json"  # what `make time-repro` measured
 FULL_SIZE = "paper"  # the scene whose results the README shows first, where it was run
 
-Layout = Literal["capture", "serial-binary", "serial-text", "lab", "ini", "eflesh"]
+Layout = Literal["capture", "serial-binary", "serial-text", "table", "lab", "ini", "eflesh"]
 Wire = Literal["binary", "binary-clock", "text-xyzt", "text-txyz"]
 Board = Annotated[str, Option(help="The circuit board's name.")]
 Chips = Annotated[int, Option("--chips", help="Chips in a frame.", min=1, max=64)]
@@ -115,6 +115,24 @@ def remove(scene: str, capture: str) -> None:
 
     adding.remove(checkout(), scene, capture)
     typer.echo(f"removed {scene}/{capture}; now: dvc repro")
+
+
+@app.command()
+def template(
+    out: Annotated[Path, Argument(help="The CSV file to write; must be new.")],
+    chips_n: Chips = 5,
+) -> None:
+    """Write the first line of a recording in layout `table`; which columns may go stands in data/README.md."""
+    from pipeline.capture.readers.plain import NEEDED, columns_of
+    from pipeline.core import io
+
+    if out.exists():
+        raise ParamsError(out, "the file", "new", "one that is there", "Choose another name.")
+    io.write_text(out, ",".join(columns_of(chips_n)) + "\n")
+    typer.echo(
+        f"wrote {out}: {', '.join(NEEDED)} and fields in uT are needed, every other column may be left out. One row a "
+        "reading, phase noload or contact; no-load rows come before each press. Then: reskin add --layout table"
+    )
 
 
 @app.command()

@@ -22,7 +22,7 @@ from pipeline.dataset.captures import read_header
 
 NATIVE_FILES = (headers.STREAM_FILE, headers.ARRIVALS_FILE, headers.PROBE_FILE)
 
-Foreign = Literal["lab", "ini", "eflesh"]
+Foreign = Literal["table", "lab", "ini", "eflesh"]
 Marks = tuple[tuple[float, float], ...]
 Prepared = tuple[Header, Mapping[str, bytes | Path]]
 
@@ -81,7 +81,7 @@ def layouts_of(recording: Path) -> list[str]:
     if (recording / headers.HEADER_FILE).is_file():
         return ["capture"]
     if found := [layout for layout in get_args(Foreign) if _reads(recording, layout)]:
-        return found
+        return [layout for layout in found if layout != "table"] or found  # a plain table may leave labels unread
     fits = stream.fitting(io.read_bytes(recording)) if recording.is_file() else []
     return sorted({"serial-text" if wire in TEXT_WIRES else "serial-binary" for wire, _ in fits})
 

@@ -14,7 +14,14 @@ from pipeline.capture.header import Header
 from pipeline.capture.readers.chips import find_whole_rows
 from pipeline.capture.readers.passes import find_passes
 from pipeline.capture.readers.table import make_readings, read_cells, to_numbers
-from pipeline.capture.readers.units import check_depths, check_fields, check_forces, check_places, check_touch
+from pipeline.capture.readers.units import (
+    SAME_PLACE_mm,
+    check_depths,
+    check_fields,
+    check_forces,
+    check_places,
+    check_touch,
+)
 from pipeline.core.errors import CaptureError
 from pipeline.core.schema import AXES_PER_CHIP_N, Readings
 
@@ -85,6 +92,7 @@ def read(folder: Path, header: Header) -> tuple[Readings, Account]:
         "noload_rows_n": 0,
         **rows.losses(),
         "no_new_force_rows_n": int((states[rows.whole, WEIGHT_COLUMN:] == NO_NEW_WEIGHT).sum()),
+        "no_depth_rows_n": int(np.isnan(readings.depth_mm).sum()),
         "passes_n": int(pass_i.max()) + 1,
     }
 
@@ -115,7 +123,8 @@ def _read_states(folder: Path, header: Header) -> Float64[np.ndarray, "f c"]:
     names = ["time", "x", "y", "z"] + (["weight"] if len(cells[0]) > WEIGHT_COLUMN else [])
     states = to_numbers(cells, where, names=names)
     check_places(states[:, 1:3], where)
-    check_depths(states[:, 3] - states[:, 3].min(), where)
+    if np.ptp(states[:, 3]) > SAME_PLACE_mm:  # else the robot's height is constant, and tells no depth
+        check_depths(states[:, 3] - states[:, 3].min(), where)
     return states
 
 
@@ -170,6 +179,7 @@ def _read_force(states: Float64[np.ndarray, "f c"], header: Header) -> dict[str,
 
 
 def _read_depth(states: Float64[np.ndarray, "f c"], header: Header) -> Float64[np.ndarray, " f"]:
-    """Count down from the highest z; NaN where the gauge measured along the skin, as that stroke is no depth."""
+    """Count down from the highest z; NaN where z never changes, or the gauge measured along the skin: no depth."""
     along = states.shape[1] > WEIGHT_COLUMN and header.options["force_axis"] != "z"
-    return np.full(len(states), np.nan) if along else states[:, 3].max() - states[:, 3]
+    still = np.ptp(states[:, 3]) <= SAME_PLACE_mm
+    return np.full(len(states), np.nan) if along or still else states[:, 3].max() - states[:, 3]

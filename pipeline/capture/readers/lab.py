@@ -4,8 +4,6 @@ Signs: the file's Fz is negative in compression and is turned; Fx and Fy are pas
 The file's depth is only an index in its name, so `depth_mm` is NaN; it has no clock, so `t_s` is NaN.
 """
 
-import re
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +13,7 @@ from jaxtyping import Bool, Float64, Int
 
 from pipeline.capture.header import Header
 from pipeline.capture.readers.chips import find_whole_rows
+from pipeline.capture.readers.named import check_columns, contact_rows, count_chips_of, count_within
 from pipeline.capture.readers.table import make_readings, mean_by_group, read_cells, to_numbers
 from pipeline.capture.readers.units import check_fields, check_forces, check_places, check_touch
 from pipeline.core.errors import CaptureError
@@ -22,7 +21,6 @@ from pipeline.core.schema import Readings
 
 READINGS = "readings.csv"
 FILES = (READINGS,)
-PHASES = ("noload", "contact")
 FIRST_LINE_N = 2  # the file's line of the first row of numbers
 
 Account = dict[str, int]
@@ -50,7 +48,7 @@ def collect(recording: Path) -> dict[str, Path]:
 
 def count_chips(files: Mapping[str, Path]) -> int:
     """Count the chips from the names of the columns."""
-    return _count_chips(read_cells(files[READINGS], str(files[READINGS]), separator=",")[0])
+    return count_chips_of(read_cells(files[READINGS], str(files[READINGS]), separator=",")[0])
 
 
 def read(folder: Path, header: Header) -> tuple[Readings, Account]:
@@ -69,7 +67,7 @@ def read(folder: Path, header: Header) -> tuple[Readings, Account]:
         remedy = "Remove the block, or record it again."
         raise CaptureError(where, "each indent", "given noload rows that were read", got, remedy)
     reading_i = np.zeros(len(keep), int)
-    reading_i[keep] = _count_within(table.press[keep])
+    reading_i[keep] = count_within(table.press[keep])
     readings = make_readings(
         header,
         keep,
@@ -95,19 +93,14 @@ def read(folder: Path, header: Header) -> tuple[Readings, Account]:
     }
 
 
-def _count_chips(names: list[str]) -> int:
-    numbers = [int(match[1]) for name in names if (match := re.fullmatch(r"(?:T|Bx|By|Bz)(\d{1,3})", name))]
-    return max(numbers, default=0) + 1
-
-
 def _read_table(path: Path, where: str) -> _Table:
     header_cells, *cells = read_cells(path, where, separator=",")
     names = [name.strip() for name in header_cells]
-    k = _count_chips(names)
+    k = count_chips_of(names)
     fields = [f"{axis}{chip}" for chip in range(k) for axis in ("Bx", "By", "Bz")]
     numeric = ["indent", "x_mm", "y_mm", *(f"T{chip}" for chip in range(k)), *fields, "Fx", "Fy", "Fz"]
-    _check_columns(names, [numeric[0], "phase", *numeric[1:]], where)
-    contact = _contact_rows([row[names.index("phase")].strip() for row in cells], where)
+    check_columns(names, [numeric[0], "phase", *numeric[1:]], where, layout="lab")
+    contact = contact_rows([row[names.index("phase")].strip() for row in cells], where, FIRST_LINE_N)
     columns = [names.index(name) for name in numeric]
     picked = [[row[i] for i in columns] for row in cells]
     numbers = to_numbers(picked, where, names=numeric, first_line_n=FIRST_LINE_N)
@@ -116,26 +109,6 @@ def _read_table(path: Path, where: str) -> _Table:
     table = _Table(press, contact, place_mm, temperature_degC, b_uT, force_N, ignored_n)
     _check_table(table, where)
     return table
-
-
-def _check_columns(names: list[str], wanted: list[str], where: str) -> None:
-    missing = [name for name in wanted if name not in names]
-    if missing:
-        got = f"none named {', '.join(missing)}"
-        raise CaptureError(where, "columns", "those of data/README.md", got, "Is this layout lab, line 1 its names?")
-    twice = [name for name, times_n in Counter(names).items() if times_n > 1]
-    if twice:
-        raise CaptureError(where, "names of columns", "unique", f"{twice[0]} twice", "Remove one of the two.")
-
-
-def _contact_rows(phases: list[str], where: str) -> Bool[np.ndarray, " f"]:
-    for row_i, phase in enumerate(phases):
-        if phase not in PHASES:
-            place = f"phase in line {FIRST_LINE_N + row_i}"
-            raise CaptureError(where, place, "noload or contact", repr(phase[:20]), "Mend the word.")
-    if "contact" not in phases:
-        raise CaptureError(where, "the file", "rows of phase contact", "none", "Was the recording cut?")
-    return np.array([phase == "contact" for phase in phases])
 
 
 def _number_presses(indent: Float64[np.ndarray, " f"], where: str) -> Int[np.ndarray, " f"]:
@@ -165,9 +138,3 @@ def _check_table(table: _Table, where: str) -> None:
     if len(moved):
         got = f"another in line {FIRST_LINE_N + moved[0]}"
         raise CaptureError(where, "an indent's place", "one x_mm, y_mm", got, "Give each press its own indent.")
-
-
-def _count_within(press: Int[np.ndarray, " f"]) -> Int[np.ndarray, " f"]:
-    """Count 0, 1, 2 ... within each block of equal numbers."""
-    begins = np.flatnonzero(np.diff(press, prepend=-1))
-    return np.arange(len(press)) - np.repeat(begins, np.diff(begins, append=len(press)))

@@ -226,3 +226,10 @@ def test_fields_in_other_units_are_refused(tmp_path: Path, of_a_uT: float) -> No
     for name in (eflesh.SENSOR, eflesh.CHANGES):
         rescale(tmp_path / name, slice(1, None), of_a_uT)
     assert "G to uT" in complaint_of(tmp_path)
+
+
+def test_a_robot_of_constant_height_gives_places_and_no_depth(tmp_path):
+    places = [[x, y, 142.0] for x, y in GRID] * 3
+    readings, account = eflesh.read(write(tmp_path, places, [300.0 + i for i in range(len(places))]), HEADER)
+    assert np.isnan(readings.depth_mm).all()
+    assert account["no_depth_rows_n"] == len(readings) == len(places)
