@@ -21,6 +21,7 @@ from pipeline.evaluation.scores import over_folds, tidy
 
 STORE = "mlflow.db"
 ARTIFACTS = "mlartifacts"
+LOADER = "pipeline.pyfunc"
 PARENT = "mlflow.parentRunId"
 ELSEWHERE = {"provenance", "runtime", "described", "variants"}  # of numbers.json: costs, and what trainings hold
 
@@ -155,21 +156,47 @@ def _publish_training(diary: Diary, stage: str, parent_id: str, file: Path, card
     client, key = diary.client, run_key(card)
     tags = {name: card[name] for name in ("scene", "question", "recipe_name", "fold", "git")}
     tags |= {"cell": card["key"], "kind": "training"}
+    tags |= {"board": ", ".join(card["test_boards"]), "skin": ", ".join(card["test_skins"])}
     tags |= {"mlflow.source.name": f"pipeline.stages.{stage}", "mlflow.source.git.commit": card["git"]}
     run_id, unwritten = diary.open(stage, key, name=file.stem, parent=parent_id, tags=tags)
     if not unwritten:
         return False
-    settings = {name: card[name] for name in ("fold", "seed_i", "seed")} | card["recipe"]
+    settings = {"method": card["recipe_name"]}
+    settings |= {name: card[name] for name in ("question", "fold", "seed_i", "seed")} | card["recipe"]
     settings |= {name: card[name] for name in ("train_rows_n", "train_boards", "test_boards", "test_skins")}
     settings |= {f"adapt_{name}": value for name, value in card.get("tuning", {}).get("settings", {}).items()}
     client.log_batch(run_id, params=[Param(name, str(value)[:500]) for name, value in settings.items()])
     metrics = [(name, value, 0) for name, value in card["scores"]["all"].items()]
     metrics += [(f"registered_{name}", value, 0) for name, value in card["scores"]["registered"].items()]
     _log(client, run_id, metrics + [("train_loss", value, step) for step, value in enumerate(card["curve"])])
+    client.log_inputs(run_id, datasets=_datasets(card))
     for artifact in (file, file.with_suffix(".safetensors")):
         client.log_artifact(run_id, str(artifact), "model")
+    # By this file MLflow finds a loader and the weights beside it. It is YAML, of which JSON is a part.
+    flavor = {"python_function": {"loader_module": LOADER, "data": f"{file.stem}.safetensors"}}
+    about = {"artifact_path": "model", "flavors": flavor, "run_id": run_id}
+    client.log_text(run_id, json.dumps(about, indent=2), "model/MLmodel")
     client.set_terminated(run_id)
     return True
+
+
+def _datasets(card: Mapping[str, Any]) -> list[Any]:
+    """Say which skins a network was trained on, and which it was tested on."""
+    from mlflow.entities import Dataset, DatasetInput, InputTag
+
+    inputs = []
+    for context in ("train", "test"):
+        skins = card[f"{context}_skins"]
+        source = {"uri": f"data/indentations/{card['scene']}", "skins": skins}
+        profile = {"skins_n": len(skins)} | ({"rows_n": card["train_rows_n"]} if context == "train" else {})
+        words = {
+            "name": f"{card['scene']}, {card['fold']}, {context}",
+            "source_type": "local",
+            "digest": _digest(source)[:8],
+        }
+        dataset = Dataset(**words, source=json.dumps(source), profile=json.dumps(profile))
+        inputs.append(DatasetInput(dataset, [InputTag("mlflow.data.context", context)]))
+    return inputs
 
 
 def _publish_curve(diary: Diary, stage: str, points: Sequence[tuple[str, int, Mapping[str, float]]]) -> str:

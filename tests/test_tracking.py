@@ -101,7 +101,11 @@ def test_every_training_is_a_child_run_once_however_often_it_is_published(tmp_pa
     assert run.data.metrics == {"accuracy_pct": 50.0, "registered_accuracy_pct": 60.0, "train_loss": 1.0}
     assert run.data.params["steps_n"] == "3"
     assert [point.value for point in client.get_metric_history(run.info.run_id, "train_loss")] == [3.0, 2.0, 1.0]
-    assert len(client.list_artifacts(run.info.run_id, "model")) == 2
+    assert len(client.list_artifacts(run.info.run_id, "model")) == 3
+    assert {run.data.params["method"], run.data.params["fold"]} == {"paper", run.data.tags["fold"]}
+    assert (run.data.tags["board"], run.data.tags["skin"]) == ("b0", "s0")
+    contexts = {one.tags[0].value: one.dataset.name for one in client.get_run(run.info.run_id).inputs.dataset_inputs}
+    assert contexts == {part: f"ci, {run.data.tags['fold']}, {part}" for part in ("train", "test")}
 
     # Other settings: the new result is shown, the old one is kept and marked.
     assert write(tmp_path, b0="k0", b1="k9") == {"new_n": 1, "kept_n": 1, "superseded_n": 2}

@@ -9,6 +9,7 @@ from base64 import b64encode
 from collections.abc import Iterator
 from pathlib import Path
 
+import mlflow
 import numpy as np
 import pandas as pd
 import pyarrow.compute as pc
@@ -16,6 +17,7 @@ import pyarrow.parquet as pq
 import pytest
 from ruamel.yaml import YAML
 
+import reskin
 from pipeline.core import io
 from pipeline.learning.inputs import Scaler
 from pipeline.questions import EXPERIMENTS
@@ -218,6 +220,17 @@ def test_predictions_follow_from_the_saved_model_alone(story):
     first = pq.read_table(folder / "predictions.parquet").filter(pc.field("fold") == "b1").slice(0, 1).to_pylist()[0]
     # float32 sums in another order
     assert [first[f"predicted_{name}"] for name in ("x_mm", "y_mm", "Fz_N")] == pytest.approx(expected, abs=1e-3)
+
+
+def test_mlflow_loads_a_model_by_its_run_and_it_answers_as_ours_does(story, monkeypatch):
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{story / 'mlflow.db'}")
+    client = mlflow.MlflowClient()
+    query = "tags.kind = 'training' and tags.question = 'lobo' and tags.current = 'true'"
+    run = client.search_runs([client.get_experiment_by_name("ci").experiment_id], query)[0]
+    ours = reskin.load_model(story / f"data/models/ci/train_multi/{run.info.run_name}.safetensors").zero(np.zeros(15))
+    db_uT = np.random.default_rng(0).normal(0, 300, (5, 15))
+    theirs = mlflow.pyfunc.load_model(f"runs:/{run.info.run_id}/model").predict(pd.DataFrame(db_uT))
+    np.testing.assert_allclose(theirs.to_numpy(), ours.predict(db_uT), rtol=1e-6)
 
 
 def test_a_second_repro_does_nothing(story):

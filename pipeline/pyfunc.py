@@ -1,0 +1,33 @@
+"""A trained network as MLflow loads it: `mlflow.pyfunc.load_model("runs:/RUN_ID/model")`. No pickle is opened.
+
+In: changes of field in uT, one row a reading (DataFrame or array, Bx0, By0, Bz0, Bx1, ...). Out: x_mm, y_mm, force_N.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+
+from pipeline.predicting import read_network
+from pipeline.trials.networks import Network
+
+COLUMNS = ("x_mm", "y_mm", "force_N")
+
+
+class Loaded:
+    """What MLflow calls."""
+
+    def __init__(self, network: Network) -> None:
+        self.network = network
+
+    def predict(self, model_input: Any, params: dict[str, Any] | None = None) -> pd.DataFrame:
+        """Answer for changes of field in uT, [f ch]."""
+        db_uT: Float[np.ndarray, "f ch"] = np.atleast_2d(np.asarray(model_input, np.float32))
+        return pd.DataFrame(self.network(db_uT), columns=list(COLUMNS))
+
+
+def _load_pyfunc(path: str) -> Loaded:
+    """Load the weights that a run's file MLmodel names; MLflow calls this."""
+    return Loaded(read_network(Path(path)))
