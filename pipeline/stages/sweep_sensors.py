@@ -2,9 +2,12 @@
 
 from pathlib import Path
 
+import numpy as np
+
 from pipeline.core import io
 from pipeline.core.config import Files, read_settings
 from pipeline.core.stage import run
+from pipeline.dataset.splits import Fold
 from pipeline.learning.recipe import HEADLINE, Recipe, training
 from pipeline.learning.recipe import adaptations as adaptations_of
 from pipeline.learning.trial import Start, Trial
@@ -28,7 +31,7 @@ def sweep_sensors(scene: str, files: Files, indentations: Path, folds: Path, sco
     }
     adapted = [
         trial
-        for fold in data.folds_of("sensors")
+        for fold in _folds(data)
         for trial in adaptations(data, fold, (HEADLINE, recipe), starts, question="sensors", pokes_n=settings.pokes_n)
     ]
     methods = [trial.what for trial in trials] + ["adapted"] * len(adapted)
@@ -38,11 +41,19 @@ def sweep_sensors(scene: str, files: Files, indentations: Path, folds: Path, sco
     note_seconds(scene, "sweep_sensors", trials, trained)
 
 
+def _folds(data: SceneData) -> list[Fold]:
+    """Order folds by their number of training skins, most first: those of all skins then stack as in `train_multi`.
+
+    Finished trainings are known by their whole stack, so that only then these are reused.
+    """
+    return sorted(data.folds_of("sensors"), key=lambda fold: -len(np.unique(data.rows.skin[fold.train])))
+
+
 def _trials(data: SceneData, recipe: Recipe, method: str) -> list[Trial]:
     """One trial a draw of skins; the draw is its seed too, as the fold's name is part of the generator's."""
     return [
         Trial("sensors", HEADLINE, recipe, fold.name, data.settings.seed, 0, fold.train, fold.test, what=method)
-        for fold in data.folds_of("sensors")
+        for fold in _folds(data)
     ]
 
 
