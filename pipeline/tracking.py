@@ -22,6 +22,7 @@ from pipeline.evaluation.scores import over_folds, tidy
 STORE = "mlflow.db"
 ARTIFACTS = "mlartifacts"
 LOADER = "pipeline.pyfunc"
+LAYOUT = 2  # of what a run of a training holds; runs of an older one are written again
 PARENT = "mlflow.parentRunId"
 ELSEWHERE = {"provenance", "runtime", "described", "variants"}  # of numbers.json: costs, and what trainings hold
 
@@ -96,7 +97,7 @@ class Diary:
 
 def run_key(card: Mapping[str, Any]) -> str:
     """Name a result by its whole card, scores included, but for the commit: equal results are one."""
-    return _digest({name: value for name, value in card.items() if name != "git"})
+    return _digest({name: value for name, value in card.items() if name != "git"} | {"published_as": LAYOUT})
 
 
 def _digest(value: Any) -> str:

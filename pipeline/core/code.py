@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 PACKAGE = "pipeline"
+DATA = (".yaml", ".html")  # files that belong to the module of their name
 ROOT = Path(__file__).parents[2]
 
 
@@ -23,17 +24,18 @@ def digest(name: str) -> str:
     file = file_of(name)
     found = hashlib.sha256(json.dumps(_syntax(ast.parse(file.read_bytes()))).encode())
     for beside in sorted(file.parent.glob(f"{file.stem}.*")):
-        if beside.suffix not in (".py", ".pyc"):
+        if beside.suffix in DATA:
             found.update(beside.read_bytes())
     return found.hexdigest()[:32]
 
 
 def imported(*names: str) -> list[str]:
-    """Name the modules of this package that some modules import, directly or not, and these themselves; sorted.
+    """Name the modules of this package that some modules import, directly or not, these themselves and their packages.
 
     Imports under `if TYPE_CHECKING:` run nothing and do not count.
     """
-    return sorted(set(names).union(*map(_graph().find_upstream_modules, names)))
+    found = set(names).union(*map(_graph().find_upstream_modules, names))
+    return sorted({name.rsplit(".", i)[0] for name in found for i in range(name.count(".") + 1)})
 
 
 @cache

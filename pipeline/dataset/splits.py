@@ -88,7 +88,7 @@ def draw_folds(rows: Rows, questions: Iterable[str], split: Split, seed: int) ->
     >>> rows = Rows.of_labels(["b1", "b1", "b2", "b3"], ["s1", "s2", "s3", "s4"])
     >>> show(draw_folds(rows, ["sensors"], Split(sensors_skins_n=(1, 2), sensors_draws_n=1), 0))
     b1-01skins-draw0 [3] [] [0 1]
-    b1-02skins-draw0 [2 3] [] [0 1]
+    b1 [2 3] [] [0 1]
     b2-01skins-draw0 [1] [] [2]
     b2-02skins-draw0 [0 1] [] [2]
     b3-01skins-draw0 [0] [] [3]

@@ -6,24 +6,21 @@ frictionless sphere, linear: small changes of depth. Refuses to know magnets, an
 
 from dataclasses import dataclass
 from functools import lru_cache
-from math import exp
-from typing import Literal, no_type_check
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
-from numba import njit
 from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
-from scipy.special import j0, j1
 
 from pipeline.core.errors import ParamsError
 from pipeline.physics import slip
+from pipeline.physics.waves import bessel, bonded, bonded_whole, sliding, sliding_whole, sum_waves
 
 Base = Literal["bonded", "slipping"]
 
 VERIFIED_DEPTH = 0.6  # of the thickness: Long et al. 2011 compared with finite elements up to here
 CURVE_N = 48  # contact radii of the force curve
-BESSEL_STEP = 1 / 256  # between tabulated Bessel functions
 
 
 def _gauss(top: float, points_n: int) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " q"]]:
@@ -153,9 +150,9 @@ def waves(contact: Contact, thickness_m: float, base: Base) -> Waves:
 
 def displacement(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"], of: Waves) -> Displacement:
     """Sum the waves at (r, z): u_r = sum of amplitude g' J1, u_z = -sum of amplitude g J0 (PHYSICS 4: U = -W'/k)."""
-    bessel = _bessel(float(np.max(r_m, initial=0.0) * of.k_per_m[-1]))
+    table = bessel(float(np.max(r_m, initial=0.0) * of.k_per_m[-1]))
     waves = np.stack([of.k_per_m, of.thickness_m * of.k_per_m, of.amplitude_m])
-    out_m, hoop, up_m, squeeze, r_z, z_r = _sum_waves(r_m, z_m, waves, of.base == "slipping", bessel)
+    out_m, hoop, up_m, squeeze, r_z, z_r = sum_waves(r_m, z_m, waves, of.base == "slipping", table)
     return Displacement(r_m=out_m, z_m=up_m, r_r=squeeze - hoop, r_z=r_z, z_r=z_r, z_z=-squeeze, hoop=hoop)
 
 
@@ -163,86 +160,10 @@ def depth_profile(
     kz: Float[np.ndarray, "s w"], kh: Float[np.ndarray, " w"], base: Base = "bonded"
 ) -> tuple[Float[np.ndarray, "s w"], Float[np.ndarray, "s w"], Float[np.ndarray, "s w"]]:
     """Give k W 2G / p^ = g at height z, and its first two derivatives by kz; g(kh) is the surface's `compliance`."""
-    of_all, of_one = (whole, wave) if base == "bonded" else (slip.whole, slip.wave)
+    of_all, of_one = (bonded_whole, bonded) if base == "bonded" else (sliding_whole, sliding)
     found = [[of_one(z, h, of_all(h)) for z, h in zip(row, kh, strict=True)] for row in kz]
     g, slope, bend = np.array(found).transpose(2, 0, 1)
     return g, slope, bend
-
-
-@njit(cache=True, error_model="numpy")
-@no_type_check
-def whole(kh):
-    """Give what `wave` needs of the layer as a whole; it is the same at every height."""
-    base = exp(-2 * kh)
-    size = (1 + base) ** 2 + 4 * kh * kh * base
-    return (1 + base) / size, 2 * kh / size * exp(-kh), 0.0
-
-
-@njit(cache=True, error_model="numpy")
-@no_type_check
-def wave(kz, kh, of):
-    """Give g of one wave at height z of a layer that is held at its base, and its first two derivatives by kz.
-
-    g = [cosh A (sinh z' + t cosh z') - A cosh t - A z' sinh t] / (cosh^2 A + A^2), t = A - z': the W of PHYSICS 4 with
-    a and b put in. All of it is divided by exp(2A) / 4, so that no exponent is positive inside the layer.
-    """
-    t = kh - kz
-    top, fade = exp(-t), exp(-kz)
-    low, high = fade * fade, top * top
-    near, far = of[0] * top, of[1] * fade
-    g = near * (1 + t - (1 - t) * low) - far * (1 + kz + (1 - kz) * high)
-    slope = near * t * (1 - low) + far * kz * (1 + high)
-    bend = near * (t * (1 + low) - (1 - low)) + far * (1 + high - kz * (1 - high))
-    return g, slope, bend
-
-
-@njit(cache=True, error_model="numpy")
-@no_type_check
-def _sum_waves(r_m, z_m, waves, slipping, bessel):
-    sums = np.zeros((6, len(r_m)))
-    for w in range(waves.shape[1]):
-        k, kh, amplitude = waves[0, w], waves[1, w], waves[2, w]
-        steep, of = amplitude * k, slip.whole(kh) if slipping else whole(kh)
-        for s in range(len(r_m)):
-            g, slope, bend = slip.wave(k * z_m[s], kh, of) if slipping else wave(k * z_m[s], kh, of)
-            at = k * r_m[s] / BESSEL_STEP
-            low = int(at)
-            j0_, j1_ = _between(bessel, low, at - low)
-            sums[0, s] += amplitude * slope * j1_
-            sums[1, s] += steep * slope / 2
-            sums[2, s] -= amplitude * g * j0_
-            sums[3, s] += steep * slope * j0_
-            sums[4, s] += steep * bend * j1_
-            sums[5, s] += steep * g * j1_
-    for s in range(len(r_m)):
-        if r_m[s] > 0:
-            sums[1, s] = sums[0, s] / r_m[s]  # on the axis: its limit
-    return sums
-
-
-@njit(cache=True, error_model="numpy")
-@no_type_check
-def _between(bessel, low, share):
-    # Cubic Hermite between points BESSEL_STEP apart, with the true slopes: wrong by less than 1e-12.
-    j0_a, j1_a, slope_a = bessel[low, 0], bessel[low, 1], bessel[low, 2]
-    j0_b, j1_b, slope_b = bessel[low + 1, 0], bessel[low + 1, 1], bessel[low + 1, 2]
-    rest = 1 - share
-    a, b = rest * rest * (1 + 2 * share), share * share * (3 - 2 * share)
-    da, db = BESSEL_STEP * share * rest * rest, -BESSEL_STEP * share * share * rest
-    return a * j0_a + b * j0_b - da * j1_a - db * j1_b, a * j1_a + b * j1_b + da * slope_a + db * slope_b
-
-
-def _bessel(top: float) -> Float[np.ndarray, "x 3"]:
-    """Tabulate J0, J1 and J1' = J0 - J1 / x from 0 to at least `top`."""
-    return _bessel_to(1 << max(8, int(np.ceil(top)).bit_length()))
-
-
-@lru_cache(maxsize=4)
-def _bessel_to(top: int) -> Float[np.ndarray, "x 3"]:
-    x = BESSEL_STEP * np.arange(round(top / BESSEL_STEP) + 2)
-    with np.errstate(invalid="ignore"):
-        slope = np.where(x > 0, j0(x) - j1(x) / x, 0.5)
-    return np.stack([j0(x), j1(x), slope], axis=1)
 
 
 @lru_cache(maxsize=64)

@@ -12,7 +12,7 @@ import pandas as pd
 
 from pipeline.reporting.figures import drawing, svg
 from pipeline.reporting.order import CONTROL, Model, models
-from pipeline.reporting.shown import COLUMNS, show, tabulate
+from pipeline.reporting.shown import COLUMNS, INTERVAL, n_of, show, tabulate
 from pipeline.reporting.sweeps import DRAWN, bars
 from pipeline.reporting.work_precision import COLOURS, MARKERS
 
@@ -32,7 +32,6 @@ def table2_figure(numbers: Mapping[str, Any], source: str) -> str:
     """Draw accuracy and MSE of each row of table 2 on boards held out, ours beside the paper's."""
     rows = _rows(numbers)
     y = np.arange(len(rows))[::-1].astype(float)
-    boards_n = rows[-1][1]["accuracy_pct"]["n"]
     with drawing(8.6, 0.9 + 0.55 * len(rows)) as figure:
         panels = figure.subplots(1, len(DRAWN), sharey=True)
         for axes, metric in zip(panels, DRAWN, strict=True):
@@ -43,11 +42,13 @@ def table2_figure(numbers: Mapping[str, Any], source: str) -> str:
                 _draw(axes, metric, np.array([at for at, _ in printed]) - APART, paper, "paper (mean, sd)", hollow=True)
             axes.set(xlabel=COLUMNS[metric].replace(", ", " / "), xlim=(0, 100 if metric == "accuracy_pct" else None))
             axes.grid(axis="x", alpha=0.25)
-        panels[0].set_yticks(y, [fill(model.title, 34) for model, _ in rows], fontsize=9)
+        panels[0].set_yticks(y, [fill(f"{model.title} (n = {n_of(row)})", 36) for model, row in rows], fontsize=9)
         panels[0].set_ylim(-0.6, len(rows) - 0.4)
         handles = panels[0].get_legend_handles_labels()
         figure.legend(*handles, loc="outside lower center", ncols=2, frameon=False, fontsize=9)
-        title = f"On boards never seen ({numbers['provenance']['scene']}, {source}, {boards_n} boards held out in turn)"
+        title = (
+            f"On boards never seen ({numbers['provenance']['scene']}, {source}; n boards held out, or pairs of skins)"
+        )
         figure.suptitle(title, x=0.01, ha="left", fontsize=11)
         return svg(figure)
 
@@ -88,8 +89,8 @@ def short_table(numbers: Mapping[str, Any]) -> pd.DataFrame:
         for metric in SHORT_TABLE:
             paper = f"{model.paper[metric][0]:.3g}" if model.paper else "–"
             line |= {f"{COLUMNS[metric]} (ours)": show(row[metric]), f"{COLUMNS[metric]} (paper)": paper}
-        lines.append(line)
-    return tabulate(lines, spread="[low, high] is the 95 % interval over boards held out")
+        lines.append(line | {"n": n_of(row)})
+    return tabulate(lines, spread=f"{INTERVAL}; n boards, or pairs of skins for one skin on others")
 
 
 def _rows(numbers: Mapping[str, Any], *, control: bool = False) -> list[tuple[Model, Mapping[str, Any]]]:

@@ -4,7 +4,7 @@ A scene whose results are of code that counted no collapsed networks is named, a
 know paths but those of the pages it leads to.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,19 +24,20 @@ class Entry:
     stale: bool
 
 
-def index(results: Sequence[Mapping[str, Any]]) -> str:
-    """Render the page of all scenes, recorded ones first: they are what counts."""
+def index(results: Sequence[Mapping[str, Any]], drawn: Collection[str]) -> str:
+    """Render the page of all scenes, recorded ones first: they are what counts. `drawn` have a headline figure."""
     kinds = []
     for source, title in KINDS.items():
         own = [numbers for numbers in results if numbers["provenance"]["source"] == source]
-        entries = [_entry(numbers) for numbers in sorted(own, key=lambda numbers: str(numbers["provenance"]["scene"]))]
+        entries = [
+            _entry(numbers, drawn) for numbers in sorted(own, key=lambda numbers: str(numbers["provenance"]["scene"]))
+        ]
         if entries:
             kinds.append({"source": source, "title": title, "sentence": SOURCES[source], "entries": entries})
     return template("index.html").render(kinds=kinds, figure=FILE)
 
 
-def _entry(numbers: Mapping[str, Any]) -> Entry:
-    stale = "trainings" not in numbers
-    has_figure = not stale and bool(numbers.get("table2") or "labels" in numbers)
+def _entry(numbers: Mapping[str, Any], drawn: Collection[str]) -> Entry:
+    scene, stale = str(numbers["provenance"]["scene"]), "trainings" not in numbers
     words = "" if stale else about(numbers).removeprefix(SOURCES[numbers["provenance"]["source"]]).strip()
-    return Entry(str(numbers["provenance"]["scene"]), words, has_figure, stale)
+    return Entry(scene, words, scene in drawn and not stale, stale)

@@ -9,7 +9,7 @@ from pipeline.evaluation.choice import to_record
 from pipeline.evaluation.scores import to_csv
 from pipeline.learning.recipe import HEADLINE
 from pipeline.reporting.figures import error_grids
-from pipeline.reporting.headline import headline_figures
+from pipeline.reporting.headline import FILE, headline_figures
 from pipeline.reporting.index import index
 from pipeline.reporting.numbers import headline_scores
 from pipeline.reporting.page import page
@@ -44,7 +44,9 @@ def report(
     io.write_texts(reports / "runtime", costs)
     io.write_text(reports / "index.html", page(numbers, tables, figures, costs))
     results = (io.read_json(file) for file in sorted(reports.parent.glob("*/numbers.json")))
-    io.write_text(reports.parent / "index.html", index([result for result in results if "described" in result]))
+    with_figure = {figure.parent.parent.name for figure in reports.parent.glob(f"*/figures/{FILE}")}
+    described = [result for result in results if "described" in result]
+    io.write_text(reports.parent / "index.html", index(described, with_figure))
     say(f"{scene}: {reports}/index.html, numbers.json, scores.json, tables, figures")
 
 

@@ -33,9 +33,9 @@ def size_MB(folder: Path) -> float:
     return round(sum(file.lstat().st_blocks * 512 for file in folder.rglob("*")) / 1e6)
 
 
-def once() -> dict[str, object]:
-    """Time one clone."""
-    folder = Path(tempfile.mkdtemp()) / "clone"
+def once(keep: Path | None) -> dict[str, object]:
+    """Time one clone; keep it, results and all, if `keep` names a folder for it."""
+    folder = keep or Path(tempfile.mkdtemp()) / "clone"
     try:
         subprocess.run(["git", "clone", "--quiet", str(ROOT), str(folder)], check=True)
         environment = run(["make", ".venv/.installed"], folder)
@@ -45,20 +45,22 @@ def once() -> dict[str, object]:
             "all_MB": size_MB(folder),
         }  # fmt: skip
     finally:
-        shutil.rmtree(folder.parent)
+        if keep is None:
+            shutil.rmtree(folder.parent)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--times", type=int, default=3)
     parser.add_argument("--out", type=Path, default=ROOT / "reports/time.json")
+    parser.add_argument("--keep", type=Path, help="keep the last clone there")
     asked = parser.parse_args()
     commit = subprocess.run(
         ["git", "rev-parse", "--short=12", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=True
     )
     runs = []
     for i in range(asked.times):
-        runs.append(once())
+        runs.append(once(asked.keep if i == asked.times - 1 else None))
         print(f"{i + 1}/{asked.times}: {runs[-1]}", flush=True)
     machine = f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
     asked.out.write_text(json.dumps({"git": commit.stdout.strip(), "machine": machine, "runs": runs}, indent=2) + "\n")

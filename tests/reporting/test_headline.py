@@ -23,7 +23,7 @@ def test_each_row_of_table_2_is_drawn_and_named_with_source_and_boards():
     said = words_of(headline_figures(numbers, "simulated")[FILE])
     for name in numbers["table2"]:
         assert models(numbers)[name].title.split(",")[0] in said
-    for word in ("simulated", "paper", "accuracy", "MSE_xy", "boards held out in turn"):
+    for word in ("simulated", "paper", "accuracy", "MSE_xy", "boards held out"):
         assert word in said
 
 

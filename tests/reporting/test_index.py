@@ -12,24 +12,25 @@ def numbers(scene: str, source: str) -> dict:
 
 
 def test_recorded_scenes_come_first_and_no_scene_stands_under_the_other_word():
-    text = index([numbers("here", "simulated"), numbers("there", "recorded")])
+    text = index([numbers("here", "simulated"), numbers("there", "recorded")], {"here"})
     recorded, simulated = text.split('<section id="simulated">')
     assert 'href="there/index.html"' in recorded
     assert 'href="here/index.html"' in simulated
     assert "there/" not in simulated
     assert "here/" not in recorded.replace("there/", "")
+    assert "there/figures" not in text  # no file, no image
 
 
 def test_a_scene_of_earlier_code_is_named_without_a_figure():
     old = numbers("old", "simulated")
     old.pop("trainings")
-    text = index([old])
+    text = index([old], {"old"})
     assert "Out of date" in text
     assert "<img" not in text
 
 
 def test_the_page_needs_nothing_but_the_pages_beside_it():
-    text = index([numbers("here", "simulated")])
+    text = index([numbers("here", "simulated")], {"here"})
     addresses = re.findall(r'(?:src|href)="([^"]+)"', text)
     assert addresses
     assert all(address.startswith("here/") for address in addresses)

@@ -292,7 +292,7 @@ def test_in_the_readme_the_order_stands_right_below_table_2():
         "grid": {"source": "simulated", "over_skins": {"step_z_uT": {"mean": 1.0, "least": 1.0, "most": 1.0, "n": 1}}}
     }
     tables = make_tables(everything())
-    results = blocks_of([everything() | {"described": described, "trainings": {}}], [], "", {})["results"]
+    results = blocks_of([everything() | {"described": described, "trainings": {}}], [], {}, None)["results"]
     table2, order = to_markdown(tables["table2"]), to_markdown(tables["order"])
     assert f"{table2}\n\n{order}" in results
 
@@ -301,11 +301,11 @@ def test_the_readme_takes_what_a_scene_costs_from_its_provenance():
     described = {"grid": {"source": "simulated", "over_skins": {}}}
     numbers = everything() | {"described": described, "trainings": {}}
     numbers["provenance"] |= {"seconds": 5400.0, "scene": "paper"}
-    assert "`paper` 90 min" in blocks_of([numbers], [], "", {})["costs"]
+    assert "`paper` 90 min" in blocks_of([numbers], [], {}, None)["costs"]
 
 
 def test_a_scene_of_earlier_code_is_called_stale_and_none_of_its_numbers_is_shown():
     numbers = everything() | {"described": {"grid": {"source": "simulated", "over_skins": {}}}}
-    blocks = blocks_of([numbers], [], "", {})
+    blocks = blocks_of([numbers], [], {}, None)
     assert "stale" in blocks["results"]
     assert "|" not in blocks["results"] + blocks["costs"]

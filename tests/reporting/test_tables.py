@@ -149,11 +149,13 @@ def test_rounding_keeps_six_digits(value, kept):
 
 
 def test_generated_blocks_replace_only_what_is_between_their_marks():
-    text = "before\n<!-- a -->\nold\n<!-- /a -->\nafter\n"
-    assert fill(text, {"a": "new"}) == "before\n<!-- a -->\nnew\n<!-- /a -->\nafter\n"
-    assert fill(fill(text, {"a": r"\1 new"}), {"a": r"\1 new"}) == fill(text, {"a": r"\1 new"})
-    with pytest.raises(SchemaError, match="the block b must be between its two marks"):
-        fill(text, {"b": "new"})
+    pages = {"one.md": "before\n<!-- a -->\nold\n<!-- /a -->\nafter\n", "other.md": "a\n"}
+    assert fill(pages, {"a": "new"}) == pages | {"one.md": "before\n<!-- a -->\nnew\n<!-- /a -->\nafter\n"}
+    assert fill(fill(pages, {"a": r"\1 new"}), {"a": r"\1 new"}) == fill(pages, {"a": r"\1 new"})
+    with pytest.raises(SchemaError, match="the block b must be in one page; got no page"):
+        fill(pages, {"b": "new"})
+    with pytest.raises(SchemaError, match="in one page; got one.md, other.md"):
+        fill(pages | {"other.md": pages["one.md"]}, {"a": "new"})
 
 
 def test_all_metrics_have_a_column():

@@ -33,7 +33,8 @@ FILES = (CSV,)
 NEEDED = ("phase", "x_mm", "y_mm")
 OPTIONAL = ("indentation", "pass", "t_s", "depth_mm", "Fx_N", "Fy_N", "Fz_N")
 FIRST_LINE_N = 2  # of a CSV file: the first row of numbers
-UNKNOWN = "nan"  # how a cell that is empty is read
+EMPTY = ("", "nan", "NaN")
+STEMS = {"f", "fx", "fy", "fz", "force", "depth", "x", "y", "t", "time", "indent", "indentation", "press", "pass"}
 
 
 Account = dict[str, int]
@@ -58,7 +59,7 @@ def count_chips(files: Mapping[str, Path]) -> int:
     return count_chips_of(_read_cells(file, str(file))[0])
 
 
-def read(folder: Path, header: Header) -> tuple[Readings, Account]:
+def read(folder: Path, header: Header) -> tuple[Readings, Account]:  # noqa: PLR0915 - one column after another
     """Read contact rows as readings; the no-load field of a row is the mean of the last no-load rows before it."""
     name = next(name for name in (CSV, PARQUET) if (folder / name).exists())
     where = f"{header.capture}/{name}"
@@ -69,12 +70,13 @@ def read(folder: Path, header: Header) -> tuple[Readings, Account]:
     columns = columns_of(header.chips_n)
     check_columns(names, columns[: -len(OPTIONAL) - header.chips_n], where, layout="table")
     contact = contact_rows([row[names.index("phase")].strip() for row in cells], where, FIRST_LINE_N)
-    known = [column for column in columns[1:] if column in names]
+    _refuse_near_names(names, columns, where)
+    known = [column for column in columns[1:] if column in names and not _is_empty(column, names, cells)]
     numbers = dict(zip(known, _to_numbers(names, cells, known, contact, where).T, strict=True))
     b_uT = np.stack([numbers[column] for column in columns[len(NEEDED) : len(NEEDED) + 3 * header.chips_n]], axis=1)
+    _check(numbers, b_uT, contact, where)
     unknown = np.full(len(contact), np.nan)
     temperature_degC = np.stack([numbers.get(f"T{chip}", unknown) for chip in range(header.chips_n)], axis=1)
-    _check(numbers, b_uT, contact, where)
     rows = find_whole_rows(b_uT, temperature_degC, header, where=where)
     press = _number_presses(numbers, contact, where)
     block = np.cumsum(np.diff(contact.astype(int), prepend=1) < 0)  # a block of no-load rows, and the contacts after it
@@ -99,7 +101,7 @@ def read(folder: Path, header: Header) -> tuple[Readings, Account]:
         "rows_read_n": len(keep),
         "noload_rows_n": int(rest.sum()),
         **rows.losses(),
-        "ignored_columns_n": len(names) - 1 - len(known),
+        "ignored_columns_n": len(set(names) - set(columns)),
         "no_depth_rows_n": len(readings) if still or "depth_mm" not in numbers else 0,
     }
 
@@ -116,14 +118,28 @@ def _read_cells(path: Path, where: str) -> tuple[list[str], list[list[str]]]:
     return list(table.column_names), [list(row) for row in zip(*columns, strict=True)]
 
 
+def _refuse_near_names(names: Sequence[str], columns: Sequence[str], where: str) -> None:
+    """Raise for a column that would be ignored, though its name is nearly one that is known: `Fz` for `Fz_N`."""
+    for name in names:
+        if name not in columns and name.lower().split("_")[0] in STEMS:
+            rule = f"one of {', '.join((*NEEDED, *OPTIONAL))}, or another word"
+            raise CaptureError(where, "a column's name", rule, repr(name), "Rename the column, or remove it.")
+
+
+def _is_empty(column: str, names: Sequence[str], cells: Sequence[Sequence[str]]) -> bool:
+    """Tell whether nothing stands in a column that may be left out, as in a template that was not filled in there."""
+    at = names.index(column)
+    return (column in OPTIONAL or column[0] == "T") and all(row[at].strip() in EMPTY for row in cells)
+
+
 def _to_numbers(
     names: list[str], cells: list[list[str]], known: Sequence[str], contact: Bool[np.ndarray, " f"], where: str
 ) -> Float64[np.ndarray, "f c"]:
     """Turn the known columns into numbers; a place, depth or force of a row without contact may be empty."""
     at = [names.index(column) for column in known]
-    may_lack = {column for column in known if column[0] != "B" and column not in ("indentation", "pass")}
+    may_lack = {column for column in known if column[0] != "B"}
     picked = [[row[i].strip() for i in at] for row in cells]
-    lacking = np.array([[not cell for cell in row] for row in picked], bool).reshape(len(picked), len(known))
+    lacking = np.array([[cell in EMPTY for cell in row] for row in picked], bool).reshape(len(picked), len(known))
     lacking &= ~contact[:, None] & np.isin(known, sorted(may_lack))
     filled = [
         ["0" if lack else cell for cell, lack in zip(*row, strict=True)] for row in zip(picked, lacking, strict=True)
@@ -156,15 +172,18 @@ def _number_presses(
 ) -> Int[np.ndarray, " f"]:
     """Number presses from 0: by `indentation` if it is there, else one more at each touch and each new place."""
     if "indentation" in numbers:
-        changes = np.diff(numbers["indentation"], prepend=np.nan) != 0
-        begins = np.flatnonzero(changes)
-        firsts, counts = np.unique(numbers["indentation"][begins], return_counts=True)
+        rows = np.flatnonzero(contact)  # a number of rows without contact says nothing
+        number = numbers["indentation"][rows]
+        begins = np.flatnonzero(np.diff(number, prepend=np.nan) != 0)
+        firsts, counts = np.unique(number[begins], return_counts=True)
         if (counts > 1).any():
             twice = firsts[counts > 1][0]
-            line_n = FIRST_LINE_N + begins[np.flatnonzero(numbers["indentation"][begins] == twice)[1]]
+            line_n = FIRST_LINE_N + rows[begins[np.flatnonzero(number[begins] == twice)[1]]]
             got = f"{twice:g} once more in line {line_n}"
             raise CaptureError(where, "indentation", "one block of rows a number", got, "Was the file joined twice?")
-        return np.cumsum(changes) - 1
+        begins_at = np.zeros(len(contact), bool)
+        begins_at[rows[begins]] = True
+        return np.maximum(np.cumsum(begins_at) - 1, 0)
     place = np.stack([numbers["x_mm"], numbers["y_mm"]], axis=1)
     elsewhere = np.r_[True, (np.abs(np.diff(place, axis=0)) > SAME_PLACE_mm).any(axis=1)]
     begins_at = contact & (np.r_[True, ~contact[:-1]] | elsewhere)

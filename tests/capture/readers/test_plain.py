@@ -83,6 +83,20 @@ def test_presses_are_the_same_with_numbers_and_without(tmp_path_factory, presses
     assert without.reading_i.tolist() == list(range(contact_n)) * presses_n
 
 
+def test_columns_of_a_template_that_stay_empty_are_unknown(tmp_path):
+    rows = table().reindex(columns=plain.columns_of(CHIPS_N))
+    readings, account = read(tmp_path, rows)
+    assert np.isnan(readings.depth_mm).all()
+    assert np.isfinite(readings.Fz_N).all()
+    assert account["ignored_columns_n"] == 0
+
+
+def test_blocks_without_contact_may_have_numbers_of_their_own(tmp_path):
+    rows = table().assign(indentation=np.repeat(np.arange(12), [3, 4] * 6))
+    readings, _ = read(tmp_path, rows)
+    assert readings.indentation.tolist() == np.repeat(np.arange(6), 4).tolist()
+
+
 def test_parquet_reads_as_csv_does(tmp_path):
     one, other = read(tmp_path / "a", table())[0], read(tmp_path / "b", table(), "mine.parquet")[0]
     np.testing.assert_array_equal(one.b_uT, other.b_uT)
@@ -124,7 +138,9 @@ MISTAKES = {
     "no contact": (lambda t: t[t.phase == "noload"], "rows of phase contact"),
     "millitesla": (lambda t: t.assign(**{c: t[c] / 1e3 for c in plain.columns_of(CHIPS_N)[3:9]}), "Convert mT or G"),
     "force pulls": (lambda t: t.assign(Fz_N=-t.Fz_N), "Turn its sign"),
-    "a press twice": (lambda t: t.assign(indentation=np.repeat([0, 1, 0, 2, 3, 4], 7)), "0 once more in line 16"),
+    "nearly a name": (lambda t: t.rename(columns={"Fz_N": "Fz"}), "'Fz'"),
+    "a force left out here": (lambda t: wrong(t, 10, "Fz_N", ""), "Fz_N in line 12"),
+    "a press twice": (lambda t: t.assign(indentation=np.repeat([0, 1, 0, 2, 3, 4], 7)), "0 once more in line 19"),
 }
 
 
