@@ -22,6 +22,7 @@ from pipeline.reporting.work_precision import cost_tables
 
 Captions = dict[str, str]  # by name of a table or figure
 FILE = Path(__file__).with_name("page.yaml")
+SHORT_OF = "not reached"  # how the checklist begins where ours did not look as far as the paper
 NOTHING = ("–", "see file", "")  # cells of the checklist that say no number
 FURTHER = "further"  # the section of what no other section names
 NUMBER = re.compile(r"[-+−]?\d[\d.,]*(e[-+]?\d+)?( ± [\d.e+-]+)?( \(seeds\))?( (%|mm|N|mm²|N²|Hz|s|µT))?|–?")
@@ -124,11 +125,15 @@ def about(numbers: Mapping[str, Any]) -> str:
 
 
 def findings(section: Section, checklist: pd.DataFrame) -> list[str]:
-    """Say what the checklist says of what a section shows: ours with its interval, and the paper's; verdicts first."""
+    """Say what the checklist says of what a section shows: ours with its interval, and the paper's; verdicts first.
+
+    Where ours did not look as far as the paper, the sentence says so.
+    """
     rows = [row for row in _rows_of(section, checklist) if row["ours"] not in NOTHING]
     judged = sorted(rows, key=lambda row: row["verdict"] in NOTHING)
     return [
         f"{row['result']}: {row['ours']}; paper: {row['paper']}"
+        + (f" ({row['difference'].split(';')[0]})" if row["difference"].startswith(SHORT_OF) else "")
         + ("" if row["verdict"] in NOTHING else f". {row['verdict'].capitalize()}.")
         for row in judged[:FINDINGS_N]
     ]

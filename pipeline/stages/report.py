@@ -9,11 +9,12 @@ from pipeline.evaluation.choice import to_record
 from pipeline.evaluation.scores import to_csv
 from pipeline.learning.recipe import HEADLINE
 from pipeline.reporting.figures import error_grids
-from pipeline.reporting.headline import FILE, headline_figures
+from pipeline.reporting.headline import FILE, headline_figures, short_table
 from pipeline.reporting.index import index
 from pipeline.reporting.numbers import headline_scores
 from pipeline.reporting.page import page
 from pipeline.reporting.parts import experiment_figures
+from pipeline.reporting.shown import to_markdown
 from pipeline.reporting.sweeps import learning_figures, learning_pages
 from pipeline.reporting.tables import make_tables, table_texts
 from pipeline.reporting.work_precision import pages
@@ -47,6 +48,8 @@ def report(
     with_figure = {figure.parent.parent.name for figure in reports.parent.glob(f"*/figures/{FILE}")}
     described = [result for result in results if "described" in result]
     io.write_text(reports.parent / "index.html", index(described, with_figure))
+    if numbers.get("table2"):
+        say(f"{scene} ({asked.source})\n{to_markdown(short_table(numbers))}")
     say(f"{scene}: {reports}/index.html, numbers.json, scores.json, tables, figures")
 
 

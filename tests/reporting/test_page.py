@@ -104,6 +104,16 @@ def test_a_section_says_what_was_found_beside_the_papers_and_verdicts_come_first
     assert said == [sentence for sentence in said if any(row["result"] in sentence for row in table.to_dict("records"))]
 
 
+def test_a_finding_says_where_ours_did_not_look_as_far_as_the_paper():
+    section = next(one for one in read_sections() if one.key == "drift")
+    row = {"result": "r", "paper": "90 %", "ours": "92 %", "verdict": "yes", "stage": "drift", "shown in": "drift"}
+    short, far = "not reached: ours after 8,000 contacts; ours is at least 90", "after 50,000 contacts"
+    (said,) = findings(section, pd.DataFrame([row | {"difference": short}]))
+    assert "(not reached: ours after 8,000 contacts). Yes." in said
+    (said,) = findings(section, pd.DataFrame([row | {"difference": far}]))
+    assert "not reached" not in said
+
+
 @pytest.mark.parametrize("source", ["simulated", "recorded"])
 def test_the_badge_says_where_the_readings_come_from(source):
     text = render(all_questions(source))
