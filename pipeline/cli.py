@@ -129,10 +129,7 @@ def template(
     if out.exists():
         raise ParamsError(out, "the file", "new", "one that is there", "Choose another name.")
     io.write_text(out, ",".join(columns_of(chips_n)) + "\n")
-    typer.echo(
-        f"wrote {out}: {', '.join(NEEDED)} and fields in uT are needed, every other column may be left out. One row a "
-        "reading, phase noload or contact; no-load rows come before each press. Then: reskin add --layout table"
-    )
+    typer.echo(f"wrote {out}: {', '.join(NEEDED)} and fields in uT are needed. Then: reskin add --layout table")
 
 
 @app.command()

@@ -4,7 +4,6 @@ In: changes of field in uT, one row a reading (DataFrame or array, Bx0, By0, Bz0
 """
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -22,7 +21,7 @@ class Loaded:
     def __init__(self, network: Network) -> None:
         self.network = network
 
-    def predict(self, model_input: Any, params: dict[str, Any] | None = None) -> pd.DataFrame:
+    def predict(self, model_input: pd.DataFrame) -> pd.DataFrame:
         """Answer for changes of field in uT, [f ch]."""
         db_uT: Float[np.ndarray, "f ch"] = np.atleast_2d(np.asarray(model_input, np.float32))
         return pd.DataFrame(self.network(db_uT), columns=list(COLUMNS))

@@ -12,7 +12,7 @@ SOURCES = {str(file.relative_to(ROOT / "pipeline")): file.read_text() for file i
 HOMES = {
     r"\bimport mlflow|from mlflow": ["tracking.py"],
     r"\bimport matplotlib|from matplotlib": ["reporting/*.py", "experiments/*/show.py"],
-    r"\bimport argparse|from argparse": ["core/stage.py"],
+    r"\bimport argparse|from argparse": ["core/stage.py", "stages/code.py"],
     r"\bimport typer|from typer": ["cli.py"],
     r"optimizer\.step\(": ["learning/train.py"],
     r"np\.random\.(?!Generator\b)|default_rng|\.manual_seed\(": ["core/seeds.py"],

@@ -24,7 +24,9 @@ from tests.stages.checkout import copy_checkout
 ROOT = Path(__file__).resolve().parents[1]
 FLOW = read_yaml(ROOT / "dvc.yaml")
 READING = [
-    stage for stage, words in FLOW["stages"].items() if "params" in words["do"] and not stage.startswith("ingest")
+    stage
+    for stage, words in FLOW["stages"].items()
+    if "params" in words.get("do", {}) and not stage.startswith("ingest")
 ]
 SCENE, SHARED = "pipeline/scenes/ci.yaml", "params.yaml"
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of DVC's own libraries
