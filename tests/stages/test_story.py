@@ -221,6 +221,7 @@ def test_predictions_follow_from_the_saved_model_alone(story):
     assert [first[f"predicted_{name}"] for name in ("x_mm", "y_mm", "Fz_N")] == pytest.approx(expected, abs=1e-3)
 
 
+@pytest.mark.filterwarnings("ignore")  # MLflow warns about its own types when pyfunc is imported
 def test_mlflow_loads_a_model_by_its_run_and_it_answers_as_ours_does(story, monkeypatch):
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{story / 'mlflow.db'}")
     client = mlflow.MlflowClient()
