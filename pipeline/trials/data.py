@@ -67,7 +67,7 @@ def train_all(data: SceneData, trials: Sequence[Trial], stage: str) -> list[Trai
     def tell(line: str) -> None:
         say(f"{stage_words}: {line}")
 
-    with make_executor() as executor:
+    with make_executor(imports="pipeline.learning.train") as executor:
         trained = run_trials(trials, measured(data), executor=executor, cache=home() / CACHE, tell=tell)
     took = {result.key: (result.seconds, result.reused) for result in trained}
     note_trainings(COSTS / data.scene, stage, took, time.monotonic() - start_s)

@@ -9,7 +9,7 @@ from pipeline.core.executors import device, make_executor
 
 def test_trainings_run_in_processes_of_their_own(monkeypatch):
     monkeypatch.setenv("RESKIN_EXECUTOR", "processes:1")
-    with make_executor() as executor:
+    with make_executor(imports="json") as executor:
         assert executor.submit(os.getpid).result() != os.getpid()
 
 
@@ -17,12 +17,12 @@ def test_trainings_run_in_processes_of_their_own(monkeypatch):
 def test_an_unknown_executor_is_one_sentence(monkeypatch, word):
     monkeypatch.setenv("RESKIN_EXECUTOR", word)
     with pytest.raises(ParamsError, match="RESKIN_EXECUTOR: the executor must be processes:N"):
-        make_executor()
+        make_executor(imports="json")
 
 
 def test_trainings_can_run_here_and_fail_as_they_would_elsewhere(monkeypatch):
     monkeypatch.setenv("RESKIN_EXECUTOR", "here")
-    with make_executor() as executor:
+    with make_executor(imports="json") as executor:
         assert executor.submit(os.getpid).result() == os.getpid()
         with pytest.raises(ZeroDivisionError):
             executor.submit(lambda: 1 // 0).result()
