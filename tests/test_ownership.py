@@ -25,6 +25,7 @@ HOMES = {
         "core/provenance.py",
         "core/server.py",
         "core/executors.py",
+        "core/progress.py",
         "tracking.py",
     ],
     r"import pickle|torch\.load\(|allow_pickle=True": [],

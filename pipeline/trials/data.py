@@ -8,8 +8,8 @@ from pathlib import Path
 from pipeline.core import io
 from pipeline.core.config import Settings
 from pipeline.core.executors import make_executor
-from pipeline.core.provenance import home, note_trainings
-from pipeline.core.stage import COSTS, say
+from pipeline.core.provenance import COSTS, home, note_trainings
+from pipeline.core.stage import say
 from pipeline.dataset.folds import load_rows, parse_folds
 from pipeline.dataset.rows import Rows, Selection
 from pipeline.dataset.splits import Fold
