@@ -9,6 +9,7 @@ import os
 import threading
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from multiprocessing import forkserver
 from time import perf_counter
 from typing import Any
 
@@ -38,6 +39,11 @@ def make_executor(tasks_n: int = 2, *, imports: str) -> Executor:
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([imports])
     return ProcessPoolExecutor(int(count), context, _end_with_parent)
+
+
+def end_workers() -> None:
+    """Wait for the process that forks workers, so that what they took counts as taken by children of this one."""
+    forkserver._forkserver._stop()  # type: ignore[attr-defined]  # else it ends unseen after its parent
 
 
 class Here(Executor):

@@ -12,6 +12,7 @@ from typing import Any
 
 from pipeline.core.config import Files
 from pipeline.core.errors import ReskinError
+from pipeline.core.executors import end_workers
 from pipeline.core.progress import announce
 from pipeline.core.provenance import COSTS, begin_cost, note_cost
 from pipeline.core.server import TrackingAway, probe, server_uri
@@ -40,6 +41,7 @@ def run(work: Callable[..., None]) -> None:
     except ReskinError as error:
         say(f"error: {error}")
         sys.exit(error.exit_code)
+    end_workers()
     note_cost(costs, unit, time.monotonic() - start_s)
 
 
