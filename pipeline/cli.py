@@ -107,6 +107,21 @@ def add(
 
 
 @app.command()
+def fetch(
+    source: Annotated[str | None, Argument(help="lab, ini, eflesh or eflash7; without one, lists them.")] = None,
+    origin: Annotated[str | None, Option("--from", help="A git mirror or a folder, in place of its home.")] = None,
+    yes: Annotated[bool, Option("--yes", help="Agree to use what has no licence.")] = False,
+) -> None:
+    """Fetch public recordings from their home, check them, and add them to their scene."""
+    from pipeline import fetching
+
+    def agree(question: str) -> bool:
+        return yes or (sys.stdin.isatty() and typer.confirm(question))
+
+    fetching.fetch(checkout(), source, origin, agree=agree, say=typer.echo)
+
+
+@app.command()
 def remove(scene: str, capture: str) -> None:
     """Take a recorded capture out of a scene again."""
     from pipeline import adding

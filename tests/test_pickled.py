@@ -1,9 +1,11 @@
 """A pickle is read as pickle reads it, for plain values and NumPy's, and nothing in it is run."""
 
+import hashlib
 import os
 import pickle
 from contextlib import suppress
 from io import BytesIO
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,10 +14,12 @@ from hypothesis import strategies as st
 
 from pipeline.capture.readers import lab
 from pipeline.core.errors import CaptureError
+from pipeline.fetching import read_sources
 from pipeline.pickled import COLUMNS, decode, to_lab_csv
 from tests.capture.headers import make_header
 
 PROTOCOLS = (3, 4)
+ROOT = Path(__file__).resolve().parents[1]
 
 scalars = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text() | st.binary()
 values = st.recursive(
@@ -139,3 +143,11 @@ def test_another_archive_is_refused_with_its_reason(archive, sentence):
         to_lab_csv(archive, "port_1.npz")
     assert str(caught.value).startswith("port_1.npz")
     assert "\n" not in str(caught.value)
+
+
+def test_real_samples_give_the_file_that_is_on_record(shared_data):
+    """Not the archive of the rig itself, which is not here: one of the same values, made as the rig makes it."""
+    file = shared_data / "lab/board1_depth1.csv"
+    known = {entry.path: entry.sha256 for entry in read_sources(ROOT)["lab"].files}
+    again = to_lab_csv(archive_of_csv(file.read_text()), "a")
+    assert hashlib.sha256(again).hexdigest() == known[file.name]
