@@ -28,7 +28,7 @@ HOMES = {
         "core/progress.py",
         "tracking.py",
     ],
-    r"import pickle|torch\.load\(|allow_pickle=True": [],
+    r"import pickle\b|from pickle |torch\.load\(|allow_pickle=True": [],
 }  # by pattern: the files that may match it
 
 
