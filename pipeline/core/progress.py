@@ -58,7 +58,8 @@ def _ask_dvc() -> list[str]:
     from dvc.repo.reproduce import get_active_graph, plan_repro  # type: ignore[import-untyped]
 
     with Repo() as repo:
-        return [stage.addressing for stage in plan_repro(get_active_graph(repo.index.graph))]
+        stages = plan_repro(get_active_graph(repo.index.graph))
+        return [stage.addressing for stage in stages if stage.cmd]  # added recordings are stages that run nothing
 
 
 def read_seconds(order: Sequence[str]) -> dict[str, float]:
