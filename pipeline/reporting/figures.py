@@ -1,6 +1,7 @@
 """Figures of a scene: predictions -> SVG text. Same data, same bytes. Sees no model and no path."""
 
 import io
+import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -11,15 +12,23 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from jaxtyping import Float
 
+from pipeline.reporting.hover import name_marks, put_titles
+
 mpl.use("Agg")
 WORST_MM = 2.0  # end of the colour scale of all error maps: twice the distance that counts as right
 GRID_MM = 16.0  # the paper's grid of places, from 0 to here
 # The five chips under it, in the frame of the labels (paper section 2), and their package of 3 mm.
 CHIPS_MM = ((8.0, 8.0), (1.0, 8.0), (15.0, 8.0), (8.0, 1.0), (8.0, 15.0))
 CHIP_MM = 3.0
+FONTS = ("DejaVu Sans", "Verdana", "sans-serif")  # Verdana is as wide, where the first is not installed
+# What nobody sees: indentation, metadata, comments, and places finer than a hundredth of a point.
+SPARED = re.compile(r"(?<=\n) +|<metadata>.*?</metadata>\n|<!--.*?-->\n", re.DOTALL)
+PLACES = re.compile(r' (d|x|y|transform)="[^"]*"')
+PAST_DIGITS = re.compile(r"(?<=\.\d\d)\d+")
 STYLE = {
     "svg.hashsalt": "reskin",
     "svg.fonttype": "none",
+    "font.sans-serif": FONTS,
     "font.size": 10.0,
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -83,10 +92,15 @@ def drawing(width_in: float, height_in: float) -> Iterator[Any]:
 
 
 def svg(figure: Any) -> str:
-    """Write a figure as SVG text without date or version, so that the same data give the same bytes."""
-    buffer = io.StringIO()
+    """Write a figure as SVG text; its marks say their values on hover.
+
+    Without date and version, so that the same data give the same bytes.
+    """
+    buffer, titles = io.StringIO(), name_marks(figure)
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-    return buffer.getvalue()
+    text = PLACES.sub(lambda found: PAST_DIGITS.sub("", found[0]), SPARED.sub("", buffer.getvalue()))
+    # Formulas name one family only, and would be written in serifs where it is not installed.
+    return put_titles(text.replace(f"'{FONTS[0]}'\"", f"'{FONTS[0]}', '{FONTS[1]}', {FONTS[2]}\""), titles)
 
 
 def _places(table: pa.Table, side: str) -> Any:
