@@ -23,9 +23,18 @@ def test_every_place_is_drawn_once_however_often_it_was_poked():
     assert draw().count("<title>x / mm") == 4
 
 
-def test_chips_are_drawn_where_places_lie_on_the_papers_grid_and_nowhere_else():
-    rectangles = draw().count('id="patch_')
-    assert rectangles - error_grid(PLACES_MM - 20, PLACES_MM - 20, title="eflesh").count('id="patch_') == 5
+def test_a_skin_and_its_chips_are_drawn_where_places_lie_on_the_papers_grid_and_nowhere_else():
+    elsewhere = error_grid(PLACES_MM - 20, PLACES_MM - 20, title="eflesh")
+    # Five chips and a skin, and these two in the legend; axes without a spine on two sides.
+    assert draw().count('id="patch_') - elsewhere.count('id="patch_') == 5 + 1 + 2 - 2
+    assert "chip" in draw()
+    assert "chip" not in elsewhere
+
+
+def test_the_worst_place_is_named():
+    errors_mm = np.zeros_like(PLACES_MM)
+    errors_mm[PLACES_MM[:, 0] + PLACES_MM[:, 1] == 4, 0] = 3.0
+    assert "worst 3.00 mm at x = 2, y = 2" in error_grid(PLACES_MM, PLACES_MM + errors_mm, title="t")
 
 
 def test_what_nobody_sees_is_left_out_and_words_keep_their_digits():
