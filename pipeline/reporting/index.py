@@ -30,9 +30,8 @@ def index(results: Sequence[Mapping[str, Any]], drawn: Mapping[str, str]) -> str
     kinds = []
     for source, title in KINDS.items():
         own = [numbers for numbers in results if numbers["provenance"]["source"] == source]
-        entries = [
-            _entry(numbers, drawn) for numbers in sorted(own, key=lambda numbers: str(numbers["provenance"]["scene"]))
-        ]
+        # Those that answer the question stand first.
+        entries = sorted((_entry(numbers, drawn) for numbers in own), key=lambda entry: (not entry.answer, entry.scene))
         if entries:
             kinds.append({"source": source, "title": title, "sentence": SOURCES[source], "entries": entries})
     return template("index.html").render(kinds=kinds)

@@ -24,6 +24,10 @@ def test_recorded_scenes_come_first_and_no_scene_stands_under_the_other_word():
 
 
 def test_each_scene_says_how_it_does_on_boards_never_seen_or_that_it_held_out_none():
+    # "a" comes before "here", and held out no board.
+    alone = {name: value for name, value in numbers("a", "simulated").items() if name != "table2"}
+    both = index([alone, numbers("here", "simulated")], {})
+    assert both.index("Scene here") < both.index("Scene a")
     one_board = {name: value for name, value in numbers("there", "recorded").items() if name != "table2"}
     text = index([numbers("here", "simulated"), one_board], {})
     recorded, simulated = text.split('<section id="simulated">')
