@@ -19,6 +19,9 @@ from pipeline.reporting.work_precision import COLOURS, MARKERS
 FILE = "headline.svg"
 APART = 0.17  # of a row: ours above, the paper's below
 SHORT_TABLE = ("accuracy_pct", "mse_xy_mm2")
+WITHIN = "Readings placed within 1 mm on boards"
+BRACKETS = "In brackets: 95 % interval over boards"
+ANSWERING = ("multi", "adapted", "single")  # rows of table 2, the one that matters most first
 
 
 def headline_figures(numbers: Mapping[str, Any], source: str) -> dict[str, str]:
@@ -26,6 +29,27 @@ def headline_figures(numbers: Mapping[str, Any], source: str) -> dict[str, str]:
     if "labels" in numbers:
         return {FILE: labels_figure(numbers, source)}
     return {FILE: table2_figure(numbers, source)} if numbers.get("table2") else {}
+
+
+def answer(numbers: Mapping[str, Any]) -> str:
+    """Say in one sentence how a model does on boards never seen, with intervals; nothing where none was held out."""
+    if numbers.get("labels"):
+        first, *_, last = [row for row in numbers["labels"] if row["method"] == numbers["labels"][0]["method"]]
+        said = [
+            f"{show(row['as_labelled']['accuracy_pct'])} % with {row['labels_n']} labels of the new board"
+            for row in (first, last)
+        ]
+        boards_n = first["as_labelled"]["accuracy_pct"]["n"]
+        return f"{WITHIN} never seen: {first['method']} {', '.join(said)}. {BRACKETS} (n = {boards_n})."
+    rows = numbers.get("table2", {})
+    known = models(numbers)
+    said = [
+        f"{known[name].short} {show(rows[name]['accuracy_pct'])} %"
+        + (f" (paper: {known[name].paper['accuracy_pct'][0]:.3g} %)" if known[name].paper else "")
+        for name in ANSWERING
+        if name in rows
+    ]
+    return f"{WITHIN} and skins never seen: {'; '.join(said)}. {BRACKETS}." if said else ""
 
 
 def table2_figure(numbers: Mapping[str, Any], source: str) -> str:
@@ -40,9 +64,11 @@ def table2_figure(numbers: Mapping[str, Any], source: str) -> str:
             if printed:
                 paper = [{metric: dict(zip(("mean", "sd"), words[metric], strict=True))} for _, words in printed]
                 _draw(axes, metric, np.array([at for at, _ in printed]) - APART, paper, "paper (mean, sd)", hollow=True)
-            axes.set(xlabel=COLUMNS[metric].replace(", ", " / "), xlim=(0, 100 if metric == "accuracy_pct" else None))
+            axes.set(xlabel=COLUMNS[metric].replace(", ", " / "), xlim=(0, 1.18 * axes.dataLim.x1))
             axes.grid(axis="x", alpha=0.25)
-        panels[0].set_yticks(y, [fill(f"{model.title} (n = {n_of(row)})", 36) for model, row in rows], fontsize=9)
+        # A space that does not break holds a count together.
+        names = [fill(f"{model.title} (n\xa0=\xa0{n_of(row)})", 34) for model, row in rows]
+        panels[0].set_yticks(y, names, fontsize=9)
         panels[0].set_ylim(-0.6, len(rows) - 0.4)
         handles = panels[0].get_legend_handles_labels()
         figure.legend(*handles, loc="outside lower center", ncols=2, frameon=False, fontsize=9)
@@ -111,3 +137,6 @@ def _draw(
     face = "white" if hollow else colour
     style = {"color": colour, "markerfacecolor": face, "markersize": 6, "capsize": 3, "linewidth": 1.2}
     axes.errorbar(means, y, xerr=lengths, fmt="s" if hollow else "o", label=label, **style)
+    for mean, length, at in zip(means, lengths[1], y, strict=True):
+        beside = {"xytext": (4, 0), "textcoords": "offset points", "va": "center", "fontsize": 9, "color": colour}
+        axes.annotate(f"{mean:.3g}", (mean + length, at), **beside)

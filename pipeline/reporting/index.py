@@ -4,40 +4,43 @@ A scene whose results are of code that counted no collapsed networks is named, a
 know paths but those of the pages it leads to.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pipeline.reporting.headline import FILE
-from pipeline.reporting.page import SOURCES, about, template
+from pipeline.reporting.headline import FILE, answer
+from pipeline.reporting.page import SOURCES, Drawing, about, measure, template
 
 KINDS = {"recorded": "Recorded boards", "simulated": "Simulated boards"}
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One scene: its name, what it says of itself, whether it has a headline figure, and whether it is out of date."""
+    """One scene: its name, its answer, what it says of itself, its headline figure, and whether it is out of date."""
 
     scene: str
+    answer: str
     about: str
-    has_figure: bool
+    figure: Drawing | None
     stale: bool
 
 
-def index(results: Sequence[Mapping[str, Any]], drawn: Collection[str]) -> str:
-    """Render the page of all scenes, recorded ones first: they are what counts. `drawn` have a headline figure."""
+def index(results: Sequence[Mapping[str, Any]], drawn: Mapping[str, str]) -> str:
+    """Render the page of all scenes, recorded ones first: they are what counts. `drawn`: headline figures by scene."""
     kinds = []
     for source, title in KINDS.items():
         own = [numbers for numbers in results if numbers["provenance"]["source"] == source]
-        entries = [
-            _entry(numbers, drawn) for numbers in sorted(own, key=lambda numbers: str(numbers["provenance"]["scene"]))
-        ]
+        # Those that answer the question stand first.
+        entries = sorted((_entry(numbers, drawn) for numbers in own), key=lambda entry: (not entry.answer, entry.scene))
         if entries:
             kinds.append({"source": source, "title": title, "sentence": SOURCES[source], "entries": entries})
-    return template("index.html").render(kinds=kinds, figure=FILE)
+    return template("index.html").render(kinds=kinds)
 
 
-def _entry(numbers: Mapping[str, Any], drawn: Collection[str]) -> Entry:
+def _entry(numbers: Mapping[str, Any], drawn: Mapping[str, str]) -> Entry:
     scene, stale = str(numbers["provenance"]["scene"]), "trainings" not in numbers
-    words = "" if stale else about(numbers).removeprefix(SOURCES[numbers["provenance"]["source"]]).strip()
-    return Entry(scene, words, scene in drawn and not stale, stale)
+    if stale:
+        return Entry(scene, "", "", None, stale)
+    words = about(numbers).removeprefix(SOURCES[numbers["provenance"]["source"]]).strip()
+    figure = measure(f"{scene}/figures/{FILE}", drawn[scene]) if scene in drawn else None
+    return Entry(scene, answer(numbers), words, figure, stale)

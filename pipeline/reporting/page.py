@@ -9,12 +9,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from pydantic import Field
 
 from pipeline.core.code import ROOT
 from pipeline.core.config import Strict, parse, read_yaml
+from pipeline.core.errors import SchemaError
+from pipeline.reporting.headline import answer
 from pipeline.reporting.parts import add_sections
 from pipeline.reporting.shown import notes
 from pipeline.reporting.sweeps import learning_costs
@@ -24,10 +27,16 @@ Captions = dict[str, str]  # by name of a table or figure
 FILE = Path(__file__).with_name("page.yaml")
 SHORT_OF = "not reached"  # how the checklist begins where ours did not look as far as the paper
 NOTHING = ("–", "see file", "")  # cells of the checklist that say no number
+PARTED = re.compile(r"(?<=\d) ± (?=\d)|\[[-+\d.e]+, [-+\d.e]+\]( (%|mm²|N²|mm|N)(?![\w]))?")
+NO_BREAK = "\u00a0"
 FURTHER = "further"  # the section of what no other section names
 NUMBER = re.compile(r"[-+−]?\d[\d.,]*(e[-+]?\d+)?( ± [\d.e+-]+)?( \(seeds\))?( (%|mm|N|mm²|N²|Hz|s|µT))?|–?")
-SVG_WIDTH_PT = re.compile(r'<svg [^>]*?width="([\d.]+)pt"')
-WIDE_PT = 500.0  # above it, letters would be too small on a telephone: the figure scrolls there
+SVG_SIZE_PT = re.compile(r'<svg [^>]*?width="([\d.]+)pt" height="([\d.]+)pt"')
+LETTERS_PT = re.compile(r"font(?:-size)?: ([\d.]+)px")  # in a file measured in points
+PX_PER_PT = 4 / 3
+WIDE_PT = 500.0  # above it, a figure has a row of its own
+LEGIBLE_PX = 8.0  # no letter is shown smaller: where that needs more width than there is, the figure scrolls
+NARROW_PX = 340.0  # what a telephone has
 LONG = 40  # letters of a cell that needs a wide column
 FINDINGS_N = 4  # sentences at the head of a section; the checklist holds all
 OPEN = {"table2", "labels", "order"}  # tables that answer the first question; all others open on demand
@@ -54,6 +63,22 @@ class Section(Strict):
 
 
 @dataclass(frozen=True)
+class Drawing:
+    """A figure as the page shows it: its file, its size, and the width below which its smallest letters get lost."""
+
+    file: str
+    width_px: int
+    height_px: int
+    least_px: int
+    wide: bool
+
+    @property
+    def scrolls(self) -> bool:
+        """Whether it is wider than a telephone."""
+        return self.least_px > NARROW_PX
+
+
+@dataclass(frozen=True)
 class Table:
     """A table as the page shows it; the look of a column is `number` (aligned right), `text` or `text long`."""
 
@@ -76,13 +101,14 @@ def page(
     shown = {**tables, **cost_tables(runtime, source), **learning_costs(runtime, source)}
     texts = {f"figures/{name}": text for name, text in figures.items()}
     texts |= {f"runtime/{name}": text for name, text in costs.items() if name.endswith(".svg")}
-    drawings = {address.split("/")[1]: (address, _is_wide(text)) for address, text in texts.items()}
+    drawings = {address.split("/")[1]: measure(address, text) for address, text in texts.items()}
     found = tables.get("checklist", pd.DataFrame())
     provenance = pd.DataFrame([{"what": key, "value": str(value)} for key, value in numbers["provenance"].items()])
     return template("page.html").render(
         scene=scene,
         source=source,
         about=about(numbers),
+        answer=answer(numbers),
         sections=[
             _fill(section, shown, drawings, source)
             | {"findings": findings(section, found), "stages": stages_of(section, found)}
@@ -100,7 +126,13 @@ def template(name: str) -> Template:
         loader=PackageLoader("pipeline.reporting", "."), autoescape=True, undefined=StrictUndefined
     )
     environment.tests["number_text"] = NUMBER.fullmatch
+    environment.filters["together"] = together
     return environment.get_template(name)
+
+
+def together(text: str) -> str:
+    """Keep a number with its deviation, and the ends of an interval, on one line."""
+    return PARTED.sub(lambda found: found[0].replace(" ", NO_BREAK), text)
 
 
 def read_sections() -> list[Section]:
@@ -120,7 +152,10 @@ def arrange(tables: Iterable[str], figures: Iterable[str]) -> list[Section]:
 def about(numbers: Mapping[str, Any]) -> str:
     """Say what a scene is: where its readings come from, and how many of them its main captures hold."""
     counts = next(iter(numbers["described"].values()))["counts"]
-    words = ", ".join(f"{n:,} {name.removesuffix('_n').replace('_', ' ')}" for name, n in counts.items() if n)
+    names = {name: name.removesuffix("_n").replace("_", " ") for name in counts}
+    words = ", ".join(
+        f"{n:,} {names[name].removesuffix('s') if n == 1 else names[name]}" for name, n in counts.items() if n
+    )
     return f"{SOURCES[numbers['provenance']['source']]} Its main captures hold {words}."
 
 
@@ -154,6 +189,20 @@ def _rows_of(section: Section, checklist: pd.DataFrame) -> list[dict[str, str]]:
     return [row for row in rows if section.captions.keys() & set(row["shown in"].split(", "))]
 
 
+def measure(file: str, svg: str) -> Drawing:
+    """Measure a figure from its text: its size in CSS pixels, and how far it may shrink."""
+    size = SVG_SIZE_PT.search(svg)
+    if size is None:
+        raise SchemaError(
+            file, "size", "in points, at the head of the file", svg[:80], "Was it written by figures.svg?"
+        )
+    width_pt, height_pt = map(float, size.groups())
+    smallest_pt = min(map(float, LETTERS_PT.findall(svg)), default=np.inf)
+    least_px = min(LEGIBLE_PX / smallest_pt, PX_PER_PT) * width_pt
+    width_px, height_px = (round(PX_PER_PT * side_pt) for side_pt in (width_pt, height_pt))
+    return Drawing(file, width_px, height_px, round(least_px), width_pt > WIDE_PT)
+
+
 def lay_out(name: str, caption: str, table: pd.DataFrame) -> Table:
     """Lay a table out: the look of its columns, its cells as text, and its notes."""
     cells = table.fillna("").astype(str)
@@ -162,19 +211,15 @@ def lay_out(name: str, caption: str, table: pd.DataFrame) -> Table:
 
 
 def _fill(
-    section: Section, tables: Mapping[str, pd.DataFrame], figures: Mapping[str, tuple[str, bool]], source: str
+    section: Section, tables: Mapping[str, pd.DataFrame], figures: Mapping[str, Drawing], source: str
 ) -> dict[str, Any]:
     words: dict[str, Any] = {name: getattr(section, name) for name in ("key", "title", "sentence")}
     captions = section.tables | section.folded
     words["tables"] = [lay_out(name, text, tables[name]) for name, text in captions.items() if name in tables]
-    shown = ((f"{text} ({source})", *figures[name]) for name, text in section.figures.items() if name in figures)
-    words["figures"] = [{"caption": caption, "file": file, "wide": wide} for caption, file, wide in shown]
+    words["figures"] = [
+        (figures[name], f"{text} ({source})") for name, text in section.figures.items() if name in figures
+    ]
     return words
-
-
-def _is_wide(svg: str) -> bool:
-    width = SVG_WIDTH_PT.search(svg)
-    return width is not None and float(width[1]) > WIDE_PT
 
 
 def _look(cells: "pd.Series[str]") -> str:

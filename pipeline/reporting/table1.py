@@ -45,7 +45,7 @@ def table1(data: Table1, measured: Mapping[str, str]) -> pd.DataFrame:
     if unknown := sorted(measured.keys() - rows.keys()):
         raise ParamsError("table 1", "measured rows", f"among {sorted(rows)}", unknown, "Name them as the table does.")
     table = pd.DataFrame(
-        {"": name, **dict(zip(data.columns, cells, strict=True)), OURS: measured.get(name, NOT_GIVEN)}
+        {"property": name, **dict(zip(data.columns, cells, strict=True)), OURS: measured.get(name, NOT_GIVEN)}
         for name, cells in rows.items()
     )
     sources = " ".join(f"{name}: {source}" for name, source in data.columns.items())

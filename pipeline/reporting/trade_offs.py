@@ -77,7 +77,7 @@ def adaptation(rows: Sequence[Mapping[str, Any]], source: str) -> str:
         for point in points:
             axes.plot(*point.place, **point.look, linestyle="none")
         _label(axes, points, LEFT)
-        figure.supxlabel("A number: unlabelled pokes of the new skin.", x=0.01, ha="left", fontsize=7)
+        figure.supxlabel("A number: unlabelled pokes of the new skin.", x=0.01, ha="left", fontsize=9)
         return svg(figure)
 
 

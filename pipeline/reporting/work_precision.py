@@ -26,7 +26,7 @@ COMPUTED = (
     "(two run side by side, so that less time passes). Last run: what passed when it ran last; trainings that were "
     "finished before are reused."
 )
-CAPTION_LETTERS = 48  # in the width of a panel, and in that of the legend
+CAPTION_LETTERS = 38  # in the width of a panel, and in that of the legend
 STUDIES = ("quadratures", "integrators")
 Kind = TypeVar("Kind", Precision, Seconds)
 
@@ -145,7 +145,7 @@ def draw(rows: Sequence[Precision], seconds: Sequence[Seconds], words: Words) ->
             _marks(axes, [row.error for row in rows if row.key[:2] == (study, REFERENCE)], points, words)
         _frame(figure, panels, len(studies), words.error)
         figure.suptitle(words.title, x=0.01, ha="left", fontsize=10)
-        figure.supxlabel(caption, x=0.01, ha="left", fontsize=7)
+        figure.supxlabel(caption, x=0.01, ha="left", fontsize=9)
         return svg(figure)
 
 
@@ -182,8 +182,8 @@ def _lines(axes: Any, points: Mapping[Key, tuple[float, float]], methods: Sequen
         of_method = [point for key, point in points.items() if key[1] == method]
         if of_method:
             colour, marker = COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)]
-            axes.plot(*zip(*of_method, strict=True), marker, color=colour, markersize=4.5, label=method)
             axes.plot(*zip(*front(of_method), strict=True), color=colour, linewidth=1)
+            axes.plot(*zip(*of_method, strict=True), marker, color=colour, markersize=4.5, label=method)
 
 
 def _marks(

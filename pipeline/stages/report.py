@@ -45,9 +45,11 @@ def report(
     io.write_texts(reports / "runtime", costs)
     io.write_text(reports / "index.html", page(numbers, tables, figures, costs))
     results = (io.read_json(file) for file in sorted(reports.parent.glob("*/numbers.json")))
-    with_figure = {figure.parent.parent.name for figure in reports.parent.glob(f"*/figures/{FILE}")}
+    headlines = {
+        file.parent.parent.name: io.read_bytes(file).decode() for file in reports.parent.glob(f"*/figures/{FILE}")
+    }
     described = [result for result in results if "described" in result]
-    io.write_text(reports.parent / "index.html", index(described, with_figure))
+    io.write_text(reports.parent / "index.html", index(described, headlines))
     if numbers.get("table2"):
         say(f"{scene} ({asked.source})\n{to_markdown(short_table(numbers))}")
     say(f"{scene}: {reports}/index.html, numbers.json, scores.json, tables, figures")

@@ -6,10 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.reporting.headline import FILE, headline_figures, short_table
+from pipeline.reporting.headline import ANSWERING, FILE, answer, headline_figures, short_table
 from pipeline.reporting.order import CONTROL, models
 from pipeline.reporting.paper import TABLE_2
-from tests.reporting.synthetic import all_questions
+from pipeline.reporting.shown import show
+from tests.reporting.synthetic import all_questions, over_boards
 
 REPORTS = Path(__file__).resolve().parents[2] / "reports"
 
@@ -37,6 +38,29 @@ def test_the_short_table_holds_ours_and_the_papers_means_and_the_control():
                 TABLE_2[name]["accuracy_pct"][0], rel=0.005
             )
     assert table.loc[CONTROL, "accuracy, % (paper)"] == "–"
+
+
+def test_the_answer_says_ours_with_its_interval_and_the_papers():
+    numbers = all_questions()
+    numbers["table2"]["multi"] |= {"accuracy_pct": over_boards(70.0, 90.0)}
+    said = answer(numbers)
+    assert "multi-sensor 80 [70, 90] % (paper: 84.4 %)" in said
+    for name in ANSWERING:
+        assert show(numbers["table2"][name]["accuracy_pct"]) in said
+        assert f"(paper: {TABLE_2[name]['accuracy_pct'][0]:.3g} %)" in said
+
+
+def test_the_answer_with_labels_is_of_one_method_without_and_with_most_of_them():
+    numbers = json.loads((REPORTS / "lab" / "numbers.json").read_text())
+    rows = [row for row in numbers["labels"] if row["method"] == numbers["labels"][0]["method"]]
+    least, most = (choose(rows, key=lambda row: row["labels_n"]) for choose in (min, max))
+    said = answer(numbers)
+    for row in (least, most):
+        assert f"{show(row['as_labelled']['accuracy_pct'])} % with {row['labels_n']} labels" in said
+
+
+def test_without_boards_held_out_there_is_no_answer():
+    assert answer({name: value for name, value in all_questions().items() if name != "table2"}) == ""
 
 
 def test_same_numbers_same_bytes_and_no_question_about_boards_no_figure():

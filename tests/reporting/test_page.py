@@ -1,19 +1,36 @@
 import re
 from collections import Counter
+from html import escape
 from html.parser import HTMLParser
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
+from pipeline.core.errors import SchemaError
 from pipeline.questions import EXPERIMENTS
 from pipeline.reporting.checklist import checklist
-from pipeline.reporting.page import FINDINGS_N, arrange, findings, lay_out, page, read_sections
+from pipeline.reporting.headline import answer
+from pipeline.reporting.page import (
+    FINDINGS_N,
+    LEGIBLE_PX,
+    about,
+    arrange,
+    findings,
+    lay_out,
+    measure,
+    page,
+    read_sections,
+    together,
+)
 from pipeline.reporting.tables import make_tables
 from tests.reporting.synthetic import all_questions
 
 ROOT = Path(__file__).resolve().parents[2]
-SVG = '<svg xmlns="http://www.w3.org/2000/svg" width="{}pt"><defs><path id="same"/></defs><text>é</text></svg>'
+SVG = (
+    '<svg xmlns="http://www.w3.org/2000/svg" width="{}pt" height="200pt"><defs><path id="same"/></defs>'
+    '<text style="font-size: 10px">é</text></svg>'
+)
 VOID = {"meta", "img", "br"}
 
 
@@ -59,8 +76,9 @@ def read() -> Reader:
 
 
 def test_the_page_needs_no_network_and_no_script(read):
-    assert [one for one in ("script", "link", "iframe", "object", "svg") if read.all(one)] == []
-    fetched = [attributes[name] for _, attributes, _ in read.elements for name in ("src", "href") if name in attributes]
+    assert [one for one in ("script", "link", "iframe", "svg") if read.all(one)] == []
+    names = ("src", "href", "data")
+    fetched = [attributes[name] for _, attributes, _ in read.elements for name in names if name in attributes]
     assert all(address.startswith(("figures/", "runtime/", "tables/", "../", "#")) for address in fetched)
     assert "url(" not in render()
     assert "@import" not in render()
@@ -86,11 +104,64 @@ def test_every_table_scrolls_in_its_own_box_and_names_its_columns(read):
     assert all(attributes.get("scope") in ("col", "row") for attributes, _ in read.all("th"))
 
 
-def test_every_figure_is_an_image_on_a_white_card_with_words_for_it(read):
-    images = read.all("img")
-    assert len(images) == 4
-    assert all(attributes["alt"].strip() and above[-1] == "div.card" for attributes, above in images)
+def test_every_figure_is_a_document_on_a_white_card_with_words_for_it_and_else_an_image(read):
+    objects, images = read.all("object"), read.all("img")
+    assert len(objects) == len(images) == 4
+    assert all(attributes["aria-label"].strip() and above[-1] == "div.card" for attributes, above in objects)
+    assert all(attributes["alt"].strip() and above[-1] == "object." for attributes, above in images)
+    assert [attributes["data"] for attributes, _ in objects] == [attributes["src"] for attributes, _ in images]
     assert [attributes.get("class") for attributes, _ in read.all("figure")].count("wide") == 1
+
+
+def test_figures_stand_before_findings_and_these_before_tables():
+    text = render()
+    for part in text.split("<section id=")[1:]:
+        places = [part.index(tag) for tag in ("<figure", '<ul class="findings"', "<details") if tag in part]
+        assert places == sorted(places)
+
+
+def test_a_figure_may_shrink_until_its_smallest_letters_are_as_small_as_one_can_read():
+    letters = '<svg width="300.0pt" height="150.0pt"><g style="font-size: 10px"/><g style="font: 6px Arial"/></svg>'
+    drawing = measure("figures/a.svg", letters)
+    assert (drawing.width_px, drawing.height_px) == (400, 200)
+    assert drawing.least_px == LEGIBLE_PX / 6 * 300  # there a letter of 6 of 300 points is so high
+    assert drawing.scrolls  # on a telephone
+    assert not measure("figures/a.svg", letters.replace("6px", "9px")).scrolls
+
+
+def test_a_figure_without_a_size_is_refused():
+    with pytest.raises(SchemaError, match=r"figures/a\.svg: size"):
+        measure("figures/a.svg", '<svg viewBox="0 0 1 1"/>')
+
+
+@pytest.mark.parametrize(
+    ("text", "kept"),
+    [
+        ("79.8 ± 8 [71.4, 88.3]", "79.8_±_8 [71.4,_88.3]"),
+        ("+1 [-0.358, 2.43] points", "+1 [-0.358,_2.43] points"),
+        ("0.5 [1e-05, 2e+03] mm²; x", "0.5 [1e-05,_2e+03]_mm²; x"),
+        ("a ± b, [low, high]", "a ± b, [low, high]"),
+    ],
+)
+def test_a_number_and_its_interval_are_not_parted(text, kept):
+    assert together(text) == kept.replace("_", "\u00a0")
+
+
+def test_the_answer_stands_in_the_first_section_before_its_figure(read):
+    numbers = all_questions()
+    first = render(numbers).split("<section")[1]
+    assert first.count('<p class="answer">') == 1
+    assert render(numbers).count('<p class="answer">') == 1
+    said = escape(together(answer(numbers)), quote=True)
+    assert said in first
+
+
+def test_what_there_is_one_of_is_said_in_the_singular():
+    numbers = all_questions()
+    counts = next(iter(numbers["described"].values()))["counts"]
+    counts.clear()
+    counts.update(captures_n=1, readings_n=2)
+    assert about(numbers).endswith("hold 1 capture, 2 readings.")
 
 
 def test_a_section_says_what_was_found_beside_the_papers_and_verdicts_come_first():
@@ -123,7 +194,7 @@ def test_the_badge_says_where_the_readings_come_from(source):
 
 def test_the_page_says_first_what_the_scene_is(read):
     words = next(i for i, word in enumerate(read.words) if "2 captures, 1,000 readings" in word)
-    assert words < read.words.index("Headline")
+    assert words < read.words.index(read_sections()[0].title)
 
 
 def test_what_no_section_names_is_still_shown(read):

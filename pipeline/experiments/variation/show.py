@@ -67,7 +67,8 @@ def _over_time(numbers: Mapping[str, Any], places: Sequence[Mapping[str, Any]], 
         scale = mpl.colors.Normalize(0, most_n)
         for axes, place in zip(panels, places, strict=True):
             for contacts_n, line_uT in zip(place["time"]["contacts_n"], place["time"]["b_uT"], strict=True):
-                axes.plot(line_uT, color=colours(scale(contacts_n)), linewidth=0.9)
+                name = f"{contacts_n:,} contacts before"
+                axes.plot(line_uT, color=colours(scale(contacts_n)), linewidth=0.9, label=name)
             _name_channels(axes, len(place["time"]["b_uT"][0]))
         figure.colorbar(mpl.cm.ScalarMappable(scale, colours), ax=panels, label="contacts before", shrink=0.8)
         return svg(figure)
