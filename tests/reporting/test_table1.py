@@ -29,10 +29,10 @@ def test_as_the_caption_says_only_reskin_meets_every_requirement():
 def test_the_papers_cells_are_never_overwritten(measured):
     table = table1(DATA, measured)
     for (name, cells), (_, row) in zip(DATA.rows.items(), table.iterrows(), strict=False):
-        assert [row[""], *(row[column] for column in DATA.columns)] == [name, *cells]
+        assert [row["property"], *(row[column] for column in DATA.columns)] == [name, *cells]
         assert row[OURS] == measured.get(name, NOT_GIVEN)
     assert set(table.iloc[-1][list(DATA.columns)]) == {NOT_GIVEN}
-    assert table.iloc[-1][""] == LOCALISATION
+    assert table.iloc[-1]["property"] == LOCALISATION
 
 
 def test_what_was_set_in_a_simulated_rig_is_not_called_measured():
