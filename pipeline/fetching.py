@@ -12,7 +12,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from pipeline import adding, preparing
 from pipeline.capture.header import HEADER_FILE
@@ -32,10 +32,19 @@ COPIES_N = 4  # of each byte on disk: as fetched, in data/raw, in DVC's cache, a
 Say = Callable[[str], None]
 
 
+def _below(path: str) -> str:
+    if Path(path).is_absolute() or ".." in Path(path).parts:
+        raise ValueError("a path below the folder of its source")
+    return path
+
+
+Below = Annotated[str, AfterValidator(_below)]
+
+
 class File(Strict):
     """One file: where it lies at home, where it lands here, and what it then must be."""
 
-    path: str
+    path: Below
     at: str
     bytes_n: Annotated[int, Field(gt=0)]
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -44,7 +53,7 @@ class File(Strict):
 class Recording(Strict):
     """How fetched files are added: the words of `reskin add`."""
 
-    path: str
+    path: Below
     layout: Foreign
     board: str
     skin: str

@@ -4,6 +4,7 @@ Git takes the commit's tree and then only the files that are read: a partial clo
 and no line end changes a byte. Refuses to know which files are wanted and which bytes are right (`fetching`).
 """
 
+import os
 import re
 import subprocess
 from collections.abc import Callable, Sequence
@@ -14,8 +15,9 @@ from pipeline.core import io
 from pipeline.core.errors import CaptureError
 
 OTHERS = "--from takes a git mirror, or a folder of the files."
-# No question for a password, which nobody would see, and no wait for a line that is dead.
-OPTIONS = ("core.askPass=true", "http.lowSpeedLimit=1000", "http.lowSpeedTime=60")
+OPTIONS = ("http.lowSpeedLimit=1000", "http.lowSpeedTime=60")  # no wait for a line that is dead
+# No question for a password, which nobody would see.
+SILENT = {"GIT_TERMINAL_PROMPT": "0", "GIT_ASKPASS": "true", "GIT_SSH_COMMAND": "ssh -oBatchMode=yes"}
 
 
 @dataclass(frozen=True)
@@ -104,7 +106,10 @@ def _git(repository: Path, *words: str) -> bytes:
     options = [word for option in OPTIONS for word in ("-c", option)]
     command = ["git", "--git-dir", str(repository), *options, *words]
     try:
-        return subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=True).stdout
+        done = subprocess.run(
+            command, stdin=subprocess.DEVNULL, capture_output=True, check=True, env={**os.environ, **SILENT}
+        )
+        return done.stdout
     except FileNotFoundError:
         remedy = "Install git, or give a folder of the files with --from."
         raise CaptureError("git", "the program", "installed", "none", remedy) from None

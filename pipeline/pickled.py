@@ -20,6 +20,7 @@ COLUMNS = [f"{what}{chip}" for chip in range(CHIPS_N) for what in ("T", "Bx", "B
 HEAD = ",".join(["indent", "phase", "x_mm", "y_mm", *COLUMNS, "Fx", "Fy", "Fz"])
 PHASES = {"noload": "bl_arr", "contact": "cont_arr"}  # the archive's name for the samples of each phase
 REMEDY = "Is it a recording of port and depth, copied whole?"
+BYTES_MAX_N = 500_000_000  # those of lab's port and depth hold 10 to 30 MB
 MARK = object()
 
 
@@ -30,6 +31,8 @@ def to_lab_csv(archive: bytes, where: str) -> bytes:
     """
     try:
         with zipfile.ZipFile(BytesIO(archive)) as file:
+            if (bytes_n := sum(member.file_size for member in file.infolist())) > BYTES_MAX_N:
+                raise CaptureError(where, "the archive", f"{BYTES_MAX_N} bytes or less, unpacked", bytes_n, REMEDY)
             samples = {phase: decode_array(file.read(f"{name}.npy"), where) for phase, name in PHASES.items()}
         rows = [(int(sample["Indent"]), phase, _row(sample)) for phase in PHASES for sample in samples[phase]]
     except CaptureError:
@@ -160,16 +163,26 @@ STEPS: Mapping[str, Step] = {
 }  # by opcode of pickletools; any other is refused
 
 
-def plain(value: Any) -> Any:
-    """Turn what NumPy's pickles ask for into lists and numbers; raise if anything else is to be called."""
+def plain(value: Any, known: dict[int, Any] | None = None) -> Any:
+    """Turn what NumPy's pickles ask for into lists and numbers; raise if anything else is to be called.
+
+    What a pickle names several times is turned once, or lists of lists of one list would take for ever.
+    """
+    known = {} if known is None else known
+    if not isinstance(value, NESTED):
+        return value
+    if id(value) not in known:
+        known[id(value)] = _plain(value, known)
+    return known[id(value)]
+
+
+def _plain(value: Any, known: dict[int, Any]) -> Any:
     match value:
         case list() | tuple():  # of a million numbers, most likely: each is plain already
-            return type(value)(plain(item) if isinstance(item, NESTED) else item for item in value)
+            return type(value)(plain(item, known) if isinstance(item, NESTED) else item for item in value)
         case dict():
-            return {plain(key): plain(item) for key, item in value.items()}
-        case Call():
-            return _numbers(value)
-    return value
+            return {plain(key, known): plain(item, known) for key, item in value.items()}
+    return _numbers(value)
 
 
 def _numbers(call: Call) -> Any:

@@ -318,3 +318,9 @@ def test_real_boards_are_in_their_scene_after_one_command(shared_data, tmp_path)
     assert "now: dvc repro (runs quick, lab; only this one: reskin scenes use lab)" in done.stdout
     again = run(root, "reskin", "fetch", "lab")
     assert again.stdout.count("added already") == 6
+
+
+@pytest.mark.parametrize("path", ["../elsewhere.csv", "/etc/elsewhere.csv", "a/../../elsewhere.csv"])
+def test_a_file_never_lands_outside_the_folder_of_its_source(path):
+    with pytest.raises(ValueError, match="a path below the folder of its source"):
+        fetching.File(path=path, at="a.csv", bytes_n=1, sha256="0" * 64)

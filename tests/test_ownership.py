@@ -25,6 +25,7 @@ HOMES = {
         "core/provenance.py",
         "core/server.py",
         "core/executors.py",
+        "origins.py",
         "core/progress.py",
         "tracking.py",
     ],

@@ -151,3 +151,11 @@ def test_real_samples_give_the_file_that_is_on_record(shared_data):
     known = {entry.path: entry.sha256 for entry in read_sources(ROOT)["lab"].files}
     again = to_lab_csv(archive_of_csv(file.read_text()), "a")
     assert hashlib.sha256(again).hexdigest() == known[file.name]
+
+
+def test_what_refers_to_itself_many_times_is_turned_once():
+    nested: list = []
+    for _ in range(60):
+        nested = [nested, nested]  # 2^60 paths
+    found = decode(pickle.dumps(nested, 4), "a")
+    assert found[0] is found[1]

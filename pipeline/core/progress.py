@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pipeline.core import io
 from pipeline.core.config import FLOW, PLAN, read_yaml
-from pipeline.core.provenance import COSTS, home
+from pipeline.core.provenance import COSTS, home, read_costs
 
 VARIABLE = "DVC_STAGE"  # where DVC tells a command which stage it runs, as `simulate@quick-wear`
 ORDER = Path(".reskin/order.json")
@@ -22,8 +22,11 @@ def announce() -> str | None:
     stage = os.environ.get(VARIABLE, "").rpartition(":")[2]  # `dvc.yaml:` stands before it where there are more files
     if not stage:
         return None
-    order = stages_in_order()
-    return describe(stage, order, read_seconds(order)) if stage in order else None
+    try:
+        order = stages_in_order()
+        return describe(stage, order, read_seconds(order)) if stage in order else None
+    except Exception as error:  # of DVC or of a file that is no longer whole: no stage ends for the sake of this line
+        return f"which of all stages this is cannot be told ({type(error).__name__} {error})"
 
 
 def describe(stage: str, order: Sequence[str], took_s: Mapping[str, float]) -> str:
@@ -32,14 +35,16 @@ def describe(stage: str, order: Sequence[str], took_s: Mapping[str, float]) -> s
     >>> describe("b@x", ["code", "b@x", "c@x"], {"b@x": 57.0, "c@x": 120.0})
     'stage 2 of 3; about 3 min left if none is skipped'
     >>> describe("b@x", ["code", "b@x", "c@x"], {"c@x": 120.0})
-    'stage 2 of 3'
+    'stage 2 of 3; about 2 min left if none is skipped, and 1 that never ran'
     """
     at = order.index(stage)
-    place = f"stage {at + 1} of {len(order)}"
-    if any(name not in took_s for name in order[at:]):
-        return place
-    left_s = sum(took_s[name] + AROUND_S for name in order[at:])
-    return f"{place}; about {max(left_s / 60, 1):.0f} min left if none is skipped"
+    left = [took_s[name] for name in order[at:] if name in took_s]
+    if not left:
+        return f"stage {at + 1} of {len(order)}"
+    minutes = max((sum(left) + AROUND_S * len(left)) / 60, 1)
+    unknown_n = len(order) - at - len(left)
+    beside = f", and {unknown_n} that never ran" if unknown_n else ""
+    return f"stage {at + 1} of {len(order)}; about {minutes:.0f} min left if none is skipped{beside}"
 
 
 def stages_in_order() -> list[str]:
@@ -63,13 +68,17 @@ def _ask_dvc() -> list[str]:
 
 
 def read_seconds(order: Sequence[str]) -> dict[str, float]:
-    """Read how long stages took when they ran last, here or else where the committed results were made."""
+    """Read how long stages took when they ran last, here or else where the committed results were made.
+
+    Half of what their trainings took when computed, if that is more: of two side by side, and some may be reused.
+    """
     found: dict[str, float] = {}
     for scene in read_yaml(Path(PLAN))["scenes"]:
         committed = Path("reports") / scene / "numbers.json"
         stages = io.read_json(committed)["runtime"]["stages"] if committed.exists() else {}
-        took_s = {unit: cost["seconds"] for unit, cost in stages.items()}
-        took_s |= {file.stem: io.read_json(file)["seconds"] for file in (home() / COSTS / scene).glob("*.json")}
+        took_s = {unit: max(cost["seconds"], cost["computed_s"] / 2) for unit, cost in stages.items()}
+        for unit, cost in read_costs(home() / COSTS / scene).items():
+            took_s[unit] = max(cost["seconds"], sum(cost["trainings_s"].values()) / 2)
         for name in order:
             stage, _, key = name.partition("@")
             if key == scene or key.startswith(f"{scene}-"):

@@ -24,6 +24,7 @@ ALL_SKINS = ""  # in column `skin`: all rows that a training was tested on
 AS_LABELLED, REGISTERED = "as_labelled", "registered"  # places: the latter after one offset a board, a diagnosis
 METHODS = {"triplet": "network + triplet", "adapt": "network, adapted"}  # of cards, by question
 CONFIDENCE = 0.95  # convention
+ABOVE_ROUNDING = 12  # decimals of a difference in %, mm2 or N2: what lies below is of float sums
 YES, NO, INCONCLUSIVE = "yes", "no", "inconclusive"
 ONE_BOARD = "inconclusive (one board)"
 VERDICTS = (
@@ -161,8 +162,10 @@ def differences(of: pd.DataFrame, over: pd.DataFrame, *, where_tested: bool = Fa
 
 
 def with_boards(by_board: pd.DataFrame) -> dict[str, Any]:
-    """Summarise over boards, and give `by_board` each board's value."""
-    return {**summarise(by_board, boards=True), "by_board": records(by_board)}
+    """Summarise over boards, and give `by_board` each board's value; what is left of equal sides is 0."""
+    summary = summarise(by_board, boards=True)
+    means = {name: stat | {"mean": round(stat["mean"], ABOVE_ROUNDING)} for name, stat in summary.items()}
+    return {**means, "by_board": records(by_board)}
 
 
 def paired(of: pd.DataFrame, over: pd.DataFrame, *, where_tested: bool = False) -> dict[str, Any]:

@@ -34,13 +34,15 @@ def headline_figures(numbers: Mapping[str, Any], source: str) -> dict[str, str]:
 def answer(numbers: Mapping[str, Any]) -> str:
     """Say in one sentence how a model does on boards never seen, with intervals; nothing where none was held out."""
     if numbers.get("labels"):
-        first, *_, last = [row for row in numbers["labels"] if row["method"] == numbers["labels"][0]["method"]]
+        first = numbers["labels"][0]
+        alike = [row for row in numbers["labels"] if all(row[name] == first[name] for name in ("method", "inputs"))]
+        of_method = {row["labels_n"]: row for row in alike}
         said = [
-            f"{show(row['as_labelled']['accuracy_pct'])} % with {row['labels_n']} labels of the new board"
-            for row in (first, last)
+            f"{show(of_method[labels_n]['as_labelled']['accuracy_pct'])} % with {labels_n} labels of the new board"
+            for labels_n in sorted({min(of_method), max(of_method)})
         ]
         boards_n = first["as_labelled"]["accuracy_pct"]["n"]
-        return f"{WITHIN} never seen: {first['method']} {', '.join(said)}. {BRACKETS} (n = {boards_n})."
+        return f"{WITHIN} never seen: {first['method']} {_with_brackets(', '.join(said), f' (n = {boards_n})')}"
     rows = numbers.get("table2", {})
     known = models(numbers)
     said = [
@@ -49,7 +51,11 @@ def answer(numbers: Mapping[str, Any]) -> str:
         for name in ANSWERING
         if name in rows
     ]
-    return f"{WITHIN} and skins never seen: {'; '.join(said)}. {BRACKETS}." if said else ""
+    return f"{WITHIN} and skins never seen: {_with_brackets('; '.join(said))}" if said else ""
+
+
+def _with_brackets(said: str, boards: str = "") -> str:
+    return f"{said}. {BRACKETS}{boards}." if "[" in said else f"{said}."
 
 
 def table2_figure(numbers: Mapping[str, Any], source: str) -> str:

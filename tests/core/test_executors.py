@@ -1,5 +1,6 @@
 import os
 import resource
+import sys
 import time
 
 import pytest
@@ -19,10 +20,27 @@ def test_what_workers_took_counts_when_they_are_ended(monkeypatch):
     monkeypatch.setenv("RESKIN_EXECUTOR", "processes:1")
     with make_executor(imports="json") as executor:
         executor.submit(burn, 0.3).result()
-    before_s = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
+    before_s = children_s()
     end_workers()
-    assert resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before_s >= 0.3
+    assert children_s() - before_s >= 0.3
     end_workers()  # of which there are none any more
+
+
+def children_s() -> float:
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def test_what_tasks_need_is_imported_before_they_begin(monkeypatch):
+    monkeypatch.setenv("RESKIN_EXECUTOR", "processes:1")
+    end_workers()
+    with make_executor(imports="colorsys") as executor:
+        assert executor.submit(is_imported, "colorsys").result()
+        assert not executor.submit(is_imported, "this").result()
+
+
+def is_imported(name: str) -> bool:
+    return name in sys.modules
 
 
 def burn(seconds: float) -> None:

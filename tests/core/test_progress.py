@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.core import progress
-from pipeline.core.config import read_yaml
+from pipeline.core.config import PLAN, read_yaml
 from pipeline.core.provenance import COSTS
-from tests.stages.checkout import copy_checkout, run
+from tests.stages.checkout import ROOT, copy_checkout, run
 
 ORDER = ["code", "simulate@tiny", "simulate@tiny-wear", "report@tiny"]
 
@@ -22,22 +22,36 @@ def test_what_is_left_shrinks_from_stage_to_stage(seconds):
     assert left == sorted(left, reverse=True)
 
 
-def test_nothing_is_said_of_time_while_a_later_stage_never_ran():
-    assert progress.describe("simulate@tiny", ORDER, {"simulate@tiny": 3.0}) == "stage 2 of 4"
+def test_nothing_is_said_of_time_before_the_first_run():
+    assert progress.describe("simulate@tiny", ORDER, {}) == "stage 2 of 4"
+
+
+def test_a_fresh_clone_tells_a_time_for_all_but_the_stages_that_are_read_before_they_end(monkeypatch):
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(progress, "home", lambda: ROOT / "no costs of its own")
+    order = ["code", *(f"{stage}@{key}" for stage, keys in read_yaml(Path(PLAN))["stages"].items() for key in keys)]
+    assert set(order) - set(progress.read_seconds(order)) == {"code", "report@quick", "publish@quick"}
+
+
+def test_what_cannot_be_told_is_said_and_ends_no_stage(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv(progress.VARIABLE, "split@tiny")
+    assert "cannot be told (FileNotFoundError" in progress.announce()
 
 
 def test_seconds_are_those_of_the_last_run_here_and_else_the_committed_ones(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("pipeline").mkdir()
     Path("pipeline/plan.yaml").write_text("scenes: {tiny: [lobo]}\n")
-    committed = {"runtime": {"stages": {"simulate-wear": {"seconds": 8.0}, "report": {"seconds": 5.0}}}}
+    stages = {"simulate-wear": {"seconds": 8.0, "computed_s": 8.0}, "report": {"seconds": 5.0, "computed_s": 30.0}}
+    committed = {"runtime": {"stages": stages}}
     for file, words in {
         Path("reports/tiny/numbers.json"): committed,
-        COSTS / "tiny/report.json": {"seconds": 2.0},
+        COSTS / "tiny/report.json": {"seconds": 2.0, "trainings_s": {"a": 9.0}},
     }.items():
         file.parent.mkdir(parents=True)
         file.write_text(json.dumps(words))
-    assert progress.read_seconds(ORDER) == {"simulate@tiny-wear": 8.0, "report@tiny": 2.0}
+    assert progress.read_seconds(ORDER) == {"simulate@tiny-wear": 8.0, "report@tiny": 4.5}
 
 
 def test_a_stage_that_a_person_starts_says_nothing(monkeypatch):
