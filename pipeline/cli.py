@@ -101,7 +101,8 @@ def add(
             options |= {"rows_late": str(rows_late)} if layout == "ini" else {}
             prepared = preparing.foreign(recording, layout, labels, options)
         header = adding.add(root, scene, prepared, allow_copy=allow_copy)
-    typer.echo(f"added {scene}/{header.capture} (board {board}, skin {skin}); now: dvc repro")
+    alone = f"only this scene: reskin scenes use {scene}"
+    typer.echo(f"added {scene}/{header.capture} (board {board}, skin {skin}); now: dvc repro ({alone})")
     if scene not in running:
         typer.echo(f"switched scene {scene} on in {config.PLAN}, beside {', '.join(running) or 'no other'}")
 

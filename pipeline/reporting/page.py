@@ -17,6 +17,7 @@ from pydantic import Field
 from pipeline.core.code import ROOT
 from pipeline.core.config import Strict, parse, read_yaml
 from pipeline.core.errors import SchemaError
+from pipeline.reporting import judging
 from pipeline.reporting.headline import answer
 from pipeline.reporting.parts import add_sections
 from pipeline.reporting.shown import notes
@@ -162,9 +163,13 @@ def about(numbers: Mapping[str, Any]) -> str:
 def findings(section: Section, checklist: pd.DataFrame) -> list[str]:
     """Say what the checklist says of what a section shows: ours with its interval, and the paper's; verdicts first.
 
-    Where ours did not look as far as the paper, the sentence says so.
+    Where ours did not look as far as the paper, the sentence says so; what cannot be compared is no finding.
     """
-    rows = [row for row in _rows_of(section, checklist) if row["ours"] not in NOTHING]
+    rows = [
+        row
+        for row in _rows_of(section, checklist)
+        if row["ours"] not in NOTHING and row["difference"] != judging.ONE_SKIN
+    ]
     judged = sorted(rows, key=lambda row: row["verdict"] in NOTHING)
     return [
         f"{row['result']}: {row['ours']}; paper: {row['paper']}"

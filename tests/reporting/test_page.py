@@ -9,6 +9,7 @@ import pytest
 
 from pipeline.core.errors import SchemaError
 from pipeline.questions import EXPERIMENTS
+from pipeline.reporting import judging
 from pipeline.reporting.checklist import checklist
 from pipeline.reporting.headline import answer
 from pipeline.reporting.page import (
@@ -183,6 +184,7 @@ def test_a_finding_says_where_ours_did_not_look_as_far_as_the_paper():
     assert "(not reached: ours after 8,000 contacts). Yes." in said
     (said,) = findings(section, pd.DataFrame([row | {"difference": far}]))
     assert "not reached" not in said
+    assert findings(section, pd.DataFrame([row | {"difference": judging.ONE_SKIN}])) == []
 
 
 @pytest.mark.parametrize("source", ["simulated", "recorded"])

@@ -75,7 +75,7 @@ def _dtype(name: str) -> type[np.generic]:
 
 def _read_text(path: Path, where: str) -> str:
     try:
-        text = path.read_bytes().decode("utf-8")
+        text = path.read_bytes().decode("utf-8-sig")  # spreadsheets begin a file with a mark of byte order
     except UnicodeDecodeError as error:
         got = f"byte {error.object[error.start]:#04x} at {error.start}"
         raise CaptureError(where, "the file", "text", got, "Is it another file under this name?") from None

@@ -58,6 +58,16 @@ def read(folder: Path, rows: pd.DataFrame, name: str = "mine.csv"):
     return plain.read(capture, make_header(layout="table", chips_n=plain.count_chips(files)))
 
 
+def test_a_spreadsheets_mark_of_byte_order_changes_nothing(tmp_path):
+    plainly, _ = read(tmp_path / "a", table())
+    table().to_csv(tmp_path / "mine.csv", index=False, encoding="utf-8-sig")
+    (tmp_path / "b").mkdir()
+    for kept, source in plain.collect(tmp_path / "mine.csv").items():
+        (tmp_path / "b" / kept).write_bytes(source.read_bytes())
+    marked, _ = plain.read(tmp_path / "b", make_header(layout="table", chips_n=CHIPS_N))
+    np.testing.assert_array_equal(marked.b_uT, plainly.b_uT)
+
+
 def test_rows_of_contact_become_readings_with_the_mean_no_load_field_before_them(tmp_path):
     rows = table()
     readings, account = read(tmp_path, rows)
