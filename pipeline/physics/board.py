@@ -36,8 +36,9 @@ class Tiles(Strict):
 
 
 class BoardDesign(Strict):
-    """Where the chips sit, seen from the middle of the board, and how each is turned about z (authors' board file).
+    """Where the chips sit, seen from the middle of the board, and how each is turned about z.
 
+    The scenes' turns are those that recordings show (tests/recordings/test_lab_frames.py), not those of a board file.
     With `tiles`, this is one board of many; chips are then numbered board by board.
     """
 

@@ -6,7 +6,7 @@ from tests.physics.test_board import SPREADS
 
 GRID = {"kind": "grid", "boards": "rigid", "skins_n": 4, "passes_n": 2, "depths_mm": (0.6, 1.2), "terms": []}
 CHIPS_MM = ((0.0, 0.0), (-7.0, 0.0), (0.0, -7.0), (7.0, 0.0), (0.0, 7.0))
-RIGID = {"chips_xy_mm": CHIPS_MM, "chips_turn_deg": (0.0, 180.0, 0.0, 90.0, 270.0), "gap_mm": 1.1}
+RIGID = {"chips_xy_mm": CHIPS_MM, "chips_turn_deg": (0.0, 180.0, 270.0, 90.0, 0.0), "gap_mm": 1.1}
 RULE = {"cell_mm": 1.0, "layers_n": 4}
 AGEING = {"settling": 0.1, "ageing": 0.01, "fading_per_decade": 0.005, "wandering_uT": 0.2}
 TEMPERATURE = {"warming_K": 3.0, "warming_s": 5.0, "swing_K": 0.0, "swing_s": 1.0, "chip_sensitivity_per_K": 0.0}
