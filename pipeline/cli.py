@@ -31,8 +31,6 @@ LOGS = (
     "A log as an SD card holds it: t_s,T0,Bx0,By0,Bz0,T1,...; degC and uT. "
     "Or a folder that `reskin record` wrote, or a Parquet file that `reskin decode` wrote."
 )
-TIMED = "reports/time.json"  # what `make time-repro` measured
-FULL_SIZE = "paper"  # the scene whose results the README shows first, where it was run
 
 Layout = Literal["capture", "serial-binary", "serial-text", "table", "lab", "ini", "eflesh"]
 Wire = Literal["binary", "binary-clock", "text-xyzt", "text-txyz"]
@@ -106,6 +104,21 @@ def add(
     typer.echo(f"added {scene}/{header.capture} (board {board}, skin {skin}); now: dvc repro")
     if scene not in running:
         typer.echo(f"switched scene {scene} on in {config.PLAN}, beside {', '.join(running) or 'no other'}")
+
+
+@app.command()
+def fetch(
+    source: Annotated[str | None, Argument(help="lab, ini, eflesh or eflash7; without one, lists them.")] = None,
+    origin: Annotated[str | None, Option("--from", help="A git mirror or a folder, in place of its home.")] = None,
+    yes: Annotated[bool, Option("--yes", help="Agree to use what has no licence.")] = False,
+) -> None:
+    """Fetch public recordings from their home, check them, and add them to their scene."""
+    from pipeline import fetching
+
+    def agree(question: str) -> bool:
+        return yes or (sys.stdin.isatty() and typer.confirm(question))
+
+    fetching.fetch(checkout(), source, origin, agree=agree, say=typer.echo)
 
 
 @app.command()
@@ -235,26 +248,12 @@ def compare(
 @app.command()
 def readme(check: Annotated[bool, Option("--check", help="Only tell whether it is up to date.")] = False) -> None:
     """Fill in the generated parts of README.md and docs from the results of the scenes that run."""
-    from pipeline.core import io
-    from pipeline.core.config import read_yaml
-    from pipeline.reporting.readme import blocks_of, fill
+    from pipeline.documenting import fill_pages
 
-    root, running = checkout(), list(checked_plan().scenes)
-    if not running:
-        raise ParamsError(config.PLAN, "scenes", "one or more", "none", "Try: reskin scenes use quick")
-    numbers = {file.parent.name: io.read_json(file) for file in sorted((root / "reports").glob("*/numbers.json"))}
-    recorded = [result for result in numbers.values() if result["provenance"]["source"] == "recorded"]
-    results = [numbers[name] for name in dict.fromkeys([FULL_SIZE, running[0]]) if name in numbers]
-    timed = io.read_json(root / TIMED) if (root / TIMED).exists() else None
-    files = [root / "README.md", *sorted((root / "docs").glob("*.md"))]
-    before = {str(file): file.read_text(encoding="utf-8") for file in files}
-    after = fill(before, blocks_of(results, recorded, read_yaml(root / "dvc.yaml")["stages"], timed))
-    changed = {page: text for page, text in after.items() if text != before[page]}
+    changed = fill_pages(checkout(), list(checked_plan().scenes), write=not check)
     if check and changed:
         typer.echo(f"behind reports and dvc.yaml: {', '.join(changed)}; run: reskin readme", err=True)
         sys.exit(1)
-    for page, text in changed.items():
-        io.write_text(Path(page), text)
 
 
 @scenes.command("list")

@@ -15,7 +15,7 @@ from pipeline.core import io
 from pipeline.core.config import FLOW, NOTHING, PARAMS, PLACE, PLAN, SCENES, declared, fill, find, put, read_yaml
 from pipeline.core.errors import ParamsError
 from pipeline.params import OnBoards, Plan, Scene, read_plan, read_scene
-from pipeline.questions import EXPERIMENTS, LEARNING, MAIN_PROTOCOL, NOT_INGESTED, QUESTIONS, stages
+from pipeline.questions import EXPERIMENTS, LEARNING, MAIN_PROTOCOL, NOT_INGESTED, QUESTIONS, TABLE_2, stages
 from pipeline.registry import Registry, read_registry
 
 HEADER = """\
@@ -58,6 +58,7 @@ def make_plan(scenes: Mapping[str, Scene], registry: Registry, flow: Mapping[str
     for stage in stages(QUESTIONS, *LEARNING, "study"):
         items[stage] = {name: {"scene": name} for name, scene in scenes.items() if scene.runs(stage)}
     items |= {question: _experiments(scenes, question) for question in EXPERIMENTS}
+    items["table2"] = {name: {"scene": name} for name, scene in scenes.items() if set(TABLE_2) <= set(scene.questions)}
     items |= {stage: {name: {"scene": name} for name in scenes} for stage in ("report", "publish")}
     for stage, of_stage in items.items():
         for item in of_stage.values():

@@ -11,6 +11,7 @@ from typing import Literal
 MAIN_PROTOCOL = "grid"  # folds are drawn on its captures
 NOT_INGESTED = {"walk"}  # kinds of protocols whose captures are read as they are: an SD card knows no probe
 POOLED_BY = "adapt"  # takes pokes of the held-out skins, so a part of these is kept from every test
+TABLE_2 = ("transfer", "lobo", "triplet", "adapt")  # of its rows; a scene that asks all has the table early
 RANDOM = ("random_test_fraction", "random_repeats_n")
 
 Kind = Literal["models", "curve", "other", "experiment", "study", "report"]

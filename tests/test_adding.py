@@ -318,7 +318,7 @@ def test_outside_a_checkout_a_command_says_so(tmp_path, monkeypatch, words):
 
 def test_a_scene_that_asks_for_folds_its_data_cannot_give_says_so(root, lab_file):
     add_lab(root, lab_file)
-    done = run(root, "dvc", "repro", check=False)
+    done = run(root, "dvc", "repro", "split@small", check=False)
     assert done.returncode != 0
     assert "question lobo: boards must be two or more; got 1 (board1)" in done.stderr + done.stdout
     assert "Traceback" not in done.stderr + done.stdout

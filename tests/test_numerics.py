@@ -4,6 +4,7 @@ import hashlib
 import os
 import subprocess
 import sys
+from functools import cache
 
 import pytest
 
@@ -24,6 +25,7 @@ print(digest.hexdigest())
 """
 
 
+@cache
 def weights_under(**setting: str) -> str:
     kept = {name: value for name, value in os.environ.items() if name not in PINNED and not name.startswith("MKL")}
     done = subprocess.run(

@@ -25,9 +25,10 @@ HOMES = {
         "core/provenance.py",
         "core/server.py",
         "core/executors.py",
+        "core/progress.py",
         "tracking.py",
     ],
-    r"import pickle|torch\.load\(|allow_pickle=True": [],
+    r"import pickle\b|from pickle |torch\.load\(|allow_pickle=True": [],
 }  # by pattern: the files that may match it
 
 

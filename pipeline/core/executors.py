@@ -9,6 +9,7 @@ import os
 import threading
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from multiprocessing import forkserver
 from time import perf_counter
 from typing import Any
 
@@ -23,10 +24,10 @@ DEVICES = ("cpu", "cuda")
 REPEATS_N = 25
 
 
-def make_executor(tasks_n: int = 2) -> Executor:
+def make_executor(tasks_n: int = 2, *, imports: str) -> Executor:
     """Make the executor that RESKIN_EXECUTOR names: `processes:N` (default N = 2, one thread each), or `here`.
 
-    One task by itself runs here: another process would only import everything again.
+    One task by itself runs here. Module `imports` is what the tasks need: it is imported once, for all processes.
     """
     name = os.environ.get(VARIABLE, DEFAULT if tasks_n > 1 else "here")
     if name == "here":
@@ -34,8 +35,15 @@ def make_executor(tasks_n: int = 2) -> Executor:
     kind, _, count = name.partition(":")
     if kind != "processes" or not count.isdecimal() or int(count) < 1:
         raise ParamsError(VARIABLE, "the executor", "processes:N with N >= 1, or here", repr(name), "Unset it for two.")
-    # spawn: a forked child of a threaded parent can hang in BLAS.
-    return ProcessPoolExecutor(int(count), multiprocessing.get_context("spawn"), _end_with_parent)
+    # forkserver: a forked child of a threaded parent can hang in BLAS; one of a process that only imported does not.
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([imports])
+    return ProcessPoolExecutor(int(count), context, _end_with_parent)
+
+
+def end_workers() -> None:
+    """Wait for the process that forks workers, so that what they took counts as taken by children of this one."""
+    forkserver._forkserver._stop()  # type: ignore[attr-defined]  # else it ends unseen after its parent
 
 
 class Here(Executor):

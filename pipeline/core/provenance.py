@@ -15,6 +15,7 @@ from pipeline.core.numerics import departures
 EXPERIMENTS = (".dvc", "tmp", "exps")  # where DVC makes copies of a checkout for experiments, and deletes them
 CODE = Path(__file__).parents[1]
 NO_CODE = ("plan.yaml", "scenes")  # settings, which stand beside the code: they decide results by their values
+COSTS = Path(".reskin/costs")
 SECONDS = Path(".reskin/seconds")  # what was timed here: beside the pipeline, as costs are
 CPUINFO = Path("/proc/cpuinfo")  # Linux only
 INSTRUCTIONS = {"avx2": "AVX2", "avx512f": "AVX-512", "amx_tile": "AMX", "asimd": "NEON", "sve": "SVE"}  # by CPU flag

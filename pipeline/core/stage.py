@@ -8,15 +8,14 @@ import inspect
 import sys
 import time
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any
 
 from pipeline.core.config import Files
 from pipeline.core.errors import ReskinError
-from pipeline.core.provenance import begin_cost, note_cost
+from pipeline.core.executors import end_workers
+from pipeline.core.progress import announce
+from pipeline.core.provenance import COSTS, begin_cost, note_cost
 from pipeline.core.server import TrackingAway, probe, server_uri
-
-COSTS = Path(".reskin/costs")
 
 
 def run(work: Callable[..., None]) -> None:
@@ -33,6 +32,8 @@ def run(work: Callable[..., None]) -> None:
         probe(server_uri())
     except TrackingAway as away:
         say(f"warning: {away}")
+    if place := announce():
+        say(f"{stage}: {place}")
     start_s, costs, unit = time.monotonic(), COSTS / arguments["scene"], _unit(stage, arguments)
     begin_cost(costs, unit)
     try:
@@ -40,6 +41,7 @@ def run(work: Callable[..., None]) -> None:
     except ReskinError as error:
         say(f"error: {error}")
         sys.exit(error.exit_code)
+    end_workers()
     note_cost(costs, unit, time.monotonic() - start_s)
 
 

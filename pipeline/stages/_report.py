@@ -11,8 +11,7 @@ from pipeline.core import io
 from pipeline.core.config import Settings, parse
 from pipeline.core.errors import ParamsError
 from pipeline.core.executors import device as trained_on
-from pipeline.core.provenance import SECONDS, add_up_costs, code_version, device, read_costs
-from pipeline.core.stage import COSTS
+from pipeline.core.provenance import COSTS, SECONDS, add_up_costs, code_version, device, read_costs
 from pipeline.evaluation.choice import choose
 from pipeline.evaluation.scores import tidy
 from pipeline.learning.recipe import HEADLINE

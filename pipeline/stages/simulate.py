@@ -20,7 +20,7 @@ def simulate(scene: str, files: Files, protocol: str, raw: Path) -> None:
     if len(pairs) < skins_n:
         rule = f"at most the {len(pairs)} that its boards have"
         raise ParamsError(settings.where, f"skins_n of protocol {protocol}", rule, skins_n, "Ask for fewer.")
-    with io.replacing(raw) as folder, make_executor(len(pairs)) as executor:
+    with io.replacing(raw) as folder, make_executor(len(pairs), imports="pipeline.synthesis.capture") as executor:
         folder.mkdir()
         waiting = [executor.submit(_record, synthesis, protocol, pair, seed, folder) for pair in pairs]
         for i, done in enumerate(waiting, 1):

@@ -29,7 +29,7 @@ def train_classical(scene: str, files: Files, indentations: Path, folds: Path, s
         Task(f"{name}.{fold.name}", method, fold.train, fold.test, NO_ROWS, settings.rows_max_n, seed)
         for fold, name, method in pairs
     ]
-    with make_executor() as executor:
+    with make_executor(imports="pipeline.learning.classical") as executor:
         fitted = run_tasks(tasks, measured(data), executor, lambda line: say(f"{scene} classical: {line}"))
     points = [
         {"name": name, "method": method.title, "inputs": method.inputs, "fold": fold.name, "seed_i": 0}

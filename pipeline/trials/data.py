@@ -8,8 +8,8 @@ from pathlib import Path
 from pipeline.core import io
 from pipeline.core.config import Settings
 from pipeline.core.executors import make_executor
-from pipeline.core.provenance import home, note_trainings
-from pipeline.core.stage import COSTS, say
+from pipeline.core.provenance import COSTS, home, note_trainings
+from pipeline.core.stage import say
 from pipeline.dataset.folds import load_rows, parse_folds
 from pipeline.dataset.rows import Rows, Selection
 from pipeline.dataset.splits import Fold
@@ -67,7 +67,7 @@ def train_all(data: SceneData, trials: Sequence[Trial], stage: str) -> list[Trai
     def tell(line: str) -> None:
         say(f"{stage_words}: {line}")
 
-    with make_executor() as executor:
+    with make_executor(imports="pipeline.learning.train") as executor:
         trained = run_trials(trials, measured(data), executor=executor, cache=home() / CACHE, tell=tell)
     took = {result.key: (result.seconds, result.reused) for result in trained}
     note_trainings(COSTS / data.scene, stage, took, time.monotonic() - start_s)

@@ -210,7 +210,7 @@ def test_the_fold_grid_is_timed_beside_plain_loops_and_sgemm(tmp_path: Path) -> 
     for i in range(REPEATS_N):
         sgemm = max(sgemm_flop_per_s())
         columns["sgemm, one thread, GFLOP/s"].append(1e-9 * sgemm)
-        with make_executor() as executor:
+        with make_executor(imports="pipeline.learning.train") as executor:
             start_s = seconds(lambda: start(executor))
             beside = [executor.submit(sgemm_flop_per_s, 100) for _ in range(2)]  # a quarter of a second each
             both = harmonic_mean(list(chain.from_iterable(one.result() for one in beside)))

@@ -1,28 +1,45 @@
 import os
+import resource
+import time
 
 import pytest
 
 from pipeline.core import executors
 from pipeline.core.errors import ParamsError
-from pipeline.core.executors import device, make_executor
+from pipeline.core.executors import device, end_workers, make_executor
 
 
 def test_trainings_run_in_processes_of_their_own(monkeypatch):
     monkeypatch.setenv("RESKIN_EXECUTOR", "processes:1")
-    with make_executor() as executor:
+    with make_executor(imports="json") as executor:
         assert executor.submit(os.getpid).result() != os.getpid()
+
+
+def test_what_workers_took_counts_when_they_are_ended(monkeypatch):
+    monkeypatch.setenv("RESKIN_EXECUTOR", "processes:1")
+    with make_executor(imports="json") as executor:
+        executor.submit(burn, 0.3).result()
+    before_s = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
+    end_workers()
+    assert resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before_s >= 0.3
+    end_workers()  # of which there are none any more
+
+
+def burn(seconds: float) -> None:
+    while time.process_time() < seconds:
+        pass
 
 
 @pytest.mark.parametrize("word", ["", "threads:2", "processes", "processes:0", "processes:-1", "processes:x"])
 def test_an_unknown_executor_is_one_sentence(monkeypatch, word):
     monkeypatch.setenv("RESKIN_EXECUTOR", word)
     with pytest.raises(ParamsError, match="RESKIN_EXECUTOR: the executor must be processes:N"):
-        make_executor()
+        make_executor(imports="json")
 
 
 def test_trainings_can_run_here_and_fail_as_they_would_elsewhere(monkeypatch):
     monkeypatch.setenv("RESKIN_EXECUTOR", "here")
-    with make_executor() as executor:
+    with make_executor(imports="json") as executor:
         assert executor.submit(os.getpid).result() == os.getpid()
         with pytest.raises(ZeroDivisionError):
             executor.submit(lambda: 1 // 0).result()

@@ -249,7 +249,7 @@ def test_a_target_that_is_unknown_or_never_changes_judges_nobody(tmp_path):
 def test_trainings_in_a_process_of_their_own_are_the_same(tmp_path, monkeypatch):
     monkeypatch.setenv("RESKIN_EXECUTOR", "processes:1")
     some = [adapting(), few_labels()]
-    with make_executor() as executor:
+    with make_executor(imports="pipeline.learning.train") as executor:
         apart = run(some, tmp_path / "apart", executor)
     assert all(alike(a, b) for a, b in zip(apart, run(some, tmp_path / "here"), strict=True))
 

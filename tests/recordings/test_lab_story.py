@@ -1,6 +1,7 @@
 """Real recordings from `reskin add` to a leave-one-board-out table, and one board more, and one less."""
 
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from pipeline import plan
 from pipeline.core import config
 from tests.stages.checkout import copy_checkout, run
 
+SAID = "said.txt"  # by DVC in the first run
 pytestmark = pytest.mark.timeout(1800)
 
 
@@ -21,18 +23,14 @@ def lab(tmp_path_factory, shared_data) -> Iterator[Path]:
     settings = YAML(typ="safe").load(scene.read_text())
     settings["train_multi"]["seeds_n"] = 1
     settings["train_multi"] |= {"steps_n": 100, "variants": {}}
-    settings["split"] = {"labels_draws_n": 1, "labels_pool_n": 20}  # of 65: one depth is added here
-    few = settings["few_labels"]
-    few |= {"recipes": {"network": few["recipes"]["network-triplet"]}, "steps_n": 20}
-    few |= {"adapted": ["network"], "methods": "tiny", "labels_n": [0, 10]}
-    for part in ("adapting", "labelling"):
-        few[part]["steps_n"] = 5
+    settings |= {"questions": ["lobo", "audit"], "split": {}}  # labels: the story of scene ci
+    del settings["few_labels"]
     with scene.open("w") as stream:
         YAML().dump(settings, stream)
     plan.use(root, [])
     for board in (1, 2):
         add(root, shared_data / f"lab/board{board}_depth2.csv", f"board{board}", f"skin{board}")
-    run(root, "dvc", "repro")
+    (root / SAID).write_text(run(root, "dvc", "repro").stdout)
     return root
 
 
@@ -52,6 +50,11 @@ def test_two_real_boards_give_two_folds_with_all_three_numbers(lab):
     for parts in boards.values():
         assert parts["trained_on_skins_n"] == 1
         assert set(parts["as_labelled"]) == {"accuracy_pct", "mse_xy_mm2", "mse_f_N2"}
+
+
+def test_stages_run_in_the_order_by_which_they_are_counted(lab):
+    order = json.loads((lab / ".reskin/order.json").read_text())["stages"]
+    assert re.findall("^Running stage '(.*)':", (lab / SAID).read_text(), re.MULTILINE) == order
 
 
 def test_a_third_board_is_one_command_and_no_line_of_code(lab, shared_data):

@@ -11,7 +11,7 @@ from pydantic import Field
 
 from pipeline.core.config import Files, Settings, Strict, read_settings
 from pipeline.core.errors import ParamsError
-from pipeline.core.executors import make_executor
+from pipeline.core.executors import Here
 from pipeline.core.schema import Readings
 from pipeline.core.stage import run, say
 from pipeline.dataset.rows import Rows, Selection, gather
@@ -208,8 +208,7 @@ def _neighbours(data: SceneData, section: Sleeve, train: np.ndarray, test: np.nd
         for inputs in ("raw", "shape")
     ]  # fmt: skip
     rows = Measured(data.rows.db_uT, data.rows.target, data.rows.skin)
-    with make_executor() as executor:
-        done = run_tasks(tasks, rows, executor, lambda line: say(f"{data.scene} sleeve: {line}"))
+    done = run_tasks(tasks, rows, Here(), lambda line: say(f"{data.scene} sleeve: {line}"))
     return {task.name: [one.predicted] for task, one in zip(tasks, done, strict=True)}
 
 

@@ -1,0 +1,29 @@
+"""Stage table2: cards of four arms -> the paper's table 2 and its figure, minutes before the report has everything."""
+
+from pathlib import Path
+
+from pipeline.core import io
+from pipeline.core.config import Files, read_settings
+from pipeline.core.stage import run, say
+from pipeline.evaluation.scores import tidy
+from pipeline.learning.recipe import HEADLINE
+from pipeline.questions import TABLE_2, stages
+from pipeline.reporting.headline import headline_figures, short_table
+from pipeline.reporting.learned import learned
+from pipeline.reporting.numbers import rounded
+from pipeline.reporting.shown import to_markdown
+
+
+def table2(scene: str, files: Files, models: Path, shown: Path) -> None:
+    """Score the held-out boards, print the table and draw its figure; the report shows the same numbers again."""
+    source = read_settings("table2", scene, files).words("source")
+    arms = stages(TABLE_2, "models")
+    cards = [io.read_json(file) for arm in arms for file in sorted((models / arm).glob("*.json"))]
+    numbers = rounded({"provenance": {"scene": scene, "source": source}, **learned(tidy(cards, {}), headline=HEADLINE)})
+    table = to_markdown(short_table(numbers))
+    io.write_texts(shown, {"table2.md": table, **headline_figures(numbers, source)})
+    say(f"{scene} ({source})\n{table}\n{scene}: {', '.join(str(file) for file in sorted(shown.iterdir()))}")
+
+
+if __name__ == "__main__":
+    run(table2)

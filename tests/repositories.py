@@ -1,0 +1,32 @@
+"""Git repositories made here, as the homes of recordings."""
+
+import subprocess
+from collections.abc import Mapping
+from pathlib import Path
+
+WHO = ("-c", "user.name=rig", "-c", "user.email=rig@example.org", "-c", "commit.gpgsign=false")
+
+
+def git(folder: Path, *words: str) -> str:
+    done = subprocess.run(["git", *WHO, "-C", str(folder), *words], capture_output=True, text=True, check=True)
+    return done.stdout.strip()
+
+
+def commit(folder: Path, files: Mapping[str, bytes]) -> str:
+    """Write files into a repository, which is made if there is none, commit them, and give the commit's hash."""
+    if not (folder / ".git").exists():
+        folder.mkdir(parents=True)
+        git(folder, "init", "--quiet")
+    for name, content in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(content)
+    git(folder, "-c", "core.autocrlf=false", "add", "--all")
+    git(folder, "commit", "--quiet", "--message", "recordings")
+    return git(folder, "rev-parse", "HEAD")
+
+
+def bare(folder: Path, mirror: Path, *, filters: bool) -> str:
+    """Clone a repository as a server holds it, which may send commits without files; give its URL."""
+    subprocess.run(["git", "clone", "--quiet", "--bare", str(folder), str(mirror)], check=True)
+    git(mirror, "config", "uploadpack.allowFilter", str(filters).lower())
+    return mirror.as_uri()

@@ -1,0 +1,320 @@
+"""Public recordings come whole, checked and once; what cannot be had, or is other than it should be, leaves nothing."""
+
+import errno
+import os
+import shutil
+from hashlib import sha256
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from ruamel.yaml import YAML
+from typer.testing import CliRunner
+
+from pipeline import adding, fetching, plan, preparing
+from pipeline.capture.readers import eflesh, ini, lab
+from pipeline.cli import app
+from pipeline.core import config
+from pipeline.core.errors import ReskinError
+from pipeline.origins import Origin
+from pipeline.params import read_plan
+from pipeline.preparing import Labels
+from pipeline.registry import read_registry
+from tests import repositories
+from tests.capture.readers.test_lab import PRESSES, write
+from tests.scenes import recorded
+from tests.stages.checkout import copy_checkout, run
+from tests.test_adding import contents
+from tests.test_pickled import archive_of_csv
+
+ROOT = Path(__file__).resolve().parents[1]
+SOURCES = fetching.read_sources(ROOT)
+
+
+def boards(folder: Path) -> dict[str, bytes]:
+    """Two recordings, of one board each, with line ends that git would change."""
+    folder.mkdir()
+    text = (write(folder, *PRESSES) / lab.READINGS).read_text().replace("\n", "\r\n")
+    return {"board1.csv": text.encode(), "board2.csv": text.replace("160.0000", "160.4000").encode()}
+
+
+def source_of(files: dict[str, bytes], home: str, commit: str | None, **changes: object) -> dict[str, object]:
+    pinned = [
+        {"path": name, "at": f"data/{name}", "bytes_n": len(content), "sha256": sha256(content).hexdigest()}
+        for name, content in files.items()
+    ]
+    recordings = [
+        {"path": name, "layout": "lab", "board": Path(name).stem, "skin": f"skin-{Path(name).stem}", "options": {}}
+        for name in files
+    ]
+    words = {"home": home, "commit": commit, "licence": "MIT", "scene": "small", "note": None}
+    return words | {"files": pinned, "recordings": recordings} | changes
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory) -> SimpleNamespace:
+    """A checkout that runs no scene yet, and a home of two recordings with a later commit in which one was changed."""
+    root, away = copy_checkout(tmp_path_factory.mktemp("checkout")), tmp_path_factory.mktemp("away")
+    plan.use(root, [])
+    with (root / config.SCENES / "small.yaml").open("w") as stream:
+        YAML().dump(recorded(), stream)
+    files = boards(away / "rig")
+    home = {f"data/{name}": content for name, content in files.items()}
+    commit = repositories.commit(away / "home", {**home, "README.md": b"A rig.\n"})
+    repositories.commit(away / "home", {"data/board1.csv": b"mended\n"})
+    url = repositories.bare(away / "home", away / "mirror.git", filters=True)
+    return SimpleNamespace(root=root, away=away, files=files, commit=commit, url=url)
+
+
+@pytest.fixture
+def root(world, tmp_path) -> Path:
+    """A checkout whose one source is that home."""
+    root = shutil.copytree(world.root, tmp_path / "checkout", symlinks=True)
+    pin(root, source_of(world.files, world.url, world.commit))
+    return root
+
+
+def pin(root: Path, source: dict[str, object]) -> None:
+    with (root / fetching.SOURCES).open("w") as stream:
+        YAML().dump({"rig": source}, stream)
+
+
+def fetch(root: Path, where: str | Path | None = None, *, agreed: bool = False) -> str:
+    said: list[str] = []
+    fetching.fetch(root, "rig", None if where is None else str(where), agree=lambda _: agreed, say=said.append)
+    return "\n".join(said)
+
+
+def refuse(root: Path, sentence: str, where: str | Path | None = None) -> None:
+    before = contents(root)
+    with pytest.raises(ReskinError, match=sentence) as caught:
+        fetch(root, where)
+    assert "\n" not in str(caught.value)
+    assert contents(root) == before
+
+
+def fetched(root: Path) -> dict[str, bytes]:
+    folder = root / fetching.FETCHED / "rig"
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture
+def not_added(monkeypatch) -> None:
+    """Fetch alone: adding takes seconds, and is not what these tests are about."""
+    monkeypatch.setattr(fetching, "_add_all", lambda *_: None)
+    monkeypatch.setattr(fetching, "_say_what_runs", lambda *_: None)
+
+
+def test_recordings_come_from_their_home_once_and_are_added_once(root, world):
+    said = fetch(root)
+    assert fetched(root) == world.files
+    assert sorted(read_registry(root).captures["small"]) == ["board1_skin-board1_board1", "board2_skin-board2_board2"]
+    for board in ("board1", "board2"):
+        raw = root / adding.RAW / "small" / f"{board}_skin-{board}_{board}"
+        assert (raw / lab.READINGS).read_bytes() == world.files[f"{board}.csv"]
+    assert list(plan.check(root).scenes) == ["small"]
+    assert "switched scene small on in pipeline/plan.yaml, beside no other" in said
+    assert "now: dvc repro" in said
+    before = contents(root)
+    said = fetch(root)
+    assert "there already and unchanged" in said
+    assert "small/board1_skin-board1_board1: added already" in said
+    assert contents(root) == before
+    plan.use(root, [])
+    assert "scene small is switched off; now: reskin scenes use small; dvc repro" in fetch(root)
+
+
+def test_adding_that_was_stopped_goes_on_where_it_was(root, monkeypatch):
+    add, calls = adding.add, []
+
+    def stopped(*words, **options):
+        calls.append(words)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return add(*words, **options)
+
+    monkeypatch.setattr(adding, "add", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        fetch(root)
+    assert list(read_registry(root).captures["small"]) == ["board1_skin-board1_board1"]
+    fetch(root)
+    assert len(read_registry(root).captures["small"]) == 2
+    assert len(calls) == 3
+
+
+def test_a_recording_that_was_added_by_hand_under_another_name_is_not_added_again(root, world, tmp_path):
+    (tmp_path / "mine.csv").write_bytes(world.files["board1.csv"])
+    prepared = preparing.foreign(tmp_path / "mine.csv", "lab", Labels("b", "s", "mine"), {})
+    adding.add(root, "small", prepared, allow_copy=False)
+    assert "small/mine: added already" in fetch(root)
+    assert sorted(read_registry(root).captures["small"]) == ["board2_skin-board2_board2", "mine"]
+
+
+@pytest.mark.usefixtures("not_added")
+def test_a_mirror_or_a_folder_takes_the_place_of_the_home(root, world, tmp_path):
+    pin(root, source_of(world.files, (tmp_path / "away").as_uri(), world.commit))
+    refuse(root, "the repository must be there and readable")
+    (tmp_path / "files/deep").mkdir(parents=True)
+    for name, content in world.files.items():
+        (tmp_path / "files/deep" / name).write_bytes(content)
+    for where in (world.url, world.away / "mirror.git", world.away / "home", tmp_path / "files"):
+        assert f"taken from: {where}" in fetch(root, where)
+        assert fetched(root) == world.files
+        shutil.rmtree(root / fetching.FETCHED)
+
+
+def test_a_commit_that_the_home_has_not_is_refused_and_no_other_is_taken(root, world):
+    pin(root, source_of(world.files, world.url, "1" * 40))
+    refuse(root, f"the commit must be {'1' * 40}, .*; got a repository without it")
+
+
+def test_a_file_with_another_checksum_is_named_with_both(root, world):
+    pin(root, source_of(world.files, world.url, None))  # the newest, in which one file is another
+    other, right = sha256(b"mended\n").hexdigest(), sha256(world.files["board1.csv"]).hexdigest()
+    refuse(root, f"data/board1.csv: sha256 must be {right} .*; got {other} .7 bytes.*--from takes a git mirror")
+
+
+def test_a_file_that_was_cut_or_is_missing_in_a_folder_is_named(root, world, tmp_path):
+    (tmp_path / "board1.csv").write_bytes(world.files["board1.csv"])
+    (tmp_path / "board2.csv").write_bytes(world.files["board2.csv"][:-1])
+    refuse(root, "board2.csv: sha256 must be", tmp_path)
+    (tmp_path / "board2.csv").unlink()
+    refuse(root, "a file must be data/board2.csv or board2.csv; got none of that name", tmp_path)
+
+
+@pytest.mark.usefixtures("not_added")
+def test_a_fetched_file_that_was_changed_since_is_fetched_again(root, world):
+    fetch(root)
+    (root / fetching.FETCHED / "rig/board2.csv").write_bytes(b"changed")
+    assert "every checksum as it must be" in fetch(root)
+    assert fetched(root) == world.files
+
+
+@pytest.mark.usefixtures("not_added")
+def test_what_has_no_licence_is_fetched_only_when_somebody_agrees(root, world):
+    pin(root, source_of(world.files, world.url, world.commit, licence=None))
+    refuse(root, "use without a licence must be agreed to; got no yes. Nothing was fetched.*--yes")
+    said = fetch(root, agreed=True)
+    assert "rig: 2 files, 0.0 MB; licence: none (use it here, do not pass it on)" in said
+    assert f"home: {world.url}, commit {world.commit}" in said
+    assert fetched(root) == world.files
+
+
+def test_without_a_terminal_a_licence_is_agreed_to_in_words(root, world, monkeypatch):
+    pin(root, source_of(world.files, world.url, world.commit, licence=None, scene=None, note="Not added."))
+    monkeypatch.chdir(root)
+    done = CliRunner().invoke(app, ["fetch", "rig"])
+    assert "add --yes" in str(done.exception)
+    assert not (root / fetching.FETCHED / "rig").exists()
+    done = CliRunner().invoke(app, ["fetch", "rig", "--yes"])
+    assert done.exit_code == 0
+    assert done.stdout.endswith("Not added.\n")
+
+
+def test_samples_in_archives_are_checked_and_added_as_the_table_that_they_become(root, tmp_path):
+    rows = [
+        f"{i},{phase},{4 * i},2,{','.join(f'{value * (1 + i):.4f}' for value in range(20))},0.000000,0.000000,{force}"
+        for i in range(2)
+        for phase, force in (("noload", "0.000000"), ("contact", "-2.000000"))
+    ]
+    names = "indent,phase,x_mm,y_mm," + ",".join(f"T{c},Bx{c},By{c},Bz{c}" for c in range(5)) + ",Fx,Fy,Fz"
+    table = "\r\n".join([names, *rows, ""]).encode()
+    archive = archive_of_csv(table.decode())
+    commit = repositories.commit(tmp_path / "home", {"raw/port_1.npz": archive})
+    source = source_of({"board1.csv": table}, str(tmp_path / "home"), commit)
+    source["files"][0]["at"] = "raw/port_1.npz"
+    pin(root, source)
+    fetch(root)
+    assert fetched(root) == {"board1.csv": table}
+    assert list(read_registry(root).captures["small"]) == ["board1_skin-board1_board1"]
+
+
+@pytest.mark.usefixtures("not_added")
+def test_a_fetch_that_was_stopped_leaves_nothing_and_can_be_run_again(root, world, monkeypatch):
+    opened, reads = fetching.open_origin, []
+
+    def stopped(*words) -> Origin:
+        origin = opened(*words)
+
+        def read(path: str) -> bytes:
+            reads.append(path)
+            if len(reads) == 2:
+                raise KeyboardInterrupt
+            return origin.read(path)
+
+        return Origin(origin.name, origin.paths, read)
+
+    monkeypatch.setattr(fetching, "open_origin", stopped)
+    before = contents(root)
+    with pytest.raises(KeyboardInterrupt):
+        fetch(root)
+    assert contents(root) == before
+    assert list((root / fetching.FETCHED).iterdir()) == []
+    fetch(root)
+    assert fetched(root) == world.files
+
+
+def test_a_disk_without_room_is_told_before_and_while_it_fills(root, monkeypatch):
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=1000))
+    refuse(root, "its disk must be free by .* MB or more; got 0 MB. Make room")
+    monkeypatch.undo()
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(fetching, "_content", full)
+    refuse(root, "the folder must be writable; got No space left on device")
+
+
+def test_a_source_that_is_not_known_is_named_beside_those_that_are(root):
+    with pytest.raises(ReskinError, match="a source must be one of rig; got lab"):
+        fetching.fetch(root, "lab", None, agree=lambda _: True, say=print)
+
+
+def test_without_a_name_all_sources_are_listed(monkeypatch):
+    monkeypatch.chdir(ROOT)
+    lines = CliRunner().invoke(app, ["fetch"]).stdout.splitlines()
+    assert [line.split(":")[0] for line in lines] == list(SOURCES)
+
+
+@pytest.mark.parametrize("name", SOURCES)
+def test_what_is_added_was_fetched_and_its_scene_is_there(name):
+    source, paths = SOURCES[name], {Path(file.path) for file in SOURCES[name].files}
+    assert len(paths) == len(source.files)
+    for recording in source.recordings:
+        assert paths & {Path(recording.path), *(path for path in paths if Path(recording.path) in path.parents)}
+    if source.scene is None:
+        assert not source.recordings
+        assert source.note is not None
+    else:
+        assert source.recordings
+        assert plan.scene_file(ROOT, source.scene).is_file()
+
+
+@pytest.mark.parametrize("name", SOURCES)
+def test_real_recordings_have_the_checksums_on_record_and_are_read(name, shared_data, tmp_path):
+    fetching.bring(SOURCES[name], str(shared_data / name), tmp_path / name)
+    counts = {"lab": 7150, "ini": 23300, "eflesh": 4805}  # rows, as data/README.md tells
+    readers = {"lab": lab, "ini": ini, "eflesh": eflesh}
+    for recording in SOURCES[name].recordings[:1]:
+        labels = Labels(recording.board, recording.skin, None)
+        prepared = preparing.foreign(tmp_path / name / recording.path, recording.layout, labels, recording.options)
+        header = preparing.headers.write_capture(tmp_path / prepared[0].capture, *prepared)
+        _, account = readers[name].read(tmp_path / header.capture, header)
+        assert account["rows_read_n"] == counts[name]
+
+
+@pytest.mark.timeout(600)
+def test_real_boards_are_in_their_scene_after_one_command(shared_data, tmp_path):
+    (tmp_path / "checkout").mkdir()
+    root = copy_checkout(tmp_path / "checkout")
+    plan.use(root, ["quick"])
+    done = run(root, "reskin", "fetch", "lab", "--yes", "--from", str(shared_data / "lab"))
+    captures = read_registry(root).captures["lab"]
+    assert {(entry.board, entry.skin) for entry in captures.values()} == {("board1", "skin1"), ("board2", "skin2")}
+    assert len(captures) == 6
+    assert list(read_plan(root / config.PLAN).scenes) == ["quick", "lab"]
+    assert "switched scene lab on in pipeline/plan.yaml, beside quick" in done.stdout
+    assert "now: dvc repro (runs quick, lab; only this one: reskin scenes use lab)" in done.stdout
+    again = run(root, "reskin", "fetch", "lab")
+    assert again.stdout.count("added already") == 6

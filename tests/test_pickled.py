@@ -1,0 +1,153 @@
+"""A pickle is read as pickle reads it, for plain values and NumPy's, and nothing in it is run."""
+
+import hashlib
+import os
+import pickle
+from contextlib import suppress
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.capture.readers import lab
+from pipeline.core.errors import CaptureError
+from pipeline.fetching import read_sources
+from pipeline.pickled import COLUMNS, decode, to_lab_csv
+from tests.capture.headers import make_header
+
+PROTOCOLS = (3, 4)
+ROOT = Path(__file__).resolve().parents[1]
+
+scalars = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text() | st.binary()
+values = st.recursive(
+    scalars, lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner) | st.lists(inner, max_size=5).map(tuple)
+)
+
+
+@given(values, st.sampled_from(PROTOCOLS))
+def test_plain_values_come_back(value, protocol):
+    assert decode(pickle.dumps(value, protocol), "a") == value
+
+
+def test_a_value_that_stands_twice_comes_back_twice():
+    row = [1.5, 2.5]
+    assert decode(pickle.dumps({"a": row, "b": [row, row]}, 3), "a") == {"a": row, "b": [row, row]}
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+@pytest.mark.parametrize("kind", ["<f4", ">f8", "<i8", "u1", "bool"])
+def test_numbers_and_arrays_of_numpy_come_back_as_numbers_and_lists(kind, protocol):
+    array = np.arange(6).reshape(2, 3).astype(kind)
+    found = decode(pickle.dumps({"array": array, "columns": array.T, "number": array[1, 2]}, protocol), "a")
+    assert found == {"array": array.tolist(), "columns": array.T.tolist(), "number": array[1, 2].item()}
+
+
+class Shout:
+    """Something whose pickle runs a command when it is loaded."""
+
+    def __init__(self, command: str) -> None:
+        self.command = command
+
+    def __reduce__(self):
+        return os.system, (self.command,)
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_nothing_that_a_pickle_asks_for_is_run(tmp_path, protocol):
+    command = f"touch {tmp_path / 'ran'}"
+    with pytest.raises(CaptureError, match="a call of posix system"):
+        decode(pickle.dumps([Shout(command)], protocol), "a")
+    assert not (tmp_path / "ran").exists()
+    pickle.loads(pickle.dumps([Shout(command)], protocol))
+    assert (tmp_path / "ran").exists()  # so it would have
+
+
+@given(st.binary(max_size=200) | st.binary(max_size=50).map(lambda tail: pickle.dumps([1, {"a": 2.5}], 4)[:-1] + tail))
+def test_any_bytes_give_a_value_or_one_error(content):
+    with suppress(CaptureError):
+        decode(content, "a")
+
+
+def sample(indent: int, place, fields, forces) -> dict:
+    return {"ReSkin Data": fields, "Force Data": forces, "Location": place, "Indent": indent}
+
+
+def archive_of(**samples) -> bytes:
+    stream = BytesIO()
+    np.savez(stream, **samples)  # a list of dicts: an array of objects, which NumPy pickles
+    return stream.getvalue()
+
+
+def archive_of_csv(text: str) -> bytes:
+    """Put the rows of a lab CSV into an archive, as the rig that recorded them did."""
+    parts: dict[str, list] = {"noload": [], "contact": []}
+    for line in text.splitlines()[1:]:
+        indent, phase, *cells = line.split(",")
+        numbers = [float(cell) for cell in cells]
+        parts[phase].append(sample(int(indent), [int(cells[0]), int(cells[1])], numbers[2:-3], numbers[-3:]))
+    return archive_of(bl_arr=parts["noload"], cont_arr=parts["contact"])
+
+
+FIELDS = [float(i) for i in range(20)]
+
+
+def test_samples_become_rows_by_indentation_no_load_first():
+    text = to_lab_csv(
+        archive_of(
+            bl_arr=[sample(0, [4, 0], FIELDS, [0, 0, 0]), sample(1, [6, 0], FIELDS, [0, 0, 0])],
+            cont_arr=[
+                sample(0, [4, 0], FIELDS, [0.1, 0, -2]),
+                sample(1, [6, 0], np.array(FIELDS, "f4"), [0, 0.25, -3]),
+            ],
+        ),
+        "a",
+    ).decode()
+    head, *rows = text.split("\r\n")[:-1]
+    assert head == f"indent,phase,x_mm,y_mm,{','.join(COLUMNS)},Fx,Fy,Fz"
+    assert [row.split(",")[:4] for row in rows] == [
+        ["0", "noload", "4", "0"], ["0", "contact", "4", "0"], ["1", "noload", "6", "0"], ["1", "contact", "6", "0"],
+    ]  # fmt: skip
+    assert rows[-1].split(",")[4:8] == ["0.0000", "1.0000", "2.0000", "3.0000"]
+    assert rows[-1].split(",")[-3:] == ["0.000000", "0.250000", "-3.000000"]
+
+
+def test_an_archive_becomes_a_recording_that_layout_lab_reads(tmp_path):
+    presses = [sample(i, [4 * i, 2], FIELDS, [0, 0, 0]) for i in range(3)]
+    contacts = [sample(i, [4 * i, 2], [2 * value for value in FIELDS], [0, 0, -1 - i]) for i in range(3)]
+    (tmp_path / lab.READINGS).write_bytes(to_lab_csv(archive_of(bl_arr=presses, cont_arr=contacts), "a"))
+    readings, account = lab.read(tmp_path, make_header(layout="lab", chips_n=5))
+    assert (account["rows_n"], account["noload_rows_n"]) == (3, 3)
+    assert readings.x_mm.tolist() == [0, 4, 8]
+    assert readings.Fz_N.tolist() == [1, 2, 3]
+
+
+@pytest.mark.parametrize(
+    ("archive", "sentence"),
+    [
+        (b"", "the archive must be a .npz with samples under bl_arr and cont_arr; got BadZipFile"),
+        (archive_of(bl_arr=[sample(0, [0, 0], FIELDS, [0, 0, 0])]), "cont_arr.npy"),
+        (archive_of(bl_arr=[1.5], cont_arr=[1.5]), "an array must be one of objects; got float64"),
+        (archive_of(bl_arr=[{"a": 1}], cont_arr=[{"a": 1}]), "KeyError 'Indent'"),
+        (archive_of(bl_arr=[sample(0, [0, 0], [1.0], [0, 0, 0])], cont_arr=[{}]), "a sample of 2 places, 1 fields"),
+        (
+            archive_of(bl_arr=[sample(0, [0, 0], ["x"] * 20, [0, 0, 0])], cont_arr=[{}]),
+            "ValueError Unknown format code",
+        ),
+    ],
+)
+def test_another_archive_is_refused_with_its_reason(archive, sentence):
+    with pytest.raises(CaptureError, match=sentence) as caught:
+        to_lab_csv(archive, "port_1.npz")
+    assert str(caught.value).startswith("port_1.npz")
+    assert "\n" not in str(caught.value)
+
+
+def test_real_samples_give_the_file_that_is_on_record(shared_data):
+    """Not the archive of the rig itself, which is not here: one of the same values, made as the rig makes it."""
+    file = shared_data / "lab/board1_depth1.csv"
+    known = {entry.path: entry.sha256 for entry in read_sources(ROOT)["lab"].files}
+    again = to_lab_csv(archive_of_csv(file.read_text()), "a")
+    assert hashlib.sha256(again).hexdigest() == known[file.name]
