@@ -73,6 +73,7 @@ ROWS = (
     _experiment("sleeve", "sleeve", section=True),
     _experiment("sensitivity", "glass"),
     _experiment("logs", "log", "lobo"),
+    _experiment("compare", None, section=True, recorded=True),
     _experiment("contacts", None, "lobo", section=True, recorded=True),
     _experiment("ambient", None, "lobo", section=True),
     _experiment("dynamics", "press", "lobo"),

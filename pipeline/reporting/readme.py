@@ -12,6 +12,7 @@ from pipeline.reporting.shown import to_markdown
 from pipeline.reporting.skins import skins_table
 from pipeline.reporting.tables import make_tables
 
+COMPARED = ("compare", "compare_parameters", "compare_frames")
 Numbers = Mapping[str, Any]  # of one scene
 
 
@@ -39,6 +40,7 @@ def blocks_of(
     The last of `results` is the scene that runs: its scores come first, and its skins are compared.
     """
     labels = [_results(numbers, ("labels",)) for numbers in recorded if "labels" in numbers]
+    compared = [_results(numbers, COMPARED) for numbers in recorded if "compare" in numbers]
     skins = {
         f"{numbers['provenance']['scene']} ({numbers['provenance']['source']})": next(
             iter(numbers["described"].values())
@@ -51,6 +53,7 @@ def blocks_of(
         "time": _time(timed),
         "costs": _costs([numbers for numbers in (*results, *recorded) if "trainings" in numbers]),
         "labels": "\n\n".join(labels) or "No recorded scene asked yet.",
+        "compare": "\n\n".join(compared) or "No recorded scene asked yet.",
         "skins": to_markdown(skins_table(skins)),
         "stages": _stages(stages),
     }

@@ -1,0 +1,1 @@
+"""Recorded changes of field beside simulated ones, poke by poke."""

@@ -1,0 +1,134 @@
+"""A skin as ten numbers and a rotation: places and forces -> the changes of field that it would show. In uT and mm.
+
+The nominal skin beside it has nothing fitted. Refuses to know recordings and how the numbers are found (`fit`).
+"""
+
+from dataclasses import asdict, dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float
+from scipy.constants import kilo, mega, micro, milli
+from scipy.spatial.transform import Rotation
+
+from pipeline.physics import dipole, flow_map, layer, magnet, slide
+from pipeline.physics.change import change_of_field
+from pipeline.physics.nodes import Quadrature, place_nodes
+from pipeline.physics.skin import SkinDesign
+
+RULE = Quadrature(cell_m=0.8e-3, layers_n=5)  # as scene quick: the cheapest under 2 % of dB (question runtime)
+
+
+@dataclass(frozen=True)
+class Law:
+    """What is fitted of one skin on its board; the first seven may differ from board to board, the rest is the law."""
+
+    seat_x_mm: float  # the skin's middle, seen from the board's
+    seat_y_mm: float
+    rotation_deg: float  # of the skin about z
+    gap_mm: float  # from the chips to the skin; trades against the amplitude, so no measured size
+    amplitude: float  # of the magnetisation, times the nominal one
+    label_x_mm: float  # from where a label says to where the tip is, along the board's axes
+    label_y_mm: float
+    stiffness_N_mm2: float
+    away_um_mm: float
+    give_x_um: float
+    give_y_um: float
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What all laws of a scene share: the skin as designed, the chips under it, the tip of the fitted skin."""
+
+    design: SkinDesign
+    chips_mm: Float[np.ndarray, "k 2"]
+    gap_mm: float
+    skin_mm: tuple[float, float]
+    skin_flipped: bool  # every field has the other sign: a checkerboard skin that lies turned by a quarter
+    tip_radius_mm: float
+
+    @property
+    def sides_m(self) -> tuple[float, float]:
+        return self.skin_mm[0] * milli, self.skin_mm[1] * milli
+
+    @property
+    def thickness_m(self) -> float:
+        return self.design.thickness_mm * milli
+
+    @cached_property
+    def rest(self) -> flow_map.Rest:
+        """Magnetise the skin, its middle at the origin."""
+        nodes = place_nodes(self.thickness_m, RULE, sides_m=self.sides_m)
+        cubes_n = (magnet.cubes_along(self.sides_m[0]), magnet.cubes_along(self.sides_m[1]))
+        b_T = magnet.array_field(nodes.nodes_m, self.thickness_m, self.design.polarity, cubes_n=cubes_n)
+        j_T = magnet.magnetise(b_T, saturation_T=self.design.saturation_T, half_field_T=self.design.half_field_T)
+        sign = -1 if self.skin_flipped else 1
+        return flow_map.at_rest(nodes.nodes_m, sign * magnet.moments(j_T, nodes.volumes_m3), self.thickness_m)
+
+    def table(self, tip_radius_mm: float) -> flow_map.FlowMap:
+        """Tabulate the sliding flow under a tip, as deep as forces are followed."""
+        deepest_m = slide.DEEPEST * self.thickness_m
+        heights = self.rest.heights
+        return flow_map.tabulate(self.thickness_m, tip_radius_mm * milli, deepest_m, heights=heights, base="slipping")
+
+    def chips_under(self, law: Law) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "3 3"]]:
+        """Give the chips' places in the skin's frame, in m, and the rotation from the skin to the board."""
+        turn = Rotation.from_euler("z", law.rotation_deg, degrees=True).as_matrix()
+        seat_mm = (law.seat_x_mm, law.seat_y_mm)
+        chips_mm = np.column_stack([self.chips_mm - seat_mm, np.full(len(self.chips_mm), -law.gap_mm)])
+        return chips_mm @ turn * milli, turn
+
+
+def at_rest_uT(law: Law, setup: Setup) -> Float[np.ndarray, "k 3"]:
+    """Give the field of the untouched skin at the chips, in the board's axes."""
+    chips_m, turn = setup.chips_under(law)
+    field_T = dipole.field(setup.rest.nodes_m, setup.rest.moments_A_m2, chips_m)
+    return law.amplitude * field_T @ turn.T / micro
+
+
+def simulate_uT(
+    law: Law, setup: Setup, place_mm: Float[np.ndarray, "n 2"], force_N: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, "n k 3"]:
+    """Give the change of field at the chips, in the board's axes, of pokes at labelled places of the board."""
+    chips_m, turn = setup.chips_under(law)
+    offset_mm = (law.label_x_mm - law.seat_x_mm, law.label_y_mm - law.seat_y_mm)
+    places_m = (place_mm + offset_mm) @ turn[:2, :2] * milli
+    stiffness_N_m2 = law.stiffness_N_mm2 * mega
+    depths_m = slide.depth_at(force_N, stiffness_N_m2=stiffness_N_m2, thickness_m=setup.thickness_m)
+    hold = slide.Hold((law.give_x_um * micro, law.give_y_um * micro), law.away_um_mm * micro / milli)
+    slides = slide.rigid(places_m, slide.under_tip_m(places_m, force_N, hold), setup.sides_m)
+    change_T = _changes_T(setup, setup.table(setup.tip_radius_mm), chips_m, places_m, depths_m, slides)
+    return law.amplitude * change_T @ turn.T / micro
+
+
+def nominal_uT(
+    setup: Setup, place_mm: Float[np.ndarray, "n 2"], force_N: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, "n k 3"]:
+    """Give the same of the skin as designed: nothing fitted, no slide, force by the elastic layer."""
+    design, deepest_m = setup.design, slide.DEEPEST * setup.thickness_m
+    curve_m = np.linspace(0, deepest_m, slide.CURVE_N)
+    known_N = layer.force(
+        curve_m, thickness_m=setup.thickness_m, tip_radius_m=design.tip_radius_mm * milli,
+        modulus_Pa=design.modulus_kPa * kilo, base="slipping",
+    )  # fmt: skip
+    depths_m = np.interp(force_N, known_N, curve_m)
+    chips_m = np.column_stack([setup.chips_mm, np.full(len(setup.chips_mm), -setup.gap_mm)]) * milli
+    still = slide.Slide(np.zeros(place_mm.shape), np.zeros(len(place_mm)))
+    table = setup.table(design.tip_radius_mm)
+    return _changes_T(setup, table, chips_m, place_mm * milli, depths_m, still) / micro
+
+
+def _changes_T(
+    setup: Setup, table: flow_map.FlowMap, chips_m: np.ndarray, places_m: np.ndarray, depths_m: np.ndarray,
+    slides: slide.Slide,
+) -> Float[np.ndarray, "n k 3"]:  # fmt: skip
+    changes_T = np.empty((len(places_m), *chips_m.shape))
+    for poke_i, (place_m, depth_m) in enumerate(zip(places_m, depths_m, strict=True)):
+        moved = flow_map.move(table, setup.rest, np.append(place_m, depth_m))
+        changes_T[poke_i] = change_of_field(moved.before, slide.apply(slides, poke_i, moved.after), chips_m)
+    return changes_T
+
+
+def with_numbers(law: Law, names: tuple[str, ...], values: Float[np.ndarray, " p"]) -> Law:
+    """Replace some numbers of a law."""
+    return Law(**(asdict(law) | dict(zip(names, map(float, values), strict=True))))

@@ -1,0 +1,219 @@
+"""Recordings made with known numbers: the fit finds them, and a wrong frame is named; and real ones."""
+
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.capture.readers import lab
+from pipeline.core.config import parse, read_yaml
+from pipeline.core.errors import ParamsError, SchemaError
+from pipeline.core.seeds import rng_for
+from pipeline.experiments.compare import fit, frames, law
+from pipeline.experiments.compare.pokes import Pokes, cosines, explained, growth, memory, pool
+from pipeline.experiments.compare.run import Compare, beside, compare_boards, framed, remembered, see, turns_of
+from pipeline.physics.skin import SkinDesign
+from tests.dataset.tables import readings
+from tests.recordings.test_recordings import LAB, ingest
+
+ROOT = Path(__file__).resolve().parents[3]
+SECTION = parse(Compare, read_yaml(ROOT / "pipeline/scenes/lab.yaml")["compare"], "lab.yaml: compare")
+# One tip for the nominal skin too, as each tip's flow takes seconds.
+DESIGN = parse(SkinDesign, read_yaml(ROOT / "params.yaml")["skin"] | {"tip_radius_mm": 2.0}, "params.yaml: skin")
+SETUP = law.Setup(DESIGN, np.array(SECTION.design.places_mm), 1.1, SECTION.skin_mm, True, SECTION.tip_radius_mm)
+TRUE = law.Law(0.4, -0.3, 0.0, 1.6, 1.8, 0.5, -0.6, 0.8, 6.0, 40.0, 10.0)
+# How near a fit comes with 3 uT of noise on 50 pokes; gap and amplitude trade against each other.
+NEAR = law.Law(0.05, 0.05, 0.0, 0.15, 0.3, 0.1, 0.1, 0.1, 0.6, 3.0, 3.0)
+TURN = turns_of(SECTION)
+
+
+def made(how: law.Law = TRUE, noise_uT: float = 3.0) -> Pokes:
+    """Record 25 places under two forces, with a known law and noise, as labels and chips of scene lab read them."""
+    rng = rng_for(0, "compare")
+    grid_mm = np.stack(np.meshgrid(*[np.linspace(-7, 7, 5)] * 2), axis=-1).reshape(-1, 2)
+    place_mm, force_N = np.tile(grid_mm, (2, 1)), np.repeat([1.0, 4.0], 25)
+    db_uT = np.einsum("kij,nki->nkj", TURN, law.simulate_uT(how, SETUP, place_mm, force_N))
+    rest_uT = np.einsum("kij,ki->kj", TURN, law.at_rest_uT(how, SETUP))
+    return Pokes(
+        board="b", groups=("soft", "hard"), group_i=np.repeat([0, 1], 25), capture_i=np.repeat([0, 1], 25),
+        place_mm=place_mm * (1, -1) + SECTION.labels_middle_mm, force_N=force_N,
+        db_uT=db_uT + noise_uT * rng.standard_normal(db_uT.shape), noload_uT=np.tile(rest_uT, (50, 1, 1)),
+        noise_uT=np.full(3, noise_uT), left_out_n=0,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def recorded() -> Pokes:
+    return made()
+
+
+def sentence(pokes: Pokes) -> str:
+    return framed(see(pokes, SECTION), SETUP, SECTION)["sentence"]
+
+
+def test_a_fit_finds_the_numbers_that_a_recording_was_made_with(recorded):
+    found, near = asdict(fit.fit(see(recorded, SECTION), SETUP, fit.TEN)), asdict(NEAR)
+    assert {
+        name: (found[name], true) for name, true in asdict(TRUE).items() if abs(found[name] - true) > near[name]
+    } == {}
+
+
+def test_what_may_differ_between_boards_is_found_with_the_law_held(recorded):
+    start = replace(fit.START, stiffness_N_mm2=0.8, away_um_mm=6.0, give_x_um=40.0, give_y_um=10.0)
+    found = fit.fit(see(made(replace(TRUE, rotation_deg=2.0)), SECTION), SETUP, fit.SEVEN, start)
+    assert found.rotation_deg == pytest.approx(2.0, abs=0.3)
+    assert (found.seat_x_mm, found.seat_y_mm) == pytest.approx((0.4, -0.3), abs=0.05)
+    assert [getattr(found, name) for name in fit.TEN[6:]] == [0.8, 6.0, 40.0, 10.0]
+
+
+def test_a_skin_read_as_the_scene_says_departs_from_nothing(recorded):
+    assert sentence(recorded) == "Labels, chips and skin lie as the scene says."
+
+
+def test_exchanged_chips_are_named(recorded):
+    swapped = replace(recorded, db_uT=recorded.db_uT[:, [0, 2, 1, 3, 4]])
+    assert sentence(swapped) == "Against the scene, chips 1 and 2 are exchanged."
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_an_axis_that_reads_with_the_other_sign_is_named(recorded, axis):
+    signs = np.where(np.arange(3) == axis, -1.0, 1.0)
+    assert sentence(replace(recorded, db_uT=recorded.db_uT * signs)) == (
+        f"Against the scene, all chips are mirrored along {'xyz'[axis]}."
+    )
+
+
+def test_one_chip_that_is_soldered_a_quarter_aside_is_named(recorded):
+    db_uT = recorded.db_uT.copy()
+    db_uT[:, 3] = db_uT[:, 3] @ frames.quarter_turn(1)
+    assert sentence(replace(recorded, db_uT=db_uT)) == (
+        "Against the scene, chip 3 is turned by 90 degrees more than the scene says."
+    )
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_labels_that_run_the_other_way_are_named(recorded, axis):
+    place_mm = recorded.place_mm.copy()
+    place_mm[:, axis] = 16.0 - place_mm[:, axis]
+    assert sentence(replace(recorded, place_mm=place_mm)) == (
+        f"Against the scene, the labels are mirrored along {'xy'[axis]}."
+    )
+
+
+def test_a_flipped_skin_is_named(recorded):
+    flipped = replace(recorded, db_uT=-recorded.db_uT)
+    assert sentence(flipped) == "Against the scene, the skin is flipped: every field has the other sign."
+
+
+def test_each_of_the_sixteen_ways_to_read_a_chip_is_tried_once():
+    matrices = {tuple(turn.matrix.ravel().round().astype(int)) for turn in frames.TURNS}
+    assert len(matrices) == len(frames.TURNS) == 16
+    assert frames.TURNS[0].say() == ""
+    assert all(turn.matrix[2, 2] == (1 if i < 8 else -1) for i, turn in enumerate(frames.TURNS))
+
+
+def test_a_flipped_skin_is_a_checkerboard_turned_by_a_quarter():
+    plain, flipped = (replace(SETUP, skin_flipped=way).rest for way in (False, True))
+    turn = frames.quarter_turn(1)
+    there = {
+        tuple(np.round(node * 1e6).astype(int)): moment
+        for node, moment in zip(plain.nodes_m, plain.moments_A_m2, strict=True)
+    }
+    for node, moment in zip(flipped.nodes_m[::97], flipped.moments_A_m2[::97], strict=True):
+        before = there[tuple(np.round(turn.T @ node * 1e6).astype(int))]
+        np.testing.assert_allclose(turn @ before, moment, atol=1e-6 * np.abs(plain.moments_A_m2).max())
+
+
+def test_without_give_slide_and_offsets_the_law_is_the_nominal_skin_but_for_its_force():
+    plain = law.Law(0.0, 0.0, 0.0, 1.1, 1.0, 0.0, 0.0, 0.9, 0.0, 0.0, 0.0)
+    setup = replace(SETUP, tip_radius_mm=DESIGN.tip_radius_mm)
+    place_mm = np.array([[3.0, -2.0], [0.0, 6.0]])
+    nominal_uT = law.nominal_uT(setup, place_mm, np.array([2.0, 2.0]))
+    lengths = [np.linalg.norm(nominal_uT - law.simulate_uT(plain, setup, place_mm, np.full(2, force_N))) for force_N in
+               np.geomspace(0.2, 8, 30)]  # some force goes as deep  # fmt: skip
+    assert min(lengths) < 0.05 * np.linalg.norm(nominal_uT)
+
+
+def test_direction_size_and_growth_of_fields_that_are_known():
+    one_uT = np.array([[[3.0, 0.0, 0.0]], [[0.0, 4.0, 0.0]]])
+    assert cosines(one_uT, 2 * one_uT).tolist() == [1.0, 1.0]
+    assert cosines(one_uT, one_uT[:, :, [1, 0, 2]]).tolist() == [0.0, 0.0]
+    assert explained(0.5 * one_uT, one_uT).tolist() == [0.75, 0.75]
+    pokes = made(noise_uT=0.0)
+    power_uT = np.ones((50, 5, 3)) * pokes.force_N[:, None, None] ** 0.3
+    assert growth(pokes, power_uT) == pytest.approx(0.3)
+    assert growth(replace(pokes, force_N=np.ones(50)), power_uT) is None
+
+
+def test_memory_is_the_part_that_was_put_in_whatever_drifts():
+    pokes, rng = made(), rng_for(1, "compare")
+    for part in (0.0, 0.07):
+        rest_uT = np.linspace(0, 60, 50)[:, None, None] ** 2 / 60 + 0.3 * rng.standard_normal((50, 5, 3))
+        rest_uT[1:] += part * pokes.db_uT[:-1]
+        assert memory(pokes, pokes.db_uT, rest_uT) == pytest.approx(part, abs=0.004)
+    assert memory(pokes, pokes.db_uT, np.tile(rest_uT[:1], (50, 1, 1))) is None  # one no-load reading for all
+
+
+def test_pokes_are_means_of_their_readings_and_what_knows_no_force_is_left_out_and_counted():
+    one = readings(f=6, indentation=np.array([0, 0, 0, 1, 1, 2], np.int32), x_mm=np.zeros(6, np.float32),
+                   Fz_N=np.array([1, 2, 3, 4, 4, np.nan], np.float32))  # fmt: skip
+    pokes = pool([one])
+    assert pokes.force_N.tolist() == [2.0, 4.0]
+    assert pokes.db_uT[:, 0, 0].tolist() == [1.0, 3.5]  # rows 0, 1, 2 and 3, 4
+    assert pokes.left_out_n == 1
+    assert pokes.groups == ("c0 1 mm",)
+    with pytest.raises(SchemaError, match="question compare must be asked of pokes with place and force"):
+        pool([readings(Fz_N=np.full(6, np.nan, np.float32))])
+    with pytest.raises(ParamsError, match="chips of compare.design must be 1, as recorded; got 5"):
+        see(pokes, SECTION)
+
+
+@pytest.fixture(scope="module")
+def real(shared_data, tmp_path_factory) -> dict[str, Pokes]:
+    """The pokes of lab boards 1 and 2."""
+    captures: dict[str, list] = {}
+    for name in LAB:
+        file = shared_data / "lab" / f"{name}.csv"
+        board = name.partition("_")[0]
+        one, _ = ingest(lab, file, tmp_path_factory.mktemp(name), board=board, capture=name)
+        captures.setdefault(board, []).append(one)
+    return {board: pool(own) for board, own in captures.items()}
+
+
+def test_laws_fitted_on_a_third_of_the_places_of_real_boards_give_all_of_them(real):
+    # Expected: what a fit on all places gives. A third leaves 22 of 65 in each of three files.
+    some = {board: _some(pokes, np.arange(len(pokes)) % 65 % 3 == 0) for board, pokes in real.items()}
+    numbers, drawn = compare_boards(some, SECTION, DESIGN, seed=2021)
+    expected = {
+        ("board1", "fitted"): {"cosine_mean": 0.901, "explained_median": 0.809, "growth": (0.24, 0.32)},
+        ("board1", "refitted"): {"cosine_mean": 0.890, "explained_median": 0.796, "growth": (0.27, 0.32)},
+        ("board2", "fitted"): {"cosine_mean": 0.900, "explained_median": 0.825, "growth": (0.23, 0.17)},
+        ("board2", "refitted"): {"cosine_mean": 0.896, "explained_median": 0.818, "growth": (0.16, 0.17)},
+    }
+    for (board, way), of in expected.items():
+        words, seen = numbers["by_board"][board]["laws"][way], see(real[board], SECTION)
+        found = law.Law(**{name: words[name] for name in law.Law.__dataclass_fields__})
+        told = beside(seen, law.simulate_uT(found, SETUP, seen.place_mm, seen.pokes.force_N))
+        assert told["cosine_mean"] == pytest.approx(of["cosine_mean"], abs=0.01)
+        assert told["explained_median"] == pytest.approx(of["explained_median"], abs=0.03)
+        assert (told["growth"]["simulated"], told["growth"]["recorded"]) == pytest.approx(of["growth"], abs=0.06)
+    for board, own in numbers["by_board"].items():
+        assert 0.6 < own["nominal"]["cosine_mean"] < 0.82
+        assert own["frames"]["sentence"] == "Labels, chips and skin lie as the scene says."
+        assert own["pokes_n"] == 66
+        assert len(drawn["boards"][board]["arrows_uT"]["recorded"]) == len(drawn["boards"][board]["places_mm"])
+    assert numbers["over_boards"]["refitted"]["cosine_mean"]["n"] == 2
+
+
+def _some(pokes: Pokes, chosen: np.ndarray) -> Pokes:
+    names = ("group_i", "capture_i", "place_mm", "force_N", "db_uT", "noload_uT")
+    return replace(pokes, **{name: getattr(pokes, name)[chosen] for name in names})
+
+
+def test_real_no_load_readings_remember_the_poke_before_and_simulated_ones_what_was_put_in(real):
+    for pokes in real.values():
+        seen = see(pokes, SECTION)
+        found = remembered(seen, seen.db_uT, SECTION, seed=2021)["memory"]
+        assert 0.05 < found["recorded"] < 0.08
+        assert found["simulated"] == pytest.approx(SECTION.memory, abs=0.005)

@@ -1,0 +1,70 @@
+"""What the report says of a comparison: every board and law beside its bounds, frames, the same figure twice."""
+
+import copy
+
+from pipeline.experiments.compare.law import Law
+from pipeline.experiments.compare.show import figures, tables
+from tests.reporting.test_work_precision import said
+
+LAW = dict.fromkeys(Law.__dataclass_fields__, 1.0)
+OWN = {
+    "cosine_mean": 0.91, "cosine_by_group": {"soft": 0.90, "hard": 0.92}, "explained_median": 0.82,
+    "growth": {"recorded": 0.3, "simulated": 0.25},
+}  # fmt: skip
+CHIP = {"chip": 0, "at": 0, "cosine_as_written": 0.7, "cosine_best": 0.8, "read": ""}
+BOARD = OWN | {
+    "nominal": OWN | {"cosine_mean": 0.7}, "refitted": OWN | {"growth": {"recorded": 0.3, "simulated": 0.5}},
+    "memory": {"recorded": 0.07, "simulated": 0.065}, "laws": {"fitted": LAW, "refitted": LAW | {"law_of": "b2"}},
+    "frames": {"sentence": "Against the scene, chips 1 and 2 are exchanged.", "chips": [CHIP]},
+    "noise_uT": {"x": 3.3, "y": 3.3, "z": 5.0}, "pokes_n": 4, "left_out_n": 1,
+}  # fmt: skip
+STAT = {"mean": 0.91, "n": 2, "ci95": [0.905, 0.915]}
+OVER = {"cosine_mean": STAT, "explained_median": STAT, "growth_difference": {"mean": 0.0, "n": 2, "ci95": [-0.2, 0.2]}}
+NUMBERS = {"by_board": {"b1": BOARD}, "over_boards": {"fitted": OVER}, "memory_put_in": 0.065}
+FIELDS = {"recorded": [[[100.0, 20.0, 5.0], [0.0, -40.0, 5.0]]], "simulated": [[[90.0, 10.0, 5.0], [0.0, -20.0, 5.0]]]}
+DRAWN = {
+    "chips_mm": [[0.0, 0.0], [7.0, 0.0]],
+    "boards": {"b1": {
+        "group": "soft", "places_mm": [[1.0, 2.0]], "arrows_uT": FIELDS, "force_N": [1.0, 4.0],
+        "length_uT": {"recorded": [100.0, 150.0], "simulated": [90.0, 160.0]},
+    }},
+}  # fmt: skip
+
+
+def test_each_law_stands_beside_its_bounds_and_one_number_beyond_them_is_a_no():
+    table = tables(NUMBERS, "recorded")["compare"]
+    assert table["within bounds"].tolist() == ["no", "yes", "no", "inconclusive"]
+    assert table["cosine"].tolist()[:3] == ["0.700 (≥ 0.90)", "0.910 (≥ 0.90)", "0.910 (≥ 0.85)"]
+    assert table["simulated with"][2] == "law of b2, seven refitted"
+    assert table["memory, % (5 to 8)"].tolist()[1] == "6.5 / 7.0"
+    assert set(table["source"]) == {"recorded"}
+    for words in ("put in by hand, 6.5 %", "both boards of scene lab in view", "not explained"):
+        assert words in table.attrs["meaning"]
+
+
+def test_a_board_alone_whose_force_hardly_differs_is_told_without_growth_and_another_boards_law():
+    alone = copy.deepcopy(BOARD)
+    for own in (alone, alone["nominal"]):
+        del own["growth"]
+    for own, name in ((alone, "refitted"), (alone["laws"], "refitted"), (alone, "memory")):
+        del own[name]
+    numbers = {"by_board": {"b1": alone}, "over_boards": {}, "memory_put_in": 0.065}
+    table = tables(numbers, "recorded")["compare"]
+    assert table["within bounds"].tolist() == ["no", "yes"]
+    assert set(table["growth (within 0.10)"]) == {"–"}
+    assert "simulated" in said(figures(numbers, DRAWN, "recorded")["compare_growth.svg"])
+
+
+def test_frames_are_told_in_one_sentence_and_parameters_with_their_units():
+    found = tables(NUMBERS, "recorded")
+    assert found["compare_frames"]["in one sentence"].tolist() == ["Against the scene, chips 1 and 2 are exchanged."]
+    assert found["compare_frames"]["cosine by chip, best"].tolist() == ["0.80"]
+    assert {"gap, mm", "slide away, µm/mm", "stiffness, N/mm²"} <= set(found["compare_parameters"].columns)
+
+
+def test_figures_name_sides_units_and_source_and_are_the_same_twice():
+    drawn = figures(NUMBERS, DRAWN, "recorded")
+    for word in ("recorded", "simulated", "µT", "(recorded; ×: poke; number: along z, µT)", "b1"):
+        assert word in said(drawn["compare_arrows.svg"])
+    assert "recorded: power 0.30" in said(drawn["compare_growth.svg"])
+    assert figures(NUMBERS, DRAWN, "recorded") == drawn

@@ -1,0 +1,122 @@
+"""The slide of a finite skin: least drag piece by piece, closed forms on a square, nothing where nothing is taken."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.core.errors import ParamsError
+from pipeline.physics import flow_map, slide
+from pipeline.physics.change import change_of_field
+
+SIDE_M, H_M = 20e-3, 2e-3
+SQUARE = (SIDE_M, SIDE_M)
+place = st.tuples(st.floats(-9e-3, 9e-3), st.floats(-9e-3, 9e-3))
+taken = st.tuples(st.floats(-1e-4, 1e-4), st.floats(-1e-4, 1e-4))
+STILL = slide.Hold((0.0, 0.0), 0.0)
+
+
+def one(place_m, taken_m, sides_m=SQUARE) -> tuple[np.ndarray, float]:
+    found = slide.rigid(np.array([place_m]), np.array([taken_m]), sides_m)
+    return found.move_m[0], float(found.spin_rad[0])
+
+
+def dragged(pieces_n, sides_m):
+    """Piece by piece: the matrix of the drag that a motion (f_x, f_y, theta) does, as a loop."""
+    drag = np.zeros((3, 3))
+    for i in range(pieces_n):
+        for j in range(pieces_n):
+            x, y = ((k + 0.5) / pieces_n * side - side / 2 for k, side in zip((i, j), sides_m, strict=True))
+            velocity = np.array([[1, 0, -y], [0, 1, x]])
+            drag += velocity.T @ velocity / pieces_n**2
+    return drag
+
+
+@pytest.mark.parametrize("sides_m", [SQUARE, (20e-3, 50e-3)])
+def test_the_motion_is_that_of_the_least_drag_over_all_pieces(sides_m):
+    place_m, taken_m = np.array([6e-3, -3e-3]), np.array([4e-5, 7e-5])
+    # Least drag with the place taken so far: Lagrange's equations. 80 pieces along a side miss rho^2 by 1/80^2.
+    held = np.array([[1, 0, -place_m[1]], [0, 1, place_m[0]]])
+    equations = np.block([[dragged(80, sides_m), held.T], [held, np.zeros((2, 2))]])
+    *expected, spin_rad = np.linalg.solve(equations, np.append(np.zeros(3), taken_m))[:3]
+    move_m, found_rad = one(place_m, taken_m, sides_m)
+    np.testing.assert_allclose(move_m, expected, rtol=1e-3)
+    np.testing.assert_allclose(found_rad, spin_rad, rtol=1e-3)
+
+
+def test_on_a_square_a_pull_across_at_the_edge_is_one_of_two_and_a_half_parts_slide():
+    # p = (L/2, 0), D along y: f = D / (1 + (L/2)^2 / (L^2/6)) = D / 2.5, theta = 6 f (L/2) / L^2 = 3 f / L.
+    move_m, spin_rad = one((SIDE_M / 2, 0.0), (0.0, 1e-4))
+    np.testing.assert_allclose(move_m, (0.0, 1e-4 / 2.5), rtol=1e-12)
+    assert spin_rad == pytest.approx(3 * 1e-4 / 2.5 / SIDE_M, rel=1e-12)
+
+
+@given(place, taken)
+def test_the_place_goes_as_far_as_it_is_taken(place_m, taken_m):
+    move_m, spin_rad = one(place_m, taken_m)
+    x, y = place_m
+    np.testing.assert_allclose(move_m + spin_rad * np.array([-y, x]), taken_m, atol=1e-18, rtol=1e-12)
+
+
+@given(place, taken)
+def test_a_square_turned_by_a_quarter_turns_its_motion_and_a_pull_along_the_radius_spins_nothing(place_m, taken_m):
+    (move_m, spin_rad), quarter = one(place_m, taken_m), np.array([[0, -1], [1, 0]])
+    turned_m, turned_rad = one(quarter @ place_m, quarter @ taken_m)
+    np.testing.assert_allclose(turned_m, quarter @ move_m, atol=1e-18, rtol=1e-12)
+    assert turned_rad == pytest.approx(spin_rad, rel=1e-12, abs=1e-18)
+    assert one(place_m, 0.01 * np.array(place_m))[1] == pytest.approx(0, abs=1e-17)
+
+
+def test_material_goes_away_from_the_middle_less_under_more_force_and_with_the_arm():
+    places_m = np.array([[4e-3, 0.0]] * 3)
+    found_m = slide.under_tip_m(places_m, np.array([0.0, 4.0, 8.0]), slide.Hold((5e-5, 1e-5), 7e-3))
+    # 7 um/mm 4 mm from the middle is 28 um, half of it at half of the force that lets go.
+    np.testing.assert_allclose(found_m, [[2.2e-5, 1e-5], [3.6e-5, 1e-5], [5e-5, 1e-5]], atol=1e-18)
+
+
+def test_without_give_and_slide_the_sliding_flow_is_what_it_was_to_the_last_bit():
+    rng = np.random.default_rng(0)
+    heights = (0.2, 0.8)
+    nodes_m = np.column_stack([rng.uniform(-8e-3, 8e-3, (60, 2)), H_M * rng.choice(heights, 60)])
+    rest = flow_map.at_rest(nodes_m, rng.normal(0, 1e-6, (60, 3)), H_M)
+    table = flow_map.tabulate(H_M, 2e-3, 0.8e-3, heights=rest.heights, base="slipping")
+    moved = flow_map.move(table, rest, np.array([3e-3, -2e-3, 0.8e-3]))
+    place_m = np.array([[3e-3, -2e-3]])
+    still = slide.rigid(place_m, slide.under_tip_m(place_m, np.array([2.0]), STILL), SQUARE)
+    after = slide.apply(still, 0, moved.after)
+    for found, expected in zip(after, moved.after, strict=True):
+        assert np.array_equal(found, expected)
+    chips_m = np.array([[0.0, 0.0, -1e-3]])
+    assert np.array_equal(
+        change_of_field(moved.before, after, chips_m), change_of_field(moved.before, moved.after, chips_m)
+    )
+
+
+def test_every_dipole_turns_about_the_middle_and_moves_as_a_loop_says():
+    rng = np.random.default_rng(1)
+    nodes_m, moments = rng.normal(0, 5e-3, (7, 3)), rng.normal(0, 1e-6, (7, 3))
+    motion = slide.Slide(np.array([[0.0, 0.0], [3e-5, -2e-5]]), np.array([0.0, 0.2]))
+    there_m, turned = slide.apply(motion, 1, (nodes_m, moments))
+    turn = np.array([[np.cos(0.2), -np.sin(0.2), 0], [np.sin(0.2), np.cos(0.2), 0], [0, 0, 1]])
+    for i in range(7):
+        np.testing.assert_allclose(there_m[i], turn @ nodes_m[i] + (3e-5, -2e-5, 0), rtol=1e-13, atol=1e-18)
+        np.testing.assert_allclose(turned[i], turn @ moments[i], rtol=1e-13, atol=1e-20)
+
+
+@given(st.floats(1e-5, 0.71 * H_M), st.floats(1e5, 1e7))
+def test_the_depth_of_a_force_is_the_depth_that_gives_it(depth_m, stiffness_N_m2):
+    of = {"stiffness_N_m2": stiffness_N_m2, "thickness_m": H_M}
+    found_m = slide.depth_at(slide.force_at(np.array([depth_m]), **of), **of)
+    assert abs(found_m[0] - depth_m) < 1e-4 * H_M  # linear between 2000 depths, worst at the first
+
+
+def test_force_is_the_square_of_small_depths_and_has_no_end_as_the_layer_is_used_up():
+    of = {"stiffness_N_m2": 1e6, "thickness_m": H_M}
+    np.testing.assert_allclose(slide.force_at(np.array([0.0, 1e-8]), **of), [0, 1e-10], rtol=1e-4)
+    assert slide.force_at(np.array([0.75 * H_M]), **of)[0] == pytest.approx(1e6 * (0.75 * H_M) ** 2 * 8)
+    assert slide.depth_at(np.array([1e6]), **of)[0] == pytest.approx(slide.DEEPEST * H_M)
+    for wrong_m in (-1e-6, H_M, np.nan):
+        with pytest.raises(ParamsError, match="poke: depth must be 0 m or more"):
+            slide.force_at(np.array([wrong_m]), **of)
+    with pytest.raises(ParamsError, match="stiffness must be above"):
+        slide.depth_at(np.array([1.0]), stiffness_N_m2=0.0, thickness_m=H_M)
