@@ -46,7 +46,7 @@ TITLES = {
     "stiffness_N_mm2": "stiffness, N/mm²", "away_um_mm": "slide away, µm/mm", "give_x_um": "give x, µm",
     "give_y_um": "give y, µm",
 }  # fmt: skip
-ARROW_MM = 4.0  # the longest of a board
+ARROW_MM = 6.0  # the longest of a board
 BOARDS_MAX_N = 4  # of which arrows are drawn
 
 
@@ -130,7 +130,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
 
 def _arrows(boards: Mapping[str, Any], chips_mm: np.ndarray, source: str) -> str:
     columns_n = max(len(own["places_mm"]) for own in boards.values())
-    half_mm = np.abs(chips_mm).max() + 1.2 * ARROW_MM
+    half_mm = np.abs(chips_mm).max() + 0.6 * ARROW_MM
     with drawing(2.0 * columns_n, 4.2 * len(boards) + 0.6) as figure:
         panels = figure.subplots(2 * len(boards), columns_n, squeeze=False)
         for row_i, (board, own) in enumerate(boards.items()):
@@ -141,11 +141,11 @@ def _arrows(boards: Mapping[str, Any], chips_mm: np.ndarray, source: str) -> str
                 row[0].set_ylabel(f"{board}\n{side}")
                 for axes, db_uT, place_mm in zip(row, own["arrows_uT"][side], own["places_mm"], strict=False):
                     sides_mm = np.array(db_uT)[:, :2] * ARROW_MM / longest_uT
-                    look = {"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.012}
+                    look = {"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.014}
                     axes.quiver(*chips_mm.T, *sides_mm.T, color=colour, **look)
                     axes.plot(*place_mm, marker="x", color="black")
                     for (x_mm, y_mm), (*_, z_uT) in zip(chips_mm, db_uT, strict=True):
-                        axes.text(x_mm, y_mm - 0.6, f"{z_uT:+.0f}", fontsize=6, ha="center", va="top")
+                        axes.text(x_mm, y_mm - 1.2, f"{z_uT:+.0f}", fontsize=6, ha="center", va="top")
             panels[2 * row_i][0].set_title(f"longest {longest_uT:.0f} µT", fontsize=8, loc="left")
         for axes in panels.ravel():
             axes.set(xlim=(-half_mm, half_mm), ylim=(-half_mm, half_mm), aspect="equal", xticks=[], yticks=[])
