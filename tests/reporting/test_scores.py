@@ -73,7 +73,7 @@ def test_a_scene_that_asks_nothing_of_this_has_no_score():
 @pytest.mark.parametrize("without", EXPERIMENTS)
 def test_a_question_that_was_not_asked_is_absent(without):
     numbers = all_questions()
-    numbers.pop(without)
+    numbers.pop(without, None)  # compare is asked of recordings only
     assert not any(name.startswith(without) for name in headline_scores(numbers))
 
 

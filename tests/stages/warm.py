@@ -53,7 +53,8 @@ def main(asked: list[str]) -> None:
             if asked and name not in asked:
                 continue
             print(f"Running stage '{name}':", flush=True)
-            stage.remove_outs(ignore_remove=True)  # as `dvc repro` does: a stage that writes nothing has nothing
+            for out in stage.outs:  # as `dvc repro` does: a stage that writes nothing has nothing
+                out.remove()
             if status := run_stage(name, stage.cmd):
                 sys.exit(f"stage {name} ended with {status}")
         repo.commit(force=True)
