@@ -74,6 +74,8 @@ class Spreads(Strict):
     """
 
     board_gap_mm: Annotated[float, Field(ge=0, le=1)]
+    board_tilt_deg: Annotated[float, Field(ge=0, le=5)]  # of the skin's base over the chips, each axis
+    board_bow_mm: Annotated[float, Field(ge=0, le=0.5)]  # of the base over the outermost chip, from a flat one
     chip_gain: Share
     chip_cross_axis: Share
     chip_tilt_deg: Annotated[float, Field(ge=0, le=10)]
@@ -84,6 +86,7 @@ class Spreads(Strict):
     skin_thickness: Share
     skin_modulus: Share
     skin_seat_mm: Annotated[float, Field(ge=0, le=2)]  # skin sideways of its place on the board, each axis
+    skin_rotation_deg: Annotated[float, Field(ge=0, le=10)]  # skin about z
     skin_depth_zero_mm: Annotated[float, Field(ge=0, le=0.2)]  # true depth minus commanded depth
 
 
@@ -103,17 +106,28 @@ def draw_board(design: BoardDesign, spreads: Spreads, *, seed: int, name: str) -
     rng = rng_for(seed, "board", name)
     chips_n = len(design.places_mm)
     gap_mm = design.gap_mm + spreads.board_gap_mm * rng.standard_normal()
-    if gap_mm <= 0:
-        raise ParamsError(f"board {name}", "gap", "above 0 mm", f"{gap_mm:.3g}", "Lower board_gap_mm.")
-    chips_mm = np.column_stack([np.array(design.places_mm), np.full(chips_n, -gap_mm)])
     tilt_deg = spreads.chip_tilt_deg * rng.standard_normal((chips_n, 2))
     turn = Rotation.from_euler("ZYX", np.column_stack([design.turns_deg, tilt_deg]), degrees=True)
     gain = np.exp(spreads.chip_gain * rng.standard_normal((chips_n, 3)))
     cross = spreads.chip_cross_axis * rng.standard_normal((chips_n, 3, 3))
+    offset_T = spreads.chip_offset_uT * micro * rng.standard_normal((chips_n, 3))
+    gaps_mm = _gaps_mm(design, gap_mm, spreads, rng)
+    if not (gaps_mm > 0).all():
+        remedy = "Lower board_gap_mm, board_tilt_deg or board_bow_mm."
+        raise ParamsError(f"board {name}", "gap", "above 0 mm at every chip", f"{gaps_mm.min():.3g}", remedy)
     return Board(
         name=name,
-        chips_m=chips_mm * milli,
+        chips_m=np.column_stack([np.array(design.places_mm), -gaps_mm]) * milli,
         turn=turn.as_matrix(),
         sensitivity=np.where(np.eye(3, dtype=bool), gain[:, :, None], cross),
-        offset_T=spreads.chip_offset_uT * micro * rng.standard_normal((chips_n, 3)),
+        offset_T=offset_T,
     )
+
+
+def _gaps_mm(design: BoardDesign, gap_mm: float, spreads: Spreads, rng: np.random.Generator) -> Float[np.ndarray, " k"]:
+    # A base that tilts and bows over its board lies nearer to some chips; the skin itself is taken as flat.
+    places_mm = np.array(design.chips_xy_mm)
+    slope, bow_mm = np.tan(np.deg2rad(spreads.board_tilt_deg)) * rng.standard_normal(2), spreads.board_bow_mm
+    away_mm = np.hypot(*places_mm.T)
+    bowed = bow_mm * rng.standard_normal() * (away_mm / max(away_mm.max(), 1e-12)) ** 2
+    return np.tile(gap_mm + places_mm @ slope + bowed, len(design.places_mm) // len(places_mm))

@@ -13,6 +13,8 @@ CROSS_MM = [[0.0, 0.0], [-7.0, 0.0], [0.0, -7.0], [7.0, 0.0], [0.0, 7.0]]
 DESIGN = {"chips_xy_mm": CROSS_MM, "chips_turn_deg": [0.0, 180.0, 270.0, 90.0, 0.0], "gap_mm": 1.1}
 SPREADS = {
     "board_gap_mm": 0.1,
+    "board_tilt_deg": 0.5,
+    "board_bow_mm": 0.03,
     "chip_gain": 0.025,
     "chip_cross_axis": 0.01,
     "chip_tilt_deg": 2.0,
@@ -23,6 +25,7 @@ SPREADS = {
     "skin_thickness": 0.03,
     "skin_modulus": 0.1,
     "skin_seat_mm": 0.25,
+    "skin_rotation_deg": 0.7,
     "skin_depth_zero_mm": 0.05,
 }
 

@@ -32,7 +32,9 @@ patient = settings(max_examples=20, deadline=None)
 def design(**changes):
     usual = {
         "polarity": "checkerboard",
+        "flipped": False,
         "base": "bonded",
+        "hold": None,
         "saturation_T": 0.11,
         "half_field_T": 0.5,
         "thickness_mm": 2.0,
