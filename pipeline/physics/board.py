@@ -14,7 +14,6 @@ from scipy.constants import micro, milli
 from scipy.spatial.transform import Rotation
 
 from pipeline.core.config import Strict
-from pipeline.core.errors import ParamsError
 from pipeline.core.seeds import rng_for
 
 CHIPS_MAX_N = 64
@@ -73,9 +72,8 @@ class Spreads(Strict):
     Factors are drawn as exp(sd * normal), so that they stay positive; all else is normal around the design.
     """
 
-    board_gap_mm: Annotated[float, Field(ge=0, le=1)]
-    board_tilt_deg: Annotated[float, Field(ge=0, le=5)]  # of the skin's base over the chips, each axis
-    board_bow_mm: Annotated[float, Field(ge=0, le=0.5)]  # of the base over the outermost chip, from a flat one
+    board_gap: Share  # of the gap between skin and chips
+    board_uneven: Share  # of the gap over the outermost chips: a base that tilts along x or y, or bows
     chip_gain: Share
     chip_cross_axis: Share
     chip_tilt_deg: Annotated[float, Field(ge=0, le=10)]
@@ -105,16 +103,13 @@ def draw_board(design: BoardDesign, spreads: Spreads, *, seed: int, name: str) -
     """Draw the board called `name`; boards side by side lie at one gap (assumed: one skin holds them down)."""
     rng = rng_for(seed, "board", name)
     chips_n = len(design.places_mm)
-    gap_mm = design.gap_mm + spreads.board_gap_mm * rng.standard_normal()
+    gap_mm = design.gap_mm * np.exp(spreads.board_gap * rng.standard_normal())
     tilt_deg = spreads.chip_tilt_deg * rng.standard_normal((chips_n, 2))
     turn = Rotation.from_euler("ZYX", np.column_stack([design.turns_deg, tilt_deg]), degrees=True)
     gain = np.exp(spreads.chip_gain * rng.standard_normal((chips_n, 3)))
     cross = spreads.chip_cross_axis * rng.standard_normal((chips_n, 3, 3))
     offset_T = spreads.chip_offset_uT * micro * rng.standard_normal((chips_n, 3))
-    gaps_mm = _gaps_mm(design, gap_mm, spreads, rng)
-    if not (gaps_mm > 0).all():
-        remedy = "Lower board_gap_mm, board_tilt_deg or board_bow_mm."
-        raise ParamsError(f"board {name}", "gap", "above 0 mm at every chip", f"{gaps_mm.min():.3g}", remedy)
+    gaps_mm = gap_mm * np.exp(spreads.board_uneven * _unevenness(design, rng))
     return Board(
         name=name,
         chips_m=np.column_stack([np.array(design.places_mm), -gaps_mm]) * milli,
@@ -124,10 +119,10 @@ def draw_board(design: BoardDesign, spreads: Spreads, *, seed: int, name: str) -
     )
 
 
-def _gaps_mm(design: BoardDesign, gap_mm: float, spreads: Spreads, rng: np.random.Generator) -> Float[np.ndarray, " k"]:
-    # A base that tilts and bows over its board lies nearer to some chips; the skin itself is taken as flat.
+def _unevenness(design: BoardDesign, rng: np.random.Generator) -> Float[np.ndarray, " k"]:
+    # Tilt and bow of the base over its board, of 1 at the outermost chip; the skin itself is taken as flat.
     places_mm = np.array(design.chips_xy_mm)
-    slope, bow_mm = np.tan(np.deg2rad(spreads.board_tilt_deg)) * rng.standard_normal(2), spreads.board_bow_mm
     away_mm = np.hypot(*places_mm.T)
-    bowed = bow_mm * rng.standard_normal() * (away_mm / max(away_mm.max(), 1e-12)) ** 2
-    return np.tile(gap_mm + places_mm @ slope + bowed, len(design.places_mm) // len(places_mm))
+    share = places_mm / max(away_mm.max(), 1e-12)
+    uneven = np.column_stack([share, (share**2).sum(axis=1)]) @ rng.standard_normal(3)
+    return np.tile(uneven, len(design.places_mm) // len(places_mm))
