@@ -134,7 +134,7 @@ def test_gaps_stay_above_nothing_and_tilt_and_bow_are_told_of_one_board_alone():
     boards = [draw_board(design(gap_mm=0.1), wide, seed=seed, name="b0") for seed in range(100)]
     gaps_m = np.stack([-board.chips_m[:, 2] for board in boards])
     assert (gaps_m > 0).all()
-    # log gap = log(middle) + 0.5 (a x + b y + c r^2), r = 1 at the outer chips: opposite ones tell tilt, all of them bow.
+    # log gap = log(middle) + 0.5 (a x + b y + c r^2), r = 1 at the outer chips: two tell tilt, all of them bow.
     log = np.log(gaps_m / gaps_m[:, :1])
     tilt, bow = (log[:, 1] - log[:, 3]) / 2, log[:, 1:].mean(axis=1)
     assert 0.35 < tilt.std() < 0.7
