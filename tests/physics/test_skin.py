@@ -13,7 +13,7 @@ from pipeline.physics.board import Board
 from pipeline.physics.change import change_of_field
 from pipeline.physics.dipole import MU0_4PI
 from pipeline.physics.nodes import CHOSEN, Quadrature
-from pipeline.physics.skin import SkinDesign, beyond_verified_n, changes_of_field, draw_skin, forces
+from pipeline.physics.skin import SkinDesign, beyond_verified_n, changes_of_field, draw_skin, forces, moved_dipoles
 from tests.laws import broken
 from tests.physics.test_board import design as board_design
 from tests.physics.test_board import draw_board, no_spread, spreads
