@@ -63,6 +63,7 @@ ROWS = (
     Question("sensors", "curve", "sweep_sensors", needs=("adapt",), folds=("sensors_skins_n", "sensors_draws_n")),
     Question("baselines", "curve", "train_classical", needs=("lobo",), section=True),
     Question("labels", "curve", "few_labels", needs=("lobo",), folds=("labels_pool_n", "labels_draws_n"), section=True),
+    Question("universal", "curve", needs=("labels", "compare"), section=True),
     Question("audit", "other", needs=("lobo",), section=True),
     Question("choice", "report", "report", needs=("lobo", "triplet", "adapt")),
     _experiment("drift", "wear", section=True, recorded=True),

@@ -46,7 +46,9 @@ def simulated_uT(design, shared_data, tmp_path_factory) -> np.ndarray:
     labels_mm = np.column_stack([readings.x_mm, readings.y_mm])[::100] - MIDDLE_MM
     pokes_m = np.column_stack([labels_mm @ TURNED * milli, np.full(65, DEPTH_M)])
     still = Spreads(**(dict.fromkeys(SPREADS, 0.0) | {"skin_filler_length_mm": 3.0}))
-    words = YAML(typ="safe").load((ROOT / "params.yaml").read_text())["skin"] | {"hold": None}  # which was fitted on these boards
+    words = YAML(typ="safe").load((ROOT / "params.yaml").read_text())["skin"] | {
+        "hold": None
+    }  # which was fitted on these boards
     skin = draw_skin(parse(SkinDesign, words, "test"), still, seed=0, name="nominal")
     _, changes_T = changes_of_field(draw_board(design, still, seed=0, name="nominal"), skin, pokes_m)
     return changes_T / micro

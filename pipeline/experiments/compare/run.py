@@ -4,7 +4,7 @@ Simulated with the nominal skin, with a law fitted on the board, and with the la
 may differ from board to board is fitted anew.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,16 +16,17 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.core.config import Files, Settings, Strict, parse, read_settings
 from pipeline.core.errors import ParamsError
+from pipeline.core.schema import Readings
 from pipeline.core.seeds import rng_for
 from pipeline.core.stage import run
 from pipeline.evaluation.scores import statistic
 from pipeline.experiments.answer import read_folder, write_answer
 from pipeline.experiments.compare import frames
-from pipeline.experiments.compare.fit import SEVEN, TEN, Seen, fit
-from pipeline.experiments.compare.law import Setup, nominal_uT, simulate_uT
-from pipeline.experiments.compare.pokes import Pokes, cosines, explained, growth, lengths_uT, memory, pool
 from pipeline.physics.board import BoardDesign
 from pipeline.physics.skin import SkinDesign
+from pipeline.twin.fit import SEVEN, TEN, Seen, fit
+from pipeline.twin.law import Setup, nominal_uT, simulate_uT
+from pipeline.twin.pokes import Pokes, cosines, explained, growth, lengths_uT, memory, pool
 
 Side_mm = Annotated[float, Field(gt=0, le=500)]
 ARROWS_N = 4  # places that the figure shows
@@ -100,10 +101,25 @@ def framed(seen: Seen, setup: Setup, section: Compare) -> dict[str, Any]:
     return {"sentence": found.sentence, "chips": chips}
 
 
+def setup_of(section: Compare, design: SkinDesign) -> Setup:
+    """Put together what all laws of a scene share."""
+    chips_mm = np.array(section.design.places_mm)
+    return Setup(design, chips_mm, section.design.gap_mm, section.skin_mm, section.skin_flipped, section.tip_radius_mm)
+
+
+def skins_of(captures: Sequence[Readings]) -> dict[str, Pokes]:
+    """Pool the captures of each skin on its board; named by the board, where that has one skin only."""
+    skins: dict[str, list[Readings]] = {}
+    for one in captures:
+        skins.setdefault(f"{one.board}/{one.skin}", []).append(one)
+    boards = [name.partition("/")[0] for name in skins]
+    names = {name: board if boards.count(board) == 1 else name for name, board in zip(skins, boards, strict=True)}
+    return {names[name]: pool(own) for name, own in skins.items()}
+
+
 def compare_boards(boards: Mapping[str, Pokes], section: Compare, design: SkinDesign, seed: int) -> tuple[Any, Any]:
     """Compare every board; give the numbers, and what the figures draw."""
-    chips_mm = np.array(section.design.places_mm)
-    setup = Setup(design, chips_mm, section.design.gap_mm, section.skin_mm, section.skin_flipped, section.tip_radius_mm)
+    setup = setup_of(section, design)
     seen = {board: see(pokes, section) for board, pokes in boards.items()}
     fitted = {board: fit(own, setup, TEN) for board, own in seen.items()}
     names = list(seen)
@@ -127,7 +143,7 @@ def compare_boards(boards: Mapping[str, Pokes], section: Compare, design: SkinDe
         )
         drawn[board] = _drawn(own, simulated_uT["fitted"])
     numbers = {"by_board": by_board, "memory_put_in": section.memory, "over_boards": over_boards(by_board)}
-    return numbers, {"chips_mm": chips_mm.tolist(), "boards": drawn}
+    return numbers, {"chips_mm": setup.chips_mm.tolist(), "boards": drawn}
 
 
 def over_boards(by_board: Mapping[str, Any]) -> dict[str, Any]:
@@ -167,12 +183,7 @@ def compare(scene: str, files: Files, indentations: Path, answer: Path) -> None:
     """Compare the recorded boards of a scene with simulated ones."""
     settings = read_settings("compare", scene, files)
     design = parse(SkinDesign, settings.shared["skin"], "params.yaml: skin")
-    skins: dict[str, list[Any]] = {}
-    for one in read_folder(indentations, tuple(settings.captures_in(indentations))):
-        skins.setdefault(f"{one.board}/{one.skin}", []).append(one)
-    boards_n = [name.partition("/")[0] for name in skins]
-    names = {name: board if boards_n.count(board) == 1 else name for name, board in zip(skins, boards_n, strict=True)}
-    boards = {names[name]: pool(captures) for name, captures in skins.items()}
+    boards = skins_of(read_folder(indentations, tuple(settings.captures_in(indentations))))
     write_answer(answer, *compare_boards(boards, read(settings), design, settings.seed))
 
 

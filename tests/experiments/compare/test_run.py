@@ -10,10 +10,11 @@ from pipeline.capture.readers import lab
 from pipeline.core.config import parse, read_yaml
 from pipeline.core.errors import ParamsError, SchemaError
 from pipeline.core.seeds import rng_for
-from pipeline.experiments.compare import fit, frames, law
-from pipeline.experiments.compare.pokes import Pokes, cosines, explained, growth, memory, pool
+from pipeline.experiments.compare import frames
 from pipeline.experiments.compare.run import Compare, beside, compare_boards, framed, remembered, see, turns_of
 from pipeline.physics.skin import SkinDesign
+from pipeline.twin import fit, law
+from pipeline.twin.pokes import Pokes, cosines, explained, growth, memory, pool
 from tests.dataset.tables import readings
 from tests.recordings.test_recordings import LAB, ingest
 

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import least_squares
 
-from pipeline.experiments.compare.law import Law, Setup, at_rest_uT, simulate_uT, with_numbers
-from pipeline.experiments.compare.pokes import Pokes, lengths_uT
+from pipeline.twin.law import Law, Setup, at_rest_uT, simulate_uT, with_numbers
+from pipeline.twin.pokes import Pokes, lengths_uT
 
 # Where a fit starts, what its priors centre on; then their standard deviations and the size of a step. Assumed.
 START = Law(0.0, 0.0, 0.0, 1.5, 1.5, 0.0, 0.0, 0.9, 5.0, 0.0, 0.0)

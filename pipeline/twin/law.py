@@ -16,7 +16,6 @@ from pipeline.physics.change import change_of_field
 from pipeline.physics.nodes import Quadrature, place_nodes
 from pipeline.physics.skin import SkinDesign
 
-LETS_GO_N = 8.0  # force at which the slide away from the middle is gone: chosen with both boards in view
 RULE = Quadrature(cell_m=0.8e-3, layers_n=5)  # as scene quick: the cheapest under 2 % of dB (question runtime)
 
 
@@ -35,6 +34,11 @@ class Law:
     away_um_mm: float
     give_x_um: float
     give_y_um: float
+    # What no fit of ten numbers moves.
+    lets_go_N: float = 8.0  # where the slide away from the middle is gone: chosen with both boards of scene lab in view
+    tilt_x_deg: float = 0.0  # of the skin over the board
+    tilt_y_deg: float = 0.0
+    label_rotation_deg: float = 0.0  # of the labels' axes about the board's middle
 
 
 @dataclass(frozen=True)
@@ -74,7 +78,8 @@ class Setup:
 
     def chips_under(self, law: Law) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "3 3"]]:
         """Give the chips' places in the skin's frame, in m, and the rotation from the skin to the board."""
-        turn = Rotation.from_euler("z", law.rotation_deg, degrees=True).as_matrix()
+        angles_deg = [law.rotation_deg, law.tilt_y_deg, law.tilt_x_deg]
+        turn = Rotation.from_euler("zyx", angles_deg, degrees=True).as_matrix()
         seat_mm = (law.seat_x_mm, law.seat_y_mm)
         chips_mm = np.column_stack([self.chips_mm - seat_mm, np.full(len(self.chips_mm), -law.gap_mm)])
         return chips_mm @ turn * milli, turn
@@ -93,11 +98,12 @@ def simulate_uT(
     """Give the change of field at the chips, in the board's axes, of pokes at labelled places of the board."""
     chips_m, turn = setup.chips_under(law)
     offset_mm = (law.label_x_mm - law.seat_x_mm, law.label_y_mm - law.seat_y_mm)
-    places_m = (place_mm + offset_mm) @ turn[:2, :2] * milli
+    labels = Rotation.from_euler("z", law.label_rotation_deg, degrees=True).as_matrix()[:2, :2]
+    places_m = (place_mm @ labels.T + offset_mm) @ turn[:2, :2] * milli
     stiffness_N_m2 = law.stiffness_N_mm2 * mega
     depths_m = slide.depth_at(force_N, stiffness_N_m2=stiffness_N_m2, thickness_m=setup.thickness_m)
     give_m, away = (law.give_x_um * micro, law.give_y_um * micro), law.away_um_mm * micro / milli
-    taken_m = slide.under_tip_m(places_m, force_N / LETS_GO_N, give_m=give_m, away=away)
+    taken_m = slide.under_tip_m(places_m, force_N / law.lets_go_N, give_m=give_m, away=away)
     slides = slide.rigid(places_m, taken_m, setup.sides_m)
     change_T = _changes_T(setup, setup.table(setup.tip_radius_mm), chips_m, places_m, depths_m, slides)
     return law.amplitude * change_T @ turn.T / micro
