@@ -1,8 +1,8 @@
 """A skin as a Gaussian map: tables of a law, and pokes -> what every place and force would read, and how sure that is.
 
 It learns in closed form from a no-load field, from pokes whose places are not known, and from labelled ones; then it
-reads places, forces and their uncertainty off a reading by Bayes' rule. Places are in the board's frame, in mm; fields in
-the board's axes, in uT. Refuses to know networks, folds and files.
+reads places, forces and their uncertainty off a reading by Bayes' rule. Places are in the board's frame, in mm; fields
+in its axes, in uT. Refuses to know networks, folds and files.
 """
 
 from dataclasses import dataclass, replace
@@ -225,7 +225,8 @@ def _between(
         step = np.clip((at[:, i] - axis[0]) / (axis[1] - axis[0]), 0, len(axis) - 1)
         low[:, i] = np.minimum(step.astype(int), len(axis) - 2)
         share[:, i] = step - low[:, i]
-    mean_uT, slope_uT = 0.0, 0.0
+    channels_n, numbers_n = tables.rest_slope_uT.shape
+    mean_uT, slope_uT = np.zeros((len(at), channels_n)), np.zeros((len(at), channels_n, numbers_n))
     for corner in np.ndindex(2, 2, 2):
         weight = np.prod(np.where(corner, share, 1 - share), axis=1)
         i, j, k = (low + corner).T
