@@ -42,8 +42,8 @@ def test_rows_are_those_that_stages_read(tmp_path):
 
 def test_pokes_are_read_as_a_simulated_capture_without_noise_is():
     words, shared = read_yaml(api.CHECKOUT / "pipeline/scenes/quick.yaml"), read_yaml(api.CHECKOUT / "params.yaml")
-    words["simulate"]["protocols"]["grid"] |= {"passes_n": 1, "depths_mm": [1.0]}
-    exact = {name: 0.0 for name in ("robot_place_sd_mm", "robot_depth_sd_mm", "force_noise_N")}
+    words["simulate"]["protocols"]["grid"] |= {"passes_n": 1, "depths_mm": [1.0], "terms": []}
+    exact = {name: 0.0 for name in ("robot_place_sd_mm", "robot_depth_sd_mm", "place_offset_sd_mm", "force_noise_N")}
     shared |= {"chip": shared["chip"] | QUIET_CHIP, "rig": shared["rig"] | exact}
     capture = record(
         check_synthesis(Settings("quick", "quick", words, shared, {})), "grid", board="b0", skin="b0_s0", seed=3

@@ -14,7 +14,6 @@ from scipy.constants import micro, milli
 from scipy.spatial.transform import Rotation
 
 from pipeline.core.config import Strict
-from pipeline.core.errors import ParamsError
 from pipeline.core.seeds import rng_for
 
 CHIPS_MAX_N = 64
@@ -73,7 +72,8 @@ class Spreads(Strict):
     Factors are drawn as exp(sd * normal), so that they stay positive; all else is normal around the design.
     """
 
-    board_gap_mm: Annotated[float, Field(ge=0, le=1)]
+    board_gap: Share  # of the gap between skin and chips
+    board_uneven: Share  # of the gap over the outermost chips: a base that tilts along x or y, or bows
     chip_gain: Share
     chip_cross_axis: Share
     chip_tilt_deg: Annotated[float, Field(ge=0, le=10)]
@@ -84,6 +84,7 @@ class Spreads(Strict):
     skin_thickness: Share
     skin_modulus: Share
     skin_seat_mm: Annotated[float, Field(ge=0, le=2)]  # skin sideways of its place on the board, each axis
+    skin_rotation_deg: Annotated[float, Field(ge=0, le=10)]  # skin about z
     skin_depth_zero_mm: Annotated[float, Field(ge=0, le=0.2)]  # true depth minus commanded depth
 
 
@@ -102,18 +103,26 @@ def draw_board(design: BoardDesign, spreads: Spreads, *, seed: int, name: str) -
     """Draw the board called `name`; boards side by side lie at one gap (assumed: one skin holds them down)."""
     rng = rng_for(seed, "board", name)
     chips_n = len(design.places_mm)
-    gap_mm = design.gap_mm + spreads.board_gap_mm * rng.standard_normal()
-    if gap_mm <= 0:
-        raise ParamsError(f"board {name}", "gap", "above 0 mm", f"{gap_mm:.3g}", "Lower board_gap_mm.")
-    chips_mm = np.column_stack([np.array(design.places_mm), np.full(chips_n, -gap_mm)])
+    gap_mm = design.gap_mm * np.exp(spreads.board_gap * rng.standard_normal())
     tilt_deg = spreads.chip_tilt_deg * rng.standard_normal((chips_n, 2))
     turn = Rotation.from_euler("ZYX", np.column_stack([design.turns_deg, tilt_deg]), degrees=True)
     gain = np.exp(spreads.chip_gain * rng.standard_normal((chips_n, 3)))
     cross = spreads.chip_cross_axis * rng.standard_normal((chips_n, 3, 3))
+    offset_T = spreads.chip_offset_uT * micro * rng.standard_normal((chips_n, 3))
+    gaps_mm = gap_mm * np.exp(spreads.board_uneven * _unevenness(design, rng))
     return Board(
         name=name,
-        chips_m=chips_mm * milli,
+        chips_m=np.column_stack([np.array(design.places_mm), -gaps_mm]) * milli,
         turn=turn.as_matrix(),
         sensitivity=np.where(np.eye(3, dtype=bool), gain[:, :, None], cross),
-        offset_T=spreads.chip_offset_uT * micro * rng.standard_normal((chips_n, 3)),
+        offset_T=offset_T,
     )
+
+
+def _unevenness(design: BoardDesign, rng: np.random.Generator) -> Float[np.ndarray, " k"]:
+    # Tilt and bow of the base over its board, of 1 at the outermost chip; the skin itself is taken as flat.
+    places_mm = np.array(design.chips_xy_mm)
+    away_mm = np.hypot(*places_mm.T)
+    share = places_mm / max(away_mm.max(), 1e-12)
+    uneven = np.column_stack([share, (share**2).sum(axis=1)]) @ rng.standard_normal(3)
+    return np.tile(uneven, len(design.places_mm) // len(places_mm))

@@ -34,16 +34,20 @@ def drag(
     path_m: Float[np.ndarray, "t 2"],
     normal_N: Float[np.ndarray, " t"],
     *,
-    stiffness_N_per_m: Float[np.ndarray, " t"] | float,
+    stiffness_N_per_m: Float[np.ndarray, "t 2 2"] | Float[np.ndarray, " t"] | float,
     friction: float,
 ) -> Drag:
     """Follow a tip that touches at the first place of `path_m`; places without normal force are no contact.
+
+    A stiffness is a number, or a symmetric matrix where a skin gives more in one direction than in another.
 
     Return mapping (Simo & Hughes 1998): the spring follows the whole step, and what exceeds the disc |Q| <= mu F is cut
     off radially as slip. A step sticks or slides only if both its ends are in contact: where in between the tip lifted
     or touched is not known, so the spring starts anew.
     """
-    stiffness = np.broadcast_to(np.asarray(stiffness_N_per_m, dtype=float), normal_N.shape)
+    stiffness = np.asarray(stiffness_N_per_m, dtype=float)
+    if stiffness.ndim < 3:
+        stiffness = np.where(np.eye(2, dtype=bool), np.broadcast_to(stiffness, normal_N.shape)[:, None, None], 0.0)
     _refuse(path_m, normal_N, stiffness, friction)
     limit_N, touching = friction * normal_N, normal_N > 0
     force_N, elastic_m = np.zeros(path_m.shape), np.zeros(path_m.shape)
@@ -52,22 +56,23 @@ def drag(
         if not (touching[now] and touching[now - 1]):
             continue
         trial_m = elastic_m[now - 1] + path_m[now] - path_m[now - 1]
-        trial_N = stiffness[now] * np.hypot(*trial_m)
+        trial_N = np.hypot(*(stiffness[now] @ trial_m))
         sliding[now] = trial_N > limit_N[now]
         elastic_m[now] = trial_m * (limit_N[now] / trial_N) if sliding[now] else trial_m
-        force_N[now] = stiffness[now] * elastic_m[now]
+        force_N[now] = stiffness[now] @ elastic_m[now]
     return Drag(force_N, elastic_m, sliding)
 
 
 def _refuse(
     path_m: Float[np.ndarray, "t 2"],
     normal_N: Float[np.ndarray, " t"],
-    stiffness: Float[np.ndarray, " t"],
+    stiffness: Float[np.ndarray, "t 2 2"],
     friction: float,
 ) -> None:
     if not np.isfinite(path_m).all():
         raise ParamsError("drag", "every place", "finite", "NaN or infinity", "Mend the path.")
-    for what, unit, values in (("normal force", "N", normal_N), ("stiffness", "N/m", stiffness)):
+    along = np.diagonal(stiffness, axis1=1, axis2=2)
+    for what, unit, values in (("normal force", "N", normal_N), ("stiffness", "N/m", along)):
         if not (np.isfinite(values) & (values >= 0)).all():
             worst = values[~(np.isfinite(values) & (values >= 0))][0]
             raise ParamsError("drag", what, f"0 {unit} or more and finite", f"{worst}", "Check its sign.")

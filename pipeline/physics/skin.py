@@ -10,13 +10,13 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
-from pydantic import Field
+from pydantic import Field, model_validator
 from scipy.constants import kilo, milli
 
 from pipeline.core.config import Strict
 from pipeline.core.errors import ParamsError
 from pipeline.core.seeds import rng_for
-from pipeline.physics import dipole, flow_map, layer, magnet
+from pipeline.physics import dipole, flow_map, layer, magnet, slide
 from pipeline.physics.board import Board, Spreads
 from pipeline.physics.change import change_of_field
 from pipeline.physics.nodes import CHOSEN, SKIN_SIDES_M, Quadrature, place_nodes
@@ -30,12 +30,20 @@ class SkinDesign(Strict):
     """What all skins of a scene have in common, the tip that pokes them included."""
 
     polarity: magnet.Polarity
+    flipped: bool  # every field has the other sign: a checkerboard skin that lies turned by a quarter
     base: layer.Base
+    hold: slide.HoldDesign | None  # of a finite skin that slides as one; none: endless, its force that of `layer`
     saturation_T: Annotated[float, Field(ge=0, le=1)]  # phi Br: volume fraction times remanence of the powder
     half_field_T: Annotated[float, Field(gt=0, le=10)]  # field that magnetises the powder to half of that
     thickness_mm: Annotated[float, Field(gt=0, le=20)]
     modulus_kPa: Annotated[float, Field(ge=0, le=1e6)]
     tip_radius_mm: Annotated[float, Field(gt=0, le=50)]
+
+    @model_validator(mode="after")
+    def _only_what_slides_is_held(self) -> "SkinDesign":
+        if self.hold is not None and self.base == "bonded":
+            raise ValueError("hold is of a skin that slides (base: slipping); of a bonded one it is null")
+        return self
 
 
 @dataclass(frozen=True)
@@ -52,6 +60,7 @@ class Skin:
     tip_radius_m: float
     depth_zero_m: float  # added to a commanded depth
     base: layer.Base
+    hold: slide.Hold | None = None
 
 
 def draw_skin(
@@ -73,23 +82,29 @@ def draw_skin(
     )
     seat_m = spreads.skin_seat_mm * milli * rng.standard_normal(2)
     depth_zero_mm = spreads.skin_depth_zero_mm * rng.standard_normal()
+    rotation_rad = np.deg2rad(spreads.skin_rotation_deg) * rng.standard_normal()
     thickness_m = float(design.thickness_mm * milli * thickness)
     rest = place_nodes(thickness_m, rule, sides_m=sides_m)
     cubes_n = (magnet.cubes_along(sides_m[0]), magnet.cubes_along(sides_m[1]))
     b_T = magnet.array_field(rest.nodes_m, thickness_m, design.polarity, cubes_n=cubes_n)
     j_T = magnet.magnetise(b_T, saturation_T=amplitude * design.saturation_T, half_field_T=design.half_field_T)
-    filler = _filler(rest.nodes_m[:, :2], spreads, rng)
+    strength = _filler(rest.nodes_m[:, :2], spreads, rng) * (-1 if design.flipped else 1)
+    at_rest = rest.nodes_m, magnet.moments(j_T * strength[:, None], rest.volumes_m3)
+    seated = slide.Slide(seat_m[None], np.array([rotation_rad]))
+    nodes_m, moments_A_m2 = slide.apply(seated, 0, at_rest)
+    modulus_Pa = float(design.modulus_kPa * kilo * modulus)
     return Skin(
         name=name,
-        nodes_m=rest.nodes_m + np.append(seat_m, 0.0),
-        moments_A_m2=magnet.moments(j_T * filler[:, None], rest.volumes_m3),
+        nodes_m=nodes_m,
+        moments_A_m2=moments_A_m2,
         seat_m=seat_m,
         sides_m=sides_m,
         thickness_m=thickness_m,
-        modulus_Pa=float(design.modulus_kPa * kilo * modulus),
+        modulus_Pa=modulus_Pa,
         tip_radius_m=design.tip_radius_mm * milli,
         depth_zero_m=float(depth_zero_mm * milli),
         base=design.base,
+        hold=None if design.hold is None else slide.hold_of(design.hold, modulus_Pa),
     )
 
 
@@ -121,9 +136,18 @@ def moved_dipoles(skin: Skin, pokes_m: Float[np.ndarray, "n 3"]) -> Iterator[tup
     rest = flow_map.at_rest(skin.nodes_m, skin.moments_A_m2, skin.thickness_m)
     deepest_m = float(np.max(true_m[:, 2]))
     table = flow_map.tabulate(skin.thickness_m, skin.tip_radius_m, deepest_m, heights=rest.heights, base=skin.base)
-    for poke_i in contacts:
+    slides = None if skin.hold is None else press_slides(skin, skin.hold, true_m[contacts])
+    for i, poke_i in enumerate(contacts):
         moved = flow_map.move(table, rest, true_m[poke_i])
-        yield int(poke_i), moved.before, moved.after
+        after = moved.after if slides is None else slide.apply(slides, i, moved.after, skin.seat_m)
+        yield int(poke_i), moved.before, after
+
+
+def press_slides(skin: Skin, hold: slide.Hold, true_m: Float[np.ndarray, "n 3"]) -> slide.Slide:
+    """Give how presses (x, y, true depth) slide a skin on its base, as one."""
+    places_m = true_m[:, :2] - skin.seat_m
+    load = slide.load_of(np.maximum(true_m[:, 2], 0.0), hold, skin.thickness_m)
+    return slide.rigid(places_m, slide.under_tip_m(places_m, load, give_m=hold.give_m, away=hold.away), skin.sides_m)
 
 
 def beyond_verified_n(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> int:
@@ -133,8 +157,14 @@ def beyond_verified_n(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> int:
 
 def forces(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """Give the force that the tip feels at commanded depths, in newtons, positive in compression."""
+    true_m = depth_m + skin.depth_zero_m
+    if skin.hold is not None:
+        layer.refuse_layer(true_m, skin.thickness_m, skin.tip_radius_m)
+        return slide.force_at(
+            np.maximum(true_m, 0.0), stiffness_N_m2=skin.hold.stiffness_N_m2, thickness_m=skin.thickness_m
+        )
     return layer.force(
-        depth_m + skin.depth_zero_m,
+        true_m,
         thickness_m=skin.thickness_m,
         tip_radius_m=skin.tip_radius_m,
         modulus_Pa=skin.modulus_Pa,

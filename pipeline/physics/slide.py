@@ -1,31 +1,59 @@
 """A finite skin slides and turns on its base as one; a layer stiffens as it thins. Places, forces, SI -> motions.
 
-The base drags every piece of skin alike, so where and how the material under the tip is taken decides the rest. How it
-is taken, and how force grows with depth, are empirical: fitted on two recorded boards (scene lab), explained by nothing
-here. Refuses to know what the layer itself does (`flow_map`), magnets and chips.
+The base holds every piece of skin alike, by springs as soft in all directions: so where and how the material under the
+tip is taken, or which force pulls there, decides the rest, for pressing and for dragging. How a press takes it, and how
+force grows with depth, are empirical: fitted on two recorded boards (scene lab), explained by nothing here. Refuses to
+know what the layer itself does (`flow_map`, `shear`), magnets and chips.
 """
 
 from dataclasses import dataclass
-from typing import no_type_check
+from typing import Annotated, no_type_check
 
 import numpy as np
 from jaxtyping import Float
 from numba import njit
+from pydantic import Field
+from scipy.constants import kilo, micro, milli
 
+from pipeline.core.config import Strict
 from pipeline.core.errors import ParamsError
 
-LETS_GO_N = 8.0  # force at which the slide away from the middle is gone: chosen with both boards in view
 STIFFENING = 1.5  # exponent of the thinning layer: chosen with both boards in view
 DEEPEST = 0.72  # of the thickness: a larger force counts as the one that goes so deep
+MIDDLE_M = np.zeros(2)
 CURVE_N = 2000  # depths at which the force is inverted, linear between; off by less than 1e-6 of the thickness
+
+
+class HoldDesign(Strict):
+    """Section `skin.hold`: how the base holds a skin that slides on it, and how force grows on it."""
+
+    give_um: tuple[float, float]  # of the rig's arm under a press, with the skin that the tip holds, x and y
+    away_um_mm: Annotated[float, Field(ge=0, le=100)]  # slide away from the skin's middle at no force
+    lets_go_mm2: Annotated[float, Field(gt=0, le=1e6)]  # of d^2 (1 - d/h)^(-3/2), where that slide is gone
+    force_per_modulus: Annotated[float, Field(gt=0, le=100)]  # K / E of `force_at`
+    springs_N_mm: Annotated[float, Field(gt=0, le=1e6)]  # force that slides the skin as one: screws, clips, friction
 
 
 @dataclass(frozen=True)
 class Hold:
-    """How the tip takes the material under it sideways."""
+    """The same of one skin, SI."""
 
-    give_m: tuple[float, float]  # of the rig's arm, with the skin that it holds
-    away: float  # slide away from the skin's middle at no force, per distance from it
+    give_m: tuple[float, float]
+    away: float
+    lets_go_m2: float
+    stiffness_N_m2: float
+    springs_N_per_m: float
+
+
+def hold_of(design: HoldDesign, modulus_Pa: float) -> Hold:
+    """Scale a design's hold to the skin's modulus; how far it slides under a depth does not depend on that."""
+    return Hold(
+        give_m=(design.give_um[0] * micro, design.give_um[1] * micro),
+        away=design.away_um_mm * micro / milli,
+        lets_go_m2=design.lets_go_mm2 * milli**2,
+        stiffness_N_m2=design.force_per_modulus * modulus_Pa,
+        springs_N_per_m=design.springs_N_mm * kilo,
+    )
 
 
 @dataclass(frozen=True)
@@ -37,32 +65,53 @@ class Slide:
 
 
 def under_tip_m(
-    places_m: Float[np.ndarray, "n 2"], force_N: Float[np.ndarray, " n"], hold: Hold
+    places_m: Float[np.ndarray, "n 2"], load: Float[np.ndarray, " n"], *, give_m: tuple[float, float], away: float
 ) -> Float[np.ndarray, "n 2"]:
-    """Give how the material under the tip is taken: give - away (1 - F / F_lets_go) p, p from the middle."""
-    return np.array(hold.give_m) - hold.away * (1 - force_N / LETS_GO_N)[:, None] * places_m
+    """Give how a press takes the material under the tip: give - away (1 - load) p, p from the skin's middle.
+
+    `load` is the force over the one at which the slide away is gone; from there on the base holds.
+    """
+    return np.array(give_m) - away * np.maximum(1 - load, 0.0)[:, None] * places_m
+
+
+def load_of(depth_m: Float[np.ndarray, " n"], hold: Hold, thickness_m: float) -> Float[np.ndarray, " n"]:
+    """Give the load of `under_tip_m` at depths: F(d) / F(where the slide is gone), whatever the modulus."""
+    return force_at(depth_m, stiffness_N_m2=1.0, thickness_m=thickness_m) / hold.lets_go_m2
+
+
+def compliance_m_per_N(
+    places_m: Float[np.ndarray, "n 2"], sides_m: tuple[float, float], springs_N_per_m: float
+) -> Float[np.ndarray, "n 2 2"]:
+    """Give how far a force at a place slides that place along: (I + q q^T / rho^2) / springs, see `rigid`."""
+    q_m = np.stack([-places_m[:, 1], places_m[:, 0]], axis=1)
+    spun = q_m[:, :, None] * q_m[:, None, :] / _rho2_m2(sides_m)
+    return (np.eye(2) + spun) / springs_N_per_m
 
 
 def rigid(places_m: Float[np.ndarray, "n 2"], taken_m: Float[np.ndarray, "n 2"], sides_m: tuple[float, float]) -> Slide:
-    """Find the motion that takes the places so far against the least drag, the mean square displacement of the skin.
+    """Find the motion that takes the places so far against the least work of the springs, mean square displacement.
 
     u = f + theta z x X with u(p) = D: f = (I + q q^T / rho^2)^-1 D, theta = q.f / rho^2, q = z x p; rho^2, the mean of
     r^2 over the skin, is (a^2 + b^2) / 12. A place off the middle spends part of its displacement on spin.
     """
-    rho2_m2 = (sides_m[0] ** 2 + sides_m[1] ** 2) / 12
     q_m = np.stack([-places_m[:, 1], places_m[:, 0]], axis=1)
-    spin_rad = (q_m * taken_m).sum(axis=1) / (rho2_m2 + (q_m * q_m).sum(axis=1))
+    spin_rad = (q_m * taken_m).sum(axis=1) / (_rho2_m2(sides_m) + (q_m * q_m).sum(axis=1))
     return Slide(taken_m - q_m * spin_rad[:, None], spin_rad)
 
 
 def apply(
-    slide: Slide, poke_i: int, dipoles: tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]
+    slide: Slide,
+    poke_i: int,
+    dipoles: tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]],
+    middle_m: Float[np.ndarray, "2"] = MIDDLE_M,
 ) -> tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]:
-    """Turn positions (from the skin's middle) and moments, and move the positions; without a slide nothing changes."""
+    """Turn positions about the skin's middle and moments, and move the positions; without a slide nothing changes."""
     positions_m, moments_A_m2 = (np.ascontiguousarray(part.T) for part in dipoles)
-    turn = float(np.cos(slide.spin_rad[poke_i])), float(np.sin(slide.spin_rad[poke_i]))
-    x_m, y_m = slide.move_m[poke_i]
-    return _turn(positions_m, turn, (x_m, y_m)).T, _turn(moments_A_m2, turn, (0.0, 0.0)).T
+    cos, sin = float(np.cos(slide.spin_rad[poke_i])), float(np.sin(slide.spin_rad[poke_i]))
+    (x_m, y_m), (middle_x_m, middle_y_m) = slide.move_m[poke_i], middle_m
+    # R (X - middle) + middle + move
+    move_m = x_m + (1 - cos) * middle_x_m + sin * middle_y_m, y_m + (1 - cos) * middle_y_m - sin * middle_x_m
+    return _turn(positions_m, (cos, sin), move_m).T, _turn(moments_A_m2, (cos, sin), (0.0, 0.0)).T
 
 
 @njit(cache=True, error_model="numpy")
@@ -91,3 +140,7 @@ def depth_at(force_N: Float[np.ndarray, " n"], *, stiffness_N_m2: float, thickne
     curve_m = np.linspace(0, DEEPEST * thickness_m, CURVE_N)
     known_N = force_at(curve_m, stiffness_N_m2=stiffness_N_m2, thickness_m=thickness_m)
     return np.interp(force_N, known_N, curve_m)
+
+
+def _rho2_m2(sides_m: tuple[float, float]) -> float:
+    return (sides_m[0] ** 2 + sides_m[1] ** 2) / 12

@@ -1,7 +1,7 @@
-"""How the skin's force relaxes. In: the elastic force at some times. Out: the force with memory, same unit.
+"""How the skin's force relaxes, and what its field remembers. In: force or change of field. Out: the same with memory.
 
-Displacement is prescribed, so the field does not relax while the contact grows (PHYSICS 0), only the force.
-Refuses to know where the elastic force comes from.
+Displacement is prescribed, so the field does not relax while the contact grows (PHYSICS 0), only the force; but a held
+poke goes on creeping, and part of its change stands in the next no-load readings. Refuses to know where either is from.
 """
 
 from dataclasses import dataclass
@@ -9,7 +9,8 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
-from pydantic import Field
+from pydantic import Field, model_validator
+from scipy.signal import lfilter
 
 from pipeline.core.config import Strict
 from pipeline.core.errors import ParamsError
@@ -38,6 +39,42 @@ class Relaxation(Strict):
 
     approach_s: Annotated[float, Field(ge=0, le=100)]
     hold_s: Annotated[float, Field(ge=0, le=100)]  # until the middle of the readings
+
+
+class Memory(Strict):
+    """How a poke's change of field creeps while it is held, and fades after it; times are those of a real rig.
+
+    What stands in the next no-load reading is as recorded (5 to 8 %, FACTS 6); how it is shared among times is assumed.
+    """
+
+    share: tuple[Annotated[float, Field(ge=0, le=1)], ...]  # of the change, that a poke held for ever would add
+    tau_s: tuple[Annotated[float, Field(gt=0, le=1e6)], ...]
+    contact_s: Annotated[float, Field(ge=0, le=1e4)]  # how long a poke is held, until the end of its readings
+    rest_s: Annotated[float, Field(ge=0, le=1e4)]  # from there to the next no-load reading
+
+    @model_validator(mode="after")
+    def _each_share_has_a_time(self) -> "Memory":
+        if len(self.share) != len(self.tau_s):
+            raise ValueError("tau_s needs one time for each share")
+        return self
+
+
+def remembered(
+    change_T: Float[np.ndarray, "n k 3"], how: Memory
+) -> tuple[Float[np.ndarray, "n k 3"], Float[np.ndarray, "n k 3"]]:
+    """Give what earlier pokes leave in each no-load reading, and what has been added to it when the poke is read.
+
+    q' = (share dB - q) / tau while a poke is held, q' = -q / tau after it, exactly; none before the first poke.
+    """
+    before_T, added_T = np.zeros_like(change_T), np.zeros_like(change_T)
+    for share, tau_s in zip(how.share, how.tau_s, strict=True):
+        held, rested = np.exp(-how.contact_s / tau_s), np.exp(-how.rest_s / tau_s)
+        crept_T = -np.expm1(-how.contact_s / tau_s) * share * change_T
+        # q before poke i + 1 is what poke i left at its end, rested: one pole.
+        left_T = lfilter([0.0, rested], [1.0, -held * rested], crept_T, axis=0)
+        before_T += left_T
+        added_T += crept_T - (1 - held) * left_T
+    return before_T, added_T
 
 
 def force_left(how: Relaxation, prony: Prony = SKIN) -> float:

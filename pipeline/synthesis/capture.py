@@ -69,6 +69,8 @@ def record(synthesis: Synthesis, protocol: str, *, board: str, skin: str, seed: 
     drawn_skin = draw_skin(synthesis.skin, spreads, seed=seed, name=skin, rule=rule, sides_m=kind.skin_m)
     plan = settings.plan(rngs["plan"], kind.skin_mm)
     tip_m = _tip(plan, rig, drawn_skin, rngs["robot"])
+    if plan.labelled:
+        tip_m[..., :2] += rig.place_offset_sd_mm * milli * rng_for(seed, "rig", board).standard_normal(2)
     response = respond(drawn_board, drawn_skin, tip_m, tilt=plan.tilt, terms=terms, rng=rngs["drift"])
     reader = switch_on(drawn_board, chip, rate_hz=rig.rate_hz, temperature=terms.temperature, rng=rngs["chips"])
     line = timeline(rig, plan.x_mm.shape[1])

@@ -14,12 +14,12 @@ from scipy.constants import micro
 from scipy.spatial.transform import Rotation
 
 from pipeline.core.config import Strict
-from pipeline.physics import shear
+from pipeline.physics import shear, slide
 from pipeline.physics.board import Board
 from pipeline.physics.change import change_of_field
 from pipeline.physics.friction import Friction, drag
 from pipeline.physics.skin import Dipoles, Skin, beyond_verified_n, changes_of_field, forces, moved_dipoles
-from pipeline.physics.viscoelastic import Relaxation, force_left
+from pipeline.physics.viscoelastic import Memory, Relaxation, force_left, remembered
 from pipeline.physics.warmth import Temperature
 from pipeline.physics.wear import Ageing, fading, softening, wandering
 
@@ -31,6 +31,7 @@ class Terms(Strict):
 
     ageing: Ageing | None = None
     friction: Friction | None = None
+    memory: Memory | None = None
     relaxation: Relaxation | None = None
     temperature: Temperature | None = None
 
@@ -80,6 +81,7 @@ def respond(
         rest_T, _ = changes_of_field(board, skin, flat_m[:0])
         force_N[:, :, :2], change_T = push(board, skin, tip_m, tilt=tilt, how=terms.friction)
     force_N[:, :, 2] = forces(skin, flat_m[:, 2]).reshape(n, stops_n)
+    change_T = change_T.reshape(n, stops_n, *rest_T.shape)
     every_rest_T = np.broadcast_to(rest_T, (n, *rest_T.shape))
     if terms.ageing is not None:
         contacts_n, ageing = np.arange(n), terms.ageing
@@ -89,8 +91,12 @@ def respond(
         every_rest_T = left[:, None, None] * rest_T + walk_T.reshape(-1, *rest_T.shape)
     if terms.relaxation is not None:
         force_N *= force_left(terms.relaxation)
+    if terms.memory is not None:
+        before_T, added_T = remembered(change_T.mean(axis=1), terms.memory)
+        every_rest_T = every_rest_T + before_T
+        change_T = change_T + added_T[:, None]
     deep_n = beyond_verified_n(skin, flat_m[:, 2])
-    return Response(every_rest_T, change_T.reshape(n, stops_n, *rest_T.shape), force_N, deep_n)
+    return Response(every_rest_T, change_T, force_N, deep_n)
 
 
 def push(
@@ -98,10 +104,10 @@ def push(
 ) -> Sideways:
     """Drag or lean a tip through the stops of every indentation, from its first in contact; Coulomb limits the force.
 
-    Sideways the skin's base is taken as held: an assumption, without which a skin that slides would come
-    along with the tip.
+    The force shears the layer under the tip, and slides a skin that its base holds by springs (`Skin.hold`) as one;
+    another skin's base is taken as fixed sideways: an assumption, without which it would come along with the tip.
     """
-    pushed = [_push_once(board, skin, *indentation, how.coefficient) for indentation in zip(tip_m, tilt, strict=True)]
+    pushed = [_push_once(board, skin, *each, how.coefficient) for each in zip(tip_m, tilt, strict=True)]
     return Sideways(*map(np.stack, zip(*pushed, strict=True)))
 
 
@@ -111,19 +117,40 @@ def _push_once(
     normal_N = forces(skin, tip_m[:, 2])
     maps = [_map(skin, depth_m) if force > 0 else None for depth_m, force in zip(tip_m[:, 2], normal_N, strict=True)]
     shear_Pa = skin.modulus_Pa / 3  # incompressible
-    stiffness = np.array([0.0 if shear_map is None else shear_Pa * shear_map.stiffness_m for shear_map in maps])
-    dragged = drag(tip_m[:, :2], normal_N, stiffness_N_per_m=stiffness, friction=coefficient)
+    layer_N_per_m = np.array([0.0 if shear_map is None else shear_Pa * shear_map.stiffness_m for shear_map in maps])
+    slides_m_per_N = _slides_m_per_N(skin, tip_m[:, :2])
+    dragged = drag(
+        tip_m[:, :2], normal_N, stiffness_N_per_m=_in_series(layer_N_per_m, slides_m_per_N), friction=coefficient
+    )
     force_N = _limited(dragged.force_N + normal_N[:, None] * tilt, coefficient * normal_N)
     # The material under the tip rested behind it: there both press and push are centred.
-    elastic_m = force_N / np.where(stiffness > 0, stiffness, 1.0)[:, None]
+    slid_m = (slides_m_per_N @ force_N[:, :, None])[:, :, 0]
+    elastic_m = force_N / np.where(layer_N_per_m > 0, layer_N_per_m, 1.0)[:, None] + slid_m
     centre_m = np.column_stack([tip_m[:, :2] - elastic_m, tip_m[:, 2]])
+    slides = slide.rigid(tip_m[:, :2] - skin.seat_m, slid_m, skin.sides_m)
     change_T = np.zeros((len(tip_m), *board.chips_m.shape))
     for stop_i, before, after in moved_dipoles(skin, centre_m):
         shear_map = maps[stop_i]
         if shear_map is not None and force_N[stop_i].any():
             after = _carry(shear_map, after, centre_m[stop_i, :2], force_N[stop_i], skin.modulus_Pa)
+            after = slide.apply(slides, stop_i, after, skin.seat_m)
         change_T[stop_i] = change_of_field(before, after, board.chips_m)
     return force_N, change_T
+
+
+def _slides_m_per_N(skin: Skin, places_m: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, "p 2 2"]:
+    if skin.hold is None:
+        return np.zeros((len(places_m), 2, 2))
+    return slide.compliance_m_per_N(places_m - skin.seat_m, skin.sides_m, skin.hold.springs_N_per_m)
+
+
+def _in_series(
+    layer_N_per_m: Float[np.ndarray, " p"], slides_m_per_N: Float[np.ndarray, "p 2 2"]
+) -> Float[np.ndarray, "p 2 2"]:
+    # A layer without stiffness passes no force on to its springs.
+    stiff = layer_N_per_m > 0
+    layers_m_per_N = np.eye(2) / np.where(stiff, layer_N_per_m, 1.0)[:, None, None]
+    return np.where(stiff[:, None, None], np.linalg.inv(layers_m_per_N + slides_m_per_N), 0.0)
 
 
 def _map(skin: Skin, depth_m: float) -> shear.ShearMap:

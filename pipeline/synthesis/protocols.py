@@ -52,7 +52,9 @@ class Shared(Strict):
 
     boards: str  # the kind of board, one of `boards` of the scene
     skins_n: Count  # the first skin of each board before the second of any
-    terms: tuple[Literal["ageing", "friction", "relaxation", "temperature"], ...]  # physics that it needs (PHYSICS 8)
+    terms: tuple[
+        Literal["ageing", "friction", "memory", "relaxation", "temperature"], ...
+    ]  # physics that it needs (PHYSICS 8)
     rate_hz: Rate_hz | None = None  # the rig's unless given: more chips take longer
 
 

@@ -30,6 +30,7 @@ class Rig(Strict):
     rate_hz: Rate_hz
     robot_place_sd_mm: Spread  # each axis
     robot_depth_sd_mm: Annotated[float, Field(ge=0, le=0.2)]
+    place_offset_sd_mm: Spread  # from where a label says to where the tip is, the same for all skins of a board
     force_noise_N: Annotated[float, Field(ge=0, le=10)]
     chunk_frames_max_n: Frames
     arrival_jitter_s: Annotated[float, Field(ge=0, le=1)]  # mean delay of a chunk, exponential
@@ -59,6 +60,7 @@ def set_up(rig: Rig, protocol: Protocol) -> Rig:
         changes |= {
             "noload_frames_n": max(round(protocol.quiet_s * protocol.rate_hz), 1),
             "robot_place_sd_mm": 0.0,
+            "place_offset_sd_mm": 0.0,
             "robot_depth_sd_mm": 0.0,
             "force_noise_N": 0.0,
             "probe_clock_offset_s": 0.0,

@@ -12,7 +12,8 @@ from pipeline.physics.board import BoardDesign, Spreads, draw_board
 CROSS_MM = [[0.0, 0.0], [-7.0, 0.0], [0.0, -7.0], [7.0, 0.0], [0.0, 7.0]]
 DESIGN = {"chips_xy_mm": CROSS_MM, "chips_turn_deg": [0.0, 180.0, 270.0, 90.0, 0.0], "gap_mm": 1.1}
 SPREADS = {
-    "board_gap_mm": 0.1,
+    "board_gap": 0.1,
+    "board_uneven": 0.06,
     "chip_gain": 0.025,
     "chip_cross_axis": 0.01,
     "chip_tilt_deg": 2.0,
@@ -23,6 +24,7 @@ SPREADS = {
     "skin_thickness": 0.03,
     "skin_modulus": 0.1,
     "skin_seat_mm": 0.25,
+    "skin_rotation_deg": 0.7,
     "skin_depth_zero_mm": 0.05,
 }
 
@@ -127,10 +129,17 @@ def test_more_chips_than_a_frame_can_hold_are_refused():
         design(tiles={"columns_n": 1, "rows_n": 13, "pitch_mm": 25.4})
 
 
-def test_a_gap_that_vanishes_is_refused():
-    # Of boards 0.1 mm above their skin, give or take 1 mm, nearly every second one is impossible.
-    with pytest.raises(ParamsError, match="board b0: gap must be above 0 mm"):
-        [draw_board(design(gap_mm=0.1), spreads(board_gap_mm=1.0), seed=seed, name="b0") for seed in range(100)]
+def test_gaps_stay_above_nothing_and_tilt_and_bow_are_told_of_one_board_alone():
+    wide = spreads(board_gap=0.5, board_uneven=0.5)
+    boards = [draw_board(design(gap_mm=0.1), wide, seed=seed, name="b0") for seed in range(100)]
+    gaps_m = np.stack([-board.chips_m[:, 2] for board in boards])
+    assert (gaps_m > 0).all()
+    # log gap = log(middle) + 0.5 (a x + b y + c r^2), r = 1 at the outer chips: two tell tilt, all of them bow.
+    log = np.log(gaps_m / gaps_m[:, :1])
+    tilt, bow = (log[:, 1] - log[:, 3]) / 2, log[:, 1:].mean(axis=1)
+    assert 0.35 < tilt.std() < 0.7
+    assert 0.35 < bow.std() < 0.7
+    np.testing.assert_allclose(log[:, 1] + log[:, 3], log[:, 2] + log[:, 4], atol=1e-12)
 
 
 def test_a_chip_without_its_turn_is_refused():

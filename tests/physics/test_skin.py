@@ -13,7 +13,7 @@ from pipeline.physics.board import Board
 from pipeline.physics.change import change_of_field
 from pipeline.physics.dipole import MU0_4PI
 from pipeline.physics.nodes import CHOSEN, Quadrature
-from pipeline.physics.skin import SkinDesign, beyond_verified_n, changes_of_field, draw_skin, forces
+from pipeline.physics.skin import SkinDesign, beyond_verified_n, changes_of_field, draw_skin, forces, moved_dipoles
 from tests.laws import broken
 from tests.physics.test_board import design as board_design
 from tests.physics.test_board import draw_board, no_spread, spreads
@@ -32,7 +32,9 @@ patient = settings(max_examples=20, deadline=None)
 def design(**changes):
     usual = {
         "polarity": "checkerboard",
+        "flipped": False,
         "base": "bonded",
+        "hold": None,
         "saturation_T": 0.11,
         "half_field_T": 0.5,
         "thickness_mm": 2.0,
@@ -297,3 +299,54 @@ def test_depths_past_what_is_verified_are_counted_from_where_the_skin_begins():
     high, low = (type(one)(**{**one.__dict__, "depth_zero_m": zero_m}) for zero_m in (-0.1e-3, 0.1e-3))
     depths_m = np.array([0.6, 1.15, 1.25]) * 1e-3  # verified to 1.2 mm of true depth
     assert [beyond_verified_n(skin_, depths_m) for skin_ in (high, one, low)] == [0, 1, 2]
+
+
+HELD = {"give_um": (48.0, 7.0), "away_um_mm": 6.0, "lets_go_mm2": 9.0, "force_per_modulus": 2.5, "springs_N_mm": 7.0}
+
+
+def held(spread=UNEVEN, **changes):
+    return skin(spread, base="slipping", hold=HELD | changes)
+
+
+def test_a_held_skin_is_the_free_one_slid_as_one_and_without_slide_the_free_one():
+    one, free = held(), skin(UNEVEN, base="slipping")
+    poke_m = np.array([[3e-3, -2e-3, 0.7e-3]])
+    [(_, _, free_m)] = moved_dipoles(free, poke_m)
+    [(_, _, held_m)] = moved_dipoles(one, poke_m)
+    apart_m = held_m[0] - free_m[0]
+    assert np.abs(apart_m[:, 2]).max() == 0
+    distance_m = np.linalg.norm(held_m[0][:50, None] - held_m[0][50:100], axis=2)
+    np.testing.assert_allclose(distance_m, np.linalg.norm(free_m[0][:50, None] - free_m[0][50:100], axis=2), rtol=1e-9)
+    # At the place of the poke it is taken by give - away (1 - load) p, p from the middle.
+    true_m, away_m = poke_m[0, 2] + one.depth_zero_m, poke_m[0, :2] - one.seat_m
+    load = true_m**2 * (1 - true_m / one.thickness_m) ** -1.5 / 9e-6
+    nearest = np.argmin(np.linalg.norm(free_m[0][:, :2] - poke_m[0, :2], axis=1))
+    np.testing.assert_allclose(apart_m[nearest, :2], (48e-6, 7e-6) - 6e-3 * (1 - load) * away_m, atol=2e-6)
+    still = held(give_um=(0.0, 0.0), away_um_mm=0.0)
+    np.testing.assert_array_equal(change(poke_m[0], still), change(poke_m[0], free))
+
+
+def test_force_on_a_held_skin_stiffens_as_it_thins_and_the_modulus_leaves_the_field_alone():
+    one = held(EXACT)
+    for depth_m in (0.4e-3, 1.0e-3):
+        expected_N = 2.5 * one.modulus_Pa * depth_m**2 * (1 - depth_m / one.thickness_m) ** -1.5
+        assert forces(one, np.array([depth_m]))[0] == pytest.approx(expected_N)
+    soft, hard = (skin(UNEVEN, base="slipping", hold=HELD, modulus_kPa=kPa) for kPa in (0.0, 1e6))
+    assert not broken(stability.modulus(BOARD, held(), soft, hard))
+
+
+def test_a_bonded_skin_is_not_held():
+    with pytest.raises(ValueError, match="hold is of a skin that slides"):
+        skin(base="bonded", hold=HELD)
+
+
+def test_a_turned_skin_senses_what_a_turned_board_does():
+    turned = skin(EXACT.model_copy(update={"skin_rotation_deg": 5.0}), base="slipping")
+    first = skin(base="slipping").nodes_m
+    angle = np.arctan2(turned.nodes_m[0, 1], turned.nodes_m[0, 0]) - np.arctan2(first[0, 1], first[0, 0])
+    assert angle != 0
+    back = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    board = Board("turned", BOARD.chips_m @ back, BOARD.turn, BOARD.sensitivity, BOARD.offset_T)
+    poke_m = np.array([2e-3, 1e-3, DEPTH_M])
+    found, expected = change(poke_m, turned), change(poke_m @ back, skin(base="slipping"), board) @ back.T
+    np.testing.assert_allclose(found, expected, atol=1e-9 * PEAK_T)

@@ -13,7 +13,8 @@ SIDE_M, H_M = 20e-3, 2e-3
 SQUARE = (SIDE_M, SIDE_M)
 place = st.tuples(st.floats(-9e-3, 9e-3), st.floats(-9e-3, 9e-3))
 taken = st.tuples(st.floats(-1e-4, 1e-4), st.floats(-1e-4, 1e-4))
-STILL = slide.Hold((0.0, 0.0), 0.0)
+STILL = {"give_m": (0.0, 0.0), "away": 0.0}
+HELD = {"give_um": (48.0, 7.0), "away_um_mm": 6.0, "lets_go_mm2": 9.0, "force_per_modulus": 2.5, "springs_N_mm": 7.0}
 
 
 def one(place_m, taken_m, sides_m=SQUARE) -> tuple[np.ndarray, float]:
@@ -69,9 +70,30 @@ def test_a_square_turned_by_a_quarter_turns_its_motion_and_a_pull_along_the_radi
 
 def test_material_goes_away_from_the_middle_less_under_more_force_and_with_the_arm():
     places_m = np.array([[4e-3, 0.0]] * 3)
-    found_m = slide.under_tip_m(places_m, np.array([0.0, 4.0, 8.0]), slide.Hold((5e-5, 1e-5), 7e-3))
-    # 7 um/mm 4 mm from the middle is 28 um, half of it at half of the force that lets go.
+    found_m = slide.under_tip_m(places_m, np.array([0.0, 0.5, 1.5]), give_m=(5e-5, 1e-5), away=7e-3)
+    # 7 um/mm 4 mm from the middle is 28 um, half of it at half of the load that lets go, and none beyond.
     np.testing.assert_allclose(found_m, [[2.2e-5, 1e-5], [3.6e-5, 1e-5], [5e-5, 1e-5]], atol=1e-18)
+
+
+@given(place, st.floats(1e3, 1e5))
+def test_a_force_slides_a_skin_as_far_as_the_same_motion_asks_for(place_m, springs_N_per_m):
+    # Springs spread evenly: the force moves by f / springs, and spins by its moment over springs rho^2 (a loop's sum).
+    force_N, (x, y) = np.array([0.7, -0.4]), place_m
+    taken_m = slide.compliance_m_per_N(np.array([place_m]), SQUARE, springs_N_per_m)[0] @ force_N
+    move_m, spin_rad = one(place_m, taken_m)
+    np.testing.assert_allclose(move_m, force_N / springs_N_per_m, atol=1e-15)
+    moment_m = (x * force_N[1] - y * force_N[0]) / springs_N_per_m
+    np.testing.assert_allclose(spin_rad, moment_m / (2 * SIDE_M**2 / 12), rtol=1e-9, atol=1e-15)
+
+
+def test_how_far_a_skin_slides_under_a_depth_does_not_depend_on_its_modulus_and_its_force_is_proportional():
+    soft, hard = (slide.hold_of(slide.HoldDesign(**HELD), modulus_Pa) for modulus_Pa in (0.0, 4e5))
+    depth_m = np.array([0.3e-3, 1.2e-3])
+    np.testing.assert_array_equal(slide.load_of(depth_m, soft, H_M), slide.load_of(depth_m, hard, H_M))
+    assert soft.stiffness_N_m2 == 0
+    assert hard.stiffness_N_m2 == pytest.approx(1e6)
+    # 8 mm^2 of d^2 (1 - d/h)^(-3/2) at half of a thickness of h: d = h / 2 = 1 mm gives 2^1.5 mm^2.
+    assert slide.load_of(np.array([1e-3]), hard, H_M)[0] == pytest.approx(2**1.5 / 9)
 
 
 def test_without_give_and_slide_the_sliding_flow_is_what_it_was_to_the_last_bit():
@@ -82,7 +104,7 @@ def test_without_give_and_slide_the_sliding_flow_is_what_it_was_to_the_last_bit(
     table = flow_map.tabulate(H_M, 2e-3, 0.8e-3, heights=rest.heights, base="slipping")
     moved = flow_map.move(table, rest, np.array([3e-3, -2e-3, 0.8e-3]))
     place_m = np.array([[3e-3, -2e-3]])
-    still = slide.rigid(place_m, slide.under_tip_m(place_m, np.array([2.0]), STILL), SQUARE)
+    still = slide.rigid(place_m, slide.under_tip_m(place_m, np.array([0.2]), **STILL), SQUARE)
     after = slide.apply(still, 0, moved.after)
     for found, expected in zip(after, moved.after, strict=True):
         assert np.array_equal(found, expected)
@@ -101,6 +123,10 @@ def test_every_dipole_turns_about_the_middle_and_moves_as_a_loop_says():
     for i in range(7):
         np.testing.assert_allclose(there_m[i], turn @ nodes_m[i] + (3e-5, -2e-5, 0), rtol=1e-13, atol=1e-18)
         np.testing.assert_allclose(turned[i], turn @ moments[i], rtol=1e-13, atol=1e-20)
+    middle_m = np.array([2e-3, -1e-3])
+    about_m, _ = slide.apply(motion, 1, (nodes_m, moments), middle_m)
+    shift_m = np.append(middle_m, 0.0)
+    np.testing.assert_allclose(about_m, slide.apply(motion, 1, (nodes_m - shift_m, moments))[0] + shift_m, atol=1e-17)
 
 
 @given(st.floats(1e-5, 0.71 * H_M), st.floats(1e5, 1e7))

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from pipeline.core.errors import ParamsError
 from pipeline.experiments.verification import relaxation
-from pipeline.physics.viscoelastic import SKIN, Prony, Relaxation, advance, force_left, relax
+from pipeline.physics.viscoelastic import SKIN, Memory, Prony, Relaxation, advance, force_left, relax, remembered
 from tests.laws import broken
 
 ROUNDING = 1e-14  # a few dozen operations on doubles
@@ -76,3 +76,45 @@ def test_an_indentation_is_read_after_the_tip_went_down_and_held():
     # While it went down, each part of the force had less time: by the mean of the decay over the approach.
     x = 5.0 / SKIN.tau_s
     assert force_left(slow) == pytest.approx(1 - (SKIN.share * (1 + np.expm1(-x) / x)).sum(), rel=1e-12)
+
+
+REMEMBERED = Memory(share=(0.11, 0.1), tau_s=(5.0, 60.0), contact_s=5.0, rest_s=1.0)
+
+
+def test_a_field_remembers_as_integration_in_small_steps_says():
+    change_T, how, steps_n = np.random.default_rng(0).normal(0, 1e-4, (6, 2, 3)), REMEMBERED, 20_000
+    q_T = np.zeros((2, *change_T.shape[1:]))
+    before_T, added_T = remembered(change_T, how)
+    for i, poke_T in enumerate(change_T):
+        np.testing.assert_allclose(before_T[i], q_T.sum(axis=0), atol=1e-8)
+        first_T = q_T.copy()
+        for long_s, held_T in ((how.contact_s, poke_T), (how.rest_s, np.zeros_like(poke_T))):
+            for _ in range(steps_n):
+                rate = [(s * held_T - q) / tau for s, q, tau in zip(how.share, q_T, how.tau_s, strict=True)]
+                q_T = q_T + long_s / steps_n * np.stack(rate)
+            if held_T is poke_T:
+                np.testing.assert_allclose(added_T[i], (q_T - first_T).sum(axis=0), atol=1e-8)
+
+
+def test_of_one_poke_five_to_eight_percent_stand_in_the_next_no_load_reading_and_less_in_later_ones():
+    once_T = np.zeros((5, 1, 3))
+    once_T[0] = 1e-3
+    before_T, _ = remembered(once_T, REMEMBERED)
+    left = before_T[:, 0, 0] / 1e-3
+    assert left[0] == 0
+    assert 0.05 < left[1] < 0.08
+    assert (np.diff(left[1:]) < 0).all()
+
+
+@given(st.floats(-3, 3))
+def test_memory_is_linear_and_without_time_there_is_none(factor):
+    change_T = np.random.default_rng(1).normal(0, 1e-4, (4, 2, 3))
+    for once, times in zip(remembered(change_T, REMEMBERED), remembered(factor * change_T, REMEMBERED), strict=True):
+        np.testing.assert_allclose(times, factor * once, atol=1e-18)
+    at_once = REMEMBERED.model_copy(update={"contact_s": 0.0, "rest_s": 0.0})
+    assert not any(part.any() for part in remembered(change_T, at_once))
+
+
+def test_shares_without_times_are_refused():
+    with pytest.raises(ValueError, match="one time for each share"):
+        Memory(share=(0.1,), tau_s=(1.0, 2.0), contact_s=1.0, rest_s=1.0)

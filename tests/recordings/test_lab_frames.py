@@ -1,7 +1,6 @@
 """How the chips of real boards are turned: recorded changes of field against the scenes' skin, with nothing fitted.
 
-Labels run along the board's x and against its y. The recorded skins were magnetised by an array that stood a cube's
-width aside of ours, so every field has the other sign.
+Labels run along the board's x and against its y.
 """
 
 from pathlib import Path
@@ -47,10 +46,10 @@ def simulated_uT(design, shared_data, tmp_path_factory) -> np.ndarray:
     labels_mm = np.column_stack([readings.x_mm, readings.y_mm])[::100] - MIDDLE_MM
     pokes_m = np.column_stack([labels_mm @ TURNED * milli, np.full(65, DEPTH_M)])
     still = Spreads(**(dict.fromkeys(SPREADS, 0.0) | {"skin_filler_length_mm": 3.0}))
-    words = YAML(typ="safe").load((ROOT / "params.yaml").read_text())["skin"]
+    words = YAML(typ="safe").load((ROOT / "params.yaml").read_text())["skin"] | {"hold": None}  # which was fitted on these boards
     skin = draw_skin(parse(SkinDesign, words, "test"), still, seed=0, name="nominal")
     _, changes_T = changes_of_field(draw_board(design, still, seed=0, name="nominal"), skin, pokes_m)
-    return -changes_T / micro
+    return changes_T / micro
 
 
 def _readings(name: str, shared_data: Path, folders: pytest.TempPathFactory) -> Readings:

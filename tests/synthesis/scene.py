@@ -31,6 +31,7 @@ SECTIONS = {
         "rate_hz": 400.0,
         "robot_place_sd_mm": 0.0,
         "robot_depth_sd_mm": 0.0,
+        "place_offset_sd_mm": 0.0,
         "force_noise_N": 0.006,
         "chunk_frames_max_n": 4,
         "arrival_jitter_s": 1e-4,
@@ -39,7 +40,9 @@ SECTIONS = {
     },
     "skin": {
         "polarity": "checkerboard",
+        "flipped": False,
         "base": "slipping",
+        "hold": None,
         "saturation_T": 0.11,
         "half_field_T": 0.8,
         "thickness_mm": 2.0,

@@ -1,5 +1,7 @@
 """A tip that pushes sideways: Coulomb and the spring by hand as truth; no friction, mirror images as laws."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -9,6 +11,7 @@ from pipeline.physics.board import draw_board
 from pipeline.physics.change import change_of_field
 from pipeline.physics.friction import Friction
 from pipeline.physics.skin import changes_of_field, draw_skin, forces, moved_dipoles
+from pipeline.physics.slide import HoldDesign
 from pipeline.synthesis.contact import push
 from tests.synthesis.scene import SECTIONS, synthesis
 
@@ -116,3 +119,35 @@ def test_a_skin_that_begins_higher_is_pushed_as_one_that_is_pressed_deeper():
     deeper = push(BOARD, SKIN, line(0.0, 3.0) + (0, 0, 0.1e-3), tilt=STRAIGHT, how=Friction(coefficient=0.5))
     np.testing.assert_allclose(there.force_N, deeper.force_N, rtol=1e-9)
     np.testing.assert_allclose(there.change_T, deeper.change_T, atol=1e-9 * np.abs(deeper.change_T).max())
+
+
+HELD = EVEN.skin.model_copy(
+    update={
+        "hold": HoldDesign(give_um=(0.0, 0.0), away_um_mm=0.0, lets_go_mm2=9.0, force_per_modulus=2.5, springs_N_mm=7.0)
+    }
+)
+
+
+def test_a_drag_slides_a_held_skin_as_one_and_what_gives_is_layer_and_springs_in_series():
+    one = draw_skin(HELD, EVEN.spreads, seed=0, name="b0_s0")
+    tip_m, so_far_m = line(0.0, 0.1, y_mm=0.0), 0.1e-3  # through the middle, so that nothing turns
+    force_N = push(BOARD, one, tip_m, tilt=STRAIGHT, how=Friction(coefficient=0.8)).force_N[0, 1]
+    sizes = {"thickness_m": one.thickness_m, "tip_radius_m": one.tip_radius_m, "base": one.base}
+    layer_N_per_m = one.modulus_Pa / 3 * shear.tabulate_depth(DEPTH_M, **sizes).stiffness_m
+    np.testing.assert_allclose(force_N, [so_far_m / (1 / layer_N_per_m + 1 / 7e3), 0.0], rtol=1e-9, atol=1e-12)
+    # Far from the tip, where the layer is not sheared, a chip sees nodes that have moved by force over springs.
+    slid = one.nodes_m + (force_N[0] / 7e3, 0.0, 0.0)
+    as_one_T = change_of_field((one.nodes_m, one.moments_A_m2), (slid, one.moments_A_m2), BOARD.chips_m)
+    pressed_T = changes_of_field(BOARD, one, tip_m[0, 1:])[1][0]
+    dragged_T = push(BOARD, one, tip_m, tilt=STRAIGHT, how=Friction(coefficient=0.8)).change_T[0, 1]
+    far = [2, 4]  # chips beside the line
+    np.testing.assert_allclose((dragged_T - pressed_T)[far], as_one_T[far], atol=0.5 * np.abs(as_one_T[far]).max())
+
+
+def test_stiff_springs_leave_the_drag_of_a_fixed_base():
+    tip_m, hold = line(0.0, 0.02), HELD.hold.model_copy(update={"springs_N_mm": 1e6})
+    stiff = draw_skin(HELD.model_copy(update={"hold": hold}), EVEN.spreads, seed=0, name="b0_s0")
+    free = replace(stiff, hold=None)
+    ours, theirs = (push(BOARD, one, tip_m, tilt=STRAIGHT, how=Friction(coefficient=10.0)) for one in (stiff, free))
+    np.testing.assert_allclose(ours.force_N, theirs.force_N, rtol=1e-3, atol=1e-6)
+    np.testing.assert_allclose(ours.change_T, theirs.change_T, atol=1e-3 * np.abs(theirs.change_T).max())

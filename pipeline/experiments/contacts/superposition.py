@@ -1,7 +1,8 @@
 """How far the field of two contacts is from the sum of their own. In: a scene's synthesis, distances. Out: numbers.
 
 The second contact displaces material that the first has moved; tips that would touch each other, or lower the surface
-under each other, are not followed. Refuses to know readings, noise and networks.
+under each other, are not followed. Nor is the slide of the skin as one (`slide`): what two tips that hold it do is not
+known. Refuses to know readings, noise and networks.
 """
 
 from collections.abc import Sequence

@@ -9,7 +9,7 @@ MEANING = (
     "Errors that leaving a term out makes, measured on this scene's first skin under the main protocol, whichever "
     "protocols leave it out: of all changes of field together (root "
     "of the mean square), the largest of the field at rest before the no-load reading is taken off, and of the force. "
-    "Not quantified, and always left out: the skin's corner tabs and screws, and how its base is held in a drag."
+    "Not quantified, and always left out: the skin's corner tabs, and its screws one by one: all of it is held alike."
 )
 
 

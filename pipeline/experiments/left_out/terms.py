@@ -20,7 +20,7 @@ from pipeline.physics.board import Board, draw_board
 from pipeline.physics.change import change_of_field
 from pipeline.physics.friction import Friction
 from pipeline.physics.skin import Skin, beyond_verified_n, changes_of_field, draw_skin, forces, moved_dipoles
-from pipeline.physics.viscoelastic import Relaxation
+from pipeline.physics.viscoelastic import Memory, Relaxation
 from pipeline.physics.wear import Ageing
 from pipeline.synthesis.capture import roster
 from pipeline.synthesis.contact import Response, Terms, push, respond
@@ -30,6 +30,7 @@ from pipeline.synthesis.settings import MAIN, Synthesis
 # Sizes of the terms that a scene leaves out: the design values of PHYSICS 5 (assumed there).
 AGEING = Ageing(settling=0.10, ageing=0.01, fading_per_decade=0.005, wandering_uT=0.2)
 RELAXATION = Relaxation(approach_s=0.5, hold_s=0.5)
+MEMORY = Memory(share=(0.11, 0.1), tau_s=(5.0, 60.0), contact_s=5.0, rest_s=1.0)
 WARMER_K = 1.0
 EARTH_T = np.array([20e-6, 0.0, -45e-6])  # some place of middle latitude
 PLACES_M = ((4e-3, 2e-3), (-6e-3, 4e-3))  # pokes for what moves inside the skin: flank and edge
@@ -72,8 +73,8 @@ def measure(of: Synthesis, *, seed: int) -> list[Omission]:
     of_protocols = *_over_time(subject, without, seed), _temperature(subject, without), _friction(subject)
     return [
         *(_by_protocol(omission, of) for omission in of_protocols),
-        _earth(without), *_inside(subject), *_free_edge(subject), _steps(without, of), _own_field(subject, of),
-        _too_deep(of, seed),
+        _earth(without), *_hold(subject), *_inside(subject), *_free_edge(subject), _steps(without, of),
+        _own_field(subject, of), _too_deep(of, seed),
     ]  # fmt: skip
 
 
@@ -106,6 +107,7 @@ def _over_time(on: Subject, without: Response, seed: int) -> list[Omission]:
     for name, terms, how in (
         ("ageing", Terms(ageing=AGEING), f"at the last of {n} contacts, a no-load reading before each"),
         ("relaxation", Terms(relaxation=slack), f"{slack.approach_s:g} s down, held for {slack.hold_s:g} s"),
+        ("memory", Terms(memory=MEMORY), f"pokes held for {MEMORY.contact_s:g} s, {MEMORY.rest_s:g} s between them"),
     ):
         felt = _feel(on, terms, seed)
         rest_uT = np.abs(felt.rest_T[-1] - without.rest_T[-1]).max() / micro
@@ -139,6 +141,20 @@ def _earth(without: Response) -> Omission:
     how = "a steady field, as long as the board does not turn; a no-load reading before each contact"
     rest_uT = float(np.abs(EARTH_T).max() / micro)
     return Omission("the earth's field", "left out", _error_pct(without.change_T, seen_T), rest_uT, 0.0, how)
+
+
+def _hold(on: Subject) -> list[Omission]:
+    """Let an endless layer slide freely, and press it as a linear elastic one."""
+    if on.skin.hold is None:
+        return []
+    free, deepest_m = replace(on.skin, hold=None), np.array([on.tip_m[..., 2].max()])
+    pokes_m = on.tip_m[:FEW].reshape(-1, 3)
+    held_T, free_T = (changes_of_field(on.board, skin, pokes_m)[1] for skin in (on.skin, free))
+    force_pct = _error_pct(forces(free, deepest_m), forces(on.skin, deepest_m))
+    how = (
+        f"an endless layer that slides freely, its force linear elasticity's; {FEW} indentations, force at the deepest"
+    )
+    return [Omission("the base's hold", "kept", _error_pct(free_T, held_T), 0.0, force_pct, how)]
 
 
 def _free_edge(on: Subject) -> list[Omission]:

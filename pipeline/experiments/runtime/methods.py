@@ -21,10 +21,10 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.experiments.runtime.trials import Trial, box_m, gauss_everywhere, laid, midpoints
 from pipeline.experiments.verification.field import field_of
-from pipeline.physics import flow, flow_map
+from pipeline.physics import flow, flow_map, slide
 from pipeline.physics.change import change_of_field
 from pipeline.physics.nodes import Nodes, Quadrature, place_nodes
-from pipeline.physics.skin import Skin, changes_of_field
+from pipeline.physics.skin import Skin, changes_of_field, press_slides
 
 RADII_N, HEIGHTS_N = 56, 16  # of the splines that move nodes; twice as many change dB by 0.1 %
 Changes = Float[np.ndarray, "n k 3"]
@@ -162,7 +162,20 @@ def paths(trial: Trial, skin: Skin) -> Path:
         cos, sin = (away_m / np.where(r_m > 0, r_m, 1.0)[:, None]).T
         nodes_m[poke_i] += np.stack([outward_m * cos, outward_m * sin, up_m], axis=1)
         turns_rad[poke_i] += angle_rad[:, None] * np.stack([-sin, cos, np.zeros_like(cos)], axis=1)
+    if skin.hold is not None:
+        true_poke_m = np.column_stack([trial.pokes_m[:, :2], true_m])
+        _slide(nodes_m, turns_rad, press_slides(skin, skin.hold, true_poke_m), skin.seat_m)
     return Path(nodes_m, turns_rad)
+
+
+def _slide(
+    nodes_m: Float[np.ndarray, "n s 3"], turns_rad: Float[np.ndarray, "n s 3"], motion: slide.Slide,
+    middle_m: Float[np.ndarray, "2"],
+) -> None:  # fmt: skip
+    for poke_i, spin_rad in enumerate(motion.spin_rad):
+        spin = Rotation.from_rotvec((0.0, 0.0, spin_rad))
+        nodes_m[poke_i], _ = slide.apply(motion, poke_i, (nodes_m[poke_i], turns_rad[poke_i]), middle_m)
+        turns_rad[poke_i] = (spin * Rotation.from_rotvec(turns_rad[poke_i])).as_rotvec()
 
 
 @dataclass(frozen=True)

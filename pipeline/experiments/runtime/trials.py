@@ -1,7 +1,7 @@
 """What all quadratures are tried on. In: board, design, name, pokes. Out: a `Trial`, and its skin on any nodes.
 
-The skin is that of its name but for its unevenness: amplitude and filler scale what every quadrature sums, over 3 mm,
-and move the errors by less than 0.05 % of dB. Refuses to know errors and times.
+The skin is that of its name but for its unevenness and its rotation: amplitude and filler scale what every quadrature
+sums, over 3 mm, and move the errors by less than 0.05 % of dB. Refuses to know errors and times.
 """
 
 from dataclasses import dataclass, replace
@@ -44,8 +44,8 @@ class Trial:
 
 
 def draw_trial(board: Board, design: SkinDesign, *, spreads: Spreads, seed: int, name: str, pokes: Pokes) -> Trial:
-    """Draw the skin called `name`, even, and lay the pokes on its pattern wherever that sits on the board."""
-    even = spreads.model_copy(update={"skin_amplitude": 0.0, "skin_filler": 0.0})
+    """Draw the skin called `name`, even and straight, and lay the pokes on its pattern wherever that sits."""
+    even = spreads.model_copy(update=dict.fromkeys(("skin_amplitude", "skin_filler", "skin_rotation_deg"), 0.0))
     skin = draw_skin(design, even, seed=seed, name=name, rule=COARSEST)
     pokes_m = milli * np.array([(*place, depth) for depth, place in product(pokes.depths_mm, pokes.places_mm)])
     pokes_m[:, :2] += skin.seat_m

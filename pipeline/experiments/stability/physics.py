@@ -19,7 +19,7 @@ from pipeline.experiments.verification.field import inside_a_box
 from pipeline.physics import dipole, friction, layer, shear
 from pipeline.physics.board import Board, BoardDesign, Spreads, draw_board
 from pipeline.physics.change import change_of_field
-from pipeline.physics.flow import Press
+from pipeline.physics.flow import Press, depth_unit
 from pipeline.physics.force_sensor import RANGE_N, read_force
 from pipeline.physics.magnet import CUBE_SIDE_M
 from pipeline.physics.nodes import Quadrature
@@ -147,7 +147,8 @@ def depth(board: Board, skin: Skin) -> list[Case]:
 
 def _almost_through(board: Board, skin: Skin) -> Case:
     case, attempt = "a poke to 0.95 of the thickness", partial(poke, board, skin, 0.95)
-    if skin.base == "bonded":
+    followed_m = skin.thickness_m * depth_unit(skin.tip_radius_m / skin.thickness_m)
+    if skin.base == "bonded" or 0.95 * skin.thickness_m + skin.depth_zero_m > followed_m:
         return refused(AREA, case, should="refused, before the map folds or loses volume", attempt=attempt)
     largest_uT = float(np.abs(attempt()).max() / micro)
     beyond = bool(layer.beyond_verified(np.array([0.95 * skin.thickness_m]), skin.thickness_m).all())

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.experiments.verification.checks import Check, farthest, worst
-from pipeline.physics import flow, layer
-from pipeline.physics.skin import Dipoles, Skin
+from pipeline.physics import flow, layer, slide
+from pipeline.physics.skin import Dipoles, Skin, press_slides
 
 STEPS_N = 12  # of 0.1 mm at 1.2 mm (PHYSICS 0)
 STEP_M = 1e-7  # of finite differences
@@ -114,7 +114,7 @@ def _places(h_m: float, r_n: int, z_n: int) -> tuple[Float[np.ndarray, " s"], Fl
 
 
 def followed(skin: Skin, place_m: Float[np.ndarray, "2"], depths_m: Float[np.ndarray, " d"]) -> Dipoles:
-    """Carry all dipoles of a skin through a poke down to true depths, without a table.
+    """Carry all dipoles of a skin through a poke down to true depths, without a table; then it slides as one.
 
     Each moment turns by the R of F = R U from a singular value decomposition. None may lie on the poke's axis.
     """
@@ -128,4 +128,8 @@ def followed(skin: Skin, place_m: Float[np.ndarray, "2"], depths_m: Float[np.nda
     plane = np.stack([(skin.moments_A_m2 * outward).sum(axis=1), skin.moments_A_m2[:, 2]], axis=1)
     turned = np.einsum("sij,sj->si", u @ vt, plane)
     aside = skin.moments_A_m2 - plane[:, :1] * outward - plane[:, 1:] * (0, 0, 1)
-    return places_m, aside + turned[:, :1] * outward + turned[:, 1:] * (0, 0, 1)
+    after = places_m, aside + turned[:, :1] * outward + turned[:, 1:] * (0, 0, 1)
+    if skin.hold is None:
+        return after
+    slides = press_slides(skin, skin.hold, np.append(place_m, depths_m[-1])[None])
+    return slide.apply(slides, 0, after, skin.seat_m)

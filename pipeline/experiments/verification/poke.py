@@ -42,10 +42,16 @@ def check_poke(
         skin.model_copy(update={"saturation_T": 2.5 * skin.saturation_T}),
     )
     dense = skin_of(DENSE)
+    # A rig's arm gives in one direction: no symmetry is to be expected of that.
+    even = (
+        skin
+        if skin.hold is None
+        else skin.model_copy(update={"hold": skin.hold.model_copy(update={"give_um": (0.0, 0.0)})})
+    )
     return [
         *quadrature(drawn, skin_of(rule), fine, rules=(rule, cells, layers), pokes_m=each_depth(_grid_m(), depths_m)),
         shortcuts(drawn, dense, min(depths_m), "shallowest"), shortcuts(drawn, dense, max(depths_m), "deepest"),
-        *symmetries(draw_board(board, exact, seed=seed, name="b0"), skin_of(COARSE, spreads=exact), skin.polarity),
+        *symmetries(draw_board(board, exact, seed=seed, name="b0"), skin_of(COARSE, even, exact), skin.polarity),
         amplitude(drawn, skin_of(COARSE), skin_of(COARSE, stronger),
                   pokes_m=each_depth(PLACES_M, (0.3 * skin.thickness_mm * milli,))),
     ]  # fmt: skip
