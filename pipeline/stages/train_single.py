@@ -6,7 +6,7 @@ from pipeline.core.config import Files, Settings, read_settings
 from pipeline.core.stage import run
 from pipeline.dataset.splits import ONE_SKIN
 from pipeline.learning.recipe import Training, training
-from pipeline.trials.data import read_data, train_all, trials_of
+from pipeline.trials.data import prepare_training, read_data, train_all, trials_of
 from pipeline.trials.models import write_models
 
 
@@ -17,6 +17,7 @@ def read(settings: Settings) -> Training:
 
 def train_single(scene: str, files: Files, indentations: Path, folds: Path, models: Path) -> None:
     """Train the recipes of section train_single on every fold of the questions about one skin."""
+    prepare_training()
     data = read_data(read_settings("train_single", scene, files), indentations, folds)
     own = [fold for fold in data.folds if fold.question in ONE_SKIN]
     trials = trials_of(data, read(data.settings), own)
