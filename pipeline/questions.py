@@ -65,6 +65,7 @@ ROWS = (
     Question("labels", "curve", "few_labels", needs=("lobo",), folds=("labels_pool_n", "labels_draws_n"), section=True),
     Question("audit", "other", needs=("lobo",), section=True),
     Question("choice", "report", "report", needs=("lobo", "triplet", "adapt")),
+    _experiment("bound", None, "single_pass"),
     _experiment("drift", "wear", section=True, recorded=True),
     _experiment("variation", "wear", section=True),
     _experiment("shear", "drag", section=True),
