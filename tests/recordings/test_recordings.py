@@ -69,6 +69,15 @@ def test_the_lab_forces_reach_from_a_touch_to_ten_newtons(shared_data: Path, tmp
 
 
 @pytest.mark.parametrize("name", LAB)
+def test_the_lab_tip_pushes_the_skin_the_way_that_its_fields_say_it_moves(
+    shared_data: Path, tmp_path: Path, name: str
+) -> None:
+    # Question compare, from fields alone: pokes of both boards carry the skin by 48 um along the labels' +x.
+    readings, _ = ingest(lab, shared_data / "lab" / f"{name}.csv", tmp_path)
+    assert 0.08 < readings.Fx_N.mean() < 0.6
+
+
+@pytest.mark.parametrize("name", LAB)
 def test_the_lab_chips_are_as_noisy_as_the_data_sheet_says(shared_data: Path, name: str) -> None:
     # Noise about the press's own mean, 65 x 9 degrees of freedom a channel: a standard deviation is known to 3 %.
     trials = read_cells(shared_data / "lab" / f"{name}.csv", name, separator=",")
