@@ -80,7 +80,7 @@ def add(
         list[str] | None,
         Option(help="capture, serial-*: STREAM_S,PROBE_S, one event on both clocks; may be repeated."),
     ] = None,
-    rows_late: Annotated[int, Option(help="ini: rows by which fields lag behind truths.", min=0, max=5)] = 0,
+    rows_late: Annotated[int | None, Option(help="ini: rows that fields lag; without it, found.", min=0, max=5)] = None,
     force_axis: Annotated[Literal["x", "y", "z"], Option(help="eflesh: the gauge's direction.")] = "z",
     allow_copy: Annotated[bool, Option("--allow-copy", help="Accept bytes that another label has.")] = False,
 ) -> None:
@@ -98,7 +98,7 @@ def add(
             prepared = preparing.dump(recording, labels, preparing.Dump(wire or usual, chips_n, rate_hz, probe, marks))
         else:
             options = {"force_axis": str(force_axis)} if layout == "eflesh" else {}
-            options |= {"rows_late": str(rows_late)} if layout == "ini" else {}
+            options |= {"rows_late": str(rows_late)} if layout == "ini" and rows_late is not None else {}
             prepared = preparing.foreign(recording, layout, labels, options)
         header = adding.add(root, scene, prepared, allow_copy=allow_copy)
     alone = f"only this scene: reskin scenes use {scene}"
