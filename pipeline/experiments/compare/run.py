@@ -22,7 +22,7 @@ from pipeline.evaluation.scores import statistic
 from pipeline.experiments.answer import read_folder, write_answer
 from pipeline.experiments.compare import frames
 from pipeline.experiments.compare.fit import SEVEN, TEN, Seen, fit
-from pipeline.experiments.compare.law import Setup, nominal_uT, simulate_uT
+from pipeline.experiments.compare.law import Setup, beyond_n, nominal_uT, simulate_uT
 from pipeline.experiments.compare.pokes import Pokes, cosines, explained, growth, lengths_uT, memory, pool
 from pipeline.physics.board import BoardDesign
 from pipeline.physics.skin import SkinDesign
@@ -116,7 +116,10 @@ def compare_boards(boards: Mapping[str, Pokes], section: Compare, design: SkinDe
             told["refitted"] = asdict(laws["refitted"]) | {"law_of": law_of}
         simulated_uT = {way: simulate_uT(law, setup, own.place_mm, own.pokes.force_N) for way, law in laws.items()}
         simulated_uT["nominal"] = nominal_uT(setup, own.place_mm, own.pokes.force_N)
-        ways = {way: beside(own, of_way) for way, of_way in simulated_uT.items()}
+        ways = {
+            way: beside(own, of_way) | {"beyond_n": beyond_n(laws.get(way), setup, own.pokes.force_N)}
+            for way, of_way in simulated_uT.items()
+        }
         by_board[board] = (
             ways.pop("fitted")
             | ways
