@@ -50,6 +50,12 @@ def turns_of(section: Compare) -> Float[np.ndarray, "k 3 3"]:
     return Rotation.from_euler("z", np.array(section.design.turns_deg)[:, None], degrees=True).as_matrix()
 
 
+def setup_of(section: Compare, design: SkinDesign) -> Setup:
+    """Put the designed skin over the scene's chips."""
+    chips_mm, flipped = np.array(section.design.places_mm), section.skin_flipped
+    return Setup(design, chips_mm, section.design.gap_mm, section.skin_mm, flipped, section.tip_radius_mm)
+
+
 def see(pokes: Pokes, section: Compare) -> Seen:
     """Turn what was read into the board's axes."""
     turn, chips_n = turns_of(section), pokes.db_uT.shape[1]
@@ -102,8 +108,7 @@ def framed(seen: Seen, setup: Setup, section: Compare) -> dict[str, Any]:
 
 def compare_boards(boards: Mapping[str, Pokes], section: Compare, design: SkinDesign, seed: int) -> tuple[Any, Any]:
     """Compare every board; give the numbers, and what the figures draw."""
-    chips_mm = np.array(section.design.places_mm)
-    setup = Setup(design, chips_mm, section.design.gap_mm, section.skin_mm, section.skin_flipped, section.tip_radius_mm)
+    setup = setup_of(section, design)
     seen = {board: see(pokes, section) for board, pokes in boards.items()}
     fitted = {board: fit(own, setup, TEN) for board, own in seen.items()}
     names = list(seen)
@@ -130,7 +135,7 @@ def compare_boards(boards: Mapping[str, Pokes], section: Compare, design: SkinDe
         )
         drawn[board] = _drawn(own, simulated_uT["fitted"])
     numbers = {"by_board": by_board, "memory_put_in": section.memory, "over_boards": over_boards(by_board)}
-    return numbers, {"chips_mm": chips_mm.tolist(), "boards": drawn}
+    return numbers, {"chips_mm": setup.chips_mm.tolist(), "boards": drawn}
 
 
 def over_boards(by_board: Mapping[str, Any]) -> dict[str, Any]:
