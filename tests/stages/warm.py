@@ -70,7 +70,7 @@ def begin(simulated: set[tuple[str, str]]) -> None:
 
 def main(asked: list[str]) -> None:
     with Repo() as repo:
-        planned = plan_repro(get_active_graph(repo.index.graph))
+        planned = [stage for stage in plan_repro(get_active_graph(repo.index.graph)) if stage.cmd]  # else it is data
         stages = {stage.addressing: stage for stage in planned if not asked or stage.addressing in asked}
         simulating = [shlex.split(stage.cmd) for name, stage in stages.items() if name.startswith("simulate@")]
         begin({(words[words.index("--scene") + 1], words[words.index("--protocol") + 1]) for words in simulating})
