@@ -59,5 +59,5 @@ def test_a_third_board_is_one_command_and_no_line_of_code(lab, shared_data):
     order = json.loads((lab / ".reskin/order.json").read_text())["stages"]  # by which stages are counted
     assert re.findall("^(?:Running s|S)tage '(.*?)'", said, re.MULTILINE) == order
     run(lab, "reskin", "remove", "lab", "board3_skin3_board1_depth1")
-    run(lab, *WARM)
+    run(lab, "dvc", "repro")
     assert sorted(by_board(lab)) == ["board1", "board2"]
