@@ -55,8 +55,7 @@ TRIED = {
 @pytest.fixture(scope="module")
 def quadratures():
     reference = Reference(coarser=Quadrature(1e-3, 8), finer=Quadrature(0.7e-3, 8), per_cell_n=3)
-    beside = Pokes(places_mm=POKES.places_mm[:1], depths_mm=POKES.depths_mm)
-    return study_quadratures([trial(pokes=beside)], TRIED, reference)
+    return study_quadratures([trial()], TRIED, reference)
 
 
 def error_of(rows, method, cell_mm=None, layers_n=None) -> float:
