@@ -27,6 +27,7 @@ app = typer.Typer(
 scenes = typer.Typer(no_args_is_help=True, help="Choose which scenes `dvc repro` runs.")
 app.add_typer(scenes, name="scenes")
 
+MODEL = "A trained model (.safetensors), its card (.json) beside it; without one, the map of simulated skins."
 LOGS = (
     "A log as an SD card holds it: t_s,T0,Bx0,By0,Bz0,T1,...; degC and uT. "
     "Or a folder that `reskin record` wrote, or a Parquet file that `reskin decode` wrote."
@@ -185,8 +186,8 @@ def decode(
 @app.command()
 def predict(
     log: Annotated[Path, Argument(help=LOGS)],
-    model: Annotated[Path, Option(help="A trained model (.safetensors), its card (.json) beside it.")],
     out: Annotated[Path, Option(help="The CSV to write: t_s,x_mm,y_mm,F_N,contact.")],
+    model: Annotated[Path | None, Option(help=MODEL)] = None,
     rate_hz: Annotated[float, Option("--rate-hz", help="Parquet without a device clock: frames a second.")] = 400.0,
 ) -> None:
     """Turn a board's log into contacts, places and forces; it begins with a second without contact."""
