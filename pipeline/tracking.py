@@ -166,10 +166,10 @@ def _publish_training(diary: Diary, stage: str, parent_id: str, file: Path, card
     settings |= {name: card[name] for name in ("question", "fold", "seed_i", "seed")} | card["recipe"]
     settings |= {name: card[name] for name in ("train_rows_n", "train_boards", "test_boards", "test_skins")}
     settings |= {f"adapt_{name}": value for name, value in card.get("tuning", {}).get("settings", {}).items()}
-    client.log_batch(run_id, params=[Param(name, str(value)[:500]) for name, value in settings.items()])
     metrics = [(name, value, 0) for name, value in card["scores"]["all"].items()]
     metrics += [(f"registered_{name}", value, 0) for name, value in card["scores"]["registered"].items()]
-    _log(client, run_id, metrics + [("train_loss", value, step) for step, value in enumerate(card["curve"])])
+    metrics += [("train_loss", value, step) for step, value in enumerate(card["curve"])]
+    _log(client, run_id, metrics, [Param(name, str(value)[:500]) for name, value in settings.items()])
     client.log_inputs(run_id, datasets=_datasets(card))
     for artifact in (file, file.with_suffix(".safetensors")):
         client.log_artifact(run_id, str(artifact), "model")
@@ -211,12 +211,12 @@ def _publish_curve(diary: Diary, stage: str, points: Sequence[tuple[str, int, Ma
     return key
 
 
-def _log(client: Any, run_id: str, rows: Iterable[tuple[str, int | float, int]]) -> None:
+def _log(client: Any, run_id: str, rows: Iterable[tuple[str, int | float, int]], params: Sequence[Any] = ()) -> None:
     from mlflow.entities import Metric
 
     metrics = [Metric(name, value, 0, step) for name, value, step in rows]
     for start in range(0, len(metrics), 1000):  # MLflow takes at most 1000 metrics a call
-        client.log_batch(run_id, metrics=metrics[start : start + 1000])
+        client.log_batch(run_id, metrics[start : start + 1000], params if not start else ())
 
 
 def _publish_report(diary: Diary, reports: Path, inputs: str) -> set[str]:

@@ -10,7 +10,6 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Float
 from pydantic import Field, model_validator
-from scipy.signal import lfilter
 
 from pipeline.core.config import Strict
 from pipeline.core.errors import ParamsError
@@ -70,8 +69,9 @@ def remembered(
     for share, tau_s in zip(how.share, how.tau_s, strict=True):
         held, rested = np.exp(-how.contact_s / tau_s), np.exp(-how.rest_s / tau_s)
         crept_T = -np.expm1(-how.contact_s / tau_s) * share * change_T
-        # q before poke i + 1 is what poke i left at its end, rested: one pole.
-        left_T = lfilter([0.0, rested], [1.0, -held * rested], crept_T, axis=0)
+        left_T = np.zeros_like(change_T)  # q before poke i + 1 is what poke i left at its end, rested
+        for i in range(len(change_T) - 1):
+            left_T[i + 1] = rested * crept_T[i] + held * rested * left_T[i]
         before_T += left_T
         added_T += crept_T - (1 - held) * left_T
     return before_T, added_T

@@ -4,6 +4,7 @@ from pathlib import Path
 
 from pipeline.core import io
 from pipeline.core.config import Files, read_settings
+from pipeline.core.executors import make_executor
 from pipeline.core.stage import run, say
 from pipeline.evaluation.choice import to_record
 from pipeline.evaluation.scores import to_csv
@@ -33,15 +34,18 @@ def report(
         io.write_json(reports / "choice.json", record)
     io.write_json(reports / "numbers.json", numbers)
     io.write_json(reports / "scores.json", headline_scores(numbers))
-    tables = make_tables(numbers)
-    io.write_texts(reports / "tables", table_texts(tables) | {"scores.csv": to_csv(scores)})
-    predictions = [io.read_table(models / arm / "predictions.parquet") for arm in asked.modelled]
-    figures = dict(error_grids(predictions, HEADLINE, f"{scene} ({asked.source})"))
-    figures |= headline_figures(numbers, asked.source)
-    figures |= dict(learning_figures(numbers, asked.source)) | experiment_figures(numbers, drawn, asked.source)
+    with make_executor(imports="pipeline.reporting.parts") as executor:  # to draw takes most of the time
+        of_experiments = executor.submit(experiment_figures, numbers, drawn, asked.source)
+        timed = executor.submit(pages, numbers["runtime"], source=asked.source)
+        tables = make_tables(numbers)
+        io.write_texts(reports / "tables", table_texts(tables) | {"scores.csv": to_csv(scores)})
+        predictions = [io.read_table(models / arm / "predictions.parquet") for arm in asked.modelled]
+        figures = dict(error_grids(predictions, HEADLINE, f"{scene} ({asked.source})"))
+        figures |= headline_figures(numbers, asked.source) | dict(learning_figures(numbers, asked.source))
+        costs = timed.result() | learning_pages(numbers["runtime"], asked.source)
+        figures |= of_experiments.result()
     io.write_texts(reports / "figures", figures)
     # Seconds differ between identical runs, so what shows them is no DVC output.
-    costs = pages(numbers["runtime"], source=asked.source) | learning_pages(numbers["runtime"], asked.source)
     io.write_texts(reports / "runtime", costs)
     io.write_text(reports / "index.html", page(numbers, tables, figures, costs))
     results = (io.read_json(file) for file in sorted(reports.parent.glob("*/numbers.json")))
