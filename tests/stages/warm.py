@@ -12,7 +12,6 @@ import shlex
 import sys
 import traceback
 
-import numpy as np
 from dvc.repo import Repo
 from dvc.repo.reproduce import get_active_graph, plan_repro
 
@@ -51,6 +50,9 @@ def run_stage(name: str, command: str) -> int:
 
 def begin(simulated: set[tuple[str, str]]) -> None:
     """Import what stages import, and follow the material under a tip for the skins of these scenes' protocols."""
+    importlib.import_module("pipeline")  # first, as it tells NumPy which instructions to use
+    import numpy as np
+
     from pipeline.core.config import Files, Settings, read_yaml
     from pipeline.physics.skin import draw_skin, moved_dipoles
     from pipeline.stages.code import entries
@@ -70,7 +72,7 @@ def begin(simulated: set[tuple[str, str]]) -> None:
 
 def main(asked: list[str]) -> None:
     with Repo() as repo:
-        planned = [stage for stage in plan_repro(get_active_graph(repo.index.graph)) if stage.cmd]  # else it is data
+        planned = plan_repro(get_active_graph(repo.index.graph))
         stages = {stage.addressing: stage for stage in planned if not asked or stage.addressing in asked}
         simulating = [shlex.split(stage.cmd) for name, stage in stages.items() if name.startswith("simulate@")]
         begin({(words[words.index("--scene") + 1], words[words.index("--protocol") + 1]) for words in simulating})
