@@ -1,0 +1,217 @@
+"""Question universal: what is known of boards -> scores of a map and of a network with it on a held-out board.
+
+With recorded boards of the rig (`rig`), and with none (`nominal`): a law's nominal numbers and their spreads alone.
+Places and fields are turned to the board's frame first. Refuses to know files and how networks are trained.
+"""
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from pipeline.core.errors import ParamsError
+from pipeline.core.seeds import rng_for
+from pipeline.dataset.splits import Fold
+from pipeline.trials.data import SceneData
+from pipeline.trials.models import score_test
+from pipeline.twin.experts import Labels, centre, multiply, off_middle_mm, shift
+from pipeline.twin.fit import Seen
+from pipeline.twin.law import Law, Setup, simulate_uT
+from pipeline.twin.network import Opinion, Weights, predict
+from pipeline.twin.residual import Residual, carry
+from pipeline.twin.skin_map import Estimate, Reader, SkinMap, new_map, see_even, see_labelled, see_pokes, see_rest
+from pipeline.twin.tables import Tables
+from pipeline.twin.training import Recorded
+
+QUESTION = "labels"  # whose folds these are
+WAYS = {"rig": "boards of the rig", "nominal": "simulated alone"}
+REACH = 1.645  # standard deviations to either side of a 90 % interval
+TEMPERS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15)
+ASSUMED_TEMPER = 0.5  # where no board is known that it could be told on: of two experts on one reading, the mean
+FORCE_MIN_N = 0.3  # of a labelled poke: below, the map is not tabulated
+READINGS_N = 100  # of a poke that a network is taught
+
+
+@dataclass(frozen=True)
+class Frame:
+    """How boards lie under their labels: chips' axes, and labels' middle and direction of y."""
+
+    turn: Float[np.ndarray, "k 3 3"]
+    middle_mm: tuple[float, float]
+    mirrored: bool
+
+    def field(self, b_uT: Float[np.ndarray, "n ch"]) -> Float[np.ndarray, "n ch"]:
+        """Turn readings from the chips' axes to the board's."""
+        of_chips = b_uT.astype(float).reshape(len(b_uT), -1, 3)
+        return np.einsum("kij,nkj->nki", self.turn, of_chips).reshape(len(b_uT), -1)
+
+    def place(self, label_mm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        """Turn labels to places in the board's frame."""
+        return (label_mm - self.middle_mm) * (1, -1 if self.mirrored else 1)
+
+    def label(self, place_mm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        """Turn places in the board's frame to labels."""
+        return place_mm * (1, -1 if self.mirrored else 1) + self.middle_mm
+
+
+@dataclass(frozen=True)
+class Experts:
+    """What comes with the project for a further board: tables, known boards' errors, trained networks."""
+
+    tables: Tables
+    networks: Sequence[Weights]
+    residual: Residual | None = None
+
+
+@dataclass(frozen=True)
+class Bench:
+    """All that folds share: rows, how boards lie under labels, what is known of each board, experts that know none."""
+
+    data: SceneData
+    frame: Frame
+    seen: Mapping[str, Seen]
+    nominal: Experts
+
+
+@dataclass(frozen=True)
+class Pokes:
+    """Pokes of one board, the mean of their readings each, in the board's frame and axes; in the order of labelling."""
+
+    place_mm: Float[np.ndarray, "m 2"]
+    force_N: Float[np.ndarray, " m"]
+    db_uT: Float[np.ndarray, "m ch"]
+
+
+@dataclass(frozen=True)
+class Told:
+    """Experts that have seen a board's field at rest and its unlabelled pokes."""
+
+    skin: SkinMap
+    networks: Sequence[Weights]
+    rest_uT: Float[np.ndarray, " ch"]
+    pool: Pokes
+    pool_mm: Float[np.ndarray, "m 2"]  # where the networks say that these are
+
+    def opinion(self, db_uT: Float[np.ndarray, "n ch"], labels_n: int) -> Opinion:
+        """Ask the networks, centred by the pool and shifted by its first labels."""
+        said = predict(self.networks, db_uT, self.rest_uT, self.pool.db_uT)
+        said_mm = self.pool_mm[:labels_n] - off_middle_mm(self.pool_mm, labels_n)
+        return shift(centre(said, self.pool_mm, labels_n), Labels(said_mm, self.pool.place_mm[:labels_n]))
+
+
+def score_fold(bench: Bench, fold: Fold, rig: Mapping[str, Experts], labels_n: Sequence[int]) -> list[dict[str, Any]]:
+    """Score the map alone and both experts on one fold: how sure they are is told on boards that are not held out."""
+    board = str(bench.data.rows.board[fold.test[0]])
+    others = [other for other in bench.seen if other != board]
+    if board not in bench.seen:  # they are named by board and skin where a board has several
+        rule = "boards of one skin each"
+        raise ParamsError(f"fold {fold.name}", "the boards", rule, ", ".join(bench.seen), "Do not ask it.")
+    pool, rest_uT = pool_of(bench, fold), bench.seen[board].rest_uT.ravel()
+    test_uT = bench.frame.field(bench.data.rows.db_uT[fold.test])
+    points = []
+    for way, experts in {"rig": rig[board], "nominal": bench.nominal}.items():
+        start_s = time.monotonic()
+        told = tell(experts, rest_uT, pool)
+        took_s = time.monotonic() - start_s
+        for n in labels_n:
+            tempers = tell_tempers(bench, others, n) if way == "rig" else (ASSUMED_TEMPER, ASSUMED_TEMPER)
+            for name, temper, found in read_both(told, test_uT, n, tempers):
+                words = {"method": f"{name}{WAYS[way]}", "labels_n": n, "fold": fold.name.rsplit("-draw", 1)[0]}
+                words |= {"inputs": "map" if "map" in name else "map and network", "temper": temper}
+                words |= {"seed_i": int(fold.name.rsplit("-draw", 1)[1]), "seconds": took_s}
+                points.append(words | {"scores": scored(bench, fold.test, found)})
+    return points
+
+
+def tell(experts: Experts, rest_uT: Float[np.ndarray, " ch"], pool: Pokes) -> Told:
+    """Tell experts what a new board gives without a label: its field at rest, and pokes all over it."""
+    skin = see_pokes(see_rest(new_map(experts.tables, experts.residual), rest_uT), pool.db_uT)
+    pool_mm = predict(experts.networks, pool.db_uT, rest_uT, pool.db_uT).place_mm
+    return Told(see_even(skin, pool.db_uT), experts.networks, rest_uT, pool, pool_mm)
+
+
+def read_both(
+    told: Told, db_uT: Float[np.ndarray, "n ch"], labels_n: int, tempers: tuple[float, float]
+) -> list[tuple[str, float, Estimate]]:
+    """Read places with so many labels: by the map alone, and by it and the networks; by name and temper."""
+    first = slice(labels_n)
+    force_N = np.maximum(told.pool.force_N[first], FORCE_MIN_N)
+    skin = see_labelled(told.skin, told.pool.place_mm[first], force_N, told.pool.db_uT[first])
+    reader = Reader(replace(skin, temper=tempers[0]))
+    both = multiply(reader, db_uT, told.opinion(db_uT, labels_n), tempers[1])
+    alone = reader.estimate(db_uT)
+    return [("universal map, ", tempers[0], alone), ("universal, ", tempers[1], both)]
+
+
+def tell_tempers(bench: Bench, boards: Sequence[str], labels_n: int) -> tuple[float, float]:
+    """Find how much the map, and both experts, are to be believed: 90 % intervals hold 90 % on boards not held out.
+
+    Each is read by the nominal experts, which know no board, with as many labels of its own, on its other pokes.
+    """
+    held: dict[tuple[int, float], list[float]] = {}
+    for board in boards:
+        seen = bench.seen[board]
+        order = rng_for(bench.data.settings.seed, "universal", board).permutation(len(seen.pokes))
+        pool_n = len(order) // 3
+        db_uT = seen.db_uT.reshape(len(order), -1)[order]
+        place_mm, force_N = seen.place_mm[order], seen.pokes.force_N[order]
+        pool = Pokes(place_mm[:pool_n], force_N[:pool_n], db_uT[:pool_n])
+        told = tell(bench.nominal, seen.rest_uT.ravel(), pool)
+        for temper in TEMPERS:
+            found = read_both(told, db_uT[pool_n:], min(labels_n, pool_n), (temper, temper))
+            for i, (_, _, estimate) in enumerate(found):
+                held.setdefault((i, temper), []).append(covered(estimate, place_mm[pool_n:]))
+    nearest = [min(TEMPERS, key=lambda temper, i=i: abs(np.mean(held[i, temper]) - 0.9)) for i in range(2)]  # type: ignore[misc]
+    return nearest[0], nearest[1]
+
+
+def covered(estimate: Estimate, place_mm: Float[np.ndarray, "n 2"]) -> float:
+    """Give the part of coordinates that lie in their 90 % intervals."""
+    return float((np.abs(estimate.place_mm - place_mm) <= REACH * estimate.sd_mm).mean())
+
+
+def scored(bench: Bench, test: Int64[np.ndarray, " b"], estimate: Estimate) -> dict[str, Any]:
+    """Score estimates as every method's, and count what their 90 % intervals hold."""
+    label_mm = bench.frame.label(estimate.place_mm)
+    predicted = np.column_stack([label_mm, estimate.force_N]).astype(np.float32)
+    scores = score_test(bench.data, test, predicted)
+    true_mm = bench.frame.place(bench.data.rows.target[test, :2].astype(float))
+    coverage = {"coverage_pct": 100 * covered(estimate, true_mm)}
+    skins = {name: own | coverage for name, own in scores["by_skin"].items()} if len(scores["by_skin"]) == 1 else {}
+    return scores | {"all": scores["all"] | coverage} | ({"by_skin": skins} if skins else {})
+
+
+def carried(seen: Mapping[str, Seen], laws: Mapping[str, Law], setup: Setup) -> Residual:
+    """Carry what laws miss on the boards that they were fitted on."""
+    missed = []
+    for board, own in seen.items():
+        simulated_uT = simulate_uT(laws[board], setup, own.place_mm, own.pokes.force_N).reshape(len(own.pokes), -1)
+        off_uT = own.db_uT.reshape(simulated_uT.shape) - simulated_uT
+        missed.append(off_uT / np.linalg.norm(simulated_uT, axis=1, keepdims=True))
+    boards = list(seen.values())
+    return carry([own.place_mm for own in boards], [own.pokes.force_N for own in boards], missed)
+
+
+def recorded(data: SceneData, frame: Frame, board: str, rest_uT: Float[np.ndarray, " ch"]) -> Recorded:
+    """Take a known board's readings for teaching: as many of each poke, of those with a force."""
+    rows = data.rows
+    own = np.flatnonzero((rows.board == board) & (rows.target[:, 2] > 0))
+    _, first, counts = np.unique(rows.indentation[own], return_index=True, return_counts=True)
+    each = own[first[:, None] + np.arange(READINGS_N) % counts[:, None]]  # an indentation's readings lie together
+    db_uT = frame.field(rows.db_uT[each.ravel()]).reshape(*each.shape, -1)
+    place_mm = frame.place(rows.target[each[:, 0], :2].astype(float))
+    parts = db_uT, rest_uT, place_mm, rows.target[each, 2]
+    return Recorded(*(part.astype(np.float32) for part in parts))
+
+
+def pool_of(bench: Bench, fold: Fold) -> Pokes:
+    """Give the means of the pool's pokes, in the order in which question labels hands out labels."""
+    rows, indentation = bench.data.rows, bench.data.rows.indentation[fold.pool]
+    order = rng_for(bench.data.settings.seed, "labelled", fold.name).permutation(np.unique(indentation))
+    own = [fold.pool[indentation == one] for one in order]
+    target = np.array([rows.target[one].mean(axis=0) for one in own], float)
+    db_uT = np.array([rows.db_uT[one].mean(axis=0) for one in own], float)
+    return Pokes(bench.frame.place(target[:, :2]), target[:, 2], bench.frame.field(db_uT))
