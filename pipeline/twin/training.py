@@ -14,11 +14,10 @@ from jaxtyping import Float, Float32
 from pydantic import Field
 from torch.nn.functional import huber_loss
 
-
 from pipeline.core.config import Strict
 from pipeline.core.seeds import rng_for
 from pipeline.twin.law import Law, Setup
-from pipeline.twin.network import LOG_N, PLACE_MM, Network, Weights, draw_weights
+from pipeline.twin.network import LOG_N, PLACE_MM, Network, draw_weights
 from pipeline.twin.population import PLACES_N, POKES_N, Population, draw_population
 from pipeline.twin.residual import Residual
 
