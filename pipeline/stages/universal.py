@@ -51,9 +51,9 @@ def universal(scene: str, files: Files, indentations: Path, folds: Path, scores:
         raise ParamsError(f"scene {scene}", "boards with known forces", "two or more", len(skins), "Add one.")
     setup = setup_of(section, parse(SkinDesign, settings.shared["skin"], "params.yaml: skin"))
     frame = Frame(turns_of(section), section.labels_middle_mm, section.labels_mirrored)
-    known = Known(data, frame, setup, {board: see(pokes, section) for board, pokes in skins.items()})
-    nominal, rig = make_experts(known, read(settings))
-    bench, points = Bench(data, frame, known.seen, nominal), []
+    seen = {board: see(pokes, section) for board, pokes in skins.items()}
+    nominal, rig = make_experts(Known(data, frame, setup, seen), read(settings))
+    bench, points = Bench(data, frame, seen, nominal), []
     for fold in data.folds_of(QUESTION):
         points += score_fold(bench, fold, rig, read(settings).labels_n)
         say(f"{scene} universal: {fold.name} done")
@@ -65,7 +65,6 @@ def make_experts(known: Known, lessons: Lessons) -> tuple[Experts, dict[str, Exp
     seen, setup, data = known.seen, known.setup, known.data
     with make_executor(imports="pipeline.twin.training") as executor:
         laws = dict(zip(seen, executor.map(fit, seen.values(), [setup] * len(seen), [TEN] * len(seen)), strict=True))
-        say(f"{data.scene} universal: fitted {len(laws)} boards")
         syllabuses = [Syllabus("nominal", NOMINAL, OF_NOMINAL, setup)]
         for board in seen:
             others = {other: own for other, own in seen.items() if other != board}

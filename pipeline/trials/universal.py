@@ -164,8 +164,11 @@ def tell_tempers(bench: Bench, boards: Sequence[str], labels_n: int) -> tuple[fl
             found = read_both(told, db_uT[pool_n:], min(labels_n, pool_n), (temper, temper))
             for i, (_, _, estimate) in enumerate(found):
                 held.setdefault((i, temper), []).append(covered(estimate, place_mm[pool_n:]))
-    nearest = [min(TEMPERS, key=lambda temper, i=i: abs(np.mean(held[i, temper]) - 0.9)) for i in range(2)]  # type: ignore[misc]
-    return nearest[0], nearest[1]
+
+    def nearest(i: int) -> float:
+        return min(TEMPERS, key=lambda temper: abs(float(np.mean(held[i, temper])) - 0.9))
+
+    return nearest(0), nearest(1)
 
 
 def covered(estimate: Estimate, place_mm: Float[np.ndarray, "n 2"]) -> float:

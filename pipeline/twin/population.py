@@ -84,7 +84,7 @@ def draw_skin(
 ) -> tuple[Float[np.ndarray, "m ch"], Float[np.ndarray, " ch"], Float[np.ndarray, "m 2"], Float[np.ndarray, " m"]]:
     """Simulate one skin on chips that err: changes of field and the field at rest, in uT, places and forces."""
     place_mm = draw_places(rng)
-    force_N = np.exp(rng.uniform(*np.log(FORCES_N), POKES_N))
+    force_N = np.exp(rng.uniform(np.log(FORCES_N[0]), np.log(FORCES_N[1]), POKES_N))
     filled = fill(setup.rest, rng)
     db_uT, rest_uT = simulate_uT(law, setup, place_mm, force_N, filled), at_rest_uT(law, setup, filled)
     chips_n = len(rest_uT)

@@ -148,7 +148,7 @@ class Feed:
         return add_error(db_uT, place_mm, log_N, self.error, rng), self.skins.rest_uT[i], place_mm, log_N
 
     def _recorded(self, n: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-        drawn = [draw_recorded(self.recorded[rng.integers(len(self.recorded))], rng) for _ in range(n)]
+        drawn = [draw_recorded(self.recorded[int(rng.integers(len(self.recorded)))], rng) for _ in range(n)]
         db_uT, rest_uT, place_mm, log_N = (np.stack(part) for part in zip(*drawn, strict=True))
         return add_error(db_uT, place_mm, log_N, ERROR_OF_RECORDED, rng), rest_uT, place_mm, log_N
 

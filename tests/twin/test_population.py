@@ -27,14 +27,14 @@ def test_the_same_seed_draws_the_same_skins_however_many_more_are_drawn(monkeypa
 
 def test_numbers_spread_as_the_table_says_and_stay_where_skins_can_be():
     rng = rng_for(1, "laws")
-    laws = [draw_law(NOMINAL, OF_NOMINAL, rng) for _ in range(2000)]
+    laws = [draw_law(NOMINAL, OF_NOMINAL, rng) for _ in range(300)]
     for name in ("seat_x_mm", "label_y_mm", "tilt_x_deg", "give_x_um"):
-        # The standard error of a standard deviation from 2,000 draws is 1.6 %.
-        assert np.std([getattr(law, name) for law in laws]) == pytest.approx(OF_NOMINAL[name], rel=0.08)
+        # The standard error of a standard deviation from 300 draws is 4 %.
+        assert np.std([getattr(law, name) for law in laws]) == pytest.approx(OF_NOMINAL[name], rel=0.16)
     for name, least in LEAST.items():
         assert min(getattr(law, name) for law in laws) >= least
     gap_mm, log = np.array([law.gap_mm for law in laws]), np.log([law.amplitude for law in laws])
-    assert np.polyfit(gap_mm, log, 1)[0] == pytest.approx(population.STRONGER_PER_MM, abs=0.08)
+    assert np.polyfit(gap_mm, log, 1)[0] == pytest.approx(population.STRONGER_PER_MM, abs=0.15)
 
 
 def test_pokes_begin_with_every_place_of_the_grid_and_all_lie_on_the_skin():
