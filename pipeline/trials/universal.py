@@ -16,15 +16,12 @@ from pipeline.core.errors import ParamsError
 from pipeline.core.seeds import rng_for
 from pipeline.dataset.splits import Fold
 from pipeline.trials.data import SceneData
+from pipeline.trials.experts import Experts, Frame
 from pipeline.trials.models import score_test
 from pipeline.twin.experts import Labels, centre, multiply, off_middle_mm, shift
 from pipeline.twin.fit import Seen
-from pipeline.twin.law import Law, Setup, simulate_uT
 from pipeline.twin.network import Opinion, Weights, predict
-from pipeline.twin.residual import Residual, carry
 from pipeline.twin.skin_map import Estimate, Reader, SkinMap, new_map, see_even, see_labelled, see_pokes, see_rest
-from pipeline.twin.tables import Tables
-from pipeline.twin.training import Recorded
 
 QUESTION = "labels"  # whose folds these are
 WAYS = {"rig": "boards of the rig", "nominal": "simulated alone"}
@@ -32,38 +29,6 @@ REACH = 1.645  # standard deviations to either side of a 90 % interval
 TEMPERS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15)
 ASSUMED_TEMPER = 0.5  # where no board is known that it could be told on: of two experts on one reading, the mean
 FORCE_MIN_N = 0.3  # of a labelled poke: below, the map is not tabulated
-READINGS_N = 100  # of a poke that a network is taught
-
-
-@dataclass(frozen=True)
-class Frame:
-    """How boards lie under their labels: chips' axes, and labels' middle and direction of y."""
-
-    turn: Float[np.ndarray, "k 3 3"]
-    middle_mm: tuple[float, float]
-    mirrored: bool
-
-    def field(self, b_uT: Float[np.ndarray, "n ch"]) -> Float[np.ndarray, "n ch"]:
-        """Turn readings from the chips' axes to the board's."""
-        of_chips = b_uT.astype(float).reshape(len(b_uT), -1, 3)
-        return np.einsum("kij,nkj->nki", self.turn, of_chips).reshape(len(b_uT), -1)
-
-    def place(self, label_mm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Turn labels to places in the board's frame."""
-        return (label_mm - self.middle_mm) * (1, -1 if self.mirrored else 1)
-
-    def label(self, place_mm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Turn places in the board's frame to labels."""
-        return place_mm * (1, -1 if self.mirrored else 1) + self.middle_mm
-
-
-@dataclass(frozen=True)
-class Experts:
-    """What comes with the project for a further board: tables, known boards' errors, trained networks."""
-
-    tables: Tables
-    networks: Sequence[Weights]
-    residual: Residual | None = None
 
 
 @dataclass(frozen=True)
@@ -185,29 +150,6 @@ def scored(bench: Bench, test: Int64[np.ndarray, " b"], estimate: Estimate) -> d
     coverage = {"coverage_pct": 100 * covered(estimate, true_mm)}
     skins = {name: own | coverage for name, own in scores["by_skin"].items()} if len(scores["by_skin"]) == 1 else {}
     return scores | {"all": scores["all"] | coverage} | ({"by_skin": skins} if skins else {})
-
-
-def carried(seen: Mapping[str, Seen], laws: Mapping[str, Law], setup: Setup) -> Residual:
-    """Carry what laws miss on the boards that they were fitted on."""
-    missed = []
-    for board, own in seen.items():
-        simulated_uT = simulate_uT(laws[board], setup, own.place_mm, own.pokes.force_N).reshape(len(own.pokes), -1)
-        off_uT = own.db_uT.reshape(simulated_uT.shape) - simulated_uT
-        missed.append(off_uT / np.linalg.norm(simulated_uT, axis=1, keepdims=True))
-    boards = list(seen.values())
-    return carry([own.place_mm for own in boards], [own.pokes.force_N for own in boards], missed)
-
-
-def recorded(data: SceneData, frame: Frame, board: str, rest_uT: Float[np.ndarray, " ch"]) -> Recorded:
-    """Take a known board's readings for teaching: as many of each poke, of those with a force."""
-    rows = data.rows
-    own = np.flatnonzero((rows.board == board) & (rows.target[:, 2] > 0))
-    _, first, counts = np.unique(rows.indentation[own], return_index=True, return_counts=True)
-    each = own[first[:, None] + np.arange(READINGS_N) % counts[:, None]]  # an indentation's readings lie together
-    db_uT = frame.field(rows.db_uT[each.ravel()]).reshape(*each.shape, -1)
-    place_mm = frame.place(rows.target[each[:, 0], :2].astype(float))
-    parts = db_uT, rest_uT, place_mm, rows.target[each, 2]
-    return Recorded(*(part.astype(np.float32) for part in parts))
 
 
 def pool_of(bench: Bench, fold: Fold) -> Pokes:
