@@ -16,6 +16,8 @@ export DO_NOT_TRACK = true
 export DVC_NO_ANALYTICS = 1
 # One thread a process: steadier on few cores, and the same sums in the same order everywhere.
 export OMP_NUM_THREADS = 1
+# Where an environment forbids it, every stage and every worker of the tests would compile all its modules again.
+export PYTHONDONTWRITEBYTECODE =
 
 .PHONY: repro test test-processors lint ui bench time-repro readme clean
 TRAINING_TESTS := tests/extremes tests/learning tests/evaluation tests/stages tests/test_numerics.py

@@ -10,13 +10,15 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from pipeline import plan
 from pipeline.capture.header import STREAM_FILE, Header, write_capture
 from pipeline.core import config, io
 from pipeline.core.errors import CaptureError, ReskinError
+from pipeline.core.stage import say
 from pipeline.dataset.captures import check_losses, open_capture
-from pipeline.params import read_plan, read_scene, read_shared
+from pipeline.params import Scene, read_plan, read_scene, read_shared
 from pipeline.preparing import Prepared
 from pipeline.registry import REGISTRY, read_registry, with_capture, without_capture, write_registry
 
@@ -45,6 +47,8 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
         _dvc(root, "add", "--quiet", str(target.relative_to(root)))
         write_registry(root, after)
         plan.use(root, [*read_plan(root / config.PLAN).scenes, scene])
+    if "compare" in (settings.model_extra or {}):
+        _warn_of_departures(target, settings, read_shared(root / config.PARAMS)["skin"])
     return complete
 
 
@@ -80,6 +84,22 @@ def _read_through(folder: Path, header: Header, limit: float) -> tuple[str, ...]
         counts = f"none; counted {dict(account)}"
         raise CaptureError(folder.name, "a capture", "one reading or more", counts, "Check its files.")
     return (readings.hexdigest(), *(header.files[name] for name in (STREAM_FILE,) if name in header.files))
+
+
+def _warn_of_departures(folder: Path, scene: Scene, skin: Mapping[str, Any]) -> None:
+    """Warn if a capture seems to lie otherwise than section compare of its scene says; it stays added."""
+    from pipeline.experiments.compare.joining import departure  # late: the physics takes seconds
+    from pipeline.experiments.compare.run import Compare
+    from pipeline.physics.skin import SkinDesign
+
+    _, blocks, _ = open_capture(folder)
+    section = config.parse(Compare, (scene.model_extra or {})["compare"], "section compare")
+    try:
+        sentence = departure(list(blocks), section, config.parse(SkinDesign, skin, "params.yaml: skin"))
+    except ReskinError as error:
+        sentence = f"Whether labels, chips and skin lie as the scene says was not checked: {error}"
+    if sentence:
+        say(f"warning: capture {folder.name}: {sentence} It was added all the same.")
 
 
 @contextmanager

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from pipeline.physics.board import Board
     from pipeline.physics.skin import Skin
     from pipeline.trials.networks import Network
+    from pipeline.twin.shipped import Universal
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 Changes = Mapping[str, Any]  # settings of params.yaml or of a scene, by name
@@ -173,6 +174,19 @@ def load_model(file: Path | str) -> Model:
     from pipeline.predicting import read_network
 
     return Model(read_network(Path(file)))
+
+
+def load_universal() -> Universal:
+    """Load the map of simulated skins that comes with the project, for a skin that nobody calibrated.
+
+    >>> skin = load_universal().zero(noload_uT)  # doctest: +SKIP
+    >>> x_mm, y_mm, force_N = skin.predict(b_uT)[0]  # doctest: +SKIP
+
+    It learns while it is used: `see` pokes anywhere, `label` some at known places.
+    """
+    from pipeline.twin import shipped
+
+    return shipped.load_universal()
 
 
 def _main_boards(scene: str) -> dict[str, Any]:

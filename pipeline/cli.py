@@ -27,6 +27,7 @@ app = typer.Typer(
 scenes = typer.Typer(no_args_is_help=True, help="Choose which scenes `dvc repro` runs.")
 app.add_typer(scenes, name="scenes")
 
+MODEL = "A trained model (.safetensors), its card (.json) beside it; without one, the map of simulated skins."
 LOGS = (
     "A log as an SD card holds it: t_s,T0,Bx0,By0,Bz0,T1,...; degC and uT. "
     "Or a folder that `reskin record` wrote, or a Parquet file that `reskin decode` wrote."
@@ -35,6 +36,7 @@ LOGS = (
 Layout = Literal["capture", "serial-binary", "serial-text", "table", "lab", "ini", "eflesh"]
 Wire = Literal["binary", "binary-clock", "text-xyzt", "text-txyz"]
 Board = Annotated[str, Option(help="The circuit board's name.")]
+Marks = Annotated[list[str] | None, Option(help="capture, serial-*: STREAM_S,PROBE_S of one event; may be repeated.")]
 Chips = Annotated[int, Option("--chips", help="Chips in a frame.", min=1, max=64)]
 
 
@@ -76,11 +78,8 @@ def add(
     chips_n: Annotated[int, Option("--chips", help="serial-*: chips in a frame.", min=1, max=64)] = 5,
     rate_hz: Annotated[float, Option("--rate-hz", help="serial-*: frames a second.")] = 400.0,
     wire: Annotated[Wire | None, Option(help="serial-*: format, if not binary or text-xyzt.")] = None,
-    mark: Annotated[
-        list[str] | None,
-        Option(help="capture, serial-*: STREAM_S,PROBE_S, one event on both clocks; may be repeated."),
-    ] = None,
-    rows_late: Annotated[int, Option(help="ini: rows by which fields lag behind truths.", min=0, max=5)] = 0,
+    mark: Marks = None,
+    rows_late: Annotated[int | None, Option(help="ini: rows that fields lag; without it, found.", min=0, max=5)] = None,
     force_axis: Annotated[Literal["x", "y", "z"], Option(help="eflesh: the gauge's direction.")] = "z",
     allow_copy: Annotated[bool, Option("--allow-copy", help="Accept bytes that another label has.")] = False,
 ) -> None:
@@ -98,7 +97,7 @@ def add(
             prepared = preparing.dump(recording, labels, preparing.Dump(wire or usual, chips_n, rate_hz, probe, marks))
         else:
             options = {"force_axis": str(force_axis)} if layout == "eflesh" else {}
-            options |= {"rows_late": str(rows_late)} if layout == "ini" else {}
+            options |= {"rows_late": str(rows_late)} if layout == "ini" and rows_late is not None else {}
             prepared = preparing.foreign(recording, layout, labels, options)
         header = adding.add(root, scene, prepared, allow_copy=allow_copy)
     alone = f"only this scene: reskin scenes use {scene}"
@@ -156,13 +155,14 @@ def record(
     chips_n: Chips = 5,
     baud: Annotated[int, Option(help="Baud rate; USB ports ignore it.", min=1)] = 115200,
     seconds: Annotated[float, Option(help="How long; without it, until Ctrl-C.", min=0.0)] = math.inf,
+    scan: Annotated[str, Option(help="The order of the rig's places: random, snake, or your words.")] = "not stated",
 ) -> None:
     """Record what a board sends; label it with the robot's log when adding it."""
     from pipeline.capture.port import PortSettings
-    from pipeline.recording import print_progress, record_capture
+    from pipeline.recording import Told, print_progress, record_capture
 
     settings = PortSettings(baud, wire, chips_n, seconds, bytes_max_n=None, silence_s=5.0, no_frame_s=5.0)
-    done = record_capture(port, out, board=board, skin=skin, settings=settings, report=print_progress())
+    done = record_capture(port, out, told=Told(board, skin, scan), settings=settings, report=print_progress())
     counts = ", ".join(f"{key} {count}" for key, count in done.account.items() if count)
     typer.echo(f"recorded {out} ({done.ended} after {done.duration_s:.1f} s): {counts}")
 
@@ -186,8 +186,8 @@ def decode(
 @app.command()
 def predict(
     log: Annotated[Path, Argument(help=LOGS)],
-    model: Annotated[Path, Option(help="A trained model (.safetensors), its card (.json) beside it.")],
     out: Annotated[Path, Option(help="The CSV to write: t_s,x_mm,y_mm,F_N,contact.")],
+    model: Annotated[Path | None, Option(help=MODEL)] = None,
     rate_hz: Annotated[float, Option("--rate-hz", help="Parquet without a device clock: frames a second.")] = 400.0,
 ) -> None:
     """Turn a board's log into contacts, places and forces; it begins with a second without contact."""

@@ -19,10 +19,11 @@ from pipeline.core import io
 from pipeline.core.config import Strict, parse
 from pipeline.core.errors import CaptureError, ParamsError, SchemaError
 from pipeline.dataset.captures import read_header, timer
-from pipeline.experiments.logs.estimates import Estimates, describe, estimate
+from pipeline.experiments.logs.estimates import Answers, Estimates, describe, estimate, quiet_start
 from pipeline.learning.card import FORMAT
 from pipeline.learning.inputs import VIEW
 from pipeline.trials.networks import Network
+from pipeline.twin.shipped import CHANNELS_N, load_universal
 
 PARQUET_MAGIC = b"PAR1"
 ANSWERS = ("x_mm", "y_mm", "Fz_N")
@@ -53,22 +54,27 @@ class Card(Strict, extra="ignore"):
     collapsed: bool
 
 
-def predict(log: Path, model: Path, out: Path, *, rate_hz: float = 400.0) -> dict[str, Any]:
+def predict(log: Path, model: Path | None, out: Path, *, rate_hz: float = 400.0) -> dict[str, Any]:
     """Write t_s, x_mm, y_mm, F_N and contact of every sound frame of a log; give the account of what was read.
 
-    Places and forces are left empty where there is no contact. `rate_hz` gives a decoded dump without a clock its time.
+    Without a model the map of simulated skins answers, which comes with the project (`twin.shipped`). Places and forces
+    are left empty where there is no contact. `rate_hz` gives a decoded dump without a clock its time.
     """
-    network = read_network(model)
-    read = (log, model, model.with_suffix(".json"))
+    network = None if model is None else read_network(model)
+    read = (log,) if model is None else (log, model, model.with_suffix(".json"))
     if out.resolve() in {file.resolve() for file in read}:
         rule = "another than the log, the model and its card"
         raise ParamsError("--out", "the file to write", rule, out, "Choose another --out.")
     t_s, b_uT, _, account = read_any_log(log, rate_hz)
-    channels_n = network.card["input"]["channels_n"]
+    channels_n = CHANNELS_N if network is None else network.card["input"]["channels_n"]
     if b_uT.shape[1] != channels_n:
         remedy = "Take a model of such boards."
         raise SchemaError(log, "channels", f"the {channels_n} of the model", b_uT.shape[1], remedy)
-    found = estimate(t_s, b_uT, [network], where=str(log))
+    if network is None:
+        answers: Answers = load_universal().zero(b_uT[: quiet_start(t_s, b_uT, where=str(log))])
+    else:
+        answers = network
+    found = estimate(t_s, b_uT, [answers], where=str(log))
     io.write_text(out, render(found))
     return describe(found) | account
 

@@ -66,6 +66,7 @@ ROWS = (
     Question("universal", "curve", needs=("labels", "compare"), section=True),
     Question("audit", "other", needs=("lobo",), section=True),
     Question("choice", "report", "report", needs=("lobo", "triplet", "adapt")),
+    _experiment("bound", None, "single_pass"),
     _experiment("drift", "wear", section=True, recorded=True),
     _experiment("variation", "wear", section=True),
     _experiment("shear", "drag", section=True),

@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.capture.header import HEADER_FILE, Clock, recorded, render, seal
@@ -18,18 +19,25 @@ from pipeline.core.errors import CaptureError
 PROGRESS_s = 1.0
 
 
-def record_capture(
-    port: str, folder: Path, *, board: str, skin: str, settings: PortSettings, report: Report
-) -> Recording:
+@dataclass(frozen=True)
+class Told:
+    """What the user says of a recording to come; `scan` is the order of the rig's places: random, snake, or words."""
+
+    board: str
+    skin: str
+    scan: str
+
+
+def record_capture(port: str, folder: Path, *, told: Told, settings: PortSettings, report: Report) -> Recording:
     """Record what a port sends, as a native capture without labels."""
     part = folder.with_name(f"{folder.name}.part")
     for path in (folder, part):
         if path.exists():
             raise CaptureError(path, "the capture's folder", "new", "one that is there", "Choose another --out.")
     header = recorded(
-        f"--out {folder.name}", capture=folder.name, board=board, skin=skin, layout="native", wire=settings.wire,
-        chips_n=settings.chips_n, clock=Clock(kind="arrivals", rate_hz=None, marks=()),
-        protocol="as the probe log says",
+        f"--out {folder.name}", capture=folder.name, board=told.board, skin=told.skin, layout="native",
+        wire=settings.wire, chips_n=settings.chips_n, options={"scan": told.scan},
+        clock=Clock(kind="arrivals", rate_hz=None, marks=()), protocol="as the probe log says",
         note="recorded by reskin record; arrival times are unix seconds of the host",
     )  # fmt: skip
     part.mkdir(parents=True)

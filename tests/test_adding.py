@@ -15,7 +15,7 @@ from pipeline.capture.probe import ProbeLog
 from pipeline.capture.wire import encode
 from pipeline.cli import app
 from pipeline.core import config
-from pipeline.core.errors import ReskinError
+from pipeline.core.errors import CaptureError, ReskinError
 from pipeline.dataset.captures import open_capture, read_header
 from pipeline.preparing import Dump, Labels
 from pipeline.registry import read_registry
@@ -81,6 +81,32 @@ def test_a_recording_that_was_added_is_tracked_registered_and_planned(root, lab_
     adding.remove(root, "small", "board1_skin1_readings")
     assert plan.check(root).scenes == {}
     assert not list((root / "data/raw").rglob("*readings*"))
+
+
+@pytest.mark.parametrize("found", ["Against the scene, chips 1 and 2 are exchanged.", None, CaptureError("no places")])
+def test_what_departs_from_section_compare_is_a_warning_and_no_refusal(root, lab_file, monkeypatch, capsys, found):
+    def departure(*_: object) -> str | None:
+        if isinstance(found, CaptureError):
+            raise found
+        return found
+
+    monkeypatch.setattr("pipeline.experiments.compare.joining.departure", departure)
+    words = recorded()
+    words["questions"] = [*words["questions"], "compare"]
+    words["compare"] = config.read_yaml(root / config.SCENES / "lab.yaml")["compare"]
+    with (root / config.SCENES / "small.yaml").open("w") as stream:
+        YAML().dump(words, stream)
+    add_lab(root, lab_file)
+    assert "board1_skin1_readings" in read_registry(root).captures["small"]
+    said = capsys.readouterr().err
+    assert ("warning: capture board1_skin1_readings: " in said) == (found is not None)
+    assert str(found or "") in said
+
+
+def test_a_scene_without_section_compare_is_held_against_nothing(root, lab_file, monkeypatch, capsys):
+    monkeypatch.setattr("pipeline.experiments.compare.joining.departure", lambda *_: pytest.fail("was asked"))
+    add_lab(root, lab_file)
+    assert "warning" not in capsys.readouterr().err
 
 
 def test_the_same_recording_twice_is_refused_and_another_label_needs_a_word(root, lab_file):

@@ -25,7 +25,8 @@ def test_every_column_of_the_file_has_its_unit_and_the_file_its_schema_version(t
     io.write_readings(tmp_path / "c0.parquet", [readings()], {})
     schema = pq.read_schema(tmp_path / "c0.parquet")
     assert {field.name: field.metadata[b"unit"].decode() for field in schema if field.name in UNITS} == UNITS
-    assert schema.metadata[b"reskin.schema"] == b"1"
+    assert schema.metadata[b"reskin.schema"] == b"2"
+    assert b"Force on the skin" in schema.metadata[b"reskin.force"]
     assert pq.ParquetFile(tmp_path / "c0.parquet").metadata.row_group(0).column(5).compression == "ZSTD"
 
 

@@ -183,3 +183,11 @@ def test_a_log_that_begins_in_contact_is_refused(tmp_path, model):
     log.write_text("".join([first, *rows[QUIET_N - 50 :]]))
     with pytest.raises(CaptureError, match="the start without contact must be"):
         predict(log, model, tmp_path / "out.csv")
+
+
+def test_without_a_model_the_map_of_simulated_skins_answers(tmp_path):
+    predict(write_log(tmp_path), None, tmp_path / "out.csv")
+    rows = [line.split(",") for line in (tmp_path / "out.csv").read_text().splitlines()[1:]]
+    touched = [row for row in rows if row[-1] == "1"]
+    assert len(touched) == TOUCHED_N
+    assert all(-1 < float(value) < 17 for row in touched for value in row[1:3])

@@ -49,7 +49,7 @@ def send_until_something_came(far: int, part: Path) -> None:
 
 def test_ctrl_c_ends_a_recording_that_can_be_added(terminal, tmp_path):
     far, name = terminal
-    recorder = start(name, tmp_path / "run1")
+    recorder = start(name, tmp_path / "run1", "--scan", "random")
     send_until_something_came(far, tmp_path / "run1.part")
     recorder.send_signal(signal.SIGINT)
     said, complained = recorder.communicate(timeout=20)
@@ -58,9 +58,11 @@ def test_ctrl_c_ends_a_recording_that_can_be_added(terminal, tmp_path):
     assert "stopped" in said
     header = parse((tmp_path / "run1" / HEADER_FILE).read_text(), "header")
     assert set(header.files) == {"stream.bin", "arrivals.csv"}
+    assert header.options == {"scan": "random"}
     probe = tmp_path / "probe.csv"
     probe.write_text("")
-    _, files = native(tmp_path / "run1", Labels("b0", "s0", None), probe, ())
+    added, files = native(tmp_path / "run1", Labels("b0", "s0", None), probe, ())
+    assert added.options == header.options
     assert set(files) == {"stream.bin", "arrivals.csv", "probe.csv"}
 
 

@@ -32,7 +32,7 @@ TYPES = {
 class ProbeLog:
     """The dwells of one capture, axis d; NaN where a label is unknown.
 
-    `phase` is stored as `contact`: False while the robot is lifted. `Fz_N` is positive in compression.
+    `phase` is stored as `contact`: False while the robot is lifted. Forces have the signs of `core.schema`.
     """
 
     indentation: Int32[np.ndarray, " d"]

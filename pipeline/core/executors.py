@@ -10,6 +10,7 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from multiprocessing import forkserver
+from multiprocessing.context import ForkServerContext
 from time import perf_counter
 from typing import Any
 
@@ -18,7 +19,7 @@ import numpy as np
 from pipeline.core.errors import ParamsError
 
 VARIABLE = "RESKIN_EXECUTOR"
-DEFAULT = "processes:2"
+DEFAULT, HERE = "processes:2", "here"
 DEVICE_VARIABLE = "RESKIN_DEVICE"
 DEVICES = ("cpu", "cuda")
 REPEATS_N = 25
@@ -29,16 +30,33 @@ def make_executor(tasks_n: int = 2, *, imports: str) -> Executor:
 
     One task by itself runs here. Module `imports` is what the tasks need: it is imported once, for all processes.
     """
-    name = os.environ.get(VARIABLE, DEFAULT if tasks_n > 1 else "here")
-    if name == "here":
-        return Here()
+    workers_n = _workers_n(DEFAULT if tasks_n > 1 else HERE)
+    return ProcessPoolExecutor(workers_n, _context(imports), _end_with_parent) if workers_n else Here()
+
+
+def prepare_workers(imports: str) -> None:
+    """Import what tasks will need where workers are forked from, while this process reads what they work on."""
+    if _workers_n(DEFAULT):
+        _context(imports)
+        forkserver.ensure_running()
+
+
+def _workers_n(otherwise: str) -> int:
+    """Read RESKIN_EXECUTOR: how many processes; 0 is `here`."""
+    name = os.environ.get(VARIABLE, otherwise)
+    if name == HERE:
+        return 0
     kind, _, count = name.partition(":")
     if kind != "processes" or not count.isdecimal() or int(count) < 1:
         raise ParamsError(VARIABLE, "the executor", "processes:N with N >= 1, or here", repr(name), "Unset it for two.")
+    return int(count)
+
+
+def _context(imports: str) -> ForkServerContext:
     # forkserver: a forked child of a threaded parent can hang in BLAS; one of a process that only imported does not.
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([imports])
-    return ProcessPoolExecutor(int(count), context, _end_with_parent)
+    return context
 
 
 def end_workers() -> None:

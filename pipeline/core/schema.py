@@ -14,7 +14,11 @@ from jaxtyping import Float32, Float64, Int32
 
 from pipeline.core.errors import SchemaError
 
-SCHEMA_VERSION = "1"
+SCHEMA_VERSION = "2"  # 1: Fx_N and Fy_N of layout lab were those of the gauge
+FORCE_SIGNS = (
+    "Force on the skin, in newtons: Fx_N and Fy_N positive along the axes of the labels x_mm and y_mm, "
+    "Fz_N positive in compression."
+)
 AXES_PER_CHIP_N = 3
 
 
@@ -22,8 +26,8 @@ AXES_PER_CHIP_N = 3
 class Readings:
     """The readings of one capture, one row each; NaN where a recording does not know a value.
 
-    Force acts on the skin: `Fz_N` is positive in compression. `b_uT` is the field as read, `noload_uT` the mean field
-    of the no-load reading that belongs to the row's indentation. `x_mm`, `y_mm` are NaN on a row without contact.
+    Forces have the signs of `FORCE_SIGNS`, recorded and simulated. `b_uT` is the field as read, `noload_uT` the mean
+    field of the no-load reading that belongs to the row's indentation. `x_mm`, `y_mm` are NaN on a row without contact.
     `n_contacts` counts the skin's contacts before this one.
     """
 
@@ -70,7 +74,7 @@ def arrow_schema(chips_n: int) -> pa.Schema:
     rows = [pa.field(name, pa.string(), False, {"unit": ""}) for name in LABELS]
     for name, unit in UNITS.items():
         rows.append(pa.field(name, _arrow_type(name, chips_n), True, {"unit": unit}))
-    return pa.schema(rows, metadata={"reskin.schema": SCHEMA_VERSION})
+    return pa.schema(rows, metadata={"reskin.schema": SCHEMA_VERSION, "reskin.force": FORCE_SIGNS})
 
 
 def _arrow_type(name: str, chips_n: int) -> pa.DataType:

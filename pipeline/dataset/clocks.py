@@ -10,7 +10,6 @@ from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int8
-from scipy.fft import irfft, next_fast_len, rfft
 
 from pipeline.capture.probe import ProbeLog
 from pipeline.core.errors import CaptureError
@@ -152,6 +151,8 @@ def _follow(
 
 def _correlate(signal: Float64[np.ndarray, " a"], window: Float64[np.ndarray, " b"]) -> Float64[np.ndarray, " c"]:
     """Correlate at every lag at which both overlap, by FFT: scipy.signal's without the second that its import takes."""
+    from scipy.fft import irfft, next_fast_len, rfft  # late: only a capture without clock marks pays for it
+
     lags_n = len(signal) + len(window) - 1
     size = next_fast_len(lags_n, real=True)
     return irfft(rfft(signal, size) * rfft(window[::-1], size), size)[:lags_n]

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from functools import reduce
 
 import numpy as np
-import pandas as pd
 from jaxtyping import Float32, Int32, Int64
 
 from pipeline.core.errors import ParamsError
@@ -113,10 +112,22 @@ def take_pokes(
     indentations, first = np.unique(rows.indentation[pool], return_index=True)
     _, place_i = np.unique(_steps(rows.target[pool[first]]), axis=0, return_inverse=True)
     shuffled = rng.permutation(len(indentations))
-    visit_i = pd.Series(shuffled).groupby(place_i.ravel()[shuffled]).cumcount().to_numpy()
-    in_turn = np.lexsort((rng.random(len(indentations)), visit_i))
+    in_turn = np.lexsort((rng.random(len(indentations)), _counted(place_i.ravel()[shuffled])))
     taken = indentations[shuffled[in_turn[:indentations_n]]]
     return np.sort(pool[np.isin(rows.indentation[pool], taken)])
+
+
+def _counted(place_i: Int64[np.ndarray, " c"]) -> Int64[np.ndarray, " c"]:
+    """Count the visits of each place in their order.
+
+    >>> _counted(np.array([1, 0, 1, 1, 0]))
+    array([0, 0, 1, 2, 1])
+    """
+    by_place = np.argsort(place_i, kind="stable")
+    visits_n = np.bincount(place_i)
+    visit_i = np.empty(len(place_i), np.int64)
+    visit_i[by_place] = np.arange(len(place_i)) - np.repeat(np.cumsum(visits_n) - visits_n, visits_n)
+    return visit_i
 
 
 def _steps(target: Float32[np.ndarray, "f 3"]) -> Int64[np.ndarray, "f 2"]:

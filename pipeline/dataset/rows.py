@@ -62,7 +62,7 @@ def gather(captures: Sequence[Readings], selection: Selection, *, targets: Seque
         raise ParamsError("the scene", "captures", "one or more", "none", "Add one with `reskin add`.")
     _check_one_kind(captures)
     captures = sorted(captures, key=lambda readings: readings.capture)
-    kept = [_contacts(readings, selection) for readings in captures]
+    kept = [contacts(readings, selection) for readings in captures]
     pairs = list(zip(captures, kept, strict=True))
     for readings, keep in pairs:
         if not keep.any():
@@ -103,7 +103,8 @@ def stack(above: Rows, below: Rows) -> Rows:
     return Rows(**stacked, indentation=indentation, dropped=above.dropped)
 
 
-def _contacts(readings: Readings, selection: Selection) -> np.ndarray:
+def contacts(readings: Readings, selection: Selection) -> np.ndarray:
+    """Mark the readings that count as a contact."""
     placed = ~(np.isnan(readings.x_mm) | np.isnan(readings.y_mm))
     weak = readings.Fz_N < selection.force_min_N  # unknown force (NaN) is not weak
     return placed & ~weak

@@ -20,7 +20,8 @@ from pipeline.dataset.lines import take_pokes
 from pipeline.dataset.rows import Rows
 
 WITHIN_SKIN = {"single_random": "readings", "single_indentation": "indentations", "single_pass": "passes"}  # and units
-ONE_SKIN = {"transfer", "single_temporal", *WITHIN_SKIN}  # questions whose networks are trained on one skin
+SAME_SKIN = {"single_temporal", *WITHIN_SKIN}  # questions that test on the skin that was learnt on
+ONE_SKIN = {"transfer", *SAME_SKIN}  # questions whose networks are trained on one skin
 Count = Annotated[int, Field(ge=1)]
 Fraction = Annotated[float, Field(gt=0, lt=1)]
 STATES_N = 2**32  # scikit-learn's seeds are below it

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from jaxtyping import Float
-from scipy.special import stdtrit
 
 from pipeline.core.errors import SchemaError
 from pipeline.evaluation.metrics import METRICS
@@ -91,6 +90,8 @@ def interval(values: Values) -> list[float] | None:
     n = len(values)
     if n < 2:
         return None
+    from scipy.special import stdtrit  # late: only where there are intervals
+
     mean = float(np.mean(values))
     reach = float(stdtrit(n - 1, (1 + CONFIDENCE) / 2) * np.std(values, ddof=1) / np.sqrt(n))
     return [mean - reach, mean + reach]

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float32, Int64, Shaped
-from scipy.spatial.transform import Rotation
 
 from pipeline.core.seeds import rng_for
 from pipeline.learning.architecture import LAYERS, Weights, draw_weights
@@ -85,6 +84,8 @@ def virtual_boards(
     Copy c of row i is row c * f + i. Each copy of a skin has random gains for each channel and leans for each chip;
     noise is random for each reading.
     """
+    from scipy.spatial.transform import Rotation  # late: only a recipe with virtual boards pays for it
+
     codes = np.unique(skin, return_inverse=True)[1]
     skins_n, chips_n = codes.max() + 1, db_uT.shape[1] // AXES_N
     copies = []

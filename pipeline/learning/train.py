@@ -15,6 +15,7 @@ from jaxtyping import Float
 from pipeline.core.errors import TrainingError
 from pipeline.core.executors import device, median_s
 from pipeline.learning.architecture import LAYERS, Weights
+from pipeline.learning.descent import AdamW, one_cycle
 from pipeline.learning.feed import UNLABELLED, Feed
 from pipeline.learning.inputs import VIEW, Scaler
 from pipeline.learning.job import Job, make_job
@@ -70,13 +71,12 @@ def train(jobs: Sequence[Job], architecture: str, schedule: Schedule, terms: Ter
     """Descend the L2 loss and the terms beside it; AdamW under torch's one-cycle rate and momentum are our choice."""
     layers = LAYERS[architecture](jobs[0].labelled.inputs.shape[1], jobs[0].labelled.targets.shape[1])
     net = Stack(layers, [job.start for job in jobs]).to(device)
-    optimizer = torch.optim.AdamW(net.parameters(), schedule.rate_max, weight_decay=schedule.weight_decay, fused=True)
-    rate = torch.optim.lr_scheduler.OneCycleLR(optimizer, schedule.rate_max, total_steps=max(schedule.steps_n, 2))
+    optimizer = AdamW(net.parameters(), schedule.weight_decay)
     feed, watch = Feed(jobs, schedule.batch_n, device), Watch(net)
     for first in range(0, schedule.steps_n, BLOCK_STEPS_N):
         steps_n = min(BLOCK_STEPS_N, schedule.steps_n - first)
         total = torch.zeros(len(jobs), device=device)
-        for batch in feed.draw(steps_n):
+        for step_i, batch in enumerate(feed.draw(steps_n), first):
             features = net.features(batch["labelled"])  # [m b 40]
             error = loss = squared_error(net.answer(features), batch["targets"])  # [m]
             if terms.triplet:
@@ -87,11 +87,10 @@ def train(jobs: Sequence[Job], architecture: str, schedule: Schedule, terms: Ter
                 loss = loss + terms.unlabelled * triplet(anchor, near, far)
             if terms.few_labels:
                 loss = loss + terms.few_labels * squared_error(net(batch["few_labels"]), batch["few_labels_targets"])
-            optimizer.zero_grad()
+            net.zero_grad()
             loss.sum().backward()  # of a sum, each network's gradient is its own
             clip(net, schedule.gradient_norm_max)  # one step too long can leave all ReLUs of a layer dead for good
-            optimizer.step()
-            rate.step()
+            optimizer.step(*one_cycle(step_i, schedule.steps_n, schedule.rate_max))
             total += error.detach()
         if not watch.look(total / steps_n, first + steps_n):
             break

@@ -89,12 +89,29 @@ def draw_pairs(points: Points, anchor: Int64[np.ndarray, " b"], rng: np.random.G
 
 def _anchors(place: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, " n"]:
     """Find a group's points with others at two different distances, among `PLACES_COMPARED_N` of its places."""
-    places, index, visits_n = np.unique(place, axis=0, return_inverse=True, return_counts=True)
+    places, index, visits_n = _distinct(place)
     others = places[:PLACES_COMPARED_N].astype(np.float64)
     d2 = ((places[:, None].astype(np.float64) - others) ** 2).sum(axis=2)  # [places others]
     farthest, nearest = d2.max(axis=1), np.where(d2 > 0, d2, np.inf).min(axis=1)
     is_anchor: np.ndarray = (visits_n > 1) | (farthest - nearest > TIED * (farthest + nearest))
-    return is_anchor[index.ravel()]
+    return is_anchor[index]
+
+
+def _distinct(
+    place: Float[np.ndarray, "n d"],
+) -> tuple[Float[np.ndarray, "p d"], Int64[np.ndarray, " n"], Int64[np.ndarray, " p"]]:
+    """Give the different places in order, which of them each point is, and how many points are there.
+
+    As `np.unique(place, axis=0, ...)`, which compares rows as records and takes three times as long.
+
+    >>> _distinct(np.array([[1.0, 2.0], [0.0, 3.0], [1.0, 2.0]]))[1:]
+    (array([1, 0, 1]), array([1, 2]))
+    """
+    order = np.lexsort(place.T[::-1])
+    is_new = np.append(True, (place[order[1:]] != place[order[:-1]]).any(axis=1))
+    index = np.empty(len(place), np.int64)
+    index[order] = np.cumsum(is_new) - 1
+    return place[order[is_new]], index, np.bincount(index)
 
 
 def _of_group(points: Points, anchor: np.ndarray, rng: np.random.Generator) -> Int64[np.ndarray, " b"]:

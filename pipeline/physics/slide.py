@@ -133,8 +133,14 @@ def force_at(depth_m: Float[np.ndarray, " n"], *, stiffness_N_m2: float, thickne
     return stiffness_N_m2 * depth_m**2 * (1 - depth_m / thickness_m) ** -STIFFENING
 
 
+def beyond_n(force_N: Float[np.ndarray, " n"], *, stiffness_N_m2: float, thickness_m: float) -> int:
+    """Count the forces that `depth_at` holds at its deepest, as they lie beyond it."""
+    deepest_m = np.array([DEEPEST * thickness_m])
+    return int((force_N > force_at(deepest_m, stiffness_N_m2=stiffness_N_m2, thickness_m=thickness_m)).sum())
+
+
 def depth_at(force_N: Float[np.ndarray, " n"], *, stiffness_N_m2: float, thickness_m: float) -> Float[np.ndarray, " n"]:
-    """Give the depth at which a tip feels a force: at most `DEEPEST` thicknesses."""
+    """Give the depth at which a tip feels a force: at most `DEEPEST` thicknesses; `beyond_n` counts what is held."""
     if not stiffness_N_m2 > 0:
         raise ParamsError("layer", "stiffness", "above 0 N/m^2", f"{stiffness_N_m2}", "Check its unit.")
     curve_m = np.linspace(0, DEEPEST * thickness_m, CURVE_N)

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 
 from pipeline.evaluation.metrics import METRICS
-from pipeline.evaluation.scores import tally
+from pipeline.evaluation.scores import statistic, tally
 from pipeline.questions import QUESTIONS
 from pipeline.reporting.learned import learned
 
@@ -41,6 +42,16 @@ def add_up(accounts: Iterable[Mapping[str, int]]) -> dict[str, int]:
         total.update({"captures_n": 1} | {name: count for name, count in account.items() if name.endswith("_n")})
     skipped = [count for name, count in total.items() if name.startswith("skipped_") and name.endswith("_bytes_n")]
     return {**total, "lost_bytes_n": sum(skipped)} if skipped else dict(total)
+
+
+def foretold(tables: Iterable[pa.Table]) -> dict[str, Any]:
+    """Summarise over folds how well places are told before their touch: by question, and by what tells them."""
+    found: dict[str, dict[str, Any]] = {}
+    for table in tables:
+        for (question, told_by), rows in table.to_pandas().groupby(["question", "told_by"], sort=False):
+            scored = {name: statistic(rows[name].to_list()) for name in METRICS if name in rows}
+            found.setdefault(question, {})[told_by] = scored
+    return {"before_touch": found} if found else {}
 
 
 def count_trainings(

@@ -35,6 +35,16 @@ SPLIT_WORDS = {
     "single_pass": "random passes held out (each visits every place and depth again)",
     "single_temporal": "first passes → last passes",
 }
+BEFORE_TOUCH = {
+    "noload": "the no-load reading before the poke alone",
+    "scan": "the number of the poke in its pass alone",
+}  # what tells a place: words
+BEFORE_TOUCH_MEANING = (
+    "Told before the touch: the place by the 2 nearest training rows, on the rows and folds above, from no change of "
+    "field. The number in the pass says how far the rig repeats its order; no network sees it. The no-load reading "
+    "says what a skin that remembers its pokes gives away of that order; it is in every change of field, so a network "
+    "that is tested on the skin it learnt on may have used it."
+)
 TABLE_2_SPREAD = (
     "± is the sd, as in the paper: over n boards held out, or over n pairs of a training and a test skin for one skin "
     f"on others. {INTERVAL} (for one skin on others: those that it was tested on)."
@@ -82,9 +92,8 @@ def make_tables(numbers: Numbers) -> dict[str, pd.DataFrame]:
         orders = {"order": order_table, "paired": paired_table, "paired_boards": paired_boards_table}
         made = {name: make(numbers, source) for name, make in orders.items()}
         tables |= {name: table for name, table in made.items() if not table.empty}
-    single = {SPLIT_WORDS[name]: (numbers[name], SINGLE_SENSOR) for name in SPLIT_WORDS if name in numbers}
-    if single:
-        tables["single_sensor"] = _beside_paper(single, source)
+    if any(name in numbers for name in SPLIT_WORDS):
+        tables["single_sensor"] = _single(numbers, source)
     tables |= experiment_tables(numbers, source)
     makers: dict[str, Callable[[Any, str], pd.DataFrame]] = {
         "sweep_pokes": sweep_pokes_table, "sweep_sensors": sweep_sensors_table, "baselines": baselines_table,
@@ -184,6 +193,20 @@ def _table_2(numbers: Numbers, source: str) -> pd.DataFrame:
     if kept_n := sum(counts["kept_collapsed_n"] for counts in asked):
         words.append(f"{kept_n} networks collapsed every time that they were trained, and are in these means.")
     table.attrs |= {"spread": TABLE_2_SPREAD} | ({"meaning": " ".join(words)} if words else {})
+    return table
+
+
+def _single(numbers: Numbers, source: str) -> pd.DataFrame:
+    """Put each split of one skin beside the paper, and below it what tells its places before the touch."""
+    rows: dict[str, tuple[Mapping[str, Any], Mapping[str, Number]]] = {}
+    for name, words in SPLIT_WORDS.items():
+        if name in numbers:
+            rows[words] = (numbers[name], SINGLE_SENSOR)
+            told = numbers.get("before_touch", {}).get(name, {})
+            rows |= {f"{words}: place from {BEFORE_TOUCH[by]}": (told[by], {}) for by in BEFORE_TOUCH if by in told}
+    table = _beside_paper(rows, source)
+    if "before_touch" in numbers:
+        table.attrs["meaning"] = BEFORE_TOUCH_MEANING
     return table
 
 

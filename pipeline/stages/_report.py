@@ -12,12 +12,13 @@ from pipeline.core.config import Settings, parse
 from pipeline.core.errors import ParamsError
 from pipeline.core.executors import device as trained_on
 from pipeline.core.provenance import COSTS, SECONDS, add_up_costs, code_version, device, read_costs
+from pipeline.dataset.scan import SCORED
 from pipeline.evaluation.choice import choose
 from pipeline.evaluation.scores import tidy
 from pipeline.learning.recipe import HEADLINE
 from pipeline.params import Asking
 from pipeline.reporting.learned import timed_learning
-from pipeline.reporting.numbers import answered, compose, count_trainings, lost_by_protocol, rounded, runtime
+from pipeline.reporting.numbers import answered, compose, count_trainings, foretold, lost_by_protocol, rounded, runtime
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,7 @@ def read_numbers(settings: Settings, asked: Asking, at: Places) -> tuple[dict[st
     numbers = {
         "provenance": _provenance(settings, asked, cards, costs),
         **compose(table, accounts, folds["dropped"], headline=HEADLINE),
+        **foretold([io.read_table(at.models / arm / SCORED) for arm in asked.modelled if arm == "train_single"]),
         "trainings": count_trainings(cards, points, experiments),
         "described": {asked.described: io.read_json(at.answers / f"described/{asked.described}.json")},
         **answers([question for question in ("audit",) if question in asked.questions]),

@@ -7,7 +7,7 @@ from pipeline.core.stage import run
 from pipeline.learning.recipe import Adaptations
 from pipeline.learning.recipe import adaptations as adaptations_of
 from pipeline.trials.adapting import adaptations, read_starts
-from pipeline.trials.data import read_data, train_all
+from pipeline.trials.data import prepare_training, read_data, train_all
 from pipeline.trials.models import write_models
 
 
@@ -18,6 +18,7 @@ def read(settings: Settings) -> Adaptations:
 
 def adapt(scene: str, files: Files, indentations: Path, folds: Path, started: Path, models: Path) -> None:
     """Fine-tune by every recipe of section adapt."""
+    prepare_training()
     data, starts = read_data(read_settings("adapt", scene, files), indentations, folds), read_starts(started)
     settings = read(data.settings)
     trials = [

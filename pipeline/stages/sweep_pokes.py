@@ -10,7 +10,7 @@ from pipeline.core.stage import run
 from pipeline.learning.recipe import HEADLINE, PokesSweep
 from pipeline.learning.recipe import adaptations as adaptations_of
 from pipeline.trials.adapting import adaptations, read_starts
-from pipeline.trials.data import read_data, train_all
+from pipeline.trials.data import prepare_training, read_data, train_all
 from pipeline.trials.models import note_seconds, point_of
 
 
@@ -21,6 +21,7 @@ def read(settings: Settings) -> PokesSweep:
 
 def sweep_pokes(scene: str, files: Files, indentations: Path, folds: Path, started: Path, scores: Path) -> None:
     """Score every number of pokes; none at all is the network as it was trained."""
+    prepare_training()
     data, starts = read_data(read_settings("sweep_pokes", scene, files), indentations, folds), read_starts(started)
     sweep, recipe = read(data.settings), adaptations_of(data.settings).recipes[HEADLINE]
     held_out = data.folds_of("lobo")[-sweep.boards_n :]

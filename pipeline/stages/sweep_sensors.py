@@ -12,12 +12,13 @@ from pipeline.learning.recipe import HEADLINE, Recipe, training
 from pipeline.learning.recipe import adaptations as adaptations_of
 from pipeline.learning.trial import Start, Trial
 from pipeline.trials.adapting import adaptations
-from pipeline.trials.data import SceneData, read_data, train_all
+from pipeline.trials.data import SceneData, prepare_training, read_data, train_all
 from pipeline.trials.models import note_seconds, point_of
 
 
 def sweep_sensors(scene: str, files: Files, indentations: Path, folds: Path, scores: Path) -> None:
     """Train the headline recipes on every draw of skins, adapt to each held-out skin, and score."""
+    prepare_training()
     data = read_data(read_settings("sweep_sensors", scene, files), indentations, folds)
     multi, triplet = (training(data.settings, section).recipes for section in ("train_multi", "train_triplet"))
     settings = adaptations_of(data.settings)

@@ -2,11 +2,14 @@
 
 from pathlib import Path
 
+from pipeline.core import io
 from pipeline.core.config import Files, Settings, read_settings
 from pipeline.core.stage import run
+from pipeline.dataset.scan import SCORED
 from pipeline.dataset.splits import ONE_SKIN
 from pipeline.learning.recipe import Training, training
-from pipeline.trials.data import read_data, train_all, trials_of
+from pipeline.trials.before_touch import score_before_touch
+from pipeline.trials.data import prepare_training, read_data, train_all, trials_of
 from pipeline.trials.models import write_models
 
 
@@ -16,11 +19,17 @@ def read(settings: Settings) -> Training:
 
 
 def train_single(scene: str, files: Files, indentations: Path, folds: Path, models: Path) -> None:
-    """Train the recipes of section train_single on every fold of the questions about one skin."""
+    """Train the recipes of section train_single on every fold of the questions about one skin.
+
+    Beside them: how well a place is told before its touch, where the skin that is tested was learnt on.
+    """
+    prepare_training()
     data = read_data(read_settings("train_single", scene, files), indentations, folds)
     own = [fold for fold in data.folds if fold.question in ONE_SKIN]
     trials = trials_of(data, read(data.settings), own)
     write_models(models, data, trials, train_all(data, trials, "train_single"), "train_single")
+    told = score_before_touch(data, indentations, io.read_json(folds)["captures"])
+    io.write_table(models / SCORED, told)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from pathlib import Path
 from pipeline.core.config import Files, Settings, read_settings
 from pipeline.core.stage import run
 from pipeline.learning.recipe import Training, training
-from pipeline.trials.data import read_data, train_all, trials_of
+from pipeline.trials.data import prepare_training, read_data, train_all, trials_of
 from pipeline.trials.models import write_models
 
 
@@ -16,6 +16,7 @@ def read(settings: Settings) -> Training:
 
 def train_triplet(scene: str, files: Files, indentations: Path, folds: Path, models: Path) -> None:
     """Train the recipes of section train_triplet on the folds of question lobo."""
+    prepare_training()
     data = read_data(read_settings("train_triplet", scene, files), indentations, folds)
     trials = trials_of(data, read(data.settings), data.folds_of("lobo"), question="triplet")
     write_models(models, data, trials, train_all(data, trials, "train_triplet"), "train_triplet")

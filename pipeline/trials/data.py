@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pipeline.core import io
 from pipeline.core.config import Settings
-from pipeline.core.executors import make_executor
+from pipeline.core.executors import make_executor, prepare_workers
 from pipeline.core.provenance import COSTS, home, note_trainings
 from pipeline.core.stage import say
 from pipeline.dataset.folds import load_rows, parse_folds
@@ -17,6 +17,7 @@ from pipeline.learning.grid import run_trials
 from pipeline.learning.recipe import Training
 from pipeline.learning.trial import Measured, Trained, Trial
 
+TRAINS = "pipeline.learning.train"
 CACHE = ".reskin/cells"  # finished trainings: a cache, and no output
 
 
@@ -32,6 +33,11 @@ class SceneData:
     def folds_of(self, question: str) -> list[Fold]:
         """Take the folds of one question."""
         return [fold for fold in self.folds if fold.question == question]
+
+
+def prepare_training() -> None:
+    """Let what trains be imported while the stage reads what it trains on."""
+    prepare_workers(TRAINS)
 
 
 def read_data(settings: Settings, indentations: Path, folds: Path) -> SceneData:
@@ -67,7 +73,7 @@ def train_all(data: SceneData, trials: Sequence[Trial], stage: str) -> list[Trai
     def tell(line: str) -> None:
         say(f"{stage_words}: {line}")
 
-    with make_executor(imports="pipeline.learning.train") as executor:
+    with make_executor(imports=TRAINS) as executor:
         trained = run_trials(trials, measured(data), executor=executor, cache=home() / CACHE, tell=tell)
     took = {result.key: (result.seconds, result.reused) for result in trained}
     note_trainings(COSTS / data.scene, stage, took, time.monotonic() - start_s)

@@ -123,17 +123,29 @@ def nominal_uT(
     setup: Setup, place_mm: Float[np.ndarray, "n 2"], force_N: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n k 3"]:
     """Give the same of the skin as designed: nothing fitted, no slide, force by the elastic layer."""
-    design, deepest_m = setup.design, slide.DEEPEST * setup.thickness_m
-    curve_m = np.linspace(0, deepest_m, slide.CURVE_N)
-    known_N = layer.force(
-        curve_m, thickness_m=setup.thickness_m, tip_radius_m=design.tip_radius_mm * milli,
-        modulus_Pa=design.modulus_kPa * kilo, base="slipping",
-    )  # fmt: skip
-    depths_m = np.interp(force_N, known_N, curve_m)
+    depths_m = np.interp(force_N, *_nominal_curve(setup))
     chips_m = np.column_stack([setup.chips_mm, np.full(len(setup.chips_mm), -setup.gap_mm)]) * milli
     still = slide.Slide(np.zeros(place_mm.shape), np.zeros(len(place_mm)))
-    table = setup.table(design.tip_radius_mm)
+    table = setup.table(setup.design.tip_radius_mm)
     return _changes_T(setup.rest, table, chips_m, place_mm * milli, depths_m, still) / micro
+
+
+def beyond_n(law: Law | None, setup: Setup, force_N: Float[np.ndarray, " n"]) -> int:
+    """Count the pokes whose force lies beyond the deepest that a law, or without one the nominal skin, follows."""
+    if law is None:
+        known_N, _ = _nominal_curve(setup)
+        return int((force_N > known_N[-1]).sum())
+    return slide.beyond_n(force_N, stiffness_N_m2=law.stiffness_N_mm2 * mega, thickness_m=setup.thickness_m)
+
+
+def _nominal_curve(setup: Setup) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
+    """Give forces on the skin as designed, and the depths at which it bears them: as deep as fields are tabulated."""
+    curve_m = np.linspace(0, slide.DEEPEST * setup.thickness_m, slide.CURVE_N)
+    known_N = layer.force(
+        curve_m, thickness_m=setup.thickness_m, tip_radius_m=setup.design.tip_radius_mm * milli,
+        modulus_Pa=setup.design.modulus_kPa * kilo, base="slipping",
+    )  # fmt: skip
+    return known_N, curve_m
 
 
 def _changes_T(

@@ -26,6 +26,7 @@ from pipeline.core.executors import make_executor
 from pipeline.core.seeds import rng_for
 from pipeline.learning import train as train_module
 from pipeline.learning.architecture import FEATURE_LAYERS_N, paper_layers
+from pipeline.learning.descent import AdamW
 from pipeline.learning.feed import Feed
 from pipeline.learning.grid import STACK_N, run_trials
 from pipeline.learning.model import Stack
@@ -189,8 +190,8 @@ STEP = {
     "forward": [(Stack, "features"), (Stack, "answer")],
     "losses": [(train_module, "squared_error"), (train_module, "triplet")],
     "backward": [(torch.Tensor, "backward")],
-    "AdamW": [(torch.optim.AdamW, "step"), (torch.optim.AdamW, "zero_grad")],
-    "one-cycle rate": [(torch.optim.lr_scheduler.OneCycleLR, "step")],
+    "AdamW": [(AdamW, "step"), (Stack, "zero_grad")],
+    "one-cycle rate": [(train_module, "one_cycle")],
     "watch for finite weights, keep them": [(Watch, "look")],
 }
 

@@ -98,7 +98,7 @@ def test_rubbish_is_the_same_rubbish_under_any_portions(data, wire, chips_n, siz
 SCRAPS = (b"\r\n", b"\r", b"\n", b"\r\n" * 9, b"\0" * 16, b"\0" * 7, b"B", b"\xff\x7f")
 
 
-@settings(max_examples=300)
+@settings(max_examples=150)
 @given(st.lists(st.sampled_from(SCRAPS)).map(b"".join), st.integers(1, 2), st.lists(st.integers(1, 30), max_size=8))
 def test_bytes_full_of_terminators_are_cut_into_the_same_frames_under_any_portions(data, chips_n, sizes):
     whole, account = deliver([data], "binary", chips_n)
@@ -111,7 +111,7 @@ def test_bytes_full_of_terminators_are_cut_into_the_same_frames_under_any_portio
 # What was damaged costs little: `suffer` counts frames that are lost or false, and every byte ------------------------
 
 
-@settings(max_examples=300)
+@settings(max_examples=150)
 @given(frames_strategy(min_frames_n=6), st.sampled_from(BINARY_WIRES), st.floats(0, 1), st.floats(0, 1))
 def test_missing_bytes_cost_at_most_two_frames(frames, wire, where, how_many):
     data = encode(frames, wire)
@@ -122,7 +122,7 @@ def test_missing_bytes_cost_at_most_two_frames(frames, wire, where, how_many):
     check_cost(frames, wire, [data[:first], data[first + missing_n :]], lost_n=2, false_n=false_n)
 
 
-@settings(max_examples=300)
+@settings(max_examples=150)
 @given(frames_strategy(min_frames_n=6), st.sampled_from(BINARY_WIRES), st.floats(0, 1), st.binary(max_size=300))
 def test_inserted_bytes_cost_at_most_two_frames(frames, wire, where, rubbish):
     data = encode(frames, wire)

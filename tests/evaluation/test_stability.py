@@ -8,7 +8,7 @@ import pytest
 from pipeline.capture import faults, stream
 from pipeline.core.config import parse, read_yaml
 from pipeline.core.errors import CaptureError
-from pipeline.experiments.stability import physics
+from pipeline.experiments.stability import physics, wire
 from pipeline.experiments.stability.cases import measured, peak_bytes, refused
 from pipeline.experiments.stability.chip import chip_cases
 from pipeline.experiments.stability.physics import physics_cases, time_cases
@@ -52,7 +52,8 @@ def test_the_same_seed_gives_the_same_words():
 
 
 @pytest.mark.parametrize(("chips_n", "gain_sel"), [(1, 7), (8, 0)])
-def test_streams_of_other_boards_are_surveyed_too(chips_n, gain_sel):
+def test_streams_of_other_boards_are_surveyed_too(monkeypatch, chips_n, gain_sel):
+    monkeypatch.setattr(wire, "BLOCKS_N", 1)  # and four times as many, under traced memory; three stand in `cases`
     assert broken(wire_cases(gain_sel, chips_n, SEED)) == set()
 
 
@@ -123,5 +124,6 @@ def test_a_fault_that_nobody_looks_for_is_found_out(monkeypatch, guard, blind, c
 
 def test_a_stream_that_forgets_bytes_is_found_out(monkeypatch):
     right = stream.FrameStream.account
+    monkeypatch.setattr(wire, "BLOCKS_N", 1)
     monkeypatch.setattr(stream.FrameStream, "account", lambda self: right(self) | {"skipped_truncated_bytes_n": 0})
     assert "last frame truncated (binary)" in broken(wire_cases(7, 5, SEED))

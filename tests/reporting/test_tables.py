@@ -1,11 +1,12 @@
 import json
 
+import pyarrow as pa
 import pytest
 
 from pipeline.core.errors import SchemaError
 from pipeline.evaluation.metrics import METRICS
 from pipeline.evaluation.scores import interval, tidy
-from pipeline.reporting.numbers import add_up, compose, lost_by_protocol, rounded
+from pipeline.reporting.numbers import add_up, compose, foretold, lost_by_protocol, rounded
 from pipeline.reporting.paper import TABLE_2
 from pipeline.reporting.readme import fill
 from pipeline.reporting.shown import show, to_markdown
@@ -48,6 +49,18 @@ def test_pooled_numbers_are_over_boards_and_single_ones_over_pairs_of_skins():
     ends = pytest.approx(interval([80.0, 90.0]))
     assert table2["multi"]["accuracy_pct"] == {"mean": 85.0, "n": 2, "sd": pytest.approx(50**0.5), "ci95": ends}
     assert table2["single"]["accuracy_pct"] == {"mean": 25.0, "n": 2, "sd": pytest.approx(50**0.5)}
+
+
+def test_what_tells_a_place_before_its_touch_stands_below_the_split_that_it_was_scored_on():
+    columns = {"question": ["single_temporal"] * 4, "fold": ["s0", "s0", "s1", "s1"], "told_by": ["noload", "scan"] * 2}
+    told = pa.table(columns | {"accuracy_pct": [10.0, 99.0, 20.0, 97.0], "mse_xy_mm2": [9.0, 0.1, 8.0, 0.3]})
+    shown = numbers([card("single_temporal", "s0", 95.0)])
+    table = make_tables(shown | foretold([told]))["single_sensor"]
+    assert table["accuracy, % (ours)"].str.partition(" ")[0].tolist() == ["95", "15", "98"]
+    assert ["no-load" in row or "number" in row for row in table["model"]] == [False, True, True]
+    assert set(table["MSE_F, N² (ours)"][1:]) == {"–"}
+    assert "before the touch" in table.attrs["meaning"]
+    assert len(make_tables(shown)["single_sensor"]) == 1
 
 
 def test_a_question_that_was_not_asked_is_absent_and_not_null():

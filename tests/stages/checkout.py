@@ -7,9 +7,11 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 LEFT_OUT = {".git", ".venv", ".reskin", "data", "reports", "mlflow.db", "mlartifacts", ".ci"}
+WARM = ("python", "tests/stages/warm.py")  # all stages, without the imports of each
 ENVIRONMENT = {
     "OMP_NUM_THREADS": "1", "MLFLOW_DISABLE_TELEMETRY": "true", "DVC_NO_ANALYTICS": "1",
     "RESKIN_EXECUTOR": "here",  # a worker spends longer on its imports than on such trainings
+    "PYTHONDONTWRITEBYTECODE": "",  # stages start a hundred times: what Python compiled is kept, wherever they run
 }  # fmt: skip
 
 

@@ -25,7 +25,7 @@ from pipeline.reporting.checklist import read_rows, resolve
 from pipeline.reporting.headline import short_table, table2_figure
 from pipeline.reporting.judging import NOT_REACHED
 from pipeline.reporting.shown import to_markdown
-from tests.stages.checkout import ENVIRONMENT, copy_checkout, run
+from tests.stages.checkout import ENVIRONMENT, WARM, copy_checkout, run
 
 LEARNING = (
     "train_single", "train_multi", "train_triplet", "adapt", "sweep_pokes", "sweep_sensors", "train_classical",
@@ -33,7 +33,6 @@ LEARNING = (
 )  # fmt: skip
 DRAWING = ("drift", "manual", "contacts", "ambient")  # experiments that draw at random in ways of their own
 ASKED = set(EXPERIMENTS) - {"compare"}  # which is asked of recordings only
-WARM = ("python", "tests/stages/warm.py")
 SAID = "said.txt"  # by the first run
 pytestmark = pytest.mark.timeout(1800)  # a guard against a hang; a busy machine takes four times as long as a quiet one
 
@@ -297,6 +296,7 @@ def test_a_stage_killed_in_the_middle_loses_no_finished_fold(story):
     stage.wait()
     finished_n = len(list(trials.glob("*.safetensors")))
     assert not models.exists()
+    environment |= ENVIRONMENT  # what is left is trained here
     again = subprocess.run(command, cwd=story, env=environment, capture_output=True, text=True, check=True)
     assert f"{finished_n} of 6 trainings were finished before" in again.stderr
     assert len(list(models.glob("*.safetensors"))) == 6

@@ -1,7 +1,8 @@
-"""Runs stages as DVC would, each in a process of its own, forked from one that has imported the libraries already.
+"""Runs stages as DVC would, each in a process of its own, forked from one that holds what they would all begin with.
 
 python tests/stages/warm.py [STAGE ...]: in a checkout, all stages or these (`drift@ci`), in DVC's order; then commits
-as `dvc commit` does. Most of a tiny stage's time is imports; tests/recordings/test_lab_story.py runs DVC itself.
+as `dvc commit` does. Most of a tiny stage's time is imports, and following the material under a tip for its tables;
+tests/recordings/test_lab_story.py runs DVC itself.
 """
 
 import importlib
@@ -11,13 +12,16 @@ import shlex
 import sys
 import traceback
 
+import numpy as np
 from dvc.repo import Repo
 from dvc.repo.reproduce import get_active_graph, plan_repro
 
 LIBRARIES = (
-    "torch", "pandas", "pyarrow.parquet", "scipy.optimize", "scipy.signal", "scipy.stats", "sklearn.ensemble", "numba",
+    "torch._dynamo",  # 2 s of each training: an optimiser imports it
+    "pandas", "pyarrow.parquet", "scipy.optimize", "scipy.signal", "scipy.stats", "sklearn.ensemble", "numba",
     "matplotlib.figure", "magpylib", "pydantic", "jinja2",
 )  # fmt: skip
+DEEP_M = 1.3e-3  # past the deepest poke of scene ci
 
 
 def run_stage(name: str, command: str) -> int:
@@ -32,6 +36,7 @@ def run_stage(name: str, command: str) -> int:
         experiment = os.path.isdir(f"pipeline/experiments/{stage}")
         module = f"pipeline.experiments.{stage}.run" if experiment else f"pipeline.stages.{stage}"
         sys.argv = [module, *words]
+        sys.modules.pop(module, None)  # it runs as `__main__`
         runpy.run_module(module, run_name="__main__", alter_sys=True)
         status = 0
     except SystemExit as exit:
@@ -44,14 +49,32 @@ def run_stage(name: str, command: str) -> int:
         os._exit(status)
 
 
-def main(asked: list[str]) -> None:
-    for name in LIBRARIES:
+def begin(simulated: set[tuple[str, str]]) -> None:
+    """Import what stages import, and follow the material under a tip for the skins of these scenes' protocols."""
+    from pipeline.core.config import Files, Settings, read_yaml
+    from pipeline.physics.skin import draw_skin, moved_dipoles
+    from pipeline.stages.code import entries
+    from pipeline.synthesis.settings import check_synthesis
+
+    for name in (*LIBRARIES, *entries().values()):
         importlib.import_module(name)
+    for scene, protocol in simulated:
+        files = Files.of(scene)
+        words, shared = (read_yaml(file) for file in (files.settings, files.params))
+        of = check_synthesis(Settings(scene, str(files.settings), words, shared, {}))
+        kind = of.boards[of.protocols[protocol].boards]
+        rule, name = kind.quadrature.quadrature(), f"{kind.letter}0_s0"
+        skin = draw_skin(of.skin, of.spreads, seed=words["seed"], name=name, rule=rule, sides_m=kind.skin_m)
+        list(moved_dipoles(skin, np.array([[0.0, 0.0, DEEP_M]])))  # its tables are kept
+
+
+def main(asked: list[str]) -> None:
     with Repo() as repo:
-        for stage in plan_repro(get_active_graph(repo.index.graph)):
-            name = stage.addressing
-            if asked and name not in asked:
-                continue
+        planned = [stage for stage in plan_repro(get_active_graph(repo.index.graph)) if stage.cmd]  # else it is data
+        stages = {stage.addressing: stage for stage in planned if not asked or stage.addressing in asked}
+        simulating = [shlex.split(stage.cmd) for name, stage in stages.items() if name.startswith("simulate@")]
+        begin({(words[words.index("--scene") + 1], words[words.index("--protocol") + 1]) for words in simulating})
+        for name, stage in stages.items():
             print(f"Running stage '{name}':", flush=True)
             for out in stage.outs:  # as `dvc repro` does: a stage that writes nothing has nothing
                 out.remove()

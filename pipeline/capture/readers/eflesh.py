@@ -1,7 +1,8 @@
 """Layout `eflesh`: a robot arm over an eFlesh skin, three CSV files in a folder. In: that folder. Out: readings.
 
 Places are the recording's robot coordinates less their minimum, so a scan reads 0 mm upwards; the depth is counted
-down from the highest z of the recording, which may hang above the skin: its offset is unknown. Only one force is known.
+down from the highest z of the recording, which may hang above the skin: its offset is unknown. Only one force is known,
+and along x or y its sign is not: the recorder does not say whether it is the skin's or the gauge's. These are counted.
 """
 
 from collections.abc import Mapping
@@ -93,6 +94,7 @@ def read(folder: Path, header: Header) -> tuple[Readings, Account]:
         **rows.losses(),
         "no_new_force_rows_n": int((states[rows.whole, WEIGHT_COLUMN:] == NO_NEW_WEIGHT).sum()),
         "no_depth_rows_n": int(np.isnan(readings.depth_mm).sum()),
+        "force_sign_unknown_rows_n": int(np.isfinite([readings.Fx_N, readings.Fy_N]).any(axis=0).sum()),
         "passes_n": int(pass_i.max()) + 1,
     }
 

@@ -1,7 +1,7 @@
 """Layout `table`: any rig's recording in one CSV or Parquet file with named columns. In: that file. Out: readings.
 
 Needed: `phase` (noload or contact), `x_mm`, `y_mm`, and of each chip `Bx0, By0, Bz0, Bx1, ...` in uT. Known where they
-are there, else unknown: `indentation`, `pass`, `t_s`, `depth_mm`, `Fx_N`, `Fy_N`, `Fz_N` (positive in compression),
+are there, else unknown: `indentation`, `pass`, `t_s`, `depth_mm`, `Fx_N`, `Fy_N`, `Fz_N` (signs: `core.schema`),
 `T0, T1, ...` in degC. A row without contact needs no place. Other columns are ignored, and counted.
 """
 

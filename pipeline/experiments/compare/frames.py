@@ -16,6 +16,7 @@ from scipy.optimize import linear_sum_assignment
 # 0.5 and more each, and a skin that sits 0.5 mm aside moves no cosine by so much.
 PENALTY = 0.1
 AXES = "xyz"
+AS_SAID = "Labels, chips and skin lie as the scene says."
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ class Found:
             if turn != TURNS[0]:
                 words.append(f"{_name(own, len(self.turns))} {turn.say()}")
         if not words:
-            return "Labels, chips and skin lie as the scene says."
+            return AS_SAID
         return f"Against the scene, {'; '.join(words)}."
 
 

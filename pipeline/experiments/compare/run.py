@@ -25,7 +25,7 @@ from pipeline.experiments.compare import frames
 from pipeline.physics.board import BoardDesign
 from pipeline.physics.skin import SkinDesign
 from pipeline.twin.fit import SEVEN, TEN, Seen, fit
-from pipeline.twin.law import Setup, nominal_uT, simulate_uT
+from pipeline.twin.law import Setup, beyond_n, nominal_uT, simulate_uT
 from pipeline.twin.pokes import Pokes, cosines, explained, growth, lengths_uT, memory, pool
 
 Side_mm = Annotated[float, Field(gt=0, le=500)]
@@ -49,6 +49,12 @@ class Compare(Strict):
 def turns_of(section: Compare) -> Float[np.ndarray, "k 3 3"]:
     """Give the rotations from the chips' axes to the board's, as the scene has them."""
     return Rotation.from_euler("z", np.array(section.design.turns_deg)[:, None], degrees=True).as_matrix()
+
+
+def setup_of(section: Compare, design: SkinDesign) -> Setup:
+    """Put the designed skin over the scene's chips."""
+    chips_mm, flipped = np.array(section.design.places_mm), section.skin_flipped
+    return Setup(design, chips_mm, section.design.gap_mm, section.skin_mm, flipped, section.tip_radius_mm)
 
 
 def see(pokes: Pokes, section: Compare) -> Seen:
@@ -101,12 +107,6 @@ def framed(seen: Seen, setup: Setup, section: Compare) -> dict[str, Any]:
     return {"sentence": found.sentence, "chips": chips}
 
 
-def setup_of(section: Compare, design: SkinDesign) -> Setup:
-    """Put together what all laws of a scene share."""
-    chips_mm = np.array(section.design.places_mm)
-    return Setup(design, chips_mm, section.design.gap_mm, section.skin_mm, section.skin_flipped, section.tip_radius_mm)
-
-
 def skins_of(captures: Sequence[Readings]) -> dict[str, Pokes]:
     """Pool the captures of each skin on its board; named by the board, where that has one skin only."""
     skins: dict[str, list[Readings]] = {}
@@ -132,7 +132,10 @@ def compare_boards(boards: Mapping[str, Pokes], section: Compare, design: SkinDe
             told["refitted"] = asdict(laws["refitted"]) | {"law_of": law_of}
         simulated_uT = {way: simulate_uT(law, setup, own.place_mm, own.pokes.force_N) for way, law in laws.items()}
         simulated_uT["nominal"] = nominal_uT(setup, own.place_mm, own.pokes.force_N)
-        ways = {way: beside(own, of_way) for way, of_way in simulated_uT.items()}
+        ways = {
+            way: beside(own, of_way) | {"beyond_n": beyond_n(laws.get(way), setup, own.pokes.force_N)}
+            for way, of_way in simulated_uT.items()
+        }
         by_board[board] = (
             ways.pop("fitted")
             | ways

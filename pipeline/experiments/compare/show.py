@@ -18,6 +18,7 @@ WAYS = {
     "refitted": "law of another board, seven refitted",
 }  # fmt: skip
 COSINE, EXPLAINED, GROWTH = "cosine", f"explained (≥ {EXPLAINED_MIN:.2f})", f"growth (within {GROWTH_WITHIN:.2f})"
+HELD = "held at the deepest"
 MEMORY = "memory, % ({:g} to {:g})".format(*MEMORY_PCT)
 NONE = "–"
 MEANING = (
@@ -29,7 +30,8 @@ MEANING = (
     "stiffening (power 3/2) and force at which the slide is gone (8 N) were chosen with both boards of scene lab in "
     "view: only a new board tests them. Why a skin slides away from its middle is not explained. Memory, simulated / "
     "recorded: of a poke's change in the next no-load reading; it is put in by hand, {:g} %, so that its estimator is "
-    "tested and nothing predicted."
+    "tested and nothing predicted. Held: pokes whose force lies beyond the deepest that the law follows (0.72 of the "
+    "thickness); they are simulated at that depth, and count like all others."
 )
 ABOUT_PARAMETERS = (
     "Seat: the skin's middle seen from the board's. Label offset: from where a label says to where the tip is. Slide "
@@ -77,6 +79,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 def _row(board: str, way: str, own: Mapping[str, Any], law: Mapping[str, Any]) -> dict[str, str]:
     good = [own["cosine_mean"] >= COSINE_MIN[way], own["explained_median"] >= EXPLAINED_MIN]
     row = _cells(board, _say(way, law), f"{own['cosine_mean']:.3f}", f"{own['explained_median']:.3f}", way)
+    row[HELD] = f"{own['beyond_n']}"
     row["cosine by file"] = ", ".join(f"{value:.3f}" for value in own["cosine_by_group"].values())
     if "growth" in own:
         grown = own["growth"]
@@ -101,7 +104,7 @@ def _over_boards(way: str, own: Mapping[str, Any]) -> dict[str, str]:
 
 def _cells(board: str, law: str, cosine: str, explained: str, way: str) -> dict[str, str]:
     cells = {"board": board, "simulated with": law, COSINE: f"{cosine} (≥ {COSINE_MIN[way]:.2f})"}
-    return cells | {"cosine by file": NONE, EXPLAINED: explained, GROWTH: NONE, MEMORY: NONE}
+    return cells | {"cosine by file": NONE, EXPLAINED: explained, GROWTH: NONE, MEMORY: NONE, HELD: NONE}
 
 
 def _say(way: str, law: Mapping[str, Any]) -> str:

@@ -33,7 +33,7 @@ from pipeline.experiments.drift.windows import (
 from pipeline.learning.card import collapse_record
 from pipeline.learning.recipe import HEADLINE, Training, with_training
 from pipeline.learning.trial import Trained, Trial
-from pipeline.trials.data import SceneData, train_all
+from pipeline.trials.data import SceneData, prepare_training, train_all
 
 Count = Annotated[int, Field(ge=1)]
 PolicyName = Literal["initial", "regular", "each"]  # no-load reading: once, every so often, before each contact
@@ -115,6 +115,7 @@ def read(settings: Settings) -> Drift:
 
 def drift(scene: str, files: Files, indentations: Path, answer: Path) -> None:
     """Train and test under every no-load policy, on every capture of a folder."""
+    prepare_training()
     settings = read_settings("drift", scene, files)
     section, selection = read(settings), settings.section(Selection, "selection")
     captures = read_folder(indentations, tuple(settings.captures_in(indentations)))

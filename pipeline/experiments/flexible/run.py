@@ -31,7 +31,7 @@ from pipeline.trials.arms import (
     compare_arms,
     summarise_arms,
 )  # fmt: skip
-from pipeline.trials.data import SceneData, read_data
+from pipeline.trials.data import SceneData, prepare_training, read_data
 
 DEPTH_DECIMALS = 2  # of a commanded depth in mm: nearer ones are one
 DRAWN_N = 400  # more points than these are not told apart in a panel
@@ -88,6 +88,7 @@ def flexible(
     scene: str, files: Files, folds: Path, main: Path, indentations: Path, started: Path, answer: Path
 ) -> None:
     """Adapt the networks of the first fold of lobo to every flexible skin, and test on its later passes."""
+    prepare_training()
     data = read_data(read_settings("flexible", scene, files), main, folds)
     starts, captures = read_starts(started), read_folder(indentations)
     adapting, first, trained_n = adaptations_of(data.settings), data.folds_of("lobo")[0], len(data.rows)

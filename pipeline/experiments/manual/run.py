@@ -28,7 +28,7 @@ from pipeline.trials.arms import (
     compare_arms,
     summarise_arms,
 )  # fmt: skip
-from pipeline.trials.data import SceneData, read_data
+from pipeline.trials.data import SceneData, prepare_training, read_data
 
 GRID = "grid"  # as many pokes, by the robot
 
@@ -53,6 +53,7 @@ def answer_manual(answers: Sequence[Answered], *, pokes_n: Sequence[int], lines_
 
 def manual(scene: str, files: Files, folds: Path, main: Path, indentations: Path, started: Path, answer: Path) -> None:
     """Adapt to every skin that was poked by hand, and by as many pokes of the robot; test on the robot's grid."""
+    prepare_training()
     data = read_data(read_settings("manual", scene, files), main, folds)
     starts = read_starts(started)
     adapting = adaptations_of(data.settings)

@@ -23,7 +23,7 @@ from pipeline.evaluation.scores import summarise, tally
 from pipeline.experiments.answer import read_folder, read_losses, write_answer
 from pipeline.learning.card import collapse_record
 from pipeline.learning.recipe import Training, with_training
-from pipeline.trials.data import SceneData, train_all, trials_of
+from pipeline.trials.data import SceneData, prepare_training, train_all, trials_of
 from pipeline.trials.models import note_seconds
 
 Count = Annotated[int, Field(ge=1)]
@@ -91,6 +91,7 @@ def read(settings: Settings) -> Shear:
 
 def shear(scene: str, files: Files, indentations: Path, answer: Path) -> None:
     """Train with five targets on both splits of every skin, and score what was held out."""
+    prepare_training()
     settings = read_settings("shear", scene, files)
     section = read(settings)
     rows = gather(read_folder(indentations), settings.section(Selection, "selection"), targets=SHEAR_TARGETS)

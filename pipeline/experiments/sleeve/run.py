@@ -24,7 +24,7 @@ from pipeline.learning.classical import Neighbours
 from pipeline.learning.recipe import HEADLINE, Training, with_training
 from pipeline.learning.trial import Measured, Trial
 from pipeline.synthesis.settings import synthesis_of
-from pipeline.trials.data import SceneData, train_all
+from pipeline.trials.data import SceneData, prepare_training, train_all
 from pipeline.trials.models import note_seconds
 
 Count = Annotated[int, Field(ge=1)]
@@ -165,6 +165,7 @@ def read(settings: Settings) -> Sleeve:
 
 def sleeve(scene: str, files: Files, indentations: Path, answer: Path) -> None:
     """Train the recipes of section sleeve on the first pokes, score them and nearest neighbours on the last."""
+    prepare_training()
     settings = read_settings("sleeve", scene, files)
     section, captures, area = read(settings), read_folder(indentations), _area(settings)
     data = SceneData(scene, settings, gather(captures, settings.section(Selection, "selection")), [])

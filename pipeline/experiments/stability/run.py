@@ -5,10 +5,10 @@ from pathlib import Path
 
 from pipeline.core import io
 from pipeline.core.config import Files, read_settings
+from pipeline.core.executors import make_executor
 from pipeline.core.stage import run, say
 from pipeline.experiments.stability.cases import Case
 from pipeline.experiments.stability.chip import chip_cases
-from pipeline.experiments.stability.learning import learning_cases
 from pipeline.experiments.stability.physics import drag_cases, physics_cases, time_cases
 from pipeline.experiments.stability.wire import wire_cases
 from pipeline.synthesis.settings import Synthesis, synthesis_of
@@ -30,12 +30,20 @@ def survey(of: Synthesis, seed: int) -> list[Case]:
 def stability(scene: str, files: Files, answer: Path) -> None:
     """Try every case on the scene's own skins and chips and on small trainings, and write down what happened."""
     settings = read_settings("stability", scene, files)
-    cases = [*survey(synthesis_of(settings), settings.seed), *learning_cases(settings.seed)]
+    with make_executor(imports="pipeline.experiments.stability.learning") as executor:
+        learning = executor.submit(_learning_cases, settings.seed)  # beside the physics
+        cases = [*survey(synthesis_of(settings), settings.seed), *learning.result()]
     io.write_json(answer, [asdict(case) for case in cases])
     for case in cases:
         if not case.holds:
             say(f"warning: {scene}: {case.area}, {case.case}: {case.happened}")
     say(f"{scene}: {sum(case.holds for case in cases)} of {len(cases)} extreme cases behave as they should")
+
+
+def _learning_cases(seed: int) -> list[Case]:
+    from pipeline.experiments.stability.learning import learning_cases  # torch, late: only a worker pays for it
+
+    return learning_cases(seed)
 
 
 if __name__ == "__main__":

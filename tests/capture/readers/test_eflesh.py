@@ -99,14 +99,16 @@ def test_grams_become_newtons_and_a_mask_becomes_nan(tmp_path: Path) -> None:
     # float32 holds seven digits
     np.testing.assert_allclose(readings.Fz_N, expected, rtol=1e-6)
     assert account["no_new_force_rows_n"] == 2
+    assert account["force_sign_unknown_rows_n"] == 0
     assert np.isnan(readings.Fx_N).all()
     assert np.isnan(readings.Fy_N).all()
 
 
 @pytest.mark.parametrize("axis", ["x", "y"])
 def test_the_gauge_measures_the_axis_that_the_header_names(tmp_path: Path, axis: str) -> None:
-    readings, _ = eflesh.read(strokes(tmp_path), GAUGED.model_copy(update={"options": {"force_axis": axis}}))
-    assert np.isfinite(getattr(readings, f"F{axis}_N")).any()
+    readings, account = eflesh.read(strokes(tmp_path), GAUGED.model_copy(update={"options": {"force_axis": axis}}))
+    felt = np.isfinite(getattr(readings, f"F{axis}_N"))
+    assert account["force_sign_unknown_rows_n"] == felt.sum() > 0
     assert np.isnan(readings.Fz_N).all()
     # A stroke along the skin is no depth.
     assert np.isnan(readings.depth_mm).all()

@@ -160,6 +160,15 @@ def test_the_account_says_by_how_many_rows_the_fields_come_late(
     for said in ("0", str(late_n)):
         _, account = ini.read(folder, late(said))
         assert account["best_rows_late_n"] == late_n
+        assert account["rows_late_n"] == int(said)
+
+
+@pytest.mark.parametrize("late_n", [0, 1, 4])
+@pytest.mark.parametrize(("passes_n", "tells"), [(13, True), (5, False)])  # 104 and 40 rows
+def test_a_header_that_says_nothing_leaves_it_to_a_recording_that_is_long_enough(tmp_path, late_n, passes_n, tells):
+    _, account = ini.read(write_late(tmp_path, ONE_PASS * passes_n, late_n), HEADER)
+    assert account["best_rows_late_n"] == late_n
+    assert account["rows_late_n"] == account["dropped_no_partner_rows_n"] == (late_n if tells else 0)
 
 
 @settings(max_examples=12, deadline=None)
@@ -204,8 +213,8 @@ def test_the_public_recording_comes_one_row_late(tmp_path: Path, shared_data: Pa
         (ini.TRUTHS, "truths_artillery_AFG_board2_50_screw.txt"),
     ):
         (tmp_path / name).write_bytes((shared_data / "ini" / source).read_bytes())
-    _, account = ini.read(tmp_path, make_header(layout="ini", options={"rows_late": "1"}))
-    assert account["best_rows_late_n"] == 1
+    _, account = ini.read(tmp_path, make_header(layout="ini"))
+    assert account["best_rows_late_n"] == account["rows_late_n"] == 1
     assert account["passes_n"] == 50
     assert account["rows_n"] + account["dropped_no_partner_rows_n"] == account["rows_read_n"] == 23300
 

@@ -66,11 +66,11 @@ def test_the_noload_field_is_the_mean_over_the_same_press(tmp_path: Path) -> Non
     assert readings.noload_uT[0].tolist() == [102, 112, 122, 132, 142, 152]
 
 
-def test_compression_is_positive_and_shear_keeps_its_sign(tmp_path: Path) -> None:
+def test_all_three_forces_are_turned_from_the_gauge_to_the_skin(tmp_path: Path) -> None:
     readings, _ = lab.read(write(tmp_path, *PRESSES), HEADER)
     np.testing.assert_array_equal(readings.Fz_N, np.float32([3.5, 3.5, 3.5, 0.5]))
-    np.testing.assert_array_equal(readings.Fx_N[:3], np.float32([0.1] * 3))
-    np.testing.assert_array_equal(readings.Fy_N[:3], np.float32([-0.2] * 3))
+    np.testing.assert_array_equal(readings.Fx_N[:3], np.float32([-0.1] * 3))
+    np.testing.assert_array_equal(readings.Fy_N[:3], np.float32([0.2] * 3))
 
 
 def test_what_the_file_does_not_know_is_nan(tmp_path: Path) -> None:

@@ -136,6 +136,23 @@ def test_without_give_slide_and_offsets_the_law_is_the_nominal_skin_but_for_its_
     assert min(lengths) < 0.05 * np.linalg.norm(nominal_uT)
 
 
+def test_pokes_beyond_the_deepest_that_a_law_follows_are_counted_and_held_there():
+    # K d^2 (1 - d/h)^(-3/2) at d = 0.72 h
+    thickness_mm = DESIGN.thickness_mm
+    deepest_N = TRUE.stiffness_N_mm2 * (0.72 * thickness_mm) ** 2 * 0.28**-1.5
+    force_N = deepest_N * np.array([0.5, 0.999, 1.001, 3.0])
+    assert law.beyond_n(TRUE, SETUP, force_N) == 2
+    held_uT = law.simulate_uT(TRUE, SETUP, np.zeros((4, 2)), force_N)
+    soft = replace(TRUE, stiffness_N_mm2=TRUE.stiffness_N_mm2 / 2)  # reaches that depth under half the force
+    assert law.beyond_n(soft, SETUP, force_N[1:]) == 3
+    np.testing.assert_allclose(held_uT[2], held_uT[3])
+
+
+def test_the_nominal_skin_counts_what_lies_beyond_its_own_curve():
+    known_N, _ = law._nominal_curve(SETUP)
+    assert law.beyond_n(None, SETUP, known_N[-1] * np.array([0.9, 1.1, 2.0])) == 2
+
+
 def test_direction_size_and_growth_of_fields_that_are_known():
     one_uT = np.array([[[3.0, 0.0, 0.0]], [[0.0, 4.0, 0.0]]])
     assert cosines(one_uT, 2 * one_uT).tolist() == [1.0, 1.0]

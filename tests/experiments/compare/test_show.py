@@ -9,11 +9,12 @@ from tests.reporting.test_work_precision import said
 LAW = dict.fromkeys(Law.__dataclass_fields__, 1.0)
 OWN = {
     "cosine_mean": 0.91, "cosine_by_group": {"soft": 0.90, "hard": 0.92}, "explained_median": 0.82,
-    "growth": {"recorded": 0.3, "simulated": 0.25},
+    "growth": {"recorded": 0.3, "simulated": 0.25}, "beyond_n": 0,
 }  # fmt: skip
 CHIP = {"chip": 0, "at": 0, "cosine_as_written": 0.7, "cosine_best": 0.8, "read": ""}
 BOARD = OWN | {
-    "nominal": OWN | {"cosine_mean": 0.7}, "refitted": OWN | {"growth": {"recorded": 0.3, "simulated": 0.5}},
+    "nominal": OWN | {"cosine_mean": 0.7, "beyond_n": 3},
+    "refitted": OWN | {"growth": {"recorded": 0.3, "simulated": 0.5}},
     "memory": {"recorded": 0.07, "simulated": 0.065}, "laws": {"fitted": LAW, "refitted": LAW | {"law_of": "b2"}},
     "frames": {"sentence": "Against the scene, chips 1 and 2 are exchanged.", "chips": [CHIP]},
     "noise_uT": {"x": 3.3, "y": 3.3, "z": 5.0}, "pokes_n": 4, "left_out_n": 1,
@@ -37,6 +38,7 @@ def test_each_law_stands_beside_its_bounds_and_one_number_beyond_them_is_a_no():
     assert table["cosine"].tolist()[:3] == ["0.700 (≥ 0.90)", "0.910 (≥ 0.90)", "0.910 (≥ 0.85)"]
     assert table["simulated with"][2] == "law of b2, seven refitted"
     assert table["memory, % (5 to 8)"].tolist()[1] == "6.5 / 7.0"
+    assert table["held at the deepest"].tolist() == ["3", "0", "0", "–"]
     assert set(table["source"]) == {"recorded"}
     for words in ("put in by hand, 6.5 %", "both boards of scene lab in view", "not explained"):
         assert words in table.attrs["meaning"]

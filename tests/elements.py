@@ -1,0 +1,150 @@
+"""A layer and a plate by finite elements (scikit-fem): truth for waves, shear, slide. In: loads. Out: motions.
+
+Taylor & Hood's elements: displacement of order 2, pressure of order 1. A load that knows no direction needs the plane
+(r, z) alone, and so does one along x. The shear modulus is 1. Knows nothing of `pipeline`: no wave, no compliance.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.linalg import splu
+from skfem import Basis, BilinearForm, ElementQuad1, ElementQuad2, ElementVector, LinearForm, MeshQuad, asm
+from skfem.helpers import ddot, dot, sym_grad, trace
+
+SLIP_SHARE = 1e-3  # Coulomb's law is smooth below this part of the largest slip
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Displacement [part, element, point] and gradient [part, by r or z, element, point] at points of integration."""
+
+    r_m: np.ndarray
+    z_m: np.ndarray
+    parts_m: np.ndarray
+    gradient: np.ndarray
+    pressure: np.ndarray
+
+
+@dataclass(frozen=True)
+class Solved:
+    """The layer, its base, its top, and the mean over the load of the displacement of the loaded part."""
+
+    inside: Motion
+    base: Motion
+    top: Motion
+    under_load_m: float
+
+
+def round_strains(u, r):
+    """Give the strains of the parts u_r, u_z: those of length, then those of angle."""
+    (r_r, r_z), (z_r, z_z) = u.grad
+    return (r_r, u[0] / r, z_z), (r_z + z_r,)
+
+
+def along_x_strains(u, r):
+    """Give those of A, B, C of `ShearMap`: u_r = (A + B) cos f, u_f = (B - A) sin f, u_z = C cos f."""
+    (a_r, a_z), (b_r, b_z), (c_r, c_z) = u.grad
+    return (a_r + b_r, 2 * u[1] / r, c_z), (b_r - a_r - 2 * u[1] / r, a_z + b_z + c_r, b_z - a_z - u[2] / r)
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A layer with cells of one size out to `fine_m`, then growing to half a thickness at `end_m`."""
+
+    thickness_m: float
+    fine_m: float
+    end_m: float
+    cells_n: int  # over the thickness
+    strains: Callable = round_strains
+
+    @cached_property
+    def basis(self) -> Basis:
+        step_m, r_m = self.thickness_m / self.cells_n, [0.0]
+        while r_m[-1] < self.end_m:
+            r_m.append(r_m[-1] + np.clip(0.25 * (r_m[-1] - self.fine_m), step_m, self.thickness_m / 2))
+        r_m = np.array(r_m) * self.end_m / r_m[-1]
+        mesh = MeshQuad.init_tensor(r_m, np.linspace(0, self.thickness_m, self.cells_n + 1))
+        edges = {"axis": lambda x: x[0] == 0, "far": lambda x: x[0] == r_m[-1]}
+        edges |= {"base": lambda x: x[1] == 0, "top": lambda x: np.isclose(x[1], self.thickness_m)}
+        parts_n = 2 if self.strains is round_strains else 3
+        return Basis(mesh.with_boundaries(edges), ElementVector(ElementQuad2(), parts_n), intorder=5)
+
+    @cached_property
+    def matrices(self) -> tuple[sp.csr_matrix, sp.csr_matrix]:
+        def work(u, v, w):
+            (long, angle), (long_v, angle_v) = self.strains(u, w.x[0]), self.strains(v, w.x[0])
+            return (2 * sum(map(np.multiply, long, long_v)) + sum(map(np.multiply, angle, angle_v))) * w.x[0]
+
+        def swelling(u, q, w):
+            return -sum(self.strains(u, w.x[0])[0]) * q * w.x[0]
+
+        squeezed = asm(BilinearForm(swelling), self.basis, self.basis.with_element(ElementQuad1()))
+        return asm(BilinearForm(work), self.basis), squeezed
+
+    def solve(self, part_i: int, load: Callable, held: dict[str, list[int]], drag: dict[str, Callable]) -> Solved:
+        """Solve for a load(r) on one part of the top, parts held at edges, and a drag(r) there per displacement u_r."""
+        (work, swelling), at = self.matrices, self.basis
+        push = asm(LinearForm(lambda v, w: load(w.x[0]) * v[part_i] * w.x[0]), at.boundary("top"))
+        for edge, of in drag.items():
+            work = work + asm(BilinearForm(lambda u, v, w, of=of: of(w.x[0]) * u[0] * v[0] * w.x[0]), at.boundary(edge))
+        still = np.concatenate([at.get_dofs(edge).all([f"u^{i + 1}"]) for edge, parts in held.items() for i in parts])
+        whole = sp.bmat([[work, swelling.T], [swelling, None]], format="csc")
+        sides = np.append(push, np.zeros(swelling.shape[0]))
+        free, found = np.setdiff1d(np.arange(len(sides)), still), np.zeros(len(sides))
+        found[free] = splu(whole[free][:, free], permc_spec="MMD_ATA").solve(sides[free])
+        total = asm(LinearForm(lambda v, w: load(w.x[0]) * v * w.x[0]), at.boundary("top").with_element(ElementQuad1()))
+        parts = found[: at.N], found[at.N :]
+        motions = (_motion(where, *parts) for where in (at, at.boundary("base"), at.boundary("top")))
+        return Solved(*motions, push @ parts[0] / total.sum())
+
+    def with_friction(self, load: Callable, friction: float, *, steps_n: int = 4, **edges) -> Solved:
+        """Solve for a pressure on top of a base that holds back with Coulomb's friction, by repeated solving.
+
+        t = -friction p u / (|u| + u0), p and u of the solution before: sticks where p is large, slides elsewhere.
+        """
+        at = self.solve(1, load, edges["held"], edges["drag"])
+        small_m = SLIP_SHARE * np.abs(at.base.parts_m[0]).max()
+        for _ in range(steps_n):
+            stress = at.base.pressure - 2 * at.base.gradient[1, 1]
+            per_m = friction * np.maximum(stress, 0) / (np.abs(at.base.parts_m[0]) + small_m)
+            at = self.solve(1, load, edges["held"], edges["drag"] | {"base": lambda _r, per_m=per_m: per_m})
+        return at
+
+
+def _motion(at: Basis, displacement: np.ndarray, pressure: np.ndarray) -> Motion:
+    u, p = at.interpolate(displacement), at.with_element(ElementQuad1()).interpolate(pressure)
+    return Motion(*at.global_coordinates(), np.asarray(u), u.grad, np.asarray(p))
+
+
+def plate(sides_m, place_m, taken_m, stiffness, *, cells_n=12, patch_m=1.5e-3):
+    """Pull a plate in plane stress, dragged alike everywhere, so that the mean over a patch goes as far as it is taken.
+
+    `stiffness` is E t over the drag per area, in areas of the plate. Returns the patch's middle, the mean motion, spin.
+    """
+    area_m2, (nu, young) = np.prod(sides_m), (0.5, stiffness * np.prod(sides_m))
+    mesh = MeshQuad.init_tensor(*(np.linspace(-side_m / 2, side_m / 2, cells_n + 1) for side_m in sides_m))
+    at = Basis(mesh, ElementVector(ElementQuad2()), intorder=5)
+
+    def work(u, v, _w):
+        e, e_v = sym_grad(u), sym_grad(v)
+        return young / (1 - nu**2) * ((1 - nu) * ddot(e, e_v) + nu * trace(e) * trace(e_v)) + dot(u, v)
+
+    def mean(form, weight=lambda x: 1.0):
+        return asm(LinearForm(lambda v, w: weight(w.x) * form(v, w.x)), at)
+
+    def bump(x):
+        return np.exp(-((x[0] - place_m[0]) ** 2 + (x[1] - place_m[1]) ** 2) / (2 * patch_m**2))
+
+    ones = at.project(lambda x: np.stack([np.ones_like(x[0]), np.zeros_like(x[0])]))
+    patch = np.stack([mean(lambda v, _x, i=i: v[i], bump) for i in (0, 1)])
+    patch /= patch[0] @ ones
+    middle_m = np.array([mean(lambda v, x, i=i: x[i] * v[0], bump) @ ones for i in (0, 1)])
+    middle_m /= mean(lambda v, _x: v[0], bump) @ ones
+    whole = sp.bmat([[asm(BilinearForm(work), at), patch.T], [patch, None]], format="csc")
+    found = splu(whole).solve(np.append(np.zeros(at.N), taken_m))[: at.N]
+    move_m = np.array([mean(lambda v, _x, i=i: v[i]) @ found for i in (0, 1)]) / area_m2
+    spin = mean(lambda v, x: x[0] * v[1] - x[1] * v[0]) @ found
+    return middle_m, move_m, spin / (area_m2 * (sides_m[0] ** 2 + sides_m[1] ** 2) / 12)

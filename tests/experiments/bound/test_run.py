@@ -1,0 +1,140 @@
+"""The bound against what chips and a linear estimate do, its slopes against a dipole's own, and how it scales."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.core import io
+from pipeline.core.errors import ParamsError, SchemaError
+from pipeline.core.seeds import rng_for
+from pipeline.evaluation.metrics import score
+from pipeline.experiments.bound.run import (
+    NETWORK,
+    bound_of,
+    expected_scores,
+    least_covariance,
+    network_scores,
+    noise_var_uT2,
+    probability_within,
+    slopes,
+    touches,
+)
+from pipeline.physics.board import draw_board
+from pipeline.physics.sensor import ChipDesign, read_field
+from pipeline.physics.skin import draw_skin
+from tests.synthesis.scene import synthesis
+
+ROWS_N = 40_000
+SAMPLING = 6 / math.sqrt(ROWS_N)  # six standard errors, relative, of a variance of normal draws (sqrt(2 / n) each)
+CHIP = ChipDesign(gain_sel=6, noise_xy_uT=3.3, noise_z_uT=5.0, noise_temperature_degC=0.0)
+SCENE = synthesis()
+NO_LABEL_ERRORS = {"place_sd_mm": 0.0, "force_sd_N": 0.0}
+
+
+def linear_sensor(rng):
+    """15 channels that answer on a straight line, x and y coupled; force by depth alone."""
+    db_slopes = rng.normal(size=(1, 15, 3)) * np.array([2.0, 3.0, 8.0])
+    return db_slopes + 0.7 * db_slopes[:, :, [1, 0, 2]], np.array([[0.0, 0.0, 1.7]])
+
+
+def test_the_best_linear_estimate_scores_what_the_bound_says():
+    rng = rng_for(1, "linear sensor")
+    db_slopes, force_slopes = linear_sensor(rng)
+    var_uT2 = np.tile([10.0, 10.0, 25.0], 5)
+    labels = {"place_sd_mm": 0.3, "force_sd_N": 0.2}
+    expected = expected_scores(least_covariance(db_slopes, force_slopes, var_uT2), **labels)
+    truth = rng.uniform(-8, 8, size=(ROWS_N, 3))
+    db_uT = truth @ db_slopes[0].T + np.sqrt(var_uT2) * rng.standard_normal((ROWS_N, 15))
+    weighted = db_slopes[0] / np.sqrt(var_uT2)[:, None]
+    found = np.linalg.lstsq(weighted, (db_uT / np.sqrt(var_uT2)).T, rcond=None)[0].T
+    found[:, 2] *= force_slopes[0, 2]
+    truth[:, 2] *= force_slopes[0, 2]
+    wrong = np.array([labels["place_sd_mm"]] * 2 + [labels["force_sd_N"]]) * rng.standard_normal((ROWS_N, 3))
+    scores = score(truth + wrong, found)
+    assert 20 < scores["accuracy_pct"] < 98  # else nothing is tested
+    assert expected["accuracy_pct"][0] == pytest.approx(scores["accuracy_pct"], abs=100 * SAMPLING / 2)
+    assert expected["mse_xy_mm2"][0] == pytest.approx(scores["mse_xy_mm2"], rel=SAMPLING * math.sqrt(2))
+    assert expected["mse_f_N2"][0] == pytest.approx(scores["mse_f_N2"], rel=SAMPLING * math.sqrt(2))
+
+
+@given(st.floats(0.05, 5.0), st.floats(0.05, 5.0))
+def test_without_correlation_the_probability_is_that_of_each_axis_times_the_other(h, k):
+    known = math.erf(h / math.sqrt(2)) * math.erf(k / math.sqrt(2))
+    assert probability_within(np.array([[h, k]]), np.zeros(1))[0] == pytest.approx(known, abs=1e-12)
+
+
+@given(st.floats(0.1, 3.0), st.floats(0.1, 3.0), st.floats(-0.95, 0.95))
+def test_with_correlation_the_probability_is_the_integral_over_one_axis(h, k, r):
+    nodes, weights = np.polynomial.legendre.leggauss(200)
+    x, root = h * nodes, math.sqrt(1 - r**2)
+    reach = np.vectorize(math.erf)
+    inner = (reach((k - r * x) / root / math.sqrt(2)) - reach((-k - r * x) / root / math.sqrt(2))) / 2
+    known = h * (weights * np.exp(-(x**2) / 2) * inner).sum() / math.sqrt(2 * math.pi)
+    assert probability_within(np.array([[h, k]]), np.array([r]))[0] == pytest.approx(known, abs=1e-10)
+
+
+def test_the_variance_is_that_of_rows_which_the_chips_read():
+    board, readings_n, noload_n = draw_board(SCENE.main_boards.design, SCENE.spreads, seed=1, name="b0"), 2, 10
+    still = np.zeros((ROWS_N // 4 * (readings_n + noload_n), 5, 3))
+    b_uT = read_field(still, board, design=CHIP, rng=rng_for(1, "still"))[0].astype(float)
+    dwells_uT = b_uT.reshape(-1, readings_n + noload_n, 15)
+    db_uT = dwells_uT[:, :readings_n].mean(axis=1) - dwells_uT[:, readings_n:].mean(axis=1)
+    known = noise_var_uT2(CHIP, 5, readings_n=readings_n, noload_frames_n=noload_n)
+    np.testing.assert_allclose(db_uT.var(axis=0), known, rtol=SAMPLING * 2)
+
+
+def test_slopes_are_those_of_a_dipole_over_a_chip():
+    def read(mm):  # Bz on a chip under a moment along z, 3 mm above it and deeper by the poke
+        x, y, z = mm[:, 0], mm[:, 1], 3.0 - mm[:, 2]
+        r2 = x**2 + y**2 + z**2
+        return ((3 * z**2 - r2) / r2**2.5)[:, None]
+
+    pokes_mm = np.array([[1.0, 0.5, 0.4], [-2.0, 3.0, 1.2], [0.0, 0.0, 0.2]])
+    x, y, z = pokes_mm[:, 0], pokes_mm[:, 1], 3.0 - pokes_mm[:, 2]
+    r2 = x**2 + y**2 + z**2
+    by_rho = (3 * r2 - 15 * z**2) / r2**3.5
+    by_z = (9 * z * r2 - 15 * z**3) / r2**3.5
+    known = np.stack([x * by_rho, y * by_rho, -by_z], axis=1)[:, None]
+    np.testing.assert_allclose(slopes(read, pokes_mm), known, rtol=1e-3, atol=1e-6)  # of the square of the step
+
+
+@given(st.floats(0.1, 10.0))
+def test_the_bound_falls_with_the_noise_and_as_one_over_the_square_root_of_the_readings(factor):
+    db_slopes, force_slopes = linear_sensor(rng_for(2, "linear sensor"))
+    one, four = (noise_var_uT2(CHIP, 5, readings_n=n, noload_frames_n=10 * n) for n in (1, 4))
+    least = least_covariance(db_slopes, force_slopes, one)
+    noisier = least_covariance(db_slopes, force_slopes, factor**2 * one)
+    fewer = least_covariance(db_slopes, force_slopes, four)
+    np.testing.assert_allclose(noisier, factor**2 * least, rtol=1e-9)
+    sds = [np.sqrt(np.diagonal(part, axis1=1, axis2=2)) for part in (fewer, least)]
+    np.testing.assert_allclose(2 * sds[0], sds[1], rtol=1e-9)
+
+
+def test_every_place_is_bounded_and_deeper_presses_and_exact_labels_are_told_better():
+    numbers = bound_of(SCENE, seed=1)
+    assert [row["depth_mm"] for row in numbers["by_depth"]] == sorted(SCENE.main.depths_mm)
+    assert (numbers["places_n"], numbers["above_the_skin_n"]) == (65, 0)
+    errors = [row["signal"]["mse_xy_mm2"] for row in numbers["by_depth"]]
+    assert errors == sorted(errors, reverse=True)
+    signal, scored = numbers["all"]["signal"], numbers["all"]["with_label_errors"]
+    assert scored["mse_xy_mm2"] - signal["mse_xy_mm2"] == pytest.approx(SCENE.rig.robot_place_sd_mm**2)
+    assert scored["mse_f_N2"] - signal["mse_f_N2"] == pytest.approx(SCENE.rig.force_noise_N**2)
+
+
+def test_pokes_above_the_skin_are_marked_and_a_skin_that_none_touches_is_refused():
+    skin = draw_skin(SCENE.skin, SCENE.spreads, seed=1, name="b0_s0", rule=SCENE.main_boards.quadrature.quadrature())
+    depths_mm = np.array([0.2, 0.6])
+    assert touches(replace(skin, depth_zero_m=-0.3e-3), depths_mm).tolist() == [False, True]
+    with pytest.raises(ParamsError, match="depths_mm must be deep enough to touch it; got 0.6 mm at most"):
+        touches(replace(skin, depth_zero_m=-0.7e-3), depths_mm)
+
+
+def test_networks_of_another_skin_are_refused(tmp_path):
+    card = {"question": NETWORK, "recipe_name": "paper", "train_skins": ["b0_s1"]}
+    io.write_json(tmp_path / "one.json", card)
+    with pytest.raises(SchemaError, match="skin of single_pass must be b0_s0, as bounded; got"):
+        network_scores(tmp_path, "b0_s0")

@@ -1,0 +1,65 @@
+"""The map that comes with the project: it reads simulated pokes, tells what is none, and refuses other boards."""
+
+import numpy as np
+import pytest
+
+import reskin
+from pipeline.core.errors import SchemaError
+from pipeline.twin.shipped import CHANNELS_N, Universal, load_universal, to_board
+from pipeline.twin.tables import NOMINAL
+
+PLACES_MM = np.array([[8.0, 8.0], [3.0, 6.0], [12.0, 11.0], [10.0, 3.0]])
+
+
+@pytest.fixture
+def skin() -> Universal:
+    return load_universal()
+
+
+def pokes(skin: Universal, force_i: int = 3) -> np.ndarray:
+    """What a nominal skin reads at the places of the lattice next to `PLACES_MM`, in the chips' axes."""
+    tables = skin.tables
+    at = np.abs((PLACES_MM - 8)[:, :, None] - tables.axis_mm).argmin(axis=2)
+    return to_chips(tables.mean_uT[at[:, 0], at[:, 1], force_i])
+
+
+def to_chips(b_uT: np.ndarray) -> np.ndarray:
+    turn = np.stack([to_board(row[None])[0] for row in np.eye(CHANNELS_N)])  # a rotation: its transpose turns back
+    return b_uT @ turn.T
+
+
+def test_a_nominal_skin_is_read_within_the_lattice_and_its_force_between_the_forces(skin):
+    tables, rest_uT = skin.tables, to_chips(skin.tables.rest_uT[None])
+    found = skin.zero(rest_uT).predict(pokes(skin) + rest_uT)
+    lattice_mm = tables.axis_mm[np.abs((PLACES_MM - 8)[:, :, None] - tables.axis_mm).argmin(axis=2)] + 8
+    assert np.abs(found[:, :2] - lattice_mm).max() < 0.5
+    assert ((found[:, 2] > tables.force_N[1]) & (found[:, 2] < tables.force_N[5])).all()
+
+
+def test_labels_move_what_is_answered_towards_them(skin):
+    rest_uT = to_chips(skin.tables.rest_uT[None])
+    read_uT, shifted_mm = pokes(skin) + rest_uT, PLACES_MM + (0.8, -0.5)
+    before = skin.zero(rest_uT).predict(read_uT)
+    after = skin.label(shifted_mm, np.full(4, skin.tables.force_N[3]), read_uT).predict(read_uT)
+    assert np.abs(after[:, :2] - shifted_mm).mean() < 0.5 * np.abs(before[:, :2] - shifted_mm).mean()
+
+
+def test_what_is_no_poke_of_a_skin_has_a_misfit_far_above_one(skin):
+    rest_uT = to_chips(skin.tables.rest_uT[None])
+    own = skin.zero(rest_uT).estimate(pokes(skin) + rest_uT).misfit
+    alien = skin.estimate(3000 * np.random.default_rng(0).standard_normal((4, CHANNELS_N)) + rest_uT).misfit
+    assert own.max() < 1
+    assert alien.min() > 10 * own.max()
+
+
+def test_the_card_says_what_the_map_is_and_what_it_is_not_for(skin):
+    assert skin.card["source"] == "simulated"
+    assert skin.card["centre"]["gap_mm"] == NOMINAL.gap_mm
+    assert skin.card["not_for"]
+    assert tuple(skin.card["spreads"]) == skin.tables.names
+
+
+def test_other_boards_are_refused(skin):
+    with pytest.raises(SchemaError, match="channels must be the 15 of five chips"):
+        skin.predict(np.zeros((2, 12)))
+    assert reskin.load_universal().tables.rest_uT.shape == (CHANNELS_N,)
