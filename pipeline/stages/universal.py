@@ -3,6 +3,7 @@
 A map, and a network with it; with recorded boards of the rig, and with none.
 """
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -17,7 +18,7 @@ from pipeline.experiments.compare.run import Compare, see, setup_of, skins_of, t
 from pipeline.physics.skin import SkinDesign
 from pipeline.trials.data import read_data
 from pipeline.trials.experts import Frame, Known, make_experts, write_networks
-from pipeline.trials.universal import QUESTION, Bench, score_fold
+from pipeline.trials.universal import QUESTION, Bench, score_fold, tell_tempers
 from pipeline.twin.training import Lessons
 
 
@@ -40,7 +41,8 @@ def universal(scene: str, files: Files, indentations: Path, folds: Path, models:
     lessons = read(settings)
     nominal, rig = make_experts(Known(data, frame, setup, seen), lessons)
     write_networks(models, [nominal, *rig.values()], lessons, settings.seed)
-    bench, points = Bench(data, frame, seen, nominal), []
+    bench, points = Bench(data, frame, seen, nominal, {}), []
+    bench = replace(bench, tempers=tell_tempers(bench, lessons.labels_n))
     for fold in data.folds_of(QUESTION):
         points += score_fold(bench, fold, rig, lessons.labels_n)
         say(f"{scene} universal: {fold.name} done")

@@ -6,7 +6,7 @@ Places and fields are turned to the board's frame first. Refuses to know files a
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,14 +21,28 @@ from pipeline.trials.models import score_test
 from pipeline.twin.experts import Labels, centre, multiply, off_middle_mm, shift
 from pipeline.twin.fit import Seen
 from pipeline.twin.network import Opinion, Weights, predict
-from pipeline.twin.skin_map import Estimate, Reader, SkinMap, new_map, see_even, see_labelled, see_pokes, see_rest
+from pipeline.twin.skin_map import (
+    Estimate,
+    Reader,
+    SkinMap,
+    joined,
+    new_map,
+    see_even,
+    see_labelled,
+    see_pokes,
+    see_rest,
+)
 
 QUESTION = "labels"  # whose folds these are
+METHODS = ("universal map, ", "universal, ")  # the map alone; with networks
 WAYS = {"rig": "boards of the rig", "nominal": "simulated alone"}
 REACH = 1.645  # standard deviations to either side of a 90 % interval
 TEMPERS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15)
 ASSUMED_TEMPER = 0.5  # where no board is known that it could be told on: of two experts on one reading, the mean
+BLOCK_N = 200  # readings at a time, to bound memory
 FORCE_MIN_N = 0.3  # of a labelled poke: below, the map is not tabulated
+
+Tempers = tuple[float, float]  # of the map alone, and of the map with networks
 
 
 @dataclass(frozen=True)
@@ -39,6 +53,7 @@ class Bench:
     frame: Frame
     seen: Mapping[str, Seen]
     nominal: Experts
+    tempers: Mapping[str, Mapping[int, Tempers]]
 
 
 @dataclass(frozen=True)
@@ -70,7 +85,6 @@ class Told:
 def score_fold(bench: Bench, fold: Fold, rig: Mapping[str, Experts], labels_n: Sequence[int]) -> list[dict[str, Any]]:
     """Score the map alone and both experts on one fold: how sure they are is told on boards that are not held out."""
     board = str(bench.data.rows.board[fold.test[0]])
-    others = [other for other in bench.seen if other != board]
     if board not in bench.seen:  # they are named by board and skin where a board has several
         rule = "boards of one skin each"
         raise ParamsError(f"fold {fold.name}", "the boards", rule, ", ".join(bench.seen), "Do not ask it.")
@@ -82,8 +96,9 @@ def score_fold(bench: Bench, fold: Fold, rig: Mapping[str, Experts], labels_n: S
         told = tell(experts, rest_uT, pool)
         took_s = time.monotonic() - start_s
         for n in labels_n:
-            tempers = tell_tempers(bench, others, n) if way == "rig" else (ASSUMED_TEMPER, ASSUMED_TEMPER)
-            for name, temper, found in read_both(told, test_uT, n, tempers):
+            tempers = bench.tempers[board][n] if way == "rig" else (ASSUMED_TEMPER, ASSUMED_TEMPER)
+            alone, both = read_both(ready(told, n), test_uT, *tempers)
+            for name, temper, found in zip(METHODS, tempers, (alone, both), strict=True):
                 words = {"method": f"{name}{WAYS[way]}", "labels_n": n, "fold": fold.name.rsplit("-draw", 1)[0]}
                 words |= {"inputs": "map" if "map" in name else "map and network", "temper": temper}
                 words |= {"seed_i": int(fold.name.rsplit("-draw", 1)[1]), "seconds": took_s}
@@ -98,42 +113,66 @@ def tell(experts: Experts, rest_uT: Float[np.ndarray, " ch"], pool: Pokes) -> To
     return Told(see_even(skin, pool.db_uT), experts.networks, rest_uT, pool, pool_mm)
 
 
-def read_both(
-    told: Told, db_uT: Float[np.ndarray, "n ch"], labels_n: int, tempers: tuple[float, float]
-) -> list[tuple[str, float, Estimate]]:
-    """Read places with so many labels: by the map alone, and by it and the networks; by name and temper."""
+@dataclass(frozen=True)
+class Ready:
+    """Experts with so many labels, ready to read."""
+
+    reader: Reader
+    told: Told
+    labels_n: int
+
+
+def ready(told: Told, labels_n: int) -> Ready:
+    """Tell a map the first labels."""
     first = slice(labels_n)
     force_N = np.maximum(told.pool.force_N[first], FORCE_MIN_N)
     skin = see_labelled(told.skin, told.pool.place_mm[first], force_N, told.pool.db_uT[first])
-    reader = Reader(replace(skin, temper=tempers[0]))
-    both = multiply(reader, db_uT, told.opinion(db_uT, labels_n), tempers[1])
-    alone = reader.estimate(db_uT)
-    return [("universal map, ", tempers[0], alone), ("universal, ", tempers[1], both)]
+    return Ready(Reader(skin), told, labels_n)
 
 
-def tell_tempers(bench: Bench, boards: Sequence[str], labels_n: int) -> tuple[float, float]:
-    """Find how much the map, and both experts, are to be believed: 90 % intervals hold 90 % on boards not held out.
+def read_both(
+    ready: Ready, db_uT: Float[np.ndarray, "n ch"], map_temper: float, both_temper: float
+) -> tuple[Estimate, Estimate]:
+    """Read places by the map alone, and by it and the networks."""
+    opinion, alone, both = ready.told.opinion(db_uT, ready.labels_n), [], []
+    for first in range(0, len(db_uT), BLOCK_N):
+        here = slice(first, first + BLOCK_N)
+        weighed = ready.reader.weigh(db_uT[here])
+        alone.append(ready.reader.answer(weighed, map_temper))
+        both.append(multiply(ready.reader, weighed, opinion[here], both_temper))
+    return joined(alone), joined(both)
 
-    Each is read by the nominal experts, which know no board, with as many labels of its own, on its other pokes.
+
+def tell_tempers(bench: Bench, labels_n: Sequence[int]) -> dict[str, dict[int, Tempers]]:
+    """Find, for each board that is held out, how much experts are to be believed: as was best on the other boards."""
+    held = {board: coverages(bench, board, labels_n) for board in bench.seen}
+    found: dict[str, dict[int, Tempers]] = {}
+    for board in held:
+        found[board] = {}
+        for n in labels_n:
+            mean = np.mean([own[n] for other, own in held.items() if other != board], axis=0)
+            of_map, of_both = np.abs(mean - 0.9).argmin(axis=0)
+            found[board][n] = TEMPERS[of_map], TEMPERS[of_both]
+    return found
+
+
+def coverages(bench: Bench, board: str, labels_n: Sequence[int]) -> dict[int, Float[np.ndarray, "t 2"]]:
+    """Give what 90 % intervals hold under each temper, of the map alone and with networks, by number of labels.
+
+    The board is read by the nominal experts, which know no board, with labels of its own, on its other pokes.
     """
-    held: dict[tuple[int, float], list[float]] = {}
-    for board in boards:
-        seen = bench.seen[board]
-        order = rng_for(bench.data.settings.seed, "universal", board).permutation(len(seen.pokes))
-        pool_n = len(order) // 3
-        db_uT = seen.db_uT.reshape(len(order), -1)[order]
-        place_mm, force_N = seen.place_mm[order], seen.pokes.force_N[order]
-        pool = Pokes(place_mm[:pool_n], force_N[:pool_n], db_uT[:pool_n])
-        told = tell(bench.nominal, seen.rest_uT.ravel(), pool)
-        for temper in TEMPERS:
-            found = read_both(told, db_uT[pool_n:], min(labels_n, pool_n), (temper, temper))
-            for i, (_, _, estimate) in enumerate(found):
-                held.setdefault((i, temper), []).append(covered(estimate, place_mm[pool_n:]))
-
-    def nearest(i: int) -> float:
-        return min(TEMPERS, key=lambda temper: abs(float(np.mean(held[i, temper])) - 0.9))
-
-    return nearest(0), nearest(1)
+    seen = bench.seen[board]
+    order = rng_for(bench.data.settings.seed, "universal", board).permutation(len(seen.pokes))
+    pool_n = len(order) // 3
+    db_uT = seen.db_uT.reshape(len(order), -1)[order]
+    place_mm, force_N = seen.place_mm[order], seen.pokes.force_N[order]
+    told = tell(bench.nominal, seen.rest_uT.ravel(), Pokes(place_mm[:pool_n], force_N[:pool_n], db_uT[:pool_n]))
+    held = {}
+    for n in labels_n:
+        experts = ready(told, min(n, pool_n))
+        both = [read_both(experts, db_uT[pool_n:], temper, temper) for temper in TEMPERS]
+        held[n] = np.array([[covered(found, place_mm[pool_n:]) for found in pair] for pair in both])
+    return held
 
 
 def covered(estimate: Estimate, place_mm: Float[np.ndarray, "n 2"]) -> float:

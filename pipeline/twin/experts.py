@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.twin.network import Opinion
-from pipeline.twin.skin_map import CELL_SD_MM, Estimate, Reader, believe, joined
+from pipeline.twin.skin_map import CELL_SD_MM, Estimate, Reader, Weighed, believe
 
 MAP_TEMPER = 0.6  # of the map's log likelihoods, as channels err together; fixed beforehand, told on no board
 SD_MIN_MM, SD_MIN_LOG_N = 0.5, 0.3  # of an opinion: a network is never surer than this
@@ -46,21 +46,9 @@ def shift(opinion: Opinion, labels: Labels) -> Opinion:
     return replace(opinion, place_mm=opinion.place_mm + told_mm)
 
 
-def multiply(
-    reader: Reader, db_uT: Float[np.ndarray, "n ch"], opinion: Opinion, temper: float, block_n: int = 200
-) -> Estimate:
-    """Read places and forces: the map's probabilities times the network's normals, and the mean over all places."""
-    blocks = []
-    for first in range(0, len(db_uT), block_n):
-        here = slice(first, first + block_n)
-        part = Opinion(opinion.place_mm[here], opinion.sd_mm[here], opinion.log_N[here], opinion.sd_log_N[here])
-        blocks.append(_multiply(reader, db_uT[here], part, temper))
-    return joined(blocks)
-
-
-def _multiply(reader: Reader, db_uT: Float[np.ndarray, "n ch"], opinion: Opinion, temper: float) -> Estimate:
-    weighed, chi2 = reader.weigh(db_uT)
-    by_map = believe(weighed, MAP_TEMPER).reshape(len(db_uT), len(reader.place_mm), -1)
+def multiply(reader: Reader, weighed: Weighed, opinion: Opinion, temper: float) -> Estimate:
+    """Give places and forces: the map's probabilities times the network's normals, and the mean over all places."""
+    by_map = believe(weighed, MAP_TEMPER).reshape(len(weighed.chi2), len(reader.place_mm), -1)
     of_place = product(by_map.sum(axis=2), reader.place_mm, opinion.place_mm, np.maximum(opinion.sd_mm, SD_MIN_MM))
     place_mm = of_place @ reader.place_mm
     likely = of_place**temper
@@ -70,8 +58,7 @@ def _multiply(reader: Reader, db_uT: Float[np.ndarray, "n ch"], opinion: Opinion
     sd_mm = np.sqrt(np.maximum(var_mm2, CELL_SD_MM**2))
     sd_log_N = np.maximum(opinion.sd_log_N, SD_MIN_LOG_N)[:, None]
     of_force = product(by_map.sum(axis=1), reader.log_N[:, None], opinion.log_N[:, None], sd_log_N)
-    likeliest = chi2[np.arange(len(chi2)), weighed.argmin(axis=1)]
-    return Estimate(place_mm, sd_mm, np.exp(of_force @ reader.log_N), likeliest / db_uT.shape[1])
+    return Estimate(place_mm, sd_mm, np.exp(of_force @ reader.log_N), weighed.misfit())
 
 
 def product(

@@ -33,6 +33,10 @@ class Opinion:
     log_N: Float[np.ndarray, " n"]
     sd_log_N: Float[np.ndarray, " n"]
 
+    def __getitem__(self, rows: slice) -> "Opinion":
+        """Take the opinion of some readings."""
+        return Opinion(self.place_mm[rows], self.sd_mm[rows], self.log_N[rows], self.sd_log_N[rows])
+
 
 class Network(nn.Module):
     """Set encoder and regressor of weights as `draw_weights` names them."""

@@ -129,6 +129,19 @@ def see_labelled(
     return replace(found, labelled=Labelled(place_mm, log_N, solved, np.linalg.inv(k)))
 
 
+@dataclass(frozen=True)
+class Weighed:
+    """Readings against hypotheses: chi^2, and -2 log likelihood less what all share; forces run within places."""
+
+    chi2: Float32[np.ndarray, "n h"]
+    total: Float32[np.ndarray, "n h"]
+    channels_n: int
+
+    def misfit(self) -> Float[np.ndarray, " n"]:
+        """Give chi^2 a channel of each reading's likeliest hypothesis."""
+        return self.chi2[np.arange(len(self.chi2)), self.total.argmin(axis=1)] / self.channels_n
+
+
 class Reader:
     """A map made ready for readings: every hypothesis (place, force) with its mean and whitened covariance."""
 
@@ -174,40 +187,36 @@ class Reader:
 
     def likely(self, db_uT: Float[np.ndarray, "n ch"]) -> tuple[Float[np.ndarray, "n l"], np.ndarray]:
         """Give the likeliest hypotheses of each reading, and their probabilities, of 1 in sum."""
-        probability = believe(self.weigh(db_uT)[0], self._temper)
+        probability = believe(self.weigh(db_uT), self._temper)
         at = np.argsort(-probability, axis=1)[:, :LIKELY_N]
         weight = np.take_along_axis(probability, at, axis=1)
         return weight / weight.sum(axis=1, keepdims=True), at
 
     def estimate(self, db_uT: Float[np.ndarray, "n ch"], block_n: int = 200) -> Estimate:
         """Read places and forces: the mean over all hypotheses."""
-        blocks = [self._estimate(db_uT[i : i + block_n]) for i in range(0, len(db_uT), block_n)]
-        return joined(blocks)
+        blocks = [self.weigh(db_uT[i : i + block_n]) for i in range(0, len(db_uT), block_n)]
+        return joined([self.answer(block, self._temper) for block in blocks])
 
-    def weigh(self, db_uT: Float[np.ndarray, "n ch"]) -> tuple[Float32[np.ndarray, "n h"], Float32[np.ndarray, "n h"]]:
-        """Give -2 log likelihood of every hypothesis (less what all share), and chi^2 alone; forces run within places.
-
-        Some 50 us a reading.
-        """
+    def weigh(self, db_uT: Float[np.ndarray, "n ch"]) -> Weighed:
+        """Weigh every hypothesis against readings: some 50 us each."""
         read_uT = db_uT.astype(np.float32)
         products = read_uT[:, self._rows] * read_uT[:, self._columns]
         chi2 = np.concatenate([products, read_uT, np.ones((len(read_uT), 1), np.float32)], axis=1) @ self._chi2
-        return chi2 + self._log_det, chi2
+        return Weighed(chi2, chi2 + self._log_det, db_uT.shape[1])
 
-    def _estimate(self, db_uT: Float[np.ndarray, "n ch"]) -> Estimate:
-        weighed, chi2 = self.weigh(db_uT)
-        probability = believe(weighed, self._temper)
-        by_place = probability.reshape(len(db_uT), len(self.place_mm), -1)
+    def answer(self, weighed: Weighed, temper: float) -> Estimate:
+        """Give places and forces, the means over all hypotheses."""
+        by_place = believe(weighed, temper).reshape(len(weighed.chi2), len(self.place_mm), -1)
         of_place, of_force = by_place.sum(axis=2), by_place.sum(axis=1)
         place_mm = of_place @ self.place_mm
         var_mm2 = np.maximum(of_place @ self.place_mm**2 - place_mm**2, CELL_SD_MM**2)
-        likeliest = chi2[np.arange(len(chi2)), probability.argmax(axis=1)]
-        return Estimate(place_mm, np.sqrt(var_mm2), np.exp(of_force @ self.log_N), likeliest / db_uT.shape[1])
+        return Estimate(place_mm, np.sqrt(var_mm2), np.exp(of_force @ self.log_N), weighed.misfit())
 
 
-def believe(weighed: Float[np.ndarray, "n h"], temper: float) -> Float[np.ndarray, "n h"]:
-    """Turn -2 log likelihoods, times a temper, into probabilities of 1 in sum."""
-    probability = np.exp(-0.5 * temper * (weighed - weighed.min(axis=1, keepdims=True)))
+def believe(weighed: Weighed, temper: float) -> Float[np.ndarray, "n h"]:
+    """Turn log likelihoods, times a temper, into probabilities of 1 in sum."""
+    total = weighed.total
+    probability = np.exp(-0.5 * temper * (total - total.min(axis=1, keepdims=True)))
     return probability / probability.sum(axis=1, keepdims=True)
 
 

@@ -55,9 +55,9 @@ def test_an_opinion_decides_where_the_map_cannot_and_little_where_it_can():
     reader = Reader(new_map(made_tables()))
     place_mm = np.array([[3.0, 2.0], [-4.0, 1.0]])
     db_uT = fields_uT(place_mm, np.array([2.0, 3.0]))
-    right = multiply(reader, db_uT, opinion(place_mm), 1.0)
-    unsure = multiply(reader, db_uT, opinion(place_mm + 5, sd_mm=50.0), 1.0)
-    blind = multiply(reader, np.zeros((2, 15)), opinion(place_mm, sd_mm=0.1), 1.0)
+    right = multiply(reader, reader.weigh(db_uT), opinion(place_mm), 1.0)
+    unsure = multiply(reader, reader.weigh(db_uT), opinion(place_mm + 5, sd_mm=50.0), 1.0)
+    blind = multiply(reader, reader.weigh(np.zeros((2, 15))), opinion(place_mm, sd_mm=0.1), 1.0)
     assert np.abs(right.place_mm - place_mm).max() < 0.5
     assert np.abs(unsure.place_mm - place_mm).max() < 0.8
     assert (right.sd_mm <= unsure.sd_mm + 1e-6).all()
@@ -68,6 +68,6 @@ def test_a_lower_power_widens_intervals_and_leaves_the_answer():
     reader = Reader(new_map(made_tables()))
     place_mm = np.array([[3.0, 2.0]])
     db_uT = fields_uT(place_mm, np.array([2.0]))
-    sure, less = (multiply(reader, db_uT, opinion(place_mm), temper) for temper in (1.0, 0.25))
+    sure, less = (multiply(reader, reader.weigh(db_uT), opinion(place_mm), temper) for temper in (1.0, 0.25))
     np.testing.assert_array_equal(sure.place_mm, less.place_mm)
     assert (less.sd_mm > sure.sd_mm).all()

@@ -46,8 +46,8 @@ def test_a_reading_is_weighed_by_its_gaussian_distance(skin):
         chi2 = off_uT @ np.linalg.solve(cov, off_uT)
         weighed = chi2 + np.linalg.slogdet(cov)[1]
         found = reader.weigh(db_uT[row : row + 1])
-        assert found[1][0, i] == pytest.approx(chi2, abs=0.01)  # single precision
-        assert found[0][0, i] == pytest.approx(weighed, abs=0.02)
+        assert found.chi2[0, i] == pytest.approx(chi2, abs=0.01)  # single precision
+        assert found.total[0, i] == pytest.approx(weighed, abs=0.02)
 
 
 def test_readings_of_the_tables_own_skin_are_read_where_they_were(skin):
