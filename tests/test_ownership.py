@@ -14,11 +14,12 @@ HOMES = {
     r"\bimport matplotlib|from matplotlib": ["reporting/*.py", "experiments/*/show.py"],
     r"\bimport argparse|from argparse": ["core/stage.py", "stages/code.py"],
     r"\bimport typer|from typer": ["cli.py"],
-    r"optimizer\.step\(": ["learning/train.py"],
+    r"optimizer\.step\(": ["learning/train.py", "twin/training.py"],
     r"np\.random\.(?!Generator\b)|default_rng|\.manual_seed\(": ["core/seeds.py"],
     r"\bimport serial|from serial": ["capture/port.py"],
     r"ruamel": ["core/config.py", "plan.py", "registry.py", "tidying.py"],
-    r"\bimport torch|from torch": [f"learning/{name}.py" for name in ("model", "train", "feed", "descent")],
+    r"\bimport torch|from torch": [f"learning/{name}.py" for name in ("model", "train", "feed", "descent")]
+    + ["twin/network.py", "twin/training.py"],
     r"from sklearn": ["dataset/splits.py", "learning/classical.py", "experiments/*.py"],
     r"os\.environ": [
         "core/numerics.py",

@@ -51,6 +51,7 @@ class Setup:
     skin_mm: tuple[float, float]
     skin_flipped: bool  # every field has the other sign: a checkerboard skin that lies turned by a quarter
     tip_radius_mm: float
+    rule: Quadrature = RULE
 
     @property
     def sides_m(self) -> tuple[float, float]:
@@ -63,7 +64,7 @@ class Setup:
     @cached_property
     def rest(self) -> flow_map.Rest:
         """Magnetise the skin, its middle at the origin."""
-        nodes = place_nodes(self.thickness_m, RULE, sides_m=self.sides_m)
+        nodes = place_nodes(self.thickness_m, self.rule, sides_m=self.sides_m)
         cubes_n = (magnet.cubes_along(self.sides_m[0]), magnet.cubes_along(self.sides_m[1]))
         b_T = magnet.array_field(nodes.nodes_m, self.thickness_m, self.design.polarity, cubes_n=cubes_n)
         j_T = magnet.magnetise(b_T, saturation_T=self.design.saturation_T, half_field_T=self.design.half_field_T)
@@ -85,17 +86,25 @@ class Setup:
         return chips_mm @ turn * milli, turn
 
 
-def at_rest_uT(law: Law, setup: Setup) -> Float[np.ndarray, "k 3"]:
-    """Give the field of the untouched skin at the chips, in the board's axes."""
+def at_rest_uT(law: Law, setup: Setup, rest: flow_map.Rest | None = None) -> Float[np.ndarray, "k 3"]:
+    """Give the field of the untouched skin at the chips, in the board's axes; `rest` as of `simulate_uT`."""
     chips_m, turn = setup.chips_under(law)
-    field_T = dipole.field(setup.rest.nodes_m, setup.rest.moments_A_m2, chips_m)
+    rest = rest or setup.rest
+    field_T = dipole.field(rest.nodes_m, rest.moments_A_m2, chips_m)
     return law.amplitude * field_T @ turn.T / micro
 
 
 def simulate_uT(
-    law: Law, setup: Setup, place_mm: Float[np.ndarray, "n 2"], force_N: Float[np.ndarray, " n"]
+    law: Law,
+    setup: Setup,
+    place_mm: Float[np.ndarray, "n 2"],
+    force_N: Float[np.ndarray, " n"],
+    rest: flow_map.Rest | None = None,
 ) -> Float[np.ndarray, "n k 3"]:
-    """Give the change of field at the chips, in the board's axes, of pokes at labelled places of the board."""
+    """Give the change of field at the chips, in the board's axes, of pokes at labelled places of the board.
+
+    `rest` replaces the setup's dipoles where a skin's filler is not even; its nodes are the setup's.
+    """
     chips_m, turn = setup.chips_under(law)
     offset_mm = (law.label_x_mm - law.seat_x_mm, law.label_y_mm - law.seat_y_mm)
     labels = Rotation.from_euler("z", law.label_rotation_deg, degrees=True).as_matrix()[:2, :2]
@@ -105,7 +114,8 @@ def simulate_uT(
     give_m, away = (law.give_x_um * micro, law.give_y_um * micro), law.away_um_mm * micro / milli
     taken_m = slide.under_tip_m(places_m, force_N / law.lets_go_N, give_m=give_m, away=away)
     slides = slide.rigid(places_m, taken_m, setup.sides_m)
-    change_T = _changes_T(setup, setup.table(setup.tip_radius_mm), chips_m, places_m, depths_m, slides)
+    table = setup.table(setup.tip_radius_mm)
+    change_T = _changes_T(rest or setup.rest, table, chips_m, places_m, depths_m, slides)
     return law.amplitude * change_T @ turn.T / micro
 
 
@@ -117,7 +127,7 @@ def nominal_uT(
     chips_m = np.column_stack([setup.chips_mm, np.full(len(setup.chips_mm), -setup.gap_mm)]) * milli
     still = slide.Slide(np.zeros(place_mm.shape), np.zeros(len(place_mm)))
     table = setup.table(setup.design.tip_radius_mm)
-    return _changes_T(setup, table, chips_m, place_mm * milli, depths_m, still) / micro
+    return _changes_T(setup.rest, table, chips_m, place_mm * milli, depths_m, still) / micro
 
 
 def beyond_n(law: Law | None, setup: Setup, force_N: Float[np.ndarray, " n"]) -> int:
@@ -139,12 +149,12 @@ def _nominal_curve(setup: Setup) -> tuple[Float[np.ndarray, " c"], Float[np.ndar
 
 
 def _changes_T(
-    setup: Setup, table: flow_map.FlowMap, chips_m: np.ndarray, places_m: np.ndarray, depths_m: np.ndarray,
+    rest: flow_map.Rest, table: flow_map.FlowMap, chips_m: np.ndarray, places_m: np.ndarray, depths_m: np.ndarray,
     slides: slide.Slide,
 ) -> Float[np.ndarray, "n k 3"]:  # fmt: skip
     changes_T = np.empty((len(places_m), *chips_m.shape))
     for poke_i, (place_m, depth_m) in enumerate(zip(places_m, depths_m, strict=True)):
-        moved = flow_map.move(table, setup.rest, np.append(place_m, depth_m))
+        moved = flow_map.move(table, rest, np.append(place_m, depth_m))
         changes_T[poke_i] = change_of_field(moved.before, slide.apply(slides, poke_i, moved.after), chips_m)
     return changes_T
 

@@ -5,12 +5,14 @@ reads places, forces and their uncertainty off a reading by Bayes' rule. Places 
 in its axes, in uT. Refuses to know networks, folds and files.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Float32
 from scipy.linalg import solve_triangular
 
+from pipeline.twin.places import inside
 from pipeline.twin.residual import Relative, Residual, kernel, no_residual
 from pipeline.twin.tables import Tables
 
@@ -21,8 +23,7 @@ LEFT_MIN = 0.03  # of the law's error that labels never take away
 SHARE_OF_UNLABELLED = 0.2  # of a poke's weight: the law's errors at neighbouring places are not independent
 LIKELY_N, ROUNDS_N = 40, 3  # hypotheses of an unlabelled poke that count; rounds of finding them again
 EVEN_MM = 0.15  # so near to the labels' middle pokes lie in the mean that are spread evenly
-MARGIN_MM = 0.4  # past the outermost place of the paper's grid
-HALF_MM, CORNER_MM = 8.0, 12.0  # of that grid: |x| and |y|, |x| + |y|
+CELL_SD_MM = 0.2  # at least, of a place: where it lies within a cell of the lattice
 
 
 @dataclass(frozen=True)
@@ -54,9 +55,7 @@ class SkinMap:
     number: Float[np.ndarray, " t"]
     cov: Float[np.ndarray, "t t"]
     labelled: Labelled | None = None
-    temper: float = (
-        1.0  # of log likelihoods: below 1, channels and readings tell less than if they erred each by itself
-    )
+    temper: float = 1.0  # of log likelihoods: below 1, channels tell less than if each erred by itself
 
     @property
     def error_cov(self) -> Float[np.ndarray, "ch ch"]:
@@ -130,19 +129,32 @@ def see_labelled(
     return replace(found, labelled=Labelled(place_mm, log_N, solved, np.linalg.inv(k)))
 
 
+@dataclass(frozen=True)
+class Weighed:
+    """Readings against hypotheses: chi^2, and -2 log likelihood less what all share; forces run within places."""
+
+    chi2: Float32[np.ndarray, "n h"]
+    total: Float32[np.ndarray, "n h"]
+    channels_n: int
+
+    def misfit(self) -> Float[np.ndarray, " n"]:
+        """Give chi^2 a channel of each reading's likeliest hypothesis."""
+        return self.chi2[np.arange(len(self.chi2)), self.total.argmin(axis=1)] / self.channels_n
+
+
 class Reader:
     """A map made ready for readings: every hypothesis (place, force) with its mean and whitened covariance."""
 
     def __init__(self, skin: SkinMap) -> None:
         tables = skin.tables
-        x_mm, y_mm = (part.ravel() for part in np.meshgrid(tables.axis_mm, tables.axis_mm, indexing="ij"))
-        inside = np.maximum(np.abs(x_mm), np.abs(y_mm)) <= HALF_MM + MARGIN_MM
-        inside &= np.abs(x_mm) + np.abs(y_mm) <= CORNER_MM + 1.5 * MARGIN_MM
-        self.place_mm = np.column_stack([x_mm, y_mm])[inside]
+        place_mm = np.stack(np.meshgrid(tables.axis_mm, tables.axis_mm, indexing="ij"), axis=-1).reshape(-1, 2)
+        pressed = inside(place_mm)
+        self.place_mm = place_mm[pressed]
         self.log_N = np.log(tables.force_N)
         forces_n, channels_n = len(self.log_N), len(tables.rest_uT)
-        self.mean_uT = tables.mean_uT.reshape(len(inside), forces_n, channels_n)[inside].reshape(-1, channels_n)
-        self.slope_uT = tables.slope_uT.reshape(len(inside), forces_n, channels_n, -1)[inside]
+        self._rows, self._columns = np.triu_indices(channels_n)
+        self.mean_uT = tables.mean_uT.reshape(len(pressed), forces_n, channels_n)[pressed].reshape(-1, channels_n)
+        self.slope_uT = tables.slope_uT.reshape(len(pressed), forces_n, channels_n, -1)[pressed]
         self.slope_uT = self.slope_uT.reshape(len(self.mean_uT), channels_n, -1)
         place_mm, log_N = np.repeat(self.place_mm, forces_n, axis=0), np.tile(self.log_N, len(self.place_mm))
         self.missed = skin.residual.at(place_mm, log_N)
@@ -164,39 +176,53 @@ class Reader:
         root = np.linalg.cholesky(_with_noise(cov))
         white = np.linalg.inv(root)
         expected_uT = expected_uT + length_uT[:, None] * missed
-        # Single precision: a reading against some 2,500 hypotheses is one product of matrices.
-        self._white = white.reshape(-1, white.shape[2]).T.astype(np.float32)
-        self._off = np.einsum("hij,hj->hi", white, expected_uT).ravel().astype(np.float32)
-        self._log_det = 2 * np.log(np.einsum("hii->hi", root)).sum(axis=1)
+        # chi^2 = d'Ad - 2 b'd + c is linear in the products of channels: a reading against some 2,500 hypotheses is one
+        # product of matrices. In single precision, off by less than 0.01 where a hypothesis is likely.
+        precision = white.transpose(0, 2, 1) @ white
+        aimed = np.einsum("hij,hj->hi", precision, expected_uT)
+        twice = np.where(self._rows == self._columns, 1.0, 2.0)
+        parts = precision[:, self._rows, self._columns] * twice, -2 * aimed, (aimed * expected_uT).sum(axis=1)[:, None]
+        self._chi2 = np.ascontiguousarray(np.concatenate(parts, axis=1).T, np.float32)
+        self._log_det = 2 * np.log(np.einsum("hii->hi", root)).sum(axis=1).astype(np.float32)
 
     def likely(self, db_uT: Float[np.ndarray, "n ch"]) -> tuple[Float[np.ndarray, "n l"], np.ndarray]:
         """Give the likeliest hypotheses of each reading, and their probabilities, of 1 in sum."""
-        probability, _ = self._posterior(db_uT.astype(np.float32))
+        probability = believe(self.weigh(db_uT), self._temper)
         at = np.argsort(-probability, axis=1)[:, :LIKELY_N]
         weight = np.take_along_axis(probability, at, axis=1)
         return weight / weight.sum(axis=1, keepdims=True), at
 
     def estimate(self, db_uT: Float[np.ndarray, "n ch"], block_n: int = 200) -> Estimate:
         """Read places and forces: the mean over all hypotheses."""
-        blocks = [self._estimate(db_uT[i : i + block_n]) for i in range(0, len(db_uT), block_n)]
-        return Estimate(*(np.concatenate([getattr(one, name) for one in blocks]) for name in Estimate.__annotations__))
+        blocks = [self.weigh(db_uT[i : i + block_n]) for i in range(0, len(db_uT), block_n)]
+        return joined([self.answer(block, self._temper) for block in blocks])
 
-    def _estimate(self, db_uT: Float[np.ndarray, "n ch"]) -> Estimate:
-        probability, chi2 = self._posterior(db_uT.astype(np.float32))
-        by_place = probability.reshape(len(db_uT), len(self.place_mm), -1)
+    def weigh(self, db_uT: Float[np.ndarray, "n ch"]) -> Weighed:
+        """Weigh every hypothesis against readings: some 50 us each."""
+        read_uT = db_uT.astype(np.float32)
+        products = read_uT[:, self._rows] * read_uT[:, self._columns]
+        chi2 = np.concatenate([products, read_uT, np.ones((len(read_uT), 1), np.float32)], axis=1) @ self._chi2
+        return Weighed(chi2, chi2 + self._log_det, db_uT.shape[1])
+
+    def answer(self, weighed: Weighed, temper: float) -> Estimate:
+        """Give places and forces, the means over all hypotheses."""
+        by_place = believe(weighed, temper).reshape(len(weighed.chi2), len(self.place_mm), -1)
         of_place, of_force = by_place.sum(axis=2), by_place.sum(axis=1)
         place_mm = of_place @ self.place_mm
-        var_mm2 = np.maximum(of_place @ self.place_mm**2 - place_mm**2, 0.2**2)  # within a cell of the lattice
-        likeliest = chi2[np.arange(len(chi2)), probability.argmax(axis=1)]
-        return Estimate(place_mm, np.sqrt(var_mm2), np.exp(of_force @ self.log_N), likeliest / db_uT.shape[1])
+        var_mm2 = np.maximum(of_place @ self.place_mm**2 - place_mm**2, CELL_SD_MM**2)
+        return Estimate(place_mm, np.sqrt(var_mm2), np.exp(of_force @ self.log_N), weighed.misfit())
 
-    def _posterior(
-        self, db_uT: Float32[np.ndarray, "n ch"]
-    ) -> tuple[Float[np.ndarray, "n h"], Float[np.ndarray, "n h"]]:
-        chi2 = ((db_uT @ self._white - self._off) ** 2).reshape(len(db_uT), len(self.mean_uT), -1).sum(axis=2)
-        log = -0.5 * self._temper * (chi2 + self._log_det)
-        probability = np.exp(log - log.max(axis=1, keepdims=True))
-        return probability / probability.sum(axis=1, keepdims=True), chi2
+
+def believe(weighed: Weighed, temper: float) -> Float[np.ndarray, "n h"]:
+    """Turn log likelihoods, times a temper, into probabilities of 1 in sum."""
+    total = weighed.total
+    probability = np.exp(-0.5 * temper * (total - total.min(axis=1, keepdims=True)))
+    return probability / probability.sum(axis=1, keepdims=True)
+
+
+def joined(parts: Sequence[Estimate]) -> Estimate:
+    """Put estimates one after the other."""
+    return Estimate(*(np.concatenate([getattr(part, name) for part in parts]) for name in Estimate.__annotations__))
 
 
 def _learn(

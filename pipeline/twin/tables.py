@@ -61,7 +61,7 @@ def tabulate(centre: Law, spreads: Mapping[str, float], setup: Setup) -> Tables:
         return read_uT.reshape(len(axis_mm), len(axis_mm), len(FORCES_N), -1), at_rest_uT(law, setup).ravel()
 
     mean_uT, rest_uT = fields_uT(centre)
-    moved = [fields_uT(_moved(centre, name, STEP * spread)) for name, spread in spreads.items()]
+    moved = [fields_uT(spread_by(centre, name, STEP * spread)) for name, spread in spreads.items()]
     return Tables(
         names=tuple(spreads), spreads=np.array(list(spreads.values())), axis_mm=axis_mm, force_N=FORCES_N,
         mean_uT=mean_uT, slope_uT=np.stack([(each_uT - mean_uT) / STEP for each_uT, _ in moved], axis=-1),
@@ -79,6 +79,7 @@ def middle(laws: list[Law]) -> Law:
     return Law(**(means | {"seat_x_mm": 0.0, "seat_y_mm": 0.0, "rotation_deg": 0.0}))
 
 
-def _moved(centre: Law, name: str, by: float) -> Law:
+def spread_by(centre: Law, name: str, by: float) -> Law:
+    """Move one number of a law, in its unit or in the logarithm of it, as its spread is."""
     value = asdict(centre)[name]
     return with_numbers(centre, (name,), np.array([value * np.exp(by) if name in OF_LOG else value + by]))

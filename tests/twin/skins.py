@@ -1,0 +1,56 @@
+"""A made-up skin whose fields are known in closed form, so that tests need no simulation; and the real one's setup."""
+
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.core.config import parse, read_yaml
+from pipeline.physics.skin import SkinDesign
+from pipeline.twin.law import Setup
+from pipeline.twin.population import POKES_N, Population, draw_places
+from pipeline.twin.tables import FORCES_N, Tables, lattice_mm
+
+ROOT = Path(__file__).resolve().parents[2]
+CHIPS_MM = np.array([[0.0, 0.0], [-7.0, 0.0], [0.0, -7.0], [7.0, 0.0], [0.0, 7.0]])
+DESIGN = parse(SkinDesign, read_yaml(ROOT / "params.yaml")["skin"] | {"tip_radius_mm": 2.0}, "params.yaml: skin")
+SETUP = Setup(DESIGN, CHIPS_MM, 1.1, (20.0, 20.0), True, 2.0)
+WIDE_MM = 5.0
+NAMES, SPREADS = ("label_x_mm", "label_y_mm", "gap_mm"), np.array([0.25, 0.25, 0.3])
+REST_SLOPE_uT = np.sin(np.arange(45.0)).reshape(15, 3) * 300
+
+
+def fields_uT(place_mm: np.ndarray, force_N: np.ndarray, upright: float = 1.0) -> np.ndarray:
+    """A bump under each chip that leans away from it: 15 channels; `upright` scales the z axes."""
+    apart = (place_mm[:, None] - CHIPS_MM) / WIDE_MM
+    size = 400 * force_N[:, None] ** 0.7 * np.exp(-(apart**2).sum(axis=2) / 2)
+    return np.stack([size * apart[..., 0], size * apart[..., 1], size * upright], axis=2).reshape(len(place_mm), -1)
+
+
+def poked_uT(place_mm: np.ndarray, force_N: np.ndarray, number: np.ndarray) -> np.ndarray:
+    """Fields of a skin whose numbers lie so many spreads off the centre."""
+    label_x_mm, label_y_mm, gap_mm = number * SPREADS
+    return fields_uT(place_mm + [label_x_mm, label_y_mm], force_N, 1 + gap_mm)
+
+
+def made_tables() -> Tables:
+    """Tables of the made-up skin; slopes by small differences."""
+    axis_mm = lattice_mm()
+    place_mm = np.stack(np.meshgrid(axis_mm, axis_mm, indexing="ij"), axis=-1).reshape(-1, 2)
+    place_mm, force_N = np.repeat(place_mm, len(FORCES_N), axis=0), np.tile(FORCES_N, len(place_mm))
+    mean_uT = poked_uT(place_mm, force_N, np.zeros(3))
+    slope_uT = np.stack([(poked_uT(place_mm, force_N, 1e-3 * one) - mean_uT) / 1e-3 for one in np.eye(3)], axis=-1)
+    shape = (len(axis_mm), len(axis_mm), len(FORCES_N), 15)
+    return Tables(
+        NAMES, SPREADS, axis_mm, FORCES_N, mean_uT.reshape(shape), slope_uT.reshape(*shape, 3),
+        rest_uT=np.zeros(15), rest_slope_uT=REST_SLOPE_uT,
+    )  # fmt: skip
+
+
+def made_population(skins_n: int, rng: np.random.Generator) -> Population:
+    """Draw made-up skins whose numbers differ."""
+    place_mm = np.stack([draw_places(rng) for _ in range(skins_n)])
+    force_N = np.exp(rng.uniform(np.log(0.5), np.log(10), (skins_n, POKES_N)))
+    number = rng.standard_normal((skins_n, 3))
+    db_uT = np.stack([poked_uT(*poke) for poke in zip(place_mm, force_N, number, strict=True)])
+    parts = db_uT, number @ REST_SLOPE_uT.T, place_mm, force_N
+    return Population(*(part.astype(np.float32) for part in parts))

@@ -1,0 +1,49 @@
+"""The network is told a set: order does not count, and none is a set too."""
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.core.seeds import rng_for
+from pipeline.twin.network import Network, draw_weights, inputs, predict
+
+RNG = rng_for(0, "network")
+POKES_uT, READ_uT, REST_uT = (RNG.normal(0, 300, shape) for shape in ((20, 15), (7, 15), (15,)))
+ONE, OTHER = (draw_weights(15, rng_for(0, name)) for name in ("one", "other"))
+
+
+def test_the_order_of_told_pokes_changes_nothing():
+    told, turned = predict([ONE], READ_uT, REST_uT, POKES_uT), predict([ONE], READ_uT, REST_uT, POKES_uT[::-1])
+    np.testing.assert_allclose(told.place_mm, turned.place_mm, atol=1e-4)  # sums in another order
+    other = predict([ONE], READ_uT, REST_uT, 2 * POKES_uT)
+    assert np.abs(told.place_mm - other.place_mm).max() > 1e-3
+
+
+def test_a_poke_that_is_not_kept_tells_nothing():
+    network, rest = Network(ONE), torch.from_numpy(REST_uT[None].astype(np.float32))
+    pokes = torch.from_numpy(POKES_uT[None].astype(np.float32))
+    kept = (torch.arange(20) < 5).float()[None]
+    torch.testing.assert_close(network.encode(pokes, rest, kept), network.encode(pokes[:, :5], rest, torch.ones(1, 5)))
+    none = predict([ONE], READ_uT, REST_uT, np.empty((0, 15)))
+    assert np.isfinite(none.place_mm).all()
+
+
+def test_a_reading_is_seen_as_direction_and_length():
+    rest = torch.zeros(1, 15)
+    near, far = (inputs(torch.from_numpy(size * READ_uT[None].astype(np.float32)), rest) for size in (1.0, 5.0))
+    torch.testing.assert_close(near[..., :15], far[..., :15])
+    torch.testing.assert_close(far[..., 15] - near[..., 15], torch.full((1, 7), float(np.log(5.0))), atol=1e-5, rtol=0)
+
+
+def test_several_networks_give_their_mean_and_count_their_difference_as_uncertainty():
+    one, other = (predict([each], READ_uT, REST_uT, POKES_uT) for each in (ONE, OTHER))
+    both = predict([ONE, OTHER], READ_uT, REST_uT, POKES_uT)
+    np.testing.assert_allclose(both.place_mm, (one.place_mm + other.place_mm) / 2, rtol=1e-6)
+    variance = (one.sd_mm**2 + other.sd_mm**2) / 2 + (one.place_mm - other.place_mm) ** 2 / 4
+    np.testing.assert_allclose(both.sd_mm**2, variance, rtol=1e-6)
+
+
+@pytest.mark.parametrize("chips_n", [1, 5])
+def test_weights_fit_any_number_of_chips(chips_n):
+    weights = draw_weights(3 * chips_n, rng_for(0, "chips"))
+    assert predict([weights], READ_uT[:, : 3 * chips_n], REST_uT[: 3 * chips_n], POKES_uT[:, : 3 * chips_n]).log_N.shape
