@@ -69,14 +69,14 @@ def under_tip_m(
 ) -> Float[np.ndarray, "n 2"]:
     """Give how a press takes the material under the tip: give - away (1 - load) p, p from the skin's middle.
 
-    `load` is the force over the one at which the slide away is gone; from there on the base holds.
+    `load` is the force over the one at which the slide away is gone.
     """
-    return np.array(give_m) - away * np.maximum(1 - load, 0.0)[:, None] * places_m
+    return np.array(give_m) - away * (1 - load)[:, None] * places_m
 
 
 def load_of(depth_m: Float[np.ndarray, " n"], hold: Hold, thickness_m: float) -> Float[np.ndarray, " n"]:
-    """Give the load of `under_tip_m` at depths: F(d) / F(where the slide is gone), whatever the modulus."""
-    return force_at(depth_m, stiffness_N_m2=1.0, thickness_m=thickness_m) / hold.lets_go_m2
+    """Give the load of `under_tip_m` at depths: F(d) / F(where the slide is gone), at most 1, whatever the modulus."""
+    return np.minimum(force_at(depth_m, stiffness_N_m2=1.0, thickness_m=thickness_m) / hold.lets_go_m2, 1.0)
 
 
 def compliance_m_per_N(

@@ -70,8 +70,8 @@ def test_a_square_turned_by_a_quarter_turns_its_motion_and_a_pull_along_the_radi
 
 def test_material_goes_away_from_the_middle_less_under_more_force_and_with_the_arm():
     places_m = np.array([[4e-3, 0.0]] * 3)
-    found_m = slide.under_tip_m(places_m, np.array([0.0, 0.5, 1.5]), give_m=(5e-5, 1e-5), away=7e-3)
-    # 7 um/mm 4 mm from the middle is 28 um, half of it at half of the load that lets go, and none beyond.
+    found_m = slide.under_tip_m(places_m, np.array([0.0, 0.5, 1.0]), give_m=(5e-5, 1e-5), away=7e-3)
+    # 7 um/mm 4 mm from the middle is 28 um, half of it at half of the load that lets go.
     np.testing.assert_allclose(found_m, [[2.2e-5, 1e-5], [3.6e-5, 1e-5], [5e-5, 1e-5]], atol=1e-18)
 
 
@@ -94,6 +94,7 @@ def test_how_far_a_skin_slides_under_a_depth_does_not_depend_on_its_modulus_and_
     assert hard.stiffness_N_m2 == pytest.approx(1e6)
     # 8 mm^2 of d^2 (1 - d/h)^(-3/2) at half of a thickness of h: d = h / 2 = 1 mm gives 2^1.5 mm^2.
     assert slide.load_of(np.array([1e-3]), hard, H_M)[0] == pytest.approx(2**1.5 / 9)
+    assert slide.load_of(np.array([0.9 * H_M]), hard, H_M)[0] == 1.0  # from there on the base holds
 
 
 def test_without_give_and_slide_the_sliding_flow_is_what_it_was_to_the_last_bit():
