@@ -35,7 +35,7 @@ def rows(few_nodes):
 
 def test_terms_that_a_scene_does_without_are_left_out_and_others_are_kept(rows):
     assert {term for term, row in rows.items() if row.done == "left out"} == {
-        "ageing", "relaxation", "temperature", "friction", "the earth's field", "the skin's free edge",
+        "ageing", "relaxation", "memory", "temperature", "friction", "the earth's field", "the skin's free edge",
         "the powder's own field",
     }  # fmt: skip
     assert rows["friction"].field_pct == rows["friction"].force_pct == 0  # nothing is dragged
@@ -80,6 +80,20 @@ def test_what_is_kept_could_not_go(rows):
     assert rows["rotation of the magnetisation"].field_pct > 5
     assert rows["slipping base"].field_pct > 50
     assert rows["the chips' steps"].field_pct < 0.5
+
+
+def test_a_base_that_holds_the_skin_is_kept_where_there_is_one(rows):
+    hold = {
+        "give_um": (48.0, 7.0),
+        "away_um_mm": 6.0,
+        "lets_go_mm2": 9.0,
+        "force_per_modulus": 2.5,
+        "springs_N_mm": 7.0,
+    }
+    found = rows_of(with_protocol("grid", FEW, skin=synthesis("skin", hold=hold).skin.model_dump()))
+    assert "the base's hold" not in rows
+    assert found["the base's hold"].done == "kept"
+    assert found["the base's hold"].field_pct > 10
 
 
 def test_the_powders_own_field_matters_by_how_much_powder_there_is(rows):
