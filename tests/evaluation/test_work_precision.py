@@ -65,7 +65,7 @@ def error_of(rows, method, cell_mm=None, layers_n=None) -> float:
 
 
 def test_a_skin_laid_on_the_products_nodes_is_the_drawn_one_but_for_its_unevenness():
-    even = spreads(skin_amplitude=0.0, skin_filler=0.0)
+    even = spreads(skin_amplitude=0.0, skin_filler=0.0, skin_rotation_deg=0.0)
     drawn = draw_skin(design(), even, seed=0, name="s3", rule=COARSE)
     ours = laid(trial(name="s3"), place_nodes(drawn.thickness_m, COARSE))
     np.testing.assert_array_equal(ours.nodes_m, drawn.nodes_m)

@@ -142,7 +142,8 @@ def test_pokes_beyond_the_deepest_that_a_law_follows_are_counted_and_held_there(
     deepest_N = TRUE.stiffness_N_mm2 * (0.72 * thickness_mm) ** 2 * 0.28**-1.5
     force_N = deepest_N * np.array([0.5, 0.999, 1.001, 3.0])
     assert law.beyond_n(TRUE, SETUP, force_N) == 2
-    held_uT = law.simulate_uT(TRUE, SETUP, np.zeros((4, 2)), force_N)
+    still = replace(TRUE, away_um_mm=0.0)  # the slide goes on with force
+    held_uT = law.simulate_uT(still, SETUP, np.zeros((4, 2)), force_N)
     soft = replace(TRUE, stiffness_N_mm2=TRUE.stiffness_N_mm2 / 2)  # reaches that depth under half the force
     assert law.beyond_n(soft, SETUP, force_N[1:]) == 3
     np.testing.assert_allclose(held_uT[2], held_uT[3])
