@@ -47,6 +47,8 @@ def checklist(numbers: Mapping[str, Any], rows: Sequence[Row] | None = None) -> 
     source = numbers["provenance"]["source"]
     lines = []
     for row in read_rows() if rows is None else rows:
+        if row.only not in (None, source):
+            continue
         printed = look_up(numbers, row.paper) if row.paper else None
         ours = resolve(numbers, row.ours) if row.ours else None
         verdict = judge(row, printed, ours, pooled=is_pooled(numbers), simulated=source == "simulated")

@@ -50,6 +50,7 @@ class Row(Strict):
         "target", "view",
     ] = "near"  # fmt: skip
     reach: Reach | None = None
+    only: Literal["recorded", "simulated"] | None = None  # scenes of such a source alone have the row
     stage: str | None = None
     shown: tuple[str, ...] = ()
     why: str = ""  # given where ours differs; numbers by their names in braces

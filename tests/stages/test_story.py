@@ -161,7 +161,7 @@ def test_every_experiment_of_the_paper_is_answered_shown_and_found_by_the_checkl
 def test_every_row_of_the_checklist_finds_its_number_and_its_files(story):
     reports = story / "reports/ci"
     numbers = json.loads((reports / "numbers.json").read_text())
-    rows = read_rows()
+    rows = [row for row in read_rows() if row.only != "recorded"]
     missing = [row for row in rows if row.ours and resolve(numbers, row.ours) is None]
     assert [row.id for row in missing] == ["plateau"]  # a sweep that is too short for it, and says so
     assert all(row.question and resolve(numbers, row.question) is not None for row in missing)
