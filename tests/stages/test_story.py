@@ -153,7 +153,7 @@ def test_every_experiment_of_the_paper_is_answered_shown_and_found_by_the_checkl
     assert "not asked in this scene" not in (tables / "checklist.md").read_text()
     page = (story / "reports/ci/index.html").read_text()
     figures = sorted((story / "reports/ci/figures").glob("*.svg"))
-    assert {file.stem for file in figures} >= ASKED - {"drift", "variation", "manual"}
+    assert {file.stem for file in figures} >= ASKED - {"bound", "drift", "variation", "manual"}
     for figure in figures:
         assert f'src="figures/{figure.name}"' in page
 
