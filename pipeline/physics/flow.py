@@ -66,7 +66,12 @@ def follow(
 
 def sink(material: Material, depth_m: float, press: Press) -> Material:
     """Carry material, its marks first, one step on to a greater depth."""
-    sunken = _carry(material, _change(material, press.contact(depth_m), press))
+    return carry(material, change(material, depth_m, press), depth_m, press)
+
+
+def carry(material: Material, waves: layer.Waves, depth_m: float, press: Press) -> Material:
+    """Carry material, with marks or without, by the change of pressure that brings the marks to a depth."""
+    sunken = _carry(material, waves)
     if not sunken.z_m.max() < RIM_MAX * press.thickness_m:
         rule = f"such that the rim stays below {RIM_MAX} of the skin's thickness"
         got = f"{depth_m / press.thickness_m:.3g} of the thickness"
@@ -94,7 +99,11 @@ def with_marks(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"], press
     """Put the marks before material at rest; they reach as far as the widest contact, whatever depth is asked for."""
     widest = press.contact(press.thickness_m * depth_unit(press.tip_radius_m / press.thickness_m))
     r_m = np.append(widest.radius_m * np.linspace(0, 1, MARKS_N) ** 2, r_m)
-    z_m = np.append(np.full(MARKS_N, press.thickness_m), z_m)
+    return resting(r_m, np.append(np.full(MARKS_N, press.thickness_m), z_m))
+
+
+def resting(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"]) -> Material:
+    """Give material at rest."""
     return Material(r_m, z_m, np.tile(np.eye(2), (len(r_m), 1, 1)), np.ones(len(r_m)))
 
 
@@ -103,17 +112,21 @@ def without_marks(material: Material) -> Material:
     return Material(*(getattr(material, name)[MARKS_N:] for name in Material.__dataclass_fields__))
 
 
-def _change(material: Material, contact: layer.Contact, press: Press) -> layer.Waves:
-    # The change of pressure, made of pressures of spheres on smaller contacts, that brings all marks inside the contact
-    # from where they are to the tip: least squares, damped, for waves shorter than the depth do not reach the marks.
+def change(material: Material, depth_m: float, press: Press) -> layer.Waves:
+    """Find the change of pressure that brings the marks, which stand first in `material`, to a greater depth.
+
+    It is made of pressures of spheres on smaller contacts, and brings all marks inside the contact from where they are
+    to the tip: least squares, damped, for waves shorter than the depth do not reach the marks.
+    """
+    contact = press.contact(depth_m)
     inside = np.flatnonzero(material.r_m[:MARKS_N] < contact.radius_m)
     r_m, z_m = material.r_m[inside], material.z_m[inside]
     radii_m = contact.radius_m * np.arange(1, PRESSURES_N + 1) / PRESSURES_N
     parts = [layer.contact_of_radius(a_m, **asdict(press)) for a_m in radii_m]
     pressures = [layer.waves(part, press.thickness_m, press.base) for part in parts]
-    changes = [layer.displacement(r_m, z_m, pressure) for pressure in pressures]
+    parted = [layer.displacement(r_m, z_m, pressure) for pressure in pressures]
     height_m = np.sqrt(press.tip_radius_m**2 - r_m**2)
-    towards = np.stack([u.z_m - r_m / height_m * u.r_m for u in changes], axis=1) / [part.depth_m for part in parts]
+    towards = np.stack([u.z_m - r_m / height_m * u.r_m for u in parted], axis=1) / [part.depth_m for part in parts]
     missing_m = press.thickness_m - contact.depth_m + press.tip_radius_m - height_m - z_m
     damping = DAMPING * np.linalg.norm(towards, 2) * np.eye(PRESSURES_N)
     share = np.linalg.lstsq(np.vstack([towards, damping]), np.append(missing_m, np.zeros(PRESSURES_N)))[0]

@@ -7,6 +7,7 @@ thickness. Refuses to know chips and force.
 from dataclasses import dataclass
 from functools import lru_cache
 from math import sqrt
+from pathlib import Path
 from typing import no_type_check
 
 import numpy as np
@@ -14,9 +15,10 @@ from jaxtyping import Float, Int
 from numba import njit
 from scipy.interpolate import CubicSpline
 
+from pipeline.core import kept
 from pipeline.core.errors import ParamsError
 from pipeline.physics import layer
-from pipeline.physics.flow import LADDER, Material, Press, angle, depth_unit, sink, with_marks, without_marks
+from pipeline.physics.flow import LADDER, Material, Press, angle, carry, change, depth_unit, resting, with_marks
 
 # In thicknesses, past the contact: what lies beyond does not move on a bonded base (4 from the axis costs up to 17 % of
 # dB), and moves outward as one on a sliding one, up to waves that fade as exp(-pi r / h).
@@ -24,7 +26,9 @@ REACH = 5.0
 SIZE_STEP = 0.2  # of ln(R/h) between tables; interpolating between them costs less than 0.3 % of dB (test_skin)
 STENCIL_N = 4  # cubic, between tables and between depths
 DET_F_ERROR_MAX = 0.1
+Displaced = Float[np.ndarray, "d l p 3"]  # outward, up, tan(angle / 2): depth, height, place
 COARSE_R = np.linspace(0, 1, 56) ** 1.5  # where the flow is computed, over the reach
+PACKAGE = Path(__file__).parent  # its sources decide the tables, which are kept beside them
 FINE_R = np.linspace(0, 1, 512)  # where it is tabulated, so that linear interpolation is enough
 
 
@@ -91,11 +95,9 @@ def _tabulate(
     at = np.log(size) / SIZE_STEP
     tables_i = int(np.floor(at)) - 1 + np.arange(STENCIL_N)
     share = _lagrange(tables_i.astype(float), at)
-    moved = np.empty((rungs_n, len(heights), len(FINE_R), 3))
-    for rung_i, here in enumerate(moved):
-        parts = [_displaced(int(table_i), heights, rung_i, base) for table_i in tables_i]
-        coarse = sum(weight * part for weight, part in zip(share, parts, strict=True))
-        here[:] = CubicSpline(COARSE_R, coarse, axis=1)(FINE_R)
+    parts = [_displaced(int(table_i), heights, rungs_n, base) for table_i in tables_i]
+    coarse = sum(weight * part for weight, part in zip(share, parts, strict=True))
+    moved = CubicSpline(COARSE_R, coarse, axis=2)(FINE_R)
     # What lies on the base keeps its height and, where that is bonded, its place; it may turn.
     moved[:, np.array(heights) == 0, :, 1 if base == "slipping" else slice(2)] = 0.0
     return FlowMap(thickness_m, thickness_m * reach(size, base), depth_m, moved, base)
@@ -144,25 +146,51 @@ def reach(size: float, base: layer.Base) -> float:
     return REACH + Press(1.0, size, base).contact(depth).radius_m
 
 
-@lru_cache(maxsize=1024)
-def _rung(table_i: int, heights: tuple[float, ...], rung_i: int, base: layer.Base) -> Material:
+@lru_cache(maxsize=256)
+def _displaced(
+    table_i: int, heights: tuple[float, ...], rungs_n: int, base: layer.Base
+) -> Float[np.ndarray, "d l p 3"]:
+    name = f"flow {table_i} {heights} {base}"
+    known = kept.load(PACKAGE, name)
+    if known is None or len(known) < rungs_n:
+        known = _sunken(table_i, heights, rungs_n, base)
+        kept.save(PACKAGE, name, known)
+    return known[:rungs_n]
+
+
+def _sunken(table_i: int, heights: tuple[float, ...], rungs_n: int, base: layer.Base) -> Displaced:
     # Each depth from the one above it, so that a deeper poke later only adds to the ladder. In thicknesses.
-    press = Press(1.0, float(np.exp(SIZE_STEP * table_i)), base)
+    size = _size(table_i)
+    at = rest = resting(*(part.ravel() for part in np.meshgrid(reach(size, base) * COARSE_R, heights)))
+    parts = np.zeros((rungs_n, 3, len(rest.r_m)))
+    for rung_i in range(1, rungs_n):
+        depth = depth_unit(size) * float(LADDER[rung_i])
+        at = carry(at, _waves(table_i, rung_i, base), depth, Press(1.0, size, base))
+        if not np.abs(np.linalg.det(at.f) * at.hoop - 1).max() <= DET_F_ERROR_MAX:
+            rule = f"such that material keeps its volume within {DET_F_ERROR_MAX:.0%}"
+            raise ParamsError("poke", "depth", rule, f"{depth:.3g} of the thickness", "Poke less deep.")
+        parts[rung_i] = at.r_m - rest.r_m, at.z_m - rest.z_m, np.tan(angle(at.f) / 2)
+    return np.moveaxis(parts, 1, 2).reshape(rungs_n, len(heights), len(COARSE_R), 3)
+
+
+@lru_cache(maxsize=1024)
+def _waves(table_i: int, rung_i: int, base: layer.Base) -> layer.Waves:
+    # What brings the surface from one depth to the next: the same for material of all heights.
+    size = _size(table_i)
+    return change(_marks(table_i, rung_i - 1, base), depth_unit(size) * float(LADDER[rung_i]), Press(1.0, size, base))
+
+
+@lru_cache(maxsize=1024)
+def _marks(table_i: int, rung_i: int, base: layer.Base) -> Material:
+    press, none = Press(1.0, _size(table_i), base), np.empty(0)
     if rung_i == 0:
-        r, z = (part.ravel() for part in np.meshgrid(reach(press.tip_radius_m, base) * COARSE_R, heights))
-        return with_marks(r, z, press)
-    depth = float(depth_unit(press.tip_radius_m) * LADDER[rung_i])
-    at = sink(_rung(table_i, heights, rung_i - 1, base), depth, press)
-    if not np.abs(np.linalg.det(at.f) * at.hoop - 1).max() <= DET_F_ERROR_MAX:
-        rule = f"such that material keeps its volume within {DET_F_ERROR_MAX:.0%}"
-        raise ParamsError("poke", "depth", rule, f"{depth:.3g} of the thickness", "Poke less deep.")
-    return at
+        return with_marks(none, none, press)
+    depth = depth_unit(press.tip_radius_m) * float(LADDER[rung_i])
+    return carry(_marks(table_i, rung_i - 1, base), _waves(table_i, rung_i, base), depth, press)
 
 
-def _displaced(table_i: int, heights: tuple[float, ...], rung_i: int, base: layer.Base) -> Float[np.ndarray, "l p 3"]:
-    rest, at = (without_marks(_rung(table_i, heights, i, base)) for i in (0, rung_i))
-    parts = np.stack([at.r_m - rest.r_m, at.z_m - rest.z_m, np.tan(angle(at.f) / 2)], axis=-1)
-    return parts.reshape(len(heights), len(COARSE_R), 3)
+def _size(table_i: int) -> float:
+    return float(np.exp(SIZE_STEP * table_i))
 
 
 def _lagrange(nodes: Float[np.ndarray, " p"], at: float) -> Float[np.ndarray, " p"]:

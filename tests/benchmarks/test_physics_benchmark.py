@@ -39,8 +39,10 @@ def one_pass_m() -> np.ndarray:
 
 
 def forget_tables() -> None:
-    for cached in (flow_map._tabulate, flow_map._rung, layer.contact_of_depth):
+    for cached in (flow_map._tabulate, flow_map._displaced, flow_map._waves, flow_map._marks, layer.contact_of_depth):
         cached.cache_clear()
+    for file in (flow_map.PACKAGE / "__pycache__").glob("kept-*.npy"):
+        file.unlink()
 
 
 def best_ms(call: Callable[[], Any], repeats_n: int) -> float:

@@ -132,3 +132,19 @@ def test_impossible_layers_and_pokes_are_refused(thickness_m, depth_m):
 def test_pokes_deeper_than_the_table_or_of_no_depth_at_all_are_refused(depth_m):
     with pytest.raises(ParamsError, match="depth must be"):
         move(np.zeros((1, 3)), (0, 0, depth_m))
+
+
+def test_a_table_that_was_kept_is_the_table_that_is_computed_and_grows_with_depth(tmp_path, monkeypatch):
+    def of_depth(depth_m):
+        for cached in (flow_map._tabulate, flow_map._displaced):
+            cached.cache_clear()
+        return flow_map.tabulate(H_M, TIP_M, depth_m, heights=(0.5,), base="bonded").moved
+
+    monkeypatch.setattr(flow_map, "PACKAGE", tmp_path)
+    shallow = of_depth(0.2e-3)
+    kept_n = len(list(tmp_path.rglob("*.npy")))
+    deep = of_depth(0.5e-3)
+    np.testing.assert_array_equal(deep[: len(shallow)], shallow)
+    np.testing.assert_array_equal(of_depth(0.2e-3), shallow)
+    np.testing.assert_array_equal(of_depth(0.5e-3), deep)
+    assert len(list(tmp_path.rglob("*.npy"))) == kept_n == flow_map.STENCIL_N
