@@ -97,7 +97,7 @@ def _tabulate(
     share = _lagrange(tables_i.astype(float), at)
     parts = [_displaced(int(table_i), heights, rungs_n, base) for table_i in tables_i]
     coarse = sum(weight * part for weight, part in zip(share, parts, strict=True))
-    moved = CubicSpline(COARSE_R, coarse, axis=2)(FINE_R)
+    moved = np.ascontiguousarray(CubicSpline(COARSE_R, coarse, axis=2)(FINE_R))  # else each poke copies its part
     # What lies on the base keeps its height and, where that is bonded, its place; it may turn.
     moved[:, np.array(heights) == 0, :, 1 if base == "slipping" else slice(2)] = 0.0
     return FlowMap(thickness_m, thickness_m * reach(size, base), depth_m, moved, base)
