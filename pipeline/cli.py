@@ -73,6 +73,7 @@ def add(
     board: Board,
     skin: Annotated[str, Option(help="The skin's name; a skin belongs to one board.")],
     scene: Annotated[str, Option(help="The scene that it joins.")],
+    like: Annotated[str | None, Option(help="The scene that a new SCENE is a copy of.")] = None,
     name: Annotated[str | None, Option(help="The capture's name; made from the labels if not given.")] = None,
     probe: Annotated[Path | None, Option(help="capture, serial-*: the robot's log (CSV).")] = None,
     chips_n: Annotated[int, Option("--chips", help="serial-*: chips in a frame.", min=1, max=64)] = 5,
@@ -84,12 +85,12 @@ def add(
     allow_copy: Annotated[bool, Option("--allow-copy", help="Accept bytes that another label has.")] = False,
 ) -> None:
     """Add a recording to a scene; then `dvc repro` uses it."""
-    from pipeline import adding, preparing
+    from pipeline import adding, plan, preparing
     from pipeline.params import read_plan
 
     root, labels, marks = checkout(), preparing.Labels(board, skin, name), preparing.parse_marks(mark or [])
     running = read_plan(root / config.PLAN).scenes
-    with preparing.suggesting_layout(recording, layout):
+    with plan.copied(root, scene, like), preparing.suggesting_layout(recording, layout):
         if layout == "capture":
             prepared = preparing.native(recording, labels, probe, marks)
         elif layout == "serial-binary" or layout == "serial-text":
@@ -100,8 +101,7 @@ def add(
             options |= {"rows_late": str(rows_late)} if layout == "ini" and rows_late is not None else {}
             prepared = preparing.foreign(recording, layout, labels, options)
         header = adding.add(root, scene, prepared, allow_copy=allow_copy)
-    alone = f"only this scene: reskin scenes use {scene}"
-    typer.echo(f"added {scene}/{header.capture} (board {board}, skin {skin}); now: dvc repro ({alone})")
+    typer.echo(f"added {scene}/{header.capture} (board {board}, skin {skin}); now: dvc repro (or: report@{scene})")
     if scene not in running:
         typer.echo(f"switched scene {scene} on in {config.PLAN}, beside {', '.join(running) or 'no other'}")
 
