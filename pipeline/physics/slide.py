@@ -21,7 +21,7 @@ from pipeline.core.errors import ParamsError
 STIFFENING = 1.5  # exponent of the thinning layer: chosen with both boards in view
 DEEPEST = 0.72  # of the thickness: a larger force counts as the one that goes so deep
 MIDDLE_M = np.zeros(2)
-CURVE_N = 2000  # depths at which the force is inverted, linear between; off by less than 1e-6 of the thickness
+CURVE_N = 2000  # depths at which the force is inverted, linear in its root between; off by less than 1e-6 thicknesses
 
 
 class HoldDesign(Strict):
@@ -145,7 +145,8 @@ def depth_at(force_N: Float[np.ndarray, " n"], *, stiffness_N_m2: float, thickne
         raise ParamsError("layer", "stiffness", "above 0 N/m^2", f"{stiffness_N_m2}", "Check its unit.")
     curve_m = np.linspace(0, DEEPEST * thickness_m, CURVE_N)
     known_N = force_at(curve_m, stiffness_N_m2=stiffness_N_m2, thickness_m=thickness_m)
-    return np.interp(force_N, known_N, curve_m)
+    root = np.sqrt(np.maximum(force_N, 0.0))  # the force starts as a square of the depth; a tip that pulls has none
+    return np.interp(root, np.sqrt(known_N), curve_m)
 
 
 def _rho2_m2(sides_m: tuple[float, float]) -> float:
