@@ -15,6 +15,7 @@ from pipeline.capture.header import HEADER_FILE, Clock, Header, Wire, recorded, 
 from pipeline.capture.port import PortSettings, Recording, Report, record
 from pipeline.core import io
 from pipeline.core.errors import CaptureError
+from pipeline.preparing import UNNAMED
 
 PROGRESS_s = 1.0
 CAPTURES = Path("captures")
@@ -27,6 +28,9 @@ class Told:
     board: str
     skin: str
     scan: str
+
+
+UNTOLD = Told(UNNAMED, UNNAMED, "not stated")
 
 
 def record_capture(port: str, folder: Path, *, told: Told, settings: PortSettings, report: Report) -> Recording:

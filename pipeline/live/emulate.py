@@ -17,7 +17,7 @@ from pipeline.core.errors import ParamsError
 from pipeline.live.script import Script
 
 TICK_S = 0.1  # how late a stop may be noticed
-LATE_MAX_S = 0.5  # who was kept waiting for longer does not catch up
+LATE_MAX_S = 0.1  # who was kept waiting for longer does not catch up
 SENT_TOGETHER_N = 256  # frames at most, when they are overdue
 HOST = "127.0.0.1"
 

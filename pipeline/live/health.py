@@ -57,7 +57,7 @@ class Health:
             alarm.count_n, alarm.last_s = alarm.count_n + count_n, now_s
 
     def active(self, now_s: float) -> list[Alarm]:
-        return [alarm for alarm in self.alarms.values() if now_s - alarm.last_s <= ACTIVE_S]
+        return [alarm for alarm in list(self.alarms.values()) if now_s - alarm.last_s <= ACTIVE_S]
 
     def feed(self, frames: Frames, now_s: float) -> Bool[np.ndarray, " f"]:
         """Look at the next frames; mark those whose every chip was read and gives what a chip can."""

@@ -105,13 +105,14 @@ def recognise(port: str, chunks: Sequence[Chunk]) -> Found:
     frames, wire, chips_n = min(
         ((decode_all(data, wire, chips_n, port)[0], wire, chips_n) for wire, chips_n in fits), key=_spread_degC
     )
-    lsb_uT = [_median(axis) for axis in faults.find_lsb(frames.b_uT).T]
+    with np.errstate(over="ignore"):  # any finite number may stand in a frame
+        lsb_uT = [_median(axis) for axis in faults.find_lsb(frames.b_uT).T]
     return Found(port, None, wire, chips_n, _rate_hz(frames, chunks), (lsb_uT[0], lsb_uT[1]))
 
 
 def _spread_degC(decoded: tuple[Frames, Wire, int]) -> float:
     """Text may hold temperatures first or last; they differ less than fields do."""
-    return float(decoded[0].temperature_degC.std())
+    return float(decoded[0].temperature_degC.std(dtype=np.float64))
 
 
 def _median(steps_uT: Float64[np.ndarray, " k"]) -> float:

@@ -24,6 +24,7 @@ class Reader:
         self.plugged_in, self.problem = False, ""
         self.missed_bytes_n = self.waiting_bytes_n = 0
         self.tape: Tape | None = None
+        self.tape_problem = ""
         self._clock_s = time.time() - time.monotonic()  # the system's clock may be set while we read
         self._chunks: deque[Chunk] = deque()
         self._came = threading.Condition()
@@ -55,7 +56,7 @@ class Reader:
     def set_tape(self, tape: Tape | None) -> None:
         """Write what comes from now on to another tape, or to none; the one before is closed."""
         with self._came:
-            before, self.tape = self.tape, tape
+            before, self.tape, self.tape_problem = self.tape, tape, ""
         if before is not None:
             before.close()
 
@@ -64,9 +65,9 @@ class Reader:
         while not self._stop.is_set():
             try:
                 device = device or self._plug_in()
+                self.plugged_in = True
                 if chunk := read_waiting(device):
                     self._keep(chunk)
-                self.plugged_in = True
             except (OSError, CaptureError) as error:
                 self.plugged_in, self.problem = False, str(error)
                 if device is not None:
@@ -96,5 +97,5 @@ class Reader:
                 try:
                     tape.write(chunk, now_s)
                 except OSError as error:  # a full disk ends the recording, and nothing else
-                    self.tape, self.problem = None, f"the recording cannot be written: {error.strerror}"
+                    self.tape, self.tape_problem = None, f"cannot be written any more: {error.strerror}"
                     tape.close()

@@ -33,6 +33,7 @@ SILENT_S = 0.3  # a controller is told when nothing comes
 OPENING_S = 10.0
 ENDS_KEPT_N = 256  # chunks, to time frames that were settled late
 UNLIKE_SDS = 10.0  # assumed, of an input in training; 6 in scene quick, 7 on lab's boards under its models
+WAITING = "waiting for data"
 ZEROING = "taking the no-load reading: do not touch, do not move"
 UNLIKE = "not a skin that the model knows: a change of field far from all it was trained on"
 
@@ -55,7 +56,7 @@ class Readings:
 
     t_s: Float64[np.ndarray, " f"]
     b_uT: Float32[np.ndarray, "f ch"]
-    db_uT: Float32[np.ndarray, "f ch"]  # NaN before the no-load reading is taken
+    db_uT: Float32[np.ndarray, "f ch"]  # NaN before the no-load reading is taken, and where a chip was not read
     answer: Float64[np.ndarray, "f 3"]  # x_mm, y_mm, F_N
     sd_mm: Float64[np.ndarray, "f 2"]
     contact: Bool[np.ndarray, " f"]
@@ -83,7 +84,7 @@ class Skin:
     """A board on a port. Iterate over it for the latest contact, or over `every()` for all."""
 
     def __init__(self, port: str, models: Sequence[Network] = (), *, baud: int = ports.BAUD) -> None:
-        self.port, self.found = port, ports.Found(port, "waiting for data")
+        self.port, self.found = port, ports.Found(port, WAITING)
         self.account: Counter[str] = Counter()  # of all streams since the start, as a `FrameStream` counts
         self._zero: Zero | None = None
         self.reader = Reader(port, baud)
@@ -135,7 +136,7 @@ class Skin:
 
     def alarms(self) -> tuple[str, ...]:
         """Say what is wrong now."""
-        own = [] if self.reader.plugged_in else [f"unplugged: {self.reader.problem}"]
+        own = [f"unplugged: {self.reader.problem}"] if self.reader.problem and not self.reader.plugged_in else []
         own += [self.found.problem] if self.found.problem else []
         own += [ZEROING] if not self.found.problem and not self.zeroed else []
         health = [] if self.found.problem else self.health.active(self.reader.unix_s())
@@ -179,16 +180,16 @@ class Skin:
         if self._head[-1][1] - self._head[0][1] < HEAD_S and bytes_n < HEAD_BYTES_MAX_N:
             return []
         chunks, self._head = self._head, []
-        self.found = ports.recognise(self.port, chunks)
-        if self.found.problem:
+        found = ports.recognise(self.port, chunks)
+        if found.problem:
+            self.found = found
             return []
         for model in self._models:
-            if (channels_n := model.card["input"]["channels_n"]) != 3 * self.found.chips_n:
+            if (channels_n := model.card["input"]["channels_n"]) != 3 * found.chips_n:
                 remedy = "Take a model of such boards."
-                raise SchemaError(
-                    self.port, "channels", f"the {channels_n} of the model", 3 * self.found.chips_n, remedy
-                )
-        self.health, self.layout = Health(self.found.chips_n), layout_of(self.found.chips_n)
+                raise SchemaError(self.port, "channels", f"the {channels_n} of the model", 3 * found.chips_n, remedy)
+        self.health, self.layout = Health(found.chips_n), layout_of(found.chips_n)
+        self.found = found  # last: another thread that sees it asks for the rest
         self._begin_stream()
         return chunks
 
@@ -246,8 +247,8 @@ class Skin:
         if zero is None:
             unknown_uT = np.full_like(frames.b_uT, np.nan)
             return Readings(t_s, frames.b_uT, unknown_uT, answer, sd_mm, np.zeros(len(t_s), bool))
-        db_uT = (frames.b_uT - zero.noload_uT).astype(np.float32)
-        contact = sound & (np.linalg.norm(db_uT, axis=1) > zero.contact_uT)
+        db_uT = (np.where(sound[:, None], frames.b_uT, np.nan) - zero.noload_uT).astype(np.float32)
+        contact = np.linalg.norm(db_uT, axis=1) > zero.contact_uT  # of NaN, nothing is more
         if self._models:
             answer[sound & ~contact, 2] = 0.0
             if contact.any():

@@ -4,8 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from pipeline.core.errors import CaptureError
+from pipeline.core.seeds import rng_for
 from pipeline.live import ports
 from pipeline.live.inject import inject, parse
 from tests.live.boards import make_script, plugged_in
@@ -39,6 +42,21 @@ def test_what_is_no_board_is_told_as_such():
     assert "another baud rate" in str(ports.recognise("port", wrong_baud))
     assert "no byte came" in str(ports.recognise("port", []))
     assert "must be one that opens" in str(ports.look("/dev/none"))
+
+
+@given(st.binary(max_size=3000), st.integers(1, 700))
+def test_any_bytes_are_a_board_or_none_and_never_an_error(data, size):
+    chunks = [(data[first : first + size], 0.01 * first) for first in range(0, len(data), size)]
+    assert str(ports.recognise("port", chunks)).startswith("port: ")
+
+
+@given(st.integers(0, 2**32), st.integers(1, 4))
+def test_frames_of_any_numbers_are_a_board(seed, chips_n):
+    rng = rng_for(seed, "numbers")
+    values = rng.integers(0, 2**32, (40, 4 * chips_n), dtype=np.uint32)
+    values[rng.random(values.shape) < 0.5] = np.float32(25).view(np.uint32)
+    data = b"".join(row.tobytes() + b"\r\n" for row in values)
+    assert str(ports.recognise("port", [(data, 0.0), (data, 1.0)])).startswith("port: ")
 
 
 def test_chips_at_rest_without_noise_show_no_scale():

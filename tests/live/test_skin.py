@@ -2,14 +2,19 @@
 
 import itertools
 import math
+import threading
 import time
+from collections import Counter
 
 import numpy as np
 import pytest
 
 import reskin
 from pipeline.core.errors import ReskinError
-from pipeline.live.inject import inject, parse
+from pipeline.core.seeds import rng_for
+from pipeline.live.emulate import open_far_end, play
+from pipeline.live.inject import MAGNET_uT, inject, parse
+from pipeline.live.skin import Skin
 from tests.live.boards import PLACES, make_script, plugged_in, write_model
 
 SCRIPT = make_script(pokes_n=2)
@@ -90,8 +95,37 @@ def test_a_second_in_which_something_moves_is_no_no_load_reading(tmp_path):
     script = inject(make_script(pokes_n=0), parse("magnet@0.35+1"))
     with plugged_in(script, loop=True) as name, reskin.open(name, model=write_model(tmp_path)) as skin:
         z_uT = skin._zero.noload_uT[2::3]
-    distance_uT = np.abs(z_uT - np.stack([script.frames.b_uT[0, 2::3], script.frames.b_uT[200, 2::3]]))
+    rest_uT = script.frames.b_uT[0, 2::3]
+    distance_uT = np.abs(z_uT - np.stack([rest_uT, rest_uT + MAGNET_uT]))
     assert distance_uT.max(axis=1).min() < 20  # one of the two levels, and nothing in between
+
+
+@pytest.mark.parametrize("minutes_n", [1])
+def test_every_byte_that_was_sent_is_a_frames_or_lost_and_counted(minutes_n):
+    script, rng = make_script(pokes_n=20), rng_for(0, "faults")
+    for fault in ("torn", "dropped", "repeated", "wrong-baud", "crlf", "failed-read", "torn"):
+        script = inject(script, parse(f"{fault}@{rng.uniform(3, 55):.2f}+{rng.uniform(0.1, 2):.2f}"))
+    end, stop, sent = open_far_end("pty"), threading.Event(), []
+    player = threading.Thread(
+        target=lambda: sent.extend(play(script, end, stop, speed=100.0) for _ in range(minutes_n))
+    )
+    skin = Skin(end.name)
+    skin.reader.start(there=True)
+    player.start()
+    while skin.poll(1.0) is not None or player.is_alive():
+        pass
+    account = skin.account + Counter({"missed_bytes_n": skin.reader.missed_bytes_n})
+    end.unplug()
+    skin.reader.stop()
+    waiting_n = (
+        account["bytes_n"]
+        - account["frame_bytes_n"]
+        - sum(count for name, count in account.items() if name.startswith("skipped_"))
+    )
+    assert account["bytes_n"] + account["missed_bytes_n"] == sum(sent)
+    assert 0 <= waiting_n < 3 * 82  # of what comes last, more bytes would tell
+    assert account["frames_n"] * 82 == account["frame_bytes_n"]
+    assert account["skipped_resync_bytes_n"] > 1000
 
 
 def test_a_model_of_other_boards_and_a_port_without_one_are_refused(tmp_path):
