@@ -23,6 +23,7 @@ class Reader:
         self.port, self.baud = port, baud
         self.plugged_in, self.problem = False, ""
         self.missed_bytes_n = self.waiting_bytes_n = 0
+        self.taken_s = 0.0  # when it was last asked, in unix seconds
         self.tape: Tape | None = None
         self.tape_problem = ""
         self._clock_s = time.time() - time.monotonic()  # the system's clock may be set while we read
@@ -51,6 +52,7 @@ class Reader:
             taken = list(self._chunks)
             self._chunks.clear()
             self.waiting_bytes_n = 0
+            self.taken_s = self.unix_s()
         return taken
 
     def set_tape(self, tape: Tape | None) -> None:
@@ -83,8 +85,8 @@ class Reader:
         return device
 
     def _keep(self, chunk: bytes) -> None:
-        now_s = self.unix_s()
         with self._came:
+            now_s = self.unix_s()  # in here, so that no chunk is older than a look that did not find it
             self._chunks.append((chunk, now_s))
             self.waiting_bytes_n += len(chunk)
             while self.waiting_bytes_n > QUEUE_BYTES_MAX_N:

@@ -223,9 +223,11 @@ class Skin:
 
     def _count(self, now_s: float) -> None:
         counted = Counter(self._stream.account())
-        more, self._counted = counted - self._counted, counted
+        more, first, self._counted = counted - self._counted, not self._counted["frames_n"], counted
         self.account += more
         lost_n = sum(count for name, count in more.items() if name.startswith("skipped_"))
+        if first and lost_n * more["frames_n"] < more["frame_bytes_n"]:
+            return  # less than a frame: the port was opened while one was sent
         self.health.note("bytes lost between frames", lost_n, now_s)
 
     def _take_zero(self, frames: Frames, t_s: Float64[np.ndarray, " f"]) -> None:
@@ -269,6 +271,6 @@ class Skin:
     def _contact(self, readings: Readings | None, i: int) -> Contact:
         if readings is None:
             nothing = np.full(3 * self.found.chips_n, np.nan, np.float32)
-            return Contact(self.reader.unix_s(), np.nan, np.nan, np.nan, (np.nan, np.nan), nothing, self.alarms())
+            return Contact(self.reader.taken_s, np.nan, np.nan, np.nan, (np.nan, np.nan), nothing, self.alarms())
         (x_mm, y_mm, force_N), (sd_x_mm, sd_y_mm) = readings.answer[i].tolist(), readings.sd_mm[i].tolist()
         return Contact(float(readings.t_s[i]), x_mm, y_mm, force_N, (sd_x_mm, sd_y_mm), readings.b_uT[i], self.alarms())

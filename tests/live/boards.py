@@ -1,7 +1,7 @@
 """Boards for tests: scripts of a quiet second and of pokes, and a model that knows their places and forces."""
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -15,6 +15,8 @@ from pipeline.core.seeds import rng_for
 from pipeline.learning.architecture import draw_weights, paper_layers
 from pipeline.live.emulate import open_far_end, play
 from pipeline.live.script import Script, encode_pieces
+from pipeline.live.skin import Readings, Skin
+from pipeline.trials.networks import Network
 from tests.capture.headers import make_header
 
 RATE_HZ = 400.0
@@ -24,12 +26,14 @@ PLACES = np.array([[4.0, 12.0, 0.8], [12.0, 4.0, 1.6]])  # x and y in mm, force 
 INPUT_SCALE_uT = 300.0
 
 
-def make_script(*, pokes_n: int = 2, chips_n: int = 5, wire: Wire = "binary", rate_hz: float = RATE_HZ) -> Script:
+def make_script(
+    *, pokes_n: int = 2, chips_n: int = 5, wire: Wire = "binary", rate_hz: float = RATE_HZ, quiet_s: float = QUIET_S
+) -> Script:
     """Make a quiet start, then pokes with pauses; noise of 3 uT on a grid of 0.15 and 0.242 uT."""
-    frames_n = round((QUIET_S + pokes_n * (POKED_S + PAUSE_S)) * rate_hz)
+    frames_n = round((quiet_s + pokes_n * (POKED_S + PAUSE_S)) * rate_hz)
     t_s, rng = np.arange(frames_n) / rate_hz, rng_for(0, "board")
-    poke_i, since_s = np.divmod(t_s - QUIET_S, POKED_S + PAUSE_S)
-    poked = (t_s >= QUIET_S) & (since_s < POKED_S)
+    poke_i, since_s = np.divmod(t_s - quiet_s, POKED_S + PAUSE_S)
+    poked = (t_s >= quiet_s) & (since_s < POKED_S)
     b_uT = 500.0 * rng.standard_normal((chips_n, 3)) + 3 * rng.standard_normal((frames_n, chips_n, 3))
     b_uT[poked] += changes_uT(chips_n)[poke_i[poked].astype(int) % 2].reshape(-1, chips_n, 3)
     step_uT = np.array([0.15, 0.15, 0.242])
@@ -77,6 +81,37 @@ def write_script(script: Script, folder: Path) -> Path:
     header = make_header(capture=folder.name, layout="native", wire=script.wire, chips_n=chips_n, clock=clock)
     write_capture(folder, header, files)
     return folder
+
+
+class PlayedReader:
+    """Gives a script's bytes at the script's own times, without port and thread, so that no load disturbs them."""
+
+    plugged_in, problem, missed_bytes_n = True, "", 0
+
+    def __init__(self, script: Script, *, frames_n: int = 20) -> None:
+        self._script, self._frames_n, self._i = script, frames_n, 0
+
+    @property
+    def at_end(self) -> bool:
+        return self._i >= len(self._script)
+
+    def unix_s(self) -> float:
+        return float(self._script.t_s[min(self._i, len(self._script) - 1)])
+
+    def take(self, _wait_s: float) -> list[tuple[bytes, float]]:
+        pieces = self._script.pieces[self._i : self._i + self._frames_n]
+        self._i += len(pieces)
+        return [(b"".join(pieces), self.unix_s())] if pieces else []
+
+
+def played(script: Script, models: Sequence[Network] = ()) -> tuple[Skin, list[Readings]]:
+    """Take a skin through a script as fast as it goes; give it, and all that it read."""
+    skin, readings = Skin("played", models), []
+    skin.reader = reader = PlayedReader(script)
+    while not reader.at_end:
+        if (found := skin.poll(0.0)) is not None:
+            readings.append(found)
+    return skin, readings
 
 
 @contextmanager
