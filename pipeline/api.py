@@ -6,7 +6,7 @@ called, so that the import costs little. Refuses to know stages and DVC.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -19,6 +19,7 @@ from pipeline.core.seeds import rng_for
 
 if TYPE_CHECKING:
     from pipeline.dataset.rows import Rows
+    from pipeline.live.skin import Skin as LiveSkin
     from pipeline.physics.board import Board
     from pipeline.physics.skin import Skin
     from pipeline.trials.networks import Network
@@ -187,6 +188,23 @@ def load_universal() -> Universal:
     from pipeline.twin import shipped
 
     return shipped.load_universal()
+
+
+def open(port: str, *, model: Path | str | Sequence[Path | str] = (), baud: int = 115200) -> LiveSkin:
+    """Open a board's port: its contacts while they happen. In the first second nothing may touch the skin.
+
+    >>> with open("/dev/ttyACM0", model="data/models/quick/train_multi/NAME.safetensors") as skin:  # doctest: +SKIP
+    ...     for contact in skin:  # the latest; skin.every() for each
+    ...         print(contact.t_s, contact.x_mm, contact.y_mm, contact.F_N, contact.alarms)
+
+    Format and chips are told from the bytes; `port` may also be `socket://host:port`. Several models give means, and
+    how far they are apart.
+    """
+    from pipeline.live.skin import Skin
+    from pipeline.predicting import read_network
+
+    files = [model] if isinstance(model, str | Path) else model
+    return Skin(port, [read_network(Path(file)) for file in files], baud=baud)
 
 
 def _main_boards(scene: str) -> dict[str, Any]:
