@@ -245,6 +245,7 @@ def test_a_full_disk_ends_a_recording_that_can_be_read_up_to_there(board, tmp_pa
     command = [sys.executable, "-c", FULL + LISTEN, board.name, str(tmp_path)]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
         wait_until((tmp_path / STREAM_FILE).exists)
+        os.set_blocking(board.far, False)  # a recorder that ends reads no more
         while process.poll() is None:
             board.send(encode(FRAMES, "binary")[:820], pause_s=0.01)
         output, _ = process.communicate(timeout=LONG_s)
