@@ -49,6 +49,7 @@ class Health:
         self._lsb_uT = np.full((chips_n, 2), np.nan)
         self._last: Frames | None = None
         self._came: deque[tuple[float, int]] = deque()
+        self._came_n = 0
 
     def note(self, name: str, count_n: int, now_s: float) -> None:
         """Count something under its name."""
@@ -113,12 +114,13 @@ class Health:
         """Count frames over a second; less than usual means that some do not come, which no format tells."""
         came = self._came
         came.append((now_s, frames_n))
+        self._came_n += frames_n
         while now_s - came[0][0] > RATE_WINDOW_S:
-            came.popleft()
+            self._came_n -= came.popleft()[1]
         span_s = now_s - came[0][0]
         if span_s < RATE_WINDOW_S / 2:
             return
-        self.rate_hz = (sum(n for _, n in came) - came[0][1]) / span_s
+        self.rate_hz = (self._came_n - came[0][1]) / span_s
         usual_hz = self.rate_hz if np.isnan(self._usual_hz) else self._usual_hz
         self._usual_hz = usual_hz + USUAL_GAIN * (self.rate_hz - usual_hz)
         self.note("slower than it was: frames are missing", int(self.rate_hz < SLOW_SHARE * self._usual_hz), now_s)

@@ -3,11 +3,13 @@
 A thread reads; whoever asks decodes and estimates, so that a slow controller loses no byte. Refuses to know pages.
 """
 
+from bisect import bisect_left
 from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
+from operator import itemgetter
 from types import TracebackType
 from typing import NamedTuple
 
@@ -217,9 +219,9 @@ class Skin:
             self._ends.append((self._ends[-1][0] + len(chunk), came_s))
         frames = self._stream.feed(b"".join(chunk for chunk, _ in chunks))
         self._count(self._ends[-1][1])
-        ends = np.array([end for end, _ in self._ends])
-        times_s = np.array([came_s for _, came_s in self._ends])
-        return frames, times_s[np.searchsorted(ends, frames.end_byte).clip(max=len(ends) - 1)]
+        last = len(self._ends) - 1
+        chunk_i = (min(bisect_left(self._ends, end, key=itemgetter(0)), last) for end in frames.end_byte.tolist())
+        return frames, np.fromiter((self._ends[i][1] for i in chunk_i), np.float64, len(frames))
 
     def _count(self, now_s: float) -> None:
         counted = Counter(self._stream.account())
