@@ -63,13 +63,15 @@ class Health:
     def feed(self, frames: Frames, now_s: float) -> Bool[np.ndarray, " f"]:
         """Look at the next frames; mark those whose every chip was read and gives what a chip can."""
         failed = np.asarray(faults.failed_reads(frames.b_uT, frames.temperature_degC))
+        zero = faults.zero_reads(frames.b_uT)
         warm = (frames.temperature_degC >= TEMPERATURE_MIN_degC) & (frames.temperature_degC <= TEMPERATURE_MAX_degC)
         beyond = (np.abs(frames.b_uT) > B_MAX_uT).reshape(len(frames), -1, 3).any(axis=2)
         self._note_chips("failed I2C reads", failed, now_s)
+        self._note_chips("zeros in place of a reading", zero, now_s)
         self._note_chips("temperature out of range", np.asarray(~warm & ~failed), now_s)
         self._note_chips("field at the end of the range", beyond & ~failed, now_s)
         self._measure_rate(len(frames), now_s)
-        sound = ~(failed | ~warm | beyond).any(axis=1)
+        sound = ~(failed | zero | ~warm | beyond).any(axis=1)
         self._held.append(frames.where(sound))
         if sum(map(len, self._held)) >= LOOK_FRAMES_N:
             self._look(concatenate(self._held, self._chips_n), now_s)
