@@ -7,11 +7,11 @@ no number of a client's reaches a file. Refuses to know how anything is estimate
 import asyncio
 import hmac
 import json
+import re
 import secrets
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from urllib.parse import urlsplit
 
 from aiohttp import WSMsgType, web
 from aiohttp.typedefs import Handler
@@ -23,6 +23,7 @@ from pipeline.trials.networks import Network
 PAGE = Path(__file__).parent / "page"
 FILES = {"/": "index.html", "/live.js": "live.js", "/live.css": "live.css"}
 LOCAL = ("127.0.0.1", "localhost", "::1")
+OWN_HOST = re.compile(r"(localhost|127\.0\.0\.1|\[::1\])(:[0-9]{1,5})?", re.IGNORECASE)
 COOKIE = "reskin-token"
 FRAME_S, STATE_S, HEARTBEAT_S = 1 / 30, 0.2, 10.0
 CLIENTS_MAX_N, REQUEST_BYTES_MAX_N = 8, 1024
@@ -58,7 +59,7 @@ class Server:
         origin = request.headers.get("Origin")
         if self._token and not hmac.compare_digest(given.encode(errors="replace"), self._token.encode()):
             raise web.HTTPForbidden(text="this page needs its token: use the address that was printed\n")
-        if not self._token and _host(f"//{request.host}") not in LOCAL:  # any site's name may lead to this machine
+        if not self._token and not OWN_HOST.fullmatch(request.host):  # any site's name may lead to this machine
             raise web.HTTPForbidden(text="this page answers to localhost and 127.0.0.1\n")
         if origin is not None and origin.partition("://")[2] != request.host:
             raise web.HTTPForbidden(text="this page answers to itself\n")
@@ -115,13 +116,6 @@ class Server:
     async def _close(self, _: web.Application) -> None:
         for page in list(self._clients):
             await page.close()
-
-
-def _host(url: str) -> str | None:
-    try:
-        return urlsplit(url).hostname
-    except ValueError:
-        return None
 
 
 def serve(
