@@ -158,6 +158,12 @@ class Model:
         answer = self._network((rows_uT - self._noload_uT).astype(np.float32))
         return answer if np.ndim(b_uT) == 2 else answer[0]
 
+    def export_onnx(self, file: Path | str) -> None:
+        """Write the network as an ONNX file: changes of field in uT in, x_mm, y_mm and F_N out; needs package onnx."""
+        from pipeline.trials import onnx_file
+
+        onnx_file.write(self._network, Path(file))
+
     def _rows(self, b_uT: ArrayLike) -> np.ndarray:
         rows_uT, channels_n = np.atleast_2d(np.asarray(b_uT, np.float32)), self.card["input"]["channels_n"]
         if rows_uT.ndim != 2 or rows_uT.shape[1] != channels_n:
