@@ -203,14 +203,14 @@ def open(port: str, *, model: Path | str | Sequence[Path | str] = (), baud: int 
     ...     for contact in skin:  # the latest; skin.every() for each
     ...         print(contact.t_s, contact.x_mm, contact.y_mm, contact.F_N, contact.alarms)
 
-    Format and chips are told from the bytes; `port` may also be `socket://host:port`. Several models give means, and
-    how far they are apart.
+    Format and chips are told from the bytes; `port` may also be `socket://host:port`. Without a model the map of
+    simulated skins answers (`load_universal`). Several models give means, and how far they are apart.
     """
     from pipeline.live.skin import Skin
     from pipeline.predicting import read_network
 
     files = [model] if isinstance(model, str | Path) else model
-    return Skin(port, [read_network(Path(file)) for file in files], baud=baud)
+    return Skin(port, [read_network(Path(file)) for file in files] or load_universal(), baud=baud)
 
 
 def _main_boards(scene: str) -> dict[str, Any]:

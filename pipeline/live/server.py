@@ -9,7 +9,7 @@ import hmac
 import json
 import re
 import secrets
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -17,8 +17,8 @@ from aiohttp import WSMsgType, web
 from aiohttp.typedefs import Handler
 
 from pipeline.core.errors import ParamsError
+from pipeline.live.answering import Models
 from pipeline.live.session import Live
-from pipeline.trials.networks import Network
 
 PAGE = Path(__file__).parent / "page"
 FILES = {"/": "index.html", "/live.js": "live.js", "/live.css": "live.css"}
@@ -118,9 +118,7 @@ class Server:
             await page.close()
 
 
-def serve(
-    port: str, models: Sequence[Network], *, what: str, host: str, http_port: int, say: Callable[[str], None]
-) -> None:
+def serve(port: str, models: Models, *, what: str, host: str, http_port: int, say: Callable[[str], None]) -> None:
     """Show a board's page until Ctrl-C."""
     token = "" if host in LOCAL else secrets.token_urlsafe(16)
     live = Live(port, models, what)
