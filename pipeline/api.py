@@ -158,6 +158,12 @@ class Model:
         answer = self._network((rows_uT - self._noload_uT).astype(np.float32))
         return answer if np.ndim(b_uT) == 2 else answer[0]
 
+    def export_onnx(self, file: Path | str) -> None:
+        """Write the network as an ONNX file: changes of field in uT in, x_mm, y_mm and F_N out; needs package onnx."""
+        from pipeline.trials import onnx_file
+
+        onnx_file.write(self._network, Path(file))
+
     def _rows(self, b_uT: ArrayLike) -> np.ndarray:
         rows_uT, channels_n = np.atleast_2d(np.asarray(b_uT, np.float32)), self.card["input"]["channels_n"]
         if rows_uT.ndim != 2 or rows_uT.shape[1] != channels_n:
@@ -197,14 +203,14 @@ def open(port: str, *, model: Path | str | Sequence[Path | str] = (), baud: int 
     ...     for contact in skin:  # the latest; skin.every() for each
     ...         print(contact.t_s, contact.x_mm, contact.y_mm, contact.F_N, contact.alarms)
 
-    Format and chips are told from the bytes; `port` may also be `socket://host:port`. Several models give means, and
-    how far they are apart.
+    Format and chips are told from the bytes; `port` may also be `socket://host:port`. Without a model the map of
+    simulated skins answers (`load_universal`). Several models give means, and how far they are apart.
     """
     from pipeline.live.skin import Skin
     from pipeline.predicting import read_network
 
     files = [model] if isinstance(model, str | Path) else model
-    return Skin(port, [read_network(Path(file)) for file in files], baud=baud)
+    return Skin(port, [read_network(Path(file)) for file in files] or load_universal(), baud=baud)
 
 
 def _main_boards(scene: str) -> dict[str, Any]:

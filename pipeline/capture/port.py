@@ -89,8 +89,10 @@ def open_port(port: str, baud: int) -> Device:
 
 def read_waiting(device: Device, bytes_max_n: int = READ_BYTES_MAX_N) -> bytes:
     """Give the bytes that wait, or those that come within `READ_TIMEOUT_s`; raise `OSError` if the board is gone."""
-    if isinstance(device, serial.Serial):  # what waits, or else one byte: then the read sleeps until it comes
-        return device.read(max(1, min(device.in_waiting, bytes_max_n)))
+    if isinstance(device, serial.Serial):  # it sleeps until a byte comes; with it come others
+        first = device.read(min(1, bytes_max_n))
+        waiting_n = min(device.in_waiting, READ_BYTES_MAX_N, bytes_max_n) - 1 if first else 0
+        return first + device.read(waiting_n) if waiting_n > 0 else first
     ready, _, _ = select.select([device], [], [], READ_TIMEOUT_s)  # a socket cannot say how many wait
     return device.read(min(READ_BYTES_MAX_N, bytes_max_n)) if ready else b""
 

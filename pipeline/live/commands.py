@@ -96,7 +96,9 @@ def emulate(
 @app.command()
 def live(
     port: Annotated[str | None, Option(help="The board's port; not given: the one that is there.")] = None,
-    model: Annotated[list[Path] | None, Option(help="A trained model (.safetensors); several say how sure.")] = None,
+    model: Annotated[
+        list[Path] | None, Option(help="A trained model (.safetensors), or several; else the map of simulated skins.")
+    ] = None,
     replay: Annotated[str | None, Option(help="In place of a board: the folder of a capture.")] = None,
     emulate: Annotated[str | None, Option(help="In place of a board: the name of a simulated scene.")] = None,
     host: Annotated[str, Option(help="Where the page listens; elsewhere than here, behind a token.")] = "127.0.0.1",
@@ -111,14 +113,15 @@ def live(
     from pipeline.live.script import read_script
     from pipeline.live.server import serve
     from pipeline.predicting import read_network
+    from pipeline.twin.shipped import load_universal
 
     given = [name for name in (port, replay, emulate) if name is not None]
     if len(given) > 1:
         raise ParamsError("live", "the board", "one of --port, --replay, --emulate", ", ".join(given), "Give one.")
-    networks = [read_network(file) for file in model or ()]
+    models = [read_network(file) for file in model] if model else load_universal()
     with ExitStack() as stack:
         what = "a board"
         if source := replay or emulate:
             script = read_script(source, Path())
             port, what = stack.enter_context(playing(script)), f"{script.source}: {source}, played"
-        serve(port or the_board().port, networks, what=what, host=host, http_port=http_port, say=typer.echo)
+        serve(port or the_board().port, models, what=what, host=host, http_port=http_port, say=typer.echo)

@@ -49,6 +49,7 @@ class Health:
         self._lsb_uT = np.full((chips_n, 2), np.nan)
         self._last: Frames | None = None
         self._came: deque[tuple[float, int]] = deque()
+        self._came_n = 0
 
     def note(self, name: str, count_n: int, now_s: float) -> None:
         """Count something under its name."""
@@ -62,13 +63,15 @@ class Health:
     def feed(self, frames: Frames, now_s: float) -> Bool[np.ndarray, " f"]:
         """Look at the next frames; mark those whose every chip was read and gives what a chip can."""
         failed = np.asarray(faults.failed_reads(frames.b_uT, frames.temperature_degC))
+        zero = faults.zero_reads(frames.b_uT)
         warm = (frames.temperature_degC >= TEMPERATURE_MIN_degC) & (frames.temperature_degC <= TEMPERATURE_MAX_degC)
         beyond = (np.abs(frames.b_uT) > B_MAX_uT).reshape(len(frames), -1, 3).any(axis=2)
         self._note_chips("failed I2C reads", failed, now_s)
+        self._note_chips("zeros in place of a reading", zero, now_s)
         self._note_chips("temperature out of range", np.asarray(~warm & ~failed), now_s)
         self._note_chips("field at the end of the range", beyond & ~failed, now_s)
         self._measure_rate(len(frames), now_s)
-        sound = ~(failed | ~warm | beyond).any(axis=1)
+        sound = ~(failed | zero | ~warm | beyond).any(axis=1)
         self._held.append(frames.where(sound))
         if sum(map(len, self._held)) >= LOOK_FRAMES_N:
             self._look(concatenate(self._held, self._chips_n), now_s)
@@ -113,12 +116,13 @@ class Health:
         """Count frames over a second; less than usual means that some do not come, which no format tells."""
         came = self._came
         came.append((now_s, frames_n))
+        self._came_n += frames_n
         while now_s - came[0][0] > RATE_WINDOW_S:
-            came.popleft()
+            self._came_n -= came.popleft()[1]
         span_s = now_s - came[0][0]
         if span_s < RATE_WINDOW_S / 2:
             return
-        self.rate_hz = (sum(n for _, n in came) - came[0][1]) / span_s
+        self.rate_hz = (self._came_n - came[0][1]) / span_s
         usual_hz = self.rate_hz if np.isnan(self._usual_hz) else self._usual_hz
         self._usual_hz = usual_hz + USUAL_GAIN * (self.rate_hz - usual_hz)
         self.note("slower than it was: frames are missing", int(self.rate_hz < SLOW_SHARE * self._usual_hz), now_s)

@@ -78,6 +78,10 @@ def _fail_read(b_uT: Fields, temperature_degC: np.ndarray, _: np.ndarray, chip_i
     b_uT[:, chip_i], temperature_degC[:, chip_i] = FAILED_B_uT, FAILED_TEMPERATURE_degC
 
 
+def _read_nothing(b_uT: Fields, temperature_degC: np.ndarray, _: np.ndarray, _chip: int) -> None:
+    b_uT[:], temperature_degC[:] = 0.0, 0.0
+
+
 def _reset(b_uT: Fields, _temperature: np.ndarray, _: np.ndarray, chip_i: int) -> None:
     step_uT = np.array([RESET_LSB_XY_uT, RESET_LSB_XY_uT, RESET_LSB_Z_uT])
     b_uT[:, chip_i] = np.rint(b_uT[:, chip_i] / step_uT) * step_uT
@@ -122,8 +126,8 @@ def _unplug(script: Script, first: int, duration_s: float) -> Script:
 
 
 VALUES: Mapping[str, Values] = {
-    "failed-read": _fail_read, "chip-reset": _reset, "stuck": _stick, "saturated": _saturate, "int16-wrap": _wrap,
-    "magnet": _magnetise, "too-hot": _heat, "crlf": _hold_crlf, "clock-jump": _jump,
+    "failed-read": _fail_read, "zeros": _read_nothing, "chip-reset": _reset, "stuck": _stick, "saturated": _saturate,
+    "int16-wrap": _wrap, "magnet": _magnetise, "too-hot": _heat, "crlf": _hold_crlf, "clock-jump": _jump,
 }  # fmt: skip
 PIECES: Mapping[str, Callable[[list[bytes], np.random.Generator], list[bytes]]] = {
     "repeated": lambda pieces, _: [2 * piece for piece in pieces],

@@ -7,22 +7,23 @@ no number of a client's reaches a file. Refuses to know how anything is estimate
 import asyncio
 import hmac
 import json
+import re
 import secrets
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from urllib.parse import urlsplit
 
 from aiohttp import WSMsgType, web
 from aiohttp.typedefs import Handler
 
 from pipeline.core.errors import ParamsError
+from pipeline.live.answering import Models
 from pipeline.live.session import Live
-from pipeline.trials.networks import Network
 
 PAGE = Path(__file__).parent / "page"
 FILES = {"/": "index.html", "/live.js": "live.js", "/live.css": "live.css"}
 LOCAL = ("127.0.0.1", "localhost", "::1")
+OWN_HOST = re.compile(r"(localhost|127\.0\.0\.1|\[::1\])(:[0-9]{1,5})?", re.IGNORECASE)
 COOKIE = "reskin-token"
 FRAME_S, STATE_S, HEARTBEAT_S = 1 / 30, 0.2, 10.0
 CLIENTS_MAX_N, REQUEST_BYTES_MAX_N = 8, 1024
@@ -58,7 +59,7 @@ class Server:
         origin = request.headers.get("Origin")
         if self._token and not hmac.compare_digest(given.encode(errors="replace"), self._token.encode()):
             raise web.HTTPForbidden(text="this page needs its token: use the address that was printed\n")
-        if not self._token and _host(f"//{request.host}") not in LOCAL:  # any site's name may lead to this machine
+        if not self._token and not OWN_HOST.fullmatch(request.host):  # any site's name may lead to this machine
             raise web.HTTPForbidden(text="this page answers to localhost and 127.0.0.1\n")
         if origin is not None and origin.partition("://")[2] != request.host:
             raise web.HTTPForbidden(text="this page answers to itself\n")
@@ -117,16 +118,7 @@ class Server:
             await page.close()
 
 
-def _host(url: str) -> str | None:
-    try:
-        return urlsplit(url).hostname
-    except ValueError:
-        return None
-
-
-def serve(
-    port: str, models: Sequence[Network], *, what: str, host: str, http_port: int, say: Callable[[str], None]
-) -> None:
+def serve(port: str, models: Models, *, what: str, host: str, http_port: int, say: Callable[[str], None]) -> None:
     """Show a board's page until Ctrl-C."""
     token = "" if host in LOCAL else secrets.token_urlsafe(16)
     live = Live(port, models, what)

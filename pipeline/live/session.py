@@ -4,17 +4,17 @@ Out: messages for pages, and captures. Refuses to know http.
 """
 
 import threading
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from pipeline.capture.header import Header
 from pipeline.capture.port import Tape
 from pipeline.core.errors import ReskinError
-from pipeline.live.skin import WAITING, Skin
+from pipeline.live.adapting import POKES_N, Pokes
+from pipeline.live.answering import Map, Models
+from pipeline.live.skin import WAITING, Readings, Skin
 from pipeline.live.view import View
 from pipeline.recording import UNTOLD, begin_capture, end_capture, new_folder
-from pipeline.trials.networks import Network
 
 POLL_S = 0.1
 
@@ -22,11 +22,12 @@ POLL_S = 0.1
 class Live:
     """A skin that is polled on a thread of its own, what pages see of it, and its recording."""
 
-    def __init__(self, port: str, models: Sequence[Network], what: str) -> None:
+    def __init__(self, port: str, models: Models, what: str) -> None:
         self.skin, self.what = Skin(port, models), what
         self.view: View | None = None
         self.problem = ""
-        self._models_n = len(models)
+        self._pokes: Pokes | None = None
+        self._adapted = ""
         self._recording: tuple[Path, Header] | None = None
         self._recorded = ""
         self._lock, self._buttons, self._stop = threading.Lock(), threading.Lock(), threading.Event()
@@ -48,11 +49,20 @@ class Live:
                 readings = self.skin.poll(POLL_S)
                 if readings is not None:
                     now_s = self.skin.reader.unix_s()
+                    self._adapt(readings)
                     with self._lock:
                         self.view = self.view or View(self.skin.layout, now_s - 1.0)
                         self.view.feed(readings, now_s)
         except ReskinError as error:
             self.problem = str(error)
+
+    def _adapt(self, readings: Readings) -> None:
+        """Let the map see a dozen pokes, if it was asked for; frames wait meanwhile, and none is lost."""
+        pokes, answers = self._pokes, self.skin.answers
+        if pokes is not None and isinstance(answers, Map):
+            pokes.feed(readings)
+            if pokes.enough:
+                self._adapted, self._pokes = answers.see(pokes.db_uT), None
 
     def message(self, after_bin: int) -> tuple[bytes, int]:
         """Give the next message of a client that has the bins before `after_bin`, and what it has then."""
@@ -68,7 +78,11 @@ class Live:
         """Say what a page shows beside the numbers."""
         skin, found = self.skin, self.skin.found
         state: dict[str, Any] = {
-            "what": self.what, "models_n": self._models_n, "zeroed": skin.zeroed,
+            "what": self.what, "zeroed": skin.zeroed,
+            "model": skin.answers.about if skin.answers else "",
+            "adaptable": isinstance(skin.answers, Map),
+            "adapting": "" if self._pokes is None else f"poke {len(self._pokes) + 1} of {POKES_N}, anywhere",
+            "adapted": self._adapted,
             "waiting": found.problem is not None,
             "alarms": [alarm for alarm in (self.problem, *skin.alarms()) if alarm not in ("", WAITING)],
             "recording": f"{self._recording[0]} {skin.reader.tape_problem}" if self._recording else "",
@@ -95,6 +109,8 @@ class Live:
         with self._buttons:
             if button == "zero":
                 self.skin.zero()
+            elif button == "adapt" and isinstance(self.skin.answers, Map):
+                self._pokes = Pokes() if self._pokes is None else None
             elif button == "record" and self._recording is not None:
                 self.end_recording()
             elif button == "record" and self.skin.found.problem is None:

@@ -3,11 +3,13 @@
 A thread reads; whoever asks decodes and estimates, so that a slow controller loses no byte. Refuses to know pages.
 """
 
+from bisect import bisect_left
 from collections import Counter, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
+from operator import itemgetter
 from types import TracebackType
 from typing import NamedTuple
 
@@ -18,13 +20,12 @@ from pipeline.capture.stream import FrameStream
 from pipeline.capture.wire import Frames, concatenate
 from pipeline.core.errors import CaptureError, SchemaError
 from pipeline.experiments.logs.estimates import CONTACT_SDS, quiet_start
-from pipeline.learning.inputs import VIEW, Scaler
 from pipeline.live import ports
+from pipeline.live.answering import Map, Models, Networks, answering
 from pipeline.live.health import Health
 from pipeline.live.layout import layout_of
 from pipeline.live.ports import Chunk
 from pipeline.live.reader import PLUGGED_IN, Reader
-from pipeline.trials.networks import Network
 
 ZERO_S = 1.0  # without contact, from which the no-load reading is taken
 ZERO_FRAMES_MAX_N = 10_000
@@ -32,10 +33,9 @@ HEAD_S, HEAD_BYTES_MAX_N = 0.5, 2**18  # from which a format is recognised
 SILENT_S = 0.3  # a controller is told when nothing comes
 OPENING_S = 10.0
 ENDS_KEPT_N = 256  # chunks, to time frames that were settled late
-UNLIKE_SDS = 10.0  # assumed, of an input in training; 6 in scene quick, 7 on lab's boards under its models
 WAITING = "waiting for data"
 ZEROING = "taking the no-load reading: do not touch, do not move"
-UNLIKE = "not a skin that the model knows: a change of field far from all it was trained on"
+UNLIKE = "not a skin that the model knows: a change of field like none of its own"
 
 
 class Contact(NamedTuple):
@@ -45,7 +45,7 @@ class Contact(NamedTuple):
     x_mm: float
     y_mm: float
     F_N: float
-    sd_mm: tuple[float, float]  # between models, in x and y; NaN with fewer than two
+    sd_mm: tuple[float, float]  # of the place along x and y: the map's, or that between networks; NaN of a single one
     b_uT: Float32[np.ndarray, " ch"]
     alarms: tuple[str, ...]  # what is wrong with the board; empty when all is well
 
@@ -83,15 +83,13 @@ class Zero(NamedTuple):
 class Skin:
     """A board on a port. Iterate over it for the latest contact, or over `every()` for all."""
 
-    def __init__(self, port: str, models: Sequence[Network] = (), *, baud: int = ports.BAUD) -> None:
+    def __init__(self, port: str, models: Models = (), *, baud: int = ports.BAUD) -> None:
         self.port, self.found = port, ports.Found(port, WAITING)
         self.account: Counter[str] = Counter()  # of all streams since the start, as a `FrameStream` counts
         self._zero: Zero | None = None
         self.reader = Reader(port, baud)
-        self._models = models
-        for model in models:  # imports and puts together what a first contact should not wait for
-            model(np.zeros((1, model.card["input"]["channels_n"]), np.float32))
-        self._scaled = [(VIEW[model.card["recipe"]["inputs"]], Scaler.of_arrays(model.tensors)) for model in models]
+        self.answers = answering(models)
+        self.problem = ""  # of the model with this board
         self._head: list[Chunk] = []
         self._quiet: list[Frames] = []
         self._quiet_from_s = np.inf
@@ -138,6 +136,7 @@ class Skin:
         """Say what is wrong now."""
         own = [f"unplugged: {self.reader.problem}"] if self.reader.problem and not self.reader.plugged_in else []
         own += [self.found.problem] if self.found.problem else []
+        own += [self.problem] if self.problem else []
         own += [ZEROING] if not self.found.problem and not self.zeroed else []
         health = [] if self.found.problem else self.health.active(self.reader.unix_s())
         return (*own, *(alarm.name for alarm in health))
@@ -184,14 +183,19 @@ class Skin:
         if found.problem:
             self.found = found
             return []
-        for model in self._models:
-            if (channels_n := model.card["input"]["channels_n"]) != 3 * found.chips_n:
-                remedy = "Take a model of such boards."
-                raise SchemaError(self.port, "channels", f"the {channels_n} of the model", 3 * found.chips_n, remedy)
+        if self.answers is not None and self.answers.channels_n != 3 * found.chips_n:
+            self._refuse_model(self.answers, found.chips_n)
         self.health, self.layout = Health(found.chips_n), layout_of(found.chips_n)
         self.found = found  # last: another thread that sees it asks for the rest
         self._begin_stream()
         return chunks
+
+    def _refuse_model(self, answers: Networks | Map, chips_n: int) -> None:
+        """Do without the map, which nobody asked for, on a board that it is not of; raise for networks."""
+        if isinstance(answers, Networks):
+            remedy = "Take a model of such boards."
+            raise SchemaError(self.port, "channels", f"the {answers.channels_n} of the model", 3 * chips_n, remedy)
+        self.answers, self.problem = None, f"no place, no force: the {answers.about} is for five chips; name a model"
 
     def _begin_stream(self) -> None:
         self._stream = FrameStream(self.found.wire, self.found.chips_n)
@@ -217,9 +221,9 @@ class Skin:
             self._ends.append((self._ends[-1][0] + len(chunk), came_s))
         frames = self._stream.feed(b"".join(chunk for chunk, _ in chunks))
         self._count(self._ends[-1][1])
-        ends = np.array([end for end, _ in self._ends])
-        times_s = np.array([came_s for _, came_s in self._ends])
-        return frames, times_s[np.searchsorted(ends, frames.end_byte).clip(max=len(ends) - 1)]
+        last = len(self._ends) - 1
+        chunk_i = (min(bisect_left(self._ends, end, key=itemgetter(0)), last) for end in frames.end_byte.tolist())
+        return frames, np.fromiter((self._ends[i][1] for i in chunk_i), np.float64, len(frames))
 
     def _count(self, now_s: float) -> None:
         counted = Counter(self._stream.account())
@@ -241,6 +245,8 @@ class Skin:
         self._quiet, self._quiet_from_s = [], np.inf
         with suppress(CaptureError):  # it moved: the next second may be quiet
             quiet_n = quiet_start(evenly_s, b_uT, where=self.port)
+            if self.answers is not None:
+                self.answers.zero(b_uT[:quiet_n])
             self._zero = Zero.of(b_uT[:quiet_n])
 
     def _estimate(self, frames: Frames, t_s: Float64[np.ndarray, " f"], sound: Bool[np.ndarray, " f"]) -> Readings:
@@ -251,22 +257,14 @@ class Skin:
             return Readings(t_s, frames.b_uT, unknown_uT, answer, sd_mm, np.zeros(len(t_s), bool))
         db_uT = (np.where(sound[:, None], frames.b_uT, np.nan) - zero.noload_uT).astype(np.float32)
         contact = np.linalg.norm(db_uT, axis=1) > zero.contact_uT  # of NaN, nothing is more
-        if self._models:
+        if self.answers is not None:
             answer[sound & ~contact, 2] = 0.0
             if contact.any():
-                answers = np.stack([model(db_uT[contact]) for model in self._models])
-                answer[contact] = answers.mean(axis=0, dtype=np.float64)
-                if len(answers) > 1:
-                    sd_mm[contact] = answers[:, :, :2].std(axis=0, ddof=1)
-                self._compare(db_uT[contact][-1:], t_s[-1])
+                answer[contact], sd_mm[contact], unlike = self.answers(db_uT[contact])
+                self.health.note(UNLIKE, int(unlike.sum()), t_s[-1])
         if sound[-1] and self.layout.known:
             self.health.feed_change(db_uT[-1], self.layout.turn, t_s[-1])
         return Readings(t_s, frames.b_uT, db_uT, answer, sd_mm, contact)
-
-    def _compare(self, db_uT: Float32[np.ndarray, "1 ch"], now_s: float) -> None:
-        """Note an input that lies outside of all that a model was trained on."""
-        for view, scaler in self._scaled:
-            self.health.note(UNLIKE, int(np.abs(scaler.encode(view(db_uT))).max() > UNLIKE_SDS), now_s)
 
     def _contact(self, readings: Readings | None, i: int) -> Contact:
         if readings is None:

@@ -1,7 +1,7 @@
 """Boards for tests: scripts of a quiet second and of pokes, and a model that knows their places and forces."""
 
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -13,10 +13,10 @@ from pipeline.capture.wire import Frames
 from pipeline.core import io
 from pipeline.core.seeds import rng_for
 from pipeline.learning.architecture import draw_weights, paper_layers
+from pipeline.live.answering import Models
 from pipeline.live.emulate import open_far_end, play
 from pipeline.live.script import Script, encode_pieces
 from pipeline.live.skin import Readings, Skin
-from pipeline.trials.networks import Network
 from tests.capture.headers import make_header
 
 RATE_HZ = 400.0
@@ -104,7 +104,7 @@ class PlayedReader:
         return [(b"".join(pieces), self.unix_s())] if pieces else []
 
 
-def played(script: Script, models: Sequence[Network] = ()) -> tuple[Skin, list[Readings]]:
+def played(script: Script, models: Models = ()) -> tuple[Skin, list[Readings]]:
     """Take a skin through a script as fast as it goes; give it, and all that it read."""
     skin, readings = Skin("played", models), []
     skin.reader = reader = PlayedReader(script)

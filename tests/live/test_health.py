@@ -59,6 +59,13 @@ def test_a_fault_is_named_with_its_chip_and_counted_where_it_was(name):
     assert health.active(alarm.last_s + 3.0) == []
 
 
+def test_zeros_are_named_on_every_chip():
+    health = feed(changed("zeros"))
+    assert {name: alarm.count_n for name, alarm in health.alarms.items()} == {
+        f"chip {chip_i}: zeros in place of a reading": 600 for chip_i in range(5)
+    }
+
+
 def test_frames_that_repeat_and_a_clock_that_jumps_are_named():
     assert "frames repeat" in feed(changed("repeated")).alarms
     assert "the board's clock jumps" in feed(changed("clock-jump", "binary-clock")).alarms
@@ -75,7 +82,7 @@ def test_a_board_of_which_half_the_frames_are_missing_is_slower_than_it_was():
 
 def test_frames_that_a_fault_has_hit_are_not_believed():
     frames = SCRIPT.frames.where(np.arange(len(SCRIPT)) < LOOK_FRAMES_N)
-    for name in ("failed-read", "saturated", "too-hot"):
+    for name in ("failed-read", "zeros", "saturated", "too-hot"):
         script = inject(SCRIPT, parse(f"{name}@0+0.05"))
         assert script.pieces[0] != SCRIPT.pieces[0]
         assert not feed_once(changed_frames(script, LOOK_FRAMES_N))[:20].any(), name

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 
 import aiohttp
@@ -46,14 +47,16 @@ class Shell:
         assert process.returncode == 0, complained
         return said
 
+    def close(self) -> None:
+        for process in self.running:
+            process.kill()
+            process.communicate()
+
 
 @pytest.fixture
 def shell(tmp_path) -> Iterator[Shell]:
-    shell = Shell(tmp_path)
-    yield shell
-    for process in shell.running:
-        process.kill()
-        process.communicate()
+    with closing(Shell(tmp_path)) as shell:
+        yield shell
 
 
 def wait_until(is_so: Callable[[], bool]) -> None:

@@ -117,6 +117,7 @@ def test_strangers_are_sent_away(tmp_path):
         own = address.removeprefix("http://")
         for headers, status in (
             ({"Host": "evil.example"}, 403), ({"Host": "127.0.0.1.evil.example"}, 403), ({"Host": "[::1"}, 403),
+            ({"Host": "lohost[::1]::8786"}, 403),
             ({"Host": "localhost:9000"}, 200),  # the other end of an SSH tunnel
             ({"Origin": "http://evil.example"}, 403), ({"Origin": "null"}, 403), ({"Origin": f"http://{own}"}, 200),
         ):  # fmt: skip

@@ -37,10 +37,13 @@ function show(next) {
   state = next;
   said("what", state.waiting ? `${state.what || ""}: waiting for data` : state.what);
   said("about", state.waiting ? "" : `${state.board}. ${state.places_known ? "" : "Places of its chips are not known: drawn in a row. "}` +
-    (state.models_n ? `${state.models_n} model${state.models_n > 1 ? "s" : ""}.` : "No model: neither place nor force; try --model."));
+    (state.model ? `Model: ${state.model}.` : "No model: neither place nor force; try --model."));
   list("alarms", state.alarms);
   list("seen", (state.seen || []).map(([name, n, s]) => `${name}: ${n}, within ${s} s`));
   $("zero").disabled = $("record").disabled = state.waiting;
+  $("adapt").disabled = state.waiting || !state.adaptable;
+  $("adapt").classList.toggle("on", Boolean(state.adapting));
+  said("adapting", state.adapting || state.adapted || "–");
   $("record").classList.toggle("on", Boolean(state.recording));
   $("record").firstChild.textContent = state.recording ? "Stop " : "Record ";
   said("recording", state.recording || state.recorded || "–");
@@ -122,7 +125,7 @@ function draw() {
     drawBoard();
     if (last && rows.length) {
       drawTrace("forces", 0, 1, .5); drawTrace("fields", 1, last.chips, 50);
-      const sure = Number.isNaN(last.sdX) ? "" : ` ± ${last.sdX.toFixed(1)}, ${last.sdY.toFixed(1)} mm between models`;
+      const sure = Number.isNaN(last.sdX) ? "" : ` ± ${last.sdX.toFixed(1)}, ${last.sdY.toFixed(1)} mm${state.adaptable ? "" : " between models"}`;
       said("place", last.contact && !Number.isNaN(last.x) ? `x ${number(last.x, 1, "mm")}, y ${number(last.y, 1, "mm")}${sure}` : last.contact ? "contact" : "no contact");
       said("force", number(last.force, 2, "N"));
       said("rate", number(last.rate, 0, "Hz")); said("lost", number(last.lost, 0, ""));
@@ -136,9 +139,9 @@ function draw() {
 }
 
 const press = (name) => { if (socket.readyState === 1 && !$(name).disabled) socket.send(JSON.stringify({press: name})); };
-for (const name of ["zero", "record"]) $(name).addEventListener("click", () => press(name));
+for (const name of ["zero", "adapt", "record"]) $(name).addEventListener("click", () => press(name));
 addEventListener("keydown", (event) => {
-  const name = {z: "zero", r: "record"}[event.key];
+  const name = {z: "zero", a: "adapt", r: "record"}[event.key];
   if (name && !event.ctrlKey && !event.metaKey && !event.altKey && !event.repeat) press(name);
 });
 addEventListener("resize", () => { dirty = true; });
