@@ -18,8 +18,9 @@ settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCh
 settings.load_profile("busy")
 
 SHARED_DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
-
-
+LONG = (  # which run stages and commands
+    "test_story", "test_lab_story", "test_fetching", "test_adding", "test_adding_an_experiment", "test_numerics",
+)  # fmt: skip
 CHECKED_N = 50  # calls of a function, in each test
 calls_n: Counter[Any] = Counter()
 
@@ -62,8 +63,8 @@ jaxtyping.jaxtyped = check_arrays  # by this name the import hook decorates ever
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the story: it is the longest file by far, and what begins last ends last (with --dist loadfile)."""
-    items.sort(key=lambda item: "test_story.py" not in item.nodeid)
+    """Begin with the longest files: what begins last ends last, and one worker would wait for it (--dist loadfile)."""
+    items.sort(key=lambda item: next((i for i, name in enumerate(LONG) if f"/{name}.py" in item.nodeid), len(LONG)))
 
 
 def pytest_collection_finish() -> None:
