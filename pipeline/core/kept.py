@@ -6,7 +6,6 @@ know what an array means.
 """
 
 import hashlib
-import os
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -14,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.core import io
-from pipeline.core.numerics import VARIABLES
+from pipeline.core.numerics import in_force
 
 LIBRARIES = ("numpy", "scipy", "numba")
 
@@ -49,7 +48,7 @@ def _folder(package: Path) -> Path:
 @cache
 def _state(package: Path) -> str:
     found = hashlib.sha256(repr([(name, version(name)) for name in LIBRARIES]).encode())
-    found.update(repr([(name, os.environ.get(name)) for name in VARIABLES]).encode())
+    found.update(repr(in_force()).encode())
     for source in sorted(package.glob("*.py")):
         found.update(source.read_bytes())
     return found.hexdigest()[:16]
