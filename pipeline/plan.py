@@ -59,7 +59,9 @@ def make_plan(scenes: Mapping[str, Scene], registry: Registry, flow: Mapping[str
     for stage in stages(QUESTIONS, *LEARNING, "study"):
         items[stage] = {name: {"scene": name} for name, scene in scenes.items() if scene.runs(stage)}
     items |= {question: _experiments(scenes, question) for question in EXPERIMENTS}
-    items["table2"] = {name: {"scene": name} for name, scene in scenes.items() if set(TABLE_2) <= set(scene.questions)}
+    items["table2"] = {
+        name: {"scene": name} for name, scene in scenes.items() if {*TABLE_2.values()} <= {*scene.questions}
+    }
     items |= {stage: {name: {"scene": name} for name in scenes} for stage in ("report", "publish")}
     for stage, of_stage in items.items():
         for item in of_stage.values():

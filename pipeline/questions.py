@@ -11,7 +11,8 @@ from typing import Literal
 MAIN_PROTOCOL = "grid"  # folds are drawn on its captures
 NOT_INGESTED = {"walk"}  # kinds of protocols whose captures are read as they are: an SD card knows no probe
 POOLED_BY = "adapt"  # takes pokes of the held-out skins, so a part of these is kept from every test
-TABLE_2 = ("transfer", "lobo", "triplet", "adapt")  # of its rows; a scene that asks all has the table early
+# The rows of table 2 and who answers them; a scene that asks all of these questions has the table early.
+TABLE_2 = {"single": "transfer", "multi": "lobo", "triplet": "triplet", "adapted": "adapt"}
 RANDOM = ("random_test_fraction", "random_repeats_n")
 
 Kind = Literal["models", "curve", "other", "experiment", "study", "report"]

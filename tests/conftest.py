@@ -1,20 +1,76 @@
-"""Fixtures that every folder of tests shares."""
+"""Fixtures that every folder of tests shares; which annotations of the project they execute."""
 
+import gc
+import inspect
+from collections import Counter
+from dataclasses import is_dataclass
+from functools import partial, wraps
 from pathlib import Path
+from typing import Any, get_args
 
+import jaxtyping
 import pytest
 from hypothesis import HealthCheck, settings
+from jaxtyping import AbstractArray, jaxtyped
 
 # How long an example takes says how busy the machine is, not whether the law holds.
 settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("busy")
 
 SHARED_DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
+LONG = (  # which run stages and commands
+    "test_story", "test_lab_story", "test_fetching", "test_adding", "test_adding_an_experiment", "test_numerics",
+)  # fmt: skip
+CHECKED_N = 50  # calls of a function, in each test
+calls_n: Counter[Any] = Counter()
+
+
+def check_arrays(of: Any = None, *, typechecker: Any) -> Any:
+    """Check shapes and kinds of arrays in the first calls of a function of the project in each test.
+
+    To check all calls takes longer than what is called; other types mypy checks.
+    """
+    if of is None:
+        return partial(check_arrays, typechecker=typechecker)
+    if inspect.isclass(of):
+        if is_dataclass(of):
+            of.__init__ = check_arrays(of.__init__, typechecker=typechecker)
+        return of
+    if not any(map(_names_an_array, inspect.get_annotations(of).values())):
+        return of
+    checked = jaxtyped(of, typechecker=typechecker)
+
+    @wraps(of)
+    def checked_at_first(*args: Any, **kwargs: Any) -> Any:
+        calls_n[of] += 1
+        return (checked if calls_n[of] <= CHECKED_N else of)(*args, **kwargs)
+
+    return checked_at_first
+
+
+def _names_an_array(hint: Any) -> bool:
+    if isinstance(hint, str):
+        return "[" in hint  # a name alone is a class, whose own annotations are executed
+    return (inspect.isclass(hint) and issubclass(hint, AbstractArray)) or any(map(_names_an_array, get_args(hint)))
+
+
+def pytest_runtest_setup() -> None:
+    calls_n.clear()
+
+
+gc.disable()  # while everything is imported
+jaxtyping.jaxtyped = check_arrays  # by this name the import hook decorates every function of the project
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the story: it is the longest file by far, and what begins last ends last (with --dist loadfile)."""
-    items.sort(key=lambda item: "test_story.py" not in item.nodeid)
+    """Begin with the longest files: what begins last ends last, and one worker would wait for it (--dist loadfile)."""
+    items.sort(key=lambda item: next((i for i, name in enumerate(LONG) if f"/{name}.py" in item.nodeid), len(LONG)))
+
+
+def pytest_collection_finish() -> None:
+    """Look no more, at each search for what nobody holds, through all that was imported: it lives to the end."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session")

@@ -76,7 +76,8 @@ def read_seconds(order: Sequence[str]) -> dict[str, float]:
     for scene in read_yaml(Path(PLAN))["scenes"]:
         committed = Path("reports") / scene / "numbers.json"
         stages = io.read_json(committed)["runtime"]["stages"] if committed.exists() else {}
-        took_s = {unit: max(cost["seconds"], cost["computed_s"] / 2) for unit, cost in stages.items()}
+        costs = {unit: cost for unit, cost in stages.items() if "computed_s" in cost}  # of older code: without
+        took_s = {unit: max(cost["seconds"], cost["computed_s"] / 2) for unit, cost in costs.items()}
         for unit, cost in read_costs(home() / COSTS / scene).items():
             took_s[unit] = max(cost["seconds"], sum(cost["trainings_s"].values()) / 2)
         for name in order:

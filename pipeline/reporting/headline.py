@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from pipeline.reporting.figures import drawing, svg
-from pipeline.reporting.order import CONTROL, Model, models
+from pipeline.reporting.order import models, table_2_rows
 from pipeline.reporting.shown import COLUMNS, INTERVAL, n_of, show, tabulate
 from pipeline.reporting.sweeps import DRAWN, bars
 from pipeline.reporting.work_precision import COLOURS, MARKERS
@@ -69,7 +69,7 @@ def _with_brackets(said: str, boards: str = "") -> str:
 
 def table2_figure(numbers: Mapping[str, Any], source: str) -> str:
     """Draw accuracy and MSE of each row of table 2 on boards held out, ours beside the paper's."""
-    rows = _rows(numbers)
+    rows = [row for name, row in table_2_rows(numbers).items() if name in numbers["table2"]]
     y = np.arange(len(rows))[::-1].astype(float)
     with drawing(8.6, 0.9 + 0.55 * len(rows)) as figure:
         panels = figure.subplots(1, len(DRAWN), sharey=True)
@@ -125,23 +125,13 @@ def labels_figure(numbers: Mapping[str, Any], source: str) -> str:
 def short_table(numbers: Mapping[str, Any]) -> pd.DataFrame:
     """Tabulate the same in five rows for a first look: means with intervals, and the paper's means."""
     lines = []
-    for model, row in _rows(numbers, control=True):
+    for model, row in table_2_rows(numbers).values():
         line = {"boards never seen": model.title}
         for metric in SHORT_TABLE:
             paper = f"{model.paper[metric][0]:.3g}" if model.paper else "–"
             line |= {f"{COLUMNS[metric]} (ours)": show(row[metric]), f"{COLUMNS[metric]} (paper)": paper}
         lines.append(line | {"n": n_of(row)})
     return tabulate(lines, spread=f"{INTERVAL}; n boards, or pairs of skins for one skin on others")
-
-
-def _rows(numbers: Mapping[str, Any], *, control: bool = False) -> list[tuple[Model, Mapping[str, Any]]]:
-    known = models(numbers)
-    rows = {name: numbers["table2"][name] for name in known if name in numbers["table2"] and name != "control"}
-    found = [(known[name], row) for name, row in rows.items()]
-    adapt = numbers.get("adapt", {})
-    if control and "control" in adapt:
-        found.append((Model(CONTROL, "control", {}), adapt["control"]))
-    return found
 
 
 def _draw(

@@ -25,13 +25,12 @@ from pipeline.evaluation.scores import (
     whole,
     with_boards,
 )  # fmt: skip
-from pipeline.questions import ROWS
+from pipeline.questions import ROWS, TABLE_2
 from pipeline.reporting.paper import PLATEAU_POKES_N
 
 Points = Mapping[str, Sequence[dict[str, Any]]]
 Seconds = Sequence[Mapping[str, Any]]
 CONTROL = "control"  # the recipe of adaptation that fine-tunes as long, without the new skin's pokes
-TABLE_2 = {"single": "transfer", "multi": "lobo", "triplet": "triplet", "adapted": "adapt"}  # rows: questions
 PAIRS = (
     ("multi", "single"), ("triplet", "multi"), ("adapted", "triplet"), ("adapted", CONTROL), (CONTROL, "triplet"),
     ("adapted", "multi"),

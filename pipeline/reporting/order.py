@@ -62,6 +62,12 @@ def models(numbers: Numbers) -> dict[str, Model]:
     }
 
 
+def table_2_rows(numbers: Numbers) -> dict[str, tuple[Model, Mapping[str, Any]]]:
+    """Give the rows of table 2 that were computed, in the paper's order; last the control, which the paper has not."""
+    ours = numbers["table2"] | ({"control": numbers["adapt"]["control"]} if "adapt" in numbers else {})
+    return {row: (model, ours[row]) for row, model in models(numbers).items() if row in ours}
+
+
 def is_pooled(numbers: Numbers) -> bool:
     """Tell whether some model of the leave-one-board-out question learnt from more than one skin."""
     boards = numbers["lobo"]["by_board"].values() if "lobo" in numbers else ()

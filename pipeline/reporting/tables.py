@@ -8,10 +8,11 @@ from typing import Any
 
 import pandas as pd
 
+from pipeline import questions
 from pipeline.experiments.left_out.show import left_out_table
 from pipeline.reporting.checklist import checklist
 from pipeline.reporting.checks import stability_table, verification_table
-from pipeline.reporting.order import SHORT, models, order_table, paired_boards_table, paired_table
+from pipeline.reporting.order import SHORT, order_table, paired_boards_table, paired_table, table_2_rows
 from pipeline.reporting.paper import ADAPTED_POKES_N, FIGURE_6A, FIGURE_6B, SINGLE_SENSOR, TABLE_2, Number
 from pipeline.reporting.parts import experiment_tables
 from pipeline.reporting.shown import (
@@ -184,11 +185,10 @@ def chosen_table(arms: Mapping[str, Any], source: str) -> pd.DataFrame:
 
 def _table_2(numbers: Numbers, source: str) -> pd.DataFrame:
     """Put each row beside the paper's row of the same kind, in the paper's order; the control is ours."""
-    ours = numbers["table2"] | ({"control": numbers["adapt"]["control"]} if "adapt" in numbers else {})
-    rows = {model.title: (ours[row], model.paper) for row, model in models(numbers).items() if row in ours}
+    rows = {model.title: (row, model.paper) for model, row in table_2_rows(numbers).values()}
     table = _beside_paper(rows, source)
     trainings = numbers.get("trainings", {})
-    asked = [trainings[name] for name in ("transfer", "lobo", "triplet", "adapt") if name in trainings]
+    asked = [trainings[question] for question in questions.TABLE_2.values() if question in trainings]
     words = [TARGET] * (source == "simulated")
     if kept_n := sum(counts["kept_collapsed_n"] for counts in asked):
         words.append(f"{kept_n} networks collapsed every time that they were trained, and are in these means.")

@@ -17,7 +17,7 @@ from pipeline.reporting.shown import to_markdown
 def table2(scene: str, files: Files, models: Path, shown: Path) -> None:
     """Score the held-out boards, print the table and draw its figure; the report shows the same numbers again."""
     source = read_settings("table2", scene, files).words("source")
-    arms = stages(TABLE_2, "models")
+    arms = stages(TABLE_2.values(), "models")
     cards = [io.read_json(file) for arm in arms for file in sorted((models / arm).glob("*.json"))]
     numbers = rounded({"provenance": {"scene": scene, "source": source}, **learned(tidy(cards, {}), headline=HEADLINE)})
     table = to_markdown(short_table(numbers))

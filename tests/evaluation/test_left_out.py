@@ -30,10 +30,17 @@ def rows_of(scene):
 
 @pytest.fixture(scope="module")
 def rows(few_nodes):
+    """Rows of every term, measured once."""
     return rows_of(with_protocol("grid", FEW))
 
 
-def test_terms_that_a_scene_does_without_are_left_out_and_others_are_kept(rows):
+@pytest.fixture
+def not_inside(monkeypatch):
+    """Do not follow material inside the skin, which takes most of the time and is the same for any other term."""
+    monkeypatch.setattr(left_out, "_inside", lambda on: [])
+
+
+def test_terms_that_a_scene_does_without_are_left_out_and_others_are_kept(rows, not_inside):
     assert {term for term, row in rows.items() if row.done == "left out"} == {
         "ageing", "relaxation", "memory", "temperature", "friction", "the earth's field", "the skin's free edge",
         "the powder's own field",
@@ -43,7 +50,7 @@ def test_terms_that_a_scene_does_without_are_left_out_and_others_are_kept(rows):
     assert aged["ageing"].done == "kept"
 
 
-def test_a_term_names_the_protocols_that_leave_it_out_and_those_that_compute_it(rows):
+def test_a_term_names_the_protocols_that_leave_it_out_and_those_that_compute_it(rows, not_inside):
     wear = FEW | {"skins_n": 1, "terms": ["ageing"]}
     found = rows_of(with_protocol("wear", wear, protocols={"grid": FEW, "wear": wear}, terms={"ageing": SIZES}))
     assert (found["ageing"].left_out_by, found["ageing"].computed_by) == (("grid",), ("wear",))
@@ -82,7 +89,7 @@ def test_what_is_kept_could_not_go(rows):
     assert rows["the chips' steps"].field_pct < 0.5
 
 
-def test_a_base_that_holds_the_skin_is_kept_where_there_is_one(rows):
+def test_a_base_that_holds_the_skin_is_kept_where_there_is_one(rows, not_inside):
     hold = {
         "give_um": (48.0, 7.0),
         "away_um_mm": 6.0,
@@ -96,7 +103,7 @@ def test_a_base_that_holds_the_skin_is_kept_where_there_is_one(rows):
     assert found["the base's hold"].field_pct > 10
 
 
-def test_the_powders_own_field_matters_by_how_much_powder_there_is(rows):
+def test_the_powders_own_field_matters_by_how_much_powder_there_is(rows, not_inside):
     half = rows_of(with_protocol("grid", FEW, skin=synthesis("skin", saturation_T=0.055).skin.model_dump()))
     # 10 %: the field that acts is half as strong, and the magnetisation is not quite linear in it
     assert half["the powder's own field"].field_pct == pytest.approx(

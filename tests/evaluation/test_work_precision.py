@@ -428,4 +428,5 @@ def test_more_pokes_leave_the_error_and_the_work_of_a_poke_nearly_as_they_are():
 
 
 def test_the_same_sweep_gives_the_same_rows(relaxations):
-    assert study_integrators(SMALL)[0] == relaxations[0]
+    again, study = study_integrators(few(ratios=(1e6,)))[0], integrators.study(1e6)
+    assert again == [row for row in relaxations[0] if row.study == study]

@@ -3,6 +3,8 @@
 import os
 import shutil
 import subprocess
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -12,6 +14,9 @@ ENVIRONMENT = {
     "RESKIN_EXECUTOR": "here",  # a worker spends longer on its imports than on such trainings
     "PYTHONDONTWRITEBYTECODE": "",  # stages start a hundred times: what Python compiled is kept, wherever they run
 }  # fmt: skip
+
+
+DONE, FAILED = "these stages ended", "these stages did not end"  # warm.py says
 
 
 def copy_checkout(folder: Path) -> Path:
@@ -34,12 +39,39 @@ def copy_checkout(folder: Path) -> Path:
     return folder
 
 
+def variables(folder: Path, **environment: str) -> dict[str, str]:
+    """Give the environment of programs that run in the copy: its own code is the copy's, and its diary its own."""
+    taken = {name: value for name, value in os.environ.items() if name != "MLFLOW_TRACKING_URI"}
+    return {**taken, **ENVIRONMENT, "PYTHONPATH": str(folder), **environment}
+
+
+@contextmanager
+def warm_stages(folder: Path) -> Iterator[Callable[..., str]]:
+    """Give what runs stages, all or those of these names, and says what they say; they share a process that is warm."""
+    words = [str(folder / ".venv/bin/python"), "tests/stages/warm.py"]
+    to, of = subprocess.PIPE, variables(folder)
+    with subprocess.Popen(words, cwd=folder, stdin=to, stdout=to, stderr=subprocess.STDOUT, text=True, env=of) as warm:
+
+        def run_stages(*names: str, end: bool = True) -> str:
+            print(*names, file=warm.stdin, flush=True)
+            said = []
+            for line in warm.stdout:
+                if line.strip() in (DONE, FAILED):
+                    break
+                said.append(line)
+            if line.strip() != (DONE if end else FAILED):
+                raise AssertionError(f"{names or 'stages'} must {'' if end else 'not '}end:\n{''.join(said)[-3000:]}")
+            return "".join(said)
+
+        yield run_stages
+        warm.stdin.close()
+
+
 def run(folder: Path, *words: str, check: bool = True, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run a program of the environment in the copy; its own code is the copy's."""
-    program = str(folder / ".venv/bin" / words[0])
-    variables = {**os.environ, **ENVIRONMENT, "PYTHONPATH": str(folder), **environment}
-    variables.pop("MLFLOW_TRACKING_URI", None) if "MLFLOW_TRACKING_URI" not in environment else None
-    done = subprocess.run([program, *words[1:]], cwd=folder, capture_output=True, text=True, env=variables, check=False)
+    """Run a program of the environment in the copy."""
+    words = (str(folder / ".venv/bin" / words[0]), *words[1:])
+    of = variables(folder, **environment)
+    done = subprocess.run(words, cwd=folder, capture_output=True, text=True, env=of, check=False)
     if check and done.returncode:
         raise AssertionError(f"{' '.join(words)} failed:\n{done.stdout[-3000:]}\n{done.stderr[-3000:]}")
     return done

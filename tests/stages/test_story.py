@@ -6,7 +6,7 @@ import re
 import signal
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import mlflow
@@ -25,7 +25,7 @@ from pipeline.reporting.checklist import read_rows, resolve
 from pipeline.reporting.headline import short_table, table2_figure
 from pipeline.reporting.judging import NOT_REACHED
 from pipeline.reporting.shown import to_markdown
-from tests.stages.checkout import ENVIRONMENT, copy_checkout, run
+from tests.stages.checkout import ENVIRONMENT, copy_checkout, run, warm_stages
 
 LEARNING = (
     "train_single", "train_multi", "train_triplet", "adapt", "sweep_pokes", "sweep_sensors", "train_classical",
@@ -33,18 +33,27 @@ LEARNING = (
 )  # fmt: skip
 DRAWING = ("drift", "manual", "contacts", "ambient")  # experiments that draw at random in ways of their own
 ASKED = set(EXPERIMENTS) - {"compare"}  # which is asked of recordings only
-WARM = ("python", "tests/stages/warm.py")
 SAID = "said.txt"  # by the first run
 pytestmark = pytest.mark.timeout(1800)  # a guard against a hang; a busy machine takes four times as long as a quiet one
 
 
 @pytest.fixture(scope="module")
-def story(tmp_path_factory) -> Iterator[Path]:
+def checkout(tmp_path_factory) -> Path:
     folder = copy_checkout(tmp_path_factory.mktemp("story"))
     run(folder, "reskin", "scenes", "use", "ci")
-    done = run(folder, *WARM)
-    (folder / SAID).write_text(done.stdout + done.stderr)
     return folder
+
+
+@pytest.fixture(scope="module")
+def run_stages(checkout) -> Iterator[Callable[..., str]]:
+    with warm_stages(checkout) as run_stages:
+        yield run_stages
+
+
+@pytest.fixture(scope="module")
+def story(checkout, run_stages) -> Path:
+    (checkout / SAID).write_text(run_stages())
+    return checkout
 
 
 def test_every_number_of_the_first_tables_is_there_and_says_that_it_is_simulated(story):
@@ -255,27 +264,25 @@ def test_mlflow_loads_a_model_by_its_run_and_it_answers_as_ours_does(story, monk
     np.testing.assert_allclose(theirs.to_numpy(), ours.predict(db_uT), rtol=1e-6)
 
 
-def test_a_second_repro_does_nothing(story):
-    assert "Data and pipelines are up to date." in run(story, "dvc", "repro").stdout
-
-
-def test_training_again_from_nothing_gives_the_same_lock_file(story):
+def test_training_again_from_nothing_gives_the_same_lock_file(story, run_stages):
     before = (story / "dvc.lock").read_text()
     for file in (story / ".reskin/cells").glob("*.safetensors"):
         file.unlink()  # else finished trainings would be reused, and prove nothing
     stages = [f"{name}@ci" for name in ("simulate", "ingest_simulated", "split", *LEARNING, *DRAWING, "report")]
-    run(story, *WARM, *stages)
+    run_stages(*stages)
     assert (story / "dvc.lock").read_text() == before
 
 
-def test_deleted_models_are_restored_without_training(story):
+def test_a_second_repro_runs_no_stage_and_restores_deleted_models(story):
     models = sorted((story / "data/models/ci/train_multi").iterdir())
     content = models[0].read_bytes()
     for file in models:
         file.unlink()
     for file in (story / ".reskin/cells").glob("*.safetensors"):
         file.unlink()
-    run(story, "dvc", "repro")
+    said = run(story, "dvc", "repro").stdout
+    assert "Stage 'train_multi@ci' is cached" in said
+    assert "Running stage" not in said
     assert models[0].read_bytes() == content
     assert list((story / ".reskin/cells").glob("*.safetensors")) == []
 
@@ -312,7 +319,7 @@ def test_a_dead_tracking_server_is_said_and_costs_no_result(story):
     assert time.monotonic() - start_s < 20  # not MLflow's own minutes; two cores may be busy
 
 
-def test_an_experiment_that_is_switched_off_leaves_no_stage_no_file_and_no_cost(story):
+def test_an_experiment_that_is_switched_off_leaves_no_stage_no_file_and_no_cost(story, run_stages):
     scene = story / "pipeline/scenes/ci.yaml"
     own = YAML(typ="safe").load(scene.read_text())
     own["questions"].remove("sleeve")
@@ -324,7 +331,7 @@ def test_an_experiment_that_is_switched_off_leaves_no_stage_no_file_and_no_cost(
     assert "sleeve@ci" in run(story, "reskin", "scenes", "use", "ci").stdout
     assert "removed sleeve@ci: data/answers/ci/sleeve.json" in run(story, "reskin", "scenes", "tidy").stdout
     assert not any("sleeve" in stage for stage in run(story, "dvc", "stage", "list", "--name-only").stdout.split())
-    run(story, "dvc", "repro", "--single-item", "report@ci")
+    run_stages("report@ci")
     assert [
         *story.glob("data/[!c]*/**/*sleeve*"),
         *story.glob("reports/ci/**/*sleeve*"),
@@ -335,13 +342,11 @@ def test_an_experiment_that_is_switched_off_leaves_no_stage_no_file_and_no_cost(
     assert not any("sleeve" in stage for stage in YAML(typ="safe").load((story / "dvc.lock").read_text())["stages"])
 
 
-def test_a_parameter_that_nobody_knows_is_one_sentence(story):
+def test_a_parameter_that_nobody_knows_is_one_sentence(story, run_stages):
     scene = story / "pipeline/scenes/ci.yaml"
     before = scene.read_text()
     scene.write_text(before.replace("random_repeats_n:", "random_repeets_n:"))
-    done = run(story, "dvc", "repro", check=False)
+    said = run_stages("split@ci", end=False)
     scene.write_text(before)
-    assert done.returncode != 0
-    said = done.stdout + done.stderr
     assert "split: random_repeets_n must be a known parameter; got 2" in said
     assert "Traceback" not in said

@@ -1,8 +1,9 @@
 """Runs stages as DVC would, each in a process of its own, forked from one that holds what they would all begin with.
 
-python tests/stages/warm.py [STAGE ...]: in a checkout, all stages or these (`drift@ci`), in DVC's order; then commits
-as `dvc commit` does. Most of a tiny stage's time is imports, and following the material under a tip for its tables;
-tests/recordings/test_lab_story.py runs DVC itself.
+`warm_stages` starts it in a checkout. Each line of its input names stages (`drift@ci sleeve@ci`; none: all), which run
+in DVC's order and are committed as `dvc commit` does; then it says `DONE`, or `FAILED`, and reads on. Most of a tiny
+stage's time is imports, and following the material under a tip for its tables; tests/recordings/test_lab_story.py runs
+DVC itself.
 """
 
 import importlib
@@ -12,8 +13,10 @@ import shlex
 import sys
 import traceback
 
-from dvc.repo import Repo
+from dvc.repo import Repo, lock_repo
 from dvc.repo.reproduce import get_active_graph, plan_repro
+
+from tests.stages.checkout import DONE, FAILED
 
 LIBRARIES = (
     "torch._dynamo",  # 2 s of each training: an optimiser imports it
@@ -70,7 +73,7 @@ def begin(simulated: set[tuple[str, str]]) -> None:
         list(moved_dipoles(skin, np.array([[0.0, 0.0, DEEP_M]])))  # its tables are kept
 
 
-def main(asked: list[str]) -> None:
+def run_stages(asked: list[str]) -> str:
     with Repo() as repo:
         planned = plan_repro(get_active_graph(repo.index.graph))
         with_words = [stage for stage in planned if stage.cmd]  # the others are recordings that were added
@@ -81,11 +84,16 @@ def main(asked: list[str]) -> None:
             print(f"Running stage '{name}':", flush=True)
             for out in stage.outs:  # as `dvc repro` does: a stage that writes nothing has nothing
                 out.remove()
-            if status := run_stage(name, stage.cmd):
-                sys.exit(f"stage {name} ended with {status}")
-        repo.commit(force=True)
+            if run_stage(name, stage.cmd):
+                return FAILED
+        with lock_repo(repo):
+            for stage in stages.values():
+                stage.save(run_cache=False)  # which holds former runs: no story asks for them
+                stage.commit()
+            next(iter(stages.values())).dvcfile.dump_stages([*stages.values()], update_pipeline=False)
+    return DONE
 
 
 if __name__ == "__main__":
-    sys.path.insert(0, os.getcwd())  # the copy's code, where this file was started from another folder
-    main(sys.argv[1:])
+    for line in sys.stdin:
+        print(run_stages(line.split()), flush=True)
