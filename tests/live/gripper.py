@@ -60,7 +60,8 @@ class Finger:
 
     def __init__(self, seed: int, at_mm: tuple[float, float] = (8.0, 8.0)) -> None:
         pokes = np.column_stack([np.tile(at_mm, (len(DEPTHS_MM), 1)), DEPTHS_MM])
-        noload_uT, b_uT, force_N = reskin.simulate_pokes(reskin.draw_skin(seed=seed), pokes, seed=seed)
+        quiet = {"noise_xy_uT": 0.0, "noise_z_uT": 0.0}  # each frame has its own
+        noload_uT, b_uT, force_N = reskin.simulate_pokes(reskin.draw_skin(seed=seed), pokes, seed=seed, chip=quiet)
         self.noload_uT = noload_uT.mean(axis=0)
         self._change_uT = np.vstack([np.zeros(15), b_uT - self.noload_uT])
         self._force_N, self._depth_mm = np.append(0, force_N), np.append(0, DEPTHS_MM)
