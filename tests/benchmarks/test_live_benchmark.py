@@ -4,6 +4,7 @@
 page is read by another too. Nothing is asserted but that frames came.
 """
 
+import asyncio
 import os
 import subprocess
 import sys
@@ -18,7 +19,9 @@ from pipeline.live.session import Live
 from pipeline.live.skin import Readings
 from pipeline.live.view import View
 from pipeline.predicting import read_network
-from tests.live.boards import make_script, write_model, write_script
+from tests.live.boards import make_script, plugged_in, write_model, write_script
+from tests.live.test_browser import BROWSER, Tab, in_browser
+from tests.live.test_server import serve
 from tests.stages.checkout import ROOT
 
 SECONDS = 30.0
@@ -67,7 +70,6 @@ def test_from_the_last_byte_of_a_frame_to_its_estimate(tmp_path, chips_n, rate_h
 
 def serve_beside(live: Live) -> str:
     """Serve the page on a thread; give its address."""
-    import asyncio
     import threading
 
     from aiohttp import web
@@ -88,6 +90,19 @@ def serve_beside(live: Live) -> str:
     threading.Thread(target=lambda: asyncio.run(run()), daemon=True).start()
     ready.wait()
     return address[0]
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no browser: see tests/live/test_browser.py")
+def test_from_the_last_byte_of_a_frame_to_the_screen(tmp_path):
+    async def act(tab: Tab) -> None:
+        await asyncio.sleep(SECONDS)
+        screen_ms = await tab.value("[last.screen50, last.screen99, last.estimate50, last.estimate99]")
+        p50, p99, *estimate_ms = screen_ms
+        print(f"\n5 chips at 400 Hz, in {BROWSER}: byte to screen p50 {p50:.0f} ms, p99 {p99:.0f} ms")
+        print(f"  byte to estimate: p50 {estimate_ms[0]:.2f} ms, p99 {estimate_ms[1]:.2f} ms")
+
+    with plugged_in(make_script(pokes_n=4), loop=True) as name:
+        serve(name, [read_network(write_model(tmp_path))], in_browser(tmp_path, act))
 
 
 def test_a_day_of_frames_takes_the_memory_of_ten_minutes():

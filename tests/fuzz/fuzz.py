@@ -22,6 +22,8 @@ def follow(name: str, seconds: int) -> None:
 
     with atheris.instrument_imports(include=["pipeline"]):
         from tests.fuzz.targets import feed
+    for file in (CORPUS / name).iterdir():
+        feed(name, file.read_bytes())  # what is imported at first use is no hang
     with tempfile.TemporaryDirectory() as found:
         limits = [f"-max_total_time={seconds}", f"-max_len={BYTES_MAX_N}", f"-rss_limit_mb={MEMORY_MAX_MB}"]
         folders = [found, str(CORPUS / name)]

@@ -13,6 +13,7 @@ import pytest
 from aiohttp import web
 
 from pipeline.capture.header import HEADER_FILE, parse
+from pipeline.live.answering import Models
 from pipeline.live.server import CLIENTS_MAX_N, REQUEST_BYTES_MAX_N, Server
 from pipeline.live.session import Live
 from pipeline.live.view import BINS_N, HEAD, NUMBERS_N
@@ -23,7 +24,7 @@ LONG_S = 60.0
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")  # of sockets that a refused client leaves
 
 
-def serve(port: str, models: list, act: Callable[[str, aiohttp.ClientSession], Awaitable[None]], token: str = ""):
+def serve(port: str, models: Models, act: Callable[[str, aiohttp.ClientSession], Awaitable[None]], token: str = ""):
     """Serve a board's page, let a client act, and stop."""
 
     async def run() -> None:

@@ -5,6 +5,8 @@ import math
 import threading
 import time
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import replace
 
 import numpy as np
@@ -139,6 +141,33 @@ def test_every_byte_that_was_sent_is_a_frames_or_lost_and_counted(minutes_n):
     assert 0 <= waiting_n < 3 * 82  # of what comes last, more bytes would tell
     assert account["frames_n"] * 82 == account["frame_bytes_n"]
     assert account["skipped_resync_bytes_n"] > 1000
+
+
+def test_the_forty_chips_of_a_sleeve_are_drawn_where_they_lie_and_answered_for(tmp_path):
+    model = read_network(write_model(tmp_path, chips_n=40))
+    skin, readings = played(make_script(pokes_n=2, chips_n=40, rate_hz=133.0), [model])
+    assert skin.layout.known
+    assert skin.found.chips_n == 40
+    found = np.concatenate([each.answer[each.contact] for each in readings])
+    nearest = np.abs(found[:, None] - PLACES).sum(axis=2).argmin(axis=1)
+    assert set(nearest) == {0, 1}
+    np.testing.assert_allclose(found, PLACES[nearest], atol=0.5)
+    assert skin.health.alarms == {}
+
+
+def test_eight_boards_on_eight_ports_are_each_their_own():
+    chips_n = range(1, 9)
+
+    def look(name: str) -> int:
+        with Skin(name) as skin:
+            contact = next(iter(skin))
+            assert skin.reader.missed_bytes_n == 0
+            return len(contact.b_uT) // 3
+
+    with ExitStack() as stack, ThreadPoolExecutor(8) as pool:
+        scripts = [make_script(pokes_n=0, chips_n=n, rate_hz=50.0, quiet_s=2.0) for n in chips_n]
+        names = [stack.enter_context(plugged_in(script, loop=True)) for script in scripts]
+        assert list(pool.map(look, names)) == list(chips_n)
 
 
 def test_a_model_of_other_boards_and_a_port_without_one_are_refused(tmp_path):
