@@ -14,7 +14,7 @@ from pipeline.core.errors import ParamsError
 from pipeline.core.schema import LABELS, Readings
 from pipeline.dataset.rows import Rows, Selection, gather
 
-Policy = Callable[[np.ndarray, np.ndarray], np.ndarray]  # no-load fields and indentations of the rows -> no-load fields
+Policy = Callable[[Readings], np.ndarray]  # -> the no-load field of each row
 TRAIN = -1
 
 
@@ -96,7 +96,7 @@ def lay_parts(
     next_i = 0
     for readings, unit_i in captures:
         for policy, choose in policies.items():
-            changed = replace(readings, noload_uT=choose(readings.noload_uT, readings.indentation))
+            changed = replace(readings, noload_uT=choose(readings))
             off_uT = (changed.noload_uT - readings.noload_uT).astype(float)
             for window_i, (start, end) in enumerate((windows.train, *windows.tests), TRAIN):
                 inside = (unit_i >= start) & (unit_i < end)

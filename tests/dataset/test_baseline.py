@@ -1,9 +1,10 @@
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.core.seeds import rng_for
-from pipeline.dataset.baseline import each, initial, rank, regular, subtract
+from pipeline.dataset.baseline import alike_within_uT, each, follow_free, free, initial, rank, regular, subtract
 
 B_uT, NOLOAD_uT = (rng_for(0, name).normal(0, 500, (5, 15)).astype(np.float32) for name in ("b", "noload"))
 
@@ -57,3 +58,38 @@ def test_policies_agree_at_the_first_indentation_and_a_reading_every_time_is_eac
 def test_ranks_count_indentations_in_order_of_time():
     assert rank(np.array([5, 5, 2, 9, 9])).tolist() == [0, 0, 1, 2, 2]
     assert rank(np.zeros(0, np.int32)).tolist() == []
+
+
+def touched(rows_n: int, touches_n: int = 200, walk_uT: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A skin whose field at rest walks, touched each time elsewhere for so many rows: b, no-load and indentation."""
+    rng = rng_for(0, "touched")
+    rest_uT = np.cumsum(walk_uT * rng.standard_normal((touches_n, 15)), axis=0)
+    touch_uT = 60 * rng.standard_normal((touches_n, 15))
+    indentation = np.repeat(np.arange(touches_n, dtype=np.int32), rows_n)
+    noload_uT = rest_uT[indentation].astype(np.float32)
+    return noload_uT + touch_uT[indentation].astype(np.float32), noload_uT, indentation
+
+
+@pytest.mark.parametrize("rows_n", [1, 4, 50])
+def test_readings_judged_free_of_contact_follow_a_walk_however_long_each_press_lasts(rows_n):
+    b_uT, noload_uT, indentation = touched(rows_n)
+    within_uT = alike_within_uT(noload_uT[: 20 * rows_n], indentation[: 20 * rows_n])
+    assert within_uT == pytest.approx(2.0, rel=0.2)
+    off_uT = free(b_uT, noload_uT, indentation, within_uT=within_uT) - noload_uT
+    assert np.sqrt((off_uT**2).mean()) < 0.7  # the walk of a fraction of a touch, now and then of one or two
+    assert np.sqrt(((initial(noload_uT, indentation) - noload_uT) ** 2).mean()) > 5
+
+
+def test_a_finger_that_slides_on_leaves_the_old_reading_in_force_and_the_skin_is_found_again_when_it_lets_go():
+    b_uT, noload_uT, _ = touched(1, walk_uT=0.1)
+    sent = [field for pair in zip(noload_uT, b_uT, strict=True) for field in pair]
+    slid = [*sent[:100], *(sent[101] + 20 * i for i in range(60)), *sent[100:]]
+    zeros = list(follow_free(slid, within_uT=0.5))
+    np.testing.assert_array_equal(zeros[159], sent[98])
+    np.testing.assert_array_equal(zeros[-1], sent[-2])
+
+
+def test_nothing_but_the_past_decides_what_is_free():
+    b_uT, noload_uT, indentation = touched(2)
+    whole, part = (free(b_uT[:n], noload_uT[:n], indentation[:n], within_uT=2.0) for n in (400, 123))
+    np.testing.assert_array_equal(whole[:123], part)

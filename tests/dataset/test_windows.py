@@ -71,7 +71,10 @@ def test_the_documented_windows_are_what_is_laid():
     assert (outcome.attempted, outcome.failed) == (2, 0)
 
 
-POLICIES = {"initial": initial, "each": each}
+POLICIES = {
+    name: lambda of, choose=choose: choose(of.noload_uT, of.indentation)
+    for name, choose in (("initial", initial), ("each", each))
+}
 
 
 def capture(skin: str, f: int = 24):
@@ -121,7 +124,7 @@ def test_as_read_a_part_is_what_gather_makes_of_its_readings(train_n, test_n, mo
     every_n = max(train_n, test_n) + more_n
     windows = lay_windows([24], train_n=train_n, test_n=test_n, every_n=every_n)
     one, everything = capture("s0"), Selection(force_min_N=0.0)
-    parts = lay_parts([(one, rank(one.indentation))], {"each": each}, windows=windows, selection=everything)
+    parts = lay_parts([(one, rank(one.indentation))], {"each": POLICIES["each"]}, windows=windows, selection=everything)
     whole = gather([one], everything)
     for part, (start, end) in zip(parts, (windows.train, *windows.tests), strict=True):
         assert (part.rows.db_uT == whole.db_uT[start:end]).all()

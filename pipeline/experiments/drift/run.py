@@ -38,7 +38,8 @@ from pipeline.learning.trial import Trained, Trial
 from pipeline.trials.data import SceneData, prepare_training, train_all
 
 Count = Annotated[int, Field(ge=1)]
-PolicyName = Literal["initial", "regular", "each"]  # no-load reading: once, every so often, before each contact
+# No-load reading: once, every so often, before each contact, or whenever a reading is judged free of contact.
+PolicyName = Literal["initial", "regular", "each", "free"]
 
 
 class Drift(Strict):
@@ -77,12 +78,21 @@ def cut(captures: Sequence[Readings], section: Drift, selection: Selection) -> t
     units = [baseline.rank(getattr(one, UNIT[section.unit])) for one in captures]
     units_n = [1 + int(own.max()) for own in units]
     windows = lay_windows(units_n, train_n=section.train_n, test_n=section.test_n, every_n=section.every_n)
-    known: dict[str, Policy] = {"initial": baseline.initial, "each": baseline.each}
-    if section.regular_n is not None:
-        known["regular"] = partial(baseline.regular, regular_n=section.regular_n)
-    policies: dict[str, Policy] = {policy: known[policy] for policy in section.policies}
+    policies: dict[str, Policy] = {policy: partial(_choose, policy, section) for policy in section.policies}
     laid = lay_parts(list(zip(captures, units, strict=True)), policies, windows=windows, selection=selection)
     return windows, laid
+
+
+def _choose(policy: PolicyName, section: Drift, readings: Readings) -> np.ndarray:
+    fields = readings.noload_uT, readings.indentation
+    if policy == "regular":
+        assert section.regular_n is not None
+        return baseline.regular(*fields, regular_n=section.regular_n)
+    if policy == "free":
+        trained_on = baseline.rank(getattr(readings, UNIT[section.unit])) < section.train_n
+        within_uT = baseline.alike_within_uT(*(of[trained_on] for of in fields))
+        return baseline.free(readings.b_uT, *fields, within_uT=within_uT)
+    return (baseline.initial if policy == "initial" else baseline.each)(*fields)
 
 
 def trials(parts: Sequence[Part], section: Drift, seed: int) -> Iterator[tuple[Trial, list[Part]]]:

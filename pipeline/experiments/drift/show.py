@@ -14,7 +14,7 @@ from pipeline.reporting.paper import FIGURE_5
 from pipeline.reporting.shown import COLUMNS, show, tabulate
 from pipeline.reporting.work_precision import COLOURS, MARKERS
 
-POLICIES = ("initial", "regular", "each")
+POLICIES = ("initial", "regular", "each", "free")
 WALKED = (
     "The networks of figure 5a on their last window again, of captures to which a random walk was added: one normal "
     "step a contact and channel, from the end of training on, in contact and no-load readings alike. The first row is "
@@ -163,6 +163,7 @@ def _policies(numbers: Mapping[str, Any]) -> dict[str, tuple[str, Sequence[Mappi
         "initial": "once at the start",
         "regular": f"every {numbers.get('regular_n')} indentations",
         "each": "before every contact",
+        "free": "whenever judged free of contact",
     }
     return {policy: (words[policy], numbers[policy]) for policy in POLICIES if policy in numbers}
 
