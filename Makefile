@@ -3,7 +3,7 @@
 # make test-processors   the tests that train, under the instructions of four kinds of processors
 # make ui      the MLflow UI on the embedded store
 # make bench   benchmarks (not part of the tests)
-# make time-repro   `make repro` in three fresh clones: seconds, CPU seconds, disk -> reports/time.json
+# make time-repro   `make repro` in a fresh clone, its stages three times: seconds, CPU seconds, disk -> reports/time.json
 # make clean   removes what the targets above made, but no data and no results
 
 PYTHON ?= python3
@@ -56,7 +56,7 @@ ui: $(STAMP)
 bench: $(STAMP)
 	$(BIN)/python -m pytest tests/benchmarks -s -q --override-ini addopts= -p no:xdist
 
-# How long a newcomer waits, and what it takes on disk: three fresh clones.
+# How long a newcomer waits, and what it takes on disk: a fresh clone, its stages three times from nothing.
 time-repro:
 	$(PYTHON) tests/benchmarks/time_repro.py --times 3
 

@@ -99,7 +99,7 @@ def _time(timed: Numbers | None) -> str:
         for unit in ("wall_s", "cpu_s")
     }
     disk = f"{median(run['all_MB'] for run in runs) / 1e3:.1f} GB on disk"
-    clones = f"median of {len(runs)} fresh clones" if len(runs) > 1 else "one fresh clone"
+    clones = "a fresh clone" + (f", stages the median of {len(runs)} runs from nothing" if len(runs) > 1 else "")
     return (
         f"Environment {minutes['environment', 'wall_s']:.1f} min, stages {minutes['stages', 'wall_s']:.1f} min "
         f"({minutes['stages', 'cpu_s']:.1f} min of CPU), {disk}, of which the environment takes "

@@ -1,7 +1,8 @@
 """Time `make repro` as a newcomer runs it: a fresh clone in an empty folder, environment first, then all stages.
 
-python3 tests/benchmarks/time_repro.py --times 3 --out reports/time.json. Each is a clone of the last commit, without
-any cache but pip's own. Needs nothing but Python and git. Keep the machine quiet.
+python3 tests/benchmarks/time_repro.py --times 3 --out reports/time.json. A clone of the last commit, without any cache
+but pip's own; the environment is made once, and the stages run so many times from nothing: between two runs all that
+git does not hold goes, but for the environment. Needs nothing but Python and git. Keep the machine quiet.
 """
 
 import argparse
@@ -13,6 +14,7 @@ import shutil
 import subprocess
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -33,35 +35,39 @@ def size_MB(folder: Path) -> float:
     return round(sum(file.lstat().st_blocks * 512 for file in folder.rglob("*")) / 1e6)
 
 
-def once(keep: Path | None) -> dict[str, object]:
-    """Time one clone; keep it, results and all, if `keep` names a folder for it."""
-    folder = keep or Path(tempfile.mkdtemp()) / "clone"
-    try:
-        subprocess.run(["git", "clone", "--quiet", str(ROOT), str(folder)], check=True)
-        environment = run(["make", ".venv/.installed"], folder)
+def measure(folder: Path, times: int) -> Iterator[dict[str, object]]:
+    """Time the environment with the first run in a new clone, and the stages of every run."""
+    subprocess.run(["git", "clone", "--quiet", str(ROOT), str(folder)], check=True)
+    environment = run(["make", ".venv/.installed"], folder)
+    environment_MB = size_MB(folder / ".venv")
+    for i in range(times):
+        if i:
+            subprocess.run(["git", "checkout", "--quiet", "."], cwd=folder, check=True)
+            subprocess.run(["git", "clean", "-fdxq", "-e", ".venv", "-e", "*.egg-info"], cwd=folder, check=True)
         stages = run(["make", "repro"], folder)
-        return {
-            "environment": environment, "stages": stages, "environment_MB": size_MB(folder / ".venv"),
-            "all_MB": size_MB(folder),
+        yield {
+            "environment": environment, "stages": stages, "environment_MB": environment_MB, "all_MB": size_MB(folder),
         }  # fmt: skip
-    finally:
-        if keep is None:
-            shutil.rmtree(folder.parent)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--times", type=int, default=3)
     parser.add_argument("--out", type=Path, default=ROOT / "reports/time.json")
-    parser.add_argument("--keep", type=Path, help="keep the last clone there")
+    parser.add_argument("--keep", type=Path, help="keep the clone there, with the results of the last run")
     asked = parser.parse_args()
     commit = subprocess.run(
         ["git", "rev-parse", "--short=12", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=True
     )
     runs = []
-    for i in range(asked.times):
-        runs.append(once(asked.keep if i == asked.times - 1 else None))
-        print(f"{i + 1}/{asked.times}: {runs[-1]}", flush=True)
+    folder = asked.keep or Path(tempfile.mkdtemp()) / "clone"
+    try:
+        for i, found in enumerate(measure(folder, asked.times), 1):
+            runs.append(found)
+            print(f"{i}/{asked.times}: {found}", flush=True)
+    finally:
+        if asked.keep is None:
+            shutil.rmtree(folder.parent)
     machine = f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
     asked.out.write_text(json.dumps({"git": commit.stdout.strip(), "machine": machine, "runs": runs}, indent=2) + "\n")
 
