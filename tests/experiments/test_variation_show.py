@@ -64,5 +64,5 @@ def test_figures_name_fifteen_channels_places_and_skins():
 
 
 def test_same_lines_same_bytes_other_lines_other_bytes():
-    assert figures(numbers(), drawn(), "simulated") == figures(numbers(), drawn(), "simulated")
-    assert figures(numbers(), drawn(), "simulated") != figures(numbers(), drawn(99.0), "simulated")
+    first, again, other = (figures(numbers(), lines, "simulated") for lines in (drawn(), drawn(), drawn(99.0)))
+    assert first == again != other

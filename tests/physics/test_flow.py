@@ -94,3 +94,12 @@ def test_a_shallow_poke_is_the_linear_one(base):
     # 5 % of the depth: the material's own displacement, and a contact (0.3 mm) not wider than the shortest wave
     np.testing.assert_allclose(at.r_m - r_m, linear.r_m, atol=0.05 * depth_m)
     np.testing.assert_allclose(at.z_m - z_m, linear.z_m, atol=0.05 * depth_m)
+
+
+@pytest.mark.parametrize("base", BASES)
+def test_material_goes_to_the_last_bit_where_it_goes_without_other_material(base):
+    r_m, z_m = nodes(8, 4)
+    alone = [follow(r_m + more_m, z_m, base=base) for more_m in (0.0, 3e-3)]
+    together = follow(np.concatenate([r_m, r_m + 3e-3]), np.tile(z_m, 2), base=base)
+    for name in ("r_m", "z_m", "f", "hoop"):
+        np.testing.assert_array_equal(getattr(together, name), np.concatenate([getattr(one, name) for one in alone]))

@@ -36,16 +36,20 @@ LEARNING = [
 ADAPTATION = [{"pokes_n": n, "seconds": 1.0 + n / 1000, **row(85.0, 0.5 - n / 10000)} for n in (65, 390, 3900)]
 
 
+@pytest.fixture(scope="module")
+def costs() -> dict[str, str]:
+    return learning_pages({"learning": LEARNING, "adaptation": ADAPTATION}, "simulated")
+
+
 def drawn(svg: str) -> int:
     """Count marks: each is one use of a path."""
     return len(re.findall("<use ", svg))
 
 
 def test_the_sweep_over_pokes_shows_none_at_all_units_source_and_the_two_points_of_the_paper():
-    words = said(sweep_pokes(POKES, "simulated")).split()
-    for word in ("0", "65", "3900", "simulated", "%", "mm²", "paper", "pokes"):
-        assert any(word in one for one in words)
-    assert "paper (table 2)" in said(sweep_pokes(POKES, "simulated"))
+    words = said(sweep_pokes(POKES, "simulated"))
+    for word in ("0", "65", "3900", "simulated", "%", "mm²", "paper (table 2)", "pokes"):
+        assert word in words
 
 
 def test_the_sweep_over_sensors_has_a_line_for_each_method_that_was_asked():
@@ -84,9 +88,8 @@ def test_only_sweeps_that_were_asked_for_are_drawn():
     assert dict(learning_figures({}, "simulated")) == {}
 
 
-def test_pages_of_costs_hold_what_was_asked_for_and_no_figure_of_what_was_not_timed():
-    pages = learning_pages({"learning": LEARNING, "adaptation": ADAPTATION}, "simulated")
-    assert set(pages) == {"training.svg", "inference.svg", "adaptation.svg", "learning.md", "adaptation.md"}
+def test_pages_of_costs_hold_what_was_asked_for_and_no_figure_of_what_was_not_timed(costs):
+    assert set(costs) == {"training.svg", "inference.svg", "adaptation.svg", "learning.md", "adaptation.md"}
     untimed = [{key: value for key, value in one.items() if key != "train_s"} for one in LEARNING]
     assert set(learning_pages({"learning": untimed}, "simulated")) == {"inference.svg", "learning.md"}
     never = [{key: value for key, value in one.items() if key != "seconds"} for one in ADAPTATION]
@@ -113,8 +116,8 @@ def test_costs_name_units_and_source_and_label_every_number_of_pokes():
     assert {"65", "390", "3900"} <= set(said(pages["adaptation.svg"]).split())
 
 
-def test_one_point_more_is_one_mark_more():
-    few, all_ = (learning_pages({"learning": rows}, "simulated")["training.svg"] for rows in (LEARNING[:3], LEARNING))
+def test_one_point_more_is_one_mark_more(costs):
+    few, all_ = learning_pages({"learning": LEARNING[:3]}, "simulated")["training.svg"], costs["training.svg"]
     ticks = {name: len(re.findall('id="[xy]tick_', text)) for name, text in (("few", few), ("all", all_))}
     # A mark stands in the panel and in the legend; a tick is one mark; every label is text and no mark.
     assert drawn(all_) - ticks["all"] - (drawn(few) - ticks["few"]) == 2
@@ -123,12 +126,10 @@ def test_one_point_more_is_one_mark_more():
 @pytest.mark.parametrize("draw", [sweep_pokes, sweep_sensors])
 def test_same_numbers_same_bytes_other_numbers_other_bytes(draw):
     rows = POKES if draw is sweep_pokes else SENSORS
-    other = [*rows[:-1], rows[-1] | row(70.0)]
-    assert draw(rows, "simulated") == draw(rows, "simulated")
-    assert draw(rows, "simulated") != draw(other, "simulated")
-    ET.fromstring(draw(rows, "simulated"))
+    figure, again, other = (draw(some, "simulated") for some in (rows, rows, [*rows[:-1], rows[-1] | row(70.0)]))
+    assert figure == again != other
+    ET.fromstring(figure)
 
 
-def test_pages_of_costs_are_the_same_bytes_for_the_same_numbers():
-    runtime = {"learning": LEARNING, "adaptation": ADAPTATION}
-    assert learning_pages(runtime, "simulated") == learning_pages(runtime, "simulated")
+def test_pages_of_costs_are_the_same_bytes_for_the_same_numbers(costs):
+    assert learning_pages({"learning": LEARNING, "adaptation": ADAPTATION}, "simulated") == costs

@@ -117,9 +117,10 @@ def test_what_a_stage_cost_stands_beside_its_last_run_and_what_that_reused():
 
 def test_same_rows_same_bytes_other_seconds_other_bytes():
     assert draw_sums() == draw_sums()
-    assert draw_stiff() == draw_stiff()
+    stiff = draw_stiff()
+    assert draw_stiff() == stiff
     slower = [Seconds(*one.key, median_s=one.median_s**2, repeats_n=5) for one in timed(STIFF)]
-    assert integrators(STIFF, slower) != draw_stiff()
+    assert integrators(STIFF, slower) != stiff
 
 
 @given(st.lists(st.tuples(st.floats(1e-6, 1), st.floats(1e-16, 1)), max_size=12))

@@ -8,7 +8,10 @@ from contextlib import contextmanager
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-LEFT_OUT = {".git", ".venv", ".reskin", "data", "reports", "mlflow.db", "mlartifacts", ".ci"}
+LEFT_OUT = {".git", ".venv", ".reskin", "data", "reports", "mlflow.db", "mlartifacts", ".ci"} | {
+    ".mypy_cache", ".ruff_cache", ".import_linter_cache", ".pytest_cache", ".hypothesis",
+}  # fmt: skip
+OF_TESTS = ("*.opt-jaxtyping*.pyc", "*-pytest-*.pyc")  # compiled for this process, which no stage reads
 ENVIRONMENT = {
     "OMP_NUM_THREADS": "1", "MLFLOW_DISABLE_TELEMETRY": "true", "DVC_NO_ANALYTICS": "1",
     "RESKIN_EXECUTOR": "here",  # a worker spends longer on its imports than on such trainings
@@ -25,7 +28,7 @@ def copy_checkout(folder: Path) -> Path:
         if path.name in LEFT_OUT or path.name.endswith(".egg-info"):
             continue
         if path.is_dir():
-            shutil.copytree(path, folder / path.name, ignore=shutil.ignore_patterns("cache", "tmp"))
+            shutil.copytree(path, folder / path.name, ignore=shutil.ignore_patterns("cache", "tmp", *OF_TESTS))
         else:
             shutil.copy(path, folder)
     (folder / "dvc.lock").unlink(missing_ok=True)

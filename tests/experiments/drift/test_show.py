@@ -137,6 +137,6 @@ def test_a_policy_has_its_colour_whichever_others_there_are():
 
 
 def test_same_numbers_same_bytes_other_points_other_bytes():
-    other = {"late": DRAWN["late"] | {"predicted_N": [0.1, 0.9, 2.1]}}
-    assert figures(numbers(), DRAWN, "simulated") == figures(numbers(), DRAWN, "simulated")
-    assert figures(numbers(), DRAWN, "simulated") != figures(numbers(), other, "simulated")
+    points = {"late": DRAWN["late"] | {"predicted_N": [0.1, 0.9, 2.1]}}
+    first, again, other = (figures(numbers(), drawn, "simulated") for drawn in (DRAWN, DRAWN, points))
+    assert first == again != other
