@@ -7,12 +7,12 @@ killed recorder leaves a `.part` that can still be added. Refuses to know ports 
 import sys
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.capture.header import HEADER_FILE, Clock, Header, Wire, recorded, render, seal
-from pipeline.capture.port import PortSettings, Recording, Report, record
+from pipeline.capture.port import PortSettings, Recording, Report, Watch, record
 from pipeline.core import io
 from pipeline.core.errors import CaptureError
 from pipeline.preparing import UNNAMED
@@ -33,11 +33,13 @@ class Told:
 UNTOLD = Told(UNNAMED, UNNAMED, "not stated")
 
 
-def record_capture(port: str, folder: Path, *, told: Told, settings: PortSettings, report: Report) -> Recording:
+def record_capture(
+    port: str, folder: Path, *, told: Told, settings: PortSettings, report: Report, watch: Watch
+) -> Recording:
     """Record what a port sends, as a native capture without labels."""
     part, header = begin_capture(folder, told, wire=settings.wire, chips_n=settings.chips_n, by="reskin record")
     try:
-        done = record(port, part, settings=settings, stop=threading.Event(), report=report)
+        done = record(port, part, settings=settings, stop=threading.Event(), report=report, watch=watch)
     except CaptureError:
         io.remove(part)  # no frame came: there is nothing to keep
         raise
@@ -78,8 +80,8 @@ def new_folder() -> Path:
     return CAPTURES / time.strftime("%Y%m%d-%H%M%S")
 
 
-def print_progress() -> Report:
-    """Make a report that writes rate, frames and losses to stderr once a second; nothing where that is no terminal."""
+def print_progress(alarms: Callable[[], Sequence[str]]) -> Report:
+    """Make a report that writes rate, losses and alarms to stderr once a second; nothing where that is no terminal."""
     start_s = last_s = time.monotonic()
     last_n = 0
 
@@ -91,6 +93,7 @@ def print_progress() -> Report:
         rate_hz = (frames_n - last_n) / (now_s - last_s)
         lost_n = sum(count for name, count in account.items() if name.startswith("skipped_"))
         line = f"{now_s - start_s:.0f} s: {rate_hz:.1f} frames/s, {frames_n} frames, {lost_n} bytes lost"
+        line = "; ".join([line, *alarms()])
         print(line, file=sys.stderr, flush=True)
         last_s, last_n = now_s, frames_n
 

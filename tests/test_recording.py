@@ -70,10 +70,11 @@ def test_a_terminal_is_told_rate_frames_and_losses_and_a_file_only_the_end(monke
     now_s = iter([0.0, 0.5, 1.0, 1.5, 3.0])
     monkeypatch.setattr(time, "monotonic", lambda: next(now_s))
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    report = print_progress()
+    report = print_progress(lambda: ["chip 1: stuck"])
     for frames_n in (200, 400, 600, 1200):
         report({"bytes_n": 1, "frames_n": frames_n, "skipped_resync_bytes_n": frames_n // 10})
     lines = ["1 s: 400.0 frames/s, 400 frames, 40 bytes lost", "3 s: 400.0 frames/s, 1200 frames, 120 bytes lost"]
+    lines = [f"{line}; chip 1: stuck" for line in lines]
     assert capsys.readouterr().err.splitlines() == lines
 
 

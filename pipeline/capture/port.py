@@ -24,7 +24,7 @@ from serial.tools import list_ports
 
 from pipeline.capture.header import ARRIVALS_FILE, STREAM_FILE, Wire
 from pipeline.capture.stream import FrameStream, no_frame
-from pipeline.capture.wire import TEXT_WIRES
+from pipeline.capture.wire import TEXT_WIRES, Frames
 from pipeline.core.errors import CaptureError
 
 READ_TIMEOUT_s = 0.1  # how late a stop, a silence or the end of the duration may be noticed
@@ -34,6 +34,7 @@ HEAD_BYTES_N = 16384  # the first bytes are kept to say what fits, should no fra
 
 Device = SerialBase  # an open port
 Report = Callable[[Mapping[str, int]], None]  # called with the account many times a second
+Watch = Callable[[Frames], object]  # called with frames as they come
 Ended = Literal["duration", "bytes", "stopped", "unplugged", "silent", "no frame", "not written"]
 
 
@@ -61,7 +62,13 @@ class Recording:
 
 
 def record(
-    port: str, folder: Path, *, settings: PortSettings, stop: threading.Event, report: Report = lambda account: None
+    port: str,
+    folder: Path,
+    *,
+    settings: PortSettings,
+    stop: threading.Event,
+    report: Report = lambda account: None,
+    watch: Watch = lambda frames: None,
 ) -> Recording:
     """Write what a port sends until `stop` is set, Ctrl-C, SIGTERM, unplugging, or the settings say so.
 
@@ -69,7 +76,7 @@ def record(
     frame ends the recording: what came is kept.
     """
     with open_port(port, settings.baud) as device, _stopping_on_signals(stop), Tape(folder, settings.wire) as tape:
-        recorder = _Recorder(port, settings, tape)
+        recorder = _Recorder(port, settings, tape, watch)
         ended = recorder.listen(device, stop, report)
     return recorder.finish(ended)
 
@@ -157,8 +164,8 @@ def _append(file: FileIO, data: bytes) -> None:
 class _Recorder:
     """Remembers what has come since the port was opened."""
 
-    def __init__(self, port: str, settings: PortSettings, tape: Tape) -> None:
-        self._port, self._settings, self._tape = port, settings, tape
+    def __init__(self, port: str, settings: PortSettings, tape: Tape, watch: Watch) -> None:
+        self._port, self._settings, self._tape, self._watch = port, settings, tape, watch
         self._frames = FrameStream(settings.wire, settings.chips_n)
         self._head = b""
         self._start_s = self._last_byte_s = time.monotonic()
@@ -215,7 +222,7 @@ class _Recorder:
         self._first_byte_s = min(self._first_byte_s, self._last_byte_s)
         self._head = (self._head + chunk)[:HEAD_BYTES_N]
         if written := self._tape.write(chunk, self._unix_s + self._last_byte_s):
-            self._frames.feed(written)
+            self._watch(self._frames.feed(written))
 
 
 def _found_ports() -> str:

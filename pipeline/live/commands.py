@@ -46,6 +46,7 @@ def record(
 ) -> None:
     """Record what a board sends; label it with the robot's log when adding it."""
     from pipeline.capture.port import PortSettings
+    from pipeline.live.health import Health
     from pipeline.recording import UNTOLD, Told, new_folder, print_progress, record_capture
 
     wire, chips_n = (wire or "binary"), (chips_n or 5)
@@ -58,8 +59,14 @@ def record(
     settings = PortSettings(baud, wire, chips_n, seconds, bytes_max_n=None, silence_s=5.0, no_frame_s=5.0)
     folder = out or new_folder()
     told = Told(board or UNTOLD.board, skin or UNTOLD.skin, scan or UNTOLD.scan)
-    done = record_capture(port, folder, told=told, settings=settings, report=print_progress())
+    health = Health(chips_n)
+    report = print_progress(lambda: [alarm.name for alarm in health.active(time.monotonic())])
+    done = record_capture(
+        port, folder, told=told, settings=settings, report=report,
+        watch=lambda frames: health.feed(frames, time.monotonic()),
+    )  # fmt: skip
     counts = ", ".join(f"{key} {count}" for key, count in done.account.items() if count)
+    counts += "".join(f"; {alarm.name} ({alarm.count_n})" for alarm in health.alarms.values())
     where = f"{folder}.part: no more could be written" if done.ended == "not written" else str(folder)
     typer.echo(f"recorded {where} ({done.ended} after {done.duration_s:.1f} s): {counts}")
 

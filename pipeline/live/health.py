@@ -65,7 +65,7 @@ class Health:
         failed = np.asarray(faults.failed_reads(frames.b_uT, frames.temperature_degC))
         zero = faults.zero_reads(frames.b_uT)
         warm = (frames.temperature_degC >= TEMPERATURE_MIN_degC) & (frames.temperature_degC <= TEMPERATURE_MAX_degC)
-        beyond = (np.abs(frames.b_uT) > B_MAX_uT).reshape(len(frames), -1, 3).any(axis=2)
+        beyond = (np.abs(frames.b_uT) > B_MAX_uT).reshape(len(frames), self._chips_n, 3).any(axis=2)
         self._note_chips("failed I2C reads", failed, now_s)
         self._note_chips("zeros in place of a reading", zero, now_s)
         self._note_chips("temperature out of range", np.asarray(~warm & ~failed), now_s)

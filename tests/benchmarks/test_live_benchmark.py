@@ -105,6 +105,7 @@ def test_from_the_last_byte_of_a_frame_to_the_screen(tmp_path):
         serve(name, [read_network(write_model(tmp_path))], in_browser(tmp_path, act))
 
 
+@pytest.mark.timeout(3600)
 def test_a_day_of_frames_takes_the_memory_of_ten_minutes():
     view, made_n = View(layout_of(5), 0.0), 400
     rng = np.random.Generator(np.random.PCG64(0))

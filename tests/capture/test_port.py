@@ -242,12 +242,16 @@ resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))  # as a disk that is
 
 
 def test_a_full_disk_ends_a_recording_that_can_be_read_up_to_there(board, tmp_path):
-    command = [sys.executable, "-c", FULL + LISTEN, board.name, str(tmp_path)]
+    command = [sys.executable, "-B", "-c", FULL + LISTEN, board.name, str(tmp_path)]  # -B: nor is compiled code cut
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
         wait_until((tmp_path / STREAM_FILE).exists)
         os.set_blocking(board.far, False)  # a recorder that ends reads no more
-        while process.poll() is None:
-            board.send(encode(FRAMES, "binary")[:820], pause_s=0.01)
+
+        def ended() -> bool:
+            board.send(encode(FRAMES, "binary")[:820])
+            return process.poll() is not None
+
+        wait_until(ended)
         output, _ = process.communicate(timeout=LONG_s)
     assert (process.returncode, output) == (0, "not written\n")
     written_n = (tmp_path / STREAM_FILE).stat().st_size

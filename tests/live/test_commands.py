@@ -2,19 +2,30 @@
 
 from pipeline.capture.header import HEADER_FILE, parse
 from pipeline.live import commands, ports
+from pipeline.live.inject import inject
+from pipeline.live.inject import parse as parse_fault
 from tests.live.boards import make_script, plugged_in
+
+UNTOLD = {"board": None, "skin": None, "wire": None, "chips_n": None, "baud": 115200, "scan": None}
 
 
 def test_a_recording_needs_no_option_when_one_board_is_there(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     with plugged_in(make_script(chips_n=4, wire="text-txyz"), loop=True) as name:
         monkeypatch.setattr(ports, "port_names", lambda: [name])
-        commands.record(None, None, None, None, None, None, 115200, 0.5)
+        commands.record(None, seconds=0.5, out=None, **UNTOLD)
     said = capsys.readouterr().out
     assert f"{name}: text-txyz, 4 chips" in said
     (folder,) = (tmp_path / "captures").iterdir()
     header = parse((folder / HEADER_FILE).read_text(), "header")
     assert (header.wire, header.chips_n, header.capture) == ("text-txyz", 4, folder.name)
+
+
+def test_a_recording_says_which_chip_was_broken(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    with plugged_in(inject(make_script(), parse_fault("failed-read@0+1")), loop=True) as name:
+        commands.record(port=name, seconds=1.5, out=tmp_path / "run1", **UNTOLD)
+    assert "; chip 1: failed I2C reads (" in capsys.readouterr().out
 
 
 def test_a_page_without_options_is_that_of_the_one_board(monkeypatch):
