@@ -6,7 +6,7 @@ called, so that the import costs little. Refuses to know stages and DVC.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -19,6 +19,7 @@ from pipeline.core.seeds import rng_for
 
 if TYPE_CHECKING:
     from pipeline.dataset.rows import Rows
+    from pipeline.live.skin import Skin as LiveSkin
     from pipeline.physics.board import Board
     from pipeline.physics.skin import Skin
     from pipeline.trials.networks import Network
@@ -157,6 +158,12 @@ class Model:
         answer = self._network((rows_uT - self._noload_uT).astype(np.float32))
         return answer if np.ndim(b_uT) == 2 else answer[0]
 
+    def export_onnx(self, file: Path | str) -> None:
+        """Write the network as an ONNX file: changes of field in uT in, x_mm, y_mm and F_N out; needs package onnx."""
+        from pipeline.trials import onnx_file
+
+        onnx_file.write(self._network, Path(file))
+
     def _rows(self, b_uT: ArrayLike) -> np.ndarray:
         rows_uT, channels_n = np.atleast_2d(np.asarray(b_uT, np.float32)), self.card["input"]["channels_n"]
         if rows_uT.ndim != 2 or rows_uT.shape[1] != channels_n:
@@ -187,6 +194,23 @@ def load_universal() -> Universal:
     from pipeline.twin import shipped
 
     return shipped.load_universal()
+
+
+def open(port: str, *, model: Path | str | Sequence[Path | str] = (), baud: int = 115200) -> LiveSkin:
+    """Open a board's port: its contacts while they happen. In the first second nothing may touch the skin.
+
+    >>> with open("/dev/ttyACM0", model="data/models/quick/train_multi/NAME.safetensors") as skin:  # doctest: +SKIP
+    ...     for contact in skin:  # the latest; skin.every() for each
+    ...         print(contact.t_s, contact.x_mm, contact.y_mm, contact.F_N, contact.alarms)
+
+    Format and chips are told from the bytes; `port` may also be `socket://host:port`. Without a model the map of
+    simulated skins answers (`load_universal`). Several models give means, and how far they are apart.
+    """
+    from pipeline.live.skin import Skin
+    from pipeline.predicting import read_network
+
+    files = [model] if isinstance(model, str | Path) else model
+    return Skin(port, [read_network(Path(file)) for file in files] or load_universal(), baud=baud)
 
 
 def _main_boards(scene: str) -> dict[str, Any]:

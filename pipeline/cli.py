@@ -3,7 +3,6 @@
 Imports within the commands: `reskin --help` waits for none of what a command needs.
 """
 
-import math
 import signal
 import sys
 from pathlib import Path
@@ -14,6 +13,7 @@ from typer import Argument, Option
 
 from pipeline.core import config
 from pipeline.core.errors import ParamsError, ReskinError
+from pipeline.live import commands
 
 if TYPE_CHECKING:
     from pipeline.params import Plan
@@ -26,6 +26,7 @@ app = typer.Typer(
 )
 scenes = typer.Typer(no_args_is_help=True, help="Choose which scenes `dvc repro` runs.")
 app.add_typer(scenes, name="scenes")
+app.add_typer(commands.app)
 
 MODEL = "A trained model (.safetensors), its card (.json) beside it; without one, the map of simulated skins."
 LOGS = (
@@ -73,6 +74,7 @@ def add(
     board: Board,
     skin: Annotated[str, Option(help="The skin's name; a skin belongs to one board.")],
     scene: Annotated[str, Option(help="The scene that it joins.")],
+    like: Annotated[str | None, Option(help="The scene that a new SCENE is a copy of.")] = None,
     name: Annotated[str | None, Option(help="The capture's name; made from the labels if not given.")] = None,
     probe: Annotated[Path | None, Option(help="capture, serial-*: the robot's log (CSV).")] = None,
     chips_n: Annotated[int, Option("--chips", help="serial-*: chips in a frame.", min=1, max=64)] = 5,
@@ -84,12 +86,12 @@ def add(
     allow_copy: Annotated[bool, Option("--allow-copy", help="Accept bytes that another label has.")] = False,
 ) -> None:
     """Add a recording to a scene; then `dvc repro` uses it."""
-    from pipeline import adding, preparing
+    from pipeline import adding, plan, preparing
     from pipeline.params import read_plan
 
     root, labels, marks = checkout(), preparing.Labels(board, skin, name), preparing.parse_marks(mark or [])
     running = read_plan(root / config.PLAN).scenes
-    with preparing.suggesting_layout(recording, layout):
+    with plan.copied(root, scene, like), preparing.suggesting_layout(recording, layout):
         if layout == "capture":
             prepared = preparing.native(recording, labels, probe, marks)
         elif layout == "serial-binary" or layout == "serial-text":
@@ -100,8 +102,7 @@ def add(
             options |= {"rows_late": str(rows_late)} if layout == "ini" and rows_late is not None else {}
             prepared = preparing.foreign(recording, layout, labels, options)
         header = adding.add(root, scene, prepared, allow_copy=allow_copy)
-    alone = f"only this scene: reskin scenes use {scene}"
-    typer.echo(f"added {scene}/{header.capture} (board {board}, skin {skin}); now: dvc repro ({alone})")
+    typer.echo(f"added {scene}/{header.capture} (board {board}, skin {skin}); now: dvc repro (or: report@{scene})")
     if scene not in running:
         typer.echo(f"switched scene {scene} on in {config.PLAN}, beside {', '.join(running) or 'no other'}")
 
@@ -143,28 +144,6 @@ def template(
         raise ParamsError(out, "the file", "new", "one that is there", "Choose another name.")
     io.write_text(out, ",".join(columns_of(chips_n)) + "\n")
     typer.echo(f"wrote {out}: {', '.join(NEEDED)} and fields in uT are needed. Then: reskin add --layout table")
-
-
-@app.command()
-def record(
-    port: Annotated[str, Option(help="The serial port, such as /dev/ttyACM0 or COM3.")],
-    board: Board,
-    skin: Annotated[str, Option(help="The skin's name.")],
-    out: Annotated[Path, Option(help="The capture's folder; must be new.")],
-    wire: Annotated[Wire, Option(help="What the firmware sends.")] = "binary",
-    chips_n: Chips = 5,
-    baud: Annotated[int, Option(help="Baud rate; USB ports ignore it.", min=1)] = 115200,
-    seconds: Annotated[float, Option(help="How long; without it, until Ctrl-C.", min=0.0)] = math.inf,
-    scan: Annotated[str, Option(help="The order of the rig's places: random, snake, or your words.")] = "not stated",
-) -> None:
-    """Record what a board sends; label it with the robot's log when adding it."""
-    from pipeline.capture.port import PortSettings
-    from pipeline.recording import Told, print_progress, record_capture
-
-    settings = PortSettings(baud, wire, chips_n, seconds, bytes_max_n=None, silence_s=5.0, no_frame_s=5.0)
-    done = record_capture(port, out, told=Told(board, skin, scan), settings=settings, report=print_progress())
-    counts = ", ".join(f"{key} {count}" for key, count in done.account.items() if count)
-    typer.echo(f"recorded {out} ({done.ended} after {done.duration_s:.1f} s): {counts}")
 
 
 @app.command()

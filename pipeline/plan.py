@@ -5,6 +5,7 @@ know what a stage does.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -160,9 +161,37 @@ def scene_file(root: Path, name: str) -> Path:
     """The file of a scene; raise if there is none."""
     known = scene_names(root)
     if name not in known:
-        remedy = f"Check the name, or write {SCENES}/{name}.yaml."
+        remedy = f"Check the name, or copy a scene: {SCENES}/{name}.yaml, or reskin add --like SCENE."
         raise ParamsError("scenes", "a scene", f"one of {', '.join(known)}", name, remedy)
     return root / SCENES / f"{name}.yaml"
+
+
+@contextmanager
+def copied(root: Path, name: str, like: str | None) -> Iterator[None]:
+    """Write scene `name` as a copy of scene `like`, and take it away again if the block fails; without `like`, nothing.
+
+    Comments go along, but for those above the first word, which tell of the other scene.
+    """
+    if like is None:
+        yield
+        return
+    original = scene_file(root, like)
+    target = original.with_name(f"{name}.yaml")
+    if target.exists():
+        remedy = "Leave out --like to add to it."
+        raise ParamsError(f"--like {like}", "the new scene", "a free name", f"{name}, which is there", remedy)
+    if not name.replace("-", "").replace("_", "").isalnum():
+        raise ParamsError("--scene", "a name", "letters, digits, - and _", name, "Choose another.")
+    words = original.read_text(encoding="utf-8").splitlines(keepends=True)
+    told = next(i for i, line in enumerate(words) if not line.startswith("#"))
+    io.write_text(
+        target, "".join([f"# Scene {name}: a copy of scene {like}, by `reskin add --like`.\n", *words[told:]])
+    )
+    try:
+        yield
+    except BaseException:
+        io.remove(target)
+        raise
 
 
 def use(root: Path, names: Sequence[str]) -> None:

@@ -21,6 +21,7 @@ from pipeline.core.errors import CaptureError, ReskinError
 from pipeline.dataset.captures import read_header
 
 NATIVE_FILES = (headers.STREAM_FILE, headers.ARRIVALS_FILE, headers.PROBE_FILE)
+UNNAMED = "unnamed"  # the board and skin of a recording that was made without their names
 
 Foreign = Literal["table", "lab", "ini", "eflesh"]
 Marks = tuple[tuple[float, float], ...]
@@ -125,7 +126,7 @@ def native(recording: Path, labels: Labels, probe: Path | None, marks: Marks) ->
     _need(recording, folder=True)
     found = read_header(recording)
     for what, said, written in (("board", labels.board, found.board), ("skin", labels.skin, found.skin)):
-        if said != written:
+        if written not in (said, UNNAMED):
             rule = f"{written!r}, as its header says"
             raise CaptureError(recording, f"--{what}", rule, repr(said), "Which is right?")
     # A recorder that was killed has not hashed its files into the header; they are there all the same.
@@ -141,7 +142,8 @@ def native(recording: Path, labels: Labels, probe: Path | None, marks: Marks) ->
             raise CaptureError(file, "the file", "unchanged since it was recorded", "another hash", "Record it again.")
     _check_names(labels)
     clock = found.clock.model_copy(update={"marks": (*found.clock.marks, *marks)})
-    return found.model_copy(update={"capture": labels.name or found.capture, "clock": clock}), files
+    named = {"capture": labels.name or found.capture, "board": labels.board, "skin": labels.skin}
+    return found.model_copy(update=named | {"clock": clock}), files
 
 
 def _check_names(labels: Labels) -> None:

@@ -11,12 +11,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.capture.header import HEADER_FILE, Clock, recorded, render, seal
+from pipeline.capture.header import HEADER_FILE, Clock, Header, Wire, recorded, render, seal
 from pipeline.capture.port import PortSettings, Recording, Report, record
 from pipeline.core import io
 from pipeline.core.errors import CaptureError
+from pipeline.preparing import UNNAMED
 
 PROGRESS_s = 1.0
+CAPTURES = Path("captures")
 
 
 @dataclass(frozen=True)
@@ -28,28 +30,52 @@ class Told:
     scan: str
 
 
+UNTOLD = Told(UNNAMED, UNNAMED, "not stated")
+
+
 def record_capture(port: str, folder: Path, *, told: Told, settings: PortSettings, report: Report) -> Recording:
     """Record what a port sends, as a native capture without labels."""
-    part = folder.with_name(f"{folder.name}.part")
-    for path in (folder, part):
-        if path.exists():
-            raise CaptureError(path, "the capture's folder", "new", "one that is there", "Choose another --out.")
-    header = recorded(
-        f"--out {folder.name}", capture=folder.name, board=told.board, skin=told.skin, layout="native",
-        wire=settings.wire, chips_n=settings.chips_n, options={"scan": told.scan},
-        clock=Clock(kind="arrivals", rate_hz=None, marks=()), protocol="as the probe log says",
-        note="recorded by reskin record; arrival times are unix seconds of the host",
-    )  # fmt: skip
-    part.mkdir(parents=True)
-    io.write_text(part / HEADER_FILE, render(header))
+    part, header = begin_capture(folder, told, wire=settings.wire, chips_n=settings.chips_n, by="reskin record")
     try:
         done = record(port, part, settings=settings, stop=threading.Event(), report=report)
     except CaptureError:
         io.remove(part)  # no frame came: there is nothing to keep
         raise
-    seal(part, header)
-    part.rename(folder)
+    if done.ended != "not written":  # else there is no room for hashes either; the part can be added as it is
+        end_capture(folder, header)
     return done
+
+
+def begin_capture(folder: Path, told: Told, *, wire: Wire, chips_n: int, by: str) -> tuple[Path, Header]:
+    """Make the folder that a stream is written into, with its header; it becomes `folder` at the end."""
+    part = _part_of(folder)
+    for path in (folder, part):
+        if path.exists():
+            raise CaptureError(path, "the capture's folder", "new", "one that is there", "Choose another --out.")
+    header = recorded(
+        f"--out {folder.name}", capture=folder.name, board=told.board, skin=told.skin, layout="native",
+        wire=wire, chips_n=chips_n, options={"scan": told.scan},
+        clock=Clock(kind="arrivals", rate_hz=None, marks=()), protocol="as the probe log says",
+        note=f"recorded by {by}; arrival times are unix seconds of the host",
+    )  # fmt: skip
+    part.mkdir(parents=True)
+    io.write_text(part / HEADER_FILE, render(header))
+    return part, header
+
+
+def end_capture(folder: Path, header: Header) -> None:
+    """Seal what was written, and give it its name."""
+    seal(_part_of(folder), header)
+    _part_of(folder).rename(folder)
+
+
+def _part_of(folder: Path) -> Path:
+    return folder.with_name(f"{folder.name}.part")
+
+
+def new_folder() -> Path:
+    """Name a capture's folder after the time."""
+    return CAPTURES / time.strftime("%Y%m%d-%H%M%S")
 
 
 def print_progress() -> Report:

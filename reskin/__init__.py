@@ -1,5 +1,25 @@
 """The Python interface of the pipeline, for notebooks and controllers: `import reskin`, and see `help(reskin)`."""
 
-from pipeline.api import Model, Pokes, draw_board, draw_skin, load_model, load_rows, load_universal, simulate_pokes
+from pipeline.api import (
+    Model,
+    Pokes,
+    draw_board,
+    draw_skin,
+    load_model,
+    load_rows,
+    load_universal,
+    open,
+    simulate_pokes,
+)
 
-__all__ = ["Model", "Pokes", "draw_board", "draw_skin", "load_model", "load_rows", "load_universal", "simulate_pokes"]
+__all__ = [
+    "Model",
+    "Pokes",
+    "draw_board",
+    "draw_skin",
+    "load_model",
+    "load_rows",
+    "load_universal",
+    "open",
+    "simulate_pokes",
+]

@@ -330,6 +330,21 @@ def test_the_command_line_says_that_a_scene_was_switched_on(root, lab_file):
     assert "switched" not in again
 
 
+def test_a_scene_that_is_new_is_a_copy_of_one_and_goes_again_if_nothing_joins_it(root, lab_file):
+    known = contents(root)
+    words = ["add", str(lab_file), "--layout", "lab", "--board", "b", "--skin", "s", "--scene", "mine", "--like"]
+    assert "a scene must be one of" in run(root, "reskin", *words, "nowhere", check=False).stderr
+    assert "the truths must be" in run(root, "reskin", *words[:3], "ini", *words[4:], "ini", check=False).stderr
+    assert contents(root) == known
+    run(root, "reskin", *words, "small")
+    text = (root / config.SCENES / "mine.yaml").read_text()
+    assert YAML(typ="safe").load(text) == recorded()
+    assert read_registry(root).captures.keys() == {"mine"}
+    again = run(root, "reskin", *words, "small", "--name", "again", check=False).stderr
+    assert "the new scene must be a free name; got mine, which is there" in again
+    assert (root / config.SCENES / "mine.yaml").read_text() == text
+
+
 @pytest.mark.parametrize(
     "words",
     ["remove s c", "publish", "compare s", "readme", "scenes list", "scenes use s", "scenes tidy", "scenes check"],

@@ -41,6 +41,14 @@ def failed_reads(
     return same_b.all(axis=2) & (same_temperature | np.isnan(temperature_degC))
 
 
+def zero_reads(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
+    """Mark the readings of a chip whose three fields are exactly 0: what stands in memory that no reading was put into.
+
+    Rows of eFlashTeam7 have it on all chips. Not even the earth leaves a chip at 0 in three directions at once.
+    """
+    return np.asarray((_by_chip(b_uT) == 0).all(axis=2))
+
+
 def find_lsb(
     b_uT: Float[np.ndarray, "f ch"], *, step_min_uT: float = STEP_MIN_uT, steps_min_n: int = STEPS_MIN_N
 ) -> Float[np.ndarray, "k 2"]:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.core import io
-from pipeline.core.numerics import in_force
+from pipeline.core.numerics import signature
 
 LIBRARIES = ("numpy", "scipy", "numba")
 
@@ -48,7 +48,7 @@ def _folder(package: Path) -> Path:
 @cache
 def _state(package: Path) -> str:
     found = hashlib.sha256(repr([(name, version(name)) for name in LIBRARIES]).encode())
-    found.update(repr(in_force()).encode())
+    found.update(repr(signature()).encode())
     for source in sorted(package.glob("*.py")):
         found.update(source.read_bytes())
     return found.hexdigest()[:16]

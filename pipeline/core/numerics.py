@@ -40,11 +40,6 @@ def pin() -> None:
         os.environ[name] = value
 
 
-def in_force() -> list[tuple[str, str | None]]:
-    """Give what the variables hold in this process."""
-    return [(name, os.environ.get(name)) for name in VARIABLES]
-
-
 def pinned(flags: frozenset[str], environment: Mapping[str, str]) -> dict[str, str]:
     """Choose values for the variables that `environment` lacks.
 

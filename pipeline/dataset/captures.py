@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
-from pipeline.capture import arrivals, faults, probe, wire
+from pipeline.capture import arrivals, probe, wire
 from pipeline.capture.arrivals import Arrivals
 from pipeline.capture.header import (
     ARRIVALS_FILE,
@@ -25,7 +25,7 @@ from pipeline.capture.header import (
 )
 from pipeline.capture.probe import ProbeLog
 from pipeline.capture.readers import READERS
-from pipeline.capture.readers.chips import Watch
+from pipeline.capture.readers.chips import Watch, missing_reads
 from pipeline.capture.readers.units import check_log
 from pipeline.capture.stream import FrameStream, no_frame
 from pipeline.capture.wire import Frames
@@ -141,7 +141,7 @@ def _timed_frames(folder: Path, header: Header, times_of: Timer, account: dict[s
 
 
 def _timed(frames: Frames, t_s: Float64[np.ndarray, " f"], watch: Watch) -> TimedFrames:
-    failed = np.asarray(faults.failed_reads(frames.b_uT, frames.temperature_degC).any(axis=1))
+    failed = missing_reads(frames.b_uT, frames.temperature_degC)
     return TimedFrames(frames, t_s, failed, watch.stuck(frames, failed))
 
 

@@ -11,12 +11,13 @@ from jaxtyping import Bool, Float
 
 from pipeline.capture.faults import find_lsb
 from pipeline.core.schema import AXES_PER_CHIP_N, Readings
-from pipeline.dataset.baseline import subtract
+from pipeline.dataset.baseline import rank, subtract
 from pipeline.evaluation.scores import summarise
 
 FORCES_N = (0.5, 1.0, 2.0, 3.0)  # at which changes of field are compared
 NEAR = 0.2  # of the force
 ENOUGH_N = 20  # readings, or a number is not given
+LAGS_N = (1, 10, 100, 1000)  # contacts from one no-load reading to another
 STEP_READINGS_N = 2000  # show the chips' steps
 PRESSED_N = 0.5  # below, a weak chip shows its noise
 
@@ -28,6 +29,7 @@ def describe(readings: Readings) -> dict[str, float]:
     change_uT = subtract(readings.b_uT, readings.noload_uT).astype(np.float64)
     return {
         **_rest(readings.noload_uT),
+        **_wander(readings),
         **_noise(readings, touched),
         **_steps(readings),
         **_rate(readings),
@@ -53,6 +55,20 @@ def _rest(noload_uT: Float[np.ndarray, "f ch"]) -> dict[str, float]:
     return {
         "field_at_rest_chip_median_uT": float(np.median(np.linalg.norm(b_uT, axis=1))),
         "field_at_rest_channel_max_uT": float(b_uT.max()),
+    }
+
+
+def _wander(readings: Readings) -> dict[str, float]:
+    """Give by how much the field at rest differs between contacts so far apart, rms over channels and pairs.
+
+    A random walk grows as the root; what a contact leaves behind stands from the first on, and repeats with the scan.
+    """
+    _, first_i = np.unique(rank(readings.indentation), return_index=True)
+    rest_uT = readings.noload_uT[first_i].astype(np.float64)
+    lags = [lag_n for lag_n in LAGS_N if len(rest_uT) >= 2 * lag_n + ENOUGH_N]
+    return {
+        f"rest_changes_in_{lag_n}_uT": float(np.sqrt(((rest_uT[lag_n:] - rest_uT[:-lag_n]) ** 2).mean()))
+        for lag_n in lags
     }
 
 

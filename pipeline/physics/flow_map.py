@@ -131,7 +131,8 @@ def at_depth(flow: FlowMap, depth_m: float) -> Float[np.ndarray, "l i 3"]:
         return flow.moved[0]
     first = max(int(np.searchsorted(flow.depth_m, depth_m)) + 1, STENCIL_N) - STENCIL_N
     near = slice(first, first + STENCIL_N)
-    return np.tensordot(_lagrange(np.sqrt(flow.depth_m[near]), np.sqrt(depth_m)), flow.moved[near], 1)
+    share = _lagrange(np.sqrt(flow.depth_m[near]), np.sqrt(depth_m))
+    return np.dot(share[None], flow.moved[near].reshape(STENCIL_N, -1)).reshape(flow.moved.shape[1:])
 
 
 def _grown_m2(flow: FlowMap, here: Float[np.ndarray, "l i 3"]) -> float:
@@ -194,8 +195,12 @@ def _size(table_i: int) -> float:
 
 
 def _lagrange(nodes: Float[np.ndarray, " p"], at: float) -> Float[np.ndarray, " p"]:
-    others = [np.delete(nodes, j) for j in range(len(nodes))]
-    return np.array([np.prod((at - rest) / (node - rest)) for node, rest in zip(nodes, others, strict=True)])
+    known, share = nodes.tolist(), np.ones(len(nodes))
+    for j, node in enumerate(known):
+        for i, other in enumerate(known):
+            if i != j:
+                share[j] *= (at - other) / (node - other)
+    return share
 
 
 @njit(cache=True, error_model="numpy")

@@ -139,8 +139,9 @@ def moved_dipoles(skin: Skin, pokes_m: Float[np.ndarray, "n 3"]) -> Iterator[tup
     slides = None if skin.hold is None else press_slides(skin, skin.hold, true_m[contacts])
     for i, poke_i in enumerate(contacts):
         moved = flow_map.move(table, rest, true_m[poke_i])
-        after = moved.after if slides is None else slide.apply(slides, i, moved.after, skin.seat_m)
-        yield int(poke_i), moved.before, after
+        if slides is not None:
+            slide.apply_in_place(slides, i, moved.after, skin.seat_m)
+        yield int(poke_i), moved.before, moved.after
 
 
 def press_slides(skin: Skin, hold: slide.Hold, true_m: Float[np.ndarray, "n 3"]) -> slide.Slide:

@@ -21,7 +21,7 @@ from pipeline.core.errors import ParamsError
 STIFFENING = 1.5  # exponent of the thinning layer: chosen with both boards in view
 DEEPEST = 0.72  # of the thickness: a larger force counts as the one that goes so deep
 MIDDLE_M = np.zeros(2)
-CURVE_N = 2000  # depths at which the force is inverted, linear between; off by less than 1e-6 of the thickness
+CURVE_N = 2000  # depths at which the force is inverted, linear in its root between; off by less than 1e-6 thicknesses
 
 
 class HoldDesign(Strict):
@@ -106,23 +106,35 @@ def apply(
     middle_m: Float[np.ndarray, "2"] = MIDDLE_M,
 ) -> tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]:
     """Turn positions about the skin's middle and moments, and move the positions; without a slide nothing changes."""
-    positions_m, moments_A_m2 = (np.ascontiguousarray(part.T) for part in dipoles)
+    positions_m, moments_A_m2 = (part.T.copy() for part in dipoles)
+    apply_in_place(slide, poke_i, (positions_m.T, moments_A_m2.T), middle_m)
+    return positions_m.T, moments_A_m2.T
+
+
+def apply_in_place(
+    slide: Slide,
+    poke_i: int,
+    dipoles: tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]],
+    middle_m: Float[np.ndarray, "2"] = MIDDLE_M,
+) -> None:
+    """Do as `apply` does to the arrays themselves, which nobody else may need: a poke moves thousands of dipoles."""
+    positions_m, moments_A_m2 = dipoles
     cos, sin = float(np.cos(slide.spin_rad[poke_i])), float(np.sin(slide.spin_rad[poke_i]))
     (x_m, y_m), (middle_x_m, middle_y_m) = slide.move_m[poke_i], middle_m
     # R (X - middle) + middle + move
     move_m = x_m + (1 - cos) * middle_x_m + sin * middle_y_m, y_m + (1 - cos) * middle_y_m - sin * middle_x_m
-    return _turn(positions_m, (cos, sin), move_m).T, _turn(moments_A_m2, (cos, sin), (0.0, 0.0)).T
+    _turn(positions_m.T, (cos, sin), move_m)
+    _turn(moments_A_m2.T, (cos, sin), (0.0, 0.0))
 
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _turn(rows, turn, move):
-    (cos, sin), out = turn, np.empty_like(rows)
+    cos, sin = turn
     for i in range(rows.shape[1]):
-        out[0, i] = cos * rows[0, i] - sin * rows[1, i] + move[0]
-        out[1, i] = sin * rows[0, i] + cos * rows[1, i] + move[1]
-        out[2, i] = rows[2, i]
-    return out
+        x, y = rows[0, i], rows[1, i]
+        rows[0, i] = cos * x - sin * y + move[0]
+        rows[1, i] = sin * x + cos * y + move[1]
 
 
 def force_at(depth_m: Float[np.ndarray, " n"], *, stiffness_N_m2: float, thickness_m: float) -> Float[np.ndarray, " n"]:
@@ -145,7 +157,8 @@ def depth_at(force_N: Float[np.ndarray, " n"], *, stiffness_N_m2: float, thickne
         raise ParamsError("layer", "stiffness", "above 0 N/m^2", f"{stiffness_N_m2}", "Check its unit.")
     curve_m = np.linspace(0, DEEPEST * thickness_m, CURVE_N)
     known_N = force_at(curve_m, stiffness_N_m2=stiffness_N_m2, thickness_m=thickness_m)
-    return np.interp(force_N, known_N, curve_m)
+    root = np.sqrt(np.maximum(force_N, 0.0))  # the force starts as a square of the depth; a tip that pulls has none
+    return np.interp(root, np.sqrt(known_N), curve_m)
 
 
 def _rho2_m2(sides_m: tuple[float, float]) -> float:

@@ -21,6 +21,7 @@ APART = 0.17  # of a row: ours above, the paper's below
 SHORT_TABLE = ("accuracy_pct", "mse_xy_mm2")
 WITHIN = "Readings placed within 1 mm on boards"
 BRACKETS = "In brackets: 95 % interval over boards"
+UNIVERSAL = "universal, "  # so begins what is told which skin it is on: the map with networks
 ANSWERING = ("multi", "adapted", "single")  # rows of table 2, the one that matters most first
 
 
@@ -34,15 +35,7 @@ def headline_figures(numbers: Mapping[str, Any], source: str) -> dict[str, str]:
 def answer(numbers: Mapping[str, Any]) -> str:
     """Say in one sentence how a model does on boards never seen, with intervals; nothing where none was held out."""
     if numbers.get("labels"):
-        first = numbers["labels"][0]
-        alike = [row for row in numbers["labels"] if all(row[name] == first[name] for name in ("method", "inputs"))]
-        of_method = {row["labels_n"]: row for row in alike}
-        said = [
-            f"{show(of_method[labels_n]['as_labelled']['accuracy_pct'])} % with {labels_n} labels of the new board"
-            for labels_n in sorted({min(of_method), max(of_method)})
-        ]
-        boards_n = first["as_labelled"]["accuracy_pct"]["n"]
-        return f"{WITHIN} never seen: {first['method']} {_with_brackets(', '.join(said), f' (n = {boards_n})')}"
+        return _answer_with_labels(numbers["labels"])
     rows = numbers.get("table2", {})
     known = models(numbers)
     said = [
@@ -52,6 +45,22 @@ def answer(numbers: Mapping[str, Any]) -> str:
         if name in rows
     ]
     return f"{WITHIN} and skins never seen: {_with_brackets('; '.join(said))}" if said else ""
+
+
+def _answer_with_labels(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Say how the models that are told which skin they are on do, then the first method, as the usual way."""
+    methods = list(dict.fromkeys((row["method"], row["inputs"]) for row in rows))
+    told = [method for method in methods if method[0].startswith(UNIVERSAL)]
+    counts = sorted({row["labels_n"] for row in rows})
+    counts_n = [counts[0], counts[-1]] if len(counts) > 1 else counts
+    said = []
+    for method in [*told, methods[0]]:
+        of_method = {row["labels_n"]: row for row in rows if (row["method"], row["inputs"]) == method}
+        scores = [show(of_method[n]["as_labelled"]["accuracy_pct"]) for n in counts_n if n in of_method]
+        said.append(f"{method[0]} {' and '.join(scores)} %")
+    boards_n = rows[0]["as_labelled"]["accuracy_pct"]["n"]
+    labels = f"with {' and '.join(map(str, counts_n))} labels of the new board"
+    return f"{WITHIN} never seen, {labels}: {_with_brackets('; '.join(said), f' (n = {boards_n})')}"
 
 
 def _with_brackets(said: str, boards: str = "") -> str:

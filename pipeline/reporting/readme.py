@@ -7,7 +7,7 @@ from typing import Any
 
 from pipeline.core.code import ROOT
 from pipeline.core.errors import SchemaError
-from pipeline.reporting.headline import short_table
+from pipeline.reporting.headline import answer, short_table
 from pipeline.reporting.shown import to_markdown
 from pipeline.reporting.skins import skins_table
 from pipeline.reporting.tables import make_tables
@@ -49,6 +49,7 @@ def blocks_of(
     }
     return {
         "headline": _headline(results[-1]),
+        "recorded": "\n\n".join(_recorded(numbers) for numbers in recorded if "labels" in numbers) or "None yet.",
         "results": "\n\n".join(_results(numbers, ("table2", "order", "single_sensor")) for numbers in results),
         "time": _time(timed),
         "costs": _costs([numbers for numbers in (*results, *recorded) if "trainings" in numbers]),
@@ -80,6 +81,11 @@ def _headline(numbers: Numbers) -> str:
     provenance = numbers["provenance"]
     heading = f"Scene `{provenance['scene']}`, **{provenance['source']}**, code {provenance['trained']}:"
     return f"{heading}\n\n{to_markdown(short_table(numbers))}"
+
+
+def _recorded(numbers: Numbers) -> str:
+    provenance = numbers["provenance"]
+    return f"Scene `{provenance['scene']}`, **{provenance['source']}**, code {provenance['trained']}. {answer(numbers)}"
 
 
 def _time(timed: Numbers | None) -> str:

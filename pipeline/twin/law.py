@@ -155,7 +155,8 @@ def _changes_T(
     changes_T = np.empty((len(places_m), *chips_m.shape))
     for poke_i, (place_m, depth_m) in enumerate(zip(places_m, depths_m, strict=True)):
         moved = flow_map.move(table, rest, np.append(place_m, depth_m))
-        changes_T[poke_i] = change_of_field(moved.before, slide.apply(slides, poke_i, moved.after), chips_m)
+        slide.apply_in_place(slides, poke_i, moved.after)
+        changes_T[poke_i] = change_of_field(moved.before, moved.after, chips_m)
     return changes_T
 
 

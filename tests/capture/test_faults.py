@@ -1,6 +1,7 @@
 """Broken chips are told from working ones, in made and in real recordings."""
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -47,6 +48,27 @@ class TestFailedReads:
 
     def test_a_real_recording_of_a_working_board_has_none(self, shared_data):
         assert not faults.failed_reads(*load_ini(shared_data, "b20_artillery_AFG_board2_50_screw.txt")).any()
+
+
+class TestZeroReads:
+    def test_three_zeros_are_no_reading_and_two_may_be_one(self):
+        b_uT = np.array([[0.0, 0.0, 0.0, 0.0, 5.0, 0.0], [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]])
+        assert faults.zero_reads(b_uT).tolist() == [[True, False], [False, True]]
+
+    @pytest.mark.parametrize(
+        ("name", "zeros_n"), [("position_1_20251028_003401", 18), ("multi_touch_1_2_20251109_230349", 61)]
+    )
+    def test_the_rows_of_zeros_of_a_real_recording_are_all_found(self, shared_data, name, zeros_n):
+        table = np.genfromtxt(shared_data / f"eflash7/{name}.csv", delimiter=",", skip_header=1)
+        zeros = faults.zero_reads(table[:, -15:])
+        assert zeros.all(axis=1).sum() == zeros.any(axis=1).sum() == zeros_n
+
+    def test_real_recordings_of_working_boards_have_none(self, shared_data):
+        assert not faults.zero_reads(load_ini(shared_data, "b20_artillery_AFG_board2_50_screw.txt")[0]).any()
+        for file in (shared_data / "lab").glob("*.csv"):
+            table = np.genfromtxt(file, delimiter=",", names=True)
+            b_uT = np.stack([table[f"B{axis}{chip}"] for chip in range(5) for axis in "xyz"], axis=1)
+            assert not faults.zero_reads(b_uT).any()
 
 
 class TestScale:

@@ -3,6 +3,7 @@
 import math
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -216,6 +217,44 @@ def test_the_partial_line_at_the_start_of_text_is_counted_and_not_written(board,
     assert (tmp_path / STREAM_FILE).read_bytes() == data[first_n:2000]
 
 
+def test_a_socket_is_recorded_as_a_port_is(tmp_path):
+    data = encode(FRAMES, "binary")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def send() -> None:
+            with server.accept()[0] as end:
+                time.sleep(0.3)  # what came before is thrown away when a port is opened
+                end.sendall(data)
+
+        sender = threading.Thread(target=send)
+        sender.start()
+        name = f"socket://127.0.0.1:{server.getsockname()[1]}"
+        recording = port.record(name, tmp_path, settings=SETTINGS, stop=threading.Event())
+        sender.join()
+    assert recording.ended == "unplugged"
+    check_files(tmp_path, recording, data)
+
+
+FULL = """
+import resource
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))  # as a disk that is full
+"""
+
+
+def test_a_full_disk_ends_a_recording_that_can_be_read_up_to_there(board, tmp_path):
+    command = [sys.executable, "-c", FULL + LISTEN, board.name, str(tmp_path)]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+        wait_until((tmp_path / STREAM_FILE).exists)
+        os.set_blocking(board.far, False)  # a recorder that ends reads no more
+        while process.poll() is None:
+            board.send(encode(FRAMES, "binary")[:820], pause_s=0.01)
+        output, _ = process.communicate(timeout=LONG_s)
+    assert (process.returncode, output) == (0, "not written\n")
+    written_n = (tmp_path / STREAM_FILE).stat().st_size
+    assert 10_000 < written_n <= 20_000
+    assert arrivals.parse(tmp_path / ARRIVALS_FILE, "arrivals.csv").byte_end[-1] == written_n
+
+
 class TestErrors:
     def test_an_absent_port_is_named(self, tmp_path):
         with pytest.raises(CaptureError, match="/dev/tty-none: the port must be one that opens; .*orts?.*found"):
@@ -238,6 +277,7 @@ class TestErrors:
 
     def test_bytes_without_a_frame_mean_a_wrong_baud_rate(self, board, tmp_path):
         rubbish = bytes(range(128)) * 4
+        os.set_blocking(board.far, False)  # nobody listens while the error is made
 
         def act(stop: threading.Event) -> None:
             while not stop.wait(0.05) and board.far >= 0:

@@ -47,6 +47,20 @@ def test_fields_noise_steps_and_forces_are_those_it_was_made_of():
     assert found["rate_hz"] == pytest.approx(400.0)
 
 
+def test_a_field_at_rest_that_walks_changes_by_the_root_of_the_contacts_and_a_short_one_is_not_asked():
+    still = made()
+    steps_uT = 0.5 * rng_for(0, "walk").standard_normal((INDENTATIONS_N, 6))
+    walked = replace(
+        still, noload_uT=REST_uT + np.repeat(np.cumsum(steps_uT, axis=0), READINGS_N, axis=0).astype(np.float32)
+    )
+    found = describe(walked)
+    assert found["rest_changes_in_1_uT"] == pytest.approx(0.5, rel=0.05)
+    assert found["rest_changes_in_10_uT"] == pytest.approx(0.5 * np.sqrt(10), rel=0.1)
+    assert found["rest_changes_in_100_uT"] == pytest.approx(0.5 * 10, rel=0.35)  # four stretches of six channels
+    assert "rest_changes_in_1000_uT" not in found
+    assert describe(still)["rest_changes_in_100_uT"] == 0
+
+
 def test_a_recording_without_a_clock_has_no_rate():
     assert "rate_hz" not in describe(replace(made(), t_s=np.full(INDENTATIONS_N * READINGS_N, np.nan)))
 

@@ -1,5 +1,6 @@
 """Stiff, extreme and broken cases end as they should, and a product that lets one through is found out."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,10 @@ from pipeline.experiments.stability.cases import measured, peak_bytes, refused
 from pipeline.experiments.stability.chip import chip_cases
 from pipeline.experiments.stability.physics import physics_cases, time_cases
 from pipeline.experiments.stability.run import survey
+from pipeline.experiments.stability.sliding import sliding_cases
 from pipeline.experiments.stability.wire import wire_cases
-from pipeline.physics import force_sensor, layer, sensor, viscoelastic
+from pipeline.physics import force_sensor, layer, sensor, slide, viscoelastic
+from pipeline.synthesis import contact
 from pipeline.synthesis.settings import Synthesis
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -49,6 +52,38 @@ def test_every_row_is_its_own_and_says_what_happened(cases):
 def test_the_same_seed_gives_the_same_words():
     assert chip_cases(DESIGN.chip, 5, SEED) == chip_cases(DESIGN.chip, 5, SEED)
     assert time_cases() == time_cases()
+
+
+def sliding():
+    return sliding_cases(BOARD, DESIGN.spreads, skin=DESIGN.skin, seed=SEED)
+
+
+def test_a_base_that_gives_nothing_away_is_found_out(monkeypatch):
+    monkeypatch.setattr(contact, "_in_series", lambda layer_N_per_m, _: layer_N_per_m[:, None, None] * np.eye(2))
+    assert broken(sliding()) == {
+        "a drag with friction 10 on a skin that slides",
+        "a tip that pulls the skin and is lifted there",
+    }
+
+
+def test_a_slide_that_forgets_to_turn_and_a_depth_between_straight_lines_are_found_out(monkeypatch):
+    def straight(force_N, *, stiffness_N_m2, thickness_m):
+        curve_m = np.linspace(0, slide.DEEPEST * thickness_m, 2000)
+        return np.interp(
+            force_N, slide.force_at(curve_m, stiffness_N_m2=stiffness_N_m2, thickness_m=thickness_m), curve_m
+        )
+
+    rigid = slide.rigid
+    monkeypatch.setattr(slide, "rigid", lambda *of: replace(rigid(*of), spin_rad=np.zeros(len(of[0]))))
+    monkeypatch.setattr(slide, "depth_at", straight)
+    assert broken(sliding()) == {
+        "the slide of a skin that is poked at its free edge",
+        "pressed to 0.72 of the thickness by force, and let go",
+    }
+
+
+def test_a_skin_that_no_springs_hold_has_no_such_case():
+    assert sliding_cases(BOARD, DESIGN.spreads, skin=DESIGN.skin.model_copy(update={"hold": None}), seed=SEED) == []
 
 
 @pytest.mark.parametrize(("chips_n", "gain_sel"), [(1, 7), (8, 0)])

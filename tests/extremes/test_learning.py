@@ -9,7 +9,7 @@ import torch
 from pipeline.dataset import splits
 from pipeline.experiments.stability import learning
 from pipeline.experiments.stability.learning import fold_cases, learning_cases, loop_cases, scaling_cases, triplet_cases
-from pipeline.learning import feed, inputs, model, train, triplets
+from pipeline.learning import feed, inputs, model, train, trial, triplets
 
 SEED = 2021
 DIVERGES = "bottleneck scaled 1e3, learning rate 10"
@@ -80,6 +80,11 @@ def test_a_loop_that_never_looks_at_its_loss_is_found_out(monkeypatch):
     monkeypatch.setattr(train.Watch, "look", blind)
     stops = {"bottleneck scaled 1e3, learning rate 1e+10", "a network that overflows beside one that does not"}
     assert broken(loop_cases(SEED)) - {DIVERGES} == stops
+
+
+def test_a_network_that_died_and_is_taken_as_sound_is_found_out(monkeypatch):
+    monkeypatch.setattr(trial, "COLLAPSED", -np.inf)
+    assert broken(loop_cases(SEED)) == {"a network that died, with a finite loss"}
 
 
 def test_a_network_that_touches_its_neighbour_is_found_out(monkeypatch):

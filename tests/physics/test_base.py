@@ -8,6 +8,7 @@ from pipeline.physics import layer, shear, slide
 from tests.elements import Layer, along_x_strains, plate
 
 H_M, WIDTH_M, TIP_M, DEPTH_M = 2e-3, 0.8e-3, 2e-3, 1.2e-3
+DRAG_M, AS_ON_THE_SKIN = 0.9e-3, 0.75  # the deepest of scenes; radius over thickness of a contact
 TAKEN_M = np.array([4e-5, 7e-5])
 HELD = {
     "slipping": {"held": {"axis": [0], "base": [1]}, "drag": {"far": lambda r: 2 / r}},  # beyond it u_r goes as 1 / r
@@ -74,8 +75,13 @@ def half_curl(at):
     return np.stack([(in_line + across) / 2, (in_line - across) / 2, b / at.r_m + (b_r - a_r) / 2])
 
 
+def test_the_deepest_drag_of_a_scene_is_among_those_that_elements_vouch_for():
+    contact = layer.contact_of_depth(DRAG_M, thickness_m=H_M, tip_radius_m=TIP_M, base="slipping")
+    assert 0.7 < contact.radius_m / H_M < AS_ON_THE_SKIN
+
+
 # as on the skin, and a thin layer, whose load is wide beside a cell: errors of 0.8 % and 0.05 %
-@pytest.mark.parametrize(("radius_h", "tolerance"), [(0.75, 0.012), (2.5, 1e-3)])
+@pytest.mark.parametrize(("radius_h", "tolerance"), [(AS_ON_THE_SKIN, 0.012), (2.5, 1e-3)])
 def test_a_layer_dragged_along_its_top_moves_turns_and_resists_as_elements_do(radius_h, tolerance):
     radius_m, chi = radius_h * H_M, layer.CONTACT_W * (1 - layer.CONTACT_X**2) ** 2.5
     traction = shear.Traction(radius_m, radius_m * layer.CONTACT_X, chi / chi.sum())

@@ -130,11 +130,11 @@ def test_every_dipole_turns_about_the_middle_and_moves_as_a_loop_says():
     np.testing.assert_allclose(about_m, slide.apply(motion, 1, (nodes_m - shift_m, moments))[0] + shift_m, atol=1e-17)
 
 
-@given(st.floats(1e-5, 0.71 * H_M), st.floats(1e5, 1e7))
+@given(st.floats(0, 0.71 * H_M), st.floats(1e5, 1e7))
 def test_the_depth_of_a_force_is_the_depth_that_gives_it(depth_m, stiffness_N_m2):
     of = {"stiffness_N_m2": stiffness_N_m2, "thickness_m": H_M}
     found_m = slide.depth_at(slide.force_at(np.array([depth_m]), **of), **of)
-    assert abs(found_m[0] - depth_m) < 1e-4 * H_M  # linear between 2000 depths, worst at the first
+    assert abs(found_m[0] - depth_m) < 1e-6 * H_M
 
 
 def test_force_is_the_square_of_small_depths_and_has_no_end_as_the_layer_is_used_up():

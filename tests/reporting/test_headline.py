@@ -10,6 +10,7 @@ from pipeline.reporting.headline import ANSWERING, FILE, answer, headline_figure
 from pipeline.reporting.order import CONTROL, models
 from pipeline.reporting.paper import TABLE_2
 from pipeline.reporting.shown import show
+from pipeline.trials.universal import METHODS, WAYS
 from tests.reporting.synthetic import all_questions, over_boards
 
 REPORTS = Path(__file__).resolve().parents[2] / "reports"
@@ -50,13 +51,19 @@ def test_the_answer_says_ours_with_its_interval_and_the_papers():
         assert f"(paper: {TABLE_2[name]['accuracy_pct'][0]:.3g} %)" in said
 
 
-def test_the_answer_with_labels_is_of_one_method_without_and_with_most_of_them():
+def test_the_answer_with_labels_is_of_the_model_that_is_told_its_skin_and_of_the_usual_one():
     numbers = json.loads((REPORTS / "lab" / "numbers.json").read_text())
-    rows = [row for row in numbers["labels"] if row["method"] == numbers["labels"][0]["method"]]
-    least, most = (choose(rows, key=lambda row: row["labels_n"]) for choose in (min, max))
-    said = answer(numbers)
-    for row in (least, most):
-        assert f"{show(row['as_labelled']['accuracy_pct'])} % with {row['labels_n']} labels" in said
+    said, usual = answer(numbers), numbers["labels"][0]["method"]
+    assert "with 0 and 40 labels of the new board" in said
+    for method in (*(f"{METHODS[1]}{way}" for way in WAYS.values()), usual):
+        rows = [row for row in numbers["labels"] if (row["method"], row["labels_n"] in (0, 40)) == (method, True)]
+        least, most = (
+            show(choose(rows, key=lambda row: row["labels_n"])["as_labelled"]["accuracy_pct"]) for choose in (min, max)
+        )
+        assert f"{method} {least} and {most} %" in said
+    plain = {"labels": [row for row in numbers["labels"] if row["method"] == usual]}
+    assert answer(plain).count(" and ") == 2
+    assert "universal" not in answer(plain)
 
 
 def test_without_boards_held_out_there_is_no_answer():

@@ -76,7 +76,8 @@ def begin(simulated: set[tuple[str, str]]) -> None:
 def run_stages(asked: list[str]) -> str:
     with Repo() as repo:
         planned = plan_repro(get_active_graph(repo.index.graph))
-        stages = {stage.addressing: stage for stage in planned if not asked or stage.addressing in asked}
+        with_words = [stage for stage in planned if stage.cmd]  # the others are recordings that were added
+        stages = {stage.addressing: stage for stage in with_words if not asked or stage.addressing in asked}
         simulating = [shlex.split(stage.cmd) for name, stage in stages.items() if name.startswith("simulate@")]
         begin({(words[words.index("--scene") + 1], words[words.index("--protocol") + 1]) for words in simulating})
         for name, stage in stages.items():

@@ -50,7 +50,7 @@ def find_whole_rows(
     b_uT: Float[np.ndarray, "f ch"], temperature_degC: Float[np.ndarray, "f k"], header: Header, *, where: str
 ) -> Rows:
     """Tell the rows that hold a reading of every chip; raise if there is none, or if a chip's scale is unknown."""
-    failed = np.asarray(faults.failed_reads(b_uT, temperature_degC).any(axis=1))
+    failed = missing_reads(b_uT, temperature_degC)
     if failed.all():
         remedy = "Mend the wiring, and record again."
         raise CaptureError(where, "rows", "read from every chip", "failed I2C reads in all of them", remedy)
@@ -59,6 +59,13 @@ def find_whole_rows(
         _check_scale(b_uT[block], header, where=f"{where} from row {block[0] + 1}")
     stuck = np.asarray(faults.stuck_chips(b_uT).any(axis=1)) & ~failed
     return Rows(~failed & ~stuck, failed, stuck)
+
+
+def missing_reads(
+    b_uT: Float[np.ndarray, "f ch"], temperature_degC: Float[np.ndarray, "f k"]
+) -> Bool[np.ndarray, " f"]:
+    """Mark the rows in which a chip was not read: its read failed, or zeros stand in its place."""
+    return np.asarray((faults.failed_reads(b_uT, temperature_degC) | faults.zero_reads(b_uT)).any(axis=1))
 
 
 def _check_scale(b_uT: Float[np.ndarray, "f ch"], header: Header, *, where: str) -> None:

@@ -2,7 +2,8 @@
 
 Needed: `phase` (noload or contact), `x_mm`, `y_mm`, and of each chip `Bx0, By0, Bz0, Bx1, ...` in uT. Known where they
 are there, else unknown: `indentation`, `pass`, `t_s`, `depth_mm`, `Fx_N`, `Fy_N`, `Fz_N` (signs: `core.schema`),
-`T0, T1, ...` in degC. A row without contact needs no place. Other columns are ignored, and counted.
+`T0, T1, ...` in degC. A row without contact needs no place. Other columns are ignored, and counted. Without a column
+`pass` the passes are found where the robot repeats its places and depths in order; else all is one.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,6 +17,7 @@ from jaxtyping import Bool, Float64, Int
 from pipeline.capture.header import Header
 from pipeline.capture.readers.chips import find_whole_rows
 from pipeline.capture.readers.named import check_columns, contact_rows, count_chips_of, count_within
+from pipeline.capture.readers.passes import find_passes
 from pipeline.capture.readers.table import make_readings, mean_by_group, read_cells, to_numbers
 from pipeline.capture.readers.units import (
     SAME_PLACE_mm,
@@ -88,10 +90,11 @@ def read(folder: Path, header: Header) -> tuple[Readings, Account]:  # noqa: PLR
         got = f"none before line {FIRST_LINE_N + without[0]}"
         raise CaptureError(where, "each press", "after no-load rows that were read", got, "Add rows of phase noload.")
     still = "depth_mm" in numbers and not numbers["depth_mm"][contact].any()
+    pass_i = numbers["pass"] if "pass" in numbers else _find_passes(numbers, press, contact)
     reading_i = np.zeros(len(keep), int)
     reading_i[keep] = count_within(press[keep])
     readings = make_readings(
-        header, keep, indentation=press, pass_i=numbers.get("pass", np.zeros(len(keep))), reading_i=reading_i,
+        header, keep, indentation=press, pass_i=pass_i, reading_i=reading_i,
         x_mm=numbers["x_mm"], y_mm=numbers["y_mm"], depth_mm=unknown if still else numbers.get("depth_mm", unknown),
         **{axis: numbers.get(axis, unknown) for axis in ("Fx_N", "Fy_N", "Fz_N", "t_s")},
         b_uT=b_uT, noload_uT=noload_uT, temperature_degC=temperature_degC, n_contacts=header.contacts_before_n + press,
@@ -102,6 +105,7 @@ def read(folder: Path, header: Header) -> tuple[Readings, Account]:  # noqa: PLR
         "noload_rows_n": int(rest.sum()),
         **rows.losses(),
         "ignored_columns_n": len(set(names) - set(columns)),
+        "passes_n": len(np.unique(readings.pass_i)),
         "no_depth_rows_n": len(readings) if still or "depth_mm" not in numbers else 0,
     }
 
@@ -188,3 +192,17 @@ def _number_presses(
     elsewhere = np.r_[True, (np.abs(np.diff(place, axis=0)) > SAME_PLACE_mm).any(axis=1)]
     begins_at = contact & (np.r_[True, ~contact[:-1]] | elsewhere)
     return np.maximum(np.cumsum(begins_at) - 1, 0)
+
+
+def _find_passes(
+    numbers: Mapping[str, Float64[np.ndarray, " f"]], press: Int[np.ndarray, " f"], contact: Bool[np.ndarray, " f"]
+) -> Int[np.ndarray, " f"]:
+    """Number the passes by the presses' places and greatest depths, as they repeat in order."""
+    of_press = [
+        np.array([part.max() for part in np.split(numbers[name][contact], np.flatnonzero(np.diff(press[contact])) + 1)])
+        for name in ("x_mm", "y_mm", "depth_mm")
+        if name in numbers
+    ]
+    _, kind = np.unique(np.round(np.stack(of_press, axis=1), 3), axis=0, return_inverse=True)
+    found = find_passes(np.stack([kind, kind], axis=1).astype(float), np.ones(len(kind), bool))
+    return found.astype(int)[press]

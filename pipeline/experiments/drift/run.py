@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from pipeline.core.config import Files, Settings, Strict, read_settings
+from pipeline.core.errors import ParamsError
 from pipeline.core.schema import Readings
 from pipeline.core.stage import run
 from pipeline.dataset import baseline
@@ -18,6 +19,7 @@ from pipeline.dataset.windows import TRAIN, Part, Policy, Windows, check_one_eac
 from pipeline.evaluation.scores import tally
 from pipeline.experiments.answer import read_folder, read_losses, write_answer
 from pipeline.experiments.drift.findings import findings
+from pipeline.experiments.drift.wander import over_steps, walked
 from pipeline.experiments.drift.windows import (
     Answers,
     boards_of,
@@ -48,6 +50,9 @@ class Drift(Strict):
     every_n: Count
     policies: Annotated[tuple[PolicyName, ...], Field(min_length=1)]
     regular_n: Count | None = None  # indentations from one no-load reading of policy `regular` to its next
+    wander_uT: tuple[
+        Annotated[float, Field(ge=0, le=1000)], ...
+    ] = ()  # added after training, sd a contact; simulated only
     training: Training
 
     @model_validator(mode="after")
@@ -120,6 +125,9 @@ def drift(scene: str, files: Files, indentations: Path, answer: Path) -> None:
     section, selection = read(settings), settings.section(Selection, "selection")
     captures = read_folder(indentations, tuple(settings.captures_in(indentations)))
     windows, parts = cut(captures, section, selection)
+    if section.wander_uT and captures[0].source != "simulated":
+        rule = "none in a recorded scene: a walk would be added to what was recorded"
+        raise ParamsError(settings.where, "drift.wander_uT", rule, list(section.wander_uT), "Take it out.")
     pairs = list(trials(parts, section, settings.seed))
     data = SceneData(scene, settings, stack(parts), [])
     answered: dict[str, list[Answers]] = {}
@@ -133,11 +141,35 @@ def drift(scene: str, files: Files, indentations: Path, answer: Path) -> None:
     counts = {"skins_n": len(captures), "seeds_n": section.training.seeds_n, "dropped": data.rows.dropped}
     words = section.model_dump(mode="json", include={"unit", "train_n", "test_n", "every_n", "regular_n"})
     numbers = {name: value for name, value in words.items() if value is not None} | counts | pace(captures)
+    if section.wander_uT:
+        numbers["wander"] = _wander(
+            section, selection, captures, parts, list(zip(pairs, trained, strict=True)), settings.seed
+        )
     variants = {name: own for name, own in rows.items() if name != HEADLINE}
     numbers |= {"left_out_units_n": windows.left_out_units_n} | found | ({"variants": variants} if variants else {})
     write_answer(
         answer, numbers, drawn, read_losses(indentations, numbers["dropped"]), tally(map(collapse_record, trained))
     )
+
+
+def _wander(
+    section: Drift,
+    selection: Selection,
+    captures: Sequence[Readings],
+    parts: Sequence[Part],
+    trained: Sequence[tuple[tuple[Trial, list[Part]], Trained]],
+    seed: int,
+) -> dict[str, Any]:
+    """Test the networks of the headline's recipe again on their last window, of captures that wander further."""
+    at = {part.first_row_i: i for i, part in enumerate(parts)}
+    last = [(trial, one, at[tests[-1].first_row_i]) for (trial, tests), one in trained if trial.recipe_name == HEADLINE]
+    trained_on = baseline.rank(getattr(captures[0], UNIT[section.unit])) < section.train_n
+    after_n = 1 + int(baseline.rank(captures[0].indentation)[trained_on].max())
+
+    def parts_at(step_uT: float) -> list[Part]:
+        return cut([walked(one, step_uT, after_n=after_n, seed=seed) for one in captures], section, selection)[1]
+
+    return over_steps(last, section.wander_uT, parts_at)
 
 
 def _tell(

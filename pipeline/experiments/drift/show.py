@@ -15,6 +15,11 @@ from pipeline.reporting.shown import COLUMNS, show, tabulate
 from pipeline.reporting.work_precision import COLOURS, MARKERS
 
 POLICIES = ("initial", "regular", "each")
+WALKED = (
+    "The networks of figure 5a on their last window again, of captures to which a random walk was added: one normal "
+    "step a contact and channel, from the end of training on, in contact and no-load readings alike. The first row is "
+    "that of figure 5a. How far fields at rest really go is in the table of skins: rms change over 1 to 1,000 contacts."
+)
 MARGIN = 0.05  # of the largest force
 JUDGED = (
     f"{VERDICTS} A finding of several parts: no, if one part is no; yes, if all are. Of these trainings: judged in the "
@@ -43,10 +48,24 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
         }
         for one in numbers["findings"]
     ]  # fmt: skip
-    return {
+    shown = {
         "drift": tabulate(lines, meaning=f"{_protocol(numbers)} {say_pace(numbers, source)} {FIGURE_5}", spread=spread),
         "drift_findings": tabulate(found, meaning=JUDGED),
     }
+    return shown | ({"drift_wander": _wander_table(numbers, source)} if "wander" in numbers else {})
+
+
+def _wander_table(numbers: Mapping[str, Any], source: str) -> pd.DataFrame:
+    named = _policies(numbers)
+    lines = []
+    for i, step_uT in enumerate(row["step_uT"] for row in next(iter(numbers["wander"].values()))):
+        line = {"further walk, µT a contact": f"{step_uT:g}", "source": source}
+        for policy, (words, _) in named.items():
+            row = numbers["wander"][policy][i]
+            line[f"no-load reading off by, µT ({words})"] = f"{row['noload_off_uT']:.3g}"
+            line |= {f"{COLUMNS[name]} ({words})": f"{row[name]:.3g}" for name in ("accuracy_pct", _error(numbers))}
+        lines.append(line)
+    return tabulate(lines, meaning=WALKED)
 
 
 def _of_trainings(one: Mapping[str, Any]) -> dict[str, str]:
@@ -56,6 +75,7 @@ def _of_trainings(one: Mapping[str, Any]) -> dict[str, str]:
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
     """Draw scores against contacts (figure 5a), and where force is known predicted against true force (figure 5b)."""
     texts = {"drift.svg": _scores(numbers, source)}
+    texts |= {"drift_wander.svg": _wander_figure(numbers, source)} if "wander" in numbers else {}
     return texts | ({"drift_force.svg": _forces(numbers["late"], drawn["late"], source)} if "late" in numbers else {})
 
 
@@ -89,6 +109,30 @@ def _scores(numbers: Mapping[str, Any], source: str) -> str:
         names = figure.axes[0].get_legend_handles_labels()
         figure.legend(*names, loc="outside lower center", ncols=3, frameon=False, title="no-load reading")
         figure.suptitle(f"Trained on first contacts, tested on later ones ({source})", x=0.01, ha="left", fontsize=11)
+        return svg(figure)
+
+
+def _wander_figure(numbers: Mapping[str, Any], source: str) -> str:
+    with drawing(7.6, 4.0) as figure:
+        error = _error(numbers)
+        for axes, metric in zip(figure.subplots(1, 2), ("accuracy_pct", error), strict=True):
+            for policy, (words, _) in _policies(numbers).items():
+                i, rows = POLICIES.index(policy), numbers["wander"][policy]
+                steps_uT = [row["step_uT"] for row in rows]
+                look = {"color": COLOURS[i], "marker": MARKERS[i], "markersize": 5, "linewidth": 1.2, "label": words}
+                axes.plot(steps_uT, [row[metric] for row in rows], **look)
+            least_uT = min((step for step in steps_uT if step > 0), default=1.0)
+            axes.set_xscale("symlog", linthresh=least_uT)
+            axes.set(xlabel="further random walk / µT a contact", ylabel=COLUMNS[metric].replace(", ", " / "))
+            axes.set_xlim(left=0)
+            axes.grid(alpha=0.25)
+        axes.set_yscale("log")
+        figure.axes[0].set_ylim(0, 102)
+        names = figure.axes[0].get_legend_handles_labels()
+        figure.legend(*names, loc="outside lower center", ncols=3, frameon=False, title="no-load reading")
+        last_n = next(iter(_policies(numbers).values()))[1][-1]["contacts_n"]
+        title = f"After {last_n:,} contacts, if the field at rest wandered more ({source})"
+        figure.suptitle(title, x=0.01, ha="left", fontsize=11)
         return svg(figure)
 
 

@@ -16,7 +16,7 @@ from pipeline.dataset.splits import Split, draw_folds
 from pipeline.evaluation.metrics import METRICS, score
 from pipeline.experiments.stability.cases import Case, measured, observed, refused
 from pipeline.learning.recipe import Labelling, Recipe
-from pipeline.learning.train import BLOCK_STEPS_N, train_stack
+from pipeline.learning.train import BLOCK_STEPS_N, JUDGED_STEPS_N, train_stack
 from pipeline.learning.trial import FewLabels, Measured, Start, Trained, Trial
 
 AREA = "learning"
@@ -27,6 +27,7 @@ STEPS_N = BLOCK_STEPS_N  # the loop looks at its loss once
 CONSTANT_uT = 12.3
 BOTTLENECK = "layer3.weight"
 ROUNDING = 1e-4  # of weights near 0.1: float32 sums of another order differ by 6e-8, and 50 steps amplify it
+STILL = 1e-12  # a rate at which nothing moves
 SCALE_POWERS = (-20, -10, 10, 20)  # of two, about 1e-6 to 1e6: float32 holds labels of these scales without rounding
 RECIPE = Recipe(
     architecture="paper", inputs="raw", scaling="standard", triplet_weight=0.0, steps_n=STEPS_N, batch_n=32,
@@ -56,10 +57,10 @@ def triplet_cases(seed: int) -> list[Case]:
 
 
 def loop_cases(seed: int) -> list[Case]:
-    """Try rates and weights that overflow, hardly any rows, and the same seed twice."""
+    """Try rates and weights that overflow, a network that died, hardly any rows, and the same seed twice."""
     trial, rows = _trial(seed), _rows(seed)
     overflow = [_explodes(trial, rows, 1e1), _explodes(trial, rows, 1e10), _beside_one_that_overflows(trial, rows)]
-    return [*overflow, *_few(trial, rows), _again(trial, rows)]
+    return [*overflow, _collapsed(trial, rows), *_few(trial, rows), _again(trial, rows)]
 
 
 def fold_cases() -> list[Case]:
@@ -142,6 +143,21 @@ def _beside_one_that_overflows(trial: Trial, rows: Measured) -> Case:
     return measured(AREA, "a network that overflows beside one that does not", should="its neighbour: as if alone",
                     happened=happened, limit=ROUNDING,
                     error=apart if _is_sound(beside) and overflowing.stopped_step == STEPS_N else np.inf)  # fmt: skip
+
+
+def _collapsed(trial: Trial, rows: Measured) -> Case:
+    dead, alive = (
+        _train(_tuned(trial, _start(trial, rows, scale), steps_n=JUDGED_STEPS_N, rate_max=STILL), rows)
+        for scale in (0.0, 1.0)
+    )
+    spread = float(np.ptp(dead.predicted, axis=0).max())
+    happened = (
+        f"{_words(dead)}, which differ by {spread:.1g}; explains {dead.explained_min:.2g} of its training rows, "
+        f"{'counted as collapsed' if dead.collapsed else 'taken as sound'}; the same network alive: "
+        f"{alive.explained_min:.2g}, {'counted as collapsed' if alive.collapsed else 'taken as sound'}"
+    )
+    return observed(AREA, "a network that died, with a finite loss", should="counted as collapsed, and it alone",
+                    happened=happened, holds=_is_sound(dead) and dead.collapsed and not alive.collapsed)  # fmt: skip
 
 
 def _few(trial: Trial, rows: Measured) -> list[Case]:

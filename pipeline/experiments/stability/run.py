@@ -10,6 +10,7 @@ from pipeline.core.stage import run, say
 from pipeline.experiments.stability.cases import Case
 from pipeline.experiments.stability.chip import chip_cases
 from pipeline.experiments.stability.physics import drag_cases, physics_cases, time_cases
+from pipeline.experiments.stability.sliding import sliding_cases
 from pipeline.experiments.stability.wire import wire_cases
 from pipeline.synthesis.settings import Synthesis, synthesis_of
 
@@ -22,6 +23,7 @@ def survey(of: Synthesis, seed: int) -> list[Case]:
         *time_cases(),
         *physics_cases(board, of.spreads, skin=of.skin, seed=seed),
         *drag_cases(of.skin),
+        *sliding_cases(board, of.spreads, skin=of.skin, seed=seed),
         *chip_cases(of.chip, chips_n, seed),
         *wire_cases(of.chip.gain_sel, chips_n, seed),
     ]

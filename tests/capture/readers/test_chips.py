@@ -35,6 +35,14 @@ def test_a_row_is_whole_if_none_of_its_chips_failed(failed: set[tuple[int, int]]
         assert set(np.flatnonzero(~whole).tolist()) == rows
 
 
+def test_a_row_with_zeros_in_place_of_a_chips_reading_is_not_whole():
+    b_uT = noisy_fields_uT(50)
+    b_uT[7, 3:6] = 0.0
+    rows = find_whole_rows(b_uT, np.full((50, CHIPS_N), 25.0), HEADER, where="here")
+    assert np.flatnonzero(~rows.whole).tolist() == [7]
+    assert rows.losses()["dropped_failed_read_rows_n"] == 1
+
+
 @pytest.mark.parametrize("chip_i", range(CHIPS_N))
 def test_a_chip_without_the_others_grid_is_named(chip_i: int) -> None:
     b_uT = noisy_fields_uT(GRID_ROWS_N)

@@ -187,3 +187,17 @@ def test_a_template_is_the_first_line_of_such_a_file(tmp_path):
     (capture / plain.CSV).write_text(out.read_text())
     with pytest.raises(CaptureError, match="rows of phase contact"):
         plain.read(capture, make_header(layout="table", chips_n=3))
+
+
+def test_passes_are_found_where_places_and_depths_repeat_in_order_and_a_column_has_the_last_word(tmp_path):
+    one = table(presses_n=9)
+    three = pd.concat([one] * 3, ignore_index=True)
+    found, account = read(tmp_path / "found", three)
+    np.testing.assert_array_equal(found.pass_i, np.repeat([0, 1, 2], len(found) // 3))
+    assert account["passes_n"] == 3
+    told, _ = read(tmp_path / "told", three.assign(**{"pass": 7}))
+    assert set(told.pass_i) == {7}
+    deeper = pd.concat([one.assign(depth_mm=depth) for depth in (0.2, 0.4, 0.6)], ignore_index=True)
+    other, account = read(tmp_path / "deeper", deeper)
+    assert set(other.pass_i) == {0}
+    assert account["passes_n"] == 1

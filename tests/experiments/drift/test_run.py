@@ -91,16 +91,28 @@ def test_a_drifting_skin_is_answered_in_every_window_and_a_single_no_load_readin
     assert numbers["late"]["force_left_pct"] == pytest.approx(100)  # this skin does not soften
     assert numbers["late"]["indentations_n"] == len(answer["drawn"]["late"]["true_N"]) == 30
     assert len(numbers["late"]["network_bias_N"]) == 1
-    assert {one["verdict"] for one in numbers["findings"]} == {"inconclusive (one board)"}
-    assert {one["of_trainings"] for one in numbers["findings"]} == {"inconclusive"}  # one network each
+    judged = {(one["verdict"], one["of_trainings"]) for one in numbers["findings"]}
+    assert judged == {("inconclusive (one board)", "inconclusive")}  # one network each
     # Whatever is subtracted under a policy, a contact changes the field by what a reading before it shows.
     db_uT = capture("s0-wear").b_uT - capture("s0-wear").noload_uT
     assert numbers["field"]["contact_uT"] == pytest.approx(np.sqrt(np.mean(db_uT.astype(float) ** 2)), rel=1e-6)
     assert numbers["contact_every_s"] == pytest.approx(EVERY_s)
     assert numbers["lasts_s"] == pytest.approx(389 * EVERY_s)
     assert len(numbers["findings"]) == 4
-    assert set(drift_pages.tables(numbers, "simulated")) == {"drift", "drift_findings"}
-    assert set(drift_pages.figures(numbers, answer["drawn"], "simulated")) == {"drift.svg", "drift_force.svg"}
+    assert set(drift_pages.tables(numbers, "simulated")) == {"drift", "drift_findings", "drift_wander"}
+    drawn = drift_pages.figures(numbers, answer["drawn"], "simulated")
+    assert set(drawn) == {"drift.svg", "drift_wander.svg", "drift_force.svg"}
+    # A walk of no step is the last window itself; a reading before every contact sees any walk.
+    for policy, (still, _) in numbers["wander"].items():
+        last = {name: numbers[policy][-1][name] for name in ("accuracy_pct", "mse_xy_mm2", "noload_off_uT")}
+        assert {name: still[name] for name in last} == pytest.approx(last)
+    assert numbers["wander"]["each"][1]["mse_xy_mm2"] == pytest.approx(numbers["each"][-1]["mse_xy_mm2"], rel=1e-3)
+
+
+def test_no_walk_is_added_to_what_was_recorded(scene, tmp_path):
+    worn = write(tmp_path / "wear", replace(capture("s0-wear"), source="recorded"))
+    with pytest.raises(ParamsError, match="drift.wander_uT must be none in a recorded scene"):
+        drift(scene="ci", indentations=worn, **scene)
 
 
 @pytest.mark.parametrize(

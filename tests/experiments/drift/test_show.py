@@ -112,6 +112,22 @@ def test_figures_are_svg_with_units_source_and_the_stated_bias():
         assert word in drawn["drift_force.svg"]
 
 
+def test_a_further_walk_has_a_row_and_a_mark_for_every_step_and_none_where_it_was_not_asked():
+    steps = {
+        policy: [
+            {"step_uT": step, "noload_off_uT": 3 * step, "n": 2, "accuracy_pct": 90 - step, "mse_f_N2": 0.01 + step}
+            for step in (0.0, 0.5, 5.0)
+        ]
+        for policy in ("initial", "regular", "each")
+    }
+    table = tables(numbers(wander=steps), "simulated")["drift_wander"]
+    assert table["further walk, µT a contact"].tolist() == ["0", "0.5", "5"]
+    assert table["accuracy, % (once at the start)"].tolist() == ["90", "89.5", "85"]
+    assert "After 10,000 contacts, if" in figures(numbers(wander=steps), DRAWN, "simulated")["drift_wander.svg"]
+    assert "drift_wander" not in tables(numbers(), "simulated")
+    assert "drift_wander.svg" not in figures(numbers(), DRAWN, "simulated")
+
+
 def test_a_policy_has_its_colour_whichever_others_there_are():
     both = numbers()
     del both["regular"], both["late"]

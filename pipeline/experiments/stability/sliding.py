@@ -1,0 +1,155 @@
+"""A skin that slides on its base, at the edges of what it is made for (PHYSICS 10). In: a scene's designs. Out: cases.
+
+Stick-slip without friction and with great friction, a tip that lifts while the skin is pulled, pokes at the free edge,
+presses under force control. Refuses to know the layer (`physics`), chips' electronics and bytes.
+"""
+
+import numpy as np
+from jaxtyping import Float
+from scipy.constants import milli
+
+from pipeline.experiments.stability.cases import Case, measured, observed
+from pipeline.experiments.stability.physics import COARSE
+from pipeline.experiments.verification.checks import no_spread
+from pipeline.physics import shear, slide
+from pipeline.physics.board import Board, BoardDesign, Spreads, draw_board
+from pipeline.physics.friction import Friction
+from pipeline.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, forces, press_slides
+from pipeline.synthesis.contact import DEPTH_STEP_M, Sideways, push
+
+AREA = "physics"
+DEPTH = 0.35  # of the thickness: the deepest drag of a scene, and the steepest shear
+PLACE_M = np.array([5.0, -3.0]) * milli  # from the skin's middle: there a pull turns it too
+WAY_M = np.array([0.0, 0.05, 0.2, 0.5]) * milli
+HELD_M = 0.1 * milli  # how far a tip that then lifts has gone
+LIFTS_N = (3, 30)  # stops on the way up
+EDGE_M = 0.1 * milli  # inside the skin's edge
+STICKY, SMOOTH = 10.0, 1e-9
+ROUNDING = 1e-12
+PRESSES = np.concatenate([[0.0], np.geomspace(1e-6, slide.DEEPEST, 400)])  # of the thickness
+
+
+def sliding_cases(board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, seed: int) -> list[Case]:
+    """Try a skin without spreads on the first board; none where no base holds the skin by springs."""
+    if skin.hold is None:
+        return []
+    even = no_spread(spreads)
+    drawn = draw_board(board, even, seed=seed, name="b0")
+    one = draw_skin(skin, even, seed=seed, name="b0_s0", rule=COARSE)
+    return [*stick_slip(drawn, one), lift(drawn, one), *edge(drawn, one), *force_control(one)]
+
+
+def stick_slip(board: Board, skin: Skin) -> list[Case]:
+    """Drag with hardly any friction, which slips at once, and with one that does not let go."""
+    path_m = _path(skin, skin.seat_m + PLACE_M, WAY_M, np.full(len(WAY_M), DEPTH))
+    normal_N = forces(skin, path_m[:, 2])
+    smooth, sticky = (_pushed(board, skin, path_m, mu) for mu in (SMOOTH, STICKY))
+    _, pressed_T = changes_of_field(board, skin, path_m)
+    drawn_N = np.linalg.norm(smooth.force_N[0], axis=1)
+    off_N = float(np.abs(drawn_N[1:] / (SMOOTH * normal_N[1:]) - 1).max())
+    off_T = float(np.abs(smooth.change_T[0] - pressed_T).max() / np.abs(pressed_T).max())
+    # What sticks follows the tip: layer and springs, one after the other, take the whole way up.
+    pulled_N = sticky.force_N[0]
+    slides_m_per_N = slide.compliance_m_per_N(path_m[:, :2] - skin.seat_m, skin.sides_m, _springs(skin))
+    taken_m = pulled_N / _layer_N_per_m(skin, DEPTH) + (slides_m_per_N @ pulled_N[:, :, None])[:, :, 0]
+    left_m = np.abs(taken_m[:, 0] - WAY_M).max() + np.abs(taken_m[:, 1]).max()
+    return [
+        measured(AREA, f"a drag with friction {SMOOTH:g} on a skin that slides",
+                 should="slips at once: friction times the normal force, and dB that of pressing alone",
+                 happened=f"{drawn_N.max():.2g} N, relative error {off_N:.1e}; dB {off_T:.1e} of its size off",
+                 error=max(off_N, off_T), limit=1e-6),
+        measured(AREA, f"a drag with friction {STICKY:g} on a skin that slides",
+                 should="sticks: layer and base, one after the other, give way by as much as the tip goes",
+                 happened=f"{np.abs(pulled_N).max():.3g} N over {WAY_M[-1] / milli:g} mm; "
+                          f"{left_m / WAY_M[-1]:.1e} of the way unaccounted for",
+                 error=float(left_m / WAY_M[-1]), limit=1e-9),
+    ]  # fmt: skip
+
+
+def lift(board: Board, skin: Skin) -> Case:
+    """Pull a skin by its middle, then lift the tip there: what friction still holds falls with the normal force."""
+    mu, errors, last_N = 1.0, [], []
+    for stops_n in LIFTS_N:
+        share = np.append(DEPTH, np.linspace(DEPTH, 0, stops_n + 1))
+        way_m = np.append(0.0, np.full(stops_n + 1, HELD_M))
+        path_m = _path(skin, skin.seat_m, way_m, share)
+        pulled_N = _pushed(board, skin, path_m, mu).force_N[0]
+        limit_N = mu * forces(skin, path_m[:, 2])
+        layers_N_per_m = np.array([_layer_N_per_m(skin, part) for part in share[1:-1]])
+        give_m_per_N = 1 / layers_N_per_m + 1 / _springs(skin)  # at the middle a pull turns nothing
+        reach_m = np.minimum.accumulate(np.minimum(HELD_M, limit_N[1:-1] * give_m_per_N))
+        errors.append(np.abs(pulled_N[1:-1, 0] - reach_m / give_m_per_N).max() / limit_N[0])
+        last_N.append(np.abs(pulled_N[-1]).max())
+    happened = (
+        f"in {LIFTS_N[0]} and {LIFTS_N[1]} stops: {max(errors):.1e} of the first friction off; {max(last_N):g} N left"
+    )
+    return measured(AREA, "a tip that pulls the skin and is lifted there",
+                    should="the least of spring and friction so far, in any number of stops; no force once it is off",
+                    happened=happened, error=float(max(*errors, *last_N)), limit=1e-9)  # fmt: skip
+
+
+def edge(board: Board, skin: Skin) -> list[Case]:
+    """Poke just inside the free edge, at the middle of a side and at a corner."""
+    half_m = np.array(skin.sides_m) / 2 - EDGE_M
+    places_m = np.array([[half_m[0], 0.0], half_m])
+    pokes_m = np.column_stack([skin.seat_m + places_m, np.full(2, 0.3 * skin.thickness_m)])
+    _, change_T = changes_of_field(board, skin, pokes_m)
+    assert skin.hold is not None
+    slides = press_slides(skin, skin.hold, pokes_m)
+    load = slide.load_of(pokes_m[:, 2], skin.hold, skin.thickness_m)
+    asked_m = slide.under_tip_m(places_m, load, give_m=skin.hold.give_m, away=skin.hold.away)
+    spun_m = slides.spin_rad[:, None] * np.stack([-places_m[:, 1], places_m[:, 0]], axis=1)
+    off = float(np.abs(slides.move_m + spun_m - asked_m).max() / np.abs(asked_m).max())
+    sizes_uT = ", ".join(f"{1e6 * size:.3g}" for size in np.abs(change_T).max(axis=(1, 2)))
+    return [
+        observed(AREA, f"pokes {EDGE_M / milli:g} mm inside the free edge, at a side and at a corner",
+                 should="finite dB, and some: half of what the tip would press is not there, and is not made up",
+                 happened=f"at most {sizes_uT} uT",
+                 holds=bool(np.isfinite(change_T).all() and (np.abs(change_T).max(axis=(1, 2)) > 0).all())),
+        measured(AREA, "the slide of a skin that is poked at its free edge",
+                 should="the place goes as far as the press takes it, turn and motion together",
+                 happened=f"{np.abs(slides.spin_rad).max():.2g} rad, relative error {off:.1e}", error=off,
+                 limit=ROUNDING),
+    ]  # fmt: skip
+
+
+def force_control(skin: Skin) -> list[Case]:
+    """Press and let go by force: the depth that a force has is the same on the way up, and back."""
+    assert skin.hold is not None
+    of = {"stiffness_N_m2": skin.hold.stiffness_N_m2, "thickness_m": skin.thickness_m}
+    depth_m = skin.thickness_m * np.concatenate([PRESSES, PRESSES[::-1]])
+    force_N = slide.force_at(depth_m, **of)
+    off = float(np.abs(slide.depth_at(force_N, **of) - depth_m).max() / skin.thickness_m)
+    beyond_N = force_N.max() * np.array([1.0, 2.0, 1e6])
+    held_m, counted_n = slide.depth_at(beyond_N, **of), slide.beyond_n(beyond_N, **of)
+    deepest = held_m / (slide.DEEPEST * skin.thickness_m)
+    return [
+        measured(AREA, f"pressed to {slide.DEEPEST:g} of the thickness by force, and let go",
+                 should="the depth of each force is the depth that gives it, down and up, without a remainder",
+                 happened=f"{force_N.max():.3g} N at most; {off:.1e} of the thickness off", error=off, limit=1e-6),
+        observed(AREA, "a force that no allowed depth gives", should="held at the deepest, and counted",
+                 happened=f"{beyond_N[-1]:.2g} N held at {deepest[-1]:.6f} of the deepest; {counted_n} counted",
+                 holds=bool(np.abs(deepest - 1).max() < ROUNDING and counted_n == 2)),
+    ]  # fmt: skip
+
+
+def _pushed(board: Board, skin: Skin, path_m: Float[np.ndarray, "p 3"], mu: float) -> Sideways:
+    return push(board, skin, path_m[None], tilt=np.zeros((1, 2)), how=Friction(coefficient=mu))
+
+
+def _path(
+    skin: Skin, start_m: Float[np.ndarray, "2"], way_m: Float[np.ndarray, " p"], share: Float[np.ndarray, " p"]
+) -> Float[np.ndarray, "p 3"]:
+    """Lay stops along x, at shares of the thickness."""
+    return np.column_stack([start_m[0] + way_m, np.full(len(way_m), start_m[1]), share * skin.thickness_m])
+
+
+def _springs(skin: Skin) -> float:
+    assert skin.hold is not None
+    return skin.hold.springs_N_per_m
+
+
+def _layer_N_per_m(skin: Skin, share: float) -> float:
+    depth_m = DEPTH_STEP_M * max(round(share * skin.thickness_m / DEPTH_STEP_M), 1)  # as `push` takes it
+    table = shear.tabulate_depth(depth_m, thickness_m=skin.thickness_m, tip_radius_m=skin.tip_radius_m, base=skin.base)
+    return skin.modulus_Pa / 3 * table.stiffness_m

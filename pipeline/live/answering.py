@@ -1,0 +1,100 @@
+"""Who answers while a board is at work: trained networks, or the map of simulated skins that comes with the project.
+
+In: changes of field in contact. Out: places, forces, how sure they are, and whether this is a skin that was ever seen.
+Refuses to know ports, frames and pages.
+"""
+
+from collections.abc import Sequence
+from copy import copy
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Float64
+
+from pipeline.learning.inputs import VIEW, Scaler
+from pipeline.trials.networks import Network
+from pipeline.twin.shipped import CHANNELS_N, Universal
+
+UNLIKE_SDS = 10.0  # assumed, of an input in training; 6 in scene quick, 7 on lab's boards under its models
+MISFIT_MAX = 4.0  # chi^2 a channel; 3.0 at most in 390 pokes of scene lab, 5.9 at the median of eflesh, another skin
+Models = Sequence[Network] | Universal
+
+
+class Answered(NamedTuple):
+    """Of each reading: x_mm, y_mm and F_N, the place's standard deviation, and whether it is like no known skin."""
+
+    answer: Float64[np.ndarray, "f 3"]
+    sd_mm: Float64[np.ndarray, "f 2"]
+    unlike: Bool[np.ndarray, " f"]
+
+
+class Networks:
+    """Several give the mean, and how far they are apart: not how far they are from the truth."""
+
+    channels_n: int
+
+    def __init__(self, models: Sequence[Network]) -> None:
+        self._models = models
+        self.channels_n = models[0].card["input"]["channels_n"]
+        self.about = f"{len(models)} network{'s' if len(models) > 1 else ''}"
+        for model in models:  # imports and puts together what a first contact should not wait for
+            model(np.zeros((1, model.card["input"]["channels_n"]), np.float32))
+        self._scaled = [(VIEW[model.card["recipe"]["inputs"]], Scaler.of_arrays(model.tensors)) for model in models]
+
+    def zero(self, b_uT: Float[np.ndarray, "f ch"]) -> None:
+        """Networks are shown changes of field alone."""
+
+    def __call__(self, db_uT: Float32[np.ndarray, "f ch"]) -> Answered:
+        answers = np.stack([model(db_uT) for model in self._models]).astype(np.float64)
+        sd_mm = answers[:, :, :2].std(axis=0, ddof=1) if len(answers) > 1 else np.full((len(db_uT), 2), np.nan)
+        shown = np.stack([np.abs(scaler.encode(view(db_uT))).max(axis=1) for view, scaler in self._scaled])
+        return Answered(answers.mean(axis=0), sd_mm, np.asarray((shown > UNLIKE_SDS).any(axis=0)))
+
+
+class Map:
+    """Is fitted to the no-load field, and to pokes at unknown places if it is let see some."""
+
+    channels_n = CHANNELS_N
+    about = "map of simulated skins"
+
+    def __init__(self, universal: Universal) -> None:
+        self._universal = universal
+        self._pokes_uT = np.zeros((0, CHANNELS_N))  # changes of field that it was let see
+        self.zero(np.zeros((1, CHANNELS_N)))
+
+    def zero(self, b_uT: Float[np.ndarray, "f ch"]) -> None:
+        """Begin anew from the no-load field, and from the pokes that were seen before."""
+        self._noload_uT = b_uT.mean(axis=0, dtype=np.float64)
+        self._learn(self._pokes_uT)
+
+    def see(self, db_uT: Float[np.ndarray, "n ch"]) -> str:
+        """Learn from pokes anywhere; say what they did to its sureness. Nobody knows where they were."""
+        before, self._pokes_uT = self._universal.estimate(self._noload_uT + db_uT), db_uT.astype(np.float64)
+        self._learn(self._pokes_uT)
+        after = self._universal.estimate(self._noload_uT + db_uT)
+        sd_mm, misfit = ([np.median(each) for each in pair] for pair in zip(
+            (before.sd_mm.max(axis=1), before.misfit), (after.sd_mm.max(axis=1), after.misfit), strict=True
+        ))  # fmt: skip
+        return (
+            f"adapted to {len(db_uT)} pokes: standard deviation of a place {sd_mm[0]:.2f} mm before, {sd_mm[1]:.2f} mm "
+            f"after; misfit {misfit[0]:.2f} before, {misfit[1]:.2f} after"
+        )
+
+    def _learn(self, pokes_uT: Float[np.ndarray, "n ch"]) -> None:
+        universal = copy(self._universal).zero(self._noload_uT[None])
+        if len(pokes_uT):
+            universal.see(self._noload_uT + pokes_uT)
+        universal.estimate(self._noload_uT[None])  # what a first contact should not wait for
+        self._universal = universal
+
+    def __call__(self, db_uT: Float32[np.ndarray, "f ch"]) -> Answered:
+        found = self._universal.estimate(self._noload_uT + db_uT)
+        answer = np.column_stack([found.place_mm, found.force_N])
+        return Answered(answer, found.sd_mm, np.asarray(found.misfit > MISFIT_MAX))
+
+
+def answering(models: Models) -> Networks | Map | None:
+    """Let networks answer, or the map; nobody, if there is no model."""
+    if isinstance(models, Universal):
+        return Map(models)
+    return Networks(models) if models else None

@@ -1,0 +1,127 @@
+"""The words of the command line for boards that are plugged in: `reskin ports`, `record`, `emulate`, `live`."""
+
+import math
+import threading
+import time
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+from typer import Argument, Option
+
+app = typer.Typer()
+
+Wire = Literal["binary", "binary-clock", "text-xyzt", "text-txyz"]
+Speed = Annotated[float, Option(help="Times its own rate; inf: as fast as it is taken.", min=0.01)]
+Baud = Annotated[int, Option(help="Baud rate; USB ports ignore it.", min=1)]
+SOURCE = "A capture's folder, or the name of a simulated scene."
+FAULT = "NAME[@START_S[+SECONDS]], such as stuck@3+1; may be repeated. A wrong name lists them all."
+
+
+@app.command()
+def ports(
+    names: Annotated[list[str] | None, Argument(help="Ports to listen to; without any, all of this machine.")] = None,
+    hunt: Annotated[bool, Option("--hunt", help="Find the board by unplugging it and plugging it in again.")] = False,
+) -> None:
+    """Find boards: which port, what they send, how often, and the scale of their chips."""
+    from pipeline.live import ports
+
+    for found in ports.find_boards([ports.hunt(typer.echo)] if hunt else names):
+        typer.echo(found)
+
+
+@app.command()
+def record(
+    port: Annotated[
+        str | None, Option(help="/dev/ttyACM0, COM3, socket://host:port; not given: the one there.")
+    ] = None,
+    board: Annotated[str | None, Option(help="The circuit board's name; `reskin add` asks for it anyhow.")] = None,
+    skin: Annotated[str | None, Option(help="The skin's name, likewise.")] = None,
+    out: Annotated[Path | None, Option(help="The capture's folder; new. Not given: captures/DATE-TIME.")] = None,
+    wire: Annotated[Wire | None, Option(help="What the firmware sends; with --port, binary if not given.")] = None,
+    chips_n: Annotated[int | None, Option("--chips", help="With --port, 5 if not given.", min=1, max=64)] = None,
+    baud: Baud = 115200,
+    seconds: Annotated[float, Option(help="How long; without it, until Ctrl-C.", min=0.0)] = math.inf,
+    scan: Annotated[str | None, Option(help="The order of the rig's places: random, snake, or your words.")] = None,
+) -> None:
+    """Record what a board sends; label it with the robot's log when adding it."""
+    from pipeline.capture.port import PortSettings
+    from pipeline.recording import UNTOLD, Told, new_folder, print_progress, record_capture
+
+    wire, chips_n = (wire or "binary"), (chips_n or 5)
+    if port is None:
+        from pipeline.live.ports import the_board
+
+        found = the_board()
+        typer.echo(found)
+        port, wire, chips_n = found.port, found.wire, found.chips_n
+    settings = PortSettings(baud, wire, chips_n, seconds, bytes_max_n=None, silence_s=5.0, no_frame_s=5.0)
+    folder = out or new_folder()
+    told = Told(board or UNTOLD.board, skin or UNTOLD.skin, scan or UNTOLD.scan)
+    done = record_capture(port, folder, told=told, settings=settings, report=print_progress())
+    counts = ", ".join(f"{key} {count}" for key, count in done.account.items() if count)
+    where = f"{folder}.part: no more could be written" if done.ended == "not written" else str(folder)
+    typer.echo(f"recorded {where} ({done.ended} after {done.duration_s:.1f} s): {counts}")
+
+
+@app.command()
+def emulate(
+    source: Annotated[str, Argument(help=SOURCE)],
+    port: Annotated[str, Option(help="pty, tcp, tcp:PORT, or ./NAME of a link to a pseudo-terminal.")] = "pty",
+    speed: Speed = 1.0,
+    fault: Annotated[list[str] | None, Option(help=FAULT)] = None,
+    loop: Annotated[bool, Option("--loop", help="Begin again when it has ended.")] = False,
+) -> None:
+    """Be a board: send a capture or a simulated scene, with faults if asked, to whoever reads the port."""
+    from pipeline.live.emulate import open_far_end, play
+    from pipeline.live.inject import inject, parse
+    from pipeline.live.script import read_script
+
+    faults = [parse(text) for text in fault or ()]
+    script = read_script(source, Path())
+    for one in faults:
+        script = inject(script, one)
+    end, stop = open_far_end(port), threading.Event()
+    typer.echo(f"{end.name}: {len(script)} frames of {script.duration_s:.1f} s, {script.wire}; Ctrl-C ends it")
+    started_s = time.monotonic()
+    try:
+        sent_n = play(script, end, stop, speed=speed, loop=loop)
+        typer.echo(f"sent {sent_n} bytes in {time.monotonic() - started_s:.1f} s")
+    except KeyboardInterrupt:
+        typer.echo("stopped")
+    finally:
+        end.unplug()
+
+
+@app.command()
+def live(
+    port: Annotated[str | None, Option(help="The board's port; not given: the one that is there.")] = None,
+    model: Annotated[
+        list[Path] | None, Option(help="A trained model (.safetensors), or several; else the map of simulated skins.")
+    ] = None,
+    replay: Annotated[str | None, Option(help="In place of a board: the folder of a capture.")] = None,
+    emulate: Annotated[str | None, Option(help="In place of a board: the name of a simulated scene.")] = None,
+    host: Annotated[str, Option(help="Where the page listens; elsewhere than here, behind a token.")] = "127.0.0.1",
+    http_port: Annotated[int, Option(help="The page's port.", min=1, max=65535)] = 8765,
+) -> None:
+    """Show a board at work in the browser: chips, contact, force, traces, and what is wrong."""
+    from contextlib import ExitStack
+
+    from pipeline.core.errors import ParamsError
+    from pipeline.live.emulate import playing
+    from pipeline.live.ports import the_board
+    from pipeline.live.script import read_script
+    from pipeline.live.server import serve
+    from pipeline.predicting import read_network
+    from pipeline.twin.shipped import load_universal
+
+    given = [name for name in (port, replay, emulate) if name is not None]
+    if len(given) > 1:
+        raise ParamsError("live", "the board", "one of --port, --replay, --emulate", ", ".join(given), "Give one.")
+    models = [read_network(file) for file in model] if model else load_universal()
+    with ExitStack() as stack:
+        what = "a board"
+        if source := replay or emulate:
+            script = read_script(source, Path())
+            port, what = stack.enter_context(playing(script)), f"{script.source}: {source}, played"
+        serve(port or the_board().port, models, what=what, host=host, http_port=http_port, say=typer.echo)

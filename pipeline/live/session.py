@@ -1,0 +1,137 @@
+"""A skin at work for whoever looks: polled on a thread of its own, recorded when asked. In: a port, models.
+
+Out: messages for pages, and captures. Refuses to know http.
+"""
+
+import threading
+from pathlib import Path
+from typing import Any
+
+from pipeline.capture.header import Header
+from pipeline.capture.port import Tape
+from pipeline.core.errors import ReskinError
+from pipeline.live.adapting import POKES_N, Pokes
+from pipeline.live.answering import Map, Models
+from pipeline.live.skin import WAITING, Readings, Skin
+from pipeline.live.view import View
+from pipeline.recording import UNTOLD, begin_capture, end_capture, new_folder
+
+POLL_S = 0.1
+
+
+class Live:
+    """A skin that is polled on a thread of its own, what pages see of it, and its recording."""
+
+    def __init__(self, port: str, models: Models, what: str) -> None:
+        self.skin, self.what = Skin(port, models), what
+        self.view: View | None = None
+        self.problem = ""
+        self._pokes: Pokes | None = None
+        self._adapted = ""
+        self._recording: tuple[Path, Header] | None = None
+        self._recorded = ""
+        self._lock, self._buttons, self._stop = threading.Lock(), threading.Lock(), threading.Event()
+        self._thread = threading.Thread(target=self._poll, name="estimates", daemon=True)
+
+    def start(self) -> None:
+        self.skin.reader.start(there=False)
+        self._thread.start()
+
+    def stop(self) -> None:
+        self._stop.set()
+        self._thread.join()
+        self.end_recording()
+        self.skin.reader.stop()
+
+    def _poll(self) -> None:
+        try:
+            while not self._stop.is_set():
+                readings = self.skin.poll(POLL_S)
+                if readings is not None:
+                    now_s = self.skin.reader.unix_s()
+                    self._adapt(readings)
+                    with self._lock:
+                        self.view = self.view or View(self.skin.layout, now_s - 1.0)
+                        self.view.feed(readings, now_s)
+        except ReskinError as error:
+            self.problem = str(error)
+
+    def _adapt(self, readings: Readings) -> None:
+        """Let the map see a dozen pokes, if it was asked for; frames wait meanwhile, and none is lost."""
+        pokes, answers = self._pokes, self.skin.answers
+        if pokes is not None and isinstance(answers, Map):
+            pokes.feed(readings)
+            if pokes.enough:
+                self._adapted, self._pokes = answers.see(pokes.db_uT), None
+
+    def message(self, after_bin: int) -> tuple[bytes, int]:
+        """Give the next message of a client that has the bins before `after_bin`, and what it has then."""
+        with self._lock:
+            if self.view is None:
+                return b"", 0
+            lost_n = sum(count for name, count in self.skin.account.items() if name.startswith("skipped_"))
+            lost_n += self.skin.reader.missed_bytes_n
+            data = self.view.message(after_bin, rate_hz=self.skin.health.rate_hz, lost_bytes_n=lost_n)
+            return data, self.view.newest_bin
+
+    def state(self) -> dict[str, Any]:
+        """Say what a page shows beside the numbers."""
+        skin, found = self.skin, self.skin.found
+        state: dict[str, Any] = {
+            "what": self.what, "zeroed": skin.zeroed,
+            "model": skin.answers.about if skin.answers else "",
+            "adaptable": isinstance(skin.answers, Map),
+            "adapting": "" if self._pokes is None else f"poke {len(self._pokes) + 1} of {POKES_N}, anywhere",
+            "adapted": self._adapted,
+            "waiting": found.problem is not None,
+            "alarms": [alarm for alarm in (self.problem, *skin.alarms()) if alarm not in ("", WAITING)],
+            "recording": f"{self._recording[0]} {skin.reader.tape_problem}" if self._recording else "",
+            "recorded": self._recorded,
+        }  # fmt: skip
+        if found.problem is None:
+            layout, alarms = skin.layout, list(skin.health.alarms.values())
+            state |= {
+                "board": f"{found.port}: {found.format}, {found.scale}",
+                "seen": [[alarm.name, alarm.count_n, round(alarm.last_s - alarm.first_s, 1)] for alarm in alarms],
+                "chips_mm": layout.chips_mm.tolist(), "places_known": layout.known, "corner_mm": layout.corner_mm,
+                "skin_mm": layout.skin_mm,
+            }  # fmt: skip
+        return state
+
+    def seen(self, message_i: object) -> None:
+        """Note that a screen has shown a message."""
+        if isinstance(message_i, int) and self.view is not None:
+            with self._lock:
+                self.view.seen(message_i, self.skin.reader.unix_s())
+
+    def press(self, button: object) -> None:
+        """Do what a button of the page says; what is no button does nothing."""
+        with self._buttons:
+            if button == "zero":
+                self.skin.zero()
+            elif button == "adapt" and isinstance(self.skin.answers, Map):
+                self._pokes = Pokes() if self._pokes is None else None
+            elif button == "record" and self._recording is not None:
+                self.end_recording()
+            elif button == "record" and self.skin.found.problem is None:
+                self.begin_recording()
+
+    def begin_recording(self) -> None:
+        """Write the stream, as it comes from now on, into a new capture."""
+        folder, found = new_folder(), self.skin.found
+        try:
+            part, header = begin_capture(folder, UNTOLD, wire=found.wire, chips_n=found.chips_n, by="reskin live")
+            self.skin.reader.set_tape(Tape(part, found.wire))
+            self._recording, self._recorded = (folder, header), ""
+        except (OSError, ReskinError) as error:
+            self._recorded = str(error)
+
+    def end_recording(self) -> None:
+        if self._recording is not None:
+            (folder, header), self._recording = self._recording, None
+            self.skin.reader.set_tape(None)
+            try:
+                end_capture(folder, header)
+                self._recorded = f"recorded {folder}"
+            except OSError as error:
+                self._recorded = f"{folder}.part could not be closed: {error.strerror}"

@@ -1,0 +1,33 @@
+"""How well a force is held with our estimate as feedback, on a simulated skin between fingers.
+
+`pytest -s -o addopts= tests/benchmarks/test_gripper_benchmark.py`. Nothing is asserted: docs/live.md has the numbers.
+"""
+
+import numpy as np
+import pytest
+
+from pipeline.core.seeds import rng_for
+from pipeline.twin.shipped import load_universal
+from tests.live.gripper import AIM_N, RATE_HZ, SETTLED_S, Finger, fit, grip
+
+SKINS_N = 6
+PLACES_MM = ((8.0, 8.0), (5.0, 10.0))
+
+
+@pytest.mark.parametrize(
+    ("feedback", "aim_N"), [("network of this skin", AIM_N), ("map of simulated skins", 2 * AIM_N)]
+)
+def test_a_force_is_held(feedback, aim_N):
+    errors, within = [], []
+    for seed in range(SKINS_N):
+        models = [fit(seed)] if feedback.startswith("network") else load_universal()
+        for place_mm in PLACES_MM:
+            held = grip(Finger(seed, place_mm), models, rng_for(seed, "grip"), aim_N=aim_N)
+            error = np.abs(held[round(SETTLED_S * RATE_HZ) :, 0] / aim_N - 1)
+            errors.append(error.mean())
+            within.append((error < 0.1).mean())
+    print(f"\n{feedback}, {aim_N:g} N, {SKINS_N} skins at {len(PLACES_MM)} places each:")
+    print(f"  error of the true force: median {np.median(errors):.1%}, worst {max(errors):.1%}")
+    print(
+        f"  time within 10 %: mean {np.mean(within):.0%}; all of it in {np.sum(np.array(within) == 1)} of {len(within)}"
+    )

@@ -1,0 +1,116 @@
+"""What arrives from outside, one target a door. In: any bytes. Out: nothing; a `ReskinError` is an answer.
+
+Used by `fuzz.py`, for as long as one likes, and by `test_corpus.py` on what is committed. Refuses to know fuzzers.
+"""
+
+import asyncio
+import tempfile
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+from aiohttp import web
+from aiohttp.test_utils import make_mocked_request
+
+from pipeline.capture import arrivals, header, probe, sd_card
+from pipeline.capture.header import Wire
+from pipeline.capture.readers import READERS
+from pipeline.capture.stream import FrameStream
+from pipeline.core.errors import ReskinError
+from pipeline.live import ports
+from pipeline.live.server import Server
+from pipeline.live.session import Live
+from pipeline.predicting import read_network
+from tests.capture.headers import make_header
+
+FOLDER = Path(tempfile.mkdtemp(prefix="reskin-fuzz-"))
+WIRES = get_args(Wire)
+LIVE = Live("none", [], "a board that is not there")
+LOOP = asyncio.new_event_loop()
+
+
+def stream(data: bytes) -> None:
+    """A stream of any format: every byte is accounted for, and portions change nothing."""
+    wire, chips_n, cut_n = WIRES[data[0] % len(WIRES)], 1 + data[1] % 8, 1 + data[2]
+    whole, parts = FrameStream(wire, chips_n), FrameStream(wire, chips_n)
+    found = [whole.feed(data[3:]), whole.close()]
+    pieces = [parts.feed(data[first : first + cut_n]) for first in range(3, len(data), cut_n)] + [parts.close()]
+    account = whole.account()
+    lost_n = sum(count for name, count in account.items() if name.startswith("skipped_"))
+    assert account["frame_bytes_n"] + lost_n == account["bytes_n"] == max(len(data) - 3, 0)
+    assert parts.account() == account
+    for a, b in (("b_uT",) * 2, ("end_byte",) * 2):
+        np.testing.assert_array_equal(
+            np.concatenate([getattr(part, a) for part in found]), np.concatenate([getattr(part, b) for part in pieces])
+        )
+
+
+def page(data: bytes) -> None:
+    """What a page says on its websocket: buttons are three words, and nothing else is done."""
+    Server(LIVE, "")._listen(data.decode(errors="replace"))
+
+
+def request(data: bytes) -> None:
+    """A request's host, origin and token: it is let in only if it names this machine and itself."""
+    host, origin, token = ([*data.decode("latin-1").split("\n"), "", "", ""])[:3]
+    words = {"Host": host} | ({"Origin": origin} if origin else {})
+    asked = make_mocked_request("GET", "/?" + token.replace(" ", "+"), headers=words)
+
+    async def answer(_: web.Request) -> web.StreamResponse:
+        name, _, port = host.lower().rpartition(":") if host[-1] != "]" and ":" in host else (host.lower(), "", "")
+        assert name in ("localhost", "127.0.0.1", "[::1]"), host
+        assert not port or port.isdecimal()
+        assert not origin or origin.endswith(host)
+        return web.Response()
+
+    try:
+        LOOP.run_until_complete(Server(LIVE, "")._check(asked, answer))
+    except web.HTTPForbidden:
+        return
+
+
+def card(data: bytes) -> None:
+    """A model's card, beside no weights to speak of."""
+    (FOLDER / "m.safetensors").write_bytes(b"\x08\0\0\0\0\0\0\0{}      ")
+    (FOLDER / "m.json").write_bytes(data)
+    read_network(FOLDER / "m.safetensors")
+
+
+def _reader(layout: str, name: str) -> Callable[[bytes], None]:
+    settings = make_header(layout=layout, chips_n=1, capture="fuzz")
+
+    def read(data: bytes) -> None:
+        folder = FOLDER / layout
+        folder.mkdir(exist_ok=True)
+        (folder / name).write_bytes(data)
+        READERS[layout].read(folder, settings)
+
+    return read
+
+
+def _log(data: bytes) -> None:
+    (FOLDER / "log.csv").write_bytes(data)
+    sd_card.read_log(FOLDER / "log.csv")
+
+
+TARGETS: Mapping[str, Callable[[bytes], None]] = {
+    "stream": stream,
+    "recognise": lambda data: str(ports.recognise("port", [(data, 0.0), (b"", 1.0)])) and None,
+    "header": lambda data: header.parse(data.decode(errors="replace"), "header") and None,
+    "arrivals": lambda data: arrivals.parse(data.decode(errors="replace"), "arrivals") and None,
+    "probe": lambda data: probe.parse(data.decode(errors="replace"), "probe") and None,
+    "log": _log,
+    "table": _reader("table", "readings.csv"),
+    "lab": _reader("lab", "readings.csv"),
+    "page": page,
+    "request": request,
+    "card": card,
+}  # fmt: skip
+
+
+def feed(name: str, data: bytes) -> None:
+    """Hand bytes to a target; what a user did wrong is an answer like any other."""
+    with suppress(ReskinError):
+        TARGETS[name](data.ljust(3, b"\0") if name == "stream" else data)

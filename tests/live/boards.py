@@ -1,0 +1,128 @@
+"""Boards for tests: scripts of a quiet second and of pokes, and a model that knows their places and forces."""
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.capture import arrivals
+from pipeline.capture.header import ARRIVALS_FILE, STREAM_FILE, Clock, Wire, write_capture
+from pipeline.capture.wire import Frames
+from pipeline.core import io
+from pipeline.core.seeds import rng_for
+from pipeline.learning.architecture import draw_weights, paper_layers
+from pipeline.live.answering import Models
+from pipeline.live.emulate import open_far_end, play
+from pipeline.live.script import Script, encode_pieces
+from pipeline.live.skin import Readings, Skin
+from tests.capture.headers import make_header
+
+RATE_HZ = 400.0
+QUIET_S, POKED_S = 1.5, 1.0
+PAUSE_S = 2.0
+PLACES = np.array([[4.0, 12.0, 0.8], [12.0, 4.0, 1.6]])  # x and y in mm, force in N: of pokes, in turn
+INPUT_SCALE_uT = 300.0
+
+
+def make_script(
+    *, pokes_n: int = 2, chips_n: int = 5, wire: Wire = "binary", rate_hz: float = RATE_HZ, quiet_s: float = QUIET_S
+) -> Script:
+    """Make a quiet start, then pokes with pauses; noise of 3 uT on a grid of 0.15 and 0.242 uT."""
+    frames_n = round((quiet_s + pokes_n * (POKED_S + PAUSE_S)) * rate_hz)
+    t_s, rng = np.arange(frames_n) / rate_hz, rng_for(0, "board")
+    poke_i, since_s = np.divmod(t_s - quiet_s, POKED_S + PAUSE_S)
+    poked = (t_s >= quiet_s) & (since_s < POKED_S)
+    b_uT = 500.0 * rng.standard_normal((chips_n, 3)) + 3 * rng.standard_normal((frames_n, chips_n, 3))
+    b_uT[poked] += changes_uT(chips_n)[poke_i[poked].astype(int) % 2].reshape(-1, chips_n, 3)
+    step_uT = np.array([0.15, 0.15, 0.242])
+    b_uT = (np.rint(b_uT / step_uT) * step_uT).reshape(frames_n, -1).astype(np.float32)
+    temperature_degC = (25 + 0.02 * rng.standard_normal((frames_n, chips_n))).astype(np.float32)
+    frames = Frames(b_uT, temperature_degC, t_s.astype(np.float32).astype(np.float64), np.zeros(frames_n, np.int64))
+    return Script("recorded", wire, frames, encode_pieces(frames, wire), t_s)
+
+
+def changes_uT(chips_n: int) -> np.ndarray:
+    """Give the changes of field of the two pokes [2 ch], which no magnet far away makes."""
+    return 200.0 * rng_for(1, "pokes").standard_normal((2, 3 * chips_n))
+
+
+def write_model(folder: Path, name: str = "model", *, off_mm: float = 0.0, chips_n: int = 5) -> Path:
+    """Write a network that is linear, and right for the two pokes; `off_mm` off along x."""
+    linear = np.linalg.lstsq(changes_uT(chips_n) / INPUT_SCALE_uT, PLACES - (off_mm, 0, 0), rcond=None)[0].T  # [3 ch]
+    weights = {key: 0 * value for key, value in draw_weights(paper_layers(3 * chips_n), rng_for(0, "net")).items()}
+    weights["layer1.weight"][:6] = np.concatenate([linear, -linear])  # a ReLU passes one of the two
+    for layer_i in range(2, 6):
+        weights[f"layer{layer_i}.weight"][:6, :6] = np.eye(6)
+    weights["layer6.weight"][:, :6] = np.hstack([np.eye(3), -np.eye(3)])
+    scaler = {"input_shift": np.zeros(3 * chips_n), "input_scale": np.full(3 * chips_n, INPUT_SCALE_uT)}
+    scaler |= {"target_shift": np.array([off_mm * 2, 0, 0]), "target_scale": np.ones(3)}
+    tensors = weights | {key: value.astype(np.float32) for key, value in scaler.items()}
+    io.write_tensors(folder / f"{name}.safetensors", tensors, {})
+    shown = {"quantity": "change of field", "unit": "uT", "channels_n": 3 * chips_n}
+    card = {
+        "format": "reskin-model/3", "scene": "quick", "recipe": {"inputs": "raw", "architecture": "paper"},
+        "input": shown, "output": {"x_mm": "mm", "y_mm": "mm", "Fz_N": "N"}, "collapsed": False,
+    }  # fmt: skip
+    io.write_json(folder / f"{name}.json", card)
+    return folder / f"{name}.safetensors"
+
+
+def write_script(script: Script, folder: Path) -> Path:
+    """Write a script as a capture that was recorded."""
+    ends = np.cumsum([len(piece) for piece in script.pieces])
+    files = {
+        STREAM_FILE: b"".join(script.pieces),
+        ARRIVALS_FILE: arrivals.render(arrivals.Arrivals(ends, 5 + script.t_s)).encode(),
+    }
+    clock = Clock(kind="arrivals", rate_hz=None, marks=())
+    chips_n = script.frames.temperature_degC.shape[1]
+    header = make_header(capture=folder.name, layout="native", wire=script.wire, chips_n=chips_n, clock=clock)
+    write_capture(folder, header, files)
+    return folder
+
+
+class PlayedReader:
+    """Gives a script's bytes at the script's own times, without port and thread, so that no load disturbs them."""
+
+    plugged_in, problem, missed_bytes_n = True, "", 0
+
+    def __init__(self, script: Script, *, frames_n: int = 20) -> None:
+        self._script, self._frames_n, self._i = script, frames_n, 0
+
+    @property
+    def at_end(self) -> bool:
+        return self._i >= len(self._script)
+
+    def unix_s(self) -> float:
+        return float(self._script.t_s[min(self._i, len(self._script) - 1)])
+
+    def take(self, _wait_s: float) -> list[tuple[bytes, float]]:
+        pieces = self._script.pieces[self._i : self._i + self._frames_n]
+        self._i += len(pieces)
+        return [(b"".join(pieces), self.unix_s())] if pieces else []
+
+
+def played(script: Script, models: Models = ()) -> tuple[Skin, list[Readings]]:
+    """Take a skin through a script as fast as it goes; give it, and all that it read."""
+    skin, readings = Skin("played", models), []
+    skin.reader = reader = PlayedReader(script)
+    while not reader.at_end:
+        if (found := skin.poll(0.0)) is not None:
+            readings.append(found)
+    return skin, readings
+
+
+@contextmanager
+def plugged_in(script: Script, port: str = "pty", **how: object) -> Iterator[str]:
+    """Play a script beside the test; give the name of its port."""
+    end, stop = open_far_end(port), threading.Event()
+    player = threading.Thread(target=play, args=[script, end, stop], kwargs=how)
+    player.start()
+    try:
+        yield end.name
+    finally:
+        stop.set()
+        player.join()
+        end.unplug()

@@ -1,0 +1,117 @@
+"""A gripper with a simulated skin on its finger: it closes on a spring, and one line holds the force that we estimate.
+
+Frames go through the wire format, the no-load reading and the estimate, as a board's do. In: a skin, a spring. Out: the
+true force and the estimate, step by step.
+"""
+
+import warnings
+from dataclasses import dataclass, field
+
+import numpy as np
+from sklearn.neural_network import MLPRegressor
+
+import reskin
+from pipeline.capture.wire import Frames
+from pipeline.core.seeds import rng_for
+from pipeline.learning.inputs import Scaler, fit_standard
+from pipeline.live.answering import Models
+from pipeline.live.script import encode_pieces
+from pipeline.live.skin import Skin
+from pipeline.trials.networks import Network
+from tests.live.boards import RATE_HZ
+
+AIM_N, GAIN_MM_N = 0.5, 0.1
+PERIOD_S, SETTLED_S = 6.0, 1.0  # in which the object stiffens and gives way; from when on the force is judged
+SOFT_N_MM, HARD_N_MM = 0.3, 3.0
+NOISE_uT, STEP_uT = 3.0, np.array([0.15, 0.15, 0.242])
+DEPTHS_MM = np.linspace(0.02, 1.5, 60)
+
+
+@dataclass(frozen=True)
+class Fitted(Network):
+    """A network of one skin, fitted to labelled pokes all over it, as a lab does with its own (paper section 5)."""
+
+    fitted: MLPRegressor = field(default_factory=MLPRegressor)
+
+    def __call__(self, db_uT: np.ndarray) -> np.ndarray:
+        scaler = Scaler.of_arrays(self.tensors)
+        return scaler.decode(self.fitted.predict(scaler.encode(db_uT)).astype(np.float32))
+
+
+def fit(seed: int, pokes_n: int = 600) -> Fitted:
+    """Fit a network to simulated pokes of a skin, each read once."""
+    rng = rng_for(seed, "gripper")
+    pokes = np.column_stack([rng.uniform(2, 14, (pokes_n, 2)), rng.uniform(DEPTHS_MM[0], DEPTHS_MM[-1], pokes_n)])
+    noload_uT, b_uT, force_N = reskin.simulate_pokes(reskin.draw_skin(seed=seed), pokes, seed=seed)
+    db_uT, target = (b_uT - noload_uT).astype(np.float32), np.column_stack([pokes[:, :2], force_N]).astype(np.float32)
+    scaler = fit_standard(db_uT, target)
+    net = MLPRegressor(
+        hidden_layer_sizes=(64, 64), solver="lbfgs", alpha=1e-3, max_iter=1500, max_fun=10**6, random_state=seed
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that it could go on
+        net.fit(scaler.encode(db_uT), scaler.encode_target(target))
+    card = {"input": {"channels_n": 15}, "recipe": {"inputs": "raw"}}
+    return Fitted(card, scaler.arrays(), net)
+
+
+class Finger:
+    """What a skin's chips read when its middle is pressed with a force: simulated once, then looked up."""
+
+    def __init__(self, seed: int, at_mm: tuple[float, float] = (8.0, 8.0)) -> None:
+        pokes = np.column_stack([np.tile(at_mm, (len(DEPTHS_MM), 1)), DEPTHS_MM])
+        quiet = {"noise_xy_uT": 0.0, "noise_z_uT": 0.0}  # each frame has its own
+        noload_uT, b_uT, force_N = reskin.simulate_pokes(reskin.draw_skin(seed=seed), pokes, seed=seed, chip=quiet)
+        self.noload_uT = noload_uT.mean(axis=0)
+        self._change_uT = np.vstack([np.zeros(15), b_uT - self.noload_uT])
+        self._force_N, self._depth_mm = np.append(0, force_N), np.append(0, DEPTHS_MM)
+
+    def force_at(self, closed_mm: float, stiffness_N_mm: float) -> float:
+        """Find where skin and spring, one after the other, bear the same force."""
+        total_mm = self._depth_mm + self._force_N / stiffness_N_mm
+        return float(np.interp(max(closed_mm, 0.0), total_mm, self._force_N))
+
+    def read(self, force_N: float) -> np.ndarray:
+        return self.noload_uT + np.array([np.interp(force_N, self._force_N, column) for column in self._change_uT.T])
+
+
+class Wire:
+    """A reader whose next frame is of the force now."""
+
+    plugged_in, problem, missed_bytes_n = True, "", 0
+
+    def __init__(self, finger: Finger, rng: np.random.Generator) -> None:
+        self._finger, self._rng, self.force_N, self.frames_n = finger, rng, 0.0, 0
+
+    @property
+    def taken_s(self) -> float:
+        return self.unix_s()
+
+    def unix_s(self) -> float:
+        return self.frames_n / RATE_HZ
+
+    def take(self, _wait_s: float) -> list[tuple[bytes, float]]:
+        self.frames_n += 1
+        b_uT = self._finger.read(self.force_N) + NOISE_uT * self._rng.standard_normal(15)
+        b_uT = (np.rint(b_uT.reshape(5, 3) / STEP_uT) * STEP_uT).reshape(1, 15).astype(np.float32)
+        warm_degC = 25 + 0.02 * self._rng.standard_normal((1, 5)).astype(np.float32)
+        frames = Frames(b_uT, warm_degC.astype(np.float32), np.full(1, np.nan), np.zeros(1, np.int64))
+        return [(encode_pieces(frames, "binary")[0], self.unix_s())]
+
+
+def grip(
+    finger: Finger, models: Models, rng: np.random.Generator, *, aim_N: float = AIM_N, seconds: float = PERIOD_S
+) -> np.ndarray:
+    """Hold an object that stiffens tenfold and gives way; give true and estimated force in N of every step [f 2]."""
+    skin, wire, closed_mm, held = Skin("gripper", models), Wire(finger, rng), 0.0, []
+    skin.reader = wire
+    while len(held) < seconds * RATE_HZ:
+        readings = skin.poll(0.0, latest=True)
+        if readings is None or not skin.zeroed:
+            continue
+        estimate_N = float(readings.answer[-1, 2])
+        held.append((wire.force_N, estimate_N))
+        closed_mm += GAIN_MM_N * (aim_N - estimate_N)  # the controller
+        share = (1 - np.cos(2 * np.pi * len(held) / RATE_HZ / PERIOD_S)) / 2
+        wire.force_N = finger.force_at(closed_mm, SOFT_N_MM * (HARD_N_MM / SOFT_N_MM) ** share)
+    return np.array(held)

@@ -1,0 +1,81 @@
+"""The map that comes with the project answers when no model is named, learns from pokes, and knows a stranger."""
+
+import numpy as np
+import pytest
+
+import reskin
+from pipeline.core.seeds import rng_for
+from pipeline.live.adapting import POKES_N, Pokes
+from pipeline.live.answering import Map
+from pipeline.live.script import Script, encode_pieces
+from pipeline.live.skin import UNLIKE, Readings
+from pipeline.twin.shipped import load_universal
+from tests.live.boards import make_script, played
+
+QUIET_N, POKED_N = 600, 100
+
+
+@pytest.fixture(scope="module")
+def simulated():
+    """A simulated skin's no-load reading, and pokes all over it: fields, places, forces."""
+    places = np.column_stack([rng_for(0, "places").uniform(3, 13, (POKES_N, 2)), np.full(POKES_N, 1.0)])
+    noload_uT, b_uT, force_N = reskin.simulate_pokes(reskin.draw_skin(seed=3), places, seed=3)
+    return noload_uT, b_uT, places[:, :2], force_N
+
+
+def poked(simulated, chips_on_n: int = 0):
+    """A script of a quiet start and of all pokes, with a pause after each; chips may come so many places later."""
+    noload_uT, b_uT, _, _ = simulated
+    script = make_script(pokes_n=0, quiet_s=(QUIET_N + 2 * POKED_N * POKES_N) / 400)
+    poke_i, since_n = np.divmod(np.arange(len(script)) - QUIET_N, 2 * POKED_N)
+    clean_uT = np.where(((poke_i >= 0) & (since_n < POKED_N))[:, None], b_uT[poke_i], noload_uT.mean(axis=0))
+    noise_uT = script.frames.b_uT - script.frames.b_uT.mean(axis=0)
+    script.frames.b_uT[:] = np.roll(clean_uT, 3 * chips_on_n, axis=1) + noise_uT
+    return Script("simulated", "binary", script.frames, encode_pieces(script.frames, "binary"), script.t_s)
+
+
+def test_without_a_model_the_map_answers_and_says_how_sure_it_is(simulated):
+    skin, readings = played(poked(simulated), load_universal())
+    answers = np.concatenate([each.answer[each.contact] for each in readings])
+    sd_mm = np.concatenate([each.sd_mm[each.contact] for each in readings])
+    true = np.repeat(simulated[2], POKED_N, axis=0)
+    assert len(answers) == pytest.approx(len(true), abs=20)
+    error_mm = np.abs(answers[: len(true), :2] - true[: len(answers)])
+    assert np.median(error_mm) < 1.0
+    assert 0.2 < np.median(error_mm) / np.median(sd_mm) < 2.0
+    assert skin.health.alarms == {}
+
+
+def test_a_board_with_its_chips_in_another_order_is_none_that_it_knows(simulated):
+    skin, _ = played(poked(simulated, chips_on_n=1), load_universal())
+    assert skin.health.alarms[UNLIKE].count_n > 0.5 * POKED_N * POKES_N
+
+
+def test_a_dozen_pokes_are_gathered_one_a_contact_and_the_map_learns_from_them(simulated):
+    _, readings = played(poked(simulated), load_universal())
+    pokes = Pokes()
+    for each in readings:
+        pokes.feed(each)
+    assert pokes.enough
+    change_uT = simulated[1] - simulated[0].mean(axis=0)
+    np.testing.assert_allclose(pokes.db_uT, change_uT, atol=30)  # the strongest of 200 readings with noise of 3 uT
+    answers = Map(load_universal())
+    answers.zero(simulated[0])
+    assert "adapted to 12 pokes: standard deviation of a place" in answers.see(pokes.db_uT)
+    before = answers(pokes.db_uT.astype(np.float32))
+    answers.zero(simulated[0])  # what it has seen is kept
+    np.testing.assert_allclose(answers(pokes.db_uT.astype(np.float32)).answer, before.answer, rtol=1e-6)
+
+
+def test_a_knock_is_no_poke():
+    pokes, db_uT = Pokes(), np.full((6, 15), 100.0, np.float32)
+    contact = np.array([True, True, False, True, False, False])
+    pokes.feed(Readings(np.arange(6.0), db_uT, db_uT, np.zeros((6, 3)), np.zeros((6, 2)), contact))
+    assert len(pokes) == 0
+
+
+def test_on_a_board_of_other_chips_it_says_that_it_cannot_answer():
+    skin, readings = played(make_script(pokes_n=1, chips_n=4), load_universal())
+    assert skin.answers is None
+    assert "no place, no force: the map of simulated skins is for five chips; name a model" in skin.alarms()
+    assert all(np.isnan(each.answer).all() for each in readings)

@@ -1,0 +1,162 @@
+"""The page in a real Chromium: a poke appears at its place, and zero, record and adapt work, by button and by key.
+
+Skipped where there is none: RESKIN_BROWSER names one, else it is looked for on the path. It is driven through its own
+debugging protocol, so that no package is needed. RESKIN_SCREENSHOTS names a folder for what is to be looked at.
+"""
+
+import asyncio
+import base64
+import os
+import shutil
+from collections.abc import Callable
+from itertools import count
+from pathlib import Path
+
+import aiohttp
+import numpy as np
+import pytest
+
+from pipeline.capture.header import HEADER_FILE
+from pipeline.live.adapting import POKES_N
+from pipeline.predicting import read_network
+from pipeline.twin.shipped import load_universal
+from tests.live.boards import PLACES, make_script, plugged_in, write_model
+from tests.live.test_answering import poked, simulated  # noqa: F401 - a fixture
+from tests.live.test_server import LONG_S, serve
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
+BROWSER = os.environ.get("RESKIN_BROWSER") or next(filter(None, map(shutil.which, NAMES)), None)
+FLAGS = ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--remote-debugging-port=0")
+WIDTHS_PX = (400, 1400)
+# The colour of the dot where a place in mm is drawn, from the page's own numbers.
+DOT = """((x, y) => { const board = document.getElementById("board"), ratio = devicePixelRatio, margin = 12,
+  [wide, high] = state.skin_mm, [left, bottom] = state.corner_mm,
+  scale = Math.min((board.clientWidth - 2 * margin) / wide, (innerHeight * .8 - 2 * margin) / high);
+  return last.contact ? [...board.getContext("2d").getImageData(ratio * (margin + (x - left) * scale),
+    ratio * (margin + (bottom + high - y) * scale), 1, 1).data].slice(0, 3) : []; })"""
+pytestmark = [
+    pytest.mark.skipif(BROWSER is None, reason=f"no browser: no RESKIN_BROWSER, on the path none of {NAMES}"),
+    pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo-terminals"),
+    pytest.mark.filterwarnings("ignore::ResourceWarning"),
+    pytest.mark.timeout(300),
+]
+
+
+class Tab:
+    """A page of a browser, driven through its debugging protocol."""
+
+    def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
+        self._socket, self._numbers, self.errors = socket, count(1), []
+
+    async def call(self, method: str, **words: object) -> dict:
+        number = next(self._numbers)
+        await self._socket.send_json({"id": number, "method": method, "params": words})
+        while True:
+            said = await self._socket.receive_json(timeout=LONG_S)
+            if said.get("method") == "Runtime.exceptionThrown":
+                self.errors.append(said["params"]["exceptionDetails"]["text"])
+            if said.get("id") == number:
+                assert "error" not in said, said
+                return said["result"]
+
+    async def value(self, words: str) -> object:
+        return (await self.call("Runtime.evaluate", expression=words, returnByValue=True))["result"].get("value")
+
+    async def text(self, name: str) -> str:
+        return str(await self.value(f"document.getElementById('{name}').innerText"))
+
+    async def until(self, words: str, is_so: Callable[[object], bool] = bool) -> object:
+        for _ in range(round(LONG_S / 0.02)):
+            if is_so(found := await self.value(words)):
+                return found
+            await asyncio.sleep(0.02)
+        raise AssertionError(f"never: {words}; last {found}")
+
+    async def press_key(self, key: str) -> None:
+        for kind in ("keyDown", "keyUp"):
+            await self.call("Input.dispatchKeyEvent", type=kind, key=key, text=key if kind == "keyDown" else "")
+
+    async def look(self, name: str) -> None:
+        """Nothing is cut off at the width of a phone and of a screen; keep pictures, if somebody wants to look."""
+        for wide in WIDTHS_PX:
+            await self.call(
+                "Emulation.setDeviceMetricsOverride", width=wide, height=900, deviceScaleFactor=1, mobile=False
+            )
+            await asyncio.sleep(0.3)
+            assert await self.value("document.documentElement.scrollWidth <= innerWidth")
+            if folder := os.environ.get("RESKIN_SCREENSHOTS"):
+                await self.until("last && last.contact && !isNaN(last.x)")
+                shot = await self.call("Page.captureScreenshot", captureBeyondViewport=True)
+                Path(folder, f"live-{name}-{wide}.png").write_bytes(base64.b64decode(shot["data"]))
+
+
+def in_browser(folder: Path, act: Callable) -> Callable:
+    """Make an action on a server's address into one on a tab that shows it."""
+
+    async def shown(address: str, client: aiohttp.ClientSession) -> None:
+        profile = folder / "profile"
+        browser = await asyncio.create_subprocess_exec(
+            BROWSER, *FLAGS, f"--user-data-dir={profile}", stderr=asyncio.subprocess.DEVNULL
+        )
+        try:
+            said = profile / "DevToolsActivePort"
+            while not (said.exists() and "\n" in said.read_text()):
+                await asyncio.sleep(0.05)
+            debugging = f"http://127.0.0.1:{said.read_text().split()[0]}"
+            async with client.put(f"{debugging}/json/new?about:blank") as answer:
+                where = (await answer.json())["webSocketDebuggerUrl"]
+            async with client.ws_connect(where, max_msg_size=0) as socket:
+                tab = Tab(socket)
+                await tab.call("Runtime.enable")
+                await tab.call("Page.navigate", url=address)
+                await tab.until("typeof state === 'object' && state.zeroed === true")
+                await act(tab)
+                assert tab.errors == []
+        finally:
+            browser.kill()
+            await browser.wait()
+
+    return shown
+
+
+def test_a_poke_is_drawn_at_its_place_and_zero_and_record_work(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    async def act(tab: Tab) -> None:
+        for x_mm, y_mm, force_N in PLACES:
+            near = f"last && last.contact && Math.hypot(last.x - {x_mm}, last.y - {y_mm}) < .5 && !dirty"
+            blue = await tab.until(f"{near} ? {DOT}({x_mm}, {y_mm}) : []")
+            assert np.abs(np.array(blue) - (0x0B, 0x53, 0x94)).max() < 3  # --link
+            await tab.until(
+                f"({near}) && document.getElementById('place').textContent.startsWith('x {x_mm:.0f}') || "
+                f"({near}) && document.getElementById('place').textContent.startsWith('x {x_mm - 1:.0f}')"
+            )
+            assert abs(float((await tab.text("force")).split()[0]) - force_N) < 0.5
+        assert "400" in await tab.text("rate") or float((await tab.text("rate")).split()[0]) > 200
+        await tab.look("network")
+        await tab.value("document.getElementById('record').click()")
+        await tab.until("state.recording")
+        await tab.press_key("r")
+        await tab.until("state.recorded.startsWith('recorded')")
+        await tab.press_key("z")
+        await tab.until("state.zeroed", lambda told: told is False)
+        await tab.until("state.zeroed")
+        assert await tab.value("document.getElementById('adapt').disabled")  # a network does not learn
+
+    with plugged_in(make_script(pokes_n=4), loop=True) as name:
+        serve(name, [read_network(write_model(tmp_path))], in_browser(tmp_path, act))
+    (folder,) = (tmp_path / "captures").iterdir()
+    assert (folder / HEADER_FILE).is_file()
+
+
+def test_a_dozen_pokes_adapt_the_map_and_its_ellipse_is_drawn(tmp_path, simulated):  # noqa: F811
+    async def act(tab: Tab) -> None:
+        await tab.until("last && last.contact && last.sdX > .1 && last.sdY > .1")
+        await tab.press_key("a")
+        await tab.until(f"state.adapting.includes('of {POKES_N}')")
+        await tab.until("state.adapted.startsWith('adapted to 12 pokes')")
+        assert "mm before" in await tab.text("adapting")
+        await tab.look("map")
+
+    with plugged_in(poked(simulated), loop=True) as name:
+        serve(name, load_universal(), in_browser(tmp_path, act))

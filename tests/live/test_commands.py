@@ -1,0 +1,26 @@
+"""Commands without options: the one board that is there is found, and recorded in its own format."""
+
+from pipeline.capture.header import HEADER_FILE, parse
+from pipeline.live import commands, ports
+from tests.live.boards import make_script, plugged_in
+
+
+def test_a_recording_needs_no_option_when_one_board_is_there(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    with plugged_in(make_script(chips_n=4, wire="text-txyz"), loop=True) as name:
+        monkeypatch.setattr(ports, "port_names", lambda: [name])
+        commands.record(None, None, None, None, None, None, 115200, 0.5)
+    said = capsys.readouterr().out
+    assert f"{name}: text-txyz, 4 chips" in said
+    (folder,) = (tmp_path / "captures").iterdir()
+    header = parse((folder / HEADER_FILE).read_text(), "header")
+    assert (header.wire, header.chips_n, header.capture) == ("text-txyz", 4, folder.name)
+
+
+def test_a_page_without_options_is_that_of_the_one_board(monkeypatch):
+    shown = {}
+    monkeypatch.setattr("pipeline.live.server.serve", lambda port, models, **words: shown.update(words, port=port))
+    monkeypatch.setattr("pipeline.live.ports.the_board", lambda: ports.Found("/dev/ttyACM0", None))
+    commands.live(None, None, None, None, "127.0.0.1", 8765)
+    assert (shown["port"], shown["host"], shown["http_port"]) == ("/dev/ttyACM0", "127.0.0.1", 8765)
+    assert shown["what"] == "a board"

@@ -1,0 +1,75 @@
+"""The examples of docs/live.md run as they stand, with stand-ins for the packages that are not ours."""
+
+import re
+import sys
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+
+import reskin
+from pipeline.live.skin import Contact
+from tests.stages.checkout import ROOT
+
+EXAMPLES = dict(re.findall(r"```python (\w+)\n(.*?)```", (ROOT / "docs/live.md").read_text(), re.DOTALL))
+
+
+class OneContact:
+    """A skin that is touched once."""
+
+    def __init__(self, port: str) -> None:
+        self.port = port
+
+    def __enter__(self):
+        contact = Contact(12.5, 4.0, 6.0, 0.5, (0.1, 0.2), np.arange(15, dtype=np.float32), ("nothing comes",))
+        return iter([contact])
+
+    def __exit__(self, *_: object) -> None: ...
+
+
+@pytest.fixture
+def run(monkeypatch):
+    def run(name: str, **modules: object) -> None:
+        for path, content in modules.items():
+            module = ModuleType(path.replace("__", "."))
+            vars(module).update(content)
+            monkeypatch.setitem(sys.modules, module.__name__, module)
+        monkeypatch.setattr(reskin, "open", OneContact)
+        exec(EXAMPLES[name], {})
+
+    return run
+
+
+def test_a_ros_2_node_publishes_each_contact_with_its_time(run):
+    published = []
+    node = SimpleNamespace(create_publisher=lambda *_: SimpleNamespace(publish=published.append))
+
+    def message(**words: object) -> SimpleNamespace:
+        return SimpleNamespace(**words, header=SimpleNamespace(stamp=SimpleNamespace()))
+
+    ros = {"init": lambda: None, "create_node": lambda _: node}
+    run("ros2", rclpy=ros, skin_msgs={}, skin_msgs__msg={"Contact": message})
+    (told,) = published
+    assert (told.x_mm, told.y_mm, told.force_n, told.sd_mm, told.alarms) == (
+        4.0,
+        6.0,
+        0.5,
+        [0.1, 0.2],
+        ["nothing comes"],
+    )
+    assert (told.header.stamp.sec, told.header.stamp.nanosec) == (12, 500_000_000)
+
+
+def test_a_lerobot_dataset_gets_a_feature_of_field_and_estimate(run):
+    frames, saved = [], []
+
+    class Dataset:
+        @staticmethod
+        def create(_name: str, *, fps: int, features: dict) -> SimpleNamespace:
+            assert features["observation.skin"]["shape"] == (len(features["observation.skin"]["names"]),)
+            return SimpleNamespace(add_frame=frames.append, save_episode=lambda: saved.append(fps))
+
+    names = {"lerobot": {}, "lerobot__datasets": {}, "lerobot__datasets__lerobot_dataset": {"LeRobotDataset": Dataset}}
+    run("lerobot", **names)
+    np.testing.assert_allclose(frames[0]["observation.skin"], [4.0, 6.0, 0.5, *range(15)])
+    assert saved == [30]

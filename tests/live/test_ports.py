@@ -1,0 +1,97 @@
+"""A board is recognised from its bytes alone, whatever it sends; what is no board is said to be none."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.core.errors import CaptureError
+from pipeline.core.seeds import rng_for
+from pipeline.live import ports
+from pipeline.live.inject import inject, parse
+from tests.live.boards import make_script, plugged_in
+
+CHUNK_N = 3  # frames, of which the cuts lie anywhere
+
+
+def chunks_of(script, cut_n=31):
+    """The script's bytes as a port that is opened in the middle of a frame hands them over."""
+    data = b"".join(script.pieces)[cut_n:]
+    size = CHUNK_N * len(script.pieces[0])
+    every_s = CHUNK_N * script.duration_s / len(script)
+    return [(data[first : first + size], every_s * i) for i, first in enumerate(range(0, len(data), size))]
+
+
+@pytest.mark.parametrize("wire", ["binary", "binary-clock", "text-xyzt", "text-txyz"])
+@pytest.mark.parametrize(("chips_n", "rate_hz"), [(1, 400.0), (5, 400.0), (40, 133.0)])
+def test_format_chips_rate_and_scale_are_told_from_the_bytes(wire, chips_n, rate_hz):
+    script = make_script(pokes_n=0, chips_n=chips_n, wire=wire, rate_hz=rate_hz)
+    found = ports.recognise("port", chunks_of(script))
+    assert (found.problem, found.wire, found.chips_n) == (None, wire, chips_n)
+    assert found.rate_hz == pytest.approx(rate_hz, rel=0.03)
+    np.testing.assert_allclose(found.lsb_uT, (0.15, 0.242), rtol=0.06)  # text has two decimals
+    assert found.gain_sel == 7
+    assert f"{chips_n} chips" in str(found)
+
+
+def test_what_is_no_board_is_told_as_such():
+    script = make_script(pokes_n=0)
+    wrong_baud = chunks_of(inject(script, parse("wrong-baud@0+99")))
+    assert "another baud rate" in str(ports.recognise("port", wrong_baud))
+    assert "no byte came" in str(ports.recognise("port", []))
+    assert "must be one that opens" in str(ports.look("/dev/none"))
+
+
+@given(st.binary(max_size=3000), st.integers(1, 700))
+def test_any_bytes_are_a_board_or_none_and_never_an_error(data, size):
+    chunks = [(data[first : first + size], 0.01 * first) for first in range(0, len(data), size)]
+    assert str(ports.recognise("port", chunks)).startswith("port: ")
+
+
+@given(st.integers(0, 2**32), st.integers(1, 4))
+def test_frames_of_any_numbers_are_a_board(seed, chips_n):
+    rng = rng_for(seed, "numbers")
+    values = rng.integers(0, 2**32, (40, 4 * chips_n), dtype=np.uint32)
+    values[rng.random(values.shape) < 0.5] = np.float32(25).view(np.uint32)
+    data = b"".join(row.tobytes() + b"\r\n" for row in values)
+    assert str(ports.recognise("port", [(data, 0.0), (data, 1.0)])).startswith("port: ")
+
+
+def test_chips_at_rest_without_noise_show_no_scale():
+    script = make_script(pokes_n=0)
+    still = replace(script, pieces=[script.pieces[0]] * len(script))
+    assert "steps not seen yet" in str(ports.recognise("port", chunks_of(still)))
+
+
+def test_the_one_board_is_found_among_ports_and_two_are_one_too_many(tmp_path):
+    script = make_script(pokes_n=1)
+    with plugged_in(script, loop=True) as name, plugged_in(script, "tcp", loop=True) as other:
+        assert ports.the_board([name, "/dev/none"]).port == name
+        with pytest.raises(CaptureError, match=r"the board must be one, .*; got .*5 chips.*; .*5 chips"):
+            ports.the_board([name, other])
+    with pytest.raises(CaptureError, match="no serial port at all"):
+        ports.the_board([])
+
+
+class TestHunt:
+    def hunt(self, *seen):
+        """Hunt over lists of ports as they are seen, one a look; the last stays."""
+        looks, said = iter(seen), []
+        last = [set(seen[-1])]
+
+        def names():
+            last[0] = set(next(looks, last[0]))
+            return last[0]
+
+        return ports.hunt(said.append, names=names, pause=lambda _: None, hunting_s=1.0), said
+
+    def test_the_port_that_goes_and_comes_is_the_board(self):
+        found, said = self.hunt("ab", "ab", "ab", "b", "b", "b", "bc")
+        assert found == "c"  # it may come back under another name
+        assert said == ["Unplug the board.", "a went. Plug it in again."]
+
+    def test_a_board_that_is_never_unplugged_is_waited_for_so_long(self):
+        with pytest.raises(CaptureError, match="a port that goes must be seen within 1 s"):
+            self.hunt("ab")

@@ -1,0 +1,166 @@
+"""A new user's way with a board that is not there, in real processes: emulate, ports, record, decode, live."""
+
+import asyncio
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+
+import aiohttp
+import numpy as np
+import pytest
+
+from pipeline.capture.header import HEADER_FILE, parse
+from pipeline.core import io
+from pipeline.preparing import Labels, native
+from tests.live.boards import PLACES, make_script, write_model, write_script
+from tests.live.test_server import until
+from tests.stages.checkout import ROOT
+
+LONG_S = 120.0  # a process that imports torch on a busy machine
+pytestmark = [pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo-terminals"), pytest.mark.timeout(900)]
+
+
+class Shell:
+    """Runs `reskin` in a folder, and ends what it left running."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.running = folder, []
+
+    def start(self, *words: object) -> subprocess.Popen:
+        command = [sys.executable, "-m", "pipeline.cli", *map(str, words)]
+        environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1", "OMP_NUM_THREADS": "1"}
+        process = subprocess.Popen(
+            command, cwd=self.folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        self.running.append(process)
+        return process
+
+    def run(self, *words: object) -> str:
+        process = self.start(*words)
+        said, complained = process.communicate(timeout=LONG_S)
+        assert process.returncode == 0, complained
+        return said
+
+    def close(self) -> None:
+        for process in self.running:
+            process.kill()
+            process.communicate()
+
+
+@pytest.fixture
+def shell(tmp_path) -> Iterator[Shell]:
+    with closing(Shell(tmp_path)) as shell:
+        yield shell
+
+
+def wait_until(is_so: Callable[[], bool]) -> None:
+    end_s = time.monotonic() + LONG_S
+    while not is_so():
+        assert time.monotonic() < end_s
+        time.sleep(0.05)
+
+
+def test_a_board_is_found_recorded_and_seen_at_work_and_its_faults_are_told(shell, tmp_path):
+    capture, link = write_script(make_script(pokes_n=4), tmp_path / "c0"), tmp_path / "board"
+    board = shell.start("emulate", capture, "--port", link, "--loop", "--fault", "crlf@1+1")
+    wait_until(link.is_symlink)
+
+    assert "binary, 5 chips, " in shell.run("ports", link)
+
+    said = shell.run("record", "--port", link, "--seconds", 2.0, "--out", "run1")
+    assert "duration after 2" in said
+    stream = tmp_path / "run1/stream.bin"
+    assert parse((tmp_path / "run1" / HEADER_FILE).read_text(), "header").chips_n == 5
+    shell.run("decode", stream, "--out", "run1.parquet")
+    assert len(io.read_table(tmp_path / "run1.parquet")) >= stream.stat().st_size // 82 - 2
+
+    board.send_signal(signal.SIGINT)
+    assert board.wait(timeout=LONG_S) == 0
+    assert not link.is_symlink()
+
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        http_port = free.getsockname()[1]
+    page = shell.start("live", "--port", link, "--model", write_model(tmp_path), "--http-port", http_port)
+    assert "open http://localhost" in page.stdout.readline()  # it waits for the board
+    board = shell.start("emulate", capture, "--port", link, "--loop", "--fault", "stall@5+2", "--fault", "unplug@11+2")
+    asyncio.run(look(f"http://localhost:{http_port}/live"))
+    page.send_signal(signal.SIGINT)
+    assert page.wait(timeout=LONG_S) == 0
+
+
+async def look(address: str) -> None:
+    """See a poke at its place, and what is wrong with the board."""
+    async with aiohttp.ClientSession() as client, connect(client, address) as page:
+        await until(page, lambda told: told.get("zeroed") is True)
+        words, near_n = "", 0
+        for _ in range(6000):
+            told = await until(page, lambda told: True)
+            words += " ".join(told.get("alarms", []))
+            if told.get("contact") == 1:
+                found = np.array([told["x_mm"], told["y_mm"], told["F_N"]])
+                near_n += int(np.abs(found - PLACES).max(axis=1).min() < 1.0)
+            if near_n >= 10 and "nothing comes" in words and "unplugged" in words:
+                return
+        raise AssertionError(f"{near_n} messages of pokes near their place; told: {words[:500]}")
+
+
+class connect:
+    """A websocket to a server that may still be starting."""
+
+    def __init__(self, client: aiohttp.ClientSession, address: str) -> None:
+        self._client, self._address = client, address
+
+    async def __aenter__(self) -> aiohttp.ClientWebSocketResponse:
+        end_s = time.monotonic() + LONG_S
+        while True:
+            try:
+                self._socket = await self._client.ws_connect(self._address)
+                return self._socket
+            except aiohttp.ClientConnectionError:
+                assert time.monotonic() < end_s
+                await asyncio.sleep(0.2)
+
+    async def __aexit__(self, *_: object) -> None:
+        await self._socket.close()
+
+
+def test_what_a_killed_recorder_had_read_of_an_emulated_board_can_be_added(shell, tmp_path):
+    capture, link = write_script(make_script(pokes_n=1), tmp_path / "c0"), tmp_path / "board"
+    shell.start("emulate", capture, "--port", link, "--loop")
+    wait_until(link.is_symlink)
+    recorder = shell.start("record", "--port", link, "--out", "run1")
+    stream = tmp_path / "run1.part/stream.bin"
+    wait_until(lambda: stream.exists() and stream.stat().st_size > 8200)
+    recorder.kill()
+    recorder.communicate()
+    (tmp_path / "probe.csv").write_text("")
+    header, files = native(tmp_path / "run1.part", Labels("b0", "s0", None), tmp_path / "probe.csv", ())
+    assert (header.capture, header.board, header.skin) == ("run1", "b0", "s0")
+    assert files["stream.bin"].stat().st_size > 8200
+
+
+def test_an_unplugged_board_ends_a_recording_that_is_whole(shell, tmp_path):
+    capture, link = write_script(make_script(pokes_n=1), tmp_path / "c0"), tmp_path / "board"
+    shell.start("emulate", capture, "--port", link, "--loop", "--fault", "unplug@3+99")
+    wait_until(link.is_symlink)
+    assert "(unplugged after" in shell.run("record", "--port", link, "--out", "run1")
+    assert (tmp_path / "run1" / HEADER_FILE).is_file()
+
+
+def test_without_a_board_the_words_are_one_sentence(shell, tmp_path):
+    for words, told in (
+        (["emulate", "nothing"], "must be a capture's folder or the name of a scene"),
+        (["emulate", "nothing", "--fault", "melted"], "must be NAME[@START_S[+DURATION_S]] with one of failed-read"),
+        (["live", "--port", "x", "--replay", "y"], "must be one of --port, --replay, --emulate"),
+    ):
+        process = shell.start(*words)
+        _, complained = process.communicate(timeout=LONG_S)
+        assert process.returncode == 2
+        assert told in complained
+        assert "Traceback" not in complained

@@ -1,0 +1,169 @@
+"""The page and its websocket: what a board does is on it; strangers, junk and crowds get nothing."""
+
+import asyncio
+import json
+import struct
+import time
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+
+import aiohttp
+import numpy as np
+import pytest
+from aiohttp import web
+
+from pipeline.capture.header import HEADER_FILE, parse
+from pipeline.live.answering import Models
+from pipeline.live.server import CLIENTS_MAX_N, REQUEST_BYTES_MAX_N, Server
+from pipeline.live.session import Live
+from pipeline.live.view import BINS_N, HEAD, NUMBERS_N
+from pipeline.predicting import read_network
+from tests.live.boards import PLACES, make_script, plugged_in, write_model
+
+LONG_S = 60.0
+pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")  # of sockets that a refused client leaves
+
+
+def serve(port: str, models: Models, act: Callable[[str, aiohttp.ClientSession], Awaitable[None]], token: str = ""):
+    """Serve a board's page, let a client act, and stop."""
+
+    async def run() -> None:
+        live = Live(port, models, "a board")
+        live.start()
+        runner = web.AppRunner(Server(live, token).application())
+        await runner.setup()
+        site = web.TCPSite(runner, "127.0.0.1", 0)
+        await site.start()
+        address = f"http://127.0.0.1:{site._server.sockets[0].getsockname()[1]}"
+        try:
+            async with aiohttp.ClientSession() as client:
+                await act(address, client)
+        finally:
+            await runner.cleanup()
+            await asyncio.to_thread(live.stop)
+
+    asyncio.run(run())
+
+
+def unpack(data: bytes) -> dict:
+    """Read a binary message as the page does."""
+    number, chips_n, bins_n, t_s = HEAD.unpack_from(data)
+    values = np.frombuffer(data, "<f4", offset=HEAD.size)
+    first = NUMBERS_N + 3 * chips_n
+    assert len(values) == first + bins_n * (1 + 2 * (1 + chips_n))
+    names = ("x_mm", "y_mm", "F_N", "sd_x", "sd_y", "contact", "rate_hz", "lost")
+    told = dict(zip(names, values[:8].tolist(), strict=True))
+    return told | {"number": number, "t_s": t_s, "bins_n": bins_n, "change_uT": values[NUMBERS_N:first]}
+
+
+async def until(socket, wanted: Callable[[dict], bool]) -> dict:
+    """Take messages until one is wanted."""
+    end_s = time.monotonic() + LONG_S
+    while time.monotonic() < end_s:
+        said = await asyncio.wait_for(socket.receive(), LONG_S)  # its own time-out begins again with every ping
+        told = unpack(said.data) if said.type == aiohttp.WSMsgType.BINARY else json.loads(said.data)
+        if wanted(told):
+            return told
+    raise AssertionError("it was never told")
+
+
+def test_a_poke_its_place_force_and_rate_are_on_the_page_and_buttons_zero_and_record(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    models = [read_network(write_model(tmp_path))]
+
+    async def act(address: str, client: aiohttp.ClientSession) -> None:
+        async with client.ws_connect(f"{address}/live") as socket:
+            state = await until(socket, lambda told: told.get("zeroed") is True)
+            assert len(state["chips_mm"]) == 5
+            poke = await until(socket, lambda told: told.get("contact") == 1)
+            assert np.abs(np.array([poke["x_mm"], poke["y_mm"], poke["F_N"]]) - PLACES).max(axis=1).min() < 0.5
+            assert poke["rate_hz"] == pytest.approx(400, rel=0.3)
+            assert poke["bins_n"] <= BINS_N
+            await socket.send_json({"seen": poke["number"]})
+            await socket.send_json({"press": "record"})
+            recording = await until(socket, lambda told: bool(told.get("recording")))
+            assert (Path(recording["recording"].strip() + ".part") / HEADER_FILE).is_file()
+            await asyncio.sleep(0.5)
+            await socket.send_json({"press": "record"})
+            done = await until(socket, lambda told: str(told.get("recorded", "")).startswith("recorded"))
+            folder = Path(done["recorded"].removeprefix("recorded "))
+            header = parse((folder / HEADER_FILE).read_text(), "header")
+            assert set(header.files) == {"stream.bin", "arrivals.csv"}
+            assert (folder / "stream.bin").stat().st_size > 82 * 50
+            await socket.send_json({"press": "zero"})
+            await until(socket, lambda told: told.get("zeroed") is False)
+            await until(socket, lambda told: told.get("zeroed") is True)
+
+    with plugged_in(make_script(pokes_n=4), loop=True) as name:
+        serve(name, models, act)
+
+
+def test_a_page_waits_for_a_board_that_is_not_there(tmp_path):
+    async def act(address: str, client: aiohttp.ClientSession) -> None:
+        async with client.ws_connect(f"{address}/live") as socket:
+            state = await until(socket, lambda told: "unplugged" in " ".join(told.get("alarms", [])))
+            assert state["waiting"]
+        for path, kind in (("/", "text/html"), ("/live.js", "javascript"), ("/live.css", "text/css")):
+            async with client.get(address + path) as page:
+                assert page.status == 200
+                assert kind in page.headers["Content-Type"]
+                assert "default-src 'self'" in page.headers["Content-Security-Policy"]
+                assert "://" not in (await page.text()).replace("http://www.w3.org", "")  # nothing from elsewhere
+
+    serve(str(tmp_path / "none"), [], act)
+
+
+def test_strangers_are_sent_away(tmp_path):
+    async def act(address: str, client: aiohttp.ClientSession) -> None:
+        own = address.removeprefix("http://")
+        for headers, status in (
+            ({"Host": "evil.example"}, 403), ({"Host": "127.0.0.1.evil.example"}, 403), ({"Host": "[::1"}, 403),
+            ({"Host": "lohost[::1]::8786"}, 403),
+            ({"Host": "localhost:9000"}, 200),  # the other end of an SSH tunnel
+            ({"Origin": "http://evil.example"}, 403), ({"Origin": "null"}, 403), ({"Origin": f"http://{own}"}, 200),
+        ):  # fmt: skip
+            async with client.get(f"{address}/", headers=headers) as page:
+                assert page.status == status, headers
+        with pytest.raises(aiohttp.WSServerHandshakeError, match="403"):
+            await client.ws_connect(f"{address}/live", headers={"Origin": "http://evil.example"})
+        for path in ("/../server.py", "/%2e%2e/server.py", "/page", "/live.js/", "/index.html"):
+            async with client.get(address + path) as page:
+                assert page.status in (400, 404)
+
+    serve(str(tmp_path / "none"), [], act)
+
+
+def test_elsewhere_than_here_nothing_is_given_without_the_token(tmp_path):
+    async def act(address: str, client: aiohttp.ClientSession) -> None:
+        for query, status in (("", 403), ("?token=guess", 403), ("?token=\u00e9", 403), ("?token=secret", 200)):
+            async with client.get(f"{address}/{query}", headers={"Host": "lab-pc:8765"}) as page:
+                assert page.status == status
+                assert ("reskin-token" in page.headers.get("Set-Cookie", "")) == (status == 200)
+        async with aiohttp.ClientSession() as other:
+            with pytest.raises(aiohttp.WSServerHandshakeError, match="403"):
+                await other.ws_connect(f"{address}/live")
+
+    serve(str(tmp_path / "none"), [], act, token="secret")
+
+
+def test_junk_does_nothing_and_what_is_too_long_or_too_many_is_refused(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    async def act(address: str, client: aiohttp.ClientSession) -> None:
+        async with client.ws_connect(f"{address}/live") as socket:
+            for junk in ("", "{", "[]", "null", '{"press": ["record"]}', '{"press": {}}', '{"seen": 1e999}', "[" * 900):
+                await socket.send_str(junk)
+            await socket.send_bytes(struct.pack("<4d", 1, 2, 3, 4))
+            await until(socket, lambda told: "alarms" in told)
+            await socket.send_str("x" * (REQUEST_BYTES_MAX_N + 1))
+            while not socket.closed:
+                await socket.receive(timeout=LONG_S)
+            assert socket.close_code == aiohttp.WSCloseCode.MESSAGE_TOO_BIG
+        crowd = [await client.ws_connect(f"{address}/live") for _ in range(CLIENTS_MAX_N)]
+        with pytest.raises(aiohttp.WSServerHandshakeError, match="503"):
+            await client.ws_connect(f"{address}/live")
+        for socket in crowd:
+            await socket.close()
+
+    serve(str(tmp_path / "none"), [], act)
+    assert list(tmp_path.iterdir()) == []

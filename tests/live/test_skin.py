@@ -1,0 +1,178 @@
+"""A controller's view: the place and force of what touches, within a second of plugging in, and what is wrong."""
+
+import itertools
+import math
+import threading
+import time
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import reskin
+from pipeline.core.errors import ReskinError
+from pipeline.core.seeds import rng_for
+from pipeline.live.emulate import open_far_end, play
+from pipeline.live.inject import inject, parse
+from pipeline.live.skin import Skin
+from pipeline.predicting import read_network
+from tests.live.boards import (
+    PAUSE_S,
+    PLACES,
+    POKED_S,
+    QUIET_S,
+    RATE_HZ,
+    make_script,
+    played,
+    plugged_in,
+    write_model,
+)
+
+SCRIPT = make_script(pokes_n=2)
+LATE = {"nothing comes", "slower than it was: frames are missing"}  # what a busy machine makes of a healthy board
+
+
+def test_every_reading_has_its_time_place_and_force_in_contact_and_none_off_it(tmp_path):
+    script = make_script(pokes_n=3)  # on a busy machine the first may pass while the port is opened
+    third_end_n = round((QUIET_S + 2 * (POKED_S + PAUSE_S) + POKED_S + 0.2) * RATE_HZ)
+    with plugged_in(script) as name, reskin.open(name, model=write_model(tmp_path)) as skin:
+        contacts = list(itertools.takewhile(lambda _: skin.account["frames_n"] < third_end_n, skin.every()))
+        assert skin.account["frames_n"] * 82 == skin.account["frame_bytes_n"]
+    found = np.array([contact[1:4] for contact in contacts if contact.F_N > 0])
+    nearest = np.abs(found[:, None] - PLACES).sum(axis=2).argmin(axis=1)
+    assert set(nearest) == {0, 1}
+    np.testing.assert_allclose(found, PLACES[nearest], atol=0.5)  # noise of 3 uT in fifteen channels
+    assert all(math.isnan(contact.x_mm) for contact in contacts if contact.F_N == 0)
+    assert 300 < len(found) < len(contacts)
+    assert {alarm for contact in contacts for alarm in contact.alarms} <= LATE
+    assert np.all(np.diff([contact.t_s for contact in contacts]) >= 0)
+    assert abs(contacts[-1].t_s - time.time()) < 60
+    assert all(math.isnan(contact.sd_mm[0]) for contact in contacts)
+
+
+def test_several_models_say_how_far_they_are_apart(tmp_path):
+    models = [write_model(tmp_path, f"m{i}", off_mm=i) for i in range(2)]
+    with plugged_in(SCRIPT) as name, reskin.open(name, model=models) as skin:
+        touched = next(contact for contact in skin if contact.F_N > 0)
+    np.testing.assert_allclose(touched[1:4], PLACES[0] + (0.5, 0, 0), atol=0.5)
+    np.testing.assert_allclose(touched.sd_mm, (math.sqrt(0.5), 0.0), atol=0.01)
+
+
+def test_who_is_slow_gets_the_latest_and_no_byte_is_lost(tmp_path):
+    with plugged_in(SCRIPT) as name, reskin.open(name, model=write_model(tmp_path)) as skin:
+        before, before_n = next(iter(skin)), skin.account["frames_n"]
+        time.sleep(1.0)  # a slow controller
+        late = next(iter(skin))
+        assert late.t_s - before.t_s > 0.5
+        assert 100 < skin.account["frames_n"] - before_n < 700
+        assert skin.reader.missed_bytes_n == 0
+
+
+def test_a_stall_and_an_unplugging_are_told_while_they_last_and_it_goes_on_after(tmp_path):
+    script = inject(inject(make_script(pokes_n=3), parse("stall@2.5+1")), parse("unplug@4.5+1"))
+    link, told = str(tmp_path / "board"), []
+    with plugged_in(script, link) as name, reskin.open(name, model=write_model(tmp_path)) as skin:
+        for contact in skin:
+            told += [] if told and told[-1] == contact.alarms else [contact.alarms]
+            if any("unplugged" in alarm for alarms in told for alarm in alarms) and contact.F_N > 0:
+                break
+    words = " ".join(alarm for alarms in told for alarm in alarms)
+    assert "nothing comes" in words
+    assert "unplugged" in words
+
+
+def test_a_failed_read_is_no_contact(tmp_path):
+    skin, readings = played(inject(SCRIPT, parse("failed-read@1.7+0.5")), [read_network(write_model(tmp_path))])
+    failed = [row for each in readings for row in each.answer[each.b_uT[:, 3] == np.float32(8028.16)]]
+    assert len(failed) == 200
+    assert np.isnan(failed).all()
+    assert skin.health.alarms["chip 1: failed I2C reads"].count_n == 200
+
+
+def test_a_port_that_is_opened_inside_a_frame_raises_no_alarm_and_a_hole_does():
+    whole = make_script(pokes_n=0)
+    for cut_i, alarms in ((0, set()), (400, {"bytes lost between frames"})):
+        pieces = [piece[30:] if i == cut_i else piece for i, piece in enumerate(whole.pieces)]
+        skin, _ = played(replace(whole, pieces=pieces))
+        assert skin.account["skipped_resync_bytes_n"] == 52
+        assert set(skin.health.alarms) == alarms
+
+
+def test_a_magnet_is_a_field_from_outside_and_nothing_else(tmp_path):
+    skin, _ = played(inject(SCRIPT, parse("magnet@3+1")), [read_network(write_model(tmp_path))])
+    assert {word.split(":")[0] for word in skin.health.alarms} == {"field from outside"}
+
+
+def test_a_second_in_which_something_moves_is_no_no_load_reading():
+    script = inject(make_script(pokes_n=0, quiet_s=4.0), parse("magnet@0.35+0.7"))
+    skin, _ = played(script)
+    rest_uT = script.frames.b_uT[:100].mean(axis=0)
+    np.testing.assert_allclose(skin._zero.noload_uT, rest_uT, atol=4 * 3 / np.sqrt(100))  # of noise of 3 uT
+    moving = inject(make_script(pokes_n=0, quiet_s=2.0), parse("magnet@0.35+0.7"))
+    assert not played(moving)[0].zeroed
+
+
+@pytest.mark.parametrize("minutes_n", [1])
+def test_every_byte_that_was_sent_is_a_frames_or_lost_and_counted(minutes_n):
+    script, rng = make_script(pokes_n=20), rng_for(0, "faults")
+    for fault in ("torn", "dropped", "repeated", "wrong-baud", "crlf", "failed-read", "torn"):
+        script = inject(script, parse(f"{fault}@{rng.uniform(3, 55):.2f}+{rng.uniform(0.1, 2):.2f}"))
+    end, stop, sent = open_far_end("pty"), threading.Event(), []
+    player = threading.Thread(
+        target=lambda: sent.extend(play(script, end, stop, speed=100.0) for _ in range(minutes_n))
+    )
+    skin = Skin(end.name)
+    skin.reader.start(there=True)
+    player.start()
+    while skin.poll(1.0) is not None or player.is_alive():
+        pass
+    account = skin.account + Counter({"missed_bytes_n": skin.reader.missed_bytes_n})
+    end.unplug()
+    skin.reader.stop()
+    waiting_n = (
+        account["bytes_n"]
+        - account["frame_bytes_n"]
+        - sum(count for name, count in account.items() if name.startswith("skipped_"))
+    )
+    assert account["bytes_n"] + account["missed_bytes_n"] == sum(sent)
+    assert 0 <= waiting_n < 3 * 82  # of what comes last, more bytes would tell
+    assert account["frames_n"] * 82 == account["frame_bytes_n"]
+    assert account["skipped_resync_bytes_n"] > 1000
+
+
+def test_the_forty_chips_of_a_sleeve_are_drawn_where_they_lie_and_answered_for(tmp_path):
+    model = read_network(write_model(tmp_path, chips_n=40))
+    skin, readings = played(make_script(pokes_n=2, chips_n=40, rate_hz=133.0), [model])
+    assert skin.layout.known
+    assert skin.found.chips_n == 40
+    found = np.concatenate([each.answer[each.contact] for each in readings])
+    nearest = np.abs(found[:, None] - PLACES).sum(axis=2).argmin(axis=1)
+    assert set(nearest) == {0, 1}
+    np.testing.assert_allclose(found, PLACES[nearest], atol=0.5)
+    assert skin.health.alarms == {}
+
+
+def test_eight_boards_on_eight_ports_are_each_their_own():
+    chips_n = range(1, 9)
+
+    def look(name: str) -> int:
+        with Skin(name) as skin:
+            contact = next(iter(skin))
+            assert skin.reader.missed_bytes_n == 0
+            return len(contact.b_uT) // 3
+
+    with ExitStack() as stack, ThreadPoolExecutor(8) as pool:
+        scripts = [make_script(pokes_n=0, chips_n=n, rate_hz=50.0, quiet_s=2.0) for n in chips_n]
+        names = [stack.enter_context(plugged_in(script, loop=True)) for script in scripts]
+        assert list(pool.map(look, names)) == list(chips_n)
+
+
+def test_a_model_of_other_boards_and_a_port_without_one_are_refused(tmp_path):
+    with plugged_in(make_script(pokes_n=1, chips_n=4)) as name:
+        with pytest.raises(ReskinError, match="channels must be the 15 of the model; got 12"):
+            reskin.open(name, model=write_model(tmp_path)).__enter__()
+    with pytest.raises(ReskinError, match="the port must be one that opens"), reskin.open("/dev/none"):
+        pass

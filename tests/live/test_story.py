@@ -1,0 +1,86 @@
+"""From a board that is not there to a table: emulate, record, add, repro; its own model sees it at work."""
+
+import json
+import os
+from contextlib import closing
+
+import numpy as np
+import pytest
+from ruamel.yaml import YAML
+
+from pipeline import plan
+from pipeline.capture import probe
+from pipeline.capture.probe import ProbeLog
+from pipeline.capture.wire import Frames
+from pipeline.core.seeds import rng_for
+from pipeline.live.script import Script, encode_pieces
+from pipeline.predicting import read_network
+from tests.live.boards import RATE_HZ, played, write_script
+from tests.live.test_processes import Shell, wait_until
+from tests.stages.checkout import copy_checkout, run
+
+POKES_N, QUIET_S, DWELL_S = 30, 1.0, 0.25
+LABELS = ("--board", "b", "--skin", "s", "--scene", "pressed")
+SCENE = {
+    "source": "recorded", "seed": 1, "questions": ["single_temporal"], "selection": {"force_min_N": 0.0},
+    "split": {"temporal_test_fraction": 0.34},
+    "train_single": {"recipe": "paper", "steps_n": 400, "seeds_n": 1, "variants": {}},
+}  # fmt: skip
+pytestmark = [pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo-terminals"), pytest.mark.timeout(900)]
+
+
+def make_poked() -> tuple[Script, ProbeLog]:
+    """Make pokes at places of a grid with pauses that differ, and the robot's log, whose clock began 100 s earlier."""
+    rng = rng_for(0, "poked")
+    starts_s = QUIET_S + np.cumsum(DWELL_S + rng.uniform(0.15, 0.4, POKES_N))
+    place_mm, force_N = 4.0 * rng.integers(1, 4, (POKES_N, 2)), rng.uniform(0.5, 2.0, POKES_N)
+    t_s = np.arange(round((starts_s[-1] + 1.0) * RATE_HZ)) / RATE_HZ
+    poke_i = np.searchsorted(starts_s, t_s, "right") - 1
+    poked = (poke_i >= 0) & (t_s < starts_s[poke_i] + DWELL_S)
+    pushed = np.column_stack([place_mm - 8, np.full(POKES_N, 4.0)]) * force_N[:, None]
+    change_uT = pushed @ (15 * rng.standard_normal((3, 15)))
+    b_uT = 500 * rng.standard_normal(15) + 3 * rng.standard_normal((len(t_s), 15)) + poked[:, None] * change_uT[poke_i]
+    step_uT = np.tile([0.15, 0.15, 0.242], 5)
+    b_uT = (np.rint(b_uT / step_uT) * step_uT).astype(np.float32)
+    temperature_degC = (25 + 0.02 * rng.standard_normal((len(t_s), 5))).astype(np.float32)
+    frames = Frames(b_uT, temperature_degC, np.full(len(t_s), np.nan), np.zeros(len(t_s), np.int64))
+    contact = np.tile([False, True], POKES_N)
+    begin_s = 100 + np.column_stack([starts_s - 0.1, starts_s + 0.02]).ravel()
+    x_mm, y_mm = np.repeat(place_mm, 2, axis=0).astype(np.float32).T
+    Fz_N = np.where(contact, np.repeat(force_N, 2), 0).astype(np.float32)
+    zero = np.zeros(2 * POKES_N, np.float32)
+    log = ProbeLog(
+        indentation=np.arange(2 * POKES_N, dtype=np.int32) // 2, pass_i=np.arange(2 * POKES_N, dtype=np.int32) // 20,
+        contact=contact, t_start_s=begin_s, t_end_s=begin_s + np.where(contact, DWELL_S - 0.04, 0.08),
+        x_mm=x_mm, y_mm=y_mm, depth_mm=np.full_like(zero, np.nan), Fx_N=zero, Fy_N=zero, Fz_N=Fz_N,
+    )  # fmt: skip
+    return Script("recorded", "binary", frames, encode_pieces(frames, "binary"), t_s), log
+
+
+def test_a_board_that_was_recorded_becomes_a_table_and_a_model_that_sees_it_live(tmp_path):
+    script, log = make_poked()
+    root, link = copy_checkout(tmp_path / "checkout"), tmp_path / "board"
+    (root / "robot.csv").write_text(probe.render(log))
+    with (root / "pipeline/scenes/pressed.yaml").open("w") as stream:
+        YAML().dump(SCENE, stream)
+    plan.use(root, [])
+    with closing(Shell(root)) as shell:
+        shell.start("emulate", write_script(script, tmp_path / "c0"), "--port", link, "--fault", "crlf@2+1")
+        wait_until(link.is_symlink)
+        assert "(unplugged after" in shell.run("record", "--port", link, "--out", "run1")  # where the script ends
+        shell.run("add", "run1", "--layout", "capture", "--probe", "robot.csv", *LABELS)
+    run(root, "python", "tests/stages/warm.py")
+
+    numbers = json.loads((root / "reports/pressed/numbers.json").read_text())
+    assert numbers["provenance"]["source"] == "recorded"
+    assert numbers["capture"]["logged_indentations_n"] == POKES_N
+    assert numbers["capture"]["frames_n"] * 82 == numbers["capture"]["frame_bytes_n"]
+    assert numbers["capture"]["frames_n"] > 0.9 * len(script)  # what waits in a terminal is lost when it opens or goes
+    model = min((root / "data/models/pressed/train_single").glob("*.safetensors"))
+    _, readings = played(script, [read_network(model)])
+    t_s = np.concatenate([each.t_s[each.contact] for each in readings])
+    found = np.concatenate([each.answer[each.contact] for each in readings])
+    assert len(found) > 0.8 * POKES_N * DWELL_S * RATE_HZ
+    pressed = log.contact.nonzero()[0][np.searchsorted(log.t_start_s[log.contact] - 100, t_s + 0.1) - 1]
+    true = np.column_stack([log.x_mm, log.y_mm, log.Fz_N])[pressed]
+    assert (np.median(np.abs(found - true), axis=0) < (1, 1, 0.2)).all()  # mm and N, of most that it was trained on

@@ -1,0 +1,55 @@
+"""What a page is sent is bounded, and a peak of one frame is never lost in it."""
+
+import numpy as np
+
+from pipeline.live.layout import layout_of
+from pipeline.live.skin import Readings
+from pipeline.live.view import BIN_S, BINS_N, HEAD, NUMBERS_N, View
+
+
+def readings(t_s, force_N):
+    db_uT = np.zeros((len(t_s), 15), np.float32)
+    answer = np.column_stack([np.full((len(t_s), 2), 8.0), force_N])
+    return Readings(t_s, db_uT, db_uT, answer, np.full((len(t_s), 2), np.nan), force_N > 0)
+
+
+def forces(data):
+    """The bins of a message: start, least and greatest force."""
+    _, chips_n, bins_n, _ = HEAD.unpack_from(data)
+    rest = np.frombuffer(data, "<f4", offset=HEAD.size)[NUMBERS_N + 3 * chips_n :]
+    start_s, traces = rest[:bins_n], rest[bins_n:].reshape(2, bins_n, 1 + chips_n)
+    return start_s, traces[0, :, 0], traces[1, :, 0]
+
+
+def test_a_peak_of_one_frame_is_in_its_bin_and_minutes_of_frames_are_ten_seconds_of_bins():
+    view, peak_s = View(layout_of(5), 0.0), 115.0
+    for first in range(0, 48_000, 40):  # two minutes at 400 Hz
+        t_s = (first + np.arange(40)) / 400
+        view.feed(readings(t_s, np.where(np.abs(t_s - peak_s) < 1e-3, 3.0, 0.1)), t_s[-1] + 0.001)
+    start_s, low_N, high_N = forces(view.message(0, rate_hz=400.0, lost_bytes_n=0))
+    assert len(start_s) <= BINS_N
+    np.testing.assert_allclose(start_s[-1], 120, atol=2 * BIN_S)
+    peak = np.abs(start_s - peak_s) < 1.5 * BIN_S
+    assert high_N[peak].max() == 3.0
+    assert set(high_N[~peak]) == set(low_N) == {np.float32(0.1)}
+    assert len(view.message(view.newest_bin, rate_hz=400.0, lost_bytes_n=0)) < 300
+
+
+def test_a_gap_is_left_out_and_a_page_that_has_some_bins_gets_the_others():
+    view = View(layout_of(5), 0.0)
+    for t_s in (np.arange(0, 1, 0.01), np.arange(5, 6, 0.01)):
+        view.feed(readings(t_s, np.ones(len(t_s))), t_s[-1])
+    start_s, _, _ = forces(view.message(0, rate_hz=100.0, lost_bytes_n=0))
+    assert not np.any((start_s > 1.0) & (start_s < 4.9))
+    later_s, _, _ = forces(view.message(275, rate_hz=100.0, lost_bytes_n=0))
+    np.testing.assert_allclose(later_s, start_s[start_s >= 5.5 - 1e-6], atol=1e-5)
+
+
+def test_the_time_to_a_screen_is_that_of_the_message_that_it_shows():
+    view = View(layout_of(5), 0.0)
+    view.feed(readings(np.array([1.0]), np.ones(1)), 1.002)
+    number = HEAD.unpack_from(view.message(0, rate_hz=1.0, lost_bytes_n=0))[0]
+    for seen in (number, number + 1, -1):  # those that were never sent tell nothing
+        view.seen(seen, 1.03)
+    np.testing.assert_allclose(view.to_screen_s, [0.03])
+    np.testing.assert_allclose(view.to_estimate_s, [0.002])
