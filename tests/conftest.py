@@ -19,7 +19,7 @@ settings.load_profile("busy")
 
 SHARED_DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
 LONG = (  # which run stages and commands
-    "test_story", "test_lab_story", "test_fetching", "test_adding", "test_adding_an_experiment", "test_numerics",
+    "stages/test_story", "test_lab_story", "test_fetching", "test_adding", "test_adding_an_experiment", "test_numerics",
 )  # fmt: skip
 CHECKED_N = 50  # calls of a function, in each test
 calls_n: Counter[Any] = Counter()
