@@ -26,6 +26,11 @@ LONG_S = 120.0  # a process that imports torch on a busy machine
 pytestmark = [pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo-terminals"), pytest.mark.timeout(900)]
 
 
+def hear_ctrl_c() -> None:
+    """Undo what a shell does to what it runs in the background, tests included: there Ctrl-C is ignored."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 class Shell:
     """Runs `reskin` in a folder, and ends what it left running."""
 
@@ -36,8 +41,9 @@ class Shell:
         command = [sys.executable, "-m", "pipeline.cli", *map(str, words)]
         environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1", "OMP_NUM_THREADS": "1"}
         process = subprocess.Popen(
-            command, cwd=self.folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
+            command, cwd=self.folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            preexec_fn=hear_ctrl_c,
+        )  # fmt: skip
         self.running.append(process)
         return process
 
