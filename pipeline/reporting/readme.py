@@ -12,6 +12,7 @@ from pipeline.reporting.shown import to_markdown
 from pipeline.reporting.skins import skins_table
 from pipeline.reporting.tables import make_tables
 
+SEVERAL_min = 100  # from here on whole minutes
 COMPARED = ("compare", "compare_parameters", "compare_frames")
 Numbers = Mapping[str, Any]  # of one scene
 
@@ -112,7 +113,8 @@ def _costs(scenes: Sequence[Numbers]) -> str:
     """Write what each scene costs when all of it is computed, on the machine that computed it."""
     by_device: dict[str, list[str]] = {}
     for provenance in (numbers["provenance"] for numbers in scenes):
-        cost = f"`{provenance['scene']}` {provenance['seconds'] / 60:.2g} min"
+        minutes = provenance["seconds"] / 60
+        cost = f"`{provenance['scene']}` {minutes:{'.2g' if minutes < SEVERAL_min else ',.0f'}} min"
         by_device.setdefault(provenance["device"], []).append(cost)
     costs = "; ".join(f"{', '.join(own)} ({device})" for device, own in by_device.items())
     counts = [count for numbers in scenes for count in numbers["trainings"].values()]
