@@ -21,6 +21,7 @@ APART = 0.17  # of a row: ours above, the paper's below
 SHORT_TABLE = ("accuracy_pct", "mse_xy_mm2")
 WITHIN = "Readings placed within 1 mm on boards"
 BRACKETS = "In brackets: 95 % interval over boards"
+TWO = 2
 UNIVERSAL = "universal, "  # so begins what is told which skin it is on: the map with networks
 ANSWERING = ("multi", "adapted", "single")  # rows of table 2, the one that matters most first
 
@@ -47,20 +48,37 @@ def answer(numbers: Mapping[str, Any]) -> str:
     return f"{WITHIN} and skins never seen: {_with_brackets('; '.join(said))}" if said else ""
 
 
-def _answer_with_labels(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Say how the models that are told which skin they are on do, then the first method, as the usual way."""
+def _told(rows: Sequence[Mapping[str, Any]]) -> tuple[list[int], dict[str, list[str]]]:
+    """Give the least and the greatest number of labels, and by method its accuracies with them.
+
+    The models that are told which skin they are on come first, then the first method, as the usual way.
+    """
     methods = list(dict.fromkeys((row["method"], row["inputs"]) for row in rows))
-    told = [method for method in methods if method[0].startswith(UNIVERSAL)]
     counts = sorted({row["labels_n"] for row in rows})
-    counts_n = [counts[0], counts[-1]] if len(counts) > 1 else counts
-    said = []
-    for method in [*told, methods[0]]:
+    ends = counts if len(counts) == 1 else [counts[0], counts[-1]]
+    said = {}
+    for method in [*(one for one in methods if one[0].startswith(UNIVERSAL)), methods[0]]:
         of_method = {row["labels_n"]: row for row in rows if (row["method"], row["inputs"]) == method}
-        scores = [show(of_method[n]["as_labelled"]["accuracy_pct"]) for n in counts_n if n in of_method]
-        said.append(f"{method[0]} {' and '.join(scores)} %")
+        said[method[0]] = [show(of_method[n]["as_labelled"]["accuracy_pct"]) for n in ends if n in of_method]
+    return ends, said
+
+
+def _answer_with_labels(rows: Sequence[Mapping[str, Any]]) -> str:
+    ends, said = _told(rows)
     boards_n = rows[0]["as_labelled"]["accuracy_pct"]["n"]
-    labels = f"with {' and '.join(map(str, counts_n))} labels of the new board"
-    return f"{WITHIN} never seen, {labels}: {_with_brackets('; '.join(said), f' (n = {boards_n})')}"
+    scores = "; ".join(f"{method} {' and '.join(of_method)} %" for method, of_method in said.items())
+    labels = f"with {' and '.join(map(str, ends))} labels of the new board"
+    return f"{WITHIN} never seen, {labels}: {_with_brackets(scores, f' (n = {boards_n})')}"
+
+
+def labels_table(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+    """Tabulate the same for a first look, a row a method."""
+    ends, said = _told(rows)
+    names = [f"within 1 mm, %, with {count} labels of the new board" for count in ends]
+    lines = [{"boards never seen": method, **dict(zip(names, scores, strict=True))} for method, scores in said.items()]
+    boards_n = rows[0]["as_labelled"]["accuracy_pct"]["n"]
+    few = "of two boards it is wide, and it knows no bounds" if boards_n == TWO else "it knows no bounds"
+    return tabulate(lines, meaning=f"[low, high]: 95 % interval over {boards_n} held-out boards (Student's t: {few}).")
 
 
 def _with_brackets(said: str, boards: str = "") -> str:

@@ -7,7 +7,7 @@ from typing import Any
 
 from pipeline.core.code import ROOT
 from pipeline.core.errors import SchemaError
-from pipeline.reporting.headline import answer, short_table
+from pipeline.reporting.headline import labels_table, short_table
 from pipeline.reporting.shown import to_markdown
 from pipeline.reporting.skins import skins_table
 from pipeline.reporting.tables import make_tables
@@ -86,7 +86,8 @@ def _headline(numbers: Numbers) -> str:
 
 def _recorded(numbers: Numbers) -> str:
     provenance = numbers["provenance"]
-    return f"Scene `{provenance['scene']}`, **{provenance['source']}**, code {provenance['trained']}. {answer(numbers)}"
+    heading = f"Scene `{provenance['scene']}`, **{provenance['source']}**, code {provenance['trained']}:"
+    return f"{heading}\n\n{to_markdown(labels_table(numbers['labels']))}"
 
 
 def _time(timed: Numbers | None) -> str:
