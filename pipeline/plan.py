@@ -4,6 +4,7 @@ DVC expands stages from what stands there and cannot look into a scene's questio
 know what a stage does.
 """
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import chain
@@ -12,6 +13,7 @@ from typing import Any
 
 from ruamel.yaml import YAML
 
+from pipeline.capture.header import NAME
 from pipeline.core import io
 from pipeline.core.config import FLOW, NOTHING, PARAMS, PLACE, PLAN, SCENES, declared, fill, find, put, read_yaml
 from pipeline.core.errors import ParamsError
@@ -175,13 +177,13 @@ def copied(root: Path, name: str, like: str | None) -> Iterator[None]:
     if like is None:
         yield
         return
+    if not re.fullmatch(NAME, name):
+        raise ParamsError("--scene", "a name", "1 to 64 of A-Z a-z 0-9 _ -", repr(name), "Choose another.")
     original = scene_file(root, like)
     target = original.with_name(f"{name}.yaml")
     if target.exists():
         remedy = "Leave out --like to add to it."
         raise ParamsError(f"--like {like}", "the new scene", "a free name", f"{name}, which is there", remedy)
-    if not name.replace("-", "").replace("_", "").isalnum():
-        raise ParamsError("--scene", "a name", "letters, digits, - and _", name, "Choose another.")
     words = original.read_text(encoding="utf-8").splitlines(keepends=True)
     told = next(i for i, line in enumerate(words) if not line.startswith("#"))
     io.write_text(

@@ -334,6 +334,8 @@ def test_a_scene_that_is_new_is_a_copy_of_one_and_goes_again_if_nothing_joins_it
     known = contents(root)
     words = ["add", str(lab_file), "--layout", "lab", "--board", "b", "--skin", "s", "--scene", "mine", "--like"]
     assert "a scene must be one of" in run(root, "reskin", *words, "nowhere", check=False).stderr
+    up = run(root, "reskin", *words[:-2], "../up", "--like", "small", check=False).stderr
+    assert "--scene: a name must be 1 to 64 of" in up
     assert "the truths must be" in run(root, "reskin", *words[:3], "ini", *words[4:], "ini", check=False).stderr
     assert contents(root) == known
     run(root, "reskin", *words, "small")

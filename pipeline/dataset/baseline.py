@@ -10,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int64, Shaped
 
+# These three were chosen on one recording (scene eflesh), with all its passes in view: another one tests them.
 STATES_N = 10  # of the skin's last states, free and touched in turn: five touches
 ALIKE_N = 4  # that a state has to resemble, itself included, to be taken as free
 SAME = 2.0  # medians of how far no-load readings of a calibration lie apart, within which two readings are alike

@@ -21,7 +21,6 @@ APART = 0.17  # of a row: ours above, the paper's below
 SHORT_TABLE = ("accuracy_pct", "mse_xy_mm2")
 WITHIN = "Readings placed within 1 mm on boards"
 BRACKETS = "In brackets: 95 % interval over boards"
-TWO = 2
 UNIVERSAL = "universal, "  # so begins what is told which skin it is on: the map with networks
 ANSWERING = ("multi", "adapted", "single")  # rows of table 2, the one that matters most first
 
@@ -77,7 +76,7 @@ def labels_table(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     names = [f"within 1 mm, %, with {count} labels of the new board" for count in ends]
     lines = [{"boards never seen": method, **dict(zip(names, scores, strict=True))} for method, scores in said.items()]
     boards_n = rows[0]["as_labelled"]["accuracy_pct"]["n"]
-    few = "of two boards it is wide, and it knows no bounds" if boards_n == TWO else "it knows no bounds"
+    few = "of two boards it is wide, and it knows no bounds" if boards_n == 2 else "it knows no bounds"
     return tabulate(lines, meaning=f"[low, high]: 95 % interval over {boards_n} held-out boards (Student's t: {few}).")
 
 
