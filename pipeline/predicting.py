@@ -20,9 +20,9 @@ from pipeline.core.config import Strict, parse
 from pipeline.core.errors import CaptureError, ParamsError, SchemaError
 from pipeline.dataset.captures import read_header, timer
 from pipeline.experiments.logs.estimates import Answers, Estimates, describe, estimate, quiet_start
-from pipeline.learning.card import FORMAT
 from pipeline.learning.inputs import VIEW
 from pipeline.trials.networks import Network
+from pipeline.trials.training import FORMAT
 from pipeline.twin.shipped import CHANNELS_N, load_universal
 
 PARQUET_MAGIC = b"PAR1"

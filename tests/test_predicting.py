@@ -15,7 +15,7 @@ from pipeline.capture.wire import Frames, encode, record_type
 from pipeline.core import io
 from pipeline.core.errors import CaptureError, ReskinError
 from pipeline.core.seeds import rng_for
-from pipeline.learning.architecture import draw_weights, paper_layers
+from pipeline.learning.model import draw_weights, paper_layers
 from pipeline.predicting import predict
 from tests.capture.headers import make_header
 

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Float32, Float64
 from pipeline.capture import columns, faults
 from pipeline.capture.columns import FIRST_ROW
 from pipeline.capture.readers.chips import GRID_ROWS_N
-from pipeline.capture.readers.units import check_fields
+from pipeline.capture.readers.table import check_fields
 from pipeline.core.errors import CaptureError
 
 TIME = "t_s"

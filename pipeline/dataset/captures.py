@@ -26,7 +26,7 @@ from pipeline.capture.header import (
 from pipeline.capture.probe import ProbeLog
 from pipeline.capture.readers import READERS
 from pipeline.capture.readers.chips import Watch, missing_reads
-from pipeline.capture.readers.units import check_log
+from pipeline.capture.readers.table import check_log
 from pipeline.capture.stream import FrameStream, no_frame
 from pipeline.capture.wire import Frames
 from pipeline.core import io

@@ -1,17 +1,62 @@
-"""Perceptrons, many at once. In: scaled inputs [m b c]. Out: scaled x, y, F, and the 40 features.
+"""The paper's perceptron: layers and first weights; and many at once. In: scaled inputs [m b c]. Out: scaled x, y, F.
 
 A stack of m networks is one tensor a layer, and a batched product replaces m small ones: for small networks calls cost
 more than sums. Refuses to know how it is trained, and in which units.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32
 from torch import nn
 
-from pipeline.learning.architecture import FEATURE_LAYERS_N, LAYERS, Layer, Weights
+from pipeline.learning.trial import Weights
+
+HIDDEN_N = 200
+FEATURES_N = 40  # the bottleneck that the triplet term acts on (paper section 4)
+FEATURE_LAYERS_N = 3
+OUTPUTS_N = 3  # x, y, F; five where shear is answered too: x, y, Fx, Fy, Fz
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A linear layer, and whether a ReLU follows it."""
+
+    in_n: int
+    out_n: int
+    relu: bool
+
+
+def paper_layers(inputs_n: int, outputs_n: int = OUTPUTS_N) -> tuple[Layer, ...]:
+    """B(15) -> MLP+ReLU(200) -> MLP(200) -> MLP(40) -> MLP+ReLU(200) -> MLP+ReLU(200) -> xyF(3), as printed."""
+    return _layers(inputs_n, outputs_n, relus=(True, False, False, True, True, False))
+
+
+def released_layers(inputs_n: int, outputs_n: int = OUTPUTS_N) -> tuple[Layer, ...]:
+    """The network that the authors released: also a ReLU after layer 2 and one on the output."""
+    return _layers(inputs_n, outputs_n, relus=(True, True, False, True, True, True))
+
+
+LAYERS = {"paper": paper_layers, "released": released_layers}
+
+
+def draw_weights(layers: Sequence[Layer], rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Draw first weights as PyTorch does by default for linear layers: uniform within 1/sqrt(fan in)."""
+    weights = {}
+    for i, layer in enumerate(layers, 1):
+        limit = layer.in_n**-0.5
+        for part, shape in (("weight", (layer.out_n, layer.in_n)), ("bias", (layer.out_n,))):
+            weights[f"layer{i}.{part}"] = rng.uniform(-limit, limit, shape).astype(np.float32)
+    return weights
+
+
+def _layers(inputs_n: int, outputs_n: int, relus: tuple[bool, ...]) -> tuple[Layer, ...]:
+    widths = (inputs_n, HIDDEN_N, HIDDEN_N, FEATURES_N, HIDDEN_N, HIDDEN_N, outputs_n)
+    return tuple(Layer(in_n, out_n, relu) for (in_n, out_n), relu in zip(pairwise(widths), relus, strict=True))
+
 
 BLOCK_ROWS_N = 65_536
 

@@ -1,10 +1,13 @@
 """The one training loop, for a stack of networks. In: trials of equal settings, rows. Out: a finished training of each.
 
-Read it from top to bottom. Networks of a stack never touch each other. Refuses to know files, processes and scores.
+Read it from top to bottom. Networks of a stack never touch each other. Below it stand AdamW and its one-cycle rate, as
+torch.optim has them, bit for bit: that imports torch's compiler at its first optimizer, two seconds of every process
+that trains. Refuses to know files, processes and scores.
 """
 
+import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -14,14 +17,11 @@ from jaxtyping import Float
 
 from pipeline.core.errors import TrainingError
 from pipeline.core.executors import device, median_s
-from pipeline.learning.architecture import LAYERS, Weights
-from pipeline.learning.descent import AdamW, one_cycle
-from pipeline.learning.feed import UNLABELLED, Feed
 from pipeline.learning.inputs import VIEW, Scaler
-from pipeline.learning.job import Job, make_job
-from pipeline.learning.model import Predictor, Stack
+from pipeline.learning.job import UNLABELLED, Feed, Job, make_job
+from pipeline.learning.model import LAYERS, Predictor, Stack
 from pipeline.learning.recipe import Schedule
-from pipeline.learning.trial import Measured, Terms, Trained, Trial
+from pipeline.learning.trial import Measured, Terms, Trained, Trial, Weights
 
 BLOCK_STEPS_N = 50  # batches drawn at once, and how often the loss is looked at
 LOST = 1e8  # mean squared error past which a network is lost, where predicting the mean has 1; few come back from it
@@ -171,3 +171,50 @@ def _explained(
 
 def _answer(scaler: Scaler, predict: Callable[[np.ndarray], np.ndarray], view: np.ndarray) -> np.ndarray:
     return scaler.decode(predict(scaler.encode(view)))
+
+
+# Defaults of torch.optim.lr_scheduler.OneCycleLR: the rate rises to its peak, then falls to nearly nothing; the first
+# momentum falls meanwhile, then rises.
+RISING = 0.3  # of all steps
+FIRST_RATE, LAST_RATE = 1 / 25, 1e-4  # of the peak; of the first
+MOMENTUM_MAX, MOMENTUM_MIN = 0.95, 0.85
+BETA2, EPS = 0.999, 1e-8  # defaults of torch.optim.AdamW
+
+
+def one_cycle(step_i: int, steps_n: int, rate_max: float) -> tuple[float, float]:
+    """Give rate and first momentum of a step: two half cosines.
+
+    >>> [round(one_cycle(i, 10, 25.0)[0], 4) for i in (0, 2, 9)]
+    [1.0, 25.0, 0.0001]
+    """
+    steps_n = max(steps_n, 2)
+    peak_i = RISING * steps_n - 1
+    first = rate_max * FIRST_RATE
+    if step_i <= peak_i:
+        part = step_i / peak_i
+        return _cosine(first, rate_max, part), _cosine(MOMENTUM_MAX, MOMENTUM_MIN, part)
+    part = (step_i - peak_i) / (steps_n - 1 - peak_i)
+    return _cosine(rate_max, first * LAST_RATE, part), _cosine(MOMENTUM_MIN, MOMENTUM_MAX, part)
+
+
+def _cosine(start: float, end: float, part: float) -> float:
+    return end + (start - end) / 2.0 * (math.cos(math.pi * part) + 1)
+
+
+class AdamW:
+    """Remembers the moments of each weight's gradient."""
+
+    def __init__(self, weights: Iterable[torch.Tensor], weight_decay: float) -> None:
+        self.weights, self.weight_decay = list(weights), weight_decay
+        self.first, self.second = ([torch.zeros_like(weight) for weight in self.weights] for _ in range(2))
+        self.steps_n = [torch.zeros((), device=weight.device) for weight in self.weights]
+
+    @torch.no_grad()
+    def step(self, rate: float, momentum: float) -> None:
+        """Move all weights by their gradients; torch raises if one has none."""
+        gradients = [weight.grad for weight in self.weights if weight.grad is not None]
+        torch._foreach_add_(self.steps_n, 1)
+        torch._fused_adamw_(
+            self.weights, gradients, self.first, self.second, [], self.steps_n, amsgrad=False, lr=rate,
+            beta1=momentum, beta2=BETA2, weight_decay=self.weight_decay, eps=EPS, maximize=False,
+        )  # fmt: skip

@@ -7,6 +7,7 @@ import hashlib
 import importlib.metadata
 import json
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +17,6 @@ from pipeline.core.code import digest
 from pipeline.core.executors import device
 from pipeline.core.numerics import signature
 from pipeline.dataset.lines import Lines
-from pipeline.learning.architecture import Weights
 from pipeline.learning.inputs import Scaler
 from pipeline.learning.recipe import FineTuning, Labelling, Recipe, Schedule
 
@@ -25,11 +25,13 @@ COLLAPSED = 0.05  # of a target's variance over a network's own training rows; s
 DECIDING = tuple(
     f"pipeline.{name}"
     for name in (
-        "core.seeds", "learning.architecture", "learning.descent", "learning.feed", "learning.inputs", "learning.job",
-        "learning.model", "learning.train", "learning.trial", "learning.triplets",
+        "core.seeds", "learning.inputs", "learning.job", "learning.model", "learning.train", "learning.trial",
+        "learning.triplets",
     )
 )  # fmt: skip
 LIBRARIES = ("torch", "numpy", "scipy")
+
+Weights = Mapping[str, np.ndarray]
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import pyarrow as pa
 
@@ -111,17 +110,6 @@ def timed(answer: Row, seconds: Sequence[Row]) -> dict[str, Any]:
     studies = ("quadratures", "integrators")
     joined = {study: [row | times.get(key(row), {}) for row in answer[study]] for study in studies}
     return {"choice": answer["choice"], **joined}
-
-
-def rounded(value: Any, digits: int = 6) -> Any:
-    """Round every float to significant digits, so that committed numbers do not change with the last bit."""
-    if isinstance(value, dict):
-        return {key: rounded(item, digits) for key, item in value.items()}
-    if isinstance(value, list):
-        return [rounded(item, digits) for item in value]
-    if isinstance(value, float):
-        return float(np.format_float_positional(value, digits, unique=False, fractional=False, trim="-"))
-    return value
 
 
 def headline_scores(numbers: Row) -> dict[str, Any]:

@@ -6,6 +6,7 @@ Refuses to know what a score is of.
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 COLUMNS = {"accuracy_pct": "accuracy, %", "mse_xy_mm2": "MSE_xy, mm²", "mse_f_N2": "MSE_F, N²"}
@@ -106,3 +107,14 @@ def to_markdown(table: pd.DataFrame) -> str:
     """Write a table as Markdown, empty where a number is not known, and say below what its numbers mean."""
     text = str(table.fillna("").to_markdown(index=False, disable_numparse=True)) + "\n"
     return text + "".join(f"\n{note}\n" for note in notes(table))
+
+
+def rounded(value: Any, digits: int = 6) -> Any:
+    """Round every float to significant digits, so that committed numbers do not change with the last bit."""
+    if isinstance(value, dict):
+        return {key: rounded(item, digits) for key, item in value.items()}
+    if isinstance(value, list):
+        return [rounded(item, digits) for item in value]
+    if isinstance(value, float):
+        return float(np.format_float_positional(value, digits, unique=False, fractional=False, trim="-"))
+    return value

@@ -18,7 +18,8 @@ from pipeline.evaluation.scores import tidy
 from pipeline.learning.recipe import HEADLINE
 from pipeline.params import Asking
 from pipeline.reporting.learned import timed_learning
-from pipeline.reporting.numbers import answered, compose, count_trainings, foretold, lost_by_protocol, rounded, runtime
+from pipeline.reporting.numbers import answered, compose, count_trainings, foretold, lost_by_protocol, runtime
+from pipeline.reporting.shown import rounded
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,7 @@ from pipeline.core.stage import run
 from pipeline.learning.recipe import Adaptations
 from pipeline.learning.recipe import adaptations as adaptations_of
 from pipeline.trials.adapting import adaptations, read_starts
-from pipeline.trials.data import prepare_training, read_data, train_all
-from pipeline.trials.models import write_models
+from pipeline.trials.training import prepare_training, read_data, train_all, write_models
 
 
 def read(settings: Settings) -> Adaptations:

@@ -11,11 +11,9 @@ from pipeline.core.executors import make_executor
 from pipeline.core.stage import run, say
 from pipeline.learning import few_labels as few
 from pipeline.learning.baselines import run_tasks
-from pipeline.learning.card import collapse_record
 from pipeline.learning.few_labels import FewLabels
 from pipeline.learning.few_labels import few_labels as few_labels_of
-from pipeline.trials.data import SceneData, measured, read_data, train_all
-from pipeline.trials.models import score_test
+from pipeline.trials.training import SceneData, collapse_record, measured, read_data, score_test, train_all
 
 
 def read(settings: Settings) -> FewLabels:

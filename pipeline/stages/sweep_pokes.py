@@ -10,8 +10,7 @@ from pipeline.core.stage import run
 from pipeline.learning.recipe import HEADLINE, PokesSweep
 from pipeline.learning.recipe import adaptations as adaptations_of
 from pipeline.trials.adapting import adaptations, read_starts
-from pipeline.trials.data import prepare_training, read_data, train_all
-from pipeline.trials.models import note_seconds, point_of
+from pipeline.trials.training import note_seconds, point_of, prepare_training, read_data, train_all
 
 
 def read(settings: Settings) -> PokesSweep:

@@ -12,8 +12,7 @@ from pipeline.learning.recipe import HEADLINE, Recipe, training
 from pipeline.learning.recipe import adaptations as adaptations_of
 from pipeline.learning.trial import Start, Trial
 from pipeline.trials.adapting import adaptations
-from pipeline.trials.data import SceneData, prepare_training, read_data, train_all
-from pipeline.trials.models import note_seconds, point_of
+from pipeline.trials.training import SceneData, note_seconds, point_of, prepare_training, read_data, train_all
 
 
 def sweep_sensors(scene: str, files: Files, indentations: Path, folds: Path, scores: Path) -> None:

@@ -10,8 +10,7 @@ from pipeline.learning.recipe import HEADLINE
 from pipeline.questions import TABLE_2, stages
 from pipeline.reporting.headline import headline_figures, short_table
 from pipeline.reporting.learned import learned
-from pipeline.reporting.numbers import rounded
-from pipeline.reporting.shown import to_markdown
+from pipeline.reporting.shown import rounded, to_markdown
 
 
 def table2(scene: str, files: Files, models: Path, shown: Path) -> None:

@@ -9,8 +9,7 @@ from pipeline.core.config import Files, Settings, read_settings
 from pipeline.core.executors import make_executor
 from pipeline.core.stage import run, say
 from pipeline.learning.baselines import Baselines, Task, baselines, run_tasks
-from pipeline.trials.data import measured, read_data
-from pipeline.trials.models import note_seconds, score_test
+from pipeline.trials.training import measured, note_seconds, read_data, score_test
 
 NO_ROWS = np.zeros(0, np.int64)
 

@@ -9,8 +9,7 @@ from pipeline.dataset.scan import SCORED
 from pipeline.dataset.splits import ONE_SKIN
 from pipeline.learning.recipe import Training, training
 from pipeline.trials.before_touch import score_before_touch
-from pipeline.trials.data import prepare_training, read_data, train_all, trials_of
-from pipeline.trials.models import write_models
+from pipeline.trials.training import prepare_training, read_data, train_all, trials_of, write_models
 
 
 def read(settings: Settings) -> Training:

@@ -5,8 +5,7 @@ from pathlib import Path
 from pipeline.core.config import Files, Settings, read_settings
 from pipeline.core.stage import run
 from pipeline.learning.recipe import Training, training
-from pipeline.trials.data import prepare_training, read_data, train_all, trials_of
-from pipeline.trials.models import write_models
+from pipeline.trials.training import prepare_training, read_data, train_all, trials_of, write_models
 
 
 def read(settings: Settings) -> Training:

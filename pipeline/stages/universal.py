@@ -16,8 +16,8 @@ from pipeline.core.stage import run, say
 from pipeline.experiments.answer import read_folder
 from pipeline.experiments.compare.run import Compare, see, setup_of, skins_of, turns_of
 from pipeline.physics.skin import SkinDesign
-from pipeline.trials.data import read_data
 from pipeline.trials.experts import Frame, Known, make_experts, write_networks
+from pipeline.trials.training import read_data
 from pipeline.trials.universal import QUESTION, Bench, score_fold, tell_tempers
 from pipeline.twin.training import Lessons
 

@@ -14,7 +14,7 @@ from pipeline.dataset.splits import Fold
 from pipeline.learning.inputs import Scaler
 from pipeline.learning.recipe import Adaptation, training
 from pipeline.learning.trial import Adapting, Start, Trial
-from pipeline.trials.data import SceneData
+from pipeline.trials.training import SceneData
 
 Starts = dict[tuple[str, str, int], Start]  # by recipe, fold and seed
 

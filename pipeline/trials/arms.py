@@ -16,13 +16,11 @@ from pipeline.core.executors import device
 from pipeline.dataset.splits import Fold
 from pipeline.evaluation import scores
 from pipeline.evaluation.metrics import score
-from pipeline.learning.card import collapse_record
 from pipeline.learning.inputs import VIEW
 from pipeline.learning.recipe import Adaptation, training
 from pipeline.learning.trial import Trial
 from pipeline.trials.adapting import Starts, own_starts
-from pipeline.trials.data import SceneData, train_all
-from pipeline.trials.models import note_seconds
+from pipeline.trials.training import SceneData, collapse_record, note_seconds, train_all
 
 FORCE = 2  # column
 BEFORE, AFTER, CONTROL = "before", "after", "control"  # arms: as it was, adapted, as long without the skin's pokes

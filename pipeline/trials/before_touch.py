@@ -17,7 +17,7 @@ from pipeline.dataset.scan import gather_scan
 from pipeline.dataset.splits import SAME_SKIN
 from pipeline.evaluation.metrics import score
 from pipeline.learning.classical import Neighbours, fit
-from pipeline.trials.data import SceneData
+from pipeline.trials.training import SceneData
 
 NEIGHBOURS = Neighbours(method="knn", inputs="raw", neighbours_n=2)
 PLACE = ("accuracy_pct", "mse_xy_mm2")

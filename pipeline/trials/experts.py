@@ -13,7 +13,7 @@ from jaxtyping import Float
 from pipeline.core import io
 from pipeline.core.executors import make_executor
 from pipeline.dataset.rows import Rows
-from pipeline.trials.data import SceneData
+from pipeline.trials.training import SceneData
 from pipeline.twin.fit import TEN, Seen, fit
 from pipeline.twin.law import Law, Setup, simulate_uT
 from pipeline.twin.network import Weights

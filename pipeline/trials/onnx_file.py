@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core.errors import ParamsError
-from pipeline.learning.architecture import LAYERS
 from pipeline.learning.inputs import DB_FLOOR_uT
+from pipeline.learning.model import LAYERS
 from pipeline.trials.networks import Network
 
 if TYPE_CHECKING:

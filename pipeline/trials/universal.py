@@ -15,9 +15,8 @@ from jaxtyping import Float, Int64
 from pipeline.core.errors import ParamsError
 from pipeline.core.seeds import rng_for
 from pipeline.dataset.splits import Fold
-from pipeline.trials.data import SceneData
 from pipeline.trials.experts import Experts, Frame
-from pipeline.trials.models import score_test
+from pipeline.trials.training import SceneData, score_test
 from pipeline.twin.experts import Labels, centre, multiply, off_middle_mm, shift
 from pipeline.twin.fit import Seen
 from pipeline.twin.network import Opinion, Weights, predict

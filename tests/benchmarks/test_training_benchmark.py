@@ -25,13 +25,11 @@ from torch.utils.data import DataLoader, TensorDataset
 from pipeline.core.executors import make_executor
 from pipeline.core.seeds import rng_for
 from pipeline.learning import train as train_module
-from pipeline.learning.architecture import FEATURE_LAYERS_N, paper_layers
-from pipeline.learning.descent import AdamW
-from pipeline.learning.feed import Feed
 from pipeline.learning.grid import STACK_N, run_trials
-from pipeline.learning.model import Stack
+from pipeline.learning.job import Feed
+from pipeline.learning.model import FEATURE_LAYERS_N, Stack, paper_layers
 from pipeline.learning.recipe import Recipe
-from pipeline.learning.train import Watch, train_stack
+from pipeline.learning.train import AdamW, Watch, train_stack
 from pipeline.learning.trial import Measured, Trial
 
 BOARDS_N, SKINS_PER_BOARD_N, SEEDS_N = 6, 3, 3

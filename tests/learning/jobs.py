@@ -3,8 +3,8 @@
 import numpy as np
 
 from pipeline.core.seeds import rng_for
-from pipeline.learning.architecture import draw_weights, paper_layers
 from pipeline.learning.job import Job, Labelled, Unlabelled
+from pipeline.learning.model import draw_weights, paper_layers
 from pipeline.learning.triplets import make_points
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from pipeline.learning.feed import UNLABELLED, Batch
+from pipeline.learning.job import UNLABELLED, Batch
 from pipeline.learning.recipe import Schedule
 from pipeline.learning.trial import Terms
 

@@ -3,7 +3,7 @@ import pytest
 from torch import nn
 
 from pipeline.core.seeds import rng_for
-from pipeline.learning.architecture import (
+from pipeline.learning.model import (
     FEATURE_LAYERS_N,
     FEATURES_N,
     LAYERS,

@@ -4,7 +4,7 @@ import sys
 import pytest
 import torch
 
-from pipeline.learning.descent import AdamW, one_cycle
+from pipeline.learning.train import AdamW, one_cycle
 
 
 def weights() -> list[torch.Tensor]:

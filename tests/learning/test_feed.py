@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.learning.feed import UNLABELLED, Batch, Feed
-from pipeline.learning.job import Job
+from pipeline.learning.job import UNLABELLED, Batch, Feed, Job
 from tests.learning.jobs import some_job
 
 STEPS_N, BATCH_N = 20, 16

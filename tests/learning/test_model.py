@@ -5,8 +5,7 @@ from torch import nn
 
 from pipeline.core.seeds import rng_for
 from pipeline.learning import model
-from pipeline.learning.architecture import LAYERS, draw_weights
-from pipeline.learning.model import Predictor, Stack
+from pipeline.learning.model import LAYERS, Predictor, Stack, draw_weights
 from tests.learning.plain import features_of, plain_net, weights_of
 
 # float32 sums of up to 200 terms, in another order, six layers deep; numbers near 1

@@ -7,13 +7,11 @@ import torch
 from torch import nn
 
 from pipeline.core.seeds import rng_for
-from pipeline.learning.architecture import Weights, paper_layers
-from pipeline.learning.feed import Feed
-from pipeline.learning.job import Job, Labelled
-from pipeline.learning.model import Stack
+from pipeline.learning.job import Feed, Job, Labelled
+from pipeline.learning.model import Stack, paper_layers
 from pipeline.learning.recipe import Recipe
 from pipeline.learning.train import BLOCK_STEPS_N, Outcome, Watch, clip, train
-from pipeline.learning.trial import Terms
+from pipeline.learning.trial import Terms, Weights
 from tests.learning.jobs import some_job, some_weights
 from tests.learning.plain import plain_net, plain_train
 from tests.learning.recipes import recipe

@@ -7,8 +7,7 @@ import pytest
 
 from pipeline.dataset.lines import Lines
 from pipeline.learning import trial as trial_module
-from pipeline.learning.feed import Feed
-from pipeline.learning.job import make_job
+from pipeline.learning.job import Feed, make_job
 from pipeline.learning.recipe import AugmentedRecipe
 from pipeline.learning.train import train_stack
 from pipeline.learning.trial import DECIDING, Keys, Measured, Terms, Trained, Trial

@@ -6,8 +6,8 @@ import numpy as np
 
 from pipeline.core.seeds import rng_for
 from pipeline.dataset.lines import Lines, hand_lines
-from pipeline.learning.architecture import draw_weights, paper_layers
 from pipeline.learning.inputs import fit_standard
+from pipeline.learning.model import draw_weights, paper_layers
 from pipeline.learning.recipe import FineTuning, Labelling
 from pipeline.learning.trial import Adapting, FewLabels, Measured, Start, Trial
 from tests.learning.recipes import recipe

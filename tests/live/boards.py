@@ -12,7 +12,7 @@ from pipeline.capture.header import ARRIVALS_FILE, STREAM_FILE, Clock, Wire, wri
 from pipeline.capture.wire import Frames
 from pipeline.core import io
 from pipeline.core.seeds import rng_for
-from pipeline.learning.architecture import draw_weights, paper_layers
+from pipeline.learning.model import draw_weights, paper_layers
 from pipeline.live.answering import Models
 from pipeline.live.emulate import open_far_end, play
 from pipeline.live.script import Script, encode_pieces

@@ -94,7 +94,7 @@ def test_a_board_is_found_recorded_and_seen_at_work_and_its_faults_are_told(shel
         http_port = free.getsockname()[1]
     page = shell.start("live", "--port", link, "--model", write_model(tmp_path), "--http-port", http_port)
     assert "open http://localhost" in page.stdout.readline()  # it waits for the board
-    board = shell.start("emulate", capture, "--port", link, "--loop", "--fault", "stall@5+2", "--fault", "unplug@11+2")
+    board = shell.start("emulate", capture, "--port", link, "--loop", "--fault", "stall@3+2", "--fault", "unplug@6.5+1")
     asyncio.run(look(f"http://localhost:{http_port}/live"))
     page.send_signal(signal.SIGINT)
     assert page.wait(timeout=LONG_S) == 0

@@ -19,7 +19,7 @@ from tests.live.boards import RATE_HZ, played, write_script
 from tests.live.test_processes import Shell, wait_until
 from tests.stages.checkout import copy_checkout, warm_stages
 
-POKES_N, QUIET_S, DWELL_S = 30, 1.0, 0.25
+POKES_N, QUIET_S, DWELL_S = 30, 1.0, 0.15
 LABELS = ("--board", "b", "--skin", "s", "--scene", "pressed")
 SCENE = {
     "source": "recorded", "seed": 1, "questions": ["single_temporal"], "selection": {"force_min_N": 0.0},
@@ -32,7 +32,7 @@ pytestmark = [pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseud
 def make_poked() -> tuple[Script, ProbeLog]:
     """Make pokes at places of a grid with pauses that differ, and the robot's log, whose clock began 100 s earlier."""
     rng = rng_for(0, "poked")
-    starts_s = QUIET_S + np.cumsum(DWELL_S + rng.uniform(0.15, 0.4, POKES_N))
+    starts_s = QUIET_S + np.cumsum(DWELL_S + rng.uniform(0.1, 0.25, POKES_N))
     place_mm, force_N = 4.0 * rng.integers(1, 4, (POKES_N, 2)), rng.uniform(0.5, 2.0, POKES_N)
     t_s = np.arange(round((starts_s[-1] + 1.0) * RATE_HZ)) / RATE_HZ
     poke_i = np.searchsorted(starts_s, t_s, "right") - 1
@@ -45,7 +45,7 @@ def make_poked() -> tuple[Script, ProbeLog]:
     temperature_degC = (25 + 0.02 * rng.standard_normal((len(t_s), 5))).astype(np.float32)
     frames = Frames(b_uT, temperature_degC, np.full(len(t_s), np.nan), np.zeros(len(t_s), np.int64))
     contact = np.tile([False, True], POKES_N)
-    begin_s = 100 + np.column_stack([starts_s - 0.1, starts_s + 0.02]).ravel()
+    begin_s = 100 + np.column_stack([starts_s - 0.08, starts_s + 0.02]).ravel()
     x_mm, y_mm = np.repeat(place_mm, 2, axis=0).astype(np.float32).T
     Fz_N = np.where(contact, np.repeat(force_N, 2), 0).astype(np.float32)
     zero = np.zeros(2 * POKES_N, np.float32)

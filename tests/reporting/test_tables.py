@@ -6,10 +6,10 @@ import pytest
 from pipeline.core.errors import SchemaError
 from pipeline.evaluation.metrics import METRICS
 from pipeline.evaluation.scores import interval, tidy
-from pipeline.reporting.numbers import add_up, compose, foretold, lost_by_protocol, rounded
+from pipeline.reporting.numbers import add_up, compose, foretold, lost_by_protocol
 from pipeline.reporting.paper import TABLE_2
 from pipeline.reporting.readme import fill
-from pipeline.reporting.shown import show, to_markdown
+from pipeline.reporting.shown import rounded, show, to_markdown
 from pipeline.reporting.table1 import NOT_GIVEN, OURS
 from pipeline.reporting.tables import make_tables
 from tests.evaluation import cards

@@ -10,7 +10,7 @@ from pipeline.core.seeds import rng_for
 from pipeline.dataset.rows import Selection, gather
 from pipeline.dataset.splits import Split, draw_folds
 from pipeline.trials.before_touch import score_before_touch
-from pipeline.trials.data import SceneData
+from pipeline.trials.training import SceneData
 from tests.dataset.tables import readings
 
 PASSES_N, PLACES_N = 4, 64

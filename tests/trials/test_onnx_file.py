@@ -6,7 +6,7 @@ import pytest
 import reskin
 from pipeline.core.errors import ParamsError
 from pipeline.core.seeds import rng_for
-from pipeline.learning.architecture import LAYERS, draw_weights
+from pipeline.learning.model import LAYERS, draw_weights
 from pipeline.trials import onnx_file
 from pipeline.trials.networks import Network
 

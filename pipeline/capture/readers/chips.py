@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Float32
 
 from pipeline.capture import faults
 from pipeline.capture.header import Header
-from pipeline.capture.readers.units import check_fields
+from pipeline.capture.readers.table import check_fields
 from pipeline.capture.stream import TEMPERATURE_MAX_degC, TEMPERATURE_MIN_degC
 from pipeline.capture.wire import Frames
 from pipeline.core.errors import CaptureError

@@ -14,14 +14,16 @@ from jaxtyping import Float64, Int32
 from pipeline.capture.header import Header
 from pipeline.capture.readers.chips import find_whole_rows
 from pipeline.capture.readers.passes import find_passes
-from pipeline.capture.readers.table import make_readings, read_cells, to_numbers
-from pipeline.capture.readers.units import (
+from pipeline.capture.readers.table import (
     SAME_PLACE_mm,
     check_depths,
     check_fields,
     check_forces,
     check_places,
     check_touch,
+    make_readings,
+    read_cells,
+    to_numbers,
 )
 from pipeline.core.errors import CaptureError
 from pipeline.core.schema import AXES_PER_CHIP_N, Readings

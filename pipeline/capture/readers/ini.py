@@ -15,8 +15,16 @@ from jaxtyping import Bool, Float64, Int32
 from pipeline.capture.header import Header
 from pipeline.capture.readers.chips import Rows, find_whole_rows
 from pipeline.capture.readers.passes import find_passes
-from pipeline.capture.readers.table import make_readings, mean_by_group, read_cells, to_numbers
-from pipeline.capture.readers.units import check_fields, check_forces, check_places, check_touch
+from pipeline.capture.readers.table import (
+    check_fields,
+    check_forces,
+    check_places,
+    check_touch,
+    make_readings,
+    mean_by_group,
+    read_cells,
+    to_numbers,
+)
 from pipeline.core.errors import CaptureError
 from pipeline.core.schema import Readings
 

@@ -14,9 +14,20 @@ from jaxtyping import Bool, Float64, Int
 
 from pipeline.capture.header import Header
 from pipeline.capture.readers.chips import find_whole_rows
-from pipeline.capture.readers.named import check_columns, contact_rows, count_chips_of, count_within
-from pipeline.capture.readers.table import make_readings, mean_by_group, read_cells, to_numbers
-from pipeline.capture.readers.units import check_fields, check_forces, check_places, check_touch
+from pipeline.capture.readers.table import (
+    check_columns,
+    check_fields,
+    check_forces,
+    check_places,
+    check_touch,
+    contact_rows,
+    count_chips_of,
+    count_within,
+    make_readings,
+    mean_by_group,
+    read_cells,
+    to_numbers,
+)
 from pipeline.core.errors import CaptureError
 from pipeline.core.schema import Readings
 

@@ -29,13 +29,12 @@ from pipeline.experiments.ambient.fields import (
     without_common_part,
 )
 from pipeline.experiments.answer import write_answer
-from pipeline.learning.card import collapse_record
 from pipeline.learning.recipe import HEADLINE, Training, training
 from pipeline.physics.ambient import EARTH_DIP_DEG, EARTH_SIZE_T
 from pipeline.physics.skin import draw_skin
 from pipeline.synthesis.settings import Synthesis, synthesis_of
-from pipeline.trials.data import SceneData, read_data, train_all, trials_of
 from pipeline.trials.networks import Network, networks_without
+from pipeline.trials.training import SceneData, collapse_record, read_data, train_all, trials_of
 
 
 class Iron(Strict):

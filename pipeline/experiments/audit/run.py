@@ -17,7 +17,7 @@ from pipeline.evaluation.choice import settings_of, trimmed
 from pipeline.experiments.audit.sides import Check, Labels, Sides, audit_fold, holds, to_words
 from pipeline.learning.inputs import FIT, VIEW
 from pipeline.learning.recipe import HEADLINE, AuditSettings
-from pipeline.trials.data import SceneData, read_data
+from pipeline.trials.training import SceneData, read_data
 
 # The same rows give the same scaler but for the order of float64 sums, and that turns the last bit of a float32 at
 # most; 4 of them are 5e-7. One foreign row in 100,000 moves a mean by some 1e-5 of its deviation.

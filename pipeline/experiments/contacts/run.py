@@ -29,8 +29,8 @@ from pipeline.experiments.contacts.pairs import (
 from pipeline.experiments.contacts.superposition import superposition
 from pipeline.learning.inputs import shape
 from pipeline.synthesis.settings import synthesis_of
-from pipeline.trials.data import SceneData, read_data
 from pipeline.trials.networks import networks_without
+from pipeline.trials.training import SceneData, read_data
 
 Count = Annotated[int, Field(ge=1)]
 Fraction = Annotated[float, Field(gt=0, lt=1)]

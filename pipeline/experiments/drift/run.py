@@ -32,10 +32,9 @@ from pipeline.experiments.drift.windows import (
     over_windows,
     pace,
 )  # fmt: skip
-from pipeline.learning.card import collapse_record
 from pipeline.learning.recipe import HEADLINE, Training, with_training
 from pipeline.learning.trial import Trained, Trial
-from pipeline.trials.data import SceneData, prepare_training, train_all
+from pipeline.trials.training import SceneData, collapse_record, prepare_training, train_all
 
 Count = Annotated[int, Field(ge=1)]
 # No-load reading: once, every so often, before each contact, or whenever a reading is judged free of contact.

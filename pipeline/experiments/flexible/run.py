@@ -31,7 +31,7 @@ from pipeline.trials.arms import (
     compare_arms,
     summarise_arms,
 )  # fmt: skip
-from pipeline.trials.data import SceneData, prepare_training, read_data
+from pipeline.trials.training import SceneData, prepare_training, read_data
 
 DEPTH_DECIMALS = 2  # of a commanded depth in mm: nearer ones are one
 DRAWN_N = 400  # more points than these are not told apart in a panel

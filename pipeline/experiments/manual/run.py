@@ -28,7 +28,7 @@ from pipeline.trials.arms import (
     compare_arms,
     summarise_arms,
 )  # fmt: skip
-from pipeline.trials.data import SceneData, prepare_training, read_data
+from pipeline.trials.training import SceneData, prepare_training, read_data
 
 GRID = "grid"  # as many pokes, by the robot
 

@@ -21,10 +21,8 @@ from pipeline.dataset.splits import NO_POOL, Fold, draw_sides
 from pipeline.evaluation.metrics import ACCURACY_LIMIT_MM
 from pipeline.evaluation.scores import summarise, tally
 from pipeline.experiments.answer import read_folder, read_losses, write_answer
-from pipeline.learning.card import collapse_record
 from pipeline.learning.recipe import Training, with_training
-from pipeline.trials.data import SceneData, prepare_training, train_all, trials_of
-from pipeline.trials.models import note_seconds
+from pipeline.trials.training import SceneData, collapse_record, note_seconds, prepare_training, train_all, trials_of
 
 Count = Annotated[int, Field(ge=1)]
 Fraction = Annotated[float, Field(gt=0, lt=1)]

@@ -19,13 +19,11 @@ from pipeline.evaluation.metrics import score
 from pipeline.evaluation.scores import tally
 from pipeline.experiments.answer import read_folder, read_losses, write_answer
 from pipeline.learning.baselines import Task, run_tasks
-from pipeline.learning.card import collapse_record
 from pipeline.learning.classical import Neighbours
 from pipeline.learning.recipe import HEADLINE, Training, with_training
 from pipeline.learning.trial import Measured, Trial
 from pipeline.synthesis.settings import synthesis_of
-from pipeline.trials.data import SceneData, prepare_training, train_all
-from pipeline.trials.models import note_seconds
+from pipeline.trials.training import SceneData, collapse_record, note_seconds, prepare_training, train_all
 
 Count = Annotated[int, Field(ge=1)]
 Fraction = Annotated[float, Field(gt=0, lt=1)]

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.capture.readers import READERS
-from pipeline.capture.readers.units import check_depths, check_fields, check_forces, check_places, check_touch
+from pipeline.capture.readers.table import check_depths, check_fields, check_forces, check_places, check_touch
 from pipeline.core import seeds
 from pipeline.core.errors import CaptureError
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pipeline.capture import faults, probe
 from pipeline.capture.header import Firmware
 from pipeline.capture.readers.chips import SCALE_FRAMES_N, Watch
-from pipeline.capture.readers.units import check_log
+from pipeline.capture.readers.table import check_log
 from pipeline.capture.wire import Frames
 from pipeline.core import seeds
 from pipeline.core.errors import CaptureError

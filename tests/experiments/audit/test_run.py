@@ -22,10 +22,9 @@ from pipeline.learning.recipe import adaptations as adaptations_of
 from pipeline.learning.recipe import training
 from pipeline.learning.trial import Measured, Trained, Trial
 from pipeline.stages import split
-from pipeline.trials import models as _models
+from pipeline.trials import training as _training
 from pipeline.trials.adapting import adaptations, read_starts
-from pipeline.trials.data import SceneData, read_data, trials_of
-from pipeline.trials.models import write_models
+from pipeline.trials.training import SceneData, read_data, trials_of, write_models
 from tests.dataset.tables import readings
 from tests.scenes import ADAPTATIONS, RECIPE, SHARED, TRAINING, recorded, settings
 
@@ -127,7 +126,7 @@ def as_drawn(trial: Trial, data: SceneData) -> Trained:
 @pytest.fixture(autouse=True)
 def _at_home(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # seconds are noted in the working folder
-    monkeypatch.setattr(_models, "code_version", lambda: "abc")
+    monkeypatch.setattr(_training, "code_version", lambda: "abc")
 
 
 @pytest.fixture(scope="module")
@@ -135,7 +134,7 @@ def honest(tmp_path_factory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         folder = tmp_path_factory.mktemp("honest")
         patch.chdir(folder)
-        patch.setattr(_models, "code_version", lambda: "abc")
+        patch.setattr(_training, "code_version", lambda: "abc")
         return build(folder / "scene")
 
 

@@ -10,7 +10,7 @@ from pipeline.core.seeds import rng_for
 from pipeline.dataset.grid import points_mm
 from pipeline.dataset.splits import Fold
 from pipeline.experiments.contacts.run import Contacts, on_board
-from pipeline.trials.data import SceneData
+from pipeline.trials.training import SceneData
 from tests.dataset import tables
 
 ASKED = Contacts(pairs_n=40, separations_mm=(4.0, 8.0), false_alarm_fraction=0.1)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from pipeline.dataset.rows import Rows
-from pipeline.learning.card import describe
 from pipeline.learning.train import train_stack
 from pipeline.learning.trial import Trained, Trial
+from pipeline.trials.training import describe
 from tests.learning.trials import OWN, POKED, ROWS_N, TEST, TRAIN, adapting, few_labels, measured, pooled
 
 

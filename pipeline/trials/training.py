@@ -1,0 +1,205 @@
+"""What the training stages share: a scene's rows and folds -> trials -> finished trainings -> models with cards.
+
+A card holds all that the use of a model needs, and what it was trained on. Knows no argv.
+"""
+
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from jaxtyping import Float32, Int64
+
+from pipeline.core import io
+from pipeline.core.config import Settings
+from pipeline.core.executors import make_executor, prepare_workers
+from pipeline.core.provenance import COSTS, SECONDS, code_version, home, note_trainings
+from pipeline.core.stage import say
+from pipeline.dataset.folds import load_rows, parse_folds
+from pipeline.dataset.rows import TARGETS, Rows, Selection
+from pipeline.dataset.splits import Fold
+from pipeline.evaluation.metrics import score_groups
+from pipeline.learning.grid import run_trials
+from pipeline.learning.recipe import Training
+from pipeline.learning.trial import Adapting, FewLabels, Measured, Trained, Trial
+
+TRAINS = "pipeline.learning.train"
+CACHE = ".reskin/cells"  # finished trainings: a cache, and no output
+
+
+@dataclass(frozen=True)
+class SceneData:
+    """What a stage that trains reads: the scene's settings, its rows and its folds."""
+
+    scene: str
+    settings: Settings
+    rows: Rows
+    folds: list[Fold]
+
+    def folds_of(self, question: str) -> list[Fold]:
+        """Take the folds of one question."""
+        return [fold for fold in self.folds if fold.question == question]
+
+
+def prepare_training() -> None:
+    """Let what trains be imported while the stage reads what it trains on."""
+    prepare_workers(TRAINS)
+
+
+def read_data(settings: Settings, indentations: Path, folds: Path) -> SceneData:
+    """Read the rows and folds that a stage trains on."""
+    words = io.read_json(folds)
+    rows = load_rows(
+        [indentations / f"{name}.parquet" for name in words["captures"]], settings.section(Selection, "selection")
+    )
+    return SceneData(settings.scene, settings, rows, parse_folds(words, rows, str(folds)))
+
+
+def trials_of(
+    data: SceneData, training: Training, folds: Iterable[Fold], *, question: str | None = None
+) -> list[Trial]:
+    """Make a trial of every recipe, fold and seed; they answer the folds' own question, or the one that is named."""
+    return [
+        Trial(question or fold.question, name, recipe, fold.name, data.settings.seed, seed_i, fold.train, fold.test)
+        for fold in folds
+        for name, recipe in training.recipes.items()
+        for seed_i in range(training.seeds_n)
+    ]
+
+
+def measured(data: SceneData) -> Measured:
+    """Give of the rows what trainings read."""
+    return Measured(data.rows.db_uT, data.rows.target, data.rows.skin)
+
+
+def train_all(data: SceneData, trials: Sequence[Trial], stage: str) -> list[Trained]:
+    """Train what is not finished yet; say what stopped early, for it is used as it last was."""
+    start_s, stage_words = time.monotonic(), f"{data.scene} {stage}"
+
+    def tell(line: str) -> None:
+        say(f"{stage_words}: {line}")
+
+    with make_executor(imports=TRAINS) as executor:
+        trained = run_trials(trials, measured(data), executor=executor, cache=home() / CACHE, tell=tell)
+    took = {result.key: (result.seconds, result.reused) for result in trained}
+    note_trainings(COSTS / data.scene, stage, took, time.monotonic() - start_s)
+    for trial, result in zip(trials, trained, strict=True):
+        if result.stopped_step is not None:
+            diverged = f"{trial.name} diverged by step {result.stopped_step}: kept as it was before"
+            say(f"warning: {stage_words}: {diverged}")
+    return trained
+
+
+def write_models(
+    models: Path, data: SceneData, trials: Sequence[Trial], trained: Sequence[Trained], stage: str
+) -> None:
+    """Write models, their cards and predictions; what they took here stands beside, as it is no result."""
+    cards = [card_of(data, trial, result) for trial, result in zip(trials, trained, strict=True)]
+    with io.replacing(models) as folder:
+        folder.mkdir()
+        for trial, result, card in zip(trials, trained, cards, strict=True):
+            tensors = dict(result.weights) | result.scaler.arrays()
+            io.write_tensors(folder / f"{trial.name}.safetensors", tensors, {"format": card["format"]})
+            io.write_json(folder / f"{trial.name}.json", card)
+        io.write_table(folder / "predictions.parquet", _predictions(trials, trained, data.rows))
+    note_seconds(data.scene, stage, trials, trained)
+
+
+def card_of(data: SceneData, trial: Trial, trained: Trained) -> dict[str, Any]:
+    """Describe a training, with its scores on the rows that it was not trained on."""
+    card = describe(trial, trained, data.rows, data.scene, code_version())
+    return card | {"scores": score_test(data, trial.test, trained.predicted)}
+
+
+def score_test(data: SceneData, test: Int64[np.ndarray, " b"], predicted: Float32[np.ndarray, "b 3"]) -> dict[str, Any]:
+    """Score predictions for tested rows."""
+    return score_groups(data.rows.target[test], predicted, data.rows.board[test], data.rows.skin[test])
+
+
+def point_of(data: SceneData, trial: Trial, trained: Trained, method: str) -> dict[str, Any]:
+    """Keep of a training in a sweep what its curve needs: no weights, no predictions."""
+    card = card_of(data, trial, trained)
+    kept = ("key", "question", "fold", "seed_i", "stopped_step", "git", "scores", "collapsed", "collapsed_before_n")
+    return {name: card[name] for name in kept} | {"method": method, "trained_on_skins_n": len(card["train_skins"])}
+
+
+def note_seconds(scene: str, stage: str, trials: Sequence[Any], trained: Sequence[Any]) -> None:
+    """Keep what trainings, of networks or of classical methods, took here."""
+    took = [
+        {"name": trial.name, "train_s": result.seconds, "one_reading_s": result.one_reading_s}
+        for trial, result in zip(trials, trained, strict=True)
+    ]
+    io.write_json(SECONDS / scene / f"{stage}.json", took)
+
+
+def _predictions(trials: Sequence[Trial], trained: Sequence[Trained], rows: Rows) -> pa.Table:
+    """One row a test row and training: the truth and the prediction, side by side."""
+    tables = []
+    for trial, result in zip(trials, trained, strict=True):
+        words = {"question": trial.question, "recipe": trial.recipe_name, "fold": trial.fold, "seed_i": trial.seed_i}
+        columns = {name: pa.repeat(word, len(trial.test)) for name, word in words.items()}
+        columns["skin"] = pa.array(rows.skin[trial.test].tolist())
+        for i, name in enumerate(TARGETS):
+            columns[f"true_{name}"] = pa.array(rows.target[trial.test, i])
+            columns[f"predicted_{name}"] = pa.array(result.predicted[:, i])
+        tables.append(pa.table(columns))
+    return pa.concat_tables(tables)
+
+
+FORMAT = "reskin-model/3"
+
+
+def describe(trial: Trial, trained: Trained, rows: Rows, scene: str, code: str) -> dict[str, Any]:
+    """Describe a trained trial; `scores` are added where the truth is known."""
+    card = {
+        "format": FORMAT,
+        "scene": scene,
+        "question": trial.question,
+        "recipe_name": trial.recipe_name,
+        "recipe": trial.recipe.model_dump(mode="json"),
+        "fold": trial.fold,
+        "seed": trial.seed,
+        "seed_i": trial.seed_i,
+        "key": trained.key,
+        "git": code,
+        "architecture": {name: list(value.shape) for name, value in trained.weights.items()},
+        "input": {
+            "quantity": "change of field",
+            "unit": "uT",
+            "channels_n": rows.db_uT.shape[1],
+            "view": trial.recipe.inputs,
+        },
+        "output": {name: name.rsplit("_", 1)[1] for name in TARGETS},
+        "scaler": {name: value.tolist() for name, value in trained.scaler.arrays().items()},
+        "stopped_step": trained.stopped_step,
+        "explained_min": None if trained.explained_min is None else round(trained.explained_min, 6),
+        **collapse_record(trained),
+        "train_boards": np.unique(rows.board[trial.train]).tolist(),
+        "train_skins": np.unique(rows.skin[trial.train]).tolist(),
+        "train_rows_n": len(trial.train),
+        "test_boards": np.unique(rows.board[trial.test]).tolist(),
+        "test_skins": np.unique(rows.skin[trial.test]).tolist(),
+        "curve": [round(value, 9) for value in trained.curve],
+    }
+    return card if trial.tuning is None else card | {"tuning": _tuning(trial.tuning, rows)}
+
+
+def collapse_record(trained: Trained) -> dict[str, Any]:
+    """Record whether a training collapsed, and how often the same trial did before, with other draws."""
+    return {"collapsed": trained.collapsed, "collapsed_before_n": trained.collapsed_before_n}
+
+
+def _tuning(tuning: Adapting | FewLabels, rows: Rows) -> dict[str, Any]:
+    row = tuning.lines.row if isinstance(tuning, Adapting) else tuning.row
+    indentations = np.unique(rows.indentation[row])
+    return {
+        "from": tuning.start.key,
+        "settings": tuning.settings.model_dump(mode="json"),
+        "kind": "unlabelled" if isinstance(tuning, Adapting) else "labelled",
+        "skins": np.unique(rows.skin[row]).tolist(),
+        "indentations": indentations.tolist(),
+        "pokes_n": len(indentations),
+    }
