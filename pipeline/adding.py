@@ -5,8 +5,6 @@ layouts (`preparing`, `capture.readers`) and stages (`plan`).
 """
 
 import hashlib
-import subprocess
-import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -44,7 +42,7 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
             complete = write_capture(target, header, files)
             fingerprints = _read_through(target, complete, limit)
         after = with_capture(before, scene, complete, fingerprints, allow_copy=allow_copy)
-        _dvc(root, "add", "--quiet", str(target.relative_to(root)))
+        _track(target, root)
         write_registry(root, after)
         plan.use(root, [*read_plan(root / config.PLAN).scenes, scene])
     if "compare" in (settings.model_extra or {}):
@@ -136,8 +134,14 @@ def _forget(target: Path) -> None:
             target.parent.rmdir()
 
 
-def _dvc(root: Path, *words: str) -> None:
-    done = subprocess.run([sys.executable, "-m", "dvc", *words], cwd=root, capture_output=True, text=True, check=False)
-    if done.returncode:
-        got = done.stderr.strip()[-300:]
-        raise CaptureError("dvc " + " ".join(words), "DVC", "able to track it", got, "See above.")
+def _track(folder: Path, root: Path) -> None:
+    """Let DVC track a folder, as `dvc add` does; in this process, as starting another takes longer than all else."""
+    from dvc.exceptions import DvcException  # late: DVC takes a second
+    from dvc.repo import Repo
+
+    try:
+        with Repo(str(root)) as repo:
+            repo.add([str(folder)])
+    except (DvcException, OSError) as error:
+        rule, got = "able to track it", " ".join(str(error).split())[-300:]
+        raise CaptureError(f"dvc add {folder.relative_to(root)}", "DVC", rule, got, "See above.") from None

@@ -59,8 +59,8 @@ def stages_in_order() -> list[str]:
 
 
 def _ask_dvc() -> list[str]:
-    from dvc.repo import Repo  # type: ignore[import-untyped]  # late: a second of imports
-    from dvc.repo.reproduce import get_active_graph, plan_repro  # type: ignore[import-untyped]
+    from dvc.repo import Repo  # late: a second of imports
+    from dvc.repo.reproduce import get_active_graph, plan_repro
 
     with Repo() as repo:
         stages = plan_repro(get_active_graph(repo.index.graph))
