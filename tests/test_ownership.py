@@ -20,7 +20,7 @@ HOMES = {
     r"np\.random\.(?!Generator\b)|default_rng|\.manual_seed\(": ["core/seeds.py"],
     r"\bimport serial|from serial": ["capture/port.py"],
     r"ruamel": ["core/config.py", "plan.py", "registry.py", "tidying.py"],
-    r"\bimport torch|from torch": [f"learning/{name}.py" for name in ("model", "train", "feed", "descent")]
+    r"\bimport torch|from torch": [f"learning/{name}.py" for name in ("model", "train", "job")]
     + ["twin/network.py", "twin/training.py"],
     r"from sklearn": ["dataset/splits.py", "learning/classical.py", "experiments/*.py"],
     r"os\.environ": [

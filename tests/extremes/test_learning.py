@@ -9,7 +9,7 @@ import torch
 from pipeline.dataset import splits
 from pipeline.experiments.stability import learning
 from pipeline.experiments.stability.learning import fold_cases, learning_cases, loop_cases, scaling_cases, triplet_cases
-from pipeline.learning import feed, inputs, model, train, trial, triplets
+from pipeline.learning import inputs, job, model, train, trial, triplets
 
 SEED = 2021
 DIVERGES = "bottleneck scaled 1e3, learning rate 10"
@@ -66,7 +66,7 @@ def test_a_triplet_loss_of_roots_is_found_out(monkeypatch):
 
 def test_a_sampler_that_takes_ties_is_found_out(monkeypatch):
     monkeypatch.setattr(triplets, "_anchors", lambda place: np.ones(len(place), bool))
-    monkeypatch.setattr(feed, "draw_pairs", lambda points, anchor, rng: (anchor, anchor))
+    monkeypatch.setattr(job, "draw_pairs", lambda points, anchor, rng: (anchor, anchor))
     assert broken(triplet_cases(SEED)) == {"two pokes a skin: from each, only the other one"}
 
 
