@@ -1,5 +1,6 @@
 """Recordings made with known numbers: the fit finds them, and a wrong frame is named; and real ones."""
 
+import itertools
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -201,22 +202,17 @@ def real(shared_data, tmp_path_factory) -> dict[str, Pokes]:
 
 
 def test_laws_fitted_on_a_third_of_the_places_of_real_boards_give_all_of_them(real):
-    # Expected: what a fit on all places gives. A third leaves 22 of 65 in each of three files.
+    # A third leaves 22 of 65 in each of three files; what is fitted on these must hold on all.
     some = {board: _some(pokes, np.arange(len(pokes)) % 65 % 3 == 0) for board, pokes in real.items()}
     numbers, drawn = compare_boards(some, SECTION, DESIGN, seed=2021)
-    expected = {
-        ("board1", "fitted"): {"cosine_mean": 0.901, "explained_median": 0.809, "growth": (0.24, 0.32)},
-        ("board1", "refitted"): {"cosine_mean": 0.890, "explained_median": 0.796, "growth": (0.27, 0.32)},
-        ("board2", "fitted"): {"cosine_mean": 0.900, "explained_median": 0.825, "growth": (0.23, 0.17)},
-        ("board2", "refitted"): {"cosine_mean": 0.896, "explained_median": 0.818, "growth": (0.16, 0.17)},
-    }
-    for (board, way), of in expected.items():
+    cosine_min = {"fitted": 0.89, "refitted": 0.85}
+    for board, way in itertools.product(real, cosine_min):
         words, seen = numbers["by_board"][board]["laws"][way], see(real[board], SECTION)
         found = law.Law(**{name: words[name] for name in law.Law.__dataclass_fields__})
         told = beside(seen, law.simulate_uT(found, SETUP, seen.place_mm, seen.pokes.force_N))
-        assert told["cosine_mean"] == pytest.approx(of["cosine_mean"], abs=0.01)
-        assert told["explained_median"] == pytest.approx(of["explained_median"], abs=0.03)
-        assert (told["growth"]["simulated"], told["growth"]["recorded"]) == pytest.approx(of["growth"], abs=0.06)
+        assert told["cosine_mean"] > cosine_min[way]
+        assert told["explained_median"] > 0.78
+        assert told["growth"]["simulated"] == pytest.approx(told["growth"]["recorded"], abs=0.12)
     for board, own in numbers["by_board"].items():
         assert 0.6 < own["nominal"]["cosine_mean"] < 0.82
         assert own["frames"]["sentence"] == "Labels, chips and skin lie as the scene says."
