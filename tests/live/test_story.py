@@ -17,7 +17,7 @@ from pipeline.live.script import Script, encode_pieces
 from pipeline.predicting import read_network
 from tests.live.boards import RATE_HZ, played, write_script
 from tests.live.test_processes import Shell, wait_until
-from tests.stages.checkout import copy_checkout, warm_stages
+from tests.stages.checkout import copy_checkout, run
 
 POKES_N, QUIET_S, DWELL_S = 30, 1.0, 0.15
 LABELS = ("--board", "b", "--skin", "s", "--scene", "pressed")
@@ -69,8 +69,7 @@ def test_a_board_that_was_recorded_becomes_a_table_and_a_model_that_sees_it_live
         wait_until(link.is_symlink)
         assert "(unplugged after" in shell.run("record", "--port", link, "--out", "run1")  # where the script ends
         shell.run("add", "run1", "--layout", "capture", "--probe", "robot.csv", *LABELS)
-    with warm_stages(root) as run_stages:
-        run_stages()
+    run(root, "dvc", "repro")
 
     numbers = json.loads((root / "reports/pressed/numbers.json").read_text())
     assert numbers["provenance"]["source"] == "recorded"
