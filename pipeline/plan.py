@@ -86,7 +86,7 @@ def _captures(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, list
 def _more(stage: str, scene: Scene, captures: list[str]) -> dict[str, Any]:
     """Give what a stage needs of the scene beyond its settings."""
     match stage:
-        case "describe" | "split" | "drift" | "variation" | "compare" | "universal":
+        case "describe" | "split" | "drift" | "variation" | "compare" | "universal" | "rivals":
             return {"captures": captures}
         case "audit":
             return {"models": scene.modelled}

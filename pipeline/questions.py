@@ -77,6 +77,7 @@ ROWS = (
     _experiment("sensitivity", "glass"),
     _experiment("logs", "log", "lobo"),
     _experiment("compare", None, section=True, recorded=True),
+    _experiment("rivals", None, "universal", section=True, recorded=True),
     _experiment("contacts", None, "lobo", section=True, recorded=True),
     _experiment("ambient", None, "lobo", section=True),
     _experiment("dynamics", "press", "lobo"),

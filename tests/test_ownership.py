@@ -16,11 +16,11 @@ HOMES = {
     r"\bimport typer|from typer": ["cli.py", "live/commands.py"],
     r"\bimport aiohttp|from aiohttp": ["live/server.py"],
     r"\bimport socket|openpty": ["live/emulate.py"],
-    r"optimizer\.step\(": ["learning/train.py", "twin/training.py"],
+    r"optimizer\.step\(": ["learning/train.py", "learning/adversarial.py", "twin/training.py"],
     r"np\.random\.(?!Generator\b)|default_rng|\.manual_seed\(": ["core/seeds.py"],
     r"\bimport serial|from serial": ["capture/port.py"],
     r"ruamel": ["core/config.py", "plan.py", "registry.py", "tidying.py"],
-    r"\bimport torch|from torch": [f"learning/{name}.py" for name in ("model", "train", "job")]
+    r"\bimport torch|from torch": [f"learning/{name}.py" for name in ("model", "train", "job", "adversarial")]
     + ["twin/network.py", "twin/training.py"],
     r"from sklearn": ["dataset/splits.py", "learning/classical.py", "experiments/*.py"],
     r"os\.environ": [

@@ -4,6 +4,7 @@ Some know no board, and for each board some know the others. Refuses to know fol
 """
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -70,18 +71,35 @@ class Experts:
 
 def make_experts(known: Known, lessons: Lessons) -> tuple[Experts, dict[str, Experts]]:
     """Fit known boards; make experts that know none, and for each board those that know the others."""
-    seen, setup = known.seen, known.setup
     with make_executor(imports="pipeline.twin.training") as executor:
-        laws = dict(zip(seen, executor.map(fit, seen.values(), [setup] * len(seen), [TEN] * len(seen)), strict=True))
-        syllabuses = [Syllabus(NAMELESS, NOMINAL, OF_NOMINAL, setup)]
-        syllabuses += [syllabus_without(known, laws, board) for board in seen]
-        tables = [executor.submit(tabulate, each.centre, each.spreads, setup) for each in syllabuses]
+        syllabuses = _syllabuses(known, executor)
+        tables = [executor.submit(tabulate, each.centre, each.spreads, known.setup) for each in syllabuses]
         networks = [executor.submit(teach, each, lessons, known.data.settings.seed) for each in syllabuses]
         found = [
             Experts(of_map.result(), of_networks.result(), each.residual, each)
             for each, of_map, of_networks in zip(syllabuses, tables, networks, strict=True)
         ]
-    return found[0], dict(zip(seen, found[1:], strict=True))
+    return found[0], dict(zip(known.seen, found[1:], strict=True))
+
+
+def read_experts(known: Known, models: Path) -> tuple[Experts, dict[str, Experts]]:
+    """Make the same again with networks that were written; laws and tables, which are no files, are found anew."""
+    with make_executor(imports="pipeline.twin.tables") as executor:
+        syllabuses = _syllabuses(known, executor)
+        tables = [executor.submit(tabulate, each.centre, each.spreads, known.setup) for each in syllabuses]
+        found = [
+            Experts(of_map.result(), read_networks(models, each.name), each.residual, each)
+            for each, of_map in zip(syllabuses, tables, strict=True)
+        ]
+    return found[0], dict(zip(known.seen, found[1:], strict=True))
+
+
+def _syllabuses(known: Known, executor: Executor) -> list[Syllabus]:
+    """Say what may be known where no board is, and where each is held out."""
+    seen, setup = known.seen, known.setup
+    laws = dict(zip(seen, executor.map(fit, seen.values(), [setup] * len(seen), [TEN] * len(seen)), strict=True))
+    nominal = Syllabus(NAMELESS, NOMINAL, OF_NOMINAL, setup)
+    return [nominal, *(syllabus_without(known, laws, board) for board in seen)]
 
 
 def syllabus_without(known: Known, laws: Mapping[str, Law], board: str) -> Syllabus:
@@ -120,10 +138,24 @@ def write_networks(models: Path, experts: Sequence[Experts], lessons: Lessons, s
     with io.replacing(models) as folder:
         folder.mkdir()
         for each in experts:
-            name = each.syllabus.name.replace(" ", "-")
+            name = _file_name(each.syllabus.name)
             tensors = {f"{i}.{key}": value for i, one in enumerate(each.networks) for key, value in one.items()}
             io.write_tensors(folder / f"{name}.safetensors", tensors, {"format": FORMAT})
             io.write_json(folder / f"{name}.json", card_of(each, lessons, seed))
+
+
+def read_networks(models: Path, name: str) -> list[Weights]:
+    """Read the networks of what is known, by its name, in their order."""
+    tensors, _ = io.read_tensors(models / f"{_file_name(name)}.safetensors")
+    networks: dict[int, dict[str, np.ndarray]] = {}
+    for key, value in tensors.items():
+        i, _, weight = key.partition(".")
+        networks.setdefault(int(i), {})[weight] = value
+    return [networks[i] for i in sorted(networks)]
+
+
+def _file_name(name: str) -> str:
+    return name.replace(" ", "-")
 
 
 def card_of(experts: Experts, lessons: Lessons, seed: int) -> dict[str, object]:

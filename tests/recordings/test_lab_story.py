@@ -24,7 +24,8 @@ def lab(tmp_path_factory, shared_data) -> Iterator[Path]:
     settings["train_multi"]["seeds_n"] = 1
     settings["train_multi"] |= {"steps_n": 100, "variants": {}}
     settings |= {"questions": ["lobo"], "split": {}}  # more: the story of scene ci
-    del settings["few_labels"], settings["audit"], settings["compare"], settings["universal"]
+    for section in ("few_labels", "audit", "compare", "universal", "rivals"):
+        del settings[section]
     with scene.open("w") as stream:
         YAML().dump(settings, stream)
     plan.use(root, [])
