@@ -65,20 +65,18 @@ def read(settings: Settings) -> Rivals:
 def rivals(scene: str, files: Files, indentations: Path, folds: Path, models: Path, answer: Path) -> None:
     """Score rivals on every held-out board, on the rows that question labels tests."""
     settings = read_settings("rivals", scene, files)
-    data, compare, section = (
-        read_data(settings, indentations, folds),
-        settings.section(Compare, "compare"),
-        read(settings),
-    )
+    data, compare = read_data(settings, indentations, folds), settings.section(Compare, "compare")
     skins = skins_of(read_folder(indentations, tuple(settings.captures_in(indentations))))
     if len(skins) < 2:
         raise ParamsError(f"scene {scene}", "boards with known forces", "two or more", len(skins), "Add one.")
     setup = setup_of(compare, parse(SkinDesign, settings.shared["skin"], "params.yaml: skin"))
     frame = Frame(turns_of(compare), compare.labels_middle_mm, compare.labels_mirrored)
-    seen, of_labels = {board: see(pokes, compare) for board, pokes in skins.items()}, data.folds_of(QUESTION)
+    seen = {board: see(pokes, compare) for board, pokes in skins.items()}
+    section, of_labels = read(settings), data.folds_of(QUESTION)
     points, unpaired_n = baselines(data, of_labels, section)
     nominal, rig = read_experts(Known(data, frame, setup, seen), models)
-    bench, took = Bench(data, frame, seen, nominal, {}), []
+    bench = Bench(data, frame, seen, nominal, {})
+    took: list[told.Timed] = []
     for fold in of_labels:
         found, timed = told.score_told(bench, setup, of_labels, fold, rig)
         points, took = points + found, took + timed
