@@ -23,6 +23,7 @@ from pipeline.learning.model import Predictor
 from pipeline.learning.recipe import Recipe
 from pipeline.trials.data import SceneData
 
+EVERY_N = 10  # of a labelled poke's readings, one is a row: they differ by noise alone
 SAME_MM = 0.5  # so near to each other two pokes lie at one place
 WAYS = {"channels matched": match_channels, "CORAL": coral}
 DIRECT, AS_ROWS = "direct standardisation", "labels as rows"
@@ -45,7 +46,7 @@ def score_regressor(data: SceneData, fold: Fold, method: Classical, labels_n: Se
     for n in labels_n:
         back_uT = standardised_uT(data, fold, pokes[:n])
         points.append(told(plain.predict(view(back_uT)), method=f"{name}, {DIRECT}", pokes=NONE, labels_n=n))
-        own = np.concatenate(pokes[:n])
+        own = np.concatenate([row[::EVERY_N] for row in pokes[:n]])
         weight = np.concatenate([np.ones(len(known)), np.full(len(own), len(known) / len(own))]).astype(np.float32)
         more = np.concatenate([known, view(rows.db_uT[own])]), np.concatenate([target, rows.target[own]])
         fitted = fit(method, *more, draws(AS_ROWS, n), weight=weight)
