@@ -6,6 +6,7 @@ one in `train`. Refuses to know places of the new skin, files and scores.
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -19,9 +20,11 @@ from pipeline.learning.recipe import Schedule
 from pipeline.learning.train import clip, squared_error
 
 JUDGE_WIDTH = 64  # assumed
+MOMENTUM = 0.5  # of two networks against each other: more of it and they swing (Radford et al., ICLR 2016)
 RISES = 10.0  # of the weight over the training: 2 / (1 + exp(-10 p)) - 1, as its authors have it
-# Three layers, so that a stack answers with what its first three make.
-JUDGE = (Layer(FEATURES_N, JUDGE_WIDTH, True), Layer(JUDGE_WIDTH, JUDGE_WIDTH, True), Layer(JUDGE_WIDTH, 1, False))
+# Its third layer is as wide as the features of any stack.
+JUDGE_WIDTHS = (FEATURES_N, JUDGE_WIDTH, JUDGE_WIDTH, FEATURES_N, 1)
+JUDGE = tuple(Layer(in_n, out_n, out_n > 1) for in_n, out_n in pairwise(JUDGE_WIDTHS))
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,7 @@ def train_adversarial(domains: Domains, schedule: Schedule, weight: float, rng: 
         loss.backward()
         clip(net, schedule.gradient_norm_max)
         clip(judge, schedule.gradient_norm_max)
-        optimizer.step(*one_cycle(step_i, schedule.steps_n, schedule.rate_max))
+        optimizer.step(one_cycle(step_i, schedule.steps_n, schedule.rate_max)[0], MOMENTUM)
     return net.member(0)
 
 
