@@ -5,7 +5,7 @@ import numpy as np
 from pipeline.core import io
 from pipeline.core.seeds import rng_for
 from pipeline.dataset.rows import Rows
-from pipeline.trials.experts import READINGS_N, Experts, Frame, recorded, write_networks
+from pipeline.trials.experts import READINGS_N, Experts, Frame, read_networks, recorded, write_networks
 from pipeline.twin.network import draw_weights, predict
 from pipeline.twin.tables import NOMINAL, OF_NOMINAL
 from pipeline.twin.training import Lessons, Syllabus
@@ -42,10 +42,7 @@ def test_written_networks_answer_as_before(tmp_path):
     networks = [draw_weights(15, rng_for(0, "written", i)) for i in range(2)]
     experts = Experts(made_tables(), networks, None, Syllabus("without b1", NOMINAL, OF_NOMINAL, SETUP))
     write_networks(tmp_path / "universal", [experts], Lessons(skins_n=1, steps_n=2, seeds_n=2), 0)
-    tensors, _ = io.read_tensors(tmp_path / "universal/without-b1.safetensors")
-    read = [
-        {name.partition(".")[2]: value for name, value in tensors.items() if name.startswith(f"{i}.")} for i in range(2)
-    ]
+    read = read_networks(tmp_path / "universal", "without b1")
     db_uT = rng_for(0, "readings").normal(0, 300, (3, 15))
     before, after = (predict(of, db_uT, np.zeros(15), db_uT) for of in (networks, read))
     np.testing.assert_array_equal(before.place_mm, after.place_mm)

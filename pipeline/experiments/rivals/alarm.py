@@ -82,8 +82,8 @@ def alarm(
 
 
 def told(
-    left: Mapping[str, Float[np.ndarray, " b"]],
-    right: Mapping[str, Float[np.ndarray, " b"]],
+    left: Mapping[str, Float[np.ndarray, "_"]],
+    right: Mapping[str, Float[np.ndarray, "_"]],
     limits: Mapping[str, float],
 ) -> dict[str, Any]:
     """Summarise over boards: readings that raise the alarm, the area under the ROC curve, the median left over."""

@@ -1,0 +1,141 @@
+"""Pairs, strangers and controls of rivals, each beside what is known in closed form; and what is shown of them."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.core.config import Settings
+from pipeline.core.errors import ParamsError
+from pipeline.core.seeds import rng_for
+from pipeline.dataset.rows import Rows
+from pipeline.dataset.splits import Fold
+from pipeline.evaluation.metrics import score_groups
+from pipeline.experiments.rivals import alarm, aligned, told
+from pipeline.experiments.rivals.alarm import QUARTER, STRANGERS, Board
+from pipeline.experiments.rivals.points import FOREIGN, NONE, OWN, next_board, pokes_of, summarise
+from pipeline.experiments.rivals.show import WHY, tables
+from pipeline.trials.data import SceneData
+
+PLACES_MM = np.array([[4.0, 4.0], [6.0, 4.0], [8.0, 6.0], [4.0, 8.0], [6.0, 8.0]])
+FORCES_N = np.array([1.0, 4.0])
+MAP = np.eye(6) + 0.2 * rng_for(0, "skins differ").standard_normal((6, 6))
+
+
+def old_uT(place_mm: np.ndarray, force_N: np.ndarray) -> np.ndarray:
+    """Fields of the known board: linear in log F at a place."""
+    towards = np.cos(place_mm @ rng_for(0, "fields").standard_normal((2, 6)))
+    return 100 * towards * (2 + np.log(force_N))[:, None]
+
+
+def recorded() -> Rows:
+    """Two boards with the same pokes, two readings each; what board b1 reads goes to b0's by `MAP`."""
+    place_mm = np.tile(np.repeat(PLACES_MM, 2, axis=0), (2, 1))
+    force_N = np.tile(FORCES_N, 10)
+    board = np.repeat(["b0", "b1"], 10)
+    db_uT = old_uT(place_mm, force_N)
+    db_uT[10:] = db_uT[10:] @ np.linalg.inv(MAP)
+    twice = [np.repeat(part, 2, axis=0) for part in (board, db_uT, np.column_stack([place_mm, force_N]))]
+    names = np.array(["c"] * 40), twice[0], twice[0]
+    fields = twice[1].astype(np.float32), twice[2].astype(np.float32)
+    return Rows(*names, *fields, np.zeros(40, np.int32), np.arange(40) // 2, {})
+
+
+def fold(name: str, train: range, pool: range, test: range) -> Fold:
+    return Fold("labels", name, np.array(train), np.array(test), np.array(pool))
+
+
+DATA = SceneData("test", Settings("test", "test.yaml", {"seed": 0}, {}, {}), recorded(), [])
+FOLD = fold("b1-draw0", range(20), range(20, 40), range(20, 40))
+
+
+def test_a_pair_is_what_known_boards_read_at_the_same_place_and_force():
+    rows = recorded()
+    rows.target[20:22, 2] = 2.0  # between the two forces there
+    rows.target[22:24, 2] = 9.0  # past the strongest
+    rows.target[24:26, :2] = 50.0  # nobody poked there
+    found = aligned.pairs_uT(rows, FOLD.train, [np.arange(i, i + 2) for i in (20, 22, 24, 26)])
+    place_mm = PLACES_MM[[0, 0]]
+    np.testing.assert_allclose(found[:2], old_uT(place_mm, np.array([2.0, 4.0])), rtol=1e-5)
+    assert np.isnan(found[2]).all()
+    np.testing.assert_allclose(found[3], rows.db_uT[6], rtol=1e-5)
+
+
+def test_enough_pairs_turn_a_new_boards_fields_into_the_known_ones():
+    back_uT = aligned.standardised_uT(DATA, FOLD, pokes_of(DATA, FOLD))
+    np.testing.assert_allclose(back_uT, DATA.rows.db_uT[:20], rtol=0.02, atol=2.0)  # the least ridge is not 0
+    nowhere = fold("b1-draw0", range(2), range(36, 40), range(20, 40))
+    with pytest.raises(ParamsError, match="labelled pokes must be within"):
+        aligned.standardised_uT(DATA, nowhere, pokes_of(DATA, nowhere))
+
+
+def test_another_skins_pokes_are_those_of_the_next_board_in_the_same_draw():
+    names = "b0-draw0", "b0-draw1", "b1-draw0", "b1-draw1"
+    folds = [fold(name, range(1), range(1), range(1)) for name in names]
+    assert [next_board(one, folds).name for one in folds] == ["b1-draw0", "b1-draw1", "b0-draw0", "b0-draw1"]
+
+
+def test_strangers_read_as_much_as_the_board_and_elsewhere():
+    chips = rng_for(0, "chips").standard_normal((3, 5, 3))
+    for name, change in STRANGERS.items():
+        np.testing.assert_allclose(np.linalg.norm(change(chips), axis=(1, 2)), np.linalg.norm(chips, axis=(1, 2)))
+        assert not np.allclose(change(chips), chips), name
+    np.testing.assert_allclose(chips @ np.linalg.matrix_power(QUARTER, 4), chips)
+    own = Board(chips[:1].reshape(1, -1), chips.reshape(3, -1), chips.reshape(3, -1))
+    exchanged = own.seen_as(STRANGERS["two chips exchanged"]).pool_uT.reshape(3, 5, 3)
+    np.testing.assert_array_equal(exchanged, chips[:, [0, 2, 1, 3, 4]])
+
+
+def test_alarms_are_counted_above_each_boards_limit():
+    right = {"b0": np.array([0.1, 0.2, 0.3, 0.4]), "b1": np.array([0.1, 0.1, 0.2, 0.2])}
+    stranger = {"b0": np.array([0.9, 0.9]), "b1": np.array([0.1, 0.9])}
+    found = alarm.told(stranger, right, {"b0": 0.35, "b1": 0.15})
+    assert found["alarm_pct"]["mean"] == pytest.approx((100 + 50) / 2)
+    assert found["auc"]["mean"] == pytest.approx((1.0 + 0.5 * 0.25 + 0.5) / 2)  # ties count half
+    assert found["left_median"]["mean"] == pytest.approx((0.9 + 0.5) / 2)
+    assert alarm.told(right, right, {"b0": 0.35, "b1": 0.15})["auc"]["mean"] == pytest.approx(0.5)
+
+
+def points(method: str, given: str, off_mm: dict[str, float]) -> list[dict[str, Any]]:
+    true = np.array([[4.0, 4.0, 1.0], [6.0, 8.0, 2.0]])
+    board = np.array(["b", "b"])
+    found = []
+    for name, by_mm in off_mm.items():
+        own = np.char.add(board, name)
+        words = {"method": method, "name": given, "labels_n": 0, "fold": f"b{name}", "seed_i": 0}
+        found.append(words | {"scores": score_groups(true, true + [[by_mm, 0, 0], [0, 0, 0]], own, own)})
+    return found
+
+
+def numbers() -> dict[str, Any]:
+    name = told.INVERSION
+    told_points = points(name, OWN, {"0": 0.0, "1": 0.5}) + points(name, FOREIGN, {"0": 2.0, "1": 0.5})
+    others = points("ridge", NONE, {"0": 2.0, "1": 2.0}) + points("ridge, CORAL", OWN, {"0": 0.0, "1": 2.0})
+    controls = told.controls() | {("ridge, CORAL", OWN, 0): ("ridge", NONE, 0)}
+    stat = {"mean": 0.9, "n": 2, "ci95": [0.8, 1.0]}
+    row = {"alarm_pct": stat, "auc": stat, "left_median": stat}
+    strangers = [{"stranger": "north for south", "law": alarm.OF_RIGHT} | row]
+    return {
+        "methods": summarise(told_points + others, controls), "unpaired_n": 2,
+        "alarm": {"asked_pct": 5.0, "limit": stat, "right": row, "strangers": strangers},
+    }  # fmt: skip
+
+
+def test_a_control_is_paired_board_by_board():
+    rows = {(row["method"], row["pokes"]): row for row in numbers()["methods"]}
+    over = rows[told.INVERSION, FOREIGN]["over"]
+    assert over["by_board"]["b0"]["accuracy_pct"] == pytest.approx(-50.0)
+    assert over["accuracy_pct"]["mean"] == pytest.approx(-25.0)
+    assert rows["ridge, CORAL", OWN]["over"]["accuracy_pct"]["mean"] == pytest.approx(25.0)
+    assert "over" not in rows["ridge", NONE]
+
+
+def test_three_tables_say_what_helped_by_how_much_and_why():
+    made = tables(numbers(), "recorded")
+    assert made["rivals"]["method"].tolist() == ["ridge", "ridge, CORAL"]
+    assert made["rivals"]["why"].tolist() == ["–", WHY["CORAL"]]
+    assert made["rivals"]["paired, accuracy, points"][1].startswith("+25")
+    assert made["rivals_told"]["paired, accuracy, points"].tolist()[1].startswith("-25")
+    assert made["rivals_alarm"]["law"].tolist() == [alarm.OF_RIGHT] * 2
+    assert made["rivals"].attrs["meaning"].endswith("2 labelled pokes had no pair.")
+    assert all(set(table["source"]) == {"recorded"} for table in made.values())
