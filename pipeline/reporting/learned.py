@@ -40,6 +40,7 @@ HONEST = {"by_indentation": "single_indentation", "by_pass": "single_pass"}  # t
 SWEPT = ("multi", "triplet", "adapted")
 TRAINED_IN = {"lobo": "train_multi", "triplet": "train_triplet", "adapt": "adapt"}
 NETWORKS = {METHODS.get(question, "network"): question for question in TRAINED_IN}  # by method
+OWN_POKES = "its own"  # of question rivals: the unlabelled pokes that a method is given
 AXES = {"pokes": ("sweep_pokes", "pokes_n"), "sensors": ("sweep_sensors", "skins_n"), "labels": ("labels", "labels_n")}
 
 
@@ -86,7 +87,17 @@ def timed_learning(numbers: Mapping[str, Any], seconds: Mapping[str, Seconds]) -
         for row in numbers["sweep_pokes"]:
             times_s = [training["train_s"] for training in took if f".{row['pokes_n']}pokes." in training["name"]]
             joined["adaptation"].append(row | ({"seconds": float(np.median(times_s))} if times_s else {}))
+    if "rivals" in numbers:
+        timed = [
+            (row, _median_times(seconds.get("rivals", []), f"{row['method']}.")) for row in _told(numbers["rivals"])
+        ]
+        joined["rivals_costs"] = [{"method": row["method"]} | row[AS_LABELLED] | times for row, times in timed if times]
     return joined
+
+
+def _told(rivals: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Take of each method the row with the skin's own pokes."""
+    return [row for row in rivals["methods"] if row["pokes"] == OWN_POKES]
 
 
 def _lobo(rows: pd.DataFrame) -> dict[str, Any]:

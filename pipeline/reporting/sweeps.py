@@ -58,7 +58,7 @@ def learning_pages(runtime: Mapping[str, Any], source: str) -> dict[str, str]:
 
 
 def learning_costs(runtime: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate errors beside costs, where those were measured: of methods, and of adaptation by its pokes."""
+    """Tabulate errors beside costs, where those were measured: of methods, of adaptation by its pokes, of rivals."""
     methods = [
         {"method": row["method"], "inputs": row["inputs"], "training, s": _time(row, "train_s")}
         | {"one reading, µs": _time(row, "inference_us"), "source": source}
@@ -69,7 +69,13 @@ def learning_costs(runtime: Mapping[str, Any], source: str) -> dict[str, pd.Data
         {"pokes": str(row["pokes_n"]), "adaptation, s": _time(row, "seconds"), "source": source} | scored(row)
         for row in sorted(runtime.get("adaptation", []), key=lambda row: row["pokes_n"])
     ]
-    lines = {"learning": methods, "adaptation": adaptations}
+    rivals = [
+        {"method": row["method"], "until ready, s": _time(row, "train_s")}
+        | {"one reading, µs": _time(row, "inference_us"), "source": source}
+        | scored(row)
+        for row in runtime.get("rivals_costs", [])
+    ]
+    lines = {"learning": methods, "adaptation": adaptations, "rivals_costs": rivals}
     return {name: tabulate(lines[name]) for name in lines if name in runtime}
 
 
