@@ -13,11 +13,9 @@ import torch
 from jaxtyping import Float, Float32
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from pipeline.learning.architecture import FEATURES_N, Layer, Weights, draw_weights, paper_layers
-from pipeline.learning.descent import AdamW, one_cycle
-from pipeline.learning.model import Stack
+from pipeline.learning.model import FEATURES_N, Layer, Stack, Weights, draw_weights, paper_layers
 from pipeline.learning.recipe import Schedule
-from pipeline.learning.train import clip, squared_error
+from pipeline.learning.train import AdamW, clip, one_cycle, squared_error
 
 JUDGE_WIDTH = 64  # assumed
 MOMENTUM = 0.5  # of two networks against each other: more of it and they swing (Radford et al., ICLR 2016)

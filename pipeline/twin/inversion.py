@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import least_squares
 
-from pipeline.twin.fit import PRIOR, PRIOR_WEIGHT, STEP, OFFSET_uT
+from pipeline.twin.fit import PRIOR, STEP, OFFSET_uT
 from pipeline.twin.law import Law, Setup, at_rest_uT, simulate_uT, with_numbers
 from pipeline.twin.places import inside
 from pipeline.twin.tables import FORCES_N, NOMINAL, lattice_mm
@@ -19,6 +19,7 @@ from pipeline.twin.tables import FORCES_N, NOMINAL, lattice_mm
 # Stiffness and labels' offset stay nominal: where nothing says how hard and where a poke was, no field tells them.
 NUMBERS = ("seat_x_mm", "seat_y_mm", "rotation_deg", "gap_mm", "amplitude", "away_um_mm", "give_x_um", "give_y_um")
 LEAST = {"gap_mm": 0.3, "amplitude": 0.05}  # below these a skin would lie in its chips
+PRIOR_WEIGHT = 0.5  # assumed: that of `fit` was chosen with boards in view
 ROUNDS_N = 3  # of finding places under a law, then numbers and places together
 EVALUATIONS_MAX_N = 8  # of all derivatives, in a round
 STEP_MM, STEP_LOG_N = 0.05, 0.03  # of differences by place and by log force

@@ -5,8 +5,7 @@ import torch
 
 from pipeline.core.seeds import rng_for
 from pipeline.learning.adversarial import Domains, rising, train_adversarial, turned_back
-from pipeline.learning.architecture import paper_layers
-from pipeline.learning.model import Stack
+from pipeline.learning.model import Stack, paper_layers
 from pipeline.learning.recipe import Schedule
 from tests.learning.jobs import some_rows
 

@@ -14,8 +14,8 @@ from pipeline.dataset.splits import Fold
 from pipeline.evaluation.scores import statistic
 from pipeline.experiments.contacts.pairs import roc_area
 from pipeline.experiments.rivals.points import board_of, means_uT, pokes_of
-from pipeline.trials.data import SceneData
 from pipeline.trials.experts import Frame
+from pipeline.trials.training import SceneData
 from pipeline.twin.fit import Seen
 from pipeline.twin.inversion import Chart, chart, fit_unlabelled, search
 from pipeline.twin.law import Setup

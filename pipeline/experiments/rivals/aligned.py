@@ -21,7 +21,7 @@ from pipeline.learning.classical import Classical, fit
 from pipeline.learning.inputs import FIT, VIEW
 from pipeline.learning.model import Predictor
 from pipeline.learning.recipe import Recipe
-from pipeline.trials.data import SceneData
+from pipeline.trials.training import SceneData
 
 EVERY_N = 10  # of a labelled poke's readings, one is a row: they differ by noise alone
 SAME_MM = 0.5  # so near to each other two pokes lie at one place

@@ -12,8 +12,7 @@ from jaxtyping import Float, Int64
 from pipeline.core.seeds import rng_for
 from pipeline.dataset.splits import Fold
 from pipeline.evaluation.scores import AS_LABELLED, REGISTERED, by_skin, over_boards, paired, tidy
-from pipeline.trials.data import SceneData
-from pipeline.trials.models import score_test
+from pipeline.trials.training import SceneData, score_test
 
 OWN, NONE, FOREIGN = "its own", "none", "another skin's"  # unlabelled pokes that a method is given
 Point = dict[str, Any]

@@ -26,8 +26,8 @@ from pipeline.experiments.rivals.points import Point, pokes_of, summarise
 from pipeline.learning.classical import Classical
 from pipeline.learning.recipe import Name, Recipe
 from pipeline.physics.skin import SkinDesign
-from pipeline.trials.data import SceneData, read_data
 from pipeline.trials.experts import Frame, Known, read_experts
+from pipeline.trials.training import SceneData, read_data
 from pipeline.trials.universal import QUESTION, Bench
 
 

@@ -15,7 +15,7 @@ from pipeline.experiments.rivals import alarm, aligned, told
 from pipeline.experiments.rivals.alarm import QUARTER, STRANGERS, Board
 from pipeline.experiments.rivals.points import FOREIGN, NONE, OWN, next_board, pokes_of, summarise
 from pipeline.experiments.rivals.show import WHY, tables
-from pipeline.trials.data import SceneData
+from pipeline.trials.training import SceneData
 
 PLACES_MM = np.array([[4.0, 4.0], [6.0, 4.0], [8.0, 6.0], [4.0, 8.0], [6.0, 8.0]])
 FORCES_N = np.array([1.0, 4.0])
