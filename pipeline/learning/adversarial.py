@@ -13,9 +13,10 @@ import torch
 from jaxtyping import Float, Float32
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from pipeline.learning.model import FEATURES_N, Layer, Stack, Weights, draw_weights, paper_layers
+from pipeline.learning.model import FEATURES_N, Layer, Stack, draw_weights, paper_layers
 from pipeline.learning.recipe import Schedule
 from pipeline.learning.train import AdamW, clip, one_cycle, squared_error
+from pipeline.learning.trial import Weights
 
 JUDGE_WIDTH = 64  # assumed
 MOMENTUM = 0.5  # of two networks against each other: more of it and they swing (Radford et al., ICLR 2016)
