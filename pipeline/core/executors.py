@@ -1,4 +1,4 @@
-"""Where trainings run, and how long a call takes. In: RESKIN_EXECUTOR. Out: a `concurrent.futures` executor.
+"""Where calls run, and how long one takes. In: RESKIN_EXECUTOR. Out: a `concurrent.futures` executor.
 
 An environment variable and no parameter, because where a training ran must not change its hash. Refuses to know
 what is run.
@@ -20,23 +20,29 @@ from pipeline.core.errors import ParamsError
 
 VARIABLE = "RESKIN_EXECUTOR"
 DEFAULT, HERE = "processes:2", "here"
+CLUSTER = "dask:"  # before the address of a scheduler that runs already
 DEVICE_VARIABLE = "RESKIN_DEVICE"
 DEVICES = ("cpu", "cuda")
 REPEATS_N = 25
 
 
 def make_executor(tasks_n: int = 2, *, imports: str) -> Executor:
-    """Make the executor that RESKIN_EXECUTOR names: `processes:N` (default N = 2, one thread each), or `here`.
+    """Make the executor that RESKIN_EXECUTOR names: `processes:N` (default N = 2), `here`, or `dask:ADDRESS`.
 
-    One task by itself runs here. Module `imports` is what the tasks need: it is imported once, for all processes.
+    All have one thread a process. One task by itself runs here, unless a place is named. Module `imports` is what the
+    tasks need: it is imported once, for all processes.
     """
+    if address := _address():
+        from pipeline.core.cluster import Cluster  # late: Dask is an extra
+
+        return Cluster(address, imports)
     workers_n = _workers_n(DEFAULT if tasks_n > 1 else HERE)
     return ProcessPoolExecutor(workers_n, _context(imports), _end_with_parent) if workers_n else Here()
 
 
 def prepare_workers(imports: str) -> None:
     """Import what tasks will need where workers are forked from, while this process reads what they work on."""
-    if _workers_n(DEFAULT):
+    if not _address() and _workers_n(DEFAULT):
         _context(imports)
         forkserver.ensure_running()
 
@@ -48,8 +54,15 @@ def _workers_n(otherwise: str) -> int:
         return 0
     kind, _, count = name.partition(":")
     if kind != "processes" or not count.isdecimal() or int(count) < 1:
-        raise ParamsError(VARIABLE, "the executor", "processes:N with N >= 1, or here", repr(name), "Unset it for two.")
+        rule = "processes:N with N >= 1, here, or dask:ADDRESS"
+        raise ParamsError(VARIABLE, "the executor", rule, repr(name), "Unset it for two processes.")
     return int(count)
+
+
+def _address() -> str:
+    """Read RESKIN_EXECUTOR: the address of a cluster's scheduler; empty where work stays on this machine."""
+    name = os.environ.get(VARIABLE, "")
+    return name.removeprefix(CLUSTER) if name.startswith(CLUSTER) else ""
 
 
 def _context(imports: str) -> ForkServerContext:

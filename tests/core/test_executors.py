@@ -48,7 +48,7 @@ def burn(seconds: float) -> None:
         pass
 
 
-@pytest.mark.parametrize("word", ["", "threads:2", "processes", "processes:0", "processes:-1", "processes:x"])
+@pytest.mark.parametrize("word", ["", "threads:2", "dask:", "processes", "processes:0", "processes:-1", "processes:x"])
 def test_an_unknown_executor_is_one_sentence(monkeypatch, word):
     monkeypatch.setenv("RESKIN_EXECUTOR", word)
     with pytest.raises(ParamsError, match="RESKIN_EXECUTOR: the executor must be processes:N"):

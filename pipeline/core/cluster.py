@@ -1,0 +1,120 @@
+"""Calls on a cluster that runs already: the address of a Dask scheduler -> a `concurrent.futures` executor.
+
+Workers see the checkout under its own path (one machine, or a shared file system), as results are files in it; rows are
+read there once a process. They give a local run's bytes because they must have its code, its variables and one thread
+each: what differs is refused before work begins. Refuses to know what is run, and to start or end any worker.
+"""
+
+import os
+import sys
+from collections.abc import Callable, Mapping
+from concurrent.futures import BrokenExecutor, Executor, Future
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import pipeline
+from pipeline.core.errors import ParamsError
+from pipeline.core.numerics import signature
+
+CONNECT_MAX_s = 20.0
+HOW = "docs/settings.md says how workers are started."
+
+
+class Cluster(Executor):
+    """Submits calls to a Dask scheduler; each runs in this process's working directory, in one thread of a worker."""
+
+    def __init__(self, address: str, imports: str) -> None:
+        self._client = _connect(address)
+        try:
+            _check_workers(self._client, address)
+            self._client.run(import_module_there, imports)
+        except BaseException:
+            self._client.close()
+            raise
+        self._executor = self._client.get_executor(pure=False)  # a call writes files: it is run as often as asked
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Run a call on one of the workers."""
+        future: Future[Any] = Future()
+        future.set_running_or_notify_cancel()
+        submitted = self._executor.submit(run_there, os.getcwd(), partial(fn, *args, **kwargs))
+        submitted.add_done_callback(partial(_pass_on, future))
+        return future
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Wait for what was submitted, or cancel it, and leave the cluster as it was."""
+        self._executor.shutdown(wait=wait and not cancel_futures)
+        self._client.close()
+
+
+def run_there(folder: str, call: Callable[[], Any]) -> Any:
+    """Run a call on a worker as if it ran in a folder: paths of stages are relative to the checkout."""
+    os.chdir(folder)  # a worker has one thread
+    return call()
+
+
+def import_module_there(name: str) -> None:
+    """Import on a worker what its calls will need."""
+    import_module(name)
+
+
+def describe_process() -> dict[str, str]:
+    """Say what decides the bits of a result: versions, the code's own files, variables; of this process."""
+    from pipeline.core.executors import DEVICE_VARIABLE, device
+
+    return {
+        "Python": sys.version.split()[0],
+        "NumPy": np.__version__,
+        "the project's code": str(Path(pipeline.__file__).resolve()),
+        DEVICE_VARIABLE: device(),
+        "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "unset"),
+        "variables of numerics": ", ".join(signature()),
+    }
+
+
+def _connect(address: str) -> Any:
+    try:
+        from distributed import Client
+    except ImportError:
+        remedy = "Try: pip install -c constraints.txt -e '.[dask]'"
+        raise ParamsError("RESKIN_EXECUTOR", "package distributed", "installed", "none", remedy) from None
+    try:
+        return Client(address, timeout=CONNECT_MAX_s, set_as_default=False)
+    except (OSError, ValueError) as error:
+        rule, got = f"one that answers within {CONNECT_MAX_s:g} s", f"{address} ({str(error)[:80]})"
+        raise ParamsError("RESKIN_EXECUTOR", "the scheduler", rule, got, HOW) from None
+
+
+def _check_workers(client: Any, address: str) -> None:
+    """Raise if there is no worker, or one that would give other bits than this process."""
+    workers: Mapping[str, Any] = client.scheduler_info(n_workers=-1)["workers"]
+    if not workers:
+        raise ParamsError("RESKIN_EXECUTOR", f"workers of {address}", "one or more", "none", HOW)
+    for name, worker in workers.items():
+        if worker["nthreads"] != 1:
+            raise ParamsError("RESKIN_EXECUTOR", f"threads of worker {name}", "1", worker["nthreads"], HOW)
+    own = describe_process()
+    for name, theirs in client.run(describe_process).items():
+        for what, value in own.items():
+            if theirs[what] != value:
+                raise ParamsError("RESKIN_EXECUTOR", f"{what} of worker {name}", value, theirs[what], HOW)
+
+
+def _pass_on(future: Future[Any], submitted: Future[Any]) -> None:
+    """Give a call's result or error on; a worker that died is told as a local one is."""
+    from distributed import KilledWorker
+
+    if submitted.cancelled():
+        future.set_exception(BrokenExecutor("the call was cancelled"))
+        return
+    error = submitted.exception()
+    if isinstance(error, KilledWorker):
+        error = BrokenExecutor(str(error))
+    if error is None:
+        future.set_result(submitted.result())
+    else:
+        future.set_exception(error)
