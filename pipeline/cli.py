@@ -34,7 +34,7 @@ LOGS = (
     "Or a folder that `reskin record` wrote, or a Parquet file that `reskin decode` wrote."
 )
 
-Layout = Literal["capture", "serial-binary", "serial-text", "table", "lab", "ini", "eflesh"]
+Layout = Literal["capture", "serial-binary", "serial-text", "table", "lab", "ini", "eflesh", "eflash7"]
 Wire = Literal["binary", "binary-clock", "text-xyzt", "text-txyz"]
 Board = Annotated[str, Option(help="The circuit board's name.")]
 Marks = Annotated[list[str] | None, Option(help="capture, serial-*: STREAM_S,PROBE_S of one event; may be repeated.")]

@@ -23,7 +23,7 @@ from pipeline.dataset.captures import read_header
 NATIVE_FILES = (headers.STREAM_FILE, headers.ARRIVALS_FILE, headers.PROBE_FILE)
 UNNAMED = "unnamed"  # the board and skin of a recording that was made without their names
 
-Foreign = Literal["table", "lab", "ini", "eflesh"]
+Foreign = Literal["table", "lab", "ini", "eflesh", "eflash7"]
 Marks = tuple[tuple[float, float], ...]
 Prepared = tuple[Header, Mapping[str, bytes | Path]]
 

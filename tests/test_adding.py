@@ -171,7 +171,7 @@ def test_a_broken_recording_leaves_nothing_behind(root, tmp_path, content):
 
 def test_a_recording_that_is_not_there_is_called_missing(root, tmp_path):
     missing = "none: the file must be there; got nothing"
-    for layout in ("lab", "ini", "eflesh"):
+    for layout in ("lab", "ini", "eflesh", "eflash7"):
         refuse(root, lambda: preparing.foreign(tmp_path / "none", layout, labels(), {}), missing)  # noqa: B023
     refuse(root, lambda: preparing.native(tmp_path / "none", labels(), None, ()), missing)
 
@@ -197,7 +197,7 @@ def test_the_wrong_layout_suggests_the_right_one(lab_file, tmp_path):
 
 
 def test_a_recording_in_the_wrong_layout_is_refused(root, lab_file):
-    for layout in ("ini", "eflesh"):
+    for layout in ("ini", "eflesh", "eflash7"):
         refuse(root, lambda: preparing.foreign(lab_file, layout, labels(), {}), "readings.csv")  # noqa: B023
     refuse(root, lambda: preparing.native(lab_file.parent, labels(), None, ()), "header.json")
 

@@ -26,7 +26,7 @@ LOG_FILE = "log.csv"
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$"
 
 Name = Annotated[str, Field(pattern=NAME)]
-Layout = Literal["native", "table", "lab", "ini", "eflesh", "sd-card"]
+Layout = Literal["native", "table", "lab", "ini", "eflesh", "eflash7", "sd-card"]
 Wire = Literal["binary", "binary-clock", "text-xyzt", "text-txyz"]
 
 

@@ -38,6 +38,11 @@ def describe(readings: Readings) -> dict[str, float]:
     }
 
 
+def without_rest(described: Mapping[str, float]) -> dict[str, float]:
+    """Leave out the fields at rest: what a recorder subtracted before it wrote is not known."""
+    return {name: number for name, number in described.items() if not name.startswith("field_at_rest")}
+
+
 def over_skins(described: Sequence[tuple[str, Mapping[str, float]]]) -> dict[str, dict[str, float]]:
     """Give mean, sd, least and most over skins of every quantity of (skin, description); a skin's captures averaged."""
     rows = pd.DataFrame([numbers for _, numbers in described])

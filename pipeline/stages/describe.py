@@ -6,15 +6,21 @@ from pipeline.core import io
 from pipeline.core.config import Files, read_settings
 from pipeline.core.stage import run, say
 from pipeline.evaluation.description import describe as describe_one
-from pipeline.evaluation.description import over_skins
+from pipeline.evaluation.description import over_skins, without_rest
 
 
 def describe(scene: str, files: Files, indentations: Path, description: Path) -> None:
     """Describe every capture of a folder, and put them together over skins."""
     names = read_settings("describe", scene, files).captures_in(indentations)
     captures = [io.read_readings(indentations / f"{name}.parquet") for name in names]
-    together = over_skins([(one.skin, describe_one(one)) for one in captures])
     accounts = {one.capture: io.read_account(indentations / f"{one.capture}.parquet") for one in captures}
+    described = {one.capture: describe_one(one) for one in captures}
+    described |= {
+        name: without_rest(described[name])
+        for name, account in accounts.items()
+        if account.get("baseline_subtracted_rows_n")
+    }
+    together = over_skins([(one.skin, described[one.capture]) for one in captures])
     readings_n = sum(map(len, captures))
     counts = {"captures_n": len(captures), "readings_n": readings_n}
     counts["indentations_n"] = sum(account.get("indentations_n", 0) for account in accounts.values())

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pipeline.capture.header import Header
-from pipeline.capture.readers import eflesh, ini, lab
+from pipeline.capture.readers import eflash7, eflesh, ini, lab
 from pipeline.capture.readers.table import read_cells
 from pipeline.core.errors import CaptureError
 from pipeline.core.schema import Readings
@@ -183,3 +183,33 @@ def test_the_eflesh_shear_recording_has_ten_chips(shared_data: Path, tmp_path: P
     assert len(readings) == 7200
     assert np.isnan(readings.Fz_N).all()
     assert 17 < np.nanmax(readings.Fx_N) < 18.5
+
+
+@pytest.mark.parametrize(
+    ("name", "places", "zero_rows_n", "presses_N"),
+    [("position_1_20251028_003401", {1}, 18, 3.5), ("multi_touch_2_7_20251109_234435", {2, 7}, 41, 12.7)],
+)
+def test_eflash7_names_places_by_number_and_writes_zeros_between(
+    shared_data: Path, tmp_path: Path, name: str, places: set[int], zero_rows_n: int, presses_N: float
+) -> None:
+    readings, account = ingest(eflash7, shared_data / "eflash7" / f"{name}.csv", tmp_path)
+    assert {n for n in range(1, 10) if f"place_{n}_rows_n" in account} == places
+    assert account["dropped_zero_rows_n"] == zero_rows_n
+    assert np.isnan(readings.x_mm).all()
+    np.testing.assert_allclose(readings.Fz_N.max(), presses_N, atol=0.1)
+
+
+def test_eflash7_begins_untouched_and_keeps_a_remainder_of_its_recorders_baseline(
+    shared_data: Path, tmp_path: Path
+) -> None:
+    files = sorted((shared_data / "eflash7").glob("*.csv"))
+    assert len(files) == 19
+    rest_uT, read_n = [], 0
+    for file in files:
+        readings, account = ingest(eflash7, file, tmp_path)
+        assert 6 <= account["noload_rows_n"] <= 72
+        assert 0.03 < account["dropped_zero_rows_n"] / account["rows_read_n"] < 0.11
+        rest_uT.append(np.linalg.norm(readings.noload_uT[0]))
+        read_n += account["rows_read_n"]
+    assert read_n == 7351
+    assert 270 < max(rest_uT) < 280  # the ninth single touch, 12 minutes after the first

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Protocol
 
 from pipeline.capture.header import Header
-from pipeline.capture.readers import eflesh, ini, lab, plain
+from pipeline.capture.readers import eflash7, eflesh, ini, lab, plain
 from pipeline.core.schema import Readings
 
 
@@ -22,4 +22,6 @@ class Reader(Protocol):
         """Read a capture folder; `rows_n` + `noload_rows_n` + all `dropped_*_rows_n` = `rows_read_n`."""
 
 
-READERS: Mapping[str, Reader] = {"table": plain, "lab": lab, "ini": ini, "eflesh": eflesh}
+READERS: Mapping[str, Reader] = {
+    "table": plain, "lab": lab, "ini": ini, "eflesh": eflesh, "eflash7": eflash7,
+}  # fmt: skip

@@ -171,12 +171,7 @@ def check_fields(b_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n: i
 
     The grid shows only where values were not averaged; what is rounded to whole decimals shows none.
     """
-    b_max_uT = np.abs(b_uT).max(axis=1)
-    if b_max_uT.max() > FULL_SCALE_uT:
-        place = f"line {first_line_n + int(b_max_uT.argmax())}"
-        rule = f"below the full scale of {FULL_SCALE_uT:.0f} uT"
-        got = f"{b_max_uT.max():.6g} in {place}"
-        raise CaptureError(where, "field", rule, got, "Are the columns in order, and in uT?")
+    _check_full_scale(b_uT, where, first_line_n)
     usual_uT = float(np.median(np.linalg.norm(b_uT.reshape(len(b_uT), -1, 3).astype(np.float64), axis=2)))
     if usual_uT < WEAKEST_uT:
         rule = f"{WEAKEST_uT:g} uT or more at most chips, as the earth's field is"
@@ -186,6 +181,15 @@ def check_fields(b_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n: i
         unit = "nT" if step_uT > NANO_STEP_MIN else "G"
         rule = "in the steps of an MLX90393, 0.15 to 9.68 uT"
         raise CaptureError(where, "field", rule, f"steps of {step_uT:.3g}", f"Convert {unit} to uT.")
+
+
+def check_changes(db_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n: int) -> None:
+    """Raise if changes of field are beyond the chip's full scale or in steps that no chip has; they may be weak."""
+    _check_full_scale(db_uT, where, first_line_n)
+    step_uT = _find_step(db_uT)
+    if step_uT > NANO_STEP_MIN or step_uT < faults.STEP_MIN_uT:
+        rule = "in the steps of an MLX90393, 0.15 to 9.68 uT"
+        raise CaptureError(where, "change of field", rule, f"steps of {step_uT:.3g}", "Convert nT, mT or G to uT.")
 
 
 def check_forces(force_N: Float[np.ndarray, " f"], where: str, *, first_line_n: int) -> None:
@@ -235,6 +239,15 @@ def check_log(log: ProbeLog, where: str) -> None:
     if len(known_N) and np.median(known_N) < 0:
         got = f"{np.median(known_N):.4g} N"
         raise CaptureError(where, "the usual Fz_N in contact", "positive", got, "Turn its sign.")
+
+
+def _check_full_scale(b_uT: Float[np.ndarray, "f ch"], where: str, first_line_n: int) -> None:
+    b_max_uT = np.abs(b_uT).max(axis=1)
+    if b_max_uT.max() > FULL_SCALE_uT:
+        place = f"line {first_line_n + int(b_max_uT.argmax())}"
+        rule = f"below the full scale of {FULL_SCALE_uT:.0f} uT"
+        got = f"{b_max_uT.max():.6g} in {place}"
+        raise CaptureError(where, "field", rule, got, "Are the columns in order, and in uT?")
 
 
 def _find_step(b_uT: Float[np.ndarray, "f ch"]) -> float:

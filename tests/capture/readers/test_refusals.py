@@ -8,15 +8,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.capture.readers import READERS
-from tests.capture.readers import test_eflesh, test_ini, test_lab, test_plain
+from tests.capture.readers import test_eflash7, test_eflesh, test_ini, test_lab, test_plain
 
 WHOLE: dict[str, Callable[[Path], Path]] = {
     "table": test_plain.write,
     "lab": lambda folder: test_lab.write(folder, *test_lab.PRESSES),
     "ini": lambda folder: test_ini.write(folder, test_ini.ONE_PASS),
     "eflesh": test_eflesh.scan,
+    "eflash7": test_eflash7.write,
 }
-TESTS = {"table": test_plain, "lab": test_lab, "ini": test_ini, "eflesh": test_eflesh}
+TESTS = {"table": test_plain, "lab": test_lab, "ini": test_ini, "eflesh": test_eflesh, "eflash7": test_eflash7}
 FILES = [(layout, name) for layout, reader in READERS.items() for name in reader.FILES]  # type: ignore[attr-defined]
 ROWLESS = [b"", b"x", b"1", b"\n", b"\x00\xff\xfe\n", test_lab.NAMES.encode(), f"{test_lab.NAMES}\n".encode()]
 

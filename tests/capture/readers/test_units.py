@@ -110,4 +110,4 @@ def test_depths_pass_in_millimetres_only(deepest_mm: float, fine: bool) -> None:
 
 
 def test_each_layout_has_a_reader() -> None:
-    assert set(READERS) == {"table", "lab", "ini", "eflesh"}
+    assert set(READERS) == {"table", "lab", "ini", "eflesh", "eflash7"}
