@@ -119,8 +119,8 @@ class Scene(Asking, Seeded, extra="allow"):
 
     @model_validator(mode="after")
     def _questions_fit_the_source(self) -> "Scene":
-        if not self.with_folds:
-            with_folds = sorted(row.name for row in ROWS if row.folds is not None)
+        if not self.with_folds and not any(row.alone for row in self.rows):
+            with_folds = sorted(row.name for row in ROWS if row.folds is not None or row.alone)
             raise ValueError(f"questions holds at least one of {with_folds}")
         if self.simulate is None:
             if self.studied:

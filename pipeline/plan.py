@@ -68,7 +68,7 @@ def make_plan(scenes: Mapping[str, Scene], registry: Registry, flow: Mapping[str
     for stage, of_stage in items.items():
         for item in of_stage.values():
             scene = scenes[item["scene"]]
-            item |= _more(stage, scene, captures[item["scene"]])
+            item |= _more(stage, item["scene"], scene, captures[item["scene"]])
             for name, word in _words(flow, stage, item, scene.model_dump(mode="json", exclude_none=True)):
                 put(item, name, word)
     return {"scenes": {name: list(scene.questions) for name, scene in scenes.items()}, "stages": items}
@@ -83,17 +83,19 @@ def _captures(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, list
     return captures
 
 
-def _more(stage: str, scene: Scene, captures: list[str]) -> dict[str, Any]:
+def _more(stage: str, name: str, scene: Scene, captures: list[str]) -> dict[str, Any]:
     """Give what a stage needs of the scene beyond its settings."""
     match stage:
-        case "describe" | "split" | "drift" | "variation" | "compare" | "universal" | "rivals":
+        case "describe" | "split" | "drift" | "variation" | "compare" | "touches" | "universal" | "rivals":
             return {"captures": captures}
         case "audit":
             return {"models": scene.modelled}
         case "contacts":
             return _physics(scene)
         case "report" | "publish":
-            return {"questions": list(scene.questions)}
+            # What stands in for models where a scene trains none: a file that these stages rest on anyhow.
+            described = f"answers/{name}/described/{scene.described}.json"
+            return {"questions": list(scene.questions), "learnt": f"models/{name}" if scene.modelled else described}
     return {}
 
 

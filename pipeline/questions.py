@@ -36,15 +36,16 @@ class Question:
     folds: tuple[str, ...] | None = None
     section: bool = False
     recorded: bool = True  # a scene of recordings may ask it too
+    alone: bool = False  # a scene may ask it and nothing else: it needs no folds, and no places in mm
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "stage", self.stage or self.name)
 
 
 def _experiment(
-    name: str, protocol: str | None, *needs: str, section: bool = False, recorded: bool = False
+    name: str, protocol: str | None, *needs: str, section: bool = False, recorded: bool = False, alone: bool = False
 ) -> Question:
-    return Question(name, "experiment", needs=needs, protocol=protocol, section=section, recorded=recorded)
+    return Question(name, "experiment", "", needs, protocol, section=section, recorded=recorded, alone=alone)
 
 
 def _study(name: str, *, section: bool = False) -> Question:
@@ -79,6 +80,7 @@ ROWS = (
     _experiment("compare", None, section=True, recorded=True),
     _experiment("rivals", None, "universal", section=True, recorded=True),
     _experiment("contacts", None, "lobo", section=True, recorded=True),
+    _experiment("touches", None, section=True, recorded=True, alone=True),
     _experiment("ambient", None, "lobo", section=True),
     _experiment("dynamics", "press", "lobo"),
     _study("verification"),

@@ -12,7 +12,7 @@ from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
 from pipeline import adding, fetching, plan, preparing
-from pipeline.capture.readers import eflesh, ini, lab
+from pipeline.capture.readers import eflash7, eflesh, ini, lab
 from pipeline.cli import app
 from pipeline.core import config
 from pipeline.core.errors import ReskinError
@@ -294,8 +294,8 @@ def test_what_is_added_was_fetched_and_its_scene_is_there(name):
 @pytest.mark.parametrize("name", SOURCES)
 def test_real_recordings_have_the_checksums_on_record_and_are_read(name, shared_data, tmp_path):
     fetching.bring(SOURCES[name], str(shared_data / name), tmp_path / name)
-    counts = {"lab": 7150, "ini": 23300, "eflesh": 4805}  # rows, as data/README.md tells
-    readers = {"lab": lab, "ini": ini, "eflesh": eflesh}
+    counts = {"lab": 7150, "ini": 23300, "eflesh": 4805, "eflash7": 268}  # rows, as data/README.md tells
+    readers = {"lab": lab, "ini": ini, "eflesh": eflesh, "eflash7": eflash7}
     for recording in SOURCES[name].recordings[:1]:
         labels = Labels(recording.board, recording.skin, None)
         prepared = preparing.foreign(tmp_path / name / recording.path, recording.layout, labels, recording.options)

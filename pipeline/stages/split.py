@@ -6,8 +6,10 @@ from pipeline.core import io
 from pipeline.core.config import Files, Settings, parse_parts, read_settings
 from pipeline.core.stage import run, say
 from pipeline.dataset.folds import load_rows, render_folds
-from pipeline.dataset.rows import Selection
+from pipeline.dataset.rows import Rows, Selection
 from pipeline.dataset.splits import Split, draw_folds
+
+NO_ROWS = Rows.of_labels(boards=[], skins=[])
 
 
 def read(settings: Settings) -> Split:
@@ -19,6 +21,9 @@ def split(scene: str, files: Files, indentations: Path, folds: Path) -> None:
     """Draw the folds of every question that the scene asks."""
     settings = read_settings("split", scene, files)
     captures = settings.captures_in(indentations)
+    if not settings.plan("folds"):  # of a scene without questions that hold anybody out, and perhaps without places
+        io.write_json(folds, render_folds(captures, NO_ROWS, []))
+        return say(f"{scene}: no question of {len(captures)} captures asks for folds")
     rows = load_rows([indentations / f"{name}.parquet" for name in captures], settings.section(Selection, "selection"))
     drawn = draw_folds(rows, settings.plan("folds"), read(settings), settings.seed)
     io.write_json(folds, render_folds(captures, rows, drawn))

@@ -1,0 +1,1 @@
+"""Touches at numbered places, one or two at once, recorded (paper section 7)."""

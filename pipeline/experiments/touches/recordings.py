@@ -1,0 +1,90 @@
+"""The recordings of numbered places: readings and accounts -> touched rows, in blocks of time.
+
+A recording is of one place or of two, pressed again and again. It is never split at random: neighbouring rows are one
+press. Refuses to know millimetres, which nobody states, and what is asked of the rows.
+"""
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from pipeline.core.errors import ParamsError
+from pipeline.core.schema import Readings
+from pipeline.dataset.baseline import subtract
+from pipeline.dataset.rows import Selection
+
+PLACE_COUNT = re.compile(r"place_(\d+)_rows_n")  # of an account, by layouts that number places
+ROWS_MIN_N = 20  # touched rows that three blocks are cut of
+
+
+@dataclass(frozen=True)
+class Touched:
+    """The touched rows of one recording, in order of time: changes of field, forces, and the place or places."""
+
+    name: str
+    places: tuple[int, ...]
+    db_uT: Float32[np.ndarray, "f ch"]
+    force_N: Float32[np.ndarray, " f"]
+
+    def part(self, rows: slice) -> "Touched":
+        """Keep some of the rows."""
+        return Touched(self.name, self.places, self.db_uT[rows], self.force_N[rows])
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """A recording's rows by time: what is learned from, what a threshold is set on, what is tested; in this order."""
+
+    train: Touched
+    aside: Touched
+    test: Touched
+
+
+def touched(readings: Readings, account: Mapping[str, int], selection: Selection) -> Touched:
+    """Take the rows with enough force; raise for a recording whose places have no numbers, or with too few rows."""
+    places = tuple(sorted(int(found[1]) for name in account if (found := PLACE_COUNT.fullmatch(name))))
+    if len(places) not in (1, 2):
+        rule = "one or two, by number"
+        remedy = "Only layout eflash7 has such; ask this of a scene of its own."
+        raise ParamsError(f"capture {readings.capture}", "its places", rule, list(places), remedy)
+    rows = readings.Fz_N >= selection.force_min_N
+    if rows.sum() < ROWS_MIN_N:
+        rule = f"{ROWS_MIN_N} or more with {selection.force_min_N:g} N"
+        raise ParamsError(f"capture {readings.capture}", "touched rows", rule, int(rows.sum()), "Press longer.")
+    db_uT = subtract(readings.b_uT[rows], readings.noload_uT[rows])
+    return Touched(readings.capture, places, db_uT, readings.Fz_N[rows])
+
+
+def in_blocks(recording: Touched, train_fraction: float, aside_fraction: float) -> Blocks:
+    """Cut a recording's rows in three by time."""
+    rows_n = len(recording.db_uT)
+    first, second = (round(share * rows_n) for share in (train_fraction, train_fraction + aside_fraction))
+    parts = (slice(0, first), slice(first, second), slice(second, None))
+    return Blocks(*(recording.part(part) for part in parts))
+
+
+def single_and_double(recordings: Iterable[Touched]) -> tuple[list[Touched], list[Touched]]:
+    """Part recordings by how many places they touch; raise if no two places were touched alone, or a pair's were not.
+
+    A place that was recorded twice alone would mix two blocks of time, and is refused.
+    """
+    ordered = sorted(recordings, key=lambda recording: (recording.places, recording.name))
+    single, double = ([one for one in ordered if len(one.places) == n] for n in (1, 2))
+    alone = [one.places[0] for one in single]
+    if len(alone) < 2 or len(set(alone)) < len(alone):
+        rule = "of two or more places, each once"
+        raise ParamsError("question touches", "recordings of one place", rule, alone, "Add or remove recordings.")
+    unknown = [one.name for one in double if not set(one.places) <= set(alone)]
+    if unknown:
+        rule = "recorded alone as well"
+        raise ParamsError("question touches", "each place of a pair", rule, f"not those of {unknown}", "Add them.")
+    return single, double
+
+
+def joined(parts: Sequence[Touched]) -> tuple[Float32[np.ndarray, "f ch"], Float64[np.ndarray, " f"]]:
+    """Stack the changes of field of single touches, and the number of the place of each row."""
+    numbers = np.repeat(np.array([float(part.places[0]) for part in parts]), [len(part.db_uT) for part in parts])
+    return np.concatenate([part.db_uT for part in parts]), numbers

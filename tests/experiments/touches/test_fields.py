@@ -1,0 +1,122 @@
+"""A pad whose fields add exactly: its pairs leave nothing over, other pairs do, and a new place is as odd as two."""
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+from scipy.optimize import lsq_linear
+
+from pipeline.core.errors import ParamsError
+from pipeline.core.seeds import rng_for
+from pipeline.dataset.rows import Selection
+from pipeline.experiments.touches import fields
+from pipeline.experiments.touches.recordings import Touched, in_blocks, single_and_double, touched
+from pipeline.experiments.touches.run import Touches, of_detection, of_forces, of_places, of_superposition
+from pipeline.experiments.touches.show import tables
+from tests.dataset.tables import readings as make_readings
+
+PLACES = (1, 2, 3, 4)
+SECTION = Touches(train_fraction=0.6, aside_fraction=0.2, false_alarm_fraction=0.05)
+NOISE_uT = 2.0
+
+
+def pad(rows_n=40):
+    """Recordings of every place and pair: dB is force times the place's own direction, plus noise."""
+    rng = rng_for(0, "touches", "pad")
+    ways = dict(zip(PLACES, 400 * rng.normal(size=(len(PLACES), 15)), strict=True))
+    found = []
+    for places in [*((place,) for place in PLACES), *combinations(PLACES, 2)]:
+        force_N = rng.uniform(1, 3, (rows_n, len(places)))
+        db_uT = force_N @ np.stack([ways[place] for place in places]) + rng.normal(0, NOISE_uT, (rows_n, 15))
+        found.append(Touched(str(places), places, db_uT.astype(np.float32), force_N.sum(axis=1).astype(np.float32)))
+    return single_and_double(found)
+
+
+@pytest.fixture(scope="module")
+def cut():
+    single, double = pad()
+    return [in_blocks(one, SECTION.train_fraction, SECTION.aside_fraction) for one in single], double
+
+
+def test_blocks_hold_every_row_once_and_in_order_of_time():
+    recording = pad()[0][0]
+    blocks = in_blocks(recording, 0.6, 0.2)
+    parts = [blocks.train, blocks.aside, blocks.test]
+    assert [len(part.db_uT) for part in parts] == [24, 8, 8]
+    np.testing.assert_array_equal(np.concatenate([part.db_uT for part in parts]), recording.db_uT)
+
+
+def test_what_is_left_over_is_what_bounded_least_squares_leaves():
+    rng = rng_for(0, "touches", "left over")
+    known = {place: rng.normal(size=15) for place in PLACES}
+    db_uT = rng.normal(0, 100, (5, 15)).astype(np.float32)
+    basis = np.stack([known[2], known[4]], axis=1)
+    costs = [lsq_linear(basis, row.astype(float), (0, np.inf)).cost for row in db_uT]
+    naive = np.sqrt(2 * np.array(costs)) / np.linalg.norm(db_uT.astype(float), axis=1)
+    np.testing.assert_allclose(fields.left_over(known, (2, 4), db_uT), naive, rtol=1e-6)  # two solvers
+
+
+def test_fields_that_add_leave_the_pair_that_was_touched_noise_alone(cut):
+    blocks, double = cut
+    numbers = of_superposition(blocks, double)
+    assert len(numbers["pairs"]) == 6
+    for pair in numbers["pairs"]:
+        assert pair["rank"] == 1
+        assert pair["left_over_pct"] < 2  # noise of 15 channels is 8 uT in some 4000
+        assert pair["best_alone_pct"] > 10 * pair["left_over_pct"]
+
+
+def test_a_single_touch_at_a_place_unknown_is_as_odd_as_two(cut):
+    found = of_detection(*cut, SECTION, 0)
+    for name in found["detected_pct"]:
+        assert found["unseen_place_called_two_pct"][name] > 90
+    assert found["detected_pct"]["direction above noise"] > 90
+    assert found["sums_called_two_pct"]["direction above noise"] > 90
+
+
+def test_places_and_forces_of_a_linear_pad_are_told(cut):
+    blocks, double = cut
+    place, force = of_places(blocks, double), of_forces(blocks, rng_for(0, "touches", "force"))
+    assert place["by_time"]["mean"] == 100
+    assert place["by_time"]["chance_pct"] == 25
+    assert force["by_time"]["mean"] < 0.02 * force["variance"]["mean"]
+
+
+def test_only_recordings_with_numbered_places_and_enough_rows_are_taken():
+    readings = make_readings(f=60, Fz_N=np.linspace(0, 2, 60, dtype=np.float32))
+    found = touched(readings, {"rows_n": 60, "place_7_rows_n": 60}, Selection(force_min_N=1.0))
+    assert found.places == (7,)
+    assert found.force_N.min() >= 1
+    with pytest.raises(ParamsError, match="its places must be one or two, by number"):
+        touched(readings, {"rows_n": 60}, Selection(force_min_N=1.0))
+    with pytest.raises(ParamsError, match="touched rows must be 20 or more with 1.9 N; got 3"):
+        touched(readings, {"place_7_rows_n": 60}, Selection(force_min_N=1.9))
+
+
+def test_a_place_that_is_recorded_twice_or_never_alone_is_refused():
+    single, double = pad()
+    with pytest.raises(ParamsError, match="of two or more places, each once"):
+        single_and_double([*single, single[0]])
+    with pytest.raises(ParamsError, match="each place of a pair must be recorded alone as well"):
+        single_and_double([*single[:2], *double])
+
+
+def test_nothing_left_to_test_is_refused():
+    with pytest.raises(ValidationError, match="leave rows to test"):
+        Touches(train_fraction=0.8, aside_fraction=0.2, false_alarm_fraction=0.05)
+
+
+def test_tables_show_pairs_only_where_two_were_touched(cut):
+    blocks, double = cut
+    for pairs in (double, []):
+        numbers = {
+            "force_min_N": 0.5, "single": {"recordings_n": 4, "rows_n": 160},
+            "double": {"recordings_n": len(pairs), "rows_n": 40 * len(pairs)}, "place": of_places(blocks, pairs),
+            "force": of_forces(blocks, rng_for(0, "touches", "force")),
+            "superposition": of_superposition(blocks, pairs), "detection": of_detection(blocks, pairs, SECTION, 0),
+        }  # fmt: skip
+        shown = tables(numbers, "recorded")
+        assert ("touches_superposition" in shown) == bool(pairs)
+        assert ("two touches called two, %" in shown["touches_detection"]) == bool(pairs)
+        assert all((table["source"] == "recorded").all() for table in shown.values())
