@@ -28,6 +28,7 @@ HOMES = {
         "core/provenance.py",
         "core/server.py",
         "core/executors.py",
+        "core/cluster.py",
         "origins.py",
         "core/progress.py",
         "tracking.py",

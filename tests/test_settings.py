@@ -109,7 +109,7 @@ def overridden(root: Path, *overrides: tuple[str, str]) -> Iterator[None]:
 
 
 ENTRY = Entry(board="b", skin="s", layout="lab", chips_n=5, fingerprints=("0",), copy_of=None)
-CAPTURES = Registry(captures={scene: {"c0": ENTRY} for scene in ("lab", "ini", "eflesh")})
+CAPTURES = Registry(captures={scene: {"c0": ENTRY} for scene in ("lab", "ini", "eflesh", "eflash7")})
 SIMULATED = ("ci", "ci-wear", "ci-flexible", "ci-hand", "ci-drag", "ci-sleeve", "ci-glass", "ci-press", "ci-log")
 ALL_SIMULATE = {f"simulate@{key}" for key in SIMULATED}
 RIGID = ALL_SIMULATE - {"simulate@ci-flexible", "simulate@ci-sleeve"}

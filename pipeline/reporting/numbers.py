@@ -22,6 +22,7 @@ SINGLE = {
 }  # fmt: skip
 POLICIES = ("initial", "regular", "each")
 OF_DRIFT = ("accuracy_pct", "mse_f_N2")
+OF_TOUCHES = ("single_touches_pct", "mean_left_over_pct")
 OF_SHEAR = ("mse_xy_mm2", "mse_fxy_N2", "mse_fz_N2")
 
 Row = Mapping[str, Any]
@@ -128,6 +129,7 @@ def headline_scores(numbers: Row) -> dict[str, Any]:
         "single_sensor": {name: _means(numbers[question]) for name, question in SINGLE.items() if question in numbers},
         "drift_end": _drift_end(numbers.get("drift", {})),
         "shear": _means(numbers["shear"], OF_SHEAR) if "shear" in numbers else {},
+        "touches": _means(numbers["touches"]["superposition"], OF_TOUCHES) if "touches" in numbers else {},
     }
     return {name: part for name, part in parts.items() if part}
 
