@@ -68,7 +68,10 @@ def collect(recording: Path) -> dict[str, Path]:
 
 def count_chips(files: Mapping[str, Path]) -> int:
     """Count the chips from the names of the columns."""
-    return _count_chips(read_cells(files[READINGS], str(files[READINGS]), separator=",")[0])
+    where = str(files[READINGS])
+    names = [name.strip() for name in read_cells(files[READINGS], where, separator=",")[0]]
+    check_columns(names, ["timestamp", "mag0_x"], where, layout="eflash7")
+    return _count_chips(names)
 
 
 def read(folder: Path, header: Header) -> tuple[Readings, Account]:
