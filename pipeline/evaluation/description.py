@@ -39,8 +39,9 @@ def describe(readings: Readings) -> dict[str, float]:
 
 
 def without_rest(described: Mapping[str, float]) -> dict[str, float]:
-    """Leave out the fields at rest: what a recorder subtracted before it wrote is not known."""
-    return {name: number for name, number in described.items() if not name.startswith("field_at_rest")}
+    """Leave out the fields at rest and their changes: what a recorder subtracted before it wrote is not known."""
+    of_rest = ("field_at_rest", "rest_changes")
+    return {name: number for name, number in described.items() if not name.startswith(of_rest)}
 
 
 def over_skins(described: Sequence[tuple[str, Mapping[str, float]]]) -> dict[str, dict[str, float]]:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from pipeline.core.schema import Readings
 from pipeline.core.seeds import rng_for
-from pipeline.evaluation.description import describe, over_skins
+from pipeline.evaluation.description import describe, over_skins, without_rest
 
 INDENTATIONS_N, READINGS_N = 400, 5
 REST_uT = np.array([300.0, -400.0, 0.0, 1000.0, 0.0, -2500.0], np.float32)
@@ -113,3 +113,8 @@ def test_how_the_change_grows_with_force_is_asked_of_a_skin_over_all_its_capture
 def test_the_mean_lies_between_least_and_most(values):
     one = over_skins([(f"s{i}", {"a": value}) for i, value in enumerate(values)])["a"]
     assert one["least"] - 1e-6 <= one["mean"] <= one["most"] + 1e-6
+
+
+def test_without_rest_nothing_tells_of_fields_at_rest():
+    told = {"field_at_rest_chip_median_uT": 80.0, "rest_changes_in_1_uT": 0.0, "rate_hz": 9.0}
+    assert without_rest(told) == {"rate_hz": 9.0}
