@@ -1,0 +1,97 @@
+"""Every byte of a faulty board is a frame's or counted as lost for the right reason, exactly, whatever the faults."""
+
+from collections import Counter
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from pipeline.core.seeds import rng_for
+from pipeline.experiments.stability.wire import deliver
+from pipeline.live.inject import PIECES, VALUES, Fault, inject
+from pipeline.live.script import Script, encode_pieces
+from tests.capture.signals import TEXT_WIRES, WIRES, make_frames
+
+SLOTS_N, SLOT_FRAMES_N, RATE_HZ = 8, 12, 400.0  # a fault has a slot of its own; the last slot has none
+NOT_FINITE_SHARE = 0.02
+SEEDS_N = 200
+REASONS = ("frames_n", "frame_bytes_n", "not_finite_frames_n", "skipped_not_finite_bytes_n", "skipped_resync_bytes_n",
+           "skipped_truncated_bytes_n")  # fmt: skip
+
+
+def draw(seed: int) -> tuple[Script, list[bytes], list[bool], np.random.Generator]:
+    """Draw a stream with faults in most of its slots; also its frames on a sound wire, and which of them are finite."""
+    rng = rng_for(seed, "byte account")
+    wire, chips_n = str(rng.choice(WIRES)), int(rng.integers(1, 6))
+    frames = make_frames(SLOTS_N * SLOT_FRAMES_N, chips_n, seed)
+    faults = [str(name) for name in rng.choice([*VALUES, *PIECES, "none"], SLOTS_N - 1)]
+    # Behind damage, a frame that makes no sense passes for the rest of one: it is lost to the search for the next.
+    finite = rng.random(len(frames)) >= NOT_FINITE_SHARE
+    finite |= np.repeat([name in PIECES for name in [*faults, "none"]], SLOT_FRAMES_N)
+    script = Script("recorded", wire, frames, encode_pieces(frames, wire), np.arange(len(frames)) / RATE_HZ)
+    for slot_i, name in enumerate(faults):  # first what the chips give, then what the wire makes of it
+        if name in VALUES and (name != "clock-jump" or wire == "binary-clock"):
+            script = inject(script, in_slot(name, slot_i, rng))
+    pieces = list(script.pieces)
+    finite |= np.array([b"\r\n" in piece[:-2] for piece in pieces])  # of two readings of such bytes, sense decides
+    for i in np.flatnonzero(~finite):
+        pieces[i] = not_finite(pieces[i], wire)
+    script, clean = replace(script, pieces=pieces), pieces
+    for slot_i, name in enumerate(faults):
+        if name in PIECES:
+            script = inject(script, in_slot(name, slot_i, rng))
+    return script, clean, finite.tolist(), rng
+
+
+def in_slot(name: str, slot_i: int, rng: np.random.Generator) -> Fault:
+    first, frames_n = rng.integers(0, SLOT_FRAMES_N // 2), rng.integers(1, SLOT_FRAMES_N // 2)
+    return Fault(name, (slot_i * SLOT_FRAMES_N + first) / RATE_HZ, frames_n / RATE_HZ)
+
+
+def not_finite(piece: bytes, wire: str) -> bytes:
+    """Let the last number of a frame be none."""
+    if wire in TEXT_WIRES:
+        return piece[: piece.rstrip().rindex(b"\t") + 1] + b"nan\r\n"
+    return piece[:-6] + np.float32(np.nan).tobytes() + piece[-2:]
+
+
+def expected(script: Script, clean: list[bytes], finite: list[bool]) -> Counter[str]:
+    """Count as the account's names mean, from what was done to each frame and not from its bytes.
+
+    What is damaged takes the next frame with it, as nothing says where that begins; but for a line feed by chance.
+    """
+    count: Counter[str] = Counter()
+    in_step = True
+    for piece, whole, is_finite in zip(script.pieces, clean, finite, strict=True):
+        if piece not in (b"", whole, 2 * whole):
+            count["skipped_resync_bytes_n"] += len(piece)
+            in_step = script.wire in TEXT_WIRES and piece.endswith(b"\n")
+            continue
+        for _ in range(len(piece) // len(whole)):
+            if not in_step:
+                count["skipped_resync_bytes_n"] += len(whole)
+            else:
+                count["frames_n" if is_finite else "not_finite_frames_n"] += 1
+                count["frame_bytes_n" if is_finite else "skipped_not_finite_bytes_n"] += len(whole)
+            in_step = True
+    return count
+
+
+def in_portions(data: bytes, rng: np.random.Generator) -> list[bytes]:
+    cuts = np.sort(rng.integers(0, len(data), rng.integers(0, 9))).tolist()
+    return [data[first:last] for first, last in pairwise([0, *cuts, len(data)])]
+
+
+def test_frames_and_lost_bytes_are_all_that_was_sent_and_each_reason_is_right():
+    total: Counter[str] = Counter()
+    for seed in range(SEEDS_N):
+        script, clean, finite, rng = draw(seed)
+        count, data = expected(script, clean, finite), b"".join(script.pieces)
+        if seed % 2 and finite[-1]:  # unplugged inside the last frame
+            left_n = len(clean[-1]) - int(rng.integers(3, len(clean[-1])))
+            data = data[: len(data) - len(clean[-1]) + left_n]
+            count.update(frames_n=-1, frame_bytes_n=-len(clean[-1]), skipped_truncated_bytes_n=left_n)
+        _, account = deliver(in_portions(data, rng), script.wire, script.frames.temperature_degC.shape[1])
+        assert account == {"bytes_n": len(data)} | {name: count[name] for name in REASONS}, f"seed {seed}"
+        total += count
+    assert all(total[name] > 100 for name in REASONS)  # every reason was put to the test
