@@ -6,34 +6,48 @@ import pytest
 import reskin
 from pipeline.core.errors import ParamsError
 from pipeline.core.seeds import rng_for
+from pipeline.learning.inputs import FIT, VIEW
+from pipeline.learning.job import Job, Labelled
 from pipeline.learning.model import LAYERS, draw_weights
+from pipeline.learning.train import train
+from pipeline.learning.trial import Terms
 from pipeline.trials import onnx_file
 from pipeline.trials.networks import Network
+from tests.learning.recipes import recipe
+
+STEPS_N = 300
+SCALING = {"paper": "standard", "released": "released"}
+PULLS_mm = np.array([[4.0, 4.0, 0.3], [12.0, 12.0, 1.5]])  # places and forces of the rows trained on: least, greatest
 
 
-def network_of(architecture: str, inputs: str) -> Network:
-    """A network with weights that were drawn, and scalers of the size that trained ones have."""
-    rng, inputs_n = rng_for(0, "onnx"), {"raw": 15, "shape": 16}[inputs]
-    scaler = {
-        "input_shift": rng.standard_normal(inputs_n), "input_scale": rng.uniform(0.2, 200, inputs_n),
-        "target_shift": np.array([8.0, 8.0, 1.0]), "target_scale": np.array([4.6, 4.6, 0.5]),
-    }  # fmt: skip
-    weights = draw_weights(LAYERS[architecture](inputs_n), rng)
-    recipe = {"architecture": architecture, "inputs": inputs}
-    card = {"recipe": recipe, "input": {"channels_n": 15}}
-    return Network(card, weights | {name: value.astype(np.float32) for name, value in scaler.items()})
+def trained(architecture: str, inputs: str) -> tuple[Network, np.ndarray]:
+    """A network after some hundred steps of the project's own loop, and rows that it has not seen."""
+    rng = rng_for(0, "onnx", architecture, inputs)
+    target = rng.uniform(*PULLS_mm, (600, 3)).astype(np.float32)  # x_mm, y_mm, F_N
+    field = 60 * rng.standard_normal((6, 15))  # uT a mm or N, and a mm^2 or N^2
+    centred = target - PULLS_mm.mean(axis=0)
+    db_uT = (np.hstack([centred, centred**2]) @ field + 3 * rng.standard_normal((600, 15))).astype(np.float32)
+    settings, view = recipe(architecture=architecture, inputs=inputs, steps_n=STEPS_N, batch_n=64), VIEW[inputs]
+    scaler = FIT[SCALING[architecture]](view(db_uT[:500]), target[:500])
+    labelled = Labelled(scaler.encode(view(db_uT[:500])), scaler.encode_target(target[:500]), None)
+    start = draw_weights(LAYERS[architecture](labelled.inputs.shape[1]), rng)
+    (outcome,) = train([Job(start, rng, labelled)], architecture, settings, Terms(0.0), "cpu")
+    assert outcome.stopped_step is None
+    assert outcome.curve[-1] < 0.7 * outcome.curve[0]  # its weights are an optimiser's, and no longer the drawn ones
+    card = {"recipe": {"architecture": architecture, "inputs": inputs}, "input": {"channels_n": 15}}
+    return Network(card, dict(outcome.weights) | scaler.arrays()), db_uT[500:]
 
 
 @pytest.mark.parametrize("architecture", ["paper", "released"])
 @pytest.mark.parametrize("inputs", ["raw", "shape"])
-def test_onnxruntime_answers_as_torch_within_1e_5(tmp_path, architecture, inputs):
+def test_onnxruntime_answers_as_a_trained_network_under_torch_within_1e_5(tmp_path, architecture, inputs):
     pytest.importorskip("onnx", reason="extra `onnx` is not installed")
     runtime = pytest.importorskip("onnxruntime", reason="extra `onnx` is not installed")
-    network = network_of(architecture, inputs)
+    network, db_uT = trained(architecture, inputs)
     reskin.Model(network).export_onnx(tmp_path / "model.onnx")
     session = runtime.InferenceSession(tmp_path / "model.onnx", providers=["CPUExecutionProvider"])
-    db_uT = (300 * rng_for(1, "onnx").standard_normal((1000, 15))).astype(np.float32)
-    db_uT[0] = 0.0
+    far_uT = (1000 * rng_for(1, "onnx").standard_normal((100, 15))).astype(np.float32)  # no row trained on is as long
+    db_uT = np.concatenate([np.zeros((1, 15), np.float32), db_uT, far_uT])
     (found,) = session.run(None, {"db_uT": db_uT})
     expected = network(db_uT)
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
@@ -42,4 +56,4 @@ def test_onnxruntime_answers_as_torch_within_1e_5(tmp_path, architecture, inputs
 def test_without_the_package_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "onnx", None)
     with pytest.raises(ParamsError, match="pip install onnx"):
-        onnx_file.build(network_of("paper", "raw"))
+        onnx_file.build(Network({}, {}))
