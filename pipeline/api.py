@@ -6,7 +6,7 @@ called, so that the import costs little. Refuses to know stages and DVC.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -18,6 +18,7 @@ from pipeline.core.errors import ParamsError, SchemaError
 from pipeline.core.seeds import rng_for
 
 if TYPE_CHECKING:
+    from pipeline.capture.labels import Label
     from pipeline.dataset.rows import Rows
     from pipeline.live.skin import Skin as LiveSkin
     from pipeline.physics.board import Board
@@ -211,6 +212,47 @@ def open(port: str, *, model: Path | str | Sequence[Path | str] = (), baud: int 
 
     files = [model] if isinstance(model, str | Path) else model
     return Skin(port, [read_network(Path(file)) for file in files] or load_universal(), baud=baud)
+
+
+def lifted() -> Label:
+    """Make the label of a board that nothing touches; it comes before that of each touch."""
+    from pipeline.capture.labels import Label
+
+    return Label(False)
+
+
+def touch(x_mm: float, y_mm: float, **known: Any) -> Label:
+    """Make the label of a touch that stands still; `known`: depth_mm, Fx_N, Fy_N, Fz_N (on the skin), pass_i."""
+    from pipeline.capture.labels import Label
+
+    return Label(True, x_mm, y_mm, **known)
+
+
+def record(
+    labels: Iterable[Label] | Callable[[], Label | None], *, port: str | None = None, out: Path | str | None = None,
+    seconds: float = float("inf"), dwell_s: float = 0.5, **told: str,
+) -> Path:  # fmt: skip
+    """Record a board while a program moves a robot and says where it stands; give the capture's folder.
+
+    >>> def pokes():  # doctest: +SKIP
+    ...     for x_mm, y_mm in places:  # in random order: skins remember the touch before
+    ...         robot.lift_and_go_to(x_mm, y_mm); yield reskin.lifted()
+    ...         robot.press(); yield reskin.touch(x_mm, y_mm, Fz_N=robot.force_N())
+    >>> reskin.record(pokes(), board="b1", skin="s1", scan="random")  # doctest: +SKIP
+
+    Each label holds for `dwell_s`, in which the program is not asked for the next. In place of a generator: a
+    function that is called each time, until it gives None. `told`: board, skin, scan.
+    """
+    from pipeline.labelling.source import from_program
+    from pipeline.live.ports import the_board
+    from pipeline.live.taping import Wanted, record_board
+
+    board = the_board(None if port is None else [port])
+    wanted = Wanted(Path(out) if out is not None else None, seconds, 115200, told)
+    done = record_board(board, wanted, from_program(labels, dwell_s))
+    if done.failed is not None:
+        raise done.failed
+    return done.folder
 
 
 def _main_boards(scene: str) -> dict[str, Any]:

@@ -131,8 +131,10 @@ def native(recording: Path, labels: Labels, probe: Path | None, marks: Marks) ->
             raise CaptureError(recording, f"--{what}", rule, repr(said), "Which is right?")
     # A recorder that was killed has not hashed its files into the header; they are there all the same.
     files = {name: recording / name for name in NATIVE_FILES if (recording / name).exists() or name in found.files}
+    marks_before = found.clock.marks
     if probe is not None:
         _need(probe)
+        marks_before = () if headers.PROBE_FILE in files else marks_before  # these are of the log that was recorded
         files[headers.PROBE_FILE] = probe
     if headers.PROBE_FILE not in files:
         raise CaptureError(recording, "a capture", "labelled by a probe log", "none", "Add --probe PROBE.csv.")
@@ -141,7 +143,7 @@ def native(recording: Path, labels: Labels, probe: Path | None, marks: Marks) ->
         if file.parent == recording and found.files.get(name, io.sha256(file)) != io.sha256(file):
             raise CaptureError(file, "the file", "unchanged since it was recorded", "another hash", "Record it again.")
     _check_names(labels)
-    clock = found.clock.model_copy(update={"marks": (*found.clock.marks, *marks)})
+    clock = found.clock.model_copy(update={"marks": (*marks_before, *marks)})
     named = {"capture": labels.name or found.capture, "board": labels.board, "skin": labels.skin}
     return found.model_copy(update=named | {"clock": clock}), files
 

@@ -5,11 +5,14 @@ from pipeline.api import (
     Pokes,
     draw_board,
     draw_skin,
+    lifted,
     load_model,
     load_rows,
     load_universal,
     open,
+    record,
     simulate_pokes,
+    touch,
 )
 
 __all__ = [
@@ -17,9 +20,12 @@ __all__ = [
     "Pokes",
     "draw_board",
     "draw_skin",
+    "lifted",
     "load_model",
     "load_rows",
     "load_universal",
     "open",
+    "record",
     "simulate_pokes",
+    "touch",
 ]

@@ -141,16 +141,16 @@ class Tape:
             self.partial_line_bytes_n += len(partial + newline)
             self._in_partial_line, chunk = not newline, rest
         if chunk:
-            _append(self._stream, chunk)
+            append(self._stream, chunk)
             self.bytes_n += len(chunk)
             self._note_arrival(unix_s)
         return chunk
 
     def _note_arrival(self, unix_s: float) -> None:
-        _append(self._arrivals, f"{self.bytes_n},{unix_s:.6f}\n".encode())
+        append(self._arrivals, f"{self.bytes_n},{unix_s:.6f}\n".encode())
 
 
-def _append(file: FileIO, data: bytes) -> None:
+def append(file: FileIO, data: bytes) -> None:
     """Write all of some bytes or none."""
     start = file.tell()
     try:

@@ -15,6 +15,8 @@ Wire = Literal["binary", "binary-clock", "text-xyzt", "text-txyz"]
 Speed = Annotated[float, Option(help="Times its own rate; inf: as fast as it is taken.", min=0.01)]
 Baud = Annotated[int, Option(help="Baud rate; USB ports ignore it.", min=1)]
 SOURCE = "A capture's folder, or the name of a simulated scene."
+LABELS = "grid:NXxNY:STEP_MM or line:N:STEP_MM asks you to press places (Enter); or a CSV that a robot appends to."
+GAUGE = "Port of a force gauge that sends lines of Fz, or Fx Fy Fz, in N; @BAUD behind it, if not 9600."
 FAULT = "NAME[@START_S[+SECONDS]], such as stuck@3+1; may be repeated. A wrong name lists them all."
 
 
@@ -43,32 +45,21 @@ def record(
     baud: Baud = 115200,
     seconds: Annotated[float, Option(help="How long; without it, until Ctrl-C.", min=0.0)] = math.inf,
     scan: Annotated[str | None, Option(help="The order of the rig's places: random, snake, or your words.")] = None,
+    labels: Annotated[str | None, Option(help=LABELS)] = None,
+    gauge: Annotated[str | None, Option(help=GAUGE)] = None,
+    dwell_s: Annotated[float, Option("--dwell", help="How long each prompt's label holds, in s.", min=0.1)] = 1.0,
 ) -> None:
-    """Record what a board sends; label it with the robot's log when adding it."""
-    from pipeline.capture.port import PortSettings
-    from pipeline.live.health import Health
-    from pipeline.recording import UNTOLD, Told, new_folder, print_progress, record_capture
+    """Record what a board sends, and labels beside it; or label it with the robot's log when adding it."""
+    from pipeline.live.taping import Wanted, board_of, record_board, source_of
 
-    wire, chips_n = (wire or "binary"), (chips_n or 5)
-    if port is None:
-        from pipeline.live.ports import the_board
-
-        found = the_board()
-        typer.echo(found)
-        port, wire, chips_n = found.port, found.wire, found.chips_n
-    settings = PortSettings(baud, wire, chips_n, seconds, bytes_max_n=None, silence_s=5.0, no_frame_s=5.0)
-    folder = out or new_folder()
-    told = Told(board or UNTOLD.board, skin or UNTOLD.skin, scan or UNTOLD.scan)
-    health = Health(chips_n)
-    report = print_progress(lambda: [alarm.name for alarm in health.active(time.monotonic())])
-    done = record_capture(
-        port, folder, told=told, settings=settings, report=report,
-        watch=lambda frames: health.feed(frames, time.monotonic()),
-    )  # fmt: skip
-    counts = ", ".join(f"{key} {count}" for key, count in done.account.items() if count)
-    counts += "".join(f"; {alarm.name} ({alarm.count_n})" for alarm in health.alarms.values())
-    where = f"{folder}.part: no more could be written" if done.ended == "not written" else str(folder)
-    typer.echo(f"recorded {where} ({done.ended} after {done.duration_s:.1f} s): {counts}")
+    source = source_of(labels, gauge, scan, dwell_s=dwell_s, say=typer.echo)
+    told = {"board": board, "skin": skin, "scan": scan}
+    board_there = board_of(port, wire, chips_n, say=typer.echo)
+    wanted = Wanted(out, seconds, baud, {name: word for name, word in told.items() if word is not None})
+    done = record_board(board_there, wanted, source)
+    typer.echo(done.said)
+    if done.failed is not None:
+        raise typer.Exit(2)
 
 
 @app.command()

@@ -1,0 +1,114 @@
+"""Labels as they come: where the skin was touched, or that it was not, and when -> rows of `probe.csv` at once.
+
+Refuses to know where labels come from (`samples`, `pipeline.labelling`), and frames.
+"""
+
+import math
+import threading
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.capture.header import PROBE_FILE
+from pipeline.capture.port import append
+from pipeline.capture.probe import CONTACT, LABELS, NOLOAD, TYPES
+from pipeline.core.errors import CaptureError
+
+TIME_STEP_s = 1e-6  # as it is written
+TIME_MAX_s = 1e11  # unix time is below it for 3,000 years, unless it is in milliseconds
+
+
+class Label(NamedTuple):
+    """What is known of a dwell, in which nothing moves; NaN where it is not known.
+
+    Forces have the signs of `core.schema`: on the skin, `Fz_N` positive in compression.
+    """
+
+    contact: bool
+    x_mm: float = math.nan
+    y_mm: float = math.nan
+    depth_mm: float = math.nan
+    Fx_N: float = math.nan
+    Fy_N: float = math.nan
+    Fz_N: float = math.nan
+    pass_i: int = 0  # which round over all places
+
+
+class Dwell(NamedTuple):
+    """A label, and from when to when it held, on the clock of its source."""
+
+    label: Label
+    t_start_s: float
+    t_end_s: float
+
+
+class ProbeTape:
+    """The probe log of a recording as it grows; a touch is written with the no-load dwell before it, or not at all.
+
+    So what a killed recorder leaves is a log that `probe.parse` takes. Touches that it would refuse are counted.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.touches_n = self.without_noload_n = self.out_of_order_n = 0
+        self._indentation = -1
+        self._end_s = -math.inf
+        self._noload: Dwell | None = None
+        self._lock = threading.Lock()
+        self._file = (folder / PROBE_FILE).open("xb", buffering=0)
+        append(self._file, (",".join(TYPES) + "\n").encode())
+
+    def close(self) -> None:
+        """Take no more labels: what a source says from now on is of another time."""
+        with self._lock:
+            self._file.close()
+
+    def write(self, dwell: Dwell) -> None:
+        """Write a touch; keep a no-load dwell for the touch that follows it. A touch may go on over several dwells."""
+        _check(dwell)
+        with self._lock:
+            if self._file.closed:
+                return
+            if dwell.t_start_s < (self._noload.t_end_s if self._noload else self._end_s):
+                self.out_of_order_n += 1
+            elif not dwell.label.contact:
+                self._noload = dwell
+            elif self._noload is None and self._indentation < 0:
+                self.without_noload_n += 1
+            else:
+                self._append(dwell)
+
+    def write_all(self, dwells: Iterable[Dwell]) -> None:
+        for dwell in dwells:
+            self.write(dwell)
+
+    def _append(self, touch: Dwell) -> None:
+        opens = self._noload is not None
+        indentation = self._indentation + opens
+        pass_i = touch.label.pass_i
+        rows = [_row(dwell, indentation, pass_i) for dwell in (self._noload, touch) if dwell is not None]
+        append(self._file, "".join(rows).encode())
+        self._indentation, self._end_s, self._noload = indentation, touch.t_end_s, None
+        self.touches_n += opens
+
+
+def _row(dwell: Dwell, indentation: int, pass_i: int) -> str:
+    label = dwell.label
+    labels = [getattr(label, name) for name in LABELS] if label.contact else [math.nan] * len(LABELS)
+    cells = ["" if math.isnan(value) else f"{value:.9g}" for value in labels]
+    times = f"{dwell.t_start_s:.6f},{dwell.t_end_s:.6f}"
+    return ",".join([f"{indentation},{pass_i},{CONTACT if label.contact else NOLOAD},{times}", *cells]) + "\n"
+
+
+def _check(dwell: Dwell) -> None:
+    label, remedy = dwell.label, "Leave out what is not known."
+    for name in LABELS:
+        value = getattr(label, name)
+        if math.isinf(value) or abs(value) > np.finfo(np.float32).max:
+            raise CaptureError("a label", name, "a number", value, remedy)
+    if not 0 <= label.pass_i < 2**31:
+        raise CaptureError("a label", "pass_i", "0 or more", label.pass_i, "Count rounds from 0.")
+    if not -TIME_MAX_s < dwell.t_start_s <= dwell.t_end_s - TIME_STEP_s < TIME_MAX_s:  # of NaN, nothing is so
+        got = f"{dwell.t_start_s} to {dwell.t_end_s} s"
+        raise CaptureError("a label", "its time", "a span of the clock", got, "Is the clock in seconds?")

@@ -1,0 +1,1 @@
+"""Where labels come from while a board is recorded: keys, a table that grows, a force gauge, a robot's program."""

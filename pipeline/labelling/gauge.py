@@ -1,0 +1,69 @@
+"""A force gauge on a serial port: lines of one number (Fz) or three (Fx Fy Fz), in N. In: a port. Out: dwells."""
+
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from pipeline.capture.labels import Label
+from pipeline.capture.port import Device, open_port, read_waiting
+from pipeline.capture.samples import Dwells, Gauge, Sample, mean_label
+from pipeline.labelling.source import Desk, Source, told_bad
+
+KEPT_N = 10_000  # samples, of which a touch is a few hundred
+
+
+class Forces:
+    """What a gauge says; it remembers the last of it, and why it fell silent."""
+
+    def __init__(self, port: str, baud: int) -> None:
+        self.port, self._baud, self._gauge = port, baud, Gauge()
+        self._kept: deque[Sample] = deque(maxlen=KEPT_N)
+        self._silent = ""
+
+    def during(self, start_s: float, end_s: float) -> Label:
+        """Give the mean force between two times; NaN where nothing was said."""
+        found = [one.label for one in list(self._kept) if one.label and start_s <= one.t_s <= end_s]
+        return mean_label(found) if found else Label(True)
+
+    def told(self) -> str:
+        """Say what could not be read of it."""
+        bad = told_bad(f"the gauge at {self.port}", self._gauge.bad_n, self._gauge.first_bad)
+        return "; ".join(words for words in (bad, self._silent) if words)
+
+    @contextmanager
+    def listening(self, desk: Desk) -> Iterator[None]:
+        """Keep what it says while something else is done; raise if its port does not open."""
+        with open_port(self.port, self._baud) as device:
+            ear = threading.Thread(target=self._listen, args=[device, desk], daemon=True)
+            ear.start()
+            try:
+                yield
+            finally:
+                desk.stop.set()
+                ear.join()
+
+    def _listen(self, device: Device, desk: Desk) -> None:
+        try:
+            self.read(device, desk, self._kept.extend)
+        except OSError as error:
+            self._silent = f"the gauge at {self.port} was unplugged, and forces are missing from then on: {error}"
+
+    def read(self, device: Device, desk: Desk, use: Callable[[list[Sample]], object]) -> None:
+        """Read until the recording stops."""
+        while not desk.stop.is_set():
+            if chunk := read_waiting(device):
+                use(self._gauge.feed(chunk, desk.unix_s()))
+
+
+def from_gauge(port: str, baud: int) -> Source:
+    """Take forces alone: touches without places, told by the force."""
+
+    def run(desk: Desk) -> str:
+        forces, dwells = Forces(port, baud), Dwells()
+        with open_port(port, baud) as device:
+            forces.read(device, desk, lambda samples: desk.tape.write_all(dwells.feed(samples)))
+        desk.tape.write_all(dwells.close())
+        return forces.told()
+
+    return Source("gauge", None, run)

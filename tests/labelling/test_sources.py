@@ -1,0 +1,173 @@
+"""Each source of labels writes a log that ingest takes, without a board, a robot or a person."""
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from pipeline.capture import probe
+from pipeline.capture.header import PROBE_FILE
+from pipeline.capture.labels import Label, ProbeTape
+from pipeline.core.errors import ParamsError
+from pipeline.core.seeds import rng_for
+from pipeline.labelling.gauge import Forces, from_gauge
+from pipeline.labelling.places import parse_places
+from pipeline.labelling.prompts import Prompts
+from pipeline.labelling.source import Desk, Labeller, Source, from_program
+from pipeline.labelling.table import from_table
+
+DWELL_s = 0.002
+
+
+@pytest.fixture
+def desk(tmp_path):
+    marks = []
+    desk = Desk(ProbeTape(tmp_path), time.time, threading.Event(), lambda *mark: marks.append(mark))
+    desk.marks = marks
+    yield desk
+    desk.tape.close()
+
+
+def log_of(folder):
+    return probe.parse(folder / PROBE_FILE, "log")
+
+
+def prompts(words, *, scan="random", forces=None, text="grid:3x2:4", dwell_s=DWELL_s):
+    said = []
+    asked = Prompts(parse_places(text), dwell_s, said.append, lambda: iter(words), forces, rng_for(0, "keys"), scan)
+    return asked, said
+
+
+def test_a_robots_program_moves_and_says_where_it_stands(desk, tmp_path):
+    def pokes():
+        for x_mm in (4.0, 12.0):
+            yield Label(False)
+            yield Label(True, x_mm, 8.0, Fz_N=0.5)
+
+    assert Labeller(from_program(pokes(), DWELL_s), desk).end(5.0) == "2 touches labelled"
+    log = log_of(tmp_path)
+    assert log.x_mm[log.contact].tolist() == [4.0, 12.0]
+    assert (log.t_end_s - log.t_start_s >= DWELL_s - 1e-5).all()
+
+
+def test_a_function_is_called_each_time_until_it_gives_none(desk, tmp_path):
+    labels = [None, Label(True, 1.0, 1.0), Label(False)]
+    from_program(labels.pop, DWELL_s).run(desk)
+    assert len(log_of(tmp_path)) == 2
+
+
+def test_what_is_no_label_and_a_robot_that_fails_end_the_labels_and_are_told(desk):
+    def pokes():
+        yield Label(False)
+        raise RuntimeError("the robot is in its limits")
+
+    labeller = Labeller(from_program(pokes(), DWELL_s), desk)
+    assert labeller.end(5.0) == "0 touches labelled; labels ended: the robot is in its limits"
+    assert isinstance(labeller.failed, RuntimeError)
+    with pytest.raises(ParamsError, match="must be a reskin.Label; got 'lifted'"):
+        from_program(["lifted"], DWELL_s).run(Desk(desk.tape, time.time, threading.Event(), desk.mark))
+
+
+def test_a_program_that_hangs_is_not_waited_for(desk):
+    hung = threading.Event()
+    labeller = Labeller(Source("hangs", None, lambda _: str(hung.wait(30))), desk)
+    assert labeller.end(0.05) == "0 touches labelled"
+    hung.set()
+
+
+def test_a_person_presses_the_places_shown_in_an_order_drawn_anew_each_pass(desk, tmp_path):
+    asked, said = prompts([""] * 24 + ["q"])
+    asked.run(desk)
+    log = log_of(tmp_path)
+    places = [tuple(xy) for xy in np.stack([log.x_mm, log.y_mm], axis=1)[log.contact].tolist()]
+    assert set(places[:6]) == set(places[6:]) == {(x, y) for x in (0.0, 4.0, 8.0) for y in (0.0, 4.0)}
+    assert places[:6] != places[6:]
+    assert log.pass_i[log.contact].tolist() == [0] * 6 + [1] * 6
+    shown = [line for line in said if "press place" in line]
+    assert all(f"x {x:g}, y {y:g} mm" in line for line, (x, y) in zip(shown, places, strict=True))
+    assert "then place" in shown[0]
+
+
+def test_another_index_a_force_and_a_slip_of_the_finger_are_understood(desk, tmp_path):
+    words = ["", "4", "", "0.8N", "", "2 1.5 n", "", "99", "what", "s", "", "q"]
+    asked, said = prompts(words, scan="snake", text="line:5:2@1,8")
+    asked.run(desk)
+    log = log_of(tmp_path)
+    assert log.x_mm[log.contact].tolist() == [9.0, 3.0, 5.0]
+    assert log.Fz_N[log.contact][1:] == pytest.approx([0.8, 1.5])
+    assert np.isnan(log.Fz_N[log.contact][0])
+    assert len([line for line in said if "is no place" in line]) == 2
+
+
+def test_a_snake_goes_there_and_back_and_places_that_are_none_are_refused():
+    assert parse_places("grid:3x2:4").order("snake", rng_for(0, "x")) == [0, 1, 2, 5, 4, 3]
+    assert parse_places("robot.csv") is None
+    for wrong in ("grid:0x2:4", "line:5:0", "grid:9999x9999:1"):
+        with pytest.raises(ParamsError, match="places must be 1 to"):
+            parse_places(wrong)
+
+
+class Telling:
+    """A gauge's port that says what it is told to; then it is unplugged."""
+
+    def __init__(self, chunks):
+        self.chunks = list(chunks)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+    def read(self, *_):
+        time.sleep(0.002)
+        if not self.chunks:
+            raise OSError("gone")
+        return self.chunks.pop(0)
+
+
+@pytest.fixture
+def telling(monkeypatch):
+    def tell(chunks):
+        monkeypatch.setattr("pipeline.labelling.gauge.open_port", lambda *_: Telling(chunks))
+        monkeypatch.setattr("pipeline.labelling.gauge.read_waiting", Telling.read)
+
+    return tell
+
+
+def test_a_gauge_beside_the_keys_gives_each_touch_its_mean_force(desk, tmp_path, telling):
+    telling([b"0.4\n0.6\n"] * 3000)
+    asked, _ = prompts(["", "", "q"], forces=Forces("gauge", 9600), dwell_s=0.05)
+    assert asked.run(desk) == ""
+    log = log_of(tmp_path)
+    assert log.Fz_N[log.contact] == pytest.approx(0.5)
+
+
+def test_a_gauge_alone_tells_touches_by_force_and_that_it_was_unplugged(desk, tmp_path, telling):
+    telling([b"0.00\n"] * 40 + [b"0.50\n"] * 40 + [b"oops\n"])
+    labeller = Labeller(from_gauge("gauge", 9600), desk)
+    labeller._thread.join()
+    assert "labels ended: gone" in labeller.end()
+    log = log_of(tmp_path)
+    assert log.contact.tolist() == [False, True]
+    assert log.Fz_N[1] == pytest.approx(0.5)
+    assert np.isnan(log.x_mm[1])
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_a_table_is_followed_as_it_grows_and_its_own_clock_is_marked(desk, tmp_path, there):
+    file, old = tmp_path / "robot.csv", "t_s,phase,x_mm,y_mm\n"
+    rows = "".join(f"{7 + 0.1 * i:.1f},{phase},4,8\n" for i, phase in enumerate(["noload"] * 3 + ["contact"] * 3))
+    if there:
+        file.write_text(old + rows.replace("\n7.", "\n1."))
+    labeller = Labeller(from_table(file), desk)
+    time.sleep(0.1)
+    with file.open("a") as stream:
+        stream.write(rows if there else old + rows)
+    time.sleep(0.1)
+    assert labeller.end(5.0) == "1 touches labelled"
+    log = log_of(tmp_path)
+    assert log.t_start_s.tolist() == pytest.approx([7.0, 7.3])
+    assert desk.marks[-1][1] == pytest.approx(7.5)
+    assert desk.marks[-1][0] == pytest.approx(time.time(), abs=5)
