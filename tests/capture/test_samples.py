@@ -35,7 +35,7 @@ def test_a_robot_that_stands_still_gives_a_dwell_of_each_phase():
 def test_a_long_touch_is_several_dwells_each_with_its_force_and_another_place_is_another_dwell():
     text = HEAD + "".join(rows("contact", i, 10, 3, 0.1 * (i + 1)) for i in range(3)) + rows("contact", 3, 3, 4)
     found, _ = dwells_of(text)
-    assert all(dwell.t_end_s - dwell.t_start_s <= DWELL_MAX_s + 0.01 for dwell in found)
+    assert all(dwell.t_end_s - dwell.t_start_s <= DWELL_MAX_s + 0.11 for dwell in found)
     assert found[-1].label.x_mm == 4
     assert sorted(dwell.label.Fz_N for dwell in found[:-1]) == [dwell.label.Fz_N for dwell in found[:-1]]
     assert len(found) == 6

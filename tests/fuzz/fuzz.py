@@ -1,7 +1,7 @@
-"""python tests/fuzz/fuzz.py TARGET|all SECONDS: look for bytes that a door does not survive.
+"""python tests/fuzz/fuzz.py TARGET|all SECONDS [KEEP]: look for bytes that a door does not survive.
 
 With `pip install atheris` new bytes follow what code they reach (libFuzzer); without it they are drawn at random from
-the corpus, which finds less. What breaks is left in the folder as `crash-...`; put it into `corpus/TARGET/`.
+the corpus, which finds less. What reached new code is kept in the folder KEEP, if one is named. What breaks is left in the folder as `crash-...`; put it into `corpus/TARGET/`.
 """
 
 import subprocess
@@ -14,8 +14,8 @@ CORPUS = Path(__file__).parent / "corpus"
 BYTES_MAX_N, MEMORY_MAX_MB, HANG_S = 4096, 2048, 20
 
 
-def follow(name: str, seconds: int) -> None:
-    """Let libFuzzer look; new bytes go to a folder of their own, which is thrown away."""
+def follow(name: str, seconds: int, keep: Path | None) -> None:
+    """Let libFuzzer look; new bytes go to a folder of their own, which is thrown away unless it was named."""
     import tempfile
 
     import atheris
@@ -26,7 +26,9 @@ def follow(name: str, seconds: int) -> None:
         feed(name, file.read_bytes())  # what is imported at first use is no hang
     with tempfile.TemporaryDirectory() as found:
         limits = [f"-max_total_time={seconds}", f"-max_len={BYTES_MAX_N}", f"-rss_limit_mb={MEMORY_MAX_MB}"]
-        folders = [found, str(CORPUS / name)]
+        if keep is not None:
+            (keep / name).mkdir(parents=True, exist_ok=True)
+        folders = [found if keep is None else str(keep / name), str(CORPUS / name)]
         atheris.Setup(
             [sys.argv[0], *limits, f"-timeout={HANG_S}", "-print_final_stats=1", *folders],
             lambda data: feed(name, data),
@@ -53,19 +55,19 @@ def draw(name: str, seconds: int) -> None:
     print(f"{name}: {tried_n} inputs in {seconds} s")
 
 
-def main(name: str, seconds: int) -> None:
+def main(name: str, seconds: int, *keep: str) -> None:
     if name == "all":
         names = sorted(folder.name for folder in CORPUS.iterdir())
         for each in names:
-            subprocess.run([sys.executable, __file__, each, str(seconds // len(names))], check=True)
+            subprocess.run([sys.executable, __file__, each, str(seconds // len(names)), *keep], check=True)
         return
     try:
         import atheris  # noqa: F401
     except ImportError:
         draw(name, seconds)
     else:
-        follow(name, seconds)
+        follow(name, seconds, Path(*keep) if keep else None)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]))
+    main(sys.argv[1], int(sys.argv[2]), *sys.argv[3:])

@@ -5,8 +5,9 @@ Used by `fuzz.py`, for as long as one likes, and by `test_corpus.py` on what is 
 
 import asyncio
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
+from itertools import zip_longest
 from pathlib import Path
 from typing import get_args
 
@@ -15,10 +16,15 @@ from aiohttp import web
 from aiohttp.test_utils import make_mocked_request
 
 from pipeline.capture import arrivals, header, probe, sd_card
-from pipeline.capture.header import Wire
+from pipeline.capture.header import PROBE_FILE, Wire
+from pipeline.capture.labels import Dwell, ProbeTape
 from pipeline.capture.readers import READERS
+from pipeline.capture.samples import Dwells, Gauge, Table
 from pipeline.capture.stream import FrameStream
 from pipeline.core.errors import ReskinError
+from pipeline.core.seeds import rng_for
+from pipeline.labelling.places import parse_places
+from pipeline.labelling.prompts import Prompts
 from pipeline.live import ports
 from pipeline.live.server import Server
 from pipeline.live.session import Live
@@ -95,6 +101,63 @@ def _log(data: bytes) -> None:
     sd_card.read_log(FOLDER / "log.csv")
 
 
+def labels(data: bytes) -> None:
+    """What a robot's program appends to its table, in portions: any of it makes a log that ingest takes, or none."""
+    table, dwells, cut_n = Table("labels"), Dwells(), 1 + data[0]
+    _write_log(
+        dwell
+        for first in range(1, len(data), cut_n)
+        for dwell in dwells.feed(table.feed(data[first : first + cut_n]))
+    )  # fmt: skip
+
+
+def gauge(data: bytes) -> None:
+    """What a force gauge says, a few bytes every 10 ms."""
+    lines, dwells, cut_n = Gauge(), Dwells(), 1 + data[0]
+    _write_log(
+        dwell
+        for i, first in enumerate(range(1, len(data), cut_n))
+        for dwell in dwells.feed(lines.feed(data[first : first + cut_n], 0.01 * i))
+    )  # fmt: skip
+
+
+def _write_log(dwells: Iterator[Dwell]) -> None:
+    folder = FOLDER / "labels"
+    folder.mkdir(exist_ok=True)
+    (folder / PROBE_FILE).unlink(missing_ok=True)
+    tape = ProbeTape(folder)
+    try:
+        tape.write_all(dwells)
+    finally:
+        tape.close()
+        if tape.touches_n:
+            assert len(probe.parse(folder / PROBE_FILE, "log")) >= 2 * tape.touches_n
+
+
+def typed(data: bytes) -> None:
+    """What a person types at a prompt: a place that is there and a force, or it is asked again."""
+    first, *words = data.decode(errors="replace").split("\n")
+    if (places := parse_places(first)) is None:
+        return
+    prompts = Prompts(places, 0.0, lambda _: None, list, None, rng_for(0, "fuzz"))
+    label = prompts._answer(iter(words), 0)
+    assert label is None or not label.contact or (label.x_mm, label.y_mm) in places.xy_mm
+
+
+def _files(layout: str, names: tuple[str, ...], **options: str) -> Callable[[bytes], None]:
+    """A recording of several files, which a line of dashes parts."""
+    settings = make_header(layout=layout, chips_n=1, capture="fuzz", options=options)
+
+    def read(data: bytes) -> None:
+        folder = FOLDER / layout
+        folder.mkdir(exist_ok=True)
+        for name, content in zip_longest(names, data.split(b"----\n")[: len(names)], fillvalue=b""):
+            (folder / name).write_bytes(content)
+        READERS[layout].read(folder, settings)
+
+    return read
+
+
 TARGETS: Mapping[str, Callable[[bytes], None]] = {
     "stream": stream,
     "recognise": lambda data: str(ports.recognise("port", [(data, 0.0), (b"", 1.0)])) and None,
@@ -104,13 +167,21 @@ TARGETS: Mapping[str, Callable[[bytes], None]] = {
     "log": _log,
     "table": _reader("table", "readings.csv"),
     "lab": _reader("lab", "readings.csv"),
+    "ini": _files("ini", ("readings.txt", "truths.txt")),
+    "eflesh": _files("eflesh", ("sensor.csv", "sensor_post_baselines.csv", "states.csv"), force_axis="z"),
+    "labels": labels,
+    "gauge": gauge,
+    "typed": typed,
     "page": page,
     "request": request,
     "card": card,
 }  # fmt: skip
 
 
+HEADS_N = {"stream": 3, "labels": 1, "gauge": 1}  # first bytes that say how to portion the rest
+
+
 def feed(name: str, data: bytes) -> None:
     """Hand bytes to a target; what a user did wrong is an answer like any other."""
     with suppress(ReskinError):
-        TARGETS[name](data.ljust(3, b"\0") if name == "stream" else data)
+        TARGETS[name](data.ljust(HEADS_N[name], b"\0") if name in HEADS_N else data)

@@ -45,7 +45,8 @@ def test_a_robots_program_moves_and_says_where_it_stands(desk, tmp_path):
             yield Label(False)
             yield Label(True, x_mm, 8.0, Fz_N=0.5)
 
-    assert Labeller(from_program(pokes(), DWELL_s), desk).end(5.0) == "2 touches labelled"
+    assert from_program(pokes(), DWELL_s).run(desk) == ""
+    assert desk.tape.touches_n == 2
     log = log_of(tmp_path)
     assert log.x_mm[log.contact].tolist() == [4.0, 12.0]
     assert (log.t_end_s - log.t_start_s >= DWELL_s - 1e-5).all()
@@ -63,7 +64,8 @@ def test_what_is_no_label_and_a_robot_that_fails_end_the_labels_and_are_told(des
         raise RuntimeError("the robot is in its limits")
 
     labeller = Labeller(from_program(pokes(), DWELL_s), desk)
-    assert labeller.end(5.0) == "0 touches labelled; labels ended: the robot is in its limits"
+    labeller._thread.join()
+    assert labeller.end() == "0 touches labelled; labels ended: the robot is in its limits"
     assert isinstance(labeller.failed, RuntimeError)
     with pytest.raises(ParamsError, match="must be a reskin.Label; got 'lifted'"):
         from_program(["lifted"], DWELL_s).run(Desk(desk.tape, time.time, threading.Event(), desk.mark))

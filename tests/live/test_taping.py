@@ -1,0 +1,122 @@
+"""From a board and a source of labels to a capture that is added as it is, whatever ends it."""
+
+import os
+import signal
+import time
+
+import numpy as np
+import pytest
+
+import reskin
+from pipeline.capture.header import HEADER_FILE, parse
+from pipeline.core.errors import ParamsError
+from pipeline.dataset.captures import open_capture
+from pipeline.live.taping import Wanted, board_of, record_board, source_of
+from pipeline.preparing import Labels, native
+from tests.live.boards import make_script, plugged_in
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo-terminals")
+PLACES = [(4.0, 8.0), (12.0, 4.0)]
+
+
+def pokes():
+    for x_mm, y_mm in PLACES:
+        yield reskin.lifted()
+        yield reskin.touch(x_mm, y_mm, Fz_N=0.5)
+
+
+def read(folder):
+    """Read a capture as `reskin add` does: its own files, under its own header."""
+    from pipeline.capture.header import write_capture
+
+    header, files = native(folder, Labels("b0", "s0", None), None, ())
+    into = folder.parent / "added" / header.capture
+    _, blocks, account = open_capture(write_capture(into, header, files) and into)
+    return list(blocks), account
+
+
+def places_of(blocks):
+    return {(float(x), float(y)) for block in blocks for x, y in zip(block.x_mm, block.y_mm, strict=True)}
+
+
+def test_what_a_program_labels_is_added_without_another_word(tmp_path):
+    with plugged_in(make_script(pokes_n=2), loop=True) as port:
+        folder = reskin.record(pokes(), port=port, out=tmp_path / "run1", dwell_s=0.3, board="b0", scan="random")
+    header = parse((folder / HEADER_FILE).read_text(), "header")
+    assert header.options == {"scan": "random", "labels": "program"}
+    blocks, account = read(folder)
+    assert places_of(blocks) == set(PLACES)
+    assert account["indentations_n"] == 2
+    assert account["clock_residual_us"] == 0
+    assert account["frames_contact_n"] == pytest.approx(2 * 0.3 * 400, rel=0.3)
+
+
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")  # Python 3.12: there are threads
+def test_a_recording_that_is_killed_has_the_labels_that_had_come(tmp_path):
+    """The recorder is a child of this process, so that no interpreter has to start."""
+    robot = tmp_path / "robot.csv"
+    with plugged_in(make_script(pokes_n=1), loop=True) as port:
+        source = source_of(str(robot), None, None, dwell_s=1.0, say=print)
+        wanted = Wanted(tmp_path / "run1", 60.0, 115200, {})
+        child = os.fork()
+        if child == 0:
+            record_board(board_of(port, None, None, say=print), wanted, source)
+            os._exit(0)
+        write_robots_log(robot, tmp_path / "run1.part/probe.csv")
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+    blocks, account = read(tmp_path / "run1.part")
+    assert places_of(blocks) == {(4.0, 8.0)}
+    assert account["dropped_no_frame_indentations_n"] == 0
+
+
+def write_robots_log(robot, probe):
+    """Touch at (4, 8) again and again until the recorder has written two touches."""
+    with robot.open("w", buffering=1) as stream:
+        stream.write("unix_s,phase,x_mm,y_mm,Fz_N\n")
+        time.sleep(1.0)
+        for i in range(600):
+            stream.write(f"{time.time():.4f},{'contact' if i // 8 % 2 else 'noload'},4,8,0.5\n")
+            time.sleep(0.02)
+            if probe.exists() and len(probe.read_text().splitlines()) > 4:
+                return
+    raise AssertionError("no labels were written")
+
+
+def test_a_full_disk_ends_it_and_what_came_can_be_added(tmp_path, monkeypatch):
+    from errno import ENOSPC
+
+    from pipeline.capture import labels
+
+    taken = []
+
+    def append(file, data):
+        taken.append(data)
+        if len(taken) > 2:  # the log's first line, and a touch
+            raise OSError(ENOSPC, "No space left on device")
+        file.write(data)
+
+    monkeypatch.setattr(labels, "append", append)
+    with plugged_in(make_script(pokes_n=1), loop=True) as port, pytest.raises(OSError, match="No space left"):
+        reskin.record(pokes(), port=port, out=tmp_path / "run1", dwell_s=0.2)
+    assert not (tmp_path / "run1").exists()
+    blocks, _ = read(tmp_path / "run1.part")
+    assert places_of(blocks) == {PLACES[0]}
+    assert all(np.isfinite(block.b_uT).all() for block in blocks)
+
+
+@pytest.mark.parametrize(
+    ("labels", "gauge", "scan", "told"),
+    [("robot.txt", None, None, "--labels: labels must be"), ("grid:2x2:4", None, "spiral", "--scan: the order"),
+     (None, "/dev/x@fast", None, "--gauge: the gauge must be"), ("robot.csv", "/dev/x", None, "--labels")],
+)  # fmt: skip
+def test_what_is_no_source_is_refused(labels, gauge, scan, told):
+    with pytest.raises(ParamsError, match=told):
+        source_of(labels, gauge, scan, dwell_s=1.0, say=print)
+
+
+def test_prompts_come_in_random_order_unless_told_and_nothing_is_asked_for_nothing():
+    assert source_of("grid:2x2:4", None, None, dwell_s=1.0, say=print).scan == "random"
+    assert source_of("line:5:2", "/dev/x@9600", "snake", dwell_s=1.0, say=print).scan == "snake"
+    assert source_of(None, "/dev/x", None, dwell_s=1.0, say=print).name == "gauge"
+    assert source_of(None, None, None, dwell_s=1.0, say=print) is None
