@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline import plan
+from pipeline.capture.decisions import Decisions
 from pipeline.capture.header import STREAM_FILE, Header, write_capture
 from pipeline.core import config, io
 from pipeline.core.errors import CaptureError, ReskinError
@@ -34,13 +35,14 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
             "Simulated and recorded captures belong to different scenes.",
         )
         raise CaptureError(f"capture {header.capture}", "source", rule, header.source, remedy)
-    limit, before = read_shared(root / config.PARAMS)["lost_fraction_max"], read_registry(root)
+    shared, before = read_shared(root / config.PARAMS), read_registry(root)
+    decisions = config.parse(Decisions, shared["faults"], f"{config.PARAMS}: faults")
     target = root / RAW / scene / header.capture
     _check_free(target, header.capture in before.captures.get(scene, {}))
     with io.restoring(root / REGISTRY, root / config.PLAN), _forgetting_on_failure(target):
         with _naming_sources(target, files):
             complete = write_capture(target, header, files)
-            fingerprints = _read_through(target, complete, limit)
+            fingerprints = _read_through(target, complete, shared["lost_fraction_max"], decisions)
         after = with_capture(before, scene, complete, fingerprints, allow_copy=allow_copy)
         _track(target, root)
         write_registry(root, after)
@@ -70,9 +72,9 @@ def _check_free(target: Path, registered: bool) -> None:
         raise CaptureError(target, "a new capture's folder", "free", "one that is there", remedy)
 
 
-def _read_through(folder: Path, header: Header, limit: float) -> tuple[str, ...]:
+def _read_through(folder: Path, header: Header, limit: float, decisions: Decisions) -> tuple[str, ...]:
     """Read a capture as ingest will; return the hashes that tell a copy of it, however it is labelled or laid out."""
-    _, blocks, account = open_capture(folder)
+    _, blocks, account = open_capture(folder, decisions)
     rows_n, readings = 0, hashlib.sha256()
     for block in blocks:
         rows_n += len(block)
@@ -81,6 +83,8 @@ def _read_through(folder: Path, header: Header, limit: float) -> tuple[str, ...]
     if rows_n == 0:
         counts = f"none; counted {dict(account)}"
         raise CaptureError(folder.name, "a capture", "one reading or more", counts, "Check its files.")
+    if told := ", ".join(f"{key.removeprefix('fault_')} {n}" for key, n in account.items() if key.startswith("fault_")):
+        say(f"warning: capture {folder.name} has faults: {told}")
     return (readings.hexdigest(), *(header.files[name] for name in (STREAM_FILE,) if name in header.files))
 
 

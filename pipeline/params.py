@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
+from pipeline.capture.decisions import Decisions
 from pipeline.core.config import Seeded, Settings, Strict, parse, read_yaml
 from pipeline.core.errors import ParamsError
 from pipeline.dataset.rows import Selection
@@ -139,6 +140,7 @@ class Shared(Strict):
     """`params.yaml`: what scenes share, by name."""
 
     lost_fraction_max: Annotated[float, Field(ge=0, le=1)]
+    faults: Decisions
     recipes: dict[Name, Section]
     adaptations: dict[Name, Section]
     labellings: dict[Name, Section]

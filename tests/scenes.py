@@ -1,5 +1,6 @@
 """Scenes for tests, as plain words, and the settings that a stage has of them."""
 
+from pipeline.capture.decisions import AS_USUAL
 from pipeline.core.config import Settings, parse
 from pipeline.params import Asking, Scene, check_scene
 
@@ -26,6 +27,7 @@ ADAPTATIONS = {"adaptation": "paper", "base": "paper", "steps_n": 1, "pokes_n": 
 # what scenes of tests share
 SHARED: dict[str, object] = {
     "lost_fraction_max": 0.05,
+    "faults": AS_USUAL.model_dump(),
     "recipes": {"paper": SHARED_RECIPE, "triplet": SHARED_RECIPE | {"triplet_weight": 0.1}},
     "adaptations": {"paper": {"unlabelled_weight": 0.1} | SCHEDULE},
     "labellings": {"few": {"own_weight": 1.0} | SCHEDULE},

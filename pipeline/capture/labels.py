@@ -16,6 +16,7 @@ from pipeline.capture.port import append
 from pipeline.capture.probe import CONTACT, LABELS, NOLOAD, TYPES
 from pipeline.core.errors import CaptureError
 
+FLOAT32_MAX = float(np.finfo(np.float32).max)
 TIME_STEP_s = 1e-6  # as it is written
 TIME_MAX_s = 1e11  # unix time is below it for 3,000 years, unless it is in milliseconds
 
@@ -105,7 +106,7 @@ def _check(dwell: Dwell) -> None:
     label, remedy = dwell.label, "Leave out what is not known."
     for name in LABELS:
         value = getattr(label, name)
-        if math.isinf(value) or abs(value) > np.finfo(np.float32).max:
+        if math.isinf(value) or abs(value) > FLOAT32_MAX:
             raise CaptureError("a label", name, "a number", value, remedy)
     if not 0 <= label.pass_i < 2**31:
         raise CaptureError("a label", "pass_i", "0 or more", label.pass_i, "Count rounds from 0.")

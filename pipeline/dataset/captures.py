@@ -13,6 +13,7 @@ from jaxtyping import Float64
 
 from pipeline.capture import arrivals, probe, wire
 from pipeline.capture.arrivals import Arrivals
+from pipeline.capture.decisions import AS_USUAL, Decisions
 from pipeline.capture.header import (
     ARRIVALS_FILE,
     HEADER_FILE,
@@ -25,7 +26,7 @@ from pipeline.capture.header import (
 )
 from pipeline.capture.probe import ProbeLog
 from pipeline.capture.readers import READERS
-from pipeline.capture.readers.chips import Watch, missing_reads
+from pipeline.capture.readers.chips import Watch
 from pipeline.capture.readers.table import check_log
 from pipeline.capture.stream import FrameStream, no_frame
 from pipeline.capture.wire import Frames
@@ -63,8 +64,8 @@ class Opened(NamedTuple):
     account: Mapping[str, int]
 
 
-def open_capture(folder: Path) -> Opened:
-    """Check a capture's header and files, and begin to read it."""
+def open_capture(folder: Path, decisions: Decisions = AS_USUAL) -> Opened:
+    """Check a capture's header and files, and begin to read it; `decisions` say what becomes of faults."""
     header = read_header(folder)
     check_same_capture(header, folder.name)
     for name, digest in header.files.items():
@@ -74,11 +75,11 @@ def open_capture(folder: Path) -> Opened:
             rule, remedy = "unchanged since it was added", "Remove it and add it again."
             raise CaptureError(folder / name, "the file", rule, "another hash", remedy)
     if header.layout == "native":
-        return Opened(header, *read_native(folder, header))
+        return Opened(header, *read_native(folder, header, decisions))
     if header.layout not in READERS:
         remedy = "An SD card's log has no labels to learn from; try: reskin predict."
         raise CaptureError(folder, "layout", f"native or one of {sorted(READERS)}", header.layout, remedy)
-    readings, account = READERS[header.layout].read(folder, header)
+    readings, account = READERS[header.layout].read(folder, header, decisions)
     return Opened(header, [readings], account)
 
 
@@ -101,7 +102,9 @@ def check_losses(account: Mapping[str, int], limit: float, where: str) -> None:
             raise CaptureError(where, f"lost {whole.removesuffix('_n')}", rule, reasons, remedy)
 
 
-def read_native(folder: Path, header: Header) -> tuple[Iterator[Readings], dict[str, int]]:
+def read_native(
+    folder: Path, header: Header, decisions: Decisions = AS_USUAL
+) -> tuple[Iterator[Readings], dict[str, int]]:
     """Begin to read a capture; the account is complete when the readings are exhausted.
 
     Without sync marks the stream is read twice, first for the clock.
@@ -112,25 +115,27 @@ def read_native(folder: Path, header: Header) -> tuple[Iterator[Readings], dict[
     log = probe.parse(folder / PROBE_FILE, str(folder / PROBE_FILE))
     check_log(log, str(folder / PROBE_FILE))
     times_of = timer(folder, header)
-    clock = _clock(folder, header, log, times_of)
+    clock = _clock(folder, header, log, _timed_frames(folder, header, times_of, {}, decisions))
     account = {
         "clock_residual_us": round(1e6 * clock.residual_s),
         "clock_explained_pct": round(100 * clock.explained),
     }
-    return join(_timed_frames(folder, header, times_of, account), log, clock, header, account), account
+    blocks = _timed_frames(folder, header, times_of, account, decisions)
+    return join(blocks, log, clock, header, account), account
 
 
-def _clock(folder: Path, header: Header, log: ProbeLog, times_of: Timer) -> ClockMap:
+def _clock(folder: Path, header: Header, log: ProbeLog, blocks: Iterator[TimedFrames]) -> ClockMap:
     if header.clock.marks:
         return from_marks(np.array(header.clock.marks), str(folder))
-    blocks = _timed_frames(folder, header, times_of, {})
     pairs = ((block.t_s[block.sound], block.frames.b_uT[block.sound]) for block in blocks)
     return from_contacts(pairs, log, str(folder))
 
 
-def _timed_frames(folder: Path, header: Header, times_of: Timer, account: dict[str, int]) -> Iterator[TimedFrames]:
+def _timed_frames(
+    folder: Path, header: Header, times_of: Timer, account: dict[str, int], decisions: Decisions
+) -> Iterator[TimedFrames]:
     """Decode the stream block by block; the stream's own account is added when it has ended."""
-    stream, watch = FrameStream(_wire(header), header.chips_n), Watch(header, str(folder / STREAM_FILE))
+    stream, watch = FrameStream(_wire(header), header.chips_n), Watch(header, str(folder / STREAM_FILE), decisions)
     frames_n = 0
     with (folder / STREAM_FILE).open("rb") as file:
         head = data = file.read(BLOCK_BYTES_N)
@@ -143,12 +148,12 @@ def _timed_frames(folder: Path, header: Header, times_of: Timer, account: dict[s
     yield _timed(frames, times_of(frames, frames_n), watch)
     if not stream.account()["frames_n"]:
         raise no_frame(str(folder / STREAM_FILE), head, _wire(header), header.chips_n)
-    account.update(stream.account())
+    account.update(stream.account() | watch.ledger.account())
 
 
 def _timed(frames: Frames, t_s: Float64[np.ndarray, " f"], watch: Watch) -> TimedFrames:
-    failed = missing_reads(frames.b_uT, frames.temperature_degC)
-    return TimedFrames(frames, t_s, failed, watch.stuck(frames, failed))
+    found = watch.look(frames, t_s)
+    return TimedFrames(frames, t_s, found.failed, found.stuck, found.beyond)
 
 
 def timer(folder: Path, header: Header) -> Timer:

@@ -31,20 +31,27 @@ COUNTS = (
     "dropped_no_noload_indentations_n",
 )
 
+BEYOND = "dropped_out_of_range_frames_n"  # counted only where there are some: it is for settings to drop them
+
 
 @dataclass(frozen=True)
 class TimedFrames:
-    """Frames with the stream time of each (NaN: unknown, as for all that follow); masks of failed and stuck chips."""
+    """Frames with the stream time of each (NaN: unknown, as for all that follow); masks of those that are not kept.
+
+    Their reads failed, a chip was stuck, or, where that was decided, a reading is beyond what a board sends.
+    """
 
     frames: Frames
     t_s: Float64[np.ndarray, " f"]
     failed: Bool[np.ndarray, " f"]
     stuck: Bool[np.ndarray, " f"]
+    beyond: Bool[np.ndarray, " f"] | None = None
 
     @property
     def sound(self) -> Bool[np.ndarray, " f"]:
         """Mark the frames that hold a fresh reading of every chip."""
-        return ~(self.failed | self.stuck)
+        kept = ~(self.failed | self.stuck)
+        return kept if self.beyond is None else kept & ~self.beyond
 
 
 @dataclass(frozen=True)
@@ -118,6 +125,7 @@ class Joiner:
     def account(self) -> dict[str, int]:
         """Count frames and indentations so far, by what became of them; each total is the sum of its parts."""
         counted = {name: self._count[name] for name in COUNTS}
+        counted |= {BEYOND: self._count[BEYOND]} if self._count[BEYOND] else {}
         logged_n = int((~self._log.contact).sum())
         unseen_n = logged_n - counted["indentations_n"] - counted["dropped_no_noload_indentations_n"]
         return counted | {"logged_indentations_n": logged_n, "dropped_no_frame_indentations_n": unseen_n}
@@ -132,6 +140,7 @@ class Joiner:
             ),
             "dropped_failed_read_frames_n": block.failed,
             "dropped_stuck_chip_frames_n": block.stuck,
+            **({} if block.beyond is None else {BEYOND: block.beyond}),
             "dropped_between_dwells_frames_n": (dwell_i < 0) | (probe_s > log.t_end_s[dwell_i]),
         }
         keep = np.ones(len(probe_s), bool)

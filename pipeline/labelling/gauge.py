@@ -61,9 +61,11 @@ def from_gauge(port: str, baud: int) -> Source:
 
     def run(desk: Desk) -> str:
         forces, dwells = Forces(port, baud), Dwells()
-        with open_port(port, baud) as device:
-            forces.read(device, desk, lambda samples: desk.tape.write_all(dwells.feed(samples)))
-        desk.tape.write_all(dwells.close())
+        try:
+            with open_port(port, baud) as device:
+                forces.read(device, desk, lambda samples: desk.tape.write_all(dwells.feed(samples)))
+        finally:
+            desk.tape.write_all(dwells.close())
         return forces.told()
 
     return Source("gauge", None, run)

@@ -15,6 +15,7 @@ Wire = Literal["binary", "binary-clock", "text-xyzt", "text-txyz"]
 Speed = Annotated[float, Option(help="Times its own rate; inf: as fast as it is taken.", min=0.01)]
 Baud = Annotated[int, Option(help="Baud rate; USB ports ignore it.", min=1)]
 SOURCE = "A capture's folder, or the name of a simulated scene."
+ON_FAULT = "NAME=drop|flag|refuse: are readings that a fault has hit shown? May be repeated, such as stuck=flag."
 LABELS = "grid:NXxNY:STEP_MM or line:N:STEP_MM asks you to press places (Enter); or a CSV that a robot appends to."
 GAUGE = "Port of a force gauge that sends lines of Fz, or Fx Fy Fz, in N; @BAUD behind it, if not 9600."
 FAULT = "NAME[@START_S[+SECONDS]], such as stuck@3+1; may be repeated. A wrong name lists them all."
@@ -101,18 +102,23 @@ def live(
     emulate: Annotated[str | None, Option(help="In place of a board: the name of a simulated scene.")] = None,
     host: Annotated[str, Option(help="Where the page listens; elsewhere than here, behind a token.")] = "127.0.0.1",
     http_port: Annotated[int, Option(help="The page's port.", min=1, max=65535)] = 8765,
+    on_fault: Annotated[list[str] | None, Option(help=ON_FAULT)] = None,
 ) -> None:
     """Show a board at work in the browser: chips, contact, force, traces, and what is wrong."""
     from contextlib import ExitStack
 
+    from pipeline.capture.decisions import decide
     from pipeline.core.errors import ParamsError
     from pipeline.live.emulate import playing
+    from pipeline.live.health import LIVE
     from pipeline.live.ports import the_board
     from pipeline.live.script import read_script
     from pipeline.live.server import serve
+    from pipeline.live.session import Live
     from pipeline.predicting import read_network
     from pipeline.twin.shipped import load_universal
 
+    decisions = decide(LIVE, on_fault or (), "--on-fault")
     given = [name for name in (port, replay, emulate) if name is not None]
     if len(given) > 1:
         raise ParamsError("live", "the board", "one of --port, --replay, --emulate", ", ".join(given), "Give one.")
@@ -122,4 +128,5 @@ def live(
         if source := replay or emulate:
             script = read_script(source, Path())
             port, what = stack.enter_context(playing(script)), f"{script.source}: {source}, played"
-        serve(port or the_board().port, models, what=what, host=host, http_port=http_port, say=typer.echo)
+        session = Live(port or the_board().port, models, what, decisions)
+        serve(session, host=host, http_port=http_port, say=typer.echo)

@@ -17,7 +17,6 @@ from aiohttp import WSMsgType, web
 from aiohttp.typedefs import Handler
 
 from pipeline.core.errors import ParamsError
-from pipeline.live.answering import Models
 from pipeline.live.session import Live
 
 PAGE = Path(__file__).parent / "page"
@@ -118,14 +117,13 @@ class Server:
             await page.close()
 
 
-def serve(port: str, models: Models, *, what: str, host: str, http_port: int, say: Callable[[str], None]) -> None:
+def serve(live: Live, *, host: str, http_port: int, say: Callable[[str], None]) -> None:
     """Show a board's page until Ctrl-C."""
     token = "" if host in LOCAL else secrets.token_urlsafe(16)
-    live = Live(port, models, what)
     live.start()
     try:
         address = f"http://{'localhost' if host in LOCAL else host}:{http_port}/{f'?token={token}' if token else ''}"
-        say(f"{what} on {port}: open {address}; Ctrl-C ends it")
+        say(f"{live.what} on {live.skin.port}: open {address}; Ctrl-C ends it")
         web.run_app(Server(live, token).application(), host=host, port=http_port, print=None, handle_signals=True)
     except OSError as error:
         raise ParamsError("--http-port", "the port of the page", "free", error.strerror, "Choose another.") from None

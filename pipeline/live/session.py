@@ -7,11 +7,13 @@ import threading
 from pathlib import Path
 from typing import Any
 
+from pipeline.capture.decisions import Decisions
 from pipeline.capture.header import Header
 from pipeline.capture.port import Tape
 from pipeline.core.errors import ReskinError
 from pipeline.live.adapting import POKES_N, Pokes
 from pipeline.live.answering import Map, Models
+from pipeline.live.health import LIVE
 from pipeline.live.skin import WAITING, Readings, Skin
 from pipeline.live.view import View
 from pipeline.recording import UNTOLD, begin_capture, end_capture, new_folder
@@ -22,8 +24,8 @@ POLL_S = 0.1
 class Live:
     """A skin that is polled on a thread of its own, what pages see of it, and its recording."""
 
-    def __init__(self, port: str, models: Models, what: str) -> None:
-        self.skin, self.what = Skin(port, models), what
+    def __init__(self, port: str, models: Models, what: str, decisions: Decisions = LIVE) -> None:
+        self.skin, self.what = Skin(port, models, decisions=decisions), what
         self.view: View | None = None
         self.problem = ""
         self._pokes: Pokes | None = None
@@ -92,7 +94,7 @@ class Live:
             layout, alarms = skin.layout, list(skin.health.alarms.values())
             state |= {
                 "board": f"{found.port}: {found.format}, {found.scale}",
-                "seen": [[alarm.name, alarm.count_n, round(alarm.last_s - alarm.first_s, 1)] for alarm in alarms],
+                "seen": [[one.name, one.count_n, round(one.last_s - one.first_s, 1), one.decision] for one in alarms],
                 "chips_mm": layout.chips_mm.tolist(), "places_known": layout.known, "corner_mm": layout.corner_mm,
                 "skin_mm": layout.skin_mm,
             }  # fmt: skip

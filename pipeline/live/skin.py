@@ -16,13 +16,15 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64
 
+from pipeline.capture.decisions import Decisions
+from pipeline.capture.limits import GARBAGE_FRAMES_N
 from pipeline.capture.stream import FrameStream
 from pipeline.capture.wire import Frames, concatenate
 from pipeline.core.errors import CaptureError, SchemaError
 from pipeline.experiments.logs.estimates import CONTACT_SDS, quiet_start
 from pipeline.live import ports
 from pipeline.live.answering import Map, Models, Networks, answering
-from pipeline.live.health import Health
+from pipeline.live.health import LIVE, Health
 from pipeline.live.layout import layout_of
 from pipeline.live.ports import Chunk
 from pipeline.live.reader import PLUGGED_IN, Reader
@@ -83,7 +85,8 @@ class Zero(NamedTuple):
 class Skin:
     """A board on a port. Iterate over it for the latest contact, or over `every()` for all."""
 
-    def __init__(self, port: str, models: Models = (), *, baud: int = ports.BAUD) -> None:
+    def __init__(self, port: str, models: Models = (), *, baud: int = ports.BAUD, decisions: Decisions = LIVE) -> None:
+        self.decisions = decisions
         self.port, self.found = port, ports.Found(port, WAITING)
         self.account: Counter[str] = Counter()  # of all streams since the start, as a `FrameStream` counts
         self._zero: Zero | None = None
@@ -147,7 +150,7 @@ class Skin:
         if not chunks:
             now_s = self.reader.unix_s()
             if not self.found.problem and now_s - self._ends[-1][1] > SILENT_S:
-                self.health.note("nothing comes", 1, now_s)
+                self.health.note("nothing comes", 1, now_s, "unplug")
             return None
         if self.found.problem:
             chunks = self._recognise(chunks)
@@ -185,7 +188,7 @@ class Skin:
             return []
         if self.answers is not None and self.answers.channels_n != 3 * found.chips_n:
             self._refuse_model(self.answers, found.chips_n)
-        self.health, self.layout = Health(found.chips_n), layout_of(found.chips_n)
+        self.health, self.layout = Health(found.chips_n, self.decisions), layout_of(found.chips_n)
         self.found = found  # last: another thread that sees it asks for the rest
         self._begin_stream()
         return chunks
@@ -200,6 +203,7 @@ class Skin:
     def _begin_stream(self) -> None:
         self._stream = FrameStream(self.found.wire, self.found.chips_n)
         self._counted: Counter[str] = Counter()
+        self._lost_in_row_n = 0
         self._ends: deque[tuple[int, float]] = deque([(0, 0.0)], maxlen=ENDS_KEPT_N)
 
     def _decode(self, chunks: list[Chunk]) -> tuple[Frames, Float64[np.ndarray, " f"]]:
@@ -232,7 +236,10 @@ class Skin:
         lost_n = sum(count for name, count in more.items() if name.startswith("skipped_"))
         if first and lost_n * more["frames_n"] < more["frame_bytes_n"]:
             return  # less than a frame: the port was opened while one was sent
-        self.health.note("bytes lost between frames", lost_n, now_s)
+        self.health.note("bytes lost between frames", lost_n, now_s, "torn")
+        self._lost_in_row_n = 0 if more["frames_n"] else self._lost_in_row_n + lost_n
+        if self._lost_in_row_n > GARBAGE_FRAMES_N * 16 * self.found.chips_n:  # no format has less than 16 bytes a chip
+            self.health.note("no frames in what comes: wrong baud rate?", lost_n, now_s, "wrong_baud")
 
     def _take_zero(self, frames: Frames, t_s: Float64[np.ndarray, " f"]) -> None:
         self._quiet.append(frames)

@@ -94,7 +94,7 @@ def record_board(board: Found, wanted: Wanted, labels: Source | None) -> Taped:
         watch=lambda frames: health.feed(frames, time.monotonic()),
     )  # fmt: skip
     counts = [", ".join(f"{key} {count}" for key, count in done.account.items() if count)]
-    counts += [f"{alarm.name} ({alarm.count_n})" for alarm in health.alarms.values()]
+    counts += [f"{one.name} ({one.count_n}, {one.last_s - one.first_s:.1f} s)" for one in health.alarms.values()]
     words, where = "; ".join([*counts, *([of_labels] if of_labels else [])]), str(folder)
     if done.ended == "not written":
         folder = folder.with_name(f"{folder.name}.part")

@@ -2,14 +2,17 @@
 
 from pathlib import Path
 
+from pipeline.capture.decisions import Decisions
 from pipeline.core import io
+from pipeline.core.config import Files, parse, read_yaml
 from pipeline.core.stage import run, say
 from pipeline.dataset.captures import check_losses, open_capture
 
 
-def ingest(scene: str, raw: Path, lost_fraction_max: float, indentations: Path) -> None:
+def ingest(scene: str, files: Files, raw: Path, lost_fraction_max: float, indentations: Path) -> None:
     """Read a capture, check what it lost, and write its readings."""
-    header, blocks, account = open_capture(raw)
+    decisions = parse(Decisions, read_yaml(files.params)["faults"], f"{files.params}: faults")
+    header, blocks, account = open_capture(raw, decisions)
     io.write_readings(indentations, blocks, account)
     try:
         check_losses(account, lost_fraction_max, str(raw))

@@ -3,16 +3,17 @@
 from pathlib import Path
 
 from pipeline.core import io
+from pipeline.core.config import Files
 from pipeline.core.stage import run
 from pipeline.stages.ingest import ingest
 
 
-def ingest_simulated(scene: str, raw: Path, lost_fraction_max: float, indentations: Path) -> None:
+def ingest_simulated(scene: str, files: Files, raw: Path, lost_fraction_max: float, indentations: Path) -> None:
     """Read every capture that the stage `simulate` wrote for a scene, through the same door as recorded ones."""
     with io.replacing(indentations) as folder:
         folder.mkdir()
         for capture in sorted(child for child in raw.iterdir() if child.is_dir()):
-            ingest(scene, capture, lost_fraction_max, folder / f"{capture.name}.parquet")
+            ingest(scene, files, capture, lost_fraction_max, folder / f"{capture.name}.parquet")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
 """python tests/fuzz/fuzz.py TARGET|all SECONDS [KEEP]: look for bytes that a door does not survive.
 
 With `pip install atheris` new bytes follow what code they reach (libFuzzer); without it they are drawn at random from
-the corpus, which finds less. What reached new code is kept in the folder KEEP, if one is named. What breaks is left in the folder as `crash-...`; put it into `corpus/TARGET/`.
+the corpus, which finds less. What reached new code is kept in the folder KEEP, if one is named. What breaks is left in
+the folder as `crash-...`; put it into `corpus/TARGET/`.
 """
 
 import subprocess

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from pipeline.capture.decisions import AS_USUAL, decide
 from pipeline.capture.wire import Frames
-from pipeline.live.health import LOOK_FRAMES_N, Health
+from pipeline.live.health import LIVE, LOOK_FRAMES_N, Health
 from pipeline.live.inject import inject, parse
 from tests.live.boards import make_script
 
@@ -108,3 +109,24 @@ def test_a_change_of_field_that_all_chips_share_comes_from_outside():
     assert health.alarms == {}
     health.feed_change(np.tile([0.0, 0.0, 400.0], 5), turn, 0.0)
     assert [name.split(":")[0] for name in health.alarms] == ["field from outside"]
+
+
+def test_what_becomes_of_readings_that_a_fault_has_hit_is_decided_by_setting():
+    for name, fault in (("failed-read", "failed_read"), ("saturated", "saturated"), ("too-hot", "too_hot")):
+        script = inject(SCRIPT, parse(f"{name}@0+0.05"))
+        frames = changed_frames(script, LOOK_FRAMES_N)
+        for decision, believed in (("drop", False), ("flag", True), ("refuse", False)):
+            health = Health(5, decide(LIVE, [f"{fault}={decision}"], "test"))
+            assert health.feed(frames, 1.0)[:20].all() == believed, name
+            (alarm,) = health.alarms.values()
+            assert (alarm.decision, alarm.count_n) == (decision, 20)
+
+
+def test_a_chip_that_is_stuck_is_not_believed_while_it_is_unless_flagged():
+    for decision, unbelieved_n in (("drop", 500), ("flag", 0)):
+        health, script, lost_n = Health(5, decide(LIVE, [f"stuck={decision}"], "test")), changed("stuck"), 0
+        for first in range(0, len(script.frames), 10):
+            rows = (np.arange(len(script.frames)) >= first) & (np.arange(len(script.frames)) < first + 10)
+            lost_n += int((~health.feed(script.frames.where(rows), float(script.t_s[rows][-1]))).sum())
+        assert lost_n == pytest.approx(unbelieved_n, abs=100)
+    assert AS_USUAL.stuck == LIVE.stuck == "drop"

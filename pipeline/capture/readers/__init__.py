@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Protocol
 
+from pipeline.capture.decisions import AS_USUAL, Decisions
 from pipeline.capture.header import Header
 from pipeline.capture.readers import eflash7, eflesh, ini, lab, plain
 from pipeline.core.schema import Readings
@@ -18,7 +19,7 @@ class Reader(Protocol):
     def count_chips(self, files: Mapping[str, Path]) -> int:
         """Count the chips that collected files have columns for."""
 
-    def read(self, folder: Path, header: Header) -> tuple[Readings, dict[str, int]]:
+    def read(self, folder: Path, header: Header, decisions: Decisions = AS_USUAL) -> tuple[Readings, dict[str, int]]:
         """Read a capture folder; `rows_n` + `noload_rows_n` + all `dropped_*_rows_n` = `rows_read_n`."""
 
 

@@ -4,17 +4,19 @@ A failed read or a stuck chip costs a row; a chip of another scale than its head
 as nobody knows what its numbers mean. Refuses to know layouts, time and dwells, and to mend anything.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, Float64, Int
 
-from pipeline.capture import faults
+from pipeline.capture import faults, limits
+from pipeline.capture.decisions import AS_USUAL, Decisions, Ledger
 from pipeline.capture.header import Header
 from pipeline.capture.readers.table import check_fields
 from pipeline.capture.stream import TEMPERATURE_MAX_degC, TEMPERATURE_MIN_degC
-from pipeline.capture.wire import Frames
+from pipeline.capture.wire import TEXT_WIRES, Frames, record_type
 from pipeline.core.errors import CaptureError
 
 SCALE_FRAMES_N = 400  # real recordings show each sound chip's grid in so many frames; in 200 it may hide
@@ -26,46 +28,83 @@ ORDER_OF_OTHER: Mapping[str | None, tuple[str, int]] = {
 SPREAD_MAX_degC = 10.0  # chips of one board, in one block
 USUAL_SCALE = "that of the other chips, and not a reset chip's"
 
+Marks = Bool[np.ndarray, " f"]
+
 
 class Rows(NamedTuple):
-    """What became of each row: `whole` ones hold a reading of every chip; the others failed or, if not, are stuck."""
+    """What became of each row: `whole` ones are kept; the others failed or, if not, are stuck or, if not, no reading.
+
+    `found` tells of each fault how often, from where to where, and what was decided.
+    """
 
     whole: Bool[np.ndarray, " f"]
     failed: Bool[np.ndarray, " f"]
     stuck: Bool[np.ndarray, " f"]
+    beyond: Bool[np.ndarray, " f"]
+    found: Mapping[str, int]
 
     def losses(self) -> dict[str, int]:
-        """Count the rows that are not whole, as accounts do."""
+        """Count the rows that are not whole, as accounts do; faults that are decided anew stand there if there are."""
+        beyond_n = int(self.beyond.sum())
         return {
             "dropped_failed_read_rows_n": int(self.failed.sum()),
             "dropped_stuck_chip_rows_n": int(self.stuck.sum()),
+            **({"dropped_out_of_range_rows_n": beyond_n} if beyond_n else {}),
+            **self.found,
         }
 
     def part(self, rows: slice) -> "Rows":
-        """Keep some of the rows."""
-        return Rows(self.whole[rows], self.failed[rows], self.stuck[rows])
+        """Keep some of the rows; what was found is of all."""
+        return Rows(self.whole[rows], self.failed[rows], self.stuck[rows], self.beyond[rows], self.found)
 
 
 def find_whole_rows(
-    b_uT: Float[np.ndarray, "f ch"], temperature_degC: Float[np.ndarray, "f k"], header: Header, *, where: str
-) -> Rows:
-    """Tell the rows that hold a reading of every chip; raise if there is none, or if a chip's scale is unknown."""
-    failed = missing_reads(b_uT, temperature_degC)
+    b_uT: Float[np.ndarray, "f ch"], temperature_degC: Float[np.ndarray, "f k"], header: Header, *, where: str,
+    decisions: Decisions = AS_USUAL,
+) -> Rows:  # fmt: skip
+    """Tell the rows to keep; raise if no row holds a reading of every chip, or for a fault that is refused.
+
+    A chip of another scale shows among all rows that did not fail, kept or not.
+    """
+    ledger, row = Ledger(decisions, where, "row"), 1 + np.arange(len(b_uT))
+    drop, beyond, failed, _ = _note_readings(ledger, b_uT, temperature_degC, row)
     if failed.all():
         remedy = "Mend the wiring, and record again."
         raise CaptureError(where, "rows", "read from every chip", "failed I2C reads in all of them", remedy)
     rows = np.flatnonzero(~failed)
     for block in np.array_split(rows, max(1, len(rows) // GRID_ROWS_N)):
-        _check_scale(b_uT[block], header, where=f"{where} from row {block[0] + 1}")
-    stuck = np.asarray(faults.stuck_chips(b_uT).any(axis=1)) & ~failed
-    return Rows(~failed & ~stuck, failed, stuck)
+        with noting_reset(ledger, decisions, row[block]):
+            _check_scale(b_uT[block], header, where=f"{where} from row {block[0] + 1}")
+    stuck = ledger.note("stuck", np.asarray(faults.stuck_chips(b_uT).any(axis=1)) & ~failed, row) & ~drop
+    beyond &= ~stuck
+    return Rows(~(drop | stuck | beyond), drop, stuck, beyond, ledger.account())
 
 
-def missing_reads(
-    b_uT: Float[np.ndarray, "f ch"], temperature_degC: Float[np.ndarray, "f k"]
-) -> Bool[np.ndarray, " f"]:
-    """Mark the rows in which a chip was not read: its read failed, or zeros stand in its place."""
-    return np.asarray((faults.failed_reads(b_uT, temperature_degC) | faults.zero_reads(b_uT)).any(axis=1))
+def _note_readings(
+    ledger: Ledger, b_uT: Float[np.ndarray, "f ch"], temperature_degC: Float[np.ndarray, "f k"],
+    at: Float64[np.ndarray, " f"] | Int[np.ndarray, " f"],
+) -> tuple[Marks, Marks, Marks, Marks]:  # fmt: skip
+    """Note what readings show by themselves; mark what to drop: not read, out of range; and all not read, all untrue."""
+    failed = np.asarray(faults.failed_reads(b_uT, temperature_degC).any(axis=1))
+    zero = np.asarray(faults.zero_reads(b_uT).any(axis=1)) & ~failed
+    hot = np.asarray(limits.too_hot(temperature_degC).any(axis=1)) & ~failed & ~zero
+    full = limits.saturated(b_uT).any(axis=1) & ~failed & ~zero
+    drop = ledger.note("failed_read", failed, at) | ledger.note("zeros", zero, at)
+    beyond = ledger.note("too_hot", hot, at) | ledger.note("saturated", full, at)
+    return drop, beyond & ~drop, failed | zero, failed | zero | hot | full
+
+
+@contextmanager
+def noting_reset(
+    ledger: Ledger, decisions: Decisions, at: Float64[np.ndarray, " f"] | Int[np.ndarray, " f"]
+) -> Iterator[None]:
+    """Let a chip of another scale be noted in place of refused, if so decided; the sentence says more of a refusal."""
+    try:
+        yield
+    except CaptureError:
+        if decisions.chip_reset == "refuse":
+            raise
+        ledger.note("chip_reset", np.ones(len(at), bool), at)
 
 
 def _check_scale(b_uT: Float[np.ndarray, "f ch"], header: Header, *, where: str) -> None:
@@ -95,25 +134,79 @@ def _refuse_scales(
         raise CaptureError(where, f"the LSB of chip {', '.join(map(str, chips))}", rule, got, remedy)
 
 
+class _Edge(NamedTuple):
+    """What is remembered of the last frame of a block: its time, the board's time, its last byte."""
+
+    t_s: float
+    device_s: float
+    end_byte: int
+
+
 class Watch:
     """Looks at every frame once; holds back at most `SCALE_FRAMES_N` of them."""
 
-    def __init__(self, header: Header, where: str) -> None:
+    def __init__(self, header: Header, where: str, decisions: Decisions = AS_USUAL) -> None:
+        self.ledger = Ledger(decisions, where, "ms")
+        self._decisions = decisions
         self._header, self._where = header, where
         self._stuck = faults.StuckChips(header.chips_n)
         self._held = np.zeros((0, 3 * header.chips_n), np.float32)
+        self._held_s = np.zeros(0)
         self._begun = False
         self._checked_n = 0
         self._lsb_uT = np.full((header.chips_n, 2), np.nan)  # of each chip, once known
+        self._before_uT: Float32[np.ndarray, "1 ch"] | None = None  # the field of the last sound frame
+        self._edge: _Edge | None = None
 
-    def stuck(self, frames: Frames, failed: Bool[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
+    def look(self, frames: Frames, t_s: Float64[np.ndarray, " f"]) -> Rows:
+        """Note every fault of the next frames, and tell the frames to keep; raise for what is refused."""
+        drop, beyond, failed, untrue = _note_readings(self.ledger, frames.b_uT, frames.temperature_degC, t_s)
+        stuck = self.ledger.note("stuck", self.stuck(frames, failed, t_s) & ~untrue, t_s)
+        self._look_at_bytes(frames, t_s)
+        beyond[~untrue] |= self._look_at_steps(frames.where(~untrue), t_s[~untrue])
+        beyond &= ~stuck
+        return Rows(~(drop | stuck | beyond), drop, stuck, beyond, {})
+
+    def _look_at_steps(self, frames: Frames, t_s: Float64[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
+        """Note what shows from one sound frame to the next, also from the last one before; mark what to drop."""
+        if not len(frames):
+            return np.zeros(0, bool)
+        before_uT = frames.b_uT[:1] + 1 if self._before_uT is None else self._before_uT  # a first frame repeats none
+        self._before_uT = frames.b_uT[-1:]
+        step_uT = np.diff(frames.b_uT, axis=0, prepend=before_uT)
+        wrapped = np.asarray(limits.wrapped(step_uT, self._lsb_uT).any(axis=1))
+        note = self.ledger.note
+        return note("int16_wrap", wrapped, t_s) | note("repeated", limits.repeated(step_uT), t_s)
+
+    def _look_at_bytes(self, frames: Frames, t_s: Float64[np.ndarray, " f"]) -> None:
+        """Note what the clocks and the places of frames among the bytes say, the last frame before included."""
+        if not len(frames):
+            return
+        first = _Edge(float(t_s[0]), float(frames.device_s[0]), 0)
+        before, note, wire = self._edge or first, self.ledger.note, self._header.wire
+        self._edge = _Edge(float(t_s[-1]), float(frames.device_s[-1]), int(frames.end_byte[-1]))
+        device_step_s = np.diff(frames.device_s, prepend=before.device_s)
+        missing_n = limits.missing(device_step_s)
+        note("clock_jump", limits.clock_jumps(device_step_s), t_s)
+        note("dropped", missing_n > 0, t_s, int(missing_n.sum()))
+        note("unplug", limits.silences(np.diff(t_s, prepend=before.t_s)), t_s)
+        frame_n = None if wire is None or wire in TEXT_WIRES else record_type(wire, self._header.chips_n).itemsize
+        lost_n = limits.lost_before(frames.end_byte, before.end_byte, frame_n)
+        usual_n = frame_n or int(np.median(np.diff(frames.end_byte, prepend=before.end_byte)))
+        garbage = lost_n > limits.GARBAGE_FRAMES_N * usual_n
+        note("wrong_baud", garbage, t_s, int(lost_n[garbage].sum()))
+        note("torn", (lost_n > 0) & ~garbage, t_s, int(lost_n[~garbage].sum()))
+
+    def stuck(
+        self, frames: Frames, failed: Bool[np.ndarray, " f"], t_s: Float64[np.ndarray, " f"] | None = None
+    ) -> Bool[np.ndarray, " f"]:
         """Mark the frames in which a chip had stopped; raise if their numbers cannot be what they are said to be."""
         finite = np.isfinite(frames.b_uT).all(axis=1) & np.isfinite(frames.temperature_degC).all(axis=1)
         sound = finite & ~failed
         if not self._begun and sound.any():
             self._begun = True
             self._check_first(frames.where(sound))
-        self._check_scales(frames.b_uT[sound])
+        self._check_scales(frames.b_uT[sound], np.zeros(int(sound.sum())) if t_s is None else t_s[sound])
         stuck = np.zeros(len(frames), bool)
         stuck[sound] = self._stuck.feed(frames.b_uT[sound]).any(axis=1)
         return stuck
@@ -132,12 +225,14 @@ class Watch:
                 raise CaptureError(self._where, f"temperatures of {wire}", rule, f"{low:.4g} to {high:.4g}", remedy)
         check_fields(frames.b_uT, self._where, first_line_n=1)
 
-    def _check_scales(self, b_uT: Float[np.ndarray, "f ch"]) -> None:
-        held = np.concatenate([self._held, b_uT])
+    def _check_scales(self, b_uT: Float[np.ndarray, "f ch"], t_s: Float64[np.ndarray, " f"]) -> None:
+        held, held_s = np.concatenate([self._held, b_uT]), np.concatenate([self._held_s, t_s])
         for first in range(0, len(held) - SCALE_FRAMES_N + 1, SCALE_FRAMES_N):
-            self._check_scale(held[first : first + SCALE_FRAMES_N])
+            with noting_reset(self.ledger, self._decisions, held_s[first : first + SCALE_FRAMES_N]):
+                self._check_scale(held[first : first + SCALE_FRAMES_N])
             self._checked_n += SCALE_FRAMES_N
-        self._held = held[len(held) // SCALE_FRAMES_N * SCALE_FRAMES_N :].copy()
+        done_n = len(held) // SCALE_FRAMES_N * SCALE_FRAMES_N
+        self._held, self._held_s = held[done_n:].copy(), held_s[done_n:].copy()
 
     def _check_scale(self, b_uT: Float[np.ndarray, "f ch"]) -> None:
         lsb_uT = faults.find_lsb(b_uT, steps_min_n=faults.SURE_STEPS_MIN_N)

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64, Int32
 
+from pipeline.capture.decisions import AS_USUAL, Decisions
 from pipeline.capture.header import Header
 from pipeline.capture.readers.chips import find_whole_rows
 from pipeline.capture.readers.passes import find_passes
@@ -63,14 +64,14 @@ def count_chips(files: Mapping[str, Path]) -> int:
     return (columns_n - 1) // AXES_PER_CHIP_N
 
 
-def read(folder: Path, header: Header) -> tuple[Readings, Account]:
+def read(folder: Path, header: Header, decisions: Decisions = AS_USUAL) -> tuple[Readings, Account]:
     """Read every row as one indentation; its no-load field is the baseline that the recorder subtracted, raw - dB."""
     time_s, b_uT, noload_uT = _read_fields(folder, header)
     states = _read_states(folder, header)
     _check_rows_n({SENSOR: len(time_s), STATES: len(states)}, header)
     _check_clocks(time_s, states[:, 0], header)
     temperature_degC = np.full((len(time_s), header.chips_n), np.nan, np.float32)
-    rows = find_whole_rows(b_uT, temperature_degC, header, where=f"{header.capture}/{SENSOR}")
+    rows = find_whole_rows(b_uT, temperature_degC, header, where=f"{header.capture}/{SENSOR}", decisions=decisions)
     place_mm = np.round(states[:, 1:3], PLACE_DECIMALS)
     place_mm -= place_mm.min(axis=0)
     pass_i, touches_i = _number_passes(place_mm, noload_uT)

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float64, Int32
 
+from pipeline.capture.decisions import AS_USUAL, Decisions
 from pipeline.capture.header import Header
 from pipeline.capture.readers.chips import Rows, find_whole_rows
 from pipeline.capture.readers.passes import find_passes
@@ -63,13 +64,13 @@ def count_chips(files: Mapping[str, Path]) -> int:
     return columns_n // VALUES_PER_CHIP_N
 
 
-def read(folder: Path, header: Header) -> tuple[Readings, Account]:
+def read(folder: Path, header: Header, decisions: Decisions = AS_USUAL) -> tuple[Readings, Account]:
     """Read all rows but those with a failed chip; the no-load field of a row is the mean of its pass's corner rows."""
     said_n = _rows_late(header)
     b_uT, temperature_degC = _read_fields(folder, header)
     truths = _read_truths(folder, header)
     _check_rows_n(len(b_uT), len(truths), said_n or 0, header)
-    rows = find_whole_rows(b_uT, temperature_degC, header, where=f"{header.capture}/{READINGS}")
+    rows = find_whole_rows(b_uT, temperature_degC, header, where=f"{header.capture}/{READINGS}", decisions=decisions)
     best_late_n, tells = _best_rows_late(b_uT, truths[:, 2], rows)
     late_n = said_n if said_n is not None else best_late_n if tells else 0
     truths, rows = truths[: len(truths) - late_n], rows.part(slice(late_n, None))

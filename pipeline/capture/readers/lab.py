@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float64, Int
 
+from pipeline.capture.decisions import AS_USUAL, Decisions
 from pipeline.capture.header import Header
 from pipeline.capture.readers.chips import find_whole_rows
 from pipeline.capture.readers.table import (
@@ -67,14 +68,14 @@ def count_chips(files: Mapping[str, Path]) -> int:
     return count_chips_of(read_cells(files[READINGS], str(files[READINGS]), separator=",")[0])
 
 
-def read(folder: Path, header: Header) -> tuple[Readings, Account]:
+def read(folder: Path, header: Header, decisions: Decisions = AS_USUAL) -> tuple[Readings, Account]:
     """Read contact rows as readings; the no-load field of a row is the mean over its press's `noload` rows."""
     where = f"{header.capture}/{READINGS}"
     table = _read_table(folder / READINGS, where)
     if table.temperature_degC.shape[1] != header.chips_n:
         got = table.temperature_degC.shape[1]
         raise CaptureError(where, "chips", f"{header.chips_n}, as in the header", got, "Mend header or file.")
-    rows = find_whole_rows(table.b_uT, table.temperature_degC, header, where=where)
+    rows = find_whole_rows(table.b_uT, table.temperature_degC, header, where=where, decisions=decisions)
     keep, noload = table.contact & rows.whole, ~table.contact & rows.whole
     noload_uT = mean_by_group(table.b_uT[noload], table.press[noload], int(table.press[-1]) + 1)
     without = np.flatnonzero(np.isnan(noload_uT[:, 0]))

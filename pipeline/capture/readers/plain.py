@@ -14,6 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Bool, Float64, Int
 
+from pipeline.capture.decisions import AS_USUAL, Decisions
 from pipeline.capture.header import Header
 from pipeline.capture.readers.chips import find_whole_rows
 from pipeline.capture.readers.passes import find_passes
@@ -67,7 +68,7 @@ def count_chips(files: Mapping[str, Path]) -> int:
     return count_chips_of(_read_cells(file, str(file))[0])
 
 
-def read(folder: Path, header: Header) -> tuple[Readings, Account]:  # noqa: PLR0915 - one column after another
+def read(folder: Path, header: Header, decisions: Decisions = AS_USUAL) -> tuple[Readings, Account]:  # noqa: PLR0915 - one column after another
     """Read contact rows as readings; the no-load field of a row is the mean of the last no-load rows before it."""
     name = next(name for name in (CSV, PARQUET) if (folder / name).exists())
     where = f"{header.capture}/{name}"
@@ -85,7 +86,7 @@ def read(folder: Path, header: Header) -> tuple[Readings, Account]:  # noqa: PLR
     _check(numbers, b_uT, contact, where)
     unknown = np.full(len(contact), np.nan)
     temperature_degC = np.stack([numbers.get(f"T{chip}", unknown) for chip in range(header.chips_n)], axis=1)
-    rows = find_whole_rows(b_uT, temperature_degC, header, where=where)
+    rows = find_whole_rows(b_uT, temperature_degC, header, where=where, decisions=decisions)
     press = _number_presses(numbers, contact, where)
     block = np.cumsum(np.diff(contact.astype(int), prepend=1) < 0)  # a block of no-load rows, and the contacts after it
     rest = ~contact & rows.whole

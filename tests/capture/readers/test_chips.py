@@ -65,5 +65,9 @@ def test_a_row_with_a_stuck_chip_is_told_from_one_that_failed() -> None:
     rows = find_whole_rows(b_uT, temperature_degC, HEADER, where="here")
     assert np.flatnonzero(rows.failed).tolist() == [10]
     assert np.flatnonzero(rows.stuck).tolist() == list(range(50 + faults.STUCK_FRAMES_MIN_N - 1, 100))
-    assert rows.losses() == {"dropped_failed_read_rows_n": 1, "dropped_stuck_chip_rows_n": 31}
+    assert rows.losses() == {
+        "dropped_failed_read_rows_n": 1, "dropped_stuck_chip_rows_n": 31,
+        "fault_failed_read_dropped_n": 1, "fault_failed_read_first_row": 11, "fault_failed_read_last_row": 11,
+        "fault_stuck_dropped_n": 31, "fault_stuck_first_row": 70, "fault_stuck_last_row": 100,
+    }  # fmt: skip
     np.testing.assert_array_equal(rows.whole, ~(rows.failed | rows.stuck))
