@@ -30,8 +30,10 @@ def test_a_recording_says_which_chip_was_broken(tmp_path, monkeypatch, capsys):
 
 def test_a_page_without_options_is_that_of_the_one_board(monkeypatch):
     shown = {}
-    monkeypatch.setattr("pipeline.live.server.serve", lambda port, models, **words: shown.update(words, port=port))
+    monkeypatch.setattr("pipeline.live.server.serve", lambda live, **words: shown.update(words, live=live))
     monkeypatch.setattr("pipeline.live.ports.the_board", lambda: ports.Found("/dev/ttyACM0", None))
-    commands.live(None, None, None, None, "127.0.0.1", 8765)
-    assert (shown["port"], shown["host"], shown["http_port"]) == ("/dev/ttyACM0", "127.0.0.1", 8765)
-    assert shown["what"] == "a board"
+    commands.live(None, None, None, None, "127.0.0.1", 8765, ["stuck=flag"])
+    skin = shown["live"].skin
+    assert (skin.port, shown["host"], shown["http_port"]) == ("/dev/ttyACM0", "127.0.0.1", 8765)
+    assert shown["live"].what == "a board"
+    assert (skin.decisions.stuck, skin.decisions.zeros) == ("flag", "drop")

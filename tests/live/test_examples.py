@@ -1,4 +1,4 @@
-"""The examples of docs/live.md run as they stand, with stand-ins for the packages that are not ours."""
+"""The examples of docs/live.md and add-a-skin.md run as they stand, with stand-ins for packages that are not ours."""
 
 import re
 import sys
@@ -11,7 +11,8 @@ import reskin
 from pipeline.live.skin import Contact
 from tests.stages.checkout import ROOT
 
-EXAMPLES = dict(re.findall(r"```python (\w+)\n(.*?)```", (ROOT / "docs/live.md").read_text(), re.DOTALL))
+PAGES = "".join((ROOT / "docs" / name).read_text() for name in ("live.md", "add-a-skin.md"))
+EXAMPLES = dict(re.findall(r"```python (\w+)\n(.*?)```", PAGES, re.DOTALL))
 
 
 class OneContact:
@@ -73,3 +74,16 @@ def test_a_lerobot_dataset_gets_a_feature_of_field_and_estimate(run):
     run("lerobot", **names)
     np.testing.assert_allclose(frames[0]["observation.skin"], [4.0, 6.0, 0.5, *range(15)])
     assert saved == [30]
+
+
+def test_a_robots_program_labels_what_is_recorded(monkeypatch):
+    did, said = [], []
+    robot = SimpleNamespace(
+        places_in_random_order=lambda: [(4.0, 8.0), (0.0, 2.0)], lift_and_go_to=lambda *place: did.append(place),
+        press=lambda: did.append("press"), force_N=lambda: 0.5,
+    )  # fmt: skip
+    monkeypatch.setattr(reskin, "record", lambda labels, **told: said.extend([*labels, told]))
+    exec(EXAMPLES["robot"], {"robot": robot})
+    assert did == [(4.0, 8.0), "press", (0.0, 2.0), "press"]
+    assert (said[1].x_mm, said[1].Fz_N, said[0].contact) == (4.0, 0.5, False)
+    assert said[-1]["scan"] == "random"

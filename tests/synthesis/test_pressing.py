@@ -181,4 +181,5 @@ def test_presses_and_fillings_come_through_the_same_door_as_everything(tmp_path)
         logged_N = capture.probe.Fz_N[capture.probe.contact]
         readings_n = 1 if name == "press" else 3
         np.testing.assert_array_equal(np.concatenate([one.Fz_N for one in blocks]), np.repeat(logged_N, readings_n))
+        assert not [key for key in opened.account if key.startswith("fault_")]  # a healthy board raises no alarm
         assert opened.account["indentations_n"] == protocol.get("presses_n", protocol.get("passes_n"))

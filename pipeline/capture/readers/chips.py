@@ -84,7 +84,7 @@ def _note_readings(
     ledger: Ledger, b_uT: Float[np.ndarray, "f ch"], temperature_degC: Float[np.ndarray, "f k"],
     at: Float64[np.ndarray, " f"] | Int[np.ndarray, " f"],
 ) -> tuple[Marks, Marks, Marks, Marks]:  # fmt: skip
-    """Note what readings show by themselves; mark what to drop: not read, out of range; and all not read, all untrue."""
+    """Note what readings show by themselves; mark what to drop (not read, out of range), all not read, all untrue."""
     failed = np.asarray(faults.failed_reads(b_uT, temperature_degC).any(axis=1))
     zero = np.asarray(faults.zero_reads(b_uT).any(axis=1)) & ~failed
     hot = np.asarray(limits.too_hot(temperature_degC).any(axis=1)) & ~failed & ~zero
