@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from pipeline.capture.labels import Dwell, Label
 from pipeline.capture.probe import CONTACT, LABELS, NOLOAD
-from pipeline.capture.readers.units import SAME_PLACE_mm
+from pipeline.capture.readers.table import SAME_PLACE_mm
 from pipeline.core.errors import CaptureError
 
 CLOCKS = ("unix_s", "t_s")  # this machine's, or one of the source's own
