@@ -6,6 +6,7 @@ beside the same labels as training rows. Refuses to know laws and maps.
 
 from collections.abc import Mapping, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int64
@@ -18,9 +19,11 @@ from pipeline.experiments.rivals.points import NONE, OWN, Key, Point, means_uT, 
 from pipeline.learning.adversarial import Domains, train_adversarial
 from pipeline.learning.alignment import choose_ridge, coral, direct, match_channels
 from pipeline.learning.classical import Classical, fit
+from pipeline.learning.grid import ATTEMPTS_MAX_N
 from pipeline.learning.inputs import FIT, VIEW
 from pipeline.learning.model import Predictor
 from pipeline.learning.recipe import Recipe
+from pipeline.learning.trial import COLLAPSED, Weights
 from pipeline.trials.training import SceneData
 
 EVERY_N = 10  # of a labelled poke's readings, one is a row: they differ by noise alone
@@ -108,19 +111,41 @@ def _between(
     return np.array([np.interp(np.log(force_N), log_N, channel) for channel in db_uT[here].T])
 
 
-def score_adversarial(data: SceneData, fold: Fold, recipe: Recipe, weight: float) -> list[Point]:
-    """Score a network whose features were trained to hide whose skin a reading is of, and its control."""
+def score_adversarial(
+    data: SceneData, fold: Fold, recipe: Recipe, weight: float
+) -> tuple[list[Point], list[dict[str, Any]]]:
+    """Score a network whose features were trained to hide whose skin a reading is of, and its control.
+
+    Beside the points: which of the two collapsed, and how often before.
+    """
     view, rows = VIEW[recipe.inputs], data.rows
     scaler = FIT[recipe.scaling](view(rows.db_uT[fold.train]), rows.target[fold.train])
     known, new, test = (scaler.encode(view(rows.db_uT[at])) for at in (fold.train, fold.pool, fold.test))
     domains = Domains(known, scaler.encode_target(rows.target[fold.train]), new)
-    points = []
+    points, trainings = [], []
     for method, pokes, by in ((CONTROL, NONE, 0.0), (ADVERSARIAL, OWN, weight)):
-        # The same draws for both, so that only the weight differs.
-        weights = train_adversarial(domains, recipe, by, rng_for(data.settings.seed, "rivals", "network", fold.name))
+        weights, record = trained_again(domains, recipe, by, (data.settings.seed, fold.name))
         answer = scaler.decode(Predictor(weights, recipe.architecture, "cpu")(test))
         points.append(point(data, fold, answer, method=method, pokes=pokes))
-    return points
+        trainings.append(record)
+    return points, trainings
+
+
+def trained_again(
+    domains: Domains, recipe: Recipe, weight: float, of: tuple[int, str]
+) -> tuple[Weights, dict[str, Any]]:
+    """Train with other draws what collapsed, as all networks are: at most so many times in all.
+
+    The draws know no weight, so that of a network and its control only the weight differs.
+    """
+    seed, fold = of
+    for attempt_i in range(ATTEMPTS_MAX_N):
+        weights = train_adversarial(domains, recipe, weight, rng_for(seed, "rivals", "network", fold, attempt_i))
+        off = Predictor(weights, recipe.architecture, "cpu")(domains.known) - domains.target
+        collapsed = bool(np.min(1 - np.nanmean(off**2, axis=0) / np.nanvar(domains.target, axis=0)) < COLLAPSED)
+        if not collapsed:
+            break
+    return weights, {"collapsed": collapsed, "collapsed_before_n": attempt_i}
 
 
 def controls(methods: Mapping[str, Classical], labels_n: Sequence[int]) -> dict[Key, Key]:

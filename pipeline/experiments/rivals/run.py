@@ -18,6 +18,7 @@ from pipeline.core.errors import ParamsError
 from pipeline.core.provenance import SECONDS
 from pipeline.core.stage import run, say
 from pipeline.dataset.splits import Fold
+from pipeline.evaluation.scores import tally
 from pipeline.experiments.answer import read_folder, write_answer
 from pipeline.experiments.compare.run import Compare, see, setup_of, skins_of, turns_of
 from pipeline.experiments.rivals import aligned, told
@@ -73,7 +74,7 @@ def rivals(scene: str, files: Files, indentations: Path, folds: Path, models: Pa
     frame = Frame(turns_of(compare), compare.labels_middle_mm, compare.labels_mirrored)
     seen = {board: see(pokes, compare) for board, pokes in skins.items()}
     section, of_labels = read(settings), data.folds_of(QUESTION)
-    points, unpaired_n = baselines(data, of_labels, section)
+    points, trainings, unpaired_n = baselines(data, of_labels, section)
     nominal, rig = read_experts(Known(data, frame, setup, seen), models)
     bench = Bench(data, frame, seen, nominal, {})
     took: list[told.Timed] = []
@@ -86,21 +87,24 @@ def rivals(scene: str, files: Files, indentations: Path, folds: Path, models: Pa
         "unpaired_n": unpaired_n,
         "alarm": alarm(data, frame, setup, seen, of_labels, section.false_alarm_fraction),
     }
-    write_answer(answer, numbers, {})
+    write_answer(answer, numbers, {}, trainings=tally(trainings))
     io.write_json(SECONDS / scene / "rivals.json", [asdict(one) for one in took])
 
 
-def baselines(data: SceneData, folds: Sequence[Fold], section: Rivals) -> tuple[list[Point], int]:
-    """Score the baselines; count the labelled pokes that known boards have no pair of."""
-    points, unpaired_n = [], 0
+def baselines(data: SceneData, folds: Sequence[Fold], section: Rivals) -> tuple[list[Point], list[dict[str, Any]], int]:
+    """Score the baselines; tell which networks collapsed; count labelled pokes that known boards have no pair of."""
+    points: list[Point] = []
+    trainings: list[dict[str, Any]] = []
+    unpaired_n = 0
     for fold in folds:
         for method in section.methods.values():
             points += aligned.score_regressor(data, fold, method, section.labels_n)
-        points += aligned.score_adversarial(data, fold, section.recipe, section.adversarial_weight)
+        of_networks, records = aligned.score_adversarial(data, fold, section.recipe, section.adversarial_weight)
+        points, trainings = points + of_networks, trainings + records
         pairs_uT = aligned.pairs_uT(data.rows, fold.train, pokes_of(data, fold)[: max(section.labels_n)])
         unpaired_n += int(np.isnan(pairs_uT).any(axis=1).sum())
         say(f"{data.scene} rivals: baselines of {fold.name} done")
-    return points, unpaired_n
+    return points, trainings, unpaired_n
 
 
 if __name__ == "__main__":

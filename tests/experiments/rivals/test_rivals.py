@@ -15,7 +15,10 @@ from pipeline.experiments.rivals import alarm, aligned, told
 from pipeline.experiments.rivals.alarm import QUARTER, STRANGERS, Board
 from pipeline.experiments.rivals.points import FOREIGN, NONE, OWN, next_board, pokes_of, summarise
 from pipeline.experiments.rivals.show import WHY, tables
+from pipeline.learning.adversarial import Domains
+from pipeline.learning.model import Predictor, draw_weights, paper_layers
 from pipeline.trials.training import SceneData
+from tests.learning.recipes import recipe
 
 PLACES_MM = np.array([[4.0, 4.0], [6.0, 4.0], [8.0, 6.0], [4.0, 8.0], [6.0, 8.0]])
 FORCES_N = np.array([1.0, 4.0])
@@ -67,6 +70,18 @@ def test_enough_pairs_turn_a_new_boards_fields_into_the_known_ones():
     nowhere = fold("b1-draw0", range(2), range(36, 40), range(20, 40))
     with pytest.raises(ParamsError, match="labelled pokes must be within"):
         aligned.standardised_uT(DATA, nowhere, pokes_of(DATA, nowhere))
+
+
+def test_a_network_that_collapses_is_trained_again_with_other_draws(monkeypatch):
+    good = draw_weights(paper_layers(15), rng_for(0, "good"))
+    known = rng_for(0, "known").normal(size=(20, 15)).astype(np.float32)
+    target = Predictor(good, "paper", "cpu")(known)
+    dead = {name: np.zeros_like(value) for name, value in good.items()}
+    tries = iter([dead, good])
+    monkeypatch.setattr(aligned, "train_adversarial", lambda *words: next(tries))
+    weights, record = aligned.trained_again(Domains(known, target, known), recipe(), 1.0, (0, "b1"))
+    assert weights is good
+    assert record == {"collapsed": False, "collapsed_before_n": 1}
 
 
 def test_another_skins_pokes_are_those_of_the_next_board_in_the_same_draw():
