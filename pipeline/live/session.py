@@ -3,13 +3,15 @@
 Out: messages for pages, and captures. Refuses to know http.
 """
 
+import re
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from pipeline.capture.header import Header
 from pipeline.capture.port import Tape
-from pipeline.core.errors import ReskinError
+from pipeline.core.errors import ParamsError, ReskinError
 from pipeline.live.adapting import POKES_N, Pokes
 from pipeline.live.answering import Map, Models
 from pipeline.live.skin import WAITING, Readings, Skin
@@ -17,13 +19,16 @@ from pipeline.live.view import View
 from pipeline.recording import UNTOLD, begin_capture, end_capture, new_folder
 
 POLL_S = 0.1
+GATHER_S = 0.02  # for which frames of several boards are gathered: estimated together they cost less, and no page draws faster
+BOARDS_MAX_N = 16
 
 
 class Live:
     """A skin that is polled on a thread of its own, what pages see of it, and its recording."""
 
-    def __init__(self, port: str, models: Models, what: str) -> None:
+    def __init__(self, port: str, models: Models, what: str, *, alone: bool = True) -> None:
         self.skin, self.what = Skin(port, models), what
+        self._alone = alone
         self.view: View | None = None
         self.problem = ""
         self._pokes: Pokes | None = None
@@ -32,6 +37,9 @@ class Live:
         self._recorded = ""
         self._lock, self._buttons, self._stop = threading.Lock(), threading.Lock(), threading.Event()
         self._thread = threading.Thread(target=self._poll, name="estimates", daemon=True)
+
+    def __str__(self) -> str:
+        return f"{self.what} on {self.skin.port}"
 
     def start(self) -> None:
         self.skin.reader.start(there=False)
@@ -53,6 +61,8 @@ class Live:
                     with self._lock:
                         self.view = self.view or View(self.skin.layout, now_s - 1.0)
                         self.view.feed(readings, now_s)
+                if not self._alone:
+                    self._stop.wait(GATHER_S)
         except ReskinError as error:
             self.problem = str(error)
 
@@ -78,12 +88,12 @@ class Live:
         """Say what a page shows beside the numbers."""
         skin, found = self.skin, self.skin.found
         state: dict[str, Any] = {
-            "what": self.what, "zeroed": skin.zeroed,
+            "what": self.what if self._alone else str(self), "zeroed": skin.zeroed,
             "model": skin.answers.about if skin.answers else "",
             "adaptable": isinstance(skin.answers, Map),
             "adapting": "" if self._pokes is None else f"poke {len(self._pokes) + 1} of {POKES_N}, anywhere",
             "adapted": self._adapted,
-            "waiting": found.problem is not None,
+            "waiting": found.problem is not None, "silent": skin.silent,
             "alarms": [alarm for alarm in (self.problem, *skin.alarms()) if alarm not in ("", WAITING)],
             "recording": f"{self._recording[0]} {skin.reader.tape_problem}" if self._recording else "",
             "recorded": self._recorded,
@@ -119,6 +129,8 @@ class Live:
     def begin_recording(self) -> None:
         """Write the stream, as it comes from now on, into a new capture."""
         folder, found = new_folder(), self.skin.found
+        if not self._alone:  # others may begin theirs in the same second
+            folder = folder.with_name(f"{folder.name}-{re.sub(r'[^A-Za-z0-9]+', '-', found.port).strip('-')}")
         try:
             part, header = begin_capture(folder, UNTOLD, wire=found.wire, chips_n=found.chips_n, by="reskin live")
             self.skin.reader.set_tape(Tape(part, found.wire))
@@ -135,3 +147,11 @@ class Live:
                 self._recorded = f"recorded {folder}"
             except OSError as error:
                 self._recorded = f"{folder}.part could not be closed: {error.strerror}"
+
+
+def several(ports: Sequence[str], models: Models, what: str) -> list[Live]:
+    """Make one of each port; all share what the models are made of, and nothing else."""
+    if len(set(ports)) != len(ports) or not 0 < len(ports) <= BOARDS_MAX_N:
+        rule, remedy = f"1 to {BOARDS_MAX_N}, each named once", "Give each --port once."
+        raise ParamsError("--port", "ports", rule, ", ".join(ports) or "none", remedy)
+    return [Live(port, models, what, alone=len(ports) == 1) for port in ports]

@@ -79,7 +79,7 @@ def serve_beside(live: Live) -> str:
     ready, address = threading.Event(), []
 
     async def run() -> None:
-        runner = web.AppRunner(Server(live, "").application())
+        runner = web.AppRunner(Server([live], "").application())
         await runner.setup()
         site = web.TCPSite(runner, "127.0.0.1", 0)
         await site.start()

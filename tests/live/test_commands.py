@@ -28,10 +28,12 @@ def test_a_recording_says_which_chip_was_broken(tmp_path, monkeypatch, capsys):
     assert "; chip 1: failed I2C reads (" in capsys.readouterr().out
 
 
-def test_a_page_without_options_is_that_of_the_one_board(monkeypatch):
+def test_a_page_without_options_is_that_of_all_boards_that_are_there(monkeypatch):
     shown = {}
-    monkeypatch.setattr("pipeline.live.server.serve", lambda port, models, **words: shown.update(words, port=port))
-    monkeypatch.setattr("pipeline.live.ports.the_board", lambda: ports.Found("/dev/ttyACM0", None))
+    monkeypatch.setattr("pipeline.live.server.serve", lambda boards, **words: shown.update(words, boards=boards))
+    monkeypatch.setattr(
+        "pipeline.live.ports.the_boards", lambda: [ports.Found(f"/dev/ttyACM{i}", None) for i in (0, 1)]
+    )
     commands.live(None, None, None, None, "127.0.0.1", 8765)
-    assert (shown["port"], shown["host"], shown["http_port"]) == ("/dev/ttyACM0", "127.0.0.1", 8765)
-    assert shown["what"] == "a board"
+    assert [str(board) for board in shown["boards"]] == ["a board on /dev/ttyACM0", "a board on /dev/ttyACM1"]
+    assert (shown["host"], shown["http_port"]) == ("127.0.0.1", 8765)
