@@ -12,15 +12,18 @@ from typing import Any
 from pipeline.capture.header import Header
 from pipeline.capture.port import Tape
 from pipeline.core.errors import ParamsError, ReskinError
-from pipeline.live.adapting import POKES_N, Pokes
+from pipeline.live.adapting import Pokes, ShownPokes
 from pipeline.live.answering import Map, Models
 from pipeline.live.skin import WAITING, Readings, Skin
 from pipeline.live.view import View
 from pipeline.recording import UNTOLD, begin_capture, end_capture, new_folder
 
 POLL_S = 0.1
-GATHER_S = 0.02  # for which frames of several boards are gathered: estimated together they cost less, and no page draws faster
+GATHER_S = (
+    0.02  # for which frames of several boards are gathered: estimated together they cost less, and no page draws faster
+)
 BOARDS_MAX_N = 16
+ADAPTING = {"adapt": Pokes, "places": ShownPokes}  # by button
 
 
 class Live:
@@ -67,12 +70,16 @@ class Live:
             self.problem = str(error)
 
     def _adapt(self, readings: Readings) -> None:
-        """Let the map see a dozen pokes, if it was asked for; frames wait meanwhile, and none is lost."""
+        """Let the map learn from pokes, if it was asked for; frames wait meanwhile, and none is lost."""
         pokes, answers = self._pokes, self.skin.answers
         if pokes is not None and isinstance(answers, Map):
             pokes.feed(readings)
             if pokes.enough:
-                self._adapted, self._pokes = answers.see(pokes.db_uT), None
+                if isinstance(pokes, ShownPokes):
+                    self._adapted = answers.label(pokes.place_mm, pokes.db_uT, pokes.kept)
+                else:
+                    self._adapted = answers.see(pokes.db_uT)
+                self._pokes = None
 
     def message(self, after_bin: int) -> tuple[bytes, int]:
         """Give the next message of a client that has the bins before `after_bin`, and what it has then."""
@@ -91,7 +98,8 @@ class Live:
             "what": self.what if self._alone else str(self), "zeroed": skin.zeroed,
             "model": skin.answers.about if skin.answers else "",
             "adaptable": isinstance(skin.answers, Map),
-            "adapting": "" if self._pokes is None else f"poke {len(self._pokes) + 1} of {POKES_N}, anywhere",
+            "adapting": pokes.words if (pokes := self._pokes) is not None else "",
+            "next_mm": pokes.next_mm if pokes is not None else None,
             "adapted": self._adapted,
             "waiting": found.problem is not None, "silent": skin.silent,
             "alarms": [alarm for alarm in (self.problem, *skin.alarms()) if alarm not in ("", WAITING)],
@@ -119,8 +127,8 @@ class Live:
         with self._buttons:
             if button == "zero":
                 self.skin.zero()
-            elif button == "adapt" and isinstance(self.skin.answers, Map):
-                self._pokes = Pokes() if self._pokes is None else None
+            elif isinstance(button, str) and button in ADAPTING and isinstance(self.skin.answers, Map):
+                self._pokes = ADAPTING[button]() if self._pokes is None else None
             elif button == "record" and self._recording is not None:
                 self.end_recording()
             elif button == "record" and self.skin.found.problem is None:

@@ -16,7 +16,7 @@ class Board {
     const article = document.getElementById("board").content.cloneNode(true).firstElementChild;
     this.parts = Object.fromEntries([...article.querySelectorAll("[data-part]")].map((part) => [part.dataset.part, part]));
     document.getElementById("boards").append(article);
-    for (const name of ["zero", "adapt", "record"]) this.parts[name].addEventListener("click", () => this.press(name));
+    for (const name of ["zero", "adapt", "places", "record"]) this.parts[name].addEventListener("click", () => this.press(name));
     this.connect();
   }
 
@@ -62,8 +62,10 @@ class Board {
     this.list("alarms", state.alarms);
     this.list("seen", (state.seen || []).map(([name, n, s]) => `${name}: ${n}, within ${s} s`));
     this.parts.zero.disabled = this.parts.record.disabled = state.waiting;
-    this.parts.adapt.disabled = state.waiting || !state.adaptable;
-    this.parts.adapt.classList.toggle("on", Boolean(state.adapting));
+    for (const name of ["adapt", "places"]) {
+      this.parts[name].disabled = state.waiting || !state.adaptable || Boolean(state.adapting) && name !== this.chosen(state);
+      this.parts[name].classList.toggle("on", Boolean(state.adapting) && name === this.chosen(state));
+    }
     this.say("adapting", state.adapting || state.adapted || "–");
     this.parts.record.classList.toggle("on", Boolean(state.recording));
     this.parts.record.firstChild.textContent = state.recording ? "Stop " : "Record ";
@@ -71,6 +73,8 @@ class Board {
     if (state.waiting) { this.last = null; this.rows = []; }
     this.dirty = true;
   }
+
+  chosen(state) { return state.next_mm ? "places" : "adapt"; }
 
   canvasOf(id, high) { // a pen in CSS pixels, on a canvas that is as sharp as the screen
     const canvas = this.parts[id], ratio = devicePixelRatio || 1, wide = canvas.clientWidth;
@@ -118,6 +122,12 @@ class Board {
       pen.fillStyle = ink(i + 1); pen.textAlign = "left"; pen.fillText(`${i}`, px + side / 2 + 3, py + side / 2 + 10);
       if (last && !state.silent && last.chips === state.chips_mm.length) arrow(pen, px, py, last.change.subarray(3 * i, 3 * i + 3), scale);
     });
+    if (state.next_mm) { // the next place to press
+      const [px, py] = at(...state.next_mm), size = Math.max(1.2 * scale, 10);
+      pen.strokeStyle = colour("--alarm"); pen.lineWidth = 3; pen.beginPath(); pen.arc(px, py, size, 0, 7);
+      for (const [dx, dy] of [[1, 0], [0, 1]]) { pen.moveTo(px - 1.5 * size * dx, py - 1.5 * size * dy); pen.lineTo(px + 1.5 * size * dx, py + 1.5 * size * dy); }
+      pen.stroke(); pen.lineWidth = 2;
+    }
     if (last && !state.silent && last.contact && !Number.isNaN(last.x)) {
       const [px, py] = at(last.x, last.y), blue = colour("--link");
       if (!Number.isNaN(last.sdX)) { pen.strokeStyle = blue; pen.beginPath(); pen.ellipse(px, py, Math.max(2 * last.sdX * scale, 1), Math.max(2 * last.sdY * scale, 1), 0, 0, 7); pen.stroke(); }
@@ -161,7 +171,7 @@ function draw() {
 }
 
 addEventListener("keydown", (event) => {
-  const name = {z: "zero", a: "adapt", r: "record"}[event.key];
+  const name = {z: "zero", a: "adapt", p: "places", r: "record"}[event.key];
   if (name && !event.ctrlKey && !event.metaKey && !event.altKey && !event.repeat) boards.forEach((board) => board.press(name));
 });
 addEventListener("resize", () => boards.forEach((board) => { board.dirty = true; }));
