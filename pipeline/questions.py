@@ -81,6 +81,7 @@ ROWS = (
     _experiment("contacts", None, "lobo", section=True, recorded=True),
     _experiment("ambient", None, "lobo", section=True),
     _experiment("dynamics", "press", "lobo"),
+    _experiment("gripper", "grip", "lobo", section=True),
     _study("verification"),
     _study("stability"),
     _study("runtime", section=True),
