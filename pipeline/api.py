@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from pipeline.capture.labels import Label
     from pipeline.dataset.rows import Rows
     from pipeline.live.skin import Skin as LiveSkin
+    from pipeline.live.skins import Skins as LiveSkins
     from pipeline.physics.board import Board
     from pipeline.physics.skin import Skin
     from pipeline.trials.networks import Network
@@ -197,7 +198,13 @@ def load_universal() -> Universal:
     return shipped.load_universal()
 
 
-def open(port: str, *, model: Path | str | Sequence[Path | str] = (), baud: int = 115200) -> LiveSkin:
+@overload
+def open(port: str, *, model: Path | str | Sequence[Path | str] = (), baud: int = 115200) -> LiveSkin: ...
+@overload
+def open(port: list[str], *, model: Path | str | Sequence[Path | str] = (), baud: int = 115200) -> LiveSkins: ...
+def open(
+    port: str | list[str], *, model: Path | str | Sequence[Path | str] = (), baud: int = 115200
+) -> LiveSkin | LiveSkins:
     """Open a board's port: its contacts while they happen. In the first second nothing may touch the skin.
 
     >>> with open("/dev/ttyACM0", model="data/models/quick/train_multi/NAME.safetensors") as skin:  # doctest: +SKIP
@@ -205,13 +212,18 @@ def open(port: str, *, model: Path | str | Sequence[Path | str] = (), baud: int 
     ...         print(contact.t_s, contact.x_mm, contact.y_mm, contact.F_N, contact.alarms)
 
     Format and chips are told from the bytes; `port` may also be `socket://host:port`. Without a model the map of
-    simulated skins answers (`load_universal`). Several models give means, and how far they are apart.
+    simulated skins answers (`load_universal`). Several models give means, and how far they are apart. A list of ports
+    gives the latest contacts of all boards, in its order; one that is unplugged does not hold up the others.
     """
     from pipeline.live.skin import Skin
+    from pipeline.live.skins import Skins
     from pipeline.predicting import read_network
 
     files = [model] if isinstance(model, str | Path) else model
-    return Skin(port, [read_network(Path(file)) for file in files] or load_universal(), baud=baud)
+    models = [read_network(Path(file)) for file in files] or load_universal()
+    if isinstance(port, str):
+        return Skin(port, models, baud=baud)
+    return Skins([Skin(each, models, baud=baud) for each in port])
 
 
 def lifted() -> Label:

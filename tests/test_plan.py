@@ -168,7 +168,7 @@ def test_every_protocol_has_a_folder_and_stages_of_its_own(tmp_path):
     root = simulated(tmp_path)
     plan.use(root, ["one"])
     stages = plan.check(root).stages
-    protocols = ("wear", "flexible", "hand", "drag", "sleeve", "glass", "press", "log")
+    protocols = ("wear", "flexible", "hand", "drag", "sleeve", "glass", "grip", "press", "log")
     assert set(stages["simulate"]) == {"one", *(f"one-{protocol}" for protocol in protocols)}
     assert stages["simulate"]["one-flexible"]["boards"] == "flexible"
     assert set(stages["ingest_simulated"]) == set(stages["simulate"]) - {"one-log"}  # an SD card has no probe to join

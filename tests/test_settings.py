@@ -110,7 +110,8 @@ def overridden(root: Path, *overrides: tuple[str, str]) -> Iterator[None]:
 
 ENTRY = Entry(board="b", skin="s", layout="lab", chips_n=5, fingerprints=("0",), copy_of=None)
 CAPTURES = Registry(captures={scene: {"c0": ENTRY} for scene in ("lab", "ini", "eflesh", "eflash7")})
-SIMULATED = ("ci", "ci-wear", "ci-flexible", "ci-hand", "ci-drag", "ci-sleeve", "ci-glass", "ci-press", "ci-log")
+OWN = ("wear", "flexible", "hand", "drag", "sleeve", "glass", "grip", "press", "log")
+SIMULATED = ("ci", *(f"ci-{protocol}" for protocol in OWN))
 ALL_SIMULATE = {f"simulate@{key}" for key in SIMULATED}
 RIGID = ALL_SIMULATE - {"simulate@ci-flexible", "simulate@ci-sleeve"}
 PLAIN = {"train_single", "train_multi", "sweep_sensors", "drift", "shear", "sleeve", "ambient"}
@@ -170,6 +171,7 @@ OVERRIDES: list[tuple[str, str, set[str] | None]] = [
     (SCENE, "sleeve.training.seeds_n=2", {"sleeve"}),
     (SCENE, "contacts.pairs_n=10", {"contacts"}),
     (SCENE, "ambient.iron.radius_mm=5.0", {"ambient"}),
+    (SCENE, "gripper.gain_mm_N=0.1", {"gripper"}),
     (SCENE, "runtime.repeats_n=2", {"runtime"}),
 ]  # fmt: skip
 

@@ -60,6 +60,7 @@ class Map:
     def __init__(self, universal: Universal) -> None:
         self._universal = universal
         self._pokes_uT = np.zeros((0, CHANNELS_N))  # changes of field that it was let see
+        self._shown_mm, self._shown_uT = np.zeros((0, 2)), np.zeros((0, CHANNELS_N))  # pokes at known places
         self.zero(np.zeros((1, CHANNELS_N)))
 
     def zero(self, b_uT: Float[np.ndarray, "f ch"]) -> None:
@@ -80,10 +81,33 @@ class Map:
             f"after; misfit {misfit[0]:.2f} before, {misfit[1]:.2f} after"
         )
 
+    def label(
+        self, place_mm: Float[np.ndarray, "n 2"], db_uT: Float[np.ndarray, "n ch"], kept: Bool[np.ndarray, " n"]
+    ) -> str:
+        """Learn from pokes at shown places; say how far off it was, and is, at those that were kept from it.
+
+        Nobody measured the force: it is taken as the map estimates it.
+        """
+
+        def error_mm() -> float:
+            found = self._universal.estimate(self._noload_uT + db_uT[kept])
+            return float(np.median(np.linalg.norm(found.place_mm - place_mm[kept], axis=1)))
+
+        before_mm = error_mm()
+        self._shown_mm, self._shown_uT = place_mm[~kept], db_uT[~kept].astype(np.float64)
+        self._learn(self._pokes_uT)
+        return (
+            f"adapted to {(~kept).sum()} shown places: error at {kept.sum()} others {before_mm:.2f} mm before, "
+            f"{error_mm():.2f} mm after (medians)"
+        )
+
     def _learn(self, pokes_uT: Float[np.ndarray, "n ch"]) -> None:
         universal = copy(self._universal).zero(self._noload_uT[None])
         if len(pokes_uT):
             universal.see(self._noload_uT + pokes_uT)
+        if len(self._shown_uT):
+            b_uT = self._noload_uT + self._shown_uT
+            universal.label(self._shown_mm, universal.estimate(b_uT).force_N, b_uT)
         universal.estimate(self._noload_uT[None])  # what a first contact should not wait for
         self._universal = universal
 

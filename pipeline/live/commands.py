@@ -94,7 +94,7 @@ def emulate(
 
 @app.command()
 def live(
-    port: Annotated[str | None, Option(help="The board's port; not given: the one that is there.")] = None,
+    port: Annotated[list[str] | None, Option(help="A board's port, or several; not given: all that are there.")] = None,
     model: Annotated[
         list[Path] | None, Option(help="A trained model (.safetensors), or several; else the map of simulated skins.")
     ] = None,
@@ -104,29 +104,29 @@ def live(
     http_port: Annotated[int, Option(help="The page's port.", min=1, max=65535)] = 8765,
     on_fault: Annotated[list[str] | None, Option(help=ON_FAULT)] = None,
 ) -> None:
-    """Show a board at work in the browser: chips, contact, force, traces, and what is wrong."""
+    """Show boards at work in the browser: chips, contact, force, traces, and what is wrong."""
     from contextlib import ExitStack
 
     from pipeline.capture.decisions import decide
     from pipeline.core.errors import ParamsError
     from pipeline.live.emulate import playing
     from pipeline.live.health import LIVE
-    from pipeline.live.ports import the_board
+    from pipeline.live.ports import the_boards
     from pipeline.live.script import read_script
     from pipeline.live.server import serve
-    from pipeline.live.session import Live
+    from pipeline.live.session import several
     from pipeline.predicting import read_network
     from pipeline.twin.shipped import load_universal
 
     decisions = decide(LIVE, on_fault or (), "--on-fault")
-    given = [name for name in (port, replay, emulate) if name is not None]
+    given = [word for word, value in (("--port", port), ("--replay", replay), ("--emulate", emulate)) if value]
     if len(given) > 1:
-        raise ParamsError("live", "the board", "one of --port, --replay, --emulate", ", ".join(given), "Give one.")
+        raise ParamsError("live", "the board", "from one of --port, --replay, --emulate", ", ".join(given), "Give one.")
     models = [read_network(file) for file in model] if model else load_universal()
     with ExitStack() as stack:
         what = "a board"
         if source := replay or emulate:
             script = read_script(source, Path())
-            port, what = stack.enter_context(playing(script)), f"{script.source}: {source}, played"
-        session = Live(port or the_board().port, models, what, decisions)
-        serve(session, host=host, http_port=http_port, say=typer.echo)
+            port, what = [stack.enter_context(playing(script))], f"{script.source}: {source}, played"
+        boards = several(port or [found.port for found in the_boards()], models, what, decisions)
+        serve(boards, host=host, http_port=http_port, say=typer.echo)

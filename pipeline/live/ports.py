@@ -70,12 +70,21 @@ def find_boards(names: Sequence[str] | None = None, *, listening_s: float = LIST
 
 def the_board(names: Sequence[str] | None = None) -> Found:
     """Give the one board that is there; raise if there is none or more."""
-    found = find_boards(names)
-    boards = [one for one in found if one.problem is None]
+    boards = the_boards(names)
     if len(boards) != 1:
-        got = "; ".join(map(str, boards or found)) or "no serial port at all"
-        raise CaptureError("ports", "the board", "one, to go without --port", got, "Plug one in, or give --port.")
+        got, remedy = "; ".join(map(str, boards)), "Give --port."
+        raise CaptureError("ports", "the board", "one, to go without --port", got, remedy)
     return boards[0]
+
+
+def the_boards(names: Sequence[str] | None = None) -> list[Found]:
+    """Give all boards that are there; raise if there is none."""
+    found = find_boards(names)
+    boards = [each for each in found if each.problem is None]
+    if not boards:
+        got = "; ".join(map(str, found)) or "no serial port at all"
+        raise CaptureError("ports", "boards", "one or more, to go without --port", got, "Plug one in, or give --port.")
+    return boards
 
 
 def look(port: str, listening_s: float = LISTENING_S) -> Found:

@@ -3,15 +3,17 @@
 Out: messages for pages, and captures. Refuses to know http.
 """
 
+import re
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from pipeline.capture.decisions import Decisions
 from pipeline.capture.header import Header
 from pipeline.capture.port import Tape
-from pipeline.core.errors import ReskinError
-from pipeline.live.adapting import POKES_N, Pokes
+from pipeline.core.errors import ParamsError, ReskinError
+from pipeline.live.adapting import Pokes, ShownPokes
 from pipeline.live.answering import Map, Models
 from pipeline.live.health import LIVE
 from pipeline.live.skin import WAITING, Readings, Skin
@@ -19,13 +21,21 @@ from pipeline.live.view import View
 from pipeline.recording import UNTOLD, begin_capture, end_capture, new_folder
 
 POLL_S = 0.1
+GATHER_S = (
+    0.02  # for which frames of several boards are gathered: estimated together they cost less, and no page draws faster
+)
+BOARDS_MAX_N = 16
+ADAPTING = {"adapt": Pokes, "places": ShownPokes}  # by button
 
 
 class Live:
     """A skin that is polled on a thread of its own, what pages see of it, and its recording."""
 
-    def __init__(self, port: str, models: Models, what: str, decisions: Decisions = LIVE) -> None:
+    def __init__(
+        self, port: str, models: Models, what: str, decisions: Decisions = LIVE, *, alone: bool = True
+    ) -> None:
         self.skin, self.what = Skin(port, models, decisions=decisions), what
+        self._alone = alone
         self.view: View | None = None
         self.problem = ""
         self._pokes: Pokes | None = None
@@ -34,6 +44,9 @@ class Live:
         self._recorded = ""
         self._lock, self._buttons, self._stop = threading.Lock(), threading.Lock(), threading.Event()
         self._thread = threading.Thread(target=self._poll, name="estimates", daemon=True)
+
+    def __str__(self) -> str:
+        return f"{self.what} on {self.skin.port}"
 
     def start(self) -> None:
         self.skin.reader.start(there=False)
@@ -55,16 +68,22 @@ class Live:
                     with self._lock:
                         self.view = self.view or View(self.skin.layout, now_s - 1.0)
                         self.view.feed(readings, now_s)
+                if not self._alone:
+                    self._stop.wait(GATHER_S)
         except ReskinError as error:
             self.problem = str(error)
 
     def _adapt(self, readings: Readings) -> None:
-        """Let the map see a dozen pokes, if it was asked for; frames wait meanwhile, and none is lost."""
+        """Let the map learn from pokes, if it was asked for; frames wait meanwhile, and none is lost."""
         pokes, answers = self._pokes, self.skin.answers
         if pokes is not None and isinstance(answers, Map):
             pokes.feed(readings)
             if pokes.enough:
-                self._adapted, self._pokes = answers.see(pokes.db_uT), None
+                if isinstance(pokes, ShownPokes):
+                    self._adapted = answers.label(pokes.place_mm, pokes.db_uT, pokes.kept)
+                else:
+                    self._adapted = answers.see(pokes.db_uT)
+                self._pokes = None
 
     def message(self, after_bin: int) -> tuple[bytes, int]:
         """Give the next message of a client that has the bins before `after_bin`, and what it has then."""
@@ -80,12 +99,13 @@ class Live:
         """Say what a page shows beside the numbers."""
         skin, found = self.skin, self.skin.found
         state: dict[str, Any] = {
-            "what": self.what, "zeroed": skin.zeroed,
+            "what": self.what if self._alone else str(self), "zeroed": skin.zeroed,
             "model": skin.answers.about if skin.answers else "",
             "adaptable": isinstance(skin.answers, Map),
-            "adapting": "" if self._pokes is None else f"poke {len(self._pokes) + 1} of {POKES_N}, anywhere",
+            "adapting": pokes.words if (pokes := self._pokes) is not None else "",
+            "next_mm": pokes.next_mm if pokes is not None else None,
             "adapted": self._adapted,
-            "waiting": found.problem is not None,
+            "waiting": found.problem is not None, "silent": skin.silent,
             "alarms": [alarm for alarm in (self.problem, *skin.alarms()) if alarm not in ("", WAITING)],
             "recording": f"{self._recording[0]} {skin.reader.tape_problem}" if self._recording else "",
             "recorded": self._recorded,
@@ -111,8 +131,8 @@ class Live:
         with self._buttons:
             if button == "zero":
                 self.skin.zero()
-            elif button == "adapt" and isinstance(self.skin.answers, Map):
-                self._pokes = Pokes() if self._pokes is None else None
+            elif isinstance(button, str) and button in ADAPTING and isinstance(self.skin.answers, Map):
+                self._pokes = ADAPTING[button]() if self._pokes is None else None
             elif button == "record" and self._recording is not None:
                 self.end_recording()
             elif button == "record" and self.skin.found.problem is None:
@@ -121,6 +141,8 @@ class Live:
     def begin_recording(self) -> None:
         """Write the stream, as it comes from now on, into a new capture."""
         folder, found = new_folder(), self.skin.found
+        if not self._alone:  # others may begin theirs in the same second
+            folder = folder.with_name(f"{folder.name}-{re.sub(r'[^A-Za-z0-9]+', '-', found.port).strip('-')}")
         try:
             part, header = begin_capture(folder, UNTOLD, wire=found.wire, chips_n=found.chips_n, by="reskin live")
             self.skin.reader.set_tape(Tape(part, found.wire))
@@ -137,3 +159,11 @@ class Live:
                 self._recorded = f"recorded {folder}"
             except OSError as error:
                 self._recorded = f"{folder}.part could not be closed: {error.strerror}"
+
+
+def several(ports: Sequence[str], models: Models, what: str, decisions: Decisions = LIVE) -> list[Live]:
+    """Make one of each port; all share what the models are made of, and nothing else."""
+    if len(set(ports)) != len(ports) or not 0 < len(ports) <= BOARDS_MAX_N:
+        rule, remedy = f"1 to {BOARDS_MAX_N}, each named once", "Give each --port once."
+        raise ParamsError("--port", "ports", rule, ", ".join(ports) or "none", remedy)
+    return [Live(port, models, what, decisions, alone=len(ports) == 1) for port in ports]

@@ -135,6 +135,11 @@ class Skin:
     def zeroed(self) -> bool:
         return self._zero is not None
 
+    @property
+    def silent(self) -> bool:
+        """Say whether nothing comes: what was read last is no more so."""
+        return not self.found.problem and self.reader.unix_s() - self._ends[-1][1] > SILENT_S
+
     def alarms(self) -> tuple[str, ...]:
         """Say what is wrong now."""
         own = [f"unplugged: {self.reader.problem}"] if self.reader.problem and not self.reader.plugged_in else []
@@ -148,9 +153,8 @@ class Skin:
         """Decode what came, wait for it at most so long, and estimate; `latest` estimates the last frame alone."""
         chunks = self.reader.take(wait_s)
         if not chunks:
-            now_s = self.reader.unix_s()
-            if not self.found.problem and now_s - self._ends[-1][1] > SILENT_S:
-                self.health.note("nothing comes", 1, now_s, "unplug")
+            if self.silent:
+                self.health.note("nothing comes", 1, self.reader.unix_s(), "unplug")
             return None
         if self.found.problem:
             chunks = self._recognise(chunks)
@@ -189,8 +193,8 @@ class Skin:
         if self.answers is not None and self.answers.channels_n != 3 * found.chips_n:
             self._refuse_model(self.answers, found.chips_n)
         self.health, self.layout = Health(found.chips_n, self.decisions), layout_of(found.chips_n)
+        self._begin_stream(found)
         self.found = found  # last: another thread that sees it asks for the rest
-        self._begin_stream()
         return chunks
 
     def _refuse_model(self, answers: Networks | Map, chips_n: int) -> None:
@@ -200,11 +204,11 @@ class Skin:
             raise SchemaError(self.port, "channels", f"the {answers.channels_n} of the model", 3 * chips_n, remedy)
         self.answers, self.problem = None, f"no place, no force: the {answers.about} is for five chips; name a model"
 
-    def _begin_stream(self) -> None:
-        self._stream = FrameStream(self.found.wire, self.found.chips_n)
+    def _begin_stream(self, found: ports.Found) -> None:
+        self._stream = FrameStream(found.wire, found.chips_n)
         self._counted: Counter[str] = Counter()
         self._lost_in_row_n = 0
-        self._ends: deque[tuple[int, float]] = deque([(0, 0.0)], maxlen=ENDS_KEPT_N)
+        self._ends: deque[tuple[int, float]] = deque([(0, self.reader.unix_s())], maxlen=ENDS_KEPT_N)
 
     def _decode(self, chunks: list[Chunk]) -> tuple[Frames, Float64[np.ndarray, " f"]]:
         """Decode chunks; a board that was plugged in again begins a stream anew."""
@@ -214,7 +218,7 @@ class Skin:
             if first in anew:
                 self._stream.close()
                 self._count(chunks[first][1])
-                self._begin_stream()
+                self._begin_stream(self.found)
             parts.append(self._feed(chunks[first:last]))
         frames = concatenate([part for part, _ in parts], self.found.chips_n)
         return frames, np.concatenate([t_s for _, t_s in parts])

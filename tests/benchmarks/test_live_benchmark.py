@@ -10,13 +10,15 @@ import subprocess
 import sys
 import time
 import tracemalloc
+from itertools import cycle
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pipeline.live.layout import layout_of
 from pipeline.live.session import Live
-from pipeline.live.skin import Readings
+from pipeline.live.skin import Readings, Skin
 from pipeline.live.view import View
 from pipeline.predicting import read_network
 from tests.live.boards import make_script, plugged_in, write_model, write_script
@@ -25,6 +27,8 @@ from tests.live.test_server import serve
 from tests.stages.checkout import ROOT
 
 SECONDS = 30.0
+QUARTER_S = 0.25
+STATM = Path("/proc/self/statm")
 PAGE = """
 import asyncio, sys, aiohttp
 async def look():
@@ -79,7 +83,7 @@ def serve_beside(live: Live) -> str:
     ready, address = threading.Event(), []
 
     async def run() -> None:
-        runner = web.AppRunner(Server(live, "").application())
+        runner = web.AppRunner(Server([live], "").application())
         await runner.setup()
         site = web.TCPSite(runner, "127.0.0.1", 0)
         await site.start()
@@ -118,3 +122,41 @@ def test_a_day_of_frames_takes_the_memory_of_ten_minutes():
         if second in (600, 86_399):
             print(f"\n  after {second} s: {tracemalloc.get_traced_memory()[0] / 1e6:.3f} MB")
     tracemalloc.stop()
+
+
+class Accelerated:
+    """A reader without port and clock: a quarter of a second of frames whenever it is asked."""
+
+    plugged_in, problem, missed_bytes_n = True, "", 0
+
+    def __init__(self, chunks: list[bytes]) -> None:
+        self._chunks, self.now_s = cycle(chunks), 0.0
+
+    def unix_s(self) -> float:
+        return self.now_s
+
+    def take(self, _wait_s: float) -> list[tuple[bytes, float]]:
+        self.now_s += QUARTER_S
+        return [(next(self._chunks), self.now_s)]
+
+
+@pytest.mark.timeout(7200)
+@pytest.mark.skipif(not STATM.exists(), reason="reads the memory of Linux")
+def test_hours_of_bytes_take_the_memory_of_ten_minutes(tmp_path):
+    script, hours = make_script(pokes_n=20), float(os.environ.get("RESKIN_HOURS", "1"))
+    frames_n = round(400 * QUARTER_S)
+    chunks = [b"".join(script.pieces[i : i + frames_n]) for i in range(0, len(script) - frames_n + 1, frames_n)]
+    skin, view = Skin("day", [read_network(write_model(tmp_path))]), View(layout_of(5), 0.0)
+    skin.reader, next_s = Accelerated(chunks), 600.0
+    begun_s = time.process_time()
+    while skin.reader.now_s < 3600 * hours:
+        if (readings := skin.poll(0.0)) is not None:
+            view.feed(readings, skin.reader.now_s)
+            view.message(view.newest_bin - 2, rate_hz=skin.health.rate_hz, lost_bytes_n=0)
+        if skin.reader.now_s >= next_s:
+            next_s += 1800.0
+            resident_MB = int(STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+            print(
+                f"\n  {skin.reader.now_s / 3600:.2f} h, {skin.account['frames_n']} frames: {resident_MB:.2f} MB", end=""
+            )
+    print(f"\n  {time.process_time() - begun_s:.0f} s of processor time")

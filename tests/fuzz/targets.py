@@ -55,7 +55,7 @@ def stream(data: bytes) -> None:
 
 def page(data: bytes) -> None:
     """What a page says on its websocket: buttons are three words, and nothing else is done."""
-    Server(LIVE, "")._listen(data.decode(errors="replace"))
+    Server([LIVE], "")._listen(LIVE, data.decode(errors="replace"))
 
 
 def request(data: bytes) -> None:
@@ -72,7 +72,7 @@ def request(data: bytes) -> None:
         return web.Response()
 
     try:
-        LOOP.run_until_complete(Server(LIVE, "")._check(asked, answer))
+        LOOP.run_until_complete(Server([LIVE], "")._check(asked, answer))
     except web.HTTPForbidden:
         return
 

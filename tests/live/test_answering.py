@@ -1,11 +1,13 @@
 """The map that comes with the project answers when no model is named, learns from pokes, and knows a stranger."""
 
+import re
+
 import numpy as np
 import pytest
 
 import reskin
 from pipeline.core.seeds import rng_for
-from pipeline.live.adapting import POKES_N, Pokes
+from pipeline.live.adapting import POKES_N, Pokes, ShownPokes
 from pipeline.live.answering import Map
 from pipeline.live.script import Script, encode_pieces
 from pipeline.live.skin import UNLIKE, Readings
@@ -26,7 +28,7 @@ def simulated():
 def poked(simulated, chips_on_n: int = 0):
     """A script of a quiet start and of all pokes, with a pause after each; chips may come so many places later."""
     noload_uT, b_uT, _, _ = simulated
-    script = make_script(pokes_n=0, quiet_s=(QUIET_N + 2 * POKED_N * POKES_N) / 400)
+    script = make_script(pokes_n=0, quiet_s=(QUIET_N + 2 * POKED_N * len(b_uT)) / 400)
     poke_i, since_n = np.divmod(np.arange(len(script)) - QUIET_N, 2 * POKED_N)
     clean_uT = np.where(((poke_i >= 0) & (since_n < POKED_N))[:, None], b_uT[poke_i], noload_uT.mean(axis=0))
     noise_uT = script.frames.b_uT - script.frames.b_uT.mean(axis=0)
@@ -65,6 +67,36 @@ def test_a_dozen_pokes_are_gathered_one_a_contact_and_the_map_learns_from_them(s
     before = answers(pokes.db_uT.astype(np.float32))
     answers.zero(simulated[0])  # what it has seen is kept
     np.testing.assert_allclose(answers(pokes.db_uT.astype(np.float32)).answer, before.answer, rtol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def pressed():
+    """A simulated skin that is pressed where the page shows it, in that order."""
+    places = np.column_stack([ShownPokes().place_mm, np.full(ShownPokes().pokes_n, 1.0)])
+    noload_uT, b_uT, force_N = reskin.simulate_pokes(reskin.draw_skin(seed=5), places, seed=5)
+    return noload_uT, b_uT, places[:, :2], force_N
+
+
+def test_presses_at_shown_places_are_learnt_from_and_judged_at_those_in_between(pressed):
+    _, readings = played(poked(pressed), load_universal())
+    pokes, crosses = ShownPokes(), []
+    for each in readings:
+        crosses += [pokes.next_mm] if pokes.next_mm not in [None, *crosses] else []
+        pokes.feed(each)
+    np.testing.assert_allclose(crosses, pressed[2])
+    assert len(np.unique(pokes.place_mm, axis=0)) == len(pokes) == 2 * pokes.kept.sum()
+    assert pokes.next_mm is None
+    answers = Map(load_universal())
+    answers.zero(pressed[0])
+    told = answers.label(pokes.place_mm, pokes.db_uT, pokes.kept)
+    before_mm, after_mm = map(float, re.findall(r"([0-9.]+) mm (?:before|after)", told))
+    found = answers(pokes.db_uT[pokes.kept].astype(np.float32)).answer[:, :2]
+    assert after_mm == pytest.approx(
+        np.median(np.linalg.norm(found - pressed[2][pokes.kept], axis=1)), abs=0.006
+    )  # of the places that were pressed
+    assert after_mm < before_mm
+    answers.zero(pressed[0])  # what it has learnt is kept
+    np.testing.assert_allclose(answers(pokes.db_uT[pokes.kept].astype(np.float32)).answer[:, :2], found, rtol=1e-6)
 
 
 def test_a_knock_is_no_poke():

@@ -7,8 +7,11 @@ debugging protocol, so that no package is needed. RESKIN_SCREENSHOTS names a fol
 import asyncio
 import base64
 import os
+import re
 import shutil
 from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 
@@ -21,15 +24,16 @@ from pipeline.live.adapting import POKES_N
 from pipeline.predicting import read_network
 from pipeline.twin.shipped import load_universal
 from tests.live.boards import PLACES, make_script, plugged_in, write_model
-from tests.live.test_answering import poked, simulated  # noqa: F401 - a fixture
+from tests.live.test_answering import poked, pressed, simulated  # noqa: F401 - fixtures
 from tests.live.test_server import LONG_S, serve
+from tests.live.test_several import GOES, RATES_HZ, plug_in_all
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 BROWSER = os.environ.get("RESKIN_BROWSER") or next(filter(None, map(shutil.which, NAMES)), None)
 FLAGS = ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--remote-debugging-port=0")
 WIDTHS_PX = (400, 1400)
 # The colour of the dot where a place in mm is drawn, from the page's own numbers.
-DOT = """((x, y) => { const board = document.getElementById("board"), ratio = devicePixelRatio, margin = 12,
+DOT = """((x, y) => { const {state, last, parts: {board}} = boards[0], ratio = devicePixelRatio, margin = 12,
   [wide, high] = state.skin_mm, [left, bottom] = state.corner_mm,
   scale = Math.min((board.clientWidth - 2 * margin) / wide, (innerHeight * .8 - 2 * margin) / high);
   return last.contact ? [...board.getContext("2d").getImageData(ratio * (margin + (x - left) * scale),
@@ -54,7 +58,7 @@ class Tab:
         while True:
             said = await self._socket.receive_json(timeout=LONG_S)
             if said.get("method") == "Runtime.exceptionThrown":
-                self.errors.append(said["params"]["exceptionDetails"]["text"])
+                self.errors.append(said["params"]["exceptionDetails"])
             if said.get("id") == number:
                 assert "error" not in said, said
                 return said["result"]
@@ -63,7 +67,7 @@ class Tab:
         return (await self.call("Runtime.evaluate", expression=words, returnByValue=True))["result"].get("value")
 
     async def text(self, name: str) -> str:
-        return str(await self.value(f"document.getElementById('{name}').innerText"))
+        return str(await self.value(f"boards[0].parts.{name}.innerText"))
 
     async def until(self, words: str, is_so: Callable[[object], bool] = bool) -> object:
         for _ in range(round(LONG_S / 0.02)):
@@ -76,7 +80,7 @@ class Tab:
         for kind in ("keyDown", "keyUp"):
             await self.call("Input.dispatchKeyEvent", type=kind, key=key, text=key if kind == "keyDown" else "")
 
-    async def look(self, name: str) -> None:
+    async def look(self, name: str, when: str = "boards[0].last.contact && !isNaN(boards[0].last.x)") -> None:
         """Nothing is cut off at the width of a phone and of a screen; keep pictures, if somebody wants to look."""
         for wide in WIDTHS_PX:
             await self.call(
@@ -85,7 +89,7 @@ class Tab:
             await asyncio.sleep(0.3)
             assert await self.value("document.documentElement.scrollWidth <= innerWidth")
             if folder := os.environ.get("RESKIN_SCREENSHOTS"):
-                await self.until("last && last.contact && !isNaN(last.x)")
+                await self.until(when)
                 shot = await self.call("Page.captureScreenshot", captureBeyondViewport=True)
                 Path(folder, f"live-{name}-{wide}.png").write_bytes(base64.b64decode(shot["data"]))
 
@@ -109,7 +113,7 @@ def in_browser(folder: Path, act: Callable) -> Callable:
                 tab = Tab(socket)
                 await tab.call("Runtime.enable")
                 await tab.call("Page.navigate", url=address)
-                await tab.until("typeof state === 'object' && state.zeroed === true")
+                await tab.until("typeof boards === 'object' && boards[0].state.zeroed === true")
                 await act(tab)
                 assert tab.errors == []
         finally:
@@ -124,24 +128,24 @@ def test_a_poke_is_drawn_at_its_place_and_zero_and_record_work(tmp_path, monkeyp
 
     async def act(tab: Tab) -> None:
         for x_mm, y_mm, force_N in PLACES:
-            near = f"last && last.contact && Math.hypot(last.x - {x_mm}, last.y - {y_mm}) < .5 && !dirty"
+            near = (
+                "(({last, dirty}) => last && last.contact && !dirty && "
+                f"Math.hypot(last.x - {x_mm}, last.y - {y_mm}) < .5)(boards[0])"
+            )
             blue = await tab.until(f"{near} ? {DOT}({x_mm}, {y_mm}) : []")
             assert np.abs(np.array(blue) - (0x0B, 0x53, 0x94)).max() < 3  # --link
-            await tab.until(
-                f"({near}) && document.getElementById('place').textContent.startsWith('x {x_mm:.0f}') || "
-                f"({near}) && document.getElementById('place').textContent.startsWith('x {x_mm - 1:.0f}')"
-            )
+            await tab.until(f"({near}) && /x {x_mm:.0f}|x {x_mm - 1:.0f}/.test(boards[0].parts.place.textContent)")
             assert abs(float((await tab.text("force")).split()[0]) - force_N) < 0.5
         assert "400" in await tab.text("rate") or float((await tab.text("rate")).split()[0]) > 200
         await tab.look("network")
-        await tab.value("document.getElementById('record').click()")
-        await tab.until("state.recording")
+        await tab.value("boards[0].parts.record.click()")
+        await tab.until("boards[0].state.recording")
         await tab.press_key("r")
-        await tab.until("state.recorded.startsWith('recorded')")
+        await tab.until("boards[0].state.recorded.startsWith('recorded')")
         await tab.press_key("z")
-        await tab.until("state.zeroed", lambda told: told is False)
-        await tab.until("state.zeroed")
-        assert await tab.value("document.getElementById('adapt').disabled")  # a network does not learn
+        await tab.until("boards[0].state.zeroed", lambda told: told is False)
+        await tab.until("boards[0].state.zeroed")
+        assert await tab.value("boards[0].parts.adapt.disabled")  # a network does not learn
 
     with plugged_in(make_script(pokes_n=4), loop=True) as name:
         serve(name, [read_network(write_model(tmp_path))], in_browser(tmp_path, act))
@@ -151,12 +155,55 @@ def test_a_poke_is_drawn_at_its_place_and_zero_and_record_work(tmp_path, monkeyp
 
 def test_a_dozen_pokes_adapt_the_map_and_its_ellipse_is_drawn(tmp_path, simulated):  # noqa: F811
     async def act(tab: Tab) -> None:
-        await tab.until("last && last.contact && last.sdX > .1 && last.sdY > .1")
+        await tab.until(
+            "boards[0].last && boards[0].last.contact && boards[0].last.sdX > .1 && boards[0].last.sdY > .1"
+        )
         await tab.press_key("a")
-        await tab.until(f"state.adapting.includes('of {POKES_N}')")
-        await tab.until("state.adapted.startsWith('adapted to 12 pokes')")
+        await tab.until(f"boards[0].state.adapting.includes('of {POKES_N}')")
+        await tab.until("boards[0].state.adapted.startsWith('adapted to 12 pokes')")
         assert "mm before" in await tab.text("adapting")
         await tab.look("map")
 
     with plugged_in(poked(simulated), loop=True) as name:
         serve(name, load_universal(), in_browser(tmp_path, act))
+
+
+def test_presses_at_the_crosses_adapt_the_map_and_errors_before_and_after_are_shown(tmp_path, pressed):  # noqa: F811
+    quiet = poked(pressed)
+    late_s = np.where(np.arange(len(quiet)) < 400, 0.0, 3.0)  # in which the button is pressed, before the first place
+    script = replace(quiet, t_s=quiet.t_s + late_s)
+
+    async def act(tab: Tab) -> None:
+        silent = "performance.now() - (globalThis.touched_ms ||= performance.now()) > 700"
+        await tab.until(f"boards[0].last.contact && (globalThis.touched_ms = performance.now()), {silent}")
+        await tab.press_key("p")
+        await tab.until("boards[0].state.next_mm && !boards[0].dirty")
+        await tab.look("cross")
+        await tab.until("boards[0].state.adapted.startsWith('adapted to 8 shown places')")
+        before_mm, after_mm = map(float, re.findall(r"([0-9.]+) mm (?:before|after)", await tab.text("adapting")))
+        assert after_mm < before_mm
+        assert await tab.value("boards[0].state.next_mm") is None
+        await tab.look("places")
+
+    with plugged_in(script, loop=True) as name:
+        serve(name, load_universal(), in_browser(tmp_path, act))
+
+
+def test_several_boards_are_drawn_each_with_its_own_dot_rate_and_losses(tmp_path):
+    async def act(tab: Tab) -> None:
+        await tab.until("boards.length === 8 && boards.every(({state}) => state.zeroed)")
+        for i in range(1, 8):  # the map is of five chips; the sleeve is drawn without a dot
+            await tab.until(f"(({{last}}) => last && last.contact && !isNaN(last.x))(boards[{i}])")
+        for i, rate_hz in enumerate(RATES_HZ[:GOES]):
+            await tab.until(f"Math.abs(parseFloat(boards[{i}].parts.rate.innerText) / {rate_hz} - 1) < .4")
+        await asyncio.to_thread(goes.close)
+        await tab.until("boards[7].state.silent && boards[7].parts.rate.innerText === '–'")
+        lost = str(await tab.value("boards.map(({parts}) => parseFloat(parts.lost.innerText)).join()")).split(",")
+        assert lost == ["0"] * GOES + ["NaN"]  # of a board that is silent nothing is shown
+        assert "unplugged" in str(await tab.value("boards[7].state.alarms.join()"))
+        assert await tab.value("boards.slice(0, 7).every(({state}) => !state.alarms.join().includes('unplugged'))")
+        await tab.look("several", "boards[1].last.contact")
+
+    with ExitStack() as stack, ExitStack() as goes:
+        names = plug_in_all(stack, goes, tmp_path, range(8))
+        serve(names, load_universal(), in_browser(tmp_path, act))

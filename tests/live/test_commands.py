@@ -28,12 +28,13 @@ def test_a_recording_says_which_chip_was_broken(tmp_path, monkeypatch, capsys):
     assert "; chip 1: failed I2C reads (" in capsys.readouterr().out
 
 
-def test_a_page_without_options_is_that_of_the_one_board(monkeypatch):
+def test_a_page_without_options_is_that_of_all_boards_that_are_there(monkeypatch):
     shown = {}
-    monkeypatch.setattr("pipeline.live.server.serve", lambda live, **words: shown.update(words, live=live))
-    monkeypatch.setattr("pipeline.live.ports.the_board", lambda: ports.Found("/dev/ttyACM0", None))
+    monkeypatch.setattr("pipeline.live.server.serve", lambda boards, **words: shown.update(words, boards=boards))
+    monkeypatch.setattr(
+        "pipeline.live.ports.the_boards", lambda: [ports.Found(f"/dev/ttyACM{i}", None) for i in (0, 1)]
+    )
     commands.live(None, None, None, None, "127.0.0.1", 8765, ["stuck=flag"])
-    skin = shown["live"].skin
-    assert (skin.port, shown["host"], shown["http_port"]) == ("/dev/ttyACM0", "127.0.0.1", 8765)
-    assert shown["live"].what == "a board"
-    assert (skin.decisions.stuck, skin.decisions.zeros) == ("flag", "drop")
+    assert [str(board) for board in shown["boards"]] == ["a board on /dev/ttyACM0", "a board on /dev/ttyACM1"]
+    assert (shown["host"], shown["http_port"]) == ("127.0.0.1", 8765)
+    assert {(board.skin.decisions.stuck, board.skin.decisions.zeros) for board in shown["boards"]} == {("flag", "drop")}

@@ -71,6 +71,7 @@ def test_the_one_board_is_found_among_ports_and_two_are_one_too_many(tmp_path):
         assert ports.the_board([name, "/dev/none"]).port == name
         with pytest.raises(CaptureError, match=r"the board must be one, .*; got .*5 chips.*; .*5 chips"):
             ports.the_board([name, other])
+        assert [found.port for found in ports.the_boards([name, "/dev/none", other])] == [name, other]
     with pytest.raises(CaptureError, match="no serial port at all"):
         ports.the_board([])
 

@@ -163,7 +163,7 @@ def test_without_a_board_the_words_are_one_sentence(shell, tmp_path):
     for words, told in (
         (["emulate", "nothing"], "must be a capture's folder or the name of a scene"),
         (["emulate", "nothing", "--fault", "melted"], "must be NAME[@START_S[+DURATION_S]] with one of failed-read"),
-        (["live", "--port", "x", "--replay", "y"], "must be one of --port, --replay, --emulate"),
+        (["live", "--port", "x", "--replay", "y"], "must be from one of --port, --replay, --emulate"),
     ):
         process = shell.start(*words)
         _, complained = process.communicate(timeout=LONG_S)

@@ -14,8 +14,8 @@ from aiohttp import web
 
 from pipeline.capture.header import HEADER_FILE, parse
 from pipeline.live.answering import Models
-from pipeline.live.server import CLIENTS_MAX_N, REQUEST_BYTES_MAX_N, Server
-from pipeline.live.session import Live
+from pipeline.live.server import PAGES_MAX_N, REQUEST_BYTES_MAX_N, Server
+from pipeline.live.session import several
 from pipeline.live.view import BINS_N, HEAD, NUMBERS_N
 from pipeline.predicting import read_network
 from tests.live.boards import PLACES, make_script, plugged_in, write_model
@@ -24,13 +24,16 @@ LONG_S = 60.0
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")  # of sockets that a refused client leaves
 
 
-def serve(port: str, models: Models, act: Callable[[str, aiohttp.ClientSession], Awaitable[None]], token: str = ""):
-    """Serve a board's page, let a client act, and stop."""
+def serve(
+    ports: str | list[str], models: Models, act: Callable[[str, aiohttp.ClientSession], Awaitable[None]], token=""
+):
+    """Serve the page of a board or several, let a client act, and stop."""
 
     async def run() -> None:
-        live = Live(port, models, "a board")
-        live.start()
-        runner = web.AppRunner(Server(live, token).application())
+        boards = several([ports] if isinstance(ports, str) else ports, models, "a board")
+        for board in boards:
+            board.start()
+        runner = web.AppRunner(Server(boards, token).application())
         await runner.setup()
         site = web.TCPSite(runner, "127.0.0.1", 0)
         await site.start()
@@ -40,7 +43,8 @@ def serve(port: str, models: Models, act: Callable[[str, aiohttp.ClientSession],
                 await act(address, client)
         finally:
             await runner.cleanup()
-            await asyncio.to_thread(live.stop)
+            for board in boards:
+                await asyncio.to_thread(board.stop)
 
     asyncio.run(run())
 
@@ -159,7 +163,7 @@ def test_junk_does_nothing_and_what_is_too_long_or_too_many_is_refused(tmp_path,
             while not socket.closed:
                 await socket.receive(timeout=LONG_S)
             assert socket.close_code == aiohttp.WSCloseCode.MESSAGE_TOO_BIG
-        crowd = [await client.ws_connect(f"{address}/live") for _ in range(CLIENTS_MAX_N)]
+        crowd = [await client.ws_connect(f"{address}/live") for _ in range(PAGES_MAX_N)]
         with pytest.raises(aiohttp.WSServerHandshakeError, match="503"):
             await client.ws_connect(f"{address}/live")
         for socket in crowd:

@@ -1,109 +1,154 @@
 // Draws what the server sends: binary messages (view.py) as numbers, board and traces; JSON (session.py) as words.
+// Each board has a socket, a state and canvases of its own: one that is unplugged leaves the others as they are.
 "use strict";
-const WINDOW_S = 10, BIN_S = .02, GAP_S = .1, NUMBERS_N = 12, HEAD_BYTES_N = 16, TRACE_PX = 170;
+const WINDOW_S = 10, BIN_S = .02, GAP_S = .1, NUMBERS_N = 12, HEAD_BYTES_N = 16, TRACE_PX = 170, RETRY_MS = 1000, DRAWING_MS = 12;
 const ARROW_UT = 300, ARROW_MM = 7; // a change of field of this is an arrow as long as chips are apart, a large one twice
 const COLOURS = ["--link", "--ink", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0072B2"]; // force, chips
-const $ = (id) => document.getElementById(id);
-const said = (id, text) => { if ($(id).textContent !== text) $(id).textContent = text; };
 const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name);
 const ink = (j) => { const name = COLOURS[j ? 1 + (j - 1) % (COLOURS.length - 1) : 0]; return name.startsWith("--") ? colour(name) : name; };
-let socket, state = {waiting: true, alarms: []}, last = null, rows = [], dirty = false;
+const number = (value, digits, unit) => value === undefined || Number.isNaN(value) ? "–" : `${value.toFixed(digits)} ${unit}`;
+const boards = [];
+let next = 0;
 
-function connect() {
-  socket = new WebSocket(location.href.replace(/^http/, "ws").replace(/\/(\?.*)?(#.*)?$/, "/live$1"));
-  socket.binaryType = "arraybuffer";
-  socket.onmessage = ({data}) => { typeof data === "string" ? show(JSON.parse(data)) : take(data); };
-  socket.onclose = () => { show({waiting: true, what: "the server does not answer; trying again", alarms: []}); setTimeout(connect, 1000); };
-}
-
-function take(data) {
-  const view = new DataView(data), chips = view.getUint16(4, true), bins = view.getUint16(6, true);
-  const values = new Float32Array(data, HEAD_BYTES_N), width = 1 + chips, first = NUMBERS_N + 3 * chips;
-  const [x, y, force, sdX, sdY, contact, rate, lost, estimate50, estimate99, screen50, screen99] = values;
-  last = {id: view.getUint32(0, true), chips, x, y, force, sdX, sdY, contact, rate, lost, estimate50, estimate99, screen50,
-    screen99, change: values.slice(NUMBERS_N, first)};
-  if (bins) { // the last bin that we have may have grown: it comes again
-    const low = first + bins, high = low + bins * width, from = values[first] - 1e-3;
-    while (rows.length && rows[rows.length - 1].t >= from) rows.pop();
-    for (let i = 0; i < bins; i++) rows.push({t: values[first + i], low: values.slice(low + i * width, low + (i + 1) * width),
-      high: values.slice(high + i * width, high + (i + 1) * width)});
-    const oldest = rows[rows.length - 1].t - WINDOW_S;
-    rows = rows.slice(Math.max(rows.findIndex((row) => row.t >= oldest), 0));
+class Board {
+  constructor(index) {
+    this.index = index; this.state = {waiting: true, alarms: []}; this.last = null; this.rows = []; this.dirty = true;
+    const article = document.getElementById("board").content.cloneNode(true).firstElementChild;
+    this.parts = Object.fromEntries([...article.querySelectorAll("[data-part]")].map((part) => [part.dataset.part, part]));
+    document.getElementById("boards").append(article);
+    for (const name of ["zero", "adapt", "places", "record"]) this.parts[name].addEventListener("click", () => this.press(name));
+    this.connect();
   }
-  dirty = true;
-}
 
-function show(next) {
-  state = next;
-  said("what", state.waiting ? `${state.what || ""}: waiting for data` : state.what);
-  said("about", state.waiting ? "" : `${state.board}. ${state.places_known ? "" : "Places of its chips are not known: drawn in a row. "}` +
-    (state.model ? `Model: ${state.model}.` : "No model: neither place nor force; try --model."));
-  list("alarms", state.alarms);
-  list("seen", (state.seen || []).map(([name, n, s]) => `${name}: ${n}, within ${s} s`));
-  $("zero").disabled = $("record").disabled = state.waiting;
-  $("adapt").disabled = state.waiting || !state.adaptable;
-  $("adapt").classList.toggle("on", Boolean(state.adapting));
-  said("adapting", state.adapting || state.adapted || "–");
-  $("record").classList.toggle("on", Boolean(state.recording));
-  $("record").firstChild.textContent = state.recording ? "Stop " : "Record ";
-  said("recording", state.recording || state.recorded || "–");
-  if (state.waiting) { last = null; rows = []; }
-  dirty = true;
-}
+  connect() {
+    const address = new URL("live" + location.search, location.href);
+    address.protocol = address.protocol.replace("http", "ws"); address.hash = ""; address.searchParams.set("board", this.index);
+    this.socket = new WebSocket(address);
+    this.socket.binaryType = "arraybuffer";
+    this.socket.onmessage = ({data}) => { typeof data === "string" ? this.show(JSON.parse(data)) : this.take(data); };
+    this.socket.onclose = () => { this.show({waiting: true, what: "the server does not answer; trying again", alarms: []}); setTimeout(() => this.connect(), RETRY_MS); };
+  }
 
-function list(id, lines) {
-  $(id).replaceChildren(...lines.map((line) => Object.assign(document.createElement("li"), {textContent: line})));
-}
+  press(name) { if (this.socket.readyState === 1 && !this.parts[name].disabled) this.socket.send(JSON.stringify({press: name})); }
 
-function canvasOf(id, high) { // a pen in CSS pixels, on a canvas that is as sharp as the screen
-  const canvas = $(id), ratio = devicePixelRatio || 1, wide = canvas.clientWidth;
-  canvas.style.height = `${high}px`; canvas.width = wide * ratio; canvas.height = high * ratio;
-  const pen = canvas.getContext("2d");
-  pen.setTransform(ratio, 0, 0, ratio, 0, 0); pen.font = "13px system-ui, sans-serif"; pen.lineWidth = 1.5;
-  return [pen, wide];
-}
+  say(name, text) { if (this.parts[name].textContent !== text) this.parts[name].textContent = text; }
 
-function drawTrace(id, first, count, least) { // of each bin the least and the greatest, one after the other
-  const [pen, wide] = canvasOf(id, TRACE_PX), left = 44, bottom = 20, high = TRACE_PX - bottom - 6, end = rows[rows.length - 1].t;
-  let top = least;
-  for (const row of rows) for (let j = first; j < first + count; j++) if (row.high[j] > top) top = row.high[j];
-  const step = [1, 2, 5, 10].map((n) => n * 10 ** Math.floor(Math.log10(top / 3))).find((n) => top / n <= 5);
-  const px = (t) => wide - (end - t) / WINDOW_S * (wide - left), py = (value) => 6 + high * (1 - value / (top * 1.05));
-  pen.strokeStyle = colour("--line"); pen.fillStyle = colour("--soft"); pen.textAlign = "right";
-  for (let value = 0; value <= top; value += step) { pen.strokeRect(left, py(value), wide, 0); pen.fillText(+value.toPrecision(3), left - 6, py(value) + 4); }
-  for (let s = 0; s <= WINDOW_S; s += 2) pen.fillText(s ? `−${s} s` : "now", Math.max(px(end - s), left + 20), TRACE_PX - 4);
-  for (let j = first; j < first + count; j++) {
-    let before = -Infinity;
-    pen.strokeStyle = ink(j); pen.beginPath();
-    for (const {t, low, high} of rows) {
-      if (Number.isNaN(low[j])) continue;
-      t - before > GAP_S ? pen.moveTo(px(t), py(low[j])) : pen.lineTo(px(t), py(low[j]));
-      pen.lineTo(px(t + BIN_S / 2), py(high[j]));
-      before = t;
+  list(name, lines) {
+    this.parts[name].replaceChildren(...lines.map((line) => Object.assign(document.createElement("li"), {textContent: line})));
+  }
+
+  take(data) {
+    const view = new DataView(data), chips = view.getUint16(4, true), bins = view.getUint16(6, true);
+    const values = new Float32Array(data, HEAD_BYTES_N), width = 1 + chips, first = NUMBERS_N + 3 * chips;
+    const [x, y, force, sdX, sdY, contact, rate, lost, estimate50, estimate99, screen50, screen99] = values;
+    this.last = {id: view.getUint32(0, true), chips, x, y, force, sdX, sdY, contact, rate, lost, estimate50, estimate99, screen50,
+      screen99, change: values.slice(NUMBERS_N, first)};
+    if (bins) { // the last bin that we have may have grown: it comes again
+      const low = first + bins, high = low + bins * width, from = values[first] - 1e-3;
+      while (this.rows.length && this.rows[this.rows.length - 1].t >= from) this.rows.pop();
+      for (let i = 0; i < bins; i++) this.rows.push({t: values[first + i], low: values.slice(low + i * width, low + (i + 1) * width),
+        high: values.slice(high + i * width, high + (i + 1) * width)});
+      const oldest = this.rows[this.rows.length - 1].t - WINDOW_S;
+      this.rows = this.rows.slice(Math.max(this.rows.findIndex((row) => row.t >= oldest), 0));
     }
-    pen.stroke();
+    this.dirty = true;
   }
-}
 
-function drawBoard() {
-  const [wide, high] = state.skin_mm || [20, 20], [left, bottom] = state.corner_mm || [-2, -2], margin = 12;
-  const scale = Math.min(($("board").clientWidth - 2 * margin) / wide, (innerHeight * .8 - 2 * margin) / high);
-  const [pen] = canvasOf("board", high * scale + 2 * margin);
-  const at = (x, y) => [margin + (x - left) * scale, margin + (bottom + high - y) * scale];
-  pen.fillStyle = colour("--skin"); pen.strokeStyle = colour("--line");
-  pen.fillRect(margin, margin, wide * scale, high * scale); pen.strokeRect(margin, margin, wide * scale, high * scale);
-  if (state.waiting) { pen.fillStyle = colour("--soft"); pen.textAlign = "center"; pen.fillText("waiting for data", margin + wide * scale / 2, margin + high * scale / 2); return; }
-  pen.lineWidth = 2;
-  state.chips_mm.forEach(([x, y], i) => {
-    const [px, py] = at(x, y), side = Math.max(1.5 * scale, 8);
-    pen.strokeStyle = colour("--soft"); pen.strokeRect(px - side / 2, py - side / 2, side, side);
-    pen.fillStyle = ink(i + 1); pen.textAlign = "left"; pen.fillText(`${i}`, px + side / 2 + 3, py + side / 2 + 10);
-    if (last && last.chips === state.chips_mm.length) arrow(pen, px, py, last.change.subarray(3 * i, 3 * i + 3), scale);
-  });
-  if (last && last.contact && !Number.isNaN(last.x)) {
-    const [px, py] = at(last.x, last.y), blue = colour("--link");
-    if (!Number.isNaN(last.sdX)) { pen.strokeStyle = blue; pen.beginPath(); pen.ellipse(px, py, Math.max(2 * last.sdX * scale, 1), Math.max(2 * last.sdY * scale, 1), 0, 0, 7); pen.stroke(); }
-    pen.fillStyle = blue; pen.beginPath(); pen.arc(px, py, 5 + 6 * Math.sqrt(Math.max(last.force, 0)), 0, 7); pen.fill();
+  show(next) {
+    const state = this.state = next;
+    this.say("what", state.waiting ? `${state.what || ""}: waiting for data` : state.what);
+    this.say("about", state.waiting ? "" : `${state.board}. ${state.places_known ? "" : "Places of its chips are not known: drawn in a row. "}` +
+      (state.model ? `Model: ${state.model}.` : "No model: neither place nor force; try --model."));
+    this.list("alarms", state.alarms);
+    this.list("seen", (state.seen || []).map(([name, n, s]) => `${name}: ${n}, within ${s} s`));
+    this.parts.zero.disabled = this.parts.record.disabled = state.waiting;
+    for (const name of ["adapt", "places"]) {
+      this.parts[name].disabled = state.waiting || !state.adaptable || Boolean(state.adapting) && name !== this.chosen(state);
+      this.parts[name].classList.toggle("on", Boolean(state.adapting) && name === this.chosen(state));
+    }
+    this.say("adapting", state.adapting || state.adapted || "–");
+    this.parts.record.classList.toggle("on", Boolean(state.recording));
+    this.parts.record.firstChild.textContent = state.recording ? "Stop " : "Record ";
+    this.say("recording", state.recording || state.recorded || "–");
+    if (state.waiting) { this.last = null; this.rows = []; }
+    this.dirty = true;
+  }
+
+  chosen(state) { return state.next_mm ? "places" : "adapt"; }
+
+  canvasOf(id, high) { // a pen in CSS pixels, on a canvas that is as sharp as the screen
+    const canvas = this.parts[id], ratio = devicePixelRatio || 1, wide = canvas.clientWidth;
+    canvas.style.height = `${high}px`; canvas.width = wide * ratio; canvas.height = high * ratio;
+    const pen = canvas.getContext("2d");
+    pen.setTransform(ratio, 0, 0, ratio, 0, 0); pen.font = "13px system-ui, sans-serif"; pen.lineWidth = 1.5;
+    return [pen, wide];
+  }
+
+  drawTrace(id, first, count, least) { // of each bin the least and the greatest, one after the other
+    const [pen, wide] = this.canvasOf(id, TRACE_PX), left = 44, bottom = 20, high = TRACE_PX - bottom - 6, end = this.rows[this.rows.length - 1].t;
+    let top = least;
+    for (const row of this.rows) for (let j = first; j < first + count; j++) if (row.high[j] > top) top = row.high[j];
+    const step = [1, 2, 5, 10].map((n) => n * 10 ** Math.floor(Math.log10(top / 3))).find((n) => top / n <= 5);
+    const px = (t) => wide - (end - t) / WINDOW_S * (wide - left), py = (value) => 6 + high * (1 - value / (top * 1.05));
+    pen.strokeStyle = colour("--line"); pen.fillStyle = colour("--soft"); pen.textAlign = "right";
+    for (let value = 0; value <= top; value += step) { pen.strokeRect(left, py(value), wide, 0); pen.fillText(+value.toPrecision(3), left - 6, py(value) + 4); }
+    for (let s = 0; s <= WINDOW_S; s += 2) pen.fillText(s ? `−${s} s` : "now", Math.max(px(end - s), left + 20), TRACE_PX - 4);
+    for (let j = first; j < first + count; j++) {
+      let before = -Infinity;
+      pen.strokeStyle = ink(j); pen.beginPath();
+      for (const {t, low, high} of this.rows) {
+        if (Number.isNaN(low[j])) continue;
+        t - before > GAP_S ? pen.moveTo(px(t), py(low[j])) : pen.lineTo(px(t), py(low[j]));
+        pen.lineTo(px(t + BIN_S / 2), py(high[j]));
+        before = t;
+      }
+      pen.stroke();
+    }
+  }
+
+  drawBoard() {
+    const {state, last} = this; // of a silent board the last reading says nothing about now
+    const [wide, high] = state.skin_mm || [20, 20], [left, bottom] = state.corner_mm || [-2, -2], margin = 12;
+    const scale = Math.max(Math.min((this.parts.board.clientWidth - 2 * margin) / wide, (innerHeight * .8 - 2 * margin) / high), .1); // a hidden window is 0 high
+    const [pen] = this.canvasOf("board", high * scale + 2 * margin);
+    const at = (x, y) => [margin + (x - left) * scale, margin + (bottom + high - y) * scale];
+    pen.fillStyle = colour("--skin"); pen.strokeStyle = colour("--line");
+    pen.fillRect(margin, margin, wide * scale, high * scale); pen.strokeRect(margin, margin, wide * scale, high * scale);
+    if (state.waiting) { pen.fillStyle = colour("--soft"); pen.textAlign = "center"; pen.fillText("waiting for data", margin + wide * scale / 2, margin + high * scale / 2); return; }
+    pen.lineWidth = 2;
+    state.chips_mm.forEach(([x, y], i) => {
+      const [px, py] = at(x, y), side = Math.max(1.5 * scale, 8);
+      pen.strokeStyle = colour("--soft"); pen.strokeRect(px - side / 2, py - side / 2, side, side);
+      pen.fillStyle = ink(i + 1); pen.textAlign = "left"; pen.fillText(`${i}`, px + side / 2 + 3, py + side / 2 + 10);
+      if (last && !state.silent && last.chips === state.chips_mm.length) arrow(pen, px, py, last.change.subarray(3 * i, 3 * i + 3), scale);
+    });
+    if (state.next_mm) { // the next place to press
+      const [px, py] = at(...state.next_mm), size = Math.max(1.2 * scale, 10);
+      pen.strokeStyle = colour("--alarm"); pen.lineWidth = 3; pen.beginPath(); pen.arc(px, py, size, 0, 7);
+      for (const [dx, dy] of [[1, 0], [0, 1]]) { pen.moveTo(px - 1.5 * size * dx, py - 1.5 * size * dy); pen.lineTo(px + 1.5 * size * dx, py + 1.5 * size * dy); }
+      pen.stroke(); pen.lineWidth = 2;
+    }
+    if (last && !state.silent && last.contact && !Number.isNaN(last.x)) {
+      const [px, py] = at(last.x, last.y), blue = colour("--link");
+      if (!Number.isNaN(last.sdX)) { pen.strokeStyle = blue; pen.beginPath(); pen.ellipse(px, py, Math.max(2 * last.sdX * scale, 1), Math.max(2 * last.sdY * scale, 1), 0, 0, 7); pen.stroke(); }
+      pen.fillStyle = blue; pen.beginPath(); pen.arc(px, py, 5 + 6 * Math.sqrt(Math.max(last.force, 0)), 0, 7); pen.fill();
+    }
+  }
+
+  draw() {
+    if (!this.dirty) return;
+    this.dirty = false;
+    this.drawBoard();
+    const {state, last} = this;
+    if (!last || state.silent || !this.rows.length) { for (const name of ["place", "force", "rate", "lost", "estimate", "screen"]) this.say(name, "–"); return; }
+    this.drawTrace("forces", 0, 1, .5); this.drawTrace("fields", 1, last.chips, 50);
+    const sure = Number.isNaN(last.sdX) ? "" : ` ± ${last.sdX.toFixed(1)}, ${last.sdY.toFixed(1)} mm${state.adaptable ? "" : " between models"}`;
+    this.say("place", last.contact && !Number.isNaN(last.x) ? `x ${number(last.x, 1, "mm")}, y ${number(last.y, 1, "mm")}${sure}` : last.contact ? "contact" : "no contact");
+    this.say("force", number(last.force, 2, "N"));
+    this.say("rate", number(last.rate, 0, "Hz")); this.say("lost", number(last.lost, 0, ""));
+    this.say("estimate", `${number(last.estimate50, 1, "ms")} (median), ${number(last.estimate99, 1, "ms")} (99 %)`);
+    this.say("screen", `${number(last.screen50, 0, "ms")} (median), ${number(last.screen99, 0, "ms")} (99 %)`);
+    if (!document.hidden) requestAnimationFrame(() => { if (this.socket.readyState === 1) this.socket.send(JSON.stringify({seen: last.id})); }); // drawn by then
   }
 }
 
@@ -117,33 +162,18 @@ function arrow(pen, px, py, [bx, by, bz], scale) { // in the plane; a ring is th
   pen.stroke();
 }
 
-function number(value, digits, unit) { return value === undefined || Number.isNaN(value) ? "–" : `${value.toFixed(digits)} ${unit}`; }
-
 function draw() {
-  if (dirty) {
-    dirty = false;
-    drawBoard();
-    if (last && rows.length) {
-      drawTrace("forces", 0, 1, .5); drawTrace("fields", 1, last.chips, 50);
-      const sure = Number.isNaN(last.sdX) ? "" : ` ± ${last.sdX.toFixed(1)}, ${last.sdY.toFixed(1)} mm${state.adaptable ? "" : " between models"}`;
-      said("place", last.contact && !Number.isNaN(last.x) ? `x ${number(last.x, 1, "mm")}, y ${number(last.y, 1, "mm")}${sure}` : last.contact ? "contact" : "no contact");
-      said("force", number(last.force, 2, "N"));
-      said("rate", number(last.rate, 0, "Hz")); said("lost", number(last.lost, 0, ""));
-      said("estimate", `${number(last.estimate50, 1, "ms")} (median), ${number(last.estimate99, 1, "ms")} (99 %)`);
-      said("screen", `${number(last.screen50, 0, "ms")} (median), ${number(last.screen99, 0, "ms")} (99 %)`);
-      const id = last.id;
-      if (!document.hidden) requestAnimationFrame(() => { if (socket.readyState === 1) socket.send(JSON.stringify({seen: id})); }); // drawn by then
-    } else ["place", "force", "rate", "lost", "estimate", "screen"].forEach((id) => said(id, "–"));
-  }
+  while (boards.length < Math.max(boards[0].state.boards_n || 0, 1)) boards.push(new Board(boards.length));
+  document.getElementById("boards").classList.toggle("single", boards.length === 1);
+  const end_ms = performance.now() + DRAWING_MS; // boards take turns where a screen's time is too short for all
+  for (let i = 0; i < boards.length && performance.now() < end_ms; i++) boards[next++ % boards.length].draw();
   requestAnimationFrame(draw);
 }
 
-const press = (name) => { if (socket.readyState === 1 && !$(name).disabled) socket.send(JSON.stringify({press: name})); };
-for (const name of ["zero", "adapt", "record"]) $(name).addEventListener("click", () => press(name));
 addEventListener("keydown", (event) => {
-  const name = {z: "zero", a: "adapt", r: "record"}[event.key];
-  if (name && !event.ctrlKey && !event.metaKey && !event.altKey && !event.repeat) press(name);
+  const name = {z: "zero", a: "adapt", p: "places", r: "record"}[event.key];
+  if (name && !event.ctrlKey && !event.metaKey && !event.altKey && !event.repeat) boards.forEach((board) => board.press(name));
 });
-addEventListener("resize", () => { dirty = true; });
-connect();
+addEventListener("resize", () => boards.forEach((board) => { board.dirty = true; }));
+boards.push(new Board(0));
 draw();

@@ -1,0 +1,1 @@
+"""A gripper that holds a force by our estimate of it."""

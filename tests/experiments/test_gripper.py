@@ -1,0 +1,58 @@
+"""A gripper on a skin of straight lines: the right estimate holds the force, a wrong one its own, a factor mends it."""
+
+import numpy as np
+import pytest
+
+from pipeline.core.seeds import rng_for
+from pipeline.experiments.gripper import show
+from pipeline.experiments.gripper.run import Finger, Gripper, Press, _scaled, answer_of, grip, judge
+
+FORCE_N = np.linspace(0, 3, 31)
+ALONG = np.arange(1.0, 16.0)
+SKIN_N_MM, GAIN_uT_PER_N = 2.0, 200.0
+HOW = Gripper(aims_N=(0.5, 1.0), stiffness_N_mm=(0.3, 3.0), gain_mm_N=0.5)
+
+
+def finger(noise_uT=0.0):
+    along = ALONG / np.linalg.norm(ALONG)
+    return Finger(
+        "b0", FORCE_N, FORCE_N / SKIN_N_MM, GAIN_uT_PER_N * FORCE_N[:, None] * along, np.full(15, 50.0), noise_uT
+    )
+
+
+def right(b_uT):
+    return (b_uT - 50.0) @ ALONG / np.linalg.norm(ALONG) / GAIN_uT_PER_N
+
+
+def test_skin_and_object_bear_the_same_force_one_after_the_other():
+    closed_mm, stiffness_N_mm = np.array([0.4, 0.4]), np.array([0.3, 3.0])
+    both_N_mm = 1 / (1 / SKIN_N_MM + 1 / stiffness_N_mm)
+    np.testing.assert_allclose(finger().squeezed_N(closed_mm, stiffness_N_mm), both_N_mm * closed_mm)
+
+
+@pytest.mark.parametrize(("factor", "held"), [(1.0, 100.0), (1.3, 0.0)])
+def test_what_is_held_is_the_estimate(factor, held):
+    runs = {"b0": grip(finger(), lambda b_uT: factor * right(b_uT), 1.0, HOW, rng_for(0, "grip"))}
+    np.testing.assert_allclose(runs["b0"][50:].mean(), 1 / factor, rtol=0.05)
+    assert judge(runs, 1.0)["held_pct"] == held
+
+
+def test_one_known_press_as_a_factor_mends_what_is_wrong_by_a_factor():
+    skin = finger(noise_uT=1.0)
+    press = Press(1.0, skin.read(np.ones(5), rng_for(0, "press")).mean(axis=0))
+    forces = _scaled(lambda b_uT: 1.3 * right(b_uT), press)
+    assert judge({"b0": grip(skin, forces, 1.0, HOW, rng_for(0, "grip"))}, 1.0)["held_pct"] == 100.0
+
+
+def test_each_aim_is_held_by_each_feedback_and_shown():
+    how = HOW.model_copy(update={"aims_N": (0.5,)})
+    networks = {"b0": [lambda db_uT: right(db_uT + 50.0)[:, None] + np.zeros(3)]}
+    numbers, drawn = answer_of([finger(noise_uT=1.0)], networks, how, seed=1)
+    assert [(row["aim_N"], row["feedback"], row["press"]) for row in numbers["rows"]] == [
+        (0.5, "networks", "none"), (0.5, "networks", "factor"), (0.5, "map", "none"), (0.5, "map", "factor"),
+        (0.5, "map", "label"),
+    ]  # fmt: skip
+    table = show.tables(numbers, "simulated")["gripper"]
+    assert table["runs"].tolist() == [2] * 5
+    assert table["held, % of runs"][0] == "100"
+    assert "0.5 N" in show.figures(numbers, drawn, "simulated")["gripper.svg"]

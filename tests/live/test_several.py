@@ -1,0 +1,100 @@
+"""Eight boards on eight ports, one of them the sleeve's forty chips: each its own, and one that goes disturbs none."""
+
+import asyncio
+import math
+import os
+from contextlib import ExitStack
+
+import aiohttp
+import numpy as np
+import pytest
+
+import reskin
+from pipeline.core.errors import ReskinError
+from pipeline.live.server import PAGES_MAX_N
+from pipeline.live.session import BOARDS_MAX_N, several
+from pipeline.live.view import BINS_N, LATENCIES_N
+from pipeline.twin.shipped import load_universal
+from tests.live.boards import PLACES, make_script, plugged_in, write_model
+from tests.live.test_server import serve, until
+
+RATES_HZ = [133.0, 400.0, *(50.0,) * 6]
+CHIPS_N = [40, *(5,) * 7]
+GOES = 7
+pytestmark = [
+    pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo-terminals"),
+    pytest.mark.filterwarnings("ignore::ResourceWarning"),
+]
+
+
+def plug_in_all(stack: ExitStack, goes: ExitStack, folder, boards) -> list[str]:
+    """Play boards beside the test; the last of eight is unplugged when `goes` is closed."""
+    names = []
+    for i in boards:
+        script = make_script(pokes_n=3, chips_n=CHIPS_N[i], rate_hz=RATES_HZ[i])
+        with_i = goes if i == GOES else stack
+        names.append(with_i.enter_context(plugged_in(script, str(folder / f"board{i}"), loop=True)))
+    return names
+
+
+def test_a_page_shows_eight_boards_and_the_unplugging_of_one_is_told_in_its_place_alone(tmp_path):
+    async def look(address: str, client: aiohttp.ClientSession, i: int) -> None:
+        async with client.ws_connect(f"{address}/live?board={i}") as page:
+            state = await until(page, lambda told: told.get("zeroed") is True)
+            assert state["boards_n"] == len(CHIPS_N)
+            assert len(state["chips_mm"]) == CHIPS_N[i]
+            assert f"board{i}" in state["what"]
+            own_hz = pytest.approx(RATES_HZ[i], rel=0.3)
+            poke = await until(page, lambda told: told.get("contact") == 1 and told["rate_hz"] == own_hz)
+            assert math.isfinite(poke["x_mm"]) == (CHIPS_N[i] == 5)  # the map is of five chips; all others are drawn
+            assert len(poke["change_uT"]) == 3 * CHIPS_N[i]
+            assert np.abs(poke["change_uT"]).max() > 100
+
+    async def act(address: str, client: aiohttp.ClientSession) -> None:
+        async with client.get(f"{address}/live?board=8") as page:
+            assert page.status == 404
+        await asyncio.gather(*(look(address, client, i) for i in range(len(CHIPS_N))))
+        pages = [await client.ws_connect(f"{address}/live?board={i}") for i in range(len(CHIPS_N))]
+        await asyncio.to_thread(goes.close)
+        await until(pages[GOES], lambda told: "unplugged" in " ".join(told.get("alarms", [])))
+        for page in pages[:GOES]:
+            after = await until(page, lambda told: "lost" in told)
+            assert after["lost"] == 0
+            assert after["bins_n"] <= BINS_N
+            later = await until(page, lambda told, t_s=after["t_s"]: told.get("t_s", 0) > t_s + 0.5)
+            assert later["lost"] == 0
+        for page in pages:
+            await page.close()
+
+    assert PAGES_MAX_N * BOARDS_MAX_N * BINS_N < 1e5  # bins at most: what is remembered has an end
+    assert LATENCIES_N < 1e4
+    with ExitStack() as stack, ExitStack() as goes:
+        serve(plug_in_all(stack, goes, tmp_path, range(len(CHIPS_N))), load_universal(), act)
+
+
+def test_a_controller_has_the_latest_of_all_and_waits_for_none_that_is_unplugged(tmp_path):
+    with ExitStack() as stack, ExitStack() as goes:
+        names = plug_in_all(stack, goes, tmp_path, (1, 2, GOES))
+        with reskin.open(names, model=write_model(tmp_path)) as skins:
+            told, found = [], []
+            for *well, last in skins:
+                found += [each[1:4] for each in well if each.F_N > 0]
+                if len(found) > 20:
+                    goes.close()
+                if any("unplugged" in alarm for alarm in last.alarms):
+                    assert math.isnan(last.F_N)
+                    assert not any("unplugged" in alarm for each in well for alarm in each.alarms)
+                    told.append(well[0].t_s)
+                if len(told) >= 20:
+                    break
+        assert np.diff(told).max() < 0.3  # of another board that is silent
+        nearest = np.abs(np.array(found)[:, None] - PLACES).sum(axis=2).min(axis=1)
+        assert np.median(nearest) < 0.5
+
+
+def test_ports_that_are_named_twice_or_too_many_or_not_there_are_refused(tmp_path):
+    for ports in (["a", "a"], [f"p{i}" for i in range(BOARDS_MAX_N + 1)], []):
+        with pytest.raises(ReskinError, match="--port: ports must be 1 to 16, each named once"):
+            several(ports, [], "a board")
+    with plugged_in(make_script(pokes_n=1), loop=True) as name, pytest.raises(ReskinError, match="/dev/none"):
+        reskin.open([name, "/dev/none"]).__enter__()
