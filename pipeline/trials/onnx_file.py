@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core.errors import ParamsError
+from pipeline.core.packages import lacking
 from pipeline.learning.inputs import DB_FLOOR_uT
 from pipeline.learning.model import LAYERS
 from pipeline.trials.networks import Network
@@ -33,7 +33,7 @@ def build(network: Network) -> "ModelProto":
     try:
         from onnx import TensorProto, checker, helper, numpy_helper
     except ImportError:
-        raise ParamsError("onnx", "the package onnx", "installed", "none", "Try: pip install onnx") from None
+        raise lacking("onnx", "export_onnx") from None
     card, scaler = network.card, dict(network.tensors)
     channels_n = card["input"]["channels_n"]
     layers = LAYERS[card["recipe"]["architecture"]](scaler["input_shift"].size)
