@@ -9,7 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-HEAD = "# Exact versions of everything that is installed; made with `make constraints`. torch is {torch} and nothing else.\n"
+HEAD = "# Exact versions of all that is installed; made with `make constraints`. torch is {torch} and nothing else.\n"
 OF_CUDA = ("nvidia-", "cuda-", "triton")  # torch for other graphics cards brings none of them
 RESOLVE = ("-m", "pip", "install", "--quiet", "--dry-run", "--ignore-installed", "--report", "-")
 

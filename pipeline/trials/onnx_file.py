@@ -1,7 +1,7 @@
 """A trained network as an ONNX file, for programs without Python. In: a network. Out: a file that says what it takes.
 
 The view, the scaler and the layers are in it: changes of field in uT go in, x and y in mm and F in N come out. Needs
-`pip install onnx` (extra `onnx`). Refuses to know where the network comes from.
+extra `onnx`. Refuses to know where the network comes from.
 """
 
 from collections.abc import Iterator
