@@ -70,7 +70,7 @@ def measure(folder: Path, python: str, constraint: Path | None) -> dict[str, obj
         "python": subprocess.check_output([new_python, "-V"], text=True).split()[1],
         "venv": made, "wheel": built, "install": installed,
         "wheel_MB": round(wheel.stat().st_size / 1e6, 1), "environment_MB": size_MB(folder / "venv"),
-        "packages_n": len(packages),
+        "packages_n": len(packages), "load_1min": round(os.getloadavg()[0], 1),
         "page_s": [seconds_to_page(folder / "venv/bin/reskin", folder / "empty") for _ in range(2)],
     }  # fmt: skip
 
