@@ -13,7 +13,7 @@ from typer import Argument, Option
 
 from pipeline.core import config
 from pipeline.core.errors import ParamsError, ReskinError
-from pipeline.core.packages import explain
+from pipeline.core.packages import explain, show_version
 from pipeline.live import commands
 
 if TYPE_CHECKING:
@@ -49,9 +49,7 @@ def main() -> None:
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what began is undone
         app()
     except ModuleNotFoundError as error:
-        if (lacking := explain(error)) is None:
-            raise
-        fail(lacking)
+        fail(explain(error))
     except ReskinError as error:
         fail(error)
 
@@ -59,14 +57,6 @@ def main() -> None:
 def fail(error: ReskinError) -> NoReturn:
     typer.echo(f"error: {error}", err=True)
     sys.exit(error.exit_code)
-
-
-def show_version(wanted: bool) -> None:
-    if wanted:
-        from importlib.metadata import version
-
-        typer.echo(version("reskin-pipeline"))
-        raise typer.Exit
 
 
 Version = Annotated[bool, Option("--version", help="Show the version.", callback=show_version, is_eager=True)]

@@ -1,8 +1,10 @@
-"""Packages that an environment may lack: the core is installed alone, further ones by the name of an extra.
+"""Packages: what an environment may lack, and what it has. The core is installed alone, the rest by names of extras.
 
 In: a package, or an import that failed. Out: one sentence that says what to install. Refuses to know what they do.
 """
 
+import sys
+from importlib.metadata import version
 from importlib.util import find_spec
 
 from pipeline.core.errors import ParamsError
@@ -23,7 +25,16 @@ def lacking(package: str, where: object) -> ParamsError:
     return ParamsError(where, f"package {package}", "installed", "an environment without it", remedy)
 
 
-def explain(error: ModuleNotFoundError) -> ParamsError | None:
-    """Turn a failed import into a sentence; of the project's own modules there is nothing to install."""
+def explain(error: ModuleNotFoundError) -> ParamsError:
+    """Turn a failed import into a sentence; raise it again if it is of a module of ours, which nothing brings."""
     package = (error.name or "").partition(".")[0]
-    return None if package in ("", *OWN) else lacking(package, "reskin")
+    if package in ("", *OWN):
+        raise error
+    return lacking(package, "reskin")
+
+
+def show_version(wanted: bool) -> None:
+    """Print the version of what is installed, and end."""
+    if wanted:
+        print(version("reskin-pipeline"))
+        sys.exit()
