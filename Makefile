@@ -4,6 +4,10 @@
 # make ui      the MLflow UI on the embedded store
 # make bench   benchmarks (not part of the tests)
 # make time-repro   `make repro` in a fresh clone, its stages three times: seconds, CPU seconds, disk -> reports/time.json
+# make constraints   the newest versions that fit together -> constraints.txt; then make test, then commit
+# make licences   the licences of all that is installed; fails on one that is not compatible
+# make audit   known faults of the versions in constraints.txt; asks pypi.org
+# make time-install   the wheel in an empty environment: seconds, MB, and a page of `reskin live`
 # make clean   removes what the targets above made, but no data and no results
 
 PYTHON ?= python3
@@ -19,7 +23,7 @@ export OMP_NUM_THREADS = 1
 # Where an environment forbids it, every stage and every worker of the tests would compile all its modules again.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: repro test test-processors lint ui bench time-repro readme clean
+.PHONY: repro test test-processors lint ui bench time-repro time-install readme constraints licences audit clean
 TRAINING_TESTS := tests/extremes tests/learning tests/evaluation tests/stages tests/test_numerics.py
 .DEFAULT_GOAL := repro
 
@@ -60,8 +64,24 @@ bench: $(STAMP)
 time-repro:
 	$(PYTHON) tests/benchmarks/time_repro.py --times 3
 
+# What somebody with a board and nothing but Python waits for, and what it takes on disk.
+time-install:
+	$(PYTHON) tests/benchmarks/time_install.py --constraint constraints.txt
+
+constraints: $(STAMP)
+	$(BIN)/python -m release.constraints
+
+licences: $(STAMP)
+	$(BIN)/python -m release.licences
+
+# In an environment of its own: what audits is no package of the project.
+audit:
+	$(PYTHON) -m venv .audit
+	.audit/bin/python -m pip install --quiet --disable-pip-version-check pip-audit
+	.audit/bin/pip-audit --strict --requirement constraints.txt --no-deps --disable-pip # strict: what cannot be asked about fails
+
 readme: $(STAMP)
 	$(BIN)/reskin readme
 
 clean:
-	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
+	rm -rf $(VENV) .audit build .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pipeline.core.config import parse, read_yaml
+from pipeline.core.config import ROOT, params_of, parse, read_yaml
 from pipeline.core.errors import ParamsError, SchemaError
 from pipeline.core.seeds import rng_for
 
@@ -27,11 +27,10 @@ if TYPE_CHECKING:
     from pipeline.trials.networks import Network
     from pipeline.twin.shipped import Universal
 
-CHECKOUT = Path(__file__).resolve().parents[1]
 Changes = Mapping[str, Any]  # settings of params.yaml or of a scene, by name
 
 
-def load_rows(scene: str, *, root: Path | str = CHECKOUT) -> Rows:
+def load_rows(scene: str, *, root: Path | str = ROOT) -> Rows:
     """Load the rows that a scene's models see; its captures must have been ingested (`dvc repro`).
 
     >>> rows = load_rows("quick")  # doctest: +SKIP
@@ -269,7 +268,7 @@ def record(
 
 def _main_boards(scene: str) -> dict[str, Any]:
     """Give the settings of the boards that a simulated scene's main protocol runs on."""
-    file = CHECKOUT / f"pipeline/scenes/{scene}.yaml"
+    file = ROOT / f"pipeline/scenes/{scene}.yaml"
     words = read_yaml(file)
     if "simulate" not in words:
         raise ParamsError(file, "the scene", "simulated", words["source"], "Try: scene='quick'")
@@ -278,4 +277,4 @@ def _main_boards(scene: str) -> dict[str, Any]:
 
 def _shared(section: str, changes: Changes | None) -> dict[str, Any]:
     """Give a section of params.yaml with some of its settings changed."""
-    return read_yaml(CHECKOUT / "params.yaml")[section] | dict(changes or {})
+    return read_yaml(params_of(ROOT))[section] | dict(changes or {})

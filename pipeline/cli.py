@@ -6,13 +6,14 @@ Imports within the commands: `reskin --help` waits for none of what a command ne
 import signal
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
 import typer
 from typer import Argument, Option
 
 from pipeline.core import config
 from pipeline.core.errors import ParamsError, ReskinError
+from pipeline.core.packages import explain, show_version
 from pipeline.live import commands
 
 if TYPE_CHECKING:
@@ -22,7 +23,8 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    help="Learning for magnetic tactile skins. Run it in the checkout.",
+    help="Learning for magnetic tactile skins. Anywhere: ports, record, decode, emulate, live, predict, template; "
+    "in the checkout, with extra `pipeline` installed: the others.",
 )
 scenes = typer.Typer(no_args_is_help=True, help="Choose which scenes `dvc repro` runs.")
 app.add_typer(scenes, name="scenes")
@@ -46,9 +48,23 @@ def main() -> None:
     try:
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what began is undone
         app()
+    except ModuleNotFoundError as error:
+        fail(explain(error))
     except ReskinError as error:
-        typer.echo(f"error: {error}", err=True)
-        sys.exit(error.exit_code)
+        fail(error)
+
+
+def fail(error: ReskinError) -> NoReturn:
+    typer.echo(f"error: {error}", err=True)
+    sys.exit(error.exit_code)
+
+
+Version = Annotated[bool, Option("--version", help="Show the version.", callback=show_version, is_eager=True)]
+
+
+@app.callback()
+def begin(version: Version = False) -> None:
+    """Take the options that stand before a command."""
 
 
 def checkout() -> Path:
@@ -86,10 +102,11 @@ def add(
     allow_copy: Annotated[bool, Option("--allow-copy", help="Accept bytes that another label has.")] = False,
 ) -> None:
     """Add a recording to a scene; then `dvc repro` uses it."""
+    root = checkout()  # first: who is elsewhere lacks more than packages
     from pipeline import adding, plan, preparing
     from pipeline.params import read_plan
 
-    root, labels, marks = checkout(), preparing.Labels(board, skin, name), preparing.parse_marks(mark or [])
+    labels, marks = preparing.Labels(board, skin, name), preparing.parse_marks(mark or [])
     running = read_plan(root / config.PLAN).scenes
     with plan.copied(root, scene, like), preparing.suggesting_layout(recording, layout):
         if layout == "capture":
@@ -114,20 +131,22 @@ def fetch(
     yes: Annotated[bool, Option("--yes", help="Agree to use what has no licence.")] = False,
 ) -> None:
     """Fetch public recordings from their home, check them, and add them to their scene."""
+    root = checkout()
     from pipeline import fetching
 
     def agree(question: str) -> bool:
         return yes or (sys.stdin.isatty() and typer.confirm(question))
 
-    fetching.fetch(checkout(), source, origin, agree=agree, say=typer.echo)
+    fetching.fetch(root, source, origin, agree=agree, say=typer.echo)
 
 
 @app.command()
 def remove(scene: str, capture: str) -> None:
     """Take a recorded capture out of a scene again."""
+    root = checkout()
     from pipeline import adding
 
-    adding.remove(checkout(), scene, capture)
+    adding.remove(root, scene, capture)
     typer.echo(f"removed {scene}/{capture}; now: dvc repro")
 
 
@@ -179,13 +198,13 @@ def predict(
 @app.command()
 def publish() -> None:
     """Write to MLflow what is not there yet, from the models of the scenes that run."""
+    root = checkout()
     from pipeline import plan
     from pipeline.core.server import TrackingAway
     from pipeline.params import read_scene
     from pipeline.stages.publish import read_curves
     from pipeline.tracking import publish as write
 
-    root = checkout()
     for name in checked_plan().scenes:
         scene, answers = read_scene(plan.scene_file(root, name), root / config.PARAMS), root / "data/answers" / name
         arms = {arm: root / "data/models" / name / arm for arm in scene.modelled}
@@ -208,9 +227,9 @@ def compare(
     against: Annotated[str, Option(help="A git revision, a folder or a numbers.json.")] = "HEAD",
 ) -> None:
     """Hold fresh numbers against the committed ones; exit status 1 if any differs by more than it may."""
+    root, worst = checkout(), 0
     from pipeline.comparing import compare_scene, table_of, verdict
 
-    root, worst = checkout(), 0
     for name in [scene] if scene else checked_plan().scenes:
         try:
             done = compare_scene(root, name, against)
@@ -228,9 +247,10 @@ def compare(
 @app.command()
 def readme(check: Annotated[bool, Option("--check", help="Only tell whether it is up to date.")] = False) -> None:
     """Fill in the generated parts of README.md and docs from the results of the scenes that run."""
+    root = checkout()
     from pipeline.documenting import fill_pages
 
-    changed = fill_pages(checkout(), list(checked_plan().scenes), write=not check)
+    changed = fill_pages(root, list(checked_plan().scenes), write=not check)
     if check and changed:
         typer.echo(f"behind reports and dvc.yaml: {', '.join(changed)}; run: reskin readme", err=True)
         sys.exit(1)

@@ -18,6 +18,7 @@ from pipeline.capture.stream import decode_all
 from pipeline.core import io
 from pipeline.core.config import Strict, parse
 from pipeline.core.errors import CaptureError, ParamsError, SchemaError
+from pipeline.core.packages import need
 from pipeline.dataset.captures import read_header, timer
 from pipeline.experiments.logs.estimates import Answers, Estimates, describe, estimate, quiet_start
 from pipeline.learning.inputs import VIEW
@@ -131,6 +132,7 @@ def read_network(model: Path) -> Network:
         rule, got = "one that learnt", "one that answers nearly the same to any input"
         raise SchemaError(card_file, "the model", rule, got, "Take the model of another seed.")
     _check_inputs(card, tensors, card_file)
+    need("torch", model)
     return Network(content, tensors)
 
 

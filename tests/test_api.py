@@ -25,7 +25,7 @@ QUIET_CHIP = {"noise_xy_uT": 0.0, "noise_z_uT": 0.0}
 
 def test_the_import_is_cheap_and_finds_no_torch():
     code = "import sys, reskin; print([name for name in ('torch', 'scipy', 'pandas', 'mlflow') if name in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], cwd=api.CHECKOUT, capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", code], cwd=api.ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 
 
@@ -41,7 +41,7 @@ def test_rows_are_those_that_stages_read(tmp_path):
 
 
 def test_pokes_are_read_as_a_simulated_capture_without_noise_is():
-    words, shared = read_yaml(api.CHECKOUT / "pipeline/scenes/quick.yaml"), read_yaml(api.CHECKOUT / "params.yaml")
+    words, shared = read_yaml(api.ROOT / "pipeline/scenes/quick.yaml"), read_yaml(api.ROOT / "params.yaml")
     words["simulate"]["protocols"]["grid"] |= {"passes_n": 1, "depths_mm": [1.0], "terms": []}
     exact = {name: 0.0 for name in ("robot_place_sd_mm", "robot_depth_sd_mm", "place_offset_sd_mm", "force_noise_N")}
     shared |= {"chip": shared["chip"] | QUIET_CHIP, "rig": shared["rig"] | exact}

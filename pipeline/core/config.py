@@ -39,6 +39,17 @@ def read_yaml(path: Path) -> Any:
         raise ParamsError(path, "the file", "YAML", problem, "Mend the line it names.") from None
 
 
+def root_of_scenes() -> Path:
+    """Give where scenes are read: the working directory if it is a checkout, otherwise what the code lies in."""
+    return Path() if Path(FLOW).is_file() else ROOT
+
+
+def params_of(root: Path) -> Path:
+    """Give the shared params.yaml of a checkout, or the copy that a wheel keeps within the package."""
+    packed = root / "pipeline" / PARAMS
+    return packed if packed.is_file() else root / PARAMS
+
+
 def parse(model: type[Model], value: Any, where: str) -> Model:
     """Check plain values against a model; name the first parameter that is wrong, and what is allowed."""
     try:
@@ -81,6 +92,7 @@ def _written(loc: Sequence[int | str], value: Any) -> list[str]:
 Words = Mapping[str, Any]
 NOTHING = object()
 FLOW, PARAMS, PLAN, SCENES = "dvc.yaml", "params.yaml", "pipeline/plan.yaml", "pipeline/scenes"
+ROOT = Path(__file__).resolve().parents[2]  # what the code lies in: a checkout, or the packages of an environment
 # In dvc.yaml: ${key}, ${item.train_multi.recipe}, ${item.terms[0]}.
 PLACE = re.compile(r"\$\{(item\.)?([^}\[]+)(?:\[(\d+)\])?\}")
 

@@ -72,12 +72,13 @@ def emulate(
     loop: Annotated[bool, Option("--loop", help="Begin again when it has ended.")] = False,
 ) -> None:
     """Be a board: send a capture or a simulated scene, with faults if asked, to whoever reads the port."""
+    from pipeline.core.config import root_of_scenes
     from pipeline.live.emulate import open_far_end, play
     from pipeline.live.inject import inject, parse
     from pipeline.live.script import read_script
 
     faults = [parse(text) for text in fault or ()]
-    script = read_script(source, Path())
+    script = read_script(source, root_of_scenes())
     for one in faults:
         script = inject(script, one)
     end, stop = open_far_end(port), threading.Event()
@@ -108,6 +109,7 @@ def live(
     from contextlib import ExitStack
 
     from pipeline.capture.decisions import decide
+    from pipeline.core.config import root_of_scenes
     from pipeline.core.errors import ParamsError
     from pipeline.live.emulate import playing
     from pipeline.live.health import LIVE
@@ -126,7 +128,7 @@ def live(
     with ExitStack() as stack:
         what = "a board"
         if source := replay or emulate:
-            script = read_script(source, Path())
+            script = read_script(source, root_of_scenes())
             port, what = [stack.enter_context(playing(script))], f"{script.source}: {source}, played"
         boards = several(port or [found.port for found in the_boards()], models, what, decisions)
         serve(boards, host=host, http_port=http_port, say=typer.echo)

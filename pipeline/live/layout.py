@@ -4,18 +4,17 @@ No byte says it: five chips are taken for the board of scene quick, forty for it
 """
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from pipeline.core.config import SCENES, parse, read_yaml
+from pipeline.core.config import ROOT, SCENES, parse, read_yaml
 from pipeline.dataset.grid import CENTRE_MM
 from pipeline.synthesis.protocols import SKIN_MM
 from pipeline.synthesis.settings import BoardKind
 
-SCENE = Path(__file__).parents[2] / SCENES / "quick.yaml"
+SCENE = ROOT / SCENES / "quick.yaml"
 ASIDE_MM = 5.0  # between chips whose places nobody knows, so that they can be drawn
 
 

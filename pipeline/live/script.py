@@ -16,7 +16,7 @@ from pipeline.capture.header import HEADER_FILE, LOG_FILE, STREAM_FILE, Wire
 from pipeline.capture.stream import decode_all
 from pipeline.capture.wire import TEXT_WIRES, Frames, encode, record_type
 from pipeline.core import io
-from pipeline.core.config import PARAMS, SCENES, Settings, parse, read_yaml
+from pipeline.core.config import SCENES, Settings, params_of, parse, read_yaml
 from pipeline.core.errors import CaptureError, ParamsError
 from pipeline.dataset.captures import read_header, timer
 from pipeline.params import Scene
@@ -54,7 +54,8 @@ def read_script(source: str, root: Path) -> Script:
         return read_capture(folder)
     if folder.name == source and scene.is_file():
         return simulate(source, root)
-    remedy = f"Scenes are in {SCENES}, captures in data/raw."
+    scenes = ", ".join(sorted(file.stem for file in (root / SCENES).glob("*.yaml")))
+    remedy = f"Scenes: {scenes or 'none here'}; the folder of a capture holds {HEADER_FILE}."
     raise ParamsError(source, "the source", "a capture's folder or the name of a scene", "neither", remedy)
 
 
@@ -83,7 +84,7 @@ def simulate(name: str, root: Path) -> Script:
     words = read_yaml(file)
     if parse(Scene, words, str(file)).simulate is None:
         raise ParamsError(file, "the scene", "simulated", "recorded", "Give the folder of one of its captures.")
-    synthesis = check_synthesis(Settings(name, str(file), words, read_yaml(root / PARAMS), {}))
+    synthesis = check_synthesis(Settings(name, str(file), words, read_yaml(params_of(root)), {}))
     protocol = WALK if WALK in synthesis.protocols else MAIN
     board, skin = roster(synthesis, protocol)[0]
     capture = record(synthesis, protocol, board=board, skin=skin, seed=words["seed"])

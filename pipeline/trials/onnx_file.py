@@ -1,7 +1,7 @@
 """A trained network as an ONNX file, for programs without Python. In: a network. Out: a file that says what it takes.
 
 The view, the scaler and the layers are in it: changes of field in uT go in, x and y in mm and F in N come out. Needs
-`pip install onnx` (extra `onnx`). Refuses to know where the network comes from.
+extra `onnx`. Refuses to know where the network comes from.
 """
 
 from collections.abc import Iterator
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core.errors import ParamsError
+from pipeline.core.packages import lacking
 from pipeline.learning.inputs import DB_FLOOR_uT
 from pipeline.learning.model import LAYERS
 from pipeline.trials.networks import Network
@@ -33,7 +33,7 @@ def build(network: Network) -> "ModelProto":
     try:
         from onnx import TensorProto, checker, helper, numpy_helper
     except ImportError:
-        raise ParamsError("onnx", "the package onnx", "installed", "none", "Try: pip install onnx") from None
+        raise lacking("onnx", "export_onnx") from None
     card, scaler = network.card, dict(network.tensors)
     channels_n = card["input"]["channels_n"]
     layers = LAYERS[card["recipe"]["architecture"]](scaler["input_shift"].size)

@@ -1,0 +1,45 @@
+"""constraints.txt, made anew. In: pyproject.toml and pip's index. Out: the newest versions that fit together.
+
+python -m release.constraints [FILE]. pip resolves extra `dev` and installs nothing. Run it with the oldest supported
+Python, so that the versions exist for it; then `make test`, and only then commit. Refuses to judge the versions.
+"""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+HEAD = "# Exact versions of all that is installed; made with `make constraints`. torch is {torch} and nothing else.\n"
+OF_CUDA = ("nvidia-", "cuda-", "triton")  # torch for other graphics cards brings none of them
+RESOLVE = ("-m", "pip", "install", "--quiet", "--dry-run", "--ignore-installed", "--report", "-")
+
+
+def resolve(python: str, wanted: str) -> dict[str, str]:
+    """Let pip find versions that fit together; give them by name, without what marks a build (`+cpu`)."""
+    report = json.loads(subprocess.check_output([python, *RESOLVE, wanted]))
+    packages = (item["metadata"] for item in report["install"])
+    return {package["name"]: package["version"].partition("+")[0] for package in packages}
+
+
+def render(versions: dict[str, str]) -> str:
+    """Write versions as pip reads them, sorted as `pip freeze` sorts, without this project.
+
+    >>> print(render({"torch": "2.0", "Attrs": "1.0", "nvidia-nccl": "3", "reskin-pipeline": "0.1"}).splitlines()[1:])
+    ['Attrs==1.0', 'torch==2.0']
+    """
+    kept = {name for name in versions if name != "reskin-pipeline" and not name.startswith(OF_CUDA)}
+    lines = "".join(f"{name}=={versions[name]}\n" for name in sorted(kept, key=str.lower))
+    return HEAD.format(torch=versions["torch"]) + lines
+
+
+def main() -> None:
+    file = Path(sys.argv[1] if len(sys.argv) > 1 else "constraints.txt")
+    text = render(resolve(sys.executable, ".[dev]"))
+    before = set(file.read_text(encoding="utf-8").splitlines()) if file.is_file() else set()
+    file.write_text(text, encoding="utf-8")
+    changed = [line for line in text.splitlines() if line not in before and not line.startswith("#")]
+    print(f"{file}: {len(text.splitlines()) - 1} packages, changed: {', '.join(changed) or 'none'}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,88 @@
+"""Time an installation as a newcomer with nothing but Python makes it: an empty environment, the wheel, a page.
+
+python3 tests/benchmarks/time_install.py [--python FILE] [--constraint FILE]. Builds the wheel, makes an empty
+environment, installs the wheel without extras, and runs `reskin live --emulate quick` in an empty folder until its page
+answers, twice: the first time, Numba compiles. Prints seconds and MB as JSON. Needs packages from pip's index or cache.
+"""
+
+import argparse
+import json
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.request
+from pathlib import Path
+
+from time_repro import run, size_MB  # beside this file
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE_S = 600.0  # at most, until the page answers
+PIP = ("-m", "pip", "--quiet", "--disable-pip-version-check")
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def answers(url: str) -> bool:
+    try:
+        with urllib.request.urlopen(url, timeout=1.0) as page:
+            return b"live.js" in page.read()
+    except OSError:
+        return False
+
+
+def seconds_to_page(reskin: Path, folder: Path) -> float:
+    """Start `reskin live` on a simulated skin; give the time until its page is served, in seconds."""
+    port, begun_s = free_port(), time.monotonic()
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    command = [str(reskin), "live", "--emulate", "quick", "--http-port", str(port)]
+    process = subprocess.Popen(command, cwd=folder, env=environment, stdout=subprocess.DEVNULL)
+    try:
+        while not answers(f"http://127.0.0.1:{port}/"):
+            if process.poll() is not None or time.monotonic() - begun_s > PAGE_S:
+                sys.exit(f"{' '.join(command)}: a page must answer within {PAGE_S:g} s; got none")
+            time.sleep(0.05)
+        return round(time.monotonic() - begun_s, 1)
+    finally:
+        process.terminate()
+        process.wait()
+
+
+def measure(folder: Path, python: str, constraint: Path | None) -> dict[str, object]:
+    """Build, install and run in an empty folder."""
+    shutil.copytree(ROOT, folder / "source", ignore=shutil.ignore_patterns(".venv", ".git", "data", "reports", "build"))
+    made = run([python, "-m", "venv", str(folder / "venv")], folder)
+    new_python = str(folder / "venv/bin/python")
+    built = run([new_python, *PIP, "wheel", "--no-deps", "--wheel-dir", "dist", "./source"], folder)
+    wheel = next((folder / "dist").glob("*.whl"))
+    limits = [] if constraint is None else ["--constraint", str(constraint.resolve())]
+    installed = run([new_python, *PIP, "install", *limits, str(wheel)], folder)
+    packages = json.loads(subprocess.check_output([new_python, "-m", "pip", "list", "--format", "json"]))
+    (folder / "empty").mkdir()
+    return {
+        "python": subprocess.check_output([new_python, "-V"], text=True).split()[1],
+        "venv": made, "wheel": built, "install": installed,
+        "wheel_MB": round(wheel.stat().st_size / 1e6, 1), "environment_MB": size_MB(folder / "venv"),
+        "packages_n": len(packages), "load_1min": round(os.getloadavg()[0], 1),
+        "page_s": [seconds_to_page(folder / "venv/bin/reskin", folder / "empty") for _ in range(2)],
+    }  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--python", default=sys.executable)
+    parser.add_argument("--constraint", type=Path)
+    asked = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        print(json.dumps(measure(Path(folder), asked.python, asked.constraint), indent=2))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,122 @@
+"""What is released: the files of the wheel, one version, licences, and a core that runs without the rest."""
+
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from pipeline.core.config import PARAMS, SCENES, params_of, read_yaml
+from pipeline.core.errors import ParamsError
+from pipeline.core.packages import explain, need
+from release.constraints import render
+from release.licences import TOLERATED, closure, incompatible, is_compatible, wanted
+
+ROOT = Path(__file__).resolve().parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+CORE = (  # what runs outside a checkout
+    "pipeline.cli", "pipeline.recording", "pipeline.capture.dump", "pipeline.predicting", "reskin",
+    *(f"pipeline.live.{name}" for name in ("ports", "emulate", "script", "inject", "server")),
+)  # fmt: skip
+AWAY = ("dvc", "grimp", "jinja2", "magpylib", "matplotlib", "mlflow", "mpmath", "onnx", "pandas", "sklearn", "torch")
+# Every package that is not of the core, as if it were not installed.
+WITHOUT = """
+import importlib, sys
+
+class Away:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {away}:
+            raise ModuleNotFoundError(name, name=name)
+
+sys.meta_path.insert(0, Away())
+for name in {core}:
+    importlib.import_module(name)
+from pipeline.twin.shipped import load_universal
+print(load_universal().predict([[0.0] * 15]).shape)
+"""
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory) -> Path:
+    """The package as setuptools lays it into a wheel."""
+    folder = tmp_path_factory.mktemp("wheel")
+    words = ["-q", "egg_info", "-e", str(folder), "build_py", "-d", str(folder / "lib")]
+    subprocess.run([sys.executable, "-W", "ignore", "setup.py", *words], cwd=ROOT, check=True, capture_output=True)
+    return folder / "lib"
+
+
+def test_the_wheel_holds_the_code_and_what_it_reads_and_nothing_else(wheel):
+    names = {str(file.relative_to(wheel)) for file in wheel.rglob("*") if file.is_file()}
+    beside = {"pipeline/plan.yaml", "pipeline/run.sh"}  # of a checkout alone
+    files = [file.relative_to(ROOT) for top in ("pipeline", "reskin") for file in (ROOT / top).rglob("*.*")]
+    code = {str(file) for file in files if not any(part.startswith((".", "__pycache__")) for part in file.parts)}
+    assert names == code - beside | {f"pipeline/{PARAMS}"}
+    assert {f"{SCENES}/quick.yaml", "pipeline/live/page/live.js", "pipeline/twin/universal.safetensors"} <= names
+
+
+def test_settings_read_from_the_wheel_are_those_of_the_checkout(wheel):
+    assert read_yaml(params_of(wheel)) == read_yaml(params_of(ROOT)) == read_yaml(ROOT / PARAMS)
+
+
+def test_every_script_of_a_page_is_ours_or_says_its_licence(wheel):
+    foreign = [file for file in wheel.rglob("*.js") if len(max(file.read_text().splitlines(), key=len)) > 500]
+    assert [file.name for file in foreign if not list(file.parent.glob(f"{file.name}.LICENSE*"))] == []
+
+
+def test_what_runs_outside_a_checkout_imports_the_core_alone():
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT.format(core=CORE, away=AWAY)], cwd=ROOT, capture_output=True, text=True
+    )
+    assert done.stdout == "(1, 3)\n", done.stderr
+
+
+def test_a_package_that_is_not_there_is_one_sentence_with_the_extra_that_brings_it():
+    with pytest.raises(ParamsError, match=r"model.safetensors: package nowhere must be installed; got .*\[pipeline\]"):
+        need("nowhere", "model.safetensors")
+    assert "'.[networks]'" in str(explain(ModuleNotFoundError("", name="torch.nn")))
+    with pytest.raises(ModuleNotFoundError):
+        explain(ModuleNotFoundError("", name="pipeline.gone"))
+
+
+def test_every_package_that_the_code_imports_is_asked_for():
+    sources = [*(ROOT / "pipeline").rglob("*.py"), *(ROOT / "reskin").rglob("*.py")]
+    texts = [file.read_text(encoding="utf-8") for file in sources]
+    names = {
+        name for text in texts for name in re.findall(r"^ *(?:import|from) (\w+)[\w.]* *(?:import|as|$|#)", text, re.M)
+    }
+    imported = names - sys.stdlib_module_names - {"pipeline", "reskin"}
+    known = {"sklearn": "scikit-learn", "serial": "pyserial", "ruamel": "ruamel.yaml"}
+    lines = [line for extra in (None, "networks", "pipeline", "onnx") for line in wanted(extra)]
+    asked = {re.split(r"[\[<>=]", line)[0] for line in lines}
+    assert {known.get(name, name) for name in imported} <= asked
+
+
+def test_one_version_stands_in_the_project_its_citation_and_its_changelog():
+    citation = read_yaml(ROOT / "CITATION.cff")
+    top = re.search(r"^## (\S+) \((\S+)\)", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert (citation["version"], citation["date-released"]) == top.groups()
+    assert (citation["version"], citation["license"]) == (PROJECT["version"], PROJECT["license"])
+
+
+def test_all_licences_are_compatible_and_those_of_the_core_without_exception():
+    assert set(incompatible(closure(wanted("dev")))) == set(TOLERATED)  # none is tolerated that need not be
+    assert closure(wanted()).keys() & TOLERATED.keys() == set()
+
+
+@pytest.mark.parametrize(
+    ("licence", "fits"),
+    [
+        ("MIT", True), ("Apache-2.0 WITH LLVM-exception AND BSD-2-Clause", True), ("GPL-3.0-only OR MIT", True),
+        ("GPL-3.0-only", False), ("MIT AND AGPL-3.0", False), ("GNU Lesser General Public License", False),
+        ("Proprietary", False), ("", False), ("my own words", False),
+    ],
+)  # fmt: skip
+def test_a_licence_is_compatible_if_one_alternative_is(licence, fits):
+    assert is_compatible(licence) is fits
+
+
+def test_constraints_name_no_project_of_ours_and_no_package_of_one_graphics_card():
+    lines = render({"torch": "2.0", "Attrs": "1.0", "nvidia-nccl": "3", "reskin-pipeline": "0.1"}).splitlines()
+    assert lines[1:] == ["Attrs==1.0", "torch==2.0"]
