@@ -6,12 +6,13 @@ at (8, 8) mm. Refuses to know recordings: nothing of them is in the file but the
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from pipeline.core import io
@@ -20,7 +21,7 @@ from pipeline.core.errors import SchemaError
 from pipeline.dataset.grid import CENTRE_MM
 from pipeline.physics.skin import SkinDesign
 from pipeline.twin.law import Setup
-from pipeline.twin.skin_map import Estimate, Reader, SkinMap, new_map, see_labelled, see_pokes, see_rest
+from pipeline.twin.skin_map import ROUNDS_N, Estimate, Reader, SkinMap, new_map, see_labelled, see_pokes, see_rest
 from pipeline.twin.tables import NOMINAL, OF_NOMINAL, Tables, tabulate
 
 FILE = Path(__file__).with_name("universal.safetensors")  # its card beside it, .json
@@ -40,9 +41,10 @@ class Universal:
 
     def __post_init__(self) -> None:
         """Start from nominal skins."""
-        self.skin = new_map(self.tables)
+        self.skin = self._nominal = new_map(self.tables)
         self._noload_uT: np.ndarray | None = None
         self._reader: Reader | None = None
+        self._seen = False  # any poke since it was zeroed
 
     @property
     def card(self) -> dict[str, Any]:
@@ -51,12 +53,16 @@ class Universal:
 
     def zero(self, b_uT: Float[np.ndarray, "f ch"]) -> "Universal":
         """Take the mean of readings without contact as the no-load field, and learn the skin's seat and gap from it."""
-        self._noload_uT = _rows(b_uT).mean(axis=0)
-        return self._learn(see_rest(new_map(self.tables), to_board(self._noload_uT[None])[0]))
+        self._noload_uT, self._seen = _rows(b_uT).mean(axis=0), False
+        return self._learn(see_rest(self._nominal, to_board(self._noload_uT[None])[0]))
 
     def see(self, b_uT: Float[np.ndarray, "n ch"]) -> "Universal":
-        """Learn from pokes at unknown places, a reading each; some dozens all over the skin."""
-        return self._learn(see_pokes(self.skin, self._change(b_uT)))
+        """Learn from pokes at unknown places, a reading each: some dozens all over the skin, later ones as they come.
+
+        The first set is looked at several times over, what comes later once: by then the skin is known.
+        """
+        rounds_n, self._seen = (1 if self._seen else ROUNDS_N), True
+        return self._learn(see_pokes(self.skin, self._change(b_uT), rounds_n=rounds_n, reader=self._ready()))
 
     def label(
         self, place_mm: Float[np.ndarray, "m 2"], force_N: Float[np.ndarray, " m"], b_uT: Float[np.ndarray, "m ch"]
@@ -72,9 +78,7 @@ class Universal:
 
     def estimate(self, b_uT: Float[np.ndarray, "f ch"]) -> Estimate:
         """Give the same with the place's standard deviation, and the misfit: far above 1, this is no skin it knows."""
-        if self._reader is None:
-            self._reader = Reader(self.skin)
-        found = self._reader.estimate(self._change(b_uT))
+        found = self._ready().estimate(self._change(b_uT))
         return Estimate(found.place_mm + CENTRE_MM, found.sd_mm, found.force_N, found.misfit)
 
     def __call__(self, db_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f 3"]:
@@ -85,6 +89,11 @@ class Universal:
     def _change(self, b_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f ch"]:
         noload_uT = self._noload_uT if self._noload_uT is not None else 0.0
         return to_board(_rows(b_uT) - noload_uT)
+
+    def _ready(self) -> Reader:
+        if self._reader is None:
+            self._reader = Reader(self.skin)
+        return self._reader
 
     def _learn(self, skin: SkinMap) -> "Universal":
         self.skin, self._reader = replace(skin, temper=TEMPER), None
@@ -117,8 +126,13 @@ def write(tables: Tables, words: Mapping[str, Any], file: Path = FILE) -> None:
 
 def to_board(b_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f ch"]:
     """Turn readings from the chips' axes to the board's."""
-    turn = Rotation.from_euler("z", np.array(TURNS_DEG)[:, None], degrees=True).as_matrix()
-    return np.einsum("kij,nkj->nki", turn, b_uT.reshape(len(b_uT), -1, 3)).reshape(len(b_uT), -1)
+    return b_uT @ _turn()
+
+
+@cache
+def _turn() -> Float[np.ndarray, "ch ch"]:
+    of_chips = Rotation.from_euler("z", np.array(TURNS_DEG)[:, None], degrees=True).as_matrix()
+    return np.array(block_diag(*of_chips)).T
 
 
 def _rows(b_uT: Float[np.ndarray, "..."]) -> Float[np.ndarray, "f ch"]:

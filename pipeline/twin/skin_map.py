@@ -12,16 +12,15 @@ import numpy as np
 from jaxtyping import Float, Float32
 from scipy.linalg import solve_triangular
 
-from pipeline.twin.places import inside
+from pipeline.twin.gaussians import products, quadratic
+from pipeline.twin.hypotheses import Hypotheses, NOISE_uT, lattice
 from pipeline.twin.residual import Relative, Residual, kernel, no_residual
 from pipeline.twin.tables import Tables
 
-LAW_ERROR = 0.35  # of |dB|: rms of how far the law is off, all channels together, before it has learnt
 OFFSET_uT = 320.0  # of a chip at rest (200) and of the law's own error there (250)
-NOISE_uT = 4.5  # of one reading, a channel
 LEFT_MIN = 0.03  # of the law's error that labels never take away
 SHARE_OF_UNLABELLED = 0.2  # of a poke's weight: the law's errors at neighbouring places are not independent
-LIKELY_N, ROUNDS_N = 40, 3  # hypotheses of an unlabelled poke that count; rounds of finding them again
+ROUNDS_N = 3  # of finding again where unlabelled pokes may have been
 EVEN_MM = 0.15  # so near to the labels' middle pokes lie in the mean that are spread evenly
 CELL_SD_MM = 0.2  # at least, of a place: where it lies within a cell of the lattice
 
@@ -52,6 +51,7 @@ class SkinMap:
 
     tables: Tables
     residual: Residual
+    hypotheses: Hypotheses
     number: Float[np.ndarray, " t"]
     cov: Float[np.ndarray, "t t"]
     labelled: Labelled | None = None
@@ -60,13 +60,13 @@ class SkinMap:
     @property
     def error_cov(self) -> Float[np.ndarray, "ch ch"]:
         """Covariance of the law's relative error, between channels."""
-        return LAW_ERROR**2 * self.residual.share
+        return self.hypotheses.error_cov
 
 
 def new_map(tables: Tables, residual: Residual | None = None) -> SkinMap:
     """Start from the spreads alone; `residual` is what the law misses on other boards of the rig."""
-    t = len(tables.names)
-    return SkinMap(tables, residual or no_residual(tables.mean_uT.shape[-1]), np.zeros(t), np.eye(t))
+    t, carried = len(tables.names), residual or no_residual(tables.mean_uT.shape[-1])
+    return SkinMap(tables, carried, lattice(tables, carried), np.zeros(t), np.eye(t))
 
 
 def see_rest(skin: SkinMap, noload_uT: Float[np.ndarray, " ch"]) -> SkinMap:
@@ -75,21 +75,21 @@ def see_rest(skin: SkinMap, noload_uT: Float[np.ndarray, " ch"]) -> SkinMap:
     return _learn(skin, tables.rest_slope_uT, noload_uT - tables.rest_uT, np.full(len(noload_uT), OFFSET_uT**2))
 
 
-def see_pokes(skin: SkinMap, db_uT: Float[np.ndarray, "n ch"]) -> SkinMap:
-    """Learn from pokes at unknown places: expectation maximisation over where each may have been."""
-    found = skin
-    for _ in range(ROUNDS_N):
-        reader = Reader(found)
-        weight, at = reader.likely(db_uT)
-        poke, rank = np.nonzero(weight * SHARE_OF_UNLABELLED > 1e-4)
-        at, weight = at[poke, rank], weight[poke, rank] * SHARE_OF_UNLABELLED
-        mean_uT, slope_uT, missed = reader.mean_uT[at], reader.slope_uT[at], reader.missed[at]
-        length_uT = np.linalg.norm(mean_uT, axis=1)
-        cov = _with_noise(length_uT[:, None, None] ** 2 * skin.error_cov)
-        off_uT = db_uT[poke] - mean_uT - length_uT[:, None] * missed
-        white = np.linalg.solve(np.linalg.cholesky(cov), np.concatenate([off_uT[..., None], slope_uT], axis=2))
-        var = np.repeat(1 / weight, off_uT.shape[1])
-        found = _learn(skin, white[..., 1:].reshape(-1, len(skin.number)), white[..., 0].ravel(), var)
+def see_pokes(
+    skin: SkinMap, db_uT: Float[np.ndarray, "n ch"], *, rounds_n: int = ROUNDS_N, reader: "Reader | None" = None
+) -> SkinMap:
+    """Learn from pokes at unknown places: expectation maximisation over where each may have been.
+
+    `reader` is the skin's, where one is ready: it spares the first round the making of one.
+    """
+    gains, expected_uT, found = skin.hypotheses.gains, skin.hypotheses.expected_uT, skin
+    for _ in range(rounds_n):
+        reader = reader or Reader(found)
+        weight = SHARE_OF_UNLABELLED * believe(reader.weigh(db_uT), skin.temper)
+        of_each = weight.sum(axis=0)
+        off_uT = weight.T @ db_uT.astype(np.float32) - of_each[:, None] * expected_uT
+        information = (of_each @ gains.information).reshape(skin.cov.shape)
+        found, reader = _gain(skin, information, off_uT.ravel() @ gains.aim), None
     return found
 
 
@@ -143,74 +143,50 @@ class Weighed:
 
 
 class Reader:
-    """A map made ready for readings: every hypothesis (place, force) with its mean and whitened covariance."""
+    """A map made ready for readings: every hypothesis (place, force) with its mean and covariance, as rows."""
 
     def __init__(self, skin: SkinMap) -> None:
-        tables = skin.tables
-        place_mm = np.stack(np.meshgrid(tables.axis_mm, tables.axis_mm, indexing="ij"), axis=-1).reshape(-1, 2)
-        pressed = inside(place_mm)
-        self.place_mm = place_mm[pressed]
-        self.log_N = np.log(tables.force_N)
-        forces_n, channels_n = len(self.log_N), len(tables.rest_uT)
-        self._rows, self._columns = np.triu_indices(channels_n)
-        self.mean_uT = tables.mean_uT.reshape(len(pressed), forces_n, channels_n)[pressed].reshape(-1, channels_n)
-        self.slope_uT = tables.slope_uT.reshape(len(pressed), forces_n, channels_n, -1)[pressed]
-        self.slope_uT = self.slope_uT.reshape(len(self.mean_uT), channels_n, -1)
-        place_mm, log_N = np.repeat(self.place_mm, forces_n, axis=0), np.tile(self.log_N, len(self.place_mm))
-        self.missed = skin.residual.at(place_mm, log_N)
-        self._temper = skin.temper
-        self._ready(skin, place_mm, log_N)
-
-    def _ready(self, skin: SkinMap, place_mm: Float[np.ndarray, "h 2"], log_N: Float[np.ndarray, " h"]) -> None:
-        expected_uT = self.mean_uT + self.slope_uT @ skin.number
+        self._of = skin.hypotheses
+        self.place_mm, self.log_N = self._of.place_mm, self._of.log_N
+        self.mean_uT, self.slope_uT, self._temper = self._of.mean_uT, self._of.slope_uT, skin.temper
+        slope = self.slope_uT.reshape(-1, len(skin.number))
+        expected_uT = self.mean_uT + (slope @ skin.number.astype(np.float32)).reshape(self.mean_uT.shape)
+        spread_uT = (slope @ np.linalg.cholesky(skin.cov).astype(np.float32)).reshape(self.slope_uT.shape)
+        missed, left = self._labelled(skin)
         length_uT = np.linalg.norm(expected_uT, axis=1)
-        missed, left = self.missed, np.ones(len(expected_uT))
-        if skin.labelled is not None:
-            of = skin.labelled
-            near = kernel(place_mm, of.place_mm, log_N, of.log_N)
-            missed = missed + near @ of.solved
-            told = np.einsum("hm,mn,hn->h", near, of.inverse, near, optimize=True)
-            left = np.maximum(1 + skin.residual.noise - told, LEFT_MIN)
-        spread_uT = self.slope_uT @ np.linalg.cholesky(skin.cov)
-        cov = spread_uT @ spread_uT.transpose(0, 2, 1) + (length_uT**2 * left)[:, None, None] * skin.error_cov
-        root = np.linalg.cholesky(_with_noise(cov))
-        white = np.linalg.inv(root)
-        expected_uT = expected_uT + length_uT[:, None] * missed
-        # chi^2 = d'Ad - 2 b'd + c is linear in the products of channels: a reading against some 2,500 hypotheses is one
-        # product of matrices. In single precision, off by less than 0.01 where a hypothesis is likely.
-        precision = white.transpose(0, 2, 1) @ white
-        aimed = np.einsum("hij,hj->hi", precision, expected_uT)
-        twice = np.where(self._rows == self._columns, 1.0, 2.0)
-        parts = precision[:, self._rows, self._columns] * twice, -2 * aimed, (aimed * expected_uT).sum(axis=1)[:, None]
-        self._chi2 = np.ascontiguousarray(np.concatenate(parts, axis=1).T, np.float32)
-        self._log_det = 2 * np.log(np.einsum("hii->hi", root)).sum(axis=1).astype(np.float32)
+        expected_uT += length_uT[:, None] * missed
+        self._row, self._log_det = quadratic(
+            expected_uT, spread_uT, length_uT**2 * left, self._of.error_cov.astype(np.float32), NOISE_uT**2
+        )
 
-    def likely(self, db_uT: Float[np.ndarray, "n ch"]) -> tuple[Float[np.ndarray, "n l"], np.ndarray]:
-        """Give the likeliest hypotheses of each reading, and their probabilities, of 1 in sum."""
-        probability = believe(self.weigh(db_uT), self._temper)
-        at = np.argsort(-probability, axis=1)[:, :LIKELY_N]
-        weight = np.take_along_axis(probability, at, axis=1)
-        return weight / weight.sum(axis=1, keepdims=True), at
+    def _labelled(self, skin: SkinMap) -> tuple[Float32[np.ndarray, "h ch"], Float32[np.ndarray, " h"]]:
+        # What the law misses everywhere, and the part of its error that labels leave.
+        missed, labelled = self._of.missed, skin.labelled
+        if labelled is None:
+            return missed, np.ones(len(missed), np.float32)
+        place_mm, log_N = self._of.at
+        near = kernel(place_mm, labelled.place_mm, log_N, labelled.log_N)
+        told = ((near @ labelled.inverse) * near).sum(axis=1)
+        left = np.maximum(1 + skin.residual.noise - told, LEFT_MIN)
+        return (missed + near @ labelled.solved).astype(np.float32), left.astype(np.float32)
 
     def estimate(self, db_uT: Float[np.ndarray, "n ch"], block_n: int = 200) -> Estimate:
         """Read places and forces: the mean over all hypotheses."""
-        blocks = [self.weigh(db_uT[i : i + block_n]) for i in range(0, len(db_uT), block_n)]
-        return joined([self.answer(block, self._temper) for block in blocks])
+        starts = range(0, len(db_uT), block_n)
+        return joined([self.answer(self.weigh(db_uT[i : i + block_n]), self._temper) for i in starts])
 
     def weigh(self, db_uT: Float[np.ndarray, "n ch"]) -> Weighed:
-        """Weigh every hypothesis against readings: some 50 us each."""
-        read_uT = db_uT.astype(np.float32)
-        products = read_uT[:, self._rows] * read_uT[:, self._columns]
-        chi2 = np.concatenate([products, read_uT, np.ones((len(read_uT), 1), np.float32)], axis=1) @ self._chi2
+        """Weigh every hypothesis against readings."""
+        chi2 = products(db_uT.astype(np.float32)) @ self._row.T
         return Weighed(chi2, chi2 + self._log_det, db_uT.shape[1])
 
     def answer(self, weighed: Weighed, temper: float) -> Estimate:
         """Give places and forces, the means over all hypotheses."""
-        by_place = believe(weighed, temper).reshape(len(weighed.chi2), len(self.place_mm), -1)
-        of_place, of_force = by_place.sum(axis=2), by_place.sum(axis=1)
-        place_mm = of_place @ self.place_mm
-        var_mm2 = np.maximum(of_place @ self.place_mm**2 - place_mm**2, CELL_SD_MM**2)
-        return Estimate(place_mm, np.sqrt(var_mm2), np.exp(of_force @ self.log_N), weighed.misfit())
+        moments = believe(weighed, temper) @ self._of.moments
+        _, mean_mm, square_mm2, log_N = np.split(moments, (1, 3, 5), axis=1)
+        place_mm = mean_mm.astype(float)
+        sd_mm = np.sqrt(np.maximum(square_mm2 - place_mm**2, CELL_SD_MM**2))
+        return Estimate(place_mm, sd_mm, np.exp(log_N[:, 0].astype(float)), weighed.misfit())
 
 
 def believe(weighed: Weighed, temper: float) -> Float[np.ndarray, "n h"]:
@@ -222,6 +198,8 @@ def believe(weighed: Weighed, temper: float) -> Float[np.ndarray, "n h"]:
 
 def joined(parts: Sequence[Estimate]) -> Estimate:
     """Put estimates one after the other."""
+    if len(parts) == 1:
+        return parts[0]
     return Estimate(*(np.concatenate([getattr(part, name) for part in parts]) for name in Estimate.__annotations__))
 
 
@@ -229,14 +207,14 @@ def _learn(
     skin: SkinMap, row: Float[np.ndarray, "r t"], value: Float[np.ndarray, " r"], var: Float[np.ndarray, " r"]
 ) -> SkinMap:
     # Linear Gaussian observations: row @ number = value + N(0, var).
-    information = np.linalg.inv(skin.cov)
-    gained = information + row.T @ (row / var[:, None])
-    number = np.linalg.solve(gained, information @ skin.number + row.T @ (value / var))
-    return replace(skin, number=number, cov=np.linalg.inv(gained))
+    return _gain(skin, row.T @ (row / var[:, None]), row.T @ (value / var))
 
 
-def _with_noise(cov_uT2: Float[np.ndarray, "h ch ch"]) -> Float[np.ndarray, "h ch ch"]:
-    return cov_uT2 + NOISE_uT**2 * np.eye(cov_uT2.shape[1])
+def _gain(skin: SkinMap, information: Float[np.ndarray, "t t"], vector: Float[np.ndarray, " t"]) -> SkinMap:
+    # Gaussians in the information form: what is known and what is told add up.
+    known = np.linalg.inv(skin.cov)
+    cov = np.linalg.inv(known + information)
+    return replace(skin, number=cov @ (known @ skin.number + vector), cov=(cov + cov.T) / 2)
 
 
 def _between(

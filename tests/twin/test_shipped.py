@@ -63,3 +63,13 @@ def test_other_boards_are_refused(skin):
     with pytest.raises(SchemaError, match="channels must be the 15 of five chips"):
         skin.predict(np.zeros((2, 12)))
     assert reskin.load_universal().tables.rest_uT.shape == (CHANNELS_N,)
+
+
+def test_pokes_one_by_one_tell_nearly_what_they_tell_at_once(skin):
+    rest_uT = to_chips(skin.tables.rest_uT[None])
+    stronger_uT = np.concatenate([1.25 * pokes(skin, force_i) for force_i in (2, 3, 4)]) + rest_uT
+    at_once = skin.zero(rest_uT).see(stronger_uT).skin.number
+    skin.zero(rest_uT).see(stronger_uT[:4])
+    for i in range(4, len(stronger_uT)):
+        skin.see(stronger_uT[i : i + 1])
+    assert np.linalg.norm(skin.skin.number - at_once) < 0.3 * np.linalg.norm(at_once)

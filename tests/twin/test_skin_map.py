@@ -7,8 +7,9 @@ import pytest
 
 from pipeline.core.seeds import rng_for
 from pipeline.twin import skin_map
+from pipeline.twin.hypotheses import LAW_ERROR, NOISE_uT
 from pipeline.twin.population import grid
-from pipeline.twin.skin_map import LAW_ERROR, NOISE_uT, OFFSET_uT, Reader, new_map, see_even, see_labelled, see_pokes
+from pipeline.twin.skin_map import OFFSET_uT, Reader, new_map, see_even, see_labelled, see_pokes
 from tests.twin.skins import REST_SLOPE_uT, made_tables, poked_uT
 
 NUMBER = np.array([0.0, 0.0, 1.5])
