@@ -69,6 +69,7 @@ ROWS = (
     Question("audit", "other", needs=("lobo",), section=True),
     Question("choice", "report", "report", needs=("lobo", "triplet", "adapt")),
     _experiment("bound", None, "single_pass"),
+    _experiment("population", None, "adapt", section=True),
     _experiment("drift", "wear", section=True, recorded=True),
     _experiment("variation", "wear", section=True),
     _experiment("shear", "drag", section=True),

@@ -72,8 +72,8 @@ def lattice(tables: Tables, residual: Residual) -> Hypotheses:
     slope_uT = tables.slope_uT.reshape(len(place_mm), len(log_N), -1)[taken].reshape(*mean_uT.shape, -1)
     taken_mm = place_mm[taken]
     missed = residual.at(np.repeat(taken_mm, len(log_N), axis=0), np.tile(log_N, len(taken_mm)))
-    single = (part.astype(np.float32) for part in (mean_uT, slope_uT, missed))
-    return Hypotheses(taken_mm, log_N, *single, LAW_ERROR**2 * residual.share)
+    mean_uT, slope_uT, missed = (part.astype(np.float32) for part in (mean_uT, slope_uT, missed))
+    return Hypotheses(taken_mm, log_N, mean_uT, slope_uT, missed, LAW_ERROR**2 * residual.share)
 
 
 def with_noise(cov_uT2: Float[np.ndarray, "h ch ch"]) -> Float[np.ndarray, "h ch ch"]:

@@ -50,9 +50,10 @@ class Population:
 
 
 def draw_population(
-    centre: Law, spreads: Mapping[str, float], setup: Setup, skins_n: int, rng: np.random.Generator
-) -> Population:
-    """Simulate skins about a centre, 130 pokes each: some 40 ms a skin."""
+    centre: Law, spreads: Mapping[str, float], setup: Setup, skins: int | slice, rng: np.random.Generator,
+    forces_N: tuple[float, float] = FORCES_N,
+) -> Population:  # fmt: skip
+    """Simulate skins about a centre, 130 pokes each: some 40 ms a skin; the first so many, or some of them."""
     setups = {
         (thickness_mm, tip_mm): replace(
             setup, design=setup.design.model_copy(update={"thickness_mm": thickness_mm}), tip_radius_mm=tip_mm,
@@ -61,12 +62,12 @@ def draw_population(
         for thickness_mm in THICKNESSES_MM
         for tip_mm in TIPS_MM
     }  # fmt: skip
-    skins = []
-    for one in rng.spawn(skins_n):  # the first skins stay the same when more are drawn
+    drawn, taken = [], skins if isinstance(skins, slice) else slice(skins)
+    for one in rng.spawn(taken.stop)[taken]:  # the first skins stay the same when more are drawn
         law = draw_law(centre, spreads, one)
         thickness_mm, tip_mm = (float(one.choice(list(of), p=list(of.values()))) for of in (THICKNESSES_MM, TIPS_MM))
-        skins.append(draw_skin(law, setups[thickness_mm, tip_mm], one))
-    return Population(*(np.array(part, np.float32) for part in zip(*skins, strict=True)))
+        drawn.append(draw_skin(law, setups[thickness_mm, tip_mm], one, forces_N))
+    return Population(*(np.array(part, np.float32) for part in zip(*drawn, strict=True)))
 
 
 def draw_law(centre: Law, spreads: Mapping[str, float], rng: np.random.Generator) -> Law:
@@ -80,11 +81,11 @@ def draw_law(centre: Law, spreads: Mapping[str, float], rng: np.random.Generator
 
 
 def draw_skin(
-    law: Law, setup: Setup, rng: np.random.Generator
+    law: Law, setup: Setup, rng: np.random.Generator, forces_N: tuple[float, float] = FORCES_N
 ) -> tuple[Float[np.ndarray, "m ch"], Float[np.ndarray, " ch"], Float[np.ndarray, "m 2"], Float[np.ndarray, " m"]]:
     """Simulate one skin on chips that err: changes of field and the field at rest, in uT, places and forces."""
     place_mm = draw_places(rng)
-    force_N = np.exp(rng.uniform(np.log(FORCES_N[0]), np.log(FORCES_N[1]), POKES_N))
+    force_N = np.exp(rng.uniform(np.log(forces_N[0]), np.log(forces_N[1]), POKES_N))
     filled = fill(setup.rest, rng)
     db_uT, rest_uT = simulate_uT(law, setup, place_mm, force_N, filled), at_rest_uT(law, setup, filled)
     chips_n = len(rest_uT)

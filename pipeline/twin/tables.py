@@ -49,21 +49,23 @@ def lattice_mm() -> Float[np.ndarray, " a"]:
     return PITCH_MM * (np.arange(STEPS_N) - (STEPS_N - 1) / 2)
 
 
-def tabulate(centre: Law, spreads: Mapping[str, float], setup: Setup) -> Tables:
+def tabulate(
+    centre: Law, spreads: Mapping[str, float], setup: Setup, forces_N: Float[np.ndarray, " q"] = FORCES_N
+) -> Tables:
     """Simulate every place and force at the centre, and with each number moved: some 50,000 pokes, half a minute."""
     axis_mm = lattice_mm()
     places_mm = np.stack(np.meshgrid(axis_mm, axis_mm, indexing="ij"), axis=-1).reshape(-1, 2)
-    place_mm = np.repeat(places_mm, len(FORCES_N), axis=0)
-    force_N = np.tile(FORCES_N, len(places_mm))
+    place_mm = np.repeat(places_mm, len(forces_N), axis=0)
+    force_N = np.tile(forces_N, len(places_mm))
 
     def fields_uT(law: Law) -> tuple[np.ndarray, np.ndarray]:
         read_uT = simulate_uT(law, setup, place_mm, force_N)
-        return read_uT.reshape(len(axis_mm), len(axis_mm), len(FORCES_N), -1), at_rest_uT(law, setup).ravel()
+        return read_uT.reshape(len(axis_mm), len(axis_mm), len(forces_N), -1), at_rest_uT(law, setup).ravel()
 
     mean_uT, rest_uT = fields_uT(centre)
     moved = [fields_uT(spread_by(centre, name, STEP * spread)) for name, spread in spreads.items()]
     return Tables(
-        names=tuple(spreads), spreads=np.array(list(spreads.values())), axis_mm=axis_mm, force_N=FORCES_N,
+        names=tuple(spreads), spreads=np.array(list(spreads.values())), axis_mm=axis_mm, force_N=forces_N,
         mean_uT=mean_uT, slope_uT=np.stack([(each_uT - mean_uT) / STEP for each_uT, _ in moved], axis=-1),
         rest_uT=rest_uT, rest_slope_uT=np.stack([(each_uT - rest_uT) / STEP for _, each_uT in moved], axis=-1),
     )  # fmt: skip

@@ -61,6 +61,7 @@ class Syllabus:
     setup: Setup
     recorded: Sequence[Recorded] = ()
     residual: Residual | None = None
+    follows_law: bool = False  # skins of a simulated scene: no law misses anything
 
 
 @dataclass(frozen=True)
@@ -127,6 +128,8 @@ class Feed:
         self.log_N = np.log(skins.force_N)
         self.carried_uT = None if syllabus.residual is None else carried_uT(skins, syllabus.residual)
         self.error = ERROR_OF_NOMINAL if syllabus.residual is None else ERROR_OF_RIG
+        if syllabus.follows_law:
+            self.error = 0.0, 0.0
 
     def draw(self, rng: np.random.Generator) -> Batch:
         """Draw simulated skins, and recorded ones where there are any; with noise, and with the law's errors."""

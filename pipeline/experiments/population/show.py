@@ -1,0 +1,72 @@
+"""What experts of simulated skins know of others: numbers -> two tables and a figure. Sees no skins and no path."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import pandas as pd
+
+from pipeline.reporting.figures import drawing, svg
+from pipeline.reporting.shown import n_of, scores, show, tabulate
+from pipeline.reporting.work_precision import COLOURS, MARKERS
+
+NAMES = {
+    "map": "universal map, skin as designed",
+    "universal": "universal, skin as designed",
+    "network": "universal network alone, skin as designed",
+}
+WEIGHED, COVERAGE = "MSE_F with one known weight / N²", "in 90 % intervals / %"
+WEIGHED_KEY, COVERAGE_KEY = "mse_f_weight_N2", "coverage_pct"
+
+
+def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
+    """Show errors by what is told of a skin, and by how many skins a network was taught."""
+    told = [_line(row, source) for row in numbers["told"]]
+    scaling = [_line(row, source, taught=row["skins_n"]) for row in numbers["scaling"]]
+    return {
+        "population": tabulate(told, meaning=_meaning(numbers)),
+        "population_scaling": tabulate(scaling, meaning=_scaling(numbers)),
+    }
+
+
+def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
+    """Draw the error against the number of skins that a network was taught."""
+    rows = pd.DataFrame(numbers["scaling"])
+    with drawing(6.0, 3.8) as figure:
+        axes = figure.subplots()
+        for i, way in enumerate(("network", "universal")):
+            own = rows[rows["way"] == way]
+            wrong_pct = [100 - one["mean"] for one in own["accuracy_pct"]]
+            sd = [one.get("sd", 0.0) for one in own["accuracy_pct"]]
+            style = {"color": COLOURS[i], "marker": MARKERS[i], "capsize": 3}
+            axes.errorbar(own["skins_n"], wrong_pct, sd, label=NAMES[way], **style)
+        axes.set(xscale="log", xlabel="simulated skins that the network was taught", ylim=(0, None))
+        axes.set_ylabel("error above 1 mm / %")
+        axes.legend(frameon=False)
+        axes.set_title(f"{numbers['steps_n']} steps each, skins of six or more boards ({source})", fontsize=9)
+        return {"population_scaling.svg": svg(figure)}
+
+
+def _line(row: Mapping[str, Any], source: str, taught: int | None = None) -> dict[str, str]:
+    line = {"method": NAMES[row["way"]]} | ({} if taught is None else {"skins taught": str(taught)})
+    line |= {"unlabelled pokes": str(row["pokes_n"]), "labels": str(row["labels_n"]), "source": source}
+    line |= scores(row) | {WEIGHED: show(row[WEIGHED_KEY]), COVERAGE: show(row[COVERAGE_KEY])}
+    return line | {"n": n_of(row)}
+
+
+def _meaning(numbers: Mapping[str, Any]) -> str:
+    coverage = ", ".join(f"{NAMES[way]} {pct:.3g} %" for way, pct in numbers["coverage_further_pct"].items())
+    return (
+        f"Experts that were taught simulated skins about the skin as designed, and none of the scene's "
+        f"{numbers['skins_asked_n']}, of which rows of later passes are read. Unlabelled pokes: one at each of the "
+        f"{numbers['pool_n']} places of the grid under any depth, or the first of these; labels are among them. The "
+        "weight: the force of one of these pokes is known, its place is not. How sure each way is, and how far a "
+        "weight moves its forces, was told on further skins of the population; there 90 % intervals hold "
+        f"{coverage}."
+    )
+
+
+def _scaling(numbers: Mapping[str, Any]) -> str:
+    return (
+        f"Networks of {numbers['steps_n']} steps each, from equal first weights, on the first so many skins of one "
+        "population; the map beside them is the same."
+    )

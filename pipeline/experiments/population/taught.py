@@ -1,0 +1,135 @@
+"""What a scene's experts are taught: its skin as designed -> a population, and networks of ever more of its skins.
+
+What is finished is kept beside compiled code, in parts: a run that was killed goes on where it was. Refuses to know the
+scene's own skins.
+"""
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import Field
+
+import pipeline.twin
+from pipeline.core import kept
+from pipeline.core.config import Strict
+from pipeline.core.errors import ParamsError
+from pipeline.core.seeds import rng_for
+from pipeline.physics.skin import SkinDesign
+from pipeline.physics.slide import force_at
+from pipeline.synthesis.settings import BoardKind
+from pipeline.twin.law import Law, Setup
+from pipeline.twin.network import Weights, draw_weights
+from pipeline.twin.population import Population, draw_population
+from pipeline.twin.tables import OF_RIG, Tables, tabulate
+from pipeline.twin.training import Syllabus, train
+
+PACKAGE = Path(pipeline.twin.__file__).parent
+PART_N = 100  # skins that are kept together
+STEPS_OF_FORCE = 0.6  # at most, of log F between two tabulated forces
+FORCE_SHARES = (0.7, 1.5)  # of the least and of the largest force of the skin as designed: skins differ
+
+
+class Taught(Strict):
+    """How many skins there are, of which networks are taught the first so many, each for as many steps."""
+
+    skins_n: Annotated[tuple[Annotated[int, Field(ge=1, le=100_000)], ...], Field(min_length=1)]
+    steps_n: Annotated[int, Field(ge=2, le=1_000_000)]
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """A syllabus of skins as a scene's are designed, with forces as its depths ask for."""
+
+    syllabus: Syllabus
+    forces_N: tuple[float, float]
+    seed: int
+
+    def skins(self, name: str, which: slice) -> Population:
+        """Draw some skins of the population that bears this name."""
+        centre, spreads, setup = self.syllabus.centre, self.syllabus.spreads, self.syllabus.setup
+        rng = rng_for(self.seed, "population", name)
+        return draw_population(centre, spreads, setup, which, rng, self.forces_N)
+
+    def tables(self) -> Tables:
+        """Tabulate the skin as designed, for the map."""
+        first, last = np.log(self.forces_N)
+        forces_N = np.exp(np.linspace(first, last, 1 + int(np.ceil((last - first) / STEPS_OF_FORCE))))
+        return tabulate(self.syllabus.centre, self.syllabus.spreads, self.syllabus.setup, forces_N)
+
+
+def lesson_of(design: SkinDesign, kind: BoardKind, depths_mm: tuple[float, ...], seed: int) -> Lesson:
+    """Put a designed skin over designed boards: the law's numbers as the design has them, its slide included."""
+    if design.hold is None:
+        remedy = "Ask this question of a scene whose skin has hold."
+        raise ParamsError("params.yaml: skin", "hold", "that of a skin that slides, as the law's", "null", remedy)
+    stiffness_N_mm2 = design.hold.force_per_modulus * design.modulus_kPa * 1e-3
+    law = Law(
+        0.0, 0.0, 0.0, kind.design.gap_mm, 1.0, 0.0, 0.0, stiffness_N_mm2, design.hold.away_um_mm,
+        *design.hold.give_um, lets_go_N=design.hold.lets_go_mm2 * stiffness_N_mm2,
+    )  # fmt: skip
+    chips_mm = np.array(kind.design.places_mm)
+    setup = Setup(design, chips_mm, kind.design.gap_mm, kind.skin_mm, design.flipped, design.tip_radius_mm)
+    deep_m = 1e-3 * np.array([min(depths_mm), max(depths_mm)])
+    ends_N = force_at(deep_m, stiffness_N_m2=1e6 * stiffness_N_mm2, thickness_m=setup.thickness_m) * FORCE_SHARES
+    syllabus = Syllabus("as designed", law, OF_RIG, setup, follows_law=True)
+    return Lesson(syllabus, (float(ends_N[0]), float(ends_N[1])), seed)
+
+
+def draw(lesson: Lesson, skins_n: int, tell: Callable[[str], None]) -> Population:
+    """Draw a population part by part."""
+    parts = []
+    for first in range(0, skins_n, PART_N):
+        which = slice(first, min(first + PART_N, skins_n))
+        parts.append(_once(lesson, f"skins {which}", partial(_stack_of, lesson, which)))
+        tell(f"{which.stop} of {skins_n} skins are drawn")
+    return _unstack(np.concatenate(parts))
+
+
+def network(lesson: Lesson, skins: Population, skins_n: int, steps_n: int) -> Weights:
+    """Train a network on the first skins of a population."""
+    first = Population(*(getattr(skins, name)[:skins_n] for name in Population.__annotations__))
+    rng_name = (lesson.seed, "population", "network")  # without the number: equal first weights
+    empty = draw_weights(skins.rest_uT.shape[1], rng_for(*rng_name))
+
+    def teach() -> Float[np.ndarray, " w"]:
+        weights, _ = train(first, lesson.syllabus, steps_n, rng_for(*rng_name))
+        return np.concatenate([weights[name].ravel() for name in empty])
+
+    flat, found, start = _once(lesson, f"network of {skins_n} skins, {steps_n} steps", teach), {}, 0
+    for name, value in empty.items():
+        found[name] = flat[start : start + value.size].reshape(value.shape)
+        start += value.size
+    return found
+
+
+def _once(lesson: Lesson, what: str, make: Callable[[], np.ndarray]) -> np.ndarray:
+    """Give what is kept under this name and these lessons; the first skin's fields stand for all physics below."""
+    seen = hashlib.sha256(_stack_of(lesson, slice(1)).tobytes()).hexdigest()
+    spreads = sorted(lesson.syllabus.spreads.items())
+    name = f"{what}; {lesson.syllabus.centre}; {spreads}; {lesson.forces_N}; seed {lesson.seed}; {seen}"
+    found = kept.load(PACKAGE, name)
+    if found is None:
+        found = make()
+        kept.save(PACKAGE, name, found)
+    return found
+
+
+def _stack_of(lesson: Lesson, which: slice) -> np.ndarray:
+    return _stack(lesson.skins("taught", which))
+
+
+def _stack(skins: Population) -> np.ndarray:
+    rest_uT = np.repeat(skins.rest_uT[:, None], skins.db_uT.shape[1], axis=1)
+    return np.concatenate([skins.db_uT, rest_uT, skins.place_mm, skins.force_N[..., None]], axis=2)
+
+
+def _unstack(stacked: np.ndarray) -> Population:
+    channels_n = (stacked.shape[2] - 3) // 2
+    db_uT, rest_uT, place_mm, force_N = np.split(stacked, (channels_n, 2 * channels_n, -1), axis=2)
+    return Population(db_uT, rest_uT[:, 0], place_mm, force_N[..., 0])

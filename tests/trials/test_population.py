@@ -1,0 +1,46 @@
+"""Experts read skins of their population: no poke is shown and asked, labels gain, the weight is one more reading."""
+
+import numpy as np
+import pytest
+
+from pipeline.core.seeds import rng_for
+from pipeline.trials.population import WAYS, WEIGHT_N, Experts, cases_of, ready, scores_of, trust
+from pipeline.twin.network import draw_weights
+from pipeline.twin.skin_map import new_map
+from tests.twin.skins import made_population, made_tables
+
+
+@pytest.fixture(scope="module")
+def experts() -> Experts:
+    return Experts(new_map(made_tables()), [draw_weights(15, rng_for(0, "population"))])
+
+
+@pytest.fixture(scope="module")
+def cases():
+    return cases_of(made_population(3, rng_for(1, "population")), rng_for(2, "population"))
+
+
+def test_no_poke_that_is_shown_is_asked(cases):
+    for case in cases:
+        shown, asked = ({tuple(row) for row in part} for part in (case.pool.db_uT, case.test_uT))
+        assert not shown & asked
+        assert len(np.unique(case.pool.place_mm.round(0), axis=0)) == len(case.pool.place_mm)  # one a place
+
+
+def test_an_untaught_network_spoils_no_map_and_labels_gain(experts, cases):
+    how = trust(experts, cases, (0, 0))
+    rows = [row for told in ((0, 0), (65, 40)) for case in cases for row in scores_of(experts, case, told, how)]
+    off_N2 = {
+        (way, n): np.mean([row["mse_f_N2"] for row in rows if (row["way"], row["labels_n"]) == (way, n)])
+        for way in WAYS
+        for n in (0, 40)
+    }
+    assert off_N2["map", 40] < off_N2["map", 0] < off_N2["network", 0]
+
+
+def test_a_weight_is_known_and_the_rows_are_not(experts, cases):
+    case = cases[0]
+    asked = ready(experts, case, (16, 0)).read_uT
+    at = np.abs(np.log(case.pool.force_N / WEIGHT_N)).argmin()
+    np.testing.assert_array_equal(asked[-1], case.pool.db_uT[at])
+    np.testing.assert_array_equal(asked[:-1], case.test_uT)
