@@ -23,6 +23,8 @@ def test_the_same_seed_draws_the_same_skins_however_many_more_are_drawn(monkeypa
     for field in fields(one):
         np.testing.assert_array_equal(getattr(one, field.name), getattr(two, field.name)[:1])
     assert not np.allclose(two.rest_uT[0], two.rest_uT[1])
+    second = draw_population(NOMINAL, OF_NOMINAL, SETUP, slice(1, 2), rng_for(0, "skins"))
+    np.testing.assert_array_equal(second.db_uT[0], two.db_uT[1])
 
 
 def test_numbers_spread_as_the_table_says_and_stay_where_skins_can_be():

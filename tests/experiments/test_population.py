@@ -1,0 +1,91 @@
+"""A scene's experts are taught the skin as designed; what is killed goes on; a pool is one poke at each place."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pipeline.core.seeds import rng_for
+from pipeline.dataset.rows import Rows
+from pipeline.dataset.splits import Fold
+from pipeline.experiments.population import show, taught
+from pipeline.experiments.population.run import cases, over_boards
+from pipeline.synthesis.settings import BoardKind
+from pipeline.trials.experts import Frame
+from pipeline.twin.population import Population
+from tests.twin.skins import DESIGN, made_population
+
+KIND = BoardKind(
+    letter="b", boards_n=1, skins_per_board_n=1, skin_mm=(20.0, 20.0), quadrature={"cell_mm": 0.8, "layers_n": 5},
+    design={"chips_xy_mm": ((0.0, 0.0),), "chips_turn_deg": (0.0,), "gap_mm": 1.1},
+)  # fmt: skip
+STAT = {"mean": 90.0, "sd": 2.0, "n": 6}
+METRICS = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2", "mse_f_weight_N2", "coverage_pct")
+
+
+def test_the_designed_skin_is_the_law_that_its_scene_simulates():
+    lesson = taught.lesson_of(DESIGN, KIND, (0.2, 1.2), seed=0)
+    law = lesson.syllabus.centre
+    assert (law.gap_mm, law.amplitude, law.away_um_mm) == (1.1, 1.0, DESIGN.hold.away_um_mm)
+    assert law.stiffness_N_mm2 == pytest.approx(0.8625)  # 345 kPa times 2.5
+    assert lesson.forces_N[0] < 0.05 < 5 < lesson.forces_N[1]  # of 0.2 and 1.2 mm
+    with pytest.raises(ValueError, match="hold must be"):
+        taught.lesson_of(DESIGN.model_copy(update={"hold": None}), KIND, (0.2,), seed=0)
+
+
+def test_a_killed_run_draws_no_part_again(monkeypatch):
+    drawn, shelf = [], {}
+    whole = made_population(7, rng_for(0, "skins"))
+
+    def skins(_: str, which: slice) -> Population:
+        drawn.append(which)
+        return Population(*(getattr(whole, name)[which] for name in Population.__annotations__))
+
+    syllabus = SimpleNamespace(spreads={}, centre=None)
+    lesson = SimpleNamespace(skins=skins, syllabus=syllabus, forces_N=(1.0, 2.0), seed=0)
+    monkeypatch.setattr(taught, "PART_N", 3)
+    monkeypatch.setattr(taught.kept, "load", lambda _, name: shelf.get(name))
+    monkeypatch.setattr(taught.kept, "save", lambda _, name, part: shelf.update({name: part}))
+    taught.draw(lesson, 6, lambda line: None)
+    drawn.clear()
+    found = taught.draw(lesson, 7, lambda line: None)
+    assert [which for which in drawn if which != slice(1)] == [slice(6, 7)]  # the first skin is a part of the names
+    for name in Population.__annotations__:
+        np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))
+
+
+def test_a_skins_pool_is_one_poke_at_each_place_and_none_of_it_is_tested():
+    places_n, depths_n, readings_n = 4, 3, 2
+    poke = np.repeat(np.arange(2 * places_n * depths_n), readings_n)  # two passes
+    target = np.stack([poke % places_n, poke % places_n, 1 + poke], axis=1).astype(np.float32)
+    names = (np.full(len(poke), name) for name in ("c", "b0", "b0_s0"))
+    pass_i = (poke // (places_n * depths_n)).astype(np.int32)
+    rows = Rows(*names, np.tile(poke[:, None], (1, 3)).astype(np.float32), target, pass_i, poke, {})
+    fold = Fold("lobo", "b0", np.zeros(0, np.int64), np.flatnonzero(pass_i == 1), np.flatnonzero(pass_i == 0))
+    data = SimpleNamespace(rows=rows, settings=SimpleNamespace(seed=0))
+    (case,) = cases(data, fold, Frame(np.eye(3)[None], (8.0, 8.0), mirrored=False), {"b0_s0": np.zeros(3)})
+    assert sorted((case.pool.place_mm[:, 0] + 8).tolist()) == [0, 1, 2, 3]
+    np.testing.assert_array_equal(case.pool.db_uT[:, 0] + 1, case.pool.force_N)  # the readings of that poke
+    assert not set(case.pool.force_N) & set(case.true[:, 2])
+    assert len(case.true) == len(fold.test)
+
+
+def test_tables_and_figure_show_every_way():
+    rows = [{"way": way, "pokes_n": 65, "labels_n": 0, **dict.fromkeys(METRICS, STAT)} for way in show.NAMES]
+    numbers = {
+        "told": rows, "scaling": [row | {"skins_n": n} for row in rows for n in (30, 3000)], "steps_n": 5,
+        "pool_n": 65, "skins_asked_n": 12, "coverage_further_pct": {"map": 90.0},
+    }  # fmt: skip
+    tables = show.tables(numbers, "simulated")
+    assert len(tables["population"]) == 3
+    assert set(tables["population_scaling"]["skins taught"]) == {"30", "3000"}
+    assert all("universal" in method for method in tables["population"]["method"])
+    assert "skins that the network was taught" in show.figures(numbers, {}, "simulated")["population_scaling.svg"]
+
+
+def test_boards_are_the_unit():
+    told = {"way": "map", "pokes_n": 0, "labels_n": 0}
+    rows = pd.DataFrame(told | {"board": ["b0", "b0", "b1"], "accuracy_pct": [1.0, 3.0, 6.0]})
+    (found,) = over_boards(rows, "way", "pokes_n", "labels_n")
+    assert (found["accuracy_pct"]["mean"], found["accuracy_pct"]["n"]) == (4.0, 2)
