@@ -103,15 +103,22 @@ def ready(experts: Experts, case: Case, told: Told) -> Ready:
 def trust(experts: Experts, cases: Sequence[Case], told: Told) -> Trust:
     """Tell on skins that are not scored how sure each way is, and how far one known weight moves its forces."""
     held = {way: np.zeros((len(TEMPERS), len(cases))) for way in WAYS}
-    off = {way: np.zeros((2, len(cases))) for way in WAYS}  # of log F: the weight's, and the mean of all others
+    # Of log F, by temper: how far the weight is off, and the mean of all others.
+    off = {way: np.zeros((len(TEMPERS), 2, len(cases))) for way in WAYS}
     for j, case in enumerate(cases):
         told_of = ready(experts, case, told)
         for i, temper in enumerate(TEMPERS):
             for way, found in told_of.answers(dict.fromkeys(WAYS, temper)).items():
                 held[way][i, j] = _held(found, case)
-                off[way][:, j] = _off_log_N(found, case)
-    tempers = {way: TEMPERS[int(np.abs(held[way].mean(axis=1) - 0.9).argmin())] for way in WAYS}
-    return Trust(tempers, {way: float(off[way][0] @ off[way][1] / (off[way][0] @ off[way][0])) for way in WAYS})
+                off[way][i, :, j] = _off_log_N(found, case)
+    chosen_i = {way: int(np.abs(held[way].mean(axis=1) - 0.9).argmin()) for way in WAYS}
+    shares = {way: share_of(*off[way][i]) for way, i in chosen_i.items()}
+    return Trust({way: TEMPERS[i] for way, i in chosen_i.items()}, shares)
+
+
+def share_of(weight_off: Float[np.ndarray, " s"], others_off: Float[np.ndarray, " s"]) -> float:
+    """Give what part of how far log F is off for the weight is to be taken from all others, by least squares."""
+    return float(weight_off @ others_off / (weight_off @ weight_off))
 
 
 def scores_of(experts: Experts, case: Case, told: Told, how: Trust) -> list[dict[str, Any]]:

@@ -75,7 +75,7 @@ def test_tables_and_figure_show_every_way():
     rows = [{"way": way, "pokes_n": 65, "labels_n": 0, **dict.fromkeys(METRICS, STAT)} for way in show.NAMES]
     numbers = {
         "told": rows, "scaling": [row | {"skins_n": n} for row in rows for n in (30, 3000)], "steps_n": 5,
-        "pool_n": 65, "skins_asked_n": 12, "coverage_further_pct": {"map": 90.0},
+        "pool_n": 65, "skins_asked_n": 12, "rows_asked_n": 24000, "coverage_further_pct": {"map": 90.0},
     }  # fmt: skip
     tables = show.tables(numbers, "simulated")
     assert len(tables["population"]) == 3

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 
 from pipeline.core.seeds import rng_for
+from pipeline.trials import population
 from pipeline.trials.population import WAYS, WEIGHT_N, Experts, cases_of, ready, scores_of, trust
+from pipeline.trials.universal import TEMPERS
 from pipeline.twin.network import draw_weights
-from pipeline.twin.skin_map import new_map
+from pipeline.twin.skin_map import Estimate, new_map
 from tests.twin.skins import made_population, made_tables
 
 
@@ -44,3 +46,24 @@ def test_a_weight_is_known_and_the_rows_are_not(experts, cases):
     at = np.abs(np.log(case.pool.force_N / WEIGHT_N)).argmin()
     np.testing.assert_array_equal(asked[-1], case.pool.db_uT[at])
     np.testing.assert_array_equal(asked[:-1], case.test_uT)
+
+
+def test_the_share_of_a_weight_is_told_at_the_temper_that_is_used(cases, monkeypatch):
+    # Forces are off by a factor that grows with the temper; intervals of one temper alone hold 90 %.
+    class Told:
+        def __init__(self, case):
+            self.case = case
+
+        def answers(self, tempers):
+            temper, case = tempers["map"], self.case
+            reach = 10.0 if temper == TEMPERS[1] else 0.0
+            true_mm, at = np.vstack([case.true[:, :2], [[0, 0]]]), np.abs(np.log(case.pool.force_N / WEIGHT_N)).argmin()
+            of_weight = case.pool.force_N[at] * np.exp(0.1)
+            force_N = np.append(case.true[:, 2] * np.exp(temper), of_weight)
+            found = Estimate(true_mm + 0.1, np.full_like(true_mm, reach), force_N, np.full(len(force_N), np.nan))
+            return dict.fromkeys(WAYS, found)
+
+    monkeypatch.setattr(population, "ready", lambda experts, case, told: Told(case))
+    how = trust(None, cases, (0, 0))
+    assert set(how.temper.values()) == {TEMPERS[1]}
+    assert how.weight_share == pytest.approx(dict.fromkeys(WAYS, TEMPERS[1] / 0.1))

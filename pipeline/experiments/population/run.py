@@ -1,4 +1,4 @@
-"""Stage population: experts that were taught simulated skins only, on the held-out rows that table 2 is scored on.
+"""Stage population: experts that were taught simulated skins only, on held-out rows of those that table 2 is scored on.
 
 They know the skin and the board as designed; none of the scene's own skins. Further skins of the population tell how
 sure they are.
@@ -31,7 +31,7 @@ from pipeline.twin.network import Weights
 from pipeline.twin.skin_map import new_map
 
 QUESTION = "lobo"  # whose folds these are: their pools are those of adaptation
-POOL_N = 65  # pokes: one at each place of the grid, under any of its depths
+POOL_MAX_N = 65  # pokes: one at each place of the paper's grid, under any of its depths
 TESTED_MAX_N = 2000  # rows of a skin that are read, drawn
 ASKED_FURTHER_N = 16  # skins of the population that tell how sure experts are
 
@@ -39,8 +39,8 @@ ASKED_FURTHER_N = 16  # skins of the population that tell how sure experts are
 class Asked(Taught):
     """Section population: what experts are taught, and what they are told of each skin."""
 
-    unlabelled_n: Annotated[tuple[Annotated[int, Field(ge=0, le=POOL_N)], ...], Field(min_length=1)]
-    labels_n: tuple[Annotated[int, Field(ge=1, le=POOL_N)], ...]
+    unlabelled_n: Annotated[tuple[Annotated[int, Field(ge=0, le=POOL_MAX_N)], ...], Field(min_length=1)]
+    labels_n: tuple[Annotated[int, Field(ge=1, le=POOL_MAX_N)], ...]
 
     def told(self) -> list[Told]:
         """List what experts are told: ever more pokes, then all of them and ever more labels."""
@@ -63,7 +63,7 @@ def cases(data: SceneData, fold: Fold, frame: Frame, rest_uT: dict[str, np.ndarr
 
 
 def _pool(data: SceneData, own: np.ndarray, frame: Frame, rng: np.random.Generator) -> Pokes:
-    # Of each place one indentation of those that are felt, the mean of its readings.
+    # Of each place one indentation, the mean of its readings.
     rows = data.rows
     first = np.unique(rows.indentation[own], return_index=True)[1]
     _, place_i = np.unique(rows.target[own[first], :2].round(2), axis=0, return_inverse=True)
@@ -136,7 +136,8 @@ def population(scene: str, files: Files, folds: Path, indentations: Path, answer
     numbers = {
         "told": over_boards(rows, "way", "pokes_n", "labels_n"),
         "scaling": over_boards(sizes, "way", "pokes_n", "labels_n", "skins_n"),
-        "skins_asked_n": len(asked), "steps_n": section.steps_n, "pool_n": POOL_N, **words,
+        "skins_asked_n": len(asked), "rows_asked_n": sum(len(case.true) for case in asked),
+        "pool_n": min(len(case.pool.force_N) for case in asked), "steps_n": section.steps_n, **words,
     }  # fmt: skip
     write_answer(answer, numbers, {})
 

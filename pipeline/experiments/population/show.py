@@ -42,7 +42,8 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
         axes.set(xscale="log", xlabel="simulated skins that the network was taught", ylim=(0, None))
         axes.set_ylabel("error above 1 mm / %")
         axes.legend(frameon=False)
-        axes.set_title(f"{numbers['steps_n']} steps each, skins of six or more boards ({source})", fontsize=9)
+        boards_n = rows["accuracy_pct"].iloc[0]["n"]
+        axes.set_title(f"{numbers['steps_n']} steps each, skins of {boards_n} boards ({source})", fontsize=9)
         return {"population_scaling.svg": svg(figure)}
 
 
@@ -57,16 +58,16 @@ def _meaning(numbers: Mapping[str, Any]) -> str:
     coverage = ", ".join(f"{NAMES[way]} {pct:.3g} %" for way, pct in numbers["coverage_further_pct"].items())
     return (
         f"Experts that were taught simulated skins about the skin as designed, and none of the scene's "
-        f"{numbers['skins_asked_n']}, of which rows of later passes are read. Unlabelled pokes: one at each of the "
-        f"{numbers['pool_n']} places of the grid under any depth, or the first of these; labels are among them. The "
-        "weight: the force of one of these pokes is known, its place is not. How sure each way is, and how far a "
-        "weight moves its forces, was told on further skins of the population; there 90 % intervals hold "
-        f"{coverage}."
+        f"{numbers['skins_asked_n']}, of which {numbers['rows_asked_n']:,} rows of later passes are read. Unlabelled "
+        f"pokes: one at each of the {numbers['pool_n']} places of the grid under any depth, or the first of these; "
+        "labels are among them. The weight: the force of one of these pokes is known, its place is not. How sure each "
+        "way is, and how far a weight moves its forces, was told on further skins of the population; there 90 % "
+        f"intervals hold {coverage}."
     )
 
 
 def _scaling(numbers: Mapping[str, Any]) -> str:
     return (
         f"Networks of {numbers['steps_n']} steps each, from equal first weights, on the first so many skins of one "
-        "population; the map beside them is the same."
+        "population; the map beside them is the same, and so is how sure they are, told with the network of most skins."
     )

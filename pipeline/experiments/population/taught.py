@@ -8,6 +8,7 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated
 
@@ -17,6 +18,7 @@ from pydantic import Field
 
 import pipeline.twin
 from pipeline.core import kept
+from pipeline.core.code import digest, imported
 from pipeline.core.config import Strict
 from pipeline.core.errors import ParamsError
 from pipeline.core.seeds import rng_for
@@ -30,6 +32,7 @@ from pipeline.twin.tables import OF_RIG, Tables, tabulate
 from pipeline.twin.training import Syllabus, train
 
 PACKAGE = Path(pipeline.twin.__file__).parent
+TRAINS = "pipeline.twin.training"
 PART_N = 100  # skins that are kept together
 STEPS_OF_FORCE = 0.6  # at most, of log F between two tabulated forces
 FORCE_SHARES = (0.7, 1.5)  # of the least and of the largest force of the skin as designed: skins differ
@@ -112,7 +115,9 @@ def _once(lesson: Lesson, what: str, make: Callable[[], np.ndarray]) -> np.ndarr
     """Give what is kept under this name and these lessons; the first skin's fields stand for all physics below."""
     seen = hashlib.sha256(_stack_of(lesson, slice(1)).tobytes()).hexdigest()
     spreads = sorted(lesson.syllabus.spreads.items())
-    name = f"{what}; {lesson.syllabus.centre}; {spreads}; {lesson.forces_N}; seed {lesson.seed}; {seen}"
+    code = [digest(module) for module in imported(TRAINS)]
+    of = f"torch {version('torch')}; {code}; {seen}"
+    name = f"{what}; {of}; {lesson.syllabus.centre}; {spreads}; {lesson.forces_N}; seed {lesson.seed}"
     found = kept.load(PACKAGE, name)
     if found is None:
         found = make()
