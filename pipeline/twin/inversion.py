@@ -1,8 +1,8 @@
 """Physics inversion: pokes at unknown places and the field at rest -> a law; readings -> places and forces in it.
 
-Least squares throughout, nothing learnt from another board: the rival of maps and networks. What a search leaves over
-tells a skin that the law does not know. Places in the board's frame, in mm; fields in its axes, in uT. Refuses to know
-recordings, folds and scores.
+Least squares throughout, from nominal numbers, no reading of another board: the rival of maps and networks. What a
+search leaves over tells a skin that the law does not know. Places in the board's frame, in mm; fields in its axes, in
+uT. Refuses to know recordings, folds and scores.
 """
 
 from dataclasses import dataclass

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 from scipy.linalg import solve_triangular
 
+from pipeline.core.errors import SchemaError
 from pipeline.twin.gaussians import products, quadratic
 from pipeline.twin.hypotheses import Hypotheses, NOISE_uT, lattice
 from pipeline.twin.residual import Relative, Residual, kernel, no_residual
@@ -158,6 +159,10 @@ class Reader:
         self._row, self._log_det = quadratic(
             expected_uT, spread_uT, length_uT**2 * left, self._of.error_cov.astype(np.float32), NOISE_uT**2
         )
+        if not np.isfinite(self._log_det).all():
+            rule, got = "positive definite", f"{int((~np.isfinite(self._log_det)).sum())} that are not"
+            remedy = "Take the no-load reading again."
+            raise SchemaError("a map of a skin", "covariances of its hypotheses", rule, got, remedy)
 
     def _labelled(self, skin: SkinMap) -> tuple[Float32[np.ndarray, "h ch"], Float32[np.ndarray, " h"]]:
         # What the law misses everywhere, and the part of its error that labels leave.

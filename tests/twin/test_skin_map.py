@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeline.core.errors import SchemaError
 from pipeline.core.seeds import rng_for
 from pipeline.twin import skin_map
 from pipeline.twin.hypotheses import LAW_ERROR, NOISE_uT
@@ -92,3 +93,9 @@ def test_pokes_that_lie_evenly_tell_where_the_labels_middle_is(skin):
     _, _, db_uT = pokes(shifted)
     found = see_even(skin, db_uT)
     assert np.linalg.norm((found.number - shifted)[:2]) < 0.5 * np.linalg.norm(shifted)
+
+
+def test_a_spread_that_is_no_covariance_is_an_error_and_no_answer_of_nan(skin):
+    broken = replace(skin, hypotheses=replace(skin.hypotheses, error_cov=-1e6 * skin.hypotheses.error_cov))
+    with pytest.raises(SchemaError, match="covariances of its hypotheses must be positive definite"):
+        Reader(broken)

@@ -13,7 +13,7 @@ NONE = "–"
 WHY = {
     "channels matched": "undoes a gain of each channel; a seat or a turn mixes channels, and where forces differ so do "
     "deviations",
-    "CORAL": "also undoes what mixes channels, as far as 65 pokes tell all their covariances; many maps have the same "
+    "CORAL": "also undoes what mixes channels, as far as the pokes tell all their covariances; many maps have the same "
     "covariances, and it knows not which keeps places",
     "direct standardisation": "knows which places belong together, but has as many unknowns as channels squared, and a "
     "linear map is not how a seat changes a field",
@@ -33,9 +33,10 @@ BASELINES = (
 OF_TOLD = (
     "No label of the held-out board. Paired: difference to the same method told the skin's own pokes, board by board. "
     "Physics inversion: a law's eight numbers, and place and force of each poke, by least squares from nominal "
-    "numbers; then each reading is searched in that law. Centred: places shifted so that the pokes' mean is the "
-    "middle, as maps and networks assume too. Its stiffness is nominal, so its forces are in nominal units. Another "
-    "skin's: the pokes of the next board, beside the held-out board's own field at rest."
+    "numbers, whose stiffness and slide are the middle of recorded boards, these included; then each reading is "
+    "searched in that law. Centred: places shifted so that the pokes' mean is the middle, as maps and networks assume "
+    "too. Its stiffness is nominal, so its forces are in nominal units. Another skin's: the pokes of "
+    "the next board, beside the held-out board's own field at rest."
 )
 OF_ALARM = (
     "Left over: |dB - simulated| / |dB| of the best place in the law, the median over readings. The alarm is raised "
