@@ -21,6 +21,8 @@ from pipeline.labelling.source import Desk, Source
 
 POLL_s = 0.05
 ENDS = ("q", "quit", "end")
+# A place, a force, or both with a blank between: else 12N would be place 1 with 2 N.
+ANSWER = re.compile(r"(?:(\d{1,5})(?:\s+|$))?(?:(\d{1,3}(?:\.\d{1,4})?)\s*[nN])?")
 Say = Callable[[str], object]
 
 
@@ -70,7 +72,7 @@ class Prompts:
     def _answer(self, typed: Iterator[str], place_i: int) -> Label | None:
         """Give the label that a person means; None at the end, one without contact for a place that is passed over."""
         for words in typed:
-            found = re.fullmatch(r"(?:(\d{1,5}))?\s*(?:(\d{1,3}(?:\.\d{1,4})?)\s*[nN])?", words)
+            found = ANSWER.fullmatch(words)
             if words in ENDS:
                 return None
             if words == "s":

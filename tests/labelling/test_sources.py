@@ -102,6 +102,18 @@ def test_another_index_a_force_and_a_slip_of_the_finger_are_understood(desk, tmp
     assert len([line for line in said if "is no place" in line]) == 2
 
 
+@pytest.mark.parametrize(
+    ("words", "x_mm", "force_N"),
+    [("12N", 0, 12), ("10N", 0, 10), ("10.5N", 0, 10.5), ("3 2.5N", 3, 2.5), ("3", 3, np.nan), ("12", 12, np.nan)],
+)
+def test_a_force_is_never_cut_into_a_place_and_a_smaller_one(desk, tmp_path, words, x_mm, force_N):
+    asked, said = prompts(["", "3.5", "1 2", "12N3", "1.2.3N", "3 N N", words, "", "q"], scan="snake", text="line:13:1")
+    asked.run(desk)
+    log = log_of(tmp_path)
+    np.testing.assert_equal((log.x_mm[1], log.Fz_N[1]), (x_mm, force_N))
+    assert len([line for line in said if "is no place" in line]) == 5
+
+
 def test_a_snake_goes_there_and_back_and_places_that_are_none_are_refused():
     assert parse_places("grid:3x2:4").order("snake", rng_for(0, "x")) == [0, 1, 2, 5, 4, 3]
     assert parse_places("robot.csv") is None
