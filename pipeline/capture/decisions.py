@@ -3,6 +3,7 @@
 Refuses to find faults (`faults`, `limits`), and to know what is done with the rows that are left.
 """
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -68,7 +69,10 @@ def decide(usual: Decisions, words: Iterable[str], where: str) -> Decisions:
 
 @dataclass
 class Found:
-    """How often a fault was seen, first and last where (s of the stream, or rows from 1), and what was decided."""
+    """How often a fault was seen, first and last where (s of the stream, or rows from 1), and what was decided.
+
+    Where is NaN as long as no time is known: bytes that came last before a recorder was killed may have none.
+    """
 
     count_n: int
     first: float
@@ -93,20 +97,24 @@ class Ledger:
         """Count a fault where it is marked, or as many as is said; give the marks of what is dropped for it."""
         decision: Decision = getattr(self._decisions, fault)
         if marks.any():
-            first, last = (float(at[i]) for i in np.flatnonzero(marks)[[0, -1]])
+            known = at[marks & np.isfinite(at)]
+            first, last = (float(known[0]), float(known[-1])) if len(known) else (math.nan, math.nan)
             count_n = int(marks.sum()) if count_n is None else count_n
             if decision == "refuse":
-                got = f"{count_n}, the first at {self._unit} {first * PER_UNIT[self._unit]:.0f}"
+                place = f"{self._unit} {first * PER_UNIT[self._unit]:.0f}" if len(known) else "an unknown time"
+                got = f"{count_n}, the first at {place}"
                 raise CaptureError(self._where, fault.replace("_", " "), "nowhere, as was decided", got, REMEDY)
             before = self.found.setdefault(fault, Found(0, first, last, decision))
-            before.count_n, before.last = before.count_n + count_n, last
+            before.count_n += count_n
+            before.first, before.last = float(np.fmin(before.first, first)), float(np.fmax(before.last, last))
         return marks if decision == "drop" else np.zeros_like(marks)
 
     def account(self) -> dict[str, int]:
-        """Say of each fault its count, decision and span, as accounts do; of a sound recording, nothing."""
+        """Say of each fault its count, decision and, if known, span, as accounts do; of a sound recording, nothing."""
         told: dict[str, int] = {}
         for name, one in self.found.items():
             told[f"fault_{name}_{DONE[one.decision]}_n"] = one.count_n
-            told[f"fault_{name}_first_{self._unit}"] = round(one.first * PER_UNIT[self._unit])
-            told[f"fault_{name}_last_{self._unit}"] = round(one.last * PER_UNIT[self._unit])
+            if not math.isnan(one.last):
+                told[f"fault_{name}_first_{self._unit}"] = round(one.first * PER_UNIT[self._unit])
+                told[f"fault_{name}_last_{self._unit}"] = round(one.last * PER_UNIT[self._unit])
         return told

@@ -91,6 +91,18 @@ def test_a_chip_reset_is_refused_or_flagged():
     assert 1.0 <= watch.ledger.found["chip_reset"].first <= 3.0
 
 
+def test_a_fault_without_time_is_counted_and_leaves_the_span_as_it_is():
+    hit, unknown_s = np.ones(2, bool), np.array([3.0, np.nan])
+    ledger = Ledger(AS_USUAL, "x", "ms")
+    for at_s in (unknown_s * np.nan, unknown_s, unknown_s * np.nan):
+        ledger.note("stuck", hit, at_s)
+    assert ledger.account() == {
+        "fault_stuck_dropped_n": 6, "fault_stuck_first_ms": 3000, "fault_stuck_last_ms": 3000,
+    }  # fmt: skip
+    with pytest.raises(CaptureError, match="got 2, the first at an unknown time"):
+        Ledger(decide(AS_USUAL, ["stuck=refuse"], "t"), "x", "ms").note("stuck", hit, unknown_s * np.nan)
+
+
 def test_rows_of_somebodys_table_are_decided_likewise():
     rng, header = rng_for(0, "rows"), make_header(chips_n=2)
     b_uT, temperature_degC = rng.normal(300, 5, (200, 6)), np.full((200, 2), 25.0)

@@ -208,12 +208,17 @@ def test_a_smaller_block_gives_the_same_readings(tmp_path: Path, monkeypatch: py
 
 
 def test_a_recorder_killed_before_its_last_row_costs_the_frames_without_time(tmp_path: Path) -> None:
-    folder = write(tmp_path, "binary")
+    b_uT, temperature_degC = FRAMES.b_uT.copy(), FRAMES.temperature_degC.copy()
+    b_uT[-1, 3:6], temperature_degC[-1, 1] = FAILED_B_uT, FAILED_TEMPERATURE_degC  # a fault without time
+    frames = dataclasses.replace(FRAMES, b_uT=b_uT, temperature_degC=temperature_degC)
+    folder = write(tmp_path, "binary", frames)
     rows = (folder / ARRIVALS_FILE).read_text().splitlines(keepends=True)
     (folder / ARRIVALS_FILE).write_text("".join(rows[:-1]))
     timed_n = int(rows[-2].split(",")[0]) // 82
     _, account = read(folder, header_of("binary"))
     assert account["dropped_no_time_frames_n"] == len(FRAMES) - timed_n
+    assert account["fault_failed_read_dropped_n"] == 1
+    assert "fault_failed_read_first_ms" not in account
 
 
 def test_readings_and_account_go_to_parquet_and_back(tmp_path: Path) -> None:
