@@ -60,13 +60,15 @@ class Rows(NamedTuple):
 
 def find_whole_rows(
     b_uT: Float[np.ndarray, "f ch"], temperature_degC: Float[np.ndarray, "f k"], header: Header, *, where: str,
-    decisions: Decisions = AS_USUAL,
+    decisions: Decisions = AS_USUAL, row: Int[np.ndarray, " f"] | None = None,
 ) -> Rows:  # fmt: skip
     """Tell the rows to keep; raise if no row holds a reading of every chip, or for a fault that is refused.
 
-    A chip of another scale shows among all rows that did not fail, kept or not.
+    A chip of another scale shows among all rows that did not fail, kept or not. `row` numbers the rows as the file
+    does, if some were left out before; else they count from 1.
     """
-    ledger, row = Ledger(decisions, where, "row"), 1 + np.arange(len(b_uT))
+    ledger = Ledger(decisions, where, "row")
+    row = 1 + np.arange(len(b_uT)) if row is None else row
     drop, beyond, failed, _ = _note_readings(ledger, b_uT, temperature_degC, row)
     if failed.all():
         remedy = "Mend the wiring, and record again."
@@ -74,7 +76,7 @@ def find_whole_rows(
     rows = np.flatnonzero(~failed)
     for block in np.array_split(rows, max(1, len(rows) // GRID_ROWS_N)):
         with noting_reset(ledger, decisions, row[block]):
-            _check_scale(b_uT[block], header, where=f"{where} from row {block[0] + 1}")
+            _check_scale(b_uT[block], header, where=f"{where} from row {row[block[0]]}")
     stuck = ledger.note("stuck", np.asarray(faults.stuck_chips(b_uT).any(axis=1)) & ~failed, row) & ~drop
     beyond &= ~stuck
     return Rows(~(drop | stuck | beyond), drop, stuck, beyond, ledger.account())

@@ -83,9 +83,11 @@ def read(folder: Path, header: Header, decisions: Decisions = AS_USUAL) -> tuple
         got = table.b_uT.shape[1] // 3
         raise CaptureError(where, "chips", f"{header.chips_n}, as in the header", got, "Mend header or file.")
     ledger = Ledger(decisions, where, "row")
-    written = ~ledger.note("zeros", _zero_rows(table.b_uT, where), FIRST_LINE_N - 1 + np.arange(len(table.b_uT)))
+    row = FIRST_LINE_N - 1 + np.arange(len(table.b_uT))
+    written = ~ledger.note("zeros", _zero_rows(table.b_uT, where), row)
     unknown_degC = np.full((int(written.sum()), header.chips_n), np.nan)
-    rows = find_whole_rows(table.b_uT[written], unknown_degC, header, where=where, decisions=decisions)
+    b_uT = table.b_uT[written]
+    rows = find_whole_rows(b_uT, unknown_degC, header, where=where, decisions=decisions, row=row[written])
     whole = written.copy()
     whole[written] = rows.whole
     noload = _untouched(table.b_uT, whole, where)

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.capture.faults import FAILED_B_uT
 from pipeline.capture.header import Header
 from pipeline.capture.readers import eflash7
 from pipeline.core.errors import CaptureError
@@ -62,6 +63,13 @@ def test_rows_of_zeros_are_dropped_and_counted_and_all_rows_add_up(tmp_path: Pat
     dropped_n = sum(count for name, count in account.items() if name.startswith("dropped_"))
     assert account["dropped_zero_rows_n"] == dropped_n == 1
     assert account["rows_n"] + account["noload_rows_n"] + dropped_n == account["rows_read_n"] == len(LEVELS)
+
+
+def test_a_fault_is_told_by_the_row_of_the_file_though_a_row_of_zeros_came_before(tmp_path: Path) -> None:
+    failed = ",".join([*ONE[-1].split(",")[:-3], *map(str, FAILED_B_uT)])
+    _, account = eflash7.read(write(tmp_path, [*ONE[:-1], failed]), HEADER)
+    assert account["fault_zeros_first_row"] == len(ONE) - 1
+    assert account["fault_failed_read_first_row"] == account["fault_failed_read_last_row"] == len(ONE)
 
 
 def test_forces_are_told_from_the_untouched_ones_and_compression_is_positive(tmp_path: Path) -> None:
