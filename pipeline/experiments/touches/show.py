@@ -12,7 +12,7 @@ ONCE = (
     "Each place was recorded once, so what is tested later in the same recordings may be told by the recording as well "
     "as by the place: only a recording of other days, or a place left out, is free of that."
 )
-DAYS = "The two-touch recordings are of another day, and nothing says that the pad was not taken off in between."
+APART = "Single touches and two at once are in different recordings; data/README.md says of which days."
 NO_MM = "The pitch of the 3 x 3 places is stated nowhere, so nothing is given in mm."
 
 
@@ -36,7 +36,8 @@ def _single(numbers: Mapping[str, Any]) -> pd.DataFrame:
     rows = [_row(f"place of one touch, {BY_TIME}", place["by_time"], "%", f"{place['by_time']['chance_pct']:.1f}")]
     if "one_of_two" in place:
         two = place["one_of_two"]
-        rows.append(_row("two touches, another day: answer is one of the two", two, "%", f"{two['chance_pct']:.1f}"))
+        chance = f"{two['chance_pct']:.1f}"
+        rows.append(_row("two touches, in their own recordings: answer is one of the two", two, "%", chance))
     variance = f"{force['variance']['mean']:.3g} (variance)"
     for way, words in (("by_time", BY_TIME), ("place_left_out", "at a place left out of training")):
         rows.append(_row(f"force of one touch, squared error, {words}", force[way], "N²", variance))
@@ -45,7 +46,7 @@ def _single(numbers: Mapping[str, Any]) -> pd.DataFrame:
     table.attrs["meaning"] = (
         f"{single['rows_n']} rows of {single['recordings_n']} recordings of one touch, {double['rows_n']} rows of "
         f"{double['recordings_n']} of two, with {numbers['force_min_N']:g} N or more. Place: the nearest directions of "
-        f"the change of field; force: ridge regression on it. Means and ± sd over n recordings. {ONCE} {DAYS} {NO_MM}"
+        f"the change of field; force: ridge regression on it. Means and ± sd over n recordings. {ONCE} {APART} {NO_MM}"
     )
     return table
 
@@ -79,7 +80,7 @@ def _superposition(numbers: Mapping[str, Any]) -> pd.DataFrame:
         "fitted by the mean directions of single touches at these places, each times an amplitude of 0 or more: how "
         "hard each was pressed is not recorded. A direction that changes with force counts as left over: of single "
         f"touches themselves it is {show_digits(numbers['single_touches_pct'], 0)} %. Two amplitudes fit better than "
-        f"one of themselves; the other pairs have two as well. {DAYS}"
+        f"one of themselves; the other pairs have two as well. {APART}"
     )
     return table
 
@@ -102,6 +103,6 @@ def _detection(numbers: Mapping[str, Any]) -> pd.DataFrame:
         f"Thresholds ask for {numbers['false_alarm_asked_pct']:g} % false alarms, as in question contacts, and are set "
         "on single touches between those that are known and those that are tested. A detector that calls a single "
         "touch at a place it does not know two has found what is new, not what is two: then the first column is no "
-        f"evidence for more. {DAYS}"
+        f"evidence for more. {APART}"
     )
     return table
