@@ -5,7 +5,8 @@ Refuses to know where labels come from (`samples`, `pipeline.labelling`), and fr
 
 import math
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,6 +15,7 @@ import numpy as np
 from pipeline.capture.header import PROBE_FILE
 from pipeline.capture.port import append
 from pipeline.capture.probe import CONTACT, LABELS, NOLOAD, TYPES
+from pipeline.capture.readers.table import SAME_PLACE_mm
 from pipeline.core.errors import CaptureError
 
 FLOAT32_MAX = float(np.finfo(np.float32).max)
@@ -56,6 +58,7 @@ class ProbeTape:
         self._indentation = -1
         self._end_s = -math.inf
         self._noload: Dwell | None = None
+        self._touch: Label | None = None  # the first of the touch that may go on
         self._lock = threading.Lock()
         self._file = (folder / PROBE_FILE).open("xb", buffering=0)
         append(self._file, (",".join(TYPES) + "\n").encode())
@@ -65,17 +68,26 @@ class ProbeTape:
         with self._lock:
             self._file.close()
 
-    def write(self, dwell: Dwell) -> None:
-        """Write a touch; keep a no-load dwell for the touch that follows it. A touch may go on over several dwells."""
-        _check(dwell)
+    @contextmanager
+    def held_open(self) -> Iterator[bool]:
+        """Tell whether labels are still taken; while this is asked, they cannot end."""
         with self._lock:
-            if self._file.closed:
+            yield not self._file.closed
+
+    def write(self, dwell: Dwell) -> None:
+        """Write a touch; keep a no-load dwell for the touch that follows it.
+
+        A touch may go on over several dwells, at the same place; elsewhere, it is one without a no-load dwell.
+        """
+        _check(dwell)
+        with self.held_open() as is_open:
+            if not is_open:
                 return
             if dwell.t_start_s < (self._noload.t_end_s if self._noload else self._end_s):
                 self.out_of_order_n += 1
             elif not dwell.label.contact:
                 self._noload = dwell
-            elif self._noload is None and self._indentation < 0:
+            elif self._noload is None and not (self._touch and same_place(self._touch, dwell.label)):
                 self.without_noload_n += 1
             else:
                 self._append(dwell)
@@ -86,12 +98,21 @@ class ProbeTape:
 
     def _append(self, touch: Dwell) -> None:
         opens = self._noload is not None
+        self._touch = touch.label if opens else self._touch
         indentation = self._indentation + opens
         pass_i = touch.label.pass_i
         rows = [_row(dwell, indentation, pass_i) for dwell in (self._noload, touch) if dwell is not None]
         append(self._file, "".join(rows).encode())
         self._indentation, self._end_s, self._noload = indentation, touch.t_end_s, None
         self.touches_n += opens
+
+
+def same_place(a: Label, b: Label) -> bool:
+    """Tell whether two labels are of one place; of two that are not known, nothing says otherwise."""
+    return all(
+        abs(a_mm - b_mm) <= SAME_PLACE_mm or (math.isnan(a_mm) and math.isnan(b_mm))
+        for a_mm, b_mm in ((a.x_mm, b.x_mm), (a.y_mm, b.y_mm))
+    )
 
 
 def _row(dwell: Dwell, indentation: int, pass_i: int) -> str:

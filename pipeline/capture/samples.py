@@ -8,9 +8,8 @@ import re
 from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
-from pipeline.capture.labels import Dwell, Label
+from pipeline.capture.labels import Dwell, Label, same_place
 from pipeline.capture.probe import CONTACT, LABELS, NOLOAD
-from pipeline.capture.readers.table import SAME_PLACE_mm
 from pipeline.core.errors import CaptureError
 
 CLOCKS = ("unix_s", "t_s")  # this machine's, or one of the source's own
@@ -155,11 +154,7 @@ def _goes_on(first: Sample, last: Sample, sample: Sample) -> bool:
     a, b = first.label, sample.label
     if a is None or b is None or a.contact != b.contact or a.pass_i != b.pass_i or sample.t_s < last.t_s:
         return False
-    return not a.contact or (_same(a.x_mm, b.x_mm) and _same(a.y_mm, b.y_mm))
-
-
-def _same(a_mm: float, b_mm: float) -> bool:
-    return abs(a_mm - b_mm) <= SAME_PLACE_mm or (math.isnan(a_mm) and math.isnan(b_mm))
+    return not a.contact or same_place(a, b)
 
 
 def _touches(force_N: float) -> bool | None:

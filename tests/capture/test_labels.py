@@ -36,6 +36,18 @@ def test_a_touch_is_written_with_the_rest_before_it_and_not_before(tmp_path):
     tape.write(Dwell(Label(True, 1.0, 1.0), 8.0, 9.0))  # of a program that was not waited for
 
 
+def test_a_touch_that_goes_on_elsewhere_without_a_lift_is_left_out(tmp_path):
+    tape = ProbeTape(tmp_path)
+    places = [(4.0, 8.0), (4.001, 8.0), (5.0, 8.0), (4.0, 9.0), (math.nan, 8.0), (4.0, 8.0)]
+    tape.write(Dwell(Label(False), 0.0, 1.0))
+    for i, (x_mm, y_mm) in enumerate(places):
+        tape.write(Dwell(Label(True, x_mm, y_mm), i + 1.0, i + 2.0))
+    tape.close()
+    log = probe.parse(tmp_path / PROBE_FILE, "log")
+    assert log.t_start_s.tolist() == [0.0, 1.0, 2.0, 6.0]
+    assert (tape.touches_n, tape.without_noload_n) == (1, 3)
+
+
 @settings(max_examples=60)
 @given(st.lists(DWELL, max_size=12))
 def test_any_labels_make_a_log_that_can_be_read(tmp_path_factory, dwells):
