@@ -60,10 +60,12 @@ def record_capture(
         if told.labels is not None:
             labeller = Labeller(told.labels, _desk(part, headers, stop))
         done = record(port, part, settings=settings, stop=stop, report=report, watch=watch)
-    except CaptureError:
+    except CaptureError as error:
         if labeller is not None:
             labeller.end()
         io.remove(part)  # no frame came: there is nothing to keep
+        if labeller is not None and labeller.failed is not None:  # this ended the recording, before a frame came
+            raise labeller.failed from error
         raise
     said = labeller.end() if labeller is not None else ""
     failed = labeller.failed if labeller is not None else None
@@ -77,18 +79,21 @@ def record_capture(
 def _desk(part: Path, headers: list[Header], stop: threading.Event) -> Desk:
     """Lay out what a source of labels works with; its clock is the port's until it says that it has another."""
     offset_s = time.time() - time.monotonic()  # the system's clock may be set while we record
+    tape = ProbeTape(part)
 
     def unix_s() -> float:
         return offset_s + time.monotonic()
 
     def mark(stream_s: float, source_s: float) -> None:
-        clock = headers[-1].clock.model_copy(update={"marks": ((stream_s, source_s),)})
-        headers.append(headers.pop().model_copy(update={"clock": clock}))
-        io.write_text(part / HEADER_FILE, render(headers[-1]))
+        with tape.held_open() as is_open:
+            if is_open:  # else the header is sealed, or soon will be
+                clock = headers[-1].clock.model_copy(update={"marks": ((stream_s, source_s),)})
+                headers[-1] = headers[-1].model_copy(update={"clock": clock})
+                io.write_text(part / HEADER_FILE, render(headers[-1]))
 
     now_s = unix_s()
     mark(now_s, now_s)
-    return Desk(ProbeTape(part), unix_s, stop, mark)
+    return Desk(tape, unix_s, stop, mark)
 
 
 def begin_capture(folder: Path, told: Told, *, wire: Wire, chips_n: int, by: str) -> tuple[Path, Header]:

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 import tty
 from collections.abc import Iterator
@@ -12,9 +13,12 @@ from pathlib import Path
 import pytest
 
 from pipeline.capture.header import HEADER_FILE, parse
+from pipeline.capture.port import PortSettings
 from pipeline.capture.wire import encode
+from pipeline.core.errors import CaptureError
+from pipeline.labelling.source import Source
 from pipeline.preparing import Labels, native
-from pipeline.recording import print_progress
+from pipeline.recording import UNTOLD, Told, _desk, begin_capture, print_progress, record_capture
 from tests.capture.signals import make_frames
 from tests.stages.checkout import ROOT
 
@@ -98,6 +102,30 @@ def test_a_port_that_is_not_there_leaves_nothing_behind(tmp_path):
     assert "the port must be one that opens" in complained
     assert "Traceback" not in complained
     assert list(tmp_path.iterdir()) == []
+
+
+def test_labels_that_fail_before_a_frame_came_say_why(terminal, tmp_path):
+    def no_gauge(_):
+        raise CaptureError("the gauge", "the port", "one that opens", "none", "Plug it in.")
+
+    told = Told("b0", "s0", "random", Source("gauge", None, no_gauge))
+    settings = PortSettings(115200, "binary", 5, 20.0, None, silence_s=20.0, no_frame_s=20.0)
+    with pytest.raises(CaptureError, match="the gauge: the port must be one that opens") as raised:
+        record_capture(terminal[1], tmp_path / "run1", told=told, settings=settings, report=len, watch=len)
+    assert "bytes must be coming in" in str(raised.value.__cause__)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_label_thread_that_hangs_writes_no_header_after_the_end(tmp_path):
+    part, header = begin_capture(tmp_path / "run1", UNTOLD, wire="binary", chips_n=5, by="a test")
+    headers = [header]
+    desk = _desk(part, headers, threading.Event())
+    desk.mark(5.0, 6.0)
+    assert headers[0].clock.marks == ((5.0, 6.0),)
+    desk.tape.close()
+    desk.mark(7.0, 8.0)
+    assert headers[0].clock.marks == ((5.0, 6.0),)
+    assert parse((part / HEADER_FILE).read_text(), "header").clock.marks == ((5.0, 6.0),)
 
 
 def test_a_folder_that_is_there_is_not_written_over(tmp_path):
