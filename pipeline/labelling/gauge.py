@@ -20,16 +20,19 @@ class Forces:
         self.port, self._baud, self._gauge = port, baud, Gauge()
         self._kept: deque[Sample] = deque(maxlen=KEPT_N)
         self._silent = ""
+        self._without_n = 0
 
     def during(self, start_s: float, end_s: float) -> Label:
-        """Give the mean force between two times; NaN where nothing was said."""
+        """Give the mean force between two times; NaN, and counted, where nothing was said."""
         found = [one.label for one in list(self._kept) if one.label and start_s <= one.t_s <= end_s]
+        self._without_n += not found
         return mean_label(found) if found else Label(True)
 
     def told(self) -> str:
-        """Say what could not be read of it."""
+        """Say what could not be read of it, and how many touches have no force."""
         bad = told_bad(f"the gauge at {self.port}", self._gauge.bad_n, self._gauge.first_bad)
-        return "; ".join(words for words in (bad, self._silent) if words)
+        without = f"{self._without_n} touches without a force: the gauge at {self.port} said none while they lasted"
+        return "; ".join(words for words in (bad, self._silent, without if self._without_n else "") if words)
 
     @contextmanager
     def listening(self, desk: Desk) -> Iterator[None]:

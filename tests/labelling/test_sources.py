@@ -158,6 +158,12 @@ def test_a_gauge_beside_the_keys_gives_each_touch_its_mean_force(desk, tmp_path,
     assert log.Fz_N[log.contact] == pytest.approx(0.5)
 
 
+def test_touches_of_which_the_gauge_said_nothing_are_counted(desk, telling):
+    telling([b""] * 3000)
+    asked, _ = prompts(["", "", "", "0.8N", "", "", "q"], forces=Forces("gauge", 9600))
+    assert asked.run(desk) == "2 touches without a force: the gauge at gauge said none while they lasted"
+
+
 def test_a_gauge_alone_tells_touches_by_force_and_that_it_was_unplugged(desk, tmp_path, telling):
     telling([b"0.00\n"] * 40 + [b"0.50\n"] * 40 + [b"oops\n"])
     labeller = Labeller(from_gauge("gauge", 9600), desk)
