@@ -1,11 +1,14 @@
 """A CSV that a robot's program appends to, followed as it grows. In: a file. Out: dwells, and how its clock runs."""
 
 import math
+import os
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 from pipeline.capture.samples import Dwells, Table
+from pipeline.core.errors import CaptureError
 from pipeline.labelling.source import Desk, Source, told_bad
 
 POLL_s = 0.02
@@ -17,16 +20,18 @@ def from_table(file: Path) -> Source:
 
     def run(desk: Desk) -> str:
         table, dwells, best_s = Table(str(file)), Dwells(), math.inf
-        for data, is_new in _grown(file, desk.stop):
-            came_s, samples = desk.unix_s(), table.feed(data)
-            if not samples or not is_new:
-                continue
-            late_s = came_s - samples[-1].t_s if table.clock == "t_s" else best_s
-            if late_s < best_s - BETTER_s:  # a row is written after its time: the least delay is nearest to none
-                best_s = late_s
-                desk.mark(came_s, samples[-1].t_s)
-            desk.tape.write_all(dwells.feed(samples))
-        desk.tape.write_all(dwells.close())
+        try:
+            for data, is_new in _grown(file, desk.stop):
+                came_s, samples = desk.unix_s(), table.feed(data)
+                if not samples or not is_new:
+                    continue
+                late_s = came_s - samples[-1].t_s if table.clock == "t_s" else best_s
+                if late_s < best_s - BETTER_s:  # a row is written after its time: the least delay is nearest to none
+                    best_s = late_s
+                    desk.mark(came_s, samples[-1].t_s)
+                desk.tape.write_all(dwells.feed(samples))
+        finally:
+            desk.tape.write_all(dwells.close())
         return told_bad(str(file), table.bad_n, table.first_bad)
 
     return Source(f"table {file.name}", None, run)
@@ -45,5 +50,20 @@ def _grown(file: Path, stop: threading.Event) -> Iterator[tuple[bytes, bool]]:
                 yield data, is_new
             else:
                 is_new = True
+                _check_grows(file, stream)
                 stop.wait(POLL_s)
         yield stream.read(2**20), True
+
+
+def _check_grows(file: Path, stream: BinaryIO) -> None:
+    """Raise if the file is no longer the one that is followed, or shorter than what was read of it."""
+    rule, remedy = "the same file, with rows appended", "Open it once, or append: do not write it anew."
+    try:
+        there = file.stat()
+    except FileNotFoundError:
+        raise CaptureError(file, "a table that is followed", rule, "no file", remedy) from None
+    if not os.path.samestat(there, os.fstat(stream.fileno())):
+        raise CaptureError(file, "a table that is followed", rule, "another file in its place", remedy)
+    if there.st_size < stream.tell():
+        got = f"{there.st_size} bytes, of which {stream.tell()} were read"
+        raise CaptureError(file, "a table that is followed", rule, got, remedy)

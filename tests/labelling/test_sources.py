@@ -1,5 +1,6 @@
 """Each source of labels writes a log that ingest takes, without a board, a robot or a person."""
 
+import re
 import threading
 import time
 
@@ -191,3 +192,30 @@ def test_a_table_is_followed_as_it_grows_and_its_own_clock_is_marked(desk, tmp_p
     assert log.t_start_s.tolist() == pytest.approx([7.0, 7.3])
     assert desk.marks[-1][1] == pytest.approx(7.5)
     assert desk.marks[-1][0] == pytest.approx(time.time(), abs=5)
+
+
+@pytest.mark.parametrize(
+    ("how", "said"),
+    [("replaced", "another file in its place"), ("cut", r"10 bytes, of which \d+ were read"), ("removed", "no file")],
+)
+def test_a_table_that_does_not_go_on_ends_the_labels_with_a_sentence(desk, tmp_path, how, said):
+    file, header = tmp_path / "robot.csv", "t_s,phase\n"
+    file.write_text(header)
+    labeller = Labeller(from_table(file), desk)
+    for begin_s in range(1000):
+        with file.open("a") as stream:
+            stream.write("".join(f"{begin_s}.{i},{'contact' if i > 4 else 'noload'}\n" for i in range(9)))
+        time.sleep(0.02)
+        if desk.marks:  # what was there before is passed over
+            break
+    if how == "replaced":
+        (tmp_path / "new.csv").write_text(header)
+        (tmp_path / "new.csv").replace(file)
+    elif how == "cut":
+        file.write_text(header)
+    else:
+        file.unlink()
+    labeller._thread.join(20)
+    told = labeller.end()
+    assert re.search(f"a table that is followed must be the same file, with rows appended; got {said}", told)
+    assert not told.startswith("0 touches")
