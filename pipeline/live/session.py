@@ -72,6 +72,8 @@ class Live:
                     self._stop.wait(GATHER_S)
         except ReskinError as error:
             self.problem = str(error)
+        except Exception as error:  # of a model: the page says that nothing is estimated any more
+            self.problem = f"estimates ended: {error!r}"
 
     def _adapt(self, readings: Readings) -> None:
         """Let the map learn from pokes, if it was asked for; frames wait meanwhile, and none is lost."""

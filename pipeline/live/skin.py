@@ -89,13 +89,11 @@ class Skin:
         self.decisions = decisions
         self.port, self.found = port, ports.Found(port, WAITING)
         self.account: Counter[str] = Counter()  # of all streams since the start, as a `FrameStream` counts
-        self._zero: Zero | None = None
         self.reader = Reader(port, baud)
         self.answers = answering(models)
         self.problem = ""  # of the model with this board
         self._head: list[Chunk] = []
-        self._quiet: list[Frames] = []
-        self._quiet_from_s = np.inf
+        self._begin_zero()
 
     def __enter__(self) -> "Skin":
         """Open the port, learn what it sends, and take the no-load reading: nothing may touch the skin meanwhile."""
@@ -128,12 +126,12 @@ class Skin:
                 yield self._contact(readings, i)
 
     def zero(self) -> None:
-        """Take the no-load reading from the next second in which nothing touches the skin."""
-        self._zero, self._quiet, self._quiet_from_s = None, [], np.inf
+        """Take the no-load reading from the next second in which nothing touches the skin; any thread may ask."""
+        self._zero_asked = True  # `poll` begins anew: what it gathers, its thread alone changes
 
     @property
     def zeroed(self) -> bool:
-        return self._zero is not None
+        return self._zero is not None and not self._zero_asked
 
     @property
     def silent(self) -> bool:
@@ -164,7 +162,7 @@ class Skin:
         if not len(frames):
             return None
         sound = self.health.feed(frames, t_s[-1])
-        if self._zero is None:
+        if not self.zeroed:
             self._take_zero(frames.where(sound), t_s)
         if latest:
             last = np.arange(len(frames)) == len(frames) - 1
@@ -245,7 +243,15 @@ class Skin:
         if self._lost_in_row_n > GARBAGE_FRAMES_N * 16 * self.found.chips_n:  # no format has less than 16 bytes a chip
             self.health.note("no frames in what comes: wrong baud rate?", lost_n, now_s, "wrong_baud")
 
+    def _begin_zero(self) -> None:
+        self._zero: Zero | None = None
+        self._quiet: list[Frames] = []
+        self._quiet_from_s = np.inf
+        self._zero_asked = False  # last: who asks from here on is heard by the next `poll`
+
     def _take_zero(self, frames: Frames, t_s: Float64[np.ndarray, " f"]) -> None:
+        if self._zero_asked:
+            self._begin_zero()
         self._quiet.append(frames)
         self._quiet_from_s = min(self._quiet_from_s, t_s[0])
         lasted_s = t_s[-1] - self._quiet_from_s

@@ -9,7 +9,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from types import TracebackType
 
-from pipeline.core.errors import ReskinError
 from pipeline.live.skin import Contact, Skin
 
 
@@ -19,7 +18,7 @@ class Skins:
     def __init__(self, skins: Sequence[Skin]) -> None:
         self.skins = skins
         self._latest: list[Contact | None] = [None] * len(skins)
-        self._failed: ReskinError | None = None
+        self._failed: Exception | None = None
         self._news, self._came, self._stop = False, threading.Condition(), threading.Event()
         self._opened = ExitStack()
         self._threads = [
@@ -64,7 +63,7 @@ class Skins:
                     self._came.notify()
                 if self._stop.is_set():
                     return
-        except ReskinError as error:  # raised where somebody iterates
+        except Exception as error:  # also one of a model: raised where somebody iterates
             with self._came:
                 self._failed = error
                 self._came.notify()

@@ -86,10 +86,16 @@ def write_script(script: Script, folder: Path) -> Path:
 class PlayedReader:
     """Gives a script's bytes at the script's own times, without port and thread, so that no load disturbs them."""
 
-    plugged_in, problem, missed_bytes_n = True, "", 0
+    plugged_in, problem, missed_bytes_n, taken_s = True, "", 0, 0.0
 
     def __init__(self, script: Script, *, frames_n: int = 20) -> None:
         self._script, self._frames_n, self._i = script, frames_n, 0
+
+    def start(self, *, there: bool) -> None:
+        """Nothing has to be opened."""
+
+    def stop(self) -> None:
+        """Nothing has to be closed."""
 
     @property
     def at_end(self) -> bool:
@@ -112,6 +118,18 @@ def played(script: Script, models: Models = ()) -> tuple[Skin, list[Readings]]:
         if (found := skin.poll(0.0)) is not None:
             readings.append(found)
     return skin, readings
+
+
+class Dying:
+    """A model that raises at the first contact, by a fault that is none of ours to name."""
+
+    channels_n, about = 15, "a model that raises"
+
+    def zero(self, b_uT: np.ndarray) -> None:
+        """Take any no-load reading."""
+
+    def __call__(self, db_uT: np.ndarray) -> None:
+        raise RuntimeError("out of memory")
 
 
 @contextmanager

@@ -12,10 +12,12 @@ import pytest
 import reskin
 from pipeline.core.errors import ReskinError
 from pipeline.live.server import PAGES_MAX_N
-from pipeline.live.session import BOARDS_MAX_N, several
+from pipeline.live.session import BOARDS_MAX_N, Live, several
+from pipeline.live.skin import Skin
+from pipeline.live.skins import Skins
 from pipeline.live.view import BINS_N, LATENCIES_N
 from pipeline.twin.shipped import load_universal
-from tests.live.boards import PLACES, make_script, plugged_in, write_model
+from tests.live.boards import PLACES, Dying, PlayedReader, make_script, plugged_in, write_model
 from tests.live.test_server import serve, until
 
 RATES_HZ = [133.0, 400.0, *(50.0,) * 6]
@@ -90,6 +92,29 @@ def test_a_controller_has_the_latest_of_all_and_waits_for_none_that_is_unplugged
         assert np.diff(told).max() < 0.3  # of another board that is silent
         nearest = np.abs(np.array(found)[:, None] - PLACES).sum(axis=2).min(axis=1)
         assert np.median(nearest) < 0.5
+
+
+def played_at(port: str) -> Skin:
+    skin = Skin(port)
+    skin.reader = PlayedReader(make_script(pokes_n=1))
+    return skin
+
+
+def test_an_error_of_a_model_is_raised_where_somebody_iterates_over_the_boards():
+    dying, well = played_at("dying"), played_at("well")
+    dying.answers = Dying()
+    with Skins([dying, well]) as skins:
+        skins._threads[0].join(60.0)
+        with pytest.raises(RuntimeError, match="out of memory"):
+            next(iter(skins))
+
+
+def test_an_error_of_a_model_is_told_on_the_page():
+    live = Live("played", [], "a board")
+    live.skin = played_at("played")
+    live.skin.answers = Dying()
+    live._poll()
+    assert "estimates ended: RuntimeError('out of memory')" in live.state()["alarms"]
 
 
 def test_ports_that_are_named_twice_or_too_many_or_not_there_are_refused(tmp_path):

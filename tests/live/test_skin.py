@@ -17,7 +17,7 @@ from pipeline.core.errors import ReskinError
 from pipeline.core.seeds import rng_for
 from pipeline.live.emulate import open_far_end, play
 from pipeline.live.inject import inject, parse
-from pipeline.live.skin import Skin
+from pipeline.live.skin import ZEROING, Skin
 from pipeline.predicting import read_network
 from tests.live.boards import (
     PAUSE_S,
@@ -25,6 +25,7 @@ from tests.live.boards import (
     POKED_S,
     QUIET_S,
     RATE_HZ,
+    PlayedReader,
     make_script,
     played,
     plugged_in,
@@ -113,6 +114,22 @@ def test_a_second_in_which_something_moves_is_no_no_load_reading():
     np.testing.assert_allclose(skin._zero.noload_uT, rest_uT, atol=4 * 3 / np.sqrt(100))  # of noise of 3 uT
     moving = inject(make_script(pokes_n=0, quiet_s=2.0), parse("magnet@0.35+0.7"))
     assert not played(moving)[0].zeroed
+
+
+def test_a_no_load_reading_that_is_asked_for_again_by_another_thread_is_begun_anew():
+    class Pressed(list):
+        def append(self, frames):  # between what two statements of the thread that polls do
+            super().append(frames)
+            skin.zero()
+
+    skin = Skin("played")
+    skin.reader, skin._quiet = PlayedReader(make_script(pokes_n=0, quiet_s=2.0)), Pressed()
+    while not skin.zeroed:
+        assert not skin.reader.at_end
+        skin.poll(0.0)
+    skin.zero()
+    assert not skin.zeroed
+    assert ZEROING in skin.alarms()
 
 
 @pytest.mark.parametrize("minutes_n", [1])
