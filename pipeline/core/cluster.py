@@ -2,19 +2,20 @@
 
 Workers see the checkout under its own path (one machine, or a shared file system), as results are files in it; rows are
 read there once a process. They give a local run's bytes because they must have its code, its variables and one thread
-each: what differs is refused before work begins. Refuses to know what is run, and to start or end any worker.
+each: what differs is refused before work begins, and at a call to a worker that came later. Refuses to know what is
+run, and to start or end any worker.
 """
 
+import hashlib
 import os
 import sys
 from collections.abc import Callable, Mapping
 from concurrent.futures import BrokenExecutor, Executor, Future
 from functools import partial
 from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 import pipeline
 from pipeline.core.errors import ParamsError
@@ -22,12 +23,34 @@ from pipeline.core.numerics import signature
 
 CONNECT_MAX_s = 20.0
 HOW = "docs/settings.md says how workers are started."
+LIBRARIES = ("numpy", "scipy", "numba", "torch", "dask", "distributed")
+CODE = (".py", ".json", ".safetensors")  # sources, and the tables that come with them; settings come with a call
+
+
+def _sources(package: Path) -> str:
+    """Digest the code of a package."""
+    found = hashlib.sha256()
+    for file in sorted(file for file in package.rglob("*") if file.suffix in CODE):
+        found.update(f"{file.relative_to(package)} {hashlib.sha256(file.read_bytes()).hexdigest()}\n".encode())
+    return found.hexdigest()[:32]
+
+
+def _version(library: str) -> str:
+    try:
+        return version(library)
+    except PackageNotFoundError:
+        return "none"
+
+
+# Of when this module was imported: a worker may outlive an edit, and computes on with what it has in memory.
+IMPORTED = {"sources as imported": _sources(Path(__file__).parents[1])} | {name: _version(name) for name in LIBRARIES}
 
 
 class Cluster(Executor):
     """Submits calls to a Dask scheduler; each runs in this process's working directory, in one thread of a worker."""
 
     def __init__(self, address: str, imports: str) -> None:
+        self._own = describe_process()
         self._client = _connect(address)
         try:
             _check_workers(self._client, address)
@@ -41,7 +64,7 @@ class Cluster(Executor):
         """Run a call on one of the workers."""
         future: Future[Any] = Future()
         future.set_running_or_notify_cancel()
-        submitted = self._executor.submit(run_there, os.getcwd(), partial(fn, *args, **kwargs))
+        submitted = self._executor.submit(run_there, os.getcwd(), self._own, partial(fn, *args, **kwargs))
         submitted.add_done_callback(partial(_pass_on, future))
         return future
 
@@ -51,8 +74,12 @@ class Cluster(Executor):
         self._client.close()
 
 
-def run_there(folder: str, call: Callable[[], Any]) -> Any:
-    """Run a call on a worker as if it ran in a folder: paths of stages are relative to the checkout."""
+def run_there(folder: str, own: Mapping[str, str], call: Callable[[], Any]) -> Any:
+    """Run a call on a worker as if it ran in a folder: paths of stages are relative to the checkout.
+
+    The worker may have come, or come back, after the others were compared with the process that calls.
+    """
+    _compare(own, describe_process(), f"process {os.getpid()}")
     os.chdir(folder)  # a worker has one thread
     return call()
 
@@ -63,12 +90,12 @@ def import_module_there(name: str) -> None:
 
 
 def describe_process() -> dict[str, str]:
-    """Say what decides the bits of a result: versions, the code's own files, variables; of this process."""
+    """Say what decides the bits of a result: versions and sources that this process imported, its variables."""
     from pipeline.core.executors import DEVICE_VARIABLE, device
 
     return {
         "Python": sys.version.split()[0],
-        "NumPy": np.__version__,
+        **IMPORTED,
         "the project's code": str(Path(pipeline.__file__).resolve()),
         DEVICE_VARIABLE: device(),
         "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "unset"),
@@ -99,9 +126,14 @@ def _check_workers(client: Any, address: str) -> None:
             raise ParamsError("RESKIN_EXECUTOR", f"threads of worker {name}", "1", worker["nthreads"], HOW)
     own = describe_process()
     for name, theirs in client.run(describe_process).items():
-        for what, value in own.items():
-            if theirs[what] != value:
-                raise ParamsError("RESKIN_EXECUTOR", f"{what} of worker {name}", value, theirs[what], HOW)
+        _compare(own, theirs, name)
+
+
+def _compare(own: Mapping[str, str], theirs: Mapping[str, str], name: str) -> None:
+    for what, value in own.items():
+        got = theirs.get(what, "nothing")  # of a worker that imported an older version of this module
+        if got != value:
+            raise ParamsError("RESKIN_EXECUTOR", f"{what} of worker {name}", value, got, f"Start it anew. {HOW}")
 
 
 def _pass_on(future: Future[Any], submitted: Future[Any]) -> None:

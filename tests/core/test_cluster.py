@@ -1,7 +1,9 @@
 """The same trainings on two workers of a real scheduler on this machine give the bytes that they give here."""
 
+import importlib.util
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -9,10 +11,11 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 
 import pytest
 
+from pipeline.core import cluster
 from pipeline.core.cluster import _check_workers, describe_process
 from pipeline.core.errors import ParamsError
 from pipeline.core.executors import make_executor, prepare_workers
@@ -21,7 +24,8 @@ from tests.learning.test_grid import alike, trials
 from tests.learning.trials import measured
 
 ROOT = Path(__file__).resolve().parents[2]
-CLI = "import pipeline; from distributed.cli.dask_{0} import main; main()"  # as docs/settings.md starts workers
+# As docs/settings.md starts workers.
+CLI = "import pipeline.core.cluster; from distributed.cli.dask_{0} import main; main()"
 START_MAX_s = 60.0
 HERE_ONLY = ["--host", "127.0.0.1", "--no-dashboard"]
 
@@ -100,6 +104,7 @@ def test_an_error_on_a_worker_comes_back_as_it_was(address, monkeypatch):
         ),
         ({"w": {"the project's code": "/elsewhere"}}, "the project's code of worker w must be .* got /elsewhere"),
         ({"w": {"RESKIN_DEVICE": "cuda"}}, "RESKIN_DEVICE of worker w must be cpu; got cuda"),
+        ({"w": {"scipy": "0.1"}}, "scipy of worker w must be .* got 0.1"),
     ],
 )
 def test_workers_that_would_give_other_bits_are_refused(workers, expected):
@@ -110,6 +115,28 @@ def test_workers_that_would_give_other_bits_are_refused(workers, expected):
     )
     with pytest.raises(ParamsError, match=expected):
         _check_workers(client, "tcp://there")
+
+
+def imported_from(file: Path) -> ModuleType:
+    """The module as a process has it that imports it now."""
+    spec = importlib.util.spec_from_file_location("cluster_of_a_copy", file)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_a_worker_that_was_started_before_an_edit_of_any_module_is_refused_and_a_new_one_passes(tmp_path):
+    package = tmp_path / "pipeline"
+    shutil.copytree(ROOT / "pipeline/core", package / "core", ignore=shutil.ignore_patterns("__pycache__"))
+    before = imported_from(package / "core/cluster.py")
+    with (package / "core/seeds.py").open("a") as module:
+        module.write("# edited\n")
+    now = imported_from(package / "core/cluster.py")
+    cluster._compare(now.describe_process(), imported_from(package / "core/cluster.py").describe_process(), "w")
+    with pytest.raises(ParamsError, match="sources as imported of worker w must be .* Start it anew"):
+        cluster._compare(now.describe_process(), before.describe_process(), "w")
+    with pytest.raises(ParamsError, match="sources as imported of worker process"):
+        cluster.run_there(str(tmp_path), before.describe_process(), os.getcwd)
 
 
 def test_workers_that_are_as_this_process_pass():

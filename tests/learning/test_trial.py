@@ -279,7 +279,7 @@ NOT_DECIDING = {
     "dataset.baseline": "makes rows, whose values are part of the key",
     "dataset.lines": "makes lines, whose values are part of the key",
     "dataset.rows": "makes rows, whose values are part of the key",
-    "core.cluster": "where it runs; its workers must have this process's device and variables",
+    "core.cluster": "where it runs; its workers must have this process's code, device and variables",
     "core.executors": "where it runs, and the clock; the device is part of the key",
     "learning.recipe": "settings, whose values are part of the key",
 }
