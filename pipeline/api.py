@@ -214,10 +214,13 @@ def open(
     simulated skins answers (`load_universal`). Several models give means, and how far they are apart. A list of ports
     gives the latest contacts of all boards, in its order; one that is unplugged does not hold up the others.
     """
+    from pipeline.live.ports import check_named_once
     from pipeline.live.skin import Skin
     from pipeline.live.skins import Skins
     from pipeline.predicting import read_network
 
+    if not isinstance(port, str):
+        check_named_once(port, "reskin.open")
     files = [model] if isinstance(model, str | Path) else model
     models = [read_network(Path(file)) for file in files] or load_universal()
     if isinstance(port, str):

@@ -16,13 +16,14 @@ from pipeline.capture.header import Wire
 from pipeline.capture.port import open_port, port_names, read_waiting
 from pipeline.capture.stream import decode_all, fitting
 from pipeline.capture.wire import Frames
-from pipeline.core.errors import CaptureError
+from pipeline.core.errors import CaptureError, ParamsError
 from pipeline.physics.sensor import GAINS, steps_uT
 
 BAUD = 115200  # USB ports ignore it
 LISTENING_S = 1.5  # some 200 frames of the slowest board, in which the step of its chips shows
 HUNTING_S = 60.0
 POLL_S = 0.2
+BOARDS_MAX_N = 16  # at once
 LSB_TOLERANCE = 0.05  # gains are a fifth or more apart
 Chunk = tuple[bytes, float]  # and when it came, in s
 
@@ -158,3 +159,10 @@ def _wait(change: Callable[[], set[str]], pause: Callable[[float], None], huntin
             return found
         pause(POLL_S)
     raise CaptureError("ports", what, f"seen within {hunting_s:g} s", "none", "Is it a board with a serial port?")
+
+
+def check_named_once(ports: Sequence[str], where: str) -> None:
+    """Raise unless boards that work at once have a port each."""
+    if len(set(ports)) != len(ports) or not 0 < len(ports) <= BOARDS_MAX_N:
+        rule = f"1 to {BOARDS_MAX_N}, each named once"
+        raise ParamsError(where, "ports", rule, ", ".join(ports) or "none", "Give each port once.")

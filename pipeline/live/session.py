@@ -12,10 +12,11 @@ from typing import Any
 from pipeline.capture.decisions import Decisions
 from pipeline.capture.header import Header
 from pipeline.capture.port import Tape
-from pipeline.core.errors import ParamsError, ReskinError
+from pipeline.core.errors import ReskinError
 from pipeline.live.adapting import Pokes, ShownPokes
 from pipeline.live.answering import Map, Models
 from pipeline.live.health import LIVE
+from pipeline.live.ports import check_named_once
 from pipeline.live.skin import WAITING, Readings, Skin
 from pipeline.live.view import View
 from pipeline.recording import UNTOLD, begin_capture, end_capture, new_folder
@@ -24,7 +25,6 @@ POLL_S = 0.1
 GATHER_S = (
     0.02  # for which frames of several boards are gathered: estimated together they cost less, and no page draws faster
 )
-BOARDS_MAX_N = 16
 ADAPTING = {"adapt": Pokes, "places": ShownPokes}  # by button
 
 
@@ -165,7 +165,5 @@ class Live:
 
 def several(ports: Sequence[str], models: Models, what: str, decisions: Decisions = LIVE) -> list[Live]:
     """Make one of each port; all share what the models are made of, and nothing else."""
-    if len(set(ports)) != len(ports) or not 0 < len(ports) <= BOARDS_MAX_N:
-        rule, remedy = f"1 to {BOARDS_MAX_N}, each named once", "Give each --port once."
-        raise ParamsError("--port", "ports", rule, ", ".join(ports) or "none", remedy)
+    check_named_once(ports, "--port")
     return [Live(port, models, what, decisions, alone=len(ports) == 1) for port in ports]
