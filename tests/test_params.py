@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.core.config import read_yaml
+from pipeline.core.config import read_yaml, root_of_scenes
 from pipeline.core.errors import ParamsError
 from pipeline.params import Scene, parse_scene, read_plan, read_scene, read_shared
 from pipeline.questions import LEARNING, stages
@@ -21,6 +21,14 @@ def test_every_scene_of_the_checkout_is_legal(file):
 def test_the_params_of_the_checkout_are_legal():
     read_shared(ROOT / "params.yaml")
     read_plan(ROOT / "pipeline/plan.yaml")
+
+
+def test_scenes_are_read_in_a_checkout_of_this_project_and_not_in_another_folder_that_dvc_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "dvc.yaml").touch()
+    assert root_of_scenes() == ROOT
+    (tmp_path / "pipeline/scenes").mkdir(parents=True)
+    assert root_of_scenes() == Path()
 
 
 @pytest.mark.parametrize(

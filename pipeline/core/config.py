@@ -41,7 +41,8 @@ def read_yaml(path: Path) -> Any:
 
 def root_of_scenes() -> Path:
     """Give where scenes are read: the working directory if it is a checkout, otherwise what the code lies in."""
-    return Path() if Path(FLOW).is_file() else ROOT
+    is_checkout = Path(FLOW).is_file() and Path(SCENES).is_dir()  # other projects have a dvc.yaml too
+    return Path() if is_checkout else ROOT
 
 
 def params_of(root: Path) -> Path:
