@@ -9,6 +9,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from pipeline.core import io
+
 HEAD = "# Exact versions of all that is installed; made with `make constraints`. torch is {torch} and nothing else.\n"
 OF_CUDA = ("nvidia-", "cuda-", "triton")  # torch for other graphics cards brings none of them
 RESOLVE = ("-m", "pip", "install", "--quiet", "--dry-run", "--ignore-installed", "--report", "-")
@@ -36,7 +38,8 @@ def main() -> None:
     file = Path(sys.argv[1] if len(sys.argv) > 1 else "constraints.txt")
     text = render(resolve(sys.executable, ".[dev]"))
     before = set(file.read_text(encoding="utf-8").splitlines()) if file.is_file() else set()
-    file.write_text(text, encoding="utf-8")
+    with io.replacing(file) as temporary:
+        temporary.write_text(text, encoding="utf-8")
     changed = [line for line in text.splitlines() if line not in before and not line.startswith("#")]
     print(f"{file}: {len(text.splitlines()) - 1} packages, changed: {', '.join(changed) or 'none'}")
 

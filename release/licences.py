@@ -21,6 +21,7 @@ COMPATIBLE = re.compile(
     re.I,
 )
 WITHHELD = re.compile(r"\b(A?GPL|LGPL|GNU|EPL|SSPL|BUSL|Commercial|Proprietary)", re.I)
+GROUP = re.compile(r"(?:^|(?<=AND )|(?<=OR )|(?<=\())\(([^()]*)\)")  # elsewhere brackets are words: BSD (3-clause)
 # Of extra `pipeline`, never of the core: DVC imports them, we start DVC; none of them is part of our wheel.
 TOLERATED = {
     "asyncssh": "EPL-2.0 or GPL-2.0+: remotes of DVC over SSH",
@@ -68,13 +69,16 @@ def licence_of(package: Distribution) -> str:
 
 
 def is_compatible(licence: str) -> bool:
-    """Tell whether every part of an expression, or one of its alternatives, is a known licence that MIT may import.
+    """Tell whether every part of an expression, or of one of its alternatives, is a known licence that MIT may import.
 
-    >>> is_compatible("Apache-2.0 OR GPL-2.0-or-later"), is_compatible("MIT AND LGPL-3.0"), is_compatible("")
+    >>> is_compatible("Apache-2.0 OR GPL-2.0-or-later"), is_compatible("MIT AND unheard-of"), is_compatible("")
     (True, False, False)
     """
-    alternatives = re.split(r"\s+OR\s+", re.sub(r"[()]", " ", licence))
-    return any(COMPATIBLE.search(text) and not WITHHELD.search(text) for text in alternatives)
+    while group := GROUP.search(licence):  # a group is as good as a licence, or as none
+        verdict = "MIT" if is_compatible(group[1]) else "Proprietary"
+        licence = licence[: group.start()] + verdict + licence[group.end() :]
+    alternatives = [re.split(r"\s+AND\s+|;", text, flags=re.I) for text in re.split(r"\s+OR\s+", licence)]
+    return any(all(COMPATIBLE.search(part) and not WITHHELD.search(part) for part in parts) for parts in alternatives)
 
 
 def incompatible(packages: dict[str, Distribution]) -> dict[str, str]:

@@ -11,6 +11,7 @@ import pytest
 from pipeline.core.config import PARAMS, SCENES, params_of, read_yaml
 from pipeline.core.errors import ParamsError
 from pipeline.core.packages import explain, need
+from release import constraints
 from release.constraints import render
 from release.licences import TOLERATED, closure, incompatible, is_compatible, wanted
 
@@ -110,11 +111,24 @@ def test_all_licences_are_compatible_and_those_of_the_core_without_exception():
     [
         ("MIT", True), ("Apache-2.0 WITH LLVM-exception AND BSD-2-Clause", True), ("GPL-3.0-only OR MIT", True),
         ("GPL-3.0-only", False), ("MIT AND AGPL-3.0", False), ("GNU Lesser General Public License", False),
-        ("Proprietary", False), ("", False), ("my own words", False),
+        ("Proprietary", False), ("", False), ("my own words", False), ("MIT AND my own words", False),
+        ("(MIT OR GPL-3.0-only) AND my own words", False), ("BSD-3-Clause AND (MIT OR GPL-3.0-only)", True),
+        ("MIT License; my own words", False), ("BSD License (3-clause)", True),
     ],
 )  # fmt: skip
 def test_a_licence_is_compatible_if_one_alternative_is(licence, fits):
     assert is_compatible(licence) is fits
+
+
+def test_constraints_are_written_beside_the_old_ones_which_they_replace_whole(tmp_path, monkeypatch):
+    file, old = tmp_path / "constraints.txt", tmp_path / "old"
+    file.write_text("torch==1.0\n")
+    old.hardlink_to(file)
+    monkeypatch.setattr(sys, "argv", ["constraints", str(file)])
+    monkeypatch.setattr(constraints, "resolve", lambda python, wanted: {"torch": "2.0"})
+    constraints.main()
+    assert file.read_text().endswith("torch==2.0\n")
+    assert old.read_text() == "torch==1.0\n"
 
 
 def test_constraints_name_no_project_of_ours_and_no_package_of_one_graphics_card():
