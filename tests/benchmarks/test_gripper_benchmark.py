@@ -1,6 +1,6 @@
 """How well a force is held with our estimate as feedback, on a simulated skin between fingers.
 
-`pytest -s -o addopts= tests/benchmarks/test_gripper_benchmark.py`. Nothing is asserted: docs/live.md has the numbers.
+`pytest -s -o addopts= tests/benchmarks/test_gripper_benchmark.py`. Nothing is asserted: it prints the numbers.
 """
 
 import numpy as np
