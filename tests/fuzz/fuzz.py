@@ -1,18 +1,25 @@
 """python tests/fuzz/fuzz.py TARGET|all SECONDS [KEEP]: look for bytes that a door does not survive.
 
 With `pip install atheris` new bytes follow what code they reach (libFuzzer); without it they are drawn at random from
-the corpus, which finds less. What reached new code is kept in the folder KEEP, if one is named. What breaks is left in
-the folder as `crash-...`; put it into `corpus/TARGET/`.
+the corpus and KEEP, which finds less, and memory is told as it goes. What reached new code is kept in the folder KEEP,
+if one is named. What breaks is left in the folder as `crash-...`; put it into `corpus/TARGET/`.
 """
 
+import operator
+import os
 import subprocess
 import sys
 import time
 from pathlib import Path
+from types import ModuleType
+
+import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 CORPUS = Path(__file__).parent / "corpus"
 BYTES_MAX_N, MEMORY_MAX_MB, HANG_S = 4096, 2048, 20
+TOLD_INPUTS_N = 10_000
+COMPARISONS = (operator.lt, operator.le, operator.eq, operator.ne, operator.gt, operator.ge)  # as Python numbers them
 
 
 def follow(name: str, seconds: int, keep: Path | None) -> None:
@@ -21,6 +28,7 @@ def follow(name: str, seconds: int, keep: Path | None) -> None:
 
     import atheris
 
+    compare_arrays_ourselves(atheris)
     with atheris.instrument_imports(include=["pipeline"]):
         from tests.fuzz.targets import feed
     for file in (CORPUS / name).iterdir():
@@ -37,13 +45,32 @@ def follow(name: str, seconds: int, keep: Path | None) -> None:
         atheris.Fuzz()
 
 
-def draw(name: str, seconds: int) -> None:
-    """Change, cut and repeat what the corpus has."""
+def compare_arrays_ourselves(atheris: ModuleType) -> None:
+    """Keep arrays from atheris 3.0: it never frees what a comparison gave, and follows none of arrays."""
+
+    def compare(left: object, right: object, comparison_i: int, *where: object) -> object:
+        if isinstance(left, np.ndarray) or isinstance(right, np.ndarray):
+            return COMPARISONS[comparison_i](left, right)
+        return atheris._trace_cmp(left, right, comparison_i, *where)
+
+    atheris.compare = compare
+    atheris.instrument_bytecode._COMPARE_FUNCTION = "compare"
+
+
+def resident_MB() -> float:
+    """Tell the memory of this process; NaN where the system has no /proc."""
+    statm = Path("/proc/self/statm")
+    return int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6 if statm.exists() else float("nan")
+
+
+def draw(name: str, seconds: int, keep: Path | None) -> None:
+    """Change, cut and repeat what the corpus has, and what was kept."""
     from pipeline.core.seeds import rng_for
     from tests.fuzz.targets import feed
 
     rng, tried_n, end_s = rng_for(time.time_ns() % 2**31, "fuzz", name), 0, time.monotonic() + seconds
-    seeds = [file.read_bytes() for file in sorted((CORPUS / name).iterdir())]
+    folders = [CORPUS / name, *([keep / name] if keep is not None else [])]
+    seeds = [file.read_bytes() for folder in folders for file in sorted(folder.iterdir())]
     while time.monotonic() < end_s:
         data = bytearray(seeds[rng.integers(len(seeds))])
         for _ in range(rng.integers(1, 8)):
@@ -51,9 +78,11 @@ def draw(name: str, seconds: int) -> None:
             data[at : at + int(rng.integers(3))] = rng.bytes(int(rng.integers(4)))
         Path("crash-last").write_bytes(data)
         feed(name, bytes(data))
+        if tried_n % TOLD_INPUTS_N == 0:
+            print(f"{name}: {tried_n} inputs, {resident_MB():.1f} MB", flush=True)
         tried_n += 1
     Path("crash-last").unlink()
-    print(f"{name}: {tried_n} inputs in {seconds} s")
+    print(f"{name}: {tried_n} inputs in {seconds} s, {resident_MB():.1f} MB")
 
 
 def main(name: str, seconds: int, *keep: str) -> None:
@@ -65,7 +94,7 @@ def main(name: str, seconds: int, *keep: str) -> None:
     try:
         import atheris  # noqa: F401
     except ImportError:
-        draw(name, seconds)
+        draw(name, seconds, Path(*keep) if keep else None)
     else:
         follow(name, seconds, Path(*keep) if keep else None)
 

@@ -29,7 +29,7 @@ from pipeline.live import ports
 from pipeline.live.server import Server
 from pipeline.live.session import Live
 from pipeline.predicting import read_network
-from tests.capture.headers import make_header
+from tests.capture.headers import AS_USUAL, make_header
 
 FOLDER = Path(tempfile.mkdtemp(prefix="reskin-fuzz-"))
 WIRES = get_args(Wire)
@@ -91,7 +91,7 @@ def _reader(layout: str, name: str) -> Callable[[bytes], None]:
         folder = FOLDER / layout
         folder.mkdir(exist_ok=True)
         (folder / name).write_bytes(data)
-        READERS[layout].read(folder, settings)
+        READERS[layout].read(folder, settings, AS_USUAL)
 
     return read
 
@@ -153,7 +153,7 @@ def _files(layout: str, names: tuple[str, ...], **options: str) -> Callable[[byt
         folder.mkdir(exist_ok=True)
         for name, content in zip_longest(names, data.split(b"----\n")[: len(names)], fillvalue=b""):
             (folder / name).write_bytes(content)
-        READERS[layout].read(folder, settings)
+        READERS[layout].read(folder, settings, AS_USUAL)
 
     return read
 
