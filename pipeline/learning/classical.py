@@ -1,6 +1,7 @@
-"""Classical methods on the networks' folds, by scikit-learn. In: settings, and rows as a view gives them. Out: a fit.
+"""Classical methods on the networks' folds. In: settings, and rows as a view gives them. Out: a fit.
 
-A fit standardises by its own training rows and runs in one thread. Refuses to know folds, skins, views and scores.
+A fit standardises by its own training rows and runs in one thread. Refuses to know folds, skins, views and scores; and
+imports what fits late: scenes are checked against these settings, and scikit-learn takes a second to import.
 """
 
 from dataclasses import dataclass, replace
@@ -9,20 +10,10 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from jaxtyping import Float, Float32, Int64
 from pydantic import Field
-from sklearn.ensemble import HistGradientBoostingRegressor
-from sklearn.kernel_ridge import KernelRidge
-from sklearn.linear_model import Ridge as LinearRidge
-from sklearn.multioutput import MultiOutputRegressor
-from sklearn.neighbors import KNeighborsRegressor
-from sklearn.preprocessing import PolynomialFeatures
-from threadpoolctl import ThreadpoolController  # type: ignore[import-untyped]
 
 from pipeline.core.config import Strict
 from pipeline.core.errors import TrainingError
 from pipeline.learning.inputs import SCALE_FLOOR, Scaler, fit_standard
-
-THREADS = ThreadpoolController()  # of the libraries above: finding them takes 3 ms, limiting them 15 us
-BLOCK_ROWS_N = 4096  # handled at once, to bound memory: a kernel of them and 6000 rows is 200 MB
 
 
 class _Method(Strict):
@@ -101,10 +92,12 @@ class Fitted:
 
     def predict(self, inputs: Float32[np.ndarray, "f c"]) -> Float32[np.ndarray, "f 3"]:
         """Predict x_mm, y_mm and F_N; NaN where no training row knew the target."""
+        from pipeline.learning.regressors import blocks, one_thread
+
         predicted = np.full((len(inputs), 3), np.nan, np.float32)
         encoded = self.scaler.encode(inputs).astype(np.float64)
-        with THREADS.limit(limits=1):
-            for block in _blocks(len(inputs)):
+        with one_thread():
+            for block in blocks(len(inputs)):
                 for part in self.parts:
                     values = part.regressor.predict(encoded[block])
                     predicted[block, part.targets] = values.reshape(-1, len(part.targets))
@@ -123,6 +116,8 @@ def fit(
 
     `weight` counts a row as so many in the loss (in a vote, of neighbours); the scaler does not know it.
     """
+    from pipeline.learning.regressors import make_regressor, one_thread
+
     assert weight is None or (weight > 0).all()
     _check(settings, inputs, target)
     scaler = _without_constant_channels(fit_standard(inputs, target))
@@ -135,73 +130,11 @@ def fit(
         if isinstance(settings, RbfRidge) and len(rows) > settings.rows_max_n:
             kept, row_weights = _thin(len(rows), settings.rows_max_n, row_weights, rng)
             rows = rows[kept]
-        regressor = _regressor(settings, rng)
-        with THREADS.limit(limits=1):
+        regressor = make_regressor(settings, rng)
+        with one_thread():
             regressor.fit(encoded[rows], encoded_target[rows][:, targets], row_weights)
         parts.append(_Part(targets, regressor, len(rows)))
     return Fitted(scaler, tuple(parts))
-
-
-def _regressor(settings: Classical, rng: np.random.Generator) -> Any:
-    match settings:
-        case Ridge():
-            return LinearRidge(settings.alpha)
-        case CubicRidge():
-            return _Cubic(settings.alpha)
-        case Neighbours(neighbours_n=k):
-            # A tree, as few of the 15 directions are ever taken; scikit-learn's choice is brute force from 16 on.
-            return _Voting(KNeighborsRegressor(k, weights="distance", algorithm="kd_tree"))
-        case RbfRidge():
-            return KernelRidge(kernel="rbf", alpha=settings.alpha, gamma=settings.gamma)
-        case Boosting():
-            trees = HistGradientBoostingRegressor(
-                max_iter=settings.rounds_n,
-                learning_rate=settings.rate,
-                max_leaf_nodes=settings.leaves_n,
-                early_stopping=False,
-                random_state=int(rng.integers(2**32)),
-            )
-            return MultiOutputRegressor(trees)
-
-
-class _Cubic:
-    """Ridge on products, its sums gathered a block at a time: all products of the paper's rows would be 5 GB."""
-
-    def __init__(self, alpha: float) -> None:
-        self.alpha = alpha
-        self.lift = PolynomialFeatures(3)  # the first product is 1, whose factor is free
-
-    def fit(self, inputs: np.ndarray, target: np.ndarray, weight: np.ndarray | None, /) -> None:
-        c = self.lift.fit(inputs[:1]).n_output_features_
-        squares, moments = np.diag([0.0] + [self.alpha] * (c - 1)), np.zeros((c, target.shape[1]))
-        root = np.ones(len(inputs)) if weight is None else np.sqrt(weight)
-        for block in _blocks(len(inputs)):
-            lifted = root[block, None] * self.lift.transform(inputs[block])  # [b c]
-            squares += lifted.T @ lifted
-            moments += lifted.T @ (root[block, None] * target[block])
-        self.factors = np.linalg.solve(squares, moments)
-
-    def predict(self, inputs: np.ndarray, /) -> np.ndarray:
-        return self.lift.transform(inputs) @ self.factors
-
-
-@dataclass(frozen=True)
-class _Voting:
-    """scikit-learn's neighbours take no weights: sum(w y / d) / sum(w / d) is the ratio of two of its answers."""
-
-    neighbours: KNeighborsRegressor
-
-    def fit(self, inputs: np.ndarray, target: np.ndarray, weight: np.ndarray | None, /) -> None:
-        votes = np.ones(len(inputs)) if weight is None else weight
-        self.neighbours.fit(inputs, np.column_stack([votes[:, None] * target, votes]))
-
-    def predict(self, inputs: np.ndarray, /) -> np.ndarray:
-        voted = self.neighbours.predict(inputs)
-        return voted[:, :-1] / voted[:, -1:]
-
-
-def _blocks(rows_n: int) -> list[slice]:
-    return [slice(i, i + BLOCK_ROWS_N) for i in range(0, rows_n, BLOCK_ROWS_N)]
 
 
 def _without_constant_channels(scaler: Scaler) -> Scaler:

@@ -10,7 +10,7 @@ import hashlib
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import BrokenExecutor, Executor, as_completed
+from concurrent.futures import Executor, as_completed
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.core import io
-from pipeline.core.errors import TrainingError
+from pipeline.core.errors import SchemaError, TrainingError
 from pipeline.core.executors import device
 from pipeline.learning.inputs import Scaler
 from pipeline.learning.trial import Keys, Measured, Trained, Trial
@@ -54,17 +54,19 @@ def _run_once(
     names = [keys.key(trial) for trial in trials]
     members = dict(zip(names, trials, strict=True))  # equal trainings are one
     planned = [(stack, _files_of(stack, cache)) for stack in stacks(members, STACK_N[device()])]
-    missing = [(stack, files) for stack, files in planned if not all(file.exists() for file in files)]
+    missing = [(stack, files) for stack, files in planned if not all([_is_whole(file, tell) for file in files])]
     fresh = {key for stack, _ in missing for key in stack}
     if len(fresh) < len(members):
         tell(f"{len(members) - len(fresh)} of {len(members)} trainings were finished before")
     if missing:
         rows_file = cache / "rows" / f"{keys.rows_digest()}-{os.getpid()}.safetensors"  # an experiment may run beside
         skin = np.unique(rows.skin, return_inverse=True)[1].astype(np.int64)
-        io.write_tensors(rows_file, {"db_uT": rows.db_uT, "target": rows.target, "skin": skin}, {})
         work = [([members[key] for key in stack], files) for stack, files in missing]
+        folds = _folds_of([trial for stack, _ in work for trial in stack])
+        shared = {"db_uT": rows.db_uT, "target": rows.target, "skin": skin}
+        io.write_tensors(rows_file, shared | {name: numbers for name, numbers in folds.values()}, {})
         try:
-            _run_stacks(work, rows_file, executor, tell)
+            _run_stacks(work, rows_file, folds, executor, tell)
         finally:
             io.remove(rows_file)
     file_of = {key: file for stack, files in planned for key, file in zip(stack, files, strict=True)}
@@ -85,42 +87,100 @@ def _files_of(stack: Sequence[str], cache: Path) -> list[Path]:
     return [cache / f"{digest}-{i}.safetensors" for i in range(len(stack))]
 
 
+Folds = Mapping[int, tuple[str, np.ndarray]]  # row numbers by identity: their name in the file of rows, and they
+
+
+def _folds_of(trials: Sequence[Trial]) -> Folds:
+    """Name each set of row numbers by its content, so that a worker reads it once and no call carries 8 bytes a row."""
+    sets = {id(numbers): numbers for trial in trials for numbers in (trial.train, trial.test)}
+    return {key: (hashlib.sha256(numbers.tobytes()).hexdigest()[:32], numbers) for key, numbers in sets.items()}
+
+
 def _run_stacks(
-    planned: Sequence[tuple[Sequence[Trial], Sequence[Path]]], rows_file: Path, executor: Executor,
+    planned: Sequence[tuple[Sequence[Trial], Sequence[Path]]], rows_file: Path, folds: Folds, executor: Executor,
     tell: Callable[[str], None],
 ) -> None:  # fmt: skip
     start_s, done_n, all_n = time.monotonic(), 0, sum(len(stack) for stack, _ in planned)
-    running = {executor.submit(_stack_to_files, rows_file, stack, files): stack for stack, files in planned}
+
+    def send(trial: Trial) -> Sent:
+        return replace(trial, train=IN_FILE, test=IN_FILE), folds[id(trial.train)][0], folds[id(trial.test)][0]
+
+    running = {
+        executor.submit(_stack_to_files, rows_file, [send(trial) for trial in stack], files): stack
+        for stack, files in planned
+    }
     for future in as_completed(running):
         try:
             future.result()
-        except TrainingError as error:
+        except Exception as error:
             executor.shutdown(cancel_futures=True)
-            raise TrainingError(f"{running[future][0].name}, {error}") from None
-        except BrokenExecutor:
-            remedy = "Out of memory? Run again: what was finished is kept."
-            raise TrainingError("training", "a worker process", "alive to its end", "one that died", remedy) from None
+            if isinstance(error, TrainingError):
+                raise TrainingError(f"{running[future][0].name}, {error}") from None
+            raise
         done_n += len(running[future])
         left_s = (time.monotonic() - start_s) / done_n * (all_n - done_n)
         tell(f"{done_n}/{all_n} {running[future][-1].name}, about {left_s:.0f} s left")
 
 
-def _stack_to_files(rows_file: Path, trials: Sequence[Trial], files: Sequence[Path]) -> None:
+IN_FILE = np.zeros(0, np.int64)  # stands for row numbers that lie in the file of rows
+Sent = tuple[Trial, str, str]  # a trial without its row numbers, and the names of those of `train` and of `test`
+
+
+def _stack_to_files(rows_file: Path, sent: Sequence[Sent], files: Sequence[Path]) -> None:
     from pipeline.learning.train import train_stack  # torch, late: only a process that trains pays for it
 
-    for trial, file, trained in zip(trials, files, train_stack(trials, _read_rows(rows_file)), strict=True):
+    def numbers(name: str) -> np.ndarray:
+        return _read_numbers(rows_file, name)
+
+    trials = [replace(trial, train=numbers(train), test=numbers(test)) for trial, train, test in sent]
+    try:
+        results = train_stack(trials, _read_rows(rows_file))
+    except RuntimeError as error:
+        if "out of memory" in str(error) or "allocate memory" in str(error):  # torch has no error of its own on a CPU
+            raise MemoryError(str(error)) from None
+        raise
+    for trial, file, trained in zip(trials, files, results, strict=True):
         tensors = {f"weights.{name}": value for name, value in trained.weights.items()} | trained.scaler.arrays()
         tensors |= {"curve": np.array(trained.curve), "predicted": trained.predicted}
         metadata = {"seconds": f"{trained.seconds:.3f}", "one_reading_s": f"{trained.one_reading_s:.3g}"}
         metadata["trial"] = trial.name
         optional = {"stopped_step": trained.stopped_step, "explained_min": trained.explained_min}
         metadata |= {name: repr(value) for name, value in optional.items() if value is not None}
-        io.write_tensors(file, tensors, metadata)
+        io.write_tensors(file, tensors, metadata | {"digest": _digest(tensors, metadata)})
+
+
+def _digest(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> str:
+    found = hashlib.sha256(repr(sorted(metadata.items())).encode())
+    for name, values in sorted(tensors.items()):
+        found.update(f"{name} {values.dtype} {values.shape}".encode())
+        found.update(np.ascontiguousarray(values).data)
+    return found.hexdigest()[:32]
+
+
+def _is_whole(file: Path, tell: Callable[[str], None]) -> bool:
+    """Tell whether a result is there as it was written; one that was damaged is said, and trained again."""
+    if not file.exists():
+        return False
+    try:
+        tensors, metadata = io.read_tensors(file)
+        written = metadata.pop("digest", None)  # results of older code have none
+        damage = "" if written in (None, _digest(tensors, metadata)) else "other content than was written"
+    except SchemaError as error:
+        damage = str(error)
+    if damage:
+        tell(f"warning: a finished training is damaged and is trained again ({file}: {damage})")
+        io.remove(file)
+    return not damage
 
 
 @lru_cache(maxsize=1)
 def _read_rows(rows_file: Path) -> Measured:
-    return Measured(**io.read_tensors(rows_file)[0])
+    return Measured(**io.read_tensors(rows_file, ("db_uT", "target", "skin"))[0])
+
+
+@lru_cache(maxsize=16)  # sets of a few folds
+def _read_numbers(rows_file: Path, name: str) -> np.ndarray:
+    return io.read_tensors(rows_file, (name,))[0][name]
 
 
 def _read_trained(file: Path) -> Trained:

@@ -183,6 +183,6 @@ def _in_full(row: Words, shared: Words, where: str) -> dict[str, dict[str, Any]]
     headline = dict(shared) | {"steps_n": row["steps_n"]}
     variants = row.get("variants", {})
     if HEADLINE in variants:
-        rule = "unlike the headline, which is the shared row as it is"
-        raise ParamsError(f"{where}.variants", "a name", rule, HEADLINE, "Choose another name.")
+        rule = f"other than {HEADLINE}, by which tables call the section's own recipe"
+        raise ParamsError(f"{where}.variants", "a variant's name", rule, HEADLINE, "Choose another name.")
     return {HEADLINE: headline} | {name: headline | changes for name, changes in variants.items()}

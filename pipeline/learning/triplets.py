@@ -2,6 +2,7 @@
 
 A group is what one triplet is drawn from: the readings of one skin, placed in mm, or the pokes of one line, placed by
 their index. One sampler for both, so that it cannot know more of an unlabelled skin than the order along a line.
+Refuses to know the loss.
 """
 
 from dataclasses import dataclass

@@ -17,14 +17,13 @@ from pipeline.dataset.rows import Rows
 from pipeline.trials.training import SceneData
 from pipeline.twin.fit import TEN, Seen, fit
 from pipeline.twin.law import Law, Setup, simulate_uT
-from pipeline.twin.network import Weights
+from pipeline.twin.opinion import Weights, of_tensors, to_tensors
 from pipeline.twin.residual import Residual, carry
 from pipeline.twin.tables import NOMINAL, OF_NOMINAL, OF_RIG, Tables, middle, tabulate
-from pipeline.twin.training import Lessons, Recorded, Syllabus, teach
+from pipeline.twin.training import NAMELESS, Lessons, Recorded, Syllabus, teach
 
 READINGS_N = 100  # of a poke that a network is taught
 FORMAT = "reskin-universal-1"
-NAMELESS = "nominal"  # of the experts that know no board
 
 
 @dataclass(frozen=True)
@@ -139,19 +138,13 @@ def write_networks(models: Path, experts: Sequence[Experts], lessons: Lessons, s
         folder.mkdir()
         for each in experts:
             name = _file_name(each.syllabus.name)
-            tensors = {f"{i}.{key}": value for i, one in enumerate(each.networks) for key, value in one.items()}
-            io.write_tensors(folder / f"{name}.safetensors", tensors, {"format": FORMAT})
+            io.write_tensors(folder / f"{name}.safetensors", to_tensors(each.networks), {"format": FORMAT})
             io.write_json(folder / f"{name}.json", card_of(each, lessons, seed))
 
 
 def read_networks(models: Path, name: str) -> list[Weights]:
     """Read the networks of what is known, by its name, in their order."""
-    tensors, _ = io.read_tensors(models / f"{_file_name(name)}.safetensors")
-    networks: dict[int, dict[str, np.ndarray]] = {}
-    for key, value in tensors.items():
-        i, _, weight = key.partition(".")
-        networks.setdefault(int(i), {})[weight] = value
-    return [networks[i] for i in sorted(networks)]
+    return of_tensors(io.read_tensors(models / f"{_file_name(name)}.safetensors")[0])
 
 
 def _file_name(name: str) -> str:

@@ -14,16 +14,26 @@ from jaxtyping import Float
 from pipeline.evaluation.metrics import score
 from pipeline.trials.universal import REACH, TEMPERS, Pokes
 from pipeline.twin.experts import Labels, multiply, shift
-from pipeline.twin.network import Opinion, Weights, predict
+from pipeline.twin.opinion import Opinion, Weights, predict
 from pipeline.twin.population import PLACES_N, Population
 from pipeline.twin.skin_map import Estimate, Reader, SkinMap, joined, see_labelled, see_pokes, see_rest
 from pipeline.twin.training import NOISE_uT
 
 BLOCK_N = 200  # readings at a time, to bound memory
-WEIGHT_N = 2.0  # of the one known weight: of the pokes that are shown, that next to it
+WEIGHT_N = 5.0  # of the one known weight, 500 g in the middle: there and then forces of all places are told best
+WEIGHT_SD = 0.02  # of the log of the force that it is taken for: friction where it is guided, and its mass
+FELT_N = 0.2  # a smaller force is felt so little that its logarithm tells nothing
 WAYS = ("map", "universal", "network")
 
 Told = tuple[int, int]  # so many unlabelled pokes, so many labels
+
+
+@dataclass(frozen=True)
+class Weight:
+    """A press of the skin's middle by a weight: its change of field, and the force that it is taken for."""
+
+    db_uT: Float[np.ndarray, " ch"]
+    force_N: float
 
 
 @dataclass(frozen=True)
@@ -33,6 +43,7 @@ class Case:
     board: str
     rest_uT: Float[np.ndarray, " ch"]
     pool: Pokes  # in the order in which they are shown, or labelled
+    weight: Weight
     test_uT: Float[np.ndarray, "n ch"]
     true: Float[np.ndarray, "n 3"]  # x, y in mm from the board's middle, F in N
 
@@ -54,15 +65,24 @@ class Trust:
 
 
 def cases_of(skins: Population, rng: np.random.Generator) -> list[Case]:
-    """Take skins of a population as ones that are asked about: pokes on the grid are shown, the others read."""
+    """Take skins of a population as ones that are asked about: pokes on the grid are shown, the others read.
+
+    The last press of each skin is the weight's.
+    """
     found = []
     for i in range(len(skins)):
         db_uT = skins.db_uT[i] + np.tile(NOISE_uT, 5) * rng.standard_normal(skins.db_uT[i].shape)
         order, place_mm, force_N = rng.permutation(PLACES_N), skins.place_mm[i], skins.force_N[i]
         pool = Pokes(place_mm[order].astype(float), force_N[order].astype(float), db_uT[order])
-        true = np.column_stack([place_mm, force_N])[PLACES_N:].astype(float)
-        found.append(Case(f"population {i}", skins.rest_uT[i].astype(float), pool, db_uT[PLACES_N:], true))
+        true = np.column_stack([place_mm, force_N])[PLACES_N:-1].astype(float)
+        weight = weight_of(db_uT[-1], float(force_N[-1]), rng)
+        found.append(Case(f"population {i}", skins.rest_uT[i].astype(float), pool, weight, db_uT[PLACES_N:-1], true))
     return found
+
+
+def weight_of(db_uT: Float[np.ndarray, " ch"], force_N: float, rng: np.random.Generator) -> Weight:
+    """Take a press as that of a weight: its force is known as well as a weight's is."""
+    return Weight(db_uT, force_N * float(np.exp(WEIGHT_SD * rng.standard_normal())))
 
 
 @dataclass(frozen=True)
@@ -92,7 +112,7 @@ def ready(experts: Experts, case: Case, told: Told) -> Ready:
     skin = see_pokes(skin, shown) if pokes_n else skin
     force_N = np.maximum(case.pool.force_N, skin.tables.force_N[0])
     skin = see_labelled(skin, case.pool.place_mm[labels], force_N[labels], case.pool.db_uT[labels])
-    read_uT = np.concatenate([case.test_uT, case.pool.db_uT[_weight_i(case), None]])
+    read_uT = np.concatenate([case.test_uT, case.weight.db_uT[None]])
     opinion = predict(experts.networks, read_uT, case.rest_uT, shown)
     if labels_n:
         said = predict(experts.networks, case.pool.db_uT[labels], case.rest_uT, shown)
@@ -133,9 +153,15 @@ def scores_of(experts: Experts, case: Case, told: Told, how: Trust) -> list[dict
             {"way": way, "pokes_n": told[0], "labels_n": told[1], "board": case.board}
             | scores
             | {"mse_f_weight_N2": float(((weighed_N - case.true[:, 2]) ** 2).mean())}
+            | {"mse_f_factor_N2": _left_by_factor_N2(read_N, case.true[:, 2])}
             | {"coverage_pct": 100 * _held(found, case)}
         )
     return rows
+
+
+def _left_by_factor_N2(read_N: Float[np.ndarray, " n"], true_N: Float[np.ndarray, " n"]) -> float:
+    # What the best factor of all forces of a skin leaves, so what no weight goes below that moves them alike.
+    return float(((read_N * (read_N @ true_N) / (read_N @ read_N) - true_N) ** 2).mean())
 
 
 def fewer(experts: Experts, networks: Sequence[Weights]) -> Experts:
@@ -143,14 +169,10 @@ def fewer(experts: Experts, networks: Sequence[Weights]) -> Experts:
     return replace(experts, networks=networks)
 
 
-def _weight_i(case: Case) -> int:
-    return int(np.abs(np.log(case.pool.force_N / WEIGHT_N)).argmin())
-
-
 def _off_log_N(found: Estimate, case: Case) -> tuple[float, float]:
     # How far log F is off for the weight, and on average for what is asked, where a force is felt.
-    felt = case.true[:, 2] > 0.1 * WEIGHT_N
-    weight = np.log(case.pool.force_N[_weight_i(case)] / found.force_N[-1])
+    felt = case.true[:, 2] > FELT_N
+    weight = np.log(case.weight.force_N / found.force_N[-1])
     return float(weight), float(np.log(case.true[felt, 2] / found.force_N[:-1][felt]).mean())
 
 

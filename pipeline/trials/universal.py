@@ -6,7 +6,7 @@ Places and fields are turned to the board's frame first. Refuses to know files a
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from pipeline.trials.experts import Experts, Frame
 from pipeline.trials.training import SceneData, score_test
 from pipeline.twin.experts import Labels, centre, multiply, off_middle_mm, shift
 from pipeline.twin.fit import Seen
-from pipeline.twin.network import Opinion, Weights, predict
+from pipeline.twin.opinion import Opinion, Weights, predict
 from pipeline.twin.skin_map import (
     Estimate,
     Reader,
@@ -37,7 +37,7 @@ METHODS = ("universal map, ", "universal, ")  # the map alone; with networks
 WAYS = {"rig": "boards of the rig", "nominal": "simulated alone"}
 REACH = 1.645  # standard deviations to either side of a 90 % interval
 TEMPERS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15)
-ASSUMED_TEMPER = 0.5  # where no board is known that it could be told on: of two experts on one reading, the mean
+ASSUMED_TEMPER = 0.5  # of the map's places, and where nothing tells how sure it is: as if channels erred in pairs
 BLOCK_N = 200  # readings at a time, to bound memory
 FORCE_MIN_N = 0.3  # of a labelled poke: below, the map is not tabulated
 
@@ -53,6 +53,7 @@ class Bench:
     seen: Mapping[str, Seen]
     nominal: Experts
     tempers: Mapping[str, Mapping[int, Tempers]]
+    sureness: Mapping[int, Tempers]  # of experts that know no board, at a misfit of 1
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,10 @@ class Pokes:
     place_mm: Float[np.ndarray, "m 2"]
     force_N: Float[np.ndarray, " m"]
     db_uT: Float[np.ndarray, "m ch"]
+
+    def __getitem__(self, which: slice) -> "Pokes":
+        """Take some of them."""
+        return Pokes(self.place_mm[which], self.force_N[which], self.db_uT[which])
 
 
 @dataclass(frozen=True)
@@ -73,12 +78,18 @@ class Told:
     rest_uT: Float[np.ndarray, " ch"]
     pool: Pokes
     pool_mm: Float[np.ndarray, "m 2"]  # where the networks say that these are
+    misfit: float  # of these, the median: chi^2 a channel, about 1 where the law errs as the map expects
 
     def opinion(self, db_uT: Float[np.ndarray, "n ch"], labels_n: int) -> Opinion:
         """Ask the networks, centred by the pool and shifted by its first labels."""
         said = predict(self.networks, db_uT, self.rest_uT, self.pool.db_uT)
         said_mm = self.pool_mm[:labels_n] - off_middle_mm(self.pool_mm, labels_n)
         return shift(centre(said, self.pool_mm, labels_n), Labels(said_mm, self.pool.place_mm[:labels_n]))
+
+    def tempers(self, sureness: Tempers) -> Tempers:
+        """Believe experts that know no board the less the worse the pokes fit; sure at most as they say themselves."""
+        of_map, of_both = (min(1.0, one / self.misfit) for one in sureness)
+        return of_map, of_both
 
 
 def score_fold(bench: Bench, fold: Fold, rig: Mapping[str, Experts], labels_n: Sequence[int]) -> list[dict[str, Any]]:
@@ -95,12 +106,12 @@ def score_fold(bench: Bench, fold: Fold, rig: Mapping[str, Experts], labels_n: S
         told = tell(experts, rest_uT, pool)
         took_s = time.monotonic() - start_s
         for n in labels_n:
-            tempers = bench.tempers[board][n] if way == "rig" else (ASSUMED_TEMPER, ASSUMED_TEMPER)
-            alone, both = read_both(ready(told, n), test_uT, *tempers)
+            tempers = bench.tempers[board][n] if way == "rig" else told.tempers(bench.sureness[n])
+            ((alone, both),) = read_both(ready(told, n), test_uT, [tempers])
             for name, temper, found in zip(METHODS, tempers, (alone, both), strict=True):
                 words = {"method": f"{name}{WAYS[way]}", "labels_n": n, "fold": fold.name.rsplit("-draw", 1)[0]}
                 words |= {"inputs": "map" if "map" in name else "map and network", "temper": temper}
-                words |= {"seed_i": int(fold.name.rsplit("-draw", 1)[1]), "seconds": took_s}
+                words |= {"seed_i": int(fold.name.rsplit("-draw", 1)[1]), "seconds": took_s, "misfit": told.misfit}
                 points.append(words | {"scores": scored(bench, fold.test, found)})
     return points
 
@@ -109,7 +120,9 @@ def tell(experts: Experts, rest_uT: Float[np.ndarray, " ch"], pool: Pokes) -> To
     """Tell experts what a new board gives without a label: its field at rest, and pokes all over it."""
     skin = see_pokes(see_rest(new_map(experts.tables, experts.residual), rest_uT), pool.db_uT)
     pool_mm = predict(experts.networks, pool.db_uT, rest_uT, pool.db_uT).place_mm
-    return Told(see_even(skin, pool.db_uT), experts.networks, rest_uT, pool, pool_mm)
+    skin = see_even(skin, pool.db_uT)
+    misfit = float(np.median(Reader(skin).weigh(pool.db_uT).misfit()))
+    return Told(skin, experts.networks, rest_uT, pool, pool_mm, misfit)
 
 
 @dataclass(frozen=True)
@@ -130,47 +143,33 @@ def ready(told: Told, labels_n: int) -> Ready:
 
 
 def read_both(
-    ready: Ready, db_uT: Float[np.ndarray, "n ch"], map_temper: float, both_temper: float
-) -> tuple[Estimate, Estimate]:
-    """Read places by the map alone, and by it and the networks."""
+    ready: Ready, db_uT: Float[np.ndarray, "n ch"], tempers: Sequence[Tempers]
+) -> list[tuple[Estimate, Estimate]]:
+    """Read places by the map alone, and by it and the networks; under other tempers intervals alone differ."""
     opinion, alone, both = ready.told.opinion(db_uT, ready.labels_n), [], []
     for first in range(0, len(db_uT), BLOCK_N):
         here = slice(first, first + BLOCK_N)
         weighed = ready.reader.weigh(db_uT[here])
-        alone.append(ready.reader.answer(weighed, map_temper))
-        both.append(multiply(ready.reader, weighed, opinion[here], both_temper))
-    return joined(alone), joined(both)
+        answer = ready.reader.answer(weighed, ASSUMED_TEMPER)
+        alone.append([about(answer, ready.reader.answer(weighed, of_map)) for of_map, _ in tempers])
+        both.append([multiply(ready.reader, weighed, opinion[here], of_both) for _, of_both in tempers])
+    by_temper = zip(zip(*alone, strict=True), zip(*both, strict=True), strict=True)
+    return [(joined(of_map), joined(of_both)) for of_map, of_both in by_temper]
 
 
-def tell_tempers(bench: Bench, labels_n: Sequence[int]) -> dict[str, dict[int, Tempers]]:
-    """Find, for each board that is held out, how much experts are to be believed: as was best on the other boards."""
-    held = {board: coverages(bench, board, labels_n) for board in bench.seen}
-    found: dict[str, dict[int, Tempers]] = {}
-    for board in held:
-        found[board] = {}
-        for n in labels_n:
-            mean = np.mean([own[n] for other, own in held.items() if other != board], axis=0)
-            of_map, of_both = np.abs(mean - 0.9).argmin(axis=0)
-            found[board][n] = TEMPERS[of_map], TEMPERS[of_both]
-    return found
+def about(answer: Estimate, likely: Estimate) -> Estimate:
+    """Give an answer how far what is likely spreads about it."""
+    return replace(answer, sd_mm=np.hypot(likely.sd_mm, likely.place_mm - answer.place_mm))
 
 
-def coverages(bench: Bench, board: str, labels_n: Sequence[int]) -> dict[int, Float[np.ndarray, "t 2"]]:
-    """Give what 90 % intervals hold under each temper, of the map alone and with networks, by number of labels.
-
-    The board is read by the nominal experts, which know no board, with labels of its own, on its other pokes.
-    """
-    seen = bench.seen[board]
-    order = rng_for(bench.data.settings.seed, "universal", board).permutation(len(seen.pokes))
-    pool_n = len(order) // 3
-    db_uT = seen.db_uT.reshape(len(order), -1)[order]
-    place_mm, force_N = seen.place_mm[order], seen.pokes.force_N[order]
-    told = tell(bench.nominal, seen.rest_uT.ravel(), Pokes(place_mm[:pool_n], force_N[:pool_n], db_uT[:pool_n]))
+def coverages(
+    told: Told, asked: Pokes, labels_n: Sequence[int], tempers: Sequence[float]
+) -> dict[int, Float[np.ndarray, "t 2"]]:
+    """Give what 90 % intervals of pokes hold under each temper, of the map alone and with networks, by labels."""
     held = {}
     for n in labels_n:
-        experts = ready(told, min(n, pool_n))
-        both = [read_both(experts, db_uT[pool_n:], temper, temper) for temper in TEMPERS]
-        held[n] = np.array([[covered(found, place_mm[pool_n:]) for found in pair] for pair in both])
+        both = read_both(ready(told, min(n, len(told.pool.force_N))), asked.db_uT, [(one, one) for one in tempers])
+        held[n] = np.array([[covered(found, asked.place_mm) for found in pair] for pair in both])
     return held
 
 
@@ -185,7 +184,8 @@ def scored(bench: Bench, test: Int64[np.ndarray, " b"], estimate: Estimate) -> d
     predicted = np.column_stack([label_mm, estimate.force_N]).astype(np.float32)
     scores = score_test(bench.data, test, predicted)
     true_mm = bench.frame.place(bench.data.rows.target[test, :2].astype(float))
-    coverage = {"coverage_pct": 100 * covered(estimate, true_mm)}
+    half_width_mm = REACH * float(np.median(estimate.sd_mm))
+    coverage = {"coverage_pct": 100 * covered(estimate, true_mm), "half_width_mm": half_width_mm}
     skins = {name: own | coverage for name, own in scores["by_skin"].items()} if len(scores["by_skin"]) == 1 else {}
     return scores | {"all": scores["all"] | coverage} | ({"by_skin": skins} if skins else {})
 

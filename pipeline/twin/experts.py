@@ -9,8 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.twin.network import Opinion
-from pipeline.twin.skin_map import CELL_SD_MM, Estimate, Reader, Weighed, believe
+from pipeline.twin.answers import products
+from pipeline.twin.opinion import Opinion
+from pipeline.twin.skin_map import Estimate, Reader, Weighed
 
 MAP_TEMPER = 0.6  # of the map's log likelihoods, as channels err together; fixed beforehand, told on no board
 SD_MIN_MM, SD_MIN_LOG_N = 0.5, 0.3  # of an opinion: a network is never surer than this
@@ -41,35 +42,19 @@ def off_middle_mm(pool_mm: Float[np.ndarray, "c 2"], labels_n: int) -> Float[np.
 
 def shift(opinion: Opinion, labels: Labels) -> Opinion:
     """Shift an opinion by a constant that labels tell, drawn towards none: Gaussian, with `OFFSET_SD_MM` beforehand."""
+    return replace(opinion, place_mm=opinion.place_mm + told_mm(labels))
+
+
+def told_mm(labels: Labels) -> Float[np.ndarray, "2"]:
+    """Give by how much labels shift an opinion."""
     off_mm = labels.place_mm - labels.said_mm
-    told_mm = off_mm.sum(axis=0) / (len(off_mm) + (LABEL_SD_MM / OFFSET_SD_MM) ** 2)
-    return replace(opinion, place_mm=opinion.place_mm + told_mm)
+    return off_mm.sum(axis=0) / (len(off_mm) + (LABEL_SD_MM / OFFSET_SD_MM) ** 2)
 
 
 def multiply(reader: Reader, weighed: Weighed, opinion: Opinion, temper: float) -> Estimate:
     """Give places and forces: the map's probabilities times the network's normals, and the mean over all places."""
-    by_map = believe(weighed, MAP_TEMPER).reshape(len(weighed.chi2), len(reader.place_mm), -1)
-    of_place = product(by_map.sum(axis=2), reader.place_mm, opinion.place_mm, np.maximum(opinion.sd_mm, SD_MIN_MM))
-    place_mm = of_place @ reader.place_mm
-    likely = of_place**temper
-    likely /= likely.sum(axis=1, keepdims=True)
-    # About the answer, which the power moves a little.
-    var_mm2 = likely @ reader.place_mm**2 - 2 * place_mm * (likely @ reader.place_mm) + place_mm**2
-    sd_mm = np.sqrt(np.maximum(var_mm2, CELL_SD_MM**2))
-    sd_log_N = np.maximum(opinion.sd_log_N, SD_MIN_LOG_N)[:, None]
-    of_force = product(by_map.sum(axis=1), reader.log_N[:, None], opinion.log_N[:, None], sd_log_N)
-    return Estimate(place_mm, sd_mm, np.exp(of_force @ reader.log_N), weighed.misfit())
-
-
-def product(
-    probability: Float[np.ndarray, "n p"],
-    at: Float[np.ndarray, "p d"],
-    mean: Float[np.ndarray, "n d"],
-    sd: Float[np.ndarray, "n d"],
-) -> Float[np.ndarray, "n p"]:
-    """Multiply probabilities of points with independent normals, and bring their sum to 1."""
-    # (a - m)^2 / s^2 as products of matrices: a row a point would be the larger array.
-    apart = (at**2 @ (1 / sd**2).T - 2 * at @ (mean / sd**2).T).T
-    log = np.log(np.maximum(probability, np.finfo(np.float32).tiny)) - 0.5 * apart
-    together = np.exp(log - log.max(axis=1, keepdims=True))
-    return together / together.sum(axis=1, keepdims=True)
+    normals = np.empty((len(opinion.log_N), 6))
+    normals[:, :2], normals[:, 4] = opinion.place_mm, opinion.log_N
+    np.maximum(opinion.sd_mm, SD_MIN_MM, out=normals[:, 2:4])
+    np.maximum(opinion.sd_log_N, SD_MIN_LOG_N, out=normals[:, 5])
+    return Estimate(*products(weighed.likelihoods, reader.at, normals, MAP_TEMPER, temper), weighed.misfit())

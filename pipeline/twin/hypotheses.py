@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Float32
 
+from pipeline.twin.gaussians import Linear, side_by_side
 from pipeline.twin.places import inside
 from pipeline.twin.residual import Residual
 from pipeline.twin.tables import Tables
@@ -22,7 +23,7 @@ class Gains:
     """What an unlabelled poke tells of a skin's numbers, by the hypothesis it is believed to be."""
 
     information: Float32[np.ndarray, "h tt"]
-    aim: Float32[np.ndarray, "hch t"]  # times how far it is off, channel by channel
+    aim: Float32[np.ndarray, "h ch t"]  # times how far it is off, channel by channel
 
 
 @dataclass(frozen=True)
@@ -42,10 +43,9 @@ class Hypotheses:
         return np.repeat(self.place_mm, len(self.log_N), axis=0), np.tile(self.log_N, len(self.place_mm))
 
     @cached_property
-    def moments(self) -> Float32[np.ndarray, "h 6"]:
-        """Give 1, x, y, their squares and log F of each hypothesis: a product with probabilities gives the means."""
-        place_mm, log_N = self.at
-        return np.column_stack([np.ones(len(log_N)), place_mm, place_mm**2, log_N]).astype(np.float32)
+    def linear(self) -> Linear:
+        """Lay means and slopes out as they are made ready for readings."""
+        return side_by_side(self.mean_uT, self.slope_uT)
 
     @cached_property
     def gains(self) -> Gains:
@@ -55,7 +55,7 @@ class Hypotheses:
         cov = with_noise(length2_uT2[:, None, None] * self.error_cov)
         aim = np.linalg.solve(cov, slope_uT)
         information = (aim.transpose(0, 2, 1) @ slope_uT).reshape(h, -1)
-        return Gains(information.astype(np.float32), aim.reshape(-1, aim.shape[2]).astype(np.float32))
+        return Gains(information.astype(np.float32), aim.astype(np.float32))
 
     @cached_property
     def expected_uT(self) -> Float32[np.ndarray, "h ch"]:

@@ -1,11 +1,9 @@
 """A network that is told which skin it reads: field at rest and pokes of a skin -> code; readings and code -> places.
 
 The pokes' places are not told (DeepSets: their order does not matter); the code scales and shifts the layers of the
-regressor (FiLM). In uT, mm and N, board's frame and axes. Refuses to know training, maps and files.
+regressor (FiLM). In PyTorch, to be trained; once it is, `opinion` asks it. In uT, mm and N, board's frame and axes.
+Refuses to know training, maps and files.
 """
-
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -13,29 +11,11 @@ from jaxtyping import Float
 from torch import nn
 from torch.nn.functional import linear
 
-Weights = Mapping[str, np.ndarray]
+from pipeline.twin.opinion import DIRECTION_GAIN, FULL_SET_N, LAYERS_N, LOG_SD, LENGTH_MIN_uT, LOG_uT, REST_uT, Weights
 
-SET_WIDTH, CODE_WIDTH, WIDTH, LAYERS_N = 160, 64, 192, 3
+SET_WIDTH, CODE_WIDTH, WIDTH = 160, 64, 192
 FILM_SD = 0.02  # of first weights: a code changes little at first
-DIRECTION_GAIN, LOG_uT, REST_uT = 4.0, 6.5, 1500.0  # bring inputs to about 1: dB/|dB|, log|dB|, field at rest
-PLACE_MM, LOG_N = 8.0, 3.0  # of an answer of 1
-LOG_SD = (-5.0, 2.0)  # an answer's log sd is held between
-FULL_SET_N = 65.0  # pokes that count as a full set
 ANSWERS_N = 6  # x, y, log F, and the log sd of each
-
-
-@dataclass(frozen=True)
-class Opinion:
-    """What a network says of readings: places and logarithms of forces, and their standard deviations."""
-
-    place_mm: Float[np.ndarray, "n 2"]
-    sd_mm: Float[np.ndarray, "n 2"]
-    log_N: Float[np.ndarray, " n"]
-    sd_log_N: Float[np.ndarray, " n"]
-
-    def __getitem__(self, rows: slice) -> "Opinion":
-        """Take the opinion of some readings."""
-        return Opinion(self.place_mm[rows], self.sd_mm[rows], self.log_N[rows], self.sd_log_N[rows])
 
 
 class Network(nn.Module):
@@ -74,7 +54,7 @@ class Network(nn.Module):
 
 def inputs(db_uT: Float[torch.Tensor, "b n ch"], rest_uT: Float[torch.Tensor, "b ch"]) -> Float[torch.Tensor, "b n i"]:
     """Give direction and log length of each change of field, and the skin's field at rest; scaled to about 1."""
-    length_uT = db_uT.norm(dim=-1, keepdim=True).clamp_min(1.0)
+    length_uT = db_uT.norm(dim=-1, keepdim=True).clamp_min(LENGTH_MIN_uT)
     rest = (rest_uT / REST_uT)[:, None].expand(-1, db_uT.shape[1], -1)
     return torch.cat([DIRECTION_GAIN * db_uT / length_uT, torch.log(length_uT) - LOG_uT, rest], -1)
 
@@ -94,26 +74,3 @@ def draw_weights(channels_n: int, rng: np.random.Generator) -> dict[str, np.ndar
         weights[f"film{i}_weight"] = (FILM_SD * rng.standard_normal((2 * WIDTH, CODE_WIDTH))).astype(np.float32)
         weights[f"film{i}_bias"] = np.zeros(2 * WIDTH, np.float32)
     return weights
-
-
-@torch.no_grad()
-def predict(
-    networks: Sequence[Weights],
-    db_uT: Float[np.ndarray, "n ch"],
-    rest_uT: Float[np.ndarray, " ch"],
-    pokes_uT: Float[np.ndarray, "c ch"],
-) -> Opinion:
-    """Ask networks about readings of one skin, told its field at rest and so many unlabelled pokes (none will do).
-
-    Of several, the mean; what they differ by counts as uncertainty.
-    """
-    torch.set_num_threads(1)  # the same sums in the same order, however many processes run beside this one
-    read, rest, pokes = (torch.from_numpy(part.astype(np.float32))[None] for part in (db_uT, rest_uT, pokes_uT))
-    answers, variances = [], []
-    for weights in networks:
-        network = Network(weights)
-        answer, log_sd = network(read, rest, network.encode(pokes, rest, torch.ones(1, len(pokes_uT))))
-        answers.append(answer[0].numpy().astype(float))
-        variances.append(np.exp(2.0 * log_sd[0].numpy().astype(float)))
-    mean, sd = np.mean(answers, axis=0), np.sqrt(np.mean(variances, axis=0) + np.var(answers, axis=0))
-    return Opinion(PLACE_MM * mean[:, :2], PLACE_MM * sd[:, :2], LOG_N * mean[:, 2], LOG_N * sd[:, 2])

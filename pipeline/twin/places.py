@@ -1,4 +1,7 @@
-"""Where a skin is pressed: places in mm from its middle -> whether they lie on the paper's octagon, or just beyond."""
+"""Where a skin is pressed: places in mm from its middle -> whether they lie on the paper's octagon, or just beyond.
+
+Refuses to know any skin.
+"""
 
 import numpy as np
 from jaxtyping import Bool, Float

@@ -22,7 +22,6 @@ PLACES_N = 65  # of the paper's grid: so many pokes tell a network which skin it
 POKES_N = 2 * PLACES_N  # and as many are asked for
 PITCH_MM, JITTER_MM = 2.0, 0.05  # of that grid; of a poke about its place
 SPREAD_OUT = 0.5  # of the pokes asked for lie anywhere on the skin, the others on the grid
-FORCES_N = (0.5, 10.0)  # log-uniform
 
 # What boards and skins differ in beside the spreads of the law's numbers. Assumed, as those.
 THICKNESSES_MM = {1.8: 0.07, 1.9: 0.24, 2.0: 0.38, 2.1: 0.24, 2.2: 0.07}  # mm: probability
@@ -31,6 +30,18 @@ STRONGER_PER_MM = 0.95  # log amplitude: a skin farther from its chips was found
 FILLER_SD, FILLER_MM, FILLER_WAVES_N = 0.15, 3.0, 64  # of the magnetisation; over which it varies
 GAIN_SD, CROSS_SD, CHIP_TURN_DEG, CHIP_OFFSET_uT = 0.025, 0.01, 2.0, 200.0
 LEAST = {"gap_mm": 0.8, "away_um_mm": 0.0, "lets_go_N": 2.0}  # chips lie in no skin; a skin is not pulled inwards
+
+
+@dataclass(frozen=True)
+class Forces:
+    """Under which forces skins are pressed, log-uniform; and with which weight at last, in the middle."""
+
+    least_N: float = 0.5
+    largest_N: float = 10.0
+    weight_N: float | None = None
+
+
+PLAIN = Forces()
 
 
 @dataclass(frozen=True)
@@ -51,7 +62,7 @@ class Population:
 
 def draw_population(
     centre: Law, spreads: Mapping[str, float], setup: Setup, skins: int | slice, rng: np.random.Generator,
-    forces_N: tuple[float, float] = FORCES_N,
+    forces: Forces = PLAIN,
 ) -> Population:  # fmt: skip
     """Simulate skins about a centre, 130 pokes each: some 40 ms a skin; the first so many, or some of them."""
     setups = {
@@ -66,7 +77,7 @@ def draw_population(
     for one in rng.spawn(taken.stop)[taken]:  # the first skins stay the same when more are drawn
         law = draw_law(centre, spreads, one)
         thickness_mm, tip_mm = (float(one.choice(list(of), p=list(of.values()))) for of in (THICKNESSES_MM, TIPS_MM))
-        drawn.append(draw_skin(law, setups[thickness_mm, tip_mm], one, forces_N))
+        drawn.append(draw_skin(law, setups[thickness_mm, tip_mm], one, forces))
     return Population(*(np.array(part, np.float32) for part in zip(*drawn, strict=True)))
 
 
@@ -81,18 +92,20 @@ def draw_law(centre: Law, spreads: Mapping[str, float], rng: np.random.Generator
 
 
 def draw_skin(
-    law: Law, setup: Setup, rng: np.random.Generator, forces_N: tuple[float, float] = FORCES_N
+    law: Law, setup: Setup, rng: np.random.Generator, forces: Forces = PLAIN
 ) -> tuple[Float[np.ndarray, "m ch"], Float[np.ndarray, " ch"], Float[np.ndarray, "m 2"], Float[np.ndarray, " m"]]:
     """Simulate one skin on chips that err: changes of field and the field at rest, in uT, places and forces."""
     place_mm = draw_places(rng)
-    force_N = np.exp(rng.uniform(np.log(forces_N[0]), np.log(forces_N[1]), POKES_N))
+    force_N = np.exp(rng.uniform(np.log(forces.least_N), np.log(forces.largest_N), POKES_N))
+    if forces.weight_N is not None:
+        place_mm, force_N = np.vstack([place_mm, np.zeros(2)]), np.append(force_N, forces.weight_N)
     filled = fill(setup.rest, rng)
     db_uT, rest_uT = simulate_uT(law, setup, place_mm, force_N, filled), at_rest_uT(law, setup, filled)
     chips_n = len(rest_uT)
     gain = draw_gains(chips_n, rng)
     rest_uT = np.einsum("kij,kj->ki", gain, rest_uT) + CHIP_OFFSET_uT * rng.standard_normal((chips_n, 3))
     db_uT = np.einsum("kij,nkj->nki", gain, db_uT)
-    return db_uT.reshape(POKES_N, -1), rest_uT.ravel(), place_mm, force_N
+    return db_uT.reshape(len(place_mm), -1), rest_uT.ravel(), place_mm, force_N
 
 
 def draw_places(rng: np.random.Generator) -> Float[np.ndarray, "m 2"]:

@@ -13,7 +13,8 @@ from jaxtyping import Float, Float32
 from scipy.linalg import solve_triangular
 
 from pipeline.core.errors import SchemaError
-from pipeline.twin.gaussians import products, quadratic
+from pipeline.twin.answers import Lattice, Likelihoods, means
+from pipeline.twin.gaussians import whiten
 from pipeline.twin.hypotheses import Hypotheses, NOISE_uT, lattice
 from pipeline.twin.residual import Relative, Residual, kernel, no_residual
 from pipeline.twin.tables import Tables
@@ -23,7 +24,7 @@ LEFT_MIN = 0.03  # of the law's error that labels never take away
 SHARE_OF_UNLABELLED = 0.2  # of a poke's weight: the law's errors at neighbouring places are not independent
 ROUNDS_N = 3  # of finding again where unlabelled pokes may have been
 EVEN_MM = 0.15  # so near to the labels' middle pokes lie in the mean that are spread evenly
-CELL_SD_MM = 0.2  # at least, of a place: where it lies within a cell of the lattice
+FELT_MIN = 1e-9  # of the weight of the likeliest hypothesis: from less, pokes teach nothing that single precision holds
 
 
 @dataclass(frozen=True)
@@ -87,10 +88,13 @@ def see_pokes(
     for _ in range(rounds_n):
         reader = reader or Reader(found)
         weight = SHARE_OF_UNLABELLED * believe(reader.weigh(db_uT), skin.temper)
-        of_each = weight.sum(axis=0)
-        off_uT = weight.T @ db_uT.astype(np.float32) - of_each[:, None] * expected_uT
-        information = (of_each @ gains.information).reshape(skin.cov.shape)
-        found, reader = _gain(skin, information, off_uT.ravel() @ gains.aim), None
+        of_all = weight.sum(axis=0)
+        felt = np.flatnonzero(of_all > FELT_MIN * of_all.max())
+        of_each = of_all[felt]
+        off_uT = weight[:, felt].T @ db_uT.astype(np.float32) - of_each[:, None] * expected_uT[felt]
+        information = (of_each @ gains.information[felt]).reshape(skin.cov.shape)
+        vector = off_uT.ravel() @ gains.aim[felt].reshape(-1, len(skin.number))
+        found, reader = _gain(skin, information, vector), None
     return found
 
 
@@ -116,7 +120,7 @@ def see_labelled(
     """Learn from labelled pokes: the skin's numbers first, then what the law misses near them (Gaussian process)."""
     if not len(place_mm):
         return skin
-    mean_uT, slope_uT, missed = _between(skin, place_mm, force_N)
+    mean_uT, slope_uT, missed = between(skin, place_mm, force_N)
     length_uT, log_N = np.linalg.norm(mean_uT, axis=1), np.log(force_N)
     k = kernel(place_mm, place_mm, log_N, log_N) + skin.residual.noise * np.eye(len(place_mm))
     root = np.linalg.cholesky(k)
@@ -135,32 +139,26 @@ class Weighed:
     """Readings against hypotheses: chi^2, and -2 log likelihood less what all share; forces run within places."""
 
     chi2: Float32[np.ndarray, "n h"]
-    total: Float32[np.ndarray, "n h"]
+    likelihoods: Likelihoods
     channels_n: int
 
     def misfit(self) -> Float[np.ndarray, " n"]:
         """Give chi^2 a channel of each reading's likeliest hypothesis."""
-        return self.chi2[np.arange(len(self.chi2)), self.total.argmin(axis=1)] / self.channels_n
+        return self.chi2[np.arange(len(self.chi2)), self.likelihoods.best] / self.channels_n
 
 
 class Reader:
     """A map made ready for readings: every hypothesis (place, force) with its mean and covariance, as rows."""
 
     def __init__(self, skin: SkinMap) -> None:
-        self._of = skin.hypotheses
-        self.place_mm, self.log_N = self._of.place_mm, self._of.log_N
-        self.mean_uT, self.slope_uT, self._temper = self._of.mean_uT, self._of.slope_uT, skin.temper
-        slope = self.slope_uT.reshape(-1, len(skin.number))
-        expected_uT = self.mean_uT + (slope @ skin.number.astype(np.float32)).reshape(self.mean_uT.shape)
-        spread_uT = (slope @ np.linalg.cholesky(skin.cov).astype(np.float32)).reshape(self.slope_uT.shape)
-        missed, left = self._labelled(skin)
-        length_uT = np.linalg.norm(expected_uT, axis=1)
-        expected_uT += length_uT[:, None] * missed
-        self._row, self._log_det = quadratic(
-            expected_uT, spread_uT, length_uT**2 * left, self._of.error_cov.astype(np.float32), NOISE_uT**2
-        )
-        if not np.isfinite(self._log_det).all():
-            rule, got = "positive definite", f"{int((~np.isfinite(self._log_det)).sum())} that are not"
+        self._of, self._temper = skin.hypotheses, skin.temper
+        self.at = Lattice(self._of.place_mm, self._of.log_N)
+        numbers = skin.number.astype(np.float32), np.linalg.cholesky(skin.cov).astype(np.float32)
+        shape = self._of.error_cov.astype(np.float32)
+        self._gaussians = whiten(self._of.linear, numbers, *self._labelled(skin), shape, NOISE_uT**2)
+        unknown = ~np.isfinite(self._gaussians.log_det)
+        if unknown.any():
+            rule, got = "positive definite", f"{int(unknown.sum())} that are not"
             remedy = "Take the no-load reading again."
             raise SchemaError("a map of a skin", "covariances of its hypotheses", rule, got, remedy)
 
@@ -182,21 +180,17 @@ class Reader:
 
     def weigh(self, db_uT: Float[np.ndarray, "n ch"]) -> Weighed:
         """Weigh every hypothesis against readings."""
-        chi2 = products(db_uT.astype(np.float32)) @ self._row.T
-        return Weighed(chi2, chi2 + self._log_det, db_uT.shape[1])
+        chi2, total = self._gaussians.weigh(db_uT.astype(np.float32))
+        return Weighed(chi2, Likelihoods(total, total.argmin(axis=1)), db_uT.shape[1])
 
     def answer(self, weighed: Weighed, temper: float) -> Estimate:
         """Give places and forces, the means over all hypotheses."""
-        moments = believe(weighed, temper) @ self._of.moments
-        _, mean_mm, square_mm2, log_N = np.split(moments, (1, 3, 5), axis=1)
-        place_mm = mean_mm.astype(float)
-        sd_mm = np.sqrt(np.maximum(square_mm2 - place_mm**2, CELL_SD_MM**2))
-        return Estimate(place_mm, sd_mm, np.exp(log_N[:, 0].astype(float)), weighed.misfit())
+        return Estimate(*means(weighed.likelihoods, self.at, temper), weighed.misfit())
 
 
 def believe(weighed: Weighed, temper: float) -> Float[np.ndarray, "n h"]:
     """Turn log likelihoods, times a temper, into probabilities of 1 in sum."""
-    total = weighed.total
+    total = weighed.likelihoods.total
     probability = np.exp(-0.5 * temper * (total - total.min(axis=1, keepdims=True)))
     return probability / probability.sum(axis=1, keepdims=True)
 
@@ -222,10 +216,10 @@ def _gain(skin: SkinMap, information: Float[np.ndarray, "t t"], vector: Float[np
     return replace(skin, number=cov @ (known @ skin.number + vector), cov=(cov + cov.T) / 2)
 
 
-def _between(
+def between(
     skin: SkinMap, place_mm: Float[np.ndarray, "m 2"], force_N: Float[np.ndarray, " m"]
 ) -> tuple[Float[np.ndarray, "m ch"], Float[np.ndarray, "m ch t"], Relative]:
-    # Linear between the lattice's places and between logarithms of forces; past the ends, the ends.
+    """Give means, slopes and what the law misses, linear between the lattice's places and logarithms of forces."""
     tables = skin.tables
     axes = tables.axis_mm, tables.axis_mm, np.log(tables.force_N)
     at = np.column_stack([place_mm, np.log(force_N)])

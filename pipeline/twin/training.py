@@ -17,7 +17,8 @@ from torch.nn.functional import huber_loss
 from pipeline.core.config import Strict
 from pipeline.core.seeds import rng_for
 from pipeline.twin.law import Law, Setup
-from pipeline.twin.network import LOG_N, PLACE_MM, Network, draw_weights
+from pipeline.twin.network import Network, draw_weights
+from pipeline.twin.opinion import LOG_N, PLACE_MM
 from pipeline.twin.population import PLACES_N, POKES_N, Population, draw_population
 from pipeline.twin.residual import Residual
 
@@ -30,6 +31,7 @@ CARRIED_MAX = 2.0  # times what is expected of known boards' errors: none to nea
 # How far the law is off, rms of |dB|, where boards are known and where none is; on recorded ones what else may differ.
 ERROR_OF_RIG, ERROR_OF_NOMINAL, ERROR_OF_RECORDED = (0.1, 0.4), (0.1, 0.5), (0.15, 0.15)
 ERROR_MM, ERROR_LOG_N, ERROR_WAVES_N = (2.5, 5.0), 1.2, 48  # over which such errors are alike; cosines that make them
+NAMELESS = "nominal"  # of the syllabus that knows no board
 BLOCK_STEPS_N = 100  # over which the loss is averaged in a curve
 
 

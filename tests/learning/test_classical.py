@@ -10,7 +10,8 @@ from sklearn.preprocessing import PolynomialFeatures
 
 from pipeline.core.errors import TrainingError
 from pipeline.core.seeds import rng_for
-from pipeline.learning.classical import BLOCK_ROWS_N, Classical, Fitted, fit
+from pipeline.learning.classical import Classical, Fitted, fit
+from pipeline.learning.regressors import BLOCK_ROWS_N
 
 SETTINGS = {
     "ridge": {"method": "ridge", "alpha": 1.0},

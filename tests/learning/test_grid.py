@@ -94,9 +94,21 @@ def test_a_result_is_that_of_its_own_cell_whatever_it_was_stacked_with(tmp_path)
         assert (one.scaler.input_shift == alone.scaler.input_shift).all()
 
 
+def test_a_call_carries_no_row_numbers_and_the_file_of_rows_each_set_once(tmp_path, monkeypatch):
+    sent, written = [], []
+    here, write = Here(), io.write_tensors
+    monkeypatch.setattr(here, "submit", lambda fn, *args: (sent.append(args), Here.submit(here, fn, *args))[1])
+    monkeypatch.setattr(
+        io, "write_tensors", lambda file, tensors, of: (written.append(tensors), write(file, tensors, of))
+    )
+    run([replace(trial, seed_i=seed_i) for trial in trials(2) for seed_i in (0, 1)], tmp_path, here)
+    assert {trial.train.size + trial.test.size for _, stack, _ in sent for trial, *_ in stack} == {0}
+    assert len(written[0]) == 3 + 4  # fields, targets and skins; the rows of two folds, trained and tested on
+
+
 def test_a_killed_grid_loses_no_finished_cell(tmp_path):
     some = trials(2 * SIZE_N + 1)
-    with pytest.raises(TrainingError):
+    with pytest.raises(BrokenProcessPool):
         run(some, tmp_path / "killed", Here(die_after=1))
     assert trainings_n(some, tmp_path / "killed") == 2  # of three stacks
     done, fresh = run(some, tmp_path / "killed"), run(some, tmp_path / "fresh")
@@ -111,9 +123,25 @@ def test_a_stack_killed_while_it_was_written_gives_what_it_would_have_given(tmp_
     assert all(alike(a, b) for a, b in zip(done, run(some, tmp_path), strict=True))
 
 
-def test_a_dead_worker_is_one_sentence(tmp_path):
-    with pytest.raises(TrainingError, match=r"^training: a worker process must be alive to its end; got .* Run again"):
-        run(trials(), tmp_path, Here(die_after=0))
+@pytest.mark.parametrize("damage", ["cut", "empty", "bit"])
+def test_a_damaged_result_is_said_and_trained_again(tmp_path, damage):
+    first, said = run(trials(), tmp_path), []
+    file = tmp_path / f"{first[1].key}.safetensors"
+    content = bytearray(file.read_bytes())
+    content[-5] ^= 1  # of a weight: what no reader of the format can notice
+    file.write_bytes({"cut": content[: len(content) // 2], "empty": b"", "bit": content}[damage])
+    again = run(trials(), tmp_path, said=said)
+    assert [line.startswith("warning: a finished training is damaged") for line in said[:2]] == [True, False]
+    assert all(alike(a, b) for a, b in zip(first, again, strict=True))
+
+
+def test_a_network_that_does_not_fit_into_memory_is_said_so(tmp_path, monkeypatch):
+    def allocate(*_: object) -> None:
+        raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 8000000000 bytes.")
+
+    monkeypatch.setattr(train, "train_stack", allocate)
+    with pytest.raises(MemoryError, match="8000000000 bytes"):
+        run(trials(), tmp_path, make_executor(1, imports="pipeline.learning.train"))
 
 
 def test_a_training_that_cannot_be_is_one_sentence_that_names_its_cell(tmp_path):

@@ -6,7 +6,8 @@ from pipeline.core import io
 from pipeline.core.seeds import rng_for
 from pipeline.dataset.rows import Rows
 from pipeline.trials.experts import READINGS_N, Experts, Frame, read_networks, recorded, write_networks
-from pipeline.twin.network import draw_weights, predict
+from pipeline.twin.network import draw_weights
+from pipeline.twin.opinion import predict
 from pipeline.twin.tables import NOMINAL, OF_NOMINAL
 from pipeline.twin.training import Lessons, Syllabus
 from tests.twin.skins import SETUP, made_tables

@@ -5,7 +5,7 @@ import pytest
 
 from pipeline.core.seeds import rng_for
 from pipeline.trials import population
-from pipeline.trials.population import WAYS, WEIGHT_N, Experts, cases_of, ready, scores_of, trust
+from pipeline.trials.population import WAYS, WEIGHT_N, WEIGHT_SD, Experts, cases_of, ready, scores_of, trust
 from pipeline.trials.universal import TEMPERS
 from pipeline.twin.network import draw_weights
 from pipeline.twin.skin_map import Estimate, new_map
@@ -19,7 +19,7 @@ def experts() -> Experts:
 
 @pytest.fixture(scope="module")
 def cases():
-    return cases_of(made_population(3, rng_for(1, "population")), rng_for(2, "population"))
+    return cases_of(made_population(3, rng_for(1, "population"), WEIGHT_N), rng_for(2, "population"))
 
 
 def test_no_poke_that_is_shown_is_asked(cases):
@@ -38,14 +38,17 @@ def test_an_untaught_network_spoils_no_map_and_labels_gain(experts, cases):
         for n in (0, 40)
     }
     assert off_N2["map", 40] < off_N2["map", 0] < off_N2["network", 0]
+    for row in rows:
+        assert row["mse_f_factor_N2"] <= min(row["mse_f_N2"], row["mse_f_weight_N2"]) + 1e-9  # the best factor of all
 
 
 def test_a_weight_is_known_and_the_rows_are_not(experts, cases):
     case = cases[0]
     asked = ready(experts, case, (16, 0)).read_uT
-    at = np.abs(np.log(case.pool.force_N / WEIGHT_N)).argmin()
-    np.testing.assert_array_equal(asked[-1], case.pool.db_uT[at])
+    np.testing.assert_array_equal(asked[-1], case.weight.db_uT)
     np.testing.assert_array_equal(asked[:-1], case.test_uT)
+    off = [np.log(one.weight.force_N / WEIGHT_N) for one in cases]
+    assert 0 < np.abs(off).max() < 5 * WEIGHT_SD
 
 
 def test_the_share_of_a_weight_is_told_at_the_temper_that_is_used(cases, monkeypatch):
@@ -57,9 +60,8 @@ def test_the_share_of_a_weight_is_told_at_the_temper_that_is_used(cases, monkeyp
         def answers(self, tempers):
             temper, case = tempers["map"], self.case
             reach = 10.0 if temper == TEMPERS[1] else 0.0
-            true_mm, at = np.vstack([case.true[:, :2], [[0, 0]]]), np.abs(np.log(case.pool.force_N / WEIGHT_N)).argmin()
-            of_weight = case.pool.force_N[at] * np.exp(0.1)
-            force_N = np.append(case.true[:, 2] * np.exp(temper), of_weight)
+            true_mm = np.vstack([case.true[:, :2], [[0, 0]]])
+            force_N = np.append(case.true[:, 2] * np.exp(temper), case.weight.force_N * np.exp(0.1))
             found = Estimate(true_mm + 0.1, np.full_like(true_mm, reach), force_N, np.full(len(force_N), np.nan))
             return dict.fromkeys(WAYS, found)
 

@@ -46,11 +46,14 @@ def made_tables() -> Tables:
     )  # fmt: skip
 
 
-def made_population(skins_n: int, rng: np.random.Generator) -> Population:
-    """Draw made-up skins whose numbers differ."""
+def made_population(skins_n: int, rng: np.random.Generator, weight_N: float | None = None) -> Population:
+    """Draw made-up skins whose numbers differ; where a weight is given, its press comes last."""
     place_mm = np.stack([draw_places(rng) for _ in range(skins_n)])
     force_N = np.exp(rng.uniform(np.log(0.5), np.log(10), (skins_n, POKES_N)))
     number = rng.standard_normal((skins_n, 3))
+    if weight_N is not None:
+        place_mm = np.concatenate([place_mm, np.zeros((skins_n, 1, 2))], axis=1)
+        force_N = np.column_stack([force_N, np.full(skins_n, weight_N)])
     db_uT = np.stack([poked_uT(*poke) for poke in zip(place_mm, force_N, number, strict=True)])
     parts = db_uT, number @ REST_SLOPE_uT.T, place_mm, force_N
     return Population(*(part.astype(np.float32) for part in parts))

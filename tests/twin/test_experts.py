@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from pipeline.core.seeds import rng_for
-from pipeline.twin.experts import LABEL_SD_MM, OFFSET_SD_MM, Labels, centre, multiply, product, shift
-from pipeline.twin.network import Opinion
+from pipeline.twin.experts import LABEL_SD_MM, OFFSET_SD_MM, Labels, centre, multiply, shift
+from pipeline.twin.opinion import Opinion
 from pipeline.twin.skin_map import Reader, new_map
 from tests.twin.skins import fields_uT, made_tables
 
@@ -15,23 +15,6 @@ RNG = rng_for(0, "experts")
 def opinion(place_mm: np.ndarray, sd_mm: float = 1.0) -> Opinion:
     n = len(place_mm)
     return Opinion(place_mm, np.full((n, 2), sd_mm), np.full(n, 1.0), np.full(n, 1.0))
-
-
-def test_a_product_on_a_lattice_is_the_closed_form_of_two_gaussians():
-    axis_mm = np.arange(-8, 8.01, 0.2)
-    at_mm = np.stack(np.meshgrid(axis_mm, axis_mm, indexing="ij"), axis=-1).reshape(-1, 2)
-    first_mm, first_sd, second_mm, second_sd = (
-        np.array([1.0, -2.0]),
-        1.2,
-        np.array([[2.5, 0.0]]),
-        np.array([[0.8, 0.6]]),
-    )
-    probability = np.exp(-0.5 * ((at_mm - first_mm) ** 2).sum(axis=1) / first_sd**2)[None]
-    found = product(probability / probability.sum(), at_mm, second_mm, second_sd)
-    var = 1 / (1 / first_sd**2 + 1 / second_sd[0] ** 2)
-    mean = var * (first_mm / first_sd**2 + second_mm[0] / second_sd[0] ** 2)
-    np.testing.assert_allclose((found @ at_mm)[0], mean, atol=1e-6)
-    np.testing.assert_allclose((found @ at_mm**2)[0] - mean**2, var, atol=1e-5)
 
 
 def test_a_centred_opinion_has_no_mean_over_the_pool():

@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from pipeline.core.seeds import rng_for
-from pipeline.twin.network import Network, draw_weights, inputs, predict
+from pipeline.twin.network import Network, draw_weights, inputs
+from pipeline.twin.opinion import LOG_N, PLACE_MM, predict
 
 RNG = rng_for(0, "network")
 POKES_uT, READ_uT, REST_uT = (RNG.normal(0, 300, shape) for shape in ((20, 15), (7, 15), (15,)))
@@ -47,3 +48,18 @@ def test_several_networks_give_their_mean_and_count_their_difference_as_uncertai
 def test_weights_fit_any_number_of_chips(chips_n):
     weights = draw_weights(3 * chips_n, rng_for(0, "chips"))
     assert predict([weights], READ_uT[:, : 3 * chips_n], REST_uT[: 3 * chips_n], POKES_uT[:, : 3 * chips_n]).log_N.shape
+
+
+@pytest.mark.parametrize("pokes_n", [0, 20])
+def test_what_is_asked_without_pytorch_is_what_was_trained_in_it(pokes_n):
+    weights = {name: value + 0.05 * RNG.standard_normal(value.shape).astype(np.float32) for name, value in ONE.items()}
+    found = predict([weights], READ_uT, REST_uT, POKES_uT[:pokes_n])
+    read, rest, pokes = (torch.from_numpy(part.astype(np.float32))[None] for part in (READ_uT, REST_uT, POKES_uT))
+    with torch.no_grad():
+        network = Network(weights)
+        kept = (torch.arange(20) < pokes_n).float()[None]
+        answer, log_sd = (part[0].numpy() for part in network(read, rest, network.encode(pokes, rest, kept)))
+    asked = np.column_stack([found.place_mm / PLACE_MM, found.log_N / LOG_N])
+    asked_sd = np.column_stack([found.sd_mm / PLACE_MM, found.sd_log_N / LOG_N])
+    np.testing.assert_allclose(asked, answer, rtol=1e-5, atol=1e-5)  # sums in another order
+    np.testing.assert_allclose(np.log(asked_sd), log_sd, rtol=1e-5, atol=1e-5)

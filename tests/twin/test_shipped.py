@@ -1,11 +1,11 @@
-"""The map that comes with the project: it reads simulated pokes, tells what is none, and refuses other boards."""
+"""The model that comes with the project: it reads simulated pokes, tells what is none, and refuses other boards."""
 
 import numpy as np
 import pytest
 
 import reskin
 from pipeline.core.errors import SchemaError
-from pipeline.twin.shipped import CHANNELS_N, Universal, load_universal, to_board
+from pipeline.twin.shipped import CHANNELS_N, FILE, Universal, load_universal, to_board
 from pipeline.twin.tables import NOMINAL
 
 PLACES_MM = np.array([[8.0, 8.0], [3.0, 6.0], [12.0, 11.0], [10.0, 3.0]])
@@ -52,10 +52,12 @@ def test_what_is_no_poke_of_a_skin_has_a_misfit_far_above_one(skin):
     assert alien.min() > 10 * own.max()
 
 
-def test_the_card_says_what_the_map_is_and_what_it_is_not_for(skin):
+def test_the_card_says_what_the_model_is_and_what_it_is_not_for(skin):
     assert skin.card["source"] == "simulated"
     assert skin.card["centre"]["gap_mm"] == NOMINAL.gap_mm
     assert skin.card["not_for"]
+    assert len(skin.networks) == skin.card["lessons"]["seeds_n"]
+    assert FILE.stat().st_size <= 5e6  # bytes
     assert tuple(skin.card["spreads"]) == skin.tables.names
 
 

@@ -39,17 +39,20 @@ def test_a_reading_is_weighed_by_its_gaussian_distance(skin):
     skin = replace(skin, number=np.array([0.3, -0.2, 0.5]))
     reader = Reader(skin)
     hypothesis = [300, 1100, 2000]
-    expected_uT = reader.mean_uT[hypothesis] + reader.slope_uT[hypothesis] @ skin.number
+    mean_uT, slope_uT = skin.hypotheses.mean_uT[hypothesis], skin.hypotheses.slope_uT[hypothesis]
+    expected_uT = mean_uT + slope_uT @ skin.number
     db_uT = expected_uT * 1.2 + 10.0
     for row, i in enumerate(hypothesis):
-        slope_uT, length_uT = reader.slope_uT[i], np.linalg.norm(expected_uT[row])
-        cov = slope_uT @ skin.cov @ slope_uT.T + ((LAW_ERROR * length_uT) ** 2 / 15 + NOISE_uT**2) * np.eye(15)
+        length_uT = np.linalg.norm(expected_uT[row])
+        cov = slope_uT[row] @ skin.cov @ slope_uT[row].T + ((LAW_ERROR * length_uT) ** 2 / 15 + NOISE_uT**2) * np.eye(
+            15
+        )
         off_uT = db_uT[row] - expected_uT[row]
         chi2 = off_uT @ np.linalg.solve(cov, off_uT)
         weighed = chi2 + np.linalg.slogdet(cov)[1]
         found = reader.weigh(db_uT[row : row + 1])
         assert found.chi2[0, i] == pytest.approx(chi2, abs=0.01)  # single precision
-        assert found.total[0, i] == pytest.approx(weighed, abs=0.02)
+        assert found.likelihoods.total[0, i] == pytest.approx(weighed, abs=0.02)
 
 
 def test_readings_of_the_tables_own_skin_are_read_where_they_were(skin):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.core.seeds import rng_for
-from pipeline.twin.network import predict
+from pipeline.twin.opinion import predict
 from pipeline.twin.population import PLACES_N, POKES_N
 from pipeline.twin.residual import carry
 from pipeline.twin.tables import NOMINAL, OF_NOMINAL

@@ -1,7 +1,7 @@
 """Stage population: experts that were taught simulated skins only, on held-out rows of those that table 2 is scored on.
 
 They know the skin and the board as designed; none of the scene's own skins. Further skins of the population tell how
-sure they are.
+sure they are. Refuses to know how experts are taught (`taught`).
 """
 
 from collections.abc import Sequence
@@ -24,10 +24,22 @@ from pipeline.experiments.population.taught import Lesson, Taught, draw, lesson_
 from pipeline.physics.skin import SkinDesign
 from pipeline.synthesis.settings import synthesis_of
 from pipeline.trials.experts import Frame
-from pipeline.trials.population import Case, Experts, Told, cases_of, fewer, scores_of, trust
+from pipeline.trials.population import (
+    WEIGHT_N,
+    WEIGHT_SD,
+    Case,
+    Experts,
+    Told,
+    Weight,
+    cases_of,
+    fewer,
+    scores_of,
+    trust,
+    weight_of,
+)
 from pipeline.trials.training import SceneData, read_data
 from pipeline.trials.universal import Pokes
-from pipeline.twin.network import Weights
+from pipeline.twin.opinion import Weights
 from pipeline.twin.skin_map import new_map
 
 QUESTION = "lobo"  # whose folds these are: their pools are those of adaptation
@@ -52,14 +64,27 @@ def cases(data: SceneData, fold: Fold, frame: Frame, rest_uT: dict[str, np.ndarr
     rows, found = data.rows, []
     for skin in np.unique(rows.skin[fold.test]):
         rng = rng_for(data.settings.seed, "population", "asked", str(skin))
-        pool = _pool(data, fold.pool[rows.skin[fold.pool] == skin], frame, rng)
+        pooled = fold.pool[rows.skin[fold.pool] == skin]
+        pool = _pool(data, pooled, frame, rng)
         test = fold.test[rows.skin[fold.test] == skin]
         test = np.sort(rng.permutation(test)[:TESTED_MAX_N])
         place_mm = frame.place(rows.target[test, :2].astype(float))
         true = np.column_stack([place_mm, rows.target[test, 2]])
         noload_uT = frame.field(rest_uT[str(skin)][None])[0]
-        found.append(Case(str(rows.board[test[0]]), noload_uT, pool, frame.field(rows.db_uT[test]), true))
+        weight = _weight(data, pooled, frame, rng_for(data.settings.seed, "population", "weight", str(skin)))
+        found.append(Case(str(rows.board[test[0]]), noload_uT, pool, weight, frame.field(rows.db_uT[test]), true))
     return found
+
+
+def _weight(data: SceneData, own: np.ndarray, frame: Frame, rng: np.random.Generator) -> Weight:
+    # Of the presses of the place next to the middle, that whose force comes next to the weight's.
+    rows = data.rows
+    off_mm = np.linalg.norm(frame.place(rows.target[own, :2].astype(float)), axis=1).round(1)
+    middle = own[off_mm == off_mm.min()]
+    press_i, first = np.unique(rows.indentation[middle], return_index=True)
+    next_i = press_i[np.abs(np.log(rows.target[middle[first], 2] / WEIGHT_N)).argmin()]
+    press = middle[rows.indentation[middle] == next_i]
+    return weight_of(frame.field(rows.db_uT[press]).mean(axis=0), float(rows.target[press, 2].mean()), rng)
 
 
 def _pool(data: SceneData, own: np.ndarray, frame: Frame, rng: np.random.Generator) -> Pokes:
@@ -93,7 +118,7 @@ def score_all(
         networks[n] = network(lesson, skins, n, section.steps_n)
         say(f"{scene} population: network of {n} skins is trained")
     whole = Experts(new_map(lesson.tables()), [networks[max(section.skins_n)]])
-    further = lesson.skins("further", slice(ASKED_FURTHER_N))
+    further = lesson.skins("further", slice(ASKED_FURTHER_N), WEIGHT_N)
     held = cases_of(further, rng_for(lesson.seed, "population", "noise"))
     rows, sizes, full, trusted = [], [], (max(section.unlabelled_n), 0), {}
     for told in section.told():
@@ -137,7 +162,8 @@ def population(scene: str, files: Files, folds: Path, indentations: Path, answer
         "told": over_boards(rows, "way", "pokes_n", "labels_n"),
         "scaling": over_boards(sizes, "way", "pokes_n", "labels_n", "skins_n"),
         "skins_asked_n": len(asked), "rows_asked_n": sum(len(case.true) for case in asked),
-        "pool_n": min(len(case.pool.force_N) for case in asked), "steps_n": section.steps_n, **words,
+        "pool_n": min(len(case.pool.force_N) for case in asked), "steps_n": section.steps_n,
+        "weight_N": WEIGHT_N, "weight_sd": WEIGHT_SD, **words,
     }  # fmt: skip
     write_answer(answer, numbers, {})
 

@@ -6,7 +6,7 @@ from typing import Any
 import pandas as pd
 
 from pipeline.reporting.figures import drawing, svg
-from pipeline.reporting.shown import n_of, scores, show, tabulate
+from pipeline.reporting.shown import n_of, scores, tabulate
 from pipeline.reporting.work_precision import COLOURS, MARKERS
 
 NAMES = {
@@ -14,8 +14,9 @@ NAMES = {
     "universal": "universal, skin as designed",
     "network": "universal network alone, skin as designed",
 }
-WEIGHED, COVERAGE = "MSE_F with one known weight / N²", "in 90 % intervals / %"
-WEIGHED_KEY, COVERAGE_KEY = "mse_f_weight_N2", "coverage_pct"
+WEIGHED, FACTOR = "MSE_F with one known weight / N²", "MSE_F after one factor a skin (diagnosis) / N²"
+COVERAGE = "in 90 % intervals / %"
+FURTHER = {"mse_f_weight_N2": WEIGHED, "mse_f_factor_N2": FACTOR, "coverage_pct": COVERAGE}
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
@@ -50,8 +51,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
 def _line(row: Mapping[str, Any], source: str, taught: int | None = None) -> dict[str, str]:
     line = {"method": NAMES[row["way"]]} | ({} if taught is None else {"skins taught": str(taught)})
     line |= {"unlabelled pokes": str(row["pokes_n"]), "labels": str(row["labels_n"]), "source": source}
-    line |= scores(row) | {WEIGHED: show(row[WEIGHED_KEY]), COVERAGE: show(row[COVERAGE_KEY])}
-    return line | {"n": n_of(row)}
+    return line | scores(row) | scores(row, FURTHER) | {"n": n_of(row)}
 
 
 def _meaning(numbers: Mapping[str, Any]) -> str:
@@ -60,7 +60,9 @@ def _meaning(numbers: Mapping[str, Any]) -> str:
         f"Experts that were taught simulated skins about the skin as designed, and none of the scene's "
         f"{numbers['skins_asked_n']}, of which {numbers['rows_asked_n']:,} rows of later passes are read. Unlabelled "
         f"pokes: one at each of the {numbers['pool_n']} places of the grid under any depth, or the first of these; "
-        "labels are among them. The weight: the force of one of these pokes is known, its place is not. How sure each "
+        f"labels are among them. The weight: of one press in the middle, {numbers['weight_N']:g} N or what of the "
+        f"first passes comes next to it, the force is known to {100 * numbers['weight_sd']:g} %; the factor uses all "
+        "forces: no weight that moves them alike goes below it. How sure each "
         "way is, and how far a weight moves its forces, was told on further skins of the population; there 90 % "
         f"intervals hold {coverage}."
     )

@@ -26,8 +26,9 @@ from pipeline.physics.skin import SkinDesign
 from pipeline.physics.slide import force_at
 from pipeline.synthesis.settings import BoardKind
 from pipeline.twin.law import Law, Setup
-from pipeline.twin.network import Weights, draw_weights
-from pipeline.twin.population import Population, draw_population
+from pipeline.twin.network import draw_weights
+from pipeline.twin.opinion import Weights
+from pipeline.twin.population import Forces, Population, draw_population
 from pipeline.twin.tables import OF_RIG, Tables, tabulate
 from pipeline.twin.training import Syllabus, train
 
@@ -53,11 +54,11 @@ class Lesson:
     forces_N: tuple[float, float]
     seed: int
 
-    def skins(self, name: str, which: slice) -> Population:
-        """Draw some skins of the population that bears this name."""
+    def skins(self, name: str, which: slice, weight_N: float | None = None) -> Population:
+        """Draw some skins of the population that bears this name; where a weight is given, its press comes last."""
         centre, spreads, setup = self.syllabus.centre, self.syllabus.spreads, self.syllabus.setup
         rng = rng_for(self.seed, "population", name)
-        return draw_population(centre, spreads, setup, which, rng, self.forces_N)
+        return draw_population(centre, spreads, setup, which, rng, Forces(*self.forces_N, weight_N))
 
     def tables(self) -> Tables:
         """Tabulate the skin as designed, for the map."""

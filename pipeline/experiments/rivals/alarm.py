@@ -13,14 +13,14 @@ from jaxtyping import Float
 from pipeline.dataset.splits import Fold
 from pipeline.evaluation.scores import statistic
 from pipeline.experiments.contacts.pairs import roc_area
-from pipeline.experiments.rivals.points import board_of, means_uT, pokes_of
+from pipeline.experiments.rivals.flagged import EVERY_N, first_folds, limits_of, worse
+from pipeline.experiments.rivals.points import INVERSION, means_uT, pokes_of
 from pipeline.trials.experts import Frame
 from pipeline.trials.training import SceneData
 from pipeline.twin.fit import Seen
 from pipeline.twin.inversion import Chart, chart, fit_unlabelled, search
 from pipeline.twin.law import Setup
 
-EVERY_N = 10  # of the tested readings, one is asked
 OF_RIGHT, OF_STRANGER = "the right skin's", "fitted anew to the stranger"
 ANOTHER = "another skin of the rig"
 QUARTER = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -52,14 +52,14 @@ def alarm(
     data: SceneData, frame: Frame, setup: Setup, seen: Mapping[str, Seen], folds: Sequence[Fold], fraction: float
 ) -> dict[str, Any]:
     """Fit a law to each board's unlabelled pokes, on its first fold; ask it of readings of its own and of strangers."""
-    first = {board_of(fold): fold for fold in reversed(folds)}
-    boards = {board: board_seen(data, seen[board], fold) for board, fold in sorted(first.items())}
+    first = first_folds(folds)
+    boards = {board: board_seen(data, seen[board], fold) for board, fold in first.items()}
     known = {board: known_of(frame, setup, own) for board, own in boards.items()}
-    left = {board: left_over(frame, known[board], own) for board, own in boards.items()}
-    limits = {
-        board: float(np.quantile(np.concatenate([left[other] for other in boards if other != board]), 1 - fraction))
-        for board in boards
-    }
+    found = {board: search(known[board], frame.field(own.asked_uT)) for board, own in boards.items()}
+    left = {board: own.left for board, own in found.items()}
+    true = {board: data.rows.target[first[board].test[::EVERY_N], :2].astype(float) for board in boards}
+    off_mm = {board: own.place_mm - frame.place(true[board]) for board, own in found.items()}
+    limits = limits_of(left, fraction)
     strangers: dict[tuple[str, str], dict[str, np.ndarray]] = {}
     names = list(boards)
     for i, (board, own) in enumerate(boards.items()):
@@ -75,6 +75,7 @@ def alarm(
         "asked_pct": 100 * fraction,
         "limit": statistic(list(limits.values()), boards=True),
         "right": told(left, left, limits),
+        "flagged": {"method": INVERSION, "by": "left over"} | worse(left, off_mm, fraction),
         "strangers": [
             {"stranger": stranger, "law": law} | told(of, left, limits) for (stranger, law), of in strangers.items()
         ],

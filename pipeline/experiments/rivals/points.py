@@ -14,6 +14,7 @@ from pipeline.dataset.splits import Fold
 from pipeline.evaluation.scores import AS_LABELLED, REGISTERED, by_skin, over_boards, paired, tidy
 from pipeline.trials.training import SceneData, score_test
 
+INVERSION = "physics inversion"  # a method
 OWN, NONE, FOREIGN = "its own", "none", "another skin's"  # unlabelled pokes that a method is given
 Point = dict[str, Any]
 Key = tuple[str, str, int]  # method, unlabelled pokes, number of labels

@@ -1,7 +1,8 @@
 """Stage rivals: what else may be done for a board that nobody calibrated, on the folds of question labels.
 
 Inputs aligned with known boards'; a law fitted to unlabelled pokes, searched, and what it leaves over as an alarm; and,
-as a control, what another skin's pokes do to all that use unlabelled ones.
+as a control, what another skin's pokes do to all that use unlabelled ones. Refuses to know how each rival works
+(modules beside this one).
 """
 
 from collections.abc import Sequence
@@ -21,7 +22,7 @@ from pipeline.dataset.splits import Fold
 from pipeline.evaluation.scores import tally
 from pipeline.experiments.answer import read_folder, write_answer
 from pipeline.experiments.compare.run import Compare, see, setup_of, skins_of, turns_of
-from pipeline.experiments.rivals import aligned, told
+from pipeline.experiments.rivals import aligned, flagged, told
 from pipeline.experiments.rivals.alarm import alarm
 from pipeline.experiments.rivals.points import Point, pokes_of, summarise
 from pipeline.learning.classical import Classical
@@ -76,16 +77,18 @@ def rivals(scene: str, files: Files, indentations: Path, folds: Path, models: Pa
     section, of_labels = read(settings), data.folds_of(QUESTION)
     points, trainings, unpaired_n = baselines(data, of_labels, section)
     nominal, rig = read_experts(Known(data, frame, setup, seen), models)
-    bench = Bench(data, frame, seen, nominal, {})
+    bench = Bench(data, frame, seen, nominal, {}, {})
     took: list[told.Timed] = []
     for fold in of_labels:
         found, timed = told.score_told(bench, setup, of_labels, fold, rig)
         points, took = points + found, took + timed
         say(f"{scene} rivals: {fold.name} told its own pokes, none and another skin's")
+    alarms = alarm(data, frame, setup, seen, of_labels, section.false_alarm_fraction)
     numbers: dict[str, Any] = {
         "methods": summarise(points, aligned.controls(section.methods, section.labels_n) | told.controls()),
         "unpaired_n": unpaired_n,
-        "alarm": alarm(data, frame, setup, seen, of_labels, section.false_alarm_fraction),
+        "flagged": [*flagged.experts(bench, of_labels, section.false_alarm_fraction), alarms.pop("flagged")],
+        "alarm": alarms,
     }
     write_answer(answer, numbers, {}, trainings=tally(trainings))
     io.write_json(SECONDS / scene / "rivals.json", [asdict(one) for one in took])

@@ -1,4 +1,4 @@
-"""Rivals, told: numbers -> three tables. Sees no reading, no model and no path."""
+"""Rivals, told: numbers -> four tables. Sees no reading, no model and no path."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -45,10 +45,17 @@ OF_ALARM = (
     "that of the right skin, or fitted anew to the stranger's own pokes and field at rest. n boards; "
     "[low, high]: 95 % interval over them (Student's t, which knows no bounds)."
 )
+OF_FLAGGED = (
+    "Each told the right skin's own unlabelled pokes and no label. Flagged: above the limit that {asked:g} % of "
+    "readings of boards not held out exceed. n boards; an error is of those that flag any reading. A misfit says that "
+    "dB is none of such a skin, a standard deviation that several places would read alike: only the latter is about "
+    "the place."
+)
+PLACES = ("accuracy_pct", "mse_xy_mm2")
 
 
 def tables(numbers: Row, source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate baselines, what unlabelled pokes are worth, and the alarm."""
+    """Tabulate baselines, what unlabelled pokes are worth, the alarm, and errors of what is flagged."""
     rows = numbers["methods"]
     told = [row for row in rows if row["method"].startswith(TOLD)]
     others = [row for row in rows if row not in told]
@@ -64,7 +71,19 @@ def tables(numbers: Row, source: str) -> dict[str, pd.DataFrame]:
             [_alarm(row, source) for row in (right, *alarm["strangers"])],
             meaning=OF_ALARM.format(asked=alarm["asked_pct"], limit=show(alarm["limit"])),
         ),
+        "rivals_flagged": tabulate(
+            [_flagged(row, source) for row in numbers["flagged"]],
+            meaning=OF_FLAGGED.format(asked=alarm["asked_pct"]),
+        ),
     }
+
+
+def _flagged(row: Row, source: str) -> dict[str, str]:
+    of = {"flagged": "flagged", "others": "all others"}
+    titles = {f"{metric}_{name}": f"{COLUMNS[metric]} ({words})" for metric in PLACES for name, words in of.items()}
+    line = {"method": row["method"], "flagged by": row["by"], "flagged, %": show(row["flagged_pct"])}
+    line |= {title: show(row[name]) if name in row else NONE for name, title in titles.items()}
+    return line | {"n": str(row["flagged_pct"]["n"]), "source": source}
 
 
 def figures(numbers: Row, drawn: Row, source: str) -> dict[str, str]:

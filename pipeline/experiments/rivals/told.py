@@ -12,14 +12,14 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.dataset.splits import Fold
-from pipeline.experiments.rivals.points import FOREIGN, NONE, OWN, Key, Point, board_of, next_board, point
+from pipeline.experiments.rivals.points import FOREIGN, INVERSION, NONE, OWN, Key, Point, board_of, next_board, point
 from pipeline.trials.experts import Experts
 from pipeline.trials.universal import ASSUMED_TEMPER, WAYS, Bench, Pokes, Told, pool_of, read_both, ready, tell
 from pipeline.twin.inversion import Chart, chart, fit_unlabelled, search
 from pipeline.twin.law import Setup
 from pipeline.twin.skin_map import new_map, see_rest
 
-INVERSION, CENTRED = "physics inversion", "physics inversion, centred"
+CENTRED = f"{INVERSION}, centred"
 EXPERTS = ("universal map, ", "universal network, ", "universal, ")  # the map, the network, both
 NOWHERE_MM = np.zeros((1, 2))  # of no poke: nothing is centred
 
@@ -70,7 +70,7 @@ def asked(
     told = tell(experts, rest_uT, pool) if len(pool.force_N) else untold(experts, rest_uT, pool)
     experts_ready = ready(told, 0)
     ready_s = time.process_time()
-    alone, both = read_both(experts_ready, test_uT, ASSUMED_TEMPER, ASSUMED_TEMPER)
+    ((alone, both),) = read_both(experts_ready, test_uT, [(ASSUMED_TEMPER, ASSUMED_TEMPER)])
     read_s = time.process_time()
     opinion = told.opinion(test_uT, 0)
     asked_s = time.process_time()
@@ -84,7 +84,7 @@ def asked(
 def untold(experts: Experts, rest_uT: Float[np.ndarray, " ch"], none: Pokes) -> Told:
     """Tell experts the field at rest, and no poke."""
     skin = see_rest(new_map(experts.tables, experts.residual), rest_uT)
-    return Told(skin, experts.networks, rest_uT, none, NOWHERE_MM)
+    return Told(skin, experts.networks, rest_uT, none, NOWHERE_MM, misfit=1.0)
 
 
 def inverted(

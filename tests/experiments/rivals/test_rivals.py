@@ -11,7 +11,7 @@ from pipeline.core.seeds import rng_for
 from pipeline.dataset.rows import Rows
 from pipeline.dataset.splits import Fold
 from pipeline.evaluation.metrics import score_groups
-from pipeline.experiments.rivals import alarm, aligned, told
+from pipeline.experiments.rivals import alarm, aligned, flagged, told
 from pipeline.experiments.rivals.alarm import QUARTER, STRANGERS, Board
 from pipeline.experiments.rivals.points import FOREIGN, NONE, OWN, next_board, pokes_of, summarise
 from pipeline.experiments.rivals.show import WHY, tables
@@ -111,6 +111,18 @@ def test_alarms_are_counted_above_each_boards_limit():
     assert alarm.told(right, right, {"b0": 0.35, "b1": 0.15})["auc"]["mean"] == pytest.approx(0.5)
 
 
+def test_flagged_readings_are_scored_beside_all_others_board_by_board():
+    value = {"b0": np.array([0.0, 1.0, 2.0, 9.0]), "b1": np.array([0.0, 1.0, 2.0, 3.0])}
+    off_mm = {board: np.array([[0.0, 0.5], [0.5, 0.0], [0.0, 0.5], [2.0, 0.0]]) for board in value}
+    assert flagged.limits_of(value, 0.0) == {"b0": 3.0, "b1": 9.0}
+    found = flagged.worse(value, off_mm, 0.0)
+    assert found["flagged_pct"]["mean"] == pytest.approx((25 + 0) / 2)
+    assert found["accuracy_pct_flagged"] == {"mean": 0.0, "n": 1}  # b1 flags none
+    assert found["mse_xy_mm2_flagged"]["mean"] == pytest.approx(2.0)
+    assert found["accuracy_pct_others"]["mean"] == pytest.approx((100 + 75) / 2)
+    assert found["mse_xy_mm2_others"]["n"] == 2
+
+
 def points(method: str, given: str, off_mm: dict[str, float]) -> list[dict[str, Any]]:
     true = np.array([[4.0, 4.0, 1.0], [6.0, 8.0, 2.0]])
     board = np.array(["b", "b"])
@@ -133,6 +145,7 @@ def numbers() -> dict[str, Any]:
     return {
         "methods": summarise(told_points + others, controls), "unpaired_n": 2,
         "alarm": {"asked_pct": 5.0, "limit": stat, "right": row, "strangers": strangers},
+        "flagged": [{"method": name, "by": "left over", "flagged_pct": stat, "mse_xy_mm2_others": stat}],
     }  # fmt: skip
 
 
@@ -145,12 +158,13 @@ def test_a_control_is_paired_board_by_board():
     assert "over" not in rows["ridge", NONE]
 
 
-def test_three_tables_say_what_helped_by_how_much_and_why():
+def test_four_tables_say_what_helped_by_how_much_and_why():
     made = tables(numbers(), "recorded")
     assert made["rivals"]["method"].tolist() == ["ridge", "ridge, CORAL"]
     assert made["rivals"]["why"].tolist() == ["–", WHY["CORAL"]]
     assert made["rivals"]["paired, accuracy, points"][1].startswith("+25")
     assert made["rivals_told"]["paired, accuracy, points"].tolist()[1].startswith("-25")
     assert made["rivals_alarm"]["law"].tolist() == [alarm.OF_RIGHT] * 2
+    assert made["rivals_flagged"]["MSE_xy, mm² (flagged)"].tolist() == ["–"]  # none was
     assert made["rivals"].attrs["meaning"].endswith("2 labelled pokes had no pair.")
     assert all(set(table["source"]) == {"recorded"} for table in made.values())

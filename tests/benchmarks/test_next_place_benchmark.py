@@ -1,0 +1,72 @@
+"""Places chosen by the map's own uncertainty beside fixed and random ones: errors after as many labels.
+
+`pytest -s -o addopts= tests/benchmarks/test_next_place_benchmark.py`: a minute. Simulated skins about the nominal one,
+with errors of the law as training draws them, that the shipped model has not seen; of each, 65 pokes on the grid may be
+labelled, 65 others are read. Nothing is asserted but that readings were answered.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.core.config import parse, read_yaml
+from pipeline.core.seeds import rng_for
+from pipeline.dataset.grid import CENTRE_MM
+from pipeline.live.adapting import SHOWN_MM
+from pipeline.physics.skin import SkinDesign
+from pipeline.twin.choosing import worth
+from pipeline.twin.law import Setup
+from pipeline.twin.population import PLACES_N, draw_population
+from pipeline.twin.shipped import CHIPS_MM, SKIN_MM, Universal, load_universal, to_board
+from pipeline.twin.tables import NOMINAL, OF_NOMINAL
+from pipeline.twin.training import ERROR_OF_NOMINAL, NOISE_uT, add_error
+
+SKINS_N, LABELS_N, PRESS_N = 40, (0, 1, 3, 5, 10), 2.0
+Choose = Callable[[Universal, list[int]], int]
+
+
+def test_errors_after_labels_at_fixed_random_and_chosen_places():
+    rng, errors = rng_for(0, "next place"), {}
+    design = parse(SkinDesign, read_yaml(Path("params.yaml"))["skin"], "params.yaml: skin")
+    setup = Setup(design, np.array(CHIPS_MM), NOMINAL.gap_mm, SKIN_MM, design.flipped, design.tip_radius_mm)
+    skins = draw_population(NOMINAL, OF_NOMINAL, setup, SKINS_N, rng)
+    db_uT = add_error(skins.db_uT, skins.place_mm, np.log(skins.force_N), ERROR_OF_NOMINAL, rng)
+    db_uT = db_uT + np.tile(NOISE_uT, 5) * rng.standard_normal(db_uT.shape)
+    to_chips = np.linalg.inv(to_board(np.eye(db_uT.shape[2])))
+    for rest_uT, own_uT, place_mm, force_N in zip(
+        skins.rest_uT @ to_chips, db_uT @ to_chips, skins.place_mm, skins.force_N, strict=True
+    ):
+        for way, choose in ways(place_mm[:PLACES_N].astype(float), rng).items():
+            skin, taken = load_universal().zero(rest_uT[None]), []
+            for n in range(max(LABELS_N) + 1):
+                if n in LABELS_N:
+                    off_mm = skin.predict(own_uT[PLACES_N:] + rest_uT)[:, :2] - CENTRE_MM - place_mm[PLACES_N:]
+                    errors.setdefault((way, n), []).append(off_mm)
+                taken.append(choose(skin, taken))
+                skin.zero(rest_uT[None])
+                skin.label(place_mm[taken] + CENTRE_MM, force_N[taken].astype(float), own_uT[taken] + rest_uT)
+    for (way, n), off_mm in errors.items():
+        within = 100 * (np.abs(off_mm) <= 1).all(axis=2).mean()
+        mse_mm2 = (np.array(off_mm) ** 2).mean(axis=(1, 2))
+        line = f"{way}, {n} labels: {within:.1f} % within 1 mm, MSE_xy {mse_mm2.mean():.3f} mm2"
+        more = mse_mm2 - (np.array(errors["fixed", n]) ** 2).mean(axis=(1, 2))
+        print(f"{line}; less fixed {more.mean():+.3f} +- {more.std(ddof=1) / SKINS_N**0.5:.3f} (standard error)")
+    assert all(np.isfinite(off_mm).all() for off_mm in errors.values())
+
+
+def ways(pool_mm: np.ndarray, rng: np.random.Generator) -> dict[str, Choose]:
+    """Fixed: of the places that `reskin live` shows, in random order, each the next poke to it that there is."""
+    shown_mm = np.stack(np.meshgrid(SHOWN_MM, SHOWN_MM), axis=-1).reshape(-1, 2) - CENTRE_MM
+    fixed = [int(np.linalg.norm(pool_mm - one, axis=1).argmin()) for one in rng.permutation(shown_mm)]
+    anywhere = rng.permutation(len(pool_mm)).tolist()
+
+    def chosen(skin: Universal, taken: list[int]) -> int:
+        free = [i for i in range(len(pool_mm)) if i not in taken]
+        return free[int(worth(skin.skin, pool_mm[free], np.full(len(free), PRESS_N)).argmax())]
+
+    return {
+        "fixed": lambda _, taken: fixed[len(taken)],
+        "random": lambda _, taken: anywhere[len(taken)],
+        "chosen": chosen,
+    }
