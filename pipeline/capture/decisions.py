@@ -6,7 +6,7 @@ Refuses to find faults (`faults`, `limits`), and to know what is done with the r
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int
@@ -38,12 +38,11 @@ class Decisions(Strict):
     wrong_baud: Lost  # many such bytes in a row
 
 
-# As ingest has always done; params.yaml says the same, and may be changed there.
-AS_USUAL = Decisions(
-    failed_read="drop", zeros="drop", stuck="drop", chip_reset="refuse", too_hot="flag", saturated="flag",
-    int16_wrap="flag", repeated="flag", dropped="flag", clock_jump="flag", unplug="flag", torn="drop",
-    wrong_baud="drop",
-)  # fmt: skip
+# For who asks whether a recording would be refused, or whether it can be read at all; ingest does as params.yaml says.
+REFUSE_ALL = Decisions.model_validate(dict.fromkeys(Decisions.model_fields, "refuse"))
+REFUSE_NONE = Decisions.model_validate(
+    {name: get_args(field.annotation)[0] for name, field in Decisions.model_fields.items()}
+)
 DONE = {"drop": "dropped", "flag": "flagged", "refuse": "refused"}
 PER_UNIT = {"ms": 1000, "row": 1}  # places are given in s, or rows
 
@@ -51,7 +50,7 @@ PER_UNIT = {"ms": 1000, "row": 1}  # places are given in s, or rows
 def decide(usual: Decisions, words: Iterable[str], where: str) -> Decisions:
     """Change some decisions by `NAME=DECISION`.
 
-    >>> decide(AS_USUAL, ["too-hot=drop"], "--on-fault").too_hot
+    >>> decide(REFUSE_ALL, ["too-hot=drop"], "--on-fault").too_hot
     'drop'
     """
     changes: dict[str, Any] = {}

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from pipeline.capture.layouts import Foreign
 from pipeline.core import io
 from pipeline.core.errors import CaptureError
 
@@ -26,7 +27,7 @@ LOG_FILE = "log.csv"
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$"
 
 Name = Annotated[str, Field(pattern=NAME)]
-Layout = Literal["native", "table", "lab", "ini", "eflesh", "eflash7", "sd-card"]
+Layout = Literal["native", Foreign, "sd-card"]
 Wire = Literal["binary", "binary-clock", "text-xyzt", "text-txyz"]
 
 

@@ -11,6 +11,7 @@ import os
 import sys
 from collections.abc import Callable, Mapping
 from concurrent.futures import BrokenExecutor, Executor, Future
+from contextlib import suppress
 from functools import partial
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
@@ -21,8 +22,8 @@ import pipeline
 from pipeline.core.errors import ParamsError
 from pipeline.core.numerics import signature
 
-CONNECT_MAX_s = 20.0
-HOW = "docs/settings.md says how workers are started."
+CONNECT_MAX_s, WORKERS_MAX_s = 20.0, 60.0  # a worker that is started beside us imports for seconds
+HOW = "docs/cluster.md says how workers are started."
 LIBRARIES = ("numpy", "scipy", "numba", "torch", "dask", "distributed")
 CODE = (".py", ".json", ".safetensors")  # sources, and the tables that come with them; settings come with a call
 
@@ -50,9 +51,11 @@ class Cluster(Executor):
     """Submits calls to a Dask scheduler; each runs in this process's working directory, in one thread of a worker."""
 
     def __init__(self, address: str, imports: str) -> None:
-        self._own = describe_process()
+        self._own, self._address = describe_process(), address
         self._client = _connect(address)
         try:
+            with suppress(TimeoutError):
+                self._client.wait_for_workers(1, timeout=WORKERS_MAX_s)
             _check_workers(self._client, address)
             self._client.run(import_module_there, imports)
         except BaseException:
@@ -65,7 +68,7 @@ class Cluster(Executor):
         future: Future[Any] = Future()
         future.set_running_or_notify_cancel()
         submitted = self._executor.submit(run_there, os.getcwd(), self._own, partial(fn, *args, **kwargs))
-        submitted.add_done_callback(partial(_pass_on, future))
+        submitted.add_done_callback(partial(_pass_on, future, self._address))
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
@@ -136,12 +139,14 @@ def _compare(own: Mapping[str, str], theirs: Mapping[str, str], name: str) -> No
             raise ParamsError("RESKIN_EXECUTOR", f"{what} of worker {name}", value, got, f"Start it anew. {HOW}")
 
 
-def _pass_on(future: Future[Any], submitted: Future[Any]) -> None:
+def _pass_on(future: Future[Any], address: str, submitted: Future[Any]) -> None:
     """Give a call's result or error on; a worker that died is told as a local one is."""
     from distributed import KilledWorker
 
-    if submitted.cancelled():
-        future.set_exception(BrokenExecutor("the call was cancelled"))
+    if submitted.cancelled():  # by Dask, when it loses the scheduler; nobody waits for what we cancel ourselves
+        what, got = f"the scheduler at {address}", "one that went away"
+        remedy = "Start it and its workers again, then run again: what was finished is kept."
+        future.set_exception(ParamsError("RESKIN_EXECUTOR", what, "there until the work is done", got, remedy))
         return
     error = submitted.exception()
     if isinstance(error, KilledWorker):

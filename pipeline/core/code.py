@@ -13,6 +13,7 @@ from typing import Any
 PACKAGE = "pipeline"
 DATA = (".yaml", ".html")  # files that belong to the module of their name
 ROOT = Path(__file__).parents[2]
+_DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef)
 
 
 @cache
@@ -51,21 +52,25 @@ def file_of(name: str) -> Path:
     return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
 
 
-def _syntax(node: Any) -> Any:
+def _syntax(node: ast.AST) -> list[Any]:
     """Turn a syntax tree into lists; empty fields are left out, as which there are differs between Python versions.
 
     >>> same = ["x = 1", "'Say.'\\nx = (1)  # metres"]
     >>> len({json.dumps(_syntax(ast.parse(source))) for source in [*same, "x = 2"]})
     2
     """
-    if isinstance(node, list):
-        return [_syntax(part) for part in node]
-    if not isinstance(node, ast.AST):
-        return repr(node)
-    fields = dict(ast.iter_fields(node))
-    if (
-        isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
-        and ast.get_docstring(node, clean=False) is not None
-    ):
-        fields["body"] = node.body[1:]
-    return [type(node).__name__, *([key, _syntax(part)] for key, part in fields.items() if part not in (None, []))]
+    found: list[Any] = [type(node).__name__]
+    for key in node._fields:
+        part: Any = getattr(node, key, None)
+        if key == "body" and isinstance(node, _DOCUMENTED) and ast.get_docstring(node, clean=False) is not None:
+            part = part[1:]
+        if isinstance(part, list):
+            if part:
+                found.append([key, [_part(one) for one in part]])
+        elif part is not None:
+            found.append([key, _part(part)])
+    return found
+
+
+def _part(of: Any) -> Any:
+    return _syntax(of) if isinstance(of, ast.AST) else repr(of)

@@ -52,14 +52,17 @@ def params_of(root: Path) -> Path:
 
 
 def parse(model: type[Model], value: Any, where: str) -> Model:
-    """Check plain values against a model; name the first parameter that is wrong, and what is allowed."""
+    """Check plain values against a model; name the first that is wrong, and what is allowed, or all that lack there."""
     try:
         # Through JSON, so that a YAML list may fill a tuple while "3" still does not become 3.
         return model.model_validate_json(json.dumps(value, default=str))
     except ValidationError as error:
         # A misspelt name is also a missing one: name what was written first.
-        first = min(error.errors(include_url=False), key=lambda found: found["type"] != "extra_forbidden")
-        name = ".".join(_written(first["loc"], value)) or "the file"
+        faults = error.errors(include_url=False)
+        first = min(faults, key=lambda found: found["type"] != "extra_forbidden")
+        beside = [found for found in faults if found["type"] == "missing" and found["loc"][:-1] == first["loc"][:-1]]
+        names = [".".join(_written(found["loc"], value)) for found in (beside if first in beside else [first])]
+        name = ", ".join(names) or "the file"
         got = "nothing" if first["type"] == "missing" else repr(first.get("input"))[:80]
         rule = {"missing": "given", "extra_forbidden": "a known parameter"}.get(first["type"])
         rule = rule or first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")

@@ -1,7 +1,8 @@
 """The errors a user can cause: one class a boundary, one sentence each.
 
 Every message reads `<where>: <what> must be <rule>; got <value>. <what to try>`; an error that passes on somebody's
-sentence takes it whole. Raised at the door and shown without a traceback; `assert` is for our own mistakes.
+sentence takes it whole. Raised at the door and shown without a traceback; `assert` is for our own mistakes. Refuses to
+know who raises them.
 """
 
 

@@ -4,11 +4,12 @@ Everything is written to a temporary name beside its target and renamed, so a ki
 old file or the new one, never half of it. Refuses to know what the objects mean.
 """
 
+import errno
 import hashlib
 import json
 import os
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -20,9 +21,17 @@ import safetensors
 import safetensors.numpy
 
 from pipeline.core.errors import SchemaError
+from pipeline.core.machine import DISK
 from pipeline.core.schema import Readings, arrow_schema, from_table, to_table
 
 ACCOUNT_KEY = b"reskin.account"
+OF_MACHINE = {
+    errno.EACCES,
+    errno.EIO,
+    errno.EMFILE,
+    errno.ENFILE,
+    errno.ESTALE,
+}  # a file that cannot be read now is not damaged
 
 
 @contextmanager
@@ -38,6 +47,10 @@ def replacing(path: Path) -> Iterator[Path]:
         elif path.is_dir():
             raise SchemaError(path, "a file to write", "no folder", "a folder", "Choose another name.")
         temporary.replace(path)
+    except OSError as error:
+        if error.errno in DISK:
+            error.filename = str(path)  # not the temporary name, which nobody knows
+        raise
     finally:
         remove(temporary)
 
@@ -109,16 +122,17 @@ def write_tensors(path: Path, tensors: Mapping[str, np.ndarray], metadata: Mappi
     """Write named arrays and a few words about them as safetensors."""
     with replacing(path) as temporary:
         dense = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
-        safetensors.numpy.save_file(dense, temporary, dict(metadata))
+        temporary.write_bytes(safetensors.numpy.save(dense, dict(metadata)))  # save_file hides what a disk refused
 
 
-def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Read what `write_tensors` wrote; no pickle is ever opened."""
+def read_tensors(path: Path, names: Sequence[str] = ()) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """Read what `write_tensors` wrote, all of it or these arrays; no pickle is ever opened."""
     _need(path)
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
-            return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}
+            return {name: file.get_tensor(name) for name in names or file.keys()}, file.metadata() or {}
     except (safetensors.SafetensorError, OSError) as error:
+        _pass_on(error)
         raise SchemaError(path, "the file", "safetensors", error, "Is it a trained model, copied whole?") from None
 
 
@@ -128,7 +142,8 @@ def write_table(path: Path, table: pa.Table) -> None:
 
 
 def read_table(path: Path) -> pa.Table:
-    return _open_parquet(path).read()
+    with _parquet(path) as file:
+        return file.read()
 
 
 def write_readings(path: Path, blocks: Iterable[Readings], account: Mapping[str, int]) -> None:
@@ -146,12 +161,13 @@ def write_readings(path: Path, blocks: Iterable[Readings], account: Mapping[str,
 
 
 def read_readings(path: Path) -> Readings:
-    return from_table(_open_parquet(path).read(), str(path))
+    return from_table(read_table(path), str(path))
 
 
 def read_account(path: Path) -> dict[str, int]:
     """Read what ingest counted for one capture: bytes, frames, rows, and what was dropped, by reason."""
-    metadata = _open_parquet(path).metadata.metadata or {}
+    with _parquet(path) as file:
+        metadata = file.metadata.metadata or {}
     if ACCOUNT_KEY not in metadata:
         raise SchemaError(path, "the file's metadata", "an account of losses", "none", "Ingest it again.")
     account: dict[str, int] = json.loads(metadata[ACCOUNT_KEY])
@@ -163,9 +179,19 @@ def _need(path: Path) -> None:
         raise SchemaError(path, "the file", "there", "nothing", "Check the path, or run the stage that writes it.")
 
 
-def _open_parquet(path: Path) -> pq.ParquetFile:
+def _pass_on(error: Exception) -> None:
+    """Raise what says nothing of the file: a disk, a right or a limit of the machine."""
+    if isinstance(error, OSError) and error.errno in OF_MACHINE:
+        raise error
+
+
+@contextmanager
+def _parquet(path: Path) -> Iterator[pq.ParquetFile]:
     _need(path)
     try:
-        return pq.ParquetFile(path)
+        yield pq.ParquetFile(path)
     except (pa.ArrowInvalid, OSError) as error:
-        raise SchemaError(path, "the file", "readable Parquet", error, "Run ingest again.") from None
+        _pass_on(error)
+        remedy = "It was cut or changed: delete it, and run the stage that writes it again."
+        got = " ".join(str(error).split()).rstrip(".")
+        raise SchemaError(path, "the file", "readable Parquet", got, remedy) from None

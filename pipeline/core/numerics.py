@@ -2,6 +2,7 @@
 
 AVX2 and AVX-512 code paths add in another order, and training amplifies the rounding. With these variables a training
 gives the same bits on both (tests/test_numerics.py). Imports nothing that needs NumPy, as it must run before it.
+Refuses to overrule a variable that the user has set.
 """
 
 import os

@@ -94,7 +94,7 @@ def note_cost(folder: Path, stage: str, seconds: float) -> None:
 
     A stage that does not run, or that DVC restores, keeps the cost that it had when it ran.
     """
-    peaks = (resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    usages = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     unit = 1 if sys.platform == "darwin" else 1024  # bytes on macOS, KiB elsewhere
     trained = _read_trainings(folder, stage)
     computed_s = trained["computed_s"]
@@ -107,7 +107,8 @@ def note_cost(folder: Path, stage: str, seconds: float) -> None:
             "other_s": round(max(seconds - min(trained["waited_s"], fresh_s), 0.0), 2),
             "trainings_s": computed_s,
             "reused_n": len(trained["reused"]),
-            "peak_process_memory_MB": round(max(peaks) * unit / 1e6, 1),
+            "cpu_s": round(sum(usage.ru_utime + usage.ru_stime for usage in usages), 2),  # imports too
+            "peak_process_memory_MB": round(max(usage.ru_maxrss for usage in usages) * unit / 1e6, 1),
         },
     )
     io.remove(_trainings_file(folder, stage))

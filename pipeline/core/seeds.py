@@ -1,7 +1,7 @@
 """The one place where random generators are made.
 
 Generators are *named*, not ordered: `rng_for(seed, "skin", "b3_s1")` stays the same when
-another board, skin or fold is added before it.
+another board, skin or fold is added before it. Refuses to know what is drawn.
 """
 
 from __future__ import annotations

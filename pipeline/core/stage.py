@@ -1,4 +1,4 @@
-"""What every stage does around its work: argv, a warning if MLflow is away, one-sentence errors, its cost.
+"""What every stage does around its work: argv, one-sentence errors, its cost.
 
 In: the stage's function; its parameters are its options. Refuses to know what the stage does.
 """
@@ -13,9 +13,9 @@ from typing import Any
 from pipeline.core.config import Files
 from pipeline.core.errors import ReskinError
 from pipeline.core.executors import end_workers
+from pipeline.core.machine import explaining
 from pipeline.core.progress import announce
 from pipeline.core.provenance import COSTS, begin_cost, note_cost
-from pipeline.core.server import TrackingAway, probe, server_uri
 
 
 def run(work: Callable[..., None]) -> None:
@@ -28,21 +28,18 @@ def run(work: Callable[..., None]) -> None:
             parser.add_argument(f"--{name.replace('_', '-')}", type=kind, required=True)
     arguments = vars(parser.parse_args())
     arguments |= {name: Files.of(arguments["scene"]) for name, kind in kinds.items() if kind is Files}
-    try:
-        probe(server_uri())
-    except TrackingAway as away:
-        say(f"warning: {away}")
     if place := announce():
         say(f"{stage}: {place}")
     start_s, costs, unit = time.monotonic(), COSTS / arguments["scene"], _unit(stage, arguments)
-    begin_cost(costs, unit)
     try:
-        work(**arguments)
+        with explaining(stage):
+            begin_cost(costs, unit)
+            work(**arguments)
+            end_workers()
+            note_cost(costs, unit, time.monotonic() - start_s)
     except ReskinError as error:
         say(f"error: {error}")
         sys.exit(error.exit_code)
-    end_workers()
-    note_cost(costs, unit, time.monotonic() - start_s)
 
 
 def _unit(stage: str, arguments: Mapping[str, Any]) -> str:

@@ -13,7 +13,7 @@ from jaxtyping import Float64
 
 from pipeline.capture import arrivals, probe, wire
 from pipeline.capture.arrivals import Arrivals
-from pipeline.capture.decisions import AS_USUAL, Decisions
+from pipeline.capture.decisions import Decisions
 from pipeline.capture.header import (
     ARRIVALS_FILE,
     HEADER_FILE,
@@ -64,7 +64,7 @@ class Opened(NamedTuple):
     account: Mapping[str, int]
 
 
-def open_capture(folder: Path, decisions: Decisions = AS_USUAL) -> Opened:
+def open_capture(folder: Path, decisions: Decisions) -> Opened:
     """Check a capture's header and files, and begin to read it; `decisions` say what becomes of faults."""
     header = read_header(folder)
     check_same_capture(header, folder.name)
@@ -102,9 +102,7 @@ def check_losses(account: Mapping[str, int], limit: float, where: str) -> None:
             raise CaptureError(where, f"lost {whole.removesuffix('_n')}", rule, reasons, remedy)
 
 
-def read_native(
-    folder: Path, header: Header, decisions: Decisions = AS_USUAL
-) -> tuple[Iterator[Readings], dict[str, int]]:
+def read_native(folder: Path, header: Header, decisions: Decisions) -> tuple[Iterator[Readings], dict[str, int]]:
     """Begin to read a capture; the account is complete when the readings are exhausted.
 
     Without sync marks the stream is read twice, first for the clock.

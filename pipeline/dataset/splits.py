@@ -104,10 +104,11 @@ def leave_one_board_out(rows: Rows, split: Split, seed: int) -> list[Fold]:
     if len(boards) < 2:
         remedy = "Add another board's recording, or take lobo out of the scene's questions."
         raise ParamsError("question lobo", "boards", "two or more", f"{len(boards)} ({', '.join(boards)})", remedy)
-    from sklearn.model_selection import LeaveOneGroupOut  # late: stages that read folds need no scikit-learn
-
-    sides = LeaveOneGroupOut().split(np.empty((len(rows), 0)), groups=rows.board)
-    return [hold_out_skins(rows, "lobo", str(rows.board[held[0]]), (train, held), split) for train, held in sides]
+    folds = []
+    for board in boards:
+        sides = np.flatnonzero(rows.board != board), np.flatnonzero(rows.board == board)
+        folds.append(hold_out_skins(rows, "lobo", str(board), sides, split))
+    return folds
 
 
 def fewer_sensors(rows: Rows, split: Split, seed: int) -> list[Fold]:
@@ -245,7 +246,7 @@ def draw_sides(
 
     `what` the groups are and `where` they are asked for stand in errors.
     """
-    from sklearn.model_selection import GroupShuffleSplit  # late, as above
+    from sklearn.model_selection import GroupShuffleSplit  # late: it takes a second, and most stages draw nothing
 
     groups_n = len(np.unique(group))
     test_n = _test_n(groups_n, max(test_fraction, 1 / groups_n), what, where)

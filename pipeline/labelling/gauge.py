@@ -1,4 +1,7 @@
-"""A force gauge on a serial port: lines of one number (Fz) or three (Fx Fy Fz), in N. In: a port. Out: dwells."""
+"""A force gauge on a serial port: lines of one number (Fz) or three (Fx Fy Fz), in N. In: a port. Out: dwells.
+
+Refuses to know places and the board.
+"""
 
 import threading
 from collections import deque
@@ -8,6 +11,7 @@ from contextlib import contextmanager
 from pipeline.capture.labels import Label
 from pipeline.capture.port import Device, open_port, read_waiting
 from pipeline.capture.samples import Dwells, Gauge, Sample, mean_label
+from pipeline.core.errors import CaptureError
 from pipeline.labelling.source import Desk, Source, told_bad
 
 KEPT_N = 10_000  # samples, of which a touch is a few hundred
@@ -49,13 +53,18 @@ class Forces:
     def _listen(self, device: Device, desk: Desk) -> None:
         try:
             self.read(device, desk, self._kept.extend)
-        except OSError as error:
-            self._silent = f"the gauge at {self.port} was unplugged, and forces are missing from then on: {error}"
+        except CaptureError as error:
+            self._silent = f"{error} Forces are missing from then on"
 
     def read(self, device: Device, desk: Desk, use: Callable[[list[Sample]], object]) -> None:
-        """Read until the recording stops."""
+        """Read until the recording stops; raise if the gauge is unplugged before."""
         while not desk.stop.is_set():
-            if chunk := read_waiting(device):
+            try:
+                chunk = read_waiting(device)
+            except OSError as error:
+                rule, remedy = "plugged in until the recording ends", "What came is kept; plug it in, record again."
+                raise CaptureError(self.port, "the force gauge", rule, error, remedy) from None
+            if chunk:
                 use(self._gauge.feed(chunk, desk.unix_s()))
 
 

@@ -1,4 +1,7 @@
-"""Places to press, numbered, and the order in which they come. In: `grid:9x9:2`. Out: places in mm."""
+"""Places to press, numbered, and the order in which they come. In: `grid:9x9:2`. Out: places in mm.
+
+Refuses to know when they are pressed and how hard.
+"""
 
 import re
 from collections.abc import Sequence

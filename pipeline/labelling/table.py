@@ -1,4 +1,7 @@
-"""A CSV that a robot's program appends to, followed as it grows. In: a file. Out: dwells, and how its clock runs."""
+"""A CSV that a robot's program appends to, followed as it grows. In: a file. Out: dwells, and how its clock runs.
+
+Refuses to know the board and to guess a unit.
+"""
 
 import math
 import os

@@ -1,4 +1,7 @@
-"""The words of the command line for boards that are plugged in: `reskin ports`, `record`, `emulate`, `live`."""
+"""The words of the command line for boards and their files: `reskin ports`, `template`, `record`, `emulate`, `live`.
+
+Refuses to know how any of them works: each calls one module beside this one.
+"""
 
 import math
 import threading
@@ -31,6 +34,22 @@ def ports(
 
     for found in ports.find_boards([ports.hunt(typer.echo)] if hunt else names):
         typer.echo(found)
+
+
+@app.command()
+def template(
+    out: Annotated[Path, Argument(help="The CSV file to write; must be new.")],
+    chips_n: Annotated[int, Option("--chips", help="Chips in a frame.", min=1, max=64)] = 5,
+) -> None:
+    """Write the first line of a recording in layout `table`; which columns may go stands in data/README.md."""
+    from pipeline.capture.readers.plain import NEEDED, columns_of
+    from pipeline.core import io
+    from pipeline.core.errors import ParamsError
+
+    if out.exists():
+        raise ParamsError(out, "the file", "new", "one that is there", "Choose another name.")
+    io.write_text(out, ",".join(columns_of(chips_n)) + "\n")
+    typer.echo(f"wrote {out}: {', '.join(NEEDED)} and fields in uT are needed. Then: reskin add --layout table")
 
 
 @app.command()

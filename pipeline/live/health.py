@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64
 
 from pipeline.capture import faults, limits
-from pipeline.capture.decisions import AS_USUAL, Decision, Decisions, decide
+from pipeline.capture.decisions import Decision, Decisions
 from pipeline.capture.wire import Frames, concatenate
 
 LOOK_FRAMES_N = 40  # a tenth of a second of five chips: how late what needs several frames is seen
@@ -24,7 +24,10 @@ ALIKE_SHARE_MAX = 0.2  # of |dB|^2 that chips do not share; 0.45 or more in all 
 ALIKE_MIN_uT = 50.0  # about the earth's field
 
 # What a controller is given must be believed at once: a reading beyond the chip's range has no place and force.
-LIVE = decide(AS_USUAL, ["too_hot=drop", "saturated=drop", "chip_reset=flag"], "live")
+LIVE = Decisions(
+    failed_read="drop", zeros="drop", stuck="drop", too_hot="drop", saturated="drop", torn="drop", wrong_baud="drop",
+    chip_reset="flag", int16_wrap="flag", repeated="flag", dropped="flag", clock_jump="flag", unplug="flag",
+)  # fmt: skip
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""What stage report reads: cards, answers and accounts of a scene on disk -> numbers, and what only figures show."""
+"""A scene's cards, answers and accounts -> numbers, and what only figures show. Refuses to know how they are shown."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

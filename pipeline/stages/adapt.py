@@ -1,4 +1,7 @@
-"""Stage adapt: networks with the triplet term, adapted to each held-out skin by its unlabelled pokes (section 5)."""
+"""Stage adapt: networks with the triplet term, adapted to each held-out skin by its unlabelled pokes (section 5).
+
+Refuses to show a network labels of the skin that it adapts to.
+"""
 
 from pathlib import Path
 

@@ -1,7 +1,7 @@
 """Stage code: the project's modules -> data/code/<stage>, the digests of all modules that a stage imports.
 
 Every other stage depends on its file here, so that an edit re-runs the stages that import the edited code, and words in
-comments and docstrings re-run none.
+comments and docstrings re-run none. Refuses to know settings and data.
 """
 
 import argparse

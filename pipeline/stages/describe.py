@@ -1,4 +1,7 @@
-"""Stage describe: the readings of one folder of captures -> what skins look like there, as numbers."""
+"""Stage describe: the readings of one folder of captures -> what skins look like there, as numbers.
+
+Refuses to know folds and models.
+"""
 
 from pathlib import Path
 

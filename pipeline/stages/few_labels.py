@@ -1,4 +1,7 @@
-"""Stage few_labels: what no, a few and more labelled pokes of a new board are worth, for every method."""
+"""Stage few_labels: what no, a few and more labelled pokes of a new board are worth, for every method.
+
+Refuses to know how a method learns (`trials`, `learning`).
+"""
 
 from pathlib import Path
 from typing import Any
@@ -31,7 +34,7 @@ def few_labels(scene: str, files: Files, indentations: Path, folds: Path, scores
         trained = train_all(data, [trial for _, trial in pairs], "few_labels")
         done = [*done, *((tried, trial, result) for (tried, trial), result in zip(pairs, trained, strict=True))]
     tasks = few.classical(study)
-    with make_executor(imports="pipeline.learning.classical") as executor:
+    with make_executor(imports="pipeline.learning.regressors") as executor:
         fitted = run_tasks(
             [task for _, task in tasks], measured(data), executor, lambda line: say(f"{scene} few_labels: {line}")
         )

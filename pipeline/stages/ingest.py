@@ -1,4 +1,7 @@
-"""Stage ingest: one recorded capture -> indentations/<scene>/<capture>.parquet, one row a reading."""
+"""Stage ingest: one recorded capture -> indentations/<scene>/<capture>.parquet, one row a reading.
+
+Refuses to know how a layout is read and which faults are dropped.
+"""
 
 from pathlib import Path
 

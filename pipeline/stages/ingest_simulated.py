@@ -1,4 +1,7 @@
-"""Stage ingest_simulated: all captures of a simulated scene -> indentations/<scene>/, one file a capture."""
+"""Stage ingest_simulated: all captures of a simulated scene -> indentations/<scene>/, one file a capture.
+
+Refuses to know that they are simulated, but for the folder.
+"""
 
 from pathlib import Path
 

@@ -1,4 +1,7 @@
-"""Stage publish: models, points of sweeps and the report -> the MLflow diary. No output: nothing reads it back."""
+"""Stage publish: models, points of sweeps and the report -> the MLflow diary. No output: nothing reads it back.
+
+Refuses to compute a result.
+"""
 
 from pathlib import Path
 

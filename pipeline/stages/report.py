@@ -1,4 +1,7 @@
-"""Stage report: models' cards, predictions, answers and accounts -> numbers, scores, tables, figures, index.html."""
+"""Stage report: models' cards, predictions, answers and accounts -> numbers, scores, tables, figures, index.html.
+
+Refuses to know readings, and to train.
+"""
 
 from pathlib import Path
 

@@ -1,4 +1,7 @@
-"""Stage simulate: parameters -> raw captures of skins that do not exist, in the wire format of those that do."""
+"""Stage simulate: parameters -> raw captures of skins that do not exist, in the wire format of those that do.
+
+Refuses to know a law of physics and who reads the captures.
+"""
 
 from pathlib import Path
 

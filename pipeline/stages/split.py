@@ -1,4 +1,4 @@
-"""Stage split: indentations -> folds.json, who is held out of what."""
+"""Stage split: indentations -> folds.json, who is held out of what. Refuses to know fields and models."""
 
 from pathlib import Path
 

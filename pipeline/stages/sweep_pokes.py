@@ -1,4 +1,7 @@
-"""Stage sweep_pokes: adaptation with few and many unlabelled pokes (paper figure 6a)."""
+"""Stage sweep_pokes: adaptation with few and many unlabelled pokes (paper figure 6a).
+
+Refuses to know how networks are adapted (`trials.adapting`).
+"""
 
 from pathlib import Path
 from typing import Any

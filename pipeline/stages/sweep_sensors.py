@@ -1,4 +1,7 @@
-"""Stage sweep_sensors: the three methods, trained on few and many skins (paper figure 6b)."""
+"""Stage sweep_sensors: the three methods, trained on few and many skins (paper figure 6b).
+
+Refuses to know how networks are trained (`trials`).
+"""
 
 from pathlib import Path
 

@@ -1,4 +1,7 @@
-"""Stage table2: cards of four arms -> the paper's table 2 and its figure, minutes before the report has everything."""
+"""Stage table2: cards of four arms -> the paper's table 2 and its figure, minutes before the report has everything.
+
+Refuses to know all else of the report, and to train.
+"""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Stage train_classical: classical methods on the folds of the pooled networks."""
+"""Stage train_classical: classical methods on the folds of the pooled networks. Refuses to know torch."""
 
 from pathlib import Path
 
@@ -28,7 +28,7 @@ def train_classical(scene: str, files: Files, indentations: Path, folds: Path, s
         Task(f"{name}.{fold.name}", method, fold.train, fold.test, NO_ROWS, settings.rows_max_n, seed)
         for fold, name, method in pairs
     ]
-    with make_executor(imports="pipeline.learning.classical") as executor:
+    with make_executor(imports="pipeline.learning.regressors") as executor:
         fitted = run_tasks(tasks, measured(data), executor, lambda line: say(f"{scene} classical: {line}"))
     points = [
         {"name": name, "method": method.title, "inputs": method.inputs, "fold": fold.name, "seed_i": 0}

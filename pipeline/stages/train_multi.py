@@ -1,4 +1,7 @@
-"""Stage train_multi: pooled boards, one held out (paper section 5.1)."""
+"""Stage train_multi: pooled boards, one held out (paper section 5.1).
+
+Refuses to know how a network is trained (`trials.training`).
+"""
 
 from pathlib import Path
 

@@ -1,4 +1,7 @@
-"""Stage train_single: one skin at a time: same-sensor splits, and one skin to others (paper sections 4 and 5.1)."""
+"""Stage train_single: one skin at a time: same-sensor splits, and one skin to others (paper sections 4 and 5.1).
+
+Refuses to know how a network is trained (`trials.training`).
+"""
 
 from pathlib import Path
 

@@ -1,4 +1,7 @@
-"""Stage train_triplet: pooled boards with the triplet term, one board held out (paper section 5)."""
+"""Stage train_triplet: pooled boards with the triplet term, one board held out (paper section 5).
+
+Refuses to know how a network is trained (`trials.training`).
+"""
 
 from pathlib import Path
 

@@ -1,6 +1,7 @@
 """Stage universal: experts that come with the project, on each held-out board, with no, a few and more of its labels.
 
-A map, and a network with it; with recorded boards of the rig, and with none.
+A map, and a network with it; with recorded boards of the rig, and with none. Refuses to know how experts are taught
+(`trials.experts`).
 """
 
 from dataclasses import replace
@@ -17,8 +18,9 @@ from pipeline.experiments.answer import read_folder
 from pipeline.experiments.compare.run import Compare, see, setup_of, skins_of, turns_of
 from pipeline.physics.skin import SkinDesign
 from pipeline.trials.experts import Frame, Known, make_experts, write_networks
+from pipeline.trials.sureness import tell_sureness, tell_tempers
 from pipeline.trials.training import read_data
-from pipeline.trials.universal import QUESTION, Bench, score_fold, tell_tempers
+from pipeline.trials.universal import QUESTION, Bench, score_fold
 from pipeline.twin.training import Lessons
 
 
@@ -41,7 +43,8 @@ def universal(scene: str, files: Files, indentations: Path, folds: Path, models:
     lessons = read(settings)
     nominal, rig = make_experts(Known(data, frame, setup, seen), lessons)
     write_networks(models, [nominal, *rig.values()], lessons, settings.seed)
-    bench, points = Bench(data, frame, seen, nominal, {}), []
+    sureness = tell_sureness(nominal, lessons.labels_n, settings.seed)
+    bench, points = Bench(data, frame, seen, nominal, {}, sureness), []
     bench = replace(bench, tempers=tell_tempers(bench, lessons.labels_n))
     for fold in data.folds_of(QUESTION):
         points += score_fold(bench, fold, rig, lessons.labels_n)

@@ -1,10 +1,15 @@
 """Headers for tests: every field of a plausible capture, any of which a test may change."""
 
+from pathlib import Path
 from typing import Any
 
+from pipeline.capture.decisions import Decisions
 from pipeline.capture.header import Header, recorded
+from pipeline.core.config import parse, read_yaml
 
 LAB = {"board": "board1", "skin": "skin1", "layout": "lab", "chips_n": 5, "protocol": "", "note": ""}
+# What is decided for faults, as params.yaml says.
+AS_USUAL = parse(Decisions, read_yaml(Path(__file__).parents[2] / "params.yaml")["faults"], "params.yaml: faults")
 
 
 def make_header(**changed: Any) -> Header:

@@ -1,20 +1,18 @@
 """Each fault is counted, with its span, and becomes what was decided: dropped, flagged, or the recording refused."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from pipeline.capture.decisions import AS_USUAL, Decisions, Ledger, decide
+from pipeline.capture.decisions import Decisions, Ledger, decide
 from pipeline.capture.header import Clock
 from pipeline.capture.readers.chips import Watch, find_whole_rows
 from pipeline.capture.stream import decode_all
-from pipeline.core.config import read_yaml
 from pipeline.core.errors import CaptureError, ParamsError
 from pipeline.core.seeds import rng_for
 from pipeline.live.inject import inject, parse
-from tests.capture.headers import make_header
+from tests.capture.headers import AS_USUAL, make_header
 from tests.live.boards import RATE_HZ, make_script
 
 SCRIPTS = {wire: make_script(pokes_n=1, wire=wire) for wire in ("binary", "binary-clock", "text-txyz")}
@@ -71,7 +69,7 @@ def test_each_fault_is_found_by_its_name_where_it_was_and_treated_as_decided(nam
 
 def test_a_board_that_is_silent_for_a_second_was_unplugged():
     script = SCRIPTS["binary"]
-    watch = Watch(make_header(layout="native", wire="binary", clock=CLOCK), "x")
+    watch = Watch(make_header(layout="native", wire="binary", clock=CLOCK), "x", AS_USUAL)
     frames = replace(script.frames, end_byte=82 * (1 + np.arange(len(script))))
     watch.look(frames, script.t_s + 1.5 * (script.t_s > 1.0))
     assert {name: (one.count_n, round(one.first, 1)) for name, one in watch.ledger.found.items()} == {
@@ -84,7 +82,7 @@ def test_a_chip_reset_is_refused_or_flagged():
     frames, _ = decode_all(b"".join(script.pieces), "binary", 5, "reset")
     header = make_header(layout="native", wire="binary", clock=CLOCK)
     with pytest.raises(CaptureError, match="the LSB of chip 1"):
-        Watch(header, "reset").look(frames, script.t_s)
+        Watch(header, "reset", AS_USUAL).look(frames, script.t_s)
     watch = Watch(header, "reset", decide(AS_USUAL, ["chip_reset=flag"], "test"))
     assert watch.look(frames, script.t_s).whole.all()
     assert watch.ledger.found["chip_reset"].count_n >= 4 * RATE_HZ
@@ -107,7 +105,7 @@ def test_rows_of_somebodys_table_are_decided_likewise():
     rng, header = rng_for(0, "rows"), make_header(chips_n=2)
     b_uT, temperature_degC = rng.normal(300, 5, (200, 6)), np.full((200, 2), 25.0)
     temperature_degC[20:30, 1], b_uT[100] = 150.0, 0.0
-    kept = find_whole_rows(b_uT, temperature_degC, header, where="here")
+    kept = find_whole_rows(b_uT, temperature_degC, header, where="here", decisions=AS_USUAL)
     assert np.flatnonzero(~kept.whole).tolist() == [100]
     assert kept.losses()["fault_too_hot_flagged_n"] == 10
     assert (kept.losses()["fault_too_hot_first_row"], kept.losses()["fault_too_hot_last_row"]) == (21, 30)
@@ -119,13 +117,11 @@ def test_rows_of_somebodys_table_are_decided_likewise():
         find_whole_rows(b_uT, temperature_degC, header, where="here", decisions=decide(AS_USUAL, ["zeros=refuse"], "t"))
 
 
-def test_what_cannot_be_decided_is_refused_and_the_settings_are_as_ever():
+def test_what_cannot_be_decided_is_refused_and_what_is_nowhere_is_not_in_the_account():
     for words, told in ((["melted=drop"], "NAME=drop"), (["torn=flag"], "torn=drop|refuse"), (["stuck"], "stuck=drop")):
         with pytest.raises(ParamsError, match="a decision must be") as error:
             decide(AS_USUAL, words, "--on-fault")
         assert told in str(error.value)
-    root = Path(__file__).parents[2]
-    assert Decisions.model_validate(read_yaml(root / "params.yaml")["faults"]) == AS_USUAL
     ledger = Ledger(AS_USUAL, "x", "row")
     assert not ledger.note("stuck", np.zeros(3, bool), np.arange(3)).any()
     assert ledger.account() == {}

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from concurrent.futures import Future
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +25,7 @@ from tests.learning.test_grid import alike, trials
 from tests.learning.trials import measured
 
 ROOT = Path(__file__).resolve().parents[2]
-# As docs/settings.md starts workers.
+# As deploy/dask.sh starts workers.
 CLI = "import pipeline.core.cluster; from distributed.cli.dask_{0} import main; main()"
 START_MAX_s = 60.0
 HERE_ONLY = ["--host", "127.0.0.1", "--no-dashboard"]
@@ -115,6 +116,15 @@ def test_workers_that_would_give_other_bits_are_refused(workers, expected):
     )
     with pytest.raises(ParamsError, match=expected):
         _check_workers(client, "tcp://there")
+
+
+def test_a_scheduler_that_goes_away_is_one_sentence():
+    pytest.importorskip("distributed", reason="Dask is not installed")
+    submitted, future = Future(), Future()
+    submitted.cancel()  # as Dask does with every call when it loses the scheduler
+    cluster._pass_on(future, "tcp://there", submitted)
+    with pytest.raises(ParamsError, match="the scheduler at tcp://there must be there .* what was finished is kept"):
+        future.result(0)
 
 
 def imported_from(file: Path) -> ModuleType:

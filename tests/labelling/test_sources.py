@@ -10,7 +10,7 @@ import pytest
 from pipeline.capture import probe
 from pipeline.capture.header import PROBE_FILE
 from pipeline.capture.labels import Label, ProbeTape
-from pipeline.core.errors import ParamsError
+from pipeline.core.errors import CaptureError, ParamsError
 from pipeline.core.seeds import rng_for
 from pipeline.labelling.gauge import Forces, from_gauge
 from pipeline.labelling.places import parse_places
@@ -165,11 +165,21 @@ def test_touches_of_which_the_gauge_said_nothing_are_counted(desk, telling):
     assert asked.run(desk) == "2 touches without a force: the gauge at gauge said none while they lasted"
 
 
+def test_a_gauge_that_is_unplugged_beside_the_keys_is_told_and_touches_go_on(desk, telling):
+    telling([b"0.5\n"])
+    asked, _ = prompts(["", "", "", "0.8N", "q"], forces=Forces("gauge", 9600), dwell_s=0.05)
+    assert "gauge: the force gauge must be plugged in" in (told := asked.run(desk))
+    assert "Forces are missing from then on" in told
+    assert desk.tape.touches_n == 2
+
+
 def test_a_gauge_alone_tells_touches_by_force_and_that_it_was_unplugged(desk, tmp_path, telling):
     telling([b"0.00\n"] * 40 + [b"0.50\n"] * 40 + [b"oops\n"])
     labeller = Labeller(from_gauge("gauge", 9600), desk)
     labeller._thread.join()
-    assert "labels ended: gone" in labeller.end()
+    unplugged = "labels ended: gauge: the force gauge must be plugged in until the recording ends; got gone. What came"
+    assert unplugged in labeller.end()
+    assert isinstance(labeller.failed, CaptureError)
     log = log_of(tmp_path)
     assert log.contact.tolist() == [False, True]
     assert log.Fz_N[1] == pytest.approx(0.5)

@@ -33,7 +33,7 @@ BROWSER = os.environ.get("RESKIN_BROWSER") or next(filter(None, map(shutil.which
 FLAGS = ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--remote-debugging-port=0")
 WIDTHS_PX = (400, 1400)
 # The colour of the dot where a place in mm is drawn, from the page's own numbers.
-DOT = """((x, y) => { const {state, last, parts: {board}} = boards[0], ratio = devicePixelRatio, margin = 12,
+DOT = """((x, y) => { const {state, last, parts: {board}} = boards[0], ratio = devicePixelRatio, margin = MARGIN_PX,
   [wide, high] = state.skin_mm, [left, bottom] = state.corner_mm,
   scale = Math.min((board.clientWidth - 2 * margin) / wide, (innerHeight * .8 - 2 * margin) / high);
   return last.contact ? [...board.getContext("2d").getImageData(ratio * (margin + (x - left) * scale),

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.capture.decisions import AS_USUAL, decide
+from pipeline.capture.decisions import decide
 from pipeline.capture.wire import Frames
 from pipeline.live.health import LIVE, LOOK_FRAMES_N, Health
 from pipeline.live.inject import inject, parse
@@ -129,4 +129,3 @@ def test_a_chip_that_is_stuck_is_not_believed_while_it_is_unless_flagged():
             rows = (np.arange(len(script.frames)) >= first) & (np.arange(len(script.frames)) < first + 10)
             lost_n += int((~health.feed(script.frames.where(rows), float(script.t_s[rows][-1]))).sum())
         assert lost_n == pytest.approx(unbelieved_n, abs=100)
-    assert AS_USUAL.stuck == LIVE.stuck == "drop"

@@ -13,6 +13,7 @@ from pipeline.core.errors import ParamsError
 from pipeline.dataset.captures import open_capture
 from pipeline.live.taping import Wanted, board_of, record_board, source_of
 from pipeline.preparing import Labels, native
+from tests.capture.headers import AS_USUAL
 from tests.live.boards import make_script, plugged_in
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo-terminals")
@@ -31,7 +32,7 @@ def read(folder):
 
     header, files = native(folder, Labels("b0", "s0", None), None, ())
     into = folder.parent / "added" / header.capture
-    _, blocks, account = open_capture(write_capture(into, header, files) and into)
+    _, blocks, account = open_capture(write_capture(into, header, files) and into, AS_USUAL)
     return list(blocks), account
 
 

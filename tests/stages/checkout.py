@@ -24,6 +24,7 @@ DONE, FAILED = "these stages ended", "these stages did not end"  # warm.py says
 
 def copy_checkout(folder: Path) -> Path:
     """Copy what a story needs, compiled code too; DVC works without git there."""
+    folder.mkdir(parents=True, exist_ok=True)
     for path in ROOT.iterdir():
         if path.name in LEFT_OUT or path.name.endswith(".egg-info"):
             continue

@@ -1,10 +1,13 @@
-"""One module a layout of recording: files in, `Readings` and an account of what was left out."""
+"""One module a layout of recording: files in, `Readings` and an account of what was left out.
+
+Refuses to know where captures are kept and what becomes of readings.
+"""
 
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Protocol
 
-from pipeline.capture.decisions import AS_USUAL, Decisions
+from pipeline.capture.decisions import Decisions
 from pipeline.capture.header import Header
 from pipeline.capture.readers import eflash7, eflesh, ini, lab, plain
 from pipeline.core.schema import Readings
@@ -19,7 +22,7 @@ class Reader(Protocol):
     def count_chips(self, files: Mapping[str, Path]) -> int:
         """Count the chips that collected files have columns for."""
 
-    def read(self, folder: Path, header: Header, decisions: Decisions = AS_USUAL) -> tuple[Readings, dict[str, int]]:
+    def read(self, folder: Path, header: Header, decisions: Decisions) -> tuple[Readings, dict[str, int]]:
         """Read a capture folder; `rows_n` + `noload_rows_n` + all `dropped_*_rows_n` = `rows_read_n`."""
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int
 
 from pipeline.capture import faults, limits
-from pipeline.capture.decisions import AS_USUAL, Decisions, Ledger
+from pipeline.capture.decisions import Decisions, Ledger
 from pipeline.capture.header import Header
 from pipeline.capture.readers.table import check_fields
 from pipeline.capture.stream import TEMPERATURE_MAX_degC, TEMPERATURE_MIN_degC
@@ -60,7 +60,7 @@ class Rows(NamedTuple):
 
 def find_whole_rows(
     b_uT: Float[np.ndarray, "f ch"], temperature_degC: Float[np.ndarray, "f k"], header: Header, *, where: str,
-    decisions: Decisions = AS_USUAL, row: Int[np.ndarray, " f"] | None = None,
+    decisions: Decisions, row: Int[np.ndarray, " f"] | None = None,
 ) -> Rows:  # fmt: skip
     """Tell the rows to keep; raise if no row holds a reading of every chip, or for a fault that is refused.
 
@@ -147,7 +147,7 @@ class _Edge(NamedTuple):
 class Watch:
     """Looks at every frame once; holds back at most `SCALE_FRAMES_N` of them."""
 
-    def __init__(self, header: Header, where: str, decisions: Decisions = AS_USUAL) -> None:
+    def __init__(self, header: Header, where: str, decisions: Decisions) -> None:
         self.ledger = Ledger(decisions, where, "ms")
         self._decisions = decisions
         self._header, self._where = header, where

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from pipeline.capture.decisions import AS_USUAL, Decisions, Ledger
+from pipeline.capture.decisions import Decisions, Ledger
 from pipeline.capture.faults import zero_reads
 from pipeline.capture.header import Header
 from pipeline.capture.readers.chips import find_whole_rows
@@ -75,7 +75,7 @@ def count_chips(files: Mapping[str, Path]) -> int:
     return _count_chips(names)
 
 
-def read(folder: Path, header: Header, decisions: Decisions = AS_USUAL) -> tuple[Readings, Account]:
+def read(folder: Path, header: Header, decisions: Decisions) -> tuple[Readings, Account]:
     """Read all rows from the first touch on as readings, touched or not; the rows before it are the no-load reading."""
     where = f"{header.capture}/{READINGS}"
     table = _read_table(folder / READINGS, where)
@@ -84,7 +84,7 @@ def read(folder: Path, header: Header, decisions: Decisions = AS_USUAL) -> tuple
         raise CaptureError(where, "chips", f"{header.chips_n}, as in the header", got, "Mend header or file.")
     ledger = Ledger(decisions, where, "row")
     row = FIRST_LINE_N - 1 + np.arange(len(table.b_uT))
-    written = ~ledger.note("zeros", _zero_rows(table.b_uT, where), row)
+    written = ~ledger.note("zeros", _zero_rows(table.b_uT, where), row)  # of all chips; `rows` tells those of some
     unknown_degC = np.full((int(written.sum()), header.chips_n), np.nan)
     b_uT = table.b_uT[written]
     rows = find_whole_rows(b_uT, unknown_degC, header, where=where, decisions=decisions, row=row[written])
@@ -115,7 +115,8 @@ def read(folder: Path, header: Header, decisions: Decisions = AS_USUAL) -> tuple
         "rows_read_n": len(keep),
         "noload_rows_n": int(noload.sum()),
         "dropped_zero_rows_n": int((~written).sum()),
-        **(ledger.account() | rows.losses()),
+        **{name.replace("zeros", "zeros_of_all_chips"): n for name, n in ledger.account().items()},
+        **rows.losses(),
         "repeated_rows_n": int((np.diff(table.b_uT[keep], axis=0) == 0).all(axis=1).sum()),
         "gap_rows_n": int((np.diff(table.time_s) > GAP_s).sum()),
         "baseline_subtracted_rows_n": len(readings),

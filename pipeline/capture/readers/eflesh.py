@@ -3,6 +3,7 @@
 Places are the recording's robot coordinates less their minimum, so a scan reads 0 mm upwards; the depth is counted
 down from the highest z of the recording, which may hang above the skin: its offset is unknown. Only one force is known,
 and along x or y its sign is not: the recorder does not say whether it is the skin's or the gauge's. These are counted.
+Refuses to guess a unit, a sign or a clock that the files do not tell.
 """
 
 from collections.abc import Mapping
@@ -11,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64, Int32
 
-from pipeline.capture.decisions import AS_USUAL, Decisions
+from pipeline.capture.decisions import Decisions
 from pipeline.capture.header import Header
 from pipeline.capture.readers.chips import find_whole_rows
 from pipeline.capture.readers.passes import find_passes
@@ -64,7 +65,7 @@ def count_chips(files: Mapping[str, Path]) -> int:
     return (columns_n - 1) // AXES_PER_CHIP_N
 
 
-def read(folder: Path, header: Header, decisions: Decisions = AS_USUAL) -> tuple[Readings, Account]:
+def read(folder: Path, header: Header, decisions: Decisions) -> tuple[Readings, Account]:
     """Read every row as one indentation; its no-load field is the baseline that the recorder subtracted, raw - dB."""
     time_s, b_uT, noload_uT = _read_fields(folder, header)
     states = _read_states(folder, header)

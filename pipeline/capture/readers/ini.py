@@ -4,6 +4,7 @@ Rows below the gauge's 0.02 N count as no contact, wherever the truths say they 
 Those that begin a pass, at a corner of the grid, are its no-load reading. `t_s` and `depth_mm` are NaN: none is known.
 Fields may come late: row i of the truths goes with a later row of the readings. By how many rows, the header says
 (`rows_late`) or, if it does not, the recording itself, where it tells: by as many as make |dB| go best with the force.
+Refuses to know which chips can be believed (`chips`) and who is tested on what.
 """
 
 from collections.abc import Mapping
@@ -12,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float64, Int32
 
-from pipeline.capture.decisions import AS_USUAL, Decisions
+from pipeline.capture.decisions import Decisions
 from pipeline.capture.header import Header
 from pipeline.capture.readers.chips import Rows, find_whole_rows
 from pipeline.capture.readers.passes import find_passes
@@ -64,7 +65,7 @@ def count_chips(files: Mapping[str, Path]) -> int:
     return columns_n // VALUES_PER_CHIP_N
 
 
-def read(folder: Path, header: Header, decisions: Decisions = AS_USUAL) -> tuple[Readings, Account]:
+def read(folder: Path, header: Header, decisions: Decisions) -> tuple[Readings, Account]:
     """Read all rows but those with a failed chip; the no-load field of a row is the mean of its pass's corner rows."""
     said_n = _rows_late(header)
     b_uT, temperature_degC = _read_fields(folder, header)

@@ -2,7 +2,8 @@
 
 Signs: the file has the force on the gauge (Fz negative in compression), so all three are turned (`core.schema`). That
 the gauge's x and y are those of the labels is read from the data: see `ON_SKIN`.
-The file's depth is only an index in its name, so `depth_mm` is NaN; it has no clock, so `t_s` is NaN.
+The file's depth is only an index in its name, so `depth_mm` is NaN; it has no clock, so `t_s` is NaN. Refuses to know
+which chips can be believed (`chips`) and who is tested on what.
 """
 
 from collections.abc import Mapping
@@ -12,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float64, Int
 
-from pipeline.capture.decisions import AS_USUAL, Decisions
+from pipeline.capture.decisions import Decisions
 from pipeline.capture.header import Header
 from pipeline.capture.readers.chips import find_whole_rows
 from pipeline.capture.readers.table import (
@@ -68,7 +69,7 @@ def count_chips(files: Mapping[str, Path]) -> int:
     return count_chips_of(read_cells(files[READINGS], str(files[READINGS]), separator=",")[0])
 
 
-def read(folder: Path, header: Header, decisions: Decisions = AS_USUAL) -> tuple[Readings, Account]:
+def read(folder: Path, header: Header, decisions: Decisions) -> tuple[Readings, Account]:
     """Read contact rows as readings; the no-load field of a row is the mean over its press's `noload` rows."""
     where = f"{header.capture}/{READINGS}"
     table = _read_table(folder / READINGS, where)

@@ -3,7 +3,8 @@
 Needed: `phase` (noload or contact), `x_mm`, `y_mm`, and of each chip `Bx0, By0, Bz0, Bx1, ...` in uT. Known where they
 are there, else unknown: `indentation`, `pass`, `t_s`, `depth_mm`, `Fx_N`, `Fy_N`, `Fz_N` (signs: `core.schema`),
 `T0, T1, ...` in degC. A row without contact needs no place. Other columns are ignored, and counted. Without a column
-`pass` the passes are found where the robot repeats its places and depths in order; else all is one.
+`pass` the passes are found where the robot repeats its places and depths in order; else all is one. Refuses to guess
+what a column means whose name it does not know.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Bool, Float64, Int
 
-from pipeline.capture.decisions import AS_USUAL, Decisions
+from pipeline.capture.decisions import Decisions
 from pipeline.capture.header import Header
 from pipeline.capture.readers.chips import find_whole_rows
 from pipeline.capture.readers.passes import find_passes
@@ -68,7 +69,7 @@ def count_chips(files: Mapping[str, Path]) -> int:
     return count_chips_of(_read_cells(file, str(file))[0])
 
 
-def read(folder: Path, header: Header, decisions: Decisions = AS_USUAL) -> tuple[Readings, Account]:  # noqa: PLR0915 - one column after another
+def read(folder: Path, header: Header, decisions: Decisions) -> tuple[Readings, Account]:  # noqa: PLR0915 - one column after another
     """Read contact rows as readings; the no-load field of a row is the mean of the last no-load rows before it."""
     name = next(name for name in (CSV, PARQUET) if (folder / name).exists())
     where = f"{header.capture}/{name}"

@@ -58,7 +58,8 @@ def make_readings(
     header: Header, keep: Bool[np.ndarray, " rows"], **columns: Shaped[np.ndarray, "rows ..."]
 ) -> Readings:
     """Make readings of the rows to keep; a column that is not given is unknown, and `reading_i` 0."""
-    columns = {"reading_i": np.zeros(len(keep)), **columns}
+    no_degC = np.full((len(keep), header.chips_n), np.nan)
+    columns = {"reading_i": np.zeros(len(keep)), "temperature_degC": no_degC, **columns}
     unknown = np.full(len(keep), np.nan)
     typed = {name: columns.get(name, unknown)[keep].astype(_dtype(name)) for name in UNITS}
     return Readings(capture=header.capture, board=header.board, skin=header.skin, source=header.source, **typed)

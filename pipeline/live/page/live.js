@@ -2,7 +2,8 @@
 // Each board has a socket, a state and canvases of its own: one that is unplugged leaves the others as they are.
 "use strict";
 const WINDOW_S = 10, BIN_S = .02, GAP_S = .1, NUMBERS_N = 12, HEAD_BYTES_N = 16, TRACE_PX = 170, RETRY_MS = 1000, DRAWING_MS = 12;
-const ARROW_UT = 300, ARROW_MM = 7; // a change of field of this is an arrow as long as chips are apart, a large one twice
+const ARROW_UT = 300, ARROW_MM = 4, MARGIN_PX = 20; // a change of field of this is an arrow as long, a large one twice: few leave the canvas
+const NARROW_PX = 400; // of a trace: fewer times are written below it
 const COLOURS = ["--link", "--ink", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0072B2"]; // force, chips
 const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name);
 const ink = (j) => { const name = COLOURS[j ? 1 + (j - 1) % (COLOURS.length - 1) : 0]; return name.startsWith("--") ? colour(name) : name; };
@@ -92,7 +93,7 @@ class Board {
     const px = (t) => wide - (end - t) / WINDOW_S * (wide - left), py = (value) => 6 + high * (1 - value / (top * 1.05));
     pen.strokeStyle = colour("--line"); pen.fillStyle = colour("--soft"); pen.textAlign = "right";
     for (let value = 0; value <= top; value += step) { pen.strokeRect(left, py(value), wide, 0); pen.fillText(+value.toPrecision(3), left - 6, py(value) + 4); }
-    for (let s = 0; s <= WINDOW_S; s += 2) pen.fillText(s ? `−${s} s` : "now", Math.max(px(end - s), left + 20), TRACE_PX - 4);
+    for (let s = 0; s <= WINDOW_S; s += wide < NARROW_PX ? 5 : 2) pen.fillText(s ? `−${s} s` : "now", Math.max(px(end - s), left + 20), TRACE_PX - 4);
     for (let j = first; j < first + count; j++) {
       let before = -Infinity;
       pen.strokeStyle = ink(j); pen.beginPath();
@@ -108,7 +109,7 @@ class Board {
 
   drawBoard() {
     const {state, last} = this; // of a silent board the last reading says nothing about now
-    const [wide, high] = state.skin_mm || [20, 20], [left, bottom] = state.corner_mm || [-2, -2], margin = 12;
+    const [wide, high] = state.skin_mm || [20, 20], [left, bottom] = state.corner_mm || [-2, -2], margin = MARGIN_PX;
     const scale = Math.max(Math.min((this.parts.board.clientWidth - 2 * margin) / wide, (innerHeight * .8 - 2 * margin) / high), .1); // a hidden window is 0 high
     const [pen] = this.canvasOf("board", high * scale + 2 * margin);
     const at = (x, y) => [margin + (x - left) * scale, margin + (bottom + high - y) * scale];
@@ -118,8 +119,8 @@ class Board {
     pen.lineWidth = 2;
     state.chips_mm.forEach(([x, y], i) => {
       const [px, py] = at(x, y), side = Math.max(1.5 * scale, 8);
-      pen.strokeStyle = colour("--soft"); pen.strokeRect(px - side / 2, py - side / 2, side, side);
-      pen.fillStyle = ink(i + 1); pen.textAlign = "left"; pen.fillText(`${i}`, px + side / 2 + 3, py + side / 2 + 10);
+      pen.strokeStyle = ink(i + 1); pen.strokeRect(px - side / 2, py - side / 2, side, side); // as its trace
+      pen.fillStyle = colour("--soft"); pen.textAlign = "left"; pen.fillText(`${i}`, px + side / 2 + 3, py + side / 2 + 10);
       if (last && !state.silent && last.chips === state.chips_mm.length) arrow(pen, px, py, last.change.subarray(3 * i, 3 * i + 3), scale);
     });
     if (state.next_mm) { // the next place to press
@@ -142,8 +143,8 @@ class Board {
     const {state, last} = this;
     if (!last || state.silent || !this.rows.length) { for (const name of ["place", "force", "rate", "lost", "estimate", "screen"]) this.say(name, "–"); return; }
     this.drawTrace("forces", 0, 1, .5); this.drawTrace("fields", 1, last.chips, 50);
-    const sure = Number.isNaN(last.sdX) ? "" : ` ± ${last.sdX.toFixed(1)}, ${last.sdY.toFixed(1)} mm${state.adaptable ? "" : " between models"}`;
-    this.say("place", last.contact && !Number.isNaN(last.x) ? `x ${number(last.x, 1, "mm")}, y ${number(last.y, 1, "mm")}${sure}` : last.contact ? "contact" : "no contact");
+    const sure = (sd) => Number.isNaN(sd) ? "" : ` ± ${sd.toFixed(1)}`, among = Number.isNaN(last.sdX) || state.adaptable ? "" : " between models";
+    this.say("place", last.contact && !Number.isNaN(last.x) ? `x ${last.x.toFixed(1)}${sure(last.sdX)}, y ${last.y.toFixed(1)}${sure(last.sdY)} mm${among}` : last.contact ? "contact" : "no contact");
     this.say("force", number(last.force, 2, "N"));
     this.say("rate", number(last.rate, 0, "Hz")); this.say("lost", number(last.lost, 0, ""));
     this.say("estimate", `${number(last.estimate50, 1, "ms")} (median), ${number(last.estimate99, 1, "ms")} (99 %)`);

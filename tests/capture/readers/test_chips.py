@@ -9,7 +9,7 @@ from pipeline.capture import faults
 from pipeline.capture.readers.chips import GRID_ROWS_N, find_whole_rows
 from pipeline.core import seeds
 from pipeline.core.errors import CaptureError
-from tests.capture.headers import make_header
+from tests.capture.headers import AS_USUAL, make_header
 
 HEADER = make_header()
 CHIPS_N = 5
@@ -31,14 +31,14 @@ def test_a_row_is_whole_if_none_of_its_chips_failed(failed: set[tuple[int, int]]
         temperature_degC[row_i, chip_i] = faults.FAILED_TEMPERATURE_degC
     rows = {row_i for row_i, _ in failed}
     if len(rows) < 50:
-        whole = find_whole_rows(b_uT, temperature_degC, HEADER, where="here").whole
+        whole = find_whole_rows(b_uT, temperature_degC, HEADER, where="here", decisions=AS_USUAL).whole
         assert set(np.flatnonzero(~whole).tolist()) == rows
 
 
 def test_a_row_with_zeros_in_place_of_a_chips_reading_is_not_whole():
     b_uT = noisy_fields_uT(50)
     b_uT[7, 3:6] = 0.0
-    rows = find_whole_rows(b_uT, np.full((50, CHIPS_N), 25.0), HEADER, where="here")
+    rows = find_whole_rows(b_uT, np.full((50, CHIPS_N), 25.0), HEADER, where="here", decisions=AS_USUAL)
     assert np.flatnonzero(~rows.whole).tolist() == [7]
     assert rows.losses()["dropped_failed_read_rows_n"] == 1
 
@@ -49,20 +49,21 @@ def test_a_chip_without_the_others_grid_is_named(chip_i: int) -> None:
     spread = seeds.rng_for(2021, "spread").standard_normal((GRID_ROWS_N, 3))
     b_uT[:, 3 * chip_i : 3 * chip_i + 3] = 300 + 5 * spread
     with pytest.raises(CaptureError, match=f"chip {chip_i} must be"):
-        find_whole_rows(b_uT, np.full((GRID_ROWS_N, CHIPS_N), np.nan), HEADER, where="here")
+        find_whole_rows(b_uT, np.full((GRID_ROWS_N, CHIPS_N), np.nan), HEADER, where="here", decisions=AS_USUAL)
 
 
 def test_fields_that_show_no_grid_at_all_are_believed() -> None:
     # As of a recorder that averages: there is nothing to compare.
     b_uT = 300 + 5 * seeds.rng_for(2021, "averaged").standard_normal((GRID_ROWS_N, 3 * CHIPS_N))
-    assert find_whole_rows(b_uT, np.full((GRID_ROWS_N, CHIPS_N), np.nan), HEADER, where="here").whole.all()
+    unknown_degC = np.full((GRID_ROWS_N, CHIPS_N), np.nan)
+    assert find_whole_rows(b_uT, unknown_degC, HEADER, where="here", decisions=AS_USUAL).whole.all()
 
 
 def test_a_row_with_a_stuck_chip_is_told_from_one_that_failed() -> None:
     b_uT, temperature_degC = noisy_fields_uT(100), np.full((100, CHIPS_N), 25.0)
     b_uT[50:, 3:6] = b_uT[50, 3:6]
     b_uT[10, :3], temperature_degC[10, 0] = faults.FAILED_B_uT, faults.FAILED_TEMPERATURE_degC
-    rows = find_whole_rows(b_uT, temperature_degC, HEADER, where="here")
+    rows = find_whole_rows(b_uT, temperature_degC, HEADER, where="here", decisions=AS_USUAL)
     assert np.flatnonzero(rows.failed).tolist() == [10]
     assert np.flatnonzero(rows.stuck).tolist() == list(range(50 + faults.STUCK_FRAMES_MIN_N - 1, 100))
     assert rows.losses() == {

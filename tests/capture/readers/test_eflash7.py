@@ -9,7 +9,7 @@ from pipeline.capture.faults import FAILED_B_uT
 from pipeline.capture.header import Header
 from pipeline.capture.readers import eflash7
 from pipeline.core.errors import CaptureError
-from tests.capture.headers import make_header
+from tests.capture.headers import AS_USUAL, make_header
 
 CHIPS_N = 2
 STEP_uT = 2.4  # of the recorded chips, along x and y
@@ -43,7 +43,7 @@ def write(folder: Path, rows: list[str] = ONE, names: list[str] = NAMES) -> Path
 
 def complaint_of(folder: Path, header: Header = HEADER) -> str:
     with pytest.raises(CaptureError) as caught:
-        eflash7.read(folder, header)
+        eflash7.read(folder, header, AS_USUAL)
     message = str(caught.value)
     assert "\n" not in message
     assert eflash7.READINGS in message
@@ -51,7 +51,7 @@ def complaint_of(folder: Path, header: Header = HEADER) -> str:
 
 
 def test_rows_from_the_first_touch_on_are_readings_and_those_before_the_no_load_reading(tmp_path: Path) -> None:
-    readings, account = eflash7.read(write(tmp_path), HEADER)
+    readings, account = eflash7.read(write(tmp_path), HEADER, AS_USUAL)
     assert readings.t_s.tolist() == [100.6, 100.7, 100.8, 100.9, 101.0, 101.2]
     np.testing.assert_allclose(readings.b_uT[:, 0], STEP_uT * np.array([41, 81, 42, 3, 2, 91]), rtol=1e-6)
     np.testing.assert_allclose(readings.noload_uT[:, 0], 1.5 * STEP_uT, rtol=1e-6)  # of 0 and 1, in turn, plus 1
@@ -59,7 +59,7 @@ def test_rows_from_the_first_touch_on_are_readings_and_those_before_the_no_load_
 
 
 def test_rows_of_zeros_are_dropped_and_counted_and_all_rows_add_up(tmp_path: Path) -> None:
-    _, account = eflash7.read(write(tmp_path), HEADER)
+    _, account = eflash7.read(write(tmp_path), HEADER, AS_USUAL)
     dropped_n = sum(count for name, count in account.items() if name.startswith("dropped_"))
     assert account["dropped_zero_rows_n"] == dropped_n == 1
     assert account["rows_n"] + account["noload_rows_n"] + dropped_n == account["rows_read_n"] == len(LEVELS)
@@ -67,34 +67,42 @@ def test_rows_of_zeros_are_dropped_and_counted_and_all_rows_add_up(tmp_path: Pat
 
 def test_a_fault_is_told_by_the_row_of_the_file_though_a_row_of_zeros_came_before(tmp_path: Path) -> None:
     failed = ",".join([*ONE[-1].split(",")[:-3], *map(str, FAILED_B_uT)])
-    _, account = eflash7.read(write(tmp_path, [*ONE[:-1], failed]), HEADER)
-    assert account["fault_zeros_first_row"] == len(ONE) - 1
+    _, account = eflash7.read(write(tmp_path, [*ONE[:-1], failed]), HEADER, AS_USUAL)
+    assert account["fault_zeros_of_all_chips_first_row"] == len(ONE) - 1
     assert account["fault_failed_read_first_row"] == account["fault_failed_read_last_row"] == len(ONE)
 
 
+def test_zeros_of_one_chip_are_counted_apart_from_those_of_all(tmp_path: Path) -> None:
+    one_chip = ",".join([*ONE[-1].split(",")[:-3], "0.0", "0.0", "0.0"])
+    _, account = eflash7.read(write(tmp_path, [*ONE[:-1], one_chip]), HEADER, AS_USUAL)
+    assert (account["fault_zeros_of_all_chips_dropped_n"], account["fault_zeros_dropped_n"]) == (1, 1)
+    assert (account["dropped_zero_rows_n"], account["dropped_failed_read_rows_n"]) == (1, 1)
+    assert account["fault_zeros_first_row"] == account["fault_zeros_last_row"] == len(ONE)
+
+
 def test_forces_are_told_from_the_untouched_ones_and_compression_is_positive(tmp_path: Path) -> None:
-    readings, account = eflash7.read(write(tmp_path), HEADER)
+    readings, account = eflash7.read(write(tmp_path), HEADER, AS_USUAL)
     np.testing.assert_allclose(readings.Fz_N, [1, 2, 1, 0, 0, 2.5], atol=1e-6)  # float32
     np.testing.assert_allclose(readings.Fx_N, 0, atol=1e-7)
     assert account["force_sign_unknown_rows_n"] == 6
 
 
 def test_a_touch_begins_where_the_force_rises(tmp_path: Path) -> None:
-    readings, _ = eflash7.read(write(tmp_path), HEADER)
+    readings, _ = eflash7.read(write(tmp_path), HEADER, AS_USUAL)
     assert readings.indentation.tolist() == [0, 0, 0, 0, 0, 1]
     assert readings.n_contacts.tolist() == [7, 7, 7, 7, 7, 8]
 
 
 def test_places_have_numbers_and_no_millimetres(tmp_path: Path) -> None:
     for rows, names, places in ((ONE, NAMES, {6}), (TWO, NAMES_OF_TWO, {3, 8})):
-        readings, account = eflash7.read(write(tmp_path, rows, names), HEADER)
+        readings, account = eflash7.read(write(tmp_path, rows, names), HEADER, AS_USUAL)
         assert np.isnan([readings.x_mm, readings.y_mm, readings.depth_mm]).all()
         assert {n for n in range(1, 10) if f"place_{n}_rows_n" in account} == places
         assert all(account[f"place_{n}_rows_n"] == account["rows_n"] for n in places)
 
 
 def test_a_recording_of_two_touches_knows_the_normal_force_alone(tmp_path: Path) -> None:
-    readings, account = eflash7.read(write(tmp_path, TWO, NAMES_OF_TWO), HEADER)
+    readings, account = eflash7.read(write(tmp_path, TWO, NAMES_OF_TWO), HEADER, AS_USUAL)
     assert np.isnan(readings.Fx_N).all()
     assert readings.Fz_N.max() == np.float32(2.5)
     assert account["force_sign_unknown_rows_n"] == 0
@@ -102,7 +110,7 @@ def test_a_recording_of_two_touches_knows_the_normal_force_alone(tmp_path: Path)
 
 def test_a_row_that_comes_late_and_one_that_is_repeated_are_counted(tmp_path: Path) -> None:
     rows = [*ONE[:10], ONE[9].replace("100.9", "103.9"), *[row.replace("101.", "104.") for row in ONE[10:]]]
-    _, account = eflash7.read(write(tmp_path, rows), HEADER)
+    _, account = eflash7.read(write(tmp_path, rows), HEADER, AS_USUAL)
     assert (account["gap_rows_n"], account["repeated_rows_n"]) == (1, 1)
 
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from pipeline.capture.header import Header
 from pipeline.capture.readers import eflesh
 from pipeline.core.errors import CaptureError
-from tests.capture.headers import make_header
+from tests.capture.headers import AS_USUAL, make_header
 
 CHIPS_N = 2
 GRID = [(274.0, -115.0), (274.0, -114.000061), (275.0, -115.0), (275.0, -113.999992)]
@@ -48,7 +48,7 @@ def strokes(folder: Path, strokes_n: int = 3) -> Path:
 
 def complaint_of(folder: Path, header: Header = HEADER) -> str:
     with pytest.raises(CaptureError) as caught:
-        eflesh.read(folder, header)
+        eflesh.read(folder, header, AS_USUAL)
     message = str(caught.value)
     assert "\n" not in message
     return message
@@ -61,25 +61,25 @@ def edit(path: Path, line_n: int, column_i: int, cell: str) -> None:
 
 
 def test_places_count_from_the_corner_of_the_scan_without_float_noise(tmp_path: Path) -> None:
-    readings, _ = eflesh.read(scan(tmp_path), HEADER)
+    readings, _ = eflesh.read(scan(tmp_path), HEADER, AS_USUAL)
     assert readings.x_mm[:4].tolist() == [0, 0, 1, 1]
     assert readings.y_mm[:4].tolist() == [0, 1, 0, 1]
 
 
 def test_depth_counts_down_from_the_highest_place(tmp_path: Path) -> None:
-    readings, _ = eflesh.read(scan(tmp_path), HEADER)
+    readings, _ = eflesh.read(scan(tmp_path), HEADER, AS_USUAL)
     assert readings.depth_mm[:4].tolist() == [0.75, 0.5, 0.25, 0]
 
 
 def test_the_noload_field_is_the_baseline_that_was_subtracted(tmp_path: Path) -> None:
-    readings, _ = eflesh.read(scan(tmp_path), HEADER)
+    readings, _ = eflesh.read(scan(tmp_path), HEADER, AS_USUAL)
     np.testing.assert_array_equal(readings.b_uT[5], 505 + 10 * np.arange(6))
     # 300 + i fits float32, and so do the differences: no rounding to allow for.
     np.testing.assert_array_equal(readings.noload_uT[5], np.full(6, 305))
 
 
 def test_a_scan_has_a_pass_each_time_its_places_repeat(tmp_path: Path) -> None:
-    readings, account = eflesh.read(scan(tmp_path, passes_n=3), HEADER)
+    readings, account = eflesh.read(scan(tmp_path, passes_n=3), HEADER, AS_USUAL)
     assert readings.pass_i.tolist() == [0] * 4 + [1] * 4 + [2] * 4
     assert account["passes_n"] == 3
     assert readings.n_contacts.tolist() == list(range(12))
@@ -87,14 +87,14 @@ def test_a_scan_has_a_pass_each_time_its_places_repeat(tmp_path: Path) -> None:
 
 
 def test_a_fresh_baseline_begins_a_stroke(tmp_path: Path) -> None:
-    readings, account = eflesh.read(strokes(tmp_path), GAUGED)
+    readings, account = eflesh.read(strokes(tmp_path), GAUGED, AS_USUAL)
     assert readings.pass_i.tolist() == [0] * 5 + [1] * 5 + [2] * 5
     assert account["passes_n"] == 3
     assert readings.n_contacts.tolist() == readings.pass_i.tolist()
 
 
 def test_grams_become_newtons_and_a_mask_becomes_nan(tmp_path: Path) -> None:
-    readings, account = eflesh.read(strokes(tmp_path, strokes_n=1), GAUGED)
+    readings, account = eflesh.read(strokes(tmp_path, strokes_n=1), GAUGED, AS_USUAL)
     expected = np.float32([np.nan, 0.980665, 9.80665, 1.4709975, np.nan])
     # float32 holds seven digits
     np.testing.assert_allclose(readings.Fz_N, expected, rtol=1e-6)
@@ -106,7 +106,9 @@ def test_grams_become_newtons_and_a_mask_becomes_nan(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("axis", ["x", "y"])
 def test_the_gauge_measures_the_axis_that_the_header_names(tmp_path: Path, axis: str) -> None:
-    readings, account = eflesh.read(strokes(tmp_path), GAUGED.model_copy(update={"options": {"force_axis": axis}}))
+    readings, account = eflesh.read(
+        strokes(tmp_path), GAUGED.model_copy(update={"options": {"force_axis": axis}}), AS_USUAL
+    )
     felt = np.isfinite(getattr(readings, f"F{axis}_N"))
     assert account["force_sign_unknown_rows_n"] == felt.sum() > 0
     assert np.isnan(readings.Fz_N).all()
@@ -123,7 +125,7 @@ def test_a_weight_without_an_axis_is_refused(tmp_path: Path, options: dict[str, 
 @settings(max_examples=20, deadline=None)
 @given(passes_n=st.integers(1, 6))
 def test_every_row_is_a_reading(tmp_path_factory: pytest.TempPathFactory, passes_n: int) -> None:
-    readings, account = eflesh.read(scan(tmp_path_factory.mktemp("eflesh"), passes_n), HEADER)
+    readings, account = eflesh.read(scan(tmp_path_factory.mktemp("eflesh"), passes_n), HEADER, AS_USUAL)
     assert account["rows_n"] == account["rows_read_n"] == len(readings) == 4 * passes_n
     assert account["noload_rows_n"] == 0
     assert (np.diff(readings.t_s) > 0).all()
@@ -199,7 +201,7 @@ def rescale(path: Path, columns: slice, factor: float) -> None:
 @pytest.mark.parametrize("factor", [1e-3, 1e3])
 def test_places_in_metres_or_micrometres_are_refused(tmp_path: Path, factor: float) -> None:
     folder = write(tmp_path, [[5.0 * i, 0.0, 142.0] for i in range(4)], [300.0] * 4)
-    eflesh.read(folder, HEADER)
+    eflesh.read(folder, HEADER, AS_USUAL)
     rescale(folder / eflesh.STATES, slice(1, 4), factor)
     assert "states.csv: places must be one, or spread over 1 to 200 mm" in complaint_of(folder)
 
@@ -232,6 +234,6 @@ def test_fields_in_other_units_are_refused(tmp_path: Path, of_a_uT: float) -> No
 
 def test_a_robot_of_constant_height_gives_places_and_no_depth(tmp_path):
     places = [[x, y, 142.0] for x, y in GRID] * 3
-    readings, account = eflesh.read(write(tmp_path, places, [300.0 + i for i in range(len(places))]), HEADER)
+    readings, account = eflesh.read(write(tmp_path, places, [300.0 + i for i in range(len(places))]), HEADER, AS_USUAL)
     assert np.isnan(readings.depth_mm).all()
     assert account["no_depth_rows_n"] == len(readings) == len(places)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from pipeline.capture.header import Firmware, Header
 from pipeline.capture.readers import ini
 from pipeline.core.errors import CaptureError
-from tests.capture.headers import make_header
+from tests.capture.headers import AS_USUAL, make_header
 
 CHIPS_N = 3
 LSB_XY_uT, LSB_Z_uT = 0.15, 0.242
@@ -59,14 +59,14 @@ def edit(path: Path, line_n: int, line: str) -> None:
 
 def complaint_of(folder: Path, header: Header = HEADER) -> str:
     with pytest.raises(CaptureError) as caught:
-        ini.read(folder, header)
+        ini.read(folder, header, AS_USUAL)
     message = str(caught.value)
     assert "\n" not in message
     return message
 
 
 def test_every_row_is_a_press_of_its_pass(tmp_path: Path) -> None:
-    readings, account = ini.read(write(tmp_path, ONE_PASS * 3), HEADER)
+    readings, account = ini.read(write(tmp_path, ONE_PASS * 3), HEADER, AS_USUAL)
     assert readings.pass_i.tolist() == [0] * 8 + [1] * 8 + [2] * 8
     assert account["passes_n"] == 3
     assert readings.indentation.tolist() == list(range(24))
@@ -75,7 +75,7 @@ def test_every_row_is_a_press_of_its_pass(tmp_path: Path) -> None:
 
 
 def test_force_and_not_the_label_tells_a_contact(tmp_path: Path) -> None:
-    readings, account = ini.read(write(tmp_path, ONE_PASS), HEADER)
+    readings, account = ini.read(write(tmp_path, ONE_PASS), HEADER, AS_USUAL)
     assert np.isnan(readings.x_mm).tolist() == [True, True, False, False, True, False, False, True]
     assert np.isnan(readings.y_mm).tolist() == np.isnan(readings.x_mm).tolist()
     np.testing.assert_array_equal(readings.Fz_N, np.float32([0, 0, 0.08, 0.3, 0, 0.52, 1.5, 0]))
@@ -85,7 +85,7 @@ def test_force_and_not_the_label_tells_a_contact(tmp_path: Path) -> None:
 
 
 def test_the_noload_field_is_the_mean_of_the_rows_that_begin_the_pass(tmp_path: Path) -> None:
-    readings, account = ini.read(write(tmp_path, ONE_PASS * 2), HEADER)
+    readings, account = ini.read(write(tmp_path, ONE_PASS * 2), HEADER, AS_USUAL)
     for pass_i in (0, 1):
         corner_uT = (field_uT(8 * pass_i) + field_uT(8 * pass_i + 1)) / 2
         expected = np.tile(corner_uT, (8, 1)).astype(np.float32)
@@ -94,12 +94,12 @@ def test_the_noload_field_is_the_mean_of_the_rows_that_begin_the_pass(tmp_path: 
 
 
 def test_places_that_never_repeat_are_one_pass(tmp_path: Path) -> None:
-    _, account = ini.read(write(tmp_path, ONE_PASS), HEADER)
+    _, account = ini.read(write(tmp_path, ONE_PASS), HEADER, AS_USUAL)
     assert account["passes_n"] == 1
 
 
 def test_what_the_files_do_not_know_is_nan(tmp_path: Path) -> None:
-    readings, _ = ini.read(write(tmp_path, ONE_PASS), HEADER)
+    readings, _ = ini.read(write(tmp_path, ONE_PASS), HEADER, AS_USUAL)
     for name in ("depth_mm", "Fx_N", "Fy_N", "t_s"):
         assert np.isnan(getattr(readings, name)).all()
 
@@ -113,7 +113,7 @@ def test_a_row_with_a_failed_read_is_dropped_and_counted(tmp_path: Path) -> None
     write(tmp_path, ONE_PASS * 2)
     edit(tmp_path / ini.READINGS, 2, f"{chip_line(1, 0)} {FAILED} {chip_line(1, 2)}")
     edit(tmp_path / ini.READINGS, 4, f"{FAILED} {FAILED} {FAILED}")
-    readings, account = ini.read(tmp_path, HEADER)
+    readings, account = ini.read(tmp_path, HEADER, AS_USUAL)
     assert account["dropped_failed_read_rows_n"] == 2
     assert readings.indentation.tolist() == [0, 2, *range(4, 16)]
     # The failed corner row takes no part in the no-load mean.
@@ -128,7 +128,7 @@ def test_every_row_is_a_reading_or_counted(
     folder = write(tmp_path_factory.mktemp("ini"), ONE_PASS * passes_n)
     for row_i in failed:
         edit(folder / ini.READINGS, row_i + 1, f"{FAILED} {chip_line(row_i, 1)} {chip_line(row_i, 2)}")
-    readings, account = ini.read(folder, HEADER)
+    readings, account = ini.read(folder, HEADER, AS_USUAL)
     assert account["rows_n"] == len(readings) == 8 * passes_n - len(failed)
     dropped_n = account["dropped_failed_read_rows_n"]
     assert account["rows_n"] + account["noload_rows_n"] + dropped_n == account["rows_read_n"] == 8 * passes_n
@@ -158,7 +158,7 @@ def test_the_account_says_by_how_many_rows_the_fields_come_late(
 ) -> None:
     folder = write_late(tmp_path_factory.mktemp("ini"), ONE_PASS * 5, late_n)
     for said in ("0", str(late_n)):
-        _, account = ini.read(folder, late(said))
+        _, account = ini.read(folder, late(said), AS_USUAL)
         assert account["best_rows_late_n"] == late_n
         assert account["rows_late_n"] == int(said)
 
@@ -166,7 +166,7 @@ def test_the_account_says_by_how_many_rows_the_fields_come_late(
 @pytest.mark.parametrize("late_n", [0, 1, 4])
 @pytest.mark.parametrize(("passes_n", "tells"), [(13, True), (5, False)])  # 104 and 40 rows
 def test_a_header_that_says_nothing_leaves_it_to_a_recording_that_is_long_enough(tmp_path, late_n, passes_n, tells):
-    _, account = ini.read(write_late(tmp_path, ONE_PASS * passes_n, late_n), HEADER)
+    _, account = ini.read(write_late(tmp_path, ONE_PASS * passes_n, late_n), HEADER, AS_USUAL)
     assert account["best_rows_late_n"] == late_n
     assert account["rows_late_n"] == account["dropped_no_partner_rows_n"] == (late_n if tells else 0)
 
@@ -179,7 +179,7 @@ def test_late_fields_are_paired_with_their_presses(
     folder = write(tmp_path_factory.mktemp("ini"), ONE_PASS * 3)
     for row_i in failed:
         edit(folder / ini.READINGS, row_i + 1, f"{FAILED} {chip_line(row_i, 1)} {chip_line(row_i, 2)}")
-    readings, account = ini.read(folder, late(str(late_n)))
+    readings, account = ini.read(folder, late(str(late_n)), AS_USUAL)
     truths_i = [i for i in range(24 - late_n) if i + late_n not in failed]
     assert readings.indentation.tolist() == truths_i
     np.testing.assert_array_equal(
@@ -213,7 +213,7 @@ def test_the_public_recording_comes_one_row_late(tmp_path: Path, shared_data: Pa
         (ini.TRUTHS, "truths_artillery_AFG_board2_50_screw.txt"),
     ):
         (tmp_path / name).write_bytes((shared_data / "ini" / source).read_bytes())
-    _, account = ini.read(tmp_path, make_header(layout="ini"))
+    _, account = ini.read(tmp_path, make_header(layout="ini"), AS_USUAL)
     assert account["best_rows_late_n"] == account["rows_late_n"] == 1
     assert account["passes_n"] == 50
     assert account["rows_n"] + account["dropped_no_partner_rows_n"] == account["rows_read_n"] == 23300

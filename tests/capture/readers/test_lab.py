@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from pipeline.capture.header import Header
 from pipeline.capture.readers import lab
 from pipeline.core.errors import CaptureError
-from tests.capture.headers import make_header
+from tests.capture.headers import AS_USUAL, make_header
 
 CHIPS_N = 2
 NAMES = "indent,phase,x_mm,y_mm,T0,Bx0,By0,Bz0,T1,Bx1,By1,Bz1,Fx,Fy,Fz"
@@ -41,7 +41,7 @@ def write(folder: Path, *rows: str, names: str = NAMES) -> Path:
 
 def complaint_of(folder: Path, header: Header = HEADER) -> str:
     with pytest.raises(CaptureError) as caught:
-        lab.read(folder, header)
+        lab.read(folder, header, AS_USUAL)
     message = str(caught.value)
     assert "\n" not in message
     assert lab.READINGS in message
@@ -49,7 +49,7 @@ def complaint_of(folder: Path, header: Header = HEADER) -> str:
 
 
 def test_contact_rows_become_readings_of_their_press(tmp_path: Path) -> None:
-    readings, _ = lab.read(write(tmp_path, *PRESSES), HEADER)
+    readings, _ = lab.read(write(tmp_path, *PRESSES), HEADER, AS_USUAL)
     assert readings.indentation.tolist() == [0, 0, 0, 1]
     assert readings.reading_i.tolist() == [0, 1, 2, 0]
     assert readings.b_uT[:, 0].tolist() == [160, 161, 162, 50]
@@ -61,20 +61,20 @@ def test_contact_rows_become_readings_of_their_press(tmp_path: Path) -> None:
 
 
 def test_the_noload_field_is_the_mean_over_the_same_press(tmp_path: Path) -> None:
-    readings, _ = lab.read(write(tmp_path, *PRESSES), HEADER)
+    readings, _ = lab.read(write(tmp_path, *PRESSES), HEADER, AS_USUAL)
     assert readings.noload_uT[:, 0].tolist() == [102, 102, 102, 90]
     assert readings.noload_uT[0].tolist() == [102, 112, 122, 132, 142, 152]
 
 
 def test_all_three_forces_are_turned_from_the_gauge_to_the_skin(tmp_path: Path) -> None:
-    readings, _ = lab.read(write(tmp_path, *PRESSES), HEADER)
+    readings, _ = lab.read(write(tmp_path, *PRESSES), HEADER, AS_USUAL)
     np.testing.assert_array_equal(readings.Fz_N, np.float32([3.5, 3.5, 3.5, 0.5]))
     np.testing.assert_array_equal(readings.Fx_N[:3], np.float32([-0.1] * 3))
     np.testing.assert_array_equal(readings.Fy_N[:3], np.float32([0.2] * 3))
 
 
 def test_what_the_file_does_not_know_is_nan(tmp_path: Path) -> None:
-    readings, _ = lab.read(write(tmp_path, *PRESSES), HEADER)
+    readings, _ = lab.read(write(tmp_path, *PRESSES), HEADER, AS_USUAL)
     assert np.isnan(readings.depth_mm).all()
     assert np.isnan(readings.t_s).all()
 
@@ -87,7 +87,7 @@ def test_every_row_is_a_reading_or_a_noload_row(
     rows = []
     for indent, (noload_n, contact_n) in enumerate(counts):
         rows += [row(indent, "noload", 100.0)] * noload_n + [row(indent, "contact", 150.0)] * contact_n
-    readings, account = lab.read(write(tmp_path_factory.mktemp("lab"), *rows), HEADER)
+    readings, account = lab.read(write(tmp_path_factory.mktemp("lab"), *rows), HEADER, AS_USUAL)
     assert account["rows_read_n"] == len(rows)
     assert account["rows_n"] == len(readings) == sum(contact_n for _, contact_n in counts)
     assert account["noload_rows_n"] == sum(noload_n for noload_n, _ in counts)
@@ -100,7 +100,7 @@ def test_a_row_with_a_failed_read_is_dropped_and_counted(tmp_path: Path) -> None
             rows[row_i].split(",22.5,")[0].rsplit(",", 4)[0]
             + ",-880.49,8028.16,5194.00,12943.36,22.5,130,140,150,0,0,-3"
         )
-    readings, account = lab.read(write(tmp_path, *rows), HEADER)
+    readings, account = lab.read(write(tmp_path, *rows), HEADER, AS_USUAL)
     assert account["dropped_failed_read_rows_n"] == 2
     assert (account["rows_n"], account["noload_rows_n"], account["rows_read_n"]) == (3, 2, 7)
     assert readings.b_uT[:, 0].tolist() == [160, 162, 50]
@@ -113,13 +113,13 @@ def test_order_of_columns_does_not_matter(tmp_path: Path) -> None:
     order = np.roll(np.arange(len(names)), 4)
     turned = [",".join(np.array(line.split(","))[order]) for line in PRESSES]
     (tmp_path / "turned").mkdir()
-    straight, _ = lab.read(write(tmp_path, *PRESSES), HEADER)
+    straight, _ = lab.read(write(tmp_path, *PRESSES), HEADER, AS_USUAL)
     folder = write(tmp_path / "turned", *turned, names=",".join(np.array(names)[order]))
-    np.testing.assert_array_equal(lab.read(folder, HEADER)[0].b_uT, straight.b_uT)
+    np.testing.assert_array_equal(lab.read(folder, HEADER, AS_USUAL)[0].b_uT, straight.b_uT)
 
 
 def test_a_column_nobody_knows_is_counted(tmp_path: Path) -> None:
-    _, account = lab.read(write(tmp_path, *[f"{line},1" for line in PRESSES], names=f"{NAMES},Mz"), HEADER)
+    _, account = lab.read(write(tmp_path, *[f"{line},1" for line in PRESSES], names=f"{NAMES},Mz"), HEADER, AS_USUAL)
     assert account["ignored_columns_n"] == 1
 
 

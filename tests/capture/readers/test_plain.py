@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from pipeline.capture.readers import eflesh, plain
 from pipeline.cli import app
 from pipeline.core.errors import CaptureError
-from tests.capture.headers import make_header
+from tests.capture.headers import AS_USUAL, make_header
 
 ROOT = Path(__file__).resolve().parents[3]
 CHIPS_N = 2
@@ -41,7 +41,7 @@ def write(folder: Path) -> Path:
 
 def complaint_of(folder: Path) -> str:
     with pytest.raises(CaptureError) as caught:
-        plain.read(folder, make_header(layout="table", chips_n=CHIPS_N))
+        plain.read(folder, make_header(layout="table", chips_n=CHIPS_N), AS_USUAL)
     assert "\n" not in str(caught.value)
     return str(caught.value)
 
@@ -55,7 +55,7 @@ def read(folder: Path, rows: pd.DataFrame, name: str = "mine.csv"):
     capture.mkdir(exist_ok=True)
     for kept, source in files.items():
         (capture / kept).write_bytes(source.read_bytes())
-    return plain.read(capture, make_header(layout="table", chips_n=plain.count_chips(files)))
+    return plain.read(capture, make_header(layout="table", chips_n=plain.count_chips(files)), AS_USUAL)
 
 
 def test_a_spreadsheets_mark_of_byte_order_changes_nothing(tmp_path):
@@ -64,7 +64,7 @@ def test_a_spreadsheets_mark_of_byte_order_changes_nothing(tmp_path):
     (tmp_path / "b").mkdir()
     for kept, source in plain.collect(tmp_path / "mine.csv").items():
         (tmp_path / "b" / kept).write_bytes(source.read_bytes())
-    marked, _ = plain.read(tmp_path / "b", make_header(layout="table", chips_n=CHIPS_N))
+    marked, _ = plain.read(tmp_path / "b", make_header(layout="table", chips_n=CHIPS_N), AS_USUAL)
     np.testing.assert_array_equal(marked.b_uT, plainly.b_uT)
 
 
@@ -171,7 +171,7 @@ def test_the_script_of_the_docs_turns_three_files_into_this_format(tmp_path, sha
     ours, _ = read(tmp_path, pd.read_csv("mine.csv"))
     chips_n = eflesh.count_chips(eflesh.collect(recording))
     header = make_header(layout="eflesh", chips_n=chips_n, options={"force_axis": "z"})
-    theirs, _ = eflesh.read(recording, header)
+    theirs, _ = eflesh.read(recording, header, AS_USUAL)
     np.testing.assert_allclose(ours.b_uT, theirs.b_uT, rtol=1e-6)
     np.testing.assert_allclose(ours.noload_uT, theirs.noload_uT, rtol=1e-4, atol=1e-2)
     np.testing.assert_allclose(ours.x_mm, theirs.x_mm, atol=1e-3)
@@ -186,7 +186,7 @@ def test_a_template_is_the_first_line_of_such_a_file(tmp_path):
     capture.mkdir()
     (capture / plain.CSV).write_text(out.read_text())
     with pytest.raises(CaptureError, match="rows of phase contact"):
-        plain.read(capture, make_header(layout="table", chips_n=3))
+        plain.read(capture, make_header(layout="table", chips_n=3), AS_USUAL)
 
 
 def test_passes_are_found_where_places_and_depths_repeat_in_order_and_a_column_has_the_last_word(tmp_path):

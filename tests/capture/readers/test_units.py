@@ -1,14 +1,26 @@
 """Units that cannot be right are told; those that can are let pass."""
 
+from typing import get_args
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline.capture.layouts import Foreign
 from pipeline.capture.readers import READERS
-from pipeline.capture.readers.table import check_depths, check_fields, check_forces, check_places, check_touch
+from pipeline.capture.readers.table import (
+    check_depths,
+    check_fields,
+    check_forces,
+    check_places,
+    check_touch,
+    make_readings,
+)
 from pipeline.core import seeds
 from pipeline.core.errors import CaptureError
+from pipeline.core.schema import to_table
+from tests.capture.headers import make_header
 
 SKIN_uT = np.array([[-541.2, 917.2, 44.9], [120.0, -3600.0, 700.0]])
 # Step and usual field of real boards: ReSkin with its own skins, eFlesh, and eFlesh at another gain.
@@ -110,4 +122,13 @@ def test_depths_pass_in_millimetres_only(deepest_mm: float, fine: bool) -> None:
 
 
 def test_each_layout_has_a_reader() -> None:
-    assert set(READERS) == {"table", "lab", "ini", "eflesh", "eflash7"}
+    assert set(READERS) == set(get_args(Foreign))
+
+
+def test_what_a_reader_does_not_give_is_unknown_on_every_chip() -> None:
+    readings = make_readings(
+        make_header(chips_n=2), np.array([True, False]), indentation=np.zeros(2), pass_i=np.zeros(2),
+        b_uT=np.ones((2, 6)), noload_uT=np.ones((2, 6)), n_contacts=np.zeros(2),
+    )  # fmt: skip
+    table = to_table(readings)
+    assert np.isnan(np.asarray(table.column("temperature_degC").combine_chunks().flatten())).tolist() == [True, True]

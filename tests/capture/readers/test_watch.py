@@ -15,7 +15,7 @@ from pipeline.capture.readers.table import check_log
 from pipeline.capture.wire import Frames
 from pipeline.core import seeds
 from pipeline.core.errors import CaptureError
-from tests.capture.headers import make_header
+from tests.capture.headers import AS_USUAL, make_header
 from tests.capture.signals import frames_of
 
 CHIPS_N = 3
@@ -45,7 +45,9 @@ def changed(frames: Frames, rows: slice, chip_i: int, values_uT: np.ndarray) -> 
 
 def look(frames: Frames, *ends: int, **header: object) -> np.ndarray:
     """Watch frames in portions that end at `ends`."""
-    watch = Watch(make_header(**({"layout": "native", "wire": "binary", "chips_n": CHIPS_N} | header)), "stream.bin")
+    watch = Watch(
+        make_header(**({"layout": "native", "wire": "binary", "chips_n": CHIPS_N} | header)), "stream.bin", AS_USUAL
+    )
     edges = [0, *sorted(ends), len(frames)]
     masks = []
     for begin, end in pairwise(edges):
@@ -97,7 +99,7 @@ def test_portions_do_not_matter(ends: list[int]) -> None:
 
 def test_failed_reads_are_not_looked_at() -> None:
     failed = changed(board(100), slice(10, 60), 0, np.array(faults.FAILED_B_uT))
-    watch = Watch(make_header(layout="native", wire="binary", chips_n=CHIPS_N), "stream.bin")
+    watch = Watch(make_header(layout="native", wire="binary", chips_n=CHIPS_N), "stream.bin", AS_USUAL)
     mask = np.arange(100) // 10 % 6 > 0
     assert not (watch.stuck(failed, mask) & mask).any()
 

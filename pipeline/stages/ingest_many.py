@@ -1,0 +1,46 @@
+"""Stage ingest_many: all captures of a recorded scene that has many -> indentations/<scene>/, one file a capture.
+
+A stage each would cost more than the reading (docs/growth.md). What was read before, of the same bytes, by the same
+code and settings, is taken over: a capture more costs itself. Refuses to know layouts: stage `ingest` reads each.
+"""
+
+import hashlib
+import shutil
+from pathlib import Path
+
+from pipeline.core import io
+from pipeline.core.config import Files, read_settings
+from pipeline.core.provenance import home
+from pipeline.core.stage import run, say
+from pipeline.stages.ingest import ingest
+
+KEPT = ".reskin/readings"  # a cache, and no output: DVC deletes those before a stage runs
+
+
+def ingest_many(scene: str, files: Files, raw: Path, code: Path, lost_fraction_max: float, indentations: Path) -> None:
+    """Read every capture of the plan, or take over what was read of it before."""
+    settings, kept = read_settings("ingest_many", scene, files), home() / KEPT / scene
+    rest_on = repr([settings.shared["faults"], lost_fraction_max]).encode() + io.read_bytes(code)
+    captures, before = settings.plan("captures"), set(kept.glob("*.parquet"))
+    read = {name: kept / f"{_key(raw / name, rest_on)}.parquet" for name in captures}
+    with io.replacing(indentations) as folder:
+        folder.mkdir()
+        for name, file in read.items():
+            if file not in before:
+                ingest(scene, files, raw / name, lost_fraction_max, file)
+            shutil.copyfile(file, folder / f"{name}.parquet")  # no link: what cuts one must not cut the other
+    for file in before.difference(read.values()):
+        io.remove(file)
+    say(f"{scene}: {len(captures)} captures, {len(before.intersection(read.values()))} of them read before")
+
+
+def _key(capture: Path, rest_on: bytes) -> str:
+    """Name what readings of a capture rest on: its name and bytes, the code, the settings."""
+    digest = hashlib.sha256(rest_on + capture.name.encode())
+    for file in sorted(file for file in capture.rglob("*") if file.is_file()):
+        digest.update(f"{file.relative_to(capture)} {io.sha256(file)}\n".encode())
+    return digest.hexdigest()
+
+
+if __name__ == "__main__":
+    run(ingest_many)

@@ -1,0 +1,74 @@
+"""What the machine refuses is one sentence that names the file a user knows; our own mistakes stay as they are."""
+
+import errno
+import os
+from concurrent.futures.process import BrokenProcessPool
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from pipeline.core import io, stage
+from pipeline.core.errors import SchemaError
+from pipeline.core.machine import MachineError, explaining
+
+
+@pytest.mark.parametrize(
+    ("error", "sentence"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device", "models"), "split: models must have room; got No space left"),
+        (OSError(errno.EROFS, "Read-only file system", "reports"), "split: reports must be readable and writable; got"),
+        (OSError(errno.ENOSPC, "No space left on device"), "split: the disk must have room"),
+        (BrokenProcessPool("gone"), "split: a worker process must be alive to its end; got one that died. Out of"),
+        (MemoryError("Unable to allocate 8 GiB"), "split: memory must be enough for its work; got Unable to allocate"),
+        (OSError(errno.ENOMEM, "Cannot allocate memory"), "split: memory must be enough for its work; got .*Cannot"),
+    ],
+)
+def test_what_the_machine_refuses_is_one_sentence(error, sentence):
+    with pytest.raises(MachineError, match=f"^{sentence}") as found, explaining("split"):
+        raise error
+    assert str(found.value).endswith("Run it again: what was finished is kept.")
+
+
+@pytest.mark.parametrize(
+    "error", [FileNotFoundError(errno.ENOENT, "No such file", "x"), ValueError("ours"), KeyError(1)]
+)
+def test_other_errors_pass_as_they_are(error):
+    with pytest.raises(type(error)), explaining("split"):
+        raise error
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="a disk without room, on Linux only")
+@pytest.mark.parametrize("write", [io.write_json, io.write_table, io.write_tensors])
+def test_a_full_disk_is_told_by_the_name_of_the_target_whatever_writes(tmp_path, write):
+    target, (temporary,) = tmp_path / "out", [tmp_path / f".out.{os.getpid()}.tmp"]
+    content = {io.write_table: pa.table({"a": np.zeros(9)}), io.write_tensors: {"a": np.zeros(9)}}.get(write, [1])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(io, "remove", lambda path: path.unlink(missing_ok=True) or path.symlink_to("/dev/full"))
+        with (
+            pytest.raises(MachineError, match=rf"^split: {target} must have room; got .*No space"),
+            explaining("split"),
+        ):
+            write(target, content, *([{}] if write is io.write_tensors else []))
+    assert temporary.is_symlink()
+    assert not target.exists()
+
+
+def test_a_table_that_was_cut_or_changed_is_one_sentence(tmp_path):
+    io.write_table(tmp_path / "t.parquet", pa.table({"a": np.random.default_rng(0).normal(size=9999)}))
+    content = (tmp_path / "t.parquet").read_bytes()
+    for damaged in (content[:-20], bytes(500) + content[500:], b""):
+        (tmp_path / "t.parquet").write_bytes(damaged)
+        with pytest.raises(SchemaError, match="must be readable Parquet; got .* run the stage that writes it again"):
+            io.read_table(tmp_path / "t.parquet")
+
+
+def test_a_stage_that_the_machine_stops_ends_with_a_sentence_and_a_status(tmp_path, monkeypatch, capsys):
+    def split(scene: str) -> None:
+        raise OSError(errno.EROFS, "Read-only file system", f"reports/{scene}")
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["split", "--scene", "lab"])
+    with pytest.raises(SystemExit, match="2"):
+        stage.run(split)
+    assert capsys.readouterr().err.startswith("error: split: reports/lab must be readable and writable; got Read-only")

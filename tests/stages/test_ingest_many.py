@@ -1,0 +1,69 @@
+"""A scene of many recorded captures is read in one stage, each capture once."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from pipeline.core import io
+from pipeline.core.config import Files
+from pipeline.core.errors import CaptureError
+from pipeline.stages import ingest_many as stage
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    """Run the stage on three captures; it gives the names of those that were read anew."""
+    monkeypatch.chdir(tmp_path)
+    read, shared = [], {"faults": {"stuck": "drop"}}
+    names = ["c0", "c1", "c2"]
+    monkeypatch.setattr(
+        stage, "read_settings", lambda *_: SimpleNamespace(shared=shared, plan=lambda _: names)
+    )  # fmt: skip
+
+    def ingest(scene, files, raw, lost_fraction_max, indentations):
+        if io.read_bytes(raw / "stream.bin") == b"broken":
+            raise CaptureError("stream.bin")
+        read.append(raw.name)
+        io.write_text(indentations, raw.name)
+
+    monkeypatch.setattr(stage, "ingest", ingest)
+    io.write_text(tmp_path / "code", "1")
+    for name in names:
+        io.write_text(tmp_path / "raw" / name / "stream.bin", name)
+
+    def run(**changed):
+        read.clear()
+        shared.update(changed)
+        stage.ingest_many("lab", Files.of("lab"), tmp_path / "raw", tmp_path / "code", 0.05, tmp_path / "out")
+        assert {file.stem: file.read_text() for file in (tmp_path / "out").iterdir()} == {name: name for name in names}
+        return read
+
+    run.names, run.folder = names, tmp_path
+    return run
+
+
+def test_a_capture_more_is_read_alone_and_one_that_is_gone_leaves_nothing(run):
+    assert run() == ["c0", "c1", "c2"]
+    assert run() == []
+    run.names.remove("c1")
+    assert run() == []
+    assert len(list((run.folder / stage.KEPT / "lab").iterdir())) == 2
+    run.names.append("c1")
+    assert run() == ["c1"]
+
+
+def test_other_bytes_settings_or_code_are_read_anew(run):
+    run()
+    io.write_text(run.folder / "raw/c1/stream.bin", "other")
+    assert run() == ["c1"]
+    assert run(faults={"stuck": "flag"}) == ["c0", "c1", "c2"]
+    io.write_text(run.folder / "code", "2")
+    assert run() == ["c0", "c1", "c2"]
+
+
+def test_what_was_read_before_a_broken_capture_is_not_lost(run):
+    io.write_text(run.folder / "raw/c2/stream.bin", "broken")
+    with pytest.raises(CaptureError):
+        run()
+    io.write_text(run.folder / "raw/c2/stream.bin", "mended")
+    assert run() == ["c2"]
