@@ -3,11 +3,15 @@
 # make test-processors   the tests that train, under the instructions of four kinds of processors
 # make ui      the MLflow UI on the embedded store
 # make bench   benchmarks (not part of the tests)
+# make faults   injects every fault for real (Linux, root for mounts) -> docs/faults.md
 # make time-repro   `make repro` in a fresh clone, its stages three times: seconds, CPU seconds, disk -> reports/time.json
 # make constraints   the newest versions that fit together -> constraints.txt; then make test, then commit
 # make licences   the licences of all that is installed; fails on one that is not compatible
 # make audit   known faults of the versions in constraints.txt; asks pypi.org
 # make time-install   the wheel in an empty environment: seconds, MB, and a page of `reskin live`
+# make team-server FOLDER=... [HOST=0.0.0.0] [PORT=5000]   MLflow on PostgreSQL, until Ctrl-C
+# make teams      what a team does, on servers of its own, which it ends -> docs/measured/teams.md
+# make cluster-test   a sweep on a cluster in network namespaces, as root -> docs/measured/cluster.md, scaling.md
 # make clean   removes what the targets above made, but no data and no results
 
 PYTHON ?= python3
@@ -23,7 +27,8 @@ export OMP_NUM_THREADS = 1
 # Where an environment forbids it, every stage and every worker of the tests would compile all its modules again.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: repro test test-processors lint ui bench time-repro time-install readme constraints licences audit clean
+.PHONY: repro test test-processors lint ui bench faults time-repro time-install readme constraints licences audit clean
+.PHONY: team-server teams cluster-test
 TRAINING_TESTS := tests/extremes tests/learning tests/evaluation tests/stages tests/test_numerics.py
 .DEFAULT_GOAL := repro
 
@@ -60,6 +65,10 @@ ui: $(STAMP)
 bench: $(STAMP)
 	$(BIN)/python -m pytest tests/benchmarks -s -q --override-ini addopts= -p no:xdist
 
+# Kills, full disks, cut files, dead servers: each hits a copy of a small checkout that has finished.
+faults: $(STAMP)
+	$(BIN)/python -m tests.faults
+
 # How long a newcomer waits, and what it takes on disk: a fresh clone, its stages three times from nothing.
 time-repro:
 	$(PYTHON) tests/benchmarks/time_repro.py --times 3
@@ -79,6 +88,22 @@ audit:
 	$(PYTHON) -m venv .audit
 	.audit/bin/python -m pip install --quiet --disable-pip-version-check pip-audit
 	.audit/bin/pip-audit --strict --requirement constraints.txt --no-deps --disable-pip # strict: what cannot be asked about fails
+
+# Both extras, and for the tests a server that speaks S3.
+$(VENV)/.team: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dask,team]' 'moto[server]'
+	@touch $@
+
+HOST ?= 127.0.0.1
+PORT ?= 5000
+team-server: $(VENV)/.team
+	$(BIN)/python -m deploy.team_server $(or $(FOLDER),$(error FOLDER=... is where the database and the artifacts lie)) --host $(HOST) --port $(PORT)
+
+teams: $(VENV)/.team
+	$(BIN)/python -m tests.benchmarks.teams
+
+cluster-test: $(VENV)/.team
+	$(BIN)/python -m tests.benchmarks.cluster
 
 readme: $(STAMP)
 	$(BIN)/reskin readme

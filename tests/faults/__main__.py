@@ -1,0 +1,95 @@
+"""Inject every fault for real, and write the table: python -m tests.faults [--only WORD] [--work FOLDER] [--out FILE].
+
+Clones the last commit, runs a small scene of a few questions there once, and lets each fault hit a copy of it. Linux;
+faults that need mounts need root, and are marked where it lacks.
+"""
+
+import argparse
+import os
+import platform
+import shutil
+import tempfile
+import time
+import traceback
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pipeline.core import io
+from tests.faults import files, kills, together, tracking  # noqa: F401 (each enters its faults)
+from tests.faults.place import ROOT, Checkout, copy, make_template
+from tests.faults.row import CASES, Row, line, not_run, table
+from tests.repositories import git
+
+OUT = ROOT / "docs/faults.md"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", nargs="*", default=[], help="faults whose name holds one of these")
+    parser.add_argument(
+        "--work", type=Path, help="a folder that is kept, with the finished checkout and the rows in it"
+    )
+    parser.add_argument("--out", type=Path, default=OUT)
+    asked = parser.parse_args()
+    work = (asked.work or Path(tempfile.mkdtemp())).resolve()
+    work.mkdir(parents=True, exist_ok=True)
+    start_s, template = time.monotonic(), Checkout(work / "template")
+    if not template.folder.exists():
+        template, _ = make_template(work / "template")
+    print(f"finished checkout: {time.monotonic() - start_s:.0f} s", flush=True)
+    rows_file, code = work / "rows.json", git(template.folder, "rev-parse", "--short=12", "HEAD~1:pipeline")
+    rows = io.read_json(rows_file) if rows_file.exists() else {}
+    for name, (how, case) in CASES.items():
+        if any(word in name for word in asked.only) if asked.only else rows.get(name, {}).get("code") != code:
+            row, seconds = hit(case, template, work / "case")
+            rows[name] = {"line": line(name, how, row, seconds), "red": bool(row.faults), "code": code, "s": seconds}
+            print(rows[name]["line"], flush=True)
+            io.write_json(rows_file, rows)
+    if not asked.work:
+        shutil.rmtree(work)
+    asked.out.write_text(page(rows))
+
+
+def hit(case, template: Checkout, folder: Path) -> tuple[Row, float]:
+    """Let a fault hit a fresh copy."""
+    shutil.rmtree(folder, ignore_errors=True)
+    at, start_s = copy(template, folder), time.monotonic()
+    try:
+        row = case(at)
+    except Exception as error:  # the table tells of it, and goes on
+        traceback.print_exc()
+        row = Row(
+            "", None, "not known", "–", [f"the fault could not be injected ({type(error).__name__} {error})"[:300]]
+        )
+    return row, time.monotonic() - start_s
+
+
+def page(rows: Mapping[str, Mapping[str, Any]]) -> str:
+    """Write the page; a fault that was not injected yet stands there as such."""
+    ran = [rows[name] for name in CASES if name in rows]
+    lines = [rows[name]["line"] if name in rows else not_run(name, how) for name, (how, _) in CASES.items()]
+    return INTRODUCTION.format(
+        faults_n=len(CASES), green_n=sum(not row["red"] for row in ran), not_run_n=len(CASES) - len(ran),
+        code=", ".join(sorted({row["code"] for row in ran})), minutes=sum(row["s"] for row in ran) / 60,
+        cores_n=os.cpu_count(), python=platform.python_version(), load=os.getloadavg()[0],
+    ) + table(lines)  # fmt: skip
+
+
+INTRODUCTION = """\
+# Faults, and what becomes of them
+
+Written by `make faults` (`python -m tests.faults`), which injects each fault for real into a copy of a checkout whose
+stages have finished, and then runs `dvc repro` once more. Green: the fault is told in a sentence without a traceback
+and within ten minutes, finished stages and trainings are not computed again, and the hashes of all outputs in dvc.lock
+are those of the undisturbed run. The scene is a part of scene `ci`, with the stages that `kill -9` names below; every
+other stage is an experiment, which starts, writes and fails through the same code (`core/stage.py`, `core/io.py`).
+
+{green_n} of {faults_n} green, {not_run_n} not run yet. Code (`git rev-parse HEAD:pipeline`) {code};
+{cores_n} cores, load {load:.0f} at the end, Python {python}; {minutes:.0f} min.
+
+"""
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,194 @@
+"""Disks and files: full, read-only, cut, changed."""
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+from pipeline.core import io
+from tests.faults.kills import address
+from tests.faults.place import SCENE, Checkout
+from tests.faults.row import NOT_RUN, Row, fault, judge
+
+TRIPLET = address("train_triplet")
+IN_NAMESPACE = ("unshare", "--mount", "--propagation", "private", "sh", "-c")  # what is mounted there, ends there
+
+
+@fault(
+    "full disk under trainings",
+    "a tmpfs of 300 kB mounted over `.reskin`; `train_triplet` trains",
+)
+def full_cells(at: Checkout) -> Row:
+    at.forget(TRIPLET)
+    script = f"mount -t tmpfs -o size=300k none .reskin && exec dvc repro {TRIPLET}"
+    return judge(at, at.run(*IN_NAMESPACE, script), at.run("dvc", "repro"), may_run=[TRIPLET])
+
+
+@fault(
+    "full disk under everything",
+    "the checkout on a tmpfs, filled but for 150 kB; room again for the next run",
+)
+def full_disk(at: Checkout) -> Row:
+    at.forget(TRIPLET)
+    disk = at.folder.with_name("disk")
+    disk.mkdir(exist_ok=True)
+    size = subprocess.run(["du", "-sm", str(at.folder)], capture_output=True, text=True, check=True).stdout
+    size_MB = int(size.split()[0])
+    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size_MB + 40}m", "none", str(disk)], check=True)
+    try:
+        subprocess.run(["cp", "-r", "--preserve=all", str(at.folder), str(disk / "case")], check=True)
+        small = Checkout(disk / "case", template=at.template)
+        _fill(disk, but_kB=150)
+        said = small.run("dvc", "repro")
+        (disk / "ballast").unlink()
+        return judge(small, said, small.run("dvc", "repro"), may_run=[TRIPLET])
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)
+
+
+def _fill(disk: Path, *, but_kB: int) -> None:
+    free = os.statvfs(disk)
+    with (disk / "ballast").open("wb") as ballast:
+        os.posix_fallocate(ballast.fileno(), 0, free.f_bavail * free.f_frsize - but_kB * 1024)
+
+
+@fault(
+    "read-only `reports/`",
+    "bound to itself read-only; `report` is yet to run, and DVC has its former outputs to remove",
+)
+def read_only_reports(at: Checkout) -> Row:
+    return _read_only(at, keep=True)
+
+
+@fault("read-only `reports/`, nothing in it", "the same; there is nothing to remove")
+def read_only_new_reports(at: Checkout) -> Row:
+    return _read_only(at, keep=False)
+
+
+def _read_only(at: Checkout, *, keep: bool) -> Row:
+    kept = at.folder / "kept"
+    shutil.copytree(at.folder / "reports", kept)
+    at.forget(address("report"))
+    if keep:
+        shutil.rmtree(at.folder / "reports")
+        shutil.copytree(kept, at.folder / "reports")
+    shutil.rmtree(kept)
+    script = f"mount --bind reports reports && mount -o remount,ro,bind reports && exec dvc repro {address('report')}"
+    return judge(at, at.run(*IN_NAMESPACE, script), at.run("dvc", "repro"), may_run=[address("report")])
+
+
+def _cut(file: Path) -> None:
+    content = file.read_bytes()
+    file.chmod(0o644)
+    file.unlink()  # the cache's copy, if it is one file with it, stays whole
+    file.write_bytes(content[: len(content) * 2 // 3])
+
+
+def _first(folder: Path, pattern: str) -> Path:
+    return min(folder.rglob(pattern))
+
+
+CUT = {
+    "simulated capture": (f"data/raw/{SCENE}", "*.bin", "ingest_simulated"),
+    "dataset (Parquet)": (f"data/indentations/{SCENE}", "*.parquet", "split"),
+    "predictions (Parquet)": (f"data/models/{SCENE}/train_multi", "predictions.parquet", "report"),
+    "model (safetensors)": (f"data/models/{SCENE}/train_triplet", "*.safetensors", "adapt"),
+}
+
+
+@fault(
+    "truncated files, `dvc repro`",
+    "a third cut from a capture, a dataset, a table of predictions and a model, of finished stages",
+)
+def cut_all(at: Checkout) -> Row:
+    for folder, pattern, _ in CUT.values():
+        _cut(_first(at.folder / folder, pattern))
+    first = at.run("dvc", "repro")
+    row = judge(at, first, at.run("dvc", "repro"), may_run=[], fails=False)
+    row.said = row.said or f"ran {', '.join(first.ran) or 'no stage: the files are restored from DVC’s cache'}"
+    row.faults += ["finished stages ran again"] if first.ran else []
+    row.faults += [] if first.status == 0 else ["it fails"]
+    return row
+
+
+def cut(what: str, folder: str, pattern: str, reader: str) -> None:
+    """Enter a file that was cut and is read past DVC."""
+
+    @fault(f"truncated {what}, read", f"a third cut from a `{pattern}` of `{folder}`; stage `{reader}` alone reads it")
+    def read(at: Checkout) -> Row:
+        _cut(_first(at.folder / folder, pattern))
+        row = judge(at, at.run(*at.command(reader)), NOT_RUN)
+        row.next_run = "`dvc repro` restores the file, as above"
+        return row
+
+
+for what, (folder, pattern, reader) in CUT.items():
+    cut(what, folder, pattern, reader)
+
+
+def _damage(file: Path) -> None:
+    mode, content = file.stat().st_mode, bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.chmod(0o644)
+    file.write_bytes(content)
+    file.chmod(mode)
+
+
+@fault(
+    "corrupted DVC cache entry",
+    "a bit changed in the cached weights of `train_triplet`; those in the checkout deleted; then `dvc repro`",
+)
+def cache_entry(at: Checkout) -> Row:
+    models = at.folder / f"data/models/{SCENE}/train_triplet"
+    model = _first(models, "*.safetensors")
+    content = model.read_bytes()
+    entry = next(
+        file for file in (at.folder / ".dvc/cache/files").rglob("*") if file.is_file() and file.read_bytes() == content
+    )
+    entry.unlink()
+    entry.write_bytes(content)
+    entry.chmod(0o444)
+    _damage(entry)
+    shutil.rmtree(models)
+    first = at.run("dvc", "repro")
+    again = at.run("dvc", "repro")
+    row = judge(at, first, again, may_run=[TRIPLET], fails=False)
+    row.faults += [] if _first(models, "*.safetensors").read_bytes() == content else ["the changed weights are in use"]
+    return row
+
+
+@fault(
+    "cut DVC cache entry of a folder",
+    "the list of files of `train_triplet` cut in DVC's cache, the folder deleted; then `dvc repro`",
+)
+def cache_folder(at: Checkout) -> Row:
+    digest = at.lock()[TRIPLET][f"data/models/{SCENE}/train_triplet"]
+    entry = at.folder / ".dvc/cache/files/md5" / digest[:2] / digest[2:]
+    _cut(entry)
+    entry.chmod(0o444)
+    shutil.rmtree(at.folder / f"data/models/{SCENE}/train_triplet")
+    first = at.run("dvc", "repro")
+    return judge(at, first, at.run("dvc", "repro"), may_run=[TRIPLET], fails=False)
+
+
+def damaged_cell(name: str, how: str, damage) -> None:
+    """Enter a finished training that was damaged."""
+
+    @fault(f"corrupted finished training, {name}", f"{how}, of a file in `.reskin/cells`; `train_triplet` runs again")
+    def case(at: Checkout) -> Row:
+        cells = at.cells()
+        at.forget(TRIPLET, cells=False)
+        card = io.read_json(_first(at.template.folder / f"data/models/{SCENE}/train_triplet", "*.json"))
+        damage(at.folder / f".reskin/cells/{card['key']}.safetensors")
+        whole = {cell: written for cell, written in at.cells().items() if written == cells[cell]}
+        first = at.run("dvc", "repro")
+        fresh_n = sum(at.cells()[cell] != written for cell, written in cells.items())
+        row = judge(at, first, at.run("dvc", "repro"), may_run=[], finished=at.cells(), fails=False)
+        row.lost = f"{len(cells) - len(whole)} training and those of its stack: {fresh_n} trained again"
+        row.faults += [] if 1 <= fresh_n <= 3 else ["not its stack alone is trained again"]
+        row.faults += [] if "is damaged" in row.said else ["nothing is said"]
+        return row
+
+
+damaged_cell("cut", "a third cut", _cut)
+damaged_cell("changed", "a bit changed", _damage)

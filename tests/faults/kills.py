@@ -1,0 +1,149 @@
+"""Processes that are killed in mid-run: every kind of stage, DVC itself, a worker."""
+
+import signal
+import time
+
+import psutil
+
+from pipeline.core import io
+from tests.faults.place import SCENE, Checkout, Said, alive
+from tests.faults.row import Row, fault, judge
+
+TRAINS = ("train_single", "train_multi", "train_triplet", "adapt")
+STAGES = (
+    "code", "simulate", "ingest_simulated", "describe", "split", *TRAINS, "train_classical", "table2", "sensitivity",
+    "audit", "report", "publish",
+)  # fmt: skip
+ATTEMPTS_N = 4
+AS_MAX = 100 * 2**20  # bytes
+
+
+def address(stage: str) -> str:
+    """Name a stage as DVC does."""
+    return stage if stage == "code" else f"{stage}@{SCENE}"
+
+
+def killed(at: Checkout, stage: str, part: float) -> Said | None:
+    """Run a stage through DVC, and kill its process after a part of what it took before; None if it ended first."""
+    cost = at.folder / ".reskin/costs" / SCENE / f"{stage}.json"
+    wait_s = part * (io.read_json(cost)["seconds"] if cost.exists() else 2.0)
+    if stage == "publish":
+        (at.folder / "mlflow.db").unlink()  # else there is nothing to write
+    start_s = time.monotonic()
+    repro = at.start("dvc", "repro", address(stage))
+    process = at.stage(stage)
+    if stage in TRAINS:
+        at.until(lambda: bool(at.cells()), process)
+    else:
+        at.until(lambda: f"{stage}: stage " in at.said() or stage == "code", process)
+        kill_s = time.monotonic() + wait_s
+        at.until(lambda: time.monotonic() > kill_s, process)
+    if alive(process):
+        process.kill()
+    said = at.end(repro, start_s)
+    return said if said.status else None
+
+
+def kill_in(stage: str) -> None:
+    """Enter the kill of a stage."""
+
+    @fault(
+        f"kill -9 in `{stage}`",
+        "the stage's process, in mid-run" + ("" if stage not in TRAINS else ", as soon as a training is finished"),
+    )
+    def case(at: Checkout) -> Row:
+        for i in range(ATTEMPTS_N):
+            at.forget(address(stage))
+            if said := killed(at, stage, 0.5 / 2**i):
+                break
+        else:
+            raise AssertionError(f"{stage} ended before it could be killed")
+        finished = at.cells() if stage in TRAINS else None
+        return judge(at, said, at.run("dvc", "repro"), may_run=[address(stage)], finished=finished)
+
+
+for name in STAGES:
+    kill_in(name)
+
+
+@fault(
+    "kill -9 of `dvc repro` itself",
+    "DVC's process, while `train_triplet` trains, which goes on alone; the next run at once",
+)
+def kill_dvc(at: Checkout) -> Row:
+    stage = address("train_triplet")
+    at.forget(stage)
+    start_s = time.monotonic()
+    repro = at.start("dvc", "repro", stage)
+    process = at.stage("train_triplet")
+    at.until(lambda: bool(at.cells()), process)
+    repro.send_signal(signal.SIGKILL)
+    said, finished = at.end(repro, start_s), at.cells()
+    again = at.run("dvc", "repro")
+    at.until(lambda: False, process, 60.0)  # what is left alone ends
+    return judge(at, said, again, may_run=[stage], finished=finished)
+
+
+def _worker(at: Checkout, stage: str) -> tuple[psutil.Process, psutil.Process]:
+    """Give a stage's process and one of its workers that has finished a training."""
+    process = at.stage(stage)
+    at.until(lambda: bool(at.cells()), process)
+    workers = [child for child in process.children(recursive=True) if _is_worker(child)]
+    return process, max(workers, key=lambda child: child.memory_info().rss)
+
+
+def _is_worker(process: psutil.Process) -> bool:
+    return (
+        process.cpu_times().user > 0
+        and not process.children()
+        and "resource_tracker" not in " ".join(process.cmdline())
+    )
+
+
+@fault(
+    "worker out of memory, killed by the kernel",
+    "SIGKILL to a worker process of `train_triplet` after a finished training",
+)
+def kill_worker(at: Checkout) -> Row:
+    stage = address("train_triplet")
+    at.forget(stage)
+    start_s = time.monotonic()
+    repro = at.start("dvc", "repro", stage, RESKIN_EXECUTOR="processes:1")
+    _worker(at, "train_triplet")[1].kill()
+    said, finished = at.end(repro, start_s), at.cells()
+    return judge(at, said, at.run("dvc", "repro"), may_run=[stage], finished=finished)
+
+
+@fault(
+    "worker out of memory, told by the allocator",
+    "RLIMIT_AS of a worker of `train_triplet` set to 100 MB, less than it has, after a finished training",
+)
+def starve_worker(at: Checkout) -> Row:
+    stage = address("train_triplet")
+    at.forget(stage)
+    start_s = time.monotonic()
+    repro = at.start("dvc", "repro", stage, RESKIN_EXECUTOR="processes:1")
+    worker = _worker(at, "train_triplet")[1]
+    worker.rlimit(psutil.RLIMIT_AS, (AS_MAX, AS_MAX))
+    said, finished = at.end(repro, start_s), at.cells()
+    return judge(at, said, at.run("dvc", "repro"), may_run=[stage], finished=finished)
+
+
+@fault(
+    "kill -9 of a stage with workers",
+    "the process of `train_triplet`; its workers must end too",
+)
+def kill_parent(at: Checkout) -> Row:
+    stage = address("train_triplet")
+    at.forget(stage)
+    start_s = time.monotonic()
+    repro = at.start("dvc", "repro", stage, RESKIN_EXECUTOR="processes:2")
+    process, _ = _worker(at, "train_triplet")
+    workers = process.children(recursive=True)
+    process.kill()
+    said = at.end(repro, start_s)
+    _, left = psutil.wait_procs(workers, 10)
+    finished = at.cells()
+    row = judge(at, said, at.run("dvc", "repro"), may_run=[stage], finished=finished)
+    row.faults += [f"{len(left)} workers outlive their stage"] if any(alive(one) for one in left) else []
+    return row

@@ -1,0 +1,231 @@
+"""Others at the same time, clocks, recordings that are added, and what git left half done."""
+
+import shutil
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+from ruamel.yaml import YAML
+
+from tests.capture.readers.test_lab import PRESSES, write
+from tests.faults.files import _cut
+from tests.faults.kills import address
+from tests.faults.place import Checkout, Said
+from tests.faults.row import Row, fault, judge
+from tests.repositories import git
+from tests.scenes import recorded
+
+TRIPLET = address("train_triplet")
+FINISHED = (address("report"), address("publish"))
+CAPTURE = "board1_skin1_readings"
+INGEST = f"ingest@rig-{CAPTURE}"
+RAW = f"data/raw/rig/{CAPTURE}"
+
+
+@fault("two `dvc repro` at once", "the second begins while `train_triplet` of the first trains")
+def two(at: Checkout) -> Row:
+    at.forget(TRIPLET)
+    start_s = time.monotonic()
+    first, other = at.start("dvc", "repro"), Checkout(at.folder, at.folder.with_suffix(".other"))
+    at.until(lambda: bool(at.cells()), at.stage("train_triplet"))
+    second = other.run("dvc", "repro")
+    one, finished = at.end(first, start_s), at.cells()
+    row = judge(at, second, at.run("dvc", "repro"), may_run=[], finished=finished)
+    row.faults += [] if one.status == 0 else ["the first fails"]
+    return row
+
+
+@fault(
+    "two `dvc repro` at once, of different stages",
+    "the second is asked for `sensitivity` while `train_triplet` of the first trains",
+)
+def two_stages(at: Checkout) -> Row:
+    at.forget(TRIPLET, address("sensitivity"))
+    start_s = time.monotonic()
+    first, other = at.start("dvc", "repro", TRIPLET), Checkout(at.folder, at.folder.with_suffix(".other"))
+    at.until(lambda: bool(at.cells()), at.stage("train_triplet"))
+    second = other.run("dvc", "repro", address("sensitivity"))
+    one, finished = at.end(first, start_s), at.cells()
+    row = judge(at, second, at.run("dvc", "repro"), may_run=[], finished=finished, fails=False)
+    row.faults += [] if one.status == 0 else ["the first fails"]
+    row.said = row.said or "nothing: both run to their end"
+    return row
+
+
+def _add(at: Checkout) -> list[str]:
+    """Write a recorded scene and a recording; give the command that adds it."""
+    with (at.folder / "pipeline/scenes/rig.yaml").open("w") as stream:
+        YAML().dump(recorded(), stream)
+    recording = at.folder.with_name("recording")
+    recording.mkdir(exist_ok=True)
+    write(recording, *PRESSES)
+    labels = ["--layout", "lab", "--board", "board1", "--skin", "skin1", "--scene", "rig"]
+    return ["python", "-m", "pipeline.cli", "add", str(recording / "readings.csv"), *labels]
+
+
+def _ingest(at: Checkout) -> Said:
+    return at.run("dvc", "repro", INGEST)
+
+
+@fault(
+    "`reskin add` beside a running `dvc repro`",
+    "a recording is added while `train_triplet` trains, and once more after its end",
+)
+def add_beside(at: Checkout) -> Row:
+    at.forget(TRIPLET)
+    words, start_s = _add(at), time.monotonic()
+    first, other = at.start("dvc", "repro"), Checkout(at.folder, at.folder.with_suffix(".other"))
+    at.until(lambda: bool(at.cells()), at.stage("train_triplet"))
+    added = other.run(*words)
+    one = at.end(first, start_s)
+    later = at.run(*words)
+    row = judge(at, added, at.run("dvc", "repro", INGEST, *FINISHED), may_run=[INGEST])
+    row.faults += [] if (one.status, later.status) == (0, 0) else ["the run, or the later add, fails"]
+    row.next_run = f"added after its end; {row.next_run}"
+    return row
+
+
+@fault(
+    "kill -9 of `reskin add`",
+    "as soon as its folder is there; then `dvc repro`, `reskin add` again, and once more after what it says is done",
+)
+def kill_add(at: Checkout) -> Row:
+    words, start_s = _add(at), time.monotonic()
+    adding = at.start(*words)
+    while adding.poll() is None and not (at.folder / RAW).exists():
+        time.sleep(0.002)
+    adding.send_signal(signal.SIGKILL)
+    at.end(adding, start_s)
+    still = at.run("dvc", "repro")
+    again = at.run(*words)
+    shutil.rmtree(at.folder / RAW)
+    later = at.run(*words)
+    row = judge(at, again, at.run("dvc", "repro", INGEST, *FINISHED), may_run=[INGEST])
+    row.faults += [] if (still.status, still.ran, later.status) == (0, [], 0) else [f"{still.ran}, {later.text[-200:]}"]
+    return row
+
+
+@fault(
+    "kill -9 in `ingest`",
+    "the stage's process, as soon as it is there; a recording of layout `lab`",
+)
+def kill_ingest(at: Checkout) -> Row:
+    at.run(*_add(at))
+    undisturbed = _ingest(at)
+    expected = at.lock()[INGEST]
+    at.forget(INGEST, cells=False)
+    start_s = time.monotonic()
+    repro = at.start("dvc", "repro", INGEST)
+    at.stage("ingest").kill()
+    said = at.end(repro, start_s)
+    row = judge(at, said, at.run("dvc", "repro", INGEST, *FINISHED), may_run=[INGEST])
+    row.faults += [] if (undisturbed.status, at.lock()[INGEST]) == (0, expected) else ["other readings"]
+    return row
+
+
+@fault(
+    "truncated recorded capture",
+    "a third cut from `readings.csv` of an added recording, which is ingested and committed; then `dvc repro`; "
+    "`git restore` of its `.dvc` and `dvc checkout --force` for the next run",
+)
+def cut_recording(at: Checkout) -> Row:
+    at.run(*_add(at))
+    _ingest(at)
+    expected = at.lock()[INGEST]
+    git(at.folder, "add", "--all")
+    git(at.folder, "commit", "--quiet", "--message", "added")
+    _cut(at.folder / RAW / "readings.csv")
+    said = _ingest(at)
+    git(at.folder, "restore", f"{RAW}.dvc")
+    restored = at.run("dvc", "checkout", "--force", f"{RAW}.dvc")
+    row = judge(at, said, at.run("dvc", "repro", INGEST, *FINISHED), may_run=[INGEST])
+    row.faults += (
+        [] if restored.status == 0 and at.lock()[INGEST] == expected else [f"not restored: {restored.text[-300:]}"]
+    )
+    return row
+
+
+BACK = """\
+import time
+_before = {name: getattr(time, name) for name in ("time", "time_ns")}
+_until = time.monotonic() + 2.0
+def _set_back(name, by):
+    setattr(time, name, lambda: _before[name]() - (by if time.monotonic() > _until else 0))
+_set_back("time", 86400.0)
+_set_back("time_ns", 86400 * 10**9)
+"""
+
+
+@fault(
+    "clock set back",
+    "by a day, 2 s after each process of `dvc repro` starts (`time.time` replaced by a sitecustomize); files of "
+    "finished stages then lie in the future; next run with the right clock",
+)
+def clock(at: Checkout) -> Row:
+    stages = [TRIPLET, address("adapt"), address("report"), address("publish")]
+    at.forget(*stages)
+    shim = at.folder.with_name("shim")
+    shim.mkdir(exist_ok=True)
+    (shim / "sitecustomize.py").write_text(BACK)
+    for file in (at.folder / "data/indentations").rglob("*.parquet"):
+        subprocess.run(["touch", "--date", "tomorrow", str(file)], check=True)
+    first = at.run("dvc", "repro", PYTHONPATH=f"{shim}:{at.folder}")
+    row = judge(at, first, at.run("dvc", "repro"), may_run=[], finished=at.cells(), fails=False)
+    row.faults += [] if set(first.ran) == set(stages) else [f"ran {first.ran}"]
+    row.said = row.said or "nothing"
+    return row
+
+
+def _damaged_then_restored(
+    at: Checkout, file: str, content: str, command: tuple[str, ...], *, fails: bool = True
+) -> Row:
+    (at.folder / file).write_text(content)
+    said = at.run(*command)
+    git(at.folder, "restore", file)
+    return judge(at, said, at.run("dvc", "repro"), may_run=[], fails=fails)
+
+
+MARKS = "<<<<<<< HEAD\n{}=======\n{}>>>>>>> other\n"
+
+
+@fault(
+    "git: conflict left in dvc.lock",
+    "marks of a merge in `dvc.lock`; `dvc repro`; `git restore dvc.lock` for the next run",
+)
+def conflict_lock(at: Checkout) -> Row:
+    text = (at.folder / "dvc.lock").read_text()
+    return _damaged_then_restored(at, "dvc.lock", MARKS.format(text, text), ("dvc", "repro"))
+
+
+@fault(
+    "git: conflict left in data/captures.yaml",
+    "marks of a merge; `reskin scenes check`; `git restore` for the next run",
+)
+def conflict_captures(at: Checkout) -> Row:
+    command = ("python", "-m", "pipeline.cli", "scenes", "check")
+    words = MARKS.format("captures: {a: {}}\n", "captures: {b: {}}\n")
+    return _damaged_then_restored(at, "data/captures.yaml", words, command)
+
+
+@fault("dvc.lock cut", "its last twentieth; `dvc repro`; `git restore dvc.lock` for the next run")
+def cut_lock(at: Checkout) -> Row:
+    text = (at.folder / "dvc.lock").read_text()
+    row = _damaged_then_restored(at, "dvc.lock", text[: len(text) * 19 // 20], ("dvc", "repro"), fails=False)
+    row.said = row.said or "nothing: what is not in it is yet to run"
+    return row
+
+
+@fault(
+    "git: index.lock left by a killed git",
+    "`.git/index.lock` is there; `split` and what follows are run; next run without it",
+)
+def index_lock(at: Checkout) -> Row:
+    at.forget(address("split"), cells=False)
+    (at.folder / ".git/index.lock").touch()
+    first = at.run("dvc", "repro")
+    Path(at.folder / ".git/index.lock").unlink()
+    row = judge(at, first, at.run("dvc", "repro"), may_run=[], finished=at.cells(), fails=False)
+    row.faults += [] if first.ran == [address("split")] else [f"ran {first.ran}"]
+    row.said = row.said or "nothing: no stage needs it"
+    return row

@@ -1,0 +1,192 @@
+"""The diary: a server that is away, silent, dies in mid-run; a store that another program holds."""
+
+import http.server
+import re
+import shutil
+import signal
+import socket
+import sqlite3
+import subprocess
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+from pipeline.core import io
+from pipeline.core.server import TrackingAway, probe
+from tests.faults.place import SCENE, Checkout, Said
+from tests.faults.row import NOT_RUN, Row, fault, judge
+
+
+def _report(at: Checkout, first: Said, again: Said | None) -> Row:
+    """Judge: the stage succeeds, says once that nothing was sent, soon; then `reskin publish`, if it ran, sends all."""
+    row, warned_n = judge(at, first, again or NOT_RUN, fails=False), first.text.count("warning:")
+    row.lost, row.next_run = "nothing", "as where it refuses"
+    if again:
+        counts = re.findall(r"MLflow runs (\{.*\})", again.text)
+        row.next_run = f"`reskin publish`: {counts[-1] if counts else again.text.strip()[-200:]}"
+        row.faults += [] if counts else ["not sent later"]
+    row.faults += [f"{warned_n} warnings"] if warned_n != 1 else []
+    row.faults += [f"exit status {first.status}"] if first.status else []
+    took_s, undisturbed_s = (_took_s(each) for each in (at, at.template))
+    row.said += f" (stage publish: {took_s:.0f} s; undisturbed {undisturbed_s:.0f} s)"
+    row.faults += ["held up"] if took_s > 2 * undisturbed_s + 60 else []
+    return row
+
+
+def _took_s(at: Checkout) -> float:
+    return float(io.read_json(at.folder / f".reskin/costs/{SCENE}/publish.json")["seconds"])
+
+
+def _away(at: Checkout, uri: str) -> Row:
+    direct = {"no_proxy": "*", "NO_PROXY": "*"}  # else a proxy may answer in its place
+    return _report(at, at.run(*at.command("publish"), MLFLOW_TRACKING_URI=uri, **direct), None)
+
+
+@fault(
+    "tracking server refuses",
+    "MLFLOW_TRACKING_URI names a port where nobody listens; stage `publish` runs",
+)
+def refused(at: Checkout) -> Row:
+    (at.folder / "mlflow.db").unlink()
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    first = at.run(*at.command("publish"), MLFLOW_TRACKING_URI=f"http://127.0.0.1:{port}")
+    return _report(at, first, at.run("python", "-m", "pipeline.cli", "publish"))
+
+
+@fault(
+    "tracking server black-holed, no route",
+    "an address from which nothing comes back (10.255.255.1)",
+)
+def no_route(at: Checkout) -> Row:
+    return _away(at, "http://10.255.255.1:5000")
+
+
+@fault("tracking server black-holed, silent", "a socket that accepts and never answers")
+def silent(at: Checkout) -> Row:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return _away(at, f"http://127.0.0.1:{server.getsockname()[1]}")
+
+
+class OnlyHealth(http.server.BaseHTTPRequestHandler):
+    """Says that it is well, and answers nothing else."""
+
+    def do_GET(self) -> None:
+        if self.path == "/health":
+            self.send_response(200)
+            self.end_headers()
+        else:
+            time.sleep(3600)
+
+    do_POST = do_GET
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@fault(
+    "tracking server hangs after its sign of life",
+    "a server that answers /health and nothing else",
+)
+def hangs(at: Checkout) -> Row:
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), OnlyHealth)
+    server.daemon_threads = True
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        return _away(at, f"http://127.0.0.1:{server.server_port}")
+    finally:
+        server.shutdown()
+
+
+@contextmanager
+def _served(at: Checkout, port: int) -> Iterator[subprocess.Popen[bytes]]:
+    """Run MLflow's own server on a store of the case."""
+    other = Checkout(at.folder, at.folder.with_suffix(".server"))
+    store, artifacts = f"sqlite:///{at.folder}/team.db", f"{at.folder}/team"
+    server = other.start(
+        "mlflow", "server", "--backend-store-uri", store, "--artifacts-destination", artifacts, "--port", str(port),
+        "--workers", "1",
+    )  # fmt: skip
+    try:
+        until_s = time.monotonic() + 180
+        while time.monotonic() < until_s:
+            try:
+                probe(f"http://127.0.0.1:{port}")
+                break
+            except TrackingAway:
+                time.sleep(0.2)
+        yield server
+    finally:
+        subprocess.run(["kill", "-9", "--", f"-{server.pid}"], check=False, stderr=subprocess.DEVNULL)
+        server.wait()
+
+
+def _in_mid_run(at: Checkout, number: signal.Signals) -> Row:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    uri = f"http://127.0.0.1:{port}"
+    with _served(at, port) as server:
+        start_s = time.monotonic()
+        publishing = at.start(*at.command("publish"), MLFLOW_TRACKING_URI=uri)
+        process = at.stage("publish")
+        at.until(lambda: _finished_n(at.folder / "team.db") >= 3, process)
+        subprocess.run(["kill", f"-{number.value}", "--", f"-{server.pid}"], check=True)
+        first = at.end(publishing, start_s)
+    written_n = _finished_n(at.folder / "team.db")
+    with _served(at, port):
+        row = _report(at, first, at.run("python", "-m", "pipeline.cli", "publish", MLFLOW_TRACKING_URI=uri))
+    row.next_run += f", {written_n} runs were there"
+    return row
+
+
+def _finished_n(store: Path) -> int:
+    try:
+        with closing(sqlite3.connect(f"file:{store}?mode=ro", uri=True, timeout=1)) as reading:
+            return int(reading.execute("select count(*) from runs where status = 'FINISHED'").fetchone()[0])
+    except sqlite3.Error:
+        return 0
+
+
+@fault(
+    "tracking server dies in mid-run",
+    "SIGKILL to `mlflow server` once 3 runs are written; it is started again for the next run",
+)
+def dies(at: Checkout) -> Row:
+    return _in_mid_run(at, signal.SIGKILL)
+
+
+@fault(
+    "tracking server stops answering in mid-run",
+    "SIGSTOP to `mlflow server` once 3 runs are written",
+)
+def stops(at: Checkout) -> Row:
+    return _in_mid_run(at, signal.SIGSTOP)
+
+
+@fault(
+    "MLflow's SQLite held by another program",
+    "BEGIN EXCLUSIVE on `mlflow.db` during the whole run",
+)
+def held(at: Checkout) -> Row:
+    with closing(sqlite3.connect(at.folder / "mlflow.db")) as other:
+        other.execute("BEGIN EXCLUSIVE")
+        return _report(at, at.run(*at.command("publish")), None)
+
+
+@fault(
+    "MLflow's SQLite held in mid-run",
+    "BEGIN EXCLUSIVE on a new `mlflow.db` once 3 runs are written, until the run has ended",
+)
+def held_in_mid_run(at: Checkout) -> Row:
+    store = at.folder / "mlflow.db"
+    store.unlink()
+    shutil.rmtree(at.folder / "mlartifacts")
+    start_s = time.monotonic()
+    publishing = at.start(*at.command("publish"))
+    at.until(lambda: _finished_n(store) >= 3, at.stage("publish"))
+    with closing(sqlite3.connect(store, timeout=30)) as other:
+        other.execute("BEGIN EXCLUSIVE")
+        first = at.end(publishing, start_s)
+    return _report(at, first, at.run("python", "-m", "pipeline.cli", "publish"))
