@@ -1,9 +1,13 @@
-"""A million indentations go from bytes to Parquet in bounded memory: frames a second and the peak are printed.
+"""A million indentations go from bytes to Parquet in bounded memory, and a capture larger than the memory allowed.
+
+Frames a second and the peak are printed.
 
 Not in the default suite: `pytest -s tests/benchmarks/test_ingest_memory.py`. It writes 2 GB below pytest's folder.
 """
 
 import resource
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -11,13 +15,13 @@ import numpy as np
 import pytest
 
 from pipeline.capture import probe
-from pipeline.capture.header import PROBE_FILE, STREAM_FILE, Clock
+from pipeline.capture.header import PROBE_FILE, STREAM_FILE, Clock, Header
 from pipeline.capture.probe import LABELS, ProbeLog
 from pipeline.capture.wire import Frames, encode
 from pipeline.core import io
 from pipeline.core.seeds import rng_for
 from pipeline.dataset.captures import read_native
-from tests.capture.headers import make_header
+from tests.capture.headers import AS_USUAL, make_header
 
 INDENTATIONS_N = 1_000_000
 TILE_N = 4_000  # indentations whose bytes are written again and again
@@ -25,12 +29,13 @@ QUIET_N = 400  # frames before the first and after the last
 SHARE = np.array([0, 0, 0, 0, 0.5, 1, 1, 1, 1, 0.5])  # of an indentation's change of field, frame by frame
 TRAVEL_N = 8  # frames at most, at random, until the next: what the clocks are aligned by without marks
 RATE_HZ = 400.0
+ALLOWED_MB, LARGE_N, LARGE_TRAVEL_N = 800, 240_000, 80  # a stream of about 1 GB, in less memory than that
 PEAK_MAX_MB = 1500  # the log of 2e6 dwells is 0.1 GB, its text 0.15 GB and what parses them the rest
 
 
-def write_capture(folder: Path) -> None:
+def write_capture(folder: Path, indentations_n: int = INDENTATIONS_N, travel_n: int = TRAVEL_N) -> None:
     rng = rng_for(0, "tile")
-    begin_i = np.cumsum(len(SHARE) + rng.integers(0, TRAVEL_N, TILE_N + 1))
+    begin_i = np.cumsum(len(SHARE) + rng.integers(0, travel_n, TILE_N + 1))
     begin_i -= begin_i[0]
     share = np.zeros((begin_i[-1], 1))
     share[begin_i[:-1, None] + np.arange(len(SHARE))] = SHARE[:, None]
@@ -38,10 +43,10 @@ def write_capture(folder: Path) -> None:
     quiet = encoded(np.zeros((QUIET_N, 15)), rng)
     with (folder / STREAM_FILE).open("wb") as file:
         file.write(quiet)
-        for _ in range(INDENTATIONS_N // TILE_N):
+        for _ in range(indentations_n // TILE_N):
             file.write(tile)
         file.write(quiet)
-    d = np.arange(2 * INDENTATIONS_N, dtype=np.int32)
+    d = np.arange(2 * indentations_n, dtype=np.int32)
     start_i = QUIET_N + d // 2 // TILE_N * begin_i[-1] + begin_i[d // 2 % TILE_N] + 5 * (d % 2)
     labels = dict.fromkeys(LABELS, np.round(rng.uniform(0, 16, len(d)), 2).astype(np.float32))
     start_s, end_s = (start_i + 0.5) / RATE_HZ, (start_i + 4.5) / RATE_HZ
@@ -53,6 +58,10 @@ def encoded(change_uT: np.ndarray, rng: np.random.Generator) -> bytes:
     f = len(change_uT)
     b_uT = (1000 + change_uT + rng.normal(0, 4, change_uT.shape)).astype(np.float32)
     return encode(Frames(b_uT, np.full((f, 5), 25, np.float32), np.zeros(f), np.zeros(f, np.int64)), "binary")
+
+
+def header(marks: tuple[tuple[float, float], ...] = ((1.0, 1.0),)) -> Header:
+    return make_header(layout="native", wire="binary", clock=Clock(kind="rate", rate_hz=RATE_HZ, marks=marks))
 
 
 def peak_mb() -> float:
@@ -71,17 +80,16 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_million_indentations_are_read_in_bounded_memory(
     folder: Path, tmp_path: Path, marks: tuple[tuple[float, float], ...]
 ) -> None:
-    clock = Clock(kind="rate", rate_hz=RATE_HZ, marks=marks)
-    header = make_header(layout="native", wire="binary", clock=clock)
+    capture = header(marks)
     before_mb, begin_s = peak_mb(), time.perf_counter()
     probe.parse(folder / PROBE_FILE, PROBE_FILE)
     parse_s = time.perf_counter() - begin_s
     begin_s = time.perf_counter()
-    blocks, account = read_native(folder, header)
+    blocks, account = read_native(folder, capture, AS_USUAL)
     rows_n = sum(len(block) for block in blocks)
     read_s = time.perf_counter() - begin_s
     begin_s = time.perf_counter()
-    io.write_readings(tmp_path / "c.parquet", *read_native(folder, header))
+    io.write_readings(tmp_path / "c.parquet", *read_native(folder, capture, AS_USUAL))
     write_s = time.perf_counter() - begin_s
     print(
         f"\nprobe log {parse_s:.1f} s; read {account['frames_n'] / read_s:,.0f} frames/s ({read_s:.0f} s), "
@@ -91,3 +99,28 @@ def test_a_million_indentations_are_read_in_bounded_memory(
     assert rows_n == 4 * INDENTATIONS_N
     assert account["indentations_n"] == INDENTATIONS_N
     assert peak_mb() < PEAK_MAX_MB
+
+
+READ = """
+import resource, sys
+from pathlib import Path
+from pipeline.core import io
+from pipeline.dataset.captures import read_native
+from tests.benchmarks.test_ingest_memory import ALLOWED_MB, header, peak_mb
+resource.setrlimit(resource.RLIMIT_AS, (ALLOWED_MB * 10**6,) * 2)
+folder = Path(sys.argv[1])
+blocks, account = read_native(folder, header())
+io.write_readings(folder / "c.parquet", blocks, account)
+print(account["frames_n"], account["indentations_n"], round(peak_mb()))
+"""
+
+
+@pytest.mark.timeout(1800)
+def test_a_capture_larger_than_memory_is_read(tmp_path: Path) -> None:
+    write_capture(tmp_path, LARGE_N, LARGE_TRAVEL_N)
+    stream_MB = (tmp_path / STREAM_FILE).stat().st_size / 1e6
+    command = [sys.executable, "-c", READ, str(tmp_path)]
+    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
+    print(f"\n{stream_MB:.0f} MB, {said[0]} frames under RLIMIT_AS of {ALLOWED_MB} MB: peak {said[2]} MB resident")
+    assert stream_MB > ALLOWED_MB
+    assert int(said[1]) == LARGE_N

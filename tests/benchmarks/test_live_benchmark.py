@@ -1,89 +1,144 @@
 """How long a byte takes to an estimate, with a page open; and what a day of frames takes in memory.
 
 `pytest -s -o addopts= tests/benchmarks/test_live_benchmark.py`. The board is another process, on a pseudo-terminal; the
-page is read by another too. Nothing is asserted but that frames came.
+page is read by another too; of several boards, each is one. Nothing is asserted but that frames came.
 """
 
 import asyncio
 import os
 import subprocess
 import sys
+import threading
 import time
 import tracemalloc
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import cycle
 from pathlib import Path
 
+import aiohttp
 import numpy as np
 import pytest
+from aiohttp import web
 
 from pipeline.live.layout import layout_of
+from pipeline.live.server import Server
 from pipeline.live.session import Live
 from pipeline.live.skin import Readings, Skin
-from pipeline.live.view import View
+from pipeline.live.view import LATENCIES_N, View
 from pipeline.predicting import read_network
-from tests.live.boards import make_script, plugged_in, write_model, write_script
+from tests.live.boards import make_script, write_model, write_script
 from tests.live.test_browser import BROWSER, Tab, in_browser
-from tests.live.test_server import serve
 from tests.stages.checkout import ROOT
 
 SECONDS = 30.0
 QUARTER_S = 0.25
 STATM = Path("/proc/self/statm")
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
 PAGE = """
 import asyncio, sys, aiohttp
-async def look():
-    async with aiohttp.ClientSession() as client, client.ws_connect(sys.argv[1]) as page:
+async def look(address):
+    async with aiohttp.ClientSession() as client, client.ws_connect(address) as page:
         async for said in page:
             pass
-asyncio.run(look())
+async def look_at_all():
+    await asyncio.gather(*map(look, sys.argv[1:]))
+asyncio.run(look_at_all())
 """
+FIVE, SLEEVE = (5, 400.0), (40, 133.0)
+BOARDS = {
+    "5 chips": [FIVE],
+    "40 chips": [SLEEVE],
+    "two boards": [FIVE] * 2,
+    "eight boards": [SLEEVE] + [(5, 133.0)] * 7,
+}
+every_way = pytest.mark.parametrize("boards", BOARDS.values(), ids=BOARDS.keys())
 
 
-@pytest.mark.parametrize(("chips_n", "rate_hz"), [(5, 400.0), (40, 133.0)])
-def test_from_the_last_byte_of_a_frame_to_its_estimate(tmp_path, chips_n, rate_hz):
-    capture = write_script(make_script(chips_n=chips_n, rate_hz=rate_hz), tmp_path / "c0")
-    link, model = tmp_path / "board", read_network(write_model(tmp_path, chips_n=chips_n))
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    words = ["-m", "pipeline.cli", "emulate", str(capture), "--port", str(link), "--loop"]
-    board = subprocess.Popen([sys.executable, *words], env=environment, cwd=ROOT)
-    live = Live(str(link), [model], "benchmark")
-    live.start()
-    server = serve_beside(live)
-    page = subprocess.Popen([sys.executable, "-c", PAGE, f"{server}/live"], env=environment)
+@every_way
+def test_from_the_last_byte_of_a_frame_to_its_estimate(tmp_path, boards):
+    with at_work(tmp_path, boards) as (lives, server):
+        addresses = [f"{server}/live?board={i}" for i in range(len(lives))]
+        page = subprocess.Popen([sys.executable, "-c", PAGE, *addresses], env=ENVIRONMENT)
+        try:
+            time.sleep(2.0)
+            with measured(lives, boards):
+                time.sleep(min(SECONDS, LATENCIES_N / boards[0][1]))
+        finally:
+            page.kill()
+            page.wait()
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no browser: see tests/live/test_browser.py")
+@every_way
+def test_from_the_last_byte_of_a_frame_to_the_screen(tmp_path, boards):
+    async def act(tab: Tab) -> None:
+        await tab.until(f"boards.length === {len(boards)} && boards.every(({{last}}) => last)")
+        with measured(lives, boards):
+            await asyncio.sleep(SECONDS)
+
+    async def look() -> None:
+        async with aiohttp.ClientSession() as client:
+            await in_browser(tmp_path, act)(server, client)
+
+    with at_work(tmp_path, boards) as (lives, server):
+        asyncio.run(look())
+
+
+@contextmanager
+def at_work(folder: Path, boards: list[tuple[int, float]]) -> Iterator[tuple[list[Live], str]]:
+    """Plug boards in, each a process of its own, and serve their page; give them when all have been zeroed."""
+    lives, players = [], []
     try:
-        while live.view is None or not live.skin.zeroed:
+        for i, (chips_n, rate_hz) in enumerate(boards):
+            capture = write_script(make_script(chips_n=chips_n, rate_hz=rate_hz), folder / f"c{i}")
+            words = ["-m", "pipeline.cli", "emulate", str(capture), "--port", str(folder / f"board{i}"), "--loop"]
+            players.append(subprocess.Popen([sys.executable, *words], env=ENVIRONMENT, cwd=ROOT))
+            model = read_network(write_model(folder, f"model{i}", chips_n=chips_n))
+            lives.append(Live(str(folder / f"board{i}"), [model], "benchmark", alone=len(boards) == 1))
+            lives[-1].start()
+        address = serve_beside(lives)
+        while not all(live.view is not None and live.skin.zeroed for live in lives):
             time.sleep(0.1)
-        time.sleep(2.0)
-        live.view.to_estimate_s.clear()
-        before_s, before_n = time.process_time(), live.skin.account["frames_n"]
-        time.sleep(min(SECONDS, 4000 / rate_hz))  # as many as a view remembers
-        took_s, frames_n = time.process_time() - before_s, live.skin.account["frames_n"] - before_n
-        latency_ms = 1e3 * np.array(live.view.to_estimate_s)
+        yield lives, address
     finally:
-        for process in (page, board):
-            process.kill()
-            process.wait()
-        live.stop()
+        for player in players:
+            player.kill()
+            player.wait()
+        for live in lives:
+            live.stop()
+
+
+@contextmanager
+def measured(lives: list[Live], boards: list[tuple[int, float]]) -> Iterator[None]:
+    """Print what frames took that came meanwhile, of all boards together."""
+    for live in lives:
+        live.view.to_estimate_s.clear()
+        live.view.to_screen_s.clear()
+    before_s, wall_s, before_n = time.process_time(), time.monotonic(), frames_of(lives)
+    yield
+    took_s, wall_s, frames_n = time.process_time() - before_s, time.monotonic() - wall_s, frames_of(lives) - before_n
     assert frames_n
-    p50, p95, p99 = np.percentile(latency_ms, [50, 95, 99])
-    print(f"\n{chips_n} chips at {rate_hz:g} Hz, a page open: {frames_n} frames")
-    print(f"  byte to estimate: p50 {p50:.2f} ms, p95 {p95:.2f} ms, p99 {p99:.2f} ms")
-    print(f"  processor time a frame, page and reading included: {1e3 * took_s / frames_n:.2f} ms")
+    print(f"\n{', '.join(f'{chips_n} chips at {rate_hz:g} Hz' for chips_n, rate_hz in boards)}: {frames_n} frames")
+    for where in ("to_estimate_s", "to_screen_s"):
+        if latency_ms := [1e3 * late_s for live in lives for late_s in list(getattr(live.view, where))]:
+            p50, p95, p99 = np.percentile(latency_ms, [50, 95, 99])
+            print(f"  byte {where[:-2].replace('_', ' ')}: p50 {p50:.2f} ms, p95 {p95:.2f} ms, p99 {p99:.2f} ms")
+    print(f"  processor time, page and reading included: {1e3 * took_s / frames_n:.2f} ms a frame,", end=" ")
+    print(f"{100 * took_s / wall_s:.0f} % of a core")
     print(f"  load of the machine: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
 
 
-def serve_beside(live: Live) -> str:
+def frames_of(lives: list[Live]) -> int:
+    return sum(live.skin.account["frames_n"] for live in lives)
+
+
+def serve_beside(lives: list[Live]) -> str:
     """Serve the page on a thread; give its address."""
-    import threading
-
-    from aiohttp import web
-
-    from pipeline.live.server import Server
-
     ready, address = threading.Event(), []
 
     async def run() -> None:
-        runner = web.AppRunner(Server([live], "").application())
+        runner = web.AppRunner(Server(lives, "").application())
         await runner.setup()
         site = web.TCPSite(runner, "127.0.0.1", 0)
         await site.start()
@@ -94,19 +149,6 @@ def serve_beside(live: Live) -> str:
     threading.Thread(target=lambda: asyncio.run(run()), daemon=True).start()
     ready.wait()
     return address[0]
-
-
-@pytest.mark.skipif(BROWSER is None, reason="no browser: see tests/live/test_browser.py")
-def test_from_the_last_byte_of_a_frame_to_the_screen(tmp_path):
-    async def act(tab: Tab) -> None:
-        await asyncio.sleep(SECONDS)
-        screen_ms = await tab.value("[last.screen50, last.screen99, last.estimate50, last.estimate99]")
-        p50, p99, *estimate_ms = screen_ms
-        print(f"\n5 chips at 400 Hz, in {BROWSER}: byte to screen p50 {p50:.0f} ms, p99 {p99:.0f} ms")
-        print(f"  byte to estimate: p50 {estimate_ms[0]:.2f} ms, p99 {estimate_ms[1]:.2f} ms")
-
-    with plugged_in(make_script(pokes_n=4), loop=True) as name:
-        serve(name, [read_network(write_model(tmp_path))], in_browser(tmp_path, act))
 
 
 @pytest.mark.timeout(3600)

@@ -1,4 +1,4 @@
-"""What the map that comes with the project takes: a reading as a controller asks, 65 pokes to learn from, one more.
+"""What the map and network of the project take: a reading as a controller asks, 65 pokes to learn from, one more.
 
 `pytest -s -o addopts= tests/benchmarks/test_map_benchmark.py`. Processor time of one thread. Nothing is asserted but
 that readings were answered.

@@ -1,0 +1,46 @@
+"""A team's MLflow server on PostgreSQL: python -m deploy.team_server FOLDER. Runs until Ctrl-C; a second start goes on.
+
+In: a folder for the database and the artifacts. Out: the line that each person sets. PostgreSQL listens on loopback
+alone, with a password of its own; MLflow has none, so that its port belongs behind a firewall or a proxy.
+"""
+
+import argparse
+import signal
+import sys
+import time
+from pathlib import Path
+
+from deploy.servers import LOOPBACK, ServerError, free_port, listens, mlflow, postgres
+
+LOOK_EVERY_s = 2.0
+
+
+def main() -> None:
+    """Start both servers, say how to use them, and wait."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--host", default=LOOPBACK, help="the address to listen on; 0.0.0.0: every one of this machine")
+    parser.add_argument("--port", type=int, default=5000)
+    asked = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    folder = asked.folder.resolve()
+    try:
+        with (
+            postgres(folder / "postgres", free_port()) as database,
+            mlflow(folder, database, asked.port, host=asked.host) as address,
+        ):
+            print(
+                f"MLflow on PostgreSQL, files in {folder}. Each person: export MLFLOW_TRACKING_URI={address}",
+                flush=True,
+            )
+            while listens(address):
+                time.sleep(LOOK_EVERY_s)
+            raise ServerError(f"MLflow: the server must stay up; got no answer at {address}. See {folder}/mlflow.log.")
+    except ServerError as error:
+        sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        print("stopped")
+
+
+if __name__ == "__main__":
+    main()

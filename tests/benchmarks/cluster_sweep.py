@@ -1,0 +1,119 @@
+"""One sweep of trainings by RESKIN_EXECUTOR, with a note of every task that was begun: `python -m ... FOLDER`.
+
+Run by cluster.py, here or in a network namespace. Out: FOLDER/found.json, and FOLDER/ran.txt, a line a task.
+"""
+
+import hashlib
+import json
+import os
+import resource
+import sys
+import time
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.core.executors import end_workers, make_executor
+from pipeline.core.seeds import rng_for
+from pipeline.learning.grid import _read_rows, run_trials
+from pipeline.learning.recipe import Recipe
+from pipeline.learning.trial import Measured, Trial
+
+BOARDS_N, SEEDS_N, ROWS_N, STEPS_N = 6, 6, 20_000, 200
+TASKS_N = SEEDS_N * BOARDS_N // 3  # stacks of three
+EMPTY_N = 300
+
+
+class Noted(Executor):
+    """Passes calls on to an executor, and has each of them noted where it runs."""
+
+    def __init__(self, inner: Executor, log: Path) -> None:
+        self._inner, self._log = inner, log
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        return self._inner.submit(noted, self._log, fn, *args, **kwargs)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        self._inner.shutdown(wait=wait, cancel_futures=cancel_futures)
+
+
+def noted(log: Path, fn: Callable[..., Any], *args: Any) -> Any:
+    """Call, and write when it began and ended, by whom, with the seconds of CPU that its process has had."""
+    name = hashlib.sha256(repr(args[-1]).encode()).hexdigest()[:8]
+    _note(log, "begun", name)
+    before_n = _read_rows.cache_info().misses
+    result = fn(*args)
+    if _read_rows.cache_info().misses > before_n:
+        _note(log, "read", str(os.getpid()))
+    _note(log, "ended", name)
+    return result
+
+
+def _note(log: Path, word: str, name: str) -> None:
+    with log.open("a") as stream:  # one short line: written whole beside those of others
+        stream.write(f"{word} {name} {os.getpid()} {time.process_time():.4f}\n")
+
+
+def nothing() -> None:
+    """The task that shows what a task costs beside its work."""
+
+
+def measured() -> Measured:
+    rng = rng_for(0, "cluster")
+    place_mm = 2.0 * rng.integers(0, 9, (ROWS_N, 2))
+    target = np.column_stack([place_mm, rng.uniform(0, 3, ROWS_N)])
+    db_uT = 50 * np.tanh(target @ rng.normal(0, 0.1, (3, 15))) + rng.normal(0, 3, (ROWS_N, 15))
+    return Measured(db_uT.astype(np.float32), target.astype(np.float32), np.arange(ROWS_N) * BOARDS_N // ROWS_N)
+
+
+def trials(rows: Measured) -> list[Trial]:
+    recipe = Recipe(
+        architecture="paper", inputs="raw", scaling="standard", triplet_weight=0.0, steps_n=STEPS_N, batch_n=128,
+        rate_max=3e-3, gradient_norm_max=1.0, weight_decay=0.0,
+    )  # fmt: skip
+    return [
+        Trial("lobo", "paper", recipe, f"b{held}", 0, seed_i, np.flatnonzero(rows.skin != held),
+              np.flatnonzero(rows.skin == held))
+        for seed_i in range(SEEDS_N)
+        for held in range(BOARDS_N)
+    ]  # fmt: skip
+
+
+def main() -> None:
+    folder, empty = Path(sys.argv[1]).resolve(), "--empty" in sys.argv
+    folder.mkdir(parents=True, exist_ok=True)
+    rows, start_s = measured(), time.monotonic()
+    found: dict[str, object] = {}
+    with make_executor(imports="pipeline.learning.train") as executor:
+        connected_s = time.monotonic()
+        executor.submit(nothing).result()  # local workers have loaded what tasks need
+        ready_s = time.monotonic()
+        noting = Noted(executor, folder / "ran.txt")
+        done = run_trials(trials(rows), rows, executor=noting, cache=folder / "cells", tell=lambda line: None)
+        swept_s = time.monotonic()
+        if empty:
+            for future in [executor.submit(nothing) for _ in range(EMPTY_N)]:
+                future.result()
+            found["empty_s"] = (time.monotonic() - swept_s) / EMPTY_N
+    found |= {"connect_s": connected_s - start_s, "sweep_s": swept_s - ready_s}
+    digest = hashlib.sha256()
+    for trained in done:
+        for name in sorted(trained.weights):
+            digest.update(trained.weights[name].tobytes())
+        digest.update(trained.predicted.tobytes())
+    end_workers()
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    found |= {"sha256": digest.hexdigest(), "children_cpu_s": used.ru_utime + used.ru_stime}
+    numbers_n = BOARDS_N * ROWS_N  # each row is trained or tested on in each fold
+    found["rows_bytes"] = sum(part.nbytes for part in (rows.db_uT, rows.target, rows.skin)) + 8 * numbers_n
+    (folder / "found.json").write_text(json.dumps(found))
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except ValueError as error:
+        sys.exit(f"error: {error}")

@@ -1,0 +1,199 @@
+"""What do more skins, and more recorded captures, cost? CPU seconds and memory of each stage and of DVC, by count.
+
+python tests/benchmarks/time_growth.py skins 18 60 180 600 1800: a scene of so many simulated skins of 65 pokes each,
+from bytes to its page. Eighteen are simulated; those beyond are their bytes again under other labels, as what follows
+costs the same. python tests/benchmarks/time_growth.py captures 10 30 100: so many recorded captures; what `reskin add`
+of one more takes, the first `dvc repro` of all, and one that has nothing to do. Adds to docs/measured/growth.json;
+then show_growth. CPU seconds, as other work on the machine changes them least.
+"""
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline import plan
+from pipeline.capture.header import HEADER_FILE, recorded, write_capture
+from pipeline.core import config, io
+from pipeline.core.config import read_yaml
+from pipeline.core.provenance import code_version, device
+from pipeline.registry import Entry, Registry, write_registry
+from tests.benchmarks.pages import MEASURED
+from tests.stages.checkout import ROOT, copy_checkout, variables
+
+SCENE, BOARDS_N, SIMULATED_N = "grow", 6, 18
+STEPS_N = 100  # of each training: rows change what is read and scored, not what a step costs
+READINGS_N = 40  # of a recorded capture: small, so that what stands around a capture is seen
+
+
+def measured(folder: Path, *words: str) -> dict[str, float]:
+    """Run a program of the environment: CPU and wall seconds of it and its children, peak memory of the largest."""
+    command, start_s = [str(folder / ".venv/bin" / words[0]), *words[1:]], time.monotonic()
+    log = folder / "said.txt"
+    with log.open("w") as said:
+        started = subprocess.Popen(command, cwd=folder, env=variables(folder), stdout=said, stderr=subprocess.STDOUT)
+        _, status, usage = os.wait4(started.pid, 0)
+    if status:
+        raise AssertionError(f"{' '.join(words)} failed:\n{log.read_text()[-3000:]}")
+    wall_s, cpu_s = time.monotonic() - start_s, usage.ru_utime + usage.ru_stime
+    return {"cpu_s": round(cpu_s, 2), "wall_s": round(wall_s, 1), "peak_MB": round(usage.ru_maxrss * 1024 / 1e6)}
+
+
+@contextmanager
+def checkout(scene: Mapping[str, Any]) -> Iterator[Path]:
+    """Give a copy of this checkout with one scene."""
+    with tempfile.TemporaryDirectory() as temporary:
+        root = copy_checkout(Path(temporary))
+        (root / config.SCENES / f"{SCENE}.yaml").write_text(json.dumps(scene))  # JSON is YAML
+        yield root
+
+
+def skins_scene(skins_n: int) -> dict[str, Any]:
+    """Take of scene quick the boards, and one light press at each place."""
+    words = read_yaml(ROOT / "pipeline/scenes/quick.yaml")
+    rigid = words["simulate"]["boards"]["rigid"] | {"boards_n": BOARDS_N, "skins_per_board_n": skins_n // BOARDS_N}
+    grid = words["simulate"]["protocols"]["grid"] | {"skins_n": skins_n, "passes_n": 1, "depths_mm": [0.8]}
+    return {
+        "source": "simulated", "seed": 2021, "questions": ["lobo"], "selection": {"force_min_N": 0.0}, "split": {},
+        "simulate": {"boards": {"rigid": rigid}, "protocols": {"grid": grid}},
+        "train_multi": words["train_multi"] | {"steps_n": STEPS_N},
+    }  # fmt: skip
+
+
+def label_again(raw: Path, skins_n: int) -> None:
+    """Lay captures beside the simulated ones: their bytes under other names, as many as are asked for."""
+    sources = sorted(child for child in raw.iterdir() if child.is_dir())
+    for i in range(len(sources), skins_n):
+        source, name = sources[i % len(sources)], f"b{i % BOARDS_N}_s{i // BOARDS_N}"
+        target = raw / name
+        target.mkdir()
+        for file in source.iterdir():
+            if file.name != HEADER_FILE:
+                os.link(file, target / file.name)
+        header = io.read_json(source / HEADER_FILE)
+        io.write_json(target / HEADER_FILE, header | {"capture": name, "board": name.split("_")[0], "skin": name})
+
+
+def stages_of(root: Path, before: Mapping[str, float]) -> dict[str, Any]:
+    """Read what each stage of the scene took; DVC took the rest of the whole run."""
+    files = sorted((root / ".reskin/costs" / SCENE).glob("*.json"))
+    costs = {file.stem: io.read_json(file) for file in files if file.stem != "simulate"}  # which ran before
+    found = {
+        stage: {"cpu_s": cost["cpu_s"], "peak_MB": round(cost["peak_process_memory_MB"])}
+        for stage, cost in costs.items()
+    }
+    return found | {"dvc": {"cpu_s": round(before["cpu_s"] - sum(cost["cpu_s"] for cost in found.values()), 2)}}
+
+
+def grow_skins(skins_n: int, bytes_of: Path) -> dict[str, Any]:
+    """Take so many skins from bytes to a page, stage by stage, as `dvc repro` does."""
+    with checkout(skins_scene(skins_n)) as root:
+        measured(root, "reskin", "scenes", "use", SCENE)
+        raw = root / "data/raw" / SCENE
+        if not bytes_of.exists():
+            simulated = measured(root, "dvc", "repro", "--quiet", f"simulate@{SCENE}")
+            shutil.copytree(raw, bytes_of)
+            io.write_json(bytes_of.with_suffix(".json"), simulated)
+        if not raw.exists():
+            shutil.copytree(bytes_of, raw)
+        label_again(raw, skins_n)
+        measured(root, "dvc", "repro", "--quiet", "code")
+        committed = measured(root, "dvc", "commit", "--quiet", "--force", f"simulate@{SCENE}")
+        whole = measured(root, "dvc", "repro", "--quiet", f"report@{SCENE}")
+        stages = stages_of(root, whole)
+        stages["dvc, raw captures"] = committed
+        stages["dvc, nothing to do"] = measured(root, "dvc", "repro", "--quiet", f"report@{SCENE}")
+        stages["whole"] = whole
+        folders = {name: sum(1 for _ in (root / name).rglob("*")) for name in ("data/raw", "data/indentations")}
+        rows_n = io.read_json(root / f"data/folds/{SCENE}.json")["rows_n"]
+        return {"skins_n": skins_n, "rows_n": rows_n, "files_n": folders, "stages": stages}
+
+
+def recording(rng: np.random.Generator) -> bytes:
+    """Write a recording of layout `table`: no two have one reading in common."""
+    fields = [f"B{axis}{chip}" for chip in range(5) for axis in "xyz"]
+    lines = [",".join(["phase", "x_mm", "y_mm", "Fz_N", *fields])]
+    for i in range(READINGS_N):
+        phase = ("noload", "contact")[i % 2]
+        values = [4.0 + i // 2 % 9, 4.0 + i // 18, 0.5 * (i % 2), *(1000 + 50 * rng.standard_normal(15)).round(2)]
+        lines.append(",".join([phase, *map(str, values)]))
+    return ("\n".join(lines) + "\n").encode()
+
+
+def lay_captures(root: Path, captures_n: int, rng: np.random.Generator) -> None:
+    """Lay captures as `reskin add` would, all at once: folders, one .dvc file each, the registry, the plan."""
+    from dvc.repo import Repo
+
+    entries, targets = {}, []
+    for i in range(captures_n):
+        labels = {"board": f"b{i % BOARDS_N}", "skin": f"b{i % BOARDS_N}_s{i // BOARDS_N}"}
+        name, target = f"c{i}", root / "data/raw" / SCENE / f"c{i}"
+        header = recorded("growth", capture=name, layout="table", chips_n=5, protocol="", note="", **labels)
+        write_capture(target, header, {"readings.csv": recording(rng)})
+        entries[name] = Entry(layout="table", chips_n=5, fingerprints=(f"{i:064x}",), copy_of=None, **labels)
+        targets.append(str(target))
+    with Repo(str(root)) as repo:
+        repo.add(targets)
+    write_registry(root, Registry(captures={SCENE: entries}))
+    plan.use(root, [SCENE])
+
+
+def grow_captures(captures_n: int) -> dict[str, Any]:
+    """Time what is done with so many recorded captures: add one more, ingest and split all, find nothing to do."""
+    rng = np.random.default_rng(captures_n)
+    training = {"recipe": "paper", "steps_n": 1, "seeds_n": 1, "variants": {}}
+    scene = {
+        "source": "recorded", "seed": 1, "questions": ["lobo"], "selection": {"force_min_N": 0.0}, "split": {},
+        "train_multi": training,
+    }  # fmt: skip
+    with checkout(scene) as root:
+        lay_captures(root, captures_n, rng)
+        (root / "one.csv").write_bytes(recording(rng))
+        words = ("--layout", "table", "--board", "b0", "--skin", "b0_s0", "--scene", SCENE, "--name", "last")
+        found = {"add one": measured(root, "reskin", "add", "one.csv", *words)}
+        found["ingest and split all"] = measured(root, "dvc", "repro", "--quiet", f"split@{SCENE}")
+        found["nothing to do"] = measured(root, "dvc", "repro", "--quiet", f"split@{SCENE}")
+        (root / "two.csv").write_bytes(recording(rng))
+        measured(root, "reskin", "add", "two.csv", *words[:-1], "more")
+        found["ingest one more, split"] = measured(root, "dvc", "repro", "--quiet", f"split@{SCENE}")
+        lock_bytes_n = (root / "dvc.lock").stat().st_size
+        return {"captures_n": captures_n, "lock_bytes_n": lock_bytes_n, "steps": found}
+
+
+def keep(out: Path, part: str, point: Mapping[str, Any], count: str) -> None:
+    """Add a point to what is there, in place of one of the same count."""
+    before: dict[str, Any] = json.loads(out.read_text()) if out.exists() else {}
+    others = [row for row in before.get(part, []) if row[count] != point[count]]
+    of = {"git": code_version(), "machine": device()}
+    out.write_text(
+        json.dumps(before | of | {part: sorted([*others, point], key=lambda row: row[count])}, indent=1) + "\n"
+    )
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("part", choices=("skins", "captures"))
+    parser.add_argument("counts", type=int, nargs="+")
+    parser.add_argument("--out", type=Path, default=MEASURED / "growth.json")
+    asked = parser.parse_args(words)
+    with tempfile.TemporaryDirectory() as temporary:
+        for count in asked.counts:
+            if asked.part == "skins":
+                point, name = grow_skins(count, Path(temporary) / "raw"), "skins_n"
+            else:
+                point, name = grow_captures(count), "captures_n"
+            print(json.dumps(point), flush=True)
+            keep(asked.out, asked.part, point, name)
+
+
+if __name__ == "__main__":
+    main()

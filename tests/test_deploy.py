@@ -1,0 +1,59 @@
+"""What starts servers and clusters: scripts that a shell can read, words that they know, programs that end."""
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from ruamel.yaml import YAML
+
+from deploy.servers import ServerError, running
+
+ROOT = Path(__file__).resolve().parents[1]
+DASK = ["sh", "deploy/dask.sh"]
+MANIFEST = list(YAML(typ="safe").load_all((ROOT / "deploy/kubernetes/reskin.yaml").read_text()))
+PODS = [part["spec"]["template"] for part in MANIFEST if "template" in part["spec"]]
+
+
+@pytest.mark.parametrize(("shell", "script"), [("sh", "deploy/dask.sh"), ("bash", "deploy/slurm/reskin.sbatch")])
+def test_scripts_can_be_read_by_their_shell(shell, script):
+    subprocess.run([shell, "-n", script], cwd=ROOT, check=True)
+
+
+def test_an_unknown_word_is_one_sentence():
+    done = subprocess.run([*DASK, "start"], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (done.returncode, "must be scheduler, worker or run; got 'start'" in done.stderr) == (2, True)
+
+
+def test_the_manifest_runs_the_words_of_the_script_against_its_own_service():
+    commands = [container["command"] for pod in PODS for container in pod["spec"]["containers"]]
+    assert [command[:2] for command in commands] == [DASK] * 3
+    assert [command[2] for command in commands] == ["scheduler", "worker", "run"]
+    service = next(part for part in MANIFEST if part["kind"] == "Service")
+    address = f"tcp://{service['metadata']['name']}:{service['spec']['ports'][0]['port']}"
+    assert [command[3] for command in commands[1:]] == [address] * 2
+    assert service["spec"]["selector"] == PODS[0]["metadata"]["labels"]
+
+
+def test_a_program_and_its_children_end_with_the_block_also_after_a_failure(tmp_path):
+    child = "import subprocess, sys; subprocess.Popen(['sleep', '60']); print('up', flush=True); sys.stdin.read()"
+    command = ["sh", "-c", f'echo $$ > group; "{sys.executable}" -c "{child}"; sleep 60']
+    with pytest.raises(ZeroDivisionError), running("it", command, tmp_path / "log") as alive:
+        while "up" not in (tmp_path / "log").read_text():
+            time.sleep(0.01)
+        alive()
+        raise ZeroDivisionError
+    group = int((tmp_path / "group").read_text())
+    with pytest.raises(ProcessLookupError):
+        for _ in range(100):  # until their parent, init, has taken note
+            os.killpg(group, 0)
+            time.sleep(0.05)
+
+
+def test_a_server_that_dies_says_what_it_said_last(tmp_path):
+    with running("it", ["sh", "-c", "echo no such folder; exit 3"], tmp_path / "log") as alive:
+        with pytest.raises(ServerError, match="it: the server must stay up; got exit status 3.*no such folder"):
+            while True:
+                alive()

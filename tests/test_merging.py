@@ -1,0 +1,159 @@
+"""Two people add recordings in two clones and merge: nothing of either is lost, and what contradicts is refused."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+from ruamel.yaml import YAML
+
+from pipeline import merging, plan
+from pipeline.core import config, io
+from pipeline.core.errors import ReskinError
+from pipeline.registry import Entry, Registry, read_registry, with_entry, write_registry
+from tests.scenes import recorded
+from tests.stages.checkout import ROOT
+
+NOTHING = Registry(captures={})
+PERSON = ["-c", "user.name=Tester", "-c", "user.email=tester@example.org", "-c", "commit.gpgsign=false"]
+
+
+def git(root: Path, *words: str, check: bool = True) -> str:
+    done = subprocess.run(["git", *PERSON, *words], cwd=root, capture_output=True, text=True, check=check)
+    return done.stdout
+
+
+def entry(skin: str, board: str, *fingerprints: str) -> Entry:
+    hashes = fingerprints or (f"{board}-{skin}",)
+    return Entry(board=board, skin=skin, layout="table", chips_n=5, fingerprints=hashes, copy_of=None)
+
+
+def added(root: Path, name: str, skin: str, board: str, scene: str = "shared") -> None:
+    """What `reskin add` and `dvc repro` change of the files that git holds."""
+    write_registry(root, with_entry(read_registry(root), scene, name, entry(skin, board), allow_copy=False))
+    plan.use(root, sorted({*plan.read_plan(root / config.PLAN).scenes, scene}))
+    lock = YAML(typ="safe").load((root / "dvc.lock").read_text())
+    lock["stages"] |= {f"ingest@{scene}-{name}": {"cmd": "ingest"}, f"report@{scene}": {"cmd": f"with {name}"}}
+    with (root / "dvc.lock").open("w") as stream:
+        YAML().dump(lock, stream)
+    io.write_text(root / f"reports/{scene}/tables/lobo.md", f"with {name}\n")
+    git(root, "add", "--all")
+    git(root, "commit", "-qm", f"Add {name}")
+
+
+@pytest.fixture(scope="module")
+def start(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("start")
+    for name in (config.FLOW, config.PARAMS, ".gitattributes"):
+        shutil.copy(ROOT / name, root)
+    (root / config.SCENES).mkdir(parents=True)
+    with (root / config.SCENES / "shared.yaml").open("w") as stream:
+        YAML().dump(recorded(), stream)
+    write_registry(root, NOTHING)
+    plan.use(root, [])
+    (root / "dvc.lock").write_text("schema: '2.0'\nstages:\n  report@quick:\n    cmd: as it was\n")
+    git(root, "init", "-qb", "main")
+    git(root, "add", "--all")
+    git(root, "commit", "-qm", "Begin")
+    return root
+
+
+@pytest.fixture
+def root(start, tmp_path) -> Path:
+    return shutil.copytree(start, tmp_path / "clone")
+
+
+def two(root: Path, ours: tuple[str, ...], theirs: tuple[str, ...]) -> None:
+    git(root, "checkout", "-qb", "theirs")
+    added(root, *theirs)
+    git(root, "checkout", "-q", "main")
+    added(root, *ours)
+    git(root, "merge", "theirs", check=False)
+
+
+def test_both_recordings_stand_in_the_registry_the_plan_and_the_lock(root):
+    two(root, ("mine", "s1", "b1"), ("yours", "s2", "b2"))
+    assert "2 captures" in merging.merge(root)
+    assert list(read_registry(root).captures["shared"]) == ["mine", "yours"]
+    assert list(plan.check(root).stages["ingest"]) == ["shared-mine", "shared-yours"]
+    stages = YAML(typ="safe").load((root / "dvc.lock").read_text())["stages"]
+    assert {"report@quick", "ingest@shared-mine", "ingest@shared-yours"} <= stages.keys()
+    assert stages["report@shared"] == {"cmd": "with mine"}  # whole, and DVC runs it again as its inputs are new
+    assert (root / "reports/shared/tables/lobo.md").read_text() == "with mine\n"
+    assert git(root, "diff", "--name-only", "--diff-filter=U") == ""
+    git(root, "commit", "-qm", "Merge")
+    assert git(root, "status", "--porcelain") == ""
+
+
+def test_a_report_that_we_deleted_and_they_changed_stays_deleted(root):
+    added(root, "first", "s0", "b0")
+    git(root, "checkout", "-qb", "theirs")
+    added(root, "yours", "s2", "b2")
+    git(root, "checkout", "-q", "main")
+    git(root, "rm", "-q", "reports/shared/tables/lobo.md")
+    git(root, "commit", "-qm", "Delete a report")
+    git(root, "merge", "theirs", check=False)
+    merging.merge(root)
+    assert git(root, "diff", "--name-only", "--diff-filter=U") == ""
+    assert not (root / "reports/shared/tables/lobo.md").exists()
+
+
+def test_what_contradicts_changes_nothing(root):
+    two(root, ("mine", "s1", "b1"), ("yours", "s1", "b2"))
+    before = {name: (root / name).read_bytes() for name in merging.SETTLED}
+    with pytest.raises(ReskinError, match="the board of skin s1 must be b1, as in mine; got b2"):
+        merging.merge(root)
+    assert {name: (root / name).read_bytes() for name in before} == before
+    assert {*merging.SETTLED} <= set(git(root, "diff", "--name-only", "--diff-filter=U").split())
+
+
+@pytest.mark.parametrize(
+    ("theirs", "sentence"),
+    [
+        ({"yours": entry("s1", "b2")}, "the board of skin s1 must be b1, as in mine; got b2"),
+        ({"yours": entry("s2", "b2", "b1-s1")}, "a recording must be new to its scene; got the readings of mine"),
+        ({"mine": entry("s2", "b2")}, "capture mine: its name must be new to its scene"),
+    ],
+)
+def test_a_merged_registry_keeps_the_rules_of_one(theirs, sentence):
+    ours = Registry(captures={"shared": {"mine": entry("s1", "b1")}})
+    with pytest.raises(ReskinError, match=sentence):
+        merging.merge_registries(NOTHING, ours, Registry(captures={"shared": theirs}))
+
+
+def test_scenes_that_either_side_switched_on_run_and_those_that_one_switched_off_do_not():
+    assert merging.merge_scenes(["a", "b"], ["a", "b", "mine"], ["yours", "b"]) == ["b", "mine", "yours"]
+    assert merging.merge_scenes([], ["mine"], ["mine", "yours"]) == ["mine", "yours"]
+
+
+def test_what_people_wrote_is_theirs_to_merge(root):
+    git(root, "checkout", "-qb", "theirs")
+    (root / config.PARAMS).write_text("theirs: 1\n")
+    git(root, "commit", "-qam", "Change a parameter")
+    git(root, "checkout", "-q", "main")
+    (root / config.PARAMS).write_text("ours: 1\n")
+    git(root, "commit", "-qam", "Change it otherwise")
+    git(root, "merge", "theirs", check=False)
+    with pytest.raises(ReskinError, match="what people wrote must be merged first; got params.yaml"):
+        merging.merge(root)
+
+
+def test_without_a_conflict_there_is_nothing_to_settle(root):
+    with pytest.raises(ReskinError, match="a merge must be under way, with files in conflict; got none"):
+        merging.merge(root)
+
+
+def test_what_one_side_removed_or_replaced_stays_so():
+    kept, gone, old, new = (entry(name, name) for name in ("s1", "s2", "s3", "s4"))
+    base = Registry(captures={"scene": {"kept": kept, "gone": gone, "replaced": old}})
+    theirs = Registry(captures={"scene": {"kept": kept, "replaced": new}})
+    assert merging.merge_registries(base, base, theirs) == theirs
+    assert merging.merge_registries(base, theirs, base) == theirs
+    assert merging.merge_registries(base, theirs, theirs) == theirs
+
+
+def test_an_entry_of_the_lock_is_taken_whole():
+    base, changed = {"a": {"in": 1, "out": 1}, "b": 1}, {"a": {"in": 2, "out": 2}}
+    assert merging.merge_stages(base, base, changed) == (changed, [])
+    assert merging.merge_stages(base, changed, base) == (changed, [])
+    assert merging.merge_stages(base, {"a": 3, "b": 1}, {"a": 4, "b": 1}) == ({"a": 3, "b": 1}, ["a"])
