@@ -1,4 +1,7 @@
-"""Learning for magnetic tactile skins: from raw serial captures to the tables of the ReSkin paper."""
+"""Learning for magnetic tactile skins: from raw serial captures to the tables of the ReSkin paper.
+
+Knows nothing itself: below it each folder owns one step, each module one thing.
+"""
 
 from pipeline.core.numerics import pin
 

@@ -20,6 +20,7 @@ from pipeline.dataset.captures import check_losses, open_capture
 from pipeline.params import Scene, read_plan, read_scene, read_shared
 from pipeline.preparing import Prepared
 from pipeline.registry import REGISTRY, read_registry, with_capture, without_capture, write_registry
+from pipeline.running import need_rest
 
 RAW = "data/raw"
 INDENTATIONS = "data/indentations"
@@ -27,6 +28,7 @@ INDENTATIONS = "data/indentations"
 
 def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Header:
     """Check a prepared recording, write it, track it with DVC, register it, and plan its scene; all, or nothing."""
+    need_rest(root)
     header, files = prepared
     settings = read_scene(plan.scene_file(root, scene), root / config.PARAMS)
     if settings.source != header.source:
@@ -48,7 +50,7 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
         write_registry(root, after)
         plan.use(root, [*read_plan(root / config.PLAN).scenes, scene])
     if "compare" in (settings.model_extra or {}):
-        _warn_of_departures(target, settings, read_shared(root / config.PARAMS)["skin"])
+        _warn_of_departures(target, settings, shared["skin"], decisions)
     return complete
 
 
@@ -88,13 +90,13 @@ def _read_through(folder: Path, header: Header, limit: float, decisions: Decisio
     return (readings.hexdigest(), *(header.files[name] for name in (STREAM_FILE,) if name in header.files))
 
 
-def _warn_of_departures(folder: Path, scene: Scene, skin: Mapping[str, Any]) -> None:
+def _warn_of_departures(folder: Path, scene: Scene, skin: Mapping[str, Any], decisions: Decisions) -> None:
     """Warn if a capture seems to lie otherwise than section compare of its scene says; it stays added."""
     from pipeline.experiments.compare.joining import departure  # late: the physics takes seconds
     from pipeline.experiments.compare.run import Compare
     from pipeline.physics.skin import SkinDesign
 
-    _, blocks, _ = open_capture(folder)
+    _, blocks, _ = open_capture(folder, decisions)
     section = config.parse(Compare, (scene.model_extra or {})["compare"], "section compare")
     try:
         sentence = departure(list(blocks), section, config.parse(SkinDesign, skin, "params.yaml: skin"))

@@ -185,12 +185,12 @@ def load_model(file: Path | str) -> Model:
 
 
 def load_universal() -> Universal:
-    """Load the map of simulated skins that comes with the project, for a skin that nobody calibrated.
+    """Load the map and network of simulated skins that come with the project, for a skin that nobody calibrated.
 
     >>> skin = load_universal().zero(noload_uT)  # doctest: +SKIP
     >>> x_mm, y_mm, force_N = skin.predict(b_uT)[0]  # doctest: +SKIP
 
-    It learns while it is used: `see` pokes anywhere, `label` some at known places.
+    It learns while it is used: `see` pokes anywhere, `label` some at known places; `next_place` says which tells most.
     """
     from pipeline.twin import shipped
 

@@ -5,14 +5,17 @@ Imports within the commands: `reskin --help` waits for none of what a command ne
 
 import signal
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
 import typer
 from typer import Argument, Option
 
+from pipeline.capture.layouts import Foreign
 from pipeline.core import config
 from pipeline.core.errors import ParamsError, ReskinError
+from pipeline.core.machine import explaining
 from pipeline.core.packages import explain, show_version
 from pipeline.live import commands
 
@@ -31,23 +34,22 @@ app.add_typer(scenes, name="scenes")
 app.add_typer(commands.app)
 
 MODEL = "A trained model (.safetensors), its card (.json) beside it; without one, the map of simulated skins."
-LOGS = (
-    "A log as an SD card holds it: t_s,T0,Bx0,By0,Bz0,T1,...; degC and uT. "
-    "Or a folder that `reskin record` wrote, or a Parquet file that `reskin decode` wrote."
-)
+LOGS = "A log of an SD card (t_s,T0,Bx0,By0,Bz0,T1,...; degC, uT), a folder of `record`, a file of `decode`."
 
-Layout = Literal["capture", "serial-binary", "serial-text", "table", "lab", "ini", "eflesh", "eflash7"]
+Layout = Literal["capture", "serial-binary", "serial-text", Foreign]
 Wire = Literal["binary", "binary-clock", "text-xyzt", "text-txyz"]
 Board = Annotated[str, Option(help="The circuit board's name.")]
 Marks = Annotated[list[str] | None, Option(help="capture, serial-*: STREAM_S,PROBE_S of one event; may be repeated.")]
 Chips = Annotated[int, Option("--chips", help="Chips in a frame.", min=1, max=64)]
+Version = Annotated[bool, Option("--version", help="Show the version.", callback=show_version, is_eager=True)]
 
 
 def main() -> None:
     """Run the command; show what a user did wrong as one sentence, without a traceback."""
     try:
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what began is undone
-        app()
+        with explaining("reskin"):
+            app()
     except ModuleNotFoundError as error:
         fail(explain(error))
     except ReskinError as error:
@@ -57,9 +59,6 @@ def main() -> None:
 def fail(error: ReskinError) -> NoReturn:
     typer.echo(f"error: {error}", err=True)
     sys.exit(error.exit_code)
-
-
-Version = Annotated[bool, Option("--version", help="Show the version.", callback=show_version, is_eager=True)]
 
 
 @app.callback()
@@ -151,18 +150,12 @@ def remove(scene: str, capture: str) -> None:
 
 
 @app.command()
-def template(
-    out: Annotated[Path, Argument(help="The CSV file to write; must be new.")],
-    chips_n: Chips = 5,
-) -> None:
-    """Write the first line of a recording in layout `table`; which columns may go stands in data/README.md."""
-    from pipeline.capture.readers.plain import NEEDED, columns_of
-    from pipeline.core import io
+def merge() -> None:
+    """Settle captures, plan and dvc.lock where a git merge of two people's recordings leaves them in conflict."""
+    root = checkout()
+    from pipeline import merging
 
-    if out.exists():
-        raise ParamsError(out, "the file", "new", "one that is there", "Choose another name.")
-    io.write_text(out, ",".join(columns_of(chips_n)) + "\n")
-    typer.echo(f"wrote {out}: {', '.join(NEEDED)} and fields in uT are needed. Then: reskin add --layout table")
+    typer.echo(merging.merge(root))
 
 
 @app.command()
@@ -227,21 +220,24 @@ def compare(
     against: Annotated[str, Option(help="A git revision, a folder or a numbers.json.")] = "HEAD",
 ) -> None:
     """Hold fresh numbers against the committed ones; exit status 1 if any differs by more than it may."""
-    root, worst = checkout(), 0
-    from pipeline.comparing import compare_scene, table_of, verdict
+    root = checkout()
+    from pipeline.comparing import compare_scene, tell
 
-    for name in [scene] if scene else checked_plan().scenes:
-        try:
-            done = compare_scene(root, name, against)
-        except ReskinError as error:
-            typer.echo(f"error: {error}", err=True)
-            worst = max(worst, error.exit_code)
-            continue
-        if table := table_of(done):
-            typer.echo(table)
-        typer.echo(verdict(name, against, done))
-        worst = max(worst, 0 if done.reproduced else 1)
-    sys.exit(worst)
+    names = [scene] if scene else checked_plan().scenes
+    told = [tell(name, against, partial(compare_scene, root, name, against), typer.echo) for name in names]
+    sys.exit(max(told, default=0))
+
+
+@app.command()
+def verify_reports(
+    names: Annotated[list[str] | None, Argument(metavar="[SCENE]...", help="Without any, all that run.")] = None,
+    against: Annotated[Path | None, Option(help="Finished reports, in place of a rerun.")] = None,
+) -> None:
+    """Run scenes again in a clean copy of the last commit; exit status 1 if reports differ by more than they may."""
+    root = checkout()
+    from pipeline.verifying import verify
+
+    sys.exit(verify(root, names or list(checked_plan().scenes), against, typer.echo))
 
 
 @app.command()

@@ -7,6 +7,7 @@ import json
 import re
 import subprocess
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from shutil import which
 from typing import Any
@@ -14,7 +15,8 @@ from typing import Any
 import pandas as pd
 
 from pipeline.core import io
-from pipeline.core.errors import SchemaError
+from pipeline.core.errors import ReskinError, SchemaError
+from pipeline.core.stage import say
 from pipeline.evaluation.reproduced import Comparison, compare
 
 SHOWN_N = 40  # rows of a table in a terminal
@@ -46,6 +48,19 @@ def read_committed(root: Path, scene: str, against: str) -> dict[str, Any]:
     return json.loads(done.stdout)
 
 
+def tell(name: str, against: str, compare_one: Callable[[], Comparison], echo: Callable[[str], None]) -> int:
+    """Tell how a comparison went; return its exit status: 0, 1 if a value is beyond its tolerance, 2 without one."""
+    try:
+        done = compare_one()
+    except ReskinError as error:
+        say(f"error: {error}")
+        return error.exit_code
+    if table := table_of(done):
+        echo(table)
+    echo(verdict(name, against, done))
+    return 0 if done.reproduced else 1
+
+
 def table_of(done: Comparison) -> str:
     """Tabulate what differs by more than it may, and name what only one side has; empty if there is nothing."""
     columns = ("number", "committed", "fresh", "difference", "tolerance")
@@ -65,8 +80,8 @@ def verdict(scene: str, against: str, done: Comparison) -> str:
     if done.reproduced and not done.within_n:
         return f"{scene}: reproduced: all {counts.partition(',')[0]}."
     if done.reproduced:
-        files = f"changed files of reports/{scene} are this machine's arithmetic; `git checkout reports/{scene}`"
-        return f"{scene}: reproduced within tolerance: {counts}, none beyond ({files} takes them back)."
+        arithmetic = "changed files are this machine's arithmetic; `git checkout reports` takes them back"
+        return f"{scene}: reproduced within tolerance: {counts}, none beyond ({arithmetic})."
     lone_n = len(done.missing) + len(done.new)
     return (
         f"{scene}: not reproduced: {counts}, {len(done.beyond)} beyond it, {lone_n} on one side only "

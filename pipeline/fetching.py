@@ -16,6 +16,7 @@ from pydantic import AfterValidator, Field
 
 from pipeline import adding, preparing
 from pipeline.capture.header import HEADER_FILE
+from pipeline.capture.layouts import Foreign
 from pipeline.core import config, io
 from pipeline.core.config import Strict, parse, read_yaml
 from pipeline.core.errors import CaptureError, ParamsError
@@ -23,7 +24,7 @@ from pipeline.dataset.captures import read_header
 from pipeline.origins import OTHERS, Origin, open_origin
 from pipeline.params import read_plan
 from pipeline.pickled import to_lab_csv
-from pipeline.preparing import Foreign, Labels, Prepared
+from pipeline.preparing import Labels, Prepared
 from pipeline.registry import read_registry
 
 SOURCES = "pipeline/fetch.yaml"

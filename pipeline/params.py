@@ -5,6 +5,7 @@ in a scene's file if, and only if, a question of the scene needs it: what a scen
 know what is done with a value.
 """
 
+from collections.abc import Set
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -107,15 +108,16 @@ class Scene(Asking, Seeded, extra="allow"):
         for row in self.rows:
             if lacking := set(row.needs) - set(self.questions):
                 raise ValueError(f"a scene that asks {row.name} also asks {sorted(lacking)}, on which it goes on")
-        there, needed = set(self.model_extra or ()), {row.stage for row in self.rows if row.section}
-        for section in SECTIONS:
-            if (section in there) != (section in needed):
-                asking = [row.name for row in ROWS if row.stage == section]
-                raise ValueError(f"section {section} stands in a scene if and only if it asks one of {asking}")
         keys = {key for row in self.rows for key in row.folds or ()}
         keys |= {"pool_passes_n"} if POOLED_BY in self.questions else set()
-        if keys != self.split.model_fields_set:
-            raise ValueError(f"split holds exactly what the questions need, {sorted(keys)}")
+        sections = {row.stage for row in self.rows if row.section}
+        wrong = [
+            *_differ("the scene", set(self.model_extra or ()), sections),
+            *_differ("split", self.split.model_fields_set, keys),
+            *(_differ("simulate.protocols", set(self.simulate.protocols), self.protocols) if self.simulate else ()),
+        ]
+        if wrong:
+            raise ValueError(f"a scene holds exactly what its questions need; {'; '.join(wrong)}")
         return self
 
     @model_validator(mode="after")
@@ -128,12 +130,13 @@ class Scene(Asking, Seeded, extra="allow"):
                 raise ValueError(f"questions {list(self.studied)} are about physics: only a simulated scene asks them")
             if beyond := sorted(row.name for row in self.rows if not row.recorded):
                 raise ValueError(f"questions {beyond} are asked of simulated scenes only, so far")
-        elif self.protocols != set(self.simulate.protocols):
-            have, want = set(self.simulate.protocols), self.protocols
-            wrong = [f"lacks {sorted(want - have)}"] * bool(want - have)
-            wrong += [f"holds {sorted(have - want)}, of which nothing is asked"] * bool(have - want)
-            raise ValueError(f"simulate.protocols holds exactly what the questions need; it {' and '.join(wrong)}")
         return self
+
+
+def _differ(place: str, have: Set[str], want: Set[str]) -> list[str]:
+    lacks = [f"{place} lacks {', '.join(sorted(want - have))}"] if want - have else []
+    extra = [f"of {place} nothing asks {', '.join(sorted(have - want))}"] if have - want else []
+    return lacks + extra
 
 
 class Shared(Strict):

@@ -20,11 +20,13 @@ from pipeline.core.errors import ParamsError
 from pipeline.params import OnBoards, Plan, Scene, read_plan, read_scene
 from pipeline.questions import EXPERIMENTS, LEARNING, MAIN_PROTOCOL, NOT_INGESTED, QUESTIONS, TABLE_2, stages
 from pipeline.registry import Registry, read_registry
+from pipeline.running import need_rest
 
 HEADER = """\
 # Which scenes run, what they ask, and what each stage of dvc.yaml takes. Written by `reskin scenes use` and `add`
 # from pipeline/scenes and data/captures.yaml; not for hands.
 """
+MANY_N = 30  # captures of a recorded scene; with more, one stage reads them all (docs/growth.md)
 TERMS_N = 4  # terms of physics that a protocol may name
 IDLE = "lost_fraction_max"  # a key of params.yaml that re-runs what a stage rests on anyhow
 # What stage contacts reads of a simulated scene, and a recorded one does not have.
@@ -41,7 +43,8 @@ def make_plan(scenes: Mapping[str, Scene], registry: Registry, flow: Mapping[str
     `flow` is dvc.yaml: words of a scene that its stages name (`${item.train_multi.recipe}`) are copied into the plan.
     """
     captures = _captures(scenes, registry)
-    pairs = [(name, capture) for name in scenes for capture in captures[name]]
+    many = {name for name in scenes if len(captures[name]) > MANY_N}
+    pairs = [(name, capture) for name in scenes if name not in many for capture in captures[name]]
     ingest = {f"{name}-{capture}": {"scene": name, "capture": capture} for name, capture in pairs}
     if len(ingest) < len(pairs):
         rule, got = "unlike any other", "two that read the same"
@@ -55,6 +58,7 @@ def make_plan(scenes: Mapping[str, Scene], registry: Registry, flow: Mapping[str
             if _protocol(scenes[item["scene"]], item).kind not in NOT_INGESTED
         },
         "ingest": ingest,
+        "ingest_many": {name: {"scene": name} for name in scenes if name in many},
         "describe": {name: {"scene": name, "protocol": scene.described} for name, scene in scenes.items()},
         "split": {name: {"scene": name, "folds": list(scene.with_folds)} for name, scene in scenes.items()},
     }
@@ -86,7 +90,17 @@ def _captures(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, list
 def _more(stage: str, name: str, scene: Scene, captures: list[str]) -> dict[str, Any]:
     """Give what a stage needs of the scene beyond its settings."""
     match stage:
-        case "describe" | "split" | "drift" | "variation" | "compare" | "touches" | "universal" | "rivals":
+        case (
+            "ingest_many"
+            | "describe"
+            | "split"
+            | "drift"
+            | "variation"
+            | "compare"
+            | "touches"
+            | "universal"
+            | "rivals"
+        ):
             return {"captures": captures}
         case "audit":
             return {"models": scene.modelled}
@@ -199,7 +213,8 @@ def copied(root: Path, name: str, like: str | None) -> Iterator[None]:
 
 
 def use(root: Path, names: Sequence[str]) -> None:
-    """Let `dvc repro` run exactly these scenes."""
+    """Let `dvc repro` run exactly these scenes; raise if it runs now, as stages read the plan when they begin."""
+    need_rest(root)
     yaml = YAML()
     yaml.width = 120
     document = {key: _flow(value) for key, value in _plan_of(root, names).items()}

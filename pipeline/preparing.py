@@ -9,11 +9,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 from pipeline.capture import header as headers
 from pipeline.capture import stream
+from pipeline.capture.decisions import REFUSE_NONE
 from pipeline.capture.header import Clock, Header
+from pipeline.capture.layouts import Foreign
 from pipeline.capture.readers import READERS
 from pipeline.capture.wire import TEXT_WIRES
 from pipeline.core import io
@@ -23,7 +25,6 @@ from pipeline.dataset.captures import read_header
 NATIVE_FILES = (headers.STREAM_FILE, headers.ARRIVALS_FILE, headers.PROBE_FILE)
 UNNAMED = "unnamed"  # the board and skin of a recording that was made without their names
 
-Foreign = Literal["table", "lab", "ini", "eflesh", "eflash7"]
 Marks = tuple[tuple[float, float], ...]
 Prepared = tuple[Header, Mapping[str, bytes | Path]]
 
@@ -92,7 +93,8 @@ def _reads(recording: Path, layout: Foreign) -> bool:
     try:
         prepared = foreign(recording, layout, Labels("board", "skin", None), options)
         with TemporaryDirectory() as folder:
-            READERS[layout].read(Path(folder) / "it", headers.write_capture(Path(folder) / "it", *prepared))
+            copy = Path(folder) / "it"
+            READERS[layout].read(copy, headers.write_capture(copy, *prepared), REFUSE_NONE)
     except ReskinError:
         return False
     return True

@@ -1,6 +1,7 @@
 """A trained network as MLflow loads it: `mlflow.pyfunc.load_model("runs:/RUN_ID/model")`. No pickle is opened.
 
 In: changes of field in uT, one row a reading (DataFrame or array, Bx0, By0, Bz0, Bx1, ...). Out: x_mm, y_mm, force_N.
+Refuses to know the pipeline: a model's folder is all it reads.
 """
 
 from pathlib import Path

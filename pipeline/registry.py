@@ -42,23 +42,29 @@ def with_capture(
     registry: Registry, scene: str, header: Header, fingerprints: tuple[str, ...], *, allow_copy: bool
 ) -> Registry:
     """Add a capture, or raise if it is there already or contradicts what is there."""
-    captures, where = registry.captures.get(scene, {}), f"capture {header.capture}"
-    twin = next((name for name, entry in captures.items() if set(entry.fingerprints) & set(fingerprints)), None)
-    if twin is not None:
-        _refuse_copy(where, twin, captures[twin], header, allow_copy)
-    if header.capture in captures:
-        raise CaptureError(where, "its name", "new to its scene", "one that is taken", "Choose another with --name.")
-    for name, entry in captures.items():
-        if entry.skin == header.skin and entry.board != header.board:
-            what, rule = f"the board of skin {header.skin}", f"{entry.board}, as in {name}"
-            remedy = "A skin that moves to another board gets a new name, or it would stand on both sides of a fold."
-            raise CaptureError(where, what, rule, header.board, remedy)
-        if entry.chips_n != header.chips_n:
-            rule, remedy = f"the {entry.chips_n} of {name}", "Add it to a scene of its own."
-            raise CaptureError(where, "chips", rule, header.chips_n, remedy)
     labels = {name: getattr(header, name) for name in ("board", "skin", "layout", "chips_n")}
-    entry = Entry(**labels, fingerprints=fingerprints, copy_of=twin)
-    return Registry(captures={**registry.captures, scene: {**captures, header.capture: entry}})
+    entry = Entry(**labels, fingerprints=fingerprints, copy_of=None)
+    return with_entry(registry, scene, header.capture, entry, allow_copy=allow_copy)
+
+
+def with_entry(registry: Registry, scene: str, capture: str, entry: Entry, *, allow_copy: bool) -> Registry:
+    """Add the entry of a capture by the same rules; also one that another clone has made."""
+    captures, where = registry.captures.get(scene, {}), f"capture {capture}"
+    twin = next((name for name, other in captures.items() if set(other.fingerprints) & set(entry.fingerprints)), None)
+    if twin is not None:
+        _refuse_copy(where, twin, captures[twin], entry, allow_copy)
+    if capture in captures:
+        raise CaptureError(where, "its name", "new to its scene", "one that is taken", "Choose another with --name.")
+    for name, other in captures.items():
+        if other.skin == entry.skin and other.board != entry.board:
+            what, rule = f"the board of skin {entry.skin}", f"{other.board}, as in {name}"
+            remedy = "A skin that moves to another board gets a new name, or it would stand on both sides of a fold."
+            raise CaptureError(where, what, rule, entry.board, remedy)
+        if other.chips_n != entry.chips_n:
+            rule, remedy = f"the {other.chips_n} of {name}", "Add it to a scene of its own."
+            raise CaptureError(where, "chips", rule, entry.chips_n, remedy)
+    added = entry.model_copy(update={"copy_of": twin})
+    return Registry(captures={**registry.captures, scene: {**captures, capture: added}})
 
 
 def without_capture(registry: Registry, scene: str, capture: str) -> Registry:
@@ -80,8 +86,8 @@ def write_registry(root: Path, registry: Registry) -> None:
         yaml.dump(registry.model_dump(mode="json"), stream)
 
 
-def _refuse_copy(where: str, twin: str, entry: Entry, header: Header, allow_copy: bool) -> None:
-    relabelled = (entry.board, entry.skin) != (header.board, header.skin)
+def _refuse_copy(where: str, twin: str, before: Entry, entry: Entry, allow_copy: bool) -> None:
+    relabelled = (before.board, before.skin) != (entry.board, entry.skin)
     if relabelled and allow_copy:
         return
     remedy = "It is in the scene already."

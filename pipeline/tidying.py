@@ -14,6 +14,7 @@ from pipeline.core import io
 from pipeline.core.config import read_yaml
 from pipeline.params import Plan
 from pipeline.plan import scene_names
+from pipeline.running import need_rest
 
 LOCK = "dvc.lock"
 
@@ -35,6 +36,7 @@ def left_over(root: Path, plan: Plan) -> dict[str, list[Path]]:
 
 def tidy(root: Path, plan: Plan) -> dict[str, list[Path]]:
     """Remove what is left over, and forget its stages; give what was removed."""
+    need_rest(root)
     stale = left_over(root, plan)
     for paths in stale.values():
         for path in paths:

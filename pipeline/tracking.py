@@ -2,6 +2,7 @@
 
 In: the cards and weights in `data/models`, and the report. Out: one experiment a scene, one parent run a stage and set
 of trainings, one child a training, and one run `report` with the page, its tables and figures, and their numbers.
+Refuses to know how a result is made, and to be read by a stage.
 """
 
 import hashlib
@@ -16,7 +17,7 @@ from types import MappingProxyType
 from typing import Any
 
 from pipeline.core import io
-from pipeline.core.server import TrackingAway, probe, server_uri
+from pipeline.core.server import Patience, TrackingAway, probe, server_uri
 from pipeline.evaluation.scores import over_folds, tidy
 
 STORE = "mlflow.db"
@@ -47,7 +48,8 @@ def publish(arms: Mapping[str, Path], curves: Curves, reports: Path, *, scene: s
     probe(uri)
     counts = {"new_n": 0, "kept_n": 0, "superseded_n": 0}
     with _client(uri) as client:
-        diary = Diary(client, _experiment(client, scene, root), scene)
+        patience = Patience(sum(len(list(models.glob("*.json"))) for models in arms.values()))
+        diary = Diary(client, _experiment(client, scene, root), scene, patience)
         current: set[str] = set()
         for stage, models in arms.items():
             keys, fresh = _publish_arm(diary, stage, models)
@@ -67,6 +69,7 @@ class Diary:
     client: Any
     experiment_id: str
     scene: str
+    patience: Patience
 
     def find(self, stage: str, **tags: str) -> Any:
         """Find a stage's newest run with these tags."""
@@ -78,6 +81,7 @@ class Diary:
         self, stage: str, key: str, *, name: str = "", parent: str = "", tags: Mapping[str, str] = MappingProxyType({})
     ) -> tuple[str, bool]:
         """Give a run, and whether it is yet to be written; one that a killed process left is replaced."""
+        self.patience.check()
         found = self.find(stage, run_key=key)
         current = {"current": "true"} | ({PARENT: parent} if parent else {})
         if found and found.info.status == "FINISHED":

@@ -1,8 +1,8 @@
 """Scenes for tests, as plain words, and the settings that a stage has of them."""
 
-from pipeline.capture.decisions import AS_USUAL
 from pipeline.core.config import Settings, parse
 from pipeline.params import Asking, Scene, check_scene
+from tests.capture.headers import AS_USUAL
 
 RECIPE = {
     "architecture": "paper", "inputs": "raw", "scaling": "standard", "triplet_weight": 0.0, "steps_n": 1, "batch_n": 64,

@@ -19,7 +19,7 @@ from pipeline.core.errors import CaptureError, ReskinError
 from pipeline.dataset.captures import open_capture, read_header
 from pipeline.preparing import Dump, Labels
 from pipeline.registry import read_registry
-from tests.capture.headers import make_header
+from tests.capture.headers import AS_USUAL, make_header
 from tests.capture.readers.test_lab import PRESSES, write
 from tests.capture.signals import make_frames
 from tests.scenes import recorded
@@ -253,7 +253,7 @@ def test_a_native_capture_is_added_with_its_own_header(root, tmp_path):
     folder = native_folder(tmp_path / "run1")
     header = adding.add(root, "small", preparing.native(folder, labels(), None, ()), allow_copy=False)
     assert header == read_header(root / "data/raw/small/run1")
-    _, blocks, account = open_capture(root / "data/raw/small/run1")
+    _, blocks, account = open_capture(root / "data/raw/small/run1", AS_USUAL)
     assert sum(map(len, blocks)) == account["frames_contact_n"] > 0
 
 
@@ -322,27 +322,35 @@ def test_the_command_line_says_what_is_wrong_without_a_traceback(root, tmp_path)
     assert len(done.stderr.strip().splitlines()) == 1
 
 
-def test_the_command_line_says_that_a_scene_was_switched_on(root, lab_file):
+def said(words: list[str]) -> str:
+    """Give what a command says in the working directory, without a process of its own: it or its error."""
+    done = CliRunner().invoke(app, words)
+    return str(done.exception) if isinstance(done.exception, ReskinError) else done.stdout
+
+
+def test_the_command_line_says_that_a_scene_was_switched_on(root, lab_file, monkeypatch):
+    monkeypatch.chdir(root)
     words = ["add", str(lab_file), "--layout", "lab", "--board", "b", "--skin", "s", "--scene", "small"]
     assert "switched scene small on in pipeline/plan.yaml" in run(root, "reskin", *words).stdout
-    again = run(root, "reskin", *words, "--name", "again", "--board", "b2", "--skin", "s2", "--allow-copy").stdout
+    again = said([*words, "--name", "again", "--board", "b2", "--skin", "s2", "--allow-copy"])
     assert "added small/again" in again
     assert "switched" not in again
 
 
-def test_a_scene_that_is_new_is_a_copy_of_one_and_goes_again_if_nothing_joins_it(root, lab_file):
+def test_a_scene_that_is_new_is_a_copy_of_one_and_goes_again_if_nothing_joins_it(root, lab_file, monkeypatch):
+    monkeypatch.chdir(root)
     known = contents(root)
     words = ["add", str(lab_file), "--layout", "lab", "--board", "b", "--skin", "s", "--scene", "mine", "--like"]
-    assert "a scene must be one of" in run(root, "reskin", *words, "nowhere", check=False).stderr
-    up = run(root, "reskin", *words[:-2], "../up", "--like", "small", check=False).stderr
+    assert "a scene must be one of" in said([*words, "nowhere"])
+    up = said([*words[:-2], "../up", "--like", "small"])
     assert "--scene: a name must be 1 to 64 of" in up
-    assert "the truths must be" in run(root, "reskin", *words[:3], "ini", *words[4:], "ini", check=False).stderr
+    assert "the truths must be" in said([*words[:3], "ini", *words[4:], "ini"])
     assert contents(root) == known
     run(root, "reskin", *words, "small")
     text = (root / config.SCENES / "mine.yaml").read_text()
     assert YAML(typ="safe").load(text) == recorded()
     assert read_registry(root).captures.keys() == {"mine"}
-    again = run(root, "reskin", *words, "small", "--name", "again", check=False).stderr
+    again = said([*words, "small", "--name", "again"])
     assert "the new scene must be a free name; got mine, which is there" in again
     assert (root / config.SCENES / "mine.yaml").read_text() == text
 

@@ -1,8 +1,11 @@
 """DVC does not follow imports: stage `code` does. Every path of a command is one that DVC knows."""
 
+import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
+from dvc.repo import Repo
 from ruamel.yaml import YAML
 
 from pipeline.core.code import file_of
@@ -55,3 +58,18 @@ def test_every_path_that_a_command_takes_is_declared(name):
 
 def test_the_flow_stays_below_thirty_stages_beside_experiments():
     assert len(STAGES.keys() - set(EXPERIMENTS)) < 30
+
+
+def test_recordings_that_git_leaves_out_are_known_to_dvc(tmp_path):
+    subprocess.run(["git", "init", "-q", str(tmp_path)], check=True)
+    shutil.copy(ROOT / ".gitignore", tmp_path)
+    (tmp_path / ".dvc").mkdir()
+    shutil.copy(ROOT / ".dvc/config", tmp_path / ".dvc")
+    capture = tmp_path / "data/raw/lab/one"
+    capture.mkdir(parents=True)
+    (capture / "readings.csv").write_text("x\n")
+    (tmp_path / "data/raw/lab/one.dvc").write_text("outs:\n- path: one\n  md5: d41d8cd98f00b204e9800998ecf8427e.dir\n")
+    with Repo(str(tmp_path)) as repo:
+        assert [stage.path_in_repo for stage in repo.index.stages] == ["data/raw/lab/one.dvc"]  # so they are pushed
+    told = subprocess.check_output(["git", "status", "--porcelain", "-uall", "data"], cwd=tmp_path, text=True)
+    assert told == "?? data/raw/lab/one.dvc\n"

@@ -21,9 +21,10 @@ from pipeline.params import read_plan
 from pipeline.preparing import Labels
 from pipeline.registry import read_registry
 from tests import repositories
+from tests.capture.headers import AS_USUAL
 from tests.capture.readers.test_lab import PRESSES, write
 from tests.scenes import recorded
-from tests.stages.checkout import copy_checkout, run
+from tests.stages.checkout import copy_checkout
 from tests.test_adding import contents
 from tests.test_pickled import archive_of_csv
 
@@ -300,23 +301,24 @@ def test_real_recordings_have_the_checksums_on_record_and_are_read(name, shared_
         labels = Labels(recording.board, recording.skin, None)
         prepared = preparing.foreign(tmp_path / name / recording.path, recording.layout, labels, recording.options)
         header = preparing.headers.write_capture(tmp_path / prepared[0].capture, *prepared)
-        _, account = readers[name].read(tmp_path / header.capture, header)
+        _, account = readers[name].read(tmp_path / header.capture, header, AS_USUAL)
         assert account["rows_read_n"] == counts[name]
 
 
 @pytest.mark.timeout(600)
-def test_real_boards_are_in_their_scene_after_one_command(shared_data, tmp_path):
+def test_real_boards_are_in_their_scene_after_one_command(shared_data, tmp_path, monkeypatch):
     (tmp_path / "checkout").mkdir()
     root = copy_checkout(tmp_path / "checkout")
     plan.use(root, ["quick"])
-    done = run(root, "reskin", "fetch", "lab", "--yes", "--from", str(shared_data / "lab"))
+    monkeypatch.chdir(root)
+    done = CliRunner().invoke(app, ["fetch", "lab", "--yes", "--from", str(shared_data / "lab")])
     captures = read_registry(root).captures["lab"]
     assert {(entry.board, entry.skin) for entry in captures.values()} == {("board1", "skin1"), ("board2", "skin2")}
     assert len(captures) == 6
     assert list(read_plan(root / config.PLAN).scenes) == ["quick", "lab"]
     assert "switched scene lab on in pipeline/plan.yaml, beside quick" in done.stdout
     assert "now: dvc repro (runs quick, lab; only this one: reskin scenes use lab)" in done.stdout
-    again = run(root, "reskin", "fetch", "lab")
+    again = CliRunner().invoke(app, ["fetch", "lab"])
     assert again.stdout.count("added already") == 6
 
 

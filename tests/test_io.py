@@ -1,3 +1,4 @@
+import errno
 from pathlib import Path
 
 import numpy as np
@@ -117,3 +118,14 @@ def test_broken_safetensors_are_one_sentence(tmp_path):
 def test_a_missing_file_is_called_missing(tmp_path, read):
     with pytest.raises(SchemaError, match="none: the file must be there; got nothing"):
         read(tmp_path / "none")
+
+
+def test_a_file_that_cannot_be_read_now_is_not_called_damaged(tmp_path, monkeypatch):
+    (tmp_path / "a.parquet").write_bytes(b"PAR1")
+
+    def refuse(path):
+        raise OSError(errno.EIO, "Input/output error", str(path))
+
+    monkeypatch.setattr(io.pq, "ParquetFile", refuse)
+    with pytest.raises(OSError, match="Input/output error"):
+        io.read_table(tmp_path / "a.parquet")

@@ -102,6 +102,19 @@ def test_every_recorded_capture_has_an_ingest_of_its_own():
     assert made["stages"]["split"] == {"lab": {"scene": "lab", "folds": ["lobo"], "captures": ["c0", "c1"]}}
 
 
+def test_a_scene_of_many_captures_has_one_ingest_for_all():
+    names = [f"c{i:02}" for i in range(plan.MANY_N + 1)]
+    made = make_plan({"lab": scene()}, Registry(captures={"lab": dict.fromkeys(names, ENTRY)}))["stages"]
+    assert made["ingest"] == {}
+    assert made["ingest_many"] == {"lab": {"scene": "lab", "captures": names}}
+    assert (
+        make_plan({"lab": scene()}, Registry(captures={"lab": dict.fromkeys(names[1:], ENTRY)}))["stages"][
+            "ingest_many"
+        ]
+        == {}
+    )
+
+
 def test_a_recorded_scene_without_recordings_says_how_to_add_one():
     with pytest.raises(ParamsError, match="reskin add RECORDING --scene lab"):
         make_plan({"lab": scene()}, Registry(captures={}))

@@ -141,7 +141,7 @@ def test_what_does_not_fit_is_refused_and_nothing_is_written(tmp_path, model):
         ({"format": 2}, "format must be reskin-model/3; got 2"),
         ({"output": {"x_mm": "mm", "y_mm": "mm"}}, "the model's answers must be for x_mm, y_mm, Fz_N; got x_mm, y_mm"),
         ({"input": None}, r"model\.json: input must be"),
-        ({"input": {}}, "input.quantity must be given; got nothing"),
+        ({"input": {}}, "input.quantity, input.unit, .* must be given; got nothing"),
         ({"input": CARD["input"] | {"unit": "T"}}, "input.unit must be 'uT'; got 'T'"),
         ({"input": CARD["input"] | {"channels_n": "15"}}, "input.channels_n must be a valid integer; got '15'"),
         ({"input": CARD["input"] | {"channels_n": 14}}, "input.channels_n must be a multiple of 3; got 14"),

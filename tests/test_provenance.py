@@ -74,6 +74,7 @@ def test_costs_are_kept_a_stage_in_seconds_and_megabytes(tmp_path):
     costs = read_costs(tmp_path)
     assert list(costs) == ["split"]
     assert costs["split"]["seconds"] == 2.35 or costs["split"]["seconds"] == 2.34  # halves round to even
+    assert 0.1 < costs["split"]["cpu_s"] < 100_000  # this process', its imports included
     assert 10 < costs["split"]["peak_process_memory_MB"] < 100_000  # a Python process; not KiB, not bytes
 
 

@@ -88,7 +88,7 @@ def test_every_package_that_the_code_imports_is_asked_for():
         name for text in texts for name in re.findall(r"^ *(?:import|from) (\w+)[\w.]* *(?:import|as|$|#)", text, re.M)
     }
     imported = names - sys.stdlib_module_names - {"pipeline", "reskin"}
-    known = {"sklearn": "scikit-learn", "serial": "pyserial", "ruamel": "ruamel.yaml"}
+    known = {"sklearn": "scikit-learn", "serial": "pyserial", "ruamel": "ruamel.yaml", "zc": "zc.lockfile"}
     lines = [line for extra in (None, "networks", "pipeline", "onnx", "dask") for line in wanted(extra)]
     asked = {re.split(r"[\[<>=]", line)[0] for line in lines}
     assert {known.get(name, name) for name in imported} <= asked

@@ -1,15 +1,17 @@
 import shutil
 import socket
+import sqlite3
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import mlflow
 import numpy as np
 import pytest
 
-from pipeline.core import io
+from pipeline.core import io, server
 from pipeline.core.server import TrackingAway, probe
 from pipeline.tracking import publish
 
@@ -254,6 +256,24 @@ def test_a_server_that_is_away_is_noticed_within_seconds(kind, request, tmp_path
     assert time.monotonic() - start_s < 4  # the two-second time-out, and writing two files
 
 
-def test_the_embedded_store_is_never_asked_for_a_sign_of_life():
+def test_an_embedded_store_that_is_not_there_yet_is_made_by_nobody_who_only_asks(tmp_path):
     probe(None)
-    probe("sqlite:///somewhere.db")
+    probe(f"sqlite:///{tmp_path / 'somewhere.db'}")
+    assert not (tmp_path / "somewhere.db").exists()
+
+
+def test_a_store_that_another_program_holds_costs_seconds_and_no_result(tmp_path, monkeypatch):
+    monkeypatch.setattr(server, "LOCK_TIMEOUT_S", 0.1)
+    with closing(sqlite3.connect(tmp_path / "mlflow.db")) as other:
+        other.execute("BEGIN EXCLUSIVE")
+        with pytest.raises(TrackingAway, match="database is locked.*Results are kept"):
+            write(tmp_path, b0="k0")
+    write(tmp_path, b0="k0")
+
+
+def test_a_server_that_is_too_slow_is_left_with_what_is_written_and_taken_up_again(tmp_path, monkeypatch):
+    monkeypatch.setattr(server, "PATIENCE_S", -2.0 * 2)  # none left for two trainings
+    with pytest.raises(TrackingAway, match="took longer than 0 s"):
+        write(tmp_path, b0="k0", b1="k1")
+    monkeypatch.undo()
+    assert write(tmp_path, b0="k0", b1="k1")["new_n"] == 2

@@ -19,7 +19,7 @@ COUNTS = (
     "seed", "labels_n", "pokes_n", "contacts_n", "trained_on_skins_n", "trained_on_rows_n", "rows_n",
 )  # fmt: skip
 KEYS = (*NAMES, *COUNTS)  # every other column is a metric
-COVERAGE = "coverage_pct"  # of 90 % intervals, where a method tells how sure it is
+SURENESS = ("coverage_pct", "half_width_mm")  # of 90 % intervals, where a method tells how sure it is
 ALL_SKINS = ""  # in column `skin`: all rows that a training was tested on
 AS_LABELLED, REGISTERED = "as_labelled", "registered"  # places: the latter after one offset a board, a diagnosis
 METHODS = {"triplet": "network + triplet", "adapt": "network, adapted"}  # of cards, by question
@@ -52,8 +52,8 @@ def tidy(cards: Cards, points: Mapping[str, Cards] | None = None) -> pd.DataFram
     for row in (row for row in rows if row["skin"] == ALL_SKINS):
         alike.setdefault(tuple(row.get(key) for key in KEYS if key != "rows_n"), []).append(row)
     kept = [*map(_pool, alike.values()), *(row for row in rows if row["skin"] != ALL_SKINS)]
-    return pd.DataFrame(kept, columns=[*KEYS, *METRICS, COVERAGE]).astype(
-        dict.fromkeys((*COUNTS, *METRICS, COVERAGE), float)
+    return pd.DataFrame(kept, columns=[*KEYS, *METRICS, *SURENESS]).astype(
+        dict.fromkeys((*COUNTS, *METRICS, *SURENESS), float)
     )
 
 

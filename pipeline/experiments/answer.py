@@ -1,4 +1,7 @@
-"""What the stages of the experiments share: the captures of a folder, and the answer that they write."""
+"""What the stages of the experiments share: the captures of a folder, and the answer that they write.
+
+Refuses to know what any of them asks.
+"""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

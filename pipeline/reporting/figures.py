@@ -28,6 +28,7 @@ FONTS = ("DejaVu Sans", "Verdana", "sans-serif")  # Verdana is as wide, where th
 SPARED = re.compile(r"(?<=\n) +|<metadata>.*?</metadata>\n|<!--.*?-->\n", re.DOTALL)
 PLACES = re.compile(r' (d|x|y|transform)="[^"]*"')
 PAST_DIGITS = re.compile(r"(?<=\.\d\d)\d+")
+SVG_DPI = 72  # of points, in which the format counts
 STYLE = {
     "svg.hashsalt": "reskin",
     "svg.fonttype": "none",
@@ -109,10 +110,21 @@ def svg(figure: Any) -> str:
     Without date and version, so that the same data give the same bytes.
     """
     buffer, titles = io.StringIO(), name_marks(figure)
+    _lay_out(figure)
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     text = PLACES.sub(lambda found: PAST_DIGITS.sub("", found[0]), SPARED.sub("", buffer.getvalue()))
     # Formulas name one family only, and would be written in serifs where it is not installed.
     return put_titles(text.replace(f"'{FONTS[0]}'\"", f"'{FONTS[0]}', '{FONTS[1]}', {FONTS[2]}\""), titles)
+
+
+def _lay_out(figure: Any) -> None:
+    """Give all axes their places as saving would, which draws the figure once more for it."""
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+
+    FigureCanvasSVG(figure)  # texts are measured as they are written
+    figure.dpi = SVG_DPI
+    figure.get_layout_engine().execute(figure)
+    figure.set_layout_engine(None)
 
 
 def _places(table: pa.Table, side: str) -> Any:

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from pipeline.reporting.figures import drawing, svg
-from pipeline.reporting.order import models, table_2_rows
+from pipeline.reporting.order import Model, models, table_2_rows
 from pipeline.reporting.shown import COLUMNS, INTERVAL, n_of, show, tabulate
 from pipeline.reporting.sweeps import DRAWN, bars
 from pipeline.reporting.work_precision import COLOURS, MARKERS
@@ -22,6 +22,7 @@ SHORT_TABLE = ("accuracy_pct", "mse_xy_mm2")
 WITHIN = "Readings placed within 1 mm on boards"
 BRACKETS = "In brackets: 95 % interval over boards"
 UNIVERSAL = "universal, "  # so begins what is told which skin it is on: the map with networks
+EXPERTS = ("universal", 0)  # the map with networks, without a label
 ANSWERING = ("multi", "adapted", "single")  # rows of table 2, the one that matters most first
 
 
@@ -36,15 +37,25 @@ def answer(numbers: Mapping[str, Any]) -> str:
     """Say in one sentence how a model does on boards never seen, with intervals; nothing where none was held out."""
     if numbers.get("labels"):
         return _answer_with_labels(numbers["labels"])
-    rows = numbers.get("table2", {})
-    known = models(numbers)
+    rows, known = numbers.get("table2", {}), models(numbers)
+    shown = _experts(numbers) + [(known[name], rows[name]) for name in ANSWERING if name in rows]
     said = [
-        f"{known[name].short} {show(rows[name]['accuracy_pct'])} %"
-        + (f" (paper: {known[name].paper['accuracy_pct'][0]:.3g} %)" if known[name].paper else "")
-        for name in ANSWERING
-        if name in rows
+        f"{model.short} {show(row['accuracy_pct'])} %"
+        + (f" (paper: {model.paper['accuracy_pct'][0]:.3g} %)" if model.paper else "")
+        for model, row in shown
     ]
     return f"{WITHIN} and skins never seen: {_with_brackets('; '.join(said))}" if said else ""
+
+
+def _experts(numbers: Mapping[str, Any]) -> list[tuple[Model, Mapping[str, Any]]]:
+    """Give the experts of question population, told most pokes and no label, as a row beside those of table 2."""
+    rows = [row for row in numbers.get("population", {}).get("told", ()) if (row["way"], row["labels_n"]) == EXPERTS]
+    if not rows:
+        return []
+    most = max(rows, key=lambda row: row["pokes_n"])
+    told = f"told {most['pokes_n']} unlabelled pokes"
+    title = f"Universal, taught simulated skins, {told} (ours)"
+    return [(Model(title, f"{UNIVERSAL}{told}", {}), most)]
 
 
 def _told(rows: Sequence[Mapping[str, Any]]) -> tuple[list[int], dict[str, list[str]]]:
@@ -86,7 +97,8 @@ def _with_brackets(said: str, boards: str = "") -> str:
 
 def table2_figure(numbers: Mapping[str, Any], source: str) -> str:
     """Draw accuracy and MSE of each row of table 2 on boards held out, ours beside the paper's."""
-    rows = [row for name, row in table_2_rows(numbers).items() if name in numbers["table2"]]
+    of_table = [row for name, row in table_2_rows(numbers).items() if name in numbers["table2"]]
+    rows = _experts(numbers) + of_table
     y = np.arange(len(rows))[::-1].astype(float)
     with drawing(8.6, 0.9 + 0.55 * len(rows)) as figure:
         panels = figure.subplots(1, len(DRAWN), sharey=True)
@@ -142,7 +154,7 @@ def labels_figure(numbers: Mapping[str, Any], source: str) -> str:
 def short_table(numbers: Mapping[str, Any]) -> pd.DataFrame:
     """Tabulate the same in five rows for a first look: means with intervals, and the paper's means."""
     lines = []
-    for model, row in table_2_rows(numbers).values():
+    for model, row in [*_experts(numbers), *table_2_rows(numbers).values()]:
         line = {"boards never seen": model.title}
         for metric in SHORT_TABLE:
             paper = f"{model.paper[metric][0]:.3g}" if model.paper else "–"

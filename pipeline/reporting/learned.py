@@ -54,7 +54,7 @@ def learned(table: pd.DataFrame, *, headline: str) -> dict[str, Any]:
     numbers: dict[str, Any] = {
         "table2": table2,
         "lobo": _lobo(models["multi"]) if "multi" in models else {},
-        "adapt": {"pokes_n": int(models[CONTROL]["pokes_n"].iloc[0]), "control": control} if control else {},
+        "adapt": _adapt(models["adapted"], control) if "adapted" in models else {},
         "paired": [
             {"of": of, "over": over} | paired(by_skin(models[of]), by_skin(models[over]), where_tested=over == "single")
             for of, over in PAIRS
@@ -64,6 +64,11 @@ def learned(table: pd.DataFrame, *, headline: str) -> dict[str, Any]:
     }
     numbers = {name: value for name, value in numbers.items() if value}
     return numbers | _curves(table) | {"variants": _variants(table)}
+
+
+def _adapt(adapted: pd.DataFrame, control: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Say how many indentations networks were adapted with, and what as much training without them gives."""
+    return {"pokes_n": int(adapted["pokes_n"].iloc[0])} | ({"control": control} if control else {})
 
 
 def curves_of(points: Points) -> dict[str, list[tuple[str, int, dict[str, float]]]]:

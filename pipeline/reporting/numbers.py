@@ -15,6 +15,7 @@ from pipeline.evaluation.metrics import METRICS
 from pipeline.evaluation.scores import statistic, tally
 from pipeline.questions import QUESTIONS
 from pipeline.reporting.learned import learned
+from pipeline.reporting.order import control_of
 
 SINGLE = {
     "by_reading": "single_random", "by_indentation": "single_indentation", "by_pass": "single_pass",
@@ -90,7 +91,7 @@ def _cost(cost: Row) -> dict[str, float]:
     return {
         "computed_s": cost["other_s"] + sum(trainings_s),
         "trainings_n": len(trainings_s),
-        **{name: cost[name] for name in ("seconds", "reused_n", "peak_process_memory_MB")},
+        **{name: cost[name] for name in ("seconds", "cpu_s", "reused_n", "peak_process_memory_MB") if name in cost},
     }
 
 
@@ -121,7 +122,7 @@ def headline_scores(numbers: Row) -> dict[str, Any]:
     recorded = {
         name for name in ("lobo", "labels") if name in numbers and numbers["provenance"]["source"] == "recorded"
     }
-    table2 = numbers.get("table2", {}) | ({"control": numbers["adapt"]["control"]} if "adapt" in numbers else {})
+    table2 = numbers.get("table2", {}) | control_of(numbers)
     parts = {
         "table2": {name: _means(row) for name, row in table2.items()},
         "lobo": {"registered": _means(numbers["lobo"]["registered"])} if "lobo" in recorded else {},

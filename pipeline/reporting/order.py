@@ -64,8 +64,13 @@ def models(numbers: Numbers) -> dict[str, Model]:
 
 def table_2_rows(numbers: Numbers) -> dict[str, tuple[Model, Mapping[str, Any]]]:
     """Give the rows of table 2 that were computed, in the paper's order; last the control, which the paper has not."""
-    ours = numbers["table2"] | ({"control": numbers["adapt"]["control"]} if "adapt" in numbers else {})
+    ours = numbers["table2"] | control_of(numbers)
     return {row: (model, ours[row]) for row, model in models(numbers).items() if row in ours}
+
+
+def control_of(numbers: Numbers) -> dict[str, Any]:
+    """Give the control's row by its name, where there is one."""
+    return {name: row for name, row in numbers.get("adapt", {}).items() if name == "control"}
 
 
 def is_pooled(numbers: Numbers) -> bool:

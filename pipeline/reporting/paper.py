@@ -1,4 +1,7 @@
-"""The paper's own numbers (Bhirangi et al., CoRL 2021), each with its place. No result of ours stands here."""
+"""The paper's own numbers (Bhirangi et al., CoRL 2021), each with its place. No result of ours stands here.
+
+Refuses to know where they are shown.
+"""
 
 from collections.abc import Mapping
 

@@ -1,4 +1,7 @@
-"""Generated parts of README.md and docs: text with marked blocks + their contents -> text. No number there is typed."""
+"""Generated parts of README.md and docs: text with marked blocks + their contents -> text. No number there is typed.
+
+Refuses to know files and runs.
+"""
 
 import re
 from collections.abc import Mapping, Sequence

@@ -36,6 +36,7 @@ SPLIT_WORDS = {
     "single_pass": "random passes held out (each visits every place and depth again)",
     "single_temporal": "first passes → last passes",
 }
+SURENESS = {"coverage_pct": "in 90 % intervals, %", "half_width_mm": "half of them, mm (median)"}
 BEFORE_TOUCH = {
     "noload": "the no-load reading before the poke alone",
     "scan": "the number of the poke in its pass alone",
@@ -152,10 +153,12 @@ def baselines_table(rows: Rows, source: str) -> pd.DataFrame:
 def labels_table(rows: Rows, source: str) -> pd.DataFrame:
     """List scores by how many labelled indentations of the new skin were at hand."""
     places = {metric: f"{title} (registered)" for metric, title in COLUMNS.items() if metric != "mse_f_N2"}
+    sure = SURENESS if any(metric in row["as_labelled"] for row in rows for metric in SURENESS) else {}
     lines = [
         {"method": row["method"], "inputs": row["inputs"], "labels": str(row["labels_n"]), "source": source}
         | scores(row["as_labelled"])
         | scores(row["registered"], places)
+        | scores(row["as_labelled"], sure)
         | {"n": n_of(row["as_labelled"])}
         for row in rows
     ]

@@ -74,6 +74,7 @@ def costs(stages: Mapping[str, Mapping[str, float]]) -> pd.DataFrame:
             "stage": name,
             "computed, s": f"{cost['computed_s']:.1f}",
             "last run, s": f"{cost['seconds']:.1f}",
+            "CPU of it, s": f"{cost['cpu_s']:.1f}" if "cpu_s" in cost else "–",  # older costs lack it
             "trainings": str(cost["trainings_n"]),
             "of them reused": str(cost["reused_n"]),
             "peak memory of a process, MB": f"{cost['peak_process_memory_MB']:.0f}",

@@ -1,1 +1,4 @@
-"""Captures of skins that do not exist: a plan, a rig and physics -> what a port and a probe would have written."""
+"""Captures of skins that do not exist: a plan, a rig and physics -> what a port and a probe would have written.
+
+Refuses to know who reads them.
+"""

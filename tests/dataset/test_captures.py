@@ -4,7 +4,7 @@ from pipeline.capture.header import write_capture
 from pipeline.capture.readers import READERS, lab
 from pipeline.core.errors import CaptureError
 from pipeline.dataset.captures import check_losses, open_capture, read_header
-from tests.capture.headers import make_header
+from tests.capture.headers import AS_USUAL, make_header
 from tests.capture.readers.test_lab import NAMES, PRESSES
 
 
@@ -15,7 +15,7 @@ def capture(folder):
 
 
 def test_a_capture_opens_through_the_reader_of_its_layout(tmp_path):
-    header, blocks, account = open_capture(capture(tmp_path / "c0"))
+    header, blocks, account = open_capture(capture(tmp_path / "c0"), AS_USUAL)
     assert header.layout in READERS
     assert sum(map(len, blocks)) == account["rows_n"] == 4
 
@@ -25,10 +25,10 @@ def test_a_file_changed_since_it_was_added_is_refused(tmp_path):
     with (folder / lab.READINGS).open("a") as stream:
         stream.write("\n")
     with pytest.raises(CaptureError, match="must be unchanged since it was added"):
-        open_capture(folder)
+        open_capture(folder, AS_USUAL)
     (folder / lab.READINGS).unlink()
     with pytest.raises(CaptureError, match="must be there, as the header says"):
-        open_capture(folder)
+        open_capture(folder, AS_USUAL)
 
 
 def test_a_folder_without_header_is_no_capture(tmp_path):

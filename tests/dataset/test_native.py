@@ -19,7 +19,7 @@ from pipeline.core.schema import Readings
 from pipeline.core.seeds import rng_for
 from pipeline.dataset import captures
 from pipeline.dataset.captures import read_native
-from tests.capture.headers import make_header
+from tests.capture.headers import AS_USUAL, make_header
 
 RATE_HZ = 100.0
 OFFSET_S = 40.0  # probe minus stream
@@ -91,7 +91,7 @@ def write(folder: Path, wire: Wire, frames: Frames = FRAMES, **files: bytes) -> 
 
 
 def read(folder: Path, header: Header) -> tuple[dict[str, np.ndarray], dict[str, int]]:
-    blocks, account = read_native(folder, header)
+    blocks, account = read_native(folder, header, AS_USUAL)
     parts = list(blocks)
     names = [field.name for field in dataclasses.fields(Readings)[4:]]
     return {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}, account
@@ -222,7 +222,7 @@ def test_a_recorder_killed_before_its_last_row_costs_the_frames_without_time(tmp
 
 
 def test_readings_and_account_go_to_parquet_and_back(tmp_path: Path) -> None:
-    blocks, account = read_native(write(tmp_path, "binary"), header_of("binary"))
+    blocks, account = read_native(write(tmp_path, "binary"), header_of("binary"), AS_USUAL)
     io.write_readings(tmp_path / "c.parquet", blocks, account)
     assert len(io.read_readings(tmp_path / "c.parquet")) == INDENTATIONS_N * CONTACT_N
     assert io.read_account(tmp_path / "c.parquet")["indentations_n"] == INDENTATIONS_N

@@ -15,12 +15,12 @@ from pipeline.dataset.splits import Split, draw_folds
 from pipeline.evaluation.metrics import METRICS, score_groups
 from pipeline.evaluation.scores import (
     AS_LABELLED,
-    COVERAGE,
     INCONCLUSIVE,
     KEYS,
     NO,
     ONE_BOARD,
     REGISTERED,
+    SURENESS,
     YES,
     all_of,
     board_means,
@@ -114,7 +114,7 @@ def test_the_table_is_one_row_a_training_and_skin_and_survives_csv():
     points = {"labels": [{"method": "ridge", "inputs": "raw", "labels_n": 5, "fold": "b0", "seed_i": 1,
                           "scores": every()[0]["scores"]}]}  # fmt: skip
     table = tidy([shifted("b0", 1), *every()], points)
-    assert list(table.columns) == [*KEYS, *METRICS, COVERAGE]
+    assert list(table.columns) == [*KEYS, *METRICS, *SURENESS]
     assert len(table) == (2 + 3) + (2 * 6 + 12) + (2 + 1)  # as labelled and registered, and each skin
     (row,) = by_skin(select(table, question="labels")).to_dict("records")
     assert (row["board"], row["skin"], row["labels_n"], row["method"]) == ("b0", "s0", 5, "ridge")

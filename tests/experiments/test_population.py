@@ -10,7 +10,7 @@ from pipeline.core.seeds import rng_for
 from pipeline.dataset.rows import Rows
 from pipeline.dataset.splits import Fold
 from pipeline.experiments.population import show, taught
-from pipeline.experiments.population.run import cases, over_boards
+from pipeline.experiments.population.run import _weight, cases, over_boards
 from pipeline.synthesis.settings import BoardKind
 from pipeline.trials.experts import Frame
 from pipeline.twin.population import Population
@@ -21,7 +21,7 @@ KIND = BoardKind(
     design={"chips_xy_mm": ((0.0, 0.0),), "chips_turn_deg": (0.0,), "gap_mm": 1.1},
 )  # fmt: skip
 STAT = {"mean": 90.0, "sd": 2.0, "n": 6}
-METRICS = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2", "mse_f_weight_N2", "coverage_pct")
+METRICS = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2", "mse_f_weight_N2", "mse_f_factor_N2", "coverage_pct")
 
 
 def test_the_designed_skin_is_the_law_that_its_scene_simulates():
@@ -71,11 +71,25 @@ def test_a_skins_pool_is_one_poke_at_each_place_and_none_of_it_is_tested():
     assert len(case.true) == len(fold.test)
 
 
+def test_the_weight_is_the_press_of_the_middle_that_comes_next_to_its_force():
+    force_N = np.repeat([1.0, 4.0, 8.0, 1.0, 4.5], 2).astype(np.float32)  # two readings of each of five presses
+    x_mm = np.repeat([8.0, 8.0, 8.0, 10.0, 10.0], 2).astype(np.float32)
+    target, poke = np.stack([x_mm, np.full(10, 8.0, np.float32), force_N], axis=1), np.repeat(np.arange(5), 2)
+    names = (np.full(10, name) for name in ("c", "b0", "b0_s0"))
+    db_uT = np.stack([force_N, x_mm, force_N], axis=1)
+    data = SimpleNamespace(rows=Rows(*names, db_uT, target, np.zeros(10, np.int32), poke, {}))
+    weight = _weight(data, np.arange(10), Frame(np.eye(3)[None], (8.0, 8.0), mirrored=False), rng_for(0, "weight"))
+    np.testing.assert_array_equal(weight.db_uT, [4, 8, 4])
+    assert 3.5 < weight.force_N < 4.5  # of 4 N, known to 2 %
+    assert weight.force_N != 4.0
+
+
 def test_tables_and_figure_show_every_way():
     rows = [{"way": way, "pokes_n": 65, "labels_n": 0, **dict.fromkeys(METRICS, STAT)} for way in show.NAMES]
     numbers = {
         "told": rows, "scaling": [row | {"skins_n": n} for row in rows for n in (30, 3000)], "steps_n": 5,
         "pool_n": 65, "skins_asked_n": 12, "rows_asked_n": 24000, "coverage_further_pct": {"map": 90.0},
+        "weight_N": 5.0, "weight_sd": 0.02,
     }  # fmt: skip
     tables = show.tables(numbers, "simulated")
     assert len(tables["population"]) == 3

@@ -213,9 +213,15 @@ def test_many_pokes_are_what_each_poke_is_alone_to_the_last_bit():
         np.testing.assert_array_equal(of_many, change(poke_m))
 
 
-@pytest.mark.parametrize("base", ["bonded", "slipping"])
-@pytest.mark.parametrize("thickness_mm", [1.82, 2.0])
-@pytest.mark.parametrize(("at", "error"), [(0.0, 0.003), (0.5, 0.006)])
+@pytest.mark.parametrize(  # each pair of a base, a thickness and a kind of depth once
+    ("base", "thickness_mm", "at", "error"),
+    [
+        ("bonded", 1.82, 0.0, 0.003),
+        ("bonded", 2.0, 0.5, 0.006),
+        ("slipping", 1.82, 0.5, 0.006),
+        ("slipping", 2.0, 0.0, 0.003),
+    ],
+)
 def test_tables_give_the_change_that_following_every_node_gives(thickness_mm, at, error, base):
     # 1.82 mm lies halfway between two tables. At the tables' depths: what interpolating in R/h and r costs. Between
     # them 0.6 %: following ends there with half a step, and half steps change dB by as much themselves (flow.STEP).

@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
-from pipeline import plan
+from pipeline import adding, plan, preparing
 from pipeline.core import config
+from pipeline.preparing import Labels
 from tests.stages.checkout import copy_checkout, run
 
 SAID = "said.txt"  # by DVC in the first run
@@ -30,13 +31,11 @@ def lab(tmp_path_factory, shared_data) -> Iterator[Path]:
         YAML().dump(settings, stream)
     plan.use(root, [])
     for board in (1, 2):
-        add(root, shared_data / f"lab/board{board}_depth2.csv", f"board{board}", f"skin{board}")
+        labels = Labels(f"board{board}", f"skin{board}", None)
+        prepared = preparing.foreign(shared_data / f"lab/board{board}_depth2.csv", "lab", labels, {})
+        adding.add(root, "lab", prepared, allow_copy=False)
     (root / SAID).write_text(run(root, "dvc", "repro").stdout)
     return root
-
-
-def add(root: Path, file: Path, board: str, skin: str, *more: str) -> None:
-    run(root, "reskin", "add", str(file), "--layout", "lab", "--board", board, "--skin", skin, "--scene", "lab", *more)
 
 
 def by_board(root: Path) -> dict:
@@ -59,8 +58,9 @@ def test_stages_run_in_the_order_by_which_they_are_counted(lab):
 
 
 def test_a_third_board_is_one_command_and_no_line_of_code(lab, shared_data):
-    add(lab, shared_data / "lab/board1_depth1.csv", "board3", "skin3")  # stands for a third board
-    said = run(lab, "dvc", "repro").stdout
+    file = str(shared_data / "lab/board1_depth1.csv")  # stands for a third board
+    run(lab, "reskin", "add", file, "--layout", "lab", "--board", "board3", "--skin", "skin3", "--scene", "lab")
+    said = run(lab, "dvc", "repro", "report@lab").stdout
     assert sorted(by_board(lab)) == ["board1", "board2", "board3"]
     assert "Stage 'ingest@lab-board1_skin1_board1_depth2' didn't change, skipping" in said
     run(lab, "reskin", "remove", "lab", "board3_skin3_board1_depth1")

@@ -15,7 +15,7 @@ from pipeline.capture.readers import eflash7, eflesh, ini, lab
 from pipeline.capture.readers.table import read_cells
 from pipeline.core.errors import CaptureError
 from pipeline.core.schema import Readings
-from tests.capture.headers import make_header
+from tests.capture.headers import AS_USUAL, make_header
 
 SPATIAL = "eflesh/spatial_resolution/20250316_155729_probe"
 NORMAL = "eflesh/normal_force/20250401_014340_probe"
@@ -33,7 +33,7 @@ def ingest(reader: ModuleType, recording: Path, folder: Path, **changed: object)
 
 
 def read_checked(reader: ModuleType, folder: Path, header: Header) -> tuple[Readings, dict[str, int]]:
-    readings, account = reader.read(folder, header)
+    readings, account = reader.read(folder, header, AS_USUAL)
     lost_n = sum(count for name, count in account.items() if name.startswith("dropped_"))
     assert account["rows_n"] + lost_n + account["noload_rows_n"] == account["rows_read_n"]
     assert account["rows_n"] == len(readings)

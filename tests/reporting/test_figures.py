@@ -1,3 +1,4 @@
+import io
 import re
 import xml.etree.ElementTree as ET
 
@@ -61,3 +62,15 @@ def test_letters_of_formulas_have_another_family_to_fall_back_on():
 def test_same_data_same_bytes_other_data_other_bytes():
     assert draw() == draw()
     assert draw() != error_grid(PLACES_MM, PLACES_MM + np.arange(12)[:, None], title="lab (recorded), lobo")
+
+
+def test_axes_lie_where_matplotlib_lays_them_out_when_it_saves():
+    def places(save) -> list[tuple[float, ...]]:
+        with drawing(5.0, 3.0) as figure:
+            for axes, scale in zip(figure.subplots(1, 2), ("linear", "log"), strict=True):
+                axes.plot([1, 10, 1000])
+                axes.set(ylabel="force / N", title="a long title of a panel", yscale=scale)
+            save(figure)
+            return [axes.get_position().bounds for axes in figure.axes]
+
+    assert places(svg) == places(lambda figure: figure.savefig(io.BytesIO(), format="svg"))

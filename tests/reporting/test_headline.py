@@ -51,6 +51,24 @@ def test_the_answer_says_ours_with_its_interval_and_the_papers():
         assert f"(paper: {TABLE_2[name]['accuracy_pct'][0]:.3g} %)" in said
 
 
+def test_experts_that_were_asked_lead_and_stand_first_in_figure_and_table():
+    numbers = all_questions()
+    told = [
+        {"way": way, "pokes_n": pokes_n, "labels_n": labels_n, "accuracy_pct": over_boards(*accuracy), "n": 2}
+        | {metric: numbers["table2"]["multi"][metric] for metric in ("mse_xy_mm2", "mse_f_N2")}
+        for way, pokes_n, labels_n, accuracy in (
+            ("universal", 16, 0, (70.0, 72.0)), ("universal", 65, 0, (90.0, 92.0)), ("universal", 65, 5, (95.0, 97.0)),
+            ("map", 65, 0, (50.0, 52.0)),
+        )
+    ]  # fmt: skip
+    numbers |= {"population": {"told": told}}
+    assert "never seen: universal, told 65 unlabelled pokes 91 [90, 92] %; multi-sensor" in answer(numbers)
+    first = short_table(numbers).iloc[0]
+    assert "65 unlabelled pokes" in first["boards never seen"]
+    assert "91" in first["accuracy, % (ours)"]
+    assert "65 unlabelled" in words_of(headline_figures(numbers, "simulated")[FILE])
+
+
 def test_the_answer_with_labels_is_of_the_model_that_is_told_its_skin_and_of_the_usual_one():
     numbers = json.loads((REPORTS / "lab" / "numbers.json").read_text())
     said, usual = answer(numbers), numbers["labels"][0]["method"]

@@ -102,7 +102,9 @@ def test_a_question_that_was_not_asked_is_absent_and_not_null():
     without = numbers([*of_boards("lobo", 80.0), *of_boards("triplet", 78.0)])
     assert without.keys() == {"table2", "lobo", "paired", "variants"}
     assert [(one["of"], one["over"]) for one in without["paired"]] == [("triplet", "multi")]
-    assert numbers(of_skins("paper", 78.0, 1.0)).keys() == {"table2", "variants"}
+    alone = numbers(of_skins("paper", 78.0, 1.0))
+    assert alone.keys() == {"table2", "adapt", "variants"}
+    assert alone["adapt"] == {"pokes_n": 390}  # with no control
     assert "null" not in json.dumps(numbers())
 
 

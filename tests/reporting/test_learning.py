@@ -202,6 +202,9 @@ def test_labelled_pokes_show_both_ways_of_scoring_places():
         "MSE_xy, mm²": "0.5 ± 1", "MSE_F, N²": "–", "accuracy, % (registered)": "42 ± 1",
         "MSE_xy, mm² (registered)": "0.2 ± 1", "n": "6",
     }  # fmt: skip
+    sure = one | {"as_labelled": row(30.0) | {"coverage_pct": {"mean": 91.0, "n": 2}}}
+    (_, line) = labels_table([one, sure], "recorded").to_dict("records")
+    assert (line["in 90 % intervals, %"], line["half of them, mm (median)"]) == ("91", "–")
 
 
 def test_a_leak_that_nobody_knew_of_stands_out():

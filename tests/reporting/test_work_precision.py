@@ -110,8 +110,8 @@ def test_pages_cope_with_a_scene_that_asked_for_one_study_or_none():
 def test_what_a_stage_cost_stands_beside_its_last_run_and_what_that_reused():
     (row,) = costs({"train_multi": cost(seconds=0.25)}).to_dict("records")
     assert row == {
-        "stage": "train_multi", "computed, s": "3.0", "last run, s": "0.2", "trainings": "2", "of them reused": "1",
-        "peak memory of a process, MB": "2",
+        "stage": "train_multi", "computed, s": "3.0", "last run, s": "0.2", "CPU of it, s": "–",
+        "trainings": "2", "of them reused": "1", "peak memory of a process, MB": "2",
     }  # fmt: skip
 
 

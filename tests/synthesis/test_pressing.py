@@ -14,6 +14,7 @@ from pipeline.physics.skin import draw_skin, forces
 from pipeline.synthesis.capture import record, to_files
 from pipeline.synthesis.pressing import LIFTED_MM, depths_under, footfalls, half_sine, presses, weights_N
 from pipeline.synthesis.protocols import SKIN_MM, Press
+from tests.capture.headers import AS_USUAL
 from tests.synthesis.scene import synthesis, with_protocol
 
 SHARED = {"boards": "rigid", "skins_n": 1, "terms": []}
@@ -169,14 +170,14 @@ def test_a_walk_leaves_the_log_of_an_sd_card_and_its_truth_and_is_no_capture_to_
     np.testing.assert_allclose(temperature_degC, capture.temperature_degC, atol=5.1e-3)
     assert account["rows_n"] == len(t_s)
     with pytest.raises(CaptureError, match="layout must be native or one of .*; got sd-card"):
-        open_capture(tmp_path / capture.name)
+        open_capture(tmp_path / capture.name, AS_USUAL)
 
 
 def test_presses_and_fillings_come_through_the_same_door_as_everything(tmp_path):
     for name, protocol in (("press", PRESS), ("glass", GLASS)):
         capture = capture_of(name, protocol)
         write_capture(tmp_path / capture.name, *to_files(capture, with_protocol(name, protocol)))
-        opened = open_capture(tmp_path / capture.name)
+        opened = open_capture(tmp_path / capture.name, AS_USUAL)
         blocks = list(opened.blocks)
         logged_N = capture.probe.Fz_N[capture.probe.contact]
         readings_n = 1 if name == "press" else 3

@@ -1,4 +1,7 @@
-"""Stage ambient: what fields from outside and iron nearby cost, and what subtracting them regains (section 7)."""
+"""Stage ambient: what fields from outside and iron nearby cost, and what subtracting them regains (section 7).
+
+Refuses to know how fields add up (`fields`) and how networks are trained (`trials`).
+"""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace

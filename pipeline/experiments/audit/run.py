@@ -1,4 +1,7 @@
-"""Stage audit: do results rest on test rows? Folds, scalers, adaptations and the choice of settings, checked again."""
+"""Stage audit: do results rest on test rows? Folds, scalers, adaptations and the choice of settings, checked again.
+
+Refuses to mend what it finds: it fails the stage on a leak, and tells the rest.
+"""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial

@@ -1,7 +1,8 @@
 """Stage bound: one simulated skin and its chips' noise -> the least error of x, y and force, beside a network's.
 
 Cramér-Rao: no unbiased estimate of a poke from one row has less variance than the inverse of Fisher's information. Of
-the poke nothing is known beforehand; of the skin, its board and the pokes before, everything.
+the poke nothing is known beforehand; of the skin, its board and the pokes before, everything. Refuses to know recorded
+skins, whose laws nobody knows, and to train.
 """
 
 from collections.abc import Callable, Mapping

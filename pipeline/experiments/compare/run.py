@@ -1,7 +1,7 @@
 """Stage compare: recorded changes of field beside simulated ones, for each board of a recorded scene.
 
 Simulated with the nominal skin, with a law fitted on the board, and with the law of another board, of which only what
-may differ from board to board is fitted anew.
+may differ from board to board is fitted anew. Refuses to know folds and networks.
 """
 
 from collections.abc import Mapping, Sequence

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32, Int64
-from sklearn.neighbors import KNeighborsRegressor, NearestNeighbors
 
 from pipeline.core.errors import ParamsError
 from pipeline.dataset.rows import Rows
@@ -23,8 +22,7 @@ NOISE_uT = 15.0  # of all channels of a reading together (a channel's is 3 to 5 
 def neighbour_distance(known: Float[np.ndarray, "a c"], asked: Float[np.ndarray, "f c"]) -> Float[np.ndarray, " f"]:
     """Give the mean distance to the nearest known rows, each column in units of its deviation among these."""
     scale = np.maximum(known.std(axis=0), 1e-12)
-    found = NearestNeighbors(n_neighbors=min(NEIGHBOURS_N, len(known))).fit(known / scale)
-    return found.kneighbors(asked / scale)[0].mean(axis=1)
+    return _neighbour_distance(known / scale, asked / scale)
 
 
 def direction_distance(
@@ -32,6 +30,12 @@ def direction_distance(
 ) -> Float[np.ndarray, " f"]:
     """Give the mean distance to the nearest known directions dB / (|dB| + noise): a weak reading's weighs less."""
     known, asked = (db_uT / (np.linalg.norm(db_uT, axis=1, keepdims=True) + NOISE_uT) for db_uT in (known_uT, asked_uT))
+    return _neighbour_distance(known, asked)
+
+
+def _neighbour_distance(known: Float[np.ndarray, "a c"], asked: Float[np.ndarray, "f c"]) -> Float[np.ndarray, " f"]:
+    from sklearn.neighbors import NearestNeighbors  # late: it takes a second, and scenes are checked without it
+
     found = NearestNeighbors(n_neighbors=min(NEIGHBOURS_N, len(known))).fit(known)
     return found.kneighbors(asked)[0].mean(axis=1)
 
@@ -45,6 +49,8 @@ def residual(
 
     Its field is that of the `known` (x_mm, y_mm, F_N; uT) nearest to the answer; a force that none knows is not asked.
     """
+    from sklearn.neighbors import KNeighborsRegressor  # late, as above
+
     target, known_uT = known
     columns = ~np.isnan(target).any(axis=0)
     scale = np.maximum(target[:, columns].std(axis=0), 1e-12)

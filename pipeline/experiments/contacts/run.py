@@ -1,4 +1,7 @@
-"""Stage contacts: what networks of single contacts make of two at once, and whether two are detected (section 7)."""
+"""Stage contacts: what networks of single contacts make of two at once, and whether two are detected (section 7).
+
+Refuses to know how networks are trained (`trials`).
+"""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path

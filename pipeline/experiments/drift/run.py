@@ -1,4 +1,7 @@
-"""Stage drift: a network for each no-load policy, trained on first contacts, tested on later ones (section 4)."""
+"""Stage drift: a network for each no-load policy, trained on first contacts, tested on later ones (section 4).
+
+Refuses to know how a skin ages (`physics`).
+"""
 
 from collections.abc import Iterator, Sequence
 from functools import partial

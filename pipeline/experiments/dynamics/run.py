@@ -1,6 +1,7 @@
 """Stage dynamics: presses that never rest, read one by one or five at once -> errors by duration (section 7).
 
-The last five readings are what the paper averages at rest; in a press they are of five different depths.
+The last five readings are what the paper averages at rest; in a press they are of five different depths. Refuses to
+know how a press is simulated and networks are trained.
 """
 
 from collections.abc import Callable, Mapping, Sequence

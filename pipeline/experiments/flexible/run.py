@@ -1,4 +1,7 @@
-"""Stage flexible: networks of rigid boards on flexible ones, before and after they are adapted (section 5)."""
+"""Stage flexible: networks of rigid boards on flexible ones, before and after they are adapted (section 5).
+
+Refuses to know how networks are adapted (`trials.adapting`).
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

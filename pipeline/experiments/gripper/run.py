@@ -1,7 +1,8 @@
 """Stage gripper: a finger's skin against objects of any stiffness -> how well one line holds a force (section 6).
 
 The force that is fed back is that of networks that never saw the skin, or of the map that comes with the project: as it
-is, or after one press of the aimed force, which is known, where the object will be held.
+is, or after one press of the aimed force, which is known, where the object will be held. Refuses to know how a press is
+simulated and networks are trained.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence

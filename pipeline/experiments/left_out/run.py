@@ -1,4 +1,7 @@
-"""Stage left_out: what the physics of a simulated scene leaves out -> what that costs, as the rows of one table."""
+"""Stage left_out: what the physics of a simulated scene leaves out -> what that costs, as the rows of one table.
+
+Refuses to know what is left out: `terms` holds it.
+"""
 
 from dataclasses import asdict
 from pathlib import Path

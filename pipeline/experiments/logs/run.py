@@ -1,6 +1,7 @@
 """Stage logs: an SD card's log -> contacts, places and forces over time (section 6, dog shoe and glove).
 
 A simulated log is scored, and read again as of a board that pitches in the earth's field, part of the quiet start.
+Refuses to know how a contact is found and estimated (`estimates`).
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,7 @@
-"""Stage manual: networks adapted to new skins by pokes along lines by hand (section 5, manual indentations)."""
+"""Stage manual: networks adapted to new skins by pokes along lines by hand (section 5, manual indentations).
+
+Refuses to know how networks are adapted (`trials.adapting`).
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace

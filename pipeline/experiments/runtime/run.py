@@ -1,4 +1,7 @@
-"""Stage runtime: error against run time of a simulated scene's physics. Errors are an output, seconds stand beside."""
+"""Stage runtime: error against run time of a simulated scene's physics. Errors are an output, seconds stand beside.
+
+Refuses to let a time decide anything.
+"""
 
 from dataclasses import asdict
 from pathlib import Path

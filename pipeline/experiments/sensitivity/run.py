@@ -1,6 +1,7 @@
 """Stage sensitivity: a glass that is filled on a skin -> the smallest weight told apart (section 6).
 
-A direction is fitted on the first half of the fillings; all else is measured on the second.
+A direction is fitted on the first half of the fillings; all else is measured on the second. Refuses to know networks:
+the field alone is asked.
 """
 
 from pathlib import Path

@@ -1,7 +1,7 @@
 """Stage shear: place and all three forces of dragged lines, by random readings and by whole lines (section 4).
 
 The paper does not say whether MSE_xy and MSE_Fxy sum or average their two axes: here they are means, as MSE_xy is in
-`metrics`.
+`metrics`. Refuses to know how networks are trained.
 """
 
 from collections.abc import Hashable, Mapping, Sequence

@@ -1,4 +1,7 @@
-"""Stage sleeve: places on one large skin over many boards, the last pokes held out (section 6, arm sleeve)."""
+"""Stage sleeve: places on one large skin over many boards, the last pokes held out (section 6, arm sleeve).
+
+Refuses to know how networks are trained, and to look at the last pokes before that.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

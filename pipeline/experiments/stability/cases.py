@@ -1,6 +1,7 @@
 """One row of the stability table: an extreme case, what came of it, and whether that is what should have.
 
 Cases (the modules beside this one) are tried on any inputs: the stage tabulates those of a scene, tests draw others.
+Refuses to know what is tried.
 """
 
 import tracemalloc

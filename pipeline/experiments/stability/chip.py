@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Float32
 from scipy.constants import micro, milli
 
 from pipeline.capture import faults
+from pipeline.capture.decisions import REFUSE_ALL
 from pipeline.capture.header import Clock, Firmware, Header
 from pipeline.capture.readers.chips import Watch
 from pipeline.capture.wire import Frames
@@ -129,7 +130,7 @@ def _watch(b_uT: Float32[np.ndarray, "f ch"], gain_sel: int | None) -> None:
     )  # fmt: skip
     warm = np.full((len(b_uT), chips_n), 25, np.float32)
     frames = Frames(b_uT, warm, np.full(len(b_uT), np.nan), np.arange(len(b_uT), dtype=np.int64))
-    Watch(header, "stability").stuck(frames, np.zeros(len(b_uT), bool))
+    Watch(header, "stability", REFUSE_ALL).stuck(frames, np.zeros(len(b_uT), bool))
 
 
 def _axes(chip_i: int) -> slice:

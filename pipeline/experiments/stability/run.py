@@ -1,4 +1,7 @@
-"""Stage stability: stiff and extreme cases of skins, chips, wires and learning -> the rows of one table."""
+"""Stage stability: stiff and extreme cases of skins, chips, wires and learning -> the rows of one table.
+
+Refuses to know a case: modules beside this one hold them.
+"""
 
 from dataclasses import asdict
 from pathlib import Path

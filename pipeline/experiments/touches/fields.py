@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64
 from scipy.optimize import nnls
-from sklearn.neighbors import KNeighborsClassifier
 
 from pipeline.experiments.contacts.pairs import (
     NEIGHBOURS_N,
@@ -35,6 +34,8 @@ def name_places(
     known_uT: Float32[np.ndarray, "a ch"], places: Float64[np.ndarray, " a"], asked_uT: Float32[np.ndarray, "f ch"]
 ) -> Float64[np.ndarray, " f"]:
     """Answer the place that most of the nearest known directions are of."""
+    from sklearn.neighbors import KNeighborsClassifier  # late: it takes a second, and scenes are checked without it
+
     voters = KNeighborsClassifier(min(NEIGHBOURS_N, len(known_uT))).fit(unit(known_uT), places)
     return np.asarray(voters.predict(unit(asked_uT)))
 

@@ -1,7 +1,8 @@
 """Stage touches: recordings of numbered places, one touched or two -> which place, which force, one or two (section 7).
 
 Places have no millimetres here, so none is asked. Each place was recorded once: by time means that its first part is
-known, which tells recordings apart as well; what is leak-free is asked of recordings that were never seen.
+known, which tells recordings apart as well; what is leak-free is asked of recordings that were never seen. Refuses to
+know millimetres and simulated skins.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,7 @@
-"""Stage variation: how the field of equal pokes differs over time and from skin to skin (figure 4)."""
+"""Stage variation: how the field of equal pokes differs over time and from skin to skin (figure 4).
+
+Refuses to know how skins age and networks.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

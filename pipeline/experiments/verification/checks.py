@@ -1,6 +1,7 @@
 """One row of the verification table: a law of the product, its error against a reference, and what that may be.
 
 Laws (the modules beside this one) return it for any inputs: the stage tabulates those of a scene, tests draw others.
+Refuses to know what is checked.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,7 @@
-"""Stage verification: a simulated scene's physics against independent references -> the rows of one table."""
+"""Stage verification: a simulated scene's physics against independent references -> the rows of one table.
+
+Refuses to know a law: modules beside this one hold them.
+"""
 
 from dataclasses import asdict
 from pathlib import Path

@@ -1,0 +1,89 @@
+"""Reports are verified against the commit: by those of a clean rerun, or by finished ones."""
+
+import json
+import subprocess
+
+import pytest
+from typer.testing import CliRunner
+
+from pipeline import verifying
+from pipeline.cli import app
+from pipeline.core import io
+
+SCORES = "question,fold,accuracy_pct\nlobo,b0,{}\n"
+
+
+def write(reports, accuracy_pct, score=80.0, model="network"):
+    io.write_json(reports / "numbers.json", {"table2": {"accuracy_pct": {"mean": accuracy_pct}}})
+    io.write_text(reports / "tables/scores.csv", SCORES.format(score))
+    io.write_text(reports / "tables/table2.csv", f'model,"accuracy, %"\n{model},{accuracy_pct}\n')
+
+
+@pytest.fixture
+def checkout(tmp_path, monkeypatch):
+    """A checkout whose committed accuracy is 80 %."""
+    write(tmp_path / "reports/quick", 80.0)
+    io.write_text(tmp_path / "dvc.yaml", "stages: {}\n")
+    io.write_text(tmp_path / "data/captures.yaml", "captures: {}\n")
+    author = ("-c", "user.name=a", "-c", "user.email=a@b")
+    for words in (["init", "-q"], ["add", "."], [*author, "commit", "-qm", "x"]):
+        subprocess.run(["git", *words], cwd=tmp_path, check=True)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def said(*words: str) -> tuple[int, str]:
+    done = CliRunner().invoke(app, ["verify-reports", *words])
+    return done.exit_code, done.output
+
+
+@pytest.mark.parametrize(
+    ("changed", "status", "told"),
+    [
+        ((80.0,), 0, "quick: reproduced: all 1 values"),
+        ((81.0, 80.5), 0, "quick, cells of tables: reproduced within tolerance: 4 values equal"),
+        ((90.0,), 1, "| table2.accuracy_pct.mean |"),
+        ((80.0, 70.0), 1, "| scores[lobo].accuracy_pct |"),
+        ((80.0, 80.0, "ridge"), 1, "quick, cells of tables: not reproduced"),
+    ],
+)
+def test_finished_reports_are_held_against_the_commit(checkout, tmp_path_factory, changed, status, told):
+    other = tmp_path_factory.mktemp("other")
+    write(other / "quick", *changed)
+    write(checkout / "reports/quick", 0.0)  # what lies in the working tree is not asked
+    code, output = said("quick", "--against", str(other))
+    assert code == status
+    assert told in output
+
+
+def test_a_rerun_starts_from_the_commit_without_its_reports_and_is_kept(checkout, monkeypatch):
+    def run(clone, environment, *words, quiet=False):
+        if words[0] == "dvc":
+            assert not (clone / "reports/quick").exists()
+            assert words[-1] == "report@quick"
+            write(clone / "reports/quick", 90.0)
+
+    monkeypatch.setattr(verifying, "_run", run)
+    code, output = said("quick")
+    assert code == 1
+    assert "+10" in output
+    kept = json.loads((checkout / verifying.VERIFIED / "quick/numbers.json").read_text())
+    assert kept["table2"]["accuracy_pct"]["mean"] == 90.0
+    assert json.loads((checkout / "reports/quick/numbers.json").read_text())["table2"]["accuracy_pct"]["mean"] == 80.0
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["lab"], "reports/lab/numbers.json must be committed"),
+        (["quick", "--against", "data"], "data: the folder must be one that holds quick/numbers.json"),
+    ],
+)
+def test_what_is_not_there_is_one_sentence(checkout, words, sentence):
+    done = CliRunner().invoke(app, ["verify-reports", *words])
+    assert sentence in str(done.exception)
+
+
+def test_a_command_that_fails_says_where(tmp_path):
+    with pytest.raises(verifying.SchemaError, match="json.tool nowhere: the rerun must be one that ends"):
+        verifying._run(tmp_path, {}, "json.tool", "nowhere", quiet=True)
