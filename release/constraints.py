@@ -1,17 +1,20 @@
 """constraints.txt, made anew. In: pyproject.toml and pip's index. Out: the newest versions that fit together.
 
-python -m release.constraints [FILE]. pip resolves extra `dev` and installs nothing. Run it with the oldest supported
-Python, so that the versions exist for it; then `make test`, and only then commit. Refuses to judge the versions.
+python -m release.constraints [FILE]. pip resolves all extras but `fuzz`, whose package few processors have, and
+installs nothing. Run it with the oldest supported Python, so that the versions exist for it; then `make test`, and only
+then commit. Refuses to judge the versions.
 """
 
 import json
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 from pipeline.core import io
 
-HEAD = "# Exact versions of all that is installed; made with `make constraints`. torch is {torch} and nothing else.\n"
+HEAD = "# Exact versions with all extras but fuzz; made with `make constraints`. torch is {torch} and nothing else.\n"
+LEFT_OUT = "fuzz"
 OF_CUDA = ("nvidia-", "cuda-", "triton")  # torch for other graphics cards brings none of them
 RESOLVE = ("-m", "pip", "install", "--quiet", "--dry-run", "--ignore-installed", "--report", "-")
 
@@ -34,9 +37,19 @@ def render(versions: dict[str, str]) -> str:
     return HEAD.format(torch=versions["torch"]) + lines
 
 
+def wanted(project: str) -> str:
+    """Name the project with its extras, as pip takes it.
+
+    >>> wanted('[project.optional-dependencies]\\ndev = ["pytest"]\\ndask = ["dask"]\\nfuzz = ["atheris"]')
+    '.[dask,dev]'
+    """
+    extras = tomllib.loads(project)["project"]["optional-dependencies"]
+    return f".[{','.join(sorted(extras.keys() - {LEFT_OUT}))}]"
+
+
 def main() -> None:
     file = Path(sys.argv[1] if len(sys.argv) > 1 else "constraints.txt")
-    text = render(resolve(sys.executable, ".[dev]"))
+    text = render(resolve(sys.executable, wanted(Path("pyproject.toml").read_text(encoding="utf-8"))))
     before = set(file.read_text(encoding="utf-8").splitlines()) if file.is_file() else set()
     with io.replacing(file) as temporary:
         temporary.write_text(text, encoding="utf-8")

@@ -1,4 +1,7 @@
-"""The Python interface of the pipeline, for notebooks and controllers: `import reskin`, and see `help(reskin)`."""
+"""The Python interface of the pipeline, for notebooks and controllers: `import reskin`, and see `help(reskin)`.
+
+Knows nothing of its own: `pipeline.api` holds it.
+"""
 
 from pipeline.api import (
     Model,
