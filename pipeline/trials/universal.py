@@ -31,6 +31,7 @@ from pipeline.twin.skin_map import (
     see_pokes,
     see_rest,
 )
+from pipeline.twin.sure import by_labels, by_misfit, left_out
 
 QUESTION = "labels"  # whose folds these are
 METHODS = ("universal map, ", "universal, ")  # the map alone; with networks
@@ -64,7 +65,7 @@ class Pokes:
     force_N: Float[np.ndarray, " m"]
     db_uT: Float[np.ndarray, "m ch"]
 
-    def __getitem__(self, which: slice) -> "Pokes":
+    def __getitem__(self, which: slice | Int64[np.ndarray, " k"]) -> "Pokes":
         """Take some of them."""
         return Pokes(self.place_mm[which], self.force_N[which], self.db_uT[which])
 
@@ -87,9 +88,14 @@ class Told:
         return shift(centre(said, self.pool_mm, labels_n), Labels(said_mm, self.pool.place_mm[:labels_n]))
 
     def tempers(self, sureness: Tempers) -> Tempers:
-        """Believe experts that know no board the less the worse the pokes fit; sure at most as they say themselves."""
-        of_map, of_both = (min(1.0, one / self.misfit) for one in sureness)
+        """Believe experts that know no board the less the worse the pokes fit."""
+        of_map, of_both = (by_misfit(one, self.misfit) for one in sureness)
         return of_map, of_both
+
+    def first(self, which: Int64[np.ndarray, " k"]) -> "Told":
+        """Put some of the pool's pokes first: they are labelled next."""
+        order = np.concatenate([which, np.setdiff1d(np.arange(len(self.pool.force_N)), which)])
+        return replace(self, pool=self.pool[order], pool_mm=self.pool_mm[order])
 
 
 def score_fold(bench: Bench, fold: Fold, rig: Mapping[str, Experts], labels_n: Sequence[int]) -> list[dict[str, Any]]:
@@ -107,6 +113,7 @@ def score_fold(bench: Bench, fold: Fold, rig: Mapping[str, Experts], labels_n: S
         took_s = time.monotonic() - start_s
         for n in labels_n:
             tempers = bench.tempers[board][n] if way == "rig" else told.tempers(bench.sureness[n])
+            (tempers,) = by_own_labels(told, n, [tempers]) if way == "nominal" else [tempers]
             ((alone, both),) = read_both(ready(told, n), test_uT, [tempers])
             for name, temper, found in zip(METHODS, tempers, (alone, both), strict=True):
                 words = {"method": f"{name}{WAYS[way]}", "labels_n": n, "fold": fold.name.rsplit("-draw", 1)[0]}
@@ -157,20 +164,27 @@ def read_both(
     return [(joined(of_map), joined(of_both)) for of_map, of_both in by_temper]
 
 
+def by_own_labels(told: Told, labels_n: int, tempers: Sequence[Tempers]) -> list[Tempers]:
+    """Believe experts by how far labelled pokes are off that they were not told, under each temper."""
+    of_map: list[tuple[list[Estimate], Any]] = []
+    of_both: list[tuple[list[Estimate], Any]] = []
+    for kept, left in left_out(min(labels_n, len(told.pool.force_N))):
+        found = read_both(ready(told.first(kept), len(kept)), told.pool.db_uT[left], tempers)
+        for parts, of_way in zip((of_map, of_both), zip(*found, strict=True), strict=True):
+            parts.append((list(of_way), told.pool.place_mm[left]))
+    ways = zip(zip(*tempers, strict=True), (of_map, of_both), strict=True)
+    return list(zip(*(by_labels(of_way, parts) for of_way, parts in ways), strict=True))
+
+
 def about(answer: Estimate, likely: Estimate) -> Estimate:
     """Give an answer how far what is likely spreads about it."""
     return replace(answer, sd_mm=np.hypot(likely.sd_mm, likely.place_mm - answer.place_mm))
 
 
-def coverages(
-    told: Told, asked: Pokes, labels_n: Sequence[int], tempers: Sequence[float]
-) -> dict[int, Float[np.ndarray, "t 2"]]:
-    """Give what 90 % intervals of pokes hold under each temper, of the map alone and with networks, by labels."""
-    held = {}
-    for n in labels_n:
-        both = read_both(ready(told, min(n, len(told.pool.force_N))), asked.db_uT, [(one, one) for one in tempers])
-        held[n] = np.array([[covered(found, asked.place_mm) for found in pair] for pair in both])
-    return held
+def coverages(told: Told, asked: Pokes, labels_n: int, tempers: Sequence[Tempers]) -> Float[np.ndarray, "t 2"]:
+    """Give what 90 % intervals of pokes hold under each temper, of the map alone and with networks."""
+    both = read_both(ready(told, labels_n), asked.db_uT, tempers)
+    return np.array([[covered(found, asked.place_mm) for found in pair] for pair in both])
 
 
 def covered(estimate: Estimate, place_mm: Float[np.ndarray, "n 2"]) -> float:

@@ -1,4 +1,4 @@
-"""Intervals of experts that know no board widen as unlabelled pokes misfit; what answers are is not moved by it."""
+"""Intervals of experts that know no board widen as pokes misfit and labels are off; no answer is moved by it."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -10,8 +10,9 @@ from pipeline.core.seeds import rng_for
 from pipeline.trials import sureness
 from pipeline.trials.experts import Experts
 from pipeline.trials.sureness import SURENESS, best, skins_of_prior, tell_sureness, told_of
-from pipeline.trials.universal import read_both, ready
+from pipeline.trials.universal import Pokes, by_own_labels, read_both, ready
 from pipeline.twin.network import draw_weights
+from pipeline.twin.sure import ratio
 from pipeline.twin.tables import NOMINAL, OF_NOMINAL
 from pipeline.twin.training import Syllabus
 from tests.twin.skins import SETUP, made_population, made_tables
@@ -53,6 +54,32 @@ def test_pokes_that_fit_worse_make_intervals_wider_and_move_no_answer(nominal):
         for one, wider in pairwise(answers):
             np.testing.assert_array_equal(one.place_mm, wider.place_mm)
             assert wider.sd_mm.mean() > one.sd_mm.mean()
+
+
+@pytest.fixture
+def labelled(nominal):
+    """A skin that fits, and the same with labels that are 3 mm off, each its own way."""
+    told, asked = told_of(nominal, skins_of_prior(nominal, 1, 0, "asked", plain), 0, 0)
+    off_mm = 3 * rng_for(1, "labels").standard_normal(told.pool.place_mm.shape)
+    misled = replace(told, pool=Pokes(told.pool.place_mm + off_mm, told.pool.force_N, told.pool.db_uT))
+    return told, misled, asked
+
+
+def test_labels_that_are_off_where_they_were_not_told_make_intervals_wider(labelled):
+    told, misled, _ = labelled
+    of_told, of_misled = (np.array(by_own_labels(one, 40, [(0.3, 0.3), (0.1, 0.1)])) for one in (told, misled))
+    assert (of_misled < of_told / 2).all()
+    assert by_own_labels(misled, 0, [(0.3, 0.2)]) == [(0.3, 0.2)]  # no label tells nothing
+    few = np.array(by_own_labels(misled, 3, [(0.3, 0.3), (0.1, 0.1)]))
+    assert (of_misled < few).all()  # three tell less than forty
+
+
+def test_a_single_label_is_read_by_experts_that_were_told_none(labelled):
+    told, misled, _ = labelled
+    (found,) = by_own_labels(misled, 1, [(0.3, 0.3)])
+    (blind,) = read_both(ready(told, 0), told.pool.db_uT[:1], [(0.3, 0.3)])
+    off = [np.abs(one.place_mm - misled.pool.place_mm[:1]) / one.sd_mm for one in blind]
+    assert found == pytest.approx([0.3 / ratio(one) for one in off])
 
 
 def test_sureness_is_told_by_skins_of_the_prior_for_every_number_of_labels(nominal, monkeypatch):

@@ -1,0 +1,50 @@
+"""How sure experts may be: every label is left out once; residuals as large as said change nothing."""
+
+import numpy as np
+import pytest
+
+from pipeline.core.seeds import rng_for
+from pipeline.twin.skin_map import Estimate
+from pipeline.twin.sure import PRIOR_N, by_labels, by_misfit, left_out, of_labels, ratio
+
+
+def estimate(off_mm: np.ndarray, sd_mm: float) -> Estimate:
+    nothing = np.zeros(len(off_mm))
+    return Estimate(off_mm, np.full(off_mm.shape, sd_mm), nothing, nothing)
+
+
+@pytest.mark.parametrize("labels_n", [0, 1, 3, 5, 12, 40])
+def test_every_label_is_left_out_once_and_told_otherwise(labels_n):
+    parts = left_out(labels_n)
+    assert sorted(i for _, left in parts for i in left) == list(range(labels_n))
+    assert all(sorted([*kept, *left]) == list(range(labels_n)) for kept, left in parts)
+    assert all(len(left) for _, left in parts)
+
+
+def test_normal_residuals_as_large_as_said_keep_the_temper_and_twice_as_large_ones_quarter_it():
+    off = np.abs(rng_for(0, "residuals").standard_normal((200_000, 2)))
+    assert ratio(off) == pytest.approx(1, abs=0.01)
+    assert ratio(2 * off) == pytest.approx(4, rel=0.01)
+
+
+def test_few_residuals_are_weighed_against_the_prior():
+    assert ratio(np.zeros((0, 2))) == 1
+    none_off = ratio(np.zeros((5, 2)))
+    assert none_off == pytest.approx((PRIOR_N / (PRIOR_N + 10)) ** 2)
+    assert none_off < 1 < ratio(np.full((1, 2), 3.0)) < ratio(np.full((20, 2), 3.0)) < 9 / (2 / np.pi)
+
+
+def test_each_temper_has_its_own_residuals_and_is_never_above_one():
+    at_mm, off_mm = np.zeros((20, 2)), np.ones((20, 2))
+    parts = [([estimate(off_mm, 1.0), estimate(off_mm, 0.25)], at_mm)] * 2
+    assert by_labels([0.2, 0.8], parts) == pytest.approx(
+        [0.2 / ratio(np.ones((40, 2))), 0.8 / ratio(np.full((40, 2), 4.0))]
+    )
+    assert by_labels([0.9], [([estimate(0 * off_mm, 1.0)], at_mm)] * 4) == [1.0]
+    assert by_labels([0.9, 0.3], []) == [0.9, 0.3]
+
+
+def test_sureness_between_told_numbers_of_labels_lies_between_and_beyond_them_stays():
+    told = {0: 0.8, 10: 0.2}
+    assert [of_labels(told, n) for n in (0, 5, 10, 99)] == pytest.approx([0.8, 0.4, 0.2, 0.2])
+    assert [by_misfit(0.5, misfit) for misfit in (0.1, 1.0, 2.0)] == [1.0, 0.5, 0.25]
