@@ -78,10 +78,16 @@ def skins_of_prior(nominal: Experts, skins_n: int, seed: int, name: str, miss: M
 
 
 def told_of(nominal: Experts, skins: Population, i: int, seed: int) -> tuple[Told, Pokes]:
-    """Tell experts of a simulated skin: a random half of its pokes is the pool, the others are asked."""
+    """Tell experts of a simulated skin its pool, and give the pokes that are asked."""
+    pool, asked = pool_of_prior(skins, i, seed)
+    return tell(nominal, skins.rest_uT[i].astype(float), pool), asked
+
+
+def pool_of_prior(skins: Population, i: int, seed: int) -> tuple[Pokes, Pokes]:
+    """Take a random half of a simulated skin's pokes as its pool; the others are asked."""
     order = rng_for(seed, "universal", "pool", i).permutation(skins.db_uT.shape[1])
     pokes = Pokes(*(part[i][order].astype(float) for part in (skins.place_mm, skins.force_N, skins.db_uT)))
-    return tell(nominal, skins.rest_uT[i].astype(float), pokes[:PLACES_N]), pokes[PLACES_N:]
+    return pokes[:PLACES_N], pokes[PLACES_N:]
 
 
 def _of_skin(told: Told, asked: Pokes, labels_n: int) -> Coverage:

@@ -31,7 +31,7 @@ from pipeline.twin.skin_map import (
     see_pokes,
     see_rest,
 )
-from pipeline.twin.sure import by_labels, by_misfit, left_out
+from pipeline.twin.sure import by_misfit, by_residuals, left_out, ratios
 
 QUESTION = "labels"  # whose folds these are
 METHODS = ("universal map, ", "universal, ")  # the map alone; with networks
@@ -172,8 +172,8 @@ def by_own_labels(told: Told, labels_n: int, tempers: Sequence[Tempers]) -> list
         found = read_both(ready(told.first(kept), len(kept)), told.pool.db_uT[left], tempers)
         for parts, of_way in zip((of_map, of_both), zip(*found, strict=True), strict=True):
             parts.append((list(of_way), told.pool.place_mm[left]))
-    ways = zip(zip(*tempers, strict=True), (of_map, of_both), strict=True)
-    return list(zip(*(by_labels(of_way, parts) for of_way, parts in ways), strict=True))
+    of_ways = zip(tempers, *(ratios(len(tempers), parts) for parts in (of_map, of_both)), strict=True)
+    return [(by_residuals(alone, of_alone), by_residuals(both, of)) for (alone, both), of_alone, of in of_ways]
 
 
 def about(answer: Estimate, likely: Estimate) -> Estimate:

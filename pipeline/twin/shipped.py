@@ -4,9 +4,8 @@ For the paper's board: five chips, turned as recorded boards have them. Places a
 at (8, 8) mm. Refuses to know recordings: nothing of them is in the file but the form of the law.
 """
 
-import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
@@ -17,13 +16,10 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from pipeline.core import io
-from pipeline.core.config import parse, read_yaml
 from pipeline.core.errors import SchemaError
 from pipeline.dataset.grid import CENTRE_MM
-from pipeline.physics.skin import SkinDesign
 from pipeline.twin.choosing import worth
-from pipeline.twin.experts import MAP_TEMPER, Labels, multiply, told_mm
-from pipeline.twin.law import Setup
+from pipeline.twin.experts import Labels, multiply, off_middle_mm, told_mm
 from pipeline.twin.opinion import FULL_SET_N, Layers, Weights, ask, moved, of_tensors, tell, to_tensors
 from pipeline.twin.skin_map import (
     ROUNDS_N,
@@ -32,43 +28,40 @@ from pipeline.twin.skin_map import (
     SkinMap,
     joined,
     new_map,
+    see_even,
     see_labelled,
     see_pokes,
     see_rest,
 )
-from pipeline.twin.tables import NOMINAL, OF_NOMINAL, Tables, tabulate
+from pipeline.twin.sure import Sureness, by_misfit, by_residuals, left_out, ratios
+from pipeline.twin.tables import Tables
 
 FILE = Path(__file__).with_name("universal.safetensors")  # its card beside it, .json
+FORMAT = "reskin-universal-3"
 CHIPS_MM = ((0.0, 0.0), (-7.0, 0.0), (0.0, -7.0), (7.0, 0.0), (0.0, 7.0))
 SKIN_MM = (20.0, 20.0)
 TURNS_DEG = (0.0, 180.0, 270.0, 90.0, 0.0)
-TEMPER = 0.5  # assumed, of what both say: two experts on one reading, the mean
 CHOICE_EVERY_N = 3  # of the lattice's places, one may be the next to press
 BLOCK_N = 200  # readings at a time, to bound memory
 CHANNELS_N = 3 * len(TURNS_DEG)
-CARD = {
-    "name": "universal, simulated alone",
-    "format": "reskin-universal-2",
-    "source": "simulated",
-    "centre": asdict(NOMINAL),
-    "map": "pokes of simulated skins on a lattice of places and forces, and their slopes; no recorded row",
-    "network": "taught pokes of simulated skins, with errors of the law drawn anew at every step; no recorded row",
-    "answers": "places: the map's probabilities times the network's normal; misfit: the map's",
-    "made_in_s_of": "one core's processor time; other machines take others",
-    "recorded_knowledge": "the form of the law and the middle of its stiffness and slide, from two recorded boards",
-    "tested_on": "reports/lab, leave-one-board-out: `universal, simulated alone`, told that pokes lie evenly, too",
-    "not_for": "boards of other chips or turns, skins of other magnets, of other thickness, two contacts, shear",
-}
+
+
+Labelled = tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, " m"], Float[np.ndarray, "m ch"]]  # mm, N, uT
+
+
+def none() -> Float[np.ndarray, "0 ch"]:
+    """Give no poke."""
+    return np.zeros((0, CHANNELS_N))
 
 
 @dataclass(frozen=True)
 class Shown:
-    """What networks are told of a skin: its field at rest, pokes (at most a full set), and labelled ones."""
+    """What experts are told of a skin: its field at rest, pokes (at most a full set), and labelled ones."""
 
     rest_uT: Float[np.ndarray, " ch"]
-    pokes_uT: Float[np.ndarray, "c ch"] = field(default_factory=lambda: np.zeros((0, CHANNELS_N)))
-    labelled_mm: Float[np.ndarray, "m 2"] = field(default_factory=lambda: np.zeros((0, 2)))
-    labelled_uT: Float[np.ndarray, "m ch"] = field(default_factory=lambda: np.zeros((0, CHANNELS_N)))
+    pokes_uT: Float[np.ndarray, "c ch"] = field(default_factory=none)
+    even_uT: Float[np.ndarray, "e ch"] = field(default_factory=none)  # those that lie evenly over the skin
+    labelled: Labelled = field(default_factory=lambda: (np.zeros((0, 2)), np.zeros(0), none()))
 
 
 @dataclass(frozen=True)
@@ -78,9 +71,10 @@ class Ready:
     reader: Reader
     networks: Sequence[Layers]
 
-    def estimate(self, db_uT: Float[np.ndarray, "n ch"]) -> Estimate:
-        """Read places and forces by both, and by the map alone whether this is such a skin."""
-        return multiply(self.reader, self.reader.weigh(db_uT), ask(self.networks, db_uT), TEMPER)
+    def estimates(self, db_uT: Float[np.ndarray, "n ch"], tempers: Sequence[float]) -> list[Estimate]:
+        """Read places and forces by both, under each temper, and by the map alone whether this is such a skin."""
+        weighed, opinion = self.reader.weigh(db_uT), ask(self.networks, db_uT)
+        return [multiply(self.reader, weighed, opinion, temper) for temper in tempers]
 
 
 @dataclass
@@ -89,43 +83,67 @@ class Universal:
 
     tables: Tables
     networks: Sequence[Weights]
+    sureness: Sureness
     skin: SkinMap = field(init=False)
 
     def __post_init__(self) -> None:
         """Start from nominal skins."""
         self._noload_uT: np.ndarray | None = None
         self._told: Ready | None = None
+        self._ratio: float | None = None
+        self._temper: float | None = None
         self._nominal = new_map(self.tables)
-        self._learn(self._nominal, Shown(self.tables.rest_uT))
+        self._begin(self._nominal, Shown(self.tables.rest_uT))
 
     @property
     def card(self) -> dict[str, Any]:
         """What the model was made of, and what it must not be used for (its JSON card)."""
         return io.read_json(FILE.with_suffix(".json"))
 
+    @property
+    def misfit(self) -> float:
+        """How badly the pokes that it was let see fit: the median of chi^2 a channel; 1 of none or too few to tell."""
+        self._ready()
+        return float(np.median(self._misfits)) if self.sureness.of_misfit(len(self._misfits)) else 1.0
+
+    @property
+    def temper(self) -> float:
+        """To what power of their product both are believed: by pokes' misfit, and by labels that are left out."""
+        pokes_n, labels_n, even = len(self._shown.pokes_uT), len(self._shown.labelled[0]), len(self._shown.even_uT) > 0
+        told = by_misfit(self.sureness.of(pokes_n, labels_n, even=even), self.misfit)
+        if self._ratio is None:
+            (self._ratio,) = self.ratios([told])
+        return by_residuals(told, self._ratio)
+
     def zero(self, b_uT: Float[np.ndarray, "f ch"]) -> "Universal":
         """Take the mean of readings without contact as the no-load field, and learn the skin's seat and gap from it."""
         self._noload_uT = _rows(b_uT).mean(axis=0)
         rest_uT = to_board(self._noload_uT[None])[0]
-        return self._learn(see_rest(self._nominal, rest_uT), Shown(rest_uT))
+        return self._begin(see_rest(self._nominal, rest_uT), Shown(rest_uT))
 
-    def see(self, b_uT: Float[np.ndarray, "n ch"]) -> "Universal":
+    def see(self, b_uT: Float[np.ndarray, "n ch"], *, even: bool = False) -> "Universal":
         """Learn from pokes at unknown places, a reading each: some dozens all over the skin, later ones as they come.
 
-        The first set is looked at several times over, what comes later once: by then the skin is known.
+        The first set is looked at several times over, what comes later once: by then the skin is known. If these and
+        all before lie evenly over the skin (a grid, each place once), say so: their mean place is then its middle.
         """
-        db_uT, pokes_uT = self._change(b_uT), self._shown.pokes_uT
-        rounds_n = 1 if len(pokes_uT) else ROUNDS_N
+        db_uT, shown = self._change(b_uT), self._shown
+        pokes_uT = np.concatenate([shown.pokes_uT, db_uT])[-FULL_SET_N:]
+        if even:
+            self._misfits = np.full(len(pokes_uT), np.nan)
+            return self._anew(replace(shown, pokes_uT=pokes_uT, even_uT=pokes_uT))._label(*shown.labelled)
+        rounds_n = 1 if len(shown.pokes_uT) else ROUNDS_N
         skin = see_pokes(self.skin, db_uT, rounds_n=rounds_n, reader=self._ready().reader)
-        return self._learn(skin, replace(self._shown, pokes_uT=np.concatenate([pokes_uT, db_uT])[-FULL_SET_N:]))
+        self._misfits = np.concatenate([self._misfits, np.full(len(db_uT), np.nan)])[-FULL_SET_N:]
+        return self._learn(skin, replace(shown, pokes_uT=pokes_uT))
 
     def label(
         self, place_mm: Float[np.ndarray, "m 2"], force_N: Float[np.ndarray, " m"], b_uT: Float[np.ndarray, "m ch"]
     ) -> "Universal":
         """Learn from pokes at known places under known forces, all that are known; earlier ones are forgotten."""
-        on_board_mm, db_uT = np.asarray(place_mm, float) - CENTRE_MM, self._change(b_uT)
-        skin = see_labelled(self.skin, on_board_mm, np.asarray(force_N, float), db_uT)
-        return self._learn(skin, replace(self._shown, labelled_mm=on_board_mm, labelled_uT=db_uT))
+        if len(self._shown.labelled[0]):
+            self._anew(self._shown)
+        return self._label(np.asarray(place_mm, float) - CENTRE_MM, np.asarray(force_N, float), self._change(b_uT))
 
     def next_place(self, force_N: float = 2.0) -> Float[np.ndarray, "2"]:
         """Give the place whose poke, labelled, would tell most of the skin, in mm; about so strong."""
@@ -139,9 +157,26 @@ class Universal:
 
     def estimate(self, b_uT: Float[np.ndarray, "f ch"]) -> Estimate:
         """Give the same with the place's standard deviation, and the misfit: far above 1, this is no skin it knows."""
+        if self._temper is None:
+            self._temper = self.temper
+        return self.estimates(b_uT, [self._temper])[0]
+
+    def estimates(self, b_uT: Float[np.ndarray, "f ch"], tempers: Sequence[float]) -> list[Estimate]:
+        """Give the same under some tempers: only standard deviations differ."""
         db_uT, told = self._change(b_uT), self._ready()
-        found = joined([told.estimate(db_uT[i : i + BLOCK_N]) for i in range(0, len(db_uT), BLOCK_N)])
-        return Estimate(found.place_mm + CENTRE_MM, found.sd_mm, found.force_N, found.misfit)
+        parts = [told.estimates(db_uT[i : i + BLOCK_N], tempers) for i in range(0, len(db_uT), BLOCK_N)]
+        found = [joined(of_temper) for of_temper in zip(*parts, strict=True)]
+        return [replace(one, place_mm=one.place_mm + CENTRE_MM) for one in found]
+
+    def ratios(self, tempers: Sequence[float]) -> list[float]:
+        """Give how much larger variances are than under each temper, by labels: each is left out in its turn."""
+        place_mm, force_N, db_uT = self._shown.labelled
+        networks, parts = self._networks(), []
+        for kept, left in left_out(len(place_mm)):
+            skin = see_labelled(self._unlabelled, place_mm[kept], force_N[kept], db_uT[kept])
+            told = Ready(Reader(skin), self._shifted(networks, place_mm[kept], db_uT[kept]))
+            parts.append((told.estimates(db_uT[left], tempers), place_mm[left]))
+        return ratios(len(tempers), parts)
 
     def __call__(self, db_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f 3"]:
         """Answer changes of field, as a network does."""
@@ -154,14 +189,48 @@ class Universal:
 
     def _ready(self) -> Ready:
         if self._told is None:
-            shown = self._shown
-            networks = [tell(weights, shown.rest_uT, shown.pokes_uT) for weights in self.networks]
-            by_mm = told_mm(Labels(ask(networks, shown.labelled_uT).place_mm, shown.labelled_mm))
-            self._told = Ready(Reader(self.skin), [moved(layers, by_mm) for layers in networks])
+            place_mm, _, db_uT = self._shown.labelled
+            reader, unread = Reader(self.skin), np.isnan(self._misfits)
+            if unread.any():  # pokes misfit the map that has first learnt from them
+                self._misfits[unread] = reader.weigh(self._shown.pokes_uT[unread]).misfit()
+            self._told = Ready(reader, self._shifted(self._networks(), place_mm, db_uT))
         return self._told
 
+    def _networks(self) -> list[Layers]:
+        return [tell(weights, self._shown.rest_uT, self._shown.pokes_uT) for weights in self.networks]
+
+    def _shifted(
+        self, networks: Sequence[Layers], place_mm: Float[np.ndarray, "m 2"], db_uT: Float[np.ndarray, "m ch"]
+    ) -> list[Layers]:
+        # Towards the middle, if pokes lie evenly, then by what labels say.
+        even_uT, said_mm = self._shown.even_uT, ask(networks, db_uT).place_mm
+        by_mm = -off_middle_mm(ask(networks, even_uT).place_mm, len(place_mm)) if len(even_uT) else np.zeros(2)
+        by_mm = by_mm + told_mm(Labels(said_mm + by_mm, place_mm))
+        return [moved(layers, by_mm) for layers in networks]
+
+    def _begin(self, skin: SkinMap, shown: Shown) -> "Universal":
+        self._start, self._misfits = skin, np.zeros(0)
+        return self._anew(shown)
+
+    def _anew(self, shown: Shown) -> "Universal":
+        # From the start, all that is shown but labels.
+        skin = see_pokes(self._start, shown.pokes_uT) if len(shown.pokes_uT) else self._start
+        skin = see_even(skin, shown.even_uT) if len(shown.even_uT) else skin
+        self._ratio = 1.0
+        return self._learn(skin, Shown(shown.rest_uT, shown.pokes_uT, shown.even_uT))
+
+    def _label(
+        self, on_board_mm: Float[np.ndarray, "m 2"], force_N: Float[np.ndarray, " m"], db_uT: Float[np.ndarray, "m ch"]
+    ) -> "Universal":
+        if not len(on_board_mm):
+            return self
+        self._ready()  # pokes misfit a map that no label has bent
+        self._unlabelled, self._ratio = self.skin, None
+        skin = see_labelled(self.skin, on_board_mm, force_N, db_uT)
+        return self._learn(skin, replace(self._shown, labelled=(on_board_mm, force_N, db_uT)))
+
     def _learn(self, skin: SkinMap, shown: Shown) -> "Universal":
-        self.skin, self._shown, self._told = replace(skin, temper=MAP_TEMPER), shown, None
+        self.skin, self._shown, self._told, self._temper = skin, shown, None, None
         return self
 
 
@@ -175,25 +244,38 @@ def load_universal(file: Path = FILE) -> Universal:
 
 
 @lru_cache(maxsize=2)
-def _parts(file: Path) -> tuple[Tables, Sequence[Weights]]:
+def _parts(file: Path) -> tuple[Tables, Sequence[Weights], Sureness]:
+    card_file = file.with_suffix(".json")
+    card = io.read_json(card_file)
+    form = card.get("format") if isinstance(card, dict) else None
+    if form != FORMAT:
+        remedy = "Take file and card of this version, or make them again: python -m pipeline.trials.shipping"
+        raise SchemaError(card_file, "format", FORMAT, form, remedy)
     parts, _ = io.read_tensors(file)
-    names = tuple(io.read_json(file.with_suffix(".json"))["spreads"])
     of_map = {one.name: parts.pop(one.name).astype(float) for one in fields(Tables) if one.name != "names"}
-    return Tables(names=names, **of_map), of_tensors(parts)
+    return Tables(names=tuple(card["spreads"]), **of_map), of_tensors(parts), Sureness.of_card(card["sureness"])
 
 
-def write(tables: Tables, networks: Sequence[Weights], words: Mapping[str, Any], file: Path = FILE) -> None:
-    """Write tables in single precision and networks, and a card of what they are: the spreads, and some words."""
+def write(
+    tables: Tables, networks: Sequence[Weights], sureness: Sureness, words: Mapping[str, Any], file: Path = FILE
+) -> None:
+    """Write tables in single precision and networks, and a card of what they are: how sure, the spreads, some words."""
     parts = [one.name for one in fields(tables) if one.name != "names"]
     of_map = {name: getattr(tables, name).astype(np.float32) for name in parts}
     io.write_tensors(file, of_map | to_tensors(networks), {})
     spreads = dict(zip(tables.names, tables.spreads.tolist(), strict=True))
-    io.write_json(file.with_suffix(".json"), {**words, "spreads": spreads})
+    card = {"format": FORMAT, **words, "sureness": sureness.to_card(), "spreads": spreads}
+    io.write_json(file.with_suffix(".json"), card)
 
 
 def to_board(b_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f ch"]:
     """Turn readings from the chips' axes to the board's."""
     return b_uT @ _turn()
+
+
+def to_chips(b_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f ch"]:
+    """Turn readings from the board's axes to the chips'."""
+    return b_uT @ _turn().T
 
 
 @cache
@@ -208,27 +290,3 @@ def _rows(b_uT: Float[np.ndarray, "..."]) -> Float[np.ndarray, "f ch"]:
         rule, remedy = f"the {CHANNELS_N} of five chips", "Load a model of such boards."
         raise SchemaError("fields", "channels", rule, f"shape {np.shape(b_uT)}", remedy)
     return rows_uT
-
-
-def make() -> None:
-    """Make the file anew, of the skin of params.yaml over the paper's board: some minutes.
-
-    The network is that which scene lab tests as the one that knows no board: the same lessons, the same seed.
-    """
-    from pipeline.twin.training import NAMELESS, Lessons, Syllabus, teach
-
-    design = parse(SkinDesign, read_yaml(Path("params.yaml"))["skin"], "params.yaml: skin")
-    setup = Setup(design, np.array(CHIPS_MM), NOMINAL.gap_mm, SKIN_MM, design.flipped, design.tip_radius_mm)
-    scene = read_yaml(Path("pipeline/scenes/lab.yaml"))
-    lessons = {name: scene["universal"][name] for name in Lessons.model_fields}
-    start_s = time.process_time()
-    tables = tabulate(NOMINAL, OF_NOMINAL, setup)
-    mapped_s = time.process_time()
-    syllabus = Syllabus(NAMELESS, NOMINAL, OF_NOMINAL, setup)
-    networks = teach(syllabus, parse(Lessons, lessons, "pipeline/scenes/lab.yaml: universal"), scene["seed"])
-    took_s = {"map": round(mapped_s - start_s), "network": round(time.process_time() - mapped_s)}
-    write(tables, networks, CARD | {"lessons": lessons | {"seed": scene["seed"]}, "made_in_s": took_s})
-
-
-if __name__ == "__main__":
-    make()

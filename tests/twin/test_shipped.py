@@ -1,11 +1,14 @@
 """The model that comes with the project: it reads simulated pokes, tells what is none, and refuses other boards."""
 
+import shutil
+
 import numpy as np
 import pytest
 
 import reskin
+from pipeline.core import io
 from pipeline.core.errors import SchemaError
-from pipeline.twin.shipped import CHANNELS_N, FILE, Universal, load_universal, to_board
+from pipeline.twin.shipped import CHANNELS_N, FILE, Universal, load_universal, to_chips
 from pipeline.twin.tables import NOMINAL
 
 PLACES_MM = np.array([[8.0, 8.0], [3.0, 6.0], [12.0, 11.0], [10.0, 3.0]])
@@ -21,11 +24,6 @@ def pokes(skin: Universal, force_i: int = 3) -> np.ndarray:
     tables = skin.tables
     at = np.abs((PLACES_MM - 8)[:, :, None] - tables.axis_mm).argmin(axis=2)
     return to_chips(tables.mean_uT[at[:, 0], at[:, 1], force_i])
-
-
-def to_chips(b_uT: np.ndarray) -> np.ndarray:
-    turn = np.stack([to_board(row[None])[0] for row in np.eye(CHANNELS_N)])  # a rotation: its transpose turns back
-    return b_uT @ turn.T
 
 
 def test_a_nominal_skin_is_read_within_the_lattice_and_its_force_between_the_forces(skin):
@@ -75,3 +73,26 @@ def test_pokes_one_by_one_tell_nearly_what_they_tell_at_once(skin):
     for i in range(4, len(stronger_uT)):
         skin.see(stronger_uT[i : i + 1])
     assert np.linalg.norm(skin.skin.number - at_once) < 0.3 * np.linalg.norm(at_once)
+
+
+def test_labels_that_it_cannot_foresee_make_it_less_sure_and_earlier_ones_are_forgotten(skin):
+    rest_uT = to_chips(skin.tables.rest_uT[None])
+    read_uT, force_N = np.tile(pokes(skin), (3, 1)) + rest_uT, np.full(12, skin.tables.force_N[3])
+    place_mm = np.tile(PLACES_MM, (3, 1))
+    skin.zero(rest_uT).label(place_mm, force_N, read_uT)
+    fits, number = skin.temper, skin.skin.number
+    skin.label(place_mm + 3 * np.random.default_rng(0).standard_normal(place_mm.shape), force_N, read_uT)
+    assert skin.temper < fits / 2
+    skin.label(place_mm, force_N, read_uT)
+    np.testing.assert_allclose(skin.skin.number, number)
+    assert skin.temper == pytest.approx(fits)
+    skin.zero(rest_uT)
+    assert skin.temper == pytest.approx(skin.sureness.of(0, 0, even=False))
+
+
+def test_a_model_of_an_earlier_version_is_refused(skin, tmp_path):
+    file = tmp_path / FILE.name
+    shutil.copy(FILE, file)
+    io.write_json(file.with_suffix(".json"), skin.card | {"format": "reskin-universal-2"})
+    with pytest.raises(SchemaError, match="format must be reskin-universal-3; got reskin-universal-2"):
+        load_universal(file)

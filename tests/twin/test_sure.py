@@ -5,7 +5,7 @@ import pytest
 
 from pipeline.core.seeds import rng_for
 from pipeline.twin.skin_map import Estimate
-from pipeline.twin.sure import PRIOR_N, by_labels, by_misfit, left_out, of_labels, ratio
+from pipeline.twin.sure import PRIOR_N, Sureness, by_misfit, by_residuals, left_out, ratio, ratios
 
 
 def estimate(off_mm: np.ndarray, sd_mm: float) -> Estimate:
@@ -34,17 +34,21 @@ def test_few_residuals_are_weighed_against_the_prior():
     assert none_off < 1 < ratio(np.full((1, 2), 3.0)) < ratio(np.full((20, 2), 3.0)) < 9 / (2 / np.pi)
 
 
-def test_each_temper_has_its_own_residuals_and_is_never_above_one():
+def test_each_temper_has_its_own_residuals_of_all_that_was_left_out():
     at_mm, off_mm = np.zeros((20, 2)), np.ones((20, 2))
     parts = [([estimate(off_mm, 1.0), estimate(off_mm, 0.25)], at_mm)] * 2
-    assert by_labels([0.2, 0.8], parts) == pytest.approx(
-        [0.2 / ratio(np.ones((40, 2))), 0.8 / ratio(np.full((40, 2), 4.0))]
-    )
-    assert by_labels([0.9], [([estimate(0 * off_mm, 1.0)], at_mm)] * 4) == [1.0]
-    assert by_labels([0.9, 0.3], []) == [0.9, 0.3]
+    assert ratios(2, parts) == pytest.approx([ratio(np.ones((40, 2))), ratio(np.full((40, 2), 4.0))])
+    assert ratios(2, []) == [1, 1]
 
 
-def test_sureness_between_told_numbers_of_labels_lies_between_and_beyond_them_stays():
-    told = {0: 0.8, 10: 0.2}
-    assert [of_labels(told, n) for n in (0, 5, 10, 99)] == pytest.approx([0.8, 0.4, 0.2, 0.2])
+def test_experts_are_believed_at_most_as_they_say_themselves():
     assert [by_misfit(0.5, misfit) for misfit in (0.1, 1.0, 2.0)] == [1.0, 0.5, 0.25]
+    assert [by_residuals(0.5, of) for of in (0.1, 1.0, 2.0)] == [1.0, 0.5, 0.25]
+
+
+def test_sureness_between_told_numbers_of_labels_lies_between_and_of_pokes_is_that_of_fewer():
+    told = Sureness({0: {0: 0.9, 10: 0.9}, 12: {0: 0.8, 10: 0.2}}, {0: 0.3})
+    assert [told.of(12, n, even=False) for n in (0, 5, 10, 99)] == pytest.approx([0.8, 0.4, 0.2, 0.2])
+    assert [told.of(n, 0, even=False) for n in (0, 11, 12, 65)] == pytest.approx([0.9, 0.9, 0.8, 0.8])
+    assert [told.of_misfit(n) for n in (0, 11, 12, 65)] == [False, False, True, True]
+    assert told.of(65, 7, even=True) == pytest.approx(0.3)
