@@ -88,11 +88,14 @@ def test_tables_and_figure_show_every_way():
     rows = [{"way": way, "pokes_n": 65, "labels_n": 0, **dict.fromkeys(METRICS, STAT)} for way in show.NAMES]
     numbers = {
         "told": rows, "scaling": [row | {"skins_n": n} for row in rows for n in (30, 3000)], "steps_n": 5,
+        "fresh": [row | {"labels_n": n} for n in (0, 5) for row in rows],
         "pool_n": 65, "skins_asked_n": 12, "rows_asked_n": 24000, "coverage_further_pct": {"map": 90.0},
         "weight_N": 5.0, "weight_sd": 0.02,
     }  # fmt: skip
     tables = show.tables(numbers, "simulated")
     assert len(tables["population"]) == 3
+    assert [*tables["population_fresh"]["labels"]] == ["0", "5"]
+    assert sum("90 %" in column for column in tables["population_fresh"]) == len(show.NAMES)
     assert set(tables["population_scaling"]["skins taught"]) == {"30", "3000"}
     assert all("universal" in method for method in tables["population"]["method"])
     assert "skins that the network was taught" in show.figures(numbers, {}, "simulated")["population_scaling.svg"]

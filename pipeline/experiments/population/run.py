@@ -1,7 +1,7 @@
 """Stage population: experts that were taught simulated skins only, on held-out rows of those that table 2 is scored on.
 
 They know the skin and the board as designed; none of the scene's own skins. Further skins of the population tell how
-sure they are. Refuses to know how experts are taught (`taught`).
+sure they are, and fresh ones what their intervals hold. Refuses to know how experts are taught (`taught`).
 """
 
 from collections.abc import Sequence
@@ -46,6 +46,8 @@ QUESTION = "lobo"  # whose folds these are: their pools are those of adaptation
 POOL_MAX_N = 65  # pokes: one at each place of the paper's grid, under any of its depths
 TESTED_MAX_N = 2000  # rows of a skin that are read, drawn
 ASKED_FURTHER_N = 16  # skins of the population that tell how sure experts are
+FRESH_N = 32  # and others, on which is counted what their intervals hold
+BY = ("way", "pokes_n", "labels_n")
 
 
 class Asked(Taught):
@@ -120,10 +122,12 @@ def score_all(
     whole = Experts(new_map(lesson.tables()), [networks[max(section.skins_n)]])
     further = lesson.skins("further", slice(ASKED_FURTHER_N), WEIGHT_N)
     held = cases_of(further, rng_for(lesson.seed, "population", "noise"))
-    rows, sizes, full, trusted = [], [], (max(section.unlabelled_n), 0), {}
+    fresh = cases_of(lesson.skins("fresh", slice(FRESH_N), WEIGHT_N), rng_for(lesson.seed, "population", "fresh noise"))
+    rows, sizes, untaught, full, trusted = [], [], [], (max(section.unlabelled_n), 0), {}
     for told in section.told():
         trusted[told] = trust(whole, held, told)
         rows += [row for case in asked for row in scores_of(whole, case, told, trusted[told])]
+        untaught += [row for case in fresh for row in scores_of(whole, case, told, trusted[told])]
         say(f"{scene} population: told {told[0]} pokes and {told[1]} labels")
     for n, weights in networks.items():
         of_n = [row for case in asked for row in scores_of(fewer(whole, [weights]), case, full, trusted[full])]
@@ -131,7 +135,8 @@ def score_all(
     within = [row for case in held for row in scores_of(whole, case, full, trusted[full])]
     coverage = pd.DataFrame(within).groupby("way")["coverage_pct"].mean().to_dict()
     share = trusted[full].weight_share
-    return pd.DataFrame(rows), pd.DataFrame(sizes), {"coverage_further_pct": coverage, "weight_share": share}
+    words = {"coverage_further_pct": coverage, "weight_share": share, "fresh": over_boards(pd.DataFrame(untaught), *BY)}
+    return pd.DataFrame(rows), pd.DataFrame(sizes), words
 
 
 def over_boards(rows: pd.DataFrame, *keys: str) -> list[dict[str, Any]]:
@@ -159,8 +164,8 @@ def population(scene: str, files: Files, folds: Path, indentations: Path, answer
     asked = [case for fold in data.folds_of(QUESTION) for case in cases(data, fold, frame, rest_uT)]
     rows, sizes, words = score_all(lesson, section, asked, scene)
     numbers = {
-        "told": over_boards(rows, "way", "pokes_n", "labels_n"),
-        "scaling": over_boards(sizes, "way", "pokes_n", "labels_n", "skins_n"),
+        "told": over_boards(rows, *BY),
+        "scaling": over_boards(sizes, *BY, "skins_n"),
         "skins_asked_n": len(asked), "rows_asked_n": sum(len(case.true) for case in asked),
         "pool_n": min(len(case.pool.force_N) for case in asked), "steps_n": section.steps_n,
         "weight_N": WEIGHT_N, "weight_sd": WEIGHT_SD, **words,

@@ -1,6 +1,6 @@
-"""What experts of simulated skins know of others: numbers -> two tables and a figure. Sees no skins and no path."""
+"""What experts of simulated skins know of others: numbers -> three tables and a figure. Sees no skins and no path."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import pandas as pd
@@ -14,6 +14,7 @@ NAMES = {
     "universal": "universal, skin as designed",
     "network": "universal network alone, skin as designed",
 }
+WAYS = {"map": "map", "network": "network", "universal": "both"}
 WEIGHED, FACTOR = "MSE_F with one known weight / N²", "MSE_F after one factor a skin (diagnosis) / N²"
 COVERAGE = "in 90 % intervals / %"
 FURTHER = {"mse_f_weight_N2": WEIGHED, "mse_f_factor_N2": FACTOR, "coverage_pct": COVERAGE}
@@ -25,6 +26,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     scaling = [_line(row, source, taught=row["skins_n"]) for row in numbers["scaling"]]
     return {
         "population": tabulate(told, meaning=_meaning(numbers)),
+        "population_fresh": tabulate(_fresh(numbers["fresh"], source), meaning=_of_fresh(numbers)),
         "population_scaling": tabulate(scaling, meaning=_scaling(numbers)),
     }
 
@@ -52,6 +54,24 @@ def _line(row: Mapping[str, Any], source: str, taught: int | None = None) -> dic
     line = {"method": NAMES[row["way"]]} | ({} if taught is None else {"skins taught": str(taught)})
     line |= {"unlabelled pokes": str(row["pokes_n"]), "labels": str(row["labels_n"]), "source": source}
     return line | scores(row) | scores(row, FURTHER) | {"n": n_of(row)}
+
+
+def _fresh(rows: Sequence[Mapping[str, Any]], source: str) -> list[dict[str, str]]:
+    lines: dict[tuple[int, int], dict[str, str]] = {}
+    for row in rows:
+        told = row["pokes_n"], row["labels_n"]
+        first = {"unlabelled pokes": str(told[0]), "labels": str(told[1]), "source": source}
+        line = lines.setdefault(told, first)
+        line |= scores(row, {"coverage_pct": f"{WAYS[row['way']]}: {COVERAGE}"}) | {"n": n_of(row)}
+    return [{**line, "n": line.pop("n")} for line in lines.values()]
+
+
+def _of_fresh(numbers: Mapping[str, Any]) -> str:
+    return (
+        "Fresh skins of the population: neither those that networks were taught nor those that tell how sure experts "
+        f"are. [low, high]: 95 % interval over n skins. The population is drawn wider than the scene's "
+        f"{numbers['skins_asked_n']} skins."
+    )
 
 
 def _meaning(numbers: Mapping[str, Any]) -> str:
