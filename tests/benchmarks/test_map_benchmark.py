@@ -1,4 +1,4 @@
-"""What the map and network of the project take: a reading as a controller asks, 65 pokes to learn from, one more.
+"""What map and network of the project take: a reading as a controller asks, 65 pokes to learn from, one more, labels.
 
 `pytest -s -o addopts= tests/benchmarks/test_map_benchmark.py`. Processor time of one thread. Nothing is asserted but
 that readings were answered.
@@ -11,6 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from pipeline.core.seeds import rng_for
+from pipeline.dataset.grid import CENTRE_MM
 from pipeline.twin.shipped import CHANNELS_N, load_universal
 
 POKES_N = 65
@@ -20,7 +21,8 @@ def test_readings_one_by_one_and_at_once_and_what_learning_takes():
     skin, rng = load_universal(), rng_for(0, "map")
     tables = skin.tables
     at = rng.integers(len(tables.axis_mm), size=(2, POKES_N))
-    db_uT = tables.mean_uT[*at, rng.integers(len(tables.force_N), size=POKES_N)]
+    force_i = rng.integers(len(tables.force_N), size=POKES_N)
+    db_uT, force_N = tables.mean_uT[*at, force_i], tables.force_N[force_i]
     b_uT = db_uT + tables.rest_uT + rng.normal(0, 4, (POKES_N, CHANNELS_N))  # axes are as good as any for the time
     rest_uT = b_uT[:1] - db_uT[:1]
     print(f"\nload of the machine: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
@@ -37,6 +39,14 @@ def test_readings_one_by_one_and_at_once_and_what_learning_takes():
 
     say(f"{POKES_N} pokes seen and ready", 1e3, "ms", see, 30, lambda: skin.zero(rest_uT).estimate(b_uT[:1]))
     say("one more poke seen and ready", 1e3, "ms", see_one, 50)
+    place_mm = tables.axis_mm[at].T + CENTRE_MM
+    for n in (5, 40):
+
+        def label(i: int, n: int = n) -> None:
+            skin.label(place_mm[:n], force_N[:n], b_uT[:n]).estimate(b_uT[:1])
+
+        say(f"{n} labels told and ready", 1e3, "ms", label, 20, lambda: skin.zero(rest_uT).see(b_uT).estimate(b_uT[:1]))
+    say("one more poke seen and ready, with labels", 1e3, "ms", see_one, 50)
     assert np.isfinite(skin.predict(b_uT)).all()
 
 
