@@ -62,14 +62,15 @@ def _fresh(rows: Sequence[Mapping[str, Any]], source: str) -> list[dict[str, str
         told = row["pokes_n"], row["labels_n"]
         first = {"unlabelled pokes": str(told[0]), "labels": str(told[1]), "source": source}
         line = lines.setdefault(told, first)
-        line |= scores(row, {"coverage_pct": f"{WAYS[row['way']]}: {COVERAGE}"}) | {"n": n_of(row)}
-    return [{**line, "n": line.pop("n")} for line in lines.values()]
+        line |= scores(row, {"coverage_pct": f"{WAYS[row['way']]}: {COVERAGE}"})
+    skins_n = n_of(rows[0])
+    return [line | {"n": skins_n} for line in lines.values()]
 
 
 def _of_fresh(numbers: Mapping[str, Any]) -> str:
     return (
         "Fresh skins of the population: neither those that networks were taught nor those that tell how sure experts "
-        f"are. [low, high]: 95 % interval over n skins. The population is drawn wider than the scene's "
+        "are. [low, high]: 95 % interval over n skins. The population is drawn wider than the scene's "
         f"{numbers['skins_asked_n']} skins."
     )
 
