@@ -97,6 +97,8 @@ def test_tables_and_figure_show_every_way():
     assert [*tables["population_fresh"]["labels"]] == ["0", "5"]
     held = [column for column in tables["population_fresh"] if "90 %" in column]
     assert [*tables["population_fresh"]][-4:] == [*held, "n"]  # the map, both, the network
+    before = {name: value for name, value in numbers.items() if name != "fresh"}
+    assert set(tables) - set(show.tables(before, "simulated")) == {"population_fresh"}
     assert set(tables["population_scaling"]["skins taught"]) == {"30", "3000"}
     assert all("universal" in method for method in tables["population"]["method"])
     assert "skins that the network was taught" in show.figures(numbers, {}, "simulated")["population_scaling.svg"]

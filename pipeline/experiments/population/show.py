@@ -24,11 +24,13 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     """Show errors by what is told of a skin, and by how many skins a network was taught."""
     told = [_line(row, source) for row in numbers["told"]]
     scaling = [_line(row, source, taught=row["skins_n"]) for row in numbers["scaling"]]
-    return {
+    shown = {
         "population": tabulate(told, meaning=_meaning(numbers)),
-        "population_fresh": tabulate(_fresh(numbers["fresh"], source), meaning=_of_fresh(numbers)),
         "population_scaling": tabulate(scaling, meaning=_scaling(numbers)),
     }
+    if "fresh" in numbers:  # committed results may be of before it was counted
+        shown["population_fresh"] = tabulate(_fresh(numbers["fresh"], source), meaning=_of_fresh(numbers))
+    return shown
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
