@@ -1,12 +1,17 @@
 import errno
+import os
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+import safetensors.numpy
 
 from pipeline.core import io
 from pipeline.core.errors import SchemaError
+from pipeline.core.machine import explaining
 from pipeline.core.schema import UNITS
 from tests.dataset.tables import readings
 
@@ -55,6 +60,35 @@ def test_a_failure_in_the_middle_leaves_the_old_file(tmp_path):
         temporary.write_text("half")
         raise RuntimeError
     assert [file.read_text() for file in tmp_path.iterdir()] == ["old"]
+
+
+def test_a_file_that_is_read_for_another_keeps_its_name_when_the_machine_refuses_it(tmp_path):
+    def refused(*names: Path) -> tuple[str, ...]:
+        """Say which file the error names, if the disk named these while a.txt was written."""
+        found = []
+        for number in (errno.EACCES, errno.ENOSPC, errno.EIO):
+            words = (names[0], None, names[1]) if len(names) == 2 else names
+            with pytest.raises(OSError, match="refused") as raised, io.replacing(tmp_path / "a.txt"):
+                raise OSError(number, "refused", *words)
+            found.append("" if raised.value.filename is None else Path(raised.value.filename).name)
+        return tuple(found)
+
+    source, temporary = tmp_path / "source", tmp_path / f".a.txt.{os.getpid()}.tmp"
+    assert refused(source) == ("source", "source", "source")
+    assert refused(temporary) == ("a.txt", "a.txt", "a.txt")
+    assert refused(source, temporary) == ("a.txt", "a.txt", "source")  # of a copy; who refused an EIO is not known
+    assert refused() == ("a.txt", "a.txt", "")
+
+
+def test_a_source_without_rights_is_named_and_not_its_copy(tmp_path):
+    with (
+        pytest.raises(IsADirectoryError, match="source"),
+        explaining("ingest_many"),
+        io.replacing(tmp_path / "copy") as temporary,
+    ):
+        (tmp_path / "source").mkdir()
+        shutil.copyfile(tmp_path / "source", temporary)
+    assert not (tmp_path / "copy").exists()
 
 
 def texts(folder: Path) -> dict[str, str]:
@@ -114,6 +148,60 @@ def test_broken_safetensors_are_one_sentence(tmp_path):
         io.read_tensors(tmp_path / "m.safetensors")
 
 
+def flipped(file: Path) -> Iterator[int]:
+    """Change one bit of a file after another, and give the byte."""
+    whole = file.read_bytes()
+    for i in range(len(whole)):
+        content = bytearray(whole)
+        content[i] ^= 1 << i % 8
+        file.write_bytes(content)
+        yield i
+    file.write_bytes(whole)
+
+
+def test_whichever_bit_of_arrays_changes_it_is_told_or_changes_nothing(tmp_path):
+    file, tensors = tmp_path / "m.safetensors", {"a": np.arange(6.0, dtype=np.float32), "b": np.arange(4)}
+    io.write_tensors(file, tensors, {"format": "1", "trial": "x"})
+    told_n = 0
+    for _ in flipped(file):
+        try:
+            found, words = io.read_tensors(file)
+        except SchemaError as error:
+            told_n += "m.safetensors: the file must be" in str(error)
+            continue
+        assert all(np.array_equal(found[name], tensors[name]) for name in tensors)
+        assert {name: words[name] for name in ("format", "trial")} == {"format": "1", "trial": "x"}
+    assert told_n > file.stat().st_size - 8  # but for bits of the digest's own name
+
+
+def test_a_changed_bit_among_the_readings_of_a_table_is_told(tmp_path):
+    file = tmp_path / "c0.parquet"
+    io.write_readings(file, [readings()], {"rows_n": 6})
+    before, chunks = repr(io.read_table(file).to_pydict()), pq.read_metadata(file).row_group(0)
+    end, told_n = chunks.column(chunks.num_columns - 1).data_page_offset, 0  # behind it: names of columns, the account
+    for i in flipped(file):
+        try:
+            assert repr(io.read_table(file).to_pydict()) == before or i > end
+        except SchemaError as error:
+            told_n += i <= end and "c0.parquet: the file must be readable Parquet" in str(error)
+    assert told_n > end // 2  # the other bits are of the pages' headers, which say nothing of what is read
+
+
+def test_arrays_without_a_digest_are_of_older_code_and_are_read(tmp_path):
+    safetensors.numpy.save_file({"a": np.arange(3.0)}, tmp_path / "m.safetensors", {"format": "1"})
+    tensors, words = io.read_tensors(tmp_path / "m.safetensors")
+    np.testing.assert_array_equal(tensors["a"], np.arange(3.0))
+    assert words == {"format": "1"}
+
+
+def test_same_arrays_same_bytes_in_every_process(tmp_path):
+    words = {name: name for name in "cabdhgfe"}
+    for seed in range(6):
+        io.write_tensors(tmp_path / str(seed), {"b": np.arange(3), "a": np.ones((2, 2))}, words)
+    assert len({file.read_bytes() for file in tmp_path.iterdir()}) == 1
+    assert list(safetensors.safe_open(tmp_path / "0", framework="numpy").keys()) == ["a", "b"]
+
+
 @pytest.mark.parametrize("read", [io.read_bytes, io.read_json, io.read_table, io.read_readings, io.read_tensors])
 def test_a_missing_file_is_called_missing(tmp_path, read):
     with pytest.raises(SchemaError, match="none: the file must be there; got nothing"):
@@ -123,7 +211,7 @@ def test_a_missing_file_is_called_missing(tmp_path, read):
 def test_a_file_that_cannot_be_read_now_is_not_called_damaged(tmp_path, monkeypatch):
     (tmp_path / "a.parquet").write_bytes(b"PAR1")
 
-    def refuse(path):
+    def refuse(path, **_):
         raise OSError(errno.EIO, "Input/output error", str(path))
 
     monkeypatch.setattr(io.pq, "ParquetFile", refuse)

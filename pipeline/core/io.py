@@ -1,7 +1,8 @@
 """Path <-> object: Parquet, safetensors, JSON, CSV. The only module of the core that opens files for writing.
 
 Everything is written to a temporary name beside its target and renamed, so a killed process leaves either the
-old file or the new one, never half of it. Refuses to know what the objects mean.
+old file or the new one, never half of it. Arrays and tables carry checksums, which every reading of them verifies: DVC
+restores files from its cache unread. Refuses to know what the objects mean.
 """
 
 import errno
@@ -25,6 +26,9 @@ from pipeline.core.machine import DISK
 from pipeline.core.schema import Readings, arrow_schema, from_table, to_table
 
 ACCOUNT_KEY = b"reskin.account"
+DIGEST = "digest"  # of a file of arrays, among its words
+HEADER_AT = 8  # bytes of a safetensors file before its header: the header's length
+MEND = "It was cut or changed. In a checkout: delete it, then `reskin check-cache` and `dvc repro`; else copy it again."
 OF_MACHINE = {
     errno.EACCES,
     errno.EIO,
@@ -48,11 +52,19 @@ def replacing(path: Path) -> Iterator[Path]:
             raise SchemaError(path, "a file to write", "no folder", "a folder", "Choose another name.")
         temporary.replace(path)
     except OSError as error:
-        if error.errno in DISK:
+        if error.errno in DISK and _is_written(error, temporary):
             error.filename = str(path)  # not the temporary name, which nobody knows
         raise
     finally:
         remove(temporary)
+
+
+def _is_written(error: OSError, temporary: Path) -> bool:
+    """Tell whether a disk refused what is being written; it may have refused a file that is read for it."""
+    if error.filename is None:  # an open stream's own; of EIO nobody knows whether it was read or written
+        return error.errno != errno.EIO
+    names = (error.filename,) if error.errno == errno.EIO else (error.filename, error.filename2)  # copyfile gives both
+    return any(str(temporary) in str(name) for name in names)
 
 
 @contextmanager
@@ -119,26 +131,52 @@ def read_json(path: Path) -> Any:
 
 
 def write_tensors(path: Path, tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> None:
-    """Write named arrays and a few words about them as safetensors."""
-    with replacing(path) as temporary:
-        dense = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
-        temporary.write_bytes(safetensors.numpy.save(dense, dict(metadata)))  # save_file hides what a disk refused
+    """Write named arrays and a few words about them as safetensors, with a digest of all of it."""
+    dense = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
+    words = {**metadata, DIGEST: _digest(dense, metadata)}
+    content = safetensors.numpy.save(dense, words)
+    with replacing(path) as temporary, temporary.open("wb") as stream:  # save_file hides what a disk refused
+        stream.write(content[:HEADER_AT] + _in_order(content, words))
+        stream.write(memoryview(content)[stream.tell() :])
 
 
 def read_tensors(path: Path, names: Sequence[str] = ()) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Read what `write_tensors` wrote, all of it or these arrays; no pickle is ever opened."""
+    """Read what `write_tensors` wrote; no pickle is ever opened.
+
+    All of it is held against its digest, which files of older code have not; of single arrays, nothing is.
+    """
     _need(path)
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
-            return {name: file.get_tensor(name) for name in names or file.keys()}, file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in names or file.keys()}
+            metadata: dict[str, str] = file.metadata() or {}
     except (safetensors.SafetensorError, OSError) as error:
         _pass_on(error)
-        raise SchemaError(path, "the file", "safetensors", error, "Is it a trained model, copied whole?") from None
+        raise SchemaError(path, "the file", "safetensors", error, f"Is it a trained model? {MEND}") from None
+    written = metadata.pop(DIGEST, None)
+    if not names and written not in (None, _digest(tensors, metadata)):
+        raise SchemaError(path, "the file", "as it was written", "other content", MEND)
+    return tensors, metadata
+
+
+def _digest(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> str:
+    found = hashlib.sha256(repr(sorted(metadata.items())).encode())
+    for name, values in sorted(tensors.items()):
+        found.update(f"{name} {values.dtype} {values.shape}".encode())
+        found.update(values.data)
+    return found.hexdigest()[:32]
+
+
+def _in_order(content: bytes, words: Mapping[str, str]) -> bytes:
+    # The header of a safetensors file with its words sorted: the library's order changes from one process to the next.
+    length = int.from_bytes(content[:HEADER_AT], "little")
+    header = json.loads(content[HEADER_AT : HEADER_AT + length]) | {"__metadata__": dict(sorted(words.items()))}
+    return json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode().ljust(length)
 
 
 def write_table(path: Path, table: pa.Table) -> None:
     with replacing(path) as temporary:
-        pq.write_table(table, temporary, compression="zstd")
+        pq.write_table(table, temporary, compression="zstd", write_page_checksum=True)
 
 
 def read_table(path: Path) -> pa.Table:
@@ -152,7 +190,8 @@ def write_readings(path: Path, blocks: Iterable[Readings], account: Mapping[str,
         writer: pq.ParquetWriter | None = None
         for block in blocks:
             if writer is None:
-                writer = pq.ParquetWriter(temporary, arrow_schema(block.chips_n), compression="zstd")
+                schema = arrow_schema(block.chips_n)
+                writer = pq.ParquetWriter(temporary, schema, compression="zstd", write_page_checksum=True)
             writer.write_table(to_table(block))
         if writer is None:
             raise SchemaError(path, "a capture", "at least one reading", "none", "See what was dropped, and why.")
@@ -189,9 +228,8 @@ def _pass_on(error: Exception) -> None:
 def _parquet(path: Path) -> Iterator[pq.ParquetFile]:
     _need(path)
     try:
-        yield pq.ParquetFile(path)
-    except (pa.ArrowInvalid, OSError) as error:
+        yield pq.ParquetFile(path, page_checksum_verification=True)
+    except (pa.ArrowInvalid, pa.ArrowNotImplementedError, UnicodeDecodeError, OSError) as error:
         _pass_on(error)
-        remedy = "It was cut or changed: delete it, and run the stage that writes it again."
         got = " ".join(str(error).split()).rstrip(".")
-        raise SchemaError(path, "the file", "readable Parquet", got, remedy) from None
+        raise SchemaError(path, "the file", "readable Parquet", got, MEND) from None
