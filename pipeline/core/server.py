@@ -8,6 +8,8 @@ import urllib.error
 import urllib.request
 from contextlib import closing
 
+from pipeline.core.errors import ReskinError
+
 VARIABLE = "MLFLOW_TRACKING_URI"
 TIMEOUT_S = 2.0
 SQLITE = "sqlite:///"
@@ -15,8 +17,10 @@ LOCK_TIMEOUT_S = 5.0  # a UI that reads, or another publication that writes a ru
 PATIENCE_S, PATIENCE_PER_RUN_S = 60.0, 2.0  # a server of one's own network takes 0.1 s a run
 
 
-class TrackingAway(Exception):
+class TrackingAway(ReskinError):
     """The tracking server does not answer; the message says what to do."""
+
+    exit_code = 3
 
 
 def server_uri() -> str | None:

@@ -1,0 +1,113 @@
+"""An object of DVC's cache that was changed is found and named, and what it reached; what is whole stays as it is."""
+
+import hashlib
+import json
+import subprocess
+from pathlib import Path
+
+import pytest
+from ruamel.yaml import YAML
+from typer.testing import CliRunner
+
+from pipeline import caching
+from pipeline.cli import app
+from pipeline.tidying import LOCK
+
+WEIGHTS, FOLDS, RECORDED = "data/models/one/train_multi", "data/folds/one.json", "data/raw/rig/b1"
+
+
+def md5(content: bytes) -> str:
+    return hashlib.md5(content).hexdigest()
+
+
+@pytest.fixture
+def root(tmp_path, monkeypatch) -> Path:
+    """A checkout with a folder of two files, one file and one recording, all of them outputs and in DVC's cache."""
+    subprocess.run(["git", "init", "-q"], cwd=tmp_path, check=True)
+    subprocess.run(["dvc", "init", "-q"], cwd=tmp_path, check=True)
+    (tmp_path / "dvc.yaml").write_text("stages: {}\n")
+    monkeypatch.chdir(tmp_path)
+    folder = {"a.safetensors": b"weights", "a.json": b"card"}
+    listed = json.dumps([{"md5": md5(content), "relpath": name} for name, content in folder.items()]).encode()
+    outs = {"train_multi@one": (WEIGHTS, f"{md5(listed)}.dir"), "split@one": (FOLDS, md5(b"folds"))}
+    stages = {name: {"cmd": "x", "outs": [{"path": path, "md5": name_}]} for name, (path, name_) in outs.items()}
+    files = {FOLDS: b"folds", RECORDED: b"recorded"} | {
+        f"{WEIGHTS}/{name}": content for name, content in folder.items()
+    }
+    for path, content in files.items():
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / path).write_bytes(content)
+    for content in (*files.values(), listed):
+        keep(tmp_path, md5(content) + (".dir" if content is listed else ""), content)
+    with (tmp_path / LOCK).open("w") as stream:
+        YAML().dump({"schema": "2.0", "stages": stages}, stream)
+    with (tmp_path / f"{RECORDED}.dvc").open("w") as stream:
+        YAML().dump({"outs": [{"path": "b1", "md5": md5(b"recorded")}]}, stream)
+    return Path()
+
+
+def at(root: Path, name: str) -> Path:
+    return root / ".dvc/cache/files/md5" / name[:2] / name[2:]
+
+
+def keep(root: Path, name: str, content: bytes) -> None:
+    at(root, name).parent.mkdir(parents=True, exist_ok=True)
+    at(root, name).unlink(missing_ok=True)
+    at(root, name).write_bytes(content)
+    at(root, name).chmod(0o444)
+
+
+def told(root: Path) -> tuple[int, str]:
+    done = CliRunner().invoke(app, ["check-cache"])
+    return done.exit_code, done.output
+
+
+def test_a_whole_cache_is_said_so(root):
+    assert told(root) == (0, "DVC's cache: 5 objects, 0 of them damaged\n")
+
+
+def test_a_damaged_object_that_was_restored_is_taken_away_with_what_came_of_it(root):
+    keep(root, md5(b"weights"), b"w3ights")
+    (root / WEIGHTS / "a.safetensors").write_bytes(b"w3ights")
+    status, words = told(root)
+    assert status == 1
+    assert "the content of the object must be what its name says; got another MD5" in words
+    assert f"no more in {WEIGHTS}/a.safetensors. Run: dvc repro train_multi@one" in words
+    assert not at(root, md5(b"weights")).exists()
+    assert [file.name for file in (root / WEIGHTS).iterdir()] == ["a.json"]
+    assert (root / caching.ASIDE / md5(b"weights")).read_bytes() == b"w3ights"
+    assert told(root) == (0, "DVC's cache: 4 objects, 0 of them damaged\n")
+
+
+def test_an_output_that_is_whole_mends_the_object(root):
+    keep(root, md5(b"folds"), b"f0lds")
+    assert f"It is mended from {FOLDS}." in told(root)[1]
+    assert at(root, md5(b"folds")).read_bytes() == (root / FOLDS).read_bytes() == b"folds"
+    assert at(root, md5(b"folds")).stat().st_mode & 0o777 == 0o444
+    assert told(root)[0] == 0
+
+
+def test_an_output_that_somebody_changed_since_is_left_alone(root):
+    keep(root, md5(b"folds"), b"f0lds")
+    (root / FOLDS).write_bytes(b"by hand")
+    assert told(root)[0] == 1
+    assert (root / FOLDS).read_bytes() == b"by hand"
+
+
+def test_a_damaged_list_of_a_folder_leaves_the_folder(root):
+    name = caching.read_yaml(root / LOCK)["stages"]["train_multi@one"]["outs"][0]["md5"]
+    keep(root, name, b"[")
+    assert "Run: dvc repro train_multi@one" in told(root)[1]
+    assert len(list((root / WEIGHTS).iterdir())) == 2
+
+
+def test_of_a_recording_the_damaged_copy_is_kept(root):
+    keep(root, md5(b"recorded"), b"rec0rded")
+    (root / RECORDED).write_bytes(b"rec0rded")
+    assert f"dvc pull {RECORDED}.dvc, or add the recording again" in told(root)[1]
+    assert (root / caching.ASIDE / md5(b"recorded")).read_bytes() == b"rec0rded"
+
+
+def test_what_nothing_needs_is_only_set_aside(root):
+    keep(root, "0" * 32, b"of an older run")
+    assert "Nothing of dvc.lock needs it" in told(root)[1]
