@@ -18,7 +18,8 @@ def need_rest(root: Path) -> None:
     users = _users(root / LOCKS / BUSY)
     if users or _is_held(root / LOCKS / HELD):
         got = f"one that runs (process {min(users)})" if users else "one that runs"
-        remedy = "Wait for its end, then try again; nothing was changed."
+        stale = f", or, if process {min(users)} is no DVC, delete {LOCKS / BUSY}" if users else ""
+        remedy = f"Wait for its end, then try again{stale}; nothing was changed."
         raise ParamsError("reskin", "this checkout", "free of a running `dvc repro`", got, remedy)
 
 

@@ -36,9 +36,21 @@ def test_a_stage_that_runs_is_named_by_its_process(tmp_path, locks):
         need_rest(tmp_path)
 
 
+def test_a_number_that_another_program_has_by_now_is_told_how_to_be_rid_of(tmp_path, locks):
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as other:  # no DVC
+        note(locks, other.pid)
+        with pytest.raises(
+            ParamsError, match=rf"or, if process {other.pid} is no DVC, delete \.dvc/tmp/rwlock; not"
+        ) as error:
+            need_rest(tmp_path)
+        (tmp_path / str(error.value).partition("delete ")[2].partition(";")[0]).unlink()
+        need_rest(tmp_path)
+        other.communicate()
+
+
 def test_between_two_stages_it_runs_too(tmp_path, locks):
     held = LockFile(str(locks / HELD))
-    with pytest.raises(ParamsError, match="free of a running"):
+    with pytest.raises(ParamsError, match="free of a running .* try again; nothing"):
         need_rest(tmp_path)
     held.close()
     need_rest(tmp_path)
