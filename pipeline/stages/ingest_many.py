@@ -21,17 +21,33 @@ def ingest_many(scene: str, files: Files, raw: Path, code: Path, lost_fraction_m
     """Read every capture of the plan, or take over what was read of it before."""
     settings, kept = read_settings("ingest_many", scene, files), home() / KEPT / scene
     rest_on = repr([settings.shared["faults"], lost_fraction_max]).encode() + io.read_bytes(code)
-    captures, before = settings.plan("captures"), set(kept.glob("*.parquet"))
-    read = {name: kept / f"{_key(raw / name, rest_on)}.parquet" for name in captures}
+    captures, before = (
+        settings.plan("captures"),
+        {file.stem.partition("-")[0]: file for file in kept.glob("*-*.parquet")},
+    )
+    taken, read_n = set(), 0
     with io.replacing(indentations) as folder:
         folder.mkdir()
-        for name, file in read.items():
-            if file not in before:
-                ingest(scene, files, raw / name, lost_fraction_max, file)
-            shutil.copyfile(file, folder / f"{name}.parquet")  # no link: what cuts one must not cut the other
-    for file in before.difference(read.values()):
+        for name in captures:
+            key = _key(raw / name, rest_on)
+            if key not in before or not _is_whole(before[key]):
+                fresh = kept / f"{key}.parquet"
+                ingest(scene, files, raw / name, lost_fraction_max, fresh)
+                before[key], read_n = fresh.rename(kept / f"{key}-{io.sha256(fresh)}.parquet"), read_n + 1
+            shutil.copyfile(before[key], folder / f"{name}.parquet")  # no link: what cuts one must not cut the other
+            taken.add(before[key])
+    for file in set(kept.glob("*.parquet")) - taken:
         io.remove(file)
-    say(f"{scene}: {len(captures)} captures, {len(before.intersection(read.values()))} of them read before")
+    say(f"{scene}: {len(captures)} captures, {len(captures) - read_n} of them read before")
+
+
+def _is_whole(kept: Path) -> bool:
+    """Tell whether kept readings are as they were written; what was damaged is said, and read again."""
+    if io.sha256(kept) == kept.stem.partition("-")[2]:
+        return True
+    say(f"warning: kept readings are damaged and are read again ({kept}: other content than was written)")
+    io.remove(kept)
+    return False
 
 
 def _key(capture: Path, rest_on: bytes) -> str:

@@ -67,3 +67,21 @@ def test_what_was_read_before_a_broken_capture_is_not_lost(run):
         run()
     io.write_text(run.folder / "raw/c2/stream.bin", "mended")
     assert run() == ["c2"]
+
+
+def test_a_damaged_kept_copy_is_said_and_read_again(run, capsys):
+    run()
+    (kept,) = [file for file in (run.folder / stage.KEPT / "lab").iterdir() if file.read_text() == "c1"]
+    kept.write_text("c9")
+    assert run() == ["c1"]
+    assert f"{kept.name}: other content than was written" in capsys.readouterr().err
+    assert run() == []
+
+
+def test_what_was_read_when_the_stage_was_killed_before_it_had_its_name_is_read_again(run):
+    run()
+    kept = run.folder / stage.KEPT / "lab"
+    (file,) = [file for file in kept.iterdir() if file.read_text() == "c2"]
+    file.rename(kept / f"{file.stem.partition('-')[0]}.parquet").write_text("half")
+    assert run() == ["c2"]
+    assert len(list(kept.iterdir())) == 3
