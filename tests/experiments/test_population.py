@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from pipeline.core.errors import SchemaError
 from pipeline.core.seeds import rng_for
 from pipeline.dataset.rows import Rows
 from pipeline.dataset.splits import Fold
@@ -82,6 +83,26 @@ def test_the_weight_is_the_press_of_the_middle_that_comes_next_to_its_force():
     np.testing.assert_array_equal(weight.db_uT, [4, 8, 4])
     assert 3.5 < weight.force_N < 4.5  # of 4 N, known to 2 %
     assert weight.force_N != 4.0
+
+
+def weight_of_middle(force_N: list[float]):
+    """Take the weight from presses of the middle, one reading each."""
+    force = np.array(force_N, np.float32)
+    names = (np.full(len(force), name) for name in ("c", "b0", "b0_s0"))
+    target, db_uT = np.full((len(force), 3), 8, np.float32), np.repeat(force[:, None], 3, axis=1)
+    target[:, 2] = force
+    rows = Rows(*names, db_uT, target, np.zeros(len(force), np.int32), np.arange(len(force)), {})
+    frame, rng = Frame(np.eye(3)[None], (8.0, 8.0), mirrored=False), rng_for(0, "weight")
+    return _weight(SimpleNamespace(rows=rows), np.arange(len(force)), frame, rng)
+
+
+@pytest.mark.parametrize("nothing_N", [0.0, -0.01, -5.0, np.nan])
+def test_a_press_without_a_force_above_nothing_is_no_known_weight(nothing_N):
+    assert weight_of_middle([nothing_N, 4.0, 1.0]).db_uT[0] == 4
+    with pytest.raises(
+        SchemaError, match="skin b0_s0: the known weight must be of a press with a force above 0 N; got 2"
+    ):
+        weight_of_middle([nothing_N, nothing_N])
 
 
 def test_tables_and_figure_show_every_way():

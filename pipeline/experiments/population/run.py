@@ -14,6 +14,7 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from pipeline.core.config import Files, Settings, parse, read_settings
+from pipeline.core.errors import SchemaError
 from pipeline.core.seeds import rng_for
 from pipeline.core.stage import run, say
 from pipeline.dataset.grid import CENTRE_MM
@@ -84,7 +85,13 @@ def _weight(data: SceneData, own: np.ndarray, frame: Frame, rng: np.random.Gener
     off_mm = np.linalg.norm(frame.place(rows.target[own, :2].astype(float)), axis=1).round(1)
     middle = own[off_mm == off_mm.min()]
     press_i, first = np.unique(rows.indentation[middle], return_index=True)
-    next_i = press_i[np.abs(np.log(rows.target[middle[first], 2] / WEIGHT_N)).argmin()]
+    ratio = rows.target[middle[first], 2] / WEIGHT_N
+    off = np.full(len(ratio), np.inf)  # a gauge may read 0 N and less, which no logarithm knows
+    off[ratio > 0] = np.abs(np.log(ratio[ratio > 0]))
+    if np.isinf(off).all():
+        rule, got = "of a press with a force above 0 N", f"{len(ratio)} without"
+        raise SchemaError(f"skin {rows.skin[own[0]]}", "the known weight", rule, got, "Check the sign of its forces.")
+    next_i = press_i[off.argmin()]
     press = middle[rows.indentation[middle] == next_i]
     return weight_of(frame.field(rows.db_uT[press]).mean(axis=0), float(rows.target[press, 2].mean()), rng)
 
