@@ -33,7 +33,7 @@ def check(root: Path, echo: Callable[[str], None]) -> int:
     uses = _uses(root, objects) if damaged else {}
     for name, file in damaged.items():
         rule, cure = "what its name says", _set_aside(root, name, file, uses.get(name, []))
-        echo(str(SchemaError(file, "the content of the object", rule, "another MD5", cure)))
+        echo(f"error: {SchemaError(file, 'the content of the object', rule, 'another MD5', cure)}")
     echo(f"DVC's cache: {len(objects)} objects, {len(damaged)} of them damaged")
     return 1 if damaged else 0
 

@@ -134,26 +134,66 @@ def _damage(file: Path) -> None:
     file.chmod(mode)
 
 
-@fault(
-    "corrupted DVC cache entry",
-    "a bit changed in the cached weights of `train_triplet`; those in the checkout deleted; then `dvc repro`",
-)
-def cache_entry(at: Checkout) -> Row:
-    models = at.folder / f"data/models/{SCENE}/train_triplet"
-    model = _first(models, "*.safetensors")
-    content = model.read_bytes()
+CHECK = ("python", "-m", "pipeline.cli", "check-cache")
+CACHED = {  # what is changed: an output, the file of it, the stage that wrote it, and one that reads it
+    "weights": (f"data/models/{SCENE}/train_triplet", "*.safetensors", TRIPLET, address("adapt")),
+    "dataset (Parquet)": (f"data/indentations/{SCENE}", "*.parquet", address("ingest_simulated"), address("split")),
+}
+
+
+def _restored(at: Checkout, out: str, pattern: str = "") -> tuple[Path, bytes]:
+    """Change a bit in DVC's cached copy of a file, and delete the output, so that DVC restores it from there."""
+    file = _first(at.folder / out, pattern) if pattern else at.folder / out
+    content = file.read_bytes()
     entry = next(
-        file for file in (at.folder / ".dvc/cache/files").rglob("*") if file.is_file() and file.read_bytes() == content
+        each for each in (at.folder / ".dvc/cache/files").rglob("*") if each.is_file() and each.read_bytes() == content
     )
     entry.unlink()
     entry.write_bytes(content)
     entry.chmod(0o444)
     _damage(entry)
-    shutil.rmtree(models)
-    first = at.run("dvc", "repro")
-    again = at.run("dvc", "repro")
-    row = judge(at, first, again, may_run=[TRIPLET], fails=False)
-    row.faults += [] if _first(models, "*.safetensors").read_bytes() == content else ["the changed weights are in use"]
+    io.remove(at.folder / out)
+    return file, content
+
+
+def cached(what: str, folder: str, pattern: str, writer: str, reader: str) -> None:
+    """Enter an object of DVC's cache that was changed, and is restored for a stage that reads it."""
+
+    @fault(
+        f"corrupted DVC cache entry, {what}",
+        f"a bit changed in the cached copy of a `{pattern}` of `{folder}`; the folder deleted, and "
+        f"`{reader.partition('@')[0]}` is yet to run; `dvc repro`; `reskin check-cache`, then the next run",
+    )
+    def case(at: Checkout) -> Row:
+        file, content = _restored(at, folder, pattern)
+        at.forget(reader, cells=False)
+        first, cells = at.run("dvc", "repro"), at.cells()
+        checked = at.run(*CHECK)
+        row = judge(at, first, at.run("dvc", "repro"), may_run=[writer, reader], finished=cells)
+        row.faults += [] if "check-cache" in row.said else ["the remedy is not told"]
+        row.faults += (
+            [] if (checked.status, str(file.relative_to(at.folder)) in checked.text) == (1, True) else ["not found"]
+        )
+        row.faults += [] if file.read_bytes() == content else ["the changed file is in use"]
+        return row
+
+
+for what, where in CACHED.items():
+    cached(what, *where)
+
+
+@fault(
+    "corrupted DVC cache entry, read by no stage",
+    "a bit changed in the cached copy of the folds (JSON); those in the checkout deleted; `dvc repro` restores them "
+    "and runs no stage; `reskin check-cache`, whose words are shown, then the next run",
+)
+def cached_folds(at: Checkout) -> Row:
+    file, content = _restored(at, f"data/folds/{SCENE}.json")
+    restored = at.run("dvc", "repro")
+    row = judge(at, at.run(*CHECK), at.run("dvc", "repro"), may_run=[address("split")])
+    row.faults += [] if (restored.status, restored.ran) == (0, []) else ["it was to be restored"]
+    row.faults += [] if file.read_bytes() == content else ["the changed folds are in use"]
+    row.known = "JSON and CSV carry no checksum: what a disk changed there is found by `reskin check-cache` alone"
     return row
 
 

@@ -88,7 +88,7 @@ class Checkout:
         """Give what the last command has said so far, without the folder's name."""
         return self._said.read_text(errors="replace").replace(f"{self.folder}/", "")
 
-    def stage(self, name: str, find_s: float = 120.0) -> psutil.Process:
+    def stage(self, name: str, find_s: float = LIMIT_S) -> psutil.Process:
         """Wait until DVC has started a stage, and give its process."""
         module = re.compile(rf"pipeline\.(stages\.{name}|experiments\.{name}\.run)$")
         until_s = time.monotonic() + find_s
@@ -99,7 +99,7 @@ class Checkout:
             time.sleep(0.05)
         raise AssertionError(f"stage {name} must start within {find_s:.0f} s:\n{self.said()[-2000:]}")
 
-    def until(self, happened: Callable[[], bool], process: psutil.Process, limit_s: float = 120.0) -> bool:
+    def until(self, happened: Callable[[], bool], process: psutil.Process, limit_s: float = LIMIT_S) -> bool:
         """Wait until something has happened; False if the process ended before."""
         until_s = time.monotonic() + limit_s
         while not happened():
@@ -135,6 +135,7 @@ class Checkout:
                 shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
         with file.open("w") as stream:
             YAML().dump(words, stream)
+        shutil.rmtree(self.folder / ".dvc/cache/runs", ignore_errors=True)  # of what ran since the template was made
         for cell in self.cells() if cells else ():
             (self.folder / ".reskin/cells" / cell).unlink()
 

@@ -47,8 +47,10 @@ def two_stages(at: Checkout) -> Row:
     at.until(lambda: bool(at.cells()), at.stage("train_triplet"))
     second = other.run("dvc", "repro", address("sensitivity"))
     one, finished = at.end(first, start_s), at.cells()
-    row = judge(at, second, at.run("dvc", "repro"), may_run=[], finished=finished, fails=False)
+    yet_to_run = [address("sensitivity")] if second.status else []  # one that was refused has run nothing
+    row = judge(at, second, at.run("dvc", "repro"), may_run=yet_to_run, finished=finished, fails=False)
     row.faults += [] if one.status == 0 else ["the first fails"]
+    row.faults += ["refused, and it ran"] if second.status and second.ran else []
     row.said = row.said or "nothing: both run to their end"
     return row
 

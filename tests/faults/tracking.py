@@ -2,6 +2,7 @@
 
 import http.server
 import re
+import shlex
 import shutil
 import signal
 import socket
@@ -56,12 +57,20 @@ def refused(at: Checkout) -> Row:
     return _report(at, first, at.run("python", "-m", "pipeline.cli", "publish"))
 
 
+HOLE = "10.255.255.1"
+IN_HOLE = (  # a network of its own, whose only neighbour takes what is sent and is not there
+    "ip link set lo up && ip link add hole0 type dummy && ip address add 10.255.255.2/24 dev hole0 && "
+    f"ip link set hole0 up && ip neighbour add {HOLE} lladdr 02:00:00:00:00:01 dev hole0 && exec "
+)
+
+
 @fault(
-    "tracking server black-holed, no route",
-    "an address from which nothing comes back (10.255.255.1)",
+    "tracking server black-holed, nothing comes back",
+    f"a network in which nothing comes back from {HOLE}, as behind a firewall that drops",
 )
 def no_route(at: Checkout) -> Row:
-    return _away(at, "http://10.255.255.1:5000")
+    words = ("unshare", "--net", "sh", "-c", IN_HOLE + shlex.join(at.command("publish")))
+    return _report(at, at.run(*words, MLFLOW_TRACKING_URI=f"http://{HOLE}:5000", no_proxy="*", NO_PROXY="*"), None)
 
 
 @fault("tracking server black-holed, silent", "a socket that accepts and never answers")
