@@ -116,8 +116,10 @@ def _client(uri: str) -> Iterator[Any]:
     os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
     import logging
 
-    for name in ("alembic", "mlflow"):
-        logging.getLogger(name).setLevel(logging.WARNING)
+    # What fails is passed on in a sentence: the traceback that MLflow writes of it would only hide that.
+    levels = {"alembic": "WARNING", "mlflow": "WARNING", "mlflow.store.db.utils": "CRITICAL"}
+    for name, level in levels.items():
+        logging.getLogger(name).setLevel(level)
     import mlflow
     from mlflow.exceptions import MlflowException
     from sqlalchemy.exc import SQLAlchemyError
@@ -125,7 +127,7 @@ def _client(uri: str) -> Iterator[Any]:
     try:
         yield mlflow.MlflowClient(tracking_uri=uri)
     except (MlflowException, SQLAlchemyError, OSError) as error:
-        sentence = " ".join(str(error).split())[:200]
+        sentence = " ".join(str(error).partition("[SQL:")[0].split())[:200]
         raise TrackingAway(
             f"MLflow at {uri} failed ({sentence}). Results are kept; `reskin publish` sends them later."
         ) from None

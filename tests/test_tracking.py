@@ -1,3 +1,4 @@
+import logging
 import shutil
 import socket
 import sqlite3
@@ -11,6 +12,7 @@ import mlflow
 import numpy as np
 import pytest
 
+from pipeline import tracking
 from pipeline.core import io, server
 from pipeline.core.server import TrackingAway, probe
 from pipeline.tracking import publish
@@ -269,6 +271,25 @@ def test_a_store_that_another_program_holds_costs_seconds_and_no_result(tmp_path
         with pytest.raises(TrackingAway, match="database is locked.*Results are kept"):
             write(tmp_path, b0="k0")
     write(tmp_path, b0="k0")
+
+
+def test_a_store_that_fails_in_mid_run_is_one_sentence_and_no_traceback(tmp_path, monkeypatch):
+    write(tmp_path, b0="k0")
+    find, told = tracking.Diary.find, []
+
+    def fails(self, *words, **tags):
+        with closing(sqlite3.connect(tmp_path / "mlflow.db")) as other:
+            other.execute("DROP TABLE IF EXISTS tags")
+        return find(self, *words, **tags)
+
+    monkeypatch.setattr(tracking.Diary, "find", fails)
+    hears = logging.Handler()
+    hears.emit = told.append
+    logging.getLogger("mlflow.store.db.utils").addHandler(hears)
+    with pytest.raises(TrackingAway, match=r"failed \(.*no such table: tags\)\. Results are kept"):
+        write(tmp_path, b0="k1")
+    logging.getLogger("mlflow.store.db.utils").removeHandler(hears)
+    assert told == []
 
 
 def test_a_server_that_is_too_slow_is_left_with_what_is_written_and_taken_up_again(tmp_path, monkeypatch):
