@@ -87,8 +87,8 @@ other stage is an experiment, which starts, writes and fails through the same co
 
 What DVC restores from its cache it does not read: an object that is read-only passes for whole. So arrays (safetensors)
 and tables (Parquet) carry checksums, and a stage, a controller or a page that reads one that was changed stops and says
-so. `reskin check-cache` holds every object against its name, JSON and CSV too, and sets aside what was changed, with its
-copies among the outputs; the next `dvc repro` makes that again. Run it when a disk is in doubt, or a stage says so.
+so. `reskin check-cache` holds every object against its name, JSON and CSV too; it sets aside what was changed and its
+copies among the outputs, and the next `dvc repro` makes that again. Run it when a disk is in doubt, or a stage says so.
 
 {green_n} of {faults_n} green, {not_run_n} not run yet. Code (`git rev-parse HEAD:pipeline`) {code};
 {cores_n} cores, load {load:.0f} at the end, Python {python}; {minutes:.0f} min.

@@ -58,9 +58,10 @@ def refused(at: Checkout) -> Row:
 
 
 HOLE = "10.255.255.1"
-IN_HOLE = (  # a network of its own, whose only neighbour takes what is sent and is not there
-    "ip link set lo up && ip link add hole0 type dummy && ip address add 10.255.255.2/24 dev hole0 && "
-    f"ip link set hole0 up && ip neighbour add {HOLE} lladdr 02:00:00:00:00:01 dev hole0 && exec "
+IN_HOLE = (  # a network of its own: what is sent to its only neighbour goes to a device that nobody reads
+    "ip link set lo up && ip link add hole0 type veth peer name hole1 && ip address add 10.255.255.2/24 dev hole0 && "
+    "ip link set hole1 up && ip link set hole0 up && "
+    f"ip neighbour add {HOLE} lladdr 02:00:00:00:00:01 dev hole0 && exec "
 )
 
 
