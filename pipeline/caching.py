@@ -50,13 +50,13 @@ def _set_aside(root: Path, name: str, file: Path, uses: Sequence[Use]) -> str:
                 shutil.copyfile(path, temporary)
                 temporary.chmod(READ_ONLY)
             return f"It is mended from {path}."
-    for path, digest in outputs:
-        if digest == changed:
-            io.remove(path)
+    copies = [path for path, digest in outputs if digest == changed]
+    for path in copies:
+        io.remove(path)
     if not uses:
         return f"Nothing of dvc.lock needs it; it now lies in {aside}."
-    found = ", ".join(dict.fromkeys(str(path) for _, path in uses))
-    return f"It now lies in {aside}, and no more in {found}. Run: {'; '.join(dict.fromkeys(how for how, _ in uses))}"
+    gone = f", and no more in {', '.join(map(str, dict.fromkeys(copies)))}" if copies else ""
+    return f"It now lies in {aside}{gone}. Run: {'; '.join(dict.fromkeys(how for how, _ in uses))}"
 
 
 def _uses(root: Path, objects: Mapping[str, Path]) -> dict[str, list[Use]]:

@@ -97,7 +97,7 @@ def test_an_output_that_somebody_changed_since_is_left_alone(root):
 def test_a_damaged_list_of_a_folder_leaves_the_folder(root):
     name = caching.read_yaml(root / LOCK)["stages"]["train_multi@one"]["outs"][0]["md5"]
     keep(root, name, b"[")
-    assert "Run: dvc repro train_multi@one" in told(root)[1]
+    assert f"It now lies in {caching.ASIDE}/{name}. Run: dvc repro train_multi@one" in told(root)[1]
     assert len(list((root / WEIGHTS).iterdir())) == 2
 
 

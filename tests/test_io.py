@@ -80,6 +80,16 @@ def test_a_file_that_is_read_for_another_keeps_its_name_when_the_machine_refuses
     assert refused() == ("a.txt", "a.txt", "")
 
 
+def test_a_disk_that_refuses_all_is_told_by_the_name_of_the_target(tmp_path, monkeypatch):
+    def refuse(path: Path) -> None:
+        raise OSError(errno.EROFS, "Read-only file system", str(path))
+
+    monkeypatch.setattr(io, "remove", refuse)
+    with pytest.raises(OSError, match="Read-only") as raised:
+        io.write_text(tmp_path / "a.txt", "new")
+    assert raised.value.filename == str(tmp_path / "a.txt")
+
+
 def test_a_source_without_rights_is_named_and_not_its_copy(tmp_path):
     with (
         pytest.raises(IsADirectoryError, match="source"),

@@ -11,7 +11,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -43,20 +43,20 @@ def replacing(path: Path) -> Iterator[Path]:
     """Give a temporary sibling of `path` to write (a file or a folder); rename it when the block ends well."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    remove(temporary)
     try:
+        remove(temporary)
         yield temporary
         if temporary.is_dir():
             remove(path)
         elif path.is_dir():
             raise SchemaError(path, "a file to write", "no folder", "a folder", "Choose another name.")
         temporary.replace(path)
-    except OSError as error:
-        if error.errno in DISK and _is_written(error, temporary):
+    except BaseException as error:
+        if isinstance(error, OSError) and error.errno in DISK and _is_written(error, temporary):
             error.filename = str(path)  # not the temporary name, which nobody knows
+        with suppress(OSError):  # what the disk refuses here, too, is told by the first error
+            remove(temporary)
         raise
-    finally:
-        remove(temporary)
 
 
 def _is_written(error: OSError, temporary: Path) -> bool:

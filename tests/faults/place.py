@@ -194,7 +194,7 @@ def copy(template: Checkout, folder: Path) -> Checkout:
 def sentence_of(said: Sequence[str] | str) -> str:
     """Pick the sentence that tells a user what went wrong: the stage's own, else DVC's."""
     lines = said.splitlines() if isinstance(said, str) else list(said)
-    for start in ("error:", "warning:", "ERROR:", "WARNING:"):
+    for start in ("error:", "warning:", "ERROR:", "WARNING:", "is invalid"):  # the last: DVC, of its own files
         found = [line for line in lines if line.startswith(start) or f" {start} " in f" {line}"]
         if found:
             return re.sub(r"(sh pipeline/run\.sh \w+).*?(, exited|$)", r"\1 …\2", found[0])

@@ -56,6 +56,7 @@ def judge(
         "a traceback": TRACES in first.text + again.text,
         "a hang": first.status is None or again.status is None,
         "no failure": fails and first.status == 0,
+        "nothing is told": (first.status or 0) > 0 and not sentence_of(first.text),  # one that was killed tells nothing
         f"the next run fails: {sentence_of(again.text)}": again.status not in (0, None),
         f"other results: {', '.join(unlike)}": bool(unlike),
         f"finished stages ran again: {', '.join(more)}": bool(more),
@@ -94,7 +95,9 @@ def not_run(name: str, how: str) -> str:
 
 
 def _plain(text: str) -> str:
-    return re.sub(r"(/tmp|/work|/var)\S*/", "…/", " ".join(text.split())).replace("|", "\\|").replace("<", "&lt;")
+    return (
+        re.sub(r"(?<!\w)(/tmp|/work|/var)\S*/", "…/", " ".join(text.split())).replace("|", "\\|").replace("<", "&lt;")
+    )
 
 
 def table(lines: Sequence[str]) -> str:

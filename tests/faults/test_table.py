@@ -21,3 +21,10 @@ def test_the_sentence_of_a_stage_goes_before_that_of_dvc():
     said = ["x: stage 2 of 3", "error: split: a must b; got c.", "ERROR: failed to reproduce 'split@a'"]
     assert sentence_of(said) == said[1]
     assert sentence_of(said[2:]) == said[2]
+    lock = "'./dvc.lock' is invalid (possible merge conflicts)."
+    assert sentence_of([lock, "", "Mapping values are not allowed"]) == lock
+
+
+def test_only_the_machines_own_folders_are_left_out():
+    row = Row("error: /tmp/x1/case/data must be; delete .dvc/tmp/rwlock", 2, "nothing", "ran adapt")
+    assert "“error: …/data must be; delete .dvc/tmp/rwlock”" in line("f", "h", row, 1.0)
