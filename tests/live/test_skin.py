@@ -94,13 +94,14 @@ def test_a_failed_read_is_no_contact(tmp_path):
     assert skin.health.alarms["chip 1: failed I2C reads"].count_n == 200
 
 
-def test_a_port_that_is_opened_inside_a_frame_raises_no_alarm_and_a_hole_does():
+def test_a_port_that_is_opened_inside_a_frame_loses_nothing_and_raises_no_alarm_and_a_hole_does():
     whole = make_script(pokes_n=0)
-    for cut_i, alarms in ((0, set()), (400, {"bytes lost between frames"})):
-        pieces = [piece[30:] if i == cut_i else piece for i, piece in enumerate(whole.pieces)]
+    for cut_i, left_n, skipped_n in ((0, 52, 52), (0, 1, 1 + 82), (400, 52, 52)):  # a line feed alone begins no frame
+        pieces = [piece[-left_n:] if i == cut_i else piece for i, piece in enumerate(whole.pieces)]
         skin, _ = played(replace(whole, pieces=pieces))
-        assert skin.account["skipped_resync_bytes_n"] == 52
-        assert set(skin.health.alarms) == alarms
+        assert skin.account["skipped_resync_bytes_n"] == skipped_n
+        assert skin.lost_bytes_n == (skipped_n if cut_i else 0)
+        assert set(skin.health.alarms) == ({"bytes lost between frames"} if cut_i else set())
 
 
 def test_a_magnet_is_a_field_from_outside_and_nothing_else(tmp_path):
