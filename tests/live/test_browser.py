@@ -38,6 +38,16 @@ DOT = """((x, y) => { const {state, last, parts: {board}} = boards[0], ratio = d
   scale = Math.min((board.clientWidth - 2 * margin) / wide, (innerHeight * .8 - 2 * margin) / high);
   return last.contact ? [...board.getContext("2d").getImageData(ratio * (margin + (x - left) * scale),
     ratio * (margin + (bottom + high - y) * scale), 1, 1).data].slice(0, 3) : []; })"""
+# How many of a trace's pixels are more or less inked than of one that is drawn at once; how many are inked.
+ANEW = """((board, i) => {
+  const count = i ? board.last.chips : 1, shown = board.traces[i];
+  const anew = new Trace(shown.canvas, shown.first, shown.least);
+  while (shown.draw(board.rows, board.changed, count)) {}
+  board.changed = Infinity; anew.columns = 1e6;
+  while (anew.draw(board.rows, Infinity, count)) {}
+  const [old, fresh] = [shown, anew].map(({pen, layer: {width, height}}) => pen.getImageData(0, 0, width, height).data)
+    .map((values) => values.filter((_, at) => at % 4 === 3));
+  return [old.filter((alpha, at) => Math.abs(alpha - fresh[at]) > 64).length, fresh.filter(Boolean).length]; })"""
 pytestmark = [
     pytest.mark.skipif(BROWSER is None, reason=f"no browser: no RESKIN_BROWSER, on the path none of {NAMES}"),
     pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo-terminals"),
@@ -138,6 +148,10 @@ def test_a_poke_is_drawn_at_its_place_and_zero_and_record_work(tmp_path, monkeyp
             assert abs(float((await tab.text("force")).split()[0]) - force_N) < 0.5
         assert "400" in await tab.text("rate") or float((await tab.text("rate")).split()[0]) > 200
         await tab.look("network")
+        for trace_i in range(2):  # what was moved, stretched and added to looks as what is drawn at once
+            differ_n, inked_n = await tab.value(f"{ANEW}(boards[0], {trace_i})")
+            assert differ_n < 0.01 * inked_n  # Chromium smooths short and long paths in two ways
+            assert inked_n > 1000
         await tab.value("boards[0].parts.record.click()")
         await tab.until("boards[0].state.recording")
         await tab.press_key("r")

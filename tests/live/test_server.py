@@ -107,7 +107,12 @@ def test_a_page_waits_for_a_board_that_is_not_there(tmp_path):
         async with client.ws_connect(f"{address}/live") as socket:
             state = await until(socket, lambda told: "unplugged" in " ".join(told.get("alarms", [])))
             assert state["waiting"]
-        for path, kind in (("/", "text/html"), ("/live.js", "javascript"), ("/live.css", "text/css")):
+        for path, kind in (
+            ("/", "text/html"),
+            ("/live.js", "javascript"),
+            ("/trace.js", "javascript"),
+            ("/live.css", "text/css"),
+        ):
             async with client.get(address + path) as page:
                 assert page.status == 200
                 assert kind in page.headers["Content-Type"]
