@@ -18,7 +18,7 @@ from pipeline.live.server import PAGES_MAX_N, REQUEST_BYTES_MAX_N, Server
 from pipeline.live.session import several
 from pipeline.live.view import BINS_N, HEAD, NUMBERS_N
 from pipeline.predicting import read_network
-from tests.live.boards import PLACES, RATE_HZ, make_script, plugged_in, write_model
+from tests.live.boards import PLACES, RATE_HZ, make_script, plugged_in, write_model, zeros_asked
 
 LONG_S = 120.0
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")  # of sockets that a refused client leaves
@@ -73,6 +73,7 @@ async def until(socket, wanted: Callable[[dict], bool]) -> dict:
 
 def test_a_poke_its_place_force_and_rate_are_on_the_page_and_buttons_zero_and_record(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    asked = zeros_asked(monkeypatch)
     models = [read_network(write_model(tmp_path))]
 
     async def act(address: str, client: aiohttp.ClientSession) -> None:
@@ -96,8 +97,10 @@ def test_a_poke_its_place_force_and_rate_are_on_the_page_and_buttons_zero_and_re
             assert set(header.files) == {"stream.bin", "arrivals.csv"}
             assert (folder / "stream.bin").stat().st_size > 82 * 50
             await socket.send_json({"press": "zero"})
-            await until(socket, lambda told: told.get("zeroed") is False)
-            await until(socket, lambda told: told.get("zeroed") is True)
+            while not asked:
+                await asyncio.sleep(0.02)
+            while not asked[0].zeroed:
+                await asyncio.sleep(0.02)
 
     with plugged_in(make_script(pokes_n=4), loop=True) as name:
         serve(name, models, act)
