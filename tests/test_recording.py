@@ -23,6 +23,7 @@ from tests.capture.signals import make_frames
 from tests.stages.checkout import ROOT
 
 FRAMES = make_frames(200, 5, seed=0)
+LONG_S = 120.0  # a process that starts on a busy machine
 
 
 @pytest.fixture
@@ -42,7 +43,8 @@ def start(name: str, out: Path, *words: str) -> subprocess.Popen:
 
 def send_until_something_came(far: int, part: Path) -> None:
     stream = part / "stream.bin"
-    for _ in range(600):
+    end_s = time.monotonic() + LONG_S
+    while time.monotonic() < end_s:
         if stream.exists():
             os.write(far, encode(FRAMES, "binary")[:1640])
             if stream.stat().st_size:
@@ -56,7 +58,7 @@ def test_ctrl_c_ends_a_recording_that_can_be_added(terminal, tmp_path):
     recorder = start(name, tmp_path / "run1", "--scan", "random")
     send_until_something_came(far, tmp_path / "run1.part")
     recorder.send_signal(signal.SIGINT)
-    said, complained = recorder.communicate(timeout=20)
+    said, complained = recorder.communicate(timeout=LONG_S)
     assert recorder.returncode == 0, complained
     assert complained == ""
     assert "stopped" in said
@@ -97,7 +99,7 @@ def test_what_a_killed_recorder_had_read_can_still_be_added(terminal, tmp_path):
 
 def test_a_port_that_is_not_there_leaves_nothing_behind(tmp_path):
     recorder = start(str(tmp_path / "none"), tmp_path / "run1")
-    _, complained = recorder.communicate(timeout=20)
+    _, complained = recorder.communicate(timeout=LONG_S)
     assert recorder.returncode == 2
     assert "the port must be one that opens" in complained
     assert "Traceback" not in complained
@@ -109,7 +111,7 @@ def test_labels_that_fail_before_a_frame_came_say_why(terminal, tmp_path):
         raise CaptureError("the gauge", "the port", "one that opens", "none", "Plug it in.")
 
     told = Told("b0", "s0", "random", Source("gauge", None, no_gauge))
-    settings = PortSettings(115200, "binary", 5, 20.0, None, silence_s=20.0, no_frame_s=20.0)
+    settings = PortSettings(115200, "binary", 5, LONG_S, None, silence_s=LONG_S, no_frame_s=LONG_S)
     with pytest.raises(CaptureError, match="the gauge: the port must be one that opens") as raised:
         record_capture(terminal[1], tmp_path / "run1", told=told, settings=settings, report=len, watch=len)
     assert "bytes must be coming in" in str(raised.value.__cause__)
@@ -131,6 +133,6 @@ def test_a_label_thread_that_hangs_writes_no_header_after_the_end(tmp_path):
 def test_a_folder_that_is_there_is_not_written_over(tmp_path):
     (tmp_path / "run1").mkdir()
     recorder = start("/dev/null", tmp_path / "run1")
-    _, complained = recorder.communicate(timeout=20)
+    _, complained = recorder.communicate(timeout=LONG_S)
     assert recorder.returncode == 2
     assert "the capture's folder must be new" in complained

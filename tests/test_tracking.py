@@ -255,7 +255,7 @@ def test_a_server_that_is_away_is_noticed_within_seconds(kind, request, tmp_path
     start_s = time.monotonic()
     with pytest.raises(TrackingAway, match="`reskin publish` sends them when it is back"):
         write(tmp_path, b0="k0")
-    assert time.monotonic() - start_s < 4  # the two-second time-out, and writing two files
+    assert time.monotonic() - start_s < 15  # two of them the time-out; with its own ways MLflow would take 20
 
 
 def test_an_embedded_store_that_is_not_there_yet_is_made_by_nobody_who_only_asks(tmp_path):

@@ -128,8 +128,9 @@ def play(script: Script, port: Port, stop: threading.Event, *, speed: float = 1.
             if due_s > now_s:
                 stop.wait(min(due_s - now_s, TICK_S))
                 continue
-            start_s += max(now_s - due_s - LATE_MAX_S, 0.0)
-            first, i = i, _next_after(script, i, now_s * speed)
+            lost_s = max(now_s - due_s - LATE_MAX_S, 0.0)
+            start_s += lost_s
+            first, i = i, _next_after(script, i, (now_s - lost_s) * speed)
             sent_n += port.send(b"".join(script.pieces[first:i]), stop)
         if not loop:
             break

@@ -20,7 +20,7 @@ from pipeline.core.errors import ParamsError
 from pipeline.live.session import Live
 
 PAGE = Path(__file__).parent / "page"
-FILES = {"/": "index.html", "/live.js": "live.js", "/live.css": "live.css"}
+FILES = {"/": "index.html", "/live.js": "live.js", "/trace.js": "trace.js", "/live.css": "live.css"}
 LOCAL = ("127.0.0.1", "localhost", "::1")
 OWN_HOST = re.compile(r"(localhost|127\.0\.0\.1|\[::1\])(:[0-9]{1,5})?", re.IGNORECASE)
 COOKIE = "reskin-token"

@@ -92,9 +92,8 @@ class Live:
         with self._lock:
             if self.view is None:
                 return b"", 0
-            lost_n = sum(count for name, count in self.skin.account.items() if name.startswith("skipped_"))
-            lost_n += self.skin.reader.missed_bytes_n
-            data = self.view.message(after_bin, rate_hz=self.skin.health.rate_hz, lost_bytes_n=lost_n)
+            rate_hz, lost_bytes_n = self.skin.health.rate_hz, self.skin.lost_bytes_n
+            data = self.view.message(after_bin, rate_hz=rate_hz, lost_bytes_n=lost_bytes_n)
             return data, self.view.newest_bin
 
     def state(self) -> dict[str, Any]:

@@ -93,6 +93,7 @@ class Skin:
         self.answers = answering(models)
         self.problem = ""  # of the model with this board
         self._head: list[Chunk] = []
+        self._opening_bytes_n = 0
         self._begin_zero()
 
     def __enter__(self) -> "Skin":
@@ -137,6 +138,12 @@ class Skin:
     def silent(self) -> bool:
         """Say whether nothing comes: what was read last is no more so."""
         return not self.found.problem and self.reader.unix_s() - self._ends[-1][1] > SILENT_S
+
+    @property
+    def lost_bytes_n(self) -> int:
+        """Count bytes that came too late or were no frame's; the end of a frame that was on its way is not lost."""
+        skipped_n = sum(count for name, count in self.account.items() if name.startswith("skipped_"))
+        return skipped_n + self.reader.missed_bytes_n - self._opening_bytes_n
 
     def alarms(self) -> tuple[str, ...]:
         """Say what is wrong now."""
@@ -236,8 +243,9 @@ class Skin:
         more, first, self._counted = counted - self._counted, not self._counted["frames_n"], counted
         self.account += more
         lost_n = sum(count for name, count in more.items() if name.startswith("skipped_"))
-        if first and lost_n * more["frames_n"] < more["frame_bytes_n"]:
-            return  # less than a frame: the port was opened while one was sent
+        if first and (lost_n - 1) * more["frames_n"] <= more["frame_bytes_n"]:
+            self._opening_bytes_n += lost_n  # the port was opened in a frame; behind a last byte alone, one is not sure
+            return
         self.health.note("bytes lost between frames", lost_n, now_s, "torn")
         self._lost_in_row_n = 0 if more["frames_n"] else self._lost_in_row_n + lost_n
         if self._lost_in_row_n > GARBAGE_FRAMES_N * 16 * self.found.chips_n:  # no format has less than 16 bytes a chip

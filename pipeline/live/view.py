@@ -67,11 +67,12 @@ class View:
         latencies_ms = [*_percentiles_ms(self.to_estimate_s), *_percentiles_ms(self.to_screen_s)]
         now = [*last.answer[-1], *last.sd_mm[-1], last.contact[-1], rate_hz, lost_bytes_n, *latencies_ms]
         change_uT = np.einsum("kij,kj->ki", self._layout.turn, last.db_uT[-1].reshape(-1, 3).astype(np.float64))
-        head = HEAD.pack(self._message_i % 2**32, self._chips_n, len(i), float(last.t_s[-1]) - self._start_s)
+        t_s = float(last.t_s[-1]) - self._start_s
+        head = HEAD.pack(self._message_i % 2**32, self._chips_n, len(i), t_s)
         parts = [
             np.array(now),
             change_uT.ravel(),
-            (numbers * BIN_S).ravel(),
+            numbers * BIN_S - t_s,  # small: of days since the start, 32 bits would round to more than a bin
             self._low[i].ravel(),
             self._high[i].ravel(),
         ]

@@ -27,7 +27,7 @@ from tests.learning.trials import measured
 ROOT = Path(__file__).resolve().parents[2]
 # As deploy/dask.sh starts workers.
 CLI = "import pipeline.core.cluster; from distributed.cli.dask_{0} import main; main()"
-START_MAX_s = 60.0
+START_MAX_s = 120.0
 HERE_ONLY = ["--host", "127.0.0.1", "--no-dashboard"]
 
 

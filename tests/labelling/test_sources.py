@@ -4,7 +4,7 @@ import re
 import threading
 import time
 from dataclasses import replace
-from itertools import count
+from itertools import count, repeat
 
 import numpy as np
 import pytest
@@ -21,6 +21,7 @@ from pipeline.labelling.source import Desk, Labeller, Source, from_program
 from pipeline.labelling.table import from_table
 
 DWELL_s = 0.002
+LONG_S = 120.0  # for what must not happen in a test that passes
 
 
 @pytest.fixture
@@ -125,11 +126,18 @@ def test_a_snake_goes_there_and_back_and_places_that_are_none_are_refused():
             parse_places(wrong)
 
 
+def wait_until(is_so):
+    end_s = time.monotonic() + LONG_S
+    while not is_so():
+        assert time.monotonic() < end_s
+        time.sleep(0.002)
+
+
 class Telling:
     """A gauge's port that says what it is told to; then it is unplugged."""
 
     def __init__(self, chunks):
-        self.chunks = list(chunks)
+        self.chunks, self.told_n, self.gone = iter(chunks), 0, False
 
     def __enter__(self):
         return self
@@ -139,38 +147,59 @@ class Telling:
 
     def read(self, *_):
         time.sleep(0.002)
-        if not self.chunks:
-            raise OSError("gone")
-        return self.chunks.pop(0)
+        for chunk in self.chunks:
+            self.told_n += 1
+            return chunk
+        self.gone = True
+        raise OSError("gone")
 
 
 @pytest.fixture
 def telling(monkeypatch):
     def tell(chunks):
-        monkeypatch.setattr("pipeline.labelling.gauge.open_port", lambda *_: Telling(chunks))
+        gauge = Telling(chunks)
+        monkeypatch.setattr("pipeline.labelling.gauge.open_port", lambda *_: gauge)
         monkeypatch.setattr("pipeline.labelling.gauge.read_waiting", Telling.read)
+        return gauge
 
     return tell
 
 
+class Heard(Desk):
+    """A desk where a label holds until the gauge has said something, or is gone, however late the machine is."""
+
+    gauge: Telling
+
+    def hold(self, label, dwell_s):
+        held, before_n = super().hold(label, dwell_s), self.gauge.told_n
+        wait_until(lambda: self.gauge.gone or self.gauge.told_n > before_n + 2)
+        return held._replace(t_end_s=self.unix_s())
+
+
+def heard(desk, gauge):
+    beside = Heard(desk.tape, desk.unix_s, desk.stop, desk.mark)
+    beside.gauge = gauge
+    return beside
+
+
 def test_a_gauge_beside_the_keys_gives_each_touch_its_mean_force(desk, tmp_path, telling):
-    telling([b"0.4\n0.6\n"] * 3000)
-    asked, _ = prompts(["", "", "q"], forces=Forces("gauge", 9600), dwell_s=0.05)
-    assert asked.run(desk) == ""
+    gauge = telling(repeat(b"0.4\n0.6\n"))
+    asked, _ = prompts(["", "", "q"], forces=Forces("gauge", 9600))
+    assert asked.run(heard(desk, gauge)) == ""
     log = log_of(tmp_path)
     assert log.Fz_N[log.contact] == pytest.approx(0.5)
 
 
 def test_touches_of_which_the_gauge_said_nothing_are_counted(desk, telling):
-    telling([b""] * 3000)
+    telling(repeat(b""))
     asked, _ = prompts(["", "", "", "0.8N", "", "", "q"], forces=Forces("gauge", 9600))
     assert asked.run(desk) == "2 touches without a force: the gauge at gauge said none while they lasted"
 
 
 def test_a_gauge_that_is_unplugged_beside_the_keys_is_told_and_touches_go_on(desk, telling):
-    telling([b"0.5\n"])
-    asked, _ = prompts(["", "", "", "0.8N", "q"], forces=Forces("gauge", 9600), dwell_s=0.05)
-    assert "gauge: the force gauge must be plugged in" in (told := asked.run(desk))
+    gauge = telling([b"0.5\n"])
+    asked, _ = prompts(["", "", "", "0.8N", "q"], forces=Forces("gauge", 9600))
+    assert "gauge: the force gauge must be plugged in" in (told := asked.run(heard(desk, gauge)))
     assert "Forces are missing from then on" in told
     assert desk.tape.touches_n == 2
 
@@ -190,22 +219,36 @@ def test_a_gauge_alone_tells_touches_by_force_and_that_it_was_unplugged(desk, tm
     assert np.isnan(log.x_mm[1])
 
 
+class Looks(threading.Event):
+    """Counts how often somebody who follows a table has looked at it: each time it waits for this."""
+
+    def __init__(self):
+        super().__init__()
+        self.looks_n = 0
+
+    def wait(self, timeout=None):
+        self.looks_n += 1
+        return super().wait(timeout)
+
+
 @pytest.mark.parametrize("there", [False, True])
 def test_a_table_is_followed_as_it_grows_and_its_own_clock_is_marked(desk, tmp_path, there):
     file, old = tmp_path / "robot.csv", "t_s,phase,x_mm,y_mm\n"
     rows = "".join(f"{7 + 0.1 * i:.1f},{phase},4,8\n" for i, phase in enumerate(["noload"] * 3 + ["contact"] * 3))
     if there:
         file.write_text(old + rows.replace("\n7.", "\n1."))
-    labeller = Labeller(from_table(file), desk)
-    time.sleep(0.1)
+    looks = Looks()
+    labeller = Labeller(from_table(file), replace(desk, stop=looks))
+    wait_until(lambda: looks.looks_n)
     with file.open("a") as stream:
         stream.write(rows if there else old + rows)
-    time.sleep(0.1)
-    assert labeller.end(5.0) == "1 touches labelled"
+    before_n = looks.looks_n
+    wait_until(lambda: looks.looks_n > before_n + 1)  # the first may have been begun before
+    assert labeller.end(LONG_S) == "1 touches labelled"
     log = log_of(tmp_path)
     assert log.t_start_s.tolist() == pytest.approx([7.0, 7.3])
     assert desk.marks[-1][1] == pytest.approx(7.5)
-    assert desk.marks[-1][0] == pytest.approx(time.time(), abs=5)
+    assert desk.marks[-1][0] == pytest.approx(time.time(), abs=LONG_S)
 
 
 @pytest.mark.parametrize(
@@ -216,7 +259,7 @@ def test_a_table_that_does_not_go_on_ends_the_labels_with_a_sentence(desk, tmp_p
     file, header = tmp_path / "robot.csv", "t_s,phase\n"
     file.write_text(header)
     labeller = Labeller(from_table(file), desk)
-    for begin_s in range(1000):
+    for begin_s in range(int(LONG_S / 0.02)):
         with file.open("a") as stream:
             stream.write("".join(f"{begin_s}.{i},{'contact' if i > 4 else 'noload'}\n" for i in range(9)))
         time.sleep(0.02)
@@ -229,7 +272,7 @@ def test_a_table_that_does_not_go_on_ends_the_labels_with_a_sentence(desk, tmp_p
         file.write_text(header)
     else:
         file.unlink()
-    labeller._thread.join(20)
+    labeller._thread.join(LONG_S)
     told = labeller.end()
     assert re.search(f"a table that is followed must be the same file, with rows appended; got {said}", told)
     assert not told.startswith("0 touches")

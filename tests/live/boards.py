@@ -120,6 +120,13 @@ def played(script: Script, models: Models = ()) -> tuple[Skin, list[Readings]]:
     return skin, readings
 
 
+def zeros_asked(monkeypatch) -> list[Skin]:
+    """List the skins as they are asked for a no-load reading: on a busy machine it is over before a page is told."""
+    asked, zero = [], Skin.zero
+    monkeypatch.setattr(Skin, "zero", lambda skin: (zero(skin), asked.append(skin)))
+    return asked
+
+
 class Dying:
     """A model that raises at the first contact, by a fault that is none of ours to name."""
 

@@ -23,7 +23,7 @@ from pipeline.capture.header import HEADER_FILE
 from pipeline.live.adapting import POKES_N
 from pipeline.predicting import read_network
 from pipeline.twin.shipped import load_universal
-from tests.live.boards import PLACES, make_script, plugged_in, write_model
+from tests.live.boards import PLACES, make_script, plugged_in, write_model, zeros_asked
 from tests.live.test_answering import poked, pressed, simulated  # noqa: F401 - fixtures
 from tests.live.test_server import LONG_S, serve
 from tests.live.test_several import GOES, RATES_HZ, plug_in_all
@@ -38,6 +38,16 @@ DOT = """((x, y) => { const {state, last, parts: {board}} = boards[0], ratio = d
   scale = Math.min((board.clientWidth - 2 * margin) / wide, (innerHeight * .8 - 2 * margin) / high);
   return last.contact ? [...board.getContext("2d").getImageData(ratio * (margin + (x - left) * scale),
     ratio * (margin + (bottom + high - y) * scale), 1, 1).data].slice(0, 3) : []; })"""
+# How many of a trace's pixels are more or less inked than of one that is drawn at once; how many are inked.
+ANEW = """((board, i) => {
+  const count = i ? board.last.chips : 1, shown = board.traces[i];
+  const anew = new Trace(shown.canvas, shown.first, shown.least);
+  while (shown.draw(board.rows, board.changed, count)) {}
+  board.changed = Infinity; anew.columns = 1e6;
+  while (anew.draw(board.rows, Infinity, count)) {}
+  const [old, fresh] = [shown, anew].map(({pen, layer: {width, height}}) => pen.getImageData(0, 0, width, height).data)
+    .map((values) => values.filter((_, at) => at % 4 === 3));
+  return [old.filter((alpha, at) => Math.abs(alpha - fresh[at]) > 64).length, fresh.filter(Boolean).length]; })"""
 pytestmark = [
     pytest.mark.skipif(BROWSER is None, reason=f"no browser: no RESKIN_BROWSER, on the path none of {NAMES}"),
     pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo-terminals"),
@@ -125,25 +135,33 @@ def in_browser(folder: Path, act: Callable) -> Callable:
 
 def test_a_poke_is_drawn_at_its_place_and_zero_and_record_work(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    asked = zeros_asked(monkeypatch)
 
     async def act(tab: Tab) -> None:
         for x_mm, y_mm, force_N in PLACES:
             near = (
-                "(({last, dirty}) => last && last.contact && !dirty && "
+                "(({state, last, dirty}) => !state.silent && last && last.contact && !dirty && "
                 f"Math.hypot(last.x - {x_mm}, last.y - {y_mm}) < .5)(boards[0])"
             )
             blue = await tab.until(f"{near} ? {DOT}({x_mm}, {y_mm}) : []")
             assert np.abs(np.array(blue) - (0x0B, 0x53, 0x94)).max() < 3  # --link
             await tab.until(f"({near}) && /x {x_mm:.0f}|x {x_mm - 1:.0f}/.test(boards[0].parts.place.textContent)")
             assert abs(float((await tab.text("force")).split()[0]) - force_N) < 0.5
-        assert "400" in await tab.text("rate") or float((await tab.text("rate")).split()[0]) > 200
+        await tab.until(
+            "(({rate}) => rate.innerText.endsWith('Hz') && parseFloat(rate.innerText) < 520)(boards[0].parts)"
+        )
         await tab.look("network")
+        for trace_i in range(2):  # what was moved, stretched and added to looks as what is drawn at once
+            differ_n, inked_n = await tab.value(f"{ANEW}(boards[0], {trace_i})")
+            assert differ_n < 0.01 * inked_n  # Chromium smooths short and long paths in two ways
+            assert inked_n > 1000
         await tab.value("boards[0].parts.record.click()")
         await tab.until("boards[0].state.recording")
         await tab.press_key("r")
         await tab.until("boards[0].state.recorded.startsWith('recorded')")
         await tab.press_key("z")
-        await tab.until("boards[0].state.zeroed", lambda told: told is False)
+        while not asked:
+            await asyncio.sleep(0.02)
         await tab.until("boards[0].state.zeroed")
         assert await tab.value("boards[0].parts.adapt.disabled")  # a network does not learn
 
@@ -174,8 +192,8 @@ def test_presses_at_the_crosses_adapt_the_map_and_errors_before_and_after_are_sh
     script = replace(quiet, t_s=quiet.t_s + late_s)
 
     async def act(tab: Tab) -> None:
-        silent = "performance.now() - (globalThis.touched_ms ||= performance.now()) > 700"
-        await tab.until(f"boards[0].last.contact && (globalThis.touched_ms = performance.now()), {silent}")
+        none = "rows.slice(-30).every(({high}) => high[0] === 0)"  # longer than between two places
+        await tab.until(f"(({{rows}}) => rows.length > 30 && rows.at(-1).n - rows.at(-30).n < 35 && {none})(boards[0])")
         await tab.press_key("p")
         await tab.until("boards[0].state.next_mm && !boards[0].dirty")
         await tab.look("cross")
@@ -195,11 +213,11 @@ def test_several_boards_are_drawn_each_with_its_own_dot_rate_and_losses(tmp_path
         for i in range(1, 8):  # the map is of five chips; the sleeve is drawn without a dot
             await tab.until(f"(({{last}}) => last && last.contact && !isNaN(last.x))(boards[{i}])")
         for i, rate_hz in enumerate(RATES_HZ[:GOES]):
-            await tab.until(f"Math.abs(parseFloat(boards[{i}].parts.rate.innerText) / {rate_hz} - 1) < .4")
+            await tab.until(f"((hz) => 0 < hz && hz < 1.4 * {rate_hz})(parseFloat(boards[{i}].parts.rate.innerText))")
         await asyncio.to_thread(goes.close)
         await tab.until("boards[7].state.silent && boards[7].parts.rate.innerText === '–'")
-        lost = str(await tab.value("boards.map(({parts}) => parseFloat(parts.lost.innerText)).join()")).split(",")
-        assert lost == ["0"] * GOES + ["NaN"]  # of a board that is silent nothing is shown
+        lost = ",".join(["0"] * GOES + ["NaN"])  # of a board that is silent nothing is shown; what is lost stays so
+        await tab.until("boards.map(({parts}) => parseFloat(parts.lost.innerText)).join()", lost.__eq__)
         assert "unplugged" in str(await tab.value("boards[7].state.alarms.join()"))
         assert await tab.value("boards.slice(0, 7).every(({state}) => !state.alarms.join().includes('unplugged'))")
         await tab.look("several", "boards[1].last.contact")

@@ -1,12 +1,28 @@
 """Commands without options: the one board that is there is found, and recorded in its own format."""
 
-from pipeline.capture.header import HEADER_FILE, parse
+import time
+from types import SimpleNamespace
+
+import pytest
+
+from pipeline.capture.header import HEADER_FILE, STREAM_FILE, parse
 from pipeline.live import commands, ports
 from pipeline.live.inject import inject
 from pipeline.live.inject import parse as parse_fault
 from tests.live.boards import make_script, plugged_in
 
 UNTOLD = {"board": None, "skin": None, "wire": None, "chips_n": None, "baud": 115200, "scan": None}
+RATE_BYTES_S = 82 * 400
+
+
+@pytest.fixture(autouse=True)
+def clock(tmp_path, monkeypatch):
+    """Let the recorder's clock go on as bytes come, so that a machine that is late records as much."""
+
+    def monotonic() -> float:
+        return sum(stream.stat().st_size for stream in tmp_path.rglob(STREAM_FILE)) / RATE_BYTES_S
+
+    monkeypatch.setattr("pipeline.capture.port.time", SimpleNamespace(monotonic=monotonic, time=time.time))
 
 
 def test_a_recording_needs_no_option_when_one_board_is_there(tmp_path, monkeypatch, capsys):
@@ -23,7 +39,7 @@ def test_a_recording_needs_no_option_when_one_board_is_there(tmp_path, monkeypat
 
 def test_a_recording_says_which_chip_was_broken(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    with plugged_in(inject(make_script(), parse_fault("failed-read@0+1")), loop=True) as name:
+    with plugged_in(inject(make_script(), parse_fault("failed-read@0+99")), loop=True) as name:
         commands.record(port=name, seconds=1.5, out=tmp_path / "run1", **UNTOLD)
     assert "; chip 1: failed I2C reads (" in capsys.readouterr().out
 

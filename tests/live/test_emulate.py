@@ -3,6 +3,7 @@
 import math
 import threading
 import time
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -11,22 +12,48 @@ import pytest
 from pipeline.capture.port import open_port, read_waiting
 from pipeline.capture.stream import decode_all
 from pipeline.core.errors import CaptureError, ParamsError
-from pipeline.live.emulate import open_far_end, play
+from pipeline.live.emulate import LATE_MAX_S, open_far_end, play
 from pipeline.live.inject import inject, parse
-from tests.live.boards import RATE_HZ, make_script, plugged_in
+from tests.live.boards import RATE_HZ, make_script
 
-LONG_S = 30.0
+LONG_S = 120.0
 SCRIPT = make_script(pokes_n=0)
 
 
-def read(name: str, bytes_n: int) -> tuple[bytes, float]:
-    """Read so many bytes; say how long it took after the first."""
-    data, start_s, end_s = b"", math.inf, time.monotonic() + LONG_S
-    with open_port(name, 115200) as device:
-        while len(data) < bytes_n and time.monotonic() < end_s:
-            data += read_waiting(device)
-            start_s = min(start_s, time.monotonic()) if data else start_s
-    return data, time.monotonic() - start_s
+class Times:
+    """A clock that waiting moves, and nothing else; also when to stop: never."""
+
+    def __init__(self):
+        self.s = 0.0
+
+    def monotonic(self):
+        return self.s
+
+    def is_set(self):
+        return False
+
+    def wait(self, seconds):
+        self.s += max(seconds, 1e-9)  # what is less than a digit of the sum would not move it
+
+
+class Taker:
+    """A reader's end that notes when each frame came, and is `late_s` once, at the frame `late_i`."""
+
+    def __init__(self, times, late_i=-1, late_s=0.0):
+        self.times, self.late_i, self.late_s, self.came_s = times, late_i, late_s, []
+
+    def send(self, data, _stop):
+        self.came_s += [self.times.s] * (len(data) // 82)
+        if self.late_i in range(len(self.came_s)):
+            self.times.s, self.late_i = self.times.s + self.late_s, -1
+        return len(data)
+
+
+@pytest.fixture
+def times(monkeypatch):
+    times = Times()
+    monkeypatch.setattr("pipeline.live.emulate.time", times)
+    return times
 
 
 @pytest.mark.parametrize("port", ["pty", "tcp"])
@@ -46,25 +73,36 @@ def test_every_byte_arrives_as_fast_as_it_is_taken_and_no_reader_is_no_loss(port
     assert told == [len(sent)]
 
 
-def test_a_script_is_played_at_its_own_rate_or_as_many_times_faster():
-    for speed in (1.0, 3.0):
-        with plugged_in(SCRIPT, speed=speed, loop=True) as name:
-            _, took_s = read(name, round(RATE_HZ) * 82)
-            assert took_s * speed == pytest.approx(1.0, abs=0.4)  # two cores, shared with other work
+@pytest.mark.parametrize("speed", [1.0, 3.0])
+def test_a_script_is_played_at_its_own_rate_or_as_many_times_faster(times, speed):
+    taker = Taker(times)
+    assert play(SCRIPT, taker, times, speed=speed) == len(b"".join(SCRIPT.pieces))
+    np.testing.assert_allclose(taker.came_s, SCRIPT.t_s / speed, atol=1e-8)
+
+
+def test_a_reader_that_keeps_the_board_waiting_is_given_a_tenth_of_a_second_at_once_and_no_more(times):
+    taker = Taker(times, late_i=100, late_s=2.0)
+    play(SCRIPT, taker, times)
+    late_s = np.array(taker.came_s) - SCRIPT.t_s
+    np.testing.assert_allclose(late_s[:101], 0, atol=1e-8)
+    np.testing.assert_allclose(late_s[-100:], 2.0 - LATE_MAX_S, atol=1 / RATE_HZ)
+    assert max(Counter(taker.came_s).values()) <= LATE_MAX_S * RATE_HZ + 1
 
 
 def test_a_link_keeps_its_name_when_the_board_is_unplugged_and_plugged_in_again(tmp_path):
-    link = tmp_path / "board"
-    script = inject(SCRIPT, parse("unplug@0.5+0.5"))
-    with (
-        plugged_in(script, str(link)) as name,
-        pytest.raises(OSError, match="returned no data|Input/output"),
-        open_port(name, 115200) as device,
-    ):
+    link, stop = tmp_path / "board", threading.Event()
+    end = open_far_end(str(link))
+    player = threading.Thread(target=play, args=[inject(SCRIPT, parse("unplug@0.5+99")), end, stop])
+    with pytest.raises(OSError, match="returned no data|Input/output"), open_port(str(link), 115200) as device:
+        player.start()
         while True:
             read_waiting(device)
     assert not link.is_symlink()
     assert not link.exists()
+    stop.set()  # which ends the time that it is away
+    player.join()
+    assert link.is_symlink()
+    end.unplug()
 
 
 def test_a_port_that_is_no_port_is_refused(tmp_path):

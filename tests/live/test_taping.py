@@ -3,14 +3,19 @@
 import os
 import signal
 import time
+from itertools import cycle
 
 import numpy as np
 import pytest
 
 import reskin
-from pipeline.capture.header import HEADER_FILE, parse
+from pipeline.capture import arrivals, probe
+from pipeline.capture.header import ARRIVALS_FILE, HEADER_FILE, PROBE_FILE, STREAM_FILE, parse
+from pipeline.capture.labels import Dwell
+from pipeline.capture.stream import decode_all
 from pipeline.core.errors import ParamsError
 from pipeline.dataset.captures import open_capture
+from pipeline.labelling.source import Desk
 from pipeline.live.taping import Wanted, board_of, record_board, source_of
 from pipeline.preparing import Labels, native
 from tests.capture.headers import AS_USUAL
@@ -18,6 +23,27 @@ from tests.live.boards import make_script, plugged_in
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo-terminals")
 PLACES = [(4.0, 8.0), (12.0, 4.0)]
+FRAME_BYTES_N, DWELL_FRAMES_N, LONG_S = 82, 40, 120.0
+
+
+def read_n(part):
+    """Count the frames that a recorder has written."""
+    stream = part / STREAM_FILE
+    return stream.stat().st_size // FRAME_BYTES_N if stream.exists() else 0
+
+
+@pytest.fixture
+def held(monkeypatch, tmp_path):
+    """Let a label hold until some frames came, however late the machine is."""
+
+    def hold(self, label, dwell_s):
+        start_s, before_n = self.unix_s(), read_n(tmp_path / "run1.part")
+        self.stop.wait(dwell_s)
+        while read_n(tmp_path / "run1.part") < before_n + DWELL_FRAMES_N and not self.stop.wait(0.01):
+            pass
+        return Dwell(label, start_s, self.unix_s())
+
+    monkeypatch.setattr(Desk, "hold", hold)
 
 
 def pokes():
@@ -40,7 +66,7 @@ def places_of(blocks):
     return {(float(x), float(y)) for block in blocks for x, y in zip(block.x_mm, block.y_mm, strict=True)}
 
 
-def test_what_a_program_labels_is_added_without_another_word(tmp_path):
+def test_what_a_program_labels_is_added_without_another_word(tmp_path, held):
     with plugged_in(make_script(pokes_n=2), loop=True) as port:
         folder = reskin.record(pokes(), port=port, out=tmp_path / "run1", dwell_s=0.3, board="b0", scan="random")
     header = parse((folder / HEADER_FILE).read_text(), "header")
@@ -49,7 +75,13 @@ def test_what_a_program_labels_is_added_without_another_word(tmp_path):
     assert places_of(blocks) == set(PLACES)
     assert account["indentations_n"] == 2
     assert account["clock_residual_us"] == 0
-    assert account["frames_contact_n"] == pytest.approx(2 * 0.3 * 400, rel=0.3)
+    log = probe.parse(folder / PROBE_FILE, "log")
+    frames, _ = decode_all((folder / STREAM_FILE).read_bytes(), "binary", 5, "stream")
+    t_s = arrivals.times_of(frames.end_byte, arrivals.parse(folder / ARRIVALS_FILE, "arrivals"))
+    dwells_s = zip(log.t_start_s[log.contact], log.t_end_s[log.contact], strict=True)
+    came_n = sum(int(((t_s > start_s) & (t_s < end_s)).sum()) for start_s, end_s in dwells_s)
+    assert came_n >= 2 * DWELL_FRAMES_N
+    assert account["frames_contact_n"] == pytest.approx(came_n, abs=2)
 
 
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")  # Python 3.12: there are threads
@@ -63,7 +95,7 @@ def test_a_recording_that_is_killed_has_the_labels_that_had_come(tmp_path):
         if child == 0:
             record_board(board_of(port, None, None, say=print), wanted, source)
             os._exit(0)
-        write_robots_log(robot, tmp_path / "run1.part/probe.csv")
+        write_robots_log(robot, tmp_path / "run1.part")
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
     blocks, account = read(tmp_path / "run1.part")
@@ -71,20 +103,23 @@ def test_a_recording_that_is_killed_has_the_labels_that_had_come(tmp_path):
     assert account["dropped_no_frame_indentations_n"] == 0
 
 
-def write_robots_log(robot, probe):
-    """Touch at (4, 8) again and again until the recorder has written two touches."""
+def write_robots_log(robot, part):
+    """Touch at (4, 8) again and again until the recorder has written two touches; each holds until frames came."""
+    end_s = time.monotonic() + LONG_S
     with robot.open("w", buffering=1) as stream:
         stream.write("unix_s,phase,x_mm,y_mm,Fz_N\n")
-        time.sleep(1.0)
-        for i in range(600):
-            stream.write(f"{time.time():.4f},{'contact' if i // 8 % 2 else 'noload'},4,8,0.5\n")
-            time.sleep(0.02)
-            if probe.exists() and len(probe.read_text().splitlines()) > 4:
+        for phase in cycle(["noload", "contact"]):
+            before_n, holds = read_n(part), True
+            while holds:  # the last row is written after the frames came
+                holds = read_n(part) < before_n + DWELL_FRAMES_N
+                stream.write(f"{time.time():.4f},{phase},4,8,0.5\n")
+                time.sleep(0.02)
+                assert time.monotonic() < end_s, "no labels were written"
+            if (part / PROBE_FILE).exists() and len((part / PROBE_FILE).read_text().splitlines()) > 4:
                 return
-    raise AssertionError("no labels were written")
 
 
-def test_a_full_disk_ends_it_and_what_came_can_be_added(tmp_path, monkeypatch):
+def test_a_full_disk_ends_it_and_what_came_can_be_added(tmp_path, monkeypatch, held):
     from errno import ENOSPC
 
     from pipeline.capture import labels

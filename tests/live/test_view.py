@@ -15,9 +15,9 @@ def readings(t_s, force_N):
 
 def forces(data):
     """The bins of a message: start, least and greatest force."""
-    _, chips_n, bins_n, _ = HEAD.unpack_from(data)
+    _, chips_n, bins_n, t_s = HEAD.unpack_from(data)
     rest = np.frombuffer(data, "<f4", offset=HEAD.size)[NUMBERS_N + 3 * chips_n :]
-    start_s, traces = rest[:bins_n], rest[bins_n:].reshape(2, bins_n, 1 + chips_n)
+    start_s, traces = t_s + rest[:bins_n].astype(float), rest[bins_n:].reshape(2, bins_n, 1 + chips_n)
     return start_s, traces[0, :, 0], traces[1, :, 0]
 
 
@@ -43,6 +43,13 @@ def test_a_gap_is_left_out_and_a_page_that_has_some_bins_gets_the_others():
     assert not np.any((start_s > 1.0) & (start_s < 4.9))
     later_s, _, _ = forces(view.message(275, rate_hz=100.0, lost_bytes_n=0))
     np.testing.assert_allclose(later_s, start_s[start_s >= 5.5 - 1e-6], atol=1e-5)
+
+
+def test_after_a_fortnight_bins_lie_as_far_apart_as_in_the_first_minute():
+    view, t_s = View(layout_of(5), 0.0), 14 * 86_400 + np.arange(0, 2, 0.005)
+    view.feed(readings(t_s, np.ones(len(t_s))), t_s[-1])
+    start_s, _, _ = forces(view.message(0, rate_hz=200.0, lost_bytes_n=0))
+    np.testing.assert_allclose(np.diff(start_s), BIN_S, atol=1e-5)
 
 
 def test_the_time_to_a_screen_is_that_of_the_message_that_it_shows():

@@ -316,7 +316,7 @@ def test_a_dead_tracking_server_is_said_and_costs_no_result(story):
              "--answers", "data/answers/ci", "--reports", "reports/ci"]  # fmt: skip
     done = run(story, "python", "-m", "pipeline.stages.publish", *words, MLFLOW_TRACKING_URI="http://127.0.0.1:9")
     assert "does not answer" in done.stderr
-    assert time.monotonic() - start_s < 20  # not MLflow's own minutes; two cores may be busy
+    assert time.monotonic() - start_s < 100  # not MLflow's own minutes; of a process that starts on a busy machine
 
 
 def test_an_experiment_that_is_switched_off_leaves_no_stage_no_file_and_no_cost(story, run_stages):

@@ -1,11 +1,11 @@
 // Draws what the server sends: binary messages (view.py) as numbers, board and traces; JSON (session.py) as words.
 // Each board has a socket, a state and canvases of its own: one that is unplugged leaves the others as they are.
 "use strict";
-const WINDOW_S = 10, BIN_S = .02, GAP_S = .1, NUMBERS_N = 12, HEAD_BYTES_N = 16, TRACE_PX = 170, RETRY_MS = 1000, DRAWING_MS = 12;
+const NUMBERS_N = 12, HEAD_BYTES_N = 16, RETRY_MS = 1000, DRAWING_MS = 12;
 const ARROW_UT = 300, ARROW_MM = 4, MARGIN_PX = 20; // a change of field of this is an arrow as long, a large one twice: few leave the canvas
-const NARROW_PX = 400; // of a trace: fewer times are written below it
 const COLOURS = ["--link", "--ink", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0072B2"]; // force, chips
-const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name);
+const style = getComputedStyle(document.documentElement); // as it is now, whenever it is asked
+const colour = (name) => style.getPropertyValue(name);
 const ink = (j) => { const name = COLOURS[j ? 1 + (j - 1) % (COLOURS.length - 1) : 0]; return name.startsWith("--") ? colour(name) : name; };
 const number = (value, digits, unit) => value === undefined || Number.isNaN(value) ? "–" : `${value.toFixed(digits)} ${unit}`;
 const boards = [];
@@ -13,9 +13,10 @@ let next = 0;
 
 class Board {
   constructor(index) {
-    this.index = index; this.state = {waiting: true, alarms: []}; this.last = null; this.rows = []; this.dirty = true;
+    this.index = index; this.state = {waiting: true, alarms: []}; this.last = null; this.rows = []; this.changed = Infinity; this.dirty = true;
     const article = document.getElementById("board").content.cloneNode(true).firstElementChild;
     this.parts = Object.fromEntries([...article.querySelectorAll("[data-part]")].map((part) => [part.dataset.part, part]));
+    this.traces = [new Trace(this.parts.forces, 0, .5), new Trace(this.parts.fields, 1, 50)];
     document.getElementById("boards").append(article);
     for (const name of ["zero", "adapt", "places", "record"]) this.parts[name].addEventListener("click", () => this.press(name));
     this.connect();
@@ -45,12 +46,13 @@ class Board {
     this.last = {id: view.getUint32(0, true), chips, x, y, force, sdX, sdY, contact, rate, lost, estimate50, estimate99, screen50,
       screen99, change: values.slice(NUMBERS_N, first)};
     if (bins) { // the last bin that we have may have grown: it comes again
-      const low = first + bins, high = low + bins * width, from = values[first] - 1e-3;
-      while (this.rows.length && this.rows[this.rows.length - 1].t >= from) this.rows.pop();
-      for (let i = 0; i < bins; i++) this.rows.push({t: values[first + i], low: values.slice(low + i * width, low + (i + 1) * width),
+      const low = first + bins, high = low + bins * width, t = view.getFloat64(8, true), bin = (i) => Math.round((t + values[first + i]) / BIN_S);
+      while (this.rows.length && this.rows[this.rows.length - 1].n >= bin(0)) this.rows.pop();
+      for (let i = 0; i < bins; i++) this.rows.push({n: bin(i), low: values.slice(low + i * width, low + (i + 1) * width),
         high: values.slice(high + i * width, high + (i + 1) * width)});
-      const oldest = this.rows[this.rows.length - 1].t - WINDOW_S;
-      this.rows = this.rows.slice(Math.max(this.rows.findIndex((row) => row.t >= oldest), 0));
+      const oldest = bin(bins - 1) - WINDOW_S / BIN_S - GAP_BINS_N - 1; // from where a line comes in on the left
+      this.rows = this.rows.slice(Math.max(this.rows.findIndex(({n}) => n >= oldest), 0));
+      this.changed = Math.min(this.changed, bin(0));
     }
     this.dirty = true;
   }
@@ -77,41 +79,11 @@ class Board {
 
   chosen(state) { return state.next_mm ? "places" : "adapt"; }
 
-  canvasOf(id, high) { // a pen in CSS pixels, on a canvas that is as sharp as the screen
-    const canvas = this.parts[id], ratio = devicePixelRatio || 1, wide = canvas.clientWidth;
-    canvas.style.height = `${high}px`; canvas.width = wide * ratio; canvas.height = high * ratio;
-    const pen = canvas.getContext("2d");
-    pen.setTransform(ratio, 0, 0, ratio, 0, 0); pen.font = "13px system-ui, sans-serif"; pen.lineWidth = 1.5;
-    return [pen, wide];
-  }
-
-  drawTrace(id, first, count, least) { // of each bin the least and the greatest, one after the other
-    const [pen, wide] = this.canvasOf(id, TRACE_PX), left = 44, bottom = 20, high = TRACE_PX - bottom - 6, end = this.rows[this.rows.length - 1].t;
-    let top = least;
-    for (const row of this.rows) for (let j = first; j < first + count; j++) if (row.high[j] > top) top = row.high[j];
-    const step = [1, 2, 5, 10].map((n) => n * 10 ** Math.floor(Math.log10(top / 3))).find((n) => top / n <= 5);
-    const px = (t) => wide - (end - t) / WINDOW_S * (wide - left), py = (value) => 6 + high * (1 - value / (top * 1.05));
-    pen.strokeStyle = colour("--line"); pen.fillStyle = colour("--soft"); pen.textAlign = "right";
-    for (let value = 0; value <= top; value += step) { pen.strokeRect(left, py(value), wide, 0); pen.fillText(+value.toPrecision(3), left - 6, py(value) + 4); }
-    for (let s = 0; s <= WINDOW_S; s += wide < NARROW_PX ? 5 : 2) pen.fillText(s ? `−${s} s` : "now", Math.max(px(end - s), left + 20), TRACE_PX - 4);
-    for (let j = first; j < first + count; j++) {
-      let before = -Infinity;
-      pen.strokeStyle = ink(j); pen.beginPath();
-      for (const {t, low, high} of this.rows) {
-        if (Number.isNaN(low[j])) continue;
-        t - before > GAP_S ? pen.moveTo(px(t), py(low[j])) : pen.lineTo(px(t), py(low[j]));
-        pen.lineTo(px(t + BIN_S / 2), py(high[j]));
-        before = t;
-      }
-      pen.stroke();
-    }
-  }
-
   drawBoard() {
     const {state, last} = this; // of a silent board the last reading says nothing about now
     const [wide, high] = state.skin_mm || [20, 20], [left, bottom] = state.corner_mm || [-2, -2], margin = MARGIN_PX;
     const scale = Math.max(Math.min((this.parts.board.clientWidth - 2 * margin) / wide, (innerHeight * .8 - 2 * margin) / high), .1); // a hidden window is 0 high
-    const [pen] = this.canvasOf("board", high * scale + 2 * margin);
+    const [pen] = penOn(this.parts.board, high * scale + 2 * margin);
     const at = (x, y) => [margin + (x - left) * scale, margin + (bottom + high - y) * scale];
     pen.fillStyle = colour("--skin"); pen.strokeStyle = colour("--line");
     pen.fillRect(margin, margin, wide * scale, high * scale); pen.strokeRect(margin, margin, wide * scale, high * scale);
@@ -142,15 +114,26 @@ class Board {
     this.drawBoard();
     const {state, last} = this;
     if (!last || state.silent || !this.rows.length) { for (const name of ["place", "force", "rate", "lost", "estimate", "screen"]) this.say(name, "–"); return; }
-    this.drawTrace("forces", 0, 1, .5); this.drawTrace("fields", 1, last.chips, 50);
+    const more = this.traces.map((trace, i) => trace.draw(this.rows, this.changed, i ? last.chips : 1));
+    this.changed = Infinity; this.dirty = more.includes(true);
     const sure = (sd) => Number.isNaN(sd) ? "" : ` ± ${sd.toFixed(1)}`, among = Number.isNaN(last.sdX) || state.adaptable ? "" : " between models";
     this.say("place", last.contact && !Number.isNaN(last.x) ? `x ${last.x.toFixed(1)}${sure(last.sdX)}, y ${last.y.toFixed(1)}${sure(last.sdY)} mm${among}` : last.contact ? "contact" : "no contact");
     this.say("force", number(last.force, 2, "N"));
     this.say("rate", number(last.rate, 0, "Hz")); this.say("lost", number(last.lost, 0, ""));
     this.say("estimate", `${number(last.estimate50, 1, "ms")} (median), ${number(last.estimate99, 1, "ms")} (99 %)`);
     this.say("screen", `${number(last.screen50, 0, "ms")} (median), ${number(last.screen99, 0, "ms")} (99 %)`);
-    if (!document.hidden) requestAnimationFrame(() => { if (this.socket.readyState === 1) this.socket.send(JSON.stringify({seen: last.id})); }); // drawn by then
+    if (document.hidden || last === this.drawn) return;
+    this.drawn = last;
+    requestAnimationFrame(() => { if (this.socket.readyState === 1) this.socket.send(JSON.stringify({seen: last.id})); }); // drawn by then
   }
+}
+
+function penOn(canvas, high) { // a pen in CSS pixels, on a canvas that is as sharp as the screen and empty
+  const ratio = devicePixelRatio || 1, wide = canvas.clientWidth, size = [Math.floor(wide * ratio), Math.floor(high * ratio)];
+  if (canvas.width !== size[0] || canvas.height !== size[1]) { [canvas.width, canvas.height] = size; canvas.style.height = `${high}px`; }
+  const pen = canvas.getContext("2d");
+  pen.setTransform(ratio, 0, 0, ratio, 0, 0); pen.clearRect(0, 0, wide + 1, high + 1); pen.font = "13px system-ui, sans-serif"; pen.lineWidth = 1.5;
+  return [pen, wide, ratio];
 }
 
 function arrow(pen, px, py, [bx, by, bz], scale) { // in the plane; a ring is the part along z

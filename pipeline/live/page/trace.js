@@ -1,0 +1,91 @@
+// Ten seconds of values as lines. What was drawn is moved, and only what is new is drawn: a chip more costs little.
+// After another scale or size the picture is stretched at once, and drawn anew from the newest on, as far as a frame's time goes.
+"use strict";
+const WINDOW_S = 10, BIN_S = .02, GAP_BINS_N = 5, TRACE_PX = 170, LEFT_PX = 44, ABOVE_PX = 6, HIGH_PX = 144;
+const NARROW_PX = 400; // of a trace: fewer times are written below it
+const ANEW_MS = 3, LINE_PX = 1.5;
+const NICE = [1, 1.5, 2, 3, 4, 5, 6, 8, 10]; // greatest values of a scale, so that it seldom changes
+
+class Trace {
+  constructor(canvas, first, least) {
+    this.canvas = canvas; this.first = first; this.least = least;
+    this.layer = {width: 0}; this.top = least;
+    this.columns = 64; // of pixels that are drawn anew in one frame: as many as take ANEW_MS
+  }
+
+  // Of each bin the least and the greatest value, one after the other; bins from `changed` on are new. Gives whether some are still to be drawn anew.
+  draw(rows, changed, count) {
+    const [pen, wide, ratio] = penOn(this.canvas, TRACE_PX), newest = rows[rows.length - 1].n, begun_ms = performance.now();
+    let greatest = this.least;
+    for (const {high} of rows) for (let j = this.first; j < this.first + count; j++) if (high[j] > greatest) greatest = high[j];
+    const unit = 10 ** Math.floor(Math.log10(greatest)), top = unit * NICE.find((n) => n * unit >= greatest || n === 10);
+    this.fit(Math.max(Math.round((wide - LEFT_PX) * ratio), 1), ratio, count, top, newest);
+    const {layer} = this, left = this.edge - layer.width, fresh = Math.min(Math.floor(changed * this.bin_px - this.aside), this.edge);
+    this.drawLines(rows, fresh, this.edge);
+    this.drawn = Math.min(this.drawn, fresh);
+    const anew = Math.max(Math.min(this.columns, this.drawn - left), 0);
+    this.drawLines(rows, this.drawn - anew, this.drawn);
+    this.drawn -= anew;
+    this.drawScale(pen, wide, top);
+    pen.setTransform(1, 0, 0, 1, 0, 0);
+    pen.drawImage(layer, Math.round(LEFT_PX * ratio), 0); // a layer is painted here, within what is timed
+    if (anew) this.columns = Math.min(Math.max(Math.round(this.columns * Math.min(ANEW_MS / (performance.now() - begun_ms), 2)), 8), layer.width);
+    return this.drawn > left;
+  }
+
+  fit(wide, ratio, count, top, newest) { // move what was drawn; stretch it to another size and scale
+    const kind = [wide, ratio, count, ink(0), ink(1)].join(), bin_px = wide * BIN_S / WINDOW_S, edge = Math.round((newest + 1) * bin_px);
+    if (kind !== this.kind) {
+      const before = this.layer;
+      this.layer = document.createElement("canvas"); this.pen = this.layer.getContext("2d");
+      this.layer.width = wide; this.layer.height = TRACE_PX * ratio;
+      if (before.width) this.pen.drawImage(before, 0, 0, wide, this.layer.height);
+      this.edge = this.drawn = edge;
+    }
+    const {layer, pen} = this, later = edge - this.edge;
+    if (later < 0 || later >= wide) { // another stream, or long unseen
+      pen.clearRect(0, 0, wide, layer.height); this.drawn = edge;
+    } else if (later || top !== this.top) {
+      const times = this.top / top, zero = (ABOVE_PX + HIGH_PX) * ratio;
+      pen.globalCompositeOperation = "copy";
+      pen.drawImage(layer, -later, zero * (1 - times), wide, layer.height * times);
+      pen.globalCompositeOperation = "source-over";
+      if (top !== this.top) this.drawn = edge;
+    }
+    const aside = (GAP_BINS_N + 1) * bin_px + 4 * ratio; // as far as a line goes from one bin to the next, and its width
+    Object.assign(this, {kind, bin_px, edge, top, ratio, count, aside});
+  }
+
+  y(value) { return ABOVE_PX + HIGH_PX * (1 - value / (this.top * 1.05)); }
+
+  drawLines(rows, from, to) { // all that touches these columns of pixels, and nothing outside: no seam is seen
+    if (to <= from) return;
+    const {layer, pen, bin_px, ratio, aside} = this, left = this.edge - layer.width, x = (n) => n * bin_px - left;
+    let last = rows.length, begin;
+    while (last > 1 && x(rows[last - 2].n) > to - left + aside) last--;
+    for (begin = last - 1; begin > 0 && x(rows[begin].n) > from - left - aside; begin--);
+    pen.save(); pen.beginPath(); pen.rect(from - left, 0, to - from, layer.height); pen.clip();
+    pen.clearRect(from - left, 0, to - from, layer.height);
+    pen.lineWidth = LINE_PX * ratio;
+    for (let j = this.first; j < this.first + this.count; j++) {
+      let before = -Infinity;
+      pen.strokeStyle = ink(j); pen.beginPath();
+      for (let i = begin; i < last; i++) {
+        const {n, low, high} = rows[i];
+        if (Number.isNaN(low[j])) continue;
+        n - before > GAP_BINS_N ? pen.moveTo(x(n), ratio * this.y(low[j])) : pen.lineTo(x(n), ratio * this.y(low[j]));
+        pen.lineTo(x(n + .5), ratio * this.y(high[j]));
+        before = n;
+      }
+      pen.stroke();
+    }
+    pen.restore();
+  }
+
+  drawScale(pen, wide, top) {
+    const step = [1, 2, 5, 10].map((n) => n * 10 ** Math.floor(Math.log10(top / 3))).find((n) => top / n <= 5);
+    pen.strokeStyle = colour("--line"); pen.fillStyle = colour("--soft"); pen.textAlign = "right";
+    for (let i = 0; i * step <= top * 1.001; i++) { pen.strokeRect(LEFT_PX, this.y(i * step), wide, 0); pen.fillText(+(i * step).toPrecision(3), LEFT_PX - 6, this.y(i * step) + 4); }
+    for (let s = 0; s <= WINDOW_S; s += wide < NARROW_PX ? 5 : 2) pen.fillText(s ? `−${s} s` : "now", Math.max(wide - s / WINDOW_S * (wide - LEFT_PX), LEFT_PX + 20), TRACE_PX - 4);
+  }
+}
