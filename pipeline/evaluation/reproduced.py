@@ -44,6 +44,8 @@ class Tolerance:
 
 COMPUTED = r"(capture|described|variation|sensitivity|left_out|verification|stability|runtime|audit)"  # no training
 LAST_BITS = "other instruction sets add in another order: weights differ in their last bits, and training magnifies it"
+# Of trainings: some 1.5 times the most by which they moved under other instructions and in float64 (docs/repeat.md).
+# Where every library is held to AVX2 (core/numerics.py) nothing moves at all.
 TOLERANCES = (  # the first that matches holds
     Tolerance(r"runtime\..*work_n$", 0.0, 0.01, "an adaptive integrator takes a step more or less"),
     Tolerance(r"^trainings\.", 3.0, 0.0, "other last bits, and another training collapses"),
@@ -51,12 +53,14 @@ TOLERANCES = (  # the first that matches holds
     Tolerance(r"stability\[learning", 0.01, 0.25, LAST_BITS),
     Tolerance(rf"^{COMPUTED}\b.*error$", 1e-7, 1e-3, "below 1e-7 an error is rounding itself"),
     Tolerance(rf"^{COMPUTED}", 1e-9, 1e-3, "computed in double precision, without training"),
-    Tolerance(r"_pct\.(sd|sd_seeds)$", 2.0, 0.0, f"{LAST_BITS}; the spread of a few units"),
-    Tolerance(r"\.(sd|sd_seeds)$|\.spread\.", 0.02, 0.5, f"{LAST_BITS}; the spread of a few units"),
-    Tolerance(r"_pct\.ci95\b", 4.0, 0.5, f"{LAST_BITS}; an end of an interval over few boards"),
-    Tolerance(r"\.ci95\b", 0.1, 0.5, f"{LAST_BITS}; an end of an interval over few boards"),
-    Tolerance(r"_pct\b", 2.0, 0.0, LAST_BITS),
-    Tolerance(r"(^|\.)(paired|contrasts)\b.*mse_", 0.05, 0.25, f"{LAST_BITS}; a small difference of two means"),
+    Tolerance(r"\.by_(board|skin)\..*_pct\b", 15.0, 0.0, f"{LAST_BITS}; of a few networks"),
+    Tolerance(r"(^|\.)(paired|contrasts)\b.*\.by_(board|skin)\..*mse_", 1.5, 0.25, f"{LAST_BITS}; of a few networks"),
+    Tolerance(r"_pct\.(sd|sd_seeds)$", 4.0, 0.0, f"{LAST_BITS}; the spread of a few units"),
+    Tolerance(r"\.(sd|sd_seeds)$|\.spread\.", 0.5, 0.5, f"{LAST_BITS}; the spread of a few units"),
+    Tolerance(r"_pct\.ci95\b", 6.0, 0.5, f"{LAST_BITS}; an end of an interval over few boards"),
+    Tolerance(r"\.ci95\b", 0.75, 0.5, f"{LAST_BITS}; an end of an interval over few boards"),
+    Tolerance(r"_pct\b", 3.0, 0.0, LAST_BITS),
+    Tolerance(r"(^|\.)(paired|contrasts)\b.*mse_", 0.25, 0.25, f"{LAST_BITS}; a small difference of two means"),
     Tolerance(r"mse_\w+", 0.002, 0.25, LAST_BITS),
     Tolerance(r"", 0.02, 0.25, LAST_BITS),
 )
