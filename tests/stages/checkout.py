@@ -1,10 +1,12 @@
 """A copy of this checkout to run whole stories in: code and configuration, no data, no git, this environment."""
 
+import compileall
 import os
 import shutil
 import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -22,8 +24,15 @@ ENVIRONMENT = {
 DONE, FAILED = "these stages ended", "these stages did not end"  # warm.py says
 
 
+@cache
+def compile_modules() -> None:
+    """Compile the project for the programs of all copies; what pytest compiles, only pytest reads."""
+    compileall.compile_dir(ROOT / "pipeline", quiet=1)
+
+
 def copy_checkout(folder: Path) -> Path:
     """Copy what a story needs, compiled code too; DVC works without git there."""
+    compile_modules()
     folder.mkdir(parents=True, exist_ok=True)
     for path in ROOT.iterdir():
         if path.name in LEFT_OUT or path.name.endswith(".egg-info"):

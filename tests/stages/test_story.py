@@ -37,8 +37,17 @@ SAID = "said.txt"  # by the first run
 pytestmark = pytest.mark.timeout(1800)  # a guard against a hang; a busy machine takes four times as long as a quiet one
 
 
+def compile_kernels() -> None:
+    """Compile what a poke and the shipped map call, which takes longer than all that a story computes with it."""
+    noload_uT, b_uT, force_N = reskin.simulate_pokes(reskin.draw_skin(), [[8.0, 8.0, 1.0]])
+    shipped = reskin.load_universal().zero(noload_uT)
+    shipped.label(np.array([[8.0, 8.0]]), force_N, b_uT)
+    shipped.predict(b_uT)
+
+
 @pytest.fixture(scope="module")
 def checkout(tmp_path_factory) -> Path:
+    compile_kernels()
     folder = copy_checkout(tmp_path_factory.mktemp("story"))
     run(folder, "reskin", "scenes", "use", "ci")
     return folder

@@ -19,8 +19,7 @@ from dvc.repo.reproduce import get_active_graph, plan_repro
 from tests.stages.checkout import DONE, FAILED
 
 LIBRARIES = (
-    "torch._dynamo",  # 2 s of each training: an optimiser imports it
-    "pandas", "pyarrow.parquet", "scipy.optimize", "scipy.signal", "scipy.stats", "sklearn.ensemble", "numba",
+    "torch", "pandas", "pyarrow.parquet", "scipy.optimize", "scipy.signal", "scipy.stats", "sklearn.ensemble", "numba",
     "matplotlib.figure", "magpylib", "pydantic", "jinja2",
 )  # fmt: skip
 DEEP_M = 1.3e-3  # past the deepest poke of scene ci
