@@ -6,6 +6,7 @@ stage's time is imports, and following the material under a tip for its tables; 
 DVC itself.
 """
 
+import gc
 import importlib
 import os
 import runpy
@@ -70,6 +71,7 @@ def begin(simulated: set[tuple[str, str]]) -> None:
         rule, name = kind.quadrature.quadrature(), f"{kind.letter}0_s0"
         skin = draw_skin(of.skin, of.spreads, seed=words["seed"], name=name, rule=rule, sides_m=kind.skin_m)
         list(moved_dipoles(skin, np.array([[0.0, 0.0, DEEP_M]])))  # its tables are kept
+    gc.freeze()  # else each stage would look through all this, and copy it, at each search for what nobody holds
 
 
 def run_stages(asked: list[str]) -> str:
