@@ -8,11 +8,11 @@ import torch
 
 from pipeline.dataset import splits
 from pipeline.experiments.stability import learning
-from pipeline.experiments.stability.learning import fold_cases, learning_cases, loop_cases, scaling_cases, triplet_cases
+from pipeline.experiments.stability.learning import fold_cases, learning_cases, scaling_cases, triplet_cases
 from pipeline.learning import inputs, job, model, train, trial, triplets
 
 SEED = 2021
-DIVERGES = "bottleneck scaled 1e3, learning rate 10"
+ROWS, TRIAL = learning._rows(SEED), learning._trial(SEED)
 
 
 def broken(cases):
@@ -78,13 +78,13 @@ def test_a_loop_that_never_looks_at_its_loss_is_found_out(monkeypatch):
         return True
 
     monkeypatch.setattr(train.Watch, "look", blind)
-    stops = {"bottleneck scaled 1e3, learning rate 1e+10", "a network that overflows beside one that does not"}
-    assert broken(loop_cases(SEED)) - {DIVERGES} == stops
+    cases = [learning._explodes(TRIAL, ROWS, 1e10), learning._beside_one_that_overflows(TRIAL, ROWS)]
+    assert broken(cases) == {case.case for case in cases}
 
 
 def test_a_network_that_died_and_is_taken_as_sound_is_found_out(monkeypatch):
     monkeypatch.setattr(trial, "COLLAPSED", -np.inf)
-    assert broken(loop_cases(SEED)) == {"a network that died, with a finite loss"}
+    assert not learning._collapsed(TRIAL, ROWS).holds
 
 
 def test_a_network_that_touches_its_neighbour_is_found_out(monkeypatch):
@@ -95,7 +95,7 @@ def test_a_network_that_touches_its_neighbour_is_found_out(monkeypatch):
         return features + 0 * features.sum(0, keepdim=True)
 
     monkeypatch.setattr(model.Stack, "features", mixed)
-    assert broken(loop_cases(SEED)) - {DIVERGES} == {"a network that overflows beside one that does not"}
+    assert not learning._beside_one_that_overflows(TRIAL, ROWS).holds
 
 
 def test_a_batch_that_ignores_the_seed_is_found_out(monkeypatch):
@@ -106,7 +106,7 @@ def test_a_batch_that_ignores_the_seed_is_found_out(monkeypatch):
         return job, scaler
 
     monkeypatch.setattr(train, "make_job", of_no_seed)
-    assert broken(loop_cases(SEED)) - {DIVERGES} == {"trained twice from one seed"}
+    assert not learning._again(TRIAL, ROWS).holds
 
 
 def test_folds_that_are_drawn_from_too_few_groups_are_found_out(monkeypatch):
