@@ -27,7 +27,7 @@ def test_fresh_no_load_readings_keep_eflesh_accurate_and_a_single_one_loses_it(s
     io.write_readings(tmp_path / "indentations" / f"{readings.capture}.parquet", [readings], account)
     yaml = YAML(typ="safe")
     settings = yaml.load((ROOT / "pipeline/scenes/eflesh.yaml").read_text())
-    settings["drift"]["training"]["steps_n"] = 600
+    settings["drift"]["training"]["steps_n"] = 300
     params = yaml.load((ROOT / "params.yaml").read_text())
     recipe = settings["drift"]["training"]["recipe"]
     item = {"scene": "eflesh", "captures": [readings.capture], "drift": {"training": {"recipe": recipe}}}
