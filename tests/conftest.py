@@ -14,7 +14,8 @@ from hypothesis import HealthCheck, settings
 from jaxtyping import AbstractArray, jaxtyped
 
 # How long an example takes says how busy the machine is, not whether the law holds.
-settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow], max_examples=50)
+settings.register_profile("thorough", settings.get_profile("busy"), max_examples=1000)  # --hypothesis-profile=thorough
 settings.load_profile("busy")
 
 SHARED_DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
