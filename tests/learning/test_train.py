@@ -94,9 +94,16 @@ def test_a_network_becomes_the_same_in_a_stack_and_alone(terms, batch_n):
         np.testing.assert_allclose(together[i].curve, alone.curve, rtol=1e-3)
 
 
-@pytest.mark.parametrize("decay", [0.0, 10.0])
-@pytest.mark.parametrize(
-    "terms", [NO_TERMS, Terms(0.5), Terms(0.0, unlabelled=0.7), Terms(0.0, few_labels=0.3), ALL_TERMS], ids=str
+@pytest.mark.parametrize(  # decay is of weights, whatever pulls at them
+    ("terms", "decay"),
+    [
+        (NO_TERMS, 0.0),
+        (Terms(0.5), 10.0),
+        (Terms(0.0, unlabelled=0.7), 0.0),
+        (Terms(0.0, few_labels=0.3), 10.0),
+        (ALL_TERMS, 10.0),
+    ],
+    ids=str,
 )
 def test_the_stack_descends_as_the_plainest_pytorch_loop_does(terms, decay):
     schedule, steps_n = recipe(steps_n=70, rate_max=5e-4, weight_decay=decay), 70
