@@ -39,12 +39,16 @@ def check_arrays(of: Any = None, *, typechecker: Any) -> Any:
         return of
     if not any(map(_names_an_array, inspect.get_annotations(of).values())):
         return of
-    checked = jaxtyped(of, typechecker=typechecker)
+    checked = None
 
     @wraps(of)
     def checked_at_first(*args: Any, **kwargs: Any) -> Any:
+        nonlocal checked
         calls_n[of] += 1
-        return (checked if calls_n[of] <= CHECKED_N else of)(*args, **kwargs)
+        if calls_n[of] > CHECKED_N:
+            return of(*args, **kwargs)
+        checked = checked or jaxtyped(of, typechecker=typechecker)  # late: it takes longer than to import the function
+        return checked(*args, **kwargs)
 
     return checked_at_first
 
