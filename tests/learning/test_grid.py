@@ -242,9 +242,7 @@ def dies(attempts: set[int]) -> object:
     return make
 
 
-@pytest.mark.parametrize(
-    ("dead", "before_n", "collapsed"), [(set(), 0, 0), ({0}, 1, 0), ({0, 1}, 2, 0), ({0, 1, 2}, 2, 1)]
-)
+@pytest.mark.parametrize(("dead", "before_n", "collapsed"), [(set(), 0, 0), ({0}, 1, 0), ({0, 1, 2}, 2, 1)])
 def test_what_collapses_is_trained_again_at_most_twice_and_counted(tmp_path, monkeypatch, dead, before_n, collapsed):
     monkeypatch.setattr(train, "make_job", dies(dead))
     some, said = trials(2, steps_n=JUDGED_STEPS_N, rate_max=1e-2), []
