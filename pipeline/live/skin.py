@@ -212,7 +212,7 @@ class Skin:
     def _begin_stream(self, found: ports.Found) -> None:
         self._stream = FrameStream(found.wire, found.chips_n)
         self._counted: Counter[str] = Counter()
-        self._lost_in_row_n = 0
+        self._lost_in_row_n = self._opening_n = 0
         self._ends: deque[tuple[int, float]] = deque([(0, self.reader.unix_s())], maxlen=ENDS_KEPT_N)
 
     def _decode(self, chunks: list[Chunk]) -> tuple[Frames, Float64[np.ndarray, " f"]]:
@@ -243,9 +243,10 @@ class Skin:
         more, first, self._counted = counted - self._counted, not self._counted["frames_n"], counted
         self.account += more
         lost_n = sum(count for name, count in more.items() if name.startswith("skipped_"))
-        if first and (lost_n - 1) * more["frames_n"] <= more["frame_bytes_n"]:
-            self._opening_bytes_n += lost_n  # the port was opened in a frame; behind a last byte alone, one is not sure
-            return
+        frame_n = more["frame_bytes_n"] / more["frames_n"] if more["frames_n"] else 16 * self.found.chips_n  # at least
+        if first and self._opening_n + lost_n <= frame_n + 1:  # behind a last byte alone, one is not sure
+            self._opening_n, self._opening_bytes_n = self._opening_n + lost_n, self._opening_bytes_n + lost_n
+            return  # the port was opened in a frame
         self.health.note("bytes lost between frames", lost_n, now_s, "torn")
         self._lost_in_row_n = 0 if more["frames_n"] else self._lost_in_row_n + lost_n
         if self._lost_in_row_n > GARBAGE_FRAMES_N * 16 * self.found.chips_n:  # no format has less than 16 bytes a chip

@@ -108,6 +108,17 @@ def test_a_port_that_is_opened_inside_a_frame_loses_nothing_and_raises_no_alarm_
         assert set(skin.health.alarms) == ({"bytes lost between frames"} if cut_i else set())
 
 
+@pytest.mark.parametrize("chunk_n", [20, 3280])
+def test_garbage_behind_a_replug_is_lost_and_told(chunk_n):
+    skin, _ = played(make_script(pokes_n=0))
+    garbage = np.random.default_rng(0).bytes(40 * 3280)
+    skin._begin_stream(skin.found)
+    for i in range(0, len(garbage), chunk_n):
+        skin._feed([(garbage[i : i + chunk_n], 0.0)])
+    assert skin.lost_bytes_n > 0.9 * len(garbage)
+    assert {"bytes lost between frames", "no frames in what comes: wrong baud rate?"} <= set(skin.health.alarms)
+
+
 def test_a_magnet_is_a_field_from_outside_and_nothing_else(tmp_path):
     skin, _ = played(inject(SCRIPT, parse("magnet@3+1")), [read_network(write_model(tmp_path))])
     assert {word.split(":")[0] for word in skin.health.alarms} == {"field from outside"}
