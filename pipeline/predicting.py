@@ -24,7 +24,8 @@ from pipeline.experiments.logs.estimates import Answers, Estimates, describe, es
 from pipeline.learning.inputs import VIEW
 from pipeline.trials.networks import Network
 from pipeline.trials.training import FORMAT
-from pipeline.twin.shipped import CHANNELS_N, load_universal
+from pipeline.twin.asked import CHANNELS_N
+from pipeline.twin.shipped import load_universal
 
 PARQUET_MAGIC = b"PAR1"
 ANSWERS = ("x_mm", "y_mm", "Fz_N")

@@ -13,7 +13,8 @@ from jaxtyping import Bool, Float, Float32, Float64
 
 from pipeline.learning.inputs import VIEW, Scaler
 from pipeline.trials.networks import Network
-from pipeline.twin.shipped import CHANNELS_N, Universal
+from pipeline.twin.asked import CHANNELS_N
+from pipeline.twin.shipped import Universal
 
 UNLIKE_SDS = 10.0  # assumed, of an input in training; 6 in scene quick, 7 on lab's boards under its models
 MISFIT_MAX = 4.0  # assumed, of chi^2 a channel: about 1 where the skin is one that the map knows

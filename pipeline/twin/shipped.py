@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from pipeline.core import io
 from pipeline.core.errors import SchemaError
 from pipeline.dataset.grid import CENTRE_MM
+from pipeline.twin.asked import CHANNELS_N, labels_of, learnt_rows_of, rows_of
 from pipeline.twin.choosing import worth
 from pipeline.twin.experts import Labels, multiply, off_middle_mm, told_mm
 from pipeline.twin.opinion import FULL_SET_N, Layers, Weights, ask, moved, of_tensors, tell, to_tensors
@@ -40,10 +41,10 @@ FILE = Path(__file__).with_name("universal.safetensors")  # its card beside it, 
 FORMAT = "reskin-universal-3"
 CHIPS_MM = ((0.0, 0.0), (-7.0, 0.0), (0.0, -7.0), (7.0, 0.0), (0.0, 7.0))
 SKIN_MM = (20.0, 20.0)
+REACH_MM = np.array([[-0.5], [0.5]]) * SKIN_MM  # of places, about the middle
 TURNS_DEG = (0.0, 180.0, 270.0, 90.0, 0.0)
 CHOICE_EVERY_N = 3  # of the lattice's places, one may be the next to press
 BLOCK_N = 200  # readings at a time, to bound memory
-CHANNELS_N = 3 * len(TURNS_DEG)
 
 
 Labelled = tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, " m"], Float[np.ndarray, "m ch"]]  # mm, N, uT
@@ -117,7 +118,7 @@ class Universal:
 
     def zero(self, b_uT: Float[np.ndarray, "f ch"]) -> "Universal":
         """Take the mean of readings without contact as the no-load field, and learn the skin's seat and gap from it."""
-        self._noload_uT = _rows(b_uT).mean(axis=0)
+        self._noload_uT = learnt_rows_of(b_uT).mean(axis=0)
         rest_uT = to_board(self._noload_uT[None])[0]
         return self._begin(see_rest(self._nominal, rest_uT), Shown(rest_uT))
 
@@ -127,23 +128,31 @@ class Universal:
         The first set is looked at several times over, what comes later once: by then the skin is known. If these and
         all before lie evenly over the skin (a grid, each place once), say so: their mean place is then its middle.
         """
-        db_uT, shown = self._change(b_uT), self._shown
+        db_uT, shown = self._change(learnt_rows_of(b_uT)), self._shown
         pokes_uT = np.concatenate([shown.pokes_uT, db_uT])[-FULL_SET_N:]
         if even:
             self._misfits = np.full(len(pokes_uT), np.nan)
             return self._anew(replace(shown, pokes_uT=pokes_uT, even_uT=pokes_uT))._label(*shown.labelled)
-        rounds_n = 1 if len(shown.pokes_uT) else ROUNDS_N
-        skin = see_pokes(self.skin, db_uT, rounds_n=rounds_n, reader=self._ready().reader)
+        labelled, rounds_n = shown.labelled, 1 if len(shown.pokes_uT) else ROUNDS_N
+        if len(labelled[0]):  # what is told counts, and not in which order
+            skin = see_pokes(self._unlabelled, db_uT, rounds_n=rounds_n, reader=Reader(self._unlabelled))
+        else:
+            skin = see_pokes(self.skin, db_uT, rounds_n=rounds_n, reader=self._ready().reader)
         self._misfits = np.concatenate([self._misfits, np.full(len(db_uT), np.nan)])[-FULL_SET_N:]
-        return self._learn(skin, replace(shown, pokes_uT=pokes_uT))
+        return self._learn(skin, Shown(shown.rest_uT, pokes_uT, shown.even_uT))._label(*labelled)
 
     def label(
         self, place_mm: Float[np.ndarray, "m 2"], force_N: Float[np.ndarray, " m"], b_uT: Float[np.ndarray, "m ch"]
     ) -> "Universal":
-        """Learn from pokes at known places under known forces, all that are known; earlier ones are forgotten."""
+        """Learn from pokes at known places under known forces, all that are known; earlier ones are forgotten.
+
+        One poke, or several; raise SchemaError, with nothing learnt, on a place off the skin or a force of 0 N or less.
+        """
+        rows_uT = learnt_rows_of(b_uT)
+        places_mm, forces_N = labels_of(place_mm, force_N, len(rows_uT), CENTRE_MM + REACH_MM)
         if len(self._shown.labelled[0]):
             self._anew(self._shown)
-        return self._label(np.asarray(place_mm, float) - CENTRE_MM, np.asarray(force_N, float), self._change(b_uT))
+        return self._label(places_mm - CENTRE_MM, forces_N, self._change(rows_uT))
 
     def next_place(self, force_N: float = 2.0) -> Float[np.ndarray, "2"]:
         """Give the place whose poke, labelled, would tell most of the skin, in mm; about so strong."""
@@ -181,11 +190,11 @@ class Universal:
     def __call__(self, db_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f 3"]:
         """Answer changes of field, as a network does."""
         noload_uT = self._noload_uT if self._noload_uT is not None else np.zeros(CHANNELS_N)
-        return self.predict(_rows(db_uT) + noload_uT).astype(np.float32)
+        return self.predict(rows_of(db_uT) + noload_uT).astype(np.float32)
 
     def _change(self, b_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f ch"]:
         noload_uT = self._noload_uT if self._noload_uT is not None else 0.0
-        return to_board(_rows(b_uT) - noload_uT)
+        return to_board(rows_of(b_uT) - noload_uT)
 
     def _ready(self) -> Ready:
         if self._told is None:
@@ -251,7 +260,7 @@ def _parts(file: Path) -> tuple[Tables, Sequence[Weights], Sureness]:
     if form != FORMAT:
         remedy = "Take file and card of this version, or make them again: python -m pipeline.trials.shipping"
         raise SchemaError(card_file, "format", FORMAT, form, remedy)
-    parts, _ = io.read_tensors(file)
+    parts, _ = io.read_tensors(file, digest_needed=True)
     of_map = {one.name: parts.pop(one.name).astype(float) for one in fields(Tables) if one.name != "names"}
     return Tables(names=tuple(card["spreads"]), **of_map), of_tensors(parts), Sureness.of_card(card["sureness"])
 
@@ -282,11 +291,3 @@ def to_chips(b_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f ch"]:
 def _turn() -> Float[np.ndarray, "ch ch"]:
     of_chips = Rotation.from_euler("z", np.array(TURNS_DEG)[:, None], degrees=True).as_matrix()
     return np.array(block_diag(*of_chips)).T
-
-
-def _rows(b_uT: Float[np.ndarray, "..."]) -> Float[np.ndarray, "f ch"]:
-    rows_uT = np.atleast_2d(np.asarray(b_uT, float))
-    if rows_uT.shape[1] != CHANNELS_N:
-        rule, remedy = f"the {CHANNELS_N} of five chips", "Load a model of such boards."
-        raise SchemaError("fields", "channels", rule, f"shape {np.shape(b_uT)}", remedy)
-    return rows_uT

@@ -12,7 +12,8 @@ import numpy as np
 
 from pipeline.core.seeds import rng_for
 from pipeline.dataset.grid import CENTRE_MM
-from pipeline.twin.shipped import CHANNELS_N, load_universal
+from pipeline.twin.asked import CHANNELS_N
+from pipeline.twin.shipped import load_universal
 
 POKES_N = 65
 

@@ -8,7 +8,8 @@ import pytest
 import reskin
 from pipeline.core import io
 from pipeline.core.errors import SchemaError
-from pipeline.twin.shipped import CHANNELS_N, FILE, Universal, load_universal, to_chips
+from pipeline.twin.asked import CHANNELS_N
+from pipeline.twin.shipped import FILE, Universal, load_universal, to_chips
 from pipeline.twin.tables import NOMINAL
 
 PLACES_MM = np.array([[8.0, 8.0], [3.0, 6.0], [12.0, 11.0], [10.0, 3.0]])
@@ -88,6 +89,49 @@ def test_labels_that_it_cannot_foresee_make_it_less_sure_and_earlier_ones_are_fo
     assert skin.temper == pytest.approx(fits)
     skin.zero(rest_uT)
     assert skin.temper == pytest.approx(skin.sureness.of(0, 0, even=False))
+
+
+def test_what_is_told_counts_and_neither_its_order_nor_what_was_asked_between(skin):
+    rest_uT = to_chips(skin.tables.rest_uT[None])
+    read_uT, force_N = pokes(skin) + rest_uT, np.full(4, skin.tables.force_N[3])
+    off_mm = PLACES_MM + np.random.default_rng(0).standard_normal(PLACES_MM.shape)
+    further_uT = np.concatenate([1.25 * pokes(skin, force_i) for force_i in (1, 2, 3, 4)]) + rest_uT
+    found = skin.zero(rest_uT).see(further_uT).label(off_mm, force_N, read_uT).estimate(read_uT)
+    skin.zero(rest_uT).label(off_mm, force_N, read_uT).predict(read_uT)
+    after = skin.see(further_uT).estimate(read_uT)
+    np.testing.assert_allclose(after.place_mm, found.place_mm)
+    np.testing.assert_allclose(after.sd_mm, found.sd_mm)
+
+
+@pytest.mark.parametrize(
+    ("place_mm", "force_N", "rule"),
+    [
+        ((8.0, np.nan), 1.0, "places must be on the skin"), ((40.0, 8.0), 1.0, "mm; got 40.0"),
+        ((8.0, 8.0), 0.0, "forces must be above 0 N; got 0.0"), ((8.0, 8.0), np.nan, "forces must be above 0 N"),
+        ((8.0, 8.0), np.inf, "forces must be finite"), ((8.0, 8.0, 1.0), 1.0, "shapes must be x and y"),
+    ],
+)  # fmt: skip
+def test_labels_that_no_poke_has_are_refused_and_nothing_is_learnt(skin, place_mm, force_N, rule):
+    rest_uT = to_chips(skin.tables.rest_uT[None])
+    read_uT = pokes(skin)[:1] + rest_uT
+    before = skin.zero(rest_uT).label(PLACES_MM[0], 1.0, read_uT[0]).predict(read_uT)  # one poke, without brackets
+    with pytest.raises(SchemaError, match=rule):
+        skin.label(place_mm, force_N, read_uT)
+    for learn in (skin.see, skin.zero):
+        with pytest.raises(SchemaError, match="must be finite numbers of uT; got nan"):
+            learn(read_uT * [np.nan])
+    np.testing.assert_array_equal(skin.predict(read_uT), before)
+
+
+def test_a_changed_model_is_refused(skin, tmp_path):
+    file = tmp_path / FILE.name
+    shutil.copy(FILE.with_suffix(".json"), file.with_suffix(".json"))
+    content = bytearray(FILE.read_bytes())
+    content[-1] ^= 1
+    for changed in (bytes(content), FILE.read_bytes().replace(b"__metadata__", b"__metad4ta__")):
+        file.write_bytes(changed)
+        with pytest.raises(SchemaError, match="must be"):
+            load_universal(file)
 
 
 def test_a_model_of_an_earlier_version_is_refused(skin, tmp_path):
