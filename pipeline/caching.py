@@ -5,6 +5,7 @@ what a failing disk changed comes back as if it were the result. Refuses to know
 """
 
 import hashlib
+import re
 import shutil
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,6 +20,7 @@ from pipeline.tidying import LOCK
 
 ASIDE = ".reskin/damaged"
 FOLDER = ".dir"  # how the name of an object ends that lists the files of a folder
+OBJECT = re.compile(r"[0-9a-f]{30}(\.dir)?")  # other names are what a killed DVC left half-written
 READ_ONLY = 0o444  # as DVC keeps objects
 
 Use = tuple[str, Path]  # the command that brings an output back, and the output
@@ -28,7 +30,8 @@ def check(root: Path, echo: Callable[[str], None]) -> int:
     """Hold every object against its name; set aside what differs, and its copies among the outputs; 1 if any does."""
     need_rest(root)
     cache = _cache_of(root)
-    objects = {f"{file.parent.name}{file.name}": file for file in sorted(cache.glob("[0-9a-f][0-9a-f]/*"))}
+    files = (file for file in sorted(cache.glob("[0-9a-f][0-9a-f]/*")) if OBJECT.fullmatch(file.name))
+    objects = {f"{file.parent.name}{file.name}": file for file in files}
     damaged = {name: file for name, file in objects.items() if _md5(file) != name.removesuffix(FOLDER)}
     uses = _uses(root, objects) if damaged else {}
     for name, file in damaged.items():
