@@ -46,8 +46,10 @@ def from_program(labels: Iterable[Label] | Callable[[], Label | None], dwell_s: 
     def run(desk: Desk) -> str:
         for label in each:
             if not isinstance(label, Label):
-                remedy = "Yield reskin.LIFTED or reskin.touch(x_mm, y_mm)."
-                raise ParamsError("labels", "what the program gives", "a reskin.Label", repr(label)[:60], remedy)
+                remedy = "Yield reskin.lifted() or reskin.touch(x_mm, y_mm)."
+                raise ParamsError(
+                    "labels", "what the program gives", "reskin.lifted() or reskin.touch(...)", repr(label)[:60], remedy
+                )
             desk.tape.write(desk.hold(label, dwell_s))
             if desk.stop.is_set():
                 break

@@ -71,7 +71,7 @@ def test_what_is_no_label_and_a_robot_that_fails_end_the_labels_and_are_told(des
     labeller._thread.join()
     assert labeller.end() == "0 touches labelled; labels ended: the robot is in its limits"
     assert isinstance(labeller.failed, RuntimeError)
-    with pytest.raises(ParamsError, match="must be a reskin.Label; got 'lifted'"):
+    with pytest.raises(ParamsError, match=r"must be reskin.lifted\(\) or reskin.touch\(...\); got 'lifted'"):
         from_program(["lifted"], DWELL_s).run(Desk(desk.tape, time.time, threading.Event(), desk.mark))
 
 
