@@ -80,7 +80,7 @@ def verdict(scene: str, against: str, done: Comparison) -> str:
     if done.reproduced and not done.within_n:
         return f"{scene}: reproduced: all {counts.partition(',')[0]}."
     if done.reproduced:
-        arithmetic = "changed files are this machine's arithmetic; `git checkout reports` takes them back"
+        arithmetic = "another processor's arithmetic does that; with AVX2, code, data or settings did: look at git diff"
         return f"{scene}: reproduced within tolerance: {counts}, none beyond ({arithmetic})."
     lone_n = len(done.missing) + len(done.new)
     return (
