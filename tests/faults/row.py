@@ -1,12 +1,15 @@
 """A row of the table of faults, and how it is judged. In: what was said and kept. Out: Markdown."""
 
 import re
+import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
 from tests.faults.place import TRACES, Checkout, Said, sentence_of
+from tests.stages.checkout import ROOT
 
+ROOTS = (tempfile.gettempdir(), str(ROOT.parent), "/var")  # paths of this machine, which no reader has
 TITLES = ("fault", "how injected", "what the user sees", "exit status", "lost", "the next run", "s", "verdict")
 
 
@@ -96,7 +99,9 @@ def not_run(name: str, how: str) -> str:
 
 def _plain(text: str) -> str:
     return (
-        re.sub(r"(?<!\w)(/tmp|/work|/var)\S*/", "…/", " ".join(text.split())).replace("|", "\\|").replace("<", "&lt;")
+        re.sub(rf"(?<!\w)({'|'.join(map(re.escape, ROOTS))})\S*/", "…/", " ".join(text.split()))
+        .replace("|", "\\|")
+        .replace("<", "&lt;")
     )
 
 
