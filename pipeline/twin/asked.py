@@ -34,8 +34,7 @@ def labels_of(
     reach_mm: Float[np.ndarray, "2 2"],
 ) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, " m"]]:
     """Take one label or several, as many as readings: places within `reach_mm` (least, most), forces above 0 N."""
-    places_mm = np.atleast_2d(np.asarray(place_mm, float))
-    forces_N = np.atleast_1d(np.asarray(force_N, float))
+    places_mm, forces_N = np.atleast_2d(place_mm), np.atleast_1d(force_N)
     got = f"places {places_mm.shape}, forces {forces_N.shape}, readings ({rows_n}, {CHANNELS_N})"
     if places_mm.shape != (rows_n, 2) or forces_N.shape != (rows_n,):
         rule, remedy = "x and y, a force and a reading of each poke", "Give arrays [m, 2], [m] and [m, 15]."

@@ -116,13 +116,13 @@ class Universal:
             (self._ratio,) = self.ratios([told])
         return by_residuals(told, self._ratio)
 
-    def zero(self, b_uT: Float[np.ndarray, "f ch"]) -> "Universal":
+    def zero(self, b_uT: Float[np.ndarray, "*f ch"]) -> "Universal":
         """Take the mean of readings without contact as the no-load field, and learn the skin's seat and gap from it."""
         self._noload_uT = learnt_rows_of(b_uT).mean(axis=0)
         rest_uT = to_board(self._noload_uT[None])[0]
         return self._begin(see_rest(self._nominal, rest_uT), Shown(rest_uT))
 
-    def see(self, b_uT: Float[np.ndarray, "n ch"], *, even: bool = False) -> "Universal":
+    def see(self, b_uT: Float[np.ndarray, "*n ch"], *, even: bool = False) -> "Universal":
         """Learn from pokes at unknown places, a reading each: some dozens all over the skin, later ones as they come.
 
         The first set is looked at several times over, what comes later once: by then the skin is known. If these and
@@ -142,14 +142,19 @@ class Universal:
         return self._learn(skin, Shown(shown.rest_uT, pokes_uT, shown.even_uT))._label(*labelled)
 
     def label(
-        self, place_mm: Float[np.ndarray, "m 2"], force_N: Float[np.ndarray, " m"], b_uT: Float[np.ndarray, "m ch"]
+        self,
+        place_mm: Float[np.ndarray, "*m 2"] | Sequence[Any],
+        force_N: Float[np.ndarray, "*m"] | Sequence[float] | float,
+        b_uT: Float[np.ndarray, "*m ch"],
     ) -> "Universal":
         """Learn from pokes at known places under known forces, all that are known; earlier ones are forgotten.
 
         One poke, or several; raise SchemaError, with nothing learnt, on a place off the skin or a force of 0 N or less.
         """
         rows_uT = learnt_rows_of(b_uT)
-        places_mm, forces_N = labels_of(place_mm, force_N, len(rows_uT), CENTRE_MM + REACH_MM)
+        places_mm, forces_N = labels_of(
+            np.asarray(place_mm, float), np.asarray(force_N, float), len(rows_uT), CENTRE_MM + REACH_MM
+        )
         if len(self._shown.labelled[0]):
             self._anew(self._shown)
         return self._label(places_mm - CENTRE_MM, forces_N, self._change(rows_uT))
@@ -159,18 +164,18 @@ class Universal:
         place_mm = self.skin.hypotheses.place_mm[::CHOICE_EVERY_N]
         return place_mm[worth(self.skin, place_mm, np.full(len(place_mm), force_N)).argmax()] + CENTRE_MM
 
-    def predict(self, b_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f 3"]:
+    def predict(self, b_uT: Float[np.ndarray, "*f ch"]) -> Float[np.ndarray, "f 3"]:
         """Give x_mm, y_mm and the normal force in N of readings in contact."""
         found = self.estimate(b_uT)
         return np.column_stack([found.place_mm, found.force_N])
 
-    def estimate(self, b_uT: Float[np.ndarray, "f ch"]) -> Estimate:
+    def estimate(self, b_uT: Float[np.ndarray, "*f ch"]) -> Estimate:
         """Give the same with the place's standard deviation, and the misfit: far above 1, this is no skin it knows."""
         if self._temper is None:
             self._temper = self.temper
         return self.estimates(b_uT, [self._temper])[0]
 
-    def estimates(self, b_uT: Float[np.ndarray, "f ch"], tempers: Sequence[float]) -> list[Estimate]:
+    def estimates(self, b_uT: Float[np.ndarray, "*f ch"], tempers: Sequence[float]) -> list[Estimate]:
         """Give the same under some tempers: only standard deviations differ."""
         db_uT, told = self._change(b_uT), self._ready()
         parts = [told.estimates(db_uT[i : i + BLOCK_N], tempers) for i in range(0, len(db_uT), BLOCK_N)]
@@ -192,7 +197,7 @@ class Universal:
         noload_uT = self._noload_uT if self._noload_uT is not None else np.zeros(CHANNELS_N)
         return self.predict(rows_of(db_uT) + noload_uT).astype(np.float32)
 
-    def _change(self, b_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f ch"]:
+    def _change(self, b_uT: Float[np.ndarray, "*f ch"]) -> Float[np.ndarray, "f ch"]:
         noload_uT = self._noload_uT if self._noload_uT is not None else 0.0
         return to_board(rows_of(b_uT) - noload_uT)
 
