@@ -184,25 +184,28 @@ def load_model(file: Path | str) -> Model:
     return Model(read_network(Path(file)))
 
 
-def load_universal() -> Universal:
+def load_universal(skin: Path | str | None = None) -> Universal:
     """Load the map and network of simulated skins that come with the project, for a skin that nobody calibrated.
 
     >>> skin = load_universal().zero(noload_uT)  # doctest: +SKIP
     >>> x_mm, y_mm, force_N = skin.predict(b_uT)[0]  # doctest: +SKIP
 
     It learns while it is used: `see` pokes anywhere, `label` some at known places; `next_place` says which tells most.
+    What it was told of a skin can be kept: `skin.save("FILE.safetensors")`, then `load_universal("FILE.safetensors")`.
     """
     from pipeline.twin import shipped
 
-    return shipped.load_universal()
+    return shipped.load_universal(skin)
 
 
 @overload
-def open(port: str, *, model: Path | str | Sequence[Path | str] = (), baud: int = 115200) -> LiveSkin: ...
+def open(port: str, *, model: Path | str | Sequence[Path | str] | Universal = (), baud: int = 115200) -> LiveSkin: ...
 @overload
-def open(port: list[str], *, model: Path | str | Sequence[Path | str] = (), baud: int = 115200) -> LiveSkins: ...
 def open(
-    port: str | list[str], *, model: Path | str | Sequence[Path | str] = (), baud: int = 115200
+    port: list[str], *, model: Path | str | Sequence[Path | str] | Universal = (), baud: int = 115200
+) -> LiveSkins: ...
+def open(
+    port: str | list[str], *, model: Path | str | Sequence[Path | str] | Universal = (), baud: int = 115200
 ) -> LiveSkin | LiveSkins:
     """Open a board's port: its contacts while they happen. In the first second nothing may touch the skin.
 
@@ -211,20 +214,24 @@ def open(
     ...         print(contact.t_s, contact.x_mm, contact.y_mm, contact.F_N, contact.alarms)
 
     Format and chips are told from the bytes; `port` may also be `socket://host:port`. Without a model the map of
-    simulated skins answers (`load_universal`). Several models give means, and how far they are apart. A list of ports
-    gives the latest contacts of all boards, in its order; one that is unplugged does not hold up the others.
+    simulated skins answers (`load_universal`); `model` may be one that learnt this skin, which it then keeps but for
+    the no-load reading. Several models give means, and how far they are apart. A list of ports gives the latest
+    contacts of all boards, in its order; one that is unplugged does not hold up the others.
     """
+    from pipeline.live.answering import check_boards
     from pipeline.live.ports import check_named_once
     from pipeline.live.skin import Skin
     from pipeline.live.skins import Skins
-    from pipeline.predicting import read_network
+    from pipeline.predicting import read_models
+    from pipeline.twin.shipped import Universal
 
     if not isinstance(port, str):
         check_named_once(port, "reskin.open")
     files = [model] if isinstance(model, str | Path) else model
-    models = [read_network(Path(file)) for file in files] or load_universal()
+    models = files if isinstance(files, Universal) else read_models([Path(file) for file in files])
     if isinstance(port, str):
         return Skin(port, models, baud=baud)
+    check_boards(models, len(port), "reskin.open")
     return Skins([Skin(each, models, baud=baud) for each in port])
 
 

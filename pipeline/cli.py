@@ -33,7 +33,7 @@ scenes = typer.Typer(no_args_is_help=True, help="Choose which scenes `dvc repro`
 app.add_typer(scenes, name="scenes")
 app.add_typer(commands.app)
 
-MODEL = "A trained model (.safetensors), its card (.json) beside it; without one, the map of simulated skins."
+MODEL = "A trained model (.safetensors), its card (.json) beside it, or a saved skin; else the map of simulated skins."
 LOGS = "A log of an SD card (t_s,T0,Bx0,By0,Bz0,T1,...; degC, uT), a folder of `record`, a file of `decode`."
 
 Layout = Literal["capture", "serial-binary", "serial-text", Foreign]

@@ -3,7 +3,7 @@
 Refuses to know scenes and folds: whether the model ever saw the log's board is for its user to know.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -25,7 +25,8 @@ from pipeline.learning.inputs import VIEW
 from pipeline.trials.networks import Network
 from pipeline.trials.training import FORMAT
 from pipeline.twin.asked import CHANNELS_N
-from pipeline.twin.shipped import load_universal
+from pipeline.twin.shipped import Universal, load_universal
+from pipeline.twin.shown import is_shown
 
 PARQUET_MAGIC = b"PAR1"
 ANSWERS = ("x_mm", "y_mm", "Fz_N")
@@ -62,21 +63,22 @@ def predict(log: Path, model: Path | None, out: Path, *, rate_hz: float = 400.0)
     Without a model the map of simulated skins answers, which comes with the project (`twin.shipped`). Places and forces
     are left empty where there is no contact. `rate_hz` gives a decoded dump without a clock its time.
     """
-    network = None if model is None else read_network(model)
+    models = read_models([] if model is None else [model])
     read = (log,) if model is None else (log, model, model.with_suffix(".json"))
     if out.resolve() in {file.resolve() for file in read}:
         rule = "another than the log, the model and its card"
         raise ParamsError("--out", "the file to write", rule, out, "Choose another --out.")
     t_s, b_uT, _, account = read_any_log(log, rate_hz)
-    channels_n = CHANNELS_N if network is None else network.card["input"]["channels_n"]
+    channels_n = CHANNELS_N if isinstance(models, Universal) else models[0].card["input"]["channels_n"]
     if b_uT.shape[1] != channels_n:
         remedy = "Take a model of such boards."
         raise SchemaError(log, "channels", f"the {channels_n} of the model", b_uT.shape[1], remedy)
-    if network is None:
-        answers: Answers = load_universal().zero(b_uT[: quiet_start(t_s, b_uT, where=str(log))])
+    answers: Sequence[Answers]
+    if isinstance(models, Universal):
+        answers = [models.zero(b_uT[: quiet_start(t_s, b_uT, where=str(log))], keep=True)]
     else:
-        answers = network
-    found = estimate(t_s, b_uT, [answers], where=str(log))
+        answers = models
+    found = estimate(t_s, b_uT, answers, where=str(log))
     io.write_text(out, render(found))
     return describe(found) | account
 
@@ -113,6 +115,16 @@ def _read_capture(folder: Path) -> sd_card.Log:
     kept = frames.where(timed)
     *log, counts = sd_card.keep_whole(t_s[timed], kept.b_uT, kept.temperature_degC, str(stream))
     return *log, account | {"dropped_no_time_frames_n": int((~timed).sum())} | counts  # type: ignore[return-value]
+
+
+def read_models(files: Sequence[Path]) -> Sequence[Network] | Universal:
+    """Read trained networks, or one skin that the universal model was told of (`save`); of no file, that model."""
+    skins = [file for file in files if file.is_file() and not file.with_suffix(".json").exists() and is_shown(file)]
+    if not skins:
+        return [read_network(file) for file in files] or load_universal()
+    if len(files) > 1:
+        raise ParamsError(skins[0], "a saved skin", "given alone", f"{len(files)} models", "Give one.")
+    return load_universal(skins[0])
 
 
 def read_network(model: Path) -> Network:

@@ -11,10 +11,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64
 
+from pipeline.core.errors import ParamsError
 from pipeline.learning.inputs import VIEW, Scaler
 from pipeline.trials.networks import Network
 from pipeline.twin.asked import CHANNELS_N
 from pipeline.twin.shipped import Universal
+from pipeline.twin.skin_map import Estimate
 
 UNLIKE_SDS = 10.0  # assumed, of an input in training; 6 in scene quick, 7 on lab's boards under its models
 MISFIT_MAX = 4.0  # assumed, of chi^2 a channel: about 1 where the skin is one that the map knows
@@ -53,27 +55,26 @@ class Networks:
 
 
 class Map:
-    """Is fitted to the no-load field, and to pokes at unknown places if it is let see some."""
+    """Is fitted to the no-load field, to pokes at unknown places if it is let see some, and to shown ones.
+
+    The model that it is given stays as it is; what that one learnt of the skin is kept.
+    """
 
     channels_n = CHANNELS_N
     about = "map of simulated skins"
 
     def __init__(self, universal: Universal) -> None:
-        self._universal = universal
-        self._pokes_uT = np.zeros((0, CHANNELS_N))  # changes of field that it was let see
-        self._shown_mm, self._shown_uT = np.zeros((0, 2)), np.zeros((0, CHANNELS_N))  # pokes at known places
-        self.zero(np.zeros((1, CHANNELS_N)))
+        self._learn(copy(universal))
 
     def zero(self, b_uT: Float[np.ndarray, "f ch"]) -> None:
         """Begin anew from the no-load field, and from the pokes that were seen before."""
-        self._noload_uT = b_uT.mean(axis=0, dtype=np.float64)
-        self._learn(self._pokes_uT)
+        self._learn(copy(self._universal).zero(b_uT.mean(axis=0, dtype=np.float64), keep=True))
 
     def see(self, db_uT: Float[np.ndarray, "n ch"]) -> str:
         """Learn from pokes anywhere; say what they did to its sureness. Nobody knows where they were."""
-        before, self._pokes_uT = self._universal.estimate(self._noload_uT + db_uT), db_uT.astype(np.float64)
-        self._learn(self._pokes_uT)
-        after = self._universal.estimate(self._noload_uT + db_uT)
+        before, b_uT = self._estimate(db_uT), db_uT + self._universal.noload_uT
+        self._learn(copy(self._universal).see(b_uT))
+        after = self._estimate(db_uT)
         sd_mm, misfit = ([np.median(each) for each in pair] for pair in zip(
             (before.sd_mm.max(axis=1), before.misfit), (after.sd_mm.max(axis=1), after.misfit), strict=True
         ))  # fmt: skip
@@ -91,31 +92,26 @@ class Map:
         """
 
         def error_mm() -> float:
-            found = self._universal.estimate(self._noload_uT + db_uT[kept])
-            return float(np.median(np.linalg.norm(found.place_mm - place_mm[kept], axis=1)))
+            return float(np.median(np.linalg.norm(self._estimate(db_uT[kept]).place_mm - place_mm[kept], axis=1)))
 
-        before_mm = error_mm()
-        self._shown_mm, self._shown_uT = place_mm[~kept], db_uT[~kept].astype(np.float64)
-        self._learn(self._pokes_uT)
+        before_mm, force_N = error_mm(), self._estimate(db_uT[~kept]).force_N
+        self._learn(copy(self._universal).label(place_mm[~kept], force_N, db_uT[~kept] + self._universal.noload_uT))
         return (
             f"adapted to {(~kept).sum()} shown places: error at {kept.sum()} others {before_mm:.2f} mm before, "
             f"{error_mm():.2f} mm after (medians)"
         )
 
-    def _learn(self, pokes_uT: Float[np.ndarray, "n ch"]) -> None:
-        universal = copy(self._universal).zero(self._noload_uT[None])
-        if len(pokes_uT):
-            universal.see(self._noload_uT + pokes_uT)
-        if len(self._shown_uT):
-            b_uT = self._noload_uT + self._shown_uT
-            universal.label(self._shown_mm, universal.estimate(b_uT).force_N, b_uT)
-        universal.estimate(self._noload_uT[None])  # what a first contact should not wait for
-        self._universal = universal
-
     def __call__(self, db_uT: Float32[np.ndarray, "f ch"]) -> Answered:
-        found = self._universal.estimate(self._noload_uT + db_uT)
+        found = self._estimate(db_uT)
         answer = np.column_stack([found.place_mm, found.force_N])
         return Answered(answer, found.sd_mm, np.asarray(found.misfit > MISFIT_MAX))
+
+    def _estimate(self, db_uT: Float[np.ndarray, "n ch"]) -> Estimate:
+        return self._universal.estimate(db_uT + self._universal.noload_uT)
+
+    def _learn(self, universal: Universal) -> None:
+        universal.estimate(universal.noload_uT)  # what a first contact should not wait for
+        self._universal = universal
 
 
 def answering(models: Models) -> Networks | Map | None:
@@ -123,3 +119,10 @@ def answering(models: Models) -> Networks | Map | None:
     if isinstance(models, Universal):
         return Map(models)
     return Networks(models) if models else None
+
+
+def check_boards(models: Models, boards_n: int, where: str) -> None:
+    """Raise ParamsError if a model that learnt one skin is to answer for several boards."""
+    if boards_n > 1 and isinstance(models, Universal) and models.told_n:
+        rule, remedy = "for one board", "Open that board alone, or give no model."
+        raise ParamsError(where, f"a model that was told {models.told_n} pokes of a skin", rule, boards_n, remedy)

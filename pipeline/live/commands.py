@@ -116,7 +116,7 @@ def emulate(
 def live(
     port: Annotated[list[str] | None, Option(help="A board's port, or several; not given: all that are there.")] = None,
     model: Annotated[
-        list[Path] | None, Option(help="A trained model (.safetensors), or several; else the map of simulated skins.")
+        list[Path] | None, Option(help="Trained models, or one skin that was saved; else the map of simulated skins.")
     ] = None,
     replay: Annotated[str | None, Option(help="In place of a board: the folder of a capture.")] = None,
     emulate: Annotated[str | None, Option(help="In place of a board: the name of a simulated scene.")] = None,
@@ -136,14 +136,13 @@ def live(
     from pipeline.live.script import read_script
     from pipeline.live.server import serve
     from pipeline.live.session import several
-    from pipeline.predicting import read_network
-    from pipeline.twin.shipped import load_universal
+    from pipeline.predicting import read_models
 
     decisions = decide(LIVE, on_fault or (), "--on-fault")
     given = [word for word, value in (("--port", port), ("--replay", replay), ("--emulate", emulate)) if value]
     if len(given) > 1:
         raise ParamsError("live", "the board", "from one of --port, --replay, --emulate", ", ".join(given), "Give one.")
-    models = [read_network(file) for file in model] if model else load_universal()
+    models = read_models(model or ())
     with ExitStack() as stack:
         what = "a board"
         if source := replay or emulate:

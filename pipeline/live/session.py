@@ -14,7 +14,7 @@ from pipeline.capture.header import Header
 from pipeline.capture.port import Tape
 from pipeline.core.errors import ReskinError
 from pipeline.live.adapting import Pokes, ShownPokes
-from pipeline.live.answering import Map, Models
+from pipeline.live.answering import Map, Models, check_boards
 from pipeline.live.health import LIVE
 from pipeline.live.ports import check_named_once
 from pipeline.live.skin import WAITING, Readings, Skin
@@ -165,4 +165,5 @@ class Live:
 def several(ports: Sequence[str], models: Models, what: str, decisions: Decisions = LIVE) -> list[Live]:
     """Make one of each port; all share what the models are made of, and nothing else."""
     check_named_once(ports, "--port")
+    check_boards(models, len(ports), "--model")
     return [Live(port, models, what, decisions, alone=len(ports) == 1) for port in ports]

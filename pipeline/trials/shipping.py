@@ -23,10 +23,11 @@ from pipeline.trials.universal import FORCE_MIN_N, covered
 from pipeline.twin.law import Setup
 from pipeline.twin.opinion import FULL_SET_N
 from pipeline.twin.population import Population
-from pipeline.twin.shipped import CHIPS_MM, SKIN_MM, Universal, to_chips, write
+from pipeline.twin.shipped import SKIN_MM, Universal, write
 from pipeline.twin.sure import Sureness, by_misfit, by_residuals
 from pipeline.twin.tables import NOMINAL, OF_NOMINAL, tabulate
 from pipeline.twin.training import NAMELESS, Lessons, Syllabus, teach
+from pipeline.twin.turned import CHIPS_MM, to_chips
 
 POKES_N = (0, 12, FULL_SET_N)  # unlabelled ones; `reskin live` asks for a dozen
 WAYS = (*((n, False) for n in POKES_N), (FULL_SET_N, True))  # so many, and whether they are said to lie evenly

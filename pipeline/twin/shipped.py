@@ -6,14 +6,12 @@ at (8, 8) mm. Refuses to know recordings: nothing of them is in the file but the
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import cache, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.linalg import block_diag
-from scipy.spatial.transform import Rotation
 
 from pipeline.core import io
 from pipeline.core.errors import SchemaError
@@ -22,6 +20,7 @@ from pipeline.twin.asked import CHANNELS_N, labels_of, learnt_rows_of, rows_of
 from pipeline.twin.choosing import worth
 from pipeline.twin.experts import Labels, multiply, off_middle_mm, told_mm
 from pipeline.twin.opinion import FULL_SET_N, Layers, Weights, ask, moved, of_tensors, tell, to_tensors
+from pipeline.twin.shown import Shown, read_shown, write_shown
 from pipeline.twin.skin_map import (
     ROUNDS_N,
     Estimate,
@@ -36,33 +35,14 @@ from pipeline.twin.skin_map import (
 )
 from pipeline.twin.sure import Sureness, by_misfit, by_residuals, left_out, ratios
 from pipeline.twin.tables import Tables
+from pipeline.twin.turned import to_board, to_chips
 
 FILE = Path(__file__).with_name("universal.safetensors")  # its card beside it, .json
 FORMAT = "reskin-universal-3"
-CHIPS_MM = ((0.0, 0.0), (-7.0, 0.0), (0.0, -7.0), (7.0, 0.0), (0.0, 7.0))
 SKIN_MM = (20.0, 20.0)
 REACH_MM = np.array([[-0.5], [0.5]]) * SKIN_MM  # of places, about the middle
-TURNS_DEG = (0.0, 180.0, 270.0, 90.0, 0.0)
 CHOICE_EVERY_N = 3  # of the lattice's places, one may be the next to press
 BLOCK_N = 200  # readings at a time, to bound memory
-
-
-Labelled = tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, " m"], Float[np.ndarray, "m ch"]]  # mm, N, uT
-
-
-def none() -> Float[np.ndarray, "0 ch"]:
-    """Give no poke."""
-    return np.zeros((0, CHANNELS_N))
-
-
-@dataclass(frozen=True)
-class Shown:
-    """What experts are told of a skin: its field at rest, pokes (at most a full set), and labelled ones."""
-
-    rest_uT: Float[np.ndarray, " ch"]
-    pokes_uT: Float[np.ndarray, "c ch"] = field(default_factory=none)
-    even_uT: Float[np.ndarray, "e ch"] = field(default_factory=none)  # those that lie evenly over the skin
-    labelled: Labelled = field(default_factory=lambda: (np.zeros((0, 2)), np.zeros(0), none()))
 
 
 @dataclass(frozen=True)
@@ -102,6 +82,16 @@ class Universal:
         return io.read_json(FILE.with_suffix(".json"))
 
     @property
+    def noload_uT(self) -> Float[np.ndarray, " ch"]:
+        """The no-load field that changes are taken from, along the chips' axes; zeros before it was zeroed."""
+        return np.zeros(CHANNELS_N) if self._noload_uT is None else self._noload_uT
+
+    @property
+    def told_n(self) -> int:
+        """Count the pokes that it learns from, labelled or not."""
+        return len(self._shown.pokes_uT) + len(self._shown.labelled[0])
+
+    @property
     def misfit(self) -> float:
         """How badly the pokes that it was let see fit: the median of chi^2 a channel; 1 of none or too few to tell."""
         self._ready()
@@ -116,11 +106,14 @@ class Universal:
             (self._ratio,) = self.ratios([told])
         return by_residuals(told, self._ratio)
 
-    def zero(self, b_uT: Float[np.ndarray, "*f ch"]) -> "Universal":
-        """Take the mean of readings without contact as the no-load field, and learn the skin's seat and gap from it."""
+    def zero(self, b_uT: Float[np.ndarray, "*f ch"], *, keep: bool = False) -> "Universal":
+        """Take the mean of readings without contact as the no-load field, and learn the skin's seat and gap from it.
+
+        What it learnt of a skin before is forgotten; `keep` the pokes and labels where the same skin has drifted.
+        """
         self._noload_uT = learnt_rows_of(b_uT).mean(axis=0)
         rest_uT = to_board(self._noload_uT[None])[0]
-        return self._begin(see_rest(self._nominal, rest_uT), Shown(rest_uT))
+        return self._take(replace(self._shown, rest_uT=rest_uT) if keep else Shown(rest_uT))
 
     def see(self, b_uT: Float[np.ndarray, "*n ch"], *, even: bool = False) -> "Universal":
         """Learn from pokes at unknown places, a reading each: some dozens all over the skin, later ones as they come.
@@ -192,14 +185,24 @@ class Universal:
             parts.append((told.estimates(db_uT[left], tempers), place_mm[left]))
         return ratios(len(tempers), parts)
 
+    def save(self, file: Path | str) -> None:
+        """Write what it was told of this skin, for `load_universal(file)`; raise SchemaError if it was never zeroed."""
+        if self._noload_uT is None:
+            raise SchemaError("save", "the model", "zeroed", "no no-load reading", "First call zero.")
+        write_shown(self._shown, Path(file))
+
+    def remember(self, file: Path | str) -> "Universal":
+        """Take up what `save` wrote of a skin, in place of what it was told; then `zero(b_uT, keep=True)`."""
+        shown = read_shown(Path(file), REACH_MM)
+        self._noload_uT = to_chips(shown.rest_uT[None])[0]
+        return self._take(shown)
+
     def __call__(self, db_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f 3"]:
         """Answer changes of field, as a network does."""
-        noload_uT = self._noload_uT if self._noload_uT is not None else np.zeros(CHANNELS_N)
-        return self.predict(rows_of(db_uT) + noload_uT).astype(np.float32)
+        return self.predict(rows_of(db_uT) + self.noload_uT).astype(np.float32)
 
     def _change(self, b_uT: Float[np.ndarray, "*f ch"]) -> Float[np.ndarray, "f ch"]:
-        noload_uT = self._noload_uT if self._noload_uT is not None else 0.0
-        return to_board(rows_of(b_uT) - noload_uT)
+        return to_board(rows_of(b_uT) - self.noload_uT)
 
     def _ready(self) -> Ready:
         if self._told is None:
@@ -222,8 +225,11 @@ class Universal:
         by_mm = by_mm + told_mm(Labels(said_mm + by_mm, place_mm))
         return [moved(layers, by_mm) for layers in networks]
 
+    def _take(self, shown: Shown) -> "Universal":
+        return self._begin(see_rest(self._nominal, shown.rest_uT), shown)._label(*shown.labelled)
+
     def _begin(self, skin: SkinMap, shown: Shown) -> "Universal":
-        self._start, self._misfits = skin, np.zeros(0)
+        self._start, self._misfits = skin, np.full(len(shown.pokes_uT), np.nan)
         return self._anew(shown)
 
     def _anew(self, shown: Shown) -> "Universal":
@@ -248,13 +254,10 @@ class Universal:
         return self
 
 
-def load_universal(file: Path = FILE) -> Universal:
-    """Load the model that comes with the project.
-
-    >>> skin = load_universal()  # doctest: +SKIP
-    >>> x_mm, y_mm, force_N = skin.zero(noload_uT).predict(b_uT)[0]  # doctest: +SKIP
-    """
-    return Universal(*_parts(file))
+def load_universal(skin: Path | str | None = None, *, file: Path = FILE) -> Universal:
+    """Load the model that comes with the project; with a file that `save` wrote, as it is on that skin."""
+    model = Universal(*_parts(file))
+    return model if skin is None else model.remember(skin)
 
 
 @lru_cache(maxsize=2)
@@ -280,19 +283,3 @@ def write(
     spreads = dict(zip(tables.names, tables.spreads.tolist(), strict=True))
     card = {"format": FORMAT, **words, "sureness": sureness.to_card(), "spreads": spreads}
     io.write_json(file.with_suffix(".json"), card)
-
-
-def to_board(b_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f ch"]:
-    """Turn readings from the chips' axes to the board's."""
-    return b_uT @ _turn()
-
-
-def to_chips(b_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f ch"]:
-    """Turn readings from the board's axes to the chips'."""
-    return b_uT @ _turn().T
-
-
-@cache
-def _turn() -> Float[np.ndarray, "ch ch"]:
-    of_chips = Rotation.from_euler("z", np.array(TURNS_DEG)[:, None], degrees=True).as_matrix()
-    return np.array(block_diag(*of_chips)).T

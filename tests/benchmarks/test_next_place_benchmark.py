@@ -18,9 +18,10 @@ from pipeline.physics.skin import SkinDesign
 from pipeline.twin.choosing import worth
 from pipeline.twin.law import Setup
 from pipeline.twin.population import PLACES_N, draw_population
-from pipeline.twin.shipped import CHIPS_MM, SKIN_MM, Universal, load_universal, to_board
+from pipeline.twin.shipped import SKIN_MM, Universal, load_universal
 from pipeline.twin.tables import NOMINAL, OF_NOMINAL
 from pipeline.twin.training import ERROR_OF_NOMINAL, NOISE_uT, add_error
+from pipeline.twin.turned import CHIPS_MM, to_board
 
 SKINS_N, LABELS_N, PRESS_N = 40, (0, 1, 3, 5, 10), 2.0
 Choose = Callable[[Universal, list[int]], int]

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 import reskin
+from pipeline.core.errors import ParamsError
 from pipeline.core.seeds import rng_for
 from pipeline.live.adapting import POKES_N, Pokes, ShownPokes
 from pipeline.live.answering import Map
 from pipeline.live.script import Script, encode_pieces
 from pipeline.live.skin import UNLIKE, Readings
+from pipeline.predicting import read_models
 from pipeline.twin.shipped import load_universal
 from tests.live.boards import make_script, played
 
@@ -111,3 +113,28 @@ def test_on_a_board_of_other_chips_it_says_that_it_cannot_answer():
     assert skin.answers is None
     assert "no place, no force: the map of simulated skins is for five chips; name a model" in skin.alarms()
     assert all(np.isnan(each.answer).all() for each in readings)
+
+
+def test_a_model_that_learnt_the_skin_keeps_what_it_learnt_when_its_board_is_opened(simulated, tmp_path):
+    noload_uT, b_uT, place_mm, force_N = simulated
+    learnt = load_universal().zero(noload_uT).label(place_mm, force_N, b_uT)
+    learnt.save(tmp_path / "s3.safetensors")
+    before, number = learnt.predict(b_uT), learnt.skin.number
+    for models in (learnt, read_models([tmp_path / "s3.safetensors"])):
+        _, readings = played(poked(simulated), models)
+        answers = np.concatenate([each.answer[each.contact] for each in readings])
+        true_mm = np.repeat(place_mm, POKED_N, axis=0)[: len(answers)]
+        untaught = np.concatenate([each.answer[each.contact] for each in played(poked(simulated), load_universal())[1]])
+        assert np.abs(answers[:, :2] - true_mm).mean() < 0.5 * np.abs(untaught[:, :2] - true_mm).mean()
+    np.testing.assert_array_equal(learnt.predict(b_uT), before)  # the user's own stays as it is
+    np.testing.assert_array_equal(learnt.skin.number, number)
+
+
+def test_one_skin_does_not_answer_for_several_boards(simulated, tmp_path):
+    noload_uT, b_uT, place_mm, force_N = simulated
+    learnt = load_universal().zero(noload_uT).label(place_mm, force_N, b_uT)
+    with pytest.raises(ParamsError, match="a model that was told 12 pokes of a skin must be for one board; got 2"):
+        reskin.open(["/dev/a", "/dev/b"], model=learnt)
+    learnt.save(tmp_path / "s3.safetensors")
+    with pytest.raises(ParamsError, match="a saved skin must be given alone; got 2 models"):
+        read_models([tmp_path / "s3.safetensors"] * 2)

@@ -9,8 +9,9 @@ import reskin
 from pipeline.core import io
 from pipeline.core.errors import SchemaError
 from pipeline.twin.asked import CHANNELS_N
-from pipeline.twin.shipped import FILE, Universal, load_universal, to_chips
+from pipeline.twin.shipped import FILE, Universal, load_universal
 from pipeline.twin.tables import NOMINAL
+from pipeline.twin.turned import to_chips
 
 PLACES_MM = np.array([[8.0, 8.0], [3.0, 6.0], [12.0, 11.0], [10.0, 3.0]])
 
@@ -131,7 +132,7 @@ def test_a_changed_model_is_refused(skin, tmp_path):
     for changed in (bytes(content), FILE.read_bytes().replace(b"__metadata__", b"__metad4ta__")):
         file.write_bytes(changed)
         with pytest.raises(SchemaError, match="must be"):
-            load_universal(file)
+            load_universal(file=file)
 
 
 def test_a_model_of_an_earlier_version_is_refused(skin, tmp_path):
@@ -139,4 +140,58 @@ def test_a_model_of_an_earlier_version_is_refused(skin, tmp_path):
     shutil.copy(FILE, file)
     io.write_json(file.with_suffix(".json"), skin.card | {"format": "reskin-universal-2"})
     with pytest.raises(SchemaError, match="format must be reskin-universal-3; got reskin-universal-2"):
+        load_universal(file=file)
+
+
+def test_a_skin_that_was_saved_answers_the_next_day_as_it_did_and_follows_its_drift(skin, tmp_path):
+    rest_uT, file = to_chips(skin.tables.rest_uT[None]), tmp_path / "s0.safetensors"
+    read_uT, force_N = pokes(skin) + rest_uT, np.full(4, skin.tables.force_N[3])
+    further_uT = np.concatenate([1.25 * pokes(skin, force_i) for force_i in (1, 2, 3, 4)]) + rest_uT
+    before = skin.zero(rest_uT).see(further_uT).label(PLACES_MM + (0.8, -0.5), force_N, read_uT).estimate(read_uT)
+    skin.save(file)
+    again = reskin.load_universal(file)
+    assert again.told_n == skin.told_n == 20
+    after = again.estimate(read_uT)
+    np.testing.assert_allclose(after.place_mm, before.place_mm)
+    np.testing.assert_allclose(after.sd_mm, before.sd_mm)
+    drifted_uT = rest_uT + np.linspace(-20, 20, CHANNELS_N)
+    kept = again.zero(drifted_uT, keep=True).predict(pokes(skin) + drifted_uT)
+    np.testing.assert_allclose(kept[:, :2], before.place_mm, atol=0.2)
+    assert again.zero(drifted_uT).told_n == 0
+
+
+def test_of_pokes_that_came_one_by_one_a_saved_skin_knows_nearly_the_same(skin, tmp_path):
+    rest_uT, file = to_chips(skin.tables.rest_uT[None]), tmp_path / "s0.safetensors"
+    skin.zero(rest_uT)
+    for one_uT in np.concatenate([1.25 * pokes(skin, force_i) for force_i in (2, 3, 4)]) + rest_uT:
+        skin.see(one_uT)
+    before = skin.estimate(pokes(skin) + rest_uT)
+    skin.save(file)
+    after = load_universal(file).estimate(pokes(skin) + rest_uT)
+    assert (np.abs(after.place_mm - before.place_mm) < 0.5 * before.sd_mm).all()
+
+
+def test_what_no_skin_was_told_is_not_taken_from_a_file(skin, tmp_path):
+    file = tmp_path / "s0.safetensors"
+    with pytest.raises(SchemaError, match="save: the model must be zeroed"):
+        skin.save(file)
+    assert not file.exists()
+    skin.zero(to_chips(skin.tables.rest_uT[None])).save(file)
+    sound, words = io.read_tensors(file)
+    one_uT = np.ones((1, CHANNELS_N))
+    for changed, rule in [
+        ({"pokes_uT": one_uT * np.nan}, "must be finite numbers of uT; got nan"),
+        ({"rest_uT": one_uT[0] * np.inf}, "must be finite numbers of uT; got inf"),
+        ({"pokes_uT": np.ones((66, CHANNELS_N))}, "arrays must be"),
+        ({"even_uT": one_uT[:, :12]}, "arrays must be"),
+        ({"labelled_mm": np.full((1, 2), 40.0), "labelled_N": np.ones(1), "labelled_uT": one_uT}, "places must be on"),
+        ({"labelled_mm": np.full((1, 2), 8.0)}, "shapes must be x and y"),
+    ]:
+        io.write_tensors(file, sound | changed, words)
+        with pytest.raises(SchemaError, match=rule):
+            load_universal(file)
+    file.write_bytes(b"no such thing")
+    with pytest.raises(SchemaError, match="the file must be safetensors"):
         load_universal(file)
+    with pytest.raises(SchemaError, match="format must be reskin-skin-1"):
+        load_universal(FILE)

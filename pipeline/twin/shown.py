@@ -1,0 +1,70 @@
+"""What a model is told of one skin: its field at rest, pokes, labelled pokes; kept in a file from one day to the next.
+
+All in the board's axes, places seen from the middle. Refuses to know what is learnt from it.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.core import io
+from pipeline.core.errors import SchemaError
+from pipeline.twin.asked import CHANNELS_N, labels_of, learnt_rows_of
+from pipeline.twin.opinion import FULL_SET_N
+
+FORMAT = "reskin-skin-1"
+SHAPES: Mapping[str, tuple[int, ...]] = {  # behind the number of pokes
+    "pokes_uT": (CHANNELS_N,),
+    "even_uT": (CHANNELS_N,),
+    "labelled_mm": (2,),
+    "labelled_N": (),
+    "labelled_uT": (CHANNELS_N,),
+}
+REMEDY = "Take a file that `save` wrote."
+
+Labelled = tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, " m"], Float[np.ndarray, "m ch"]]  # mm, N, uT
+
+
+def none() -> Float[np.ndarray, "0 ch"]:
+    """Give no poke."""
+    return np.zeros((0, CHANNELS_N))
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What experts are told of a skin: its field at rest, pokes (at most a full set), and labelled ones."""
+
+    rest_uT: Float[np.ndarray, " ch"]
+    pokes_uT: Float[np.ndarray, "c ch"] = field(default_factory=none)
+    even_uT: Float[np.ndarray, "e ch"] = field(default_factory=none)  # those that lie evenly over the skin
+    labelled: Labelled = field(default_factory=lambda: (np.zeros((0, 2)), np.zeros(0), none()))
+
+
+def write_shown(shown: Shown, file: Path) -> None:
+    """Write it as safetensors; the model that learns from it is not in the file."""
+    values = (shown.pokes_uT, shown.even_uT, *shown.labelled)
+    io.write_tensors(file, {"rest_uT": shown.rest_uT, **dict(zip(SHAPES, values, strict=True))}, {"format": FORMAT})
+
+
+def is_shown(file: Path) -> bool:
+    """Say whether `write_shown` wrote a file; raise SchemaError on one that is no safetensors or was changed."""
+    return io.read_tensors(file)[1].get("format") == FORMAT
+
+
+def read_shown(file: Path, reach_mm: Float[np.ndarray, "2 2"]) -> Shown:
+    """Read it again; raise SchemaError on what no skin within `reach_mm` of its middle was ever told."""
+    found, words = io.read_tensors(file, digest_needed=True)
+    if words.get("format") != FORMAT:
+        raise SchemaError(file, "format", FORMAT, words.get("format"), REMEDY)
+    shapes = {name: values.shape[1:] for name, values in found.items() if name != "rest_uT"}
+    if shapes != SHAPES or found["rest_uT"].shape != (CHANNELS_N,) or len(found["pokes_uT"]) > FULL_SET_N:
+        rule, got = f"{', '.join(SHAPES)} of {CHANNELS_N} channels", {name: found[name].shape for name in sorted(found)}
+        raise SchemaError(file, "arrays", rule, got, REMEDY)
+    fields_uT = {name: learnt_rows_of(values) for name, values in found.items() if values.shape[1:] == (CHANNELS_N,)}
+    place_mm, force_N = found["labelled_mm"], found["labelled_N"]
+    labels_of(place_mm, force_N, len(fields_uT["labelled_uT"]), reach_mm)
+    rest_uT = learnt_rows_of(found["rest_uT"])[0]
+    return Shown(rest_uT, fields_uT["pokes_uT"], fields_uT["even_uT"], (place_mm, force_N, fields_uT["labelled_uT"]))
