@@ -116,10 +116,13 @@ class Dwells:
     """Joins samples that stay touching at one place, or stay off, into dwells; forces and depths are means.
 
     A touch of several `DWELL_MAX_s` becomes as many dwells, so that a recording that is killed has its labels too.
+    `short_n` counts touches too short to be one.
     """
 
     def __init__(self) -> None:
         self._run: list[Sample] = []
+        self._cut: Sample | None = None  # where a touch that goes on was cut
+        self.short_n = 0
 
     def feed(self, samples: Iterable[Sample]) -> Iterator[Dwell]:
         """Take the next samples; give the dwells that are over."""
@@ -133,12 +136,24 @@ class Dwells:
                 self._run.append(sample)
                 if sample.label.contact and (self._lasts_s() >= DWELL_MAX_s or len(self._run) >= DWELL_SAMPLES_MAX_N):
                     yield from self.close()
+                    self._cut = sample
 
     def close(self) -> Iterator[Dwell]:
         """Give the dwell that the last samples make, if they last long enough to be one."""
         lasts_s, run, self._run = self._lasts_s(), self._run, []
+        rest = bool(run) and self._cut is not None and _goes_on(self._cut, self._cut, run[0])
+        self._cut = None
         if lasts_s >= DWELL_MIN_s:
             yield Dwell(mean_label([sample.label for sample in run if sample.label]), run[0].t_s, run[-1].t_s)
+        elif run and run[0].label and run[0].label.contact and not rest:
+            self.short_n += 1
+
+    def told(self) -> str:
+        """Say how many touches were too short; a table that has a row a change of state has no others."""
+        if not self.short_n:
+            return ""
+        least = f"{DWELL_MIN_s:g} s from its first line to its last"
+        return f"{self.short_n} touches left out: one lasts {least}, so write lines all the while"
 
     def _lasts_s(self) -> float:
         return self._run[-1].t_s - self._run[0].t_s if self._run else 0.0

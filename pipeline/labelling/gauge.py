@@ -78,6 +78,6 @@ def from_gauge(port: str, baud: int) -> Source:
                 forces.read(device, desk, lambda samples: desk.tape.write_all(dwells.feed(samples)))
         finally:
             desk.tape.write_all(dwells.close())
-        return forces.told()
+        return "; ".join(filter(None, (forces.told(), dwells.told())))
 
     return Source("gauge", None, run)

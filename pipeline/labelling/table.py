@@ -35,7 +35,7 @@ def from_table(file: Path) -> Source:
                 desk.tape.write_all(dwells.feed(samples))
         finally:
             desk.tape.write_all(dwells.close())
-        return told_bad(str(file), table.bad_n, table.first_bad)
+        return "; ".join(filter(None, (told_bad(str(file), table.bad_n, table.first_bad), dwells.told())))
 
     return Source(f"table {file.name}", None, run)
 

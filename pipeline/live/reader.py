@@ -21,7 +21,7 @@ class Reader:
 
     def __init__(self, port: str, baud: int = BAUD) -> None:
         self.port, self.baud = port, baud
-        self.plugged_in, self.problem = False, ""
+        self.plugged_in, self.was_plugged_in, self.problem = False, False, ""
         self.missed_bytes_n = self.waiting_bytes_n = 0
         self.taken_s = 0.0  # when it was last asked, in unix seconds
         self.tape: Tape | None = None
@@ -67,7 +67,7 @@ class Reader:
         while not self._stop.is_set():
             try:
                 device = device or self._plug_in()
-                self.plugged_in = True
+                self.plugged_in = self.was_plugged_in = True
                 if chunk := read_waiting(device):
                     self._keep(chunk)
             except (OSError, CaptureError) as error:

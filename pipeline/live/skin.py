@@ -147,7 +147,8 @@ class Skin:
 
     def alarms(self) -> tuple[str, ...]:
         """Say what is wrong now."""
-        own = [f"unplugged: {self.reader.problem}"] if self.reader.problem and not self.reader.plugged_in else []
+        away = "unplugged" if self.reader.was_plugged_in else "not open"  # it may be missing, or another program's
+        own = [f"{away}: {self.reader.problem}"] if self.reader.problem and not self.reader.plugged_in else []
         own += [self.found.problem] if self.found.problem else []
         own += [self.problem] if self.problem else []
         own += [ZEROING] if not self.found.problem and not self.zeroed else []

@@ -79,3 +79,16 @@ def test_a_line_without_end_is_not_kept():
     for _ in range(1000):
         lines.feed(b"9" * 100)
         assert len(lines._rest) <= 4200
+
+
+def test_touches_too_short_to_be_one_are_counted_and_told_but_not_the_rest_of_a_long_one():
+    table, dwells = Table("robot.csv"), Dwells()
+    changes = "t_s,phase,x_mm,y_mm\n0,noload,4,8\n1,contact,4,8\n2,noload,4,8\n3,contact,5,8\n4,noload,5,8\n"
+    list(dwells.feed(table.feed(changes.encode())))
+    assert dwells.short_n == 2
+    assert dwells.told().startswith("2 touches left out: one lasts 0.05 s")
+    long = "".join(f"{5 + 0.01 * i:.2f},contact,4,8\n" for i in range(53))  # 0.52 s: a dwell, and 0.01 s
+    assert len(list(dwells.feed(table.feed((long + "6,noload,4,8\n").encode())))) == 1
+    assert dwells.short_n == 2
+    list(dwells.feed(table.feed(b"7,contact,4,8\n8,noload,4,8\n")))
+    assert dwells.short_n == 3

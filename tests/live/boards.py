@@ -86,7 +86,7 @@ def write_script(script: Script, folder: Path) -> Path:
 class PlayedReader:
     """Gives a script's bytes at the script's own times, without port and thread, so that no load disturbs them."""
 
-    plugged_in, problem, missed_bytes_n, taken_s = True, "", 0, 0.0
+    plugged_in, was_plugged_in, problem, missed_bytes_n, taken_s = True, True, "", 0, 0.0
 
     def __init__(self, script: Script, *, frames_n: int = 20) -> None:
         self._script, self._frames_n, self._i = script, frames_n, 0

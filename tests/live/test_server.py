@@ -109,7 +109,7 @@ def test_a_poke_its_place_force_and_rate_are_on_the_page_and_buttons_zero_and_re
 def test_a_page_waits_for_a_board_that_is_not_there(tmp_path):
     async def act(address: str, client: aiohttp.ClientSession) -> None:
         async with client.ws_connect(f"{address}/live") as socket:
-            state = await until(socket, lambda told: "unplugged" in " ".join(told.get("alarms", [])))
+            state = await until(socket, lambda told: "not open" in " ".join(told.get("alarms", [])))
             assert state["waiting"]
         for path, kind in (
             ("/", "text/html"),

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import reskin
+from pipeline.capture.port import open_port
 from pipeline.core.errors import ReskinError
 from pipeline.core.seeds import rng_for
 from pipeline.live.emulate import open_far_end, play
@@ -212,3 +213,15 @@ def test_a_model_of_other_boards_and_a_port_without_one_are_refused(tmp_path):
             reskin.open(name, model=write_model(tmp_path)).__enter__()
     with pytest.raises(ReskinError, match="the port must be one that opens"), reskin.open("/dev/none"):
         pass
+
+
+def test_a_port_that_another_program_holds_is_called_not_open_and_not_unplugged():
+    with plugged_in(SCRIPT, loop=True) as name, open_port(name, 115200):
+        skin = Skin(name)
+        skin.reader.start(there=False)
+        try:
+            while not skin.reader.problem:  # the suite's time limit ends it
+                time.sleep(0.01)
+            assert skin.alarms()[0].startswith(f"not open: {name}: the port must be one that opens")
+        finally:
+            skin.reader.stop()
