@@ -6,6 +6,7 @@ called, so that the import costs little. Refuses to know stages and DVC.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, overload
@@ -262,7 +263,8 @@ def record(
     >>> reskin.record(pokes(), board="b1", skin="s1", scan="random")  # doctest: +SKIP
 
     Each label holds for `dwell_s`, in which the program is not asked for the next. In place of a generator: a
-    function that is called each time, until it gives None. `told`: board, skin, scan.
+    function that is called each time, until it gives None. `told`: board, skin, scan. What came, and what was lost or
+    left out, is said on stderr.
     """
     from pipeline.labelling.source import from_program
     from pipeline.live.ports import the_board
@@ -271,6 +273,7 @@ def record(
     board = the_board(None if port is None else [port])
     wanted = Wanted(Path(out) if out is not None else None, seconds, 115200, told)
     done = record_board(board, wanted, from_program(labels, dwell_s))
+    print(done.said, file=sys.stderr)
     if done.failed is not None:
         raise done.failed
     return done.folder

@@ -66,9 +66,10 @@ def places_of(blocks):
     return {(float(x), float(y)) for block in blocks for x, y in zip(block.x_mm, block.y_mm, strict=True)}
 
 
-def test_what_a_program_labels_is_added_without_another_word(tmp_path, held):
+def test_what_a_program_labels_is_added_without_another_word(tmp_path, held, capsys):
     with plugged_in(make_script(pokes_n=2), loop=True) as port:
         folder = reskin.record(pokes(), port=port, out=tmp_path / "run1", dwell_s=0.3, board="b0", scan="random")
+    assert "2 touches labelled" in capsys.readouterr().err
     header = parse((folder / HEADER_FILE).read_text(), "header")
     assert header.options == {"scan": "random", "labels": "program"}
     blocks, account = read(folder)
