@@ -147,8 +147,8 @@ class Skin:
 
     def alarms(self) -> tuple[str, ...]:
         """Say what is wrong now."""
-        away = "unplugged" if self.reader.was_plugged_in else "not open"  # it may be missing, or another program's
-        own = [f"{away}: {self.reader.problem}"] if self.reader.problem and not self.reader.plugged_in else []
+        gone = [f"{'unplugged' if self.reader.was_plugged_in else 'not open'}: {self.reader.problem}"]
+        own = gone if self.reader.problem and not self.reader.plugged_in else []
         own += [self.found.problem] if self.found.problem else []
         own += [self.problem] if self.problem else []
         own += [ZEROING] if not self.found.problem and not self.zeroed else []
@@ -268,10 +268,9 @@ class Skin:
         b_uT = np.concatenate([part.b_uT for part in self._quiet])
         if len(b_uT) < 2 or (lasted_s < ZERO_S and len(b_uT) < ZERO_FRAMES_MAX_N):
             return
-        evenly_s = np.linspace(0, lasted_s, len(b_uT))  # frames of one chunk came at once
         self._quiet, self._quiet_from_s = [], np.inf
-        with suppress(CaptureError):  # it moved: the next second may be quiet
-            quiet_n = quiet_start(evenly_s, b_uT, where=self.port)
+        with suppress(CaptureError):  # it moved: the next second may be quiet; frames of one chunk came at once
+            quiet_n = quiet_start(np.linspace(0, lasted_s, len(b_uT)), b_uT, where=self.port)
             if self.answers is not None:
                 self.answers.zero(b_uT[:quiet_n])
             self._zero = Zero.of(b_uT[:quiet_n])
@@ -280,8 +279,8 @@ class Skin:
         answer, sd_mm = np.full((len(frames), 3), np.nan), np.full((len(frames), 2), np.nan)
         zero = self._zero
         if zero is None:
-            unknown_uT = np.full_like(frames.b_uT, np.nan)
-            return Readings(t_s, frames.b_uT, unknown_uT, answer, sd_mm, np.zeros(len(t_s), bool))
+            unknown_uT, contact = np.full_like(frames.b_uT, np.nan), np.zeros(len(t_s), bool)
+            return Readings(t_s, frames.b_uT, unknown_uT, answer, sd_mm, contact)
         db_uT = (np.where(sound[:, None], frames.b_uT, np.nan) - zero.noload_uT).astype(np.float32)
         contact = np.linalg.norm(db_uT, axis=1) > zero.contact_uT  # of NaN, nothing is more
         if self.answers is not None:
