@@ -119,7 +119,7 @@ def _read_capture(folder: Path) -> sd_card.Log:
 
 def read_models(files: Sequence[Path]) -> Sequence[Network] | Universal:
     """Read trained networks, or one skin that the universal model was told of (`save`); of no file, that model."""
-    skins = [file for file in files if file.is_file() and not file.with_suffix(".json").exists() and is_shown(file)]
+    skins = [file for file in files if file.is_file() and is_shown(file)]
     if not skins:
         return [read_network(file) for file in files] or load_universal()
     if len(files) > 1:

@@ -9,6 +9,8 @@ from jaxtyping import Bool, Float
 from pipeline.core.errors import SchemaError
 
 CHANNELS_N = 15  # of five chips, three axes each
+FIELD_MAX_uT = 1e6  # 20 times what a chip can measure: no poke, and single precision holds its square
+LABELS_MAX_N = 2000  # pokes at once: memory grows with their square, time faster
 
 
 def rows_of(b_uT: Float[np.ndarray, "..."]) -> Float[np.ndarray, "f ch"]:
@@ -21,9 +23,11 @@ def rows_of(b_uT: Float[np.ndarray, "..."]) -> Float[np.ndarray, "f ch"]:
 
 
 def learnt_rows_of(b_uT: Float[np.ndarray, "..."]) -> Float[np.ndarray, "f ch"]:
-    """Take readings to learn from; raise SchemaError on one that is no number."""
+    """Take readings to learn from; raise SchemaError on one that is no number, or that no chip measures."""
     rows_uT = rows_of(b_uT)
     _need("fields", "readings to learn from", "finite numbers of uT", rows_uT, np.isfinite(rows_uT))
+    rule = f"at most {FIELD_MAX_uT:,.0f} uT in size"
+    _need("fields", "readings to learn from", rule, rows_uT, np.abs(rows_uT) <= FIELD_MAX_uT)
     return rows_uT
 
 
@@ -39,6 +43,8 @@ def labels_of(
     if places_mm.shape != (rows_n, 2) or forces_N.shape != (rows_n,):
         rule, remedy = "x and y, a force and a reading of each poke", "Give arrays [m, 2], [m] and [m, 15]."
         raise SchemaError("labels", "shapes", rule, got, remedy)
+    if rows_n > LABELS_MAX_N:
+        raise SchemaError("labels", "their number", f"at most {LABELS_MAX_N}", rows_n, "Take some of them.")
     least_mm, most_mm = reach_mm
     on_skin = (places_mm >= least_mm) & (places_mm <= most_mm)
     _need("labels", "places", f"on the skin, {least_mm.tolist()} to {most_mm.tolist()} mm", places_mm, on_skin)

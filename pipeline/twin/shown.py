@@ -23,6 +23,7 @@ SHAPES: Mapping[str, tuple[int, ...]] = {  # behind the number of pokes
     "labelled_N": (),
     "labelled_uT": (CHANNELS_N,),
 }
+FILE_BYTES_MAX_N = 2**20  # a full set of pokes and LABELS_MAX_N labels take a third of it
 REMEDY = "Take a file that `save` wrote."
 
 Labelled = tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, " m"], Float[np.ndarray, "m ch"]]  # mm, N, uT
@@ -50,21 +51,27 @@ def write_shown(shown: Shown, file: Path) -> None:
 
 
 def is_shown(file: Path) -> bool:
-    """Say whether `write_shown` wrote a file; raise SchemaError on one that is no safetensors or was changed."""
-    return io.read_tensors(file)[1].get("format") == FORMAT
+    """Say whether `write_shown` wrote a file; raise SchemaError on a small one that is no safetensors or was changed."""
+    return file.stat().st_size <= FILE_BYTES_MAX_N and io.read_tensors(file)[1].get("format") == FORMAT
 
 
 def read_shown(file: Path, reach_mm: Float[np.ndarray, "2 2"]) -> Shown:
     """Read it again; raise SchemaError on what no skin within `reach_mm` of its middle was ever told."""
+    if file.is_file() and (bytes_n := file.stat().st_size) > FILE_BYTES_MAX_N:
+        raise SchemaError(file, "a saved skin", f"at most {FILE_BYTES_MAX_N:,} bytes", f"{bytes_n:,}", REMEDY)
     found, words = io.read_tensors(file, digest_needed=True)
     if words.get("format") != FORMAT:
         raise SchemaError(file, "format", FORMAT, words.get("format"), REMEDY)
-    shapes = {name: values.shape[1:] for name, values in found.items() if name != "rest_uT"}
-    if shapes != SHAPES or found["rest_uT"].shape != (CHANNELS_N,) or len(found["pokes_uT"]) > FULL_SET_N:
-        rule, got = f"{', '.join(SHAPES)} of {CHANNELS_N} channels", {name: found[name].shape for name in sorted(found)}
+    got = {name: values.shape for name, values in sorted(found.items())}
+    counts_n = {name: shape[0] for name, shape in got.items() if shape and name != "rest_uT"}
+    of_skin = {"rest_uT": (CHANNELS_N,)} | {name: (counts_n.get(name, 0), *shape) for name, shape in SHAPES.items()}
+    if got != of_skin or max(counts_n["pokes_uT"], counts_n["even_uT"]) > FULL_SET_N:
+        rule = f"rest_uT, {', '.join(SHAPES)} of {CHANNELS_N} channels and at most {FULL_SET_N} unlabelled pokes"
         raise SchemaError(file, "arrays", rule, got, REMEDY)
     fields_uT = {name: learnt_rows_of(values) for name, values in found.items() if values.shape[1:] == (CHANNELS_N,)}
-    place_mm, force_N = found["labelled_mm"], found["labelled_N"]
-    labels_of(place_mm, force_N, len(fields_uT["labelled_uT"]), reach_mm)
+    labels_n = len(fields_uT["labelled_uT"])
+    place_mm, force_N = labels_of(
+        found["labelled_mm"].astype(float), found["labelled_N"].astype(float), labels_n, reach_mm
+    )
     rest_uT = learnt_rows_of(found["rest_uT"])[0]
     return Shown(rest_uT, fields_uT["pokes_uT"], fields_uT["even_uT"], (place_mm, force_N, fields_uT["labelled_uT"]))

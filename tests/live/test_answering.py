@@ -120,6 +120,7 @@ def test_a_model_that_learnt_the_skin_keeps_what_it_learnt_when_its_board_is_ope
     learnt = load_universal().zero(noload_uT).label(place_mm, force_N, b_uT)
     learnt.save(tmp_path / "s3.safetensors")
     before, number = learnt.predict(b_uT), learnt.skin.number
+    (tmp_path / "s3.json").write_text("{}")  # a user's own file of that name is no network's card
     for models in (learnt, read_models([tmp_path / "s3.safetensors"])):
         _, readings = played(poked(simulated), models)
         answers = np.concatenate([each.answer[each.contact] for each in readings])

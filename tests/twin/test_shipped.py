@@ -171,6 +171,11 @@ def test_of_pokes_that_came_one_by_one_a_saved_skin_knows_nearly_the_same(skin, 
     assert (np.abs(after.place_mm - before.place_mm) < 0.5 * before.sd_mm).all()
 
 
+def many(labels_n):
+    """Labels in the skin's middle."""
+    return {"labelled_mm": np.zeros((labels_n, 2)), "labelled_N": np.ones(labels_n)}
+
+
 def test_what_no_skin_was_told_is_not_taken_from_a_file(skin, tmp_path):
     file = tmp_path / "s0.safetensors"
     with pytest.raises(SchemaError, match="save: the model must be zeroed"):
@@ -182,16 +187,26 @@ def test_what_no_skin_was_told_is_not_taken_from_a_file(skin, tmp_path):
     for changed, rule in [
         ({"pokes_uT": one_uT * np.nan}, "must be finite numbers of uT; got nan"),
         ({"rest_uT": one_uT[0] * np.inf}, "must be finite numbers of uT; got inf"),
+        ({"pokes_uT": one_uT * 1e7}, "must be at most 1,000,000 uT in size; got 1"),
         ({"pokes_uT": np.ones((66, CHANNELS_N))}, "arrays must be"),
+        ({"even_uT": np.ones((66, CHANNELS_N))}, "arrays must be"),
         ({"even_uT": one_uT[:, :12]}, "arrays must be"),
         ({"labelled_mm": np.full((1, 2), 40.0), "labelled_N": np.ones(1), "labelled_uT": one_uT}, "places must be on"),
         ({"labelled_mm": np.full((1, 2), 8.0)}, "shapes must be x and y"),
+        ({"labelled_uT": np.ones((2001, CHANNELS_N))} | many(2001), "their number must be at most 2000; got 2001"),
+        ({"pokes_uT": np.ones((9000, CHANNELS_N))}, "a saved skin must be at most 1,048,576 bytes; got 1,08"),
     ]:
         io.write_tensors(file, sound | changed, words)
         with pytest.raises(SchemaError, match=rule):
             load_universal(file)
+    io.write_tensors(file, {name: sound[name] for name in sound if name != "rest_uT"}, words)
+    with pytest.raises(SchemaError, match="arrays must be rest_uT"):
+        load_universal(file)
     file.write_bytes(b"no such thing")
     with pytest.raises(SchemaError, match="the file must be safetensors"):
         load_universal(file)
-    with pytest.raises(SchemaError, match="format must be reskin-skin-1"):
+    io.write_tensors(file, sound, {"format": "reskin-skin-0"})
+    with pytest.raises(SchemaError, match="format must be reskin-skin-1; got reskin-skin-0"):
+        load_universal(file)
+    with pytest.raises(SchemaError, match="a saved skin must be at most 1,048,576 bytes"):
         load_universal(FILE)
