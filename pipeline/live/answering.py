@@ -57,23 +57,29 @@ class Networks:
 class Map:
     """Is fitted to the no-load field, to pokes at unknown places if it is let see some, and to shown ones.
 
-    The model that it is given stays as it is; what that one learnt of the skin is kept.
+    The model that it is given stays as it is; what that one learnt of the skin is kept. Later pokes here take the place
+    of earlier ones: a dozen that went wrong is mended by another.
     """
 
     channels_n = CHANNELS_N
     about = "map of simulated skins"
 
     def __init__(self, universal: Universal) -> None:
-        self._learn(copy(universal))
+        self._given = universal
+        self._noload_uT = universal.noload_uT
+        self._pokes_uT = np.zeros((0, CHANNELS_N))  # changes of field that it was let see
+        self._shown_mm, self._shown_uT = np.zeros((0, 2)), np.zeros((0, CHANNELS_N))  # pokes at known places
+        self._learn()
 
     def zero(self, b_uT: Float[np.ndarray, "f ch"]) -> None:
         """Begin anew from the no-load field, and from the pokes that were seen before."""
-        self._learn(copy(self._universal).zero(b_uT.mean(axis=0, dtype=np.float64), keep=True))
+        self._noload_uT = b_uT.mean(axis=0, dtype=np.float64)
+        self._learn()
 
     def see(self, db_uT: Float[np.ndarray, "n ch"]) -> str:
         """Learn from pokes anywhere; say what they did to its sureness. Nobody knows where they were."""
-        before, b_uT = self._estimate(db_uT), db_uT + self._universal.noload_uT
-        self._learn(copy(self._universal).see(b_uT))
+        before, self._pokes_uT = self._estimate(db_uT), db_uT.astype(np.float64)
+        self._learn()
         after = self._estimate(db_uT)
         sd_mm, misfit = ([np.median(each) for each in pair] for pair in zip(
             (before.sd_mm.max(axis=1), before.misfit), (after.sd_mm.max(axis=1), after.misfit), strict=True
@@ -94,8 +100,9 @@ class Map:
         def error_mm() -> float:
             return float(np.median(np.linalg.norm(self._estimate(db_uT[kept]).place_mm - place_mm[kept], axis=1)))
 
-        before_mm, force_N = error_mm(), self._estimate(db_uT[~kept]).force_N
-        self._learn(copy(self._universal).label(place_mm[~kept], force_N, db_uT[~kept] + self._universal.noload_uT))
+        before_mm = error_mm()
+        self._shown_mm, self._shown_uT = place_mm[~kept], db_uT[~kept].astype(np.float64)
+        self._learn()
         return (
             f"adapted to {(~kept).sum()} shown places: error at {kept.sum()} others {before_mm:.2f} mm before, "
             f"{error_mm():.2f} mm after (medians)"
@@ -107,10 +114,16 @@ class Map:
         return Answered(answer, found.sd_mm, np.asarray(found.misfit > MISFIT_MAX))
 
     def _estimate(self, db_uT: Float[np.ndarray, "n ch"]) -> Estimate:
-        return self._universal.estimate(db_uT + self._universal.noload_uT)
+        return self._universal.estimate(db_uT + self._noload_uT)
 
-    def _learn(self, universal: Universal) -> None:
-        universal.estimate(universal.noload_uT)  # what a first contact should not wait for
+    def _learn(self) -> None:
+        universal = copy(self._given).zero(self._noload_uT, keep=True)
+        if len(self._pokes_uT):
+            universal.see(self._pokes_uT + self._noload_uT)
+        if len(self._shown_uT):
+            b_uT = self._shown_uT + self._noload_uT
+            universal.label(self._shown_mm, universal.estimate(b_uT).force_N, b_uT, keep=True)
+        universal.estimate(self._noload_uT)  # what a first contact should not wait for
         self._universal = universal
 
 

@@ -139,8 +139,10 @@ class Universal:
         place_mm: Float[np.ndarray, "*m 2"] | Sequence[Any],
         force_N: Float[np.ndarray, "*m"] | Sequence[float] | float,
         b_uT: Float[np.ndarray, "*m ch"],
+        *,
+        keep: bool = False,
     ) -> "Universal":
-        """Learn from pokes at known places under known forces, all that are known; earlier ones are forgotten.
+        """Learn from pokes at known places under known forces, all that are known; `keep` earlier ones, or forget them.
 
         One poke, or several; raise SchemaError, with nothing learnt, on a place off the skin or a force of 0 N or less.
         """
@@ -148,9 +150,13 @@ class Universal:
         places_mm, forces_N = labels_of(
             np.asarray(place_mm, float), np.asarray(force_N, float), len(rows_uT), CENTRE_MM + REACH_MM
         )
+        labelled = [places_mm - CENTRE_MM, forces_N, self._change(rows_uT)]
+        if keep:
+            labelled = [np.concatenate(both) for both in zip(self._shown.labelled, labelled, strict=True)]
+            labels_of(labelled[0], labelled[1], len(labelled[2]), REACH_MM)  # with those they may be too many
         if len(self._shown.labelled[0]):
             self._anew(self._shown)
-        return self._label(places_mm - CENTRE_MM, forces_N, self._change(rows_uT))
+        return self._label(*labelled)
 
     def next_place(self, force_N: float = 2.0) -> Float[np.ndarray, "2"]:
         """Give the place whose poke, labelled, would tell most of the skin, in mm; about so strong."""

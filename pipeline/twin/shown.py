@@ -51,7 +51,7 @@ def write_shown(shown: Shown, file: Path) -> None:
 
 
 def is_shown(file: Path) -> bool:
-    """Say whether `write_shown` wrote a file; raise SchemaError on a small one that is no safetensors or was changed."""
+    """Say whether `write_shown` wrote a file; raise SchemaError on a small one that is damaged or no safetensors."""
     return file.stat().st_size <= FILE_BYTES_MAX_N and io.read_tensors(file)[1].get("format") == FORMAT
 
 

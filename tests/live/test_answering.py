@@ -71,6 +71,20 @@ def test_a_dozen_pokes_are_gathered_one_a_contact_and_the_map_learns_from_them(s
     np.testing.assert_allclose(answers(pokes.db_uT.astype(np.float32)).answer, before.answer, rtol=1e-6)
 
 
+def test_a_dozen_pokes_that_went_wrong_are_mended_by_another(simulated):
+    db_uT = simulated[1] - simulated[0].mean(axis=0)
+    mended, once = Map(load_universal()), Map(load_universal())
+    for answers in (mended, once):
+        answers.zero(simulated[0])
+    mended.see(rng_for(0, "a hand").normal(0, 300, db_uT.shape))
+    wrong = mended(db_uT.astype(np.float32)).answer
+    for answers in (mended, once):
+        answers.see(db_uT)
+    right = once(db_uT.astype(np.float32)).answer
+    np.testing.assert_allclose(mended(db_uT.astype(np.float32)).answer, right, rtol=1e-6)
+    assert np.abs(wrong - right).max() > 1.0
+
+
 @pytest.fixture(scope="module")
 def pressed():
     """A simulated skin that is pressed where the page shows it, in that order."""
@@ -99,6 +113,19 @@ def test_presses_at_shown_places_are_learnt_from_and_judged_at_those_in_between(
     assert after_mm < before_mm
     answers.zero(pressed[0])  # what it has learnt is kept
     np.testing.assert_allclose(answers(pokes.db_uT[pokes.kept].astype(np.float32)).answer[:, :2], found, rtol=1e-6)
+
+
+def test_shown_places_are_learnt_beside_the_labels_that_a_model_has(pressed):
+    noload_uT, b_uT, place_mm, force_N = pressed
+    kept, rest_uT = ShownPokes().kept, noload_uT.mean(axis=0)
+    learnt = load_universal().zero(noload_uT).label(place_mm[kept], force_N[kept], b_uT[kept])
+    all_force_N = np.where(kept, force_N, learnt.estimate(b_uT).force_N)  # nobody measured that of the shown ones
+    at_once = load_universal().zero(noload_uT).label(place_mm, all_force_N, b_uT).predict(b_uT)
+    answers = Map(learnt)
+    answers.zero(noload_uT)
+    answers.label(place_mm, b_uT - rest_uT, kept)
+    np.testing.assert_allclose(answers((b_uT - rest_uT).astype(np.float32)).answer, at_once, rtol=1e-3)
+    assert learnt.told_n == kept.sum()
 
 
 def test_a_knock_is_no_poke():

@@ -160,6 +160,20 @@ def test_a_skin_that_was_saved_answers_the_next_day_as_it_did_and_follows_its_dr
     assert again.zero(drifted_uT).told_n == 0
 
 
+def test_labels_are_kept_where_that_is_asked_for_and_else_forgotten(skin):
+    rest_uT = to_chips(skin.tables.rest_uT[None])
+    read_uT, force_N, shifted_mm = pokes(skin) + rest_uT, np.full(4, skin.tables.force_N[3]), PLACES_MM + (0.8, -0.5)
+    at_once = skin.zero(rest_uT).label(shifted_mm, force_N, read_uT).predict(read_uT)
+    skin.zero(rest_uT).label(shifted_mm[:2], force_N[:2], read_uT[:2])
+    in_turn = skin.label(shifted_mm[2:], force_N[2:], read_uT[2:], keep=True).predict(read_uT)
+    np.testing.assert_allclose(in_turn, at_once, rtol=1e-6)
+    assert skin.told_n == 4
+    with pytest.raises(SchemaError, match="their number must be at most 2000; got 2003"):
+        skin.label(np.full((1999, 2), 8.0), np.ones(1999), np.ones((1999, CHANNELS_N)), keep=True)
+    assert skin.told_n == 4
+    assert skin.label(shifted_mm[2:], force_N[2:], read_uT[2:]).told_n == 2
+
+
 def test_of_pokes_that_came_one_by_one_a_saved_skin_knows_nearly_the_same(skin, tmp_path):
     rest_uT, file = to_chips(skin.tables.rest_uT[None]), tmp_path / "s0.safetensors"
     skin.zero(rest_uT)
