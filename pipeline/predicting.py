@@ -130,6 +130,9 @@ def read_models(files: Sequence[Path]) -> Sequence[Network] | Universal:
 def read_network(model: Path) -> Network:
     """Read a model and the card beside it; raise if it does not answer x, y and F from changes of field."""
     card_file = model.with_suffix(".json")
+    if model.is_file() and is_shown(model):
+        remedy = "Load it with reskin.load_universal."
+        raise ParamsError(model, "the model", "a trained network", "a saved skin", remedy)
     for file, what in ((model, "the model"), (card_file, "the card beside the model")):
         if not file.is_file():
             raise ParamsError(file, what, "there", "nothing", "Give --model a trained .safetensors file.")

@@ -164,5 +164,7 @@ def test_one_skin_does_not_answer_for_several_boards(simulated, tmp_path):
     with pytest.raises(ParamsError, match="a model that was told 12 pokes of a skin must be for one board; got 2"):
         reskin.open(["/dev/a", "/dev/b"], model=learnt)
     learnt.save(tmp_path / "s3.safetensors")
+    with pytest.raises(ParamsError, match="must be a trained network; got a saved skin. Load it with reskin.load_univ"):
+        reskin.load_model(tmp_path / "s3.safetensors")
     with pytest.raises(ParamsError, match="a saved skin must be given alone; got 2 models"):
         read_models([tmp_path / "s3.safetensors"] * 2)
