@@ -1,12 +1,14 @@
 """A board that is not there: plays a script into a pseudo-terminal or a TCP socket, at its own rate or another.
 
-Time stands still while nobody reads, so that what is sent is taken: bytes sent are bytes received. Refuses to know
-what the bytes mean.
+Time stands still while nobody reads, so that what is sent is taken: bytes sent are bytes received. What is played over
+and over begins again when its port is opened, as boards do that are reset by that: each reader finds the untouched
+skin that the script begins with. Refuses to know what the bytes mean.
 """
 
 import os
 import select
 import socket
+import struct
 import threading
 import time
 from collections.abc import Iterator
@@ -30,14 +32,18 @@ class Terminal:
             raise ParamsError("--port", "the port", "tcp on this system", "pty", "Try: --port tcp")
         if link is not None and (link.exists() and not link.is_symlink()):
             raise ParamsError(link, "the link", "new", "a file that is there", "Choose another name.")
-        self._link = link
+        self._link, self._opened = link, False
         self.plug_in()
 
     def plug_in(self) -> None:
-        import tty  # not on Windows
+        import fcntl
+        import termios
+        import tty  # none of them is on Windows
 
         self._far, self._near = os.openpty()
         tty.setraw(self._near)
+        fcntl.ioctl(self._far, termios.TIOCPKT, struct.pack("i", 1))  # say when somebody opens it, who then flushes it
+        self._flushed = termios.TIOCPKT_FLUSHREAD
         os.set_blocking(self._far, False)
         self.name = os.ttyname(self._near)
         if self._link is not None:
@@ -54,17 +60,25 @@ class Terminal:
     def send(self, data: bytes, stop: threading.Event) -> int:
         taken_n = 0
         while taken_n < len(data) and not stop.is_set():
-            if select.select([], [self._far], [], TICK_S)[1]:
-                with suppress(BlockingIOError):
+            told, free, _ = select.select([self._far], [self._far], [], TICK_S)
+            with suppress(BlockingIOError):
+                if told:  # what a reader writes is not heard
+                    self._opened |= bool(os.read(self._far, 4096)[0] & self._flushed)
+                if free:
                     taken_n += os.write(self._far, data[taken_n:])
         return taken_n
+
+    def was_opened(self) -> bool:
+        """Say whether somebody has opened the port since this was last asked."""
+        opened, self._opened = self._opened, False
+        return opened
 
 
 class Socket:
     """A TCP server on this machine, for one reader at a time: `socket://127.0.0.1:PORT`."""
 
     def __init__(self, number: int = 0) -> None:
-        self._number = number
+        self._number, self._opened = number, False
         self.plug_in()
 
     def plug_in(self) -> None:
@@ -88,6 +102,7 @@ class Socket:
             try:
                 if self._client is None:
                     self._client = self._server.accept()[0]
+                    self._opened = True
                     self._client.settimeout(TICK_S)
                 taken_n += self._client.send(data[taken_n:])
             except TimeoutError:
@@ -97,6 +112,11 @@ class Socket:
                     self._client.close()
                 self._client = None
         return taken_n
+
+    def was_opened(self) -> bool:
+        """Say whether somebody has connected since this was last asked."""
+        opened, self._opened = self._opened, False
+        return opened
 
 
 Port = Terminal | Socket
@@ -116,7 +136,7 @@ def open_far_end(port: str) -> Port:
 
 def play(script: Script, port: Port, stop: threading.Event, *, speed: float = 1.0, loop: bool = False) -> int:
     """Send a script, `speed` times as fast as it was recorded (`math.inf`: as fast as it is taken); give the bytes."""
-    sent_n, start_s = 0, time.monotonic()
+    sent_n, start_s, comes_back = 0, time.monotonic(), False
     while not stop.is_set():
         i = 0
         while i < len(script) and not stop.is_set():
@@ -124,6 +144,7 @@ def play(script: Script, port: Port, stop: threading.Event, *, speed: float = 1.
                 port.unplug()
                 stop.wait(script.away_s[i])
                 port.plug_in()
+                comes_back = True  # who opens it then finds the script where it was
             now_s, due_s = time.monotonic() - start_s, float(script.t_s[i]) / speed
             if due_s > now_s:
                 stop.wait(min(due_s - now_s, TICK_S))
@@ -132,6 +153,10 @@ def play(script: Script, port: Port, stop: threading.Event, *, speed: float = 1.
             start_s += lost_s
             first, i = i, _next_after(script, i, (now_s - lost_s) * speed)
             sent_n += port.send(b"".join(script.pieces[first:i]), stop)
+            if port.was_opened():
+                if loop and not comes_back:
+                    i, start_s = 0, time.monotonic()
+                comes_back = False
         if not loop:
             break
         start_s += script.duration_s / speed

@@ -48,6 +48,9 @@ class Taker:
             self.times.s, self.late_i = self.times.s + self.late_s, -1
         return len(data)
 
+    def was_opened(self):
+        return False
+
 
 @pytest.fixture
 def times(monkeypatch):
@@ -71,6 +74,24 @@ def test_every_byte_arrives_as_fast_as_it_is_taken_and_no_reader_is_no_loss(port
     end.unplug()
     assert data == sent
     assert told == [len(sent)]
+
+
+@pytest.mark.parametrize("port", ["pty", "tcp"])
+def test_what_is_played_over_and_over_begins_again_when_its_port_is_opened_again(port):
+    end, stop, first = open_far_end(port), threading.Event(), b"".join(SCRIPT.pieces[:100])
+    player = threading.Thread(target=play, args=[SCRIPT, end, stop], kwargs={"loop": True})
+    player.start()
+    began = []
+    for _ in range(3):
+        with open_port(end.name, 115200) as device:
+            data = b""
+            while len(data) < 1.5 * len(first):
+                data += read_waiting(device)
+        began.append(first in data)
+    stop.set()
+    player.join()
+    end.unplug()
+    assert all(began)
 
 
 @pytest.mark.parametrize("speed", [1.0, 3.0])
