@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, overload
+from typing import TYPE_CHECKING, Any, NamedTuple, Union, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from pipeline.trials.networks import Network
     from pipeline.twin.shipped import Universal
 
+Answering = Union[Path, str, Sequence[Path | str], "Model", "Universal"]
 Changes = Mapping[str, Any]  # settings of params.yaml or of a scene, by name
 
 
@@ -200,14 +201,10 @@ def load_universal(skin: Path | str | None = None) -> Universal:
 
 
 @overload
-def open(port: str, *, model: Path | str | Sequence[Path | str] | Universal = (), baud: int = 115200) -> LiveSkin: ...
+def open(port: str, *, model: Answering = (), baud: int = 115200) -> LiveSkin: ...
 @overload
-def open(
-    port: list[str], *, model: Path | str | Sequence[Path | str] | Universal = (), baud: int = 115200
-) -> LiveSkins: ...
-def open(
-    port: str | list[str], *, model: Path | str | Sequence[Path | str] | Universal = (), baud: int = 115200
-) -> LiveSkin | LiveSkins:
+def open(port: list[str], *, model: Answering = (), baud: int = 115200) -> LiveSkins: ...
+def open(port: str | list[str], *, model: Answering = (), baud: int = 115200) -> LiveSkin | LiveSkins:
     """Open a board's port: its contacts while they happen. In the first second nothing may touch the skin.
 
     >>> with open("/dev/ttyACM0", model="data/models/quick/train_multi/NAME.safetensors") as skin:  # doctest: +SKIP
@@ -215,9 +212,9 @@ def open(
     ...         print(contact.t_s, contact.x_mm, contact.y_mm, contact.F_N, contact.alarms)
 
     Format and chips are told from the bytes; `port` may also be `socket://host:port`. Without a model the map of
-    simulated skins answers (`load_universal`); `model` may be one that learnt this skin, which it then keeps but for
-    the no-load reading. Several models give means, and how far they are apart. A list of ports gives the latest
-    contacts of all boards, in its order; one that is unplugged does not hold up the others.
+    simulated skins answers (`load_universal`); `model` may be loaded already, also one that learnt this skin, which it
+    then keeps but for the no-load reading. Several models give means, and how far they are apart. A list of ports
+    gives the latest contacts of all boards, in its order; one that is unplugged does not hold up the others.
     """
     from pipeline.live.answering import check_boards
     from pipeline.live.ports import check_named_once
@@ -228,8 +225,12 @@ def open(
 
     if not isinstance(port, str):
         check_named_once(port, "reskin.open")
-    files = [model] if isinstance(model, str | Path) else model
-    models = files if isinstance(files, Universal) else read_models([Path(file) for file in files])
+    if isinstance(model, Universal):
+        models: Sequence[Network] | Universal = model
+    elif isinstance(model, Model):
+        models = [model._network]
+    else:
+        models = read_models([Path(file) for file in ([model] if isinstance(model, str | Path) else model)])
     if isinstance(port, str):
         return Skin(port, models, baud=baud)
     check_boards(models, len(port), "reskin.open")

@@ -67,7 +67,10 @@ def test_who_is_slow_gets_the_latest_and_no_byte_is_lost(tmp_path):
     def frame_i(contact) -> int:
         return int(np.flatnonzero((SCRIPT.frames.b_uT == contact.b_uT).all(axis=1))[0])
 
-    with plugged_in(SCRIPT, loop=True) as name, reskin.open(name, model=write_model(tmp_path)) as skin:
+    with (
+        plugged_in(SCRIPT, loop=True) as name,
+        reskin.open(name, model=reskin.load_model(write_model(tmp_path))) as skin,
+    ):
         before, before_n = next(iter(skin)), skin.account["frames_n"]
         while skin.reader.waiting_bytes_n < 300 * 82:  # a slow controller
             time.sleep(0.01)
