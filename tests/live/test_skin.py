@@ -71,10 +71,13 @@ def test_who_is_slow_gets_the_latest_and_no_byte_is_lost(tmp_path):
         plugged_in(SCRIPT, loop=True) as name,
         reskin.open(name, model=reskin.load_model(write_model(tmp_path))) as skin,
     ):
-        before, before_n = next(iter(skin)), skin.account["frames_n"]
+        came = (
+            contact for contact in skin if np.isfinite(contact.b_uT).all()
+        )  # not that nothing comes on a busy machine
+        before, before_n = next(came), skin.account["frames_n"]
         while skin.reader.waiting_bytes_n < 300 * 82:  # a slow controller
             time.sleep(0.01)
-        late = next(iter(skin))
+        late = next(came)
         came_n = skin.account["frames_n"] - before_n
         assert came_n >= 300
         assert (frame_i(late) - frame_i(before) - came_n) % len(SCRIPT) == 0  # the last of those that came, and no hole
