@@ -1,5 +1,7 @@
 """Fixtures that every folder of tests shares; which annotations of the project they execute."""
 
+import pipeline  # isort: skip  # noqa: F401  (first: it selects the arithmetic that NumPy loads with)
+
 import gc
 import inspect
 from collections import Counter
@@ -65,6 +67,7 @@ def pytest_runtest_setup() -> None:
 
 gc.disable()  # while everything is imported
 jaxtyping.jaxtyped = check_arrays  # by this name the import hook decorates every function of the project
+jaxtyping.install_import_hook("pipeline", "beartype.beartype")  # its pytest plugin would import NumPy too early
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

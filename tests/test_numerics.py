@@ -1,56 +1,97 @@
-"""A training gives the same bits whatever instructions the processor has, and the user's own settings stand."""
+"""Trainings are the same bits on every processor with AVX2, and the user's own settings stand."""
 
-import hashlib
 import os
 import subprocess
 import sys
 from functools import cache
+from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
-from pipeline.core.numerics import BEYOND_AVX2, PINNED, cpu_flags, pinned
+from pipeline.core.numerics import BEYOND_AVX2, PINNED, TOO_LATE, VARIABLES, cpu_flags, departures, pinned
+from pipeline.core.reproducible import affine, exp
+from pipeline.core.seeds import rng_for
 
+ROOT = Path(__file__).resolve().parents[1]
 AVX2, NEWEST = frozenset({"avx2"}), frozenset({"avx2", *BEYOND_AVX2.values()})
-TRAIN = """
-from pipeline.experiments.stability.learning import _trial, _changed, _rows
-from pipeline.learning.train import train_stack
-import hashlib, sys
-trials = [_changed(_trial(i), triplet_weight=0.1) for i in range(3)]
-digest = hashlib.sha256()
-for one in train_stack(trials, _rows(0)):
-    for name, value in sorted(one.weights.items()):
-        digest.update(value.tobytes())
-    digest.update(one.predicted.tobytes())
-print(digest.hexdigest())
-"""
+needs_avx2 = pytest.mark.skipif("avx2" not in cpu_flags(), reason="nothing is selected on a processor without AVX2")
 
 
 @cache
-def weights_under(**setting: str) -> str:
-    kept = {name: value for name, value in os.environ.items() if name not in PINNED and not name.startswith("MKL")}
-    done = subprocess.run(
-        [sys.executable, "-c", TRAIN], env={**kept, **setting}, capture_output=True, text=True, check=True
-    )
-    assert len(done.stdout.strip()) == 2 * hashlib.sha256().digest_size
-    return done.stdout
+def digests_under(*settings: str) -> str:
+    """Digests of tiny trainings in a fresh process, in which these variables are set and no other that matters."""
+    kept = {name: value for name, value in os.environ.items() if name not in VARIABLES and not name.startswith("MKL")}
+    environment = kept | dict(setting.split("=") for setting in settings)
+    command = [sys.executable, "-m", "tests.arithmetic"]
+    return subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, check=True).stdout
 
 
-@pytest.mark.skipif("avx512f" not in cpu_flags(), reason="needs a processor with AVX-512, to leave it unused")
-def test_a_training_has_the_same_bits_with_the_instructions_of_older_processors():
-    assert weights_under(MKL_ENABLE_INSTRUCTIONS="AVX2") == weights_under()
+@needs_avx2
+@pytest.mark.parametrize(
+    "settings",
+    [
+        ("MKL_CBWR=COMPATIBLE", "ONEDNN_MAX_CPU_ISA=SSE41"),  # as on a processor that MKL and oneDNN do not know
+        ("MKL_ENABLE_INSTRUCTIONS=AVX2",),
+        ("OMP_NUM_THREADS=3", "MKL_NUM_THREADS=3"),
+    ],
+    ids=" ".join,
+)
+def test_trainings_are_the_same_bits_whatever_mkl_does_and_however_many_threads_there_are(settings):
+    assert digests_under(*settings) == digests_under()
 
 
-@pytest.mark.skipif("avx2" not in cpu_flags(), reason="needs a processor with AVX2, to leave it unused")
-def test_a_users_own_setting_takes_effect():
-    assert weights_under(MKL_CBWR="COMPATIBLE") != weights_under()
+@needs_avx2
+@pytest.mark.parametrize("setting", ["ATEN_CPU_CAPABILITY=default", "OPENBLAS_CORETYPE=Prescott"])
+def test_each_of_the_three_trainings_depends_on_what_is_selected(setting):
+    pairs = zip(digests_under(setting).split(), digests_under().split(), strict=True)
+    assert all(one != other for one, other in pairs)
+
+
+def test_affine_and_its_gradients_equal_pytorchs():
+    rng = rng_for(0, "affine")
+    for shapes in (((3, 7, 5), (3, 5, 4), (3, 1, 4)), ((3, 7, 5), (5, 4), (1, 4)), ((7, 5), (5, 4), (1, 4))):
+        ours = [torch.from_numpy(rng.normal(size=shape)).requires_grad_() for shape in shapes]
+        theirs = [values.detach().clone().requires_grad_() for values in ours]
+        weights = torch.from_numpy(rng.normal(size=(*shapes[0][:-1], 4)))
+        (affine(*ours) * weights).sum().backward()
+        (torch.matmul(theirs[0], theirs[1]).add(theirs[2]) * weights).sum().backward()
+        for one, other in zip(ours, theirs, strict=True):
+            torch.testing.assert_close(one.grad, other.grad)  # float64: sums of at most 21 products of size 1
+        torch.testing.assert_close(affine(*ours), torch.matmul(theirs[0], theirs[1]) + theirs[2])
+
+
+def test_what_overflows_becomes_infinite_without_a_warning():
+    assert affine(torch.full((2, 3), 1e30), torch.full((3, 1), 1e30), torch.zeros(1, 1)).isinf().all()
+
+
+@given(st.floats(-80, 80, width=32))
+def test_exp_is_the_exponential_to_float32(value):
+    # 80 x log2(e) = 115 is rounded to 2^-18, so that its power of two is off by 3e-6 at most.
+    assert float(exp(torch.tensor([value]))) == pytest.approx(np.exp(np.float64(value)), rel=5e-6)
+
+
+def test_numpy_that_was_loaded_before_is_reported():
+    code = "import numpy; from pipeline.core.numerics import departures; import os; print(departures(os.environ))"
+    kept = {name: value for name, value in os.environ.items() if name not in VARIABLES}
+    done = subprocess.run([sys.executable, "-c", code], env=kept, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert (TOO_LATE in done.stdout) == ("avx2" in cpu_flags())
+
+
+def test_a_variable_that_the_user_has_changed_is_reported():
+    assert departures(PINNED) == []
+    assert departures({**PINNED, "OPENBLAS_CORETYPE": "Zen"}) == ["OPENBLAS_CORETYPE=Zen"]
 
 
 def test_what_the_user_has_set_is_left_alone():
-    mine = {"MKL_CBWR": "COMPATIBLE", "NPY_DISABLE_CPU_FEATURES": ""}
+    mine = {"ATEN_CPU_CAPABILITY": "default", "NPY_DISABLE_CPU_FEATURES": ""}
     assert not set(pinned(NEWEST, mine)) & set(mine)
 
 
-def test_numpy_is_told_only_of_instructions_that_are_there():
+def test_numpy_disables_only_features_that_the_processor_has():
     assert "NPY_DISABLE_CPU_FEATURES" not in pinned(AVX2, {})
     assert pinned(NEWEST, {})["NPY_DISABLE_CPU_FEATURES"].split() == list(BEYOND_AVX2)
 

@@ -32,8 +32,8 @@ def test_the_machine_is_told_in_words():
 
 def test_a_processor_is_named_with_its_instruction_sets_and_what_holds_libraries_to_fewer():
     assert processor(XEON, {}, otherwise="") == "Intel Xeon Gold 6442Y (AVX2, AVX-512, AMX)"
-    held = {"MKL_CBWR": "COMPATIBLE", "ATEN_CPU_CAPABILITY": "", "HOME": "/home/me"}
-    assert processor(XEON, held, otherwise="") == "Intel Xeon Gold 6442Y (AVX2, AVX-512, AMX; MKL_CBWR=COMPATIBLE)"
+    held = {"OPENBLAS_CORETYPE": "Zen", "ATEN_CPU_CAPABILITY": "", "HOME": "/home/me"}
+    assert processor(XEON, held, otherwise="") == "Intel Xeon Gold 6442Y (AVX2, AVX-512, AMX; OPENBLAS_CORETYPE=Zen)"
 
 
 def test_the_first_processor_is_named_where_a_machine_has_two_kinds():

@@ -1,53 +1,51 @@
-"""The same sums with AVX2 and AVX-512: variables that libraries read when they load. In: the environment. Out: same.
+"""Select the same arithmetic on every x86-64 processor with AVX2, through variables that libraries read when they load.
 
-AVX2 and AVX-512 code paths add in another order, and training amplifies the rounding. With these variables a training
-gives the same bits on both (tests/test_numerics.py). Imports nothing that needs NumPy, as it must run before it.
-Refuses to overrule a variable that the user has set.
+PyTorch, NumPy, OpenBLAS and Numba choose their code by the instructions that a processor offers, and OpenBLAS splits
+products among threads; each choice adds in another order, and training amplifies the rounding. With the values below,
+and `pipeline.core.reproducible` in place of MKL, results are the same bits on every such processor
+(tests/test_numerics.py). `pin` must run before NumPy is imported, so this module imports nothing that needs NumPy.
 """
 
 import os
 import platform
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 
 CPUINFO = Path("/proc/cpuinfo")
-VARIABLES = (
-    "MKL_CBWR",
-    "MKL_ENABLE_INSTRUCTIONS",
-    "ATEN_CPU_CAPABILITY",
-    "ONEDNN_MAX_CPU_ISA",
-    "OPENBLAS_CORETYPE",
-    "NPY_DISABLE_CPU_FEATURES",
-    "NUMBA_CPU_NAME",
-)  # all that this module sets, or that changes its effect
 PINNED = {
-    "MKL_CBWR": "AUTO,STRICT",  # products of matrices: a fast code path, in the same order of sums on all
-    "ATEN_CPU_CAPABILITY": "avx2",
-    "ONEDNN_MAX_CPU_ISA": "AVX2",
-    "OPENBLAS_CORETYPE": "Haswell",
+    "ATEN_CPU_CAPABILITY": "avx2",  # PyTorch: sums, and functions of each element
+    "OPENBLAS_CORETYPE": "Haswell",  # NumPy and SciPy: products of matrices, LAPACK
+    "OPENBLAS_NUM_THREADS": "1",
     "NUMBA_CPU_NAME": "haswell",
 }
-# NumPy's names of what it must not use, and the processor's flag of the newest of their instructions. NumPy warns of a
-# name that the processor lacks, so only those are named that it has.
+# Features that NumPy must not use, and the CPU flag of the newest instructions of each. NumPy warns of a feature that
+# the processor lacks, so only those are disabled that it has.
 BEYOND_AVX2 = {"X86_V4": "avx512vl", "AVX512_ICL": "avx512_vbmi2", "AVX512_SPR": "avx512_fp16"}
+VARIABLES = (*PINNED, "NPY_DISABLE_CPU_FEATURES", "NUMBA_CPU_FEATURES")
+TOO_LATE = "NumPy was imported before pipeline"
+
+_loaded_before: list[str] = []
 
 
 def pin() -> None:
-    """Set what is not set yet, in this process and those that it starts; nothing on processors without AVX2.
+    """Set the variables that are not set yet, for this process and those that it starts.
 
-    What the user has set stays as it is.
+    On processors without AVX2 nothing is set, and a variable that the user has set is left alone.
     """
-    for name, value in pinned(cpu_flags(), os.environ).items():
-        os.environ[name] = value
+    chosen = pinned(cpu_flags(), os.environ)
+    if "numpy" in sys.modules and not chosen.keys().isdisjoint({"OPENBLAS_CORETYPE", "NPY_DISABLE_CPU_FEATURES"}):
+        _loaded_before[:] = [TOO_LATE]
+    os.environ.update(chosen)
 
 
 def pinned(flags: frozenset[str], environment: Mapping[str, str]) -> dict[str, str]:
-    """Choose values for the variables that `environment` lacks.
+    """Return values for the variables that `environment` lacks.
 
     >>> pinned(frozenset({"neon"}), {})
     {}
-    >>> pinned(frozenset({"avx2"}), {"MKL_CBWR": "COMPATIBLE"})["OPENBLAS_CORETYPE"]
-    'Haswell'
+    >>> pinned(frozenset({"avx2"}), {"OPENBLAS_CORETYPE": "Zen"})["OPENBLAS_NUM_THREADS"]
+    '1'
     """
     if "avx2" not in flags:
         return {}
@@ -58,22 +56,22 @@ def pinned(flags: frozenset[str], environment: Mapping[str, str]) -> dict[str, s
 
 
 def departures(environment: Mapping[str, str]) -> list[str]:
-    """Name the variables that hold libraries to other code paths than `pin` does: results may differ in the last bits.
+    """List the settings that differ from those of `pin`, with which results may differ in the last bits.
 
-    >>> departures({"MKL_CBWR": "COMPATIBLE", "NUMBA_CPU_NAME": "haswell"})
-    ['MKL_CBWR=COMPATIBLE']
+    >>> departures({"ATEN_CPU_CAPABILITY": "default", "NUMBA_CPU_NAME": "haswell"})
+    ['ATEN_CPU_CAPABILITY=default']
     """
     pinned_to = {name: {value} for name, value in PINNED.items()}
     features = " ".join(BEYOND_AVX2)  # a processor that has some of them only: a part
     pinned_to["NPY_DISABLE_CPU_FEATURES"] = {features[:end].rstrip() for end in range(len(features) + 1)}
     values = {name: environment.get(name, "") for name in VARIABLES}
-    return [f"{name}={value}" for name, value in values.items() if value and value not in pinned_to.get(name, set())]
+    changed = [f"{name}={value}" for name, value in values.items() if value and value not in pinned_to.get(name, set())]
+    return changed + _loaded_before
 
 
 def signature() -> tuple[str, ...]:
-    """What may give a training other bits on this machine: variables that set how matrix products are summed."""
-    sums = (os.environ.get(name, "") for name in ("MKL_CBWR", "ATEN_CPU_CAPABILITY"))
-    return (*sums, *departures(os.environ))
+    """Return what may change the last bits of a training on this machine; a part of the keys of cached results."""
+    return ("pinned" if "avx2" in cpu_flags() else "not pinned", *departures(os.environ))
 
 
 def cpu_flags(cpuinfo: Path = CPUINFO) -> frozenset[str]:

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Float32
 from torch import nn
 
+from pipeline.core.reproducible import affine
 from pipeline.learning.trial import Weights
 
 HIDDEN_N = 200
@@ -96,7 +97,7 @@ class Stack(nn.Module):
 
     def _run(self, values: torch.Tensor, first: int, last: int) -> torch.Tensor:
         for i in range(first, last):
-            values = torch.baddbmm(self.biases[i], values, self.weights[i])
+            values = affine(values, self.weights[i], self.biases[i])
             values = torch.relu_(values) if self.relus[i] else values
         return values
 

@@ -25,8 +25,8 @@ COLLAPSED = 0.05  # of a target's variance over a network's own training rows; s
 DECIDING = tuple(
     f"pipeline.{name}"
     for name in (
-        "core.seeds", "learning.inputs", "learning.job", "learning.model", "learning.train", "learning.trial",
-        "learning.triplets",
+        "core.reproducible", "core.seeds", "learning.inputs", "learning.job", "learning.model", "learning.train",
+        "learning.trial", "learning.triplets",
     )
 )  # fmt: skip
 LIBRARIES = ("torch", "numpy", "scipy")

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import nn
-from torch.nn.functional import linear
 
+from pipeline.core.reproducible import affine
 from pipeline.twin.opinion import DIRECTION_GAIN, FULL_SET_N, LAYERS_N, LOG_SD, LENGTH_MIN_uT, LOG_uT, REST_uT, Weights
 
 SET_WIDTH, CODE_WIDTH, WIDTH = 160, 64, 192
@@ -49,14 +49,19 @@ class Network(nn.Module):
         return answer, log_sd.clamp(*LOG_SD)
 
     def _linear(self, name: str, values: torch.Tensor) -> torch.Tensor:
-        return linear(values, self.weights[f"{name}_weight"], self.weights[f"{name}_bias"])
+        return affine(values, self.weights[f"{name}_weight"].mT, self.weights[f"{name}_bias"][None])
 
 
 def inputs(db_uT: Float[torch.Tensor, "b n ch"], rest_uT: Float[torch.Tensor, "b ch"]) -> Float[torch.Tensor, "b n i"]:
-    """Give direction and log length of each change of field, and the skin's field at rest; scaled to about 1."""
-    length_uT = db_uT.norm(dim=-1, keepdim=True).clamp_min(LENGTH_MIN_uT)
-    rest = (rest_uT / REST_uT)[:, None].expand(-1, db_uT.shape[1], -1)
-    return torch.cat([DIRECTION_GAIN * db_uT / length_uT, torch.log(length_uT) - LOG_uT, rest], -1)
+    """Return direction and log length of each change of field, and the skin's field at rest; scaled to about 1.
+
+    Computed in NumPy, as `torch.log` differs between processors; gradients do not reach the readings.
+    """
+    db, rest = db_uT.numpy(), rest_uT.numpy() / np.float32(REST_uT)
+    length_uT = np.maximum(np.linalg.norm(db, axis=-1, keepdims=True), np.float32(LENGTH_MIN_uT))
+    shape = (*db.shape[:2], rest.shape[-1])
+    parts = [DIRECTION_GAIN * db / length_uT, np.log(length_uT) - LOG_uT, np.broadcast_to(rest[:, None], shape)]
+    return torch.from_numpy(np.concatenate(parts, axis=-1))
 
 
 def draw_weights(channels_n: int, rng: np.random.Generator) -> dict[str, np.ndarray]:

@@ -15,6 +15,7 @@ from pydantic import Field
 from torch.nn.functional import huber_loss
 
 from pipeline.core.config import Strict
+from pipeline.core.reproducible import exp
 from pipeline.core.seeds import rng_for
 from pipeline.twin.law import Law, Setup
 from pipeline.twin.network import Network, draw_weights
@@ -118,7 +119,7 @@ def loss_of(network: Network, batch: Batch) -> tuple[torch.Tensor, torch.Tensor]
     error = HUBER_WEIGHT * huber_loss(answer, target, delta=HUBER_DELTA)
     # The spread learns from errors, not errors from the spread: Gaussian likelihood alone gives hard pokes up.
     off = (answer - target).detach()
-    surprise = (log_sd + 0.5 * off**2 * torch.exp(-2 * log_sd)).mean()
+    surprise = (log_sd + 0.5 * off**2 * exp(-2 * log_sd)).mean()
     return error + SPREAD_WEIGHT * surprise, error
 
 

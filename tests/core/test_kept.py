@@ -29,7 +29,7 @@ def test_what_was_kept_comes_back_to_the_last_bit(package):
 def test_another_state_gives_nothing_and_takes_the_place_of_the_old(package, monkeypatch, what):
     kept.save(package, "flow", np.ones(3))
     if what == "setting":
-        monkeypatch.setenv("MKL_CBWR", "SSE2")
+        monkeypatch.setenv("ATEN_CPU_CAPABILITY", "default")
     else:
         (package / ("a.py" if what == "source" else "b.py")).write_text("x = 2\n")
     kept._state.cache_clear()

@@ -1,0 +1,89 @@
+"""Print digests of the weights of three tiny trainings, here or on emulated processors.
+
+The trainings: the paper's networks side by side with all terms of the loss, the adversarial network, the universal
+model's. `python -m tests.arithmetic` prints their digests; test_numerics.py runs it under several settings.
+`python -m tests.arithmetic Haswell-v2 EPYC-v1` also runs it on processors that QEMU emulates (package qemu-user; some
+two minutes each; all names: `qemu-x86_64 -cpu help`) and fails if one has other digests. MKL and PyTorch choose their
+code by maker and features of the processor that is emulated, so this finds what variables cannot show.
+"""
+
+import pipeline  # isort: skip  # noqa: F401  (first: it selects the arithmetic that NumPy loads with)
+
+import hashlib
+import os
+import subprocess
+import sys
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from pipeline.core.seeds import rng_for
+from pipeline.learning.adversarial import Domains, train_adversarial
+from pipeline.learning.recipe import Schedule
+from pipeline.learning.train import train
+from pipeline.learning.trial import Terms
+from pipeline.twin.population import POKES_N, Population
+from pipeline.twin.tables import NOMINAL, OF_NOMINAL
+from pipeline.twin.training import Syllabus
+from pipeline.twin.training import train as train_universal
+from tests.learning.jobs import some_job, some_rows
+from tests.twin.skins import SETUP
+
+STEPS_N = 30
+SCHEDULE = Schedule(steps_n=STEPS_N, batch_n=128, rate_max=3e-3, gradient_norm_max=1.0, weight_decay=0.01)
+
+
+def digest(arrays: Iterable[np.ndarray]) -> str:
+    found = hashlib.sha256()
+    for array in arrays:
+        found.update(array.tobytes())
+    return found.hexdigest()[:16]
+
+
+def paper_networks() -> str:
+    jobs = [some_job(name, n=300, terms=True) for name in range(3)]
+    outcomes = train(jobs, "paper", SCHEDULE, Terms(0.1, 0.1, 0.1), "cpu")
+    return digest(outcome.weights[name] for outcome in outcomes for name in sorted(outcome.weights))
+
+
+def adversarial_network() -> str:
+    known, target = some_rows(300, "known")
+    weights = train_adversarial(
+        Domains(known, target, some_rows(200, "new")[0]), SCHEDULE, 0.5, rng_for(0, "adversarial")
+    )
+    return digest(weights[name] for name in sorted(weights))
+
+
+def universal_network() -> str:
+    rng = rng_for(0, "population")
+    skins = Population(
+        rng.normal(0, 300, (20, POKES_N, 15)).astype(np.float32), rng.normal(0, 1000, (20, 15)).astype(np.float32),
+        rng.uniform(-8, 8, (20, POKES_N, 2)).astype(np.float32), rng.uniform(0.1, 8, (20, POKES_N)).astype(np.float32),
+    )  # fmt: skip
+    weights, _ = train_universal(skins, Syllabus("made up", NOMINAL, OF_NOMINAL, SETUP), STEPS_N, rng)
+    return digest(weights[name] for name in sorted(weights))
+
+
+def on_processor(name: str) -> str:
+    """Return the digests as an emulated processor computes them."""
+    command = ["qemu-x86_64", "-cpu", name, sys.executable, "-m", "tests.arithmetic"]
+    # It reads this machine's features from /proc/cpuinfo, and NumPy warns of those that the emulated one lacks.
+    environment = {**os.environ, "NPY_DISABLE_CPU_FEATURES": ""}
+    done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, check=True)
+    return done.stdout.decode().strip()
+
+
+def main(processors: Sequence[str]) -> None:
+    here = f"{paper_networks()} {adversarial_network()} {universal_network()}"
+    print(here, flush=True)
+    different = []
+    for name in processors:
+        there = on_processor(name)
+        print(f"{there}  {name}", flush=True)
+        different += [name] * (there != here)
+    if different:
+        sys.exit(f"other weights than on this processor: {', '.join(different)}")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
