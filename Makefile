@@ -2,7 +2,7 @@
 # make test    lint, types, layers, tests
 # make test-processors   trainings on emulated processors of Intel and AMD: the same bits (needs qemu-user)
 # make ui      the MLflow UI on the embedded store
-# make bench   benchmarks (not part of the tests)
+# make bench   benchmarks at full size (the tests run each at a tiny size)
 # make faults   injects every fault for real (Linux, root for mounts) -> docs/faults.md
 # make time-repro   `make repro` in a fresh clone, its stages three times: seconds, CPU seconds, disk -> reports/time.json
 # make constraints   the newest versions that fit together -> constraints.txt; then make test, then commit
@@ -60,7 +60,7 @@ ui: $(STAMP)
 	$(BIN)/mlflow ui --backend-store-uri sqlite:///mlflow.db
 
 bench: $(STAMP)
-	$(BIN)/python -m pytest tests/benchmarks -s -q --override-ini addopts= -p no:xdist
+	RESKIN_BENCHMARKS=full $(BIN)/python -m pytest tests/benchmarks -s -q -p no:xdist
 
 # Kills, full disks, cut files, dead servers: each hits a copy of a small checkout that has finished.
 faults: $(STAMP)

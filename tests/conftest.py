@@ -15,6 +15,8 @@ import pytest
 from hypothesis import HealthCheck, settings
 from jaxtyping import AbstractArray, jaxtyped
 
+from tests.benchmarks import FULL
+
 # How long an example takes says how busy the machine is, not whether the law holds.
 settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow], max_examples=50)
 settings.register_profile("thorough", settings.get_profile("busy"), max_examples=1000)  # --hypothesis-profile=thorough
@@ -67,7 +69,8 @@ def pytest_runtest_setup() -> None:
 
 gc.disable()  # while everything is imported
 jaxtyping.jaxtyped = check_arrays  # by this name the import hook decorates every function of the project
-jaxtyping.install_import_hook("pipeline", "beartype.beartype")  # its pytest plugin would import NumPy too early
+if not FULL:  # benchmarks at full size run the code as it is
+    jaxtyping.install_import_hook("pipeline", "beartype.beartype")  # its pytest plugin would import NumPy too early
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

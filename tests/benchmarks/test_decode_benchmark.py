@@ -1,6 +1,7 @@
 """How much faster whole blocks decode than one frame at a time, over the same bytes in the same run.
 
-`pytest -s -o addopts= tests/benchmarks/test_decode_benchmark.py`. The loops run over a tenth of the frames, and their
+`RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_decode_benchmark.py`.
+The loops run over a tenth of the frames, and their
 time counts tenfold; every time is the best of three. Nothing but equality of the values is asserted.
 """
 
@@ -17,10 +18,11 @@ import pytest
 
 from pipeline.capture.stream import FrameStream, decode_all
 from pipeline.capture.wire import encode
+from tests.benchmarks import size
 from tests.capture.signals import make_frames
 
-FRAMES_N = 1_000_000
-LOOP_FRAMES_N = 100_000
+FRAMES_N = size(1_000_000, 2_000)
+LOOP_FRAMES_N = size(100_000, 200)
 CHIPS_N = 5
 FRAME_BYTES_N = 82
 PORTION_BYTES_N = 4096

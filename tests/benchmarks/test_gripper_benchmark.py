@@ -1,6 +1,7 @@
 """How well a force is held with our estimate as feedback, on a simulated skin between fingers.
 
-`pytest -s -o addopts= tests/benchmarks/test_gripper_benchmark.py`. Nothing is asserted: it prints the numbers.
+`RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_gripper_benchmark.py`.
+Nothing is asserted: it prints the numbers.
 """
 
 import numpy as np
@@ -8,10 +9,12 @@ import pytest
 
 from pipeline.core.seeds import rng_for
 from pipeline.twin.shipped import load_universal
-from tests.live.gripper import AIM_N, RATE_HZ, SETTLED_S, Finger, fit, grip
+from tests.benchmarks import size
+from tests.live.gripper import AIM_N, PERIOD_S, RATE_HZ, SETTLED_S, Finger, fit, grip
 
-SKINS_N = 6
-PLACES_MM = ((8.0, 8.0), (5.0, 10.0))
+SKINS_N = size(6, 1)
+PLACES_MM = size(((8.0, 8.0), (5.0, 10.0)), ((8.0, 8.0),))
+POKES_N, SECONDS = size(600, 20), size(PERIOD_S, SETTLED_S + 0.1)
 
 
 @pytest.mark.parametrize(
@@ -20,9 +23,9 @@ PLACES_MM = ((8.0, 8.0), (5.0, 10.0))
 def test_a_force_is_held(feedback, aim_N):
     errors, within = [], []
     for seed in range(SKINS_N):
-        models = [fit(seed)] if feedback.startswith("network") else load_universal()
+        models = [fit(seed, POKES_N)] if feedback.startswith("network") else load_universal()
         for place_mm in PLACES_MM:
-            held = grip(Finger(seed, place_mm), models, rng_for(seed, "grip"), aim_N=aim_N)
+            held = grip(Finger(seed, place_mm), models, rng_for(seed, "grip"), aim_N=aim_N, seconds=SECONDS)
             error = np.abs(held[round(SETTLED_S * RATE_HZ) :, 0] / aim_N - 1)
             errors.append(error.mean())
             within.append((error < 0.1).mean())

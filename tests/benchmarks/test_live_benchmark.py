@@ -1,6 +1,7 @@
 """How long a byte takes to an estimate, with a page open; and what a day of frames takes in memory.
 
-`pytest -s -o addopts= tests/benchmarks/test_live_benchmark.py`. The board is another process, on a pseudo-terminal; the
+`RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_live_benchmark.py`.
+The board is another process, on a pseudo-terminal; the
 page is read by another too; of several boards, each is one. Nothing is asserted but that frames came.
 """
 
@@ -27,11 +28,12 @@ from pipeline.live.session import Live
 from pipeline.live.skin import Readings, Skin
 from pipeline.live.view import LATENCIES_N, View
 from pipeline.predicting import read_network
+from tests.benchmarks import size
 from tests.live.boards import make_script, write_model, write_script
 from tests.live.test_browser import BROWSER, Tab, in_browser
 from tests.stages.checkout import ROOT
 
-SECONDS = 30.0
+SECONDS = size(30.0, 0.5)
 QUARTER_S = 0.25
 STATM = Path("/proc/self/statm")
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
@@ -47,11 +49,12 @@ asyncio.run(look_at_all())
 """
 FIVE, SLEEVE = (5, 400.0), (40, 133.0)
 BOARDS = {
+    "two boards": [FIVE] * 2,
     "5 chips": [FIVE],
     "40 chips": [SLEEVE],
-    "two boards": [FIVE] * 2,
     "eight boards": [SLEEVE] + [(5, 133.0)] * 7,
 }
+BOARDS = size(BOARDS, dict([*BOARDS.items()][:1]))
 every_way = pytest.mark.parametrize("boards", BOARDS.values(), ids=BOARDS.keys())
 
 
@@ -61,7 +64,7 @@ def test_from_the_last_byte_of_a_frame_to_its_estimate(tmp_path, boards):
         addresses = [f"{server}/live?board={i}" for i in range(len(lives))]
         page = subprocess.Popen([sys.executable, "-c", PAGE, *addresses], env=ENVIRONMENT)
         try:
-            time.sleep(2.0)
+            time.sleep(size(2.0, 0.1))
             with measured(lives, boards):
                 time.sleep(min(SECONDS, LATENCIES_N / boards[0][1]))
         finally:
@@ -158,10 +161,10 @@ def test_a_day_of_frames_takes_the_memory_of_ten_minutes():
     db_uT = rng.standard_normal((made_n, 15)).astype(np.float32)
     answer, sd_mm = rng.standard_normal((made_n, 3)), np.full((made_n, 2), np.nan)
     tracemalloc.start()
-    for second in range(86_400):
+    for second in range(size(86_400, 60)):
         t_s = second + np.arange(made_n) / made_n
         view.feed(Readings(t_s, db_uT, db_uT, answer, sd_mm, answer[:, 2] > 0), t_s[-1])
-        if second in (600, 86_399):
+        if second in size((600, 86_399), (30, 59)):
             print(f"\n  after {second} s: {tracemalloc.get_traced_memory()[0] / 1e6:.3f} MB")
     tracemalloc.stop()
 
@@ -185,7 +188,7 @@ class Accelerated:
 @pytest.mark.timeout(7200)
 @pytest.mark.skipif(not STATM.exists(), reason="reads the memory of Linux")
 def test_hours_of_bytes_take_the_memory_of_ten_minutes(tmp_path):
-    script, hours = make_script(pokes_n=20), float(os.environ.get("RESKIN_HOURS", "1"))
+    script, hours = make_script(pokes_n=20), float(os.environ.get("RESKIN_HOURS", size("1", "0.02")))
     frames_n = round(400 * QUARTER_S)
     chunks = [b"".join(script.pieces[i : i + frames_n]) for i in range(0, len(script) - frames_n + 1, frames_n)]
     skin, view = Skin("day", [read_network(write_model(tmp_path))]), View(layout_of(5), 0.0)

@@ -1,6 +1,7 @@
 """What map and network of the project take: a reading as a controller asks, 65 pokes to learn from, one more, labels.
 
-`pytest -s -o addopts= tests/benchmarks/test_map_benchmark.py`. Processor time of one thread. Nothing is asserted but
+`RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_map_benchmark.py`.
+Processor time of one thread. Nothing is asserted but
 that readings were answered.
 """
 
@@ -14,6 +15,7 @@ from pipeline.core.seeds import rng_for
 from pipeline.dataset.grid import CENTRE_MM
 from pipeline.twin.asked import CHANNELS_N
 from pipeline.twin.shipped import load_universal
+from tests.benchmarks import size
 
 POKES_N = 65
 
@@ -57,7 +59,7 @@ def say(
 ) -> None:  # fmt: skip
     """Print the least, the median and the 99th percentile of so many calls."""
     took = []
-    for i in range(calls_n):
+    for i in range(size(calls_n, 2)):
         before()
         start_s = time.process_time()
         call(i)

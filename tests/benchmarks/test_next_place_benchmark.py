@@ -1,6 +1,7 @@
 """Places chosen by the map's own uncertainty beside fixed and random ones: errors after as many labels.
 
-`pytest -s -o addopts= tests/benchmarks/test_next_place_benchmark.py`: a minute. Simulated skins about the nominal one,
+`RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_next_place_benchmark.py`:
+a minute. Simulated skins about the nominal one,
 with errors of the law as training draws them, that the shipped model has not seen; of each, 65 pokes on the grid may be
 labelled, 65 others are read. Nothing is asserted but that readings were answered.
 """
@@ -22,8 +23,9 @@ from pipeline.twin.shipped import SKIN_MM, Universal, load_universal
 from pipeline.twin.tables import NOMINAL, OF_NOMINAL
 from pipeline.twin.training import ERROR_OF_NOMINAL, NOISE_uT, add_error
 from pipeline.twin.turned import CHIPS_MM, to_board
+from tests.benchmarks import size
 
-SKINS_N, LABELS_N, PRESS_N = 40, (0, 1, 3, 5, 10), 2.0
+SKINS_N, LABELS_N, PRESS_N = size(40, 2), size((0, 1, 3, 5, 10), (0, 1)), 2.0
 Choose = Callable[[Universal, list[int]], int]
 
 

@@ -1,6 +1,6 @@
 """What an indentation costs on one core, and how often magpylib's dipoles would fit into that, in the same run.
 
-`OMP_NUM_THREADS=1 pytest -s -o addopts= tests/benchmarks/test_physics_benchmark.py`. Nothing but equality is asserted.
+`RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_physics_benchmark.py`. Nothing but equality is asserted.
 """
 
 import resource
@@ -20,12 +20,13 @@ from pipeline.physics import dipole, flow_map, layer
 from pipeline.physics.board import Board, draw_board
 from pipeline.physics.change import change_of_field
 from pipeline.physics.skin import Skin, changes_of_field, draw_skin
+from tests.benchmarks import FULL, size
 from tests.physics.test_board import design as board_design
 from tests.physics.test_board import no_spread, spreads
 from tests.physics.test_skin import design
 
-DEPTHS_MM = (0.2, 0.4, 0.6, 0.8, 1.0, 1.2)
-SKINS_N = 18
+DEPTHS_MM = size((0.2, 0.4, 0.6, 0.8, 1.0, 1.2), (0.2,))
+SKINS_N, PASSES_N = size(18, 1), size(26, 1)
 BOARD = draw_board(board_design(), no_spread(), seed=0, name="b0")
 
 
@@ -39,6 +40,8 @@ def one_pass_m() -> np.ndarray:
 
 
 def forget_tables() -> None:
+    if not FULL:
+        return  # other tests use them at the same time
     for cached in (flow_map._tabulate, flow_map._displaced, flow_map._waves, flow_map._marks, layer.contact_of_depth):
         cached.cache_clear()
     for file in (flow_map.PACKAGE / "__pycache__").glob("kept-*.npy"):
@@ -135,11 +138,11 @@ def test_eighteen_skins_are_timed_from_their_names_on() -> None:
 @pytest.mark.timeout(600)
 def test_a_papers_worth_of_pokes_each_at_its_own_place_and_depth_is_timed_on_two_skins() -> None:
     rng = rng_for(0, "benchmark")
-    pokes_m = np.tile(one_pass_m(), (26, 1))
+    pokes_m = np.tile(one_pass_m(), (PASSES_N, 1))
     pokes_m += rng.normal(0, (0.05e-3, 0.05e-3, 0.01e-3), pokes_m.shape)
     forget_tables()
     start_s = time.perf_counter()
-    for skin_i in range(2):
+    for skin_i in range(min(SKINS_N, 2)):
         changes_of_field(BOARD, skin(f"s{skin_i}"), pokes_m)
     total_s = time.perf_counter() - start_s
     peak_MB = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

@@ -9,13 +9,15 @@ from pipeline.learning.model import Stack, paper_layers
 from pipeline.learning.recipe import Schedule
 from tests.learning.jobs import some_rows
 
-SCHEDULE = Schedule(steps_n=150, batch_n=32, rate_max=3e-3, gradient_norm_max=1.0, weight_decay=0.0)
+SCHEDULE = Schedule(steps_n=600, batch_n=32, rate_max=3e-3, gradient_norm_max=1.0, weight_decay=0.0)
 KNOWN, TARGET = some_rows(200, "known")
 NEW = some_rows(100, "new")[0] + np.float32(1.5)
 
 
-def trained(weight: float, new: np.ndarray = NEW) -> dict[str, np.ndarray]:
-    return dict(train_adversarial(Domains(KNOWN, TARGET, new), SCHEDULE, weight, rng_for(0, "adversarial")))
+def trained(
+    weight: float, new: np.ndarray = NEW, seed: int = 0, schedule: Schedule = SCHEDULE
+) -> dict[str, np.ndarray]:
+    return dict(train_adversarial(Domains(KNOWN, TARGET, new), schedule, weight, rng_for(seed, "adversarial")))
 
 
 def apart(weights: dict[str, np.ndarray]) -> float:
@@ -39,9 +41,15 @@ def test_the_weight_rises_from_nothing_to_all():
     assert abs(rising(1.0) - 1) < 1e-4
 
 
-def test_features_of_both_skins_come_nearer_to_each_other_and_the_control_knows_no_new_skin():
-    control, told = trained(0.0), trained(1.0)
-    assert apart(told) < 0.75 * apart(control)
-    elsewhere = trained(0.0, NEW + np.float32(3.0))
+def test_features_of_both_skins_come_nearer_to_each_other():
+    # Over 12 seeds the ratio is 0.30 with a standard deviation of 0.12, so that the mean of three is 4 of its own
+    # (0.068) below 0.6. After 150 steps the ratio was 1.05 +- 0.45: nothing can be said then.
+    ratios = [apart(trained(1.0, seed=seed)) / apart(trained(0.0, seed=seed)) for seed in range(3)]
+    assert np.mean(ratios) < 0.6
+
+
+def test_the_control_does_not_depend_on_the_new_skin():
+    short = SCHEDULE.model_copy(update={"steps_n": 20})
+    control, elsewhere = trained(0.0, schedule=short), trained(0.0, NEW + np.float32(3.0), schedule=short)
     for name, value in control.items():
         np.testing.assert_array_equal(value, elsewhere[name])
