@@ -40,7 +40,7 @@ $(STAMP): pyproject.toml constraints.txt
 repro: $(STAMP)
 	$(BIN)/reskin scenes check
 	$(BIN)/dvc repro
-	@$(BIN)/reskin compare || true # says whether changed files under reports/ are fine; a scene of your own has nothing committed
+	@$(BIN)/reskin compare || true # compares with the committed reports; a scene of your own has none
 
 test: lint
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder

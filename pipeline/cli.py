@@ -5,7 +5,6 @@ Imports within the commands: `reskin --help` waits for none of what a command ne
 
 import signal
 import sys
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
@@ -212,15 +211,14 @@ def publish() -> None:
 @app.command()
 def compare(
     scene: Annotated[str | None, Argument(help="A scene; without one, all that run.")] = None,
-    against: Annotated[str, Option(help="A git revision, a folder or a numbers.json.")] = "HEAD",
+    against: Annotated[str, Option(help="A git revision, or a folder with reports.")] = "HEAD",
 ) -> None:
-    """Hold fresh numbers against the committed ones; exit status 1 if any differs by more than it may."""
+    """Compare fresh reports with the committed ones; exit status 1 if any value differs."""
     root = checkout()
-    from pipeline.comparing import compare_scene, tell
+    from pipeline.comparing import compare_scene
 
     names = [scene] if scene else checked_plan().scenes
-    told = [tell(name, against, partial(compare_scene, root, name, against), typer.echo) for name in names]
-    sys.exit(max(told, default=0))
+    sys.exit(max((compare_scene(root, name, against, typer.echo) for name in names), default=0))
 
 
 @app.command()
@@ -228,7 +226,7 @@ def verify_reports(
     names: Annotated[list[str] | None, Argument(metavar="[SCENE]...", help="Without any, all that run.")] = None,
     against: Annotated[Path | None, Option(help="Finished reports, in place of a rerun.")] = None,
 ) -> None:
-    """Run scenes again in a clean copy of the last commit; exit status 1 if reports differ by more than they may."""
+    """Run scenes again in a clean copy of the last commit; exit status 1 if any value of their reports differs."""
     root = checkout()
     from pipeline.verifying import verify
 

@@ -1,93 +1,194 @@
-"""Holds a fresh run against committed numbers. In: a scene, a revision or a folder. Out: a comparison, and words of it.
+"""`reskin compare`: compare the reports of a fresh run with committed ones, and say what differs.
 
-Refuses to know tolerances, and what a number means.
+Compares numbers.json and the tables of a scene. It knows no tolerances: see `evaluation.reproduced`.
 """
 
+import csv
+import io
 import json
-import re
 import subprocess
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from shutil import which
 from typing import Any
 
 import pandas as pd
 
-from pipeline.core import io
 from pipeline.core.errors import ReskinError, SchemaError
 from pipeline.core.stage import say
-from pipeline.evaluation.reproduced import Comparison, compare
+from pipeline.evaluation.reproduced import Comparison, Difference, compare, part_of
 
-SHOWN_N = 40  # rows of a table in a terminal
-
-
-def compare_scene(root: Path, scene: str, against: str) -> Comparison:
-    """Compare the numbers that lie in `reports/` with those of a revision, a folder or a file."""
-    file = root / "reports" / scene / "numbers.json"
-    if not file.exists():
-        raise SchemaError(file, "the file", "there", "none", f"Try: reskin scenes use {scene}, then dvc repro.")
-    return compare(read_committed(root, scene, against), io.read_json(file))
+LISTED_N = 10  # largest differences, and differing parts, that are listed
+MACHINE = ("device", "versions", "trained", "git")  # of the provenance: what may explain a difference
+EXPECTED = (
+    "With the code, settings and versions (constraints.txt) of the committed run, values are equal on every x86-64 "
+    "processor with AVX2; a GPU or other versions may differ. If none of these explains it, please report it."
+)
+Echo = Callable[[str], None]
 
 
-def read_committed(root: Path, scene: str, against: str) -> dict[str, Any]:
-    """Read the numbers to compare with: from a path if there is one of that name, else from git."""
-    place = Path(against)
-    if place.exists():
-        names = ("", "numbers.json", f"{scene}/numbers.json", f"reports/{scene}/numbers.json")
-        found = next((place / name for name in names if (place / name).is_file()), None)
-        if found is None:
-            remedy = "Name reports/<scene> of another checkout, or a numbers.json."
-            raise SchemaError(against, "the folder", f"one that holds {scene}/numbers.json", "none", remedy)
-        return io.read_json(found)
-    words = ["git", "show", f"{against}:./reports/{scene}/numbers.json"]
-    done = subprocess.run(words, cwd=root, capture_output=True, text=True, check=False) if which("git") else None
-    if done is None or done.returncode:
-        remedy = "Try: reskin compare SCENE --against REVISION-OR-FOLDER."
-        raise SchemaError(f"git revision {against}", f"reports/{scene}/numbers.json", "committed", "none", remedy)
-    return json.loads(done.stdout)
+@dataclass(frozen=True)
+class Reports:
+    """What two runs are compared by: numbers.json, the cells of tables, and where they came from."""
+
+    where: str  # how a sentence names them
+    numbers: dict[str, Any]
+    tables: dict[str, list[dict[str, Any]]]
+    provenance: dict[str, Any]
 
 
-def tell(name: str, against: str, compare_one: Callable[[], Comparison], echo: Callable[[str], None]) -> int:
-    """Tell how a comparison went; return its exit status: 0, 1 if a value is beyond its tolerance, 2 without one."""
+def compare_scene(root: Path, scene: str, against: str, echo: Echo) -> int:
+    """Compare `reports/<scene>` with those of a revision or a folder; return the exit status of `tell`.
+
+    A scene that cannot be compared is an error in one sentence, so that other scenes are compared all the same.
+    """
     try:
-        done = compare_one()
+        folder = root / "reports" / scene
+        if not (folder / "numbers.json").exists():
+            remedy = f"Try: reskin scenes use {scene}, then dvc repro."
+            raise SchemaError(folder / "numbers.json", "the file", "there", "none", remedy)
+        committed = read_folder(Path(against), scene) if Path(against).exists() else read_revision(root, scene, against)
+        return tell(scene, committed, read_folder(folder, scene), echo)
     except ReskinError as error:
         say(f"error: {error}")
         return error.exit_code
-    if table := table_of(done):
-        echo(table)
-    echo(verdict(name, against, done))
-    return 0 if done.reproduced else 1
 
 
-def table_of(done: Comparison) -> str:
-    """Tabulate what differs by more than it may, and name what only one side has; empty if there is nothing."""
-    columns = ("number", "committed", "fresh", "difference", "tolerance")
-    rows = [(x.name, _short(x.committed), _short(x.fresh), x.off, x.tolerance) for x in done.beyond[:SHOWN_N]]
-    table = pd.DataFrame(rows, columns=columns)
-    lines = [str(table.to_markdown(index=False, disable_numparse=True))] if rows else []
-    lines += [f"and {len(done.beyond) - SHOWN_N} more"] * (len(done.beyond) > SHOWN_N)
-    for word, names in (("only committed", done.missing), ("only fresh", done.new)):
-        questions = Counter(re.split(r"[.\[]", name)[0] for name in names)
-        lines += [f"{word}: {', '.join(f'{name} ({n} values)' for name, n in questions.items())}"] * bool(names)
-    return "\n".join(lines)
+def read_folder(place: Path, scene: str) -> Reports:
+    """Read the reports of a scene from `reports/<scene>` itself, a folder around it, or the folder of a file."""
+    around = place if place.is_dir() else place.parent
+    candidates = (around, around / scene, around / "reports" / scene)
+    folder = next((one for one in candidates if (one / "numbers.json").is_file()), None)
+    if folder is None:
+        remedy = "Name reports/<scene> of another checkout."
+        raise SchemaError(place, "the folder", f"one that holds {scene}/numbers.json", "none", remedy)
+    names = [file for pattern in ("*.json", "tables/*.csv") for file in sorted(folder.glob(pattern))]
+    return _parse(f"in {folder}", {str(file.relative_to(folder)): file.read_text("utf-8") for file in names})
 
 
-def verdict(scene: str, against: str, done: Comparison) -> str:
-    """Say in one sentence whether the run is the committed one."""
-    counts = f"{done.equal_n} values equal those of {against}, {done.within_n} differ within their tolerance"
-    if done.reproduced and not done.within_n:
-        return f"{scene}: reproduced: all {counts.partition(',')[0]}."
-    if done.reproduced:
-        arithmetic = "another processor's arithmetic does that; with AVX2, code, data or settings did: look at git diff"
-        return f"{scene}: reproduced within tolerance: {counts}, none beyond ({arithmetic})."
-    lone_n = len(done.missing) + len(done.new)
-    return (
-        f"{scene}: not reproduced: {counts}, {len(done.beyond)} beyond it, {lone_n} on one side only "
-        "(other settings or code do that; with the same, please report it)."
+def read_revision(root: Path, scene: str, revision: str) -> Reports:
+    """Read the reports of a scene from git."""
+    folder = f"./reports/{scene}"
+    listed = _git(root, "ls-tree", "-r", "--name-only", revision, f"{folder}/") if which("git") else None
+    names = [name for name in (listed or "").splitlines() if name.endswith((".json", ".csv"))]
+    if f"reports/{scene}/numbers.json" not in names:
+        remedy = "Try: reskin compare SCENE --against REVISION-OR-FOLDER."
+        raise SchemaError(f"git revision {revision}", f"reports/{scene}/numbers.json", "committed", "none", remedy)
+    commit = _git(root, "log", "-1", "--format=%h", revision, "--", folder) or ""
+    texts = {name.removeprefix(f"reports/{scene}/"): _git(root, "show", f"{revision}:./{name}") or "" for name in names}
+    return _parse(f"committed at {commit.strip()}", texts)
+
+
+def tell(title: str, committed: Reports, fresh: Reports, echo: Echo) -> int:
+    """Say how two runs compare, the summary last; return 0 if all values are equal, else 1."""
+    parts = {
+        "numbers.json": compare(committed.numbers, fresh.numbers),
+        "tables": compare(committed.tables, fresh.tables),
+    }
+    counts = {part: done.equal.total() + len(done.differing) for part, done in parts.items()}
+    values = f"{sum(counts.values()):,} values"
+    of_parts = " and ".join(f"{n:,} of {part}" for part, n in counts.items())
+    if all(done.reproduced for done in parts.values()):
+        echo(f"{title}: reproduced: all {values} equal those {committed.where} ({of_parts}).")
+        return 0
+    echo(_machines(committed.provenance, fresh.provenance))
+    for part, done in parts.items():
+        echo(f"\n{part}: {_counted(done)}")
+        for word, names in (("only committed", done.missing), ("only fresh", done.new)):
+            if names:
+                echo(f"{word}: {_listed(Counter(map(part_of, names)))}")
+    numbers = sorted((one for done in parts.values() for one in done.differing if one.relative), key=_by_size)
+    if numbers:
+        echo(f"\nLargest differences, relative to the larger of the two numbers:\n{_largest(numbers[:LISTED_N])}")
+    turned = [one for done in parts.values() for one in done.differing if one.verdicts]
+    echo("\n".join([f"\nVerdicts that changed: {len(turned) or 'none'}", *map(_turned, turned)]))
+    differing_n = sum(len(done.differing) for done in parts.values())
+    lone_n = sum(len(done.missing) + len(done.new) for done in parts.values())
+    by = f", numbers by up to {_percent(numbers[0])}" if numbers else ""
+    lone = f"; {lone_n:,} are in one run only" if lone_n else ""
+    verdicts = f"{len(turned)} verdict{'s' if len(turned) != 1 else ''} changed" if turned else "no verdict changed"
+    echo(
+        f"\n{title}: not equal: {differing_n:,} of {values} differ from those {committed.where}{by}{lone}; {verdicts}. "
+        f"{EXPECTED}"
     )
+    return 1
+
+
+def _machines(committed: Mapping[str, Any], fresh: Mapping[str, Any]) -> str:
+    """Tabulate on what machine, with what code and versions both ran."""
+    rows = [{"run": key, "committed": _short(committed.get(key)), "fresh": _short(fresh.get(key))} for key in MACHINE]
+    return str(pd.DataFrame(rows).to_markdown(index=False, disable_numparse=True))
+
+
+def _counted(done: Comparison) -> str:
+    compared_n = done.equal.total() + len(done.differing)
+    differing = Counter(part_of(one.name) for one in done.differing)
+    if not differing:
+        return f"all {compared_n:,} that both have are equal"
+    return f"{len(done.differing):,} of {compared_n:,} differ: {_listed(differing)}"
+
+
+def _listed(counts: Counter[str]) -> str:
+    return ", ".join(f"{part} {n:,}" for part, n in counts.most_common())
+
+
+def _by_size(one: Difference) -> float:
+    return -(one.relative or 0.0)
+
+
+def _percent(one: Difference) -> str:
+    return f"{100 * (one.relative or 0.0):.3g} %"
+
+
+def _largest(differences: Sequence[Difference]) -> str:
+    rows = [
+        {
+            "number": one.name,
+            "committed": _short(one.committed),
+            "fresh": _short(one.fresh),
+            "differs by": _percent(one),
+        }
+        for one in differences
+    ]
+    return str(pd.DataFrame(rows).to_markdown(index=False, disable_numparse=True))
+
+
+def _turned(one: Difference) -> str:
+    old, new = one.verdicts or ("", "")
+    return f"- {one.name}: {old} -> {new}"
 
 
 def _short(value: object) -> str:
-    return f"{value:.6g}" if isinstance(value, float) else str(value)[:40]
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name} {one}" for name, one in value.items())
+    return "unknown" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _parse(where: str, texts: Mapping[str, str]) -> Reports:
+    """Parse the files of a report by name."""
+    numbers = json.loads(texts["numbers.json"])
+    provenance = numbers.get("provenance", {}) | json.loads(texts.get("provenance.json", "{}"))
+    tables = {Path(name).stem: _cells(words) for name, words in sorted(texts.items()) if name.endswith(".csv")}
+    return Reports(where, numbers, tables, provenance)
+
+
+def _cells(words: str) -> list[dict[str, Any]]:
+    rows = csv.DictReader(io.StringIO(words))
+    return [{str(key): _number(cell) for key, cell in row.items()} for row in rows]
+
+
+def _number(cell: str) -> int | float | str:
+    for kind in (int, float):
+        try:
+            return kind(cell)
+        except ValueError:
+            continue
+    return cell
+
+
+def _git(root: Path, *words: str) -> str | None:
+    """Run git in the checkout and give what it prints; None if it fails."""
+    done = subprocess.run(["git", *words], cwd=root, capture_output=True, text=True, check=False)
+    return None if done.returncode else done.stdout

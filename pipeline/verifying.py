@@ -1,86 +1,36 @@
-"""Are the committed reports what their code makes? In: scenes, or finished reports. Out: words, and an exit status.
+"""`reskin verify-reports`: run scenes again in a clone of the last commit, and compare their reports.
 
-A scene runs again from nothing in a clone of the last commit: no cache of stages or trainings is there. Refuses to know
-tolerances (`evaluation.reproduced`), and what a stage does.
+A scene runs from nothing: no cache of stages or trainings is there. This module knows no stage but `report`.
 """
 
-import csv
-import io as text
 import os
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from pipeline.adding import RAW
-from pipeline.comparing import read_committed, tell
+from pipeline.comparing import Echo, read_folder, read_revision, tell
 from pipeline.core import io
 from pipeline.core.errors import SchemaError
 from pipeline.core.stage import say
-from pipeline.evaluation.reproduced import compare
 from pipeline.registry import REGISTRY
 
 VERIFIED = ".reskin/verified"  # what the last reruns reported, for a look and for `--against` elsewhere
-FOR_PROGRAMS = "scores"  # its cells are numbers; those of the others are for people, and stand in numbers.json
 QUIET = {"MLFLOW_DISABLE_TELEMETRY": "true", "DVC_NO_ANALYTICS": "1", "OMP_NUM_THREADS": "1"}  # as the Makefile does
-Echo = Callable[[str], None]
 
 
 def verify(root: Path, names: Sequence[str], against: Path | None, echo: Echo) -> int:
-    """Tell of each scene how its rerun, or `against`, compares with the commit; return the exit status."""
-    committed = {name: _committed(root, name) for name in names}  # first: hours later is late to find none
+    """Compare each scene's rerun, or its reports in `against`, with the last commit; return the exit status."""
+    committed = {name: read_revision(root, name, "HEAD") for name in names}  # first: hours later is late to find none
     if against is None:
         rerun(root, names)
-    worst = 0
-    for name in names:
-        fresh = root / VERIFIED / name if against is None else _reports_in(against, name)
-        old, new = committed[name], {"numbers": io.read_json(fresh / "numbers.json"), "tables": _tables_of(fresh)}
-        for part, title in (("numbers", name), ("tables", f"{name}, cells of tables")):
-            worst = max(worst, tell(title, "HEAD", partial(compare, old[part], new[part]), echo))
-    return worst
-
-
-def _committed(root: Path, name: str) -> dict[str, Any]:
-    """Read what the last commit holds of a scene's reports."""
-    numbers, folder = read_committed(root, name, "HEAD"), f"./reports/{name}/tables"
-    listed = _git(root, "ls-tree", "-r", "--name-only", "HEAD", f"{folder}/").splitlines()
-    tables = {Path(file).stem: _git(root, "show", f"HEAD:./{file}") for file in listed if file.endswith(".csv")}
-    return {"numbers": numbers, "tables": {stem: _cells(stem, words) for stem, words in tables.items()}}
-
-
-def _reports_in(folder: Path, name: str) -> Path:
-    """Find a scene's finished reports in a folder: `reports/<scene>` itself, or what is around it."""
-    found = [
-        place for place in (folder, folder / name, folder / "reports" / name) if (place / "numbers.json").is_file()
-    ]
-    if not found:
-        raise SchemaError(folder, "the folder", f"one that holds {name}/numbers.json", "none", f"Name reports/{name}.")
-    return found[0]
-
-
-def _tables_of(folder: Path) -> dict[str, Any]:
-    files = sorted((folder / "tables").glob("*.csv"))
-    return {file.stem: _cells(file.stem, file.read_text(encoding="utf-8")) for file in files}
-
-
-def _cells(stem: str, words: str) -> list[dict[str, Any]]:
-    """Read a table's rows; numbers stay texts but in what is for programs, as `compare` looks past numbers in texts."""
-    rows = list(csv.DictReader(text.StringIO(words)))
-    return [{key: _number(cell) for key, cell in row.items()} for row in rows] if stem == FOR_PROGRAMS else rows
-
-
-def _number(cell: str) -> int | float | str:
-    for kind in (int, float):
-        try:
-            return kind(cell)
-        except ValueError:
-            continue
-    return cell
+    return max(
+        tell(name, committed[name], read_folder(against or root / VERIFIED / name, name), echo) for name in names
+    )
 
 
 def rerun(root: Path, names: Sequence[str]) -> None:

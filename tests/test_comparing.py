@@ -1,23 +1,32 @@
+"""`reskin compare`: one line where all values are equal, else an account of what differs, machines and verdicts."""
+
 import subprocess
 
 import pytest
 from typer.testing import CliRunner
 
-from pipeline import comparing, plan
+from pipeline import plan
 from pipeline.cli import app
-from pipeline.comparing import compare_scene
 from pipeline.core import io
-from pipeline.core.errors import SchemaError
+
+XEON, EPYC = "cpu x86_64 Intel Xeon (AVX2), 2 cores", "cpu x86_64 AMD EPYC (AVX2), 4 cores"
 
 
-def numbers(accuracy_pct: float) -> dict:
-    return {"provenance": {"seconds": accuracy_pct}, "table2": {"multi": {"accuracy_pct": {"mean": accuracy_pct}}}}
+def write(reports, accuracy_pct: float, *, verdict: str = "yes", device: str = XEON) -> None:
+    scores = {"accuracy_pct": {"mean": accuracy_pct}}
+    io.write_json(
+        reports / "numbers.json", {"provenance": {"seed": 1}, "table2": {"multi": scores, "single": {"n": 6}}}
+    )
+    io.write_json(reports / "provenance.json", {"device": device, "trained": "abc", "seconds": accuracy_pct})
+    order = f'claim,"MSE_xy, mm²"\nadapted better than multi-sensor,"{verdict}: -0.03 [-0.06, 0.01]"\n'
+    io.write_text(reports / "tables/order.csv", order)
+    io.write_text(reports / "tables/scores.csv", f"question,accuracy_pct\nlobo,{accuracy_pct}\n")
 
 
 @pytest.fixture
 def checkout(tmp_path, monkeypatch):
     """A checkout whose committed accuracy is 80 %."""
-    io.write_json(tmp_path / "reports/quick/numbers.json", numbers(80.0))
+    write(tmp_path / "reports/quick", 80.0)
     io.write_text(tmp_path / "dvc.yaml", "stages: {}\n")
     author = ("-c", "user.name=a", "-c", "user.email=a@b")
     for words in (["init", "-q"], ["add", "."], [*author, "commit", "-qm", "x"], ["tag", "first"]):
@@ -31,28 +40,66 @@ def said(*words: str) -> tuple[int, str]:
     return done.exit_code, done.output
 
 
-@pytest.mark.parametrize(
-    ("accuracy_pct", "status", "verdict"),
-    [
-        (80.0, 0, "quick: reproduced: all 1 values equal"), (81.0, 0, "quick: reproduced within tolerance"),
-        (90.0, 1, "quick: not reproduced"),
-    ],
-)  # fmt: skip
-def test_the_verdict_is_a_sentence_and_an_exit_status(checkout, accuracy_pct, status, verdict):
-    io.write_json(checkout / "reports/quick/numbers.json", numbers(accuracy_pct))
-    for against in ([], ["--against", "first"]):
-        code, output = said("quick", *against)
-        assert code == status
-        assert output.splitlines()[-1].startswith(verdict)
-        assert ("table2.multi.accuracy_pct.mean" in output) == (status == 1)
+@pytest.mark.parametrize("against", [[], ["--against", "first"]])
+def test_equal_values_are_one_line_of_good_news_whatever_the_machine_and_its_seconds(checkout, against):
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip()
+    provenance = io.read_json(checkout / "reports/quick/provenance.json")
+    io.write_json(checkout / "reports/quick/provenance.json", provenance | {"device": EPYC, "seconds": 9.0})
+    code, output = said("quick", *against)
+    assert code == 0
+    assert output == (
+        f"quick: reproduced: all 7 values equal those committed at {commit} (3 of numbers.json and 4 of tables).\n"
+    )
+
+
+def test_a_difference_is_told_with_machines_places_and_sizes(checkout):
+    write(checkout / "reports/quick", 60.0, device=EPYC)
+    code, output = said("quick")
+    assert code == 1
+    assert XEON in output
+    assert EPYC in output
+    assert "numbers.json: 1 of 3 differ: table2 1" in output
+    assert "tables: 1 of 4 differ: scores 1" in output
+    row = next(line for line in output.splitlines() if "table2.multi.accuracy_pct.mean" in line)
+    assert [cell.strip() for cell in row.split("|")[2:5]] == ["80", "60", "25 %"]
+    summary = output.splitlines()[-1]
+    assert summary.startswith("quick: not equal: 2 of 7 values differ from those committed at ")
+    assert "numbers by up to 25 %" in summary
+    assert "no verdict changed" in summary
+
+
+def test_a_difference_in_the_last_digit_is_one(checkout):
+    write(checkout / "reports/quick", 80.00000000000001)
+    code, output = said("quick")
+    assert code == 1
+    assert "not equal: 2 of 7 values" in output
+
+
+def test_every_verdict_that_changed_is_named(checkout):
+    write(checkout / "reports/quick", 80.0, verdict="inconclusive")
+    code, output = said("quick")
+    assert code == 1
+    assert "Verdicts that changed: 1\n" in output
+    assert "- order[adapted better than multi-sensor].MSE_xy, mm²: yes -> inconclusive\n" in output
+    assert "1 verdict changed" in output.splitlines()[-1]
+
+
+def test_values_that_only_one_run_has_are_counted_by_section(checkout):
+    numbers = io.read_json(checkout / "reports/quick/numbers.json")
+    io.write_json(checkout / "reports/quick/numbers.json", numbers | {"drift": {"each": [{"contacts_n": 1}]}})
+    (checkout / "reports/quick/tables/order.csv").unlink()
+    code, output = said("quick")
+    assert code == 1
+    assert "only fresh: drift 1" in output
+    assert "only committed: order 2" in output
+    assert "3 are in one run only" in output.splitlines()[-1]
 
 
 @pytest.mark.parametrize("where", ["", "quick", "reports/quick", "quick/numbers.json"])
-def test_a_folder_or_a_file_may_stand_for_the_revision(checkout, where):
+def test_a_folder_or_a_file_in_it_may_stand_for_the_revision(checkout, where):
     other = checkout / "other"
-    file = other / where if where.endswith(".json") else other / where / "numbers.json"
-    io.write_json(file, numbers(80.0))
-    assert compare_scene(checkout, "quick", str(other if where == "reports/quick" else other / where)).reproduced
+    write(other / (where.removesuffix("numbers.json") if where.endswith(".json") else where), 80.0)
+    assert said("quick", "--against", str(other if where == "reports/quick" else other / where))[0] == 0
 
 
 @pytest.mark.parametrize(
@@ -69,10 +116,13 @@ def test_what_is_not_there_is_one_sentence_and_exit_status_2(checkout, words, se
     assert sentence is None or f"error: {sentence}" in output
 
 
-def test_outside_git_nothing_is_committed(tmp_path):
-    io.write_json(tmp_path / "reports/quick/numbers.json", numbers(80.0))
-    with pytest.raises(SchemaError, match="must be committed"):
-        compare_scene(tmp_path, "quick", "HEAD")
+def test_outside_git_nothing_is_committed(tmp_path, monkeypatch):
+    write(tmp_path / "reports/quick", 80.0)
+    io.write_text(tmp_path / "dvc.yaml", "stages: {}\n")
+    monkeypatch.chdir(tmp_path)
+    code, output = said("quick")
+    assert code == 2
+    assert "must be committed" in output
 
 
 def test_without_a_scene_all_that_run_are_compared_and_the_worst_is_told(checkout, monkeypatch):
@@ -81,10 +131,3 @@ def test_without_a_scene_all_that_run_are_compared_and_the_worst_is_told(checkou
     assert code == 2
     assert "lab" in output
     assert "quick: reproduced" in output
-
-
-def test_values_that_one_side_lacks_are_named_by_question(checkout):
-    io.write_json(checkout / "reports/quick/numbers.json", numbers(80.0) | {"drift": {"each": [{"contacts_n": 1}]}})
-    done = compare_scene(checkout, "quick", "HEAD")
-    assert comparing.table_of(done) == "only fresh: drift (1 values)"
-    assert not done.reproduced

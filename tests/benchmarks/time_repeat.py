@@ -1,8 +1,8 @@
-"""How far do the same settings' numbers lie apart under other threads, instructions, precisions and Pythons?
+"""Are the numbers of the same settings equal under other threads, instructions and Pythons?
 
-python tests/benchmarks/time_repeat.py [--python .../python3.12 ...]: a part of scene quick (one skin a board, all its
+python -m tests.benchmarks.time_repeat [--python .../python3.12 ...]: a part of scene quick (one skin a board, all its
 passes and steps; one skin alone, boards held out without and with triplets) runs from nothing in a clean copy of the
-last commit under each setting; every number of its report is held against the first run's. Adds to
+last commit under each setting; its numbers are compared with those of the first run. Adds to
 docs/measured/repeat.json and writes docs/repeat.md.
 """
 
@@ -14,15 +14,15 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from pipeline.core import io
 from pipeline.core.config import read_yaml
 from pipeline.core.provenance import code_version, device
-from pipeline.evaluation.reproduced import TOLERANCES, leaves, tolerance_of
-from tests.benchmarks.pages import MEASURED, ROOT, short, table, write_block
+from pipeline.evaluation.reproduced import compare
+from tests.benchmarks.pages import MEASURED, ROOT, table, write_block
 
 SCENE = "repeat"
 SKINS_N = 6  # one a board
@@ -41,16 +41,8 @@ SETTINGS: dict[str, dict[str, str]] = {
     "nothing pinned": UNPINNED,
     "ATEN_CPU_CAPABILITY=default": {"ATEN_CPU_CAPABILITY": "default"},
     "MKL_CBWR=COMPATIBLE": {"MKL_CBWR": "COMPATIBLE"},
-    "networks in float64": {},
 }
 FIRST = "two processes"
-DOUBLE = "networks in float64"  # the product has no such setting: its tensors are cast, in a copy
-CASTS = {
-    "pipeline/learning/train.py": ("for job in jobs]).to(device)", ".double()"),
-    "pipeline/learning/job.py": ("np.concatenate(rows)).to(device)", ".double()"),
-    "pipeline/learning/model.py": ("Stack(layers, [weights]).to(device)", ".double()"),
-}
-FED = ("pipeline/learning/model.py", "torch.from_numpy(inputs)", "torch.from_numpy(inputs).double()")
 
 
 def scene_words() -> dict[str, Any]:
@@ -65,55 +57,34 @@ def scene_words() -> dict[str, Any]:
     }  # fmt: skip
 
 
-def make_checkout(folder: Path, *, double: bool) -> None:
+def make_checkout(folder: Path) -> None:
     """Clone the last commit, with the scene in it."""
     subprocess.run(["git", "clone", "--quiet", str(ROOT), str(folder)], check=True)
     (folder / f"pipeline/scenes/{SCENE}.yaml").write_text(json.dumps(scene_words(), indent=1))  # JSON is YAML
-    if double:
-        for name, (after, cast) in CASTS.items():
-            replace(folder / name, after, after + cast)
-        replace(folder / FED[0], *FED[1:])
     author = ("-c", "user.name=a", "-c", "user.email=a@b")
     for words in (["add", "."], [*author, "commit", "--quiet", "--message", SCENE]):
         subprocess.run(["git", *words], cwd=folder, check=True)
-
-
-def replace(file: Path, old: str, new: str) -> None:
-    text = file.read_text()
-    assert text.count(old) == 1, f"{file}: {old}"
-    file.write_text(text.replace(old, new))
 
 
 def run(folder: Path, python: Path, setting: Mapping[str, str]) -> dict[str, Any]:
     """Run the scene from nothing, and read its numbers."""
     environment = {**os.environ, **setting, "PYTHONPATH": str(folder)}
     subprocess.run([str(python), "-c", AGAIN], cwd=folder, env=environment, check=True, stderr=subprocess.DEVNULL)
-    return dict(leaves(io.read_json(folder / f".reskin/verified/{SCENE}/numbers.json")))
+    numbers: dict[str, Any] = io.read_json(folder / f".reskin/verified/{SCENE}/numbers.json")
+    return numbers
 
 
 def differences(first: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
-    """Count what is equal; give by kind of number (its tolerance's place) the largest difference, and what it is of."""
-    kinds: dict[str, dict[str, Any]] = {}
-    texts_n = 0
-    for name, value in first.items():
-        fresh = other[name]
-        if not isinstance(value, int | float) or isinstance(value, bool):
-            texts_n += value != fresh
-            continue
-        tolerance = tolerance_of(name)
-        kind = kinds.setdefault(
-            str(TOLERANCES.index(tolerance)),
-            {"values_n": 0, "equal_n": 0, "beyond_n": 0, "absolute": 0.0, "relative": 0.0},
-        )
-        off = abs(fresh - value)
-        kind["values_n"] += 1
-        kind["equal_n"] += off == 0
-        kind["beyond_n"] += not tolerance.allows(value, fresh)
-        if off > kind["absolute"]:
-            kind |= {"absolute": off, "of": name}
-        if value:
-            kind["relative"] = max(kind["relative"], off / abs(value))
-    return {"texts_differ_n": texts_n, "absent_n": len(first.keys() ^ other.keys()), "kinds": kinds}
+    """Count the values that are equal and those that differ, with the largest relative difference and its name."""
+    done = compare(first, other)
+    found = {
+        "equal_n": done.equal.total(),
+        "values_n": done.equal.total() + len(done.differing),
+        "absent_n": len(done.missing) + len(done.new),
+    }
+    numbers = [one for one in done.differing if one.relative is not None]
+    largest = max(numbers, key=lambda one: one.relative or 0.0, default=None)
+    return found | ({"largest_relative": largest.relative, "of": largest.name} if largest else {})
 
 
 def main() -> None:
@@ -132,7 +103,7 @@ def main() -> None:
         first: dict[str, Any] = {}
         for name, (python, setting) in runs.items():
             folder = Path(temporary) / name.replace(" ", "_").replace("=", "_")
-            make_checkout(folder, double=name == DOUBLE)
+            make_checkout(folder)
             try:
                 numbers = run(folder, python, setting)
             except subprocess.CalledProcessError as error:
@@ -149,40 +120,19 @@ def main() -> None:
 
 
 def show(found: Mapping[str, Any]) -> None:
-    """Write what was measured into docs/repeat.md: a row a setting, and a row a kind of number."""
-    settings = [
+    """Write what was measured into docs/repeat.md: a row a setting."""
+    rows = [
         {
             "setting": name,
-            "numbers equal": sum(kind["equal_n"] for kind in run["kinds"].values()),
-            "of": sum(kind["values_n"] for kind in run["kinds"].values()),
-            "beyond tolerance": sum(kind["beyond_n"] for kind in run["kinds"].values()),
-            "other words": run["texts_differ_n"],
+            "values equal": run["equal_n"],
+            "of": run["values_n"],
+            "largest relative difference": f"{100 * run.get('largest_relative', 0.0):.3g} %",
+            "of which": run.get("of", "–"),
         }
         for name, run in found["runs"].items()
     ]
-    parts = [
-        f"Code {found['git']}, {found['machine']}; the first row is what the others are held against.",
-        table(settings),
-    ]
-    write_block("repeat.md", "repeat", [*parts, table([*_kinds(found["runs"])])])
-
-
-def _kinds(runs: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    for i, tolerance in enumerate(TOLERANCES):
-        of_kind = {name: run["kinds"][str(i)] for name, run in runs.items() if str(i) in run["kinds"]}
-        if of_kind:
-            worst = max(of_kind, key=lambda name: of_kind[name]["absolute"])
-            yield {
-                "kind of number": f"`{tolerance.pattern.replace('|', chr(92) + '|')}`"
-                if tolerance.pattern
-                else "all others",
-                "numbers": of_kind[worst]["values_n"],
-                "largest difference": short(of_kind[worst]["absolute"]),
-                "of which": of_kind[worst].get("of", "–"),
-                "under": worst if of_kind[worst]["absolute"] else "–",
-                "largest relative": f"{100 * max(kind['relative'] for kind in of_kind.values()):.2g} %",
-                "tolerance": str(tolerance),
-            }
+    heading = f"Code {found['git']}, {found['machine']}; the first row is what the others are compared with."
+    write_block("repeat.md", "repeat", [heading, table(rows)])
 
 
 def version_of(python: Path) -> str:
