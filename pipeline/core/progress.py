@@ -74,7 +74,7 @@ def read_seconds(order: Sequence[str]) -> dict[str, float]:
     """
     found: dict[str, float] = {}
     for scene in read_yaml(Path(PLAN))["scenes"]:
-        committed = Path("reports") / scene / "numbers.json"
+        committed = Path("reports") / scene / "provenance.json"
         stages = io.read_json(committed)["runtime"]["stages"] if committed.exists() else {}
         costs = {unit: cost for unit, cost in stages.items() if "computed_s" in cost}  # of older code: without
         took_s = {unit: max(cost["seconds"], cost["computed_s"] / 2) for unit, cost in costs.items()}

@@ -6,6 +6,7 @@ import resource
 import subprocess
 import sys
 from collections.abc import Iterable, Mapping
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ CODE = Path(__file__).parents[1]
 NO_CODE = ("plan.yaml", "scenes")  # settings, which stand beside the code: they decide results by their values
 COSTS = Path(".reskin/costs")
 SECONDS = Path(".reskin/seconds")  # what was timed here: beside the pipeline, as costs are
+COMPUTING = ("numpy", "scipy", "numba", "scikit-learn", "torch", "pandas")
 CPUINFO = Path("/proc/cpuinfo")  # Linux only
 INSTRUCTIONS = {"avx2": "AVX2", "avx512f": "AVX-512", "amx_tile": "AMX", "asimd": "NEON", "sve": "SVE"}  # by CPU flag
 
@@ -65,6 +67,11 @@ def processor(cpuinfo: str, environ: Mapping[str, str], *, otherwise: str) -> st
     instructions = ", ".join(name for flag, name in INSTRUCTIONS.items() if flag in flags)
     details = "; ".join(part for part in (instructions, ", ".join(departures(environ))) if part)
     return f"{plain} ({details})" if details else plain
+
+
+def versions() -> dict[str, str]:
+    """The versions of the packages whose arithmetic decides results."""
+    return {name: version(name) for name in COMPUTING}
 
 
 def begin_cost(folder: Path, stage: str) -> None:

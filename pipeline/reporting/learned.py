@@ -93,10 +93,11 @@ def timed_learning(numbers: Mapping[str, Any], seconds: Mapping[str, Seconds]) -
             times_s = [training["train_s"] for training in took if f".{row['pokes_n']}pokes." in training["name"]]
             joined["adaptation"].append(row | ({"seconds": float(np.median(times_s))} if times_s else {}))
     if "rivals" in numbers:
-        timed = [
-            (row, _median_times(seconds.get("rivals", []), f"{row['method']}.")) for row in _told(numbers["rivals"])
+        took = seconds.get("rivals", [])
+        joined["rivals_costs"] = [
+            {"method": row["method"]} | row[AS_LABELLED] | _median_times(took, f"{row['method']}.")
+            for row in _told(numbers["rivals"])
         ]
-        joined["rivals_costs"] = [{"method": row["method"]} | row[AS_LABELLED] | times for row, times in timed if times]
     return joined
 
 

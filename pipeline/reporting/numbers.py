@@ -1,7 +1,7 @@
 """`numbers.json`: every number that any text shows, nested by question. In: scores, accounts, costs. Out: plain words.
 
-`scores.json` holds a few of them, for `dvc metrics`. A question that was not asked is absent. Refuses to know how a
-number is shown.
+`scores.json` holds a few of them, for `dvc metrics`. `provenance.json` holds what differs between equal runs: commit,
+machine, versions, seconds. A question that was not asked is absent. Refuses to know how a number is shown.
 """
 
 from collections import Counter
@@ -24,6 +24,9 @@ SINGLE = {
 POLICIES = ("initial", "regular", "each")
 OF_DRIFT = ("accuracy_pct", "mse_f_N2")
 OF_TOUCHES = ("single_touches_pct", "mean_left_over_pct")
+SETTINGS = ("scene", "source", "seed")  # of the provenance: equal between equal runs
+TIMES = ("median_s", "repeats_n", "train_s", "inference_us", "seconds")  # of a row below `runtime`
+ROW_KEYS = ("study", "method", "inputs", "setting", "pokes_n")  # name a row below `runtime`
 OF_SHEAR = ("mse_xy_mm2", "mse_fxy_N2", "mse_fz_N2")
 
 Row = Mapping[str, Any]
@@ -112,6 +115,39 @@ def timed(answer: Row, seconds: Sequence[Row]) -> dict[str, Any]:
     studies = ("quadratures", "integrators")
     joined = {study: [row | times.get(key(row), {}) for row in answer[study]] for study in studies}
     return {"choice": answer["choice"], **joined}
+
+
+def split(numbers: Row) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Split the numbers of a run into numbers.json, which equal runs share, and provenance.json, of this run alone."""
+    own = {name: value for name, value in numbers["provenance"].items() if name not in SETTINGS}
+    costs: dict[str, Any] = {"stages": numbers["runtime"]["stages"]}
+    studies: dict[str, Any] = {}
+    for name, value in numbers["runtime"].items():
+        if isinstance(value, list):
+            costs[name] = [{key: row[key] for key in (*ROW_KEYS, *TIMES) if key in row} for row in value]
+            studies[name] = [{key: row[key] for key in row if key not in TIMES} for row in value]
+        elif name != "stages":
+            studies[name] = value
+    settings = {name: numbers["provenance"][name] for name in SETTINGS}
+    return {**numbers, "provenance": settings, "runtime": studies}, {**own, "runtime": costs}
+
+
+def join(numbers: Row, provenance: Row) -> dict[str, Any]:
+    """Put numbers.json and provenance.json of a run together again: the inverse of `split`."""
+    own = {name: value for name, value in provenance.items() if name != "runtime"}
+    return {
+        **numbers,
+        "provenance": {**numbers["provenance"], **own},
+        "runtime": _overlay(numbers["runtime"], provenance["runtime"]),
+    }
+
+
+def _overlay(numbers: Row, costs: Row) -> dict[str, Any]:
+    joined = {**numbers, **costs}
+    for name in joined:
+        if isinstance(joined[name], list):
+            joined[name] = [row | times for row, times in zip(numbers[name], costs[name], strict=True)]
+    return joined
 
 
 def headline_scores(numbers: Row) -> dict[str, Any]:

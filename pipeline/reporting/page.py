@@ -91,34 +91,49 @@ class Table:
     notes: list[str]
 
 
-def page(
-    numbers: Mapping[str, Any],
-    tables: Mapping[str, pd.DataFrame],
-    figures: Mapping[str, str],
-    costs: Mapping[str, str],
-) -> str:
-    """Render the page of a scene; figures are SVG text by file name, `costs` the texts of the runtime folder."""
-    source, scene, runtime = numbers["provenance"]["source"], numbers["provenance"]["scene"], numbers["runtime"]
-    shown = {**tables, **cost_tables(runtime, source), **learning_costs(runtime, source)}
-    texts = {f"figures/{name}": text for name, text in figures.items()}
-    texts |= {f"runtime/{name}": text for name, text in costs.items() if name.endswith(".svg")}
-    drawings = {address.split("/")[1]: measure(address, text) for address, text in texts.items()}
+def page(numbers: Mapping[str, Any], tables: Mapping[str, pd.DataFrame], figures: Mapping[str, str]) -> str:
+    """Render the page of a scene, equal for equal runs; figures are SVG text by file name."""
+    source = numbers["provenance"]["source"]
+    drawings = {name: measure(f"figures/{name}", text) for name, text in figures.items()}
     found = tables.get("checklist", pd.DataFrame())
-    provenance = pd.DataFrame([{"what": key, "value": str(value)} for key, value in numbers["provenance"].items()])
     return template("page.html").render(
-        scene=scene,
+        scene=numbers["provenance"]["scene"],
         source=source,
         about=about(numbers),
         answer=answer(numbers),
         sections=[
-            _fill(section, shown, drawings, source)
+            _fill(section, tables, drawings, source)
             | {"findings": findings(section, found), "stages": stages_of(section, found)}
-            for section in arrange(shown, drawings)
+            for section in arrange(tables, drawings)
         ],
         saved=[*tables],
         opened=OPEN,
-        provenance=lay_out("provenance", "Provenance", provenance),
     )
+
+
+def run_page(numbers: Mapping[str, Any], costs: Mapping[str, str]) -> str:
+    """Render the page of one run, which the page of the scene embeds: its commit, machine, versions and times.
+
+    `numbers` are joined with their provenance, `costs` the texts of the folder that the page stands in.
+    """
+    source, provenance = numbers["provenance"]["source"], _flat(numbers["provenance"])
+    tables = cost_tables(numbers["runtime"], source) | learning_costs(numbers["runtime"], source)
+    drawings = {name: measure(name, text) for name, text in costs.items() if name.endswith(".svg")}
+    rows = pd.DataFrame([{"what": key, "value": value} for key, value in provenance.items()])
+    return template("page.run.html").render(
+        scene=numbers["provenance"]["scene"],
+        source=source,
+        provenance=lay_out("provenance", "Provenance", rows),
+        sections=[_fill(section, tables, drawings, source) for section in arrange(tables, drawings)],
+    )
+
+
+def _flat(provenance: Mapping[str, Any]) -> dict[str, str]:
+    """Write each value as text, a mapping as its names and values."""
+    return {
+        key: ", ".join(f"{name} {one}" for name, one in value.items()) if isinstance(value, Mapping) else str(value)
+        for key, value in provenance.items()
+    }
 
 
 def template(name: str) -> Template:

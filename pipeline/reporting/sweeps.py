@@ -74,6 +74,7 @@ def learning_costs(runtime: Mapping[str, Any], source: str) -> dict[str, pd.Data
         | {"one reading, µs": _time(row, "inference_us"), "source": source}
         | scored(row)
         for row in runtime.get("rivals_costs", [])
+        if "train_s" in row
     ]
     lines = {"learning": methods, "adaptation": adaptations, "rivals_costs": rivals}
     return {name: tabulate(lines[name]) for name in lines if name in runtime}

@@ -11,7 +11,7 @@ from pipeline.core import io
 from pipeline.core.config import Settings, parse
 from pipeline.core.errors import ParamsError
 from pipeline.core.executors import device as trained_on
-from pipeline.core.provenance import COSTS, SECONDS, add_up_costs, code_version, device, read_costs
+from pipeline.core.provenance import COSTS, SECONDS, add_up_costs, code_version, device, read_costs, versions
 from pipeline.dataset.scan import SCORED
 from pipeline.evaluation.choice import choose
 from pipeline.evaluation.scores import tidy
@@ -85,6 +85,6 @@ def _provenance(
     """Say where a result came from; a stage whose question was switched off costs nothing any more."""
     return {
         "scene": settings.scene, "source": asked.source, "git": code_version(), "seed": settings.seed,
-        "trained": ", ".join(sorted({card["git"] for card in cards})),
+        "trained": ", ".join(sorted({card["git"] for card in cards})), "versions": versions(),
         "device": f"{device()}, networks on {trained_on()}", "seconds": round(add_up_costs(costs.values()), 1),
     }  # fmt: skip

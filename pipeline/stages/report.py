@@ -15,8 +15,8 @@ from pipeline.learning.recipe import HEADLINE
 from pipeline.reporting.figures import error_grids
 from pipeline.reporting.headline import FILE, headline_figures, short_table
 from pipeline.reporting.index import index
-from pipeline.reporting.numbers import headline_scores
-from pipeline.reporting.page import page
+from pipeline.reporting.numbers import headline_scores, split
+from pipeline.reporting.page import page, run_page
 from pipeline.reporting.parts import experiment_figures
 from pipeline.reporting.shown import to_markdown
 from pipeline.reporting.sweeps import learning_figures, learning_pages
@@ -35,8 +35,10 @@ def report(
     if "choice" in asked.questions:
         record = to_record(numbers["chosen"], read_cards(asked, models), source=asked.source, seed=settings.seed)
         io.write_json(reports / "choice.json", record)
-    io.write_json(reports / "numbers.json", numbers)
-    io.write_json(reports / "scores.json", headline_scores(numbers))
+    shared, of_this_run = split(numbers)
+    files_of = {"numbers": shared, "provenance": of_this_run, "scores": headline_scores(numbers)}
+    for name, content in files_of.items():
+        io.write_json(reports / f"{name}.json", content)
     with make_executor(imports="pipeline.reporting.parts") as executor:  # to draw takes most of the time
         of_experiments = executor.submit(experiment_figures, numbers, drawn, asked.source)
         timed = executor.submit(pages, numbers["runtime"], source=asked.source)
@@ -48,9 +50,9 @@ def report(
         costs = timed.result() | learning_pages(numbers["runtime"], asked.source)
         figures |= of_experiments.result()
     io.write_texts(reports / "figures", figures)
-    # Seconds differ between identical runs, so what shows them is no DVC output.
-    io.write_texts(reports / "runtime", costs)
-    io.write_text(reports / "index.html", page(numbers, tables, figures, costs))
+    # Seconds, commit and machine differ between equal runs: what shows them is in one folder, and no DVC output.
+    io.write_texts(reports / "runtime", costs | {"index.html": run_page(numbers, costs)})
+    io.write_text(reports / "index.html", page(shared, tables, figures))
     results = (io.read_json(file) for file in sorted(reports.parent.glob("*/numbers.json")))
     headlines = {
         file.parent.parent.name: io.read_bytes(file).decode() for file in reports.parent.glob(f"*/figures/{FILE}")
@@ -59,7 +61,7 @@ def report(
     io.write_text(reports.parent / "index.html", index(described, headlines))
     if numbers.get("table2"):
         say(f"{scene} ({asked.source})\n{to_markdown(short_table(numbers))}")
-    say(f"{scene}: {reports}/index.html, numbers.json, scores.json, tables, figures")
+    say(f"{scene}: {reports}/index.html, numbers.json, provenance.json, scores.json, tables, figures, runtime")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Workers 1 to 256, simulated from measured times and sizes: where more of them stop helping, and why.
 
-In: what cluster.py measured, and what each stage's trainings took (reports/<scene>/numbers.json). Out: a table and a
+In: what cluster.py measured, and what each stage's trainings took (reports/<scene>/provenance.json). Out: a table and a
 figure. The engine is simulated event by event: one client hands tasks out one after another, one network carries them,
 each worker reads the rows once, tasks take what stages took, spread as measured.
 """
@@ -67,7 +67,7 @@ def simulate(sweep: Sweep, workers_n: int, of: Measurements, spread: Sequence[fl
 
 def sweeps_of(scene: str) -> tuple[list[Sweep], float]:
     """Read what each stage's trainings took, and the seconds of all other stages."""
-    stages = json.loads((ROOT / f"reports/{scene}/numbers.json").read_text())["runtime"]["stages"].values()
+    stages = json.loads((ROOT / f"reports/{scene}/provenance.json").read_text())["runtime"]["stages"].values()
     sweeps, rest_s = [], 0.0
     for stage in stages:
         if trainings_n := stage["trainings_n"]:

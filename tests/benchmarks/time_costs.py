@@ -1,8 +1,8 @@
 """What each stage of a scene costs, beside the least that this machine could need for the three heaviest.
 
-python -m tests.benchmarks.time_costs [quick paper]: stages from reports/<scene>/numbers.json and dvc.lock, as the last
-run left them; this machine's rates of matrix products (a CPU second, with the instructions that trainings use), memory
-and disk are measured now. Writes docs/costs.md. Keep the machine quiet: stages were timed, and not now.
+python -m tests.benchmarks.time_costs [quick paper]: stages from reports/<scene>/provenance.json and dvc.lock, as the
+last run left them; this machine's rates of matrix products (a CPU second, with the instructions that trainings use),
+memory and disk are measured now. Writes docs/costs.md. Keep the machine quiet: stages were timed, and not now.
 """
 
 import argparse
@@ -81,7 +81,7 @@ def measure_rates() -> dict[str, float]:
 
 def stages_of(scene: str) -> list[dict[str, Any]]:
     """Read what each stage cost, and what it left on disk where dvc.lock tells it."""
-    costs = json.loads((ROOT / f"reports/{scene}/numbers.json").read_text())["runtime"]["stages"]
+    costs = json.loads((ROOT / f"reports/{scene}/provenance.json").read_text())["runtime"]["stages"]
     lock = read_yaml(ROOT / "dvc.lock")["stages"]
     rows = []
     for unit, cost in costs.items():
@@ -149,7 +149,7 @@ def main() -> None:
     ]
     for scene in scenes:
         rows = stages_of(scene)
-        code = json.loads((ROOT / f"reports/{scene}/numbers.json").read_text())["provenance"]["git"]
+        code = json.loads((ROOT / f"reports/{scene}/provenance.json").read_text())["git"]
         parts += [
             f"## Scene `{scene}`, code {code}",
             table(heaviest(scene, rows, rates)),

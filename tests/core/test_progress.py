@@ -47,7 +47,7 @@ def test_seconds_are_those_of_the_last_run_here_and_else_the_committed_ones(tmp_
     stages["code"] = {"seconds": 1.0}  # as older code wrote them
     committed = {"runtime": {"stages": stages}}
     for file, words in {
-        Path("reports/tiny/numbers.json"): committed,
+        Path("reports/tiny/provenance.json"): committed,
         COSTS / "tiny/report.json": {"seconds": 2.0, "trainings_s": {"a": 9.0}},
     }.items():
         file.parent.mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""A numbers.json that has every question's contract keys, with values that no run made."""
+"""Numbers and provenance of a run that has every question's contract keys, with values that no run made."""
 
 from scipy.stats import t
 
@@ -43,6 +43,7 @@ def all_questions(source: str = "simulated") -> dict:
     return {
         "provenance": {
             "scene": "x", "source": source, "git": "abc", "seed": 1, "trained": "abc", "device": "z", "seconds": 1.0,
+            "versions": {"numpy": "1", "torch": "2"},
         },
         "capture": {"captures_n": 2, "frames_n": 10, "indentations_n": 5, "left_out": {"low_force_rows_n": 3}},
         "lobo": {

@@ -12,6 +12,7 @@ from pipeline.questions import EXPERIMENTS
 from pipeline.reporting import judging
 from pipeline.reporting.checklist import checklist
 from pipeline.reporting.headline import answer
+from pipeline.reporting.numbers import split
 from pipeline.reporting.page import (
     FINDINGS_N,
     LEGIBLE_PX,
@@ -22,10 +23,11 @@ from pipeline.reporting.page import (
     measure,
     page,
     read_sections,
+    run_page,
     together,
 )
 from pipeline.reporting.tables import make_tables
-from tests.reporting.synthetic import all_questions
+from tests.reporting.synthetic import all_questions, cost
 
 ROOT = Path(__file__).resolve().parents[2]
 SVG = (
@@ -68,7 +70,11 @@ def render(numbers: dict | None = None, **more: pd.DataFrame) -> str:
     drift = pd.DataFrame({"contacts": ["0"], "accuracy, %": ["90"]})
     tables = make_tables(plain) | {"checklist": checklist(numbers), "drift": drift} | more
     figures = {"drift.svg": SVG.format(300), "sweep_pokes.svg": SVG.format(600), "unheard_of.svg": SVG.format(300)}
-    return page(numbers, tables, figures, {"training.svg": SVG.format(300), "stages.md": "| a |"})
+    return page(split(numbers)[0], tables, figures)
+
+
+def render_run(numbers: dict) -> str:
+    return run_page(numbers, {"training.svg": SVG.format(300), "stages.md": "| a |"})
 
 
 @pytest.fixture(scope="module")
@@ -77,10 +83,12 @@ def read() -> Reader:
 
 
 def test_the_page_needs_no_network_and_no_script(read):
-    assert [one for one in ("script", "link", "iframe", "svg") if read.all(one)] == []
+    assert [one for one in ("script", "link", "svg") if read.all(one)] == []
     names = ("src", "href", "data")
     fetched = [attributes[name] for _, attributes, _ in read.elements for name in names if name in attributes]
-    assert all(address.startswith(("figures/", "runtime/", "tables/", "../", "#")) for address in fetched)
+    assert all(
+        address.startswith(("figures/", "runtime/", "tables/", "provenance.json", "../", "#")) for address in fetched
+    )
     assert "url(" not in render()
     assert "@import" not in render()
 
@@ -107,7 +115,7 @@ def test_every_table_scrolls_in_its_own_box_and_names_its_columns(read):
 
 def test_every_figure_is_a_document_on_a_white_card_with_words_for_it_and_else_an_image(read):
     objects, images = read.all("object"), read.all("img")
-    assert len(objects) == len(images) == 4
+    assert len(objects) == len(images) == 3
     assert all(attributes["aria-label"].strip() and above[-1] == "div.card" for attributes, above in objects)
     assert all(attributes["alt"].strip() and above[-1] == "object." for attributes, above in images)
     assert [attributes["data"] for attributes, _ in objects] == [attributes["src"] for attributes, _ in images]
@@ -214,10 +222,23 @@ def test_a_question_that_was_not_asked_leaves_no_section():
     ]  # fmt: skip
 
 
-def test_every_key_of_the_provenance_is_shown(read):
-    provenance = all_questions()["provenance"]
-    assert set(provenance) <= set(read.words)
-    assert {str(value) for value in provenance.values()} <= set(read.words)
+def test_the_page_of_a_run_shows_its_whole_provenance_and_its_run_times():
+    numbers = all_questions()
+    words = Reader(render_run(numbers)).words
+    provenance = numbers["provenance"] | {"versions": "numpy 1, torch 2"}
+    assert set(provenance) <= set(words)
+    assert {str(value) for value in provenance.values()} <= set(words)
+    assert any("Cost of each stage" in word for word in words)
+    assert [figure["data"] for figure, _ in Reader(render_run(numbers)).all("object")] == ["training.svg"]
+
+
+def test_the_page_embeds_that_of_its_run_and_is_the_same_for_another(read):
+    assert [frame["src"] for frame, _ in read.all("iframe")] == ["runtime/index.html"]
+    other = all_questions()
+    other["provenance"] |= {"git": "other", "trained": "other", "device": "other", "versions": {}, "seconds": 9.0}
+    other["runtime"]["stages"] = {"report": cost(9.0), "drift": cost()}
+    assert render(other) == render()
+    assert render_run(other) != render_run(all_questions())
 
 
 def test_the_same_inputs_give_the_same_bytes():

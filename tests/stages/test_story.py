@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import time
@@ -25,6 +26,7 @@ from pipeline.questions import EXPERIMENTS
 from pipeline.reporting.checklist import read_rows, resolve
 from pipeline.reporting.headline import short_table, table2_figure
 from pipeline.reporting.judging import NOT_REACHED
+from pipeline.reporting.numbers import join
 from pipeline.reporting.shown import to_markdown
 from tests.stages.checkout import ENVIRONMENT, copy_checkout, run, warm_stages
 
@@ -69,7 +71,8 @@ def story(checkout, run_stages) -> Path:
 def test_every_number_of_the_first_tables_is_there_and_says_that_it_is_simulated(story):
     numbers = json.loads((story / "reports/ci/numbers.json").read_text())
     assert numbers["provenance"]["source"] == "simulated"
-    assert {"git", "seed", "device", "seconds"} <= set(numbers["provenance"])
+    provenance = json.loads((story / "reports/ci/provenance.json").read_text())
+    assert {"git", "trained", "device", "versions", "seconds", "runtime"} == set(provenance)
     for row in ("single", "multi", "triplet", "adapted"):
         for metric in ("accuracy_pct", "mse_xy_mm2", "mse_f_N2"):
             assert {"mean", "sd", "n"} <= set(numbers["table2"][row][metric])
@@ -107,7 +110,7 @@ def test_dvc_shows_a_few_scores_which_are_numbers_of_numbers_json(story):
 
 
 def test_a_stage_costs_what_its_trainings_cost_and_says_what_it_reused(story):
-    stages = json.loads((story / "reports/ci/numbers.json").read_text())["runtime"]["stages"]
+    stages = json.loads((story / "reports/ci/provenance.json").read_text())["runtime"]["stages"]
     for arm in ("train_single", "train_multi", "train_triplet", "adapt", "sweep_sensors", "drift", "few_labels"):
         assert stages[arm]["trainings_n"] > 0
         assert stages[arm]["computed_s"] > 0
@@ -177,6 +180,32 @@ def test_every_experiment_of_the_paper_is_answered_shown_and_found_by_the_checkl
         assert f'src="figures/{figure.name}"' in page
 
 
+def test_another_commit_machine_and_time_change_only_provenance_and_run_times(story, tmp_path):
+    again = tmp_path / "again"
+    shutil.copytree(
+        story, again, symlinks=True, ignore=shutil.ignore_patterns(".dvc", "raw", "mlflow.db", "mlartifacts")
+    )
+    for file in (again / ".reskin").glob("*/ci/*.json"):
+        text = re.sub(r"(?<=: )\d+\.\d+(e-?\d+)?", lambda found: str(3 * float(found[0]) + 1), file.read_text())
+        file.write_text(text)
+    author = ("-c", "user.name=a", "-c", "user.email=a@b")
+    for words in (["init", "-q"], ["add", "pipeline"], [*author, "commit", "-qm", "x"]):
+        subprocess.run(["git", *words], cwd=again, check=True)
+    words = ["--scene", "ci", "--indentations", "data/indentations/ci", "--folds", "data/folds/ci.json", "--models",
+             "data/models/ci", "--answers", "data/answers/ci", "--reports", "reports/ci"]  # fmt: skip
+    on_one_core = "import os, runpy; os.sched_setaffinity(0, [min(os.sched_getaffinity(0))]); "
+    on_one_core += "runpy.run_module('pipeline.stages.report', run_name='__main__', alter_sys=True)"
+    run(again, "python", "-c", on_one_core, *words)
+    before, after = (
+        {str(file.relative_to(reports)): file.read_bytes() for file in reports.rglob("*") if file.is_file()}
+        for reports in (story / "reports", again / "reports")
+    )
+    assert after.keys() == before.keys()
+    changed = {name for name in after if after[name] != before[name]}
+    assert {name for name in changed if not name.startswith("ci/runtime/")} == {"ci/provenance.json"}
+    assert {"ci/runtime/index.html", "ci/runtime/stages.md", "ci/runtime/quadratures.svg"} <= changed
+
+
 def test_every_row_of_the_checklist_finds_its_number_and_its_files(story):
     reports = story / "reports/ci"
     numbers = json.loads((reports / "numbers.json").read_text())
@@ -215,7 +244,9 @@ def test_a_log_of_a_card_is_predicted_by_a_model_of_the_scene(story):
 def test_the_physics_is_answered_for_and_says_that_it_is_simulated(story):
     numbers = json.loads((story / "reports/ci/numbers.json").read_text())
     assert {row["term"] for row in numbers["left_out"] if row["done"] == "left out"} >= {"ageing", "temperature"}
-    rows = numbers["runtime"]["quadratures"] + numbers["runtime"]["integrators"]
+    costs = json.loads((story / "reports/ci/provenance.json").read_text())
+    runtime = join(numbers, costs)["runtime"]
+    rows = runtime["quadratures"] + runtime["integrators"]
     assert all(("median_s" in row) == (row["failure"] is None and row["method"] != "reference") for row in rows)
     assert set(numbers["described"]) == {"grid"}
     for name in ("left_out", "skins"):
@@ -353,7 +384,8 @@ def test_an_experiment_that_is_switched_off_leaves_no_stage_no_file_and_no_cost(
     ] == []  # data/code: of every stage
     numbers = json.loads((story / "reports/ci/numbers.json").read_text())
     assert "sleeve" not in numbers
-    assert not any("sleeve" in unit for unit in numbers["runtime"]["stages"])
+    provenance = json.loads((story / "reports/ci/provenance.json").read_text())
+    assert not any("sleeve" in unit for unit in provenance["runtime"]["stages"])
     assert not any("sleeve" in stage for stage in YAML(typ="safe").load((story / "dvc.lock").read_text())["stages"])
 
 
