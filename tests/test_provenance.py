@@ -1,10 +1,11 @@
 import re
+import subprocess
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core import provenance
+from pipeline.core import code, provenance
 from pipeline.core.numerics import VARIABLES, pinned
 from pipeline.core.provenance import (
     INSTRUCTIONS,
@@ -16,6 +17,7 @@ from pipeline.core.provenance import (
     note_trainings,
     processor,
     read_costs,
+    version_of,
 )
 
 XEON = "processor\t: 0\nmodel name\t: Intel(R) Xeon(R) Gold 6442Y\nflags\t\t: fpu sse2 avx2 avx512f amx_tile\n\n"
@@ -24,6 +26,44 @@ OLD = "processor\t: 1\nmodel name\t: Another one\nflags\t\t: fpu sse2\n"
 
 def test_a_result_names_the_commit_of_its_code_or_says_that_it_cannot():
     assert re.fullmatch(r"[0-9a-f]{12}(\+dirty)?|unknown", code_version())
+
+
+def test_the_commit_of_modules_is_the_last_that_changed_what_they_do(tmp_path, monkeypatch):
+    monkeypatch.setattr(provenance, "ROOT", tmp_path)
+    monkeypatch.setattr(code, "ROOT", tmp_path)
+    (tmp_path / "pipeline").mkdir()
+    modules = ["pipeline.one", "pipeline.two"]
+
+    def write(**texts: str) -> None:
+        for name, text in texts.items():
+            (tmp_path / "pipeline" / name.replace("_", ".")).write_text(text)
+
+    def commit(**texts: str) -> str:
+        write(**texts)
+        author = ("-c", "user.name=a", "-c", "user.email=a@b")
+        for words in (["add", "."], [*author, "commit", "-qm", "x"]):
+            subprocess.run(["git", *words], cwd=tmp_path, check=True)
+        found = subprocess.run(["git", "rev-parse", "HEAD"], cwd=tmp_path, capture_output=True, text=True, check=True)
+        return found.stdout[:12]
+
+    write(one_py="A = 1\n", two_py="B = 1\n")
+    assert version_of(modules) == "unknown"  # no repository
+    subprocess.run(["git", "init", "-q"], cwd=tmp_path, check=True)
+    first = commit(one_yaml="a: 1\n")
+    assert version_of(modules) == first
+    commit(one_py="A = 1  # of what\n", two_py='"""Two."""\n\nB = 1\n', other_py="C = 1\n")
+    assert version_of(modules) == first
+    second = commit(one_yaml="a: 2\n")
+    assert version_of(modules) == second
+    third = commit(two_py="B = 2\n")
+    commit(other_py="C = 2\n")
+    assert version_of(modules) == third
+    assert version_of(["pipeline.one"]) == second
+    write(one_py='"""One."""\n\nA = 1\n')
+    assert version_of(modules) == third
+    write(one_py="A = 2\n")
+    assert version_of(modules) == f"{third}+dirty"
+    assert version_of(["pipeline.two"]) == third
 
 
 def test_the_machine_is_told_in_words():

@@ -22,12 +22,21 @@ def digest(name: str) -> str:
 
     Formatting, comments and the version of Python change nothing. `show.yaml` belongs to `show.py` beside it.
     """
-    file = file_of(name)
-    found = hashlib.sha256(json.dumps(_syntax(ast.parse(file.read_bytes()))).encode())
-    for beside in sorted(file.parent.glob(f"{file.stem}.*")):
-        if beside.suffix in DATA:
-            found.update(beside.read_bytes())
+    found = hashlib.sha256()
+    for file in files_of(name):
+        found.update(meaning(file.name, file.read_bytes()))
     return found.hexdigest()[:32]
+
+
+def files_of(name: str) -> list[Path]:
+    """Give the files of a module: its own, and data files of the same name beside it."""
+    file = file_of(name)
+    return [file, *sorted(one for one in file.parent.glob(f"{file.stem}.*") if one.suffix in DATA)]
+
+
+def meaning(file: str, content: bytes) -> bytes:
+    """Give what a file does: of Python its syntax without comments and docstrings, else all of it."""
+    return json.dumps(_syntax(ast.parse(content))).encode() if file.endswith(".py") else content
 
 
 def imported(*names: str) -> list[str]:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.core import io
+from pipeline.core.code import ROOT, files_of, meaning
 from pipeline.core.numerics import departures
 
 EXPERIMENTS = (".dvc", "tmp", "exps")  # where DVC makes copies of a checkout for experiments, and deletes them
@@ -44,6 +45,28 @@ def code_version() -> str:
     if not commit:
         return "unknown"
     return commit + ("+dirty" if _git("status", "--porcelain", "--", *of_code) else "")
+
+
+def version_of(modules: Iterable[str]) -> str:
+    """The last commit that changed what these modules do; `+dirty` and `unknown` as for `code_version`.
+
+    Later commits that change other modules, comments or docstrings leave it as it is, so that equal code names the same
+    commit in every checkout with its history.
+    """
+    files = [str(file.relative_to(ROOT)) for name in modules for file in files_of(name)]
+    edited = _git("status", "--porcelain", "--", *files) and any(
+        _meaning("HEAD", file) != meaning(file, (ROOT / file).read_bytes().strip()) for file in files
+    )
+    for commit in _git("log", "--format=%H", "--", *files).splitlines():
+        words = ("diff-tree", "--root", "--no-commit-id", "--name-only", "--relative", "-r", commit)
+        names = _git(*words, "--", *files).splitlines()
+        if any(_meaning(f"{commit}^", name) != _meaning(commit, name) for name in names):
+            return commit[:12] + ("+dirty" if edited else "")
+    return "unknown"
+
+
+def _meaning(commit: str, file: str) -> bytes:
+    return meaning(file, _git("show", f"{commit}:./{file}").encode())
 
 
 def device() -> str:
@@ -148,7 +171,7 @@ def _read_trainings(folder: Path, stage: str) -> dict[str, Any]:
 
 def _git(*words: str) -> str:
     try:
-        done = subprocess.run(["git", *words], cwd=CODE, capture_output=True, text=True, check=False)
+        done = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=False)
     except OSError:
         return ""  # no git on this machine: the version is reported as unknown
     return done.stdout.strip() if done.returncode == 0 else ""

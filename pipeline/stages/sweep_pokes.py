@@ -49,7 +49,7 @@ def sweep_pokes(scene: str, files: Files, indentations: Path, folds: Path, start
 
 def _unadapted(started: Path, base: str, held_out: set[str]) -> list[dict[str, Any]]:
     cards = [io.read_json(file) for file in sorted(started.glob("*.json"))]
-    kept = ("key", "question", "fold", "seed_i", "stopped_step", "git", "scores")
+    kept = ("key", "question", "fold", "seed_i", "stopped_step", "scores")
     return [
         {name: card[name] for name in kept} | {"method": "triplet", "pokes_n": 0}
         for card in cards

@@ -14,9 +14,10 @@ import pyarrow as pa
 from jaxtyping import Float32, Int64
 
 from pipeline.core import io
+from pipeline.core.code import imported
 from pipeline.core.config import Settings
 from pipeline.core.executors import make_executor, prepare_workers
-from pipeline.core.provenance import COSTS, SECONDS, code_version, home, note_trainings
+from pipeline.core.provenance import COSTS, SECONDS, home, note_trainings, version_of
 from pipeline.core.stage import say
 from pipeline.dataset.folds import load_rows, parse_folds
 from pipeline.dataset.rows import TARGETS, Rows, Selection
@@ -97,7 +98,8 @@ def write_models(
     models: Path, data: SceneData, trials: Sequence[Trial], trained: Sequence[Trained], stage: str
 ) -> None:
     """Write models, their cards and predictions; what they took here stands beside, as it is no result."""
-    cards = [card_of(data, trial, result) for trial, result in zip(trials, trained, strict=True)]
+    code = version_of(imported(f"pipeline.stages.{stage}"))
+    cards = [card_of(data, trial, result) | {"git": code} for trial, result in zip(trials, trained, strict=True)]
     with io.replacing(models) as folder:
         folder.mkdir()
         for trial, result, card in zip(trials, trained, cards, strict=True):
@@ -110,7 +112,7 @@ def write_models(
 
 def card_of(data: SceneData, trial: Trial, trained: Trained) -> dict[str, Any]:
     """Describe a training, with its scores on the rows that it was not trained on."""
-    card = describe(trial, trained, data.rows, data.scene, code_version())
+    card = describe(trial, trained, data.rows, data.scene)
     return card | {"scores": score_test(data, trial.test, trained.predicted)}
 
 
@@ -122,7 +124,7 @@ def score_test(data: SceneData, test: Int64[np.ndarray, " b"], predicted: Float3
 def point_of(data: SceneData, trial: Trial, trained: Trained, method: str) -> dict[str, Any]:
     """Keep of a training in a sweep what its curve needs: no weights, no predictions."""
     card = card_of(data, trial, trained)
-    kept = ("key", "question", "fold", "seed_i", "stopped_step", "git", "scores", "collapsed", "collapsed_before_n")
+    kept = ("key", "question", "fold", "seed_i", "stopped_step", "scores", "collapsed", "collapsed_before_n")
     return {name: card[name] for name in kept} | {"method": method, "trained_on_skins_n": len(card["train_skins"])}
 
 
@@ -152,7 +154,7 @@ def _predictions(trials: Sequence[Trial], trained: Sequence[Trained], rows: Rows
 FORMAT = "reskin-model/3"
 
 
-def describe(trial: Trial, trained: Trained, rows: Rows, scene: str, code: str) -> dict[str, Any]:
+def describe(trial: Trial, trained: Trained, rows: Rows, scene: str) -> dict[str, Any]:
     """Describe a trained trial; `scores` are added where the truth is known."""
     card = {
         "format": FORMAT,
@@ -164,7 +166,6 @@ def describe(trial: Trial, trained: Trained, rows: Rows, scene: str, code: str) 
         "seed": trial.seed,
         "seed_i": trial.seed_i,
         "key": trained.key,
-        "git": code,
         "architecture": {name: list(value.shape) for name, value in trained.weights.items()},
         "input": {
             "quantity": "change of field",

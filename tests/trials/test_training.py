@@ -21,12 +21,12 @@ def rows() -> Rows:
 def card(trial: Trial, **changes: object) -> dict:
     (one,) = train_stack([trial], measured())
     trained = Trained(**{**vars(one), "key": "k", **changes})
-    return describe(trial, trained, rows(), scene="lab", code="abc")
+    return describe(trial, trained, rows(), scene="lab")
 
 
 def test_a_card_says_what_was_trained_on_what_and_tested_on_what():
     words = card(pooled())
-    assert (words["scene"], words["git"], words["key"], words["question"]) == ("lab", "abc", "k", "triplet")
+    assert (words["scene"], words["key"], words["question"]) == ("lab", "k", "triplet")
     assert (words["train_boards"], words["train_skins"]) == (["b0"], ["b0_s0", "b0_s1"])
     assert (words["test_boards"], words["test_skins"]) == (["b1"], ["b1_s1"])
     assert words["train_rows_n"] == len(TRAIN)

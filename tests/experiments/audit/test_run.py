@@ -126,7 +126,7 @@ def as_drawn(trial: Trial, data: SceneData) -> Trained:
 @pytest.fixture(autouse=True)
 def _at_home(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # seconds are noted in the working folder
-    monkeypatch.setattr(_training, "code_version", lambda: "abc")
+    monkeypatch.setattr(_training, "version_of", lambda modules: "abc")
 
 
 @pytest.fixture(scope="module")
@@ -134,7 +134,7 @@ def honest(tmp_path_factory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         folder = tmp_path_factory.mktemp("honest")
         patch.chdir(folder)
-        patch.setattr(_training, "code_version", lambda: "abc")
+        patch.setattr(_training, "version_of", lambda modules: "abc")
         return build(folder / "scene")
 
 
