@@ -4,7 +4,6 @@ With recorded boards of the rig (`rig`), and with none (`nominal`): a law's nomi
 Places and fields are turned to the board's frame first. Refuses to know files and how networks are trained.
 """
 
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -108,9 +107,7 @@ def score_fold(bench: Bench, fold: Fold, rig: Mapping[str, Experts], labels_n: S
     test_uT = bench.frame.field(bench.data.rows.db_uT[fold.test])
     points = []
     for way, experts in {"rig": rig[board], "nominal": bench.nominal}.items():
-        start_s = time.monotonic()
         told = tell(experts, rest_uT, pool)
-        took_s = time.monotonic() - start_s
         for n in labels_n:
             tempers = bench.tempers[board][n] if way == "rig" else told.tempers(bench.sureness[n])
             (tempers,) = by_own_labels(told, n, [tempers]) if way == "nominal" else [tempers]
@@ -118,7 +115,7 @@ def score_fold(bench: Bench, fold: Fold, rig: Mapping[str, Experts], labels_n: S
             for name, temper, found in zip(METHODS, tempers, (alone, both), strict=True):
                 words = {"method": f"{name}{WAYS[way]}", "labels_n": n, "fold": fold.name.rsplit("-draw", 1)[0]}
                 words |= {"inputs": "map" if "map" in name else "map and network", "temper": temper}
-                words |= {"seed_i": int(fold.name.rsplit("-draw", 1)[1]), "seconds": took_s, "misfit": told.misfit}
+                words |= {"seed_i": int(fold.name.rsplit("-draw", 1)[1]), "misfit": told.misfit}
                 points.append(words | {"scores": scored(bench, fold.test, found)})
     return points
 
