@@ -99,7 +99,8 @@ def tell(title: str, committed: Reports, fresh: Reports, echo: Echo) -> int:
         for word, names in (("only committed", done.missing), ("only fresh", done.new)):
             if names:
                 echo(f"{word}: {_listed(Counter(map(part_of, names)))}")
-    numbers = sorted((one for done in parts.values() for one in done.differing if one.relative), key=_by_size)
+    sized = [[one for one in done.differing if one.relative] for done in parts.values()]
+    numbers = sorted(next(filter(None, sized), []), key=_by_size)  # tables repeat what numbers.json holds
     if numbers:
         echo(f"\nLargest differences, relative to the larger of the two numbers:\n{_largest(numbers[:LISTED_N])}")
     turned = [one for done in parts.values() for one in done.differing if one.verdicts]
