@@ -328,6 +328,15 @@ def test_a_second_repro_runs_no_stage_and_restores_deleted_models(story):
     assert list((story / ".reskin/cells").glob("*.safetensors")) == []
 
 
+def test_an_edited_number_of_a_report_is_noticed(story):
+    file = story / "reports/ci/numbers.json"
+    content = file.read_text()
+    file.write_text(content.replace("simulated", "recorded", 1))
+    said = run(story, "dvc", "status", "report@ci").stdout
+    file.write_text(content)
+    assert re.search(r"modified:\s+reports/ci/numbers.json", said)
+
+
 def test_a_stage_killed_in_the_middle_loses_no_finished_fold(story):
     models = story / "data/models/killed"
     words = ["--scene", "ci", "--indentations", "data/indentations/ci",
