@@ -91,6 +91,10 @@ def test_what_the_user_has_set_is_left_alone():
     assert not set(pinned(NEWEST, mine)) & set(mine)
 
 
+def test_an_empty_variable_counts_as_not_set():
+    assert pinned(AVX2, {"OPENBLAS_CORETYPE": ""}) == PINNED
+
+
 def test_numpy_disables_only_features_that_the_processor_has():
     assert "NPY_DISABLE_CPU_FEATURES" not in pinned(AVX2, {})
     assert pinned(NEWEST, {})["NPY_DISABLE_CPU_FEATURES"].split() == list(BEYOND_AVX2)

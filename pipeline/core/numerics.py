@@ -52,7 +52,8 @@ def pinned(flags: frozenset[str], environment: Mapping[str, str]) -> dict[str, s
     chosen = dict(PINNED)
     if beyond := [name for name, flag in BEYOND_AVX2.items() if flag in flags]:
         chosen["NPY_DISABLE_CPU_FEATURES"] = " ".join(beyond)
-    return {name: value for name, value in chosen.items() if name not in environment}
+    empty = {name for name in PINNED if not environment.get(name)}  # libraries take an empty variable for none
+    return {name: value for name, value in chosen.items() if name not in environment or name in empty}
 
 
 def departures(environment: Mapping[str, str]) -> list[str]:
