@@ -4,6 +4,7 @@ Rows below the gauge's 0.02 N count as no contact, wherever the truths say they 
 Those that begin a pass, at a corner of the grid, are its no-load reading. `t_s` and `depth_mm` are NaN: none is known.
 Fields may come late: row i of the truths goes with a later row of the readings. By how many rows, the header says
 (`rows_late`) or, if it does not, the recording itself, where it tells: by as many as make |dB| go best with the force.
+A recording whose fields do not come as late throughout lost a row in one file, and is refused.
 Refuses to know which chips can be believed (`chips`) and who is tested on what.
 """
 
@@ -16,6 +17,7 @@ from jaxtyping import Bool, Float64, Int32
 from pipeline.capture.decisions import Decisions
 from pipeline.capture.header import Header
 from pipeline.capture.readers.chips import Rows, find_whole_rows
+from pipeline.capture.readers.lateness import find_change
 from pipeline.capture.readers.passes import find_passes
 from pipeline.capture.readers.table import (
     check_fields,
@@ -74,6 +76,7 @@ def read(folder: Path, header: Header, decisions: Decisions) -> tuple[Readings, 
     rows = find_whole_rows(b_uT, temperature_degC, header, where=f"{header.capture}/{READINGS}", decisions=decisions)
     best_late_n, tells = _best_rows_late(b_uT, truths[:, 2], rows)
     late_n = said_n if said_n is not None else best_late_n if tells else 0
+    _check_lateness(b_uT, truths, rows, header)
     truths, rows = truths[: len(truths) - late_n], rows.part(slice(late_n, None))
     b_uT, temperature_degC, keep = b_uT[late_n:], temperature_degC[late_n:], rows.whole
     contact = truths[:, 2] >= CONTACT_MIN_N
@@ -165,6 +168,23 @@ def _best_rows_late(
         return 0, False
     gain = float(max(correlations) - correlations[0])
     return int(np.argmax(correlations)), len(force_N) >= LATE_ROWS_MIN_N and gain >= LATE_GAIN_MIN
+
+
+def _check_lateness(
+    b_uT: Float64[np.ndarray, "f ch"], truths: Float64[np.ndarray, "f 3"], rows: Rows, header: Header
+) -> None:
+    """Refuse a recording whose fields fall behind their truths, or overtake them, on the way."""
+    change = find_change(b_uT, truths, truths[:, 2] >= CONTACT_MIN_N, rows.whole)
+    if change is None:
+        return
+    file = READINGS if change.after < change.before else TRUTHS
+    got = f"{change.before} rows late before about row {change.row + 1} of {TRUTHS}, {change.after} from there on"
+    remedy = (
+        f"{abs(change.after - change.before)} row(s) seem to be missing in {file}. Cut both files there, or put the "
+        "row back, and add the recording again."
+    )
+    rule = "the same number of rows behind their truths throughout"
+    raise CaptureError(f"{header.capture}/{READINGS}", "fields", rule, got, remedy)
 
 
 def _corner_rows(pass_i: Int32[np.ndarray, " f"], contact: Bool[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
