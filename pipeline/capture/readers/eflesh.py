@@ -17,6 +17,7 @@ from pipeline.capture.header import Header
 from pipeline.capture.readers.chips import find_whole_rows
 from pipeline.capture.readers.passes import find_passes
 from pipeline.capture.readers.table import (
+    DEPTH_MIN_mm,
     SAME_PLACE_mm,
     check_depths,
     check_fields,
@@ -43,6 +44,9 @@ CLOCKS_APART_MAX_s = 0.05  # both files are written in one loop, milliseconds ap
 PLACE_DECIMALS = 3  # the robot reports -84.999992 mm for -85
 # Rounding of raw - dB in float32 stays below 0.004 uT; in a new reading some channel moves by an LSB, 0.15 uT or more.
 SAME_NOLOAD_uT = 0.02
+
+# A robot that holds its height wanders by 1e-4 of it; a press in m that is mistaken for mm is some hundredths of it.
+HELD_PART = 1e-3
 
 Account = dict[str, int]
 
@@ -129,7 +133,7 @@ def _read_states(folder: Path, header: Header) -> Float64[np.ndarray, "f c"]:
     names = ["time", "x", "y", "z"] + (["weight"] if len(cells[0]) > WEIGHT_COLUMN else [])
     states = to_numbers(cells, where, names=names)
     check_places(states[:, 1:3], where)
-    if np.ptp(states[:, 3]) > SAME_PLACE_mm:  # else the robot's height is constant, and tells no depth
+    if not _holds_height(states[:, 3]):
         check_depths(states[:, 3] - states[:, 3].min(), where)
     return states
 
@@ -185,7 +189,11 @@ def _read_force(states: Float64[np.ndarray, "f c"], header: Header) -> dict[str,
 
 
 def _read_depth(states: Float64[np.ndarray, "f c"], header: Header) -> Float64[np.ndarray, " f"]:
-    """Count down from the highest z; NaN where z never changes, or the gauge measured along the skin: no depth."""
+    """Count down from the highest z; NaN where the robot held z, or the gauge measured along the skin: no depth."""
     along = states.shape[1] > WEIGHT_COLUMN and header.options["force_axis"] != "z"
-    still = np.ptp(states[:, 3]) <= SAME_PLACE_mm
-    return np.full(len(states), np.nan) if along or still else states[:, 3].max() - states[:, 3]
+    z_mm = states[:, 3]
+    return np.full(len(states), np.nan) if along or _holds_height(z_mm) else z_mm.max() - z_mm
+
+
+def _holds_height(z_mm: Float64[np.ndarray, " f"]) -> bool:
+    return bool(np.ptp(z_mm) <= max(SAME_PLACE_mm, min(DEPTH_MIN_mm, HELD_PART * np.abs(z_mm).max())))

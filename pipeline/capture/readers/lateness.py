@@ -1,8 +1,8 @@
 """Find where the lateness between two files that are joined row by row changes within a recording.
 
 A recorder that loses a row in one of two files pairs every later field with its neighbour's label, and both files may
-keep their length. Layout `ini` is the only one that joins files by row number: the others have one file (`table`,
-`lab`, `eflash7`) or join by time (`eflesh`, byte streams).
+keep their length. Layout `ini` is the only one that joins files by row number alone: `table`, `lab` and `eflash7` have
+one file, `eflesh` compares the times of each row, and byte streams are joined with their labels by time.
 """
 
 from typing import NamedTuple

@@ -237,3 +237,11 @@ def test_a_robot_of_constant_height_gives_places_and_no_depth(tmp_path):
     readings, account = eflesh.read(write(tmp_path, places, [300.0 + i for i in range(len(places))]), HEADER, AS_USUAL)
     assert np.isnan(readings.depth_mm).all()
     assert account["no_depth_rows_n"] == len(readings) == len(places)
+
+
+def test_a_robot_that_holds_its_height_within_hundredths_of_a_mm_gives_no_depth(tmp_path):
+    z_mm = np.linspace(143.0, 143.0177, 3 * len(GRID))
+    places = [[x, y, z] for (x, y), z in zip(GRID * 3, z_mm, strict=True)]
+    readings, account = eflesh.read(write(tmp_path, places, [300.0 + i for i in range(len(places))]), HEADER, AS_USUAL)
+    assert np.isnan(readings.depth_mm).all()
+    assert account["no_depth_rows_n"] == len(places)
