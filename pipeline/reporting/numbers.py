@@ -166,7 +166,7 @@ def headline_scores(numbers: Row) -> dict[str, Any]:
         "single_sensor": {name: _means(numbers[question]) for name, question in SINGLE.items() if question in numbers},
         "drift_end": _drift_end(numbers.get("drift", {})),
         "shear": _means(numbers["shear"], OF_SHEAR) if "shear" in numbers else {},
-        "touches": _means(numbers["touches"]["superposition"], OF_TOUCHES) if "touches" in numbers else {},
+        "touches": _means(numbers.get("touches", {}).get("superposition", {}), OF_TOUCHES),
     }
     return {name: part for name, part in parts.items() if part}
 

@@ -44,16 +44,13 @@ class Blocks:
 
 
 def touched(readings: Readings, account: Mapping[str, int], selection: Selection) -> Touched:
-    """Take the rows with enough force; raise for a recording whose places have no numbers, or with too few rows."""
+    """Take the rows with enough force; raise for a recording whose places have no numbers."""
     places = tuple(sorted(int(found[1]) for name in account if (found := PLACE_COUNT.fullmatch(name))))
     if len(places) not in (1, 2):
         rule = "one or two, by number"
         remedy = "Only layout eflash7 has such; ask this of a scene of its own."
         raise ParamsError(f"capture {readings.capture}", "its places", rule, list(places), remedy)
     rows = readings.Fz_N >= selection.force_min_N
-    if rows.sum() < ROWS_MIN_N:
-        rule = f"{ROWS_MIN_N} or more with {selection.force_min_N:g} N"
-        raise ParamsError(f"capture {readings.capture}", "touched rows", rule, int(rows.sum()), "Press longer.")
     db_uT = subtract(readings.b_uT[rows], readings.noload_uT[rows])
     return Touched(readings.capture, places, db_uT, readings.Fz_N[rows])
 
@@ -66,22 +63,45 @@ def in_blocks(recording: Touched, train_fraction: float, aside_fraction: float) 
     return Blocks(*(recording.part(part) for part in parts))
 
 
-def single_and_double(recordings: Iterable[Touched]) -> tuple[list[Touched], list[Touched]]:
-    """Part recordings by how many places they touch; raise if no two places were touched alone, or a pair's were not.
+@dataclass(frozen=True)
+class Sorted:
+    """Recordings of one place and of two, why others are left out (by name), and why nothing can be computed."""
 
-    A place that was recorded twice alone would mix two blocks of time, and is refused.
+    single: list[Touched]
+    double: list[Touched]
+    left_out: dict[str, str]
+    problem: str | None
+
+
+def sort_recordings(recordings: Iterable[Touched]) -> Sorted:
+    """Sort recordings by how many places they touch, and leave out those that cannot be used.
+
+    A recording needs `ROWS_MIN_N` touched rows, a pair of places that each was recorded alone, too. A place that was
+    recorded alone twice would mix two blocks of time, so only its first recording is used.
     """
-    ordered = sorted(recordings, key=lambda recording: (recording.places, recording.name))
-    single, double = ([one for one in ordered if len(one.places) == n] for n in (1, 2))
-    alone = [one.places[0] for one in single]
-    if len(alone) < 2 or len(set(alone)) < len(alone):
-        rule = "of two or more places, each once"
-        raise ParamsError("question touches", "recordings of one place", rule, alone, "Add or remove recordings.")
-    unknown = [one.name for one in double if not set(one.places) <= set(alone)]
-    if unknown:
-        rule = "recorded alone as well"
-        raise ParamsError("question touches", "each place of a pair", rule, f"not those of {unknown}", "Add them.")
-    return single, double
+    ordered = sorted(recordings, key=lambda one: (len(one.places), one.places, one.name))  # single places first
+    left_out = {
+        one.name: f"{len(one.db_uT)} touched rows, fewer than {ROWS_MIN_N}"
+        for one in ordered
+        if len(one.db_uT) < ROWS_MIN_N
+    }
+    usable = [one for one in ordered if one.name not in left_out]
+    single: dict[int, Touched] = {}
+    double = []
+    for one in usable:
+        unknown = sorted(set(one.places) - single.keys()) if len(one.places) == 2 else []
+        if unknown:
+            left_out[one.name] = f"place {' and '.join(map(str, unknown))} not recorded alone"
+        elif len(one.places) == 2:
+            double.append(one)
+        elif one.places[0] in single:
+            left_out[one.name] = f"place {one.places[0]} already recorded alone, by {single[one.places[0]].name}"
+        else:
+            single[one.places[0]] = one
+    problem = None
+    if len(single) < 2:
+        problem = f"places recorded alone: {len(single)}; at least 2 are needed. Add their recordings to this scene."
+    return Sorted(list(single.values()), double, left_out, problem)
 
 
 def joined(parts: Sequence[Touched]) -> tuple[Float32[np.ndarray, "f ch"], Float64[np.ndarray, " f"]]:

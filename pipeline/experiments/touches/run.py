@@ -21,7 +21,7 @@ from pipeline.dataset.rows import Selection
 from pipeline.evaluation.scores import statistic
 from pipeline.experiments.answer import write_answer
 from pipeline.experiments.touches import fields
-from pipeline.experiments.touches.recordings import Blocks, Touched, in_blocks, joined, single_and_double, touched
+from pipeline.experiments.touches.recordings import Blocks, Touched, in_blocks, joined, sort_recordings, touched
 from pipeline.learning.classical import Ridge, fit
 
 Fraction = Annotated[float, Field(gt=0, lt=1)]
@@ -147,14 +147,22 @@ def touches(scene: str, files: Files, indentations: Path, answer: Path) -> None:
     settings = read_settings("touches", scene, files)
     section, selection = read(settings), settings.section(Selection, "selection")
     sources = [indentations / f"{name}.parquet" for name in settings.captures_in(indentations)]
-    single, double = single_and_double(
-        touched(io.read_readings(file), io.read_account(file), selection) for file in sources
-    )
-    blocks = [in_blocks(one, section.train_fraction, section.aside_fraction) for one in single]
-    numbers = {
+    found = sort_recordings(touched(io.read_readings(file), io.read_account(file), selection) for file in sources)
+    single, double = found.single, found.double
+    counts = {
         "force_min_N": selection.force_min_N,
         "single": {"recordings_n": len(single), "rows_n": sum(len(one.db_uT) for one in single)},
         "double": {"recordings_n": len(double), "rows_n": sum(len(one.db_uT) for one in double)},
+        "left_out": found.left_out,
+    }
+    for name, reason in found.left_out.items():
+        say(f"{scene}: warning: {name} left out: {reason}")
+    if found.problem:
+        write_answer(answer, counts | {"not_computed": found.problem}, {})
+        say(f"{scene}: warning: touches not computed: {found.problem}")
+        return
+    blocks = [in_blocks(one, section.train_fraction, section.aside_fraction) for one in single]
+    numbers = counts | {
         "tested_rows_n": sum(len(one.test.db_uT) for one in blocks),
         "place": of_places(blocks, double),
         "force": of_forces(blocks, rng_for(settings.seed, "touches", "force")),

@@ -18,6 +18,8 @@ NO_MM = "The pitch of the 3 x 3 places is stated nowhere, so nothing is given in
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     """Tabulate what one touch tells, how two add up, and whether two are told from one."""
+    if "not_computed" in numbers:
+        return {"touches": _not_computed(numbers, source)}
     found = {"touches": _single(numbers), "touches_detection": _detection(numbers["detection"])}
     if numbers["superposition"]["pairs"]:
         found["touches_superposition"] = _superposition(numbers["superposition"])
@@ -47,8 +49,24 @@ def _single(numbers: Mapping[str, Any]) -> pd.DataFrame:
         f"{single['rows_n']} rows of {single['recordings_n']} recordings of one touch, {double['rows_n']} rows of "
         f"{double['recordings_n']} of two, with {numbers['force_min_N']:g} N or more. Place: the nearest directions of "
         f"the change of field; force: ridge regression on it. Means and ± sd over n recordings. {ONCE} {APART} {NO_MM}"
+        f"{_left_out(numbers)}"
     )
     return table
+
+
+def _not_computed(numbers: Mapping[str, Any], source: str) -> pd.DataFrame:
+    rows = [{"recordings": "all", "not used because": numbers["not_computed"]}]
+    rows += [{"recordings": name, "not used because": reason} for name, reason in numbers["left_out"].items()]
+    table = pd.DataFrame(rows).assign(source=source)
+    table.attrs["meaning"] = (
+        f"Nothing was computed from {numbers['single']['recordings_n']} usable recordings of one touch and "
+        f"{numbers['double']['recordings_n']} of two."
+    )
+    return table
+
+
+def _left_out(numbers: Mapping[str, Any]) -> str:
+    return "".join(f" Left out: {name} ({reason})." for name, reason in numbers.get("left_out", {}).items())
 
 
 def _row(what: str, stat: Mapping[str, Any], unit: str, chance: str) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """A pad whose fields add exactly: its pairs leave nothing over, other pairs do, and a new place is as odd as two."""
 
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -11,7 +12,7 @@ from pipeline.core.errors import ParamsError
 from pipeline.core.seeds import rng_for
 from pipeline.dataset.rows import Selection
 from pipeline.experiments.touches import fields
-from pipeline.experiments.touches.recordings import Touched, in_blocks, single_and_double, touched
+from pipeline.experiments.touches.recordings import Touched, in_blocks, sort_recordings, touched
 from pipeline.experiments.touches.run import Touches, of_detection, of_forces, of_places, of_superposition
 from pipeline.experiments.touches.show import tables
 from tests.dataset.tables import readings as make_readings
@@ -30,7 +31,8 @@ def pad(rows_n=40):
         force_N = rng.uniform(1, 3, (rows_n, len(places)))
         db_uT = force_N @ np.stack([ways[place] for place in places]) + rng.normal(0, NOISE_uT, (rows_n, 15))
         found.append(Touched(str(places), places, db_uT.astype(np.float32), force_N.sum(axis=1).astype(np.float32)))
-    return single_and_double(found)
+    sorted_ = sort_recordings(found)
+    return sorted_.single, sorted_.double
 
 
 @pytest.fixture(scope="module")
@@ -83,23 +85,41 @@ def test_places_and_forces_of_a_linear_pad_are_told(cut):
     assert force["by_time"]["mean"] < 0.02 * force["variance"]["mean"]
 
 
-def test_only_recordings_with_numbered_places_and_enough_rows_are_taken():
+def test_only_recordings_with_numbered_places_are_taken():
     readings = make_readings(f=60, Fz_N=np.linspace(0, 2, 60, dtype=np.float32))
     found = touched(readings, {"rows_n": 60, "place_7_rows_n": 60}, Selection(force_min_N=1.0))
     assert found.places == (7,)
     assert found.force_N.min() >= 1
     with pytest.raises(ParamsError, match="its places must be one or two, by number"):
         touched(readings, {"rows_n": 60}, Selection(force_min_N=1.0))
-    with pytest.raises(ParamsError, match="touched rows must be 20 or more with 1.9 N; got 3"):
-        touched(readings, {"place_7_rows_n": 60}, Selection(force_min_N=1.9))
 
 
-def test_a_place_that_is_recorded_twice_or_never_alone_is_refused():
+def test_recordings_that_cannot_be_used_are_left_out_with_a_reason():
     single, double = pad()
-    with pytest.raises(ParamsError, match="of two or more places, each once"):
-        single_and_double([*single, single[0]])
-    with pytest.raises(ParamsError, match="each place of a pair must be recorded alone as well"):
-        single_and_double([*single[:2], *double])
+    short = replace(single[0].part(slice(0, 19)), name="short")
+    again = replace(single[1], name="second of place 2")
+    found = sort_recordings([*single[1:], again, short, *double])
+    assert [one.name for one in found.single] == [one.name for one in single[1:]]
+    assert found.problem is None
+    assert found.left_out["short"] == "19 touched rows, fewer than 20"
+    assert found.left_out["second of place 2"] == "place 2 already recorded alone, by (2,)"
+    without_1 = [one for one in double if 1 not in one.places]
+    assert [one.name for one in found.double] == [one.name for one in without_1]
+    assert found.left_out["(1, 2)"] == "place 1 not recorded alone"
+
+
+def test_recordings_of_two_touches_alone_give_a_table_that_says_why_nothing_was_computed():
+    _, double = pad()
+    found = sort_recordings(double)
+    assert found.problem == "places recorded alone: 0; at least 2 are needed. Add their recordings to this scene."
+    numbers = {
+        "force_min_N": 0.5, "single": {"recordings_n": 0, "rows_n": 0}, "double": {"recordings_n": 0, "rows_n": 0},
+        "left_out": found.left_out, "not_computed": found.problem,
+    }  # fmt: skip
+    shown = tables(numbers, "recorded")
+    assert list(shown) == ["touches"]
+    assert shown["touches"]["not used because"].tolist()[0] == found.problem
+    assert len(shown["touches"]) == 1 + len(double)
 
 
 def test_nothing_left_to_test_is_refused():
