@@ -26,6 +26,7 @@ class Decisions(Strict):
     failed_read: Decision  # an I2C read that failed
     zeros: Decision  # in place of a reading
     stuck: Decision  # a chip stays the same while others move
+    constant_channel: Seen  # Bx, By or Bz of a chip never changes while other channels do
     chip_reset: Seen  # a chip's step is not that of the others, or changes
     too_hot: Decision  # or too cold: temperature out of range
     saturated: Decision  # field at the end of the chip's range

@@ -116,6 +116,37 @@ class StuckChips:
         return (quiet_n >= STUCK_FRAMES_MIN_N - 1) & (moved_n >= OTHERS_MOVE_MIN * quiet_n)
 
 
+class ConstantChannels:
+    """Finds channels that keep one value in a whole recording while others change; it may come in any portions.
+
+    A chip of which all three channels are constant is not reported here: it is stuck.
+    """
+
+    def __init__(self, chips_n: int) -> None:
+        self._first_uT = np.full((chips_n, 3), np.nan)
+        self._changed = np.zeros((chips_n, 3), bool)
+        self._readings_n = 0
+
+    def feed(self, b_uT: Float[np.ndarray, "f ch"]) -> None:
+        """Take the next readings of a board that did not fail."""
+        chips = _by_chip(b_uT)
+        if not len(chips):
+            return
+        if not self._readings_n:
+            self._first_uT = chips[0].copy()
+        self._changed |= (chips != self._first_uT).any(axis=0)
+        self._readings_n += len(chips)
+
+    def found(self) -> list[str]:
+        """Name the constant channels and their values, `Bz of chip 0 (12.5 uT)`; none in too short a recording."""
+        if self._readings_n < STUCK_FRAMES_MIN_N:
+            return []
+        odd = ~self._changed & self._changed.any(axis=1, keepdims=True)
+        return [
+            f"B{'xyz'[axis]} of chip {chip} ({self._first_uT[chip, axis]:.6g} uT)" for chip, axis in np.argwhere(odd)
+        ]
+
+
 def _step(axes_uT: list[Float[np.ndarray, " f"]], steps_min_n: int) -> float:
     """Find the step of the grid on which all values of some axes lie."""
     gaps_uT = np.concatenate([np.diff(np.unique(axis[np.isfinite(axis)])) for axis in axes_uT])

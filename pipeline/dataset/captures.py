@@ -146,6 +146,7 @@ def _timed_frames(
     yield _timed(frames, times_of(frames, frames_n), watch)
     if not stream.account()["frames_n"]:
         raise no_frame(str(folder / STREAM_FILE), head, _wire(header), header.chips_n)
+    watch.close()
     account.update(stream.account() | watch.ledger.account())
 
 

@@ -26,7 +26,8 @@ ALIKE_MIN_uT = 50.0  # about the earth's field
 # What a controller is given must be believed at once: a reading beyond the chip's range has no place and force.
 LIVE = Decisions(
     failed_read="drop", zeros="drop", stuck="drop", too_hot="drop", saturated="drop", torn="drop", wrong_baud="drop",
-    chip_reset="flag", int16_wrap="flag", repeated="flag", dropped="flag", clock_jump="flag", unplug="flag",
+    constant_channel="flag", chip_reset="flag", int16_wrap="flag", repeated="flag", dropped="flag", clock_jump="flag",
+    unplug="flag",
 )  # fmt: skip
 
 

@@ -1,11 +1,15 @@
 """Each fault is counted, with its span, and becomes what was decided: dropped, flagged, or the recording refused."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from pipeline.capture.decisions import Decisions, Ledger, decide
+from pipeline.capture.faults import ConstantChannels
 from pipeline.capture.header import Clock
 from pipeline.capture.readers.chips import Watch, find_whole_rows
 from pipeline.capture.stream import decode_all
@@ -125,3 +129,59 @@ def test_what_cannot_be_decided_is_refused_and_what_is_nowhere_is_not_in_the_acc
     ledger = Ledger(AS_USUAL, "x", "row")
     assert not ledger.note("stuck", np.zeros(3, bool), np.arange(3)).any()
     assert ledger.account() == {}
+
+
+CONSTANT = (
+    r"each channel must be one that changes; got one value throughout for Bz of chip 0 \(.*\), Bz of chip 1 \(0 uT\)"
+)
+
+
+def constant_z(b_uT: np.ndarray) -> np.ndarray:
+    """Chips 0 and 1 whose z never changes, the second one at 0."""
+    changed = b_uT.copy()
+    changed[:, 2], changed[:, 5] = b_uT[0, 2], 0.0
+    return changed
+
+
+def test_channels_that_never_change_are_refused_or_flagged_in_rows():
+    """All layouts of recordings by others look for faults with this function."""
+    rng, header = rng_for(0, "constant"), make_header(chips_n=3)
+    b_uT, warm_degC = constant_z(rng.normal(300, 5, (200, 9))), np.full((200, 3), 25.0)
+    with pytest.raises(CaptureError, match=CONSTANT):
+        find_whole_rows(b_uT, warm_degC, header, where="here", decisions=AS_USUAL)
+    flagging = decide(AS_USUAL, ["constant_channel=flag"], "test")
+    rows = find_whole_rows(b_uT, warm_degC, header, where="here", decisions=flagging)
+    assert rows.whole.all()
+    assert rows.losses()["fault_constant_channel_flagged_n"] == 200
+    few = find_whole_rows(b_uT[:19], warm_degC[:19], header, where="here", decisions=AS_USUAL)
+    assert few.whole.all()
+
+
+@given(st.lists(st.integers(0, 400), max_size=4))
+def test_channels_that_never_change_are_found_in_a_stream_of_any_portions(ends):
+    frames = SCRIPTS["binary"].frames
+    frames = replace(frames, b_uT=constant_z(frames.b_uT), end_byte=82 * (1 + np.arange(len(frames))))
+    for words, refused in (([], True), (["constant_channel=flag"], False)):
+        header = make_header(layout="native", wire="binary", clock=CLOCK)
+        watch = Watch(header, "x", decide(AS_USUAL, words, "test"))
+        edges = [0, *sorted(ends), len(frames)]
+        for begin, end in pairwise(edges):
+            rows = (np.arange(len(frames)) >= begin) & (np.arange(len(frames)) < end)
+            watch.look(frames.where(rows), SCRIPTS["binary"].t_s[rows])
+        if refused:
+            with pytest.raises(CaptureError, match=CONSTANT):
+                watch.close()
+        else:
+            watch.close()
+            assert watch.ledger.account()["fault_constant_channel_last_ms"] > 0
+
+
+def test_a_board_whose_chips_or_all_channels_stand_still_has_no_constant_channel():
+    channels = ConstantChannels(2)
+    channels.feed(np.zeros((50, 6)))
+    assert channels.found() == []
+    moving = np.zeros((50, 6))
+    moving[:, 3:] = rng_for(0, "still").normal(0, 5, (50, 3))
+    channels = ConstantChannels(2)
+    channels.feed(moving)
+    assert channels.found() == []  # chip 0 is stuck

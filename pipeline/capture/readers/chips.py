@@ -77,6 +77,9 @@ def find_whole_rows(
     for block in np.array_split(rows, max(1, len(rows) // GRID_ROWS_N)):
         with noting_reset(ledger, decisions, row[block]):
             _check_scale(b_uT[block], header, where=f"{where} from row {row[block[0]]}")
+    channels = faults.ConstantChannels(header.chips_n)
+    channels.feed(b_uT[~failed])
+    note_constant(channels, ledger, decisions, where, row)
     stuck = ledger.note("stuck", np.asarray(faults.stuck_chips(b_uT).any(axis=1)) & ~failed, row) & ~drop
     beyond &= ~stuck
     return Rows(~(drop | stuck | beyond), drop, stuck, beyond, ledger.account())
@@ -107,6 +110,23 @@ def noting_reset(
         if decisions.chip_reset == "refuse":
             raise
         ledger.note("chip_reset", np.ones(len(at), bool), at)
+
+
+def note_constant(
+    channels: faults.ConstantChannels, ledger: Ledger, decisions: Decisions, where: str,
+    at: Float64[np.ndarray, " f"] | Int[np.ndarray, " f"],
+) -> None:  # fmt: skip
+    """Note or refuse channels that never changed in the whole recording; the error names them."""
+    found = channels.found()
+    if found and decisions.constant_channel == "refuse":
+        remedy = (
+            "Check the wiring, the chip and the columns, and record again; or accept it by faults: constant_channel: "
+            "flag in params.yaml."
+        )
+        got = f"one value throughout for {', '.join(found)}"
+        raise CaptureError(where, "each channel", "one that changes", got, remedy)
+    if found:
+        ledger.note("constant_channel", np.ones(len(at), bool), at)
 
 
 def _check_scale(b_uT: Float[np.ndarray, "f ch"], header: Header, *, where: str) -> None:
@@ -152,6 +172,8 @@ class Watch:
         self._decisions = decisions
         self._header, self._where = header, where
         self._stuck = faults.StuckChips(header.chips_n)
+        self._channels = faults.ConstantChannels(header.chips_n)
+        self._span_s: list[float] = []  # first and last time
         self._held = np.zeros((0, 3 * header.chips_n), np.float32)
         self._held_s = np.zeros(0)
         self._begun = False
@@ -167,7 +189,14 @@ class Watch:
         self._look_at_bytes(frames, t_s)
         beyond[~untrue] |= self._look_at_steps(frames.where(~untrue), t_s[~untrue])
         beyond &= ~stuck
+        self._channels.feed(frames.b_uT[~untrue])
+        if len(t_s):
+            self._span_s = [*(self._span_s or [float(t_s[0])])[:1], float(t_s[-1])]
         return Rows(~(drop | stuck | beyond), drop, stuck, beyond, {})
+
+    def close(self) -> None:
+        """Note what only the whole stream shows; raise for what is refused."""
+        note_constant(self._channels, self.ledger, self._decisions, self._where, np.array(self._span_s))
 
     def _look_at_steps(self, frames: Frames, t_s: Float64[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
         """Note what shows from one sound frame to the next, also from the last one before; mark what to drop."""

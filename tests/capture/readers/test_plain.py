@@ -201,3 +201,10 @@ def test_passes_are_found_where_places_and_depths_repeat_in_order_and_a_column_h
     other, account = read(tmp_path / "deeper", deeper)
     assert set(other.pass_i) == {0}
     assert account["passes_n"] == 1
+
+
+def test_channels_that_are_constant_throughout_are_named(tmp_path):
+    rows = table()
+    rows["Bz0"], rows["Bz1"] = 12.5, 0.0
+    rows.to_csv(tmp_path / plain.CSV, index=False)
+    assert "one value throughout for Bz of chip 0 (12.5 uT), Bz of chip 1 (0 uT)" in complaint_of(tmp_path)
