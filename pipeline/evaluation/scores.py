@@ -118,10 +118,18 @@ def over_units(rows: pd.DataFrame, *unit: str, boards: bool = False) -> dict[str
     """
     groups = rows.groupby(list(unit))[_metrics(rows)]
     summary = summarise(groups.mean(), boards=boards)
-    if not boards or groups.ngroups == 1:
-        for name, sd in groups.std().mean().dropna().items():
-            summary[str(name)]["sd_seeds"] = float(sd)
-    return summary
+    return with_seeds(summary, rows, *unit) if not boards or groups.ngroups == 1 else summary
+
+
+def with_seeds(summary: Mapping[str, Stat], rows: pd.DataFrame, *unit: str) -> dict[str, dict[str, Any]]:
+    """Add `sd_seeds` to each statistic: the standard deviation (n - 1) of the rows of a unit, mean over units.
+
+    The rows of a unit are networks that differ in their seed. A metric whose units have one row each is left as it is.
+    """
+    sds = rows.groupby(list(unit))[_metrics(rows)].std().mean().dropna()
+    return {
+        name: {**stat, "sd_seeds": float(sds[name])} if name in sds else dict(stat) for name, stat in summary.items()
+    }
 
 
 def over_folds(rows: pd.DataFrame) -> dict[str, dict[str, Any]]:

@@ -19,20 +19,25 @@ SPREAD = f"{INTERVAL}; ± is the sd over n repeats on one skin, or over seeds wh
 
 
 def show(value: Stat | None) -> str:
-    """Write a mean with three significant digits: with its interval over boards, or else with its deviation."""
+    """Write a mean with three significant digits: with its interval over boards, or else with its deviation.
+
+    The standard deviation over network seeds follows where it is known.
+    """
     if value is None:
         return "–"
     if "ci95" in value:
-        return f"{_three(value['mean'])} {show_interval(value)}"
+        return f"{_three(value['mean'])} {show_interval(value)}{_show_seeds(value)}"
     return show_deviation(value)
 
 
 def show_deviation(value: Stat) -> str:
-    """Write a mean and its standard deviation over n, or over seeds where there is one unit."""
-    mean = _three(value["mean"])
-    if "sd" in value:
-        return f"{mean} ± {value['sd']:.2g}"
-    return mean + (f" ± {value['sd_seeds']:.2g} (seeds)" if "sd_seeds" in value else "")
+    """Write a mean, its standard deviation over n, and that over network seeds where it is known."""
+    over_n = f" ± {value['sd']:.2g}" if "sd" in value else ""
+    return f"{_three(value['mean'])}{over_n}{_show_seeds(value)}"
+
+
+def _show_seeds(value: Stat) -> str:
+    return f" ± {value['sd_seeds']:.2g} (seeds)" if "sd_seeds" in value else ""
 
 
 def show_interval(value: Stat) -> str:
@@ -42,9 +47,10 @@ def show_interval(value: Stat) -> str:
 
 
 def show_digits(value: Stat, digits: int) -> str:
-    """Write a mean with so many decimals, and its interval over boards if it has one."""
+    """Write a mean with so many decimals, and its interval over boards and deviation over seeds if it has them."""
     numbers = [f"{number:.{digits}f}" for number in (value["mean"], *value.get("ci95", ()))]
-    return f"{numbers[0]} [{numbers[1]}, {numbers[2]}]" if len(numbers) > 1 else numbers[0]
+    interval = f" [{numbers[1]}, {numbers[2]}]" if len(numbers) > 1 else ""
+    return f"{numbers[0]}{interval}{_show_seeds(value)}"
 
 
 def show_both(value: Stat | None) -> str:

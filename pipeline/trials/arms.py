@@ -15,7 +15,7 @@ from jaxtyping import Float
 from pipeline.core.executors import device
 from pipeline.dataset.splits import Fold
 from pipeline.evaluation import scores
-from pipeline.evaluation.metrics import score
+from pipeline.evaluation.metrics import METRICS, score
 from pipeline.learning.inputs import VIEW
 from pipeline.learning.recipe import Adaptation, training
 from pipeline.learning.trial import Trial
@@ -74,9 +74,15 @@ def bias(true: Float[np.ndarray, "b 3"], predicted: Float[np.ndarray, "b 3"]) ->
 
 
 def summarise_arms(answers: Sequence[Answered], judge: Judge = score) -> dict[str, dict[str, Any]]:
-    """Summarise every metric over boards, each the mean of its skins, each of these of its seeds; by arm."""
+    """Summarise every metric over boards, each the mean of its skins, each of these of its seeds; by arm.
+
+    `sd_seeds` is the standard deviation over the networks of one skin, mean over skins.
+    """
     arms = _tidy(answers, judge).groupby("method", sort=False)
-    return {str(arm): scores.summarise(scores.board_means(rows), boards=True) for arm, rows in arms}
+    return {
+        str(arm): scores.with_seeds(scores.summarise(scores.board_means(rows), boards=True), rows, "board", "skin")
+        for arm, rows in arms
+    }
 
 
 def biases(answers: Sequence[Answered]) -> dict[str, dict[str, Any]]:
@@ -86,9 +92,18 @@ def biases(answers: Sequence[Answered]) -> dict[str, dict[str, Any]]:
 
 
 def compare_arms(answers: Sequence[Answered], of: str, over: str) -> dict[str, Any]:
-    """Compare two arms skin by skin, `of` less `over`: over boards, and `by_board`."""
+    """Compare two arms skin by skin, `of` less `over`: over boards, and `by_board`.
+
+    `sd_seeds` is that of the differences: networks of equal seeds started from the same weights.
+    """
     rows = _tidy(answers, score)
-    return scores.paired(*(scores.select(rows, method=arm) for arm in (of, over)))
+    sides = [scores.select(rows, method=arm) for arm in (of, over)]
+    compared = scores.paired(*sides)
+    network = ["board", "skin", "seed"]
+    metrics = [name for name in METRICS if name in rows]
+    each = sides[0].set_index(network)[metrics] - sides[1].set_index(network)[metrics]
+    by_board = compared.pop("by_board")
+    return scores.with_seeds(compared, each, "board", "skin") | {"by_board": by_board}
 
 
 def _tidy(answers: Sequence[Answered], judge: Judge) -> pd.DataFrame:

@@ -38,6 +38,7 @@ from pipeline.evaluation.scores import (
     verdict,
     verdict_within,
     whole,
+    with_seeds,
 )
 from tests.dataset.test_splits import six_by_three_in_passes
 from tests.evaluation.cards import SKINS, card, every
@@ -83,6 +84,14 @@ def test_seeds_of_one_fold_are_averaged_before_folds_are_counted():
     assert summary["sd"] == pytest.approx(14 / 2**0.5)
     assert summary["sd_seeds"] == pytest.approx(8**0.5)
     assert "sd" not in over_folds(tidy(cards[:2]))["mse_xy_mm2"]
+
+
+def test_the_spread_over_seeds_is_that_within_a_unit_and_one_row_has_none():
+    rows = scored({"b0": [[1.0, 3.0], [5.0, 5.0]], "b1": [[8.0]]})
+    found = with_seeds({"accuracy_pct": {"mean": 5.5, "n": 2}}, rows, "board", "skin")["accuracy_pct"]
+    assert found == {"mean": 5.5, "n": 2, "sd_seeds": pytest.approx(np.mean([2**0.5, 0]))}
+    alone = {"accuracy_pct": {"mean": 8.0, "n": 1}}
+    assert with_seeds(alone, select(rows, board="b1"), "board", "skin") == alone
 
 
 def test_networks_adapted_to_one_skin_each_have_a_row_for_all_skins_by_fold_and_seed():

@@ -83,7 +83,31 @@ def test_differences_are_those_of_the_summary_of_cards():
         for arm in (BEFORE, AFTER)
     }  # fmt: skip
     of, over = (by_skin(tidy(cards[arm])) for arm in (AFTER, BEFORE))
-    assert compare_arms(ANSWERS, AFTER, BEFORE) == paired(of, over)
+    found = compare_arms(ANSWERS, AFTER, BEFORE)
+    for name in ("accuracy_pct", "mse_xy_mm2", "mse_f_N2"):
+        del found[name]["sd_seeds"]
+    assert found == paired(of, over)
+
+
+def by_seed(arm: str, skin: str) -> np.ndarray:
+    own = sorted((one for one in ANSWERS if (one.arm, one.skin) == (arm, skin)), key=lambda one: one.seed_i)
+    return np.array([score(one.true, one.predicted)["mse_xy_mm2"] for one in own])
+
+
+def test_the_spread_over_seeds_is_that_of_one_skins_networks_and_differences_pair_equal_seeds():
+    found = summarise_arms(ANSWERS)[AFTER]["mse_xy_mm2"]
+    assert found["sd_seeds"] == pytest.approx(np.mean([by_seed(AFTER, skin).std(ddof=1) for skin in BOARD]))
+    found = compare_arms(ANSWERS, AFTER, BEFORE)["mse_xy_mm2"]
+    differences = [by_seed(AFTER, skin) - by_seed(BEFORE, skin) for skin in BOARD]
+    assert found["sd_seeds"] == pytest.approx(np.mean([one.std(ddof=1) for one in differences]))
+
+
+def test_one_network_has_no_spread_over_seeds():
+    first = [one for one in ANSWERS if one.seed_i == 0]
+    assert "sd_seeds" not in summarise_arms(first)[AFTER]["accuracy_pct"]
+    assert "sd_seeds" not in compare_arms(first, AFTER, BEFORE)["accuracy_pct"]
+    assert "sd_seeds" in answer_manual(ANSWERS, pokes_n=[3], lines_n=[1])["after"]["accuracy_pct"]
+    assert "sd_seeds" in answer_flexible(ANSWERS)["bias_f_N"][AFTER]
 
 
 def test_adaptation_by_hand_is_told_with_its_counts_its_control_and_its_price():

@@ -13,7 +13,7 @@ from tests.reporting.test_work_precision import said
 
 
 def stat(mean: float, n: int = 3) -> dict[str, float]:
-    return {"mean": float(mean), "sd": 0.1, "n": float(n)}
+    return {"mean": float(mean), "sd": 0.1, "n": float(n), "sd_seeds": 0.02}
 
 
 def metrics(accuracy_pct: float) -> dict:
@@ -25,7 +25,7 @@ DRAGGED = {
     "explained_xy": stat(0.99), "explained_fxy": stat(0.98), "explained_fz": stat(0.999),
 }  # fmt: skip
 SHEARED = DRAGGED | {
-    "by_line": DRAGGED | {"accuracy_pct": stat(58)}, "readings_n": 4590, "lines_n": 54, "passes_n": 1,
+    "by_line": DRAGGED | {"accuracy_pct": stat(58)}, "readings_n": 4590, "lines_n": 54, "passes_n": 1, "seeds_n": 3,
     "fx_rms_N": 1.06, "fy_rms_N": 1.07, "fz_rms_N": 1.97,
 }  # fmt: skip
 POKED = {
@@ -62,11 +62,12 @@ def test_shear_shows_both_splits_beside_the_papers_numbers_and_what_is_explained
     for mean, sd in SHEAR.values():
         assert f"{mean:g} ± {sd:g}" in text
     table = shear.tables(SHEARED, "simulated")["shear"]
-    assert table["accuracy, % (ours)"].tolist() == ["96 ± 0.1", "58 ± 0.1"]
+    assert table["accuracy, % (ours)"].tolist() == ["96 ± 0.1 ± 0.02 (seeds)", "58 ± 0.1 ± 0.02 (seeds)"]
+    assert "± (seeds) is the sd over 3 network seeds" in text
     assert table["split"].tolist()[0] == "random readings held out (ours; the paper names no split)"
     assert "4590 readings of 54 dragged lines in 1 passes" in text
     words = said(shear.figures(SHEARED, CURVES, "simulated")["shear.svg"])
-    assert "0.980 sideways, 0.999 normal" in words
+    assert "0.980 ± 0.020 (seeds) sideways, 0.999 ± 0.020 (seeds) normal" in words
     assert words.count("/ N") == 6
 
 
@@ -74,9 +75,10 @@ def test_manual_shows_each_arm_and_the_differences_with_their_signs():
     table = manual.tables(POKED, "simulated")["manual"].set_index("networks")
     for arm, name in (("before", "before"), ("after", "adapted by hand")):
         assert table.loc[name, "accuracy, % (paper)"] == f"{MANUAL[arm]['accuracy_pct']:g}"
-    assert (
-        table.loc["by hand less before, on the same skin", "accuracy, % (ours)"] == "inconclusive (one board): +2 ± 0.1"
-    )
+    difference = table.loc["by hand less before, on the same skin", "accuracy, % (ours)"]
+    assert difference == "inconclusive (one board): +2 ± 0.1 ± 0.02 (seeds)"
+    assert table.loc["adapted by hand", "accuracy, % (ours)"] == "83 ± 0.1 ± 0.02 (seeds)"
+    assert "over 3 network seeds" in to_markdown(manual.tables(POKED, "simulated")["manual"])
     assert len(table) == 7
     without = {name: value for name, value in POKED.items() if name != "control"}
     without["paired"] = {"after_minus_before": metrics(2)}
@@ -88,10 +90,11 @@ def test_flexible_states_the_bias_with_its_sign_and_how_our_boards_differ_from_t
     assert f"{FLEXIBLE['mse_xy_mm2']:g}" in text
     assert "30 % less; the paper's 80 % less" in text
     table = flexible.tables(BENT, "simulated")["flexible"]
-    assert table["bias of F, N"].tolist() == ["+0.96 ± 0.1", "-0.83 ± 0.1", "+0.97 ± 0.1"]
+    assert table["bias of F, N"].tolist() == [f"{mean} ± 0.1 ± 0.02 (seeds)" for mean in ("+0.96", "-0.83", "+0.97")]
+    assert "over 3 network seeds" in text
     words = said(flexible.figures(BENT, ARMS, "simulated")["flexible.svg"])
-    assert "before: bias +0.96 ± 0.1 N" in words
-    assert "adapted: bias -0.83 ± 0.1 N" in words
+    assert "bias +0.96 ± 0.1 ± 0.02 (seeds) N" in words
+    assert "bias -0.83 ± 0.1 ± 0.02 (seeds) N" in words
 
 
 def test_directions_stand_below_where_the_scene_has_such_networks():

@@ -47,14 +47,18 @@ def test_the_truth_explains_all_and_its_mean_nothing():
 
 def test_seeds_are_averaged_within_a_fold_before_folds_are():
     scores = [("a", {"mse": 1.0}), ("a", {"mse": 3.0}), ("b", {"mse": 6.0})]
-    answer = answer_shear(scores, scores[:1], target=drawn(0)[0], lines_n=3, passes_n=1)
-    assert answer["mse"] == {"mean": 4.0, "n": 2, "sd": pytest.approx(8**0.5)}
+    answer = answer_shear(scores, scores[:1], target=drawn(0)[0], lines_n=3, passes_n=1, seeds_n=2)
+    assert answer["mse"] == {"mean": 4.0, "n": 2, "sd": pytest.approx(8**0.5), "sd_seeds": pytest.approx(2**0.5)}
+    assert "sd_seeds" not in answer["by_line"]["mse"]
+    assert answer["seeds_n"] == 2
 
 
 def test_both_ways_stand_beside_each_other_with_the_size_of_the_forces():
     true, predicted = drawn(1)
     score = score5(true, predicted)
-    answer = answer_shear([("a", score)], [("b", {**score, "accuracy_pct": 7.0})], target=true, lines_n=3, passes_n=1)
+    answer = answer_shear(
+        [("a", score)], [("b", {**score, "accuracy_pct": 7.0})], target=true, lines_n=3, passes_n=1, seeds_n=1
+    )
     assert answer["accuracy_pct"]["mean"] == score["accuracy_pct"]
     assert answer["by_line"]["accuracy_pct"]["mean"] == 7.0
     assert (answer["readings_n"], answer["lines_n"]) == (40, 3)

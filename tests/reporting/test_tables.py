@@ -9,7 +9,7 @@ from pipeline.evaluation.scores import interval, tidy
 from pipeline.reporting.numbers import add_up, compose, foretold, lost_by_protocol
 from pipeline.reporting.paper import TABLE_2
 from pipeline.reporting.readme import fill
-from pipeline.reporting.shown import rounded, show, to_markdown
+from pipeline.reporting.shown import rounded, show, show_digits, to_markdown
 from pipeline.reporting.table1 import NOT_GIVEN, OURS
 from pipeline.reporting.tables import make_tables
 from tests.evaluation import cards
@@ -151,9 +151,12 @@ def test_a_number_that_is_not_known_is_a_dash():
     assert table["MSE_F, N² (ours)"].tolist() == ["–"]
 
 
-def test_a_spread_over_seeds_alone_is_called_so():
+def test_a_spread_over_seeds_is_shown_and_called_so():
     assert show({"mean": 99.7, "n": 1, "sd_seeds": 0.04}) == "99.7 ± 0.04 (seeds)"
-    assert show({"mean": 99.7, "n": 2, "sd": 1.0, "sd_seeds": 0.04}) == "99.7 ± 1"
+    assert show({"mean": 99.7, "n": 2, "sd": 1.0, "sd_seeds": 0.04}) == "99.7 ± 1 ± 0.04 (seeds)"
+    of_boards = {"mean": 99.7, "n": 2, "sd": 1.0, "ci95": [90.7, 108.7], "sd_seeds": 0.04}
+    assert show(of_boards) == "99.7 [90.7, 108.7] ± 0.04 (seeds)"
+    assert show_digits(of_boards, 2) == "99.70 [90.70, 108.70] ± 0.04 (seeds)"
 
 
 @pytest.mark.parametrize(("value", "kept"), [(1234567.8, 1234570.0), (0.000123456789, 0.000123457), (0.0, 0.0)])

@@ -24,7 +24,8 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
         lines += [_line(OF_SHAPE + ARMS[arm], numbers["shape"], arm, source) for arm in ARMS if arm in numbers["shape"]]
     spread = (
         f"[low, high] is the 95 % interval over n boards, each skin the mean of {numbers['seeds_n']} networks; one "
-        "fold's networks answer for all these boards, so it says nothing of other training boards."
+        "fold's networks answer for all these boards, so it says nothing of other training boards. ± (seeds) is the "
+        f"standard deviation over {numbers['seeds_n']} network seeds on one skin, mean over skins."
     )
     return {"flexible": tabulate(lines, meaning=_meaning(numbers), spread=spread)}
 
@@ -39,10 +40,13 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
             axes.plot(ends_N, ends_N, color=COLOURS[0], linewidth=0.8)
             axes.scatter(forces["true_N"], forces["predicted_N"], s=7, color=colour, alpha=0.6, linewidths=0)
             bias = f"bias {show_difference(numbers['bias_f_N'][arm])} N"
-            axes.set_title(f"{ARMS[arm]}: {bias}", loc="left", fontsize=10)
+            axes.set_title(f"{ARMS[arm]}:\n{bias}", loc="left", fontsize=9)
             axes.set(xlabel="true force / N")
         panels[0].set_ylabel("predicted force / N")
-        title = f"Networks of rigid boards on flexible boards ({source})"
+        title = (
+            f"Networks of rigid boards on flexible boards ({source})\n"
+            f"bias over {numbers['seeds_n']} network seeds, points of the first"
+        )
         figure.suptitle(title, x=0.01, ha="left", fontsize=10)
         return {"flexible.svg": svg(figure)}
 

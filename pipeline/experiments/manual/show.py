@@ -41,7 +41,11 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
         f"(paper: {MANUAL_POKES_N}); tested on the robot's grid of the same skin, by networks that never saw its "
         f"board. Differences: whether by hand is better. {VERDICTS}"
     )
-    spread = f"[low, high] is the 95 % interval over n boards, each skin the mean of {numbers['seeds_n']} networks."
+    spread = (
+        f"[low, high] is the 95 % interval over n boards, each skin the mean of {numbers['seeds_n']} networks. "
+        f"± (seeds) is the standard deviation over {numbers['seeds_n']} network seeds on one skin, mean over skins; of "
+        "a difference, that of the differences of equal seeds."
+    )
     return {"manual": tabulate(lines, meaning=meaning, spread=spread)}
 
 

@@ -19,7 +19,7 @@ from pipeline.core.stage import run
 from pipeline.dataset.rows import SHEAR_TARGETS, Rows, Selection, gather
 from pipeline.dataset.splits import NO_POOL, Fold, draw_sides
 from pipeline.evaluation.metrics import ACCURACY_LIMIT_MM
-from pipeline.evaluation.scores import summarise, tally
+from pipeline.evaluation.scores import over_units, tally
 from pipeline.experiments.answer import read_folder, read_losses, write_answer
 from pipeline.learning.recipe import Training, with_training
 from pipeline.trials.training import SceneData, collapse_record, note_seconds, prepare_training, train_all, trials_of
@@ -62,15 +62,18 @@ def answer_shear(
     target: Float[np.ndarray, "f 5"],
     lines_n: int,
     passes_n: int,
+    seeds_n: int,
 ) -> dict[str, Any]:
     """Summarise (fold, score) pairs of both splits over folds, each the mean of its seeds, with the forces' size.
 
-    Of `lines_n` dragged lines in all, each place and depth was dragged along in each of `passes_n`.
+    Of `lines_n` dragged lines in all, each place and depth was dragged along in each of `passes_n`. `sd_seeds` is the
+    standard deviation over the `seeds_n` networks of one fold, mean over folds.
     """
     rms_N = np.sqrt((target.astype(float) ** 2).mean(axis=0))
     sizes = {"fx_rms_N": float(rms_N[2]), "fy_rms_N": float(rms_N[3]), "fz_rms_N": float(rms_N[4])}
     return _over_folds(by_reading) | {
-        "by_line": _over_folds(by_line), "readings_n": len(target), "lines_n": lines_n, "passes_n": passes_n, **sizes,
+        "by_line": _over_folds(by_line), "seeds_n": seeds_n,
+        "readings_n": len(target), "lines_n": lines_n, "passes_n": passes_n, **sizes,
     }  # fmt: skip
 
 
@@ -79,7 +82,7 @@ MILLI = 3  # decimals of a force in the figure: more than are seen
 
 
 def _over_folds(scored: Sequence[tuple[Hashable, Mapping[str, float]]]) -> dict[str, Any]:
-    return summarise(pd.DataFrame([scores for _, scores in scored]).groupby([fold for fold, _ in scored]).mean())
+    return over_units(pd.DataFrame([{"fold": fold, **scores} for fold, scores in scored]), "fold")
 
 
 def read(settings: Settings) -> Shear:
@@ -106,6 +109,7 @@ def shear(scene: str, files: Files, indentations: Path, answer: Path) -> None:
     numbers = answer_shear(
         [one for one in scores if one[0] not in names], [one for one in scores if one[0] in names],
         target=rows.target, lines_n=len(np.unique(rows.indentation)), passes_n=len(np.unique(rows.pass_i)),
+        seeds_n=section.training.seeds_n,
     )  # fmt: skip
     first_i = next(i for i, trial in enumerate(trials) if trial.fold in names)
     shown = rng_for(settings.seed, "shear", "drawn").permutation(len(trials[first_i].test))[:DRAWN_N]

@@ -41,7 +41,11 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
         "paper's are not stated, and an MSE grows with the square of the force: explained variance, 1 - MSE / "
         "variance, does not. MSE_Fxy is a mean over two axes too; the paper does not say whether it sums or averages."
     )
-    return {"shear": tabulate(lines, meaning=meaning, spread="± is the sd over n random splits.")}
+    spread = (
+        f"± is the sd over n random splits, each the mean of {numbers['seeds_n']} networks; ± (seeds) is the sd over "
+        f"{numbers['seeds_n']} network seeds on one split, mean over splits."
+    )
+    return {"shear": tabulate(lines, meaning=meaning, spread=spread)}
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
@@ -54,10 +58,14 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
             axes.scatter(true_N, predicted_N, s=7, color=COLOURS[1], alpha=0.6, linewidths=0)
             axes.set(xlabel=f"true {name} / N", ylabel=f"predicted {name} / N")
             axes.locator_params(nbins=4)
-        explained = {part: numbers["by_line"][f"explained_{part}"]["mean"] for part in ("fxy", "fz")}
+        explained = {part: _explained(numbers["by_line"][f"explained_{part}"]) for part in ("fxy", "fz")}
         title = (
-            f"Forces of dragged lines held out whole ({source})\n"
-            f"explained variance: {explained['fxy']:.3f} sideways, {explained['fz']:.3f} normal"
+            f"Forces of dragged lines held out whole ({source}); points of the first of {numbers['seeds_n']} networks\n"
+            f"explained variance: {explained['fxy']} sideways, {explained['fz']} normal"
         )
         figure.suptitle(title, x=0.01, ha="left", fontsize=10)
         return {"shear.svg": svg(figure)}
+
+
+def _explained(stat: Mapping[str, float]) -> str:
+    return f"{stat['mean']:.3f}" + (f" ± {stat['sd_seeds']:.3f} (seeds)" if "sd_seeds" in stat else "")
