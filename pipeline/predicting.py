@@ -164,7 +164,8 @@ def _check_inputs(card: Card, tensors: Mapping[str, np.ndarray], where: Path) ->
 
 def render(found: Estimates) -> str:
     """Write estimates as CSV: mm and N to three decimals, empty off contact."""
-    answer = np.where(found.contact[:, None], np.round(found.answer, 3), np.nan)
+    (answer,) = found.answers  # of one model
+    answer = np.where(found.contact[:, None], np.round(answer, 3), np.nan)
     fields = dict(zip(("x_mm", "y_mm", "F_N"), answer.T, strict=True))
     table = {"t_s": pa.array(np.round(found.t_s, 4))}
     # from_pandas: NaN becomes null, which CSV writes as an empty field

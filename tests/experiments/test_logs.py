@@ -89,11 +89,24 @@ def test_steps_forces_and_noise_are_found_again():
     assert scores["mse_f_N2"] == pytest.approx((NOISE_uT / 200) ** 2 / 15, rel=0.3)
 
 
-def test_networks_are_averaged():
-    t_s, b_uT, _ = walk()
-    one = estimate(t_s, b_uT, [answers], where="log").answer
-    both = estimate(t_s, b_uT, [answers, lambda db_uT: answers(db_uT) + np.float32(1)], where="log").answer
-    np.testing.assert_allclose(both, one + 0.5, atol=1e-5)  # float32
+def test_each_network_is_scored_by_itself_and_their_errors_do_not_cancel():
+    t_s, b_uT, force_N = walk()
+    off = [lambda db_uT, by=by: answers(db_uT) + np.array([0, 0, by], np.float32) for by in (-1.0, 1.0, 2.0)]
+    found = estimate(t_s, b_uT, off, where="log")
+    scores = score_contacts(found, truth(force_N))
+    assert scores["mse_f_N2"] == pytest.approx((1 + 1 + 4) / 3, rel=0.01)  # of the mean network: 0.44
+    assert scores["spread"]["mse_f_N2"] == pytest.approx(np.std([1, 1, 4], ddof=1), rel=0.02)
+    assert describe(found)["force_max_N"] == pytest.approx(4 + 2 / 3, abs=0.05)  # three networks of 3, 5 and 6 N
+    assert "spread" not in score_contacts(estimate(t_s, b_uT, off[:1], where="log"), truth(force_N))
+
+
+def test_a_drawn_series_is_the_first_networks_with_the_range_of_all():
+    t_s, b_uT, force_N = walk(steps_n=40)
+    off = [lambda db_uT, by=by: answers(db_uT) + np.array([by, 0, 0], np.float32) for by in (0.0, 1.0, -2.0)]
+    drawn = thin(estimate(t_s, b_uT, off, where="log"), truth(force_N))
+    assert {6.0, 8.0, 9.0} == {max(x_mm for x_mm in drawn[which]["x_mm"] if x_mm is not None)
+                               for which in ("low", "estimated", "high")}  # fmt: skip
+    assert "low" not in thin(estimate(t_s, b_uT, off[:1], where="log"), truth(force_N))
 
 
 @given(st.lists(st.booleans(), max_size=40))

@@ -5,7 +5,7 @@ from pipeline.experiments.logs.show import figures, tables
 ACCOUNT = {"rows_read_n": 101, "rows_n": 100, "gap_frames_n": 2, "gaps_n": 1}
 NUMBERS = {
     "rate_hz": 250.0, "duration_s": 4.0, "readings_n": 100, "contacts_n": 3, "contact_readings_n": 40,
-    "account": ACCOUNT,
+    "account": ACCOUNT, "networks_n": 3,
 }  # fmt: skip
 SERIES = {name: [None, 1.0, 2.0] for name in ("x_mm", "y_mm", "F_N")}
 
@@ -36,6 +36,15 @@ def test_the_rate_in_the_words_is_that_of_the_log():
     table = tables(NUMBERS | {"rate_hz": 133.0}, "recorded")["logs"]
     assert "A log at 133 Hz with" in table.attrs["meaning"]
     assert "The board keeps its place" in table.attrs["meaning"]
+
+
+def test_the_spread_over_networks_stands_beside_their_mean_and_in_the_figure():
+    numbers = NUMBERS | {"accuracy_pct": 80.0, "spread": {"accuracy_pct": 2.5}}
+    table = tables(numbers, "simulated")["logs"]
+    assert table.set_index("what")["ours"]["accuracy, %"] == "80 ± 2.5"
+    assert "over 3 network seeds" in table.attrs["meaning"]
+    drawn = {"t_s": [0.0, 0.1, 0.2], "estimated": SERIES, "low": SERIES, "high": SERIES}
+    assert "range over 3 network seeds" in figures(numbers, drawn, "simulated")["logs.svg"]
 
 
 def test_the_figure_draws_the_truth_where_there_is_one():

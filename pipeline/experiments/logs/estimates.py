@@ -9,10 +9,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Bool, Float, Float32, Float64
 
 from pipeline.core.errors import CaptureError
 from pipeline.evaluation.metrics import score
+from pipeline.evaluation.scores import summarise
 
 WINDOW_S = 0.1  # assumed: windows whose means are compared with the start's
 QUIET_MIN_S = 0.5  # assumed: a shorter start gives no no-load reading to rely on
@@ -29,7 +31,7 @@ class Estimates:
     """What a log says, row by row; places and forces mean something in contact only."""
 
     t_s: Float64[np.ndarray, " f"]
-    answer: Float64[np.ndarray, "f 3"]  # x_mm, y_mm, F_N: mean over networks
+    answers: Float64[np.ndarray, "m f 3"]  # x_mm, y_mm, F_N of each network
     contact: Bool[np.ndarray, " f"]
     quiet_n: int
     noise_uT: float
@@ -51,8 +53,8 @@ def estimate_after(
     noise_uT = float(np.sqrt((db_uT[:quiet_n].astype(np.float64) ** 2).mean()))
     length_uT = np.linalg.norm(db_uT, axis=1)
     contact = length_uT > np.median(length_uT[:quiet_n]) + CONTACT_SDS * noise_uT
-    answer = np.stack([network(db_uT) for network in networks]).mean(axis=0, dtype=np.float64)
-    return Estimates(t_s, answer, contact, quiet_n, noise_uT)
+    answers = np.stack([network(db_uT) for network in networks]).astype(np.float64)
+    return Estimates(t_s, answers, contact, quiet_n, noise_uT)
 
 
 def quiet_start(t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"], *, where: str) -> int:
@@ -95,7 +97,7 @@ def contacts_n(contact: Bool[np.ndarray, " f"]) -> int:
 
 
 def describe(of: Estimates) -> dict[str, Any]:
-    """Say how long the log is, and what is in it."""
+    """Say how long the log is, and what is in it; the largest force is the mean of the networks' largest ones."""
     return {
         "rate_hz": 1 / step_s(of.t_s),
         "duration_s": float(of.t_s[-1] - of.t_s[0] + step_s(of.t_s)),
@@ -104,11 +106,14 @@ def describe(of: Estimates) -> dict[str, Any]:
         "noise_uT": of.noise_uT,
         "contact_readings_n": int(of.contact.sum()),
         "contacts_n": contacts_n(of.contact),
-    } | ({"force_max_N": float(of.answer[of.contact, 2].max())} if of.contact.any() else {})
+    } | ({"force_max_N": float(of.answers[:, of.contact, 2].max(axis=1).mean())} if of.contact.any() else {})
 
 
 def score_contacts(of: Estimates, true: Float64[np.ndarray, "f 3"]) -> dict[str, Any]:
-    """Score the readings found in contact; true rows are NaN where there is none, and count what was missed."""
+    """Score the readings found in contact; true rows are NaN where there is none, and count what was missed.
+
+    Each network is scored by itself: scores are the mean over networks, and `spread` holds their standard deviation.
+    """
     touched = np.isfinite(true[:, 2])
     both = of.contact & touched
     counts: dict[str, Any] = {
@@ -119,7 +124,11 @@ def score_contacts(of: Estimates, true: Float64[np.ndarray, "f 3"]) -> dict[str,
     }
     if counts["missed_readings_n"]:
         counts["missed_force_max_N"] = float(true[touched & ~of.contact, 2].max())
-    return counts | (score(true[both], of.answer[both]) if both.any() else {})
+    if not both.any():
+        return counts
+    stats = summarise(pd.DataFrame([score(true[both], answer[both]) for answer in of.answers]))
+    spread = {name: stat["sd"] for name, stat in stats.items() if "sd" in stat}
+    return counts | {name: stat["mean"] for name, stat in stats.items()} | ({"spread": spread} if spread else {})
 
 
 def truth_at(
@@ -135,10 +144,15 @@ def truth_at(
 
 
 def thin(of: Estimates, true: Float64[np.ndarray, "f 3"] | None) -> dict[str, Any]:
-    """Keep at most 1,500 readings of the series, evenly, for figures; None where there is no contact."""
+    """Keep at most 1,500 readings of the series, evenly, for figures; None where there is no contact.
+
+    `estimated` is what the first network answers; of several networks, `low` and `high` are the least and most.
+    """
     kept = np.unique(np.linspace(0, len(of.t_s) - 1, POINTS_MAX_N).astype(int))
-    answer = np.where(of.contact[:, None], of.answer, np.nan)[kept]
-    drawn: dict[str, Any] = {"t_s": np.round(of.t_s[kept], 3).tolist(), "estimated": _columns(answer)}
+    answers = np.where(of.contact[:, None], of.answers, np.nan)[:, kept]
+    drawn: dict[str, Any] = {"t_s": np.round(of.t_s[kept], 3).tolist(), "estimated": _columns(answers[0])}
+    if len(answers) > 1:
+        drawn |= {"low": _columns(answers.min(axis=0)), "high": _columns(answers.max(axis=0))}
     return drawn if true is None else drawn | {"true": _columns(true[kept])}
 
 

@@ -38,7 +38,7 @@ from pipeline.trials.networks import networks_without
 
 PITCHES_DEG = (0.0, 10.0, 20.0, 45.0)  # assumed: how far a shoe leans to either side, once a step
 PERIOD_S = 1.0  # assumed, for a log with fewer than two contacts
-TOLD = ("false_readings_n", "missed_readings_n", "mse_f_N2", "accuracy_pct")
+TOLD = ("false_readings_n", "missed_readings_n", "mse_f_N2", "accuracy_pct", "spread")
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,8 @@ from pipeline.reporting.work_precision import COLOURS
 MEANING = (  # {rate_hz} comes from the numbers
     "A log at {rate_hz:.0f} Hz with nothing but times and readings, as a board writes it to an SD card: a quiet start, "
     "then footfalls at random places. The quiet start is the no-load reading; contact is a change of field well above "
-    "its noise; places and forces are the mean of networks that never saw the board. Errors are over the readings "
+    "its noise; places and forces are answered by networks that never saw the board, each scored by itself: ± is the "
+    "standard deviation over {networks_n} network seeds. Errors are over the readings "
     "found in contact, against the truth that the simulator keeps. The board keeps its place: the earth's field is "
     "part of the no-load reading and stays as it is, which it does not in a dog's shoe or on a hand."
 )
@@ -22,7 +23,8 @@ TURNING = (
     "in the earth's field of {earth_uT:.0f} µT, walking north (the worst way); the angles are assumed. What changes "
     "of that field passes for contacts. As a remedy, one chip more, aside and of the same make and noise, is read with "
     "every frame, and its reading is taken off all others, turned as the board's design turns each chip. Errors are "
-    "over the readings found in contact that are: where more weak ones are found, the mean error of force falls."
+    "over the readings found in contact that are: where more weak ones are found, the mean error of force falls. ± is "
+    "the standard deviation over network seeds."
 )
 WAYS = {"as logged": None, "a chip's aside taken off": "reference_chip"}
 
@@ -51,7 +53,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     table = pd.DataFrame(
         [{"what": what, "ours": ours, "paper": theirs, "source": source} for what, ours, theirs in rows]
     )
-    table.attrs["meaning"] = MEANING.format(rate_hz=numbers["rate_hz"])
+    table.attrs["meaning"] = MEANING.format(**{name: numbers[name] for name in ("rate_hz", "networks_n")})
     return {"logs": table} | ({"logs_turning": _turning(numbers, source)} if "turning" in numbers else {})
 
 
@@ -88,12 +90,17 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
             for which, colour, width in (("estimated", COLOURS[1], 1.8), ("true", COLOURS[2], 0.9)):
                 if which in drawn:
                     axes.plot(t_s, np.array(drawn[which][name], float), color=colour, linewidth=width, label=which)
+            if "low" in drawn:
+                low, high = (np.array(drawn[which][name], float) for which in ("low", "high"))
+                words = f"range over {numbers['networks_n']} network seeds"
+                axes.fill_between(t_s, low, high, color=COLOURS[1], alpha=0.3, linewidth=0, label=words)
             axes.set_ylabel(label)
         panels[0].set_ylim(bottom=0)
         panels[1].set_ylim(-2, 18)  # the grid is 16 mm wide
         panels[2].set_ylim(-2, 18)
         panels[2].set_xlabel("time / s")
-        panels[0].legend(frameon=False, fontsize=9, ncols=2, loc="lower right", bbox_to_anchor=(1, 1))
+        handles, labels = panels[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
         panels[0].set_title(f"A log at {numbers['rate_hz']:.0f} Hz ({source})", loc="left", fontsize=11)
         return {"logs.svg": svg(figure)}
 
@@ -101,4 +108,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
 def _show(numbers: Mapping[str, Any], name: str) -> str:
     if name not in numbers:
         return "unknown"
-    return f"{numbers[name]}" if isinstance(numbers[name], int) else f"{numbers[name]:.3g}"
+    if isinstance(numbers[name], int):
+        return f"{numbers[name]}"
+    spread = numbers.get("spread", {})
+    return f"{numbers[name]:.3g}" + (f" ± {spread[name]:.2g}" if name in spread else "")
