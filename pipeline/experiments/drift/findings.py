@@ -192,7 +192,7 @@ def _overestimates(late: Row) -> Found:
     measured = (
         f"policy {late['policy']} after {late['contacts_n']:,} contacts: bias {late['bias_N']:+.3g} ± "
         f"{late['bias_se_N']:.2g} N ({late['bias_pct']:+.2g} %), standard error over {late['indentations_n']} "
-        f"indentations of the mean over {len(biases_N)} network(s); {gap}{Pairs({}, late['network_board']).bars}"
+        f"indentations, mean over {len(biases_N)} network(s); {gap}{Pairs({}, late['network_board']).bars}"
     )
     measured += f"; slope {late['slope']:.3g}"
     left_pct = late.get("force_left_pct")

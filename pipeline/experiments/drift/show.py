@@ -39,8 +39,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
             for metric in ("accuracy_pct", error):
                 line[f"{COLUMNS[metric]} ({words})"] = show(_stat(rows[i], metric))
         lines.append(line)
-    seeds = f"± is the sd over {numbers['skins_n']} skin(s) of {numbers['seeds_n']} seeds each."
-    spread = seeds if any(row["spread"] for _, rows in named.values() for row in rows) else "One network each."
+    spread = _spread(numbers)
     found = [
         {
             "finding (paper)": one["finding"], "holds": one["verdict"], **_of_trainings(one),
@@ -63,9 +62,28 @@ def _wander_table(numbers: Mapping[str, Any], source: str) -> pd.DataFrame:
         for policy, (words, _) in named.items():
             row = numbers["wander"][policy][i]
             line[f"no-load reading off by, µT ({words})"] = f"{row['noload_off_uT']:.3g}"
-            line |= {f"{COLUMNS[name]} ({words})": f"{row[name]:.3g}" for name in ("accuracy_pct", _error(numbers))}
+            line |= {f"{COLUMNS[name]} ({words})": show(_stat(row, name)) for name in ("accuracy_pct", _error(numbers))}
         lines.append(line)
-    return tabulate(lines, meaning=WALKED)
+    return tabulate(lines, meaning=WALKED, spread=_spread(numbers))
+
+
+def _spread(numbers: Mapping[str, Any]) -> str:
+    """Say over what ± is, which all rows of all policies share."""
+    [(_, rows), *_] = _policies(numbers).values()
+    seeds_n, skins_n = numbers["seeds_n"], numbers["skins_n"]
+    if not rows[0]["spread"]:
+        return "One network each."
+    if skins_n == 1:
+        return f"± is the sd over {seeds_n} network seeds, all tested on the same contacts."
+    return f"± is the sd over {skins_n} skins with {seeds_n} network seeds each."
+
+
+def _legend(numbers: Mapping[str, Any]) -> str:
+    """Say what the lines of a figure differ in, and what their bars are."""
+    spread = _spread(numbers)
+    return (
+        f"no-load reading; {spread.removesuffix('.').replace('± is', 'bars:')}" if "±" in spread else "no-load reading"
+    )
 
 
 def _of_trainings(one: Mapping[str, Any]) -> dict[str, str]:
@@ -107,7 +125,7 @@ def _scores(numbers: Mapping[str, Any], source: str) -> str:
         axes.set_yscale("log")
         figure.axes[0].set_ylim(0, 102)
         names = figure.axes[0].get_legend_handles_labels()
-        figure.legend(*names, loc="outside lower center", ncols=3, frameon=False, title="no-load reading")
+        figure.legend(*names, loc="outside lower center", ncols=3, frameon=False, title=_legend(numbers))
         figure.suptitle(f"Trained on first contacts, tested on later ones ({source})", x=0.01, ha="left", fontsize=11)
         return svg(figure)
 
@@ -119,8 +137,9 @@ def _wander_figure(numbers: Mapping[str, Any], source: str) -> str:
             for policy, (words, _) in _policies(numbers).items():
                 i, rows = POLICIES.index(policy), numbers["wander"][policy]
                 steps_uT = [row["step_uT"] for row in rows]
-                look = {"color": COLOURS[i], "marker": MARKERS[i], "markersize": 5, "linewidth": 1.2, "label": words}
-                axes.plot(steps_uT, [row[metric] for row in rows], **look)
+                bars = [row["spread"].get(metric, 0.0) for row in rows] if rows[0]["spread"] else None
+                look = {"color": COLOURS[i], "marker": MARKERS[i], "markersize": 5, "linewidth": 1.2, "capsize": 2}
+                axes.errorbar(steps_uT, [row[metric] for row in rows], bars, label=words, **look)
             least_uT = min((step for step in steps_uT if step > 0), default=1.0)
             axes.set_xscale("symlog", linthresh=least_uT)
             axes.set(xlabel="further random walk / µT a contact", ylabel=COLUMNS[metric].replace(", ", " / "))
@@ -129,7 +148,7 @@ def _wander_figure(numbers: Mapping[str, Any], source: str) -> str:
         axes.set_yscale("log")
         figure.axes[0].set_ylim(0, 102)
         names = figure.axes[0].get_legend_handles_labels()
-        figure.legend(*names, loc="outside lower center", ncols=3, frameon=False, title="no-load reading")
+        figure.legend(*names, loc="outside lower center", ncols=3, frameon=False, title=_legend(numbers))
         last_n = next(iter(_policies(numbers).values()))[1][-1]["contacts_n"]
         title = f"After {last_n:,} contacts, if the field at rest wandered more ({source})"
         figure.suptitle(title, x=0.01, ha="left", fontsize=11)
@@ -148,7 +167,9 @@ def _forces(late: Mapping[str, Any], points: Mapping[str, Sequence[float]], sour
         said = (
             f"bias {late['bias_N']:+.3g} ± {late['bias_se_N']:.1g} N ({late['bias_pct']:+.2g} %)\n"
             f"slope {late['slope']:.3g}, {late['indentations_n']:,} indentations\n"
-            f"no-load reading: policy {late['policy']}"
+            f"no-load reading: policy {late['policy']}\n"
+            f"means over {len(late['network_bias_N'])} network(s)\n"
+            "points: first seed"
         )
         axes.text(0.03, 0.97, said, transform=axes.transAxes, va="top", fontsize=10)
         axes.legend(loc="lower right", frameon=False)

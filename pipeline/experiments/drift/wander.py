@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from scipy.constants import micro
 
 from pipeline.core.executors import device
@@ -17,6 +18,7 @@ from pipeline.core.seeds import rng_for
 from pipeline.dataset.baseline import rank
 from pipeline.dataset.windows import Part
 from pipeline.evaluation.metrics import METRICS, score
+from pipeline.evaluation.scores import summarise
 from pipeline.learning.inputs import VIEW
 from pipeline.learning.trial import Trained, Trial
 from pipeline.physics.wear import wandering
@@ -34,7 +36,7 @@ def walked(readings: Readings, step_uT: float, *, after_n: int, seed: int) -> Re
 def over_steps(
     networks: Sequence[tuple[Trial, Trained, int]], steps_uT: Sequence[float], parts_at: Callable[[float], list[Part]]
 ) -> dict[str, list[dict[str, Any]]]:
-    """Give for each policy a row for each step: scores of the last window, mean over skins and seeds.
+    """Give for each policy a row for each step: scores of the last window, mean and sd (`spread`) over skins and seeds.
 
     `networks` stand beside the index of the part that each was last tested on; `parts_at` lays the parts anew.
     """
@@ -48,8 +50,10 @@ def over_steps(
             scores.setdefault(part.policy, []).append(score(part.rows.target, _answer(trial, trained, part)))
             off_uT.setdefault(part.policy, []).append(part.noload_off_uT)
         for policy, own in scores.items():
-            means = {name: float(np.mean([one[name] for one in own])) for name in METRICS if name in own[0]}
+            stats = summarise(pd.DataFrame(own)[[name for name in METRICS if name in own[0]]])
+            means = {name: stat["mean"] for name, stat in stats.items()}
             row = {"step_uT": step_uT, "noload_off_uT": float(np.mean(off_uT[policy])), "n": len(own), **means}
+            row["spread"] = {name: stat["sd"] for name, stat in stats.items() if "sd" in stat}
             rows.setdefault(policy, []).append(row)
     return rows
 

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int, Int64, Shaped
 from pipeline.core.schema import Readings
 from pipeline.dataset.baseline import rank, subtract
 from pipeline.evaluation.metrics import METRICS, score
-from pipeline.evaluation.scores import board_means, summarise
+from pipeline.evaluation.scores import board_means, summarise, with_seeds
 
 LATE_CONTACTS_N = 45_000  # paper figure 5b: "after 45,000 interactions"
 FORCE = 2  # column of a target
@@ -41,7 +41,7 @@ class Answers:
 
 @dataclass(frozen=True)
 class Contacts:
-    """One point an indentation: the means of its readings, and over networks; where no force is known there is none."""
+    """One point an indentation: the means of its readings; where no force is known there is none."""
 
     skin: Shaped[np.ndarray, " n"]
     true_N: Float[np.ndarray, " n"]
@@ -88,12 +88,12 @@ def boards_of(answers: Sequence[Answers], policy: str) -> list[str]:
 
 
 def last_window(answers: Sequence[Answers], policy: str) -> dict[str, Any]:
-    """Summarise the scores of the last window over boards."""
+    """Summarise the scores of the last window over boards; `sd_seeds` is over the networks of one skin."""
     last_i = max(one.window_i for one in answers)
     own = [one for one in answers if (one.policy, one.window_i) == (policy, last_i)]
     contacts_n = round(float(np.mean([one.contacts_n for one in own])))
     rows = pd.DataFrame([{"board": one.board, "skin": one.skin, **score_window(one)} for one in own])
-    return {"contacts_n": contacts_n, **summarise(board_means(rows), boards=True)}
+    return {"contacts_n": contacts_n, **with_seeds(summarise(board_means(rows), boards=True), rows, "board", "skin")}
 
 
 def late_window(rows: Sequence[dict[str, Any]]) -> int:
@@ -103,9 +103,9 @@ def late_window(rows: Sequence[dict[str, Any]]) -> int:
 
 
 def by_contact(answers: Sequence[Answers]) -> Contacts:
-    """Take the readings of an indentation together, and the networks that were asked of it: they are not independent.
+    """Take the readings of an indentation together: they are not independent.
 
-    All answers are of one window.
+    All answers are of one window, each of one skin and one network.
     """
     skin = np.concatenate([np.full(len(one.indentation), one.skin) for one in answers])
     indentation = np.concatenate([one.indentation for one in answers])
@@ -158,17 +158,22 @@ def force_left(early: Readings, late: Readings) -> float | None:
 def late_force(
     answers: Sequence[Answers], policy: str, window_i: int
 ) -> tuple[dict[str, Any], dict[str, list[float]]] | None:
-    """Give the force bias of one window, of its mean network and of each, and its points to draw.
+    """Give the force bias of one window, mean over seeds, that of each network, and the first seed's points to draw.
 
     None if fewer than two contacts have a known force.
     """
     own = [one for one in answers if (one.policy, one.window_i) == (policy, window_i)]
-    contacts = by_contact(own)
-    if len(contacts.true_N) < 2:
+    seeds = sorted({one.seed_i for one in own})
+    contacts = [by_contact([one for one in own if one.seed_i == seed_i]) for seed_i in seeds]
+    if len(contacts[0].true_N) < 2:
         return None
+    biases = [force_bias(one) for one in contacts]
+    # The indentations are the same for every seed, so that their standard error is not less for several.
+    means = {name: float(np.mean([one[name] for one in biases])) for name in biases[0]}
+    means["indentations_n"] = biases[0]["indentations_n"]
     each_N = [force_bias(by_contact([one]))["bias_N"] for one in own]
     networks = {"network_bias_N": each_N, "network_board": [one.board for one in own]}
-    return force_bias(contacts) | networks, points(contacts)
+    return means | networks, points(contacts[0])
 
 
 def points(contacts: Contacts) -> dict[str, list[float]]:

@@ -174,7 +174,7 @@ def test_measured_sentences_hold_the_numbers_of_the_run():
     assert offset.startswith("Mean over windows: MSE_xy is 0.215 mm² with regular ones, 1.75 with a single no-load")
     assert "MSE_F is 0.00315 against 0.00215 N²" in third
     assert "bias +0.02 ± 0.0007 N (+1.7 %)" in late
-    assert "1000 indentations of the mean over 3 network(s); +0.02 [+0.018, +0.022] N ([low, high]" in late
+    assert "1000 indentations, mean over 3 network(s); +0.02 [+0.018, +0.022] N ([low, high]" in late
     assert "98.1 % of its early force" in late
 
 

@@ -18,7 +18,7 @@ def numbers(force: bool = True, spread: bool = True, **changed) -> dict:
         policies[policy] = [{"contacts_n": n, **metrics, "spread": deviation} for n in (5000, 10_000)]
     late = {
         "policy": "regular", "contacts_n": 45_000, "bias_N": 0.0157, "bias_pct": 1.3, "bias_se_N": 8e-4, "slope": 1.01,
-        "indentations_n": 1000,
+        "indentations_n": 1000, "network_bias_N": [0.01, 0.0214],
     }  # fmt: skip
     found = [
         {"finding": "errors grow", "holds": True, "verdict": "yes", "of_trainings": "yes", "measured": "They do."},
@@ -88,6 +88,13 @@ def test_the_pace_of_the_capture_stands_below_and_a_simulated_one_is_said_to_be_
     assert "When the contacts were is not known." in to_markdown(tables(unknown, "recorded")["drift"])
 
 
+def test_the_spread_is_said_to_be_over_network_seeds_and_over_skins_where_there_are_several():
+    said = to_markdown(tables(numbers(), "simulated")["drift"])
+    assert "± is the sd over 2 network seeds, all tested on the same contacts." in said
+    said = to_markdown(tables(numbers(skins_n=4), "recorded")["drift"])
+    assert "± is the sd over 4 skins with 2 network seeds each." in said
+
+
 def test_one_network_has_no_spread_and_says_so():
     said = to_markdown(tables(numbers(spread=False), "simulated")["drift"])
     assert "One network each" in said
@@ -108,6 +115,7 @@ def test_figures_are_svg_with_units_source_and_the_stated_bias():
         assert "(simulated)" in text
     for word in ("accuracy / %", "MSE_F / N²", "contacts the skin has felt", "every 390 indentations"):
         assert word in drawn["drift.svg"]
+    assert "bars: the sd over 2 network seeds" in drawn["drift.svg"]
     for word in ("true force / N", "predicted force / N", "bias +0.0157 ± 0.0008 N (+1.3 %)", "45,000 contacts"):
         assert word in drawn["drift_force.svg"]
 
@@ -115,14 +123,22 @@ def test_figures_are_svg_with_units_source_and_the_stated_bias():
 def test_a_further_walk_has_a_row_and_a_mark_for_every_step_and_none_where_it_was_not_asked():
     steps = {
         policy: [
-            {"step_uT": step, "noload_off_uT": 3 * step, "n": 2, "accuracy_pct": 90 - step, "mse_f_N2": 0.01 + step}
+            {
+                "step_uT": step,
+                "noload_off_uT": 3 * step,
+                "n": 2,
+                "accuracy_pct": 90 - step,
+                "mse_f_N2": 0.01 + step,
+                "spread": {"accuracy_pct": 1.5, "mse_f_N2": 0.001},
+            }
             for step in (0.0, 0.5, 5.0)
         ]
         for policy in ("initial", "regular", "each")
     }
     table = tables(numbers(wander=steps), "simulated")["drift_wander"]
     assert table["further walk, µT a contact"].tolist() == ["0", "0.5", "5"]
-    assert table["accuracy, % (once at the start)"].tolist() == ["90", "89.5", "85"]
+    assert table["accuracy, % (once at the start)"].tolist() == ["90 ± 1.5", "89.5 ± 1.5", "85 ± 1.5"]
+    assert "± is the sd over 2 network seeds" in to_markdown(table)
     assert "After 10,000 contacts, if" in figures(numbers(wander=steps), DRAWN, "simulated")["drift_wander.svg"]
     assert "drift_wander" not in tables(numbers(), "simulated")
     assert "drift_wander.svg" not in figures(numbers(), DRAWN, "simulated")

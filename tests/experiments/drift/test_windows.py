@@ -15,6 +15,7 @@ from pipeline.experiments.drift.windows import (
     field_sizes,
     force_bias,
     force_left,
+    last_window,
     late_force,
     late_window,
     of_networks,
@@ -64,7 +65,7 @@ def test_late_is_the_first_window_after_45000_contacts_or_else_the_last():
 
 
 def test_the_bias_is_what_scipy_finds_over_indentations_and_not_over_readings():
-    own = [answers(seed_i=0), answers(seed_i=1), answers(skin="s1")]
+    own = [answers(), answers(skin="s1")]
     true_N, predicted_N = [], []
     for skin in ("s0", "s1"):
         for press in range(20):
@@ -134,6 +135,24 @@ def test_the_late_force_has_a_bias_for_every_network_whose_mean_is_the_bias():
     errors_N = [float((one.predicted - one.true)[:, 2].mean()) for one in own]
     assert numbers["network_bias_N"] == pytest.approx(errors_N, abs=1e-6)  # float32 newtons
     assert numbers["bias_N"] == pytest.approx(np.mean(errors_N), abs=1e-6)
+
+
+def test_each_seed_has_its_own_late_force_and_the_points_are_those_of_the_first():
+    high, low = answers(seed_i=0, bias_N=0.3), answers(seed_i=1, bias_N=-0.3)
+    numbers, drawn = late_force([low, high], "each", 0)
+    alone = [force_bias(by_contact([one])) for one in (high, low)]
+    for name in ("bias_N", "bias_pct", "bias_se_N", "slope"):
+        assert numbers[name] == pytest.approx(np.mean([one[name] for one in alone]))
+    assert numbers["indentations_n"] == 20
+    assert drawn == points(by_contact([high]))  # and not those of the mean network
+
+
+def test_the_last_window_has_its_spread_over_seeds_on_each_skin():
+    own = [answers(skin=skin, seed_i=seed_i) for skin in ("s0", "s1") for seed_i in (0, 1, 2)]
+    mse_N2 = np.array([score(one.true, one.predicted)["mse_f_N2"] for one in own]).reshape(2, 3)
+    found = last_window(own, "each")["mse_f_N2"]
+    assert found["sd_seeds"] == pytest.approx(mse_N2.std(axis=1, ddof=1).mean())
+    assert found["mean"] == pytest.approx(mse_N2.mean())
 
 
 def timed(indentation: list, t_s: list):
