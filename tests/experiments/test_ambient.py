@@ -142,6 +142,10 @@ def test_arms_are_put_together_over_the_boards_that_they_were_tried_on():
         "mean": 70.0, "n": 2, "sd": pytest.approx(np.sqrt(200)), "ci95": interval([60.0, 80.0]),
     }  # fmt: skip
     assert rows[1]["b"]["accuracy_pct"] == {"mean": 50.0, "n": 1}
+    again = [point("b0", "a", 84.0, field_uT=5.0), point("b1", "a", 60.0, field_uT=5.0)]  # of other seeds
+    both = by_step([*points, *again], "field_uT", ["b0", "b1"])[1]["a"]["accuracy_pct"]
+    assert (both["mean"], both["n"]) == (71.0, 2)  # boards
+    assert both["sd_seeds"] == pytest.approx(np.sqrt(8) / 2)
     (iron,) = by_step(points, "distance_mm", ["b0", "b1"])
     assert iron["field_uT"] == pytest.approx(np.sqrt(12.5))
     assert by_step(points, "field_uT", ["b0"])[1]["a"]["accuracy_pct"]["mean"] == 80.0

@@ -15,8 +15,9 @@ def rows(boards_n):
 
 
 NUMBERS = {
-    "arms": {"a": "as it is", "b": "a chip more", "c": "trained anew"}, "boards_n": 3, "directions": "random",
-    "earth_uT": 50.0, "earth_dip_deg": 66.0, "iron_radius_mm": 10.0, **rows(3), "last_board": {"board": "b2"} | rows(1),
+    "arms": {"a": "as it is", "b": "a chip more", "c": "trained anew"}, "boards_n": 3, "seeds_n": 2,
+    "directions": "random", "earth_uT": 50.0, "earth_dip_deg": 66.0, "iron_radius_mm": 10.0, **rows(3),
+    "last_board": {"board": "b2"} | rows(1),
 }  # fmt: skip
 
 

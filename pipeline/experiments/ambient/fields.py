@@ -14,7 +14,7 @@ from jaxtyping import Float, Float32, Int64
 from scipy.constants import micro, milli
 from scipy.spatial.transform import Rotation
 
-from pipeline.evaluation.scores import summarise
+from pipeline.evaluation.scores import summarise, with_seeds
 from pipeline.physics.ambient import EARTH_T, ball_field, ball_images, directions
 from pipeline.physics.board import Board, BoardDesign, draw_board
 from pipeline.physics.skin import Skin
@@ -123,17 +123,21 @@ def one_a_poke(
 
 
 def by_step(points: Sequence[dict[str, Any]], case: str, boards: Sequence[str]) -> list[dict[str, Any]]:
-    """Summarise scores over boards: a row a step of the `case`, in it each arm (of the boards that it was tried on)."""
-    own = [point for point in points if case in point and point["board"] in boards]
+    """Summarise scores over boards: a row a step of the `case`, in it each arm (of the boards that it was tried on).
+
+    Each point is one network's; `sd_seeds` is the standard deviation over the networks of one board, mean over boards.
+    """
+    of_case = [point for point in points if case in point and point["board"] in boards]
     rows = []
-    for step in sorted({point[case] for point in own}):
-        here = [point for point in own if point[case] == step]
+    for step in sorted({point[case] for point in of_case}):
+        here = [point for point in of_case if point[case] == step]
         row: dict[str, Any] = {case: step}
         for size, name in (("rms_uT", "field_uT"), ("aside_rms_uT", "aside_field_uT")):
             if size in here[0]:
                 row[name] = float(np.sqrt(np.mean([point[size] ** 2 for point in here])))
         for arm in dict.fromkeys(point["arm"] for point in here):
-            row[arm] = summarise(pd.DataFrame([point["scores"] for point in here if point["arm"] == arm]), boards=True)
+            own = pd.DataFrame([{"board": point["board"], **point["scores"]} for point in here if point["arm"] == arm])
+            row[arm] = with_seeds(summarise(own.groupby("board").mean(), boards=True), own, "board")
         rows.append(row)
     return rows
 

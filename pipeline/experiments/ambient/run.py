@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import pandas as pd
 from pydantic import Field
 from scipy.constants import micro
 
@@ -76,7 +75,7 @@ def networks_of_common_part(
 def on_board(
     data: SceneData, fold: Fold, section: Ambient, *, of: Synthesis, instrument: Instrument, networks: Networks
 ) -> Iterator[dict[str, Any]]:
-    """Score every arm that has networks in every field, on one reading of each of the board's held-out pokes."""
+    """Score every network of every arm in every field, on one reading of each of the board's held-out pokes."""
     test = one_a_poke(data.rows.indentation, fold.test, rng_for(data.settings.seed, "ambient", fold.name, "pokes"))
     db_uT, true = data.rows.db_uT[test], data.rows.target[test]
     off = without_common_part(instrument.turn)
@@ -92,8 +91,8 @@ def on_board(
     ):
         for arm, trained in networks.items():
             shown = arms[arm](case).astype(np.float32)
-            scores = pd.DataFrame([score(true, network(shown)) for network in trained]).mean().to_dict()
-            yield {"board": fold.name, "arm": arm, **case.words, "scores": scores}
+            for network in trained:
+                yield {"board": fold.name, "arm": arm, **case.words, "scores": score(true, network(shown))}
 
 
 def _iron(
@@ -135,6 +134,7 @@ def ambient(scene: str, files: Files, folds: Path, indentations: Path, models: P
             OWN: "the uniform field that fits a board's own chips best is taken off, in training as in use",
         },
         "boards_n": len(boards),
+        "seeds_n": trained.seeds_n,
         "directions": "a random one for each poke",
         "earth_uT": EARTH_SIZE_T / micro,
         "earth_dip_deg": EARTH_DIP_DEG,

@@ -39,8 +39,8 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
         f"lies right above the skin's middle, in the earth's field ({numbers['earth_uT']:g} µT, dipping "
         f"{numbers['earth_dip_deg']:g}°) and the skin's own. {meanings}. The last arm is trained for board "
         f"{last['board']} alone: compare arms there. [low, high] is the 95 % interval over held-out boards (Student's "
-        "t). The paper gives no number "
-        "(section 7: future work)."
+        f"t); ± (seeds) the standard deviation over {numbers['seeds_n']} network seeds on one board, mean over boards. "
+        "The paper gives no number (section 7: future work)."
     )
     return {"ambient": table}
 

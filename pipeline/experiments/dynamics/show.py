@@ -17,7 +17,7 @@ MEANING = (
     "of the last five readings is the paper's protocol at rest; in a press the five see different depths. Against the "
     "force of its middle reading the same mean shows what of its error is lag: an answer that comes two frames late. "
     "Presses of one duration differ from those of another in depth and place too: compare the ways, at each duration. "
-    f"± is the sd over networks; all presses are on one board. {VERDICTS}"
+    f"± is the sd over network seeds; all presses are on one board. {VERDICTS}"
 )
 WAYS = {"one": "each reading alone", "mean5": "mean of the last five", "mean5_of_middle": "the same, two frames late"}
 LESS = "less force error than each reading alone, N²"  # column

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Float, Float32, Float64
 from pydantic import Field
 
@@ -20,7 +21,7 @@ from pipeline.core.seeds import rng_for
 from pipeline.core.stage import run, say
 from pipeline.dataset.baseline import subtract
 from pipeline.dataset.grid import CENTRE_MM
-from pipeline.evaluation.scores import statistic
+from pipeline.evaluation.scores import summarise, with_seeds
 from pipeline.experiments.answer import read_folder, read_losses, write_answer
 from pipeline.experiments.logs.estimates import CONTACT_SDS
 from pipeline.experiments.sensitivity.run import levels_of
@@ -93,19 +94,20 @@ def finger_of(capture: Readings, weight_N: Float64[np.ndarray, " p"]) -> Finger:
 
 
 def feedbacks(finger: Finger, networks: Sequence[Answers], press: Press) -> Iterator[tuple[str, str, Forces]]:
-    """Name who estimates the force, what was done with the known press, and the estimate."""
+    """Name who estimates the force, what was done with the known press, and the estimate; each network by itself."""
     nothing = load_universal().zero(finger.noload_uT[None])
     labelled = load_universal().zero(finger.noload_uT[None])
     labelled.label(np.full((1, 2), CENTRE_MM), np.array([press.force_N]), press.b_uT[None])
 
-    def by_networks(b_uT: Float[np.ndarray, "r ch"]) -> Float[np.ndarray, " r"]:
-        db_uT = (b_uT - finger.noload_uT).astype(np.float32)
-        return np.stack([network(db_uT)[:, 2] for network in networks]).mean(axis=0, dtype=np.float64)
-
-    for who, forces in (("networks", by_networks), ("map", _by_map(nothing))):
+    by_networks = [("networks", _by_network(network, finger.noload_uT)) for network in networks]
+    for who, forces in (*by_networks, ("map", _by_map(nothing))):
         yield who, "none", forces
         yield who, "factor", _scaled(forces, press)
     yield "map", "label", _by_map(labelled)
+
+
+def _by_network(network: Answers, noload_uT: Float64[np.ndarray, " ch"]) -> Forces:
+    return lambda b_uT: network((b_uT - noload_uT).astype(np.float32))[:, 2].astype(np.float64)
 
 
 def _by_map(universal: Universal) -> Forces:
@@ -136,18 +138,25 @@ def grip(
     return np.array(held_N)
 
 
-def judge(runs: Mapping[str, Float64[np.ndarray, "f r"]], aim_N: float) -> dict[str, Any]:
-    """Say how far true forces were from the aim, over the runs of all boards, once settled."""
-    off = {board: held_N[round(SETTLED_S * RATE_HZ) :] / aim_N - 1 for board, held_N in runs.items()}
-    every = np.concatenate(list(off.values()), axis=1)
-    by_board_pct = [100 * np.abs(one).mean() for one in off.values()]
+def judge(runs: Mapping[str, Sequence[Float64[np.ndarray, "f r"]]], aim_N: float) -> dict[str, Any]:
+    """Say how far true forces were from the aim, over the runs of all boards and estimators, once settled.
+
+    `runs` are those of each estimator (network seed) on each board; `sd_seeds` is the standard deviation over the
+    estimators of one board, mean over boards.
+    """
+    off = {board: [one[round(SETTLED_S * RATE_HZ) :] / aim_N - 1 for one in own] for board, own in runs.items()}
+    every = np.concatenate([one for own in off.values() for one in own], axis=1)
+    rows = pd.DataFrame(
+        [{"board": board, "error_pct": 100 * np.abs(one).mean()} for board, own in off.items() for one in own]
+    )
+    error = with_seeds(summarise(rows.groupby("board").mean(), boards=True), rows, "board")["error_pct"]
     return {
         "runs_n": every.shape[1],
         "held_pct": 100 * float((np.abs(every.mean(axis=0)) < WITHIN).mean()),
         "always_pct": 100 * float((np.abs(every) < WITHIN).all(axis=0).mean()),
         "median_error_pct": 100 * float(np.median(np.abs(every).mean(axis=0))),
         "worst_error_pct": 100 * float(np.abs(every).mean(axis=0).max()),
-        "error_pct": statistic(by_board_pct, boards=True),
+        "error_pct": error,
     }
 
 
@@ -157,21 +166,25 @@ def answer_of(
     """Hold each force with each feedback, on every skin."""
     rows, drawn = [], []
     for aim_N in how.aims_N:
-        runs: dict[tuple[str, str], dict[str, Float64[np.ndarray, "f r"]]] = {}
+        runs: dict[tuple[str, str], dict[str, list[Float64[np.ndarray, "f r"]]]] = {}
         for finger in fingers:
             rng = rng_for(seed, "gripper", finger.board, f"{aim_N:g}")
             known_uT = finger.read(np.full(READINGS_N, aim_N), rng).mean(axis=0)
             for who, press, forces in feedbacks(finger, networks[finger.board], Press(aim_N, known_uT)):
-                runs.setdefault((who, press), {})[finger.board] = grip(finger, forces, aim_N, how, rng)
+                held_N = grip(finger, forces, aim_N, how, rng)
+                runs.setdefault((who, press), {}).setdefault(finger.board, []).append(held_N)
         for (who, press), by_board in runs.items():
             words = {"aim_N": aim_N, "feedback": who, "press": press}
             rows.append(words | judge(by_board, aim_N))
-            mean_N = np.concatenate([held[round(SETTLED_S * RATE_HZ) :].mean(axis=0) for held in by_board.values()])
+            mean_N = np.concatenate(
+                [held_N[round(SETTLED_S * RATE_HZ) :].mean(axis=0) for own in by_board.values() for held_N in own]
+            )
             drawn.append(words | {"off_pct": np.round(100 * (mean_N / aim_N - 1), 2).tolist()})
     return {
         "rows": rows,
         "within_pct": 100 * WITHIN,
         "skins_n": len(fingers),
+        "seeds_n": max(len(own) for own in networks.values()),
         "rate_hz": RATE_HZ,
         **how.model_dump(mode="json"),
     }, {"rows": drawn}

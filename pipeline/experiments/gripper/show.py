@@ -16,7 +16,8 @@ MEANING = (
     "and answers from 0.55 N on. The known press is one of the aimed force at the place where the object is then held: "
     "as a factor it scales all estimates, as a label the map learns from it. Judged is the true force from one second "
     "on: held is a run whose mean force lies within {within_pct:g} % of the aim, always one that never leaves that "
-    "band; an error is the mean of a run's. [low, high]: 95 % interval over boards."
+    "band; an error is the mean of a run's. [low, high]: 95 % interval over boards. Each of {seeds_n} networks a board "
+    "holds by itself; ± (seeds): standard deviation over {seeds_n} network seeds on one board, mean over boards."
 )
 PRESSES = {"none": "no", "factor": "as a factor", "label": "as a label"}
 
@@ -67,4 +68,5 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
 
 def _interval(stat: Mapping[str, Any]) -> str:
     low_high = f" [{stat['ci95'][0]:.1f}, {stat['ci95'][1]:.1f}]" if "ci95" in stat else ""
-    return f"{stat['mean']:.1f}{low_high}"
+    seeds = f" ± {stat['sd_seeds']:.1f} (seeds)" if "sd_seeds" in stat else ""
+    return f"{stat['mean']:.1f}{low_high}{seeds}"
