@@ -31,6 +31,8 @@ def test_every_method_is_a_row_that_says_its_source_and_that_the_paper_has_no_nu
     assert set(table["source"]) == {"simulated"}
     assert set(table["paper"]) == {"none: a demonstration"}
     assert table["seeds"].tolist() == ["1", "2", "1"]
+    assert "±" in table["accuracy, %"][1]
+    assert "network seeds that column `seeds` counts" in table.attrs["spread"]
     assert float(table["median error, mm"][0]) == pytest.approx(
         numbers["median_error_mm"]["mean"], rel=5e-3
     )  # 3 digits

@@ -206,6 +206,27 @@ def test_another_commit_machine_and_time_change_only_provenance_and_run_times(st
     assert {"ci/runtime/index.html", "ci/runtime/stages.md", "ci/runtime/quadratures.svg"} <= changed
 
 
+def test_numbers_of_single_boards_rest_on_several_network_seeds_and_show_their_spread(story):
+    numbers = json.loads((story / "reports/ci/numbers.json").read_text())
+    for question in ("manual", "flexible"):
+        assert numbers[question]["seeds_n"] == 2
+        assert all("sd_seeds" in numbers[question][arm]["accuracy_pct"] for arm in ("before", "after", "control"))
+        assert "sd_seeds" in numbers[question]["paired"]["after_minus_before"]["accuracy_pct"]
+    assert numbers["shear"]["seeds_n"] == numbers["drift"]["seeds_n"] == numbers["logs"]["networks_n"] == 2
+    assert all("sd_seeds" in numbers["shear"][name] for name in ("mse_xy_mm2", "mse_fxy_N2", "mse_fz_N2"))
+    assert "mse_f_N2" in numbers["logs"]["spread"]
+    assert {"mean", "sd", "n"} == set(numbers["sleeve"]["accuracy_pct"])
+    assert numbers["sleeve"]["accuracy_pct"]["n"] == 2
+    for policy in ("initial", "regular", "each"):
+        assert all("mse_f_N2" in row["spread"] for row in numbers["drift"][policy] + numbers["drift"]["wander"][policy])
+    for name in ("manual", "flexible", "shear", "ambient", "gripper"):
+        assert "(seeds)" in (story / f"reports/ci/tables/{name}.md").read_text()
+    for name in ("manual", "flexible", "shear", "ambient", "gripper", "logs", "sleeve", "drift", "drift_wander"):
+        table = (story / f"reports/ci/tables/{name}.md").read_text()
+        assert "±" in table
+        assert re.search("over (2 |the )?network seeds", table)
+
+
 def test_every_row_of_the_checklist_finds_its_number_and_its_files(story):
     reports = story / "reports/ci"
     numbers = json.loads((reports / "numbers.json").read_text())
@@ -263,7 +284,7 @@ def test_there_is_one_parquet_file_a_capture_with_units(story):
 def test_a_score_is_what_a_naive_loop_over_the_held_out_readings_finds(story):
     card = json.loads((story / "data/models/ci/train_multi/lobo.paper.b1.seed0.json").read_text())
     predictions = pq.read_table(story / "data/models/ci/train_multi/predictions.parquet").to_pylist()
-    own = [row for row in predictions if row["fold"] == "b1"]
+    own = [row for row in predictions if (row["fold"], row["seed_i"]) == ("b1", 0)]
     truths = []
     for skin in ("b1_s0", "b1_s1"):
         for reading in pq.read_table(story / f"data/indentations/ci/{skin}.parquet").to_pylist():

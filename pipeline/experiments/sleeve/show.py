@@ -17,7 +17,7 @@ from pipeline.reporting.work_precision import COLOURS
 PLACES = {"median_error_mm": "median error, mm", "p95_error_mm": "95 % within, mm"}
 PARTS = {"near_seam": "median near a border of boards, mm", "inside": "median elsewhere, mm"}
 NO_NUMBER = "none: a demonstration"
-SPREAD = "± is the standard deviation over seeds."
+SPREAD = "± is the standard deviation over the network seeds that column `seeds` counts."
 NAMES = {"knn-raw": "k nearest neighbours (dB)", "knn-shape": "k nearest neighbours (shape of dB)"}
 NETWORK = "the paper's network"
 
@@ -53,7 +53,8 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
         bar.ax.tick_params(labelsize=9)
         axes.set(xlabel="y / mm", ylabel="x / mm", aspect="equal")
         median = show(numbers["median_error_mm"])
-        title = f"Held-out pokes over {numbers['chips_n']} chips ({source}): median error {median} mm"
+        over = f"over {numbers['median_error_mm']['n']} network seeds"
+        title = f"Held-out pokes over {numbers['chips_n']} chips ({source})\nmedian error {median} mm {over}"
         figure.suptitle(title, x=0.01, ha="left", fontsize=10)
         figure.legend(loc="outside lower left", ncols=3, frameon=False, fontsize=9)
         return {"sleeve.svg": svg(figure)}

@@ -76,7 +76,7 @@ def test_a_drifting_skin_is_answered_in_every_window_and_a_single_no_load_readin
     answer = io.read_json(scene["answer"])
     numbers = answer["numbers"]
     assert {name: numbers[name] for name in ("skins_n", "seeds_n", "train_n", "left_out_units_n")} == {
-        "skins_n": 1, "seeds_n": 1, "train_n": 100, "left_out_units_n": 0,
+        "skins_n": 1, "seeds_n": 2, "train_n": 100, "left_out_units_n": 0,
     }  # fmt: skip
     for policy in ("initial", "regular", "each"):
         assert [row["contacts_n"] for row in numbers[policy]] == [100, 200, 300]
@@ -90,9 +90,10 @@ def test_a_drifting_skin_is_answered_in_every_window_and_a_single_no_load_readin
     assert last["initial"] > 2 * max(last["regular"], last["each"])
     assert numbers["late"]["force_left_pct"] == pytest.approx(100)  # this skin does not soften
     assert numbers["late"]["indentations_n"] == len(answer["drawn"]["late"]["true_N"]) == 30
-    assert len(numbers["late"]["network_bias_N"]) == 1
-    judged = {(one["verdict"], one["of_trainings"]) for one in numbers["findings"]}
-    assert judged == {("inconclusive (one board)", "inconclusive")}  # one network each
+    assert len(numbers["late"]["network_bias_N"]) == 2
+    assert all(row["spread"]["mse_xy_mm2"] > 0 for policy in off_uT for row in numbers[policy])
+    assert all(numbers["last_window"][policy]["mse_xy_mm2"]["sd_seeds"] > 0 for policy in off_uT)
+    assert {one["verdict"] for one in numbers["findings"]} == {"inconclusive (one board)"}
     # Whatever is subtracted under a policy, a contact changes the field by what a reading before it shows.
     db_uT = capture("s0-wear").b_uT - capture("s0-wear").noload_uT
     assert numbers["field"]["contact_uT"] == pytest.approx(np.sqrt(np.mean(db_uT.astype(float) ** 2)), rel=1e-6)
@@ -106,6 +107,7 @@ def test_a_drifting_skin_is_answered_in_every_window_and_a_single_no_load_readin
     for policy, (still, _) in numbers["wander"].items():
         last = {name: numbers[policy][-1][name] for name in ("accuracy_pct", "mse_xy_mm2", "noload_off_uT")}
         assert {name: still[name] for name in last} == pytest.approx(last)
+        assert still["spread"]["mse_xy_mm2"] == pytest.approx(numbers[policy][-1]["spread"]["mse_xy_mm2"])
     assert numbers["wander"]["each"][1]["mse_xy_mm2"] == pytest.approx(numbers["each"][-1]["mse_xy_mm2"], rel=1e-3)
 
 
