@@ -111,7 +111,10 @@ class Universal:
 
         What it learnt of a skin before is forgotten; `keep` the pokes and labels where the same skin has drifted.
         """
-        self._noload_uT = learnt_rows_of(b_uT).mean(axis=0)
+        noload_uT = learnt_rows_of(b_uT)
+        if not len(noload_uT):
+            raise SchemaError("zero", "readings without contact", "one or more", 0, "Read the board before a touch.")
+        self._noload_uT = noload_uT.mean(axis=0)
         rest_uT = to_board(self._noload_uT[None])[0]
         return self._take(replace(self._shown, rest_uT=rest_uT) if keep else Shown(rest_uT))
 
@@ -177,7 +180,7 @@ class Universal:
     def estimates(self, b_uT: Float[np.ndarray, "*f ch"], tempers: Sequence[float]) -> list[Estimate]:
         """Give the same under some tempers: only standard deviations differ."""
         db_uT, told = self._change(b_uT), self._ready()
-        parts = [told.estimates(db_uT[i : i + BLOCK_N], tempers) for i in range(0, len(db_uT), BLOCK_N)]
+        parts = [told.estimates(db_uT[i : i + BLOCK_N], tempers) for i in range(0, max(len(db_uT), 1), BLOCK_N)]
         found = [joined(of_temper) for of_temper in zip(*parts, strict=True)]
         return [replace(one, place_mm=one.place_mm + CENTRE_MM) for one in found]
 

@@ -224,3 +224,11 @@ def test_what_no_skin_was_told_is_not_taken_from_a_file(skin, tmp_path):
         load_universal(file)
     with pytest.raises(SchemaError, match="a saved skin must be at most 1,048,576 bytes"):
         load_universal(FILE)
+
+
+def test_no_rows_give_no_answers_and_cannot_zero():
+    model = load_universal()
+    assert model.predict(np.empty((0, 15))).shape == (0, 3)
+    assert len(model.estimate(np.empty((0, 15))).place_mm) == 0
+    with pytest.raises(SchemaError, match="readings without contact must be one or more; got 0"):
+        model.zero(np.empty((0, 15)))
