@@ -21,6 +21,7 @@ from pipeline.capture.readers.chips import find_whole_rows
 from pipeline.capture.readers.passes import find_passes
 from pipeline.capture.readers.table import (
     SAME_PLACE_mm,
+    WEAKEST_uT,
     check_columns,
     check_depths,
     check_fields,
@@ -46,6 +47,8 @@ FIRST_LINE_N = 2  # of a CSV file: the first row of numbers
 EMPTY = ("", "nan", "NaN")
 STEMS = {"f", "fx", "fy", "fz", "force", "depth", "x", "y", "t", "time", "indent", "indentation", "press", "pass"}
 
+
+SUBTRACTED_PART = 0.5  # assumed: of the field in contact, at the chip that reads most
 
 Account = dict[str, int]
 
@@ -166,6 +169,7 @@ def _check(
     contact: Bool[np.ndarray, " f"],
     where: str,
 ) -> None:
+    _refuse_subtracted(b_uT, contact, where)
     check_fields(b_uT, where, first_line_n=FIRST_LINE_N)
     check_places(np.stack([numbers["x_mm"], numbers["y_mm"]], axis=1)[contact], where)
     if "depth_mm" in numbers:
@@ -177,6 +181,21 @@ def _check(
     if "Fz_N" in numbers and np.median(numbers["Fz_N"][contact]) < 0:
         got = f"{np.median(numbers['Fz_N'][contact]):.4g} N"
         raise CaptureError(where, "the usual Fz_N in contact", "positive", got, "Turn its sign.")
+
+
+def _refuse_subtracted(b_uT: Float64[np.ndarray, "f ch"], contact: Bool[np.ndarray, " f"], where: str) -> None:
+    """Raise if fields are weak, and weakest without contact: a baseline was subtracted already.
+
+    In other units both shrink alike: a skin's field at rest is larger than what a press changes of it.
+    """
+    chips_uT = np.linalg.norm(b_uT.reshape(len(b_uT), -1, 3), axis=2)
+    if np.median(chips_uT) >= WEAKEST_uT or contact.all() or not contact.any():
+        return
+    rest_uT, pressed_uT = (float(np.median(chips_uT[rows].max(axis=1))) for rows in (~contact, contact))
+    if rest_uT < SUBTRACTED_PART * pressed_uT:
+        got = f"{rest_uT:.3g} uT at most in no-load rows beside {pressed_uT:.3g} uT in contact"
+        remedy = "A baseline seems to be subtracted already: write the raw fields of both phases."
+        raise CaptureError(where, "raw fields", "those of the skin at rest, not changes", got, remedy)
 
 
 def _number_presses(

@@ -28,6 +28,9 @@ MAGNITUDE_MAX = 1e10
 def read_cells(path: Path, where: str, *, separator: str | None) -> list[list[str]]:
     """Split a text file into cells, one list a line and all of one length; `None` splits at any white space."""
     text = _read_text(path, where)
+    if separator == "," and ";" in text.partition("\n")[0]:
+        remedy = "Export it with commas between columns and points in numbers."
+        raise CaptureError(where, "columns", "separated by commas", "semicolons in line 1", remedy)
     cells = [line.split(separator) for line in text.removesuffix("\n").split("\n")]
     for line_i, row in enumerate(cells):
         if len(row) != len(cells[0]):

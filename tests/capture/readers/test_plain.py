@@ -208,3 +208,20 @@ def test_channels_that_are_constant_throughout_are_named(tmp_path):
     rows["Bz0"], rows["Bz1"] = 12.5, 0.0
     rows.to_csv(tmp_path / plain.CSV, index=False)
     assert "one value throughout for Bz of chip 0 (12.5 uT), Bz of chip 1 (0 uT)" in complaint_of(tmp_path)
+
+
+def test_fields_with_a_baseline_subtracted_are_called_that_and_not_another_unit(tmp_path):
+    rows, columns = table(presses_n=2), plain.columns_of(CHIPS_N)[3:9]
+    fields_uT = rows[columns].to_numpy()
+    rest = (rows["phase"] == "noload").to_numpy()
+    rows[columns] = (fields_uT - fields_uT[rest].mean(axis=0)) / 5
+    rows.to_csv(tmp_path / plain.CSV, index=False)
+    assert "A baseline seems to be subtracted already" in complaint_of(tmp_path)
+    rows[columns] = fields_uT / 1000
+    rows.to_csv(tmp_path / plain.CSV, index=False)
+    assert "Convert mT or G to uT" in complaint_of(tmp_path)
+
+
+def test_semicolons_with_decimal_commas_are_named(tmp_path):
+    table().to_csv(tmp_path / plain.CSV, index=False, sep=";", decimal=",")
+    assert "must be separated by commas; got semicolons in line 1" in complaint_of(tmp_path)
