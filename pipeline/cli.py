@@ -244,14 +244,15 @@ def check_cache() -> None:
 
 @app.command()
 def readme(check: Annotated[bool, Option("--check", help="Only tell whether it is up to date.")] = False) -> None:
-    """Fill in the generated parts of README.md and docs from the results of the scenes that run."""
+    """Fill in the generated parts of README.md and docs from the results in reports, whichever scenes run."""
     root = checkout()
     from pipeline.documenting import fill_pages
 
-    changed = fill_pages(root, list(checked_plan().scenes), write=not check)
+    changed, shown = fill_pages(root, write=not check)
     if check and changed:
         typer.echo(f"behind reports and dvc.yaml: {', '.join(changed)}; run: reskin readme", err=True)
         sys.exit(1)
+    typer.echo(f"rewritten: {', '.join(changed) or 'nothing'}; results shown: scenes {', '.join(shown)}")
 
 
 @scenes.command("list")

@@ -1,9 +1,8 @@
-"""README.md and docs: their generated parts, filled in from the results of all scenes. In: reports. Out: pages.
+"""Fill in the generated parts of README.md and docs from the results in `reports/`.
 
-Refuses to know what a part says (`reporting.readme`).
+The scenes that `dvc repro` runs make no difference. Knows no wording of a part (`reporting.readme`).
 """
 
-from collections.abc import Sequence
 from pathlib import Path
 
 from pipeline.core import config, io
@@ -13,19 +12,26 @@ from pipeline.reporting.numbers import join
 from pipeline.reporting.readme import blocks_of, fill
 
 TIMED = "reports/time.json"  # what `make time-repro` measured
-FULL_SIZE = "paper"  # the scene whose results are shown first, where it was run
+FULL_SIZE, HEADLINE = "paper", "quick"  # the simulated scenes that the pages show; README begins with the second
 
 
-def fill_pages(root: Path, running: Sequence[str], *, write: bool) -> list[str]:
-    """Fill in all pages, and write them if asked to; name those that differ from what was written."""
-    if not running:
-        raise ParamsError(config.PLAN, "scenes", "one or more", "none", "Try: reskin scenes use quick")
+def fill_pages(root: Path, *, write: bool) -> tuple[list[str], list[str]]:
+    """Fill in all pages, and write them if `write`; return the pages that change, and the scenes that they show.
+
+    The pages show the simulated scenes `paper` and `quick`, and every recorded scene with results in `reports/`.
+    """
     files = sorted((root / "reports").glob("*/numbers.json"))
     numbers = {
         file.parent.name: join(io.read_json(file), io.read_json(file.with_name("provenance.json"))) for file in files
     }
+    for name in (FULL_SIZE, HEADLINE):
+        if name not in numbers:
+            raise ParamsError(
+                f"reports/{name}/numbers.json is missing, and README.md and docs show its results. "
+                f"Restore it: git restore reports/{name}"
+            )
     recorded = [result for result in numbers.values() if result["provenance"]["source"] == "recorded"]
-    results = [numbers[name] for name in dict.fromkeys([FULL_SIZE, running[0]]) if name in numbers]
+    results = [numbers[name] for name in (FULL_SIZE, HEADLINE)]
     timed = io.read_json(root / TIMED) if (root / TIMED).exists() else None
     texts = [root / "README.md", *sorted((root / "docs").glob("*.md"))]
     before = {str(file): file.read_text(encoding="utf-8") for file in texts}
@@ -33,4 +39,4 @@ def fill_pages(root: Path, running: Sequence[str], *, write: bool) -> list[str]:
     changed = [page for page in after if after[page] != before[page]]
     for page in changed if write else ():
         io.write_text(Path(page), after[page])
-    return changed
+    return changed, [result["provenance"]["scene"] for result in (*results, *recorded)]

@@ -1,12 +1,14 @@
 import re
+import shutil
 import subprocess
 
 import pytest
 
+from pipeline.core import io
 from pipeline.core.config import read_yaml
 from pipeline.reporting.readme import blocks_of
 from tests.reporting.synthetic import all_questions
-from tests.stages.checkout import ROOT, run
+from tests.stages.checkout import ROOT, copy_checkout, run
 
 OWN = ["reports", "params.yaml", "data/captures.yaml", "dvc.yaml", "README.md", "docs"]
 
@@ -19,6 +21,39 @@ def test_the_readme_shows_what_the_committed_results_say():
         pytest.skip("this checkout has results or scenes of its own; `reskin readme` would show those")
     done = run(ROOT, "reskin", "readme", "--check", check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_the_pages_show_the_same_scenes_whichever_scene_runs(tmp_path):
+    root = copy_checkout(tmp_path)
+    for file in (ROOT / "reports").glob("*/numbers.json"):
+        (root / "reports" / file.parent.name).mkdir(exist_ok=True)
+        shutil.copy(file, root / "reports" / file.parent.name)
+    run(root, "reskin", "readme")
+    pages = [root / "README.md", *(root / "docs").glob("*.md")]
+    before = [page.read_bytes() for page in pages]
+
+    run(root, "reskin", "scenes", "use", "ci")
+    numbers = all_questions()
+    io.write_json(root / "reports/ci/numbers.json", numbers | {"provenance": numbers["provenance"] | {"scene": "ci"}})
+    said = run(root, "reskin", "readme").stdout
+    assert [page.read_bytes() for page in pages] == before
+    assert said.startswith("rewritten: nothing; results shown: scenes paper, quick, ")
+
+    (root / "reports/paper/numbers.json").unlink()
+    failed = run(root, "reskin", "readme", check=False)
+    assert failed.returncode == 2
+    assert "reports/paper/numbers.json is missing" in failed.stderr
+
+
+def test_what_was_rewritten_is_said_with_the_scenes_shown(tmp_path):
+    root = copy_checkout(tmp_path)
+    for name in ("quick", "paper"):
+        (root / "reports" / name).mkdir()
+        shutil.copy(ROOT / "reports" / name / "numbers.json", root / "reports" / name)
+    readme = root / "README.md"
+    readme.write_text(re.sub(r"(<!-- headline -->\n).*?(<!-- /headline)", r"\1\2", readme.read_text(), flags=re.DOTALL))
+    said = run(root, "reskin", "readme").stdout
+    assert re.fullmatch(r"rewritten: README\.md, .*; results shown: scenes paper, quick\n", said)
 
 
 def test_the_readme_links_the_code_of_every_stage():

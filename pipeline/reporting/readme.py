@@ -41,7 +41,7 @@ def blocks_of(
 ) -> dict[str, str]:
     """Make the blocks: results beside the paper's, skins beside recorded ones, the stages and their code.
 
-    The last of `results` is the scene that runs: its scores come first, and its skins are compared.
+    The last of `results` is the headline scene: README shows its scores, and its skins are compared.
     """
     labels = [_results(numbers, ("labels",)) for numbers in recorded if "labels" in numbers]
     compared = [_results(numbers, COMPARED) for numbers in recorded if "compare" in numbers]
