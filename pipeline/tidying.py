@@ -1,7 +1,7 @@
-"""What switched-off questions left behind. In: dvc.lock, the plan. Out: stages and their files, removed when told.
+"""Find and remove what switched-off questions left behind in this checkout.
 
-Of scenes that run only: what another scene made may have taken hours, and it may run again. Refuses to know what a
-file holds.
+Only of scenes in the plan: the outputs of another scene may have taken hours, and it may run again. Knows no content of
+a file.
 """
 
 from collections.abc import Iterable, Mapping
@@ -20,7 +20,10 @@ LOCK = "dvc.lock"
 
 
 def left_over(root: Path, plan: Plan) -> dict[str, list[Path]]:
-    """List stages that ran and are not planned any more, and the files that only they wrote, by stage."""
+    """List stages that ran here and are not planned any more, and the files that only they wrote, by stage.
+
+    dvc.lock is committed, and so also lists stages that ran only elsewhere: those have no output here.
+    """
     if not (root / LOCK).exists():
         return {}
     stages: Mapping[str, Any] = read_yaml(root / LOCK).get("stages", {})
@@ -30,7 +33,9 @@ def left_over(root: Path, plan: Plan) -> dict[str, list[Path]]:
     return {
         name: [root / path for path in _outs(stage) if not _touches(path, kept)]
         for name, stage in stages.items()
-        if name not in planned and _scene_of(name, known) in plan.scenes
+        if name not in planned
+        and _scene_of(name, known) in plan.scenes
+        and any((root / path).exists() for path in _outs(stage))
     }
 
 

@@ -71,6 +71,11 @@ def test_a_question_that_is_asked_leaves_nothing_over(root):
     assert set(tidying.left_over(root, plan.check(root))) == {"simulate@one-gone"}
 
 
+def test_a_stage_of_dvc_lock_that_ran_only_elsewhere_is_not_named(root):
+    (root / WRITTEN["drift@one"]).unlink()
+    assert set(tidying.left_over(root, plan.check(root))) == {"simulate@one-gone"}
+
+
 def test_a_checkout_that_never_ran_has_nothing_over(root):
     (root / tidying.LOCK).unlink()
     assert tidying.left_over(root, plan.check(root)) == tidying.tidy(root, plan.check(root)) == {}
