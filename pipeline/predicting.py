@@ -127,15 +127,29 @@ def read_models(files: Sequence[Path]) -> Sequence[Network] | Universal:
     return load_universal(skins[0])
 
 
+def _remedy(model: Path) -> str:
+    """Say how to get a model file that is missing; stages write them to data/models/SCENE/STAGE."""
+    if there := sorted(file.name for file in model.parent.glob("*.safetensors")):
+        return f"Models in its folder: {', '.join(there[:3])}{', ...' if there[3:] else ''}"
+    if model.parts[-5:-3] != ("data", "models"):
+        return "Give the path of a trained .safetensors file."
+    scene = model.parts[-3]
+    return (
+        f"Scene {scene} writes it: in the checkout, run `reskin scenes use {scene}` and then `make repro`, which takes "
+        "from the cache what was computed there before."
+    )
+
+
 def read_network(model: Path) -> Network:
     """Read a model and the card beside it; raise if it does not answer x, y and F from changes of field."""
     card_file = model.with_suffix(".json")
     if model.is_file() and is_shown(model):
         remedy = "Load it with reskin.load_universal."
         raise ParamsError(model, "the model", "a trained network", "a saved skin", remedy)
-    for file, what in ((model, "the model"), (card_file, "the card beside the model")):
-        if not file.is_file():
-            raise ParamsError(file, what, "there", "nothing", "Give --model a trained .safetensors file.")
+    if not model.is_file():
+        raise ParamsError(f"{model}: model file not found. {_remedy(model)}")
+    if not card_file.is_file():
+        raise ParamsError(f"{card_file}: card of the model not found. Copy it with its .safetensors file.")
     content = io.read_json(card_file)
     form = content.get("format") if isinstance(content, dict) else None
     if form != FORMAT:

@@ -17,6 +17,7 @@ from pipeline.core.errors import CaptureError, ReskinError
 from pipeline.core.seeds import rng_for
 from pipeline.learning.model import draw_weights, paper_layers
 from pipeline.predicting import predict
+from reskin import load_model
 from tests.capture.headers import make_header
 
 RATE_HZ, QUIET_N, TOUCHED_N = 250.0, 400, 100
@@ -118,7 +119,7 @@ def test_what_does_not_fit_is_refused_and_nothing_is_written(tmp_path, model):
     four.mkdir()
     refusals = [
         (write_log(four, chips_n=4), model, out, "channels must be the 15 of the model; got 12"),
-        (log, tmp_path / "other.safetensors", out, "the model must be there"),
+        (log, tmp_path / "other.safetensors", out, r"model file not found. Models in its folder: model\.safetensors"),
         (log, model, log, "the file to write must be another than the log, the model and its card"),
         (log, model, model, "the file to write must be another"),
         (log, model, model.with_suffix(".json"), "the file to write must be another"),
@@ -173,8 +174,23 @@ def test_a_card_that_is_no_card_is_refused(tmp_path, model):
 
 def test_a_model_without_its_card_is_refused(tmp_path, model):
     model.with_suffix(".json").unlink()
-    with pytest.raises(ReskinError, match="the card beside the model must be there"):
+    with pytest.raises(ReskinError, match=r"model\.json: card of the model not found"):
         predict(write_log(tmp_path), model, tmp_path / "out.csv")
+
+
+@pytest.mark.parametrize(
+    ("path", "remedy"),
+    [
+        (
+            "data/models/quick/train_multi/lobo.paper.b0.seed0.safetensors",
+            "`reskin scenes use quick` and then `make re",
+        ),
+        ("mine/one.safetensors", "Give the path of a trained"),
+    ],
+)
+def test_a_model_that_is_missing_says_which_scene_writes_it(tmp_path, path, remedy):
+    with pytest.raises(ReskinError, match=f"model file not found.*{remedy}"):
+        load_model(tmp_path / path)
 
 
 def test_a_log_that_begins_in_contact_is_refused(tmp_path, model):
