@@ -1,24 +1,27 @@
-"""Which stage of all this is, and how long the rest may take. In: DVC's order of stages, the costs of earlier runs.
+"""Tell which stage of `dvc repro` runs, and how long the rest may take.
 
-Out: a line. Refuses to know what a stage does, and decides nothing.
+A time is given only where every stage that is left ran in this checkout with the settings that its scene has now. Knows
+no stage by name, and decides nothing.
 """
 
 import hashlib
+import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from pipeline.core import io
-from pipeline.core.config import FLOW, PLAN, read_yaml
+from pipeline.core.config import FLOW, PLAN, Files, read_yaml
 from pipeline.core.provenance import COSTS, home, read_costs
 
 VARIABLE = "DVC_STAGE"  # where DVC tells a command which stage it runs, as `simulate@quick-wear`
 ORDER = Path(".reskin/order.json")
-AROUND_S = 1.5  # assumed: what passes around a stage's own work: its start and imports, DVC's bookkeeping
+AROUND_S = 3.0  # a stage's start and imports, and DVC's bookkeeping: 117 s of 39 stages of scene quick, 4 busy cores
 
 
 def announce() -> str | None:
-    """Tell which stage of how many this is and how long the rest may take; None where it is not DVC that runs it."""
+    """Tell which stage of how many this is and how long the rest may take; None if DVC does not run it."""
     stage = os.environ.get(VARIABLE, "").rpartition(":")[2]  # `dvc.yaml:` stands before it where there are more files
     if not stage:
         return None
@@ -30,21 +33,31 @@ def announce() -> str | None:
 
 
 def describe(stage: str, order: Sequence[str], took_s: Mapping[str, float]) -> str:
-    """Compose the line: `order` names all stages as DVC runs them, `took_s` how long each took when it ran last.
+    """Compose the line: `order` names all stages as DVC runs them, `took_s` those whose time is known.
 
     >>> describe("b@x", ["code", "b@x", "c@x"], {"b@x": 57.0, "c@x": 120.0})
-    'stage 2 of 3; about 3 min left if none is skipped'
+    'stage 2 of 3; at most about 3 min left, as it took here with these settings'
     >>> describe("b@x", ["code", "b@x", "c@x"], {"c@x": 120.0})
-    'stage 2 of 3; about 2 min left if none is skipped, and 1 that never ran'
+    'stage 2 of 3'
     """
     at = order.index(stage)
-    left = [took_s[name] for name in order[at:] if name in took_s]
-    if not left:
-        return f"stage {at + 1} of {len(order)}"
-    minutes = max((sum(left) + AROUND_S * len(left)) / 60, 1)
-    unknown_n = len(order) - at - len(left)
-    beside = f", and {unknown_n} that never ran" if unknown_n else ""
-    return f"stage {at + 1} of {len(order)}; about {minutes:.0f} min left if none is skipped{beside}"
+    place, left = f"stage {at + 1} of {len(order)}", order[at:]
+    if any(name not in took_s for name in left):
+        return place
+    minutes = max(sum(took_s[name] + AROUND_S for name in left) / 60, 1)
+    return f"{place}; at most about {minutes:.0f} min left, as it took here with these settings"
+
+
+def settings_of(scene: str) -> str:
+    """Hash all settings that decide what a scene costs: its file, params.yaml, and its items in the plan."""
+    files = Files.of(scene)
+    stages = read_yaml(files.plan)["stages"]
+    items = {stage: [item for item in of.values() if item["scene"] == scene] for stage, of in stages.items()}
+    return _hash([read_yaml(files.settings), read_yaml(files.params), items])
+
+
+def _hash(values: Any) -> str:
+    return hashlib.sha256(json.dumps(values, sort_keys=True, default=str).encode()).hexdigest()
 
 
 def stages_in_order() -> list[str]:
@@ -68,21 +81,18 @@ def _ask_dvc() -> list[str]:
 
 
 def read_seconds(order: Sequence[str]) -> dict[str, float]:
-    """Read how long stages took when they ran last, here or else where the committed results were made.
+    """Read how long stages took here when they last ran, of those whose scene still has the settings of that run.
 
-    Half of what their trainings took when computed, if that is more: of two side by side, and some may be reused.
+    If trainings of that run were taken from an earlier one, the time without them is not known: all trainings are added
+    up, as if one ran after another.
     """
     found: dict[str, float] = {}
     for scene in read_yaml(Path(PLAN))["scenes"]:
-        committed = Path("reports") / scene / "provenance.json"
-        stages = io.read_json(committed)["runtime"]["stages"] if committed.exists() else {}
-        costs = {unit: cost for unit, cost in stages.items() if "computed_s" in cost}  # of older code: without
-        took_s = {unit: max(cost["seconds"], cost["computed_s"] / 2) for unit, cost in costs.items()}
+        settings = settings_of(scene)
         for unit, cost in read_costs(home() / COSTS / scene).items():
-            took_s[unit] = max(cost["seconds"], sum(cost["trainings_s"].values()) / 2)
-        for name in order:
-            stage, _, key = name.partition("@")
-            if key == scene or key.startswith(f"{scene}-"):
-                unit = stage + key.removeprefix(scene)
-                found |= {name: took_s[unit]} if unit in took_s else {}
+            stage, _, part = unit.partition("-")
+            name = f"{stage}@{scene}-{part}" if part else f"{stage}@{scene}"
+            if name in order and cost.get("settings") == settings:
+                computed_s = cost["other_s"] + sum(cost["trainings_s"].values())
+                found[name] = computed_s if cost["reused_n"] else cost["seconds"]
     return found

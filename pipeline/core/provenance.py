@@ -119,8 +119,10 @@ def note_trainings(folder: Path, stage: str, trained: Mapping[str, tuple[float, 
     )
 
 
-def note_cost(folder: Path, stage: str, seconds: float) -> None:
+def note_cost(folder: Path, stage: str, seconds: float, settings: str | None = None) -> None:
     """Keep what a stage cost beside the pipeline, never in an output: it differs between identical runs.
+
+    `settings` is a hash of the settings that it ran with.
 
     A stage that does not run, or that DVC restores, keeps the cost that it had when it ran.
     """
@@ -133,6 +135,7 @@ def note_cost(folder: Path, stage: str, seconds: float) -> None:
         folder / f"{stage}.json",
         {
             "seconds": round(seconds, 2),
+            "settings": settings,
             # Side by side they took less than their sum; what else passed meanwhile, as imports, counts here.
             "other_s": round(max(seconds - min(trained["waited_s"], fresh_s), 0.0), 2),
             "trainings_s": computed_s,

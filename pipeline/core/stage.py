@@ -14,7 +14,7 @@ from pipeline.core.config import Files
 from pipeline.core.errors import ReskinError
 from pipeline.core.executors import end_workers
 from pipeline.core.machine import explaining
-from pipeline.core.progress import announce
+from pipeline.core.progress import announce, settings_of
 from pipeline.core.provenance import COSTS, begin_cost, note_cost
 
 
@@ -30,13 +30,14 @@ def run(work: Callable[..., None]) -> None:
     arguments |= {name: Files.of(arguments["scene"]) for name, kind in kinds.items() if kind is Files}
     if place := announce():
         say(f"{stage}: {place}")
+    settings = settings_of(arguments["scene"]) if place else None  # read now: they may be edited while it runs
     start_s, costs, unit = time.monotonic(), COSTS / arguments["scene"], _unit(stage, arguments)
     try:
         with explaining(stage):
             begin_cost(costs, unit)
             work(**arguments)
             end_workers()
-            note_cost(costs, unit, time.monotonic() - start_s)
+            note_cost(costs, unit, time.monotonic() - start_s, settings)
     except ReskinError as error:
         say(f"error: {error}")
         sys.exit(error.exit_code)
@@ -44,7 +45,9 @@ def run(work: Callable[..., None]) -> None:
 
 def _unit(stage: str, arguments: Mapping[str, Any]) -> str:
     """Name what ran: some stages run for each recorded capture, or for each protocol's folder."""
-    of = {"ingest": "indentations", "ingest_simulated": "indentations", "describe": "indentations", "simulate": "raw"}
+    if stage == "ingest":
+        return f"{stage}-{arguments['indentations'].stem}"
+    of = {"ingest_simulated": "indentations", "describe": "indentations", "simulate": "raw"}
     if stage not in of:
         return stage
     part = arguments[of[stage]].stem.removeprefix(arguments["scene"]).strip("-")
