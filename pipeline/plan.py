@@ -6,7 +6,7 @@ know what a stage does.
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from pipeline.core.errors import ParamsError
 from pipeline.params import OnBoards, Plan, Scene, read_plan, read_scene
 from pipeline.questions import EXPERIMENTS, LEARNING, MAIN_PROTOCOL, NOT_INGESTED, QUESTIONS, TABLE_2, stages
 from pipeline.registry import Registry, read_registry
-from pipeline.running import need_rest
+from pipeline.running import LOCKS, need_rest
 
 HEADER = """\
 # Which scenes run, what they ask, and what each stage of dvc.yaml takes. Written by `reskin scenes use` and `add`
@@ -221,6 +221,22 @@ def use(root: Path, names: Sequence[str]) -> None:
     with io.replacing(root / PLAN) as temporary, temporary.open("w", encoding="utf-8") as stream:
         stream.write(HEADER)
         yaml.dump(document, stream)
+    _keep_outputs(root)
+
+
+def _keep_outputs(root: Path) -> None:
+    """Let the outputs of scenes that leave the plan stay in the working tree.
+
+    DVC lists the outputs that it wrote; `dvc checkout`, `dvc exp run` and `dvc exp apply` delete those that no stage of
+    the current plan writes. Outputs that are not listed are left alone.
+    """
+    if not (root / LOCKS).is_dir():  # DVC has not run here
+        return
+    from dvc.exceptions import DvcException  # late: DVC takes a second
+    from dvc.repo import Repo
+
+    with suppress(DvcException), Repo(str(root)) as repo:  # where DVC does not start, it deletes nothing either
+        repo.state.links.clear()
 
 
 def check(root: Path) -> Plan:

@@ -14,6 +14,7 @@ from pipeline.questions import EXPERIMENTS
 from pipeline.registry import Entry, Registry
 from pipeline.stages._report import asking as read_asking
 from tests.scenes import SHARED, asking, recorded, settings
+from tests.stages.checkout import copy_checkout, run
 
 ROOT = Path(__file__).resolve().parents[1]
 ENTRY = Entry(board="b", skin="s", layout="lab", chips_n=5, fingerprints=("0",), copy_of=None)
@@ -205,3 +206,21 @@ def test_a_scene_that_cannot_be_simulated_is_refused_before_anything_runs(tmp_pa
     with pytest.raises(ParamsError, match=sentence):
         plan.use(root, ["one"])
     assert (root / config.PLAN).read_text() == before
+
+
+STAND_IN = """\
+for out; do :; done  # the last argument: what a stage writes
+mkdir -p "$out"
+touch "$out/simulate"  # of stage code: the digest that stage simulate depends on
+"""
+
+
+def test_dvc_checkout_keeps_the_outputs_of_scenes_that_left_the_plan(tmp_path):
+    root = copy_checkout(tmp_path)
+    (root / "pipeline/run.sh").write_text(STAND_IN)
+    run(root, "reskin", "scenes", "use", "ci")
+    run(root, "dvc", "repro", "simulate@ci")
+    run(root, "reskin", "scenes", "use", "quick")
+    run(root, "dvc", "repro", "simulate@quick")
+    run(root, "dvc", "checkout", check=False)  # it fails: other stages of quick never ran
+    assert sorted(path.name for path in (root / "data/raw").iterdir() if path.is_dir()) == ["ci", "quick"]
