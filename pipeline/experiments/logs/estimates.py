@@ -9,12 +9,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from jaxtyping import Bool, Float, Float32, Float64
 
 from pipeline.core.errors import CaptureError
 from pipeline.evaluation.metrics import score
-from pipeline.evaluation.scores import summarise
 
 WINDOW_S = 0.1  # assumed: windows whose means are compared with the start's
 QUIET_MIN_S = 0.5  # assumed: a shorter start gives no no-load reading to rely on
@@ -126,9 +124,14 @@ def score_contacts(of: Estimates, true: Float64[np.ndarray, "f 3"]) -> dict[str,
         counts["missed_force_max_N"] = float(true[touched & ~of.contact, 2].max())
     if not both.any():
         return counts
-    stats = summarise(pd.DataFrame([score(true[both], answer[both]) for answer in of.answers]))
-    spread = {name: stat["sd"] for name, stat in stats.items() if "sd" in stat}
-    return counts | {name: stat["mean"] for name, stat in stats.items()} | ({"spread": spread} if spread else {})
+    scores = [score(true[both], answer[both]) for answer in of.answers]
+    of_networks = {name: np.array([one[name] for one in scores]) for name in scores[0]}
+    spread = {name: float(values.std(ddof=1)) for name, values in of_networks.items()} if len(scores) > 1 else {}
+    return (
+        counts
+        | {name: float(values.mean()) for name, values in of_networks.items()}
+        | ({"spread": spread} if spread else {})
+    )
 
 
 def truth_at(
