@@ -23,7 +23,7 @@ SETTINGS = [ROOT / "params.yaml", *sorted((ROOT / "pipeline/scenes").glob("*.yam
 NAMED = {"recipes", "adaptations", "labellings", "boards", "protocols", "variants", "rules"}  # below: names of rows
 
 # Names of rows, boards, captures, stages: no key with a meaning of its own.
-NAME = re.compile(r".* .*|[0-9]+|[bf][0-9]|board[0-9].*|(ingest|simulate).*|knn-.*|shape|released")
+NAME = re.compile(r".* .*|[0-9]+|[bf][0-9](_s[0-9].*)?|board[0-9].*|(ingest|simulate).*|knn-.*|shape|released")
 
 
 def words_of(page: str) -> set[str]:

@@ -36,7 +36,7 @@ def describe(stage: str, order: Sequence[str], took_s: Mapping[str, float]) -> s
     """Compose the line: `order` names all stages as DVC runs them, `took_s` those whose time is known.
 
     >>> describe("b@x", ["code", "b@x", "c@x"], {"b@x": 57.0, "c@x": 120.0})
-    'stage 2 of 3; at most about 3 min left, as it took here with these settings'
+    'stage 2 of 3; at most about 3 min left, by what it took here with these settings'
     >>> describe("b@x", ["code", "b@x", "c@x"], {"c@x": 120.0})
     'stage 2 of 3'
     """
@@ -45,7 +45,7 @@ def describe(stage: str, order: Sequence[str], took_s: Mapping[str, float]) -> s
     if any(name not in took_s for name in left):
         return place
     minutes = max(sum(took_s[name] + AROUND_S for name in left) / 60, 1)
-    return f"{place}; at most about {minutes:.0f} min left, as it took here with these settings"
+    return f"{place}; at most about {minutes:.0f} min left, by what it took here with these settings"
 
 
 def settings_of(scene: str) -> str:

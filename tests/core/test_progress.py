@@ -67,7 +67,7 @@ def test_a_second_run_with_the_same_settings_says_what_the_first_took(checkout, 
     assert run_all(monkeypatch) == PLACES
     (checkout / "pipeline/scenes/tiny.yaml").write_text("steps_n: 100 # the same number\n")
     left_min = [41, 31, 1]
-    basis = "as it took here with these settings"
+    basis = "by what it took here with these settings"
     assert run_all(monkeypatch) == [
         f"{place}; at most about {minutes} min left, {basis}" for place, minutes in zip(PLACES, left_min, strict=True)
     ]
