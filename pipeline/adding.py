@@ -5,7 +5,7 @@ layouts (`preparing`, `capture.readers`) and stages (`plan`).
 """
 
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from pipeline.core import config, io
 from pipeline.core.errors import CaptureError, ReskinError
 from pipeline.core.stage import say
 from pipeline.dataset.captures import check_losses, open_capture
+from pipeline.dataset.orientation import other_orientation, presses_of
 from pipeline.params import Scene, read_plan, read_scene, read_shared
 from pipeline.preparing import Prepared
 from pipeline.registry import REGISTRY, read_registry, with_capture, without_capture, write_registry
@@ -24,6 +25,7 @@ from pipeline.running import need_rest
 
 RAW = "data/raw"
 INDENTATIONS = "data/indentations"
+COMPARED_N = 3  # captures of the scene, the last ones, with which the places of a new one are compared
 
 
 def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Header:
@@ -51,6 +53,8 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
         plan.use(root, [*read_plan(root / config.PLAN).scenes, scene])
     if "compare" in (settings.model_extra or {}):
         _warn_of_departures(target, settings, shared["skin"], decisions)
+    else:
+        _warn_of_other_labels(target, list(before.captures.get(scene, {})), decisions)
     return complete
 
 
@@ -104,6 +108,21 @@ def _warn_of_departures(folder: Path, scene: Scene, skin: Mapping[str, Any], dec
         sentence = f"Whether labels, chips and skin lie as the scene says was not checked: {error}"
     if sentence:
         say(f"warning: capture {folder.name}: {sentence} It was added all the same.")
+
+
+def _warn_of_other_labels(folder: Path, others: Sequence[str], decisions: Decisions) -> None:
+    """Warn if places seem turned, mirrored or exchanged beside those of the scene's other captures; it stays added."""
+    found = []
+    own = presses_of(open_capture(folder, decisions)[1])
+    for other in others[-COMPARED_N:]:
+        if (folder.parent / other).is_dir():
+            found.append(other_orientation(own, presses_of(open_capture(folder.parent / other, decisions)[1])))
+    usual = max(set(found), key=found.count, default=None)
+    if usual is not None:
+        say(
+            f"warning: capture {folder.name}: its places agree with those of the scene's other captures only {usual}. "
+            "Are columns exchanged, or was the board turned? It was added all the same."
+        )
 
 
 @contextmanager

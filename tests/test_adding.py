@@ -4,6 +4,7 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from ruamel.yaml import YAML
 from typer.testing import CliRunner
@@ -12,10 +13,12 @@ from pipeline import adding, plan, preparing
 from pipeline.capture import probe
 from pipeline.capture.header import Clock, write_capture
 from pipeline.capture.probe import ProbeLog
+from pipeline.capture.readers import plain
 from pipeline.capture.wire import encode
 from pipeline.cli import app
 from pipeline.core import config
 from pipeline.core.errors import CaptureError, ReskinError
+from pipeline.core.seeds import rng_for
 from pipeline.dataset.captures import open_capture, read_header
 from pipeline.preparing import Dump, Labels
 from pipeline.registry import read_registry
@@ -24,6 +27,7 @@ from tests.capture.readers.test_lab import PRESSES, write
 from tests.capture.signals import make_frames
 from tests.scenes import recorded
 from tests.stages.checkout import copy_checkout, run
+from tests.twin.skins import fields_uT
 
 
 @pytest.fixture(scope="module")
@@ -107,6 +111,22 @@ def test_a_scene_without_section_compare_is_held_against_nothing(root, lab_file,
     monkeypatch.setattr("pipeline.experiments.compare.joining.departure", lambda *_: pytest.fail("was asked"))
     add_lab(root, lab_file)
     assert "warning" not in capsys.readouterr().err
+
+
+def test_places_that_lie_otherwise_than_those_of_other_captures_are_a_warning(root, tmp_path, lab_file, capsys):
+    columns = plain.columns_of(5)
+    for i, exchanged in enumerate((False, True)):
+        places_mm = rng_for(i, "places").uniform(0, 16, (40, 2)).round(2)
+        changes_uT = fields_uT(places_mm - 8, np.full(40, 2.0))
+        labels_mm = places_mm[:, ::-1] if exchanged else places_mm
+        noise_uT = rng_for(i, "noise").normal(0, 3, (80, 15))
+        rows = pd.DataFrame({"phase": ["noload", "contact"] * 40})
+        rows[["x_mm", "y_mm"]] = labels_mm.repeat(2, axis=0)
+        rows[columns[3:18]] = 500.0 + noise_uT + np.where([[False], [True]] * 40, changes_uT.repeat(2, axis=0), 0.0)
+        rows.to_csv(tmp_path / f"board{i}.csv", index=False)
+        prepared = preparing.foreign(tmp_path / f"board{i}.csv", "table", labels(f"board{i}", f"skin{i}"), {})
+        adding.add(root, "small", prepared, allow_copy=False)
+        assert ("other captures only with x and y exchanged" in capsys.readouterr().err) == exchanged
 
 
 def test_the_same_recording_twice_is_refused_and_another_label_needs_a_word(root, lab_file):
