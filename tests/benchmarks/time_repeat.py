@@ -32,15 +32,16 @@ AGAIN = f"from pathlib import Path; from pipeline.verifying import rerun; rerun(
 # Whatever this processor has, and its libraries choose: nothing that pipeline/core/numerics.py pins holds.
 UNPINNED = {
     "MKL_CBWR": "AUTO", "ATEN_CPU_CAPABILITY": "avx512", "ONEDNN_MAX_CPU_ISA": "DEFAULT",
-    "OPENBLAS_CORETYPE": "SkylakeX", "NPY_DISABLE_CPU_FEATURES": "", "NUMBA_CPU_NAME": "host",
+    "OPENBLAS_CORETYPE": "SkylakeX", "OPENBLAS_NUM_THREADS": "2",
+    "NPY_DISABLE_CPU_FEATURES": "", "NUMBA_CPU_NAME": "host",
 }  # fmt: skip
 SETTINGS: dict[str, dict[str, str]] = {
     "two processes": {},
     "one process": {"RESKIN_EXECUTOR": "here"},
-    "two threads of BLAS": dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "2"),
+    "two threads of OpenMP and MKL": dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS"), "2"),
     "nothing pinned": UNPINNED,
     "ATEN_CPU_CAPABILITY=default": {"ATEN_CPU_CAPABILITY": "default"},
-    "MKL_CBWR=COMPATIBLE": {"MKL_CBWR": "COMPATIBLE"},
+    "MKL and oneDNN as on an unknown processor": {"MKL_CBWR": "COMPATIBLE", "ONEDNN_MAX_CPU_ISA": "SSE41"},
 }
 FIRST = "two processes"
 
