@@ -177,13 +177,14 @@ def _check_lateness(
     change = find_change(b_uT, truths, truths[:, 2] >= CONTACT_MIN_N, rows.whole)
     if change is None:
         return
-    file = READINGS if change.after < change.before else TRUTHS
-    got = f"{change.before} rows late before about row {change.row + 1} of {TRUTHS}, {change.after} from there on"
+    rows_n = abs(change.after - change.before)
+    lost = f"{rows_n} row{'s' if rows_n > 1 else ''} of {'readings' if change.after < change.before else 'truths'}"
+    got = f"{change.before} before about row {change.row + 1}, {change.after} from there on"
     remedy = (
-        f"{abs(change.after - change.before)} row(s) seem to be missing in {file}. Cut both files there, or put the "
-        "row back, and add the recording again."
+        f"{lost} seem to be missing there. Cut both files before that row, or put back what is missing, and add the "
+        "recording again."
     )
-    rule = "the same number of rows behind their truths throughout"
+    rule = "as many rows behind their truths throughout"
     raise CaptureError(f"{header.capture}/{READINGS}", "fields", rule, got, remedy)
 
 
