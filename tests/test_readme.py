@@ -6,6 +6,7 @@ import pytest
 
 from pipeline.core import io
 from pipeline.core.config import read_yaml
+from pipeline.reporting.numbers import split
 from pipeline.reporting.readme import blocks_of
 from tests.reporting.synthetic import all_questions
 from tests.stages.checkout import ROOT, copy_checkout, run
@@ -23,18 +24,25 @@ def test_the_readme_shows_what_the_committed_results_say():
     assert done.returncode == 0, done.stderr
 
 
+def copy_results(root, scenes):
+    for name in scenes:
+        (root / "reports" / name).mkdir(exist_ok=True)
+        for file in ("numbers.json", "provenance.json"):
+            shutil.copy(ROOT / "reports" / name / file, root / "reports" / name)
+
+
 def test_the_pages_show_the_same_scenes_whichever_scene_runs(tmp_path):
     root = copy_checkout(tmp_path)
-    for file in (ROOT / "reports").glob("*/numbers.json"):
-        (root / "reports" / file.parent.name).mkdir(exist_ok=True)
-        shutil.copy(file, root / "reports" / file.parent.name)
+    copy_results(root, [file.parent.name for file in (ROOT / "reports").glob("*/numbers.json")])
     run(root, "reskin", "readme")
     pages = [root / "README.md", *(root / "docs").glob("*.md")]
     before = [page.read_bytes() for page in pages]
 
     run(root, "reskin", "scenes", "use", "ci")
     numbers = all_questions()
-    io.write_json(root / "reports/ci/numbers.json", numbers | {"provenance": numbers["provenance"] | {"scene": "ci"}})
+    shared, of_this_run = split(numbers | {"provenance": numbers["provenance"] | {"scene": "ci"}})
+    io.write_json(root / "reports/ci/numbers.json", shared)
+    io.write_json(root / "reports/ci/provenance.json", of_this_run)
     said = run(root, "reskin", "readme").stdout
     assert [page.read_bytes() for page in pages] == before
     assert said.startswith("rewritten: nothing; results shown: scenes paper, quick, ")
@@ -47,9 +55,7 @@ def test_the_pages_show_the_same_scenes_whichever_scene_runs(tmp_path):
 
 def test_what_was_rewritten_is_said_with_the_scenes_shown(tmp_path):
     root = copy_checkout(tmp_path)
-    for name in ("quick", "paper"):
-        (root / "reports" / name).mkdir()
-        shutil.copy(ROOT / "reports" / name / "numbers.json", root / "reports" / name)
+    copy_results(root, ["quick", "paper"])
     readme = root / "README.md"
     readme.write_text(re.sub(r"(<!-- headline -->\n).*?(<!-- /headline)", r"\1\2", readme.read_text(), flags=re.DOTALL))
     said = run(root, "reskin", "readme").stdout

@@ -10,6 +10,7 @@ from typing import Any
 
 from pipeline.core.code import ROOT
 from pipeline.core.errors import SchemaError
+from pipeline.questions import EXPERIMENTS
 from pipeline.reporting.headline import labels_table, short_table
 from pipeline.reporting.shown import to_markdown
 from pipeline.reporting.skins import skins_table
@@ -73,7 +74,8 @@ def _results(numbers: Numbers, names: Sequence[str]) -> str:
             f"{provenance['git']}, with other settings and before the check for collapsed networks; no number of it is "
             f"shown here. Run it again: `reskin scenes use {scene}`, `dvc repro`."
         )
-    tables = make_tables(numbers)
+    # Results that were committed before the code of other experiments changed can still be shown.
+    tables = make_tables({name: part for name, part in numbers.items() if name not in EXPERIMENTS or name in names})
     heading = (
         f"Scene `{provenance['scene']}`, **{provenance['source']}**; trained by code {provenance['trained']}, "
         f"seed {provenance['seed']}, {provenance['device']}:"
