@@ -104,7 +104,7 @@ def draw_skin(
         tip_radius_m=design.tip_radius_mm * milli,
         depth_zero_m=float(depth_zero_mm * milli),
         base=design.base,
-        hold=None if design.hold is None else slide.hold_of(design.hold, modulus_Pa),
+        hold=None if design.hold is None else slide.hold_of(design.hold),
     )
 
 
@@ -145,10 +145,18 @@ def moved_dipoles(skin: Skin, pokes_m: Float[np.ndarray, "n 3"]) -> Iterator[tup
 
 
 def press_slides(skin: Skin, hold: slide.Hold, true_m: Float[np.ndarray, "n 3"]) -> slide.Slide:
-    """Give how presses (x, y, true depth) slide a skin on its base, as one."""
+    """Give how presses (x, y, true depth) slide a skin on its base, as one, as far as the tip's friction allows.
+
+    The slide away from the middle is gone at a depth, whatever the modulus; friction is felt in newtons.
+    """
     places_m = true_m[:, :2] - skin.seat_m
-    load = slide.load_of(np.maximum(true_m[:, 2], 0.0), hold, skin.thickness_m)
-    return slide.rigid(places_m, slide.under_tip_m(places_m, load, give_m=hold.give_m, away=hold.away), skin.sides_m)
+    relative_m2 = slide.force_at(
+        true_m[:, 2], modulus_Pa=1.0, thickness_m=skin.thickness_m, tip_radius_m=skin.tip_radius_m
+    )
+    load = np.minimum(relative_m2 / hold.lets_go_m2, 1.0)
+    taken_m = slide.under_tip_m(places_m, load, give_m=hold.give_m, away=hold.away)
+    whole = slide.rigid(places_m, taken_m, skin.sides_m)
+    return slide.gripped(whole, skin.modulus_Pa * relative_m2, hold.grip_N_per_m)
 
 
 def beyond_verified_n(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> int:
@@ -158,19 +166,11 @@ def beyond_verified_n(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> int:
 
 def forces(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """Give the force that the tip feels at commanded depths, in newtons, positive in compression."""
+    of = {"thickness_m": skin.thickness_m, "tip_radius_m": skin.tip_radius_m, "modulus_Pa": skin.modulus_Pa}
     true_m = depth_m + skin.depth_zero_m
     if skin.hold is not None:
-        layer.refuse_layer(true_m, skin.thickness_m, skin.tip_radius_m)
-        return slide.force_at(
-            np.maximum(true_m, 0.0), stiffness_N_m2=skin.hold.stiffness_N_m2, thickness_m=skin.thickness_m
-        )
-    return layer.force(
-        true_m,
-        thickness_m=skin.thickness_m,
-        tip_radius_m=skin.tip_radius_m,
-        modulus_Pa=skin.modulus_Pa,
-        base=skin.base,
-    )
+        return slide.force_at(true_m, **of)
+    return layer.force(true_m, **of, base=skin.base)
 
 
 def _refuse_beside(pokes_m: Float[np.ndarray, "n 3"], skin: Skin) -> None:

@@ -23,7 +23,7 @@ from pipeline.physics.viscoelastic import Memory, Relaxation, force_left, rememb
 from pipeline.physics.warmth import Temperature
 from pipeline.physics.wear import Ageing, fading, softening, wandering
 
-DEPTH_STEP_M = 10e-6  # depths whose shear is taken as one: stiffness differs by 1 %
+DEPTH_STEP_M = 10e-6  # depths whose shear is taken as one: stiffness differs by 1 %, dB by 0.1 uT
 
 
 class Terms(Strict):

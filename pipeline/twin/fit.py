@@ -13,11 +13,11 @@ from pipeline.twin.law import Law, Setup, at_rest_uT, simulate_uT, with_numbers
 from pipeline.twin.pokes import Pokes, lengths_uT
 
 # Where a fit starts, what its priors centre on; then their standard deviations and the size of a step. Assumed.
-START = Law(0.0, 0.0, 0.0, 1.5, 1.5, 0.0, 0.0, 0.9, 5.0, 0.0, 0.0)
-PRIOR = Law(1.0, 1.0, 3.0, 0.4, 0.5, 1.0, 1.0, 1.0, 10.0, 60.0, 60.0)
-STEP = Law(0.3, 0.3, 1.0, 0.2, 0.2, 0.4, 0.4, 0.3, 4.0, 20.0, 20.0)
+START = Law(0.0, 0.0, 0.0, 1.5, 1.5, 0.0, 0.0, 0.2, 5.0, 0.0, 0.0)
+PRIOR = Law(1.0, 1.0, 3.0, 0.4, 0.5, 1.0, 1.0, 0.25, 10.0, 60.0, 60.0)
+STEP = Law(0.3, 0.3, 1.0, 0.2, 0.2, 0.4, 0.4, 0.07, 4.0, 20.0, 20.0)
 OF_BOARD = ("seat_x_mm", "seat_y_mm", "gap_mm", "amplitude", "label_x_mm", "label_y_mm")
-TEN = (*OF_BOARD, "stiffness_N_mm2", "away_um_mm", "give_x_um", "give_y_um")
+TEN = (*OF_BOARD, "modulus_MPa", "away_um_mm", "give_x_um", "give_y_um")
 SEVEN = (*OF_BOARD, "rotation_deg")  # what may differ between boards, the law of another one held
 PRIOR_WEIGHT = 0.25  # chosen with both boards of scene lab in view: at twice as much, one of four fits explains 0.796
 GROWTH_WEIGHT = 10.0  # of how log|dB| is off by group, less its mean: growth with force
@@ -61,5 +61,5 @@ def fit(seen: Seen, setup: Setup, names: tuple[str, ...], start: Law = START) ->
 
 def _limits(names: tuple[str, ...]) -> tuple[list[float], list[float]]:
     # Below these a skin would lie in its chips, or push back.
-    least = {"gap_mm": 0.3, "amplitude": 0.05, "stiffness_N_mm2": 0.05}
+    least = {"gap_mm": 0.3, "amplitude": 0.05, "modulus_MPa": 0.01}
     return [least.get(name, -np.inf) for name in names], [np.inf] * len(names)

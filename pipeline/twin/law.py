@@ -30,12 +30,13 @@ class Law:
     amplitude: float  # of the magnetisation, times the nominal one
     label_x_mm: float  # from where a label says to where the tip is, along the board's axes
     label_y_mm: float
-    stiffness_N_mm2: float
+    modulus_MPa: float
     away_um_mm: float
     give_x_um: float
     give_y_um: float
     # What no fit of ten numbers moves.
     lets_go_N: float = 8.0  # where the slide away from the middle is gone: chosen with both boards of scene lab in view
+    grip_N_mm: float = 8.75  # springs of 7 N/mm over a friction of 0.8 (params.yaml: skin.hold), see `slide.gripped`
     tilt_x_deg: float = 0.0  # of the skin over the board
     tilt_y_deg: float = 0.0
     label_rotation_deg: float = 0.0  # of the labels' axes about the board's middle
@@ -109,11 +110,11 @@ def simulate_uT(
     offset_mm = (law.label_x_mm - law.seat_x_mm, law.label_y_mm - law.seat_y_mm)
     labels = Rotation.from_euler("z", law.label_rotation_deg, degrees=True).as_matrix()[:2, :2]
     places_m = (place_mm @ labels.T + offset_mm) @ turn[:2, :2] * milli
-    stiffness_N_m2 = law.stiffness_N_mm2 * mega
-    depths_m = slide.depth_at(force_N, stiffness_N_m2=stiffness_N_m2, thickness_m=setup.thickness_m)
+    depths_m = slide.depth_at(force_N, **_layer(law, setup))
     give_m, away = (law.give_x_um * micro, law.give_y_um * micro), law.away_um_mm * micro / milli
     taken_m = slide.under_tip_m(places_m, force_N / law.lets_go_N, give_m=give_m, away=away)
-    slides = slide.rigid(places_m, taken_m, setup.sides_m)
+    whole = slide.rigid(places_m, taken_m, setup.sides_m)
+    slides = slide.gripped(whole, force_N, law.grip_N_mm * kilo)
     table = setup.table(setup.tip_radius_mm)
     change_T = _changes_T(rest or setup.rest, table, chips_m, places_m, depths_m, slides)
     return law.amplitude * change_T @ turn.T / micro
@@ -135,7 +136,14 @@ def beyond_n(law: Law | None, setup: Setup, force_N: Float[np.ndarray, " n"]) ->
     if law is None:
         known_N, _ = _nominal_curve(setup)
         return int((force_N > known_N[-1]).sum())
-    return slide.beyond_n(force_N, stiffness_N_m2=law.stiffness_N_mm2 * mega, thickness_m=setup.thickness_m)
+    return slide.beyond_n(force_N, **_layer(law, setup))
+
+
+def _layer(law: Law, setup: Setup) -> dict[str, float]:
+    return {
+        "modulus_Pa": law.modulus_MPa * mega, "thickness_m": setup.thickness_m,
+        "tip_radius_m": setup.tip_radius_mm * milli,
+    }  # fmt: skip
 
 
 def _nominal_curve(setup: Setup) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:

@@ -13,20 +13,21 @@ from pipeline.twin.law import Law, Setup, at_rest_uT, simulate_uT, with_numbers
 
 PITCH_MM, STEPS_N = 0.8, 22  # of the lattice of places, along x and y
 FORCES_N = np.exp(np.linspace(np.log(0.55), np.log(9.5), 6))
-OF_LOG = ("amplitude", "stiffness_N_mm2")  # their spreads are of the logarithm
+OF_LOG = ("amplitude", "modulus_MPa")  # their spreads are of the logarithm
 # Spreads of a skin's numbers about those of boards of the same rig, and about the nominal ones where no board is known.
 # Assumed, wider than two recorded boards differ.
 OF_RIG = {
     "seat_x_mm": 0.4, "seat_y_mm": 0.4, "rotation_deg": 1.0, "gap_mm": 0.25, "amplitude": 0.2, "label_x_mm": 0.25,
-    "label_y_mm": 0.25, "stiffness_N_mm2": 0.2, "away_um_mm": 2.0, "give_x_um": 15.0, "give_y_um": 15.0,
+    "label_y_mm": 0.25, "modulus_MPa": 0.2, "away_um_mm": 2.0, "give_x_um": 15.0, "give_y_um": 15.0,
     "lets_go_N": 2.4, "tilt_x_deg": 0.7, "tilt_y_deg": 0.7, "label_rotation_deg": 0.5,
 }  # fmt: skip
 OF_NOMINAL = OF_RIG | {
-    "gap_mm": 0.45, "amplitude": 0.3, "label_x_mm": 0.5, "label_y_mm": 0.5, "stiffness_N_mm2": 0.25, "away_um_mm": 2.5,
+    "gap_mm": 0.45, "amplitude": 0.3, "label_x_mm": 0.5, "label_y_mm": 0.5, "modulus_MPa": 0.25, "away_um_mm": 2.5,
     "give_x_um": 40.0, "give_y_um": 40.0,
 }  # fmt: skip
-# Nothing of a recorded board but the form of the law, and the middle of its stiffness and of its slide.
-NOMINAL = Law(0.0, 0.0, 0.0, 1.6, 1.4, 0.0, 0.0, 0.9, 5.0, 0.0, 0.0)
+# Nothing of a recorded board but the form of the law and the middle of its slide; modulus: Dragon Skin 10 with filler,
+# 150 to 230 kPa.
+NOMINAL = Law(0.0, 0.0, 0.0, 1.6, 1.4, 0.0, 0.0, 0.19, 7.0, 0.0, 0.0)
 STEP = 0.4  # of a spread: over which slopes are taken
 
 

@@ -93,9 +93,9 @@ def test_a_base_that_holds_the_skin_is_kept_where_there_is_one(rows, not_inside)
     hold = {
         "give_um": (48.0, 7.0),
         "away_um_mm": 6.0,
-        "lets_go_mm2": 9.0,
-        "force_per_modulus": 2.5,
+        "lets_go_mm2": 40.0,
         "springs_N_mm": 7.0,
+        "friction": 0.8,
     }
     found = rows_of(with_protocol("grid", FEW, skin=synthesis("skin", hold=hold).skin.model_dump()))
     assert "the base's hold" not in rows

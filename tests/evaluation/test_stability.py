@@ -67,11 +67,9 @@ def test_a_base_that_gives_nothing_away_is_found_out(monkeypatch):
 
 
 def test_a_slide_that_forgets_to_turn_and_a_depth_between_straight_lines_are_found_out(monkeypatch):
-    def straight(force_N, *, stiffness_N_m2, thickness_m):
+    def straight(force_N, *, thickness_m, **of):
         curve_m = np.linspace(0, slide.DEEPEST * thickness_m, 2000)
-        return np.interp(
-            force_N, slide.force_at(curve_m, stiffness_N_m2=stiffness_N_m2, thickness_m=thickness_m), curve_m
-        )
+        return np.interp(force_N, slide.force_at(curve_m, thickness_m=thickness_m, **of), curve_m)
 
     rigid = slide.rigid
     monkeypatch.setattr(slide, "rigid", lambda *of: replace(rigid(*of), spin_rad=np.zeros(len(of[0]))))

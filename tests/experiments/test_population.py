@@ -29,7 +29,7 @@ def test_the_designed_skin_is_the_law_that_its_scene_simulates():
     lesson = taught.lesson_of(DESIGN, KIND, (0.2, 1.2), seed=0)
     law = lesson.syllabus.centre
     assert (law.gap_mm, law.amplitude, law.away_um_mm) == (1.1, 1.0, DESIGN.hold.away_um_mm)
-    assert law.stiffness_N_mm2 == pytest.approx(0.8625)  # 345 kPa times 2.5
+    assert (law.modulus_MPa, law.grip_N_mm) == (pytest.approx(1e-3 * DESIGN.modulus_kPa), pytest.approx(8.75))
     assert lesson.forces_N[0] < 0.05 < 5 < lesson.forces_N[1]  # of 0.2 and 1.2 mm
     with pytest.raises(ValueError, match="hold must be"):
         taught.lesson_of(DESIGN.model_copy(update={"hold": None}), KIND, (0.2,), seed=0)

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.core.errors import ParamsError
-from pipeline.physics import flow_map, slide
+from pipeline.physics import flow_map, layer, slide
 from pipeline.physics.change import change_of_field
 
 SIDE_M, H_M = 20e-3, 2e-3
@@ -14,7 +14,7 @@ SQUARE = (SIDE_M, SIDE_M)
 place = st.tuples(st.floats(-9e-3, 9e-3), st.floats(-9e-3, 9e-3))
 taken = st.tuples(st.floats(-1e-4, 1e-4), st.floats(-1e-4, 1e-4))
 STILL = {"give_m": (0.0, 0.0), "away": 0.0}
-HELD = {"give_um": (48.0, 7.0), "away_um_mm": 6.0, "lets_go_mm2": 9.0, "force_per_modulus": 2.5, "springs_N_mm": 7.0}
+HELD = {"give_um": (48.0, 7.0), "away_um_mm": 6.0, "lets_go_mm2": 40.0, "springs_N_mm": 7.0, "friction": 0.8}
 
 
 def one(place_m, taken_m, sides_m=SQUARE) -> tuple[np.ndarray, float]:
@@ -86,15 +86,27 @@ def test_a_force_slides_a_skin_as_far_as_the_same_motion_asks_for(place_m, sprin
     np.testing.assert_allclose(spin_rad, moment_m / (2 * SIDE_M**2 / 12), rtol=1e-9, atol=1e-15)
 
 
-def test_how_far_a_skin_slides_under_a_depth_does_not_depend_on_its_modulus_and_its_force_is_proportional():
-    soft, hard = (slide.hold_of(slide.HoldDesign(**HELD), modulus_Pa) for modulus_Pa in (0.0, 4e5))
-    depth_m = np.array([0.3e-3, 1.2e-3])
-    np.testing.assert_array_equal(slide.load_of(depth_m, soft, H_M), slide.load_of(depth_m, hard, H_M))
-    assert soft.stiffness_N_m2 == 0
-    assert hard.stiffness_N_m2 == pytest.approx(1e6)
-    # 8 mm^2 of d^2 (1 - d/h)^(-3/2) at half of a thickness of h: d = h / 2 = 1 mm gives 2^1.5 mm^2.
-    assert slide.load_of(np.array([1e-3]), hard, H_M)[0] == pytest.approx(2**1.5 / 9)
-    assert slide.load_of(np.array([0.9 * H_M]), hard, H_M)[0] == 1.0  # from there on the base holds
+@given(place, taken, st.floats(1e-6, 20.0))
+def test_friction_bounds_a_slide_in_the_direction_that_it_has(place_m, taken_m, force_N):
+    hold = slide.hold_of(slide.HoldDesign(**HELD))
+    whole = slide.rigid(np.array([place_m]), np.array([taken_m]), SQUARE)
+    found = slide.gripped(whole, np.array([force_N]), hold.grip_N_per_m)
+    sideways_N = hold.springs_N_per_m * np.hypot(*found.move_m[0])
+    assert sideways_N <= min(0.8 * force_N, hold.springs_N_per_m * np.hypot(*whole.move_m[0])) * (1 + 1e-12)
+    moves, (x, y), (whole_x, whole_y) = whole.move_m.any(), found.move_m[0], whole.move_m[0]
+    assert x * whole_y == pytest.approx(y * whole_x, abs=1e-24)
+    if moves:  # motion and spin are held back alike: by 1 - exp(-mu F / k u)
+        share = 1 - np.exp(-0.8 * force_N / (7e3 * np.hypot(whole_x, whole_y)))
+        np.testing.assert_allclose(found.move_m, share * whole.move_m, rtol=1e-9, atol=1e-20)
+        np.testing.assert_allclose(found.spin_rad, share * whole.spin_rad, rtol=1e-9, atol=1e-20)
+
+
+def test_a_firm_press_takes_the_whole_slide_and_none_takes_none():
+    whole = slide.Slide(np.array([[5e-5, 0.0], [0.0, 0.0]]), np.array([1e-3, 0.0]))
+    for force_N, share in ((0.0, 0.0), (1e3, 1.0)):
+        found = slide.gripped(whole, np.full(2, force_N), 8750.0)
+        np.testing.assert_array_equal(found.move_m, share * whole.move_m)
+        np.testing.assert_array_equal(found.spin_rad, share * whole.spin_rad)
 
 
 def test_without_give_and_slide_the_sliding_flow_is_what_it_was_to_the_last_bit():
@@ -130,20 +142,28 @@ def test_every_dipole_turns_about_the_middle_and_moves_as_a_loop_says():
     np.testing.assert_allclose(about_m, slide.apply(motion, 1, (nodes_m - shift_m, moments))[0] + shift_m, atol=1e-17)
 
 
+TIP = {"thickness_m": H_M, "tip_radius_m": 2e-3}
+
+
 @given(st.floats(0, 0.71 * H_M), st.floats(1e5, 1e7))
-def test_the_depth_of_a_force_is_the_depth_that_gives_it(depth_m, stiffness_N_m2):
-    of = {"stiffness_N_m2": stiffness_N_m2, "thickness_m": H_M}
+def test_the_depth_of_a_force_is_the_depth_that_gives_it(depth_m, modulus_Pa):
+    of = TIP | {"modulus_Pa": modulus_Pa}
     found_m = slide.depth_at(slide.force_at(np.array([depth_m]), **of), **of)
     assert abs(found_m[0] - depth_m) < 1e-6 * H_M
 
 
-def test_force_is_the_square_of_small_depths_and_has_no_end_as_the_layer_is_used_up():
-    of = {"stiffness_N_m2": 1e6, "thickness_m": H_M}
-    np.testing.assert_allclose(slide.force_at(np.array([0.0, 1e-8]), **of), [0, 1e-10], rtol=1e-4)
-    assert slide.force_at(np.array([0.75 * H_M]), **of)[0] == pytest.approx(1e6 * (0.75 * H_M) ** 2 * 8)
+def test_force_begins_as_hertz_has_it_and_has_no_end_as_the_layer_is_used_up():
+    of = TIP | {"modulus_Pa": 2e5}
+    np.testing.assert_allclose(  # incompressible: 4/3 E / (1 - 1/4) sqrt(R) d^(3/2)
+        slide.force_at(np.array([0.0, 1e-9]), **of), [0, 16 / 9 * 2e5 * np.sqrt(2e-3) * 1e-9**1.5], rtol=2e-3
+    )
+    at_m = np.array([0.75 * H_M])
+    assert slide.force_at(at_m, **of)[0] == pytest.approx(8 * layer.force(at_m, **of, base="slipping")[0])
     assert slide.depth_at(np.array([1e6]), **of)[0] == pytest.approx(slide.DEEPEST * H_M)
-    for wrong_m in (-1e-6, H_M, np.nan):
-        with pytest.raises(ParamsError, match="poke: depth must be 0 m or more"):
+    assert slide.beyond_n(np.array([1.0, 1e6]), **of) == 1
+    assert slide.force_at(np.array([-1e-6]), **of)[0] == 0  # above the skin
+    for wrong_m in (H_M, np.nan):
+        with pytest.raises(ParamsError, match="poke: depth must be finite and below"):
             slide.force_at(np.array([wrong_m]), **of)
-    with pytest.raises(ParamsError, match="stiffness must be above"):
-        slide.depth_at(np.array([1.0]), stiffness_N_m2=0.0, thickness_m=H_M)
+    with pytest.raises(ParamsError, match="modulus must be above"):
+        slide.depth_at(np.array([1.0]), **(of | {"modulus_Pa": 0.0}))

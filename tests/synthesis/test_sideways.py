@@ -123,7 +123,7 @@ def test_a_skin_that_begins_higher_is_pushed_as_one_that_is_pressed_deeper():
 
 HELD = EVEN.skin.model_copy(
     update={
-        "hold": HoldDesign(give_um=(0.0, 0.0), away_um_mm=0.0, lets_go_mm2=9.0, force_per_modulus=2.5, springs_N_mm=7.0)
+        "hold": HoldDesign(give_um=(0.0, 0.0), away_um_mm=0.0, lets_go_mm2=40.0, springs_N_mm=7.0, friction=0.8)
     }
 )
 

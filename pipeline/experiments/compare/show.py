@@ -45,7 +45,7 @@ ABOUT_FRAMES = (
 TITLES = {
     "seat_x_mm": "seat x, mm", "seat_y_mm": "seat y, mm", "rotation_deg": "rotation, degrees", "gap_mm": "gap, mm",
     "amplitude": "amplitude", "label_x_mm": "label offset x, mm", "label_y_mm": "label offset y, mm",
-    "stiffness_N_mm2": "stiffness, N/mm²", "away_um_mm": "slide away, µm/mm", "give_x_um": "give x, µm",
+    "modulus_MPa": "Young's modulus, MPa", "away_um_mm": "slide away, µm/mm", "give_x_um": "give x, µm",
     "give_y_um": "give y, µm",
 }  # fmt: skip
 ARROW_MM = 6.0  # the longest of a board

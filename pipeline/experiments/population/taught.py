@@ -15,6 +15,7 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Float
 from pydantic import Field
+from scipy.constants import mega, milli
 
 import pipeline.twin
 from pipeline.core import kept
@@ -72,15 +73,19 @@ def lesson_of(design: SkinDesign, kind: BoardKind, depths_mm: tuple[float, ...],
     if design.hold is None:
         remedy = "Ask this question of a scene whose skin has hold."
         raise ParamsError("params.yaml: skin", "hold", "that of a skin that slides, as the law's", "null", remedy)
-    stiffness_N_mm2 = design.hold.force_per_modulus * design.modulus_kPa * 1e-3
+    modulus_MPa = design.modulus_kPa * 1e-3
     law = Law(
-        0.0, 0.0, 0.0, kind.design.gap_mm, 1.0, 0.0, 0.0, stiffness_N_mm2, design.hold.away_um_mm,
-        *design.hold.give_um, lets_go_N=design.hold.lets_go_mm2 * stiffness_N_mm2,
+        0.0, 0.0, 0.0, kind.design.gap_mm, 1.0, 0.0, 0.0, modulus_MPa, design.hold.away_um_mm,
+        *design.hold.give_um, lets_go_N=design.hold.lets_go_mm2 * modulus_MPa,
+        grip_N_mm=design.hold.springs_N_mm / design.hold.friction,
     )  # fmt: skip
     chips_mm = np.array(kind.design.places_mm)
     setup = Setup(design, chips_mm, kind.design.gap_mm, kind.skin_mm, design.flipped, design.tip_radius_mm)
     deep_m = 1e-3 * np.array([min(depths_mm), max(depths_mm)])
-    ends_N = force_at(deep_m, stiffness_N_m2=1e6 * stiffness_N_mm2, thickness_m=setup.thickness_m) * FORCE_SHARES
+    tip_m = design.tip_radius_mm * milli
+    ends_N = FORCE_SHARES * force_at(
+        deep_m, modulus_Pa=mega * modulus_MPa, thickness_m=setup.thickness_m, tip_radius_m=tip_m
+    )
     syllabus = Syllabus("as designed", law, OF_RIG, setup, follows_law=True)
     return Lesson(syllabus, (float(ends_N[0]), float(ends_N[1])), seed)
 

@@ -92,17 +92,21 @@ def _pokes_m(skin: Skin, share: float = DEPTH) -> Float[np.ndarray, "n 3"]:
 
 
 def modulus(board: Board, usual: Skin, soft: Skin, hard: Skin) -> list[Case]:
-    usual_T, soft_T, hard_T = (poke(board, skin) for skin in (usual, soft, hard))
+    """Press skins of no stiffness and of a metal's: the depth is prescribed, so the modulus decides the grip alone."""
+    free = replace(usual, hold=None)
+    firm = usual if usual.hold is None else replace(usual, hold=replace(usual.hold, friction=1e12))
+    free_T, firm_T, soft_T, hard_T = (poke(board, skin) for skin in (free, firm, soft, hard))
     soft_N, hard_N = (forces(skin, _pokes_m(skin)[:, 2]) for skin in (soft, hard))
     pushed_N = np.column_stack([np.zeros((len(hard_N), 2)), hard_N])
     read_N, clipped_n = read_force(pushed_N, noise_N=0.0, rng=rng_for(0, "stability"))
-    soft_off_T, hard_off_T = (float(np.abs(of_T - usual_T).max()) for of_T in (soft_T, hard_T))
+    soft_off_T, hard_off_T = float(np.abs(soft_T - free_T).max()), float(np.abs(hard_T - firm_T).max())
     held = clipped_n == len(hard_N) and bool((read_N[:, 2] == RANGE_N[2]).all())
     return [
-        observed(AREA, "a skin of no stiffness, E = 0", should="no force at all; dB as ever: the depth is prescribed",
+        observed(AREA, "a skin of no stiffness, E = 0", should="no force, so no slide: dB of the layer's flow alone",
                  happened=f"force {np.abs(soft_N).max():g} N; dB differs by {soft_off_T:g} T",
                  holds=not soft_N.any() and soft_off_T == 0),
-        observed(AREA, "a stiff skin, E = 1 GPa", should="dB as ever; force held at the sensor's range, and counted",
+        observed(AREA, "a stiff skin, E = 1 GPa",
+                 should="dB of a tip that never slips; force held at the sensor's range, and counted",
                  happened=f"dB differs by {hard_off_T:g} T; {hard_N.max():.3g} N read as {read_N[:, 2].max():g} N, "
                           f"{clipped_n} of {len(hard_N)} counted as clipped",
                  holds=hard_off_T == 0 and held),

@@ -96,10 +96,15 @@ def edge(board: Board, skin: Skin) -> list[Case]:
     _, change_T = changes_of_field(board, skin, pokes_m)
     assert skin.hold is not None
     slides = press_slides(skin, skin.hold, pokes_m)
-    load = slide.load_of(pokes_m[:, 2], skin.hold, skin.thickness_m)
+    force_N = skin.modulus_Pa * slide.force_at(
+        pokes_m[:, 2], modulus_Pa=1.0, thickness_m=skin.thickness_m, tip_radius_m=skin.tip_radius_m
+    )
+    load = np.minimum(force_N / (skin.modulus_Pa * skin.hold.lets_go_m2), 1.0)
     asked_m = slide.under_tip_m(places_m, load, give_m=skin.hold.give_m, away=skin.hold.away)
-    spun_m = slides.spin_rad[:, None] * np.stack([-places_m[:, 1], places_m[:, 0]], axis=1)
-    off = float(np.abs(slides.move_m + spun_m - asked_m).max() / np.abs(asked_m).max())
+    went_m = slides.move_m + slides.spin_rad[:, None] * np.stack([-places_m[:, 1], places_m[:, 0]], axis=1)
+    share = (went_m * asked_m).sum(axis=1) / (asked_m**2).sum(axis=1)
+    off = float(np.abs(went_m - share[:, None] * asked_m).max() / np.abs(asked_m).max())
+    used = skin.hold.grip_N_per_m * np.hypot(*slides.move_m.T) / force_N
     sizes_uT = ", ".join(f"{1e6 * size:.3g}" for size in np.abs(change_T).max(axis=(1, 2)))
     return [
         observed(AREA, f"pokes {EDGE_M / milli:g} mm inside the free edge, at a side and at a corner",
@@ -107,16 +112,19 @@ def edge(board: Board, skin: Skin) -> list[Case]:
                  happened=f"at most {sizes_uT} uT",
                  holds=bool(np.isfinite(change_T).all() and (np.abs(change_T).max(axis=(1, 2)) > 0).all())),
         measured(AREA, "the slide of a skin that is poked at its free edge",
-                 should="the place goes as far as the press takes it, turn and motion together",
+                 should="the place goes where the press takes it, turn and motion together",
                  happened=f"{np.abs(slides.spin_rad).max():.2g} rad, relative error {off:.1e}", error=off,
                  limit=ROUNDING),
+        observed(AREA, "the force that this slide takes", should="some, and no more than friction holds",
+                 happened=f"at most {used.max():.3g} of the tip's friction",
+                 holds=bool((used > 0).all() and (used <= 1).all())),
     ]  # fmt: skip
 
 
 def force_control(skin: Skin) -> list[Case]:
     """Press and let go by force: the depth that a force has is the same on the way up, and back."""
     assert skin.hold is not None
-    of = {"stiffness_N_m2": skin.hold.stiffness_N_m2, "thickness_m": skin.thickness_m}
+    of = {"modulus_Pa": skin.modulus_Pa, "thickness_m": skin.thickness_m, "tip_radius_m": skin.tip_radius_m}
     depth_m = skin.thickness_m * np.concatenate([PRESSES, PRESSES[::-1]])
     force_N = slide.force_at(depth_m, **of)
     off = float(np.abs(slide.depth_at(force_N, **of) - depth_m).max() / skin.thickness_m)

@@ -13,6 +13,7 @@ from pipeline.core.errors import ParamsError, SchemaError
 from pipeline.core.seeds import rng_for
 from pipeline.experiments.compare import frames
 from pipeline.experiments.compare.run import Compare, beside, compare_boards, framed, remembered, see, turns_of
+from pipeline.physics import layer
 from pipeline.physics.skin import SkinDesign
 from pipeline.twin import fit, law
 from pipeline.twin.pokes import Pokes, cosines, explained, growth, memory, pool
@@ -24,9 +25,9 @@ SECTION = parse(Compare, read_yaml(ROOT / "pipeline/scenes/lab.yaml")["compare"]
 # One tip for the nominal skin too, as each tip's flow takes seconds.
 DESIGN = parse(SkinDesign, read_yaml(ROOT / "params.yaml")["skin"] | {"tip_radius_mm": 2.0}, "params.yaml: skin")
 SETUP = law.Setup(DESIGN, np.array(SECTION.design.places_mm), 1.1, SECTION.skin_mm, True, SECTION.tip_radius_mm)
-TRUE = law.Law(0.4, -0.3, 0.0, 1.6, 1.8, 0.5, -0.6, 0.8, 6.0, 40.0, 10.0)
+TRUE = law.Law(0.4, -0.3, 0.0, 1.6, 1.8, 0.5, -0.6, 0.22, 6.0, 40.0, 10.0)
 # How near a fit comes with 3 uT of noise on 50 pokes; gap and amplitude trade against each other.
-NEAR = law.Law(0.05, 0.05, 0.0, 0.15, 0.3, 0.1, 0.1, 0.1, 0.6, 3.0, 3.0)
+NEAR = law.Law(0.05, 0.05, 0.0, 0.15, 0.3, 0.1, 0.1, 0.03, 0.6, 3.0, 3.0)
 TURN = turns_of(SECTION)
 
 
@@ -62,11 +63,11 @@ def test_a_fit_finds_the_numbers_that_a_recording_was_made_with(recorded):
 
 
 def test_what_may_differ_between_boards_is_found_with_the_law_held(recorded):
-    start = replace(fit.START, stiffness_N_mm2=0.8, away_um_mm=6.0, give_x_um=40.0, give_y_um=10.0)
+    start = replace(fit.START, modulus_MPa=0.25, away_um_mm=6.0, give_x_um=40.0, give_y_um=10.0)
     found = fit.fit(see(made(replace(TRUE, rotation_deg=2.0)), SECTION), SETUP, fit.SEVEN, start)
     assert found.rotation_deg == pytest.approx(2.0, abs=0.3)
     assert (found.seat_x_mm, found.seat_y_mm) == pytest.approx((0.4, -0.3), abs=0.05)
-    assert [getattr(found, name) for name in fit.TEN[6:]] == [0.8, 6.0, 40.0, 10.0]
+    assert [getattr(found, name) for name in fit.TEN[6:]] == [0.25, 6.0, 40.0, 10.0]
 
 
 def test_a_skin_read_as_the_scene_says_departs_from_nothing(recorded):
@@ -128,24 +129,24 @@ def test_a_flipped_skin_is_a_checkerboard_turned_by_a_quarter():
 
 
 def test_without_give_slide_and_offsets_the_law_is_the_nominal_skin_but_for_its_force():
-    plain = law.Law(0.0, 0.0, 0.0, 1.1, 1.0, 0.0, 0.0, 0.9, 0.0, 0.0, 0.0)
+    plain = law.Law(0.0, 0.0, 0.0, 1.1, 1.0, 0.0, 0.0, 0.2, 0.0, 0.0, 0.0)
     setup = replace(SETUP, tip_radius_mm=DESIGN.tip_radius_mm)
     place_mm = np.array([[3.0, -2.0], [0.0, 6.0]])
-    nominal_uT = law.nominal_uT(setup, place_mm, np.array([2.0, 2.0]))
+    nominal_uT = law.nominal_uT(setup, place_mm, np.array([0.5, 0.5]))
     lengths = [np.linalg.norm(nominal_uT - law.simulate_uT(plain, setup, place_mm, np.full(2, force_N))) for force_N in
                np.geomspace(0.2, 8, 30)]  # some force goes as deep  # fmt: skip
     assert min(lengths) < 0.05 * np.linalg.norm(nominal_uT)
 
 
 def test_pokes_beyond_the_deepest_that_a_law_follows_are_counted_and_held_there():
-    # K d^2 (1 - d/h)^(-3/2) at d = 0.72 h
-    thickness_mm = DESIGN.thickness_mm
-    deepest_N = TRUE.stiffness_N_mm2 * (0.72 * thickness_mm) ** 2 * 0.28**-1.5
+    deepest_m = np.array([0.72e-3 * DESIGN.thickness_mm])
+    of = {"modulus_Pa": 1e6 * TRUE.modulus_MPa, "thickness_m": SETUP.thickness_m, "tip_radius_m": 2e-3}
+    (deepest_N,) = layer.force(deepest_m, **of, base="slipping") * 0.28**-1.5
     force_N = deepest_N * np.array([0.5, 0.999, 1.001, 3.0])
     assert law.beyond_n(TRUE, SETUP, force_N) == 2
     still = replace(TRUE, away_um_mm=0.0)  # the slide goes on with force
     held_uT = law.simulate_uT(still, SETUP, np.zeros((4, 2)), force_N)
-    soft = replace(TRUE, stiffness_N_mm2=TRUE.stiffness_N_mm2 / 2)  # reaches that depth under half the force
+    soft = replace(TRUE, modulus_MPa=TRUE.modulus_MPa / 2)  # reaches that depth under half the force
     assert law.beyond_n(soft, SETUP, force_N[1:]) == 3
     np.testing.assert_allclose(held_uT[2], held_uT[3])
 

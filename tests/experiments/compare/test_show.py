@@ -61,7 +61,7 @@ def test_frames_are_told_in_one_sentence_and_parameters_with_their_units():
     found = tables(NUMBERS, "recorded")
     assert found["compare_frames"]["in one sentence"].tolist() == ["Against the scene, chips 1 and 2 are exchanged."]
     assert found["compare_frames"]["cosine by chip, best"].tolist() == ["0.80"]
-    assert {"gap, mm", "slide away, µm/mm", "stiffness, N/mm²"} <= set(found["compare_parameters"].columns)
+    assert {"gap, mm", "slide away, µm/mm", "Young's modulus, MPa"} <= set(found["compare_parameters"].columns)
 
 
 def test_figures_name_sides_units_and_source_and_are_the_same_twice():

@@ -1,0 +1,121 @@
+"""A touch from its first millinewton to lift-off: nothing jumps. Skins of the product's settings, drawn at random."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.core.config import parse, read_yaml
+from pipeline.physics import slide
+from pipeline.physics.board import Board, BoardDesign, Spreads, draw_board
+from pipeline.physics.friction import Friction
+from pipeline.physics.nodes import Quadrature
+from pipeline.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, forces
+from pipeline.synthesis.contact import Terms, push, respond
+
+ROOT = Path(__file__).resolve().parents[2]
+PARAMS = read_yaml(ROOT / "params.yaml")
+QUICK = read_yaml(ROOT / "pipeline/scenes/quick.yaml")
+DESIGN = parse(SkinDesign, PARAMS["skin"], "skin")
+SPREADS = parse(Spreads, PARAMS["spreads"], "spreads")
+RIGID = parse(BoardDesign, QUICK["simulate"]["boards"]["rigid"]["design"], "boards")
+TERMS = parse(Terms, PARAMS["terms"], "terms")
+COARSE = Quadrature(1e-3, 4)
+LIGHT_N, LIGHT_MAX_uT = 1e-3, 5.0
+STOPS_N = 48  # of a path, and twice as many
+HALVED = 0.75  # of the largest step of dB: half as large where dB is smooth, as large where it jumps
+places = st.tuples(st.floats(-8e-3, 8e-3), st.floats(-8e-3, 8e-3))
+some = settings(max_examples=8, deadline=None)
+
+
+def drawn(name: str) -> tuple[Board, Skin]:
+    board = draw_board(RIGID, SPREADS, seed=1, name=name)
+    return board, draw_skin(DESIGN, SPREADS, seed=1, name=f"{name}_s0", rule=COARSE)
+
+
+def pressed_by(skin: Skin, force_N) -> np.ndarray:
+    """Give the commanded depths of forces on a skin; of none, a tip 20 um above it."""
+    of = {"thickness_m": skin.thickness_m, "tip_radius_m": skin.tip_radius_m, "modulus_Pa": skin.modulus_Pa}
+    depth_m = slide.depth_at(np.asarray(force_N, float), **of) - skin.depth_zero_m
+    return np.where(np.asarray(force_N) > 0, depth_m, -20e-6 - skin.depth_zero_m)
+
+
+def sizes_uT(change_T) -> np.ndarray:
+    return 1e6 * np.linalg.norm(change_T.reshape(len(change_T), -1), axis=1)
+
+
+@some
+@given(places, st.integers(0, 10**6))
+def test_a_touch_of_a_millinewton_changes_the_field_by_less_than_a_readings_noise(place_m, name_i):
+    board, skin = drawn(f"b{name_i}")
+    force_N = np.array([0.0, 1e-6, 1e-5, 1e-4, LIGHT_N])
+    poke_m = np.column_stack([np.tile(place_m, (5, 1)), pressed_by(skin, force_N)])
+    np.testing.assert_allclose(forces(skin, poke_m[:, 2]), force_N, rtol=1e-2)
+    found_uT = sizes_uT(changes_of_field(board, skin, poke_m)[1])
+    assert found_uT[0] == 0
+    assert found_uT[1] < 0.2  # a thousandth of that force
+    assert found_uT[-1] <= LIGHT_MAX_uT
+
+
+def path(skin: Skin, ends_m, forces_N, stops_n: int) -> np.ndarray:
+    """Approach, press, drag under a growing force, release: stops in equal steps of place and of force."""
+    share = np.linspace(0, 3, stops_n + 1)
+    place_m = np.stack([np.interp(share, (1, 2), ends) for ends in np.transpose(ends_m)], axis=1)
+    force_N = np.interp(share, (0, 1, 2, 3), (0.0, *forces_N, 0.0))
+    return np.column_stack([place_m, pressed_by(skin, force_N)])[None]
+
+
+def largest_step_uT(board: Board, skin: Skin, tip_m, coefficient: float) -> float:
+    found = push(board, skin, tip_m, tilt=np.zeros((1, 2)), how=Friction(coefficient=coefficient))
+    assert not found.change_T[0, [0, -1]].any()
+    return float(sizes_uT(np.diff(found.change_T[0], axis=0)).max())
+
+
+@settings(max_examples=4, deadline=None)
+@given(places, places, st.tuples(st.floats(0.05, 1.5), st.floats(0.05, 1.5)), st.integers(0, 10**6))
+def test_half_the_step_of_force_and_place_is_half_the_largest_step_of_the_field(start_m, end_m, forces_N, name_i):
+    board, skin = drawn(f"b{name_i}")
+    coarse, fine = (
+        largest_step_uT(board, skin, path(skin, (start_m, end_m), forces_N, n), 0.4) for n in (STOPS_N, 2 * STOPS_N)
+    )
+    assert fine <= HALVED * coarse
+
+
+def test_a_slide_that_is_taken_whole_at_first_contact_is_found_out(monkeypatch):
+    board, skin = drawn("b0")
+    monkeypatch.setattr(slide, "gripped", lambda whole, *_: whole)
+    place_m = (6e-3, 2e-3)
+    coarse, fine = (
+        largest_step_uT(board, skin, path(skin, (place_m, place_m), (0.5, 0.6), n), 0.4) for n in (STOPS_N, 2 * STOPS_N)
+    )
+    assert fine > HALVED * coarse
+
+
+@pytest.mark.parametrize("terms", [(), ("memory",)])
+def test_at_lift_off_nothing_is_left_but_what_the_skin_remembers(terms):
+    board, skin = drawn("b0")
+    depth_m = pressed_by(skin, np.array([0.5, 2.0, 0.5, 0.0]))
+    tip_m = np.column_stack([np.full(4, 5e-3), np.full(4, -3e-3), depth_m])[None].repeat(3, axis=0)
+    rng = np.random.default_rng(0)
+    found = respond(board, skin, tip_m, tilt=np.zeros((3, 2)), terms=TERMS.only(terms), rng=rng)
+    left_uT, pressed_uT = sizes_uT(found.change_T[:, -1]), sizes_uT(found.change_T[:, 1])
+    assert not found.force_N[:, -1].any()
+    if terms:  # 5 to 8 % of the last contact stands in the next no-load reading (recorded)
+        assert (left_uT < 0.2 * pressed_uT).all()
+        assert left_uT[0] > 0
+    else:
+        assert not left_uT.any()
+
+
+def test_a_light_touch_is_felt_in_proportion_and_a_firm_one_as_before_friction_was_asked():
+    board, skin = drawn("b0")
+    assert skin.hold is not None
+    firm = replace(skin, hold=replace(skin.hold, friction=1e12))
+    place_m = np.array([7e-3, 4e-3])
+    at = np.column_stack([np.tile(place_m, (2, 1)), pressed_by(skin, np.array([1e-3, 6.0]))])
+    light_uT, hard_uT = (sizes_uT(changes_of_field(board, one, at)[1]) for one in (skin, firm))
+    assert light_uT[0] < 0.02 * hard_uT[0]
+    assert light_uT[1] == pytest.approx(hard_uT[1], rel=1e-3)
