@@ -18,6 +18,7 @@ from pipeline.core.errors import ParamsError
 from pipeline.learning.recipe import adaptations, training
 from pipeline.params import module_of, read_scene
 from pipeline.registry import Entry, Registry
+from pipeline.synthesis.fingerprint import SECTIONS
 from pipeline.synthesis.settings import synthesis_of
 from tests.stages.checkout import copy_checkout
 
@@ -60,7 +61,9 @@ def effective(stage: str, asked: Settings) -> str:
             words[section] = training(asked, section).model_dump(mode="json")
     if "adapt" in asked.of_scene:
         words["adapt"] = adaptations(asked).model_dump(mode="json")
-    if {"skin", "spreads"} & set(asked.shared):  # else a stage takes one or two numbers of section simulate
+    if stage in PHYSICS:
+        words["physics"] = {name: asked.shared[name] for name in SECTIONS}
+    elif {"skin", "spreads"} & set(asked.shared):  # else a stage takes one or two numbers of section simulate
         words["making"] = {name: repr(part) for name, part in synthesis_of(asked).__dict__.items()}
     return json.dumps(words, sort_keys=True, default=str)
 
@@ -116,6 +119,7 @@ ALL_SIMULATE = {f"simulate@{key}" for key in SIMULATED}
 RIGID = ALL_SIMULATE - {"simulate@ci-flexible", "simulate@ci-sleeve"}
 PLAIN = {"train_single", "train_multi", "sweep_sensors", "drift", "shear", "sleeve", "ambient"}
 BASED = {"adapt", "sweep_pokes", "sweep_sensors", "manual", "flexible"}
+PHYSICS = {"audit", "report"}  # its fingerprint is compared with that of scene tuning
 DRAWN = {"logs", "ambient", "contacts", "runtime", "left_out"}
 # By override the stages that read it; None: whichever do. A stage that is named nowhere here (that of a new experiment)
 # is checked for what every stage is: DVC runs it again if, and only if, its code gets something else.
@@ -129,12 +133,12 @@ OVERRIDES: list[tuple[str, str, set[str] | None]] = [
     (SHARED, "labellings.few.own_weight=2.0", {"few_labels"}),
     (SHARED, "methods.tiny.ridge.alpha=2.0", {"train_classical", "few_labels"}),
     (SHARED, "methods.all.ridge.alpha=2.0", set()),
-    (SHARED, "skin.modulus_kPa=300.0", ALL_SIMULATE | DRAWN - {"logs"}),
-    (SHARED, "chip.noise_xy_uT=4.0", ALL_SIMULATE | {"logs", "ambient"}),
-    (SHARED, "chip.gain_sel=5", ALL_SIMULATE | {"logs", "ambient", "left_out"}),
-    (SHARED, "rig.rate_hz=200.0", ALL_SIMULATE),
-    (SHARED, "rig.readings_n=3", ALL_SIMULATE | {"logs", "ambient"}),
-    (SHARED, "spreads.chip_tilt_deg=1.0", ALL_SIMULATE | DRAWN),
+    (SHARED, "skin.modulus_kPa=300.0", ALL_SIMULATE | PHYSICS | DRAWN - {"logs"}),
+    (SHARED, "chip.noise_xy_uT=4.0", ALL_SIMULATE | PHYSICS | {"logs", "ambient"}),
+    (SHARED, "chip.gain_sel=5", ALL_SIMULATE | PHYSICS | {"logs", "ambient", "left_out"}),
+    (SHARED, "rig.rate_hz=200.0", ALL_SIMULATE | PHYSICS),
+    (SHARED, "rig.readings_n=3", ALL_SIMULATE | PHYSICS | {"logs", "ambient"}),
+    (SHARED, "spreads.chip_tilt_deg=1.0", ALL_SIMULATE | PHYSICS | DRAWN),
     (SHARED, "terms.ageing.settling=0.2", {"simulate@ci-wear"}),
     (SHARED, "terms.friction.coefficient=0.5", {"simulate@ci-hand", "simulate@ci-drag"}),
     (SHARED, "terms.relaxation.hold_s=1.0", {"simulate@ci-wear", "simulate@ci-hand"}),

@@ -53,10 +53,15 @@ def choose(cards: Cards) -> dict[str, dict[str, Any]]:
     return {"train_multi": chosen_multi, "adapt": chosen_adapt, "train_triplet": chosen_triplet}
 
 
-def to_record(chosen: Mapping[str, Mapping[str, Any]], cards: Cards, *, source: str, seed: int) -> dict[str, Any]:
-    """Write down what was chosen on which boards and skins, for the audit of the scenes that use it."""
+def to_record(
+    chosen: Mapping[str, Mapping[str, Any]], cards: Cards, *, source: str, seed: int, physics: str
+) -> dict[str, Any]:
+    """Write down what was chosen on which boards and skins, for the audit of the scenes that use it.
+
+    `physics` is the fingerprint of the simulated skin that they were drawn of.
+    """
     return {
-        "scene": cards[0]["scene"], "source": source, "seed": seed,
+        "scene": cards[0]["scene"], "source": source, "seed": seed, "physics": physics,
         "boards": sorted({board for card in cards for board in card["test_boards"]}),
         "skins": sorted({skin for card in cards for skin in card["test_skins"]}),
         "chosen": {stage: choice["settings"] for stage, choice in chosen.items()},
@@ -97,9 +102,14 @@ def _has_collapsed(card: Card) -> bool:
 
 def _errors(cards: Cards, candidates: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     """Give by recipe the error's mean over its settings' budgets: recipes that differ in nothing else share it."""
-    keys = {card["recipe_name"]: _key(card) for card in cards}
+    settings = {card["recipe_name"]: (_key(card), _budget(card)) for card in cards}
     errors = {candidate["recipe_name"]: candidate[BY]["mean"] for candidate in candidates}
-    return {name: float(np.mean([errors[alike] for alike in keys if keys[alike] == key])) for name, key in keys.items()}
+
+    def over_budgets(key: Mapping[str, Any]) -> float:
+        by_budget = {budget: errors[name] for name, (own, budget) in settings.items() if own == key}
+        return float(np.mean(list(by_budget.values())))  # equal candidates under two names count once
+
+    return {name: over_budgets(key) for name, (key, _) in settings.items()}
 
 
 def _check_budgets(cards: Cards, stage: str) -> None:

@@ -1,4 +1,4 @@
-"""The paper's three numbers, from predictions. In: true and predicted x, y, F. Out: accuracy and mean squared errors.
+"""The paper's three numbers, from predictions, and R^2 of the force. In: true and predicted x, y, F.
 
 Refuses to know models, folds and files. NaN in the truth means unknown, and is left out of that number.
 """
@@ -9,14 +9,16 @@ import numpy as np
 from jaxtyping import Float
 
 ACCURACY_LIMIT_MM = 1.0  # paper section 4: both |dx| and |dy| within 1 mm
-METRICS = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2")
+METRICS = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2", "r2_f")
+TRUTH = ("force_mean_N", "force_var_N2")  # of the rows that are scored, so that scores of parts can be put together
 
 
 def score(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -> dict[str, float]:
     """Score predictions of (x_mm, y_mm, F_N).
 
-    MSE_xy is the mean over the two axes (the paper does not say whether it sums or averages); MSE_F is absent when no
-    force is known.
+    MSE_xy is the mean over the two axes (the paper does not say whether it sums or averages). R^2 of the force is
+    1 - MSE_F over the variance of the true forces: 0 is what their mean as a constant answer reaches. Force has no
+    score where none is known, and no R^2 where it does not vary.
     """
     error = predicted.astype(float) - true
     known = ~np.isnan(error[:, 2])
@@ -27,6 +29,10 @@ def score(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -
     }
     if known.any():
         numbers["mse_f_N2"] = float((error[known, 2] ** 2).mean())
+        force_N = true[known, 2].astype(float)
+        numbers |= {"force_mean_N": float(force_N.mean()), "force_var_N2": float(force_N.var())}
+        if numbers["force_var_N2"] > 0:
+            numbers["r2_f"] = 1 - numbers["mse_f_N2"] / numbers["force_var_N2"]
     return numbers
 
 

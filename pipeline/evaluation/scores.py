@@ -12,7 +12,7 @@ import pandas as pd
 from jaxtyping import Float
 
 from pipeline.core.errors import SchemaError
-from pipeline.evaluation.metrics import METRICS
+from pipeline.evaluation.metrics import METRICS, TRUTH
 
 NAMES = ("question", "method", "recipe", "inputs", "architecture", "base", "fold", "board", "skin", "places")
 COUNTS = (
@@ -24,18 +24,25 @@ ALL_SKINS = ""  # in column `skin`: all rows that a training was tested on
 AS_LABELLED, REGISTERED = "as_labelled", "registered"  # places: the latter after one offset a board, a diagnosis
 METHODS = {"triplet": "network + triplet", "adapt": "network, adapted"}  # of cards, by question
 CONFIDENCE = 0.95  # convention
+PERCENTAGES = ("accuracy_pct", "coverage_pct")  # between 0 and 100
+AT_MOST_1 = ("r2_f", "cosine_mean", "explained_median")
 ABOVE_ROUNDING = 12  # decimals of a difference in %, mm2 or N2: what lies below is of float sums
-YES, NO, INCONCLUSIVE = "yes", "no", "inconclusive"
-ONE_BOARD = "inconclusive (one board)"
+BOARDS_MIN = 4  # from so many on there is an interval; of fewer, each board's value is given
+YES, NO, INCONCLUSIVE = "supported", "contradicted", "undecided"
+FEW_BOARDS = f"not judged (fewer than {BOARDS_MIN} boards)"
 VERDICTS = (
-    "Yes: the 95 % interval lies wholly on the claim's side of 0 or of the stated threshold. No: wholly on the other "
-    "side. Inconclusive: it includes 0 or the threshold; one board has no interval. The interval is over boards "
-    "(Student's t of the boards' means; skins and networks of a board are averaged first)."
+    "Supported: the 95 % interval lies wholly on the claim's side of 0 or of the stated threshold. Contradicted: "
+    "wholly on the other side. Undecided: it includes 0 or the threshold. Not judged: fewer than "
+    f"{BOARDS_MIN} boards have no interval, and their own values are given. The interval is over boards (Student's t "
+    "of the boards' means; skins and networks of a board are averaged first), on a scale that keeps it in the possible "
+    "range: logit of accuracies, logarithm of squared errors, differences as they are. Folds share training boards, "
+    "which no interval knows."
 )
 
 Cards = Sequence[Mapping[str, Any]]
 Values = Sequence[float] | Float[np.ndarray, " n"] | pd.Series
-Stat = Mapping[str, Any]  # mean, n; where n > 1 also sd, and where n are boards ci95: [low, high]
+# mean, n; where n > 1 also sd; where n are boards, ci95: [low, high], or of few boards values: each board's own
+Stat = Mapping[str, Any]
 
 
 def tidy(cards: Cards, points: Mapping[str, Cards] | None = None) -> pd.DataFrame:
@@ -79,36 +86,91 @@ def by_skin(rows: pd.DataFrame) -> pd.DataFrame:
     return rows[rows["skin"] != ALL_SKINS]
 
 
-def interval(values: Values) -> list[float] | None:
+def interval(values: Values, metric: str = "") -> list[float] | None:
     """Give the two-sided 95 % interval of a mean by Student's t with n - 1 degrees of freedom; None below two values.
+
+    A metric with a bounded range has its interval on a scale without bounds, see `reached`.
 
     >>> interval([1.0]) is None
     True
     >>> [round(float(end), 2) for end in interval([1.0, 3.0])]  # t is 12.71 with one degree of freedom
     [-10.71, 14.71]
+    >>> [round(float(end), 1) for end in interval([60.0, 90.0, 99.0, 95.0], "accuracy_pct")]
+    [46.2, 97.8]
     """
     n = len(values)
     if n < 2:
         return None
-    from scipy.special import stdtrit  # late: only where there are intervals
-
-    mean = float(np.mean(values))
-    reach = float(stdtrit(n - 1, (1 + CONFIDENCE) / 2) * np.std(values, ddof=1) / np.sqrt(n))
-    return [mean - reach, mean + reach]
+    return reached(float(np.mean(values)), float(np.std(values, ddof=1) / np.sqrt(n)), n - 1, metric)
 
 
-def statistic(values: Values, *, boards: bool = False) -> dict[str, Any]:
-    """Give mean and number, and of two values or more sd (n - 1) and, if they are `boards`, the interval `ci95`."""
+def reached(mean: float, se: float, freedom: float, metric: str = "") -> list[float]:
+    """Give the 95 % interval of a mean with this standard error, by Student's t, inside the metric's range.
+
+    Delta method: g(mean) +- t g'(mean) se, taken back by the inverse of g. g is the logit of a percentage, the
+    logarithm of a squared error, -log(1 - x) of what is 1 at most, and x itself of anything else.
+    """
+    from scipy.special import expit, logit, stdtrit  # late: only where there are intervals
+
+    reach = float(stdtrit(freedom, (1 + CONFIDENCE) / 2)) * se
+    if reach == 0:
+        return [mean, mean]
+    ends = np.array([-reach, reach])
+    if metric in PERCENTAGES:
+        share = mean / 100
+        return [float(end) for end in 100 * expit(logit(share) + ends / (100 * share * (1 - share)))]
+    if metric.startswith("mse_"):
+        return [float(end) for end in mean * np.exp(ends / mean)]
+    if metric in AT_MOST_1:
+        return [float(end) for end in 1 - (1 - mean) * np.exp(-ends / (1 - mean))]
+    return [float(end) for end in mean + ends]
+
+
+def p_value(mean: float, se: float, freedom: float) -> float:
+    """Give the two-sided p-value of a mean difference being 0, by Student's t."""
+    from scipy.special import stdtr
+
+    if se == 0:
+        return 1.0 if mean == 0 else 0.0
+    return float(2 * stdtr(freedom, -abs(mean) / se))
+
+
+def holm(p_values: Mapping[str, float]) -> dict[str, float]:
+    """Adjust the p-values of a family for their number (Holm 1979); each is compared with 0.05 as it is.
+
+    >>> holm({"a": 0.01, "b": 0.04, "c": 0.03})
+    {'a': 0.03, 'c': 0.06, 'b': 0.06}
+    """
+    adjusted, least = {}, 0.0
+    for i, name in enumerate(sorted(p_values, key=lambda one: p_values[one])):
+        least = max(least, min(1.0, (len(p_values) - i) * p_values[name]))
+        adjusted[name] = least
+    return adjusted
+
+
+def statistic(values: Values, *, boards: bool = False, metric: str = "") -> dict[str, Any]:
+    """Give mean and number, and of two values or more sd (n - 1).
+
+    Of `boards` also the interval `ci95`, or of fewer than `BOARDS_MIN` their `values`, in the order of the boards.
+    """
     stat = {"mean": float(np.mean(values)), "n": len(values)}
     if len(values) < 2:
         return stat
-    return stat | {"sd": float(np.std(values, ddof=1))} | ({"ci95": interval(values)} if boards else {})
+    stat["sd"] = float(np.std(values, ddof=1))
+    if not boards:
+        return stat
+    few = len(values) < BOARDS_MIN
+    return stat | ({"values": [float(one) for one in values]} if few else {"ci95": interval(values, metric)})
 
 
-def summarise(units: pd.DataFrame, *, boards: bool = False) -> dict[str, dict[str, Any]]:
-    """Summarise each column over the rows that have it."""
+def summarise(units: pd.DataFrame, *, boards: bool = False, differences: bool = False) -> dict[str, dict[str, Any]]:
+    """Summarise each column over the rows that have it; of `differences` no range is known."""
     known = {str(name): units[name].dropna().to_numpy() for name in units}
-    return {name: statistic(values, boards=boards) for name, values in known.items() if len(values)}
+    return {
+        name: statistic(values, boards=boards, metric="" if differences else name)
+        for name, values in known.items()
+        if len(values)
+    }
 
 
 def over_units(rows: pd.DataFrame, *unit: str, boards: bool = False) -> dict[str, dict[str, Any]]:
@@ -143,14 +205,35 @@ def over_boards(rows: pd.DataFrame, places: str = AS_LABELLED) -> dict[str, dict
 
 
 def over_pairs(rows: pd.DataFrame) -> dict[str, dict[str, Any]]:
-    """Summarise pairs of a training and a test skin, as the paper does (3 x 9 pairs), `ci95` over test boards.
+    """Summarise pairs of a training and a test skin, as the paper does (3 x 9 pairs).
 
-    The same few networks answer on every board, so the interval says nothing of other training skins.
+    `ci95` is over training skins and test boards alike (`two_way`), `training_n` and `boards_n` how many there are.
     """
-    pairs = over_units(by_skin(rows), "fold", "skin")
-    boards = summarise(board_means(by_skin(rows)), boards=True)
-    return {name: stat | {key: boards[name][key] for key in ("ci95",) if key in boards[name]}
-            for name, stat in pairs.items()}  # fmt: skip
+    own = by_skin(rows)
+    pairs, crossed = over_units(own, "fold", "skin"), own.groupby(["fold", "board"])[_metrics(own)].mean()
+    found = {}
+    for name, stat in pairs.items():
+        table = crossed[name].dropna().unstack()
+        error = two_way(table)
+        found[name] = stat | {"training_n": len(table), "boards_n": len(table.columns)}
+        if error is not None:
+            found[name]["ci95"] = reached(stat["mean"], *error, name)
+    return found
+
+
+def two_way(table: pd.DataFrame) -> tuple[float, float] | None:
+    """Give the standard error, and its degrees of freedom, of a mean over rows and columns that are both samples.
+
+    Training skins are rows, test boards columns; cells may be missing. The variance is that of row means over their
+    number plus that of column means over theirs, with Satterthwaite's degrees of freedom: a little too wide, as what is
+    left in single cells counts twice. None below two rows or `BOARDS_MIN` columns.
+    """
+    if len(table) < 2 or len(table.columns) < BOARDS_MIN:
+        return None
+    factors = [table.mean(axis=axis).to_numpy() for axis in (1, 0)]
+    parts = [float(means.var(ddof=1)) / len(means) for means in factors]
+    weight = sum(part**2 / (len(means) - 1) for part, means in zip(parts, factors, strict=True))
+    return sum(parts) ** 0.5, sum(parts) ** 2 / weight if weight else 1.0
 
 
 def board_means(rows: pd.DataFrame) -> pd.DataFrame:
@@ -158,31 +241,58 @@ def board_means(rows: pd.DataFrame) -> pd.DataFrame:
     return _skin_means(rows).groupby("board").mean()
 
 
-def differences(of: pd.DataFrame, over: pd.DataFrame, *, where_tested: bool = False) -> pd.DataFrame:
-    """Subtract skin by skin, each side the mean of its networks there; a row a board, the mean of its skins.
-
-    Both sides have the same skins, or are compared where the second was tested: one skin on others is on some boards.
-    """
+def differences(of: pd.DataFrame, over: pd.DataFrame) -> pd.DataFrame:
+    """Subtract skin by skin, each side the mean of its networks there; a row a board, the mean of its skins."""
     ours, theirs = _skin_means(of), _skin_means(over)
-    if where_tested:
-        ours = ours[ours.index.isin(theirs.index)]
     if not ours.index.equals(theirs.index):
-        unpaired = sorted(ours.index.symmetric_difference(theirs.index))
-        remedy = "Train both on the same folds."
-        raise SchemaError("a paired difference", "held-out skins", "the same on both sides", unpaired, remedy)
+        raise _unpaired(sorted(ours.index.symmetric_difference(theirs.index)))
     return (ours - theirs).groupby("board").mean()
 
 
 def with_boards(by_board: pd.DataFrame) -> dict[str, Any]:
-    """Summarise over boards, and give `by_board` each board's value; what is left of equal sides is 0."""
-    summary = summarise(by_board, boards=True)
+    """Summarise differences over boards, and give `by_board` each board's value; what is left of equal sides is 0.
+
+    Over `BOARDS_MIN` boards or more, `p` is the p-value of no difference, from `se` and `df` (degrees of freedom).
+    """
+    summary = summarise(by_board, boards=True, differences=True)
     means = {name: stat | {"mean": round(stat["mean"], ABOVE_ROUNDING)} for name, stat in summary.items()}
+    for stat in means.values():
+        if "ci95" in stat:
+            stat |= _tested(stat["mean"], stat["sd"] / stat["n"] ** 0.5, stat["n"] - 1)
     return {**means, "by_board": records(by_board)}
 
 
-def paired(of: pd.DataFrame, over: pd.DataFrame, *, where_tested: bool = False) -> dict[str, Any]:
+def paired(of: pd.DataFrame, over: pd.DataFrame) -> dict[str, Any]:
     """Compare two sides of equal skins: every metric's difference over boards, and `by_board`."""
-    return with_boards(differences(of, over, where_tested=where_tested))
+    return with_boards(differences(of, over))
+
+
+def paired_with_single(of: pd.DataFrame, single: pd.DataFrame) -> dict[str, Any]:
+    """Compare networks of many skins with networks of one skin each, where these were tested: as `paired`.
+
+    Both the boards and the single networks' training skins are samples: the interval and `p` are those of `two_way`.
+    """
+    theirs = single.groupby(["fold", "board", "skin"])[_metrics(single)].mean()
+    ours, skins = _skin_means(of), pd.MultiIndex.from_tuples([pair[1:] for pair in theirs.index])
+    if unpaired := sorted(set(skins) - set(ours.index)):
+        raise _unpaired(unpaired)
+    apart = (ours.loc[skins, theirs.columns].set_axis(theirs.index) - theirs).groupby(["fold", "board"]).mean()
+    found = with_boards(apart.groupby("board").mean())
+    for name in apart:
+        if name in found:
+            stat = {key: value for key, value in found[name].items() if key in ("mean", "sd", "n", "values")}
+            error = two_way(apart[name].dropna().unstack())
+            found[name] = stat if error is None else stat | _tested(stat["mean"], *error)
+    return found
+
+
+def _tested(mean: float, se: float, freedom: float) -> dict[str, Any]:
+    return {"ci95": reached(mean, se, freedom), "se": se, "df": freedom, "p": p_value(mean, se, freedom)}
+
+
+def _unpaired(skins: Sequence[Any]) -> SchemaError:
+    remedy = "Train both on the same folds."
+    return SchemaError("a paired difference", "held-out skins", "the same on both sides", skins, remedy)
 
 
 def records(rows: pd.DataFrame) -> dict[str, dict[str, float]]:
@@ -194,7 +304,7 @@ def records(rows: pd.DataFrame) -> dict[str, dict[str, float]]:
 def verdict(stat: Stat, *, above: float = 0.0) -> str:
     """Judge whether a mean over boards is above a threshold, by its interval."""
     if "ci95" not in stat:
-        return ONE_BOARD
+        return FEW_BOARDS
     low, high = stat["ci95"]
     return YES if low > above else NO if high < above else INCONCLUSIVE
 
@@ -202,7 +312,7 @@ def verdict(stat: Stat, *, above: float = 0.0) -> str:
 def verdict_within(stat: Stat, reach: float) -> str:
     """Judge whether a mean over boards is nearer to 0 than `reach`, by its interval (equivalence)."""
     if "ci95" not in stat:
-        return ONE_BOARD
+        return FEW_BOARDS
     low, high = stat["ci95"]
     if -reach < low and high < reach:
         return YES
@@ -212,12 +322,13 @@ def verdict_within(stat: Stat, reach: float) -> str:
 def negated(stat: Stat) -> dict[str, Any]:
     """Turn a difference round: of an error, less is a gain."""
     turned = {**stat, "mean": -stat["mean"]}
+    turned |= {"values": [-one for one in stat["values"]]} if "values" in stat else {}
     return turned | ({"ci95": [-end for end in reversed(stat["ci95"])]} if "ci95" in stat else {})
 
 
 def all_of(verdicts: Sequence[str]) -> str:
     """Judge a claim of several parts: one no is enough to deny it, and only yes throughout affirms it."""
-    return next((word for word in (NO, ONE_BOARD, INCONCLUSIVE) if word in verdicts), YES)
+    return next((word for word in (NO, FEW_BOARDS, INCONCLUSIVE) if word in verdicts), YES)
 
 
 def tally(trainings: Iterable[Mapping[str, Any]]) -> dict[str, int]:
@@ -265,8 +376,12 @@ def _rows(keys: Mapping[str, Any], scores: Mapping[str, Any]) -> list[dict[str, 
 
 def _pool(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Put the scores of one fold and seed together that were tested on a skin each, by their numbers of rows."""
-    rows_n = [row["rows_n"] for row in rows]
-    scores = {
-        name: float(np.average([row[name] for row in rows], weights=rows_n)) for name in METRICS if name in rows[0]
-    }
-    return {**rows[0], **scores, "rows_n": sum(rows_n)}
+    rows_n = np.array([row["rows_n"] for row in rows])
+    known = [name for name in (*METRICS, *TRUTH) if all(name in row for row in rows)]
+    parts = {name: np.array([row[name] for row in rows]) for name in known}
+    scores = {name: float(np.average(values, weights=rows_n)) for name, values in parts.items()}
+    if "r2_f" in parts:
+        between_N2 = (parts["force_mean_N"] - scores["force_mean_N"]) ** 2
+        scores["force_var_N2"] += float(np.average(between_N2, weights=rows_n))
+        scores["r2_f"] = 1 - scores["mse_f_N2"] / scores["force_var_N2"]
+    return {**rows[0], **scores, "rows_n": int(rows_n.sum())}

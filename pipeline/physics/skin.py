@@ -173,6 +173,13 @@ def forces(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, " 
     return layer.force(true_m, **of, base=skin.base)
 
 
+def shear_moduli_Pa(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Give the shear modulus that the layer under the tip shows at commanded depths; incompressible: E / 3."""
+    if skin.hold is None:
+        return np.full(len(depth_m), skin.modulus_Pa / 3)
+    return skin.modulus_Pa / 3 * slide.stiffening(depth_m + skin.depth_zero_m, skin.thickness_m)
+
+
 def _refuse_beside(pokes_m: Float[np.ndarray, "n 3"], skin: Skin) -> None:
     # The layer is endless in the model: past the skin's edge it would press on material that is not there.
     half_m = np.array(skin.sides_m) / 2

@@ -158,16 +158,19 @@ def _turn(rows, turn, move):
 def force_at(
     depth_m: Float[np.ndarray, " n"], *, modulus_Pa: float, thickness_m: float, tip_radius_m: float
 ) -> Float[np.ndarray, " n"]:
-    """Give the force of a tip on a sliding layer that thins under it: that of `layer.force` times (1 - d/h)^(-3/2)."""
+    """Give the force of a tip on a sliding layer that thins under it: that of `layer.force` times `stiffening`."""
     elastic_N = layer.force(
         depth_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m, modulus_Pa=modulus_Pa, base="slipping"
     )
-    return elastic_N * (1 - np.maximum(depth_m, 0.0) / thickness_m) ** -STIFFENING
+    return elastic_N * stiffening(depth_m, thickness_m)
 
 
-def beyond_n(
-    force_N: Float[np.ndarray, " n"], *, modulus_Pa: float, thickness_m: float, tip_radius_m: float
-) -> int:
+def stiffening(depth_m: Float[np.ndarray, " n"], thickness_m: float) -> Float[np.ndarray, " n"]:
+    """Give by how much a layer is stiffer that thins under a tip, against pressing and (assumed) shear alike."""
+    return (1 - np.maximum(depth_m, 0.0) / thickness_m) ** -STIFFENING
+
+
+def beyond_n(force_N: Float[np.ndarray, " n"], *, modulus_Pa: float, thickness_m: float, tip_radius_m: float) -> int:
     """Count the forces that `depth_at` holds at its deepest, as they lie beyond it."""
     at_m = np.array([DEEPEST * thickness_m])
     deepest_N = force_at(at_m, modulus_Pa=modulus_Pa, thickness_m=thickness_m, tip_radius_m=tip_radius_m)

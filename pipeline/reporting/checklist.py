@@ -14,9 +14,9 @@ import pandas as pd
 
 from pipeline.core.config import parse, read_yaml
 from pipeline.core.errors import SchemaError
-from pipeline.evaluation.scores import VERDICTS
+from pipeline.evaluation.scores import VERDICTS, holm
 from pipeline.reporting import judging, paper
-from pipeline.reporting.judging import NONE, Row, Verdict, judge, mean_of
+from pipeline.reporting.judging import NONE, Row, Verdict, adjusted, judge, mean_of, p_of
 from pipeline.reporting.order import FEW_POINTS, is_pooled
 from pipeline.reporting.parts import add_rows
 from pipeline.reporting.shown import show, show_difference
@@ -27,9 +27,17 @@ METRICS = {
     "mse_fxy_N2": "MSE of the shear force", "mse_fz_N2": "MSE of the normal force",
 }  # fmt: skip
 UNITS = {"pct": "%", "mm2": "mm²", "N2": "N²", "mm": "mm", "N": "N", "hz": "Hz"}
+CLAIM = "claim: "
+FAMILY = (
+    "The claims of section 5 about accuracy, the primary score, are one family, listed before any run (checklist.yaml, "
+    "family): their p-values (t over boards) are adjusted by Holm's method, and a claim is supported or contradicted "
+    f"only if its adjusted p is {judging.SIGNIFICANT:g} or less. All other verdicts are unadjusted: exploratory. "
+    f"Sizeable: at least {100 * judging.SIZEABLE:g} % of the paper's own difference; equivalent to none: the whole "
+    "interval is nearer to 0 than that."
+)
 MEANING = (
-    f"Verdicts are on claims. {VERDICTS} Pairs of numbers have no verdict: a number differs where it is outside the "
-    f"paper's sd, or by more than {100 * judging.NEAR:g} % where the paper gives none. Slightly: less than "
+    f"Verdicts are on claims. {VERDICTS} {FAMILY} Pairs of numbers have no verdict: a number differs where it is "
+    f"outside the paper's sd, or by more than {100 * judging.NEAR:g} % where the paper gives none. Slightly: less than "
     f"{FEW_POINTS:g} points of accuracy up or down; a plateau: less than {judging.PLATEAU_POINTS:g}. Reasons are "
     "assumed: no run tested them. Where there is no number to compare, see the file named last."
 )
@@ -46,12 +54,13 @@ def checklist(numbers: Mapping[str, Any], rows: Sequence[Row] | None = None) -> 
     """Put every result of the paper beside ours, with a sentence on how they differ."""
     source = numbers["provenance"]["source"]
     lines = []
-    for row in read_rows() if rows is None else rows:
-        if row.only not in (None, source):
-            continue
-        printed = look_up(numbers, row.paper) if row.paper else None
-        ours = resolve(numbers, row.ours) if row.ours else None
+    asked = [row for row in (read_rows() if rows is None else rows) if row.only in (None, source)]
+    p_values = family_p(numbers, asked)
+    for row in asked:
+        printed, ours = _both(numbers, row)
         verdict = judge(row, printed, ours, pooled=is_pooled(numbers), simulated=source == "simulated")
+        if row.id in p_values:
+            verdict = adjusted(row, verdict, p_values[row.id], len(p_values))
         if ours is None and row.question in numbers:
             verdict = Verdict(judging.NOT_REACHED)
         lines.append(
@@ -70,6 +79,26 @@ def checklist(numbers: Mapping[str, Any], rows: Sequence[Row] | None = None) -> 
     table = pd.DataFrame(lines)
     table.attrs["meaning"] = MEANING
     return table
+
+
+def claims_table(table: pd.DataFrame) -> pd.DataFrame:
+    """Take of a checklist the paper's claims, with their verdicts."""
+    claims = table[table["result"].str.startswith(CLAIM)].drop(columns=["stage", "shown in"])
+    claims = claims.assign(result=claims["result"].str.removeprefix(CLAIM)).rename(columns={"result": "claim"})
+    claims.attrs["meaning"] = f"{VERDICTS} {FAMILY}"
+    return claims
+
+
+def family_p(numbers: Mapping[str, Any], rows: Sequence[Row]) -> dict[str, float]:
+    """Give the p-values of the claims that are tested together, by row, adjusted for their number."""
+    found = {row.id: p_of(row, *_both(numbers, row)) for row in rows if row.family}
+    return holm({name: p for name, p in found.items() if p is not None})
+
+
+def _both(numbers: Mapping[str, Any], row: Row) -> tuple[Any, Any]:
+    """Find the paper's number and ours."""
+    printed = look_up(numbers, row.paper) if row.paper else None
+    return printed, resolve(numbers, row.ours) if row.ours else None
 
 
 def resolve(numbers: Any, path: str) -> Any:

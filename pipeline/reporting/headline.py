@@ -12,13 +12,13 @@ import pandas as pd
 
 from pipeline.reporting.figures import drawing, svg
 from pipeline.reporting.order import Model, models, table_2_rows
-from pipeline.reporting.shown import COLUMNS, INTERVAL, n_of, show, tabulate
+from pipeline.reporting.shown import COLUMNS, INTERVAL, OF_PAPER, n_of, show, tabulate
 from pipeline.reporting.sweeps import DRAWN, bars
 from pipeline.reporting.work_precision import COLOURS, MARKERS
 
 FILE = "headline.svg"
 APART = 0.17  # of a row: ours above, the paper's below
-SHORT_TABLE = ("accuracy_pct", "mse_xy_mm2")
+SHORT_TABLE = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2", "r2_f")
 WITHIN = "Readings placed within 1 mm on boards"
 BRACKETS = "In brackets: 95 % interval over boards"
 UNIVERSAL = "universal, "  # so begins what is told which skin it is on: the map with networks
@@ -157,8 +157,9 @@ def short_table(numbers: Mapping[str, Any]) -> pd.DataFrame:
     for model, row in [*_experts(numbers), *table_2_rows(numbers).values()]:
         line = {"boards never seen": model.title}
         for metric in SHORT_TABLE:
-            paper = f"{model.paper[metric][0]:.3g}" if model.paper else "–"
-            line |= {f"{COLUMNS[metric]} (ours)": show(row[metric]), f"{COLUMNS[metric]} (paper)": paper}
+            paper = f"{model.paper[metric][0]:.3g}" if metric in model.paper else "–"
+            line |= {f"{COLUMNS[metric]} (ours)": show(row.get(metric))}
+            line |= {f"{COLUMNS[metric]} (paper)": paper} if metric in OF_PAPER else {}
         lines.append(line | {"n": n_of(row)})
     return tabulate(lines, spread=f"{INTERVAL}; n boards, or pairs of skins for one skin on others")
 

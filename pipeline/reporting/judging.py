@@ -9,10 +9,12 @@ from typing import Any, Literal
 
 from pipeline.core.config import Strict
 from pipeline.evaluation import scores as inference
-from pipeline.evaluation.scores import INCONCLUSIVE, NO, ONE_BOARD, YES, Stat, negated
+from pipeline.evaluation.scores import BOARDS_MIN, FEW_BOARDS, INCONCLUSIVE, NO, YES, Stat, negated
 from pipeline.reporting.order import FEW_POINTS, gain
 
 NEAR = 0.10  # assumed: relative tolerance where the paper gives no sd
+SIZEABLE = 0.5  # assumed: part of the paper's own difference that a sizeable one reaches, and a negligible one does not
+SIGNIFICANT = 0.05  # convention: of p-values adjusted for the family of claims
 PLATEAU_POINTS = 1.0  # assumed: "seems to plateau"
 NOT_ASKED = "not asked in this scene"
 NOT_REACHED = "not reached in this scene"
@@ -21,7 +23,7 @@ SETTING = "a setting of this scene, not a result"
 TARGET = "a calibration target of the simulated spreads: agreement is no evidence"
 POOLED = ("table2.multi.", "table2.triplet.", "table2.adapted.", "paired.", "contrasts.")  # networks of many skins
 NONE = "–"
-DIFFERENCES = ("gain", "slight", "plateau")  # rules about differences: shown with their sign
+DIFFERENCES = ("gain", "sizeable", "slight", "plateau")  # rules about differences: shown with their sign
 
 
 class Reach(Strict):
@@ -42,13 +44,15 @@ class Row(Strict):
     says: str | None = None  # the paper's words, where it gives no number
     ours: str | None = None
     question: str | None = None  # the question that ours follows from, where a small scene may not have ours
-    # gain: a paired difference is an improvement; each: all of a list are; slight, plateau: it is small; finding:
+    # gain: a paired difference is an improvement; sizeable: by half of the paper's at least; each: all of a list are
+    # improvements; slight, plateau: it is small; finding:
     # judged by its experiment; view: a figure to look at; input: a setting of simulated scenes; setting: of all scenes;
     # target: where simulated, the calibration target of the spreads
     rule: Literal[
-        "near", "at_most", "at_least", "positive", "gain", "each", "slight", "plateau", "finding", "input", "setting",
-        "target", "view",
+        "near", "at_most", "at_least", "positive", "gain", "sizeable", "each", "slight", "plateau", "finding", "input",
+        "setting", "target", "view",
     ] = "near"  # fmt: skip
+    family: bool = False  # one of the paper's claims that are tested together: p-values are adjusted by Holm's method
     reach: Reach | None = None
     only: Literal["recorded", "simulated"] | None = None  # scenes of such a source alone have the row
     stage: str | None = None
@@ -66,6 +70,35 @@ class Verdict:
     word: str = NONE
 
 
+def p_of(row: Row, printed: Any, ours: Any) -> float | None:
+    """Give the p-value of a claim about differences over boards; None where too few boards were compared.
+
+    Of a claim about every number of training skins, the largest: it holds only if all do.
+    """
+    if isinstance(ours, Sequence):
+        each = [p_of(row, None, one["accuracy_pct"]) for one in ours]
+        return None if not each or None in each else max(one for one in each if one is not None)
+    if not isinstance(ours, Mapping) or "se" not in ours:
+        return None
+    limit = sizeable(mean_of(printed)) if row.rule == "sizeable" else 0.0
+    better = gain(ours, str(row.ours).rsplit(".", 1)[-1])
+    return inference.p_value(better["mean"] - limit, ours["se"], ours["df"])
+
+
+def sizeable(printed: float | None) -> float:
+    """Give the gain that counts as sizeable: a stated part of the paper's own difference."""
+    assert printed is not None, "a row that is judged by the paper's difference prints one"
+    return SIZEABLE * abs(printed)
+
+
+def adjusted(row: Row, verdict: Verdict, p: float, family_n: int) -> Verdict:
+    """Leave a claim of the family undecided unless it is significant among all of them."""
+    sentence = f"{verdict.sentence}; p = {p:.2g}, adjusted for {family_n} claims"
+    if verdict.word not in (YES, NO) or p <= SIGNIFICANT:
+        return Verdict(sentence, verdict.differs, verdict.word)
+    return Verdict(sentence, verdict.differs, INCONCLUSIVE)
+
+
 def judge(row: Row, printed: Any, ours: Any, *, pooled: bool, simulated: bool) -> Verdict:
     """Judge ours against the paper's: a verdict on a claim, or the distance of two numbers."""
     if row.ours is None:
@@ -75,7 +108,7 @@ def judge(row: Row, printed: Any, ours: Any, *, pooled: bool, simulated: bool) -
     if not pooled and row.ours.startswith(POOLED):
         return Verdict(ONE_SKIN)
     if isinstance(ours, bool):
-        return Verdict(f"{'holds' if ours else 'does not hold'} on the board that was measured", not ours, ONE_BOARD)
+        return Verdict(f"{'holds' if ours else 'does not hold'} on the board that was measured", not ours, FEW_BOARDS)
     if row.rule == "setting" or (row.rule == "input" and simulated):
         return Verdict(SETTING)
     return _judge_by_rule(row, printed, ours, simulated=simulated)
@@ -86,7 +119,7 @@ def _judge_by_rule(row: Row, printed: Any, ours: Any, *, simulated: bool) -> Ver
     match row.rule:
         case "view":
             return Verdict(NONE)
-        case "gain" | "slight" | "plateau":
+        case "gain" | "sizeable" | "slight" | "plateau":
             return _judge_difference(row.rule, path, mean_of(printed), ours)
         case "at_most" | "at_least" | "positive":
             limit = 0.0 if row.rule == "positive" else mean_of(printed)
@@ -113,19 +146,32 @@ def mean_of(value: Any) -> float | None:
 
 def _judge_difference(rule: str, path: str, printed: float | None, ours: Stat) -> Verdict:
     """Judge a paired difference by its interval, and say whether the interval includes the paper's difference."""
-    if rule == "gain":
-        better = gain(ours, path.rsplit(".", 1)[-1])
-        word = inference.verdict(better)
-        words = {YES: "lies on the claimed side of 0", NO: "lies on the other side of 0", INCONCLUSIVE: "includes 0"}
-        alone = f"; ours {words[YES if better['mean'] > 0 else NO]}"
+    better = gain(ours, path.rsplit(".", 1)[-1])
+    if rule in ("gain", "sizeable"):
+        limit = sizeable(printed) if rule == "sizeable" else 0.0
+        what = f"half of the paper's difference, {limit:.3g}" if rule == "sizeable" else "0"
+        word = inference.verdict(better, above=limit)
+        words = {YES: f"lies beyond {what}, on the claimed side", NO: f"lies short of {what}",
+                 INCONCLUSIVE: f"includes {what}"}  # fmt: skip
+        alone = f"; ours is {'beyond' if better['mean'] > limit else 'short of'} {what}"
     else:
         limit = FEW_POINTS if rule == "slight" else PLATEAU_POINTS
         word = inference.verdict_within(ours, limit)
         words = {YES: "is within", NO: "is beyond", INCONCLUSIVE: "includes a limit of"}
         words = {key: f"{text} ±{limit:g} points" for key, text in words.items()}
         alone = ""
-    sentence = f"one board: no interval{alone}" if word == ONE_BOARD else f"{_interval(ours)} {words[word]}"
+    sentence = f"fewer than {BOARDS_MIN} boards: no interval{alone}"
+    if word != FEW_BOARDS:
+        sentence = f"{_interval(ours)} {words[word]}{_negligible(better, printed) if rule != 'slight' else ''}"
     return Verdict(sentence + _including(ours, printed), word == NO, word)
+
+
+def _negligible(better: Stat, printed: float | None) -> str:
+    """Say that a gain is smaller than half of the paper's, by equivalence: the whole interval is."""
+    if not printed:
+        return ""
+    low, high = better["ci95"]
+    return "; equivalent to none within half of the paper's" if max(-low, high) < sizeable(printed) else ""
 
 
 def _judge_limit(rule: str, limit: float, ours: Stat) -> Verdict:

@@ -20,7 +20,10 @@ from pipeline.evaluation.scores import (
     over_folds,
     over_pairs,
     paired,
+    paired_with_single,
+    records,
     select,
+    summarise,
     tidy,
     whole,
     with_boards,
@@ -55,8 +58,10 @@ def learned(table: pd.DataFrame, *, headline: str) -> dict[str, Any]:
         "table2": table2,
         "lobo": _lobo(models["multi"]) if "multi" in models else {},
         "adapt": _adapt(models["adapted"], control) if "adapted" in models else {},
+        "constant_force": _constants(table, models),
         "paired": [
-            {"of": of, "over": over} | paired(by_skin(models[of]), by_skin(models[over]), where_tested=over == "single")
+            {"of": of, "over": over}
+            | (paired_with_single if over == "single" else paired)(by_skin(models[of]), by_skin(models[over]))
             for of, over in PAIRS
             if of in models and over in models
         ],
@@ -64,6 +69,12 @@ def learned(table: pd.DataFrame, *, headline: str) -> dict[str, Any]:
     }
     numbers = {name: value for name, value in numbers.items() if value}
     return numbers | _curves(table) | {"variants": _variants(table)}
+
+
+def _constants(table: pd.DataFrame, models: Mapping[str, pd.DataFrame]) -> dict[str, Any]:
+    tested = {"table2": models.get("multi", table[:0]), "labels": select(table, question="labels")}
+    found = {name: _constant_force(rows) for name, rows in tested.items()}
+    return {name: row for name, row in found.items() if row}
 
 
 def _adapt(adapted: pd.DataFrame, control: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -219,7 +230,17 @@ def _labels(rows: pd.DataFrame) -> Iterator[dict[str, Any]]:
     for (method, inputs), group in _parts(rows, ["method", "inputs"], sort=False):
         for labels_n, scored in _parts(group, "labels_n"):
             parts = {places: over_boards(scored, places) for places in (AS_LABELLED, REGISTERED)}
-            yield {"method": method, "inputs": inputs, "labels_n": int(labels_n), **parts}
+            by_board = records(whole(scored).groupby("board")[list(METRICS)].mean())
+            yield {"method": method, "inputs": inputs, "labels_n": int(labels_n), **parts, "by_board": by_board}
+
+
+def _constant_force(rows: pd.DataFrame) -> dict[str, Any]:
+    """Score the mean of the tested forces as a constant answer: its MSE is their variance, MSE_F / (1 - R^2)."""
+    tested = whole(rows).dropna(subset=["r2_f"])
+    tested = tested[tested["r2_f"] < 1]
+    variance_N2 = (tested["mse_f_N2"] / (1 - tested["r2_f"])).groupby(tested["board"]).mean()
+    scores = pd.DataFrame({"mse_f_N2": variance_N2, "r2_f": 0.0})
+    return summarise(scores, boards=True) if len(scores) else {}
 
 
 def _curve_name(row: Mapping[str, Any]) -> str:

@@ -1,20 +1,16 @@
-"""The order of the paper's rows: numbers.json -> tables of paired differences over boards, and verdicts.
+"""The rows of table 2 in the paper's order: numbers.json -> what they are called, and tables of paired differences."""
 
-Refuses to know why a claim does not hold.
-"""
-
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import pandas as pd
 
-from pipeline.evaluation.scores import VERDICTS, negated, verdict, verdict_within
+from pipeline.evaluation.scores import negated
 from pipeline.reporting.paper import ADAPTED_POKES_N, TABLE_2, TABLE_2_ROWS, Number
-from pipeline.reporting.shown import COLUMNS, Stat, beside, n_of, show_difference, tabulate
+from pipeline.reporting.shown import COLUMNS, Stat, beside, show_difference, tabulate
 
 FEW_POINTS = 5.0  # assumed: the paper's own drop is 3.4 points, "slightly affects performance"
-FAR_SHARE = 0.5  # assumed: of the difference of the paper's own means
 ALONE = "Leave-one-board-out, one training skin"
 CONTROL = "Control: fine-tuned as long, without the new skin's pokes (ours)"
 SHORT = {
@@ -23,17 +19,12 @@ SHORT = {
 }  # fmt: skip
 PAIRED = (
     "Differences on the same test rows, skin by skin, each side the mean of its networks on a skin and a board the "
-    "mean of its skins; [low, high] is the 95 % interval over n boards (Student's t)."
-)
-ORDER = (
-    f"{VERDICTS} The verdict stands before the mean difference. Better: threshold 0. Far better: "
-    f"{100 * FAR_SHARE:g} % of the difference of the paper's means. Within a few points: less than {FEW_POINTS:g} "
-    "points of accuracy up or down. One skin on others is compared on the boards that it was tested on."
+    "mean of its skins; [low, high] is the 95 % interval over n boards (Student's t). One skin on others: on the "
+    "boards that it was tested on, and the interval is over its training skins too. What they decide: table claims."
 )
 CHANGE = "difference"  # column
 
 Numbers = Mapping[str, Any]
-Judge = Callable[[Stat, str], str]  # of a difference and its metric
 
 
 @dataclass(frozen=True)
@@ -103,52 +94,9 @@ def paired_boards_table(numbers: Numbers, source: str) -> pd.DataFrame:
     return tabulate(lines, spread=PAIRED)
 
 
-def order_table(numbers: Numbers, source: str) -> pd.DataFrame:
-    """Judge each claim of the paper about the order of its rows, and our control, by differences over boards.
-
-    Empty where there are only pairs about which the paper claims nothing.
-    """
-    known = models(numbers)
-    pairs = {(row["of"], row["over"]): row for row in numbers["paired"]}
-    pooled: list[tuple[str, tuple[str, str], Judge]] = [
-        ("multi-sensor better than single-sensor", ("multi", "single"), _better),
-        ("multi-sensor far better than single-sensor", ("multi", "single"), _far),
-    ]
-    few = f"{known['triplet'].short} within a few points of {known['multi'].short}"
-    claims = [*(pooled if is_pooled(numbers) else []), (few, ("triplet", "multi"), _few)]
-    for over, ours in (("triplet", ""), ("multi", ""), ("control", " (ours)")):
-        claims.append((f"adapted better than {known[over].short}{ours}", ("adapted", over), _better))
-    lines = [
-        {"claim": words}
-        | {title: judge(pairs[key][m], m) if m in pairs[key] else "–" for m, title in COLUMNS.items()}
-        | {"n": n_of(pairs[key]), "source": source}
-        for words, key, judge in claims
-        if key in pairs
-    ]
-    return tabulate(lines, meaning=ORDER, spread=PAIRED)
-
-
-def far_beyond(metric: str) -> float:
-    """Give the gain beyond which many skins are far better than one: a share of the difference of the paper's means."""
-    return FAR_SHARE * abs(TABLE_2["multi"][metric][0] - TABLE_2["single"][metric][0])
-
-
 def gain(difference: Stat, metric: str) -> Stat:
     """Turn the difference of an error round, so that more is better."""
-    return difference if metric == "accuracy_pct" else negated(difference)
-
-
-def _far(difference: Stat, metric: str) -> str:
-    return f"{verdict(gain(difference, metric), above=far_beyond(metric))}: {show_difference(difference)}"
-
-
-def _better(difference: Stat, metric: str) -> str:
-    return f"{verdict(gain(difference, metric))}: {show_difference(difference)}"
-
-
-def _few(difference: Stat, metric: str) -> str:
-    words = f"{verdict_within(difference, FEW_POINTS)}: {show_difference(difference)}"
-    return words if metric == "accuracy_pct" else "–"
+    return negated(difference) if metric.startswith("mse_") else difference
 
 
 def _name(row: Mapping[str, Any], known: Mapping[str, Model]) -> str:

@@ -40,7 +40,7 @@ LEGIBLE_PX = 8.0  # no letter is shown smaller: where that needs more width than
 NARROW_PX = 340.0  # what a telephone has
 LONG = 40  # letters of a cell that needs a wide column
 FINDINGS_N = 4  # sentences at the head of a section; the checklist holds all
-OPEN = {"table2", "labels", "order"}  # tables that answer the first question; all others open on demand
+OPEN = {"table2", "labels", "claims"}  # tables that answer the first question; all others open on demand
 SOURCES = {
     "simulated": "Every reading of this scene was simulated: no number on this page was measured on hardware.",
     "recorded": "Every reading of this scene was recorded from hardware.",

@@ -9,11 +9,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-COLUMNS = {"accuracy_pct": "accuracy, %", "mse_xy_mm2": "MSE_xy, mm²", "mse_f_N2": "MSE_F, N²"}
-Stat = Mapping[str, Any]  # mean, n, and where known sd and ci95: [low, high]
+COLUMNS = {"accuracy_pct": "accuracy, %", "mse_xy_mm2": "MSE_xy, mm²", "mse_f_N2": "MSE_F, N²", "r2_f": "R² of F"}
+OF_FORCE = ("mse_f_N2", "r2_f")  # an offset of places changes neither
+OF_PAPER = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2")  # the scores that the paper gives
+Stat = Mapping[str, Any]  # mean, n, and where known sd and ci95: [low, high], or values: each of a few boards
 MEANING = "Accuracy: the part of held-out readings whose x and y are both within 1 mm. MSE_xy: mean over the two axes."
 INTERVAL = (
-    "[low, high] is the 95 % interval over held-out boards (Student's t), each the mean of its skins and networks"
+    "[low, high] is the 95 % interval over held-out boards (Student's t), each the mean of its skins and networks; "
+    "below four boards (a; b) are the boards' own values instead"
 )
 SPREAD = f"{INTERVAL}; ± is the sd over n repeats on one skin, or over seeds where it says so."
 
@@ -25,7 +28,7 @@ def show(value: Stat | None) -> str:
     """
     if value is None:
         return "–"
-    if "ci95" in value:
+    if "ci95" in value or "values" in value:
         return f"{_three(value['mean'])} {show_interval(value)}{_show_seeds(value)}"
     return show_deviation(value)
 
@@ -41,21 +44,25 @@ def _show_seeds(value: Stat) -> str:
 
 
 def show_interval(value: Stat) -> str:
-    """Write the 95 % interval over boards alone."""
+    """Write the 95 % interval over boards alone, or the values of a few boards."""
+    if "values" in value:
+        return f"({'; '.join(map(_three, value['values']))})"
     low, high = value["ci95"]
     return f"[{_three(low)}, {_three(high)}]"
 
 
 def show_digits(value: Stat, digits: int) -> str:
     """Write a mean with so many decimals, and its interval over boards and deviation over seeds if it has them."""
-    numbers = [f"{number:.{digits}f}" for number in (value["mean"], *value.get("ci95", ()))]
-    interval = f" [{numbers[1]}, {numbers[2]}]" if len(numbers) > 1 else ""
-    return f"{numbers[0]}{interval}{_show_seeds(value)}"
+    mean, *ends = [f"{number:.{digits}f}" for number in (value["mean"], *value.get("ci95", value.get("values", ())))]
+    if not ends:
+        return f"{mean}{_show_seeds(value)}"
+    boards = f"[{', '.join(ends)}]" if "ci95" in value else f"({'; '.join(ends)})"
+    return f"{mean} {boards}{_show_seeds(value)}"
 
 
 def show_both(value: Stat | None) -> str:
     """Write a mean, its standard deviation as the paper does, and its interval over boards."""
-    if value is None or "ci95" not in value:
+    if value is None or not {"ci95", "values"} & set(value):
         return show(value)
     return f"{show_deviation(value)} {show_interval(value)}"
 
@@ -81,13 +88,14 @@ def beside(
     """Show every metric of a row beside what the paper prints, and over how many ours is."""
     cells: dict[str, str] = {}
     for metric, title in COLUMNS.items():
-        cells |= {f"{title} (ours)": show(row.get(metric)), f"{title} ({paper})": printed.get(metric, "–")}
+        cells |= {f"{title} (ours)": show(row.get(metric))}
+        cells |= {f"{title} ({paper})": printed.get(metric, "–")} if metric in OF_PAPER else {}
     return cells | {"n": n_of(row)}
 
 
 def n_of(row: Mapping[str, Any]) -> str:
     """Show over how many the scores of a row are."""
-    return str(row["accuracy_pct"]["n"])
+    return str(row.get("accuracy_pct", row.get("mse_f_N2"))["n"])
 
 
 def _three(value: float) -> str:

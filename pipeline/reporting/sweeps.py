@@ -107,7 +107,7 @@ def sweep_sensors(rows: Rows, source: str) -> str:
 def bars(scores: Rows, metric: str) -> tuple[np.ndarray, np.ndarray]:
     """Find means and the lengths of their bars (down, up): the interval over boards, cut at what is possible.
 
-    Without one (one board, the paper) bars are one sd.
+    Of a few boards bars reach from the least to the largest value; without boards (the paper) they are one sd.
     """
     means = np.array([row[metric]["mean"] for row in scores])
     ends = np.array([_ends(row[metric]) for row in scores]).clip(*DRAWN[metric])
@@ -116,7 +116,8 @@ def bars(scores: Rows, metric: str) -> tuple[np.ndarray, np.ndarray]:
 
 def _ends(stat: Mapping[str, Any]) -> tuple[float, float]:
     sd = stat.get("sd", stat.get("sd_seeds", 0.0))
-    low, high = stat.get("ci95", (stat["mean"] - sd, stat["mean"] + sd))
+    values = stat.get("values", (stat["mean"] - sd, stat["mean"] + sd))
+    low, high = stat.get("ci95", (min(values), max(values)))
     return low, high
 
 
@@ -162,6 +163,7 @@ def _bars(axes: Any, lines: Sequence[Line], metric: str) -> None:
 def _about_bars(lines: Sequence[Line]) -> str:
     stats = [row["accuracy_pct"] for line in lines for row in line.scores]
     kinds = {f"95 % interval over {stat['n']} boards" for stat in stats if "ci95" in stat}
+    kinds |= {f"least to largest of {stat['n']} boards" for stat in stats if "values" in stat}
     kinds |= {"sd over seeds (one board)" for stat in stats if "sd" not in stat and "sd_seeds" in stat}
     if not kinds:
         return "No bars: one training each."

@@ -23,6 +23,7 @@ from pipeline.reporting.sweeps import learning_figures, learning_pages
 from pipeline.reporting.tables import make_tables, table_texts
 from pipeline.reporting.work_precision import pages
 from pipeline.stages._report import Places, asking, read_cards, read_numbers
+from pipeline.synthesis.fingerprint import fingerprint
 
 
 def report(
@@ -33,7 +34,10 @@ def report(
     asked = asking(settings)
     numbers, drawn, scores = read_numbers(settings, asked, Places(indentations, folds, models, answers))
     if "choice" in asked.questions:
-        record = to_record(numbers["chosen"], read_cards(asked, models), source=asked.source, seed=settings.seed)
+        record = to_record(
+            numbers["chosen"], read_cards(asked, models), source=asked.source, seed=settings.seed,
+            physics=fingerprint(settings),
+        )  # fmt: skip
         io.write_json(reports / "choice.json", record)
     shared, of_this_run = split(numbers)
     files_of = {"numbers": shared, "provenance": of_this_run, "scores": headline_scores(numbers)}

@@ -18,7 +18,15 @@ from pipeline.physics import shear, slide
 from pipeline.physics.board import Board
 from pipeline.physics.change import change_of_field
 from pipeline.physics.friction import Friction, drag
-from pipeline.physics.skin import Dipoles, Skin, beyond_verified_n, changes_of_field, forces, moved_dipoles
+from pipeline.physics.skin import (
+    Dipoles,
+    Skin,
+    beyond_verified_n,
+    changes_of_field,
+    forces,
+    moved_dipoles,
+    shear_moduli_Pa,
+)
 from pipeline.physics.viscoelastic import Memory, Relaxation, force_left, remembered
 from pipeline.physics.warmth import Temperature
 from pipeline.physics.wear import Ageing, fading, softening, wandering
@@ -116,8 +124,8 @@ def _push_once(
 ) -> tuple[Float[np.ndarray, "p 2"], Float[np.ndarray, "p k 3"]]:
     normal_N = forces(skin, tip_m[:, 2])
     maps = [_map(skin, depth_m) if force > 0 else None for depth_m, force in zip(tip_m[:, 2], normal_N, strict=True)]
-    shear_Pa = skin.modulus_Pa / 3  # incompressible
-    layer_N_per_m = np.array([0.0 if shear_map is None else shear_Pa * shear_map.stiffness_m for shear_map in maps])
+    shear_Pa = shear_moduli_Pa(skin, tip_m[:, 2])
+    layer_N_per_m = shear_Pa * np.array([0.0 if shear_map is None else shear_map.stiffness_m for shear_map in maps])
     slides_m_per_N = _slides_m_per_N(skin, tip_m[:, :2])
     dragged = drag(
         tip_m[:, :2], normal_N, stiffness_N_per_m=_in_series(layer_N_per_m, slides_m_per_N), friction=coefficient
@@ -132,7 +140,7 @@ def _push_once(
     for stop_i, before, after in moved_dipoles(skin, centre_m):
         shear_map = maps[stop_i]
         if shear_map is not None and force_N[stop_i].any():
-            after = _carry(shear_map, after, centre_m[stop_i, :2], force_N[stop_i], skin.modulus_Pa)
+            after = _carry(shear_map, after, centre_m[stop_i, :2], force_N[stop_i], 3 * shear_Pa[stop_i])
             after = slide.apply(slides, stop_i, after, skin.seat_m)
         change_T[stop_i] = change_of_field(before, after, board.chips_m)
     return force_N, change_T

@@ -31,6 +31,7 @@ from pipeline.twin.skin_map import (
     see_rest,
 )
 from pipeline.twin.sure import by_misfit, by_residuals, left_out, ratios
+from pipeline.twin.tables import FORCES_N
 
 QUESTION = "labels"  # whose folds these are
 METHODS = ("universal map, ", "universal, ")  # the map alone; with networks
@@ -39,7 +40,7 @@ REACH = 1.645  # standard deviations to either side of a 90 % interval
 TEMPERS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15)
 ASSUMED_TEMPER = 0.5  # of the map's places, and where nothing tells how sure it is: as if channels erred in pairs
 BLOCK_N = 200  # readings at a time, to bound memory
-FORCE_MIN_N = 0.3  # of a labelled poke: below, the map is not tabulated
+FORCE_MIN_N = float(FORCES_N[0])  # of a labelled poke: below, the map is not tabulated
 
 Tempers = tuple[float, float]  # of the map alone, and of the map with networks
 

@@ -34,14 +34,25 @@ LEAST = {"gap_mm": 0.8, "away_um_mm": 0.0, "lets_go_N": 2.0}  # chips lie in no 
 
 @dataclass(frozen=True)
 class Forces:
-    """Under which forces skins are pressed, log-uniform; and with which weight at last, in the middle."""
+    """Under which forces skins are pressed, log-uniform; and with which weight at last, in the middle.
+
+    A share of the presses are light touches, log-uniform from `light_N` to `least_N`.
+    """
 
     least_N: float = 0.5
     largest_N: float = 10.0
     weight_N: float | None = None
+    light_N: float = 0.05
+    light_share: float = 0.0
+
+    def draw(self, n: int, rng: np.random.Generator) -> Float[np.ndarray, " n"]:
+        """Draw the forces of some presses."""
+        force_N = np.exp(rng.uniform(np.log(self.least_N), np.log(self.largest_N), n))
+        light_N = np.exp(rng.uniform(np.log(self.light_N), np.log(self.least_N), n))
+        return np.where(rng.random(n) < self.light_share, light_N, force_N)
 
 
-PLAIN = Forces()
+PLAIN = Forces(light_share=0.2)
 
 
 @dataclass(frozen=True)
@@ -96,7 +107,7 @@ def draw_skin(
 ) -> tuple[Float[np.ndarray, "m ch"], Float[np.ndarray, " ch"], Float[np.ndarray, "m 2"], Float[np.ndarray, " m"]]:
     """Simulate one skin on chips that err: changes of field and the field at rest, in uT, places and forces."""
     place_mm = draw_places(rng)
-    force_N = np.exp(rng.uniform(np.log(forces.least_N), np.log(forces.largest_N), POKES_N))
+    force_N = forces.draw(POKES_N, rng)
     if forces.weight_N is not None:
         place_mm, force_N = np.vstack([place_mm, np.zeros(2)]), np.append(force_N, forces.weight_N)
     filled = fill(setup.rest, rng)

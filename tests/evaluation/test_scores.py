@@ -15,26 +15,30 @@ from pipeline.dataset.splits import Split, draw_folds
 from pipeline.evaluation.metrics import METRICS, score_groups
 from pipeline.evaluation.scores import (
     AS_LABELLED,
+    FEW_BOARDS,
     INCONCLUSIVE,
     KEYS,
     NO,
-    ONE_BOARD,
     REGISTERED,
     SURENESS,
     YES,
     all_of,
     board_means,
     by_skin,
+    holm,
     interval,
     negated,
     over_boards,
     over_folds,
     over_pairs,
     paired,
+    paired_with_single,
+    reached,
     select,
     statistic,
     tidy,
     to_csv,
+    two_way,
     verdict,
     verdict_within,
     whole,
@@ -45,8 +49,8 @@ from tests.evaluation.cards import SKINS, card, every
 
 FEW = settings(max_examples=25, deadline=None)  # tables take milliseconds
 DOUBLE = 1e-9  # sums of doubles of tens
-VALUES = st.lists(st.floats(-50, 50), min_size=2, max_size=9).filter(lambda values: np.std(values) > 1e-3)
-PAIRS = st.lists(st.tuples(st.floats(-50, 50), st.floats(-50, 50)), min_size=2, max_size=9).filter(
+VALUES = st.lists(st.floats(-50, 50), min_size=4, max_size=9).filter(lambda values: np.std(values) > 1e-3)
+PAIRS = st.lists(st.tuples(st.floats(-50, 50), st.floats(-50, 50)), min_size=4, max_size=9).filter(
     lambda pairs: np.std([a - b for a, b in pairs]) > 1e-3
 )
 RNG = rng_for(0, "summary")
@@ -181,15 +185,15 @@ def test_paired_differences_of_cards_are_those_of_naive_loops():
         assert {board: one[name] for board, one in found["by_board"].items()} == pytest.approx(looped)
         mean = sum(looped.values()) / 2
         sd = sum((one - mean) ** 2 for one in looped.values()) ** 0.5
-        ends = interval(list(looped.values()))
         assert found[name] == {
-            "mean": pytest.approx(mean), "sd": pytest.approx(sd), "n": 2, "ci95": pytest.approx(ends)
+            "mean": pytest.approx(mean), "sd": pytest.approx(sd), "n": 2,
+            "values": pytest.approx([looped[board] for board in sorted(looped)]),
         }  # fmt: skip
     assert found["mse_xy_mm2"]["mean"] < 0  # the first side is the better one
 
 
 def test_nothing_differs_from_itself_and_other_numbers_of_seeds_are_no_matter():
-    assert paired(of_skins(), of_skins())["accuracy_pct"] == {"mean": 0.0, "sd": 0.0, "n": 2, "ci95": [0.0, 0.0]}
+    assert paired(of_skins(), of_skins())["accuracy_pct"] == {"mean": 0.0, "sd": 0.0, "n": 2, "values": [0.0, 0.0]}
     assert paired(of_skins(), by_skin(tidy(every(off_mm=2.0)[:4])))["accuracy_pct"]["n"] == 2
 
 
@@ -245,25 +249,93 @@ def test_small_is_what_lies_wholly_between_both_limits(ends, word):
 def test_one_board_has_no_interval_and_concludes_nothing():
     stat = paired(scored({"b0": [[3.0], [4.0]]}), scored({"b0": [[1.0], [1.0]]}))["accuracy_pct"]
     assert stat == {"mean": 2.5, "n": 1}
-    assert verdict(stat) == verdict_within(stat, 5.0) == verdict(negated(stat)) == ONE_BOARD
+    assert verdict(stat) == verdict_within(stat, 5.0) == verdict(negated(stat)) == FEW_BOARDS
 
 
 def test_repeats_on_one_skin_are_no_boards():
-    assert verdict({"mean": 96.0, "sd": 0.1, "n": 5}, above=90.0) == ONE_BOARD  # n with no interval over boards
+    assert verdict({"mean": 96.0, "sd": 0.1, "n": 5}, above=90.0) == FEW_BOARDS  # n with no interval over boards
 
 
 def test_a_claim_of_several_parts_holds_where_all_do_and_fails_where_one_does():
     assert all_of([YES, YES]) == YES
     assert all_of([YES, INCONCLUSIVE, NO]) == NO
     assert all_of([YES, INCONCLUSIVE]) == INCONCLUSIVE
-    assert all_of([YES, ONE_BOARD]) == ONE_BOARD
+    assert all_of([YES, FEW_BOARDS]) == FEW_BOARDS
 
 
-def test_sides_with_other_skins_make_no_pair_unless_they_are_left_out_first():
+def test_sides_with_other_skins_make_no_pair():
     few, many = scored({"b0": [[1.0]]}), scored({"b0": [[2.0], [3.0]], "b1": [[4.0]]})
     with pytest.raises(SchemaError, match="held-out skins must be the same on both sides; got .*'b1_s0'"):
         paired(few, many)
-    assert paired(many, few, where_tested=True)["by_board"] == {"b0": {"accuracy_pct": 1.0}}
+
+
+def crossed(values: dict[str, dict[str, float]]) -> pd.DataFrame:
+    """Scores by training skin (fold) and test board, one skin a board."""
+    rows = [
+        {"fold": fold, "board": board, "skin": f"{board}_s0", "accuracy_pct": value}
+        for fold, boards in values.items() for board, value in boards.items()
+    ]  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+def test_one_skin_against_many_counts_the_training_skins_as_a_sample_too():
+    boards = [f"b{i}" for i in range(4)]
+    alike = crossed({fold: {board: 20.0 + i for i, board in enumerate(boards)} for fold in ("t0", "t1", "t2")})
+    apart = crossed({f"t{j}": {board: 20.0 + i + 10 * j for i, board in enumerate(boards)} for j in range(3)})
+    many = of_boards([80.0, 81.0, 82.0, 83.0])
+    sure, unsure = (paired_with_single(many, one)["accuracy_pct"] for one in (alike, apart))
+    assert sure["mean"] == pytest.approx(60.0)
+    assert sure["ci95"] == pytest.approx([60.0, 60.0])  # every skin of every board gains as much
+    # Boards gain 50 each; training skins gain 60, 50, 40: a variance of 100 / 3, and two degrees of freedom.
+    low, high = t.interval(0.95, 2, 50, np.sqrt(100 / 3))
+    assert unsure["ci95"] == pytest.approx([low, high])
+    assert unsure["p"] == pytest.approx(2 * t.sf(50 / np.sqrt(100 / 3), 2))
+    assert paired_with_single(of_boards([80.0] * 4), crossed({"t0": {"b1": 79.0}}))["by_board"] == {
+        "b1": {"accuracy_pct": 1.0}
+    }
+    with pytest.raises(SchemaError, match="held-out skins must be the same"):
+        paired_with_single(of_boards([80.0]), alike)
+
+
+@FEW
+@given(VALUES, VALUES)
+def test_the_variance_of_a_crossed_mean_is_at_least_that_of_either_factor(rows, columns):
+    table = pd.DataFrame(np.add.outer(rows, columns))
+    se, freedom = two_way(table)
+    of_rows, of_columns = (np.var(part, ddof=1) / len(part) for part in (rows, columns))
+    assert se**2 == pytest.approx(of_rows + of_columns)
+    assert min(len(rows), len(columns)) - 1 <= freedom * (1 + 1e-9)
+    assert freedom <= (len(rows) + len(columns) - 2) * (1 + 1e-9)
+    assert two_way(table[[0, 1]]) is None  # two boards
+
+
+@FEW
+@given(st.lists(st.floats(1, 99), min_size=4, max_size=9))
+def test_intervals_stay_in_the_range_of_their_metric_and_hold_the_mean(values):
+    mean = float(np.mean(values))
+    for metric, low, high in (("accuracy_pct", 0, 100), ("mse_xy_mm2", 0, np.inf)):
+        ends = interval(values, metric)
+        assert low <= ends[0] <= mean * (1 + 1e-12)
+        assert mean * (1 - 1e-12) <= ends[1] <= high
+    ends = interval([1 - value for value in values], "r2_f")  # far below 1
+    assert ends[0] <= 1 - mean + 1e-9
+    assert 1 - mean - 1e-9 <= ends[1] <= 1
+
+
+@FEW
+@given(st.lists(st.floats(49.9, 50.1), min_size=4, max_size=9))
+def test_where_boards_agree_the_bounded_interval_is_students(values):
+    plain, bounded = np.array(interval(values)), np.array(interval(values, "accuracy_pct"))
+    np.testing.assert_allclose(bounded, plain, atol=0.02 * np.ptp(plain) + 1e-9)
+
+
+@FEW
+@given(st.dictionaries(st.text(min_size=1, max_size=3), st.floats(0, 1), min_size=1, max_size=8))
+def test_holms_p_values_are_those_of_the_step_down_definition(p_values):
+    adjusted, names = holm(p_values), sorted(p_values, key=lambda name: p_values[name])
+    for rank, name in enumerate(names):
+        worst = max((len(names) - i) * p_values[names[i]] for i in range(rank + 1))
+        assert adjusted[name] == min(1.0, worst)
 
 
 def test_a_score_that_some_skins_or_all_lack_is_of_those_that_have_it():
@@ -279,12 +351,12 @@ def test_boards_are_summarised_as_folds_are_and_have_an_interval():
     rows = tidy(every())
     for name, stat in over_boards(rows).items():
         plain = over_folds(rows)[name]
-        assert stat.keys() == {"mean", "n", "sd", "ci95"}
+        assert stat.keys() == {"mean", "n", "sd", "values"}
         assert [stat[key] for key in ("mean", "sd", "n")] == [plain[key] for key in ("mean", "sd", "n")]
         means = [
             np.mean([one["scores"]["all"][name] for one in every() if one["fold"] == board]) for board in ("b0", "b1")
         ]
-        assert stat["ci95"] == pytest.approx(interval(means))
+        assert stat["values"] == pytest.approx(means)
 
 
 def test_draws_of_one_board_are_no_boards():
@@ -296,21 +368,23 @@ def test_draws_of_one_board_are_no_boards():
     assert alone["sd_seeds"] > 0
 
 
-def test_one_skin_on_others_counts_pairs_as_the_paper_does_and_its_interval_is_over_test_boards():
+def test_one_skin_on_others_counts_pairs_as_the_paper_does_and_its_interval_knows_both_samples():
     rng = rng_for(0, "transfer")
-    boards, skins = np.repeat(["b1", "b2"], 20), np.repeat(["b1_s0", "b1_s1", "b2_s0", "b2_s1"], 10)
+    tested = [f"b{i}" for i in range(1, 5)]
+    boards, skins = np.repeat(tested, 20), np.repeat([f"{board}_s{i}" for board in tested for i in range(2)], 10)
     cards = []
-    for fold in ("b0_s0", "b3_s0", "b4_s0"):
-        true = rng.uniform(0, 16, (40, 3))
+    for fold in ("b0_s0", "b5_s0", "b6_s0"):
+        true = rng.uniform(0, 16, (80, 3))
         scores = score_groups(true, true + rng.normal(0, 2, true.shape), boards, skins)
         cards.append(card("transfer", fold, scores))
     stat = over_pairs(tidy(cards))["mse_xy_mm2"]
-    assert stat["n"] == 3 * 4
-    by_board = [
-        np.mean([one["scores"]["by_skin"][f"{board}_s{i}"]["mse_xy_mm2"] for one in cards for i in range(2)])
-        for board in ("b1", "b2")
-    ]
-    assert stat["ci95"] == pytest.approx(interval(by_board))
+    assert (stat["n"], stat["training_n"], stat["boards_n"]) == (3 * 8, 3, 4)
+    table = pd.DataFrame(
+        [[np.mean([one["scores"]["by_skin"][f"{board}_s{i}"]["mse_xy_mm2"] for i in range(2)]) for board in tested]
+         for one in cards]
+    )  # fmt: skip
+    assert stat["ci95"] == pytest.approx(reached(float(table.to_numpy().mean()), *two_way(table), "mse_xy_mm2"))
+    assert stat["ci95"][0] > 0
 
 
 def test_one_skin_on_others_and_many_skins_are_tested_on_the_same_rows():

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
 from pipeline.core.errors import SchemaError
-from pipeline.evaluation.scores import INCONCLUSIVE, NO, ONE_BOARD, YES
+from pipeline.evaluation.scores import FEW_BOARDS, INCONCLUSIVE, NO, YES
 from pipeline.questions import EXPERIMENTS
 from pipeline.reporting import paper
 from pipeline.reporting.checklist import checklist, look_up, read_rows, resolve
@@ -116,7 +116,7 @@ def word(found: Any, printed: Any = None, **words: Any) -> str:
 )  # fmt: skip
 def test_claims_are_judged_by_their_interval_over_boards(rule, low, high, said):
     assert word(over_boards(low, high), rule=rule) == said
-    assert word({"mean": (low + high) / 2, "n": 1}, rule=rule) == ONE_BOARD
+    assert word({"mean": (low + high) / 2, "n": 1}, rule=rule) == FEW_BOARDS
 
 
 @given(low=st.floats(50, 99), width=st.floats(0.1, 20), limit=st.floats(60, 99))
@@ -139,7 +139,7 @@ def test_a_claim_says_whether_the_papers_difference_lies_in_our_interval():
 
 
 def test_a_score_on_repeats_of_one_skin_is_one_board_however_many_repeats():
-    assert word(stat(96.3, 0.1, 5), 90.0, rule="at_least") == ONE_BOARD
+    assert word(stat(96.3, 0.1, 5), 90.0, rule="at_least") == FEW_BOARDS
 
 
 def test_what_is_to_hold_at_every_number_of_skins_fails_where_one_fails():
@@ -164,9 +164,9 @@ def test_a_calibration_target_is_no_evidence_where_it_was_simulated():
 def test_every_claim_of_the_paper_has_a_verdict_in_the_one_vocabulary():
     table = checklist(all_questions())
     claims = table["result"].str.startswith("claim")
-    assert set(table.loc[claims, "verdict"]) <= {YES, NO, INCONCLUSIVE, ONE_BOARD}
+    assert set(table.loc[claims, "verdict"]) <= {YES, NO, INCONCLUSIVE, FEW_BOARDS}
     assert claims.sum() > 20
-    assert set(table["verdict"]) <= {YES, NO, INCONCLUSIVE, ONE_BOARD, "–"}
+    assert set(table["verdict"]) <= {YES, NO, INCONCLUSIVE, FEW_BOARDS, "–"}
 
 
 def test_a_sweep_that_does_not_go_as_far_as_a_claim_says_so():

@@ -20,6 +20,7 @@ from pipeline.evaluation.choice import settings_of, trimmed
 from pipeline.experiments.audit.sides import Check, Labels, Sides, audit_fold, holds, to_words
 from pipeline.learning.inputs import FIT, VIEW
 from pipeline.learning.recipe import HEADLINE, AuditSettings
+from pipeline.synthesis.fingerprint import fingerprint
 from pipeline.trials.training import SceneData, read_data
 
 # The same rows give the same scaler but for the order of float64 sums, and that turns the last bit of a float32 at
@@ -43,6 +44,7 @@ class Choice(Strict, extra="allow"):
     seed: int
     boards: tuple[str, ...]
     skins: tuple[str, ...]
+    physics: str = "not recorded"
     chosen: dict[str, dict[str, Any]]
 
 
@@ -71,6 +73,7 @@ def audit_choice(
     seed: int,
     test_boards: Sequence[str],
     test_skins: Sequence[str],
+    physics: str,
 ) -> list[Check]:
     """Check that settings were chosen on other boards and skins, and state which headlines are not the chosen ones.
 
@@ -84,6 +87,9 @@ def audit_choice(
         found = f"{len(shared)} of {len(set(tested))} tested were chosen on{': ' if shared else ''}{', '.join(shared)}"
         rule = f"none of those that scene {record.scene} chose on (of its source and seed)"
         checks.append(Check(f"settings: {what}", "all folds", rule, found, holds=not shared, known=False))
+    found = "equal" if record.physics == physics else f"{NOT_CHOSEN}: {record.physics}, now {physics}; run it again"
+    rule = f"the simulated skin that scene {record.scene} chose on has the fingerprint of today's"
+    checks.append(Check("settings: physics", "all arms", rule, found, holds=True, known=False))
     return checks + [_as_chosen(arm, recipe, record) for arm, recipe in recipes.items()]
 
 
@@ -198,6 +204,7 @@ def settings_checks(data: SceneData, choice: Path, models: Path) -> list[Check]:
         io.read_json(choice), recipes, source=data.settings.words("source"), seed=data.settings.seed,
         test_boards=np.unique(data.rows.board[held_out]).tolist(),
         test_skins=np.unique(data.rows.skin[held_out]).tolist(),
+        physics=fingerprint(data.settings),
     )  # fmt: skip
 
 

@@ -150,7 +150,7 @@ def network_scores(models: Path, skin: str) -> dict[str, Any]:
     if skins != [skin]:
         raise SchemaError(models, f"skin of {NETWORK}", f"{skin}, as bounded", skins, "Train its networks again.")
     scores = over_folds(tidy(cards))
-    return {metric: scores[metric] for metric in METRICS}
+    return {metric: scores[metric] for metric in METRICS if metric in scores}
 
 
 def bound(scene: str, files: Files, models: Path, answer: Path) -> None:

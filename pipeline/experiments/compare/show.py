@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pipeline.evaluation.scores import NO, YES, all_of, verdict, verdict_within
+from pipeline.evaluation.scores import all_of, verdict, verdict_within
 from pipeline.reporting.figures import drawing, svg
 from pipeline.reporting.shown import show_digits, tabulate
 from pipeline.reporting.work_precision import COLOURS, MARKERS
@@ -87,7 +87,7 @@ def _row(board: str, way: str, own: Mapping[str, Any], law: Mapping[str, Any]) -
         good.append(abs(grown["simulated"] - grown["recorded"]) <= GROWTH_WITHIN)
     if "memory" in own:
         row[MEMORY] = " / ".join(f"{100 * own['memory'][side]:.1f}" for side in ("simulated", "recorded"))
-    return row | {"within bounds": YES if all(good) else NO}
+    return row | {"within bounds": "yes" if all(good) else "no"}
 
 
 def _over_boards(way: str, own: Mapping[str, Any]) -> dict[str, str]:

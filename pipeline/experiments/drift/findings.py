@@ -12,9 +12,10 @@ import pandas as pd
 from jaxtyping import Float
 
 from pipeline.evaluation.scores import (
+    BOARDS_MIN,
+    FEW_BOARDS,
     INCONCLUSIVE,
     NO,
-    ONE_BOARD,
     YES,
     Stat,
     all_of,
@@ -111,10 +112,10 @@ class Pairs:
     def bars(self) -> str:
         """Say what brackets are."""
         boards_n = len(set(self.boards))
-        if boards_n > 1:
+        if boards_n >= BOARDS_MIN:
             return f" ([low, high]: 95 %, Student's t over {boards_n} boards)"
-        pairs_n = len(self.boards)
-        return f" ([low, high]: 95 %, over {pairs_n} networks of one board)" if pairs_n > 1 else " (one network)"
+        pairs_n, of = len(self.boards), "one board" if boards_n == 1 else f"{boards_n} boards"
+        return f" ([low, high]: 95 %, over {pairs_n} networks of {of})" if pairs_n > 1 else " (one network)"
 
 
 def rates(contacts_n: Sequence[int], errors: Float[np.ndarray, "u w"]) -> Float[np.ndarray, " u"]:
@@ -245,7 +246,7 @@ def _inconclusive(judged: str, gaps: Sequence[Gap]) -> str:
     """Say of which parts nothing can be concluded."""
     if judged == NO:
         return ""
-    if judged == ONE_BOARD:
-        return "Inconclusive: one board says nothing of others. "
+    if judged == FEW_BOARDS:
+        return f"Not judged: fewer than {BOARDS_MIN} boards say little of others. "
     covered = "; ".join(f"{gap.word}, {gap}" for gap in gaps if gap.verdict == INCONCLUSIVE)
-    return f"Inconclusive: the 95 % interval over boards includes 0 ({covered}). "
+    return f"Undecided: the 95 % interval over boards includes 0 ({covered}). "

@@ -10,7 +10,7 @@ import pandas as pd
 
 from pipeline.reporting.figures import drawing, svg
 from pipeline.reporting.paper import FLEXIBLE, FLEXIBLE_BIAS, FLEXIBLE_GAP_LESS_PCT
-from pipeline.reporting.shown import COLUMNS, show, show_difference, tabulate
+from pipeline.reporting.shown import COLUMNS, OF_PAPER, show, show_difference, tabulate
 from pipeline.reporting.work_precision import COLOURS
 
 ARMS = {"before": "before", "after": "adapted", "control": "as long, without pokes"}
@@ -68,8 +68,9 @@ def _line(name: str, numbers: Mapping[str, Any], arm: str, source: str) -> dict[
     line = {"networks": name, "source": source}
     paper = FLEXIBLE if arm == "after" else {}
     for metric, title in COLUMNS.items():
-        line[f"{title} (ours)"] = show(numbers[arm][metric])
-        line[f"{title} (paper)"] = f"{paper[metric]:g}" if metric in paper else "–"
+        line[f"{title} (ours)"] = show(numbers[arm].get(metric))
+        if metric in OF_PAPER:
+            line[f"{title} (paper)"] = f"{paper[metric]:g}" if metric in paper else "–"
     line |= {"bias of F, N": show_difference(numbers["bias_f_N"][arm])}
     line |= {"bias of F, %": show_difference(numbers["bias_f_pct"][arm])}
     return line | {"n": str(numbers[arm]["accuracy_pct"]["n"])}

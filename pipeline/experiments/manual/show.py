@@ -8,7 +8,7 @@ import pandas as pd
 from pipeline.evaluation.scores import VERDICTS, verdict
 from pipeline.reporting.order import gain
 from pipeline.reporting.paper import GAINS, MANUAL, MANUAL_POKES_N
-from pipeline.reporting.shown import COLUMNS, Stat, show, show_difference, tabulate
+from pipeline.reporting.shown import COLUMNS, OF_PAPER, Stat, show, show_difference, tabulate
 
 ARMS = {
     "before": "before",
@@ -34,7 +34,8 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
         line = {"networks": name, "source": source}
         for metric, title in COLUMNS.items():
             line[f"{title} (ours)"] = words(ours.get(metric), metric)
-            line[f"{title} (paper)"] = f"{paper[metric]:g}" if metric in paper else "–"
+            if metric in OF_PAPER:
+                line[f"{title} (paper)"] = f"{paper[metric]:g}" if metric in paper else "–"
         lines.append(line | {"n": str(ours["accuracy_pct"]["n"])})
     meaning = (
         f"{numbers['pokes_n']} pokes by hand a skin, along {numbers['lines_n']} lines of which only the order is known "

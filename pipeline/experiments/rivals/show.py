@@ -5,7 +5,7 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.reporting.shown import COLUMNS, n_of, scores, show, show_difference, tabulate
+from pipeline.reporting.shown import COLUMNS, OF_FORCE, n_of, scores, show, show_difference, tabulate
 
 Row = Mapping[str, Any]
 NONE = "–"
@@ -92,7 +92,7 @@ def figures(numbers: Row, drawn: Row, source: str) -> dict[str, str]:
 
 
 def _line(row: Row, source: str) -> dict[str, str]:
-    places = {metric: f"{title} (registered)" for metric, title in COLUMNS.items() if metric != "mse_f_N2"}
+    places = {metric: f"{title} (registered)" for metric, title in COLUMNS.items() if metric not in OF_FORCE}
     line = {"method": row["method"], "unlabelled pokes": row["pokes"], "labels": str(row["labels_n"]), "source": source}
     line |= scores(row["as_labelled"]) | scores(row["registered"], places)
     over = row.get("over", {})

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pipeline.evaluation.scores import INCONCLUSIVE, ONE_BOARD
+from pipeline.evaluation.scores import FEW_BOARDS, INCONCLUSIVE
 from pipeline.reporting import paper
 from pipeline.reporting.figures import drawing, svg
 from pipeline.reporting.work_precision import COLOURS
@@ -78,7 +78,7 @@ def _rises(rise: Mapping[str, Any]) -> str:
     here = "rises" if rise["holds"] else "does not rise"
     rises_n = rise["pairs_n"] - rise["falls_n"]
     return (
-        f"{ONE_BOARD}; {here} on this one: {rises_n} of {rise['pairs_n']} pairs {rise['step_N']:.3g} N apart, {ranks}"
+        f"{FEW_BOARDS}; {here} on this one: {rises_n} of {rise['pairs_n']} pairs {rise['step_N']:.3g} N apart, {ranks}"
     )
 
 

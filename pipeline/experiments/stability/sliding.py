@@ -14,7 +14,7 @@ from pipeline.experiments.verification.checks import no_spread
 from pipeline.physics import shear, slide
 from pipeline.physics.board import Board, BoardDesign, Spreads, draw_board
 from pipeline.physics.friction import Friction
-from pipeline.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, forces, press_slides
+from pipeline.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, forces, press_slides, shear_moduli_Pa
 from pipeline.synthesis.contact import DEPTH_STEP_M, Sideways, push
 
 AREA = "physics"
@@ -160,4 +160,5 @@ def _springs(skin: Skin) -> float:
 def _layer_N_per_m(skin: Skin, share: float) -> float:
     depth_m = DEPTH_STEP_M * max(round(share * skin.thickness_m / DEPTH_STEP_M), 1)  # as `push` takes it
     table = shear.tabulate_depth(depth_m, thickness_m=skin.thickness_m, tip_radius_m=skin.tip_radius_m, base=skin.base)
-    return skin.modulus_Pa / 3 * table.stiffness_m
+    shear_Pa = shear_moduli_Pa(skin, np.array([share * skin.thickness_m]))[0]
+    return float(shear_Pa * table.stiffness_m)
