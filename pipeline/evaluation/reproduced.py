@@ -11,7 +11,10 @@ from enum import Enum
 from typing import Any
 
 LABEL_N = 3  # leading words of a row that may name it
-VERDICT = re.compile(r"(yes|no|inconclusive( \(one board\))?)(?![\w ])")  # how a cell with a verdict begins
+# How a cell with a verdict begins; the first three are of results before 2026-11.
+VERDICT = re.compile(
+    r"(yes|no|inconclusive( \(one board\))?|supported|contradicted|undecided|not judged \([^)]*\))(?![\w ])"
+)
 Leaf = bool | int | float | str | None
 
 
@@ -40,7 +43,7 @@ class Difference:
 
     @property
     def verdicts(self) -> tuple[str, str] | None:
-        """The verdicts (yes, no, inconclusive) that two texts begin with; None if one does not or they are equal."""
+        """The verdicts that two texts begin with; None if one does not or they are equal."""
         old, new = (VERDICT.match(value) if isinstance(value, str) else None for value in (self.committed, self.fresh))
         return (old[1], new[1]) if old and new and old[1] != new[1] else None
 

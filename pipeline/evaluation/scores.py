@@ -343,7 +343,7 @@ def tally(trainings: Iterable[Mapping[str, Any]]) -> dict[str, int]:
 
 
 def _metrics(rows: pd.DataFrame) -> list[str]:
-    return [str(name) for name in rows if name not in KEYS]
+    return [str(name) for name in rows if name not in (*KEYS, *TRUTH)]
 
 
 def _skin_means(rows: pd.DataFrame) -> pd.DataFrame:

@@ -82,8 +82,9 @@ def checklist(numbers: Mapping[str, Any], rows: Sequence[Row] | None = None) -> 
 
 
 def claims_table(table: pd.DataFrame) -> pd.DataFrame:
-    """Take of a checklist the paper's claims, with their verdicts."""
-    claims = table[table["result"].str.startswith(CLAIM)].drop(columns=["stage", "shown in"])
+    """Take of a checklist the paper's claims that are judged, with their verdicts."""
+    judged = table["result"].str.startswith(CLAIM) & (table["verdict"] != NONE)
+    claims = table[judged].drop(columns=["stage", "shown in"])
     claims = claims.assign(result=claims["result"].str.removeprefix(CLAIM)).rename(columns={"result": "claim"})
     claims.attrs["meaning"] = f"{VERDICTS} {FAMILY}"
     return claims

@@ -150,7 +150,8 @@ def test_nothing_to_choose_from_is_one_sentence(cards, stage):
 
 def test_the_record_names_every_board_and_skin_that_was_looked_at_and_the_settings_alone():
     cards = [*CARDS, card("lobo", "slow", 0.5, "b2"), card("lobo", "slow", 0.5, "b1")]
-    record = to_record(choose(CARDS), cards, source="simulated", seed=777)
+    record = to_record(choose(CARDS), cards, source="simulated", seed=777, physics="abc")
+    assert record["physics"] == "abc"
     assert (record["scene"], record["source"], record["seed"]) == ("tuning", "simulated", 777)
     assert (record["boards"], record["skins"]) == (["b0", "b1", "b2"], ["b0_s0", "b1_s0", "b2_s0"])
     assert record["chosen"] == {stage: one["settings"] for stage, one in choose(CARDS).items()}

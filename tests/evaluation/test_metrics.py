@@ -2,14 +2,30 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from sklearn.metrics import r2_score
 
-from pipeline.evaluation.metrics import register, score, score_groups
+from pipeline.evaluation.metrics import METRICS, register, score, score_groups
 
 TRUE = np.array([[2.0, 2.0, 1.0], [4.0, 6.0, 2.0], [8.0, 8.0, 3.0], [16.0, 0.0, 0.5]])
 
 
 def test_a_perfect_prediction_has_no_error():
-    assert score(TRUE, TRUE) == {"accuracy_pct": 100.0, "mse_xy_mm2": 0.0, "mse_f_N2": 0.0}
+    found = score(TRUE, TRUE)
+    assert {name: found[name] for name in METRICS} == {
+        "accuracy_pct": 100.0, "mse_xy_mm2": 0.0, "mse_f_N2": 0.0, "r2_f": 1.0,
+    }  # fmt: skip
+
+
+@given(st.lists(st.tuples(st.floats(0, 10), st.floats(0, 10)), min_size=2, max_size=20))
+def test_r2_of_the_force_is_that_of_scikit_learn_and_0_for_the_mean(forces):
+    true, predicted = (np.column_stack([np.zeros((len(forces), 2)), part]) for part in zip(*forces, strict=True))
+    found, constant = score(true, predicted), true.copy()
+    constant[:, 2] = true[:, 2].mean()
+    if np.ptp(true[:, 2]) > 1e-3:
+        assert found["r2_f"] == pytest.approx(r2_score(true[:, 2], predicted[:, 2]), rel=1e-6, abs=1e-9)
+        assert score(true, constant)["r2_f"] == pytest.approx(0, abs=1e-9)
+    if np.ptp(true[:, 2]) == 0:
+        assert "r2_f" not in score(true, constant)
 
 
 def test_both_axes_must_be_within_one_millimetre():

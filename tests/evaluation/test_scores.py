@@ -105,7 +105,7 @@ def test_networks_adapted_to_one_skin_each_have_a_row_for_all_skins_by_fold_and_
     for places, part in ((AS_LABELLED, "all"), (REGISTERED, "registered")):
         for _, row in whole(tidy(every()), places).iterrows():
             own = [one for one in every() if (one["fold"], one["seed_i"]) == (row.fold, row.seed)]
-            for name in METRICS:
+            for name in METRICS[:3]:  # R^2: test_skins_of_unequally_many_rows
                 total = 0.0
                 for one in own:
                     total += one["scores"][part][name]
@@ -118,9 +118,8 @@ def test_skins_of_unequally_many_rows_pool_to_the_score_of_all_their_rows():
     parts = [slice(0, 10), slice(10, 30)]
     skins = [score_groups(TRUE[part], predicted[part], board[part], np.repeat(str(part), 30)[part]) for part in parts]
     (row,) = whole(tidy([card("adapt", "b0", scores) for scores in skins])).to_dict("records")
-    assert {name: row[name] for name in METRICS} == pytest.approx(
-        score_groups(TRUE, predicted, board, SKIN)["all"], rel=1e-12  # float64
-    )  # fmt: skip
+    whole_board = score_groups(TRUE, predicted, board, SKIN)["all"]
+    assert [row[name] for name in METRICS] == pytest.approx([whole_board[name] for name in METRICS], rel=1e-12)
 
 
 def test_the_table_is_one_row_a_training_and_skin_and_survives_csv():
@@ -356,7 +355,8 @@ def test_boards_are_summarised_as_folds_are_and_have_an_interval():
         means = [
             np.mean([one["scores"]["all"][name] for one in every() if one["fold"] == board]) for board in ("b0", "b1")
         ]
-        assert stat["values"] == pytest.approx(means)
+        if name != "r2_f":  # of the skins of a board together, test_skins_of_unequally_many_rows
+            assert stat["values"] == pytest.approx(means)
 
 
 def test_draws_of_one_board_are_no_boards():

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from scipy.constants import micro
 
 from pipeline.core.seeds import rng_for
-from pipeline.evaluation.scores import interval
 from pipeline.experiments.ambient.fields import (
     by_step,
     guessed_uT,
@@ -139,7 +138,7 @@ def test_arms_are_put_together_over_the_boards_that_they_were_tried_on():
     rows = by_step(points, "field_uT", ["b0", "b1"])
     assert [row["field_uT"] for row in rows] == [0.0, 5.0]
     assert rows[1]["a"]["accuracy_pct"] == {
-        "mean": 70.0, "n": 2, "sd": pytest.approx(np.sqrt(200)), "ci95": interval([60.0, 80.0]),
+        "mean": 70.0, "n": 2, "sd": pytest.approx(np.sqrt(200)), "values": [80.0, 60.0],
     }  # fmt: skip
     assert rows[1]["b"]["accuracy_pct"] == {"mean": 50.0, "n": 1}
     again = [point("b0", "a", 84.0, field_uT=5.0), point("b1", "a", 60.0, field_uT=5.0)]  # of other seeds

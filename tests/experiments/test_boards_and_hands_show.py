@@ -76,7 +76,7 @@ def test_manual_shows_each_arm_and_the_differences_with_their_signs():
     for arm, name in (("before", "before"), ("after", "adapted by hand")):
         assert table.loc[name, "accuracy, % (paper)"] == f"{MANUAL[arm]['accuracy_pct']:g}"
     difference = table.loc["by hand less before, on the same skin", "accuracy, % (ours)"]
-    assert difference == "inconclusive (one board): +2 ± 0.1 ± 0.02 (seeds)"
+    assert difference == "not judged (fewer than 4 boards): +2 ± 0.1 ± 0.02 (seeds)"
     assert table.loc["adapted by hand", "accuracy, % (ours)"] == "83 ± 0.1 ± 0.02 (seeds)"
     assert "over 3 network seeds" in to_markdown(manual.tables(POKED, "simulated")["manual"])
     assert len(table) == 7

@@ -45,13 +45,13 @@ def test_what_is_not_told_apart_is_said_so():
     table = sensitivity.tables(glass(1e3)[0], "simulated")["sensitivity"]
     assert table["ours"][0] == "none up to 1"
     assert table["ours"][1] == "none"
-    assert "inconclusive: no step stands out of noise" in table.set_index("what")["ours"][RISES]
+    assert "undecided: no step stands out of noise" in table.set_index("what")["ours"][RISES]
 
 
 def test_the_verdict_on_rising_says_at_which_step_it_was_judged():
     table = sensitivity.tables(glass(0.0)[0], "simulated")["sensitivity"]
     found = table.set_index("what")["ours"]
-    assert found[RISES].startswith("inconclusive (one board); rises on this one: 10 of 10 pairs 0.1 N apart")
+    assert found[RISES].startswith("not judged (fewer than 4 boards); rises on this one: 10 of 10 pairs 0.1 N apart")
     assert found["falls from level to level, 0.1 N apart"] == "0 of 10"  # no noise, no error
     assert "at least 95 % of the pairs" in table.attrs["meaning"]
 
@@ -60,7 +60,7 @@ def test_both_ways_are_compared_in_every_row_group_and_unknown_lags_are_dashes()
     table = dynamics.tables(NUMBERS, "simulated")["dynamics"]
     judged = table[dynamics.LESS] != ""
     assert list(table.loc[judged, "answered by"].unique()) == ["mean of the last five"]
-    assert set(table.loc[judged, dynamics.LESS]) == {"inconclusive (one board): -0.25"}
+    assert set(table.loc[judged, dynamics.LESS]) == {"not judged (fewer than 4 boards): -0.25"}
     assert list(table["lag / ms"][-3:]) == ["0.9", "–", "–"]
     assert table["MSE_F / N²"][0] == "0.5 ± 0.1"
 

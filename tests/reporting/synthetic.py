@@ -11,8 +11,10 @@ def stat(mean: float = 1.0, sd: float = 0.5, n: int = 3) -> dict:
 
 def over_boards(low: float = 0.5, high: float = 1.5, n: int = 6) -> dict:
     """A summary over boards with this 95 % interval."""
-    reach = (high - low) / 2
-    return {"mean": (low + high) / 2, "sd": reach * n**0.5 / t.ppf(0.975, n - 1), "n": n, "ci95": [low, high]}
+    reach, middle = (high - low) / 2, (low + high) / 2
+    se = reach / t.ppf(0.975, n - 1)
+    stat = {"mean": middle, "sd": se * n**0.5, "n": n, "ci95": [low, high]}
+    return stat | {"se": se, "df": n - 1, "p": 2 * t.sf(abs(middle) / se, n - 1) if se else 0.0}
 
 
 def difference(low: float = 0.5, high: float = 1.5) -> dict:
@@ -35,7 +37,13 @@ def all_questions(source: str = "simulated") -> dict:
     plain = dict.fromkeys(METRICS, 1.0)
     windows = [{"contacts_n": 5000, "accuracy_pct": 90.0, "mse_xy_mm2": 0.1, "mse_f_N2": 0.1}]
     names = ("higher_and_faster", "offset", "each_is_worse", "overestimates")
-    said = {"finding": "errors grow", "holds": True, "verdict": "yes", "of_trainings": "yes", "measured": "+3 points"}
+    said = {
+        "finding": "errors grow",
+        "holds": True,
+        "verdict": "supported",
+        "of_trainings": "supported",
+        "measured": "+3 points",
+    }
     last = {"contacts_n": 49000, "accuracy_pct": {"mean": 90.0, "n": 1}}
     contrasts = ("pokes_first", "pokes_gain", "pokes_plateau", "sensors_gain_fewer")
     contrasts += tuple(f"sensors_more_{method}" for method in ("multi", "triplet", "adapted"))

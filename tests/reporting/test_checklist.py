@@ -5,12 +5,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from ruamel.yaml import YAML
+from scipy.stats import t
 
 from pipeline.core.errors import SchemaError
 from pipeline.evaluation.scores import FEW_BOARDS, INCONCLUSIVE, NO, YES
 from pipeline.questions import EXPERIMENTS
 from pipeline.reporting import paper
-from pipeline.reporting.checklist import checklist, look_up, read_rows, resolve
+from pipeline.reporting.checklist import checklist, claims_table, look_up, read_rows, resolve
 from pipeline.reporting.judging import Row, judge
 from tests.reporting.synthetic import all_questions, over_boards, stat
 
@@ -138,6 +139,59 @@ def test_a_claim_says_whether_the_papers_difference_lies_in_our_interval():
     assert sentence(over_boards(2.0, 8.0), 5.97, rule="gain").endswith("our 95 % interval includes the paper's")
 
 
+@pytest.mark.parametrize(
+    ("low", "high", "said", "more"),
+    [
+        (3.0, 8.0, YES, "lies beyond half of the paper's difference"),
+        (2.0, 8.0, INCONCLUSIVE, "includes half"),
+        (-1.0, 2.9, NO, "equivalent to none within half of the paper's"),
+        (-4.0, 2.9, NO, "lies short of half of the paper's difference, 2.98"),
+    ],
+)
+def test_a_sizeable_gain_is_half_of_the_papers_and_one_below_that_may_be_equivalent_to_none(low, high, said, more):
+    assert word(over_boards(low, high), 5.97, rule="sizeable") == said
+    found = sentence(over_boards(low, high), 5.97, rule="sizeable")
+    assert more in found
+    assert ("equivalent" in found) == (max(-low, high) < 5.97 / 2)
+
+
+def with_p(p: float, mean: float = 1.0) -> dict:
+    """A difference over boards whose two-sided p-value is p."""
+    se = mean / t.isf(p / 2, 5)
+    return {"mean": mean, "sd": se * 6**0.5, "n": 6, "ci95": [mean - 2.571 * se, mean + 2.571 * se], "se": se, "df": 5}
+
+
+def test_a_family_of_claims_is_judged_by_holm_and_other_rows_are_not():
+    rows = [
+        row(
+            id=f"r{i}",
+            what="claim: x",
+            paper=None,
+            says="claimed",
+            ours=f"d{i}.accuracy_pct",
+            rule="gain",
+            family=i < 3,
+        )
+        for i in range(4)
+    ]
+    numbers = all_questions() | {f"d{i}": {"accuracy_pct": with_p(p)} for i, p in enumerate((0.01, 0.03, 0.04, 0.04))}
+    table = checklist(numbers, rows)
+    # Of three, 0.01 becomes 0.03; 0.03 and 0.04 become 0.06: no longer significant, though their intervals exclude 0.
+    assert table["verdict"].tolist() == [YES, INCONCLUSIVE, INCONCLUSIVE, YES]
+    assert table["difference"].tolist()[1].endswith("p = 0.06, adjusted for 3 claims")
+    assert "adjusted" not in table["difference"].tolist()[3]
+
+
+def test_claims_stand_in_a_table_of_their_own_if_they_are_judged():
+    claims = claims_table(checklist(all_questions()))
+    assert len(claims) > 15
+    assert not claims["claim"].str.startswith("claim").any()
+    assert "Holm" in claims.attrs["meaning"]
+    family = {one.id for one in ROWS if one.family}
+    assert len(family) == 12
+    assert all(name.endswith("accuracy_pct") or name.startswith(("pokes", "sensors")) for name in family)
+
+
 def test_a_score_on_repeats_of_one_skin_is_one_board_however_many_repeats():
     assert word(stat(96.3, 0.1, 5), 90.0, rule="at_least") == FEW_BOARDS
 
@@ -147,7 +201,7 @@ def test_what_is_to_hold_at_every_number_of_skins_fails_where_one_fails():
         {"skins_n": n, "accuracy_pct": over_boards(*ends)} for n, ends in ((1, (1, 2)), (6, (-1, 2)), (15, (2, 3)))
     ]
     assert word(sweep, rule="each") == INCONCLUSIVE
-    assert sentence(sweep, None, rule="each") == "yes with 1, 15; inconclusive with 6 training skins"
+    assert sentence(sweep, None, rule="each") == "supported with 1, 15; undecided with 6 training skins"
     sweep[0]["accuracy_pct"] = over_boards(-2, -1)
     assert word(sweep, rule="each") == NO
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from pipeline.evaluation.scores import interval, tidy
+from pipeline.evaluation.scores import tidy
 from pipeline.reporting import learned
 from tests.reporting.test_learned import HELD_OUT, point
 
@@ -35,7 +35,7 @@ def test_pokes_are_compared_with_none_and_beyond_the_papers_plateau():
     }  # fmt: skip
     assert gains(found["pokes_gain"]) == {"b0": 10.0, "b1": 4.0}
     assert gains(found["pokes_plateau"]) == {"b0": 1.0, "b1": -1.0}
-    assert found["pokes_gain"]["accuracy_pct"]["ci95"] == pytest.approx(interval([10.0, 4.0]))
+    assert found["pokes_gain"]["accuracy_pct"]["values"] == pytest.approx([10.0, 4.0])
 
 
 def test_what_a_sweep_does_not_reach_is_absent():

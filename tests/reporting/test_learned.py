@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from pipeline.evaluation.scores import interval, tidy
+from pipeline.evaluation.scores import tidy
 from pipeline.reporting.learned import PAIRS, learned, timed_learning
 from tests.evaluation import cards
 
@@ -62,7 +62,7 @@ def paired(of: str, over: str) -> dict:
 def test_table_2_is_over_boards_and_adapted_skins_are_pooled_by_board():
     table2 = numbers()["table2"]
     assert table2.keys() == {"multi", "triplet", "adapted"}
-    assert table2["triplet"]["accuracy_pct"] == {"mean": 78.0, "n": 2, "sd": 0.0, "ci95": [78.0, 78.0]}
+    assert table2["triplet"]["accuracy_pct"] == {"mean": 78.0, "n": 2, "sd": 0.0, "values": [78.0, 78.0]}
     # board b0: 80 and 82, board b1: 84 and 86
     assert table2["adapted"]["accuracy_pct"] == over(81.0, 85.0)
 
@@ -74,7 +74,7 @@ def test_the_control_stands_beside_adaptation_with_the_number_of_pokes():
 
 def over(*boards: float) -> dict:
     sd = (boards[1] - boards[0]) / 2**0.5
-    return {"mean": sum(boards) / 2, "n": 2, "sd": pytest.approx(sd), "ci95": pytest.approx(interval(boards))}
+    return {"mean": sum(boards) / 2, "n": 2, "sd": pytest.approx(sd), "values": pytest.approx(list(boards))}
 
 
 def test_pairs_are_over_the_held_out_boards_and_of_one_method_over_another():
@@ -84,7 +84,7 @@ def test_pairs_are_over_the_held_out_boards_and_of_one_method_over_another():
     by_board = paired("adapted", "triplet")["by_board"]
     assert {board: own["accuracy_pct"] for board, own in by_board.items()} == {"b0": 3.0, "b1": 7.0}
     assert paired("adapted", "control")["accuracy_pct"] == over(1.5, 3.5)
-    assert paired("triplet", "multi")["accuracy_pct"] == {"mean": -2.0, "n": 2, "sd": 0.0, "ci95": [-2.0, -2.0]}
+    assert paired("triplet", "multi")["accuracy_pct"] == {"mean": -2.0, "n": 2, "sd": 0.0, "values": [-2.0, -2.0]}
     assert paired("adapted", "multi")["accuracy_pct"]["mean"] == 3.0
     assert paired("control", "triplet")["accuracy_pct"]["mean"] == 2.5
 

@@ -29,8 +29,8 @@ def test_the_rows_of_table_2_and_the_control_are_shown_by_their_means():
     numbers["table2"]["multi"]["accuracy_pct"] = stat(82.2)
     assert headline_scores(numbers) == {
         "table2": {
-            "multi": {"accuracy_pct": 82.2, "mse_xy_mm2": 1.0, "mse_f_N2": 1.0},
-            "control": {"accuracy_pct": 1.0, "mse_xy_mm2": 1.0, "mse_f_N2": 1.0},
+            "multi": {"accuracy_pct": 82.2, "mse_xy_mm2": 1.0, "mse_f_N2": 1.0, "r2_f": 1.0},
+            "control": {"accuracy_pct": 1.0, "mse_xy_mm2": 1.0, "mse_f_N2": 1.0, "r2_f": 1.0},
         }
     }
 
@@ -49,7 +49,7 @@ def test_recorded_boards_are_shown_registered_too_and_with_the_best_method_for_n
     rows = [row("a", 0, 20.0), row("b", 0, 30.0), row("a", 10, 99.0), row("a", 40, 50.0), row("b", 40, 40.0)]
     numbers = {"provenance": {"source": "recorded"}, "lobo": {"registered": scores()}, "labels": rows}
     assert headline_scores(numbers) == {
-        "lobo": {"registered": {"accuracy_pct": 1.0, "mse_xy_mm2": 1.0, "mse_f_N2": 1.0}},
+        "lobo": {"registered": {"accuracy_pct": 1.0, "mse_xy_mm2": 1.0, "mse_f_N2": 1.0, "r2_f": 1.0}},
         "labels": {
             "best_of_0_labels": {"method": "b (raw)", "accuracy_pct": 30.0},
             "best_of_40_labels": {"method": "a (raw)", "accuracy_pct": 50.0},

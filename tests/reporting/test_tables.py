@@ -4,12 +4,11 @@ import pyarrow as pa
 import pytest
 
 from pipeline.core.errors import SchemaError
-from pipeline.evaluation.metrics import METRICS
-from pipeline.evaluation.scores import interval, tidy
+from pipeline.evaluation.scores import tidy
 from pipeline.reporting.numbers import add_up, compose, foretold, lost_by_protocol
 from pipeline.reporting.paper import TABLE_2
 from pipeline.reporting.readme import fill
-from pipeline.reporting.shown import rounded, show, show_digits, to_markdown
+from pipeline.reporting.shown import OF_PAPER, rounded, show, show_digits, to_markdown
 from pipeline.reporting.table1 import NOT_GIVEN, OURS
 from pipeline.reporting.tables import make_tables
 from tests.evaluation import cards
@@ -46,9 +45,10 @@ def numbers(made: list[dict] = CARDS, source: str = "recorded") -> dict:
 
 def test_pooled_numbers_are_over_boards_and_single_ones_over_pairs_of_skins():
     table2 = numbers()["table2"]
-    ends = pytest.approx(interval([80.0, 90.0]))
-    assert table2["multi"]["accuracy_pct"] == {"mean": 85.0, "n": 2, "sd": pytest.approx(50**0.5), "ci95": ends}
-    assert table2["single"]["accuracy_pct"] == {"mean": 25.0, "n": 2, "sd": pytest.approx(50**0.5)}
+    spread = pytest.approx(50**0.5)
+    assert table2["multi"]["accuracy_pct"] == {"mean": 85.0, "n": 2, "sd": spread, "values": [80.0, 90.0]}
+    pairs = {"mean": 25.0, "n": 2, "sd": spread, "training_n": 1, "boards_n": 1}
+    assert table2["single"]["accuracy_pct"] == pairs
 
 
 def test_what_tells_a_place_before_its_touch_stands_below_the_split_that_it_was_scored_on():
@@ -156,6 +156,8 @@ def test_a_spread_over_seeds_is_shown_and_called_so():
     assert show({"mean": 99.7, "n": 2, "sd": 1.0, "sd_seeds": 0.04}) == "99.7 ± 1 ± 0.04 (seeds)"
     of_boards = {"mean": 99.7, "n": 2, "sd": 1.0, "ci95": [90.7, 108.7], "sd_seeds": 0.04}
     assert show(of_boards) == "99.7 [90.7, 108.7] ± 0.04 (seeds)"
+    few = {"mean": 85.0, "n": 2, "sd": 7.0, "values": [80.0, 90.0]}
+    assert (show(few), show_digits(few, 1)) == ("85 (80; 90)", "85.0 (80.0; 90.0)")
     assert show_digits(of_boards, 2) == "99.70 [90.70, 108.70] ± 0.04 (seeds)"
 
 
@@ -175,4 +177,4 @@ def test_generated_blocks_replace_only_what_is_between_their_marks():
 
 
 def test_all_metrics_have_a_column():
-    assert {metric for row in TABLE_2.values() for metric in row} == set(METRICS)
+    assert {metric for row in TABLE_2.values() for metric in row} == set(OF_PAPER)

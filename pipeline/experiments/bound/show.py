@@ -26,8 +26,9 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
 def _line(depth: str, row: Mapping[str, Any], network: Mapping[str, Any], source: str) -> dict[str, str]:
     line = {"depth, mm": depth, "source": source}
     for metric, title in COLUMNS.items():
-        line |= {f"{title} ({words})": f"{row[side][metric]:.3g}" for side, words in SIDES.items()}
-        line[f"{title} (network)"] = show(network[metric]) if network else NONE
+        if metric in row[next(iter(SIDES))]:  # R^2 is bounded by nothing here
+            line |= {f"{title} ({words})": f"{row[side][metric]:.3g}" for side, words in SIDES.items()}
+        line[f"{title} (network)"] = show(network.get(metric)) if network else NONE
     return line | {"n": n_of(network) if network else NONE}
 
 

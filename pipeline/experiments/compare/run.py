@@ -5,13 +5,14 @@ may differ from board to board is fitted anew. Refuses to know folds and network
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float
 from pydantic import Field
+from scipy.constants import milli
 from scipy.spatial.transform import Rotation
 
 from pipeline.core.config import Files, Settings, Strict, parse, read_settings
@@ -24,14 +25,19 @@ from pipeline.experiments.answer import read_folder, write_answer
 from pipeline.experiments.compare import frames
 from pipeline.physics.board import BoardDesign
 from pipeline.physics.skin import SkinDesign
-from pipeline.twin.fit import SEVEN, TEN, Seen, fit
-from pipeline.twin.law import Setup, beyond_n, nominal_uT, simulate_uT
+from pipeline.twin.fit import SEVEN, START, TEN, Seen, fit
+from pipeline.twin.law import Law, Setup, beyond_n, nominal_uT, simulate_uT
 from pipeline.twin.pokes import Pokes, cosines, explained, growth, lengths_uT, memory, pool
 
 Side_mm = Annotated[float, Field(gt=0, le=500)]
 ARROWS_N = 4  # places that the figure shows
 WALK_uT = 0.5  # of the no-load field from poke to poke, assumed, where memory is simulated
 NOLOAD_READINGS_N = 10
+CURVE_N = np.geomspace(3e-4, 10.0, 46)  # forces of the curve from the lightest touch to a firm press
+LIGHT_N = 1e-3
+EVERY = 5  # of a board's places, one is on that curve
+# Friction under the tip bounds the slide: k / mu in N/mm, of none (the whole slide at any force) to a slippery tip.
+GRIPS_N_MM = (1e-6, 4.0, START.grip_N_mm, 18.0)
 
 
 class Compare(Strict):
@@ -93,6 +99,34 @@ def remembered(seen: Seen, simulated_uT: Float[np.ndarray, "n k 3"], section: Co
     return {"memory": found} if None not in found.values() else {}
 
 
+def curve(law: Law, setup: Setup, place_mm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " c"]:
+    """Give |dB| in uT, the median over some places, of presses with the forces of `CURVE_N`."""
+    places_mm = np.unique(place_mm.round(2), axis=0)[::EVERY]
+    at_mm, force_N = np.repeat(places_mm, len(CURVE_N), axis=0), np.tile(CURVE_N, len(places_mm))
+    length_uT = lengths_uT(simulate_uT(law, setup, at_mm, force_N)).reshape(len(places_mm), -1)
+    return np.median(length_uT, axis=0)
+
+
+def grips(seen: Seen, setup: Setup, fitted: Law) -> list[dict[str, Any]]:
+    """Fit the law anew with other frictions under the tip: what recordings tell of it, and what a touch would read.
+
+    `grip_N` is the force that takes two thirds of the slide in the skin's middle.
+    """
+    rows = []
+    for grip_N_mm in GRIPS_N_MM:
+        law = replace(fitted, grip_N_mm=grip_N_mm)
+        if grip_N_mm != fitted.grip_N_mm:
+            law = fit(seen, setup, TEN, replace(START, grip_N_mm=grip_N_mm))
+        agrees = beside(seen, simulate_uT(law, setup, seen.place_mm, seen.pokes.force_N))
+        length_uT = curve(law, setup, seen.place_mm)
+        rows.append(
+            {name: agrees[name] for name in ("cosine_mean", "explained_median", "growth") if name in agrees}
+            | {"grip_N_mm": grip_N_mm, "grip_N": grip_N_mm * milli * float(np.hypot(law.give_x_um, law.give_y_um))}
+            | {"light_uT": float(np.interp(LIGHT_N, CURVE_N, length_uT)), "curve_uT": length_uT.round(2).tolist()}
+        )
+    return rows
+
+
 def framed(seen: Seen, setup: Setup, section: Compare) -> dict[str, Any]:
     """Say whether labels, chips and skin lie as the scene has them."""
     found = frames.check(
@@ -136,17 +170,23 @@ def compare_boards(boards: Mapping[str, Pokes], section: Compare, design: SkinDe
             way: beside(own, of_way) | {"beyond_n": beyond_n(laws.get(way), setup, own.pokes.force_N)}
             for way, of_way in simulated_uT.items()
         }
+        gripped = grips(own, setup, fitted[board])
+        curves = {f"{row['grip_N_mm']:g}": row.pop("curve_uT") for row in gripped}
         by_board[board] = (
             ways.pop("fitted")
+            | {"grips": gripped}
             | ways
             | remembered(own, simulated_uT["fitted"], section, seed)
             | {"laws": told, "frames": framed(own, setup, section)}
             | {"noise_uT": dict(zip("xyz", own.pokes.noise_uT.tolist(), strict=True))}
             | {"pokes_n": len(own.pokes), "left_out_n": own.pokes.left_out_n}
         )
-        drawn[board] = _drawn(own, simulated_uT["fitted"])
-    numbers = {"by_board": by_board, "memory_put_in": section.memory, "over_boards": over_boards(by_board)}
-    return numbers, {"chips_mm": setup.chips_mm.tolist(), "boards": drawn}
+        drawn[board] = _drawn(own, simulated_uT["fitted"]) | {"curve_uT": curves}
+    numbers = {
+        "by_board": by_board, "over_boards": over_boards(by_board), "memory_put_in": section.memory,
+        "light_N": LIGHT_N, "grip_N_mm": START.grip_N_mm,
+    }  # fmt: skip
+    return numbers, {"chips_mm": setup.chips_mm.tolist(), "curve_N": CURVE_N.tolist(), "boards": drawn}
 
 
 def over_boards(by_board: Mapping[str, Any]) -> dict[str, Any]:

@@ -38,6 +38,12 @@ ABOUT_PARAMETERS = (
     "away: how far the material under the tip goes from the skin's middle at no force, per distance from it; give: of "
     "the rig's arm. Gap and amplitude trade against each other: neither is a measured size."
 )
+ABOUT_GRIP = (
+    "A tip slides the skin no further than its friction on the skin allows: k |u| <= mu F. k / mu = {grip_N_mm:g} N/mm "
+    "is used (springs of 7 N/mm from a recorded sideways force, friction of 0.8: params.yaml); all else is fitted anew "
+    "for each. Recordings begin above half a newton and see only the end of it: what is assumed decides the field of a "
+    "light touch. Without friction the skin would jump at contact."
+)
 ABOUT_FRAMES = (
     "Cosines over all pokes together, with the nominal skin: read as the scene says, and in the best of all ways. A "
     "way that departs from the scene is named if it raises the sum over chips by 0.1 and more for each departure."
@@ -69,6 +75,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     found = {
         "compare": tabulate(rows, meaning=MEANING.format(100 * numbers["memory_put_in"])),
         "compare_parameters": tabulate(laws, meaning=ABOUT_PARAMETERS),
+        "compare_grip": tabulate(_grips(by_board), meaning=ABOUT_GRIP.format(**numbers)),
         "compare_frames": tabulate([_lies(*row) for row in by_board.items()], meaning=ABOUT_FRAMES),
     }
     for table in found.values():
@@ -107,6 +114,19 @@ def _cells(board: str, law: str, cosine: str, explained: str, way: str) -> dict[
     return cells | {"cosine by file": NONE, EXPLAINED: explained, GROWTH: NONE, MEMORY: NONE, HELD: NONE}
 
 
+def _grips(by_board: Mapping[str, Any]) -> list[dict[str, str]]:
+    lines = []
+    for board, own in by_board.items():
+        for row in own.get("grips", []):
+            line = {"board": board, "k / mu, N/mm": f"{row['grip_N_mm']:.3g}", "two thirds slide at, N": NONE}
+            line["two thirds slide at, N"] = f"{row['grip_N']:.2g}"
+            line |= {"cosine": f"{row['cosine_mean']:.3f}", "explained": f"{row['explained_median']:.3f}"}
+            grown = row.get("growth")
+            line[GROWTH] = f"{grown['simulated']:.2f} / {grown['recorded']:.2f}" if grown else NONE
+            lines.append(line | {"|dB| of 1 mN, µT (median place)": f"{row['light_uT']:.3g}"})
+    return lines
+
+
 def _say(way: str, law: Mapping[str, Any]) -> str:
     return WAYS[way].replace("another board", str(law["law_of"])) if "law_of" in law else WAYS[way]
 
@@ -128,7 +148,31 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
     return {
         "compare_arrows.svg": _arrows(boards, np.array(drawn["chips_mm"]), source),
         "compare_growth.svg": _growth(drawn["boards"], numbers["by_board"], source),
+        "compare_touch.svg": _touch(drawn, numbers, source),
     }
+
+
+def _touch(drawn: Mapping[str, Any], numbers: Mapping[str, Any], source: str) -> str:
+    """Draw |dB| against force from the lightest touch on: recorded presses, and the law with some frictions."""
+    boards, used = drawn["boards"], f"{numbers['grip_N_mm']:g}"
+    with drawing(4.2 * len(boards) + 0.6, 4.2) as figure:
+        panels = figure.subplots(1, len(boards), squeeze=False)[0]
+        for axes, (board, own) in zip(panels, boards.items(), strict=True):
+            look = {"color": COLOURS[0], "marker": MARKERS[0], "linestyle": "", "markersize": 3, "alpha": 0.5}
+            axes.plot(own["force_N"], own["length_uT"]["recorded"], label="recorded", **look)
+            styles = iter(("-.", ":", "--", (0, (1, 3))))
+            for grip, length_uT in own["curve_uT"].items():
+                line = {"linestyle": "-", "linewidth": 2} if grip == used else {"linestyle": next(styles)}
+                words = "any force slides it" if float(grip) < 1e-3 else f"k / μ {grip} N/mm"
+                label = f"simulated, {words}" + (" (used)" if grip == used else "")
+                axes.plot(drawn["curve_N"], length_uT, color=COLOURS[1], label=label, **line)
+            axes.set(xscale="log", yscale="log", xlabel="force / N", ylabel="|dB| / µT", title=board)
+            axes.set_ylim(bottom=0.1)
+            axes.grid(alpha=0.25)
+            axes.legend(frameon=False, fontsize=8)
+        title = f"From the lightest touch on: change of field against force ({source}; simulated: median over places)"
+        figure.suptitle(title, x=0.01, ha="left", fontsize=11)
+        return svg(figure)
 
 
 def _arrows(boards: Mapping[str, Any], chips_mm: np.ndarray, source: str) -> str:

@@ -22,11 +22,13 @@ from pipeline.learning.recipe import adaptations as adaptations_of
 from pipeline.learning.recipe import training
 from pipeline.learning.trial import Measured, Trained, Trial
 from pipeline.stages import split
+from pipeline.synthesis.fingerprint import SECTIONS as PHYSICS
 from pipeline.trials import training as _training
 from pipeline.trials.adapting import adaptations, read_starts
 from pipeline.trials.training import SceneData, read_data, trials_of, write_models
 from tests.dataset.tables import readings
 from tests.scenes import ADAPTATIONS, RECIPE, SHARED, TRAINING, recorded, settings
+from tests.synthesis.scene import SECTIONS
 
 PLACES_N, PASSES_N, READINGS_N, CH_N = 16, 2, 2, 15
 SEED = 2021
@@ -81,7 +83,7 @@ def build(folder: Path, skins: tuple[str, ...] = SKINS) -> Path:
     for skin in skins:
         io.write_readings(folder / f"indentations/{skin}.parquet", [capture(skin)], {})
     io.write_json(folder / "tiny.yaml", SCENE)  # JSON is YAML
-    io.write_json(folder / "params.yaml", SHARED)
+    io.write_json(folder / "params.yaml", SHARED | {name: SECTIONS[name] for name in PHYSICS})
     io.write_json(
         folder / "plan.yaml", {"scenes": {}, "stages": {"audit": {"tiny": {"scene": "tiny", "models": list(MODELS)}}}}
     )

@@ -329,7 +329,7 @@ CHOICE = {
 
 def choice_checks(choice=CHOICE, recipes=None, source="simulated", seed=2021):
     recipes = {"train_multi": dict(RECIPE)} if recipes is None else recipes
-    names = {"test_boards": ["b0", "b2"], "test_skins": ["b0_s0", "b0_s1", "b2_s0"]}
+    names = {"test_boards": ["b0", "b2"], "test_skins": ["b0_s0", "b0_s1", "b2_s0"], "physics": "abc"}
     return audit_choice(choice, recipes, source=source, seed=seed, **names)
 
 

@@ -12,29 +12,39 @@ OWN = {
     "growth": {"recorded": 0.3, "simulated": 0.25}, "beyond_n": 0,
 }  # fmt: skip
 CHIP = {"chip": 0, "at": 0, "cosine_as_written": 0.7, "cosine_best": 0.8, "read": ""}
+GRIP = {
+    "cosine_mean": 0.91, "explained_median": 0.82, "growth": {"recorded": 0.3, "simulated": 0.25}, "grip_N_mm": 8.75,
+    "grip_N": 0.5, "light_uT": 3.0,
+}  # fmt: skip
 BOARD = OWN | {
     "nominal": OWN | {"cosine_mean": 0.7, "beyond_n": 3},
     "refitted": OWN | {"growth": {"recorded": 0.3, "simulated": 0.5}},
     "memory": {"recorded": 0.07, "simulated": 0.065}, "laws": {"fitted": LAW, "refitted": LAW | {"law_of": "b2"}},
     "frames": {"sentence": "Against the scene, chips 1 and 2 are exchanged.", "chips": [CHIP]},
+    "grips": [GRIP | {"grip_N_mm": 1e-6, "grip_N": 5e-8, "light_uT": 300.0}, GRIP],
     "noise_uT": {"x": 3.3, "y": 3.3, "z": 5.0}, "pokes_n": 4, "left_out_n": 1,
 }  # fmt: skip
 STAT = {"mean": 0.91, "n": 2, "ci95": [0.905, 0.915]}
 OVER = {"cosine_mean": STAT, "explained_median": STAT, "growth_difference": {"mean": 0.0, "n": 2, "ci95": [-0.2, 0.2]}}
-NUMBERS = {"by_board": {"b1": BOARD}, "over_boards": {"fitted": OVER}, "memory_put_in": 0.065}
+NUMBERS = {
+    "by_board": {"b1": BOARD}, "over_boards": {"fitted": OVER}, "memory_put_in": 0.065, "light_N": 0.001,
+    "grip_N_mm": 8.75,
+}  # fmt: skip
 FIELDS = {"recorded": [[[100.0, 20.0, 5.0], [0.0, -40.0, 5.0]]], "simulated": [[[90.0, 10.0, 5.0], [0.0, -20.0, 5.0]]]}
 DRAWN = {
+    "curve_N": [0.001, 1.0, 10.0],
     "chips_mm": [[0.0, 0.0], [7.0, 0.0]],
     "boards": {"b1": {
         "group": "soft", "places_mm": [[1.0, 2.0]], "arrows_uT": FIELDS, "force_N": [1.0, 4.0],
         "length_uT": {"recorded": [100.0, 150.0], "simulated": [90.0, 160.0]},
+        "curve_uT": {"1e-06": [300.0, 400.0, 500.0], "8.75": [3.0, 300.0, 450.0]},
     }},
 }  # fmt: skip
 
 
 def test_each_law_stands_beside_its_bounds_and_one_number_beyond_them_is_a_no():
     table = tables(NUMBERS, "recorded")["compare"]
-    assert table["within bounds"].tolist() == ["no", "yes", "no", "inconclusive"]
+    assert table["within bounds"].tolist() == ["no", "yes", "no", "undecided"]
     assert table["cosine"].tolist()[:3] == ["0.700 (≥ 0.90)", "0.910 (≥ 0.90)", "0.910 (≥ 0.85)"]
     assert table["simulated with"][2] == "law of b2, seven refitted"
     assert table["memory, % (5 to 8)"].tolist()[1] == "6.5 / 7.0"
@@ -50,7 +60,7 @@ def test_a_board_alone_whose_force_hardly_differs_is_told_without_growth_and_ano
         del own["growth"]
     for own, name in ((alone, "refitted"), (alone["laws"], "refitted"), (alone, "memory")):
         del own[name]
-    numbers = {"by_board": {"b1": alone}, "over_boards": {}, "memory_put_in": 0.065}
+    numbers = NUMBERS | {"by_board": {"b1": alone}, "over_boards": {}}
     table = tables(numbers, "recorded")["compare"]
     assert table["within bounds"].tolist() == ["no", "yes"]
     assert set(table["growth (within 0.10)"]) == {"–"}
@@ -69,4 +79,13 @@ def test_figures_name_sides_units_and_source_and_are_the_same_twice():
     for word in ("recorded", "simulated", "µT", "(recorded; ×: poke; number: along z, µT)", "b1"):
         assert word in said(drawn["compare_arrows.svg"])
     assert "recorded: power 0.30" in said(drawn["compare_growth.svg"])
+    for word in ("k / μ 8.75 N/mm (used)", "any force slides it", "recorded"):
+        assert word in said(drawn["compare_touch.svg"])
     assert figures(NUMBERS, DRAWN, "recorded") == drawn
+
+
+def test_what_recordings_tell_of_the_grip_stands_beside_what_a_light_touch_would_read():
+    table = tables(NUMBERS, "recorded")["compare_grip"]
+    assert table["k / mu, N/mm"].tolist() == ["1e-06", "8.75"]
+    assert table["|dB| of 1 mN, µT (median place)"].tolist() == ["300", "3"]
+    assert "k / mu = 8.75 N/mm is used" in table.attrs["meaning"]

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from pipeline.core.errors import ParamsError
 from pipeline.core.seeds import rng_for
 from pipeline.dataset.grid import points_mm
-from pipeline.evaluation.scores import interval
 from pipeline.experiments.contacts.pairs import (
     TOLERANCE_MM,
     along_the_line,
@@ -147,7 +146,7 @@ def test_the_area_over_all_pairs_leaves_out_those_at_one_place():
 def test_boards_are_put_together_leaf_by_leaf():
     trees = [{"a": {"b": 1.0}, "c": 4.0}, {"a": {"b": 3.0}, "c": 6.0}]
     assert summarise_nested(trees) == {
-        "a": {"b": {"mean": 2.0, "n": 2, "sd": pytest.approx(np.sqrt(2)), "ci95": interval([1.0, 3.0])}},
-        "c": {"mean": 5.0, "n": 2, "sd": pytest.approx(np.sqrt(2)), "ci95": interval([4.0, 6.0])},
+        "a": {"b": {"mean": 2.0, "n": 2, "sd": pytest.approx(np.sqrt(2)), "values": [1.0, 3.0]}},
+        "c": {"mean": 5.0, "n": 2, "sd": pytest.approx(np.sqrt(2)), "values": [4.0, 6.0]},
     }
     assert summarise_nested(trees[:1])["c"] == {"mean": 4.0, "n": 1}

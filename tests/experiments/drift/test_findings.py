@@ -34,7 +34,9 @@ def errors(start: float, per_window: float, by_seed=BY_SEED, force: bool = True)
 PAPER = {"initial": errors(1.0, 0.5), "regular": errors(0.2, 0.01), "each": errors(0.3, 0.01)}
 
 
-def found(networks: dict, late: dict | None = LATE, boards: tuple[str, ...] = ("b0", "b1", "b2", "b3")) -> dict[str, dict]:
+def found(
+    networks: dict, late: dict | None = LATE, boards: tuple[str, ...] = ("b0", "b1", "b2", "b3")
+) -> dict[str, dict]:
     rows = {
         policy: [
             {"contacts_n": n, "noload_off_uT": OFF_uT[policy]}
@@ -62,7 +64,8 @@ def test_errors_as_in_the_paper_show_all_its_findings_and_need_no_reason():
         (OFFSET, {"initial": errors(0.1, 0.0)}, LATE, "changes the field by 140 µT"),
         (EACH_IS_WORSE, {"each": errors(0.1, 0.01)}, LATE, "off by 0.94 µT of drift"),  # 2^2 - 2 1.25^2 = 0.94^2
         (
-            OVERESTIMATES, {}, LATE | {"bias_N": -0.02, "bias_pct": -1.7, "network_bias_N": [-0.02, -0.021, -0.02, -0.019]},
+            OVERESTIMATES, {},
+            LATE | {"bias_N": -0.02, "bias_pct": -1.7, "network_bias_N": [-0.02, -0.021, -0.02, -0.019]},
             "explains a bias of +1.9 %",
         ),
     ],
@@ -96,7 +99,9 @@ def test_many_trainings_on_one_board_conclude_nothing_of_others_but_are_judged_a
     one_board = found(PAPER, LATE | {"network_board": ["b0"] * 4}, ("b0",) * 4)
     assert {one["verdict"] for one in one_board.values()} == {FEW_BOARDS}
     assert {one["of_trainings"] for one in one_board.values()} == {YES}
-    assert all(one["why"].startswith("Not judged: fewer than 4 boards say little of others. ") for one in one_board.values())
+    assert all(
+        one["why"].startswith("Not judged: fewer than 4 boards say little of others. ") for one in one_board.values()
+    )
 
 
 def test_more_trainings_of_the_same_errors_make_no_board_surer():
@@ -171,16 +176,16 @@ def test_measured_sentences_hold_the_numbers_of_the_run():
     first, offset, third, late = (one["measured"] for one in found(PAPER).values())
     assert "MSE_xy is 1.75 against 0.215 mm² with regular ones" in first
     assert "changes by 1 against 0.02 mm² in 10,000 contacts" in first
-    assert first.endswith("([low, high]: 95 %, Student's t over 3 boards).")
+    assert first.endswith("([low, high]: 95 %, Student's t over 4 boards).")
     assert offset.startswith("Mean over windows: MSE_xy is 0.215 mm² with regular ones, 1.75 with a single no-load")
     assert "MSE_F is 0.00315 against 0.00215 N²" in third
     assert "bias +0.02 ± 0.0007 N (+1.7 %)" in late
-    assert "1000 indentations, mean over 3 network(s); +0.02 [+0.018, +0.022] N ([low, high]" in late
+    assert "1000 indentations, mean over 4 network(s); +0.02 [+0.019, +0.021] N ([low, high]" in late
     assert "98.1 % of its early force" in late
 
 
 def test_what_shows_in_one_error_alone_is_said_to():
-    lower = PAPER["each"] | {"mse_xy_mm2": np.full((3, 4), 0.1)}
+    lower = PAPER["each"] | {"mse_xy_mm2": np.full((4, 4), 0.1)}
     third = found(PAPER | {"each": lower})[EACH_IS_WORSE]
     assert third["verdict"] == NO
     assert third["why"].startswith("It shows in MSE_F alone. ")

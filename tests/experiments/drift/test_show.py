@@ -33,7 +33,7 @@ def numbers(force: bool = True, spread: bool = True, **changed) -> dict:
         {
             "finding": "too much force",
             "holds": False,
-            "verdict": "inconclusive (one board)",
+            "verdict": "not judged (fewer than 4 boards)",
             "of_trainings": "yes",
             "measured": "A little.",
             "why": "One board.",
@@ -60,7 +60,7 @@ def test_a_row_a_window_shows_every_policy_and_where_it_is_from(source):
 
 def test_a_finding_that_does_not_hold_or_cannot_be_told_says_which_and_gives_its_reason():
     table = tables(numbers(), "simulated")["drift_findings"]
-    assert table["holds"].tolist() == ["yes", "no", "inconclusive (one board)"]
+    assert table["holds"].tolist() == ["yes", "no", "not judged (fewer than 4 boards)"]
     assert table["of these trainings"].tolist() == ["yes", "no", "yes"]
     assert table["why not"].tolist() == ["–", "Never stale.", "One board."]
     assert "95 % interval over pairs of networks" in to_markdown(table)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.stats import linregress, sem
 
 from pipeline.core.seeds import rng_for
-from pipeline.evaluation.metrics import score
+from pipeline.evaluation.metrics import METRICS, score
 from pipeline.experiments.drift.windows import (
     POINTS_MAX_N,
     Answers,
@@ -123,7 +123,7 @@ def test_each_network_has_its_own_row_so_that_policies_pair_by_skin_and_seed():
         for window_i in (0, 1)
     ]
     found = of_networks([*reversed(own), answers("initial")], "each")
-    assert set(found) == {"accuracy_pct", "mse_xy_mm2", "mse_f_N2"}
+    assert set(found) == set(METRICS)
     want = [[score(one.true, one.predicted)["mse_f_N2"] for one in own[2 * i : 2 * i + 2]] for i in range(4)]
     np.testing.assert_allclose(found["mse_f_N2"], want)
 
