@@ -84,6 +84,7 @@ ROWS = (
     _experiment("touches", None, section=True, recorded=True, alone=True),
     _experiment("ambient", None, "lobo", section=True),
     _experiment("dynamics", "press", "lobo"),
+    _experiment("worlds", None, "transfer", "adapt", section=True),
     _experiment("gripper", "grip", "lobo", section=True),
     _study("verification"),
     _study("stability"),

@@ -1,4 +1,4 @@
-"""What is known of a row before its touch: the field without load, the number in the scan. In: captures. Out: a `Scan`.
+"""What is known of a row before its touch: the field without load, the number in the scan; and rows that only hover.
 
 A model that is tested on the skin it learnt on may answer by these alone. Refuses to know fields in contact, folds and
 scores.
@@ -40,3 +40,40 @@ def number_in_pass(readings: Readings) -> Int64[np.ndarray, " f"]:
     first = np.full(len(passes), indentation.max())
     np.minimum.at(first, of_pass, indentation)
     return indentation - first[of_pass]
+
+
+@dataclass(frozen=True)
+class Hover:
+    """Rows of a tip that is over a known place and does not touch; `pass_i` counts as that of `Rows` does."""
+
+    db_uT: Float32[np.ndarray, "f ch"]
+    place_mm: Float32[np.ndarray, "f 2"]
+    skin: np.ndarray
+    pass_i: Int64[np.ndarray, " f"]
+
+    def __len__(self) -> int:
+        return len(self.skin)
+
+
+def gather_hover(captures: Sequence[Readings]) -> Hover:
+    """Stack the rows without force between the contacts of a pass, each at the place of the contact that comes next.
+
+    A tip that goes down on a place in steps hovers over it first. Rows before the first contact of a pass are its
+    no-load reading, and rows after the last have no place.
+    """
+    parts: list[tuple[np.ndarray, ...]] = []
+    passes_n: dict[str, int] = {}
+    for one in sorted(captures, key=lambda readings: readings.capture):
+        before_n = passes_n.get(one.skin, 0)
+        passes_n[one.skin] = before_n + int(one.pass_i.max()) + 1
+        touches = np.flatnonzero(np.isfinite(one.x_mm) & (one.Fz_N > 0))
+        empty = np.flatnonzero(np.isnan(one.x_mm) & (one.Fz_N == 0))
+        after = np.searchsorted(touches, empty)
+        inside = (after > 0) & (after < len(touches))
+        empty, last, coming = empty[inside], touches[after[inside] - 1], touches[after[inside]]
+        same = (one.pass_i[last] == one.pass_i[empty]) & (one.pass_i[coming] == one.pass_i[empty])
+        empty, coming = empty[same], coming[same]
+        place_mm = np.column_stack([one.x_mm[coming], one.y_mm[coming]])
+        skins, pass_i = np.full(len(empty), one.skin), one.pass_i[empty].astype(np.int64) + before_n
+        parts.append((one.b_uT[empty] - one.noload_uT[empty], place_mm, skins, pass_i))
+    return Hover(*(np.concatenate(part) for part in zip(*parts, strict=True)))

@@ -138,7 +138,9 @@ def _single(table: pd.DataFrame, headline: str) -> dict[str, Any]:
     numbers = {question: group for question, group in numbers.items() if group}
     papers = next(({"split": question} | numbers[question] for question in PAPERS_SPLITS if question in numbers), {})
     honest = {name: numbers[question] for name, question in HONEST.items() if question in numbers}
-    return numbers | {"single_sensor": papers | honest}
+    by_skin = whole(select(table, question="single_temporal", recipe=headline)).groupby("fold")[list(METRICS)].mean()
+    skins = {"single_skins": records(by_skin)} if len(by_skin) > 1 else {}
+    return numbers | {"single_sensor": papers | honest} | skins
 
 
 def _variants(table: pd.DataFrame) -> dict[str, dict[str, Any]]:

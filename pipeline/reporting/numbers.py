@@ -22,6 +22,9 @@ SINGLE = {
     "by_time": "single_temporal",
 }  # fmt: skip
 POLICIES = ("initial", "regular", "each")
+HOVER = ("hover", "hover_network")  # what tells the place of a tip that does not touch
+LENGTHS, PLACE = ("hover_uT", "touch_uT"), ("accuracy_pct", "mse_xy_mm2")
+SEEN_PCT = 25.0  # assumed: chips see a tip itself that is placed so often without touching
 OF_DRIFT = ("accuracy_pct", "mse_f_N2")
 OF_TOUCHES = ("single_touches_pct", "mean_left_over_pct")
 SETTINGS = ("scene", "source", "seed")  # of the provenance: equal between equal runs
@@ -51,11 +54,19 @@ def add_up(accounts: Iterable[Mapping[str, int]]) -> dict[str, int]:
 def foretold(tables: Iterable[pa.Table]) -> dict[str, Any]:
     """Summarise over folds how well places are told before their touch: by question, and by what tells them."""
     found: dict[str, dict[str, Any]] = {}
+    hover: dict[str, dict[str, Any]] = {}
     for table in tables:
         for (question, told_by), rows in table.to_pandas().groupby(["question", "told_by"], sort=False):
-            scored = {name: statistic(rows[name].to_list()) for name in METRICS if name in rows}
-            found.setdefault(question, {})[told_by] = scored
-    return {"before_touch": found} if found else {}
+            if told_by not in HOVER:
+                scored = {name: statistic(rows[name].to_list()) for name in METRICS if name in rows}
+                found.setdefault(question, {})[told_by] = scored
+                continue
+            for row in rows.to_dict("records"):
+                own = hover.setdefault(str(row["fold"]), {name: row[name] for name in LENGTHS})
+                own[told_by] = {name: row[name] for name in PLACE}
+                if told_by == "hover":
+                    own["seen"] = bool(row["accuracy_pct"] >= SEEN_PCT)
+    return ({"before_touch": found} if found else {}) | ({"hover": hover} if hover else {})
 
 
 def count_trainings(

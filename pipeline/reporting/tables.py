@@ -48,6 +48,16 @@ BEFORE_TOUCH_MEANING = (
     "says what a skin that remembers its pokes gives away of that order; it is in every change of field, so a network "
     "that is tested on the skin it learnt on may have used it."
 )
+SEEN_TIP = (
+    "Not beside the paper's numbers: a tip that only hovers is placed too, so the indenter itself is magnetic and "
+    "these scores are no evidence of touch"
+)
+HOVER_MEANING = (
+    "Hover control: rows of the tested passes in which the gauge feels nothing, at the place that is touched next, "
+    "answered by what was learnt on contacts. A skin that feels nothing is placed by chance, a few in a hundred. A tip "
+    "that the nearest contacts place a quarter of the time is called seen (assumed): its own magnetism is read. |dB| "
+    "without contact holds the noise of the no-load reading too."
+)
 TABLE_2_SPREAD = (
     "± is the sd, as in the paper: over n boards held out, or over n pairs of a training and a test skin for one skin "
     f"on others. {INTERVAL} (for one skin on others: over its training skins and the boards that it was tested on)."
@@ -98,6 +108,8 @@ def make_tables(numbers: Numbers) -> dict[str, pd.DataFrame]:
         tables |= {name: table for name, table in made.items() if not table.empty}
     if any(name in numbers for name in SPLIT_WORDS):
         tables["single_sensor"] = _single(numbers, source)
+    if "hover" in numbers:
+        tables["hover"] = _hover(numbers, source)
     tables |= experiment_tables(numbers, source)
     makers: dict[str, Callable[[Any, str], pd.DataFrame]] = {
         "sweep_pokes": sweep_pokes_table, "sweep_sensors": sweep_sensors_table, "baselines": baselines_table,
@@ -227,15 +239,45 @@ def _table_2(numbers: Numbers, source: str) -> pd.DataFrame:
 def _single(numbers: Numbers, source: str) -> pd.DataFrame:
     """Put each split of one skin beside the paper, and below it what tells its places before the touch."""
     rows: dict[str, tuple[Mapping[str, Any], Mapping[str, Number]]] = {}
+    seen = [skin for skin, own in numbers.get("hover", {}).items() if own["seen"]]
     for name, words in SPLIT_WORDS.items():
         if name in numbers:
-            rows[words] = (numbers[name], SINGLE_SENSOR)
+            skins = numbers.get("single_skins", {}) if name == "single_temporal" else {}
+            own = {f"{words}: {skin}": (_stats(scores), skin in seen) for skin, scores in skins.items()}
+            own = own or {words: (numbers[name], bool(seen))}
+            rows |= {title: (scores, {} if of_seen else SINGLE_SENSOR) for title, (scores, of_seen) in own.items()}
             told = numbers.get("before_touch", {}).get(name, {})
             rows |= {f"{words}: place from {BEFORE_TOUCH[by]}": (told[by], {}) for by in BEFORE_TOUCH if by in told}
     table = _beside_paper(rows, source)
-    if "before_touch" in numbers:
-        table.attrs["meaning"] = BEFORE_TOUCH_MEANING
+    meaning = [BEFORE_TOUCH_MEANING] if "before_touch" in numbers else []
+    if seen:
+        meaning.append(f"{SEEN_TIP} (table hover: {', '.join(seen)}).")
+    if meaning:
+        table.attrs["meaning"] = " ".join(meaning)
     return table
+
+
+def _hover(numbers: Numbers, source: str) -> pd.DataFrame:
+    """List what a tip that does not touch gives away, skin by skin, beside the scores of contacts."""
+    skins, lines = numbers.get("single_skins", {}), []
+    for skin, own in numbers["hover"].items():
+        contact = skins.get(skin, _means(numbers["single_temporal"]))
+        line = {"skin": skin, "source": source, "contacts, within 1 mm, %": f"{contact['accuracy_pct']:.3g}"}
+        line |= {
+            f"no contact, within 1 mm, % ({words})": f"{own[by]['accuracy_pct']:.3g}" if by in own else "–"
+            for by, words in (("hover", "2 nearest contacts"), ("hover_network", "network"))
+        }
+        line |= {"|dB| without contact, µT": f"{own['hover_uT']:.3g}", "|dB| at 1 N, µT": f"{own['touch_uT']:.3g}"}
+        lines.append(line | {"the tip": "is seen without touch" if own["seen"] else "is not seen"})
+    return tabulate(lines, meaning=HOVER_MEANING)
+
+
+def _stats(scores: Mapping[str, float]) -> dict[str, Any]:
+    return {name: {"mean": value, "n": 1} for name, value in scores.items()}
+
+
+def _means(row: Mapping[str, Any]) -> dict[str, float]:
+    return {name: stat["mean"] for name, stat in row.items() if isinstance(stat, Mapping) and "mean" in stat}
 
 
 def _beside_paper(rows: Mapping[str, tuple[Mapping[str, Any], Mapping[str, Number]]], source: str) -> pd.DataFrame:

@@ -11,7 +11,8 @@ from pipeline.core.stage import run
 from pipeline.dataset.scan import SCORED
 from pipeline.dataset.splits import ONE_SKIN
 from pipeline.learning.recipe import Training, training
-from pipeline.trials.before_touch import score_before_touch
+from pipeline.trials.before_touch import BY_TIME, score_before_touch
+from pipeline.trials.networks import networks_by_fold
 from pipeline.trials.training import prepare_training, read_data, train_all, trials_of, write_models
 
 
@@ -30,7 +31,7 @@ def train_single(scene: str, files: Files, indentations: Path, folds: Path, mode
     own = [fold for fold in data.folds if fold.question in ONE_SKIN]
     trials = trials_of(data, read(data.settings), own)
     write_models(models, data, trials, train_all(data, trials, "train_single"), "train_single")
-    told = score_before_touch(data, indentations, io.read_json(folds)["captures"])
+    told = score_before_touch(data, indentations, io.read_json(folds)["captures"], networks_by_fold(models, BY_TIME))
     io.write_table(models / SCORED, told)
 
 

@@ -51,3 +51,14 @@ def networks_without(models: Path, board: str, *, recipe: str = HEADLINE) -> lis
         rule = f"some of recipe {recipe} with board {board} held out"
         raise SchemaError(str(models), "networks", rule, "none", "Train them: ask lobo of this scene.")
     return found
+
+
+def networks_by_fold(models: Path, question: str, *, recipe: str = HEADLINE) -> dict[str, list[Network]]:
+    """Read the networks of a question by fold, one a seed; none where it was not asked."""
+    found: dict[str, list[Network]] = {}
+    for file in sorted(models.glob("*.json")):
+        card = io.read_json(file)
+        if (card["question"], card["recipe_name"]) == (question, recipe):
+            network = Network(card, io.read_tensors(file.with_suffix(".safetensors"))[0])
+            found.setdefault(card["fold"], []).append(network)
+    return found

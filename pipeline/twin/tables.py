@@ -12,7 +12,7 @@ from jaxtyping import Float
 from pipeline.twin.law import Law, Setup, at_rest_uT, simulate_uT, with_numbers
 
 PITCH_MM, STEPS_N = 0.8, 22  # of the lattice of places, along x and y
-FORCES_N = np.exp(np.linspace(np.log(0.05), np.log(9.5), 10))  # from a light touch to the hardest recorded press
+FORCES_N = np.exp(np.linspace(np.log(0.05), np.log(9.5), 9))  # from a light touch to the hardest recorded press
 OF_LOG = ("amplitude", "modulus_MPa")  # their spreads are of the logarithm
 # Spreads of a skin's numbers about those of boards of the same rig, and about the nominal ones where no board is known.
 # Assumed, wider than two recorded boards differ.

@@ -8,13 +8,14 @@ from pipeline.core.config import parse, read_yaml
 from pipeline.physics.skin import SkinDesign
 from pipeline.twin.law import Setup
 from pipeline.twin.population import POKES_N, Population, draw_places
-from pipeline.twin.tables import FORCES_N, Tables, lattice_mm
+from pipeline.twin.tables import Tables, lattice_mm
 
 ROOT = Path(__file__).resolve().parents[2]
 CHIPS_MM = np.array([[0.0, 0.0], [-7.0, 0.0], [0.0, -7.0], [7.0, 0.0], [0.0, 7.0]])
 DESIGN = parse(SkinDesign, read_yaml(ROOT / "params.yaml")["skin"] | {"tip_radius_mm": 2.0}, "params.yaml: skin")
 SETUP = Setup(DESIGN, CHIPS_MM, 1.1, (20.0, 20.0), True, 2.0)
 WIDE_MM = 5.0
+FORCES_N = np.geomspace(0.55, 9.5, 6)  # enough for a skin in closed form
 NAMES, SPREADS = ("label_x_mm", "label_y_mm", "gap_mm"), np.array([0.25, 0.25, 0.3])
 REST_SLOPE_uT = np.sin(np.arange(45.0)).reshape(15, 3) * 300
 

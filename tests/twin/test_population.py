@@ -12,7 +12,6 @@ from pipeline.twin.places import inside
 from pipeline.twin.population import (
     LEAST,
     PLACES_N,
-    Forces,
     draw_gains,
     draw_law,
     draw_places,
@@ -35,7 +34,7 @@ def test_the_same_seed_draws_the_same_skins_however_many_more_are_drawn(monkeypa
     assert not np.allclose(two.rest_uT[0], two.rest_uT[1])
     second = draw_population(NOMINAL, OF_NOMINAL, SETUP, slice(1, 2), rng_for(0, "skins"))
     np.testing.assert_array_equal(second.db_uT[0], two.db_uT[1])
-    weighed = draw_population(NOMINAL, OF_NOMINAL, SETUP, 1, rng_for(0, "skins"), Forces(weight_N=5.0))
+    weighed = draw_population(NOMINAL, OF_NOMINAL, SETUP, 1, rng_for(0, "skins"), replace(PLAIN, weight_N=5.0))
     np.testing.assert_array_equal(weighed.db_uT[:, :-1], one.db_uT)  # the press of a weight moves no other
     assert (*weighed.place_mm[0, -1], weighed.force_N[0, -1]) == (0, 0, 5)
 

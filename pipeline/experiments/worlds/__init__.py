@@ -1,0 +1,1 @@
+"""What decides table 2: its rows against what simulated skins differ in."""
