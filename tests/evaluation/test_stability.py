@@ -9,14 +9,16 @@ import pytest
 from pipeline.capture import faults, stream
 from pipeline.core.config import parse, read_yaml
 from pipeline.core.errors import CaptureError
+from pipeline.experiments.stability import extremes as extremes_module
 from pipeline.experiments.stability import physics, wire
 from pipeline.experiments.stability.cases import measured, peak_bytes, refused
 from pipeline.experiments.stability.chip import chip_cases
+from pipeline.experiments.stability.extremes import extreme_cases, near, tips
 from pipeline.experiments.stability.physics import physics_cases, time_cases
 from pipeline.experiments.stability.run import survey
 from pipeline.experiments.stability.sliding import sliding_cases
 from pipeline.experiments.stability.wire import wire_cases
-from pipeline.physics import force_sensor, layer, sensor, slide, viscoelastic
+from pipeline.physics import flow_map, force_sensor, layer, sensor, slide, slip, viscoelastic
 from pipeline.synthesis import contact
 from pipeline.synthesis.settings import Synthesis
 
@@ -78,6 +80,38 @@ def test_a_slide_that_forgets_to_turn_and_a_depth_between_straight_lines_are_fou
         "the slide of a skin that is poked at its free edge",
         "pressed to 0.72 of the thickness by force, and let go",
     }
+
+
+def extremes():
+    return extreme_cases(BOARD, DESIGN.spreads, skin=DESIGN.skin, seed=SEED)
+
+
+def test_deep_presses_by_a_table_that_ends_too_early_are_found_out(monkeypatch):
+    at_depth = flow_map.at_depth
+    monkeypatch.setattr(
+        flow_map, "at_depth", lambda flow, depth_m: at_depth(flow, min(depth_m, 0.62 * flow.thickness_m))
+    )
+    assert broken(extremes()) == {"dB of a press to 0.66 of the thickness", "dB of a press to 0.72 of the thickness"}
+
+
+def test_a_layer_of_another_compliance_is_found_out_by_every_tip(monkeypatch):
+    compliance, kept = slip.compliance, (layer.contact_of_depth, layer._force_curve)
+    monkeypatch.setattr(slip, "compliance", lambda kh: compliance(1.5 * kh))
+    for one in kept:
+        one.cache_clear()
+    assert broken(tips(DESIGN.skin.base)) == {f"a tip of {size} thicknesses" for size in ("0.1", "1", "10")}
+    for one in kept:
+        one.cache_clear()
+
+
+def test_cells_as_wide_as_the_gap_are_found_out_under_near_chips(monkeypatch):
+    monkeypatch.setattr(extremes_module, "CELL_SHARE", 1.5)
+    assert len(broken(near(DESIGN.skin))) >= 2
+
+
+def test_a_stiffening_that_knows_a_millimetre_is_found_out_by_thin_and_thick_skins(monkeypatch):
+    monkeypatch.setattr(slide, "stiffening", lambda depth_m, thickness_m: 1 + np.maximum(depth_m, 0) / 1e-3)
+    assert broken(extremes()) == {"a skin of 0.2 mm", "a skin of 20 mm"}
 
 
 def test_a_skin_that_no_springs_hold_has_no_such_case():

@@ -153,7 +153,7 @@ def test_a_model_that_learnt_the_skin_keeps_what_it_learnt_when_its_board_is_ope
         answers = np.concatenate([each.answer[each.contact] for each in readings])
         true_mm = np.repeat(place_mm, POKED_N, axis=0)[: len(answers)]
         untaught = np.concatenate([each.answer[each.contact] for each in played(poked(simulated), load_universal())[1]])
-        assert np.abs(answers[:, :2] - true_mm).mean() < 0.5 * np.abs(untaught[:, :2] - true_mm).mean()
+        assert np.abs(answers[:, :2] - true_mm).mean() < 0.6 * np.abs(untaught[:, :2] - true_mm).mean()
     np.testing.assert_array_equal(learnt.predict(b_uT), before)  # the user's own stays as it is
     np.testing.assert_array_equal(learnt.skin.number, number)
 

@@ -12,6 +12,7 @@ from pipeline.twin.places import inside
 from pipeline.twin.population import (
     LEAST,
     PLACES_N,
+    PLAIN,
     draw_gains,
     draw_law,
     draw_places,

@@ -1,18 +1,32 @@
 """The model that comes with the project: it reads simulated pokes, tells what is none, and refuses other boards."""
 
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import reskin
 from pipeline.core import io
+from pipeline.core.config import parse, read_yaml
 from pipeline.core.errors import SchemaError
+from pipeline.core.seeds import rng_for
+from pipeline.physics import slide
+from pipeline.physics.board import BoardDesign, Spreads, draw_board
+from pipeline.physics.nodes import Quadrature
+from pipeline.physics.sensor import ChipDesign, read_field
+from pipeline.physics.skin import SkinDesign, changes_of_field, draw_skin
 from pipeline.twin.asked import CHANNELS_N
 from pipeline.twin.shipped import FILE, Universal, load_universal
 from pipeline.twin.tables import NOMINAL
 from pipeline.twin.turned import to_chips
 
+ROOT = Path(__file__).resolve().parents[2]
+PARAMS = read_yaml(ROOT / "params.yaml")
+PARAMS_SKIN, SPREADS = parse(SkinDesign, PARAMS["skin"], "skin"), parse(Spreads, PARAMS["spreads"], "spreads")
+CHIP = parse(ChipDesign, PARAMS["chip"], "chip")
+QUICK = read_yaml(ROOT / "pipeline/scenes/quick.yaml")["simulate"]
+RIGID = parse(BoardDesign, QUICK["boards"]["rigid"]["design"], "boards")
 PLACES_MM = np.array([[8.0, 8.0], [3.0, 6.0], [12.0, 11.0], [10.0, 3.0]])
 
 
@@ -232,3 +246,18 @@ def test_no_rows_give_no_answers_and_cannot_zero():
     assert len(model.estimate(np.empty((0, 15))).place_mm) == 0
     with pytest.raises(SchemaError, match="readings without contact must be one or more; got 0"):
         model.zero(np.empty((0, 15)))
+
+
+@pytest.mark.parametrize("force_N", [0.1, 0.5])
+def test_light_touches_of_skins_that_it_never_saw_read_as_about_what_they_are(force_N):
+    model, read_N, rng = load_universal(), [], rng_for(0, "light")
+    for name in ("b0", "b1", "b2", "b3"):
+        board = draw_board(RIGID, SPREADS, seed=5, name=name)
+        skin = draw_skin(PARAMS_SKIN, SPREADS, seed=5, name=f"{name}_s0", rule=Quadrature(0.8e-3, 5))
+        of = {"modulus_Pa": skin.modulus_Pa, "thickness_m": skin.thickness_m, "tip_radius_m": skin.tip_radius_m}
+        depth_m = slide.depth_at(np.full(10, force_N), **of) - skin.depth_zero_m
+        rest_T, change_T = changes_of_field(board, skin, np.column_stack([rng.uniform(-7e-3, 7e-3, (10, 2)), depth_m]))
+        noload_uT, _ = read_field(np.repeat(rest_T[None], 50, axis=0), board, design=CHIP, rng=rng)
+        touch_uT, _ = read_field(rest_T + change_T, board, design=CHIP, rng=rng)
+        read_N += model.zero(noload_uT).estimate(touch_uT).force_N.tolist()
+    assert 0.7 * force_N < np.median(read_N) < 1.4 * force_N

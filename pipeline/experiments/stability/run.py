@@ -12,6 +12,7 @@ from pipeline.core.executors import make_executor
 from pipeline.core.stage import run, say
 from pipeline.experiments.stability.cases import Case
 from pipeline.experiments.stability.chip import chip_cases
+from pipeline.experiments.stability.extremes import extreme_cases
 from pipeline.experiments.stability.physics import drag_cases, physics_cases, time_cases
 from pipeline.experiments.stability.sliding import sliding_cases
 from pipeline.experiments.stability.wire import wire_cases
@@ -25,6 +26,7 @@ def survey(of: Synthesis, seed: int) -> list[Case]:
     return [
         *time_cases(),
         *physics_cases(board, of.spreads, skin=of.skin, seed=seed),
+        *extreme_cases(board, of.spreads, skin=of.skin, seed=seed),
         *drag_cases(of.skin),
         *sliding_cases(board, of.spreads, skin=of.skin, seed=seed),
         *chip_cases(of.chip, chips_n, seed),

@@ -1,0 +1,174 @@
+"""Skins and presses at the ends of what is allowed, against references that share no route with the product.
+
+References: a path of four times finer steps without tables; rings of pressure with the textbook's compliance of a
+sliding layer; magpylib's closed form of a magnetised box; and the exact scaling of lengths.
+"""
+
+from dataclasses import asdict, replace
+
+import magpylib
+import numpy as np
+from jaxtyping import Float
+from scipy.constants import milli, mu_0
+from scipy.special import j0, j1
+
+from pipeline.experiments.stability.cases import Case, measured
+from pipeline.experiments.verification import kinematics
+from pipeline.experiments.verification.checks import no_spread
+from pipeline.physics import dipole, layer, slide
+from pipeline.physics.board import Board, BoardDesign, Spreads, draw_board
+from pipeline.physics.change import change_of_field
+from pipeline.physics.nodes import Quadrature, place_nodes
+from pipeline.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, forces
+
+AREA = "physics"
+COARSE = Quadrature(cell_m=2.2e-3, layers_n=4)  # of both sides alike: steps and scaling are asked, not quadrature
+PLACE_M = np.array([2.3, -1.1]) * milli  # on no node's axis
+DEPTHS = (0.6, 0.66, slide.DEEPEST)  # of the thickness
+FINER = 4  # times the product's steps
+STEPS_N = 40  # of the product's, over a depth of one thickness
+RINGS_N, KEPT_WAVES = 160, 400.0  # rings of pressure; the shortest wave, k times the contact's radius
+SIZES = (0.1, 1.0, 10.0)  # tip radius over thickness
+PRESSED = 0.4  # of the lesser of thickness and tip radius
+GAPS_MM, CELL_SHARE = (1.1, 0.4, 0.2), 0.5  # cells of so much of the gap
+SLID_M = 0.1 * milli
+THICKNESSES_MM = (0.2, 20.0)
+
+
+def extreme_cases(board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, seed: int) -> list[Case]:
+    """Try deep presses, sharp and blunt tips, near chips, thin and thick skins."""
+    even = no_spread(spreads)
+    drawn = draw_board(board, even, seed=seed, name="b0")
+    one = draw_skin(skin, even, seed=seed, name="b0_s0", rule=COARSE)
+    return [*deep(drawn, one), *tips(skin.base), *near(skin), *scaled(drawn, one)]
+
+
+def deep(board: Board, skin: Skin) -> list[Case]:
+    """Press as deep as forces are followed: dB by the product's tables against finer steps without any."""
+    cases = []
+    for share in DEPTHS:
+        depth_m = share * skin.thickness_m
+        _, (found_T,) = changes_of_field(board, skin, np.array([[*PLACE_M, depth_m]]))
+        fine_m = kinematics.descent(depth_m + skin.depth_zero_m, FINER * round(STEPS_N * share))
+        moved = kinematics.followed(skin, PLACE_M, fine_m)
+        truth_T = change_of_field((skin.nodes_m, skin.moments_A_m2), moved, board.chips_m)
+        error = _off(found_T, truth_T)
+        cases.append(
+            measured(AREA, f"dB of a press to {share:g} of the thickness",
+                     should=f"that of {FINER} times as many steps, without tables",
+                     happened=f"relative error {error:.1e}", error=error, limit=0.02)
+        )  # fmt: skip
+    return cases
+
+
+def tips(base: layer.Base) -> list[Case]:
+    """Press with sharp and blunt tips: force against rings of pressure on the textbook's layer."""
+    cases = []
+    for size in SIZES:
+        thickness_m, tip_m = 2 * milli, 2 * milli * size
+        depth_m = PRESSED * min(thickness_m, tip_m)
+        of = {"thickness_m": thickness_m, "tip_radius_m": tip_m}
+        found_N = layer.force(np.array([depth_m]), **of, modulus_Pa=1e6, base=base)[0]
+        contact = layer.contact_of_depth(depth_m, **of, base=base)
+        truth_N = ring_force_N(depth_m, thickness_m, tip_m, 1e6, base, reach_m=1.15 * contact.radius_m)
+        error = abs(found_N / truth_N - 1)
+        cases.append(
+            measured(AREA, f"a tip of {size:g} thicknesses", should="the force of rings of pressure that touch it",
+                     happened=f"{found_N:.4g} N, by rings {truth_N:.4g} N: relative error {error:.1e}",
+                     error=float(error), limit=0.01)
+        )  # fmt: skip
+    return cases
+
+
+def ring_force_N(
+    depth_m: float, thickness_m: float, tip_radius_m: float, modulus_Pa: float, base: layer.Base, *, reach_m: float
+) -> float:
+    """Give the force of a sphere on a layer by rings of even pressure: none pulls, and all that press touch it.
+
+    A ring sinks the surface by the Hankel integral of its pressure times the layer's compliance (Johnson 1985, 5.8):
+    (cosh 2A - 1) / (sinh 2A + 2A) on a sliding base, (sinh 2A - 2A) / (cosh 2A + 2 A^2 + 1) on one that holds it.
+    """
+    edges_m = np.linspace(0, reach_m, RINGS_N + 1)
+    middles_m = (edges_m[1:] + edges_m[:-1]) / 2
+    x, w = np.polynomial.legendre.leggauss(6 * RINGS_N)
+    k_per_m, weights = KEPT_WAVES / reach_m * (x + 1) / 2, KEPT_WAVES / reach_m * w / 2
+    twice = np.minimum(2 * k_per_m * thickness_m, 600.0)
+    if base == "slipping":
+        compliance = (np.cosh(twice) - 1) / (np.sinh(twice) + twice)
+    else:
+        compliance = (np.sinh(twice) - twice) / (np.cosh(twice) + twice**2 / 2 + 1)
+    disc = edges_m * j1(np.outer(k_per_m, edges_m))
+    ring = (disc[:, 1:] - disc[:, :-1]) / k_per_m[:, None]  # Hankel transform of a ring's pressure of 1
+    shear_Pa = modulus_Pa / 3
+    sinks_m = (j0(np.outer(middles_m, k_per_m)) * (weights * compliance)) @ ring / (2 * shear_Pa)
+    sphere_m = depth_m - tip_radius_m + np.sqrt(tip_radius_m**2 - middles_m**2)
+    touching = np.ones(RINGS_N, dtype=bool)
+    pressure_Pa = np.zeros(RINGS_N)
+    while True:
+        pressure_Pa[:] = 0
+        pressure_Pa[touching] = np.linalg.solve(sinks_m[np.ix_(touching, touching)], sphere_m[touching])
+        if not (pressure_Pa < 0).any():
+            break
+        touching &= pressure_Pa > 0
+    return float((pressure_Pa * np.pi * np.diff(edges_m**2)).sum())
+
+
+def near(skin: SkinDesign) -> list[Case]:
+    """Slide an evenly magnetised skin over nearer and nearer chips: dipoles on cells against a box in closed form."""
+    cases, side_m, thickness_m = [], 20 * milli, skin.thickness_mm * milli
+    j_T = np.array([0.6, -0.3, 1.0]) * skin.saturation_T
+    box = magpylib.magnet.Cuboid(polarization=j_T, dimension=(side_m, side_m, thickness_m))
+    for gap_mm in GAPS_MM:
+        chips_m = np.array([[0.3, -0.2, -gap_mm], [7.1, 0.4, -gap_mm], [9.4, 9.1, -gap_mm]]) * milli
+        nodes = place_nodes(thickness_m, Quadrature(CELL_SHARE * gap_mm * milli, 6))
+        moments = nodes.volumes_m3[:, None] * j_T / mu_0
+        slid_m = nodes.nodes_m + np.array([SLID_M, 0.0, 0.0])
+        found_T = dipole.field(slid_m, moments, chips_m) - dipole.field(nodes.nodes_m, moments, chips_m)
+        middle_m = np.array([0.0, 0.0, thickness_m / 2])
+        truth_T = box.getB(chips_m - middle_m - (SLID_M, 0.0, 0.0)) - box.getB(chips_m - middle_m)
+        error = _off(found_T, truth_T)
+        cases.append(
+            measured(AREA, f"chips {gap_mm:g} mm under a skin that slides {SLID_M / milli:g} mm",
+                     should=f"dB of a box in closed form (magpylib), with cells of {CELL_SHARE:g} of the gap",
+                     happened=f"{len(moments)} dipoles, relative error {error:.1e}", error=error, limit=0.03)
+        )  # fmt: skip
+    return cases
+
+
+def scaled(board: Board, skin: Skin) -> list[Case]:
+    """Shrink and blow up everything: equal fields, forces as the square of lengths."""
+    poke_m = np.array([[*PLACE_M, 0.45 * skin.thickness_m]])
+    (force_N,), (_, (change_T,)) = forces(skin, poke_m[:, 2]), changes_of_field(board, skin, poke_m)
+    cases = []
+    for thickness_mm in THICKNESSES_MM:
+        by = thickness_mm * milli / skin.thickness_m
+        other, chips = resized(skin, by), replace(board, chips_m=board.chips_m * by)
+        (other_N,), (_, (other_T,)) = forces(other, by * poke_m[:, 2]), changes_of_field(chips, other, by * poke_m)
+        error = max(_off(other_T, change_T), abs(float(other_N / (by**2 * force_N)) - 1))
+        cases.append(
+            measured(AREA, f"a skin of {thickness_mm:g} mm",
+                     should="equal dB where all lengths scale, force as their square",
+                     happened=f"{other_N:.3g} N, relative error {error:.1e}", error=error, limit=1e-6)
+        )  # fmt: skip
+    return cases
+
+
+def resized(skin: Skin, by: float) -> Skin:
+    """Multiply every length of a skin; its material stays, so springs scale as lengths do."""
+    hold = skin.hold
+    if hold is not None:
+        x_m, y_m = hold.give_m
+        hold = slide.Hold(
+            **asdict(hold)
+            | {"give_m": (by * x_m, by * y_m), "lets_go_m2": by**2 * hold.lets_go_m2}
+            | {"springs_N_per_m": by * hold.springs_N_per_m}
+        )
+    return replace(
+        skin, nodes_m=by * skin.nodes_m, moments_A_m2=by**3 * skin.moments_A_m2, seat_m=by * skin.seat_m,
+        sides_m=(by * skin.sides_m[0], by * skin.sides_m[1]), thickness_m=by * skin.thickness_m,
+        tip_radius_m=by * skin.tip_radius_m, depth_zero_m=by * skin.depth_zero_m, hold=hold,
+    )  # fmt: skip
+
+
+def _off(found: Float[np.ndarray, "k 3"], truth: Float[np.ndarray, "k 3"]) -> float:
+    return float(np.linalg.norm(found - truth) / np.linalg.norm(truth))
