@@ -48,6 +48,8 @@ class Forces:
     def draw(self, n: int, rng: np.random.Generator) -> Float[np.ndarray, " n"]:
         """Draw the forces of some presses."""
         force_N = np.exp(rng.uniform(np.log(self.least_N), np.log(self.largest_N), n))
+        if self.light_share == 0:
+            return force_N
         light_N = np.exp(rng.uniform(np.log(self.light_N), np.log(self.least_N), n))
         return np.where(rng.random(n) < self.light_share, light_N, force_N)
 

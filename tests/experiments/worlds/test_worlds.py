@@ -1,0 +1,101 @@
+"""What decides table 2: the law's error is as large and smooth as asked, worlds differ in one thing, rows are scored."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ruamel.yaml import YAML
+
+from pipeline.core import io
+from pipeline.core.config import Files, parse, read_settings, read_yaml
+from pipeline.evaluation.metrics import METRICS
+from pipeline.experiments.worlds import show
+from pipeline.experiments.worlds.run import Residual, Worlds, rows_of, with_residual, worlds, worlds_of
+from pipeline.synthesis.settings import synthesis_of
+from tests.reporting.test_work_precision import said
+
+ROOT = Path(__file__).resolve().parents[3]
+HOW = Residual(sizes=(0.4,), length_mm=3.5, length_log_N=1.2, own_share=0.5)
+GRID_MM = np.stack(np.meshgrid(np.linspace(-8, 8, 33), np.linspace(-8, 8, 33)), axis=-1).reshape(-1, 2)
+AT = np.column_stack([GRID_MM, np.zeros(len(GRID_MM))])
+CHANGE_uT = 100 * np.sin(np.arange(15.0) + GRID_MM[:, :1])
+
+
+def added(skin: str = "b0_s0", how: Residual = HOW, size: float = 0.4) -> np.ndarray:
+    return with_residual(CHANGE_uT, AT, size, how, 1, skin) - CHANGE_uT
+
+
+def test_the_error_is_as_large_as_asked_smooth_and_the_same_for_the_same_skin():
+    parts = [np.linalg.norm(added(f"b{i}_s0"), axis=1) / np.linalg.norm(CHANGE_uT, axis=1) for i in range(8)]
+    assert np.sqrt(np.mean(np.square(parts))) == pytest.approx(0.4, rel=0.1)
+    unit = added() / np.linalg.norm(CHANGE_uT, axis=1, keepdims=True)
+    step = np.linalg.norm(np.diff(unit.reshape(33, 33, 15), axis=1), axis=2)  # half a millimetre apart
+    assert step.mean() < 0.25 * np.linalg.norm(unit, axis=1).mean()
+    np.testing.assert_array_equal(added(), added())
+    assert not np.allclose(added(), added("b1_s0"))
+    assert with_residual(CHANGE_uT, AT, 0.0, HOW, 1, "b0_s0") is CHANGE_uT
+
+
+def test_what_is_no_skins_own_is_alike_on_all_and_what_is_shares_half_of_its_variance():
+    alike = HOW.model_copy(update={"own_share": 0.0})
+    np.testing.assert_array_equal(added("b0_s0", alike), added("b1_s0", alike))
+    pairs = [np.corrcoef(added(f"b{i}_s0").ravel(), added(f"b{i + 1}_s0").ravel())[0, 1] for i in range(8)]
+    assert np.mean(pairs) == pytest.approx(0.5, abs=0.15)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory) -> Files:
+    """Scene decide with three boards of one skin, three pokes deep and a few steps."""
+    folder = tmp_path_factory.mktemp("worlds")
+    words = YAML(typ="safe").load((ROOT / "pipeline/scenes/decide.yaml").read_text())
+    words["simulate"]["boards"]["rigid"] |= {
+        "boards_n": 3, "skins_per_board_n": 1, "quadrature": {"cell_mm": 3.0, "layers_n": 2},
+    }  # fmt: skip
+    words["simulate"]["protocols"]["grid"] |= {"skins_n": 3, "passes_n": 2, "depths_mm": [0.6, 1.0]}
+    words["split"] = {"transfer_skins_n": 2, "pool_passes_n": 1}
+    for section in ("train_single", "train_multi", "train_triplet"):
+        words[section]["steps_n"] = 12
+    words["adapt"] |= {"steps_n": 3, "pokes_n": 65}
+    words["worlds"] |= {"skin_modulus": [0.1], "amplitude_and_gap": [1.0], "friction": [0.8]}
+    words["worlds"]["residual"]["sizes"] = [0.0, 0.42]
+    rows = {name: {"recipe": words[name]["recipe"]} for name in ("train_single", "train_multi", "train_triplet")}
+    item = {"scene": "decide", "simulate": {"protocols": {"grid": {"boards": "rigid"}}}, **rows}
+    plan = {"stages": {"worlds": {"decide": item | {"adapt": {"adaptation": "paper"}}}}}
+    shutil.copy(ROOT / "dvc.yaml", folder)
+    shutil.copy(ROOT / "params.yaml", folder)
+    for name, content in {"decide.yaml": words, "plan.yaml": plan}.items():
+        with (folder / name).open("w") as stream:
+            YAML().dump(content, stream)
+    return Files(folder / "decide.yaml", folder / "params.yaml", folder / "plan.yaml")
+
+
+def test_every_world_has_the_rows_of_table_2_board_by_board_and_is_shown(files, tmp_path):
+    worlds(scene="decide", files=files, answer=tmp_path / "answer.json")
+    numbers = io.read_json(tmp_path / "answer.json")["numbers"]
+    assert [(one["factor"], one["value"]) for one in numbers["by_world"]] == [("default", 1.0), ("residual", 0.42)]
+    for one in numbers["by_world"]:
+        for row in ("single", "multi", "triplet", "adapted"):
+            assert set(one[row]) == {*METRICS, "by_board"}
+            assert set(one[row]["by_board"]) <= {"b0", "b1", "b2"}
+    table = show.tables(numbers, "simulated")["worlds"]
+    assert table["row"].tolist()[:2] == ["single-sensor", "multi-sensor"]
+    assert len(table) == 8
+    drawn = show.figures(numbers, {}, "simulated")["worlds.svg"]
+    for words in ("What decides table 2 (simulated", "friction under the tip", "adapted"):
+        assert words in said(drawn)
+
+
+def test_worlds_differ_in_one_thing_and_press_the_same_places(files):
+    settings = read_settings("worlds", "decide", files)
+    section = parse(Worlds, read_yaml(ROOT / "pipeline/scenes/decide.yaml")["worlds"], "worlds")
+    listed = worlds_of(synthesis_of(settings), section)
+    assert [world.name for world in listed] == [
+        "default-1", "residual-0.21", "residual-0.42", "skin_modulus-0", "skin_modulus-0.3", "amplitude_and_gap-0",
+        "amplitude_and_gap-2", "friction-0.35", "friction-1.7",
+    ]  # fmt: skip
+    own, erring, slippery = (rows_of(listed[i], section, 1) for i in (0, 2, 7))
+    np.testing.assert_array_equal(own.target, erring.target)  # places and forces stay
+    assert not np.allclose(own.db_uT, erring.db_uT, rtol=0.05)
+    np.testing.assert_array_equal(own.target, slippery.target)
+    assert np.linalg.norm(own.db_uT - slippery.db_uT) > 0.01 * np.linalg.norm(own.db_uT)
