@@ -43,7 +43,7 @@ CARD = {
     "over the skin) and by labels, over the median misfit of the pokes (of 12 or more) and over what labelled pokes "
     "that are left out in their turn are off. Told on simulated skins so that 1.645 to either side hold 90 %",
     "made_in_s_of": "one core's processor time; other machines take others",
-    "recorded_knowledge": "the form of the law and the middle of its stiffness and slide, from two recorded boards",
+    "recorded_knowledge": "the form of the law and the middle of its slide, from two recorded boards",
     "tested_on": "reports/lab, leave-one-board-out: `universal, simulated alone` is this model, told 65 pokes that lie "
     "evenly (see(pokes, even=True)) and labels; intervals of skins that were told fewer pokes are told on simulated "
     "skins alone",

@@ -1,4 +1,4 @@
-"""What decides table 2: the law's error is as large and smooth as asked, worlds differ in one thing, rows are scored."""
+"""What decides table 2: the law's error is as large as asked, worlds differ in one thing, rows are scored."""
 
 import shutil
 from pathlib import Path

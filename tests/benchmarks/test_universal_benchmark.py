@@ -1,0 +1,109 @@
+"""Error of the universal model against what it takes: lattice pitch, forces, training skins and steps.
+
+`RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_universal_benchmark.py` prints a table, docs/learning.md holds
+one. Skins that nobody was taught, with errors of the law as in training, told 65 pokes. Processor time of one thread.
+"""
+
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.core.config import parse, read_yaml
+from pipeline.physics.skin import SkinDesign
+from pipeline.trials.experts import Experts
+from pipeline.trials.shipping import UNKNOWN, shown
+from pipeline.trials.sureness import AS_TAUGHT, MISSES, pool_of_prior, skins_of_prior
+from pipeline.twin import tables
+from pipeline.twin.law import Setup
+from pipeline.twin.opinion import FULL_SET_N, Weights
+from pipeline.twin.shipped import SKIN_MM, Universal
+from pipeline.twin.tables import NOMINAL, OF_NOMINAL, Tables, tabulate
+from pipeline.twin.training import NAMELESS, Lessons, Syllabus, teach
+from pipeline.twin.turned import CHIPS_MM
+from tests.benchmarks import FULL, size
+
+ROOT = Path(__file__).resolve().parents[2]
+SIDE_MM = tables.PITCH_MM * tables.STEPS_N
+PITCHES_MM, FORCES_N = size((1.6, 0.8, 0.6), (3.2,)), size((4, 9, 17), (3,))
+SKINS_N, STEPS_N = size((125, 500, 2000), (8,)), size((300, 1200), (5,))
+ASKED_N, SEED = size(24, 2), 2021
+
+
+@dataclass(frozen=True)
+class Row:
+    """A setting, what it scored and what it took."""
+
+    words: str
+    accuracy_pct: float
+    mse_xy_mm2: float
+    force_factor: float
+    made_s: float
+    reading_us: float
+
+    def __str__(self) -> str:
+        return (
+            f"| {self.words} | {self.accuracy_pct:.1f} | {self.mse_xy_mm2:.2f} | {self.force_factor:.2f} | "
+            f"{self.made_s:.0f} | {self.reading_us:.0f} |"
+        )
+
+
+def test_error_against_time_of_map_and_network(monkeypatch):
+    design = parse(SkinDesign, read_yaml(ROOT / "params.yaml")["skin"], "skin")
+    setup = Setup(design, np.array(CHIPS_MM), NOMINAL.gap_mm, SKIN_MM, design.flipped, design.tip_radius_mm)
+    syllabus = Syllabus(NAMELESS, NOMINAL, OF_NOMINAL, setup)
+    networks: dict[tuple[int, int], tuple[Sequence[Weights], float]] = {}
+    for skins_n in SKINS_N:
+        for steps_n in STEPS_N:
+            start_s = time.process_time()
+            taught = teach(syllabus, Lessons(skins_n=skins_n, steps_n=steps_n, seeds_n=1), SEED)
+            networks[skins_n, steps_n] = taught, time.process_time() - start_s
+    used = networks[SKINS_N[len(SKINS_N) // 2], STEPS_N[-1]][0]
+    print(f"\nload of the machine: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores; {ASKED_N} skins asked")
+    print("| setting | within 1 mm, % | MSE_xy, mm² | force off by a factor of | made in, s | a reading, µs |")
+    print("|---|---|---|---|---|---|")
+    rows = []
+    for pitch_mm in PITCHES_MM:
+        for forces_n in FORCES_N if pitch_mm == 0.8 or not FULL else (9,):
+            made, made_s = lattice(monkeypatch, pitch_mm, forces_n, setup)
+            rows.append(asked(f"pitch {pitch_mm} mm, {forces_n} forces", made, used, syllabus, made_s))
+            print(rows[-1])
+    whole, _ = lattice(monkeypatch, 0.8 if FULL else 3.2, 9 if FULL else 3, setup)
+    for (skins_n, steps_n), (taught, taught_s) in networks.items():
+        rows.append(asked(f"network of {skins_n} skins, {steps_n} steps", whole, taught, syllabus, taught_s))
+        print(rows[-1])
+    assert all(np.isfinite([row.accuracy_pct, row.mse_xy_mm2, row.force_factor]).all() for row in rows)
+    if FULL:
+        assert rows[-1].accuracy_pct > 50
+
+
+def lattice(monkeypatch, pitch_mm: float, forces_n: int, setup: Setup) -> tuple[Tables, float]:
+    """Tabulate a lattice of this pitch and so many forces; give what that took."""
+    monkeypatch.setattr(tables, "PITCH_MM", pitch_mm)
+    monkeypatch.setattr(tables, "STEPS_N", 2 * round(SIDE_MM / pitch_mm / 2))
+    forces_N = np.geomspace(tables.FORCES_N[0], tables.FORCES_N[-1], forces_n)
+    start_s = time.process_time()
+    return tabulate(NOMINAL, OF_NOMINAL, setup, forces_N), time.process_time() - start_s
+
+
+def asked(words: str, made: Tables, networks: Sequence[Weights], syllabus: Syllabus, made_s: float) -> Row:
+    """Ask a model about skins that nobody was taught, told 65 pokes of each."""
+    model = Universal(made, networks, UNKNOWN)
+    skins = skins_of_prior(Experts(made, networks, None, syllabus), ASKED_N, SEED, AS_TAUGHT, MISSES[AS_TAUGHT])
+    off_mm, off_log, took_s, read_n = [], [], 0.0, 0
+    for i in range(len(skins)):
+        b_uT, place_mm = shown(model, skins, i, (FULL_SET_N, 0), even=True, seed=SEED)
+        model.estimate(b_uT[:1])  # made ready
+        start_s = time.process_time()
+        found = model.estimate(b_uT)
+        took_s, read_n = took_s + time.process_time() - start_s, read_n + len(b_uT)
+        off_mm.append(found.place_mm - place_mm)
+        off_log.append(np.log(found.force_N / pool_of_prior(skins, i, SEED)[1].force_N))
+    off = np.concatenate(off_mm)
+    return Row(
+        words, 100 * float((np.abs(off) <= 1).all(axis=1).mean()), float((off**2).mean()),
+        float(np.exp(np.sqrt(np.mean(np.concatenate(off_log) ** 2)))), made_s, 1e6 * took_s / read_n,
+    )  # fmt: skip
