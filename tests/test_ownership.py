@@ -42,8 +42,3 @@ HOMES = {
 def test_a_word_is_said_only_at_home(word):
     said = [name for name, text in SOURCES.items() if re.search(word, text)]
     assert [name for name in said if not any(fnmatch(name, home) for home in HOMES[word])] == []
-
-
-@pytest.mark.parametrize("name", sorted(SOURCES))
-def test_a_module_fits_on_a_few_screens(name):
-    assert len(SOURCES[name].splitlines()) <= (90 if name.startswith("stages/") else 300)

@@ -49,7 +49,7 @@ def test_two_real_boards_give_two_folds_with_all_three_numbers(lab):
     assert sorted(boards) == ["board1", "board2"]
     for parts in boards.values():
         assert parts["trained_on_skins_n"] == 1
-        assert set(parts["as_labelled"]) == {"accuracy_pct", "mse_xy_mm2", "mse_f_N2"}
+        assert set(parts["as_labelled"]) == {"accuracy_pct", "mse_xy_mm2", "mse_f_N2", "r2_f"}
 
 
 def test_stages_run_in_the_order_by_which_they_are_counted(lab):

@@ -35,7 +35,13 @@ LEARNING = (
     "few_labels", "audit",
 )  # fmt: skip
 DRAWING = ("drift", "manual", "contacts", "ambient")  # experiments that draw at random in ways of their own
-ASKED = set(EXPERIMENTS) - {"compare", "rivals", "touches", "population"}  # asked of recordings, and of many skins
+ASKED = set(EXPERIMENTS) - {
+    "compare",
+    "rivals",
+    "touches",
+    "population",
+    "worlds",
+}  # asked of recordings, and of many skins
 SAID = "said.txt"  # by the first run
 pytestmark = pytest.mark.timeout(1800)  # a guard against a hang; a busy machine takes four times as long as a quiet one
 
