@@ -55,7 +55,7 @@ def blocks_of(
     return {
         "headline": _headline(results[-1]),
         "recorded": "\n\n".join(_recorded(numbers) for numbers in recorded if "labels" in numbers) or "None yet.",
-        "results": "\n\n".join(_results(numbers, ("table2", "claims", "single_sensor")) for numbers in results),
+        "results": "\n\n".join(_results(numbers, ("table2", "claims", "manual", "flexible", "single_sensor")) for numbers in results),
         "time": _time(timed),
         "costs": _costs([numbers for numbers in (*results, *recorded) if "trainings" in numbers]),
         "labels": "\n\n".join(labels) or "No recorded scene asked yet.",
