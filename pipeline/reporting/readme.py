@@ -17,6 +17,7 @@ from pipeline.reporting.skins import skins_table
 from pipeline.reporting.tables import make_tables
 
 SEVERAL_min = 100  # from here on whole minutes
+TABLES = ("table2", "claims", "manual", "flexible", "single_sensor")  # of each simulated scene in docs/results.md
 COMPARED = ("compare", "compare_parameters", "compare_frames")
 Numbers = Mapping[str, Any]  # of one scene
 
@@ -55,7 +56,7 @@ def blocks_of(
     return {
         "headline": _headline(results[-1]),
         "recorded": "\n\n".join(_recorded(numbers) for numbers in recorded if "labels" in numbers) or "None yet.",
-        "results": "\n\n".join(_results(numbers, ("table2", "claims", "manual", "flexible", "single_sensor")) for numbers in results),
+        "results": "\n\n".join(_results(numbers, TABLES) for numbers in results),
         "time": _time(timed),
         "costs": _costs([numbers for numbers in (*results, *recorded) if "trainings" in numbers]),
         "labels": "\n\n".join(labels) or "No recorded scene asked yet.",
