@@ -93,7 +93,8 @@ def gripped(slide: Slide, force_N: Float[np.ndarray, " n"], grip_N_per_m: float)
     """
     needed_N = grip_N_per_m * np.hypot(*slide.move_m.T)
     moves = needed_N > 0
-    share = np.where(moves, -np.expm1(-force_N / np.where(moves, needed_N, 1.0)), 0.0)
+    with np.errstate(over="ignore"):  # of a slide so small that any force takes all of it
+        share = np.where(moves, -np.expm1(-force_N / np.where(moves, needed_N, 1.0)), 0.0)
     return Slide(slide.move_m * share[:, None], slide.spin_rad * share)
 
 
