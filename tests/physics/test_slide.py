@@ -95,7 +95,7 @@ def test_friction_bounds_a_slide_in_the_direction_that_it_has(place_m, taken_m, 
     sideways_N = hold.springs_N_per_m * np.hypot(*found.move_m[0])
     assert sideways_N <= min(0.8 * force_N, hold.springs_N_per_m * np.hypot(*whole.move_m[0])) * (1 + 1e-12)
     moves, (x, y), (whole_x, whole_y) = whole.move_m.any(), found.move_m[0], whole.move_m[0]
-    assert x * whole_y == pytest.approx(y * whole_x, abs=1e-24)
+    assert x * whole_y == pytest.approx(y * whole_x, rel=1e-12, abs=1e-24)
     if moves:  # motion and spin are held back alike: by 1 - exp(-mu F / k u)
         with np.errstate(over="ignore"):
             share = 1 - np.exp(-0.8 * force_N / (7e3 * np.hypot(whole_x, whole_y)))
