@@ -14,7 +14,7 @@ scheduler)
     exec python -m distributed.cli.dask_scheduler --port "${1:-8786}" --no-dashboard --no-jupyter
     ;;
 worker) # through the package, which sets what libraries read when they load
-    exec python -c "import pipeline.core.cluster; from distributed.cli.dask_worker import main; main()" \
+    exec python -c "import pipeline.cluster; from distributed.cli.dask_worker import main; main()" \
         "$1" --nworkers "${2:-1}" --nthreads 1 --no-dashboard --death-timeout 300
     ;;
 run)

@@ -1,8 +1,3 @@
-"""Learning for magnetic tactile skins: from raw serial captures to the tables of the ReSkin paper.
+"""Reproduction of the ReSkin paper: DVC stages, experiments, scenes, reports and MLflow, on the library `reskin`."""
 
-Knows nothing itself: below it each folder owns one step, each module one thing.
-"""
-
-from pipeline.core.numerics import pin
-
-pin()  # before any module of the package imports NumPy
+import reskin  # noqa: F401  (first: it selects the arithmetic that NumPy loads with)

@@ -11,15 +11,14 @@ from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 import typer
 from typer import Argument, Option
 
-from pipeline.capture.layouts import Foreign
-from pipeline.core import config
-from pipeline.core.errors import ParamsError, ReskinError
-from pipeline.core.machine import explaining
-from pipeline.core.packages import explain, show_version
-from pipeline.live import commands
+from reskin import config
+from reskin.errors import ParamsError, ReskinError, explaining
+from reskin.live import commands
+from reskin.packages import explain, show_version
+from reskin.recordings.layouts import Foreign
 
 if TYPE_CHECKING:
-    from pipeline.params import Plan
+    from pipeline.scenes import Plan
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -101,8 +100,10 @@ def add(
 ) -> None:
     """Add a recording to a scene; then `dvc repro` uses it."""
     root = checkout()  # first: who is elsewhere lacks more than packages
-    from pipeline import adding, plan, preparing
-    from pipeline.params import read_plan
+    from pipeline import plan
+    from pipeline.manage import add as adding
+    from pipeline.scenes import read_plan
+    from reskin.recordings import preparing
 
     labels, marks = preparing.Labels(board, skin, name), preparing.parse_marks(mark or [])
     running = read_plan(root / config.PLAN).scenes
@@ -130,7 +131,7 @@ def fetch(
 ) -> None:
     """Fetch public recordings from their home, check them, and add them to their scene."""
     root = checkout()
-    from pipeline import fetching
+    from pipeline.manage import fetch as fetching
 
     def agree(question: str) -> bool:
         return yes or (sys.stdin.isatty() and typer.confirm(question))
@@ -142,7 +143,7 @@ def fetch(
 def remove(scene: str, capture: str) -> None:
     """Take a recorded capture out of a scene again."""
     root = checkout()
-    from pipeline import adding
+    from pipeline.manage import add as adding
 
     adding.remove(root, scene, capture)
     typer.echo(f"removed {scene}/{capture}; now: dvc repro")
@@ -152,7 +153,7 @@ def remove(scene: str, capture: str) -> None:
 def merge() -> None:
     """Settle captures, plan and dvc.lock where a git merge of two people's recordings leaves them in conflict."""
     root = checkout()
-    from pipeline import merging
+    from pipeline.manage import merge as merging
 
     typer.echo(merging.merge(root))
 
@@ -165,8 +166,8 @@ def decode(
     chips_n: Chips = 5,
 ) -> None:
     """Decode a dump of a port to one row a frame, and account for every byte."""
-    from pipeline.capture.dump import decode_dump
-    from pipeline.core import io
+    from reskin import io
+    from reskin.board.decode import decode_dump
 
     table, account = decode_dump(io.read_bytes(stream), wire, chips_n, str(stream))
     io.write_table(out, table)
@@ -181,7 +182,7 @@ def predict(
     rate_hz: Annotated[float, Option("--rate-hz", help="Parquet without a device clock: frames a second.")] = 400.0,
 ) -> None:
     """Turn a board's log into contacts, places and forces; it begins with a second without contact."""
-    from pipeline.predicting import predict as write
+    from reskin.predicting import predict as write
 
     counts = write(log, model, out, rate_hz=rate_hz)
     typer.echo(f"predicted {out}: " + ", ".join(f"{key} {count:.6g}" for key, count in counts.items()))
@@ -192,7 +193,7 @@ def publish() -> None:
     """Write to MLflow what is not there yet, from the models of the scenes that run."""
     root = checkout()
     from pipeline import plan
-    from pipeline.params import read_scene
+    from pipeline.scenes import read_scene
     from pipeline.stages.publish import read_curves
     from pipeline.tracking import publish as write
 
@@ -215,7 +216,7 @@ def compare(
 ) -> None:
     """Compare fresh reports with the committed ones; exit status 1 if any value differs."""
     root = checkout()
-    from pipeline.comparing import compare_scene
+    from pipeline.manage.compare import compare_scene
 
     names = [scene] if scene else checked_plan().scenes
     sys.exit(max((compare_scene(root, name, against, typer.echo) for name in names), default=0))
@@ -228,7 +229,7 @@ def verify_reports(
 ) -> None:
     """Run scenes again in a clean copy of the last commit; exit status 1 if any value of their reports differs."""
     root = checkout()
-    from pipeline.verifying import verify
+    from pipeline.manage.verify import verify
 
     sys.exit(verify(root, names or list(checked_plan().scenes), against, typer.echo))
 
@@ -237,16 +238,16 @@ def verify_reports(
 def check_cache() -> None:
     """Hold DVC's cache against its names; what was changed is set aside, and `dvc repro` makes it again."""
     root = checkout()
-    from pipeline import caching
+    from pipeline.manage import cache
 
-    sys.exit(caching.check(root, typer.echo))
+    sys.exit(cache.check(root, typer.echo))
 
 
 @app.command()
 def readme(check: Annotated[bool, Option("--check", help="Only tell whether it is up to date.")] = False) -> None:
     """Fill in the generated parts of README.md and docs from the results in reports, whichever scenes run."""
     root = checkout()
-    from pipeline.documenting import fill_pages
+    from pipeline.report.readme import fill_pages
 
     changed, shown = fill_pages(root, write=not check)
     if check and changed:
@@ -268,7 +269,8 @@ def list_scenes() -> None:
 @scenes.command()
 def use(names: list[str]) -> None:
     """Let `dvc repro` run exactly these scenes."""
-    from pipeline import plan, tidying
+    from pipeline import plan
+    from pipeline.manage import tidy as tidying
 
     plan.use(checkout(), names)
     typer.echo(f"dvc repro now runs: {', '.join(names)}")
@@ -279,7 +281,7 @@ def use(names: list[str]) -> None:
 @scenes.command()
 def tidy() -> None:
     """Remove the files of questions that were switched off since they ran, of the scenes that run."""
-    from pipeline import tidying
+    from pipeline.manage import tidy as tidying
 
     stale = tidying.tidy(checkout(), checked_plan())
     for stage, paths in stale.items():

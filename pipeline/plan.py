@@ -13,14 +13,26 @@ from typing import Any
 
 from ruamel.yaml import YAML
 
-from pipeline.capture.header import NAME
-from pipeline.core import io
-from pipeline.core.config import FLOW, NOTHING, PARAMS, PLACE, PLAN, SCENES, declared, fill, find, put, read_yaml
-from pipeline.core.errors import ParamsError
-from pipeline.params import OnBoards, Plan, Scene, read_plan, read_scene
-from pipeline.questions import EXPERIMENTS, LEARNING, MAIN_PROTOCOL, NOT_INGESTED, QUESTIONS, TABLE_2, stages
-from pipeline.registry import Registry, read_registry
-from pipeline.running import LOCKS, need_rest
+from pipeline.manage.registry import Registry, read_registry
+from pipeline.manage.running import LOCKS, need_rest
+from pipeline.scenes import (
+    EXPERIMENTS,
+    LEARNING,
+    MAIN_PROTOCOL,
+    NOT_INGESTED,
+    QUESTIONS,
+    TABLE_2,
+    OnBoards,
+    Plan,
+    Scene,
+    read_plan,
+    read_scene,
+    stages,
+)
+from reskin import io
+from reskin.config import FLOW, NOTHING, PARAMS, PLACE, PLAN, SCENES, declared, fill, find, put, read_yaml
+from reskin.errors import ParamsError
+from reskin.recordings.header import NAME
 
 HEADER = """\
 # Which scenes run, what they ask, and what each stage of dvc.yaml takes. Written by `reskin scenes use` and `add`

@@ -10,8 +10,8 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from pipeline.predicting import read_network
-from pipeline.trials.networks import Network
+from reskin.models.trained import Network
+from reskin.predicting import read_network
 
 COLUMNS = ("x_mm", "y_mm", "force_N")
 

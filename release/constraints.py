@@ -11,7 +11,7 @@ import sys
 import tomllib
 from pathlib import Path
 
-from pipeline.core import io
+from reskin import io
 
 HEAD = "# Exact versions with all extras but fuzz; made with `make constraints`. torch is {torch} and nothing else.\n"
 LEFT_OUT = "fuzz"

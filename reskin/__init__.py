@@ -1,22 +1,35 @@
-"""The Python interface of the pipeline, for notebooks and controllers: `import reskin`, and see `help(reskin)`.
+"""Learning for magnetic tactile skins: boards, recordings, simulation, models and calibration.
 
-Knows nothing of its own: `pipeline.api` holds it.
+    >>> import reskin
+    >>> skin = reskin.draw_skin(seed=1)
+    >>> noload_uT, b_uT, force_N = reskin.simulate_pokes(skin, [[8.0, 8.0, 1.0]])
+    >>> b_uT.shape
+    (1, 15)
+
+Public names are imported when they are first used, so that `import reskin` costs little.
 """
 
-from pipeline.api import (
-    Model,
-    Pokes,
-    draw_board,
-    draw_skin,
-    lifted,
-    load_model,
-    load_rows,
-    load_universal,
-    open,
-    record,
-    simulate_pokes,
-    touch,
-)
+from typing import TYPE_CHECKING, Any
+
+from reskin.numerics import pin
+
+pin()  # before any module of the package imports NumPy
+
+if TYPE_CHECKING:
+    from reskin.api import (
+        Model,
+        Pokes,
+        draw_board,
+        draw_skin,
+        lifted,
+        load_model,
+        load_rows,
+        load_universal,
+        open,
+        record,
+        simulate_pokes,
+        touch,
+    )
 
 __all__ = [
     "Model",
@@ -32,3 +45,15 @@ __all__ = [
     "simulate_pokes",
     "touch",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from reskin import api
+
+    return getattr(api, name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

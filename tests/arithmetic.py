@@ -17,15 +17,15 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from pipeline.core.seeds import rng_for
-from pipeline.learning.adversarial import Domains, train_adversarial
-from pipeline.learning.recipe import Schedule
-from pipeline.learning.train import train
-from pipeline.learning.trial import Terms
-from pipeline.twin.population import POKES_N, Population
-from pipeline.twin.tables import NOMINAL, OF_NOMINAL
-from pipeline.twin.training import Syllabus
-from pipeline.twin.training import train as train_universal
+from reskin.models.adversarial import Domains, train_adversarial
+from reskin.models.recipe import Schedule
+from reskin.models.train import train
+from reskin.models.trial import Terms
+from reskin.seeds import rng_for
+from reskin.universal.map import NOMINAL, OF_NOMINAL
+from reskin.universal.population import POKES_N, Population
+from reskin.universal.training import Syllabus
+from reskin.universal.training import train as train_universal
 from tests.learning.jobs import some_job, some_rows
 from tests.twin.skins import SETUP
 

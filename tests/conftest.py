@@ -70,7 +70,8 @@ def pytest_runtest_setup() -> None:
 gc.disable()  # while everything is imported
 jaxtyping.jaxtyped = check_arrays  # by this name the import hook decorates every function of the project
 if not FULL:  # benchmarks at full size run the code as it is
-    jaxtyping.install_import_hook("pipeline", "beartype.beartype")  # its pytest plugin would import NumPy too early
+    # not by its pytest plugin, which would import NumPy too early
+    jaxtyping.install_import_hook(["pipeline", "reskin"], "beartype.beartype")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -1,7 +1,7 @@
 """Scenes for tests, as plain words, and the settings that a stage has of them."""
 
-from pipeline.core.config import Settings, parse
-from pipeline.params import Asking, Scene, check_scene
+from pipeline.scenes import Asking, Scene, check_scene
+from reskin.config import Settings, parse
 from tests.capture.headers import AS_USUAL
 
 RECIPE = {

@@ -9,19 +9,20 @@ import pytest
 from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
-from pipeline import adding, plan, preparing
-from pipeline.capture import probe
-from pipeline.capture.header import Clock, write_capture
-from pipeline.capture.probe import ProbeLog
-from pipeline.capture.readers import plain
-from pipeline.capture.wire import encode
+from pipeline import plan
 from pipeline.cli import app
-from pipeline.core import config
-from pipeline.core.errors import CaptureError, ReskinError
-from pipeline.core.seeds import rng_for
-from pipeline.dataset.captures import open_capture, read_header
-from pipeline.preparing import Dump, Labels
-from pipeline.registry import read_registry
+from pipeline.manage import add
+from pipeline.manage.registry import read_registry
+from reskin import config
+from reskin.board.wire import encode
+from reskin.errors import CaptureError, ReskinError
+from reskin.recordings import preparing, probe
+from reskin.recordings.header import Clock, write_capture
+from reskin.recordings.ingest import open_capture, read_header
+from reskin.recordings.preparing import Dump, Labels
+from reskin.recordings.probe import ProbeLog
+from reskin.recordings.readers import table
+from reskin.seeds import rng_for
 from tests.capture.headers import AS_USUAL, make_header
 from tests.capture.readers.test_lab import PRESSES, write
 from tests.capture.signals import make_frames
@@ -56,7 +57,7 @@ def labels(board: str = "board1", skin: str = "skin1", name: str | None = None) 
 
 
 def add_lab(root: Path, file: Path, *, allow_copy: bool = False, **words: str):
-    return adding.add(root, "small", preparing.foreign(file, "lab", labels(**words), {}), allow_copy=allow_copy)
+    return add.add(root, "small", preparing.foreign(file, "lab", labels(**words), {}), allow_copy=allow_copy)
 
 
 def contents(root: Path) -> dict[str, bytes]:
@@ -82,7 +83,7 @@ def test_a_recording_that_was_added_is_tracked_registered_and_planned(root, lab_
     params = plan.check(root)
     assert list(params.scenes) == ["small"]
     assert list(params.stages["ingest"]) == ["small-board1_skin1_readings"]
-    adding.remove(root, "small", "board1_skin1_readings")
+    add.remove(root, "small", "board1_skin1_readings")
     assert plan.check(root).scenes == {}
     assert not list((root / "data/raw").rglob("*readings*"))
 
@@ -114,7 +115,7 @@ def test_a_scene_without_section_compare_is_held_against_nothing(root, lab_file,
 
 
 def test_places_that_lie_otherwise_than_those_of_other_captures_are_a_warning(root, tmp_path, lab_file, capsys):
-    columns = plain.columns_of(5)
+    columns = table.columns_of(5)
     for i, exchanged in enumerate((False, True)):
         places_mm = rng_for(i, "places").uniform(0, 16, (40, 2)).round(2)
         changes_uT = fields_uT(places_mm - 8, np.full(40, 2.0))
@@ -125,7 +126,7 @@ def test_places_that_lie_otherwise_than_those_of_other_captures_are_a_warning(ro
         rows[columns[3:18]] = 500.0 + noise_uT + np.where([[False], [True]] * 40, changes_uT.repeat(2, axis=0), 0.0)
         rows.to_csv(tmp_path / f"board{i}.csv", index=False)
         prepared = preparing.foreign(tmp_path / f"board{i}.csv", "table", labels(f"board{i}", f"skin{i}"), {})
-        adding.add(root, "small", prepared, allow_copy=False)
+        add.add(root, "small", prepared, allow_copy=False)
         assert ("other captures only with x and y exchanged" in capsys.readouterr().err) == exchanged
 
 
@@ -149,7 +150,7 @@ def test_a_removal_that_cannot_be_planned_changes_nothing(root, lab_file):
     add_lab(root, lab_file)
     file = root / config.PLAN
     file.write_text(file.read_text().replace("  small: [lobo]\n", "  small: [lobo]\n  nowhere: [lobo]\n", 1))
-    refuse(root, lambda: adding.remove(root, "small", "board1_skin1_readings"), "nowhere")
+    refuse(root, lambda: add.remove(root, "small", "board1_skin1_readings"), "nowhere")
 
 
 def test_what_a_killed_add_left_is_told_from_a_capture(root, lab_file):
@@ -232,7 +233,7 @@ def test_a_name_that_is_no_name_is_refused(root, lab_file, tmp_path, name):
 def test_an_unknown_scene_is_named_beside_the_known_ones(root, lab_file):
     prepared = preparing.foreign(lab_file, "lab", labels(), {})
     refuse(
-        root, lambda: adding.add(root, "smal", prepared, allow_copy=False), "a scene must be one of .*small.*; got smal"
+        root, lambda: add.add(root, "smal", prepared, allow_copy=False), "a scene must be one of .*small.*; got smal"
     )
 
 
@@ -240,7 +241,7 @@ def test_a_recording_does_not_join_a_simulated_scene(root, lab_file):
     prepared = preparing.foreign(lab_file, "lab", labels(), {})
     refuse(
         root,
-        lambda: adding.add(root, "ci", prepared, allow_copy=False),
+        lambda: add.add(root, "ci", prepared, allow_copy=False),
         "source must be simulated, as scene ci is; got recorded",
     )
 
@@ -271,7 +272,7 @@ def native_folder(folder: Path, stream: bytes = encode(FRAMES, "binary")) -> Pat
 
 def test_a_native_capture_is_added_with_its_own_header(root, tmp_path):
     folder = native_folder(tmp_path / "run1")
-    header = adding.add(root, "small", preparing.native(folder, labels(), None, ()), allow_copy=False)
+    header = add.add(root, "small", preparing.native(folder, labels(), None, ()), allow_copy=False)
     assert header == read_header(root / "data/raw/small/run1")
     _, blocks, account = open_capture(root / "data/raw/small/run1", AS_USUAL)
     assert sum(map(len, blocks)) == account["frames_contact_n"] > 0
@@ -304,7 +305,7 @@ def test_a_dump_without_a_frame_is_refused(root, tmp_path, damage, sentence):
     what = Dump("binary", 2, 400.0, tmp_path / "probe.csv", ())
     refuse(
         root,
-        lambda: adding.add(root, "small", preparing.dump(tmp_path / "dump.bin", labels(), what), allow_copy=False),
+        lambda: add.add(root, "small", preparing.dump(tmp_path / "dump.bin", labels(), what), allow_copy=False),
         sentence,
     )
 
@@ -315,7 +316,7 @@ def test_a_dump_of_the_wrong_number_of_chips_says_what_fits(root, tmp_path):
     what = Dump("binary", 5, 400.0, tmp_path / "probe.csv", ())
     refuse(
         root,
-        lambda: adding.add(root, "small", preparing.dump(tmp_path / "dump.bin", labels(), what), allow_copy=False),
+        lambda: add.add(root, "small", preparing.dump(tmp_path / "dump.bin", labels(), what), allow_copy=False),
         "It fits binary with 2 chips",
     )
     refuse(
@@ -328,7 +329,7 @@ def test_a_capture_that_lost_too_much_is_refused_with_the_counts(root, tmp_path)
     damaged = native_folder(tmp_path / "run1", stream[:1000] + bytes(1500) + stream[1000:])
     refuse(
         root,
-        lambda: adding.add(root, "small", preparing.native(damaged, labels(), None, ()), allow_copy=False),
+        lambda: add.add(root, "small", preparing.native(damaged, labels(), None, ()), allow_copy=False),
         r"lost bytes must be at most 5%.*skipped_resync_bytes",
     )
 

@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from pipeline import plan
-from pipeline.core import code
-from pipeline.core.config import find, read_yaml
-from pipeline.learning.trial import DECIDING, Keys
+from reskin import code
+from reskin.config import find, read_yaml
+from reskin.models.trial import DECIDING, Keys
 from tests.learning.trials import measured, pooled
 from tests.stages.checkout import ROOT, copy_checkout, run
 
@@ -37,7 +37,7 @@ FILES = {
 
 from pathlib import Path
 
-from pipeline.core.stage import run
+from pipeline.stage import run
 from pipeline.experiments.answer import read_folder, write_answer
 
 
@@ -155,7 +155,7 @@ def inserted(file: Path, line: str, text: str) -> str:
 
 
 def test_a_new_experiment_runs_its_own_stage_and_the_report(root, before):
-    questions, scene = "pipeline/questions.py", f"{plan.SCENES}/ci.yaml"
+    questions, scene = "pipeline/scenes.py", f"{plan.SCENES}/ci.yaml"
     files = {f"pipeline/experiments/repeat/{name}": text for name, text in FILES.items()} | {
         questions: inserted(root / questions, '    _study("verification"),\n', QUESTION),
         plan.FLOW: inserted(root / plan.FLOW, "  report: #", STAGE),
@@ -175,7 +175,7 @@ def test_a_new_figure_of_an_experiment_runs_the_report(root, before):
 
 
 def test_words_in_a_module_that_every_stage_imports_run_nothing(root, before):
-    io = "pipeline/core/io.py"
+    io = "reskin/io.py"
     with edited(root, {io: "# More.\n" + (root / io).read_text().replace('"""', '"""More. ', 1)}):
         assert run_again(before, state(root)) == set()
 
@@ -197,6 +197,6 @@ def test_words_in_the_code_of_learning_change_no_key_of_a_training_and_code_does
     assert (
         key(told)
         == key(sources)
-        != key(sources | {"pipeline.learning.train": sources["pipeline.learning.train"] + "\nWEIGHT = 1.0\n"})
+        != key(sources | {"reskin.models.train": sources["reskin.models.train"] + "\nWEIGHT = 1.0\n"})
     )
     code.digest.cache_clear()

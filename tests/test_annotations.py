@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from jaxtyping import TypeCheckError
 
-from pipeline.capture.wire import Frames
-from pipeline.physics.flow import angle
+from reskin.board.wire import Frames
+from reskin.physics.layer import angle
 from tests.conftest import CHECKED_N
 
 

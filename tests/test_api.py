@@ -7,16 +7,15 @@ import numpy as np
 import pytest
 
 import reskin
-from pipeline import api
-from pipeline.core import io
-from pipeline.core.config import Settings, read_yaml
-from pipeline.core.errors import ReskinError
-from pipeline.core.seeds import rng_for
-from pipeline.dataset.folds import load_rows
-from pipeline.dataset.rows import Selection
-from pipeline.predicting import read_network
-from pipeline.synthesis.capture import record
-from pipeline.synthesis.settings import check_synthesis
+from reskin import api, io
+from reskin.config import Settings, read_yaml
+from reskin.data.folds import load_rows
+from reskin.data.rows import Selection
+from reskin.errors import ReskinError
+from reskin.predicting import read_network
+from reskin.seeds import rng_for
+from reskin.simulation.capture import record
+from reskin.simulation.settings import check_synthesis
 from tests.test_io import readings
 from tests.test_predicting import model  # noqa: F401 (a fixture)
 

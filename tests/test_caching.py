@@ -10,9 +10,9 @@ import pytest
 from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
-from pipeline import caching
 from pipeline.cli import app
-from pipeline.tidying import LOCK
+from pipeline.manage import cache
+from pipeline.manage.tidy import LOCK
 
 WEIGHTS, FOLDS, RECORDED = "data/models/one/train_multi", "data/folds/one.json", "data/raw/rig/b1"
 
@@ -77,7 +77,7 @@ def test_a_damaged_object_that_was_restored_is_taken_away_with_what_came_of_it(r
     assert f"no more in {WEIGHTS}/a.safetensors. Run: dvc repro train_multi@one" in words
     assert not at(root, md5(b"weights")).exists()
     assert [file.name for file in (root / WEIGHTS).iterdir()] == ["a.json"]
-    assert (root / caching.ASIDE / md5(b"weights")).read_bytes() == b"w3ights"
+    assert (root / cache.ASIDE / md5(b"weights")).read_bytes() == b"w3ights"
     assert told(root) == (0, "DVC's cache: 4 objects, 0 of them damaged\n")
 
 
@@ -97,9 +97,9 @@ def test_an_output_that_somebody_changed_since_is_left_alone(root):
 
 
 def test_a_damaged_list_of_a_folder_leaves_the_folder(root):
-    name = caching.read_yaml(root / LOCK)["stages"]["train_multi@one"]["outs"][0]["md5"]
+    name = cache.read_yaml(root / LOCK)["stages"]["train_multi@one"]["outs"][0]["md5"]
     keep(root, name, b"[")
-    assert f"It now lies in {caching.ASIDE}/{name}. Run: dvc repro train_multi@one" in told(root)[1]
+    assert f"It now lies in {cache.ASIDE}/{name}. Run: dvc repro train_multi@one" in told(root)[1]
     assert len(list((root / WEIGHTS).iterdir())) == 2
 
 
@@ -107,7 +107,7 @@ def test_of_a_recording_the_damaged_copy_is_kept(root):
     keep(root, md5(b"recorded"), b"rec0rded")
     (root / RECORDED).write_bytes(b"rec0rded")
     assert f"dvc pull {RECORDED}.dvc, or add the recording again" in told(root)[1]
-    assert (root / caching.ASIDE / md5(b"recorded")).read_bytes() == b"rec0rded"
+    assert (root / cache.ASIDE / md5(b"recorded")).read_bytes() == b"rec0rded"
 
 
 def test_what_nothing_needs_is_only_set_aside(root):

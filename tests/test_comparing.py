@@ -7,7 +7,7 @@ from typer.testing import CliRunner
 
 from pipeline import plan
 from pipeline.cli import app
-from pipeline.core import io
+from reskin import io
 
 XEON, EPYC = "cpu x86_64 Intel Xeon (AVX2), 2 cores", "cpu x86_64 AMD EPYC (AVX2), 4 cores"
 

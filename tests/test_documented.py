@@ -9,14 +9,13 @@ from typing import Any
 import pytest
 from ruamel.yaml import YAML
 
-from pipeline.core import io
-from pipeline.core.config import read_yaml
-from pipeline.core.schema import UNITS, arrow_schema
-from pipeline.dataset.rows import TARGETS
-from pipeline.evaluation.metrics import METRICS
-from pipeline.evaluation.scores import KEYS, SURENESS
-from pipeline.params import check_scene, read_shared
-from pipeline.questions import QUESTIONS
+from pipeline.report.statistics import KEYS, SURENESS
+from pipeline.scenes import QUESTIONS, check_scene, read_shared
+from reskin import io
+from reskin.config import read_yaml
+from reskin.data.rows import TARGETS
+from reskin.metrics import METRICS
+from reskin.schema import UNITS, arrow_schema
 
 ROOT = Path(__file__).resolve().parents[1]
 SETTINGS = [ROOT / "params.yaml", *sorted((ROOT / "pipeline/scenes").glob("*.yaml"))]

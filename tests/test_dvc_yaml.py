@@ -8,9 +8,9 @@ import pytest
 from dvc.repo import Repo
 from ruamel.yaml import YAML
 
-from pipeline.core.code import file_of
-from pipeline.questions import EXPERIMENTS
+from pipeline.scenes import EXPERIMENTS
 from pipeline.stages.code import entries, modules_of
+from reskin.code import file_of
 
 ROOT = Path(__file__).resolve().parents[1]
 FLOW = YAML(typ="safe").load((ROOT / "dvc.yaml").read_text())["stages"]
@@ -33,8 +33,8 @@ def test_stage_code_reads_every_module_that_a_stage_imports_and_idle_paths_are_n
 
 
 def test_a_stage_knows_the_modules_that_decide_its_results():
-    assert "pipeline.learning.train" in modules_of("pipeline.stages.train_multi")
-    assert "pipeline.learning.train" not in modules_of("pipeline.stages.simulate")
+    assert "reskin.models.train" in modules_of("pipeline.stages.train_multi")
+    assert "reskin.models.train" not in modules_of("pipeline.stages.simulate")
     shown = {name for name in modules_of("pipeline.stages.report") if name.endswith(".show")}
     assert shown == {
         f"pipeline.experiments.{name}.show"

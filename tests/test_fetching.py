@@ -11,15 +11,18 @@ import pytest
 from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
-from pipeline import adding, fetching, plan, preparing
-from pipeline.capture.readers import eflash7, eflesh, ini, lab
+from pipeline import plan
 from pipeline.cli import app
-from pipeline.core import config
-from pipeline.core.errors import ReskinError
-from pipeline.origins import Origin
-from pipeline.params import read_plan
-from pipeline.preparing import Labels
-from pipeline.registry import read_registry
+from pipeline.manage import add as adding
+from pipeline.manage import fetch as fetching
+from pipeline.manage.fetch import Origin
+from pipeline.manage.registry import read_registry
+from pipeline.scenes import read_plan
+from reskin import config
+from reskin.errors import ReskinError
+from reskin.recordings import preparing
+from reskin.recordings.preparing import Labels
+from reskin.recordings.readers import eflash7, eflesh, ini, lab
 from tests import repositories
 from tests.capture.headers import AS_USUAL
 from tests.capture.readers.test_lab import PRESSES, write

@@ -4,7 +4,7 @@ import os
 import subprocess
 from pathlib import Path
 
-from pipeline.core.provenance import home, is_experiment
+from pipeline.provenance import home, is_experiment
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -9,10 +9,9 @@ import pyarrow.parquet as pq
 import pytest
 import safetensors.numpy
 
-from pipeline.core import io
-from pipeline.core.errors import SchemaError
-from pipeline.core.machine import explaining
-from pipeline.core.schema import UNITS
+from reskin import io
+from reskin.errors import SchemaError, explaining
+from reskin.schema import UNITS
 from tests.dataset.tables import readings
 
 

@@ -7,10 +7,11 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
-from pipeline import merging, plan
-from pipeline.core import config, io
-from pipeline.core.errors import ReskinError
-from pipeline.registry import Entry, Registry, read_registry, with_entry, write_registry
+from pipeline import plan
+from pipeline.manage import merge
+from pipeline.manage.registry import Entry, Registry, read_registry, with_entry, write_registry
+from reskin import config, io
+from reskin.errors import ReskinError
 from tests.scenes import recorded
 from tests.stages.checkout import ROOT
 
@@ -73,7 +74,7 @@ def two(root: Path, ours: tuple[str, ...], theirs: tuple[str, ...]) -> None:
 
 def test_both_recordings_stand_in_the_registry_the_plan_and_the_lock(root):
     two(root, ("mine", "s1", "b1"), ("yours", "s2", "b2"))
-    assert "2 captures" in merging.merge(root)
+    assert "2 captures" in merge.merge(root)
     assert list(read_registry(root).captures["shared"]) == ["mine", "yours"]
     assert list(plan.check(root).stages["ingest"]) == ["shared-mine", "shared-yours"]
     stages = YAML(typ="safe").load((root / "dvc.lock").read_text())["stages"]
@@ -93,18 +94,18 @@ def test_a_report_that_we_deleted_and_they_changed_stays_deleted(root):
     git(root, "rm", "-q", "reports/shared/tables/lobo.md")
     git(root, "commit", "-qm", "Delete a report")
     git(root, "merge", "theirs", check=False)
-    merging.merge(root)
+    merge.merge(root)
     assert git(root, "diff", "--name-only", "--diff-filter=U") == ""
     assert not (root / "reports/shared/tables/lobo.md").exists()
 
 
 def test_what_contradicts_changes_nothing(root):
     two(root, ("mine", "s1", "b1"), ("yours", "s1", "b2"))
-    before = {name: (root / name).read_bytes() for name in merging.SETTLED}
+    before = {name: (root / name).read_bytes() for name in merge.SETTLED}
     with pytest.raises(ReskinError, match="the board of skin s1 must be b1, as in mine; got b2"):
-        merging.merge(root)
+        merge.merge(root)
     assert {name: (root / name).read_bytes() for name in before} == before
-    assert {*merging.SETTLED} <= set(git(root, "diff", "--name-only", "--diff-filter=U").split())
+    assert {*merge.SETTLED} <= set(git(root, "diff", "--name-only", "--diff-filter=U").split())
 
 
 @pytest.mark.parametrize(
@@ -118,12 +119,12 @@ def test_what_contradicts_changes_nothing(root):
 def test_a_merged_registry_keeps_the_rules_of_one(theirs, sentence):
     ours = Registry(captures={"shared": {"mine": entry("s1", "b1")}})
     with pytest.raises(ReskinError, match=sentence):
-        merging.merge_registries(NOTHING, ours, Registry(captures={"shared": theirs}))
+        merge.merge_registries(NOTHING, ours, Registry(captures={"shared": theirs}))
 
 
 def test_scenes_that_either_side_switched_on_run_and_those_that_one_switched_off_do_not():
-    assert merging.merge_scenes(["a", "b"], ["a", "b", "mine"], ["yours", "b"]) == ["b", "mine", "yours"]
-    assert merging.merge_scenes([], ["mine"], ["mine", "yours"]) == ["mine", "yours"]
+    assert merge.merge_scenes(["a", "b"], ["a", "b", "mine"], ["yours", "b"]) == ["b", "mine", "yours"]
+    assert merge.merge_scenes([], ["mine"], ["mine", "yours"]) == ["mine", "yours"]
 
 
 def test_what_people_wrote_is_theirs_to_merge(root):
@@ -135,25 +136,25 @@ def test_what_people_wrote_is_theirs_to_merge(root):
     git(root, "commit", "-qam", "Change it otherwise")
     git(root, "merge", "theirs", check=False)
     with pytest.raises(ReskinError, match="what people wrote must be merged first; got params.yaml"):
-        merging.merge(root)
+        merge.merge(root)
 
 
 def test_without_a_conflict_there_is_nothing_to_settle(root):
     with pytest.raises(ReskinError, match="a merge must be under way, with files in conflict; got none"):
-        merging.merge(root)
+        merge.merge(root)
 
 
 def test_what_one_side_removed_or_replaced_stays_so():
     kept, gone, old, new = (entry(name, name) for name in ("s1", "s2", "s3", "s4"))
     base = Registry(captures={"scene": {"kept": kept, "gone": gone, "replaced": old}})
     theirs = Registry(captures={"scene": {"kept": kept, "replaced": new}})
-    assert merging.merge_registries(base, base, theirs) == theirs
-    assert merging.merge_registries(base, theirs, base) == theirs
-    assert merging.merge_registries(base, theirs, theirs) == theirs
+    assert merge.merge_registries(base, base, theirs) == theirs
+    assert merge.merge_registries(base, theirs, base) == theirs
+    assert merge.merge_registries(base, theirs, theirs) == theirs
 
 
 def test_an_entry_of_the_lock_is_taken_whole():
     base, changed = {"a": {"in": 1, "out": 1}, "b": 1}, {"a": {"in": 2, "out": 2}}
-    assert merging.merge_stages(base, base, changed) == (changed, [])
-    assert merging.merge_stages(base, changed, base) == (changed, [])
-    assert merging.merge_stages(base, {"a": 3, "b": 1}, {"a": 4, "b": 1}) == ({"a": 3, "b": 1}, ["a"])
+    assert merge.merge_stages(base, base, changed) == (changed, [])
+    assert merge.merge_stages(base, changed, base) == (changed, [])
+    assert merge.merge_stages(base, {"a": 3, "b": 1}, {"a": 4, "b": 1}) == ({"a": 3, "b": 1}, ["a"])

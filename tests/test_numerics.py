@@ -12,9 +12,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core.numerics import BEYOND_AVX2, PINNED, TOO_LATE, VARIABLES, cpu_flags, departures, pinned
-from pipeline.core.reproducible import affine, exp
-from pipeline.core.seeds import rng_for
+from reskin.models.reproducible import affine, exp
+from reskin.numerics import BEYOND_AVX2, PINNED, TOO_LATE, VARIABLES, cpu_flags, departures, pinned
+from reskin.seeds import rng_for
 
 ROOT = Path(__file__).resolve().parents[1]
 AVX2, NEWEST = frozenset({"avx2"}), frozenset({"avx2", *BEYOND_AVX2.values()})
@@ -75,7 +75,7 @@ def test_exp_is_the_exponential_to_float32(value):
 
 
 def test_numpy_that_was_loaded_before_is_reported():
-    code = "import numpy; from pipeline.core.numerics import departures; import os; print(departures(os.environ))"
+    code = "import numpy; from reskin.numerics import departures; import os; print(departures(os.environ))"
     kept = {name: value for name, value in os.environ.items() if name not in VARIABLES}
     done = subprocess.run([sys.executable, "-c", code], env=kept, cwd=ROOT, capture_output=True, text=True, check=True)
     assert (TOO_LATE in done.stdout) == ("avx2" in cpu_flags())

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.core.errors import CaptureError
-from pipeline.origins import Origin, open_origin
+from pipeline.manage.fetch import Origin, open_origin
+from reskin.errors import CaptureError
 from tests import repositories
 
 # Line ends that git would change, bytes that are no text, a name that a shell would expand, one that git would quote.

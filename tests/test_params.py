@@ -3,10 +3,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.core.config import read_yaml, root_of_scenes
-from pipeline.core.errors import ParamsError
-from pipeline.params import Scene, parse_scene, read_plan, read_scene, read_shared
-from pipeline.questions import LEARNING, stages
+from pipeline.scenes import LEARNING, Scene, parse_scene, read_plan, read_scene, read_shared, stages
+from reskin.config import read_yaml, root_of_scenes
+from reskin.errors import ParamsError
 from tests.scenes import ADAPTATIONS, DRAWN_WITH, SECTIONS, TRAINING, asking, check, recorded
 
 ROOT = Path(__file__).resolve().parents[1]

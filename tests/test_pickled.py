@@ -12,10 +12,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.capture.readers import lab
-from pipeline.core.errors import CaptureError
-from pipeline.fetching import read_sources
-from pipeline.pickled import COLUMNS, decode, to_lab_csv
+from pipeline.manage.fetch import read_sources
+from reskin.errors import CaptureError
+from reskin.recordings.pickled import COLUMNS, decode, to_lab_csv
+from reskin.recordings.readers import lab
 from tests.capture.headers import AS_USUAL, make_header
 
 PROTOCOLS = (3, 4)

@@ -6,13 +6,12 @@ import pytest
 from ruamel.yaml import YAML
 
 from pipeline import plan
-from pipeline.core import config
-from pipeline.core.config import parse, read_yaml
-from pipeline.core.errors import ParamsError
-from pipeline.params import Plan, Scene, parse_scene
-from pipeline.questions import EXPERIMENTS
-from pipeline.registry import Entry, Registry
+from pipeline.manage.registry import Entry, Registry
+from pipeline.scenes import EXPERIMENTS, Plan, Scene, parse_scene
 from pipeline.stages._report import asking as read_asking
+from reskin import config
+from reskin.config import parse, read_yaml
+from reskin.errors import ParamsError
 from tests.scenes import SHARED, asking, recorded, settings
 from tests.stages.checkout import copy_checkout, run
 

@@ -6,18 +6,17 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from pipeline.capture import arrivals
-from pipeline.capture.arrivals import Arrivals
-from pipeline.capture.dump import decode_dump
-from pipeline.capture.header import ARRIVALS_FILE, STREAM_FILE, Clock, write_capture
-from pipeline.capture.sd_card import render
-from pipeline.capture.wire import Frames, encode, record_type
-from pipeline.core import io
-from pipeline.core.errors import CaptureError, ReskinError
-from pipeline.core.seeds import rng_for
-from pipeline.learning.model import draw_weights, paper_layers
-from pipeline.predicting import predict
-from reskin import load_model
+from reskin import io, load_model
+from reskin.board.decode import decode_dump
+from reskin.board.wire import Frames, encode, record_type
+from reskin.errors import CaptureError, ReskinError
+from reskin.models.network import draw_weights, paper_layers
+from reskin.predicting import predict
+from reskin.recordings import clocks
+from reskin.recordings.clocks import Arrivals
+from reskin.recordings.header import ARRIVALS_FILE, STREAM_FILE, Clock, write_capture
+from reskin.recordings.readers.sd_card import render
+from reskin.seeds import rng_for
 from tests.capture.headers import make_header
 
 RATE_HZ, QUIET_N, TOUCHED_N = 250.0, 400, 100
@@ -64,7 +63,7 @@ def write_stream(folder, wire):
     arrived = Arrivals(np.append(0, ends), np.append(0.0, t_s))
     clock = Clock(kind="arrivals", rate_hz=None, marks=())
     header = make_header(capture="run1", layout="native", wire=wire, chips_n=5, clock=clock)
-    files = {STREAM_FILE: stream, ARRIVALS_FILE: arrivals.render(arrived).encode()}
+    files = {STREAM_FILE: stream, ARRIVALS_FILE: clocks.render(arrived).encode()}
     write_capture(folder / "run1", header, files)
     return folder / "run1"
 

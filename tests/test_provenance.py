@@ -5,9 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core import code, provenance
-from pipeline.core.numerics import VARIABLES, pinned
-from pipeline.core.provenance import (
+from pipeline import provenance
+from pipeline.provenance import (
     INSTRUCTIONS,
     add_up_costs,
     begin_cost,
@@ -19,6 +18,8 @@ from pipeline.core.provenance import (
     read_costs,
     version_of,
 )
+from reskin import code
+from reskin.numerics import VARIABLES, pinned
 
 XEON = "processor\t: 0\nmodel name\t: Intel(R) Xeon(R) Gold 6442Y\nflags\t\t: fpu sse2 avx2 avx512f amx_tile\n\n"
 OLD = "processor\t: 1\nmodel name\t: Another one\nflags\t\t: fpu sse2\n"

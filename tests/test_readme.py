@@ -4,10 +4,10 @@ import subprocess
 
 import pytest
 
-from pipeline.core import io
-from pipeline.core.config import read_yaml
-from pipeline.reporting.numbers import split
-from pipeline.reporting.readme import blocks_of
+from pipeline.report.numbers import split
+from pipeline.report.readme import blocks_of
+from reskin import io
+from reskin.config import read_yaml
 from tests.reporting.synthetic import all_questions
 from tests.stages.checkout import ROOT, copy_checkout, run
 

@@ -12,13 +12,13 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.capture.header import HEADER_FILE, parse
-from pipeline.capture.port import PortSettings
-from pipeline.capture.wire import encode
-from pipeline.core.errors import CaptureError
-from pipeline.labelling.source import Source
-from pipeline.preparing import Labels, native
-from pipeline.recording import UNTOLD, Told, _desk, begin_capture, print_progress, record_capture
+from reskin.board.port import PortSettings
+from reskin.board.wire import encode
+from reskin.errors import CaptureError
+from reskin.recordings.header import HEADER_FILE, parse
+from reskin.recordings.labelling.source import Source
+from reskin.recordings.preparing import Labels, native
+from reskin.recordings.recorder import UNTOLD, Told, _desk, begin_capture, print_progress, record_capture
 from tests.capture.signals import make_frames
 from tests.stages.checkout import ROOT
 

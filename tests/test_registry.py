@@ -1,8 +1,8 @@
 import pytest
 
-from pipeline.capture.header import Header
-from pipeline.core.errors import CaptureError
-from pipeline.registry import Registry, with_capture, without_capture
+from pipeline.manage.registry import Registry, with_capture, without_capture
+from reskin.errors import CaptureError
+from reskin.recordings.header import Header
 from tests.capture.headers import make_header
 
 EMPTY = Registry(captures={})

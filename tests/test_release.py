@@ -8,18 +8,18 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.core.config import PARAMS, SCENES, params_of, read_yaml
-from pipeline.core.errors import ParamsError
-from pipeline.core.packages import explain, need
 from release import constraints
 from release.constraints import render
 from release.licences import TOLERATED, closure, incompatible, is_compatible, wanted
+from reskin.config import PARAMS, SCENES, params_of, read_yaml
+from reskin.errors import ParamsError
+from reskin.packages import explain, need
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 CORE = (  # what runs outside a checkout
-    "pipeline.cli", "pipeline.recording", "pipeline.capture.dump", "pipeline.predicting", "reskin",
-    *(f"pipeline.live.{name}" for name in ("ports", "emulate", "script", "inject", "server")),
+    "pipeline.cli", "reskin.recordings.recorder", "reskin.board.decode", "reskin.predicting", "reskin",
+    *(f"reskin.live.{name}" for name in ("ports", "emulate", "script", "inject", "server")),
 )  # fmt: skip
 AWAY = ("dvc", "grimp", "jinja2", "magpylib", "matplotlib", "mlflow", "mpmath", "onnx", "pandas", "sklearn", "torch")
 # Every package that is not of the core, as if it were not installed.
@@ -34,7 +34,7 @@ class Away:
 sys.meta_path.insert(0, Away())
 for name in {core}:
     importlib.import_module(name)
-from pipeline.twin.shipped import load_universal
+from reskin.universal.model import load_universal
 print(load_universal().predict([[0.0] * 15]).shape)
 """
 

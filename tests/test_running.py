@@ -8,8 +8,8 @@ import sys
 import pytest
 from zc.lockfile import LockFile
 
-from pipeline.core.errors import ParamsError
-from pipeline.running import BUSY, HELD, LOCKS, need_rest
+from pipeline.manage.running import BUSY, HELD, LOCKS, need_rest
+from reskin.errors import ParamsError
 
 
 @pytest.fixture

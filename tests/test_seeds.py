@@ -1,7 +1,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core.seeds import rng_for, seed_for
+from reskin.seeds import rng_for, seed_for
 
 names = st.lists(st.text(max_size=5), max_size=3)
 

@@ -12,14 +12,14 @@ import pytest
 from ruamel.yaml import YAML
 
 from pipeline import plan
-from pipeline.core import config
-from pipeline.core.config import Files, Settings, declared, read_settings, read_yaml
-from pipeline.core.errors import ParamsError
-from pipeline.learning.recipe import adaptations, training
-from pipeline.params import module_of, read_scene
-from pipeline.registry import Entry, Registry
-from pipeline.synthesis.fingerprint import SECTIONS
-from pipeline.synthesis.settings import synthesis_of
+from pipeline.manage.registry import Entry, Registry
+from pipeline.scenes import module_of, read_scene
+from reskin import config
+from reskin.config import Files, Settings, declared, read_settings, read_yaml
+from reskin.errors import ParamsError
+from reskin.models.recipe import adaptations, training
+from reskin.simulation.fingerprint import SECTIONS
+from reskin.simulation.settings import synthesis_of
 from tests.stages.checkout import copy_checkout
 
 ROOT = Path(__file__).resolve().parents[1]

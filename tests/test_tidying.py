@@ -6,8 +6,9 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
-from pipeline import plan, tidying
-from pipeline.core import config
+from pipeline import plan
+from pipeline.manage import tidy
+from reskin import config
 from tests.scenes import asking
 from tests.test_plan import checkout
 
@@ -29,53 +30,53 @@ def root(tmp_path) -> Path:
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
         (folder / path).write_text("made")
     stages = {name: {"cmd": "x", "outs": [{"path": path}]} for name, path in WRITTEN.items()}
-    with (folder / tidying.LOCK).open("w") as stream:
+    with (folder / tidy.LOCK).open("w") as stream:
         YAML().dump({"schema": "2.0", "stages": stages}, stream)
     return folder
 
 
 def test_what_a_question_left_is_named_with_its_files(root):
-    assert tidying.left_over(root, plan.check(root)) == {
+    assert tidy.left_over(root, plan.check(root)) == {
         "drift@one": [root / WRITTEN["drift@one"]],
         "simulate@one-gone": [root / WRITTEN["simulate@one-gone"]],
     }
 
 
 def test_tidying_removes_that_and_nothing_else(root):
-    tidying.tidy(root, plan.check(root))
+    tidy.tidy(root, plan.check(root))
     there = {name for name, path in WRITTEN.items() if (root / path).exists()}
     assert there == {"train_multi@one", "drift@two", "split@one"}
-    lock = YAML(typ="safe").load((root / tidying.LOCK).read_text())
+    lock = YAML(typ="safe").load((root / tidy.LOCK).read_text())
     assert set(lock["stages"]) == there
     assert lock["schema"] == "2.0"
-    assert tidying.left_over(root, plan.check(root)) == {}
+    assert tidy.left_over(root, plan.check(root)) == {}
 
 
 def test_a_file_that_a_planned_stage_writes_too_stays(root):
-    lock = YAML(typ="safe").load((root / tidying.LOCK).read_text())
+    lock = YAML(typ="safe").load((root / tidy.LOCK).read_text())
     lock["stages"]["drift@one"]["outs"] = [{"path": "data/models/one"}]  # holds what train_multi writes
-    with (root / tidying.LOCK).open("w") as stream:
+    with (root / tidy.LOCK).open("w") as stream:
         YAML().dump(lock, stream)
-    assert tidying.left_over(root, plan.check(root))["drift@one"] == []
+    assert tidy.left_over(root, plan.check(root))["drift@one"] == []
 
 
 def test_a_scene_whose_name_begins_like_another_is_its_own(root):
     shutil.copy(root / config.SCENES / "one.yaml", root / config.SCENES / "one-gone.yaml")
-    assert set(tidying.left_over(root, plan.check(root))) == {"drift@one"}
+    assert set(tidy.left_over(root, plan.check(root))) == {"drift@one"}
 
 
 def test_a_question_that_is_asked_leaves_nothing_over(root):
     with (root / config.SCENES / "one.yaml").open("w") as stream:
         YAML().dump(asking("lobo", "drift"), stream)
     plan.use(root, ["one"])
-    assert set(tidying.left_over(root, plan.check(root))) == {"simulate@one-gone"}
+    assert set(tidy.left_over(root, plan.check(root))) == {"simulate@one-gone"}
 
 
 def test_a_stage_of_dvc_lock_that_ran_only_elsewhere_is_not_named(root):
     (root / WRITTEN["drift@one"]).unlink()
-    assert set(tidying.left_over(root, plan.check(root))) == {"simulate@one-gone"}
+    assert set(tidy.left_over(root, plan.check(root))) == {"simulate@one-gone"}
 
 
 def test_a_checkout_that_never_ran_has_nothing_over(root):
-    (root / tidying.LOCK).unlink()
-    assert tidying.left_over(root, plan.check(root)) == tidying.tidy(root, plan.check(root)) == {}
+    (root / tidy.LOCK).unlink()
+    assert tidy.left_over(root, plan.check(root)) == tidy.tidy(root, plan.check(root)) == {}

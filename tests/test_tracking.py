@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from pipeline import tracking
-from pipeline.core import io, server
-from pipeline.core.server import TrackingAway, probe
-from pipeline.tracking import publish
+from pipeline import tracking as server
+from pipeline.tracking import TrackingAway, probe, publish
+from reskin import io
 
 
 @pytest.fixture(scope="module")

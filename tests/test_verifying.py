@@ -6,9 +6,9 @@ import subprocess
 import pytest
 from typer.testing import CliRunner
 
-from pipeline import verifying
 from pipeline.cli import app
-from pipeline.core import io
+from pipeline.manage import verify
+from reskin import io
 
 SCORES = "question,fold,accuracy_pct\nlobo,b0,{}\n"
 
@@ -62,11 +62,11 @@ def test_a_rerun_starts_from_the_commit_without_its_reports_and_is_kept(checkout
             assert words[-1] == "report@quick"
             write(clone / "reports/quick", 90.0)
 
-    monkeypatch.setattr(verifying, "_run", run)
+    monkeypatch.setattr(verify, "_run", run)
     code, output = said("quick")
     assert code == 1
     assert "| 80          | 90      |" in output
-    kept = json.loads((checkout / verifying.VERIFIED / "quick/numbers.json").read_text())
+    kept = json.loads((checkout / verify.VERIFIED / "quick/numbers.json").read_text())
     assert kept["table2"]["accuracy_pct"]["mean"] == 90.0
     assert json.loads((checkout / "reports/quick/numbers.json").read_text())["table2"]["accuracy_pct"]["mean"] == 80.0
 
@@ -84,5 +84,5 @@ def test_what_is_not_there_is_one_sentence(checkout, words, sentence):
 
 
 def test_a_command_that_fails_says_where(tmp_path):
-    with pytest.raises(verifying.SchemaError, match="json.tool nowhere: the rerun must be one that ends"):
-        verifying._run(tmp_path, {}, "json.tool", "nowhere", quiet=True)
+    with pytest.raises(verify.SchemaError, match="json.tool nowhere: the rerun must be one that ends"):
+        verify._run(tmp_path, {}, "json.tool", "nowhere", quiet=True)

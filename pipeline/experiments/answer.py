@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pipeline.core import io
-from pipeline.core.errors import SchemaError
-from pipeline.core.schema import Readings
+from reskin import io
+from reskin.errors import SchemaError
+from reskin.schema import Readings
 
 Capture = TypeVar("Capture")
 NO_CAPTURES: Mapping[str, Any] = {"accounts": [], "left_out": {}}  # of its own: it asks the main ones

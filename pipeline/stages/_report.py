@@ -7,19 +7,26 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.core import io
-from pipeline.core.config import Settings, parse
-from pipeline.core.errors import ParamsError
-from pipeline.core.executors import device as trained_on
-from pipeline.core.provenance import COSTS, SECONDS, add_up_costs, code_version, device, read_costs, versions
-from pipeline.dataset.scan import SCORED
-from pipeline.evaluation.choice import choose
-from pipeline.evaluation.scores import tidy
-from pipeline.learning.recipe import HEADLINE
-from pipeline.params import Asking
-from pipeline.reporting.learned import timed_learning
-from pipeline.reporting.numbers import answered, compose, count_trainings, foretold, lost_by_protocol, runtime
-from pipeline.reporting.shown import rounded
+from pipeline.provenance import COSTS, SECONDS, add_up_costs, code_version, device, read_costs, versions
+from pipeline.report.choice import choose
+from pipeline.report.formatting import rounded
+from pipeline.report.numbers import (
+    answered,
+    compose,
+    count_trainings,
+    foretold,
+    lost_by_protocol,
+    runtime,
+    timed_learning,
+)
+from pipeline.report.statistics import tidy
+from pipeline.scenes import Asking
+from reskin import io
+from reskin.config import Settings, parse
+from reskin.data.rows import SCORED
+from reskin.errors import ParamsError
+from reskin.models.recipe import HEADLINE
+from reskin.numerics import device as trained_on
 
 
 @dataclass(frozen=True)

@@ -5,12 +5,11 @@ Refuses to show a network labels of the skin that it adapts to.
 
 from pathlib import Path
 
-from pipeline.core.config import Files, Settings, read_settings
-from pipeline.core.stage import run
-from pipeline.learning.recipe import Adaptations
-from pipeline.learning.recipe import adaptations as adaptations_of
-from pipeline.trials.adapting import adaptations, read_starts
-from pipeline.trials.training import prepare_training, read_data, train_all, write_models
+from pipeline.stage import run
+from pipeline.training.trainings import adaptations, prepare_training, read_data, read_starts, train_all, write_models
+from reskin.config import Files, Settings, read_settings
+from reskin.models.recipe import Adaptations
+from reskin.models.recipe import adaptations as adaptations_of
 
 
 def read(settings: Settings) -> Adaptations:

@@ -7,11 +7,11 @@ comments and docstrings re-run none. Refuses to know settings and data.
 import argparse
 from pathlib import Path
 
-from pipeline.core import io
-from pipeline.core.code import ROOT, digest, imported
+from reskin import io
+from reskin.code import ROOT, digest, imported
 
 STAGES, EXPERIMENTS = ROOT / "pipeline/stages", ROOT / "pipeline/experiments"
-SHOWING = "pipeline.reporting.parts"  # imports by name what shows each experiment
+SHOWING = "pipeline.report.parts"  # imports by name what shows each experiment
 
 
 def entries() -> dict[str, str]:

@@ -5,11 +5,11 @@ Refuses to know folds and models.
 
 from pathlib import Path
 
-from pipeline.core import io
-from pipeline.core.config import Files, read_settings
-from pipeline.core.stage import run, say
-from pipeline.evaluation.description import describe as describe_one
-from pipeline.evaluation.description import over_skins, without_rest
+from pipeline.report.description import describe as describe_one
+from pipeline.report.description import over_skins, without_rest
+from pipeline.stage import run, say
+from reskin import io
+from reskin.config import Files, read_settings
 
 
 def describe(scene: str, files: Files, indentations: Path, description: Path) -> None:

@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.core import io
-from pipeline.core.config import Files, Settings, read_settings
-from pipeline.core.executors import make_executor
-from pipeline.core.stage import run, say
-from pipeline.learning import few_labels as few
-from pipeline.learning.baselines import run_tasks
-from pipeline.learning.few_labels import FewLabels
-from pipeline.learning.few_labels import few_labels as few_labels_of
-from pipeline.trials.training import SceneData, collapse_record, measured, read_data, score_test, train_all
+from pipeline.executors import make_executor
+from pipeline.stage import run, say
+from pipeline.training import few_labels as few
+from pipeline.training.few_labels import FewLabels
+from pipeline.training.few_labels import few_labels as few_labels_of
+from pipeline.training.trainings import SceneData, collapse_record, measured, read_data, score_test, train_all
+from reskin import io
+from reskin.config import Files, Settings, read_settings
+from reskin.models.classical import run_tasks
 
 
 def read(settings: Settings) -> FewLabels:
@@ -34,7 +34,7 @@ def few_labels(scene: str, files: Files, indentations: Path, folds: Path, scores
         trained = train_all(data, [trial for _, trial in pairs], "few_labels")
         done = [*done, *((tried, trial, result) for (tried, trial), result in zip(pairs, trained, strict=True))]
     tasks = few.classical(study)
-    with make_executor(imports="pipeline.learning.regressors") as executor:
+    with make_executor(imports="reskin.models.classical") as executor:
         fitted = run_tasks(
             [task for _, task in tasks], measured(data), executor, lambda line: say(f"{scene} few_labels: {line}")
         )

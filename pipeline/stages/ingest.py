@@ -5,11 +5,11 @@ Refuses to know how a layout is read and which faults are dropped.
 
 from pathlib import Path
 
-from pipeline.capture.decisions import Decisions
-from pipeline.core import io
-from pipeline.core.config import Files, parse, read_yaml
-from pipeline.core.stage import run, say
-from pipeline.dataset.captures import check_losses, open_capture
+from pipeline.stage import run, say
+from reskin import io
+from reskin.config import Files, parse, read_yaml
+from reskin.recordings.fault_policy import Decisions
+from reskin.recordings.ingest import check_losses, open_capture
 
 
 def ingest(scene: str, files: Files, raw: Path, lost_fraction_max: float, indentations: Path) -> None:

@@ -8,11 +8,11 @@ import hashlib
 import shutil
 from pathlib import Path
 
-from pipeline.core import io
-from pipeline.core.config import Files, read_settings
-from pipeline.core.provenance import home
-from pipeline.core.stage import run, say
+from pipeline.provenance import home
+from pipeline.stage import run, say
 from pipeline.stages.ingest import ingest
+from reskin import io
+from reskin.config import Files, read_settings
 
 KEPT = ".reskin/readings"  # a cache, and no output: DVC deletes those before a stage runs
 

@@ -5,10 +5,10 @@ Refuses to know that they are simulated, but for the folder.
 
 from pathlib import Path
 
-from pipeline.core import io
-from pipeline.core.config import Files
-from pipeline.core.stage import run
+from pipeline.stage import run
 from pipeline.stages.ingest import ingest
+from reskin import io
+from reskin.config import Files
 
 
 def ingest_simulated(scene: str, files: Files, raw: Path, lost_fraction_max: float, indentations: Path) -> None:

@@ -5,16 +5,15 @@ Refuses to compute a result.
 
 from pathlib import Path
 
-from pipeline.core import io
-from pipeline.core.config import Files, read_settings
-from pipeline.core.provenance import home, is_experiment
-from pipeline.core.server import TrackingAway
-from pipeline.core.stage import run, say
-from pipeline.params import Asking
-from pipeline.reporting.learned import curves_of
+from pipeline.provenance import home, is_experiment
+from pipeline.report.numbers import curves_of
+from pipeline.scenes import Asking
+from pipeline.stage import run, say
 from pipeline.stages._report import asking
-from pipeline.tracking import Curves, metrics_of
+from pipeline.tracking import Curves, TrackingAway, metrics_of
 from pipeline.tracking import publish as write
+from reskin import io
+from reskin.config import Files, read_settings
 
 
 def publish(scene: str, files: Files, models: Path, answers: Path, reports: Path) -> None:

@@ -5,25 +5,22 @@ Refuses to know readings, and to train.
 
 from pathlib import Path
 
-from pipeline.core import io
-from pipeline.core.config import Files, read_settings
-from pipeline.core.executors import make_executor
-from pipeline.core.stage import run, say
-from pipeline.evaluation.choice import to_record
-from pipeline.evaluation.scores import to_csv
-from pipeline.learning.recipe import HEADLINE
-from pipeline.reporting.figures import error_grids
-from pipeline.reporting.headline import FILE, headline_figures, short_table
-from pipeline.reporting.index import index
-from pipeline.reporting.numbers import headline_scores, split
-from pipeline.reporting.page import page, run_page
-from pipeline.reporting.parts import experiment_figures
-from pipeline.reporting.shown import to_markdown
-from pipeline.reporting.sweeps import learning_figures, learning_pages
-from pipeline.reporting.tables import make_tables, table_texts
-from pipeline.reporting.work_precision import pages
+from pipeline.executors import make_executor
+from pipeline.report.choice import to_record
+from pipeline.report.figures import error_grids, learning_figures, learning_pages, pages
+from pipeline.report.formatting import to_markdown
+from pipeline.report.headline import FILE, headline_figures, short_table
+from pipeline.report.numbers import headline_scores, split
+from pipeline.report.page import index, page, run_page
+from pipeline.report.parts import experiment_figures
+from pipeline.report.statistics import to_csv
+from pipeline.report.tables import make_tables, table_texts
+from pipeline.stage import run, say
 from pipeline.stages._report import Places, asking, read_cards, read_numbers
-from pipeline.synthesis.fingerprint import fingerprint
+from reskin import io
+from reskin.config import Files, read_settings
+from reskin.models.recipe import HEADLINE
+from reskin.simulation.fingerprint import fingerprint
 
 
 def report(
@@ -43,7 +40,7 @@ def report(
     files_of = {"numbers": shared, "provenance": of_this_run, "scores": headline_scores(numbers)}
     for name, content in files_of.items():
         io.write_json(reports / f"{name}.json", content)
-    with make_executor(imports="pipeline.reporting.parts") as executor:  # to draw takes most of the time
+    with make_executor(imports="pipeline.report.parts") as executor:  # to draw takes most of the time
         of_experiments = executor.submit(experiment_figures, numbers, drawn, asked.source)
         timed = executor.submit(pages, numbers["runtime"], source=asked.source)
         tables = make_tables(numbers)

@@ -5,14 +5,14 @@ Refuses to know a law of physics and who reads the captures.
 
 from pathlib import Path
 
-from pipeline.capture.header import write_capture
-from pipeline.core import io
-from pipeline.core.config import Files, read_settings
-from pipeline.core.errors import ParamsError
-from pipeline.core.executors import make_executor
-from pipeline.core.stage import run, say
-from pipeline.synthesis.capture import record, roster, to_files
-from pipeline.synthesis.settings import Synthesis, synthesis_of
+from pipeline.executors import make_executor
+from pipeline.stage import run, say
+from reskin import io
+from reskin.config import Files, read_settings
+from reskin.errors import ParamsError
+from reskin.recordings.header import write_capture
+from reskin.simulation.capture import record, roster, to_files
+from reskin.simulation.settings import Synthesis, synthesis_of
 
 
 def simulate(scene: str, files: Files, protocol: str, raw: Path) -> None:
@@ -23,7 +23,7 @@ def simulate(scene: str, files: Files, protocol: str, raw: Path) -> None:
     if len(pairs) < skins_n:
         rule = f"at most the {len(pairs)} that its boards have"
         raise ParamsError(settings.where, f"skins_n of protocol {protocol}", rule, skins_n, "Ask for fewer.")
-    with io.replacing(raw) as folder, make_executor(len(pairs), imports="pipeline.synthesis.capture") as executor:
+    with io.replacing(raw) as folder, make_executor(len(pairs), imports="reskin.simulation.capture") as executor:
         folder.mkdir()
         waiting = [executor.submit(_record, synthesis, protocol, pair, seed, folder) for pair in pairs]
         for i, done in enumerate(waiting, 1):

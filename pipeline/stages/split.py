@@ -2,12 +2,12 @@
 
 from pathlib import Path
 
-from pipeline.core import io
-from pipeline.core.config import Files, Settings, parse_parts, read_settings
-from pipeline.core.stage import run, say
-from pipeline.dataset.folds import load_rows, render_folds
-from pipeline.dataset.rows import Rows, Selection
-from pipeline.dataset.splits import Split, draw_folds
+from pipeline.stage import run, say
+from reskin import io
+from reskin.config import Files, Settings, parse_parts, read_settings
+from reskin.data.folds import load_rows, render_folds
+from reskin.data.rows import Rows, Selection
+from reskin.data.splits import Split, draw_folds
 
 NO_ROWS = Rows.of_labels(boards=[], skins=[])
 

@@ -6,14 +6,21 @@ Refuses to know how networks are adapted (`trials.adapting`).
 from pathlib import Path
 from typing import Any
 
-from pipeline.core import io
-from pipeline.core.config import Files, Settings, read_settings
-from pipeline.core.errors import ParamsError
-from pipeline.core.stage import run
-from pipeline.learning.recipe import HEADLINE, PokesSweep
-from pipeline.learning.recipe import adaptations as adaptations_of
-from pipeline.trials.adapting import adaptations, read_starts
-from pipeline.trials.training import note_seconds, point_of, prepare_training, read_data, train_all
+from pipeline.stage import run
+from pipeline.training.trainings import (
+    adaptations,
+    note_seconds,
+    point_of,
+    prepare_training,
+    read_data,
+    read_starts,
+    train_all,
+)
+from reskin import io
+from reskin.config import Files, Settings, read_settings
+from reskin.errors import ParamsError
+from reskin.models.recipe import HEADLINE, PokesSweep
+from reskin.models.recipe import adaptations as adaptations_of
 
 
 def read(settings: Settings) -> PokesSweep:

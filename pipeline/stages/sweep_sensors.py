@@ -7,15 +7,22 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.core import io
-from pipeline.core.config import Files, read_settings
-from pipeline.core.stage import run
-from pipeline.dataset.splits import Fold
-from pipeline.learning.recipe import HEADLINE, Recipe, training
-from pipeline.learning.recipe import adaptations as adaptations_of
-from pipeline.learning.trial import Start, Trial
-from pipeline.trials.adapting import adaptations
-from pipeline.trials.training import SceneData, note_seconds, point_of, prepare_training, read_data, train_all
+from pipeline.stage import run
+from pipeline.training.trainings import (
+    SceneData,
+    adaptations,
+    note_seconds,
+    point_of,
+    prepare_training,
+    read_data,
+    train_all,
+)
+from reskin import io
+from reskin.config import Files, read_settings
+from reskin.data.splits import Fold
+from reskin.models.recipe import HEADLINE, Recipe, training
+from reskin.models.recipe import adaptations as adaptations_of
+from reskin.models.trial import Start, Trial
 
 
 def sweep_sensors(scene: str, files: Files, indentations: Path, folds: Path, scores: Path) -> None:

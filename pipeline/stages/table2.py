@@ -5,15 +5,15 @@ Refuses to know all else of the report, and to train.
 
 from pathlib import Path
 
-from pipeline.core import io
-from pipeline.core.config import Files, read_settings
-from pipeline.core.stage import run, say
-from pipeline.evaluation.scores import tidy
-from pipeline.learning.recipe import HEADLINE
-from pipeline.questions import TABLE_2, stages
-from pipeline.reporting.headline import headline_figures, short_table
-from pipeline.reporting.learned import learned
-from pipeline.reporting.shown import rounded, to_markdown
+from pipeline.report.formatting import rounded, to_markdown
+from pipeline.report.headline import headline_figures, short_table
+from pipeline.report.numbers import learned
+from pipeline.report.statistics import tidy
+from pipeline.scenes import TABLE_2, stages
+from pipeline.stage import run, say
+from reskin import io
+from reskin.config import Files, read_settings
+from reskin.models.recipe import HEADLINE
 
 
 def table2(scene: str, files: Files, models: Path, shown: Path) -> None:

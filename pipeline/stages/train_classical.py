@@ -4,12 +4,12 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.core import io
-from pipeline.core.config import Files, Settings, read_settings
-from pipeline.core.executors import make_executor
-from pipeline.core.stage import run, say
-from pipeline.learning.baselines import Baselines, Task, baselines, run_tasks
-from pipeline.trials.training import measured, note_seconds, read_data, score_test
+from pipeline.executors import make_executor
+from pipeline.stage import run, say
+from pipeline.training.trainings import measured, note_seconds, read_data, score_test
+from reskin import io
+from reskin.config import Files, Settings, read_settings
+from reskin.models.classical import Baselines, Task, baselines, run_tasks
 
 NO_ROWS = np.zeros(0, np.int64)
 
@@ -28,7 +28,7 @@ def train_classical(scene: str, files: Files, indentations: Path, folds: Path, s
         Task(f"{name}.{fold.name}", method, fold.train, fold.test, NO_ROWS, settings.rows_max_n, seed)
         for fold, name, method in pairs
     ]
-    with make_executor(imports="pipeline.learning.regressors") as executor:
+    with make_executor(imports="reskin.models.classical") as executor:
         fitted = run_tasks(tasks, measured(data), executor, lambda line: say(f"{scene} classical: {line}"))
     points = [
         {"name": name, "method": method.title, "inputs": method.inputs, "fold": fold.name, "seed_i": 0}

@@ -5,15 +5,15 @@ Refuses to know how a network is trained (`trials.training`).
 
 from pathlib import Path
 
-from pipeline.core import io
-from pipeline.core.config import Files, Settings, read_settings
-from pipeline.core.stage import run
-from pipeline.dataset.scan import SCORED
-from pipeline.dataset.splits import ONE_SKIN
-from pipeline.learning.recipe import Training, training
-from pipeline.trials.before_touch import BY_TIME, score_before_touch
-from pipeline.trials.networks import networks_by_fold
-from pipeline.trials.training import prepare_training, read_data, train_all, trials_of, write_models
+from pipeline.stage import run
+from pipeline.training.before_contact import BY_TIME, score_before_touch
+from pipeline.training.trainings import prepare_training, read_data, train_all, trials_of, write_models
+from reskin import io
+from reskin.config import Files, Settings, read_settings
+from reskin.data.rows import SCORED
+from reskin.data.splits import ONE_SKIN
+from reskin.models.recipe import Training, training
+from reskin.models.trained import networks_by_fold
 
 
 def read(settings: Settings) -> Training:

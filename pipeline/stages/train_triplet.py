@@ -5,10 +5,10 @@ Refuses to know how a network is trained (`trials.training`).
 
 from pathlib import Path
 
-from pipeline.core.config import Files, Settings, read_settings
-from pipeline.core.stage import run
-from pipeline.learning.recipe import Training, training
-from pipeline.trials.training import prepare_training, read_data, train_all, trials_of, write_models
+from pipeline.stage import run
+from pipeline.training.trainings import prepare_training, read_data, train_all, trials_of, write_models
+from reskin.config import Files, Settings, read_settings
+from reskin.models.recipe import Training, training
 
 
 def read(settings: Settings) -> Training:

@@ -10,18 +10,26 @@ from typing import Annotated
 
 from pydantic import Field
 
-from pipeline.core import io
-from pipeline.core.config import Files, Settings, parse, read_settings
-from pipeline.core.errors import ParamsError
-from pipeline.core.stage import run, say
 from pipeline.experiments.answer import read_folder
 from pipeline.experiments.compare.run import Compare, see, setup_of, skins_of, turns_of
-from pipeline.physics.skin import SkinDesign
-from pipeline.trials.experts import Frame, Known, make_experts, write_networks
-from pipeline.trials.sureness import tell_sureness, tell_tempers
-from pipeline.trials.training import read_data
-from pipeline.trials.universal import QUESTION, Bench, score_fold
-from pipeline.twin.training import Lessons
+from pipeline.stage import run, say
+from pipeline.training.trainings import read_data
+from pipeline.training.universal import (
+    QUESTION,
+    Bench,
+    Frame,
+    Known,
+    make_experts,
+    score_fold,
+    tell_sureness,
+    tell_tempers,
+    write_networks,
+)
+from reskin import io
+from reskin.config import Files, Settings, parse, read_settings
+from reskin.errors import ParamsError
+from reskin.physics.skin import SkinDesign
+from reskin.universal.training import Lessons
 
 
 class Universal(Lessons):

@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.core.executors import end_workers, make_executor
-from pipeline.core.seeds import rng_for
-from pipeline.learning.grid import _read_rows, run_trials
-from pipeline.learning.recipe import Recipe
-from pipeline.learning.trial import Measured, Trial
+from pipeline.executors import end_workers, make_executor
+from reskin.models.grid import _read_rows, run_trials
+from reskin.models.recipe import Recipe
+from reskin.models.trial import Measured, Trial
+from reskin.seeds import rng_for
 
 BOARDS_N, SEEDS_N, ROWS_N, STEPS_N = 6, 6, 20_000, 200
 TASKS_N = SEEDS_N * BOARDS_N // 3  # stacks of three
@@ -87,7 +87,7 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     rows, start_s = measured(), time.monotonic()
     found: dict[str, object] = {}
-    with make_executor(imports="pipeline.learning.train") as executor:
+    with make_executor(imports="reskin.models.train") as executor:
         connected_s = time.monotonic()
         executor.submit(nothing).result()  # local workers have loaded what tasks need
         ready_s = time.monotonic()

@@ -6,9 +6,9 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.core import io
-from pipeline.reporting.readme import fill
-from pipeline.reporting.shown import to_markdown
+from pipeline.report.formatting import to_markdown
+from pipeline.report.readme import fill
+from reskin import io
 
 ROOT = Path(__file__).resolve().parents[2]
 MEASURED = ROOT / "docs/measured"  # one file a benchmark, and the page is made of it

@@ -17,8 +17,8 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from pipeline.core.seeds import rng_for
-from pipeline.learning.grid import STACK_N
+from reskin.models.grid import STACK_N
+from reskin.seeds import rng_for
 from tests.benchmarks.steps import ROOT
 
 WORKERS_N = (1, 2, 4, 8, 16, 32, 64, 128, 256)

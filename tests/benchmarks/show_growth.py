@@ -14,9 +14,8 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 from scipy.optimize import brentq
 
-from pipeline.core import io
-from pipeline.reporting.figures import STYLE, svg
-from pipeline.reporting.work_precision import COLOURS, MARKERS
+from pipeline.report.figures import COLOURS, MARKERS, STYLE, svg
+from reskin import io
 from tests.benchmarks.pages import MEASURED, ROOT, short, table, write_block
 
 FIGURE = "docs/img/growth.svg"

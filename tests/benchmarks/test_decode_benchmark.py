@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.capture.stream import FrameStream, decode_all
-from pipeline.capture.wire import encode
+from reskin.board.stream import FrameStream, decode_all
+from reskin.board.wire import encode
 from tests.benchmarks import size
 from tests.capture.signals import make_frames
 

@@ -7,8 +7,8 @@ Nothing is asserted: it prints the numbers.
 import numpy as np
 import pytest
 
-from pipeline.core.seeds import rng_for
-from pipeline.twin.shipped import load_universal
+from reskin.seeds import rng_for
+from reskin.universal.model import load_universal
 from tests.benchmarks import size
 from tests.live.gripper import AIM_N, PERIOD_S, RATE_HZ, SETTLED_S, Finger, fit, grip
 

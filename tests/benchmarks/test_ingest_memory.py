@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.capture import probe
-from pipeline.capture.header import PROBE_FILE, STREAM_FILE, Clock, Header
-from pipeline.capture.probe import LABELS, ProbeLog
-from pipeline.capture.wire import Frames, encode
-from pipeline.core import io
-from pipeline.core.seeds import rng_for
-from pipeline.dataset.captures import read_native
+from reskin import io
+from reskin.board.wire import Frames, encode
+from reskin.recordings import probe
+from reskin.recordings.header import PROBE_FILE, STREAM_FILE, Clock, Header
+from reskin.recordings.ingest import read_native
+from reskin.recordings.probe import LABELS, ProbeLog
+from reskin.seeds import rng_for
 from tests.benchmarks import FULL, size
 from tests.capture.headers import AS_USUAL, make_header
 
@@ -110,7 +110,7 @@ READ = """
 import resource, sys
 from pathlib import Path
 from pipeline.core import io
-from pipeline.dataset.captures import read_native
+from reskin.recordings.ingest import read_native
 from tests.benchmarks.test_ingest_memory import ALLOWED_MB, AS_USUAL, header, peak_mb
 resource.setrlimit(resource.RLIMIT_AS, (ALLOWED_MB * 10**6,) * 2)
 folder = Path(sys.argv[1])

@@ -12,14 +12,25 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from pipeline.trials import sureness
-from pipeline.trials.experts import Experts
-from pipeline.trials.sureness import AS_TAUGHT, MISSES, skins_of_prior, tell_sureness, told_of
-from pipeline.trials.universal import ASSUMED_TEMPER, REACH, by_own_labels, covered, read_both, ready
-from pipeline.twin import training
-from pipeline.twin.population import Population
-from pipeline.twin.tables import NOMINAL, OF_NOMINAL, tabulate
-from pipeline.twin.training import Lessons, Syllabus, add_error, teach
+from pipeline.training import universal
+from pipeline.training.universal import (
+    AS_TAUGHT,
+    ASSUMED_TEMPER,
+    MISSES,
+    REACH,
+    Experts,
+    by_own_labels,
+    covered,
+    read_both,
+    ready,
+    skins_of_prior,
+    tell_sureness,
+    told_of,
+)
+from reskin.universal import training
+from reskin.universal.map import NOMINAL, OF_NOMINAL, tabulate
+from reskin.universal.population import Population
+from reskin.universal.training import Lessons, Syllabus, add_error, teach
 from tests.benchmarks import FULL, size
 from tests.twin.skins import SETUP
 
@@ -68,7 +79,7 @@ FAMILIES: dict[str, Miss] = {
 @pytest.mark.timeout(3600)
 def test_intervals_of_skins_that_the_law_misses_in_other_ways(monkeypatch):
     if not FULL:
-        monkeypatch.setattr(sureness, "FURTHER_N", 1)
+        monkeypatch.setattr(universal, "FURTHER_N", 1)
     syllabus = Syllabus("nominal", NOMINAL, OF_NOMINAL, SETUP)
     nominal = Experts(tabulate(NOMINAL, OF_NOMINAL, SETUP), teach(syllabus, LESSONS, SEED), None, syllabus)
     by_labels = tell_sureness(nominal, LABELS_N, SEED)

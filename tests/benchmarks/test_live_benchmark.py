@@ -22,12 +22,12 @@ import numpy as np
 import pytest
 from aiohttp import web
 
-from pipeline.live.layout import layout_of
-from pipeline.live.server import Server
-from pipeline.live.session import Live
-from pipeline.live.skin import Readings, Skin
-from pipeline.live.view import LATENCIES_N, View
-from pipeline.predicting import read_network
+from reskin.live.layout import layout_of
+from reskin.live.server import Server
+from reskin.live.session import Live
+from reskin.live.tracker import Readings, Skin
+from reskin.live.view import LATENCIES_N, View
+from reskin.predicting import read_network
 from tests.benchmarks import size
 from tests.live.boards import make_script, write_model, write_script
 from tests.live.test_browser import BROWSER, Tab, in_browser

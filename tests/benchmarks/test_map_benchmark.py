@@ -11,10 +11,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pipeline.core.seeds import rng_for
-from pipeline.dataset.grid import CENTRE_MM
-from pipeline.twin.asked import CHANNELS_N
-from pipeline.twin.shipped import load_universal
+from reskin.data.grid import CENTRE_MM
+from reskin.seeds import rng_for
+from reskin.universal.calibration import CHANNELS_N
+from reskin.universal.model import load_universal
 from tests.benchmarks import size
 
 POKES_N = 65

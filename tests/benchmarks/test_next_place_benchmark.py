@@ -11,18 +11,18 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.core.config import parse, read_yaml
-from pipeline.core.seeds import rng_for
-from pipeline.dataset.grid import CENTRE_MM
-from pipeline.live.adapting import SHOWN_MM
-from pipeline.physics.skin import SkinDesign
-from pipeline.twin.choosing import worth
-from pipeline.twin.law import Setup
-from pipeline.twin.population import PLACES_N, draw_population
-from pipeline.twin.shipped import SKIN_MM, Universal, load_universal
-from pipeline.twin.tables import NOMINAL, OF_NOMINAL
-from pipeline.twin.training import ERROR_OF_NOMINAL, NOISE_uT, add_error
-from pipeline.twin.turned import CHIPS_MM, to_board
+from reskin.config import parse, read_yaml
+from reskin.data.grid import CENTRE_MM
+from reskin.live.calibrating import SHOWN_MM
+from reskin.physics.skin import SkinDesign
+from reskin.seeds import rng_for
+from reskin.universal.axes import CHIPS_MM, to_board
+from reskin.universal.calibration import worth
+from reskin.universal.law import Setup
+from reskin.universal.map import NOMINAL, OF_NOMINAL
+from reskin.universal.model import SKIN_MM, Universal, load_universal
+from reskin.universal.population import PLACES_N, draw_population
+from reskin.universal.training import ERROR_OF_NOMINAL, NOISE_uT, add_error
 from tests.benchmarks import size
 
 SKINS_N, LABELS_N, PRESS_N = size(40, 2), size((0, 1, 3, 5, 10), (0, 1)), 2.0

@@ -14,12 +14,12 @@ import pytest
 from scipy.constants import mu_0
 from scipy.spatial.transform import Rotation
 
-from pipeline.core.seeds import rng_for
-from pipeline.dataset.grid import CENTRE_MM, protocol
-from pipeline.physics import dipole, flow_map, layer
-from pipeline.physics.board import Board, draw_board
-from pipeline.physics.change import change_of_field
-from pipeline.physics.skin import Skin, changes_of_field, draw_skin
+from reskin.data.grid import CENTRE_MM, protocol
+from reskin.physics import flow_map, layer, magnet
+from reskin.physics.board import Board, draw_board
+from reskin.physics.magnet import change_of_field
+from reskin.physics.skin import Skin, changes_of_field, draw_skin
+from reskin.seeds import rng_for
 from tests.benchmarks import FULL, size
 from tests.physics.test_board import design as board_design
 from tests.physics.test_board import no_spread, spreads
@@ -88,7 +88,7 @@ def test_the_field_of_all_nodes_costs_less_than_magpylibs_dipoles() -> None:
 
     calls: dict[str, tuple[Callable[[], np.ndarray], int]] = {
         "compiled": (lambda: change_of_field(rest, moved, BOARD.chips_m), 50),
-        "NumPy": (lambda: dipole.field(*moved, BOARD.chips_m) - dipole.field(*rest, BOARD.chips_m), 10),
+        "NumPy": (lambda: magnet.field(*moved, BOARD.chips_m) - magnet.field(*rest, BOARD.chips_m), 10),
         "magpylib.core": (lambda: core_field(moved, BOARD) - core_field(rest, BOARD), 10),
         "magpylib objects": (by_objects, 3),
     }

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.core.config import PARAMS, PLAN, SCENES, read_yaml
+from reskin.config import PARAMS, PLAN, SCENES, read_yaml
 from tests.benchmarks import size
 
 ROOT = Path(__file__).resolve().parents[2]

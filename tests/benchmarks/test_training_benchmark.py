@@ -22,15 +22,14 @@ import torch
 from torch import nn
 from torch.utils.data import DataLoader, TensorDataset
 
-from pipeline.core.executors import make_executor
-from pipeline.core.seeds import rng_for
-from pipeline.learning import train as train_module
-from pipeline.learning.grid import STACK_N, run_trials
-from pipeline.learning.job import Feed
-from pipeline.learning.model import FEATURE_LAYERS_N, Stack, paper_layers
-from pipeline.learning.recipe import Recipe
-from pipeline.learning.train import AdamW, Watch, train_stack
-from pipeline.learning.trial import Measured, Trial
+from pipeline.executors import make_executor
+from reskin.models import train as train_module
+from reskin.models.grid import STACK_N, run_trials
+from reskin.models.network import FEATURE_LAYERS_N, Stack, paper_layers
+from reskin.models.recipe import Recipe
+from reskin.models.train import AdamW, Feed, Watch, train_stack
+from reskin.models.trial import Measured, Trial
+from reskin.seeds import rng_for
 from tests.benchmarks import FULL, size
 
 BOARDS_N, SKINS_PER_BOARD_N, SEEDS_N = 6, 3, 3
@@ -210,7 +209,7 @@ def test_the_fold_grid_is_timed_beside_plain_loops_and_sgemm(tmp_path: Path) -> 
     for i in range(REPEATS_N):
         sgemm = max(sgemm_flop_per_s())
         columns["sgemm, one thread, GFLOP/s"].append(1e-9 * sgemm)
-        with make_executor(imports="pipeline.learning.train") as executor:
+        with make_executor(imports="reskin.models.train") as executor:
             start_s = seconds(lambda: start(executor))
             beside = [executor.submit(sgemm_flop_per_s, size(100, 2)) for _ in range(2)]  # a quarter of a second each
             both = harmonic_mean(list(chain.from_iterable(one.result() for one in beside)))

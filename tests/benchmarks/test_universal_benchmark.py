@@ -12,22 +12,21 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.core.config import parse, read_yaml
-from pipeline.physics.skin import SkinDesign
-from pipeline.trials.experts import Experts
-from pipeline.trials.shipping import UNKNOWN, shown
-from pipeline.trials.sureness import AS_TAUGHT, MISSES, pool_of_prior, skins_of_prior
-from pipeline.twin import tables
-from pipeline.twin.law import Setup
-from pipeline.twin.opinion import FULL_SET_N, Weights
-from pipeline.twin.shipped import SKIN_MM, Universal
-from pipeline.twin.tables import NOMINAL, OF_NOMINAL, Tables, tabulate
-from pipeline.twin.training import NAMELESS, Lessons, Syllabus, teach
-from pipeline.twin.turned import CHIPS_MM
+from pipeline.training.shipping import UNKNOWN, shown
+from pipeline.training.universal import AS_TAUGHT, MISSES, Experts, pool_of_prior, skins_of_prior
+from reskin.config import parse, read_yaml
+from reskin.physics.skin import SkinDesign
+from reskin.universal import map
+from reskin.universal.axes import CHIPS_MM
+from reskin.universal.law import Setup
+from reskin.universal.map import NOMINAL, OF_NOMINAL, Tables, tabulate
+from reskin.universal.model import SKIN_MM, Universal
+from reskin.universal.network import FULL_SET_N, Weights
+from reskin.universal.training import NAMELESS, Lessons, Syllabus, teach
 from tests.benchmarks import FULL, size
 
 ROOT = Path(__file__).resolve().parents[2]
-SIDE_MM = tables.PITCH_MM * tables.STEPS_N
+SIDE_MM = map.PITCH_MM * map.STEPS_N
 PITCHES_MM, FORCES_N = size((1.6, 0.8, 0.6), (3.2,)), size((4, 9, 17), (3,))
 SKINS_N, STEPS_N = size((125, 500, 2000), (8,)), size((300, 1200), (5,))
 ASKED_N, SEED = size(24, 2), 2021
@@ -82,9 +81,9 @@ def test_error_against_time_of_map_and_network(monkeypatch):
 
 def lattice(monkeypatch, pitch_mm: float, forces_n: int, setup: Setup) -> tuple[Tables, float]:
     """Tabulate a lattice of this pitch and so many forces; give what that took."""
-    monkeypatch.setattr(tables, "PITCH_MM", pitch_mm)
-    monkeypatch.setattr(tables, "STEPS_N", 2 * round(SIDE_MM / pitch_mm / 2))
-    forces_N = np.geomspace(tables.FORCES_N[0], tables.FORCES_N[-1], forces_n)
+    monkeypatch.setattr(map, "PITCH_MM", pitch_mm)
+    monkeypatch.setattr(map, "STEPS_N", 2 * round(SIDE_MM / pitch_mm / 2))
+    forces_N = np.geomspace(map.FORCES_N[0], map.FORCES_N[-1], forces_n)
     start_s = time.process_time()
     return tabulate(NOMINAL, OF_NOMINAL, setup, forces_N), time.process_time() - start_s
 

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from pipeline.core.config import read_yaml
-from pipeline.core.provenance import device
-from pipeline.learning.model import FEATURE_LAYERS_N, paper_layers
+from pipeline.provenance import device
+from reskin.config import read_yaml
+from reskin.models.network import FEATURE_LAYERS_N, paper_layers
 from tests.benchmarks.pages import MEASURED, ROOT, short, table, write_block
 
 HEAVIEST_N, BEST_OF_N = 3, 5

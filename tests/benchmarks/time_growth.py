@@ -22,11 +22,11 @@ from typing import Any
 import numpy as np
 
 from pipeline import plan
-from pipeline.capture.header import HEADER_FILE, recorded, write_capture
-from pipeline.core import config, io
-from pipeline.core.config import read_yaml
-from pipeline.core.provenance import code_version, device
-from pipeline.registry import Entry, Registry, write_registry
+from pipeline.manage.registry import Entry, Registry, write_registry
+from pipeline.provenance import code_version, device
+from reskin import config, io
+from reskin.config import read_yaml
+from reskin.recordings.header import HEADER_FILE, recorded, write_capture
 from tests.benchmarks.pages import MEASURED
 from tests.stages.checkout import ROOT, copy_checkout, variables
 

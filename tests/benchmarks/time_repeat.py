@@ -18,18 +18,18 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pipeline.core import io
-from pipeline.core.config import read_yaml
-from pipeline.core.provenance import code_version, device
-from pipeline.evaluation.reproduced import compare
+from pipeline.manage.compare import compare
+from pipeline.provenance import code_version, device
+from reskin import io
+from reskin.config import read_yaml
 from tests.benchmarks.pages import MEASURED, ROOT, table, write_block
 
 SCENE = "repeat"
 SKINS_N = 6  # one a board
 QUESTIONS = ("single_random", "lobo", "triplet")
 TRAINED = ("train_single", "train_multi", "train_triplet")
-AGAIN = f"from pathlib import Path; from pipeline.verifying import rerun; rerun(Path(), ['{SCENE}'])"
-# Whatever this processor has, and its libraries choose: nothing that pipeline/core/numerics.py pins holds.
+AGAIN = f"from pathlib import Path; from pipeline.manage.verify import rerun; rerun(Path(), ['{SCENE}'])"
+# Whatever this processor has, and its libraries choose: nothing that reskin/numerics.py pins holds.
 UNPINNED = {
     "MKL_CBWR": "AUTO", "ATEN_CPU_CAPABILITY": "avx512", "ONEDNN_MAX_CPU_ISA": "DEFAULT",
     "OPENBLAS_CORETYPE": "SkylakeX", "OPENBLAS_NUM_THREADS": "2",

@@ -3,9 +3,9 @@
 from pathlib import Path
 from typing import Any
 
-from pipeline.capture.decisions import Decisions
-from pipeline.capture.header import Header, recorded
-from pipeline.core.config import parse, read_yaml
+from reskin.config import parse, read_yaml
+from reskin.recordings.fault_policy import Decisions
+from reskin.recordings.header import Header, recorded
 
 LAB = {"board": "board1", "skin": "skin1", "layout": "lab", "chips_n": 5, "protocol": "", "note": ""}
 # What is decided for faults, as params.yaml says.

@@ -3,8 +3,8 @@
 import numpy as np
 from hypothesis import strategies as st
 
-from pipeline.capture.wire import Frames
-from pipeline.core import seeds
+from reskin import seeds
+from reskin.board.wire import Frames
 
 # Readings whose float32 holds CR LF in its middle, at gain 6 of the chip (FACTS: fixtures of the wire format).
 CRLF_TEMPERATURE_degC = 34.513275

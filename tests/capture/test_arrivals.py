@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.capture import arrivals
-from pipeline.capture.arrivals import Arrivals
-from pipeline.core.errors import CaptureError
+from reskin.errors import CaptureError
+from reskin.recordings import clocks
+from reskin.recordings.clocks import Arrivals
 
 GOOD = "byte_end,t_s\n0,10.0\n100,10.5\n300,10.5\n400,11.5\n"
 STEPS = st.lists(st.tuples(st.integers(1, 10_000), st.floats(0, 10)), min_size=1, max_size=30)
@@ -39,14 +39,14 @@ def test_a_frame_time_is_what_a_walk_over_the_chunks_gives(steps: Steps, first: 
     end_byte = np.linspace(1, table.byte_end[-1] + 50, 40).astype(np.int64)
     want_s = [naive_time_s(int(byte), table) for byte in end_byte]
     # Sums of up to 31 doubles of size 1e3 to 1e4.
-    np.testing.assert_allclose(arrivals.times_of(end_byte, table), want_s, rtol=1e-12, atol=1e-9)
+    np.testing.assert_allclose(clocks.times_of(end_byte, table), want_s, rtol=1e-12, atol=1e-9)
 
 
 @given(steps=STEPS, first=st.tuples(st.integers(0, 500), st.floats(-1e3, 1e3)))
 def test_times_never_fall_and_stay_within_their_chunk(steps: Steps, first: tuple[int, float]) -> None:
     table = arrivals_of(steps, first)
     end_byte = np.arange(table.byte_end[0], min(table.byte_end[-1], table.byte_end[0] + 3000), dtype=np.int64) + 1
-    t_s = arrivals.times_of(end_byte, table)
+    t_s = clocks.times_of(end_byte, table)
     chunk_i = np.searchsorted(table.byte_end, end_byte)
     assert (np.diff(t_s) >= 0).all()
     assert (t_s <= table.t_s[chunk_i] + 1e-9).all()
@@ -54,19 +54,19 @@ def test_times_never_fall_and_stay_within_their_chunk(steps: Steps, first: tuple
 
 
 def test_a_frame_past_the_last_chunk_has_no_time() -> None:
-    t_s = arrivals.times_of(np.array([82, 400, 401], np.int64), arrivals.parse(GOOD, "arrivals.csv"))
+    t_s = clocks.times_of(np.array([82, 400, 401], np.int64), clocks.parse(GOOD, "arrivals.csv"))
     np.testing.assert_array_equal(t_s, [10 + 0.5 * 0.82, 11.5, np.nan])
 
 
 def test_at_a_constant_rate_frames_follow_evenly_whatever_the_dump_starts_with() -> None:
-    t_s = arrivals.constant_rate(np.array([1.0, 2.0, 401.0]), 400.0)
+    t_s = clocks.constant_rate(np.array([1.0, 2.0, 401.0]), 400.0)
     np.testing.assert_allclose(t_s, [0.0025, 0.005, 1.0025], rtol=1e-15)
 
 
 @given(steps=STEPS, first=st.tuples(st.integers(0, 500), st.floats(-1e9, 1e9)))
 def test_parse_undoes_render(steps: Steps, first: tuple[int, float]) -> None:
     table = arrivals_of(steps, first)
-    again = arrivals.parse(arrivals.render(table), "arrivals.csv")
+    again = clocks.parse(clocks.render(table), "arrivals.csv")
     np.testing.assert_array_equal(again.byte_end, table.byte_end)
     np.testing.assert_array_equal(again.t_s, table.t_s)
 
@@ -89,9 +89,9 @@ def test_parse_undoes_render(steps: Steps, first: tuple[int, float]) -> None:
 )
 def test_a_fault_is_one_sentence_that_names_its_place(old: str, new: str, says: str) -> None:
     with pytest.raises(CaptureError, match=rf"^arrivals\.csv.*{says}"):
-        arrivals.parse(GOOD.replace(old, new, 1), "arrivals.csv")
+        clocks.parse(GOOD.replace(old, new, 1), "arrivals.csv")
 
 
 def test_an_absent_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match="arrivals.csv: the file must be there"):
-        arrivals.parse(tmp_path / "arrivals.csv", "arrivals.csv")
+        clocks.parse(tmp_path / "arrivals.csv", "arrivals.csv")

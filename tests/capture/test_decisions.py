@@ -8,14 +8,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.capture.decisions import Decisions, Ledger, decide
-from pipeline.capture.faults import ConstantChannels
-from pipeline.capture.header import Clock
-from pipeline.capture.readers.chips import Watch, find_whole_rows
-from pipeline.capture.stream import decode_all
-from pipeline.core.errors import CaptureError, ParamsError
-from pipeline.core.seeds import rng_for
-from pipeline.live.inject import inject, parse
+from reskin.board.faults import ConstantChannels
+from reskin.board.stream import decode_all
+from reskin.errors import CaptureError, ParamsError
+from reskin.live.emulator import inject, parse_fault
+from reskin.recordings.chips import Watch, find_whole_rows
+from reskin.recordings.fault_policy import Decisions, Ledger, decide
+from reskin.recordings.header import Clock
+from reskin.seeds import rng_for
 from tests.capture.headers import AS_USUAL, make_header
 from tests.live.boards import RATE_HZ, make_script
 
@@ -34,7 +34,7 @@ FAULTS = [
 
 def look(name: str, wire: str, decisions: Decisions = AS_USUAL):
     """Look at a stream with a fault, as ingest does; give what is found, and the frames that are kept."""
-    script = SCRIPTS[wire] if name == "none" else inject(SCRIPTS[wire], parse(f"{name}@{FROM_S}+{LASTS_S}"))
+    script = SCRIPTS[wire] if name == "none" else inject(SCRIPTS[wire], parse_fault(f"{name}@{FROM_S}+{LASTS_S}"))
     frames, _ = decode_all(b"".join(script.pieces), wire, 5, name)
     sent_byte = np.cumsum([len(piece) for piece in script.pieces])
     t_s = np.interp(frames.end_byte, sent_byte, script.t_s)
@@ -82,7 +82,7 @@ def test_a_board_that_is_silent_for_a_second_was_unplugged():
 
 
 def test_a_chip_reset_is_refused_or_flagged():
-    script = inject(make_script(pokes_n=2), parse("chip-reset@2+5"))
+    script = inject(make_script(pokes_n=2), parse_fault("chip-reset@2+5"))
     frames, _ = decode_all(b"".join(script.pieces), "binary", 5, "reset")
     header = make_header(layout="native", wire="binary", clock=CLOCK)
     with pytest.raises(CaptureError, match="the LSB of chip 1"):

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from pipeline.capture.dump import decode_dump
-from pipeline.capture.wire import encode
-from pipeline.core.errors import CaptureError
+from reskin.board.decode import decode_dump
+from reskin.board.wire import encode
+from reskin.errors import CaptureError
 from tests.capture.signals import make_frames
 
 

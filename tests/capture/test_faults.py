@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.capture import faults
-from pipeline.core import seeds
+from reskin import seeds
+from reskin.board import faults
 from tests.capture.signals import frames_of
 
 NOISE_uT = 5.0  # FACTS: 3.0 to 5.0 uT on real boards

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.capture.header import Clock, check_same_capture, parse, render, write_capture
-from pipeline.core.errors import CaptureError
+from reskin.errors import CaptureError
+from reskin.recordings.header import Clock, check_same_capture, parse, render, write_capture
 from tests.capture.headers import make_header
 
 

@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.capture import probe
-from pipeline.capture.header import PROBE_FILE
-from pipeline.capture.labels import Dwell, Label, ProbeTape
-from pipeline.core.errors import CaptureError
+from reskin.errors import CaptureError
+from reskin.recordings import probe
+from reskin.recordings.header import PROBE_FILE
+from reskin.recordings.labels import Dwell, Label, ProbeTape
 
 NUMBER = st.floats(-1e6, 1e6, width=32) | st.just(math.nan)
 LABEL = st.builds(Label, st.booleans(), *[NUMBER] * 6, st.integers(0, 9))

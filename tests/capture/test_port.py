@@ -18,11 +18,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pipeline.capture import arrivals, port, stream
-from pipeline.capture.header import ARRIVALS_FILE, STREAM_FILE
-from pipeline.capture.port import PortSettings, Recording
-from pipeline.capture.wire import encode
-from pipeline.core.errors import CaptureError
+from reskin.board import port, stream
+from reskin.board.port import PortSettings, Recording
+from reskin.board.wire import encode
+from reskin.errors import CaptureError
+from reskin.recordings import clocks
+from reskin.recordings.header import ARRIVALS_FILE, STREAM_FILE
 from tests.capture.signals import make_frames
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo-terminals")
@@ -106,7 +107,7 @@ def wait_until_written(folder: Path, bytes_n: int) -> None:
 
 def check_files(folder: Path, recording: Recording, sent: bytes) -> None:
     data = (folder / STREAM_FILE).read_bytes()
-    rows = arrivals.parse(folder / ARRIVALS_FILE, "arrivals.csv")
+    rows = clocks.parse(folder / ARRIVALS_FILE, "arrivals.csv")
     assert data == sent
     assert recording.account["bytes_n"] == len(data) == rows.byte_end[-1]
     assert rows.byte_end[0] == 0
@@ -155,8 +156,8 @@ def test_arrivals_tell_when_bytes_came(board, clock, tmp_path):
         board.send(data[4100:])
 
     record(board, tmp_path, act, bytes_max_n=len(data))
-    rows = arrivals.parse(tmp_path / ARRIVALS_FILE, "arrivals.csv")
-    came_s = arrivals.times_of(np.array([4100, 8200]), rows)
+    rows = clocks.parse(tmp_path / ARRIVALS_FILE, "arrivals.csv")
+    came_s = clocks.times_of(np.array([4100, 8200]), rows)
     assert came_s[1] - came_s[0] == pytest.approx(pause_s, abs=1e-5)
 
 
@@ -211,7 +212,7 @@ def test_a_port_that_falls_silent_after_its_frames_keeps_them(board, clock, tmp_
 LISTEN = """
 import sys, threading
 from pathlib import Path
-from pipeline.capture import port
+from reskin.recordings import port
 settings = port.PortSettings(115200, "binary", 5, float("inf"), None, 120.0, 120.0)
 print(port.record(sys.argv[1], Path(sys.argv[2]), settings=settings, stop=threading.Event()).ended)
 """
@@ -230,7 +231,7 @@ def test_ctrl_c_and_termination_keep_what_came(board, tmp_path, number):
         output, _ = process.communicate(timeout=LONG_s)
     assert process.returncode == 0
     assert output == "stopped\n"
-    assert arrivals.parse(tmp_path / ARRIVALS_FILE, "arrivals.csv").byte_end[-1] == len(data)
+    assert clocks.parse(tmp_path / ARRIVALS_FILE, "arrivals.csv").byte_end[-1] == len(data)
 
 
 def test_a_kill_loses_nothing_that_was_read(board, tmp_path):
@@ -241,7 +242,7 @@ def test_a_kill_loses_nothing_that_was_read(board, tmp_path):
         board.send(data)
         wait_until(lambda: written.stat().st_size == len(data))
         process.kill()
-    assert arrivals.parse(tmp_path / ARRIVALS_FILE, "arrivals.csv").byte_end[-1] <= len(data)
+    assert clocks.parse(tmp_path / ARRIVALS_FILE, "arrivals.csv").byte_end[-1] <= len(data)
 
 
 def test_waiting_for_bytes_costs_no_processor_time(board, tmp_path):
@@ -304,7 +305,7 @@ def test_a_full_disk_ends_a_recording_that_can_be_read_up_to_there(board, tmp_pa
     assert (process.returncode, output) == (0, "not written\n")
     written_n = (tmp_path / STREAM_FILE).stat().st_size
     assert 10_000 < written_n <= 20_000
-    assert arrivals.parse(tmp_path / ARRIVALS_FILE, "arrivals.csv").byte_end[-1] == written_n
+    assert clocks.parse(tmp_path / ARRIVALS_FILE, "arrivals.csv").byte_end[-1] == written_n
 
 
 class TestErrors:

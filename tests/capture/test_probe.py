@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.capture import probe
-from pipeline.capture.probe import LABELS, ProbeLog
-from pipeline.core.errors import CaptureError
-from pipeline.core.seeds import rng_for
+from reskin.errors import CaptureError
+from reskin.recordings import probe
+from reskin.recordings.probe import LABELS, ProbeLog
+from reskin.seeds import rng_for
 
 HEAD = "indentation,pass_i,phase,t_start_s,t_end_s,x_mm,y_mm,depth_mm,Fx_N,Fy_N,Fz_N\n"
 GOOD = (

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.capture.labels import Dwell
-from pipeline.capture.samples import DWELL_MAX_s, Dwells, Gauge, Lines, Table
-from pipeline.core.errors import CaptureError
+from reskin.errors import CaptureError
+from reskin.recordings.labels import Dwell
+from reskin.recordings.samples import DWELL_MAX_s, Dwells, Gauge, Lines, Table
 
 HEAD = "unix_s,phase,x_mm,y_mm,Fz_N,note\n"
 

@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.capture.faults import FAILED_B_uT, FAILED_TEMPERATURE_degC
-from pipeline.capture.sd_card import column_names, read_log, render
-from pipeline.core.errors import CaptureError
-from pipeline.core.seeds import rng_for
+from reskin.board.faults import FAILED_B_uT, FAILED_TEMPERATURE_degC
+from reskin.errors import CaptureError
+from reskin.recordings.readers.sd_card import column_names, read_log, render
+from reskin.seeds import rng_for
 
 
 def made(frames_n=60, chips_n=2):

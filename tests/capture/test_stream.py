@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.capture import stream
-from pipeline.capture.stream import FrameStream, decode_all
-from pipeline.capture.wire import Frames, encode, line_bytes_max_n, record_type
-from pipeline.core.errors import CaptureError
 from pipeline.experiments.stability.wire import Damage, deliver, joined, records, suffer
+from reskin.board import stream
+from reskin.board.stream import FrameStream, decode_all
+from reskin.board.wire import Frames, encode, line_bytes_max_n, record_type
+from reskin.errors import CaptureError
 from tests.capture.signals import BINARY_WIRES, TEXT_WIRES, WIRES, CRLF_TEMPERATURE_degC, frames_strategy, make_frames
 from tests.laws import broken
 

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from pipeline.capture import wire as wires
-from pipeline.capture.wire import decode_lines, decode_runs, encode, record_type
+from reskin.board import wire as wires
+from reskin.board.wire import decode_lines, decode_runs, encode, record_type
 from tests.capture import signals
 from tests.capture.signals import BINARY_WIRES, frames_of, frames_strategy, make_frames
 

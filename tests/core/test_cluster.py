@@ -16,17 +16,17 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from pipeline.core import cluster
-from pipeline.core.cluster import _check_workers, describe_process
-from pipeline.core.errors import ParamsError
-from pipeline.core.executors import make_executor, prepare_workers
-from pipeline.learning.grid import run_trials
+from pipeline import cluster
+from pipeline.cluster import _check_workers, describe_process
+from pipeline.executors import make_executor, prepare_workers
+from reskin.errors import ParamsError
+from reskin.models.grid import run_trials
 from tests.learning.test_grid import alike, trials
 from tests.learning.trials import measured
 
 ROOT = Path(__file__).resolve().parents[2]
 # As deploy/dask.sh starts workers.
-CLI = "import pipeline.core.cluster; from distributed.cli.dask_{0} import main; main()"
+CLI = "import pipeline.cluster; from distributed.cli.dask_{0} import main; main()"
 START_MAX_s = 120.0
 HERE_ONLY = ["--host", "127.0.0.1", "--no-dashboard"]
 
@@ -74,8 +74,8 @@ def test_a_sweep_on_two_workers_gives_the_bytes_of_a_local_one(address, tmp_path
     for name, place in (("here", "here"), ("there", f"dask:{address}")):
         monkeypatch.setenv("RESKIN_EXECUTOR", place)
         monkeypatch.setenv("OMP_NUM_THREADS", os.environ.get("OMP_NUM_THREADS", "1"))
-        prepare_workers("pipeline.learning.train")
-        with make_executor(imports="pipeline.learning.train") as executor:
+        prepare_workers("reskin.models.train")
+        with make_executor(imports="reskin.models.train") as executor:
             cache = tmp_path / name
             results.append(run_trials(some, measured(), executor=executor, cache=cache, tell=lambda _: None))
             ran = [future.result() for future in [executor.submit(where, i) for i in range(6)]]

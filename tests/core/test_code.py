@@ -2,7 +2,7 @@
 
 import pytest
 
-from pipeline.core import code
+from reskin import code
 
 SOURCE = '''"""A module."""
 
@@ -54,9 +54,9 @@ def test_a_data_file_of_the_same_name_belongs_to_the_module(monkeypatch, tmp_pat
 
 
 def test_imports_are_followed_within_the_package():
-    names = code.imported("pipeline.learning.train")
-    assert {"pipeline.learning.train", "pipeline.core.seeds"} <= set(names)
-    assert {"pipeline", "pipeline.learning"} <= set(names)  # whose __init__ runs before
+    names = code.imported("reskin.models.train")
+    assert {"reskin.models.train", "reskin.seeds"} <= set(names)
+    assert {"pipeline", "reskin.models"} <= set(names)  # whose __init__ runs before
     assert all(name.split(".")[0] == "pipeline" for name in names)
 
 

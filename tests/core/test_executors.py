@@ -5,9 +5,10 @@ import time
 
 import pytest
 
-from pipeline.core import executors
-from pipeline.core.errors import ParamsError
-from pipeline.core.executors import device, end_workers, make_executor
+from pipeline import executors
+from pipeline.executors import end_workers, make_executor
+from reskin.errors import ParamsError
+from reskin.numerics import device
 
 
 def test_trainings_run_in_processes_of_their_own(monkeypatch):

@@ -8,9 +8,9 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from pipeline.core import io, stage
-from pipeline.core.errors import SchemaError
-from pipeline.core.machine import MachineError, explaining
+from pipeline import stage
+from reskin import io
+from reskin.errors import MachineError, SchemaError, explaining
 
 
 @pytest.mark.parametrize(

@@ -7,11 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core import io, progress
-from pipeline.core.config import PLAN, read_yaml
-from pipeline.core.progress import settings_of
-from pipeline.core.provenance import COSTS
-from pipeline.core.stage import run as run_stage
+from pipeline import progress
+from pipeline.progress import settings_of
+from pipeline.provenance import COSTS
+from pipeline.stage import run as run_stage
+from reskin import io
+from reskin.config import PLAN, read_yaml
 from tests.stages.checkout import copy_checkout, run
 
 ORDER = ["code", "simulate@tiny", "simulate@tiny-wear", "report@tiny"]
@@ -47,8 +48,8 @@ class Clock:
         work.__name__ = stage.partition("@")[0]
         monkeypatch.setenv(progress.VARIABLE, stage)
         monkeypatch.setattr(progress, "_ask_dvc", lambda: ["code", "split@tiny", "ingest@tiny-tiny_1", "report@tiny"])
-        monkeypatch.setattr("pipeline.core.stage.time", self)
-        monkeypatch.setattr("pipeline.core.stage.say", said.append)
+        monkeypatch.setattr("pipeline.stage.time", self)
+        monkeypatch.setattr("pipeline.stage.say", said.append)
         monkeypatch.setattr("sys.argv", ["stage", "--scene", "tiny", "--indentations", "tiny_1.parquet"])
         run_stage(work)
         return said[0].partition(": ")[2]

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.core.schema import Readings
-from pipeline.core.seeds import rng_for
-from pipeline.dataset.rows import Rows
+from reskin.data.rows import Rows
+from reskin.schema import Readings
+from reskin.seeds import rng_for
 
 
 def readings(capture: str = "c0", board: str = "b0", skin: str = "s0", f: int = 6, **changes: object) -> Readings:

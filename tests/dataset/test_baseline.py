@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core.seeds import rng_for
-from pipeline.dataset.baseline import alike_within_uT, each, follow_free, free, initial, rank, regular, subtract
+from reskin.data.baseline import alike_within_uT, each, follow_free, free, initial, rank, regular, subtract
+from reskin.seeds import rng_for
 
 B_uT, NOLOAD_uT = (rng_for(0, name).normal(0, 500, (5, 15)).astype(np.float32) for name in ("b", "noload"))
 

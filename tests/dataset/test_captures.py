@@ -1,9 +1,9 @@
 import pytest
 
-from pipeline.capture.header import write_capture
-from pipeline.capture.readers import READERS, lab
-from pipeline.core.errors import CaptureError
-from pipeline.dataset.captures import check_losses, open_capture, read_header
+from reskin.errors import CaptureError
+from reskin.recordings.header import write_capture
+from reskin.recordings.ingest import check_losses, open_capture, read_header
+from reskin.recordings.readers import READERS, lab
 from tests.capture.headers import AS_USUAL, make_header
 from tests.capture.readers.test_lab import NAMES, PRESSES
 

@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.capture.probe import LABELS, ProbeLog
-from pipeline.core.errors import CaptureError
-from pipeline.core.seeds import rng_for
-from pipeline.dataset.clocks import Block, ClockMap, from_contacts, from_marks
+from reskin.errors import CaptureError
+from reskin.recordings.clocks import Block, ClockMap, from_contacts, from_marks
+from reskin.recordings.probe import LABELS, ProbeLog
+from reskin.seeds import rng_for
 
 FRAME_S = 1 / 400
 NOISE_UT = 4.0  # of a real board

@@ -6,11 +6,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core.errors import SchemaError
-from pipeline.dataset import folds as module
-from pipeline.dataset import splits
-from pipeline.dataset.folds import from_ranges, parse_folds, render_folds, to_ranges
-from pipeline.dataset.splits import Split, draw_folds
+from reskin.data import folds as module
+from reskin.data import splits
+from reskin.data.folds import from_ranges, parse_folds, render_folds, to_ranges
+from reskin.data.splits import Split, draw_folds
+from reskin.errors import SchemaError
 from tests.dataset.tables import rows
 
 TABLE = rows(["b0", "b0", "b1", "b2"], ["s0", "s0", "s1", "s2"])

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.dataset.grid import points_mm, protocol
+from reskin.data.grid import points_mm, protocol
 
 depths_mm = st.lists(st.floats(0.1, 1.2), min_size=1, max_size=6, unique=True)
 

@@ -8,12 +8,12 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.capture.probe import LABELS, ProbeLog
-from pipeline.capture.wire import Frames
-from pipeline.core.schema import Readings
-from pipeline.core.seeds import rng_for
-from pipeline.dataset.clocks import ClockMap
-from pipeline.dataset.indentations import Joiner, TimedFrames, join
+from reskin.board.wire import Frames
+from reskin.recordings.clocks import ClockMap
+from reskin.recordings.ingest import Joiner, TimedFrames, join
+from reskin.recordings.probe import LABELS, ProbeLog
+from reskin.schema import Readings
+from reskin.seeds import rng_for
 from tests.capture.headers import make_header
 
 CHIPS_N = 2

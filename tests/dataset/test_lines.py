@@ -6,12 +6,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core.errors import ParamsError
-from pipeline.core.seeds import rng_for
-from pipeline.dataset.grid import points_mm, protocol
-from pipeline.dataset.lines import Lines, grid_lines, hand_lines, hand_rows, shifted, take_pokes
-from pipeline.dataset.rows import Rows, Selection, gather, stack
-from pipeline.synthesis.protocols import SKIN_MM, Hand
+from reskin.data.grid import points_mm, protocol
+from reskin.data.lines import Lines, grid_lines, hand_lines, hand_rows, shifted, take_pokes
+from reskin.data.rows import Rows, Selection, gather, stack
+from reskin.errors import ParamsError
+from reskin.seeds import rng_for
+from reskin.simulation.protocols import SKIN_MM, Hand
 from tests.dataset.tables import readings
 from tests.dataset.tables import rows as labelled
 

@@ -7,18 +7,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.capture import arrivals, probe
-from pipeline.capture.arrivals import Arrivals
-from pipeline.capture.faults import STUCK_FRAMES_MIN_N, FAILED_B_uT, FAILED_TEMPERATURE_degC
-from pipeline.capture.header import ARRIVALS_FILE, PROBE_FILE, STREAM_FILE, Clock, Header, Wire
-from pipeline.capture.probe import LABELS, ProbeLog
-from pipeline.capture.wire import Frames, encode
-from pipeline.core import io
-from pipeline.core.errors import CaptureError
-from pipeline.core.schema import Readings
-from pipeline.core.seeds import rng_for
-from pipeline.dataset import captures
-from pipeline.dataset.captures import read_native
+from reskin import io
+from reskin.board.faults import STUCK_FRAMES_MIN_N, FAILED_B_uT, FAILED_TEMPERATURE_degC
+from reskin.board.wire import Frames, encode
+from reskin.errors import CaptureError
+from reskin.recordings import clocks, ingest, probe
+from reskin.recordings.clocks import Arrivals
+from reskin.recordings.header import ARRIVALS_FILE, PROBE_FILE, STREAM_FILE, Clock, Header, Wire
+from reskin.recordings.ingest import read_native
+from reskin.recordings.probe import LABELS, ProbeLog
+from reskin.schema import Readings
+from reskin.seeds import rng_for
 from tests.capture.headers import AS_USUAL, make_header
 
 RATE_HZ = 100.0
@@ -82,7 +81,7 @@ def write(folder: Path, wire: Wire, frames: Frames = FRAMES, **files: bytes) -> 
     table = Arrivals(np.append(0, ends[chunk_i]).astype(np.int64), np.append(0.0, (chunk_i + 1) / RATE_HZ))
     contents = {
         STREAM_FILE: whole,
-        ARRIVALS_FILE: arrivals.render(table).encode(),
+        ARRIVALS_FILE: clocks.render(table).encode(),
         PROBE_FILE: probe.render(LOG).encode(),
     }
     for name, content in contents.items():
@@ -200,7 +199,7 @@ def test_a_probe_log_in_another_unit_is_refused(tmp_path: Path) -> None:
 def test_a_smaller_block_gives_the_same_readings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     header = header_of("binary")
     whole, whole_account = read(write(tmp_path, "binary"), header)
-    monkeypatch.setattr(captures, "BLOCK_BYTES_N", 1000)
+    monkeypatch.setattr(ingest, "BLOCK_BYTES_N", 1000)
     parts, parts_account = read(tmp_path, header)
     assert parts_account == whole_account
     for name, column in whole.items():

@@ -5,9 +5,9 @@ import shutil
 import numpy as np
 import pytest
 
-from pipeline.capture.readers import lab
-from pipeline.core.seeds import rng_for
-from pipeline.dataset.orientation import WAYS, Presses, other_orientation, presses_of
+from reskin.recordings.orientation import WAYS, Presses, other_orientation, presses_of
+from reskin.recordings.readers import lab
+from reskin.seeds import rng_for
 from tests.capture.headers import AS_USUAL, make_header
 from tests.twin.skins import fields_uT
 

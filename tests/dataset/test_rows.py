@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from pipeline.core.errors import ParamsError
-from pipeline.dataset.rows import SHEAR_TARGETS, Selection, gather
+from reskin.data.rows import SHEAR_TARGETS, Selection, gather
+from reskin.errors import ParamsError
 from tests.dataset.tables import readings
 
 ALL = Selection(force_min_N=0.0)

@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from pipeline.core.schema import Readings
-from pipeline.dataset.rows import Selection, gather
-from pipeline.dataset.scan import gather_scan, number_in_pass
+from reskin.data.rows import Selection, gather, gather_scan, number_in_pass
+from reskin.schema import Readings
 from tests.dataset.tables import readings
 
 ALL = Selection(force_min_N=0.0)

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.model_selection import ShuffleSplit
 
-from pipeline.core.errors import ParamsError
-from pipeline.dataset.splits import Split, draw_folds, draw_sides
+from reskin.data.splits import Split, draw_folds, draw_sides
+from reskin.errors import ParamsError
 from tests.dataset.tables import rows
 
 TOGETHER = {"single_indentation": "indentation", "single_pass": "pass_i"}

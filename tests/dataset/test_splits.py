@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core.config import parse
-from pipeline.core.errors import ParamsError
-from pipeline.dataset.splits import Split, draw_folds
+from reskin.config import parse
+from reskin.data.splits import Split, draw_folds
+from reskin.errors import ParamsError
 from tests.dataset.tables import rows
 
 TRANSFER = Split(transfer_skins_n=3)

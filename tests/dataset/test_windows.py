@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core.errors import ParamsError
-from pipeline.dataset import windows as documented
-from pipeline.dataset.baseline import each, initial, rank
-from pipeline.dataset.rows import Selection, gather
-from pipeline.dataset.windows import TRAIN, check_one_each, lay_parts, lay_windows, stack, take
+from reskin.data import windows as documented
+from reskin.data.baseline import each, initial, rank
+from reskin.data.rows import Selection, gather
+from reskin.data.windows import TRAIN, check_one_each, lay_parts, lay_windows, stack, take
+from reskin.errors import ParamsError
 from tests.dataset.tables import readings
 
 sizes = st.tuples(st.integers(1, 60), st.integers(1, 10), st.integers(0, 10), st.integers(0, 9))

@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.core.seeds import rng_for
-from pipeline.evaluation.metrics import score_groups
+from reskin.metrics import score_groups
+from reskin.seeds import rng_for
 from tests.scenes import RECIPE
 
 SKINS = [("b0", "s0"), ("b0", "s1"), ("b1", "s2"), ("b1", "s3")]

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.core.errors import ParamsError
-from pipeline.evaluation.choice import choose, to_record
+from pipeline.report.choice import choose, to_record
+from reskin.errors import ParamsError
 from tests.evaluation import cards
 from tests.scenes import RECIPE
 

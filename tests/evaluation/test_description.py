@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core.schema import Readings
-from pipeline.core.seeds import rng_for
-from pipeline.evaluation.description import describe, over_skins, without_rest
+from pipeline.report.description import describe, over_skins, without_rest
+from reskin.schema import Readings
+from reskin.seeds import rng_for
 
 INDENTATIONS_N, READINGS_N = 400, 5
 REST_uT = np.array([300.0, -400.0, 0.0, 1000.0, 0.0, -2500.0], np.float32)

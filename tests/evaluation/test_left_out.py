@@ -5,11 +5,10 @@ import pytest
 
 from pipeline.experiments.left_out import terms as left_out
 from pipeline.experiments.left_out.terms import AGEING, RELAXATION, measure
-from pipeline.physics.board import draw_board
-from pipeline.physics.nodes import Quadrature
-from pipeline.physics.skin import changes_of_field, draw_skin
-from pipeline.physics.viscoelastic import force_left
-from pipeline.physics.wear import softening
+from reskin.physics.aging import force_left, softening
+from reskin.physics.board import draw_board
+from reskin.physics.magnet import Quadrature
+from reskin.physics.skin import changes_of_field, draw_skin
 from tests.synthesis.scene import AGEING as SIZES
 from tests.synthesis.scene import GRID, synthesis, with_protocol
 

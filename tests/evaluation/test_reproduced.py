@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.core.io import read_json
-from pipeline.evaluation.reproduced import compare, leaves
+from pipeline.manage.compare import compare, leaves
+from reskin.io import read_json
 from tests.stages.checkout import ROOT
 
 NAMES = ("table2", "shear", "accuracy_pct", "mse_xy_mm2", "rows_n", "mean", "holds")

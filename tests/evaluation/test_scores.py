@@ -9,11 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import t, ttest_rel
 
-from pipeline.core.errors import SchemaError
-from pipeline.core.seeds import rng_for
-from pipeline.dataset.splits import Split, draw_folds
-from pipeline.evaluation.metrics import METRICS, score_groups
-from pipeline.evaluation.scores import (
+from pipeline.report.statistics import (
     AS_LABELLED,
     FEW_BOARDS,
     INCONCLUSIVE,
@@ -44,6 +40,10 @@ from pipeline.evaluation.scores import (
     whole,
     with_seeds,
 )
+from reskin.data.splits import Split, draw_folds
+from reskin.errors import SchemaError
+from reskin.metrics import METRICS, score_groups
+from reskin.seeds import rng_for
 from tests.dataset.test_splits import six_by_three_in_passes
 from tests.evaluation.cards import SKINS, card, every
 

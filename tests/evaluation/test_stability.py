@@ -6,9 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.capture import faults, stream
-from pipeline.core.config import parse, read_yaml
-from pipeline.core.errors import CaptureError
 from pipeline.experiments.stability import extremes as extremes_module
 from pipeline.experiments.stability import physics, wire
 from pipeline.experiments.stability.cases import measured, peak_bytes, refused
@@ -18,9 +15,13 @@ from pipeline.experiments.stability.physics import physics_cases, time_cases
 from pipeline.experiments.stability.run import survey
 from pipeline.experiments.stability.sliding import sliding_cases
 from pipeline.experiments.stability.wire import wire_cases
-from pipeline.physics import flow_map, force_sensor, layer, sensor, slide, slip, viscoelastic
-from pipeline.synthesis import contact
-from pipeline.synthesis.settings import Synthesis
+from reskin.board import faults, stream
+from reskin.config import parse, read_yaml
+from reskin.errors import CaptureError
+from reskin.physics import aging, chip, flow_map, force_sensor, layer, slide
+from reskin.physics import layer as slip
+from reskin.simulation import contact
+from reskin.simulation.settings import Synthesis
 
 ROOT = Path(__file__).resolve().parents[2]
 SHARED = {name: read_yaml(ROOT / "params.yaml")[name] for name in ("rig", "skin", "chip", "spreads", "terms")}
@@ -95,7 +96,7 @@ def test_deep_presses_by_a_table_that_ends_too_early_are_found_out(monkeypatch):
 
 
 def test_a_layer_of_another_compliance_is_found_out_by_every_tip(monkeypatch):
-    compliance, kept = slip.compliance, (layer.contact_of_depth, layer._force_curve)
+    compliance, kept = slip.compliance_on_slip, (layer.contact_of_depth, layer._force_curve)
     monkeypatch.setattr(slip, "compliance", lambda kh: compliance(1.5 * kh))
     for one in kept:
         one.cache_clear()
@@ -150,12 +151,12 @@ def test_the_peak_is_what_is_held_at_once():
 
 
 def test_the_naive_quotient_of_a_small_step_is_found_out(monkeypatch):
-    monkeypatch.setattr(viscoelastic, "_mean_decay", lambda x: (1 - np.exp(-x)) / np.where(x > 0, x, 1.0))
+    monkeypatch.setattr(aging, "_mean_decay", lambda x: (1 - np.exp(-x)) / np.where(x > 0, x, 1.0))
     assert "dt / tau_min 1e-16" in broken(time_cases())
 
 
 def test_time_that_may_run_backwards_is_found_out(monkeypatch):
-    monkeypatch.setattr(viscoelastic.np, "isfinite", lambda _: np.True_)
+    monkeypatch.setattr(aging.np, "isfinite", lambda _: np.True_)
     assert "a time step of inf s" in broken(time_cases())
 
 
@@ -171,7 +172,7 @@ def test_a_force_sensor_without_a_range_and_a_flag_that_never_rises_are_found_ou
 
 
 def test_a_chip_that_never_saturates_is_found_out(monkeypatch):
-    monkeypatch.setattr(sensor, "FIELD_MAX_T", 1.0)
+    monkeypatch.setattr(chip, "FIELD_MAX_T", 1.0)
     assert broken(chip_cases(DESIGN.chip, 5, SEED)) == {"60, -4 and -70 mT at GAIN_SEL 7"}
 
 

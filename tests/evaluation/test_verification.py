@@ -6,8 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.capture import stream, wire
-from pipeline.core.config import parse, read_yaml
 from pipeline.experiments.verification import poke
 from pipeline.experiments.verification.checks import Check, no_spread
 from pipeline.experiments.verification.contact import check_contact
@@ -17,11 +15,14 @@ from pipeline.experiments.verification.frames import check_frames
 from pipeline.experiments.verification.kinematics import one_small_step
 from pipeline.experiments.verification.relaxation import check_relaxation
 from pipeline.experiments.verification.run import verify
-from pipeline.physics import change, flow_map, layer, magnet, sensor, viscoelastic
-from pipeline.physics.board import draw_board
-from pipeline.physics.flow import Press
-from pipeline.physics.skin import draw_skin
-from pipeline.synthesis.settings import Synthesis
+from reskin.board import stream, wire
+from reskin.config import parse, read_yaml
+from reskin.physics import aging, chip, flow_map, layer, magnet
+from reskin.physics import magnet as change
+from reskin.physics.board import draw_board
+from reskin.physics.layer import Press
+from reskin.physics.skin import draw_skin
+from reskin.simulation.settings import Synthesis
 
 ROOT = Path(__file__).resolve().parents[2]
 SHARED = {name: read_yaml(ROOT / "params.yaml")[name] for name in ("rig", "skin", "chip", "spreads", "terms")}
@@ -145,12 +146,12 @@ def test_the_naive_quotient_of_a_small_step_is_seen(monkeypatch):
     def naive(x):
         return np.where(x > 0, (1 - np.exp(-x)) / np.where(x > 0, x, 1.0), 1.0)
 
-    monkeypatch.setattr(viscoelastic, "_mean_decay", naive)
+    monkeypatch.setattr(aging, "_mean_decay", naive)
     assert any("one step" in law for law in broken(check_relaxation()))
 
 
 def test_a_wrong_step_of_the_chip_is_seen(monkeypatch):
-    monkeypatch.setattr(sensor, "STEP_AT_GAIN_ONE_uT", (0.161, 0.161, 0.294))  # the data sheet's other HALLCONF
+    monkeypatch.setattr(chip, "STEP_AT_GAIN_ONE_uT", (0.161, 0.161, 0.294))  # the data sheet's other HALLCONF
     wrong = broken(check_electronics(DESIGN.chip, SEED))
     assert "chip: uT a count, GAIN_SEL 6 and 7" in wrong
     assert "chip: past its range, GAIN_SEL 7, to 50 mT" in wrong

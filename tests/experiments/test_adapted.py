@@ -5,9 +5,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core.seeds import rng_for
-from pipeline.evaluation.metrics import METRICS, score, score_groups
-from pipeline.evaluation.scores import by_skin, paired, tidy
 from pipeline.experiments.flexible.run import (
     DRAWN_N,
     answer_flexible,
@@ -17,7 +14,10 @@ from pipeline.experiments.flexible.run import (
     strength_ratio,
 )  # fmt: skip
 from pipeline.experiments.manual.run import GRID, answer_manual
-from pipeline.trials.arms import AFTER, BEFORE, CONTROL, Answered, bias, biases, compare_arms, summarise_arms
+from pipeline.report.statistics import by_skin, paired, tidy
+from pipeline.training.variants import AFTER, BEFORE, CONTROL, Answered, bias, biases, compare_arms, summarise_arms
+from reskin.metrics import METRICS, score, score_groups
+from reskin.seeds import rng_for
 from tests.evaluation.cards import card
 
 SINGLE = 1e-4  # sums of single-precision forces of some newtons

@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.constants import micro
 
-from pipeline.core.seeds import rng_for
 from pipeline.experiments.ambient.fields import (
     by_step,
     guessed_uT,
@@ -22,8 +21,9 @@ from pipeline.experiments.ambient.fields import (
     uniform_cases,
     without_common_part,
 )
-from pipeline.physics.sensor import ChipDesign, read_field, steps_uT
-from pipeline.physics.skin import draw_skin
+from reskin.physics.chip import ChipDesign, read_field, steps_uT
+from reskin.physics.skin import draw_skin
+from reskin.seeds import rng_for
 from tests.synthesis.scene import SECTIONS, synthesis
 
 NO_SPREAD = {name: 0.0 for name in SECTIONS["spreads"] if name != "skin_filler_length_mm"}

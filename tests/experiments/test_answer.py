@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.core import io
-from pipeline.core.errors import SchemaError
 from pipeline.experiments.answer import only, read_losses, write_answer
+from reskin import io
+from reskin.errors import SchemaError
 from tests.dataset import tables
 
 

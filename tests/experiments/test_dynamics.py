@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core.seeds import rng_for
 from pipeline.experiments.dynamics.run import WINDOW_N, compare, lag_ms, presses_of, running_mean
+from reskin.seeds import rng_for
 
 RATE_HZ = 400.0
 

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from pipeline.core.seeds import rng_for
 from pipeline.experiments.dynamics import show as dynamics
 from pipeline.experiments.sensitivity import show as sensitivity
 from pipeline.experiments.sensitivity.run import answer_of
+from reskin.seeds import rng_for
 
 ERROR = {"mean": 0.5, "sd": 0.1, "n": 3}
 RISES = "mean response rises at every step that stands out of noise"

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from pipeline.core.seeds import rng_for
 from pipeline.experiments.gripper import show
 from pipeline.experiments.gripper.run import Finger, Gripper, Press, _scaled, answer_of, grip, judge
+from reskin.seeds import rng_for
 
 FORCE_N = np.linspace(0, 3, 31)
 ALONG = np.arange(1.0, 16.0)

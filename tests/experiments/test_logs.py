@@ -5,21 +5,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core.errors import CaptureError
-from pipeline.core.seeds import rng_for
 from pipeline.experiments.ambient.fields import Instrument
-from pipeline.experiments.logs.estimates import (
-    contacts_n,
-    describe,
-    estimate,
-    quiet_start,
-    score_contacts,
-    thin,
-    truth_at,
-)
 from pipeline.experiments.logs.run import PERIOD_S, PITCHES_DEG, Log, earth_T, step_period_s, swing, turn_log
-from pipeline.physics.ambient import EARTH_DIP_DEG, EARTH_SIZE_T, EARTH_T
-from pipeline.physics.board import Board
+from reskin.errors import CaptureError
+from reskin.live.contacts import contacts_n, describe, estimate, quiet_start, score_contacts, thin, truth_at
+from reskin.physics.ambient import EARTH_DIP_DEG, EARTH_SIZE_T, EARTH_T
+from reskin.physics.board import Board
+from reskin.seeds import rng_for
 
 RATE_HZ = 250.0
 NOISE_uT = 3.0

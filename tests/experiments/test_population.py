@@ -6,15 +6,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipeline.core.errors import SchemaError
-from pipeline.core.seeds import rng_for
-from pipeline.dataset.rows import Rows
-from pipeline.dataset.splits import Fold
 from pipeline.experiments.population import show, taught
 from pipeline.experiments.population.run import _weight, cases, over_boards
-from pipeline.synthesis.settings import BoardKind
-from pipeline.trials.experts import Frame
-from pipeline.twin.population import Population
+from pipeline.training.universal import Frame
+from reskin.data.rows import Rows
+from reskin.data.splits import Fold
+from reskin.errors import SchemaError
+from reskin.seeds import rng_for
+from reskin.simulation.settings import BoardKind
+from reskin.universal.population import Population
 from tests.twin.skins import DESIGN, made_population
 
 KIND = BoardKind(

@@ -8,8 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import linregress, norm, spearmanr
 
-from pipeline.core.errors import SchemaError
-from pipeline.core.seeds import rng_for
 from pipeline.experiments.sensitivity.run import (
     answer_of,
     direction,
@@ -18,6 +16,8 @@ from pipeline.experiments.sensitivity.run import (
     smallest_step_N,
     told_apart,
 )
+from reskin.errors import SchemaError
+from reskin.seeds import rng_for
 
 STEP_N = 0.02
 WEIGHT_N = STEP_N * np.arange(26)

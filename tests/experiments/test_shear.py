@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.metrics import mean_squared_error, r2_score
 
-from pipeline.core.seeds import rng_for
 from pipeline.experiments.shear.run import answer_shear, score5
+from reskin.seeds import rng_for
 
 
 def drawn(seed: int, f: int = 40) -> tuple[np.ndarray, np.ndarray]:

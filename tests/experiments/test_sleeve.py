@@ -6,10 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.metrics import mean_squared_error
 
-from pipeline.core.errors import ParamsError
-from pipeline.core.schema import Readings
-from pipeline.core.seeds import rng_for
-from pipeline.dataset.rows import Rows
 from pipeline.experiments.sleeve.run import (
     NEAR_MM,
     Area,
@@ -21,6 +17,10 @@ from pipeline.experiments.sleeve.run import (
     score_places,
     to_draw,
 )
+from reskin.data.rows import Rows
+from reskin.errors import ParamsError
+from reskin.schema import Readings
+from reskin.seeds import rng_for
 
 CROSS_MM = [(x + a, y + b) for y in (-38.1, -12.7, 12.7, 38.1) for x in (-12.7, 12.7) for a, b in ((0, 0), (7, 0))]
 AREA = lay_out((50.8, 101.6), CROSS_MM, boards_n=(2, 4), pitch_mm=25.4)

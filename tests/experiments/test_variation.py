@@ -3,8 +3,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core.errors import ParamsError
-from pipeline.core.seeds import rng_for
 from pipeline.experiments.variation.run import (
     LINES_MAX_N,
     Visits,
@@ -13,6 +11,8 @@ from pipeline.experiments.variation.run import (
     over_skins,
     over_time,
 )
+from reskin.errors import ParamsError
+from reskin.seeds import rng_for
 from tests.dataset.tables import readings
 
 

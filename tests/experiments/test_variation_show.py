@@ -1,7 +1,7 @@
 import xml.etree.ElementTree as ET
 
 from pipeline.experiments.variation.show import figures, tables
-from pipeline.reporting.shown import to_markdown
+from pipeline.report.formatting import to_markdown
 
 
 def numbers(skins: tuple[str, ...] = ("s0", "s1")) -> dict:

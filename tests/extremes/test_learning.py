@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.dataset import splits
 from pipeline.experiments.stability import learning
 from pipeline.experiments.stability.learning import fold_cases, learning_cases, scaling_cases, triplet_cases
-from pipeline.learning import inputs, job, model, train, trial, triplets
+from reskin.data import splits
+from reskin.models import inputs, losses, network, train, trial
+from reskin.models import train as job
 
 SEED = 2021
 ROWS, TRIAL = learning._rows(SEED), learning._trial(SEED)
@@ -65,7 +66,7 @@ def test_a_triplet_loss_of_roots_is_found_out(monkeypatch):
 
 
 def test_a_sampler_that_takes_ties_is_found_out(monkeypatch):
-    monkeypatch.setattr(triplets, "_anchors", lambda place: np.ones(len(place), bool))
+    monkeypatch.setattr(losses, "_anchors", lambda place: np.ones(len(place), bool))
     monkeypatch.setattr(job, "draw_pairs", lambda points, anchor, rng: (anchor, anchor))
     assert broken(triplet_cases(SEED)) == {"two pokes a skin: from each, only the other one"}
 
@@ -88,13 +89,13 @@ def test_a_network_that_died_and_is_taken_as_sound_is_found_out(monkeypatch):
 
 
 def test_a_network_that_touches_its_neighbour_is_found_out(monkeypatch):
-    right = model.Stack.features
+    right = network.Stack.features
 
     def mixed(self, inputs):
         features = right(self, inputs)
         return features + 0 * features.sum(0, keepdim=True)
 
-    monkeypatch.setattr(model.Stack, "features", mixed)
+    monkeypatch.setattr(network.Stack, "features", mixed)
     assert not learning._beside_one_that_overflows(TRIAL, ROWS).holds
 
 

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pipeline.core import io
+from reskin import io
 from tests.faults import files, kills, together, tracking  # noqa: F401 (each enters its faults)
 from tests.faults.place import ROOT, Checkout, copy, make_template
 from tests.faults.row import CASES, Row, line, not_run, table

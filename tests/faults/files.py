@@ -5,7 +5,7 @@ import shutil
 import subprocess
 from pathlib import Path
 
-from pipeline.core import io
+from reskin import io
 from tests.faults.kills import address
 from tests.faults.place import SCENE, Checkout
 from tests.faults.row import NOT_RUN, Row, fault, judge

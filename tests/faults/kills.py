@@ -5,7 +5,7 @@ import time
 
 import psutil
 
-from pipeline.core import io
+from reskin import io
 from tests.faults.place import SCENE, Checkout, Said, alive
 from tests.faults.row import Row, fault, judge
 

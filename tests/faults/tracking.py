@@ -14,8 +14,8 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
-from pipeline.core import io
-from pipeline.core.server import TrackingAway, probe
+from pipeline.tracking import TrackingAway, probe
+from reskin import io
 from tests.faults.place import SCENE, Checkout, Said
 from tests.faults.row import NOT_RUN, Row, fault, judge
 

@@ -65,7 +65,7 @@ def resident_MB() -> float:
 
 def draw(name: str, seconds: int, keep: Path | None) -> None:
     """Change, cut and repeat what the corpus has, and what was kept."""
-    from pipeline.core.seeds import rng_for
+    from reskin.seeds import rng_for
     from tests.fuzz.targets import feed
 
     rng, tried_n, end_s = rng_for(time.time_ns() % 2**31, "fuzz", name), 0, time.monotonic() + seconds

@@ -15,20 +15,20 @@ import numpy as np
 from aiohttp import web
 from aiohttp.test_utils import make_mocked_request
 
-from pipeline.capture import arrivals, header, probe, sd_card
-from pipeline.capture.header import PROBE_FILE, Wire
-from pipeline.capture.labels import Dwell, ProbeTape
-from pipeline.capture.readers import READERS
-from pipeline.capture.samples import Dwells, Gauge, Table
-from pipeline.capture.stream import FrameStream
-from pipeline.core.errors import ReskinError
-from pipeline.core.seeds import rng_for
-from pipeline.labelling.places import parse_places
-from pipeline.labelling.prompts import Prompts
-from pipeline.live import ports
-from pipeline.live.server import Server
-from pipeline.live.session import Live
-from pipeline.predicting import read_network
+from reskin.board import find
+from reskin.board.stream import FrameStream
+from reskin.errors import ReskinError
+from reskin.live.server import Server
+from reskin.live.session import Live
+from reskin.predicting import read_network
+from reskin.recordings import clocks, header, probe
+from reskin.recordings.header import PROBE_FILE, Wire
+from reskin.recordings.labelling.places import parse_places
+from reskin.recordings.labelling.prompts import Prompts
+from reskin.recordings.labels import Dwell, ProbeTape
+from reskin.recordings.readers import READERS, sd_card
+from reskin.recordings.samples import Dwells, Gauge, Table
+from reskin.seeds import rng_for
 from tests.capture.headers import AS_USUAL, make_header
 
 FOLDER = Path(tempfile.mkdtemp(prefix="reskin-fuzz-"))
@@ -160,9 +160,9 @@ def _files(layout: str, names: tuple[str, ...], **options: str) -> Callable[[byt
 
 TARGETS: Mapping[str, Callable[[bytes], None]] = {
     "stream": stream,
-    "recognise": lambda data: str(ports.recognise("port", [(data, 0.0), (b"", 1.0)])) and None,
+    "recognise": lambda data: str(find.recognise("port", [(data, 0.0), (b"", 1.0)])) and None,
     "header": lambda data: header.parse(data.decode(errors="replace"), "header") and None,
-    "arrivals": lambda data: arrivals.parse(data.decode(errors="replace"), "arrivals") and None,
+    "arrivals": lambda data: clocks.parse(data.decode(errors="replace"), "arrivals") and None,
     "probe": lambda data: probe.parse(data.decode(errors="replace"), "probe") and None,
     "log": _log,
     "table": _reader("table", "readings.csv"),

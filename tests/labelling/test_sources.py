@@ -9,16 +9,16 @@ from itertools import count, repeat
 import numpy as np
 import pytest
 
-from pipeline.capture import probe
-from pipeline.capture.header import PROBE_FILE
-from pipeline.capture.labels import Label, ProbeTape
-from pipeline.core.errors import CaptureError, ParamsError
-from pipeline.core.seeds import rng_for
-from pipeline.labelling.gauge import Forces, from_gauge
-from pipeline.labelling.places import parse_places
-from pipeline.labelling.prompts import Prompts
-from pipeline.labelling.source import Desk, Labeller, Source, from_program
-from pipeline.labelling.table import from_table
+from reskin.errors import CaptureError, ParamsError
+from reskin.recordings import probe
+from reskin.recordings.header import PROBE_FILE
+from reskin.recordings.labelling.gauge import Forces, from_gauge
+from reskin.recordings.labelling.places import parse_places
+from reskin.recordings.labelling.prompts import Prompts
+from reskin.recordings.labelling.source import Desk, Labeller, Source, from_program
+from reskin.recordings.labelling.table import from_table
+from reskin.recordings.labels import Label, ProbeTape
+from reskin.seeds import rng_for
 
 DWELL_s = 0.002
 LONG_S = 120.0  # for what must not happen in a test that passes
@@ -158,8 +158,8 @@ class Telling:
 def telling(monkeypatch):
     def tell(chunks):
         gauge = Telling(chunks)
-        monkeypatch.setattr("pipeline.labelling.gauge.open_port", lambda *_: gauge)
-        monkeypatch.setattr("pipeline.labelling.gauge.read_waiting", Telling.read)
+        monkeypatch.setattr("reskin.recordings.labelling.gauge.open_port", lambda *_: gauge)
+        monkeypatch.setattr("reskin.recordings.labelling.gauge.read_waiting", Telling.read)
         return gauge
 
     return tell

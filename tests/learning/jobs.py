@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from pipeline.core.seeds import rng_for
-from pipeline.learning.job import Job, Labelled, Unlabelled
-from pipeline.learning.model import draw_weights, paper_layers
-from pipeline.learning.triplets import make_points
+from reskin.models.losses import make_points
+from reskin.models.network import draw_weights, paper_layers
+from reskin.models.train import Job, Labelled, Unlabelled
+from reskin.seeds import rng_for
 
 
 def some_weights(*names: str | int) -> dict[str, np.ndarray]:

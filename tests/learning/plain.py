@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from torch import nn
 
-from pipeline.learning.job import UNLABELLED, Batch
-from pipeline.learning.recipe import Schedule
-from pipeline.learning.trial import Terms
+from reskin.models.recipe import Schedule
+from reskin.models.train import UNLABELLED, Batch
+from reskin.models.trial import Terms
 
 # paper section 4: B(15) -> MLP+ReLU(200) -> MLP(200) -> MLP(40) -> MLP+ReLU(200) -> MLP+ReLU(200) -> xyF(3)
 PAPER = ("15-200", "ReLU", "200-200", "200-40", "40-200", "ReLU", "200-200", "ReLU", "200-3")

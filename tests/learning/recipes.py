@@ -1,6 +1,6 @@
 """Recipes small enough for tests."""
 
-from pipeline.learning.recipe import Recipe
+from reskin.models.recipe import Recipe
 
 
 def recipe(**changes: object) -> Recipe:

@@ -3,10 +3,10 @@
 import numpy as np
 import torch
 
-from pipeline.core.seeds import rng_for
-from pipeline.learning.adversarial import Domains, rising, train_adversarial, turned_back
-from pipeline.learning.model import Stack, paper_layers
-from pipeline.learning.recipe import Schedule
+from reskin.models.adversarial import Domains, rising, train_adversarial, turned_back
+from reskin.models.network import Stack, paper_layers
+from reskin.models.recipe import Schedule
+from reskin.seeds import rng_for
 from tests.learning.jobs import some_rows
 
 SCHEDULE = Schedule(steps_n=600, batch_n=32, rate_max=3e-3, gradient_norm_max=1.0, weight_decay=0.0)

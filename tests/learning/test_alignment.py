@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.linalg import sqrtm
 
-from pipeline.core.seeds import rng_for
-from pipeline.learning.alignment import RIDGES, choose_ridge, coral, direct, match_channels
+from reskin.models.alignment import RIDGES, choose_ridge, coral, direct, match_channels
+from reskin.seeds import rng_for
 
 
 def drawn(name: str, n: int = 80, c: int = 4) -> np.ndarray:

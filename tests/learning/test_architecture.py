@@ -2,14 +2,8 @@ import numpy as np
 import pytest
 from torch import nn
 
-from pipeline.core.seeds import rng_for
-from pipeline.learning.model import (
-    FEATURE_LAYERS_N,
-    FEATURES_N,
-    LAYERS,
-    draw_weights,
-    paper_layers,
-)
+from reskin.models.network import FEATURE_LAYERS_N, FEATURES_N, LAYERS, draw_weights, paper_layers
+from reskin.seeds import rng_for
 from tests.learning.plain import PRINTED
 
 

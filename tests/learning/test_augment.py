@@ -2,9 +2,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core.seeds import rng_for
-from pipeline.learning.job import virtual_boards
-from pipeline.learning.recipe import Augmentation
+from reskin.models.recipe import Augmentation
+from reskin.models.train import virtual_boards
+from reskin.seeds import rng_for
 
 SKIN = np.array(["s1", "s1", "s2", "s1", "s2"])
 

@@ -10,11 +10,10 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter
 from sklearn.linear_model import Ridge
 
-from pipeline.core.seeds import rng_for
-from pipeline.learning import baselines
-from pipeline.learning.baselines import Fit, Task, run_tasks
-from pipeline.learning.classical import Classical, fit
-from pipeline.learning.trial import Measured
+from reskin.models import classical
+from reskin.models.classical import Classical, Fit, Task, fit, run_tasks
+from reskin.models.trial import Measured
+from reskin.seeds import rng_for
 
 SETTINGS = {
     "ridge": {"method": "ridge", "alpha": 1.0},
@@ -70,7 +69,7 @@ def fits(monkeypatch) -> list[dict[str, Any]]:
         seen.append({"inputs": inputs, "target": target, "weight": weight})
         return fit(one, inputs, target, rng, weight=weight)
 
-    monkeypatch.setattr(baselines, "fit", listening)
+    monkeypatch.setattr(classical, "fit", listening)
     return seen
 
 
@@ -118,7 +117,7 @@ def test_the_weights_of_both_kinds_sum_to_the_same_however_many_there_are(own_n,
             weights.append(weight)
             return fit(one, inputs, target, rng, weight=weight)
 
-        patch.setattr(baselines, "fit", listening)
+        patch.setattr(classical, "fit", listening)
         answered(task(few_labels=np.arange(60, 60 + own_n), rows_max_n=rows_max_n))
     (weight,) = weights
     others, own = weight[:-own_n], weight[-own_n:]

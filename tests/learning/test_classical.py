@@ -8,10 +8,9 @@ from pydantic import TypeAdapter, ValidationError
 from sklearn.linear_model import Ridge
 from sklearn.preprocessing import PolynomialFeatures
 
-from pipeline.core.errors import TrainingError
-from pipeline.core.seeds import rng_for
-from pipeline.learning.classical import Classical, Fitted, fit
-from pipeline.learning.regressors import BLOCK_ROWS_N
+from reskin.errors import TrainingError
+from reskin.models.classical import BLOCK_ROWS_N, Classical, Fitted, fit
+from reskin.seeds import rng_for
 
 SETTINGS = {
     "ridge": {"method": "ridge", "alpha": 1.0},

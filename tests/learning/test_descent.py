@@ -4,7 +4,7 @@ import sys
 import pytest
 import torch
 
-from pipeline.learning.train import AdamW, one_cycle
+from reskin.models.train import AdamW, one_cycle
 
 
 def weights() -> list[torch.Tensor]:
@@ -34,7 +34,7 @@ def test_it_moves_weights_as_torch_does_bit_for_bit(steps_n, weight_decay):
 def test_training_imports_no_compiler():
     """It takes a process that trains two seconds, and nothing here is compiled."""
     code = (
-        "import sys\nfrom pipeline.learning.train import train\nfrom pipeline.learning.trial import Terms\n"
+        "import sys\nfrom reskin.models.train import train\nfrom reskin.models.trial import Terms\n"
         "from tests.learning.jobs import some_job\nfrom tests.learning.recipes import recipe\n"
         "train([some_job(0)], 'paper', recipe(steps_n=2), Terms(0.0), 'cpu')\n"
         "sys.exit('torch._dynamo' in sys.modules)"

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.learning.job import UNLABELLED, Batch, Feed, Job
+from reskin.models.train import UNLABELLED, Batch, Feed, Job
 from tests.learning.jobs import some_job
 
 STEPS_N, BATCH_N = 20, 16

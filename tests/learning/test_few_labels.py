@@ -9,16 +9,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.core.config import parse
-from pipeline.core.errors import ParamsError
-from pipeline.core.seeds import rng_for
-from pipeline.dataset.rows import Rows
-from pipeline.dataset.splits import Split, draw_folds
-from pipeline.learning import few_labels as few
-from pipeline.learning.baselines import Baselines, Task
-from pipeline.learning.few_labels import FewLabels as Settings
-from pipeline.learning.job import make_job
-from pipeline.learning.trial import Adapting, FewLabels, Keys, Measured, Trained, Trial
+from pipeline.training import few_labels as few
+from pipeline.training.few_labels import FewLabels as Settings
+from reskin.config import parse
+from reskin.data.rows import Rows
+from reskin.data.splits import Split, draw_folds
+from reskin.errors import ParamsError
+from reskin.models.classical import Baselines, Task
+from reskin.models.train import make_job
+from reskin.models.trial import Adapting, FewLabels, Keys, Measured, Trained, Trial
+from reskin.seeds import rng_for
 from tests.scenes import RECIPE
 
 SKINS = ("b0_s0", "b0_s1", "b1_s0", "b2_s0")

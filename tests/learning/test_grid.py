@@ -8,14 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core import io
-from pipeline.core.errors import ReskinError, TrainingError
-from pipeline.core.executors import make_executor
-from pipeline.learning import train
-from pipeline.learning.grid import STACK_N, run_trials, stacks
-from pipeline.learning.job import make_job
-from pipeline.learning.train import JUDGED_STEPS_N, train_stack
-from pipeline.learning.trial import Trained, Trial
+from pipeline.executors import make_executor
+from reskin import io
+from reskin.errors import ReskinError, TrainingError
+from reskin.models import train
+from reskin.models.grid import STACK_N, run_trials, stacks
+from reskin.models.train import JUDGED_STEPS_N, make_job, train_stack
+from reskin.models.trial import Trained, Trial
 from tests.learning.recipes import recipe
 from tests.learning.trials import TRAIN, adapting, few_labels, measured, pooled, without_triplets
 
@@ -141,7 +140,7 @@ def test_a_network_that_does_not_fit_into_memory_is_said_so(tmp_path, monkeypatc
 
     monkeypatch.setattr(train, "train_stack", allocate)
     with pytest.raises(MemoryError, match="8000000000 bytes"):
-        run(trials(), tmp_path, make_executor(1, imports="pipeline.learning.train"))
+        run(trials(), tmp_path, make_executor(1, imports="reskin.models.train"))
 
 
 def test_a_training_that_cannot_be_is_one_sentence_that_names_its_cell(tmp_path):
@@ -275,7 +274,7 @@ def test_a_target_that_is_unknown_or_never_changes_judges_nobody(tmp_path):
 def test_trainings_in_a_process_of_their_own_are_the_same(tmp_path, monkeypatch):
     monkeypatch.setenv("RESKIN_EXECUTOR", "processes:1")
     some = [adapting(), few_labels()]
-    with make_executor(imports="pipeline.learning.train") as executor:
+    with make_executor(imports="reskin.models.train") as executor:
         apart = run(some, tmp_path / "apart", executor)
     assert all(alike(a, b) for a, b in zip(apart, run(some, tmp_path / "here"), strict=True))
 

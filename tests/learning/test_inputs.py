@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core.seeds import rng_for
-from pipeline.learning.inputs import VIEW, DB_FLOOR_uT
+from reskin.models.inputs import VIEW, DB_FLOOR_uT
+from reskin.seeds import rng_for
 
 SHAPE_ATOL = 1e-6  # a component is at most 1, and is rounded to float32 (6e-8) a few times
 LOG_ATOL = 1e-5  # a log of up to 17, rounded to float32 (6e-8 of it) a few times

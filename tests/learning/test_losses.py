@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import special_ortho_group
 
-from pipeline.core.seeds import rng_for
-from pipeline.learning.train import squared_error, triplet
+from reskin.models.train import squared_error, triplet
+from reskin.seeds import rng_for
 
 M, B, D = 3, 7, 40
 SUM_RTOL = 1e-5  # float32 sums of up to 280 terms

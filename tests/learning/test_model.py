@@ -3,9 +3,9 @@ import pytest
 import torch
 from torch import nn
 
-from pipeline.core.seeds import rng_for
-from pipeline.learning import model
-from pipeline.learning.model import LAYERS, Predictor, Stack, draw_weights
+from reskin.models import network
+from reskin.models.network import LAYERS, Predictor, Stack, draw_weights
+from reskin.seeds import rng_for
 from tests.learning.plain import features_of, plain_net, weights_of
 
 # float32 sums of up to 200 terms, in another order, six layers deep; numbers near 1
@@ -115,7 +115,7 @@ def test_the_released_network_answers_no_number_below_zero():
 @pytest.mark.parametrize("block_n", [1, 7, 16, 100])
 def test_prediction_does_not_depend_on_the_block(monkeypatch, block_n):
     inputs = batch(1)[0].numpy()
-    monkeypatch.setattr(model, "BLOCK_ROWS_N", block_n)
+    monkeypatch.setattr(network, "BLOCK_ROWS_N", block_n)
     predict = Predictor(drawn(), "paper", "cpu")
     answers = predict(inputs)
     one_by_one = np.concatenate([predict(row[None]) for row in inputs])

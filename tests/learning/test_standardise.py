@@ -2,8 +2,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core.seeds import rng_for
-from pipeline.learning.inputs import SCALE_FLOOR, Scaler, fit_released, fit_standard
+from reskin.models.inputs import SCALE_FLOOR, Scaler, fit_released, fit_standard
+from reskin.seeds import rng_for
 
 
 def rows(n: int = 50, ch: int = 6) -> tuple[np.ndarray, np.ndarray]:

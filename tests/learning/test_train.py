@@ -6,12 +6,11 @@ import pytest
 import torch
 from torch import nn
 
-from pipeline.core.seeds import rng_for
-from pipeline.learning.job import Feed, Job, Labelled
-from pipeline.learning.model import Stack, paper_layers
-from pipeline.learning.recipe import Recipe
-from pipeline.learning.train import BLOCK_STEPS_N, Outcome, Watch, clip, train
-from pipeline.learning.trial import Terms, Weights
+from reskin.models.network import Stack, paper_layers
+from reskin.models.recipe import Recipe
+from reskin.models.train import BLOCK_STEPS_N, Feed, Job, Labelled, Outcome, Watch, clip, train
+from reskin.models.trial import Terms, Weights
+from reskin.seeds import rng_for
 from tests.learning.jobs import some_job, some_weights
 from tests.learning.plain import plain_net, plain_train
 from tests.learning.recipes import recipe

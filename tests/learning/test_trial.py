@@ -5,12 +5,11 @@ import grimp
 import numpy as np
 import pytest
 
-from pipeline.dataset.lines import Lines
-from pipeline.learning import trial as trial_module
-from pipeline.learning.job import Feed, make_job
-from pipeline.learning.recipe import AugmentedRecipe
-from pipeline.learning.train import train_stack
-from pipeline.learning.trial import DECIDING, Keys, Measured, Terms, Trained, Trial
+from reskin.data.lines import Lines
+from reskin.models import trial as trial_module
+from reskin.models.recipe import AugmentedRecipe
+from reskin.models.train import Feed, make_job, train_stack
+from reskin.models.trial import DECIDING, Keys, Measured, Terms, Trained, Trial
 from tests.learning.recipes import recipe
 from tests.learning.trials import (
     OWN,
@@ -287,7 +286,7 @@ NOT_DECIDING = {
 
 def test_all_code_that_a_training_runs_through_is_part_of_its_key():
     graph = grimp.build_graph("pipeline", cache_dir=None)
-    modules = {"pipeline.learning.train", *graph.find_upstream_modules("pipeline.learning.train")}
+    modules = {"reskin.models.train", *graph.find_upstream_modules("reskin.models.train")}
     imported = {module for module in modules if not graph.find_children(module)}
     others = {f"pipeline.{name}" for name in NOT_DECIDING}
     assert imported - others == set(DECIDING)

@@ -3,9 +3,9 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from pipeline.core.errors import TrainingError
-from pipeline.core.seeds import rng_for
-from pipeline.learning.triplets import Points, draw_pairs, make_points
+from reskin.errors import TrainingError
+from reskin.models.losses import Points, draw_pairs, make_points
+from reskin.seeds import rng_for
 
 DRAWN_N = 400
 ROW = np.arange(5, dtype=np.float64)[:, None]  # five pokes of a line, placed by index

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.core.seeds import rng_for
-from pipeline.dataset.lines import Lines, hand_lines
-from pipeline.learning.inputs import fit_standard
-from pipeline.learning.model import draw_weights, paper_layers
-from pipeline.learning.recipe import FineTuning, Labelling
-from pipeline.learning.trial import Adapting, FewLabels, Measured, Start, Trial
+from reskin.data.lines import Lines, hand_lines
+from reskin.models.inputs import fit_standard
+from reskin.models.network import draw_weights, paper_layers
+from reskin.models.recipe import FineTuning, Labelling
+from reskin.models.trial import Adapting, FewLabels, Measured, Start, Trial
+from reskin.seeds import rng_for
 from tests.learning.recipes import recipe
 
 ROWS_N = 48  # twelve a skin

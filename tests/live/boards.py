@@ -7,16 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.capture import arrivals
-from pipeline.capture.header import ARRIVALS_FILE, STREAM_FILE, Clock, Wire, write_capture
-from pipeline.capture.wire import Frames
-from pipeline.core import io
-from pipeline.core.seeds import rng_for
-from pipeline.learning.model import draw_weights, paper_layers
-from pipeline.live.answering import Models
-from pipeline.live.emulate import open_far_end, play
-from pipeline.live.script import Script, encode_pieces
-from pipeline.live.skin import Readings, Skin
+from reskin import io
+from reskin.board.wire import Frames
+from reskin.live.answering import Models
+from reskin.live.emulator import Script, encode_pieces, open_far_end, play
+from reskin.live.tracker import Readings, Skin
+from reskin.models.network import draw_weights, paper_layers
+from reskin.recordings import clocks
+from reskin.recordings.header import ARRIVALS_FILE, STREAM_FILE, Clock, Wire, write_capture
+from reskin.seeds import rng_for
 from tests.capture.headers import make_header
 
 RATE_HZ = 400.0
@@ -74,7 +73,7 @@ def write_script(script: Script, folder: Path) -> Path:
     ends = np.cumsum([len(piece) for piece in script.pieces])
     files = {
         STREAM_FILE: b"".join(script.pieces),
-        ARRIVALS_FILE: arrivals.render(arrivals.Arrivals(ends, 5 + script.t_s)).encode(),
+        ARRIVALS_FILE: clocks.render(clocks.Arrivals(ends, 5 + script.t_s)).encode(),
     }
     clock = Clock(kind="arrivals", rate_hz=None, marks=())
     chips_n = script.frames.temperature_degC.shape[1]

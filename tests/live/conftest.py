@@ -7,5 +7,5 @@ LONG_S = 120.0
 
 @pytest.fixture(autouse=True)
 def patient(monkeypatch):
-    monkeypatch.setattr("pipeline.live.skin.OPENING_S", LONG_S)
-    monkeypatch.setattr("pipeline.live.server.HEARTBEAT_S", LONG_S)  # a test answers a ping when it has read all before
+    monkeypatch.setattr("reskin.live.tracker.OPENING_S", LONG_S)
+    monkeypatch.setattr("reskin.live.server.HEARTBEAT_S", LONG_S)  # a test answers a ping when it has read all before

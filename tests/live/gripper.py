@@ -11,13 +11,13 @@ import numpy as np
 from sklearn.neural_network import MLPRegressor
 
 import reskin
-from pipeline.capture.wire import Frames
-from pipeline.core.seeds import rng_for
-from pipeline.learning.inputs import Scaler, fit_standard
-from pipeline.live.answering import Models
-from pipeline.live.script import encode_pieces
-from pipeline.live.skin import Skin
-from pipeline.trials.networks import Network
+from reskin.board.wire import Frames
+from reskin.live.answering import Models
+from reskin.live.emulator import encode_pieces
+from reskin.live.tracker import Skin
+from reskin.models.inputs import Scaler, fit_standard
+from reskin.models.trained import Network
+from reskin.seeds import rng_for
 from tests.live.boards import RATE_HZ
 
 AIM_N, GAIN_MM_N = 0.5, 0.1

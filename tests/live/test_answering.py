@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 import reskin
-from pipeline.core.errors import ParamsError
-from pipeline.core.seeds import rng_for
-from pipeline.live.adapting import POKES_N, Pokes, ShownPokes
-from pipeline.live.answering import Map
-from pipeline.live.script import Script, encode_pieces
-from pipeline.live.skin import UNLIKE, Readings
-from pipeline.predicting import read_models
-from pipeline.twin.shipped import load_universal
+from reskin.errors import ParamsError
+from reskin.live.answering import Map
+from reskin.live.calibrating import POKES_N, Pokes, ShownPokes
+from reskin.live.emulator import Script, encode_pieces
+from reskin.live.tracker import UNLIKE, Readings
+from reskin.predicting import read_models
+from reskin.seeds import rng_for
+from reskin.universal.model import load_universal
 from tests.live.boards import make_script, played
 
 QUIET_N, POKED_N = 600, 100

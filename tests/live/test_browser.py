@@ -19,10 +19,10 @@ import aiohttp
 import numpy as np
 import pytest
 
-from pipeline.capture.header import HEADER_FILE
-from pipeline.live.adapting import POKES_N
-from pipeline.predicting import read_network
-from pipeline.twin.shipped import load_universal
+from reskin.live.calibrating import POKES_N
+from reskin.predicting import read_network
+from reskin.recordings.header import HEADER_FILE
+from reskin.universal.model import load_universal
 from tests.live.boards import PLACES, make_script, plugged_in, write_model, zeros_asked
 from tests.live.test_answering import poked, pressed, simulated  # noqa: F401 - fixtures
 from tests.live.test_server import LONG_S, serve

@@ -6,10 +6,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from pipeline.core.seeds import rng_for
 from pipeline.experiments.stability.wire import deliver
-from pipeline.live.inject import PIECES, VALUES, Fault, inject
-from pipeline.live.script import Script, encode_pieces
+from reskin.live.emulator import PIECES, VALUES, Fault, Script, encode_pieces, inject
+from reskin.seeds import rng_for
 from tests.capture.signals import TEXT_WIRES, WIRES, make_frames
 
 SLOTS_N, SLOT_FRAMES_N, RATE_HZ = 8, 12, 400.0  # a fault has a slot of its own; the last slot has none

@@ -5,10 +5,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from pipeline.capture.header import HEADER_FILE, STREAM_FILE, parse
-from pipeline.live import commands, ports
-from pipeline.live.inject import inject
-from pipeline.live.inject import parse as parse_fault
+from reskin.board import find
+from reskin.live import commands
+from reskin.live.emulator import inject, parse_fault
+from reskin.recordings.header import HEADER_FILE, STREAM_FILE, parse
 from tests.live.boards import make_script, plugged_in
 
 UNTOLD = {"board": None, "skin": None, "wire": None, "chips_n": None, "baud": 115200, "scan": None}
@@ -22,13 +22,13 @@ def clock(tmp_path, monkeypatch):
     def monotonic() -> float:
         return sum(stream.stat().st_size for stream in tmp_path.rglob(STREAM_FILE)) / RATE_BYTES_S
 
-    monkeypatch.setattr("pipeline.capture.port.time", SimpleNamespace(monotonic=monotonic, time=time.time))
+    monkeypatch.setattr("reskin.board.port.time", SimpleNamespace(monotonic=monotonic, time=time.time))
 
 
 def test_a_recording_needs_no_option_when_one_board_is_there(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     with plugged_in(make_script(chips_n=4, wire="text-txyz"), loop=True) as name:
-        monkeypatch.setattr(ports, "port_names", lambda: [name])
+        monkeypatch.setattr(find, "port_names", lambda: [name])
         commands.record(None, seconds=0.5, out=None, **UNTOLD)
     said = capsys.readouterr().out
     assert f"{name}: text-txyz, 4 chips" in said
@@ -46,10 +46,8 @@ def test_a_recording_says_which_chip_was_broken(tmp_path, monkeypatch, capsys):
 
 def test_a_page_without_options_is_that_of_all_boards_that_are_there(monkeypatch):
     shown = {}
-    monkeypatch.setattr("pipeline.live.server.serve", lambda boards, **words: shown.update(words, boards=boards))
-    monkeypatch.setattr(
-        "pipeline.live.ports.the_boards", lambda: [ports.Found(f"/dev/ttyACM{i}", None) for i in (0, 1)]
-    )
+    monkeypatch.setattr("reskin.live.server.serve", lambda boards, **words: shown.update(words, boards=boards))
+    monkeypatch.setattr("reskin.board.find.the_boards", lambda: [find.Found(f"/dev/ttyACM{i}", None) for i in (0, 1)])
     commands.live(None, None, None, None, "127.0.0.1", 8765, ["stuck=flag"])
     assert [str(board) for board in shown["boards"]] == ["a board on /dev/ttyACM0", "a board on /dev/ttyACM1"]
     assert (shown["host"], shown["http_port"]) == ("127.0.0.1", 8765)

@@ -9,11 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.capture.port import open_port, read_waiting
-from pipeline.capture.stream import decode_all
-from pipeline.core.errors import CaptureError, ParamsError
-from pipeline.live.emulate import LATE_MAX_S, open_far_end, play
-from pipeline.live.inject import inject, parse
+from reskin.board.port import open_port, read_waiting
+from reskin.board.stream import decode_all
+from reskin.errors import CaptureError, ParamsError
+from reskin.live.emulator import LATE_MAX_S, inject, open_far_end, parse_fault, play
 from tests.live.boards import RATE_HZ, make_script
 
 LONG_S = 120.0
@@ -55,7 +54,7 @@ class Taker:
 @pytest.fixture
 def times(monkeypatch):
     times = Times()
-    monkeypatch.setattr("pipeline.live.emulate.time", times)
+    monkeypatch.setattr("reskin.live.emulator.time", times)
     return times
 
 
@@ -116,7 +115,7 @@ def test_a_reader_that_keeps_the_board_waiting_is_given_a_tenth_of_a_second_at_o
 def test_a_link_keeps_its_name_when_the_board_is_unplugged_and_plugged_in_again(tmp_path):
     link, stop = tmp_path / "board", threading.Event()
     end = open_far_end(str(link))
-    player = threading.Thread(target=play, args=[inject(SCRIPT, parse("unplug@0.5+99")), end, stop])
+    player = threading.Thread(target=play, args=[inject(SCRIPT, parse_fault("unplug@0.5+99")), end, stop])
     with pytest.raises(OSError, match="returned no data|Input/output"), open_port(str(link), 115200) as device:
         player.start()
         while True:
@@ -142,7 +141,7 @@ def test_a_port_that_is_no_port_is_refused(tmp_path):
 class TestFaults:
     def test_values_change_inside_the_fault_and_bytes_outside_stay(self):
         for name in ("failed-read", "chip-reset", "stuck", "saturated", "int16-wrap", "magnet", "too-hot", "crlf"):
-            changed = inject(SCRIPT, parse(f"{name}@0.5+0.25"))
+            changed = inject(SCRIPT, parse_fault(f"{name}@0.5+0.25"))
             inside = (SCRIPT.t_s >= 0.5) & (SCRIPT.t_s < 0.75)
             differs = np.array([one != other for one, other in zip(changed.pieces, SCRIPT.pieces, strict=True)])
             assert not differs[~inside].any(), name
@@ -151,7 +150,9 @@ class TestFaults:
 
     def test_dropped_repeated_and_torn_frames_are_so_many_less_or_more(self):
         def frames_n(name: str) -> int:
-            return len(decode_all(b"".join(inject(SCRIPT, parse(f"{name}@0.5+0.25")).pieces), "binary", 5, name)[0])
+            return len(
+                decode_all(b"".join(inject(SCRIPT, parse_fault(f"{name}@0.5+0.25")).pieces), "binary", 5, name)[0]
+            )
 
         assert frames_n("dropped") == len(SCRIPT) - 50
         assert frames_n("repeated") == len(SCRIPT) + 100
@@ -161,11 +162,11 @@ class TestFaults:
         with pytest.raises(ParamsError, match="Take binary-clock"):
             inject(
                 replace(SCRIPT, frames=replace(SCRIPT.frames, device_s=SCRIPT.frames.device_s * np.nan)),
-                parse("clock-jump@0.5"),
+                parse_fault("clock-jump@0.5"),
             )
-        assert len(inject(make_script(pokes_n=0, wire="binary-clock"), parse("clock-jump@0.5"))) == len(SCRIPT)
+        assert len(inject(make_script(pokes_n=0, wire="binary-clock"), parse_fault("clock-jump@0.5"))) == len(SCRIPT)
 
     @pytest.mark.parametrize("text", ["", "stick", "stuck@", "stuck@-1", "stuck@1+", "stuck@99", "stuck@1e9"])
     def test_a_fault_that_is_none_or_never_happens_is_refused(self, text):
         with pytest.raises(ParamsError, match="must be"):
-            inject(SCRIPT, parse(text))
+            inject(SCRIPT, parse_fault(text))

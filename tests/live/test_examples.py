@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import reskin
-from pipeline.live.skin import Contact
+from reskin.live.tracker import Contact
 from tests.stages.checkout import ROOT
 
 PAGES = "".join((ROOT / "docs" / name).read_text() for name in ("live.md", "add-a-skin.md"))

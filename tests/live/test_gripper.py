@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.core.seeds import rng_for
+from reskin.seeds import rng_for
 from tests.live.gripper import AIM_N, PERIOD_S, RATE_HZ, SETTLED_S, Finger, fit, grip
 
 SEEDS = range(3)  # each a skin and its network

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from pipeline.capture.decisions import decide
-from pipeline.capture.wire import Frames
-from pipeline.live.health import LIVE, LOOK_FRAMES_N, Health
-from pipeline.live.inject import inject, parse
+from reskin.board.wire import Frames
+from reskin.live.emulator import inject, parse_fault
+from reskin.live.health import LIVE, LOOK_FRAMES_N, Health
+from reskin.recordings.fault_policy import decide
 from tests.live.boards import make_script
 
 SCRIPT = make_script(pokes_n=2)
@@ -31,11 +31,11 @@ def feed(script, frames_n=7):
 
 def changed(name, wire="binary"):
     """The frames of a script with a fault, decoded again."""
-    from pipeline.capture.stream import decode_all
-    from pipeline.live.script import Script
+    from reskin.board.stream import decode_all
+    from reskin.live.emulator import Script
 
     lasts_s = 4.0 if name == "chip-reset" else 1.5  # lost settings do not come back
-    script = inject(make_script(pokes_n=2, wire=wire), parse(f"{name}@1.5+{lasts_s}"))
+    script = inject(make_script(pokes_n=2, wire=wire), parse_fault(f"{name}@1.5+{lasts_s}"))
     frames, _ = decode_all(b"".join(script.pieces), wire, 5, name)
     t_s = script.t_s if len(frames) == len(script) else np.linspace(0, script.duration_s, len(frames))
     return Script("recorded", wire, frames, [b""] * len(frames), t_s)
@@ -84,7 +84,7 @@ def test_a_board_of_which_half_the_frames_are_missing_is_slower_than_it_was():
 def test_frames_that_a_fault_has_hit_are_not_believed():
     frames = SCRIPT.frames.where(np.arange(len(SCRIPT)) < LOOK_FRAMES_N)
     for name in ("failed-read", "zeros", "saturated", "too-hot"):
-        script = inject(SCRIPT, parse(f"{name}@0+0.05"))
+        script = inject(SCRIPT, parse_fault(f"{name}@0+0.05"))
         assert script.pieces[0] != SCRIPT.pieces[0]
         assert not feed_once(changed_frames(script, LOOK_FRAMES_N))[:20].any(), name
         assert feed_once(changed_frames(script, LOOK_FRAMES_N))[20:].all(), name
@@ -92,7 +92,7 @@ def test_frames_that_a_fault_has_hit_are_not_believed():
 
 
 def changed_frames(script, frames_n):
-    from pipeline.capture.stream import decode_all
+    from reskin.board.stream import decode_all
 
     return decode_all(b"".join(script.pieces[:frames_n]), "binary", 5, "script")[0]
 
@@ -113,7 +113,7 @@ def test_a_change_of_field_that_all_chips_share_comes_from_outside():
 
 def test_what_becomes_of_readings_that_a_fault_has_hit_is_decided_by_setting():
     for name, fault in (("failed-read", "failed_read"), ("saturated", "saturated"), ("too-hot", "too_hot")):
-        script = inject(SCRIPT, parse(f"{name}@0+0.05"))
+        script = inject(SCRIPT, parse_fault(f"{name}@0+0.05"))
         frames = changed_frames(script, LOOK_FRAMES_N)
         for decision, believed in (("drop", False), ("flag", True), ("refuse", False)):
             health = Health(5, decide(LIVE, [f"{fault}={decision}"], "test"))

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core.errors import CaptureError
-from pipeline.core.seeds import rng_for
-from pipeline.live import ports
-from pipeline.live.inject import inject, parse
+from reskin.board import find
+from reskin.errors import CaptureError
+from reskin.live.emulator import inject, parse_fault
+from reskin.seeds import rng_for
 from tests.live.boards import make_script, plugged_in
 
 CHUNK_N = 3  # frames, of which the cuts lie anywhere
@@ -28,7 +28,7 @@ def chunks_of(script, cut_n=31):
 @pytest.mark.parametrize(("chips_n", "rate_hz"), [(1, 400.0), (5, 400.0), (40, 133.0)])
 def test_format_chips_rate_and_scale_are_told_from_the_bytes(wire, chips_n, rate_hz):
     script = make_script(pokes_n=0, chips_n=chips_n, wire=wire, rate_hz=rate_hz)
-    found = ports.recognise("port", chunks_of(script))
+    found = find.recognise("port", chunks_of(script))
     assert (found.problem, found.wire, found.chips_n) == (None, wire, chips_n)
     assert found.rate_hz == pytest.approx(rate_hz, rel=0.03)
     np.testing.assert_allclose(found.lsb_uT, (0.15, 0.242), rtol=0.06)  # text has two decimals
@@ -38,16 +38,16 @@ def test_format_chips_rate_and_scale_are_told_from_the_bytes(wire, chips_n, rate
 
 def test_what_is_no_board_is_told_as_such():
     script = make_script(pokes_n=0)
-    wrong_baud = chunks_of(inject(script, parse("wrong-baud@0+99")))
-    assert "another baud rate" in str(ports.recognise("port", wrong_baud))
-    assert "no byte came" in str(ports.recognise("port", []))
-    assert "must be one that opens" in str(ports.look("/dev/none"))
+    wrong_baud = chunks_of(inject(script, parse_fault("wrong-baud@0+99")))
+    assert "another baud rate" in str(find.recognise("port", wrong_baud))
+    assert "no byte came" in str(find.recognise("port", []))
+    assert "must be one that opens" in str(find.look("/dev/none"))
 
 
 @given(st.binary(max_size=3000), st.integers(1, 700))
 def test_any_bytes_are_a_board_or_none_and_never_an_error(data, size):
     chunks = [(data[first : first + size], 0.01 * first) for first in range(0, len(data), size)]
-    assert str(ports.recognise("port", chunks)).startswith("port: ")
+    assert str(find.recognise("port", chunks)).startswith("port: ")
 
 
 @given(st.integers(0, 2**32), st.integers(1, 4))
@@ -56,24 +56,24 @@ def test_frames_of_any_numbers_are_a_board(seed, chips_n):
     values = rng.integers(0, 2**32, (40, 4 * chips_n), dtype=np.uint32)
     values[rng.random(values.shape) < 0.5] = np.float32(25).view(np.uint32)
     data = b"".join(row.tobytes() + b"\r\n" for row in values)
-    assert str(ports.recognise("port", [(data, 0.0), (data, 1.0)])).startswith("port: ")
+    assert str(find.recognise("port", [(data, 0.0), (data, 1.0)])).startswith("port: ")
 
 
 def test_chips_at_rest_without_noise_show_no_scale():
     script = make_script(pokes_n=0)
     still = replace(script, pieces=[script.pieces[0]] * len(script))
-    assert "steps not seen yet" in str(ports.recognise("port", chunks_of(still)))
+    assert "steps not seen yet" in str(find.recognise("port", chunks_of(still)))
 
 
 def test_the_one_board_is_found_among_ports_and_two_are_one_too_many(tmp_path):
     script = make_script(pokes_n=1)
     with plugged_in(script, loop=True) as name, plugged_in(script, "tcp", loop=True) as other:
-        assert ports.the_board([name, "/dev/none"]).port == name
+        assert find.the_board([name, "/dev/none"]).port == name
         with pytest.raises(CaptureError, match=r"the board must be one, .*; got .*5 chips.*; .*5 chips"):
-            ports.the_board([name, other])
-        assert [found.port for found in ports.the_boards([name, "/dev/none", other])] == [name, other]
+            find.the_board([name, other])
+        assert [found.port for found in find.the_boards([name, "/dev/none", other])] == [name, other]
     with pytest.raises(CaptureError, match="no serial port at all"):
-        ports.the_board([])
+        find.the_board([])
 
 
 class TestHunt:
@@ -86,7 +86,7 @@ class TestHunt:
             last[0] = set(next(looks, last[0]))
             return last[0]
 
-        return ports.hunt(said.append, names=names, pause=lambda _: None, hunting_s=1.0), said
+        return find.hunt(said.append, names=names, pause=lambda _: None, hunting_s=1.0), said
 
     def test_the_port_that_goes_and_comes_is_the_board(self):
         found, said = self.hunt("ab", "ab", "ab", "b", "b", "b", "bc")

@@ -17,11 +17,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from pipeline.capture.header import HEADER_FILE, parse
 from pipeline.cli import app
-from pipeline.core import io
-from pipeline.core.errors import ReskinError
-from pipeline.preparing import Labels, native
+from reskin import io
+from reskin.errors import ReskinError
+from reskin.recordings.header import HEADER_FILE, parse
+from reskin.recordings.preparing import Labels, native
 from tests.live.boards import PLACES, make_script, write_model, write_script
 from tests.live.test_server import until
 from tests.stages.checkout import ROOT

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.capture.header import LOG_FILE, Clock, write_capture
-from pipeline.capture.sd_card import render
-from pipeline.core.errors import ReskinError
-from pipeline.live.script import read_script, simulate
+from reskin.errors import ReskinError
+from reskin.live.emulator import read_script, simulate
+from reskin.recordings.header import LOG_FILE, Clock, write_capture
+from reskin.recordings.readers.sd_card import render
 from tests.capture.headers import make_header
 from tests.live.boards import make_script, write_script
 from tests.stages.checkout import ROOT

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from aiohttp import web
 
-from pipeline.capture.header import HEADER_FILE, parse
-from pipeline.live.answering import Models
-from pipeline.live.server import PAGES_MAX_N, REQUEST_BYTES_MAX_N, Server
-from pipeline.live.session import several
-from pipeline.live.view import BINS_N, HEAD, NUMBERS_N
-from pipeline.predicting import read_network
+from reskin.live.answering import Models
+from reskin.live.server import PAGES_MAX_N, REQUEST_BYTES_MAX_N, Server
+from reskin.live.session import several
+from reskin.live.view import BINS_N, HEAD, NUMBERS_N
+from reskin.predicting import read_network
+from reskin.recordings.header import HEADER_FILE, parse
 from tests.live.boards import PLACES, RATE_HZ, make_script, plugged_in, write_model, zeros_asked
 
 LONG_S = 120.0

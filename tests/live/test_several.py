@@ -11,14 +11,13 @@ import numpy as np
 import pytest
 
 import reskin
-from pipeline.core.errors import ReskinError
-from pipeline.live.ports import BOARDS_MAX_N
-from pipeline.live.server import PAGES_MAX_N
-from pipeline.live.session import Live, several
-from pipeline.live.skin import Skin
-from pipeline.live.skins import Skins
-from pipeline.live.view import BINS_N, LATENCIES_N
-from pipeline.twin.shipped import load_universal
+from reskin.board.find import BOARDS_MAX_N
+from reskin.errors import ReskinError
+from reskin.live.server import PAGES_MAX_N
+from reskin.live.session import Live, Skins, several
+from reskin.live.tracker import Skin
+from reskin.live.view import BINS_N, LATENCIES_N
+from reskin.universal.model import load_universal
 from tests.live.boards import PLACES, Dying, PlayedReader, make_script, plugged_in, write_model
 from tests.live.test_server import serve, until
 

@@ -14,13 +14,12 @@ import numpy as np
 import pytest
 
 import reskin
-from pipeline.capture.port import open_port
-from pipeline.core.errors import ReskinError
-from pipeline.core.seeds import rng_for
-from pipeline.live.emulate import open_far_end, play
-from pipeline.live.inject import inject, parse
-from pipeline.live.skin import ZEROING, Skin
-from pipeline.predicting import read_network
+from reskin.board.port import open_port
+from reskin.errors import ReskinError
+from reskin.live.emulator import inject, open_far_end, parse_fault, play
+from reskin.live.tracker import ZEROING, Skin
+from reskin.predicting import read_network
+from reskin.seeds import rng_for
 from tests.live.boards import (
     PLACES,
     QUIET_S,
@@ -85,7 +84,7 @@ def test_who_is_slow_gets_the_latest_and_no_byte_is_lost(tmp_path):
 
 
 def test_a_stall_and_an_unplugging_are_told_while_they_last_and_it_goes_on_after(tmp_path):
-    script = inject(inject(make_script(pokes_n=3), parse("stall@2.5+1")), parse("unplug@4.5+1"))
+    script = inject(inject(make_script(pokes_n=3), parse_fault("stall@2.5+1")), parse_fault("unplug@4.5+1"))
     link, told = str(tmp_path / "board"), []
     with plugged_in(script, link, loop=True) as name, reskin.open(name, model=write_model(tmp_path)) as skin:
         for contact in skin:
@@ -98,7 +97,7 @@ def test_a_stall_and_an_unplugging_are_told_while_they_last_and_it_goes_on_after
 
 
 def test_a_failed_read_is_no_contact(tmp_path):
-    skin, readings = played(inject(SCRIPT, parse("failed-read@1.7+0.5")), [read_network(write_model(tmp_path))])
+    skin, readings = played(inject(SCRIPT, parse_fault("failed-read@1.7+0.5")), [read_network(write_model(tmp_path))])
     failed = [row for each in readings for row in each.answer[each.b_uT[:, 3] == np.float32(8028.16)]]
     assert len(failed) == 200
     assert np.isnan(failed).all()
@@ -127,16 +126,16 @@ def test_garbage_behind_a_replug_is_lost_and_told(chunk_n):
 
 
 def test_a_magnet_is_a_field_from_outside_and_nothing_else(tmp_path):
-    skin, _ = played(inject(SCRIPT, parse("magnet@3+1")), [read_network(write_model(tmp_path))])
+    skin, _ = played(inject(SCRIPT, parse_fault("magnet@3+1")), [read_network(write_model(tmp_path))])
     assert {word.split(":")[0] for word in skin.health.alarms} == {"field from outside"}
 
 
 def test_a_second_in_which_something_moves_is_no_no_load_reading():
-    script = inject(make_script(pokes_n=0, quiet_s=4.0), parse("magnet@0.35+0.7"))
+    script = inject(make_script(pokes_n=0, quiet_s=4.0), parse_fault("magnet@0.35+0.7"))
     skin, _ = played(script)
     rest_uT = script.frames.b_uT[:100].mean(axis=0)
     np.testing.assert_allclose(skin._zero.noload_uT, rest_uT, atol=4 * 3 / np.sqrt(100))  # of noise of 3 uT
-    moving = inject(make_script(pokes_n=0, quiet_s=2.0), parse("magnet@0.35+0.7"))
+    moving = inject(make_script(pokes_n=0, quiet_s=2.0), parse_fault("magnet@0.35+0.7"))
     assert not played(moving)[0].zeroed
 
 
@@ -161,7 +160,7 @@ def test_every_byte_that_was_sent_is_a_frames_or_lost_and_counted():
     minutes_n = int(os.environ.get("RESKIN_MINUTES", "1"))
     script, rng = make_script(pokes_n=20), rng_for(0, "faults")
     for fault in ("torn", "dropped", "repeated", "wrong-baud", "crlf", "failed-read", "torn"):
-        script = inject(script, parse(f"{fault}@{rng.uniform(3, 55):.2f}+{rng.uniform(0.1, 2):.2f}"))
+        script = inject(script, parse_fault(f"{fault}@{rng.uniform(3, 55):.2f}+{rng.uniform(0.1, 2):.2f}"))
     end, stop, sent = open_far_end("pty"), threading.Event(), []
     player = threading.Thread(
         target=lambda: sent.extend(play(script, end, stop, speed=100.0) for _ in range(minutes_n))

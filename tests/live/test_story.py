@@ -10,15 +10,13 @@ import pytest
 from ruamel.yaml import YAML
 
 from pipeline import plan
-from pipeline.capture import arrivals, probe
-from pipeline.capture.header import ARRIVALS_FILE, HEADER_FILE, STREAM_FILE, parse, seal
-from pipeline.capture.probe import ProbeLog
-from pipeline.capture.wire import Frames
-from pipeline.core.seeds import rng_for
-from pipeline.live.inject import inject
-from pipeline.live.inject import parse as parse_fault
-from pipeline.live.script import Script, encode_pieces
-from pipeline.predicting import read_network
+from reskin.board.wire import Frames
+from reskin.live.emulator import Script, encode_pieces, inject, parse_fault
+from reskin.predicting import read_network
+from reskin.recordings import clocks, probe
+from reskin.recordings.header import ARRIVALS_FILE, HEADER_FILE, STREAM_FILE, parse, seal
+from reskin.recordings.probe import ProbeLog
+from reskin.seeds import rng_for
 from tests.live.boards import RATE_HZ, played, write_script
 from tests.live.test_processes import Shell, wait_until
 from tests.stages.checkout import copy_checkout, run
@@ -69,8 +67,8 @@ def let_arrive_in_time(folder: Path, sent: Script) -> None:
     assert first >= 0  # it is all of what was sent from when the port was opened
     ends = np.cumsum([len(piece) for piece in sent.pieces]) - first
     came = (ends > 0) & (ends <= len(data))
-    times = arrivals.Arrivals(ends[came], 1e9 + sent.t_s[came])
-    (folder / ARRIVALS_FILE).write_text(arrivals.render(times))
+    times = clocks.Arrivals(ends[came], 1e9 + sent.t_s[came])
+    (folder / ARRIVALS_FILE).write_text(clocks.render(times))
     seal(folder, header)
 
 

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 import reskin
-from pipeline.capture import arrivals, probe
-from pipeline.capture.header import ARRIVALS_FILE, HEADER_FILE, PROBE_FILE, STREAM_FILE, parse
-from pipeline.capture.labels import Dwell
-from pipeline.capture.stream import decode_all
-from pipeline.core.errors import ParamsError
-from pipeline.dataset.captures import open_capture
-from pipeline.labelling.source import Desk
-from pipeline.live.taping import Wanted, board_of, record_board, source_of
-from pipeline.preparing import Labels, native
+from reskin.board.stream import decode_all
+from reskin.errors import ParamsError
+from reskin.live.taping import Wanted, board_of, record_board, source_of
+from reskin.recordings import clocks, probe
+from reskin.recordings.header import ARRIVALS_FILE, HEADER_FILE, PROBE_FILE, STREAM_FILE, parse
+from reskin.recordings.ingest import open_capture
+from reskin.recordings.labelling.source import Desk
+from reskin.recordings.labels import Dwell
+from reskin.recordings.preparing import Labels, native
 from tests.capture.headers import AS_USUAL
 from tests.live.boards import make_script, plugged_in
 
@@ -54,7 +54,7 @@ def pokes():
 
 def read(folder):
     """Read a capture as `reskin add` does: its own files, under its own header."""
-    from pipeline.capture.header import write_capture
+    from reskin.recordings.header import write_capture
 
     header, files = native(folder, Labels("b0", "s0", None), None, ())
     into = folder.parent / "added" / header.capture
@@ -78,7 +78,7 @@ def test_what_a_program_labels_is_added_without_another_word(tmp_path, held, cap
     assert account["clock_residual_us"] == 0
     log = probe.parse(folder / PROBE_FILE, "log")
     frames, _ = decode_all((folder / STREAM_FILE).read_bytes(), "binary", 5, "stream")
-    t_s = arrivals.times_of(frames.end_byte, arrivals.parse(folder / ARRIVALS_FILE, "arrivals"))
+    t_s = clocks.times_of(frames.end_byte, clocks.parse(folder / ARRIVALS_FILE, "arrivals"))
     dwells_s = zip(log.t_start_s[log.contact], log.t_end_s[log.contact], strict=True)
     came_n = sum(int(((t_s > start_s) & (t_s < end_s)).sum()) for start_s, end_s in dwells_s)
     assert came_n >= 2 * DWELL_FRAMES_N
@@ -123,7 +123,7 @@ def write_robots_log(robot, part):
 def test_a_full_disk_ends_it_and_what_came_can_be_added(tmp_path, monkeypatch, held):
     from errno import ENOSPC
 
-    from pipeline.capture import labels
+    from reskin.recordings import labels
 
     taken = []
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from pipeline.live.layout import layout_of
-from pipeline.live.skin import Readings
-from pipeline.live.view import BIN_S, BINS_N, HEAD, NUMBERS_N, View
+from reskin.live.layout import layout_of
+from reskin.live.tracker import Readings
+from reskin.live.view import BIN_S, BINS_N, HEAD, NUMBERS_N, View
 
 
 def readings(t_s, force_N):

@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from magpylib.core import magnet_sphere_Bfield
 
-from pipeline.core.seeds import rng_for
-from pipeline.physics import dipole
-from pipeline.physics.ambient import EARTH_SIZE_T, EARTH_T, ball_field, ball_images, directions
+from reskin.physics import magnet
+from reskin.physics.ambient import EARTH_SIZE_T, EARTH_T, ball_field, ball_images, directions
+from reskin.seeds import rng_for
 
 RADIUS_M = 5e-3
 CENTRE_M = np.array([1e-3, -2e-3, 12e-3])
@@ -69,10 +69,10 @@ def test_a_ball_as_permeable_as_air_is_not_there():
 
 def test_lines_of_dipoles_and_images_together_meet_the_surface_upright():
     observers_m = on_sphere(RADIUS_M)
-    together_T = dipole.field(*NEAR, observers_m) + images(observers_m)
+    together_T = magnet.field(*NEAR, observers_m) + images(observers_m)
     sideways_T = np.cross(together_T, outward(observers_m))
     assert np.abs(sideways_T).max() < 1e-9 * np.abs(together_T).max()  # rounding
-    without_T = np.cross(dipole.field(*NEAR, observers_m), outward(observers_m))
+    without_T = np.cross(magnet.field(*NEAR, observers_m), outward(observers_m))
     assert np.abs(without_T).max() > 0.1 * np.abs(together_T).max()  # the ball does bend them
 
 
@@ -92,7 +92,7 @@ def test_what_images_add_has_no_pole_as_nothing_magnetic_has():
 def test_images_of_a_far_dipole_are_those_of_its_uniform_field():
     far = np.array([[0.4, -0.6, 0.9]]), np.array([[1.0, 2.0, -3.0]])
     observers_m = on_sphere(2 * RADIUS_M)
-    uniform_T = dipole.field(*far, CENTRE_M[None])[0]
+    uniform_T = magnet.field(*far, CENTRE_M[None])[0]
     of_uniform_T = field(observers_m, uniform_T, mu_r=1e12)
     np.testing.assert_allclose(  # over 5 mm the field of a dipole 1 m away varies by 3 * 5 mm / 1 m
         images(observers_m, far), of_uniform_T, rtol=0, atol=0.02 * np.abs(of_uniform_T).max()

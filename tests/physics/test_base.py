@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.polynomial import Polynomial
 
-from pipeline.physics import layer, shear, slide
+from reskin.physics import layer, shear, slide
 from tests.elements import Layer, along_x_strains, plate
 
 H_M, WIDTH_M, TIP_M, DEPTH_M = 2e-3, 0.8e-3, 2e-3, 1.2e-3

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core.config import parse
-from pipeline.core.errors import ParamsError
-from pipeline.physics.board import BoardDesign, Spreads, draw_board
+from reskin.config import parse
+from reskin.errors import ParamsError
+from reskin.physics.board import BoardDesign, Spreads, draw_board
 
 CROSS_MM = [[0.0, 0.0], [-7.0, 0.0], [0.0, -7.0], [7.0, 0.0], [0.0, 7.0]]
 DESIGN = {"chips_xy_mm": CROSS_MM, "chips_turn_deg": [0.0, 180.0, 270.0, 90.0, 0.0], "gap_mm": 1.1}

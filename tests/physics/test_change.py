@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core.errors import ParamsError
-from pipeline.core.seeds import rng_for
 from pipeline.experiments.verification.field import dipoles
-from pipeline.physics import dipole
-from pipeline.physics.change import change_of_field
+from reskin.errors import ParamsError
+from reskin.physics import magnet
+from reskin.physics.magnet import change_of_field
+from reskin.seeds import rng_for
 from tests.laws import broken
 
 ROUNDING = 1e-12  # a few thousand operations in float64, of like sign in the sum of sizes
@@ -24,8 +24,8 @@ def compiled():
 
 def naive(rest, moved, observers_m):
     """The specification: the field of each dipole after, less its field before, then the sum."""
-    after_T = dipole.field_of_each(*moved, observers_m)
-    return (after_T - dipole.field_of_each(*rest, observers_m)).sum(axis=1)
+    after_T = magnet.field_of_each(*moved, observers_m)
+    return (after_T - magnet.field_of_each(*rest, observers_m)).sum(axis=1)
 
 
 def scene(seed, nodes_n=200):
@@ -38,7 +38,7 @@ def scene(seed, nodes_n=200):
 
 
 def size_T(rest, moved, observers_m):
-    return np.abs(dipole.field_of_each(*rest, observers_m)).sum()
+    return np.abs(magnet.field_of_each(*rest, observers_m)).sum()
 
 
 @given(seeds)
@@ -82,7 +82,7 @@ def test_a_tiny_move_keeps_the_digits_that_two_large_sums_would_lose():
     step_m = np.array([1e-9, 0.0, 0.0])
     found_T = change_of_field((nodes_m, moments), (nodes_m + step_m, moments), observers_m)
     wide_m = 1e3 * step_m
-    ahead_T, behind_T = (dipole.field(nodes_m + side * wide_m, moments, observers_m) for side in (1, -1))
+    ahead_T, behind_T = (magnet.field(nodes_m + side * wide_m, moments, observers_m) for side in (1, -1))
     # rtol: next order, (1e-6 m / 3e-3 m)^2, and 1e-9 m / 3e-3 m
     np.testing.assert_allclose(found_T, (ahead_T - behind_T) / 2e3, rtol=1e-4)
 

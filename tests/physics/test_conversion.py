@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.physics.conversion import CONVERSION_S, last_conversions, seen_at
+from reskin.physics.chip import CONVERSION_S, last_conversions, seen_at
 
 rates_hz = st.floats(50, 5000)
 phases_s = st.floats(0, CONVERSION_S)

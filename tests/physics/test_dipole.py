@@ -6,10 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.constants import mu_0
 
-from pipeline.core.errors import ParamsError
-from pipeline.core.seeds import rng_for
 from pipeline.experiments.verification.field import dipoles
-from pipeline.physics.dipole import MU0_4PI, field, field_of_each
+from reskin.errors import ParamsError
+from reskin.physics.magnet import MU0_4PI, field, field_of_each
+from reskin.seeds import rng_for
 
 ROUNDING = 1e-12  # a few hundred operations in float64
 SIX_STEPS = (np.eye(3)[:, None] * np.array([1.0, -1.0])[:, None]).reshape(6, 3)

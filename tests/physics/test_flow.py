@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from pipeline.experiments.verification import kinematics
-from pipeline.physics import flow, layer
+from reskin.physics import layer
+from reskin.physics import layer as flow
 from tests.laws import broken
 
 H_M, TIP_M = 2e-3, 3e-3

@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.core.errors import ParamsError
-from pipeline.physics import flow, flow_map, layer
+from reskin.errors import ParamsError
+from reskin.physics import flow_map, layer
+from reskin.physics import layer as flow
 
 H_M, TIP_M = 2e-3, 3e-3
 HEIGHTS = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 1.0)

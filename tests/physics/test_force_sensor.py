@@ -4,8 +4,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core.seeds import rng_for
-from pipeline.physics.force_sensor import RANGE_N, read_force
+from reskin.physics.force_sensor import RANGE_N, read_force
+from reskin.seeds import rng_for
 
 inside_N = st.tuples(st.floats(-25, 25), st.floats(-25, 25), st.floats(-35, 35))
 

@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from pipeline.core.errors import ParamsError
 from pipeline.experiments.verification.contact import straight_drag
-from pipeline.physics.friction import drag
+from reskin.errors import ParamsError
+from reskin.physics.shear import drag
 
 ROUNDING = 1e-12  # some hundred steps on doubles
 K = 1000.0  # newtons per metre: the skin's order

@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import jv
 
-from pipeline.core.errors import ParamsError
 from pipeline.experiments.verification import contact, kinematics
-from pipeline.physics import layer
-from pipeline.physics.flow import Press
+from reskin.errors import ParamsError
+from reskin.physics import layer
+from reskin.physics.layer import Press
 from tests.laws import broken
 
 PRESS = Press(2e-3, 3e-3, "bonded")

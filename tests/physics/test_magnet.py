@@ -7,12 +7,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.constants import mu_0
 
-from pipeline.core.errors import ParamsError
-from pipeline.core.seeds import rng_for
 from pipeline.experiments.verification import field as laws
-from pipeline.physics import magnet
-from pipeline.physics.dipole import MU0_4PI, field
-from pipeline.physics.nodes import Quadrature, place_nodes
+from reskin.errors import ParamsError
+from reskin.physics import magnet
+from reskin.physics.magnet import MU0_4PI, Quadrature, field, place_nodes
+from reskin.seeds import rng_for
 from tests.laws import broken
 
 THICKNESS_M = 2e-3

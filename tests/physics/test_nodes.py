@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core.errors import ParamsError
-from pipeline.physics.magnet import CUBE_SIDE_M, seams_m
-from pipeline.physics.nodes import CHOSEN, SEAMS_M, SKIN_SIDE_M, Quadrature, place_nodes
+from reskin.errors import ParamsError
+from reskin.physics.magnet import CHOSEN, CUBE_SIDE_M, SEAMS_M, SKIN_SIDE_M, Quadrature, place_nodes, seams_m
 
 THICKNESS_M = 2e-3
 rules = st.builds(Quadrature, cell_m=st.floats(0.3e-3, 5e-3), layers_n=st.integers(1, 8))

@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core.seeds import rng_for
 from pipeline.experiments.stability.chip import out_of_range
 from pipeline.experiments.verification import electronics
-from pipeline.physics.board import Board
-from pipeline.physics.sensor import ChipDesign, Overruns, read_field, read_temperature, steps_uT
+from reskin.physics.board import Board
+from reskin.physics.chip import ChipDesign, Overruns, read_field, read_temperature, steps_uT
+from reskin.seeds import rng_for
 from tests.laws import broken
 
 QUARTER = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])

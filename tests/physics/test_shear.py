@@ -9,10 +9,10 @@ from scipy.integrate import quad, solve_bvp
 from scipy.linalg import polar
 from scipy.special import jv
 
-from pipeline.core.errors import ParamsError
 from pipeline.experiments.verification import contact
-from pipeline.physics import layer, shear
-from pipeline.physics.shear import Traction
+from reskin.errors import ParamsError
+from reskin.physics import layer, shear
+from reskin.physics.shear import Traction
 from tests.laws import broken
 
 H_M, TIP_M, YOUNG_PA = 2e-3, 3e-3, 190e3

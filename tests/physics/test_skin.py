@@ -5,15 +5,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.core.errors import ParamsError
 from pipeline.experiments.stability import physics as stability
 from pipeline.experiments.verification import kinematics, poke
-from pipeline.physics import dipole, flow, flow_map, slide
-from pipeline.physics.board import Board
-from pipeline.physics.change import change_of_field
-from pipeline.physics.dipole import MU0_4PI
-from pipeline.physics.nodes import CHOSEN, Quadrature
-from pipeline.physics.skin import SkinDesign, beyond_verified_n, changes_of_field, draw_skin, forces, moved_dipoles
+from reskin.errors import ParamsError
+from reskin.physics import flow_map, layer, magnet, slide
+from reskin.physics.board import Board
+from reskin.physics.magnet import CHOSEN, MU0_4PI, Quadrature, change_of_field
+from reskin.physics.skin import SkinDesign, beyond_verified_n, changes_of_field, draw_skin, forces, moved_dipoles
 from tests.laws import broken
 from tests.physics.test_board import design as board_design
 from tests.physics.test_board import draw_board, no_spread, spreads
@@ -135,8 +133,8 @@ def test_the_change_is_what_two_large_sums_differ_by():
     moved = moved_by(one, poke_m)
     places_m, moments = one.nodes_m.copy(), one.moments_A_m2.copy()
     places_m[moved.i], moments[moved.i] = moved.after
-    after_T = dipole.field(places_m, moments, BOARD.chips_m)
-    before_T = dipole.field(one.nodes_m, one.moments_A_m2, BOARD.chips_m)
+    after_T = magnet.field(places_m, moments, BOARD.chips_m)
+    before_T = magnet.field(one.nodes_m, one.moments_A_m2, BOARD.chips_m)
     np.testing.assert_allclose(change(poke_m, one), after_T - before_T, atol=1e-11 * PEAK_T)
 
 
@@ -226,10 +224,10 @@ def test_tables_give_the_change_that_following_every_node_gives(thickness_mm, at
     # 1.82 mm lies halfway between two tables. At the tables' depths: what interpolating in R/h and r costs. Between
     # them 0.6 %: following ends there with half a step, and half steps change dB by as much themselves (flow.STEP).
     one = skin(SEATED, thickness_mm=thickness_mm, base=base)
-    ladder_m = one.thickness_m * flow.depth_unit(one.tip_radius_m / one.thickness_m) * flow.LADDER
+    ladder_m = one.thickness_m * layer.depth_unit(one.tip_radius_m / one.thickness_m) * layer.LADDER
     for rung_i in (6, 16, 22):
         poke_m = np.array([1.3e-3, -2.1e-3, (1 - at) * ladder_m[rung_i] + at * ladder_m[rung_i + 1]])
-        depths_m = flow.steps((float(poke_m[2]),), flow.Press(one.thickness_m, one.tip_radius_m, base))
+        depths_m = layer.steps((float(poke_m[2]),), layer.Press(one.thickness_m, one.tip_radius_m, base))
         truth = kinematics.followed(one, poke_m[:2], depths_m)
         # On a bonded base nothing moves past the table's reach.
         near = np.linalg.norm(

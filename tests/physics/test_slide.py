@@ -5,9 +5,9 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from pipeline.core.errors import ParamsError
-from pipeline.physics import flow_map, layer, slide
-from pipeline.physics.change import change_of_field
+from reskin.errors import ParamsError
+from reskin.physics import flow_map, layer, slide
+from reskin.physics.magnet import change_of_field
 
 SIDE_M, H_M = 20e-3, 2e-3
 SQUARE = (SIDE_M, SIDE_M)

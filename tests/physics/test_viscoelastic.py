@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core.errors import ParamsError
 from pipeline.experiments.verification import relaxation
-from pipeline.physics.viscoelastic import SKIN, Memory, Prony, Relaxation, advance, force_left, relax, remembered
+from reskin.errors import ParamsError
+from reskin.physics.aging import SKIN, Memory, Prony, Relaxation, advance, force_left, relax, remembered
 from tests.laws import broken
 
 ROUNDING = 1e-14  # a few dozen operations on doubles

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.physics.warmth import Temperature, remanence, warmer_K
+from reskin.physics.aging import Temperature, remanence, warmer_K
 
 HOW = Temperature(warming_K=4.0, warming_s=100.0, swing_K=0.0, swing_s=600.0, chip_sensitivity_per_K=0.0)
 

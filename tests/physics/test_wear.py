@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core.errors import ParamsError
-from pipeline.core.seeds import rng_for
-from pipeline.physics.wear import fading, softening, wandering
+from reskin.errors import ParamsError
+from reskin.physics.aging import fading, softening, wandering
+from reskin.seeds import rng_for
 
 DESIGN = {"settling": 0.10, "ageing": 0.01}
 counts = st.lists(st.integers(0, 10**6), min_size=1, max_size=50).map(lambda n: np.array(sorted(n)))

@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
-from pipeline.capture.readers import eflesh
-from pipeline.core import io
-from pipeline.core.config import Files
 from pipeline.experiments.drift.run import drift
+from reskin import io
+from reskin.config import Files
+from reskin.recordings.readers import eflesh
 from tests.recordings.test_recordings import SPATIAL, ingest
 
 ROOT = Path(__file__).resolve().parents[2]

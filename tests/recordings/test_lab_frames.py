@@ -12,11 +12,11 @@ from scipy.constants import micro, milli
 from scipy.linalg import orthogonal_procrustes
 from scipy.spatial.transform import Rotation
 
-from pipeline.capture.readers import lab
-from pipeline.core.config import SCENES, parse
-from pipeline.core.schema import Readings
-from pipeline.physics.board import BoardDesign, Spreads, draw_board
-from pipeline.physics.skin import SkinDesign, changes_of_field, draw_skin
+from reskin.config import SCENES, parse
+from reskin.physics.board import BoardDesign, Spreads, draw_board
+from reskin.physics.skin import SkinDesign, changes_of_field, draw_skin
+from reskin.recordings.readers import lab
+from reskin.schema import Readings
 from tests.physics.test_board import SPREADS, as_tuples
 from tests.recordings.test_recordings import LAB, ingest
 

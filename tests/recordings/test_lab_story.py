@@ -8,9 +8,11 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
-from pipeline import adding, plan, preparing
-from pipeline.core import config
-from pipeline.preparing import Labels
+from pipeline import plan
+from pipeline.manage import add
+from reskin import config
+from reskin.recordings import preparing
+from reskin.recordings.preparing import Labels
 from tests.stages.checkout import copy_checkout, run
 
 SAID = "said.txt"  # by DVC in the first run
@@ -33,7 +35,7 @@ def lab(tmp_path_factory, shared_data) -> Iterator[Path]:
     for board in (1, 2):
         labels = Labels(f"board{board}", f"skin{board}", None)
         prepared = preparing.foreign(shared_data / f"lab/board{board}_depth2.csv", "lab", labels, {})
-        adding.add(root, "lab", prepared, allow_copy=False)
+        add.add(root, "lab", prepared, allow_copy=False)
     (root / SAID).write_text(run(root, "dvc", "repro").stdout)
     return root
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pipeline.capture.wire import Frames
-from pipeline.live.health import Health
+from reskin.board.wire import Frames
+from reskin.live.health import Health
 
 RATE_HZ = 100.0
 RESET, FAILED = "another step than the others: reset", "failed I2C reads"

@@ -10,11 +10,11 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from pipeline.capture.header import Header
-from pipeline.capture.readers import eflash7, eflesh, ini, lab
-from pipeline.capture.readers.table import read_cells
-from pipeline.core.errors import CaptureError
-from pipeline.core.schema import Readings
+from reskin.errors import CaptureError
+from reskin.recordings.header import Header
+from reskin.recordings.readers import eflash7, eflesh, ini, lab
+from reskin.recordings.text import read_cells
+from reskin.schema import Readings
 from tests.capture.headers import AS_USUAL, make_header
 
 SPATIAL = "eflesh/spatial_resolution/20250316_155729_probe"

@@ -2,7 +2,7 @@
 
 from scipy.stats import t
 
-from pipeline.evaluation.metrics import METRICS
+from reskin.metrics import METRICS
 
 
 def stat(mean: float = 1.0, sd: float = 0.5, n: int = 3) -> dict:

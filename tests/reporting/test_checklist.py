@@ -7,12 +7,12 @@ from hypothesis import strategies as st
 from ruamel.yaml import YAML
 from scipy.stats import t
 
-from pipeline.core.errors import SchemaError
-from pipeline.evaluation.scores import FEW_BOARDS, INCONCLUSIVE, NO, YES
-from pipeline.questions import EXPERIMENTS
-from pipeline.reporting import paper
-from pipeline.reporting.checklist import checklist, claims_table, look_up, read_rows, resolve
-from pipeline.reporting.judging import Row, judge
+from pipeline.report import paper
+from pipeline.report.checklist import checklist, claims_table, look_up, read_rows, resolve
+from pipeline.report.judging import Row, judge
+from pipeline.report.statistics import FEW_BOARDS, INCONCLUSIVE, NO, YES
+from pipeline.scenes import EXPERIMENTS
+from reskin.errors import SchemaError
 from tests.reporting.synthetic import all_questions, over_boards, stat
 
 ROOT = Path(__file__).resolve().parents[2]

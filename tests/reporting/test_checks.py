@@ -2,7 +2,7 @@
 
 import pytest
 
-from pipeline.reporting.checks import stability_table, verification_table
+from pipeline.report.formatting import stability_table, verification_table
 
 CHECK = {
     "subject": "chip", "law": "conversion", "against": "data sheet", "error": 3.33e-05, "unit": "uT",

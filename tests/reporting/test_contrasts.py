@@ -2,8 +2,8 @@
 
 import pytest
 
-from pipeline.evaluation.scores import tidy
-from pipeline.reporting import learned
+from pipeline.report import numbers
+from pipeline.report.statistics import tidy
 from tests.reporting.test_learned import HELD_OUT, point
 
 
@@ -17,11 +17,11 @@ def points(key: str, by_count: dict[int, tuple[float, float]], **words: str) -> 
 
 
 def contrasts_of_pokes(points: list[dict]) -> dict:
-    return learned.contrasts_of_pokes(tidy([], {"pokes": points}))
+    return numbers.contrasts_of_pokes(tidy([], {"pokes": points}))
 
 
 def contrasts_of_sensors(points: list[dict]) -> dict:
-    return learned.contrasts_of_sensors(tidy([], {"sensors": points}))
+    return numbers.contrasts_of_sensors(tidy([], {"sensors": points}))
 
 
 def gains(contrast: dict) -> dict[str, float]:

@@ -4,7 +4,7 @@ import xml.etree.ElementTree as ET
 
 import numpy as np
 
-from pipeline.reporting.figures import drawing, error_grid, svg
+from pipeline.report.figures import drawing, error_grid, svg
 
 PLACES_MM = np.array([[0.0, 0.0], [0.0, 2.0], [2.0, 0.0], [2.0, 2.0]] * 3)
 

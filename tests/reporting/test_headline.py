@@ -6,11 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.reporting.headline import ANSWERING, FILE, answer, headline_figures, short_table
-from pipeline.reporting.order import CONTROL, models
-from pipeline.reporting.paper import TABLE_2
-from pipeline.reporting.shown import show
-from pipeline.trials.universal import METHODS, WAYS
+from pipeline.report.formatting import CONTROL, models, show
+from pipeline.report.headline import ANSWERING, FILE, answer, headline_figures, short_table
+from pipeline.report.paper import TABLE_2
+from pipeline.training.universal import METHODS, WAYS
 from tests.reporting.synthetic import all_questions, over_boards
 
 REPORTS = Path(__file__).resolve().parents[2] / "reports"

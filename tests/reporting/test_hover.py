@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.reporting.figures import drawing, svg
-from pipeline.reporting.hover import MOST
+from pipeline.report.figures import MOST, drawing, svg
 
 SVG = "{http://www.w3.org/2000/svg}"
 

@@ -2,7 +2,7 @@
 
 import re
 
-from pipeline.reporting.index import index
+from pipeline.report.page import index
 from tests.reporting.synthetic import all_questions
 
 SVG = '<svg width="600.0pt" height="200.0pt"><text style="font-size: 9px">a</text></svg>'

@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from pipeline.evaluation.scores import tidy
-from pipeline.reporting.learned import PAIRS, learned, timed_learning
+from pipeline.report.numbers import PAIRS, learned, timed_learning
+from pipeline.report.statistics import tidy
 from tests.evaluation import cards
 
 HELD_OUT = {"b0": ("s0", "s1"), "b1": ("s2", "s3")}

@@ -5,13 +5,12 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.reporting.learned import timed_learning
-from pipeline.reporting.order import CONTROL, paired_boards_table, paired_table
-from pipeline.reporting.paper import TABLE_2
-from pipeline.reporting.readme import blocks_of
-from pipeline.reporting.shown import to_markdown
-from pipeline.reporting.sweeps import learning_costs
-from pipeline.reporting.tables import (
+from pipeline.report.figures import learning_costs
+from pipeline.report.formatting import CONTROL, paired_boards_table, paired_table, to_markdown
+from pipeline.report.numbers import timed_learning
+from pipeline.report.paper import TABLE_2
+from pipeline.report.readme import blocks_of
+from pipeline.report.tables import (
     audit_table,
     baselines_table,
     chosen_table,

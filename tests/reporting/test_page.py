@@ -7,13 +7,11 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from pipeline.core.errors import SchemaError
-from pipeline.questions import EXPERIMENTS
-from pipeline.reporting import judging
-from pipeline.reporting.checklist import checklist
-from pipeline.reporting.headline import answer
-from pipeline.reporting.numbers import split
-from pipeline.reporting.page import (
+from pipeline.report import judging
+from pipeline.report.checklist import checklist
+from pipeline.report.headline import answer
+from pipeline.report.numbers import split
+from pipeline.report.page import (
     FINDINGS_N,
     LEGIBLE_PX,
     about,
@@ -26,7 +24,9 @@ from pipeline.reporting.page import (
     run_page,
     together,
 )
-from pipeline.reporting.tables import make_tables
+from pipeline.report.tables import make_tables
+from pipeline.scenes import EXPERIMENTS
+from reskin.errors import SchemaError
 from tests.reporting.synthetic import all_questions, cost
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.reporting.trade_offs import place_labels
+from pipeline.report.figures import place_labels
 
 LABEL = np.array([0.06, 0.05])
 MARK = np.array([0.03, 0.04])

@@ -4,10 +4,9 @@ import copy
 
 import pytest
 
-from pipeline.core.io import read_json
-from pipeline.evaluation.reproduced import leaves
-from pipeline.reporting.learned import timed_learning
-from pipeline.reporting.numbers import TIMES, join, split
+from pipeline.manage.compare import leaves
+from pipeline.report.numbers import TIMES, join, split, timed_learning
+from reskin.io import read_json
 from tests.reporting.synthetic import all_questions, cost, scores
 from tests.stages.checkout import ROOT
 

@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from pipeline.core.io import read_json
-from pipeline.questions import EXPERIMENTS
-from pipeline.reporting.numbers import headline_scores
+from pipeline.report.numbers import headline_scores
+from pipeline.scenes import EXPERIMENTS
+from reskin.io import read_json
 from tests.reporting.synthetic import all_questions, scores, stat
 from tests.stages.checkout import ROOT
 

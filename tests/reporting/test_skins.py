@@ -2,7 +2,7 @@
 
 import pytest
 
-from pipeline.reporting.skins import skins_table
+from pipeline.report.tables import skins_table
 
 
 def described(source, **means):

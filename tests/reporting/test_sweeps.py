@@ -6,7 +6,7 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
-from pipeline.reporting.sweeps import bars, learning_figures, learning_pages, sweep_pokes, sweep_sensors
+from pipeline.report.figures import bars, learning_figures, learning_pages, sweep_pokes, sweep_sensors
 from tests.reporting.test_work_precision import said
 
 

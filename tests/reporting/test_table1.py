@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core.errors import ParamsError
-from pipeline.reporting.table1 import LOCALISATION, NOT_GIVEN, OURS, measured, read_table1, table1
+from pipeline.report.table1 import LOCALISATION, NOT_GIVEN, OURS, measured, read_table1, table1
+from reskin.errors import ParamsError
 from tests.reporting.synthetic import all_questions, stat
 
 DATA = read_table1()

@@ -3,14 +3,14 @@ import json
 import pyarrow as pa
 import pytest
 
-from pipeline.core.errors import SchemaError
-from pipeline.evaluation.scores import tidy
-from pipeline.reporting.numbers import add_up, compose, foretold, lost_by_protocol
-from pipeline.reporting.paper import TABLE_2
-from pipeline.reporting.readme import fill
-from pipeline.reporting.shown import OF_PAPER, rounded, show, show_digits, to_markdown
-from pipeline.reporting.table1 import NOT_GIVEN, OURS
-from pipeline.reporting.tables import make_tables
+from pipeline.report.formatting import OF_PAPER, rounded, show, show_digits, to_markdown
+from pipeline.report.numbers import add_up, compose, foretold, lost_by_protocol
+from pipeline.report.paper import TABLE_2
+from pipeline.report.readme import fill
+from pipeline.report.statistics import tidy
+from pipeline.report.table1 import NOT_GIVEN, OURS
+from pipeline.report.tables import make_tables
+from reskin.errors import SchemaError
 from tests.evaluation import cards
 
 

@@ -6,7 +6,7 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.reporting.trade_offs import look_of, trade_off, trade_off_points
+from pipeline.report.figures import look_of, trade_off, trade_off_points
 from tests.reporting.test_work_precision import said
 
 

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.experiments.runtime.rows import REFERENCE, Precision, Seconds, choose
-from pipeline.physics.nodes import CHOSEN
-from pipeline.reporting.work_precision import COLOURS, MARKERS, costs, failures, front, integrators, pages, quadratures
+from pipeline.report.figures import COLOURS, MARKERS, costs, failures, front, integrators, pages, quadratures
+from reskin.physics.magnet import CHOSEN
 from tests.reporting.synthetic import cost
 
 RULES = [("Gauss in z", "0.5 mm x 6", 10584, 0.004), ("Gauss in z", "0.7 mm x 5", 5120, 0.015)]

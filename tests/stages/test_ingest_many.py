@@ -4,10 +4,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from pipeline.core import io
-from pipeline.core.config import Files
-from pipeline.core.errors import CaptureError
 from pipeline.stages import ingest_many as stage
+from reskin import io
+from reskin.config import Files
+from reskin.errors import CaptureError
 
 
 @pytest.fixture

@@ -1,8 +1,8 @@
 """What of an experiment reaches the diary: its numbers, over contacts where they go over contacts."""
 
-from pipeline.core import io
-from pipeline.params import parse_scene
+from pipeline.scenes import parse_scene
 from pipeline.stages.publish import read_curves
+from reskin import io
 from tests.scenes import asking
 
 

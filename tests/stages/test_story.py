@@ -20,14 +20,14 @@ import pytest
 from ruamel.yaml import YAML
 
 import reskin
-from pipeline.core import io
-from pipeline.learning.inputs import Scaler
-from pipeline.questions import EXPERIMENTS
-from pipeline.reporting.checklist import read_rows, resolve
-from pipeline.reporting.headline import short_table, table2_figure
-from pipeline.reporting.judging import NOT_REACHED
-from pipeline.reporting.numbers import join
-from pipeline.reporting.shown import to_markdown
+from pipeline.report.checklist import read_rows, resolve
+from pipeline.report.formatting import to_markdown
+from pipeline.report.headline import short_table, table2_figure
+from pipeline.report.judging import NOT_REACHED
+from pipeline.report.numbers import join
+from pipeline.scenes import EXPERIMENTS
+from reskin import io
+from reskin.models.inputs import Scaler
 from tests.stages.checkout import ENVIRONMENT, copy_checkout, run, warm_stages
 
 LEARNING = (

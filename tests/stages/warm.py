@@ -56,10 +56,10 @@ def begin(simulated: set[tuple[str, str]]) -> None:
     importlib.import_module("pipeline")  # first, as it tells NumPy which instructions to use
     import numpy as np
 
-    from pipeline.core.config import Files, Settings, read_yaml
-    from pipeline.physics.skin import draw_skin, moved_dipoles
     from pipeline.stages.code import entries
-    from pipeline.synthesis.settings import check_synthesis
+    from reskin.config import Files, Settings, read_yaml
+    from reskin.physics.skin import draw_skin, moved_dipoles
+    from reskin.simulation.settings import check_synthesis
 
     for name in (*LIBRARIES, *entries().values()):
         importlib.import_module(name)

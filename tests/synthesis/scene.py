@@ -1,7 +1,7 @@
 """A small scene to simulate, as plain words, and small changes of it."""
 
-from pipeline.core.config import parse
-from pipeline.synthesis.settings import Synthesis
+from reskin.config import parse
+from reskin.simulation.settings import Synthesis
 from tests.physics.test_board import SPREADS
 
 GRID = {"kind": "grid", "boards": "rigid", "skins_n": 4, "passes_n": 2, "depths_mm": (0.6, 1.2), "terms": []}

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from pipeline.capture.stream import FrameStream
-from pipeline.capture.wire import concatenate
-from pipeline.core.errors import ParamsError
-from pipeline.dataset.grid import points_mm
-from pipeline.physics.board import draw_board
-from pipeline.physics.skin import changes_of_field, draw_skin, forces
-from pipeline.synthesis.capture import record, roster, to_files
+from reskin.board.stream import FrameStream
+from reskin.board.wire import concatenate
+from reskin.data.grid import points_mm
+from reskin.errors import ParamsError
+from reskin.physics.board import draw_board
+from reskin.physics.skin import changes_of_field, draw_skin, forces
+from reskin.simulation.capture import record, roster, to_files
 from tests.synthesis.scene import AGEING, GRID, RELAXATION, RIGID, SECTIONS, TEMPERATURE, synthesis, with_protocol
 
 LIFTED_N, MOVING_N, DWELL_N = 1 + 4, 2, 1 + 3

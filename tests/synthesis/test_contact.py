@@ -3,13 +3,12 @@
 import numpy as np
 import pytest
 
-from pipeline.core.seeds import rng_for
-from pipeline.physics.board import draw_board
-from pipeline.physics.friction import Friction
-from pipeline.physics.skin import changes_of_field, draw_skin, forces
-from pipeline.physics.viscoelastic import Relaxation, force_left
-from pipeline.physics.wear import Ageing
-from pipeline.synthesis.contact import Terms, respond
+from reskin.physics.aging import Ageing, Relaxation, force_left
+from reskin.physics.board import draw_board
+from reskin.physics.shear import Friction
+from reskin.physics.skin import changes_of_field, draw_skin, forces
+from reskin.seeds import rng_for
+from reskin.simulation.contact import Terms, respond
 from tests.synthesis.scene import synthesis
 
 OF = synthesis()

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.core.config import read_yaml
-from pipeline.physics import slide
-from pipeline.synthesis.fingerprint import SECTIONS, of_sections
+from reskin.config import read_yaml
+from reskin.physics import slide
+from reskin.simulation.fingerprint import SECTIONS, of_sections
 
 ROOT = Path(__file__).resolve().parents[2]
 PARAMS = read_yaml(ROOT / "params.yaml")

@@ -3,14 +3,13 @@
 import numpy as np
 import pytest
 
-from pipeline.core.seeds import rng_for
-from pipeline.physics.board import Board
-from pipeline.physics.sensor import ChipDesign
-from pipeline.physics.warmth import REMANENCE_PER_K, Temperature
-from pipeline.synthesis import frames
-from pipeline.synthesis.contact import Response
-from pipeline.synthesis.frames import Reader, read_frames
-from pipeline.synthesis.rig import Rig, timeline
+from reskin.physics.aging import REMANENCE_PER_K, Temperature
+from reskin.physics.board import Board
+from reskin.physics.chip import ChipDesign
+from reskin.seeds import rng_for
+from reskin.simulation import rig
+from reskin.simulation.contact import Response
+from reskin.simulation.rig import Reader, Rig, read_frames, timeline
 from tests.synthesis.scene import SECTIONS
 
 N, CHIPS_N = 40, 2
@@ -36,7 +35,7 @@ def read(chip=LOUD, rate_hz=400.0, temperature=None, sensitivity_per_K=(0.0, 0.0
 @pytest.mark.parametrize("rate_hz", [400.0, 1000.0])
 def test_blocks_leave_no_trace(rate_hz, monkeypatch):
     whole = read(rate_hz=rate_hz, temperature=WARMING)
-    monkeypatch.setattr(frames, "BLOCK_INDENTATIONS_N", 7)
+    monkeypatch.setattr(rig, "BLOCK_INDENTATIONS_N", 7)
     parts = read(rate_hz=rate_hz, temperature=WARMING)
     np.testing.assert_array_equal(whole.b_uT, parts.b_uT)
     np.testing.assert_array_equal(whole.temperature_degC, parts.temperature_degC)

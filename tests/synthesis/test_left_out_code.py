@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.physics import shear
-from pipeline.synthesis.capture import record
+from reskin.physics import shear
+from reskin.simulation.capture import record
 from tests.synthesis.scene import AGEING, GRID, RELAXATION, TEMPERATURE, with_protocol
 
 TERMS = {

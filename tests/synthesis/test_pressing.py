@@ -5,15 +5,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.capture.header import write_capture
-from pipeline.capture.sd_card import read_log
-from pipeline.core.errors import CaptureError, ParamsError
-from pipeline.core.seeds import rng_for
-from pipeline.dataset.captures import open_capture
-from pipeline.physics.skin import draw_skin, forces
-from pipeline.synthesis.capture import record, to_files
-from pipeline.synthesis.pressing import LIFTED_MM, depths_under, footfalls, half_sine, presses, weights_N
-from pipeline.synthesis.protocols import SKIN_MM, Press
+from reskin.errors import CaptureError, ParamsError
+from reskin.physics.skin import draw_skin, forces
+from reskin.recordings.header import write_capture
+from reskin.recordings.ingest import open_capture
+from reskin.recordings.readers.sd_card import read_log
+from reskin.seeds import rng_for
+from reskin.simulation.capture import record, to_files
+from reskin.simulation.protocols import (
+    LIFTED_MM,
+    SKIN_MM,
+    Press,
+    depths_under,
+    footfalls,
+    half_sine,
+    presses,
+    weights_N,
+)
 from tests.capture.headers import AS_USUAL
 from tests.synthesis.scene import synthesis, with_protocol
 

@@ -6,11 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import kstest
 
-from pipeline.core.config import parse
-from pipeline.core.errors import ParamsError
-from pipeline.core.seeds import rng_for
-from pipeline.dataset.grid import points_mm
-from pipeline.synthesis.protocols import SKIN_MM, Drag, Grid, Hand, Scatter
+from reskin.config import parse
+from reskin.data.grid import points_mm
+from reskin.errors import ParamsError
+from reskin.seeds import rng_for
+from reskin.simulation.protocols import SKIN_MM, Drag, Grid, Hand, Scatter
 
 SHARED = {"boards": "rigid", "skins_n": 1, "terms": ()}
 GRID = Grid(kind="grid", passes_n=2, depths_mm=(0.2, 0.4, 0.6, 0.8, 1.0, 1.2), **SHARED)

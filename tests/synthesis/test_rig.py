@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core.seeds import rng_for
-from pipeline.synthesis.protocols import SKIN_MM, Drag, Grid
-from pipeline.synthesis.rig import Rig, chunks, draw_clock, misplace, probe_log, timeline
+from reskin.seeds import rng_for
+from reskin.simulation.protocols import SKIN_MM, Drag, Grid
+from reskin.simulation.rig import Rig, chunks, draw_clock, misplace, probe_log, timeline
 from tests.synthesis.scene import SECTIONS
 
 SHARED = {"boards": "rigid", "skins_n": 1, "terms": ()}

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pipeline.physics import shear
-from pipeline.physics.board import draw_board
-from pipeline.physics.change import change_of_field
-from pipeline.physics.friction import Friction
-from pipeline.physics.skin import changes_of_field, draw_skin, forces, moved_dipoles
-from pipeline.physics.slide import HoldDesign
-from pipeline.synthesis.contact import push
+from reskin.physics import shear
+from reskin.physics.board import draw_board
+from reskin.physics.magnet import change_of_field
+from reskin.physics.shear import Friction
+from reskin.physics.skin import changes_of_field, draw_skin, forces, moved_dipoles
+from reskin.physics.slide import HoldDesign
+from reskin.simulation.contact import push
 from tests.synthesis.scene import SECTIONS, synthesis
 
 LENGTH = "skin_filler_length_mm"

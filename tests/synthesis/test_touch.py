@@ -8,13 +8,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.core.config import parse, read_yaml
-from pipeline.physics import slide
-from pipeline.physics.board import Board, BoardDesign, Spreads, draw_board
-from pipeline.physics.friction import Friction
-from pipeline.physics.nodes import Quadrature
-from pipeline.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, forces
-from pipeline.synthesis.contact import Terms, push, respond
+from reskin.config import parse, read_yaml
+from reskin.physics import slide
+from reskin.physics.board import Board, BoardDesign, Spreads, draw_board
+from reskin.physics.magnet import Quadrature
+from reskin.physics.shear import Friction
+from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, forces
+from reskin.simulation.contact import Terms, push, respond
 
 ROOT = Path(__file__).resolve().parents[2]
 PARAMS = read_yaml(ROOT / "params.yaml")

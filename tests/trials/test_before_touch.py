@@ -4,14 +4,13 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.core import io
-from pipeline.core.config import Settings
-from pipeline.core.seeds import rng_for
-from pipeline.dataset.rows import Selection, gather
-from pipeline.dataset.scan import gather_hover
-from pipeline.dataset.splits import Split, draw_folds
-from pipeline.trials.before_touch import score_before_touch
-from pipeline.trials.training import SceneData
+from pipeline.training.before_contact import score_before_touch
+from pipeline.training.trainings import SceneData
+from reskin import io
+from reskin.config import Settings
+from reskin.data.rows import Selection, gather, gather_hover
+from reskin.data.splits import Split, draw_folds
+from reskin.seeds import rng_for
 from tests.dataset.tables import readings
 
 PASSES_N, PLACES_N = 4, 64

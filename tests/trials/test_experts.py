@@ -2,14 +2,13 @@
 
 import numpy as np
 
-from pipeline.core import io
-from pipeline.core.seeds import rng_for
-from pipeline.dataset.rows import Rows
-from pipeline.trials.experts import READINGS_N, Experts, Frame, read_networks, recorded, write_networks
-from pipeline.twin.network import draw_weights
-from pipeline.twin.opinion import predict
-from pipeline.twin.tables import NOMINAL, OF_NOMINAL
-from pipeline.twin.training import Lessons, Syllabus
+from pipeline.training.universal import READINGS_N, Experts, Frame, read_networks, recorded, write_networks
+from reskin import io
+from reskin.data.rows import Rows
+from reskin.seeds import rng_for
+from reskin.universal.map import NOMINAL, OF_NOMINAL
+from reskin.universal.network import draw_weights, predict
+from reskin.universal.training import Lessons, Syllabus
 from tests.twin.skins import SETUP, made_tables
 
 QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])

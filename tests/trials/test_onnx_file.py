@@ -4,15 +4,14 @@ import numpy as np
 import pytest
 
 import reskin
-from pipeline.core.errors import ParamsError
-from pipeline.core.seeds import rng_for
-from pipeline.learning.inputs import FIT, VIEW
-from pipeline.learning.job import Job, Labelled
-from pipeline.learning.model import LAYERS, draw_weights
-from pipeline.learning.train import train
-from pipeline.learning.trial import Terms
-from pipeline.trials import onnx_file
-from pipeline.trials.networks import Network
+from reskin.errors import ParamsError
+from reskin.models import trained as onnx_file
+from reskin.models.inputs import FIT, VIEW
+from reskin.models.network import LAYERS, draw_weights
+from reskin.models.train import Job, Labelled, train
+from reskin.models.trained import Network
+from reskin.models.trial import Terms
+from reskin.seeds import rng_for
 from tests.learning.recipes import recipe
 
 STEPS_N = 300

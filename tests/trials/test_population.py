@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from pipeline.core.seeds import rng_for
-from pipeline.trials import population
-from pipeline.trials.population import WAYS, WEIGHT_N, WEIGHT_SD, Experts, cases_of, ready, scores_of, trust
-from pipeline.trials.universal import TEMPERS
-from pipeline.twin.network import draw_weights
-from pipeline.twin.skin_map import Estimate, new_map
+from pipeline.training import population
+from pipeline.training.population import WAYS, WEIGHT_N, WEIGHT_SD, Experts, cases_of, ready, scores_of, trust
+from pipeline.training.universal import TEMPERS
+from reskin.seeds import rng_for
+from reskin.universal.map import Estimate, new_map
+from reskin.universal.network import draw_weights
 from tests.twin.skins import made_population, made_tables
 
 

@@ -3,17 +3,15 @@
 import numpy as np
 import pytest
 
-from pipeline.core.seeds import rng_for
-from pipeline.trials import shipping
-from pipeline.trials.experts import Experts
-from pipeline.trials.shipping import shown, tell_sureness
-from pipeline.trials.sureness import SURENESS, told_of
-from pipeline.trials.universal import by_own_labels, read_both, ready
-from pipeline.twin.population import POKES_N, Population
-from pipeline.twin.shipped import Universal, load_universal
-from pipeline.twin.sure import Sureness
-from pipeline.twin.tables import NOMINAL, OF_NOMINAL
-from pipeline.twin.training import Syllabus
+from pipeline.training import shipping
+from pipeline.training.shipping import shown, tell_sureness
+from pipeline.training.universal import SURENESS, Experts, by_own_labels, read_both, ready, told_of
+from reskin.seeds import rng_for
+from reskin.universal.calibration import Sureness
+from reskin.universal.map import NOMINAL, OF_NOMINAL
+from reskin.universal.model import Universal, load_universal
+from reskin.universal.population import POKES_N, Population
+from reskin.universal.training import Syllabus
 from tests.twin.skins import SETUP
 
 

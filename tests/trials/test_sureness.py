@@ -6,22 +6,31 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from pipeline.core.seeds import rng_for
-from pipeline.trials import sureness
-from pipeline.trials.experts import Experts
-from pipeline.trials.sureness import SURENESS, best, skins_of_prior, tell_sureness, told_of
-from pipeline.trials.universal import Pokes, by_own_labels, read_both, ready
-from pipeline.twin.network import draw_weights
-from pipeline.twin.sure import ratio
-from pipeline.twin.tables import NOMINAL, OF_NOMINAL
-from pipeline.twin.training import Syllabus
+from pipeline.training import universal
+from pipeline.training.universal import (
+    SURENESS,
+    Experts,
+    Pokes,
+    best,
+    by_own_labels,
+    read_both,
+    ready,
+    skins_of_prior,
+    tell_sureness,
+    told_of,
+)
+from reskin.seeds import rng_for
+from reskin.universal.calibration import ratio
+from reskin.universal.map import NOMINAL, OF_NOMINAL
+from reskin.universal.network import draw_weights
+from reskin.universal.training import Syllabus
 from tests.twin.skins import SETUP, made_population, made_tables
 
 
 @pytest.fixture(autouse=True)
 def made(monkeypatch):
     draw = lambda centre, spreads, setup, n, rng: made_population(n, rng)  # noqa: E731
-    monkeypatch.setattr(sureness, "draw_population", draw)
+    monkeypatch.setattr(universal, "draw_population", draw)
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +92,7 @@ def test_a_single_label_is_read_by_experts_that_were_told_none(labelled):
 
 
 def test_sureness_is_told_by_skins_of_the_prior_for_every_number_of_labels(nominal, monkeypatch):
-    monkeypatch.setattr(sureness, "FURTHER_N", 2)
+    monkeypatch.setattr(universal, "FURTHER_N", 2)
     found = tell_sureness(nominal, (0, 40), seed=0)
     assert set(found) == {0, 40}
     assert set(np.ravel(list(found.values()))) <= set(SURENESS)

@@ -3,10 +3,10 @@ import json
 import numpy as np
 import pytest
 
-from pipeline.dataset.rows import Rows
-from pipeline.learning.train import train_stack
-from pipeline.learning.trial import Trained, Trial
-from pipeline.trials.training import describe
+from pipeline.training.trainings import describe
+from reskin.data.rows import Rows
+from reskin.models.train import train_stack
+from reskin.models.trial import Trained, Trial
 from tests.learning.trials import OWN, POKED, ROWS_N, TEST, TRAIN, adapting, few_labels, measured, pooled
 
 

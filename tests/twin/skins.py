@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.core.config import parse, read_yaml
-from pipeline.physics.skin import SkinDesign
-from pipeline.twin.law import Setup
-from pipeline.twin.population import POKES_N, Population, draw_places
-from pipeline.twin.tables import Tables, lattice_mm
+from reskin.config import parse, read_yaml
+from reskin.physics.skin import SkinDesign
+from reskin.universal.law import Setup
+from reskin.universal.map import Tables, lattice_mm
+from reskin.universal.population import POKES_N, Population, draw_places
 
 ROOT = Path(__file__).resolve().parents[2]
 CHIPS_MM = np.array([[0.0, 0.0], [-7.0, 0.0], [0.0, -7.0], [7.0, 0.0], [0.0, 7.0]])

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pipeline.core.seeds import rng_for
-from pipeline.twin.answers import CELL_SD_MM, Lattice, Likelihoods, means, products
+from reskin.seeds import rng_for
+from reskin.universal.answers import CELL_SD_MM, Lattice, Likelihoods, means, products
 
 AXIS_mm = np.arange(-8, 8.01, 0.4)
 AT = Lattice(np.stack(np.meshgrid(AXIS_mm, AXIS_mm, indexing="ij"), axis=-1).reshape(-1, 2), np.log([0.5, 1, 2, 4, 8]))

@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 
-from pipeline.twin.choosing import worth
-from pipeline.twin.hypotheses import NOISE_uT
-from pipeline.twin.residual import kernel
-from pipeline.twin.shipped import load_universal
-from pipeline.twin.skin_map import SkinMap, new_map, see_labelled
+from reskin.universal.calibration import worth
+from reskin.universal.map import NOISE_uT, SkinMap, kernel, new_map, see_labelled
+from reskin.universal.model import load_universal
 from tests.twin.skins import fields_uT, made_tables
 
 PLACE_mm, FORCE_N = np.array([[0.4, -1.2], [5.2, 2.8]]), np.array([2.0, 2.0])  # of the lattice

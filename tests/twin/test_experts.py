@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from pipeline.core.seeds import rng_for
-from pipeline.twin.experts import LABEL_SD_MM, OFFSET_SD_MM, Labels, centre, multiply, shift
-from pipeline.twin.opinion import Opinion
-from pipeline.twin.skin_map import Reader, new_map
+from reskin.seeds import rng_for
+from reskin.universal.combine import LABEL_SD_MM, OFFSET_SD_MM, Labels, centre, multiply, shift
+from reskin.universal.map import Reader, new_map
+from reskin.universal.network import Opinion
 from tests.twin.skins import fields_uT, made_tables
 
 RNG = rng_for(0, "experts")

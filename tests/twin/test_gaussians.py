@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pipeline.core.seeds import rng_for
-from pipeline.twin.gaussians import LANES_N, side_by_side, whiten
+from reskin.seeds import rng_for
+from reskin.universal.gaussians import LANES_N, side_by_side, whiten
 
 
 @pytest.mark.parametrize("h", [1, LANES_N, LANES_N + 3])

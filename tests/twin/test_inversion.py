@@ -5,12 +5,12 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
-from pipeline.core.seeds import rng_for
-from pipeline.twin import inversion
-from pipeline.twin.inversion import LEAST, NUMBERS, STEP_MM, _Together, chart, fit_unlabelled, search
-from pipeline.twin.law import at_rest_uT, simulate_uT
-from pipeline.twin.population import COARSE
-from pipeline.twin.tables import NOMINAL, lattice_mm
+from reskin.seeds import rng_for
+from reskin.universal import inversion
+from reskin.universal.inversion import LEAST, NUMBERS, STEP_MM, _Together, chart, fit_unlabelled, search
+from reskin.universal.law import at_rest_uT, simulate_uT
+from reskin.universal.map import NOMINAL, lattice_mm
+from reskin.universal.population import COARSE
 from tests.twin.skins import SETUP
 
 CHEAP = replace(SETUP, rule=COARSE)

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.core.seeds import rng_for
-from pipeline.twin.network import Network, draw_weights, inputs
-from pipeline.twin.opinion import LOG_N, PLACE_MM, predict
+from reskin.seeds import rng_for
+from reskin.universal.network import LOG_N, PLACE_MM, Network, draw_weights, inputs, predict
 
 RNG = rng_for(0, "network")
 POKES_uT, READ_uT, REST_uT = (RNG.normal(0, 300, shape) for shape in ((20, 15), (7, 15), (15,)))

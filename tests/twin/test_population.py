@@ -5,11 +5,11 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from pipeline.core.seeds import rng_for
-from pipeline.twin import population
-from pipeline.twin.law import at_rest_uT, simulate_uT
-from pipeline.twin.places import inside
-from pipeline.twin.population import (
+from reskin.seeds import rng_for
+from reskin.universal import population
+from reskin.universal.law import at_rest_uT, inside, simulate_uT
+from reskin.universal.map import NOMINAL, OF_NOMINAL
+from reskin.universal.population import (
     LEAST,
     PLACES_N,
     PLAIN,
@@ -20,7 +20,6 @@ from pipeline.twin.population import (
     fill,
     grid,
 )
-from pipeline.twin.tables import NOMINAL, OF_NOMINAL
 from tests.twin.skins import SETUP
 
 COARSE = replace(SETUP, rule=population.COARSE)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pipeline.core.seeds import rng_for
-from pipeline.twin.residual import NOISE, SHARED, carry, kernel, no_residual
+from reskin.seeds import rng_for
+from reskin.universal.map import NOISE, SHARED, carry, kernel, no_residual
 
 APART_MM = np.array([[0.0, 0.0], [40.0, 0.0], [0.0, 40.0]])  # so far that no place tells of another
 FORCE_N = np.ones(3)

@@ -7,19 +7,19 @@ import numpy as np
 import pytest
 
 import reskin
-from pipeline.core import io
-from pipeline.core.config import parse, read_yaml
-from pipeline.core.errors import SchemaError
-from pipeline.core.seeds import rng_for
-from pipeline.physics import slide
-from pipeline.physics.board import BoardDesign, Spreads, draw_board
-from pipeline.physics.nodes import Quadrature
-from pipeline.physics.sensor import ChipDesign, read_field
-from pipeline.physics.skin import SkinDesign, changes_of_field, draw_skin
-from pipeline.twin.asked import CHANNELS_N
-from pipeline.twin.shipped import FILE, Universal, load_universal
-from pipeline.twin.tables import NOMINAL
-from pipeline.twin.turned import to_chips
+from reskin import io
+from reskin.config import parse, read_yaml
+from reskin.errors import SchemaError
+from reskin.physics import slide
+from reskin.physics.board import BoardDesign, Spreads, draw_board
+from reskin.physics.chip import ChipDesign, read_field
+from reskin.physics.magnet import Quadrature
+from reskin.physics.skin import SkinDesign, changes_of_field, draw_skin
+from reskin.seeds import rng_for
+from reskin.universal.axes import to_chips
+from reskin.universal.calibration import CHANNELS_N
+from reskin.universal.map import NOMINAL
+from reskin.universal.model import FILE, Universal, load_universal
 
 ROOT = Path(__file__).resolve().parents[2]
 PARAMS = read_yaml(ROOT / "params.yaml")

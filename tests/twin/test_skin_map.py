@@ -5,19 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.core.errors import SchemaError
-from pipeline.core.seeds import rng_for
-from pipeline.twin import skin_map
-from pipeline.twin.hypotheses import LAW_ERROR, NOISE_uT
-from pipeline.twin.population import grid
-from pipeline.twin.skin_map import OFFSET_uT, Reader, new_map, see_even, see_labelled, see_pokes
+from reskin.errors import SchemaError
+from reskin.seeds import rng_for
+from reskin.universal import map
+from reskin.universal.map import LAW_ERROR, NOISE_uT, OFFSET_uT, Reader, new_map, see_even, see_labelled, see_pokes
+from reskin.universal.population import grid
 from tests.twin.skins import REST_SLOPE_uT, made_tables, poked_uT
 
 NUMBER = np.array([0.0, 0.0, 1.5])
 
 
 @pytest.fixture(scope="module")
-def skin() -> skin_map.SkinMap:
+def skin() -> map.SkinMap:
     return new_map(made_tables())
 
 
@@ -28,7 +27,7 @@ def pokes(number=NUMBER, seed=0):
 
 def test_a_field_at_rest_is_learnt_as_by_conditioning_a_gaussian(skin):
     noload_uT = rng_for(1, "rest").normal(0, 300, 15)
-    found = skin_map.see_rest(skin, noload_uT)
+    found = map.see_rest(skin, noload_uT)
     # The covariance form of what the map writes in the information form.
     gain = REST_SLOPE_uT.T @ np.linalg.inv(REST_SLOPE_uT @ REST_SLOPE_uT.T + OFFSET_uT**2 * np.eye(15))
     np.testing.assert_allclose(found.number, gain @ noload_uT, rtol=1e-9)

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from pipeline.core.seeds import rng_for
-from pipeline.twin.skin_map import Estimate
-from pipeline.twin.sure import PRIOR_N, Sureness, by_misfit, by_residuals, left_out, ratio, ratios
+from reskin.seeds import rng_for
+from reskin.universal.calibration import PRIOR_N, Sureness, by_misfit, by_residuals, left_out, ratio, ratios
+from reskin.universal.map import Estimate
 
 
 def estimate(off_mm: np.ndarray, sd_mm: float) -> Estimate:

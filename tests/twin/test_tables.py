@@ -5,14 +5,14 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
-from pipeline.twin import tables
-from pipeline.twin.law import simulate_uT
-from pipeline.twin.tables import NOMINAL, OF_LOG, OF_NOMINAL, OF_RIG, STEP, middle, spread_by, tabulate
+from reskin.universal import map
+from reskin.universal.law import simulate_uT
+from reskin.universal.map import NOMINAL, OF_LOG, OF_NOMINAL, OF_RIG, STEP, middle, spread_by, tabulate
 from tests.twin.skins import SETUP
 
 
 def test_tables_hold_the_laws_fields_and_their_slopes(monkeypatch):
-    monkeypatch.setattr(tables, "lattice_mm", lambda: np.array([-4.0, 1.0]))
+    monkeypatch.setattr(map, "lattice_mm", lambda: np.array([-4.0, 1.0]))
     found = tabulate(NOMINAL, {"amplitude": 0.2, "label_x_mm": 0.5}, SETUP)
     at_mm = np.array([[-4.0, 1.0]])
     for i, force_N in enumerate(found.force_N):

@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 
-from pipeline.core.seeds import rng_for
-from pipeline.twin.opinion import predict
-from pipeline.twin.population import PLACES_N, POKES_N
-from pipeline.twin.residual import carry
-from pipeline.twin.tables import NOMINAL, OF_NOMINAL
-from pipeline.twin.training import Feed, Recorded, Syllabus, add_error, carried_uT, draw_kept, draw_recorded, train
+from reskin.seeds import rng_for
+from reskin.universal.map import NOMINAL, OF_NOMINAL, carry
+from reskin.universal.network import predict
+from reskin.universal.population import PLACES_N, POKES_N
+from reskin.universal.training import Feed, Recorded, Syllabus, add_error, carried_uT, draw_kept, draw_recorded, train
 from tests.twin.skins import SETUP, fields_uT, made_population
 
 SYLLABUS = Syllabus("made up", NOMINAL, OF_NOMINAL, SETUP)

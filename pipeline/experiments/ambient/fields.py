@@ -14,11 +14,11 @@ from jaxtyping import Float, Float32, Int64
 from scipy.constants import micro, milli
 from scipy.spatial.transform import Rotation
 
-from pipeline.evaluation.scores import summarise, with_seeds
-from pipeline.physics.ambient import EARTH_T, ball_field, ball_images, directions
-from pipeline.physics.board import Board, BoardDesign, draw_board
-from pipeline.physics.skin import Skin
-from pipeline.synthesis.settings import Synthesis
+from pipeline.report.statistics import summarise, with_seeds
+from reskin.physics.ambient import EARTH_T, ball_field, ball_images, directions
+from reskin.physics.board import Board, BoardDesign, draw_board
+from reskin.physics.skin import Skin
+from reskin.simulation.settings import Synthesis
 
 REFERENCE_ASIDE_MM = 30.0  # the lone chip, from the board's middle along x: assumed far enough to read no poke
 

@@ -12,12 +12,6 @@ import numpy as np
 from pydantic import Field
 from scipy.constants import micro
 
-from pipeline.core.config import Files, Settings, Strict, read_settings
-from pipeline.core.seeds import rng_for
-from pipeline.core.stage import run
-from pipeline.dataset.splits import Fold
-from pipeline.evaluation.metrics import score
-from pipeline.evaluation.scores import tally
 from pipeline.experiments.ambient.fields import (
     REFERENCE_ASIDE_MM,
     Case,
@@ -31,12 +25,18 @@ from pipeline.experiments.ambient.fields import (
     without_common_part,
 )
 from pipeline.experiments.answer import write_answer
-from pipeline.learning.recipe import HEADLINE, Training, training
-from pipeline.physics.ambient import EARTH_DIP_DEG, EARTH_SIZE_T
-from pipeline.physics.skin import draw_skin
-from pipeline.synthesis.settings import Synthesis, synthesis_of
-from pipeline.trials.networks import Network, networks_without
-from pipeline.trials.training import SceneData, collapse_record, read_data, train_all, trials_of
+from pipeline.report.statistics import tally
+from pipeline.stage import run
+from pipeline.training.trainings import SceneData, collapse_record, read_data, train_all, trials_of
+from reskin.config import Files, Settings, Strict, read_settings
+from reskin.data.splits import Fold
+from reskin.metrics import score
+from reskin.models.recipe import HEADLINE, Training, training
+from reskin.models.trained import Network, networks_without
+from reskin.physics.ambient import EARTH_DIP_DEG, EARTH_SIZE_T
+from reskin.physics.skin import draw_skin
+from reskin.seeds import rng_for
+from reskin.simulation.settings import Synthesis, synthesis_of
 
 
 class Iron(Strict):

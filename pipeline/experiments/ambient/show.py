@@ -8,9 +8,8 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.reporting.figures import drawing, svg
-from pipeline.reporting.shown import show_digits
-from pipeline.reporting.work_precision import COLOURS, MARKERS
+from pipeline.report.figures import COLOURS, MARKERS, drawing, svg
+from pipeline.report.formatting import show_digits
 
 COLUMNS = {
     "accuracy_pct": ("accuracy, %", 1), "mse_xy_mm2": ("MSE_xy, mm²", 2), "mse_f_N2": ("MSE_F, N²", 3),

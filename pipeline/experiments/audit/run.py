@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.core import io
-from pipeline.core.config import Files, Settings, Strict, parse, read_settings
-from pipeline.core.errors import LeakError, SchemaError
-from pipeline.core.seeds import rng_for
-from pipeline.core.stage import run, say
-from pipeline.evaluation.choice import settings_of, trimmed
 from pipeline.experiments.audit.sides import Check, Labels, Sides, audit_fold, holds, to_words
-from pipeline.learning.inputs import FIT, VIEW
-from pipeline.learning.recipe import HEADLINE, AuditSettings
-from pipeline.synthesis.fingerprint import fingerprint
-from pipeline.trials.training import SceneData, read_data
+from pipeline.report.choice import settings_of, trimmed
+from pipeline.stage import run, say
+from pipeline.training.trainings import SceneData, read_data
+from reskin import io
+from reskin.config import Files, Settings, Strict, parse, read_settings
+from reskin.errors import LeakError, SchemaError
+from reskin.models.inputs import FIT, VIEW
+from reskin.models.recipe import HEADLINE, AuditSettings
+from reskin.seeds import rng_for
+from reskin.simulation.fingerprint import fingerprint
 
 # The same rows give the same scaler but for the order of float64 sums, and that turns the last bit of a float32 at
 # most; 4 of them are 5e-7. One foreign row in 100,000 moves a mean by some 1e-5 of its deviation.

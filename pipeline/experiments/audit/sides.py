@@ -10,8 +10,8 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.core.errors import ParamsError
 from pipeline.experiments.audit.copies import COPIED_SHARE_MAX, liken, strong_indentations
+from reskin.errors import ParamsError
 
 
 @dataclass(frozen=True)

@@ -15,21 +15,21 @@ from jaxtyping import Bool, Float
 from scipy.constants import milli
 from scipy.special import owens_t
 
-from pipeline.core import io
-from pipeline.core.config import Files, read_settings
-from pipeline.core.errors import ParamsError, SchemaError
-from pipeline.core.stage import run, say
-from pipeline.dataset.grid import CENTRE_MM, points_mm
-from pipeline.evaluation.metrics import ACCURACY_LIMIT_MM, METRICS
-from pipeline.evaluation.scores import over_folds, tidy
 from pipeline.experiments.ambient.fields import seen_uT
 from pipeline.experiments.answer import write_answer
-from pipeline.learning.recipe import HEADLINE
-from pipeline.physics.board import draw_board
-from pipeline.physics.sensor import ChipDesign, steps_uT
-from pipeline.physics.skin import Skin, changes_of_field, draw_skin, forces
-from pipeline.synthesis.capture import roster
-from pipeline.synthesis.settings import MAIN, Synthesis, synthesis_of
+from pipeline.report.statistics import over_folds, tidy
+from pipeline.stage import run, say
+from reskin import io
+from reskin.config import Files, read_settings
+from reskin.data.grid import CENTRE_MM, points_mm
+from reskin.errors import ParamsError, SchemaError
+from reskin.metrics import ACCURACY_LIMIT_MM, METRICS
+from reskin.models.recipe import HEADLINE
+from reskin.physics.board import draw_board
+from reskin.physics.chip import ChipDesign, steps_uT
+from reskin.physics.skin import Skin, changes_of_field, draw_skin, forces
+from reskin.simulation.capture import roster
+from reskin.simulation.settings import MAIN, Synthesis, synthesis_of
 
 ROW_READINGS_N = 1  # of a row that a network sees (dataset.rows)
 STEP_MM = 0.01  # of the differences; 0.002 to 0.05 mm give the same bound within 2 %

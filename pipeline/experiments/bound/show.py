@@ -5,7 +5,7 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.reporting.shown import COLUMNS, n_of, show, tabulate
+from pipeline.report.formatting import COLUMNS, n_of, show, tabulate
 
 SIDES = {"signal": "bound", "with_label_errors": "bound, labels' errors added"}
 NONE = "–"

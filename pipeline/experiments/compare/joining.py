@@ -8,11 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.core.schema import Readings
 from pipeline.experiments.compare.frames import AS_SAID
 from pipeline.experiments.compare.run import Compare, framed, see, setup_of
-from pipeline.physics.skin import SkinDesign
-from pipeline.twin.pokes import Pokes, pool
+from reskin.physics.skin import SkinDesign
+from reskin.schema import Readings
+from reskin.universal.presses import Pokes, pool
 
 CHIPS_N = 5  # frames are told by chips on all sides of the middle
 # Fewer pokes tell nothing sure; more tell the same, and take seconds: on lab every third of 65 places tells it right.

@@ -15,19 +15,18 @@ from pydantic import Field
 from scipy.constants import milli
 from scipy.spatial.transform import Rotation
 
-from pipeline.core.config import Files, Settings, Strict, parse, read_settings
-from pipeline.core.errors import ParamsError
-from pipeline.core.schema import Readings
-from pipeline.core.seeds import rng_for
-from pipeline.core.stage import run
-from pipeline.evaluation.scores import statistic
 from pipeline.experiments.answer import read_folder, write_answer
 from pipeline.experiments.compare import frames
-from pipeline.physics.board import BoardDesign
-from pipeline.physics.skin import SkinDesign
-from pipeline.twin.fit import SEVEN, START, TEN, Seen, fit
-from pipeline.twin.law import Law, Setup, beyond_n, nominal_uT, simulate_uT
-from pipeline.twin.pokes import Pokes, cosines, explained, growth, lengths_uT, memory, pool
+from pipeline.report.statistics import statistic
+from pipeline.stage import run
+from reskin.config import Files, Settings, Strict, parse, read_settings
+from reskin.errors import ParamsError
+from reskin.physics.board import BoardDesign
+from reskin.physics.skin import SkinDesign
+from reskin.schema import Readings
+from reskin.seeds import rng_for
+from reskin.universal.law import SEVEN, START, TEN, Law, Seen, Setup, beyond_n, fit, nominal_uT, simulate_uT
+from reskin.universal.presses import Pokes, cosines, explained, growth, lengths_uT, memory, pool
 
 Side_mm = Annotated[float, Field(gt=0, le=500)]
 ARROWS_N = 4  # places that the figure shows

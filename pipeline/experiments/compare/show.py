@@ -6,10 +6,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pipeline.evaluation.scores import all_of, verdict, verdict_within
-from pipeline.reporting.figures import drawing, svg
-from pipeline.reporting.shown import show_digits, tabulate
-from pipeline.reporting.work_precision import COLOURS, MARKERS
+from pipeline.report.figures import COLOURS, MARKERS, drawing, svg
+from pipeline.report.formatting import show_digits, tabulate
+from pipeline.report.statistics import all_of, verdict, verdict_within
 
 COSINE_MIN = {"nominal": 0.90, "fitted": 0.90, "refitted": 0.85}
 EXPLAINED_MIN, GROWTH_WITHIN, MEMORY_PCT = 0.80, 0.10, (5.0, 8.0)

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32, Int64
 
-from pipeline.core.errors import ParamsError
-from pipeline.dataset.rows import Rows
-from pipeline.evaluation.metrics import ACCURACY_LIMIT_MM
-from pipeline.evaluation.scores import statistic
+from pipeline.report.statistics import statistic
+from reskin.data.rows import Rows
+from reskin.errors import ParamsError
+from reskin.metrics import ACCURACY_LIMIT_MM
 
 NEIGHBOURS_N = 5  # assumed, of both detectors that ask neighbours
 NOISE_uT = 15.0  # of all channels of a reading together (a channel's is 3 to 5 uT, FACTS 3): what lies below is not odd

@@ -11,10 +11,6 @@ import numpy as np
 from jaxtyping import Float32
 from pydantic import Field
 
-from pipeline.core.config import Files, Settings, Strict, read_settings
-from pipeline.core.seeds import rng_for
-from pipeline.core.stage import run
-from pipeline.dataset.splits import Fold
 from pipeline.experiments.answer import write_answer
 from pipeline.experiments.contacts.pairs import (
     Pairs,
@@ -30,10 +26,14 @@ from pipeline.experiments.contacts.pairs import (
     where_it_falls,
 )
 from pipeline.experiments.contacts.superposition import superposition
-from pipeline.learning.inputs import shape
-from pipeline.synthesis.settings import synthesis_of
-from pipeline.trials.networks import networks_without
-from pipeline.trials.training import SceneData, read_data
+from pipeline.stage import run
+from pipeline.training.trainings import SceneData, read_data
+from reskin.config import Files, Settings, Strict, read_settings
+from reskin.data.splits import Fold
+from reskin.models.inputs import shape
+from reskin.models.trained import networks_without
+from reskin.seeds import rng_for
+from reskin.simulation.settings import synthesis_of
 
 Count = Annotated[int, Field(ge=1)]
 Fraction = Annotated[float, Field(gt=0, lt=1)]

@@ -9,9 +9,8 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.reporting.figures import drawing, svg
-from pipeline.reporting.shown import show_digits
-from pipeline.reporting.work_precision import COLOURS, MARKERS
+from pipeline.report.figures import COLOURS, MARKERS, drawing, svg
+from pipeline.report.formatting import show_digits
 
 MEANING = (
     "Two contacts are the sum of two changes of field that were read of one held-out skin, so their noise is that of "

@@ -12,13 +12,13 @@ import numpy as np
 from jaxtyping import Float
 from scipy.constants import milli
 
-from pipeline.core.seeds import rng_for
-from pipeline.physics import flow_map
-from pipeline.physics.board import Board, draw_board
-from pipeline.physics.change import change_of_field
-from pipeline.physics.skin import Dipoles, Skin, draw_skin
-from pipeline.synthesis.capture import roster
-from pipeline.synthesis.settings import MAIN, Synthesis
+from reskin.physics import flow_map
+from reskin.physics.board import Board, draw_board
+from reskin.physics.magnet import change_of_field
+from reskin.physics.skin import Dipoles, Skin, draw_skin
+from reskin.seeds import rng_for
+from reskin.simulation.capture import roster
+from reskin.simulation.settings import MAIN, Synthesis
 
 PAIRS_N = 6  # of each distance, drawn
 MIDDLE_MM = 2.0  # a pair's middle lies so near the skin's, each axis

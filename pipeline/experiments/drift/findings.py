@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from pipeline.evaluation.scores import (
+from pipeline.report.statistics import (  # fmt: skip
     BOARDS_MIN,
     FEW_BOARDS,
     INCONCLUSIVE,
@@ -22,7 +22,7 @@ from pipeline.evaluation.scores import (
     interval,
     statistic,
     verdict,
-)  # fmt: skip
+)
 
 HIGHER_AND_FASTER = (
     '"prediction errors are higher and increase faster when we only make a single no-load measurement at the start"'

@@ -12,14 +12,6 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from pipeline.core.config import Files, Settings, Strict, read_settings
-from pipeline.core.errors import ParamsError
-from pipeline.core.schema import Readings
-from pipeline.core.stage import run
-from pipeline.dataset import baseline
-from pipeline.dataset.rows import Selection
-from pipeline.dataset.windows import TRAIN, Part, Policy, Windows, check_one_each, lay_parts, lay_windows, stack
-from pipeline.evaluation.scores import tally
 from pipeline.experiments.answer import read_folder, read_losses, write_answer
 from pipeline.experiments.drift.findings import findings
 from pipeline.experiments.drift.wander import over_steps, walked
@@ -35,9 +27,17 @@ from pipeline.experiments.drift.windows import (
     over_windows,
     pace,
 )  # fmt: skip
-from pipeline.learning.recipe import HEADLINE, Training, with_training
-from pipeline.learning.trial import Trained, Trial
-from pipeline.trials.training import SceneData, collapse_record, prepare_training, train_all
+from pipeline.report.statistics import tally
+from pipeline.stage import run
+from pipeline.training.trainings import SceneData, collapse_record, prepare_training, train_all
+from reskin.config import Files, Settings, Strict, read_settings
+from reskin.data import baseline
+from reskin.data.rows import Selection
+from reskin.data.windows import TRAIN, Part, Policy, Windows, check_one_each, lay_parts, lay_windows, stack
+from reskin.errors import ParamsError
+from reskin.models.recipe import HEADLINE, Training, with_training
+from reskin.models.trial import Trained, Trial
+from reskin.schema import Readings
 
 Count = Annotated[int, Field(ge=1)]
 # No-load reading: once, every so often, before each contact, or whenever a reading is judged free of contact.

@@ -8,11 +8,10 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.evaluation.scores import VERDICTS
-from pipeline.reporting.figures import drawing, svg
-from pipeline.reporting.paper import FIGURE_5
-from pipeline.reporting.shown import COLUMNS, show, tabulate
-from pipeline.reporting.work_precision import COLOURS, MARKERS
+from pipeline.report.figures import COLOURS, MARKERS, drawing, svg
+from pipeline.report.formatting import COLUMNS, show, tabulate
+from pipeline.report.paper import FIGURE_5
+from pipeline.report.statistics import VERDICTS
 
 POLICIES = ("initial", "regular", "each", "free")
 WALKED = (

@@ -12,16 +12,16 @@ import numpy as np
 import pandas as pd
 from scipy.constants import micro
 
-from pipeline.core.executors import device
-from pipeline.core.schema import Readings
-from pipeline.core.seeds import rng_for
-from pipeline.dataset.baseline import rank
-from pipeline.dataset.windows import Part
-from pipeline.evaluation.metrics import METRICS, score
-from pipeline.evaluation.scores import summarise
-from pipeline.learning.inputs import VIEW
-from pipeline.learning.trial import Trained, Trial
-from pipeline.physics.wear import wandering
+from pipeline.report.statistics import summarise
+from reskin.data.baseline import rank
+from reskin.data.windows import Part
+from reskin.metrics import METRICS, score
+from reskin.models.inputs import VIEW
+from reskin.models.trial import Trained, Trial
+from reskin.numerics import device
+from reskin.physics.aging import wandering
+from reskin.schema import Readings
+from reskin.seeds import rng_for
 
 
 def walked(readings: Readings, step_uT: float, *, after_n: int, seed: int) -> Readings:
@@ -59,7 +59,7 @@ def over_steps(
 
 
 def _answer(trial: Trial, trained: Trained, part: Part) -> np.ndarray:
-    from pipeline.learning.model import Predictor  # torch, late
+    from reskin.models.network import Predictor  # torch, late
 
     predict = Predictor(trained.weights, trial.recipe.architecture, device())
     return trained.scaler.decode(predict(trained.scaler.encode(VIEW[trial.recipe.inputs](part.rows.db_uT))))

@@ -12,10 +12,10 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float, Int, Int64, Shaped
 
-from pipeline.core.schema import Readings
-from pipeline.dataset.baseline import rank, subtract
-from pipeline.evaluation.metrics import METRICS, score
-from pipeline.evaluation.scores import board_means, summarise, with_seeds
+from pipeline.report.statistics import board_means, summarise, with_seeds
+from reskin.data.baseline import rank, subtract
+from reskin.metrics import METRICS, score
+from reskin.schema import Readings
 
 LATE_CONTACTS_N = 45_000  # paper figure 5b: "after 45,000 interactions"
 FORCE = 2  # column of a target

@@ -14,13 +14,13 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
 
-from pipeline.core.stage import run, say
-from pipeline.dataset.baseline import subtract
-from pipeline.dataset.rows import TARGETS
-from pipeline.evaluation.metrics import score
-from pipeline.evaluation.scores import paired, statistic, summarise
 from pipeline.experiments.answer import only, read_folder, read_losses, write_answer
-from pipeline.trials.networks import networks_without
+from pipeline.report.statistics import paired, statistic, summarise
+from pipeline.stage import run, say
+from reskin.data.baseline import subtract
+from reskin.data.rows import TARGETS
+from reskin.metrics import score
+from reskin.models.trained import networks_without
 
 WINDOW_N = 5  # readings that the paper takes at rest (section 3)
 FORCE_MIN_N = 0.2  # assumed: below it there is little contact to place, and a press's first and last readings lie there

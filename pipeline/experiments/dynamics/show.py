@@ -5,11 +5,10 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.evaluation.scores import VERDICTS, negated, verdict
-from pipeline.reporting import paper
-from pipeline.reporting.figures import drawing, svg
-from pipeline.reporting.shown import show_difference
-from pipeline.reporting.work_precision import COLOURS, MARKERS
+from pipeline.report import paper
+from pipeline.report.figures import COLOURS, MARKERS, drawing, svg
+from pipeline.report.formatting import show_difference
+from pipeline.report.statistics import VERDICTS, negated, verdict
 
 MEANING = (
     "Half-sine presses at random places of the grid, every frame read. The model is the paper's network, trained on "

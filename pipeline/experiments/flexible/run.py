@@ -11,18 +11,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.core.config import Files, parse_parts, read_settings
-from pipeline.core.schema import Readings
-from pipeline.core.seeds import rng_for
-from pipeline.core.stage import run
-from pipeline.dataset.rows import Selection, gather, stack
-from pipeline.dataset.splits import Split, hold_out_skins
-from pipeline.evaluation.scores import statistic
 from pipeline.experiments.answer import read_folder, read_losses, write_answer
-from pipeline.learning.recipe import HEADLINE
-from pipeline.learning.recipe import adaptations as adaptations_of
-from pipeline.trials.adapting import adaptations, read_starts
-from pipeline.trials.arms import (
+from pipeline.report.statistics import statistic
+from pipeline.stage import run
+from pipeline.training.trainings import SceneData, adaptations, prepare_training, read_data, read_starts
+from pipeline.training.variants import (  # fmt: skip
     AFTER,
     BEFORE,
     CONTROL,
@@ -33,8 +26,14 @@ from pipeline.trials.arms import (
     biases,
     compare_arms,
     summarise_arms,
-)  # fmt: skip
-from pipeline.trials.training import SceneData, prepare_training, read_data
+)
+from reskin.config import Files, parse_parts, read_settings
+from reskin.data.rows import Selection, gather, stack
+from reskin.data.splits import Split, hold_out_skins
+from reskin.models.recipe import HEADLINE
+from reskin.models.recipe import adaptations as adaptations_of
+from reskin.schema import Readings
+from reskin.seeds import rng_for
 
 DEPTH_DECIMALS = 2  # of a commanded depth in mm: nearer ones are one
 DRAWN_N = 400  # more points than these are not told apart in a panel

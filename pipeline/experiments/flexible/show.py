@@ -8,10 +8,9 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.reporting.figures import drawing, svg
-from pipeline.reporting.paper import FLEXIBLE, FLEXIBLE_BIAS, FLEXIBLE_GAP_LESS_PCT
-from pipeline.reporting.shown import COLUMNS, OF_PAPER, show, show_difference, tabulate
-from pipeline.reporting.work_precision import COLOURS
+from pipeline.report.figures import COLOURS, drawing, svg
+from pipeline.report.formatting import COLUMNS, OF_PAPER, show, show_difference, tabulate
+from pipeline.report.paper import FLEXIBLE, FLEXIBLE_BIAS, FLEXIBLE_GAP_LESS_PCT
 
 ARMS = {"before": "before", "after": "adapted", "control": "as long, without pokes"}
 OF_SHAPE = "direction and length of the change of field (ours): "

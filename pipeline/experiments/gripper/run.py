@@ -15,20 +15,19 @@ import pandas as pd
 from jaxtyping import Float, Float32, Float64
 from pydantic import Field
 
-from pipeline.core.config import Files, Settings, Strict, parse_parts, read_settings
-from pipeline.core.schema import Readings
-from pipeline.core.seeds import rng_for
-from pipeline.core.stage import run, say
-from pipeline.dataset.baseline import subtract
-from pipeline.dataset.grid import CENTRE_MM
-from pipeline.evaluation.scores import summarise, with_seeds
 from pipeline.experiments.answer import read_folder, read_losses, write_answer
-from pipeline.experiments.logs.estimates import CONTACT_SDS
 from pipeline.experiments.sensitivity.run import levels_of
-from pipeline.synthesis.pressing import weights_N
-from pipeline.synthesis.protocols import Load
-from pipeline.trials.networks import networks_without
-from pipeline.twin.shipped import Universal, load_universal
+from pipeline.report.statistics import summarise, with_seeds
+from pipeline.stage import run, say
+from reskin.config import Files, Settings, Strict, parse_parts, read_settings
+from reskin.data.baseline import subtract
+from reskin.data.grid import CENTRE_MM
+from reskin.live.contacts import CONTACT_SDS
+from reskin.models.trained import networks_without
+from reskin.schema import Readings
+from reskin.seeds import rng_for
+from reskin.simulation.protocols import Load, weights_N
+from reskin.universal.model import Universal, load_universal
 
 RATE_HZ, SECONDS, SETTLED_S = 50.0, 4.0, 1.0  # of the controller; from SETTLED_S on the force is judged
 SWING = 3.0  # by which an object stiffens, and gives way, about its own stiffness, once

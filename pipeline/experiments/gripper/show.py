@@ -5,8 +5,7 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.reporting.figures import drawing, svg
-from pipeline.reporting.work_precision import COLOURS
+from pipeline.report.figures import COLOURS, drawing, svg
 
 MEANING = (
     "One line of a controller closes a gripper until the estimated force is the aimed one, "

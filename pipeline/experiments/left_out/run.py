@@ -6,11 +6,11 @@ Refuses to know what is left out: `terms` holds it.
 from dataclasses import asdict
 from pathlib import Path
 
-from pipeline.core import io
-from pipeline.core.config import Files, read_settings
-from pipeline.core.stage import run, say
 from pipeline.experiments.left_out.terms import measure
-from pipeline.synthesis.settings import synthesis_of
+from pipeline.stage import run, say
+from reskin import io
+from reskin.config import Files, read_settings
+from reskin.simulation.settings import synthesis_of
 
 
 def left_out(scene: str, files: Files, answer: Path) -> None:

@@ -12,20 +12,21 @@ from magpylib.core import magnet_cuboid_Bfield
 from scipy.constants import micro, milli
 from scipy.spatial.transform import Rotation
 
-from pipeline.core.seeds import rng_for
-from pipeline.dataset.grid import CENTRE_MM
 from pipeline.experiments.runtime.trials import box_m, midpoints
-from pipeline.physics import flow, layer, magnet, nodes, sensor, warmth
-from pipeline.physics.board import Board, draw_board
-from pipeline.physics.change import change_of_field
-from pipeline.physics.friction import Friction
-from pipeline.physics.skin import Skin, beyond_verified_n, changes_of_field, draw_skin, forces, moved_dipoles
-from pipeline.physics.viscoelastic import Memory, Relaxation
-from pipeline.physics.wear import Ageing
-from pipeline.synthesis.capture import roster
-from pipeline.synthesis.contact import Response, Terms, push, respond
-from pipeline.synthesis.protocols import Plan
-from pipeline.synthesis.settings import MAIN, Synthesis
+from reskin.data.grid import CENTRE_MM
+from reskin.physics import aging, chip, layer, magnet
+from reskin.physics import layer as flow
+from reskin.physics import magnet as nodes
+from reskin.physics.aging import Ageing, Memory, Relaxation
+from reskin.physics.board import Board, draw_board
+from reskin.physics.magnet import change_of_field
+from reskin.physics.shear import Friction
+from reskin.physics.skin import Skin, beyond_verified_n, changes_of_field, draw_skin, forces, moved_dipoles
+from reskin.seeds import rng_for
+from reskin.simulation.capture import roster
+from reskin.simulation.contact import Response, Terms, push, respond
+from reskin.simulation.protocols import Plan
+from reskin.simulation.settings import MAIN, Synthesis
 
 # Sizes of the terms that a scene leaves out: the design values of PHYSICS 5 (assumed there).
 AGEING = Ageing(settling=0.10, ageing=0.01, fading_per_decade=0.005, wandering_uT=0.2)
@@ -118,7 +119,7 @@ def _over_time(on: Subject, without: Response, seed: int) -> list[Omission]:
 
 
 def _temperature(on: Subject, without: Response) -> Omission:
-    factor = warmth.remanence(np.array([WARMER_K]))[0]
+    factor = aging.remanence(np.array([WARMER_K]))[0]
     rest_uT = float(np.abs((factor - 1) * without.rest_T).max() / micro)
     field_pct = _error_pct(without.change_T, factor * without.change_T)
     how = f"{WARMER_K:g} K warmer, a no-load reading before each contact"
@@ -235,7 +236,7 @@ def _change(on: Subject, moved: Sequence[Moved]) -> Float[np.ndarray, "p k 3"]:
 
 def _steps(without: Response, of: Synthesis) -> Omission:
     change_uT = without.change_T / micro
-    step_uT = sensor.steps_uT(of.chip.gain_sel)
+    step_uT = chip.steps_uT(of.chip.gain_sel)
     share = np.sqrt((step_uT**2 / 12).mean() / (change_uT**2).mean())
     return Omission("the chips' steps", "kept", float(100 * share), float(step_uT.max() / 2), 0.0, "rounding alone")
 

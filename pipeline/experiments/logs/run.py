@@ -14,27 +14,19 @@ from jaxtyping import Bool, Float, Float32, Float64
 from scipy.constants import micro
 from scipy.spatial.transform import Rotation
 
-from pipeline.capture import probe, sd_card
-from pipeline.capture.header import LOG_FILE, PROBE_FILE
-from pipeline.core.config import Files, Settings, read_settings
-from pipeline.core.seeds import rng_for
-from pipeline.core.stage import run, say
-from pipeline.dataset.captures import read_header
 from pipeline.experiments.ambient.fields import Instrument, guessed_uT, seen_uT, take_board
 from pipeline.experiments.answer import only, write_answer
-from pipeline.experiments.logs.estimates import (
-    Answers,
-    contacts_n,
-    describe,
-    estimate,
-    estimate_after,
-    score_contacts,
-    thin,
-    truth_at,
-)
-from pipeline.physics.ambient import EARTH_SIZE_T, EARTH_T
-from pipeline.synthesis.settings import synthesis_of
-from pipeline.trials.networks import networks_without
+from pipeline.stage import run, say
+from reskin.config import Files, Settings, read_settings
+from reskin.live.contacts import Answers, contacts_n, describe, estimate, estimate_after, score_contacts, thin, truth_at
+from reskin.models.trained import networks_without
+from reskin.physics.ambient import EARTH_SIZE_T, EARTH_T
+from reskin.recordings import probe
+from reskin.recordings.header import LOG_FILE, PROBE_FILE
+from reskin.recordings.ingest import read_header
+from reskin.recordings.readers import sd_card
+from reskin.seeds import rng_for
+from reskin.simulation.settings import synthesis_of
 
 PITCHES_DEG = (0.0, 10.0, 20.0, 45.0)  # assumed: how far a shoe leans to either side, once a step
 PERIOD_S = 1.0  # assumed, for a log with fewer than two contacts

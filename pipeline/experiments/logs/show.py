@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pipeline.reporting import paper
-from pipeline.reporting.figures import drawing, svg
-from pipeline.reporting.work_precision import COLOURS
+from pipeline.report import paper
+from pipeline.report.figures import COLOURS, drawing, svg
 
 MEANING = (  # {rate_hz} comes from the numbers
     "A log at {rate_hz:.0f} Hz with nothing but times and readings, as a board writes it to an SD card: a quiet start, "

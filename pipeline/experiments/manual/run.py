@@ -10,18 +10,20 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.core.config import Files, read_settings
-from pipeline.core.errors import SchemaError
-from pipeline.core.stage import run
-from pipeline.dataset.lines import Lines, hand_rows, shifted
-from pipeline.dataset.rows import stack
-from pipeline.dataset.splits import Fold
 from pipeline.experiments.answer import read_folder, read_losses, write_answer
-from pipeline.learning.recipe import HEADLINE, Adaptations
-from pipeline.learning.recipe import adaptations as adaptations_of
-from pipeline.learning.trial import Trial
-from pipeline.trials.adapting import Pokes, Starts, adaptation, own_starts, pool_lines, read_starts
-from pipeline.trials.arms import (
+from pipeline.stage import run
+from pipeline.training.trainings import (
+    Pokes,
+    SceneData,
+    Starts,
+    adaptation,
+    own_starts,
+    pool_lines,
+    prepare_training,
+    read_data,
+    read_starts,
+)
+from pipeline.training.variants import (  # fmt: skip
     AFTER,
     BEFORE,
     CONTROL,
@@ -30,8 +32,15 @@ from pipeline.trials.arms import (
     answers_before,
     compare_arms,
     summarise_arms,
-)  # fmt: skip
-from pipeline.trials.training import SceneData, prepare_training, read_data
+)
+from reskin.config import Files, read_settings
+from reskin.data.lines import Lines, hand_rows, shifted
+from reskin.data.rows import stack
+from reskin.data.splits import Fold
+from reskin.errors import SchemaError
+from reskin.models.recipe import HEADLINE, Adaptations
+from reskin.models.recipe import adaptations as adaptations_of
+from reskin.models.trial import Trial
 
 GRID = "grid"  # as many pokes, by the robot
 

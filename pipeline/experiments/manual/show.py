@@ -5,10 +5,9 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.evaluation.scores import VERDICTS, verdict
-from pipeline.reporting.order import gain
-from pipeline.reporting.paper import GAINS, MANUAL, MANUAL_POKES_N
-from pipeline.reporting.shown import COLUMNS, OF_PAPER, Stat, show, show_difference, tabulate
+from pipeline.report.formatting import COLUMNS, OF_PAPER, Stat, gain, show, show_difference, tabulate
+from pipeline.report.paper import GAINS, MANUAL, MANUAL_POKES_N
+from pipeline.report.statistics import VERDICTS, verdict
 
 ARMS = {
     "before": "before",

@@ -13,19 +13,11 @@ import pandas as pd
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from pipeline.core.config import Files, Settings, parse, read_settings
-from pipeline.core.errors import SchemaError
-from pipeline.core.seeds import rng_for
-from pipeline.core.stage import run, say
-from pipeline.dataset.grid import CENTRE_MM
-from pipeline.dataset.splits import Fold
-from pipeline.evaluation.scores import summarise
 from pipeline.experiments.answer import read_folder, write_answer
 from pipeline.experiments.population.taught import Lesson, Taught, draw, lesson_of, network
-from pipeline.physics.skin import SkinDesign
-from pipeline.synthesis.settings import synthesis_of
-from pipeline.trials.experts import Frame
-from pipeline.trials.population import (
+from pipeline.report.statistics import summarise
+from pipeline.stage import run, say
+from pipeline.training.population import (
     WEIGHT_N,
     WEIGHT_SD,
     Case,
@@ -38,10 +30,17 @@ from pipeline.trials.population import (
     trust,
     weight_of,
 )
-from pipeline.trials.training import SceneData, read_data
-from pipeline.trials.universal import Pokes
-from pipeline.twin.opinion import Weights
-from pipeline.twin.skin_map import new_map
+from pipeline.training.trainings import SceneData, read_data
+from pipeline.training.universal import Frame, Pokes
+from reskin.config import Files, Settings, parse, read_settings
+from reskin.data.grid import CENTRE_MM
+from reskin.data.splits import Fold
+from reskin.errors import SchemaError
+from reskin.physics.skin import SkinDesign
+from reskin.seeds import rng_for
+from reskin.simulation.settings import synthesis_of
+from reskin.universal.map import new_map
+from reskin.universal.network import Weights
 
 QUESTION = "lobo"  # whose folds these are: their pools are those of adaptation
 POOL_MAX_N = 65  # pokes: one at each place of the paper's grid, under any of its depths

@@ -5,9 +5,8 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.reporting.figures import drawing, svg
-from pipeline.reporting.shown import n_of, scores, tabulate
-from pipeline.reporting.work_precision import COLOURS, MARKERS
+from pipeline.report.figures import COLOURS, MARKERS, drawing, svg
+from pipeline.report.formatting import n_of, scores, tabulate
 
 NAMES = {
     "map": "universal map, skin as designed",

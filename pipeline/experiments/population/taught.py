@@ -17,24 +17,23 @@ from jaxtyping import Float
 from pydantic import Field
 from scipy.constants import mega, milli
 
-import pipeline.twin
-from pipeline.core import kept
-from pipeline.core.code import digest, imported
-from pipeline.core.config import Strict
-from pipeline.core.errors import ParamsError
-from pipeline.core.seeds import rng_for
-from pipeline.physics.skin import SkinDesign
-from pipeline.physics.slide import force_at
-from pipeline.synthesis.settings import BoardKind
-from pipeline.twin.law import Law, Setup
-from pipeline.twin.network import draw_weights
-from pipeline.twin.opinion import Weights
-from pipeline.twin.population import Forces, Population, draw_population
-from pipeline.twin.tables import OF_RIG, Tables, tabulate
-from pipeline.twin.training import Syllabus, train
+import reskin.universal
+from reskin import io
+from reskin.code import digest, imported
+from reskin.config import Strict
+from reskin.errors import ParamsError
+from reskin.physics.skin import SkinDesign
+from reskin.physics.slide import force_at
+from reskin.seeds import rng_for
+from reskin.simulation.settings import BoardKind
+from reskin.universal.law import Law, Setup
+from reskin.universal.map import OF_RIG, Tables, tabulate
+from reskin.universal.network import Weights, draw_weights
+from reskin.universal.population import Forces, Population, draw_population
+from reskin.universal.training import Syllabus, train
 
-PACKAGE = Path(pipeline.twin.__file__).parent
-TRAINS = "pipeline.twin.training"
+PACKAGE = Path(reskin.universal.__file__).parent
+TRAINS = "reskin.universal.training"
 PART_N = 100  # skins that are kept together
 STEPS_OF_FORCE = 0.6  # at most, of log F between two tabulated forces
 FORCE_SHARES = (0.7, 1.5)  # of the least and of the largest force of the skin as designed: skins differ
@@ -124,10 +123,10 @@ def _once(lesson: Lesson, what: str, make: Callable[[], np.ndarray]) -> np.ndarr
     code = [digest(module) for module in imported(TRAINS)]
     of = f"torch {version('torch')}; {code}; {seen}"
     name = f"{what}; {of}; {lesson.syllabus.centre}; {spreads}; {lesson.forces_N}; seed {lesson.seed}"
-    found = kept.load(PACKAGE, name)
+    found = io.load(PACKAGE, name)
     if found is None:
         found = make()
-        kept.save(PACKAGE, name, found)
+        io.save(PACKAGE, name, found)
     return found
 
 

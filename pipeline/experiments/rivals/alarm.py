@@ -10,16 +10,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.dataset.splits import Fold
-from pipeline.evaluation.scores import statistic
 from pipeline.experiments.contacts.pairs import roc_area
 from pipeline.experiments.rivals.flagged import EVERY_N, first_folds, limits_of, worse
 from pipeline.experiments.rivals.points import INVERSION, means_uT, pokes_of
-from pipeline.trials.experts import Frame
-from pipeline.trials.training import SceneData
-from pipeline.twin.fit import Seen
-from pipeline.twin.inversion import Chart, chart, fit_unlabelled, search
-from pipeline.twin.law import Setup
+from pipeline.report.statistics import statistic
+from pipeline.training.trainings import SceneData
+from pipeline.training.universal import Frame
+from reskin.data.splits import Fold
+from reskin.universal.inversion import Chart, chart, fit_unlabelled, search
+from reskin.universal.law import Seen, Setup
 
 OF_RIGHT, OF_STRANGER = "the right skin's", "fitted anew to the stranger"
 ANOTHER = "another skin of the rig"

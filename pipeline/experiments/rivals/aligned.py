@@ -11,20 +11,20 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int64
 
-from pipeline.core.errors import ParamsError
-from pipeline.core.seeds import rng_for
-from pipeline.dataset.rows import Rows
-from pipeline.dataset.splits import Fold
 from pipeline.experiments.rivals.points import NONE, OWN, Key, Point, means_uT, point, pokes_of
-from pipeline.learning.adversarial import Domains, train_adversarial
-from pipeline.learning.alignment import choose_ridge, coral, direct, match_channels
-from pipeline.learning.classical import Classical, fit
-from pipeline.learning.grid import ATTEMPTS_MAX_N
-from pipeline.learning.inputs import FIT, VIEW
-from pipeline.learning.model import Predictor
-from pipeline.learning.recipe import Recipe
-from pipeline.learning.trial import COLLAPSED, Weights
-from pipeline.trials.training import SceneData
+from pipeline.training.trainings import SceneData
+from reskin.data.rows import Rows
+from reskin.data.splits import Fold
+from reskin.errors import ParamsError
+from reskin.models.adversarial import Domains, train_adversarial
+from reskin.models.alignment import choose_ridge, coral, direct, match_channels
+from reskin.models.classical import Classical, fit
+from reskin.models.grid import ATTEMPTS_MAX_N
+from reskin.models.inputs import FIT, VIEW
+from reskin.models.network import Predictor
+from reskin.models.recipe import Recipe
+from reskin.models.trial import COLLAPSED, Weights
+from reskin.seeds import rng_for
 
 EVERY_N = 10  # of a labelled poke's readings, one is a row: they differ by noise alone
 SAME_MM = 0.5  # so near to each other two pokes lie at one place

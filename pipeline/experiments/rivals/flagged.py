@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.dataset.splits import Fold
-from pipeline.evaluation.metrics import ACCURACY_LIMIT_MM
-from pipeline.evaluation.scores import statistic
 from pipeline.experiments.rivals.points import board_of
-from pipeline.trials.universal import ASSUMED_TEMPER, METHODS, WAYS, Bench, pool_of, read_both, ready, tell
+from pipeline.report.statistics import statistic
+from pipeline.training.universal import ASSUMED_TEMPER, METHODS, WAYS, Bench, pool_of, read_both, ready, tell
+from reskin.data.splits import Fold
+from reskin.metrics import ACCURACY_LIMIT_MM
 
 EVERY_N = 10  # of the tested readings, one is asked
 ByBoard = Mapping[str, Float[np.ndarray, "_"]]

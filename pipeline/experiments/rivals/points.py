@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int64
 
-from pipeline.core.seeds import rng_for
-from pipeline.dataset.splits import Fold
-from pipeline.evaluation.scores import AS_LABELLED, REGISTERED, by_skin, over_boards, paired, tidy
-from pipeline.trials.training import SceneData, score_test
+from pipeline.report.statistics import AS_LABELLED, REGISTERED, by_skin, over_boards, paired, tidy
+from pipeline.training.trainings import SceneData, score_test
+from reskin.data.splits import Fold
+from reskin.seeds import rng_for
 
 INVERSION = "physics inversion"  # a method
 OWN, NONE, FOREIGN = "its own", "none", "another skin's"  # unlabelled pokes that a method is given

@@ -13,24 +13,23 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from pipeline.core import io
-from pipeline.core.config import Files, Settings, Strict, parse, read_settings
-from pipeline.core.errors import ParamsError
-from pipeline.core.provenance import SECONDS
-from pipeline.core.stage import run, say
-from pipeline.dataset.splits import Fold
-from pipeline.evaluation.scores import tally
 from pipeline.experiments.answer import read_folder, write_answer
 from pipeline.experiments.compare.run import Compare, see, setup_of, skins_of, turns_of
 from pipeline.experiments.rivals import aligned, flagged, told
 from pipeline.experiments.rivals.alarm import alarm
 from pipeline.experiments.rivals.points import Point, pokes_of, summarise
-from pipeline.learning.classical import Classical
-from pipeline.learning.recipe import Name, Recipe
-from pipeline.physics.skin import SkinDesign
-from pipeline.trials.experts import Frame, Known, read_experts
-from pipeline.trials.training import SceneData, read_data
-from pipeline.trials.universal import QUESTION, Bench
+from pipeline.provenance import SECONDS
+from pipeline.report.statistics import tally
+from pipeline.stage import run, say
+from pipeline.training.trainings import SceneData, read_data
+from pipeline.training.universal import QUESTION, Bench, Frame, Known, read_experts
+from reskin import io
+from reskin.config import Files, Settings, Strict, parse, read_settings
+from reskin.data.splits import Fold
+from reskin.errors import ParamsError
+from reskin.models.classical import Classical
+from reskin.models.recipe import Name, Recipe
+from reskin.physics.skin import SkinDesign
 
 
 class Rivals(Strict):

@@ -5,7 +5,7 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.reporting.shown import COLUMNS, OF_FORCE, n_of, scores, show, show_difference, tabulate
+from pipeline.report.formatting import COLUMNS, OF_FORCE, n_of, scores, show, show_difference, tabulate
 
 Row = Mapping[str, Any]
 NONE = "–"

@@ -11,13 +11,23 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.dataset.splits import Fold
 from pipeline.experiments.rivals.points import FOREIGN, INVERSION, NONE, OWN, Key, Point, board_of, next_board, point
-from pipeline.trials.experts import Experts
-from pipeline.trials.universal import ASSUMED_TEMPER, WAYS, Bench, Pokes, Told, pool_of, read_both, ready, tell
-from pipeline.twin.inversion import Chart, chart, fit_unlabelled, search
-from pipeline.twin.law import Setup
-from pipeline.twin.skin_map import new_map, see_rest
+from pipeline.training.universal import (
+    ASSUMED_TEMPER,
+    WAYS,
+    Bench,
+    Experts,
+    Pokes,
+    Told,
+    pool_of,
+    read_both,
+    ready,
+    tell,
+)
+from reskin.data.splits import Fold
+from reskin.universal.inversion import Chart, chart, fit_unlabelled, search
+from reskin.universal.law import Setup
+from reskin.universal.map import new_map, see_rest
 
 CENTRED = f"{INVERSION}, centred"
 EXPERTS = ("universal map, ", "universal network, ", "universal, ")  # the map, the network, both

@@ -14,11 +14,11 @@ from jaxtyping import Float
 from pydantic import Field
 from scipy.integrate import solve_ivp
 
-from pipeline.core.config import Strict
 from pipeline.experiments.runtime.rows import Contestant, Precision
 from pipeline.experiments.runtime.trials import Positive
 from pipeline.experiments.verification.relaxation import hereditary
-from pipeline.physics.viscoelastic import SKIN, Prony, relax
+from reskin.config import Strict
+from reskin.physics.aging import SKIN, Prony, relax
 
 EXACT, EULER = "exact update", "explicit Euler"
 SOLVERS = ("Radau", "BDF", "LSODA", "RK45")  # of scipy.integrate

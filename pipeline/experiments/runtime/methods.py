@@ -21,10 +21,9 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.experiments.runtime.trials import Trial, box_m, gauss_everywhere, laid, midpoints
 from pipeline.experiments.verification.field import field_of
-from pipeline.physics import flow, flow_map, slide
-from pipeline.physics.change import change_of_field
-from pipeline.physics.nodes import Nodes, Quadrature, place_nodes
-from pipeline.physics.skin import Skin, changes_of_field, press_slides
+from reskin.physics import flow_map, layer, slide
+from reskin.physics.magnet import Nodes, Quadrature, change_of_field, place_nodes
+from reskin.physics.skin import Skin, changes_of_field, press_slides
 
 RADII_N, HEIGHTS_N = 56, 16  # of the splines that move nodes; twice as many change dB by 0.1 %
 Changes = Float[np.ndarray, "n k 3"]
@@ -149,7 +148,7 @@ def paths(trial: Trial, skin: Skin) -> Path:
     nodes_m = np.tile(skin.nodes_m, (len(trial.pokes_m), 1, 1))
     turns_rad = np.zeros_like(nodes_m)
     true_m = trial.pokes_m[:, 2] + skin.depth_zero_m
-    press = flow.Press(skin.thickness_m, skin.tip_radius_m, skin.base)
+    press = layer.Press(skin.thickness_m, skin.tip_radius_m, skin.base)
     bends, reach_m = _bends(press, tuple(np.unique(true_m).tolist()))
     for poke_i, (poke_m, depth_m) in enumerate(zip(trial.pokes_m, true_m, strict=True)):
         bend = bends[float(depth_m)]
@@ -187,15 +186,15 @@ class _Bend:
 
 
 @lru_cache(maxsize=8)
-def _bends(press: flow.Press, depths_m: tuple[float, ...]) -> tuple[dict[float, _Bend], float]:
+def _bends(press: layer.Press, depths_m: tuple[float, ...]) -> tuple[dict[float, _Bend], float]:
     reach_m = press.thickness_m * flow_map.reach(press.tip_radius_m / press.thickness_m, press.base)
     r_m = reach_m * np.linspace(0, 1, RADII_N) ** 1.5
     z_m = press.thickness_m * np.linspace(0, 1, HEIGHTS_N)
     r0_m, z0_m = (part.ravel() for part in np.meshgrid(r_m, z_m, indexing="ij"))
-    steps_m = flow.steps(depths_m, press)
+    steps_m = layer.steps(depths_m, press)
     found = {}
-    for step_m, end in zip(steps_m, flow.follow(r0_m, z0_m, steps_m, press=press), strict=True):
-        changes = [part.reshape(RADII_N, HEIGHTS_N) for part in (end.r_m - r0_m, end.z_m - z0_m, flow.angle(end.f))]
+    for step_m, end in zip(steps_m, layer.follow(r0_m, z0_m, steps_m, press=press), strict=True):
+        changes = [part.reshape(RADII_N, HEIGHTS_N) for part in (end.r_m - r0_m, end.z_m - z0_m, layer.angle(end.f))]
         edge_m = reach_m + float(changes[0][-1].mean())
         grown_m2 = edge_m**2 - reach_m**2 if press.base == "slipping" else 0.0
         found[float(step_m)] = _Bend(tuple(RectBivariateSpline(r_m, z_m, change) for change in changes), grown_m2)

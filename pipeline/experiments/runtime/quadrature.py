@@ -13,11 +13,11 @@ from jaxtyping import Float
 from pydantic import Field
 from scipy.constants import milli
 
-from pipeline.core.errors import ParamsError
 from pipeline.experiments.runtime.methods import METHODS, Prepared, whole
 from pipeline.experiments.runtime.rows import REFERENCE, Contestant, Precision, written
 from pipeline.experiments.runtime.trials import Pokes, Trial, gauss_everywhere
-from pipeline.physics.nodes import Quadrature
+from reskin.errors import ParamsError
+from reskin.physics.magnet import Quadrature
 
 STUDY = "dB of an indentation"
 ALL = "all depths"

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from scipy.constants import milli
 
-from pipeline.core.errors import ParamsError
-from pipeline.physics.nodes import Quadrature
+from reskin.errors import ParamsError
+from reskin.physics.magnet import Quadrature
 
 REFERENCE = "reference"  # the method of a row that says how wrong the reference of its study is at most
 CANDIDATES = "Gauss in z"  # the rules that `nodes.place_nodes` can lay

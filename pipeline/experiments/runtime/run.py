@@ -9,17 +9,17 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from pipeline.core import io
-from pipeline.core.config import Files, Settings, Strict, read_settings
-from pipeline.core.provenance import SECONDS
-from pipeline.core.stage import run, say
 from pipeline.experiments.runtime.integrators import Integrators, study_integrators
 from pipeline.experiments.runtime.quadrature import Quadratures, study_quadratures
 from pipeline.experiments.runtime.rows import choose, race
 from pipeline.experiments.runtime.trials import Trial, draw_trial
-from pipeline.physics.board import draw_board
-from pipeline.synthesis.capture import roster
-from pipeline.synthesis.settings import MAIN, Synthesis, synthesis_of
+from pipeline.provenance import SECONDS
+from pipeline.stage import run, say
+from reskin import io
+from reskin.config import Files, Settings, Strict, read_settings
+from reskin.physics.board import draw_board
+from reskin.simulation.capture import roster
+from reskin.simulation.settings import MAIN, Synthesis, synthesis_of
 
 
 class RunTime(Strict):

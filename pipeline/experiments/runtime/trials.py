@@ -14,12 +14,12 @@ from jaxtyping import Float
 from pydantic import Field
 from scipy.constants import milli
 
-from pipeline.core.config import Strict
-from pipeline.core.errors import ParamsError
-from pipeline.physics import magnet
-from pipeline.physics.board import Board, Spreads
-from pipeline.physics.nodes import SEAMS_M, SKIN_SIDE_M, Nodes, Quadrature
-from pipeline.physics.skin import Skin, SkinDesign, draw_skin
+from reskin.config import Strict
+from reskin.errors import ParamsError
+from reskin.physics import magnet
+from reskin.physics.board import Board, Spreads
+from reskin.physics.magnet import SEAMS_M, SKIN_SIDE_M, Nodes, Quadrature
+from reskin.physics.skin import Skin, SkinDesign, draw_skin
 
 COARSEST = Quadrature(cell_m=20e-3, layers_n=1)  # its nodes are replaced
 Positive = Annotated[float, Field(gt=0)]

@@ -12,13 +12,12 @@ import pandas as pd
 from jaxtyping import Float, Float32, Float64, Int32
 from scipy.special import ndtr, ndtri
 
-from pipeline.core.config import Files, parse_parts, read_settings
-from pipeline.core.errors import SchemaError
-from pipeline.core.stage import run, say
-from pipeline.dataset.baseline import subtract
 from pipeline.experiments.answer import only, read_folder, read_losses, write_answer
-from pipeline.synthesis.pressing import weights_N
-from pipeline.synthesis.protocols import Load
+from pipeline.stage import run, say
+from reskin.config import Files, parse_parts, read_settings
+from reskin.data.baseline import subtract
+from reskin.errors import SchemaError
+from reskin.simulation.protocols import Load, weights_N
 
 TOLD_SHARE = 0.95  # of pairs ordered rightly: told apart
 WATER_N_PER_ML = 9.81e-3  # 1 g at 9.81 m/s^2

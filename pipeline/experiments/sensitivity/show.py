@@ -6,10 +6,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pipeline.evaluation.scores import FEW_BOARDS, INCONCLUSIVE
-from pipeline.reporting import paper
-from pipeline.reporting.figures import drawing, svg
-from pipeline.reporting.work_precision import COLOURS
+from pipeline.report import paper
+from pipeline.report.figures import COLOURS, drawing, svg
+from pipeline.report.statistics import FEW_BOARDS, INCONCLUSIVE
 
 MEANING = (  # {told_pct} comes from the numbers
     "A weight at the skin's middle goes up step by step; the glass's flat foot is taken as the rig's round tip. Two "

@@ -13,16 +13,16 @@ import pandas as pd
 from jaxtyping import Float
 from pydantic import Field
 
-from pipeline.core.config import Files, Settings, Strict, read_settings
-from pipeline.core.seeds import rng_for, seed_for
-from pipeline.core.stage import run
-from pipeline.dataset.rows import SHEAR_TARGETS, Rows, Selection, gather
-from pipeline.dataset.splits import NO_POOL, Fold, draw_sides
-from pipeline.evaluation.metrics import ACCURACY_LIMIT_MM
-from pipeline.evaluation.scores import over_units, tally
 from pipeline.experiments.answer import read_folder, read_losses, write_answer
-from pipeline.learning.recipe import Training, with_training
-from pipeline.trials.training import SceneData, collapse_record, note_seconds, prepare_training, train_all, trials_of
+from pipeline.report.statistics import over_units, tally
+from pipeline.stage import run
+from pipeline.training.trainings import SceneData, collapse_record, note_seconds, prepare_training, train_all, trials_of
+from reskin.config import Files, Settings, Strict, read_settings
+from reskin.data.rows import SHEAR_TARGETS, Rows, Selection, gather
+from reskin.data.splits import NO_POOL, Fold, draw_sides
+from reskin.metrics import ACCURACY_LIMIT_MM
+from reskin.models.recipe import Training, with_training
+from reskin.seeds import rng_for, seed_for
 
 Count = Annotated[int, Field(ge=1)]
 Fraction = Annotated[float, Field(gt=0, lt=1)]

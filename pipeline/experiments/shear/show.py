@@ -8,10 +8,9 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.reporting.figures import drawing, svg
-from pipeline.reporting.paper import SHEAR
-from pipeline.reporting.shown import show, tabulate
-from pipeline.reporting.work_precision import COLOURS
+from pipeline.report.figures import COLOURS, drawing, svg
+from pipeline.report.formatting import show, tabulate
+from pipeline.report.paper import SHEAR
 
 TITLES = {
     "mse_fxy_N2": "MSE_Fxy, N²", "mse_fz_N2": "MSE_Fz, N²", "mse_xy_mm2": "MSE_xy, mm²", "accuracy_pct": "accuracy, %",

@@ -12,21 +12,20 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Int64, Shaped
 from pydantic import Field
 
-from pipeline.core.config import Files, Settings, Strict, read_settings
-from pipeline.core.errors import ParamsError
-from pipeline.core.executors import Here
-from pipeline.core.schema import Readings
-from pipeline.core.stage import run, say
-from pipeline.dataset.rows import Rows, Selection, gather
-from pipeline.evaluation.metrics import score
-from pipeline.evaluation.scores import tally
+from pipeline.executors import Here
 from pipeline.experiments.answer import read_folder, read_losses, write_answer
-from pipeline.learning.baselines import Task, run_tasks
-from pipeline.learning.classical import Neighbours
-from pipeline.learning.recipe import HEADLINE, Training, with_training
-from pipeline.learning.trial import Measured, Trial
-from pipeline.synthesis.settings import synthesis_of
-from pipeline.trials.training import SceneData, collapse_record, note_seconds, prepare_training, train_all
+from pipeline.report.statistics import tally
+from pipeline.stage import run, say
+from pipeline.training.trainings import SceneData, collapse_record, note_seconds, prepare_training, train_all
+from reskin.config import Files, Settings, Strict, read_settings
+from reskin.data.rows import Rows, Selection, gather
+from reskin.errors import ParamsError
+from reskin.metrics import score
+from reskin.models.classical import Neighbours, Task, run_tasks
+from reskin.models.recipe import HEADLINE, Training, with_training
+from reskin.models.trial import Measured, Trial
+from reskin.schema import Readings
+from reskin.simulation.settings import synthesis_of
 
 Count = Annotated[int, Field(ge=1)]
 Fraction = Annotated[float, Field(gt=0, lt=1)]

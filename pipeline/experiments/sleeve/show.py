@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pipeline.reporting.figures import drawing, svg
-from pipeline.reporting.paper import SLEEVE, SLEEVE_SKIN, SLEEVE_WORDS
-from pipeline.reporting.shown import COLUMNS, scores, show, tabulate
-from pipeline.reporting.work_precision import COLOURS
+from pipeline.report.figures import COLOURS, drawing, svg
+from pipeline.report.formatting import COLUMNS, scores, show, tabulate
+from pipeline.report.paper import SLEEVE, SLEEVE_SKIN, SLEEVE_WORDS
 
 PLACES = {"median_error_mm": "median error, mm", "p95_error_mm": "95 % within, mm"}
 PARTS = {"near_seam": "median near a border of boards, mm", "inside": "median elsewhere, mm"}

@@ -8,7 +8,7 @@ import tracemalloc
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from pipeline.core.errors import ReskinError
+from reskin.errors import ReskinError
 
 
 @dataclass(frozen=True)

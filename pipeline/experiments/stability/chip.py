@@ -9,15 +9,15 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 from scipy.constants import micro, milli
 
-from pipeline.capture import faults
-from pipeline.capture.decisions import REFUSE_ALL
-from pipeline.capture.header import Clock, Firmware, Header
-from pipeline.capture.readers.chips import Watch
-from pipeline.capture.wire import Frames
-from pipeline.core.seeds import rng_for
 from pipeline.experiments.stability.cases import Case, measured, observed, refused
 from pipeline.experiments.verification.electronics import quiet, read_bare
-from pipeline.physics.sensor import ChipDesign, steps_uT
+from reskin.board import faults
+from reskin.board.wire import Frames
+from reskin.physics.chip import ChipDesign, steps_uT
+from reskin.recordings.chips import Watch
+from reskin.recordings.fault_policy import REFUSE_ALL
+from reskin.recordings.header import Clock, Firmware, Header
+from reskin.seeds import rng_for
 
 AREA = "chip"
 FRAMES_N = 800

@@ -15,11 +15,10 @@ from scipy.special import j0, j1
 from pipeline.experiments.stability.cases import Case, measured
 from pipeline.experiments.verification import kinematics
 from pipeline.experiments.verification.checks import no_spread
-from pipeline.physics import dipole, layer, slide
-from pipeline.physics.board import Board, BoardDesign, Spreads, draw_board
-from pipeline.physics.change import change_of_field
-from pipeline.physics.nodes import Quadrature, place_nodes
-from pipeline.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, forces
+from reskin.physics import layer, magnet, slide
+from reskin.physics.board import Board, BoardDesign, Spreads, draw_board
+from reskin.physics.magnet import Quadrature, change_of_field, place_nodes
+from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, forces
 
 AREA = "physics"
 COARSE = Quadrature(cell_m=2.2e-3, layers_n=4)  # of both sides alike: steps and scaling are asked, not quadrature
@@ -123,7 +122,7 @@ def near(skin: SkinDesign) -> list[Case]:
         nodes = place_nodes(thickness_m, Quadrature(CELL_SHARE * gap_mm * milli, 6))
         moments = nodes.volumes_m3[:, None] * j_T / mu_0
         slid_m = nodes.nodes_m + np.array([SLID_M, 0.0, 0.0])
-        found_T = dipole.field(slid_m, moments, chips_m) - dipole.field(nodes.nodes_m, moments, chips_m)
+        found_T = magnet.field(slid_m, moments, chips_m) - magnet.field(nodes.nodes_m, moments, chips_m)
         middle_m = np.array([0.0, 0.0, thickness_m / 2])
         truth_T = box.getB(chips_m - middle_m - (SLID_M, 0.0, 0.0)) - box.getB(chips_m - middle_m)
         error = _off(found_T, truth_T)

@@ -10,14 +10,14 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float32
 
-from pipeline.core.seeds import rng_for
-from pipeline.dataset.rows import Rows
-from pipeline.dataset.splits import Split, draw_folds
-from pipeline.evaluation.metrics import METRICS, score
 from pipeline.experiments.stability.cases import Case, measured, observed, refused
-from pipeline.learning.recipe import Labelling, Recipe
-from pipeline.learning.train import BLOCK_STEPS_N, JUDGED_STEPS_N, train_stack
-from pipeline.learning.trial import FewLabels, Measured, Start, Trained, Trial
+from reskin.data.rows import Rows
+from reskin.data.splits import Split, draw_folds
+from reskin.metrics import METRICS, score
+from reskin.models.recipe import Labelling, Recipe
+from reskin.models.train import BLOCK_STEPS_N, JUDGED_STEPS_N, train_stack
+from reskin.models.trial import FewLabels, Measured, Start, Trained, Trial
+from reskin.seeds import rng_for
 
 AREA = "learning"
 ROWS_N, TRAIN_N, CHANNELS_N = 240, 160, 15

@@ -10,21 +10,20 @@ import numpy as np
 from jaxtyping import Float
 from scipy.constants import kilo, micro, milli
 
-from pipeline.core.seeds import rng_for
 from pipeline.experiments.stability.cases import Case, measured, observed, peak_bytes, refused
 from pipeline.experiments.verification import kinematics, relaxation
 from pipeline.experiments.verification.checks import worst
 from pipeline.experiments.verification.contact import force_N
 from pipeline.experiments.verification.field import inside_a_box
-from pipeline.physics import dipole, friction, layer, shear
-from pipeline.physics.board import Board, BoardDesign, Spreads, draw_board
-from pipeline.physics.change import change_of_field
-from pipeline.physics.flow import Press, depth_unit
-from pipeline.physics.force_sensor import RANGE_N, read_force
-from pipeline.physics.magnet import CUBE_SIDE_M
-from pipeline.physics.nodes import Quadrature
-from pipeline.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, forces
-from pipeline.physics.viscoelastic import SKIN, advance
+from reskin.physics import layer, magnet, shear
+from reskin.physics import shear as friction
+from reskin.physics.aging import SKIN, advance
+from reskin.physics.board import Board, BoardDesign, Spreads, draw_board
+from reskin.physics.force_sensor import RANGE_N, read_force
+from reskin.physics.layer import Press, depth_unit
+from reskin.physics.magnet import CUBE_SIDE_M, Quadrature, change_of_field
+from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, forces
+from reskin.seeds import rng_for
 
 AREA = "physics"
 COARSE = Quadrature(cell_m=2.2e-3, layers_n=4)
@@ -186,7 +185,7 @@ def single_precision(board: Board, fine: Skin) -> Case:
     double_T = change_of_field(rest, moved, board.chips_m)
     x, m, moved_x, moved_m, chips = (part.astype(np.float32) for part in (*rest, *moved, board.chips_m))
     # Node by node, as the product does: the difference of two large sums would lose more.
-    each_T = dipole.field_of_each(moved_x, moved_m, chips) - dipole.field_of_each(x, m, chips)
+    each_T = magnet.field_of_each(moved_x, moved_m, chips) - magnet.field_of_each(x, m, chips)
     single_T = each_T.sum(axis=1)
     error_uT = float(np.abs(single_T - double_T).max() / micro)
     happened = f"{single_T.dtype}, {len(x)} dipoles: {error_uT:.1e} uT off, of {np.abs(double_T).max() / micro:.3g} uT"

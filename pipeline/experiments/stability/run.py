@@ -6,17 +6,17 @@ Refuses to know a case: modules beside this one hold them.
 from dataclasses import asdict
 from pathlib import Path
 
-from pipeline.core import io
-from pipeline.core.config import Files, read_settings
-from pipeline.core.executors import make_executor
-from pipeline.core.stage import run, say
+from pipeline.executors import make_executor
 from pipeline.experiments.stability.cases import Case
 from pipeline.experiments.stability.chip import chip_cases
 from pipeline.experiments.stability.extremes import extreme_cases
 from pipeline.experiments.stability.physics import drag_cases, physics_cases, time_cases
 from pipeline.experiments.stability.sliding import sliding_cases
 from pipeline.experiments.stability.wire import wire_cases
-from pipeline.synthesis.settings import Synthesis, synthesis_of
+from pipeline.stage import run, say
+from reskin import io
+from reskin.config import Files, read_settings
+from reskin.simulation.settings import Synthesis, synthesis_of
 
 
 def survey(of: Synthesis, seed: int) -> list[Case]:

@@ -11,11 +11,11 @@ from scipy.constants import milli
 from pipeline.experiments.stability.cases import Case, measured, observed
 from pipeline.experiments.stability.physics import COARSE
 from pipeline.experiments.verification.checks import no_spread
-from pipeline.physics import shear, slide
-from pipeline.physics.board import Board, BoardDesign, Spreads, draw_board
-from pipeline.physics.friction import Friction
-from pipeline.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, forces, press_slides, shear_moduli_Pa
-from pipeline.synthesis.contact import DEPTH_STEP_M, Sideways, push
+from reskin.physics import shear, slide
+from reskin.physics.board import Board, BoardDesign, Spreads, draw_board
+from reskin.physics.shear import Friction
+from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, forces, press_slides, shear_moduli_Pa
+from reskin.simulation.contact import DEPTH_STEP_M, Sideways, push
 
 AREA = "physics"
 DEPTH = 0.35  # of the thickness: the deepest drag of a scene, and the steepest shear

@@ -11,12 +11,12 @@ from typing import get_args
 
 import numpy as np
 
-from pipeline.capture.header import Wire
-from pipeline.capture.stream import FrameStream, decode_all
-from pipeline.capture.wire import BLOCK_FRAMES_N, TEXT_WIRES, Frames, concatenate, encode
-from pipeline.core.seeds import rng_for
 from pipeline.experiments.stability.cases import Case, measured, peak_bytes, refused
 from pipeline.experiments.verification.frames import CRLF_degC, make_frames
+from reskin.board.stream import FrameStream, decode_all
+from reskin.board.wire import BLOCK_FRAMES_N, TEXT_WIRES, Frames, concatenate, encode
+from reskin.recordings.header import Wire
+from reskin.seeds import rng_for
 
 AREA = "wire"
 FRAMES_N = 40

@@ -19,7 +19,7 @@ from pipeline.experiments.contacts.pairs import (
     neighbour_distance,
     roc_area,
 )
-from pipeline.learning.inputs import shape
+from reskin.models.inputs import shape
 
 Directions = Mapping[int, Float64[np.ndarray, " ch"]]  # by place
 Scores = dict[str, Float[np.ndarray, "_"]]  # by detector: the larger, the less like one touch

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from pipeline.core.errors import ParamsError
-from pipeline.core.schema import Readings
-from pipeline.dataset.baseline import subtract
-from pipeline.dataset.rows import Selection
+from reskin.data.baseline import subtract
+from reskin.data.rows import Selection
+from reskin.errors import ParamsError
+from reskin.schema import Readings
 
 PLACE_COUNT = re.compile(r"place_(\d+)_rows_n")  # of an account, by layouts that number places
 ROWS_MIN_N = 20  # touched rows that three blocks are cut of

@@ -13,16 +13,16 @@ import numpy as np
 from jaxtyping import Float32
 from pydantic import Field, model_validator
 
-from pipeline.core import io
-from pipeline.core.config import Files, Settings, Strict, read_settings
-from pipeline.core.seeds import rng_for
-from pipeline.core.stage import run, say
-from pipeline.dataset.rows import Selection
-from pipeline.evaluation.scores import statistic
 from pipeline.experiments.answer import write_answer
 from pipeline.experiments.touches import fields
 from pipeline.experiments.touches.recordings import Blocks, Touched, in_blocks, joined, sort_recordings, touched
-from pipeline.learning.classical import Ridge, fit
+from pipeline.report.statistics import statistic
+from pipeline.stage import run, say
+from reskin import io
+from reskin.config import Files, Settings, Strict, read_settings
+from reskin.data.rows import Selection
+from reskin.models.classical import Ridge, fit
+from reskin.seeds import rng_for
 
 Fraction = Annotated[float, Field(gt=0, lt=1)]
 LINEAR = Ridge(inputs="raw", method="ridge", alpha=1.0)  # of force

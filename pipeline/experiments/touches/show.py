@@ -5,7 +5,7 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.reporting.shown import show_digits
+from pipeline.report.formatting import show_digits
 
 BY_TIME = "later in the same recordings"
 ONCE = (

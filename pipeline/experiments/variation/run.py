@@ -13,14 +13,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from pydantic import Field
 
-from pipeline.core import io
-from pipeline.core.config import Files, Settings, Strict, read_settings
-from pipeline.core.errors import ParamsError
-from pipeline.core.schema import Readings
-from pipeline.core.stage import run
-from pipeline.dataset.baseline import rank, subtract
 from pipeline.experiments.answer import read_folder, read_losses, write_answer
 from pipeline.experiments.drift.windows import pace, rms
+from pipeline.stage import run
+from reskin import io
+from reskin.config import Files, Settings, Strict, read_settings
+from reskin.data.baseline import rank, subtract
+from reskin.errors import ParamsError
+from reskin.schema import Readings
 
 Count = Annotated[int, Field(ge=1)]
 Place_mm = tuple[float, float]

@@ -12,10 +12,9 @@ import numpy as np
 import pandas as pd
 
 from pipeline.experiments.drift.show import say_pace
-from pipeline.reporting.figures import drawing, svg
-from pipeline.reporting.paper import FIGURE_4
-from pipeline.reporting.shown import tabulate
-from pipeline.reporting.work_precision import COLOURS, MARKERS
+from pipeline.report.figures import COLOURS, MARKERS, drawing, svg
+from pipeline.report.formatting import tabulate
+from pipeline.report.paper import FIGURE_4
 
 MEANING = (
     "By how much equal pokes differ: rms over the channels, and as a part of the change of field that the poke makes. "

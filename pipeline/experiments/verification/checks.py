@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.physics.board import Spreads
+from reskin.physics.board import Spreads
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Float, Float32
 from scipy.constants import micro, milli
 
-from pipeline.core.seeds import rng_for
 from pipeline.experiments.verification.checks import Check, farthest, relative
-from pipeline.physics.board import Board
-from pipeline.physics.sensor import ChipDesign, Overruns, read_field, read_temperature, steps_uT
+from reskin.physics.board import Board
+from reskin.physics.chip import ChipDesign, Overruns, read_field, read_temperature, steps_uT
+from reskin.seeds import rng_for
 
 PUBLISHED_STEPS_uT = {7: (0.150, 0.150, 0.242), 6: (0.200, 0.200, 0.3227)}  # by GAIN_SEL; RES 0
 PUBLISHED_GAINS = (5.0, 4.0, 3.0, 2.5, 2.0, 1.667, 1.333, 1.0)  # GAIN_SEL 0 to 7

@@ -11,12 +11,12 @@ from jaxtyping import Float
 from magpylib.core import dipole_Hfield
 from scipy.constants import milli, mu_0
 
-from pipeline.core.seeds import rng_for
 from pipeline.experiments.verification.checks import Check, worst
-from pipeline.physics import dipole, magnet
-from pipeline.physics.change import change_of_field
-from pipeline.physics.nodes import Quadrature, place_nodes
-from pipeline.physics.skin import Dipoles, SkinDesign
+from reskin.physics import magnet
+from reskin.physics import magnet as dipole
+from reskin.physics.magnet import Quadrature, change_of_field, place_nodes
+from reskin.physics.skin import Dipoles, SkinDesign
+from reskin.seeds import rng_for
 
 NEAR_CELLS, FAR_CELLS = 0.6, 50.0  # distances, in sizes of a cell (PHYSICS 9)
 COARSE = Quadrature(cell_m=1.5e-3, layers_n=3)

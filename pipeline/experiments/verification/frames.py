@@ -9,13 +9,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pipeline.capture import wire
-from pipeline.capture.header import Wire
-from pipeline.capture.stream import decode_all
-from pipeline.capture.wire import Frames
-from pipeline.core.seeds import rng_for
 from pipeline.experiments.verification.checks import Check
-from pipeline.physics.sensor import steps_uT
+from reskin.board import wire
+from reskin.board.stream import decode_all
+from reskin.board.wire import Frames
+from reskin.physics.chip import steps_uT
+from reskin.recordings.header import Wire
+from reskin.seeds import rng_for
 
 FRAMES_N = 300
 CRLF_degC = 34.513275  # its float32 holds CR LF

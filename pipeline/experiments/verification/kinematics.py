@@ -7,8 +7,9 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.experiments.verification.checks import Check, farthest, worst
-from pipeline.physics import flow, layer, slide
-from pipeline.physics.skin import Dipoles, Skin, press_slides
+from reskin.physics import layer, slide
+from reskin.physics import layer as flow
+from reskin.physics.skin import Dipoles, Skin, press_slides
 
 STEPS_N = 12  # of 0.1 mm at 1.2 mm (PHYSICS 0)
 STEP_M = 1e-7  # of finite differences

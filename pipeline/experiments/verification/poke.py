@@ -9,14 +9,13 @@ import numpy as np
 from jaxtyping import Float
 from scipy.constants import micro, milli
 
-from pipeline.dataset.grid import CENTRE_MM, protocol
 from pipeline.experiments.verification import kinematics
 from pipeline.experiments.verification.checks import Check, apart, no_spread, worst
 from pipeline.experiments.verification.field import TURN, field_of
-from pipeline.physics.board import Board, BoardDesign, Spreads, draw_board
-from pipeline.physics.magnet import Polarity
-from pipeline.physics.nodes import Quadrature
-from pipeline.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin
+from reskin.data.grid import CENTRE_MM, protocol
+from reskin.physics.board import Board, BoardDesign, Spreads, draw_board
+from reskin.physics.magnet import Polarity, Quadrature
+from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin
 
 COARSE = Quadrature(cell_m=2.2e-3, layers_n=4)  # for laws that hold for any rule
 DENSE = Quadrature(cell_m=1.5e-3, layers_n=4)  # for what the table and the steps cost

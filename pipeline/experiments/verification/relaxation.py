@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.experiments.verification.checks import Check, worst
-from pipeline.physics.viscoelastic import SKIN, Prony, advance, relax
+from reskin.physics.aging import SKIN, Prony, advance, relax
 
 POKES_N, CYCLE_S, RAMP_S, HOLD_S = 20, 1.5, 0.3, 0.7  # 20 pokes over 30 s (PHYSICS 5)
 NAME = "relaxation of the force"

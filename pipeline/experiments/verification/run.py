@@ -8,9 +8,6 @@ from pathlib import Path
 
 from scipy.constants import milli
 
-from pipeline.core import io
-from pipeline.core.config import Files, read_settings
-from pipeline.core.stage import run, say
 from pipeline.experiments.verification.checks import Check
 from pipeline.experiments.verification.contact import check_contact, check_sideways
 from pipeline.experiments.verification.electronics import check_electronics
@@ -19,8 +16,11 @@ from pipeline.experiments.verification.frames import check_frames
 from pipeline.experiments.verification.kinematics import check_kinematics
 from pipeline.experiments.verification.poke import check_poke
 from pipeline.experiments.verification.relaxation import check_relaxation
-from pipeline.physics.flow import Press
-from pipeline.synthesis.settings import Synthesis, synthesis_of
+from pipeline.stage import run, say
+from reskin import io
+from reskin.config import Files, read_settings
+from reskin.physics.layer import Press
+from reskin.simulation.settings import Synthesis, synthesis_of
 
 
 def verify(of: Synthesis, *, depths_m: tuple[float, ...], seed: int) -> list[Check]:

@@ -15,25 +15,33 @@ from jaxtyping import Float
 from pydantic import Field
 from scipy.constants import micro, milli
 
-from pipeline.core.config import Files, Settings, Strict, read_settings
-from pipeline.core.seeds import rng_for
-from pipeline.core.stage import run, say
-from pipeline.dataset.rows import Rows, stack
-from pipeline.dataset.splits import Fold, Split, draw_folds
-from pipeline.evaluation.metrics import METRICS
-from pipeline.evaluation.scores import by_skin, over_boards, over_pairs, records, select, tidy, whole
 from pipeline.experiments.answer import write_answer
-from pipeline.learning.recipe import HEADLINE, training
-from pipeline.learning.recipe import adaptations as adaptations_of
-from pipeline.learning.trial import Start, Trial
-from pipeline.physics.board import draw_board
-from pipeline.physics.force_sensor import read_force
-from pipeline.physics.skin import changes_of_field, draw_skin, forces
-from pipeline.synthesis.capture import roster
-from pipeline.synthesis.rig import misplace
-from pipeline.synthesis.settings import MAIN, Synthesis, synthesis_of
-from pipeline.trials.adapting import Starts, adaptations
-from pipeline.trials.training import SceneData, card_of, note_seconds, prepare_training, train_all, trials_of
+from pipeline.report.statistics import by_skin, over_boards, over_pairs, records, select, tidy, whole
+from pipeline.stage import run, say
+from pipeline.training.trainings import (
+    SceneData,
+    Starts,
+    adaptations,
+    card_of,
+    note_seconds,
+    prepare_training,
+    train_all,
+    trials_of,
+)
+from reskin.config import Files, Settings, Strict, read_settings
+from reskin.data.rows import Rows, stack
+from reskin.data.splits import Fold, Split, draw_folds
+from reskin.metrics import METRICS
+from reskin.models.recipe import HEADLINE, training
+from reskin.models.recipe import adaptations as adaptations_of
+from reskin.models.trial import Start, Trial
+from reskin.physics.board import draw_board
+from reskin.physics.force_sensor import read_force
+from reskin.physics.skin import changes_of_field, draw_skin, forces
+from reskin.seeds import rng_for
+from reskin.simulation.capture import roster
+from reskin.simulation.rig import misplace
+from reskin.simulation.settings import MAIN, Synthesis, synthesis_of
 
 WAVES_N = 48  # cosines that make a smooth error
 DEFAULT = "default"

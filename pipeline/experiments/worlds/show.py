@@ -5,11 +5,9 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.reporting.figures import drawing, svg
-from pipeline.reporting.order import SHORT
-from pipeline.reporting.paper import TABLE_2
-from pipeline.reporting.shown import COLUMNS, show, tabulate
-from pipeline.reporting.work_precision import COLOURS, MARKERS
+from pipeline.report.figures import COLOURS, MARKERS, drawing, svg
+from pipeline.report.formatting import COLUMNS, SHORT, show, tabulate
+from pipeline.report.paper import TABLE_2
 
 DEFAULT = "default"
 FACTORS = {

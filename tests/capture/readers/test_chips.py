@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.capture import faults
-from pipeline.capture.readers.chips import GRID_ROWS_N, find_whole_rows
-from pipeline.core import seeds
-from pipeline.core.errors import CaptureError
+from reskin import seeds
+from reskin.board import faults
+from reskin.errors import CaptureError
+from reskin.recordings.chips import GRID_ROWS_N, find_whole_rows
 from tests.capture.headers import AS_USUAL, make_header
 
 HEADER = make_header()

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.capture.faults import FAILED_B_uT
-from pipeline.capture.header import Header
-from pipeline.capture.readers import eflash7
-from pipeline.core.errors import CaptureError
+from reskin.board.faults import FAILED_B_uT
+from reskin.errors import CaptureError
+from reskin.recordings.header import Header
+from reskin.recordings.readers import eflash7
 from tests.capture.headers import AS_USUAL, make_header
 
 CHIPS_N = 2

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.capture.header import Header
-from pipeline.capture.readers import eflesh
-from pipeline.core.errors import CaptureError
+from reskin.errors import CaptureError
+from reskin.recordings.header import Header
+from reskin.recordings.readers import eflesh
 from tests.capture.headers import AS_USUAL, make_header
 
 CHIPS_N = 2

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.capture.header import Firmware, Header
-from pipeline.capture.readers import ini
-from pipeline.core.errors import CaptureError
+from reskin.errors import CaptureError
+from reskin.recordings.header import Firmware, Header
+from reskin.recordings.readers import ini
 from tests.capture.headers import AS_USUAL, make_header
 
 CHIPS_N = 3

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.capture.readers import ini
-from pipeline.capture.readers.lateness import find_change
-from pipeline.core.errors import CaptureError
-from pipeline.core.seeds import rng_for
+from reskin.errors import CaptureError
+from reskin.recordings.readers import ini
+from reskin.recordings.readers.alignment import find_change
+from reskin.seeds import rng_for
 from tests.capture.headers import AS_USUAL, make_header
 
 PUBLIC = ("artillery_AFG_board2_50_screw", "artillery_AFG_board1_50")

@@ -7,8 +7,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.capture.readers.passes import find_passes
-from pipeline.core import seeds
+from reskin import seeds
+from reskin.recordings.readers.alignment import find_passes
 
 
 def raster(columns_n: int, rows_n: int, presses_n: int) -> np.ndarray:

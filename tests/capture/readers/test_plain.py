@@ -10,9 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from pipeline.capture.readers import eflesh, plain
 from pipeline.cli import app
-from pipeline.core.errors import CaptureError
+from reskin.errors import CaptureError
+from reskin.recordings.readers import eflesh
+from reskin.recordings.readers import table as plain
 from tests.capture.headers import AS_USUAL, make_header
 
 ROOT = Path(__file__).resolve().parents[3]

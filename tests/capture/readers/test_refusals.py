@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.capture.readers import READERS
+from reskin.recordings.readers import READERS
 from tests.capture.readers import test_eflash7, test_eflesh, test_ini, test_lab, test_plain
 
 WHOLE: dict[str, Callable[[Path], Path]] = {

@@ -7,19 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.capture.layouts import Foreign
-from pipeline.capture.readers import READERS
-from pipeline.capture.readers.table import (
-    check_depths,
-    check_fields,
-    check_forces,
-    check_places,
-    check_touch,
-    make_readings,
-)
-from pipeline.core import seeds
-from pipeline.core.errors import CaptureError
-from pipeline.core.schema import to_table
+from reskin import seeds
+from reskin.errors import CaptureError
+from reskin.recordings.layouts import Foreign
+from reskin.recordings.readers import READERS
+from reskin.recordings.text import check_depths, check_fields, check_forces, check_places, check_touch, make_readings
+from reskin.schema import to_table
 from tests.capture.headers import make_header
 
 SKIN_uT = np.array([[-541.2, 917.2, 44.9], [120.0, -3600.0, 700.0]])

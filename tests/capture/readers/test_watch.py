@@ -8,13 +8,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.capture import faults, probe
-from pipeline.capture.header import Firmware
-from pipeline.capture.readers.chips import SCALE_FRAMES_N, Watch
-from pipeline.capture.readers.table import check_log
-from pipeline.capture.wire import Frames
-from pipeline.core import seeds
-from pipeline.core.errors import CaptureError
+from reskin import seeds
+from reskin.board import faults
+from reskin.board.wire import Frames
+from reskin.errors import CaptureError
+from reskin.recordings import probe
+from reskin.recordings.chips import SCALE_FRAMES_N, Watch
+from reskin.recordings.header import Firmware
+from reskin.recordings.text import check_log
 from tests.capture.headers import AS_USUAL, make_header
 from tests.capture.signals import frames_of
 

@@ -7,25 +7,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.core import io
-from pipeline.core.config import Files
-from pipeline.core.errors import LeakError
-from pipeline.core.schema import Readings
-from pipeline.core.seeds import rng_for
-from pipeline.dataset.folds import load_rows, parse_folds, render_folds
-from pipeline.dataset.rows import Selection
-from pipeline.dataset.splits import Fold, draw_folds
 from pipeline.experiments.audit.run import audit
-from pipeline.learning.inputs import FIT, VIEW
-from pipeline.learning.job import make_job
-from pipeline.learning.recipe import adaptations as adaptations_of
-from pipeline.learning.recipe import training
-from pipeline.learning.trial import Measured, Trained, Trial
 from pipeline.stages import split
-from pipeline.synthesis.fingerprint import SECTIONS as PHYSICS
-from pipeline.trials import training as _training
-from pipeline.trials.adapting import adaptations, read_starts
-from pipeline.trials.training import SceneData, read_data, trials_of, write_models
+from pipeline.training import trainings as _training
+from pipeline.training.trainings import SceneData, adaptations, read_data, read_starts, trials_of, write_models
+from reskin import io
+from reskin.config import Files
+from reskin.data.folds import load_rows, parse_folds, render_folds
+from reskin.data.rows import Selection
+from reskin.data.splits import Fold, draw_folds
+from reskin.errors import LeakError
+from reskin.models.inputs import FIT, VIEW
+from reskin.models.recipe import adaptations as adaptations_of
+from reskin.models.recipe import training
+from reskin.models.train import make_job
+from reskin.models.trial import Measured, Trained, Trial
+from reskin.schema import Readings
+from reskin.seeds import rng_for
+from reskin.simulation.fingerprint import SECTIONS as PHYSICS
 from tests.dataset.tables import readings
 from tests.scenes import ADAPTATIONS, RECIPE, SHARED, TRAINING, recorded, settings
 from tests.synthesis.scene import SECTIONS

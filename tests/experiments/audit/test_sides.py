@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.core.errors import ParamsError, SchemaError
-from pipeline.core.seeds import rng_for
 from pipeline.experiments.audit import copies, sides
 from pipeline.experiments.audit.copies import nearest_rays
 from pipeline.experiments.audit.run import audit_choice, audit_scaler
 from pipeline.experiments.audit.sides import Labels, Sides, audit_fold, holds, to_words
-from pipeline.learning.inputs import FIT
+from reskin.errors import ParamsError, SchemaError
+from reskin.models.inputs import FIT
+from reskin.seeds import rng_for
 
 NONE = np.zeros(0, np.int64)
 READINGS_N = 3

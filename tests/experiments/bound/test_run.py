@@ -8,10 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core import io
-from pipeline.core.errors import ParamsError, SchemaError
-from pipeline.core.seeds import rng_for
-from pipeline.evaluation.metrics import score
 from pipeline.experiments.bound.run import (
     NETWORK,
     bound_of,
@@ -23,9 +19,13 @@ from pipeline.experiments.bound.run import (
     slopes,
     touches,
 )
-from pipeline.physics.board import draw_board
-from pipeline.physics.sensor import ChipDesign, read_field
-from pipeline.physics.skin import draw_skin
+from reskin import io
+from reskin.errors import ParamsError, SchemaError
+from reskin.metrics import score
+from reskin.physics.board import draw_board
+from reskin.physics.chip import ChipDesign, read_field
+from reskin.physics.skin import draw_skin
+from reskin.seeds import rng_for
 from tests.synthesis.scene import synthesis
 
 ROWS_N = 40_000

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.capture.readers import lab
-from pipeline.core.schema import Readings
 from pipeline.experiments.compare.joining import POKES_MAX_N, _thin, departure
-from pipeline.twin.pokes import pool
+from reskin.recordings.readers import lab
+from reskin.schema import Readings
+from reskin.universal.presses import pool
 from tests.experiments.compare.test_run import DESIGN, SECTION
 from tests.recordings.test_recordings import ingest
 

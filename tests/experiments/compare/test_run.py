@@ -7,16 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.capture.readers import lab
-from pipeline.core.config import parse, read_yaml
-from pipeline.core.errors import ParamsError, SchemaError
-from pipeline.core.seeds import rng_for
 from pipeline.experiments.compare import frames
 from pipeline.experiments.compare.run import Compare, beside, compare_boards, framed, remembered, see, turns_of
-from pipeline.physics import layer
-from pipeline.physics.skin import SkinDesign
-from pipeline.twin import fit, law
-from pipeline.twin.pokes import Pokes, cosines, explained, growth, memory, pool
+from reskin.config import parse, read_yaml
+from reskin.errors import ParamsError, SchemaError
+from reskin.physics import layer
+from reskin.physics.skin import SkinDesign
+from reskin.recordings.readers import lab
+from reskin.seeds import rng_for
+from reskin.universal import law
+from reskin.universal import law as fit
+from reskin.universal.presses import Pokes, cosines, explained, growth, memory, pool
 from tests.dataset.tables import readings
 from tests.recordings.test_recordings import LAB, ingest
 

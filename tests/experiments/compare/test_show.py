@@ -3,7 +3,7 @@
 import copy
 
 from pipeline.experiments.compare.show import figures, tables
-from pipeline.twin.law import Law
+from reskin.universal.law import Law
 from tests.reporting.test_work_precision import said
 
 LAW = dict.fromkeys(Law.__dataclass_fields__, 1.0)

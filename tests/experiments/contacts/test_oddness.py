@@ -6,7 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.metrics import roc_auc_score
 
-from pipeline.core.seeds import rng_for
 from pipeline.experiments.contacts.pairs import (
     NEIGHBOURS_N,
     NOISE_uT,
@@ -16,6 +15,7 @@ from pipeline.experiments.contacts.pairs import (
     residual,
     roc_area,
 )
+from reskin.seeds import rng_for
 
 SCORES = st.lists(st.integers(0, 9), min_size=1, max_size=30).map(lambda values: np.array(values, float))
 

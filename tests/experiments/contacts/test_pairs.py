@@ -7,9 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core.errors import ParamsError
-from pipeline.core.seeds import rng_for
-from pipeline.dataset.grid import points_mm
 from pipeline.experiments.contacts.pairs import (
     TOLERANCE_MM,
     along_the_line,
@@ -19,6 +16,9 @@ from pipeline.experiments.contacts.pairs import (
     summarise_nested,
     where_it_falls,
 )
+from reskin.data.grid import points_mm
+from reskin.errors import ParamsError
+from reskin.seeds import rng_for
 from tests.dataset import tables
 
 SKINS = ("b0_s0", "b0_s1", "b1_s0")

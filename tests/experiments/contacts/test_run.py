@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.core.config import Settings, read_yaml
-from pipeline.core.seeds import rng_for
-from pipeline.dataset.grid import points_mm
-from pipeline.dataset.splits import Fold
 from pipeline.experiments.contacts.run import Contacts, on_board
-from pipeline.trials.training import SceneData
+from pipeline.training.trainings import SceneData
+from reskin.config import Settings, read_yaml
+from reskin.data.grid import points_mm
+from reskin.data.splits import Fold
+from reskin.seeds import rng_for
 from tests.dataset import tables
 
 ASKED = Contacts(pairs_n=40, separations_mm=(4.0, 8.0), false_alarm_fraction=0.1)

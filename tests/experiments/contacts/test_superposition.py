@@ -5,9 +5,9 @@ import pytest
 
 from pipeline.experiments.contacts import superposition as module
 from pipeline.experiments.contacts.superposition import press_on, superposition
-from pipeline.physics.board import draw_board
-from pipeline.physics.change import change_of_field
-from pipeline.physics.skin import draw_skin, moved_dipoles
+from reskin.physics.board import draw_board
+from reskin.physics.magnet import change_of_field
+from reskin.physics.skin import draw_skin, moved_dipoles
 from tests.synthesis.scene import synthesis
 
 SCENE = synthesis()

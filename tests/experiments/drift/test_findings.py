@@ -4,7 +4,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import ttest_rel
 
-from pipeline.evaluation.scores import FEW_BOARDS, INCONCLUSIVE, NO, YES
 from pipeline.experiments.drift.findings import (
     EACH_IS_WORSE,
     HIGHER_AND_FASTER,
@@ -13,6 +12,7 @@ from pipeline.experiments.drift.findings import (
     findings,
     rates,
 )
+from pipeline.report.statistics import FEW_BOARDS, INCONCLUSIVE, NO, YES
 
 FIELD = {"contact_uT": 140.0, "noload_noise_uT": 1.25}
 LATE = {

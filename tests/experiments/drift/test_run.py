@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from pipeline.core import io
-from pipeline.core.config import Files
-from pipeline.core.errors import ParamsError
-from pipeline.core.schema import Readings
-from pipeline.core.seeds import rng_for
-from pipeline.dataset.grid import points_mm
 from pipeline.experiments.drift import show as drift_pages
 from pipeline.experiments.drift.run import drift
 from pipeline.experiments.variation import show as variation_pages
 from pipeline.experiments.variation.run import variation
+from reskin import io
+from reskin.config import Files
+from reskin.data.grid import points_mm
+from reskin.errors import ParamsError
+from reskin.schema import Readings
+from reskin.seeds import rng_for
 from tests.dataset.tables import readings
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -4,7 +4,7 @@ import xml.etree.ElementTree as ET
 import pytest
 
 from pipeline.experiments.drift.show import figures, tables
-from pipeline.reporting.shown import to_markdown
+from pipeline.report.formatting import to_markdown
 
 
 def numbers(force: bool = True, spread: bool = True, **changed) -> dict:

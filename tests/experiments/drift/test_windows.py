@@ -6,8 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import linregress, sem
 
-from pipeline.core.seeds import rng_for
-from pipeline.evaluation.metrics import METRICS, score
 from pipeline.experiments.drift.windows import (
     POINTS_MAX_N,
     Answers,
@@ -23,6 +21,8 @@ from pipeline.experiments.drift.windows import (
     pace,
     points,
 )
+from reskin.metrics import METRICS, score
+from reskin.seeds import rng_for
 from tests.dataset.tables import readings
 
 

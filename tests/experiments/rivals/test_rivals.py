@@ -5,19 +5,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.core.config import Settings
-from pipeline.core.errors import ParamsError
-from pipeline.core.seeds import rng_for
-from pipeline.dataset.rows import Rows
-from pipeline.dataset.splits import Fold
-from pipeline.evaluation.metrics import score_groups
 from pipeline.experiments.rivals import alarm, aligned, flagged, told
 from pipeline.experiments.rivals.alarm import QUARTER, STRANGERS, Board
 from pipeline.experiments.rivals.points import FOREIGN, NONE, OWN, next_board, pokes_of, summarise
 from pipeline.experiments.rivals.show import WHY, tables
-from pipeline.learning.adversarial import Domains
-from pipeline.learning.model import Predictor, draw_weights, paper_layers
-from pipeline.trials.training import SceneData
+from pipeline.training.trainings import SceneData
+from reskin.config import Settings
+from reskin.data.rows import Rows
+from reskin.data.splits import Fold
+from reskin.errors import ParamsError
+from reskin.metrics import score_groups
+from reskin.models.adversarial import Domains
+from reskin.models.network import Predictor, draw_weights, paper_layers
+from reskin.seeds import rng_for
 from tests.learning.recipes import recipe
 
 PLACES_MM = np.array([[4.0, 4.0], [6.0, 4.0], [8.0, 6.0], [4.0, 8.0], [6.0, 8.0]])

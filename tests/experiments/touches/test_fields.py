@@ -8,13 +8,13 @@ import pytest
 from pydantic import ValidationError
 from scipy.optimize import lsq_linear
 
-from pipeline.core.errors import ParamsError
-from pipeline.core.seeds import rng_for
-from pipeline.dataset.rows import Selection
 from pipeline.experiments.touches import fields
 from pipeline.experiments.touches.recordings import Touched, in_blocks, sort_recordings, touched
 from pipeline.experiments.touches.run import Touches, of_detection, of_forces, of_places, of_superposition
 from pipeline.experiments.touches.show import tables
+from reskin.data.rows import Selection
+from reskin.errors import ParamsError
+from reskin.seeds import rng_for
 from tests.dataset.tables import readings as make_readings
 
 PLACES = (1, 2, 3, 4)

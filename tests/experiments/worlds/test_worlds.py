@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from pipeline.core import io
-from pipeline.core.config import Files, parse, read_settings, read_yaml
-from pipeline.evaluation.metrics import METRICS
 from pipeline.experiments.worlds import show
 from pipeline.experiments.worlds.run import Residual, Worlds, rows_of, with_residual, worlds, worlds_of
-from pipeline.synthesis.settings import synthesis_of
+from reskin import io
+from reskin.config import Files, parse, read_settings, read_yaml
+from reskin.metrics import METRICS
+from reskin.simulation.settings import synthesis_of
 from tests.reporting.test_work_precision import said
 
 ROOT = Path(__file__).resolve().parents[3]

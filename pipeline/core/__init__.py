@@ -1,1 +1,0 @@
-"""What every stage stands on: errors, files, tables, seeds, settings, costs. Knows no skin."""

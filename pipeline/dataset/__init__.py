@@ -1,1 +1,0 @@
-"""From captures to rows that a model may see: joining clocks, no-load policies, splits. Knows no network."""

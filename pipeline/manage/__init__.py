@@ -1,0 +1,1 @@
+"""Commands that manage recordings and results in a checkout."""

@@ -1,0 +1,172 @@
+"""Adding a recording: a header and files -> data/raw/<scene>/<capture>/, tracked, registered, planned. Or nothing.
+
+Everything is read through and checked before it counts; what fails, or is stopped, leaves no trace. Refuses to know
+layouts (`preparing`, `capture.readers`) and stages (`plan`).
+"""
+
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from pipeline import plan
+from pipeline.manage.registry import REGISTRY, read_registry, with_capture, without_capture, write_registry
+from pipeline.manage.running import need_rest
+from pipeline.scenes import Scene, read_plan, read_scene, read_shared
+from pipeline.stage import say
+from reskin import config, io
+from reskin.errors import CaptureError, ReskinError
+from reskin.recordings.fault_policy import Decisions
+from reskin.recordings.header import STREAM_FILE, Header, write_capture
+from reskin.recordings.ingest import check_losses, open_capture
+from reskin.recordings.orientation import other_orientation, presses_of
+from reskin.recordings.preparing import Prepared
+
+RAW = "data/raw"
+INDENTATIONS = "data/indentations"
+COMPARED_N = 3  # captures of the scene, the last ones, with which the places of a new one are compared
+
+
+def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Header:
+    """Check a prepared recording, write it, track it with DVC, register it, and plan its scene; all, or nothing."""
+    need_rest(root)
+    header, files = prepared
+    settings = read_scene(plan.scene_file(root, scene), root / config.PARAMS)
+    if settings.source != header.source:
+        rule, remedy = (
+            f"{settings.source}, as scene {scene} is",
+            "Simulated and recorded captures belong to different scenes.",
+        )
+        raise CaptureError(f"capture {header.capture}", "source", rule, header.source, remedy)
+    shared, before = read_shared(root / config.PARAMS), read_registry(root)
+    decisions = config.parse(Decisions, shared["faults"], f"{config.PARAMS}: faults")
+    target = root / RAW / scene / header.capture
+    _check_free(target, header.capture in before.captures.get(scene, {}))
+    with io.restoring(root / REGISTRY, root / config.PLAN), _forgetting_on_failure(target):
+        with _naming_sources(target, files):
+            complete = write_capture(target, header, files)
+            fingerprints = _read_through(target, complete, shared["lost_fraction_max"], decisions)
+        after = with_capture(before, scene, complete, fingerprints, allow_copy=allow_copy)
+        _track(target, root)
+        write_registry(root, after)
+        plan.use(root, [*read_plan(root / config.PLAN).scenes, scene])
+    if "compare" in (settings.model_extra or {}):
+        _warn_of_departures(target, settings, shared["skin"], decisions)
+    else:
+        _warn_of_other_labels(target, list(before.captures.get(scene, {})), decisions)
+    return complete
+
+
+def remove(root: Path, scene: str, capture: str) -> None:
+    """Take a capture out again: its entry and its stage, then its raw files and its readings."""
+    after = without_capture(read_registry(root), scene, capture)
+    running = read_plan(root / config.PLAN).scenes
+    with io.restoring(root / REGISTRY, root / config.PLAN):
+        write_registry(root, after)
+        plan.use(root, [name for name in running if name != scene or scene in after.captures])
+    _forget(root / RAW / scene / capture)
+    io.remove(root / INDENTATIONS / scene / f"{capture}.parquet")
+
+
+def _check_free(target: Path, registered: bool) -> None:
+    if registered:
+        remedy = "Is it the same recording? It is in already. Otherwise choose another --name."
+        raise CaptureError(f"capture {target.name}", "its name", "new to its scene", "one that is taken", remedy)
+    if target.exists():
+        remedy = "It is in no scene: an add was killed there. Delete the folder, or choose another --name."
+        raise CaptureError(target, "a new capture's folder", "free", "one that is there", remedy)
+
+
+def _read_through(folder: Path, header: Header, limit: float, decisions: Decisions) -> tuple[str, ...]:
+    """Read a capture as ingest will; return the hashes that tell a copy of it, however it is labelled or laid out."""
+    _, blocks, account = open_capture(folder, decisions)
+    rows_n, readings = 0, hashlib.sha256()
+    for block in blocks:
+        rows_n += len(block)
+        readings.update(block.b_uT.tobytes())
+    check_losses(account, limit, folder.name)
+    if rows_n == 0:
+        counts = f"none; counted {dict(account)}"
+        raise CaptureError(folder.name, "a capture", "one reading or more", counts, "Check its files.")
+    if told := ", ".join(f"{key.removeprefix('fault_')} {n}" for key, n in account.items() if key.startswith("fault_")):
+        say(f"warning: capture {folder.name} has faults: {told}")
+    return (readings.hexdigest(), *(header.files[name] for name in (STREAM_FILE,) if name in header.files))
+
+
+def _warn_of_departures(folder: Path, scene: Scene, skin: Mapping[str, Any], decisions: Decisions) -> None:
+    """Warn if a capture seems to lie otherwise than section compare of its scene says; it stays added."""
+    from pipeline.experiments.compare.joining import departure  # late: the physics takes seconds
+    from pipeline.experiments.compare.run import Compare
+    from reskin.physics.skin import SkinDesign
+
+    _, blocks, _ = open_capture(folder, decisions)
+    section = config.parse(Compare, (scene.model_extra or {})["compare"], "section compare")
+    try:
+        sentence = departure(list(blocks), section, config.parse(SkinDesign, skin, "params.yaml: skin"))
+    except ReskinError as error:
+        sentence = f"Whether labels, chips and skin lie as the scene says was not checked: {error}"
+    if sentence:
+        say(f"warning: capture {folder.name}: {sentence} It was added all the same.")
+
+
+def _warn_of_other_labels(folder: Path, others: Sequence[str], decisions: Decisions) -> None:
+    """Warn if places seem turned, mirrored or exchanged beside those of the scene's other captures; it stays added."""
+    found = []
+    own = presses_of(open_capture(folder, decisions)[1])
+    for other in others[-COMPARED_N:]:
+        if (folder.parent / other).is_dir():
+            found.append(other_orientation(own, presses_of(open_capture(folder.parent / other, decisions)[1])))
+    usual = max(set(found), key=found.count, default=None)
+    if usual is not None:
+        say(
+            f"warning: capture {folder.name}: its places agree with those of the scene's other captures only {usual}. "
+            "Are columns exchanged, or was the board turned? It was added all the same."
+        )
+
+
+@contextmanager
+def _naming_sources(target: Path, files: Mapping[str, bytes | Path]) -> Iterator[None]:
+    """Let errors name the user's files, and not copies that are about to go."""
+    try:
+        yield
+    except ReskinError as error:
+        sentence = str(error)
+        for name, source in files.items():
+            for copy in (str(target / name), f"{target.name}/{name}"):
+                sentence = sentence.replace(copy, str(source))
+        raise type(error)(sentence) from None
+
+
+@contextmanager
+def _forgetting_on_failure(target: Path) -> Iterator[None]:
+    try:
+        yield
+    except BaseException:
+        _forget(target)  # Ctrl-C included: a half-added recording is worse than none
+        raise
+
+
+def _forget(target: Path) -> None:
+    io.remove(target)
+    io.remove(target.with_name(f"{target.name}.dvc"))
+    if target.parent.is_dir():
+        ignored = target.parent / ".gitignore"
+        if ignored.exists():
+            lines = [line for line in ignored.read_text(encoding="utf-8").splitlines() if line != f"/{target.name}"]
+            io.write_text(ignored, "\n".join(lines) + "\n") if lines else io.remove(ignored)
+        if not any(target.parent.iterdir()):
+            target.parent.rmdir()
+
+
+def _track(folder: Path, root: Path) -> None:
+    """Let DVC track a folder, as `dvc add` does; in this process, as starting another takes longer than all else."""
+    from dvc.exceptions import DvcException  # late: DVC takes a second
+    from dvc.repo import Repo
+
+    try:
+        with Repo(str(root)) as repo:
+            repo.add([str(folder)])
+    except (DvcException, OSError) as error:
+        rule, got = "able to track it", " ".join(str(error).split())[-300:]
+        raise CaptureError(f"dvc add {folder.relative_to(root)}", "DVC", rule, got, "See above.") from None

@@ -1,0 +1,96 @@
+"""The recorded captures of this checkout: `data/captures.yaml`. In: YAML. Out: names, labels and hashes by scene.
+
+Refuses to know what is in a capture.
+"""
+
+from pathlib import Path
+
+from ruamel.yaml import YAML
+
+from reskin import io
+from reskin.config import Strict, parse, read_yaml
+from reskin.errors import CaptureError
+from reskin.recordings.header import Header
+
+REGISTRY = "data/captures.yaml"
+COMMENT = "# The recorded captures of this checkout, by scene; written by `reskin add` and `reskin remove`.\n"
+
+
+class Entry(Strict):
+    """One recorded capture: its labels, and the hashes that tell a second copy."""
+
+    board: str
+    skin: str
+    layout: str
+    chips_n: int
+    fingerprints: tuple[str, ...]  # of readings, and of the stream: one in common tells a copy
+    copy_of: str | None
+
+
+class Registry(Strict):
+    """Captures by scene, then by name."""
+
+    captures: dict[str, dict[str, Entry]]
+
+
+def read_registry(root: Path) -> Registry:
+    """Read and check `data/captures.yaml`."""
+    return parse(Registry, read_yaml(root / REGISTRY), str(root / REGISTRY))
+
+
+def with_capture(
+    registry: Registry, scene: str, header: Header, fingerprints: tuple[str, ...], *, allow_copy: bool
+) -> Registry:
+    """Add a capture, or raise if it is there already or contradicts what is there."""
+    labels = {name: getattr(header, name) for name in ("board", "skin", "layout", "chips_n")}
+    entry = Entry(**labels, fingerprints=fingerprints, copy_of=None)
+    return with_entry(registry, scene, header.capture, entry, allow_copy=allow_copy)
+
+
+def with_entry(registry: Registry, scene: str, capture: str, entry: Entry, *, allow_copy: bool) -> Registry:
+    """Add the entry of a capture by the same rules; also one that another clone has made."""
+    captures, where = registry.captures.get(scene, {}), f"capture {capture}"
+    twin = next((name for name, other in captures.items() if set(other.fingerprints) & set(entry.fingerprints)), None)
+    if twin is not None:
+        _refuse_copy(where, twin, captures[twin], entry, allow_copy)
+    if capture in captures:
+        raise CaptureError(where, "its name", "new to its scene", "one that is taken", "Choose another with --name.")
+    for name, other in captures.items():
+        if other.skin == entry.skin and other.board != entry.board:
+            what, rule = f"the board of skin {entry.skin}", f"{other.board}, as in {name}"
+            remedy = "A skin that moves to another board gets a new name, or it would stand on both sides of a fold."
+            raise CaptureError(where, what, rule, entry.board, remedy)
+        if other.chips_n != entry.chips_n:
+            rule, remedy = f"the {other.chips_n} of {name}", "Add it to a scene of its own."
+            raise CaptureError(where, "chips", rule, entry.chips_n, remedy)
+    added = entry.model_copy(update={"copy_of": twin})
+    return Registry(captures={**registry.captures, scene: {**captures, capture: added}})
+
+
+def without_capture(registry: Registry, scene: str, capture: str) -> Registry:
+    """Take a capture out; a scene without captures goes too."""
+    captures = registry.captures.get(scene, {})
+    if capture not in captures:
+        known = ", ".join(sorted(captures)) or "none"
+        raise CaptureError(f"scene {scene}", "a capture", f"one of its own ({known})", capture, "Check the name.")
+    left = {name: entry for name, entry in captures.items() if name != capture}
+    others = {name: entries for name, entries in registry.captures.items() if name != scene}
+    return Registry(captures=others | ({scene: left} if left else {}))
+
+
+def write_registry(root: Path, registry: Registry) -> None:
+    """Write `data/captures.yaml`."""
+    yaml = YAML()
+    with io.replacing(root / REGISTRY) as temporary, temporary.open("w", encoding="utf-8") as stream:
+        stream.write(COMMENT)
+        yaml.dump(registry.model_dump(mode="json"), stream)
+
+
+def _refuse_copy(where: str, twin: str, before: Entry, entry: Entry, allow_copy: bool) -> None:
+    relabelled = (before.board, before.skin) != (entry.board, entry.skin)
+    if relabelled and allow_copy:
+        return
+    remedy = "It is in the scene already."
+    if relabelled:
+        remedy = "Under two labels it would stand on both sides of a fold; to try that knowingly, add --allow-copy."
+    raise CaptureError(where, "a recording", "new to its scene", f"the readings of {twin}", remedy)

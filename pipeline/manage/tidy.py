@@ -1,0 +1,71 @@
+"""Find and remove what switched-off questions left behind in this checkout.
+
+Only of scenes in the plan: the outputs of another scene may have taken hours, and it may run again. Knows no content of
+a file.
+"""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from ruamel.yaml import YAML
+
+from pipeline.manage.running import need_rest
+from pipeline.plan import scene_names
+from pipeline.scenes import Plan
+from reskin import io
+from reskin.config import read_yaml
+
+LOCK = "dvc.lock"
+
+
+def left_over(root: Path, plan: Plan) -> dict[str, list[Path]]:
+    """List stages that ran here and are not planned any more, and the files that only they wrote, by stage.
+
+    dvc.lock is committed, and so also lists stages that ran only elsewhere: those have no output here.
+    """
+    if not (root / LOCK).exists():
+        return {}
+    stages: Mapping[str, Any] = read_yaml(root / LOCK).get("stages", {})
+    planned = {f"{stage}@{key}" for stage, keys in plan.stages.items() for key in keys}
+    kept = {path for name, stage in stages.items() if name in planned for path in _outs(stage)}
+    known = scene_names(root)
+    return {
+        name: [root / path for path in _outs(stage) if not _touches(path, kept)]
+        for name, stage in stages.items()
+        if name not in planned
+        and _scene_of(name, known) in plan.scenes
+        and any((root / path).exists() for path in _outs(stage))
+    }
+
+
+def tidy(root: Path, plan: Plan) -> dict[str, list[Path]]:
+    """Remove what is left over, and forget its stages; give what was removed."""
+    need_rest(root)
+    stale = left_over(root, plan)
+    for paths in stale.values():
+        for path in paths:
+            io.remove(path)
+    if stale:
+        yaml = YAML()
+        document = yaml.load((root / LOCK).read_text(encoding="utf-8"))
+        for name in stale:
+            del document["stages"][name]
+        with io.replacing(root / LOCK) as temporary, temporary.open("w", encoding="utf-8") as stream:
+            yaml.dump(document, stream)
+    return stale
+
+
+def _outs(stage: Mapping[str, Any]) -> list[Path]:
+    return [Path(out["path"]) for out in stage.get("outs", [])]
+
+
+def _touches(path: Path, others: Iterable[Path]) -> bool:
+    """Tell whether a path is one of others, lies in one or holds one."""
+    return any(path.is_relative_to(other) or other.is_relative_to(path) for other in others)
+
+
+def _scene_of(stage: str, known: Iterable[str]) -> str:
+    """Name the scene of `stage@scene` or `stage@scene-part`: the longest name that fits."""
+    key = stage.partition("@")[2]
+    return max((name for name in known if f"{key}-".startswith(f"{name}-")), key=len, default="")

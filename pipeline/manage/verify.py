@@ -1,0 +1,84 @@
+"""`reskin verify-reports`: run scenes again in a clone of the last commit, and compare their reports.
+
+A scene runs from nothing: no cache of stages or trainings is there. This module knows no stage but `report`.
+"""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from pipeline.manage.add import RAW
+from pipeline.manage.compare import Echo, read_folder, read_revision, tell
+from pipeline.manage.registry import REGISTRY
+from pipeline.stage import say
+from reskin import io
+from reskin.errors import SchemaError
+
+VERIFIED = ".reskin/verified"  # what the last reruns reported, for a look and for `--against` elsewhere
+QUIET = {"MLFLOW_DISABLE_TELEMETRY": "true", "DVC_NO_ANALYTICS": "1", "OMP_NUM_THREADS": "1"}  # as the Makefile does
+
+
+def verify(root: Path, names: Sequence[str], against: Path | None, echo: Echo) -> int:
+    """Compare each scene's rerun, or its reports in `against`, with the last commit; return the exit status."""
+    committed = {name: read_revision(root, name, "HEAD") for name in names}  # first: hours later is late to find none
+    if against is None:
+        rerun(root, names)
+    return max(
+        tell(name, committed[name], read_folder(against or root / VERIFIED / name, name), echo) for name in names
+    )
+
+
+def rerun(root: Path, names: Sequence[str]) -> None:
+    """Run scenes in a clone of the last commit, and keep what they report."""
+    if changed := _git(root, "status", "--porcelain", "--untracked-files=no"):
+        say(f"warning: {len(changed.splitlines())} files differ from the last commit, which is what runs")
+    with tempfile.TemporaryDirectory(prefix="reskin-verify-", ignore_cleanup_errors=True) as temporary:
+        clone = Path(temporary) / "clone"
+        _git(root, "clone", "--quiet", ".", str(clone))
+        (clone / ".venv").symlink_to(sys.prefix)  # where run.sh looks first
+        _bring_recordings(root, clone, names)
+        environment = {**QUIET, **os.environ, "PYTHONPATH": str(clone)}
+        _run(clone, environment, "pipeline.cli", "scenes", "use", *names, quiet=True)
+        for name in names:
+            shutil.rmtree(clone / "reports" / name, ignore_errors=True)  # what does not run cannot pass
+        # Forced: no cache of this machine stands in for a stage. What only tells others of results is left out.
+        _run(clone, environment, "dvc", "repro", "--quiet", "--force", *(f"report@{name}" for name in names))
+        for name in names:
+            with io.replacing(root / VERIFIED / name) as folder:
+                shutil.copytree(clone / "reports" / name, folder)
+
+
+def _bring_recordings(root: Path, clone: Path, names: Sequence[str]) -> None:
+    """Copy the recordings of these scenes, which git does not hold."""
+    shutil.copy(root / REGISTRY, clone / REGISTRY)
+    for name in names:
+        if (root / RAW / name).is_dir() and any((root / RAW / name).glob("*.dvc")):
+            shutil.copytree(root / RAW / name, clone / RAW / name, dirs_exist_ok=True)
+
+
+def _run(clone: Path, environment: Mapping[str, str], *words: str, quiet: bool = False) -> None:
+    to = subprocess.DEVNULL if quiet else None
+    command = [sys.executable, "-m", *words]
+    with subprocess.Popen(command, cwd=clone, env=environment, stdout=to, process_group=0) as running:
+        try:
+            running.wait()
+        except BaseException:
+            os.killpg(running.pid, signal.SIGTERM)  # DVC's stages too: they would go on in a folder that is no more
+            raise
+    if running.returncode:
+        remedy = "See above: it fails in a clean copy of the last commit."
+        raise SchemaError(" ".join(words), "the rerun", "one that ends", f"exit status {running.returncode}", remedy)
+
+
+def _git(root: Path, *words: str) -> str:
+    done = subprocess.run(["git", *words], cwd=root, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SchemaError(
+            f"git {words[0]}", "the checkout", "one of git", done.stderr.strip()[-300:], "Clone the project."
+        )
+    return done.stdout

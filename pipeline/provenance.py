@@ -1,0 +1,180 @@
+"""Where a result came from: the checkout, the commit of the code, the machine, the cost in seconds. Knows no result."""
+
+import os
+import platform
+import resource
+import subprocess
+import sys
+from collections.abc import Iterable, Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from reskin import io
+from reskin.code import ROOT, files_of, meaning
+from reskin.numerics import departures
+
+EXPERIMENTS = (".dvc", "tmp", "exps")  # where DVC makes copies of a checkout for experiments, and deletes them
+PACKAGES = (ROOT / "pipeline", ROOT / "reskin")
+NO_CODE = ("plan.yaml", "scenes")  # settings, which stand beside the code: they decide results by their values
+COSTS = Path(".reskin/costs")
+SECONDS = Path(".reskin/seconds")  # what was timed here: beside the pipeline, as costs are
+COMPUTING = ("numpy", "scipy", "numba", "scikit-learn", "torch", "pandas")
+CPUINFO = Path("/proc/cpuinfo")  # Linux only
+INSTRUCTIONS = {"avx2": "AVX2", "avx512f": "AVX-512", "amx_tile": "AMX", "asimd": "NEON", "sve": "SVE"}  # by CPU flag
+
+
+def home() -> Path:
+    """Give the checkout, where caches lie: the working directory, or the one around a copy of DVC for an experiment."""
+    here = Path.cwd()
+    around = [parent for parent in here.parents if here.relative_to(parent).parts[:3] == EXPERIMENTS]
+    return around[-1] if around else Path()
+
+
+def is_experiment() -> bool:
+    return home() != Path()
+
+
+def code_version() -> str:
+    """The last commit that changed code of the two packages, `+dirty` if it was changed since, `unknown` outside git.
+
+    Not the checkout's HEAD: a later commit of results must not make equal results look different.
+    """
+    of_code = (*map(str, PACKAGES), *(f":(exclude){PACKAGES[0] / name}" for name in NO_CODE))
+    commit = _git("log", "-1", "--format=%h", "--abbrev=12", "--", *of_code)
+    if not commit:
+        return "unknown"
+    return commit + ("+dirty" if _git("status", "--porcelain", "--", *of_code) else "")
+
+
+def version_of(modules: Iterable[str]) -> str:
+    """The last commit that changed what these modules do; `+dirty` and `unknown` as for `code_version`.
+
+    Later commits that change other modules, comments or docstrings leave it as it is, so that equal code names the same
+    commit in every checkout with its history.
+    """
+    files = [str(file.relative_to(ROOT)) for name in modules for file in files_of(name)]
+    edited = _git("status", "--porcelain", "--", *files) and any(
+        _meaning("HEAD", file) != meaning(file, (ROOT / file).read_bytes().strip()) for file in files
+    )
+    for commit in _git("log", "--format=%H", "--", *files).splitlines():
+        words = ("diff-tree", "--root", "--no-commit-id", "--name-only", "--relative", "-r", commit)
+        names = _git(*words, "--", *files).splitlines()
+        if any(_meaning(f"{commit}^", name) != _meaning(commit, name) for name in names):
+            return commit[:12] + ("+dirty" if edited else "")
+    return "unknown"
+
+
+def _meaning(commit: str, file: str) -> bytes:
+    return meaning(file, _git("show", f"{commit}:./{file}").encode())
+
+
+def device() -> str:
+    """The machine in words: processor and instruction sets, cores that this process may use, Python."""
+    cores_n = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    cpuinfo = CPUINFO.read_text(encoding="utf-8", errors="replace") if CPUINFO.exists() else ""
+    named = processor(cpuinfo, os.environ, otherwise=platform.processor())
+    return f"cpu {platform.machine()} {named}, {cores_n} cores, Python {platform.python_version()}"
+
+
+def processor(cpuinfo: str, environ: Mapping[str, str], *, otherwise: str) -> str:
+    """The processor's model, the instruction sets that it offers, and what of `numerics` the user has set.
+
+    `cpuinfo` is Linux's /proc/cpuinfo; where it names no model, `otherwise` does.
+    """
+    lines = [line.partition(":") for line in cpuinfo.splitlines()]
+    values = {name.strip().lower(): value.strip() for name, _, value in reversed(lines)}  # the first processor's
+    flags = set(values.get("flags", values.get("features", "")).split())
+    model = values.get("model name") or otherwise or "unknown processor"
+    plain = " ".join(model.replace("(R)", "").replace("(TM)", "").split())
+    instructions = ", ".join(name for flag, name in INSTRUCTIONS.items() if flag in flags)
+    details = "; ".join(part for part in (instructions, ", ".join(departures(environ))) if part)
+    return f"{plain} ({details})" if details else plain
+
+
+def versions() -> dict[str, str]:
+    """The versions of the packages whose arithmetic decides results."""
+    return {name: version(name) for name in COMPUTING}
+
+
+def begin_cost(folder: Path, stage: str) -> None:
+    """Forget the trainings of a stage's last run, which begins anew."""
+    io.remove(_trainings_file(folder, stage))
+
+
+def note_trainings(folder: Path, stage: str, trained: Mapping[str, tuple[float, bool]], waited_s: float) -> None:
+    """Add trainings to those of a stage's run: by key the seconds when computed, and whether an earlier run did.
+
+    `waited_s` is what the stage waited for them.
+    """
+    before = _read_trainings(folder, stage)
+    reused = {key for key, (_, again) in trained.items() if again} - set(before["computed_s"])
+    io.write_json(
+        _trainings_file(folder, stage),
+        {
+            "waited_s": before["waited_s"] + waited_s,
+            "computed_s": before["computed_s"] | {key: seconds for key, (seconds, _) in trained.items()},
+            "reused": sorted({*before["reused"], *reused}),
+        },
+    )
+
+
+def note_cost(folder: Path, stage: str, seconds: float, settings: str | None = None) -> None:
+    """Keep what a stage cost beside the pipeline, never in an output: it differs between identical runs.
+
+    `settings` is a hash of the settings that it ran with.
+
+    A stage that does not run, or that DVC restores, keeps the cost that it had when it ran.
+    """
+    usages = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    unit = 1 if sys.platform == "darwin" else 1024  # bytes on macOS, KiB elsewhere
+    trained = _read_trainings(folder, stage)
+    computed_s = trained["computed_s"]
+    fresh_s = sum(seconds for key, seconds in computed_s.items() if key not in trained["reused"])
+    io.write_json(
+        folder / f"{stage}.json",
+        {
+            "seconds": round(seconds, 2),
+            "settings": settings,
+            # Side by side they took less than their sum; what else passed meanwhile, as imports, counts here.
+            "other_s": round(max(seconds - min(trained["waited_s"], fresh_s), 0.0), 2),
+            "trainings_s": computed_s,
+            "reused_n": len(trained["reused"]),
+            "cpu_s": round(sum(usage.ru_utime + usage.ru_stime for usage in usages), 2),  # imports too
+            "peak_process_memory_MB": round(max(usage.ru_maxrss for usage in usages) * unit / 1e6, 1),
+        },
+    )
+    io.remove(_trainings_file(folder, stage))
+
+
+def read_costs(folder: Path) -> dict[str, dict[str, Any]]:
+    """Read the costs of the stages that ran here, by stage; those of an older form tell nothing of trainings."""
+    costs = {file.stem: io.read_json(file) for file in sorted(folder.glob("*.json"))}
+    return {stage: cost for stage, cost in costs.items() if "trainings_s" in cost}
+
+
+def add_up_costs(costs: Iterable[Mapping[str, Any]]) -> float:
+    """Add what stages cost when they were computed, in seconds; a training that two of them share counts once.
+
+    Trainings are added as if one ran after another: where two run side by side, less time passes.
+    """
+    stages = list(costs)
+    trainings_s = {key: seconds for cost in stages for key, seconds in cost["trainings_s"].items()}
+    return float(sum(cost["other_s"] for cost in stages) + sum(trainings_s.values()))
+
+
+def _trainings_file(folder: Path, stage: str) -> Path:
+    return folder / "running" / f"{stage}.json"
+
+
+def _read_trainings(folder: Path, stage: str) -> dict[str, Any]:
+    file = _trainings_file(folder, stage)
+    return io.read_json(file) if file.exists() else {"waited_s": 0.0, "computed_s": {}, "reused": []}
+
+
+def _git(*words: str) -> str:
+    try:
+        done = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=False)
+    except OSError:
+        return ""  # no git on this machine: the version is reported as unknown
+    return done.stdout.strip() if done.returncode == 0 else ""

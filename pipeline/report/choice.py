@@ -1,0 +1,143 @@
+"""Which settings were best on the boards of a study? In: cards of its trainings. Out: the choice, and its candidates.
+
+By the mean squared error of places over the boards held out in turn; the paper's inputs only, as its method is what is
+set. How many steps there are is a scene's budget: every candidate is tried with the same budgets, and its errors are
+averaged over them, so that no setting wins by training longer. Settings with which a training collapsed are not
+chosen. Settings of adaptation are chosen together with the triplet weight of the network that they start from: alone,
+the triplet term only costs. Refuses to know who uses a choice.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from pipeline.report.statistics import over_folds, tidy
+from reskin.errors import ParamsError
+
+BY = "mse_xy_mm2"
+PAPER_INPUTS = "raw"
+VARIED = (
+    "steps_n", "batch_n", "rate_max", "gradient_norm_max", "weight_decay", "triplet_weight", "base",
+    "unlabelled_weight",
+)  # fmt: skip
+BUDGET = ("steps_n", "base")  # how long is a scene's budget; what a base is called is no setting
+WHERE = "choice of settings"
+
+Card = Mapping[str, Any]
+Cards = Sequence[Card]
+
+
+def choose(cards: Cards) -> dict[str, dict[str, Any]]:
+    """Choose for every stage: `recipe_name`, its settings, `by` which number, `candidates` with their scores.
+
+    An adaptation's `control` is what it must beat: fine-tuned as long from the same network, without the pokes.
+    """
+    by_paper = [card for card in cards if card["recipe"]["inputs"] == PAPER_INPUTS]
+    multi, triplet, tuned = ([card for card in by_paper if card["question"] == q] for q in ("lobo", "triplet", "adapt"))
+    dead = [trimmed(card["recipe"]) for card in triplet if _has_collapsed(card)]
+    with_pokes = [card for card in tuned if settings_of(card)["unlabelled_weight"] > 0]
+    eligible = [card for card in with_pokes if trimmed(card["recipe"]) not in dead]
+    _, chosen_multi, _ = _choose(multi, multi, "train_multi")
+    best, chosen_adapt, errors = _choose(tuned, eligible, "adapt")
+    chosen_adapt["error"] = errors[best["recipe_name"]]
+    without = _key(best) | {"unlabelled_weight": 0.0}
+    if control := [card["recipe_name"] for card in tuned if _key(card) == without]:
+        chosen_adapt["control"] = errors[control[0]]
+    chosen_triplet = {
+        "recipe_name": settings_of(best)["base"],
+        "settings": trimmed(best["recipe"]),
+        "by": "MSE_xy of the networks adapted from it",
+        "candidates": _candidates(triplet),
+    }
+    return {"train_multi": chosen_multi, "adapt": chosen_adapt, "train_triplet": chosen_triplet}
+
+
+def to_record(
+    chosen: Mapping[str, Mapping[str, Any]], cards: Cards, *, source: str, seed: int, physics: str
+) -> dict[str, Any]:
+    """Write down what was chosen on which boards and skins, for the audit of the scenes that use it.
+
+    `physics` is the fingerprint of the simulated skin that they were drawn of.
+    """
+    return {
+        "scene": cards[0]["scene"], "source": source, "seed": seed, "physics": physics,
+        "boards": sorted({board for card in cards for board in card["test_boards"]}),
+        "skins": sorted({skin for card in cards for skin in card["test_skins"]}),
+        "chosen": {stage: choice["settings"] for stage, choice in chosen.items()},
+    }  # fmt: skip
+
+
+def settings_of(card: Card) -> dict[str, Any]:
+    """Give what a training was set to: its recipe, or how it went on from one."""
+    settings: dict[str, Any] = card["tuning"]["settings"] if "tuning" in card else card["recipe"]
+    return settings
+
+
+def trimmed(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Leave out what is no setting of the method."""
+    return {name: value for name, value in settings.items() if name not in BUDGET}
+
+
+def _choose(cards: Cards, eligible: Cards, stage: str) -> tuple[Card, dict[str, Any], dict[str, float]]:
+    """Find a card of the eligible settings with the least error; give what is chosen by it, and errors by recipe."""
+    what = f"candidates of {stage}"
+    if not eligible:
+        raise ParamsError(WHERE, what, "one or more", "none", "Ask lobo, triplet, adapt.")
+    _check_budgets(cards, stage)
+    dead = [_key(card) for card in cards if _has_collapsed(card)]
+    sound = [card for card in eligible if _key(card) not in dead]
+    if not sound:
+        raise ParamsError(WHERE, what, "one or more without a collapsed training", "none", "Try lower rates.")
+    candidates = _candidates(cards)
+    errors = _errors(cards, candidates)
+    best = min(sound, key=lambda card: (errors[card["recipe_name"]], _budget(card)))
+    chosen = {"recipe_name": best["recipe_name"], "settings": trimmed(settings_of(best))}
+    return best, chosen | {"by": "MSE_xy, mean over all budgets of steps", "candidates": candidates}, errors
+
+
+def _has_collapsed(card: Card) -> bool:
+    return bool(card["collapsed"] or card["collapsed_before_n"])
+
+
+def _errors(cards: Cards, candidates: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Give by recipe the error's mean over its settings' budgets: recipes that differ in nothing else share it."""
+    settings = {card["recipe_name"]: (_key(card), _budget(card)) for card in cards}
+    errors = {candidate["recipe_name"]: candidate[BY]["mean"] for candidate in candidates}
+
+    def over_budgets(key: Mapping[str, Any]) -> float:
+        by_budget = {budget: errors[name] for name, (own, budget) in settings.items() if own == key}
+        return float(np.mean(list(by_budget.values())))  # equal candidates under two names count once
+
+    return {name: over_budgets(key) for name, (key, _) in settings.items()}
+
+
+def _check_budgets(cards: Cards, stage: str) -> None:
+    tried = {card["recipe_name"]: {_budget(alike) for alike in cards if _key(alike) == _key(card)} for card in cards}
+    every = set().union(*tried.values())
+    for name, budgets in tried.items():
+        if budgets != every:
+            what, got = f"steps of {stage}'s {name}", f"{sorted(budgets)} of {sorted(every)}"
+            remedy = "Try every candidate with every number of steps."
+            raise ParamsError(WHERE, what, "those of all candidates", got, remedy)
+
+
+def _key(card: Card) -> dict[str, Any]:
+    """Name settings without their budget; an adaptation's with those of the network that it starts from."""
+    return trimmed(card["recipe"]) | (trimmed(settings_of(card)) if "tuning" in card else {})
+
+
+def _budget(card: Card) -> tuple[int, int]:
+    return (card["recipe"]["steps_n"], card["tuning"]["settings"]["steps_n"] if "tuning" in card else 0)
+
+
+def _candidates(cards: Cards) -> list[dict[str, Any]]:
+    settings = {card["recipe_name"]: settings_of(card) for card in reversed(cards)}  # of the first card
+    return [
+        {
+            "recipe_name": name,
+            "settings": ", ".join(f"{key} {value}" for key, value in settings[name].items() if key in VARIED),
+            **over_folds(rows),
+        }
+        for name, rows in tidy(cards).groupby("recipe", sort=False)
+    ]

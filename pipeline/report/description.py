@@ -1,0 +1,127 @@
+"""What a skin's recordings look like: fields, noise, steps, forces. In: `Readings`. Out: numbers by name, units in it.
+
+The same numbers for simulated and recorded skins, so that they can stand side by side. Refuses to know who they are.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Bool, Float
+
+from pipeline.report.statistics import summarise
+from reskin.board.faults import find_lsb
+from reskin.data.baseline import rank, subtract
+from reskin.schema import AXES_PER_CHIP_N, Readings
+
+FORCES_N = (0.5, 1.0, 2.0, 3.0)  # at which changes of field are compared
+NEAR = 0.2  # of the force
+ENOUGH_N = 20  # readings, or a number is not given
+LAGS_N = (1, 10, 100, 1000)  # contacts from one no-load reading to another
+STEP_READINGS_N = 2000  # show the chips' steps
+PRESSED_N = 0.5  # below, a weak chip shows its noise
+
+
+def describe(readings: Readings) -> dict[str, float]:
+    """Describe one capture; what it does not hold, or hardly, is absent."""
+    # A row with a force but no place is no contact; one with neither is a contact that nobody labelled.
+    touched = ~(readings.Fz_N <= 0) & ~(np.isnan(readings.x_mm) & ~np.isnan(readings.Fz_N))
+    change_uT = subtract(readings.b_uT, readings.noload_uT).astype(np.float64)
+    return {
+        **_rest(readings.noload_uT),
+        **_wander(readings),
+        **_noise(readings, touched),
+        **_steps(readings),
+        **_rate(readings),
+        **_forces(readings.Fz_N[touched]),
+        **_changes(change_uT[touched], readings.Fz_N[touched]),
+    }
+
+
+def without_rest(described: Mapping[str, float]) -> dict[str, float]:
+    """Leave out the fields at rest and their changes: what a recorder subtracted before it wrote is not known."""
+    of_rest = ("field_at_rest", "rest_changes")
+    return {name: number for name, number in described.items() if not name.startswith(of_rest)}
+
+
+def over_skins(described: Sequence[tuple[str, Mapping[str, float]]]) -> dict[str, dict[str, float]]:
+    """Give mean, sd, least and most over skins of every quantity of (skin, description); a skin's captures averaged."""
+    rows = pd.DataFrame([numbers for _, numbers in described])
+    skins = rows.groupby([skin for skin, _ in described], sort=False).mean()
+    weak, strong = "change_at_1_N_uT", "change_at_3_N_uT"
+    if {weak, strong} <= set(skins):  # captures of one skin may each hold one force alone, so this is asked of the skin
+        skins["change_at_3_N_over_1_N"] = skins[strong] / skins[weak]
+    found = summarise(skins)
+    return {name: stat | {"least": float(skins[name].min()), "most": float(skins[name].max())}
+            for name, stat in found.items()}  # fmt: skip
+
+
+def _rest(noload_uT: Float[np.ndarray, "f ch"]) -> dict[str, float]:
+    b_uT = np.abs(np.median(noload_uT.astype(np.float64), axis=0)).reshape(-1, AXES_PER_CHIP_N)
+    return {
+        "field_at_rest_chip_median_uT": float(np.median(np.linalg.norm(b_uT, axis=1))),
+        "field_at_rest_channel_max_uT": float(b_uT.max()),
+    }
+
+
+def _wander(readings: Readings) -> dict[str, float]:
+    """Give by how much the field at rest differs between contacts so far apart, rms over channels and pairs.
+
+    A random walk grows as the root; what a contact leaves behind stands from the first on, and repeats with the scan.
+    """
+    _, first_i = np.unique(rank(readings.indentation), return_index=True)
+    rest_uT = readings.noload_uT[first_i].astype(np.float64)
+    lags = [lag_n for lag_n in LAGS_N if len(rest_uT) >= 2 * lag_n + ENOUGH_N]
+    return {
+        f"rest_changes_in_{lag_n}_uT": float(np.sqrt(((rest_uT[lag_n:] - rest_uT[:-lag_n]) ** 2).mean()))
+        for lag_n in lags
+    }
+
+
+def _noise(readings: Readings, touched: Bool[np.ndarray, " f"]) -> dict[str, float]:
+    # At one stop of one indentation nothing moves: what is left is noise. Pooled over stops.
+    stops = [part[touched] for part in (readings.indentation, readings.x_mm, readings.y_mm)]
+    by_stop = pd.DataFrame(readings.b_uT[touched].astype(np.float64)).groupby(stops, dropna=False, sort=False)
+    freedom_n = int(touched.sum()) - by_stop.ngroups
+    if freedom_n < ENOUGH_N:
+        return {}
+    left_uT = readings.b_uT[touched] - by_stop.transform("mean").to_numpy()
+    sd_uT = np.sqrt((left_uT**2).sum(axis=0) / freedom_n).reshape(-1, AXES_PER_CHIP_N)
+    return {"noise_xy_uT": float(np.median(sd_uT[:, :2])), "noise_z_uT": float(np.median(sd_uT[:, 2]))}
+
+
+def _steps(readings: Readings) -> dict[str, float]:
+    lsb_uT = find_lsb(readings.b_uT[:STEP_READINGS_N])
+    known = {"step_xy_uT": lsb_uT[:, 0], "step_z_uT": lsb_uT[:, 1]}
+    return {name: float(np.nanmedian(steps)) for name, steps in known.items() if np.isfinite(steps).any()}
+
+
+def _rate(readings: Readings) -> dict[str, float]:
+    """Give the rate at which readings of one stop followed each other, where a clock tells."""
+    between_s = np.diff(readings.t_s)[(np.diff(readings.indentation) == 0) & (np.diff(readings.reading_i) == 1)]
+    known_s = between_s[between_s > 0]  # NaN, no clock, is not
+    return {"rate_hz": float(1 / np.median(known_s))} if len(known_s) >= ENOUGH_N else {}
+
+
+def _forces(force_N: Float[np.ndarray, " f"]) -> dict[str, float]:
+    known_N = force_N[np.isfinite(force_N)]
+    if len(known_N) < ENOUGH_N:
+        return {}
+    return {"force_median_N": float(np.median(known_N)), "force_max_N": float(known_N.max())}
+
+
+def _changes(change_uT: Float[np.ndarray, "f ch"], force_N: Float[np.ndarray, " f"]) -> dict[str, float]:
+    size_uT = np.linalg.norm(change_uT, axis=1)
+    found = {}
+    for at_N in FORCES_N:
+        near = np.abs(force_N - at_N) <= NEAR * at_N
+        if near.sum() >= ENOUGH_N:
+            found[f"change_at_{at_N:g}_N_uT"] = float(np.median(size_uT[near]))
+    chips_uT = np.linalg.norm(
+        change_uT.reshape(len(change_uT), change_uT.shape[1] // AXES_PER_CHIP_N, AXES_PER_CHIP_N), axis=2
+    )
+    pressed = ~(force_N < PRESSED_N)
+    if pressed.sum() >= ENOUGH_N and chips_uT.shape[1] > 1:
+        ratio = chips_uT[pressed].min(axis=1) / chips_uT[pressed].max(axis=1)
+        found["weakest_over_strongest_chip"] = float(np.median(ratio))
+    return found

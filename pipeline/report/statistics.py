@@ -1,0 +1,387 @@
+"""The scores of learning: one tidy table, and its only statistics. In: cards, points of sweeps. Out: plain numbers.
+
+A row is one training on one skin, or on all skins that it was tested on. The unit of inference is the board: its skins
+share it and the network that never saw it. Refuses to know networks, files, and who claims what.
+"""
+
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+
+from reskin.errors import SchemaError
+from reskin.metrics import METRICS, TRUTH
+
+NAMES = ("question", "method", "recipe", "inputs", "architecture", "base", "fold", "board", "skin", "places")
+COUNTS = (
+    "seed", "labels_n", "pokes_n", "contacts_n", "trained_on_skins_n", "trained_on_rows_n", "rows_n",
+)  # fmt: skip
+KEYS = (*NAMES, *COUNTS)  # every other column is a metric
+SURENESS = ("coverage_pct", "half_width_mm")  # of 90 % intervals, where a method tells how sure it is
+ALL_SKINS = ""  # in column `skin`: all rows that a training was tested on
+AS_LABELLED, REGISTERED = "as_labelled", "registered"  # places: the latter after one offset a board, a diagnosis
+METHODS = {"triplet": "network + triplet", "adapt": "network, adapted"}  # of cards, by question
+CONFIDENCE = 0.95  # convention
+PERCENTAGES = ("accuracy_pct", "coverage_pct")  # between 0 and 100
+AT_MOST_1 = ("r2_f", "cosine_mean", "explained_median")
+ABOVE_ROUNDING = 12  # decimals of a difference in %, mm2 or N2: what lies below is of float sums
+BOARDS_MIN = 4  # from so many on there is an interval; of fewer, each board's value is given
+YES, NO, INCONCLUSIVE = "supported", "contradicted", "undecided"
+FEW_BOARDS = f"not judged (fewer than {BOARDS_MIN} boards)"
+VERDICTS = (
+    "Supported: the 95 % interval lies wholly on the claim's side of 0 or of the stated threshold. Contradicted: "
+    "wholly on the other side. Undecided: it includes 0 or the threshold. Not judged: fewer than "
+    f"{BOARDS_MIN} boards have no interval, and their own values are given. The interval is over boards (Student's t "
+    "of the boards' means; skins and networks of a board are averaged first), on a scale that keeps it in the possible "
+    "range: logit of accuracies, logarithm of squared errors, differences as they are. Folds share training boards, "
+    "which no interval knows."
+)
+
+Cards = Sequence[Mapping[str, Any]]
+Values = Sequence[float] | Float[np.ndarray, " n"] | pd.Series
+# mean, n; where n > 1 also sd; where n are boards, ci95: [low, high], or of few boards values: each board's own
+Stat = Mapping[str, Any]
+
+
+def tidy(cards: Cards, points: Mapping[str, Cards] | None = None) -> pd.DataFrame:
+    """Tabulate what cards of models and points of curves, by question, say of their scores.
+
+    Networks adapted to one skin each have a row for all skins of their fold too, by fold and seed.
+    """
+    keyed = [(_keys_of_card(card), card["scores"]) for card in cards]
+    keyed += [
+        (_keys_of_point(question, point), point["scores"]) for question, own in (points or {}).items() for point in own
+    ]
+    rows = [dict.fromkeys(NAMES, "") | row for keys, scores in keyed for row in _rows(keys, scores)]
+    alike: dict[Hashable, list[dict[str, Any]]] = {}  # for all skins: one training, or one for each skin
+    for row in (row for row in rows if row["skin"] == ALL_SKINS):
+        alike.setdefault(tuple(row.get(key) for key in KEYS if key != "rows_n"), []).append(row)
+    kept = [*map(_pool, alike.values()), *(row for row in rows if row["skin"] != ALL_SKINS)]
+    return pd.DataFrame(kept, columns=[*KEYS, *METRICS, *SURENESS]).astype(
+        dict.fromkeys((*COUNTS, *METRICS, *SURENESS), float)
+    )
+
+
+def to_csv(table: pd.DataFrame) -> str:
+    """Write the table with six significant digits, as numbers.json has."""
+    return table.convert_dtypes().to_csv(index=False, float_format="%.6g")
+
+
+def select(rows: pd.DataFrame, **words: str | float) -> pd.DataFrame:
+    """Keep the rows whose columns say these words."""
+    for column, word in words.items():
+        rows = rows[rows[column] == word]
+    return rows
+
+
+def whole(rows: pd.DataFrame, places: str = AS_LABELLED) -> pd.DataFrame:
+    """Keep a row a training: all skins that it was tested on."""
+    return select(rows, skin=ALL_SKINS, places=places)
+
+
+def by_skin(rows: pd.DataFrame) -> pd.DataFrame:
+    """Keep a row a training and skin."""
+    return rows[rows["skin"] != ALL_SKINS]
+
+
+def interval(values: Values, metric: str = "") -> list[float] | None:
+    """Give the two-sided 95 % interval of a mean by Student's t with n - 1 degrees of freedom; None below two values.
+
+    A metric with a bounded range has its interval on a scale without bounds, see `reached`.
+
+    >>> interval([1.0]) is None
+    True
+    >>> [round(float(end), 2) for end in interval([1.0, 3.0])]  # t is 12.71 with one degree of freedom
+    [-10.71, 14.71]
+    >>> [round(float(end), 1) for end in interval([60.0, 90.0, 99.0, 95.0], "accuracy_pct")]
+    [46.2, 97.8]
+    """
+    n = len(values)
+    if n < 2:
+        return None
+    return reached(float(np.mean(values)), float(np.std(values, ddof=1) / np.sqrt(n)), n - 1, metric)
+
+
+def reached(mean: float, se: float, freedom: float, metric: str = "") -> list[float]:
+    """Give the 95 % interval of a mean with this standard error, by Student's t, inside the metric's range.
+
+    Delta method: g(mean) +- t g'(mean) se, taken back by the inverse of g. g is the logit of a percentage, the
+    logarithm of a squared error, -log(1 - x) of what is 1 at most, and x itself of anything else.
+    """
+    from scipy.special import expit, logit, stdtrit  # late: only where there are intervals
+
+    reach = float(stdtrit(freedom, (1 + CONFIDENCE) / 2)) * se
+    if reach == 0:
+        return [mean, mean]
+    ends = np.array([-reach, reach])
+    if metric in PERCENTAGES:
+        share = mean / 100
+        return [float(end) for end in 100 * expit(logit(share) + ends / (100 * share * (1 - share)))]
+    if metric.startswith("mse_"):
+        return [float(end) for end in mean * np.exp(ends / mean)]
+    if metric in AT_MOST_1:
+        return [float(end) for end in 1 - (1 - mean) * np.exp(-ends / (1 - mean))]
+    return [float(end) for end in mean + ends]
+
+
+def p_value(mean: float, se: float, freedom: float) -> float:
+    """Give the two-sided p-value of a mean difference being 0, by Student's t."""
+    from scipy.special import stdtr
+
+    if se == 0:
+        return 1.0 if mean == 0 else 0.0
+    return float(2 * stdtr(freedom, -abs(mean) / se))
+
+
+def holm(p_values: Mapping[str, float]) -> dict[str, float]:
+    """Adjust the p-values of a family for their number (Holm 1979); each is compared with 0.05 as it is.
+
+    >>> holm({"a": 0.01, "b": 0.04, "c": 0.03})
+    {'a': 0.03, 'c': 0.06, 'b': 0.06}
+    """
+    adjusted, least = {}, 0.0
+    for i, name in enumerate(sorted(p_values, key=lambda one: p_values[one])):
+        least = max(least, min(1.0, (len(p_values) - i) * p_values[name]))
+        adjusted[name] = least
+    return adjusted
+
+
+def statistic(values: Values, *, boards: bool = False, metric: str = "") -> dict[str, Any]:
+    """Give mean and number, and of two values or more sd (n - 1).
+
+    Of `boards` also the interval `ci95`, or of fewer than `BOARDS_MIN` their `values`, in the order of the boards.
+    """
+    stat = {"mean": float(np.mean(values)), "n": len(values)}
+    if len(values) < 2:
+        return stat
+    stat["sd"] = float(np.std(values, ddof=1))
+    if not boards:
+        return stat
+    few = len(values) < BOARDS_MIN
+    return stat | ({"values": [float(one) for one in values]} if few else {"ci95": interval(values, metric)})
+
+
+def summarise(units: pd.DataFrame, *, boards: bool = False, differences: bool = False) -> dict[str, dict[str, Any]]:
+    """Summarise each column over the rows that have it; of `differences` no range is known."""
+    known = {str(name): units[name].dropna().to_numpy() for name in units}
+    return {
+        name: statistic(values, boards=boards, metric="" if differences else name)
+        for name, values in known.items()
+        if len(values)
+    }
+
+
+def over_units(rows: pd.DataFrame, *unit: str, boards: bool = False) -> dict[str, dict[str, Any]]:
+    """Summarise every metric over units, each the mean of its rows; `sd_seeds` is the mean sd within a unit.
+
+    Over several boards there is no `sd_seeds`.
+    """
+    groups = rows.groupby(list(unit))[_metrics(rows)]
+    summary = summarise(groups.mean(), boards=boards)
+    return with_seeds(summary, rows, *unit) if not boards or groups.ngroups == 1 else summary
+
+
+def with_seeds(summary: Mapping[str, Stat], rows: pd.DataFrame, *unit: str) -> dict[str, dict[str, Any]]:
+    """Add `sd_seeds` to each statistic: the standard deviation (n - 1) of the rows of a unit, mean over units.
+
+    The rows of a unit are networks that differ in their seed. A metric whose units have one row each is left as it is.
+    """
+    sds = rows.groupby(list(unit))[_metrics(rows)].std().mean().dropna()
+    return {
+        name: {**stat, "sd_seeds": float(sds[name])} if name in sds else dict(stat) for name, stat in summary.items()
+    }
+
+
+def over_folds(rows: pd.DataFrame) -> dict[str, dict[str, Any]]:
+    """Summarise trainings over folds, each the mean of its seeds."""
+    return over_units(whole(rows), "fold")
+
+
+def over_boards(rows: pd.DataFrame, places: str = AS_LABELLED) -> dict[str, dict[str, Any]]:
+    """Summarise trainings over held-out boards, each the mean of its trainings (seeds, draws of skins)."""
+    return over_units(whole(rows, places), "board", boards=True)
+
+
+def over_pairs(rows: pd.DataFrame) -> dict[str, dict[str, Any]]:
+    """Summarise pairs of a training and a test skin, as the paper does (3 x 9 pairs).
+
+    `ci95` is over training skins and test boards alike (`two_way`), `training_n` and `boards_n` how many there are.
+    """
+    own = by_skin(rows)
+    pairs, crossed = over_units(own, "fold", "skin"), own.groupby(["fold", "board"])[_metrics(own)].mean()
+    found = {}
+    for name, stat in pairs.items():
+        table = crossed[name].dropna().unstack()
+        error = two_way(table)
+        found[name] = stat | {"training_n": len(table), "boards_n": len(table.columns)}
+        if error is not None:
+            found[name]["ci95"] = reached(stat["mean"], *error, name)
+    return found
+
+
+def two_way(table: pd.DataFrame) -> tuple[float, float] | None:
+    """Give the standard error, and its degrees of freedom, of a mean over rows and columns that are both samples.
+
+    Training skins are rows, test boards columns; cells may be missing. The variance is that of row means over their
+    number plus that of column means over theirs, with Satterthwaite's degrees of freedom: a little too wide, as what is
+    left in single cells counts twice. None below two rows or `BOARDS_MIN` columns.
+    """
+    if len(table) < 2 or len(table.columns) < BOARDS_MIN:
+        return None
+    factors = [table.mean(axis=axis).to_numpy() for axis in (1, 0)]
+    parts = [float(means.var(ddof=1)) / len(means) for means in factors]
+    weight = sum(part**2 / (len(means) - 1) for part, means in zip(parts, factors, strict=True))
+    return sum(parts) ** 0.5, sum(parts) ** 2 / weight if weight else 1.0
+
+
+def board_means(rows: pd.DataFrame) -> pd.DataFrame:
+    """Average networks on each skin, then the skins of each board: a row a board."""
+    return _skin_means(rows).groupby("board").mean()
+
+
+def differences(of: pd.DataFrame, over: pd.DataFrame) -> pd.DataFrame:
+    """Subtract skin by skin, each side the mean of its networks there; a row a board, the mean of its skins."""
+    ours, theirs = _skin_means(of), _skin_means(over)
+    if not ours.index.equals(theirs.index):
+        raise _unpaired(sorted(ours.index.symmetric_difference(theirs.index)))
+    return (ours - theirs).groupby("board").mean()
+
+
+def with_boards(by_board: pd.DataFrame) -> dict[str, Any]:
+    """Summarise differences over boards, and give `by_board` each board's value; what is left of equal sides is 0.
+
+    Over `BOARDS_MIN` boards or more, `p` is the p-value of no difference, from `se` and `df` (degrees of freedom).
+    """
+    summary = summarise(by_board, boards=True, differences=True)
+    means = {name: stat | {"mean": round(stat["mean"], ABOVE_ROUNDING)} for name, stat in summary.items()}
+    for stat in means.values():
+        if "ci95" in stat:
+            stat |= _tested(stat["mean"], stat["sd"] / stat["n"] ** 0.5, stat["n"] - 1)
+    return {**means, "by_board": records(by_board)}
+
+
+def paired(of: pd.DataFrame, over: pd.DataFrame) -> dict[str, Any]:
+    """Compare two sides of equal skins: every metric's difference over boards, and `by_board`."""
+    return with_boards(differences(of, over))
+
+
+def paired_with_single(of: pd.DataFrame, single: pd.DataFrame) -> dict[str, Any]:
+    """Compare networks of many skins with networks of one skin each, where these were tested: as `paired`.
+
+    Both the boards and the single networks' training skins are samples: the interval and `p` are those of `two_way`.
+    """
+    theirs = single.groupby(["fold", "board", "skin"])[_metrics(single)].mean()
+    ours, skins = _skin_means(of), pd.MultiIndex.from_tuples([pair[1:] for pair in theirs.index])
+    if unpaired := sorted(set(skins) - set(ours.index)):
+        raise _unpaired(unpaired)
+    apart = (ours.loc[skins, theirs.columns].set_axis(theirs.index) - theirs).groupby(["fold", "board"]).mean()
+    found = with_boards(apart.groupby("board").mean())
+    for name in apart:
+        if name in found:
+            stat = {key: value for key, value in found[name].items() if key in ("mean", "sd", "n", "values")}
+            error = two_way(apart[name].dropna().unstack())
+            found[name] = stat if error is None else stat | _tested(stat["mean"], *error)
+    return found
+
+
+def _tested(mean: float, se: float, freedom: float) -> dict[str, Any]:
+    return {"ci95": reached(mean, se, freedom), "se": se, "df": freedom, "p": p_value(mean, se, freedom)}
+
+
+def _unpaired(skins: Sequence[Any]) -> SchemaError:
+    remedy = "Train both on the same folds."
+    return SchemaError("a paired difference", "held-out skins", "the same on both sides", skins, remedy)
+
+
+def records(rows: pd.DataFrame) -> dict[str, dict[str, float]]:
+    """Give known numbers by index and column."""
+    known = {str(index): row.dropna() for index, row in rows.iterrows()}
+    return {index: {str(name): float(value) for name, value in row.items()} for index, row in known.items()}
+
+
+def verdict(stat: Stat, *, above: float = 0.0) -> str:
+    """Judge whether a mean over boards is above a threshold, by its interval."""
+    if "ci95" not in stat:
+        return FEW_BOARDS
+    low, high = stat["ci95"]
+    return YES if low > above else NO if high < above else INCONCLUSIVE
+
+
+def verdict_within(stat: Stat, reach: float) -> str:
+    """Judge whether a mean over boards is nearer to 0 than `reach`, by its interval (equivalence)."""
+    if "ci95" not in stat:
+        return FEW_BOARDS
+    low, high = stat["ci95"]
+    if -reach < low and high < reach:
+        return YES
+    return NO if low > reach or high < -reach else INCONCLUSIVE
+
+
+def negated(stat: Stat) -> dict[str, Any]:
+    """Turn a difference round: of an error, less is a gain."""
+    turned = {**stat, "mean": -stat["mean"]}
+    turned |= {"values": [-one for one in stat["values"]]} if "values" in stat else {}
+    return turned | ({"ci95": [-end for end in reversed(stat["ci95"])]} if "ci95" in stat else {})
+
+
+def all_of(verdicts: Sequence[str]) -> str:
+    """Judge a claim of several parts: one no is enough to deny it, and only yes throughout affirms it."""
+    return next((word for word in (NO, FEW_BOARDS, INCONCLUSIVE) if word in verdicts), YES)
+
+
+def tally(trainings: Iterable[Mapping[str, Any]]) -> dict[str, int]:
+    """Count trainings: all, those that collapsed, and those of them that were kept as no other draw went better.
+
+    >>> tally([{"collapsed": False, "collapsed_before_n": 1}, {"collapsed": True, "collapsed_before_n": 2}])
+    {'trainings_n': 5, 'collapsed_n': 4, 'kept_collapsed_n': 1}
+    """
+    counted = [(training["collapsed"], training["collapsed_before_n"]) for training in trainings]
+    kept_n, before_n = sum(collapsed for collapsed, _ in counted), sum(before_n for _, before_n in counted)
+    return {"trainings_n": len(counted) + before_n, "collapsed_n": before_n + kept_n, "kept_collapsed_n": kept_n}
+
+
+def _metrics(rows: pd.DataFrame) -> list[str]:
+    return [str(name) for name in rows if name not in (*KEYS, *TRUTH)]
+
+
+def _skin_means(rows: pd.DataFrame) -> pd.DataFrame:
+    return rows.groupby(["board", "skin"])[_metrics(rows)].mean()
+
+
+def _keys_of_card(card: Mapping[str, Any]) -> dict[str, Any]:
+    keys = {key: card[key] for key in ("question", "fold")} | {"recipe": card["recipe_name"], "seed": card["seed_i"]}
+    keys |= {key: card["recipe"][key] for key in ("inputs", "architecture")}
+    keys |= {"method": METHODS.get(card["question"], "network"), "trained_on_skins_n": len(card["train_skins"])}
+    keys |= {"trained_on_rows_n": card["train_rows_n"]}
+    tuning = card.get("tuning")
+    return keys | ({"base": tuning["settings"]["base"], "pokes_n": tuning["pokes_n"]} if tuning else {})
+
+
+def _keys_of_point(question: str, point: Mapping[str, Any]) -> dict[str, Any]:
+    named = {"name": "recipe", "seed_i": "seed", "rows_n": "trained_on_rows_n"}
+    keys = {named.get(key, key): value for key, value in point.items()}
+    return {key: value for key, value in keys.items() if key in KEYS} | {"question": question}
+
+
+def _rows(keys: Mapping[str, Any], scores: Mapping[str, Any]) -> list[dict[str, Any]]:
+    boards = {*scores["board_of"].values()}
+    every = {**keys, "skin": ALL_SKINS, "board": boards.pop() if len(boards) == 1 else "", "rows_n": scores["rows_n"]}
+    rows = [every | {"places": AS_LABELLED} | scores["all"], every | {"places": REGISTERED} | scores["registered"]]
+    for skin, own in scores["by_skin"].items():
+        rows.append({**keys, "skin": skin, "board": scores["board_of"][skin], "places": AS_LABELLED, **own})
+    return rows
+
+
+def _pool(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Put the scores of one fold and seed together that were tested on a skin each, by their numbers of rows."""
+    rows_n = np.array([row["rows_n"] for row in rows])
+    known = [name for name in (*METRICS, *TRUTH) if all(name in row for row in rows)]
+    parts = {name: np.array([row[name] for row in rows]) for name in known}
+    scores = {name: float(np.average(values, weights=rows_n)) for name, values in parts.items()}
+    if "r2_f" in parts:
+        between_N2 = (parts["force_mean_N"] - scores["force_mean_N"]) ** 2
+        scores["force_var_N2"] += float(np.average(between_N2, weights=rows_n))
+        scores["r2_f"] = 1 - scores["mse_f_N2"] / scores["force_var_N2"]
+    return {**rows[0], **scores, "rows_n": int(rows_n.sum())}

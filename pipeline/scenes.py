@@ -1,0 +1,304 @@
+"""Scenes: the experiments that exist, and the legal values of `params.yaml` and of every scene."""
+
+from collections.abc import Iterable, Mapping, Set
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from types import ModuleType
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from reskin.config import Seeded, Settings, Strict, parse, read_yaml
+from reskin.data.rows import Selection
+from reskin.data.splits import Split
+from reskin.errors import ParamsError
+from reskin.models.recipe import FineTuning, Labelling, Name, Recipe, Schedule
+from reskin.recordings.fault_policy import Decisions
+
+MAIN_PROTOCOL = "grid"  # folds are drawn on its captures
+NOT_INGESTED = {"walk"}  # kinds of protocols whose captures are read as they are: an SD card knows no probe
+POOLED_BY = "adapt"  # takes pokes of the held-out skins, so a part of these is kept from every test
+# The rows of table 2 and who answers them; a scene that asks all of these questions has the table early.
+TABLE_2 = {"single": "transfer", "multi": "lobo", "triplet": "triplet", "adapted": "adapt"}
+RANDOM = ("random_test_fraction", "random_repeats_n")
+
+Kind = Literal["models", "curve", "other", "experiment", "study", "report"]
+
+
+@dataclass(frozen=True)
+class Question:
+    """One row: a question, the stage that answers it and the questions it goes on from.
+
+    `kind` tells what the answer is: models with cards, points of a curve, another file about learning, an experiment
+    with a folder of its own, a study of the physics, or words of the report. `protocol` is that of the captures it is
+    asked of; None: the main ones. `folds` are the keys of `split` that its folds are drawn with; None: it has no folds
+    of its own. `section`: the scene's file holds settings for it, named as the stage.
+    """
+
+    name: str
+    kind: Kind
+    stage: str = ""
+    needs: tuple[str, ...] = ()
+    protocol: str | None = None
+    folds: tuple[str, ...] | None = None
+    section: bool = False
+    recorded: bool = True  # a scene of recordings may ask it too
+    alone: bool = False  # a scene may ask it and nothing else: it needs no folds, and no places in mm
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "stage", self.stage or self.name)
+
+
+def _experiment(
+    name: str, protocol: str | None, *needs: str, section: bool = False, recorded: bool = False, alone: bool = False
+) -> Question:
+    return Question(name, "experiment", "", needs, protocol, section=section, recorded=recorded, alone=alone)
+
+
+def _study(name: str, *, section: bool = False) -> Question:
+    return Question(name, "study", section=section, recorded=False)
+
+
+ROWS = (
+    Question("single_random", "models", "train_single", folds=RANDOM, section=True),
+    Question("single_indentation", "models", "train_single", folds=RANDOM, section=True),
+    Question("single_pass", "models", "train_single", folds=RANDOM, section=True),
+    Question("single_temporal", "models", "train_single", folds=("temporal_test_fraction",), section=True),
+    Question("transfer", "models", "train_single", folds=("transfer_skins_n",), section=True),
+    Question("lobo", "models", "train_multi", folds=(), section=True),
+    Question("triplet", "models", "train_triplet", needs=("lobo",), section=True),
+    Question("adapt", "models", needs=("triplet",), section=True),
+    Question("pokes", "curve", "sweep_pokes", needs=("adapt",), section=True),
+    Question("sensors", "curve", "sweep_sensors", needs=("adapt",), folds=("sensors_skins_n", "sensors_draws_n")),
+    Question("baselines", "curve", "train_classical", needs=("lobo",), section=True),
+    Question("labels", "curve", "few_labels", needs=("lobo",), folds=("labels_pool_n", "labels_draws_n"), section=True),
+    Question("universal", "curve", needs=("labels", "compare"), section=True),
+    Question("audit", "other", needs=("lobo",), section=True),
+    Question("choice", "report", "report", needs=("lobo", "triplet", "adapt")),
+    _experiment("bound", None, "single_pass"),
+    _experiment("population", None, "adapt", section=True),
+    _experiment("drift", "wear", section=True, recorded=True),
+    _experiment("variation", "wear", section=True),
+    _experiment("shear", "drag", section=True),
+    _experiment("manual", "hand", "adapt"),
+    _experiment("flexible", "flexible", "adapt"),
+    _experiment("sleeve", "sleeve", section=True),
+    _experiment("sensitivity", "glass"),
+    _experiment("logs", "log", "lobo"),
+    _experiment("compare", None, section=True, recorded=True),
+    _experiment("rivals", None, "universal", section=True, recorded=True),
+    _experiment("contacts", None, "lobo", section=True, recorded=True),
+    _experiment("touches", None, section=True, recorded=True, alone=True),
+    _experiment("ambient", None, "lobo", section=True),
+    _experiment("dynamics", "press", "lobo"),
+    _experiment("worlds", None, "transfer", "adapt", section=True),
+    _experiment("gripper", "grip", "lobo", section=True),
+    _study("verification"),
+    _study("stability"),
+    _study("runtime", section=True),
+    _study("left_out"),
+)
+QUESTIONS: Mapping[str, Question] = {row.name: row for row in ROWS}
+
+
+def stages(names: Iterable[str], *kinds: Kind) -> list[str]:
+    """Name the stages that answer questions of some kinds, in the order of the table; each once."""
+    chosen = set(names)
+    return list(dict.fromkeys(row.stage for row in ROWS if row.name in chosen and row.kind in kinds))
+
+
+LEARNING: tuple[Kind, ...] = ("models", "curve", "other")
+EXPERIMENTS = tuple(row.name for row in ROWS if row.kind == "experiment")
+SECTIONS = tuple(dict.fromkeys(row.stage for row in ROWS if row.section))
+
+
+SHARED_ROWS: dict[str, type[Schedule]] = {"recipes": Recipe, "adaptations": FineTuning, "labellings": Labelling}
+STEPS = "How many steps is a scene's budget: write them in its sections."
+Section = dict[str, Any]  # checked by the stage that reads it
+Source = Literal["simulated", "recorded"]
+
+
+class OnBoards(Strict, extra="allow"):
+    """A protocol, as far as the plan needs it: its kind, its kind of boards, its terms of physics."""
+
+    kind: str
+    boards: str
+    terms: tuple[str, ...]
+
+
+class Simulation(Strict):
+    """Section `simulate`; the rest is checked by `synthesis`, so that only its stages depend on physics."""
+
+    boards: dict[str, Section]
+    protocols: Annotated[dict[str, OnBoards], Field(min_length=1)]
+
+
+class Asking(Strict, extra="ignore"):
+    """The two settings of a scene that say which stages it has."""
+
+    source: Source
+    questions: Annotated[tuple[Literal[tuple(QUESTIONS)], ...], Field(min_length=1)]  # type: ignore[valid-type]
+
+    @property
+    def rows(self) -> list[Question]:
+        """The rows of the table of questions that the scene asks, in the order that it asks them."""
+        return [QUESTIONS[name] for name in self.questions]
+
+    @property
+    def experiments(self) -> tuple[str, ...]:
+        return tuple(row.name for row in self.rows if row.kind == "experiment")
+
+    @property
+    def studied(self) -> tuple[str, ...]:
+        return tuple(row.name for row in self.rows if row.kind == "study")
+
+    @property
+    def with_folds(self) -> tuple[str, ...]:
+        return tuple(row.name for row in self.rows if row.folds is not None)
+
+    @property
+    def modelled(self) -> list[str]:
+        """The stages that leave models, with cards and predictions."""
+        return stages(self.questions, "models")
+
+    @property
+    def curves(self) -> dict[str, str]:
+        """The questions whose answers are points of a curve, and the stage that finds them."""
+        return {row.name: row.stage for row in ROWS if row.kind == "curve" and row.name in self.questions}
+
+    @property
+    def protocols(self) -> set[str]:
+        """The protocols that a simulated scene needs for its questions."""
+        return {MAIN_PROTOCOL} | {row.protocol for row in self.rows if row.protocol is not None}
+
+    @property
+    def described(self) -> str:
+        """The name of the description of a scene's captures."""
+        return "recorded" if self.source == "recorded" else MAIN_PROTOCOL
+
+    def runs(self, unit: str) -> bool:
+        """Tell whether a stage still runs for the scene, named as its cost is: `drift`, `simulate-wear`."""
+        stage, _, part = unit.partition("-")
+        if stage in {row.stage for row in ROWS if row.kind != "report"}:
+            return stage in {row.stage for row in self.rows}
+        return not part or self.source == "recorded" or part in self.protocols
+
+
+class Scene(Asking, Seeded, extra="allow"):
+    """One named set-up: its captures (or how to simulate them), the questions it asks, and a section for each."""
+
+    selection: Selection
+    split: Split
+    simulate: Simulation | None = None
+
+    @model_validator(mode="after")
+    def _sections_follow_questions(self) -> "Scene":
+        if (self.simulate is not None) != (self.source == "simulated"):
+            raise ValueError("section simulate stands in a scene if and only if its source is simulated")
+        for row in self.rows:
+            if lacking := set(row.needs) - set(self.questions):
+                raise ValueError(f"a scene that asks {row.name} also asks {sorted(lacking)}, on which it goes on")
+        keys = {key for row in self.rows for key in row.folds or ()}
+        keys |= {"pool_passes_n"} if POOLED_BY in self.questions else set()
+        sections = {row.stage for row in self.rows if row.section}
+        wrong = [
+            *_differ("the scene", set(self.model_extra or ()), sections),
+            *_differ("split", self.split.model_fields_set, keys),
+            *(_differ("simulate.protocols", set(self.simulate.protocols), self.protocols) if self.simulate else ()),
+        ]
+        if wrong:
+            raise ValueError(f"a scene holds exactly what its questions need; {'; '.join(wrong)}")
+        return self
+
+    @model_validator(mode="after")
+    def _questions_fit_the_source(self) -> "Scene":
+        if not self.with_folds and not any(row.alone for row in self.rows):
+            with_folds = sorted(row.name for row in ROWS if row.folds is not None or row.alone)
+            raise ValueError(f"questions holds at least one of {with_folds}")
+        if self.simulate is None:
+            if self.studied:
+                raise ValueError(f"questions {list(self.studied)} are about physics: only a simulated scene asks them")
+            if beyond := sorted(row.name for row in self.rows if not row.recorded):
+                raise ValueError(f"questions {beyond} are asked of simulated scenes only, so far")
+        return self
+
+
+def _differ(place: str, have: Set[str], want: Set[str]) -> list[str]:
+    lacks = [f"{place} lacks {', '.join(sorted(want - have))}"] if want - have else []
+    extra = [f"of {place} nothing asks {', '.join(sorted(have - want))}"] if have - want else []
+    return lacks + extra
+
+
+class Shared(Strict):
+    """`params.yaml`: what scenes share, by name."""
+
+    lost_fraction_max: Annotated[float, Field(ge=0, le=1)]
+    faults: Decisions
+    recipes: dict[Name, Section]
+    adaptations: dict[Name, Section]
+    labellings: dict[Name, Section]
+    methods: dict[Name, dict[Name, Section]]
+    skin: Section
+    rig: Section
+    chip: Section
+    spreads: Section
+    terms: dict[str, Section]
+
+
+class Plan(Strict):
+    """`pipeline/plan.yaml`: what each scene that runs asks, and by stage and key what each stage of dvc.yaml takes."""
+
+    scenes: dict[str, tuple[str, ...]]
+    stages: dict[str, dict[str, dict[str, Any]]]
+
+
+def read_scene(path: Path, params: Path) -> Scene:
+    """Read and check `pipeline/scenes/<name>.yaml`, with the rows of `params.yaml` that it names."""
+    return check_scene(path.stem, str(path), read_yaml(path), read_shared(params))
+
+
+def check_scene(name: str, where: str, words: dict[str, Any], shared: dict[str, Any]) -> Scene:
+    """Check a scene, and every section as the stage that reads it does."""
+    scene, settings = parse_scene(words, where), Settings(name, where, words, shared, {})
+    for stage in dict.fromkeys(["split", *(row.stage for row in scene.rows if row.kind != "report")]):
+        if read := getattr(module_of(stage), "read", None):
+            read(settings)
+    if scene.simulate is not None:
+        from reskin.simulation.settings import check_synthesis  # the physics, for a simulated scene only
+
+        check_synthesis(settings)
+    return scene
+
+
+def parse_scene(words: dict[str, Any], where: str) -> Scene:
+    """Check a scene's questions, and that it has the sections for them; their stages check what stands in these."""
+    for name, value in words.items():
+        if name not in {*Scene.model_fields, *SECTIONS}:
+            raise ParamsError(where, name, "a known parameter", repr(value)[:80], "Mend it there.")
+        if name in SECTIONS and not isinstance(value, dict):
+            raise ParamsError(where, name, "a valid dictionary", repr(value)[:80], "Mend it there.")
+    return parse(Scene, words, where)
+
+
+def module_of(stage: str) -> ModuleType:
+    """Import the module of a stage: `experiments.<stage>.run`, or `stages.<stage>`."""
+    experiment = f"pipeline.experiments.{stage}"
+    return import_module(f"{experiment}.run" if find_spec(experiment) else f"pipeline.stages.{stage}")
+
+
+def read_shared(path: Path) -> dict[str, Any]:
+    """Read and check `params.yaml`, as it is written."""
+    words: dict[str, Any] = read_yaml(path)
+    shared = parse(Shared, words, str(path))
+    for section, model in SHARED_ROWS.items():
+        for name, row in getattr(shared, section).items():
+            if "steps_n" in row:
+                raise ParamsError(f"{path}: {section}", name, "without steps_n", "one", STEPS)
+            parse(model, row | {"steps_n": 1}, f"{path}: {section}.{name}")
+    return words
+
+
+def read_plan(path: Path) -> Plan:
+    return parse(Plan, read_yaml(path), str(path))

@@ -1,0 +1,181 @@
+"""Question labels: what a few labels of a new board are worth. In: rows, folds, settings. Out: what to run.
+
+Networks are trained, adapted by unlabelled pokes, and fine-tuned on labelled ones; classical methods are fitted with
+them. Refuses to know how they are run and scored.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Int64
+from pydantic import Field, model_validator
+
+from reskin.config import Settings, Strict, parse
+from reskin.data.lines import grid_lines
+from reskin.data.rows import Rows
+from reskin.data.splits import Fold
+from reskin.errors import ParamsError
+from reskin.models import trial as trials
+from reskin.models.classical import Classical, Task
+from reskin.models.recipe import AugmentedRecipe, FineTuning, Labelling, Name, Recipe, Steps, Variants
+from reskin.models.trial import Adapting, Start, Trained, Trial
+from reskin.seeds import rng_for
+
+QUESTION = "labels"
+Labels = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
+
+
+class FewLabels(Strict):
+    """Section few_labels: networks and classical methods with so many labelled pokes of the held-out board.
+
+    `adapted` names the recipes that are also adapted by their unlabelled pokes, as `adapting` says.
+    """
+
+    labels_n: Labels
+    recipes: dict[Name, Recipe | AugmentedRecipe]
+    adapted: tuple[Name, ...]
+    adapting: FineTuning
+    labelling: Labelling
+    rows_max_n: Annotated[int, Field(ge=1)]
+    methods: dict[Name, Classical]
+
+    @model_validator(mode="after")
+    def _adapts_what_it_trains(self) -> "FewLabels":
+        if unknown := set(self.adapted) - set(self.recipes):
+            raise ValueError(f"adapted names recipes of few_labels, not {sorted(unknown)}")
+        return self
+
+
+class AdaptingRow(Strict):
+    """A shared adaptation, so many steps of it."""
+
+    adaptation: Name
+    steps_n: Steps
+
+
+class LabellingRow(Strict):
+    """A shared labelling, so many steps of it."""
+
+    labelling: Name
+    steps_n: Steps
+
+
+class FewLabelsRow(Strict):
+    """Section few_labels as a scene writes it: `recipes` say what each does differently from the shared `recipe`."""
+
+    labels_n: Labels
+    recipe: Name
+    steps_n: Steps
+    recipes: Variants
+    adapted: tuple[Name, ...]
+    adapting: AdaptingRow
+    labelling: LabellingRow
+    rows_max_n: Steps
+    methods: Name
+
+
+@dataclass(frozen=True)
+class Study:
+    """Rows, the folds of the question, the scene's seed, and the settings."""
+
+    rows: Rows
+    folds: Sequence[Fold]
+    seed: int
+    settings: FewLabels
+
+
+@dataclass(frozen=True)
+class Tried:
+    """One entry of the table: a method on a fold with so many labels."""
+
+    method: str
+    inputs: str
+    labels_n: int
+    fold: Fold
+
+
+Done = tuple[Tried, Trial, Trained]
+
+
+def few_labels(settings: Settings) -> FewLabels:
+    """Read section few_labels, with the rows that it names."""
+    section, where = settings.words("few_labels"), f"{settings.where}: few_labels"
+    row = parse(FewLabelsRow, section, where)
+    base = settings.row("recipes", row.recipe) | {"steps_n": row.steps_n}
+    full = {name: section[name] for name in ("labels_n", "adapted", "rows_max_n")}
+    full["recipes"] = {name: base | changes for name, changes in row.recipes.items()}
+    full["adapting"] = settings.row("adaptations", row.adapting.adaptation) | {"steps_n": row.adapting.steps_n}
+    full["labelling"] = settings.row("labellings", row.labelling.labelling) | {"steps_n": row.labelling.steps_n}
+    return parse(FewLabels, full | {"methods": settings.row("methods", row.methods)}, where)
+
+
+def networks(study: Study, done: Sequence[Done]) -> list[tuple[Tried, Trial]]:
+    """Train every recipe on every fold."""
+    return [
+        (
+            Tried(name, recipe.inputs, 0, fold),
+            Trial(QUESTION, name, recipe, fold.name, study.seed, 0, fold.train, fold.test),
+        )
+        for fold in study.folds
+        for name, recipe in study.settings.recipes.items()
+    ]
+
+
+def adapted(study: Study, done: Sequence[Done]) -> list[tuple[Tried, Trial]]:
+    """Adapt the named recipes by all pokes of the pool, unlabelled."""
+    pairs = []
+    for tried, trial, trained in done:
+        if trial.recipe_name in study.settings.adapted:
+            lines = grid_lines(study.rows, tried.fold.pool)
+            tuning = Adapting(_start(trained), study.settings.adapting, lines)
+            pair = Tried(f"{tried.method}, adapted", tried.inputs, 0, tried.fold)
+            pairs.append((pair, _tuned(trial, tuning, "adapted")))
+    return pairs
+
+
+def labelled(study: Study, done: Sequence[Done]) -> list[tuple[Tried, Trial]]:
+    """Fine-tune every network on every number of labelled pokes."""
+    pairs = []
+    for tried, trial, trained in done:
+        for labels_n, row in _labelled_rows(study, tried.fold).items():
+            if labels_n:
+                tuning = trials.FewLabels(_start(trained), study.settings.labelling, row)
+                pair = Tried(tried.method, tried.inputs, labels_n, tried.fold)
+                pairs.append((pair, _tuned(trial, tuning, f"{trial.what}{labels_n}labels")))
+    return pairs
+
+
+def classical(study: Study) -> list[tuple[Tried, Task]]:
+    """Fit every classical method with every number of labelled pokes."""
+    most_n = study.settings.rows_max_n
+    return [
+        (
+            Tried(method.title, method.inputs, labels_n, fold),
+            Task(f"{name}.{fold.name}.{labels_n}", method, fold.train, fold.test, row, most_n, study.seed),
+        )
+        for fold in study.folds
+        for name, method in study.settings.methods.items()
+        for labels_n, row in _labelled_rows(study, fold).items()
+    ]
+
+
+def _labelled_rows(study: Study, fold: Fold) -> Mapping[int, Int64[np.ndarray, " o"]]:
+    """Choose the labelled pokes of the pool at random, the fewer among the more; give their rows."""
+    indentation, labels_n = study.rows.indentation[fold.pool], study.settings.labels_n
+    indentations = np.unique(indentation)
+    if max(labels_n) > len(indentations):
+        rule = f"at most the {len(indentations)} pokes of its pool"
+        remedy = "Ask for fewer, or raise split.labels_pool_n."
+        raise ParamsError(f"fold labels/{fold.name}", "few_labels.labels_n", rule, max(labels_n), remedy)
+    order = rng_for(study.seed, "labelled", fold.name).permutation(indentations)
+    return {n: fold.pool[np.isin(indentation, order[:n])] for n in labels_n}
+
+
+def _start(trained: Trained) -> Start:
+    return Start(trained.key, trained.weights, trained.scaler)
+
+
+def _tuned(trial: Trial, tuning: Adapting | trials.FewLabels, what: str) -> Trial:
+    return replace(trial, tuning=tuning, skin=trial.fold.rsplit("-draw", 1)[0], what=what)

@@ -1,0 +1,116 @@
+"""Networks before and after they are adapted to a skin: their answers on its rows by arm, and scores over boards.
+
+An arm is one way to treat the same networks: left as they were, adapted, adapted without the skin's pokes, ...
+Refuses to know pokes and files.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+
+from pipeline.report import statistics
+from pipeline.training.trainings import SceneData, Starts, collapse_record, note_seconds, own_starts, train_all
+from reskin.data.splits import Fold
+from reskin.metrics import METRICS, score
+from reskin.models.inputs import VIEW
+from reskin.models.recipe import Adaptation, training
+from reskin.models.trial import Trial
+from reskin.numerics import device
+
+FORCE = 2  # column
+BEFORE, AFTER, CONTROL = "before", "after", "control"  # arms: as it was, adapted, as long without the skin's pokes
+Judge = Callable[[np.ndarray, np.ndarray], dict[str, float]]  # of true and predicted x_mm, y_mm, F_N
+
+
+@dataclass(frozen=True)
+class Answered:
+    """What one network answers on one skin's tested rows, axes x_mm, y_mm, F_N."""
+
+    arm: str
+    board: str
+    skin: str
+    seed_i: int
+    true: Float[np.ndarray, "b 3"]
+    predicted: Float[np.ndarray, "b 3"]
+
+
+def answers_before(data: SceneData, fold: Fold, settings: Adaptation, starts: Starts, skin: str) -> Iterator[Answered]:
+    """Answer on a skin's tested rows as the networks do before they are adapted."""
+    from reskin.models.network import Predictor  # torch, late: only a stage that answers pays for it
+
+    recipe = training(data.settings, "train_triplet").recipes[settings.base]
+    test = fold.test[data.rows.skin[fold.test] == skin]
+    view = VIEW[recipe.inputs](data.rows.db_uT[test])
+    for seed_i, start in own_starts(starts, settings.base, fold).items():
+        predict = Predictor(start.weights, recipe.architecture, device())
+        predicted = start.scaler.decode(predict(start.scaler.encode(view)))
+        yield Answered(BEFORE, str(data.rows.board[test[0]]), skin, seed_i, data.rows.target[test], predicted)
+
+
+def answers_after(
+    data: SceneData, trials: Sequence[tuple[str, Trial]], stage: str
+) -> tuple[list[Answered], dict[str, int]]:
+    """Adapt by (arm, trial), and answer on each trial's tested rows; count what collapsed."""
+    adapted = [trial for _, trial in trials]
+    trained = train_all(data, adapted, stage)
+    note_seconds(data.scene, stage, adapted, trained)
+    answered = []
+    for (arm, trial), done in zip(trials, trained, strict=True):
+        board, true = str(data.rows.board[trial.test[0]]), data.rows.target[trial.test]
+        answered.append(Answered(arm, board, trial.skin, trial.seed_i, true, done.predicted))
+    return answered, statistics.tally(map(collapse_record, trained))
+
+
+def bias(true: Float[np.ndarray, "b 3"], predicted: Float[np.ndarray, "b 3"]) -> dict[str, float]:
+    """By how much force is over-estimated, in newtons and as a part of the mean force; negative is too little."""
+    true_N = true[:, FORCE].astype(float)
+    over_N = float((predicted[:, FORCE].astype(float) - true_N).mean())
+    return {"bias_f_N": over_N, "bias_f_pct": 100 * over_N / float(true_N.mean())}
+
+
+def summarise_arms(answers: Sequence[Answered], judge: Judge = score) -> dict[str, dict[str, Any]]:
+    """Summarise every metric over boards, each the mean of its skins, each of these of its seeds; by arm.
+
+    `sd_seeds` is the standard deviation over the networks of one skin, mean over skins.
+    """
+    arms = _tidy(answers, judge).groupby("method", sort=False)
+    return {
+        str(arm): statistics.with_seeds(
+            statistics.summarise(statistics.board_means(rows), boards=True), rows, "board", "skin"
+        )
+        for arm, rows in arms
+    }
+
+
+def biases(answers: Sequence[Answered]) -> dict[str, dict[str, Any]]:
+    """Both ways to say the force bias, each by arm, over boards."""
+    by_arm = summarise_arms(answers, bias)
+    return {name: {arm: found[name] for arm, found in by_arm.items()} for name in ("bias_f_N", "bias_f_pct")}
+
+
+def compare_arms(answers: Sequence[Answered], of: str, over: str) -> dict[str, Any]:
+    """Compare two arms skin by skin, `of` less `over`: over boards, and `by_board`.
+
+    `sd_seeds` is that of the differences: networks of equal seeds started from the same weights.
+    """
+    rows = _tidy(answers, score)
+    sides = [statistics.select(rows, method=arm) for arm in (of, over)]
+    compared = statistics.paired(*sides)
+    network = ["board", "skin", "seed"]
+    metrics = [name for name in METRICS if name in rows]
+    each = sides[0].set_index(network)[metrics] - sides[1].set_index(network)[metrics]
+    by_board = compared.pop("by_board")
+    return statistics.with_seeds(compared, each, "board", "skin") | {"by_board": by_board}
+
+
+def _tidy(answers: Sequence[Answered], judge: Judge) -> pd.DataFrame:
+    rows = (
+        {"method": answer.arm, "board": answer.board, "skin": answer.skin, "seed": answer.seed_i}
+        | judge(answer.true, answer.predicted)
+        for answer in answers
+    )
+    return pd.DataFrame(rows)

@@ -1,0 +1,1 @@
+"""Boards: bytes on the wire, ports and faulty readings."""

@@ -1,0 +1,52 @@
+"""Decode a dump of a serial port to a table with one row for each frame, and encode a table as frames."""
+
+import numpy as np
+import pyarrow as pa
+from jaxtyping import Float32, Float64
+
+from reskin.board.stream import decode_all
+from reskin.board.wire import record_type
+from reskin.errors import CaptureError
+from reskin.recordings import clocks
+from reskin.recordings.header import Wire
+
+
+def decode_dump(data: bytes, wire: Wire, chips_n: int, where: str) -> tuple[pa.Table, dict[str, int]]:
+    """Decode a dump; raise `CaptureError` if there is not one frame in it. Units stand in the fields' metadata."""
+    frames, account = decode_all(data, wire, chips_n, where)
+    values = [*frames.b_uT.T, *frames.temperature_degC.T, frames.device_s, frames.end_byte]
+    fields = [
+        pa.field(name, pa.from_numpy_dtype(column.dtype), metadata={"unit": unit})
+        for (name, unit), column in zip(_columns(chips_n).items(), values, strict=True)
+    ]
+    arrays = [pa.array(np.ascontiguousarray(column)) for column in values]
+    return pa.Table.from_arrays(arrays, schema=pa.schema(fields)), account
+
+
+def read_frames(
+    table: pa.Table, rate_hz: float, where: str
+) -> tuple[Float64[np.ndarray, " f"], Float32[np.ndarray, "f ch"], Float32[np.ndarray, "f k"]]:
+    """Give time in s, field in uT and temperature in degC of the frames of a decoded dump.
+
+    Time is the device's where all frames have it, else that of a constant rate; lost bytes then keep their time, if
+    frames have one length.
+    """
+    chips_n = sum(name.startswith("temperature") for name in table.column_names)
+    if table.column_names != list(_columns(chips_n)):
+        remedy = "Decode the dump again: reskin decode."
+        raise CaptureError(where, "columns", "those of reskin decode", ", ".join(table.column_names)[:80], remedy)
+    values = [np.asarray(column) for column in table.columns]
+    device_s, end_byte = values[-2:]
+    if np.isfinite(device_s).all():
+        t_s = device_s.astype(np.float64)
+    else:
+        frame_bytes_n = record_type("binary", chips_n).itemsize  # a line of text is longer
+        is_binary = (np.diff(end_byte, prepend=0) == frame_bytes_n).any()
+        t_s = clocks.constant_rate(end_byte / frame_bytes_n if is_binary else 1.0 + np.arange(len(table)), rate_hz)
+    return t_s, np.stack(values[: 3 * chips_n], axis=1), np.stack(values[3 * chips_n : -2], axis=1)
+
+
+def _columns(chips_n: int) -> dict[str, str]:
+    """Name the columns of a decoded dump, and the unit of each."""
+    names = {f"b{axis}{chip}_uT": "uT" for chip in range(chips_n) for axis in "xyz"}
+    return names | {f"temperature{chip}_degC": "degC" for chip in range(chips_n)} | {"device_s": "s", "end_byte": "1"}

@@ -1,0 +1,237 @@
+"""Detect faulty readings: out of range, stuck, jumped, repeated, exchanged or failed chips, and impossible times.
+
+Masks of frames and flags of chips, for files as a whole and block by block.
+"""
+
+import numpy as np
+from jaxtyping import Bool, Float, Float64, Int
+
+from reskin.board.stream import TEMPERATURE_MAX_degC, TEMPERATURE_MIN_degC
+
+# What the ReSkin firmware sends for a chip whose I2C read failed; seen in INI's recording AFG_flex_50.
+FAILED_B_uT = (8028.16, 5194.00, 12943.36)
+FAILED_TEMPERATURE_degC = -880.49
+FAILED_TOLERANCE = 0.01  # text wires round to two decimals
+
+# The grid of a chip back at its power-on settings; seen in INI's recordings AFG_test_new_board15 and piezo.
+RESET_LSB_XY_uT = 0.98
+RESET_LSB_Z_uT = 1.58
+LSB_TOLERANCE = 0.1  # gains of the MLX90393 are a fifth or more apart (data sheet, table 17)
+
+# A grid shows when neighbouring values often lie one step apart: 5 % or more of all gaps in the first 200 frames of 14
+# real recordings are one step. Values without a grid have one smallest gap, and by chance one or two close to it.
+STEP_SHARE_MIN = 0.04
+STEPS_MIN_N = 4
+STEP_SPREAD_MAX = 0.06  # two decimals spread a step of 0.242 uT by 0.02; gaps by chance up to 1.5 of the least, by 0.12
+SURE_STEPS_MIN_N = 20  # so many equal gaps are no accident, even of few values without noise
+STEP_MIN_uT = 0.1  # no setting of the MLX90393 has a finer LSB than 0.150 uT (data sheet, table 17)
+SAME_VALUE_uT = 1e-3  # float32 arithmetic may write one value in two ways
+
+# Noise moves a chip that works; it repeats itself only when it is read again before its next conversion is done
+# (1.84 ms), or where its LSB is coarse: for at most 3 frames in 14 real recordings.
+STUCK_FRAMES_MIN_N = 20
+OTHERS_MOVE_MIN = 0.5  # without noise a board moves only while it is pressed or released
+
+
+def failed_reads(
+    b_uT: Float[np.ndarray, "f ch"], temperature_degC: Float[np.ndarray, "f k"]
+) -> Bool[np.ndarray, "f k"]:
+    """Mark the readings of a chip whose I2C read failed; a recording without temperatures has NaN there."""
+    same_b = np.abs(_by_chip(b_uT) - FAILED_B_uT) <= FAILED_TOLERANCE
+    same_temperature = np.abs(temperature_degC - FAILED_TEMPERATURE_degC) <= FAILED_TOLERANCE
+    return same_b.all(axis=2) & (same_temperature | np.isnan(temperature_degC))
+
+
+def zero_reads(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
+    """Mark the readings of a chip whose three fields are exactly 0: what stands in memory that no reading was put into.
+
+    Rows of eFlashTeam7 have it on all chips. Not even the earth leaves a chip at 0 in three directions at once.
+    """
+    return np.asarray((_by_chip(b_uT) == 0).all(axis=2))
+
+
+def find_lsb(
+    b_uT: Float[np.ndarray, "f ch"], *, step_min_uT: float = STEP_MIN_uT, steps_min_n: int = STEPS_MIN_N
+) -> Float[np.ndarray, "k 2"]:
+    """Estimate the step between a chip's values, in uT, along x and y and along z; NaN where no grid shows.
+
+    A few hundred frames show it; a chip whose settings change among them shows none. A grid is `steps_min_n` steps of
+    `step_min_uT` or more.
+    """
+    chips = np.moveaxis(_by_chip(b_uT), 1, 0)
+    steps_uT = np.array(
+        [[_step([chip[:, 0], chip[:, 1]], steps_min_n), _step([chip[:, 2]], steps_min_n)] for chip in chips]
+    ).reshape(-1, 2)
+    return np.where(steps_uT >= step_min_uT, steps_uT, np.nan)
+
+
+def reset_chips(b_uT: Float[np.ndarray, "f ch"], expected_lsb_uT: tuple[float, float] | None) -> Bool[np.ndarray, " k"]:
+    """Flag the chips whose grid is not the expected one (x and y, z).
+
+    Without an expectation: those whose grid differs from that of most chips, or is the one of a chip after a reset. A
+    chip that shows no grid is not flagged.
+    """
+    return odd_scales(find_lsb(b_uT), expected_lsb_uT)
+
+
+def odd_scales(lsb_uT: Float[np.ndarray, "k 2"], expected_lsb_uT: tuple[float, float] | None) -> Bool[np.ndarray, " k"]:
+    """Flag chips as `reset_chips` does, from the steps that `find_lsb` gave."""
+    if expected_lsb_uT is not None:
+        return _not_on_grid(lsb_uT, expected_lsb_uT)
+    after_reset = ~_not_on_grid(lsb_uT, (RESET_LSB_XY_uT, RESET_LSB_Z_uT)) & np.isfinite(lsb_uT).all(axis=1)
+    usual_xy_uT, usual_z_uT = (_median(axis[np.isfinite(axis)]) for axis in lsb_uT.T)
+    return after_reset | _not_on_grid(lsb_uT, (usual_xy_uT, usual_z_uT))
+
+
+def stuck_chips(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
+    """Mark the readings of a chip that has stayed the same for `STUCK_FRAMES_MIN_N` frames while the board moved."""
+    return StuckChips(b_uT.shape[1] // 3).feed(b_uT)
+
+
+class StuckChips:
+    """Remembers since when each chip has not moved, so that a recording may come in any portions.
+
+    A reading is stuck if it is at least the `STUCK_FRAMES_MIN_N`-th of a run of equal ones, and other chips moved in
+    `OTHERS_MOVE_MIN` or more of the run: a board that stands still as a whole, or has no noise, is not broken.
+    """
+
+    def __init__(self, chips_n: int) -> None:
+        self._last_uT = np.full((1, chips_n, 3), np.nan)
+        self._quiet_n = np.zeros(chips_n, np.int64)  # frames since each chip's last move
+        self._moved_n = np.zeros(chips_n, np.int64)  # of these, the ones in which another chip moved
+
+    def feed(self, b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
+        """Take the next readings; mark the stuck ones."""
+        chips = _by_chip(b_uT)
+        if not len(chips):
+            return np.zeros(chips.shape[:2], bool)
+        moves = (np.diff(np.concatenate([self._last_uT, chips]), axis=0) != 0).any(axis=2)
+        frame_n = np.arange(1, len(chips) + 1)[:, None]
+        board_n = moves.any(axis=1).cumsum()[:, None]
+        begin_n = np.maximum.accumulate(np.where(moves, frame_n, 0), axis=0)
+        moved_before_n = np.concatenate([[0], board_n[:, 0]])[begin_n]
+        carried = begin_n == 0
+        quiet_n = frame_n - begin_n + carried * self._quiet_n
+        moved_n = board_n - moved_before_n + carried * self._moved_n
+        self._last_uT, self._quiet_n, self._moved_n = chips[-1:].astype(np.float64), quiet_n[-1], moved_n[-1]
+        return (quiet_n >= STUCK_FRAMES_MIN_N - 1) & (moved_n >= OTHERS_MOVE_MIN * quiet_n)
+
+
+class ConstantChannels:
+    """Finds channels that keep one value in a whole recording while others change; it may come in any portions.
+
+    A chip of which all three channels are constant is not reported here: it is stuck.
+    """
+
+    def __init__(self, chips_n: int) -> None:
+        self._first_uT = np.full((chips_n, 3), np.nan)
+        self._changed = np.zeros((chips_n, 3), bool)
+        self._readings_n = 0
+
+    def feed(self, b_uT: Float[np.ndarray, "f ch"]) -> None:
+        """Take the next readings of a board that did not fail."""
+        chips = _by_chip(b_uT)
+        if not len(chips):
+            return
+        if not self._readings_n:
+            self._first_uT = chips[0].copy()
+        self._changed |= (chips != self._first_uT).any(axis=0)
+        self._readings_n += len(chips)
+
+    def found(self) -> list[str]:
+        """Name the constant channels and their values, `Bz of chip 0 (12.5 uT)`; none in too short a recording."""
+        if self._readings_n < STUCK_FRAMES_MIN_N:
+            return []
+        odd = ~self._changed & self._changed.any(axis=1, keepdims=True)
+        return [
+            f"B{'xyz'[axis]} of chip {chip} ({self._first_uT[chip, axis]:.6g} uT)" for chip, axis in np.argwhere(odd)
+        ]
+
+
+def _step(axes_uT: list[Float[np.ndarray, " f"]], steps_min_n: int) -> float:
+    """Find the step of the grid on which all values of some axes lie."""
+    gaps_uT = np.concatenate([np.diff(np.unique(axis[np.isfinite(axis)])) for axis in axes_uT])
+    gaps_uT = gaps_uT[gaps_uT > SAME_VALUE_uT]
+    if not len(gaps_uT):
+        return np.nan
+    single = gaps_uT[gaps_uT < 1.5 * gaps_uT.min()]
+    alike = single.std() <= STEP_SPREAD_MAX * single.mean()
+    shows = alike and len(single) >= max(steps_min_n, STEP_SHARE_MIN * len(gaps_uT))
+    return float(single.mean()) if shows else np.nan
+
+
+def _median(known: Float[np.ndarray, " k"]) -> float:
+    return float(np.median(known)) if len(known) else np.nan
+
+
+def _not_on_grid(lsb_uT: Float[np.ndarray, "k 2"], grid_uT: tuple[float, float]) -> Bool[np.ndarray, " k"]:
+    return np.any(np.abs(lsb_uT / grid_uT - 1) > LSB_TOLERANCE, axis=1)
+
+
+def _by_chip(b_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f k 3"]:
+    return b_uT.reshape(len(b_uT), b_uT.shape[1] // 3, 3)
+
+
+B_MAX_uT = 49_000.0  # an MLX90393 measures up to 50 mT (data sheet)
+INT16_STEPS_N = 2**15
+CLOCK_STEP_MAX_S = 1.0
+REPEATED_LOOK_N, REPEATED_SHARE = 40, 0.4  # assumed: so many of so many frames, which is a tenth of a second at 400 Hz
+MISSING_STEPS = 1.6  # of the usual step of the board's clock
+SILENCE_S = 1.0
+SILENCE_STEPS = 50.0  # of the usual time between two frames: a slow log is not silent
+GARBAGE_FRAMES_N = 10  # so many frames' bytes in a row that are none are no torn frame
+LONG_LINE = 1.5  # of the usual length of a line of text
+
+
+def too_hot(temperature_degC: Float[np.ndarray, "f k"]) -> Bool[np.ndarray, "f k"]:
+    """Mark temperatures out of the chip's range; unknown ones are not."""
+    return (temperature_degC < TEMPERATURE_MIN_degC) | (temperature_degC > TEMPERATURE_MAX_degC)
+
+
+def saturated(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
+    """Mark the readings of a chip that are at the end of its range."""
+    return np.asarray((np.abs(b_uT) > B_MAX_uT).reshape(len(b_uT), b_uT.shape[1] // 3, 3).any(axis=2))
+
+
+def wrapped(step_uT: Float[np.ndarray, "f ch"], lsb_uT: Float[np.ndarray, "k 2"]) -> Bool[np.ndarray, "f k"]:
+    """Mark steps from frame to frame that int16 does not hold; of a chip whose LSB is not known, none."""
+    wrap_uT = INT16_STEPS_N * lsb_uT[:, [0, 0, 1]]
+    return np.asarray((np.abs(step_uT.reshape(len(step_uT), -1, 3)) > wrap_uT).any(axis=2))
+
+
+def repeated(step_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, " f"]:
+    """Mark frames that are the one before again, where that is many: a loop may outrun the chips now and then."""
+    same = np.asarray((step_uT == 0).all(axis=1))
+    if len(same) < REPEATED_LOOK_N:
+        return np.zeros(len(same), bool)
+    share = np.convolve(same, np.full(REPEATED_LOOK_N, 1 / REPEATED_LOOK_N), mode="same")
+    return np.asarray(same & (share > REPEATED_SHARE))
+
+
+def clock_jumps(device_step_s: Float[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
+    """Mark steps of the board's clock that no loop takes."""
+    return np.asarray((device_step_s < 0) | (device_step_s > CLOCK_STEP_MAX_S))
+
+
+def missing(device_step_s: Float[np.ndarray, " f"]) -> Int[np.ndarray, " f"]:
+    """Count the frames that are missing before each, by the board's clock; without one nothing tells."""
+    usual_s = np.median(device_step_s) if len(device_step_s) else np.nan
+    if not usual_s > 0:
+        return np.zeros(len(device_step_s), np.int64)
+    late = (device_step_s > MISSING_STEPS * usual_s) & ~clock_jumps(device_step_s)
+    return np.where(late, np.rint(device_step_s / usual_s) - 1, 0).astype(np.int64)
+
+
+def silences(step_s: Float64[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
+    """Mark frames before which nothing came for a second or more: unplugged, or stalled."""
+    usual_s = np.median(step_s[np.isfinite(step_s)]) if np.isfinite(step_s).any() else np.inf
+    return np.asarray(step_s > max(SILENCE_S, SILENCE_STEPS * usual_s))
+
+
+def lost_before(end_byte: Int[np.ndarray, " f"], first_byte: int, frame_bytes_n: int | None) -> Int[np.ndarray, " f"]:
+    """Count the bytes before each frame that are none; without a frame's length (text) the usual line tells."""
+    length_n = np.diff(end_byte, prepend=first_byte)
+    if frame_bytes_n is not None:
+        return length_n - frame_bytes_n
+    usual_n = int(np.median(length_n)) if len(length_n) else 0
+    return np.where(length_n > LONG_LINE * usual_n, length_n - usual_n, 0)

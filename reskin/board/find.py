@@ -1,0 +1,165 @@
+"""Find which serial port is a board: listen to each, and say what its bytes are."""
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+
+from reskin.board import faults
+from reskin.board.port import open_port, port_names, read_waiting
+from reskin.board.stream import decode_all, fitting
+from reskin.board.wire import Frames
+from reskin.errors import CaptureError, ParamsError
+from reskin.physics.chip import GAINS, steps_uT
+from reskin.recordings.header import Wire
+
+BAUD = 115200  # USB ports ignore it
+LISTENING_S = 1.5  # some 200 frames of the slowest board, in which the step of its chips shows
+HUNTING_S = 60.0
+POLL_S = 0.2
+BOARDS_MAX_N = 16  # at once
+LSB_TOLERANCE = 0.05  # gains are a fifth or more apart
+Chunk = tuple[bytes, float]  # and when it came, in s
+
+
+class Found(NamedTuple):
+    """A port, and the board on it; without one, `problem` says what is there instead."""
+
+    port: str
+    problem: str | None
+    wire: Wire = "binary"
+    chips_n: int = 0
+    rate_hz: float = np.nan
+    lsb_uT: tuple[float, float] = (np.nan, np.nan)  # along x and y, and z: the median chip's
+
+    @property
+    def gain_sel(self) -> int | None:
+        """The setting of the chips' gain whose steps these are."""
+        for gain_sel in range(len(GAINS)):
+            xy_uT, _, z_uT = steps_uT(gain_sel)
+            if np.allclose(self.lsb_uT, (xy_uT, z_uT), rtol=LSB_TOLERANCE):
+                return gain_sel
+        return None
+
+    def __str__(self) -> str:
+        return f"{self.port}: {self.problem or f'{self.format}, {self.rate_hz:.0f} Hz, {self.scale}'}"
+
+    @property
+    def format(self) -> str:
+        return f"{self.wire}, {self.chips_n} chips"
+
+    @property
+    def scale(self) -> str:
+        if np.isfinite(self.lsb_uT).all():
+            gain = f", GAIN_SEL {self.gain_sel}" if self.gain_sel is not None else ", no gain at its usual resolution"
+            return f"steps {self.lsb_uT[0]:.3f} uT in x, y and {self.lsb_uT[1]:.3f} uT in z{gain}"
+        return "steps not seen yet: does it move?"
+
+
+def find_boards(names: Sequence[str] | None = None, *, listening_s: float = LISTENING_S) -> list[Found]:
+    """Listen to ports, all at once: those given, or all of this machine."""
+    names = port_names() if names is None else names
+    with ThreadPoolExecutor(max(len(names), 1)) as pool:
+        return list(pool.map(lambda name: look(name, listening_s), names))
+
+
+def the_board(names: Sequence[str] | None = None) -> Found:
+    """Give the one board that is there; raise if there is none or more."""
+    boards = the_boards(names)
+    if len(boards) != 1:
+        got, remedy = "; ".join(map(str, boards)), "Give --port."
+        raise CaptureError("ports", "the board", "one, to go without --port", got, remedy)
+    return boards[0]
+
+
+def the_boards(names: Sequence[str] | None = None) -> list[Found]:
+    """Give all boards that are there; raise if there is none."""
+    found = find_boards(names)
+    boards = [each for each in found if each.problem is None]
+    if not boards:
+        got = "; ".join(map(str, found)) or "no serial port at all"
+        raise CaptureError("ports", "boards", "one or more, to go without --port", got, "Plug one in, or give --port.")
+    return boards
+
+
+def look(port: str, listening_s: float = LISTENING_S) -> Found:
+    """Listen to a port for a while and say what is there."""
+    chunks: list[Chunk] = []
+    try:
+        with open_port(port, BAUD) as device:
+            end_s = time.monotonic() + listening_s
+            while time.monotonic() < end_s:
+                if chunk := read_waiting(device):
+                    chunks.append((chunk, time.monotonic()))
+    except CaptureError as error:
+        return Found(port, str(error).removeprefix(f"{port}: "))
+    except OSError as error:
+        return Found(port, f"gone while it was read: {error}")
+    return recognise(port, chunks)
+
+
+def recognise(port: str, chunks: Sequence[Chunk]) -> Found:
+    """Say what a port's bytes are: their format, chips, rate and scale."""
+    data = b"".join(chunk for chunk, _ in chunks)
+    if not data:
+        return Found(port, "no byte came: is the board running?")
+    fits = fitting(data)
+    if not fits:
+        return Found(port, f"no frame in {len(data)} bytes: another baud rate, or another device")
+    frames, wire, chips_n = min(
+        ((decode_all(data, wire, chips_n, port)[0], wire, chips_n) for wire, chips_n in fits), key=_spread_degC
+    )
+    with np.errstate(over="ignore"):  # any finite number may stand in a frame
+        lsb_uT = [_median(axis) for axis in faults.find_lsb(frames.b_uT).T]
+    return Found(port, None, wire, chips_n, _rate_hz(frames, chunks), (lsb_uT[0], lsb_uT[1]))
+
+
+def _spread_degC(decoded: tuple[Frames, Wire, int]) -> float:
+    """Text may hold temperatures first or last; they differ less than fields do."""
+    return float(decoded[0].temperature_degC.std(dtype=np.float64))
+
+
+def _median(steps_uT: Float64[np.ndarray, " k"]) -> float:
+    shown_uT = steps_uT[np.isfinite(steps_uT)]
+    return float(np.median(shown_uT)) if len(shown_uT) else np.nan
+
+
+def _rate_hz(frames: Frames, chunks: Sequence[Chunk]) -> float:
+    """Count the frames that came after the first chunk, which may have waited."""
+    later_n = int((frames.end_byte > len(chunks[0][0])).sum())
+    took_s = chunks[-1][1] - chunks[0][1]
+    return later_n / took_s if took_s > 0 else np.nan
+
+
+def hunt(
+    say: Callable[[str], None],
+    *,
+    names: Callable[[], Iterable[str]] = port_names,
+    pause: Callable[[float], None] = time.sleep,
+    hunting_s: float = HUNTING_S,
+) -> str:
+    """Find the port that goes when the board is unplugged, and comes when it is plugged in again."""
+    say("Unplug the board.")
+    before = set(names())
+    gone = _wait(lambda: before - set(names()), pause, hunting_s, "a port that goes")
+    say(f"{', '.join(sorted(gone))} went. Plug it in again.")
+    left = before - gone
+    return min(_wait(lambda: set(names()) - left, pause, hunting_s, "a port that comes"))
+
+
+def _wait(change: Callable[[], set[str]], pause: Callable[[float], None], hunting_s: float, what: str) -> set[str]:
+    for _ in range(round(hunting_s / POLL_S)):
+        if found := change():
+            return found
+        pause(POLL_S)
+    raise CaptureError("ports", what, f"seen within {hunting_s:g} s", "none", "Is it a board with a serial port?")
+
+
+def check_named_once(ports: Sequence[str], where: str) -> None:
+    """Raise unless boards that work at once have a port each."""
+    if len(set(ports)) != len(ports) or not 0 < len(ports) <= BOARDS_MAX_N:
+        rule = f"1 to {BOARDS_MAX_N}, each named once"
+        raise ParamsError(where, "ports", rule, ", ".join(ports) or "none", "Give each port once.")

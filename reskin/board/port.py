@@ -1,0 +1,247 @@
+"""Read a board's port into a capture: `stream.bin` and the arrival times of its bytes.
+
+The port is a serial port or `socket://host:port`.
+"""
+
+import math
+import select
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from io import FileIO
+from pathlib import Path
+from types import FrameType
+from typing import Literal
+
+import serial
+from serial.serialutil import SerialBase
+from serial.tools import list_ports
+
+from reskin.board.stream import FrameStream, no_frame
+from reskin.board.wire import TEXT_WIRES, Frames
+from reskin.errors import CaptureError
+from reskin.recordings.header import ARRIVALS_FILE, STREAM_FILE, Wire
+
+READ_TIMEOUT_s = 0.1  # how late a stop, a silence or the end of the duration may be noticed
+READ_BYTES_MAX_N = 65536
+SOCKET = "socket://"
+HEAD_BYTES_N = 16384  # the first bytes are kept to say what fits, should no frame come
+
+Device = SerialBase  # an open port
+Report = Callable[[Mapping[str, int]], None]  # called with the account many times a second
+Watch = Callable[[Frames], object]  # called with frames as they come
+Ended = Literal["duration", "bytes", "stopped", "unplugged", "silent", "no frame", "not written"]
+
+
+@dataclass(frozen=True)
+class PortSettings:
+    """How to listen, and for how long; `math.inf` seconds and no `bytes_max_n` go on until stopped."""
+
+    baud: int
+    wire: Wire
+    chips_n: int
+    duration_s: float
+    bytes_max_n: int | None
+    silence_s: float  # a port that sends nothing for so long has ended
+    no_frame_s: float  # a port that sends has so long to send its first frame
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What was recorded and how it ended; `account` counts the frames and losses that a `FrameStream` saw."""
+
+    ended: Ended
+    duration_s: float
+    partial_line_bytes_n: int  # bytes before the first whole line, not written
+    account: dict[str, int]
+
+
+def record(
+    port: str,
+    folder: Path,
+    *,
+    settings: PortSettings,
+    stop: threading.Event,
+    report: Report = lambda account: None,
+    watch: Watch = lambda frames: None,
+) -> Recording:
+    """Write what a port sends until `stop` is set, Ctrl-C, SIGTERM, unplugging, or the settings say so.
+
+    Raises `CaptureError` if the port does not open or not one frame comes. A port that falls silent after its first
+    frame ends the recording: what came is kept.
+    """
+    with open_port(port, settings.baud) as device, _stopping_on_signals(stop), Tape(folder, settings.wire) as tape:
+        recorder = _Recorder(port, settings, tape, watch)
+        ended = recorder.listen(device, stop, report)
+    return recorder.finish(ended)
+
+
+def open_port(port: str, baud: int) -> Device:
+    """Open a serial port for this process alone, or connect to a socket."""
+    try:
+        if "://" in port and not port.startswith(SOCKET):  # pyserial has more schemes, some of which load code
+            raise ValueError(f"of these, only {SOCKET}host:port is known")
+        device = serial.serial_for_url(port, baud, timeout=READ_TIMEOUT_s, exclusive=None if "://" in port else True)
+    except (OSError, ValueError) as error:
+        raise CaptureError(port, "the port", "one that opens", error, _found_ports()) from None
+    if not isinstance(device, serial.Serial):
+        device.timeout = 0
+    return device
+
+
+def read_waiting(device: Device, bytes_max_n: int = READ_BYTES_MAX_N) -> bytes:
+    """Give the bytes that wait, or those that come within `READ_TIMEOUT_s`; raise `OSError` if the board is gone."""
+    if isinstance(device, serial.Serial):  # it sleeps until a byte comes; with it come others
+        first = device.read(min(1, bytes_max_n))
+        waiting_n = min(device.in_waiting, READ_BYTES_MAX_N, bytes_max_n) - 1 if first else 0
+        return first + device.read(waiting_n) if waiting_n > 0 else first
+    ready, _, _ = select.select([device], [], [], READ_TIMEOUT_s)  # a socket cannot say how many wait
+    return device.read(min(READ_BYTES_MAX_N, bytes_max_n)) if ready else b""
+
+
+def port_names() -> list[str]:
+    """Name the serial ports that this machine has."""
+    return sorted(found.device for found in list_ports.comports())
+
+
+class Tape:
+    """The two files of a recording as they grow: a chunk is written first, then when it came.
+
+    So no arrival speaks of bytes that are not there; what a full disk does not take whole is taken back.
+    """
+
+    def __init__(self, folder: Path, wire: Wire) -> None:
+        self.bytes_n = self.partial_line_bytes_n = 0
+        self._in_partial_line = wire in TEXT_WIRES
+        # Unbuffered: what a killed process had written is there, and nothing waits to fail again on closing.
+        self._stream = (folder / STREAM_FILE).open("xb", buffering=0)
+        self._arrivals = (folder / ARRIVALS_FILE).open("xb", buffering=0)
+        self._arrivals.write(b"byte_end,t_s\n")
+        self._note_arrival(time.time())
+
+    def __enter__(self) -> "Tape":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self._stream.close()
+        self._arrivals.close()
+
+    def write(self, chunk: bytes, unix_s: float) -> bytes:
+        """Write a chunk; give what of it was written: of a number cut at the start of text, nobody could tell."""
+        if self._in_partial_line:
+            partial, newline, rest = chunk.partition(b"\n")
+            self.partial_line_bytes_n += len(partial + newline)
+            self._in_partial_line, chunk = not newline, rest
+        if chunk:
+            append(self._stream, chunk)
+            self.bytes_n += len(chunk)
+            self._note_arrival(unix_s)
+        return chunk
+
+    def _note_arrival(self, unix_s: float) -> None:
+        append(self._arrivals, f"{self.bytes_n},{unix_s:.6f}\n".encode())
+
+
+def append(file: FileIO, data: bytes) -> None:
+    """Write all of some bytes or none."""
+    start = file.tell()
+    try:
+        while data:
+            data = data[file.write(data) :]
+    except OSError:
+        file.truncate(start)
+        raise
+
+
+class _Recorder:
+    """Remembers what has come since the port was opened."""
+
+    def __init__(self, port: str, settings: PortSettings, tape: Tape, watch: Watch) -> None:
+        self._port, self._settings, self._tape, self._watch = port, settings, tape, watch
+        self._frames = FrameStream(settings.wire, settings.chips_n)
+        self._head = b""
+        self._start_s = self._last_byte_s = time.monotonic()
+        self._first_byte_s = math.inf
+        # The system's clock may be set while we record, and arrival times must not fall.
+        self._unix_s = time.time() - self._start_s
+
+    def listen(self, device: Device, stop: threading.Event, report: Report) -> Ended:
+        """Read until there is a reason to end."""
+        while not (ended := self._reason_to_end(stop)):
+            report(self._frames.account())
+            try:
+                chunk = read_waiting(device, self._room_n())
+            except OSError:  # pyserial's errors are OSErrors too
+                return "unplugged"
+            try:
+                self._keep(chunk)
+            except OSError:
+                return "not written"
+        return ended
+
+    def finish(self, ended: Ended) -> Recording:
+        """Say what came; raise if there is no frame in it."""
+        self._frames.close()
+        account = self._frames.account()
+        duration_s = time.monotonic() - self._start_s
+        if not self._head:
+            got, remedy = f"none in {duration_s:.1f} s", f"Is the board running, and this its port? {_found_ports()}"
+            raise CaptureError(self._port, "bytes", "coming in", got, remedy)
+        if not account["frames_n"]:
+            raise no_frame(self._port, self._head, self._settings.wire, self._settings.chips_n)
+        return Recording(ended, duration_s, self._tape.partial_line_bytes_n, account)
+
+    def _reason_to_end(self, stop: threading.Event) -> Ended | None:
+        settings, now_s = self._settings, time.monotonic()
+        frames_n = self._frames.account()["frames_n"]
+        reasons: dict[Ended, bool] = {
+            "stopped": stop.is_set(),
+            "duration": now_s - self._start_s >= settings.duration_s,
+            "bytes": not self._room_n(),
+            "silent": now_s - self._last_byte_s > settings.silence_s,
+            "no frame": not frames_n and now_s - self._first_byte_s > settings.no_frame_s,
+        }
+        return next((ended for ended, is_so in reasons.items() if is_so), None)
+
+    def _room_n(self) -> int:
+        bytes_max_n = self._settings.bytes_max_n
+        return sys.maxsize if bytes_max_n is None else bytes_max_n - self._tape.bytes_n
+
+    def _keep(self, chunk: bytes) -> None:
+        if not chunk:
+            return
+        self._last_byte_s = time.monotonic()
+        self._first_byte_s = min(self._first_byte_s, self._last_byte_s)
+        self._head = (self._head + chunk)[:HEAD_BYTES_N]
+        if written := self._tape.write(chunk, self._unix_s + self._last_byte_s):
+            self._watch(self._frames.feed(written))
+
+
+def _found_ports() -> str:
+    names = port_names()
+    return f"Ports found: {', '.join(names)}." if names else "No serial port was found: is the board plugged in?"
+
+
+@contextmanager
+def _stopping_on_signals(stop: threading.Event) -> Iterator[None]:
+    """Let Ctrl-C and SIGTERM set `stop`; only the main thread can, and may."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def ask(_number: int, _frame: FrameType | None) -> None:
+        stop.set()
+
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,103 @@
+"""A thread that reads a port and waits for nobody. In: a port. Out: chunks and when they came; a tape, if asked for.
+
+A board that is unplugged is waited for. Refuses to know formats and what chunks hold.
+"""
+
+import threading
+import time
+from collections import deque
+
+from reskin.board.find import BAUD, Chunk
+from reskin.board.port import Device, Tape, open_port, read_waiting
+from reskin.errors import CaptureError
+
+QUEUE_BYTES_MAX_N = 2**22  # two minutes of five chips at 400 Hz: who is later than that loses the oldest
+RETRY_S = 0.5
+PLUGGED_IN = b""  # a chunk that says that the stream begins anew
+
+
+class Reader:
+    """Remembers what came and was not taken; `missed_bytes_n` counts what nobody took in time."""
+
+    def __init__(self, port: str, baud: int = BAUD) -> None:
+        self.port, self.baud = port, baud
+        self.plugged_in, self.was_plugged_in, self.problem = False, False, ""
+        self.missed_bytes_n = self.waiting_bytes_n = 0
+        self.taken_s = 0.0  # when it was last asked, in unix seconds
+        self.tape: Tape | None = None
+        self.tape_problem = ""
+        self._clock_s = time.time() - time.monotonic()  # the system's clock may be set while we read
+        self._chunks: deque[Chunk] = deque()
+        self._came = threading.Condition()
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._read, name=f"reader of {port}", daemon=True)
+
+    def start(self, *, there: bool) -> None:
+        """Begin to read; a port that must be `there` is opened first, and an error if it is not."""
+        self._device = open_port(self.port, self.baud) if there else None
+        self._thread.start()
+
+    def stop(self) -> None:
+        self._stop.set()
+        self._thread.join()
+        self.set_tape(None)
+
+    def unix_s(self) -> float:
+        return self._clock_s + time.monotonic()
+
+    def take(self, wait_s: float) -> list[Chunk]:
+        """Take all that came; wait for something at most so long."""
+        with self._came:
+            self._came.wait_for(lambda: bool(self._chunks), wait_s)
+            taken = list(self._chunks)
+            self._chunks.clear()
+            self.waiting_bytes_n = 0
+            self.taken_s = self.unix_s()
+        return taken
+
+    def set_tape(self, tape: Tape | None) -> None:
+        """Write what comes from now on to another tape, or to none; the one before is closed."""
+        with self._came:
+            before, self.tape, self.tape_problem = self.tape, tape, ""
+        if before is not None:
+            before.close()
+
+    def _read(self) -> None:
+        device: Device | None = self._device
+        while not self._stop.is_set():
+            try:
+                device = device or self._plug_in()
+                self.plugged_in = self.was_plugged_in = True
+                if chunk := read_waiting(device):
+                    self._keep(chunk)
+            except (OSError, CaptureError) as error:
+                self.plugged_in, self.problem = False, str(error)
+                if device is not None:
+                    device.close()
+                    device = None
+                self._stop.wait(RETRY_S)
+        if device is not None:
+            device.close()
+
+    def _plug_in(self) -> Device:
+        device = open_port(self.port, self.baud)
+        self._keep(PLUGGED_IN)
+        return device
+
+    def _keep(self, chunk: bytes) -> None:
+        with self._came:
+            now_s = self.unix_s()  # in here, so that no chunk is older than a look that did not find it
+            self._chunks.append((chunk, now_s))
+            self.waiting_bytes_n += len(chunk)
+            while self.waiting_bytes_n > QUEUE_BYTES_MAX_N:
+                oldest_n = len(self._chunks.popleft()[0])
+                self.waiting_bytes_n -= oldest_n
+                self.missed_bytes_n += oldest_n
+            self._came.notify()
+            tape = self.tape
+            if tape is not None:
+                try:
+                    tape.write(chunk, now_s)
+                except OSError as error:  # a full disk ends the recording, and nothing else
+                    self.tape, self.tape_problem = None, f"cannot be written any more: {error.strerror}"
+                    tape.close()

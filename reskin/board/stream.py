@@ -1,0 +1,278 @@
+"""From a stream to frames, without I/O. In: bytes in any portions. Out: whole frames, and a count of every lost byte.
+
+No format marks a frame's start, and CR LF may stand inside a float (34.513275 degC has it), so where frames lie is
+decided from the bytes alone, never from how they were portioned. Refuses to know ports, files and clocks.
+"""
+
+import re
+from collections import Counter
+from dataclasses import dataclass, replace
+from typing import get_args
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int64, UInt8
+
+from reskin.board import wire as wires
+from reskin.board.wire import BLOCK_FRAMES_N, CR, LF, Frames, Run
+from reskin.errors import CaptureError
+from reskin.recordings.header import Wire
+
+BLOCK_LINES_N = 8192
+CHIPS_MAX_N = 64  # as in the header
+ACCOUNT = ("bytes_n", "frames_n", "frame_bytes_n", "not_finite_frames_n", "skipped_not_finite_bytes_n",
+           "skipped_resync_bytes_n", "skipped_truncated_bytes_n")  # fmt: skip
+
+# An MLX90393 measures up to 50 mT (data sheet) in steps above 0.1 uT. Only where CR LF leaves two ways to lay frames do
+# these limits decide: a value outside them is no reason to drop a frame (failed reads are outside, see `faults`).
+TEMPERATURE_MIN_degC, TEMPERATURE_MAX_degC = -50.0, 125.0
+B_MAX_uT = 6e4
+VALUE_MIN = 1e-3  # what is nearer to 0, in uT or degC, is below the chip's LSB
+
+SEARCH_FRAMES_N = 64  # a search looks at so many frames' bytes at once
+
+
+@dataclass(frozen=True)
+class _Scan:
+    """What a scan settled: frames, counts (names of `ACCOUNT`), bytes; and whether a frame is known to begin there."""
+
+    frames: Frames
+    count: Counter[str]
+    settled_n: int
+    at_boundary: bool
+
+
+class FrameStream:
+    """Remembers the bytes that are not settled yet; returns frames as soon as they are certain.
+
+    `_lay_frames` says which bytes are a binary frame; a text frame is a line of exactly 4 k numbers of two decimals.
+    A stream is believed to begin with a frame: a first line cut inside its first number is a frame with a wrong number.
+    """
+
+    def __init__(self, wire: Wire, chips_n: int) -> None:
+        self._wire, self._chips_n = wire, chips_n
+        self._scan = _scan_lines if wire in wires.TEXT_WIRES else _scan_binary
+        self._rest = b""
+        self._at_boundary = True
+        self._closed = False
+        self._count: Counter[str] = Counter()
+
+    def feed(self, data: bytes) -> Frames:
+        """Take the next bytes; give the frames that are now certain."""
+        assert not self._closed, "a stream that ended takes no more bytes"
+        return self._advance(data, final=False)
+
+    def close(self) -> Frames:
+        """Say that the stream has ended; give the frames that waited for more, and count what is left as lost."""
+        self._closed = True
+        return self._advance(b"", final=True)
+
+    def account(self) -> dict[str, int]:
+        """Count bytes and frames; once closed, `frame_bytes_n` and all `skipped_*_bytes_n` add up to `bytes_n`."""
+        return {name: self._count[name] for name in ACCOUNT}
+
+    def _advance(self, data: bytes, final: bool) -> Frames:
+        buffer = self._rest + data if self._rest else data
+        offset = self._count["bytes_n"] - len(self._rest)
+        scan = self._scan(np.frombuffer(buffer, np.uint8), self._at_boundary, final, self._wire, self._chips_n)
+        self._rest, self._at_boundary = (b"" if final else buffer[scan.settled_n :]), scan.at_boundary
+        self._count.update(scan.count, bytes_n=len(data), frames_n=len(scan.frames))
+        found_n = scan.count["frame_bytes_n"] + scan.count["skipped_not_finite_bytes_n"]
+        self._count["skipped_resync_bytes_n"] += scan.settled_n - found_n
+        self._count["skipped_truncated_bytes_n"] += len(buffer) - scan.settled_n if final else 0
+        return replace(scan.frames, end_byte=scan.frames.end_byte + offset)
+
+
+def decode_all(data: bytes, wire: Wire, chips_n: int, where: str) -> tuple[Frames, dict[str, int]]:
+    """Decode a whole stream; raise `CaptureError` if there is not one frame in it."""
+    stream = FrameStream(wire, chips_n)
+    frames = wires.concatenate([part for part in (stream.feed(data), stream.close()) if len(part)], chips_n)
+    if not stream.account()["frames_n"]:
+        raise no_frame(where, data, wire, chips_n)
+    return frames, stream.account()
+
+
+def no_frame(where: str, data: bytes, wire: Wire, chips_n: int) -> CaptureError:
+    """Make the error for a stream without a frame, from its bytes or the first of them; say what fits them instead."""
+    rule, got = f"frames of {chips_n} chips in wire format {wire}", f"no frame found in {len(data)} bytes"
+    hint = " or ".join(f"{fit} with {k} chips" for fit, k in fitting(data))
+    remedy = "Wrong baud rate, chip count or wire format?" + (f" It fits {hint}." if hint else "")
+    if not data:
+        remedy = "Is the board running and sending?"
+    return CaptureError(where, "the stream", rule, got, remedy)
+
+
+def fitting(data: bytes) -> list[tuple[Wire, int]]:
+    """List the formats, of the fewest chips that do, in which most of the first 16 KiB of `data` is frames."""
+    data = data[:16384]
+    for chips_n in range(1, min(CHIPS_MAX_N, len(data) // 16) + 1):  # no format has less than 16 bytes a chip
+        streams = {wire: FrameStream(wire, chips_n) for wire in get_args(Wire)}
+        for stream in streams.values():
+            stream.feed(data)
+        found = [wire for wire, stream in streams.items() if 2 * stream.account()["frame_bytes_n"] > len(data)]
+        if found:
+            return [(wire, chips_n) for wire in found]
+    return []
+
+
+def _scan_binary(
+    octets: UInt8[np.ndarray, " bytes"], at_boundary: bool, final: bool, wire: Wire, chips_n: int
+) -> _Scan:
+    record = wires.record_type(wire, chips_n)
+    runs, settled_n, at_boundary = _lay_frames(octets, at_boundary, final, record)
+    frames, finite = wires.decode_runs(octets, runs, wire, chips_n)
+    lost_n = len(frames) - int(np.count_nonzero(finite))
+    if lost_n:
+        frames = frames.where(finite)
+    count = Counter(
+        frame_bytes_n=len(frames) * record.itemsize,
+        not_finite_frames_n=lost_n,
+        skipped_not_finite_bytes_n=lost_n * record.itemsize,
+    )
+    return _Scan(frames, count, settled_n, at_boundary)
+
+
+def _lay_frames(
+    octets: UInt8[np.ndarray, " bytes"], at_boundary: bool, final: bool, record: np.dtype[np.void]
+) -> tuple[list[Run], int, bool]:
+    """Find the runs of frames; also how many bytes are settled and whether a frame is known to begin there.
+
+    A frame is taken at once where the one before ended (or the stream began) and CR LF closes it, unless CR LF stands
+    in its payload too *and* its values make no sense. Then, and after a break, the next frame is searched for: CR LF
+    stands before it and closes it. If several layouts fit, the one with most plausible chips in two frames wins, then
+    the first.
+    """
+    runs: list[Run] = []
+    position = 0
+    while True:
+        if at_boundary:
+            frames_n = _sure_frames_n(octets[position:], record)
+            runs.append((position, frames_n))
+            position += frames_n * record.itemsize
+            if len(octets) - position < record.itemsize:
+                break
+        window = octets[position : position + SEARCH_FRAMES_N * record.itemsize]
+        reaches_end = position + len(window) == len(octets)
+        skip_n, found = _search(window, at_boundary, final and reaches_end, record)
+        position += skip_n
+        at_boundary = found or (at_boundary and skip_n == 0)
+        if found:
+            runs.append((position, 1))
+            position += record.itemsize
+        elif reaches_end:
+            break
+    return [run for run in runs if run[1]], position, at_boundary
+
+
+def _sure_frames_n(octets: UInt8[np.ndarray, " bytes"], record: np.dtype[np.void]) -> int:
+    """Count the frames from the first byte on that need no look at what follows them."""
+    sure_n, frames_n = 0, len(octets) // record.itemsize
+    while sure_n < frames_n:
+        block_n = min(frames_n - sure_n, BLOCK_FRAMES_N)
+        block = octets[sure_n * record.itemsize : (sure_n + block_n) * record.itemsize]
+        sure_in_block_n = _sure_in_block_n(block, record)
+        sure_n += sure_in_block_n
+        if sure_in_block_n < block_n:
+            break
+    return sure_n
+
+
+def _sure_in_block_n(block: UInt8[np.ndarray, " bytes"], record: np.dtype[np.void]) -> int:
+    rows = block.reshape(-1, record.itemsize)
+    closed = (rows[:, -2] == CR) & (rows[:, -1] == LF)
+    closed_n = len(rows) if closed.all() else int(closed.argmin())
+    ends = _terminators(block[: closed_n * record.itemsize])
+    if np.count_nonzero(ends) == closed_n:  # none but those that close a frame
+        return closed_n
+    inside = np.flatnonzero(ends)
+    inside = inside[inside % record.itemsize != record.itemsize - 2]
+    suspect_i = np.unique(inside // record.itemsize)
+    sane = _plausible(block.view(record)["txyz"][suspect_i]).all(axis=1)
+    return closed_n if sane.all() else int(suspect_i[sane.argmin()])
+
+
+def _search(
+    window: UInt8[np.ndarray, " bytes"], at_boundary: bool, final: bool, record: np.dtype[np.void]
+) -> tuple[int, bool]:
+    """Give the number of bytes to skip, and whether a frame begins there (else: more bytes must tell).
+
+    If a window is searched again with more bytes, the two before the first undecided start are kept: they may close
+    a frame before it.
+    """
+    length_n, window_n = record.itemsize, len(window)
+    ended = np.zeros(window_n + 2 * length_n + 1, bool)  # a frame may have ended before this byte
+    ended[0] = at_boundary
+    ended[2 : window_n + 1] = _terminators(window)[: max(window_n - 1, 0)]
+    fits = ended[:-length_n] & ended[length_n:]
+    first = int(fits.argmax())
+    if not fits[first]:
+        return (window_n if final else max(window_n - length_n - 1, 0)), False
+    if not final and window_n < first + 3 * length_n:  # rivals may follow
+        return max(first - 2, 0), False
+    starts = first + np.flatnonzero(fits[first : first + length_n])
+    here_n, next_n = (
+        np.array([_plausible_n(window[start:], record) if fits[start] else 0 for start in starts + shift])
+        for shift in (0, length_n)
+    )
+    best_i = int((here_n + next_n).argmax())
+    start = int(starts[best_i])
+    # A frame's end behind a CR LF that ended nothing looks like a frame; the one after it is more plausible.
+    is_tail = next_n[best_i] > here_n[best_i] and not (at_boundary and start == 0)
+    return start + length_n * int(is_tail), True
+
+
+def _terminators(octets: UInt8[np.ndarray, " bytes"]) -> Bool[np.ndarray, " pairs"]:
+    """Mark the bytes that begin a CR LF."""
+    return (octets[:-1] == CR) & (octets[1:] == LF)
+
+
+def _plausible_n(octets: UInt8[np.ndarray, " bytes"], record: np.dtype[np.void]) -> int:
+    """Count the plausible chips of the frame at the first byte."""
+    return int(np.count_nonzero(_plausible(octets[: record.itemsize].view(record)["txyz"])))
+
+
+def _plausible(txyz: Float32[np.ndarray, "f k 4"]) -> Bool[np.ndarray, "f k"]:
+    """Mark the chips whose values a magnetometer can give."""
+    temperature_degC, b_uT = txyz[..., 0], txyz[..., 1:]
+    warm = (temperature_degC >= TEMPERATURE_MIN_degC) & (temperature_degC <= TEMPERATURE_MAX_degC)
+    no_dust = ((txyz == 0) | (np.abs(txyz) >= VALUE_MIN)).all(axis=-1)
+    return warm & no_dust & (np.abs(b_uT) <= B_MAX_uT).all(axis=-1)
+
+
+def _scan_lines(octets: UInt8[np.ndarray, " bytes"], at_boundary: bool, final: bool, wire: Wire, chips_n: int) -> _Scan:
+    """Decode whole lines; a line longer than any frame is not waited for."""
+    line_end = np.flatnonzero(octets == LF) + 1
+    settled_n = int(line_end[-1]) if len(line_end) else 0
+    parts: list[Frames] = []
+    count: Counter[str] = Counter()
+    # What is left of a line that was not waited for may look like a frame, and is none.
+    for first in range(0 if at_boundary else 1, len(line_end), BLOCK_LINES_N):
+        base = int(line_end[first - 1]) if first else 0
+        ends = line_end[first : first + BLOCK_LINES_N] - base
+        block, lines_n = octets[base : base + ends[-1]], np.diff(ends, prepend=0)
+        frames, is_frame = wires.decode_lines(block, ends, wire, chips_n)
+        lost = _not_finite_lines(block, ends, is_frame, chips_n)
+        parts.append(replace(frames, end_byte=frames.end_byte + base))
+        count.update(
+            frame_bytes_n=int(lines_n[is_frame].sum()),
+            not_finite_frames_n=int(np.count_nonzero(lost)),
+            skipped_not_finite_bytes_n=int(lines_n[lost].sum()),
+        )
+    at_boundary = at_boundary or settled_n > 0
+    if not at_boundary or len(octets) - settled_n > wires.line_bytes_max_n(chips_n):
+        settled_n, at_boundary = len(octets), False
+    return _Scan(wires.concatenate(parts, chips_n), count, settled_n, at_boundary)
+
+
+def _not_finite_lines(
+    block: UInt8[np.ndarray, " bytes"],
+    line_end: Int64[np.ndarray, " lines"],
+    is_frame: Bool[np.ndarray, " lines"],
+    chips_n: int,
+) -> Bool[np.ndarray, " lines"]:
+    """Mark the lines that would be frames, had the firmware not written nan, inf or ovf for a number."""
+    line = re.compile(rb"(?:-?(?:\d{1,10}\.\d\d|nan|inf|ovf)\t?){%d}\t?\r?\n" % (wires.NUMBERS_PER_CHIP_N * chips_n))
+    start = np.concatenate([[0], line_end[:-1]])
+    marked = np.zeros(len(line_end), bool)
+    for line_i in np.flatnonzero(~is_frame):
+        marked[line_i] = line.fullmatch(block[start[line_i] : line_end[line_i]].tobytes()) is not None
+    return marked

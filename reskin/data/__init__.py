@@ -1,0 +1,1 @@
+"""Datasets: rows that a model sees, no-load baselines, splits."""

@@ -1,0 +1,202 @@
+"""Rows that a model sees: readings of many captures, selected and stacked.
+
+Also what is known of a row before its contact: the no-load field, its number in the scan, and rows without contact.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Int32, Int64
+
+from reskin.config import Strict
+from reskin.data.baseline import subtract
+from reskin.errors import ParamsError
+from reskin.schema import Readings
+
+TARGETS = ("x_mm", "y_mm", "Fz_N")
+AS_THEY_ARE = ("capture", "board", "skin", "db_uT", "target", "pass_i")  # columns that are stacked unchanged
+SHEAR_TARGETS = ("x_mm", "y_mm", "Fx_N", "Fy_N", "Fz_N")  # of dragged lines (paper section 4)
+
+
+class Selection(Strict):
+    """Which readings count as a contact: those with a known place and, where it is known, at least this force."""
+
+    force_min_N: float
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Stacked rows of a scene, captures in order of name.
+
+    `db_uT` is the change of field against the no-load reading of the same indentation; `target` holds x_mm, y_mm and
+    Fz_N (NaN where a recording has no force), unless others were gathered; `pass_i` counts on over the captures of one
+    skin; `indentation` counts on over the captures of the scene, and the readings of one indentation share it.
+    """
+
+    capture: np.ndarray
+    board: np.ndarray
+    skin: np.ndarray
+    db_uT: Float32[np.ndarray, "f ch"]
+    target: Float32[np.ndarray, "f t"]
+    pass_i: Int32[np.ndarray, " f"]
+    indentation: Int64[np.ndarray, " f"]
+    dropped: dict[str, int]
+
+    def __len__(self) -> int:
+        return len(self.db_uT)
+
+    @classmethod
+    def of_labels(cls, boards: Sequence[str], skins: Sequence[str], pass_i: Sequence[int] | None = None) -> "Rows":
+        """Rows without readings, one an indentation, for showing how folds are drawn; one pass unless told."""
+        f = len(boards)
+        empty, passes = np.zeros((f, 3), np.float32), np.array(pass_i if pass_i is not None else [0] * f, np.int32)
+        labels = np.array(["c"] * f), np.array(boards), np.array(skins)
+        return cls(*labels, empty, empty, passes, np.arange(f), {})
+
+
+def gather(captures: Sequence[Readings], selection: Selection, *, targets: Sequence[str] = TARGETS) -> Rows:
+    """Stack the captures of a scene into rows, and count what is no contact; `targets` name columns of `Readings`."""
+    if not captures:
+        raise ParamsError("the scene", "captures", "one or more", "none", "Add one with `reskin add`.")
+    _check_one_kind(captures)
+    captures = sorted(captures, key=lambda readings: readings.capture)
+    kept = [contacts(readings, selection) for readings in captures]
+    pairs = list(zip(captures, kept, strict=True))
+    for readings, keep in pairs:
+        if not keep.any():
+            what = f"readings with a known place and at least {selection.force_min_N} N"
+            remedy = "Look at its places and at the sign of its force."
+            raise ParamsError(f"capture {readings.capture}", what, "one or more", f"none of {len(readings)}", remedy)
+    passes_n: dict[str, int] = {}
+    pass_i = []
+    for readings, keep in pairs:
+        before_n = passes_n.get(readings.skin, 0)
+        pass_i.append(readings.pass_i[keep] + np.int32(before_n))
+        passes_n[readings.skin] = before_n + int(readings.pass_i.max()) + 1
+    kept_n = [int(keep.sum()) for keep in kept]
+    places_unknown_n = sum(int(np.isnan(readings.x_mm).sum()) for readings in captures)
+    weak_n = sum(map(len, captures)) - sum(kept_n) - places_unknown_n
+    columns = [np.stack([getattr(readings, name) for name in targets], axis=1)[keep] for readings, keep in pairs]
+    return Rows(
+        capture=np.repeat(np.array([readings.capture for readings in captures]), kept_n),
+        board=np.repeat(np.array([readings.board for readings in captures]), kept_n),
+        skin=np.repeat(np.array([readings.skin for readings in captures]), kept_n),
+        db_uT=np.concatenate([subtract(readings.b_uT[keep], readings.noload_uT[keep]) for readings, keep in pairs]),
+        target=np.concatenate(columns),
+        pass_i=np.concatenate(pass_i),
+        indentation=_count_on([readings.indentation[keep] for readings, keep in pairs]),
+        dropped={"no_contact_rows_n": places_unknown_n, "low_force_rows_n": weak_n},
+    )
+
+
+def stack(above: Rows, below: Rows) -> Rows:
+    """Put rows below others, whose numbers stay what they were; indentations below are numbered after those above."""
+    if below.db_uT.shape[1:] != above.db_uT.shape[1:]:
+        rule = f"the {above.db_uT.shape[1]} of {above.capture[0]}"
+        raise ParamsError(
+            f"capture {below.capture[0]}", "channels", rule, below.db_uT.shape[1], "Use boards of one kind."
+        )
+    stacked = {name: np.concatenate([getattr(above, name), getattr(below, name)]) for name in AS_THEY_ARE}
+    indentation = np.concatenate([above.indentation, below.indentation + above.indentation.max() + 1])
+    return Rows(**stacked, indentation=indentation, dropped=above.dropped)
+
+
+def contacts(readings: Readings, selection: Selection) -> np.ndarray:
+    """Mark the readings that count as a contact."""
+    placed = ~(np.isnan(readings.x_mm) | np.isnan(readings.y_mm))
+    weak = readings.Fz_N < selection.force_min_N  # unknown force (NaN) is not weak
+    return placed & ~weak
+
+
+def _count_on(indentations: list[np.ndarray]) -> Int64[np.ndarray, " f"]:
+    """Number the indentations of each capture after those of the one before."""
+    before_n, counted = 0, []
+    for numbers in indentations:
+        distinct, index = np.unique(numbers, return_inverse=True)
+        counted.append(before_n + index)
+        before_n += len(distinct)
+    return np.concatenate(counted)
+
+
+def _check_one_kind(captures: Sequence[Readings]) -> None:
+    first = captures[0]
+    boards: dict[str, str] = {}
+    for readings in captures:
+        where, skin = f"capture {readings.capture}", readings.skin
+        if readings.chips_n != first.chips_n:
+            what, rule = "chips of a scene's captures", f"the {first.chips_n} of {first.capture}"
+            raise ParamsError(where, what, rule, readings.chips_n, "Add it to a scene of its own.")
+        if readings.source != first.source:
+            rule = f"{first.source}, as {first.capture} is"
+            remedy = "Simulated and recorded captures belong to different scenes."
+            raise ParamsError(where, "source", rule, readings.source, remedy)
+        if boards.setdefault(skin, readings.board) != readings.board:
+            remedy = "A skin moved to another board is a new skin here: give it a new name."
+            raise ParamsError(where, f"the board of skin {skin}", f"{boards[skin]}, as before", readings.board, remedy)
+
+
+SCORED = "before_touch.parquet"  # beside the models of one skin: how well this alone tells a place
+
+
+@dataclass(frozen=True)
+class Scan:
+    """Of the rows that `gather` stacks: the no-load field, and the number of the indentation in its pass."""
+
+    noload_uT: Float32[np.ndarray, "f ch"]
+    scan_i: Int64[np.ndarray, " f"]
+
+
+def gather_scan(captures: Sequence[Readings], selection: Selection) -> Scan:
+    """Stack what is known before each touch, in the order of `gather`."""
+    captures = sorted(captures, key=lambda readings: readings.capture)
+    kept = [contacts(readings, selection) for readings in captures]
+    noload = [readings.noload_uT[keep] for readings, keep in zip(captures, kept, strict=True)]
+    scan = [number_in_pass(readings)[keep] for readings, keep in zip(captures, kept, strict=True)]
+    return Scan(np.concatenate(noload), np.concatenate(scan))
+
+
+def number_in_pass(readings: Readings) -> Int64[np.ndarray, " f"]:
+    """Number the indentations of each pass from 0, those that are no row for a model included."""
+    passes, of_pass = np.unique(readings.pass_i, return_inverse=True)
+    indentation = readings.indentation.astype(np.int64)
+    first = np.full(len(passes), indentation.max())
+    np.minimum.at(first, of_pass, indentation)
+    return indentation - first[of_pass]
+
+
+@dataclass(frozen=True)
+class Hover:
+    """Rows of a tip that is over a known place and does not touch; `pass_i` counts as that of `Rows` does."""
+
+    db_uT: Float32[np.ndarray, "f ch"]
+    place_mm: Float32[np.ndarray, "f 2"]
+    skin: np.ndarray
+    pass_i: Int64[np.ndarray, " f"]
+
+    def __len__(self) -> int:
+        return len(self.skin)
+
+
+def gather_hover(captures: Sequence[Readings]) -> Hover:
+    """Stack the rows without force between the contacts of a pass, each at the place of the contact that comes next.
+
+    A tip that goes down on a place in steps hovers over it first. Rows before the first contact of a pass are its
+    no-load reading, and rows after the last have no place.
+    """
+    parts: list[tuple[np.ndarray, ...]] = []
+    passes_n: dict[str, int] = {}
+    for one in sorted(captures, key=lambda readings: readings.capture):
+        before_n = passes_n.get(one.skin, 0)
+        passes_n[one.skin] = before_n + int(one.pass_i.max()) + 1
+        touches = np.flatnonzero(np.isfinite(one.x_mm) & (one.Fz_N > 0))
+        empty = np.flatnonzero(np.isnan(one.x_mm) & (one.Fz_N == 0))
+        after = np.searchsorted(touches, empty)
+        inside = (after > 0) & (after < len(touches))
+        empty, last, coming = empty[inside], touches[after[inside] - 1], touches[after[inside]]
+        same = (one.pass_i[last] == one.pass_i[empty]) & (one.pass_i[coming] == one.pass_i[empty])
+        empty, coming = empty[same], coming[same]
+        place_mm = np.column_stack([one.x_mm[coming], one.y_mm[coming]])
+        skins, pass_i = np.full(len(empty), one.skin), one.pass_i[empty].astype(np.int64) + before_n
+        parts.append((one.b_uT[empty] - one.noload_uT[empty], place_mm, skins, pass_i))
+    return Hover(*(np.concatenate(part) for part in zip(*parts, strict=True)))

@@ -1,0 +1,284 @@
+"""Who is held out: boards, sensors, one skin's readings, indentations or passes. In: rows, settings. Out: folds.
+
+The drawing is scikit-learn's; this module names the groups and proves that no skin or board is on both sides of a fold
+between skins. Refuses to know what is trained on a fold.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import partial
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Int64, Shaped
+from pydantic import Field, field_validator
+
+from reskin.config import Strict
+from reskin.data.lines import take_pokes
+from reskin.data.rows import Rows
+from reskin.errors import ParamsError
+from reskin.seeds import rng_for, seed_for
+
+WITHIN_SKIN = {"single_random": "readings", "single_indentation": "indentations", "single_pass": "passes"}  # and units
+SAME_SKIN = {"single_temporal", *WITHIN_SKIN}  # questions that test on the skin that was learnt on
+ONE_SKIN = {"transfer", *SAME_SKIN}  # questions whose networks are trained on one skin
+Count = Annotated[int, Field(ge=1)]
+Fraction = Annotated[float, Field(gt=0, lt=1)]
+STATES_N = 2**32  # scikit-learn's seeds are below it
+
+Sides = tuple[Int64[np.ndarray, " a"], Int64[np.ndarray, " b"]]  # train and test
+
+
+class Split(Strict):
+    """How folds are drawn; each part is there if, and only if, its question is asked."""
+
+    random_test_fraction: Fraction | None = None
+    random_repeats_n: Count | None = None
+    temporal_test_fraction: Fraction | None = None
+    transfer_skins_n: Count | None = None
+    sensors_skins_n: Annotated[tuple[Count, ...], Field(min_length=1)] | None = None
+    sensors_draws_n: Count | None = None
+    pool_passes_n: Count | None = None  # of each held-out skin, its first ones
+    labels_pool_n: Count | None = None  # indentations of each held-out skin that may be labelled, of all depths
+    labels_draws_n: Count | None = None
+
+    @field_validator("sensors_skins_n")
+    @classmethod
+    def _sensors_differ(cls, skins_n: tuple[int, ...] | None) -> tuple[int, ...] | None:
+        if skins_n is not None and len(set(skins_n)) < len(skins_n):
+            raise ValueError(f"sensors_skins_n names each number of skins once, not {list(skins_n)}")
+        return skins_n
+
+
+@dataclass(frozen=True)
+class Fold:
+    """Row numbers (of `Rows`): the two sides of one hold-out, and the pool of unlabelled pokes on the held-out skins.
+
+    Adaptation may poke in the pool; nothing is scored there, so that every method is scored on the same rows.
+    """
+
+    question: str
+    name: str
+    train: Int64[np.ndarray, " a"]
+    test: Int64[np.ndarray, " b"]
+    pool: Int64[np.ndarray, " c"]
+
+
+NO_POOL = np.zeros(0, np.int64)
+
+
+def draw_folds(rows: Rows, questions: Iterable[str], split: Split, seed: int) -> list[Fold]:
+    """Draw the folds of every question that a scene asks.
+
+    >>> rows = Rows.of_labels(boards=["b1", "b1", "b2"], skins=["s1", "s2", "s3"])
+    >>> [(fold.name, fold.train.tolist(), fold.test.tolist()) for fold in draw_folds(rows, ["lobo"], Split(), 0)]
+    [('b1', [2], [0, 1]), ('b2', [0, 1], [2])]
+
+    With a pool, the first passes of each held-out skin are adapted on, and its later ones tested:
+
+    >>> rows = Rows.of_labels(["b1"] * 3 + ["b2"] * 2, ["s1"] * 3 + ["s2"] * 2, pass_i=[0, 1, 2, 0, 1])
+    >>> def show(folds):
+    ...     for fold in folds:
+    ...         print(fold.name, fold.train, fold.pool, fold.test)
+    >>> show(draw_folds(rows, ["lobo"], Split(pool_passes_n=1), 0))
+    b1 [3 4] [0] [1 2]
+    b2 [0 1 2] [3] [4]
+
+    Fewer sensors: every board is held out in turn, and each draw adds skins to those that it had:
+
+    >>> rows = Rows.of_labels(["b1", "b1", "b2", "b3"], ["s1", "s2", "s3", "s4"])
+    >>> show(draw_folds(rows, ["sensors"], Split(sensors_skins_n=(1, 2), sensors_draws_n=1), 0))
+    b1-01skins-draw0 [3] [] [0 1]
+    b1 [2 3] [] [0 1]
+    b2-01skins-draw0 [1] [] [2]
+    b2-02skins-draw0 [0 1] [] [2]
+    b3-01skins-draw0 [0] [] [3]
+    b3-02skins-draw0 [0 1] [] [3]
+    """
+    return [fold for question in questions for fold in _DRAW[question](rows, split, seed)]
+
+
+def leave_one_board_out(rows: Rows, split: Split, seed: int) -> list[Fold]:
+    """One fold a board: train on all other boards, test on its skins (paper section 5.1)."""
+    boards = np.unique(rows.board)
+    if len(boards) < 2:
+        remedy = "Add another board's recording, or take lobo out of the scene's questions."
+        raise ParamsError("question lobo", "boards", "two or more", f"{len(boards)} ({', '.join(boards)})", remedy)
+    folds = []
+    for board in boards:
+        sides = np.flatnonzero(rows.board != board), np.flatnonzero(rows.board == board)
+        folds.append(hold_out_skins(rows, "lobo", str(board), sides, split))
+    return folds
+
+
+def fewer_sensors(rows: Rows, split: Split, seed: int) -> list[Fold]:
+    """Train on k skins of all boards but one, test on that board; one fold a board, k and draw (paper figure 6b).
+
+    Every board is held out in turn and has draws of its own. Within a draw, the skins of a smaller k are among those of
+    a larger one. All of them are the fold of `lobo`, drawn once and named as there, so that its trainings are reused.
+    """
+    assert split.sensors_skins_n is not None
+    assert split.sensors_draws_n is not None
+    folds = []
+    for board in np.unique(rows.board):
+        held, skins = np.flatnonzero(rows.board == board), np.unique(rows.skin[rows.board != board])
+        if max(split.sensors_skins_n) > len(skins):
+            rule = f"at most the {len(skins)} skins beside held-out board {board}"
+            remedy = "Ask for fewer, or add another board's recording."
+            raise ParamsError("question sensors", "split.sensors_skins_n", rule, max(split.sensors_skins_n), remedy)
+        draws = range(split.sensors_draws_n)
+        orders = [rng_for(seed, "sensors", str(board), draw_i).permutation(skins) for draw_i in draws]
+        for skins_n in split.sensors_skins_n:
+            for draw_i, order in enumerate(orders if skins_n < len(skins) else orders[:1]):
+                train = np.flatnonzero(np.isin(rows.skin, order[:skins_n]))
+                name = f"{board}-{skins_n:02d}skins-draw{draw_i}" if skins_n < len(skins) else str(board)
+                folds.append(hold_out_skins(rows, "sensors", name, (train, held), split))
+    return folds
+
+
+def few_labels(rows: Rows, split: Split, seed: int) -> list[Fold]:
+    """Hold a board out as in `lobo`, a random pool of its indentations to be labelled; one fold a board and draw.
+
+    The pool is not tested, whether its labels are used or not, so that all numbers of labels have equal tests.
+    """
+    assert split.labels_pool_n is not None
+    assert split.labels_draws_n is not None
+    plain = split.model_copy(update={"pool_passes_n": None})
+    folds = []
+    for whole in leave_one_board_out(rows, plain, seed):
+        skins = np.unique(rows.skin[whole.test])
+        for draw_i in range(split.labels_draws_n):
+            pools = []
+            for skin in skins:
+                on_skin, rng = whole.test[rows.skin[whole.test] == skin], rng_for(seed, "labels", str(skin), draw_i)
+                pools.append(take_pokes(rows, on_skin, split.labels_pool_n, rng))
+            pool = np.sort(np.concatenate(pools))
+            test = np.setdiff1d(whole.test, pool)
+            if not len(test):
+                what, rule = "split.labels_pool_n", "less than its indentations"
+                remedy = "Ask for fewer, or record more."
+                raise ParamsError(f"fold labels/{whole.name}", what, rule, split.labels_pool_n, remedy)
+            folds.append(Fold("labels", f"{whole.name}-draw{draw_i}", whole.train, test, pool))
+    return folds
+
+
+def one_skin_to_others(rows: Rows, split: Split, seed: int) -> list[Fold]:
+    """Train on one skin, test on skins of other boards; one fold a training skin.
+
+    Where others adapt, the pool is left out of the tests here too, so that all are scored on the same rows.
+
+    The paper trains on 3 skins, one at a time, and tests on 9 others: with 6 boards of 3 skins, the training skins
+    are the first of the first three boards and the tests all skins of the other three.
+    """
+    assert split.transfer_skins_n is not None
+    boards, train_n = np.unique(rows.board), split.transfer_skins_n
+    if train_n >= len(boards):
+        rule = f"less than the scene's {len(boards)} boards"
+        remedy = "Each training skin takes a board; another must be left to test on."
+        raise ParamsError("question transfer", "split.transfer_skins_n", rule, train_n, remedy)
+    held = np.flatnonzero(np.isin(rows.board, boards[train_n:]))
+    folds = []
+    for board in boards[:train_n]:
+        skin = np.unique(rows.skin[rows.board == board])[0]
+        train = np.flatnonzero((rows.board == board) & (rows.skin == skin))
+        folds.append(hold_out_skins(rows, "transfer", str(skin), (train, held), split))
+    return folds
+
+
+def hold_out_skins(rows: Rows, question: str, name: str, sides: tuple[np.ndarray, np.ndarray], split: Split) -> Fold:
+    """Make a fold of train and held-out rows; with `pool_passes_n`, each held-out skin's first passes are its pool."""
+    train, held = sides
+    pooled = np.zeros(len(held), bool)
+    if split.pool_passes_n is not None:
+        for skin in np.unique(rows.skin[held]):
+            on_skin = rows.skin[held] == skin
+            passes = np.unique(rows.pass_i[held[on_skin]])
+            if len(passes) <= split.pool_passes_n:
+                what, rule = f"passes of held-out skin {skin}", f"more than split.pool_passes_n, {split.pool_passes_n}"
+                remedy = "Record more passes, or make the pool smaller."
+                raise ParamsError(f"question {question}", what, rule, len(passes), remedy)
+            pooled |= on_skin & np.isin(rows.pass_i[held], passes[: split.pool_passes_n])
+    fold = Fold(question, name, train, held[~pooled], held[pooled])
+    _prove_apart(rows, fold)
+    return fold
+
+
+def within_first_skin(rows: Rows, split: Split, seed: int, *, question: str) -> list[Fold]:
+    """Hold out random readings, indentations or passes of the first skin, repeatedly; at least one.
+
+    Readings are the paper's way (section 4): those of one indentation fall on both sides, which flatters the model.
+    """
+    assert split.random_test_fraction is not None
+    assert split.random_repeats_n is not None
+    group = {"readings": np.arange(len(rows)), "indentations": rows.indentation, "passes": rows.pass_i}
+    unit, skin_rows = WITHIN_SKIN[question], np.flatnonzero(rows.skin == np.unique(rows.skin)[0])
+    sides = draw_sides(
+        group[unit][skin_rows], test_fraction=split.random_test_fraction, repeats_n=split.random_repeats_n,
+        state=seed if unit == "readings" else seed_for(seed, question),
+        what=f"{unit} of skin {rows.skin[skin_rows[0]]}", where=f"question {question}",
+    )  # fmt: skip
+    return [Fold(question, f"repeat{i}", skin_rows[a], skin_rows[b], NO_POOL) for i, (a, b) in enumerate(sides)]
+
+
+def last_passes(rows: Rows, split: Split, seed: int) -> list[Fold]:
+    """Train on the first passes of a skin, test on its last; one fold a skin."""
+    assert split.temporal_test_fraction is not None
+    folds = []
+    for skin in np.unique(rows.skin):
+        skin_rows = np.flatnonzero(rows.skin == skin)
+        captures = np.unique(rows.capture[skin_rows])
+        if len(captures) > 1:
+            what, rule = f"the captures of skin {skin}", "one, as no clock orders several"
+            remedy = "Record the passes in one capture, or ask single_random."
+            raise ParamsError("question single_temporal", what, rule, ", ".join(captures), remedy)
+        pass_i = rows.pass_i[skin_rows]
+        passes, what = np.unique(pass_i), f"passes of skin {skin}"
+        test_n = _test_n(len(passes), split.temporal_test_fraction, what, "question single_temporal")
+        train, test = (skin_rows[np.isin(pass_i, side)] for side in (passes[:-test_n], passes[-test_n:]))
+        folds.append(Fold("single_temporal", str(skin), train, test, NO_POOL))
+    return folds
+
+
+def draw_sides(
+    group: Shaped[np.ndarray, " f"], *, test_fraction: float, repeats_n: int, state: int, what: str, where: str
+) -> list[Sides]:
+    """Draw test groups, repeatedly: rows of equal `group` stay together; one group at least is tested.
+
+    `what` the groups are and `where` they are asked for stand in errors.
+    """
+    from sklearn.model_selection import GroupShuffleSplit  # late: it takes a second, and most stages draw nothing
+
+    groups_n = len(np.unique(group))
+    test_n = _test_n(groups_n, max(test_fraction, 1 / groups_n), what, where)
+    shuffle = GroupShuffleSplit(repeats_n, test_size=test_n, random_state=state % STATES_N)
+    return [(train, test) for train, test in shuffle.split(group, groups=group)]
+
+
+def _test_n(all_n: int, fraction: float, what: str, where: str) -> int:
+    """Round the number held out to the nearest; both sides need one at least."""
+    test_n = round(fraction * all_n)
+    if not 0 < test_n < all_n:
+        got = f"{all_n}, of which {fraction:g} are {test_n}"
+        remedy = "Record more, change the fraction, or take the question out of the scene's."
+        raise ParamsError(where, what, "enough for both sides", got, remedy)
+    return test_n
+
+
+def _prove_apart(rows: Rows, fold: Fold) -> None:
+    held = np.concatenate([fold.test, fold.pool])
+    for what, labels in (("board", rows.board), ("skin", rows.skin)):
+        both = np.intersect1d(np.unique(labels[fold.train]), np.unique(labels[held]))
+        if len(both):
+            where, got = f"fold {fold.question}/{fold.name}", f"{', '.join(both)} on both"
+            remedy = "Give every skin its own name, and each skin one board."
+            raise ParamsError(where, f"a {what}", "on one side only", got, remedy)
+
+
+_DRAW: dict[str, Callable[[Rows, Split, int], list[Fold]]] = {
+    "lobo": leave_one_board_out,
+    "sensors": fewer_sensors,
+    "labels": few_labels,
+    "transfer": one_skin_to_others,
+    "single_temporal": last_passes,
+    **{question: partial(within_first_skin, question=question) for question in WITHIN_SKIN},
+}

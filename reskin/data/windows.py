@@ -1,0 +1,114 @@
+"""Windows of captures in order of time under several no-load policies. In: `Readings`. Out: parts, one stack of rows.
+
+A window is a range of units (indentations or passes); a part is one window of one skin under one policy. Refuses to
+know what is trained on a part.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from jaxtyping import Bool, Int64
+
+from reskin.data.rows import Rows, Selection, gather
+from reskin.errors import ParamsError
+from reskin.schema import LABELS, Readings
+
+Policy = Callable[[Readings], np.ndarray]  # -> the no-load field of each row
+TRAIN = -1
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Half-open ranges of units: those trained on, and each test's; a window that was cut short is left out."""
+
+    train: tuple[int, int]
+    tests: tuple[tuple[int, int], ...]
+    left_out_units_n: int
+
+
+@dataclass(frozen=True)
+class Part:
+    """A window's rows in the stack of all; window `TRAIN` is the one trained on."""
+
+    policy: str
+    window_i: int
+    readings: Readings
+    rows: Rows
+    noload_off_uT: float  # rms over rows and channels: the policy's no-load field less that read before the contact
+    first_row_i: int
+
+    @property
+    def row_i(self) -> Int64[np.ndarray, " f"]:
+        """The numbers of its rows in the stack."""
+        return np.arange(self.first_row_i, self.first_row_i + len(self.rows))
+
+
+def lay_windows(units_n: Sequence[int], *, train_n: int, test_n: int, every_n: int) -> Windows:
+    """Train on the first units, test on some after every so many, as far as all captures go (paper section 4).
+
+    `units_n` is the length of each capture, in units.
+
+    >>> lay_windows([23], train_n=5, test_n=2, every_n=5)
+    Windows(train=(0, 5), tests=((5, 7), (10, 12), (15, 17), (20, 22)), left_out_units_n=0)
+    >>> lay_windows([21], train_n=5, test_n=2, every_n=5)
+    Windows(train=(0, 5), tests=((5, 7), (10, 12), (15, 17)), left_out_units_n=1)
+    """
+    windows_n = max(0, (min(units_n) - test_n) // every_n)
+    if not windows_n:
+        rule = f"at least drift.every_n + test_n = {every_n + test_n} long"
+        remedy = "Record more, or make the windows smaller."
+        raise ParamsError("question drift", "the shortest capture", rule, min(units_n), remedy)
+    tests = tuple((i * every_n, i * every_n + test_n) for i in range(1, windows_n + 1))
+    left_out_n = sum(max(0, length_n - (windows_n + 1) * every_n) for length_n in units_n)
+    return Windows((0, train_n), tests, left_out_n)
+
+
+def take(readings: Readings, rows: Bool[np.ndarray, " f"]) -> Readings:
+    arrays = [name for name in Readings.__dataclass_fields__ if name not in LABELS]
+    return replace(readings, **{name: getattr(readings, name)[rows] for name in arrays})
+
+
+def check_one_each(captures: Sequence[Readings]) -> None:
+    """Raise if a skin has several captures: no clock orders them."""
+    names: dict[str, list[str]] = {}
+    for readings in captures:
+        names.setdefault(readings.skin, []).append(readings.capture)
+    for skin, of_skin in names.items():
+        if len(of_skin) > 1:
+            what, rule = f"the captures of skin {skin}", "one, as no clock orders several"
+            remedy = "Record its contacts in one capture, or give each skin its own name."
+            raise ParamsError("question drift", what, rule, ", ".join(of_skin), remedy)
+
+
+def lay_parts(
+    captures: Sequence[tuple[Readings, Int64[np.ndarray, " _"]]],
+    policies: Mapping[str, Policy],
+    *,
+    windows: Windows,
+    selection: Selection,
+) -> list[Part]:
+    """Lay the rows of every capture, policy and window below each other; beside a capture stands the unit of each row.
+
+    A policy sees the whole capture, whatever the windows and the selection leave out.
+    """
+    parts: list[Part] = []
+    next_i = 0
+    for readings, unit_i in captures:
+        for policy, choose in policies.items():
+            changed = replace(readings, noload_uT=choose(readings))
+            off_uT = (changed.noload_uT - readings.noload_uT).astype(float)
+            for window_i, (start, end) in enumerate((windows.train, *windows.tests), TRAIN):
+                inside = (unit_i >= start) & (unit_i < end)
+                window, rms_uT = take(changed, inside), float(np.sqrt((off_uT[inside] ** 2).mean()))
+                parts.append(Part(policy, window_i, window, gather([window], selection), rms_uT, next_i))
+                next_i += len(parts[-1].rows)
+    return parts
+
+
+def stack(parts: Sequence[Part]) -> Rows:
+    """Make one set of rows of all parts; what the selection left out is counted once, as it is so for every policy."""
+    arrays = [field.name for field in fields(Rows) if field.name != "dropped"]
+    stacked = {name: np.concatenate([getattr(part.rows, name) for part in parts]) for name in arrays}
+    dropped = [part.rows.dropped for part in parts if part.policy == parts[0].policy]
+    return Rows(**stacked, dropped={reason: sum(counts[reason] for counts in dropped) for reason in dropped[0]})

@@ -1,0 +1,277 @@
+"""Read and write files: Parquet, safetensors, JSON, CSV and text, each written whole or not at all.
+
+Also keeps arrays that take seconds to compute beside compiled code, as a cache.
+"""
+
+import errno
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import safetensors
+import safetensors.numpy
+
+from reskin.errors import DISK, SchemaError
+from reskin.numerics import signature
+from reskin.schema import Readings, arrow_schema, from_table, to_table
+
+ACCOUNT_KEY = b"reskin.account"
+DIGEST = "digest"  # of a file of arrays, among its words
+HEADER_AT = 8  # bytes of a safetensors file before its header: the header's length
+MEND = "It was cut or changed. In a checkout: delete it, then `reskin check-cache` and `dvc repro`; else copy it again."
+OF_MACHINE = {
+    errno.EACCES,
+    errno.EIO,
+    errno.EMFILE,
+    errno.ENFILE,
+    errno.ESTALE,
+}  # a file that cannot be read now is not damaged
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Give a temporary sibling of `path` to write (a file or a folder); rename it when the block ends well."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        remove(temporary)
+        yield temporary
+        if temporary.is_dir():
+            remove(path)
+        elif path.is_dir():
+            raise SchemaError(path, "a file to write", "no folder", "a folder", "Choose another name.")
+        temporary.replace(path)
+    except BaseException as error:
+        if isinstance(error, OSError) and error.errno in DISK and _is_written(error, temporary):
+            error.filename = str(path)  # not the temporary name, which nobody knows
+        with suppress(OSError):  # what the disk refuses here, too, is told by the first error
+            remove(temporary)
+        raise
+
+
+def _is_written(error: OSError, temporary: Path) -> bool:
+    """Tell whether a disk refused what is being written; it may have refused a file that is read for it."""
+    if error.filename is None:  # an open stream's own; of EIO nobody knows whether it was read or written
+        return error.errno != errno.EIO
+    names = (error.filename,) if error.errno == errno.EIO else (error.filename, error.filename2)  # copyfile gives both
+    return any(str(temporary) in str(name) for name in names)
+
+
+@contextmanager
+def restoring(*files: Path) -> Iterator[None]:
+    """Give files their old content back if the block fails, Ctrl-C included."""
+    before = {file: file.read_bytes() for file in files}
+    try:
+        yield
+    except BaseException:
+        for file, content in before.items():
+            if file.read_bytes() != content:
+                with replacing(file) as temporary:
+                    temporary.write_bytes(content)
+        raise
+
+
+def remove(path: Path) -> None:
+    """Delete a file or a folder, if it is there."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def sha256(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def read_bytes(path: Path) -> bytes:
+    """Read a whole file; raise `SchemaError` if it is not one."""
+    _need(path)
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise SchemaError(path, "the file", "readable", error.strerror, "Check the path.") from None
+
+
+def write_text(path: Path, text: str) -> None:
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
+    """Write a folder of texts by file name, in place of what it held."""
+    with replacing(folder) as temporary:
+        temporary.mkdir()
+        for name, text in texts.items():
+            write_text(temporary / name, text)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write JSON with two-space indent; NaN and infinity are refused, as JSON has neither."""
+    write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
+
+
+def read_json(path: Path) -> Any:
+    """Read JSON; raise `SchemaError` with the place of the first fault."""
+    _need(path)
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise SchemaError(path, "the file", "JSON", error, "Run its stage again.") from None
+
+
+def write_tensors(path: Path, tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> None:
+    """Write named arrays and a few words about them as safetensors, with a digest of all of it."""
+    dense = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
+    words = {**metadata, DIGEST: _digest(dense, metadata)}
+    content = safetensors.numpy.save(dense, words)
+    with replacing(path) as temporary, temporary.open("wb") as stream:  # save_file hides what a disk refused
+        stream.write(content[:HEADER_AT] + _in_order(content, words))
+        stream.write(memoryview(content)[stream.tell() :])
+
+
+def read_tensors(
+    path: Path, names: Sequence[str] = (), *, digest_needed: bool = False
+) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """Read what `write_tensors` wrote; no pickle is ever opened.
+
+    All of it is held against its digest, which files of older code need not have; of single arrays, nothing is.
+    """
+    _need(path)
+    try:
+        with safetensors.safe_open(path, framework="numpy") as file:
+            tensors = {name: file.get_tensor(name) for name in names or file.keys()}
+            metadata: dict[str, str] = file.metadata() or {}
+    except (safetensors.SafetensorError, OSError) as error:
+        _pass_on(error)
+        raise SchemaError(path, "the file", "safetensors", error, f"Is it a trained model? {MEND}") from None
+    written = metadata.pop(DIGEST, None)
+    allowed = {_digest(tensors, metadata), *([] if digest_needed else [None])} if not names else {written}
+    if written not in allowed:
+        raise SchemaError(path, "the file", "as it was written", "other content", MEND)
+    return tensors, metadata
+
+
+def _digest(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> str:
+    found = hashlib.sha256(repr(sorted(metadata.items())).encode())
+    for name, values in sorted(tensors.items()):
+        found.update(f"{name} {values.dtype} {values.shape}".encode())
+        found.update(values.data)
+    return found.hexdigest()[:32]
+
+
+def _in_order(content: bytes, words: Mapping[str, str]) -> bytes:
+    # The header of a safetensors file with its words sorted: the library's order changes from one process to the next.
+    length = int.from_bytes(content[:HEADER_AT], "little")
+    header = json.loads(content[HEADER_AT : HEADER_AT + length]) | {"__metadata__": dict(sorted(words.items()))}
+    return json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode().ljust(length)
+
+
+def write_table(path: Path, table: pa.Table) -> None:
+    with replacing(path) as temporary:
+        pq.write_table(table, temporary, compression="zstd", write_page_checksum=True)
+
+
+def read_table(path: Path) -> pa.Table:
+    with _parquet(path) as file:
+        return file.read()
+
+
+def write_readings(path: Path, blocks: Iterable[Readings], account: Mapping[str, int]) -> None:
+    """Write the readings of one capture block by block; `account` may still fill while blocks arrive."""
+    with replacing(path) as temporary:
+        writer: pq.ParquetWriter | None = None
+        for block in blocks:
+            if writer is None:
+                schema = arrow_schema(block.chips_n)
+                writer = pq.ParquetWriter(temporary, schema, compression="zstd", write_page_checksum=True)
+            writer.write_table(to_table(block))
+        if writer is None:
+            raise SchemaError(path, "a capture", "at least one reading", "none", "See what was dropped, and why.")
+        writer.add_key_value_metadata({ACCOUNT_KEY.decode(): json.dumps(dict(account), sort_keys=True)})
+        writer.close()
+
+
+def read_readings(path: Path) -> Readings:
+    return from_table(read_table(path), str(path))
+
+
+def read_account(path: Path) -> dict[str, int]:
+    """Read what ingest counted for one capture: bytes, frames, rows, and what was dropped, by reason."""
+    with _parquet(path) as file:
+        metadata = file.metadata.metadata or {}
+    if ACCOUNT_KEY not in metadata:
+        raise SchemaError(path, "the file's metadata", "an account of losses", "none", "Ingest it again.")
+    account: dict[str, int] = json.loads(metadata[ACCOUNT_KEY])
+    return account
+
+
+def _need(path: Path) -> None:
+    if not path.exists():
+        raise SchemaError(path, "the file", "there", "nothing", "Check the path, or run the stage that writes it.")
+
+
+def _pass_on(error: Exception) -> None:
+    """Raise what says nothing of the file: a disk, a right or a limit of the machine."""
+    if isinstance(error, OSError) and error.errno in OF_MACHINE:
+        raise error
+
+
+@contextmanager
+def _parquet(path: Path) -> Iterator[pq.ParquetFile]:
+    _need(path)
+    try:
+        yield pq.ParquetFile(path, page_checksum_verification=True)
+    except (pa.ArrowInvalid, pa.ArrowNotImplementedError, UnicodeDecodeError, OSError) as error:
+        _pass_on(error)
+        got = " ".join(str(error).split()).rstrip(".")
+        raise SchemaError(path, "the file", "readable Parquet", got, MEND) from None
+
+
+LIBRARIES = ("numpy", "scipy", "numba")
+
+
+def load(package: Path, name: str) -> np.ndarray | None:
+    """Read the array of this name; None where none is kept, or what is there cannot be read as an array."""
+    try:
+        return np.load(_file(package, name), allow_pickle=False)
+    except (OSError, ValueError, EOFError):
+        return None
+
+
+def save(package: Path, name: str, array: np.ndarray) -> None:
+    """Keep an array under this name, in place of an older one."""
+    try:
+        with replacing(_file(package, name)) as temporary, temporary.open("wb") as stream:
+            np.save(stream, array, allow_pickle=False)
+        for other in set(_folder(package).glob("kept-*.npy")) - set(_folder(package).glob(f"kept-{_state(package)}-*")):
+            remove(other)  # of a state that has passed
+    except OSError:
+        return  # a read-only or full disk costs seconds, no result
+
+
+def _file(package: Path, name: str) -> Path:
+    return _folder(package) / f"kept-{_state(package)}-{hashlib.sha256(name.encode()).hexdigest()[:16]}.npy"
+
+
+def _folder(package: Path) -> Path:
+    return package / "__pycache__"
+
+
+@cache
+def _state(package: Path) -> str:
+    found = hashlib.sha256(repr([(name, version(name)) for name in LIBRARIES]).encode())
+    found.update(repr(signature()).encode())
+    for source in sorted(package.glob("*.py")):
+        found.update(source.read_bytes())
+    return found.hexdigest()[:16]

@@ -1,0 +1,149 @@
+"""The words of the command line for boards and their files: `reskin ports`, `template`, `record`, `emulate`, `live`.
+
+Refuses to know how any of them works: each calls one module beside this one.
+"""
+
+import math
+import threading
+import time
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+from typer import Argument, Option
+
+app = typer.Typer()
+
+Wire = Literal["binary", "binary-clock", "text-xyzt", "text-txyz"]
+Speed = Annotated[float, Option(help="Times its own rate; inf: as fast as it is taken.", min=0.01)]
+Baud = Annotated[int, Option(help="Baud rate; USB ports ignore it.", min=1)]
+SOURCE = "A capture's folder, or the name of a simulated scene."
+ON_FAULT = "NAME=drop|flag|refuse: are readings that a fault has hit shown? May be repeated, such as stuck=flag."
+LABELS = "grid:NXxNY:STEP_MM or line:N:STEP_MM asks you to press places (Enter); or a CSV that a robot appends to."
+GAUGE = "Port of a force gauge that sends lines of Fz, or Fx Fy Fz, in N; @BAUD behind it, if not 9600."
+FAULT = "NAME[@START_S[+SECONDS]], such as stuck@3+1; may be repeated. A wrong name lists them all."
+
+
+@app.command()
+def find(
+    names: Annotated[list[str] | None, Argument(help="Ports to listen to; without any, all of this machine.")] = None,
+    hunt: Annotated[bool, Option("--hunt", help="Find the board by unplugging it and plugging it in again.")] = False,
+) -> None:
+    """Find boards: which port, what they send, how often, and the scale of their chips."""
+    from reskin.board import find
+
+    for found in find.find_boards([find.hunt(typer.echo)] if hunt else names):
+        typer.echo(found)
+
+
+@app.command()
+def template(
+    out: Annotated[Path, Argument(help="The CSV file to write; must be new.")],
+    chips_n: Annotated[int, Option("--chips", help="Chips in a frame.", min=1, max=64)] = 5,
+) -> None:
+    """Write the first line of a recording in layout `table`; which columns may go stands in data/README.md."""
+    from reskin import io
+    from reskin.errors import ParamsError
+    from reskin.recordings.readers.table import NEEDED, columns_of
+
+    if out.exists():
+        raise ParamsError(out, "the file", "new", "one that is there", "Choose another name.")
+    io.write_text(out, ",".join(columns_of(chips_n)) + "\n")
+    typer.echo(f"wrote {out}: {', '.join(NEEDED)} and fields in uT are needed. Then: reskin add --layout table")
+
+
+@app.command()
+def record(
+    port: Annotated[
+        str | None, Option(help="/dev/ttyACM0, COM3, socket://host:port; not given: the one there.")
+    ] = None,
+    board: Annotated[str | None, Option(help="The circuit board's name; `reskin add` asks for it anyhow.")] = None,
+    skin: Annotated[str | None, Option(help="The skin's name, likewise.")] = None,
+    out: Annotated[Path | None, Option(help="The capture's folder; new. Not given: captures/DATE-TIME.")] = None,
+    wire: Annotated[Wire | None, Option(help="What the firmware sends; with --port, binary if not given.")] = None,
+    chips_n: Annotated[int | None, Option("--chips", help="With --port, 5 if not given.", min=1, max=64)] = None,
+    baud: Baud = 115200,
+    seconds: Annotated[float, Option(help="How long; without it, until Ctrl-C.", min=0.0)] = math.inf,
+    scan: Annotated[str | None, Option(help="The order of the rig's places: random, snake, or your words.")] = None,
+    labels: Annotated[str | None, Option(help=LABELS)] = None,
+    gauge: Annotated[str | None, Option(help=GAUGE)] = None,
+    dwell_s: Annotated[float, Option("--dwell", help="How long each prompt's label holds, in s.", min=0.1)] = 1.0,
+) -> None:
+    """Record what a board sends, and labels beside it; or label it with the robot's log when adding it."""
+    from reskin.live.taping import Wanted, board_of, record_board, source_of
+
+    source = source_of(labels, gauge, scan, dwell_s=dwell_s, say=typer.echo)
+    told = {"board": board, "skin": skin, "scan": scan}
+    board_there = board_of(port, wire, chips_n, say=typer.echo)
+    wanted = Wanted(out, seconds, baud, {name: word for name, word in told.items() if word is not None})
+    done = record_board(board_there, wanted, source)
+    typer.echo(done.said)
+    if done.failed is not None:
+        raise typer.Exit(2)
+
+
+@app.command()
+def emulate(
+    source: Annotated[str, Argument(help=SOURCE)],
+    port: Annotated[str, Option(help="pty, tcp, tcp:PORT, or ./NAME of a link to a pseudo-terminal.")] = "pty",
+    speed: Speed = 1.0,
+    fault: Annotated[list[str] | None, Option(help=FAULT)] = None,
+    loop: Annotated[bool, Option("--loop", help="Begin again when it has ended.")] = False,
+) -> None:
+    """Be a board: send a capture or a simulated scene, with faults if asked, to whoever reads the port."""
+    from reskin.config import root_of_scenes
+    from reskin.live.emulator import inject, open_far_end, parse_fault, play, read_script
+
+    faults = [parse_fault(text) for text in fault or ()]
+    script = read_script(source, root_of_scenes())
+    for one in faults:
+        script = inject(script, one)
+    end, stop = open_far_end(port), threading.Event()
+    typer.echo(f"{end.name}: {len(script)} frames of {script.duration_s:.1f} s, {script.wire}; Ctrl-C ends it")
+    started_s = time.monotonic()
+    try:
+        sent_n = play(script, end, stop, speed=speed, loop=loop)
+        typer.echo(f"sent {sent_n} bytes in {time.monotonic() - started_s:.1f} s")
+    except KeyboardInterrupt:
+        typer.echo("stopped")
+    finally:
+        end.unplug()
+
+
+@app.command()
+def live(
+    port: Annotated[list[str] | None, Option(help="A board's port, or several; not given: all that are there.")] = None,
+    model: Annotated[
+        list[Path] | None, Option(help="Trained models, or one skin that was saved; else the map of simulated skins.")
+    ] = None,
+    replay: Annotated[str | None, Option(help="In place of a board: the folder of a capture.")] = None,
+    emulate: Annotated[str | None, Option(help="In place of a board: the name of a simulated scene.")] = None,
+    host: Annotated[str, Option(help="Where the page listens; elsewhere than here, behind a token.")] = "127.0.0.1",
+    http_port: Annotated[int, Option(help="The page's port.", min=1, max=65535)] = 8765,
+    on_fault: Annotated[list[str] | None, Option(help=ON_FAULT)] = None,
+) -> None:
+    """Show boards at work in the browser: chips, contact, force, traces, and what is wrong."""
+    from contextlib import ExitStack
+
+    from reskin.board.find import the_boards
+    from reskin.config import root_of_scenes
+    from reskin.errors import ParamsError
+    from reskin.live.emulator import playing, read_script
+    from reskin.live.health import LIVE
+    from reskin.live.server import serve
+    from reskin.live.session import several
+    from reskin.predicting import read_models
+    from reskin.recordings.fault_policy import decide
+
+    decisions = decide(LIVE, on_fault or (), "--on-fault")
+    given = [word for word, value in (("--port", port), ("--replay", replay), ("--emulate", emulate)) if value]
+    if len(given) > 1:
+        raise ParamsError("live", "the board", "from one of --port, --replay, --emulate", ", ".join(given), "Give one.")
+    models = read_models(model or ())
+    with ExitStack() as stack:
+        what = "a board"
+        if source := replay or emulate:
+            script = read_script(source, root_of_scenes())
+            port, what = [stack.enter_context(playing(script))], f"{script.source}: {source}, played"
+        boards = several(port or [found.port for found in the_boards()], models, what, decisions)
+        serve(boards, host=host, http_port=http_port, say=typer.echo)

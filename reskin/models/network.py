@@ -1,0 +1,120 @@
+"""The paper's perceptron: layers and first weights; and many at once. In: scaled inputs [m b c]. Out: scaled x, y, F.
+
+A stack of m networks is one tensor a layer, and a batched product replaces m small ones: for small networks calls cost
+more than sums. Refuses to know how it is trained, and in which units.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32
+from torch import nn
+
+from reskin.models.reproducible import affine
+from reskin.models.trial import Weights
+
+HIDDEN_N = 200
+FEATURES_N = 40  # the bottleneck that the triplet term acts on (paper section 4)
+FEATURE_LAYERS_N = 3
+OUTPUTS_N = 3  # x, y, F; five where shear is answered too: x, y, Fx, Fy, Fz
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A linear layer, and whether a ReLU follows it."""
+
+    in_n: int
+    out_n: int
+    relu: bool
+
+
+def paper_layers(inputs_n: int, outputs_n: int = OUTPUTS_N) -> tuple[Layer, ...]:
+    """B(15) -> MLP+ReLU(200) -> MLP(200) -> MLP(40) -> MLP+ReLU(200) -> MLP+ReLU(200) -> xyF(3), as printed."""
+    return _layers(inputs_n, outputs_n, relus=(True, False, False, True, True, False))
+
+
+def released_layers(inputs_n: int, outputs_n: int = OUTPUTS_N) -> tuple[Layer, ...]:
+    """The network that the authors released: also a ReLU after layer 2 and one on the output."""
+    return _layers(inputs_n, outputs_n, relus=(True, True, False, True, True, True))
+
+
+LAYERS = {"paper": paper_layers, "released": released_layers}
+
+
+def draw_weights(layers: Sequence[Layer], rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Draw first weights as PyTorch does by default for linear layers: uniform within 1/sqrt(fan in)."""
+    weights = {}
+    for i, layer in enumerate(layers, 1):
+        limit = layer.in_n**-0.5
+        for part, shape in (("weight", (layer.out_n, layer.in_n)), ("bias", (layer.out_n,))):
+            weights[f"layer{i}.{part}"] = rng.uniform(-limit, limit, shape).astype(np.float32)
+    return weights
+
+
+def _layers(inputs_n: int, outputs_n: int, relus: tuple[bool, ...]) -> tuple[Layer, ...]:
+    widths = (inputs_n, HIDDEN_N, HIDDEN_N, FEATURES_N, HIDDEN_N, HIDDEN_N, outputs_n)
+    return tuple(Layer(in_n, out_n, relu) for (in_n, out_n), relu in zip(pairwise(widths), relus, strict=True))
+
+
+BLOCK_ROWS_N = 65_536
+
+
+class Stack(nn.Module):
+    """Networks of one architecture, side by side; those of one stack never touch each other."""
+
+    def __init__(self, layers: Sequence[Layer], members: Sequence[Weights]) -> None:
+        super().__init__()
+        self.relus = [layer.relu for layer in layers]
+        self.members_n = len(members)
+        numbers = range(1, len(layers) + 1)
+        # In one piece: autograd and AdamW would copy gradients to the order of a merely transposed weight.
+        self.weights = nn.ParameterList(_stacked(members, f"layer{i}.weight").mT.contiguous() for i in numbers)
+        self.biases = nn.ParameterList(_stacked(members, f"layer{i}.bias")[:, None] for i in numbers)
+
+    def features(self, inputs: Float[torch.Tensor, "m b c"]) -> Float[torch.Tensor, "m b 40"]:
+        """What the first three layers make of a batch for each network."""
+        return self._run(inputs, 0, FEATURE_LAYERS_N)
+
+    def answer(self, features: Float[torch.Tensor, "m b 40"]) -> Float[torch.Tensor, "m b t"]:
+        return self._run(features, FEATURE_LAYERS_N, len(self.relus))
+
+    def forward(self, inputs: Float[torch.Tensor, "m b c"]) -> Float[torch.Tensor, "m b t"]:
+        return self.answer(self.features(inputs))
+
+    def member(self, i: int) -> dict[str, np.ndarray]:
+        """Take the weights of one network out, as `layer1.weight` [out in], `layer1.bias` [out], ..."""
+        taken = {}
+        for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True), 1):
+            taken[f"layer{k}.weight"] = weight.detach()[i].T.contiguous().cpu().numpy().copy()
+            taken[f"layer{k}.bias"] = bias.detach()[i, 0].cpu().numpy().copy()
+        return taken
+
+    def finite(self) -> Bool[torch.Tensor, " m"]:
+        return torch.stack([torch.isfinite(values.detach()).flatten(1).all(1) for values in self.parameters()]).all(0)
+
+    def _run(self, values: torch.Tensor, first: int, last: int) -> torch.Tensor:
+        for i in range(first, last):
+            values = affine(values, self.weights[i], self.biases[i])
+            values = torch.relu_(values) if self.relus[i] else values
+        return values
+
+
+class Predictor:
+    """One trained network, ready to answer; rows are answered a block at a time to bound memory."""
+
+    def __init__(self, weights: Weights, architecture: str, device: str) -> None:
+        inputs_n, outputs_n = weights["layer1.weight"].shape[1], len(weights[f"layer{len(weights) // 2}.bias"])
+        layers = LAYERS[architecture](inputs_n, outputs_n)
+        self.net, self.device = Stack(layers, [weights]).to(device), device
+
+    @torch.no_grad()
+    def __call__(self, inputs: Float32[np.ndarray, "n c"]) -> Float32[np.ndarray, "n t"]:
+        blocks = torch.from_numpy(inputs).split(BLOCK_ROWS_N)
+        return torch.cat([self.net(block[None].to(self.device))[0].cpu() for block in blocks]).numpy()
+
+
+def _stacked(members: Sequence[Weights], name: str) -> torch.Tensor:
+    return torch.from_numpy(np.stack([member[name] for member in members]))

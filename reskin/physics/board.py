@@ -1,0 +1,128 @@
+"""The circuit board, and every spread of boards and skins. In: a design and a name. Out: one `Board`, SI inside.
+
+A board is drawn from a generator that bears its name: board 7 stays the same when board 8 is added.
+Refuses to know magnets, skins and what a chip makes of the field (`sensor`).
+"""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import Field, model_validator
+from scipy.constants import micro, milli
+from scipy.spatial.transform import Rotation
+
+from reskin.config import Strict
+from reskin.seeds import rng_for
+
+CHIPS_MAX_N = 64
+Share = Annotated[float, Field(ge=0, le=0.5)]
+
+
+class Tiles(Strict):
+    """Several boards side by side under one skin, their middles on a lattice around its middle."""
+
+    columns_n: Annotated[int, Field(ge=1, le=CHIPS_MAX_N)]  # along x
+    rows_n: Annotated[int, Field(ge=1, le=CHIPS_MAX_N)]  # along y
+    pitch_mm: Annotated[float, Field(gt=0, le=500)]
+
+    @property
+    def middles_mm(self) -> list[tuple[float, float]]:
+        """Give the middles of the boards, row by row."""
+        x_mm, y_mm = (self.pitch_mm * (np.arange(n) - (n - 1) / 2) for n in (self.columns_n, self.rows_n))
+        return [(float(x), float(y)) for y in y_mm for x in x_mm]
+
+
+class BoardDesign(Strict):
+    """Where the chips sit, seen from the middle of the board, and how each is turned about z.
+
+    The scenes' turns are those that recordings show (tests/recordings/test_lab_frames.py), not those of a board file.
+    With `tiles`, this is one board of many; chips are then numbered board by board.
+    """
+
+    chips_xy_mm: Annotated[tuple[tuple[float, float], ...], Field(min_length=1, max_length=CHIPS_MAX_N)]
+    chips_turn_deg: tuple[float, ...]
+    gap_mm: Annotated[float, Field(gt=0, le=10)]  # sensing plane below the skin: rigid 1.1, flexible 0.6
+    tiles: Tiles | None = None
+
+    @model_validator(mode="after")
+    def _each_chip_is_turned(self) -> "BoardDesign":
+        if len(self.chips_xy_mm) != len(self.chips_turn_deg):
+            raise ValueError("chips_turn_deg needs one turn for each of chips_xy_mm")
+        if len(self.places_mm) > CHIPS_MAX_N:
+            raise ValueError(f"tiles make at most {CHIPS_MAX_N} chips in all, not {len(self.places_mm)}")
+        return self
+
+    @property
+    def places_mm(self) -> list[tuple[float, float]]:
+        """Give the places of all chips of all boards, seen from the middle of the skin."""
+        boards_mm = [(0.0, 0.0)] if self.tiles is None else self.tiles.middles_mm
+        return [(x + chip_x, y + chip_y) for x, y in boards_mm for chip_x, chip_y in self.chips_xy_mm]
+
+    @property
+    def turns_deg(self) -> list[float]:
+        """Give the turns of all chips of all boards."""
+        return [*self.chips_turn_deg] * (len(self.places_mm) // len(self.chips_xy_mm))
+
+
+class Spreads(Strict):
+    """Standard deviations between boards and between skins. All of them are ASSUMPTIONS (PHYSICS 6 and 7).
+
+    Factors are drawn as exp(sd * normal), so that they stay positive; all else is normal around the design.
+    """
+
+    board_gap: Share  # of the gap between skin and chips
+    board_uneven: Share  # of the gap over the outermost chips: a base that tilts along x or y, or bows
+    chip_gain: Share
+    chip_cross_axis: Share
+    chip_tilt_deg: Annotated[float, Field(ge=0, le=10)]
+    chip_offset_uT: Annotated[float, Field(ge=0, le=5000)]
+    skin_amplitude: Share  # of the magnetisation
+    skin_filler: Share  # of the magnetisation from place to place
+    skin_filler_length_mm: Annotated[float, Field(gt=0, le=50)]  # correlation exp(-r^2 / 2 length^2)
+    skin_thickness: Share
+    skin_modulus: Share
+    skin_seat_mm: Annotated[float, Field(ge=0, le=2)]  # skin sideways of its place on the board, each axis
+    skin_rotation_deg: Annotated[float, Field(ge=0, le=10)]  # skin about z
+    skin_depth_zero_mm: Annotated[float, Field(ge=0, le=0.2)]  # true depth minus commanded depth
+
+
+@dataclass(frozen=True)
+class Board:
+    """One board: z = 0 is where the skin's base lies; a chip reads sensitivity @ turn^T @ B + offset."""
+
+    name: str
+    chips_m: Float[np.ndarray, "k 3"]
+    turn: Float[np.ndarray, "k 3 3"]  # columns: the chip's axes in the board's frame
+    sensitivity: Float[np.ndarray, "k 3 3"]
+    offset_T: Float[np.ndarray, "k 3"]
+
+
+def draw_board(design: BoardDesign, spreads: Spreads, *, seed: int, name: str) -> Board:
+    """Draw the board called `name`; boards side by side lie at one gap (assumed: one skin holds them down)."""
+    rng = rng_for(seed, "board", name)
+    chips_n = len(design.places_mm)
+    gap_mm = design.gap_mm * np.exp(spreads.board_gap * rng.standard_normal())
+    tilt_deg = spreads.chip_tilt_deg * rng.standard_normal((chips_n, 2))
+    turn = Rotation.from_euler("ZYX", np.column_stack([design.turns_deg, tilt_deg]), degrees=True)
+    gain = np.exp(spreads.chip_gain * rng.standard_normal((chips_n, 3)))
+    cross = spreads.chip_cross_axis * rng.standard_normal((chips_n, 3, 3))
+    offset_T = spreads.chip_offset_uT * micro * rng.standard_normal((chips_n, 3))
+    gaps_mm = gap_mm * np.exp(spreads.board_uneven * _unevenness(design, rng))
+    return Board(
+        name=name,
+        chips_m=np.column_stack([np.array(design.places_mm), -gaps_mm]) * milli,
+        turn=turn.as_matrix(),
+        sensitivity=np.where(np.eye(3, dtype=bool), gain[:, :, None], cross),
+        offset_T=offset_T,
+    )
+
+
+def _unevenness(design: BoardDesign, rng: np.random.Generator) -> Float[np.ndarray, " k"]:
+    # Tilt and bow of the base over its board, of 1 at the outermost chip; the skin itself is taken as flat.
+    places_mm = np.array(design.chips_xy_mm)
+    away_mm = np.hypot(*places_mm.T)
+    share = places_mm / max(away_mm.max(), 1e-12)
+    uneven = np.column_stack([share, (share**2).sum(axis=1)]) @ rng.standard_normal(3)
+    return np.tile(uneven, len(design.places_mm) // len(places_mm))

@@ -1,0 +1,231 @@
+"""Fields of the magnetised skin: magnetisation, quadrature nodes, point dipoles, and the change when they move.
+
+SI units.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise, product
+from math import ceil, sqrt
+from typing import Annotated, Literal, no_type_check
+
+import numpy as np
+from jaxtyping import Float
+from numba import njit
+from pydantic import Field
+from scipy.constants import milli, mu_0
+
+from reskin.config import Strict
+from reskin.errors import ParamsError
+
+CUBE_SIDE_M = 6.35e-3  # 0.25 in cubes
+CUBES_N = (4, 4)  # along x and along y, under the authors' skin of 20 x 20 mm
+ARRAY_BELOW_M = 0.50e-3  # from the skin's base down to the lower cubes' faces, authors' CAD
+ARRAY_ABOVE_M = 0.25e-3  # from the skin's top up to the upper cubes' faces, authors' CAD
+ARRAY_REMANENCE_T = 1.32  # N42 cubes, assumed
+
+Polarity = Literal["checkerboard", "same"]  # the paper does not say; upper and lower cubes attract in both
+
+
+def cuboid_field(
+    observers_m: Float[np.ndarray, "o 3"], polarization_T: float, *, sides_m: tuple[float, float, float]
+) -> Float[np.ndarray, "o 3"]:
+    """Give the field, in tesla, of a box around the origin that is magnetised along z.
+
+    Two charged rectangles (Engel-Herbert & Hesjedal, J. Appl. Phys. 97:074504, 2005), plus J inside.
+    The lines through the box's edges are left to the caller: there the logarithms are infinite.
+    """
+    half_m = np.array(sides_m) / 2
+    b_T = np.zeros_like(observers_m)
+    for signs in product((1, -1), repeat=3):
+        b_T += np.prod(signs) * _corner(observers_m - half_m * signs)
+    b_T *= polarization_T / (4 * np.pi)
+    b_T[:, 2] += polarization_T * (np.abs(observers_m) < half_m).all(axis=1)
+    return b_T
+
+
+def _corner(from_m: Float[np.ndarray, "o 3"]) -> Float[np.ndarray, "o 3"]:
+    """Give what one corner of a box adds to its field, of 4 pi / J."""
+    x, y, z = from_m.T
+    xx, yy, zz = x * x, y * y, z * z
+    # asinh(y / hypot(x, z)) is log(y + r) less what both ends share, and keeps its digits where y < 0.
+    along_x, along_y = -np.arcsinh(y / np.sqrt(xx + zz)), -np.arcsinh(x / np.sqrt(yy + zz))
+    return np.stack([along_x, along_y, np.arctan(x * y / (z * np.sqrt(xx + yy + zz)))], axis=1)
+
+
+def cubes_along(side_m: float) -> int:
+    """Count the cubes along a side of a skin: enough to cover it, as the authors' four do (assumed of other skins)."""
+    return ceil(side_m / CUBE_SIDE_M - 1e-9)
+
+
+def seams_m(side_m: float) -> tuple[float, ...]:
+    """Say where two cubes touch along a side, from the skin's middle; there the magnetisation bends."""
+    n = cubes_along(side_m)
+    return tuple(CUBE_SIDE_M * (i - n / 2) for i in range(1, n))
+
+
+def array_field(
+    nodes_m: Float[np.ndarray, "s 3"], thickness_m: float, polarity: Polarity, *, cubes_n: tuple[int, int] = CUBES_N
+) -> Float[np.ndarray, "s 3"]:
+    """Sum the field of so many cubes below, and as many above, at places in the slab, in tesla.
+
+    Cubes that touch share corners: each corner is computed once, with the signs of all its cubes added up.
+    """
+    if not (nodes_m[:, 2].min() >= 0 and nodes_m[:, 2].max() <= thickness_m):
+        got = f"{nodes_m[:, 2].min():.3g} ... {nodes_m[:, 2].max():.3g} m"
+        raise ParamsError("magnet array", "places", "inside the slab", got, "Magnetise the skin at rest.")
+    signs = np.ones(cubes_n) if polarity == "same" else (-1.0) ** np.add.outer(*map(np.arange, cubes_n))
+    # Of a cube the corner on its right counts +, the one on its left -; along y and z likewise.
+    weights = -np.diff(-np.diff(np.pad(signs, 1), axis=0), axis=1)
+    below_m, above_m = -ARRAY_BELOW_M, thickness_m + ARRAY_ABOVE_M
+    faces_m = {below_m: 1, below_m - CUBE_SIDE_M: -1, above_m + CUBE_SIDE_M: 1, above_m: -1}
+    b_T = np.zeros_like(nodes_m)
+    for i, j in zip(*np.nonzero(weights), strict=True):
+        x_m, y_m = (CUBE_SIDE_M * (at - n / 2) for at, n in zip((i, j), cubes_n, strict=True))
+        for z_m, top in faces_m.items():
+            b_T += weights[i, j] * top * _corner(nodes_m - (x_m, y_m, z_m))
+    return b_T * ARRAY_REMANENCE_T / (4 * np.pi)
+
+
+def magnetise(b_T: Float[np.ndarray, "s 3"], *, saturation_T: float, half_field_T: float) -> Float[np.ndarray, "s 3"]:
+    """Give the magnetisation J that a field leaves in the powder: phi Br u^3 / (1 + u^3) along B, u = |B| / B_half."""
+    u = np.linalg.norm(b_T, axis=1, keepdims=True) / half_field_T
+    # u^2 / half_field_T stands for u^3 / |B|, which is finite where the field vanishes (seam crossings).
+    return saturation_T * b_T * u**2 / half_field_T / (1 + u**3)
+
+
+def moments(j_T: Float[np.ndarray, "s 3"], volumes_m3: Float[np.ndarray, " s"]) -> Float[np.ndarray, "s 3"]:
+    """Turn magnetisation into the dipole moment of each cell, in A m^2."""
+    return j_T * (volumes_m3 / mu_0)[:, None]
+
+
+SKIN_SIDE_M = 20e-3  # authors' CAD
+SKIN_SIDES_M = (SKIN_SIDE_M, SKIN_SIDE_M)
+SEAMS_M = seams_m(SKIN_SIDE_M)  # of the 4x4 array of 0.25 in cubes that magnetises the authors' skin
+
+
+class Rule(Strict):
+    """A rule of quadrature as a scene writes it: the nearer the chips, the finer it must be (question runtime)."""
+
+    cell_mm: Annotated[float, Field(gt=0, le=20)]
+    layers_n: Annotated[int, Field(ge=1, le=100)]
+
+    def quadrature(self) -> "Quadrature":
+        """Give it in SI."""
+        return Quadrature(self.cell_mm * milli, self.layers_n)
+
+
+@dataclass(frozen=True)
+class Quadrature:
+    """A rule: cells at most so wide, and so many Gauss nodes over the thickness."""
+
+    cell_m: float
+    layers_n: int
+
+
+CHOSEN = Quadrature(cell_m=0.5e-3, layers_n=6)  # 42 x 42 x 6 nodes; dB within 2 % of cells half as wide (test_skin)
+
+
+@dataclass(frozen=True)
+class Nodes:
+    """Nodes of a skin at rest; x and y from its middle, z from the base (0) to the top."""
+
+    nodes_m: Float[np.ndarray, "s 3"]
+    volumes_m3: Float[np.ndarray, " s"]
+
+
+def place_nodes(thickness_m: float, rule: Quadrature = CHOSEN, *, sides_m: tuple[float, float] = SKIN_SIDES_M) -> Nodes:
+    """Fill the skin with midpoints of cells that end at seams and edges, times Gauss nodes in z."""
+    if not (thickness_m > 0 and rule.cell_m > 0 and rule.layers_n > 0):
+        got = f"{thickness_m:.3g} m, {rule.cell_m:.3g} m and {rule.layers_n}"
+        raise ParamsError("quadrature", "thickness, cell and layers", "above 0", got, "Mend the design.")
+    (along_x_m, widths_x_m), (along_y_m, widths_y_m) = (_cells(side_m, rule) for side_m in sides_m)
+    gauss, weights = np.polynomial.legendre.leggauss(rule.layers_n)
+    x_m, y_m, z_m = np.meshgrid(along_x_m, along_y_m, (1 + gauss) / 2 * thickness_m, indexing="ij")
+    volumes_m3 = np.einsum("i,j,k->ijk", widths_x_m, widths_y_m, weights / 2 * thickness_m)
+    return Nodes(np.stack([x_m, y_m, z_m], axis=-1).reshape(-1, 3), volumes_m3.ravel())
+
+
+def _cells(side_m: float, rule: Quadrature) -> tuple[Float[np.ndarray, " i"], Float[np.ndarray, " i"]]:
+    """Give the middles and the widths of the cells along one side."""
+    marks_m = (-side_m / 2, *seams_m(side_m), side_m / 2)
+    spans = [np.linspace(a, b, ceil((b - a) / rule.cell_m - 1e-9) + 1) for a, b in pairwise(marks_m)]
+    centres_m = np.concatenate([(edges[1:] + edges[:-1]) / 2 for edges in spans])
+    return centres_m, np.concatenate([np.diff(edges) for edges in spans])
+
+
+MU0_4PI = mu_0 / (4 * np.pi)  # CODATA, T m / A; not exactly 1e-7 since 2019
+
+
+def field(
+    positions_m: Float[np.ndarray, "s 3"], moments_A_m2: Float[np.ndarray, "s 3"], observers_m: Float[np.ndarray, "o 3"]
+) -> Float[np.ndarray, "o 3"]:
+    """Sum the fields of all dipoles at each observer, in tesla."""
+    return field_of_each(positions_m, moments_A_m2, observers_m).sum(axis=1)
+
+
+def field_of_each(
+    positions_m: Float[np.ndarray, "s 3"], moments_A_m2: Float[np.ndarray, "s 3"], observers_m: Float[np.ndarray, "o 3"]
+) -> Float[np.ndarray, "o s 3"]:
+    """Give the field of each dipole at each observer: mu0/4pi (3 (m.r) r / r^5 - m / r^3), in tesla."""
+    # The axis of three comes first inside, so that every product runs over long contiguous rows.
+    separation = observers_m.T[:, :, None] - positions_m.T[:, None, :]
+    moment = moments_A_m2.T[:, None, :]
+    r2 = (separation * separation).sum(axis=0)
+    if r2.size and not r2.min() > 0:
+        raise ParamsError("dipole field", "distance to a chip", "above 0 m", "0 or NaN", "Move the chip.")
+    along = 3 * (moment * separation).sum(axis=0) / r2
+    each = (along * separation - moment) * (MU0_4PI / (r2 * np.sqrt(r2)))
+    return np.moveaxis(each, 0, 2)
+
+
+def change_of_field(
+    rest: tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]],
+    moved: tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]],
+    observers_m: Float[np.ndarray, "o 3"],
+) -> Float[np.ndarray, "o 3"]:
+    """Sum K(x) m' - K(X) m over the dipoles (positions in m, moments in A m^2) at rest (X, m) and moved (x, m').
+
+    Columns that lie together in memory (Fortran order, as `flow_map.move` gives them) are not copied.
+    """
+    rows = [np.ascontiguousarray(part.T) for part in (*rest, *moved)]
+    change_T = MU0_4PI * _sum_of_changes(*rows, np.ascontiguousarray(observers_m))
+    if not np.isfinite(change_T).all():
+        raise ParamsError("change of field", "distance to a chip", "above 0 m", "0 or NaN", "Move the chip.")
+    return change_T
+
+
+# Without fastmath the loop over nodes is still vectorised, since it sums nothing; what stays changes exactly nothing.
+# error_model: a division by zero gives infinity, as in NumPy, and is refused above; no test for it inside the loop.
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _sum_of_changes(nodes, moments, moved, moved_moments, observers):
+    u, v, w, p, q, t = nodes[0], nodes[1], nodes[2], moments[0], moments[1], moments[2]
+    a, b, c, f, g, h = moved[0], moved[1], moved[2], moved_moments[0], moved_moments[1], moved_moments[2]
+    change_x, change_y, change_z = np.empty(len(u)), np.empty(len(u)), np.empty(len(u))
+    total = np.zeros_like(observers)
+    for o in range(len(observers)):
+        x, y, z = observers[o]
+        for i in range(len(u)):
+            dx, dy, dz = x - a[i], y - b[i], z - c[i]
+            over_r2 = 1 / (dx * dx + dy * dy + dz * dz)
+            over_r3 = over_r2 * sqrt(over_r2)
+            along = 3 * over_r2 * (f[i] * dx + g[i] * dy + h[i] * dz)
+            ex, ey, ez = x - u[i], y - v[i], z - w[i]
+            over_q2 = 1 / (ex * ex + ey * ey + ez * ez)
+            over_q3 = over_q2 * sqrt(over_q2)
+            before = 3 * over_q2 * (p[i] * ex + q[i] * ey + t[i] * ez)
+            change_x[i] = (along * dx - f[i]) * over_r3 - (before * ex - p[i]) * over_q3
+            change_y[i] = (along * dy - g[i]) * over_r3 - (before * ey - q[i]) * over_q3
+            change_z[i] = (along * dz - h[i]) * over_r3 - (before * ez - t[i]) * over_q3
+        total[o, 0], total[o, 1], total[o, 2] = _total(change_x), _total(change_y), _total(change_z)
+    return total
+
+
+# reassoc: lets several partial sums run side by side. Infinities and NaN are still seen.
+@njit(cache=True, fastmath={"reassoc"})
+@no_type_check
+def _total(parts):
+    total = 0.0
+    for i in range(len(parts)):
+        total += parts[i]
+    return total

@@ -1,0 +1,199 @@
+"""One skin, and the change of field that pokes make. In: a design, a name, a board, pokes. Out: tesla and newtons.
+
+A skin is drawn from a generator that bears its name: skin 7 stays the same when skin 8 is added.
+Refuses to know chips' electronics, protocols and labels: pokes come as true places in the board's frame.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import Field, model_validator
+from scipy.constants import kilo, milli
+
+from reskin.config import Strict
+from reskin.errors import ParamsError
+from reskin.physics import flow_map, layer, magnet, slide
+from reskin.physics import magnet as dipole
+from reskin.physics.board import Board, Spreads
+from reskin.physics.magnet import CHOSEN, SKIN_SIDES_M, Quadrature, change_of_field, place_nodes
+from reskin.seeds import rng_for
+
+Dipoles = tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]  # positions in m, moments in A m^2
+
+FILLER_WAVES_N = 64  # plane waves that make up a skin's unevenness
+
+
+class SkinDesign(Strict):
+    """What all skins of a scene have in common, the tip that pokes them included."""
+
+    polarity: magnet.Polarity
+    flipped: bool  # every field has the other sign: a checkerboard skin that lies turned by a quarter
+    base: layer.Base
+    hold: slide.HoldDesign | None  # of a finite skin that slides as one; none: endless, its force that of `layer`
+    saturation_T: Annotated[float, Field(ge=0, le=1)]  # phi Br: volume fraction times remanence of the powder
+    half_field_T: Annotated[float, Field(gt=0, le=10)]  # field that magnetises the powder to half of that
+    thickness_mm: Annotated[float, Field(gt=0, le=20)]
+    modulus_kPa: Annotated[float, Field(ge=0, le=1e6)]
+    tip_radius_mm: Annotated[float, Field(gt=0, le=50)]
+
+    @model_validator(mode="after")
+    def _only_what_slides_is_held(self) -> "SkinDesign":
+        if self.hold is not None and self.base == "bonded":
+            raise ValueError("hold is of a skin that slides (base: slipping); of a bonded one it is null")
+        return self
+
+
+@dataclass(frozen=True)
+class Skin:
+    """One skin at rest on its board, in the board's frame; its pattern and its edges sit where the skin does."""
+
+    name: str
+    nodes_m: Float[np.ndarray, "s 3"]
+    moments_A_m2: Float[np.ndarray, "s 3"]
+    seat_m: Float[np.ndarray, " 2"]  # the skin's middle
+    sides_m: tuple[float, float]
+    thickness_m: float
+    modulus_Pa: float
+    tip_radius_m: float
+    depth_zero_m: float  # added to a commanded depth
+    base: layer.Base
+    hold: slide.Hold | None = None
+
+
+def draw_skin(
+    design: SkinDesign,
+    spreads: Spreads,
+    *,
+    seed: int,
+    name: str,
+    rule: Quadrature = CHOSEN,
+    sides_m: tuple[float, float] = SKIN_SIDES_M,
+) -> Skin:
+    """Draw the skin called `name`, as it sits on its board; another rule of quadrature sees the same skin.
+
+    An array of magnets that covers a skin of other sides magnetises it.
+    """
+    rng = rng_for(seed, "skin", name)
+    amplitude, thickness, modulus = np.exp(
+        np.array([spreads.skin_amplitude, spreads.skin_thickness, spreads.skin_modulus]) * rng.standard_normal(3)
+    )
+    seat_m = spreads.skin_seat_mm * milli * rng.standard_normal(2)
+    depth_zero_mm = spreads.skin_depth_zero_mm * rng.standard_normal()
+    rotation_rad = np.deg2rad(spreads.skin_rotation_deg) * rng.standard_normal()
+    thickness_m = float(design.thickness_mm * milli * thickness)
+    rest = place_nodes(thickness_m, rule, sides_m=sides_m)
+    cubes_n = (magnet.cubes_along(sides_m[0]), magnet.cubes_along(sides_m[1]))
+    b_T = magnet.array_field(rest.nodes_m, thickness_m, design.polarity, cubes_n=cubes_n)
+    j_T = magnet.magnetise(b_T, saturation_T=amplitude * design.saturation_T, half_field_T=design.half_field_T)
+    strength = _filler(rest.nodes_m[:, :2], spreads, rng) * (-1 if design.flipped else 1)
+    at_rest = rest.nodes_m, magnet.moments(j_T * strength[:, None], rest.volumes_m3)
+    seated = slide.Slide(seat_m[None], np.array([rotation_rad]))
+    nodes_m, moments_A_m2 = slide.apply(seated, 0, at_rest)
+    modulus_Pa = float(design.modulus_kPa * kilo * modulus)
+    return Skin(
+        name=name,
+        nodes_m=nodes_m,
+        moments_A_m2=moments_A_m2,
+        seat_m=seat_m,
+        sides_m=sides_m,
+        thickness_m=thickness_m,
+        modulus_Pa=modulus_Pa,
+        tip_radius_m=design.tip_radius_mm * milli,
+        depth_zero_m=float(depth_zero_mm * milli),
+        base=design.base,
+        hold=None if design.hold is None else slide.hold_of(design.hold),
+    )
+
+
+def changes_of_field(
+    board: Board, skin: Skin, pokes_m: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "n k 3"]]:
+    """Give the field at rest, and how each poke (x, y, depth) changes it, at the chips, in tesla.
+
+    No contact (true depth of zero or less): exactly zero. A poke beside the skin is refused.
+    """
+    # Chip by chip, to bound memory: a large skin under many chips has millions of pairs.
+    rest_T = np.concatenate([dipole.field(skin.nodes_m, skin.moments_A_m2, chip_m[None]) for chip_m in board.chips_m])
+    changes_T = np.zeros((len(pokes_m), *board.chips_m.shape))
+    for poke_i, before, after in moved_dipoles(skin, pokes_m):
+        changes_T[poke_i] = change_of_field(before, after, board.chips_m)
+    return rest_T, changes_T
+
+
+def moved_dipoles(skin: Skin, pokes_m: Float[np.ndarray, "n 3"]) -> Iterator[tuple[int, Dipoles, Dipoles]]:
+    """Yield index, dipoles at rest and dipoles moved, of each poke that moves some: of those within its reach alone.
+
+    What displaces them further may be applied to the last; `change_of_field` sums what they change.
+    """
+    true_m = pokes_m + np.array([0.0, 0.0, skin.depth_zero_m])
+    _refuse_beside(true_m, skin)
+    contacts = np.flatnonzero(~(true_m[:, 2] <= 0))  # a depth that is NaN goes on, to be refused
+    if not contacts.size:
+        return
+    rest = flow_map.at_rest(skin.nodes_m, skin.moments_A_m2, skin.thickness_m)
+    deepest_m = float(np.max(true_m[:, 2]))
+    table = flow_map.tabulate(skin.thickness_m, skin.tip_radius_m, deepest_m, heights=rest.heights, base=skin.base)
+    slides = None if skin.hold is None else press_slides(skin, skin.hold, true_m[contacts])
+    for i, poke_i in enumerate(contacts):
+        moved = flow_map.move(table, rest, true_m[poke_i])
+        if slides is not None:
+            slide.apply_in_place(slides, i, moved.after, skin.seat_m)
+        yield int(poke_i), moved.before, moved.after
+
+
+def press_slides(skin: Skin, hold: slide.Hold, true_m: Float[np.ndarray, "n 3"]) -> slide.Slide:
+    """Give how presses (x, y, true depth) slide a skin on its base, as one, as far as the tip's friction allows.
+
+    The slide away from the middle is gone at a depth, whatever the modulus; friction is felt in newtons.
+    """
+    places_m = true_m[:, :2] - skin.seat_m
+    relative_m2 = slide.force_at(
+        true_m[:, 2], modulus_Pa=1.0, thickness_m=skin.thickness_m, tip_radius_m=skin.tip_radius_m
+    )
+    load = np.minimum(relative_m2 / hold.lets_go_m2, 1.0)
+    taken_m = slide.under_tip_m(places_m, load, give_m=hold.give_m, away=hold.away)
+    whole = slide.rigid(places_m, taken_m, skin.sides_m)
+    return slide.gripped(whole, skin.modulus_Pa * relative_m2, hold.grip_N_per_m)
+
+
+def beyond_verified_n(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> int:
+    """Count the commanded depths that take this skin deeper than any published solution vouches for."""
+    return int(layer.beyond_verified(depth_m + skin.depth_zero_m, skin.thickness_m).sum())
+
+
+def forces(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Give the force that the tip feels at commanded depths, in newtons, positive in compression."""
+    of = {"thickness_m": skin.thickness_m, "tip_radius_m": skin.tip_radius_m, "modulus_Pa": skin.modulus_Pa}
+    true_m = depth_m + skin.depth_zero_m
+    if skin.hold is not None:
+        return slide.force_at(true_m, **of)
+    return layer.force(true_m, **of, base=skin.base)
+
+
+def shear_moduli_Pa(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Give the shear modulus that the layer under the tip shows at commanded depths; incompressible: E / 3."""
+    if skin.hold is None:
+        return np.full(len(depth_m), skin.modulus_Pa / 3)
+    return skin.modulus_Pa / 3 * slide.stiffening(depth_m + skin.depth_zero_m, skin.thickness_m)
+
+
+def _refuse_beside(pokes_m: Float[np.ndarray, "n 3"], skin: Skin) -> None:
+    # The layer is endless in the model: past the skin's edge it would press on material that is not there.
+    half_m = np.array(skin.sides_m) / 2
+    off = ~(np.abs(pokes_m[:, :2] - skin.seat_m) <= half_m).all(axis=1)
+    if off.any():
+        x_mm, y_mm = pokes_m[np.argmax(off), :2] / milli
+        rule = "on the skin, within {:.4g} and {:.4g} mm of its middle along x and y".format(*half_m / milli)
+        remedy = "Poke elsewhere, or lower skin_seat_mm."
+        raise ParamsError(f"skin {skin.name}", "poke", rule, f"({x_mm:.3g}, {y_mm:.3g}) mm", remedy)
+
+
+def _filler(xy_m: Float[np.ndarray, "s 2"], spreads: Spreads, rng: np.random.Generator) -> Float[np.ndarray, " s"]:
+    # A smooth random factor as a sum of plane waves: it knows no lattice, so a finer one sees the same skin.
+    waves = rng.standard_normal((FILLER_WAVES_N, 2)) / (spreads.skin_filler_length_mm * milli)
+    phases = rng.uniform(0, 2 * np.pi, FILLER_WAVES_N)
+    uneven = np.sqrt(2 / FILLER_WAVES_N) * np.cos(xy_m @ waves.T + phases).sum(axis=1)
+    return np.exp(spreads.skin_filler * uneven)

@@ -1,0 +1,298 @@
+"""Clocks: arrival times of frames, and the linear map from stream time to probe time."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+from jaxtyping import Bool, Float32, Float64, Int8, Int64
+
+from reskin.errors import CaptureError
+from reskin.recordings import columns
+from reskin.recordings.probe import ProbeLog
+
+TYPES = {"byte_end": pa.int64(), "t_s": pa.float64()}
+
+
+@dataclass(frozen=True)
+class Arrivals:
+    """The chunks of a stream in order, axis c: bytes come in all, and when."""
+
+    byte_end: Int64[np.ndarray, " c"]
+    t_s: Float64[np.ndarray, " c"]
+
+    def __len__(self) -> int:
+        return len(self.byte_end)
+
+
+def parse(source: str | Path, where: str) -> Arrivals:
+    """Read arrivals from CSV text, or from the file at a path; raise `CaptureError` naming the first bad row."""
+    table = columns.parse(source, TYPES, where)
+    if len(table) < 2:
+        raise CaptureError(where, "arrivals", "two rows or more", len(table), "Give a rate in the header.")
+    byte_end, t_s = (table.column(name).to_numpy() for name in TYPES)
+    for bad, name, rule in (
+        (~np.isfinite(byte_end), "byte_end", "known"),  # Arrow gives NaN for an empty field
+        (~np.isfinite(t_s), "t_s", "a finite time"),
+        (byte_end < 0, "byte_end", "0 or more"),
+        (np.diff(byte_end, prepend=-1) <= 0, "byte_end", "more than in the row above"),
+        (np.diff(t_s, prepend=t_s[0]) < 0, "t_s", "not before the row above"),
+    ):
+        columns.refuse(bad, where, name, rule, {"byte_end": byte_end, "t_s": t_s}[name], "Record the capture again.")
+    if t_s[-1] == t_s[0]:
+        got = f"{t_s[0]} in every row"
+        raise CaptureError(where, "arrivals", "spread in time", got, "Mend the recorder's clock.")
+    return Arrivals(byte_end, t_s)
+
+
+def render(arrivals: Arrivals) -> str:
+    """Write arrivals as CSV; `parse` gives the same arrivals back."""
+    return columns.render(pa.table({name: getattr(arrivals, name) for name in TYPES}))
+
+
+def times_of(end_byte: Int64[np.ndarray, " f"], arrivals: Arrivals) -> Float64[np.ndarray, " f"]:
+    """Give each frame the time of its last byte, on a straight line between the ends of the chunks around it.
+
+    A byte came before its chunk was read and, but for the port's buffer, after the one before it was: the error is
+    less than the time between the two. Frames of the first chunk lie on a line at the stream's mean rate. A frame
+    past the last chunk has no time: NaN.
+    """
+    byte_end, t_s = arrivals.byte_end, arrivals.t_s
+    s_per_byte = (t_s[-1] - t_s[0]) / (byte_end[-1] - byte_end[0])
+    before_s = np.minimum(end_byte - byte_end[0], 0) * s_per_byte
+    return np.interp(end_byte, byte_end, t_s, right=np.nan) + before_s
+
+
+def constant_rate(frame: Float64[np.ndarray, " f"], rate_hz: float) -> Float64[np.ndarray, " f"]:
+    """Give each frame the time of its place in a stream of constant rate; 0 at the start of the stream.
+
+    `frame` is the place in frames: bytes up to its end over bytes a frame, where frames have one length, so that
+    broken bytes keep their time; else a running count. Frames lost before the dump shift all that follow.
+    """
+    return frame / rate_hz
+
+
+RATE_LIMIT = 0.1  # a nominal rate may be some per cent off; more is a mark in milliseconds, or of another event
+STEPS_PER_DWELL_N = 16
+STEPS_MAX_N = 2**27  # 128 MB; 1e6 indentations of 8 dwell lengths each
+SEARCH_STEPS_N = 2**16  # the first search sees 4,000 dwell lengths of either clock; 50 ppm blur it by a fifth of one
+WINDOW_STEPS_N = 2**14  # afterwards each 1,000 dwell lengths give an offset of their own, for the rate
+EXPLAINED_MIN = 0.5  # 0 is chance, 1 is every dwell
+MARGIN_MIN = 1.5  # indentations; shifted by one period, a periodic protocol loses one, and one may be too weak to see
+SEEN_MIN = 0.5  # of the dwells that any shift lays on the stream: a few fit somewhere by chance
+PEAK_DROP = 0.05  # the offset is the middle of the peak this far below its top: a top can be flat, flanks are steep
+AWAY_NOISES = 1.5  # times the median distance of no-load: 2.7 sd for the 15 channels of a board
+STRETCH_PERIODS_N = 32
+START_FRAMES_N = 4
+REFERENCE_FRAMES_N = 4096
+_REMEDY = "Add sync marks: reskin add ... --mark STREAM_S,PROBE_S, one event on both clocks."
+
+# Stream times [f] and fields in uT [f ch]; the axes have no letters, as f differs from block to block.
+Block = tuple[Float64[np.ndarray, "_"], Float32[np.ndarray, "_ _"]]
+
+
+@dataclass(frozen=True)
+class ClockMap:
+    """The line between the clocks; `residual_s` is the largest misfit of the marks (or windows) it was drawn through.
+
+    `explained` is the share of dwell time that the field agrees with, 0 for chance; 1 where marks were given.
+    """
+
+    offset_s: float
+    rate: float
+    residual_s: float
+    explained: float
+
+    def probe_s(self, stream_s: Float64[np.ndarray, " f"]) -> Float64[np.ndarray, " f"]:
+        """Give the probe's time of each stream time; NaN stays NaN."""
+        return self.offset_s + self.rate * stream_s
+
+
+def from_marks(marks: Float64[np.ndarray, "m 2"], where: str) -> ClockMap:
+    """Draw the line through sync marks (stream time, probe time): one gives the offset, more also the rate."""
+    given = marks.tolist()
+    if not given or not np.isfinite(marks).all():
+        raise CaptureError(where, "clock.marks", "one or more pairs of finite times", given, "Mend them.")
+    if len(np.unique(marks[:, 0])) < len(marks):
+        raise CaptureError(where, "clock.marks", "of different stream times", given, "Keep one of them.")
+    return _line(marks[:, 0], marks[:, 1] - marks[:, 0], 1.0, where)
+
+
+def from_contacts(blocks: Iterable[Block], log: ProbeLog, where: str) -> ClockMap:
+    """Find the line that lays the field's contacts on the dwells of the probe log.
+
+    The stream begins with the robot lifted. Memory: 1 byte a sixteenth of a dwell.
+    """
+    if not log.contact.any():
+        raise CaptureError(where, "the probe log", "one with contacts", "none", "Record the capture again.")
+    step_s = float(np.median((log.t_end_s - log.t_start_s)[log.contact])) / STEPS_PER_DWELL_N
+    pattern = _Pattern(log)
+    start_s, signal = _contact_signal(blocks, pattern, step_s, where)
+    offset_s = _search(signal[:SEARCH_STEPS_N], pattern, start_s, step_s, where)
+    mid_s, offsets_s, matched, dwelt = [], [], 0.0, 0.0
+    window_s = start_s
+    for window in np.array_split(signal, -(-len(signal) // WINDOW_STEPS_N)):
+        found_s, window_matched, window_dwelt = _follow(window, pattern, window_s + offset_s, step_s)
+        matched, dwelt = matched + window_matched, dwelt + window_dwelt
+        if window_matched > EXPLAINED_MIN * window_dwelt:
+            offset_s += found_s
+            mid_s.append(window_s + len(window) * step_s / 2)
+            offsets_s.append(offset_s)
+        window_s += len(window) * step_s
+    if matched <= EXPLAINED_MIN * dwelt:
+        raise CaptureError(where, "dwells that the field agrees with", f"over {EXPLAINED_MIN:.0%}",
+                                    f"{matched / max(dwelt, 1e-9):.0%}", _REMEDY)  # fmt: skip
+    return _line(np.array(mid_s), np.array(offsets_s), matched / dwelt, where)
+
+
+class _Pattern:
+    """What a contact signal of +1 and -1 should be: the dwells, contact and no-load weighing the same in all."""
+
+    def __init__(self, log: ProbeLog) -> None:
+        dwell_s = log.t_end_s - log.t_start_s
+        weight = np.where(log.contact, 0.5 / dwell_s[log.contact].sum(), 0.5 / dwell_s[~log.contact].sum())
+        firsts = log.t_start_s[~log.contact]  # each indentation opens with its one no-load dwell
+        self.start_s, self.end_s = float(log.t_start_s[0]), float(log.t_end_s[-1])
+        self.period_s = float(np.median(np.diff(firsts))) if len(firsts) > 1 else self.end_s - self.start_s
+        self.quiet = 1 - float(dwell_s[log.contact].sum()) / (self.end_s - self.start_s)
+        scaled = len(firsts) * weight * dwell_s  # so that one indentation weighs 1
+        self._knots_s = np.stack([log.t_start_s, log.t_end_s], axis=1).ravel()
+        self._signed = _running(np.where(log.contact, scaled, -scaled))
+        self._dwelt = _running(scaled)
+
+    def signed(self, start_s: float, steps_n: int, step_s: float) -> Float64[np.ndarray, " g"]:
+        """Give the weight of each step of a grid in probe time: contact above 0, no-load below, between dwells 0."""
+        return np.diff(np.interp(start_s + step_s * np.arange(steps_n + 1), self._knots_s, self._signed))
+
+    def dwelt(self, start_s: float, steps_n: int, step_s: float) -> Float64[np.ndarray, " g"]:
+        """Give the same without sign."""
+        return np.diff(np.interp(start_s + step_s * np.arange(steps_n + 1), self._knots_s, self._dwelt))
+
+
+def _running(weight: Float64[np.ndarray, " d"]) -> Float64[np.ndarray, " e"]:
+    total = np.cumsum(weight)
+    return np.stack([total - weight, total], axis=1).ravel()
+
+
+def _search(signal: Int8[np.ndarray, " g"], pattern: _Pattern, start_s: float, step_s: float, where: str) -> float:
+    """Find the offset at any lag, by FFT; raise if a second one fits about as well."""
+    steps_n = min(int((pattern.end_s - pattern.start_s) / step_s) + 1, SEARCH_STEPS_N)
+    samples = signal / np.abs(signal).mean()  # most steps may lie between two frames
+    weights, dwelt = (of(pattern.start_s, steps_n, step_s) for of in (pattern.signed, pattern.dwelt))
+    seen = _correlate(dwelt, np.abs(samples))
+    # What is matched, less what a poor fit would match: else a shift that loses a dwell here may win it back there,
+    # by laying more of the log on the stream.
+    score = _correlate(weights, samples) - EXPLAINED_MIN * seen
+    score[seen < SEEN_MIN * seen.max()] = 0.0
+    top_i = int(score.argmax())
+    away = np.abs(np.arange(len(score)) - top_i) * step_s > pattern.period_s / 2
+    margin = score[top_i] - score[away].max(initial=0.0)
+    unexplained = (1 - EXPLAINED_MIN) * seen[top_i] - score[top_i]  # matched less than seen; a dwell amiss counts twice
+    if margin < MARGIN_MIN + unexplained / 2:
+        got = f"two fits {margin:.2g} indentations apart, of {dwelt.sum():.0f}"
+        raise CaptureError(where, "the fit of field and dwells", "better than any other", got, _REMEDY)
+    return pattern.start_s + (top_i - (len(signal) - 1)) * step_s - start_s
+
+
+def _follow(
+    window: Int8[np.ndarray, " g"], pattern: _Pattern, probe_s: float, step_s: float
+) -> tuple[float, float, float]:
+    """Find how far a window's offset lies from the one expected; return this, its match and the dwell time it saw."""
+    reach_n = int(pattern.period_s / step_s) // 2 + 1
+    begin_s, steps_n = probe_s - reach_n * step_s, len(window) + 2 * reach_n
+    samples = window.astype(np.float64)
+    score = _correlate(pattern.signed(begin_s, steps_n, step_s), samples)[len(samples) - 1 : steps_n]
+    top_i = int(score.argmax())
+    dwelt = pattern.dwelt(begin_s + top_i * step_s, len(window), step_s) @ np.abs(samples)
+    return (_middle(score, top_i) - reach_n) * step_s, float(score[top_i]), float(dwelt)
+
+
+def _correlate(signal: Float64[np.ndarray, " a"], window: Float64[np.ndarray, " b"]) -> Float64[np.ndarray, " c"]:
+    """Correlate at every lag at which both overlap, by FFT: scipy.signal's without the second that its import takes."""
+    from scipy.fft import irfft, next_fast_len, rfft  # late: only a capture without clock marks pays for it
+
+    lags_n = len(signal) + len(window) - 1
+    size = next_fast_len(lags_n, real=True)
+    return irfft(rfft(signal, size) * rfft(window[::-1], size), size)[:lags_n]
+
+
+def _middle(score: Float64[np.ndarray, " g"], top_i: int) -> float:
+    """Give the middle of a peak between its flanks at `PEAK_DROP` below its top, in fractions of a step."""
+    level = (1 - PEAK_DROP) * score[top_i]
+    below_i = np.flatnonzero(score < level)
+    left_i, right_i = below_i[below_i < top_i][-1:], below_i[below_i > top_i][:1]
+    if not len(left_i) or not len(right_i):
+        return float(top_i)
+    left, right = int(left_i[0]), int(right_i[0])
+    rise = (level - score[left]) / (score[left + 1] - score[left])
+    fall = (level - score[right]) / (score[right - 1] - score[right])
+    return float(left + rise + right - fall) / 2
+
+
+def _contact_signal(
+    blocks: Iterable[Block], pattern: _Pattern, step_s: float, where: str
+) -> tuple[float, Int8[np.ndarray, " g"]]:
+    """Give the time of the first step, and +1 (contact), -1 (no-load) or 0 (no frame) for each step of the stream."""
+    parts: list[tuple[int, Int8[np.ndarray, " g"]]] = []
+    start_s = None
+    for t_s, contact in _touched(blocks, pattern):
+        start_s = t_s[0] if start_s is None else start_s
+        step_i = (t_s - start_s) / step_s
+        if step_i[-1] > STEPS_MAX_N:
+            rule = f"at most {STEPS_MAX_N * step_s:.0f} s long for dwells this short"
+            raise CaptureError(where, "the stream", rule, f"{t_s[-1] - start_s:.0f} s", _REMEDY)
+        first_i, here_i = int(step_i[0]), step_i.astype(np.int64) - int(step_i[0])
+        parts.append((first_i, np.sign(np.bincount(here_i, np.where(contact, 1, -1))).astype(np.int8)))
+    if start_s is None:
+        raise CaptureError(where, "the stream", "one with frames", "none", "Record the capture again.")
+    signal = np.zeros(parts[-1][0] + len(parts[-1][1]), np.int8)
+    for first_i, part in parts:
+        signal[first_i : first_i + len(part)] = part
+    return float(start_s), signal
+
+
+def _touched(
+    blocks: Iterable[Block], pattern: _Pattern
+) -> Iterator[tuple[Float64[np.ndarray, "_"], Bool[np.ndarray, "_"]]]:
+    """Decide for each frame whether its field is away from a running no-load field by more than noise.
+
+    The log says how much of the time the skin is not touched: so many of the frames, the nearest to the last no-load
+    field, are no-load, and half of these surely so. They give the next no-load field, and their spread the noise.
+    """
+    noload_uT, noise_uT = None, np.inf
+    for t_s, b_uT in _stretches(blocks, STRETCH_PERIODS_N * pattern.period_s):
+        if noload_uT is None:
+            noload_uT = np.median(b_uT[:START_FRAMES_N], axis=0)
+        if noise_uT == np.inf or t_s[-1] - t_s[0] > STRETCH_PERIODS_N * pattern.period_s / 4:  # else all may be contact
+            sample = b_uT[:: -(-len(b_uT) // REFERENCE_FRAMES_N)]
+            far_uT = np.linalg.norm(sample - noload_uT, axis=1)
+            noload_uT = sample[far_uT <= np.quantile(far_uT, pattern.quiet / 2)].mean(axis=0)
+            noise_uT = float(np.quantile(np.linalg.norm(sample - noload_uT, axis=1), pattern.quiet / 2))
+        yield t_s, np.linalg.norm(b_uT - noload_uT, axis=1) > AWAY_NOISES * noise_uT
+
+
+def _stretches(blocks: Iterable[Block], stretch_s: float) -> Iterator[Block]:
+    """Cut blocks in time, and leave out frames that are not finite: over a stretch the no-load field stays."""
+    for t_s, b_uT in blocks:
+        good = np.isfinite(b_uT).all(axis=1) & np.isfinite(t_s)
+        t_s, b_uT = t_s[good], b_uT[good]
+        cuts = [0, *(np.flatnonzero(np.diff(t_s // stretch_s)) + 1), len(t_s)]
+        for begin, end in pairwise(cuts):
+            if end > begin:
+                yield t_s[begin:end], b_uT[begin:end]
+
+
+def _line(
+    at_s: Float64[np.ndarray, " m"], offset_s: Float64[np.ndarray, " m"], explained: float, where: str
+) -> ClockMap:
+    """Draw the least-squares line through offsets seen at stream times; one gives no rate."""
+    mid_s, mean_s = at_s.mean(), offset_s.mean()  # centred, as clocks may count from 1970
+    spread_s2 = ((at_s - mid_s) ** 2).sum()
+    slope = float(((at_s - mid_s) * (offset_s - mean_s)).sum() / spread_s2) if len(at_s) > 1 else 0.0
+    residual_s = float(np.abs(offset_s - mean_s - slope * (at_s - mid_s)).max())
+    if abs(slope) > RATE_LIMIT:
+        rule = f"in seconds of one event each, so that their rate is 1 within {RATE_LIMIT}"
+        raise CaptureError(where, "clock.marks", rule, f"rate {1 + slope:.6g}", "Check the marks.")
+    return ClockMap(float(mean_s - slope * mid_s), 1 + slope, residual_s, explained)

@@ -1,0 +1,145 @@
+"""The header of a capture: who, what, in which units, on which clock. In: JSON text. Out: a checked `Header`, a folder.
+
+A capture is a folder `data/raw/<scene>/<capture>/` that holds `header.json` and either the byte stream of a
+port (`stream.bin`, `arrivals.csv`, `probe.csv`) or the untouched files of somebody else's recording.
+Refuses to know what the bytes mean (`wire`, `readers`).
+"""
+
+import json
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from reskin import io
+from reskin.errors import CaptureError
+from reskin.recordings.layouts import Foreign
+
+RATE_MAX_HZ = 1e5
+HEADER_FILE = "header.json"
+STREAM_FILE = "stream.bin"
+ARRIVALS_FILE = "arrivals.csv"
+PROBE_FILE = "probe.csv"
+LOG_FILE = "log.csv"
+
+NAME = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$"
+
+Name = Annotated[str, Field(pattern=NAME)]
+Layout = Literal["native", Foreign, "sd-card"]
+Wire = Literal["binary", "binary-clock", "text-xyzt", "text-txyz"]
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+
+class Clock(_Frozen):
+    """How frames get a time: from `arrivals.csv`, from a constant rate, or not at all (`recording`).
+
+    `marks` are pairs (stream time, probe time) of one event seen by both clocks, in seconds; with none, ingest
+    aligns the clocks by the contacts themselves.
+    """
+
+    kind: Literal["arrivals", "rate", "recording"]
+    rate_hz: Annotated[float, Field(gt=0, le=RATE_MAX_HZ)] | None
+    marks: tuple[tuple[float, float], ...]
+
+    @model_validator(mode="after")
+    def _rate_is_there(self) -> "Clock":
+        if (self.kind == "rate") != (self.rate_hz is not None):
+            raise ValueError("rate_hz belongs to clock kind 'rate', and to no other")
+        return self
+
+
+class Firmware(_Frozen):
+    """Scale of the magnetometer as the firmware sets it (MLX90393 data sheet, table 17)."""
+
+    gain_sel: Annotated[int, Field(ge=0, le=7)]
+    lsb_xy_uT: Annotated[float, Field(gt=0)]
+    lsb_z_uT: Annotated[float, Field(gt=0)]
+
+
+class Header(_Frozen):
+    """One capture's header; every field is written, none has a default."""
+
+    format: Literal["reskin-capture/1"]
+    capture: Name
+    board: Name
+    skin: Name
+    source: Literal["simulated", "recorded"]
+    layout: Layout
+    wire: Wire | None
+    chips_n: Annotated[int, Field(ge=1, le=64)]
+    unit_b: Literal["uT"]
+    unit_force: Literal["N"]
+    unit_place: Literal["mm"]
+    firmware: Firmware | None
+    clock: Clock
+    protocol: str
+    contacts_before_n: Annotated[int, Field(ge=0)]
+    options: dict[str, str]
+    files: dict[str, str]  # name -> sha256, of everything but this header
+    note: str
+
+    @model_validator(mode="after")
+    def _stream_has_wire(self) -> "Header":
+        if (self.layout == "native") != (self.wire is not None):
+            raise ValueError("wire belongs to layout 'native', and to no other")
+        return self
+
+
+def parse(text: str, where: str) -> Header:
+    """Read a header from JSON; raise `CaptureError` naming the first field that is wrong."""
+    try:
+        return Header.model_validate_json(text)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        field = ".".join(map(str, first["loc"])) or "header"
+        got = "nothing" if first["type"] == "missing" else repr(first.get("input"))[:80]
+        rule = first["msg"].removeprefix("Value error, ")
+        raise CaptureError(f"{where}: {field}: {rule}; got {got}. Mend the header or record again.") from None
+
+
+def recorded(where: str, **fields: Any) -> Header:
+    """Make and check the header of a recording; what is not given is that of one whose own files say all."""
+    usual: dict[str, Any] = {
+        "format": "reskin-capture/1", "source": "recorded", "wire": None, "unit_b": "uT", "unit_force": "N",
+        "unit_place": "mm", "firmware": None, "clock": Clock(kind="recording", rate_hz=None, marks=()),
+        "contacts_before_n": 0, "options": {}, "files": {},
+    }  # fmt: skip
+    given = usual | fields
+    return parse(render(Header.model_construct(**{name: given[name] for name in Header.model_fields})), where)
+
+
+def render(header: Header) -> str:
+    """Write a header as JSON, two-space indented, keys in the order of `Header`."""
+    return json.dumps(header.model_dump(mode="json"), indent=2) + "\n"
+
+
+def check_same_capture(header: Header, folder: str) -> None:
+    """Raise if a capture folder was renamed by hand, which would give two names to one thing."""
+    if header.capture != folder:
+        rule = f"the folder's name {folder!r}"
+        raise CaptureError(f"{folder}/{HEADER_FILE}", "capture", rule, repr(header.capture), "Rename it back.")
+
+
+def write_capture(folder: Path, header: Header, contents: Mapping[str, bytes | Path]) -> Header:
+    """Write a capture's files (bytes, or copies of paths), hash them into the header, and write that last."""
+    with io.replacing(folder) as temporary:
+        temporary.mkdir()
+        for name, content in contents.items():
+            if isinstance(content, Path):
+                shutil.copyfile(content, temporary / name)
+            else:
+                (temporary / name).write_bytes(content)
+        return seal(temporary, header)
+
+
+def seal(folder: Path, header: Header) -> Header:
+    """Hash the files that a folder holds into its header, and write that."""
+    names = sorted(path.name for path in folder.iterdir() if path.name != HEADER_FILE)
+    complete = header.model_copy(update={"files": {name: io.sha256(folder / name) for name in names}})
+    io.write_text(folder / HEADER_FILE, render(complete))
+    return complete

@@ -1,0 +1,372 @@
+"""Turn a capture of any layout into readings, with an account of every lost or dropped byte and row.
+
+Frames are joined to the dwells of the probe log by the clocks of both.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int32, Int64
+
+from reskin import io
+from reskin.board import wire
+from reskin.board.stream import FrameStream, no_frame
+from reskin.board.wire import Frames
+from reskin.errors import CaptureError
+from reskin.recordings import clocks, probe
+from reskin.recordings.chips import Watch
+from reskin.recordings.clocks import Arrivals, ClockMap, from_contacts, from_marks
+from reskin.recordings.fault_policy import Decisions
+from reskin.recordings.header import (
+    ARRIVALS_FILE,
+    HEADER_FILE,
+    PROBE_FILE,
+    STREAM_FILE,
+    Header,
+    Wire,
+    check_same_capture,
+    parse,
+)
+from reskin.recordings.probe import LABELS, ProbeLog
+from reskin.recordings.readers import READERS
+from reskin.recordings.text import check_log
+from reskin.schema import Readings
+
+COUNTS = (
+    "frames_n",
+    "frames_noload_n",
+    "frames_contact_n",
+    "dropped_no_time_frames_n",
+    "dropped_not_finite_frames_n",
+    "dropped_failed_read_frames_n",
+    "dropped_stuck_chip_frames_n",
+    "dropped_between_dwells_frames_n",
+    "dropped_no_noload_frames_n",
+    "dropped_no_contact_frames_n",
+    "indentations_n",
+    "dropped_no_noload_indentations_n",
+)
+
+BEYOND = "dropped_out_of_range_frames_n"  # counted only where there are some: it is for settings to drop them
+
+
+@dataclass(frozen=True)
+class TimedFrames:
+    """Frames with the stream time of each (NaN: unknown, as for all that follow); masks of those that are not kept.
+
+    Their reads failed, a chip was stuck, or, where that was decided, a reading is beyond what a board sends.
+    """
+
+    frames: Frames
+    t_s: Float64[np.ndarray, " f"]
+    failed: Bool[np.ndarray, " f"]
+    stuck: Bool[np.ndarray, " f"]
+    beyond: Bool[np.ndarray, " f"] | None = None
+
+    @property
+    def sound(self) -> Bool[np.ndarray, " f"]:
+        """Mark the frames that hold a fresh reading of every chip."""
+        kept = ~(self.failed | self.stuck)
+        return kept if self.beyond is None else kept & ~self.beyond
+
+
+@dataclass(frozen=True)
+class _Held:
+    """Frames that lie in a dwell, in order of time."""
+
+    dwell_i: Int64[np.ndarray, " f"]
+    t_s: Float64[np.ndarray, " f"]
+    b_uT: Float32[np.ndarray, "f ch"]
+    temperature_degC: Float32[np.ndarray, "f k"]
+
+    def where(self, rows: Bool[np.ndarray, " f"] | slice) -> "_Held":
+        return _Held(self.dwell_i[rows], self.t_s[rows], self.b_uT[rows], self.temperature_degC[rows])
+
+    def then(self, later: "_Held") -> "_Held":
+        pairs = ((getattr(self, name), getattr(later, name)) for name in self.__dataclass_fields__)
+        return _Held(*map(np.concatenate, pairs))
+
+
+def join(
+    blocks: Iterable[TimedFrames], log: ProbeLog, clock: ClockMap, header: Header, account: dict[str, int]
+) -> Iterator[Readings]:
+    """Yield the readings of indentations that are over; `account` is complete once the last one was taken."""
+    joiner = Joiner(log, clock, header)
+    for block in blocks:
+        readings = joiner.feed(block)
+        if len(readings):
+            yield readings
+    readings = joiner.close()
+    if len(readings):
+        yield readings
+    account.update(joiner.account())
+
+
+class Joiner:
+    """Sorts frames into dwells; holds back the indentation that may still grow.
+
+    A frame counts under the first reason that fits: no time, not finite, failed read, stuck chip, between dwells. The
+    no-load field of an indentation is the mean over its no-load dwell. `t_s` of a reading is the stream's time.
+    """
+
+    def __init__(self, log: ProbeLog, clock: ClockMap, header: Header) -> None:
+        self._log, self._clock, self._header = log, clock, header
+        opens = ~log.contact  # each indentation opens with its one no-load dwell
+        self._group_i = np.cumsum(opens) - 1
+        touched = np.zeros(int(opens.sum()), np.int64)
+        touched[self._group_i[log.contact]] = 1
+        self._before_n = header.contacts_before_n + np.cumsum(touched) - touched
+        self._held = self._nothing()
+        self._count: Counter[str] = Counter()
+
+    def feed(self, block: TimedFrames) -> Readings:
+        """Take the next frames; give the readings of all indentations that are now over (often none)."""
+        probe_s = self._clock.probe_s(block.t_s)
+        held = self._held.then(self._sort(block, probe_s))
+        known_s = probe_s[np.isfinite(probe_s)]
+        if not len(known_s) or not len(held.dwell_i):
+            self._held = held
+            return self._readings(self._nothing())
+        # Times never fall, so an indentation is over once a frame belongs to a later one.
+        now_i = np.searchsorted(self._log.t_start_s, known_s[-1], "right") - 1
+        over_n = int(np.searchsorted(self._group_i[held.dwell_i], self._group_i[now_i], "left"))
+        self._held = held.where(slice(over_n, None))
+        return self._readings(held.where(slice(0, over_n)))
+
+    def close(self) -> Readings:
+        """Give the readings of the last indentation, as far as the stream went."""
+        held, self._held = self._held, self._nothing()
+        return self._readings(held)
+
+    def account(self) -> dict[str, int]:
+        """Count frames and indentations so far, by what became of them; each total is the sum of its parts."""
+        counted = {name: self._count[name] for name in COUNTS}
+        counted |= {BEYOND: self._count[BEYOND]} if self._count[BEYOND] else {}
+        logged_n = int((~self._log.contact).sum())
+        unseen_n = logged_n - counted["indentations_n"] - counted["dropped_no_noload_indentations_n"]
+        return counted | {"logged_indentations_n": logged_n, "dropped_no_frame_indentations_n": unseen_n}
+
+    def _sort(self, block: TimedFrames, probe_s: Float64[np.ndarray, " f"]) -> _Held:
+        frames, log = block.frames, self._log
+        dwell_i = np.searchsorted(log.t_start_s, probe_s, "right") - 1
+        lost = {
+            "dropped_no_time_frames_n": np.isnan(probe_s),
+            "dropped_not_finite_frames_n": ~(
+                np.isfinite(frames.b_uT).all(axis=1) & np.isfinite(frames.temperature_degC).all(axis=1)
+            ),
+            "dropped_failed_read_frames_n": block.failed,
+            "dropped_stuck_chip_frames_n": block.stuck,
+            **({} if block.beyond is None else {BEYOND: block.beyond}),
+            "dropped_between_dwells_frames_n": (dwell_i < 0) | (probe_s > log.t_end_s[dwell_i]),
+        }
+        keep = np.ones(len(probe_s), bool)
+        self._count["frames_n"] += len(keep)
+        for reason, mask in lost.items():
+            self._count[reason] += int((keep & mask).sum())
+            keep &= ~mask
+        return _Held(dwell_i[keep], block.t_s[keep], frames.b_uT[keep], frames.temperature_degC[keep])
+
+    def _readings(self, held: _Held) -> Readings:
+        """Turn the frames of whole indentations into readings, and count those that lack their other half."""
+        group_i, contact = self._group_i[held.dwell_i], self._log.contact[held.dwell_i]
+        with_noload, with_contact = group_i[~contact], group_i[contact]
+        paired_noload, paired = np.isin(with_noload, with_contact), np.isin(with_contact, with_noload)
+        rows, group_i = held.where(contact).where(paired), with_contact[paired]
+        noload = held.where(~contact).where(paired_noload)
+        noload_uT, row_group_i = _means(noload.b_uT, with_noload[paired_noload], group_i)
+        self._count.update(
+            frames_noload_n=int(paired_noload.sum()),
+            frames_contact_n=len(group_i),
+            dropped_no_contact_frames_n=int((~paired_noload).sum()),
+            dropped_no_noload_frames_n=int((~paired).sum()),
+            indentations_n=len(noload_uT),
+            dropped_no_noload_indentations_n=len(np.unique(with_contact[~paired])),
+        )
+        return self._labelled(rows, noload_uT[row_group_i], group_i)
+
+    def _labelled(
+        self, rows: _Held, noload_uT: Float32[np.ndarray, "f ch"], group_i: Int64[np.ndarray, " f"]
+    ) -> Readings:
+        log, header = self._log, self._header
+        return Readings(
+            capture=header.capture, board=header.board, skin=header.skin, source=header.source,
+            indentation=log.indentation[rows.dwell_i], pass_i=log.pass_i[rows.dwell_i], reading_i=_rank(group_i),
+            **{name: getattr(log, name)[rows.dwell_i] for name in LABELS},
+            b_uT=rows.b_uT, noload_uT=noload_uT, temperature_degC=rows.temperature_degC, t_s=rows.t_s,
+            n_contacts=self._before_n[group_i].astype(np.int32),
+        )  # fmt: skip
+
+    def _nothing(self) -> _Held:
+        k = self._header.chips_n
+        empty = np.zeros((0, 4 * k), np.float32)
+        return _Held(np.zeros(0, np.int64), np.zeros(0), empty[:, : 3 * k], empty[:, :k])
+
+
+def _means(
+    b_uT: Float32[np.ndarray, "f ch"], group_i: Int64[np.ndarray, " f"], wanted_i: Int64[np.ndarray, " g"]
+) -> tuple[Float32[np.ndarray, "i ch"], Int64[np.ndarray, " g"]]:
+    """Give the mean field of each run of equal `group_i`, and the run that each of `wanted_i` belongs to."""
+    runs_i, first_i, run_n = np.unique(group_i, return_index=True, return_counts=True)
+    if not len(runs_i):
+        return b_uT, wanted_i
+    sums_uT = np.add.reduceat(b_uT, first_i, axis=0, dtype=np.float64)
+    return (sums_uT / run_n[:, None]).astype(np.float32), np.searchsorted(runs_i, wanted_i)
+
+
+def _rank(group_i: Int64[np.ndarray, " f"]) -> Int32[np.ndarray, " f"]:
+    """Number the rows of each run of equal `group_i` from 0."""
+    _, first_i, run_n = np.unique(group_i, return_index=True, return_counts=True)
+    return (np.arange(len(group_i)) - np.repeat(first_i, run_n)).astype(np.int32)
+
+
+BLOCK_BYTES_N = 2**22
+# A whole that is counted, and the prefix and suffix of counts of its lost parts.
+LOSSES = (
+    ("bytes_n", "skipped_", "_bytes_n"),
+    ("frames_n", "dropped_", "_frames_n"),
+    ("rows_read_n", "dropped_", "_rows_n"),
+    ("logged_indentations_n", "dropped_", "_indentations_n"),
+)
+# Frames between dwells, and those of a dwell without its counterpart, are expected; so are rows of zeros where a
+# recorder asks faster than chips answer, of which its reader allows so many.
+NO_LOSS = (
+    "dropped_between_dwells_frames_n",
+    "dropped_no_noload_frames_n",
+    "dropped_no_contact_frames_n",
+    "dropped_zero_rows_n",
+)
+
+Timer = Callable[[Frames, int], Float64[np.ndarray, "_"]]  # frames, and how many came before -> stream time of each
+
+
+class Opened(NamedTuple):
+    """A capture being read; `account` is complete when `blocks` is exhausted."""
+
+    header: Header
+    blocks: Iterable[Readings]
+    account: Mapping[str, int]
+
+
+def open_capture(folder: Path, decisions: Decisions) -> Opened:
+    """Check a capture's header and files, and begin to read it; `decisions` say what becomes of faults."""
+    header = read_header(folder)
+    check_same_capture(header, folder.name)
+    for name, digest in header.files.items():
+        if not (folder / name).is_file():
+            raise CaptureError(folder / name, "the file", "there, as the header says", "nothing", "Add it again.")
+        if io.sha256(folder / name) != digest:
+            rule, remedy = "unchanged since it was added", "Remove it and add it again."
+            raise CaptureError(folder / name, "the file", rule, "another hash", remedy)
+    if header.layout == "native":
+        return Opened(header, *read_native(folder, header, decisions))
+    if header.layout not in READERS:
+        remedy = "An SD card's log has no labels to learn from; try: reskin predict."
+        raise CaptureError(folder, "layout", f"native or one of {sorted(READERS)}", header.layout, remedy)
+    readings, account = READERS[header.layout].read(folder, header, decisions)
+    return Opened(header, [readings], account)
+
+
+def read_header(folder: Path) -> Header:
+    file = folder / HEADER_FILE
+    if not file.is_file():
+        raise CaptureError(file, "a capture", f"a folder with {HEADER_FILE}", "none", "Is it another --layout?")
+    return parse(file.read_text(encoding="utf-8", errors="replace"), str(file))
+
+
+def check_losses(account: Mapping[str, int], limit: float, where: str) -> None:
+    """Raise if a capture lost more than the fraction `limit` of its bytes, frames, rows or indentations."""
+    for whole, prefix, suffix in LOSSES:
+        lost = [key for key in account if key.startswith(prefix) and key.endswith(suffix) and key not in NO_LOSS]
+        lost_n = sum(account[key] for key in lost)
+        if lost_n > limit * account.get(whole, 0):
+            reasons = ", ".join(f"{account[key]} {key.removesuffix('_n')}" for key in lost if account[key])
+            rule = f"at most {limit:.0%} of {account[whole]}"
+            remedy = "Mend the recording, or raise lost_fraction_max in params.yaml."
+            raise CaptureError(where, f"lost {whole.removesuffix('_n')}", rule, reasons, remedy)
+
+
+def read_native(folder: Path, header: Header, decisions: Decisions) -> tuple[Iterator[Readings], dict[str, int]]:
+    """Begin to read a capture; the account is complete when the readings are exhausted.
+
+    Without sync marks the stream is read twice, first for the clock.
+    """
+    stream = folder / STREAM_FILE
+    if not stream.is_file():
+        raise CaptureError(stream, "the file", "there", "nothing", "Copy the whole capture folder.")
+    log = probe.parse(folder / PROBE_FILE, str(folder / PROBE_FILE))
+    check_log(log, str(folder / PROBE_FILE))
+    times_of = timer(folder, header)
+    clock = _clock(folder, header, log, _timed_frames(folder, header, times_of, {}, decisions))
+    account = {
+        "clock_residual_us": round(1e6 * clock.residual_s),
+        "clock_explained_pct": round(100 * clock.explained),
+    }
+    blocks = _timed_frames(folder, header, times_of, account, decisions)
+    return join(blocks, log, clock, header, account), account
+
+
+def _clock(folder: Path, header: Header, log: ProbeLog, blocks: Iterator[TimedFrames]) -> ClockMap:
+    if header.clock.marks:
+        return from_marks(np.array(header.clock.marks), str(folder))
+    pairs = ((block.t_s[block.sound], block.frames.b_uT[block.sound]) for block in blocks)
+    return from_contacts(pairs, log, str(folder))
+
+
+def _timed_frames(
+    folder: Path, header: Header, times_of: Timer, account: dict[str, int], decisions: Decisions
+) -> Iterator[TimedFrames]:
+    """Decode the stream block by block; the stream's own account is added when it has ended."""
+    stream, watch = FrameStream(_wire(header), header.chips_n), Watch(header, str(folder / STREAM_FILE), decisions)
+    frames_n = 0
+    with (folder / STREAM_FILE).open("rb") as file:
+        head = data = file.read(BLOCK_BYTES_N)
+        while data:
+            frames = stream.feed(data)
+            yield _timed(frames, times_of(frames, frames_n), watch)
+            frames_n += len(frames)
+            data = file.read(BLOCK_BYTES_N)
+    frames = stream.close()
+    yield _timed(frames, times_of(frames, frames_n), watch)
+    if not stream.account()["frames_n"]:
+        raise no_frame(str(folder / STREAM_FILE), head, _wire(header), header.chips_n)
+    watch.close()
+    account.update(stream.account() | watch.ledger.account())
+
+
+def _timed(frames: Frames, t_s: Float64[np.ndarray, " f"], watch: Watch) -> TimedFrames:
+    found = watch.look(frames, t_s)
+    return TimedFrames(frames, t_s, found.failed, found.stuck, found.beyond)
+
+
+def timer(folder: Path, header: Header) -> Timer:
+    """Choose how frames get a time, as the header's clock says."""
+    rate_hz = header.clock.rate_hz
+    if header.clock.kind == "arrivals":
+        table = _arrivals(folder)
+        return lambda frames, _: clocks.times_of(frames.end_byte, table)
+    if rate_hz is None:
+        got = repr(header.clock.kind)
+        raise CaptureError(folder, "clock.kind", "'arrivals' or 'rate' for a port's stream", got, "Mend it.")
+    if header.wire in wire.TEXT_WIRES:
+        return lambda frames, before_n: clocks.constant_rate(before_n + 1.0 + np.arange(len(frames)), rate_hz)
+    frame_bytes_n = wire.record_type(_wire(header), header.chips_n).itemsize
+    return lambda frames, _: clocks.constant_rate(frames.end_byte / frame_bytes_n, rate_hz)
+
+
+def _arrivals(folder: Path) -> Arrivals:
+    """Read the arrivals; a stream that is shorter than they say was cut off after it was recorded."""
+    table = clocks.parse(folder / ARRIVALS_FILE, str(folder / ARRIVALS_FILE))
+    bytes_n, arrived_n = (folder / STREAM_FILE).stat().st_size, int(table.byte_end[-1])
+    if bytes_n < arrived_n:
+        rule = f"the {arrived_n} bytes long that {ARRIVALS_FILE} says"
+        raise CaptureError(folder / STREAM_FILE, "the stream", rule, bytes_n, "Copy the capture again.")
+    return table
+
+
+def _wire(header: Header) -> Wire:
+    assert header.wire is not None, "the header's own check: a native capture has a wire"
+    return header.wire

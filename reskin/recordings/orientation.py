@@ -1,0 +1,75 @@
+"""Whether the places of a capture lie as those of other captures: turned, mirrored, or with x and y exchanged.
+
+Boards of one scene read alike where they are pressed alike, so the place of a press can be looked up among the presses
+of other captures. If the looked-up places agree with the labels only after the labels are turned or mirrored, the
+labels of one of them are probably wrong. Nothing is assumed of the board, so one capture alone says nothing.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from reskin.schema import Readings
+
+PRESSES_MIN_N = 20  # fewer presses do not tell
+EXPLAINED_MIN = 0.5  # of the places' variance, that another orientation must explain
+GAIN_MIN = 0.5  # and so much more than the labels as they are
+WAYS = {
+    "as they are": [[1, 0], [0, 1]],
+    "with x and y exchanged": [[0, 1], [1, 0]],
+    "with x mirrored": [[-1, 0], [0, 1]],
+    "with y mirrored": [[1, 0], [0, -1]],
+    "turned by 90 degrees": [[0, -1], [1, 0]],
+    "turned by 180 degrees": [[-1, 0], [0, -1]],
+    "turned by 270 degrees": [[0, 1], [-1, 0]],
+    "with x and y exchanged and mirrored": [[0, -1], [-1, 0]],
+}
+
+
+@dataclass(frozen=True)
+class Presses:
+    """Places in mm, from their middle, and directions of the change of field (unit vectors), one per press."""
+
+    place_mm: Float[np.ndarray, "n 2"]
+    direction: Float[np.ndarray, "n ch"]
+
+
+def presses_of(blocks: Iterable[Readings]) -> Presses:
+    """Average the readings of each press whose place is known, over all blocks of a capture."""
+    place_mm, change_uT = [], []
+    for block in blocks:
+        known = np.isfinite(block.x_mm) & np.isfinite(block.y_mm)
+        for press in np.unique(block.indentation[known]):
+            rows = known & (block.indentation == press)
+            place_mm.append([block.x_mm[rows][0], block.y_mm[rows][0]])
+            change_uT.append((block.b_uT[rows].astype(float) - block.noload_uT[rows]).mean(axis=0))
+    if not place_mm:
+        return Presses(np.zeros((0, 2)), np.zeros((0, 0)))
+    places, changes = np.array(place_mm, float), np.array(change_uT)
+    length = np.linalg.norm(changes, axis=1)
+    sound = np.isfinite(length) & (length > 0)
+    middle_mm = (places[sound].max(axis=0) + places[sound].min(axis=0)) / 2 if sound.any() else 0.0
+    return Presses(places[sound] - middle_mm, changes[sound] / length[sound, None])
+
+
+def other_orientation(own: Presses, others: Presses) -> str | None:
+    """Return how the labels would have to be changed to agree with those of other captures; None if not at all.
+
+    Each press gets the mean place of the three presses of `others` that are nearest in direction. A way to change the
+    labels counts if it explains `EXPLAINED_MIN` of the variance of these places, `GAIN_MIN` more than the labels do.
+    """
+    comparable = own.direction.shape[1:] == others.direction.shape[1:]
+    if not comparable or min(len(own.place_mm), len(others.place_mm)) < PRESSES_MIN_N:
+        return None
+    nearest = np.argsort(-own.direction @ others.direction.T, axis=1)[:, :3]
+    looked_up_mm = others.place_mm[nearest].mean(axis=1)
+    variance = max(float((looked_up_mm**2).mean()), 1e-12)
+    explained = {
+        name: 1 - float(((own.place_mm @ np.array(way).T - looked_up_mm) ** 2).mean()) / variance
+        for name, way in WAYS.items()
+    }
+    best = max(explained, key=lambda name: explained[name])
+    as_are = explained["as they are"]
+    return best if explained[best] >= EXPLAINED_MIN and explained[best] - as_are >= GAIN_MIN else None

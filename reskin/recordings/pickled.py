@@ -1,0 +1,213 @@
+"""Archives of pickled samples (.npz, as the rig of layout `lab` wrote them) -> the text of one CSV file of that layout.
+
+No pickle is loaded: its opcodes are followed as data, so nothing in it is imported, called or run, and what is neither
+plain values nor NumPy numbers is refused. Refuses to know where archives come from (`fetching`).
+"""
+
+import pickletools
+import zipfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from io import BytesIO
+from typing import Any
+
+import numpy as np
+
+from reskin.errors import CaptureError
+
+CHIPS_N = 5
+COLUMNS = [f"{what}{chip}" for chip in range(CHIPS_N) for what in ("T", "Bx", "By", "Bz")]
+HEAD = ",".join(["indent", "phase", "x_mm", "y_mm", *COLUMNS, "Fx", "Fy", "Fz"])
+PHASES = {"noload": "bl_arr", "contact": "cont_arr"}  # the archive's name for the samples of each phase
+REMEDY = "Is it a recording of port and depth, copied whole?"
+BYTES_MAX_N = 500_000_000  # those of lab's port and depth hold 10 to 30 MB
+MARK = object()
+
+
+def to_lab_csv(archive: bytes, where: str) -> bytes:
+    """Write an archive's samples as CSV: by indentation, first those without load; degC and uT to 1e-4, N to 1e-6.
+
+    Lines end as in the CSV of RFC 4180.
+    """
+    try:
+        with zipfile.ZipFile(BytesIO(archive)) as file:
+            if (bytes_n := sum(member.file_size for member in file.infolist())) > BYTES_MAX_N:
+                raise CaptureError(where, "the archive", f"{BYTES_MAX_N} bytes or less, unpacked", bytes_n, REMEDY)
+            samples = {phase: decode_array(file.read(f"{name}.npy"), where) for phase, name in PHASES.items()}
+        rows = [(int(sample["Indent"]), phase, _row(sample)) for phase in PHASES for sample in samples[phase]]
+    except CaptureError:
+        raise
+    except Exception as error:  # whatever a foreign archive may hold instead; it is refused, with its reason
+        rule = f"a .npz with samples under {' and '.join(PHASES.values())}"
+        raise CaptureError(where, "the archive", rule, _words(error), REMEDY) from None
+    rows.sort(key=lambda row: row[0])  # stable: no-load rows stay before contact rows
+    return "".join(f"{line}\r\n" for line in [HEAD, *(f"{i},{phase},{cells}" for i, phase, cells in rows)]).encode()
+
+
+def _row(sample: Mapping[str, Any]) -> str:
+    place, fields, forces = (sample[key] for key in ("Location", "ReSkin Data", "Force Data"))
+    if (len(place), len(fields), len(forces)) != (2, len(COLUMNS), 3):
+        raise ValueError(f"a sample of {len(place)} places, {len(fields)} fields and {len(forces)} forces")
+    cells = [f"{mm:g}" for mm in place] + [f"{value:.4f}" for value in fields] + [f"{force:.6f}" for force in forces]
+    return ",".join(cells)
+
+
+def decode_array(npy: bytes, where: str) -> Any:
+    """Give the objects of an .npy file that holds an array of them."""
+    stream = BytesIO(npy)
+    version = np.lib.format.read_magic(stream)
+    read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    _, _, dtype = read_header(stream)
+    if not dtype.hasobject:
+        raise CaptureError(where, "an array", "one of objects", dtype, REMEDY)
+    return decode(stream.read(), where)
+
+
+def decode(pickled: bytes, where: str) -> Any:
+    """Give the plain values of a pickle: lists, tuples, dicts, numbers, text, bytes; NumPy's numbers and arrays too.
+
+    Of protocols 3 and 4, in which NumPy has written arrays of objects.
+    """
+    stack = _Stack([], {})
+    try:
+        for opcode, arg, at in pickletools.genops(pickled):
+            if opcode.name not in STEPS:
+                rule = "made of plain values and NumPy numbers"
+                raise CaptureError(f"{where} @{at}", "a pickle", rule, f"opcode {opcode.name}", REMEDY)
+            STEPS[opcode.name](stack, arg)
+        return plain(stack.values.pop())
+    except CaptureError:
+        raise
+    except Exception as error:  # bytes that are no pickle fail anywhere: in pickletools, on an empty stack, in NumPy
+        raise CaptureError(where, "a pickle", "whole", _words(error), REMEDY) from None
+
+
+@dataclass
+class Call:
+    """What a pickle asks to be called: a name, never looked up."""
+
+    name: str
+    args: Any
+    state: Any = None
+
+
+NESTED = (list, tuple, dict, Call)
+
+
+@dataclass
+class _Stack:
+    """The stack and the memo that a pickle's opcodes work on."""
+
+    values: list[Any]
+    memo: dict[int, Any]
+
+    def push(self, value: Any) -> None:
+        self.values.append(value)
+
+    def last(self, length: int) -> list[Any]:
+        """Take so many values off the top."""
+        taken = self.values[-length:]
+        del self.values[-length:]
+        return taken
+
+    def since_mark(self) -> list[Any]:
+        """Take what was pushed since the last mark off the top, and the mark."""
+        at = max(i for i, value in enumerate(self.values) if value is MARK)
+        taken = self.values[at + 1 :]
+        del self.values[at:]
+        return taken
+
+    def extend(self, values: list[Any]) -> None:
+        self.values[-1].extend(values)
+
+    def set_items(self, values: list[Any]) -> None:
+        self.values[-1].update(zip(values[::2], values[1::2], strict=True))
+
+    def build(self) -> None:
+        state = self.values.pop()
+        self.values[-1].state = state
+
+    def remember(self, i: int) -> None:
+        self.memo[i] = self.values[-1]
+
+
+Step = Callable[[_Stack, Any], None]
+
+
+NUMBERS = ("BININT", "BININT1", "BININT2", "LONG1", "LONG4", "BINFLOAT")
+TEXTS = ("BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8", "BINBYTES", "SHORT_BINBYTES", "BINBYTES8", "GLOBAL")
+STEPS: Mapping[str, Step] = {
+    **dict.fromkeys(("PROTO", "FRAME", "STOP"), lambda stack, _: None),
+    **dict.fromkeys((*NUMBERS, *TEXTS), _Stack.push),
+    "NONE": lambda stack, _: stack.push(None),
+    "NEWTRUE": lambda stack, _: stack.push(True),
+    "NEWFALSE": lambda stack, _: stack.push(False),
+    "MARK": lambda stack, _: stack.push(MARK),
+    "EMPTY_LIST": lambda stack, _: stack.push([]),
+    "EMPTY_DICT": lambda stack, _: stack.push({}),
+    "EMPTY_TUPLE": lambda stack, _: stack.push(()),
+    "TUPLE1": lambda stack, _: stack.push(tuple(stack.last(1))),
+    "TUPLE2": lambda stack, _: stack.push(tuple(stack.last(2))),
+    "TUPLE3": lambda stack, _: stack.push(tuple(stack.last(3))),
+    "TUPLE": lambda stack, _: stack.push(tuple(stack.since_mark())),
+    "APPEND": lambda stack, _: stack.extend(stack.last(1)),
+    "APPENDS": lambda stack, _: stack.extend(stack.since_mark()),
+    "SETITEM": lambda stack, _: stack.set_items(stack.last(2)),
+    "SETITEMS": lambda stack, _: stack.set_items(stack.since_mark()),
+    "STACK_GLOBAL": lambda stack, _: stack.push(" ".join(stack.last(2))),
+    "REDUCE": lambda stack, _: stack.push(Call(*stack.last(2))),
+    "BUILD": lambda stack, _: stack.build(),
+    "MEMOIZE": lambda stack, _: stack.remember(len(stack.memo)),
+    **dict.fromkeys(("BINPUT", "LONG_BINPUT"), lambda stack, i: stack.remember(i)),
+    **dict.fromkeys(("BINGET", "LONG_BINGET"), lambda stack, i: stack.push(stack.memo[i])),
+}  # by opcode of pickletools; any other is refused
+
+
+def plain(value: Any, known: dict[int, Any] | None = None) -> Any:
+    """Turn what NumPy's pickles ask for into lists and numbers; raise if anything else is to be called.
+
+    What a pickle names several times is turned once, or lists of lists of one list would take for ever.
+    """
+    known = {} if known is None else known
+    if not isinstance(value, NESTED):
+        return value
+    if id(value) not in known:
+        known[id(value)] = _plain(value, known)
+    return known[id(value)]
+
+
+def _plain(value: Any, known: dict[int, Any]) -> Any:
+    match value:
+        case list() | tuple():  # of a million numbers, most likely: each is plain already
+            return type(value)(plain(item, known) if isinstance(item, NESTED) else item for item in value)
+        case dict():
+            return {plain(key, known): plain(item, known) for key, item in value.items()}
+    return _numbers(value)
+
+
+def _numbers(call: Call) -> Any:
+    match call.name.replace("numpy._core", "numpy.core"):  # NumPy 2's name
+        case "numpy.core.multiarray scalar":
+            return np.frombuffer(plain(call.args[1]), _dtype(call.args[0]))[0].item()
+        case "numpy.core.multiarray _reconstruct":
+            _, shape, dtype, by_columns, content = call.state
+            if isinstance(content, list):
+                return plain(content) if len(shape) == 1 else _refuse(f"an array of objects {shape}")
+            array = np.frombuffer(plain(content), _dtype(dtype))
+            return array.reshape(shape, order="F" if by_columns else "C").tolist()
+    return _refuse(f"a call of {call.name}")
+
+
+def _dtype(call: Call) -> "np.dtype[Any]":
+    kind, order = call.args[0], call.state[1]
+    if call.name != "numpy dtype" or kind[:1] not in "biuf":
+        _refuse(f"{call.name} {kind}")
+    return np.dtype(kind if order == "|" else order + kind)
+
+
+def _refuse(got: str) -> Any:
+    raise ValueError(got)
+
+
+def _words(error: Exception) -> str:
+    return f"{type(error).__name__} {error}".strip()[:200]

@@ -1,0 +1,103 @@
+"""The probe log: where the robot dwelt, when, and what it felt. In: `probe.csv`. Out: a checked `ProbeLog`, and back.
+
+One row a dwell, on the robot's own clock, in order of time. An indentation is one no-load dwell (robot lifted) and
+then its contact dwells (one, unless the robot drags). Refuses to know frames and their clock.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from jaxtyping import Bool, Float32, Float64, Int32
+
+from reskin.errors import CaptureError
+from reskin.recordings import columns
+from reskin.recordings.columns import refuse
+
+NOLOAD, CONTACT = "noload", "contact"
+LABELS = ("x_mm", "y_mm", "depth_mm", "Fx_N", "Fy_N", "Fz_N")
+TYPES = {
+    "indentation": pa.int32(),
+    "pass_i": pa.int32(),
+    "phase": pa.string(),
+    "t_start_s": pa.float64(),
+    "t_end_s": pa.float64(),
+    **dict.fromkeys(LABELS, pa.float32()),
+}
+
+
+@dataclass(frozen=True)
+class ProbeLog:
+    """The dwells of one capture, axis d; NaN where a label is unknown.
+
+    `phase` is stored as `contact`: False while the robot is lifted. Forces have the signs of `core.schema`.
+    """
+
+    indentation: Int32[np.ndarray, " d"]
+    pass_i: Int32[np.ndarray, " d"]
+    contact: Bool[np.ndarray, " d"]
+    t_start_s: Float64[np.ndarray, " d"]
+    t_end_s: Float64[np.ndarray, " d"]
+    x_mm: Float32[np.ndarray, " d"]
+    y_mm: Float32[np.ndarray, " d"]
+    depth_mm: Float32[np.ndarray, " d"]
+    Fx_N: Float32[np.ndarray, " d"]
+    Fy_N: Float32[np.ndarray, " d"]
+    Fz_N: Float32[np.ndarray, " d"]
+
+    def __len__(self) -> int:
+        return len(self.indentation)
+
+
+def parse(source: str | Path, where: str) -> ProbeLog:
+    """Read a probe log from CSV text, or from the file at a path; raise `CaptureError` naming the first bad row."""
+    table = columns.parse(source, TYPES, where)
+    if not len(table):
+        raise CaptureError(where, "the log", "one row a dwell", "no rows", "Record the capture again.")
+    for name in ("indentation", "pass_i", "phase", "t_start_s", "t_end_s"):
+        unknown = np.asarray(table.column(name).is_null())
+        refuse(unknown, where, name, "known", "an empty field", "Only labels may be left empty.")
+    phases = table.column("phase")
+    foreign = np.asarray(pc.invert(pc.is_in(phases, pa.array([NOLOAD, CONTACT]))))
+    refuse(foreign, where, "phase", f"{NOLOAD} or {CONTACT}", phases, "Write one of the two words.")
+    numbers = {name: np.asarray(table.column(name)) for name in TYPES if name != "phase"}
+    log = ProbeLog(contact=np.asarray(pc.equal(phases, CONTACT)), **numbers)
+    _check_numbers(log, where)
+    _check_order(log, where)
+    return log
+
+
+def render(log: ProbeLog) -> str:
+    """Write a probe log as CSV; `parse` gives the same log back."""
+    arrays = {name: getattr(log, name) for name in TYPES if name != "phase"}
+    arrays["phase"] = np.where(log.contact, CONTACT, NOLOAD)
+    # from_pandas: NaN becomes null, which CSV writes as an empty field
+    fields = {name: pa.array(arrays[name], kind, from_pandas=True) for name, kind in TYPES.items()}
+    return columns.render(pa.table(fields))
+
+
+def _check_numbers(log: ProbeLog, where: str) -> None:
+    for name in LABELS:
+        values = getattr(log, name)
+        refuse(np.isinf(values), where, name, "finite, or empty if unknown", values, "Leave it empty.")
+    for name in ("t_start_s", "t_end_s"):
+        values = getattr(log, name)
+        refuse(~np.isfinite(values), where, name, "a finite time", values, "Remove a dwell without times.")
+    for name in ("indentation", "pass_i"):
+        values = getattr(log, name)
+        refuse(values < 0, where, name, "0 or more", values, "Count from 0.")
+
+
+def _check_order(log: ProbeLog, where: str) -> None:
+    end_s = log.t_end_s
+    refuse(end_s <= log.t_start_s, where, "t_end_s", "later than t_start_s of its row", end_s, "Mend the times.")
+    overlaps = np.append(False, log.t_start_s[1:] < end_s[:-1])
+    refuse(overlaps, where, "t_start_s", "not before the dwell above has ended", log.t_start_s, "Sort dwells by time.")
+    falls = np.diff(log.indentation, prepend=log.indentation[0]) < 0
+    refuse(falls, where, "indentation", "rising with time", log.indentation, "Number indentations on over the passes.")
+    opens = np.diff(log.indentation, prepend=-1) != 0
+    remedy = "Log one no-load dwell, and then the contact, of every indentation."
+    refuse(opens & log.contact, where, "an indentation's first dwell", NOLOAD, CONTACT, remedy)
+    refuse(~opens & ~log.contact, where, "an indentation's later dwells", CONTACT, NOLOAD, remedy)

@@ -1,0 +1,31 @@
+"""One module a layout of recording: files in, `Readings` and an account of what was left out.
+
+Refuses to know where captures are kept and what becomes of readings.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Protocol
+
+from reskin.recordings.fault_policy import Decisions
+from reskin.recordings.header import Header
+from reskin.recordings.readers import eflash7, eflesh, ini, lab, table
+from reskin.schema import Readings
+
+
+class Reader(Protocol):
+    """What each module of a layout offers."""
+
+    def collect(self, recording: Path) -> dict[str, Path]:
+        """Find a recording's files: name in the capture folder -> source."""
+
+    def count_chips(self, files: Mapping[str, Path]) -> int:
+        """Count the chips that collected files have columns for."""
+
+    def read(self, folder: Path, header: Header, decisions: Decisions) -> tuple[Readings, dict[str, int]]:
+        """Read a capture folder; `rows_n` + `noload_rows_n` + all `dropped_*_rows_n` = `rows_read_n`."""
+
+
+READERS: Mapping[str, Reader] = {
+    "table": table, "lab": lab, "ini": ini, "eflesh": eflesh, "eflash7": eflash7,
+}  # fmt: skip

@@ -1,0 +1,206 @@
+"""Layout `eflash7`: an eFlesh pad pressed over a six-axis sensor, one CSV file a recording. In: it. Out: readings.
+
+One place is touched, or two at once, of a 3 x 3 grid whose pitch nobody states: `x_mm`, `y_mm` are NaN, and the account
+counts the rows of each place by its number, `place_<n>_rows_n`, which is 1 + column + 3 row. The recorder subtracted a
+baseline that it does not give, so `b_uT` is known but for a constant a channel; the no-load field is the mean of the
+untouched rows that a recording begins with, and the sensor's force is told from theirs. Refuses to guess a pitch.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from reskin.board.faults import zero_reads
+from reskin.errors import CaptureError
+from reskin.recordings.chips import find_whole_rows
+from reskin.recordings.fault_policy import Decisions, Ledger
+from reskin.recordings.header import Header
+from reskin.recordings.text import (
+    check_changes,
+    check_columns,
+    check_forces,
+    check_touch,
+    count_within,
+    make_readings,
+    read_cells,
+    to_numbers,
+)
+from reskin.schema import Readings
+
+READINGS = "readings.csv"
+FILES = (READINGS,)
+FIRST_LINE_N = 2  # the file's line of the first row of numbers
+SIDE_N = 3  # places a side of the grid
+ONE, TWO = ("x_pos", "y_pos"), ("pos1_x", "pos1_y", "pos2_x", "pos2_y")
+FORCES = ("fx", "fy", "fz")
+ON_SKIN = -1.0  # the file has compression as negative fz
+TOUCH_N = 0.5  # assumed, as the file marks no touches: one begins where the force rises above this
+# Chips are read about ten times a second, and the recorder writes zeros where it asked too early.
+ZERO_FRACTION_MAX = 0.25  # 4 to 10 % in 19 recordings
+GAP_s = 0.5
+# 19 recordings begin with 1.4 to 17 s without contact; noise is 3 to 6 uT, a touch 500 and more.
+STILL_uT = 40.0
+STILL_ROWS_MIN_N = 5
+
+Account = dict[str, int]
+
+
+@dataclass(frozen=True)
+class _Table:
+    """The columns of one file; `places` are the numbers of the touched places, `force_N` that on the gauge."""
+
+    time_s: Float64[np.ndarray, " f"]
+    b_uT: Float64[np.ndarray, "f ch"]
+    force_N: Float64[np.ndarray, "f 3"]
+    places: list[int]
+    ignored_columns_n: int
+
+
+def collect(recording: Path) -> dict[str, Path]:
+    """Find the file of a recording: the CSV file itself."""
+    if not recording.is_file():
+        raise CaptureError(recording, "an eflash7 recording", "one CSV file", "none", "Add each file by itself.")
+    return {READINGS: recording}
+
+
+def count_chips(files: Mapping[str, Path]) -> int:
+    """Count the chips from the names of the columns."""
+    where = str(files[READINGS])
+    names = [name.strip() for name in read_cells(files[READINGS], where, separator=",")[0]]
+    check_columns(names, ["timestamp", "mag0_x"], where, layout="eflash7")
+    return _count_chips(names)
+
+
+def read(folder: Path, header: Header, decisions: Decisions) -> tuple[Readings, Account]:
+    """Read all rows from the first touch on as readings, touched or not; the rows before it are the no-load reading."""
+    where = f"{header.capture}/{READINGS}"
+    table = _read_table(folder / READINGS, where)
+    if table.b_uT.shape[1] != 3 * header.chips_n:
+        got = table.b_uT.shape[1] // 3
+        raise CaptureError(where, "chips", f"{header.chips_n}, as in the header", got, "Mend header or file.")
+    ledger = Ledger(decisions, where, "row")
+    row = FIRST_LINE_N - 1 + np.arange(len(table.b_uT))
+    written = ~ledger.note("zeros", _zero_rows(table.b_uT, where), row)  # of all chips; `rows` tells those of some
+    unknown_degC = np.full((int(written.sum()), header.chips_n), np.nan)
+    b_uT = table.b_uT[written]
+    rows = find_whole_rows(b_uT, unknown_degC, header, where=where, decisions=decisions, row=row[written])
+    whole = written.copy()
+    whole[written] = rows.whole
+    noload = _untouched(table.b_uT, whole, where)
+    force_N = table.force_N - table.force_N[noload].mean(axis=0)
+    _check_force(table.force_N, force_N, where)
+    touch_i = _number_touches(ON_SKIN * force_N[:, 2], whole)
+    keep = whole & ~noload
+    readings = make_readings(
+        header,
+        keep,
+        indentation=touch_i,
+        pass_i=np.zeros(len(keep)),
+        reading_i=count_within(touch_i),
+        Fx_N=force_N[:, 0],
+        Fy_N=force_N[:, 1],
+        Fz_N=ON_SKIN * force_N[:, 2],
+        b_uT=table.b_uT,
+        noload_uT=np.broadcast_to(table.b_uT[noload].mean(axis=0), table.b_uT.shape),
+        temperature_degC=np.full((len(keep), header.chips_n), np.nan),
+        t_s=table.time_s,
+        n_contacts=header.contacts_before_n + touch_i,
+    )
+    return readings, {
+        "rows_n": len(readings),
+        "rows_read_n": len(keep),
+        "noload_rows_n": int(noload.sum()),
+        "dropped_zero_rows_n": int((~written).sum()),
+        **{name.replace("zeros", "zeros_of_all_chips"): n for name, n in ledger.account().items()},
+        **rows.losses(),
+        "repeated_rows_n": int((np.diff(table.b_uT[keep], axis=0) == 0).all(axis=1).sum()),
+        "gap_rows_n": int((np.diff(table.time_s) > GAP_s).sum()),
+        "baseline_subtracted_rows_n": len(readings),
+        "force_sign_unknown_rows_n": int(np.isfinite(readings.Fx_N).sum()),
+        "ignored_columns_n": table.ignored_columns_n,
+        **{f"place_{place}_rows_n": len(readings) for place in table.places},
+    }
+
+
+def _count_chips(names: Sequence[str]) -> int:
+    return max((int(found[1]) + 1 for name in names if (found := re.fullmatch(r"mag(\d{1,2})_[xyz]", name))), default=1)
+
+
+def _read_table(path: Path, where: str) -> _Table:
+    header_cells, *cells = read_cells(path, where, separator=",")
+    names = [name.strip() for name in header_cells]
+    fields = [f"mag{chip}_{axis}" for chip in range(_count_chips(names)) for axis in "xyz"]
+    places = list(TWO if set(TWO) & set(names) else ONE)
+    forces = list(FORCES if places == list(ONE) else FORCES[2:])
+    numeric = ["timestamp", *places, *forces, *fields]
+    check_columns(names, numeric, where, layout="eflash7")
+    columns = [names.index(name) for name in numeric]
+    picked = [[row[i] for i in columns] for row in cells]
+    numbers = to_numbers(picked, where, names=numeric, first_line_n=FIRST_LINE_N)
+    time_s, place, force_N, b_uT = np.split(numbers, np.cumsum([1, len(places), len(forces)]), axis=1)
+    back = np.flatnonzero(np.diff(time_s[:, 0]) <= 0)
+    if len(back):
+        got = f"an earlier one in line {FIRST_LINE_N + back[0] + 1}"
+        raise CaptureError(where, "timestamp", "later in each line", got, "Were two recordings joined?")
+    check_changes(b_uT, where, first_line_n=FIRST_LINE_N)
+    known_N = np.full((len(numbers), 3), np.nan)
+    known_N[:, -len(forces) :] = force_N
+    return _Table(time_s[:, 0], b_uT, known_N, _number_places(place, where), len(names) - len(numeric))
+
+
+def _number_places(place: Float64[np.ndarray, "f c"], where: str) -> list[int]:
+    """Number the touched places, column 1 to 3 and row 1 to 3 of each; a recording has one place, or one pair."""
+    moved = np.flatnonzero((place != place[0]).any(axis=1))
+    if len(moved):
+        got = f"another in line {FIRST_LINE_N + moved[0]}"
+        raise CaptureError(where, "places", "the same in all rows", got, "Add each place by itself.")
+    pairs = place[0].reshape(-1, 2)
+    if not np.isin(pairs, np.arange(1, SIDE_N + 1)).all():
+        rule = f"columns and rows 1 to {SIDE_N} of a grid"
+        raise CaptureError(where, "places", rule, place[0].tolist(), "Places in mm belong to layout table.")
+    numbers = sorted(int(column + SIDE_N * (row - 1)) for column, row in pairs)
+    if len(set(numbers)) < len(numbers):
+        raise CaptureError(where, "two places", "two", f"place {numbers[0]} twice", "Mend the columns of places.")
+    return numbers
+
+
+def _zero_rows(b_uT: Float64[np.ndarray, "f ch"], where: str) -> Bool[np.ndarray, " f"]:
+    """Mark the rows in which the recorder wrote zeros for all chips; a change of 0 everywhere looks the same."""
+    zero = np.asarray(zero_reads(b_uT).all(axis=1))
+    if zero.mean() > ZERO_FRACTION_MAX:
+        rule, got = f"at most {ZERO_FRACTION_MAX:.0%} of the rows", f"{int(zero.sum())} of {len(zero)}"
+        raise CaptureError(where, "rows of zeros", rule, got, "Was the sensor unplugged? Record again.")
+    return zero
+
+
+def _untouched(b_uT: Float64[np.ndarray, "f ch"], whole: Bool[np.ndarray, " f"], where: str) -> Bool[np.ndarray, " f"]:
+    """Mark the rows from the first one on in which no channel has moved; raise if they are too few."""
+    first_uT = np.median(b_uT[whole][:STILL_ROWS_MIN_N], axis=0)
+    moved = whole & (np.abs(b_uT - first_uT) > STILL_uT).any(axis=1)
+    untouched = whole & ~np.logical_or.accumulate(moved)
+    if untouched.sum() < STILL_ROWS_MIN_N:
+        rule = f"{STILL_ROWS_MIN_N} or more, without contact"
+        got = f"fields that move by more than {STILL_uT:g} uT in line {FIRST_LINE_N + int(moved.argmax())}"
+        raise CaptureError(where, "the rows before the first touch", rule, got, "Record its beginning too.")
+    return untouched
+
+
+def _check_force(gauge_N: Float64[np.ndarray, "f 3"], force_N: Float64[np.ndarray, "f 3"], where: str) -> None:
+    for axis_N in gauge_N.T:
+        check_forces(axis_N, where, first_line_n=FIRST_LINE_N)
+    check_touch(force_N, where)
+    if force_N[:, 2].max() > -force_N[:, 2].min():
+        got = f"{force_N[:, 2].max():.4g} N"
+        remedy = "Is compression negative fz in this file? Turn its sign."
+        raise CaptureError(where, "the strongest fz", "negative", got, remedy)
+
+
+def _number_touches(pressed_N: Float64[np.ndarray, " f"], whole: Bool[np.ndarray, " f"]) -> Int64[np.ndarray, " f"]:
+    """Number the touches: one begins where the force rises above `TOUCH_N`, and lasts until the next."""
+    pressed = pressed_N >= TOUCH_N
+    begins = pressed & ~np.concatenate([[False], pressed[:-1]])
+    return np.maximum(np.cumsum(begins) - 1, 0)

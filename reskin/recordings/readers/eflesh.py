@@ -1,0 +1,199 @@
+"""Layout `eflesh`: a robot arm over an eFlesh skin, three CSV files in a folder. In: that folder. Out: readings.
+
+Places are the recording's robot coordinates less their minimum, so a scan reads 0 mm upwards; the depth is counted
+down from the highest z of the recording, which may hang above the skin: its offset is unknown. Only one force is known,
+and along x or y its sign is not: the recorder does not say whether it is the skin's or the gauge's. These are counted.
+Refuses to guess a unit, a sign or a clock that the files do not tell.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64, Int32
+
+from reskin.errors import CaptureError
+from reskin.recordings.chips import find_whole_rows
+from reskin.recordings.fault_policy import Decisions
+from reskin.recordings.header import Header
+from reskin.recordings.readers.alignment import find_passes
+from reskin.recordings.text import (
+    DEPTH_MIN_mm,
+    SAME_PLACE_mm,
+    check_depths,
+    check_fields,
+    check_forces,
+    check_places,
+    check_touch,
+    make_readings,
+    read_cells,
+    to_numbers,
+)
+from reskin.schema import AXES_PER_CHIP_N, Readings
+
+SENSOR = "sensor.csv"
+CHANGES = "sensor_post_baselines.csv"
+STATES = "states.csv"
+FILES = (SENSOR, STATES, CHANGES)
+
+FORCE_AXES = ("x", "y", "z")
+NEWTON_PER_GRAM = 9.80665e-3  # standard gravity
+WEIGHT_COLUMN = 4  # of states.csv, after time, x, y and z; a recording of places only has none
+NO_NEW_WEIGHT = -1.0
+CLOCKS_APART_MAX_s = 0.05  # both files are written in one loop, milliseconds apart
+PLACE_DECIMALS = 3  # the robot reports -84.999992 mm for -85
+# Rounding of raw - dB in float32 stays below 0.004 uT; in a new reading some channel moves by an LSB, 0.15 uT or more.
+SAME_NOLOAD_uT = 0.02
+
+# A robot that holds its height wanders by 1e-4 of it; a press in m that is mistaken for mm is some hundredths of it.
+HELD_PART = 1e-3
+
+Account = dict[str, int]
+
+
+def collect(recording: Path) -> dict[str, Path]:
+    """Find the three files in the folder of one recording."""
+    missing = [name for name in FILES if not (recording / name).is_file()]
+    if missing:
+        rule = f"a folder with {', '.join(FILES)}"
+        raise CaptureError(recording, "an eflesh recording", rule, f"no {', '.join(missing)}", "Fetch it whole.")
+    return {name: recording / name for name in FILES}
+
+
+def count_chips(files: Mapping[str, Path]) -> int:
+    """Count the chips from the columns of `sensor.csv`: one time, then three a chip."""
+    where = str(files[SENSOR])
+    columns_n = len(read_cells(files[SENSOR], where, separator=",")[0])
+    if columns_n < 1 + AXES_PER_CHIP_N or (columns_n - 1) % AXES_PER_CHIP_N:
+        raise CaptureError(where, "columns", "a time and 3 a chip", columns_n, "Is this layout eflesh?")
+    return (columns_n - 1) // AXES_PER_CHIP_N
+
+
+def read(folder: Path, header: Header, decisions: Decisions) -> tuple[Readings, Account]:
+    """Read every row as one indentation; its no-load field is the baseline that the recorder subtracted, raw - dB."""
+    time_s, b_uT, noload_uT = _read_fields(folder, header)
+    states = _read_states(folder, header)
+    _check_rows_n({SENSOR: len(time_s), STATES: len(states)}, header)
+    _check_clocks(time_s, states[:, 0], header)
+    temperature_degC = np.full((len(time_s), header.chips_n), np.nan, np.float32)
+    rows = find_whole_rows(b_uT, temperature_degC, header, where=f"{header.capture}/{SENSOR}", decisions=decisions)
+    place_mm = np.round(states[:, 1:3], PLACE_DECIMALS)
+    place_mm -= place_mm.min(axis=0)
+    pass_i, touches_i = _number_passes(place_mm, noload_uT)
+    readings = make_readings(
+        header,
+        rows.whole,
+        indentation=np.arange(len(time_s)),
+        pass_i=pass_i,
+        x_mm=place_mm[:, 0],
+        y_mm=place_mm[:, 1],
+        **_read_force(states, header),
+        depth_mm=_read_depth(states, header),
+        b_uT=b_uT,
+        noload_uT=noload_uT,
+        temperature_degC=temperature_degC,
+        t_s=time_s,
+        n_contacts=header.contacts_before_n + touches_i,
+    )
+    return readings, {
+        "rows_n": len(readings),
+        "rows_read_n": len(time_s),
+        "noload_rows_n": 0,
+        **rows.losses(),
+        "no_new_force_rows_n": int((states[rows.whole, WEIGHT_COLUMN:] == NO_NEW_WEIGHT).sum()),
+        "no_depth_rows_n": int(np.isnan(readings.depth_mm).sum()),
+        "force_sign_unknown_rows_n": int(np.isfinite([readings.Fx_N, readings.Fy_N]).any(axis=0).sum()),
+        "passes_n": int(pass_i.max()) + 1,
+    }
+
+
+def _read_fields(
+    folder: Path, header: Header
+) -> tuple[Float64[np.ndarray, " f"], Float64[np.ndarray, "f ch"], Float64[np.ndarray, "f ch"]]:
+    """Read times, raw fields and no-load fields; both files of the sensor must hold the same times."""
+    names = ["time", *(f"B{axis}{chip}" for chip in range(header.chips_n) for axis in "xyz")]
+    sensor, changes = (
+        to_numbers(read_cells(folder / name, where, separator=","), where, names=names)
+        for name, where in ((name, f"{header.capture}/{name}") for name in (SENSOR, CHANGES))
+    )
+    _check_rows_n({SENSOR: len(sensor), CHANGES: len(changes)}, header)
+    differ = np.flatnonzero(sensor[:, 0] != changes[:, 0])
+    if len(differ):
+        got = f"another in line {differ[0] + 1}"
+        where = f"{header.capture}/{CHANGES}"
+        raise CaptureError(where, "time", f"that of {SENSOR}", got, "Take both files of one recording.")
+    check_fields(sensor[:, 1:], f"{header.capture}/{SENSOR}", first_line_n=1)
+    return sensor[:, 0], sensor[:, 1:], sensor[:, 1:] - changes[:, 1:]
+
+
+def _read_states(folder: Path, header: Header) -> Float64[np.ndarray, "f c"]:
+    """Read time, x, y, z and, if the recording has it, the weight."""
+    where = f"{header.capture}/{STATES}"
+    cells = read_cells(folder / STATES, where, separator=",")
+    names = ["time", "x", "y", "z"] + (["weight"] if len(cells[0]) > WEIGHT_COLUMN else [])
+    states = to_numbers(cells, where, names=names)
+    check_places(states[:, 1:3], where)
+    if not _holds_height(states[:, 3]):
+        check_depths(states[:, 3] - states[:, 3].min(), where)
+    return states
+
+
+def _check_rows_n(rows_n: Mapping[str, int], header: Header) -> None:
+    if len(set(rows_n.values())) != 1:
+        got = " and ".join(f"{count} in {name}" for name, count in rows_n.items())
+        raise CaptureError(header.capture, "rows", "equal in number", got, "Was one of the files cut?")
+
+
+def _check_clocks(sensor_s: Float64[np.ndarray, " f"], states_s: Float64[np.ndarray, " f"], header: Header) -> None:
+    """Rows pair in order, so the clocks must agree row by row, and go on."""
+    apart = np.flatnonzero(np.abs(states_s - sensor_s) >= CLOCKS_APART_MAX_s)
+    if len(apart):
+        where, rule = f"{header.capture}/{STATES}", f"within {CLOCKS_APART_MAX_s} s of {SENSOR}"
+        got = f"{states_s[apart[0]] - sensor_s[apart[0]]:.3f} s in line {apart[0] + 1}"
+        raise CaptureError(where, "time", rule, got, "Is a row missing in one of the files?")
+    back = np.flatnonzero(np.diff(sensor_s) <= 0)
+    if len(back):
+        where, got = f"{header.capture}/{SENSOR}", f"an earlier one in line {back[0] + 2}"
+        raise CaptureError(where, "time", "later in each line", got, "Were two recordings joined?")
+
+
+def _number_passes(
+    place_mm: Float64[np.ndarray, "f 2"], noload_uT: Float64[np.ndarray, "f ch"]
+) -> tuple[Int32[np.ndarray, " f"], Int32[np.ndarray, " f"]]:
+    """Number passes, and the touches before each row.
+
+    Over many places each row is a touch, and a pass ends when the places repeat. At a single place the robot
+    strokes up and down and takes a fresh baseline before each stroke: a new no-load field begins a pass, one touch.
+    """
+    if place_mm.any():
+        everywhere = np.ones(len(place_mm), bool)
+        return find_passes(place_mm, everywhere), np.arange(len(place_mm), dtype=np.int32)
+    fresh = (np.abs(np.diff(noload_uT, axis=0)) > SAME_NOLOAD_uT).any(axis=1)
+    pass_i = np.concatenate([[0], np.cumsum(fresh)]).astype(np.int32)
+    return pass_i, pass_i
+
+
+def _read_force(states: Float64[np.ndarray, "f c"], header: Header) -> dict[str, Float64[np.ndarray, " f"]]:
+    """Give the force along the gauge's axis by its column, NaN where it had no new reading; nothing without a gauge."""
+    if states.shape[1] <= WEIGHT_COLUMN:
+        return {}
+    if "force_axis" not in header.options or header.options["force_axis"] not in FORCE_AXES:
+        got = header.options if header.options else "no option"
+        remedy = "Say which force the gauge measured."
+        raise CaptureError(header.capture, "option force_axis", "x, y or z", got, remedy)
+    weight_g, where = states[:, WEIGHT_COLUMN], f"{header.capture}/{STATES}"
+    weight_N = np.where(weight_g == NO_NEW_WEIGHT, np.nan, weight_g * NEWTON_PER_GRAM)
+    check_forces(weight_N, where, first_line_n=1)
+    check_touch(weight_N, where)
+    return {f"F{header.options['force_axis']}_N": weight_N}
+
+
+def _read_depth(states: Float64[np.ndarray, "f c"], header: Header) -> Float64[np.ndarray, " f"]:
+    """Count down from the highest z; NaN where the robot held z, or the gauge measured along the skin: no depth."""
+    along = states.shape[1] > WEIGHT_COLUMN and header.options["force_axis"] != "z"
+    z_mm = states[:, 3]
+    return np.full(len(states), np.nan) if along or _holds_height(z_mm) else z_mm.max() - z_mm
+
+
+def _holds_height(z_mm: Float64[np.ndarray, " f"]) -> bool:
+    return bool(np.ptp(z_mm) <= max(SAME_PLACE_mm, min(DEPTH_MIN_mm, HELD_PART * np.abs(z_mm).max())))

@@ -1,0 +1,208 @@
+"""Layout `ini`: a 3-D printer and a force gauge, two text files. In: readings and truths. Out: one reading a press.
+
+Rows below the gauge's 0.02 N count as no contact, wherever the truths say they are: they stay, without place or force.
+Those that begin a pass, at a corner of the grid, are its no-load reading. `t_s` and `depth_mm` are NaN: none is known.
+Fields may come late: row i of the truths goes with a later row of the readings. By how many rows, the header says
+(`rows_late`) or, if it does not, the recording itself, where it tells: by as many as make |dB| go best with the force.
+A recording whose fields do not come as late throughout lost a row in one file, and is refused.
+Refuses to know which chips can be believed (`chips`) and who is tested on what.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int32
+
+from reskin.errors import CaptureError
+from reskin.recordings.chips import Rows, find_whole_rows
+from reskin.recordings.fault_policy import Decisions
+from reskin.recordings.header import Header
+from reskin.recordings.readers.alignment import find_change, find_passes
+from reskin.recordings.text import (
+    check_fields,
+    check_forces,
+    check_places,
+    check_touch,
+    make_readings,
+    mean_by_group,
+    read_cells,
+    to_numbers,
+)
+from reskin.schema import Readings
+
+READINGS = "readings.txt"
+TRUTHS = "truths.txt"
+FILES = (READINGS, TRUTHS)
+CONTACT_MIN_N = 0.02  # the recorder labels weaker rows (10, 10, 0), a real place: only force tells them apart
+VALUES_PER_CHIP_N = 4
+ROWS_LATE = ("0", "1", "2", "3", "4", "5")
+# Only a recording of so many rows tells its lateness, and by so much more of correlation than rows as recorded: the
+# public one has 0.65 instead of 0.45 over 23300 rows.
+LATE_ROWS_MIN_N, LATE_GAIN_MIN = 100, 0.1
+
+Account = dict[str, int]
+
+
+def collect(recording: Path) -> dict[str, Path]:
+    """Find the readings file and its truths beside it: `b20_NAME.txt` goes with `truths_NAME.txt`."""
+    if not recording.is_file() or recording.name.startswith("truths_"):
+        rule = "the text file of readings"
+        raise CaptureError(recording, "an ini recording", rule, recording.name, "Name the file, not truths_*.")
+    names = [f"truths_{recording.name.partition('_')[2]}", f"truths_{recording.name}"]
+    found = [recording.with_name(name) for name in names if recording.with_name(name).is_file()]
+    if not found:
+        got = f"no {' or '.join(names)}"
+        raise CaptureError(recording, "the truths", "in the same folder", got, "Fetch or rename the truths file.")
+    return {READINGS: recording, TRUTHS: found[0]}
+
+
+def count_chips(files: Mapping[str, Path]) -> int:
+    """Count the chips from the columns of the readings: X, Y, Z, T a chip."""
+    where = str(files[READINGS])
+    columns_n = len(read_cells(files[READINGS], where, separator=None)[0])
+    if columns_n == 0 or columns_n % VALUES_PER_CHIP_N:
+        raise CaptureError(where, "columns", "X, Y, Z, T a chip", columns_n, "Is this layout ini?")
+    return columns_n // VALUES_PER_CHIP_N
+
+
+def read(folder: Path, header: Header, decisions: Decisions) -> tuple[Readings, Account]:
+    """Read all rows but those with a failed chip; the no-load field of a row is the mean of its pass's corner rows."""
+    said_n = _rows_late(header)
+    b_uT, temperature_degC = _read_fields(folder, header)
+    truths = _read_truths(folder, header)
+    _check_rows_n(len(b_uT), len(truths), said_n or 0, header)
+    rows = find_whole_rows(b_uT, temperature_degC, header, where=f"{header.capture}/{READINGS}", decisions=decisions)
+    best_late_n, tells = _best_rows_late(b_uT, truths[:, 2], rows)
+    late_n = said_n if said_n is not None else best_late_n if tells else 0
+    _check_lateness(b_uT, truths, rows, header)
+    truths, rows = truths[: len(truths) - late_n], rows.part(slice(late_n, None))
+    b_uT, temperature_degC, keep = b_uT[late_n:], temperature_degC[late_n:], rows.whole
+    contact = truths[:, 2] >= CONTACT_MIN_N
+    pass_i = find_passes(truths[:, :2], contact)
+    corner = _corner_rows(pass_i, contact)
+    place_mm = np.where(contact[:, None], truths[:, :2], np.nan)
+    readings = make_readings(
+        header,
+        keep,
+        indentation=np.arange(len(keep)),
+        pass_i=pass_i,
+        x_mm=place_mm[:, 0],
+        y_mm=place_mm[:, 1],
+        Fz_N=np.where(contact, truths[:, 2], 0.0),
+        b_uT=b_uT,
+        noload_uT=_noload_field(b_uT, pass_i, corner & keep, header),
+        temperature_degC=temperature_degC,
+        n_contacts=header.contacts_before_n + np.cumsum(contact) - contact,
+    )
+    return readings, {
+        "rows_n": len(readings),
+        "rows_read_n": len(keep) + late_n,
+        **rows.losses(),
+        "dropped_no_partner_rows_n": late_n,
+        "noload_rows_n": 0,
+        "no_contact_rows_n": int((keep & ~contact).sum()),
+        "corner_rows_n": int((keep & corner).sum()),
+        "passes_n": int(pass_i.max()) + 1,
+        "rows_late_n": late_n,
+        "best_rows_late_n": best_late_n,
+    }
+
+
+def _read_fields(folder: Path, header: Header) -> tuple[Float64[np.ndarray, "f ch"], Float64[np.ndarray, "f k"]]:
+    """Read fields and temperatures, chip by chip."""
+    names = [f"{value}{chip}" for chip in range(header.chips_n) for value in ("Bx", "By", "Bz", "T")]
+    where = f"{header.capture}/{READINGS}"
+    numbers = to_numbers(read_cells(folder / READINGS, where, separator=None), where, names=names)
+    per_chip = numbers.reshape(len(numbers), header.chips_n, VALUES_PER_CHIP_N)
+    b_uT = per_chip[:, :, :3].reshape(len(numbers), -1)
+    check_fields(b_uT, where, first_line_n=1)
+    return b_uT, per_chip[:, :, 3]
+
+
+def _read_truths(folder: Path, header: Header) -> Float64[np.ndarray, "f 3"]:
+    """Read x mm, y mm, F N."""
+    where = f"{header.capture}/{TRUTHS}"
+    truths = to_numbers(read_cells(folder / TRUTHS, where, separator=None), where, names=["x_mm", "y_mm", "F_N"])
+    check_forces(truths[:, 2], where, first_line_n=1)
+    check_touch(truths[:, 2], where)
+    check_places(truths[truths[:, 2] >= CONTACT_MIN_N, :2], where)
+    return truths
+
+
+def _check_rows_n(readings_n: int, truths_n: int, rows_late_n: int, header: Header) -> None:
+    if readings_n <= rows_late_n:
+        rule = f"more than the {rows_late_n} of option rows_late"
+        raise CaptureError(header.capture, "rows", rule, readings_n, "Was the recording cut?")
+    if readings_n != truths_n:
+        got = f"{readings_n} in {READINGS} and {truths_n} in {TRUTHS}"
+        raise CaptureError(header.capture, "rows", "equal in number", got, "Is this the truths file of this one?")
+
+
+def _rows_late(header: Header) -> int | None:
+    """Read by how many rows the header says that fields come late; None if it leaves that to the recording."""
+    if "rows_late" not in header.options:
+        return None
+    rows_late = header.options["rows_late"]
+    if rows_late not in ROWS_LATE:
+        remedy = "Say by how many rows the fields come late."
+        raise CaptureError(header.capture, "option rows_late", f"0 to {ROWS_LATE[-1]}", rows_late, remedy)
+    return int(rows_late)
+
+
+def _best_rows_late(
+    b_uT: Float64[np.ndarray, "f ch"], force_N: Float64[np.ndarray, " f"], rows: Rows
+) -> tuple[int, bool]:
+    """Find by how many rows the fields come late, as |dB| goes best with the force then, and whether that is sure."""
+    correlations = []
+    for rows_late_n in range(min(len(ROWS_LATE), len(force_N) - 1)):
+        whole = rows.whole[rows_late_n:]
+        late_uT, pressed_N = b_uT[rows_late_n:][whole], force_N[: len(whole)][whole]
+        rest = pressed_N < CONTACT_MIN_N
+        if not (rest.any() and len(np.unique(pressed_N)) > 1):
+            return 0, False
+        change_uT = np.linalg.norm(late_uT - late_uT[rest].mean(axis=0), axis=1)
+        correlations.append(np.corrcoef(change_uT, pressed_N)[0, 1] if np.ptp(change_uT) > 0 else -1.0)
+    if not correlations:
+        return 0, False
+    gain = float(max(correlations) - correlations[0])
+    return int(np.argmax(correlations)), len(force_N) >= LATE_ROWS_MIN_N and gain >= LATE_GAIN_MIN
+
+
+def _check_lateness(
+    b_uT: Float64[np.ndarray, "f ch"], truths: Float64[np.ndarray, "f 3"], rows: Rows, header: Header
+) -> None:
+    """Refuse a recording whose fields fall behind their truths, or overtake them, on the way."""
+    change = find_change(b_uT, truths, truths[:, 2] >= CONTACT_MIN_N, rows.whole)
+    if change is None:
+        return
+    rows_n = abs(change.after - change.before)
+    lost = f"{rows_n} row{'s' if rows_n > 1 else ''} of {'readings' if change.after < change.before else 'truths'}"
+    got = f"{change.before} before about row {change.row + 1}, {change.after} from there on"
+    remedy = (
+        f"{lost} seem to be missing there. Cut both files before that row, or put back what is missing, and add the "
+        "recording again."
+    )
+    rule = "as many rows behind their truths throughout"
+    raise CaptureError(f"{header.capture}/{READINGS}", "fields", rule, got, remedy)
+
+
+def _corner_rows(pass_i: Int32[np.ndarray, " f"], contact: Bool[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
+    """Mark the rows of each pass before its first contact: the indenter is at the first corner, off the skin."""
+    touches_before_n = np.cumsum(contact)
+    begins = np.flatnonzero(np.diff(pass_i, prepend=-1))
+    before_pass_n = (touches_before_n - contact)[begins]
+    return np.asarray(touches_before_n == before_pass_n[pass_i])
+
+
+def _noload_field(
+    b_uT: Float64[np.ndarray, "f ch"], pass_i: Int32[np.ndarray, " f"], corner: Bool[np.ndarray, " f"], header: Header
+) -> Float64[np.ndarray, "f ch"]:
+    """Give each row the mean field of the corner rows of its pass."""
+    noload_uT = mean_by_group(b_uT[corner], pass_i[corner], int(pass_i.max()) + 1)
+    without = np.flatnonzero(np.isnan(noload_uT[:, 0]))
+    if len(without):
+        got = f"none in the pass from line {int(np.argmax(pass_i == without[0])) + 1}"
+        where, rule = f"{header.capture}/{TRUTHS}", f"begun by a whole row without contact (F < {CONTACT_MIN_N} N)"
+        raise CaptureError(where, "each pass", rule, got, "Start each pass off the skin, or cut this pass out.")
+    return noload_uT[pass_i]

@@ -1,0 +1,168 @@
+"""The log that a board writes to an SD card (section 6: dog shoe, glove). In: a CSV. Out: timed readings, an account.
+
+One line a frame: seconds of the board's clock, then T, Bx, By, Bz of each chip in degC and uT, as the text firmware
+prints them. Refuses to know contacts, places and forces: the log does not either.
+"""
+
+from codecs import BOM_UTF8
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+from jaxtyping import Bool, Float, Float32, Float64
+
+from reskin.board import faults
+from reskin.errors import CaptureError
+from reskin.recordings import columns
+from reskin.recordings.chips import GRID_ROWS_N
+from reskin.recordings.columns import FIRST_ROW
+from reskin.recordings.text import check_fields
+
+TIME = "t_s"
+CHIP_COLUMNS = ("T", "Bx", "By", "Bz")
+HEADER_LETTERS_MAX = 10_000  # a line of 64 chips has 1,500
+RATE_MIN_HZ, RATE_MAX_HZ = 1.0, 10_000.0  # assumed: no board logs slower, and a chip reads no faster
+KEPT_SHARE_MIN = 0.5  # assumed: less than this is no log of what was touched
+Log = tuple[
+    Float64[np.ndarray, " rows"], Float32[np.ndarray, "rows ch"], Float32[np.ndarray, "rows k"], dict[str, int]
+]  # s, uT, degC, an account
+GAP_FRAMES = 1.5  # times the usual step of time; in between, a frame or more is missing
+
+
+def column_names(chips_n: int) -> list[str]:
+    """Name the columns of a log."""
+    return [TIME, *(f"{name}{chip_i}" for chip_i in range(chips_n) for name in CHIP_COLUMNS)]
+
+
+def render(
+    t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"], temperature_degC: Float32[np.ndarray, "f k"]
+) -> str:
+    """Write a log: times to 0.1 ms, readings with the two decimals of the text firmware."""
+    frames_n, chips_n = temperature_degC.shape
+    chips = np.concatenate([temperature_degC[:, :, None], b_uT.reshape(frames_n, chips_n, 3)], axis=2)
+    line = ",".join(["%.4f", *["%.2f"] * (4 * chips_n)])
+    rows = np.column_stack([t_s, chips.reshape(frames_n, -1)]).tolist()
+    return "\n".join([",".join(column_names(chips_n)), *(line % tuple(row) for row in rows)]) + "\n"
+
+
+def read_log(path: Path) -> Log:
+    """Read time in s, field in uT and temperature in degC of the frames in which every chip was read, and an account.
+
+    Failed reads and stuck chips cost a frame and are counted; if they leave less than half of the log, it is refused,
+    as is one of a chip that lost its settings. `gaps_n` counts the places where time goes on by more than the usual
+    step, `gap_frames_n` the frames that fit in there.
+    """
+    where = str(path)
+    chips_n = _chips_n(path, where)
+    table = columns.parse(path, dict.fromkeys(column_names(chips_n), pa.float64()), where)
+    if not len(table):
+        raise CaptureError(where, "the log", "one line a frame", "no lines", "Copy the log again.")
+    numbers = np.column_stack([_finite(table, name, where) for name in table.column_names])
+    chips = numbers[:, 1:].reshape(len(numbers), chips_n, 4)
+    b_uT = chips[:, :, 1:].reshape(len(chips), -1).astype(np.float32)
+    return keep_whole(numbers[:, 0], b_uT, chips[:, :, 0].astype(np.float32), where, first_row=FIRST_ROW)
+
+
+def keep_whole(
+    t_s: Float64[np.ndarray, " f"],
+    b_uT: Float32[np.ndarray, "f ch"],
+    temperature_degC: Float32[np.ndarray, "f k"],
+    where: str,
+    *,
+    first_row: int = 1,
+) -> Log:
+    """Keep the frames in which every chip was read, and count the others; `first_row` numbers the first in errors."""
+    _check_time(t_s, where, first_row)
+    check_fields(b_uT, where, first_line_n=first_row)
+    failed, stuck = _faults(b_uT, temperature_degC, where, first_row)
+    whole = ~failed & ~stuck
+    account = _gaps(t_s) | {
+        "rows_read_n": len(t_s),
+        "dropped_failed_read_rows_n": int(failed.sum()),
+        "dropped_stuck_chip_rows_n": int(stuck.sum()),
+        "rows_n": int(whole.sum()),
+    }
+    _check_kept(account, where)
+    return t_s[whole], b_uT[whole], temperature_degC[whole], account
+
+
+def _check_kept(account: dict[str, int], where: str) -> None:
+    """Raise if faults left too little of a log; say which."""
+    read_n, kept_n = account["rows_read_n"], account["rows_n"]
+    if kept_n < max(2, KEPT_SHARE_MIN * read_n):
+        failed_n, stuck_n = account["dropped_failed_read_rows_n"], account["dropped_stuck_chip_rows_n"]
+        got = f"{kept_n} of {read_n}: {failed_n} had failed I2C reads, {stuck_n} stuck chips"
+        rule = f"read from every chip in {100 * KEPT_SHARE_MIN:g} % of them or more"
+        raise CaptureError(where, "lines", rule, got, "Mend the wiring, and log again.")
+
+
+def _chips_n(path: Path, where: str) -> int:
+    """Count the chips that the header line names; a last line without an end was cut."""
+    try:
+        with path.open("rb") as file:
+            first = file.readline(HEADER_LETTERS_MAX)
+            file.seek(-1, 2)
+            last = file.read(1)
+    except FileNotFoundError:
+        raise CaptureError(where, "the file", "there", "nothing", "Check the path.") from None
+    except OSError as error:
+        got = "an empty file" if path.is_file() and not path.stat().st_size else error.strerror
+        raise CaptureError(where, "the log", "a readable file", got, "Check the name.") from None
+    # A text editor or a spreadsheet may have put a byte order mark first; the CSV reader skips it too.
+    names = first.removeprefix(BOM_UTF8).decode("ascii", errors="replace").strip().split(",")
+    chips_n = (len(names) - 1) // len(CHIP_COLUMNS)
+    if chips_n < 1 or names != column_names(chips_n):
+        rule, got = f"{','.join(column_names(1))}, then T1 and so on", repr(",".join(names)[:60])
+        raise CaptureError(
+            where, "row 1, the column names,", rule, got, "If it is a board's log, write that line on top."
+        )
+    if last != b"\n":
+        rule, remedy = "complete and end in a line feed", "Remove it, if the board was switched off there."
+        raise CaptureError(where, "the last line", rule, "a line that was cut", remedy)
+    return chips_n
+
+
+def _finite(table: pa.Table, name: str, where: str) -> Float64[np.ndarray, " f"]:
+    values = np.asarray(table.column(name), np.float64)  # an empty cell is NaN
+    remedy = "Remove that line; the gap is counted."
+    columns.refuse(~np.isfinite(values), where, name, "a finite number", values, remedy)
+    return values
+
+
+def _check_time(t_s: Float64[np.ndarray, " f"], where: str, first_row: int) -> None:
+    if len(t_s) < 2:
+        raise CaptureError(where, "the log", "two lines or more", len(t_s), "Copy the log again.")
+    back = np.diff(t_s) <= 0
+    if back.any():
+        row_i = int(back.argmax()) + 1
+        got = f"{t_s[row_i]:.4f} after {t_s[row_i - 1]:.4f}"
+        remedy = "Was the board reset? Cut the log there."
+        raise CaptureError(f"{where} row {row_i + first_row}", TIME, "later than the line above", got, remedy)
+    rate_hz = 1 / float(np.median(np.diff(t_s)))
+    if not RATE_MIN_HZ <= rate_hz <= RATE_MAX_HZ:
+        rule = f"{RATE_MIN_HZ:g} to {RATE_MAX_HZ:g} lines a second"
+        remedy = f"{TIME} is in seconds: was it written in milliseconds?"
+        raise CaptureError(where, "the rate", rule, f"{rate_hz:.3g}", remedy)
+
+
+def _faults(
+    b_uT: Float32[np.ndarray, "f ch"], temperature_degC: Float32[np.ndarray, "f k"], where: str, first_row: int
+) -> tuple[Bool[np.ndarray, " f"], Bool[np.ndarray, " f"]]:
+    failed = np.asarray(faults.failed_reads(b_uT, temperature_degC).any(axis=1))
+    if failed.all():
+        remedy = "Mend the wiring, and log again."
+        raise CaptureError(where, "lines", "read from every chip", "failed I2C reads in all of them", remedy)
+    read = np.flatnonzero(~failed)
+    for block in np.array_split(read, max(1, len(read) // GRID_ROWS_N)):
+        odd = np.flatnonzero(faults.reset_chips(b_uT[block], None))
+        if len(odd):
+            what = f"the step of chip {', '.join(map(str, odd))} from row {block[0] + first_row} on"
+            rule, remedy = "that of the other chips", "It lost its settings: reset the board, log again."
+            raise CaptureError(where, what, rule, "another", remedy)
+    return failed, np.asarray(faults.stuck_chips(b_uT).any(axis=1)) & ~failed
+
+
+def _gaps(t_s: Float[np.ndarray, " f"]) -> dict[str, int]:
+    steps = np.diff(t_s) / np.median(np.diff(t_s))
+    wide = steps > GAP_FRAMES
+    return {"gaps_n": int(wide.sum()), "gap_frames_n": int((np.round(steps[wide]) - 1).sum())}

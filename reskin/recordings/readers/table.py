@@ -1,0 +1,228 @@
+"""Reader of layout `table`: any rig's recording in one CSV or Parquet file with named columns."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from jaxtyping import Bool, Float64, Int
+
+from reskin.errors import CaptureError
+from reskin.recordings.chips import find_whole_rows
+from reskin.recordings.fault_policy import Decisions
+from reskin.recordings.header import Header
+from reskin.recordings.readers.alignment import find_passes
+from reskin.recordings.text import (
+    SAME_PLACE_mm,
+    WEAKEST_uT,
+    check_columns,
+    check_depths,
+    check_fields,
+    check_forces,
+    check_places,
+    check_touch,
+    contact_rows,
+    count_chips_of,
+    count_within,
+    make_readings,
+    mean_by_group,
+    read_cells,
+    to_numbers,
+)
+from reskin.schema import Readings
+
+CSV, PARQUET = "readings.csv", "readings.parquet"
+FILES = (CSV,)
+NEEDED = ("phase", "x_mm", "y_mm")
+OPTIONAL = ("indentation", "pass", "t_s", "depth_mm", "Fx_N", "Fy_N", "Fz_N")
+FIRST_LINE_N = 2  # of a CSV file: the first row of numbers
+EMPTY = ("", "nan", "NaN")
+STEMS = {"f", "fx", "fy", "fz", "force", "depth", "x", "y", "t", "time", "indent", "indentation", "press", "pass"}
+
+
+SUBTRACTED_PART = 0.5  # assumed: of the field in contact, at the chip that reads most
+
+Account = dict[str, int]
+
+
+def columns_of(chips_n: int) -> list[str]:
+    """List all columns that a file may have, in the order of a template."""
+    fields = [f"{axis}{chip}" for chip in range(chips_n) for axis in ("Bx", "By", "Bz")]
+    return [*NEEDED, *fields, *OPTIONAL, *(f"T{chip}" for chip in range(chips_n))]
+
+
+def collect(recording: Path) -> dict[str, Path]:
+    """Find the file of a recording."""
+    if not recording.is_file():
+        raise CaptureError(recording, "a table", "one CSV or Parquet file", "none", "Add each file by itself.")
+    return {PARQUET if recording.suffix == ".parquet" else CSV: recording}
+
+
+def count_chips(files: Mapping[str, Path]) -> int:
+    """Count the chips from the names of the columns."""
+    (file,) = files.values()
+    return count_chips_of(_read_cells(file, str(file))[0])
+
+
+def read(folder: Path, header: Header, decisions: Decisions) -> tuple[Readings, Account]:
+    """Read contact rows as readings; the no-load field of a row is the mean of the last no-load rows before it."""
+    name = next(name for name in (CSV, PARQUET) if (folder / name).exists())
+    where = f"{header.capture}/{name}"
+    names, cells = _read_cells(folder / name, where)
+    if count_chips_of(names) != header.chips_n:
+        rule = f"{header.chips_n}, as in the header"
+        raise CaptureError(where, "chips", rule, count_chips_of(names), "Mend header or file.")
+    columns = columns_of(header.chips_n)
+    check_columns(names, columns[: -len(OPTIONAL) - header.chips_n], where, layout="table")
+    contact = contact_rows([row[names.index("phase")].strip() for row in cells], where, FIRST_LINE_N)
+    _refuse_near_names(names, columns, where)
+    known = [column for column in columns[1:] if column in names and not _is_empty(column, names, cells)]
+    numbers = dict(zip(known, _to_numbers(names, cells, known, contact, where).T, strict=True))
+    b_uT = np.stack([numbers[column] for column in columns[len(NEEDED) : len(NEEDED) + 3 * header.chips_n]], axis=1)
+    _check(numbers, b_uT, contact, where)
+    unknown = np.full(len(contact), np.nan)
+    temperature_degC = np.stack([numbers.get(f"T{chip}", unknown) for chip in range(header.chips_n)], axis=1)
+    rows = find_whole_rows(b_uT, temperature_degC, header, where=where, decisions=decisions)
+    press = _number_presses(numbers, contact, where)
+    block = np.cumsum(np.diff(contact.astype(int), prepend=1) < 0)  # a block of no-load rows, and the contacts after it
+    rest = ~contact & rows.whole
+    noload_uT = mean_by_group(b_uT[rest], block[rest], int(block[-1]) + 1)[block]
+    keep = contact & rows.whole
+    without = np.flatnonzero(keep & np.isnan(noload_uT[:, 0]))
+    if len(without):
+        got = f"none before line {FIRST_LINE_N + without[0]}"
+        raise CaptureError(where, "each press", "after no-load rows that were read", got, "Add rows of phase noload.")
+    still = "depth_mm" in numbers and not numbers["depth_mm"][contact].any()
+    pass_i = numbers["pass"] if "pass" in numbers else _find_passes(numbers, press, contact)
+    reading_i = np.zeros(len(keep), int)
+    reading_i[keep] = count_within(press[keep])
+    readings = make_readings(
+        header, keep, indentation=press, pass_i=pass_i, reading_i=reading_i,
+        x_mm=numbers["x_mm"], y_mm=numbers["y_mm"], depth_mm=unknown if still else numbers.get("depth_mm", unknown),
+        **{axis: numbers.get(axis, unknown) for axis in ("Fx_N", "Fy_N", "Fz_N", "t_s")},
+        b_uT=b_uT, noload_uT=noload_uT, temperature_degC=temperature_degC, n_contacts=header.contacts_before_n + press,
+    )  # fmt: skip
+    return readings, {
+        "rows_n": len(readings),
+        "rows_read_n": len(keep),
+        "noload_rows_n": int(rest.sum()),
+        **rows.losses(),
+        "ignored_columns_n": len(set(names) - set(columns)),
+        "passes_n": len(np.unique(readings.pass_i)),
+        "no_depth_rows_n": len(readings) if still or "depth_mm" not in numbers else 0,
+    }
+
+
+def _read_cells(path: Path, where: str) -> tuple[list[str], list[list[str]]]:
+    if path.suffix != ".parquet":
+        head, *cells = read_cells(path, where, separator=",")
+        return [name.strip() for name in head], cells
+    try:
+        table = pq.read_table(path)
+    except (pa.ArrowInvalid, OSError) as error:
+        raise CaptureError(where, "the file", "Parquet", str(error)[:60], "Write it again.") from None
+    columns = [["" if value is None else str(value) for value in column.to_pylist()] for column in table.columns]
+    return list(table.column_names), [list(row) for row in zip(*columns, strict=True)]
+
+
+def _refuse_near_names(names: Sequence[str], columns: Sequence[str], where: str) -> None:
+    """Raise for a column that would be ignored, though its name is nearly one that is known: `Fz` for `Fz_N`."""
+    for name in names:
+        if name not in columns and name.lower().split("_")[0] in STEMS:
+            rule = f"one of {', '.join((*NEEDED, *OPTIONAL))}, or another word"
+            raise CaptureError(where, "a column's name", rule, repr(name), "Rename the column, or remove it.")
+
+
+def _is_empty(column: str, names: Sequence[str], cells: Sequence[Sequence[str]]) -> bool:
+    """Tell whether nothing stands in a column that may be left out, as in a template that was not filled in there."""
+    at = names.index(column)
+    return (column in OPTIONAL or column[0] == "T") and all(row[at].strip() in EMPTY for row in cells)
+
+
+def _to_numbers(
+    names: list[str], cells: list[list[str]], known: Sequence[str], contact: Bool[np.ndarray, " f"], where: str
+) -> Float64[np.ndarray, "f c"]:
+    """Turn the known columns into numbers; a place, depth or force of a row without contact may be empty."""
+    at = [names.index(column) for column in known]
+    may_lack = {column for column in known if column[0] != "B"}
+    picked = [[row[i].strip() for i in at] for row in cells]
+    lacking = np.array([[cell in EMPTY for cell in row] for row in picked], bool).reshape(len(picked), len(known))
+    lacking &= ~contact[:, None] & np.isin(known, sorted(may_lack))
+    filled = [
+        ["0" if lack else cell for cell, lack in zip(*row, strict=True)] for row in zip(picked, lacking, strict=True)
+    ]
+    numbers = to_numbers(filled, where, names=known, first_line_n=FIRST_LINE_N)
+    return np.where(lacking, np.nan, numbers)
+
+
+def _check(
+    numbers: Mapping[str, Float64[np.ndarray, " f"]],
+    b_uT: Float64[np.ndarray, "f ch"],
+    contact: Bool[np.ndarray, " f"],
+    where: str,
+) -> None:
+    _refuse_subtracted(b_uT, contact, where)
+    check_fields(b_uT, where, first_line_n=FIRST_LINE_N)
+    check_places(np.stack([numbers["x_mm"], numbers["y_mm"]], axis=1)[contact], where)
+    if "depth_mm" in numbers:
+        check_depths(numbers["depth_mm"][contact], where)
+    for axis in ("Fx_N", "Fy_N", "Fz_N"):
+        if axis in numbers:
+            check_forces(numbers[axis], where, first_line_n=FIRST_LINE_N)
+            check_touch(numbers[axis][contact], where)
+    if "Fz_N" in numbers and np.median(numbers["Fz_N"][contact]) < 0:
+        got = f"{np.median(numbers['Fz_N'][contact]):.4g} N"
+        raise CaptureError(where, "the usual Fz_N in contact", "positive", got, "Turn its sign.")
+
+
+def _refuse_subtracted(b_uT: Float64[np.ndarray, "f ch"], contact: Bool[np.ndarray, " f"], where: str) -> None:
+    """Raise if fields are weak, and weakest without contact: a baseline was subtracted already.
+
+    In other units both shrink alike: a skin's field at rest is larger than what a press changes of it.
+    """
+    chips_uT = np.linalg.norm(b_uT.reshape(len(b_uT), -1, 3), axis=2)
+    if np.median(chips_uT) >= WEAKEST_uT or contact.all() or not contact.any():
+        return
+    rest_uT, pressed_uT = (float(np.median(chips_uT[rows].max(axis=1))) for rows in (~contact, contact))
+    if rest_uT < SUBTRACTED_PART * pressed_uT:
+        got = f"{rest_uT:.3g} uT at most in no-load rows beside {pressed_uT:.3g} uT in contact"
+        remedy = "A baseline seems to be subtracted already: write the raw fields of both phases."
+        raise CaptureError(where, "raw fields", "those of the skin at rest, not changes", got, remedy)
+
+
+def _number_presses(
+    numbers: Mapping[str, Float64[np.ndarray, " f"]], contact: Bool[np.ndarray, " f"], where: str
+) -> Int[np.ndarray, " f"]:
+    """Number presses from 0: by `indentation` if it is there, else one more at each touch and each new place."""
+    if "indentation" in numbers:
+        rows = np.flatnonzero(contact)  # a number of rows without contact says nothing
+        number = numbers["indentation"][rows]
+        begins = np.flatnonzero(np.diff(number, prepend=np.nan) != 0)
+        firsts, counts = np.unique(number[begins], return_counts=True)
+        if (counts > 1).any():
+            twice = firsts[counts > 1][0]
+            line_n = FIRST_LINE_N + rows[begins[np.flatnonzero(number[begins] == twice)[1]]]
+            got = f"{twice:g} once more in line {line_n}"
+            raise CaptureError(where, "indentation", "one block of rows a number", got, "Was the file joined twice?")
+        begins_at = np.zeros(len(contact), bool)
+        begins_at[rows[begins]] = True
+        return np.maximum(np.cumsum(begins_at) - 1, 0)
+    place = np.stack([numbers["x_mm"], numbers["y_mm"]], axis=1)
+    elsewhere = np.r_[True, (np.abs(np.diff(place, axis=0)) > SAME_PLACE_mm).any(axis=1)]
+    begins_at = contact & (np.r_[True, ~contact[:-1]] | elsewhere)
+    return np.maximum(np.cumsum(begins_at) - 1, 0)
+
+
+def _find_passes(
+    numbers: Mapping[str, Float64[np.ndarray, " f"]], press: Int[np.ndarray, " f"], contact: Bool[np.ndarray, " f"]
+) -> Int[np.ndarray, " f"]:
+    """Number the passes by the presses' places and greatest depths, as they repeat in order."""
+    of_press = [
+        np.array([part.max() for part in np.split(numbers[name][contact], np.flatnonzero(np.diff(press[contact])) + 1)])
+        for name in ("x_mm", "y_mm", "depth_mm")
+        if name in numbers
+    ]
+    _, kind = np.unique(np.round(np.stack(of_press, axis=1), 3), axis=0, return_inverse=True)
+    found = find_passes(np.stack([kind, kind], axis=1).astype(float), np.ones(len(kind), bool))
+    return found.astype(int)[press]

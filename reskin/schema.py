@@ -1,0 +1,141 @@
+"""What a row means: column, dtype, unit, axis. In: arrays. Out: the Arrow schema of `data/indentations`.
+
+Axis letters, used in every array annotation: n indentations, f readings (frames), ch = 3 k channels
+(Bx, By, Bz of chip 0, then of chip 1, ...), k chips, s sources, o observers, b batch, d dwells of the robot,
+c chunks of a stream, g steps of a time grid.
+Refuses to know where a reading came from or what will be learned from it.
+"""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+import pyarrow as pa
+from jaxtyping import Float32, Float64, Int32
+
+from reskin.errors import SchemaError
+
+SCHEMA_VERSION = "2"  # 1: Fx_N and Fy_N of layout lab were those of the gauge
+FORCE_SIGNS = (
+    "Force on the skin, in newtons: Fx_N and Fy_N positive along the axes of the labels x_mm and y_mm, "
+    "Fz_N positive in compression."
+)
+AXES_PER_CHIP_N = 3
+
+
+@dataclass(frozen=True)
+class Readings:
+    """The readings of one capture, one row each; NaN where a recording does not know a value.
+
+    Forces have the signs of `FORCE_SIGNS`, recorded and simulated. `b_uT` is the field as read, `noload_uT` the mean
+    field of the no-load reading that belongs to the row's indentation. `x_mm`, `y_mm` are NaN on a row without contact.
+    `n_contacts` counts the skin's contacts before this one.
+    """
+
+    capture: str
+    board: str
+    skin: str
+    source: str  # "simulated" or "recorded"
+    indentation: Int32[np.ndarray, " f"]
+    pass_i: Int32[np.ndarray, " f"]
+    reading_i: Int32[np.ndarray, " f"]
+    x_mm: Float32[np.ndarray, " f"]
+    y_mm: Float32[np.ndarray, " f"]
+    depth_mm: Float32[np.ndarray, " f"]
+    Fx_N: Float32[np.ndarray, " f"]
+    Fy_N: Float32[np.ndarray, " f"]
+    Fz_N: Float32[np.ndarray, " f"]
+    b_uT: Float32[np.ndarray, "f ch"]
+    noload_uT: Float32[np.ndarray, "f ch"]
+    temperature_degC: Float32[np.ndarray, "f k"]
+    t_s: Float64[np.ndarray, " f"]
+    n_contacts: Int32[np.ndarray, " f"]
+
+    def __len__(self) -> int:
+        return len(self.indentation)
+
+    @property
+    def chips_n(self) -> int:
+        return self.b_uT.shape[1] // AXES_PER_CHIP_N
+
+
+LABELS = ("capture", "board", "skin", "source")
+# Of every column of numbers: the suffix of its name where that is a unit.
+UNITS = {
+    field.name: suffix if (suffix := field.name.rpartition("_")[2]) in ("mm", "N", "uT", "degC", "s") else "1"
+    for field in fields(Readings)
+    if field.name not in LABELS
+}
+_INTEGERS = ("indentation", "pass_i", "reading_i", "n_contacts")
+_PER_CHIP_N = {"b_uT": AXES_PER_CHIP_N, "noload_uT": AXES_PER_CHIP_N, "temperature_degC": 1}
+
+
+def arrow_schema(chips_n: int) -> pa.Schema:
+    """Give the Arrow schema of a readings table; the unit stands in each field's metadata."""
+    rows = [pa.field(name, pa.string(), False, {"unit": ""}) for name in LABELS]
+    for name, unit in UNITS.items():
+        rows.append(pa.field(name, _arrow_type(name, chips_n), True, {"unit": unit}))
+    return pa.schema(rows, metadata={"reskin.schema": SCHEMA_VERSION, "reskin.force": FORCE_SIGNS})
+
+
+def _arrow_type(name: str, chips_n: int) -> pa.DataType:
+    if name in _PER_CHIP_N:
+        return pa.list_(pa.float32(), _PER_CHIP_N[name] * chips_n)
+    if name in _INTEGERS:
+        return pa.int32()
+    return pa.float64() if name == "t_s" else pa.float32()
+
+
+def to_table(readings: Readings) -> pa.Table:
+    """Turn readings into an Arrow table with units."""
+    schema = arrow_schema(readings.chips_n)
+    columns = []
+    for field in schema:
+        value = getattr(readings, field.name)
+        if field.name in LABELS:
+            columns.append(pa.array([value] * len(readings), pa.string()))
+        elif field.name in _PER_CHIP_N:
+            columns.append(pa.FixedSizeListArray.from_arrays(pa.array(value.ravel()), field.type.list_size))
+        else:
+            columns.append(pa.array(value, field.type))
+    return pa.Table.from_arrays(columns, schema=schema)
+
+
+def from_table(table: pa.Table, where: str) -> Readings:
+    """Read a table of one capture back; raise `SchemaError` if it is not of this schema."""
+    chips_n = check_schema(table.schema, where)
+    values: dict[str, object] = {}
+    for name in LABELS:
+        distinct = table.column(name).unique().to_pylist()
+        if len(distinct) != 1:
+            remedy = "Write one capture a file."
+            raise SchemaError(where, f"column {name}", "one value in the file", distinct[:3], remedy)
+        values[name] = distinct[0]
+    for name in UNITS:
+        column = table.column(name).combine_chunks()
+        if name in _PER_CHIP_N:
+            values[name] = np.asarray(column.flatten()).reshape(len(table), _PER_CHIP_N[name] * chips_n)
+        else:
+            values[name] = np.asarray(column)
+    return Readings(**values)  # type: ignore[arg-type]
+
+
+def check_schema(schema: pa.Schema, where: str) -> int:
+    """Check names, types and units against `arrow_schema`; return the number of chips."""
+    missing = [field.name for field in fields(Readings) if field.name not in schema.names]
+    if missing:
+        rule, got = "those of reskin/schema.py", f"none named {missing}"
+        raise SchemaError(where, "columns", rule, got, "Ingest it again.")
+    b_type = schema.field("b_uT").type
+    if not pa.types.is_fixed_size_list(b_type) or b_type.list_size % AXES_PER_CHIP_N:
+        raise SchemaError(where, "b_uT", "a fixed list of 3 values a chip", b_type, "Ingest it again.")
+    chips_n = b_type.list_size // AXES_PER_CHIP_N
+    for want in arrow_schema(chips_n):
+        have = schema.field(want.name)
+        if have.type != want.type:
+            raise SchemaError(where, f"column {want.name}", want.type, have.type, "Ingest it again.")
+        unit, want_unit = (have.metadata or {}).get(b"unit"), (want.metadata or {})[b"unit"]
+        if unit != want_unit:
+            got = "no unit" if unit is None else unit.decode()
+            remedy = "Convert it, then write the unit."
+            raise SchemaError(where, f"unit of {want.name}", repr(want_unit.decode()), got, remedy)
+    return chips_n

@@ -1,0 +1,192 @@
+"""The contact response: field and force at every stop of the tip. In: board, skin, tips, terms of physics.
+
+A term of physics that a protocol does not name is not computed (PHYSICS 8 says what that costs).
+Refuses to know frames, chips' electronics and clocks.
+"""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.constants import micro
+from scipy.spatial.transform import Rotation
+
+from reskin.config import Strict
+from reskin.physics import shear, slide
+from reskin.physics.aging import (
+    Ageing,
+    Memory,
+    Relaxation,
+    Temperature,
+    fading,
+    force_left,
+    remembered,
+    softening,
+    wandering,
+)
+from reskin.physics.board import Board
+from reskin.physics.magnet import change_of_field
+from reskin.physics.shear import Friction, drag
+from reskin.physics.skin import (
+    Dipoles,
+    Skin,
+    beyond_verified_n,
+    changes_of_field,
+    forces,
+    moved_dipoles,
+    shear_moduli_Pa,
+)
+
+DEPTH_STEP_M = 10e-6  # depths whose shear is taken as one: stiffness differs by 1 %, dB by 0.1 uT
+
+
+class Terms(Strict):
+    """Physics that only some protocols need, each with its sizes."""
+
+    ageing: Ageing | None = None
+    friction: Friction | None = None
+    memory: Memory | None = None
+    relaxation: Relaxation | None = None
+    temperature: Temperature | None = None
+
+    def named(self) -> set[str]:
+        return {name for name in type(self).model_fields if getattr(self, name) is not None}
+
+    def only(self, names: Collection[str]) -> "Terms":
+        return Terms(**{name: getattr(self, name) for name in names})
+
+
+class Sideways(NamedTuple):
+    """At every stop: the force in the skin's plane, and the change of field that press and push make together."""
+
+    force_N: Float[np.ndarray, "n p 2"]
+    change_T: Float[np.ndarray, "n p k 3"]
+
+
+@dataclass(frozen=True)
+class Response:
+    """Fields at the chips in tesla and forces on the skin in newtons; axes n indentations, p stops, k chips."""
+
+    rest_T: Float[np.ndarray, "n k 3"]  # before each indentation
+    change_T: Float[np.ndarray, "n p k 3"]
+    force_N: Float[np.ndarray, "n p 3"]
+    beyond_verified_n: int  # stops deeper than any published solution vouches for
+
+
+def respond(
+    board: Board,
+    skin: Skin,
+    tip_m: Float[np.ndarray, "n p 3"],
+    *,
+    tilt: Float[np.ndarray, "n 2"],
+    terms: Terms,
+    rng: np.random.Generator,
+) -> Response:
+    """Press the skin at every stop (x, y, depth in the board's frame), fresh at the first indentation.
+
+    Without friction nothing pushes sideways: a tip that is dragged or leans (`tilt`, x and y over z) only presses.
+    """
+    n, stops_n, _ = tip_m.shape
+    flat_m = tip_m.reshape(-1, 3)
+    force_N = np.zeros((n, stops_n, 3))
+    if terms.friction is None:
+        rest_T, change_T = changes_of_field(board, skin, flat_m)
+    else:
+        rest_T, _ = changes_of_field(board, skin, flat_m[:0])
+        force_N[:, :, :2], change_T = push(board, skin, tip_m, tilt=tilt, how=terms.friction)
+    force_N[:, :, 2] = forces(skin, flat_m[:, 2]).reshape(n, stops_n)
+    change_T = change_T.reshape(n, stops_n, *rest_T.shape)
+    every_rest_T = np.broadcast_to(rest_T, (n, *rest_T.shape))
+    if terms.ageing is not None:
+        contacts_n, ageing = np.arange(n), terms.ageing
+        force_N *= softening(contacts_n, settling=ageing.settling, ageing=ageing.ageing)[:, None, None]
+        left = 1 - fading(contacts_n, per_decade=ageing.fading_per_decade)
+        walk_T = wandering(contacts_n, rest_T.size, step_T=ageing.wandering_uT * micro, rng=rng)
+        every_rest_T = left[:, None, None] * rest_T + walk_T.reshape(-1, *rest_T.shape)
+    if terms.relaxation is not None:
+        force_N *= force_left(terms.relaxation)
+    if terms.memory is not None:
+        before_T, added_T = remembered(change_T.mean(axis=1), terms.memory)
+        every_rest_T = every_rest_T + before_T
+        change_T = change_T + added_T[:, None]
+    deep_n = beyond_verified_n(skin, flat_m[:, 2])
+    return Response(every_rest_T, change_T, force_N, deep_n)
+
+
+def push(
+    board: Board, skin: Skin, tip_m: Float[np.ndarray, "n p 3"], *, tilt: Float[np.ndarray, "n 2"], how: Friction
+) -> Sideways:
+    """Drag or lean a tip through the stops of every indentation, from its first in contact; Coulomb limits the force.
+
+    The force shears the layer under the tip, and slides a skin that its base holds by springs (`Skin.hold`) as one;
+    another skin's base is taken as fixed sideways: an assumption, without which it would come along with the tip.
+    """
+    pushed = [_push_once(board, skin, *each, how.coefficient) for each in zip(tip_m, tilt, strict=True)]
+    return Sideways(*map(np.stack, zip(*pushed, strict=True)))
+
+
+def _push_once(
+    board: Board, skin: Skin, tip_m: Float[np.ndarray, "p 3"], tilt: Float[np.ndarray, "2"], coefficient: float
+) -> tuple[Float[np.ndarray, "p 2"], Float[np.ndarray, "p k 3"]]:
+    normal_N = forces(skin, tip_m[:, 2])
+    maps = [_map(skin, depth_m) if force > 0 else None for depth_m, force in zip(tip_m[:, 2], normal_N, strict=True)]
+    shear_Pa = shear_moduli_Pa(skin, tip_m[:, 2])
+    layer_N_per_m = shear_Pa * np.array([0.0 if shear_map is None else shear_map.stiffness_m for shear_map in maps])
+    slides_m_per_N = _slides_m_per_N(skin, tip_m[:, :2])
+    dragged = drag(
+        tip_m[:, :2], normal_N, stiffness_N_per_m=_in_series(layer_N_per_m, slides_m_per_N), friction=coefficient
+    )
+    force_N = _limited(dragged.force_N + normal_N[:, None] * tilt, coefficient * normal_N)
+    # The material under the tip rested behind it: there both press and push are centred.
+    slid_m = (slides_m_per_N @ force_N[:, :, None])[:, :, 0]
+    elastic_m = force_N / np.where(layer_N_per_m > 0, layer_N_per_m, 1.0)[:, None] + slid_m
+    centre_m = np.column_stack([tip_m[:, :2] - elastic_m, tip_m[:, 2]])
+    slides = slide.rigid(tip_m[:, :2] - skin.seat_m, slid_m, skin.sides_m)
+    change_T = np.zeros((len(tip_m), *board.chips_m.shape))
+    for stop_i, before, after in moved_dipoles(skin, centre_m):
+        shear_map = maps[stop_i]
+        if shear_map is not None and force_N[stop_i].any():
+            after = _carry(shear_map, after, centre_m[stop_i, :2], force_N[stop_i], 3 * shear_Pa[stop_i])
+            after = slide.apply(slides, stop_i, after, skin.seat_m)
+        change_T[stop_i] = change_of_field(before, after, board.chips_m)
+    return force_N, change_T
+
+
+def _slides_m_per_N(skin: Skin, places_m: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, "p 2 2"]:
+    if skin.hold is None:
+        return np.zeros((len(places_m), 2, 2))
+    return slide.compliance_m_per_N(places_m - skin.seat_m, skin.sides_m, skin.hold.springs_N_per_m)
+
+
+def _in_series(
+    layer_N_per_m: Float[np.ndarray, " p"], slides_m_per_N: Float[np.ndarray, "p 2 2"]
+) -> Float[np.ndarray, "p 2 2"]:
+    # A layer without stiffness passes no force on to its springs.
+    stiff = layer_N_per_m > 0
+    layers_m_per_N = np.eye(2) / np.where(stiff, layer_N_per_m, 1.0)[:, None, None]
+    return np.where(stiff[:, None, None], np.linalg.inv(layers_m_per_N + slides_m_per_N), 0.0)
+
+
+def _map(skin: Skin, depth_m: float) -> shear.ShearMap:
+    true_m = DEPTH_STEP_M * max(round((depth_m + skin.depth_zero_m) / DEPTH_STEP_M), 1)
+    return shear.tabulate_depth(true_m, thickness_m=skin.thickness_m, tip_radius_m=skin.tip_radius_m, base=skin.base)
+
+
+def _limited(force_N: Float[np.ndarray, "p 2"], limit_N: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p 2"]:
+    size_N = np.hypot(*force_N.T)
+    return force_N * np.minimum(1.0, limit_N / np.where(size_N > 0, size_N, 1.0))[:, None]
+
+
+def _carry(
+    shear_map: shear.ShearMap,
+    dipoles: Dipoles,
+    centre_m: Float[np.ndarray, "2"],
+    force_N: Float[np.ndarray, "2"],
+    modulus_Pa: float,
+) -> Dipoles:
+    nodes_m, moments_A_m2 = dipoles
+    carried = shear.carry(shear_map, nodes_m, centre_m, force_N=force_N, modulus_Pa=modulus_Pa)
+    angle_rad, axis = shear.angle_and_axis(carried.half_curl)
+    return nodes_m + carried.displacement_m, Rotation.from_rotvec(angle_rad[:, None] * axis).apply(moments_A_m2)

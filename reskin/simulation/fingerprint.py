@@ -1,0 +1,49 @@
+"""A fingerprint of the simulated skin: the same as long as equal presses make equal fields and forces."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from scipy.constants import micro, milli
+
+from reskin.config import Settings, parse
+from reskin.physics.board import BoardDesign, Spreads, draw_board
+from reskin.physics.magnet import Quadrature
+from reskin.physics.skin import SkinDesign, changes_of_field, draw_skin, forces
+
+SECTIONS = ("skin", "rig", "chip", "spreads")  # of params.yaml
+RULE = Quadrature(cell_m=0.8e-3, layers_n=5)  # as scene quick
+BOARD = BoardDesign(
+    chips_xy_mm=((0.0, 0.0), (-7.0, 0.0), (0.0, -7.0), (7.0, 0.0), (0.0, 7.0)),
+    chips_turn_deg=(0.0, 180.0, 270.0, 90.0, 0.0),
+    gap_mm=1.1,
+)
+PLACES_MM = ((0.0, 0.0), (4.0, -2.0), (-6.0, 4.0), (8.0, 4.0))
+DEPTHS_MM = (0.2, 0.6, 1.2)
+DIGITS = 4  # significant ones: rounding differs less, another law more
+
+
+def fingerprint(settings: Settings) -> str:
+    """Give the fingerprint of the skin, rig and chips of params.yaml."""
+    return of_sections({name: settings.shared[name] for name in SECTIONS})
+
+
+def of_sections(sections: Mapping[str, Any]) -> str:
+    """Press two drawn skins at some places and depths: a digest of fields in uT, forces in N, and rig and chips.
+
+    Code that computes the same in another way has the same fingerprint; another law or another setting has not.
+    """
+    design = parse(SkinDesign, sections["skin"], "params.yaml: skin")
+    spreads = parse(Spreads, sections["spreads"], "params.yaml: spreads")
+    pokes_m = milli * np.array([(*place, depth) for place in PLACES_MM for depth in DEPTHS_MM])
+    felt = []
+    for name in ("b0", "b1"):
+        board = draw_board(BOARD, spreads, seed=0, name=name)
+        skin = draw_skin(design, spreads, seed=0, name=f"{name}_s0", rule=RULE)
+        rest_T, change_T = changes_of_field(board, skin, pokes_m)
+        felt += [rest_T.ravel() / micro, change_T.ravel() / micro, forces(skin, pokes_m[:, 2])]
+    rounded = [f"{value:.{DIGITS - 1}e}" for value in np.concatenate(felt)]
+    words = json.dumps([rounded, sections["rig"], sections["chip"]], sort_keys=True, default=str)
+    return hashlib.sha256(words.encode()).hexdigest()[:16]

@@ -1,0 +1,223 @@
+"""The simulated rig: robot, force sensor, port and clocks; fields at stops become frames as chips read them."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64, Int64
+from pydantic import Field
+
+from reskin.config import Strict
+from reskin.physics import aging
+from reskin.physics import chip as conversion
+from reskin.physics.aging import ROOM_DEGC, Temperature
+from reskin.physics.board import Board
+from reskin.physics.chip import ChipDesign, read_field, read_temperature
+from reskin.recordings.probe import ProbeLog
+from reskin.simulation.contact import Response
+from reskin.simulation.protocols import Plan, Press, Protocol, Rate_hz, Walk
+
+FrameCount = Annotated[int, Field(ge=1, le=1000)]
+Spread = Annotated[float, Field(ge=0, le=1)]
+
+
+class Rig(Strict):
+    """Section `rig`: how often frames come, how well the robot repeats, and what the clocks and the port do."""
+
+    noload_frames_n: FrameCount
+    moving_frames_n: Annotated[int, Field(ge=0, le=1000)]  # on the way down, and as many on the way up
+    settling_frames_n: Annotated[int, Field(ge=0, le=1000)]  # at rest, before each dwell
+    readings_n: FrameCount
+    rate_hz: Rate_hz
+    robot_place_sd_mm: Spread  # each axis
+    robot_depth_sd_mm: Annotated[float, Field(ge=0, le=0.2)]
+    place_offset_sd_mm: Spread  # from where a label says to where the tip is, the same for all skins of a board
+    force_noise_N: Annotated[float, Field(ge=0, le=10)]
+    chunk_frames_max_n: FrameCount
+    arrival_jitter_s: Annotated[float, Field(ge=0, le=1)]  # mean delay of a chunk, exponential
+    probe_clock_offset_s: Annotated[float, Field(ge=0, le=1e6)]  # sd of the probe's clock minus the stream's
+    probe_clock_rate_error: Annotated[float, Field(ge=0, le=0.01)]  # sd
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """The frames of one indentation, axis t: the stop that each sees, and what share of its change of field."""
+
+    stop_i: Int64[np.ndarray, " t"]
+    share: Float64[np.ndarray, " t"]
+    noload_i: int  # first frame of the no-load dwell
+    contact_i: Int64[np.ndarray, " p"]  # first frame of each contact dwell
+
+    def __len__(self) -> int:
+        return len(self.stop_i)
+
+
+def set_up(rig: Rig, protocol: Protocol) -> Rig:
+    """Set the rig up for a protocol: its rate; a stop a frame where nothing rests; no robot, one clock in a walk."""
+    changes: dict[str, float] = {} if protocol.rate_hz is None else {"rate_hz": protocol.rate_hz}
+    if isinstance(protocol, Press | Walk):
+        changes |= {"moving_frames_n": 0, "settling_frames_n": 0, "readings_n": 1}
+    if isinstance(protocol, Walk):
+        changes |= {
+            "noload_frames_n": max(round(protocol.quiet_s * protocol.rate_hz), 1),
+            "robot_place_sd_mm": 0.0,
+            "place_offset_sd_mm": 0.0,
+            "robot_depth_sd_mm": 0.0,
+            "force_noise_N": 0.0,
+            "probe_clock_offset_s": 0.0,
+            "probe_clock_rate_error": 0.0,
+        }
+    return rig.model_copy(update=changes)
+
+
+def timeline(rig: Rig, stops_n: int) -> Timeline:
+    """Lay out one indentation: settle, no load, down, at every stop settle and read, up."""
+    ramp = np.arange(1, rig.moving_frames_n + 1) / (rig.moving_frames_n + 1)
+    lifted_n, dwell_n = rig.settling_frames_n + rig.noload_frames_n, rig.settling_frames_n + rig.readings_n
+    share = np.concatenate([np.zeros(lifted_n), ramp, np.ones(stops_n * dwell_n), ramp[::-1]])
+    before_i = lifted_n + rig.moving_frames_n
+    stop_i = np.clip((np.arange(len(share)) - before_i) // dwell_n, 0, stops_n - 1)
+    contact_i = before_i + dwell_n * np.arange(stops_n) + rig.settling_frames_n
+    return Timeline(stop_i, share, rig.settling_frames_n, contact_i)
+
+
+def misplace(plan: Plan, rig: Rig, rng: np.random.Generator) -> Float64[np.ndarray, "n p 3"]:
+    """Give where the tip really goes, in mm: x, y and depth; off the plan alike at all stops of an indentation.
+
+    A hand goes where it goes: its plan is what it did.
+    """
+    planned_mm = np.stack([plan.x_mm, plan.y_mm, plan.depth_mm], axis=2)
+    if not plan.labelled:
+        return planned_mm
+    sd_mm = np.array([rig.robot_place_sd_mm, rig.robot_place_sd_mm, rig.robot_depth_sd_mm])
+    return planned_mm + sd_mm * rng.standard_normal((len(plan), 1, 3))
+
+
+def chunks(
+    frame_s: Float64[np.ndarray, " f"], rig: Rig, rng: np.random.Generator
+) -> tuple[Int64[np.ndarray, " c"], Float64[np.ndarray, " c"]]:
+    """Let frames arrive: frames come in all, and when. A port hands over a few at once, none early, all in order."""
+    frames_n = len(frame_s)
+    sizes = rng.integers(1, rig.chunk_frames_max_n + 1, size=frames_n)
+    ends = np.cumsum(sizes)
+    ends = np.append(ends[ends < frames_n], frames_n)
+    arrival_s = frame_s[ends - 1] + rig.arrival_jitter_s * rng.standard_exponential(len(ends))
+    return np.append(0, ends), np.append(0.0, np.maximum.accumulate(arrival_s))
+
+
+def draw_clock(rig: Rig, rng: np.random.Generator) -> tuple[float, float]:
+    """Draw offset in s and rate of the probe's clock against the stream's."""
+    offset_s, error = rng.standard_normal(2) * (rig.probe_clock_offset_s, rig.probe_clock_rate_error)
+    return float(offset_s), float(1 + error)
+
+
+def probe_log(plan: Plan, read_N: Float[np.ndarray, "n d 3"], rig: Rig, clock: tuple[float, float]) -> ProbeLog:
+    """Write what robot and force sensor log: for each indentation its no-load dwell, then its stops (d = 1 + p).
+
+    A dwell runs from half a frame before its first frame to half a frame after its last. Above the skin there is none.
+    """
+    stops_n = plan.x_mm.shape[1]
+    frames = timeline(rig, stops_n)
+    offset_s, rate = clock
+    first_i = np.append(frames.noload_i, frames.contact_i)
+    long_n = np.append(rig.noload_frames_n, np.full(stops_n, rig.readings_n))
+    start_i = np.arange(len(plan))[:, None] * len(frames) + first_i
+    contact = np.tile(np.arange(1 + stops_n) > 0, len(plan))
+    unknown = 0.0 if plan.labelled else np.nan
+    depth_mm = np.hstack([np.zeros((len(plan), 1)), plan.depth_mm + unknown])
+    places_mm = (np.hstack([stops_mm[:, :1], stops_mm]) + unknown for stops_mm in (plan.x_mm, plan.y_mm))
+    force_N = (read_N + unknown).reshape(-1, 3)
+    labels = [label.astype(np.float32).ravel() for label in (*places_mm, depth_mm, *force_N.T)]
+    dwells = (
+        np.repeat(np.arange(len(plan), dtype=np.int32), 1 + stops_n),
+        np.repeat(plan.pass_i, 1 + stops_n),
+        contact,
+        offset_s + rate * (start_i + 0.5).ravel() / rig.rate_hz,
+        offset_s + rate * (start_i + long_n + 0.5).ravel() / rig.rate_hz,
+        *labels,
+    )
+    logged = np.hstack([np.ones((len(plan), 1), bool), ~(plan.depth_mm < 0)]).ravel()
+    return ProbeLog(*(column[logged] for column in dwells))
+
+
+BLOCK_INDENTATIONS_N = 1000
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Readings in order of time, and how many values were out of the chips' range."""
+
+    b_uT: Float32[np.ndarray, "f ch"]
+    temperature_degC: Float32[np.ndarray, "f k"]
+    clipped_n: int
+    wrapped_n: int
+
+
+@dataclass(frozen=True)
+class Reader:
+    """Chips that read one capture: each converts at its phase, and may be sensitive to temperature."""
+
+    board: Board
+    chip: ChipDesign
+    rate_hz: float
+    phase_s: Float64[np.ndarray, " k"]
+    temperature: Temperature | None
+    sensitivity_per_K: Float64[np.ndarray, " k"]
+
+
+def switch_on(
+    board: Board, chip: ChipDesign, *, rate_hz: float, temperature: Temperature | None, rng: np.random.Generator
+) -> Reader:
+    """Draw each chip's phase and sensitivity to temperature."""
+    chips_n = len(board.chips_m)
+    phase_s = conversion.CONVERSION_S * rng.random(chips_n)
+    sd = 0.0 if temperature is None else temperature.chip_sensitivity_per_K
+    return Reader(board, chip, rate_hz, phase_s, temperature, sd * rng.standard_normal(chips_n))
+
+
+def read_frames(
+    response: Response,
+    timeline: Timeline,
+    reader: Reader,
+    *,
+    noise: np.random.Generator,
+    warmth_noise: np.random.Generator,
+) -> Frames:
+    """Read every frame of every indentation; the result does not depend on the size of blocks."""
+    frame_s = (1 + np.arange(len(response.rest_T) * len(timeline))) / reader.rate_hz
+    age_s, source_i = conversion.last_conversions(frame_s, reader.phase_s)
+    b_uT, temperature_degC, overruns = [], [], []
+    for first_i in range(0, len(response.rest_T), BLOCK_INDENTATIONS_N):
+        seen_T, chips_degC = _field_at(response, timeline, reader, age_s, first_i)
+        block_uT, overrun = read_field(seen_T, reader.board, design=reader.chip, rng=noise)
+        b_uT.append(block_uT)
+        overruns.append(overrun)
+        temperature_degC.append(read_temperature(chips_degC, reader.chip, warmth_noise))
+    # A conversion that two frames bring is the same reading twice, its noise included.
+    chip_i = np.arange(len(reader.phase_s))
+    repeated_uT = np.concatenate(b_uT).reshape(len(frame_s), -1, 3)[source_i, chip_i].reshape(len(frame_s), -1)
+    return Frames(
+        repeated_uT,
+        np.concatenate(temperature_degC)[source_i, chip_i],
+        sum(overrun.clipped_n for overrun in overruns),
+        sum(overrun.wrapped_n for overrun in overruns),
+    )
+
+
+def _field_at(
+    response: Response, timeline: Timeline, reader: Reader, age_s: Float[np.ndarray, "f k"], first_i: int
+) -> tuple[Float[np.ndarray, "b k 3"], Float[np.ndarray, "b k"]]:
+    # What is read in a block's first frames may have been converted in the indentation before.
+    lead_n = len(timeline) if first_i else 0
+    block = slice(first_i - (1 if first_i else 0), first_i + BLOCK_INDENTATIONS_N)
+    b_T = response.rest_T[block, None] + timeline.share[:, None, None] * response.change_T[block, timeline.stop_i]
+    frames_n, start = b_T.shape[0] * b_T.shape[1], block.start * len(timeline)
+    b_T = b_T.reshape(frames_n, *b_T.shape[2:])
+    warm_degC = np.full(frames_n, ROOM_DEGC)
+    if reader.temperature is not None:
+        warmer_K = aging.warmer_K((1 + start + np.arange(frames_n)) / reader.rate_hz, reader.temperature)
+        warm_degC += warmer_K
+        gain = aging.remanence(warmer_K)[:, None] * (1 + warmer_K[:, None] * reader.sensitivity_per_K)  # [f k]
+        b_T *= gain[:, :, None]
+    seen_T = conversion.seen_at(b_T, age_s[start : start + frames_n], reader.rate_hz)
+    return seen_T[lead_n:], np.repeat(warm_degC[lead_n:, None], len(reader.phase_s), axis=1)

@@ -1,0 +1,147 @@
+"""Section `simulate` of a scene: which skins there are, what they are like and how they are recorded. Knows no stage.
+
+In: settings that a stage declares. Out: a checked `Synthesis`.
+"""
+
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+from pydantic import Field, model_validator
+from scipy.constants import milli
+
+from reskin.config import Settings, Strict, parse, parse_parts
+from reskin.physics.board import BoardDesign, Spreads
+from reskin.physics.chip import ChipDesign
+from reskin.physics.magnet import Rule
+from reskin.physics.skin import SkinDesign
+from reskin.simulation.contact import Terms
+from reskin.simulation.protocols import SKIN_MM, Drag, Grid, Hand, Protocol
+from reskin.simulation.rig import Rig
+
+MAIN = "grid"  # its captures bear the names of their skins alone
+# The protocols that questions are asked of, and the kind that each question can read.
+KINDS: dict[str, str] = {
+    MAIN: "grid", "wear": "grid", "flexible": "grid", "drag": "drag", "hand": "hand", "sleeve": "scatter",
+    "glass": "load", "press": "press", "log": "walk",
+}  # fmt: skip
+ON_MAIN_BOARDS = ("wear", "drag", "hand", "glass", "press", "log")  # compared with, or read by networks of, these
+ON_OTHER_BOARDS = ("flexible",)
+OF_ONE_SKIN = ("wear", "glass", "press", "log")  # a question about the protocol reads one capture
+SHARED: dict[str, type[Strict]] = {"skin": SkinDesign, "rig": Rig, "chip": ChipDesign, "spreads": Spreads}
+Count = Annotated[int, Field(ge=1, le=1000)]
+Side_mm = Annotated[float, Field(gt=0, le=500)]
+
+
+class BoardKind(Strict):
+    """Boards of one make, each with its own skins; their names start with the letter."""
+
+    letter: Annotated[str, Field(pattern="^[a-z]$")]
+    boards_n: Count
+    skins_per_board_n: Count
+    design: BoardDesign
+    skin_mm: tuple[Side_mm, Side_mm]  # along x and y
+    quadrature: Rule
+
+    @property
+    def skin_m(self) -> tuple[float, float]:
+        return self.skin_mm[0] * milli, self.skin_mm[1] * milli
+
+
+class Synthesis(Strict):
+    """Section `simulate` of a scene: which skins there are, what they are like and how they are recorded."""
+
+    boards: Annotated[dict[str, BoardKind], Field(min_length=1)]
+    protocols: Annotated[dict[str, Protocol], Field(min_length=1)]
+    rig: Rig
+    skin: SkinDesign
+    chip: ChipDesign
+    spreads: Spreads
+    terms: Terms
+
+    @model_validator(mode="after")
+    def _nothing_is_named_that_is_not_there(self) -> "Synthesis":
+        used = {term for protocol in self.protocols.values() for term in protocol.terms}
+        if used != self.terms.named():
+            raise ValueError(
+                f"terms holds exactly what a protocol needs, {sorted(used)}; it holds {sorted(self.terms.named())}"
+            )
+        for name, protocol in self.protocols.items():
+            if protocol.boards not in self.boards:
+                raise ValueError(f"protocol {name}: boards is one of {sorted(self.boards)}, not {protocol.boards!r}")
+            if isinstance(protocol, Hand) and protocol.tilt_sd_deg > 0 and "friction" not in protocol.terms:
+                raise ValueError(f"protocol {name}: a stylus that leans (tilt_sd_deg) needs the term friction")
+            kind, skins_n = self.boards[protocol.boards], protocol.skins_n
+            if skins_n > (have_n := kind.boards_n * kind.skins_per_board_n):
+                raise ValueError(
+                    f"protocol {name}: skins_n {skins_n} is more than {protocol.boards} boards have, {have_n}"
+                )
+        if len({kind.letter for kind in self.boards.values()}) < len(self.boards):
+            raise ValueError("kinds of boards need different letters")
+        return self
+
+    @model_validator(mode="after")
+    def _folds_are_drawn_on_the_papers_protocol(self) -> "Synthesis":
+        if MAIN not in self.protocols or not isinstance(self.protocols[MAIN], Grid):
+            raise ValueError(f"protocols holds a grid named {MAIN}")
+        if self.main_boards.skin_mm != SKIN_MM:  # the studies of physics are of the authors' skin
+            raise ValueError(f"skin_mm of the boards of protocol {MAIN} is {list(SKIN_MM)}")
+        return self
+
+    @model_validator(mode="after")
+    def _protocols_suit_their_questions(self) -> "Synthesis":
+        for name, protocol in self.protocols.items():
+            kind, boards, skins_n = KINDS.get(name, protocol.kind), protocol.boards, protocol.skins_n
+            if protocol.kind != kind:
+                raise ValueError(f"protocol {name}: kind is {kind}, which its question reads, not {protocol.kind}")
+            if isinstance(protocol, Drag) and "friction" not in protocol.terms:
+                raise ValueError(f"protocol {name}: terms of a drag hold friction, without which there is no shear")
+            if name in ON_MAIN_BOARDS and boards != self.main.boards:
+                raise ValueError(f"protocol {name}: boards is {self.main.boards}, as of {MAIN}, not {boards}")
+            if name in ON_OTHER_BOARDS and boards == self.main.boards:
+                raise ValueError(f"protocol {name}: boards is another kind than that of {MAIN}, not {boards} too")
+            if name in OF_ONE_SKIN and skins_n != 1:
+                raise ValueError(f"protocol {name}: skins_n is 1, as its question reads one skin, not {skins_n}")
+        return self
+
+    @property
+    def main(self) -> Grid:
+        """The protocol that folds are drawn on."""
+        main = self.protocols[MAIN]
+        assert isinstance(main, Grid), "checked above"
+        return main
+
+    @property
+    def main_boards(self) -> BoardKind:
+        return self.boards[self.main.boards]
+
+
+def synthesis_of(settings: Settings) -> Synthesis:
+    """Put together what the stage declares of section `simulate` and of what scenes share; the rest is not there."""
+    section, where = settings.words("simulate"), f"{settings.where}: simulate"
+    shared = {name: model for name, model in SHARED.items() if name in settings.shared}
+    parts: dict[str, Any] = {
+        name: parse_parts(model, settings.shared[name], f"params.yaml: {name}") for name, model in shared.items()
+    }
+    parts["boards"] = {
+        name: parse_parts(BoardKind, kind, f"{where}.boards.{name}") for name, kind in section.get("boards", {}).items()
+    }
+    protocols = section.get("protocols", {})
+    whole = {name: protocol for name, protocol in protocols.items() if "kind" in protocol}
+    parts["protocols"] = dict(parse_parts(Synthesis, {"protocols": whole}, where).protocols) if whole else {}
+    for name in protocols.keys() - whole.keys():  # a few numbers of the main protocol
+        parts["protocols"][name] = parse_parts(Grid, protocols[name], f"{where}.protocols.{name}")
+    if "rig" in settings.shared and whole:  # what is recorded, and not only looked at, has terms
+        parts |= parse_parts(Synthesis, {"terms": _terms(settings, whole)}, "params.yaml").__dict__
+    return Synthesis.model_construct(**parts)
+
+
+def check_synthesis(settings: Settings) -> Synthesis:
+    """Check section `simulate` of a whole scene with all that scenes share of it."""
+    section = settings.words("simulate")
+    shared = {name: settings.shared[name] for name in SHARED} | {"terms": _terms(settings, section["protocols"])}
+    return parse(Synthesis, section | shared, f"{settings.where}: simulate")
+
+
+def _terms(settings: Settings, protocols: Mapping[str, Any]) -> dict[str, Any]:
+    names = sorted({term for protocol in protocols.values() for term in protocol["terms"]})
+    return {name: settings.row("terms", name) for name in names}
