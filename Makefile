@@ -26,6 +26,8 @@ export DVC_NO_ANALYTICS = 1
 export OMP_NUM_THREADS = 1
 # Where an environment forbids it, every stage and every worker of the tests would compile all its modules again.
 export PYTHONDONTWRITEBYTECODE =
+# Stages run `python`: the one of this environment.
+export PATH := $(CURDIR)/$(BIN):$(PATH)
 
 .PHONY: repro test test-processors lint ui bench faults time-repro time-install readme constraints licences audit clean
 .PHONY: team-server teams cluster-test

@@ -1,3 +1,5 @@
 """Reproduction of the ReSkin paper: DVC stages, experiments, scenes, reports and MLflow, on the library `reskin`."""
 
 import reskin  # noqa: F401  (first: it selects the arithmetic that NumPy loads with)
+
+FLOW, PARAMS, PLAN, SCENES = "dvc.yaml", "params.yaml", "pipeline/plan.yaml", "pipeline/scenes"  # in a checkout

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 import typer
 from typer import Argument, Option
 
-from reskin import config
+from pipeline import PLAN
 from reskin.errors import ParamsError, ReskinError, explaining
 from reskin.live import commands
 from reskin.packages import explain, show_version
@@ -106,7 +106,7 @@ def add(
     from reskin.recordings import preparing
 
     labels, marks = preparing.Labels(board, skin, name), preparing.parse_marks(mark or [])
-    running = read_plan(root / config.PLAN).scenes
+    running = read_plan(root / PLAN).scenes
     with plan.copied(root, scene, like), preparing.suggesting_layout(recording, layout):
         if layout == "capture":
             prepared = preparing.native(recording, labels, probe, marks)
@@ -120,7 +120,7 @@ def add(
         header = adding.add(root, scene, prepared, allow_copy=allow_copy)
     typer.echo(f"added {scene}/{header.capture} (board {board}, skin {skin}); now: dvc repro (or: report@{scene})")
     if scene not in running:
-        typer.echo(f"switched scene {scene} on in {config.PLAN}, beside {', '.join(running) or 'no other'}")
+        typer.echo(f"switched scene {scene} on in {PLAN}, beside {', '.join(running) or 'no other'}")
 
 
 @app.command()
@@ -192,13 +192,12 @@ def predict(
 def publish() -> None:
     """Write to MLflow what is not there yet, from the models of the scenes that run."""
     root = checkout()
-    from pipeline import plan
     from pipeline.scenes import read_scene
-    from pipeline.stages.publish import read_curves
+    from pipeline.stages.report import read_curves
     from pipeline.tracking import publish as write
 
     for name in checked_plan().scenes:
-        scene, answers = read_scene(plan.scene_file(root, name), root / config.PARAMS), root / "data/answers" / name
+        scene, answers = read_scene(root, name), root / "data/answers" / name
         arms = {arm: root / "data/models" / name / arm for arm in scene.modelled}
         written = [answers / f"{stage}.json" for stage in (*scene.curves.values(), *scene.experiments)]
         missing = [path for path in (*arms.values(), *written) if not path.exists()]

@@ -1,18 +1,14 @@
-"""Which stage runs for which scene, with what: scenes + recorded captures -> `pipeline/plan.yaml`.
-
-DVC expands stages from what stands there and cannot look into a scene's questions; this module can. Refuses to
-know what a stage does.
-"""
+"""Generate pipeline/plan.yaml: the scenes that each DVC stage iterates over."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from ruamel.yaml import YAML
 
+from pipeline import PLAN, SCENES
 from pipeline.manage.registry import Registry, read_registry
 from pipeline.manage.running import LOCKS, need_rest
 from pipeline.scenes import (
@@ -22,7 +18,6 @@ from pipeline.scenes import (
     NOT_INGESTED,
     QUESTIONS,
     TABLE_2,
-    OnBoards,
     Plan,
     Scene,
     read_plan,
@@ -30,32 +25,24 @@ from pipeline.scenes import (
     stages,
 )
 from reskin import io
-from reskin.config import FLOW, NOTHING, PARAMS, PLACE, PLAN, SCENES, declared, fill, find, put, read_yaml
 from reskin.errors import ParamsError
 from reskin.recordings.header import NAME
 
 HEADER = """\
-# Which scenes run, what they ask, and what each stage of dvc.yaml takes. Written by `reskin scenes use` and `add`
-# from pipeline/scenes and data/captures.yaml; not for hands.
+# Which scenes run, and over what each stage of dvc.yaml iterates. Generated from pipeline/scenes and data/captures.yaml
+# by `reskin scenes use` and `reskin add`: do not edit.
 """
 MANY_N = 30  # captures of a recorded scene; with more, one stage reads them all (docs/growth.md)
-TERMS_N = 4  # terms of physics that a protocol may name
-IDLE = "lost_fraction_max"  # a key of params.yaml that re-runs what a stage rests on anyhow
-# What stage contacts reads of a simulated scene, and a recorded one does not have.
-PHYSICS_OF_SCENE = tuple(
-    key.replace("MAIN", f"simulate.protocols.{MAIN_PROTOCOL}")
-    for key in ("MAIN.boards", "MAIN.depths_mm", "MAIN.skins_n", "simulate.boards.${item.MAIN.boards}")
-)
-PHYSICS_SHARED = ("skin", "spreads")
 
 
-def make_plan(scenes: Mapping[str, Scene], registry: Registry, flow: Mapping[str, Any]) -> dict[str, Any]:
-    """Derive `pipeline/plan.yaml`: a question that no scene asks leaves its stage without items.
+def make_plan(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, Any]:
+    """Derive the plan: what each scene runs, its recorded captures, and the items of every stage.
 
-    `flow` is dvc.yaml: words of a scene that its stages name (`${item.train_multi.recipe}`) are copied into the plan.
+    A stage iterates over names of scenes; over captures by folder (simulate, ingest); or over names of scenes, each
+    with the folder of readings that its experiment uses. What no scene runs has no items, and so no stage.
     """
     captures = _captures(scenes, registry)
-    many = {name for name in scenes if len(captures[name]) > MANY_N}
+    many = [name for name in scenes if len(captures[name]) > MANY_N]
     pairs = [(name, capture) for name in scenes if name not in many for capture in captures[name]]
     ingest = {f"{name}-{capture}": {"scene": name, "capture": capture} for name, capture in pairs}
     if len(ingest) < len(pairs):
@@ -63,31 +50,37 @@ def make_plan(scenes: Mapping[str, Scene], registry: Registry, flow: Mapping[str
         raise ParamsError("stage ingest", "scene-capture", rule, got, "Rename a scene.")
     simulated = _folders(scenes)
     items: dict[str, Any] = {
-        "simulate": {key: _simulated(scenes[item["scene"]], item) for key, item in simulated.items()},
+        "simulate": simulated,
         "ingest_simulated": {
-            key: item
-            for key, item in simulated.items()
-            if _protocol(scenes[item["scene"]], item).kind not in NOT_INGESTED
+            folder: item
+            for folder, item in simulated.items()
+            if _kind(scenes[item["scene"]], item["protocol"]) not in NOT_INGESTED
         },
         "ingest": ingest,
-        "ingest_many": {name: {"scene": name} for name in scenes if name in many},
-        "describe": {name: {"scene": name, "protocol": scene.described} for name, scene in scenes.items()},
-        "split": {name: {"scene": name, "folds": list(scene.with_folds)} for name, scene in scenes.items()},
+        "ingest_many": many,
+        "describe": list(scenes),
+        "split": list(scenes),
     }
     for stage in stages(QUESTIONS, *LEARNING, "study"):
-        items[stage] = {name: {"scene": name} for name, scene in scenes.items() if scene.runs(stage)}
-    items |= {question: _experiments(scenes, question) for question in EXPERIMENTS}
-    items["table2"] = {
-        name: {"scene": name} for name, scene in scenes.items() if {*TABLE_2.values()} <= {*scene.questions}
+        items[stage] = [name for name, scene in scenes.items() if scene.runs(stage)]
+    for name in EXPERIMENTS:
+        protocol = QUESTIONS[name].protocol
+        running = [scene for scene in scenes if name in scenes[scene].questions]
+        if protocol is None:
+            items[name] = running
+        else:
+            items[name] = {
+                scene: scene if scenes[scene].simulate is None else _folder(scene, protocol) for scene in running
+            }
+    items["table2"] = [name for name, scene in scenes.items() if {*TABLE_2.values()} <= {*scene.questions}]
+    items |= {stage: list(scenes) for stage in ("report", "publish")}
+    return {
+        "scenes": {name: list(scene.questions) for name, scene in scenes.items()},
+        "captures": captures,
+        "held_out": {name: list(scene.with_folds) for name, scene in scenes.items()},
+        "models": {name: scene.modelled for name, scene in scenes.items()},
+        "stages": items,
     }
-    items |= {stage: {name: {"scene": name} for name in scenes} for stage in ("report", "publish")}
-    for stage, of_stage in items.items():
-        for item in of_stage.values():
-            scene = scenes[item["scene"]]
-            item |= _more(stage, item["scene"], scene, captures[item["scene"]])
-            for name, word in _words(flow, stage, item, scene.model_dump(mode="json", exclude_none=True)):
-                put(item, name, word)
-    return {"scenes": {name: list(scene.questions) for name, scene in scenes.items()}, "stages": items}
 
 
 def _captures(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, list[str]]:
@@ -99,69 +92,9 @@ def _captures(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, list
     return captures
 
 
-def _more(stage: str, name: str, scene: Scene, captures: list[str]) -> dict[str, Any]:
-    """Give what a stage needs of the scene beyond its settings."""
-    match stage:
-        case (
-            "ingest_many"
-            | "describe"
-            | "split"
-            | "drift"
-            | "variation"
-            | "compare"
-            | "touches"
-            | "universal"
-            | "rivals"
-        ):
-            return {"captures": captures}
-        case "audit":
-            return {"models": scene.modelled}
-        case "contacts":
-            return _physics(scene)
-        case "report" | "publish":
-            # What stands in for models where a scene trains none: a file that these stages rest on anyhow.
-            described = f"answers/{name}/described/{scene.described}.json"
-            return {"questions": list(scene.questions), "learnt": f"models/{name}" if scene.modelled else described}
-    return {}
-
-
-def _words(
-    flow: Mapping[str, Any], stage: str, item: Mapping[str, Any], scene: Mapping[str, Any]
-) -> Iterator[tuple[str, Any]]:
-    """Find the words of a scene that a stage's parameters name in dvc.yaml: rows of params.yaml, kinds of boards."""
-    for template in chain.from_iterable(declared(flow, stage).values()):
-        for match in PLACE.finditer(template):
-            if match[1] and find(item, match[2]) is NOTHING:
-                yield match[2], find(scene, match[2])
-
-
-def _physics(scene: Scene) -> dict[str, list[str]]:
-    if scene.simulate is None:  # nothing to read there: keys that it reads anyhow stand in
-        return {"of_scene": ["seed"] * len(PHYSICS_OF_SCENE), "shared": [IDLE] * len(PHYSICS_SHARED)}
-    words = scene.model_dump(mode="json")
-    return {"of_scene": [fill(key, "", words) for key in PHYSICS_OF_SCENE], "shared": list(PHYSICS_SHARED)}
-
-
-def _simulated(scene: Scene, item: dict[str, str]) -> dict[str, Any]:
-    """Add a protocol's boards and terms: four keys, as DVC cannot take a list; `chip`, which it reads too, fills up."""
-    protocol = _protocol(scene, item)
-    terms = [f"terms.{term}" for term in protocol.terms]
-    return {**item, "boards": protocol.boards, "shared": terms + ["chip"] * (TERMS_N - len(terms))}
-
-
-def _protocol(scene: Scene, item: Mapping[str, str]) -> OnBoards:
+def _kind(scene: Scene, protocol: str) -> str:
     assert scene.simulate is not None, "only a simulated scene has folders by protocol"
-    return scene.simulate.protocols[item["protocol"]]
-
-
-def _experiments(scenes: Mapping[str, Scene], question: str) -> dict[str, dict[str, Any]]:
-    """Name the folder of captures that an experiment is asked of, by scene."""
-    protocol = QUESTIONS[question].protocol or MAIN_PROTOCOL
-    return {
-        name: {"scene": name, "folder": name if scene.simulate is None else _folder(name, protocol)}
-        for name, scene in scenes.items()
-        if question in scene.questions
-    }
+    return scene.simulate.protocols[protocol].kind
 
 
 def _folder(scene: str, protocol: str) -> str:
@@ -229,7 +162,7 @@ def use(root: Path, names: Sequence[str]) -> None:
     need_rest(root)
     yaml = YAML()
     yaml.width = 120
-    document = {key: _flow(value) for key, value in _plan_of(root, names).items()}
+    document = {key: _flow(value) for key, value in plan_of(root, names).items()}
     with io.replacing(root / PLAN) as temporary, temporary.open("w", encoding="utf-8") as stream:
         stream.write(HEADER)
         yaml.dump(document, stream)
@@ -252,17 +185,18 @@ def _keep_outputs(root: Path) -> None:
 
 
 def check(root: Path) -> Plan:
-    """Raise if the plan is not what its scenes ask for, or a scene or params.yaml is wrong; return it otherwise."""
+    """Return the plan; raise if it is not that of its scenes, or if a scene or params.yaml is wrong."""
     plan = read_plan(root / PLAN)
-    if plan.model_dump(mode="json") != _plan_of(root, list(plan.scenes)):
+    if plan.model_dump(mode="json") != plan_of(root, list(plan.scenes)):
         remedy = f"Try: reskin scenes use {' '.join(plan.scenes)}"
         raise ParamsError(root / PLAN, "the plan", "what its scenes ask for", "an older one", remedy)
     return plan
 
 
-def _plan_of(root: Path, names: Sequence[str]) -> dict[str, Any]:
-    scenes = {name: read_scene(scene_file(root, name), root / PARAMS) for name in dict.fromkeys(names)}
-    return make_plan(scenes, read_registry(root), read_yaml(root / FLOW))
+def plan_of(root: Path, names: Sequence[str]) -> dict[str, Any]:
+    """Derive the plan of these scenes of a checkout."""
+    scenes = {name: read_scene(root, scene_file(root, name).stem) for name in dict.fromkeys(names)}
+    return make_plan(scenes, read_registry(root))
 
 
 def _flow(value: Any) -> Any:

@@ -11,9 +11,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from pipeline import FLOW, PLAN
 from pipeline.provenance import COSTS, home, read_costs
+from pipeline.settings import read_settings
 from reskin import io
-from reskin.config import FLOW, PLAN, Files, read_yaml
+from reskin.config import read_yaml
 
 VARIABLE = "DVC_STAGE"  # where DVC tells a command which stage it runs, as `simulate@quick-wear`
 ORDER = Path(".reskin/order.json")
@@ -49,11 +51,9 @@ def describe(stage: str, order: Sequence[str], took_s: Mapping[str, float]) -> s
 
 
 def settings_of(scene: str) -> str:
-    """Hash all settings that decide what a scene costs: its file, params.yaml, and its items in the plan."""
-    files = Files.of(scene)
-    stages = read_yaml(files.plan)["stages"]
-    items = {stage: [item for item in of.values() if item["scene"] == scene] for stage, of in stages.items()}
-    return _hash([read_yaml(files.settings), read_yaml(files.params), items])
+    """Digest all settings that decide what a scene costs: its own, what scenes share, and its captures."""
+    settings = read_settings(scene)
+    return _hash([settings.of_scene, settings.shared, settings.captures])
 
 
 def _hash(values: Any) -> str:

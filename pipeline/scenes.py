@@ -1,16 +1,16 @@
 """Scenes: the experiments that exist, and the legal values of `params.yaml` and of every scene."""
 
 from collections.abc import Iterable, Mapping, Set
-from dataclasses import dataclass
-from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
-from types import ModuleType
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from reskin.config import Seeded, Settings, Strict, parse, read_yaml
+from pipeline import PARAMS
+from pipeline.questions import LEARNING_ROWS, Kind, Question
+from pipeline.settings import Seeded, Settings, read_settings
+from pipeline.stages import module_of
+from reskin.config import Strict, parse, read_yaml
 from reskin.data.rows import Selection
 from reskin.data.splits import Split
 from reskin.errors import ParamsError
@@ -22,33 +22,6 @@ NOT_INGESTED = {"walk"}  # kinds of protocols whose captures are read as they ar
 POOLED_BY = "adapt"  # takes pokes of the held-out skins, so a part of these is kept from every test
 # The rows of table 2 and who answers them; a scene that asks all of these questions has the table early.
 TABLE_2 = {"single": "transfer", "multi": "lobo", "triplet": "triplet", "adapted": "adapt"}
-RANDOM = ("random_test_fraction", "random_repeats_n")
-
-Kind = Literal["models", "curve", "other", "experiment", "study", "report"]
-
-
-@dataclass(frozen=True)
-class Question:
-    """One row: a question, the stage that answers it and the questions it goes on from.
-
-    `kind` tells what the answer is: models with cards, points of a curve, another file about learning, an experiment
-    with a folder of its own, a study of the physics, or words of the report. `protocol` is that of the captures it is
-    asked of; None: the main ones. `folds` are the keys of `split` that its folds are drawn with; None: it has no folds
-    of its own. `section`: the scene's file holds settings for it, named as the stage.
-    """
-
-    name: str
-    kind: Kind
-    stage: str = ""
-    needs: tuple[str, ...] = ()
-    protocol: str | None = None
-    folds: tuple[str, ...] | None = None
-    section: bool = False
-    recorded: bool = True  # a scene of recordings may ask it too
-    alone: bool = False  # a scene may ask it and nothing else: it needs no folds, and no places in mm
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "stage", self.stage or self.name)
 
 
 def _experiment(
@@ -62,21 +35,7 @@ def _study(name: str, *, section: bool = False) -> Question:
 
 
 ROWS = (
-    Question("single_random", "models", "train_single", folds=RANDOM, section=True),
-    Question("single_indentation", "models", "train_single", folds=RANDOM, section=True),
-    Question("single_pass", "models", "train_single", folds=RANDOM, section=True),
-    Question("single_temporal", "models", "train_single", folds=("temporal_test_fraction",), section=True),
-    Question("transfer", "models", "train_single", folds=("transfer_skins_n",), section=True),
-    Question("lobo", "models", "train_multi", folds=(), section=True),
-    Question("triplet", "models", "train_triplet", needs=("lobo",), section=True),
-    Question("adapt", "models", needs=("triplet",), section=True),
-    Question("pokes", "curve", "sweep_pokes", needs=("adapt",), section=True),
-    Question("sensors", "curve", "sweep_sensors", needs=("adapt",), folds=("sensors_skins_n", "sensors_draws_n")),
-    Question("baselines", "curve", "train_classical", needs=("lobo",), section=True),
-    Question("labels", "curve", "few_labels", needs=("lobo",), folds=("labels_pool_n", "labels_draws_n"), section=True),
-    Question("universal", "curve", needs=("labels", "compare"), section=True),
-    Question("audit", "other", needs=("lobo",), section=True),
-    Question("choice", "report", "report", needs=("lobo", "triplet", "adapt")),
+    *LEARNING_ROWS,
     _experiment("bound", None, "single_pass"),
     _experiment("population", None, "adapt", section=True),
     _experiment("drift", "wear", section=True, recorded=True),
@@ -240,39 +199,44 @@ class Shared(Strict):
     adaptations: dict[Name, Section]
     labellings: dict[Name, Section]
     methods: dict[Name, dict[Name, Section]]
-    skin: Section
-    rig: Section
-    chip: Section
-    spreads: Section
-    terms: dict[str, Section]
 
 
 class Plan(Strict):
-    """`pipeline/plan.yaml`: what each scene that runs asks, and by stage and key what each stage of dvc.yaml takes."""
+    """`pipeline/plan.yaml`: experiments of the scenes that run, their recorded captures, the items of each stage."""
 
     scenes: dict[str, tuple[str, ...]]
-    stages: dict[str, dict[str, dict[str, Any]]]
+    captures: dict[str, tuple[str, ...]]
+    held_out: dict[str, tuple[str, ...]]
+    models: dict[str, tuple[str, ...]]
+    stages: dict[str, Any]
 
 
-def read_scene(path: Path, params: Path) -> Scene:
-    """Read and check `pipeline/scenes/<name>.yaml`, with the rows of `params.yaml` that it names."""
-    return check_scene(path.stem, str(path), read_yaml(path), read_shared(params))
+def read_scene(root: Path, name: str) -> Scene:
+    """Read and check `pipeline/scenes/<name>.yaml`, with the shared rows that it names."""
+    read_shared(root / PARAMS)
+    return check_scene(read_settings(name, root))
 
 
-def check_scene(name: str, where: str, words: dict[str, Any], shared: dict[str, Any]) -> Scene:
+def check_scene(settings: Settings) -> Scene:
     """Check a scene, and every section as the stage that reads it does."""
-    scene, settings = parse_scene(words, where), Settings(name, where, words, shared, {})
+    scene = parse_scene(settings.of_scene, settings.where)
     for stage in dict.fromkeys(["split", *(row.stage for row in scene.rows if row.kind != "report")]):
-        if read := getattr(module_of(stage), "read", None):
+        module = module_of(stage)
+        if read := getattr(module, f"read_{stage}", getattr(module, "read", None)):
             read(settings)
     if scene.simulate is not None:
-        from reskin.simulation.settings import check_synthesis  # the physics, for a simulated scene only
+        from pipeline.synthesis import synthesis_of  # the physics, for a simulated scene only
 
-        check_synthesis(settings)
+        synthesis_of(settings)
     return scene
 
 
-def parse_scene(words: dict[str, Any], where: str) -> Scene:
+def asked_by(settings: Settings) -> Asking:
+    """Parse which experiments a scene runs, and on which kind of data."""
+    return parse(Asking, {name: settings[name] for name in ("source", "questions")}, settings.where)
+
+
+def parse_scene(words: Mapping[str, Any], where: str) -> Scene:
     """Check a scene's questions, and that it has the sections for them; their stages check what stands in these."""
     for name, value in words.items():
         if name not in {*Scene.model_fields, *SECTIONS}:
@@ -280,12 +244,6 @@ def parse_scene(words: dict[str, Any], where: str) -> Scene:
         if name in SECTIONS and not isinstance(value, dict):
             raise ParamsError(where, name, "a valid dictionary", repr(value)[:80], "Mend it there.")
     return parse(Scene, words, where)
-
-
-def module_of(stage: str) -> ModuleType:
-    """Import the module of a stage: `experiments.<stage>.run`, or `stages.<stage>`."""
-    experiment = f"pipeline.experiments.{stage}"
-    return import_module(f"{experiment}.run" if find_spec(experiment) else f"pipeline.stages.{stage}")
 
 
 def read_shared(path: Path) -> dict[str, Any]:

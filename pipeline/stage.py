@@ -1,55 +1,55 @@
-"""What every stage does around its work: argv, one-sentence errors, its cost.
-
-In: the stage's function; its parameters are its options. Refuses to know what the stage does.
-"""
+"""Run one stage: parse its arguments, explain its errors, record its cost."""
 
 import argparse
 import inspect
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from pipeline.executors import end_workers
 from pipeline.progress import announce, settings_of
 from pipeline.provenance import COSTS, begin_cost, note_cost
-from reskin.config import Files
+from pipeline.settings import Settings, read_settings
 from reskin.errors import ReskinError, explaining
 
 
-def run(work: Callable[..., None]) -> None:
-    """Call `work` with options of its own names (`--scene quick`), all required; `files` follows from the scene."""
+def run(work: Callable[..., None], arguments: Sequence[str]) -> None:
+    """Call the function of a stage with options of the names of its parameters; its settings are those of `--scene`."""
     stage = work.__name__
-    parser = argparse.ArgumentParser(prog=f"sh pipeline/run.sh {stage}", description=work.__doc__)
+    parser = argparse.ArgumentParser(prog=f"python -m pipeline {stage}", description=work.__doc__)
+    parser.add_argument("--scene", required=True)
     kinds = {name: parameter.annotation for name, parameter in inspect.signature(work).parameters.items()}
     for name, kind in kinds.items():
-        if kind is not Files:
+        if kind is not Settings:
             parser.add_argument(f"--{name.replace('_', '-')}", type=kind, required=True)
-    arguments = vars(parser.parse_args())
-    arguments |= {name: Files.of(arguments["scene"]) for name, kind in kinds.items() if kind is Files}
+    options = vars(parser.parse_args(arguments))
+    scene = options.pop("scene")
     if place := announce():
         say(f"{stage}: {place}")
-    settings = settings_of(arguments["scene"]) if place else None  # read now: they may be edited while it runs
-    start_s, costs, unit = time.monotonic(), COSTS / arguments["scene"], _unit(stage, arguments)
+    digest = settings_of(scene) if place else None  # read now: they may be edited while it runs
+    start_s, costs, unit = time.monotonic(), COSTS / scene, _unit(stage, scene, options)
     try:
         with explaining(stage):
             begin_cost(costs, unit)
-            work(**arguments)
+            if Settings in kinds.values():
+                options["settings"] = read_settings(scene)
+            work(**options)
             end_workers()
-            note_cost(costs, unit, time.monotonic() - start_s, settings)
+            note_cost(costs, unit, time.monotonic() - start_s, digest)
     except ReskinError as error:
         say(f"error: {error}")
         sys.exit(error.exit_code)
 
 
-def _unit(stage: str, arguments: Mapping[str, Any]) -> str:
-    """Name what ran: some stages run for each recorded capture, or for each protocol's folder."""
+def _unit(stage: str, scene: str, options: Mapping[str, Any]) -> str:
+    """Name what ran, for its cost: some stages run once for each recorded capture, or for each protocol's folder."""
     if stage == "ingest":
-        return f"{stage}-{arguments['indentations'].stem}"
+        return f"{stage}-{options['indentations'].stem}"
     of = {"ingest_simulated": "indentations", "describe": "indentations", "simulate": "raw"}
     if stage not in of:
         return stage
-    part = arguments[of[stage]].stem.removeprefix(arguments["scene"]).strip("-")
+    part = options[of[stage]].stem.removeprefix(scene).strip("-")
     return f"{stage}-{part}" if part else stage
 
 

@@ -228,7 +228,7 @@ def _publish_training(diary: Diary, stage: str, parent_id: str, file: Path, card
     tags = {name: card[name] for name in ("scene", "question", "recipe_name", "fold", "git")}
     tags |= {"cell": card["key"], "kind": "training"}
     tags |= {"board": ", ".join(card["test_boards"]), "skin": ", ".join(card["test_skins"])}
-    tags |= {"mlflow.source.name": f"pipeline.stages.{stage}", "mlflow.source.git.commit": card["git"]}
+    tags |= {"mlflow.source.name": f"python -m pipeline {stage}", "mlflow.source.git.commit": card["git"]}
     run_id, unwritten = diary.open(stage, key, name=file.stem, parent=parent_id, tags=tags)
     if not unwritten:
         return False

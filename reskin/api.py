@@ -1,7 +1,7 @@
-"""What `import reskin` offers a notebook or a controller. In: names and plain values (lists, dicts). Out: NumPy arrays.
+"""The public functions and classes of `reskin`, for notebooks and robot programs.
 
-Units stand in names: mm, N, uT; a channel is Bx, By or Bz of a chip. What a function needs is imported when it is
-called, so that the import costs little. Refuses to know stages and DVC.
+They take names and plain values and return NumPy arrays. Units are in names: mm, N, uT; a channel is Bx, By or Bz of a
+chip. Functions import what they need when they are called, so that `import reskin` costs little.
 """
 
 from __future__ import annotations
@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Union, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
-from reskin.config import ROOT, params_of, parse, read_yaml
+from reskin.config import parse
 from reskin.errors import ParamsError, SchemaError
 from reskin.seeds import rng_for
+from reskin.simulation.defaults import nominal
 
 if TYPE_CHECKING:
     from reskin.data.rows import Rows
@@ -29,52 +30,70 @@ if TYPE_CHECKING:
     from reskin.universal.model import Universal
 
 Answering = Union[Path, str, Sequence[Path | str], "Model", "Universal"]
-Changes = Mapping[str, Any]  # settings of params.yaml or of a scene, by name
+Changes = Mapping[str, Any]  # of nominal settings, by name
+NOMINAL_BOARD = "rigid"
 
 
-def load_rows(scene: str, *, root: Path | str = ROOT) -> Rows:
-    """Load the rows that a scene's models see; its captures must have been ingested (`dvc repro`).
+def load_rows(folder: Path | str, *, force_min_N: float = 0.0) -> Rows:
+    """Load ingested readings of contacts, as models are trained on them.
 
-    >>> rows = load_rows("quick")  # doctest: +SKIP
+    Parameters
+    ----------
+    folder : folder of Parquet files, such as `data/indentations/quick` after `dvc repro`
+    force_min_N : readings with less normal force are left out
+
+    Returns
+    -------
+    Rows : `db_uT` [f ch] is the change of field, `target` [f 3] is x_mm, y_mm and Fz_N; `board` and `skin` [f] names
+
+    >>> rows = load_rows("data/indentations/quick")  # doctest: +SKIP
     >>> rows.db_uT, rows.target, rows.board  # doctest: +SKIP
-
-    `db_uT` [f ch] is the change of field, `target` [f 3] is x_mm, y_mm and Fz_N; `board` and `skin` [f] are names.
     """
     from reskin.data import folds
     from reskin.data.rows import Selection
 
-    file = Path(root) / f"pipeline/scenes/{scene}.yaml"
-    selection = parse(Selection, read_yaml(file)["selection"], f"{file}: selection")
-    readings = sorted((Path(root) / "data/indentations" / scene).glob("*.parquet"))
-    return folds.load_rows(readings, selection)
+    files = sorted(Path(folder).glob("*.parquet"))
+    if not files:
+        remedy = "Ingest captures first: dvc repro."
+        raise ParamsError("load_rows", "the folder", "one with Parquet files", str(folder), remedy)
+    return folds.load_rows(files, Selection(force_min_N=force_min_N))
 
 
-def draw_board(
-    name: str = "b0", *, seed: int = 0, scene: str = "quick", spreads: Changes | None = None, **design: Any
-) -> Board:
+def draw_board(name: str = "b0", *, seed: int = 0, spreads: Changes | None = None, **design: Any) -> Board:
     """Draw a simulated circuit board; the same name and seed give the same board.
 
-    >>> board = draw_board(gap_mm=0.6)  # doctest: +SKIP
+    Parameters
+    ----------
+    name : name of the board
+    seed : seed of all draws
+    spreads : changes of the standard deviations between boards, such as `{"chip_offset_uT": 0.0}`
+    design : changes of the nominal board: `chips_xy_mm` [[x, y], ...] seen from the middle of the skin,
+        `chips_turn_deg` [turn, ...], `gap_mm`
 
-    `design` changes the scene's board: `chips_xy_mm` [[x, y], ...] seen from the middle of the skin, `chips_turn_deg`
-    [turn, ...], `gap_mm`. `spreads` changes standard deviations of params.yaml, as `{"chip_offset_uT": 0.0}`.
+    >>> board = draw_board(gap_mm=0.6)
     """
     from reskin.physics import board
     from reskin.physics.board import BoardDesign, Spreads
 
-    settings = parse(BoardDesign, _main_boards(scene)["design"] | design, "draw_board")
-    return board.draw_board(settings, parse(Spreads, _shared("spreads", spreads), "spreads"), seed=seed, name=name)
+    settings = parse(BoardDesign, nominal("boards")[NOMINAL_BOARD]["design"] | design, "draw_board")
+    return board.draw_board(settings, parse(Spreads, nominal("spreads", spreads), "spreads"), seed=seed, name=name)
 
 
-def draw_skin(
-    name: str = "b0_s0", *, seed: int = 0, scene: str = "quick", spreads: Changes | None = None, **design: Any
-) -> Skin:
+def draw_skin(name: str = "b0_s0", *, seed: int = 0, spreads: Changes | None = None, **design: Any) -> Skin:
     """Draw a simulated skin; the same name and seed give the same skin.
 
-    >>> skin = draw_skin(seed=1, thickness_mm=3.0)  # doctest: +SKIP
+    Parameters
+    ----------
+    name : name of the skin
+    seed : seed of all draws
+    spreads : changes of the standard deviations between skins, such as `{"skin_modulus": 0.0}`
+    design : changes of the nominal skin: `thickness_mm`, `modulus_kPa`, `tip_radius_mm`, ...
 
-    `design` changes the skin of params.yaml: `thickness_mm`, `modulus_kPa`, `tip_radius_mm`, ...; `spreads` as for
-    boards. Inside, `nodes_m` [s 3] and `moments_A_m2` [s 3] are the dipoles that the skin is summed of.
+    Returns
+    -------
+    Skin : `nodes_m` [s 3] and `moments_A_m2` [s 3] are the dipoles that the skin is summed of
+
+    >>> skin = draw_skin(seed=1, thickness_mm=3.0)
     """
     from scipy.constants import milli
 
@@ -82,13 +101,13 @@ def draw_skin(
     from reskin.physics.board import Spreads
     from reskin.physics.magnet import Rule
 
-    boards = _main_boards(scene)
+    boards = nominal("boards")[NOMINAL_BOARD]
     return skin.draw_skin(
-        parse(skin.SkinDesign, _shared("skin", design), "draw_skin"),
-        parse(Spreads, _shared("spreads", spreads), "spreads"),
+        parse(skin.SkinDesign, nominal("skin", design), "draw_skin"),
+        parse(Spreads, nominal("spreads", spreads), "spreads"),
         seed=seed,
         name=name,
-        rule=parse(Rule, boards["quadrature"], f"scene {scene}: quadrature").quadrature(),
+        rule=parse(Rule, boards["quadrature"], "quadrature").quadrature(),
         sides_m=(boards["skin_mm"][0] * milli, boards["skin_mm"][1] * milli),
     )
 
@@ -108,7 +127,7 @@ def simulate_pokes(
 
     >>> noload_uT, b_uT, Fz_N = simulate_pokes(draw_skin(), [[8.0, 8.0, 1.0], [2.0, 4.0, 0.5]])  # doctest: +SKIP
 
-    Without a board, it is poked on the default one. `chip` changes the magnetometer of params.yaml, as
+    Without a board, it is poked on the default one. `chip` changes the nominal magnetometer, as
     `{"noise_xy_uT": 0.0, "noise_z_uT": 0.0}`. Terms that only some protocols need (ageing, friction) are left out.
     """
     from scipy.constants import milli
@@ -126,7 +145,7 @@ def simulate_pokes(
     rngs = {part: rng_for(seed, "poking", skin.name, part) for part in ("drift", "noload", "contact")}
     no_tilt = np.zeros((len(tip_m), 2))
     response = respond(board, skin, tip_m[:, None], tilt=no_tilt, terms=Terms(), rng=rngs["drift"])
-    design = parse(ChipDesign, _shared("chip", chip), "chip")
+    design = parse(ChipDesign, nominal("chip", chip), "chip")
     noload_uT, _ = read_field(response.rest_T, board, design=design, rng=rngs["noload"])
     b_uT, _ = read_field(response.rest_T + response.change_T[:, 0], board, design=design, rng=rngs["contact"])
     return Pokes(noload_uT, b_uT, response.force_N[:, 0, 2])
@@ -278,17 +297,3 @@ def record(
     if done.failed is not None:
         raise done.failed
     return done.folder
-
-
-def _main_boards(scene: str) -> dict[str, Any]:
-    """Give the settings of the boards that a simulated scene's main protocol runs on."""
-    file = ROOT / f"pipeline/scenes/{scene}.yaml"
-    words = read_yaml(file)
-    if "simulate" not in words:
-        raise ParamsError(file, "the scene", "simulated", words["source"], "Try: scene='quick'")
-    return words["simulate"]["boards"][words["simulate"]["protocols"]["grid"]["boards"]]
-
-
-def _shared(section: str, changes: Changes | None) -> dict[str, Any]:
-    """Give a section of params.yaml with some of its settings changed."""
-    return read_yaml(params_of(ROOT))[section] | dict(changes or {})

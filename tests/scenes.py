@@ -1,7 +1,8 @@
 """Scenes for tests, as plain words, and the settings that a stage has of them."""
 
 from pipeline.scenes import Asking, Scene, check_scene
-from reskin.config import Settings, parse
+from pipeline.settings import Settings
+from reskin.config import parse
 from tests.capture.headers import AS_USUAL
 
 RECIPE = {
@@ -90,16 +91,11 @@ def asking(*questions: str, **changes: object) -> dict[str, object]:
 
 
 def settings(scene: dict[str, object], name: str = "tiny", **shared: object) -> Settings:
-    """All settings of a scene, as a stage that declares everything would read them."""
-    return Settings(name, f"{name}.yaml", scene, SHARED | shared, {"captures": [], **planned(scene)})
+    """All settings of a scene, as a stage reads them."""
+    asked = parse(Asking, {key: scene[key] for key in ("source", "questions")}, name)
+    return Settings(name, f"{name}.yaml", scene, SHARED | shared, (), asked.with_folds, tuple(asked.modelled))
 
 
-def planned(scene: dict[str, object]) -> dict[str, object]:
-    """What the plan says of a scene to the stages that ask it."""
-    words = {name: scene[name] for name in ("source", "questions")}
-    return {"questions": scene["questions"], "models": parse(Asking, words, "scene.yaml").modelled}
-
-
-def check(words: dict[str, object]) -> Scene:
+def check(scene: dict[str, object]) -> Scene:
     """Check a scene as `reskin scenes check` does."""
-    return check_scene("scene", "scene.yaml", words, SHARED)
+    return check_scene(Settings("scene", "scene.yaml", scene, SHARED))

@@ -9,7 +9,7 @@ import pytest
 from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
-from pipeline import plan
+from pipeline import PLAN, SCENES, plan
 from pipeline.cli import app
 from pipeline.manage import add
 from pipeline.manage.registry import read_registry
@@ -36,7 +36,7 @@ def empty(tmp_path_factory) -> Path:
     """A checkout that runs no scene yet."""
     root = copy_checkout(tmp_path_factory.mktemp("checkout"))
     plan.use(root, [])
-    with (root / config.SCENES / "small.yaml").open("w") as stream:
+    with (root / SCENES / "small.yaml").open("w") as stream:
         YAML().dump(recorded(), stream)
     return root
 
@@ -98,8 +98,8 @@ def test_what_departs_from_section_compare_is_a_warning_and_no_refusal(root, lab
     monkeypatch.setattr("pipeline.experiments.compare.joining.departure", departure)
     words = recorded()
     words["questions"] = [*words["questions"], "compare"]
-    words["compare"] = config.read_yaml(root / config.SCENES / "lab.yaml")["compare"]
-    with (root / config.SCENES / "small.yaml").open("w") as stream:
+    words["compare"] = config.read_yaml(root / SCENES / "lab.yaml")["compare"]
+    with (root / SCENES / "small.yaml").open("w") as stream:
         YAML().dump(words, stream)
     add_lab(root, lab_file)
     assert "board1_skin1_readings" in read_registry(root).captures["small"]
@@ -148,7 +148,7 @@ def test_a_copy_written_with_a_digit_more_is_still_a_copy(root, lab_file, tmp_pa
 
 def test_a_removal_that_cannot_be_planned_changes_nothing(root, lab_file):
     add_lab(root, lab_file)
-    file = root / config.PLAN
+    file = root / PLAN
     file.write_text(file.read_text().replace("  small: [lobo]\n", "  small: [lobo]\n  nowhere: [lobo]\n", 1))
     refuse(root, lambda: add.remove(root, "small", "board1_skin1_readings"), "nowhere")
 
@@ -368,12 +368,12 @@ def test_a_scene_that_is_new_is_a_copy_of_one_and_goes_again_if_nothing_joins_it
     assert "the truths must be" in said([*words[:3], "ini", *words[4:], "ini"])
     assert contents(root) == known
     run(root, "reskin", *words, "small")
-    text = (root / config.SCENES / "mine.yaml").read_text()
+    text = (root / SCENES / "mine.yaml").read_text()
     assert YAML(typ="safe").load(text) == recorded()
     assert read_registry(root).captures.keys() == {"mine"}
     again = said([*words, "small", "--name", "again"])
     assert "the new scene must be a free name; got mine, which is there" in again
-    assert (root / config.SCENES / "mine.yaml").read_text() == text
+    assert (root / SCENES / "mine.yaml").read_text() == text
 
 
 @pytest.mark.parametrize(

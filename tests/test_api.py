@@ -2,29 +2,32 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import reskin
-from reskin import api, io
-from reskin.config import Settings, read_yaml
+from reskin import io
+from reskin.config import read_yaml
 from reskin.data.folds import load_rows
 from reskin.data.rows import Selection
 from reskin.errors import ReskinError
 from reskin.predicting import read_network
 from reskin.seeds import rng_for
 from reskin.simulation.capture import record
-from reskin.simulation.settings import check_synthesis
+from reskin.simulation.defaults import nominal
+from reskin.simulation.settings import parse_synthesis
 from tests.test_io import readings
 from tests.test_predicting import model  # noqa: F401 (a fixture)
 
+ROOT = Path(__file__).resolve().parents[1]
 QUIET_CHIP = {"noise_xy_uT": 0.0, "noise_z_uT": 0.0}
 
 
 def test_the_import_is_cheap_and_finds_no_torch():
     code = "import sys, reskin; print([name for name in ('torch', 'scipy', 'pandas', 'mlflow') if name in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], cwd=api.ROOT, capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 
 
@@ -32,21 +35,19 @@ def test_rows_are_those_that_stages_read(tmp_path):
     files = [tmp_path / f"data/indentations/small/c{i}.parquet" for i in range(2)]
     for file in files:
         io.write_readings(file, [readings()], {})
-    io.write_text(tmp_path / "pipeline/scenes/small.yaml", "selection: {force_min_N: 0.0}\n")
-    rows = reskin.load_rows("small", root=tmp_path)
+    rows = reskin.load_rows(tmp_path / "data/indentations/small")
     expected = load_rows(files, Selection(force_min_N=0.0))
     for name in ("capture", "board", "skin", "db_uT", "target", "pass_i", "indentation"):
         np.testing.assert_array_equal(getattr(rows, name), getattr(expected, name))
 
 
 def test_pokes_are_read_as_a_simulated_capture_without_noise_is():
-    words, shared = read_yaml(api.ROOT / "pipeline/scenes/quick.yaml"), read_yaml(api.ROOT / "params.yaml")
-    words["simulate"]["protocols"]["grid"] |= {"passes_n": 1, "depths_mm": [1.0], "terms": []}
+    simulate = read_yaml(ROOT / "pipeline/scenes/quick.yaml")["simulate"]
+    simulate["protocols"] = {"grid": simulate["protocols"]["grid"] | {"passes_n": 1, "depths_mm": [1.0], "terms": []}}
     exact = {name: 0.0 for name in ("robot_place_sd_mm", "robot_depth_sd_mm", "place_offset_sd_mm", "force_noise_N")}
-    shared |= {"chip": shared["chip"] | QUIET_CHIP, "rig": shared["rig"] | exact}
-    capture = record(
-        check_synthesis(Settings("quick", "quick", words, shared, {})), "grid", board="b0", skin="b0_s0", seed=3
-    )
+    shared = {name: nominal(name) for name in ("skin", "spreads", "terms")}
+    shared |= {"chip": nominal("chip", QUIET_CHIP), "rig": nominal("rig", exact)}
+    capture = record(parse_synthesis(simulate, shared, "quick"), "grid", board="b0", skin="b0_s0", seed=3)
     contact = capture.probe.contact
     places = np.stack([getattr(capture.probe, name)[contact] for name in ("x_mm", "y_mm", "depth_mm")], axis=1)
 
@@ -72,8 +73,6 @@ def test_a_design_is_changed_with_plain_values_and_a_wrong_one_is_a_sentence():
         reskin.draw_skin(thickness_mm="thick")
     with pytest.raises(ReskinError, match="pokes must be rows of x_mm, y_mm, depth_mm; got shape"):
         reskin.simulate_pokes(reskin.draw_skin(), [8, 8, 1])
-    with pytest.raises(ReskinError, match="the scene must be simulated; got recorded"):
-        reskin.draw_skin(scene="lab")
 
 
 def test_a_zeroed_model_answers_as_the_stages_network_does(model):  # noqa: F811

@@ -14,7 +14,7 @@ from pipeline.cli import app
 from pipeline.manage import cache
 from pipeline.manage.tidy import LOCK
 
-WEIGHTS, FOLDS, RECORDED = "data/models/one/train_multi", "data/folds/one.json", "data/raw/rig/b1"
+WEIGHTS, FOLDS, RECORDED = "data/models/one/train_multi", "data/models/one/folds.json", "data/raw/rig/b1"
 
 
 def md5(content: bytes) -> str:

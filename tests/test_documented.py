@@ -10,15 +10,17 @@ import pytest
 from ruamel.yaml import YAML
 
 from pipeline.report.statistics import KEYS, SURENESS
-from pipeline.scenes import QUESTIONS, check_scene, read_shared
+from pipeline.scenes import QUESTIONS, check_scene
+from pipeline.settings import Settings, read_shared_files
 from reskin import io
 from reskin.config import read_yaml
 from reskin.data.rows import TARGETS
 from reskin.metrics import METRICS
 from reskin.schema import UNITS, arrow_schema
+from reskin.simulation.defaults import NOMINAL
 
 ROOT = Path(__file__).resolve().parents[1]
-SETTINGS = [ROOT / "params.yaml", *sorted((ROOT / "pipeline/scenes").glob("*.yaml"))]
+SETTINGS = [ROOT / "params.yaml", NOMINAL, *sorted((ROOT / "pipeline/scenes").glob("*.yaml"))]
 NAMED = {"recipes", "adaptations", "labellings", "boards", "protocols", "variants", "rules"}  # below: names of rows
 
 # Names of rows, boards, captures, stages: no key with a meaning of its own.
@@ -79,4 +81,4 @@ def test_the_scene_that_docs_show_is_legal_with_the_recipe_that_they_show():
         for name in ("scene", "recipe")
     )
     words = YAML(typ="safe").load(page) | YAML(typ="safe").load(recipe)
-    check_scene("tiny", "docs", words, read_shared(ROOT / "params.yaml"))
+    check_scene(Settings("tiny", "docs", words, read_shared_files(ROOT)))

@@ -11,14 +11,13 @@ import pytest
 from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
-from pipeline import plan
+from pipeline import PLAN, SCENES, plan
 from pipeline.cli import app
 from pipeline.manage import add as adding
 from pipeline.manage import fetch as fetching
 from pipeline.manage.fetch import Origin
 from pipeline.manage.registry import read_registry
 from pipeline.scenes import read_plan
-from reskin import config
 from reskin.errors import ReskinError
 from reskin.recordings import preparing
 from reskin.recordings.preparing import Labels
@@ -60,7 +59,7 @@ def world(tmp_path_factory) -> SimpleNamespace:
     """A checkout that runs no scene yet, and a home of two recordings with a later commit in which one was changed."""
     root, away = copy_checkout(tmp_path_factory.mktemp("checkout")), tmp_path_factory.mktemp("away")
     plan.use(root, [])
-    with (root / config.SCENES / "small.yaml").open("w") as stream:
+    with (root / SCENES / "small.yaml").open("w") as stream:
         YAML().dump(recorded(), stream)
     files = boards(away / "rig")
     home = {f"data/{name}": content for name, content in files.items()}
@@ -318,7 +317,7 @@ def test_real_boards_are_in_their_scene_after_one_command(shared_data, tmp_path,
     captures = read_registry(root).captures["lab"]
     assert {(entry.board, entry.skin) for entry in captures.values()} == {("board1", "skin1"), ("board2", "skin2")}
     assert len(captures) == 6
-    assert list(read_plan(root / config.PLAN).scenes) == ["quick", "lab"]
+    assert list(read_plan(root / PLAN).scenes) == ["quick", "lab"]
     assert "switched scene lab on in pipeline/plan.yaml, beside quick" in done.stdout
     assert "now: dvc repro (runs quick, lab; only this one: reskin scenes use lab)" in done.stdout
     again = CliRunner().invoke(app, ["fetch", "lab"])

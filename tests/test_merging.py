@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
-from pipeline import plan
+from pipeline import FLOW, PARAMS, PLAN, SCENES, plan
 from pipeline.manage import merge
 from pipeline.manage.registry import Entry, Registry, read_registry, with_entry, write_registry
-from reskin import config, io
+from reskin import io
 from reskin.errors import ReskinError
 from tests.scenes import recorded
 from tests.stages.checkout import ROOT
@@ -32,7 +32,7 @@ def entry(skin: str, board: str, *fingerprints: str) -> Entry:
 def added(root: Path, name: str, skin: str, board: str, scene: str = "shared") -> None:
     """What `reskin add` and `dvc repro` change of the files that git holds."""
     write_registry(root, with_entry(read_registry(root), scene, name, entry(skin, board), allow_copy=False))
-    plan.use(root, sorted({*plan.read_plan(root / config.PLAN).scenes, scene}))
+    plan.use(root, sorted({*plan.read_plan(root / PLAN).scenes, scene}))
     lock = YAML(typ="safe").load((root / "dvc.lock").read_text())
     lock["stages"] |= {f"ingest@{scene}-{name}": {"cmd": "ingest"}, f"report@{scene}": {"cmd": f"with {name}"}}
     with (root / "dvc.lock").open("w") as stream:
@@ -45,10 +45,10 @@ def added(root: Path, name: str, skin: str, board: str, scene: str = "shared") -
 @pytest.fixture(scope="module")
 def start(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("start")
-    for name in (config.FLOW, config.PARAMS, ".gitattributes"):
+    for name in (FLOW, PARAMS, ".gitattributes"):
         shutil.copy(ROOT / name, root)
-    (root / config.SCENES).mkdir(parents=True)
-    with (root / config.SCENES / "shared.yaml").open("w") as stream:
+    (root / SCENES).mkdir(parents=True)
+    with (root / SCENES / "shared.yaml").open("w") as stream:
         YAML().dump(recorded(), stream)
     write_registry(root, NOTHING)
     plan.use(root, [])
@@ -129,10 +129,10 @@ def test_scenes_that_either_side_switched_on_run_and_those_that_one_switched_off
 
 def test_what_people_wrote_is_theirs_to_merge(root):
     git(root, "checkout", "-qb", "theirs")
-    (root / config.PARAMS).write_text("theirs: 1\n")
+    (root / PARAMS).write_text("theirs: 1\n")
     git(root, "commit", "-qam", "Change a parameter")
     git(root, "checkout", "-q", "main")
-    (root / config.PARAMS).write_text("ours: 1\n")
+    (root / PARAMS).write_text("ours: 1\n")
     git(root, "commit", "-qam", "Change it otherwise")
     git(root, "merge", "theirs", check=False)
     with pytest.raises(ReskinError, match="what people wrote must be merged first; got params.yaml"):

@@ -1,17 +1,16 @@
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from ruamel.yaml import YAML
 
-from pipeline import plan
+from pipeline import FLOW, PARAMS, PLAN, SCENES, plan
 from pipeline.manage.registry import Entry, Registry
 from pipeline.scenes import EXPERIMENTS, Plan, Scene, parse_scene
-from pipeline.stages._report import asking as read_asking
-from reskin import config
-from reskin.config import parse, read_yaml
+from pipeline.stages.report import read_asked
+from reskin.config import parse
 from reskin.errors import ParamsError
+from reskin.simulation.defaults import SHARED as SIMULATED
 from tests.scenes import SHARED, asking, recorded, settings
 from tests.stages.checkout import copy_checkout, run
 
@@ -19,11 +18,8 @@ ROOT = Path(__file__).resolve().parents[1]
 ENTRY = Entry(board="b", skin="s", layout="lab", chips_n=5, fingerprints=("0",), copy_of=None)
 
 
-FLOW = read_yaml(ROOT / config.FLOW)
-
-
 def make_plan(scenes, registry):
-    return plan.make_plan(scenes, registry, FLOW)
+    return plan.make_plan(scenes, registry)
 
 
 def scene(**changes: object) -> Scene:
@@ -36,8 +32,8 @@ def test_the_plan_of_the_checkout_is_what_its_scenes_ask_for():
 
 def test_a_question_that_no_scene_asks_has_no_stage():
     made = make_plan({"lab": scene()}, Registry(captures={"lab": {"c0": ENTRY}}))["stages"]
-    assert made["train_multi"] == {"lab": {"scene": "lab", "train_multi": {"recipe": "paper"}}}
-    assert made["train_single"] == made["verification"] == made["runtime"] == {}
+    assert made["train_multi"] == ["lab"]
+    assert made["train_single"] == made["verification"] == made["runtime"] == []
     assert made["simulate"] == made["ingest_simulated"] == {}
 
 
@@ -63,7 +59,7 @@ def test_a_stage_about_learning_runs_for_the_scenes_that_ask_it_and_for_no_other
     parse(Plan, made, "plan")
     assert list(made["stages"][stage]) == ["two"]
     assert all(list(made["stages"][every]) == ["one", "two"] for every in ("train_multi", "report", "publish"))
-    assert make_plan({"one": plain}, captures)["stages"][stage] == {}
+    assert make_plan({"one": plain}, captures)["stages"][stage] == []
 
 
 def test_an_experiment_of_a_recorded_scene_is_asked_of_its_own_captures_and_of_no_other_scene():
@@ -71,25 +67,27 @@ def test_an_experiment_of_a_recorded_scene_is_asked_of_its_own_captures_and_of_n
     captures = Registry(captures={"one": {"c0": ENTRY}, "two": {"c0": ENTRY}})
     made = make_plan({"one": plain, "two": asked}, captures)
     parse(Plan, made, "plan")
-    assert made["stages"]["drift"] == {
-        "two": {"scene": "two", "folder": "two", "captures": ["c0"], "drift": {"training": {"recipe": "paper"}}}
-    }
-    assert all(made["stages"][question] == {} for question in EXPERIMENTS if question != "drift")
+    assert made["stages"]["drift"] == {"two": "two"}
+    assert made["captures"] == {"one": ["c0"], "two": ["c0"]}
+    assert not any(made["stages"][question] for question in EXPERIMENTS if question != "drift")
 
 
 def test_a_choice_of_settings_needs_no_stage_of_its_own():
     chosen, plain = (parse_scene(asking(*own), "scene.yaml") for own in ((*ADAPTED, "choice"), ADAPTED))
     captures = Registry(captures={"lab": {"c0": ENTRY}})
     with_choice, without = (make_plan({"lab": one}, captures)["stages"] for one in (chosen, plain))
-    named = {stage for stage in with_choice if with_choice[stage] != without[stage]}
-    assert named == {"report", "publish"}  # which are told what is asked
+    assert with_choice == without
 
 
-def test_a_question_that_was_added_since_is_noticed_by_the_stages():
+def test_an_experiment_that_was_added_since_the_plan_is_noticed_by_the_report(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("pipeline").mkdir()
+    Path(PLAN).write_text("scenes: {tiny: [lobo, baselines]}\n")
     own = settings(asking("lobo", "baselines"))
-    assert read_asking(own).questions == ("lobo", "baselines")
+    assert read_asked(own).questions == ("lobo", "baselines")
+    Path(PLAN).write_text("scenes: {tiny: [lobo]}\n")
     with pytest.raises(ParamsError, match="baselines only in one. Try: reskin scenes use tiny"):
-        read_asking(replace(own, planned={"questions": ["lobo"]}))
+        read_asked(own)
 
 
 def test_every_recorded_capture_has_an_ingest_of_its_own():
@@ -99,19 +97,20 @@ def test_every_recorded_capture_has_an_ingest_of_its_own():
         "lab-c0": {"scene": "lab", "capture": "c0"},
         "lab-c1": {"scene": "lab", "capture": "c1"},
     }
-    assert made["stages"]["split"] == {"lab": {"scene": "lab", "folds": ["lobo"], "captures": ["c0", "c1"]}}
+    assert made["stages"]["split"] == ["lab"]
+    assert made["captures"] == {"lab": ["c0", "c1"]}
 
 
 def test_a_scene_of_many_captures_has_one_ingest_for_all():
     names = [f"c{i:02}" for i in range(plan.MANY_N + 1)]
     made = make_plan({"lab": scene()}, Registry(captures={"lab": dict.fromkeys(names, ENTRY)}))["stages"]
     assert made["ingest"] == {}
-    assert made["ingest_many"] == {"lab": {"scene": "lab", "captures": names}}
+    assert made["ingest_many"] == ["lab"]
     assert (
         make_plan({"lab": scene()}, Registry(captures={"lab": dict.fromkeys(names[1:], ENTRY)}))["stages"][
             "ingest_many"
         ]
-        == {}
+        == []
     )
 
 
@@ -121,29 +120,29 @@ def test_a_recorded_scene_without_recordings_says_how_to_add_one():
 
 
 def checkout(folder: Path, running: str = "{}") -> Path:
-    (folder / config.SCENES).mkdir(parents=True)
+    (folder / SCENES).mkdir(parents=True)
     (folder / "data").mkdir()
     for name, questions in (("one", ["lobo"]), ("two", ["lobo"])):
-        with (folder / config.SCENES / f"{name}.yaml").open("w") as stream:
+        with (folder / SCENES / f"{name}.yaml").open("w") as stream:
             YAML().dump(recorded(questions=questions), stream)
     with (folder / "data/captures.yaml").open("w") as stream:
         YAML().dump({"captures": {"one": {"c0": ENTRY.model_dump()}, "two": {"c0": ENTRY.model_dump()}}}, stream)
-    with (folder / config.PARAMS).open("w") as stream:
-        YAML().dump(SHARED, stream)
-    shutil.copy(ROOT / config.FLOW, folder)
-    (folder / config.PLAN).write_text(f"scenes: {running}\nstages: {{}}\n")
+    with (folder / PARAMS).open("w") as stream:
+        YAML().dump({name: rows for name, rows in SHARED.items() if name not in SIMULATED}, stream)
+    shutil.copy(ROOT / FLOW, folder)
+    (folder / PLAN).write_text(f"scenes: {running}\ncaptures: {{}}\nheld_out: {{}}\nmodels: {{}}\nstages: {{}}\n")
     return folder
 
 
 def test_use_writes_the_plan_and_no_file_of_hands(tmp_path):
     root = checkout(tmp_path)
-    by_hand = [root / config.PARAMS, *(root / config.SCENES).iterdir()]
+    by_hand = [root / PARAMS, *(root / SCENES).iterdir()]
     before = [file.read_bytes() for file in by_hand]
     plan.use(root, ["two", "one", "two"])
     made = plan.check(root)
     assert list(made.scenes) == ["two", "one"]
     assert list(made.stages["train_multi"]) == ["two", "one"]
-    assert "not for hands" in (root / config.PLAN).read_text()
+    assert "do not edit" in (root / PLAN).read_text()
     assert [file.read_bytes() for file in by_hand] == before
 
 
@@ -161,14 +160,13 @@ def test_an_unknown_scene_is_named_beside_the_known_ones(tmp_path):
 def simulated(tmp_path, **changes):
     """A checkout whose scene `one` is the tiny one, changed: in its section simulate, or in what scenes share."""
     root = checkout(tmp_path)
-    shutil.copy(ROOT / config.PARAMS, root)
-    shutil.copy(ROOT / config.SCENES / "ci.yaml", root / config.SCENES / "one.yaml")
+    shutil.copy(ROOT / PARAMS, root)
+    shutil.copy(ROOT / SCENES / "ci.yaml", root / SCENES / "one.yaml")
     for path, value in changes.items():
         *sections, name = path.split("__")
-        shared = sections[0] == "skin"
-        changed = root / config.PARAMS if shared else root / config.SCENES / "one.yaml"
+        changed = root / SCENES / "one.yaml"
         words = YAML(typ="safe").load(changed.read_text())
-        section = words if shared else words["simulate"]
+        section = words["simulate"]
         for part in sections:
             section = section[part]
         section[name] = value
@@ -183,17 +181,15 @@ def test_every_protocol_has_a_folder_and_stages_of_its_own(tmp_path):
     stages = plan.check(root).stages
     protocols = ("wear", "flexible", "hand", "drag", "sleeve", "glass", "grip", "press", "log")
     assert set(stages["simulate"]) == {"one", *(f"one-{protocol}" for protocol in protocols)}
-    assert stages["simulate"]["one-flexible"]["boards"] == "flexible"
     assert set(stages["ingest_simulated"]) == set(stages["simulate"]) - {"one-log"}  # an SD card has no probe to join
-    assert set(stages["describe"]) == {"one"}
-    assert stages["drift"]["one"]["folder"] == "one-wear"
+    assert stages["describe"] == ["one"]
+    assert stages["drift"] == {"one": "one-wear"}
 
 
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"skin__base": "glued"}, "skin.base must be 'bonded' or 'slipping'; got 'glued'"),
-        ({"protocols__wear__terms": ["wind"]}, r"params.yaml: terms.wind must be given"),
+        ({"protocols__wear__terms": ["wind"]}, r"protocols.wear.terms.0 must be 'ageing', 'friction', "),
         ({"protocols__wear__skins_n": 99}, "protocol wear: skins_n 99 is more than rigid boards have, 6"),
         ({"protocols__press__skins_n": 3}, "protocol press: skins_n is 1, as its question reads one skin, not 3"),
         ({"protocols__flexible__boards": "rigid"}, "protocol flexible: boards is another kind than that of grid"),
@@ -201,22 +197,26 @@ def test_every_protocol_has_a_folder_and_stages_of_its_own(tmp_path):
 )
 def test_a_scene_that_cannot_be_simulated_is_refused_before_anything_runs(tmp_path, changes, sentence):
     root = simulated(tmp_path, **changes)
-    before = (root / config.PLAN).read_text()
+    before = (root / PLAN).read_text()
     with pytest.raises(ParamsError, match=sentence):
         plan.use(root, ["one"])
-    assert (root / config.PLAN).read_text() == before
+    assert (root / PLAN).read_text() == before
 
 
-STAND_IN = """\
-for out; do :; done  # the last argument: what a stage writes
-mkdir -p "$out"
-touch "$out/simulate"  # of stage code: the digest that stage simulate depends on
+STAND_IN = """
+import pathlib, sys
+out = pathlib.Path(sys.argv[-1])  # what a stage writes
+out.mkdir(parents=True, exist_ok=True)
+(out / "simulate").touch()  # of stage code: the digest that stage simulate depends on
+if sys.argv[1] == "scenes":
+    from pipeline.cli import main
+    main()
 """
 
 
 def test_dvc_checkout_keeps_the_outputs_of_scenes_that_left_the_plan(tmp_path):
     root = copy_checkout(tmp_path)
-    (root / "pipeline/run.sh").write_text(STAND_IN)
+    (root / "pipeline/__main__.py").write_text(STAND_IN)
     run(root, "reskin", "scenes", "use", "ci")
     run(root, "dvc", "repro", "simulate@ci")
     run(root, "reskin", "scenes", "use", "quick")

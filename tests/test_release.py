@@ -11,15 +11,15 @@ import pytest
 from release import constraints
 from release.constraints import render
 from release.licences import TOLERATED, closure, incompatible, is_compatible, wanted
-from reskin.config import PARAMS, SCENES, params_of, read_yaml
+from reskin.config import read_yaml
 from reskin.errors import ParamsError
 from reskin.packages import explain, need
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 CORE = (  # what runs outside a checkout
-    "pipeline.cli", "reskin.recordings.recorder", "reskin.board.decode", "reskin.predicting", "reskin",
-    *(f"reskin.live.{name}" for name in ("ports", "emulate", "script", "inject", "server")),
+    "pipeline.cli", "reskin", "reskin.api", "reskin.recordings.recorder", "reskin.board.decode", "reskin.board.find",
+    "reskin.predicting", "reskin.live.emulator", "reskin.live.server",
 )  # fmt: skip
 AWAY = ("dvc", "grimp", "jinja2", "magpylib", "matplotlib", "mlflow", "mpmath", "onnx", "pandas", "sklearn", "torch")
 # Every package that is not of the core, as if it were not installed.
@@ -44,21 +44,26 @@ def wheel(tmp_path_factory) -> Path:
     """The package as setuptools lays it into a wheel."""
     folder = tmp_path_factory.mktemp("wheel")
     words = ["-q", "egg_info", "-e", str(folder), "build_py", "-d", str(folder / "lib")]
-    subprocess.run([sys.executable, "-W", "ignore", "setup.py", *words], cwd=ROOT, check=True, capture_output=True)
+    subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", "import setuptools; setuptools.setup()", *words],
+        cwd=ROOT,
+        check=True,
+        capture_output=True,
+    )
     return folder / "lib"
 
 
 def test_the_wheel_holds_the_code_and_what_it_reads_and_nothing_else(wheel):
     names = {str(file.relative_to(wheel)) for file in wheel.rglob("*") if file.is_file()}
-    beside = {"pipeline/plan.yaml", "pipeline/run.sh"}  # of a checkout alone
+    beside = {"pipeline/plan.yaml"}  # of a checkout alone
     files = [file.relative_to(ROOT) for top in ("pipeline", "reskin") for file in (ROOT / top).rglob("*.*")]
     code = {str(file) for file in files if not any(part.startswith((".", "__pycache__")) for part in file.parts)}
-    assert names == code - beside | {f"pipeline/{PARAMS}"}
-    assert {f"{SCENES}/quick.yaml", "pipeline/live/page/live.js", "pipeline/twin/universal.safetensors"} <= names
-
-
-def test_settings_read_from_the_wheel_are_those_of_the_checkout(wheel):
-    assert read_yaml(params_of(wheel)) == read_yaml(params_of(ROOT)) == read_yaml(ROOT / PARAMS)
+    assert names == code - beside
+    assert {
+        "reskin/simulation/nominal.yaml",
+        "reskin/live/page/live.js",
+        "reskin/universal/universal.safetensors",
+    } <= names
 
 
 def test_every_script_of_a_page_is_ours_or_says_its_licence(wheel):

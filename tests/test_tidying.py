@@ -6,9 +6,8 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
-from pipeline import plan
+from pipeline import SCENES, plan
 from pipeline.manage import tidy
-from reskin import config
 from tests.scenes import asking
 from tests.test_plan import checkout
 
@@ -17,7 +16,7 @@ WRITTEN = {
     "train_multi@one": "data/models/one/train_multi",
     "simulate@one-gone": "data/raw/one-gone",
     "drift@two": "data/answers/two/drift.json",
-    "split@one": "data/folds/one.json",
+    "split@one": "data/models/one/folds.json",
 }
 
 
@@ -61,12 +60,12 @@ def test_a_file_that_a_planned_stage_writes_too_stays(root):
 
 
 def test_a_scene_whose_name_begins_like_another_is_its_own(root):
-    shutil.copy(root / config.SCENES / "one.yaml", root / config.SCENES / "one-gone.yaml")
+    shutil.copy(root / SCENES / "one.yaml", root / SCENES / "one-gone.yaml")
     assert set(tidy.left_over(root, plan.check(root))) == {"drift@one"}
 
 
 def test_a_question_that_is_asked_leaves_nothing_over(root):
-    with (root / config.SCENES / "one.yaml").open("w") as stream:
+    with (root / SCENES / "one.yaml").open("w") as stream:
         YAML().dump(asking("lobo", "drift"), stream)
     plan.use(root, ["one"])
     assert set(tidy.left_over(root, plan.check(root))) == {"simulate@one-gone"}

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from pipeline import plan
+from pipeline import PARAMS, PLAN, plan
 from pipeline.manage.registry import REGISTRY, read_registry, with_capture, without_capture, write_registry
 from pipeline.manage.running import need_rest
 from pipeline.scenes import Scene, read_plan, read_scene, read_shared
@@ -22,6 +22,7 @@ from reskin.recordings.header import STREAM_FILE, Header, write_capture
 from reskin.recordings.ingest import check_losses, open_capture
 from reskin.recordings.orientation import other_orientation, presses_of
 from reskin.recordings.preparing import Prepared
+from reskin.simulation.defaults import nominal
 
 RAW = "data/raw"
 INDENTATIONS = "data/indentations"
@@ -32,27 +33,27 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
     """Check a prepared recording, write it, track it with DVC, register it, and plan its scene; all, or nothing."""
     need_rest(root)
     header, files = prepared
-    settings = read_scene(plan.scene_file(root, scene), root / config.PARAMS)
+    settings = read_scene(root, plan.scene_file(root, scene).stem)
     if settings.source != header.source:
         rule, remedy = (
             f"{settings.source}, as scene {scene} is",
             "Simulated and recorded captures belong to different scenes.",
         )
         raise CaptureError(f"capture {header.capture}", "source", rule, header.source, remedy)
-    shared, before = read_shared(root / config.PARAMS), read_registry(root)
-    decisions = config.parse(Decisions, shared["faults"], f"{config.PARAMS}: faults")
+    shared, before = read_shared(root / PARAMS), read_registry(root)
+    decisions = config.parse(Decisions, shared["faults"], f"{PARAMS}: faults")
     target = root / RAW / scene / header.capture
     _check_free(target, header.capture in before.captures.get(scene, {}))
-    with io.restoring(root / REGISTRY, root / config.PLAN), _forgetting_on_failure(target):
+    with io.restoring(root / REGISTRY, root / PLAN), _forgetting_on_failure(target):
         with _naming_sources(target, files):
             complete = write_capture(target, header, files)
             fingerprints = _read_through(target, complete, shared["lost_fraction_max"], decisions)
         after = with_capture(before, scene, complete, fingerprints, allow_copy=allow_copy)
         _track(target, root)
         write_registry(root, after)
-        plan.use(root, [*read_plan(root / config.PLAN).scenes, scene])
+        plan.use(root, [*read_plan(root / PLAN).scenes, scene])
     if "compare" in (settings.model_extra or {}):
-        _warn_of_departures(target, settings, shared["skin"], decisions)
+        _warn_of_departures(target, settings, nominal("skin"), decisions)
     else:
         _warn_of_other_labels(target, list(before.captures.get(scene, {})), decisions)
     return complete
@@ -61,8 +62,8 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
 def remove(root: Path, scene: str, capture: str) -> None:
     """Take a capture out again: its entry and its stage, then its raw files and its readings."""
     after = without_capture(read_registry(root), scene, capture)
-    running = read_plan(root / config.PLAN).scenes
-    with io.restoring(root / REGISTRY, root / config.PLAN):
+    running = read_plan(root / PLAN).scenes
+    with io.restoring(root / REGISTRY, root / PLAN):
         write_registry(root, after)
         plan.use(root, [name for name in running if name != scene or scene in after.captures])
     _forget(root / RAW / scene / capture)

@@ -14,10 +14,11 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field
 
+from pipeline import PLAN
 from pipeline.manage import add
 from pipeline.manage.registry import read_registry
 from pipeline.scenes import read_plan
-from reskin import config, io
+from reskin import io
 from reskin.config import Strict, parse, read_yaml
 from reskin.errors import CaptureError, ParamsError
 from reskin.recordings import preparing
@@ -201,7 +202,7 @@ def fetch(root: Path, name: str | None, where: str | None, *, agree: Callable[[s
         return say("\n".join(_summary(name, source) for name, source in sources.items()))
     if name not in sources:
         raise ParamsError("reskin fetch", "a source", f"one of {', '.join(sources)}", name, f"{SOURCES} lists them.")
-    source, folder, running = sources[name], root / FETCHED / name, read_plan(root / config.PLAN).scenes
+    source, folder, running = sources[name], root / FETCHED / name, read_plan(root / PLAN).scenes
     if all(_is_there(folder / file.path, file) for file in source.files):
         say(f"{folder}: {source.size}, there already and unchanged")
     else:
@@ -312,10 +313,10 @@ def _added_as(root: Path, scene: str, prepared: Prepared) -> str | None:
 
 
 def _say_what_runs(root: Path, scene: str, before: Mapping[str, object], say: Say) -> None:
-    running = list(read_plan(root / config.PLAN).scenes)
+    running = list(read_plan(root / PLAN).scenes)
     if scene not in running:
         return say(f"scene {scene} is switched off; now: reskin scenes use {' '.join([*running, scene])}; dvc repro")
     if scene not in before:
-        say(f"switched scene {scene} on in {config.PLAN}, beside {', '.join(before) or 'no other'}")
+        say(f"switched scene {scene} on in {PLAN}, beside {', '.join(before) or 'no other'}")
     say(f"now: dvc repro (runs {', '.join(running)}; only this one: reskin scenes use {scene})")
     say(f"then: reports/{scene}/index.html, and beside the other scenes in reports/index.html")

@@ -10,7 +10,7 @@ from pathlib import Path
 from shutil import which
 from typing import Any
 
-from pipeline import plan
+from pipeline import PLAN, plan
 from pipeline.manage.registry import (
     REGISTRY,
     Entry,
@@ -22,7 +22,7 @@ from pipeline.manage.registry import (
 )
 from pipeline.scenes import read_plan
 from reskin import io
-from reskin.config import PLAN, parse
+from reskin.config import parse
 from reskin.errors import ParamsError
 
 LOCK = "dvc.lock"

@@ -40,10 +40,10 @@ def rerun(root: Path, names: Sequence[str]) -> None:
     with tempfile.TemporaryDirectory(prefix="reskin-verify-", ignore_cleanup_errors=True) as temporary:
         clone = Path(temporary) / "clone"
         _git(root, "clone", "--quiet", ".", str(clone))
-        (clone / ".venv").symlink_to(sys.prefix)  # where run.sh looks first
         _bring_recordings(root, clone, names)
-        environment = {**QUIET, **os.environ, "PYTHONPATH": str(clone)}
-        _run(clone, environment, "pipeline.cli", "scenes", "use", *names, quiet=True)
+        path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"  # stages run `python`
+        environment = {**QUIET, **os.environ, "PYTHONPATH": str(clone), "PATH": path}
+        _run(clone, environment, "pipeline", "scenes", "use", *names, quiet=True)
         for name in names:
             shutil.rmtree(clone / "reports" / name, ignore_errors=True)  # what does not run cannot pass
         # Forced: no cache of this machine stands in for a stage. What only tells others of results is left out.

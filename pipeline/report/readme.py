@@ -6,13 +6,14 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from pipeline import FLOW
 from pipeline.report.formatting import to_markdown
 from pipeline.report.headline import labels_table, short_table
 from pipeline.report.numbers import join
 from pipeline.report.tables import make_tables, skins_table
 from pipeline.scenes import EXPERIMENTS
-from reskin import config, io
-from reskin.code import ROOT
+from pipeline.stages import module_name
+from reskin import io
 from reskin.config import read_yaml
 from reskin.errors import ParamsError, SchemaError
 
@@ -141,8 +142,7 @@ def _stages(stages: Mapping[str, Any]) -> str:
             for out in stage.get("do", stage).get(key, [])
         ]
         written = ", ".join(f"`{re.sub(r'[$]{[^}]*}', '…', out)}`" for out in outs) or "MLflow runs"
-        homes = (f"pipeline/stages/{name}.py", f"pipeline/experiments/{name}/run.py")
-        code = next(home for home in homes if (ROOT / home).exists())
+        code = f"{module_name(name).replace('.', '/')}.py" if name != "code" else "pipeline/stages/code.py"
         lines.append(f"| {name} | [{code}](../{code}) | {written} |")
     return "\n".join(lines)
 
@@ -171,7 +171,7 @@ def fill_pages(root: Path, *, write: bool) -> tuple[list[str], list[str]]:
     timed = io.read_json(root / TIMED) if (root / TIMED).exists() else None
     texts = [root / "README.md", *sorted((root / "docs").glob("*.md"))]
     before = {str(file): file.read_text(encoding="utf-8") for file in texts}
-    after = fill(before, blocks_of(results, recorded, read_yaml(root / config.FLOW)["stages"], timed))
+    after = fill(before, blocks_of(results, recorded, read_yaml(root / FLOW)["stages"], timed))
     changed = [page for page in after if after[page] != before[page]]
     for page in changed if write else ():
         io.write_text(Path(page), after[page])

@@ -1,4 +1,34 @@
-"""One thin module a DVC stage: read argv and params, read inputs, call one or two functions, write.
+"""The stages of the pipeline: thin functions that read inputs, call the library, and write outputs.
 
-Refuses to know arithmetic: what a stage computes stands in the folder that it calls.
+`python -m pipeline STAGE --scene NAME ...` runs one; dvc.yaml says with which inputs and outputs.
 """
+
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+
+MODULES = {
+    "simulate": ("simulate",),
+    "ingest": ("ingest", "ingest_many", "ingest_simulated", "describe", "split"),
+    "train": ("train_single", "train_multi", "train_triplet", "adapt", "train_classical"),
+    "sweeps": ("sweep_pokes", "sweep_sensors"),
+    "universal": ("few_labels", "universal"),
+    "report": ("table2", "report", "publish"),
+}
+EXPERIMENTS = Path(__file__).parents[1] / "experiments"
+STAGES = {stage: f"pipeline.stages.{module}" for module, names in MODULES.items() for stage in names}
+
+
+def is_stage(name: str) -> bool:
+    """Tell whether a stage or an experiment has this name."""
+    return name in STAGES or (EXPERIMENTS / name / "run.py").is_file()
+
+
+def module_name(stage: str) -> str:
+    """Name the module that holds a stage's function: one of `pipeline.stages`, or that of an experiment."""
+    return STAGES.get(stage, f"pipeline.experiments.{stage}.run")
+
+
+def module_of(stage: str) -> ModuleType:
+    """Import the module that holds a stage's function."""
+    return import_module(module_name(stage))

@@ -1,30 +1,119 @@
-"""Stage ingest: one recorded capture -> indentations/<scene>/<capture>.parquet, one row a reading.
+"""Stages from captures to a dataset: ingest, ingest_many, ingest_simulated, describe, split."""
 
-Refuses to know how a layout is read and which faults are dropped.
-"""
-
+import hashlib
+import shutil
 from pathlib import Path
 
-from pipeline.stage import run, say
+from pipeline.provenance import home
+from pipeline.report.description import describe as describe_capture
+from pipeline.report.description import over_skins, without_rest
+from pipeline.settings import Settings
+from pipeline.stage import say
 from reskin import io
-from reskin.config import Files, parse, read_yaml
+from reskin.data.folds import load_rows, render_folds
+from reskin.data.rows import Rows, Selection
+from reskin.data.splits import Split, draw_folds
 from reskin.recordings.fault_policy import Decisions
 from reskin.recordings.ingest import check_losses, open_capture
 
+CACHE = ".reskin/readings"  # of ingest_many; DVC deletes a stage's outputs before it runs
+NO_ROWS = Rows.of_labels(boards=[], skins=[])
 
-def ingest(scene: str, files: Files, raw: Path, lost_fraction_max: float, indentations: Path) -> None:
-    """Read a capture, check what it lost, and write its readings."""
-    decisions = parse(Decisions, read_yaml(files.params)["faults"], f"{files.params}: faults")
+
+def ingest(settings: Settings, raw: Path, indentations: Path) -> None:
+    """Read one recorded capture, check what it lost, and write its readings: one row each."""
+    decisions = settings.shared_section(Decisions, "faults")
     header, blocks, account = open_capture(raw, decisions)
     io.write_readings(indentations, blocks, account)
     try:
-        check_losses(account, lost_fraction_max, str(raw))
+        check_losses(account, settings.shared["lost_fraction_max"], str(raw))
     except ValueError:
         io.remove(indentations)
         raise
     kept = ", ".join(f"{key} {count}" for key, count in account.items() if count)
-    say(f"{scene}/{header.capture} ({header.source}): {kept}")
+    say(f"{settings.scene}/{header.capture} ({header.source}): {kept}")
 
 
-if __name__ == "__main__":
-    run(ingest)
+def ingest_simulated(settings: Settings, raw: Path, indentations: Path) -> None:
+    """Read every capture of one simulated protocol, as recorded captures are read."""
+    with io.replacing(indentations) as folder:
+        folder.mkdir()
+        for capture in sorted(child for child in raw.iterdir() if child.is_dir()):
+            ingest(settings, capture, folder / f"{capture.name}.parquet")
+
+
+def ingest_many(settings: Settings, raw: Path, code: Path, indentations: Path) -> None:
+    """Read the captures of a recorded scene that has many of them; a DVC stage each would cost more than the reading.
+
+    Captures that were read before, with the same bytes, code and settings, come from a cache (docs/growth.md).
+    """
+    cache = home() / CACHE / settings.scene
+    rest_on = repr([settings.shared["faults"], settings.shared["lost_fraction_max"]]).encode() + io.read_bytes(code)
+    before = {file.stem.partition("-")[0]: file for file in cache.glob("*-*.parquet")}
+    used, read_n = set(), 0
+    with io.replacing(indentations) as folder:
+        folder.mkdir()
+        for name in settings.captures:
+            key = _cache_key(raw / name, rest_on)
+            if key not in before or not _is_whole(before[key]):
+                fresh = cache / f"{key}.parquet"
+                ingest(settings, raw / name, fresh)
+                before[key], read_n = fresh.rename(cache / f"{key}-{io.sha256(fresh)}.parquet"), read_n + 1
+            shutil.copyfile(before[key], folder / f"{name}.parquet")  # no link: an edit of one must not edit the other
+            used.add(before[key])
+    for file in set(cache.glob("*.parquet")) - used:
+        io.remove(file)
+    captures_n = len(settings.captures)
+    say(f"{settings.scene}: {captures_n} captures, {captures_n - read_n} of them read before")
+
+
+def _is_whole(cached: Path) -> bool:
+    """Check cached readings against the digest in their name; remove them and warn if they were damaged."""
+    if io.sha256(cached) == cached.stem.partition("-")[2]:
+        return True
+    say(f"warning: cached readings are damaged and are read again ({cached}: other content than was written)")
+    io.remove(cached)
+    return False
+
+
+def _cache_key(capture: Path, rest_on: bytes) -> str:
+    """Digest what readings of a capture depend on: its name and bytes, the code, the settings."""
+    digest = hashlib.sha256(rest_on + capture.name.encode())
+    for file in sorted(file for file in capture.rglob("*") if file.is_file()):
+        digest.update(f"{file.relative_to(capture)} {io.sha256(file)}\n".encode())
+    return digest.hexdigest()
+
+
+def describe(settings: Settings, indentations: Path, description: Path) -> None:
+    """Describe the recordings of a scene: fields, noise, steps and forces, over its skins."""
+    captures = [io.read_readings(indentations / f"{name}.parquet") for name in settings.captures_in(indentations)]
+    accounts = {one.capture: io.read_account(indentations / f"{one.capture}.parquet") for one in captures}
+    described = {one.capture: describe_capture(one) for one in captures}
+    described |= {
+        name: without_rest(described[name])
+        for name, account in accounts.items()
+        if account.get("baseline_subtracted_rows_n")
+    }
+    together = over_skins([(one.skin, described[one.capture]) for one in captures])
+    readings_n = sum(map(len, captures))
+    counts = {"captures_n": len(captures), "readings_n": readings_n}
+    counts["indentations_n"] = sum(account.get("indentations_n", 0) for account in accounts.values())
+    io.write_json(description, {"counts": counts, "source": captures[0].source, "over_skins": together})
+    say(f"{settings.scene}: {indentations}: {readings_n} readings of {len(captures)} captures described")
+
+
+def read_split(settings: Settings) -> Split:
+    """Parse section split."""
+    return settings.section(Split, "split")
+
+
+def split(settings: Settings, indentations: Path, folds: Path) -> None:
+    """Draw the folds of every experiment of the scene that holds rows out."""
+    captures = settings.captures_in(indentations)
+    if not settings.held_out:
+        io.write_json(folds, render_folds(captures, NO_ROWS, []))
+        return say(f"{settings.scene}: no experiment on {len(captures)} captures holds rows out")
+    rows = load_rows([indentations / f"{name}.parquet" for name in captures], settings.section(Selection, "selection"))
+    drawn = draw_folds(rows, settings.held_out, read_split(settings), settings.seed)
+    io.write_json(folds, render_folds(captures, rows, drawn))
+    say(f"{settings.scene}: {len(rows)} rows of {len(captures)} captures, {len(drawn)} folds; left out: {rows.dropped}")

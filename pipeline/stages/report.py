@@ -1,39 +1,80 @@
-"""Stage report: models' cards, predictions, answers and accounts -> numbers, scores, tables, figures, index.html.
+"""Stages that show results: table2 (early), report (numbers, tables, figures, pages), publish (MLflow)."""
 
-Refuses to know readings, and to train.
-"""
-
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import pandas as pd
+
+from pipeline import PLAN
 from pipeline.executors import make_executor
-from pipeline.report.choice import to_record
+from pipeline.provenance import (
+    COSTS,
+    SECONDS,
+    add_up_costs,
+    code_version,
+    device,
+    home,
+    is_experiment,
+    read_costs,
+    versions,
+)
+from pipeline.report.choice import choose, to_record
 from pipeline.report.figures import error_grids, learning_figures, learning_pages, pages
-from pipeline.report.formatting import to_markdown
+from pipeline.report.formatting import rounded, to_markdown
 from pipeline.report.headline import FILE, headline_figures, short_table
-from pipeline.report.numbers import headline_scores, split
+from pipeline.report.numbers import (
+    answered,
+    compose,
+    count_trainings,
+    curves_of,
+    foretold,
+    headline_scores,
+    learned,
+    lost_by_protocol,
+    runtime,
+    split,
+    timed_learning,
+)
 from pipeline.report.page import index, page, run_page
 from pipeline.report.parts import experiment_figures
-from pipeline.report.statistics import to_csv
+from pipeline.report.statistics import tidy, to_csv
 from pipeline.report.tables import make_tables, table_texts
-from pipeline.stage import run, say
-from pipeline.stages._report import Places, asking, read_cards, read_numbers
+from pipeline.scenes import TABLE_2, Asking, asked_by, stages
+from pipeline.settings import Settings
+from pipeline.stage import say
+from pipeline.tracking import Curves, TrackingAway, metrics_of
+from pipeline.tracking import publish as write_runs
 from reskin import io
-from reskin.config import Files, read_settings
+from reskin.config import read_yaml
+from reskin.data.rows import SCORED
+from reskin.errors import ParamsError
 from reskin.models.recipe import HEADLINE
+from reskin.numerics import device as trained_on
 from reskin.simulation.fingerprint import fingerprint
 
 
-def report(
-    scene: str, files: Files, indentations: Path, folds: Path, models: Path, answers: Path, reports: Path
-) -> None:
+def table2(settings: Settings, models: Path, shown: Path) -> None:
+    """Write table 2 of the paper and its figure as soon as its networks are trained; the report shows them again."""
+    source, scene = settings["source"], settings.scene
+    variants = stages(TABLE_2.values(), "models")
+    cards = [io.read_json(file) for variant in variants for file in sorted((models / variant).glob("*.json"))]
+    numbers = rounded({"provenance": {"scene": scene, "source": source}, **learned(tidy(cards, {}), headline=HEADLINE)})
+    table = to_markdown(short_table(numbers))
+    io.write_texts(shown, {"table2.md": table, **headline_figures(numbers, source)})
+    say(f"{scene} ({source})\n{table}\n{scene}: {', '.join(str(file) for file in sorted(shown.iterdir()))}")
+
+
+def report(settings: Settings, indentations: Path, folds: Path, models: Path, answers: Path, reports: Path) -> None:
     """Write the numbers, tables, figures and the page of a scene."""
-    settings = read_settings("report", scene, files)
-    asked = asking(settings)
+    scene = settings.scene
+    asked = read_asked(settings)
     numbers, drawn, scores = read_numbers(settings, asked, Places(indentations, folds, models, answers))
     if "choice" in asked.questions:
         record = to_record(
             numbers["chosen"], read_cards(asked, models), source=asked.source, seed=settings.seed,
-            physics=fingerprint(settings),
+            physics=fingerprint(settings.shared),
         )  # fmt: skip
         io.write_json(reports / "choice.json", record)
     shared, of_this_run = split(numbers)
@@ -65,5 +106,94 @@ def report(
     say(f"{scene}: {reports}/index.html, numbers.json, provenance.json, scores.json, tables, figures, runtime")
 
 
-if __name__ == "__main__":
-    run(report)
+def publish(settings: Settings, models: Path, answers: Path, reports: Path) -> None:
+    """Write every training of a scene and its report to MLflow once; if the server is away, warn and go on."""
+    asked, scene = read_asked(settings), settings.scene
+    variants = {variant: models / variant for variant in asked.modelled}
+    name = f"{scene} (dvc exp)" if is_experiment() else scene  # beside the checkout's own results, not in their place
+    try:
+        counts = write_runs(variants, read_curves(asked, answers), reports, scene=name, root=home())
+        say(f"{name}: MLflow runs {counts}")
+    except TrackingAway as away:
+        say(f"warning: {scene} is not in MLflow: {away}")
+
+
+def read_curves(asked: Asking, answers: Path) -> Curves:
+    """Read the points of every sweep and the numbers of every experiment, as curves by stage."""
+    stages = asked.curves
+    points = {question: io.read_json(answers / f"{stage}.json") for question, stage in stages.items()}
+    curves: dict[str, list[tuple[str, int, dict[str, float]]]]
+    curves = {stages[question]: rows for question, rows in curves_of(points).items()}
+    for question in asked.experiments:
+        numbers = io.read_json(answers / f"{question}.json")["numbers"]
+        named = [(name.rpartition("."), value, step) for name, value, step in metrics_of({question: numbers})]
+        curves[question] = [(head, step, {tail: value}) for (head, _, tail), value, step in named]
+    return curves
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where a scene's results lie."""
+
+    indentations: Path
+    folds: Path
+    models: Path
+    answers: Path
+
+
+def read_asked(settings: Settings) -> Asking:
+    """Read which experiments the scene runs; raise if it was edited since the plan was made."""
+    asked = asked_by(settings)
+    planned = read_yaml(Path(PLAN))["scenes"].get(settings.scene, [])
+    if list(asked.questions) != list(planned):
+        differing = ", ".join(sorted(set(asked.questions) ^ set(planned))) or "another order"
+        remedy = f"Try: reskin scenes use {settings.scene}, beside the others that run."
+        raise ParamsError(settings.where, "questions", f"those of {PLAN}", f"{differing} only in one", remedy)
+    return asked
+
+
+def read_cards(asked: Asking, models: Path) -> list[dict[str, Any]]:
+    """Read the cards of all models that the scene keeps."""
+    return [io.read_json(file) for arm in asked.modelled for file in sorted((models / arm).glob("*.json"))]
+
+
+def read_numbers(settings: Settings, asked: Asking, at: Places) -> tuple[dict[str, Any], dict[str, Any], pd.DataFrame]:
+    """Read what numbers.json says, by experiment what only its figures show, and the table of scores."""
+    folds, cards = io.read_json(at.folds), read_cards(asked, at.models)
+    accounts = [io.read_account(at.indentations / f"{name}.parquet") for name in folds["captures"]]
+
+    def answers(names: Sequence[str]) -> dict[str, Any]:
+        return {name: io.read_json(at.answers / f"{name}.json") for name in names}
+
+    points = {question: answers([stage])[stage] for question, stage in asked.curves.items()}
+    experiments, table = answers(asked.experiments), tidy(cards, points)
+    costs = {unit: cost for unit, cost in read_costs(COSTS / settings.scene).items() if asked.runs(unit)}
+    took = {file.stem: io.read_json(file) for file in sorted((SECONDS / settings.scene).glob("*.json"))}
+    numbers = {
+        "provenance": _provenance(settings, asked, cards, costs),
+        **compose(table, accounts, folds["dropped"], headline=HEADLINE),
+        **foretold([io.read_table(at.models / arm / SCORED) for arm in asked.modelled if arm == "train_single"]),
+        "trainings": count_trainings(cards, points, experiments),
+        "described": {asked.described: io.read_json(at.answers / "described.json")},
+        **answers([question for question in ("audit",) if question in asked.questions]),
+        **{question: answer["numbers"] for question, answer in experiments.items()},
+        **answered(answers(asked.studied), runtime(len(cards), costs), took),
+    }
+    if asked.source == "simulated":
+        losses = {question: answer["losses"] for question, answer in experiments.items()}
+        numbers["capture_by_protocol"] = lost_by_protocol(losses)
+    if "choice" in asked.questions:
+        numbers["chosen"] = choose(cards)
+    numbers["runtime"] |= timed_learning(numbers, took)
+    return rounded(numbers), {question: answer["drawn"] for question, answer in experiments.items()}, table
+
+
+def _provenance(
+    settings: Settings, asked: Asking, cards: Sequence[Mapping[str, Any]], costs: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Say where a result came from; a stage whose question was switched off costs nothing any more."""
+    return {
+        "scene": settings.scene, "source": asked.source, "git": code_version(), "seed": settings.seed,
+        "trained": ", ".join(sorted({card["git"] for card in cards})), "versions": versions(),
+        "device": f"{device()}, networks on {trained_on()}", "seconds": round(add_up_costs(costs.values()), 1),
+    }  # fmt: skip

@@ -1,23 +1,20 @@
-"""Stage simulate: parameters -> raw captures of skins that do not exist, in the wire format of those that do.
-
-Refuses to know a law of physics and who reads the captures.
-"""
+"""Stage simulate: raw captures of simulated skins, in the wire format of recorded ones."""
 
 from pathlib import Path
 
 from pipeline.executors import make_executor
-from pipeline.stage import run, say
+from pipeline.settings import Settings
+from pipeline.stage import say
+from pipeline.synthesis import synthesis_of
 from reskin import io
-from reskin.config import Files, read_settings
 from reskin.errors import ParamsError
 from reskin.recordings.header import write_capture
 from reskin.simulation.capture import record, roster, to_files
-from reskin.simulation.settings import Synthesis, synthesis_of
+from reskin.simulation.settings import Synthesis
 
 
-def simulate(scene: str, files: Files, protocol: str, raw: Path) -> None:
-    """Record every skin of one protocol of a simulated scene."""
-    settings = read_settings("simulate", raw.name, files)
+def simulate(settings: Settings, protocol: str, raw: Path) -> None:
+    """Record every skin of one protocol."""
     synthesis, seed = synthesis_of(settings), settings.seed
     pairs, skins_n = roster(synthesis, protocol), synthesis.protocols[protocol].skins_n
     if len(pairs) < skins_n:
@@ -27,7 +24,7 @@ def simulate(scene: str, files: Files, protocol: str, raw: Path) -> None:
         folder.mkdir()
         waiting = [executor.submit(_record, synthesis, protocol, pair, seed, folder) for pair in pairs]
         for i, done in enumerate(waiting, 1):
-            say(f"{scene}: simulated {done.result()} ({i}/{len(pairs)})")
+            say(f"{settings.scene}: simulated {done.result()} ({i}/{len(pairs)})")
 
 
 def _record(synthesis: Synthesis, protocol: str, pair: tuple[str, str], seed: int, folder: Path) -> str:
@@ -35,7 +32,3 @@ def _record(synthesis: Synthesis, protocol: str, pair: tuple[str, str], seed: in
     capture = record(synthesis, protocol, board=board, skin=skin, seed=seed)
     header = write_capture(folder / capture.name, *to_files(capture, synthesis))
     return f"{capture.name} on {board}, {header.protocol}; {header.note}"
-
-
-if __name__ == "__main__":
-    run(simulate)

@@ -1,19 +1,20 @@
-"""Stage universal: experts that come with the project, on each held-out board, with no, a few and more of its labels.
-
-A map, and a network with it; with recorded boards of the rig, and with none. Refuses to know how experts are taught
-(`trials.experts`).
-"""
+"""Stages that score methods on a held-out board with no, a few and more of its labels: few_labels, universal."""
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
+import numpy as np
 from pydantic import Field
 
+from pipeline.executors import make_executor
 from pipeline.experiments.answer import read_folder
 from pipeline.experiments.compare.run import Compare, see, setup_of, skins_of, turns_of
-from pipeline.stage import run, say
-from pipeline.training.trainings import read_data
+from pipeline.settings import Settings
+from pipeline.stage import say
+from pipeline.training import few_labels as few
+from pipeline.training.few_labels import FewLabels
+from pipeline.training.trainings import SceneData, collapse_record, measured, read_data, score_test, train_all
 from pipeline.training.universal import (
     QUESTION,
     Bench,
@@ -26,29 +27,66 @@ from pipeline.training.universal import (
     write_networks,
 )
 from reskin import io
-from reskin.config import Files, Settings, parse, read_settings
 from reskin.errors import ParamsError
+from reskin.models.classical import run_tasks
 from reskin.physics.skin import SkinDesign
 from reskin.universal.training import Lessons
 
 
-class Universal(Lessons):
-    """Section universal: networks' lessons; with so many labelled pokes of the held-out board."""
+def read_few_labels(settings: Settings) -> FewLabels:
+    """Parse section few_labels."""
+    return few.read_few_labels(settings)
+
+
+def few_labels(settings: Settings, indentations: Path, folds: Path, scores: Path) -> None:
+    """Score networks, adapted networks and classical methods with every number of labels on the same rows."""
+    data = read_data(settings, indentations, folds)
+    study = few.Study(data.rows, data.folds_of(few.QUESTION), settings.seed, read_few_labels(settings))
+    done: list[few.Done] = []
+    for step in (few.networks, few.adapted, few.labelled):  # each goes on from what the last ones trained
+        pairs = step(study, done)
+        trained = train_all(data, [trial for _, trial in pairs], "few_labels")
+        done = [*done, *((tried, trial, result) for (tried, trial), result in zip(pairs, trained, strict=True))]
+    tasks = few.classical(study)
+    with make_executor(imports="reskin.models.classical") as executor:
+        fitted = run_tasks(
+            [task for _, task in tasks], measured(data), executor, lambda line: say(f"{data.scene} few_labels: {line}")
+        )
+    points = [_point(data, tried, trained.predicted) | collapse_record(trained) for tried, _, trained in done]
+    points += [_point(data, tried, answer.predicted) for (tried, _), answer in zip(tasks, fitted, strict=True)]
+    io.write_json(scores, points)
+
+
+def _point(data: SceneData, tried: few.Tried, predicted: np.ndarray) -> dict[str, Any]:
+    board, draw = tried.fold.name.rsplit("-draw", 1)
+    point = {"method": tried.method, "inputs": tried.inputs, "labels_n": tried.labels_n, "fold": board}
+    return point | {"seed_i": int(draw), "scores": score_test(data, tried.fold.test, predicted)}
+
+
+class UniversalSection(Lessons):
+    """Section universal: settings of its training; numbers of labelled pokes of the held-out board."""
 
     labels_n: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
 
 
-def universal(scene: str, files: Files, indentations: Path, folds: Path, models: Path, scores: Path) -> None:
-    """Score the experts on every held-out board, with every number of its labels, on the rows others are tested on."""
-    settings = read_settings("universal", scene, files)
+def read_universal(settings: Settings) -> UniversalSection:
+    """Parse section universal."""
+    return settings.section(UniversalSection, "universal")
+
+
+def universal(settings: Settings, indentations: Path, folds: Path, models: Path, scores: Path) -> None:
+    """Score the universal model on every held-out board, with every number of its labels, on the rows of few_labels.
+
+    A map, and a network with it; calibrated with recorded boards of the rig, and with simulated skins alone.
+    """
     data, section = read_data(settings, indentations, folds), settings.section(Compare, "compare")
     skins = skins_of(read_folder(indentations, tuple(settings.captures_in(indentations))))
     if len(skins) < 2:
-        raise ParamsError(f"scene {scene}", "boards with known forces", "two or more", len(skins), "Add one.")
-    setup = setup_of(section, parse(SkinDesign, settings.shared["skin"], "params.yaml: skin"))
+        raise ParamsError(f"scene {data.scene}", "boards with known forces", "two or more", len(skins), "Add one.")
+    setup = setup_of(section, settings.shared_section(SkinDesign, "skin"))
     frame = Frame(turns_of(section), section.labels_middle_mm, section.labels_mirrored)
     seen = {board: see(pokes, section) for board, pokes in skins.items()}
-    lessons = read(settings)
+    lessons = read_universal(settings)
     nominal, rig = make_experts(Known(data, frame, setup, seen), lessons)
     write_networks(models, [nominal, *rig.values()], lessons, settings.seed)
     sureness = tell_sureness(nominal, lessons.labels_n, settings.seed)
@@ -56,14 +94,5 @@ def universal(scene: str, files: Files, indentations: Path, folds: Path, models:
     bench = replace(bench, tempers=tell_tempers(bench, lessons.labels_n))
     for fold in data.folds_of(QUESTION):
         points += score_fold(bench, fold, rig, lessons.labels_n)
-        say(f"{scene} universal: {fold.name} done")
+        say(f"{data.scene} universal: {fold.name} done")
     io.write_json(scores, points)
-
-
-def read(settings: Settings) -> Universal:
-    """Read section universal."""
-    return settings.section(Universal, "universal")
-
-
-if __name__ == "__main__":
-    run(universal)

@@ -12,14 +12,15 @@ import numpy as np
 from jaxtyping import Int64
 from pydantic import Field, model_validator
 
-from reskin.config import Settings, Strict, parse
+from pipeline.settings import Settings, take
+from reskin.config import Strict, parse
 from reskin.data.lines import grid_lines
 from reskin.data.rows import Rows
 from reskin.data.splits import Fold
 from reskin.errors import ParamsError
 from reskin.models import trial as trials
 from reskin.models.classical import Classical, Task
-from reskin.models.recipe import AugmentedRecipe, FineTuning, Labelling, Name, Recipe, Steps, Variants
+from reskin.models.recipe import AugmentedRecipe, FineTuning, Labelling, Name, Recipe
 from reskin.models.trial import Adapting, Start, Trained, Trial
 from reskin.seeds import rng_for
 
@@ -48,34 +49,6 @@ class FewLabels(Strict):
         return self
 
 
-class AdaptingRow(Strict):
-    """A shared adaptation, so many steps of it."""
-
-    adaptation: Name
-    steps_n: Steps
-
-
-class LabellingRow(Strict):
-    """A shared labelling, so many steps of it."""
-
-    labelling: Name
-    steps_n: Steps
-
-
-class FewLabelsRow(Strict):
-    """Section few_labels as a scene writes it: `recipes` say what each does differently from the shared `recipe`."""
-
-    labels_n: Labels
-    recipe: Name
-    steps_n: Steps
-    recipes: Variants
-    adapted: tuple[Name, ...]
-    adapting: AdaptingRow
-    labelling: LabellingRow
-    rows_max_n: Steps
-    methods: Name
-
-
 @dataclass(frozen=True)
 class Study:
     """Rows, the folds of the question, the scene's seed, and the settings."""
@@ -99,16 +72,18 @@ class Tried:
 Done = tuple[Tried, Trial, Trained]
 
 
-def few_labels(settings: Settings) -> FewLabels:
-    """Read section few_labels, with the rows that it names."""
-    section, where = settings.words("few_labels"), f"{settings.where}: few_labels"
-    row = parse(FewLabelsRow, section, where)
-    base = settings.row("recipes", row.recipe) | {"steps_n": row.steps_n}
-    full = {name: section[name] for name in ("labels_n", "adapted", "rows_max_n")}
-    full["recipes"] = {name: base | changes for name, changes in row.recipes.items()}
-    full["adapting"] = settings.row("adaptations", row.adapting.adaptation) | {"steps_n": row.adapting.steps_n}
-    full["labelling"] = settings.row("labellings", row.labelling.labelling) | {"steps_n": row.labelling.steps_n}
-    return parse(FewLabels, full | {"methods": settings.row("methods", row.methods)}, where)
+def read_few_labels(settings: Settings) -> FewLabels:
+    """Parse section few_labels, with the shared rows that it names."""
+    section, where = dict(settings["few_labels"]), f"{settings.where}: few_labels"
+    base = settings.row("recipes", take(section, "recipe", where)) | {"steps_n": take(section, "steps_n", where)}
+    adapting, labelling = dict(take(section, "adapting", where)), dict(take(section, "labelling", where))
+    resolved = {
+        "recipes": {name: base | changes for name, changes in take(section, "recipes", where).items()},
+        "adapting": settings.row("adaptations", take(adapting, "adaptation", where)) | adapting,
+        "labelling": settings.row("labellings", take(labelling, "labelling", where)) | labelling,
+        "methods": settings.row("methods", take(section, "methods", where)),
+    }
+    return parse(FewLabels, section | resolved, where)
 
 
 def networks(study: Study, done: Sequence[Done]) -> list[tuple[Tried, Trial]]:

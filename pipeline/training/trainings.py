@@ -12,10 +12,11 @@ from jaxtyping import Float32, Int64
 
 from pipeline.executors import make_executor, prepare_workers
 from pipeline.provenance import COSTS, SECONDS, home, note_trainings, version_of
+from pipeline.settings import Settings, Training
 from pipeline.stage import say
+from pipeline.stages import module_name
 from reskin import io
 from reskin.code import imported
-from reskin.config import Settings
 from reskin.data.folds import load_rows, parse_folds
 from reskin.data.lines import Lines, grid_lines, take_pokes
 from reskin.data.rows import TARGETS, Rows, Selection
@@ -24,7 +25,7 @@ from reskin.errors import SchemaError
 from reskin.metrics import score_groups
 from reskin.models.grid import run_trials
 from reskin.models.inputs import Scaler
-from reskin.models.recipe import Adaptation, Training, training
+from reskin.models.recipe import Adaptation
 from reskin.models.trained import FORMAT
 from reskin.models.trial import Adapting, FewLabels, Measured, Start, Trained, Trial
 from reskin.seeds import rng_for
@@ -100,7 +101,7 @@ def write_models(
     models: Path, data: SceneData, trials: Sequence[Trial], trained: Sequence[Trained], stage: str
 ) -> None:
     """Write models, their cards and predictions; what they took here stands beside, as it is no result."""
-    code = version_of(imported(f"pipeline.stages.{stage}"))
+    code = version_of(imported(module_name(stage)))
     cards = [card_of(data, trial, result) | {"git": code} for trial, result in zip(trials, trained, strict=True)]
     with io.replacing(models) as folder:
         folder.mkdir()
@@ -246,7 +247,7 @@ def adaptation(data: SceneData, fold: Fold, named: tuple[str, Adaptation], start
     name, settings = named
     test = fold.test[data.rows.skin[fold.test] == pokes.skin]
     start = own_starts(starts, settings.base, fold)[pokes.seed_i]
-    recipe = training(data.settings, "train_triplet").recipes[settings.base]
+    recipe = data.settings.training("train_triplet").recipes[settings.base]
     return Trial(
         pokes.question, name, recipe, fold.name, data.settings.seed, pokes.seed_i, fold.train, test,
         Adapting(start, settings, pokes.lines), pokes.skin, pokes.what,

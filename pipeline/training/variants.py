@@ -17,7 +17,7 @@ from pipeline.training.trainings import SceneData, Starts, collapse_record, note
 from reskin.data.splits import Fold
 from reskin.metrics import METRICS, score
 from reskin.models.inputs import VIEW
-from reskin.models.recipe import Adaptation, training
+from reskin.models.recipe import Adaptation
 from reskin.models.trial import Trial
 from reskin.numerics import device
 
@@ -42,7 +42,7 @@ def answers_before(data: SceneData, fold: Fold, settings: Adaptation, starts: St
     """Answer on a skin's tested rows as the networks do before they are adapted."""
     from reskin.models.network import Predictor  # torch, late: only a stage that answers pays for it
 
-    recipe = training(data.settings, "train_triplet").recipes[settings.base]
+    recipe = data.settings.training("train_triplet").recipes[settings.base]
     test = fold.test[data.rows.skin[fold.test] == skin]
     view = VIEW[recipe.inputs](data.rows.db_uT[test])
     for seed_i, start in own_starts(starts, settings.base, fold).items():

@@ -17,15 +17,15 @@ app = typer.Typer()
 Wire = Literal["binary", "binary-clock", "text-xyzt", "text-txyz"]
 Speed = Annotated[float, Option(help="Times its own rate; inf: as fast as it is taken.", min=0.01)]
 Baud = Annotated[int, Option(help="Baud rate; USB ports ignore it.", min=1)]
-SOURCE = "A capture's folder, or the name of a simulated scene."
+SOURCE = "A capture's folder, nominal (a simulated skin), or the YAML file of a simulated scene."
 ON_FAULT = "NAME=drop|flag|refuse: are readings that a fault has hit shown? May be repeated, such as stuck=flag."
 LABELS = "grid:NXxNY:STEP_MM or line:N:STEP_MM asks you to press places (Enter); or a CSV that a robot appends to."
 GAUGE = "Port of a force gauge that sends lines of Fz, or Fx Fy Fz, in N; @BAUD behind it, if not 9600."
 FAULT = "NAME[@START_S[+SECONDS]], such as stuck@3+1; may be repeated. A wrong name lists them all."
 
 
-@app.command()
-def find(
+@app.command("ports")
+def find_ports(
     names: Annotated[list[str] | None, Argument(help="Ports to listen to; without any, all of this machine.")] = None,
     hunt: Annotated[bool, Option("--hunt", help="Find the board by unplugging it and plugging it in again.")] = False,
 ) -> None:
@@ -91,11 +91,10 @@ def emulate(
     loop: Annotated[bool, Option("--loop", help="Begin again when it has ended.")] = False,
 ) -> None:
     """Be a board: send a capture or a simulated scene, with faults if asked, to whoever reads the port."""
-    from reskin.config import root_of_scenes
     from reskin.live.emulator import inject, open_far_end, parse_fault, play, read_script
 
     faults = [parse_fault(text) for text in fault or ()]
-    script = read_script(source, root_of_scenes())
+    script = read_script(source)
     for one in faults:
         script = inject(script, one)
     end, stop = open_far_end(port), threading.Event()
@@ -117,7 +116,7 @@ def live(
         list[Path] | None, Option(help="Trained models, or one skin that was saved; else the map of simulated skins.")
     ] = None,
     replay: Annotated[str | None, Option(help="In place of a board: the folder of a capture.")] = None,
-    emulate: Annotated[str | None, Option(help="In place of a board: the name of a simulated scene.")] = None,
+    emulate: Annotated[str | None, Option(help="In place of a board: nominal, or a simulated scene's YAML.")] = None,
     host: Annotated[str, Option(help="Where the page listens; elsewhere than here, behind a token.")] = "127.0.0.1",
     http_port: Annotated[int, Option(help="The page's port.", min=1, max=65535)] = 8765,
     on_fault: Annotated[list[str] | None, Option(help=ON_FAULT)] = None,
@@ -126,7 +125,6 @@ def live(
     from contextlib import ExitStack
 
     from reskin.board.find import the_boards
-    from reskin.config import root_of_scenes
     from reskin.errors import ParamsError
     from reskin.live.emulator import playing, read_script
     from reskin.live.health import LIVE
@@ -143,7 +141,7 @@ def live(
     with ExitStack() as stack:
         what = "a board"
         if source := replay or emulate:
-            script = read_script(source, root_of_scenes())
+            script = read_script(source)
             port, what = [stack.enter_context(playing(script))], f"{script.source}: {source}, played"
         boards = several(port or [found.port for found in the_boards()], models, what, decisions)
         serve(boards, host=host, http_port=http_port, say=typer.echo)

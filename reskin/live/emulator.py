@@ -12,24 +12,24 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
-from pipeline.scenes import Scene
 from reskin import io
 from reskin.board.faults import FAILED_B_uT, FAILED_TEMPERATURE_degC, RESET_LSB_XY_uT, RESET_LSB_Z_uT
 from reskin.board.stream import decode_all
 from reskin.board.wire import TEXT_WIRES, Frames, encode, record_type
-from reskin.config import SCENES, Settings, params_of, parse, read_yaml
+from reskin.config import read_yaml
 from reskin.errors import CaptureError, ParamsError
 from reskin.recordings.header import HEADER_FILE, LOG_FILE, STREAM_FILE, Wire
 from reskin.recordings.ingest import read_header, timer
 from reskin.recordings.readers import sd_card
 from reskin.seeds import rng_for
 from reskin.simulation.capture import record, roster
-from reskin.simulation.settings import MAIN, check_synthesis
+from reskin.simulation.defaults import NOMINAL, SHARED, nominal
+from reskin.simulation.settings import MAIN, parse_synthesis
 
 WALK = "log"  # the protocol that is most like a hand: touches, and pauses between them
 Source = Literal["simulated", "recorded"]
@@ -55,16 +55,25 @@ class Script:
         return float(self.t_s[-1] * len(self) / max(len(self) - 1, 1)) if len(self) else 0.0
 
 
-def read_script(source: str, root: Path) -> Script:
-    """Read a capture's folder, or simulate the scene of this name: its walk if it has one, else its grid."""
-    folder, scene = Path(source), root / SCENES / f"{source}.yaml"
+NOMINAL_SOURCE = "nominal"
+SEED = 2021  # of a simulation that names none
+
+
+def read_script(source: str) -> Script:
+    """Read the folder of a capture, or simulate: `nominal`, or a YAML file with a section `simulate` (a scene)."""
+    folder = Path(source)
     if (folder / HEADER_FILE).is_file():
         return read_capture(folder)
-    if folder.name == source and scene.is_file():
-        return simulate(source, root)
-    scenes = ", ".join(sorted(file.stem for file in (root / SCENES).glob("*.yaml")))
-    remedy = f"Scenes: {scenes or 'none here'}; the folder of a capture holds {HEADER_FILE}."
-    raise ParamsError(source, "the source", "a capture's folder or the name of a scene", "neither", remedy)
+    if source == NOMINAL_SOURCE:
+        settings = read_yaml(NOMINAL)
+        return simulate({name: settings[name] for name in ("boards", "protocols")}, SEED, source)
+    if folder.suffix == ".yaml" and folder.is_file():
+        scene = read_yaml(folder)
+        if not isinstance(scene, dict) or "simulate" not in scene:
+            raise ParamsError(source, "the scene", "simulated", "recorded", "Give the folder of one of its captures.")
+        return simulate(scene["simulate"], scene.get("seed", SEED), source)
+    rule = f"the folder of a capture (with {HEADER_FILE}), {NOMINAL_SOURCE}, or the YAML file of a simulated scene"
+    raise ParamsError(source, "the source", rule, "none of them", f"Try: {NOMINAL_SOURCE}")
 
 
 def read_capture(folder: Path) -> Script:
@@ -86,16 +95,12 @@ def read_capture(folder: Path) -> Script:
     return Script(header.source, header.wire, frames, pieces, t_s - t_s[0])
 
 
-def simulate(name: str, root: Path) -> Script:
-    """Take the first skin of a simulated scene through its walk or its grid."""
-    file = root / SCENES / f"{name}.yaml"
-    words = read_yaml(file)
-    if parse(Scene, words, str(file)).simulate is None:
-        raise ParamsError(file, "the scene", "simulated", "recorded", "Give the folder of one of its captures.")
-    synthesis = check_synthesis(Settings(name, str(file), words, read_yaml(params_of(root)), {}))
+def simulate(section: Mapping[str, Any], seed: int, where: str) -> Script:
+    """Simulate the first skin of a section `simulate`: its walk if it has one, else its grid."""
+    synthesis = parse_synthesis(section, {name: nominal(name) for name in SHARED}, f"{where}: simulate")
     protocol = WALK if WALK in synthesis.protocols else MAIN
     board, skin = roster(synthesis, protocol)[0]
-    capture = record(synthesis, protocol, board=board, skin=skin, seed=words["seed"])
+    capture = record(synthesis, protocol, board=board, skin=skin, seed=seed)
     chunk_i = np.searchsorted(capture.arrived_frames_n, 1 + np.arange(len(capture.b_uT)))
     return _script("simulated", capture.b_uT, capture.temperature_degC, capture.arrived_s[chunk_i])
 

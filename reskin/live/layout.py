@@ -1,6 +1,6 @@
-"""Where the chips of a board lie and how each is turned, as far as that is known. In: their number. Out: a layout.
+"""Positions and orientations of a board's chips, as far as they are known.
 
-No byte says it: five chips are taken for the board of scene quick, forty for its sleeve. Refuses to guess at others.
+No byte says it: five chips are taken for the paper's board, forty for its sleeve.
 """
 
 from dataclasses import dataclass
@@ -9,12 +9,12 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from reskin.config import ROOT, SCENES, parse, read_yaml
+from reskin.config import parse
 from reskin.data.grid import CENTRE_MM
+from reskin.simulation.defaults import nominal
 from reskin.simulation.protocols import SKIN_MM
 from reskin.simulation.settings import BoardKind
 
-SCENE = ROOT / SCENES / "quick.yaml"
 ASIDE_MM = 5.0  # between chips whose places nobody knows, so that they can be drawn
 
 
@@ -30,9 +30,9 @@ class Layout:
 
 
 def layout_of(chips_n: int) -> Layout:
-    """Find the board of so many chips among those of scene quick; others are drawn in a row."""
-    for name, words in read_yaml(SCENE)["simulate"]["boards"].items():
-        kind = parse(BoardKind, words, f"{SCENE}: simulate.boards.{name}")
+    """Find the nominal board with this number of chips; others are drawn in a row."""
+    for name, words in nominal("boards").items():
+        kind = parse(BoardKind, words, f"nominal board {name}")
         if len(kind.design.places_mm) == chips_n:
             half_mm = np.array(kind.skin_mm) / 2
             centre_mm = np.full(2, CENTRE_MM) if kind.skin_mm == SKIN_MM else half_mm

@@ -18,10 +18,9 @@ from sklearn.neighbors import KNeighborsRegressor
 from sklearn.preprocessing import PolynomialFeatures
 from threadpoolctl import ThreadpoolController  # type: ignore[import-untyped]
 
-from reskin.config import Settings, Strict, parse
+from reskin.config import Strict
 from reskin.errors import TrainingError
 from reskin.models.inputs import SCALE_FLOOR, VIEW, Scaler, fit_standard
-from reskin.models.recipe import Name, Steps
 from reskin.models.trial import Measured, median_s
 from reskin.seeds import rng_for
 
@@ -266,20 +265,6 @@ def blocks(rows_n: int) -> list[slice]:
     return [slice(i, i + BLOCK_ROWS_N) for i in range(0, rows_n, BLOCK_ROWS_N)]
 
 
-class Baselines(Strict):
-    """Section train_classical: methods on the folds of question lobo, each on at most so many training rows."""
-
-    rows_max_n: Annotated[int, Field(ge=1)]
-    methods: dict[Name, Classical]
-
-
-class BaselinesRow(Strict):
-    """Section train_classical as a scene writes it: `methods` names a set of params.yaml."""
-
-    rows_max_n: Steps
-    methods: Name
-
-
 @dataclass(frozen=True)
 class Task:
     """A method on one fold; `few_labels` are labelled rows of a new skin, which together weigh as much as all others.
@@ -314,13 +299,6 @@ class _Inputs:
     target: Float32[np.ndarray, "a 3"]
     weight: Float32[np.ndarray, " a"] | None
     test: Float32[np.ndarray, "b c"]
-
-
-def baselines(settings: Settings) -> Baselines:
-    """Read section train_classical, with the set of methods that it names."""
-    section, where = settings.words("train_classical"), f"{settings.where}: train_classical"
-    row = parse(BaselinesRow, section, where)
-    return parse(Baselines, dict(section) | {"methods": settings.row("methods", row.methods)}, where)
 
 
 def run_tasks(tasks: Sequence[Task], rows: Measured, executor: Executor, tell: Callable[[str], None]) -> list[Fit]:

@@ -1,14 +1,10 @@
-"""A recipe: a row of settings for the training loop. In: a section of a scene. Out: whole recipes by name.
+"""Recipes: the settings of one training, fine-tuning or labelling."""
 
-A section names a shared row, its number of steps, and the differences of its variants. Knows no data and no network.
-"""
+from typing import Annotated, Literal
 
-from typing import Annotated, Any, Literal, TypeVar
+from pydantic import Field
 
-from pydantic import Field, model_validator
-
-from reskin.config import Settings, Strict, Words, parse, parse_parts
-from reskin.errors import ParamsError
+from reskin.config import Strict
 
 HEADLINE = "paper"  # the recipe whose numbers stand beside the paper's; others are variants
 
@@ -78,111 +74,3 @@ class Adaptation(FineTuning):
     """Fine-tuning from one recipe of train_triplet; with an `unlabelled_weight` of 0 it is the control."""
 
     base: Name
-
-
-class _Recipes(Strict):
-    @model_validator(mode="after")
-    def _has_a_headline(self) -> "_Recipes":
-        if HEADLINE not in self.recipes:  # type: ignore[attr-defined]
-            raise ValueError(f"recipes hold a recipe named {HEADLINE}, which stands beside the paper's numbers")
-        return self
-
-
-class Adaptations(_Recipes):
-    """What stage adapt runs on every held-out skin: adaptations by `pokes_n` of its indentations, unlabelled."""
-
-    pokes_n: Annotated[int, Field(ge=1)]
-    recipes: dict[Name, Adaptation]
-
-
-class PokesSweep(Strict):
-    """Numbers of unlabelled indentations to adapt with, on the last `boards_n` boards held out; 0 is no adaptation."""
-
-    pokes_n: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
-    boards_n: Annotated[int, Field(ge=1)]
-
-
-class Training(_Recipes):
-    """What a training stage runs: every recipe on every fold with every seed."""
-
-    recipes: dict[Name, Recipe | AugmentedRecipe]
-    seeds_n: Annotated[int, Field(ge=1)]
-
-
-class AuditSettings(Strict):
-    """Whether the scene's settings were chosen, so that a study must vouch for them, or are for speed alone."""
-
-    settings: Literal["chosen", "for speed"]
-
-
-Steps = Annotated[int, Field(ge=1)]
-Variants = dict[Name, dict[str, Any]]  # what each does differently from the row that its section names
-
-
-class TrainingRow(Strict):
-    """Training as a scene writes it: the shared recipe that is the headline, and what variants do differently."""
-
-    recipe: Name
-    steps_n: Steps
-    seeds_n: Annotated[int, Field(ge=1)]
-    variants: Variants
-
-
-class AdaptationsRow(Strict):
-    """Section adapt as a scene writes it: the shared adaptation that is the headline, its base, its variants."""
-
-    adaptation: Name
-    base: Name
-    steps_n: Steps
-    pokes_n: Annotated[int, Field(ge=1)]
-    variants: Variants
-
-
-Model = TypeVar("Model", bound=Strict)
-
-
-def training(settings: Settings, section: str) -> Training:
-    """Read a section that trains, every recipe in full; of what the stage does not declare, nothing is there."""
-    row, where = settings.words(section), f"{settings.where}: {section}"
-    parse_parts(TrainingRow, row, where)
-    return parse_parts(Training, _recipes(settings, row, where), where)
-
-
-def with_training(settings: Settings, model: type[Model], section: str) -> Model:
-    """Read a section that holds a `training`, every recipe in full."""
-    whole, where = dict(settings.words(section)), f"{settings.where}: {section}"
-    row = whole.get("training", {})
-    parse(TrainingRow, row, f"{where}.training")
-    return parse(model, whole | {"training": _recipes(settings, row, f"{where}.training")}, where)
-
-
-def adaptations(settings: Settings) -> Adaptations:
-    """Read section adapt, every adaptation in full: the control follows what it controls.
-
-    Every base is a recipe of train_triplet.
-    """
-    row, where = settings.words("adapt"), f"{settings.where}: adapt"
-    parse_parts(AdaptationsRow, row, where)
-    shared = {**settings.row("adaptations", row["adaptation"]), "base": row["base"]}
-    full = {"recipes": _in_full(row, shared, where)} | {name: row[name] for name in ("pokes_n",) if name in row}
-    section = parse_parts(Adaptations, full, where)
-    known = sorted(training(settings, "train_triplet").recipes)
-    for name, recipe in section.recipes.items():
-        if recipe.base not in known:
-            raise ParamsError(where, f"base of {name}", f"one of {known}", repr(recipe.base), "Mend it there.")
-    return section
-
-
-def _recipes(settings: Settings, row: Words, where: str) -> dict[str, Any]:
-    recipes = _in_full(row, settings.row("recipes", row["recipe"]), where)
-    return {"recipes": recipes} | {name: row[name] for name in ("seeds_n",) if name in row}
-
-
-def _in_full(row: Words, shared: Words, where: str) -> dict[str, dict[str, Any]]:
-    """Write every recipe of a section in full: the headline as it is shared, variants with their differences."""
-    headline = dict(shared) | {"steps_n": row["steps_n"]}
-    variants = row.get("variants", {})
-    if HEADLINE in variants:
-        rule = f"other than {HEADLINE}, by which tables call the section's own recipe"
-        raise ParamsError(f"{where}.variants", "a variant's name", rule, HEADLINE, "Choose another name.")
-    return {HEADLINE: headline} | {name: headline | changes for name, changes in variants.items()}

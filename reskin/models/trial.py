@@ -22,13 +22,10 @@ from reskin.numerics import device, signature
 
 COLLAPSED = 0.05  # of a target's variance over a network's own training rows; sound ones explain more than 0.9
 # The modules whose code decides what a training results in (tests/learning/test_trial.py compares with imports).
-DECIDING = tuple(
-    f"pipeline.{name}"
-    for name in (
-        "core.reproducible", "core.seeds", "learning.inputs", "learning.job", "learning.model", "learning.train",
-        "learning.trial", "learning.triplets",
-    )
-)  # fmt: skip
+DECIDING = (
+    "reskin.seeds",
+    *(f"reskin.models.{name}" for name in ("inputs", "losses", "network", "reproducible", "train", "trial")),
+)
 LIBRARIES = ("torch", "numpy", "scipy")
 
 Weights = Mapping[str, np.ndarray]

@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 from scipy.constants import micro, milli
 
-from reskin.config import Settings, parse
+from reskin.config import parse
 from reskin.physics.board import BoardDesign, Spreads, draw_board
 from reskin.physics.magnet import Quadrature
 from reskin.physics.skin import SkinDesign, changes_of_field, draw_skin, forces
 
-SECTIONS = ("skin", "rig", "chip", "spreads")  # of params.yaml
 RULE = Quadrature(cell_m=0.8e-3, layers_n=5)  # as scene quick
 BOARD = BoardDesign(
     chips_xy_mm=((0.0, 0.0), (-7.0, 0.0), (0.0, -7.0), (7.0, 0.0), (0.0, 7.0)),
@@ -25,18 +24,13 @@ DEPTHS_MM = (0.2, 0.6, 1.2)
 DIGITS = 4  # significant ones: rounding differs less, another law more
 
 
-def fingerprint(settings: Settings) -> str:
-    """Give the fingerprint of the skin, rig and chips of params.yaml."""
-    return of_sections({name: settings.shared[name] for name in SECTIONS})
-
-
-def of_sections(sections: Mapping[str, Any]) -> str:
+def fingerprint(sections: Mapping[str, Any]) -> str:
     """Press two drawn skins at some places and depths: a digest of fields in uT, forces in N, and rig and chips.
 
     Code that computes the same in another way has the same fingerprint; another law or another setting has not.
     """
-    design = parse(SkinDesign, sections["skin"], "params.yaml: skin")
-    spreads = parse(Spreads, sections["spreads"], "params.yaml: spreads")
+    design = parse(SkinDesign, sections["skin"], "skin")
+    spreads = parse(Spreads, sections["spreads"], "spreads")
     pokes_m = milli * np.array([(*place, depth) for place in PLACES_MM for depth in DEPTHS_MM])
     felt = []
     for name in ("b0", "b1"):

@@ -1,7 +1,4 @@
-"""Section `simulate` of a scene: which skins there are, what they are like and how they are recorded. Knows no stage.
-
-In: settings that a stage declares. Out: a checked `Synthesis`.
-"""
+"""Settings of a simulation: which skins there are, what they are like and how they are recorded."""
 
 from collections.abc import Mapping
 from typing import Annotated, Any
@@ -9,7 +6,7 @@ from typing import Annotated, Any
 from pydantic import Field, model_validator
 from scipy.constants import milli
 
-from reskin.config import Settings, Strict, parse, parse_parts
+from reskin.config import Strict, parse
 from reskin.physics.board import BoardDesign, Spreads
 from reskin.physics.chip import ChipDesign
 from reskin.physics.magnet import Rule
@@ -115,33 +112,16 @@ class Synthesis(Strict):
         return self.boards[self.main.boards]
 
 
-def synthesis_of(settings: Settings) -> Synthesis:
-    """Put together what the stage declares of section `simulate` and of what scenes share; the rest is not there."""
-    section, where = settings.words("simulate"), f"{settings.where}: simulate"
-    shared = {name: model for name, model in SHARED.items() if name in settings.shared}
-    parts: dict[str, Any] = {
-        name: parse_parts(model, settings.shared[name], f"params.yaml: {name}") for name, model in shared.items()
+def parse_synthesis(section: Mapping[str, Any], shared: Mapping[str, Any], where: str) -> Synthesis:
+    """Parse section `simulate` of a scene, with the skin, rig, chip, spreads and terms that scenes share.
+
+    Of the terms, those are taken that a protocol names.
+    """
+    protocols = section.get("protocols")
+    named = {
+        term
+        for protocol in (protocols.values() if isinstance(protocols, Mapping) else ())
+        for term in (protocol.get("terms", ()) if isinstance(protocol, Mapping) else ())
     }
-    parts["boards"] = {
-        name: parse_parts(BoardKind, kind, f"{where}.boards.{name}") for name, kind in section.get("boards", {}).items()
-    }
-    protocols = section.get("protocols", {})
-    whole = {name: protocol for name, protocol in protocols.items() if "kind" in protocol}
-    parts["protocols"] = dict(parse_parts(Synthesis, {"protocols": whole}, where).protocols) if whole else {}
-    for name in protocols.keys() - whole.keys():  # a few numbers of the main protocol
-        parts["protocols"][name] = parse_parts(Grid, protocols[name], f"{where}.protocols.{name}")
-    if "rig" in settings.shared and whole:  # what is recorded, and not only looked at, has terms
-        parts |= parse_parts(Synthesis, {"terms": _terms(settings, whole)}, "params.yaml").__dict__
-    return Synthesis.model_construct(**parts)
-
-
-def check_synthesis(settings: Settings) -> Synthesis:
-    """Check section `simulate` of a whole scene with all that scenes share of it."""
-    section = settings.words("simulate")
-    shared = {name: settings.shared[name] for name in SHARED} | {"terms": _terms(settings, section["protocols"])}
-    return parse(Synthesis, section | shared, f"{settings.where}: simulate")
-
-
-def _terms(settings: Settings, protocols: Mapping[str, Any]) -> dict[str, Any]:
-    names = sorted({term for protocol in protocols.values() for term in protocol["terms"]})
-    return {name: settings.row("terms", name) for name in names}
+    terms = {name: values for name, values in shared["terms"].items() if name in named}
+    return parse(Synthesis, {**section, **{name: shared[name] for name in SHARED}, "terms": terms}, where)

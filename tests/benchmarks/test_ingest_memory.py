@@ -109,7 +109,7 @@ def test_a_million_indentations_are_read_in_bounded_memory(
 READ = """
 import resource, sys
 from pathlib import Path
-from pipeline.core import io
+from reskin import io
 from reskin.recordings.ingest import read_native
 from tests.benchmarks.test_ingest_memory import ALLOWED_MB, AS_USUAL, header, peak_mb
 resource.setrlimit(resource.RLIMIT_AS, (ALLOWED_MB * 10**6,) * 2)

@@ -7,15 +7,15 @@ labelled, 65 others are read. Nothing is asserted but that readings were answere
 """
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 
-from reskin.config import parse, read_yaml
+from reskin.config import parse
 from reskin.data.grid import CENTRE_MM
 from reskin.live.calibrating import SHOWN_MM
 from reskin.physics.skin import SkinDesign
 from reskin.seeds import rng_for
+from reskin.simulation.defaults import nominal
 from reskin.universal.axes import CHIPS_MM, to_board
 from reskin.universal.calibration import worth
 from reskin.universal.law import Setup
@@ -31,7 +31,7 @@ Choose = Callable[[Universal, list[int]], int]
 
 def test_errors_after_labels_at_fixed_random_and_chosen_places():
     rng, errors = rng_for(0, "next place"), {}
-    design = parse(SkinDesign, read_yaml(Path("params.yaml"))["skin"], "params.yaml: skin")
+    design = parse(SkinDesign, nominal("skin"), "params.yaml: skin")
     setup = Setup(design, np.array(CHIPS_MM), NOMINAL.gap_mm, SKIN_MM, design.flipped, design.tip_radius_mm)
     skins = draw_population(NOMINAL, OF_NOMINAL, setup, SKINS_N, rng)
     db_uT = add_error(skins.db_uT, skins.place_mm, np.log(skins.force_N), ERROR_OF_NOMINAL, rng)

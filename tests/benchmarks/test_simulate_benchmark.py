@@ -13,7 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from reskin.config import PARAMS, PLAN, SCENES, read_yaml
+from pipeline import PARAMS, PLAN, SCENES
+from reskin.config import read_yaml
 from tests.benchmarks import size
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -32,7 +33,7 @@ def test_the_papers_captures_are_timed_from_parameters_to_bytes(tmp_path: Path) 
         shutil.copy(ROOT / name, tmp_path / name)
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "RESKIN_EXECUTOR": size("processes:2", "here")}
     start_s = time.perf_counter()
-    command = [sys.executable, "-m", "pipeline.stages.simulate", "--scene", "quick", "--protocol", "grid"]
+    command = [sys.executable, "-m", "pipeline", "simulate", "--scene", "quick", "--protocol", "grid"]
     subprocess.run(
         [*command, "--raw", "data/raw/quick"], cwd=tmp_path, env=environment, capture_output=True, check=True
     )

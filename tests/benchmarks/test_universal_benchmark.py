@@ -14,8 +14,9 @@ import numpy as np
 
 from pipeline.training.shipping import UNKNOWN, shown
 from pipeline.training.universal import AS_TAUGHT, MISSES, Experts, pool_of_prior, skins_of_prior
-from reskin.config import parse, read_yaml
+from reskin.config import parse
 from reskin.physics.skin import SkinDesign
+from reskin.simulation.defaults import nominal
 from reskin.universal import map
 from reskin.universal.axes import CHIPS_MM
 from reskin.universal.law import Setup
@@ -51,7 +52,7 @@ class Row:
 
 
 def test_error_against_time_of_map_and_network(monkeypatch):
-    design = parse(SkinDesign, read_yaml(ROOT / "params.yaml")["skin"], "skin")
+    design = parse(SkinDesign, nominal("skin"), "skin")
     setup = Setup(design, np.array(CHIPS_MM), NOMINAL.gap_mm, SKIN_MM, design.flipped, design.tip_radius_mm)
     syllabus = Syllabus(NAMELESS, NOMINAL, OF_NOMINAL, setup)
     networks: dict[tuple[int, int], tuple[Sequence[Weights], float]] = {}

@@ -21,10 +21,10 @@ from typing import Any
 
 import numpy as np
 
-from pipeline import plan
+from pipeline import SCENES, plan
 from pipeline.manage.registry import Entry, Registry, write_registry
 from pipeline.provenance import code_version, device
-from reskin import config, io
+from reskin import io
 from reskin.config import read_yaml
 from reskin.recordings.header import HEADER_FILE, recorded, write_capture
 from tests.benchmarks.pages import MEASURED
@@ -53,7 +53,7 @@ def checkout(scene: Mapping[str, Any]) -> Iterator[Path]:
     """Give a copy of this checkout with one scene."""
     with tempfile.TemporaryDirectory() as temporary:
         root = copy_checkout(Path(temporary))
-        (root / config.SCENES / f"{SCENE}.yaml").write_text(json.dumps(scene))  # JSON is YAML
+        (root / SCENES / f"{SCENE}.yaml").write_text(json.dumps(scene))  # JSON is YAML
         yield root
 
 
@@ -114,7 +114,7 @@ def grow_skins(skins_n: int, bytes_of: Path) -> dict[str, Any]:
         stages["dvc, nothing to do"] = measured(root, "dvc", "repro", "--quiet", f"report@{SCENE}")
         stages["whole"] = whole
         folders = {name: sum(1 for _ in (root / name).rglob("*")) for name in ("data/raw", "data/indentations")}
-        rows_n = io.read_json(root / f"data/folds/{SCENE}.json")["rows_n"]
+        rows_n = io.read_json(root / f"data/models/{SCENE}/folds.json")["rows_n"]
         return {"skins_n": skins_n, "rows_n": rows_n, "files_n": folders, "stages": stages}
 
 

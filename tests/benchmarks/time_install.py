@@ -1,8 +1,9 @@
 """Time an installation as a newcomer with nothing but Python makes it: an empty environment, the wheel, a page.
 
 python3 tests/benchmarks/time_install.py [--python FILE] [--constraint FILE]. Builds the wheel, makes an empty
-environment, installs the wheel without extras, and runs `reskin live --emulate quick` in an empty folder until its page
-answers, twice: the first time, Numba compiles. Prints seconds and MB as JSON. Needs packages from pip's index or cache.
+environment, installs the wheel without extras, and runs `reskin live --emulate nominal` in an empty folder until its
+page answers, twice: the first time, Numba compiles. Prints seconds and MB as JSON. Needs packages from pip's index or
+cache.
 """
 
 import argparse
@@ -42,7 +43,7 @@ def seconds_to_page(reskin: Path, folder: Path) -> float:
     """Start `reskin live` on a simulated skin; give the time until its page is served, in seconds."""
     port, begun_s = free_port(), time.monotonic()
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    command = [str(reskin), "live", "--emulate", "quick", "--http-port", str(port)]
+    command = [str(reskin), "live", "--emulate", "nominal", "--http-port", str(port)]
     process = subprocess.Popen(command, cwd=folder, env=environment, stdout=subprocess.DEVNULL)
     try:
         while not answers(f"http://127.0.0.1:{port}/"):

@@ -212,7 +212,7 @@ def test_a_port_that_falls_silent_after_its_frames_keeps_them(board, clock, tmp_
 LISTEN = """
 import sys, threading
 from pathlib import Path
-from reskin.recordings import port
+from reskin.board import port
 settings = port.PortSettings(115200, "binary", 5, float("inf"), None, 120.0, 120.0)
 print(port.record(sys.argv[1], Path(sys.argv[2]), settings=settings, stop=threading.Event()).ended)
 """

@@ -135,14 +135,17 @@ def imported_from(file: Path) -> ModuleType:
     return module
 
 
-def test_a_worker_that_was_started_before_an_edit_of_any_module_is_refused_and_a_new_one_passes(tmp_path):
-    package = tmp_path / "pipeline"
-    shutil.copytree(ROOT / "pipeline/core", package / "core", ignore=shutil.ignore_patterns("__pycache__"))
-    before = imported_from(package / "core/cluster.py")
-    with (package / "core/seeds.py").open("a") as module:
+def test_a_worker_that_was_started_before_an_edit_of_any_module_is_refused_and_a_new_one_passes(tmp_path, monkeypatch):
+    for package in ("pipeline", "reskin"):
+        (tmp_path / package).mkdir()
+        shutil.copy(ROOT / package / "__init__.py", tmp_path / package)
+        monkeypatch.setattr(sys.modules[package], "__file__", str(tmp_path / package / "__init__.py"))
+    source = ROOT / "pipeline/cluster.py"
+    before = imported_from(source)
+    with (tmp_path / "reskin/seeds.py").open("w") as module:
         module.write("# edited\n")
-    now = imported_from(package / "core/cluster.py")
-    cluster._compare(now.describe_process(), imported_from(package / "core/cluster.py").describe_process(), "w")
+    now = imported_from(source)
+    cluster._compare(now.describe_process(), imported_from(source).describe_process(), "w")
     with pytest.raises(ParamsError, match="sources as imported of worker w must be .* Start it anew"):
         cluster._compare(now.describe_process(), before.describe_process(), "w")
     with pytest.raises(ParamsError, match="sources as imported of worker process"):

@@ -56,8 +56,12 @@ def test_a_data_file_of_the_same_name_belongs_to_the_module(monkeypatch, tmp_pat
 def test_imports_are_followed_within_the_package():
     names = code.imported("reskin.models.train")
     assert {"reskin.models.train", "reskin.seeds"} <= set(names)
-    assert {"pipeline", "reskin.models"} <= set(names)  # whose __init__ runs before
-    assert all(name.split(".")[0] == "pipeline" for name in names)
+    assert {"reskin", "reskin.models"} <= set(names)  # whose __init__ runs before
+    assert all(name.split(".")[0] in code.PACKAGES for name in names)
+
+
+def test_an_edit_of_the_library_runs_the_stages_again_that_use_it():
+    assert {"reskin.models.train", "pipeline.stages.train"} <= set(code.imported("pipeline.stages.train"))
 
 
 def test_an_editors_backup_beside_a_module_changes_nothing(monkeypatch, tmp_path):

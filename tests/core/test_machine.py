@@ -64,11 +64,10 @@ def test_a_table_that_was_cut_or_changed_is_one_sentence(tmp_path):
 
 
 def test_a_stage_that_the_machine_stops_ends_with_a_sentence_and_a_status(tmp_path, monkeypatch, capsys):
-    def split(scene: str) -> None:
-        raise OSError(errno.EROFS, "Read-only file system", f"reports/{scene}")
+    def split(folds: str) -> None:
+        raise OSError(errno.EROFS, "Read-only file system", folds)
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("sys.argv", ["split", "--scene", "lab"])
     with pytest.raises(SystemExit, match="2"):
-        stage.run(split)
+        stage.run(split, ["--scene", "lab", "--folds", "reports/lab"])
     assert capsys.readouterr().err.startswith("error: split: reports/lab must be readable and writable; got Read-only")

@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline import progress
+from pipeline import PLAN, progress
 from pipeline.progress import settings_of
 from pipeline.provenance import COSTS
 from pipeline.stage import run as run_stage
 from reskin import io
-from reskin.config import PLAN, read_yaml
+from reskin.config import read_yaml
 from tests.stages.checkout import copy_checkout, run
 
 ORDER = ["code", "simulate@tiny", "simulate@tiny-wear", "report@tiny"]
@@ -23,7 +23,7 @@ def checkout(tmp_path, monkeypatch) -> Path:
     """A checkout of one scene, in which no stage ran; it is the working directory."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "pipeline/scenes").mkdir(parents=True)
-    (tmp_path / PLAN).write_text("scenes: {tiny: [lobo]}\nstages: {split: {tiny: {scene: tiny, captures: [a]}}}\n")
+    (tmp_path / PLAN).write_text("scenes: {tiny: [lobo]}\ncaptures: {tiny: [a]}\nstages: {split: [tiny]}\n")
     (tmp_path / "pipeline/scenes/tiny.yaml").write_text("steps_n: 100 # a hundred\n")
     (tmp_path / "params.yaml").write_text("rate: 1e-3\n")
     (tmp_path / "dvc.yaml").write_text("")
@@ -41,7 +41,7 @@ class Clock:
     def run(self, monkeypatch, stage: str, seconds: float) -> str:
         """Run a stage as DVC does; give what it says at its start."""
 
-        def work(scene: str, indentations: Path) -> None:
+        def work(indentations: Path) -> None:
             self.now_s += seconds
 
         said = []
@@ -50,8 +50,7 @@ class Clock:
         monkeypatch.setattr(progress, "_ask_dvc", lambda: ["code", "split@tiny", "ingest@tiny-tiny_1", "report@tiny"])
         monkeypatch.setattr("pipeline.stage.time", self)
         monkeypatch.setattr("pipeline.stage.say", said.append)
-        monkeypatch.setattr("sys.argv", ["stage", "--scene", "tiny", "--indentations", "tiny_1.parquet"])
-        run_stage(work)
+        run_stage(work, ["--scene", "tiny", "--indentations", "tiny_1.parquet"])
         return said[0].partition(": ")[2]
 
 
@@ -79,7 +78,7 @@ def test_a_second_run_with_the_same_settings_says_what_the_first_took(checkout, 
     [
         ("pipeline/scenes/tiny.yaml", "steps_n: 9000\n"),
         ("params.yaml", "rate: 2e-3\n"),
-        (PLAN, "scenes: {tiny: [lobo]}\nstages: {split: {tiny: {scene: tiny, captures: [a, b]}}}\n"),
+        (PLAN, "scenes: {tiny: [lobo]}\ncaptures: {tiny: [a, b]}\nstages: {split: [tiny]}\n"),
     ],
 )
 def test_times_with_other_settings_or_captures_are_no_basis_for_an_estimate(checkout, monkeypatch, file, text):

@@ -21,10 +21,11 @@ from reskin.errors import CaptureError
 from reskin.physics import aging, chip, flow_map, force_sensor, layer, slide
 from reskin.physics import layer as slip
 from reskin.simulation import contact
+from reskin.simulation.defaults import nominal
 from reskin.simulation.settings import Synthesis
 
 ROOT = Path(__file__).resolve().parents[2]
-SHARED = {name: read_yaml(ROOT / "params.yaml")[name] for name in ("rig", "skin", "chip", "spreads", "terms")}
+SHARED = {name: nominal(name) for name in ("rig", "skin", "chip", "spreads", "terms")}
 DESIGN = parse(Synthesis, SHARED | read_yaml(ROOT / "pipeline" / "scenes" / "quick.yaml")["simulate"], "simulate")
 BOARD = DESIGN.boards["rigid"].design
 SEED = 2021
@@ -97,7 +98,7 @@ def test_deep_presses_by_a_table_that_ends_too_early_are_found_out(monkeypatch):
 
 def test_a_layer_of_another_compliance_is_found_out_by_every_tip(monkeypatch):
     compliance, kept = slip.compliance_on_slip, (layer.contact_of_depth, layer._force_curve)
-    monkeypatch.setattr(slip, "compliance", lambda kh: compliance(1.5 * kh))
+    monkeypatch.setattr(slip, "compliance_on_slip", lambda kh: compliance(1.5 * kh))
     for one in kept:
         one.cache_clear()
     assert broken(tips(DESIGN.skin.base)) == {f"a tip of {size} thicknesses" for size in ("0.1", "1", "10")}

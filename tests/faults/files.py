@@ -188,7 +188,7 @@ for what, where in CACHED.items():
     "and runs no stage; `reskin check-cache`, whose words are shown, then the next run",
 )
 def cached_folds(at: Checkout) -> Row:
-    file, content = _restored(at, f"data/folds/{SCENE}.json")
+    file, content = _restored(at, f"data/models/{SCENE}/folds.json")
     restored = at.run("dvc", "repro")
     row = judge(at, at.run(*CHECK), at.run("dvc", "repro"), may_run=[address("split")])
     row.faults += [] if (restored.status, restored.ran) == (0, []) else ["it was to be restored"]

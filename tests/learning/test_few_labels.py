@@ -9,13 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline.stages.train import ClassicalMethods
 from pipeline.training import few_labels as few
 from pipeline.training.few_labels import FewLabels as Settings
 from reskin.config import parse
 from reskin.data.rows import Rows
 from reskin.data.splits import Split, draw_folds
 from reskin.errors import ParamsError
-from reskin.models.classical import Baselines, Task
+from reskin.models.classical import Task
 from reskin.models.train import make_job
 from reskin.models.trial import Adapting, FewLabels, Keys, Measured, Trained, Trial
 from reskin.seeds import rng_for
@@ -259,4 +260,4 @@ def test_a_wrong_setting_of_few_labels_is_one_sentence(changes, sentence):
 )
 def test_a_wrong_setting_of_the_baselines_is_one_sentence(changes, sentence):
     with pytest.raises(ParamsError, match=sentence):
-        parse(Baselines, {"rows_max_n": 5, "methods": ASKED["methods"]} | changes, "train_classical")
+        parse(ClassicalMethods, {"rows_max_n": 5, "methods": ASKED["methods"]} | changes, "train_classical")

@@ -270,25 +270,23 @@ def test_a_network_begins_with_the_mean_of_the_targets_as_its_last_bias(scaling)
 
 
 NOT_DECIDING = {
-    "core.code": "tells code from code",
-    "core.config": "checks settings, whose values are part of the key",
-    "core.errors": "stops a training, and changes none",
-    "core.numerics": "its signature of the environment is part of the key",
-    "core.schema": "makes rows, whose values are part of the key",
-    "dataset.baseline": "makes rows, whose values are part of the key",
-    "dataset.lines": "makes lines, whose values are part of the key",
-    "dataset.rows": "makes rows, whose values are part of the key",
-    "core.cluster": "where it runs; its workers must have this process's code, device and variables",
-    "core.executors": "where it runs, and the clock; the device is part of the key",
-    "learning.recipe": "settings, whose values are part of the key",
+    "code": "tells code from code",
+    "config": "checks settings, whose values are part of the key",
+    "errors": "stops a training, and changes none",
+    "numerics": "its signature of the environment is part of the key, as is the device",
+    "schema": "makes rows, whose values are part of the key",
+    "data.baseline": "makes rows, whose values are part of the key",
+    "data.lines": "makes lines, whose values are part of the key",
+    "data.rows": "makes rows, whose values are part of the key",
+    "models.recipe": "settings, whose values are part of the key",
 }
 
 
 def test_all_code_that_a_training_runs_through_is_part_of_its_key():
-    graph = grimp.build_graph("pipeline", cache_dir=None)
+    graph = grimp.build_graph("reskin", cache_dir=None)
     modules = {"reskin.models.train", *graph.find_upstream_modules("reskin.models.train")}
     imported = {module for module in modules if not graph.find_children(module)}
-    others = {f"pipeline.{name}" for name in NOT_DECIDING}
+    others = {f"reskin.{name}" for name in NOT_DECIDING}
     assert imported - others == set(DECIDING)
     assert others <= imported
 

@@ -170,7 +170,7 @@ def test_without_a_board_the_words_are_one_sentence(shell):
     assert "must be from one of --port, --replay, --emulate" in complained
     assert "Traceback" not in complained
     for words, told in (
-        (["nothing"], "must be a capture's folder or the name of a scene"),
+        (["nothing"], "must be the folder of a capture .*, nominal, or the YAML file of a simulated scene"),
         (["nothing", "--fault", "melted"], r"must be NAME\[@START_S\[\+DURATION_S\]\] with one of failed-read"),
     ):
         with pytest.raises(ReskinError, match=told):

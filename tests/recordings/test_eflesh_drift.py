@@ -1,14 +1,13 @@
 """Drift on a real recording: which no-load reading is subtracted decides what a network knows of later passes."""
 
-import shutil
 from pathlib import Path
 
 import pytest
 from ruamel.yaml import YAML
 
 from pipeline.experiments.drift.run import drift
+from pipeline.settings import Settings, read_shared_files
 from reskin import io
-from reskin.config import Files
 from reskin.recordings.readers import eflesh
 from tests.recordings.test_recordings import SPATIAL, ingest
 
@@ -28,16 +27,8 @@ def test_fresh_no_load_readings_keep_eflesh_accurate_and_a_single_one_loses_it(s
     yaml = YAML(typ="safe")
     settings = yaml.load((ROOT / "pipeline/scenes/eflesh.yaml").read_text())
     settings["drift"]["training"]["steps_n"] = 300
-    params = yaml.load((ROOT / "params.yaml").read_text())
-    recipe = settings["drift"]["training"]["recipe"]
-    item = {"scene": "eflesh", "captures": [readings.capture], "drift": {"training": {"recipe": recipe}}}
-    plan = {"stages": {"drift": {"eflesh": item}}}
-    shutil.copy(ROOT / "dvc.yaml", tmp_path)
-    for name, words in {"eflesh.yaml": settings, "params.yaml": params, "plan.yaml": plan}.items():
-        with (tmp_path / name).open("w") as stream:
-            YAML().dump(words, stream)
     drift(
-        scene="eflesh", files=Files(tmp_path / "eflesh.yaml", tmp_path / "params.yaml", tmp_path / "plan.yaml"),
+        Settings("eflesh", "eflesh.yaml", settings, read_shared_files(ROOT), (readings.capture,)),
         indentations=tmp_path / "indentations", answer=tmp_path / "answer.json",
     )  # fmt: skip
     numbers = io.read_json(tmp_path / "answer.json")["numbers"]

@@ -12,7 +12,8 @@ from scipy.constants import micro, milli
 from scipy.linalg import orthogonal_procrustes
 from scipy.spatial.transform import Rotation
 
-from reskin.config import SCENES, parse
+from pipeline import SCENES
+from reskin.config import parse
 from reskin.physics.board import BoardDesign, Spreads, draw_board
 from reskin.physics.skin import SkinDesign, changes_of_field, draw_skin
 from reskin.recordings.readers import lab

@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
-from pipeline import plan
+from pipeline import SCENES, plan
 from pipeline.manage import add
-from reskin import config
 from reskin.recordings import preparing
 from reskin.recordings.preparing import Labels
 from tests.stages.checkout import copy_checkout, run
@@ -22,7 +21,7 @@ pytestmark = pytest.mark.timeout(1800)
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory, shared_data) -> Iterator[Path]:
     root = copy_checkout(tmp_path_factory.mktemp("lab"))
-    scene = root / config.SCENES / "lab.yaml"
+    scene = root / SCENES / "lab.yaml"
     settings = YAML(typ="safe").load(scene.read_text())
     settings["train_multi"]["seeds_n"] = 1
     settings["train_multi"] |= {"steps_n": 100, "variants": {}}
@@ -67,5 +66,5 @@ def test_a_third_board_is_one_command_and_no_line_of_code(lab, shared_data):
     assert "Stage 'ingest@lab-board1_skin1_board1_depth2' didn't change, skipping" in said
     run(lab, "reskin", "remove", "lab", "board3_skin3_board1_depth1")
     run(lab, "dvc", "repro", "split@lab")  # the first stage that boards meet in
-    folds = json.loads((lab / "data/folds/lab.json").read_text())["folds"]
+    folds = json.loads((lab / "data/models/lab/folds.json").read_text())["folds"]
     assert {board for fold in folds for board in fold["test_boards"]} == {"board1", "board2"}

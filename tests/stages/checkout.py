@@ -27,7 +27,8 @@ DONE, FAILED = "these stages ended", "these stages did not end"  # warm.py says
 @cache
 def compile_modules() -> None:
     """Compile the project for the programs of all copies; what pytest compiles, only pytest reads."""
-    compileall.compile_dir(ROOT / "pipeline", quiet=1)
+    for package in ("pipeline", "reskin"):
+        compileall.compile_dir(ROOT / package, quiet=1)
 
 
 def copy_checkout(folder: Path) -> Path:
@@ -55,7 +56,8 @@ def copy_checkout(folder: Path) -> Path:
 def variables(folder: Path, **environment: str) -> dict[str, str]:
     """Give the environment of programs that run in the copy: its own code is the copy's, and its diary its own."""
     taken = {name: value for name, value in os.environ.items() if name != "MLFLOW_TRACKING_URI"}
-    return {**taken, **ENVIRONMENT, "PYTHONPATH": str(folder), **environment}
+    path = f"{folder / '.venv/bin'}{os.pathsep}{taken['PATH']}"  # stages run `python`
+    return {**taken, **ENVIRONMENT, "PYTHONPATH": str(folder), "PATH": path, **environment}
 
 
 @contextmanager

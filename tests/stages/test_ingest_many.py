@@ -1,12 +1,10 @@
 """A scene of many recorded captures is read in one stage, each capture once."""
 
-from types import SimpleNamespace
-
 import pytest
 
-from pipeline.stages import ingest_many as stage
+from pipeline.settings import Settings
+from pipeline.stages import ingest as stage
 from reskin import io
-from reskin.config import Files
 from reskin.errors import CaptureError
 
 
@@ -14,13 +12,10 @@ from reskin.errors import CaptureError
 def run(tmp_path, monkeypatch):
     """Run the stage on three captures; it gives the names of those that were read anew."""
     monkeypatch.chdir(tmp_path)
-    read, shared = [], {"faults": {"stuck": "drop"}}
+    read, shared = [], {"faults": {"stuck": "drop"}, "lost_fraction_max": 0.05}
     names = ["c0", "c1", "c2"]
-    monkeypatch.setattr(
-        stage, "read_settings", lambda *_: SimpleNamespace(shared=shared, plan=lambda _: names)
-    )  # fmt: skip
 
-    def ingest(scene, files, raw, lost_fraction_max, indentations):
+    def ingest(settings, raw, indentations):
         if io.read_bytes(raw / "stream.bin") == b"broken":
             raise CaptureError("stream.bin")
         read.append(raw.name)
@@ -34,7 +29,8 @@ def run(tmp_path, monkeypatch):
     def run(**changed):
         read.clear()
         shared.update(changed)
-        stage.ingest_many("lab", Files.of("lab"), tmp_path / "raw", tmp_path / "code", 0.05, tmp_path / "out")
+        settings = Settings("lab", "lab.yaml", {}, dict(shared), tuple(names))
+        stage.ingest_many(settings, tmp_path / "raw", tmp_path / "code", tmp_path / "out")
         assert {file.stem: file.read_text() for file in (tmp_path / "out").iterdir()} == {name: name for name in names}
         return read
 
@@ -47,7 +43,7 @@ def test_a_capture_more_is_read_alone_and_one_that_is_gone_leaves_nothing(run):
     assert run() == []
     run.names.remove("c1")
     assert run() == []
-    assert len(list((run.folder / stage.KEPT / "lab").iterdir())) == 2
+    assert len(list((run.folder / stage.CACHE / "lab").iterdir())) == 2
     run.names.append("c1")
     assert run() == ["c1"]
 
@@ -71,7 +67,7 @@ def test_what_was_read_before_a_broken_capture_is_not_lost(run):
 
 def test_a_damaged_kept_copy_is_said_and_read_again(run, capsys):
     run()
-    (kept,) = [file for file in (run.folder / stage.KEPT / "lab").iterdir() if file.read_text() == "c1"]
+    (kept,) = [file for file in (run.folder / stage.CACHE / "lab").iterdir() if file.read_text() == "c1"]
     kept.write_text("c9")
     assert run() == ["c1"]
     assert f"{kept.name}: other content than was written" in capsys.readouterr().err
@@ -80,7 +76,7 @@ def test_a_damaged_kept_copy_is_said_and_read_again(run, capsys):
 
 def test_what_was_read_when_the_stage_was_killed_before_it_had_its_name_is_read_again(run):
     run()
-    kept = run.folder / stage.KEPT / "lab"
+    kept = run.folder / stage.CACHE / "lab"
     (file,) = [file for file in kept.iterdir() if file.read_text() == "c2"]
     file.rename(kept / f"{file.stem.partition('-')[0]}.parquet").write_text("half")
     assert run() == ["c2"]

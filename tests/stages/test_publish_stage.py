@@ -1,7 +1,7 @@
 """What of an experiment reaches the diary: its numbers, over contacts where they go over contacts."""
 
 from pipeline.scenes import parse_scene
-from pipeline.stages.publish import read_curves
+from pipeline.stages.report import read_curves
 from reskin import io
 from tests.scenes import asking
 

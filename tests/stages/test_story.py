@@ -195,13 +195,13 @@ def test_another_commit_machine_and_time_change_only_provenance_and_run_times(st
         text = re.sub(r"(?<=: )\d+\.\d+(e-?\d+)?", lambda found: str(3 * float(found[0]) + 1), file.read_text())
         file.write_text(text)
     author = ("-c", "user.name=a", "-c", "user.email=a@b")
-    for words in (["init", "-q"], ["add", "pipeline"], [*author, "commit", "-qm", "x"]):
+    for words in (["init", "-q"], ["add", "pipeline", "reskin"], [*author, "commit", "-qm", "x"]):
         subprocess.run(["git", *words], cwd=again, check=True)
-    words = ["--scene", "ci", "--indentations", "data/indentations/ci", "--folds", "data/folds/ci.json", "--models",
-             "data/models/ci", "--answers", "data/answers/ci", "--reports", "reports/ci"]  # fmt: skip
+    words = ["--scene", "ci", "--indentations", "data/indentations/ci", "--folds", "data/models/ci/folds.json",
+             "--models", "data/models/ci", "--answers", "data/answers/ci", "--reports", "reports/ci"]  # fmt: skip
     on_one_core = "import os, runpy; os.sched_setaffinity(0, [min(os.sched_getaffinity(0))]); "
-    on_one_core += "runpy.run_module('pipeline.stages.report', run_name='__main__', alter_sys=True)"
-    run(again, "python", "-c", on_one_core, *words)
+    on_one_core += "runpy.run_module('pipeline', run_name='__main__', alter_sys=True)"
+    run(again, "python", "-c", on_one_core, "report", *words)
     before, after = (
         {str(file.relative_to(reports)): file.read_bytes() for file in reports.rglob("*") if file.is_file()}
         for reports in (story / "reports", again / "reports")
@@ -367,8 +367,8 @@ def test_an_edited_number_of_a_report_is_noticed(story):
 def test_a_stage_killed_in_the_middle_loses_no_finished_fold(story):
     models = story / "data/models/killed"
     words = ["--scene", "ci", "--indentations", "data/indentations/ci",
-             "--folds", "data/folds/ci.json", "--models", str(models)]  # fmt: skip
-    command = [str(story / ".venv/bin/python"), "-m", "pipeline.stages.train_triplet", *words]
+             "--folds", "data/models/ci/folds.json", "--models", str(models)]  # fmt: skip
+    command = [str(story / ".venv/bin/python"), "-m", "pipeline", "train_triplet", *words]
     environment = {**os.environ, **ENVIRONMENT, "PYTHONPATH": str(story), "RESKIN_EXECUTOR": "processes:1"}
     trials = story / ".reskin/cells"
     for file in trials.glob("*.safetensors"):
@@ -396,7 +396,7 @@ def test_a_dead_tracking_server_is_said_and_costs_no_result(story):
     start_s = time.monotonic()
     words = ["--scene", "ci", "--models", "data/models/ci",
              "--answers", "data/answers/ci", "--reports", "reports/ci"]  # fmt: skip
-    done = run(story, "python", "-m", "pipeline.stages.publish", *words, MLFLOW_TRACKING_URI="http://127.0.0.1:9")
+    done = run(story, "python", "-m", "pipeline", "publish", *words, MLFLOW_TRACKING_URI="http://127.0.0.1:9")
     assert "does not answer" in done.stderr
     assert time.monotonic() - start_s < 100  # not MLflow's own minutes; of a process that starts on a busy machine
 

@@ -27,19 +27,15 @@ DEEP_M = 1.3e-3  # past the deepest poke of scene ci
 
 
 def run_stage(name: str, command: str) -> int:
-    """Do what pipeline/run.sh does with a stage's words, in a fork; give its exit status."""
+    """Run `python -m pipeline STAGE ...` in a fork; give its exit status."""
     sys.stdout.flush()
     if child := os.fork():
         return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     status = 1
     try:
         os.environ["DVC_STAGE"] = name
-        stage, *words = shlex.split(command)[2:]
-        experiment = os.path.isdir(f"pipeline/experiments/{stage}")
-        module = f"pipeline.experiments.{stage}.run" if experiment else f"pipeline.stages.{stage}"
-        sys.argv = [module, *words]
-        sys.modules.pop(module, None)  # it runs as `__main__`
-        runpy.run_module(module, run_name="__main__", alter_sys=True)
+        sys.argv = shlex.split(command)[2:]
+        runpy.run_module("pipeline", run_name="__main__", alter_sys=True)
         status = 0
     except SystemExit as exit:
         status = exit.code if isinstance(exit.code, int) else 1
@@ -56,20 +52,19 @@ def begin(simulated: set[tuple[str, str]]) -> None:
     importlib.import_module("pipeline")  # first, as it tells NumPy which instructions to use
     import numpy as np
 
+    from pipeline.settings import read_settings
     from pipeline.stages.code import entries
-    from reskin.config import Files, Settings, read_yaml
+    from pipeline.synthesis import synthesis_of
     from reskin.physics.skin import draw_skin, moved_dipoles
-    from reskin.simulation.settings import check_synthesis
 
     for name in (*LIBRARIES, *entries().values()):
         importlib.import_module(name)
     for scene, protocol in simulated:
-        files = Files.of(scene)
-        words, shared = (read_yaml(file) for file in (files.settings, files.params))
-        of = check_synthesis(Settings(scene, str(files.settings), words, shared, {}))
+        settings = read_settings(scene)
+        of = synthesis_of(settings)
         kind = of.boards[of.protocols[protocol].boards]
         rule, name = kind.quadrature.quadrature(), f"{kind.letter}0_s0"
-        skin = draw_skin(of.skin, of.spreads, seed=words["seed"], name=name, rule=rule, sides_m=kind.skin_m)
+        skin = draw_skin(of.skin, of.spreads, seed=settings.seed, name=name, rule=rule, sides_m=kind.skin_m)
         list(moved_dipoles(skin, np.array([[0.0, 0.0, DEEP_M]])))  # its tables are kept
     gc.freeze()  # else each stage would look through all this, and copy it, at each search for what nobody holds
 

@@ -7,16 +7,17 @@ import pytest
 
 from reskin.config import read_yaml
 from reskin.physics import slide
-from reskin.simulation.fingerprint import SECTIONS, of_sections
+from reskin.simulation.defaults import NOMINAL
+from reskin.simulation.fingerprint import fingerprint
 
 ROOT = Path(__file__).resolve().parents[2]
-PARAMS = read_yaml(ROOT / "params.yaml")
-TODAY = of_sections(PARAMS)
+PARAMS = read_yaml(NOMINAL)
+TODAY = fingerprint(PARAMS)
 
 
 def test_the_same_settings_in_another_order_have_the_same_fingerprint():
-    turned = {name: dict(reversed(PARAMS[name].items())) for name in reversed(SECTIONS)}
-    assert of_sections(turned) == TODAY
+    turned = {name: dict(reversed(PARAMS[name].items())) for name in reversed(("skin", "rig", "chip", "spreads"))}
+    assert fingerprint(turned) == TODAY
     assert len(TODAY) == 16
 
 
@@ -28,17 +29,17 @@ def test_the_same_settings_in_another_order_have_the_same_fingerprint():
     ],
 )  # fmt: skip
 def test_another_setting_has_another_fingerprint(section, name, value):
-    changed = deepcopy({name: dict(PARAMS[name]) for name in SECTIONS})
+    changed = deepcopy({name: dict(PARAMS[name]) for name in ("skin", "rig", "chip", "spreads")})
     changed[section][name] = value
-    assert of_sections(changed) != TODAY
+    assert fingerprint(changed) != TODAY
 
 
 def test_another_law_has_another_fingerprint_and_rounding_has_not(monkeypatch):
     rigid = slide.under_tip_m
     monkeypatch.setattr(slide, "under_tip_m", lambda *of, **how: rigid(*of, **how) * (1 + 1e-12))
-    assert of_sections(PARAMS) == TODAY
+    assert fingerprint(PARAMS) == TODAY
     monkeypatch.setattr(slide, "under_tip_m", lambda *of, **how: rigid(*of, **how) * 1.02)
-    assert of_sections(PARAMS) != TODAY
+    assert fingerprint(PARAMS) != TODAY
 
 
 def test_settings_were_chosen_on_the_skin_of_today():

@@ -15,9 +15,10 @@ from reskin.physics.magnet import Quadrature
 from reskin.physics.shear import Friction
 from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, forces
 from reskin.simulation.contact import Terms, push, respond
+from reskin.simulation.defaults import NOMINAL
 
 ROOT = Path(__file__).resolve().parents[2]
-PARAMS = read_yaml(ROOT / "params.yaml")
+PARAMS = read_yaml(NOMINAL)
 QUICK = read_yaml(ROOT / "pipeline/scenes/quick.yaml")
 DESIGN = parse(SkinDesign, PARAMS["skin"], "skin")
 SPREADS = parse(Spreads, PARAMS["spreads"], "spreads")

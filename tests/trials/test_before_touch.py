@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.settings import Settings
 from pipeline.training.before_contact import score_before_touch
 from pipeline.training.trainings import SceneData
 from reskin import io
-from reskin.config import Settings
 from reskin.data.rows import Selection, gather, gather_hover
 from reskin.data.splits import Split, draw_folds
 from reskin.seeds import rng_for
@@ -35,7 +35,7 @@ def scored(folder: Path, *, snake: bool, memory: float) -> dict[str, float]:
     rows = gather([one], Selection(force_min_N=0.0))
     folds = draw_folds(rows, ["single_temporal"], Split(temporal_test_fraction=0.25), 0)
     table = score_before_touch(
-        SceneData("test", Settings("test", "test.yaml", WORDS, {}, {}), rows, folds), folder, ["c0"], {}
+        SceneData("test", Settings("test", "test.yaml", WORDS, {}), rows, folds), folder, ["c0"], {}
     )
     return dict(zip(table["told_by"].to_pylist(), table["accuracy_pct"].to_pylist(), strict=True))
 
@@ -73,7 +73,7 @@ def hovering(folder: Path, *, magnetic: bool) -> dict[str, dict[str, float]]:
     io.write_readings(folder / "c0.parquet", [one], {})
     rows = gather([one], Selection(force_min_N=0.1))
     folds = draw_folds(rows, ["single_temporal"], Split(temporal_test_fraction=0.25), 0)
-    data = SceneData("test", Settings("test", "test.yaml", WORDS, {}, {}), rows, folds)
+    data = SceneData("test", Settings("test", "test.yaml", WORDS, {}), rows, folds)
     table = score_before_touch(data, folder, ["c0"], {"s0": [lambda db_uT: np.zeros((len(db_uT), 3), np.float32)]})
     return {row["told_by"]: row for row in table.to_pylist()}
 

@@ -7,8 +7,8 @@ from reskin import io
 from reskin.data.rows import Rows
 from reskin.seeds import rng_for
 from reskin.universal.map import NOMINAL, OF_NOMINAL
-from reskin.universal.network import draw_weights, predict
-from reskin.universal.training import Lessons, Syllabus
+from reskin.universal.network import predict
+from reskin.universal.training import Lessons, Syllabus, draw_weights
 from tests.twin.skins import SETUP, made_tables
 
 QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])

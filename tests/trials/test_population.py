@@ -8,7 +8,7 @@ from pipeline.training.population import WAYS, WEIGHT_N, WEIGHT_SD, Experts, cas
 from pipeline.training.universal import TEMPERS
 from reskin.seeds import rng_for
 from reskin.universal.map import Estimate, new_map
-from reskin.universal.network import draw_weights
+from reskin.universal.training import draw_weights
 from tests.twin.skins import made_population, made_tables
 
 

@@ -22,8 +22,7 @@ from pipeline.training.universal import (
 from reskin.seeds import rng_for
 from reskin.universal.calibration import ratio
 from reskin.universal.map import NOMINAL, OF_NOMINAL
-from reskin.universal.network import draw_weights
-from reskin.universal.training import Syllabus
+from reskin.universal.training import Syllabus, draw_weights
 from tests.twin.skins import SETUP, made_population, made_tables
 
 

@@ -4,15 +4,16 @@ from pathlib import Path
 
 import numpy as np
 
-from reskin.config import parse, read_yaml
+from reskin.config import parse
 from reskin.physics.skin import SkinDesign
+from reskin.simulation.defaults import nominal
 from reskin.universal.law import Setup
 from reskin.universal.map import Tables, lattice_mm
 from reskin.universal.population import POKES_N, Population, draw_places
 
 ROOT = Path(__file__).resolve().parents[2]
 CHIPS_MM = np.array([[0.0, 0.0], [-7.0, 0.0], [0.0, -7.0], [7.0, 0.0], [0.0, 7.0]])
-DESIGN = parse(SkinDesign, read_yaml(ROOT / "params.yaml")["skin"] | {"tip_radius_mm": 2.0}, "params.yaml: skin")
+DESIGN = parse(SkinDesign, nominal("skin") | {"tip_radius_mm": 2.0}, "params.yaml: skin")
 SETUP = Setup(DESIGN, CHIPS_MM, 1.1, (20.0, 20.0), True, 2.0)
 WIDE_MM = 5.0
 FORCES_N = np.geomspace(0.55, 9.5, 6)  # enough for a skin in closed form

@@ -16,13 +16,14 @@ from reskin.physics.chip import ChipDesign, read_field
 from reskin.physics.magnet import Quadrature
 from reskin.physics.skin import SkinDesign, changes_of_field, draw_skin
 from reskin.seeds import rng_for
+from reskin.simulation import defaults
 from reskin.universal.axes import to_chips
 from reskin.universal.calibration import CHANNELS_N
 from reskin.universal.map import NOMINAL
 from reskin.universal.model import FILE, Universal, load_universal
 
 ROOT = Path(__file__).resolve().parents[2]
-PARAMS = read_yaml(ROOT / "params.yaml")
+PARAMS = read_yaml(defaults.NOMINAL)
 PARAMS_SKIN, SPREADS = parse(SkinDesign, PARAMS["skin"], "skin"), parse(Spreads, PARAMS["spreads"], "spreads")
 CHIP = parse(ChipDesign, PARAMS["chip"], "chip")
 QUICK = read_yaml(ROOT / "pipeline/scenes/quick.yaml")["simulate"]

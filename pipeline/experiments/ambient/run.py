@@ -26,17 +26,18 @@ from pipeline.experiments.ambient.fields import (
 )
 from pipeline.experiments.answer import write_answer
 from pipeline.report.statistics import tally
-from pipeline.stage import run
+from pipeline.settings import Settings, Training
+from pipeline.synthesis import synthesis_of
 from pipeline.training.trainings import SceneData, collapse_record, read_data, train_all, trials_of
-from reskin.config import Files, Settings, Strict, read_settings
+from reskin.config import Strict
 from reskin.data.splits import Fold
 from reskin.metrics import score
-from reskin.models.recipe import HEADLINE, Training, training
+from reskin.models.recipe import HEADLINE
 from reskin.models.trained import Network, networks_without
 from reskin.physics.ambient import EARTH_DIP_DEG, EARTH_SIZE_T
 from reskin.physics.skin import draw_skin
 from reskin.seeds import rng_for
-from reskin.simulation.settings import Synthesis, synthesis_of
+from reskin.simulation.settings import Synthesis
 
 
 class Iron(Strict):
@@ -112,11 +113,11 @@ def read(settings: Settings) -> Ambient:
     return settings.section(Ambient, "ambient")
 
 
-def ambient(scene: str, files: Files, folds: Path, indentations: Path, models: Path, answer: Path) -> None:
+def ambient(settings: Settings, folds: Path, indentations: Path, models: Path, answer: Path) -> None:
     """Test every held-out board in fields that came up after its no-load readings; train one arm on the last board."""
-    data = read_data(read_settings("ambient", scene, files), indentations, folds)
+    data = read_data(settings, indentations, folds)
     of, seed = synthesis_of(data.settings), data.settings.seed
-    section, trained = read(data.settings), training(data.settings, "train_multi")
+    section, trained = read(data.settings), data.settings.training("train_multi")
     held_out = data.folds_of("lobo")
     boards = [fold.name for fold in held_out]
     points: list[dict[str, Any]] = []
@@ -148,7 +149,3 @@ def ambient(scene: str, files: Files, folds: Path, indentations: Path, models: P
         },
     }
     write_answer(answer, numbers, {}, trainings=trainings)
-
-
-if __name__ == "__main__":
-    run(ambient)

@@ -6,20 +6,21 @@ Refuses to mend what it finds: it fails the stage on a leak, and tells the rest.
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from pipeline.experiments.audit.sides import Check, Labels, Sides, audit_fold, holds, to_words
 from pipeline.report.choice import settings_of, trimmed
-from pipeline.stage import run, say
+from pipeline.settings import Settings
+from pipeline.stage import say
 from pipeline.training.trainings import SceneData, read_data
 from reskin import io
-from reskin.config import Files, Settings, Strict, parse, read_settings
+from reskin.config import Strict, parse
 from reskin.errors import LeakError, SchemaError
 from reskin.models.inputs import FIT, VIEW
-from reskin.models.recipe import HEADLINE, AuditSettings
+from reskin.models.recipe import HEADLINE
 from reskin.seeds import rng_for
 from reskin.simulation.fingerprint import fingerprint
 
@@ -166,7 +167,7 @@ def model_checks(data: SceneData, sides: dict[tuple[str, str], Sides], models: P
     views = {name: view(data.rows.db_uT) for name, view in VIEW.items()}
     fits: Fits = {}
     keys: dict[tuple[str, int], set[str]] = {}  # of the networks that may be adapted, by fold and seed
-    for arm in data.settings.plan("models"):
+    for arm in data.settings.models:
         cards = {file: io.read_json(file) for file in sorted((models / arm).glob("*.json"))}
         yield audit_collapse(arm, list(cards.values()))
         for file, card in cards.items():
@@ -198,13 +199,13 @@ def _fit_once(
 
 def settings_checks(data: SceneData, choice: Path, models: Path) -> list[Check]:
     """Compare the headline recipes that were trained with the record of what was chosen, and where."""
-    recipes = {arm: trimmed(_headline(models / arm)) for arm in data.settings.plan("models")}
+    recipes = {arm: trimmed(_headline(models / arm)) for arm in data.settings.models}
     held_out = np.unique(np.concatenate([fold.test for fold in data.folds]))
     return audit_choice(
-        io.read_json(choice), recipes, source=data.settings.words("source"), seed=data.settings.seed,
+        io.read_json(choice), recipes, source=data.settings["source"], seed=data.settings.seed,
         test_boards=np.unique(data.rows.board[held_out]).tolist(),
         test_skins=np.unique(data.rows.skin[held_out]).tolist(),
-        physics=fingerprint(data.settings),
+        physics=fingerprint(data.settings.shared),
     )  # fmt: skip
 
 
@@ -214,14 +215,20 @@ def _headline(models: Path) -> dict[str, Any]:
     return settings_of(next(card for card in cards if card["recipe_name"] == HEADLINE))
 
 
+class AuditSettings(Strict):
+    """Section audit: were the scene's settings chosen, so that a study must vouch for them, or are they for speed?"""
+
+    settings: Literal["chosen", "for speed"]
+
+
 def read(settings: Settings) -> AuditSettings:
     """Read section audit."""
     return settings.section(AuditSettings, "audit")
 
 
-def audit(scene: str, files: Files, indentations: Path, folds: Path, models: Path, choice: Path, answer: Path) -> None:
+def audit(settings: Settings, indentations: Path, folds: Path, models: Path, choice: Path, answer: Path) -> None:
     """Check every fold, the scaler of every network and the settings; a leak fails the stage and names itself."""
-    data = read_data(read_settings("audit", scene, files), indentations, folds)
+    data = read_data(settings, indentations, folds)
     labels = Labels(data.rows.board, data.rows.skin, data.rows.indentation, data.rows.capture)
     sides = [Sides(fold.question, fold.name, fold.train, fold.pool, fold.test) for fold in data.folds]
     checks = [
@@ -236,17 +243,13 @@ def audit(scene: str, files: Files, indentations: Path, folds: Path, models: Pat
     if not holds(checks):
         first = next(check for check in checks if not (check.holds or check.known))
         raise LeakError(
-            f"audit of {scene}, {first.where}", first.what, first.rule, first.found, "Look at who is held out."
+            f"audit of {settings.scene}, {first.where}", first.what, first.rule, first.found, "Look at who is held out."
         )
     io.write_json(answer, to_words(checks))
     unchosen_n = sum(check.found.startswith(NOT_CHOSEN) for check in checks)
     dead_n = sum(check.known and check.what == COLLAPSE for check in checks)
     papers_n = sum(check.known for check in checks) - dead_n
     say(
-        f"{scene}: {len(checks)} checks, no leak; {papers_n} known, the paper's own; "
+        f"{settings.scene}: {len(checks)} checks, no leak; {papers_n} known, the paper's own; "
         f"{dead_n} arms with collapsed networks; {unchosen_n} settings that the study did not choose"
     )
-
-
-if __name__ == "__main__":
-    run(audit)

@@ -18,9 +18,10 @@ from scipy.special import owens_t
 from pipeline.experiments.ambient.fields import seen_uT
 from pipeline.experiments.answer import write_answer
 from pipeline.report.statistics import over_folds, tidy
-from pipeline.stage import run, say
+from pipeline.settings import Settings
+from pipeline.stage import say
+from pipeline.synthesis import synthesis_of
 from reskin import io
-from reskin.config import Files, read_settings
 from reskin.data.grid import CENTRE_MM, points_mm
 from reskin.errors import ParamsError, SchemaError
 from reskin.metrics import ACCURACY_LIMIT_MM, METRICS
@@ -29,7 +30,7 @@ from reskin.physics.board import draw_board
 from reskin.physics.chip import ChipDesign, steps_uT
 from reskin.physics.skin import Skin, changes_of_field, draw_skin, forces
 from reskin.simulation.capture import roster
-from reskin.simulation.settings import MAIN, Synthesis, synthesis_of
+from reskin.simulation.settings import MAIN, Synthesis
 
 ROW_READINGS_N = 1  # of a row that a network sees (dataset.rows)
 STEP_MM = 0.01  # of the differences; 0.002 to 0.05 mm give the same bound within 2 %
@@ -153,14 +154,9 @@ def network_scores(models: Path, skin: str) -> dict[str, Any]:
     return {metric: scores[metric] for metric in METRICS if metric in scores}
 
 
-def bound(scene: str, files: Files, models: Path, answer: Path) -> None:
+def bound(settings: Settings, models: Path, answer: Path) -> None:
     """Bound what one row tells of a poke, and put the paper's network beside it."""
-    settings = read_settings("bound", scene, files)
     numbers = bound_of(synthesis_of(settings), seed=settings.seed)
     write_answer(answer, numbers | {"network": network_scores(models, numbers["skin"])}, {})
     least = numbers["all"]["with_label_errors"]
-    say(f"{scene}: noise and labels allow {least['accuracy_pct']:.4g} % and {least['mse_xy_mm2']:.3g} mm2")
-
-
-if __name__ == "__main__":
-    run(bound)
+    say(f"{settings.scene}: noise and labels allow {least['accuracy_pct']:.4g} % and {least['mse_xy_mm2']:.3g} mm2")

@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 from pipeline.experiments.answer import read_folder, write_answer
 from pipeline.experiments.compare import frames
 from pipeline.report.statistics import statistic
-from pipeline.stage import run
-from reskin.config import Files, Settings, Strict, parse, read_settings
+from pipeline.settings import Settings
+from reskin.config import Strict
 from reskin.errors import ParamsError
 from reskin.physics.board import BoardDesign
 from reskin.physics.skin import SkinDesign
@@ -221,13 +221,8 @@ def read(settings: Settings) -> Compare:
     return settings.section(Compare, "compare")
 
 
-def compare(scene: str, files: Files, indentations: Path, answer: Path) -> None:
+def compare(settings: Settings, indentations: Path, answer: Path) -> None:
     """Compare the recorded boards of a scene with simulated ones."""
-    settings = read_settings("compare", scene, files)
-    design = parse(SkinDesign, settings.shared["skin"], "params.yaml: skin")
+    design = settings.shared_section(SkinDesign, "skin")
     boards = skins_of(read_folder(indentations, tuple(settings.captures_in(indentations))))
     write_answer(answer, *compare_boards(boards, read(settings), design, settings.seed))
-
-
-if __name__ == "__main__":
-    run(compare)

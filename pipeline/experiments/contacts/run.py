@@ -26,14 +26,14 @@ from pipeline.experiments.contacts.pairs import (
     where_it_falls,
 )
 from pipeline.experiments.contacts.superposition import superposition
-from pipeline.stage import run
+from pipeline.settings import Settings
+from pipeline.synthesis import synthesis_of
 from pipeline.training.trainings import SceneData, read_data
-from reskin.config import Files, Settings, Strict, read_settings
+from reskin.config import Strict
 from reskin.data.splits import Fold
 from reskin.models.inputs import shape
 from reskin.models.trained import networks_without
 from reskin.seeds import rng_for
-from reskin.simulation.settings import synthesis_of
 
 Count = Annotated[int, Field(ge=1)]
 Fraction = Annotated[float, Field(gt=0, lt=1)]
@@ -122,9 +122,9 @@ def read(settings: Settings) -> Contacts:
     return settings.section(Contacts, "contacts")
 
 
-def contacts(scene: str, files: Files, folds: Path, indentations: Path, models: Path, answer: Path) -> None:
+def contacts(settings: Settings, folds: Path, indentations: Path, models: Path, answer: Path) -> None:
     """Add pokes of every held-out board in pairs, and ask the networks that never saw it."""
-    data = read_data(read_settings("contacts", scene, files), indentations, folds)
+    data = read_data(settings, indentations, folds)
     settings, held_out = data.settings, data.folds_of("lobo")
     section = read(settings)
     boards, drawn = zip(
@@ -154,7 +154,3 @@ def contacts(scene: str, files: Files, folds: Path, indentations: Path, models: 
 
 def _row(stats: dict[str, Any], separation_mm: float) -> dict[str, Any]:
     return {"separation_mm": separation_mm, **stats["falls"][separation_mm], **stats["by_separation"][separation_mm]}
-
-
-if __name__ == "__main__":
-    run(contacts)

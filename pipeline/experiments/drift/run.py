@@ -28,14 +28,14 @@ from pipeline.experiments.drift.windows import (
     pace,
 )  # fmt: skip
 from pipeline.report.statistics import tally
-from pipeline.stage import run
+from pipeline.settings import Settings, Training
 from pipeline.training.trainings import SceneData, collapse_record, prepare_training, train_all
-from reskin.config import Files, Settings, Strict, read_settings
+from reskin.config import Strict
 from reskin.data import baseline
 from reskin.data.rows import Selection
 from reskin.data.windows import TRAIN, Part, Policy, Windows, check_one_each, lay_parts, lay_windows, stack
 from reskin.errors import ParamsError
-from reskin.models.recipe import HEADLINE, Training, with_training
+from reskin.models.recipe import HEADLINE
 from reskin.models.trial import Trained, Trial
 from reskin.schema import Readings
 
@@ -127,13 +127,12 @@ def force_left_pct(parts: Sequence[Part], policy: str, window_i: int) -> float |
 
 def read(settings: Settings) -> Drift:
     """Read section drift."""
-    return with_training(settings, Drift, "drift")
+    return settings.with_training(Drift, "drift")
 
 
-def drift(scene: str, files: Files, indentations: Path, answer: Path) -> None:
+def drift(settings: Settings, indentations: Path, answer: Path) -> None:
     """Train and test under every no-load policy, on every capture of a folder."""
     prepare_training()
-    settings = read_settings("drift", scene, files)
     section, selection = read(settings), settings.section(Selection, "selection")
     captures = read_folder(indentations, tuple(settings.captures_in(indentations)))
     windows, parts = cut(captures, section, selection)
@@ -141,7 +140,7 @@ def drift(scene: str, files: Files, indentations: Path, answer: Path) -> None:
         rule = "none in a recorded scene: a walk would be added to what was recorded"
         raise ParamsError(settings.where, "drift.wander_uT", rule, list(section.wander_uT), "Take it out.")
     pairs = list(trials(parts, section, settings.seed))
-    data = SceneData(scene, settings, stack(parts), [])
+    data = SceneData(settings.scene, settings, stack(parts), [])
     answered: dict[str, list[Answers]] = {}
     trained = train_all(data, [trial for trial, _ in pairs], "drift")
     for (trial, tests), one in zip(pairs, trained, strict=True):
@@ -201,7 +200,3 @@ def _tell(
     found = findings(rows, networks, boards=boards, field=field, late=numbers.get("late"))
     last = {name: last_window(answered, name) for name in section.policies}
     return numbers | {"findings": found, "last_window": last}, drawn
-
-
-if __name__ == "__main__":
-    run(drift)

@@ -16,7 +16,8 @@ from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
 
 from pipeline.experiments.answer import only, read_folder, read_losses, write_answer
 from pipeline.report.statistics import paired, statistic, summarise
-from pipeline.stage import run, say
+from pipeline.settings import Settings
+from pipeline.stage import say
 from reskin.data.baseline import subtract
 from reskin.data.rows import TARGETS
 from reskin.metrics import score
@@ -136,15 +137,12 @@ def _scores(
     return {way: summarise(own) for way, own in scores.items()} | {"paired": {"mean5_minus_one": paired(*sides)}}
 
 
-def dynamics(scene: str, indentations: Path, models: Path, answer: Path) -> None:
+def dynamics(settings: Settings, indentations: Path, models: Path, answer: Path) -> None:
     """Ask the networks of train_multi that never saw the pressed skin's board."""
     one = only(read_folder(indentations), indentations)
     true = np.stack([getattr(one, name) for name in TARGETS], axis=1)
     presses = presses_of(subtract(one.b_uT, one.noload_uT), true, one.t_s, one.indentation)
     numbers = compare(presses, networks_without(models, one.board), board=one.board)
     write_answer(answer, numbers, {}, read_losses(indentations, {}))
-    say(f"{scene}: {numbers['readings_n']} readings of {numbers['presses_n']} presses at {numbers['rate_hz']:.0f} Hz")
-
-
-if __name__ == "__main__":
-    run(dynamics)
+    of_presses = f"{numbers['presses_n']} presses at {numbers['rate_hz']:.0f} Hz"
+    say(f"{settings.scene}: {numbers['readings_n']} readings of {of_presses}")

@@ -13,7 +13,8 @@ from jaxtyping import Float
 
 from pipeline.experiments.answer import read_folder, read_losses, write_answer
 from pipeline.report.statistics import statistic
-from pipeline.stage import run
+from pipeline.settings import Settings
+from pipeline.synthesis import synthesis_of
 from pipeline.training.trainings import SceneData, adaptations, prepare_training, read_data, read_starts
 from pipeline.training.variants import (  # fmt: skip
     AFTER,
@@ -27,11 +28,9 @@ from pipeline.training.variants import (  # fmt: skip
     compare_arms,
     summarise_arms,
 )
-from reskin.config import Files, parse_parts, read_settings
 from reskin.data.rows import Selection, gather, stack
 from reskin.data.splits import Split, hold_out_skins
 from reskin.models.recipe import HEADLINE
-from reskin.models.recipe import adaptations as adaptations_of
 from reskin.schema import Readings
 from reskin.seeds import rng_for
 
@@ -86,20 +85,16 @@ def _median_uT(captures: Sequence[ByDepth], depth_mm: float) -> float:
 SHAPE = "shape"  # the recipe on directions, if the scene has one: it ought to care less about the gap
 
 
-def flexible(
-    scene: str, files: Files, folds: Path, main: Path, indentations: Path, started: Path, answer: Path
-) -> None:
+def flexible(settings: Settings, folds: Path, main: Path, indentations: Path, started: Path, answer: Path) -> None:
     """Adapt the networks of the first fold of lobo to every flexible skin, and test on its later passes."""
     prepare_training()
-    data = read_data(read_settings("flexible", scene, files), main, folds)
+    data = read_data(settings, main, folds)
     starts, captures = read_starts(started), read_folder(indentations)
-    adapting, first, trained_n = adaptations_of(data.settings), data.folds_of("lobo")[0], len(data.rows)
+    adapting, first, trained_n = data.settings.adaptations(), data.folds_of("lobo")[0], len(data.rows)
     poked = gather(captures, data.settings.section(Selection, "selection"))
     data = replace(data, rows=stack(data.rows, poked))
     sides = (first.train, np.arange(trained_n, len(data.rows)))
-    fold = hold_out_skins(
-        data.rows, "flexible", first.name, sides, parse_parts(Split, data.settings.words("split"), "split")
-    )
+    fold = hold_out_skins(data.rows, "flexible", first.name, sides, data.settings.section(Split, "split"))
     arms = {
         name: arm for name, arm in ((HEADLINE, AFTER), (CONTROL, CONTROL), (SHAPE, SHAPE)) if name in adapting.recipes
     }
@@ -136,10 +131,6 @@ def _by_depth(captures: Sequence[Readings]) -> list[dict[float, np.ndarray]]:
 def _gaps(data: SceneData) -> dict[str, Any]:
     """Tell the gaps between skin and chips of both kinds of boards, and by how much one is less."""
     kinds = {"rigid": "grid", "flexible": "flexible"}
-    boards = {kind: data.settings.words(f"simulate.protocols.{of}.boards") for kind, of in kinds.items()}
-    gap_mm = {kind: float(data.settings.words(f"simulate.boards.{of}.design.gap_mm")) for kind, of in boards.items()}
+    of = synthesis_of(data.settings)
+    gap_mm = {kind: of.boards[of.protocols[name].boards].design.gap_mm for kind, name in kinds.items()}
     return {"gap_mm": gap_mm, "gap_less_pct": gap_less_pct(gap_mm)}
-
-
-if __name__ == "__main__":
-    run(flexible)

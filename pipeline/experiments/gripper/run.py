@@ -18,15 +18,17 @@ from pydantic import Field
 from pipeline.experiments.answer import read_folder, read_losses, write_answer
 from pipeline.experiments.sensitivity.run import levels_of
 from pipeline.report.statistics import summarise, with_seeds
-from pipeline.stage import run, say
-from reskin.config import Files, Settings, Strict, parse_parts, read_settings
+from pipeline.settings import Settings
+from pipeline.stage import say
+from pipeline.synthesis import loads_of
+from reskin.config import Strict
 from reskin.data.baseline import subtract
 from reskin.data.grid import CENTRE_MM
 from reskin.live.contacts import CONTACT_SDS
 from reskin.models.trained import networks_without
 from reskin.schema import Readings
 from reskin.seeds import rng_for
-from reskin.simulation.protocols import Load, weights_N
+from reskin.simulation.protocols import weights_N
 from reskin.universal.model import Universal, load_universal
 
 RATE_HZ, SECONDS, SETTLED_S = 50.0, 4.0, 1.0  # of the controller; from SETTLED_S on the force is judged
@@ -194,18 +196,16 @@ def read(settings: Settings) -> Gripper:
     return settings.section(Gripper, "gripper")
 
 
-def gripper(scene: str, files: Files, indentations: Path, models: Path, answer: Path) -> None:
+def gripper(settings: Settings, indentations: Path, models: Path, answer: Path) -> None:
     """Let a gripper hold objects by the force that is estimated of its finger's skin."""
-    settings = read_settings("gripper", scene, files)
-    load = parse_parts(Load, settings.words("simulate.protocols.grip"), "simulate.protocols.grip")
+    load = loads_of(settings, "grip")
     weight_N = weights_N(load.force_max_N, load.step_N)
     fingers = [finger_of(capture, weight_N) for capture in read_folder(indentations)]
     networks = {finger.board: networks_without(models, finger.board) for finger in fingers}
-    numbers, drawn = answer_of(fingers, networks, read(settings), seed=settings.words("seed"))
+    numbers, drawn = answer_of(fingers, networks, read(settings), seed=settings.seed)
     write_answer(answer, numbers, drawn, read_losses(indentations, {}))
     best = max(numbers["rows"], key=lambda row: row["held_pct"])
-    say(f"{scene}: {best['aim_N']} N held in {best['held_pct']:.0f} % of runs by {best['feedback']}, {best['press']}")
-
-
-if __name__ == "__main__":
-    run(gripper)
+    say(
+        f"{settings.scene}: {best['aim_N']} N held in {best['held_pct']:.0f} % of runs by {best['feedback']}, "
+        f"{best['press']}"
+    )

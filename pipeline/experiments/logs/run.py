@@ -16,8 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.experiments.ambient.fields import Instrument, guessed_uT, seen_uT, take_board
 from pipeline.experiments.answer import only, write_answer
-from pipeline.stage import run, say
-from reskin.config import Files, Settings, read_settings
+from pipeline.settings import Settings
+from pipeline.stage import say
+from pipeline.synthesis import synthesis_of
 from reskin.live.contacts import Answers, contacts_n, describe, estimate, estimate_after, score_contacts, thin, truth_at
 from reskin.models.trained import networks_without
 from reskin.physics.ambient import EARTH_SIZE_T, EARTH_T
@@ -26,7 +27,6 @@ from reskin.recordings.header import LOG_FILE, PROBE_FILE
 from reskin.recordings.ingest import read_header
 from reskin.recordings.readers import sd_card
 from reskin.seeds import rng_for
-from reskin.simulation.settings import synthesis_of
 
 PITCHES_DEG = (0.0, 10.0, 20.0, 45.0)  # assumed: how far a shoe leans to either side, once a step
 PERIOD_S = 1.0  # assumed, for a log with fewer than two contacts
@@ -99,9 +99,8 @@ def turned(log: Log, board: str, settings: Settings, networks: Sequence[Answers]
     }
 
 
-def logs(scene: str, files: Files, raw: Path, models: Path, answer: Path) -> None:
+def logs(settings: Settings, raw: Path, models: Path, answer: Path) -> None:
     """Read a folder's walk with networks that never saw its board; score it where its truth is kept, and turn it."""
-    settings = read_settings("logs", scene, files)
     folder = only(sorted(child for child in raw.iterdir() if child.is_dir()), raw)
     t_s, b_uT, _, account = sd_card.read_log(folder / LOG_FILE)
     board = read_header(folder).board
@@ -116,8 +115,4 @@ def logs(scene: str, files: Files, raw: Path, models: Path, answer: Path) -> Non
         numbers |= score_contacts(found, true) | turned(Log(t_s, b_uT, true, found.quiet_n), board, settings, networks)
     losses = {"accounts": [numbers["account"]], "left_out": {}}
     write_answer(answer, numbers, thin(found, true), losses)
-    say(f"{scene}: {numbers['contacts_n']} contacts in {numbers['duration_s']:.1f} s of log")
-
-
-if __name__ == "__main__":
-    run(logs)
+    say(f"{settings.scene}: {numbers['contacts_n']} contacts in {numbers['duration_s']:.1f} s of log")

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.experiments.answer import read_folder, read_losses, write_answer
-from pipeline.stage import run
+from pipeline.settings import Adaptations, Settings
 from pipeline.training.trainings import (
     Pokes,
     SceneData,
@@ -33,13 +33,11 @@ from pipeline.training.variants import (  # fmt: skip
     compare_arms,
     summarise_arms,
 )
-from reskin.config import Files, read_settings
 from reskin.data.lines import Lines, hand_rows, shifted
 from reskin.data.rows import stack
 from reskin.data.splits import Fold
 from reskin.errors import SchemaError
-from reskin.models.recipe import HEADLINE, Adaptations
-from reskin.models.recipe import adaptations as adaptations_of
+from reskin.models.recipe import HEADLINE
 from reskin.models.trial import Trial
 
 GRID = "grid"  # as many pokes, by the robot
@@ -63,12 +61,12 @@ def answer_manual(answers: Sequence[Answered], *, pokes_n: Sequence[int], lines_
     return counts | arms | {"paired": differences}
 
 
-def manual(scene: str, files: Files, folds: Path, main: Path, indentations: Path, started: Path, answer: Path) -> None:
+def manual(settings: Settings, folds: Path, main: Path, indentations: Path, started: Path, answer: Path) -> None:
     """Adapt to every skin that was poked by hand, and by as many pokes of the robot; test on the robot's grid."""
     prepare_training()
-    data = read_data(read_settings("manual", scene, files), main, folds)
+    data = read_data(settings, main, folds)
     starts = read_starts(started)
-    adapting = adaptations_of(data.settings)
+    adapting = data.settings.adaptations()
     poked, found = hand_rows(read_folder(indentations))
     lines = {skin: shifted(own, len(data.rows)) for skin, own in found.items()}
     data = replace(data, rows=stack(data.rows, poked))
@@ -108,7 +106,3 @@ def _fold_without(data: SceneData, board: str) -> Fold:
         remedy = "Poke skins by hand that the grid knows too."
         raise SchemaError("question manual", f"board {board}", f"one of {sorted(folds)}", "none", remedy)
     return folds[board]
-
-
-if __name__ == "__main__":
-    run(manual)

@@ -16,7 +16,9 @@ from scipy.spatial.transform import Rotation
 from pipeline.experiments.answer import read_folder, write_answer
 from pipeline.experiments.population.taught import Lesson, Taught, draw, lesson_of, network
 from pipeline.report.statistics import summarise
-from pipeline.stage import run, say
+from pipeline.settings import Settings
+from pipeline.stage import say
+from pipeline.synthesis import synthesis_of
 from pipeline.training.population import (
     WEIGHT_N,
     WEIGHT_SD,
@@ -32,13 +34,11 @@ from pipeline.training.population import (
 )
 from pipeline.training.trainings import SceneData, read_data
 from pipeline.training.universal import Frame, Pokes
-from reskin.config import Files, Settings, parse, read_settings
 from reskin.data.grid import CENTRE_MM
 from reskin.data.splits import Fold
 from reskin.errors import SchemaError
 from reskin.physics.skin import SkinDesign
 from reskin.seeds import rng_for
-from reskin.simulation.settings import synthesis_of
 from reskin.universal.map import new_map
 from reskin.universal.network import Weights
 
@@ -159,16 +159,15 @@ def read(settings: Settings) -> Asked:
     return settings.section(Asked, "population")
 
 
-def population(scene: str, files: Files, folds: Path, indentations: Path, answer: Path) -> None:
+def population(settings: Settings, folds: Path, indentations: Path, answer: Path) -> None:
     """Ask experts of simulated skins about every held-out skin of a simulated scene."""
-    settings = read_settings("population", scene, files)
     data, section, synthesis = read_data(settings, indentations, folds), read(settings), synthesis_of(settings)
-    kind, design = synthesis.main_boards, parse(SkinDesign, settings.shared["skin"], "params.yaml: skin")
+    kind, design = synthesis.main_boards, settings.shared_section(SkinDesign, "skin")
     lesson = lesson_of(design, kind, synthesis.main.depths_mm, settings.seed)
     turn = Rotation.from_euler("z", np.array(kind.design.turns_deg)[:, None], degrees=True).as_matrix()
     frame, rest_uT = Frame(turn, (CENTRE_MM, CENTRE_MM), mirrored=False), rest_by_skin(indentations)
     asked = [case for fold in data.folds_of(QUESTION) for case in cases(data, fold, frame, rest_uT)]
-    rows, sizes, words = score_all(lesson, section, asked, scene)
+    rows, sizes, words = score_all(lesson, section, asked, settings.scene)
     numbers = {
         "told": over_boards(rows, *BY),
         "scaling": over_boards(sizes, *BY, "skins_n"),
@@ -177,7 +176,3 @@ def population(scene: str, files: Files, folds: Path, indentations: Path, answer
         "weight_N": WEIGHT_N, "weight_sd": WEIGHT_SD, **words,
     }  # fmt: skip
     write_answer(answer, numbers, {})
-
-
-if __name__ == "__main__":
-    run(population)

@@ -28,9 +28,9 @@ from reskin.seeds import rng_for
 from reskin.simulation.settings import BoardKind
 from reskin.universal.law import Law, Setup
 from reskin.universal.map import OF_RIG, Tables, tabulate
-from reskin.universal.network import Weights, draw_weights
+from reskin.universal.network import Weights
 from reskin.universal.population import Forces, Population, draw_population
-from reskin.universal.training import Syllabus, train
+from reskin.universal.training import Syllabus, draw_weights, train
 
 PACKAGE = Path(reskin.universal.__file__).parent
 TRAINS = "reskin.universal.training"

@@ -20,11 +20,12 @@ from pipeline.experiments.rivals.alarm import alarm
 from pipeline.experiments.rivals.points import Point, pokes_of, summarise
 from pipeline.provenance import SECONDS
 from pipeline.report.statistics import tally
-from pipeline.stage import run, say
+from pipeline.settings import Settings
+from pipeline.stage import say
 from pipeline.training.trainings import SceneData, read_data
 from pipeline.training.universal import QUESTION, Bench, Frame, Known, read_experts
 from reskin import io
-from reskin.config import Files, Settings, Strict, parse, read_settings
+from reskin.config import Strict, parse
 from reskin.data.splits import Fold
 from reskin.errors import ParamsError
 from reskin.models.classical import Classical
@@ -57,20 +58,19 @@ class RivalsRow(Strict):
 def read(settings: Settings) -> Rivals:
     """Read section rivals, with the rows that it names."""
     where = f"{settings.where}: rivals"
-    row = parse(RivalsRow, settings.words("rivals"), where)
+    row = parse(RivalsRow, settings["rivals"], where)
     recipe = settings.row("recipes", row.recipe) | {"inputs": row.inputs, "steps_n": row.steps_n}
     full = row.model_dump(exclude={"inputs", "steps_n"})
     return parse(Rivals, full | {"recipe": recipe, "methods": settings.row("methods", row.methods)}, where)
 
 
-def rivals(scene: str, files: Files, indentations: Path, folds: Path, models: Path, answer: Path) -> None:
+def rivals(settings: Settings, indentations: Path, folds: Path, models: Path, answer: Path) -> None:
     """Score rivals on every held-out board, on the rows that question labels tests."""
-    settings = read_settings("rivals", scene, files)
     data, compare = read_data(settings, indentations, folds), settings.section(Compare, "compare")
     skins = skins_of(read_folder(indentations, tuple(settings.captures_in(indentations))))
     if len(skins) < 2:
-        raise ParamsError(f"scene {scene}", "boards with known forces", "two or more", len(skins), "Add one.")
-    setup = setup_of(compare, parse(SkinDesign, settings.shared["skin"], "params.yaml: skin"))
+        raise ParamsError(f"scene {settings.scene}", "boards with known forces", "two or more", len(skins), "Add one.")
+    setup = setup_of(compare, settings.shared_section(SkinDesign, "skin"))
     frame = Frame(turns_of(compare), compare.labels_middle_mm, compare.labels_mirrored)
     seen = {board: see(pokes, compare) for board, pokes in skins.items()}
     section, of_labels = read(settings), data.folds_of(QUESTION)
@@ -81,7 +81,7 @@ def rivals(scene: str, files: Files, indentations: Path, folds: Path, models: Pa
     for fold in of_labels:
         found, timed = told.score_told(bench, setup, of_labels, fold, rig)
         points, took = points + found, took + timed
-        say(f"{scene} rivals: {fold.name} told its own pokes, none and another skin's")
+        say(f"{settings.scene} rivals: {fold.name} told its own pokes, none and another skin's")
     alarms = alarm(data, frame, setup, seen, of_labels, section.false_alarm_fraction)
     numbers: dict[str, Any] = {
         "methods": summarise(points, aligned.controls(section.methods, section.labels_n) | told.controls()),
@@ -90,7 +90,7 @@ def rivals(scene: str, files: Files, indentations: Path, folds: Path, models: Pa
         "alarm": alarms,
     }
     write_answer(answer, numbers, {}, trainings=tally(trainings))
-    io.write_json(SECONDS / scene / "rivals.json", [asdict(one) for one in took])
+    io.write_json(SECONDS / settings.scene / "rivals.json", [asdict(one) for one in took])
 
 
 def baselines(data: SceneData, folds: Sequence[Fold], section: Rivals) -> tuple[list[Point], list[dict[str, Any]], int]:
@@ -107,7 +107,3 @@ def baselines(data: SceneData, folds: Sequence[Fold], section: Rivals) -> tuple[
         unpaired_n += int(np.isnan(pairs_uT).any(axis=1).sum())
         say(f"{data.scene} rivals: baselines of {fold.name} done")
     return points, trainings, unpaired_n
-
-
-if __name__ == "__main__":
-    run(rivals)

@@ -14,12 +14,14 @@ from pipeline.experiments.runtime.quadrature import Quadratures, study_quadratur
 from pipeline.experiments.runtime.rows import choose, race
 from pipeline.experiments.runtime.trials import Trial, draw_trial
 from pipeline.provenance import SECONDS
-from pipeline.stage import run, say
+from pipeline.settings import Settings
+from pipeline.stage import say
+from pipeline.synthesis import synthesis_of
 from reskin import io
-from reskin.config import Files, Settings, Strict, read_settings
+from reskin.config import Strict
 from reskin.physics.board import draw_board
 from reskin.simulation.capture import roster
-from reskin.simulation.settings import MAIN, Synthesis, synthesis_of
+from reskin.simulation.settings import MAIN, Synthesis
 
 
 class RunTime(Strict):
@@ -35,20 +37,22 @@ def read(settings: Settings) -> RunTime:
     return settings.section(RunTime, "runtime")
 
 
-def runtime(scene: str, files: Files, answer: Path) -> None:
+def runtime(settings: Settings, answer: Path) -> None:
     """Compare quadratures and integrators; seconds differ between identical runs, so they are no output."""
-    settings = read_settings("runtime", scene, files)
     of, tried = synthesis_of(settings), read(settings)
     rows, calls = study_quadratures(_trials(of, tried.quadratures, settings.seed), tried.quadratures.rules_of())
     more, more_calls = study_integrators(tried.integrators)
     choice = choose(rows, used=of.main_boards.quadrature.quadrature())
     seconds = race([*calls, *more_calls], tried.repeats_n)
-    io.write_json(SECONDS / scene / "runtime.json", [asdict(row) for row in seconds])
+    io.write_json(SECONDS / settings.scene / "runtime.json", [asdict(row) for row in seconds])
     words: dict[str, Any] = {"choice": asdict(choice)}
     words |= {"quadratures": [asdict(row) for row in rows], "integrators": [asdict(row) for row in more]}
     io.write_json(answer, words)
     failed_n = sum(row.failure is not None for row in [*rows, *more])
-    say(f"{scene}: {len(rows) + len(more)} ways tried, {failed_n} failed; cheapest quadrature: {choice.setting}")
+    say(
+        f"{settings.scene}: {len(rows) + len(more)} ways tried, {failed_n} failed; "
+        f"cheapest quadrature: {choice.setting}"
+    )
 
 
 def _trials(of: Synthesis, tried: Quadratures, seed: int) -> list[Trial]:
@@ -60,7 +64,3 @@ def _trials(of: Synthesis, tried: Quadratures, seed: int) -> list[Trial]:
     return [
         draw_trial(board, of.skin, spreads=of.spreads, seed=seed, name=skin, pokes=tried) for board, skin in nearest
     ]
-
-
-if __name__ == "__main__":
-    run(runtime)

@@ -13,11 +13,12 @@ from jaxtyping import Float, Float32, Float64, Int32
 from scipy.special import ndtr, ndtri
 
 from pipeline.experiments.answer import only, read_folder, read_losses, write_answer
-from pipeline.stage import run, say
-from reskin.config import Files, parse_parts, read_settings
+from pipeline.settings import Settings
+from pipeline.stage import say
+from pipeline.synthesis import loads_of
 from reskin.data.baseline import subtract
 from reskin.errors import SchemaError
-from reskin.simulation.protocols import Load, weights_N
+from reskin.simulation.protocols import weights_N
 
 TOLD_SHARE = 0.95  # of pairs ordered rightly: told apart
 WATER_N_PER_ML = 9.81e-3  # 1 g at 9.81 m/s^2
@@ -140,18 +141,13 @@ def monotonic(response_uT: Float64[np.ndarray, "n p"], weight_N: Float64[np.ndar
     return found
 
 
-def sensitivity(scene: str, files: Files, indentations: Path, answer: Path) -> None:
+def sensitivity(settings: Settings, indentations: Path, answer: Path) -> None:
     """Tell how small a weight the one skin tells that was loaded."""
-    glass = read_settings("sensitivity", scene, files).words("simulate.protocols.glass")
-    load = parse_parts(Load, glass, "simulate.protocols.glass")
+    load = loads_of(settings, "glass")
     one = only(read_folder(indentations), indentations)
     weight_N = weights_N(load.force_max_N, load.step_N)
     change_uT = subtract(one.b_uT, one.noload_uT)
     levels_uT = levels_of(change_uT, one.indentation, one.Fz_N, levels_n=len(weight_N), where=one.capture)
     numbers, drawn = answer_of(levels_uT, weight_N)
     write_answer(answer, numbers, drawn, read_losses(indentations, {}))
-    say(f"{scene}: weights {numbers['smallest_step_N']} N apart are told, in {numbers['fillings_n']} fillings")
-
-
-if __name__ == "__main__":
-    run(sensitivity)
+    say(f"{settings.scene}: weights {numbers['smallest_step_N']} N apart are told, in {numbers['fillings_n']} fillings")

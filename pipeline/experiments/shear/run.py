@@ -15,13 +15,12 @@ from pydantic import Field
 
 from pipeline.experiments.answer import read_folder, read_losses, write_answer
 from pipeline.report.statistics import over_units, tally
-from pipeline.stage import run
+from pipeline.settings import Settings, Training
 from pipeline.training.trainings import SceneData, collapse_record, note_seconds, prepare_training, train_all, trials_of
-from reskin.config import Files, Settings, Strict, read_settings
+from reskin.config import Strict
 from reskin.data.rows import SHEAR_TARGETS, Rows, Selection, gather
 from reskin.data.splits import NO_POOL, Fold, draw_sides
 from reskin.metrics import ACCURACY_LIMIT_MM
-from reskin.models.recipe import Training, with_training
 from reskin.seeds import rng_for, seed_for
 
 Count = Annotated[int, Field(ge=1)]
@@ -87,21 +86,20 @@ def _over_folds(scored: Sequence[tuple[Hashable, Mapping[str, float]]]) -> dict[
 
 def read(settings: Settings) -> Shear:
     """Read section shear."""
-    return with_training(settings, Shear, "shear")
+    return settings.with_training(Shear, "shear")
 
 
-def shear(scene: str, files: Files, indentations: Path, answer: Path) -> None:
+def shear(settings: Settings, indentations: Path, answer: Path) -> None:
     """Train with five targets on both splits of every skin, and score what was held out."""
     prepare_training()
-    settings = read_settings("shear", scene, files)
     section = read(settings)
     rows = gather(read_folder(indentations), settings.section(Selection, "selection"), targets=SHEAR_TARGETS)
     by_reading = _folds(rows, np.arange(len(rows)), "reading", section, settings.seed)
     by_line = _folds(rows, rows.indentation, "line", section, settings.seed)
-    data = SceneData(scene, settings, rows, [*by_reading, *by_line])
+    data = SceneData(settings.scene, settings, rows, [*by_reading, *by_line])
     trials = trials_of(data, section.training, data.folds)
     trained = train_all(data, trials, "shear")
-    note_seconds(scene, "shear", trials, trained)
+    note_seconds(settings.scene, "shear", trials, trained)
     scores = [
         (one.fold, score5(rows.target[one.test], done.predicted)) for one, done in zip(trials, trained, strict=True)
     ]
@@ -136,7 +134,3 @@ def _folds(rows: Rows, group: np.ndarray, by: str, section: Shear, seed: int) ->
 def _forces(target: np.ndarray) -> list[list[float]]:
     """Give Fx, Fy, Fz as three lists."""
     return [np.round(target[:, i].astype(float), MILLI).tolist() for i in range(2, 5)]
-
-
-if __name__ == "__main__":
-    run(shear)

@@ -15,17 +15,18 @@ from pydantic import Field
 from pipeline.executors import Here
 from pipeline.experiments.answer import read_folder, read_losses, write_answer
 from pipeline.report.statistics import tally
-from pipeline.stage import run, say
+from pipeline.settings import Settings, Training
+from pipeline.stage import say
+from pipeline.synthesis import synthesis_of
 from pipeline.training.trainings import SceneData, collapse_record, note_seconds, prepare_training, train_all
-from reskin.config import Files, Settings, Strict, read_settings
+from reskin.config import Strict
 from reskin.data.rows import Rows, Selection, gather
 from reskin.errors import ParamsError
 from reskin.metrics import score
 from reskin.models.classical import Neighbours, Task, run_tasks
-from reskin.models.recipe import HEADLINE, Training, with_training
+from reskin.models.recipe import HEADLINE
 from reskin.models.trial import Measured, Trial
 from reskin.schema import Readings
-from reskin.simulation.settings import synthesis_of
 
 Count = Annotated[int, Field(ge=1)]
 Fraction = Annotated[float, Field(gt=0, lt=1)]
@@ -160,15 +161,14 @@ def to_draw(
 
 def read(settings: Settings) -> Sleeve:
     """Read section sleeve."""
-    return with_training(settings, Sleeve, "sleeve")
+    return settings.with_training(Sleeve, "sleeve")
 
 
-def sleeve(scene: str, files: Files, indentations: Path, answer: Path) -> None:
+def sleeve(settings: Settings, indentations: Path, answer: Path) -> None:
     """Train the recipes of section sleeve on the first pokes, score them and nearest neighbours on the last."""
     prepare_training()
-    settings = read_settings("sleeve", scene, files)
     section, captures, area = read(settings), read_folder(indentations), _area(settings)
-    data = SceneData(scene, settings, gather(captures, settings.section(Selection, "selection")), [])
+    data = SceneData(settings.scene, settings, gather(captures, settings.section(Selection, "selection")), [])
     train, test = hold_out_last(data.rows, section.test_fraction)
     trials = [
         Trial("sleeve", name, recipe, "last", data.settings.seed, seed_i, train, test)
@@ -176,7 +176,7 @@ def sleeve(scene: str, files: Files, indentations: Path, answer: Path) -> None:
         for seed_i in range(section.training.seeds_n)
     ]
     trained = train_all(data, trials, "sleeve")
-    note_seconds(scene, "sleeve", trials, trained)
+    note_seconds(settings.scene, "sleeve", trials, trained)
     answers = {name: [o.predicted for c, o in zip(trials, trained, strict=True) if c.recipe_name == name]
                for name in section.training.recipes}  # fmt: skip
     answers |= _neighbours(data, section, train, test)
@@ -195,7 +195,8 @@ def sleeve(scene: str, files: Files, indentations: Path, answer: Path) -> None:
 
 
 def _area(settings: Settings) -> Area:
-    kind = synthesis_of(settings).boards[settings.words("simulate.protocols.sleeve.boards")]
+    of = synthesis_of(settings)
+    kind = of.boards[of.protocols["sleeve"].boards]
     tiles = kind.design.tiles
     boards_n, pitch_mm = ((1, 1), 0.0) if tiles is None else ((tiles.columns_n, tiles.rows_n), tiles.pitch_mm)
     return lay_out(kind.skin_mm, kind.design.places_mm, boards_n=boards_n, pitch_mm=pitch_mm)
@@ -211,7 +212,3 @@ def _neighbours(data: SceneData, section: Sleeve, train: np.ndarray, test: np.nd
     rows = Measured(data.rows.db_uT, data.rows.target, data.rows.skin)
     done = run_tasks(tasks, rows, Here(), lambda line: say(f"{data.scene} sleeve: {line}"))
     return {task.name: [one.predicted] for task, one in zip(tasks, done, strict=True)}
-
-
-if __name__ == "__main__":
-    run(sleeve)

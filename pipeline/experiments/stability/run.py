@@ -13,10 +13,11 @@ from pipeline.experiments.stability.extremes import extreme_cases
 from pipeline.experiments.stability.physics import drag_cases, physics_cases, time_cases
 from pipeline.experiments.stability.sliding import sliding_cases
 from pipeline.experiments.stability.wire import wire_cases
-from pipeline.stage import run, say
+from pipeline.settings import Settings
+from pipeline.stage import say
+from pipeline.synthesis import synthesis_of
 from reskin import io
-from reskin.config import Files, read_settings
-from reskin.simulation.settings import Synthesis, synthesis_of
+from reskin.simulation.settings import Synthesis
 
 
 def survey(of: Synthesis, seed: int) -> list[Case]:
@@ -34,24 +35,19 @@ def survey(of: Synthesis, seed: int) -> list[Case]:
     ]
 
 
-def stability(scene: str, files: Files, answer: Path) -> None:
+def stability(settings: Settings, answer: Path) -> None:
     """Try every case on the scene's own skins and chips and on small trainings, and write down what happened."""
-    settings = read_settings("stability", scene, files)
     with make_executor(imports="pipeline.experiments.stability.learning") as executor:
         learning = executor.submit(_learning_cases, settings.seed)  # beside the physics
         cases = [*survey(synthesis_of(settings), settings.seed), *learning.result()]
     io.write_json(answer, [asdict(case) for case in cases])
     for case in cases:
         if not case.holds:
-            say(f"warning: {scene}: {case.area}, {case.case}: {case.happened}")
-    say(f"{scene}: {sum(case.holds for case in cases)} of {len(cases)} extreme cases behave as they should")
+            say(f"warning: {settings.scene}: {case.area}, {case.case}: {case.happened}")
+    say(f"{settings.scene}: {sum(case.holds for case in cases)} of {len(cases)} extreme cases behave as they should")
 
 
 def _learning_cases(seed: int) -> list[Case]:
     from pipeline.experiments.stability.learning import learning_cases  # torch, late: only a worker pays for it
 
     return learning_cases(seed)
-
-
-if __name__ == "__main__":
-    run(stability)

@@ -17,9 +17,10 @@ from pipeline.experiments.answer import write_answer
 from pipeline.experiments.touches import fields
 from pipeline.experiments.touches.recordings import Blocks, Touched, in_blocks, joined, sort_recordings, touched
 from pipeline.report.statistics import statistic
-from pipeline.stage import run, say
+from pipeline.settings import Settings
+from pipeline.stage import say
 from reskin import io
-from reskin.config import Files, Settings, Strict, read_settings
+from reskin.config import Strict
 from reskin.data.rows import Selection
 from reskin.models.classical import Ridge, fit
 from reskin.seeds import rng_for
@@ -142,9 +143,8 @@ def of_unseen_places(blocks: Sequence[Blocks], false_alarm_fraction: float) -> d
     return {name: float(np.mean([row[name] for row in called])) for name in called[0]}
 
 
-def touches(scene: str, files: Files, indentations: Path, answer: Path) -> None:
+def touches(settings: Settings, indentations: Path, answer: Path) -> None:
     """Answer what can be asked of touches at numbered places."""
-    settings = read_settings("touches", scene, files)
     section, selection = read(settings), settings.section(Selection, "selection")
     sources = [indentations / f"{name}.parquet" for name in settings.captures_in(indentations)]
     found = sort_recordings(touched(io.read_readings(file), io.read_account(file), selection) for file in sources)
@@ -156,10 +156,10 @@ def touches(scene: str, files: Files, indentations: Path, answer: Path) -> None:
         "left_out": found.left_out,
     }
     for name, reason in found.left_out.items():
-        say(f"{scene}: warning: {name} left out: {reason}")
+        say(f"{settings.scene}: warning: {name} left out: {reason}")
     if found.problem:
         write_answer(answer, counts | {"not_computed": found.problem}, {})
-        say(f"{scene}: warning: touches not computed: {found.problem}")
+        say(f"{settings.scene}: warning: touches not computed: {found.problem}")
         return
     blocks = [in_blocks(one, section.train_fraction, section.aside_fraction) for one in single]
     numbers = counts | {
@@ -170,8 +170,4 @@ def touches(scene: str, files: Files, indentations: Path, answer: Path) -> None:
         "detection": of_detection(blocks, double, section, settings.seed),
     }
     write_answer(answer, numbers, {})
-    say(f"{scene}: {len(single)} recordings of one place, {len(double)} of two")
-
-
-if __name__ == "__main__":
-    run(touches)
+    say(f"{settings.scene}: {len(single)} recordings of one place, {len(double)} of two")

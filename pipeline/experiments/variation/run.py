@@ -15,9 +15,9 @@ from pydantic import Field
 
 from pipeline.experiments.answer import read_folder, read_losses, write_answer
 from pipeline.experiments.drift.windows import pace, rms
-from pipeline.stage import run
+from pipeline.settings import Settings
 from reskin import io
-from reskin.config import Files, Settings, Strict, read_settings
+from reskin.config import Strict
 from reskin.data.baseline import rank, subtract
 from reskin.errors import ParamsError
 from reskin.schema import Readings
@@ -149,9 +149,8 @@ def read(settings: Settings) -> Variation:
     return settings.section(Variation, "variation")
 
 
-def variation(scene: str, files: Files, main: Path, indentations: Path, answer: Path) -> None:
+def variation(settings: Settings, main: Path, indentations: Path, answer: Path) -> None:
     """Compare visits of equal places: of the worn skin in `indentations`, and of several skins in `main`."""
-    settings = read_settings("variation", scene, files)
     section = read(settings)
     worn = read_folder(indentations)[0]
     of_skins = _visits(main, settings.captures_in(main), section)
@@ -179,7 +178,3 @@ def _visits(main: Path, names: list[str], section: Variation) -> dict[str, list[
         boards[one.skin] = one.board
         visits[one.skin] = [find_visits(one, place_mm, section.depth_mm) for place_mm in section.places_mm]
     return {skin: visits[skin] for skin in first_of_each_board(boards, section.skins_n)}
-
-
-if __name__ == "__main__":
-    run(variation)

@@ -16,11 +16,12 @@ from pipeline.experiments.verification.frames import check_frames
 from pipeline.experiments.verification.kinematics import check_kinematics
 from pipeline.experiments.verification.poke import check_poke
 from pipeline.experiments.verification.relaxation import check_relaxation
-from pipeline.stage import run, say
+from pipeline.settings import Settings
+from pipeline.stage import say
+from pipeline.synthesis import synthesis_of
 from reskin import io
-from reskin.config import Files, read_settings
 from reskin.physics.layer import Press
-from reskin.simulation.settings import Synthesis, synthesis_of
+from reskin.simulation.settings import Synthesis
 
 
 def verify(of: Synthesis, *, depths_m: tuple[float, ...], seed: int) -> list[Check]:
@@ -40,17 +41,15 @@ def verify(of: Synthesis, *, depths_m: tuple[float, ...], seed: int) -> list[Che
     ]
 
 
-def verification(scene: str, files: Files, answer: Path) -> None:
+def verification(settings: Settings, answer: Path) -> None:
     """Check the scene's own skins, pokes and chips."""
-    settings = read_settings("verification", scene, files)
     of = synthesis_of(settings)
     checks = verify(of, depths_m=tuple(milli * depth_mm for depth_mm in of.main.depths_mm), seed=settings.seed)
     io.write_json(answer, [asdict(check) | {"holds": check.holds} for check in checks])
     for check in checks:
         if not check.holds:
-            say(f"warning: {scene}: {check.subject}, {check.law}: error {check.error:.3g}, past {check.tolerance:.3g}")
-    say(f"{scene}: {sum(check.holds for check in checks)} of {len(checks)} checks of the physics hold")
-
-
-if __name__ == "__main__":
-    run(verification)
+            say(
+                f"warning: {settings.scene}: {check.subject}, {check.law}: "
+                f"error {check.error:.3g}, past {check.tolerance:.3g}"
+            )
+    say(f"{settings.scene}: {sum(check.holds for check in checks)} of {len(checks)} checks of the physics hold")

@@ -17,7 +17,9 @@ from scipy.constants import micro, milli
 
 from pipeline.experiments.answer import write_answer
 from pipeline.report.statistics import by_skin, over_boards, over_pairs, records, select, tidy, whole
-from pipeline.stage import run, say
+from pipeline.settings import Settings
+from pipeline.stage import say
+from pipeline.synthesis import synthesis_of
 from pipeline.training.trainings import (
     SceneData,
     Starts,
@@ -28,12 +30,11 @@ from pipeline.training.trainings import (
     train_all,
     trials_of,
 )
-from reskin.config import Files, Settings, Strict, read_settings
+from reskin.config import Strict
 from reskin.data.rows import Rows, stack
 from reskin.data.splits import Fold, Split, draw_folds
 from reskin.metrics import METRICS
-from reskin.models.recipe import HEADLINE, training
-from reskin.models.recipe import adaptations as adaptations_of
+from reskin.models.recipe import HEADLINE
 from reskin.models.trial import Start, Trial
 from reskin.physics.board import draw_board
 from reskin.physics.force_sensor import read_force
@@ -41,7 +42,7 @@ from reskin.physics.skin import changes_of_field, draw_skin, forces
 from reskin.seeds import rng_for
 from reskin.simulation.capture import roster
 from reskin.simulation.rig import misplace
-from reskin.simulation.settings import MAIN, Synthesis, synthesis_of
+from reskin.simulation.settings import MAIN, Synthesis
 
 WAVES_N = 48  # cosines that make a smooth error
 DEFAULT = "default"
@@ -189,10 +190,9 @@ def read(settings: Settings) -> Worlds:
     return settings.section(Worlds, "worlds")
 
 
-def worlds(scene: str, files: Files, answer: Path) -> None:
+def worlds(settings: Settings, answer: Path) -> None:
     """Train the rows of table 2 in every world, and score them there."""
     prepare_training()
-    settings = read_settings("worlds", scene, files)
     section, split = read(settings), settings.section(Split, "split")
     listed = worlds_of(synthesis_of(settings), section)
     rows, folds = None, []
@@ -200,9 +200,9 @@ def worlds(scene: str, files: Files, answer: Path) -> None:
         own = rows_of(world, section, settings.seed)
         folds += list(folds_of(own, split, settings.seed, world.name, 0 if rows is None else len(rows)))
         rows = own if rows is None else stack(rows, own)
-        say(f"{scene} worlds: {i + 1} of {len(listed)} worlds are pressed ({world.name})")
+        say(f"{settings.scene} worlds: {i + 1} of {len(listed)} worlds are pressed ({world.name})")
     assert rows is not None, "the scene's own world is always there"
-    data = SceneData(scene, settings, rows, folds)
+    data = SceneData(settings.scene, settings, rows, folds)
     cards = _trained(data, listed)
     numbers = {"by_world": [_scored(cards, world) for world in listed], **_constants(section, data, listed)}
     write_answer(answer, numbers, {})
@@ -211,16 +211,16 @@ def worlds(scene: str, files: Files, answer: Path) -> None:
 def _trained(data: SceneData, listed: Sequence[World]) -> list[dict[str, Any]]:
     """Train one skin, many skins, and many with triplets, then adapt the last; give their cards."""
     lobo = data.folds_of("lobo")
-    trials = trials_of(data, training(data.settings, "train_single"), data.folds_of("transfer"))
-    trials += trials_of(data, training(data.settings, "train_multi"), lobo)
-    trials += trials_of(data, training(data.settings, "train_triplet"), lobo, question="triplet")
+    trials = trials_of(data, data.settings.training("train_single"), data.folds_of("transfer"))
+    trials += trials_of(data, data.settings.training("train_multi"), lobo)
+    trials += trials_of(data, data.settings.training("train_triplet"), lobo, question="triplet")
     trained = train_all(data, trials, "worlds")
     starts: Starts = {
         (trial.recipe_name, trial.fold, trial.seed_i): Start(result.key, result.weights, result.scaler)
         for trial, result in zip(trials, trained, strict=True)
         if trial.question == "triplet"
     }
-    adapt = adaptations_of(data.settings)
+    adapt = data.settings.adaptations()
     adapted: list[Trial] = [
         trial
         for fold in lobo
@@ -258,9 +258,5 @@ def _constants(section: Worlds, data: SceneData, listed: Sequence[World]) -> dic
         "skin_modulus": first.spreads.skin_modulus,
         "friction": first.skin.hold.friction if first.skin.hold is not None else 0.0,
         "rows_n": len(data.rows), "folds_n": len(data.folds_of("lobo")) // len(listed),
-        "steps_n": training(data.settings, "train_multi").recipes[HEADLINE].steps_n,
+        "steps_n": data.settings.training("train_multi").recipes[HEADLINE].steps_n,
     }  # fmt: skip
-
-
-if __name__ == "__main__":
-    run(worlds)

@@ -8,23 +8,20 @@ import numpy as np
 import pytest
 
 from pipeline.experiments.audit.run import audit
-from pipeline.stages import split
+from pipeline.settings import Settings
+from pipeline.stages.ingest import read_split
 from pipeline.training import trainings as _training
 from pipeline.training.trainings import SceneData, adaptations, read_data, read_starts, trials_of, write_models
 from reskin import io
-from reskin.config import Files
 from reskin.data.folds import load_rows, parse_folds, render_folds
 from reskin.data.rows import Selection
 from reskin.data.splits import Fold, draw_folds
 from reskin.errors import LeakError
 from reskin.models.inputs import FIT, VIEW
-from reskin.models.recipe import adaptations as adaptations_of
-from reskin.models.recipe import training
 from reskin.models.train import make_job
 from reskin.models.trial import Measured, Trained, Trial
 from reskin.schema import Readings
 from reskin.seeds import rng_for
-from reskin.simulation.fingerprint import SECTIONS as PHYSICS
 from tests.dataset.tables import readings
 from tests.scenes import ADAPTATIONS, RECIPE, SHARED, TRAINING, recorded, settings
 from tests.synthesis.scene import SECTIONS
@@ -32,6 +29,7 @@ from tests.synthesis.scene import SECTIONS
 PLACES_N, PASSES_N, READINGS_N, CH_N = 16, 2, 2, 15
 SEED = 2021
 ROOT = Path(__file__).resolve().parents[3]
+PHYSICS = ("skin", "rig", "chip", "spreads")
 MODELS = ("train_single", "train_multi", "train_triplet", "adapt")
 SKINS = ("b0_s0", "b0_s1", "b1_s0", "b2_s0")
 COPY = "b3_s0"  # b0_s0 again, under the name of another board's skin
@@ -81,29 +79,24 @@ def build(folder: Path, skins: tuple[str, ...] = SKINS) -> Path:
     """Write a scene's files as its stages do, but that its networks stay as they were drawn."""
     for skin in skins:
         io.write_readings(folder / f"indentations/{skin}.parquet", [capture(skin)], {})
-    io.write_json(folder / "tiny.yaml", SCENE)  # JSON is YAML
-    io.write_json(folder / "params.yaml", SHARED | {name: SECTIONS[name] for name in PHYSICS})
-    io.write_json(
-        folder / "plan.yaml", {"scenes": {}, "stages": {"audit": {"tiny": {"scene": "tiny", "models": list(MODELS)}}}}
-    )
-    (folder / "dvc.yaml").write_text((ROOT / "dvc.yaml").read_text())
+    io.write_json(folder / "scene.json", SCENE)
     asked = settings(SCENE)
     rows = load_rows([folder / f"indentations/{skin}.parquet" for skin in skins], asked.section(Selection, "selection"))
-    drawn = draw_folds(rows, ("single_random", "lobo"), split.read(asked), asked.seed)
+    drawn = draw_folds(rows, ("single_random", "lobo"), read_split(asked), asked.seed)
     io.write_json(folder / "folds.json", render_folds(skins, rows, drawn))
     data = scenery(folder)
     for arm, section, question in (
-        ("train_single", training(asked, "train_single"), "single_random"),
-        ("train_multi", training(asked, "train_multi"), "lobo"),
+        ("train_single", asked.training("train_single"), "single_random"),
+        ("train_multi", asked.training("train_multi"), "lobo"),
     ):
         write(folder, arm, data, trials_of(data, section, data.folds_of(question)))
     write(
         folder,
         "train_triplet",
         data,
-        trials_of(data, training(asked, "train_triplet"), data.folds_of("lobo"), question="triplet"),
+        trials_of(data, asked.training("train_triplet"), data.folds_of("lobo"), question="triplet"),
     )
-    starts, named = read_starts(folder / "models/train_triplet"), ("paper", adaptations_of(asked).recipes["paper"])
+    starts, named = read_starts(folder / "models/train_triplet"), ("paper", asked.adaptations().recipes["paper"])
     adapted = [adaptations(data, fold, named, starts, question="adapt", pokes_n=8) for fold in data.folds_of("lobo")]
     write(folder, "adapt", data, [trial for trials in adapted for trial in trials])
     io.write_json(folder / "choice.json", CHOICE)
@@ -144,11 +137,14 @@ def scene(honest, tmp_path) -> Path:
     return shutil.copytree(honest, tmp_path / "scene")
 
 
+def asked_of(folder: Path) -> Settings:
+    return settings(io.read_json(folder / "scene.json"), **{name: SECTIONS[name] for name in PHYSICS})
+
+
 def audited(folder: Path) -> list[dict]:
     answer = folder / "audit.json"
-    files = Files(folder / "tiny.yaml", folder / "params.yaml", folder / "plan.yaml")
     audit(
-        "tiny", files, folder / "indentations", folder / "folds.json", folder / "models", folder / "choice.json",
+        asked_of(folder), folder / "indentations", folder / "folds.json", folder / "models", folder / "choice.json",
         answer,
     )  # fmt: skip
     return io.read_json(answer)
@@ -177,7 +173,7 @@ def test_honest_files_pass_and_every_fold_network_and_arm_was_looked_at(scene, c
 
 
 def test_a_scene_whose_settings_are_for_speed_needs_no_record_of_a_choice(scene):
-    io.write_json(scene / "tiny.yaml", SCENE | {"audit": {"settings": "for speed"}})
+    io.write_json(scene / "scene.json", SCENE | {"audit": {"settings": "for speed"}})
     (scene / "choice.json").unlink()
     assert not any(check["what"].startswith("settings") for check in audited(scene))
 

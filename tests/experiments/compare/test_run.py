@@ -15,6 +15,7 @@ from reskin.physics import layer
 from reskin.physics.skin import SkinDesign
 from reskin.recordings.readers import lab
 from reskin.seeds import rng_for
+from reskin.simulation.defaults import nominal
 from reskin.universal import law
 from reskin.universal import law as fit
 from reskin.universal.presses import Pokes, cosines, explained, growth, memory, pool
@@ -24,7 +25,7 @@ from tests.recordings.test_recordings import LAB, ingest
 ROOT = Path(__file__).resolve().parents[3]
 SECTION = parse(Compare, read_yaml(ROOT / "pipeline/scenes/lab.yaml")["compare"], "lab.yaml: compare")
 # One tip for the nominal skin too, as each tip's flow takes seconds.
-DESIGN = parse(SkinDesign, read_yaml(ROOT / "params.yaml")["skin"] | {"tip_radius_mm": 2.0}, "params.yaml: skin")
+DESIGN = parse(SkinDesign, nominal("skin") | {"tip_radius_mm": 2.0}, "params.yaml: skin")
 SETUP = law.Setup(DESIGN, np.array(SECTION.design.places_mm), 1.1, SECTION.skin_mm, True, SECTION.tip_radius_mm)
 TRUE = law.Law(0.4, -0.3, 0.0, 1.6, 1.8, 0.5, -0.6, 0.22, 6.0, 40.0, 10.0)
 # How near a fit comes with 3 uT of noise on 50 pokes; gap and amplitude trade against each other.

@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.experiments.contacts.run import Contacts, on_board
+from pipeline.settings import Settings
 from pipeline.training.trainings import SceneData
-from reskin.config import Settings, read_yaml
+from reskin.config import read_yaml
 from reskin.data.grid import points_mm
 from reskin.data.splits import Fold
 from reskin.seeds import rng_for
@@ -28,7 +29,7 @@ def scenery():
     db_uT = (200 * force_N[:, None] * near).astype(np.float32)
     target = np.column_stack([places_mm, force_N]).astype(np.float32)
     return SceneData(
-        "test", Settings("ci", "ci.yaml", read_yaml(CI), {}, {}), replace(rows, db_uT=db_uT, target=target), []
+        "test", Settings("ci", "ci.yaml", read_yaml(CI), {}), replace(rows, db_uT=db_uT, target=target), []
     )
 
 

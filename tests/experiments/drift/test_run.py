@@ -1,6 +1,5 @@
 """Stages drift and variation on a skin whose field is known in closed form, with the settings of scene ci."""
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,8 +12,8 @@ from pipeline.experiments.drift import show as drift_pages
 from pipeline.experiments.drift.run import drift
 from pipeline.experiments.variation import show as variation_pages
 from pipeline.experiments.variation.run import variation
+from pipeline.settings import Settings, read_shared_files
 from reskin import io
-from reskin.config import Files
 from reskin.data.grid import points_mm
 from reskin.errors import ParamsError
 from reskin.schema import Readings
@@ -59,20 +58,14 @@ def scene(tmp_path, monkeypatch) -> dict[str, Any]:
     settings = YAML(typ="safe").load((ROOT / "pipeline/scenes/ci.yaml").read_text())
     settings["drift"]["training"]["steps_n"] = 300
     settings["variation"]["skins_n"] = 2
-    shared = YAML(typ="safe").load((ROOT / "params.yaml").read_text())
-    item = {"scene": "ci", "captures": []}
-    stages = {"drift": {"ci": item | {"drift": {"training": {"recipe": "paper"}}}}, "variation": {"ci": item}}
-    plan = {"stages": stages}
-    shutil.copy(ROOT / "dvc.yaml", tmp_path)
-    for name, words in {"ci.yaml": settings, "params.yaml": shared, "plan.yaml": plan}.items():
-        with (tmp_path / name).open("w") as stream:
-            YAML().dump(words, stream)
-    files = Files(tmp_path / "ci.yaml", tmp_path / "params.yaml", tmp_path / "plan.yaml")
-    return {"files": files, "answer": tmp_path / "answer.json"}
+    return {
+        "settings": Settings("ci", "ci.yaml", settings, read_shared_files(ROOT)),
+        "answer": tmp_path / "answer.json",
+    }
 
 
 def test_a_drifting_skin_is_answered_in_every_window_and_a_single_no_load_reading_is_worst(scene, tmp_path):
-    drift(scene="ci", indentations=write(tmp_path / "wear", capture("s0-wear")), **scene)
+    drift(indentations=write(tmp_path / "wear", capture("s0-wear")), **scene)
     answer = io.read_json(scene["answer"])
     numbers = answer["numbers"]
     assert {name: numbers[name] for name in ("skins_n", "seeds_n", "train_n", "left_out_units_n")} == {
@@ -114,7 +107,7 @@ def test_a_drifting_skin_is_answered_in_every_window_and_a_single_no_load_readin
 def test_no_walk_is_added_to_what_was_recorded(scene, tmp_path):
     worn = write(tmp_path / "wear", replace(capture("s0-wear"), source="recorded"))
     with pytest.raises(ParamsError, match="drift.wander_uT must be none in a recorded scene"):
-        drift(scene="ci", indentations=worn, **scene)
+        drift(indentations=worn, **scene)
 
 
 @pytest.mark.parametrize(
@@ -129,7 +122,7 @@ def test_no_walk_is_added_to_what_was_recorded(scene, tmp_path):
 )
 def test_what_has_no_order_or_no_window_is_refused_before_anything_is_trained(scene, tmp_path, captures, sentence):
     with pytest.raises(ParamsError, match=sentence):
-        drift(scene="ci", indentations=write(tmp_path / "wear", *captures), **scene)
+        drift(indentations=write(tmp_path / "wear", *captures), **scene)
     assert not (tmp_path / ".reskin").exists()
 
 
@@ -138,7 +131,7 @@ def test_variation_finds_the_drift_in_what_is_read_and_the_gain_between_skins(sc
     main = write(
         tmp_path / "main", capture("s0"), capture("s1", "b1", "s1", gain=1.5), capture("s2", "b0", "s2", gain=9)
     )
-    variation(scene="ci", main=main, indentations=worn, **scene)
+    variation(main=main, indentations=worn, **scene)
     answer = io.read_json(scene["answer"])
     assert answer["numbers"]["contact_every_s"] == pytest.approx(EVERY_s)
     assert answer["numbers"]["shown_s"] == pytest.approx(199 * EVERY_s)  # the first 200 contacts

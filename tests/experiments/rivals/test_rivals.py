@@ -9,8 +9,8 @@ from pipeline.experiments.rivals import alarm, aligned, flagged, told
 from pipeline.experiments.rivals.alarm import QUARTER, STRANGERS, Board
 from pipeline.experiments.rivals.points import FOREIGN, NONE, OWN, next_board, pokes_of, summarise
 from pipeline.experiments.rivals.show import WHY, tables
+from pipeline.settings import Settings
 from pipeline.training.trainings import SceneData
-from reskin.config import Settings
 from reskin.data.rows import Rows
 from reskin.data.splits import Fold
 from reskin.errors import ParamsError
@@ -48,7 +48,7 @@ def fold(name: str, train: range, pool: range, test: range) -> Fold:
     return Fold("labels", name, np.array(train), np.array(test), np.array(pool))
 
 
-DATA = SceneData("test", Settings("test", "test.yaml", {"seed": 0}, {}, {}), recorded(), [])
+DATA = SceneData("test", Settings("test", "test.yaml", {"seed": 0}, {}), recorded(), [])
 FOLD = fold("b1-draw0", range(20), range(20, 40), range(20, 40))
 
 

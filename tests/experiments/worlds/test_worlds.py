@@ -1,6 +1,5 @@
 """What decides table 2: the law's error is as large as asked, worlds differ in one thing, rows are scored."""
 
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +8,11 @@ from ruamel.yaml import YAML
 
 from pipeline.experiments.worlds import show
 from pipeline.experiments.worlds.run import Residual, Worlds, rows_of, with_residual, worlds, worlds_of
+from pipeline.settings import Settings, read_shared_files
+from pipeline.synthesis import synthesis_of
 from reskin import io
-from reskin.config import Files, parse, read_settings, read_yaml
+from reskin.config import parse, read_yaml
 from reskin.metrics import METRICS
-from reskin.simulation.settings import synthesis_of
 from tests.reporting.test_work_precision import said
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -45,9 +45,8 @@ def test_what_is_no_skins_own_is_alike_on_all_and_what_is_shares_half_of_its_var
 
 
 @pytest.fixture(scope="module")
-def files(tmp_path_factory) -> Files:
+def files() -> Settings:
     """Scene decide with three boards of one skin, three pokes deep and a few steps."""
-    folder = tmp_path_factory.mktemp("worlds")
     words = YAML(typ="safe").load((ROOT / "pipeline/scenes/decide.yaml").read_text())
     words["simulate"]["boards"]["rigid"] |= {
         "boards_n": 3, "skins_per_board_n": 1, "quadrature": {"cell_mm": 3.0, "layers_n": 2},
@@ -59,19 +58,11 @@ def files(tmp_path_factory) -> Files:
     words["adapt"] |= {"steps_n": 3, "pokes_n": 65}
     words["worlds"] |= {"skin_modulus": [0.1], "amplitude_and_gap": [1.0], "friction": [0.8]}
     words["worlds"]["residual"]["sizes"] = [0.0, 0.42]
-    rows = {name: {"recipe": words[name]["recipe"]} for name in ("train_single", "train_multi", "train_triplet")}
-    item = {"scene": "decide", "simulate": {"protocols": {"grid": {"boards": "rigid"}}}, **rows}
-    plan = {"stages": {"worlds": {"decide": item | {"adapt": {"adaptation": "paper"}}}}}
-    shutil.copy(ROOT / "dvc.yaml", folder)
-    shutil.copy(ROOT / "params.yaml", folder)
-    for name, content in {"decide.yaml": words, "plan.yaml": plan}.items():
-        with (folder / name).open("w") as stream:
-            YAML().dump(content, stream)
-    return Files(folder / "decide.yaml", folder / "params.yaml", folder / "plan.yaml")
+    return Settings("decide", "decide.yaml", words, read_shared_files(ROOT))
 
 
 def test_every_world_has_the_rows_of_table_2_board_by_board_and_is_shown(files, tmp_path):
-    worlds(scene="decide", files=files, answer=tmp_path / "answer.json")
+    worlds(files, answer=tmp_path / "answer.json")
     numbers = io.read_json(tmp_path / "answer.json")["numbers"]
     assert [(one["factor"], one["value"]) for one in numbers["by_world"]] == [("default", 1.0), ("residual", 0.42)]
     for one in numbers["by_world"]:
@@ -87,7 +78,7 @@ def test_every_world_has_the_rows_of_table_2_board_by_board_and_is_shown(files, 
 
 
 def test_worlds_differ_in_one_thing_and_press_the_same_places(files):
-    settings = read_settings("worlds", "decide", files)
+    settings = files
     section = parse(Worlds, read_yaml(ROOT / "pipeline/scenes/decide.yaml")["worlds"], "worlds")
     listed = worlds_of(synthesis_of(settings), section)
     assert [world.name for world in listed] == [

@@ -1,0 +1,34 @@
+"""`python -m pipeline STAGE --scene NAME ...`: what dvc.yaml calls, and the commands that manage a checkout."""
+
+import sys
+from pathlib import Path
+
+import pipeline
+
+
+def main() -> None:
+    """Run a stage, or a command of `pipeline.cli`."""
+    here, code = Path.cwd().resolve(), Path(pipeline.__file__).resolve()
+    name = sys.argv[1] if len(sys.argv) > 1 else "--help"
+    if not code.is_relative_to(here) and (here / "pipeline/__main__.py").is_file():
+        sys.exit(f"error: the code in {code.parent} would run in {here}. Try: cd {here}; python -m pipeline ...")
+    try:
+        if name == "code":
+            from pipeline.stages.code import write_digests
+
+            write_digests(Path(sys.argv[sys.argv.index("--digests") + 1]))
+            return
+        from pipeline.stage import run
+        from pipeline.stages import is_stage, module_of
+    except ModuleNotFoundError as error:
+        sys.exit(f"error: package {error.name} is not installed for {sys.executable}. Try: . .venv/bin/activate")
+    if is_stage(name):
+        run(getattr(module_of(name), name), sys.argv[2:])
+    else:
+        from pipeline.cli import main as command
+
+        command()
+
+
+if __name__ == "__main__":
+    main()

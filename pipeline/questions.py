@@ -1,0 +1,51 @@
+"""What is trained on the folds of a scene: each kind of training or score, its stage, and what it builds on."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+RANDOM = ("random_test_fraction", "random_repeats_n")
+
+Kind = Literal["models", "curve", "other", "experiment", "study", "report"]
+
+
+@dataclass(frozen=True)
+class Question:
+    """One row: a question, the stage that answers it and the questions it goes on from.
+
+    `kind` tells what the answer is: models with cards, points of a curve, another file about learning, an experiment
+    with a folder of its own, a study of the physics, or words of the report. `protocol` is that of the captures it is
+    asked of; None: the main ones. `folds` are the keys of `split` that its folds are drawn with; None: it has no folds
+    of its own. `section`: the scene's file holds settings for it, named as the stage.
+    """
+
+    name: str
+    kind: Kind
+    stage: str = ""
+    needs: tuple[str, ...] = ()
+    protocol: str | None = None
+    folds: tuple[str, ...] | None = None
+    section: bool = False
+    recorded: bool = True  # a scene of recordings may ask it too
+    alone: bool = False  # a scene may ask it and nothing else: it needs no folds, and no places in mm
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "stage", self.stage or self.name)
+
+
+LEARNING_ROWS = (
+    Question("single_random", "models", "train_single", folds=RANDOM, section=True),
+    Question("single_indentation", "models", "train_single", folds=RANDOM, section=True),
+    Question("single_pass", "models", "train_single", folds=RANDOM, section=True),
+    Question("single_temporal", "models", "train_single", folds=("temporal_test_fraction",), section=True),
+    Question("transfer", "models", "train_single", folds=("transfer_skins_n",), section=True),
+    Question("lobo", "models", "train_multi", folds=(), section=True),
+    Question("triplet", "models", "train_triplet", needs=("lobo",), section=True),
+    Question("adapt", "models", needs=("triplet",), section=True),
+    Question("pokes", "curve", "sweep_pokes", needs=("adapt",), section=True),
+    Question("sensors", "curve", "sweep_sensors", needs=("adapt",), folds=("sensors_skins_n", "sensors_draws_n")),
+    Question("baselines", "curve", "train_classical", needs=("lobo",), section=True),
+    Question("labels", "curve", "few_labels", needs=("lobo",), folds=("labels_pool_n", "labels_draws_n"), section=True),
+    Question("universal", "curve", needs=("labels", "compare"), section=True),
+    Question("audit", "other", needs=("lobo",), section=True),
+    Question("choice", "report", "report", needs=("lobo", "triplet", "adapt")),
+)

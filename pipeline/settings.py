@@ -1,0 +1,152 @@
+"""Settings of a scene: its own file, `params.yaml`, and the nominal skin of the library, each read once.
+
+A stage receives them as one `Settings` and parses the sections that it needs into typed models. `dvc.yaml` lists the
+same sections as the stage's parameters (tests/test_dvc_yaml.py compares the two).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from pydantic import Field
+
+from pipeline import PARAMS, PLAN, SCENES
+from reskin.config import Strict, parse, read_yaml
+from reskin.errors import ParamsError
+from reskin.models.recipe import HEADLINE, Adaptation, AugmentedRecipe, Name, Recipe
+from reskin.simulation.defaults import NOMINAL, SHARED
+
+PLANNED = ("captures", "held_out", "models")  # of each scene in the plan
+Section = TypeVar("Section", bound=Strict)
+Seed = Annotated[int, Field(ge=0)]
+Count = Annotated[int, Field(ge=1)]
+
+
+class Seeded(Strict):
+    """The seed of a scene."""
+
+    seed: Seed
+
+
+class Training(Strict):
+    """Recipes by name, each trained on every fold with `seeds_n` seeds; `paper` is the headline."""
+
+    recipes: dict[Name, Recipe | AugmentedRecipe]
+    seeds_n: Count
+
+
+class Adaptations(Strict):
+    """Adaptations by name, each with `pokes_n` unlabelled indentations of every held-out skin."""
+
+    pokes_n: Count
+    recipes: dict[Name, Adaptation]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The settings of a scene.
+
+    scene: name of the scene. where: its file, for error messages. of_scene: the content of that file. shared: the
+    content of `params.yaml` and of the library's nominal skin. From the plan: the names of its recorded captures, of
+    what holds rows out, and of the stages that write models.
+    """
+
+    scene: str
+    where: str
+    of_scene: Mapping[str, Any]
+    shared: Mapping[str, Any]
+    captures: tuple[str, ...] = ()
+    held_out: tuple[str, ...] = ()
+    models: tuple[str, ...] = ()
+
+    def __getitem__(self, section: str) -> Any:
+        """Return a section of the scene's file as it is written; raise `ParamsError` if it is missing."""
+        if section not in self.of_scene:
+            raise ParamsError(self.where, section, "given", "nothing", "Write it there.")
+        return self.of_scene[section]
+
+    def section(self, model: type[Section], name: str) -> Section:
+        """Parse a section of the scene's file."""
+        return parse(model, self[name], f"{self.where}: {name}")
+
+    def shared_section(self, model: type[Section], name: str) -> Section:
+        """Parse a section that all scenes share, such as `skin`."""
+        return parse(model, self.shared[name], name)
+
+    def row(self, section: str, name: Any) -> dict[str, Any]:
+        """Return a named row of a shared section, such as a recipe; raise `ParamsError` if there is none."""
+        rows = self.shared[section]
+        if name not in rows:
+            raise ParamsError(self.where, f"a row of {section}", f"one of {sorted(rows)}", repr(name), "Mend it there.")
+        return dict(rows[name])
+
+    @property
+    def seed(self) -> int:
+        return parse(Seeded, {"seed": self["seed"]}, self.where).seed
+
+    def training(self, section: str) -> Training:
+        """Parse a section that trains."""
+        where = f"{self.where}: {section}"
+        return parse(Training, self.expand_training(self[section], where), where)
+
+    def with_training(self, model: type[Section], name: str) -> Section:
+        """Parse a section that holds a `training` of its own."""
+        section, where = dict(self[name]), f"{self.where}: {name}"
+        training = self.expand_training(take(section, "training", where), f"{where}.training")
+        return parse(model, section | {"training": training}, where)
+
+    def adaptations(self) -> Adaptations:
+        """Parse section `adapt`; every base is a recipe of section `train_triplet`."""
+        section, where = dict(self["adapt"]), f"{self.where}: adapt"
+        shared = self.row("adaptations", take(section, "adaptation", where)) | {"base": take(section, "base", where)}
+        found = parse(Adaptations, expand_variants(section, shared, where), where)
+        known = sorted(self.training("train_triplet").recipes)
+        for name, recipe in found.recipes.items():
+            if recipe.base not in known:
+                raise ParamsError(where, f"base of {name}", f"one of {known}", repr(recipe.base), "Mend it there.")
+        return found
+
+    def expand_training(self, section: Mapping[str, Any], where: str) -> dict[str, Any]:
+        """Replace the name of a shared recipe and the differences of its variants by whole recipes."""
+        section = dict(section)
+        return expand_variants(section, self.row("recipes", take(section, "recipe", where)), where)
+
+    def captures_in(self, indentations: Path) -> list[str]:
+        """Name the captures of a folder of readings: those registered if recorded, all that are there if simulated.
+
+        The registry decides for recorded ones, so that the file of a removed capture does not come back.
+        """
+        return sorted(self.captures) or sorted(file.stem for file in indentations.glob("*.parquet"))
+
+
+def read_settings(scene: str, root: Path = Path()) -> Settings:
+    """Read the settings of a scene of a checkout."""
+    file, plan = root / SCENES / f"{scene}.yaml", root / PLAN
+    planned = read_yaml(plan) if plan.is_file() else {}
+    captures, held_out, models = (tuple(planned.get(key, {}).get(scene, ())) for key in PLANNED)
+    return Settings(scene, str(file), read_yaml(file), read_shared_files(root), captures, held_out, models)
+
+
+def read_shared_files(root: Path = Path()) -> dict[str, Any]:
+    """Read what scenes share: `params.yaml` and the nominal skin."""
+    nominal = read_yaml(NOMINAL)
+    return {**read_yaml(root / PARAMS), **{name: nominal[name] for name in SHARED}}
+
+
+def take(section: dict[str, Any], key: str, where: str) -> Any:
+    """Remove a key from a section and return its value; raise `ParamsError` if it is missing."""
+    if key not in section:
+        raise ParamsError(where, key, "given", f"only {', '.join(sorted(section)) or 'nothing'}", "Mend it there.")
+    return section.pop(key)
+
+
+def expand_variants(section: Mapping[str, Any], shared: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Replace `steps_n` and `variants` of a section by `recipes`: the headline, and each variant in full."""
+    section = dict(section)
+    headline = dict(shared) | {"steps_n": take(section, "steps_n", where)}
+    variants = take(section, "variants", where)
+    if HEADLINE in variants:
+        rule = f"other than {HEADLINE}, by which tables call the section's own recipe"
+        raise ParamsError(f"{where}.variants", "a variant's name", rule, HEADLINE, "Choose another name.")
+    return section | {"recipes": {HEADLINE: headline} | {name: headline | own for name, own in variants.items()}}
