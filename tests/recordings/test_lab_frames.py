@@ -18,6 +18,7 @@ from reskin.physics.board import BoardDesign, Spreads, draw_board
 from reskin.physics.skin import SkinDesign, changes_of_field, draw_skin
 from reskin.recordings.readers import lab
 from reskin.schema import Readings
+from reskin.simulation.defaults import nominal
 from tests.physics.test_board import SPREADS, as_tuples
 from tests.recordings.test_recordings import LAB, ingest
 
@@ -47,9 +48,7 @@ def simulated_uT(design, shared_data, tmp_path_factory) -> np.ndarray:
     labels_mm = np.column_stack([readings.x_mm, readings.y_mm])[::100] - MIDDLE_MM
     pokes_m = np.column_stack([labels_mm @ TURNED * milli, np.full(65, DEPTH_M)])
     still = Spreads(**(dict.fromkeys(SPREADS, 0.0) | {"skin_filler_length_mm": 3.0}))
-    words = YAML(typ="safe").load((ROOT / "params.yaml").read_text())["skin"] | {
-        "hold": None
-    }  # which was fitted on these boards
+    words = nominal("skin") | {"hold": None}  # which was fitted on these boards
     skin = draw_skin(parse(SkinDesign, words, "test"), still, seed=0, name="nominal")
     _, changes_T = changes_of_field(draw_board(design, still, seed=0, name="nominal"), skin, pokes_m)
     return changes_T / micro
