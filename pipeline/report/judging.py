@@ -73,11 +73,17 @@ class Verdict:
 def p_of(row: Row, printed: Any, ours: Any) -> float | None:
     """Give the p-value of a claim about differences over boards; None where too few boards were compared.
 
-    Of a claim about every number of training skins, the largest: it holds only if all do.
+    A claim about every number of training skins holds only if it does for all: the largest p-value. One number that
+    contradicts it is enough to deny it: then the smallest, by Bonferroni's correction for their number.
     """
     if isinstance(ours, Sequence):
-        each = [p_of(row, None, one["accuracy_pct"]) for one in ours]
-        return None if not each or None in each else max(one for one in each if one is not None)
+        points = [one["accuracy_pct"] for one in ours]
+        each = [p for p in (p_of(row, None, one) for one in points) if p is not None]
+        if not each or len(each) < len(points):
+            return None
+        metric = str(row.ours).rsplit(".", 1)[-1]
+        against = [p for p, one in zip(each, points, strict=True) if gain(one, metric)["mean"] < 0 and p <= SIGNIFICANT]
+        return min(1.0, len(each) * min(against)) if against else max(each)
     if not isinstance(ours, Mapping) or "se" not in ours:
         return None
     limit = sizeable(mean_of(printed)) if row.rule == "sizeable" else 0.0

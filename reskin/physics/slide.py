@@ -173,7 +173,7 @@ def stiffening(depth_m: Float[np.ndarray, " n"], thickness_m: float) -> Float[np
 
 def beyond_n(force_N: Float[np.ndarray, " n"], *, modulus_Pa: float, thickness_m: float, tip_radius_m: float) -> int:
     """Count the forces that `depth_at` holds at its deepest, as they lie beyond it."""
-    at_m = np.array([DEEPEST * thickness_m])
+    at_m = np.array([_deepest_m(thickness_m, tip_radius_m)])
     deepest_N = force_at(at_m, modulus_Pa=modulus_Pa, thickness_m=thickness_m, tip_radius_m=tip_radius_m)
     return int((force_N > deepest_N).sum())
 
@@ -189,10 +189,15 @@ def depth_at(
     return np.interp(np.cbrt(relative_m2**2), curve_m2, curve_m)
 
 
+def _deepest_m(thickness_m: float, tip_radius_m: float) -> float:
+    """Give the depth that is followed at most: `DEEPEST` thicknesses, and less than the radius of a sharp tip."""
+    return min(DEEPEST * thickness_m, 0.999 * tip_radius_m)
+
+
 @lru_cache(maxsize=64)
 def _curve(thickness_m: float, tip_radius_m: float) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
     # Depths, and (F / E)^(2/3) there.
-    curve_m = np.linspace(0, DEEPEST * thickness_m, CURVE_N)
+    curve_m = np.linspace(0, _deepest_m(thickness_m, tip_radius_m), CURVE_N)
     known_m2 = force_at(curve_m, modulus_Pa=1.0, thickness_m=thickness_m, tip_radius_m=tip_radius_m)
     return curve_m, np.cbrt(known_m2**2)
 

@@ -169,3 +169,10 @@ def test_force_begins_as_hertz_has_it_and_has_no_end_as_the_layer_is_used_up():
             slide.force_at(np.array([wrong_m]), **of)
     with pytest.raises(ParamsError, match="modulus must be above"):
         slide.depth_at(np.array([1.0]), **(of | {"modulus_Pa": 0.0}))
+
+
+def test_a_tip_sharper_than_the_layer_is_thick_is_followed_to_its_own_radius():
+    of = {"thickness_m": H_M, "tip_radius_m": 0.5e-3, "modulus_Pa": 2e5}
+    assert slide.depth_at(np.array([0.1]), **of)[0] < 0.5e-3
+    assert slide.depth_at(np.array([1e6]), **of)[0] == pytest.approx(0.999 * 0.5e-3)
+    assert slide.beyond_n(np.array([1e-3, 1e6]), **of) == 1

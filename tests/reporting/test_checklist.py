@@ -1,4 +1,5 @@
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -9,7 +10,7 @@ from scipy.stats import t
 
 from pipeline.report import paper
 from pipeline.report.checklist import checklist, claims_table, look_up, read_rows, resolve
-from pipeline.report.judging import Row, judge
+from pipeline.report.judging import Row, judge, p_of
 from pipeline.report.statistics import FEW_BOARDS, INCONCLUSIVE, NO, YES
 from pipeline.scenes import EXPERIMENTS
 from reskin.errors import SchemaError
@@ -310,3 +311,15 @@ def test_a_row_of_a_list_is_picked_by_its_value():
     assert resolve(all_questions(), "sweep_pokes.pokes_n=390.accuracy_pct") == stat()
     assert resolve(all_questions(), "paired.of=adapted,over=multi.over") == "multi"
     assert resolve(all_questions(), "sweep_pokes.pokes_n=391.accuracy_pct") is None
+
+
+def test_a_claim_of_several_parts_is_denied_by_one_part_with_bonferronis_p_and_affirmed_by_the_largest():
+    row = SimpleNamespace(rule="better", ours="x.accuracy_pct")
+
+    def parts(*means: float) -> list[dict]:
+        return [{"accuracy_pct": {"mean": mean, "se": se, "df": 5}} for mean, se in zip(means, (0.5, 1.0), strict=True)]
+
+    alone = [p_of(row, None, one["accuracy_pct"]) for one in parts(-5.0, 0.2)]
+    assert p_of(row, None, parts(-5.0, 0.2)) == pytest.approx(2 * alone[0])  # not the 0.85 of the other
+    assert p_of(row, None, parts(5.0, 0.2)) == pytest.approx(alone[1])
+    assert p_of(row, None, []) is None

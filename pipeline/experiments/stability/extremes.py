@@ -1,7 +1,7 @@
-"""Skins and presses at the ends of what is allowed, against references that share no route with the product.
+"""Skins and presses at the ends of what is allowed, against references.
 
-References: a path of four times finer steps without tables; rings of pressure with the textbook's compliance of a
-sliding layer; magpylib's closed form of a magnetised box; and the exact scaling of lengths.
+A path of four times finer steps without tables, from the same slides; rings of pressure with the textbook's
+compliance of a sliding layer; magpylib's closed form of a magnetised box; and the exact scaling of lengths.
 """
 
 from dataclasses import asdict, replace

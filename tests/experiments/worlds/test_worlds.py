@@ -68,6 +68,7 @@ def test_every_world_has_the_rows_of_table_2_board_by_board_and_is_shown(files, 
     for one in numbers["by_world"]:
         for row in ("single", "multi", "triplet", "adapted"):
             assert set(one[row]) == {*METRICS, "by_board"}
+            assert one[row]["by_board"]
             assert set(one[row]["by_board"]) <= {"b0", "b1", "b2"}
     table = show.tables(numbers, "simulated")["worlds"]
     assert table["row"].tolist()[:2] == ["single-sensor", "multi-sensor"]
