@@ -31,7 +31,8 @@ def score(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -
         numbers["mse_f_N2"] = float((error[known, 2] ** 2).mean())
         force_N = true[known, 2].astype(float)
         numbers |= {"force_mean_N": float(force_N.mean()), "force_var_N2": float(force_N.var())}
-        if np.ptp(force_N) > 0:  # the variance of equal forces may be off zero by rounding
+        # The variance of equal forces may be off zero by rounding, that of nearly equal ones vanish.
+        if np.ptp(force_N) > 0 and numbers["force_var_N2"] > 0:
             numbers["r2_f"] = 1 - numbers["mse_f_N2"] / numbers["force_var_N2"]
     return numbers
 
