@@ -19,7 +19,10 @@ INTERVAL = (
     "[low, high] is the 95 % interval over held-out boards (Student's t), each the mean of its skins and networks; "
     "below four boards (a; b) are the boards' own values instead"
 )
-SPREAD = f"{INTERVAL}; ± is the sd over n repeats on one skin, or over seeds where it says so."
+SPREAD = (
+    f"{INTERVAL}; ± is the sd over n repeats on one skin, over n pairs of a training and a "
+    "test skin in rows of one skin on others, or over seeds where it says so."
+)
 
 
 def show(value: Stat | None) -> str:

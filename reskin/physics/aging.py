@@ -55,21 +55,23 @@ class Memory(Strict):
 
 
 def remembered(
-    change_T: Float[np.ndarray, "n k 3"], how: Memory
-) -> tuple[Float[np.ndarray, "n k 3"], Float[np.ndarray, "n k 3"]]:
-    """Give what earlier pokes leave in each no-load reading, and what has been added to it when the poke is read.
+    change_T: Float[np.ndarray, "n p k 3"], how: Memory
+) -> tuple[Float[np.ndarray, "n k 3"], Float[np.ndarray, "n p k 3"]]:
+    """Give what earlier pokes leave in each no-load reading, and what has been added to it at every stop of a poke.
 
     q' = (share dB - q) / tau while a poke is held, q' = -q / tau after it, exactly; none before the first poke.
+    A stop has no known time: there the poke counts as held for `contact_s`, with the mean dB of the stops so far.
     """
-    before_T, added_T = np.zeros_like(change_T), np.zeros_like(change_T)
+    so_far_T = change_T.cumsum(axis=1) / np.arange(1, change_T.shape[1] + 1)[:, None, None]
+    before_T, added_T = np.zeros_like(change_T[:, 0]), np.zeros_like(change_T)
     for share, tau_s in zip(how.share, how.tau_s, strict=True):
         held, rested = np.exp(-how.contact_s / tau_s), np.exp(-how.rest_s / tau_s)
-        crept_T = -np.expm1(-how.contact_s / tau_s) * share * change_T
-        left_T = np.zeros_like(change_T)  # q before poke i + 1 is what poke i left at its end, rested
+        crept_T = -np.expm1(-how.contact_s / tau_s) * share * so_far_T
+        left_T = np.zeros_like(before_T)  # q before poke i + 1 is what poke i left at its end, rested
         for i in range(len(change_T) - 1):
-            left_T[i + 1] = rested * crept_T[i] + held * rested * left_T[i]
+            left_T[i + 1] = rested * crept_T[i, -1] + held * rested * left_T[i]
         before_T += left_T
-        added_T += crept_T - (1 - held) * left_T
+        added_T += crept_T - (1 - held) * left_T[:, None]
     return before_T, added_T
 
 

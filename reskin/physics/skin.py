@@ -123,10 +123,13 @@ def changes_of_field(
     return rest_T, changes_T
 
 
-def moved_dipoles(skin: Skin, pokes_m: Float[np.ndarray, "n 3"]) -> Iterator[tuple[int, Dipoles, Dipoles]]:
+def moved_dipoles(
+    skin: Skin, pokes_m: Float[np.ndarray, "n 3"], slid: Float[np.ndarray, " n"] | None = None
+) -> Iterator[tuple[int, Dipoles, Dipoles]]:
     """Yield index, dipoles at rest and dipoles moved, of each poke that moves some: of those within its reach alone.
 
-    What displaces them further may be applied to the last; `change_of_field` sums what they change.
+    `slid` is the share of each press's slide that takes place, all of it if not said. What displaces the dipoles
+    further may be applied to the last; `change_of_field` sums what they change.
     """
     true_m = pokes_m + np.array([0.0, 0.0, skin.depth_zero_m])
     _refuse_beside(true_m, skin)
@@ -137,6 +140,8 @@ def moved_dipoles(skin: Skin, pokes_m: Float[np.ndarray, "n 3"]) -> Iterator[tup
     deepest_m = float(np.max(true_m[:, 2]))
     table = flow_map.tabulate(skin.thickness_m, skin.tip_radius_m, deepest_m, heights=rest.heights, base=skin.base)
     slides = None if skin.hold is None else press_slides(skin, skin.hold, true_m[contacts])
+    if slides is not None and slid is not None:
+        slides = slides.times(slid[contacts])
     for i, poke_i in enumerate(contacts):
         moved = flow_map.move(table, rest, true_m[poke_i])
         if slides is not None:

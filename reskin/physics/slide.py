@@ -51,8 +51,8 @@ class Hold:
 
     @property
     def grip_N_per_m(self) -> float:
-        """Normal force by which a slide is bounded, over that slide: k / mu, see `gripped`."""
-        return self.springs_N_per_m / self.friction
+        """Normal force over the slide that it can hold: k / mu, see `gripped`; infinite without friction."""
+        return self.springs_N_per_m / self.friction if self.friction > 0 else np.inf
 
 
 def hold_of(design: HoldDesign) -> Hold:
@@ -73,6 +73,10 @@ class Slide:
     move_m: Float[np.ndarray, "n 2"]
     spin_rad: Float[np.ndarray, " n"]
 
+    def times(self, share: Float[np.ndarray, " n"]) -> "Slide":
+        """Give a share of each motion."""
+        return Slide(self.move_m * share[:, None], self.spin_rad * share)
+
 
 def under_tip_m(
     places_m: Float[np.ndarray, "n 2"], load: Float[np.ndarray, " n"], *, give_m: tuple[float, float], away: float
@@ -91,11 +95,12 @@ def gripped(slide: Slide, force_N: Float[np.ndarray, " n"], grip_N_per_m: float)
     1 - exp(-mu F / (k |u|)), is below both bounds: k |u| share <= mu F, and the whole slide under a firm press.
     `grip_N_per_m` is k / mu.
     """
-    needed_N = grip_N_per_m * np.hypot(*slide.move_m.T)
+    with np.errstate(invalid="ignore"):  # no slide that nothing grips
+        needed_N = grip_N_per_m * np.hypot(*slide.move_m.T)
     moves = needed_N > 0
     with np.errstate(over="ignore"):  # of a slide so small that any force takes all of it
         share = np.where(moves, -np.expm1(-force_N / np.where(moves, needed_N, 1.0)), 0.0)
-    return Slide(slide.move_m * share[:, None], slide.spin_rad * share)
+    return slide.times(share)
 
 
 def compliance_m_per_N(

@@ -5,7 +5,7 @@ Refuses to know frames, chips' electronics and clocks.
 """
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -36,10 +36,9 @@ from reskin.physics.skin import (
     changes_of_field,
     forces,
     moved_dipoles,
+    press_slides,
     shear_moduli_Pa,
 )
-
-DEPTH_STEP_M = 10e-6  # depths whose shear is taken as one: stiffness differs by 1 %, dB by 0.1 uT
 
 
 class Terms(Strict):
@@ -59,10 +58,14 @@ class Terms(Strict):
 
 
 class Sideways(NamedTuple):
-    """At every stop: the force in the skin's plane, and the change of field that press and push make together."""
+    """At every stop: the force in the skin's plane, and what press and push make together.
+
+    `slide_m` is how far the skin has moved as one, without its turn: its springs pull it back by k times that.
+    """
 
     force_N: Float[np.ndarray, "n p 2"]
     change_T: Float[np.ndarray, "n p k 3"]
+    slide_m: Float[np.ndarray, "n p 2"]
 
 
 @dataclass(frozen=True)
@@ -95,7 +98,8 @@ def respond(
         rest_T, change_T = changes_of_field(board, skin, flat_m)
     else:
         rest_T, _ = changes_of_field(board, skin, flat_m[:0])
-        force_N[:, :, :2], change_T = push(board, skin, tip_m, tilt=tilt, how=terms.friction)
+        pushed = push(board, skin, tip_m, tilt=tilt, how=terms.friction)
+        force_N[:, :, :2], change_T = pushed.force_N, pushed.change_T
     force_N[:, :, 2] = forces(skin, flat_m[:, 2]).reshape(n, stops_n)
     change_T = change_T.reshape(n, stops_n, *rest_T.shape)
     every_rest_T = np.broadcast_to(rest_T, (n, *rest_T.shape))
@@ -108,9 +112,9 @@ def respond(
     if terms.relaxation is not None:
         force_N *= force_left(terms.relaxation)
     if terms.memory is not None:
-        before_T, added_T = remembered(change_T.mean(axis=1), terms.memory)
+        before_T, added_T = remembered(change_T, terms.memory)
         every_rest_T = every_rest_T + before_T
-        change_T = change_T + added_T[:, None]
+        change_T = change_T + added_T
     deep_n = beyond_verified_n(skin, flat_m[:, 2])
     return Response(every_rest_T, change_T, force_N, deep_n)
 
@@ -122,18 +126,23 @@ def push(
 
     The force shears the layer under the tip, and slides a skin that its base holds by springs (`Skin.hold`) as one;
     another skin's base is taken as fixed sideways: an assumption, without which it would come along with the tip.
+    One friction, that of `how`, bounds the slide of press and drag together: a drag that takes a share of it leaves the
+    rest to the press (assumed), so that a tip which slips has let go of the skin that it took along when it pressed.
     """
+    if skin.hold is not None:
+        skin = replace(skin, hold=replace(skin.hold, friction=how.coefficient))
     pushed = [_push_once(board, skin, *each, how.coefficient) for each in zip(tip_m, tilt, strict=True)]
     return Sideways(*map(np.stack, zip(*pushed, strict=True)))
 
 
 def _push_once(
     board: Board, skin: Skin, tip_m: Float[np.ndarray, "p 3"], tilt: Float[np.ndarray, "2"], coefficient: float
-) -> tuple[Float[np.ndarray, "p 2"], Float[np.ndarray, "p k 3"]]:
+) -> Sideways:
     normal_N = forces(skin, tip_m[:, 2])
-    maps = [_map(skin, depth_m) if force > 0 else None for depth_m, force in zip(tip_m[:, 2], normal_N, strict=True)]
     shear_Pa = shear_moduli_Pa(skin, tip_m[:, 2])
-    layer_N_per_m = shear_Pa * np.array([0.0 if shear_map is None else shear_map.stiffness_m for shear_map in maps])
+    layer_N_per_m = np.zeros(len(tip_m))
+    for stop_i in np.flatnonzero(normal_N > 0).tolist():
+        layer_N_per_m[stop_i] = shear_Pa[stop_i] * _map(skin, tip_m[stop_i, 2]).stiffness_m
     slides_m_per_N = _slides_m_per_N(skin, tip_m[:, :2])
     dragged = drag(
         tip_m[:, :2], normal_N, stiffness_N_per_m=_in_series(layer_N_per_m, slides_m_per_N), friction=coefficient
@@ -143,15 +152,21 @@ def _push_once(
     slid_m = (slides_m_per_N @ force_N[:, :, None])[:, :, 0]
     elastic_m = force_N / np.where(layer_N_per_m > 0, layer_N_per_m, 1.0)[:, None] + slid_m
     centre_m = np.column_stack([tip_m[:, :2] - elastic_m, tip_m[:, 2]])
-    slides = slide.rigid(tip_m[:, :2] - skin.seat_m, slid_m, skin.sides_m)
+    dragged_slide = slide.rigid(tip_m[:, :2] - skin.seat_m, slid_m, skin.sides_m)
+    limit_N = coefficient * normal_N
+    left = 1 - np.minimum(np.hypot(*force_N.T) / np.where(limit_N > 0, limit_N, 1.0), 1.0)
     change_T = np.zeros((len(tip_m), *board.chips_m.shape))
-    for stop_i, before, after in moved_dipoles(skin, centre_m):
-        shear_map = maps[stop_i]
-        if shear_map is not None and force_N[stop_i].any():
+    for stop_i, before, after in moved_dipoles(skin, centre_m, left):
+        if force_N[stop_i].any():
+            shear_map = _map(skin, centre_m[stop_i, 2])
             after = _carry(shear_map, after, centre_m[stop_i, :2], force_N[stop_i], 3 * shear_Pa[stop_i])
-            after = slide.apply(slides, stop_i, after, skin.seat_m)
+            after = slide.apply(dragged_slide, stop_i, after, skin.seat_m)
         change_T[stop_i] = change_of_field(before, after, board.chips_m)
-    return force_N, change_T
+    slide_m = np.zeros((len(tip_m), 2))
+    if skin.hold is not None:
+        true_m = centre_m + np.array([0.0, 0.0, skin.depth_zero_m])
+        slide_m = dragged_slide.move_m + press_slides(skin, skin.hold, true_m).times(left).move_m
+    return Sideways(force_N, change_T, slide_m)
 
 
 def _slides_m_per_N(skin: Skin, places_m: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, "p 2 2"]:
@@ -170,8 +185,8 @@ def _in_series(
 
 
 def _map(skin: Skin, depth_m: float) -> shear.ShearMap:
-    true_m = DEPTH_STEP_M * max(round((depth_m + skin.depth_zero_m) / DEPTH_STEP_M), 1)
-    return shear.tabulate_depth(true_m, thickness_m=skin.thickness_m, tip_radius_m=skin.tip_radius_m, base=skin.base)
+    true_m = depth_m + skin.depth_zero_m
+    return shear.at_depth(true_m, thickness_m=skin.thickness_m, tip_radius_m=skin.tip_radius_m, base=skin.base)
 
 
 def _limited(force_N: Float[np.ndarray, "p 2"], limit_N: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p 2"]:

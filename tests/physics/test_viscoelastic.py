@@ -82,9 +82,10 @@ REMEMBERED = Memory(share=(0.11, 0.1), tau_s=(5.0, 60.0), contact_s=5.0, rest_s=
 
 
 def test_a_field_remembers_as_integration_in_small_steps_says():
-    change_T, how, steps_n = np.random.default_rng(0).normal(0, 1e-4, (6, 2, 3)), REMEMBERED, 20_000
+    stops_T, how, steps_n = np.random.default_rng(0).normal(0, 1e-4, (6, 3, 2, 3)), REMEMBERED, 20_000
+    change_T = stops_T.mean(axis=1)
     q_T = np.zeros((2, *change_T.shape[1:]))
-    before_T, added_T = remembered(change_T, how)
+    before_T, added_T = remembered(stops_T, how)
     for i, poke_T in enumerate(change_T):
         np.testing.assert_allclose(before_T[i], q_T.sum(axis=0), atol=1e-8)
         first_T = q_T.copy()
@@ -93,11 +94,11 @@ def test_a_field_remembers_as_integration_in_small_steps_says():
                 rate = [(s * held_T - q) / tau for s, q, tau in zip(how.share, q_T, how.tau_s, strict=True)]
                 q_T = q_T + long_s / steps_n * np.stack(rate)
             if held_T is poke_T:
-                np.testing.assert_allclose(added_T[i], (q_T - first_T).sum(axis=0), atol=1e-8)
+                np.testing.assert_allclose(added_T[i, -1], (q_T - first_T).sum(axis=0), atol=1e-8)
 
 
 def test_of_one_poke_five_to_eight_percent_stand_in_the_next_no_load_reading_and_less_in_later_ones():
-    once_T = np.zeros((5, 1, 3))
+    once_T = np.zeros((5, 1, 1, 3))
     once_T[0] = 1e-3
     before_T, _ = remembered(once_T, REMEMBERED)
     left = before_T[:, 0, 0] / 1e-3
@@ -106,9 +107,19 @@ def test_of_one_poke_five_to_eight_percent_stand_in_the_next_no_load_reading_and
     assert (np.diff(left[1:]) < 0).all()
 
 
+def test_a_tip_that_hovers_over_a_fresh_skin_finds_no_memory_of_the_press_to_come():
+    stops_T = np.zeros((2, 4, 1, 3))
+    stops_T[:, 2] = 1e-3  # hovers twice, presses, lifts off
+    _, added_T = remembered(stops_T, REMEMBERED)
+    assert not added_T[0, :2].any()
+    assert (added_T[0, 2:] > 0).all()
+    one_T = np.full((1, 1, 1, 3), 1e-3 / 4)  # a press of the same mean
+    np.testing.assert_allclose(added_T[0, -1], remembered(one_T, REMEMBERED)[1][0, 0])
+
+
 @given(st.floats(-3, 3))
 def test_memory_is_linear_and_without_time_there_is_none(factor):
-    change_T = np.random.default_rng(1).normal(0, 1e-4, (4, 2, 3))
+    change_T = np.random.default_rng(1).normal(0, 1e-4, (4, 3, 2, 3))
     for once, times in zip(remembered(change_T, REMEMBERED), remembered(factor * change_T, REMEMBERED), strict=True):
         np.testing.assert_allclose(times, factor * once, atol=1e-18)
     at_once = REMEMBERED.model_copy(update={"contact_s": 0.0, "rest_s": 0.0})

@@ -15,7 +15,7 @@ from reskin.physics import shear, slide
 from reskin.physics.board import Board, BoardDesign, Spreads, draw_board
 from reskin.physics.shear import Friction
 from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, forces, press_slides, shear_moduli_Pa
-from reskin.simulation.contact import DEPTH_STEP_M, Sideways, push
+from reskin.simulation.contact import Sideways, push
 
 AREA = "physics"
 DEPTH = 0.35  # of the thickness: the deepest drag of a scene, and the steepest shear
@@ -158,7 +158,7 @@ def _springs(skin: Skin) -> float:
 
 
 def _layer_N_per_m(skin: Skin, share: float) -> float:
-    depth_m = DEPTH_STEP_M * max(round(share * skin.thickness_m / DEPTH_STEP_M), 1)  # as `push` takes it
-    table = shear.tabulate_depth(depth_m, thickness_m=skin.thickness_m, tip_radius_m=skin.tip_radius_m, base=skin.base)
-    shear_Pa = shear_moduli_Pa(skin, np.array([share * skin.thickness_m]))[0]
+    depth_m = share * skin.thickness_m
+    table = shear.at_depth(depth_m, thickness_m=skin.thickness_m, tip_radius_m=skin.tip_radius_m, base=skin.base)
+    shear_Pa = shear_moduli_Pa(skin, np.array([depth_m]))[0]
     return float(shear_Pa * table.stiffness_m)
