@@ -1,16 +1,11 @@
 """Figures: marks with their values on hover, error maps, sweeps, trade-offs, error against run time."""
 
-import io
-import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from html import escape
 from math import ceil
 from textwrap import fill
 from typing import Any, TypeVar
 
-import matplotlib as mpl
 import numpy as np
 import pandas as pd
 import pyarrow as pa
@@ -18,115 +13,10 @@ import pyarrow.compute as pc
 from jaxtyping import Float
 
 from pipeline.experiments.runtime.rows import CANDIDATES, ERROR_MAX, REFERENCE, Choice, Key, Precision, Seconds
+from pipeline.report.drawing import COLOURS, MARKERS, drawing, style, svg
 from pipeline.report.formatting import COLUMNS, SHORT, scored, tabulate, to_markdown
 from pipeline.report.paper import ADAPTED_POKES_N, TABLE_2
 
-MOST = 150  # marks of one kind: of more, a title each would weigh more than it tells
-USE, PATH = re.compile(r"<(use) [^>]*/>"), re.compile(r"<(path) [^>]*/>")  # few marks are written out one by one
-GROUP = re.compile(r"<g[ >]|</g>")
-
-Titles = Mapping[str, list[str]]  # by id of a group: a title for each of its marks, in order, or one for a line without
-Say = Callable[[float], str]
-
-
-def name_marks(figure: Any) -> Titles:
-    """Give an id to each line and each cloud of marks, and say what its marks are."""
-    titles = {}
-    for i, axes in enumerate(figure.axes):
-        for j, (artist, texts) in enumerate(_described(axes)):
-            artist.set_gid(f"marks_{i}_{j}")
-            titles[f"marks_{i}_{j}"] = texts
-    return titles
-
-
-def put_titles(svg: str, titles: Titles) -> str:
-    """Write the titles into the groups of their ids; none where more or fewer marks were drawn than described."""
-    for name, texts in titles.items():
-        before, head, after = svg.partition(f'<g id="{name}">')
-        if head:  # else nothing was drawn
-            end = _end_of(after)
-            svg = before + head + _with_titles(after[:end], texts) + after[end:]
-    return svg
-
-
-def _with_titles(group: str, texts: list[str]) -> str:
-    pattern = USE if USE.search(group) else PATH
-    if len(pattern.findall(group)) != len(texts):
-        return group
-    waiting = iter(texts)
-    return pattern.sub(lambda mark: f"{mark[0][:-2]}><title>{escape(next(waiting))}</title></{mark[1]}>", group)
-
-
-def _end_of(text: str) -> int:
-    """Find where the group ends in which a text begins."""
-    depth = 1
-    for tag in GROUP.finditer(text):
-        depth += -1 if tag[0] == "</g>" else 1
-        if depth == 0:
-            return tag.start()
-    raise AssertionError("every group of an SVG ends")
-
-
-def _described(axes: Any) -> Iterator[tuple[Any, list[str]]]:
-    """Yield the lines of a panel, and its clouds of marks, with the titles of each."""
-    x, y = _say_along(axes, "x"), _say_along(axes, "y")
-    barred = {container.lines[0]: container for container in axes.containers if hasattr(container, "has_yerr")}
-    caps = {cap for container in barred.values() for cap in container.lines[1]}
-    for line in axes.lines:
-        name = barred.get(line, line).get_label()
-        if line.get_marker() in ("None", None, "", " "):
-            if not name.startswith("_"):
-                yield line, [name]
-        elif line not in caps and len(line.get_xydata()) <= MOST:
-            texts = [_title(name, x(at), y(of)) for at, of in line.get_xydata()]
-            yield line, _with_bars(texts, barred[line]) if line in barred else texts
-    for cloud in axes.collections:
-        if hasattr(cloud, "get_sizes") and 0 < len(cloud.get_offsets()) <= MOST:
-            yield cloud, _of_cloud(cloud, x, y)
-
-
-def _of_cloud(cloud: Any, x: Say, y: Say) -> list[str]:
-    values, bar = cloud.get_array(), cloud.colorbar
-    texts = [_title(cloud.get_label(), x(at), y(of)) for at, of in np.asarray(cloud.get_offsets())]
-    if values is None or bar is None:
-        return texts
-    name = bar.ax.get_ylabel()
-    return [f"{text}\n{name} = {_number(value)}" for text, value in zip(texts, values, strict=True)]
-
-
-def _with_bars(texts: list[str], container: Any) -> list[str]:
-    """Add from where to where the bar of each mark reaches."""
-    side = 1 if container.has_yerr else 0
-    ends = [ends[:, side] for bars in container.lines[2] for ends in bars.get_segments()]
-    if len(ends) != len(texts):
-        return texts
-    said = [f"\nbar from {_number(a)} to {_number(b)}" if a < b else "" for a, b in ends]
-    return [text + bar for text, bar in zip(texts, said, strict=True)]
-
-
-def _title(name: str, *values: str) -> str:
-    return "\n".join([*([] if name.startswith("_") else [name]), *values])
-
-
-def _say_along(axes: Any, which: str) -> Say:
-    """Make what says a value along an axis: beside the axis' name, or as its nearest tick where ticks have names."""
-    axis, siblings = getattr(axes, f"{which}axis"), getattr(axes, f"get_shared_{which}_axes")().get_siblings(axes)
-    labels = [one.get_label_text() for one in (axis, *(getattr(other, f"{which}axis") for other in siblings))]
-    name = " ".join(next((label for label in labels if label), which).split())
-    were_set = type(axis.get_major_locator()).__name__ == "FixedLocator"  # one by one: perhaps with names
-    places = axis.get_majorticklocs() if were_set else ()
-    texts = zip(places, axis.get_major_formatter().format_ticks(places), strict=True)
-    ticks = {place: " ".join(text.split()) for place, text in texts if any(map(str.isalpha, text))}
-    if ticks:
-        return lambda value: ticks[min(ticks, key=lambda place: abs(place - value))]
-    return lambda value: f"{name} = {_number(value)}"
-
-
-def _number(value: float) -> str:
-    return f"{value:.4g}"
-
-
-mpl.use("Agg")
 WORST_MM = 2.0  # end of the colour scale of all error maps: twice the distance that counts as right
 GRID_MM = 16.0  # the paper's grid of places, from 0 to here
 TICK_MM = 4.0  # every other place of it
@@ -135,20 +25,6 @@ SKIN_MM = (-2.0, 18.0)  # the skin around it: "20mm x 20mm" (paper section 2)
 # The five chips under it, in the frame of the labels (paper section 2), and their package of 3 mm.
 CHIPS_MM = ((8.0, 8.0), (1.0, 8.0), (15.0, 8.0), (8.0, 1.0), (8.0, 15.0))
 CHIP_MM = 3.0
-FONTS = ("DejaVu Sans", "Verdana", "sans-serif")  # Verdana is as wide, where the first is not installed
-# What nobody sees: indentation, metadata, comments, and places finer than a hundredth of a point.
-SPARED = re.compile(r"(?<=\n) +|<metadata>.*?</metadata>\n|<!--.*?-->\n", re.DOTALL)
-PLACES = re.compile(r' (d|x|y|transform)="[^"]*"')
-PAST_DIGITS = re.compile(r"(?<=\.\d\d)\d+")
-SVG_DPI = 72  # of points, in which the format counts
-STYLE = {
-    "svg.hashsalt": "reskin",
-    "svg.fonttype": "none",
-    "font.sans-serif": FONTS,
-    "font.size": 10.0,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-}
 
 
 def error_grids(predictions: Iterable[pa.Table], recipe: str, scene: str) -> Iterator[tuple[str, str]]:
@@ -205,38 +81,6 @@ def _draw_skin(axes: Any) -> None:
     limits_mm, ticks_mm = (start_mm - 0.5, SKIN_MM[1] + 0.5), np.arange(0, GRID_MM + 1, TICK_MM)
     axes.set(xlim=limits_mm, ylim=limits_mm, xticks=ticks_mm, yticks=ticks_mm)
     axes.spines[["left", "bottom"]].set_visible(False)
-
-
-@contextmanager
-def drawing(width_in: float, height_in: float) -> Iterator[Any]:
-    """Give an empty figure to draw on, in the style of all figures."""
-    from matplotlib.figure import Figure
-
-    with mpl.rc_context(STYLE):
-        yield Figure(figsize=(width_in, height_in), layout="constrained")
-
-
-def svg(figure: Any) -> str:
-    """Write a figure as SVG text; its marks say their values on hover.
-
-    Without date and version, so that the same data give the same bytes.
-    """
-    buffer, titles = io.StringIO(), name_marks(figure)
-    _lay_out(figure)
-    figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-    text = PLACES.sub(lambda found: PAST_DIGITS.sub("", found[0]), SPARED.sub("", buffer.getvalue()))
-    # Formulas name one family only, and would be written in serifs where it is not installed.
-    return put_titles(text.replace(f"'{FONTS[0]}'\"", f"'{FONTS[0]}', '{FONTS[1]}', {FONTS[2]}\""), titles)
-
-
-def _lay_out(figure: Any) -> None:
-    """Give all axes their places as saving would, which draws the figure once more for it."""
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
-
-    FigureCanvasSVG(figure)  # texts are measured as they are written
-    figure.dpi = SVG_DPI
-    figure.get_layout_engine().execute(figure)
-    figure.set_layout_engine(None)
 
 
 def _places(table: pa.Table, side: str) -> Any:
@@ -350,7 +194,7 @@ def _sweep(lines: Sequence[Line], title: str, xlabel: str, *, log: bool) -> str:
     from matplotlib.figure import Figure
 
     counts = sorted({count for line in lines for count in line.counts})
-    with mpl.rc_context(STYLE):
+    with style():
         figure = Figure(figsize=(5.6, 6.4), layout="constrained")
         for axes, metric in zip(figure.subplots(len(DRAWN), 1), DRAWN, strict=True):
             if log:
@@ -422,7 +266,7 @@ def trade_off(rows: Sequence[Mapping[str, Any]], key: str, *, title: str, cost: 
     """Draw errors of methods against the cost `key`, log-log; a step joins the Pareto front, its members numbered."""
     points = trade_off_points(rows, key)
     members = [point for point in points if point.label]
-    with mpl.rc_context(STYLE):
+    with style():
         figure, axes = _axes(title, xscale="log", xlabel=cost)
         _limit(axes, points)
         for point in points:
@@ -456,7 +300,7 @@ def adaptation(rows: Sequence[Mapping[str, Any]], source: str) -> str:
     """Draw the error after adaptation against its seconds, every point with its number of pokes."""
     timed = sorted((row for row in rows if "seconds" in row), key=lambda row: row["pokes_n"])
     points = [Point("", str(row["pokes_n"]), (row["seconds"], row["mse_xy_mm2"]["mean"]), look_of(1)) for row in timed]
-    with mpl.rc_context(STYLE):
+    with style():
         title = f"Error on a new skin against adaptation time ({source})"
         figure, axes = _axes(title, xscale="linear", xlabel="median time of an adaptation / s")
         _limit(axes, points)
@@ -531,9 +375,6 @@ def place_labels(
     return placed
 
 
-# Okabe & Ito 2008, told apart by colour-blind readers; their yellow is left out, which is pale on white.
-COLOURS = ("#000000", "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 LOWEST = 1e-16  # rounding: no error is drawn below it, for the axis is logarithmic
 COLUMNS_N = 3
 COMPUTED = (
@@ -648,7 +489,7 @@ def draw(rows: Sequence[Precision], seconds: Sequence[Seconds], words: Words) ->
     columns_n = min(COLUMNS_N, len(studies))
     lines_n = ceil(len(studies) / columns_n)
     caption = "\n".join(fill(line, CAPTION_LETTERS * (1 + columns_n)) for line in (words.note, *failures(rows)))
-    with mpl.rc_context(STYLE):
+    with style():
         size_in = (3.2 + 2.6 * columns_n, max(1.2 + 2.6 * lines_n + 0.15 * caption.count("\n"), 5.0))
         figure = Figure(figsize=size_in, layout="constrained")
         panels = figure.subplots(lines_n, columns_n, sharex=True, sharey=True, squeeze=False)

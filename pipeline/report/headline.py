@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pipeline.report.figures import COLOURS, DRAWN, MARKERS, bars, drawing, svg
+from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
+from pipeline.report.figures import DRAWN, bars
 from pipeline.report.formatting import COLUMNS, INTERVAL, OF_PAPER, Model, models, n_of, show, table_2_rows, tabulate
 
 FILE = "headline.svg"

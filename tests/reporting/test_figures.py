@@ -4,7 +4,8 @@ import xml.etree.ElementTree as ET
 
 import numpy as np
 
-from pipeline.report.figures import drawing, error_grid, svg
+from pipeline.report.drawing import drawing, svg
+from pipeline.report.figures import error_grid
 
 PLACES_MM = np.array([[0.0, 0.0], [0.0, 2.0], [2.0, 0.0], [2.0, 2.0]] * 3)
 

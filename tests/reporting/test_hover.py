@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.report.figures import MOST, drawing, svg
+from pipeline.report.drawing import MOST, drawing, svg
 
 SVG = "{http://www.w3.org/2000/svg}"
 

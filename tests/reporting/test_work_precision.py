@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.experiments.runtime.rows import REFERENCE, Precision, Seconds, choose
-from pipeline.report.figures import COLOURS, MARKERS, costs, failures, front, integrators, pages, quadratures
+from pipeline.report.drawing import COLOURS, MARKERS
+from pipeline.report.figures import costs, failures, front, integrators, pages, quadratures
 from reskin.physics.magnet import CHOSEN
 from tests.reporting.synthetic import cost
 

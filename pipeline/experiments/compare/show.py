@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pipeline.report.figures import COLOURS, MARKERS, drawing, svg
+from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
 from pipeline.report.formatting import show_digits, tabulate
 from pipeline.report.statistics import all_of, verdict, verdict_within
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.report.figures import COLOURS, MARKERS, drawing, svg
+from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
 from pipeline.report.formatting import COLUMNS, show, tabulate
 from pipeline.report.paper import FIGURE_5
 from pipeline.report.statistics import VERDICTS

@@ -6,7 +6,7 @@ from typing import Any
 import pandas as pd
 
 from pipeline.report import paper
-from pipeline.report.figures import COLOURS, MARKERS, drawing, svg
+from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
 from pipeline.report.formatting import show_difference
 from pipeline.report.statistics import VERDICTS, negated, verdict
 

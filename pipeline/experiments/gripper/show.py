@@ -5,7 +5,7 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.report.figures import COLOURS, drawing, svg
+from pipeline.report.drawing import COLOURS, drawing, svg
 
 MEANING = (
     "One line of a controller closes a gripper until the estimated force is the aimed one, "

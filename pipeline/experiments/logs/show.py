@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 
 from pipeline.report import paper
-from pipeline.report.figures import COLOURS, drawing, svg
+from pipeline.report.drawing import COLOURS, drawing, svg
 
 MEANING = (  # {rate_hz} comes from the numbers
     "A log at {rate_hz:.0f} Hz with nothing but times and readings, as a board writes it to an SD card: a quiet start, "

@@ -5,7 +5,7 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.report.figures import COLOURS, MARKERS, drawing, svg
+from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
 from pipeline.report.formatting import n_of, scores, tabulate
 
 NAMES = {

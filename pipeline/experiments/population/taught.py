@@ -27,7 +27,8 @@ from reskin.physics.slide import force_at
 from reskin.seeds import rng_for
 from reskin.simulation.settings import BoardKind
 from reskin.universal.law import Law, Setup
-from reskin.universal.map import OF_RIG, Tables, tabulate
+from reskin.universal.map import OF_RIG, Tables
+from reskin.universal.map import tabulate as tabulate_map
 from reskin.universal.network import Weights
 from reskin.universal.population import Forces, Population, draw_population
 from reskin.universal.training import Syllabus, draw_weights, train
@@ -64,7 +65,7 @@ class Lesson:
         """Tabulate the skin as designed, for the map."""
         first, last = np.log(self.forces_N)
         forces_N = np.exp(np.linspace(first, last, 1 + int(np.ceil((last - first) / STEPS_OF_FORCE))))
-        return tabulate(self.syllabus.centre, self.syllabus.spreads, self.syllabus.setup, forces_N)
+        return tabulate_map(self.syllabus.centre, self.syllabus.spreads, self.syllabus.setup, forces_N)
 
 
 def lesson_of(design: SkinDesign, kind: BoardKind, depths_mm: tuple[float, ...], seed: int) -> Lesson:

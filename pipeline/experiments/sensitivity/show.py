@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 
 from pipeline.report import paper
-from pipeline.report.figures import COLOURS, drawing, svg
+from pipeline.report.drawing import COLOURS, drawing, svg
 from pipeline.report.statistics import FEW_BOARDS, INCONCLUSIVE
 
 MEANING = (  # {told_pct} comes from the numbers

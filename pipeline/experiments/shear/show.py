@@ -8,7 +8,7 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.report.figures import COLOURS, drawing, svg
+from pipeline.report.drawing import COLOURS, drawing, svg
 from pipeline.report.formatting import show, tabulate
 from pipeline.report.paper import SHEAR
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pipeline.report.figures import COLOURS, drawing, svg
+from pipeline.report.drawing import COLOURS, drawing, svg
 from pipeline.report.formatting import COLUMNS, scores, show, tabulate
 from pipeline.report.paper import SLEEVE, SLEEVE_SKIN, SLEEVE_WORDS
 

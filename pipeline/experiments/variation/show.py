@@ -7,12 +7,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 import pandas as pd
 
 from pipeline.experiments.drift.show import say_pace
-from pipeline.report.figures import COLOURS, MARKERS, drawing, svg
+from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
 from pipeline.report.formatting import tabulate
 from pipeline.report.paper import FIGURE_4
 
