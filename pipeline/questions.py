@@ -1,7 +1,12 @@
-"""What is trained on the folds of a scene: each kind of training or score, its stage, and what it builds on."""
+"""What a scene can run: trainings on its folds, experiments, and studies of the physics."""
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
+
+from reskin.config import Strict, parse, read_yaml
 
 RANDOM = ("random_test_fraction", "random_repeats_n")
 
@@ -30,6 +35,49 @@ class Question:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "stage", self.stage or self.name)
+
+
+class Needs(Strict):
+    """Section `experiment` of an experiment's YAML file: what a scene needs to run it.
+
+    kind: an experiment has results of its own; a study is about the physics, and the same for all simulated scenes.
+    protocol: the simulated protocol whose captures it reads; None: those of the main protocol. needs: what the scene
+    runs besides. settings: the scene holds a section of settings of its name. recorded: a scene of recordings may run
+    it. alone: a scene may run nothing else.
+    """
+
+    kind: Literal["experiment", "study"] = "experiment"
+    protocol: str | None = None
+    needs: tuple[str, ...] = ()
+    settings: bool = False
+    recorded: bool = False
+    alone: bool = False
+
+
+class ExperimentFile(Strict):
+    """`pipeline/experiments/<name>.yaml`: its needs, its section of the report page, its rows of the checklist."""
+
+    experiment: Needs
+    section: dict[str, Any] | None = None
+    checklist: tuple[dict[str, Any], ...] = ()
+
+
+FOLDER = Path(__file__).parent / "experiments"
+
+
+@cache
+def experiment_files() -> Mapping[str, ExperimentFile]:
+    """Read the YAML files of all experiments, by name."""
+    return {file.stem: parse(ExperimentFile, read_yaml(file), str(file)) for file in sorted(FOLDER.glob("*.yaml"))}
+
+
+def experiment_rows() -> Iterator[Question]:
+    """Give the rows of all experiments and studies, by name."""
+    for name, file in experiment_files().items():
+        own = file.experiment
+        yield Question(
+            name, own.kind, "", own.needs, own.protocol, section=own.settings, recorded=own.recorded, alone=own.alone
+        )
 
 
 LEARNING_ROWS = (

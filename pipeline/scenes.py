@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from pipeline import PARAMS
-from pipeline.questions import LEARNING_ROWS, Kind, Question
+from pipeline.questions import LEARNING_ROWS, Kind, Question, experiment_rows
 from pipeline.settings import Seeded, Settings, read_settings
 from pipeline.stages import module_of
 from reskin.config import Strict, parse, read_yaml
@@ -24,41 +24,7 @@ POOLED_BY = "adapt"  # takes pokes of the held-out skins, so a part of these is 
 TABLE_2 = {"single": "transfer", "multi": "lobo", "triplet": "triplet", "adapted": "adapt"}
 
 
-def _experiment(
-    name: str, protocol: str | None, *needs: str, section: bool = False, recorded: bool = False, alone: bool = False
-) -> Question:
-    return Question(name, "experiment", "", needs, protocol, section=section, recorded=recorded, alone=alone)
-
-
-def _study(name: str, *, section: bool = False) -> Question:
-    return Question(name, "study", section=section, recorded=False)
-
-
-ROWS = (
-    *LEARNING_ROWS,
-    _experiment("bound", None, "single_pass"),
-    _experiment("population", None, "adapt", section=True),
-    _experiment("drift", "wear", section=True, recorded=True),
-    _experiment("variation", "wear", section=True),
-    _experiment("shear", "drag", section=True),
-    _experiment("manual", "hand", "adapt"),
-    _experiment("flexible", "flexible", "adapt"),
-    _experiment("sleeve", "sleeve", section=True),
-    _experiment("sensitivity", "glass"),
-    _experiment("logs", "log", "lobo"),
-    _experiment("compare", None, section=True, recorded=True),
-    _experiment("rivals", None, "universal", section=True, recorded=True),
-    _experiment("contacts", None, "lobo", section=True, recorded=True),
-    _experiment("touches", None, section=True, recorded=True, alone=True),
-    _experiment("ambient", None, "lobo", section=True),
-    _experiment("dynamics", "press", "lobo"),
-    _experiment("worlds", None, "transfer", "adapt", section=True),
-    _experiment("gripper", "grip", "lobo", section=True),
-    _study("verification"),
-    _study("stability"),
-    _study("runtime", section=True),
-    _study("left_out"),
-)
+ROWS = (*LEARNING_ROWS, *experiment_rows())
 QUESTIONS: Mapping[str, Question] = {row.name: row for row in ROWS}
 
 

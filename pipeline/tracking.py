@@ -16,7 +16,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from pipeline.report.statistics import over_folds, tidy
+from pipeline.statistics import over_folds, tidy
 from reskin import io
 from reskin.errors import ReskinError
 

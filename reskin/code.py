@@ -17,13 +17,14 @@ _DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef)
 
 
 @cache
-def digest(name: str) -> str:
+def digest(name: str, *, data: bool = True) -> str:
     """Give the digest of what a module does: of its syntax without docstrings, and of data files of the same name.
 
-    Formatting, comments and the version of Python change nothing. `show.yaml` belongs to `show.py` beside it.
+    Formatting, comments and the version of Python change nothing. `page.yaml` belongs to `page.py` beside it; without
+    `data`, files like it do not count.
     """
     found = hashlib.sha256()
-    for file in files_of(name):
+    for file in files_of(name) if data else [file_of(name)]:
         found.update(meaning(file.name, file.read_bytes()))
     return found.hexdigest()[:32]
 

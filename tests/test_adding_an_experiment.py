@@ -14,7 +14,6 @@ from tests.learning.trials import measured, pooled
 from tests.stages.checkout import ROOT, copy_checkout, run
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of DVC's own libraries
-QUESTION = '    _experiment("repeat", None, recorded=True),\n'
 STAGE = """\
   repeat: # how much force differs from reading to reading
     foreach: ${stages.repeat}
@@ -27,10 +26,14 @@ STAGE = """\
 
 """
 FILES = {
-    "__init__.py": '"""How much force differs from reading to reading."""\n',
-    "run.py": '''"""Stage repeat: readings -> the spread of force."""
+    "repeat.yaml": "experiment: {recorded: true}\n",
+    "repeat.py": '''"""How much force differs from reading to reading."""
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
+
+import pandas as pd
 
 from pipeline.experiments.answer import read_folder, write_answer
 
@@ -38,13 +41,6 @@ from pipeline.experiments.answer import read_folder, write_answer
 def repeat(indentations: Path, answer: Path) -> None:
     """Write the standard deviation of force by capture."""
     write_answer(answer, {one.capture: float(one.Fz_N.std()) for one in read_folder(indentations)}, {})
-''',
-    "show.py": '''"""Shows the spread of force: numbers -> one table."""
-
-from collections.abc import Mapping
-from typing import Any
-
-import pandas as pd
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
@@ -142,9 +138,8 @@ def inserted(file: Path, line: str, text: str) -> str:
 
 
 def test_a_new_experiment_runs_its_own_stage_and_the_report(root, before):
-    questions, scene = "pipeline/scenes.py", f"{SCENES}/ci.yaml"
-    files = {f"pipeline/experiments/repeat/{name}": text for name, text in FILES.items()} | {
-        questions: inserted(root / questions, '    _study("verification"),\n', QUESTION),
+    scene = f"{SCENES}/ci.yaml"
+    files = {f"pipeline/experiments/{name}": text for name, text in FILES.items()} | {
         FLOW: inserted(root / FLOW, "  report: #", STAGE),
         scene: inserted(root / scene, "single_random,", "repeat, "),
     }
@@ -157,11 +152,14 @@ def test_a_new_experiment_runs_its_own_stage_and_the_report(root, before):
     }  # fmt: skip
 
 
-def test_a_new_figure_of_an_experiment_runs_the_report(root, before):
-    show = "pipeline/experiments/shear/show.py"
-    with edited(root, {show: (root / show).read_text() + "\n\nMORE = 1\n"}):
+def test_a_new_caption_runs_the_report_and_the_code_of_an_experiment_its_stage_too(root, before):
+    captions, module = "pipeline/experiments/shear.yaml", "pipeline/experiments/shear.py"
+    with edited(root, {captions: (root / captions).read_text().replace("title: ", "title: More ", 1)}):
         after = state(root)
     assert run_again(before, after) == {"table2@ci", "report@ci", "publish@ci"}  # one module shows all
+    with edited(root, {module: (root / module).read_text() + "\n\nMORE = 1\n"}):
+        after = state(root)
+    assert run_again(before, after) == {"shear@ci", "table2@ci", "report@ci", "publish@ci"}
 
 
 def test_words_in_a_module_that_every_stage_imports_run_nothing(root, before):

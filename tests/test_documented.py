@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 from ruamel.yaml import YAML
 
-from pipeline.report.statistics import KEYS, SURENESS
 from pipeline.scenes import QUESTIONS, check_scene
 from pipeline.settings import Settings, read_shared_files
+from pipeline.statistics import KEYS, SURENESS
 from reskin import io
 from reskin.config import read_yaml
 from reskin.data.rows import TARGETS
@@ -82,3 +82,12 @@ def test_the_scene_that_docs_show_is_legal_with_the_recipe_that_they_show():
     )
     words = YAML(typ="safe").load(page) | YAML(typ="safe").load(recipe)
     check_scene(Settings("tiny", "docs", words, read_shared_files(ROOT)))
+
+
+@pytest.mark.parametrize(
+    "page", [*sorted((ROOT / "docs").glob("*.md")), ROOT / "README.md"], ids=lambda page: page.name
+)
+def test_files_that_docs_name_exist(page):
+    named = re.findall(r"`((?:reskin|pipeline|tests)/[\w./-]+)`", page.read_text(encoding="utf-8"))
+    examples = re.compile(r".*/(repeat|tiny)[./].*")  # that a page tells how to add
+    assert sorted({name for name in named if not (ROOT / name).exists() and not examples.match(name)}) == []

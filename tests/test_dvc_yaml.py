@@ -9,12 +9,14 @@ from dvc.repo import Repo
 from ruamel.yaml import YAML
 
 from pipeline.scenes import EXPERIMENTS
-from pipeline.stages.code import entries, modules_of
+from pipeline.stages.code import digests_of, entries
+from reskin import code
 from reskin.code import file_of
 
 ROOT = Path(__file__).resolve().parents[1]
 FLOW = YAML(typ="safe").load((ROOT / "dvc.yaml").read_text())["stages"]
 STAGES = {name: stage.get("do", stage) for name, stage in FLOW.items()}
+MANUAL = "pipeline.experiments.manual"
 OTHERS = sorted(STAGES.keys() - {"code"})
 
 
@@ -27,20 +29,28 @@ def test_stage_code_writes_what_every_other_stage_depends_on():
 
 def test_stage_code_reads_every_module_that_a_stage_imports_and_idle_paths_are_not_named():
     named = {ROOT / path for path in STAGES["code"]["deps"]}
-    needed = {file_of(name) for entry in entries().values() for name in modules_of(entry)}
+    needed = {file_of(name) for stage in entries() for name in digests_of(stage)}
     homes = {next((path for path in (file, *file.parents) if path in named), file) for file in needed}
     assert homes == named
 
 
 def test_a_stage_knows_the_modules_that_decide_its_results():
-    assert "reskin.models.train" in modules_of("pipeline.stages.train")
-    assert "reskin.models.train" not in modules_of("pipeline.stages.simulate")
-    shown = {name for name in modules_of("pipeline.stages.report") if name.endswith(".show")}
-    assert shown == {
-        f"pipeline.experiments.{name}.show"
-        for name in entries()
-        if (ROOT / f"pipeline/experiments/{name}/show.py").exists()
-    }
+    assert "reskin.models.train" in digests_of("train_multi")
+    assert "reskin.models.train" not in digests_of("simulate")
+    assert {f"pipeline.experiments.{name}" for name in EXPERIMENTS} <= digests_of("report").keys()
+
+
+def test_a_caption_runs_the_report_again_and_no_experiment(monkeypatch):
+    monkeypatch.setattr(code, "meaning", lambda file, content: b"other" if file == "manual.yaml" else b"same")
+    code.digest.cache_clear()
+    other = {stage: digests_of(stage)[MANUAL] for stage in ("manual", "report")}
+    monkeypatch.setattr(code, "meaning", lambda file, content: b"same")
+    code.digest.cache_clear()
+    same = {stage: digests_of(stage)[MANUAL] for stage in ("manual", "report")}
+    code.digest.cache_clear()
+    assert other["manual"] == same["manual"]
+    assert other["report"] != same["report"]
+    assert not any(name.startswith("pipeline.report") for name in digests_of("manual"))
 
 
 @pytest.mark.parametrize("name", sorted(STAGES))

@@ -1,4 +1,6 @@
-"""One folder an experiment: `run.py` computes its answer, `show.py` makes tables and figures of it.
+"""Experiments: one module each (settings, computation, tables, figures), and a YAML file of the same name.
 
-Knows no experiment by name: `questions` lists them, and the package of each holds a sentence only.
+`manual.py` holds the function `manual`, which stage `manual` calls, and optionally `read_manual` (checks its settings),
+`tables` and `figures`. `manual.yaml` says what a scene needs to run it (`experiment`, see `pipeline.questions`), and
+holds its section of the report page and its rows of the checklist against the paper.
 """

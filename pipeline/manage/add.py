@@ -97,8 +97,10 @@ def _read_through(folder: Path, header: Header, limit: float, decisions: Decisio
 
 def _warn_of_departures(folder: Path, scene: Scene, skin: Mapping[str, Any], decisions: Decisions) -> None:
     """Warn if a capture seems to lie otherwise than section compare of its scene says; it stays added."""
-    from pipeline.experiments.compare.joining import departure  # late: the physics takes seconds
-    from pipeline.experiments.compare.run import Compare
+    from pipeline.experiments.compare import (
+        Compare,
+        departure,  # late: the physics takes seconds
+    )
     from reskin.physics.skin import SkinDesign
 
     _, blocks, _ = open_capture(folder, decisions)

@@ -1,6 +1,6 @@
 """The checklist: each figure, table and numbered result of the paper beside ours. In: numbers.json. Out: one table.
 
-Its rows are data, `checklist.yaml` and `show.yaml` of each experiment; the paper's numbers are constants of
+Its rows are data, `checklist.yaml` and the YAML file of each experiment; the paper's numbers are constants of
 `reporting.paper`. Refuses to know how ours were computed.
 """
 
@@ -16,7 +16,7 @@ from pipeline.report import judging, paper
 from pipeline.report.formatting import FEW_POINTS, is_pooled, show, show_difference
 from pipeline.report.judging import NONE, Row, Verdict, adjusted, judge, mean_of, p_of
 from pipeline.report.parts import add_rows
-from pipeline.report.statistics import VERDICTS, holm
+from pipeline.statistics import VERDICTS, holm
 from reskin.config import parse, read_yaml
 from reskin.errors import SchemaError
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.report.statistics import over_folds, tidy
+from pipeline.statistics import over_folds, tidy
 from reskin.errors import ParamsError
 
 BY = "mse_xy_mm2"

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float
 
-from pipeline.report.statistics import summarise
+from pipeline.statistics import summarise
 from reskin.board.faults import find_lsb
 from reskin.data.baseline import rank, subtract
 from reskin.schema import AXES_PER_CHIP_N, Readings

@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from jaxtyping import Float
 
-from pipeline.experiments.runtime.rows import CANDIDATES, ERROR_MAX, REFERENCE, Choice, Key, Precision, Seconds
+from pipeline.experiments.runtime import CANDIDATES, ERROR_MAX, REFERENCE, Choice, Key, Precision, Seconds
 from pipeline.report.drawing import COLOURS, MARKERS, drawing, style, svg
 from pipeline.report.formatting import COLUMNS, SHORT, scored, tabulate, to_markdown
 from pipeline.report.paper import ADAPTED_POKES_N, TABLE_2

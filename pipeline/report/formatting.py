@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from pipeline.report.paper import ADAPTED_POKES_N, TABLE_2, TABLE_2_ROWS, Number
-from pipeline.report.statistics import negated
+from pipeline.statistics import negated
 
 COLUMNS = {"accuracy_pct": "accuracy, %", "mse_xy_mm2": "MSE_xy, mm²", "mse_f_N2": "MSE_F, N²", "r2_f": "R² of F"}
 OF_FORCE = ("mse_f_N2", "r2_f")  # an offset of places changes neither

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from pipeline.report import statistics as inference
+from pipeline import statistics as inference
 from pipeline.report.formatting import FEW_POINTS, gain
-from pipeline.report.statistics import BOARDS_MIN, FEW_BOARDS, INCONCLUSIVE, NO, YES, Stat, negated
+from pipeline.statistics import BOARDS_MIN, FEW_BOARDS, INCONCLUSIVE, NO, YES, Stat, negated
 from reskin.config import Strict
 
 NEAR = 0.10  # assumed: relative tolerance where the paper gives no sd

@@ -10,7 +10,8 @@ import pyarrow as pa
 
 from pipeline.report.formatting import control_of
 from pipeline.report.paper import PLATEAU_POKES_N
-from pipeline.report.statistics import (  # fmt: skip
+from pipeline.scenes import QUESTIONS, ROWS, TABLE_2
+from pipeline.statistics import (
     AS_LABELLED,
     METHODS,
     REGISTERED,
@@ -30,7 +31,6 @@ from pipeline.report.statistics import (  # fmt: skip
     whole,
     with_boards,
 )
-from pipeline.scenes import QUESTIONS, ROWS, TABLE_2
 from reskin.metrics import METRICS
 
 Points = Mapping[str, Sequence[dict[str, Any]]]

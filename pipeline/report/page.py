@@ -16,7 +16,8 @@ from pipeline.report.figures import cost_tables, learning_costs
 from pipeline.report.formatting import notes
 from pipeline.report.headline import FILE, answer
 from pipeline.report.parts import add_sections
-from reskin.code import ROOT
+from pipeline.stages import is_stage, module_name
+from reskin.code import ROOT, file_of
 from reskin.config import Strict, parse, read_yaml
 from reskin.errors import SchemaError
 
@@ -191,8 +192,7 @@ def findings(section: Section, checklist: pd.DataFrame) -> list[str]:
 def stages_of(section: Section, checklist: pd.DataFrame) -> list[tuple[str, str]]:
     """Name the stages behind a section, and the files of their code."""
     stages = dict.fromkeys(row["stage"] for row in _rows_of(section, checklist) if row["stage"] not in NOTHING)
-    homes = {stage: (f"pipeline/experiments/{stage}/run.py", f"pipeline/stages/{stage}.py") for stage in stages}
-    return [(stage, home) for stage, files in homes.items() for home in files if (ROOT / home).exists()]
+    return [(stage, str(file_of(module_name(stage)).relative_to(ROOT))) for stage in stages if is_stage(stage)]
 
 
 def _rows_of(section: Section, checklist: pd.DataFrame) -> list[dict[str, str]]:

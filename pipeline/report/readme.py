@@ -14,6 +14,7 @@ from pipeline.report.tables import make_tables, skins_table
 from pipeline.scenes import EXPERIMENTS
 from pipeline.stages import module_name
 from reskin import io
+from reskin.code import ROOT, file_of
 from reskin.config import read_yaml
 from reskin.errors import ParamsError, SchemaError
 
@@ -142,7 +143,7 @@ def _stages(stages: Mapping[str, Any]) -> str:
             for out in stage.get("do", stage).get(key, [])
         ]
         written = ", ".join(f"`{re.sub(r'[$]{[^}]*}', '…', out)}`" for out in outs) or "MLflow runs"
-        code = f"{module_name(name).replace('.', '/')}.py" if name != "code" else "pipeline/stages/code.py"
+        code = file_of(module_name(name) if name != "code" else "pipeline.stages.code").relative_to(ROOT)
         lines.append(f"| {name} | [{code}](../{code}) | {written} |")
     return "\n".join(lines)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 
 from pipeline import scenes
-from pipeline.experiments.left_out.show import left_out_table
+from pipeline.experiments.left_out import left_out_table
 from pipeline.report.checklist import checklist, claims_table
 from pipeline.report.formatting import (
     COLUMNS,

@@ -15,18 +15,19 @@ MODULES = {
     "universal": ("few_labels", "universal"),
     "report": ("table2", "report", "publish"),
 }
-EXPERIMENTS = Path(__file__).parents[1] / "experiments"
+EXPERIMENTS = "pipeline.experiments"
+FOLDER = Path(__file__).parents[1] / "experiments"
 STAGES = {stage: f"pipeline.stages.{module}" for module, names in MODULES.items() for stage in names}
 
 
 def is_stage(name: str) -> bool:
     """Tell whether a stage or an experiment has this name."""
-    return name in STAGES or (EXPERIMENTS / name / "run.py").is_file()
+    return name in STAGES or (FOLDER / f"{name}.py").is_file() or (FOLDER / name / "__init__.py").is_file()
 
 
 def module_name(stage: str) -> str:
     """Name the module that holds a stage's function: one of `pipeline.stages`, or that of an experiment."""
-    return STAGES.get(stage, f"pipeline.experiments.{stage}.run")
+    return STAGES.get(stage, f"{EXPERIMENTS}.{stage}")
 
 
 def module_of(stage: str) -> ModuleType:

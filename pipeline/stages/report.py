@@ -39,11 +39,11 @@ from pipeline.report.numbers import (
 )
 from pipeline.report.page import index, page, run_page
 from pipeline.report.parts import experiment_figures
-from pipeline.report.statistics import tidy, to_csv
 from pipeline.report.tables import make_tables, table_texts
 from pipeline.scenes import TABLE_2, Asking, asked_by, stages
 from pipeline.settings import Settings
 from pipeline.stage import say
+from pipeline.statistics import tidy, to_csv
 from pipeline.tracking import Curves, TrackingAway, metrics_of
 from pipeline.tracking import publish as write_runs
 from reskin import io

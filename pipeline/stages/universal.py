@@ -9,7 +9,7 @@ from pydantic import Field
 
 from pipeline.executors import make_executor
 from pipeline.experiments.answer import read_folder
-from pipeline.experiments.compare.run import Compare, see, setup_of, skins_of, turns_of
+from pipeline.experiments.compare import Compare, see, setup_of, skins_of, turns_of
 from pipeline.settings import Settings
 from pipeline.stage import say
 from pipeline.training import few_labels as few

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from pipeline.report import statistics
+from pipeline import statistics
 from pipeline.training.trainings import SceneData, Starts, collapse_record, note_seconds, own_starts, train_all
 from reskin.data.splits import Fold
 from reskin.metrics import METRICS, score

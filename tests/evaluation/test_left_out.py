@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pipeline.experiments.left_out import terms as left_out
-from pipeline.experiments.left_out.terms import AGEING, RELAXATION, measure
+from pipeline.experiments import left_out
+from pipeline.experiments.left_out import AGEING, RELAXATION, measure
 from reskin.physics.aging import force_left, softening
 from reskin.physics.board import draw_board
 from reskin.physics.magnet import Quadrature

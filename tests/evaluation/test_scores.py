@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import t, ttest_rel
 
-from pipeline.report.statistics import (
+from pipeline.statistics import (
     AS_LABELLED,
     FEW_BOARDS,
     INCONCLUSIVE,

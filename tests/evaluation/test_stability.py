@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 from pipeline.experiments.stability import extremes as extremes_module
-from pipeline.experiments.stability import physics, wire
+from pipeline.experiments.stability import physics, survey, wire
 from pipeline.experiments.stability.cases import measured, peak_bytes, refused
 from pipeline.experiments.stability.chip import chip_cases
 from pipeline.experiments.stability.extremes import extreme_cases, near, tips
 from pipeline.experiments.stability.physics import physics_cases, time_cases
-from pipeline.experiments.stability.run import survey
 from pipeline.experiments.stability.sliding import sliding_cases
 from pipeline.experiments.stability.wire import wire_cases
 from reskin.board import faults, stream

@@ -1,8 +1,8 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.experiments.audit.run import audit_collapse
-from pipeline.report.statistics import tally
+from pipeline.experiments.audit import audit_collapse
+from pipeline.statistics import tally
 
 OF_ONE = st.fixed_dictionaries({"collapsed": st.booleans(), "collapsed_before_n": st.integers(0, 2)})
 

@@ -6,15 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.experiments.verification import poke
+from pipeline.experiments.verification import mechanics, verify
 from pipeline.experiments.verification.checks import Check, no_spread
-from pipeline.experiments.verification.contact import check_contact
-from pipeline.experiments.verification.electronics import check_electronics
-from pipeline.experiments.verification.field import check_field
-from pipeline.experiments.verification.frames import check_frames
-from pipeline.experiments.verification.kinematics import one_small_step
-from pipeline.experiments.verification.relaxation import check_relaxation
-from pipeline.experiments.verification.run import verify
+from pipeline.experiments.verification.mechanics import check_contact, one_small_step
+from pipeline.experiments.verification.signals import check_electronics, check_field, check_frames, check_relaxation
 from reskin.board import stream, wire
 from reskin.config import parse, read_yaml
 from reskin.physics import aging, chip, flow_map, layer, magnet
@@ -141,10 +136,10 @@ def test_moments_that_do_not_turn_with_the_material_are_seen(monkeypatch):
         return replace(moved, after=(moved.after[0], moved.before[1]))
 
     board = draw_board(DESIGN.boards["rigid"].design, DESIGN.spreads, seed=SEED, name="b0")
-    skin = draw_skin(DESIGN.skin, DESIGN.spreads, seed=SEED, name="b0_s0", rule=poke.COARSE)
-    assert poke.shortcuts(board, skin, DEPTHS_M[-1], "deepest", poke.PLACES_M[:1]).holds
+    skin = draw_skin(DESIGN.skin, DESIGN.spreads, seed=SEED, name="b0_s0", rule=mechanics.COARSE)
+    assert mechanics.shortcuts(board, skin, DEPTHS_M[-1], "deepest", mechanics.PLACES_M[:1]).holds
     monkeypatch.setattr(flow_map, "move", unturned)
-    assert not poke.shortcuts(board, skin, DEPTHS_M[-1], "deepest", poke.PLACES_M[:1]).holds
+    assert not mechanics.shortcuts(board, skin, DEPTHS_M[-1], "deepest", mechanics.PLACES_M[:1]).holds
 
 
 def test_the_naive_quotient_of_a_small_step_is_seen(monkeypatch):

@@ -10,14 +10,39 @@ from hypothesis import strategies as st
 from scipy.constants import mu_0
 from scipy.integrate import quad
 
-from pipeline.experiments.runtime import integrators, methods
-from pipeline.experiments.runtime.integrators import EULER, EXACT, SOLVERS, Integrators, poke_often, study_integrators
-from pipeline.experiments.runtime.methods import METHODS, Path, paths, whole
-from pipeline.experiments.runtime.quadrature import ALL, Reference, errors, study_quadratures
-from pipeline.experiments.runtime.rows import CANDIDATES, ERROR_MAX, REFERENCE, Contestant, Precision, choose, race
-from pipeline.experiments.runtime.rows import written as name_of
-from pipeline.experiments.runtime.trials import Pokes, Trial, box_m, draw_trial, gauss_everywhere, laid, midpoints
-from pipeline.experiments.verification.relaxation import hereditary
+from pipeline.experiments import runtime
+from pipeline.experiments.runtime import (
+    ALL,
+    CANDIDATES,
+    ERROR_MAX,
+    EULER,
+    EXACT,
+    METHODS,
+    REFERENCE,
+    SOLVERS,
+    Contestant,
+    Integrators,
+    NodePath,
+    Pokes,
+    Precision,
+    Reference,
+    Trial,
+    box_m,
+    choose,
+    draw_trial,
+    errors,
+    gauss_everywhere,
+    laid,
+    midpoints,
+    paths,
+    poke_often,
+    race,
+    study_integrators,
+    study_quadratures,
+    whole,
+)
+from pipeline.experiments.runtime import written as name_of
+from pipeline.experiments.verification.signals import hereditary
 from reskin.errors import ParamsError
 from reskin.physics import layer
 from reskin.physics.aging import SKIN
@@ -113,9 +138,9 @@ def test_a_box_that_is_lifted_changes_the_field_as_charged_faces_do(monkeypatch)
         BOARD, like, spreads=no_spread(), seed=0, name="s0", pokes=Pokes(places_mm=((0.0, 0.0),), depths_mm=(1.0,))
     )
     skin = laid(one, midpoints(one.skin.thickness_m, whole_skin))
-    lifted = Path(skin.nodes_m[None] + lift_m, np.zeros((1, 1, 3)))
-    monkeypatch.setattr(methods, "paths", lambda *_: lifted)
-    found_T = methods.magpylib_cuboids(one, whole_skin).call()[0]
+    lifted = NodePath(skin.nodes_m[None] + lift_m, np.zeros((1, 1, 3)))
+    monkeypatch.setattr(runtime, "paths", lambda *_: lifted)
+    found_T = runtime.magpylib_cuboids(one, whole_skin).call()[0]
     sides_m = (SKIN_SIDE_M, SKIN_SIDE_M, one.skin.thickness_m)
     jx_T, jy_T, jz_T = mu_0 * skin.moments_A_m2[0] / np.prod(sides_m)
     assert max(abs(jx_T), abs(jy_T)) < 1e-12 * abs(jz_T)
@@ -282,7 +307,7 @@ def test_contestants_run_in_turn_and_backwards_in_every_other_round():
 
 def test_seconds_are_medians_an_indentation(monkeypatch):
     now_s = accumulate([0.0, 0.005, 1.0, 0.5, 1.0, 0.005])  # before and after each of three naps
-    monkeypatch.setattr("pipeline.experiments.runtime.rows.perf_counter", lambda: next(now_s))
+    monkeypatch.setattr("pipeline.experiments.runtime.perf_counter", lambda: next(now_s))
     (slow,) = race([Contestant(("study", "naps", "x"), lambda: None, 5)], 3)
     assert slow.key == ("study", "naps", "x")
     assert slow.median_s == pytest.approx(0.001)
@@ -309,16 +334,16 @@ def relaxations():
 
 
 def of(rows, ratio, method) -> list[Precision]:
-    return [row for row in rows if row.study == integrators.study(ratio) and row.method == method]
+    return [row for row in rows if row.study == runtime.study(ratio) and row.method == method]
 
 
 def test_the_skins_own_relaxation_has_its_own_stiffness():
-    np.testing.assert_allclose(integrators.stiff(1e7).tau_s, SKIN.tau_s, rtol=1e-12)
+    np.testing.assert_allclose(runtime.stiff(1e7).tau_s, SKIN.tau_s, rtol=1e-12)
 
 
 @pytest.mark.parametrize("ratio", RATIOS)
 def test_a_stiffness_is_the_ratio_of_the_slowest_relaxation_to_the_fastest(ratio):
-    prony = integrators.stiff(ratio)
+    prony = runtime.stiff(ratio)
     assert prony.tau_s.max() / prony.tau_s.min() == pytest.approx(ratio, rel=1e-9)
     assert prony.tau_s.max() == SKIN.tau_s.max()
     assert (prony.share == SKIN.share).all()
@@ -326,7 +351,7 @@ def test_a_stiffness_is_the_ratio_of_the_slowest_relaxation_to_the_fastest(ratio
 
 def test_the_exact_force_is_the_convolution_with_the_relaxation_function():
     # Lee & Radok 1960, by adaptive quadrature instead of by states
-    prony, (time_s, elastic) = integrators.stiff(1e5), poke_often(2)
+    prony, (time_s, elastic) = runtime.stiff(1e5), poke_often(2)
     speeds = np.diff(elastic) / np.diff(time_s)
 
     def relaxation(t_s):
@@ -413,7 +438,7 @@ def test_a_solver_that_reports_failure_is_listed_with_its_words(monkeypatch):
     class Gone:
         success, message = False, "Required step size is less than spacing between numbers."
 
-    monkeypatch.setattr(integrators, "solve_ivp", lambda *_, **__: Gone)
+    monkeypatch.setattr(runtime, "solve_ivp", lambda *_, **__: Gone)
     rows, _ = study_integrators(few(ratios=(1e7,)))
     assert {one.failure for one in of(rows, 1e7, "BDF")} == {Gone.message}
 
@@ -428,5 +453,5 @@ def test_more_pokes_leave_the_error_and_the_work_of_a_poke_nearly_as_they_are():
 
 
 def test_the_same_sweep_gives_the_same_rows(relaxations):
-    again, study = study_integrators(few(ratios=(1e6,)))[0], integrators.study(1e6)
+    again, study = study_integrators(few(ratios=(1e6,)))[0], runtime.study(1e6)
     assert again == [row for row in relaxations[0] if row.study == study]

@@ -5,16 +5,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.experiments.flexible.run import (
+from pipeline.experiments.flexible import (  # fmt: skip
     DRAWN_N,
     answer_flexible,
     by_depth,
     forces_drawn,
     gap_less_pct,
     strength_ratio,
-)  # fmt: skip
-from pipeline.experiments.manual.run import GRID, answer_manual
-from pipeline.report.statistics import by_skin, paired, tidy
+)
+from pipeline.experiments.manual import GRID, answer_manual
+from pipeline.statistics import by_skin, paired, tidy
 from pipeline.training.variants import AFTER, BEFORE, CONTROL, Answered, bias, biases, compare_arms, summarise_arms
 from reskin.metrics import METRICS, score, score_groups
 from reskin.seeds import rng_for

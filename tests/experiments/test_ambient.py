@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.constants import micro
 
-from pipeline.experiments.ambient.fields import (
+from pipeline.experiments.ambient import (
     by_step,
     guessed_uT,
     iron_cases,

@@ -1,6 +1,6 @@
 """What the report says of fields from outside: every arm where it was tried, units, and the earth's field."""
 
-from pipeline.experiments.ambient.show import figures, tables
+from pipeline.experiments.ambient import figures, tables
 from tests.reporting.test_work_precision import said
 
 

@@ -4,9 +4,7 @@ import xml.etree.ElementTree as ET
 
 import pytest
 
-from pipeline.experiments.flexible import show as flexible
-from pipeline.experiments.manual import show as manual
-from pipeline.experiments.shear import show as shear
+from pipeline.experiments import flexible, manual, shear
 from pipeline.report.formatting import to_markdown
 from pipeline.report.paper import FLEXIBLE, MANUAL, SHEAR
 from tests.reporting.test_work_precision import said

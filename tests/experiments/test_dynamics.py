@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.experiments.dynamics.run import WINDOW_N, compare, lag_ms, presses_of, running_mean
+from pipeline.experiments.dynamics import WINDOW_N, compare, lag_ms, presses_of, running_mean
 from reskin.seeds import rng_for
 
 RATE_HZ = 400.0

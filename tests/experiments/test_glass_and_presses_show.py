@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from pipeline.experiments.dynamics import show as dynamics
-from pipeline.experiments.sensitivity import show as sensitivity
-from pipeline.experiments.sensitivity.run import answer_of
+from pipeline.experiments import dynamics, sensitivity
+from pipeline.experiments.sensitivity import answer_of
 from reskin.seeds import rng_for
 
 ERROR = {"mean": 0.5, "sd": 0.1, "n": 3}

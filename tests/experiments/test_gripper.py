@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pipeline.experiments.gripper import show
-from pipeline.experiments.gripper.run import Finger, Gripper, Press, _scaled, answer_of, grip, judge
+from pipeline.experiments import gripper
+from pipeline.experiments.gripper import Finger, Gripper, Press, _scaled, answer_of, grip, judge
 from reskin.seeds import rng_for
 
 FORCE_N = np.linspace(0, 3, 31)
@@ -55,7 +55,7 @@ def test_two_networks_that_err_to_either_side_hold_nothing_though_their_mean_is_
     assert row["error_pct"]["sd_seeds"] == pytest.approx(np.std([one["mean"] for one in alone], ddof=1))
     assert "sd_seeds" not in alone[0]
     assert numbers["seeds_n"] == 2
-    table = show.tables(numbers, "simulated")["gripper"]
+    table = gripper.tables(numbers, "simulated")["gripper"]
     assert "(seeds)" in table["error, % (boards)"][0]
     assert "over 2 network seeds" in table.attrs["meaning"]
 
@@ -68,7 +68,7 @@ def test_each_aim_is_held_by_each_feedback_and_shown():
         (0.5, "networks", "none"), (0.5, "networks", "factor"), (0.5, "map", "none"), (0.5, "map", "factor"),
         (0.5, "map", "label"),
     ]  # fmt: skip
-    table = show.tables(numbers, "simulated")["gripper"]
+    table = gripper.tables(numbers, "simulated")["gripper"]
     assert table["runs"].tolist() == [2] * 5
     assert table["held, % of runs"][0] == "100"
-    assert "0.5 N" in show.figures(numbers, drawn, "simulated")["gripper.svg"]
+    assert "0.5 N" in gripper.figures(numbers, drawn, "simulated")["gripper.svg"]

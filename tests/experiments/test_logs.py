@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.experiments.ambient.fields import Instrument
-from pipeline.experiments.logs.run import PERIOD_S, PITCHES_DEG, Log, earth_T, step_period_s, swing, turn_log
+from pipeline.experiments.ambient import Instrument
+from pipeline.experiments.logs import PERIOD_S, PITCHES_DEG, Log, earth_T, step_period_s, swing, turn_log
 from reskin.errors import CaptureError
 from reskin.live.contacts import contacts_n, describe, estimate, quiet_start, score_contacts, thin, truth_at
 from reskin.physics.ambient import EARTH_DIP_DEG, EARTH_SIZE_T, EARTH_T

@@ -1,6 +1,6 @@
 """Table and figure of a log say what the numbers say, and what is not known."""
 
-from pipeline.experiments.logs.show import figures, tables
+from pipeline.experiments.logs import figures, tables
 
 ACCOUNT = {"rows_read_n": 101, "rows_n": 100, "gap_frames_n": 2, "gaps_n": 1}
 NUMBERS = {

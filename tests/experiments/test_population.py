@@ -6,8 +6,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipeline.experiments.population import show, taught
-from pipeline.experiments.population.run import _weight, cases, over_boards
+from pipeline.experiments import population
+from pipeline.experiments.population import _weight, cases, over_boards
 from pipeline.training.universal import Frame
 from reskin.data.rows import Rows
 from reskin.data.splits import Fold
@@ -26,13 +26,13 @@ METRICS = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2", "mse_f_weight_N2", "mse_f_f
 
 
 def test_the_designed_skin_is_the_law_that_its_scene_simulates():
-    lesson = taught.lesson_of(DESIGN, KIND, (0.2, 1.2), seed=0)
+    lesson = population.lesson_of(DESIGN, KIND, (0.2, 1.2), seed=0)
     law = lesson.syllabus.centre
     assert (law.gap_mm, law.amplitude, law.away_um_mm) == (1.1, 1.0, DESIGN.hold.away_um_mm)
     assert (law.modulus_MPa, law.grip_N_mm) == (pytest.approx(1e-3 * DESIGN.modulus_kPa), pytest.approx(8.75))
     assert lesson.forces_N[0] < 0.05 < 5 < lesson.forces_N[1]  # of 0.2 and 1.2 mm
     with pytest.raises(ValueError, match="hold must be"):
-        taught.lesson_of(DESIGN.model_copy(update={"hold": None}), KIND, (0.2,), seed=0)
+        population.lesson_of(DESIGN.model_copy(update={"hold": None}), KIND, (0.2,), seed=0)
 
 
 def test_a_killed_run_draws_no_part_again(monkeypatch):
@@ -45,12 +45,12 @@ def test_a_killed_run_draws_no_part_again(monkeypatch):
 
     syllabus = SimpleNamespace(spreads={}, centre=None)
     lesson = SimpleNamespace(skins=skins, syllabus=syllabus, forces_N=(1.0, 2.0), seed=0)
-    monkeypatch.setattr(taught, "PART_N", 3)
-    monkeypatch.setattr(taught.io, "load", lambda _, name: shelf.get(name))
-    monkeypatch.setattr(taught.io, "save", lambda _, name, part: shelf.update({name: part}))
-    taught.draw(lesson, 6, lambda line: None)
+    monkeypatch.setattr(population, "PART_N", 3)
+    monkeypatch.setattr(population.io, "load", lambda _, name: shelf.get(name))
+    monkeypatch.setattr(population.io, "save", lambda _, name, part: shelf.update({name: part}))
+    population.draw(lesson, 6, lambda line: None)
     drawn.clear()
-    found = taught.draw(lesson, 7, lambda line: None)
+    found = population.draw(lesson, 7, lambda line: None)
     assert [which for which in drawn if which != slice(1)] == [slice(6, 7)]  # the first skin is a part of the names
     for name in Population.__annotations__:
         np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))
@@ -106,23 +106,23 @@ def test_a_press_without_a_force_above_nothing_is_no_known_weight(nothing_N):
 
 
 def test_tables_and_figure_show_every_way():
-    rows = [{"way": way, "pokes_n": 65, "labels_n": 0, **dict.fromkeys(METRICS, STAT)} for way in show.NAMES]
+    rows = [{"way": way, "pokes_n": 65, "labels_n": 0, **dict.fromkeys(METRICS, STAT)} for way in population.NAMES]
     numbers = {
         "told": rows, "scaling": [row | {"skins_n": n} for row in rows for n in (30, 3000)], "steps_n": 5,
         "fresh": [row | {"labels_n": n} for n in (0, 5) for row in rows],
         "pool_n": 65, "skins_asked_n": 12, "rows_asked_n": 24000, "coverage_further_pct": {"map": 90.0},
         "weight_N": 5.0, "weight_sd": 0.02,
     }  # fmt: skip
-    tables = show.tables(numbers, "simulated")
+    tables = population.tables(numbers, "simulated")
     assert len(tables["population"]) == 3
     assert [*tables["population_fresh"]["labels"]] == ["0", "5"]
     held = [column for column in tables["population_fresh"] if "90 %" in column]
     assert [*tables["population_fresh"]][-4:] == [*held, "n"]  # the map, both, the network
     before = {name: value for name, value in numbers.items() if name != "fresh"}
-    assert set(tables) - set(show.tables(before, "simulated")) == {"population_fresh"}
+    assert set(tables) - set(population.tables(before, "simulated")) == {"population_fresh"}
     assert set(tables["population_scaling"]["skins taught"]) == {"30", "3000"}
     assert all("universal" in method for method in tables["population"]["method"])
-    assert "skins that the network was taught" in show.figures(numbers, {}, "simulated")["population_scaling.svg"]
+    assert "skins that the network was taught" in population.figures(numbers, {}, "simulated")["population_scaling.svg"]
 
 
 def test_boards_are_the_unit():

@@ -8,14 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import linregress, norm, spearmanr
 
-from pipeline.experiments.sensitivity.run import (
-    answer_of,
-    direction,
-    levels_of,
-    monotonic,
-    smallest_step_N,
-    told_apart,
-)
+from pipeline.experiments.sensitivity import answer_of, direction, levels_of, monotonic, smallest_step_N, told_apart
 from reskin.errors import SchemaError
 from reskin.seeds import rng_for
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.metrics import mean_squared_error, r2_score
 
-from pipeline.experiments.shear.run import answer_shear, score5
+from pipeline.experiments.shear import answer_shear, score5
 from reskin.seeds import rng_for
 
 

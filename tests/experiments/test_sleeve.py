@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.metrics import mean_squared_error
 
-from pipeline.experiments.sleeve.run import (
+from pipeline.experiments.sleeve import (
     NEAR_MM,
     Area,
     errors_mm,

@@ -6,8 +6,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from pipeline.experiments.sleeve.run import NEAR_MM, errors_mm, score_places, to_draw
-from pipeline.experiments.sleeve.show import figures, tables
+from pipeline.experiments.sleeve import NEAR_MM, errors_mm, figures, score_places, tables, to_draw
 from tests.experiments.test_sleeve import AREA, answered
 
 SVG = "{http://www.w3.org/2000/svg}"

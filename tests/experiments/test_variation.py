@@ -3,14 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.experiments.variation.run import (
-    LINES_MAX_N,
-    Visits,
-    find_visits,
-    first_of_each_board,
-    over_skins,
-    over_time,
-)
+from pipeline.experiments.variation import LINES_MAX_N, Visits, find_visits, first_of_each_board, over_skins, over_time
 from reskin.errors import ParamsError
 from reskin.seeds import rng_for
 from tests.dataset.tables import readings

@@ -1,6 +1,6 @@
 import xml.etree.ElementTree as ET
 
-from pipeline.experiments.variation.show import figures, tables
+from pipeline.experiments.variation import figures, tables
 from pipeline.report.formatting import to_markdown
 
 

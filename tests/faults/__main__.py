@@ -83,7 +83,8 @@ Written by `make faults` (`python -m tests.faults`), which injects each fault fo
 stages have finished, and then runs `dvc repro` once more. Green: the fault is told in a sentence without a traceback
 and within ten minutes, finished stages and trainings are not computed again, and the hashes of all outputs in dvc.lock
 are those of the undisturbed run. The scene is a part of scene `ci`, with the stages that `kill -9` names below; every
-other stage is an experiment, which starts, writes and fails through the same code (`core/stage.py`, `core/io.py`).
+other stage is an experiment, which starts, writes and fails through the same code (`pipeline/stage.py` and
+`reskin/io.py`).
 
 What DVC restores from its cache it does not read: an object that is read-only passes for whole. So arrays (safetensors)
 and tables (Parquet) carry checksums, and a stage, a controller or a page that reads one that was changed stops and says

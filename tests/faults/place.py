@@ -90,11 +90,11 @@ class Checkout:
 
     def stage(self, name: str, find_s: float = LIMIT_S) -> psutil.Process:
         """Wait until DVC has started a stage, and give its process."""
-        module = re.compile(rf"pipeline\.(stages\.{name}|experiments\.{name}\.run)$")
+        command = ["-m", "pipeline", name]
         until_s = time.monotonic() + find_s
         while time.monotonic() < until_s:
             for process in psutil.process_iter(["cmdline"]):
-                if any(module.match(word) for word in process.info["cmdline"] or ()) and _cwd(process) == self.folder:
+                if (process.info["cmdline"] or [])[1:4] == command and _cwd(process) == self.folder:
                     return process
             time.sleep(0.05)
         raise AssertionError(f"stage {name} must start within {find_s:.0f} s:\n{self.said()[-2000:]}")

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.experiments.verification.field import dipoles
+from pipeline.experiments.verification.signals import dipoles
 from reskin.errors import ParamsError
 from reskin.physics import magnet
 from reskin.physics.magnet import change_of_field

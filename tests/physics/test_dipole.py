@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.constants import mu_0
 
-from pipeline.experiments.verification.field import dipoles
+from pipeline.experiments.verification.signals import dipoles
 from reskin.errors import ParamsError
 from reskin.physics.magnet import MU0_4PI, field, field_of_each
 from reskin.seeds import rng_for

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from pipeline.experiments.verification import kinematics
+from pipeline.experiments.verification import mechanics
 from reskin.physics import layer
 from reskin.physics import layer as flow
 from tests.laws import broken
@@ -37,12 +37,12 @@ def det_f(at):
 @pytest.mark.parametrize("depth_m", [0.2e-3, 0.6e-3, 1.2e-3])
 def test_the_sunken_surface_lies_on_the_sphere(depth_m, base):
     # Without following the surface it is 27 % of the depth beside it at 1.2 mm.
-    assert not broken(kinematics.sunken_surface(flow.Press(H_M, TIP_M, base), depth_m))
+    assert not broken(mechanics.sunken_surface(flow.Press(H_M, TIP_M, base), depth_m))
 
 
 @pytest.mark.parametrize("base", BASES)
 def test_volume_and_base_are_kept_and_f_is_the_gradient_of_the_map(base):
-    assert not broken(kinematics.whole_flow(flow.Press(H_M, TIP_M, base), 1.2e-3))
+    assert not broken(mechanics.whole_flow(flow.Press(H_M, TIP_M, base), 1.2e-3))
 
 
 def test_the_angle_is_that_of_the_polar_decomposition():
@@ -62,7 +62,7 @@ def test_volume_is_kept_where_one_linear_step_loses_most_of_it():
 
 def test_what_flows_in_under_a_sliding_tip_flows_out_and_the_base_goes_along():
     press = flow.Press(H_M, TIP_M, "slipping")
-    assert not broken(kinematics.far_out(press, 1.2e-3))
+    assert not broken(mechanics.far_out(press, 1.2e-3))
     # Between a cone's and a cylinder's volume under the dent.
     grown_m2 = (follow(np.full(5, 9e-3), np.linspace(0, 1, 5) * H_M, base="slipping").r_m ** 2 - 9e-3**2).mean()
     assert (

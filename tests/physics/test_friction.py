@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from pipeline.experiments.verification.contact import straight_drag
+from pipeline.experiments.verification.mechanics import straight_drag
 from reskin.errors import ParamsError
 from reskin.physics.shear import drag
 

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import jv
 
-from pipeline.experiments.verification import contact, kinematics
+from pipeline.experiments.verification import mechanics
 from reskin.errors import ParamsError
 from reskin.physics import layer
 from reskin.physics.layer import Press
@@ -33,7 +33,7 @@ def field(r_m, z_m, depth_m=1.2e-3):
 
 @given(waves_kh)
 def test_the_compliance_is_that_of_50_digits(kh):
-    assert contact.bonded_compliance(np.array([kh])).holds
+    assert mechanics.bonded_compliance(np.array([kh])).holds
 
 
 def test_long_waves_hardly_sink_and_short_ones_as_in_a_half_space():
@@ -71,22 +71,22 @@ def test_the_base_is_held_and_the_surface_free_of_shear():
 def test_the_force_is_dimitriadis_where_the_tip_is_small_beside_the_layer(thickness_m, tip_radius_m, relative_depth):
     # From chi^2 on the series is low: 8 % at chi = sqrt(R d) / h = 0.5, 16 % at 1, as rings of pressure confirm.
     depth_m = min(relative_depth * thickness_m, 0.2 * tip_radius_m, 0.25 * thickness_m**2 / tip_radius_m)
-    assert contact.dimitriadis(np.array([depth_m]), Press(thickness_m, tip_radius_m, "bonded")).holds
+    assert mechanics.dimitriadis(np.array([depth_m]), Press(thickness_m, tip_radius_m, "bonded")).holds
 
 
 @pytest.mark.parametrize("tip_m", [2e-3, 3e-3, 4e-3])
 def test_the_force_is_that_of_published_solutions_scales_and_passes_through_each_contact(tip_m):
     press = Press(2e-3, tip_m, "bonded")
-    thick = contact.hertz("bonded", tip_m), *contact.sneddon(tip_m * np.array([0.1, 0.4, 0.7]), press)
-    laws = contact.long_2011(DEPTHS_M, press), *contact.scaling(DEPTHS_M, press, 1e9)
+    thick = mechanics.hertz("bonded", tip_m), *mechanics.sneddon(tip_m * np.array([0.1, 0.4, 0.7]), press)
+    laws = mechanics.long_2011(DEPTHS_M, press), *mechanics.scaling(DEPTHS_M, press, 1e9)
     assert not broken([*thick, *laws])
 
 
 @pytest.mark.parametrize("base", ["bonded", "slipping"])
 def test_rings_of_pressure_give_the_same_force_and_pull_nowhere(base):
     press = Press(2e-3, 3e-3, base)
-    assert contact.rings(1e-3, press).holds
-    _, pressure = contact.ring_pressures(1e-3, press)
+    assert mechanics.rings(1e-3, press).holds
+    _, pressure = mechanics.ring_pressures(1e-3, press)
     assert (pressure > 0).all()  # the radius is not too large: nothing pulls
     assert pressure[-1] < 0.25 * pressure[0]  # nor too small: no edge
 
@@ -94,7 +94,7 @@ def test_rings_of_pressure_give_the_same_force_and_pull_nowhere(base):
 @pytest.mark.parametrize("base", ["bonded", "slipping"])
 @pytest.mark.parametrize("depth_m", [0.6e-3, 1.2e-3])
 def test_one_small_step_keeps_volume_and_base_and_puts_the_surface_on_the_tip(base, depth_m):
-    assert not broken(kinematics.one_small_step(Press(2e-3, 3e-3, base), depth_m))
+    assert not broken(mechanics.one_small_step(Press(2e-3, 3e-3, base), depth_m))
 
 
 def test_on_the_axis_the_hoop_strain_is_that_beside_it():

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.constants import mu_0
 
-from pipeline.experiments.verification import field as laws
+from pipeline.experiments.verification import signals as laws
 from reskin.errors import ParamsError
 from reskin.physics import magnet
 from reskin.physics.magnet import MU0_4PI, Quadrature, field, place_nodes

@@ -6,14 +6,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.experiments.stability.chip import out_of_range
-from pipeline.experiments.verification import electronics
+from pipeline.experiments.verification import signals
 from reskin.physics.board import Board
 from reskin.physics.chip import ChipDesign, Overruns, read_field, read_temperature, steps_uT
 from reskin.seeds import rng_for
 from tests.laws import broken
 
 QUARTER = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-QUIET = electronics.quiet(7)
+QUIET = signals.quiet(7)
 LOUD = ChipDesign(gain_sel=7, noise_xy_uT=3.3, noise_z_uT=5.0, noise_temperature_degC=0.1)
 
 
@@ -29,7 +29,7 @@ def read(b_T, of=None, design=QUIET):
 
 @given(st.integers(0, 7), st.integers(0, 10**6))
 def test_steps_conversion_and_wrap_are_those_of_the_data_sheet(gain_sel, seed):
-    assert not broken([*electronics.steps(), *electronics.conversion(gain_sel, seed)])
+    assert not broken([*signals.steps(), *signals.conversion(gain_sel, seed)])
 
 
 def test_a_quiet_chip_within_its_range_counts_nothing():
@@ -72,7 +72,7 @@ def test_what_clips_is_the_field_that_the_chip_sees_and_not_its_offset():
 
 
 def test_noise_has_the_stated_spread_on_each_axis_and_temperature_the_steps_of_the_data_sheet():
-    assert not broken([*electronics.noise(LOUD, 0), electronics.temperature(0)])
+    assert not broken([*signals.noise(LOUD, 0), signals.temperature(0)])
     b_uT, _ = read(np.zeros((40_000, 3)), design=LOUD)
     np.testing.assert_allclose(b_uT.mean(axis=0), 0, atol=0.1)  # four times 5 uT / sqrt(n)
     read_degC = read_temperature(np.full((10_000, 5), 25.0), LOUD, rng_for(2, "sensor"))

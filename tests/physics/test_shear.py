@@ -9,7 +9,7 @@ from scipy.integrate import quad, solve_bvp
 from scipy.linalg import polar
 from scipy.special import jv
 
-from pipeline.experiments.verification import contact
+from pipeline.experiments.verification import mechanics
 from reskin.errors import ParamsError
 from reskin.physics import layer, shear
 from reskin.physics.shear import Traction
@@ -200,7 +200,7 @@ def test_the_table_gives_the_field_it_was_made_of(force):
 
 @pytest.mark.parametrize("radius_m", [0.05e-3, 0.3e-3])
 def test_on_a_thick_layer_a_tip_that_sticks_is_as_stiff_as_mindlins_and_one_that_slides_a_sixth_softer(radius_m):
-    assert not broken([contact.sticking(radius_m), contact.sliding(radius_m, TIP_M, "bonded")])
+    assert not broken([mechanics.sticking(radius_m), mechanics.sliding(radius_m, TIP_M, "bonded")])
     # mean of 6 a^2 - 3 r^2 over q ~ sqrt(a^2 - r^2) is 24/5 a^2: u = pi q0 a / 32 G * 24/5 = 9 Q / 40 G a
     assert shear.stiffness_m(hertzian(radius_m), 100.0) == pytest.approx(40 / 9 * radius_m, rel=1e-4)
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.experiments.stability import physics as stability
-from pipeline.experiments.verification import kinematics, poke
+from pipeline.experiments.verification import mechanics
 from reskin.errors import ParamsError
 from reskin.physics import flow_map, layer, magnet, slide
 from reskin.physics.board import Board
@@ -105,8 +105,8 @@ def test_cells_half_as_wide_change_a_poke_by_less_than_2_percent_and_more_layers
     # shallow poke over a seam 2 % is less than any chip can see: there the bound is a tenth of its noise, 3.3 uT.
     rules = CHOSEN, Quadrature(CHOSEN.cell_m / 2, CHOSEN.layers_n), Quadrature(CHOSEN.cell_m, 2 * CHOSEN.layers_n)
     used, *fine = (skin(SEATED, rule=rule, base=base) for rule in rules)
-    pokes_m = poke.each_depth(np.array([(x, y) for x in (-6e-3, 0.0, 4e-3) for y in (-2e-3, 6e-3)]), (depth_m,))
-    assert not broken(poke.quadrature(BOARD, used, tuple(fine), rules=rules, pokes_m=pokes_m, unseen_uT=0.33))
+    pokes_m = mechanics.each_depth(np.array([(x, y) for x in (-6e-3, 0.0, 4e-3) for y in (-2e-3, 6e-3)]), (depth_m,))
+    assert not broken(mechanics.quadrature(BOARD, used, tuple(fine), rules=rules, pokes_m=pokes_m, unseen_uT=0.33))
 
 
 def test_without_the_rotation_of_the_moments_the_change_would_be_wrong_by_more_than_itself():
@@ -155,14 +155,14 @@ def test_extreme_skins_and_pokes_end_as_they_should(base):
 @given(places_m, places_m, st.sampled_from(["checkerboard", "same"]), st.sampled_from(["bonded", "slipping"]))
 def test_turning_mirroring_and_shifting_board_and_poke_does_so_to_the_change(x_m, y_m, polarity, base):
     even = skin(polarity=polarity, base=base)
-    assert not broken(poke.symmetries(BOARD, even, polarity, np.array([[x_m, y_m]])))
+    assert not broken(mechanics.symmetries(BOARD, even, polarity, np.array([[x_m, y_m]])))
 
 
 @patient
 @given(places_m, places_m, st.floats(0.01, 5))
 def test_the_change_is_proportional_to_the_magnetisation(x_m, y_m, factor):
     skins, pokes_m = (skin(saturation_T=size_T) for size_T in (0.1, 0.1 * factor)), np.array([[x_m, y_m, DEPTH_M]])
-    assert poke.amplitude(BOARD, *skins, pokes_m=pokes_m, factor=factor).holds
+    assert mechanics.amplitude(BOARD, *skins, pokes_m=pokes_m, factor=factor).holds
 
 
 def test_a_tip_that_starts_too_high_makes_no_contact_at_a_shallow_command():
@@ -228,7 +228,7 @@ def test_tables_give_the_change_that_following_every_node_gives(thickness_mm, at
     for rung_i in (6, 16, 22):
         poke_m = np.array([1.3e-3, -2.1e-3, (1 - at) * ladder_m[rung_i] + at * ladder_m[rung_i + 1]])
         depths_m = layer.steps((float(poke_m[2]),), layer.Press(one.thickness_m, one.tip_radius_m, base))
-        truth = kinematics.followed(one, poke_m[:2], depths_m)
+        truth = mechanics.followed(one, poke_m[:2], depths_m)
         # On a bonded base nothing moves past the table's reach.
         near = np.linalg.norm(
             one.nodes_m[:, :2] - poke_m[:2], axis=1, keepdims=True

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.experiments.verification import contact
+from pipeline.experiments.verification import mechanics
 from reskin.physics import layer
 from reskin.physics import layer as slip
 
@@ -18,12 +18,12 @@ waves_kh = st.floats(0.01, 30)
 @given(waves_kh, st.floats(0.05, 0.95))
 def test_profile_and_compliance_are_those_of_a_dense_solve(kh, share):
     with mpmath.workdps(50):
-        w, z = contact.dense_profile(mpmath.mpf(kh)), mpmath.mpf(kh) * mpmath.mpf(share)
+        w, z = mechanics.dense_profile(mpmath.mpf(kh)), mpmath.mpf(kh) * mpmath.mpf(share)
         truth = [float(mpmath.diff(w, z, n)) for n in range(3)]
     found = layer.depth_profile(np.array([[kh * share]]), np.array([kh]), "slipping")
     # 1e-10: of long waves the profile is a difference of numbers 1 / (kh)^2 as large
     np.testing.assert_allclose([part.item() for part in found], truth, atol=1e-10 * np.abs(truth).max())
-    assert contact.sliding_compliance(np.array([kh])).holds
+    assert mechanics.sliding_compliance(np.array([kh])).holds
 
 
 @given(st.floats(1e-3, 300))

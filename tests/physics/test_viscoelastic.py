@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.experiments.verification import relaxation
+from pipeline.experiments.verification import signals
 from reskin.errors import ParamsError
 from reskin.physics.aging import SKIN, Memory, Prony, Relaxation, advance, force_left, relax, remembered
 from tests.laws import broken
@@ -17,11 +17,11 @@ changes = st.floats(-10, 10)
 
 @given(st.floats(1e3, 1e8), st.floats(1e-16, 1e8))
 def test_one_step_is_that_of_50_digits_however_stiff(ratio, dt_over_fastest):
-    assert relaxation.step_error(1e-3 * dt_over_fastest, relaxation.stiff(ratio)) <= relaxation.ROUNDING
+    assert signals.step_error(1e-3 * dt_over_fastest, signals.stiff(ratio)) <= signals.ROUNDING
 
 
 def test_pokes_in_a_row_and_a_held_poke_relax_as_the_relaxation_function_says():
-    assert not broken(relaxation.check_relaxation())
+    assert not broken(signals.check_relaxation())
 
 
 def test_no_time_and_no_change_leave_the_state_bit_for_bit():

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
-from pipeline.experiments.drift.run import drift
+from pipeline.experiments.drift import drift
 from pipeline.settings import Settings, read_shared_files
 from reskin import io
 from reskin.recordings.readers import eflesh

@@ -11,8 +11,8 @@ from scipy.stats import t
 from pipeline.report import paper
 from pipeline.report.checklist import checklist, claims_table, look_up, read_rows, resolve
 from pipeline.report.judging import Row, judge, p_of
-from pipeline.report.statistics import FEW_BOARDS, INCONCLUSIVE, NO, YES
 from pipeline.scenes import EXPERIMENTS
+from pipeline.statistics import FEW_BOARDS, INCONCLUSIVE, NO, YES
 from reskin.errors import SchemaError
 from tests.reporting.synthetic import all_questions, over_boards, stat
 

@@ -3,7 +3,7 @@
 import pytest
 
 from pipeline.report import numbers
-from pipeline.report.statistics import tidy
+from pipeline.statistics import tidy
 from tests.reporting.test_learned import HELD_OUT, point
 
 

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from pipeline.report.numbers import PAIRS, learned, timed_learning
-from pipeline.report.statistics import tidy
+from pipeline.statistics import tidy
 from tests.evaluation import cards
 
 HELD_OUT = {"b0": ("s0", "s1"), "b1": ("s2", "s3")}

@@ -1,6 +1,6 @@
 """The table of omissions: who does without a term, who computes it, and what stands first."""
 
-from pipeline.experiments.left_out.show import left_out_table
+from pipeline.experiments.left_out import left_out_table
 
 
 def omission(term: str, done: str, left_out_by: list[str], computed_by: list[str]) -> dict:

@@ -7,9 +7,9 @@ from pipeline.report.formatting import OF_PAPER, rounded, show, show_digits, to_
 from pipeline.report.numbers import add_up, compose, foretold, lost_by_protocol
 from pipeline.report.paper import TABLE_2
 from pipeline.report.readme import fill
-from pipeline.report.statistics import tidy
 from pipeline.report.table1 import NOT_GIVEN, OURS
 from pipeline.report.tables import make_tables
+from pipeline.statistics import tidy
 from reskin.errors import SchemaError
 from tests.evaluation import cards
 

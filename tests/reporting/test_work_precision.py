@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.experiments.runtime.rows import REFERENCE, Precision, Seconds, choose
+from pipeline.experiments.runtime import REFERENCE, Precision, Seconds, choose
 from pipeline.report.drawing import COLOURS, MARKERS
 from pipeline.report.figures import costs, failures, front, integrators, pages, quadratures
 from reskin.physics.magnet import CHOSEN

@@ -1,1 +1,50 @@
 """What the stiff, the extreme and the broken do to physics, chip, wire and learning."""
+
+from dataclasses import asdict
+from pathlib import Path
+
+from pipeline.executors import make_executor
+from pipeline.experiments.stability.cases import Case
+from pipeline.experiments.stability.chip import chip_cases
+from pipeline.experiments.stability.extremes import extreme_cases
+from pipeline.experiments.stability.physics import drag_cases, physics_cases, time_cases
+from pipeline.experiments.stability.sliding import sliding_cases
+from pipeline.experiments.stability.wire import wire_cases
+from pipeline.settings import Settings
+from pipeline.stage import say
+from pipeline.synthesis import synthesis_of
+from reskin import io
+from reskin.simulation.settings import Synthesis
+
+
+def survey(of: Synthesis, seed: int) -> list[Case]:
+    """Try every case of physics, chip and wire on the designs of a scene."""
+    board = of.main_boards.design
+    chips_n = len(board.places_mm)
+    return [
+        *time_cases(),
+        *physics_cases(board, of.spreads, skin=of.skin, seed=seed),
+        *extreme_cases(board, of.spreads, skin=of.skin, seed=seed),
+        *drag_cases(of.skin),
+        *sliding_cases(board, of.spreads, skin=of.skin, seed=seed),
+        *chip_cases(of.chip, chips_n, seed),
+        *wire_cases(of.chip.gain_sel, chips_n, seed),
+    ]
+
+
+def stability(settings: Settings, answer: Path) -> None:
+    """Try every case on the scene's own skins and chips and on small trainings, and write down what happened."""
+    with make_executor(imports="pipeline.experiments.stability.learning") as executor:
+        learning = executor.submit(_learning_cases, settings.seed)  # beside the physics
+        cases = [*survey(synthesis_of(settings), settings.seed), *learning.result()]
+    io.write_json(answer, [asdict(case) for case in cases])
+    for case in cases:
+        if not case.holds:
+            say(f"warning: {settings.scene}: {case.area}, {case.case}: {case.happened}")
+    say(f"{settings.scene}: {sum(case.holds for case in cases)} of {len(cases)} extreme cases behave as they should")
+
+
+def _learning_cases(seed: int) -> list[Case]:
+    from pipeline.experiments.stability.learning import learning_cases  # torch, late: only a worker pays for it
+
+    return learning_cases(seed)

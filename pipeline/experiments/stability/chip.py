@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Float32
 from scipy.constants import micro, milli
 
 from pipeline.experiments.stability.cases import Case, measured, observed, refused
-from pipeline.experiments.verification.electronics import quiet, read_bare
+from pipeline.experiments.verification.signals import quiet, read_bare
 from reskin.board import faults
 from reskin.board.wire import Frames
 from reskin.physics.chip import ChipDesign, steps_uT

@@ -13,7 +13,7 @@ from scipy.constants import milli, mu_0
 from scipy.special import j0, j1
 
 from pipeline.experiments.stability.cases import Case, measured
-from pipeline.experiments.verification import kinematics
+from pipeline.experiments.verification import mechanics
 from pipeline.experiments.verification.checks import no_spread
 from reskin.physics import layer, magnet, slide
 from reskin.physics.board import Board, BoardDesign, Spreads, draw_board
@@ -48,8 +48,8 @@ def deep(board: Board, skin: Skin) -> list[Case]:
     for share in DEPTHS:
         depth_m = share * skin.thickness_m
         _, (found_T,) = changes_of_field(board, skin, np.array([[*PLACE_M, depth_m]]))
-        fine_m = kinematics.descent(depth_m + skin.depth_zero_m, FINER * round(STEPS_N * share))
-        moved = kinematics.followed(skin, PLACE_M, fine_m)
+        fine_m = mechanics.descent(depth_m + skin.depth_zero_m, FINER * round(STEPS_N * share))
+        moved = mechanics.followed(skin, PLACE_M, fine_m)
         truth_T = change_of_field((skin.nodes_m, skin.moments_A_m2), moved, board.chips_m)
         error = _off(found_T, truth_T)
         cases.append(

@@ -11,10 +11,10 @@ from jaxtyping import Float
 from scipy.constants import kilo, micro, milli
 
 from pipeline.experiments.stability.cases import Case, measured, observed, peak_bytes, refused
-from pipeline.experiments.verification import kinematics, relaxation
+from pipeline.experiments.verification import mechanics, signals
 from pipeline.experiments.verification.checks import worst
-from pipeline.experiments.verification.contact import force_N
-from pipeline.experiments.verification.field import inside_a_box
+from pipeline.experiments.verification.mechanics import force_N
+from pipeline.experiments.verification.signals import inside_a_box
 from reskin.physics import layer, magnet, shear
 from reskin.physics import shear as friction
 from reskin.physics.aging import SKIN, advance
@@ -34,7 +34,7 @@ POKES_N = 2000
 BYTES_MAX_N = 1000  # a poke: 1e6 pokes in 1 GB, 120 bytes of each its result
 PATH_MM = (0.0, 0.1, 0.5, 4.0)  # of a drag
 STICKY = 1e6  # a friction that never lets go
-STIFF = relaxation.stiff(1e8)
+STIFF = signals.stiff(1e8)
 
 
 def time_cases() -> list[Case]:
@@ -48,7 +48,7 @@ def time_cases() -> list[Case]:
                  happened=f"{same_n} of {len(state)} values identical bit for bit", holds=same_n == len(state)),
         *(
             refused("time", f"a time step of {dt_s:g} s", should="refused, with the step named",
-                    attempt=partial(advance, relaxation.STATE, 1.0, dt_s, STIFF))
+                    attempt=partial(advance, signals.STATE, 1.0, dt_s, STIFF))
             for dt_s in (-1 * micro, np.nan, np.inf)
         ),
     ]  # fmt: skip
@@ -56,9 +56,9 @@ def time_cases() -> list[Case]:
 
 def _step(case: str, dt_over_fastest: float, should: str) -> Case:
     dt_s = dt_over_fastest * float(STIFF.tau_s[0])
-    found, error = advance(relaxation.STATE, 1.3, dt_s, STIFF), relaxation.step_error(dt_s, STIFF)
+    found, error = advance(signals.STATE, 1.3, dt_s, STIFF), signals.step_error(dt_s, STIFF)
     happened = f"relative error {error:.1e}, {np.count_nonzero(np.isfinite(found))} of {len(found)} values finite"
-    return measured("time", case, should=should, happened=happened, error=error, limit=relaxation.ROUNDING)
+    return measured("time", case, should=should, happened=happened, error=error, limit=signals.ROUNDING)
 
 
 def physics_cases(board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, seed: int) -> list[Case]:
@@ -180,8 +180,8 @@ def amplitude(board: Board, usual: Skin, bare: Skin, strong: Skin) -> list[Case]
 
 def single_precision(board: Board, fine: Skin) -> Case:
     rest = fine.nodes_m, fine.moments_A_m2
-    depths_m = kinematics.descent(0.5 * fine.thickness_m + fine.depth_zero_m, 1)
-    moved = kinematics.followed(fine, PLACES_M[0], depths_m)
+    depths_m = mechanics.descent(0.5 * fine.thickness_m + fine.depth_zero_m, 1)
+    moved = mechanics.followed(fine, PLACES_M[0], depths_m)
     double_T = change_of_field(rest, moved, board.chips_m)
     x, m, moved_x, moved_m, chips = (part.astype(np.float32) for part in (*rest, *moved, board.chips_m))
     # Node by node, as the product does: the difference of two large sums would lose more.

@@ -1,1 +1,47 @@
 """Each law of the simulator against a reference that shares no code with it."""
+
+from dataclasses import asdict
+from pathlib import Path
+
+from scipy.constants import milli
+
+from pipeline.experiments.verification.checks import Check
+from pipeline.experiments.verification.mechanics import check_contact, check_kinematics, check_poke, check_sideways
+from pipeline.experiments.verification.signals import check_electronics, check_field, check_frames, check_relaxation
+from pipeline.settings import Settings
+from pipeline.stage import say
+from pipeline.synthesis import synthesis_of
+from reskin import io
+from reskin.physics.layer import Press
+from reskin.simulation.settings import Synthesis
+
+
+def verify(of: Synthesis, *, depths_m: tuple[float, ...], seed: int) -> list[Check]:
+    """Measure every law against its reference, for the designs of a scene, in the order of the simulator's chain."""
+    board, skin = of.main_boards, of.skin
+    press = Press(skin.thickness_mm * milli, skin.tip_radius_mm * milli, skin.base)
+    rule = board.quadrature.quadrature()
+    return [
+        *check_field(skin, seed),
+        *check_contact(skin),
+        *check_kinematics(press, max(depths_m)),
+        *check_sideways(skin),
+        *check_poke(board.design, of.spreads, skin=skin, rule=rule, depths_m=depths_m, seed=seed),
+        *check_relaxation(),
+        *check_electronics(of.chip, seed),
+        *check_frames(of.chip.gain_sel, len(board.design.places_mm), seed),
+    ]
+
+
+def verification(settings: Settings, answer: Path) -> None:
+    """Check the scene's own skins, pokes and chips."""
+    of = synthesis_of(settings)
+    checks = verify(of, depths_m=tuple(milli * depth_mm for depth_mm in of.main.depths_mm), seed=settings.seed)
+    io.write_json(answer, [asdict(check) | {"holds": check.holds} for check in checks])
+    for check in checks:
+        if not check.holds:
+            say(
+                f"warning: {settings.scene}: {check.subject}, {check.law}: "
+                f"error {check.error:.3g}, past {check.tolerance:.3g}"
+            )
+    say(f"{settings.scene}: {sum(check.holds for check in checks)} of {len(checks)} checks of the physics hold")

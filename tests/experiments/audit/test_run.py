@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.experiments.audit.run import audit
+from pipeline.experiments.audit import audit
 from pipeline.settings import Settings
 from pipeline.stages.ingest import read_split
 from pipeline.training import trainings as _training

@@ -9,10 +9,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.experiments.audit import copies, sides
-from pipeline.experiments.audit.copies import nearest_rays
-from pipeline.experiments.audit.run import audit_choice, audit_scaler
-from pipeline.experiments.audit.sides import Labels, Sides, audit_fold, holds, to_words
+from pipeline.experiments import audit
+from pipeline.experiments.audit import (
+    Labels,
+    Sides,
+    audit_choice,
+    audit_fold,
+    audit_scaler,
+    holds,
+    nearest_rays,
+    to_words,
+)
 from reskin.errors import ParamsError, SchemaError
 from reskin.models.inputs import FIT
 from reskin.seeds import rng_for
@@ -57,7 +64,7 @@ LABELS, DB_uT = poked()
 
 
 def test_a_fold_drawn_in_the_docstring_is_as_printed():
-    outcome = doctest.testmod(sides, extraglobs={"rng": rng_for(0, "doctest")})
+    outcome = doctest.testmod(audit, extraglobs={"rng": rng_for(0, "doctest")})
     assert outcome.attempted >= 4
     assert outcome.failed == 0
 
@@ -160,8 +167,8 @@ def test_a_copied_capture_is_found_among_a_skins_many_own():
 
 
 def test_a_copy_is_found_in_a_sample_as_well(monkeypatch):
-    monkeypatch.setattr(copies, "PAIRS_MAX_N", 12_000)
-    monkeypatch.setattr(copies, "SAMPLE_MIN_N", 1)
+    monkeypatch.setattr(audit, "PAIRS_MAX_N", 12_000)
+    monkeypatch.setattr(audit, "SAMPLE_MIN_N", 1)
     planted = with_copy(DB_uT, LABELS, "b2_s1", "b0_s1", sd_uT=5, factor=1)
     check = audited(held_out(LABELS), LABELS, planted)[-1]
     assert check.found.endswith("of 25 indentations")  # 12,000 pairs over 240 training indentations and 2 captures
@@ -205,7 +212,7 @@ def test_the_order_of_rows_does_not_change_what_is_found(draw, copied, question)
 
 
 def test_the_nearest_ray_is_that_of_the_smallest_angle(monkeypatch):
-    monkeypatch.setattr(copies, "CHUNK_PAIRS_N", 100)  # several chunks
+    monkeypatch.setattr(audit, "CHUNK_PAIRS_N", 100)  # several chunks
     rng = rng_for(2, "rays")
     rows, others = (rng.normal(0, 100, (n, 6)).astype(np.float32) for n in (13, 40))
     nearest, off_uT = nearest_rays(rows, others)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.experiments.bound.run import (
+from pipeline.experiments.bound import (
     NETWORK,
     bound_of,
     expected_scores,

@@ -1,6 +1,6 @@
 """What the report says of the bound: a row a depth, and one in all with the network beside it."""
 
-from pipeline.experiments.bound.show import figures, tables
+from pipeline.experiments.bound import figures, tables
 from tests.reporting.synthetic import scores
 
 BOUND = {"accuracy_pct": 99.5, "mse_xy_mm2": 0.01, "mse_f_N2": 0.002}

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.experiments.compare.joining import POKES_MAX_N, _thin, departure
+from pipeline.experiments.compare import POKES_MAX_N, _thin, departure
 from reskin.recordings.readers import lab
 from reskin.schema import Readings
 from reskin.universal.presses import pool

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.experiments.compare import frames
-from pipeline.experiments.compare.run import Compare, beside, compare_boards, framed, remembered, see, turns_of
+from pipeline.experiments import compare
+from pipeline.experiments.compare import Compare, beside, compare_boards, framed, remembered, see, turns_of
 from reskin.config import parse, read_yaml
 from reskin.errors import ParamsError, SchemaError
 from reskin.physics import layer
@@ -91,7 +91,7 @@ def test_an_axis_that_reads_with_the_other_sign_is_named(recorded, axis):
 
 def test_one_chip_that_is_soldered_a_quarter_aside_is_named(recorded):
     db_uT = recorded.db_uT.copy()
-    db_uT[:, 3] = db_uT[:, 3] @ frames.quarter_turn(1)
+    db_uT[:, 3] = db_uT[:, 3] @ compare.quarter_turn(1)
     assert sentence(replace(recorded, db_uT=db_uT)) == (
         "Against the scene, chip 3 is turned by 90 degrees more than the scene says."
     )
@@ -112,15 +112,15 @@ def test_a_flipped_skin_is_named(recorded):
 
 
 def test_each_of_the_sixteen_ways_to_read_a_chip_is_tried_once():
-    matrices = {tuple(turn.matrix.ravel().round().astype(int)) for turn in frames.TURNS}
-    assert len(matrices) == len(frames.TURNS) == 16
-    assert frames.TURNS[0].say() == ""
-    assert all(turn.matrix[2, 2] == (1 if i < 8 else -1) for i, turn in enumerate(frames.TURNS))
+    matrices = {tuple(turn.matrix.ravel().round().astype(int)) for turn in compare.TURNS}
+    assert len(matrices) == len(compare.TURNS) == 16
+    assert compare.TURNS[0].say() == ""
+    assert all(turn.matrix[2, 2] == (1 if i < 8 else -1) for i, turn in enumerate(compare.TURNS))
 
 
 def test_a_flipped_skin_is_a_checkerboard_turned_by_a_quarter():
     plain, flipped = (replace(SETUP, skin_flipped=way).rest for way in (False, True))
-    turn = frames.quarter_turn(1)
+    turn = compare.quarter_turn(1)
     there = {
         tuple(np.round(node * 1e6).astype(int)): moment
         for node, moment in zip(plain.nodes_m, plain.moments_A_m2, strict=True)

@@ -2,7 +2,7 @@
 
 import copy
 
-from pipeline.experiments.compare.show import figures, tables
+from pipeline.experiments.compare import figures, tables
 from reskin.universal.law import Law
 from tests.reporting.test_work_precision import said
 

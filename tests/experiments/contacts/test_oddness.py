@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.metrics import roc_auc_score
 
-from pipeline.experiments.contacts.pairs import (
+from pipeline.experiments.contacts import (
     NEIGHBOURS_N,
     NOISE_uT,
     direction_distance,

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.experiments.contacts.pairs import (
+from pipeline.experiments.contacts import (
     TOLERANCE_MM,
     along_the_line,
     detect,

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.experiments.contacts.run import Contacts, on_board
+from pipeline.experiments.contacts import Contacts, on_board
 from pipeline.settings import Settings
 from pipeline.training.trainings import SceneData
 from reskin.config import read_yaml

@@ -1,6 +1,6 @@
 """What the report says of two contacts: every distance and detector, the false alarms, and the source of each row."""
 
-from pipeline.experiments.contacts.show import figures, tables
+from pipeline.experiments.contacts import figures, tables
 from tests.reporting.test_work_precision import said
 
 

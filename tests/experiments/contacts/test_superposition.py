@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pipeline.experiments.contacts import superposition as module
-from pipeline.experiments.contacts.superposition import press_on, superposition
+from pipeline.experiments import contacts as module
+from pipeline.experiments.contacts import press_on, superposition
 from reskin.physics.board import draw_board
 from reskin.physics.magnet import change_of_field
 from reskin.physics.skin import draw_skin, moved_dipoles

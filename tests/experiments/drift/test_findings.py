@@ -4,15 +4,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import ttest_rel
 
-from pipeline.experiments.drift.findings import (
-    EACH_IS_WORSE,
-    HIGHER_AND_FASTER,
-    OFFSET,
-    OVERESTIMATES,
-    findings,
-    rates,
-)
-from pipeline.report.statistics import FEW_BOARDS, INCONCLUSIVE, NO, YES
+from pipeline.experiments.drift import EACH_IS_WORSE, HIGHER_AND_FASTER, OFFSET, OVERESTIMATES, findings, rates
+from pipeline.statistics import FEW_BOARDS, INCONCLUSIVE, NO, YES
 
 FIELD = {"contact_uT": 140.0, "noload_noise_uT": 1.25}
 LATE = {

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from pipeline.experiments.drift import show as drift_pages
-from pipeline.experiments.drift.run import drift
-from pipeline.experiments.variation import show as variation_pages
-from pipeline.experiments.variation.run import variation
+from pipeline.experiments import drift as drift_pages
+from pipeline.experiments import variation as variation_pages
+from pipeline.experiments.drift import drift
+from pipeline.experiments.variation import variation
 from pipeline.settings import Settings, read_shared_files
 from reskin import io
 from reskin.data.grid import points_mm

@@ -3,7 +3,7 @@ import xml.etree.ElementTree as ET
 
 import pytest
 
-from pipeline.experiments.drift.show import figures, tables
+from pipeline.experiments.drift import figures, tables
 from pipeline.report.formatting import to_markdown
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.experiments.drift.wander import walked
+from pipeline.experiments.drift import walked
 from tests.experiments.drift.test_run import capture
 
 AFTER_N = 100

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import linregress, sem
 
-from pipeline.experiments.drift.windows import (
+from pipeline.experiments.drift import (
     POINTS_MAX_N,
     Answers,
     by_contact,

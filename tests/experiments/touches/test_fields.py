@@ -8,10 +8,19 @@ import pytest
 from pydantic import ValidationError
 from scipy.optimize import lsq_linear
 
-from pipeline.experiments.touches import fields
-from pipeline.experiments.touches.recordings import Touched, in_blocks, sort_recordings, touched
-from pipeline.experiments.touches.run import Touches, of_detection, of_forces, of_places, of_superposition
-from pipeline.experiments.touches.show import tables
+from pipeline.experiments import touches
+from pipeline.experiments.touches import (
+    Touched,
+    Touches,
+    in_blocks,
+    of_detection,
+    of_forces,
+    of_places,
+    of_superposition,
+    sort_recordings,
+    tables,
+    touched,
+)
 from reskin.data.rows import Selection
 from reskin.errors import ParamsError
 from reskin.seeds import rng_for
@@ -56,7 +65,7 @@ def test_what_is_left_over_is_what_bounded_least_squares_leaves():
     basis = np.stack([known[2], known[4]], axis=1)
     costs = [lsq_linear(basis, row.astype(float), (0, np.inf)).cost for row in db_uT]
     naive = np.sqrt(2 * np.array(costs)) / np.linalg.norm(db_uT.astype(float), axis=1)
-    np.testing.assert_allclose(fields.left_over(known, (2, 4), db_uT), naive, rtol=1e-6)  # two solvers
+    np.testing.assert_allclose(touches.left_over(known, (2, 4), db_uT), naive, rtol=1e-6)  # two solvers
 
 
 def test_fields_that_add_leave_the_pair_that_was_touched_noise_alone(cut):

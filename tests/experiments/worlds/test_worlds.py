@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from pipeline.experiments.worlds import show
-from pipeline.experiments.worlds.run import Residual, Worlds, rows_of, with_residual, worlds, worlds_of
+from pipeline.experiments import worlds as show
+from pipeline.experiments.worlds import Residual, Worlds, rows_of, with_residual, worlds, worlds_of
 from pipeline.settings import Settings, read_shared_files
 from pipeline.synthesis import synthesis_of
 from reskin import io

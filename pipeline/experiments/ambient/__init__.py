@@ -1,1 +1,0 @@
-"""Fields from outside, and iron nearby (paper section 7)."""

@@ -1,1 +1,0 @@
-"""Whether test rows leaked into training: folds, copies, scalers, settings."""

@@ -1,1 +1,0 @@
-"""How well the chips' noise lets one sensor be read, beside how well a network reads it (paper section 4)."""

@@ -1,0 +1,581 @@
+"""Recorded changes of field beside simulated ones, poke by poke."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float, Int
+from pydantic import Field
+from scipy.constants import milli
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.transform import Rotation
+
+from pipeline.experiments.answer import read_folder, write_answer
+from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
+from pipeline.report.formatting import show_digits, tabulate
+from pipeline.settings import Settings
+from pipeline.statistics import all_of, statistic, verdict, verdict_within
+from reskin.config import Strict
+from reskin.errors import ParamsError
+from reskin.physics.board import BoardDesign
+from reskin.physics.skin import SkinDesign
+from reskin.schema import Readings
+from reskin.seeds import rng_for
+from reskin.universal.law import SEVEN, START, TEN, Law, Seen, Setup, beyond_n, fit, nominal_uT, simulate_uT
+from reskin.universal.presses import Pokes, cosines, explained, growth, lengths_uT, memory, pool
+
+Side_mm = Annotated[float, Field(gt=0, le=500)]
+
+
+class Compare(Strict):
+    """How the recorded board lies under its labels and its skin, and what is put in by hand."""
+
+    design: BoardDesign
+    skin_mm: tuple[Side_mm, Side_mm]
+    skin_flipped: bool  # every field has the other sign: a checkerboard skin that lies turned by a quarter
+    labels_middle_mm: tuple[float, float]  # the label of the board's middle
+    labels_mirrored: bool  # y labels run against the board's y
+    tip_radius_mm: Annotated[float, Field(gt=0, le=50)]
+    memory: Annotated[float, Field(ge=0, lt=1)]  # part of a poke's change that stays in the next no-load reading
+
+
+# What a departure must add to the sum over chips of the cosines to be named. Assumed: chips that are read wrongly lose
+# 0.5 and more each, and a skin that sits 0.5 mm aside moves no cosine by so much.
+PENALTY = 0.1
+AXES = "xyz"
+AS_SAID = "Labels, chips and skin lie as the scene says."
+
+
+@dataclass(frozen=True)
+class Turn:
+    """A quarter turn about z, after axes of a chip changed sign."""
+
+    quarters: int
+    signs: tuple[int, int, int]
+
+    @property
+    def matrix(self) -> Float[np.ndarray, "3 3"]:
+        return quarter_turn(self.quarters) @ np.diag(self.signs)
+
+    def say(self) -> str:
+        """Say what differs from the scene, of a chip."""
+        mirrored = " and ".join(axis for axis, sign in zip(AXES, self.signs, strict=True) if sign < 0)
+        words = [f"turned by {90 * self.quarters} degrees more than the scene says"] * bool(self.quarters)
+        return " and ".join(words + [f"mirrored along {mirrored}"] * bool(mirrored))
+
+
+# Each of 16 ways once, in few words: a mirrored x turned by a half is a mirrored y. The first is the scene's own; the
+# first eight leave z alone, as labels do.
+PLAIN = [(quarters, 1, 1) for quarters in range(4)] + [(0, -1, 1), (0, 1, -1), (1, -1, 1), (1, 1, -1)]
+TURNS = [Turn(quarters, (x, y, z)) for z in (1, -1) for quarters, x, y in PLAIN]
+
+
+def quarter_turn(quarters: int) -> Float[np.ndarray, "3 3"]:
+    """Rotate by so many quarters about z."""
+    cos, sin = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarters % 4]
+    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True)
+class Found:
+    """The best way to read a recording; `chips` is where each recorded chip sits, by the scene's numbers."""
+
+    labels: Turn
+    flipped: bool
+    chips: Int[np.ndarray, " k"]
+    turns: tuple[Turn, ...]
+    cosines: Float[np.ndarray, " k"]
+    as_written: Float[np.ndarray, " k"]
+    worth: float
+
+    @property
+    def sentence(self) -> str:
+        """Name what departs from the scene."""
+        words = [f"the labels are {self.labels.say()}"] * (self.labels != TURNS[0])
+        words += ["the skin is flipped: every field has the other sign"] * self.flipped
+        words += _exchanged(self.chips)
+        for turn in dict.fromkeys(self.turns):
+            own = [i for i, found in enumerate(self.turns) if found == turn]
+            if turn != TURNS[0]:
+                words.append(f"{_name(own, len(self.turns))} {turn.say()}")
+        if not words:
+            return AS_SAID
+        return f"Against the scene, {'; '.join(words)}."
+
+
+def _name(chips: Sequence[int], chips_n: int) -> str:
+    if len(chips) == chips_n:
+        return "all chips are"
+    return f"chip {chips[0]} is" if len(chips) == 1 else f"chips {', '.join(map(str, chips))} are"
+
+
+def _exchanged(at: Int[np.ndarray, " k"]) -> list[str]:
+    moved = np.flatnonzero(at != np.arange(len(at))).tolist()
+    if len(moved) == 2:
+        return [f"chips {moved[0]} and {moved[1]} are exchanged"]
+    places = ", ".join(f"{i} sits at {at[i]}" for i in moved)
+    return [f"chips are exchanged ({places})"] if moved else []
+
+
+def check(
+    place_mm: Float[np.ndarray, "n 2"],
+    read_uT: Float[np.ndarray, "n k 3"],
+    chips_turn: Float[np.ndarray, "k 3 3"],
+    nominal: Callable[[Float[np.ndarray, "n 2"]], Float[np.ndarray, "n k 3"]],
+) -> Found:
+    """Find the best way to read pokes, their places on the board and their changes of field in the chips' axes.
+
+    The scene has the chips' turns; `nominal` simulates places, in the board's axes. A chip that sits at another's place
+    is taken to be turned as that one.
+    """
+    turns = np.stack([turn.matrix for turn in TURNS])
+    as_written, found = np.empty(0), []
+    for labels in TURNS[:8]:
+        simulated_uT = nominal(place_mm @ labels.matrix[:2, :2].T)
+        # [k recorded, k simulated, turn]: the cosine over all pokes of a recorded chip, turned, with a simulated one.
+        at_chips_uT = np.einsum("kij,nki->nkj", chips_turn, simulated_uT)
+        moments = np.einsum("nka,nlb->klab", read_uT, at_chips_uT)
+        sizes = np.linalg.norm(read_uT, axis=(0, 2))[:, None] * np.linalg.norm(simulated_uT, axis=(0, 2))
+        cosine = np.einsum("klab,tba->klt", moments, turns) / sizes[..., None]
+        if labels == TURNS[0]:
+            as_written = np.diagonal(cosine[..., 0]).copy()
+        ways = product((False, True), TURNS)
+        found += [_best(labels, flipped, common, cosine, as_written) for flipped, common in ways]
+    return max(found, key=lambda one: one.worth)
+
+
+def _best(
+    labels: Turn, flipped: bool, common: Turn, cosine: Float[np.ndarray, "k l t"], as_written: np.ndarray
+) -> Found:
+    # What all chips have in common is one departure, a little larger: a flipped skin reads as such a turn, too.
+    signed = -cosine if flipped else cosine
+    worth = signed - PENALTY * np.array([turn != common for turn in TURNS])
+    of_pair = worth.max(axis=2) - PENALTY * (1 - np.eye(len(worth)))
+    own, at = linear_sum_assignment(of_pair, maximize=True)
+    turn_i = worth[own, at].argmax(axis=1)
+    total = of_pair[own, at].sum() - PENALTY * ((labels != TURNS[0]) + flipped + 1.5 * (common != TURNS[0]))
+    turns = tuple(TURNS[i] for i in turn_i)
+    return Found(labels, flipped, at, turns, signed[own, at, turn_i], as_written, float(total))
+
+
+CHIPS_N = 5  # frames are told by chips on all sides of the middle
+# Fewer pokes tell nothing sure; more tell the same, and take seconds: on lab every third of 65 places tells it right.
+POKES_MIN_N, POKES_MAX_N = 20, 70
+
+
+def departure(blocks: Sequence[Readings], section: Compare, design: SkinDesign) -> str | None:
+    """Name what departs from the scene; None where nothing does, or where the capture cannot tell."""
+    if blocks[0].chips_n != CHIPS_N or not any(_pressed(block).any() for block in blocks):
+        return None
+    pokes = _thin(pool(blocks))
+    if len(pokes) < POKES_MIN_N or not (np.linalg.norm(pokes.db_uT, axis=(0, 2)) > 0).all():
+        return None
+    sentence = framed(see(pokes, section), setup_of(section, design), section)["sentence"]
+    return None if sentence == AS_SAID else str(sentence)
+
+
+def _pressed(readings: Readings) -> np.ndarray:
+    return np.isfinite(readings.x_mm) & np.isfinite(readings.y_mm) & (readings.Fz_N > 0)
+
+
+def _thin(pokes: Pokes) -> Pokes:
+    """Keep at most so many pokes, evenly over the recording."""
+    kept = np.unique(np.linspace(0, len(pokes) - 1, POKES_MAX_N).round().astype(int))
+    of_poke = ("group_i", "capture_i", "place_mm", "force_N", "db_uT", "noload_uT")
+    return replace(pokes, **{name: getattr(pokes, name)[kept] for name in of_poke})
+
+
+ARROWS_N = 4  # places that the figure shows
+WALK_uT = 0.5  # of the no-load field from poke to poke, assumed, where memory is simulated
+NOLOAD_READINGS_N = 10
+CURVE_N = np.geomspace(3e-4, 10.0, 46)  # forces of the curve from the lightest touch to a firm press
+LIGHT_N = 1e-3
+EVERY = 5  # of a board's places, one is on that curve
+# Friction under the tip bounds the slide: k / mu in N/mm, of none (the whole slide at any force) to a slippery tip.
+GRIPS_N_MM = (1e-6, 4.0, START.grip_N_mm, 18.0)
+
+
+def turns_of(section: Compare) -> Float[np.ndarray, "k 3 3"]:
+    """Give the rotations from the chips' axes to the board's, as the scene has them."""
+    return Rotation.from_euler("z", np.array(section.design.turns_deg)[:, None], degrees=True).as_matrix()
+
+
+def setup_of(section: Compare, design: SkinDesign) -> Setup:
+    """Put the designed skin over the scene's chips."""
+    chips_mm, flipped = np.array(section.design.places_mm), section.skin_flipped
+    return Setup(design, chips_mm, section.design.gap_mm, section.skin_mm, flipped, section.tip_radius_mm)
+
+
+def see(pokes: Pokes, section: Compare) -> Seen:
+    """Turn what was read into the board's axes."""
+    turn, chips_n = turns_of(section), pokes.db_uT.shape[1]
+    if len(turn) != chips_n:
+        rule, remedy = f"{chips_n}, as recorded", "Mend compare.design of the scene."
+        raise ParamsError(f"board {pokes.board}", "chips of compare.design", rule, len(turn), remedy)
+    place_mm = (pokes.place_mm - section.labels_middle_mm) * (1, -1 if section.labels_mirrored else 1)
+    rest_uT = np.einsum("kij,kj->ki", turn, pokes.noload_uT.mean(axis=0))
+    return Seen(pokes, place_mm, np.einsum("kij,nkj->nki", turn, pokes.db_uT), rest_uT)
+
+
+def beside(seen: Seen, simulated_uT: Float[np.ndarray, "n k 3"]) -> dict[str, Any]:
+    """Compare simulated changes with recorded ones: direction, size and growth with force."""
+    cosine, groups = cosines(simulated_uT, seen.db_uT), seen.pokes.groups
+    grown = {"recorded": growth(seen.pokes, seen.db_uT), "simulated": growth(seen.pokes, simulated_uT)}
+    return {
+        "cosine_mean": float(cosine.mean()),
+        "cosine_by_group": {name: float(cosine[seen.pokes.group_i == i].mean()) for i, name in enumerate(groups)},
+        "explained_median": float(np.median(explained(simulated_uT, seen.db_uT))),
+    } | ({"growth": grown} if None not in grown.values() else {})
+
+
+def remembered(seen: Seen, simulated_uT: Float[np.ndarray, "n k 3"], section: Compare, seed: int) -> dict[str, Any]:
+    """Find the memory of the recordings, and of simulated no-load readings into which one was put by hand."""
+    pokes = seen.pokes  # turning a chip changes no sum of products, so its axes may be any
+    rng = rng_for(seed, "compare", pokes.board)
+    walk_uT = WALK_uT * rng.standard_normal(simulated_uT.shape).cumsum(axis=0)
+    noise_uT = pokes.noise_uT / np.sqrt(NOLOAD_READINGS_N) * rng.standard_normal(simulated_uT.shape)
+    before_uT = np.roll(simulated_uT, 1, axis=0)  # the first of a capture follows none, and is not asked
+    found = {
+        "recorded": memory(pokes, pokes.db_uT, pokes.noload_uT),
+        "simulated": memory(pokes, simulated_uT, walk_uT + noise_uT + section.memory * before_uT),
+    }
+    return {"memory": found} if None not in found.values() else {}
+
+
+def curve(law: Law, setup: Setup, place_mm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " c"]:
+    """Give |dB| in uT, the median over some places, of presses with the forces of `CURVE_N`."""
+    places_mm = np.unique(place_mm.round(2), axis=0)[::EVERY]
+    at_mm, force_N = np.repeat(places_mm, len(CURVE_N), axis=0), np.tile(CURVE_N, len(places_mm))
+    length_uT = lengths_uT(simulate_uT(law, setup, at_mm, force_N)).reshape(len(places_mm), -1)
+    return np.median(length_uT, axis=0)
+
+
+def grips(seen: Seen, setup: Setup, fitted: Law) -> list[dict[str, Any]]:
+    """Fit the law anew with other frictions under the tip: what recordings tell of it, and what a touch would read.
+
+    `grip_N` is the force that takes two thirds of the slide in the skin's middle.
+    """
+    rows = []
+    for grip_N_mm in GRIPS_N_MM:
+        law = replace(fitted, grip_N_mm=grip_N_mm)
+        if grip_N_mm != fitted.grip_N_mm:
+            law = fit(seen, setup, TEN, replace(START, grip_N_mm=grip_N_mm))
+        agrees = beside(seen, simulate_uT(law, setup, seen.place_mm, seen.pokes.force_N))
+        length_uT = curve(law, setup, seen.place_mm)
+        rows.append(
+            {name: agrees[name] for name in ("cosine_mean", "explained_median", "growth") if name in agrees}
+            | {"grip_N_mm": grip_N_mm, "grip_N": grip_N_mm * milli * float(np.hypot(law.give_x_um, law.give_y_um))}
+            | {"light_uT": float(np.interp(LIGHT_N, CURVE_N, length_uT)), "curve_uT": length_uT.round(2).tolist()}
+        )
+    return rows
+
+
+def framed(seen: Seen, setup: Setup, section: Compare) -> dict[str, Any]:
+    """Say whether labels, chips and skin lie as the scene has them."""
+    found = check(
+        seen.place_mm, seen.pokes.db_uT, turns_of(section),
+        lambda at_mm: nominal_uT(setup, at_mm, seen.pokes.force_N),
+    )  # fmt: skip
+    columns = zip(found.chips.tolist(), found.as_written.tolist(), found.cosines.tolist(), found.turns, strict=True)
+    chips = [
+        {"chip": i, "at": at, "cosine_as_written": written, "cosine_best": best, "read": turn.say()}
+        for i, (at, written, best, turn) in enumerate(columns)
+    ]
+    return {"sentence": found.sentence, "chips": chips}
+
+
+def skins_of(captures: Sequence[Readings]) -> dict[str, Pokes]:
+    """Pool the captures of each skin on its board; named by the board, where that has one skin only."""
+    skins: dict[str, list[Readings]] = {}
+    for one in captures:
+        skins.setdefault(f"{one.board}/{one.skin}", []).append(one)
+    boards = [name.partition("/")[0] for name in skins]
+    names = {name: board if boards.count(board) == 1 else name for name, board in zip(skins, boards, strict=True)}
+    return {names[name]: pool(own) for name, own in skins.items()}
+
+
+def compare_boards(boards: Mapping[str, Pokes], section: Compare, design: SkinDesign, seed: int) -> tuple[Any, Any]:
+    """Compare every board; give the numbers, and what the figures draw."""
+    setup = setup_of(section, design)
+    seen = {board: see(pokes, section) for board, pokes in boards.items()}
+    fitted = {board: fit(own, setup, TEN) for board, own in seen.items()}
+    names = list(seen)
+    by_board, drawn = {}, {}
+    for i, (board, own) in enumerate(seen.items()):
+        laws, told = {"fitted": fitted[board]}, {"fitted": asdict(fitted[board])}
+        if len(names) > 1:
+            law_of = names[(i + 1) % len(names)]
+            laws["refitted"] = fit(own, setup, SEVEN, fitted[law_of])
+            told["refitted"] = asdict(laws["refitted"]) | {"law_of": law_of}
+        simulated_uT = {way: simulate_uT(law, setup, own.place_mm, own.pokes.force_N) for way, law in laws.items()}
+        simulated_uT["nominal"] = nominal_uT(setup, own.place_mm, own.pokes.force_N)
+        ways = {
+            way: beside(own, of_way) | {"beyond_n": beyond_n(laws.get(way), setup, own.pokes.force_N)}
+            for way, of_way in simulated_uT.items()
+        }
+        gripped = grips(own, setup, fitted[board])
+        curves = {f"{row['grip_N_mm']:g}": row.pop("curve_uT") for row in gripped}
+        by_board[board] = (
+            ways.pop("fitted")
+            | {"grips": gripped}
+            | ways
+            | remembered(own, simulated_uT["fitted"], section, seed)
+            | {"laws": told, "frames": framed(own, setup, section)}
+            | {"noise_uT": dict(zip("xyz", own.pokes.noise_uT.tolist(), strict=True))}
+            | {"pokes_n": len(own.pokes), "left_out_n": own.pokes.left_out_n}
+        )
+        drawn[board] = _drawn(own, simulated_uT["fitted"]) | {"curve_uT": curves}
+    numbers = {
+        "by_board": by_board, "over_boards": over_boards(by_board), "memory_put_in": section.memory,
+        "light_N": LIGHT_N, "grip_N_mm": START.grip_N_mm,
+    }  # fmt: skip
+    return numbers, {"chips_mm": setup.chips_mm.tolist(), "curve_N": CURVE_N.tolist(), "boards": drawn}
+
+
+def over_boards(by_board: Mapping[str, Any]) -> dict[str, Any]:
+    """Summarise over boards what has bounds: the board is the unit."""
+    found: dict[str, Any] = {}
+    for way in ("nominal", "fitted", "refitted"):
+        rows = [own if way == "fitted" else own[way] for own in by_board.values() if way == "fitted" or way in own]
+        values = {name: [own[name] for own in rows] for name in ("cosine_mean", "explained_median")}
+        grown = [own["growth"] for own in rows if "growth" in own]
+        values["growth_difference"] = [one["simulated"] - one["recorded"] for one in grown]
+        if rows:
+            found[way] = {name: statistic(each, boards=True) for name, each in values.items() if each}
+    return found
+
+
+def _drawn(seen: Seen, simulated_uT: Float[np.ndarray, "n k 3"]) -> dict[str, Any]:
+    # Places in the middle group, from the middle outwards.
+    own = np.flatnonzero(seen.pokes.group_i == len(seen.pokes.groups) // 2)
+    order = own[np.argsort(np.hypot(*seen.place_mm[own].T), kind="stable")]
+    chosen = order[np.unique(np.linspace(0, len(order) - 1, ARROWS_N).round().astype(int))]
+    fields = {"recorded": seen.db_uT, "simulated": simulated_uT}
+    return {
+        "group": seen.pokes.groups[len(seen.pokes.groups) // 2],
+        "places_mm": seen.place_mm[chosen].round(2).tolist(),
+        "arrows_uT": {name: of[chosen].round(1).tolist() for name, of in fields.items()},
+        "force_N": seen.pokes.force_N.round(3).tolist(),
+        "length_uT": {name: lengths_uT(of).round(1).tolist() for name, of in fields.items()},
+    }
+
+
+def read(settings: Settings) -> Compare:
+    """Read section compare."""
+    return settings.section(Compare, "compare")
+
+
+def compare(settings: Settings, indentations: Path, answer: Path) -> None:
+    """Compare the recorded boards of a scene with simulated ones."""
+    design = settings.shared_section(SkinDesign, "skin")
+    boards = skins_of(read_folder(indentations, tuple(settings.captures_in(indentations))))
+    write_answer(answer, *compare_boards(boards, read(settings), design, settings.seed))
+
+
+COSINE_MIN = {"nominal": 0.90, "fitted": 0.90, "refitted": 0.85}
+EXPLAINED_MIN, GROWTH_WITHIN, MEMORY_PCT = 0.80, 0.10, (5.0, 8.0)
+WAYS = {
+    "nominal": "nominal skin, nothing fitted", "fitted": "ten numbers, fitted on this board",
+    "refitted": "law of another board, seven refitted",
+}  # fmt: skip
+COSINE, EXPLAINED, GROWTH = "cosine", f"explained (≥ {EXPLAINED_MIN:.2f})", f"growth (within {GROWTH_WITHIN:.2f})"
+HELD = "held at the deepest"
+MEMORY = "memory, % ({:g} to {:g})".format(*MEMORY_PCT)
+NONE = "–"
+MEANING = (
+    "dB of each recorded poke, the mean in contact less the mean before, beside the simulated one at its labelled "
+    "place and recorded force. Bounds stand in brackets. Cosine: over all channels, the mean over pokes. Explained: 1 "
+    "- |simulated - recorded|² / |recorded|², the median. Growth: d log|dB| / d log F within a place, the median over "
+    "places, simulated / recorded. A board is within bounds, yes or no, by its own numbers; four boards or more are "
+    "also judged together, by the 95 % interval over them (Student's t). The form of the law, its tip radius (2 mm), "
+    "stiffening (power 3/2) and force at which the slide is gone (8 N) were chosen with both boards of scene lab in "
+    "view: only a new board tests them. Why a skin slides away from its middle is not explained. Memory, simulated / "
+    "recorded: of a poke's change in the next no-load reading; it is put in by hand, {:g} %, so that its estimator is "
+    "tested and nothing predicted. Held: pokes whose force lies beyond the deepest that the law follows (0.72 of the "
+    "thickness); they are simulated at that depth, and count like all others."
+)
+ABOUT_PARAMETERS = (
+    "Seat: the skin's middle seen from the board's. Label offset: from where a label says to where the tip is. Slide "
+    "away: how far the material under the tip goes from the skin's middle at no force, per distance from it; give: of "
+    "the rig's arm. Gap and amplitude trade against each other: neither is a measured size."
+)
+ABOUT_GRIP = (
+    "A tip slides the skin no further than its friction on the skin allows: k |u| <= mu F. k / mu = {grip_N_mm:g} N/mm "
+    "is used (springs of 7 N/mm from a recorded sideways force, friction of 0.8: params.yaml); all else is fitted anew "
+    "for each. Recordings begin above half a newton and see only the end of it: what is assumed decides the field of a "
+    "light touch. Without friction the skin would jump at contact."
+)
+ABOUT_FRAMES = (
+    "Cosines over all pokes together, with the nominal skin: read as the scene says, and in the best of all ways. A "
+    "way that departs from the scene is named if it raises the sum over chips by 0.1 and more for each departure."
+)
+TITLES = {
+    "seat_x_mm": "seat x, mm", "seat_y_mm": "seat y, mm", "rotation_deg": "rotation, degrees", "gap_mm": "gap, mm",
+    "amplitude": "amplitude", "label_x_mm": "label offset x, mm", "label_y_mm": "label offset y, mm",
+    "modulus_MPa": "Young's modulus, MPa", "away_um_mm": "slide away, µm/mm", "give_x_um": "give x, µm",
+    "give_y_um": "give y, µm",
+}  # fmt: skip
+ARROW_MM = 6.0  # the longest of a board
+BOARDS_MAX_N = 4  # of which arrows are drawn
+
+
+def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
+    """Tabulate agreement beside its bounds, what was fitted, and how labels, chips and skin lie."""
+    by_board = numbers["by_board"]
+    rows = [
+        _row(board, way, own if way == "fitted" else own[way], own["laws"].get(way, {}))
+        for board, own in by_board.items()
+        for way in WAYS
+        if way == "fitted" or way in own
+    ] + [_over_boards(way, of_way) for way, of_way in numbers["over_boards"].items()]
+    laws = [
+        {"board": board, "law": _say(way, law)} | {title: f"{law[name]:.3g}" for name, title in TITLES.items()}
+        for board, own in by_board.items()
+        for way, law in own["laws"].items()
+    ]
+    found = {
+        "compare": tabulate(rows, meaning=MEANING.format(100 * numbers["memory_put_in"])),
+        "compare_parameters": tabulate(laws, meaning=ABOUT_PARAMETERS),
+        "compare_grip": tabulate(_grips(by_board), meaning=ABOUT_GRIP.format(**numbers)),
+        "compare_frames": tabulate([_lies(*row) for row in by_board.items()], meaning=ABOUT_FRAMES),
+    }
+    for table in found.values():
+        table["source"] = source
+    return found
+
+
+def _row(board: str, way: str, own: Mapping[str, Any], law: Mapping[str, Any]) -> dict[str, str]:
+    good = [own["cosine_mean"] >= COSINE_MIN[way], own["explained_median"] >= EXPLAINED_MIN]
+    row = _cells(board, _say(way, law), f"{own['cosine_mean']:.3f}", f"{own['explained_median']:.3f}", way)
+    row[HELD] = f"{own['beyond_n']}"
+    row["cosine by file"] = ", ".join(f"{value:.3f}" for value in own["cosine_by_group"].values())
+    if "growth" in own:
+        grown = own["growth"]
+        row[GROWTH] = f"{grown['simulated']:.2f} / {grown['recorded']:.2f}"
+        good.append(abs(grown["simulated"] - grown["recorded"]) <= GROWTH_WITHIN)
+    if "memory" in own:
+        row[MEMORY] = " / ".join(f"{100 * own['memory'][side]:.1f}" for side in ("simulated", "recorded"))
+    return row | {"within bounds": "yes" if all(good) else "no"}
+
+
+def _over_boards(way: str, own: Mapping[str, Any]) -> dict[str, str]:
+    told = [
+        verdict(own["cosine_mean"], above=COSINE_MIN[way]), verdict(own["explained_median"], above=EXPLAINED_MIN)
+    ]  # fmt: skip
+    shown = [show_digits(own[name], 3) for name in ("cosine_mean", "explained_median")]
+    row = _cells(f"all ({own['cosine_mean']['n']})", WAYS[way], shown[0], shown[1], way)
+    if "growth_difference" in own:
+        row[GROWTH] = f"difference {show_digits(own['growth_difference'], 2)}"
+        told.append(verdict_within(own["growth_difference"], GROWTH_WITHIN))
+    return row | {"within bounds": all_of(told)}
+
+
+def _cells(board: str, law: str, cosine: str, explained: str, way: str) -> dict[str, str]:
+    cells = {"board": board, "simulated with": law, COSINE: f"{cosine} (≥ {COSINE_MIN[way]:.2f})"}
+    return cells | {"cosine by file": NONE, EXPLAINED: explained, GROWTH: NONE, MEMORY: NONE, HELD: NONE}
+
+
+def _grips(by_board: Mapping[str, Any]) -> list[dict[str, str]]:
+    lines = []
+    for board, own in by_board.items():
+        for row in own.get("grips", []):
+            line = {"board": board, "k / mu, N/mm": f"{row['grip_N_mm']:.3g}", "two thirds slide at, N": NONE}
+            line["two thirds slide at, N"] = f"{row['grip_N']:.2g}"
+            line |= {"cosine": f"{row['cosine_mean']:.3f}", "explained": f"{row['explained_median']:.3f}"}
+            grown = row.get("growth")
+            line[GROWTH] = f"{grown['simulated']:.2f} / {grown['recorded']:.2f}" if grown else NONE
+            lines.append(line | {"|dB| of 1 mN, µT (median place)": f"{row['light_uT']:.3g}"})
+    return lines
+
+
+def _say(way: str, law: Mapping[str, Any]) -> str:
+    return WAYS[way].replace("another board", str(law["law_of"])) if "law_of" in law else WAYS[way]
+
+
+def _lies(board: str, own: Mapping[str, Any]) -> dict[str, str]:
+    chips, noise_uT = own["frames"]["chips"], own["noise_uT"]
+    cosine = {
+        f"cosine by chip, {words}": ", ".join(f"{chip[key]:.2f}" for chip in chips)
+        for words, key in (("as written", "cosine_as_written"), ("best", "cosine_best"))
+    }
+    noise = {"noise of a reading x, y, z, µT": ", ".join(f"{value:.2g}" for value in noise_uT.values())}
+    pokes = {"pokes": str(own["pokes_n"]), "left out": str(own["left_out_n"])}
+    return {"board": board, "in one sentence": own["frames"]["sentence"]} | cosine | noise | pokes
+
+
+def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
+    """Draw the field's change at the chips for a few places, and its growth with force, recorded and simulated."""
+    boards = dict(list(drawn["boards"].items())[:BOARDS_MAX_N])
+    return {
+        "compare_arrows.svg": _arrows(boards, np.array(drawn["chips_mm"]), source),
+        "compare_growth.svg": _growth(drawn["boards"], numbers["by_board"], source),
+        "compare_touch.svg": _touch(drawn, numbers, source),
+    }
+
+
+def _touch(drawn: Mapping[str, Any], numbers: Mapping[str, Any], source: str) -> str:
+    """Draw |dB| against force from the lightest touch on: recorded presses, and the law with some frictions."""
+    boards, used = drawn["boards"], f"{numbers['grip_N_mm']:g}"
+    with drawing(4.2 * len(boards) + 0.6, 4.2) as figure:
+        panels = figure.subplots(1, len(boards), squeeze=False)[0]
+        for axes, (board, own) in zip(panels, boards.items(), strict=True):
+            look = {"color": COLOURS[0], "marker": MARKERS[0], "linestyle": "", "markersize": 3, "alpha": 0.5}
+            axes.plot(own["force_N"], own["length_uT"]["recorded"], label="recorded", **look)
+            styles = iter(("-.", ":", "--", (0, (1, 3))))
+            for grip, length_uT in own["curve_uT"].items():
+                line = {"linestyle": "-", "linewidth": 2} if grip == used else {"linestyle": next(styles)}
+                words = "any force slides it" if float(grip) < 1e-3 else f"k / μ {grip} N/mm"
+                label = f"simulated, {words}" + (" (used)" if grip == used else "")
+                axes.plot(drawn["curve_N"], length_uT, color=COLOURS[1], label=label, **line)
+            axes.set(xscale="log", yscale="log", xlabel="force / N", ylabel="|dB| / µT", title=board)
+            axes.set_ylim(bottom=0.1)
+            axes.grid(alpha=0.25)
+            axes.legend(frameon=False, fontsize=8)
+        title = f"From the lightest touch on: change of field against force ({source}; simulated: median over places)"
+        figure.suptitle(title, x=0.01, ha="left", fontsize=11)
+        return svg(figure)
+
+
+def _arrows(boards: Mapping[str, Any], chips_mm: np.ndarray, source: str) -> str:
+    columns_n = max(len(own["places_mm"]) for own in boards.values())
+    half_mm = np.abs(chips_mm).max() + 0.6 * ARROW_MM
+    with drawing(2.0 * columns_n, 4.2 * len(boards) + 0.6) as figure:
+        panels = figure.subplots(2 * len(boards), columns_n, squeeze=False)
+        for row_i, (board, own) in enumerate(boards.items()):
+            recorded_uT = np.array(own["arrows_uT"]["recorded"])
+            longest_uT = np.linalg.norm(recorded_uT[..., :2], axis=-1).max()
+            for side_i, (side, colour) in enumerate(zip(("recorded", "simulated"), COLOURS, strict=False)):
+                row = panels[2 * row_i + side_i]
+                row[0].set_ylabel(f"{board}\n{side}")
+                for axes, db_uT, place_mm in zip(row, own["arrows_uT"][side], own["places_mm"], strict=False):
+                    sides_mm = np.array(db_uT)[:, :2] * ARROW_MM / longest_uT
+                    look = {"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.014}
+                    axes.quiver(*chips_mm.T, *sides_mm.T, color=colour, **look)
+                    axes.plot(*place_mm, marker="x", color="black")
+                    for (x_mm, y_mm), (*_, z_uT) in zip(chips_mm, db_uT, strict=True):
+                        axes.text(x_mm, y_mm - 1.2, f"{z_uT:+.0f}", fontsize=6, ha="center", va="top")
+            panels[2 * row_i][0].set_title(f"longest {longest_uT:.0f} µT", fontsize=8, loc="left")
+        for axes in panels.ravel():
+            axes.set(xlim=(-half_mm, half_mm), ylim=(-half_mm, half_mm), aspect="equal", xticks=[], yticks=[])
+        title = f"Change of field at the chips ({source}; ×: poke; number: along z, µT)"
+        figure.suptitle(title, x=0.01, ha="left", fontsize=11)
+        return svg(figure)
+
+
+def _growth(boards: Mapping[str, Any], by_board: Mapping[str, Any], source: str) -> str:
+    with drawing(3.6 * len(boards) + 0.6, 3.6) as figure:
+        panels = figure.subplots(1, len(boards), squeeze=False)[0]
+        for axes, (board, own) in zip(panels, boards.items(), strict=True):
+            for side, colour, marker in zip(("recorded", "simulated"), COLOURS, MARKERS, strict=False):
+                slope = by_board[board].get("growth", {}).get(side)
+                label = side if slope is None else f"{side}: power {slope:.2f}"
+                look = {"color": colour, "marker": marker, "linestyle": "", "markersize": 3, "alpha": 0.6}
+                axes.plot(own["force_N"], own["length_uT"][side], label=label, **look)
+            axes.set(xscale="log", yscale="log", xlabel="force / N", ylabel="|dB| / µT", title=board)
+            axes.legend(frameon=False, fontsize=8)
+        figure.suptitle(f"Change of field against force ({source})", x=0.01, ha="left", fontsize=11)
+        return svg(figure)

@@ -1,1 +1,0 @@
-"""Recorded changes of field beside simulated ones, poke by poke."""

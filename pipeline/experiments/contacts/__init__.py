@@ -1,1 +1,0 @@
-"""Two contacts at once (paper section 7)."""

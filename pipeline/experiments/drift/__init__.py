@@ -1,1 +1,0 @@
-"""A skin over its contacts, by no-load policy (paper section 4, figure 5)."""

@@ -1,0 +1,231 @@
+"""Presses that never rest (paper section 7)."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
+
+from pipeline.experiments.answer import only, read_folder, read_losses, write_answer
+from pipeline.report import paper
+from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
+from pipeline.report.formatting import show_difference
+from pipeline.settings import Settings
+from pipeline.stage import say
+from pipeline.statistics import VERDICTS, negated, paired, statistic, summarise, verdict
+from reskin.data.baseline import subtract
+from reskin.data.rows import TARGETS
+from reskin.metrics import score
+from reskin.models.trained import networks_without
+
+WINDOW_N = 5  # readings that the paper takes at rest (section 3)
+FORCE_MIN_N = 0.2  # assumed: below it there is little contact to place, and a press's first and last readings lie there
+BINS_N = 5
+LAGS_MS = np.arange(-5.0, 20.05, 0.1)  # that are tried
+WAYS = ("one", "mean5", "mean5_of_middle")
+
+Answers = Callable[[Float32[np.ndarray, "f ch"]], Float32[np.ndarray, "f 3"]]
+
+
+@dataclass(frozen=True)
+class Presses:
+    """Readings of presses in order of time; `press_i` counts from 0, `duration_s` is that of the row's press."""
+
+    db_uT: Float32[np.ndarray, "f ch"]
+    true: Float64[np.ndarray, "f 3"]  # x_mm, y_mm, F_N
+    t_s: Float64[np.ndarray, " f"]
+    press_i: Int64[np.ndarray, " f"]
+    duration_s: Float64[np.ndarray, " f"]
+    scored: Bool[np.ndarray, " f"]  # enough force, and four readings of the press before it
+
+    def __len__(self) -> int:
+        return len(self.t_s)
+
+
+def presses_of(
+    db_uT: Float32[np.ndarray, "f ch"],
+    true: Float[np.ndarray, "f 3"],
+    t_s: Float64[np.ndarray, " f"],
+    indentation: Int32[np.ndarray, " f"],
+) -> Presses:
+    """Tell the presses apart; each lasts from half a frame before its first reading to half one after its last."""
+    _, first_i, press_i, frames_n = np.unique(indentation, return_index=True, return_inverse=True, return_counts=True)
+    duration_s = (t_s[first_i + frames_n - 1] - t_s[first_i]) + 1 / rate_of(t_s, press_i)
+    place = np.arange(len(t_s)) - first_i[press_i]
+    scored = (true[:, 2] >= FORCE_MIN_N) & (place >= WINDOW_N - 1)
+    return Presses(db_uT, true.astype(np.float64), t_s, press_i, duration_s[press_i], scored)
+
+
+def rate_of(t_s: Float64[np.ndarray, " f"], press_i: Int64[np.ndarray, " f"]) -> float:
+    """Measure the rate in Hz at which readings of a press follow each other."""
+    return float(1 / np.median(np.diff(t_s)[np.diff(press_i) == 0]))
+
+
+def running_mean(values: Float[np.ndarray, "f c"]) -> Float64[np.ndarray, "f c"]:
+    """Average each row with the four before it; the first four with as many as there are."""
+    total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0, dtype=np.float64)])
+    end = np.arange(1, len(values) + 1)
+    start = np.maximum(end - WINDOW_N, 0)
+    return (total[end] - total[start]) / (end - start)[:, None]
+
+
+def compare(of: Presses, networks: Sequence[Answers], *, board: str) -> dict[str, Any]:
+    """Score each reading alone, the mean of the last five, and that mean against the middle one's truth.
+
+    All presses are on one skin of this `board`: `paired` compares both ways that answer at once, and has no interval.
+    """
+    mean_uT = running_mean(of.db_uT).astype(np.float32)
+    alone, meant = ([network(one) for network in networks] for one in (of.db_uT, mean_uT))
+    answers = {"one": alone, "mean5": meant, "mean5_of_middle": meant}
+    edges_s = np.geomspace(of.duration_s.min(), of.duration_s.max() * (1 + 1e-9), BINS_N + 1)
+    by_duration = []
+    for low_s, high_s in pairwise(edges_s):
+        own = of.scored & (of.duration_s >= low_s) & (of.duration_s < high_s)
+        if own.any():
+            presses_n = len(np.unique(of.press_i[own]))
+            words = {"duration_s": float(np.sqrt(low_s * high_s)), "n": int(own.sum()), "presses_n": presses_n}
+            by_duration.append(words | _scores(of, answers, own, board))
+    return {
+        "readings_n": int(of.scored.sum()),
+        "presses_n": len(np.unique(of.press_i[of.scored])),
+        "rate_hz": rate_of(of.t_s, of.press_i),
+        "window_n": WINDOW_N,
+        "force_min_N": FORCE_MIN_N,
+        "by_duration": by_duration,
+        "all": _scores(of, answers, of.scored, board),
+        "lag_ms": {way: lags(of, [one[:, 2] for one in answers[way]]) for way in ("one", "mean5")},
+    }
+
+
+def lags(of: Presses, force_N: Sequence[Float[np.ndarray, " f"]]) -> dict[str, float]:
+    """Find by how many ms the answered forces lag behind the true ones, over presses and networks."""
+    found_ms = [
+        lag_ms(of.t_s[rows], answer_N[rows], of.t_s[own], of.true[own, 2])
+        for own in (of.press_i == press_i for press_i in np.unique(of.press_i[of.scored]))
+        for rows in [own & of.scored]
+        if rows.sum() > WINDOW_N
+        for answer_N in force_N
+    ]
+    return statistic(found_ms) if found_ms else {"n": 0}
+
+
+def lag_ms(
+    t_s: Float64[np.ndarray, " f"],
+    answer_N: Float[np.ndarray, " f"],
+    true_t_s: Float64[np.ndarray, " g"],
+    true_N: Float64[np.ndarray, " g"],
+) -> float:
+    """Give the delay of the true force, times whatever factor, that lies nearest to the answers (least squares)."""
+    delayed_N = np.interp(t_s[None] - LAGS_MS[:, None] / 1e3, true_t_s, true_N)
+    explained = (delayed_N @ answer_N) ** 2 / (delayed_N**2).sum(axis=1)
+    return float(LAGS_MS[int(np.argmax(explained))])
+
+
+def _scores(
+    of: Presses, answers: Mapping[str, Sequence[Any]], rows: Bool[np.ndarray, " f"], board: str
+) -> dict[str, Any]:
+    # The middle of the last five readings is two before the last, and in the same press where a row is scored.
+    middle = np.flatnonzero(rows) - WINDOW_N // 2
+    true = {"one": of.true[rows], "mean5": of.true[rows], "mean5_of_middle": of.true[middle]}
+    scores = {way: pd.DataFrame([score(true[way], one[rows]) for one in answers[way]]) for way in WAYS}
+    sides = (scores[way].assign(board=board, skin="") for way in ("mean5", "one"))
+    return {way: summarise(own) for way, own in scores.items()} | {"paired": {"mean5_minus_one": paired(*sides)}}
+
+
+def dynamics(settings: Settings, indentations: Path, models: Path, answer: Path) -> None:
+    """Ask the networks of train_multi that never saw the pressed skin's board."""
+    one = only(read_folder(indentations), indentations)
+    true = np.stack([getattr(one, name) for name in TARGETS], axis=1)
+    presses = presses_of(subtract(one.b_uT, one.noload_uT), true, one.t_s, one.indentation)
+    numbers = compare(presses, networks_without(models, one.board), board=one.board)
+    write_answer(answer, numbers, {}, read_losses(indentations, {}))
+    of_presses = f"{numbers['presses_n']} presses at {numbers['rate_hz']:.0f} Hz"
+    say(f"{settings.scene}: {numbers['readings_n']} readings of {of_presses}")
+
+
+MEANING = (
+    "Half-sine presses at random places of the grid, every frame read. The model is the paper's network, trained on "
+    "readings at rest of other boards. Scored are readings with four before them in the press and some force. The mean "
+    "of the last five readings is the paper's protocol at rest; in a press the five see different depths. Against the "
+    "force of its middle reading the same mean shows what of its error is lag: an answer that comes two frames late. "
+    "Presses of one duration differ from those of another in depth and place too: compare the ways, at each duration. "
+    f"± is the sd over network seeds; all presses are on one board. {VERDICTS}"
+)
+WAY_NAMES = {
+    "one": "each reading alone",
+    "mean5": "mean of the last five",
+    "mean5_of_middle": "the same, two frames late",
+}
+LESS = "less force error than each reading alone, N²"  # column
+TICKS_S = (0.05, 0.1, 0.2, 0.5, 1.0)
+METRICS = {"accuracy_pct": "accuracy / %", "mse_xy_mm2": "MSE_xy / mm²", "mse_f_N2": "MSE_F / N²"}
+
+
+def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
+    """Show the errors of each way by duration of the press, and over all presses; the paper has none."""
+    rows = [(f"{one['duration_s']:.2g}", one) for one in numbers["by_duration"]]
+    rows.append(("all", numbers["all"] | {"n": numbers["readings_n"], "presses_n": numbers["presses_n"]}))
+    table = pd.DataFrame(
+        {
+            "press lasts about, s": label,
+            "presses": one["presses_n"],
+            "readings": one["n"],
+            "answered by": words,
+            **{title: _show(one[way].get(name)) for name, title in METRICS.items()},
+            "lag / ms": _show(_lag(numbers, way)) if label == "all" else "",
+            LESS: _less(one) if way == "mean5" else "",
+            "paper": paper.DYNAMICS if label == "all" and way == "one" else "",
+            "source": source,
+        }
+        for label, one in rows
+        for way, words in WAY_NAMES.items()
+    )
+    table.attrs["meaning"] = MEANING
+    return {"dynamics": table}
+
+
+def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
+    """Draw errors of force and place against the press's duration."""
+    with drawing(7.6, 3.8) as figure:
+        panels = figure.subplots(1, 2)
+        # A press stays where it is: against the middle's place the mean is as good as against the last one's.
+        for axes, name, ways_n in zip(panels, ("mse_f_N2", "mse_xy_mm2"), (3, 2), strict=True):
+            for i, (way, words) in enumerate(list(WAY_NAMES.items())[:ways_n]):
+                points = [(one["duration_s"], one[way][name]) for one in numbers["by_duration"] if name in one[way]]
+                duration_s = [where for where, _ in points]
+                mean, sd = ([one.get(part, 0.0) for _, one in points] for part in ("mean", "sd"))
+                axes.errorbar(
+                    duration_s, mean, sd, color=COLOURS[i], marker=MARKERS[i], markersize=4.5, linewidth=1.2,
+                    capsize=2, label=words,
+                )  # fmt: skip
+            axes.set(xscale="log", xlabel="duration of the press / s", ylabel=METRICS[name])
+            axes.set_xticks(TICKS_S, [f"{one:g}" for one in TICKS_S])
+            axes.minorticks_off()
+            axes.set_ylim(bottom=0)
+        handles, labels = panels[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
+        figure.suptitle(f"Presses read at {numbers['rate_hz']:.0f} Hz ({source})", x=0.01, ha="left", fontsize=11)
+        return {"dynamics.svg": svg(figure)}
+
+
+def _less(one: Mapping[str, Any]) -> str:
+    """Judge whether the mean of the last five readings has less force error than each reading alone."""
+    if "paired" not in one or "mse_f_N2" not in one["paired"]["mean5_minus_one"]:
+        return "–"  # no force is known, or an older run
+    difference = one["paired"]["mean5_minus_one"]["mse_f_N2"]
+    return f"{verdict(negated(difference))}: {show_difference(difference)}"
+
+
+def _lag(numbers: Mapping[str, Any], way: str) -> Mapping[str, float] | None:
+    lag: Mapping[str, float] = numbers["lag_ms"].get(way, {})
+    return lag if "mean" in lag else None
+
+
+def _show(value: Mapping[str, float] | None) -> str:
+    if value is None:
+        return "–"
+    return f"{value['mean']:.3g}" + (f" ± {value['sd']:.2g}" if "sd" in value else "")

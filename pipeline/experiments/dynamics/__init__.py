@@ -1,1 +1,0 @@
-"""Presses that never rest (paper section 7)."""

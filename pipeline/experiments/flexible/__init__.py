@@ -1,1 +1,0 @@
-"""Networks of rigid boards on flexible ones (paper section 5)."""

@@ -1,1 +1,0 @@
-"""A gripper that holds a force by our estimate of it."""

@@ -1,0 +1,334 @@
+"""What the physics leaves out, and what that costs."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+from magpylib.core import magnet_cuboid_Bfield
+from scipy.constants import micro, milli
+from scipy.spatial.transform import Rotation
+
+from pipeline.experiments.runtime import box_m, midpoints
+from pipeline.settings import Settings
+from pipeline.stage import say
+from pipeline.synthesis import synthesis_of
+from reskin import io
+from reskin.data.grid import CENTRE_MM
+from reskin.physics import aging, chip, layer, magnet
+from reskin.physics import layer as flow
+from reskin.physics import magnet as nodes
+from reskin.physics.aging import Ageing, Memory, Relaxation
+from reskin.physics.board import Board, draw_board
+from reskin.physics.magnet import change_of_field
+from reskin.physics.shear import Friction
+from reskin.physics.skin import Skin, beyond_verified_n, changes_of_field, draw_skin, forces, moved_dipoles
+from reskin.seeds import rng_for
+from reskin.simulation.capture import roster
+from reskin.simulation.contact import Response, Terms, push, respond
+from reskin.simulation.protocols import Plan
+from reskin.simulation.settings import MAIN, Synthesis
+
+# Sizes of the terms that a scene leaves out: the design values of PHYSICS 5 (assumed there).
+AGEING = Ageing(settling=0.10, ageing=0.01, fading_per_decade=0.005, wandering_uT=0.2)
+RELAXATION = Relaxation(approach_s=0.5, hold_s=0.5)
+MEMORY = Memory(share=(0.11, 0.1), tau_s=(5.0, 60.0), contact_s=5.0, rest_s=1.0)
+WARMER_K = 1.0
+EARTH_T = np.array([20e-6, 0.0, -45e-6])  # some place of middle latitude
+PLACES_M = ((4e-3, 2e-3), (-6e-3, 4e-3))  # pokes for what moves inside the skin: flank and edge
+BOXES = nodes.Quadrature(cell_m=1.5e-3, layers_n=3)  # whose own field is summed
+FRICTION = Friction(coefficient=0.8)  # 0.5-1.2, assumed (PHYSICS 4)
+FEW = 5
+COARSE = nodes.Quadrature(cell_m=1.2e-3, layers_n=4)  # where every node is followed by itself, or is a box of its own
+
+
+@dataclass(frozen=True)
+class Omission:
+    """One term: rms error of the change of field and of the force in %, largest error of the field at rest in uT."""
+
+    term: str
+    done: str  # "left out", "kept"
+    field_pct: float | None
+    rest_uT: float | None
+    force_pct: float | None
+    how: str
+    left_out_by: tuple[str, ...] = ()  # protocols; none of a term that is no protocol's to ask for
+    computed_by: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What everything is measured on: the first skin of the main protocol, and that protocol."""
+
+    board: Board
+    skin: Skin
+    coarse: Skin  # the same skin on fewer nodes
+    plan: Plan
+    tip_m: Float[np.ndarray, "n p 3"]
+    used: tuple[str, ...]
+
+
+def measure(of: Synthesis, *, seed: int) -> list[Omission]:
+    """Measure every term of PHYSICS 8 on a scene."""
+    subject = _subject(of, seed)
+    without = _feel(subject, Terms(), seed)
+    of_protocols = *_over_time(subject, without, seed), _temperature(subject, without), _friction(subject)
+    return [
+        *(_by_protocol(omission, of) for omission in of_protocols),
+        _earth(without), *_hold(subject), *_inside(subject), *_free_edge(subject), _steps(without, of),
+        _own_field(subject, of), _too_deep(of, seed),
+    ]  # fmt: skip
+
+
+def _by_protocol(omission: Omission, of: Synthesis) -> Omission:
+    """Name the protocols that leave a term out, and those that compute it."""
+    computed = tuple(name for name, protocol in of.protocols.items() if omission.term in protocol.terms)
+    return replace(
+        omission, left_out_by=tuple(name for name in of.protocols if name not in computed), computed_by=computed
+    )
+
+
+def _subject(of: Synthesis, seed: int) -> Subject:
+    kind, (board, skin) = of.main_boards, roster(of, MAIN)[0]
+    plan = of.main.plan(rng_for(seed, "left out"), kind.skin_mm)
+    tip_mm = np.stack([plan.x_mm - CENTRE_MM, plan.y_mm - CENTRE_MM, plan.depth_mm], axis=2)
+    return Subject(
+        draw_board(kind.design, of.spreads, seed=seed, name=board),
+        draw_skin(of.skin, of.spreads, seed=seed, name=skin, rule=kind.quadrature.quadrature()),
+        draw_skin(of.skin, of.spreads, seed=seed, name=skin, rule=COARSE),
+        plan,
+        tip_mm * milli,
+        of.main.terms,
+    )
+
+
+def _over_time(on: Subject, without: Response, seed: int) -> list[Omission]:
+    """Feel the whole protocol with a term, and compare with what was felt without."""
+    n, slack = len(on.plan), RELAXATION
+    rows = []
+    for name, terms, how in (
+        ("ageing", Terms(ageing=AGEING), f"at the last of {n} contacts, a no-load reading before each"),
+        ("relaxation", Terms(relaxation=slack), f"{slack.approach_s:g} s down, held for {slack.hold_s:g} s"),
+        ("memory", Terms(memory=MEMORY), f"pokes held for {MEMORY.contact_s:g} s, {MEMORY.rest_s:g} s between them"),
+    ):
+        felt = _feel(on, terms, seed)
+        rest_uT = np.abs(felt.rest_T[-1] - without.rest_T[-1]).max() / micro
+        force_pct = _error_pct(without.force_N[-1], felt.force_N[-1])
+        field_pct = _error_pct(without.change_T, felt.change_T)
+        rows.append(Omission(name, _done(name, on), field_pct, float(rest_uT), force_pct, how))
+    return rows
+
+
+def _temperature(on: Subject, without: Response) -> Omission:
+    factor = aging.remanence(np.array([WARMER_K]))[0]
+    rest_uT = float(np.abs((factor - 1) * without.rest_T).max() / micro)
+    field_pct = _error_pct(without.change_T, factor * without.change_T)
+    how = f"{WARMER_K:g} K warmer, a no-load reading before each contact"
+    return Omission("temperature", _done("temperature", on), field_pct, rest_uT, 0.0, how)
+
+
+def _friction(on: Subject) -> Omission:
+    tip_m, pressed = on.tip_m[:FEW], changes_of_field(on.board, on.skin, on.tip_m[:FEW].reshape(-1, 3))[1]
+    pushed = push(on.board, on.skin, tip_m, tilt=on.plan.tilt[:FEW], how=FRICTION)
+    field_pct = _error_pct(pressed.reshape(pushed.change_T.shape), pushed.change_T)
+    force_pct = 100 * float(np.abs(pushed.force_N).max() / forces(on.skin, tip_m[..., 2].ravel()).max())
+    how = f"coefficient {FRICTION.coefficient:g}, {FEW} indentations of the protocol: nothing moves sideways"
+    return Omission("friction", _done("friction", on), field_pct, 0.0, force_pct, how)
+
+
+def _earth(without: Response) -> Omission:
+    """Add a steady field to no-load reading and contact alike, and take one from the other."""
+    rest_T = without.rest_T[:, None] + EARTH_T
+    seen_T = (rest_T + without.change_T) - rest_T
+    how = "a steady field, as long as the board does not turn; a no-load reading before each contact"
+    rest_uT = float(np.abs(EARTH_T).max() / micro)
+    return Omission("the earth's field", "left out", _error_pct(without.change_T, seen_T), rest_uT, 0.0, how)
+
+
+def _hold(on: Subject) -> list[Omission]:
+    """Let an endless layer slide freely, and press it as a linear elastic one."""
+    if on.skin.hold is None:
+        return []
+    free, deepest_m = replace(on.skin, hold=None), np.array([on.tip_m[..., 2].max()])
+    pokes_m = on.tip_m[:FEW].reshape(-1, 3)
+    held_T, free_T = (changes_of_field(on.board, skin, pokes_m)[1] for skin in (on.skin, free))
+    force_pct = _error_pct(forces(free, deepest_m), forces(on.skin, deepest_m))
+    how = (
+        f"an endless layer that slides freely, its force linear elasticity's; {FEW} indentations, force at the deepest"
+    )
+    return [Omission("the base's hold", "kept", _error_pct(free_T, held_T), 0.0, force_pct, how)]
+
+
+def _free_edge(on: Subject) -> list[Omission]:
+    """Let a sliding skin end: a free disc stretches by c r / 3 R^2 on top of the c / r of an endless one."""
+    if on.skin.base == "bonded":
+        return []
+    depth_m = float(on.tip_m[..., 2].max())
+    poke_m = np.array([[*on.skin.seat_m, depth_m]])
+    [(_, before, after)] = moved_dipoles(on.skin, poke_m)
+    edge_m = min(on.skin.sides_m) / 2
+    away_m, then_m = (part[0][:, :2] - on.skin.seat_m for part in (before, after))
+    far = np.argmax(np.hypot(*away_m.T))
+    grown_m2 = float((then_m[far] ** 2).sum() - (away_m[far] ** 2).sum())
+    stretched_m = np.column_stack([then_m * (1 + grown_m2 / 2 / (3 * edge_m**2)) + on.skin.seat_m, after[0][:, 2]])
+    endless_T = change_of_field(before, after, on.board.chips_m)
+    ended_T = change_of_field(before, (stretched_m, after[1]), on.board.chips_m)
+    how = f"a free disc of {2 * edge_m / milli:g} mm, plane stress, poked in its middle to {depth_m / milli:.2g} mm"
+    return [Omission("the skin's free edge", "left out", _error_pct(endless_T, ended_T), 0.0, None, how)]
+
+
+def _inside(on: Subject) -> list[Omission]:
+    """Move the material of a few pokes as the scene does, and as it would without one part of the physics."""
+    skin, depth_m = on.skin, float(on.tip_m[..., 2].max()) + on.skin.depth_zero_m
+    base: layer.Base = "bonded" if skin.base == "slipping" else "slipping"
+    press = flow.Press(skin.thickness_m, skin.tip_radius_m, skin.base)
+    swapped = replace(press, base=base)
+    true = _flow(on, depth_m, press)
+    wrong_N, true_N = (
+        layer.force(np.array([depth_m]), **asdict(pressed), modulus_Pa=skin.modulus_Pa) for pressed in (swapped, press)
+    )
+    cases: dict[str, tuple[list[Moved], float, str]] = {
+        "rotation of the magnetisation": ([(r, z, np.zeros_like(a)) for r, z, a in true], 0.0, "moments do not turn"),
+        "increments": (
+            [_one_shot(on, place_m, depth_m, press) for place_m in PLACES_M], 0.0, "one linear step to the full depth",
+        ),
+        f"{skin.base} base": (
+            _flow(on, depth_m, swapped), _error_pct(wrong_N, true_N), f"a {base} base",
+        ),
+    }  # fmt: skip
+    true_T, pokes = _change(on, true), f"{len(PLACES_M)} pokes of {depth_m / milli:.2g} mm"
+    return [
+        Omission(term, "kept", _error_pct(_change(on, moved), true_T), 0.0, force_pct, f"{how}; {pokes}")
+        for term, (moved, force_pct, how) in cases.items()
+    ]
+
+
+Moved = tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"], Float[np.ndarray, " s"]]  # r_m, z_m, angle_rad
+
+
+def _flow(on: Subject, depth_m: float, press: flow.Press) -> list[Moved]:
+    """Follow the material from every place at once: the same pressures carry it."""
+    r_m = np.concatenate([np.hypot(*(on.coarse.nodes_m[:, :2] - place_m).T) for place_m in PLACES_M])
+    z_m = np.tile(on.coarse.nodes_m[:, 2], len(PLACES_M))
+    end = flow.follow(r_m, z_m, flow.steps((depth_m,), press), press=press)[-1]
+    moved = (np.split(values, len(PLACES_M)) for values in (end.r_m, end.z_m, flow.angle(end.f)))
+    return list(zip(*moved, strict=True))
+
+
+def _one_shot(on: Subject, place_m: tuple[float, float], depth_m: float, press: flow.Press) -> Moved:
+    r_m, z_m = np.hypot(*(on.coarse.nodes_m[:, :2] - place_m).T), on.coarse.nodes_m[:, 2].copy()
+    u = layer.displacement(r_m, z_m, layer.waves(press.contact(depth_m), press.thickness_m, press.base))
+    return r_m + u.r_m, z_m + u.z_m, (u.r_z - u.z_r) / 2
+
+
+def _change(on: Subject, moved: Sequence[Moved]) -> Float[np.ndarray, "p k 3"]:
+    """Sum what the material of each poke changes."""
+    skin, changes_T = on.coarse, []
+    for place_m, (moved_r_m, moved_z_m, angle_rad) in zip(PLACES_M, moved, strict=True):
+        away_m = skin.nodes_m[:, :2] - place_m
+        r_m = np.hypot(*away_m.T)
+        out = away_m / np.where(r_m > 0, r_m, 1.0)[:, None]
+        moved_m = np.column_stack([place_m + out * moved_r_m[:, None], moved_z_m])
+        axis = np.column_stack([-out[:, 1], out[:, 0], np.zeros(len(out))])
+        moments = Rotation.from_rotvec(angle_rad[:, None] * axis).apply(skin.moments_A_m2)
+        changes_T.append(change_of_field((skin.nodes_m, skin.moments_A_m2), (moved_m, moments), on.board.chips_m))
+    return np.array(changes_T)
+
+
+def _steps(without: Response, of: Synthesis) -> Omission:
+    change_uT = without.change_T / micro
+    step_uT = chip.steps_uT(of.chip.gain_sel)
+    share = np.sqrt((step_uT**2 / 12).mean() / (change_uT**2).mean())
+    return Omission("the chips' steps", "kept", float(100 * share), float(step_uT.max() / 2), 0.0, "rounding alone")
+
+
+def _own_field(on: Subject, of: Synthesis) -> Omission:
+    """Let the powder feel the field that it makes itself, once, and see what that changes (boxes, magpylib)."""
+    rest = midpoints(on.skin.thickness_m, BOXES)
+    b_T = magnet.array_field(rest.nodes_m, on.skin.thickness_m, of.skin.polarity)
+    sizes = {"saturation_T": of.skin.saturation_T, "half_field_T": of.skin.half_field_T}
+    j_T, boxes_n = magnet.magnetise(b_T, **sizes), len(b_T)
+    away_m = (rest.nodes_m[:, None] - rest.nodes_m).reshape(-1, 3)
+    boxes_m = np.tile(box_m(on.skin.thickness_m, BOXES), (boxes_n**2, 1))
+    own_T = magnet_cuboid_Bfield(away_m, boxes_m, np.tile(j_T, (boxes_n, 1))).reshape(boxes_n, boxes_n, 3).sum(axis=1)
+    with_own_T = magnet.magnetise(b_T + own_T - j_T, **sizes)  # B less J, mu0 H, is what acts on the powder
+    pokes_m = np.array([(*place_m, float(on.tip_m[..., 2].max())) for place_m in PLACES_M])
+    nodes_m = rest.nodes_m + np.append(on.skin.seat_m, 0.0)
+    moments_A_m2 = [magnet.moments(each_T, rest.volumes_m3) for each_T in (j_T, with_own_T)]
+    skins = [replace(on.skin, nodes_m=nodes_m, moments_A_m2=each_A_m2) for each_A_m2 in moments_A_m2]
+    changes_T = [changes_of_field(on.board, skin, pokes_m)[1] for skin in skins]
+    how = (
+        f"{boxes_n} boxes, first order, {len(PLACES_M)} pokes; of the magnetisation {_error_pct(j_T, with_own_T):.2g} %"
+    )
+    return Omission("the powder's own field", "left out", _error_pct(*changes_T), None, 0.0, how)
+
+
+def _too_deep(of: Synthesis, seed: int) -> Omission:
+    """Count, over all skins, the stops that are deeper than any published solution vouches for."""
+    depth_m = milli * of.main.plan(rng_for(seed, "left out"), of.main_boards.skin_mm).depth_mm.ravel()
+    skins = [draw_skin(of.skin, of.spreads, seed=seed, name=skin, rule=COARSE) for _, skin in roster(of, MAIN)]
+    share_pct = 100 * sum(beyond_verified_n(skin, depth_m) for skin in skins) / (len(depth_m) * len(skins))
+    how = f"{share_pct:.3g} % of the stops of {len(skins)} skins are past 0.6 of the thickness: nothing published there"
+    return Omission("depths past 0.6 of the thickness", "kept", None, None, None, how)
+
+
+def _feel(on: Subject, terms: Terms, seed: int) -> Response:
+    return respond(on.board, on.skin, on.tip_m, tilt=on.plan.tilt, terms=terms, rng=rng_for(seed, "left out", "walk"))
+
+
+def _done(term: str, on: Subject) -> str:
+    return "kept" if term in on.used else "left out"
+
+
+def _error_pct(without: Float[np.ndarray, "..."], true: Float[np.ndarray, "..."]) -> float:
+    return float(100 * np.linalg.norm(without - true) / np.linalg.norm(true))
+
+
+def left_out(settings: Settings, answer: Path) -> None:
+    """Measure every term on the scene's own first skin, and name the protocols that do without it."""
+    of, seed = synthesis_of(settings), settings.seed
+    omissions = measure(of, seed=seed)
+    io.write_json(answer, [asdict(omission) for omission in omissions])
+    left = ", ".join(omission.term for omission in omissions if omission.done == "left out")
+    say(f"{settings.scene}: left out by the main protocol, and measured: {left}")
+
+
+MEANING = (
+    "Errors that leaving a term out makes, measured on this scene's first skin under the main protocol, whichever "
+    "protocols leave it out: of all changes of field together (root "
+    "of the mean square), the largest of the field at rest before the no-load reading is taken off, and of the force. "
+    "Not quantified, and always left out: the skin's corner tabs, and its screws one by one: all of it is held alike."
+)
+
+
+def left_out_table(rows: Sequence[Mapping[str, Any]], source: str) -> pd.DataFrame:
+    """Show every term and the protocols that leave it out; what the main protocol leaves out first."""
+    ordered = sorted(rows, key=lambda row: row["done"] != "left out")
+    table = pd.DataFrame(
+        {
+            "term": row["term"],
+            "in this scene": _where(row),
+            "error of the change of field, %": _show(row["field_pct"]),
+            "error of the field at rest, µT": _show(row["rest_uT"]),
+            "error of the force, %": _show(row["force_pct"]),
+            "measured": row["how"],
+            "source": source,
+        }
+        for row in ordered
+    )
+    table.attrs["meaning"] = MEANING
+    return table
+
+
+def _where(row: Mapping[str, Any]) -> str:
+    by = {"left out": row["left_out_by"], "computed": row["computed_by"]}
+    return "; ".join(f"{what}: {', '.join(protocols)}" for what, protocols in by.items() if protocols) or row["done"]
+
+
+def _show(value: float | None) -> str:
+    if value is None:
+        return "–"
+    return f"{value:.0f}" if value >= 10 else f"{value:.2g}"

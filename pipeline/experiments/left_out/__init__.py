@@ -1,1 +1,0 @@
-"""What the physics leaves out, and what that costs."""

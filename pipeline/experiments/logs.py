@@ -1,0 +1,221 @@
+"""Force and place from an SD card's log (paper section 6)."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Bool, Float, Float32, Float64
+from scipy.constants import micro
+from scipy.spatial.transform import Rotation
+
+from pipeline.experiments.ambient import Instrument, guessed_uT, seen_uT, take_board
+from pipeline.experiments.answer import only, write_answer
+from pipeline.report import paper
+from pipeline.report.drawing import COLOURS, drawing, svg
+from pipeline.settings import Settings
+from pipeline.stage import say
+from pipeline.synthesis import synthesis_of
+from reskin.live.contacts import Answers, contacts_n, describe, estimate, estimate_after, score_contacts, thin, truth_at
+from reskin.models.trained import networks_without
+from reskin.physics.ambient import EARTH_SIZE_T, EARTH_T
+from reskin.recordings import probe
+from reskin.recordings.header import LOG_FILE, PROBE_FILE
+from reskin.recordings.ingest import read_header
+from reskin.recordings.readers import sd_card
+from reskin.seeds import rng_for
+
+PITCHES_DEG = (0.0, 10.0, 20.0, 45.0)  # assumed: how far a shoe leans to either side, once a step
+PERIOD_S = 1.0  # assumed, for a log with fewer than two contacts
+TOLD = ("false_readings_n", "missed_readings_n", "mse_f_N2", "accuracy_pct", "spread")
+
+
+@dataclass(frozen=True)
+class Log:
+    """A log of a board that keeps its place, its quiet start, and what was true of it."""
+
+    t_s: Float64[np.ndarray, " f"]
+    b_uT: Float32[np.ndarray, "f ch"]
+    true: Float64[np.ndarray, "f 3"]  # NaN where nothing touches
+    quiet_n: int
+
+
+def turn_log(log: Log, own: Instrument, networks: Sequence[Answers], rng: np.random.Generator) -> list[dict[str, Any]]:
+    """Let the board pitch by more and more after its quiet start; score it as it is, and less what a chip aside reads.
+
+    `own.noise_uT` is that of one reading of the chip aside.
+    """
+    period_s = step_period_s(log.t_s, np.isfinite(log.true[:, 2]))
+    told = []
+    for pitch_deg in PITCHES_DEG:
+        swing_rad = np.radians(pitch_deg) * swing(log.t_s, start_s=float(log.t_s[log.quiet_n - 1]), period_s=period_s)
+        field_T = earth_T(swing_rad)
+        added_uT = seen_uT(own.board, np.repeat(field_T[:, None], len(own.turn), axis=1))
+        less_uT = added_uT - guessed_uT(own, field_T, rng)
+        told.append(
+            {"pitch_deg": pitch_deg} | _told(log, added_uT, networks)
+            | {"reference_chip": _told(log, less_uT, networks)}
+        )  # fmt: skip
+    return told
+
+
+def step_period_s(t_s: Float64[np.ndarray, " f"], touched: Bool[np.ndarray, " f"]) -> float:
+    """Give the usual time from the start of one contact to that of the next."""
+    starts_s = t_s[np.flatnonzero(np.diff(touched.astype(int), prepend=0) == 1)]
+    return float(np.median(np.diff(starts_s))) if len(starts_s) > 1 else PERIOD_S
+
+
+def swing(t_s: Float64[np.ndarray, " f"], *, start_s: float, period_s: float) -> Float64[np.ndarray, " f"]:
+    """Give a sine that begins at `start_s`, and rest before."""
+    return np.sin(2 * np.pi * np.maximum(t_s - start_s, 0) / period_s)
+
+
+def earth_T(pitch_rad: Float64[np.ndarray, " f"]) -> Float[np.ndarray, "f 3"]:
+    """Give the earth's field in the axes of a board that is turned about its y axis; at rest its x axis points north.
+
+    Assumed: walking north, so that the whole field lies in the plane of turning. It is the worst way to go.
+    """
+    return Rotation.from_euler("y", pitch_rad[:, None]).inv().apply(EARTH_T)
+
+
+def _told(log: Log, added_uT: Float[np.ndarray, "f ch"], networks: Sequence[Answers]) -> dict[str, Any]:
+    found = estimate_after(log.quiet_n, log.t_s, (log.b_uT + added_uT).astype(np.float32), networks)
+    scores = score_contacts(found, log.true)
+    return {"contacts_n": contacts_n(found.contact)} | {name: scores[name] for name in TOLD if name in scores}
+
+
+def turned(log: Log, board: str, settings: Settings, networks: Sequence[Answers]) -> dict[str, Any]:
+    """Tell what the networks find in the log if its board turns in the earth's field."""
+    of, seed = synthesis_of(settings), settings.seed
+    noise_uT = np.array([of.chip.noise_xy_uT, of.chip.noise_xy_uT, of.chip.noise_z_uT])  # a log's readings are single
+    own = replace(take_board(of, board, seed=seed), noise_uT=noise_uT)
+    return {
+        "turning": turn_log(log, own, networks, rng_for(seed, "logs", board, "aside")),
+        "turning_period_s": step_period_s(log.t_s, np.isfinite(log.true[:, 2])),
+        "earth_uT": EARTH_SIZE_T / micro,
+    }
+
+
+def logs(settings: Settings, raw: Path, models: Path, answer: Path) -> None:
+    """Read a folder's walk with networks that never saw its board; score it where its truth is kept, and turn it."""
+    folder = only(sorted(child for child in raw.iterdir() if child.is_dir()), raw)
+    t_s, b_uT, _, account = sd_card.read_log(folder / LOG_FILE)
+    board = read_header(folder).board
+    networks = networks_without(models, board)
+    found = estimate(t_s, b_uT, networks, where=str(folder / LOG_FILE))
+    numbers, true = describe(found) | {"networks_n": len(networks), "account": account}, None
+    if (folder / PROBE_FILE).is_file():
+        log = probe.parse(folder / PROBE_FILE, str(folder / PROBE_FILE))
+        known = np.stack([log.x_mm, log.y_mm, log.Fz_N], axis=1)
+        known[~log.contact] = np.nan
+        true = truth_at(t_s, log.t_start_s, log.t_end_s, known)
+        numbers |= score_contacts(found, true) | turned(Log(t_s, b_uT, true, found.quiet_n), board, settings, networks)
+    losses = {"accounts": [numbers["account"]], "left_out": {}}
+    write_answer(answer, numbers, thin(found, true), losses)
+    say(f"{settings.scene}: {numbers['contacts_n']} contacts in {numbers['duration_s']:.1f} s of log")
+
+
+MEANING = (  # {rate_hz} comes from the numbers
+    "A log at {rate_hz:.0f} Hz with nothing but times and readings, as a board writes it to an SD card: a quiet start, "
+    "then footfalls at random places. The quiet start is the no-load reading; contact is a change of field well above "
+    "its noise; places and forces are answered by networks that never saw the board, each scored by itself: ± is the "
+    "standard deviation over {networks_n} network seeds. Errors are over the readings "
+    "found in contact, against the truth that the simulator keeps. The board keeps its place: the earth's field is "
+    "part of the no-load reading and stays as it is, which it does not in a dog's shoe or on a hand."
+)
+TURNING = (
+    "The same log, as if the board pitched to either side by so much, as a sine once a step ({turning_period_s:.2g} s) "
+    "in the earth's field of {earth_uT:.0f} µT, walking north (the worst way); the angles are assumed. What changes "
+    "of that field passes for contacts. As a remedy, one chip more, aside and of the same make and noise, is read with "
+    "every frame, and its reading is taken off all others, turned as the board's design turns each chip. Errors are "
+    "over the readings found in contact that are: where more weak ones are found, the mean error of force falls. ± is "
+    "the standard deviation over network seeds."
+)
+WAYS = {"as logged": None, "a chip's aside taken off": "reference_chip"}
+
+
+def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
+    """Show what was found in the log, and how well where that is known; the paper shows its logs as videos."""
+    account = numbers["account"]
+    rows = [
+        ("rate, Hz", f"{numbers['rate_hz']:.0f}", f"{paper.LOG_RATE_HZ:.0f}"),
+        ("duration, s", f"{numbers['duration_s']:.1f}", "–"),
+        ("readings", f"{numbers['readings_n']}", "–"),
+        ("readings lost to failed reads and stuck chips", f"{account['rows_read_n'] - account['rows_n']}", "–"),
+        ("frames missing in gaps of time", f"{account['gap_frames_n']}", "–"),
+        ("contacts found", f"{numbers['contacts_n']}", "–"),
+        ("contacts made", _show(numbers, "contacts_true_n"), "–"),
+        ("readings in contact", f"{numbers['contact_readings_n']}", "–"),
+        ("readings in contact that were missed", _show(numbers, "missed_readings_n"), "–"),
+        ("largest force of a missed reading, N", _show(numbers, "missed_force_max_N"), "–"),
+        ("readings without contact taken for one", _show(numbers, "false_readings_n"), "–"),
+        ("largest force found, N", _show(numbers, "force_max_N"), "–"),
+        ("largest force made, N", _show(numbers, "force_true_max_N"), "–"),
+        ("accuracy, %", _show(numbers, "accuracy_pct"), "–"),
+        ("MSE_xy, mm²", _show(numbers, "mse_xy_mm2"), "–"),
+        ("MSE_F, N²", _show(numbers, "mse_f_N2"), "–"),
+    ]
+    table = pd.DataFrame(
+        [{"what": what, "ours": ours, "paper": theirs, "source": source} for what, ours, theirs in rows]
+    )
+    table.attrs["meaning"] = MEANING.format(**{name: numbers[name] for name in ("rate_hz", "networks_n")})
+    return {"logs": table} | ({"logs_turning": _turning(numbers, source)} if "turning" in numbers else {})
+
+
+def _turning(numbers: Mapping[str, Any], source: str) -> pd.DataFrame:
+    """Show what is found in the log of a board that turns, by its largest pitch."""
+    rows = []
+    for row in numbers["turning"]:
+        for words, name in WAYS.items():
+            own = row if name is None else row[name]
+            rows.append(
+                {
+                    "pitch / °": f"± {row['pitch_deg']:g}",
+                    "readings": words,
+                    "contacts found": _show(own, "contacts_n"),
+                    "contacts made": _show(numbers, "contacts_true_n"),
+                    "readings without contact taken for one": _show(own, "false_readings_n"),
+                    "readings in contact that were missed": _show(own, "missed_readings_n"),
+                    "MSE_F / N²": _show(own, "mse_f_N2"),
+                    "accuracy / %": _show(own, "accuracy_pct"),
+                    "source": source,
+                }
+            )
+    table = pd.DataFrame(rows)
+    table.attrs["meaning"] = TURNING.format(**{name: numbers[name] for name in ("turning_period_s", "earth_uT")})
+    return table
+
+
+def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
+    """Draw force, x and y over time, in contact only."""
+    t_s = np.array(drawn["t_s"])
+    with drawing(7.0, 5.0) as figure:
+        panels = figure.subplots(3, 1, sharex=True, height_ratios=(2, 1, 1))
+        for axes, name, label in zip(panels, ("F_N", "x_mm", "y_mm"), ("F / N", "x / mm", "y / mm"), strict=True):
+            for which, colour, width in (("estimated", COLOURS[1], 1.8), ("true", COLOURS[2], 0.9)):
+                if which in drawn:
+                    axes.plot(t_s, np.array(drawn[which][name], float), color=colour, linewidth=width, label=which)
+            if "low" in drawn:
+                low, high = (np.array(drawn[which][name], float) for which in ("low", "high"))
+                words = f"range over {numbers['networks_n']} network seeds"
+                axes.fill_between(t_s, low, high, color=COLOURS[1], alpha=0.3, linewidth=0, label=words)
+            axes.set_ylabel(label)
+        panels[0].set_ylim(bottom=0)
+        panels[1].set_ylim(-2, 18)  # the grid is 16 mm wide
+        panels[2].set_ylim(-2, 18)
+        panels[2].set_xlabel("time / s")
+        handles, labels = panels[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
+        panels[0].set_title(f"A log at {numbers['rate_hz']:.0f} Hz ({source})", loc="left", fontsize=11)
+        return {"logs.svg": svg(figure)}
+
+
+def _show(numbers: Mapping[str, Any], name: str) -> str:
+    if name not in numbers:
+        return "unknown"
+    if isinstance(numbers[name], int):
+        return f"{numbers[name]}"
+    spread = numbers.get("spread", {})
+    return f"{numbers[name]:.3g}" + (f" ± {spread[name]:.2g}" if name in spread else "")

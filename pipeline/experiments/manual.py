@@ -1,0 +1,163 @@
+"""Networks adapted by hand pokes (paper section 5)."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from pipeline.experiments.answer import read_folder, read_losses, write_answer
+from pipeline.report.formatting import COLUMNS, OF_PAPER, Stat, gain, show, show_difference, tabulate
+from pipeline.report.paper import GAINS, MANUAL, MANUAL_POKES_N
+from pipeline.settings import Adaptations, Settings
+from pipeline.statistics import VERDICTS, verdict
+from pipeline.training.trainings import (
+    Pokes,
+    SceneData,
+    Starts,
+    adaptation,
+    own_starts,
+    pool_lines,
+    prepare_training,
+    read_data,
+    read_starts,
+)
+from pipeline.training.variants import (  # fmt: skip
+    AFTER,
+    BEFORE,
+    CONTROL,
+    Answered,
+    answers_after,
+    answers_before,
+    compare_arms,
+    summarise_arms,
+)
+from reskin.data.lines import Lines, hand_rows, shifted
+from reskin.data.rows import stack
+from reskin.data.splits import Fold
+from reskin.errors import SchemaError
+from reskin.models.recipe import HEADLINE
+from reskin.models.trial import Trial
+
+GRID = "grid"  # as many pokes, by the robot
+
+
+def answer_manual(answers: Sequence[Answered], *, pokes_n: Sequence[int], lines_n: Sequence[int]) -> dict[str, Any]:
+    """Summarise over boards; `pokes_n` and `lines_n` are those of each skin, and what is told is their mean."""
+    arms = summarise_arms(answers)
+    counts = {
+        "pokes_n": round(np.mean(pokes_n)),
+        "lines_n": round(np.mean(lines_n)),
+        "skins_n": len({one.skin for one in answers}),
+        "boards_n": len({one.board for one in answers}),
+        "seeds_n": len({one.seed_i for one in answers}),
+    }
+    differences = {
+        f"{AFTER}_minus_{other}": compare_arms(answers, AFTER, other)
+        for other in (BEFORE, CONTROL, GRID)
+        if other in arms
+    }
+    return counts | arms | {"paired": differences}
+
+
+def manual(settings: Settings, folds: Path, main: Path, indentations: Path, started: Path, answer: Path) -> None:
+    """Adapt to every skin that was poked by hand, and by as many pokes of the robot; test on the robot's grid."""
+    prepare_training()
+    data = read_data(settings, main, folds)
+    starts = read_starts(started)
+    adapting = data.settings.adaptations()
+    poked, found = hand_rows(read_folder(indentations))
+    lines = {skin: shifted(own, len(data.rows)) for skin, own in found.items()}
+    data = replace(data, rows=stack(data.rows, poked))
+    trials: list[tuple[str, Trial]] = []
+    answers: list[Answered] = []
+    for skin, own in lines.items():
+        fold = _fold_without(data, str(poked.board[poked.skin == skin][0]))
+        answers += answers_before(data, fold, adapting.recipes[HEADLINE], starts, skin)
+        trials += _trials(data, fold, adapting, starts, (skin, own))
+    after, trainings = answers_after(data, trials, "manual")
+    pokes_n, lines_n = zip(*((_pokes_n(data, own), len(np.unique(own.line_i))) for own in lines.values()), strict=True)
+    numbers = answer_manual([*answers, *after], pokes_n=pokes_n, lines_n=lines_n)
+    write_answer(answer, numbers, {}, read_losses(indentations, poked.dropped), trainings)
+
+
+def _trials(
+    data: SceneData, fold: Fold, adapting: Adaptations, starts: Starts, poked: tuple[str, Lines]
+) -> Iterator[tuple[str, Trial]]:
+    """Make the arms of one skin: by hand, by the robot, and as long without pokes if there is such a recipe."""
+    (skin, by_hand), headline = poked, (HEADLINE, adapting.recipes[HEADLINE])
+    for seed_i in own_starts(starts, headline[1].base, fold):
+        by_robot = pool_lines(data, fold, skin, pokes_n=_pokes_n(data, by_hand), seed_i=seed_i)
+        pokes = Pokes("manual", skin, seed_i, "hand", by_hand)
+        yield AFTER, adaptation(data, fold, headline, starts, pokes)
+        yield GRID, adaptation(data, fold, headline, starts, replace(pokes, what="grid", lines=by_robot))
+        if CONTROL in adapting.recipes:
+            yield CONTROL, adaptation(data, fold, (CONTROL, adapting.recipes[CONTROL]), starts, pokes)
+
+
+def _pokes_n(data: SceneData, lines: Lines) -> int:
+    return len(np.unique(data.rows.indentation[lines.row]))
+
+
+def _fold_without(data: SceneData, board: str) -> Fold:
+    folds = {fold.name: fold for fold in data.folds_of("lobo")}
+    if board not in folds:
+        remedy = "Poke skins by hand that the grid knows too."
+        raise SchemaError("question manual", f"board {board}", f"one of {sorted(folds)}", "none", remedy)
+    return folds[board]
+
+
+ARMS = {
+    "before": "before",
+    "after": "adapted by hand",
+    "control": "as long, without pokes",
+    "grid": "adapted by as many pokes of the robot",
+}
+GAINED = {"after_minus_before": GAINS["by_hand"]}
+PAIRED = {
+    "after_minus_before": "by hand less before, on the same skin",
+    "after_minus_control": "by hand less without pokes, on the same skin",
+    "after_minus_grid": "by hand less by the robot, on the same skin",
+}
+
+
+def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
+    """Show the arms, then their differences skin by skin."""
+    shown = [(ARMS[arm], numbers[arm], MANUAL.get(arm, {}), _shown) for arm in ARMS if arm in numbers]
+    differences = numbers["paired"]
+    shown += [(PAIRED[one], differences[one], GAINED.get(one, {}), _judged) for one in PAIRED if one in differences]
+    lines = []
+    for name, ours, paper, words in shown:
+        line = {"networks": name, "source": source}
+        for metric, title in COLUMNS.items():
+            line[f"{title} (ours)"] = words(ours.get(metric), metric)
+            if metric in OF_PAPER:
+                line[f"{title} (paper)"] = f"{paper[metric]:g}" if metric in paper else "–"
+        lines.append(line | {"n": str(ours["accuracy_pct"]["n"])})
+    meaning = (
+        f"{numbers['pokes_n']} pokes by hand a skin, along {numbers['lines_n']} lines of which only the order is known "
+        f"(paper: {MANUAL_POKES_N}); tested on the robot's grid of the same skin, by networks that never saw its "
+        f"board. Differences: whether by hand is better. {VERDICTS}"
+    )
+    spread = (
+        f"[low, high] is the 95 % interval over n boards, each skin the mean of {numbers['seeds_n']} networks. "
+        f"± (seeds) is the standard deviation over {numbers['seeds_n']} network seeds on one skin, mean over skins; of "
+        "a difference, that of the differences of equal seeds."
+    )
+    return {"manual": tabulate(lines, meaning=meaning, spread=spread)}
+
+
+def _shown(stat: Stat | None, metric: str) -> str:
+    return show(stat)
+
+
+def _judged(stat: Stat | None, metric: str) -> str:
+    """Say whether a difference is a gain, before its size."""
+    return "–" if stat is None else f"{verdict(gain(stat, metric))}: {show_difference(stat)}"
+
+
+def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
+    """Nothing: a table says it all."""
+    return {}

@@ -1,1 +1,0 @@
-"""Networks adapted by hand pokes (paper section 5)."""

@@ -1,1 +1,0 @@
-"""Experts taught simulated skins only, on skins of a simulated scene: unlabelled pokes, one weight, a few labels."""

@@ -1,1 +1,0 @@
-"""What rivals make of a board that nobody calibrated: aligned inputs, a law fitted to pokes, another skin's pokes."""

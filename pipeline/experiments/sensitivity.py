@@ -1,0 +1,245 @@
+"""The smallest weight told apart (paper section 6)."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float, Float32, Float64, Int32
+from scipy.special import ndtr, ndtri
+
+from pipeline.experiments.answer import only, read_folder, read_losses, write_answer
+from pipeline.report import paper
+from pipeline.report.drawing import COLOURS, drawing, svg
+from pipeline.settings import Settings
+from pipeline.stage import say
+from pipeline.statistics import FEW_BOARDS, INCONCLUSIVE
+from pipeline.synthesis import loads_of
+from reskin.data.baseline import subtract
+from reskin.errors import SchemaError
+from reskin.simulation.protocols import weights_N
+
+TOLD_SHARE = 0.95  # of pairs ordered rightly: told apart
+WATER_N_PER_ML = 9.81e-3  # 1 g at 9.81 m/s^2
+
+
+def levels_of(
+    db_uT: Float32[np.ndarray, "f ch"],
+    indentation: Int32[np.ndarray, " f"],
+    force_N: Float32[np.ndarray, " f"],
+    *,
+    levels_n: int,
+    where: str,
+) -> Float32[np.ndarray, "n p r ch"]:
+    """Sort readings by filling, weight and reading; a stop is a run of one force reading, as the log has one a stop."""
+    new = np.flatnonzero((np.diff(indentation) != 0) | (np.diff(force_N) != 0)) + 1
+    stops = np.split(np.arange(len(force_N)), new)
+    fillings_n = len(np.unique(indentation))
+    lengths = {len(stop) for stop in stops}
+    if len(stops) != fillings_n * levels_n or len(lengths) != 1:
+        got = f"{len(stops)} stops of {sorted(lengths)} readings in {fillings_n} fillings"
+        rule = f"{levels_n} a filling, all of as many readings"
+        raise SchemaError(where, "stops", rule, got, "Simulate and ingest it again.")
+    return db_uT[np.stack(stops)].reshape(fillings_n, levels_n, lengths.pop(), -1)
+
+
+def answer_of(
+    db_uT: Float32[np.ndarray, "n p r ch"], weight_N: Float64[np.ndarray, " p"]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Measure what one skin tells of weights that go up by even steps: numbers, and what figures draw besides."""
+    fitted, held = np.split(db_uT.astype(np.float64), [len(db_uT) // 2])
+    along_uT = held @ direction(fitted)
+    response_uT, step_N = along_uT.mean(axis=(0, 2)), float(weight_N[1] - weight_N[0])
+    told = {"one_reading": told_apart(along_uT), "five_readings": told_apart(along_uT.mean(axis=2, keepdims=True))}
+    by_length = {
+        "one_reading": told_apart(np.linalg.norm(held, axis=3)),
+        "five_readings": told_apart(np.linalg.norm(held.mean(axis=2, keepdims=True), axis=3)),
+    }
+    steps_N = _known({name: smallest_step_N(share, step_N) for name, share in told.items()})
+    numbers = {
+        "levels_n": len(weight_N),
+        "fillings_n": len(db_uT),
+        "held_out_n": len(held),
+        "readings_per_stop_n": db_uT.shape[2],
+        "step_N": step_N,
+        "told_pct": 100 * TOLD_SHARE,
+        "range_N": float(weight_N[-1]),
+        "smallest_step_N": steps_N,
+        "smallest_step_mL": {name: value_N / WATER_N_PER_ML for name, value_N in steps_N.items()},
+        "by_length_N": _known({name: smallest_step_N(share, step_N) for name, share in by_length.items()}),
+        "monotonic": monotonic(along_uT.mean(axis=2), weight_N),
+        "noise_uT": float(np.sqrt(along_uT.var(axis=2, ddof=1).mean())),
+        "gain_uT_per_N": float(np.polyfit(weight_N, response_uT, 1)[0]),
+    }
+    drawn: dict[str, Any] = {
+        "weight_N": np.round(weight_N, 4).tolist(),
+        "response_uT": np.round(response_uT, 2).tolist(),
+        "sd_uT": np.round(along_uT.std(axis=(0, 2), ddof=1), 2).tolist(),
+    }
+    drawn["told"] = {name: np.round(share, 4).tolist() for name, share in told.items()}
+    drawn["told_by_length"] = {name: np.round(share, 4).tolist() for name, share in by_length.items()}
+    return numbers, drawn
+
+
+def _known(steps_N: dict[str, float | None]) -> dict[str, float]:
+    return {name: value_N for name, value_N in steps_N.items() if value_N is not None}
+
+
+def direction(db_uT: Float64[np.ndarray, "n p r ch"]) -> Float64[np.ndarray, " ch"]:
+    """Give the unit vector along the mean change of field."""
+    mean_uT = db_uT.mean(axis=(0, 1, 2))
+    return mean_uT / np.linalg.norm(mean_uT)
+
+
+def told_apart(response_uT: Float64[np.ndarray, "n p r"]) -> Float64[np.ndarray, " d"]:
+    """Give the share of pairs of readings whose order is that of their weights, by difference: 1 step, 2 steps, ...
+
+    A pair is two readings of the same filling, as both share its no-load reading; equal responses count half.
+    """
+    levels_n = response_uT.shape[1]
+    shares = []
+    for steps_n in range(1, levels_n):
+        more, less = response_uT[:, steps_n:, :, None], response_uT[:, :-steps_n, None, :]
+        shares.append(float((more > less).mean() + 0.5 * (more == less).mean()))
+    return np.array(shares)
+
+
+def smallest_step_N(share: Float[np.ndarray, " d"], step_N: float) -> float | None:
+    """Give the smallest difference from which on all larger ones are told apart; None if the largest is not."""
+    untold_i = np.flatnonzero(share < TOLD_SHARE)  # index 0 is one step
+    last_i = int(untold_i.max(initial=-1))
+    return None if last_i == len(share) - 1 else step_N * (last_i + 2)
+
+
+def monotonic(response_uT: Float64[np.ndarray, "n p"], weight_N: Float64[np.ndarray, " p"]) -> dict[str, Any]:
+    """Tell whether the fillings' mean response rises from every weight to the one `step_N` above it.
+
+    The step is the least of whole ones whose mean rise noise hides from one filling in no more than 5 % of cases:
+    pouring finer does not make a skin fall. It comes from noise and gain, not from the order found, or a fall would
+    lengthen the step until it hides. Where no step is as long, no rise is shown, and there is no `step_N`.
+    """
+    mean_uT, rise_uT = response_uT.mean(axis=0), np.diff(response_uT, axis=1)
+    noise_uT = float(np.sqrt(rise_uT.var(axis=0, ddof=1).mean())) if len(rise_uT) > 1 else np.nan  # of one rise
+    gain_uT = float(np.polyfit(np.arange(len(mean_uT)), mean_uT, 1)[0])  # a step
+    found: dict[str, Any] = {
+        "holds": False,
+        "falls_n": 0,
+        "pairs_n": 0,
+        "spearman": float(np.corrcoef(weight_N, pd.Series(mean_uT).rank())[0, 1]),
+        "neighbours": {"falls_n": int((np.diff(mean_uT) <= 0).sum())},
+    }
+    needed = ndtri(TOLD_SHARE) * noise_uT / gain_uT if gain_uT > 0 else np.inf
+    if needed <= len(mean_uT) - 1:
+        steps_n = max(int(np.ceil(needed)), 1)
+        falls_n, pairs_n = int((mean_uT[steps_n:] <= mean_uT[:-steps_n]).sum()), len(mean_uT) - steps_n
+        step_N = steps_n * float(weight_N[1] - weight_N[0])
+        found |= {"holds": falls_n == 0, "falls_n": falls_n, "pairs_n": pairs_n, "step_N": step_N}
+    if noise_uT > 0:  # of an even, straight rise with the standard error of a mean one
+        z = -gain_uT / (noise_uT / np.sqrt(len(rise_uT)))
+        found["neighbours"]["expected_falls_n"] = float(rise_uT.shape[1] * ndtr(z))
+    return found
+
+
+def sensitivity(settings: Settings, indentations: Path, answer: Path) -> None:
+    """Tell how small a weight the one skin tells that was loaded."""
+    load = loads_of(settings, "glass")
+    one = only(read_folder(indentations), indentations)
+    weight_N = weights_N(load.force_max_N, load.step_N)
+    change_uT = subtract(one.b_uT, one.noload_uT)
+    levels_uT = levels_of(change_uT, one.indentation, one.Fz_N, levels_n=len(weight_N), where=one.capture)
+    numbers, drawn = answer_of(levels_uT, weight_N)
+    write_answer(answer, numbers, drawn, read_losses(indentations, {}))
+    say(f"{settings.scene}: weights {numbers['smallest_step_N']} N apart are told, in {numbers['fillings_n']} fillings")
+
+
+MEANING = (  # {told_pct} comes from the numbers
+    "A weight at the skin's middle goes up step by step; the glass's flat foot is taken as the rig's round tip. Two "
+    "weights are told apart where at least {told_pct:g} % of the pairs of readings within a filling, in fillings that "
+    "fitted nothing, are in the order of the weights, and so are those of all larger differences. The response is the "
+    "change of field along its mean direction in the other half of the fillings. Whether its mean over fillings rises "
+    "is judged at the least step whose mean rise stands out of the noise of a stop's readings in {told_pct:g} % of "
+    "cases: at finer ones noise alone makes it fall."
+)
+READINGS = {"one_reading": "one reading", "five_readings": "mean of a stop's readings"}
+
+
+def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
+    """Show the smallest step told apart, in newtons and in water, and whether the response is monotonic."""
+    rows = []
+    for name, words in READINGS.items():
+        rows += [
+            (
+                f"smallest step told apart, {words}, N",
+                _show(numbers["smallest_step_N"], name, numbers),
+                f"< {paper.SENSITIVITY_N:g}",
+            ),
+            (f"smallest step told apart, {words}, mL of water", _show_mL(name, numbers), f"< {paper.SENSITIVITY_ML:g}"),
+            (f"the same by |dB| alone, {words}, N", _show(numbers["by_length_N"], name, numbers), "–"),
+        ]
+    rise = numbers["monotonic"]
+    rows += [
+        ("mean response rises at every step that stands out of noise", _rises(rise), paper.MONOTONIC),
+        (f"falls from level to level, {numbers['step_N']:g} N apart", _falls(rise["neighbours"], numbers), "–"),
+        ("gain, straight line, µT/N", f"{numbers['gain_uT_per_N']:.3g}", "–"),
+        ("noise of one reading along the response, µT", f"{numbers['noise_uT']:.2g}", "–"),
+    ]
+    table = pd.DataFrame(
+        [{"what": what, "ours": ours, "paper": theirs, "source": source} for what, ours, theirs in rows]
+    )
+    table.attrs["meaning"] = MEANING.format(told_pct=numbers["told_pct"])
+    return {"sensitivity": table}
+
+
+def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
+    """Draw the response against weight, and how sure a difference is told."""
+    with drawing(7.6, 3.6) as figure:
+        left, right = figure.subplots(1, 2)
+        weight_N, response_uT, sd_uT = (np.array(drawn[name]) for name in ("weight_N", "response_uT", "sd_uT"))
+        left.fill_between(weight_N, response_uT - sd_uT, response_uT + sd_uT, color=COLOURS[6], linewidth=0)
+        left.plot(weight_N, response_uT, color=COLOURS[1])
+        left.set(xlabel="weight / N", ylabel="response / µT (mean, sd of a reading)")
+        difference_N = numbers["step_N"] * np.arange(1, len(weight_N))
+        for colour, (name, words) in zip(COLOURS[1:], READINGS.items(), strict=False):
+            share_pct = 100 * np.array(drawn["told"][name])
+            right.plot(difference_N, share_pct, "o-", color=colour, markersize=3, linewidth=1.2, label=words)
+        told_pct = numbers["told_pct"]
+        right.axhline(told_pct, color="0.3", linestyle="--", linewidth=1, label=f"{told_pct:g} %")
+        right.axvline(paper.SENSITIVITY_N, color="0.6", linestyle=":", linewidth=1.2, label="paper: less than this")
+        right.set(xscale="log", xlabel="difference of weight / N", ylabel="pairs in the right order / %")
+        right.set_ylim(48, 102)  # half is chance
+        right.legend(frameon=True, framealpha=1, edgecolor="none", fontsize=9, loc="lower right")
+        figure.suptitle(f"A glass is filled on the skin ({source})", x=0.01, ha="left", fontsize=11)
+        return {"sensitivity.svg": svg(figure)}
+
+
+def _rises(rise: Mapping[str, Any]) -> str:
+    ranks = f"rank correlation {rise['spearman']:.4f}"
+    if "step_N" not in rise:
+        return f"{INCONCLUSIVE}: no step stands out of noise; {ranks}"
+    here = "rises" if rise["holds"] else "does not rise"
+    rises_n = rise["pairs_n"] - rise["falls_n"]
+    return (
+        f"{FEW_BOARDS}; {here} on this one: {rises_n} of {rise['pairs_n']} pairs {rise['step_N']:.3g} N apart, {ranks}"
+    )
+
+
+def _falls(found: Mapping[str, Any], numbers: Mapping[str, Any]) -> str:
+    expected = f", {found['expected_falls_n']:.1f} expected of noise" if "expected_falls_n" in found else ""
+    return f"{found['falls_n']} of {numbers['levels_n'] - 1}{expected}"
+
+
+def _show(steps_N: Mapping[str, float], name: str, numbers: Mapping[str, Any]) -> str:
+    if name not in steps_N:
+        return f"none up to {numbers['range_N']:g}"
+    return f"{_least(steps_N[name], numbers)}{steps_N[name]:.3g}"
+
+
+def _show_mL(name: str, numbers: Mapping[str, Any]) -> str:
+    if name not in numbers["smallest_step_mL"]:
+        return "none"
+    return f"{_least(numbers['smallest_step_N'][name], numbers)}{numbers['smallest_step_mL'][name]:.2g}"
+
+
+def _least(step_N: float, numbers: Mapping[str, Any]) -> str:
+    return "at most " if step_N <= numbers["step_N"] else ""  # no finer one was tried

@@ -1,1 +1,0 @@
-"""The smallest weight told apart (paper section 6)."""

@@ -1,0 +1,193 @@
+"""Place and all three forces of dragged lines (paper section 4)."""
+
+from collections.abc import Hashable, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+from pydantic import Field
+
+from pipeline.experiments.answer import read_folder, read_losses, write_answer
+from pipeline.report.drawing import COLOURS, drawing, svg
+from pipeline.report.formatting import show, tabulate
+from pipeline.report.paper import SHEAR
+from pipeline.settings import Settings, Training
+from pipeline.statistics import over_units, tally
+from pipeline.training.trainings import SceneData, collapse_record, note_seconds, prepare_training, train_all, trials_of
+from reskin.config import Strict
+from reskin.data.rows import SHEAR_TARGETS, Rows, Selection, gather
+from reskin.data.splits import NO_POOL, Fold, draw_sides
+from reskin.metrics import ACCURACY_LIMIT_MM
+from reskin.seeds import rng_for, seed_for
+
+Count = Annotated[int, Field(ge=1)]
+Fraction = Annotated[float, Field(gt=0, lt=1)]
+
+
+class Shear(Strict):
+    """Dragged lines: place and all three forces (paper section 4)."""
+
+    test_fraction: Fraction
+    repeats_n: Count
+    training: Training
+
+
+PLACE, SIDEWAYS, NORMAL = slice(0, 2), slice(2, 4), slice(4, 5)
+PARTS = {"xy": (PLACE, "mse_xy_mm2"), "fxy": (SIDEWAYS, "mse_fxy_N2"), "fz": (NORMAL, "mse_fz_N2")}
+
+
+def score5(true: Float[np.ndarray, "f 5"], predicted: Float[np.ndarray, "f 5"]) -> dict[str, float]:
+    """Score predictions of (x_mm, y_mm, Fx_N, Fy_N, Fz_N).
+
+    `explained_*` is 1 - MSE / variance of the truth: 1 is perfect, 0 is no better than the mean. It stands beside the
+    errors because forces of another size than the paper's have errors of another size.
+    """
+    error = predicted.astype(float) - true
+    near = np.abs(error[:, PLACE]) <= ACCURACY_LIMIT_MM
+    numbers = {"accuracy_pct": 100.0 * float(near.all(axis=1).mean())}
+    numbers |= {mse: float((error[:, part] ** 2).mean()) for part, mse in PARTS.values()}
+    for name, (part, mse) in PARTS.items():
+        numbers[f"explained_{name}"] = 1 - numbers[mse] / float(true[:, part].astype(float).var(axis=0).mean())
+    return numbers
+
+
+def answer_shear(
+    by_reading: Sequence[tuple[Hashable, Mapping[str, float]]],
+    by_line: Sequence[tuple[Hashable, Mapping[str, float]]],
+    *,
+    target: Float[np.ndarray, "f 5"],
+    lines_n: int,
+    passes_n: int,
+    seeds_n: int,
+) -> dict[str, Any]:
+    """Summarise (fold, score) pairs of both splits over folds, each the mean of its seeds, with the forces' size.
+
+    Of `lines_n` dragged lines in all, each place and depth was dragged along in each of `passes_n`. `sd_seeds` is the
+    standard deviation over the `seeds_n` networks of one fold, mean over folds.
+    """
+    rms_N = np.sqrt((target.astype(float) ** 2).mean(axis=0))
+    sizes = {"fx_rms_N": float(rms_N[2]), "fy_rms_N": float(rms_N[3]), "fz_rms_N": float(rms_N[4])}
+    return _over_folds(by_reading) | {
+        "by_line": _over_folds(by_line), "seeds_n": seeds_n,
+        "readings_n": len(target), "lines_n": lines_n, "passes_n": passes_n, **sizes,
+    }  # fmt: skip
+
+
+DRAWN_N = 400  # more points than these are not told apart in a panel
+MILLI = 3  # decimals of a force in the figure: more than are seen
+
+
+def _over_folds(scored: Sequence[tuple[Hashable, Mapping[str, float]]]) -> dict[str, Any]:
+    return over_units(pd.DataFrame([{"fold": fold, **scores} for fold, scores in scored]), "fold")
+
+
+def read(settings: Settings) -> Shear:
+    """Read section shear."""
+    return settings.with_training(Shear, "shear")
+
+
+def shear(settings: Settings, indentations: Path, answer: Path) -> None:
+    """Train with five targets on both splits of every skin, and score what was held out."""
+    prepare_training()
+    section = read(settings)
+    rows = gather(read_folder(indentations), settings.section(Selection, "selection"), targets=SHEAR_TARGETS)
+    by_reading = _folds(rows, np.arange(len(rows)), "reading", section, settings.seed)
+    by_line = _folds(rows, rows.indentation, "line", section, settings.seed)
+    data = SceneData(settings.scene, settings, rows, [*by_reading, *by_line])
+    trials = trials_of(data, section.training, data.folds)
+    trained = train_all(data, trials, "shear")
+    note_seconds(settings.scene, "shear", trials, trained)
+    scores = [
+        (one.fold, score5(rows.target[one.test], done.predicted)) for one, done in zip(trials, trained, strict=True)
+    ]
+    names = {fold.name for fold in by_line}
+    numbers = answer_shear(
+        [one for one in scores if one[0] not in names], [one for one in scores if one[0] in names],
+        target=rows.target, lines_n=len(np.unique(rows.indentation)), passes_n=len(np.unique(rows.pass_i)),
+        seeds_n=section.training.seeds_n,
+    )  # fmt: skip
+    first_i = next(i for i, trial in enumerate(trials) if trial.fold in names)
+    shown = rng_for(settings.seed, "shear", "drawn").permutation(len(trials[first_i].test))[:DRAWN_N]
+    true, predicted = rows.target[trials[first_i].test], trained[first_i].predicted
+    drawn = {"true": _forces(true[shown]), "predicted": _forces(predicted[shown])}
+    write_answer(answer, numbers, drawn, read_losses(indentations, rows.dropped), tally(map(collapse_record, trained)))
+
+
+def _folds(rows: Rows, group: np.ndarray, by: str, section: Shear, seed: int) -> list[Fold]:
+    """Draw the folds of every skin by itself; rows of equal `group` stay together."""
+    folds = []
+    for skin in np.unique(rows.skin):
+        own = np.flatnonzero(rows.skin == skin)
+        drawn = draw_sides(
+            group[own], test_fraction=section.test_fraction, repeats_n=section.repeats_n,
+            state=seed_for(seed, "shear", by, str(skin)), what=f"{by}s of skin {skin}", where="question shear",
+        )  # fmt: skip
+        folds += [
+            Fold("shear", f"{skin}-{by}{i}", own[train], own[test], NO_POOL) for i, (train, test) in enumerate(drawn)
+        ]
+    return folds
+
+
+def _forces(target: np.ndarray) -> list[list[float]]:
+    """Give Fx, Fy, Fz as three lists."""
+    return [np.round(target[:, i].astype(float), MILLI).tolist() for i in range(2, 5)]
+
+
+TITLES = {
+    "mse_fxy_N2": "MSE_Fxy, N²", "mse_fz_N2": "MSE_Fz, N²", "mse_xy_mm2": "MSE_xy, mm²", "accuracy_pct": "accuracy, %",
+    "explained_fxy": "explained variance of Fxy", "explained_fz": "explained variance of Fz",
+}  # fmt: skip
+FORCES = ("Fx", "Fy", "Fz")
+
+
+def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
+    """Show both splits, the paper's numbers beside each: it names none."""
+    ways = {
+        "random readings held out (ours; the paper names no split)": numbers,
+        "whole lines held out": numbers["by_line"],
+    }
+    lines = []
+    for way, own in ways.items():
+        line = {"split": way, "source": source}
+        for metric, title in TITLES.items():
+            line[f"{title} (ours)"] = show(own[metric])
+            if metric in SHEAR:
+                line[f"{title} (paper)"] = "{:g} ± {:g}".format(*SHEAR[metric])
+        lines.append(line | {"n": str(own["accuracy_pct"]["n"])})
+    rms_N = ", ".join(f"{numbers[f'{axis}_rms_N']:.2g} N (F{axis[1]})" for axis in ("fx", "fy", "fz"))
+    meaning = (
+        f"{numbers['readings_n']} readings of {numbers['lines_n']} dragged lines in {numbers['passes_n']} passes: a "
+        f"line that is held out is dragged along in {numbers['passes_n'] - 1} others. Our forces are {rms_N} rms. The "
+        "paper's are not stated, and an MSE grows with the square of the force: explained variance, 1 - MSE / "
+        "variance, does not. MSE_Fxy is a mean over two axes too; the paper does not say whether it sums or averages."
+    )
+    spread = (
+        f"± is the sd over n random splits, each the mean of {numbers['seeds_n']} networks; ± (seeds) is the sd over "
+        f"{numbers['seeds_n']} network seeds on one split, mean over splits."
+    )
+    return {"shear": tabulate(lines, meaning=meaning, spread=spread)}
+
+
+def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
+    """Draw predicted against true force of lines that were held out whole, a panel a direction."""
+    with drawing(7.6, 3.1) as figure:
+        panels = figure.subplots(1, len(FORCES))
+        for axes, name, true_N, predicted_N in zip(panels, FORCES, drawn["true"], drawn["predicted"], strict=True):
+            low, high = min(*true_N, *predicted_N), max(*true_N, *predicted_N)
+            axes.plot([low, high], [low, high], color=COLOURS[0], linewidth=0.8)
+            axes.scatter(true_N, predicted_N, s=7, color=COLOURS[1], alpha=0.6, linewidths=0)
+            axes.set(xlabel=f"true {name} / N", ylabel=f"predicted {name} / N")
+            axes.locator_params(nbins=4)
+        explained = {part: _explained(numbers["by_line"][f"explained_{part}"]) for part in ("fxy", "fz")}
+        title = (
+            f"Forces of dragged lines held out whole ({source}); points of the first of {numbers['seeds_n']} networks\n"
+            f"explained variance: {explained['fxy']} sideways, {explained['fz']} normal"
+        )
+        figure.suptitle(title, x=0.01, ha="left", fontsize=10)
+        return {"shear.svg": svg(figure)}
+
+
+def _explained(stat: Mapping[str, float]) -> str:
+    return f"{stat['mean']:.3f}" + (f" ± {stat['sd_seeds']:.3f} (seeds)" if "sd_seeds" in stat else "")

@@ -1,1 +1,0 @@
-"""Place and all three forces of dragged lines (paper section 4)."""

@@ -1,0 +1,293 @@
+"""Many boards under one skin (paper section 6)."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Bool, Float, Int, Int64, Shaped
+from pydantic import Field
+
+from pipeline.executors import Here
+from pipeline.experiments.answer import read_folder, read_losses, write_answer
+from pipeline.report.drawing import COLOURS, drawing, svg
+from pipeline.report.formatting import COLUMNS, scores, show, tabulate
+from pipeline.report.paper import SLEEVE, SLEEVE_SKIN, SLEEVE_WORDS
+from pipeline.settings import Settings, Training
+from pipeline.stage import say
+from pipeline.statistics import tally
+from pipeline.synthesis import synthesis_of
+from pipeline.training.trainings import SceneData, collapse_record, note_seconds, prepare_training, train_all
+from reskin.config import Strict
+from reskin.data.rows import Rows, Selection, gather
+from reskin.errors import ParamsError
+from reskin.metrics import score
+from reskin.models.classical import Neighbours, Task, run_tasks
+from reskin.models.recipe import HEADLINE
+from reskin.models.trial import Measured, Trial
+from reskin.schema import Readings
+
+Count = Annotated[int, Field(ge=1)]
+Fraction = Annotated[float, Field(gt=0, lt=1)]
+
+
+class Sleeve(Strict):
+    """Many boards under one skin (paper section 6); the last part of the pokes is held out."""
+
+    test_fraction: Fraction
+    neighbours_n: Count  # of the k nearest neighbours that stand beside the networks
+    training: Training
+
+
+NEAR_MM = 4.0  # what counts as near a border between two boards: about twice the skin's thickness, assumed
+Stats = dict[str, dict[str, float]]
+
+
+@dataclass(frozen=True)
+class Area:
+    """A skin and what lies under it, in labels: mm from the skin's corner."""
+
+    sides_mm: tuple[float, float]
+    chips_mm: Float[np.ndarray, "k 2"]
+    borders_mm: tuple[tuple[float, ...], tuple[float, ...]]  # between boards: x of upright ones, y of level ones
+
+    def near_border(self, place_mm: Float[np.ndarray, "f 2"]) -> Bool[np.ndarray, " f"]:
+        """Mark places nearer than `NEAR_MM` to a border between two boards."""
+        near = np.zeros(len(place_mm), bool)
+        for along_mm, borders_mm in zip(place_mm.T, self.borders_mm, strict=True):
+            for border_mm in borders_mm:
+                near |= np.abs(along_mm - border_mm) < NEAR_MM
+        return near
+
+
+def lay_out(
+    sides_mm: tuple[float, float],
+    chips_mm: Sequence[tuple[float, float]],
+    *,
+    boards_n: tuple[int, int],
+    pitch_mm: float,
+) -> Area:
+    """Move chips from the frame of the skin's middle to labels, and draw the borders between boards on a lattice."""
+    middle_mm = np.array(sides_mm) / 2
+    x_mm, y_mm = (
+        tuple(float(m + pitch_mm * (i - n / 2)) for i in range(1, n)) for m, n in zip(middle_mm, boards_n, strict=True)
+    )
+    return Area(sides_mm, np.array(chips_mm) + middle_mm, (x_mm, y_mm))
+
+
+def hold_out_last(rows: Rows, test_fraction: float) -> tuple[Int64[np.ndarray, " a"], Int64[np.ndarray, " b"]]:
+    """Give the rows of the first indentations of each capture, and of its last ones, which no training sees."""
+    held = np.zeros(len(rows), bool)
+    for capture in np.unique(rows.capture):
+        own = rows.capture == capture
+        indentations = np.unique(rows.indentation[own])  # in order of time
+        test_n = round(test_fraction * len(indentations))
+        if not 0 < test_n < len(indentations):
+            got = f"{test_n} of the {len(indentations)} of {capture}"
+            rule = "one or more, and not all"
+            raise ParamsError("question sleeve", "indentations held out", rule, got, "Poke more often.")
+        held |= own & (rows.indentation >= indentations[-test_n])
+    return np.flatnonzero(~held), np.flatnonzero(held)
+
+
+def rate_hz(captures: Sequence[Readings]) -> float:
+    """Measure how often frames came, from the times of readings that follow each other in one indentation."""
+    steps_n, steps_s = 0, 0.0
+    for one in captures:
+        same = (np.diff(one.indentation) == 0) & (np.diff(one.reading_i) == 1)
+        steps_n += int(same.sum())
+        steps_s += float(np.diff(one.t_s)[same].sum())
+    if not steps_s > 0:
+        rule, remedy = "two or more an indentation, at known times", "Record more than one reading."
+        raise ParamsError("question sleeve", "readings", rule, f"{steps_n} steps of time", remedy)
+    return steps_n / steps_s
+
+
+def errors_mm(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -> Float[np.ndarray, " f"]:
+    """Give the distance between true and predicted place of each reading."""
+    return np.linalg.norm(predicted[:, :2].astype(float) - true[:, :2], axis=1)
+
+
+def score_places(
+    true: Float[np.ndarray, "f 3"],
+    answers: Sequence[Float[np.ndarray, "f 3"]],
+    indentation: Int[np.ndarray, " f"],
+    area: Area,
+) -> dict[str, Any]:
+    """Score one method's answers, one a seed, on the same readings: overall, near borders between boards, elsewhere."""
+    near = area.near_border(true[:, :2])
+    each_mm = [errors_mm(true, predicted) for predicted in answers]
+    words: dict[str, Any] = over_seeds(
+        [
+            {
+                **score(true, predicted),
+                "median_error_mm": float(np.median(error_mm)),
+                "p95_error_mm": float(np.percentile(error_mm, 95)),
+            }
+            for predicted, error_mm in zip(answers, each_mm, strict=True)
+        ]
+    )
+    for name, part in (("near_seam", near), ("inside", ~near)):
+        if part.any():
+            medians = [{"median_error_mm": float(np.median(error_mm[part]))} for error_mm in each_mm]
+            words[name] = {**over_seeds(medians), "pokes_n": len(np.unique(indentation[part]))}
+    return words
+
+
+def over_seeds(scores: Sequence[Mapping[str, float]]) -> Stats:
+    """Mean, standard deviation (n - 1; absent for one) and number of each metric over trainings."""
+    stats: Stats = {}
+    for name in scores[0]:
+        values = np.array([one[name] for one in scores])
+        stats[name] = {"mean": float(values.mean()), "n": len(values)}
+        if len(values) > 1:
+            stats[name]["sd"] = float(values.std(ddof=1))
+    return stats
+
+
+def to_draw(
+    area: Area, true: Float[np.ndarray, "f 3"], error_mm: Shaped[np.ndarray, " f"], indentation: Int[np.ndarray, " f"]
+) -> dict[str, Any]:
+    """List every tested indentation with the mean error of its readings, and what lies under the skin."""
+    _, first, which = np.unique(indentation, return_index=True, return_inverse=True)
+    mean_mm = np.bincount(which, error_mm) / np.bincount(which)
+    (x_mm, y_mm), (chips_x_mm, chips_y_mm) = true[first, :2].T, area.chips_mm.T
+    columns = {"x_mm": x_mm, "y_mm": y_mm, "error_mm": mean_mm, "chips_x_mm": chips_x_mm, "chips_y_mm": chips_y_mm}
+    rounded: dict[str, Any] = {name: np.round(values.astype(float), 2).tolist() for name, values in columns.items()}
+    borders = dict(zip(("borders_x_mm", "borders_y_mm"), map(list, area.borders_mm), strict=True))
+    return rounded | borders | {"area_mm": list(area.sides_mm)}
+
+
+def read(settings: Settings) -> Sleeve:
+    """Read section sleeve."""
+    return settings.with_training(Sleeve, "sleeve")
+
+
+def sleeve(settings: Settings, indentations: Path, answer: Path) -> None:
+    """Train the recipes of section sleeve on the first pokes, score them and nearest neighbours on the last."""
+    prepare_training()
+    section, captures, area = read(settings), read_folder(indentations), _area(settings)
+    data = SceneData(settings.scene, settings, gather(captures, settings.section(Selection, "selection")), [])
+    train, test = hold_out_last(data.rows, section.test_fraction)
+    trials = [
+        Trial("sleeve", name, recipe, "last", data.settings.seed, seed_i, train, test)
+        for name, recipe in section.training.recipes.items()
+        for seed_i in range(section.training.seeds_n)
+    ]
+    trained = train_all(data, trials, "sleeve")
+    note_seconds(settings.scene, "sleeve", trials, trained)
+    answers = {name: [o.predicted for c, o in zip(trials, trained, strict=True) if c.recipe_name == name]
+               for name in section.training.recipes}  # fmt: skip
+    answers |= _neighbours(data, section, train, test)
+    true, indentation = data.rows.target[test], data.rows.indentation[test]
+    scored = {name: score_places(true, own, indentation, area) for name, own in answers.items()}
+    trained_n, tested_n = (len(np.unique(data.rows.indentation[part])) for part in (train, test))
+    numbers = {
+        "chips_n": captures[0].chips_n, "rate_hz": rate_hz(captures), "area_mm": list(area.sides_mm),
+        "pokes_n": trained_n + tested_n, "trained_n": trained_n, "tested_n": tested_n, "near_mm": NEAR_MM,
+        **scored.pop(HEADLINE), "variants": scored,
+    }  # fmt: skip
+    error_mm = errors_mm(true, answers[HEADLINE][0])
+    drawn = to_draw(area, true, error_mm, indentation)
+    losses = read_losses(indentations, data.rows.dropped)
+    write_answer(answer, numbers, drawn, losses, tally(map(collapse_record, trained)))
+
+
+def _area(settings: Settings) -> Area:
+    of = synthesis_of(settings)
+    kind = of.boards[of.protocols["sleeve"].boards]
+    tiles = kind.design.tiles
+    boards_n, pitch_mm = ((1, 1), 0.0) if tiles is None else ((tiles.columns_n, tiles.rows_n), tiles.pitch_mm)
+    return lay_out(kind.skin_mm, kind.design.places_mm, boards_n=boards_n, pitch_mm=pitch_mm)
+
+
+def _neighbours(data: SceneData, section: Sleeve, train: np.ndarray, test: np.ndarray) -> dict[str, list[np.ndarray]]:
+    none = np.zeros(0, np.int64)
+    tasks = [
+        Task(f"knn-{inputs}", Neighbours(method="knn", inputs=inputs, neighbours_n=section.neighbours_n),
+             train, test, none, len(train), data.settings.seed)
+        for inputs in ("raw", "shape")
+    ]  # fmt: skip
+    rows = Measured(data.rows.db_uT, data.rows.target, data.rows.skin)
+    done = run_tasks(tasks, rows, Here(), lambda line: say(f"{data.scene} sleeve: {line}"))
+    return {task.name: [one.predicted] for task, one in zip(tasks, done, strict=True)}
+
+
+PLACES = {"median_error_mm": "median error, mm", "p95_error_mm": "95 % within, mm"}
+PARTS = {"near_seam": "median near a border of boards, mm", "inside": "median elsewhere, mm"}
+NO_NUMBER = "none: a demonstration"
+SPREAD = "± is the standard deviation over the network seeds that column `seeds` counts."
+NAMES = {"knn-raw": "k nearest neighbours (dB)", "knn-shape": "k nearest neighbours (shape of dB)"}
+NETWORK = "the paper's network"
+
+
+def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
+    """Put every method's places beside each other, and the set-up beside the paper's."""
+    lines = [_line(NETWORK, numbers, source)]
+    lines += [
+        _line(NAMES.get(name, f"network, recipe {name}"), one, source) for name, one in numbers["variants"].items()
+    ]
+    near_n, inside_n = (numbers[part]["pokes_n"] if part in numbers else 0 for part in PARTS)
+    meaning = (
+        f"Trained on the first {numbers['trained_n']} pokes of one skin, tested on its last {numbers['tested_n']}: "
+        f"{near_n} of them less than {numbers['near_mm']:g} mm from a border of two boards, {inside_n} elsewhere. "
+        f"The paper prints no number here: {SLEEVE_WORDS}."
+    )
+    return {"sleeve": tabulate(lines, meaning=meaning, spread=SPREAD), "sleeve_set_up": _set_up(numbers, source)}
+
+
+def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
+    """Map the whole skin: every tested poke, coloured by its error, over chips and borders of boards."""
+    with drawing(6.2, 3.5) as figure:
+        axes = figure.subplots()
+        _under_the_skin(axes, drawn)
+        most_mm = numbers["p95_error_mm"]["mean"]
+        size = float(np.clip(12_000 / len(drawn["x_mm"]), 10, 60))
+        # The long side lies: y runs to the right.
+        points = axes.scatter(
+            drawn["y_mm"], drawn["x_mm"], c=drawn["error_mm"], s=size, cmap="viridis", vmin=0.0, vmax=most_mm,
+            edgecolors="white", linewidths=0.3, zorder=3,
+        )  # fmt: skip
+        bar = figure.colorbar(points, label="place error, first seed / mm", extend="max", shrink=0.8)
+        bar.ax.tick_params(labelsize=9)
+        axes.set(xlabel="y / mm", ylabel="x / mm", aspect="equal")
+        median = show(numbers["median_error_mm"])
+        over = f"over {numbers['median_error_mm']['n']} network seeds"
+        title = f"Held-out pokes over {numbers['chips_n']} chips ({source})\nmedian error {median} mm {over}"
+        figure.suptitle(title, x=0.01, ha="left", fontsize=10)
+        figure.legend(loc="outside lower left", ncols=3, frameon=False, fontsize=9)
+        return {"sleeve.svg": svg(figure)}
+
+
+def _under_the_skin(axes: Any, drawn: Mapping[str, Any]) -> None:
+    x_mm, y_mm = drawn["area_mm"]
+    thin = {"color": "0.5", "linewidth": 0.8, "zorder": 1}
+    axes.vlines(drawn["borders_y_mm"], 0, x_mm, **thin, label="border of two boards")
+    axes.hlines(drawn["borders_x_mm"], 0, y_mm, **thin)
+    axes.plot([0, y_mm, y_mm, 0, 0], [0, 0, x_mm, x_mm, 0], color=COLOURS[0], linewidth=1.2, label="edge of the skin")
+    chips = {"marker": "+", "s": 45, "color": COLOURS[2], "linewidths": 1.2, "zorder": 4, "label": "chip"}
+    axes.scatter(drawn["chips_y_mm"], drawn["chips_x_mm"], **chips)
+    axes.set(xlim=(-1.5, y_mm + 1.5), ylim=(-1.5, x_mm + 1.5))
+    for side in ("left", "bottom"):
+        axes.spines[side].set_visible(False)
+
+
+def _line(name: str, one: Mapping[str, Any], source: str) -> dict[str, str]:
+    line = {"method": name, "source": source} | scores(one, COLUMNS | PLACES)
+    for part, title in PARTS.items():
+        line[title] = show(one[part]["median_error_mm"]) if part in one else "–"
+    return line | {"paper": NO_NUMBER, "seeds": str(one["accuracy_pct"]["n"])}
+
+
+def _set_up(numbers: Mapping[str, Any], source: str) -> pd.DataFrame:
+    printed = {"chips": str(SLEEVE["chips_n"]), "rate, Hz": f"{SLEEVE['rate_hz']:g}", "skin, mm": SLEEVE_SKIN}
+    ours = {
+        "chips": str(numbers["chips_n"]),
+        "rate, Hz": f"{numbers['rate_hz']:.1f}",
+        "skin, mm": "{:g} x {:g}".format(*numbers["area_mm"]),
+    }
+    return tabulate(
+        [{"what": what, "ours": one, "paper": printed[what], "source": source} for what, one in ours.items()]
+    )

@@ -1,1 +1,0 @@
-"""Many boards under one skin (paper section 6)."""

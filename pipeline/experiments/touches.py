@@ -1,0 +1,475 @@
+"""Touches at numbered places, one or two at once, recorded (paper section 7)."""
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Bool, Float, Float32, Float64
+from pydantic import Field, model_validator
+from scipy.optimize import nnls
+
+from pipeline.experiments.answer import write_answer
+from pipeline.experiments.contacts import NEIGHBOURS_N, NOISE_uT, direction_distance, neighbour_distance, roc_area
+from pipeline.report.formatting import show_digits
+from pipeline.settings import Settings
+from pipeline.stage import say
+from pipeline.statistics import statistic
+from reskin import io
+from reskin.config import Strict
+from reskin.data.baseline import subtract
+from reskin.data.rows import Selection
+from reskin.errors import ParamsError
+from reskin.models.classical import Ridge, fit
+from reskin.models.inputs import shape
+from reskin.schema import Readings
+from reskin.seeds import rng_for
+
+Directions = Mapping[int, Float64[np.ndarray, " ch"]]  # by place
+Scores = dict[str, Float[np.ndarray, "_"]]  # by detector: the larger, the less like one touch
+
+
+def unit(db_uT: Float32[np.ndarray, "f ch"]) -> Float64[np.ndarray, "f ch"]:
+    """Give directions dB / (|dB| + noise): a weak reading's is short."""
+    return np.asarray(db_uT / (np.linalg.norm(db_uT.astype(np.float64), axis=1, keepdims=True) + NOISE_uT))
+
+
+def name_places(
+    known_uT: Float32[np.ndarray, "a ch"], places: Float64[np.ndarray, " a"], asked_uT: Float32[np.ndarray, "f ch"]
+) -> Float64[np.ndarray, " f"]:
+    """Answer the place that most of the nearest known directions are of."""
+    from sklearn.neighbors import KNeighborsClassifier  # late: it takes a second, and scenes are checked without it
+
+    voters = KNeighborsClassifier(min(NEIGHBOURS_N, len(known_uT))).fit(unit(known_uT), places)
+    return np.asarray(voters.predict(unit(asked_uT)))
+
+
+def directions(
+    known_uT: Float32[np.ndarray, "a ch"], places: Float64[np.ndarray, " a"]
+) -> dict[int, Float64[np.ndarray, " ch"]]:
+    """Give the mean direction of each place's rows."""
+    units = unit(known_uT)
+    return {int(place): units[places == place].mean(axis=0) for place in np.unique(places)}
+
+
+def left_over(
+    known: Directions, places: Sequence[int], db_uT: Float32[np.ndarray, "f ch"]
+) -> Float64[np.ndarray, " f"]:
+    """Give what amplitudes of 0 or more of these places' directions, fitted row by row, leave of dB, as a share of it.
+
+    This is the least that any two strengths can leave: how hard each place was pressed is not known.
+    """
+    basis = np.stack([known[place] for place in places], axis=1)
+    rows_uT = db_uT.astype(np.float64)
+    return np.array([nnls(basis, row_uT)[1] for row_uT in rows_uT]) / np.linalg.norm(rows_uT, axis=1)
+
+
+def explain_pair(known: Directions, pair: tuple[int, int], db_uT: Float32[np.ndarray, "f ch"]) -> dict[str, Any]:
+    """Say how much of the field of two touches the sum of theirs leaves, beside one place's and all other pairs'."""
+    left = {of: float(np.median(left_over(known, of, db_uT))) for of in combinations(sorted(known), 2)}
+    alone = {place: float(np.median(left_over(known, (place,), db_uT))) for place in known}
+    least = min(alone, key=lambda place: alone[place])
+    others = [share for of, share in left.items() if of != pair]
+    return {
+        "places": list(pair), "rows_n": len(db_uT), "left_over_pct": 100 * left[pair],
+        "weaker_alone_pct": 100 * max(alone[place] for place in pair),
+        "stronger_alone_pct": 100 * min(alone[place] for place in pair),
+        "best_alone_pct": 100 * alone[least], "best_alone": least,
+        "other_pairs_pct": 100 * float(np.mean(others)), "rank": 1 + sum(share < left[pair] for share in others),
+        "pairs_n": len(left),
+    }  # fmt: skip
+
+
+def oddness(known_uT: Float32[np.ndarray, "a ch"], known: Directions, asked_uT: Float32[np.ndarray, "f ch"]) -> Scores:
+    """Score rows by the detectors of question contacts that need no network, and by what one place leaves over."""
+    alone = [left_over(known, (place,), asked_uT) for place in known]
+    return {
+        "direction and length": neighbour_distance(shape(known_uT), shape(asked_uT)),
+        "direction above noise": direction_distance(known_uT, asked_uT),
+        "left over by one place": np.min(alone, axis=0),
+    }
+
+
+def limits_of(aside: Scores, false_alarm_fraction: float) -> dict[str, float]:
+    """Set each detector's threshold so that it calls odd so many of the single touches kept aside."""
+    return {name: float(np.quantile(scores, 1 - false_alarm_fraction)) for name, scores in aside.items()}
+
+
+def called_pct(scores: Scores, limits: Mapping[str, float]) -> dict[str, float]:
+    """Give the share of rows above each detector's threshold, in percent."""
+    return {name: 100 * float((scores[name] > limit).mean()) for name, limit in limits.items()}
+
+
+def areas(single: Scores, double: Scores) -> dict[str, float]:
+    """Give each detector's area under the ROC curve, of single touches against double ones."""
+    return {name: roc_area(single[name], double[name]) for name in single}
+
+
+def is_one_of(answers: Float64[np.ndarray, " f"], places: Sequence[int]) -> Bool[np.ndarray, " f"]:
+    """Mark the answers that name one of the touched places."""
+    return np.isin(answers, list(places))
+
+
+PLACE_COUNT = re.compile(r"place_(\d+)_rows_n")  # of an account, by layouts that number places
+ROWS_MIN_N = 20  # touched rows that three blocks are cut of
+
+
+@dataclass(frozen=True)
+class Touched:
+    """The touched rows of one recording, in order of time: changes of field, forces, and the place or places."""
+
+    name: str
+    places: tuple[int, ...]
+    db_uT: Float32[np.ndarray, "f ch"]
+    force_N: Float32[np.ndarray, " f"]
+
+    def part(self, rows: slice) -> "Touched":
+        """Keep some of the rows."""
+        return Touched(self.name, self.places, self.db_uT[rows], self.force_N[rows])
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """A recording's rows by time: what is learned from, what a threshold is set on, what is tested; in this order."""
+
+    train: Touched
+    aside: Touched
+    test: Touched
+
+
+def touched(readings: Readings, account: Mapping[str, int], selection: Selection) -> Touched:
+    """Take the rows with enough force; raise for a recording whose places have no numbers."""
+    places = tuple(sorted(int(found[1]) for name in account if (found := PLACE_COUNT.fullmatch(name))))
+    if len(places) not in (1, 2):
+        rule = "one or two, by number"
+        remedy = "Only layout eflash7 has such; ask this of a scene of its own."
+        raise ParamsError(f"capture {readings.capture}", "its places", rule, list(places), remedy)
+    rows = readings.Fz_N >= selection.force_min_N
+    db_uT = subtract(readings.b_uT[rows], readings.noload_uT[rows])
+    return Touched(readings.capture, places, db_uT, readings.Fz_N[rows])
+
+
+def in_blocks(recording: Touched, train_fraction: float, aside_fraction: float) -> Blocks:
+    """Cut a recording's rows in three by time."""
+    rows_n = len(recording.db_uT)
+    first, second = (round(share * rows_n) for share in (train_fraction, train_fraction + aside_fraction))
+    parts = (slice(0, first), slice(first, second), slice(second, None))
+    return Blocks(*(recording.part(part) for part in parts))
+
+
+@dataclass(frozen=True)
+class Sorted:
+    """Recordings of one place and of two, why others are left out (by name), and why nothing can be computed."""
+
+    single: list[Touched]
+    double: list[Touched]
+    left_out: dict[str, str]
+    problem: str | None
+
+
+def sort_recordings(recordings: Iterable[Touched]) -> Sorted:
+    """Sort recordings by how many places they touch, and leave out those that cannot be used.
+
+    A recording needs `ROWS_MIN_N` touched rows, a pair of places that each was recorded alone, too. A place that was
+    recorded alone twice would mix two blocks of time, so only its first recording is used.
+    """
+    ordered = sorted(recordings, key=lambda one: (len(one.places), one.places, one.name))  # single places first
+    left_out = {
+        one.name: f"{len(one.db_uT)} touched rows, fewer than {ROWS_MIN_N}"
+        for one in ordered
+        if len(one.db_uT) < ROWS_MIN_N
+    }
+    usable = [one for one in ordered if one.name not in left_out]
+    single: dict[int, Touched] = {}
+    double = []
+    for one in usable:
+        unknown = sorted(set(one.places) - single.keys()) if len(one.places) == 2 else []
+        if unknown:
+            left_out[one.name] = f"place {' and '.join(map(str, unknown))} not recorded alone"
+        elif len(one.places) == 2:
+            double.append(one)
+        elif one.places[0] in single:
+            left_out[one.name] = f"place {one.places[0]} already recorded alone, by {single[one.places[0]].name}"
+        else:
+            single[one.places[0]] = one
+    problem = None
+    if len(single) < 2:
+        problem = f"places recorded alone: {len(single)}; at least 2 are needed. Add their recordings to this scene."
+    return Sorted(list(single.values()), double, left_out, problem)
+
+
+def joined(parts: Sequence[Touched]) -> tuple[Float32[np.ndarray, "f ch"], Float64[np.ndarray, " f"]]:
+    """Stack the changes of field of single touches, and the number of the place of each row."""
+    numbers = np.repeat(np.array([float(part.places[0]) for part in parts]), [len(part.db_uT) for part in parts])
+    return np.concatenate([part.db_uT for part in parts]), numbers
+
+
+Fraction = Annotated[float, Field(gt=0, lt=1)]
+LINEAR = Ridge(inputs="raw", method="ridge", alpha=1.0)  # of force
+SUMS_N = 100  # sums of two single touches, of each pair of places, drawn
+
+
+class Touches(Strict):
+    """How a recording is cut by time, and how many single touches a threshold may call two."""
+
+    train_fraction: Fraction
+    aside_fraction: Fraction
+    false_alarm_fraction: Fraction
+
+    @model_validator(mode="after")
+    def _something_is_left(self) -> "Touches":
+        if self.train_fraction + self.aside_fraction >= 1:
+            raise ValueError("train_fraction and aside_fraction leave rows to test: together less than 1")
+        return self
+
+
+def read(settings: Settings) -> Touches:
+    """Read section touches."""
+    return settings.section(Touches, "touches")
+
+
+def of_places(blocks: Sequence[Blocks], double: Sequence[Touched]) -> dict[str, Any]:
+    """Name the place of single touches by time, and of two touches: is the answer one of both?"""
+    known_uT, numbers = joined([one.train for one in blocks])
+    right_pct = [
+        100 * float(is_one_of(name_places(known_uT, numbers, part.db_uT), part.places).mean())
+        for part in [*(one.test for one in blocks), *double]
+    ]
+    singles_n = len(blocks)
+    told = {
+        "by_time": statistic(right_pct[:singles_n]) | {"chance_pct": 100 / singles_n},
+        "by_place": {str(one.test.places[0]): pct for one, pct in zip(blocks, right_pct, strict=False)},
+    }
+    if not double:
+        return told
+    return told | {"one_of_two": statistic(right_pct[singles_n:]) | {"chance_pct": 200 / singles_n}}
+
+
+def of_forces(blocks: Sequence[Blocks], rng: np.random.Generator) -> dict[str, Any]:
+    """Fit force to fields of single touches: tested later in the same recordings, and in recordings left out."""
+    by_time = [_force_error(blocks, one.test, rng) for one in blocks]
+    left_out = [_force_error([other for other in blocks if other is not one], one.test, rng) for one in blocks]
+    spread = [{"mse_f_N2": float(one.test.force_N.var(dtype=np.float64))} for one in blocks]
+    ways = {"by_time": by_time, "place_left_out": left_out, "variance": spread}
+    return {way: statistic([row["mse_f_N2"] for row in rows]) for way, rows in ways.items()}
+
+
+def _force_error(known: Sequence[Blocks], asked: Touched, rng: np.random.Generator) -> dict[str, float]:
+    train = [one.train for one in known]
+    target = np.full((sum(len(part.force_N) for part in train), 3), np.nan, np.float32)
+    target[:, 2] = np.concatenate([part.force_N for part in train])
+    fitted = fit(LINEAR, np.concatenate([part.db_uT for part in train]), target, rng, weight=None)
+    error_N = fitted.predict(asked.db_uT)[:, 2].astype(np.float64) - asked.force_N
+    return {"mse_f_N2": float((error_N**2).mean())}
+
+
+def of_superposition(blocks: Sequence[Blocks], double: Sequence[Touched]) -> dict[str, Any]:
+    """Explain two touches by the directions of single ones, beside what these leave of single touches themselves."""
+    known = directions(*joined([one.train for one in blocks]))
+    own_pct = [100 * float(np.median(left_over(known, one.test.places, one.test.db_uT))) for one in blocks]
+    pairs = [explain_pair(known, (one.places[0], one.places[1]), one.db_uT) for one in double]
+    return {"single_touches_pct": statistic(own_pct), "pairs": pairs} | {
+        f"mean_{name}": statistic([pair[name] for pair in pairs])
+        for name in ("left_over_pct", "stronger_alone_pct", "other_pairs_pct")
+        if pairs
+    }
+
+
+def of_detection(blocks: Sequence[Blocks], double: Sequence[Touched], section: Touches, seed: int) -> dict[str, Any]:
+    """Tell two touches from one at a set share of false alarms; with the two controls that say what was told."""
+    known_uT, numbers = joined([one.train for one in blocks])
+    known = directions(known_uT, numbers)
+
+    def scored(parts: Sequence[Float32[np.ndarray, "_ ch"]]) -> Scores:
+        return oddness(known_uT, known, np.concatenate(parts))
+
+    limits = limits_of(scored([one.aside.db_uT for one in blocks]), section.false_alarm_fraction)
+    single = scored([one.test.db_uT for one in blocks])
+    sums = scored(sums_of(blocks, rng_for(seed, "touches", "sums")))
+    told = {
+        "false_alarm_asked_pct": 100 * section.false_alarm_fraction,
+        "false_alarm_pct": called_pct(single, limits),
+        "sums_called_two_pct": called_pct(sums, limits),
+        "unseen_place_called_two_pct": of_unseen_places(blocks, section.false_alarm_fraction),
+    }
+    if not double:
+        return told
+    both = scored([one.db_uT for one in double])
+    return told | {"detected_pct": called_pct(both, limits), "auc": areas(single, both)}
+
+
+def sums_of(blocks: Sequence[Blocks], rng: np.random.Generator) -> list[Float32[np.ndarray, "_ ch"]]:
+    """Add tested single touches of each two places, as question contacts does of boards without two touches."""
+    tested = [one.test.db_uT for one in blocks]
+    drawn = [
+        (a_uT[rng.integers(len(a_uT), size=SUMS_N)], b_uT[rng.integers(len(b_uT), size=SUMS_N)])
+        for i, a_uT in enumerate(tested)
+        for b_uT in tested[i + 1 :]
+    ]
+    return [a_uT + b_uT for a_uT, b_uT in drawn]
+
+
+def of_unseen_places(blocks: Sequence[Blocks], false_alarm_fraction: float) -> dict[str, float]:
+    """Call two what is one: single touches of each place, by detectors that know all other places; mean over places."""
+    called = []
+    for one in blocks:
+        others = [other for other in blocks if other is not one]
+        known_uT, numbers = joined([other.train for other in others])
+        known = directions(known_uT, numbers)
+        aside = oddness(known_uT, known, joined([other.aside for other in others])[0])
+        limits = limits_of(aside, false_alarm_fraction)
+        called.append(called_pct(oddness(known_uT, known, one.test.db_uT), limits))
+    return {name: float(np.mean([row[name] for row in called])) for name in called[0]}
+
+
+def touches(settings: Settings, indentations: Path, answer: Path) -> None:
+    """Answer what can be asked of touches at numbered places."""
+    section, selection = read(settings), settings.section(Selection, "selection")
+    sources = [indentations / f"{name}.parquet" for name in settings.captures_in(indentations)]
+    found = sort_recordings(touched(io.read_readings(file), io.read_account(file), selection) for file in sources)
+    single, double = found.single, found.double
+    counts = {
+        "force_min_N": selection.force_min_N,
+        "single": {"recordings_n": len(single), "rows_n": sum(len(one.db_uT) for one in single)},
+        "double": {"recordings_n": len(double), "rows_n": sum(len(one.db_uT) for one in double)},
+        "left_out": found.left_out,
+    }
+    for name, reason in found.left_out.items():
+        say(f"{settings.scene}: warning: {name} left out: {reason}")
+    if found.problem:
+        write_answer(answer, counts | {"not_computed": found.problem}, {})
+        say(f"{settings.scene}: warning: touches not computed: {found.problem}")
+        return
+    blocks = [in_blocks(one, section.train_fraction, section.aside_fraction) for one in single]
+    numbers = counts | {
+        "tested_rows_n": sum(len(one.test.db_uT) for one in blocks),
+        "place": of_places(blocks, double),
+        "force": of_forces(blocks, rng_for(settings.seed, "touches", "force")),
+        "superposition": of_superposition(blocks, double),
+        "detection": of_detection(blocks, double, section, settings.seed),
+    }
+    write_answer(answer, numbers, {})
+    say(f"{settings.scene}: {len(single)} recordings of one place, {len(double)} of two")
+
+
+BY_TIME = "later in the same recordings"
+ONCE = (
+    "Each place was recorded once, so what is tested later in the same recordings may be told by the recording as well "
+    "as by the place: only a recording of other days, or a place left out, is free of that."
+)
+APART = "Single touches and two at once are in different recordings; data/README.md says of which days."
+NO_MM = "The pitch of the 3 x 3 places is stated nowhere, so nothing is given in mm."
+
+
+def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
+    """Tabulate what one touch tells, how two add up, and whether two are told from one."""
+    if "not_computed" in numbers:
+        return {"touches": _not_computed(numbers, source)}
+    found = {"touches": _single(numbers), "touches_detection": _detection(numbers["detection"])}
+    if numbers["superposition"]["pairs"]:
+        found["touches_superposition"] = _superposition(numbers["superposition"])
+    for table in found.values():
+        table["source"] = source
+    return found
+
+
+def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
+    """Nothing: tables say it all."""
+    return {}
+
+
+def _single(numbers: Mapping[str, Any]) -> pd.DataFrame:
+    place, force = numbers["place"], numbers["force"]
+    rows = [_row(f"place of one touch, {BY_TIME}", place["by_time"], "%", f"{place['by_time']['chance_pct']:.1f}")]
+    if "one_of_two" in place:
+        two = place["one_of_two"]
+        chance = f"{two['chance_pct']:.1f}"
+        rows.append(_row("two touches, in their own recordings: answer is one of the two", two, "%", chance))
+    variance = f"{force['variance']['mean']:.3g} (variance)"
+    for way, words in (("by_time", BY_TIME), ("place_left_out", "at a place left out of training")):
+        rows.append(_row(f"force of one touch, squared error, {words}", force[way], "N²", variance))
+    table = pd.DataFrame(rows)
+    single, double = numbers["single"], numbers["double"]
+    table.attrs["meaning"] = (
+        f"{single['rows_n']} rows of {single['recordings_n']} recordings of one touch, {double['rows_n']} rows of "
+        f"{double['recordings_n']} of two, with {numbers['force_min_N']:g} N or more. Place: the nearest directions of "
+        f"the change of field; force: ridge regression on it. Means and ± sd over n recordings. {ONCE} {APART} {NO_MM}"
+        f"{_left_out(numbers)}"
+    )
+    return table
+
+
+def _not_computed(numbers: Mapping[str, Any], source: str) -> pd.DataFrame:
+    rows = [{"recordings": "all", "not used because": numbers["not_computed"]}]
+    rows += [{"recordings": name, "not used because": reason} for name, reason in numbers["left_out"].items()]
+    table = pd.DataFrame(rows).assign(source=source)
+    table.attrs["meaning"] = (
+        f"Nothing was computed from {numbers['single']['recordings_n']} usable recordings of one touch and "
+        f"{numbers['double']['recordings_n']} of two."
+    )
+    return table
+
+
+def _left_out(numbers: Mapping[str, Any]) -> str:
+    return "".join(f" Left out: {name} ({reason})." for name, reason in numbers.get("left_out", {}).items())
+
+
+def _row(what: str, stat: Mapping[str, Any], unit: str, chance: str) -> dict[str, Any]:
+    spread = f" ± {stat['sd']:.3g}" if "sd" in stat else ""
+    return {"what": what, "result": f"{stat['mean']:.3g}{spread} {unit}", "by chance": chance, "n": stat["n"]}
+
+
+def _superposition(numbers: Mapping[str, Any]) -> pd.DataFrame:
+    rows = [
+        {
+            "places": " and ".join(map(str, pair["places"])),
+            "sum of both, %": f"{pair['left_over_pct']:.0f}",
+            "the stronger alone, %": f"{pair['stronger_alone_pct']:.0f}",
+            "the best of all places alone, %": f"{pair['best_alone_pct']:.0f} (place {pair['best_alone']})",
+            "other pairs, mean, %": f"{pair['other_pairs_pct']:.0f}",
+            "rank among pairs": f"{pair['rank']} of {pair['pairs_n']}",
+            "rows": f"{pair['rows_n']}",
+        }
+        for pair in numbers["pairs"]
+    ]
+    means = {
+        "sum of both, %": "mean_left_over_pct", "the stronger alone, %": "mean_stronger_alone_pct",
+        "other pairs, mean, %": "mean_other_pairs_pct",
+    }  # fmt: skip
+    rows.append({"places": "mean"} | {title: show_digits(numbers[name], 0) for title, name in means.items()})
+    table = pd.DataFrame(rows).fillna("–")
+    table.attrs["meaning"] = (
+        "What is left of a recorded change of field of two touches, as a share of it (median over rows), when it is "
+        "fitted by the mean directions of single touches at these places, each times an amplitude of 0 or more: how "
+        "hard each was pressed is not recorded. A direction that changes with force counts as left over: of single "
+        f"touches themselves it is {show_digits(numbers['single_touches_pct'], 0)} %. Two amplitudes fit better than "
+        f"one of themselves; the other pairs have two as well. {APART}"
+    )
+    return table
+
+
+def _detection(numbers: Mapping[str, Any]) -> pd.DataFrame:
+    columns = {
+        "two touches called two, %": "detected_pct",
+        "single touches called two, %": "false_alarm_pct",
+        "a single touch at an unknown place called two, %": "unseen_place_called_two_pct",
+        "sums of two single touches called two, %": "sums_called_two_pct",
+    }
+    rows = [
+        {"detector": name}
+        | {title: f"{numbers[key][name]:.0f}" for title, key in columns.items() if key in numbers}
+        | ({"area under the ROC curve": f"{numbers['auc'][name]:.3f}"} if "auc" in numbers else {})
+        for name in numbers["false_alarm_pct"]
+    ]
+    table = pd.DataFrame(rows)
+    table.attrs["meaning"] = (
+        f"Thresholds ask for {numbers['false_alarm_asked_pct']:g} % false alarms, as in question contacts, and are set "
+        "on single touches between those that are known and those that are tested. A detector that calls a single "
+        "touch at a place it does not know two has found what is new, not what is two: then the first column is no "
+        f"evidence for more. {APART}"
+    )
+    return table

@@ -1,1 +1,0 @@
-"""Touches at numbered places, one or two at once, recorded (paper section 7)."""

@@ -1,0 +1,474 @@
+"""Laws of contact, force and friction, against closed forms, published fits and rings of pressure. Out: checks.
+
+Refuses to know magnets, and where the material goes (`kinematics`).
+"""
+
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from typing import Any
+
+import mpmath
+import numpy as np
+from jaxtyping import Float
+from scipy.constants import kilo, micro, milli
+from scipy.integrate import quad
+from scipy.special import ellipe, ellipk, j0, j1
+
+from pipeline.experiments.verification.checks import Check, apart, farthest, no_spread, relative, worst
+from pipeline.experiments.verification.signals import TURN, field_of
+from reskin.data.grid import CENTRE_MM, protocol
+from reskin.physics import layer, shear, slide
+from reskin.physics import layer as flow
+from reskin.physics import layer as slip
+from reskin.physics import shear as friction
+from reskin.physics.board import Board, BoardDesign, Spreads, draw_board
+from reskin.physics.layer import Press
+from reskin.physics.magnet import Polarity, Quadrature
+from reskin.physics.skin import Dipoles, Skin, SkinDesign, changes_of_field, draw_skin, press_slides
+
+HALF_SPACE_M = 100.0  # a layer that a tip of millimetres does not feel the base of
+HELD_BACK = 1.770  # integral of 1 - compliance (PHYSICS 4; Dimitriadis et al. 2002 fit 1.780)
+BONDED = (1.0, 1.133, 1.283, 0.769, 0.0975)  # Dimitriadis et al. 2002, powers of chi = sqrt(R d) / h
+RINGS_N = 40
+SKIN_FORCE = "force of the skin"
+FRICTION = 0.8
+BONDED_KH, SLIDING_KH = np.geomspace(1e-3, 300, 60), np.geomspace(0.01, 30, 12)
+
+
+def check_contact(skin: SkinDesign) -> list[Check]:
+    """Check the layer's compliance, the force down to the published solutions' 0.6 of the thickness, and friction."""
+    bonded = Press(skin.thickness_mm * milli, skin.tip_radius_mm * milli, "bonded")
+    sliding = Press(bonded.thickness_m, bonded.tip_radius_m, "slipping")
+    depth_m = layer.VERIFIED_DEPTH * bonded.thickness_m * np.arange(1, 7) / 6
+    return [
+        bonded_compliance(), held_back(),
+        sliding_compliance(), hertz("slipping", bonded.tip_radius_m),
+        hertz("bonded", bonded.tip_radius_m), *sneddon(bonded.tip_radius_m * np.array([0.1, 0.3, 0.7]), bonded),
+        dimitriadis(depth_m, bonded), long_2011(depth_m, bonded),
+        *(rings(float(depth_m.max()), press) for press in (bonded, sliding)),
+        *scaling(depth_m, bonded, skin.modulus_kPa * kilo),
+    ]  # fmt: skip
+
+
+def force_N(depth_m: Float[np.ndarray, " n"], press: Press, modulus_Pa: float = 1.0) -> Float[np.ndarray, " n"]:
+    """Give the product's force, for 1 Pa unless said."""
+    return layer.force(depth_m, **asdict(press), modulus_Pa=modulus_Pa)
+
+
+def hertz_N(depth_m: Float[np.ndarray, " n"], tip_m: float) -> Float[np.ndarray, " n"]:
+    """Give Hertz's force on an incompressible half-space of 1 Pa: 16/9 E sqrt(R) d^1.5."""
+    return 16 / 9 * np.sqrt(tip_m) * depth_m**1.5
+
+
+def bonded_compliance(kh: Float[np.ndarray, " w"] = BONDED_KH) -> Check:
+    with mpmath.workdps(50):
+        truth = [
+            float((mpmath.sinh(2 * a) - 2 * a) / (mpmath.cosh(2 * a) + 2 * a**2 + 1))
+            for a in map(mpmath.mpf, kh.tolist())
+        ]
+    return Check("bonded layer", "compliance, kh 1e-3-300", "its formula in 50 digits (mpmath)",
+                 relative(layer.compliance(kh), np.array(truth)), "1", 3e-12,
+                 "the series' next term, and 1 - 1 + ... at kh = 1/4, which costs 3 digits")  # fmt: skip
+
+
+def held_back() -> Check:
+    missing, _ = quad(lambda a: 1 - layer.compliance(np.array([a]))[0], 0, 40)
+    return Check("bonded layer", "a0: what a half-space lacks adds up", f"{HELD_BACK:.3f}", abs(missing - HELD_BACK),
+                 "1", 5e-4, "three printed decimals")  # fmt: skip
+
+
+def sliding_compliance(kh: Float[np.ndarray, " w"] = SLIDING_KH) -> Check:
+    with mpmath.workdps(50):
+        truth = [float(dense_profile(mpmath.mpf(a))(mpmath.mpf(a))) for a in kh.tolist()]
+    return Check("sliding layer", "compliance, kh 0.01-30", "a dense solve of four conditions, 50 digits (mpmath)",
+                 relative(slip.compliance_on_slip(kh), np.array(truth)), "1", 1e-12,
+                 "rounding, 1 - 1 + ... at small kh")  # fmt: skip
+
+
+def dense_profile(kh: Any) -> Callable[[Any], Any]:
+    """Solve for W under a pressure of 1 in 2 G k: W'' + W = 0 at both faces, W = 0 below, 3 W' - W''' = 2 above."""
+    basis = (mpmath.sinh, mpmath.cosh, lambda z: z * mpmath.sinh(z), lambda z: z * mpmath.cosh(z))
+    conditions = (({0: 1}, 0), ({2: 1, 0: 1}, 0), ({2: 1, 0: 1}, kh), ({1: 1.5, 3: -0.5}, kh))
+    rows = [[sum(c * mpmath.diff(w, z, n) for n, c in of.items()) for w in basis] for of, z in conditions]
+    weights = mpmath.lu_solve(mpmath.matrix(rows), mpmath.matrix([0, 0, 0, 1]))
+    return lambda z: sum(weight * w(z) for weight, w in zip(weights, basis, strict=True))
+
+
+def hertz(base: layer.Base, tip_m: float) -> Check:
+    depth_m = tip_m * np.array([1e-6, 1e-5])
+    law, reason = {
+        "bonded": ("Hertz's, d / R to 1e-5", "the base is felt as sqrt(R d) / h, 2e-7; a sphere is no paraboloid: "
+                   "d / R, 1e-5; the curve is a spline"),
+        "slipping": ("Hertz's, on a sliding base too", "as on a bonded one"),
+    }[base]  # fmt: skip
+    error = relative(force_N(depth_m, Press(HALF_SPACE_M, tip_m, base)), hertz_N(depth_m, tip_m))
+    return Check("force, thick layer", law, "16/9 E sqrt(R) d^1.5 (Hertz 1882)", error, "1", 1e-4, reason)
+
+
+def sneddon(radii_m: Float[np.ndarray, " n"], press: Press) -> list[Check]:
+    tip_m = press.tip_radius_m
+    thick = asdict(press) | {"thickness_m": HALF_SPACE_M}
+    contacts = [layer.contact_of_radius(float(a), **thick) for a in radii_m]
+    log = np.log((tip_m + radii_m) / (tip_m - radii_m))
+    sneddon_N = 4 / 3 * ((radii_m**2 + tip_m**2) / 2 * log - radii_m * tip_m)
+    found_N = np.array([4 * np.pi / 3 * contact.weights_m2.sum() for contact in contacts])
+    found_m = np.array([contact.depth_m for contact in contacts])
+    law, base = "a sphere's, contact radius to 0.7 R", "the base is felt as a / h, 2e-5"
+    return [
+        Check("force, thick layer", law, "Sneddon 1965", relative(found_N, sneddon_N), "1", 1e-4, base),
+        Check("depth, thick layer", law, "Sneddon 1965", relative(found_m, radii_m * log / 2), "1", 1e-4, base),
+    ]
+
+
+def _to_depths(depth_m: Float[np.ndarray, " n"]) -> str:
+    return f"bonded layer, {depth_m.min() / milli:g}-{depth_m.max() / milli:g} mm"
+
+
+def dimitriadis(depth_m: Float[np.ndarray, " n"], press: Press) -> Check:
+    chi = np.sqrt(press.tip_radius_m * depth_m) / press.thickness_m
+    bonded_N = hertz_N(depth_m, press.tip_radius_m) * np.polynomial.polynomial.polyval(chi, BONDED)
+    return Check(SKIN_FORCE, _to_depths(depth_m), "Dimitriadis et al. 2002, bonded",
+                 relative(force_N(depth_m, press), bonded_N), "1", 0.10,
+                 "a series in chi = sqrt(R d) / h, from chi^2 on low: 8 % at chi = 0.5 against rings of pressure"
+                 )  # fmt: skip
+
+
+def long_2011(depth_m: Float[np.ndarray, " n"], press: Press) -> Check:
+    h_m, tip_m = press.thickness_m, press.tip_radius_m
+    omega, flat = (tip_m * depth_m / h_m**2) ** 1.5, h_m / tip_m
+    alpha, beta = 10.05 - 0.63 * np.sqrt(flat) * (3.1 + flat**2), 4.8 - 4.23 * flat**2
+    psi = (1 + 2.3 * omega) / (1 + 1.15 * np.cbrt(omega) + alpha * omega + beta * omega**2)
+    return Check(SKIN_FORCE, _to_depths(depth_m), "Long et al. 2011",
+                 relative(force_N(depth_m, press), hertz_N(depth_m, tip_m) / psi), "1", 0.05,
+                 "a fit to finite elements of large deformation, made for 0.3 <= R/h <= 12.7, d/h <= 0.6")  # fmt: skip
+
+
+def rings(depth_m: float, press: Press) -> Check:
+    edges_m, pressure = ring_pressures(depth_m, press)
+    rings_N = float(2 / 3 * np.pi * (pressure * np.diff(edges_m**2)).sum())
+    return Check(SKIN_FORCE, f"{press.base} layer, {depth_m / milli:g} mm", f"{RINGS_N} rings of even pressure",
+                 abs(float(force_N(np.array([depth_m]), press)[0]) / rings_N - 1), "1", 0.01,
+                 "a ring is 2.5 % of the contact's radius")  # fmt: skip
+
+
+def ring_pressures(depth_m: float, press: Press) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " p"]]:
+    """Give the edges of the rings over the product's contact, and their pressures for 1 Pa."""
+    h_m, tip_m, radius_m = press.thickness_m, press.tip_radius_m, press.contact(depth_m).radius_m
+    edges_m = radius_m * np.linspace(0, 1, RINGS_N + 1)
+    middles_m = (edges_m[1:] + edges_m[:-1]) / 2
+    discs_m = np.array([[_sinking_m(r, edge, h_m, press.base) for edge in edges_m[1:]] for r in middles_m])
+    rings_m = np.diff(discs_m, axis=1, prepend=0.0)
+    return edges_m, np.linalg.solve(rings_m, depth_m - (tip_m - np.sqrt(tip_m**2 - middles_m**2)))
+
+
+def _sinking_m(r_m: float, disc_m: float, h_m: float, base: layer.Base) -> float:
+    # Under unit pressure / 2G on a disc: that of a half-space (elliptic integrals) less the hold of the base.
+    m = (min(r_m, disc_m) / max(r_m, disc_m)) ** 2
+    free = 2 / np.pi * max(r_m, disc_m) * (ellipe(m) if r_m <= disc_m else ellipe(m) - (1 - m) * ellipk(m))
+    k = np.linspace(1e-3, 25, 1500) / h_m
+    surface = layer.compliance if base == "bonded" else slip.compliance_on_slip
+    held = disc_m * j1(k * disc_m) / k * (1 - surface(k * h_m)) * j0(k * r_m)
+    return float(free - np.trapezoid(held, k))
+
+
+def scaling(depth_m: Float[np.ndarray, " n"], press: Press, modulus_Pa: float) -> list[Check]:
+    once_N = force_N(depth_m, press)
+    larger = Press(3 * press.thickness_m, 3 * press.tip_radius_m, press.base)
+    exact_N = [4 * np.pi / 3 * press.contact(float(d)).weights_m2.sum() for d in depth_m]
+    return [
+        Check(SKIN_FORCE, "proportional to E", "itself, at 1 Pa",
+              worst(force_N(depth_m, press, modulus_Pa), modulus_Pa * once_N), "1", 1e-13, "rounding"),
+        Check(SKIN_FORCE, "three times the size, nine times the force", "itself, scaled",
+              worst(force_N(3 * depth_m, larger), 9 * once_N), "1", 1e-9,
+              "the spline's knots are found by a root search to 1e-12"),
+        Check(SKIN_FORCE, "the curve passes through each contact", "the contact itself",
+              worst(once_N, np.array(exact_N)), "1", 1e-6, "a cubic spline over 48 contacts"),
+    ]  # fmt: skip
+
+
+def check_sideways(skin: SkinDesign) -> list[Check]:
+    """Check the stiffness of a thick layer and the friction along a straight drag."""
+    tip_m, modulus_Pa = skin.tip_radius_mm * milli, skin.modulus_kPa * kilo
+    radius_m = 0.1 * tip_m
+    limit_N, stiffness = FRICTION * modulus_Pa * radius_m**2, modulus_Pa * radius_m
+    return [
+        sticking(radius_m), sliding(radius_m, tip_m, skin.base),
+        straight_drag(np.linspace(0, 3e-3, 31), limit_N, stiffness_N_per_m=stiffness, coefficient=FRICTION),
+    ]  # fmt: skip
+
+
+def sticking(radius_m: float) -> Check:
+    ratio = shear.stiffness_m(shear.stick(radius_m, HALF_SPACE_M), HALF_SPACE_M) / radius_m
+    return Check("sideways stiffness, thick layer", "a tip that sticks: 16/3 G a", "Mindlin 1949, nu = 1/2",
+                 abs(ratio / (16 / 3) - 1), "1", 1e-3, "the base is felt as a / h, 3e-6; sums over the contact"
+                 )  # fmt: skip
+
+
+def sliding(radius_m: float, tip_m: float, base: layer.Base) -> Check:
+    contact = layer.contact_of_radius(radius_m, thickness_m=HALF_SPACE_M, tip_radius_m=tip_m, base=base)
+    ratio = shear.stiffness_m(shear.slip(contact), HALF_SPACE_M) / radius_m
+    return Check("sideways stiffness, thick layer", "q = mu p of Hertz: 40/9 G a", "Cerruti's integral in closed form",
+                 abs(ratio / (40 / 9) - 1), "1", 2e-3, "contact radius R / 10: a sphere is no paraboloid")  # fmt: skip
+
+
+def straight_drag(
+    path_m: Float[np.ndarray, " t"], limit_N: float, *, stiffness_N_per_m: float, coefficient: float
+) -> Check:
+    places_m, normal_N = np.column_stack([path_m, np.zeros_like(path_m)]), np.full_like(path_m, limit_N / coefficient)
+    found = friction.drag(places_m, normal_N, stiffness_N_per_m=stiffness_N_per_m, friction=coefficient)
+    truth_N = np.minimum(stiffness_N_per_m * path_m, limit_N)
+    return Check("friction", "Q = min(k s, mu F) along a straight drag", "itself, by hand",
+                 float(np.abs(found.force_N[:, 0] - truth_N).max() / limit_N), "1", 1e-12, "rounding of 30 steps"
+                 )  # fmt: skip
+
+
+STEPS_N = 12  # of 0.1 mm at 1.2 mm (PHYSICS 0)
+STEP_M = 1e-7  # of finite differences
+HELD = {"bonded": "stays", "slipping": "keeps its height"}
+
+
+def check_kinematics(press: flow.Press, depth_m: float) -> list[Check]:
+    """Check one linear step and the whole flow down to a depth."""
+    far = far_out(press, depth_m) if press.base == "slipping" else []
+    return [*one_small_step(press, depth_m), *whole_flow(press, depth_m), *sunken_surface(press, depth_m), *far]
+
+
+def descent(depth_m: float, steps_n: int = STEPS_N) -> Float[np.ndarray, " d"]:
+    """List depths from 0 in even steps, the first cut in four and in two, where the contact grows as the root."""
+    even = np.linspace(0, depth_m, steps_n + 1)
+    return np.concatenate([[0.0, even[1] / 4, even[1] / 2], even[1:]])
+
+
+def one_small_step(press: flow.Press, depth_m: float) -> list[Check]:
+    h_m, tip_m, contact = press.thickness_m, press.tip_radius_m, press.contact(depth_m)
+    waves = layer.waves(contact, h_m, press.base)
+    r_m, z_m = _places(h_m, 17, 9)
+    u = layer.displacement(r_m, z_m, waves)
+    right, left = (layer.displacement(r_m + side * STEP_M, z_m, waves) for side in (1, -1))
+    above, below = (layer.displacement(r_m, z_m + side * STEP_M, waves) for side in (1, -1))
+    slopes = [right.r_m - left.r_m, right.z_m - left.z_m, above.r_m - below.r_m, above.z_m - below.z_m]
+    numeric = np.stack([*(slope / (2 * STEP_M) for slope in slopes), u.r_m / r_m])
+    base = layer.displacement(r_m, np.zeros_like(r_m), waves)
+    under_m = 0.95 * contact.radius_m * np.linspace(0, 1, 30)
+    sunken = layer.displacement(under_m, np.full(30, h_m), waves)
+    sphere_m = tip_m - np.sqrt(tip_m**2 - under_m**2) - depth_m
+    name, differences = "one small step", "central differences over 0.1 um"
+    length = "of strains near 1: step squared over length squared"
+    return [
+        Check(name, "div u = 0", differences, farthest(numeric[0] + numeric[3] + numeric[4], 0.0), "1", 1e-6, length),
+        Check(name, "gradient of u", differences, farthest(np.stack([u.r_r, u.z_r, u.r_z, u.z_z, u.hoop]), numeric),
+              "1", 1e-6, length),
+        Check(name, f"the {press.base} base {HELD[press.base]}", "0 m", _off(base.r_m, base.z_m, press), "m", 1e-17,
+              "rounding: 1e-14 of the depth"),
+        Check(name, "the surface lies on the tip", "a sphere", farthest(sunken.z_m, sphere_m) / depth_m,
+              "of the depth", 0.005, "waves shorter than 1/6 of the thickness are cut"),
+    ]  # fmt: skip
+
+
+def _off(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"], press: flow.Press) -> float:
+    return float(np.abs([z_m] if press.base == "slipping" else [r_m, z_m]).max())
+
+
+def whole_flow(press: flow.Press, depth_m: float) -> list[Check]:
+    h_m = press.thickness_m
+    r_m, z_m = _places(h_m, 25, 11)
+    inside = len(r_m)
+    # The places, their neighbours for finite differences, and the base: one flow for all of them.
+    shifts = [(0.0, 0.0), (STEP_M, 0.0), (-STEP_M, 0.0), (0.0, STEP_M), (0.0, -STEP_M)]
+    base_m = np.linspace(0, 4 * h_m, 40)
+    all_r_m = np.concatenate([*(r_m + dr_m for dr_m, _ in shifts), base_m])
+    all_z_m = np.concatenate([*(z_m + dz_m for _, dz_m in shifts), np.zeros_like(base_m)])
+    depths_m = descent(depth_m)
+    end = flow.follow(all_r_m, all_z_m, depths_m, press=press)[-1]
+    _, right, left, above, below, base = np.split(np.stack([end.r_m, end.z_m]), inside * np.arange(1, 6), axis=1)
+    numeric = np.stack([right - left, above - below], axis=1) / (2 * STEP_M)  # 2 (r, z), 2 (by r0, by z0), places
+    f, hoop = end.f[:inside], end.hoop[:inside]
+    gradient = max(farthest(f, numeric.transpose(2, 0, 1)), farthest(hoop, end.r_m[:inside] / r_m))
+    return [
+        Check("flow", f"det F = 1 in {STEPS_N} steps", "1", farthest(np.linalg.det(f) * hoop, 1.0), "1", 0.02,
+              "second order in the steps; worst at the contact's edge"),
+        Check("flow", "F is the gradient of the map", "central differences over 0.1 um", gradient, "1", 1e-5,
+              "of stretches near 1: step squared over length squared"),
+        Check("flow", f"the {press.base} base {HELD[press.base]}", "0 m", _off(base[0] - base_m, base[1], press), "m",
+              1e-16, f"rounding of {len(depths_m) - 1} steps; its table is 0 there to the last bit"),
+    ]  # fmt: skip
+
+
+def sunken_surface(press: flow.Press, depth_m: float) -> list[Check]:
+    h_m, tip_m, radius_m = press.thickness_m, press.tip_radius_m, press.contact(depth_m).radius_m
+    end = flow.follow(radius_m * np.linspace(0, 1.4, 40), np.full(40, h_m), descent(depth_m), press=press)[-1]
+    above_m = end.z_m - (h_m - depth_m + tip_m - np.sqrt(tip_m**2 - np.minimum(end.r_m, tip_m) ** 2))
+    touches = end.r_m < 0.95 * radius_m
+    return [
+        Check("flow", "the sunken surface lies on the tip", "a sphere", farthest(above_m[touches], 0.0) / depth_m,
+              "of the depth", 0.02, "six pressures a step"),
+        Check("flow", "nothing beside the contact pierces the tip", "a sphere",
+              max(0.0, float(above_m.max() / depth_m)), "of the depth", 0.02, "as above"),
+    ]  # fmt: skip
+
+
+def far_out(press: flow.Press, depth_m: float) -> list[Check]:
+    """Check, of a sliding skin, that what flows in under the tip flows out through every circle around it."""
+    h_m = press.thickness_m
+    r_m, z_m = (part.ravel() for part in np.meshgrid(np.array([4.0, 5.0, 6.0]) * h_m, np.linspace(0, h_m, 7)))
+    end = flow.follow(r_m, z_m, descent(depth_m), press=press)[-1]
+    grown_m2 = end.r_m**2 - r_m**2
+    return [
+        Check("flow", "far out all heights move by what the tip displaces", "the mean over heights and circles",
+              worst(grown_m2, np.full_like(grown_m2, grown_m2.mean())), "1", 0.03,
+              "waves fade as exp(-pi r / h) past the contact; the map goes on in closed form from 5 thicknesses on"),
+    ]  # fmt: skip
+
+
+def _places(h_m: float, r_n: int, z_n: int) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"]]:
+    r_m, z_m = np.meshgrid(np.linspace(0.035, 2.5, r_n) * h_m, np.linspace(0.03, 0.97, z_n) * h_m, indexing="ij")
+    return r_m.ravel(), z_m.ravel()
+
+
+def followed(skin: Skin, place_m: Float[np.ndarray, "2"], depths_m: Float[np.ndarray, " d"]) -> Dipoles:
+    """Carry all dipoles of a skin through a poke down to true depths, without a table; then it slides as one.
+
+    Each moment turns by the R of F = R U from a singular value decomposition. None may lie on the poke's axis.
+    """
+    away_m = skin.nodes_m[:, :2] - place_m
+    r_m = np.linalg.norm(away_m, axis=1)
+    press = flow.Press(skin.thickness_m, skin.tip_radius_m, skin.base)
+    end = flow.follow(r_m, skin.nodes_m[:, 2], depths_m, press=press)[-1]
+    outward = np.column_stack([away_m / r_m[:, None], np.zeros_like(r_m)])
+    places_m = np.column_stack([place_m + end.r_m[:, None] * outward[:, :2], end.z_m])
+    u, _, vt = np.linalg.svd(end.f)
+    plane = np.stack([(skin.moments_A_m2 * outward).sum(axis=1), skin.moments_A_m2[:, 2]], axis=1)
+    turned = np.einsum("sij,sj->si", u @ vt, plane)
+    aside = skin.moments_A_m2 - plane[:, :1] * outward - plane[:, 1:] * (0, 0, 1)
+    after = places_m, aside + turned[:, :1] * outward + turned[:, 1:] * (0, 0, 1)
+    if skin.hold is None:
+        return after
+    slides = press_slides(skin, skin.hold, np.append(place_m, depths_m[-1])[None])
+    return slide.apply(slides, 0, after, skin.seat_m)
+
+
+COARSE = Quadrature(cell_m=2.2e-3, layers_n=4)  # for laws that hold for any rule
+DENSE = Quadrature(cell_m=1.5e-3, layers_n=4)  # for what the table and the steps cost
+EVERY_PLACE = 5  # of the protocol's 65
+REFERENCE_STEPS_N = 16
+UNSEEN_uT = 1.0  # a third of a chip's noise, to which it adds 5 %, as squares add
+PLACES_M = np.array([[1.1, -2.3], [-4.2, 0.7], [5.3, 6.1]]) * milli  # on no node's axis
+Places = Float[np.ndarray, "p 2"]
+
+
+def check_poke(
+    board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, rule: Quadrature, depths_m: tuple[float, ...], seed: int
+) -> list[Check]:
+    """Check dB on a scene's own first skin, and its symmetries on the design without spreads."""
+    drawn, exact = draw_board(board, spreads, seed=seed, name="b0"), no_spread(spreads)
+
+    def skin_of(rule: Quadrature, design: SkinDesign = skin, spreads: Spreads = spreads) -> Skin:
+        return draw_skin(design, spreads, seed=seed, name="b0_s0", rule=rule)
+
+    cells, layers = Quadrature(rule.cell_m / 2, rule.layers_n), Quadrature(rule.cell_m, 2 * rule.layers_n)
+    fine, stronger = (
+        (skin_of(cells), skin_of(layers)),
+        skin.model_copy(update={"saturation_T": 2.5 * skin.saturation_T}),
+    )
+    dense = skin_of(DENSE)
+    # A rig's arm gives in one direction: no symmetry is to be expected of that.
+    even = (
+        skin
+        if skin.hold is None
+        else skin.model_copy(update={"hold": skin.hold.model_copy(update={"give_um": (0.0, 0.0)})})
+    )
+    return [
+        *quadrature(drawn, skin_of(rule), fine, rules=(rule, cells, layers), pokes_m=each_depth(_grid_m(), depths_m)),
+        shortcuts(drawn, dense, min(depths_m), "shallowest"), shortcuts(drawn, dense, max(depths_m), "deepest"),
+        *symmetries(draw_board(board, exact, seed=seed, name="b0"), skin_of(COARSE, even, exact), skin.polarity),
+        amplitude(drawn, skin_of(COARSE), skin_of(COARSE, stronger),
+                  pokes_m=each_depth(PLACES_M, (0.3 * skin.thickness_mm * milli,))),
+    ]  # fmt: skip
+
+
+def quadrature(
+    board: Board,
+    skin: Skin,
+    fine: tuple[Skin, Skin],
+    *,
+    rules: tuple[Quadrature, Quadrature, Quadrature],
+    pokes_m: Float[np.ndarray, "n 3"],
+    unseen_uT: float = UNSEEN_uT,
+) -> list[Check]:
+    """Compare dB of a skin with that of the same skin on narrower cells, and on more layers."""
+    found_T, cells_T, layers_T = (changes_of_field(board, each, pokes_m)[1] for each in (skin, *fine))
+    size_T = np.linalg.norm(cells_T, axis=(1, 2), keepdims=True)
+    allowed_T = np.maximum(0.02 * size_T, unseen_uT * micro)
+    used, cells, layers = rules
+    narrower = f"cells of {cells.cell_m / milli:g} mm for {used.cell_m / milli:g} mm"
+    few = f"{len(np.unique(pokes_m[:, :2], axis=0))} places of the protocol"
+    return [
+        Check("dB of pokes", f"quadrature, {few}, all depths", narrower, apart(found_T, cells_T), "1", 0.02,
+              "2 % is what an indentation may be wrong by in all (DESIGN 6)"),
+        Check("dB of pokes", f"quadrature, {few}, each channel of each poke", narrower,
+              float((np.abs(found_T - cells_T) / allowed_T).max()), "of the allowed", 1.0,
+              f"2 % of the poke's dB, or {unseen_uT:g} uT where that is more: a third of a chip's noise"),
+        Check("dB of pokes", f"quadrature, {few}, all depths", f"{layers.layers_n} layers for {used.layers_n}",
+              apart(found_T, layers_T), "1", 0.005, "Gauss nodes converge fast: a quarter of what the cells cost"),
+    ]  # fmt: skip
+
+
+def shortcuts(board: Board, skin: Skin, depth_m: float, kind: str, places_m: Places = PLACES_M) -> Check:
+    """Compare dB with that of magpylib's dipoles, each followed by itself."""
+    pokes_m = each_depth(places_m, (depth_m,))
+    _, found_T = changes_of_field(board, skin, pokes_m)
+    before_T = field_of((skin.nodes_m, skin.moments_A_m2), board.chips_m)
+    depths_m = descent(depth_m + skin.depth_zero_m, REFERENCE_STEPS_N)
+    moved = [followed(skin, place_m, depths_m) for place_m in places_m]
+    truth_T = np.stack([field_of(dipoles, board.chips_m) - before_T for dipoles in moved])
+    return Check("dB of pokes", f"table, steps and kernel, {kind} depth ({depth_m / milli:g} mm)",
+                 f"each node followed in {REFERENCE_STEPS_N} steps, F = R U by SVD, magpylib's dipoles",
+                 apart(found_T, truth_T), "1", 0.02,
+                 "2 % is what an indentation may be wrong by in all (steps, table, kernel; DESIGN 6)")  # fmt: skip
+
+
+def symmetries(board: Board, skin: Skin, polarity: Polarity, places_m: Places = PLACES_M) -> list[Check]:
+    """Turn, mirror and shift board, skin and pokes without spreads; the shift holds for any skin."""
+    sign = -1 if polarity == "checkerboard" else 1  # a quarter turn, or a mirror in x, swaps a checkerboard's poles
+    mirror, shift_m = np.diag([-1.0, 1.0, 1.0]), np.array([0.4, -0.7, 0.0]) * milli
+    pokes_m = each_depth(places_m, (0.3 * skin.thickness_m,))
+    here_T = _change(board.chips_m, skin, pokes_m)
+    turned_T = _change(board.chips_m @ TURN.T, skin, pokes_m @ TURN.T)
+    mirrored_T = _change(board.chips_m @ mirror, skin, pokes_m @ mirror)
+    shifted = replace(skin, nodes_m=skin.nodes_m + shift_m, seat_m=skin.seat_m + shift_m[:2])
+    shifted_T = _change(board.chips_m + shift_m, shifted, pokes_m + shift_m)
+    rounding = "rounding; no term may know a direction"
+    name = f"dB of pokes, {polarity}"
+    return [
+        Check(name, "a quarter turn of board and poke", "itself, turned", worst(turned_T, sign * here_T @ TURN.T), "1",
+              1e-9, rounding),
+        Check(name, "a mirror image of board and poke", "itself, mirrored",
+              worst(mirrored_T, sign * here_T @ mirror), "1", 1e-9, rounding),
+        Check(name, "skin, poke and chips moved together", "itself", worst(shifted_T, here_T), "1", 1e-9, rounding),
+    ]  # fmt: skip
+
+
+def amplitude(
+    board: Board, skin: Skin, stronger: Skin, *, pokes_m: Float[np.ndarray, "n 3"], factor: float = 2.5
+) -> Check:
+    """Compare dB with that of a skin that is magnetised so many times as strongly."""
+    once_T, more_T = (_change(board.chips_m, each, pokes_m) for each in (skin, stronger))
+    return Check("dB of pokes", "proportional to the magnetisation", f"itself, {factor:g} times",
+                 worst(more_T, factor * once_T), "1", 1e-12, "rounding")  # fmt: skip
+
+
+def _change(
+    chips_m: Float[np.ndarray, "k 3"], skin: Skin, pokes_m: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n k 3"]:
+    eyes = np.tile(np.eye(3), (len(chips_m), 1, 1))
+    return changes_of_field(Board("bare", chips_m, eyes, eyes, np.zeros_like(chips_m)), skin, pokes_m)[1]
+
+
+def _grid_m() -> Places:
+    plan = protocol((1.0,), 1)
+    return (np.column_stack([plan.x_mm - CENTRE_MM, plan.y_mm - CENTRE_MM]) * milli)[::EVERY_PLACE]
+
+
+def each_depth(places_m: Places, depths_m: tuple[float, ...]) -> Float[np.ndarray, "n 3"]:
+    """List every place at every depth, depth after depth."""
+    return np.column_stack([np.tile(places_m, (len(depths_m), 1)), np.repeat(depths_m, len(places_m))])

@@ -1,0 +1,331 @@
+"""What decides table 2: its rows against what simulated skins differ in."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+from pydantic import Field
+from scipy.constants import micro, milli
+
+from pipeline.experiments.answer import write_answer
+from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
+from pipeline.report.formatting import COLUMNS, SHORT, show, tabulate
+from pipeline.report.paper import TABLE_2
+from pipeline.settings import Settings
+from pipeline.stage import say
+from pipeline.statistics import by_skin, over_boards, over_pairs, records, select, tidy, whole
+from pipeline.synthesis import synthesis_of
+from pipeline.training.trainings import (
+    SceneData,
+    Starts,
+    adaptations,
+    card_of,
+    note_seconds,
+    prepare_training,
+    train_all,
+    trials_of,
+)
+from reskin.config import Strict
+from reskin.data.rows import Rows, stack
+from reskin.data.splits import Fold, Split, draw_folds
+from reskin.metrics import METRICS
+from reskin.models.recipe import HEADLINE
+from reskin.models.trial import Start, Trial
+from reskin.physics.board import draw_board
+from reskin.physics.force_sensor import read_force
+from reskin.physics.skin import changes_of_field, draw_skin, forces
+from reskin.seeds import rng_for
+from reskin.simulation.capture import roster
+from reskin.simulation.rig import misplace
+from reskin.simulation.settings import MAIN, Synthesis
+
+WAVES_N = 48  # cosines that make a smooth error
+DEFAULT = "default"
+Size = Annotated[float, Field(ge=0, le=2)]
+Sizes = Annotated[tuple[Size, ...], Field(min_length=1)]
+QUESTIONS = {"single": "transfer", "multi": "lobo", "triplet": "triplet", "adapted": "adapt"}  # rows of table 2
+
+
+class Residual(Strict):
+    """What the law leaves: rms sizes as parts of |dB|, over which it is alike, and how much is one skin's own."""
+
+    sizes: Sizes
+    length_mm: Annotated[float, Field(gt=0, le=50)]
+    length_log_N: Annotated[float, Field(gt=0, le=10)]
+    own_share: Annotated[float, Field(ge=0, le=1)]  # of its variance; the rest is the same on all skins
+
+
+class Worlds(Strict):
+    """Section worlds: the values that each factor takes, all others at the scene's."""
+
+    residual: Residual
+    skin_modulus: Sizes  # spreads.skin_modulus
+    amplitude_and_gap: Sizes  # times spreads.skin_amplitude and spreads.board_gap
+    friction: Sizes  # skin.hold.friction, of the tip that slides a skin
+
+
+@dataclass(frozen=True)
+class World:
+    """One world: a factor's value, its settings, and the size of the law's error."""
+
+    factor: str
+    value: float
+    synthesis: Synthesis
+    residual: float = 0.0
+
+    @property
+    def name(self) -> str:
+        """Name it in files and folds."""
+        return f"{self.factor}-{self.value:g}"
+
+
+def worlds_of(synthesis: Synthesis, section: Worlds) -> list[World]:
+    """List the worlds; that of the scene's own settings comes first, and once."""
+    spreads, hold = synthesis.spreads, synthesis.skin.hold
+    found = [World(DEFAULT, 1.0, synthesis)]
+    found += [World("residual", size, synthesis, size) for size in section.residual.sizes if size > 0]
+    for sd in section.skin_modulus:
+        if sd != spreads.skin_modulus:
+            changed = spreads.model_copy(update={"skin_modulus": sd})
+            found.append(World("skin_modulus", sd, synthesis.model_copy(update={"spreads": changed})))
+    for times in section.amplitude_and_gap:
+        if times != 1:
+            both = {name: times * getattr(spreads, name) for name in ("skin_amplitude", "board_gap")}
+            changed = spreads.model_copy(update=both)
+            found.append(World("amplitude_and_gap", times, synthesis.model_copy(update={"spreads": changed})))
+    for friction in section.friction:
+        if hold is not None and friction != hold.friction:
+            skin = synthesis.skin.model_copy(update={"hold": hold.model_copy(update={"friction": friction})})
+            found.append(World("friction", friction, synthesis.model_copy(update={"skin": skin})))
+    return found
+
+
+def smooth(
+    at: Float[np.ndarray, "n 3"], channels_n: int, how: Residual, rng: np.random.Generator
+) -> Float[np.ndarray, "n ch"]:
+    """Draw a smooth field of each channel with a variance of 1, over x and y in mm and log force."""
+    lengths = np.array([how.length_mm, how.length_mm, how.length_log_N])
+    waves = rng.standard_normal((3, WAVES_N)) / lengths[:, None]
+    phase = rng.uniform(0, 2 * np.pi, WAVES_N)
+    amplitude = rng.standard_normal((WAVES_N, channels_n)) * np.sqrt(2 / WAVES_N)
+    return np.cos(at @ waves + phase) @ amplitude
+
+
+def with_residual(
+    change_uT: Float[np.ndarray, "n ch"], at: Float[np.ndarray, "n 3"], size: float, how: Residual, seed: int, skin: str
+) -> Float[np.ndarray, "n ch"]:
+    """Add what the law leaves to a skin's changes of field: `size` times |dB|, rms over presses.
+
+    A part is the same on all skins, as a law errs alike on them; the rest bears the skin's name.
+    """
+    if size == 0:
+        return change_uT
+    channels_n = change_uT.shape[1]
+    shared = smooth(at, channels_n, how, rng_for(seed, "worlds", "residual"))
+    own = smooth(at, channels_n, how, rng_for(seed, "worlds", "residual", skin))
+    unit = np.sqrt(1 - how.own_share) * shared + np.sqrt(how.own_share) * own
+    length_uT = np.linalg.norm(change_uT, axis=1, keepdims=True)
+    return change_uT + size * length_uT / np.sqrt(channels_n) * unit
+
+
+def rows_of(world: World, section: Worlds, seed: int) -> Rows:
+    """Press every skin of a world as the main protocol does, and read its chips and the force sensor."""
+    parts = [_skin_rows(world, section, seed, board, skin) for board, skin in roster(world.synthesis, MAIN)]
+    rows = parts[0]
+    for part in parts[1:]:
+        rows = stack(rows, part)
+    return rows
+
+
+def _skin_rows(world: World, section: Worlds, seed: int, board_name: str, skin_name: str) -> Rows:
+    synthesis, rig, chip = world.synthesis, world.synthesis.rig, world.synthesis.chip
+    kind = synthesis.main_boards
+    rng = rng_for(seed, "worlds", board_name, skin_name)  # the same presses and noise in every world
+    board = draw_board(kind.design, synthesis.spreads, seed=seed, name=board_name)
+    rule = kind.quadrature.quadrature()
+    skin = draw_skin(synthesis.skin, synthesis.spreads, seed=seed, name=skin_name, rule=rule, sides_m=kind.skin_m)
+    plan = synthesis.main.plan(rng, kind.skin_mm)
+    tip_m = ((misplace(plan, rig, rng) - (*plan.centre_mm, 0)) * milli)[:, 0]
+    tip_m[:, :2] += rig.place_offset_sd_mm * milli * rng_for(seed, "rig", board_name).standard_normal(2)
+    _, change_T = changes_of_field(board, skin, tip_m)
+    read_T = np.einsum("kij,nkj->nki", board.sensitivity @ board.turn.transpose(0, 2, 1), change_T)
+    force_N = forces(skin, tip_m[:, 2])
+    at = np.column_stack([tip_m[:, :2] / milli, np.log(np.maximum(force_N, rig.force_noise_N))])
+    change_uT = with_residual(
+        read_T.reshape(len(tip_m), -1) / micro, at, world.residual, section.residual, seed, skin_name
+    )
+    n, channels_n = change_uT.shape
+    noise_uT = np.tile([chip.noise_xy_uT, chip.noise_xy_uT, chip.noise_z_uT], channels_n // 3)
+    noload_uT = noise_uT / np.sqrt(rig.noload_frames_n) * rng.standard_normal((n, 1, channels_n))
+    reading_uT = noise_uT * rng.standard_normal((n, rig.readings_n, channels_n))
+    db_uT = (change_uT[:, None] + reading_uT - noload_uT).reshape(-1, channels_n)
+    pushed_N = np.column_stack([np.zeros((n, 2)), force_N])
+    read_N, _ = read_force(pushed_N, noise_N=rig.force_noise_N, rng=rng)
+    target = np.column_stack([plan.x_mm[:, 0], plan.y_mm[:, 0], read_N[:, 2]]).astype(np.float32)
+    felt = np.repeat(read_N[:, 2] >= 0, rig.readings_n)  # as `Selection` of a scene does
+    rows_n = n * rig.readings_n
+    return Rows(
+        capture=np.full(rows_n, skin_name)[felt], board=np.full(rows_n, board_name)[felt],
+        skin=np.full(rows_n, skin_name)[felt], db_uT=db_uT.astype(np.float32)[felt],
+        target=np.repeat(target, rig.readings_n, axis=0)[felt],
+        pass_i=np.repeat(plan.pass_i.astype(np.int32), rig.readings_n)[felt],
+        indentation=np.repeat(np.arange(n), rig.readings_n)[felt], dropped={},
+    )  # fmt: skip
+
+
+def folds_of(rows: Rows, split: Split, seed: int, world: str, before_n: int) -> Iterator[Fold]:
+    """Draw a world's folds, numbered among the rows of all worlds and named after it."""
+    for fold in draw_folds(rows, ("transfer", "lobo"), split, seed):
+        sides = [side + before_n for side in (fold.train, fold.test, fold.pool)]
+        yield Fold(fold.question, f"{world}.{fold.name}", *sides)
+
+
+def read(settings: Settings) -> Worlds:
+    """Read section worlds."""
+    return settings.section(Worlds, "worlds")
+
+
+def worlds(settings: Settings, answer: Path) -> None:
+    """Train the rows of table 2 in every world, and score them there."""
+    prepare_training()
+    section, split = read(settings), settings.section(Split, "split")
+    listed = worlds_of(synthesis_of(settings), section)
+    rows, folds = None, []
+    for i, world in enumerate(listed):
+        own = rows_of(world, section, settings.seed)
+        folds += list(folds_of(own, split, settings.seed, world.name, 0 if rows is None else len(rows)))
+        rows = own if rows is None else stack(rows, own)
+        say(f"{settings.scene} worlds: {i + 1} of {len(listed)} worlds are pressed ({world.name})")
+    assert rows is not None, "the scene's own world is always there"
+    data = SceneData(settings.scene, settings, rows, folds)
+    cards = _trained(data, listed)
+    numbers = {"by_world": [_scored(cards, world) for world in listed], **_constants(section, data, listed)}
+    write_answer(answer, numbers, {})
+
+
+def _trained(data: SceneData, listed: Sequence[World]) -> list[dict[str, Any]]:
+    """Train one skin, many skins, and many with triplets, then adapt the last; give their cards."""
+    lobo = data.folds_of("lobo")
+    trials = trials_of(data, data.settings.training("train_single"), data.folds_of("transfer"))
+    trials += trials_of(data, data.settings.training("train_multi"), lobo)
+    trials += trials_of(data, data.settings.training("train_triplet"), lobo, question="triplet")
+    trained = train_all(data, trials, "worlds")
+    starts: Starts = {
+        (trial.recipe_name, trial.fold, trial.seed_i): Start(result.key, result.weights, result.scaler)
+        for trial, result in zip(trials, trained, strict=True)
+        if trial.question == "triplet"
+    }
+    adapt = data.settings.adaptations()
+    adapted: list[Trial] = [
+        trial
+        for fold in lobo
+        for trial in adaptations(
+            data, fold, (HEADLINE, adapt.recipes[HEADLINE]), starts, question="adapt", pokes_n=adapt.pokes_n
+        )
+    ]
+    trained = [*trained, *train_all(data, adapted, "worlds")]
+    note_seconds(data.scene, "worlds", [*trials, *adapted], trained)
+    return [card_of(data, trial, result) for trial, result in zip([*trials, *adapted], trained, strict=True)]
+
+
+def _scored(cards: Sequence[dict[str, Any]], world: World) -> dict[str, Any]:
+    """Score the rows of table 2 in one world."""
+    own = [
+        card | {"fold": card["fold"].removeprefix(f"{world.name}.")}
+        for card in cards
+        if card["fold"].startswith(f"{world.name}.") and card["recipe_name"] == HEADLINE
+    ]
+    table, found = tidy(own), {}
+    for row, question in QUESTIONS.items():
+        rows = select(table, question=question)
+        boards = by_skin(rows).groupby("board")[list(METRICS)].mean() if row == "single" else None
+        boards = whole(rows).groupby("board")[list(METRICS)].mean() if boards is None else boards
+        scored = over_pairs(rows) if row == "single" else over_boards(rows)
+        found[row] = {name: scored[name] for name in METRICS if name in scored} | {"by_board": records(boards)}
+    return {"factor": world.factor, "value": world.value, **found}
+
+
+def _constants(section: Worlds, data: SceneData, listed: Sequence[World]) -> dict[str, Any]:
+    """Say what was done: settings of the scene's own world, and how much was trained."""
+    first = listed[0].synthesis
+    return {
+        "residual_length_mm": section.residual.length_mm, "residual_own_share": section.residual.own_share,
+        "skin_modulus": first.spreads.skin_modulus,
+        "friction": first.skin.hold.friction if first.skin.hold is not None else 0.0,
+        "rows_n": len(data.rows), "folds_n": len(data.folds_of("lobo")) // len(listed),
+        "steps_n": data.settings.training("train_multi").recipes[HEADLINE].steps_n,
+    }  # fmt: skip
+
+
+DEFAULT_WORLD = "default"
+FACTORS = {
+    "residual": "error that the law leaves, part of |dB|", "skin_modulus": "spread of stiffness (sd of the logarithm)",
+    "amplitude_and_gap": "spreads of amplitude and gap, times the default", "friction": "friction under the tip",
+}  # fmt: skip
+DRAWN = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2")
+MEANING = (
+    "Each world differs from the default in one thing; the same skins, presses, noise and folds in all. Law's error: "
+    "the largest is what the fitted law leaves on recorded boards (scene lab, 1 - explained), alike over "
+    "{residual_length_mm:g} mm, {residual_own_share:.0%} of its variance one skin's own; simulated skins of all other "
+    "scenes have none. {folds_n} boards held out in turn, {steps_n} steps, one network each."
+)
+DEFAULTS = {"residual": 0.0, "amplitude_and_gap": 1.0}  # of the other factors: among the numbers
+
+
+def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
+    """List each world's rows of table 2."""
+    lines = [
+        {"world": _say(world), "row": SHORT[row], "source": source}
+        | {title: show(world[row].get(metric)) for metric, title in COLUMNS.items()}
+        for world in numbers["by_world"]
+        for row in TABLE_2
+    ]
+    return {"worlds": tabulate(lines, meaning=MEANING.format(**numbers))}
+
+
+def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
+    """Draw the rows of table 2 against each factor; the default is where all panels of a row meet."""
+    with drawing(11.0, 7.6) as figure:
+        panels = figure.subplots(len(DRAWN), len(FACTORS), sharey="row", squeeze=False)
+        for column, (factor, words) in enumerate(FACTORS.items()):
+            found = _along(numbers, factor)
+            for row, metric in enumerate(DRAWN):
+                _draw(panels[row][column], found, metric, default=_default(numbers, factor))
+            panels[-1][column].set_xlabel(words, fontsize=8)
+        for row, metric in enumerate(DRAWN):
+            panels[row][0].set_ylabel(COLUMNS[metric].replace(", ", " / "))
+        handles = panels[0][0].get_legend_handles_labels()
+        figure.legend(*handles, loc="outside lower center", ncols=5, frameon=False, fontsize=9)
+        title = f"What decides table 2 ({source}; dotted: the default, dashed: the paper)"
+        figure.suptitle(title, x=0.01, ha="left", fontsize=11)
+        return {"worlds.svg": svg(figure)}
+
+
+def _draw(axes: Any, found: Sequence[tuple[float, Mapping[str, Any]]], metric: str, *, default: float) -> None:
+    values = [value for value, _ in found]
+    for (row, paper), colour, marker in zip(TABLE_2.items(), COLOURS, MARKERS, strict=False):
+        means = [world[row][metric]["mean"] for _, world in found]
+        axes.plot(values, means, color=colour, marker=marker, markersize=5, linewidth=1.2, label=SHORT[row])
+        axes.axhline(paper[metric][0], color=colour, linestyle="--", linewidth=0.8)
+    axes.axvline(default, color="0.5", linestyle=":", linewidth=1, label="default")
+    if metric != "accuracy_pct":
+        axes.set_yscale("log")
+    axes.grid(alpha=0.25)
+
+
+def _along(numbers: Mapping[str, Any], factor: str) -> list[tuple[float, Mapping[str, Any]]]:
+    worlds = [(world["value"], world) for world in numbers["by_world"] if world["factor"] == factor]
+    own = next(world for world in numbers["by_world"] if world["factor"] == DEFAULT_WORLD)
+    return sorted([*worlds, (_default(numbers, factor), own)], key=lambda pair: pair[0])
+
+
+def _default(numbers: Mapping[str, Any], factor: str) -> float:
+    return DEFAULTS[factor] if factor in DEFAULTS else float(numbers[factor])
+
+
+def _say(world: Mapping[str, Any]) -> str:
+    return "default" if world["factor"] == DEFAULT_WORLD else f"{FACTORS[world['factor']]}: {world['value']:g}"

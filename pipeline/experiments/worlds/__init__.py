@@ -1,1 +1,0 @@
-"""What decides table 2: its rows against what simulated skins differ in."""
