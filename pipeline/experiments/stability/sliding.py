@@ -4,6 +4,8 @@ Stick-slip without friction and with great friction, a tip that lifts while the 
 presses under force control. Refuses to know the layer (`physics`), chips' electronics and bytes.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float
 from scipy.constants import milli
@@ -44,7 +46,9 @@ def stick_slip(board: Board, skin: Skin) -> list[Case]:
     path_m = _path(skin, skin.seat_m + PLACE_M, WAY_M, np.full(len(WAY_M), DEPTH))
     normal_N = forces(skin, path_m[:, 2])
     smooth, sticky = (_pushed(board, skin, path_m, mu) for mu in (SMOOTH, STICKY))
-    _, pressed_T = changes_of_field(board, skin, path_m)
+    assert skin.hold is not None
+    slippery = replace(skin, hold=replace(skin.hold, friction=SMOOTH))  # a press slides it by as little as a drag
+    _, pressed_T = changes_of_field(board, slippery, path_m)
     drawn_N = np.linalg.norm(smooth.force_N[0], axis=1)
     off_N = float(np.abs(drawn_N[1:] / (SMOOTH * normal_N[1:]) - 1).max())
     off_T = float(np.abs(smooth.change_T[0] - pressed_T).max() / np.abs(pressed_T).max())
