@@ -7,7 +7,7 @@ import pipeline
 
 
 def main() -> None:
-    """Run a stage, or a command of `pipeline.cli`."""
+    """Run a stage, or a command of `reskin`."""
     here, code = Path.cwd().resolve(), Path(pipeline.__file__).resolve()
     name = sys.argv[1] if len(sys.argv) > 1 else "--help"
     if not code.is_relative_to(here) and (here / "pipeline/__main__.py").is_file():
@@ -25,7 +25,7 @@ def main() -> None:
     if is_stage(name):
         run(getattr(module_of(name), name), sys.argv[2:])
     else:
-        from pipeline.cli import main as command
+        from reskin.cli import main as command
 
         command()
 

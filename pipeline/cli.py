@@ -1,67 +1,30 @@
-"""The `reskin` command: words of the command line -> one call each. Knows no format and no model.
+"""Commands that manage a checkout: recordings, scenes, results. They join the `reskin` command there (`reskin.cli`).
 
-Imports within the commands: `reskin --help` waits for none of what a command needs.
+A command imports what it needs when it runs, so that `reskin --help` is quick.
 """
 
-import signal
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from typer import Argument, Option
 
 from pipeline import PLAN
-from reskin.errors import ParamsError, ReskinError, explaining
-from reskin.live import commands
-from reskin.packages import explain, show_version
+from reskin.cli import Wire
+from reskin.errors import ParamsError
 from reskin.recordings.layouts import Foreign
 
 if TYPE_CHECKING:
     from pipeline.scenes import Plan
 
-app = typer.Typer(
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    help="Learning for magnetic tactile skins. Anywhere: ports, record, decode, emulate, live, predict, template; "
-    "in the checkout, with extra `pipeline` installed: the others.",
-)
+app = typer.Typer()
 scenes = typer.Typer(no_args_is_help=True, help="Choose which scenes `dvc repro` runs.")
 app.add_typer(scenes, name="scenes")
-app.add_typer(commands.app)
-
-MODEL = "A trained model (.safetensors), its card (.json) beside it, or a saved skin; else the map of simulated skins."
-LOGS = "A log of an SD card (t_s,T0,Bx0,By0,Bz0,T1,...; degC, uT), a folder of `record`, a file of `decode`."
 
 Layout = Literal["capture", "serial-binary", "serial-text", Foreign]
-Wire = Literal["binary", "binary-clock", "text-xyzt", "text-txyz"]
 Board = Annotated[str, Option(help="The circuit board's name.")]
 Marks = Annotated[list[str] | None, Option(help="capture, serial-*: STREAM_S,PROBE_S of one event; may be repeated.")]
-Chips = Annotated[int, Option("--chips", help="Chips in a frame.", min=1, max=64)]
-Version = Annotated[bool, Option("--version", help="Show the version.", callback=show_version, is_eager=True)]
-
-
-def main() -> None:
-    """Run the command; show what a user did wrong as one sentence, without a traceback."""
-    try:
-        signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what began is undone
-        with explaining("reskin"):
-            app()
-    except ModuleNotFoundError as error:
-        fail(explain(error))
-    except ReskinError as error:
-        fail(error)
-
-
-def fail(error: ReskinError) -> NoReturn:
-    typer.echo(f"error: {error}", err=True)
-    sys.exit(error.exit_code)
-
-
-@app.callback()
-def begin(version: Version = False) -> None:
-    """Take the options that stand before a command."""
 
 
 def checkout() -> Path:
@@ -156,36 +119,6 @@ def merge() -> None:
     from pipeline.manage import merge as merging
 
     typer.echo(merging.merge(root))
-
-
-@app.command()
-def decode(
-    stream: Annotated[Path, Argument(help="A file of bytes as they came from a port.")],
-    out: Annotated[Path, Option(help="The Parquet file to write.")],
-    wire: Annotated[Wire, Option(help="What the firmware sent.")] = "binary",
-    chips_n: Chips = 5,
-) -> None:
-    """Decode a dump of a port to one row a frame, and account for every byte."""
-    from reskin import io
-    from reskin.board.decode import decode_dump
-
-    table, account = decode_dump(io.read_bytes(stream), wire, chips_n, str(stream))
-    io.write_table(out, table)
-    typer.echo(f"decoded {out}: " + ", ".join(f"{key} {count}" for key, count in account.items()))
-
-
-@app.command()
-def predict(
-    log: Annotated[Path, Argument(help=LOGS)],
-    out: Annotated[Path, Option(help="The CSV to write: t_s,x_mm,y_mm,F_N,contact.")],
-    model: Annotated[Path | None, Option(help=MODEL)] = None,
-    rate_hz: Annotated[float, Option("--rate-hz", help="Parquet without a device clock: frames a second.")] = 400.0,
-) -> None:
-    """Turn a board's log into contacts, places and forces; it begins with a second without contact."""
-    from reskin.predicting import predict as write
-
-    counts = write(log, model, out, rate_hz=rate_hz)
-    typer.echo(f"predicted {out}: " + ", ".join(f"{key} {count:.6g}" for key, count in counts.items()))
 
 
 @app.command()
@@ -293,7 +226,3 @@ def tidy() -> None:
 def check() -> None:
     """Fail if a scene or params.yaml is wrong, or the plan is not what the scenes ask for."""
     checked_plan()
-
-
-if __name__ == "__main__":
-    main()

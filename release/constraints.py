@@ -29,10 +29,10 @@ def resolve(python: str, wanted: str) -> dict[str, str]:
 def render(versions: dict[str, str]) -> str:
     """Write versions as pip reads them, sorted as `pip freeze` sorts, without this project.
 
-    >>> print(render({"torch": "2.0", "Attrs": "1.0", "nvidia-nccl": "3", "reskin-pipeline": "0.1"}).splitlines()[1:])
+    >>> print(render({"torch": "2.0", "Attrs": "1.0", "nvidia-nccl": "3", "reskin": "0.1"}).splitlines()[1:])
     ['Attrs==1.0', 'torch==2.0']
     """
-    kept = {name for name in versions if name != "reskin-pipeline" and not name.startswith(OF_CUDA)}
+    kept = {name for name in versions if name != "reskin" and not name.startswith(OF_CUDA)}
     lines = "".join(f"{name}=={versions[name]}\n" for name in sorted(kept, key=str.lower))
     return HEAD.format(torch=versions["torch"]) + lines
 

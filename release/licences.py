@@ -47,7 +47,7 @@ def closure(requirements: Iterable[str]) -> dict[str, Distribution]:
         name = canonicalize_name(requirement.name)
         if requirement.marker is not None and not requirement.marker.evaluate({"extra": extra}):
             continue
-        if name == "reskin-pipeline":
+        if name == "reskin":
             todo += [(Requirement(text), "") for part in requirement.extras for text in wanted(part)]
             continue
         package = distribution(name)

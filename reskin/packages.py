@@ -7,7 +7,7 @@ from importlib.util import find_spec
 from reskin.errors import ParamsError
 
 OWN = ("pipeline", "reskin")
-EXTRAS = {"torch": "networks", "onnx": "onnx", "onnxruntime": "onnx"}  # by package; all others are of `pipeline`
+EXTRAS = {"torch": "train", "onnx": "onnx", "onnxruntime": "onnx"}  # by package; all others are of `pipeline`
 
 
 def need(package: str, where: object) -> None:
@@ -33,5 +33,5 @@ def explain(error: ModuleNotFoundError) -> ParamsError:
 def show_version(wanted: bool) -> None:
     """Print the version of what is installed, and end."""
     if wanted:
-        print(version("reskin-pipeline"))
+        print(version("reskin"))
         sys.exit()

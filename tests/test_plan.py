@@ -209,7 +209,7 @@ out = pathlib.Path(sys.argv[-1])  # what a stage writes
 out.mkdir(parents=True, exist_ok=True)
 (out / "simulate").touch()  # of stage code: the digest that stage simulate depends on
 if sys.argv[1] == "scenes":
-    from pipeline.cli import main
+    from reskin.cli import main
     main()
 """
 

@@ -8,9 +8,11 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.cli import app as checkout
 from release import constraints
 from release.constraints import render
 from release.licences import TOLERATED, closure, incompatible, is_compatible, wanted
+from reskin.cli import OF_CHECKOUT, add_checkout_commands
 from reskin.config import read_yaml
 from reskin.errors import ParamsError
 from reskin.packages import explain, need
@@ -18,7 +20,7 @@ from reskin.packages import explain, need
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 CORE = (  # what runs outside a checkout
-    "pipeline.cli", "reskin", "reskin.api", "reskin.recordings.recorder", "reskin.board.decode", "reskin.board.find",
+    "reskin.cli", "reskin", "reskin.api", "reskin.recordings.recorder", "reskin.board.decode", "reskin.board.find",
     "reskin.predicting", "reskin.live.emulator", "reskin.live.server",
 )  # fmt: skip
 AWAY = ("dvc", "grimp", "jinja2", "magpylib", "matplotlib", "mlflow", "mpmath", "onnx", "pandas", "sklearn", "torch")
@@ -53,12 +55,10 @@ def wheel(tmp_path_factory) -> Path:
     return folder / "lib"
 
 
-def test_the_wheel_holds_the_code_and_what_it_reads_and_nothing_else(wheel):
+def test_the_wheel_holds_the_library_and_what_it_reads_and_nothing_else(wheel):
     names = {str(file.relative_to(wheel)) for file in wheel.rglob("*") if file.is_file()}
-    beside = {"pipeline/plan.yaml"}  # of a checkout alone
-    files = [file.relative_to(ROOT) for top in ("pipeline", "reskin") for file in (ROOT / top).rglob("*.*")]
-    code = {str(file) for file in files if not any(part.startswith((".", "__pycache__")) for part in file.parts)}
-    assert names == code - beside
+    files = [file.relative_to(ROOT) for file in (ROOT / "reskin").rglob("*.*")]
+    assert names == {str(file) for file in files if not any(part.startswith((".", "__pyc")) for part in file.parts)}
     assert {
         "reskin/simulation/nominal.yaml",
         "reskin/live/page/live.js",
@@ -81,7 +81,7 @@ def test_what_runs_outside_a_checkout_imports_the_core_alone():
 def test_a_package_that_is_not_there_is_one_sentence_with_the_extra_that_brings_it():
     with pytest.raises(ParamsError, match=r"model.safetensors: package nowhere must be installed; got .*\[pipeline\]"):
         need("nowhere", "model.safetensors")
-    assert "'.[networks]'" in str(explain(ModuleNotFoundError("", name="torch.nn")))
+    assert "'.[train]'" in str(explain(ModuleNotFoundError("", name="torch.nn")))
     with pytest.raises(ModuleNotFoundError):
         explain(ModuleNotFoundError("", name="pipeline.gone"))
 
@@ -94,7 +94,7 @@ def test_every_package_that_the_code_imports_is_asked_for():
     }
     imported = names - sys.stdlib_module_names - {"pipeline", "reskin"}
     known = {"sklearn": "scikit-learn", "serial": "pyserial", "ruamel": "ruamel.yaml", "zc": "zc.lockfile"}
-    lines = [line for extra in (None, "networks", "pipeline", "onnx", "dask") for line in wanted(extra)]
+    lines = [line for extra in (None, "train", "pipeline", "onnx", "dask") for line in wanted(extra)]
     asked = {re.split(r"[\[<>=]", line)[0] for line in lines}
     assert {known.get(name, name) for name in imported} <= asked
 
@@ -137,5 +137,17 @@ def test_constraints_are_written_beside_the_old_ones_which_they_replace_whole(tm
 
 
 def test_constraints_name_no_project_of_ours_and_no_package_of_one_graphics_card():
-    lines = render({"torch": "2.0", "Attrs": "1.0", "nvidia-nccl": "3", "reskin-pipeline": "0.1"}).splitlines()
+    lines = render({"torch": "2.0", "Attrs": "1.0", "nvidia-nccl": "3", "reskin": "0.1"}).splitlines()
     assert lines[1:] == ["Attrs==1.0", "torch==2.0"]
+
+
+def test_the_command_of_the_library_knows_which_commands_a_checkout_adds():
+    names = {one.name or one.callback.__name__.replace("_", "-") for one in checkout.registered_commands}
+    assert {"scenes", *names} == {*OF_CHECKOUT}
+
+
+def test_elsewhere_a_command_of_a_checkout_says_where_it_works(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["reskin", "add", "mine.csv"])
+    with pytest.raises(ParamsError, match="the working directory must be a checkout of the project"):
+        add_checkout_commands()

@@ -57,7 +57,7 @@ class Clone:
         return run([sys.executable, "-m", "dvc", *words], self.folder, self._variables)
 
     def reskin(self, *words: str) -> str:
-        return run([sys.executable, "-m", "pipeline.cli", *words], self.folder, self._variables)
+        return run([sys.executable, "-m", "pipeline", *words], self.folder, self._variables)
 
     def add(self, skin_i: int) -> None:
         """Add one skin on a board of its own: a simulated one, as a plain table of readings."""

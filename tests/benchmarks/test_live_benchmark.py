@@ -95,7 +95,7 @@ def at_work(folder: Path, boards: list[tuple[int, float]]) -> Iterator[tuple[lis
     try:
         for i, (chips_n, rate_hz) in enumerate(boards):
             capture = write_script(make_script(chips_n=chips_n, rate_hz=rate_hz), folder / f"c{i}")
-            words = ["-m", "pipeline.cli", "emulate", str(capture), "--port", str(folder / f"board{i}"), "--loop"]
+            words = ["-m", "pipeline", "emulate", str(capture), "--port", str(folder / f"board{i}"), "--loop"]
             players.append(subprocess.Popen([sys.executable, *words], env=ENVIRONMENT, cwd=ROOT))
             model = read_network(write_model(folder, f"model{i}", chips_n=chips_n))
             lives.append(Live(str(folder / f"board{i}"), [model], "benchmark", alone=len(boards) == 1))

@@ -134,7 +134,7 @@ def _damage(file: Path) -> None:
     file.chmod(mode)
 
 
-CHECK = ("python", "-m", "pipeline.cli", "check-cache")
+CHECK = ("python", "-m", "pipeline", "check-cache")
 CACHED = {  # what is changed: an output, the file of it, the stage that wrote it, and one that reads it
     "weights": (f"data/models/{SCENE}/train_triplet", "*.safetensors", TRIPLET, address("adapt")),
     "dataset (Parquet)": (f"data/indentations/{SCENE}", "*.parquet", address("ingest_simulated"), address("split")),

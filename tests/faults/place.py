@@ -164,7 +164,7 @@ def make_template(folder: Path) -> tuple[Checkout, Said]:
         YAML().dump(small(YAML(typ="safe").load((scenes / "ci.yaml").read_text())), stream)
     (folder / "dvc.lock").unlink()
     at = Checkout(folder)
-    for words in (["python", "-m", "pipeline.cli", "scenes", "use", SCENE], ["dvc", "repro"]):
+    for words in (["python", "-m", "pipeline", "scenes", "use", SCENE], ["dvc", "repro"]):
         done = at.run(*words, limit_s=6 * LIMIT_S)
         if done.status:
             raise AssertionError(f"{' '.join(words)} failed:\n{done.text[-3000:]}")

@@ -63,7 +63,7 @@ def _add(at: Checkout) -> list[str]:
     recording.mkdir(exist_ok=True)
     write(recording, *PRESSES)
     labels = ["--layout", "lab", "--board", "board1", "--skin", "skin1", "--scene", "rig"]
-    return ["python", "-m", "pipeline.cli", "add", str(recording / "readings.csv"), *labels]
+    return ["python", "-m", "pipeline", "add", str(recording / "readings.csv"), *labels]
 
 
 def _ingest(at: Checkout) -> Said:
@@ -205,7 +205,7 @@ def conflict_lock(at: Checkout) -> Row:
     "marks of a merge; `reskin scenes check`; `git restore` for the next run",
 )
 def conflict_captures(at: Checkout) -> Row:
-    command = ("python", "-m", "pipeline.cli", "scenes", "check")
+    command = ("python", "-m", "pipeline", "scenes", "check")
     words = MARKS.format("captures: {a: {}}\n", "captures: {b: {}}\n")
     return _damaged_then_restored(at, "data/captures.yaml", words, command)
 

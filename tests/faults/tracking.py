@@ -54,7 +54,7 @@ def refused(at: Checkout) -> Row:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
     first = at.run(*at.command("publish"), MLFLOW_TRACKING_URI=f"http://127.0.0.1:{port}")
-    return _report(at, first, at.run("python", "-m", "pipeline.cli", "publish"))
+    return _report(at, first, at.run("python", "-m", "pipeline", "publish"))
 
 
 HOLE = "10.255.255.1"
@@ -146,7 +146,7 @@ def _in_mid_run(at: Checkout, number: signal.Signals) -> Row:
         first = at.end(publishing, start_s)
     written_n = _finished_n(at.folder / "team.db")
     with _served(at, port):
-        row = _report(at, first, at.run("python", "-m", "pipeline.cli", "publish", MLFLOW_TRACKING_URI=uri))
+        row = _report(at, first, at.run("python", "-m", "pipeline", "publish", MLFLOW_TRACKING_URI=uri))
     row.next_run += f", {written_n} runs were there"
     return row
 
@@ -199,4 +199,4 @@ def held_in_mid_run(at: Checkout) -> Row:
     with closing(sqlite3.connect(store, timeout=30)) as other:
         other.execute("BEGIN EXCLUSIVE")
         first = at.end(publishing, start_s)
-    return _report(at, first, at.run("python", "-m", "pipeline.cli", "publish"))
+    return _report(at, first, at.run("python", "-m", "pipeline", "publish"))

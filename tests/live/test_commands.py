@@ -5,8 +5,8 @@ from types import SimpleNamespace
 
 import pytest
 
+from reskin import cli as commands
 from reskin.board import find
-from reskin.live import commands
 from reskin.live.emulator import inject, parse_fault
 from reskin.recordings.header import HEADER_FILE, STREAM_FILE, parse
 from tests.live.boards import make_script, plugged_in

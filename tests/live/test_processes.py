@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from pipeline.cli import app
 from reskin import io
+from reskin.cli import app
 from reskin.errors import ReskinError
 from reskin.recordings.header import HEADER_FILE, parse
 from reskin.recordings.preparing import Labels, native
@@ -42,7 +42,7 @@ class Shell:
         self.folder, self.running = folder, []
 
     def start(self, *words: object) -> subprocess.Popen:
-        command = [sys.executable, "-m", "pipeline.cli", *map(str, words)]
+        command = [sys.executable, "-m", "pipeline", *map(str, words)]
         environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1", "OMP_NUM_THREADS": "1"}
         process = subprocess.Popen(
             command, cwd=self.folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,

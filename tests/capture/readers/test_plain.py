@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from pipeline.cli import app
+from reskin.cli import app
 from reskin.errors import CaptureError
 from reskin.recordings.readers import eflesh
 from reskin.recordings.readers import table as plain

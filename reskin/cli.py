@@ -1,18 +1,37 @@
-"""The words of the command line for boards and their files: `reskin ports`, `template`, `record`, `emulate`, `live`.
+"""The `reskin` command: ports, record, decode, emulate, live, predict, template.
 
-Refuses to know how any of them works: each calls one module beside this one.
+In a checkout of the project, the commands of `pipeline.cli` join it. A command imports what it needs when it runs, so
+that `reskin --help` is quick.
 """
 
+import importlib
 import math
+import signal
+import sys
 import threading
 import time
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NoReturn
 
 import typer
 from typer import Argument, Option
 
-app = typer.Typer()
+from reskin.errors import ParamsError, ReskinError, explaining
+from reskin.packages import explain, show_version
+
+CHECKOUT = ("dvc.yaml", "pipeline/cli.py")  # files of a checkout of the project
+OF_CHECKOUT = (  # commands of `pipeline.cli`
+    "add", "check-cache", "compare", "fetch", "merge", "publish", "readme", "remove", "scenes", "verify-reports",
+)  # fmt: skip
+
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Learning for magnetic tactile skins: read boards, record, see contacts live, turn logs into contacts.",
+    epilog=f"In a checkout of the project also: {', '.join(OF_CHECKOUT)}.",
+)
 
 Wire = Literal["binary", "binary-clock", "text-xyzt", "text-txyz"]
 Speed = Annotated[float, Option(help="Times its own rate; inf: as fast as it is taken.", min=0.01)]
@@ -22,6 +41,45 @@ ON_FAULT = "NAME=drop|flag|refuse: are readings that a fault has hit shown? May 
 LABELS = "grid:NXxNY:STEP_MM or line:N:STEP_MM asks you to press places (Enter); or a CSV that a robot appends to."
 GAUGE = "Port of a force gauge that sends lines of Fz, or Fx Fy Fz, in N; @BAUD behind it, if not 9600."
 FAULT = "NAME[@START_S[+SECONDS]], such as stuck@3+1; may be repeated. A wrong name lists them all."
+MODEL = "A trained model (.safetensors), its card (.json) beside it, or a saved skin; else the map of simulated skins."
+LOGS = "A log of an SD card (t_s,T0,Bx0,By0,Bz0,T1,...; degC, uT), a folder of `record`, a file of `decode`."
+Chips = Annotated[int, Option("--chips", help="Chips in a frame.", min=1, max=64)]
+Version = Annotated[bool, Option("--version", help="Show the version.", callback=show_version, is_eager=True)]
+
+
+def main() -> None:
+    """Run the command; show what a user did wrong as one sentence, without a traceback."""
+    try:
+        signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what began is undone
+        with explaining("reskin"):
+            add_checkout_commands()
+            app()
+    except ModuleNotFoundError as error:
+        fail(explain(error))
+    except ReskinError as error:
+        fail(error)
+
+
+def fail(error: ReskinError) -> NoReturn:
+    typer.echo(f"error: {error}", err=True)
+    sys.exit(error.exit_code)
+
+
+def add_checkout_commands() -> None:
+    """Add the commands of the checkout that the working directory is; its own code runs, wherever `reskin` is from."""
+    here = Path.cwd()
+    if all((here / file).is_file() for file in CHECKOUT):
+        sys.path.insert(0, str(here))
+        app.add_typer(importlib.import_module("pipeline.cli").app)
+        app.info.epilog = None
+    elif sys.argv[1:2] and sys.argv[1] in OF_CHECKOUT:
+        rule = "a checkout of the project, with dvc.yaml in it"
+        raise ParamsError("reskin", "the working directory", rule, here, "Change to the checkout first.")
+
+
+@app.callback()
+def begin(version: Version = False) -> None:
+    """Take the options that stand before a command."""
 
 
 @app.command("ports")
@@ -145,3 +203,37 @@ def live(
             port, what = [stack.enter_context(playing(script))], f"{script.source}: {source}, played"
         boards = several(port or [found.port for found in the_boards()], models, what, decisions)
         serve(boards, host=host, http_port=http_port, say=typer.echo)
+
+
+@app.command()
+def decode(
+    stream: Annotated[Path, Argument(help="A file of bytes as they came from a port.")],
+    out: Annotated[Path, Option(help="The Parquet file to write.")],
+    wire: Annotated[Wire, Option(help="What the firmware sent.")] = "binary",
+    chips_n: Chips = 5,
+) -> None:
+    """Decode a dump of a port to one row a frame, and account for every byte."""
+    from reskin import io
+    from reskin.board.decode import decode_dump
+
+    table, account = decode_dump(io.read_bytes(stream), wire, chips_n, str(stream))
+    io.write_table(out, table)
+    typer.echo(f"decoded {out}: " + ", ".join(f"{key} {count}" for key, count in account.items()))
+
+
+@app.command()
+def predict(
+    log: Annotated[Path, Argument(help=LOGS)],
+    out: Annotated[Path, Option(help="The CSV to write: t_s,x_mm,y_mm,F_N,contact.")],
+    model: Annotated[Path | None, Option(help=MODEL)] = None,
+    rate_hz: Annotated[float, Option("--rate-hz", help="Parquet without a device clock: frames a second.")] = 400.0,
+) -> None:
+    """Turn a board's log into contacts, places and forces; it begins with a second without contact."""
+    from reskin.predicting import predict as write
+
+    counts = write(log, model, out, rate_hz=rate_hz)
+    typer.echo(f"predicted {out}: " + ", ".join(f"{key} {count:.6g}" for key, count in counts.items()))
+
+
+if __name__ == "__main__":
+    main()
