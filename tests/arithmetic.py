@@ -26,8 +26,8 @@ from reskin.universal.map import NOMINAL, OF_NOMINAL
 from reskin.universal.population import POKES_N, Population
 from reskin.universal.training import Syllabus
 from reskin.universal.training import train as train_universal
-from tests.learning.jobs import some_job, some_rows
-from tests.twin.skins import SETUP
+from tests.models.jobs import some_job, some_rows
+from tests.universal.skins import SETUP
 
 STEPS_N = 30
 SCHEDULE = Schedule(steps_n=STEPS_N, batch_n=128, rate_max=3e-3, gradient_norm_max=1.0, weight_decay=0.01)

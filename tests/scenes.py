@@ -3,7 +3,7 @@
 from pipeline.scenes import Asking, Scene, check_scene
 from pipeline.settings import Settings
 from reskin.config import parse
-from tests.capture.headers import AS_USUAL
+from tests.recordings.headers import AS_USUAL
 
 RECIPE = {
     "architecture": "paper", "inputs": "raw", "scaling": "standard", "triplet_weight": 0.0, "steps_n": 1, "batch_n": 64,

@@ -23,12 +23,12 @@ from reskin.recordings.preparing import Dump, Labels
 from reskin.recordings.probe import ProbeLog
 from reskin.recordings.readers import table
 from reskin.seeds import rng_for
-from tests.capture.headers import AS_USUAL, make_header
-from tests.capture.readers.test_lab import PRESSES, write
-from tests.capture.signals import make_frames
+from tests.board.signals import make_frames
+from tests.recordings.headers import AS_USUAL, make_header
+from tests.recordings.readers.test_lab import PRESSES, write
 from tests.scenes import recorded
 from tests.stages.checkout import copy_checkout, run
-from tests.twin.skins import fields_uT
+from tests.universal.skins import fields_uT
 
 
 @pytest.fixture(scope="module")

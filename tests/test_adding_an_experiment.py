@@ -10,7 +10,7 @@ import pytest
 from pipeline import FLOW, PLAN, SCENES
 from reskin import code
 from reskin.models.trial import DECIDING, Keys
-from tests.learning.trials import measured, pooled
+from tests.models.trials import measured, pooled
 from tests.stages.checkout import ROOT, copy_checkout, run
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of DVC's own libraries

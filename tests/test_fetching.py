@@ -23,8 +23,8 @@ from reskin.recordings import preparing
 from reskin.recordings.preparing import Labels
 from reskin.recordings.readers import eflash7, eflesh, ini, lab
 from tests import repositories
-from tests.capture.headers import AS_USUAL
-from tests.capture.readers.test_lab import PRESSES, write
+from tests.recordings.headers import AS_USUAL
+from tests.recordings.readers.test_lab import PRESSES, write
 from tests.scenes import recorded
 from tests.stages.checkout import copy_checkout
 from tests.test_adding import contents

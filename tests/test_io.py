@@ -12,7 +12,7 @@ import safetensors.numpy
 from reskin import io
 from reskin.errors import SchemaError, explaining
 from reskin.schema import UNITS
-from tests.dataset.tables import readings
+from tests.data.tables import readings
 
 
 def test_readings_come_back_as_they_were_written(tmp_path):

@@ -16,7 +16,7 @@ from pipeline.manage.fetch import read_sources
 from reskin.errors import CaptureError
 from reskin.recordings.pickled import COLUMNS, decode, to_lab_csv
 from reskin.recordings.readers import lab
-from tests.capture.headers import AS_USUAL, make_header
+from tests.recordings.headers import AS_USUAL, make_header
 
 PROTOCOLS = (3, 4)
 ROOT = Path(__file__).resolve().parents[1]

@@ -17,7 +17,7 @@ from reskin.recordings.clocks import Arrivals
 from reskin.recordings.header import ARRIVALS_FILE, STREAM_FILE, Clock, write_capture
 from reskin.recordings.readers.sd_card import render
 from reskin.seeds import rng_for
-from tests.capture.headers import make_header
+from tests.recordings.headers import make_header
 
 RATE_HZ, QUIET_N, TOUCHED_N = 250.0, 400, 100
 ANSWER = np.array([8.0, 4.0, 1.5], np.float32)

@@ -8,7 +8,7 @@ from pipeline.report.numbers import split
 from pipeline.report.readme import blocks_of
 from reskin import io
 from reskin.config import read_yaml
-from tests.reporting.synthetic import all_questions
+from tests.report.synthetic import all_questions
 from tests.stages.checkout import ROOT, copy_checkout, run
 
 OWN = ["reports", "params.yaml", "data/captures.yaml", "dvc.yaml", "README.md", "docs"]

@@ -19,7 +19,7 @@ from reskin.recordings.header import HEADER_FILE, parse
 from reskin.recordings.labelling.source import Source
 from reskin.recordings.preparing import Labels, native
 from reskin.recordings.recorder import UNTOLD, Told, _desk, begin_capture, print_progress, record_capture
-from tests.capture.signals import make_frames
+from tests.board.signals import make_frames
 from tests.stages.checkout import ROOT
 
 FRAMES = make_frames(200, 5, seed=0)

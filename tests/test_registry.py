@@ -3,7 +3,7 @@ import pytest
 from pipeline.manage.registry import Registry, with_capture, without_capture
 from reskin.errors import CaptureError
 from reskin.recordings.header import Header
-from tests.capture.headers import make_header
+from tests.recordings.headers import make_header
 
 EMPTY = Registry(captures={})
 

@@ -1,7 +1,7 @@
 """What a method sees: a view of the change of field, and the scaler between uT, mm, N and the numbers of a network.
 
 A view is a fixed function of one row, so it cannot leak; a scaler is fitted on training rows only
-(tests/learning/test_trial.py plants the leak). Refuses to know skins, folds and networks.
+(tests/models/test_trial.py plants the leak). Refuses to know skins, folds and networks.
 """
 
 from collections.abc import Callable, Mapping

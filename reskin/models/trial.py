@@ -21,7 +21,7 @@ from reskin.models.recipe import FineTuning, Labelling, Recipe, Schedule
 from reskin.numerics import device, signature
 
 COLLAPSED = 0.05  # of a target's variance over a network's own training rows; sound ones explain more than 0.9
-# The modules whose code decides what a training results in (tests/learning/test_trial.py compares with imports).
+# The modules whose code decides what a training results in (tests/models/test_trial.py compares with imports).
 DECIDING = (
     "reskin.seeds",
     *(f"reskin.models.{name}" for name in ("inputs", "losses", "network", "reproducible", "train", "trial")),

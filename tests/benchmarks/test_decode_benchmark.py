@@ -19,7 +19,7 @@ import pytest
 from reskin.board.stream import FrameStream, decode_all
 from reskin.board.wire import encode
 from tests.benchmarks import size
-from tests.capture.signals import make_frames
+from tests.board.signals import make_frames
 
 FRAMES_N = size(1_000_000, 2_000)
 LOOP_FRAMES_N = size(100_000, 200)

@@ -22,7 +22,7 @@ from reskin.recordings.ingest import read_native
 from reskin.recordings.probe import LABELS, ProbeLog
 from reskin.seeds import rng_for
 from tests.benchmarks import FULL, size
-from tests.capture.headers import AS_USUAL, make_header
+from tests.recordings.headers import AS_USUAL, make_header
 
 INDENTATIONS_N = size(1_000_000, 800)
 TILE_N = size(4_000, 400)  # indentations whose bytes are written again and again

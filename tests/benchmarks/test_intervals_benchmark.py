@@ -32,7 +32,7 @@ from reskin.universal.map import NOMINAL, OF_NOMINAL, tabulate
 from reskin.universal.population import Population
 from reskin.universal.training import Lessons, Syllabus, add_error, teach
 from tests.benchmarks import FULL, size
-from tests.twin.skins import SETUP
+from tests.universal.skins import SETUP
 
 SEED, LESSONS = 2021, Lessons(skins_n=size(500, 4), steps_n=size(1200, 3), seeds_n=1)  # as scene lab
 SKINS_N, LABELS_N = size(12, 1), size((0, 5, 10, 20, 40), (0,))

@@ -18,7 +18,7 @@ from pipeline.statistics import by_skin, paired, tidy
 from pipeline.training.variants import AFTER, BEFORE, CONTROL, Answered, bias, biases, compare_arms, summarise_arms
 from reskin.metrics import METRICS, score, score_groups
 from reskin.seeds import rng_for
-from tests.evaluation.cards import card
+from tests.report.cards import card
 
 SINGLE = 1e-4  # sums of single-precision forces of some newtons
 

@@ -24,7 +24,7 @@ from pipeline.experiments.ambient import (
 from reskin.physics.chip import ChipDesign, read_field, steps_uT
 from reskin.physics.skin import draw_skin
 from reskin.seeds import rng_for
-from tests.synthesis.scene import SECTIONS, synthesis
+from tests.simulation.scene import SECTIONS, synthesis
 
 NO_SPREAD = {name: 0.0 for name in SECTIONS["spreads"] if name != "skin_filler_length_mm"}
 QUIET = {"noise_xy_uT": 0.0, "noise_z_uT": 0.0}

@@ -1,7 +1,7 @@
 """What the report says of fields from outside: every arm where it was tried, units, and the earth's field."""
 
 from pipeline.experiments.ambient import figures, tables
-from tests.reporting.test_work_precision import said
+from tests.report.test_work_precision import said
 
 
 def scores(accuracy, boards_n):

@@ -8,7 +8,7 @@ import pytest
 from pipeline.experiments.answer import only, read_losses, write_answer
 from reskin import io
 from reskin.errors import SchemaError
-from tests.dataset import tables
+from tests.data import tables
 
 
 def test_every_capture_of_the_folder_is_accounted_for_beside_what_rows_lost(tmp_path):

@@ -7,7 +7,7 @@ import pytest
 from pipeline.experiments import flexible, manual, shear
 from pipeline.report.formatting import to_markdown
 from pipeline.report.paper import FLEXIBLE, MANUAL, SHEAR
-from tests.reporting.test_work_precision import said
+from tests.report.test_work_precision import said
 
 
 def stat(mean: float, n: int = 3) -> dict[str, float]:

@@ -15,7 +15,7 @@ from reskin.errors import SchemaError
 from reskin.seeds import rng_for
 from reskin.simulation.settings import BoardKind
 from reskin.universal.population import Population
-from tests.twin.skins import DESIGN, made_population
+from tests.universal.skins import DESIGN, made_population
 
 KIND = BoardKind(
     letter="b", boards_n=1, skins_per_board_n=1, skin_mm=(20.0, 20.0), quadrature={"cell_mm": 0.8, "layers_n": 5},

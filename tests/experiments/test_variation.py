@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from pipeline.experiments.variation import LINES_MAX_N, Visits, find_visits, first_of_each_board, over_skins, over_time
 from reskin.errors import ParamsError
 from reskin.seeds import rng_for
-from tests.dataset.tables import readings
+from tests.data.tables import readings
 
 
 def capture(passes_n: int = 4):

@@ -8,11 +8,11 @@ from pathlib import Path
 
 from ruamel.yaml import YAML
 
-from tests.capture.readers.test_lab import PRESSES, write
 from tests.faults.files import _cut
 from tests.faults.kills import address
 from tests.faults.place import Checkout, Said
 from tests.faults.row import Row, fault, judge
+from tests.recordings.readers.test_lab import PRESSES, write
 from tests.repositories import git
 from tests.scenes import recorded
 

@@ -29,7 +29,7 @@ from reskin.recordings.labels import Dwell, ProbeTape
 from reskin.recordings.readers import READERS, sd_card
 from reskin.recordings.samples import Dwells, Gauge, Table
 from reskin.seeds import rng_for
-from tests.capture.headers import AS_USUAL, make_header
+from tests.recordings.headers import AS_USUAL, make_header
 
 FOLDER = Path(tempfile.mkdtemp(prefix="reskin-fuzz-"))
 WIRES = get_args(Wire)

@@ -16,7 +16,7 @@ from reskin.models.network import draw_weights, paper_layers
 from reskin.recordings import clocks
 from reskin.recordings.header import ARRIVALS_FILE, STREAM_FILE, Clock, Wire, write_capture
 from reskin.seeds import rng_for
-from tests.capture.headers import make_header
+from tests.recordings.headers import make_header
 
 RATE_HZ = 400.0
 QUIET_S, POKED_S = 1.5, 1.0

@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.experiments.stability.wire import deliver
 from reskin.live.emulator import PIECES, VALUES, Fault, Script, encode_pieces, inject
 from reskin.seeds import rng_for
-from tests.capture.signals import TEXT_WIRES, WIRES, make_frames
+from tests.board.signals import TEXT_WIRES, WIRES, make_frames
 
 SLOTS_N, SLOT_FRAMES_N, RATE_HZ = 8, 12, 400.0  # a fault has a slot of its own; the last slot has none
 NOT_FINITE_SHARE = 0.02

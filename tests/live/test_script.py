@@ -7,8 +7,8 @@ from reskin.errors import ReskinError
 from reskin.live.emulator import read_script
 from reskin.recordings.header import LOG_FILE, Clock, write_capture
 from reskin.recordings.readers.sd_card import render
-from tests.capture.headers import make_header
 from tests.live.boards import make_script, write_script
+from tests.recordings.headers import make_header
 from tests.stages.checkout import ROOT
 
 SCRIPT = make_script(pokes_n=1)

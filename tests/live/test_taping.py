@@ -18,8 +18,8 @@ from reskin.recordings.ingest import open_capture
 from reskin.recordings.labelling.source import Desk
 from reskin.recordings.labels import Dwell
 from reskin.recordings.preparing import Labels, native
-from tests.capture.headers import AS_USUAL
 from tests.live.boards import make_script, plugged_in
+from tests.recordings.headers import AS_USUAL
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo-terminals")
 PLACES = [(4.0, 8.0), (12.0, 4.0)]

@@ -15,7 +15,7 @@ from reskin.recordings.header import Header
 from reskin.recordings.readers import eflash7, eflesh, ini, lab
 from reskin.recordings.text import read_cells
 from reskin.schema import Readings
-from tests.capture.headers import AS_USUAL, make_header
+from tests.recordings.headers import AS_USUAL, make_header
 
 SPATIAL = "eflesh/spatial_resolution/20250316_155729_probe"
 NORMAL = "eflesh/normal_force/20250401_014340_probe"

@@ -22,9 +22,9 @@ from reskin.models.train import make_job
 from reskin.models.trial import Measured, Trained, Trial
 from reskin.schema import Readings
 from reskin.seeds import rng_for
-from tests.dataset.tables import readings
+from tests.data.tables import readings
 from tests.scenes import ADAPTATIONS, RECIPE, SHARED, TRAINING, recorded, settings
-from tests.synthesis.scene import SECTIONS
+from tests.simulation.scene import SECTIONS
 
 PLACES_N, PASSES_N, READINGS_N, CH_N = 16, 2, 2, 15
 SEED = 2021

@@ -26,7 +26,7 @@ from reskin.physics.board import draw_board
 from reskin.physics.chip import ChipDesign, read_field
 from reskin.physics.skin import draw_skin
 from reskin.seeds import rng_for
-from tests.synthesis.scene import synthesis
+from tests.simulation.scene import synthesis
 
 ROWS_N = 40_000
 SAMPLING = 6 / math.sqrt(ROWS_N)  # six standard errors, relative, of a variance of normal draws (sqrt(2 / n) each)

@@ -1,7 +1,7 @@
 """What the report says of the bound: a row a depth, and one in all with the network beside it."""
 
 from pipeline.experiments.bound import figures, tables
-from tests.reporting.synthetic import scores
+from tests.report.synthetic import scores
 
 BOUND = {"accuracy_pct": 99.5, "mse_xy_mm2": 0.01, "mse_f_N2": 0.002}
 ROW = {"signal": BOUND, "with_label_errors": BOUND | {"mse_xy_mm2": 0.04}}

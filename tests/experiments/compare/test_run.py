@@ -19,7 +19,7 @@ from reskin.simulation.defaults import nominal
 from reskin.universal import law
 from reskin.universal import law as fit
 from reskin.universal.presses import Pokes, cosines, explained, growth, memory, pool
-from tests.dataset.tables import readings
+from tests.data.tables import readings
 from tests.recordings.test_recordings import LAB, ingest
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -4,7 +4,7 @@ import copy
 
 from pipeline.experiments.compare import figures, tables
 from reskin.universal.law import Law
-from tests.reporting.test_work_precision import said
+from tests.report.test_work_precision import said
 
 LAW = dict.fromkeys(Law.__dataclass_fields__, 1.0)
 OWN = {

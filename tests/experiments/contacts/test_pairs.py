@@ -19,7 +19,7 @@ from pipeline.experiments.contacts import (
 from reskin.data.grid import points_mm
 from reskin.errors import ParamsError
 from reskin.seeds import rng_for
-from tests.dataset import tables
+from tests.data import tables
 
 SKINS = ("b0_s0", "b0_s1", "b1_s0")
 

@@ -12,7 +12,7 @@ from reskin.config import read_yaml
 from reskin.data.grid import points_mm
 from reskin.data.splits import Fold
 from reskin.seeds import rng_for
-from tests.dataset import tables
+from tests.data import tables
 
 ASKED = Contacts(pairs_n=40, separations_mm=(4.0, 8.0), false_alarm_fraction=0.1)
 CI = Path(__file__).resolve().parents[3] / "pipeline/scenes/ci.yaml"

@@ -1,7 +1,7 @@
 """What the report says of two contacts: every distance and detector, the false alarms, and the source of each row."""
 
 from pipeline.experiments.contacts import figures, tables
-from tests.reporting.test_work_precision import said
+from tests.report.test_work_precision import said
 
 
 def stat(mean):

@@ -8,7 +8,7 @@ from pipeline.experiments.contacts import press_on, superposition
 from reskin.physics.board import draw_board
 from reskin.physics.magnet import change_of_field
 from reskin.physics.skin import draw_skin, moved_dipoles
-from tests.synthesis.scene import synthesis
+from tests.simulation.scene import synthesis
 
 SCENE = synthesis()
 BOARD = draw_board(SCENE.main_boards.design, SCENE.spreads, seed=1, name="b0")

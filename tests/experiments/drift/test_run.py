@@ -18,7 +18,7 @@ from reskin.data.grid import points_mm
 from reskin.errors import ParamsError
 from reskin.schema import Readings
 from reskin.seeds import rng_for
-from tests.dataset.tables import readings
+from tests.data.tables import readings
 
 ROOT = Path(__file__).resolve().parents[3]
 DEPTHS_MM, PASSES_N, DRIFT_uT = (0.6, 1.2), 3, 0.3  # 390 contacts; drift of each channel a contact

@@ -23,7 +23,7 @@ from pipeline.experiments.drift import (
 )
 from reskin.metrics import METRICS, score
 from reskin.seeds import rng_for
-from tests.dataset.tables import readings
+from tests.data.tables import readings
 
 
 def answers(policy="each", skin="s0", seed_i=0, window_i=0, n=40, bias_N=0.1, **changes) -> Answers:

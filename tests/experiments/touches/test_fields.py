@@ -24,7 +24,7 @@ from pipeline.experiments.touches import (
 from reskin.data.rows import Selection
 from reskin.errors import ParamsError
 from reskin.seeds import rng_for
-from tests.dataset.tables import readings as make_readings
+from tests.data.tables import readings as make_readings
 
 PLACES = (1, 2, 3, 4)
 SECTION = Touches(train_fraction=0.6, aside_fraction=0.2, false_alarm_fraction=0.05)

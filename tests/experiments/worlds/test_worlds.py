@@ -13,7 +13,7 @@ from pipeline.synthesis import synthesis_of
 from reskin import io
 from reskin.config import parse, read_yaml
 from reskin.metrics import METRICS
-from tests.reporting.test_work_precision import said
+from tests.report.test_work_precision import said
 
 ROOT = Path(__file__).resolve().parents[3]
 HOW = Residual(sizes=(0.4,), length_mm=3.5, length_log_N=1.2, own_share=0.5)

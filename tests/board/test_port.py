@@ -1,0 +1,364 @@
+"""A port is recorded whole, over a pseudo-terminal, however the recording ends."""
+
+import math
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+import tty
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from reskin.board import port, stream
+from reskin.board.port import PortSettings, Recording
+from reskin.board.wire import encode
+from reskin.errors import CaptureError
+from reskin.recordings import clocks
+from reskin.recordings.header import ARRIVALS_FILE, STREAM_FILE
+from tests.board.signals import make_frames
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo-terminals")
+
+ROOT = Path(__file__).resolve().parents[2]
+FRAMES = make_frames(100, 5, 0)
+LONG_s = 120.0  # for what must not happen in a test that passes
+SETTINGS = PortSettings(
+    baud=115200, wire="binary", chips_n=5, duration_s=LONG_s, bytes_max_n=None, silence_s=LONG_s, no_frame_s=LONG_s
+)
+
+
+@dataclass
+class Board:
+    """The far end of a pseudo-terminal: what it sends arrives at `name`."""
+
+    far: int
+    near: int
+    name: str
+
+    def send(self, *chunks: bytes) -> None:
+        with suppress(OSError):  # nobody listens any more
+            for chunk in chunks:
+                os.write(self.far, chunk)
+
+    def unplug(self) -> None:
+        os.close(self.far)
+        self.far = -1
+
+
+@pytest.fixture
+def board() -> Iterator[Board]:
+    far, near = os.openpty()
+    tty.setraw(near)
+    end = Board(far, near, os.ttyname(near))
+    yield end
+    for handle in (end.far, end.near):
+        if handle >= 0:
+            os.close(handle)
+
+
+@dataclass
+class StandingClock:
+    """The recorder's clock, which a test moves: however late the machine is, to the recorder no time passes."""
+
+    s: float = 0.0
+
+
+@pytest.fixture
+def clock(monkeypatch) -> StandingClock:
+    standing = StandingClock()
+    monkeypatch.setattr(port, "time", SimpleNamespace(monotonic=lambda: standing.s, time=time.time))
+    return standing
+
+
+def record(board: Board, folder: Path, act: Callable[[threading.Event], None], **changed: object) -> Recording:
+    """Record from a board that begins to `act` once the port is open: what came before is thrown away."""
+
+    def begin() -> None:
+        wait_until((folder / STREAM_FILE).exists)
+        act(stop)
+
+    stop, actor = threading.Event(), threading.Thread(target=begin)
+    actor.start()
+    try:
+        return port.record(board.name, folder, settings=replace(SETTINGS, **changed), stop=stop)
+    finally:
+        actor.join()
+
+
+def wait_until(is_so: Callable[[], bool]) -> None:
+    end_s = time.monotonic() + LONG_s
+    while not is_so():
+        assert time.monotonic() < end_s
+        time.sleep(0.02)
+
+
+def wait_until_written(folder: Path, bytes_n: int) -> None:
+    wait_until(lambda: (folder / STREAM_FILE).stat().st_size == bytes_n)
+
+
+def check_files(folder: Path, recording: Recording, sent: bytes) -> None:
+    data = (folder / STREAM_FILE).read_bytes()
+    rows = clocks.parse(folder / ARRIVALS_FILE, "arrivals.csv")
+    assert data == sent
+    assert recording.account["bytes_n"] == len(data) == rows.byte_end[-1]
+    assert rows.byte_end[0] == 0
+    assert abs(rows.t_s[-1] - time.time()) < 60
+    assert recording.account["frames_n"] == len(stream.decode_all(data, SETTINGS.wire, 5, "stream.bin")[0])
+
+
+def test_what_was_sent_is_what_is_written_and_stops_after_the_duration(board, clock, tmp_path):
+    data = encode(FRAMES, "binary")
+
+    def act(_: threading.Event) -> None:
+        board.send(*[data[i : i + 1000] for i in range(0, len(data), 1000)])
+        wait_until_written(tmp_path, len(data))
+        clock.s = 1.5
+
+    recording = record(board, tmp_path, act, duration_s=1.5)
+    assert recording.ended == "duration"
+    assert recording.account["frames_n"] == len(FRAMES)
+    assert recording.duration_s == 1.5
+    check_files(tmp_path, recording, data)
+
+
+def test_a_report_counts_the_frames_while_they_come(board, tmp_path):
+    seen: list[int] = []
+    data = encode(FRAMES, "binary")
+    settings = replace(SETTINGS, bytes_max_n=len(data))
+
+    def report(account: Mapping[str, int]) -> None:
+        if not seen:
+            board.send(data)
+        seen.append(account["frames_n"])
+
+    port.record(board.name, tmp_path, settings=settings, stop=threading.Event(), report=report)
+    assert seen[0] == 0
+    assert seen == sorted(seen)
+    assert seen[-1] >= 1
+
+
+def test_arrivals_tell_when_bytes_came(board, clock, tmp_path):
+    data, pause_s = encode(FRAMES, "binary"), 0.4
+
+    def act(_: threading.Event) -> None:
+        board.send(data[:4100])
+        wait_until_written(tmp_path, 4100)
+        clock.s += pause_s
+        board.send(data[4100:])
+
+    record(board, tmp_path, act, bytes_max_n=len(data))
+    rows = clocks.parse(tmp_path / ARRIVALS_FILE, "arrivals.csv")
+    came_s = clocks.times_of(np.array([4100, 8200]), rows)
+    assert came_s[1] - came_s[0] == pytest.approx(pause_s, abs=1e-5)
+
+
+def test_a_byte_limit_is_kept_to_the_byte(board, tmp_path):
+    data = encode(FRAMES, "binary")
+    recording = record(board, tmp_path, lambda _: board.send(data), bytes_max_n=1000)
+    assert recording.ended == "bytes"
+    check_files(tmp_path, recording, data[:1000])
+    assert recording.account["skipped_truncated_bytes_n"] == 1000 % 82
+
+
+def test_unplugging_keeps_what_came(board, tmp_path):
+    data = encode(FRAMES, "binary")
+
+    def act(_: threading.Event) -> None:
+        board.send(data[:-7])
+        wait_until_written(tmp_path, len(data) - 7)
+        board.unplug()
+
+    recording = record(board, tmp_path, act)
+    assert recording.ended == "unplugged"
+    assert recording.account["frames_n"] == len(FRAMES) - 1
+    check_files(tmp_path, recording, data[:-7])
+
+
+def test_a_stop_from_outside_keeps_what_came(board, tmp_path):
+    data = encode(FRAMES, "binary")
+
+    def act(stop: threading.Event) -> None:
+        board.send(data)
+        wait_until_written(tmp_path, len(data))
+        stop.set()
+
+    recording = record(board, tmp_path, act)
+    assert recording.ended == "stopped"
+    check_files(tmp_path, recording, data)
+
+
+def test_a_port_that_falls_silent_after_its_frames_keeps_them(board, clock, tmp_path):
+    data = encode(FRAMES, "binary")
+
+    def act(_: threading.Event) -> None:
+        board.send(data)
+        wait_until_written(tmp_path, len(data))
+        clock.s = 0.9
+
+    recording = record(board, tmp_path, act, silence_s=0.8)
+    assert recording.ended == "silent"
+    check_files(tmp_path, recording, data)
+
+
+LISTEN = """
+import sys, threading
+from pathlib import Path
+from reskin.board import port
+settings = port.PortSettings(115200, "binary", 5, float("inf"), None, 120.0, 120.0)
+print(port.record(sys.argv[1], Path(sys.argv[2]), settings=settings, stop=threading.Event()).ended)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_and_termination_keep_what_came(board, tmp_path, number):
+    data = encode(FRAMES, "binary")
+    command = [sys.executable, "-c", LISTEN, board.name, str(tmp_path)]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+        written = tmp_path / STREAM_FILE
+        wait_until(written.exists)
+        board.send(data)
+        wait_until(lambda: written.stat().st_size == len(data))
+        process.send_signal(number)
+        output, _ = process.communicate(timeout=LONG_s)
+    assert process.returncode == 0
+    assert output == "stopped\n"
+    assert clocks.parse(tmp_path / ARRIVALS_FILE, "arrivals.csv").byte_end[-1] == len(data)
+
+
+def test_a_kill_loses_nothing_that_was_read(board, tmp_path):
+    data = encode(FRAMES, "binary")
+    with subprocess.Popen([sys.executable, "-c", LISTEN, board.name, str(tmp_path)], cwd=ROOT) as process:
+        written = tmp_path / STREAM_FILE
+        wait_until(written.exists)
+        board.send(data)
+        wait_until(lambda: written.stat().st_size == len(data))
+        process.kill()
+    assert clocks.parse(tmp_path / ARRIVALS_FILE, "arrivals.csv").byte_end[-1] <= len(data)
+
+
+def test_waiting_for_bytes_costs_no_processor_time(board, tmp_path):
+    before_s = time.process_time()
+    with pytest.raises(CaptureError):
+        record(board, tmp_path, lambda _: None, silence_s=1.0)
+    assert time.process_time() - before_s < 0.3  # a busy wait takes all of the second
+
+
+def test_the_partial_line_at_the_start_of_text_is_counted_and_not_written(board, clock, tmp_path):
+    data = encode(FRAMES, "text-xyzt")
+    first_n = data.index(b"\n") + 1
+
+    def act(_: threading.Event) -> None:
+        board.send(data[3:2000])
+        wait_until_written(tmp_path, 2000 - first_n)
+        clock.s = 0.9
+
+    recording = record(board, tmp_path, act, wire="text-xyzt", silence_s=0.8)
+    assert recording.partial_line_bytes_n == first_n - 3
+    assert (tmp_path / STREAM_FILE).read_bytes() == data[first_n:2000]
+
+
+def test_a_socket_is_recorded_as_a_port_is(tmp_path):
+    data = encode(FRAMES, "binary")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def send() -> None:
+            with server.accept()[0] as end:
+                wait_until((tmp_path / STREAM_FILE).exists)  # what came before is thrown away when a port is opened
+                end.sendall(data)
+
+        sender = threading.Thread(target=send)
+        sender.start()
+        name = f"socket://127.0.0.1:{server.getsockname()[1]}"
+        recording = port.record(name, tmp_path, settings=SETTINGS, stop=threading.Event())
+        sender.join()
+    assert recording.ended == "unplugged"
+    check_files(tmp_path, recording, data)
+
+
+FULL = """
+import resource
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))  # as a disk that is full
+"""
+
+
+def test_a_full_disk_ends_a_recording_that_can_be_read_up_to_there(board, tmp_path):
+    command = [sys.executable, "-B", "-c", FULL + LISTEN, board.name, str(tmp_path)]  # -B: nor is compiled code cut
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+        wait_until((tmp_path / STREAM_FILE).exists)
+        os.set_blocking(board.far, False)  # a recorder that ends reads no more
+
+        def ended() -> bool:
+            board.send(encode(FRAMES, "binary")[:820])
+            return process.poll() is not None
+
+        wait_until(ended)
+        output, _ = process.communicate(timeout=LONG_s)
+    assert (process.returncode, output) == (0, "not written\n")
+    written_n = (tmp_path / STREAM_FILE).stat().st_size
+    assert 10_000 < written_n <= 20_000
+    assert clocks.parse(tmp_path / ARRIVALS_FILE, "arrivals.csv").byte_end[-1] == written_n
+
+
+class TestErrors:
+    def test_an_absent_port_is_named(self, tmp_path):
+        with pytest.raises(CaptureError, match="/dev/tty-none: the port must be one that opens; .*orts?.*found"):
+            port.record("/dev/tty-none", tmp_path, settings=SETTINGS, stop=threading.Event())
+        assert list(tmp_path.iterdir()) == []
+
+    def test_a_file_is_no_port(self, tmp_path):
+        file = tmp_path / "no_port"
+        file.touch()
+        with pytest.raises(CaptureError, match="no_port: the port must be one that opens"):
+            port.record(str(file), tmp_path, settings=SETTINGS, stop=threading.Event())
+
+    def test_a_silent_port_is_named(self, board, clock, tmp_path):
+        with pytest.raises(CaptureError, match=f"{board.name}: bytes must be coming in; got none in 0.7 s. Is the"):
+            record(board, tmp_path, lambda _: setattr(clock, "s", 0.7), silence_s=0.6)
+
+    def test_a_port_unplugged_before_its_first_byte_is_named(self, board, tmp_path):
+        with pytest.raises(CaptureError, match="bytes must be coming in"):
+            record(board, tmp_path, lambda _: board.unplug())
+
+    def test_bytes_without_a_frame_mean_a_wrong_baud_rate(self, board, tmp_path):
+        rubbish = bytes(range(128)) * 4
+        os.set_blocking(board.far, False)  # nobody listens while the error is made
+
+        def act(stop: threading.Event) -> None:
+            while not stop.wait(0.05) and board.far >= 0:
+                board.send(rubbish)
+
+        stop = threading.Event()
+        actor = threading.Thread(target=act, args=[stop])
+        actor.start()
+        try:
+            with pytest.raises(CaptureError, match="no frame found in .* Wrong baud rate"):
+                port.record(board.name, tmp_path, settings=replace(SETTINGS, no_frame_s=0.7), stop=threading.Event())
+        finally:
+            stop.set()
+            actor.join()
+
+    def test_the_error_says_that_the_board_has_fewer_chips(self, board, clock, tmp_path):
+        data = encode(make_frames(30, 4, 0), "binary")
+
+        def act(_: threading.Event) -> None:
+            board.send(data)
+            wait_until_written(tmp_path, len(data))
+            clock.s = 0.6
+
+        with pytest.raises(CaptureError, match="It fits binary with 4 chips"):
+            record(board, tmp_path, act, no_frame_s=0.5)
+
+    def test_a_folder_that_holds_a_stream_is_not_written_to(self, board, tmp_path):
+        (tmp_path / STREAM_FILE).write_bytes(b"old")
+        with pytest.raises(FileExistsError):
+            port.record(board.name, tmp_path, settings=replace(SETTINGS, duration_s=math.inf), stop=threading.Event())
+        assert (tmp_path / STREAM_FILE).read_bytes() == b"old"

@@ -1,0 +1,287 @@
+from collections import Counter
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from reskin.data.grid import points_mm, protocol
+from reskin.data.lines import Lines, grid_lines, hand_lines, hand_rows, shifted, take_pokes
+from reskin.data.rows import Rows, Selection, gather, stack
+from reskin.errors import ParamsError
+from reskin.seeds import rng_for
+from reskin.simulation.protocols import SKIN_MM, Hand
+from tests.data.tables import readings
+from tests.data.tables import rows as labelled
+
+READINGS_N = 2  # of one indentation
+
+
+def at(place_mm, skins=None, indentation=None) -> Rows:
+    """Rows at these places (x, y), each an indentation of its own unless told."""
+    f = len(place_mm)
+    skins = ["s0"] * f if skins is None else skins
+    table = labelled([f"b_{skin}" for skin in skins], skins)
+    target = np.column_stack([place_mm, np.arange(f)]).astype(np.float32)
+    numbers = np.arange(f) if indentation is None else np.asarray(indentation, np.int64)
+    return replace(table, target=target, indentation=numbers)
+
+
+def grid(depths_n: int = 1, passes_n: int = 1, skin: str = "s0") -> Rows:
+    pokes = protocol([0.5 + 0.1 * i for i in range(depths_n)], passes_n)
+    place_mm = np.repeat(np.column_stack([pokes.x_mm, pokes.y_mm]), READINGS_N, axis=0)
+    return at(place_mm, [skin] * len(place_mm), np.repeat(pokes.indentation, READINGS_N))
+
+
+def every(table: Rows) -> np.ndarray:
+    return np.arange(len(table))
+
+
+def as_set(lines: Lines, names=None) -> set:
+    """The lines without their numbers: each a set of (row, index)."""
+    names = np.arange(lines.row.max() + 1) if names is None else np.asarray(names)
+    one = {line: [] for line in lines.line_i.tolist()}
+    for row, line, order in zip(lines.row, lines.line_i, lines.order_i, strict=True):
+        one[int(line)].append((int(names[row]), int(order)))
+    return {frozenset(pairs) for pairs in one.values()}
+
+
+def naive_grid(table: Rows, chosen) -> set:
+    """The same by loops over rows: all of one skin with the same y (then the same x), indexed by the other."""
+    found = set()
+    place = {int(i): (str(table.skin[i]), *(round(float(v) * 10) for v in table.target[i, :2])) for i in chosen}
+    for i in place:
+        for across, along in ((2, 1), (1, 2)):
+            skin = place[i][0]
+            ranks = sorted({other[along] for other in place.values() if other[0] == skin})
+            mates = [j for j in place if place[j][0] == skin and place[j][across] == place[i][across]]
+            line = frozenset((j, ranks.index(place[j][along])) for j in mates)
+            if len({order for _, order in line}) > 1:
+                found.add((across, line))
+    return found
+
+
+places = st.lists(
+    st.tuples(st.sampled_from(["s0", "s1"]), st.integers(0, 4), st.integers(0, 4)), min_size=1, max_size=30
+)
+
+
+@given(places, st.data())
+def test_lines_of_a_grid_are_those_of_nested_loops_over_chosen_rows(labels, data):
+    table = at([(1.3 * x, 0.7 * y) for _, x, y in labels], [skin for skin, _, _ in labels])
+    chosen = np.array(sorted(data.draw(st.sets(st.integers(0, len(labels) - 1), min_size=1))))
+    lines, naive = grid_lines(table, chosen), naive_grid(table, chosen)
+    assert as_set(lines, every(table)) == {line for _, line in naive}
+    assert len(set(lines.line_i.tolist())) == len(naive)
+    assert sorted(set(lines.line_i.tolist())) == list(range(len(naive)))
+
+
+def test_the_papers_65_points_are_9_rows_and_9_columns_of_known_lengths():
+    lines = grid_lines(grid(depths_n=2), every(grid(depths_n=2)))
+    lengths = [len(set(lines.order_i[lines.line_i == line_i])) for line_i in range(18)]
+    assert lengths == [5, 5, 9, 9, 9, 9, 9, 5, 5] * 2  # rows of the grid, then columns
+    assert lines.line_i.max() == 17
+    assert Counter(lines.row.tolist()) == dict.fromkeys(range(65 * 2 * READINGS_N), 2)  # each on its row and column
+
+
+def test_readings_and_visits_of_one_place_share_line_and_index():
+    table = grid(depths_n=2, passes_n=3)
+    lines = grid_lines(table, every(table))
+    of_row = {row: set() for row in range(len(table))}
+    for row, line, order in zip(lines.row.tolist(), lines.line_i.tolist(), lines.order_i.tolist(), strict=True):
+        of_row[row].add((line, order))
+    by_place = {}
+    for row, (x_mm, y_mm) in enumerate(table.target[:, :2].tolist()):
+        by_place.setdefault((x_mm, y_mm), set()).add(frozenset(of_row[row]))
+    assert len(by_place) == 65
+    assert all(len(seen) == 1 for seen in by_place.values())
+    assert len(set.union(*by_place.values())) == 65  # and no two places share both
+
+
+@given(places, st.data())
+def test_the_order_of_rows_changes_no_line(labels, data):
+    order = data.draw(st.permutations(range(len(labels))))
+    straight = at([(x, y) for _, x, y in labels], [skin for skin, _, _ in labels])
+    turned = [labels[i] for i in order]
+    shuffled = at([(x, y) for _, x, y in turned], [skin for skin, _, _ in turned])
+    ahead, behind = grid_lines(straight, every(straight)), grid_lines(shuffled, every(shuffled))
+    back = [np.array(order)[behind.row], behind.line_i, behind.order_i]
+    assert sorted(zip(*map(np.ndarray.tolist, back), strict=True)) == sorted(
+        zip(ahead.row.tolist(), ahead.line_i.tolist(), ahead.order_i.tolist(), strict=True)
+    )
+
+
+@given(places, st.lists(st.floats(0.3, 5), min_size=10, max_size=10), st.floats(-20, 20))
+def test_only_the_order_of_places_matters_not_spacing_nor_origin_nor_force(labels, gaps_mm, origin_mm):
+    skins = [skin for skin, _, _ in labels]
+    along_mm = origin_mm + np.cumsum(gaps_mm)
+    plain = at([(x, y) for _, x, y in labels], skins)
+    warped = at([(along_mm[x], along_mm[5 + y]) for _, x, y in labels], skins)
+    rng = rng_for(0, "other recording")
+    warped.target[:, 2] = rng.normal(size=len(labels))
+    warped = replace(warped, db_uT=rng.normal(size=plain.db_uT.shape).astype(np.float32))
+    one, other = grid_lines(plain, every(plain)), grid_lines(warped, every(warped))
+    for field in fields(Lines):
+        assert (getattr(one, field.name) == getattr(other, field.name)).all()
+
+
+def test_a_place_written_a_hair_aside_is_the_same_place():
+    lines = grid_lines(at([(0, 0), (2.00001, 0), (1.99999, 0.02), (4, 0)]), np.arange(4))
+    assert as_set(lines) == {frozenset({(0, 0), (1, 1), (2, 1), (3, 2)})}
+
+
+def test_a_place_that_one_line_lacks_leaves_a_gap():
+    lines = grid_lines(at([(0, 0), (4, 0), (0, 2), (2, 2)]), np.arange(4))
+    assert frozenset({(0, 0), (1, 2)}) in as_set(lines)
+    assert frozenset({(2, 0), (3, 1)}) in as_set(lines)
+
+
+def test_a_pool_without_rows_or_of_one_place_has_no_lines():
+    assert len(grid_lines(at([(1, 1)] * 3), np.arange(3))) == 0
+    assert len(grid_lines(at([(1, 1)]), np.zeros(0, np.int64))) == 0
+
+
+@pytest.mark.parametrize("lines", [grid_lines(grid(), np.arange(130)), hand_lines(*np.zeros((2, 4), np.int32))])
+def test_neither_place_nor_force_nor_field_is_reachable_from_lines(lines):
+    assert [field.name for field in fields(lines)] == ["row", "line_i", "order_i"]
+    assert set(vars(lines)) == {"row", "line_i", "order_i"}
+    for array in vars(lines).values():
+        assert array.dtype.kind == "i"
+        assert array.base is None  # no view of a table
+
+
+@given(st.lists(st.tuples(st.integers(0, 4), st.integers(0, 5)), min_size=1, max_size=30))
+def test_lines_by_hand_are_those_of_nested_loops(pokes):
+    pass_i, along = (np.array(column, np.int32) for column in zip(*pokes, strict=True))
+    indentation = (10 * pass_i + along).astype(np.int32)  # counts on over the passes
+    naive = set()
+    for one in set(pass_i.tolist()):
+        own = [i for i in range(len(pokes)) if pass_i[i] == one]
+        first = min(indentation[i] for i in own)
+        if len({indentation[i] for i in own}) > 1:
+            naive.add(frozenset((i, int(indentation[i] - first)) for i in own))
+    lines = hand_lines(pass_i, indentation)
+    assert as_set(lines, range(len(pokes))) == naive
+    assert sorted(set(lines.line_i.tolist())) == list(range(len(naive)))
+
+
+def test_a_simulated_hands_pokes_are_indexed_from_0_along_each_line():
+    asked = Hand(
+        boards="rigid", skins_n=1, terms=(), kind="hand", lines_n=3, pokes_per_line_n=4, depth_mm=(0.5, 1.0),
+        place_sd_mm=0.3, tilt_sd_deg=5.0,
+    )  # fmt: skip
+    pass_i = asked.plan(rng_for(0, "hand"), SKIN_MM).pass_i
+    readings = np.repeat(np.arange(12, dtype=np.int32), READINGS_N)
+    lines = hand_lines(pass_i[readings], readings)
+    assert lines.row.tolist() == list(range(24))
+    assert lines.line_i.tolist() == [0] * 8 + [1] * 8 + [2] * 8
+    assert lines.order_i.tolist() == [0, 0, 1, 1, 2, 2, 3, 3] * 3
+
+
+@given(st.integers(0, 6 * 65), st.integers(0, 2**32))
+def test_every_place_is_poked_equally_often_and_with_all_its_readings(indentations_n, seed):
+    table = grid(depths_n=3, passes_n=2)
+    chosen = take_pokes(table, every(table), indentations_n, rng_for(seed, "pokes"))
+    taken = set(table.indentation[chosen].tolist())
+    assert len(taken) == indentations_n
+    assert chosen.tolist() == [row for row in range(len(table)) if table.indentation[row] in taken]
+    counts = Counter(map(tuple, table.target[chosen, :2].tolist()))
+    visits_n = [counts[tuple(place_mm)] // READINGS_N for place_mm in points_mm().tolist()]
+    assert max(visits_n) - min(visits_n) <= 1
+
+
+@given(st.integers(0, 390), st.integers(0, 390), st.integers(0, 2**32))
+def test_from_one_seed_a_smaller_choice_is_part_of_a_larger_one(one_n, other_n, seed):
+    table = grid(depths_n=3, passes_n=2)
+    few, many = (
+        set(take_pokes(table, every(table), n, rng_for(seed, "pokes")).tolist()) for n in sorted((one_n, other_n))
+    )
+    assert few <= many
+
+
+@given(st.integers(0, 2**32))
+def test_the_order_of_rows_does_not_decide_which_pokes_are_taken(seed):
+    table = grid(depths_n=2)
+    order = rng_for(seed, "order").permutation(len(table))
+    shuffled = replace(table, target=table.target[order], indentation=table.indentation[order])
+    one, other = (take_pokes(each, every(each), 80, rng_for(seed, "pokes")) for each in (table, shuffled))
+    assert set(table.indentation[one].tolist()) == set(shuffled.indentation[other].tolist())
+
+
+def test_only_the_pool_is_poked():
+    table = grid(depths_n=2, passes_n=2)
+    pool = np.flatnonzero(table.indentation >= 130)  # the second pass
+    assert take_pokes(table, pool, 130, rng_for(0, "pokes")).tolist() == pool.tolist()
+    assert set(take_pokes(table, pool, 20, rng_for(0, "pokes")).tolist()) < set(pool.tolist())
+
+
+def test_places_of_a_remainder_and_depths_of_a_visit_are_drawn_fairly():
+    # Place 0 was visited 8 times, place 1 once: the one poke falls on either alike, and on each of the 8 alike.
+    table = at([(0, 0)] * 8 + [(2, 0)])
+    taken = Counter(int(take_pokes(table, every(table), 1, rng_for(0, "fair", i))[0]) for i in range(1600))
+    assert abs(taken[8] - 800) < 4 * np.sqrt(1600 / 4)  # four standard deviations of a fair coin
+    assert all(abs(taken[row] - 100) < 4 * np.sqrt(100 * 15 / 16) for row in range(8))
+
+
+def test_more_pokes_than_the_pool_holds_is_one_sentence_with_both_numbers():
+    table = grid()
+    with pytest.raises(ParamsError, match="skin s0: pokes to choose must be at most the 65 indentations.*; got 66"):
+        take_pokes(table, every(table), 66, rng_for(0, "pokes"))
+
+
+def test_pokes_are_chosen_on_one_skin_at_a_time():
+    with pytest.raises(ParamsError, match="its pool must be of one skin; got s0, s1"):
+        take_pokes(at([(0, 0), (2, 0)], ["s0", "s1"]), np.arange(2), 1, rng_for(0, "pokes"))
+
+
+EVERY = Selection(force_min_N=0.0)
+UNKNOWN = np.full(6, np.nan, np.float32)
+
+
+def by_hand(skin: str = "s0", **changes: object):
+    pressed = {"indentation": np.repeat(np.arange(3, dtype=np.int32), 2), "pass_i": np.zeros(6, np.int32)}
+    unknown = {"x_mm": UNKNOWN, "y_mm": UNKNOWN, "depth_mm": UNKNOWN, "Fz_N": UNKNOWN}
+    return readings(f"{skin}-hand", "b0", skin, **(pressed | unknown | changes))
+
+
+@given(st.integers(2, 12), st.integers(2, 12))
+def test_rows_above_stay_as_they_were_and_indentations_are_never_shared(above_n, below_n):
+    above, below = gather([readings("c0", f=above_n)], EVERY), gather([readings("c1", skin="s1", f=below_n)], EVERY)
+    both = stack(above, below)
+    assert len(both) == above_n + below_n
+    for name in ("capture", "board", "skin", "db_uT", "target", "pass_i", "indentation"):
+        assert (getattr(both, name)[:above_n] == getattr(above, name)).all()
+    assert (both.db_uT[above_n:] == below.db_uT).all()
+    assert (both.skin[above_n:] == "s1").all()
+    assert not {*both.indentation[:above_n]} & {*both.indentation[above_n:]}
+    assert len({*both.indentation[above_n:]}) == len({*below.indentation})
+
+
+def test_pokes_by_hand_have_fields_but_neither_place_nor_force_and_no_row_is_left_out():
+    rows, _ = hand_rows([by_hand("s0"), by_hand("s1")])
+    assert len(rows) == 12
+    assert np.isnan(rows.target).all()
+    assert rows.db_uT[:, 0].tolist() == [0, 1, 2, 3, 4, 5] * 2
+    assert len({*rows.indentation}) == 6
+
+
+def test_lines_of_each_skin_name_its_own_rows_in_the_order_of_the_hand():
+    captures = [by_hand("s0"), by_hand("s1")]
+    rows, lines = hand_rows(captures)
+    for one in captures:
+        alone = hand_lines(one.pass_i, one.indentation)
+        assert lines[one.skin].order_i.tolist() == alone.order_i.tolist() == [0, 0, 1, 1, 2, 2]
+        assert set(rows.skin[lines[one.skin].row]) == {one.skin}
+    above = gather([readings("c0", f=4)], EVERY)
+    below = shifted(lines["s1"], len(above))
+    assert set(stack(above, rows).skin[below.row]) == {"s1"}
+
+
+def test_boards_of_other_channels_and_a_skin_poked_twice_are_refused():
+    wide = {name: np.zeros((6, 6), np.float32) for name in ("b_uT", "noload_uT")}
+    other = gather([readings("c1", skin="s1", temperature_degC=np.zeros((6, 2), np.float32), **wide)], EVERY)
+    with pytest.raises(ParamsError, match="channels must be the 3 of c0; got 6"):
+        stack(gather([readings("c0")], EVERY), other)
+    with pytest.raises(ParamsError, match="its skin must be poked by hand in one capture; got s0"):
+        hand_rows([by_hand("s0"), by_hand("s0")])

@@ -1,0 +1,87 @@
+"""Splits within one skin: what must stay together does, in any order of rows, and the paper's way does not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from sklearn.model_selection import ShuffleSplit
+
+from reskin.data.splits import Split, draw_folds, draw_sides
+from reskin.errors import ParamsError
+from tests.data.tables import rows
+
+TOGETHER = {"single_indentation": "indentation", "single_pass": "pass_i"}
+splits = st.builds(
+    lambda fraction, repeats_n: Split(random_test_fraction=fraction, random_repeats_n=repeats_n),
+    st.floats(0.05, 0.6), st.integers(1, 4),
+)  # fmt: skip
+
+
+def visited(passes_n: int, pokes_n: int, readings_n: int = 2, skins_n: int = 2):
+    """So many skins on one board, so many passes of so many indentations of so many readings."""
+    labels = [(skin, p) for skin in range(skins_n) for p in range(passes_n) for _ in range(pokes_n * readings_n)]
+    table = rows(["b0"] * len(labels), [f"b0_s{skin}" for skin, _ in labels], [p for _, p in labels])
+    return replace(table, indentation=np.arange(len(labels)) // readings_n)
+
+
+@pytest.mark.parametrize("question", TOGETHER)
+@given(passes_n=st.integers(2, 7), pokes_n=st.integers(1, 6), split=splits, seed=st.integers(0, 2**40))
+def test_no_indentation_and_no_pass_is_on_both_sides_and_no_row_of_the_skin_is_lost(
+    question, passes_n, pokes_n, split, seed
+):
+    table = visited(passes_n, pokes_n)
+    group = getattr(table, TOGETHER[question])
+    folds = draw_folds(table, [question], split, seed)
+    assert [fold.name for fold in folds] == [f"repeat{i}" for i in range(split.random_repeats_n)]
+    for fold in folds:
+        assert not {*group[fold.train]} & {*group[fold.test]}
+        assert not {*table.indentation[fold.train]} & {*table.indentation[fold.test]}
+        assert sorted([*fold.train, *fold.test]) == np.flatnonzero(table.skin == "b0_s0").tolist()
+        assert len(fold.test) > 0
+        assert len(fold.pool) == 0
+
+
+@pytest.mark.parametrize("question", TOGETHER)
+@given(order=st.permutations(range(24)))
+def test_which_groups_are_held_out_is_the_same_for_any_order_of_rows_that_keeps_their_numbers(question, order):
+    table = visited(3, 4, skins_n=1)
+    order = np.array(order)
+    shuffled = replace(table, **{name: getattr(table, name)[order] for name in ("indentation", "pass_i", "skin")})
+    split = Split(random_test_fraction=0.3, random_repeats_n=2)
+    group = TOGETHER[question]
+    for one, other in zip(*(draw_folds(t, [question], split, 3) for t in (table, shuffled)), strict=True):
+        assert {*getattr(table, group)[one.test]} == {*getattr(shuffled, group)[other.test]}
+
+
+def test_the_papers_way_has_readings_of_one_indentation_on_both_sides():
+    table = visited(4, 10, readings_n=5)
+    (fold,) = draw_folds(table, ["single_random"], Split(random_test_fraction=0.1, random_repeats_n=1), 0)
+    shared = {*table.indentation[fold.train]} & {*table.indentation[fold.test]}
+    assert len(shared) > len(fold.test) / 2
+
+
+@given(st.integers(2, 200), st.floats(0.01, 0.9), st.integers(0, 2**32 - 1))
+def test_groups_of_one_row_are_drawn_as_scikit_learn_draws_rows(rows_n, fraction, state):
+    test_n = max(1, round(fraction * rows_n))
+    if test_n == rows_n:
+        return
+    ours = draw_sides(np.arange(rows_n), test_fraction=fraction, repeats_n=2, state=state, what="rows", where="here")
+    theirs = ShuffleSplit(2, test_size=test_n, random_state=state).split(np.arange(rows_n))
+    for (train, test), (train_too, test_too) in zip(ours, theirs, strict=True):
+        assert train.tolist() == sorted(train_too)
+        assert test.tolist() == sorted(test_too)
+
+
+def test_one_pass_of_four_is_tested_though_a_tenth_of_four_is_none():
+    table = visited(4, 5)
+    folds = draw_folds(table, ["single_pass"], Split(random_test_fraction=0.1, random_repeats_n=20), 0)
+    assert {len({*table.pass_i[fold.test]}) for fold in folds} == {1}
+    assert {int(table.pass_i[fold.test[0]]) for fold in folds} == {0, 1, 2, 3}  # by chance alone: 4 (3/4)^20 = 1 %
+
+
+def test_a_skin_of_one_pass_cannot_be_split_by_pass_and_says_so():
+    split = Split(random_test_fraction=0.1, random_repeats_n=1)
+    with pytest.raises(ParamsError, match="question single_pass: passes of skin b0_s0 must be enough for both sides"):
+        draw_folds(visited(1, 5), ["single_pass"], split, 0)

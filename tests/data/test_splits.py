@@ -1,0 +1,318 @@
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from reskin.config import parse
+from reskin.data.splits import Split, draw_folds
+from reskin.errors import ParamsError
+from tests.data.tables import rows
+
+TRANSFER = Split(transfer_skins_n=3)
+RANDOM = Split(random_test_fraction=0.1, random_repeats_n=4)
+TEMPORAL = Split(temporal_test_fraction=0.2)
+
+labels = st.lists(st.tuples(st.sampled_from("abcd"), st.integers(0, 2)), min_size=4, max_size=40)
+
+
+def of_pairs(pairs):
+    return rows([f"b{board}" for board, _ in pairs], [f"b{board}_s{skin}" for board, skin in pairs])
+
+
+def six_by_three(readings_n: int = 4):
+    return of_pairs([(board, skin) for board in range(6) for skin in range(3) for _ in range(readings_n)])
+
+
+@given(labels.filter(lambda pairs: len({board for board, _ in pairs}) > 1))
+def test_every_row_is_held_out_once_and_never_trained_on_in_its_fold(pairs):
+    table = of_pairs(pairs)
+    folds = draw_folds(table, ["lobo"], Split(), 0)
+    assert sorted(np.concatenate([fold.test for fold in folds]).tolist()) == list(range(len(table)))
+    for fold in folds:
+        assert sorted([*fold.train, *fold.test]) == list(range(len(table)))
+        for names in (table.board, table.skin):
+            assert not set(names[fold.train]) & set(names[fold.test])
+
+
+def test_six_boards_give_six_folds_of_three_skins():
+    table = six_by_three()
+    folds = draw_folds(table, ["lobo"], Split(), 0)
+    assert [fold.name for fold in folds] == [f"b{i}" for i in range(6)]
+    assert all(len(set(table.skin[fold.test])) == 3 for fold in folds)
+
+
+@given(st.permutations(range(18)))
+def test_the_order_of_rows_does_not_decide_who_is_held_out(order):
+    pairs = [(board, skin) for board in range(6) for skin in range(3)]
+    straight, shuffled = of_pairs(pairs), of_pairs([pairs[i] for i in order])
+    for question, split in (("lobo", Split()), ("transfer", TRANSFER)):
+        ahead, behind = (draw_folds(table, [question], split, 0) for table in (straight, shuffled))
+        for one, other in zip(ahead, behind, strict=True):
+            assert one.name == other.name
+            assert set(straight.skin[one.test]) == set(shuffled.skin[other.test])
+
+
+def test_transfer_is_three_single_skins_on_nine_others_as_in_the_paper():
+    table = six_by_three()
+    folds = draw_folds(table, ["transfer"], TRANSFER, 0)
+    assert [set(table.skin[fold.train]) for fold in folds] == [{"b0_s0"}, {"b1_s0"}, {"b2_s0"}]
+    for fold in folds:
+        assert len(set(table.skin[fold.test])) == 9
+        assert not set(table.board[fold.train]) & set(table.board[fold.test])
+
+
+def test_random_readings_stay_within_one_skin_and_differ_between_repeats():
+    table = six_by_three(50)
+    folds = draw_folds(table, ["single_random"], RANDOM, 5)
+    assert len(folds) == 4
+    assert {len(fold.test) for fold in folds} == {5}
+    for fold in folds:
+        assert set(table.skin[np.concatenate([fold.train, fold.test])]) == {"b0_s0"}
+        assert not set(fold.train) & set(fold.test)
+    assert len({tuple(fold.test) for fold in folds}) > 1
+    again = draw_folds(table, ["single_random"], RANDOM, 5)
+    assert all((a.test == b.test).all() for a, b in zip(folds, again, strict=True))
+
+
+@given(st.integers(3, 30))
+def test_the_last_passes_are_tested_and_no_later_pass_is_trained_on(passes_n):
+    table = rows(["b0"] * 2 * passes_n, ["s0"] * 2 * passes_n, [i // 2 for i in range(2 * passes_n)])
+    (fold,) = draw_folds(table, ["single_temporal"], TEMPORAL, 0)
+    assert table.pass_i[fold.train].max() < table.pass_i[fold.test].min()
+    assert len(fold.train) + len(fold.test) == len(table)
+
+
+def test_fifty_passes_split_forty_to_ten():
+    table = rows(["b0"] * 50, ["s0"] * 50, list(range(50)))
+    (fold,) = draw_folds(table, ["single_temporal"], TEMPORAL, 0)
+    assert (len(fold.train), len(fold.test)) == (40, 10)
+
+
+def six_by_three_in_passes(passes_n: int, readings_n: int = 2):
+    labels = [
+        (f"b{board}", f"b{board}_s{skin}", pass_i)
+        for board in range(6) for skin in range(3) for pass_i in range(passes_n) for _ in range(readings_n)
+    ]  # fmt: skip
+    return rows(*(list(column) for column in zip(*labels, strict=True)))
+
+
+SENSORS = Split(sensors_skins_n=(15, 1, 6), sensors_draws_n=3, pool_passes_n=2)
+
+
+@pytest.mark.parametrize(("question", "split"), [("lobo", Split(pool_passes_n=2)), ("sensors", SENSORS)])
+def test_the_pool_is_the_first_passes_of_each_held_out_skin_and_the_test_its_later_ones(question, split):
+    table = six_by_three_in_passes(5)
+    for fold in draw_folds(table, [question], split, 0):
+        board = {*table.board[fold.test]}
+        assert len(board) == 1
+        held = [i for i in range(len(table)) if table.board[i] in board]
+        assert fold.pool.tolist() == [i for i in held if table.pass_i[i] in (0, 1)]
+        assert fold.test.tolist() == [i for i in held if table.pass_i[i] not in (0, 1)]
+        assert not {*table.indentation[fold.pool]} & {*table.indentation[fold.test]}
+
+
+@pytest.mark.parametrize("question", ["lobo", "sensors"])
+@given(order=st.permutations(range(12)))
+def test_the_order_of_rows_decides_neither_pool_nor_training_skins(question, order):
+    labels = [(f"b{board}", f"b{board}_s{skin}", p) for board in range(3) for skin in range(2) for p in (3, 5)]
+    split = Split(sensors_skins_n=(1, 3), sensors_draws_n=2, pool_passes_n=1)  # pass 4 has no row left
+    straight, shuffled = (
+        rows(*(list(column) for column in zip(*(labels[i] for i in numbers), strict=True)))
+        for numbers in (range(12), order)
+    )
+    ahead, behind = (draw_folds(table, [question], split, 7) for table in (straight, shuffled))
+    for one, other in zip(ahead, behind, strict=True):
+        assert one.name == other.name
+        for side in ("train", "test", "pool"):
+            assert {*getattr(one, side).tolist()} == {order[i] for i in getattr(other, side).tolist()}
+
+
+def test_without_a_pool_all_rows_of_the_held_out_board_are_tested():
+    table = six_by_three_in_passes(2)
+    for question in ("lobo", "sensors"):
+        for fold in draw_folds(table, [question], Split(sensors_skins_n=(2,), sensors_draws_n=1), 0):
+            assert len(fold.pool) == 0
+            assert fold.test.tolist() == np.flatnonzero(table.board == table.board[fold.test[0]]).tolist()
+
+
+@pytest.mark.parametrize(("question", "split"), [("single_random", RANDOM), ("single_temporal", TEMPORAL)])
+def test_questions_that_adapt_nothing_have_no_pool_even_where_others_have_one(question, split):
+    table = six_by_three_in_passes(5)
+    pooled = draw_folds(table, [question], split.model_copy(update={"pool_passes_n": 1}), 0)
+    for fold, plain in zip(pooled, draw_folds(table, [question], split, 0), strict=True):
+        assert len(fold.pool) == 0
+        assert fold.test.tolist() == plain.test.tolist()
+
+
+@given(st.integers(0, 2**32))
+def test_fewer_sensors_are_nested_within_a_draw_and_never_of_the_board_held_out(seed):
+    table = six_by_three_in_passes(3, readings_n=1)
+    folds = {fold.name: fold for fold in draw_folds(table, ["sensors"], SENSORS, seed)}
+    boards = [f"b{i}" for i in range(6)]
+    assert list(folds) == [
+        name
+        for board in boards
+        for name in [board, *(f"{board}-{k:02d}skins-draw{draw_i}" for k in (1, 6) for draw_i in range(3))]
+    ]
+    for board, draw_i in product(boards, range(3)):
+        of_sizes = [*(folds[f"{board}-{k:02d}skins-draw{draw_i}"] for k in (1, 6)), folds[board]]
+        assert {skin for fold in of_sizes for skin in table.skin[fold.test]} == {f"{board}_s{i}" for i in range(3)}
+        one, six, all_of_them = ({*table.skin[fold.train]} for fold in of_sizes)
+        assert one < six < all_of_them
+        assert (len(one), len(six), len(all_of_them)) == (1, 6, 15)
+        assert board not in {skin[:2] for skin in all_of_them}
+
+
+def test_all_skins_but_those_of_a_board_are_its_fold_of_lobo():
+    table = six_by_three_in_passes(3)
+    split = Split(sensors_skins_n=(15,), sensors_draws_n=2, pool_passes_n=1)
+    for fold, whole in zip(
+        draw_folds(table, ["sensors"], split, 0), draw_folds(table, ["lobo"], split, 0), strict=True
+    ):
+        assert fold.name == whole.name
+        for side in ("train", "test", "pool"):
+            np.testing.assert_array_equal(getattr(fold, side), getattr(whole, side))
+
+
+def test_another_draw_of_sensors_takes_other_skins_and_no_more_draws_change_it():
+    table = six_by_three_in_passes(1)
+    few, many = (
+        draw_folds(table, ["sensors"], Split(sensors_skins_n=(6,), sensors_draws_n=draws_n), 0) for draws_n in (2, 5)
+    )
+    first = [fold for fold in many if fold.name.startswith("b0")]
+    assert len({tuple(fold.train) for fold in first}) == 5
+    assert [fold.train.tolist() for fold in few[:2]] == [fold.train.tolist() for fold in first[:2]]
+
+
+def test_boards_draw_their_training_skins_each_by_itself():
+    table = six_by_three_in_passes(1)
+    folds = draw_folds(table, ["sensors"], Split(sensors_skins_n=(3,), sensors_draws_n=1), 0)
+    ranks = {
+        tuple(np.flatnonzero(np.isin(np.unique(np.delete(table.skin, fold.test)), table.skin[fold.train])))
+        for fold in folds
+    }
+    assert len(ranks) > 1  # not the same three of the fifteen that each board leaves
+
+
+def test_a_number_of_sensors_asked_twice_is_refused_as_its_folds_would_share_a_name():
+    with pytest.raises(ParamsError, match="names each number of skins once"):
+        parse(Split, {"sensors_skins_n": [3, 3]}, "scene")
+
+
+LABELS = Split(labels_pool_n=5, labels_draws_n=3)
+PLACES_N = 4
+PLACE = np.array([0, 0, 0, 1, 1, 1, 2, 2, 3, 3])  # of ten indentations: unequal visits, as recordings have
+
+
+def poked(boards_n: int = 3, readings_n: int = 2):
+    """Two skins a board, each with ten indentations at four places, in two passes."""
+    labels = [
+        (f"b{board}", f"b{board}_s{skin}", place, i, i // 5)
+        for board in range(boards_n) for skin in range(2) for i, place in enumerate(PLACE) for _ in range(readings_n)
+    ]  # fmt: skip
+    boards, skins, places, _, passes = (list(column) for column in zip(*labels, strict=True))
+    target = np.stack([2.0 * np.array(places), np.zeros(len(places)), np.ones(len(places))], axis=1)
+    indentation = np.arange(len(labels)) // readings_n
+    return replace(rows(boards, skins, passes), target=target.astype(np.float32), indentation=indentation)
+
+
+@given(st.integers(0, 2**32), st.integers(1, 9), st.integers(1, 3))
+def test_a_board_is_held_out_whole_and_a_pool_drawn_from_each_of_its_skins(seed, pool_n, draws_n):
+    table = poked()
+    folds = draw_folds(table, ["labels"], Split(labels_pool_n=pool_n, labels_draws_n=draws_n), seed)
+    assert [fold.name for fold in folds] == [f"b{board}-draw{draw}" for board in range(3) for draw in range(draws_n)]
+    for fold in folds:
+        held = np.flatnonzero(table.board == fold.name[:2])
+        assert sorted([*fold.pool, *fold.test]) == held.tolist()  # apart, and nothing is lost
+        assert sorted([*fold.train, *held]) == list(range(len(table)))
+        assert not {*table.indentation[fold.pool]} & {*table.indentation[fold.test]}
+        for skin in np.unique(table.skin[held]):
+            assert len(np.unique(table.indentation[fold.pool[table.skin[fold.pool] == skin]])) == pool_n
+
+
+@given(st.integers(0, 2**32), st.integers(1, 8))
+def test_a_pool_of_labels_takes_every_place_equally_often(seed, pool_n):
+    table = poked()
+    for fold in draw_folds(table, ["labels"], Split(labels_pool_n=pool_n, labels_draws_n=2), seed):
+        for skin in np.unique(table.skin[fold.pool]):
+            own = fold.pool[table.skin[fold.pool] == skin]
+            first = own[np.unique(table.indentation[own], return_index=True)[1]]
+            visits = np.bincount((table.target[first, 0] / 2).astype(int), minlength=PLACES_N)
+            assert visits.max() <= -(-pool_n // PLACES_N)
+
+
+def test_draws_of_a_pool_of_labels_differ_and_follow_from_the_seed_alone():
+    table = poked()
+    first, again, other = (draw_folds(table, ["labels"], LABELS, seed) for seed in (1, 1, 2))
+    fewer = draw_folds(table, ["labels"], Split(labels_pool_n=5, labels_draws_n=1), 1)
+    assert [fold.pool.tolist() for fold in first] == [fold.pool.tolist() for fold in again]
+    assert len({tuple(fold.pool) for fold in [*first, *other]}) == 2 * len(first)
+    assert [fold.pool.tolist() for fold in fewer] == [fold.pool.tolist() for fold in first[::3]]
+
+
+def test_two_skins_of_a_board_are_labelled_at_pokes_of_their_own():
+    table = poked(boards_n=2)
+    own_n = len(PLACE)
+    for fold in draw_folds(table, ["labels"], LABELS, 0):
+        one, other = (
+            {*table.indentation[fold.pool[table.skin[fold.pool] == skin]] % own_n}
+            for skin in np.unique(table.skin[fold.pool])
+        )
+        assert one != other
+
+
+def test_a_pool_for_adaptation_is_another_and_does_not_shrink_the_folds_of_labels():
+    table = poked()
+    plain, pooled = (
+        draw_folds(table, ["labels"], LABELS.model_copy(update={"pool_passes_n": passes_n}), 0)
+        for passes_n in (None, 1)
+    )
+    for one, other in zip(plain, pooled, strict=True):
+        for side in ("train", "pool", "test"):
+            assert (getattr(one, side) == getattr(other, side)).all()
+
+
+ALMOST_ALL = Split(random_test_fraction=0.95, random_repeats_n=1)
+POOL_OF_2 = Split(pool_passes_n=2)
+MANY_SENSORS = Split(sensors_skins_n=(3, 16), sensors_draws_n=1)
+ONE_BOARD = rows(["b0"] * 3, ["s0"] * 3)
+TWO_CAPTURES = replace(ONE_BOARD, capture=np.array(["run2", "run10", "run10"]))
+
+
+@pytest.mark.parametrize(
+    ("table", "question", "split", "sentence"),
+    [
+        (ONE_BOARD, "lobo", Split(), "question lobo: boards must be two or more; got 1"),
+        (ONE_BOARD, "transfer", TRANSFER, "split.transfer_skins_n must be less than .* 1 boards; got 3"),
+        (ONE_BOARD, "single_temporal", TEMPORAL, "passes of skin s0 must be .*; got 1, of which 0.2 are 0"),
+        (ONE_BOARD, "single_random", ALMOST_ALL, "got 3, of which 0.95 are 3"),
+        (six_by_three_in_passes(2), "lobo", POOL_OF_2, "passes of held-out skin b0_s0 must be more than .*, 2; got 2"),
+        (six_by_three_in_passes(2), "sensors", SENSORS, "passes of held-out skin b0_s0 must be more than .*, 2; got 2"),
+        (six_by_three_in_passes(1), "sensors", MANY_SENSORS, "at most the 15 skins beside held-out board b0; got 16"),
+        (ONE_BOARD, "sensors", SENSORS, "at most the 0 skins beside held-out board b0; got 15"),
+        (ONE_BOARD, "labels", LABELS, "question lobo: boards must be two or more; got 1"),
+        (
+            poked(), "labels", Split(labels_pool_n=10, labels_draws_n=1),
+            "fold labels/b0: split.labels_pool_n must be less than its indentations; got 10",
+        ),
+        (
+            poked(), "labels", Split(labels_pool_n=11, labels_draws_n=1),
+            "skin b0_s0: pokes to choose must be at most the 10 indentations of its pool; got 11",
+        ),
+        (TWO_CAPTURES, "single_temporal", TEMPORAL, "the captures of skin s0 must be one, .*; got run10, run2"),
+    ],
+)  # fmt: skip
+def test_folds_that_the_data_cannot_give_are_one_sentence(table, question, split, sentence):
+    with pytest.raises(ParamsError, match=sentence):
+        draw_folds(table, [question], split, 0)
+
+
+@pytest.mark.parametrize(
+    ("question", "split"), [("lobo", Split()), ("sensors", Split(sensors_skins_n=(1,), sensors_draws_n=1))]
+)
+def test_a_planted_leak_a_skin_on_two_boards_is_refused(question, split):
+    with pytest.raises(ParamsError, match="must be on one side only; got .* on both"):
+        draw_folds(rows(["b0", "b1"], ["s0", "s0"]), [question], split, 0)

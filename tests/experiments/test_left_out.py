@@ -1,0 +1,114 @@
+"""What leaving physics out costs, against closed forms of the terms; what scales with what as laws."""
+
+import numpy as np
+import pytest
+
+from pipeline.experiments import left_out
+from pipeline.experiments.left_out import AGEING, RELAXATION, measure
+from reskin.physics.aging import force_left, softening
+from reskin.physics.board import draw_board
+from reskin.physics.magnet import Quadrature
+from reskin.physics.skin import changes_of_field, draw_skin
+from tests.simulation.scene import AGEING as SIZES
+from tests.simulation.scene import GRID, synthesis, with_protocol
+
+FEW = GRID | {"passes_n": 1}
+INDENTATIONS_N = 130
+
+
+@pytest.fixture(autouse=True, scope="module")
+def few_nodes():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(left_out, "COARSE", Quadrature(2e-3, 3))
+        yield
+
+
+def rows_of(scene):
+    return {row.term: row for row in measure(scene, seed=1)}
+
+
+@pytest.fixture(scope="module")
+def rows(few_nodes):
+    """Rows of every term, measured once."""
+    return rows_of(with_protocol("grid", FEW))
+
+
+@pytest.fixture
+def not_inside(monkeypatch):
+    """Do not follow material inside the skin, which takes most of the time and is the same for any other term."""
+    monkeypatch.setattr(left_out, "_inside", lambda on: [])
+
+
+def test_terms_that_a_scene_does_without_are_left_out_and_others_are_kept(rows, not_inside):
+    assert {term for term, row in rows.items() if row.done == "left out"} == {
+        "ageing", "relaxation", "memory", "temperature", "friction", "the earth's field", "the skin's free edge",
+        "the powder's own field",
+    }  # fmt: skip
+    assert rows["friction"].field_pct == rows["friction"].force_pct == 0  # nothing is dragged
+    aged = rows_of(with_protocol("grid", FEW | {"terms": ["ageing"]}, terms={"ageing": SIZES}))
+    assert aged["ageing"].done == "kept"
+
+
+def test_a_term_names_the_protocols_that_leave_it_out_and_those_that_compute_it(rows, not_inside):
+    wear = FEW | {"skins_n": 1, "terms": ["ageing"]}
+    found = rows_of(with_protocol("wear", wear, protocols={"grid": FEW, "wear": wear}, terms={"ageing": SIZES}))
+    assert (found["ageing"].left_out_by, found["ageing"].computed_by) == (("grid",), ("wear",))
+    assert found["ageing"].done == "left out"  # by the main protocol, which costs are measured on
+    assert found["ageing"].force_pct == rows["ageing"].force_pct
+    assert (found["friction"].left_out_by, found["friction"].computed_by) == (("grid", "wear"), ())
+    assert found["the powder's own field"].left_out_by == found["the chips' steps"].computed_by == ()
+
+
+def test_ageing_and_relaxation_cost_the_force_what_their_formulas_say(rows):
+    left = softening(np.array([INDENTATIONS_N - 1]), settling=AGEING.settling, ageing=AGEING.ageing)[0]
+    assert rows["ageing"].force_pct == pytest.approx(100 * (1 / left - 1), rel=1e-9)
+    assert rows["relaxation"].force_pct == pytest.approx(100 * (1 / force_left(RELAXATION) - 1), rel=1e-9)
+    assert rows["ageing"].field_pct == rows["relaxation"].field_pct == 0  # displacement is prescribed (PHYSICS 0)
+
+
+def test_a_kelvin_costs_0_12_percent_of_every_field(rows):
+    of = synthesis()
+    board = draw_board(of.main_boards.design, of.spreads, seed=1, name="b0")
+    skin = draw_skin(of.skin, of.spreads, seed=1, name="b0_s0", rule=of.main_boards.quadrature.quadrature())
+    rest_T, _ = changes_of_field(board, skin, np.zeros((0, 3)))
+    assert rows["temperature"].field_pct == pytest.approx(100 * (1 / 0.9988 - 1), rel=1e-6)
+    assert rows["temperature"].rest_uT == pytest.approx(0.0012e6 * np.abs(rest_T).max(), rel=1e-6)
+
+
+def test_a_steady_field_is_taken_off_with_the_no_load_reading(rows):
+    assert 0 < rows["the earth's field"].field_pct < 1e-6  # rounding
+    assert rows["the earth's field"].rest_uT == pytest.approx(45)
+
+
+def test_what_is_kept_could_not_go(rows):
+    # PHYSICS 8: increments 16-23 % of a bonded skin at 1.2 mm; of a sliding one the far field, which is linear, counts
+    assert rows["increments"].field_pct > 2
+    assert rows["rotation of the magnetisation"].field_pct > 5
+    assert rows["slipping base"].field_pct > 50
+    assert rows["the chips' steps"].field_pct < 0.5
+
+
+def test_a_base_that_holds_the_skin_is_kept_where_there_is_one(rows, not_inside):
+    hold = {
+        "give_um": (48.0, 7.0),
+        "away_um_mm": 6.0,
+        "lets_go_mm2": 40.0,
+        "springs_N_mm": 7.0,
+        "friction": 0.8,
+    }
+    found = rows_of(with_protocol("grid", FEW, skin=synthesis("skin", hold=hold).skin.model_dump()))
+    assert "the base's hold" not in rows
+    assert found["the base's hold"].done == "kept"
+    assert found["the base's hold"].field_pct > 10
+
+
+def test_the_powders_own_field_matters_by_how_much_powder_there_is(rows, not_inside):
+    half = rows_of(with_protocol("grid", FEW, skin=synthesis("skin", saturation_T=0.055).skin.model_dump()))
+    # 10 %: the field that acts is half as strong, and the magnetisation is not quite linear in it
+    assert half["the powder's own field"].field_pct == pytest.approx(
+        rows["the powder's own field"].field_pct / 2, rel=0.1
+    )
+
+
+def test_every_row_says_how_it_was_measured(rows):
+    assert all(row.how for row in rows.values())

@@ -1,0 +1,42 @@
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from reskin.models.train import AdamW, one_cycle
+
+
+def weights() -> list[torch.Tensor]:
+    torch_rng = torch.Generator().manual_seed(1)
+    shapes = [(3, 4, 5), (3, 1, 5)]
+    return [torch.randn(shape, generator=torch_rng).requires_grad_() for shape in shapes]
+
+
+@pytest.mark.parametrize("steps_n", [1, 2, 3, 10, 150])
+@pytest.mark.parametrize("weight_decay", [0.0, 0.1])
+def test_it_moves_weights_as_torch_does_bit_for_bit(steps_n, weight_decay):
+    ours, theirs = weights(), weights()
+    optimizer = torch.optim.AdamW(theirs, 1.2e-2, weight_decay=weight_decay, fused=True)
+    rate = torch.optim.lr_scheduler.OneCycleLR(optimizer, 1.2e-2, total_steps=max(steps_n, 2))
+    adam = AdamW(ours, weight_decay)
+    for step_i in range(steps_n):
+        for net in (ours, theirs):
+            for values in net:
+                values.grad = torch.sin(7 * values.detach()) * 10.0 ** (-step_i % 5)
+        adam.step(*one_cycle(step_i, steps_n, 1.2e-2))
+        optimizer.step()
+        rate.step()
+        for one, other in zip(ours, theirs, strict=True):
+            assert torch.equal(one, other)
+
+
+def test_training_imports_no_compiler():
+    """It takes a process that trains two seconds, and nothing here is compiled."""
+    code = (
+        "import sys\nfrom reskin.models.train import train\nfrom reskin.models.trial import Terms\n"
+        "from tests.models.jobs import some_job\nfrom tests.models.recipes import recipe\n"
+        "train([some_job(0)], 'paper', recipe(steps_n=2), Terms(0.0), 'cpu')\n"
+        "sys.exit('torch._dynamo' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

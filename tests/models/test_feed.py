@@ -1,0 +1,117 @@
+import numpy as np
+import pytest
+import torch
+
+from reskin.models.train import UNLABELLED, Batch, Feed, Job
+from tests.models.jobs import some_job
+
+STEPS_N, BATCH_N = 20, 16
+
+
+def batches(jobs: list[Job], steps_n: int = STEPS_N, batch_n: int = BATCH_N) -> list[Batch]:
+    return list(Feed(jobs, batch_n, "cpu").draw(steps_n))
+
+
+def rows_of(batch: torch.Tensor, rows: np.ndarray) -> list[int]:
+    """The numbers of the rows that a batch of one network holds; rows are all different."""
+    (found,) = [np.argmax((rows[None] == batch.numpy()[:, None]).all(axis=2), axis=1)]
+    assert (rows[found] == batch.numpy()).all()
+    return found.tolist()
+
+
+def test_a_step_has_a_batch_of_every_kind_for_every_network():
+    steps = batches([some_job(i, terms=True) for i in range(3)])
+    assert len(steps) == STEPS_N
+    for step in steps:
+        assert {name: tuple(values.shape) for name, values in step.items()} == {
+            name: (3, BATCH_N, 3 if name.endswith("targets") else 15)
+            for name in ("labelled", "targets", "near", "far", *UNLABELLED, "few_labels", "few_labels_targets")
+        }
+
+
+def test_nothing_is_drawn_of_what_a_job_does_not_hold():
+    assert batches([some_job()])[0].keys() == {"labelled", "targets"}
+
+
+def test_targets_stand_beside_their_own_rows_and_networks_see_their_own_rows_only():
+    jobs = [some_job(i, n=n, terms=True) for i, n in enumerate((12, 32, 17))]
+    for step in batches(jobs):
+        for i, job in enumerate(jobs):
+            chosen = rows_of(step["labelled"][i], job.labelled.inputs)
+            assert (step["targets"][i].numpy() == job.labelled.targets[chosen]).all()
+            own = rows_of(step["few_labels"][i], job.few_labels.inputs)
+            assert (step["few_labels_targets"][i].numpy() == job.few_labels.targets[own]).all()
+            rows_of(step["unlabelled"][i], job.unlabelled.inputs)
+
+
+def test_near_and_far_are_triplets_of_the_labelled_rows():
+    job = some_job(terms=True)
+    place, group = job.labelled.points.place, job.labelled.points.group
+    for step in batches([job]):
+        three = zip(*(rows_of(step[name][0], job.labelled.inputs) for name in ("labelled", "near", "far")), strict=True)
+        for anchor, near, far in three:
+            assert group[anchor] == group[near] == group[far]
+            assert ((place[anchor] - place[near]) ** 2).sum() < ((place[anchor] - place[far]) ** 2).sum()
+
+
+def test_pokes_are_triplets_of_one_line_by_index_and_a_row_on_two_lines_takes_part_in_both():
+    job = some_job(terms=True)
+    points, row = job.unlabelled.points, job.unlabelled.row
+    lines_of = {r: {(points.group[q], points.place[q, 0]) for q in np.flatnonzero(row == r)} for r in range(20)}
+    met = set()
+    for step in batches([job], 40):
+        for three in zip(*(rows_of(step[name][0], job.unlabelled.inputs) for name in UNLABELLED), strict=True):
+            on_one_line = [
+                (line, abs(a - p), abs(a - n))
+                for line, a in lines_of[three[0]] for of_p, p in lines_of[three[1]] for of_n, n in lines_of[three[2]]
+                if line == of_p == of_n
+            ]  # fmt: skip
+            assert any(near < far for _, near, far in on_one_line)
+            met |= {line for line, _, _ in on_one_line}
+    assert met == {0, 1, 2}
+
+
+def test_every_row_is_drawn_about_equally_often():
+    job, n = some_job(n=8), 400 * BATCH_N
+    drawn = np.concatenate([rows_of(step["labelled"][0], job.labelled.inputs) for step in batches([job], 400)])
+    assert (np.abs(np.bincount(drawn, minlength=8) - n / 8) < 6 * (n * 7 / 64) ** 0.5).all()  # six binomial sd
+
+
+def test_a_networks_batches_do_not_depend_on_its_neighbours():
+    (alone, beside) = (
+        batches(jobs) for jobs in ([some_job(1, terms=True)], [some_job(i, terms=True) for i in range(3)])
+    )
+    for one, other in zip(alone, beside, strict=True):
+        assert all(torch.equal(one[name][0], other[name][1]) for name in one)
+
+
+def test_one_more_term_leaves_all_other_batches_as_they_are():
+    """Methods are compared in pairs: in every block, not only in the first."""
+    full = some_job(terms=True)
+    without = {
+        "triplet": Job(full.start, some_job().rng, some_job().labelled, full.unlabelled, full.few_labels),
+        "unlabelled": Job(full.start, some_job().rng, full.labelled, None, full.few_labels),
+        "few_labels": Job(full.start, some_job().rng, full.labelled, full.unlabelled),
+    }
+    feed = Feed([full], BATCH_N, "cpu")
+    blocks = [list(feed.draw(STEPS_N)) for _ in range(3)]
+    for job in without.values():
+        less = Feed([job], BATCH_N, "cpu")
+        for block in blocks:
+            for one, other in zip(less.draw(STEPS_N), block, strict=True):
+                assert all(torch.equal(one[name], other[name]) for name in one)
+
+
+def test_blocks_and_networks_draw_rows_of_their_own():
+    same_rows = some_job(0)
+    other = Job(same_rows.start, some_job(1).rng, same_rows.labelled)
+    feed = Feed([same_rows, other], BATCH_N, "cpu")
+    (first,), (second,) = feed.draw(1), feed.draw(1)
+    assert not torch.equal(first["labelled"][0], first["labelled"][1])
+    assert not torch.equal(first["labelled"], second["labelled"])
+
+
+@pytest.mark.parametrize(("n", "batch_n"), [(1, 16), (1, 1), (32, 1), (3, 100)])
+def test_any_number_of_rows_fills_any_batch(n, batch_n):
+    (step,) = batches([some_job(n=n)], 1, batch_n)
+    assert step["labelled"].shape == (1, batch_n, 15)

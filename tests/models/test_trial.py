@@ -1,0 +1,343 @@
+from collections.abc import Callable
+from dataclasses import fields, replace
+
+import grimp
+import numpy as np
+import pytest
+
+from reskin.data.lines import Lines
+from reskin.models import trial as trial_module
+from reskin.models.recipe import AugmentedRecipe
+from reskin.models.train import Feed, make_job, train_stack
+from reskin.models.trial import DECIDING, Keys, Measured, Terms, Trained, Trial
+from tests.models.recipes import recipe
+from tests.models.trials import (
+    OWN,
+    POKED,
+    ROWS_N,
+    TEST,
+    TRAIN,
+    adapting,
+    changed,
+    few_labels,
+    lines,
+    measured,
+    pooled,
+    start,
+    without_triplets,
+)
+
+NEW = np.arange(24, ROWS_N)  # every row of a skin that is not trained on
+KINDS = {"pooled": pooled, "adapting": adapting, "few labels": few_labels}
+
+
+def trained(trial: Trial, rows: Measured) -> Trained:
+    return train_stack([trial], rows)[0]
+
+
+def alike(one: Trained, other: Trained) -> bool:
+    """Bit for bit: weights, scaler, curve."""
+    weights = all((one.weights[name] == other.weights[name]).all() for name in one.weights)
+    scaler, again = one.scaler.arrays(), other.scaler.arrays()
+    return weights and one.curve == other.curve and all((scaler[name] == again[name]).all() for name in scaler)
+
+
+# What adaptation may see
+
+
+@pytest.mark.parametrize("new", [np.nan, 1e3, -7.0], ids=str)
+@pytest.mark.parametrize("at", [POKED, TEST, NEW], ids=["poked", "tested", "all"])
+def test_adaptation_cannot_see_places_and_forces_of_the_new_skin(at, new):
+    once, blind = trained(adapting(), measured()), trained(adapting(), changed(measured(), "target", at, new))
+    assert alike(once, blind)
+    assert (once.predicted == blind.predicted).all()
+
+
+def test_adaptation_cannot_see_which_skin_its_pokes_are_on():
+    assert alike(trained(adapting(), measured()), trained(adapting(), changed(measured(), "skin", NEW, "b0_s0")))
+
+
+def test_adaptation_sees_fields_and_order_of_the_pokes_that_lines_name():
+    once, along = trained(adapting(), measured()), lines()
+    backwards = replace(along, row=along.row[[0, 2, 4, 1, 3, 5]])
+    assert not alike(once, trained(adapting(along=backwards), measured()))
+    assert not alike(once, trained(adapting(), changed(measured(), "db_uT", POKED[0], 0)))
+    assert not alike(once, trained(adapting(), changed(measured(), "target", TRAIN[0], 0)))
+
+
+def test_lines_have_no_place_and_no_force():
+    assert [field.name for field in fields(Lines)] == ["row", "line_i", "order_i"]
+
+
+def test_pokes_are_scaled_as_the_start_was_and_each_point_names_its_row():
+    line_i, order_i = np.array([[0, 0, 0, 1, 1, 1], [0, 1, 2, 0, 2, 3]], np.int32)
+    along = Lines(np.array([40, 36, 38, 40, 36, 41]), line_i, order_i)
+    scaler = replace(start().scaler, input_shift=np.arange(15, dtype=np.float32))
+    job, used = make_job(tuned(adapting(along=along), start=replace(start(), scaler=scaler)), measured())
+    assert used is scaler
+    db_uT = measured().db_uT
+    for point, row in enumerate(along.row):
+        expected = [(db_uT[row, ch] - scaler.input_shift[ch]) / scaler.input_scale[ch] for ch in range(15)]
+        assert job.unlabelled.inputs[job.unlabelled.row[point]].tolist() == expected
+    assert job.unlabelled.points.place[:, 0].tolist() == order_i.tolist()
+    assert job.unlabelled.points.group.tolist() == line_i.tolist()
+    assert len(job.unlabelled.inputs) == 4
+
+
+@pytest.mark.parametrize("at", [POKED, NEW], ids=["poked", "all"])
+def test_the_control_looks_at_nothing_of_the_new_skin(at):
+    control = adapting(unlabelled_weight=0.0)
+    once = trained(control, measured())
+    for part, new in (("db_uT", 1e4), ("target", np.nan)):
+        assert alike(once, trained(control, changed(measured(), part, at, new)))
+    assert not alike(once, trained(adapting(), measured()))
+
+
+def test_a_few_labels_are_seen_and_no_others():
+    once = trained(few_labels(), measured())
+    others = np.setdiff1d(NEW, OWN)
+    assert alike(once, trained(few_labels(), changed(measured(), "target", others, np.nan)))
+    assert not alike(once, trained(few_labels(), changed(measured(), "target", OWN, 0)))
+    assert not alike(once, trained(few_labels(own_weight=0.0), measured()))
+
+
+# What is held out
+
+
+@pytest.mark.parametrize("scaling", ["standard", "released"])
+@pytest.mark.parametrize("view", ["raw", "shape"])
+def test_a_planted_leak_would_show_nothing_of_a_test_row_reaches_the_model(scaling, view):
+    trial = pooled(scaling=scaling, inputs=view)
+    once = trained(trial, measured())
+    planted = changed(changed(measured(), "db_uT", TEST, 1e4), "target", TEST, -1e4)
+    again = trained(trial, planted)
+    assert alike(once, again)
+    assert (once.predicted != again.predicted).any()
+
+
+@pytest.mark.parametrize("kind", sorted(KINDS))
+def test_a_scaler_is_that_of_the_rows_trained_on(kind):
+    _, scaler = make_job(KINDS[kind](), changed(measured(), "db_uT", NEW, 1e6))
+    np.testing.assert_allclose(scaler.input_shift, measured().db_uT[TRAIN].mean(axis=0, dtype=float), rtol=1e-6)
+    np.testing.assert_allclose(scaler.target_scale, measured().target[TRAIN].std(axis=0, dtype=float), rtol=1e-6)
+
+
+def test_labelled_triplets_are_by_place_on_each_skin_in_mm():
+    rows = measured()
+    job, _ = make_job(pooled(), rows)
+    assert (job.labelled.points.place == rows.target[TRAIN, :2]).all()
+    assert job.labelled.points.group.tolist() == [0] * 12 + [1] * 12
+    assert (
+        make_job(replace(pooled(), recipe=pooled().recipe.model_copy(update={"triplet_weight": 0.0})), rows)[
+            0
+        ].labelled.points
+        is None
+    )
+
+
+def test_terms_weigh_what_the_recipe_and_the_tuning_say():
+    assert pooled().terms == Terms(0.5)
+    assert adapting(unlabelled_weight=0.25).terms == Terms(0.5, unlabelled=0.25)
+    assert few_labels(own_weight=0.75).terms == Terms(0.5, few_labels=0.75)
+    assert adapting().schedule == adapting().tuning.settings
+    assert pooled().schedule == pooled().recipe
+
+
+# Pairs
+
+
+def first_batches(trial: Trial) -> list[np.ndarray]:
+    feed = Feed([make_job(trial, measured())[0]], 16, "cpu")
+    return [step["labelled"].numpy() for _ in range(3) for step in feed.draw(5)]
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        replace(pooled(), recipe_name="variant", question="lobo", what="multi"),
+        pooled(weight_decay=0.5, rate_max=1e-4),
+        without_triplets(),
+    ],
+    ids=["another name", "another schedule", "no triplets"],
+)
+def test_recipes_are_compared_from_equal_starts_on_equal_batches(other):
+    one, two = (make_job(trial, measured())[0].start for trial in (pooled(), other))
+    assert all((one[name] == two[name]).all() for name in one)
+    assert all((a == b).all() for a, b in zip(first_batches(pooled()), first_batches(other), strict=True))
+
+
+def test_adaptation_is_compared_with_its_control_on_equal_batches():
+    pairs = zip(first_batches(adapting()), first_batches(adapting(unlabelled_weight=0.0)), strict=True)
+    assert all((a == b).all() for a, b in pairs)
+
+
+@pytest.mark.parametrize("changes", [{"seed": 8}, {"seed_i": 1}, {"fold": "b0"}], ids=str)
+def test_folds_and_seeds_start_and_draw_differently(changes):
+    other = replace(pooled(), **changes)
+    assert (
+        make_job(pooled(), measured())[0].start["layer1.weight"]
+        != make_job(other, measured())[0].start["layer1.weight"]
+    ).any()
+    assert any((a != b).any() for a, b in zip(first_batches(pooled()), first_batches(other), strict=True))
+
+
+# Keys
+
+
+def key(trial: Trial, rows: Measured | None = None) -> str:
+    return Keys(rows or measured()).key(trial)
+
+
+def tuned(trial: Trial, **changes: object) -> Trial:
+    return replace(trial, tuning=replace(trial.tuning, **changes))
+
+
+def with_row(part: str, row: int, to: object) -> Callable[[], Measured]:
+    return lambda: changed(measured(), part, np.array([row]), to)
+
+
+DECISIVE_ROWS = {
+    "a trained field": ("pooled", with_row("db_uT", TRAIN[3], 1.0)),
+    "a trained place": ("pooled", with_row("target", TRAIN[3], 1.0)),
+    "the skin of a trained row": ("pooled", with_row("skin", TRAIN[3], "b0_s1")),
+    "a tested field": ("pooled", with_row("db_uT", TEST[3], 1.0)),
+    "a poked field": ("adapting", with_row("db_uT", POKED[3], 1.0)),
+    "an own field": ("few labels", with_row("db_uT", OWN[1], 1.0)),
+    "an own label": ("few labels", with_row("target", OWN[1], 1.0)),
+}
+IDLE_ROWS = {
+    "a tested place": ("pooled", with_row("target", TEST[3], 1.0)),
+    "a field that nobody uses": ("pooled", with_row("db_uT", 30, 1.0)),
+    "the name of all skins": ("pooled", lambda: replace(measured(), skin=np.char.add("x", measured().skin))),
+    "the skin of a tested row": ("pooled", with_row("skin", TEST[3], "b0_s1")),
+    "a poked place": ("adapting", with_row("target", POKED[3], np.nan)),
+    "a label that is not its own": ("few labels", with_row("target", POKED[5], 1.0)),
+}
+
+
+@pytest.mark.parametrize("what", sorted(DECISIVE_ROWS))
+def test_a_key_changes_with_every_row_that_decides_the_result(what):
+    kind, rows = DECISIVE_ROWS[what]
+    assert key(KINDS[kind](), rows()) != key(KINDS[kind]())
+
+
+@pytest.mark.parametrize("what", sorted(IDLE_ROWS))
+def test_a_key_does_not_change_with_what_decides_nothing(what):
+    kind, rows = IDLE_ROWS[what]
+    assert key(KINDS[kind](), rows()) == key(KINDS[kind]())
+
+
+def finer(trial: Trial, **changes: object) -> Trial:
+    return tuned(trial, settings=trial.tuning.settings.model_copy(update=changes))
+
+
+def test_no_two_settings_share_a_key():
+    along = lines()
+    trials = [
+        pooled(), adapting(), few_labels(), replace(pooled(), train=TRAIN[1:]), replace(pooled(), test=TEST[1:]),
+        *[pooled(**one) for one in (
+            {"architecture": "released"}, {"inputs": "shape"}, {"scaling": "released"}, {"steps_n": 5}, {"batch_n": 8},
+            {"rate_max": 1e-3}, {"weight_decay": 0.1}, {"gradient_norm_max": 0.5},
+        )],
+        without_triplets(),
+        replace(pooled(), seed=8), replace(pooled(), seed_i=1), replace(pooled(), fold="b0"),
+        replace(adapting(), skin="b1_s0"), tuned(adapting(), start=start("another")), finer(adapting(), steps_n=5),
+        finer(adapting(), unlabelled_weight=0.25), finer(adapting(), rate_max=1e-4),
+        adapting(along=replace(along, order_i=along.order_i[::-1].copy())),
+        adapting(along=replace(along, line_i=np.array([0, 0, 0, 1, 1, 1], np.int32))),
+        adapting(along=replace(along, row=along.row[::-1].copy())),
+        tuned(few_labels(), row=OWN[:2]), finer(few_labels(), own_weight=0.25),
+    ]  # fmt: skip
+    assert len({key(trial) for trial in trials}) == len(trials)
+
+
+def test_a_training_after_one_that_collapsed_has_a_key_a_start_and_batches_of_its_own():
+    again = replace(pooled(), attempt_i=1)
+    assert key(again) != key(pooled())
+    (one, _), (other, _) = make_job(pooled(), measured()), make_job(again, measured())
+    assert (one.start["layer1.weight"] != other.start["layer1.weight"]).all()
+    assert one.rng.integers(1 << 60) != other.rng.integers(1 << 60)
+
+
+@pytest.mark.parametrize("scaling", ["standard", "released"])
+def test_a_network_begins_with_the_mean_of_the_targets_as_its_last_bias(scaling):
+    trial = replace(without_triplets(), recipe=recipe(scaling=scaling))
+    rows = changed(measured(), "target", np.arange(3), np.nan)
+    job, scaler = make_job(trial, changed(rows, "target", (slice(None), 2), np.nan))
+    predicted = scaler.decode(job.start["layer6.bias"][None])[0]
+    np.testing.assert_allclose(predicted[:2], rows.target[TRAIN[3:], :2].mean(axis=0), rtol=1e-5)
+    assert job.start["layer6.bias"][2] == 0  # a target that nobody knows
+
+
+NOT_DECIDING = {
+    "code": "tells code from code",
+    "config": "checks settings, whose values are part of the key",
+    "errors": "stops a training, and changes none",
+    "numerics": "its signature of the environment is part of the key, as is the device",
+    "schema": "makes rows, whose values are part of the key",
+    "data.baseline": "makes rows, whose values are part of the key",
+    "data.lines": "makes lines, whose values are part of the key",
+    "data.rows": "makes rows, whose values are part of the key",
+    "models.recipe": "settings, whose values are part of the key",
+}
+
+
+def test_all_code_that_a_training_runs_through_is_part_of_its_key():
+    graph = grimp.build_graph("reskin", cache_dir=None)
+    modules = {"reskin.models.train", *graph.find_upstream_modules("reskin.models.train")}
+    imported = {module for module in modules if not graph.find_children(module)}
+    others = {f"reskin.{name}" for name in NOT_DECIDING}
+    assert imported - others == set(DECIDING)
+    assert others <= imported
+
+
+def test_questions_and_names_do_not_enter_a_key():
+    assert key(replace(pooled(), question="sensors", recipe_name="other", what="multi")) == key(pooled())
+
+
+def test_rows_that_nobody_uses_may_come_and_go():
+    rows = measured()
+    fewer = Measured(*(getattr(rows, field.name)[6:] for field in fields(rows)))
+    moved = replace(pooled(), train=TRAIN[6:] - 6, test=TEST - 6)
+    assert key(moved, fewer) == key(replace(pooled(), train=TRAIN[6:]))
+
+
+def test_keys_are_the_same_from_one_book_of_keys_and_from_many():
+    book, trials = Keys(measured()), [pooled(), replace(pooled(), train=TRAIN[1:]), pooled(), adapting()]
+    assert [book.key(trial) for trial in trials] == [key(trial) for trial in trials]
+
+
+def test_a_key_changes_with_the_code_that_trains(monkeypatch):
+    before = key(pooled())
+    monkeypatch.setattr(trial_module, "digest", lambda name: f"another {name}")
+    assert key(pooled()) != before
+
+
+def test_a_name_says_what_tells_a_trial_apart():
+    assert pooled().name == "triplet.paper.b1.seed0"
+    assert replace(adapting(), what="65pokes").name == "adapt.paper.b1.b1_s1.65pokes.seed0"
+
+
+def test_copies_of_rows_keep_their_targets_and_are_skins_of_their_own():
+    words = {"copies_n": 2, "gain_sd": 0.0, "lean_sd_deg": 0.0, "noise_uT": 0.0}
+    plain = pooled()
+    recipe = AugmentedRecipe.model_validate(plain.recipe.model_dump() | {"augmentation": words})
+    (one, _), (more, _) = (make_job(trial, measured()) for trial in (plain, replace(plain, recipe=recipe)))
+    # Boards that do not differ: the same rows three times over, with the same targets.
+    np.testing.assert_array_equal(more.labelled.inputs, np.tile(one.labelled.inputs, (3, 1)))
+    np.testing.assert_array_equal(more.labelled.targets, np.tile(one.labelled.targets, (3, 1)))
+    assert more.labelled.points.group.tolist() == np.repeat(range(6), 12).tolist()
+
+
+def test_copies_are_drawn_anew_in_every_fold_and_seed_and_enter_the_key():
+    words = {"copies_n": 1, "gain_sd": 0.1, "lean_sd_deg": 5.0, "noise_uT": 1.0}
+    recipe = AugmentedRecipe.model_validate(pooled().recipe.model_dump() | {"augmentation": words})
+    other = AugmentedRecipe.model_validate(pooled().recipe.model_dump() | {"augmentation": words | {"gain_sd": 0.2}})
+    trial = replace(pooled(), recipe=recipe)
+    drawn = [
+        make_job(one, measured())[0].labelled.inputs
+        for one in (trial, trial, replace(trial, fold="b9"), replace(trial, seed_i=5))
+    ]
+    assert (drawn[0] == drawn[1]).all()
+    assert not any((drawn[0] == one).all() for one in drawn[2:])
+    assert key(trial) != key(replace(trial, recipe=other)) != key(pooled())

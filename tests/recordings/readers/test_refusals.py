@@ -1,0 +1,51 @@
+"""What every layout refuses in one sentence: files of rubbish, without rows, or cut."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from reskin.recordings.readers import READERS
+from tests.recordings.readers import test_eflash7, test_eflesh, test_ini, test_lab, test_plain
+
+WHOLE: dict[str, Callable[[Path], Path]] = {
+    "table": test_plain.write,
+    "lab": lambda folder: test_lab.write(folder, *test_lab.PRESSES),
+    "ini": lambda folder: test_ini.write(folder, test_ini.ONE_PASS),
+    "eflesh": test_eflesh.scan,
+    "eflash7": test_eflash7.write,
+}
+TESTS = {"table": test_plain, "lab": test_lab, "ini": test_ini, "eflesh": test_eflesh, "eflash7": test_eflash7}
+FILES = [(layout, name) for layout, reader in READERS.items() for name in reader.FILES]  # type: ignore[attr-defined]
+ROWLESS = [b"", b"x", b"1", b"\n", b"\x00\xff\xfe\n", test_lab.NAMES.encode(), f"{test_lab.NAMES}\n".encode()]
+
+
+def refuse(folder: Path, layout: str, name: str, change: Callable[[bytes], bytes]) -> str:
+    file = WHOLE[layout](folder) / name
+    file.write_bytes(change(file.read_bytes()))
+    return TESTS[layout].complaint_of(folder)
+
+
+@pytest.mark.parametrize(("layout", "name"), FILES)
+@pytest.mark.parametrize("content", ROWLESS, ids=repr)
+def test_a_file_without_rows(tmp_path: Path, layout: str, name: str, content: bytes) -> None:
+    assert name in refuse(tmp_path, layout, name, lambda _: content)
+
+
+@settings(max_examples=100, deadline=None)
+@given(content=st.binary(max_size=200), file=st.sampled_from(FILES))
+def test_random_bytes(tmp_path_factory: pytest.TempPathFactory, content: bytes, file: tuple[str, str]) -> None:
+    refuse(tmp_path_factory.mktemp("random"), *file, lambda _: content)
+
+
+@settings(max_examples=120, deadline=None)
+@given(data=st.data(), file=st.sampled_from(FILES))
+def test_a_file_cut_in_a_line(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject, file: tuple[str, str]
+) -> None:
+    def cut(whole: bytes) -> bytes:
+        return whole[: data.draw(st.integers(0, len(whole) - 1).filter(lambda n: whole[n - 1 : n] != b"\n"))]
+
+    refuse(tmp_path_factory.mktemp("cut"), *file, cut)

@@ -1,0 +1,127 @@
+"""Units that cannot be right are told; those that can are let pass."""
+
+from typing import get_args
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from reskin import seeds
+from reskin.errors import CaptureError
+from reskin.recordings.layouts import Foreign
+from reskin.recordings.readers import READERS
+from reskin.recordings.text import check_depths, check_fields, check_forces, check_places, check_touch, make_readings
+from reskin.schema import to_table
+from tests.recordings.headers import make_header
+
+SKIN_uT = np.array([[-541.2, 917.2, 44.9], [120.0, -3600.0, 700.0]])
+# Step and usual field of real boards: ReSkin with its own skins, eFlesh, and eFlesh at another gain.
+BOARDS_uT = {"ini": (0.15, 400.0), "lab": (0.2, 1500.0), "eflesh": (2.4, 9000.0), "eflesh shear": (0.6, 6000.0)}
+
+
+def fields_uT(step_uT: float, usual_uT: float, seed: int = 0) -> np.ndarray:
+    """1000 noisy rows of five chips whose field has about the usual size."""
+    rng = seeds.rng_for(seed, "fields")
+    axes = rng.standard_normal((5, 3))
+    rest_uT = usual_uT * axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    b_uT = rest_uT.ravel() + 5 * rng.standard_normal((1000, 15))
+    return np.round(b_uT / step_uT) * step_uT
+
+
+def test_a_skins_field_passes_in_microtesla_only() -> None:
+    check_fields(SKIN_uT, "here", first_line_n=1)
+    with pytest.raises(CaptureError, match="Convert mT or G"):
+        check_fields(SKIN_uT / 1e3, "here", first_line_n=1)
+    with pytest.raises(CaptureError, match="in line 2"):
+        check_fields(SKIN_uT * 1e3, "here", first_line_n=1)
+
+
+@settings(deadline=None, max_examples=20)
+@given(name=st.sampled_from(sorted(BOARDS_uT)), seed=st.integers(0, 1000))
+def test_a_board_passes_in_microtesla_only(name: str, seed: int) -> None:
+    b_uT = fields_uT(*BOARDS_uT[name], seed)
+    check_fields(b_uT, "here", first_line_n=1)
+    for of_a_uT in (1e-2, 1e-3, 1e-6, 1e3):
+        with pytest.raises(CaptureError, match=r"^here: field must be .* got .*uT"):
+            check_fields(of_a_uT * b_uT, "here", first_line_n=1)
+
+
+def test_gauss_is_known_by_its_steps_where_the_field_is_strong() -> None:
+    with pytest.raises(CaptureError, match="0.15 to 9.68 uT; got steps of 0.024. Convert G to uT"):
+        check_fields(1e-2 * fields_uT(*BOARDS_uT["eflesh"]), "here", first_line_n=1)
+
+
+@pytest.mark.parametrize("usual_uT", [30.0, 65.0, 3000.0])
+def test_fields_without_noise_or_grid_pass_from_the_earths_on(usual_uT: float) -> None:
+    still = np.tile(fields_uT(0.15, usual_uT)[:1] * 0 + usual_uT / np.sqrt(3), (400, 1))
+    check_fields(still, "here", first_line_n=1)
+    smooth = usual_uT + seeds.rng_for(0, "smooth").standard_normal((400, 15))
+    check_fields(smooth, "here", first_line_n=1)
+    check_fields(smooth.round(2), "here", first_line_n=1)
+
+
+def test_the_fields_of_real_boards_pass_and_not_in_gauss(shared_data) -> None:
+    files = sorted((shared_data / "lab").glob("*.csv"))
+    boards = [np.loadtxt(file, delimiter=",", skiprows=1, usecols=[5, 6, 7, 9, 10, 11]) for file in files]
+    boards += [np.loadtxt(file, delimiter=",")[:, 1:] for file in sorted((shared_data / "eflesh").rglob("sensor.csv"))]
+    assert len(boards) > 6
+    for b_uT in boards:
+        check_fields(b_uT, "here", first_line_n=1)
+        with pytest.raises(CaptureError, match="G to uT"):
+            check_fields(b_uT / 100, "here", first_line_n=1)
+
+
+def test_a_press_passes_in_newtons_only() -> None:
+    press_N = np.array([np.nan, 0.0, -9.5, 3.4])
+    check_forces(press_N, "here", first_line_n=1)
+    with pytest.raises(CaptureError, match="in line 12"):
+        check_forces(press_N * 101.97, "here", first_line_n=10)
+
+
+def test_forces_that_no_gauge_can_tell_are_refused() -> None:
+    for fine_N in (np.array([0.0, 0.05, np.nan]), np.zeros(3), np.full(3, np.nan), np.array([[0.1, -1.0, 0.0]])):
+        check_touch(fine_N, "here")
+    with pytest.raises(CaptureError, match="^here: force must be .* got 0.0416 at most. Convert kg"):
+        check_touch(np.array([0.0, -0.0416, np.nan]), "here")
+
+
+@settings(deadline=None)
+@given(extent_mm=st.floats(1.0, 199.0), start_mm=st.floats(-500, 500))
+def test_places_pass_in_millimetres_only(extent_mm: float, start_mm: float) -> None:
+    place_mm = np.array([[start_mm, 3.0], [start_mm + extent_mm * 1.001, 3.0], [np.nan, np.nan]])
+    check_places(place_mm, "here")
+    for factor in (1e-3, 1e3):
+        if extent_mm * factor > 200 or 0.01 < extent_mm * factor < 1:
+            with pytest.raises(CaptureError, match="^here: places must be one, or spread over 1 to 200 mm"):
+                check_places(factor * place_mm, "here")
+
+
+def test_one_place_passes_with_the_robots_rounding() -> None:
+    check_places(np.array([[315.0, -100.0], [315.00003, -99.99999]]), "here")
+    check_places(np.full((3, 2), np.nan), "here")
+
+
+@pytest.mark.parametrize(
+    ("deepest_mm", "fine"), [(1.2, True), (0.0, True), (12.0, True), (0.0012, False), (1200, False)]
+)
+def test_depths_pass_in_millimetres_only(deepest_mm: float, fine: bool) -> None:
+    depth_mm = np.array([0.0, deepest_mm / 2, deepest_mm, np.nan])
+    if fine:
+        check_depths(depth_mm, "here")
+    else:
+        with pytest.raises(CaptureError, match="^here: depth must be 0.05 to 100 mm where it is greatest"):
+            check_depths(depth_mm, "here")
+
+
+def test_each_layout_has_a_reader() -> None:
+    assert set(READERS) == set(get_args(Foreign))
+
+
+def test_what_a_reader_does_not_give_is_unknown_on_every_chip() -> None:
+    readings = make_readings(
+        make_header(chips_n=2), np.array([True, False]), indentation=np.zeros(2), pass_i=np.zeros(2),
+        b_uT=np.ones((2, 6)), noload_uT=np.ones((2, 6)), n_contacts=np.zeros(2),
+    )  # fmt: skip
+    table = to_table(readings)
+    assert np.isnan(np.asarray(table.column("temperature_degC").combine_chunks().flatten())).tolist() == [True, True]

@@ -1,0 +1,257 @@
+"""A native capture, from bytes to readings: what was pressed comes out, and every byte and frame is accounted for."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from reskin import io
+from reskin.board.faults import STUCK_FRAMES_MIN_N, FAILED_B_uT, FAILED_TEMPERATURE_degC
+from reskin.board.wire import Frames, encode
+from reskin.errors import CaptureError
+from reskin.recordings import clocks, ingest, probe
+from reskin.recordings.clocks import Arrivals
+from reskin.recordings.header import ARRIVALS_FILE, PROBE_FILE, STREAM_FILE, Clock, Header, Wire
+from reskin.recordings.ingest import read_native
+from reskin.recordings.probe import LABELS, ProbeLog
+from reskin.schema import Readings
+from reskin.seeds import rng_for
+from tests.recordings.headers import AS_USUAL, make_header
+
+RATE_HZ = 100.0
+OFFSET_S = 40.0  # probe minus stream
+INDENTATIONS_N = 60
+NOLOAD_N, MOVE_N, CONTACT_N = 4, 3, 5  # frames of one indentation: lifted, down, pressed, up
+CHIPS_N = 5
+
+
+def press() -> tuple[Frames, ProbeLog]:
+    """Press a skin at random: frames at `RATE_HZ`, whole hundredths of uT, and the log of where they were pressed."""
+    rng = rng_for(0, "press")
+    move_n = rng.integers(MOVE_N, 3 * MOVE_N, (INDENTATIONS_N, 2))
+    parts, rows, begin = [], [], 10
+    parts.append(np.zeros((begin, 15)))
+    for number in range(INDENTATIONS_N):
+        down_n, up_n = move_n[number]
+        share = np.concatenate(
+            [
+                np.zeros(NOLOAD_N),
+                np.linspace(0, 1, down_n + 2)[1:-1],
+                np.ones(CONTACT_N),
+                np.linspace(1, 0, up_n + 2)[1:-1],
+            ]
+        )
+        parts.append(share[:, None] * rng.normal(0, 200, 15))
+        pressed = begin + NOLOAD_N + down_n
+        # Dwells reach half a frame past their frames; a frame i ends at (i + 1) / RATE_HZ.
+        rows.append((number, False, begin + 0.5, begin + NOLOAD_N + 0.5))
+        rows.append((number, True, pressed + 0.5, pressed + CONTACT_N + 0.5))
+        begin += len(share)
+    parts.append(np.zeros((10, 15)))
+    clean_uT = np.concatenate(parts)
+    b_uT = np.round(500 + clean_uT + rng.normal(0, 4, clean_uT.shape), 2).astype(np.float32)
+    temperature_degC = np.round(rng.normal(25, 0.1, (len(b_uT), CHIPS_N)), 2).astype(np.float32)
+    frame_s = (1 + np.arange(len(b_uT))) / RATE_HZ
+    frames = Frames(b_uT, temperature_degC, frame_s, np.zeros(len(b_uT), np.int64))
+    number, contact, start, end = (np.array(column) for column in zip(*rows, strict=True))
+    labels = {name: np.where(contact, i + number, np.nan).astype(np.float32) for i, name in enumerate(LABELS)}
+    number = number.astype(np.int32)
+    start_s, end_s = start / RATE_HZ + OFFSET_S, end / RATE_HZ + OFFSET_S
+    return frames, ProbeLog(number, number // 20, contact.astype(bool), start_s, end_s, **labels)
+
+
+FRAMES, LOG = press()
+MARKS = ((0.5, OFFSET_S + 0.5), (8.0, OFFSET_S + 8.0))
+
+
+def header_of(wire: Wire, kind: str = "arrivals", marks: tuple[tuple[float, float], ...] = MARKS) -> Header:
+    clock = Clock(kind=kind, rate_hz=RATE_HZ if kind == "rate" else None, marks=marks)  # type: ignore[arg-type]
+    return make_header(layout="native", wire=wire, clock=clock, chips_n=CHIPS_N)
+
+
+def write(folder: Path, wire: Wire, frames: Frames = FRAMES, **files: bytes) -> Path:
+    """Write a capture's files; chunks of 1 to 7 frames arrive when their last frame has ended."""
+    whole = encode(frames, wire)
+    rows = np.arange(len(frames))
+    ends = np.cumsum([len(encode(frames.where(rows == row_i), wire)) for row_i in rows])
+    chunk_i = np.cumsum(rng_for(0, "chunks").integers(1, 8, len(frames)))
+    chunk_i = np.append(chunk_i[chunk_i < len(frames)], len(frames)) - 1
+    table = Arrivals(np.append(0, ends[chunk_i]).astype(np.int64), np.append(0.0, (chunk_i + 1) / RATE_HZ))
+    contents = {
+        STREAM_FILE: whole,
+        ARRIVALS_FILE: clocks.render(table).encode(),
+        PROBE_FILE: probe.render(LOG).encode(),
+    }
+    for name, content in contents.items():
+        (folder / name).write_bytes(files.get(name.split(".")[0], content))
+    return folder
+
+
+def read(folder: Path, header: Header) -> tuple[dict[str, np.ndarray], dict[str, int]]:
+    blocks, account = read_native(folder, header, AS_USUAL)
+    parts = list(blocks)
+    names = [field.name for field in dataclasses.fields(Readings)[4:]]
+    return {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}, account
+
+
+def expected() -> dict[str, np.ndarray]:
+    """What a loop over dwells finds, from the frames before they were bytes."""
+    columns: dict[str, list[Any]] = {
+        name: [] for name in ("indentation", "reading_i", "x_mm", "b_uT", "noload_uT", "t_s")
+    }
+    noload_uT = np.zeros(15)
+    for dwell_i in range(len(LOG)):
+        probe_s = FRAMES.device_s + OFFSET_S
+        inside = np.flatnonzero((probe_s >= LOG.t_start_s[dwell_i]) & (probe_s <= LOG.t_end_s[dwell_i]))
+        if not LOG.contact[dwell_i]:
+            noload_uT = FRAMES.b_uT[inside].mean(axis=0, dtype=np.float64)
+            continue
+        assert len(inside) == CONTACT_N
+        for reading_i, frame_i in enumerate(inside):
+            row = (LOG.indentation[dwell_i], reading_i, LOG.x_mm[dwell_i], FRAMES.b_uT[frame_i], noload_uT)
+            for name, value in zip(columns, (*row, FRAMES.device_s[frame_i]), strict=True):
+                columns[name].append(value)
+    return {name: np.array(column) for name, column in columns.items()}
+
+
+@pytest.mark.parametrize("wire", ["binary", "binary-clock", "text-xyzt", "text-txyz"])
+@pytest.mark.parametrize("kind", ["arrivals", "rate"])
+@pytest.mark.parametrize("marks", [MARKS, ()], ids=["marks", "contacts"])
+def test_what_was_pressed_comes_out(
+    tmp_path: Path, wire: Wire, kind: str, marks: tuple[tuple[float, float], ...]
+) -> None:
+    got, account = read(write(tmp_path, wire), header_of(wire, kind, marks))
+    for name, column in expected().items():
+        # All is copied but the mean (float32) and the time (text lines differ in length within a chunk: half a frame).
+        atol = {"t_s": 0.5 / RATE_HZ, "noload_uT": 1e-3}.get(name, 0)
+        np.testing.assert_allclose(got[name], column, rtol=0, atol=atol, err_msg=name)
+    assert account["indentations_n"] == account["logged_indentations_n"] == INDENTATIONS_N
+    assert account["frames_n"] == len(FRAMES)
+
+
+def test_every_byte_and_frame_is_accounted_for_when_the_stream_is_broken(tmp_path: Path) -> None:
+    b_uT, temperature_degC = FRAMES.b_uT.copy(), FRAMES.temperature_degC.copy()
+    b_uT[20:23, 3:6], temperature_degC[20:23, 1] = FAILED_B_uT, FAILED_TEMPERATURE_degC
+    b_uT[40] = np.nan
+    whole = encode(dataclasses.replace(FRAMES, b_uT=b_uT, temperature_degC=temperature_degC), "binary")
+    broken = whole[: 82 * 100 + 30] + whole[82 * 101 :]  # 52 bytes of a frame are missing
+    _, account = read(write(tmp_path, "binary", stream=broken), header_of("binary", "rate"))
+    assert account["bytes_n"] == len(broken)
+    skipped = [key for key in account if key.startswith("skipped_") and key.endswith("_bytes_n")]
+    assert account["bytes_n"] == account["frame_bytes_n"] + sum(account[key] for key in skipped)
+    dropped = [key for key in account if key.startswith("dropped_") and key.endswith("_frames_n")]
+    used = account["frames_noload_n"] + account["frames_contact_n"]
+    assert account["frames_n"] == used + sum(account[key] for key in dropped)
+    assert account["dropped_failed_read_frames_n"] == 3
+    assert account["not_finite_frames_n"] == 1
+    assert account["skipped_resync_bytes_n"] > 0
+
+
+def with_chip(rows: slice, values_uT: np.ndarray) -> Frames:
+    b_uT = FRAMES.b_uT.copy()
+    b_uT[rows, 3:6] = values_uT
+    return dataclasses.replace(FRAMES, b_uT=b_uT)
+
+
+@pytest.mark.parametrize("marks", [MARKS, ()], ids=["marks", "contacts"])
+def test_a_chip_that_freezes_costs_its_frames(tmp_path: Path, marks: tuple[tuple[float, float], ...]) -> None:
+    begin = len(FRAMES) // 3
+    frozen = with_chip(slice(begin, None), FRAMES.b_uT[begin, 3:6])
+    _, account = read(write(tmp_path, "binary", frozen), header_of("binary", marks=marks))
+    assert account["dropped_stuck_chip_frames_n"] == len(FRAMES) - begin - STUCK_FRAMES_MIN_N + 1
+    dropped = [key for key in account if key.startswith("dropped_") and key.endswith("_frames_n")]
+    used = account["frames_noload_n"] + account["frames_contact_n"]
+    assert account["frames_n"] == used + sum(account[key] for key in dropped)
+
+
+def test_a_chip_that_loses_its_settings_is_named(tmp_path: Path) -> None:
+    b_uT = FRAMES.b_uT.copy()
+    steps_uT = np.tile([0.15, 0.15, 0.242], CHIPS_N).astype(np.float32)
+    b_uT = np.round(b_uT / steps_uT) * steps_uT
+    reset_uT = np.array([0.98, 0.98, 1.58], np.float32)
+    b_uT[600:, 3:6] = np.round(b_uT[600:, 3:6] / reset_uT) * reset_uT
+    folder = write(tmp_path, "binary", dataclasses.replace(FRAMES, b_uT=b_uT))
+    with pytest.raises(CaptureError, match="stream.bin from sound frame .*: the LSB of chip 1 must be as before"):
+        read(folder, header_of("binary"))
+
+
+@pytest.mark.parametrize("of_a_uT", [1e-2, 1e-3, 1e-6])
+def test_a_stream_in_another_unit_is_refused(tmp_path: Path, of_a_uT: float) -> None:
+    other = dataclasses.replace(FRAMES, b_uT=FRAMES.b_uT * np.float32(of_a_uT))
+    with pytest.raises(CaptureError, match="stream.bin: field must be .* G to uT"):
+        read(write(tmp_path, "binary", other), header_of("binary"))
+
+
+@pytest.mark.parametrize(("sent", "said"), [("text-xyzt", "text-txyz"), ("text-txyz", "text-xyzt")])
+def test_lines_of_the_other_order_are_refused(tmp_path: Path, sent: Wire, said: Wire) -> None:
+    with pytest.raises(CaptureError, match=rf"stream.bin: temperatures of {said} .* Is the wire format {sent}\?"):
+        read(write(tmp_path, sent), header_of(said))
+
+
+def test_a_probe_log_in_another_unit_is_refused(tmp_path: Path) -> None:
+    folder = write(tmp_path, "binary", probe=probe.render(dataclasses.replace(LOG, x_mm=LOG.x_mm * 1000)).encode())
+    with pytest.raises(CaptureError, match="probe.csv: places must be one, or spread over 1 to 200 mm; got 5.9e"):
+        read(folder, header_of("binary"))
+
+
+def test_a_smaller_block_gives_the_same_readings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    header = header_of("binary")
+    whole, whole_account = read(write(tmp_path, "binary"), header)
+    monkeypatch.setattr(ingest, "BLOCK_BYTES_N", 1000)
+    parts, parts_account = read(tmp_path, header)
+    assert parts_account == whole_account
+    for name, column in whole.items():
+        np.testing.assert_array_equal(parts[name], column, err_msg=name)
+
+
+def test_a_recorder_killed_before_its_last_row_costs_the_frames_without_time(tmp_path: Path) -> None:
+    b_uT, temperature_degC = FRAMES.b_uT.copy(), FRAMES.temperature_degC.copy()
+    b_uT[-1, 3:6], temperature_degC[-1, 1] = FAILED_B_uT, FAILED_TEMPERATURE_degC  # a fault without time
+    frames = dataclasses.replace(FRAMES, b_uT=b_uT, temperature_degC=temperature_degC)
+    folder = write(tmp_path, "binary", frames)
+    rows = (folder / ARRIVALS_FILE).read_text().splitlines(keepends=True)
+    (folder / ARRIVALS_FILE).write_text("".join(rows[:-1]))
+    timed_n = int(rows[-2].split(",")[0]) // 82
+    _, account = read(folder, header_of("binary"))
+    assert account["dropped_no_time_frames_n"] == len(FRAMES) - timed_n
+    assert account["fault_failed_read_dropped_n"] == 1
+    assert "fault_failed_read_first_ms" not in account
+
+
+def test_readings_and_account_go_to_parquet_and_back(tmp_path: Path) -> None:
+    blocks, account = read_native(write(tmp_path, "binary"), header_of("binary"), AS_USUAL)
+    io.write_readings(tmp_path / "c.parquet", blocks, account)
+    assert len(io.read_readings(tmp_path / "c.parquet")) == INDENTATIONS_N * CONTACT_N
+    assert io.read_account(tmp_path / "c.parquet")["indentations_n"] == INDENTATIONS_N
+
+
+@pytest.mark.parametrize(
+    ("files", "kind", "says"),
+    [
+        ({"stream": b""}, "rate", "stream.bin: the stream must be .* no frame found in 0 bytes"),
+        ({"stream": b"\x00"}, "rate", "stream.bin: the stream must be .* no frame found in 1 bytes"),
+        ({"stream": rng_for(0, "noise").bytes(3000)}, "rate", "no frame found in 3000 bytes. Wrong baud"),
+        (
+            {"stream": encode(FRAMES, "binary")[:-100]},
+            "arrivals",
+            "stream.bin: the stream must be the .* Copy the capture",
+        ),
+        ({"stream": b"", "arrivals": b""}, "arrivals", "arrivals.csv: the table must be CSV"),
+        ({"probe": b"\xff\xfe"}, "rate", "probe.csv"),
+        ({}, "recording", "clock.kind must be 'arrivals' or 'rate'"),
+    ],
+)
+def test_a_broken_capture_is_one_sentence(tmp_path: Path, files: dict[str, bytes], kind: str, says: str) -> None:
+    write(tmp_path, "binary", **files)
+    for marks in (MARKS, ()):
+        with pytest.raises(CaptureError, match=says):
+            read(tmp_path, header_of("binary", kind, marks))
+
+
+@pytest.mark.parametrize("name", [STREAM_FILE, ARRIVALS_FILE, PROBE_FILE])
+def test_a_missing_file_is_named(tmp_path: Path, name: str) -> None:
+    (write(tmp_path, "binary") / name).unlink()
+    with pytest.raises(CaptureError, match=f"{name}: the file must be there; got nothing"):
+        read(tmp_path, header_of("binary"))

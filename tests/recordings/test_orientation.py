@@ -1,0 +1,60 @@
+"""Exchanged, mirrored and turned labels are found beside captures of other skins, and right ones are left alone."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+from reskin.recordings.orientation import WAYS, Presses, other_orientation, presses_of
+from reskin.recordings.readers import lab
+from reskin.seeds import rng_for
+from tests.recordings.headers import AS_USUAL, make_header
+from tests.universal.skins import fields_uT
+
+DEPARTURES = [name for name in WAYS if name != "as they are"]
+
+
+def board(name: str, presses_n: int = 60) -> Presses:
+    """Presses of a skin with gains of its own, under noise."""
+    rng = rng_for(0, "orientation", name)
+    place_mm = rng.uniform(-8, 8, (presses_n, 2))
+    db_uT = fields_uT(place_mm, rng.uniform(1, 5, presses_n)) * rng.normal(1, 0.1, 15)
+    db_uT = db_uT + rng.normal(0, 5, db_uT.shape)
+    return Presses(place_mm, db_uT / np.linalg.norm(db_uT, axis=1, keepdims=True))
+
+
+def relabelled(presses: Presses, way: str) -> Presses:
+    return Presses(presses.place_mm @ np.array(WAYS[way]).T, presses.direction)
+
+
+def undone(way: str) -> str:
+    inverse = np.array(WAYS[way]).T.tolist()
+    return next(name for name, matrix in WAYS.items() if matrix == inverse)
+
+
+@pytest.mark.parametrize("way", DEPARTURES)
+def test_changed_labels_are_named_by_what_undoes_the_change(way):
+    assert other_orientation(relabelled(board("one"), way), board("other")) == undone(way)
+
+
+def test_right_labels_few_presses_and_other_boards_raise_no_alarm():
+    one, other = board("one"), board("other")
+    assert other_orientation(one, other) is None
+    assert other_orientation(relabelled(board("few", 19), "with x mirrored"), other) is None
+    fewer_chips = Presses(other.place_mm, other.direction[:, :9])
+    assert other_orientation(relabelled(one, "with x mirrored"), fewer_chips) is None
+    noise = Presses(other.place_mm, rng_for(0, "noise").normal(size=other.direction.shape))
+    assert other_orientation(relabelled(one, "with x mirrored"), noise) is None
+
+
+def test_on_recorded_boards_every_change_is_found_from_the_other_board(shared_data, tmp_path):
+    """Of 18 pairs of files of two boards one says nothing (board 2, depth 3, beside board 1, depth 1)."""
+    boards = {}
+    for number in (1, 2):
+        shutil.copy(shared_data / f"lab/board{number}_depth2.csv", tmp_path / lab.READINGS)
+        readings, _ = lab.read(tmp_path, make_header(layout="lab", chips_n=5), AS_USUAL)
+        boards[number] = presses_of([readings])
+    for own, other in ((1, 2), (2, 1)):
+        assert other_orientation(boards[own], boards[other]) is None
+        for way in DEPARTURES:
+            assert other_orientation(relabelled(boards[own], way), boards[other]) == undone(way)

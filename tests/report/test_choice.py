@@ -1,0 +1,198 @@
+"""The choice of settings, on cards made by hand."""
+
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.report.choice import choose, to_record
+from reskin.errors import ParamsError
+from tests.report import cards
+from tests.scenes import RECIPE
+
+Card = dict[str, Any]
+
+
+def card(question: str, name: str, mse_xy_mm2: float, fold: str = "b0", **changes: Any) -> Card:
+    """A card with one skin a board; accuracy and force speak for the worst place."""
+    score = {"accuracy_pct": mse_xy_mm2, "mse_xy_mm2": mse_xy_mm2, "mse_f_N2": 1 / mse_xy_mm2}
+    scores = {
+        "all": score,
+        "registered": score,
+        "by_skin": {f"{fold}_s0": score},
+        "board_of": {f"{fold}_s0": fold},
+        "rows_n": 4,
+    }
+    who = {"scene": "tuning", "test_boards": [fold], "test_skins": [f"{fold}_s0"]}
+    went = {"collapsed": False, "collapsed_before_n": 0}
+    return cards.card(question, fold, scores, name) | who | went | changes
+
+
+def adapted(name: str, mse_xy_mm2: float, base: str, *, unlabelled_weight: float = 0.1, **changes: Any) -> Card:
+    schedule = {"batch_n": 64, "rate_max": 1e-3, "weight_decay": 0.0, "steps_n": 400}
+    settings = {"base": base, "unlabelled_weight": unlabelled_weight} | schedule
+    recipe = RECIPE | {"triplet_weight": WEIGHTS[base]}
+    return card("adapt", name, mse_xy_mm2, recipe=recipe, **changes) | {
+        "tuning": {"pokes_n": 390, "settings": settings}
+    }
+
+
+WEIGHTS = {"light": 0.1, "heavy": 1.0}
+CARDS = [
+    card("lobo", "slow", 0.5, recipe=RECIPE | {"rate_max": 1e-3}),
+    card("lobo", "fast", 0.3, recipe=RECIPE | {"rate_max": 6e-3}),
+    card("lobo", "fastest", 0.4, recipe=RECIPE | {"rate_max": 9e-3}),
+    card("triplet", "light", 0.35, recipe=RECIPE | {"triplet_weight": 0.1}),
+    card("triplet", "heavy", 0.6, recipe=RECIPE | {"triplet_weight": 1.0}),
+    adapted("from-light", 0.34, "light"),
+    adapted("from-heavy", 0.25, "heavy"),
+]
+
+
+def names(chosen: dict[str, Any]) -> dict[str, str]:
+    return {stage: one["recipe_name"] for stage, one in chosen.items()}
+
+
+def test_the_least_error_of_places_wins_and_adaptation_chooses_its_base():
+    chosen = choose(CARDS)
+    assert names(chosen) == {"train_multi": "fast", "adapt": "from-heavy", "train_triplet": "heavy"}
+    assert chosen["train_multi"]["settings"]["rate_max"] == 6e-3
+    assert chosen["train_triplet"]["settings"]["triplet_weight"] == 1.0  # light was better alone, heavy once adapted
+    assert chosen["adapt"]["settings"]["unlabelled_weight"] == 0.1
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.permutations(CARDS))
+def test_the_order_of_cards_chooses_nothing(cards):
+    assert names(choose(cards)) == {"train_multi": "fast", "adapt": "from-heavy", "train_triplet": "heavy"}
+
+
+def test_every_candidate_is_told_with_its_score():
+    told = {
+        stage: {one["recipe_name"]: one["mse_xy_mm2"]["mean"] for one in chosen["candidates"]}
+        for stage, chosen in choose(CARDS).items()
+    }
+    assert told == {
+        "train_multi": {"slow": 0.5, "fast": 0.3, "fastest": 0.4},
+        "train_triplet": {"light": 0.35, "heavy": 0.6},
+        "adapt": {"from-light": 0.34, "from-heavy": 0.25},
+    }
+
+
+def test_the_mean_over_boards_decides_each_the_mean_of_its_seeds():
+    """Two seeds of a board do not count twice: (0.4 + 0.9) / 2 is less than 0.695, (0.4 + 0.9 + 0.9) / 3 is not."""
+    boards = [
+        card("lobo", "fast", 0.29, "b0", recipe=RECIPE | {"rate_max": 6e-3}),
+        card("lobo", "fast", 1.1, "b1", recipe=RECIPE | {"rate_max": 6e-3}),
+        card("lobo", "even", 0.4, "b0"),
+        card("lobo", "even", 0.85, "b1"),
+        card("lobo", "even", 0.95, "b1", seed_i=1),
+    ]
+    chosen = choose([one for one in CARDS if one["question"] != "lobo"] + boards)["train_multi"]
+    scores = {one["recipe_name"]: one["mse_xy_mm2"]["mean"] for one in chosen["candidates"]}
+    assert scores == {"fast": pytest.approx(0.695), "even": pytest.approx(0.65)}
+    assert chosen["recipe_name"] == "even"
+
+
+def test_skins_adapted_to_by_themselves_are_one_score_of_their_board():
+    """Two skins of board b0 (0.2, 0.4) and one of b1 (0.9): (0.3 + 0.9) / 2, and not the mean of three."""
+    skins = [
+        adapted("from-light", error, "light", fold=fold, test_skins=[skin])
+        for fold, skin, error in (("b0", "b0_s0", 0.2), ("b0", "b0_s1", 0.4), ("b1", "b1_s0", 0.9))
+    ]
+    chosen = choose([one for one in CARDS if one["question"] != "adapt"] + skins)["adapt"]
+    told = chosen["candidates"][0]["mse_xy_mm2"]
+    assert told["mean"] == pytest.approx(0.6)
+    assert "sd_seeds" not in told  # skins are no seeds
+
+
+SHAPED = {"inputs": "shape"}
+
+
+@pytest.mark.parametrize(
+    "better",
+    [
+        card("lobo", "shaped", 0.001, recipe=RECIPE | SHAPED),
+        card("triplet", "shaped", 0.001, recipe=RECIPE | SHAPED),
+        adapted("shaped", 0.001, "light") | {"recipe": RECIPE | SHAPED},
+        card("single_random", "single", 0.001),
+    ],
+    ids=["shape", "triplet shape", "adapted shape", "another question"],
+)
+def test_other_inputs_and_other_questions_are_no_candidates_however_good(better):
+    assert choose([better, *CARDS]) == choose(CARDS)
+
+
+def test_how_long_and_what_a_base_is_called_are_no_settings():
+    for one in choose(CARDS).values():
+        assert "steps_n" not in one["settings"]
+        assert "base" not in one["settings"]
+    chosen = choose(CARDS)
+    assert {*chosen["train_multi"]["settings"]} == {*RECIPE} - {"steps_n"}
+    assert {*chosen["adapt"]["settings"]} == {"batch_n", "rate_max", "weight_decay", "unlabelled_weight"}
+
+
+@pytest.mark.parametrize(
+    ("cards", "stage"),
+    [
+        ([], "train_multi"),
+        ([one for one in CARDS if one["question"] != "lobo"], "train_multi"),
+        ([one for one in CARDS if one["question"] != "adapt"], "adapt"),
+        ([*CARDS[:5], adapted("control", 0.1, "light", unlabelled_weight=0.0)], "adapt"),
+    ],
+    ids=["nothing", "nothing pooled", "nothing adapted", "a control alone"],
+)
+def test_nothing_to_choose_from_is_one_sentence(cards, stage):
+    with pytest.raises(ParamsError, match=f"candidates of {stage} must be one or more; got none. Ask lobo"):
+        choose(cards)
+
+
+def test_the_record_names_every_board_and_skin_that_was_looked_at_and_the_settings_alone():
+    cards = [*CARDS, card("lobo", "slow", 0.5, "b2"), card("lobo", "slow", 0.5, "b1")]
+    record = to_record(choose(CARDS), cards, source="simulated", seed=777, physics="abc")
+    assert record["physics"] == "abc"
+    assert (record["scene"], record["source"], record["seed"]) == ("tuning", "simulated", 777)
+    assert (record["boards"], record["skins"]) == (["b0", "b1", "b2"], ["b0_s0", "b1_s0", "b2_s0"])
+    assert record["chosen"] == {stage: one["settings"] for stage, one in choose(CARDS).items()}
+
+
+def longer(one: Card, steps_n: int, **scores: float) -> Card:
+    """The same settings with another budget of steps, and another error."""
+    return card(one["question"], f"{one['recipe_name']}-{steps_n}", scores["mse_xy_mm2"],
+                recipe=one["recipe"] | {"steps_n": steps_n})  # fmt: skip
+
+
+def test_no_setting_wins_by_training_longer():
+    slow, fast = (card("lobo", name, mse, recipe=RECIPE | {"rate_max": rate, "steps_n": 100})
+                  for name, mse, rate in (("slow", 0.5, 1e-3), ("fast", 0.4, 6e-3)))  # fmt: skip
+    others = [one for one in CARDS if one["question"] != "lobo"]
+    unfair = [slow, fast, longer(slow, 900, mse_xy_mm2=0.1)]
+    with pytest.raises(ParamsError, match="steps of train_multi's fast must be those of all candidates"):
+        choose([*unfair, *others])
+    chosen = choose([*unfair, longer(fast, 900, mse_xy_mm2=0.15), *others])["train_multi"]
+    assert chosen["recipe_name"] == "fast" or chosen["settings"]["rate_max"] == 6e-3  # 0.275 against 0.3
+
+
+def test_a_control_is_a_candidate_that_is_listed_and_never_chosen():
+    control = adapted("from-heavy-control", 0.2, "heavy", unlabelled_weight=0.0)
+    chosen = choose([*CARDS, control])["adapt"]
+    assert chosen["recipe_name"] == "from-heavy"
+    assert (chosen["error"], chosen["control"]) == (pytest.approx(0.25), pytest.approx(0.2))
+    assert "from-heavy-control" in {one["recipe_name"] for one in chosen["candidates"]}
+    assert "control" not in choose(CARDS)["adapt"]
+
+
+@pytest.mark.parametrize("fate", [{"collapsed": True}, {"collapsed_before_n": 1}])
+def test_settings_with_which_a_training_collapsed_are_not_chosen_however_good(fate):
+    """Another board went well with the same settings; that one did not is enough."""
+    again = card("lobo", "fast", 0.1, "b1", recipe=RECIPE | {"rate_max": 6e-3}, **fate)
+    assert names(choose([*CARDS, again]))["train_multi"] == "fastest"
+    every = [one | fate if one["question"] == "lobo" else one for one in CARDS]
+    with pytest.raises(ParamsError, match="candidates of train_multi must be one or more without a collapsed"):
+        choose(every)
+
+
+def test_a_network_that_collapsed_is_chosen_for_no_adaptation():
+    cards = [one | {"collapsed_before_n": 1} if one["recipe_name"] == "heavy" else one for one in CARDS]
+    assert names(choose(cards)) == {"train_multi": "fast", "adapt": "from-light", "train_triplet": "light"}

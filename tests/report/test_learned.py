@@ -1,0 +1,174 @@
+"""Numbers of the questions about many skins, from cards small enough to be added up by hand."""
+
+import json
+
+import pytest
+
+from pipeline.report.numbers import PAIRS, learned, timed_learning
+from pipeline.statistics import tidy
+from tests.report import cards
+
+HELD_OUT = {"b0": ("s0", "s1"), "b1": ("s2", "s3")}
+BETTER = {"s0": 2.0, "s1": 4.0, "s2": 6.0, "s3": 8.0}  # points that adaptation gains on each skin
+
+
+BOARD_OF = {skin: board for board, skins in HELD_OUT.items() for skin in skins}
+
+
+def scores(by_skin: dict[str, float]) -> dict:
+    own = {skin: {"accuracy_pct": pct, "mse_xy_mm2": 1.0, "mse_f_N2": 0.5} for skin, pct in by_skin.items()}
+    every = {"accuracy_pct": sum(by_skin.values()) / len(by_skin), "mse_xy_mm2": 1.0, "mse_f_N2": 0.5}
+    return {"all": every, "registered": every, "by_skin": own, "rows_n": 10 * len(own)} | {
+        "board_of": {skin: BOARD_OF[skin] for skin in own}
+    }
+
+
+def card(question: str, fold: str, by_skin: dict[str, float], recipe: str = "paper", seed_i: int = 0) -> dict:
+    return cards.card(question, fold, scores(by_skin), recipe, seed_i)
+
+
+def point(by_skin: dict[str, float], fold: str = "b1", seed_i: int = 0, **words: object) -> dict:
+    return {"fold": fold, "seed_i": seed_i, "scores": scores(by_skin)} | words
+
+
+def of_boards(question: str, pct: float, recipe: str = "paper") -> list[dict]:
+    return [card(question, fold, dict.fromkeys(skins, pct), recipe) for fold, skins in HELD_OUT.items()]
+
+
+def of_skins(recipe: str, base_pct: float, times: float) -> list[dict]:
+    return [
+        card("adapt", fold, {skin: base_pct + times * BETTER[skin]}, recipe)
+        for fold, skins in HELD_OUT.items()
+        for skin in skins
+    ]
+
+
+CARDS = [
+    *of_boards("lobo", 80.0), *of_boards("triplet", 78.0),
+    *of_skins("paper", 78.0, 1.0), *of_skins("control", 78.0, 0.5),
+    *of_boards("lobo", 1.0, "released"), *of_boards("triplet", 2.0, "other"), *of_skins("other", 3.0, 1.0),
+]  # fmt: skip
+
+
+def numbers(made: list[dict] = CARDS, **points: list[dict]) -> dict:
+    return learned(tidy(made, points), headline="paper")
+
+
+def paired(of: str, over: str) -> dict:
+    (one,) = [one for one in numbers()["paired"] if (one["of"], one["over"]) == (of, over)]
+    return one
+
+
+def test_table_2_is_over_boards_and_adapted_skins_are_pooled_by_board():
+    table2 = numbers()["table2"]
+    assert table2.keys() == {"multi", "triplet", "adapted"}
+    assert table2["triplet"]["accuracy_pct"] == {"mean": 78.0, "n": 2, "sd": 0.0, "values": [78.0, 78.0]}
+    # board b0: 80 and 82, board b1: 84 and 86
+    assert table2["adapted"]["accuracy_pct"] == over(81.0, 85.0)
+
+
+def test_the_control_stands_beside_adaptation_with_the_number_of_pokes():
+    assert numbers()["adapt"]["pokes_n"] == 390
+    assert numbers()["adapt"]["control"]["accuracy_pct"] == over(79.5, 81.5)
+
+
+def over(*boards: float) -> dict:
+    sd = (boards[1] - boards[0]) / 2**0.5
+    return {"mean": sum(boards) / 2, "n": 2, "sd": pytest.approx(sd), "values": pytest.approx(list(boards))}
+
+
+def test_pairs_are_over_the_held_out_boards_and_of_one_method_over_another():
+    assert [(one["of"], one["over"]) for one in numbers()["paired"]] == [one for one in PAIRS if "single" not in one]
+    # gains of 2 and 4 points on the skins of b0, of 6 and 8 on those of b1
+    assert paired("adapted", "triplet")["accuracy_pct"] == over(3.0, 7.0)
+    by_board = paired("adapted", "triplet")["by_board"]
+    assert {board: own["accuracy_pct"] for board, own in by_board.items()} == {"b0": 3.0, "b1": 7.0}
+    assert paired("adapted", "control")["accuracy_pct"] == over(1.5, 3.5)
+    assert paired("triplet", "multi")["accuracy_pct"] == {"mean": -2.0, "n": 2, "sd": 0.0, "values": [-2.0, -2.0]}
+    assert paired("adapted", "multi")["accuracy_pct"]["mean"] == 3.0
+    assert paired("control", "triplet")["accuracy_pct"]["mean"] == 2.5
+
+
+def test_many_skins_are_compared_with_one_on_the_skins_that_one_was_tested_on():
+    single = [card("transfer", "s0", {"s2": 20.0, "s3": 30.0}), card("transfer", "s9", {"s2": 40.0, "s3": 30.0})]
+    (one,) = [one for one in numbers([*CARDS, *single])["paired"] if one["over"] == "single"]
+    assert {board: own["accuracy_pct"] for board, own in one["by_board"].items()} == {"b1": 80.0 - 30.0}
+    assert one["accuracy_pct"] == {"mean": 50.0, "n": 1}
+
+
+def test_a_question_that_was_not_asked_is_absent_and_not_null():
+    assert numbers([]) == {"variants": {}}
+    assert numbers(of_boards("lobo", 80.0)).keys() == {"table2", "lobo", "variants"}
+    without = numbers([*of_boards("lobo", 80.0), *of_boards("triplet", 78.0)])
+    assert without.keys() == {"table2", "lobo", "paired", "variants"}
+    assert [(one["of"], one["over"]) for one in without["paired"]] == [("triplet", "multi")]
+    alone = numbers(of_skins("paper", 78.0, 1.0))
+    assert alone.keys() == {"table2", "adapt", "variants"}
+    assert alone["adapt"] == {"pokes_n": 390}  # with no control
+    assert "null" not in json.dumps(numbers())
+
+
+def test_other_recipes_are_in_no_number_but_the_variants():
+    alone = numbers([one for one in CARDS if one["recipe_name"] in ("paper", "control")])
+    assert numbers() == alone | {"variants": numbers()["variants"]}
+    assert numbers()["variants"].keys() == {"lobo", "triplet", "adapt"}
+    assert numbers()["variants"]["adapt"]["other"]["accuracy_pct"] == over(6.0, 10.0)
+
+
+def test_a_sweep_over_pokes_is_in_their_order_and_starts_with_none():
+    points = [
+        *(point({skin: pct}, pokes_n=n) for n, skin, pct in ((390, "s2", 90.0), (390, "s3", 94.0))),
+        *(point({skin: pct}, pokes_n=n) for n, skin, pct in ((65, "s2", 80.0), (65, "s3", 86.0))),
+        point({"s2": 70.0, "s3": 72.0}, pokes_n=0), point({"s2": 74.0, "s3": 76.0}, seed_i=1, pokes_n=0),
+    ]  # fmt: skip
+    sweep = numbers([], pokes=points)["sweep_pokes"]
+    assert [(one["pokes_n"], one["accuracy_pct"]["mean"]) for one in sweep] == [(0, 73.0), (65, 83.0), (390, 92.0)]
+    assert sweep[0]["accuracy_pct"] == {"mean": 73.0, "n": 1, "sd_seeds": pytest.approx(8**0.5)}
+
+
+def test_a_sweep_over_sensors_has_a_curve_for_each_method_over_draws():
+    points = [
+        point(by_skin, f"b1-{skins_n:02d}skins-draw{draw_i}", method=method, trained_on_skins_n=skins_n)
+        for method, step_pct in (("multi", 0.0), ("triplet", 1.0), ("adapted", 2.0))
+        for skins_n in (3, 1)
+        for draw_i in range(2)
+        for by_skin in (
+            [{"s2": 50.0 + skins_n + step_pct + draw_i}, {"s3": 60.0 + skins_n + step_pct + draw_i}]
+            if method == "adapted"
+            else [{"s2": 50.0 + skins_n + step_pct + draw_i, "s3": 60.0 + skins_n + step_pct + draw_i}]
+        )
+    ]
+    sweep = numbers([], sensors=points)["sweep_sensors"]
+    assert [(one["method"], one["skins_n"], one["accuracy_pct"]["mean"]) for one in sweep] == [
+        ("multi", 1, 56.5), ("multi", 3, 58.5), ("triplet", 1, 57.5), ("triplet", 3, 59.5), ("adapted", 1, 58.5),
+        ("adapted", 3, 60.5),
+    ]  # fmt: skip
+    assert all(one["accuracy_pct"]["n"] == 1 for one in sweep)  # two draws for one board
+    assert all(one["accuracy_pct"]["sd_seeds"] == pytest.approx(0.5**0.5) for one in sweep)
+
+
+def test_a_method_has_its_own_times_and_an_adapted_network_those_of_its_base_too():
+    rows = [
+        {"method": "ridge", "inputs": "raw", "name": "ridge"},
+        {"method": "ridge", "inputs": "shape", "name": "ridge-shape"},
+        {"method": "network, adapted", "inputs": "raw", "name": "long", "base": "paper"},
+        {"method": "network", "inputs": "raw", "name": "paper"},
+    ]
+
+    def took(name: str, seconds: float) -> dict:
+        return {"name": name, "train_s": seconds, "one_reading_s": 1e-6 * seconds}
+
+    seconds = {
+        "train_classical": [took("ridge.b0", 1), took("ridge.b1", 2), took("ridge.b2", 9), took("ridge-shape.b0", 100)],
+        "train_triplet": [took("triplet.paper.b0.seed0", 30), took("triplet.other.b0.seed0", 999)],
+        "adapt": [took("adapt.long.b0.s.390pokes.seed0", 5)],
+    }
+    timed = timed_learning({"baselines": rows}, seconds)["learning"]
+    assert [row.get("train_s") for row in timed] == [2, 100, 35, None]  # medians; what was not timed has no time
+    assert [row["inference_us"] for row in timed[:3]] == pytest.approx([2, 100, 5])
+
+
+def test_an_adaptation_is_timed_by_its_number_of_pokes():
+    numbers = {"sweep_pokes": [{"pokes_n": 0}, {"pokes_n": 6}, {"pokes_n": 65}]}
+    seconds = {"sweep_pokes": [{"name": f"pokes.paper.b0.s.{n}pokes.seed0", "train_s": float(n)} for n in (6, 65)]}
+    assert [row.get("seconds") for row in timed_learning(numbers, seconds)["adaptation"]] == [None, 6.0, 65.0]

@@ -1,0 +1,289 @@
+import re
+from collections import Counter
+from html import escape
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from pipeline.report import judging
+from pipeline.report.checklist import checklist
+from pipeline.report.headline import answer
+from pipeline.report.numbers import split
+from pipeline.report.page import (
+    FINDINGS_N,
+    LEGIBLE_PX,
+    about,
+    arrange,
+    findings,
+    lay_out,
+    measure,
+    page,
+    read_sections,
+    run_page,
+    together,
+)
+from pipeline.report.tables import make_tables
+from pipeline.scenes import EXPERIMENTS
+from reskin.errors import SchemaError
+from tests.report.synthetic import all_questions, cost
+
+ROOT = Path(__file__).resolve().parents[2]
+SVG = (
+    '<svg xmlns="http://www.w3.org/2000/svg" width="{}pt" height="200pt"><defs><path id="same"/></defs>'
+    '<text style="font-size: 10px">é</text></svg>'
+)
+VOID = {"meta", "img", "br"}
+
+
+class Reader(HTMLParser):
+    """Every element with its attributes and ancestors; raises where tags do not nest."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.elements: list[tuple[str, dict, tuple[str, ...]]] = []
+        self.words: list[str] = []
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.elements.append((tag, dict(attrs), tuple(self.open)))
+        if tag not in VOID:
+            self.open.append(f"{tag}.{dict(attrs).get('class', '')}")
+
+    def handle_endtag(self, tag):
+        assert self.open.pop().split(".")[0] == tag
+
+    def handle_data(self, data):
+        self.words.append(data.strip())
+
+    def all(self, tag: str) -> list[tuple[dict, tuple[str, ...]]]:
+        return [(attributes, above) for name, attributes, above in self.elements if name == tag]
+
+
+def render(numbers: dict | None = None, **more: pd.DataFrame) -> str:
+    numbers = all_questions() if numbers is None else numbers
+    # Experiments have synthetic numbers here, which no real table could be made of.
+    plain = {name: value for name, value in numbers.items() if name not in EXPERIMENTS}
+    drift = pd.DataFrame({"contacts": ["0"], "accuracy, %": ["90"]})
+    tables = make_tables(plain) | {"checklist": checklist(numbers), "drift": drift} | more
+    figures = {"drift.svg": SVG.format(300), "sweep_pokes.svg": SVG.format(600), "unheard_of.svg": SVG.format(300)}
+    return page(split(numbers)[0], tables, figures)
+
+
+def render_run(numbers: dict) -> str:
+    return run_page(numbers, {"training.svg": SVG.format(300), "stages.md": "| a |"})
+
+
+@pytest.fixture(scope="module")
+def read() -> Reader:
+    return Reader(render(surprise=pd.DataFrame({"<b>": ["a & b", None], "n": ["1", "2"]})))
+
+
+def test_the_page_needs_no_network_and_no_script(read):
+    assert [one for one in ("script", "link", "svg") if read.all(one)] == []
+    names = ("src", "href", "data")
+    fetched = [attributes[name] for _, attributes, _ in read.elements for name in names if name in attributes]
+    assert all(
+        address.startswith(("figures/", "runtime/", "tables/", "provenance.json", "../", "#")) for address in fetched
+    )
+    assert "url(" not in render()
+    assert "@import" not in render()
+
+
+def test_links_lead_to_ids_and_no_id_stands_twice(read):
+    ids = Counter(attributes["id"] for _, attributes, _ in read.elements if "id" in attributes)
+    assert max(ids.values()) == 1
+    links = {attributes["href"] for attributes, _ in read.all("a")}
+    assert {link[1:] for link in links if link.startswith("#")} <= set(ids)
+    assert [link for link in links if link.startswith("../../") and not (ROOT / link[6:]).exists()] == [
+        "../../pipeline/scenes/x.yaml"  # no such scene: its numbers are synthetic
+    ]
+    labels = {attributes["aria-labelledby"] for _, attributes, _ in read.elements if "aria-labelledby" in attributes}
+    assert labels <= set(ids)
+
+
+def test_every_table_scrolls_in_its_own_box_and_names_its_columns(read):
+    tables = read.all("table")
+    assert len(tables) > 8
+    assert all(above[-1] == "div.box" for _, above in tables)
+    assert len(read.all("caption")) == len(tables)
+    assert all(attributes.get("scope") in ("col", "row") for attributes, _ in read.all("th"))
+
+
+def test_every_figure_is_a_document_on_a_white_card_with_words_for_it_and_else_an_image(read):
+    objects, images = read.all("object"), read.all("img")
+    assert len(objects) == len(images) == 3
+    assert all(attributes["aria-label"].strip() and above[-1] == "div.card" for attributes, above in objects)
+    assert all(attributes["alt"].strip() and above[-1] == "object." for attributes, above in images)
+    assert [attributes["data"] for attributes, _ in objects] == [attributes["src"] for attributes, _ in images]
+    assert [attributes.get("class") for attributes, _ in read.all("figure")].count("wide") == 1
+
+
+def test_figures_stand_before_findings_and_these_before_tables():
+    text = render()
+    for part in text.split("<section id=")[1:]:
+        places = [part.index(tag) for tag in ("<figure", '<ul class="findings"', "<details") if tag in part]
+        assert places == sorted(places)
+
+
+def test_a_figure_may_shrink_until_its_smallest_letters_are_as_small_as_one_can_read():
+    letters = '<svg width="300.0pt" height="150.0pt"><g style="font-size: 10px"/><g style="font: 6px Arial"/></svg>'
+    drawing = measure("figures/a.svg", letters)
+    assert (drawing.width_px, drawing.height_px) == (400, 200)
+    assert drawing.least_px == LEGIBLE_PX / 6 * 300  # there a letter of 6 of 300 points is so high
+    assert drawing.scrolls  # on a telephone
+    assert not measure("figures/a.svg", letters.replace("6px", "9px")).scrolls
+
+
+def test_a_figure_without_a_size_is_refused():
+    with pytest.raises(SchemaError, match=r"figures/a\.svg: size"):
+        measure("figures/a.svg", '<svg viewBox="0 0 1 1"/>')
+
+
+@pytest.mark.parametrize(
+    ("text", "kept"),
+    [
+        ("79.8 ± 8 [71.4, 88.3]", "79.8_±_8 [71.4,_88.3]"),
+        ("+1 [-0.358, 2.43] points", "+1 [-0.358,_2.43] points"),
+        ("0.5 [1e-05, 2e+03] mm²; x", "0.5 [1e-05,_2e+03]_mm²; x"),
+        ("a ± b, [low, high]", "a ± b, [low, high]"),
+    ],
+)
+def test_a_number_and_its_interval_are_not_parted(text, kept):
+    assert together(text) == kept.replace("_", "\u00a0")
+
+
+def test_the_answer_stands_in_the_first_section_before_its_figure(read):
+    numbers = all_questions()
+    first = render(numbers).split("<section")[1]
+    assert first.count('<p class="answer">') == 1
+    assert render(numbers).count('<p class="answer">') == 1
+    said = escape(together(answer(numbers)), quote=True)
+    assert said in first
+
+
+def test_what_there_is_one_of_is_said_in_the_singular():
+    numbers = all_questions()
+    counts = next(iter(numbers["described"].values()))["counts"]
+    counts.clear()
+    counts.update(captures_n=1, readings_n=2)
+    assert about(numbers).endswith("hold 1 capture, 2 readings.")
+
+
+def test_a_section_says_what_was_found_beside_the_papers_and_verdicts_come_first():
+    numbers = all_questions()
+    table, section = checklist(numbers), next(one for one in read_sections() if one.key == "skins")
+    said = findings(section, table)
+    assert 0 < len(said) <= FINDINGS_N
+    assert all("paper: " in sentence for sentence in said)
+    judged = [sentence.endswith(".") for sentence in said]
+    assert judged == sorted(judged, reverse=True)
+    assert said == [sentence for sentence in said if any(row["result"] in sentence for row in table.to_dict("records"))]
+
+
+def test_a_finding_says_where_ours_did_not_look_as_far_as_the_paper():
+    section = next(one for one in read_sections() if one.key == "drift")
+    row = {"result": "r", "paper": "90 %", "ours": "92 %", "verdict": "yes", "stage": "drift", "shown in": "drift"}
+    short, far = "not reached: ours after 8,000 contacts; ours is at least 90", "after 50,000 contacts"
+    (said,) = findings(section, pd.DataFrame([row | {"difference": short}]))
+    assert "(not reached: ours after 8,000 contacts). Yes." in said
+    (said,) = findings(section, pd.DataFrame([row | {"difference": far}]))
+    assert "not reached" not in said
+    assert findings(section, pd.DataFrame([row | {"difference": judging.ONE_SKIN}])) == []
+
+
+@pytest.mark.parametrize("source", ["simulated", "recorded"])
+def test_the_badge_says_where_the_readings_come_from(source):
+    text = render(all_questions(source))
+    assert f'<strong class="badge {source}">{source.upper()}</strong>' in text
+    assert {"simulated": "RECORDED", "recorded": "SIMULATED"}[source] not in text
+
+
+def test_the_page_says_first_what_the_scene_is(read):
+    words = next(i for i, word in enumerate(read.words) if "2 captures, 1,000 readings" in word)
+    assert words < read.words.index(read_sections()[0].title)
+
+
+def test_what_no_section_names_is_still_shown(read):
+    assert "Surprise" in read.words
+    assert "<b>" in read.words  # as text, not as a tag
+    assert "a & b" in read.words
+    assert "Unheard of (simulated)" in read.words
+
+
+def test_a_question_that_was_not_asked_leaves_no_section():
+    keys = [section.key for section in arrange(["table2", "captures"], [])]
+    assert keys == ["headline", "captures"]
+    assert [section.key for section in arrange(["shear", "paired", "drift"], ["training.svg"])] == [
+        "shear", "drift", "skins", "costs",
+    ]  # fmt: skip
+
+
+def test_the_page_of_a_run_shows_its_whole_provenance_and_its_run_times():
+    numbers = all_questions()
+    words = Reader(render_run(numbers)).words
+    provenance = numbers["provenance"] | {"versions": "numpy 1, torch 2"}
+    assert set(provenance) <= set(words)
+    assert {str(value) for value in provenance.values()} <= set(words)
+    assert any("Cost of each stage" in word for word in words)
+    assert [figure["data"] for figure, _ in Reader(render_run(numbers)).all("object")] == ["training.svg"]
+
+
+def test_the_page_embeds_that_of_its_run_and_is_the_same_for_another(read):
+    assert [frame["src"] for frame, _ in read.all("iframe")] == ["runtime/index.html"]
+    other = all_questions()
+    other["provenance"] |= {"git": "other", "trained": "other", "device": "other", "versions": {}, "seconds": 9.0}
+    other["runtime"]["stages"] = {"report": cost(9.0), "drift": cost()}
+    assert render(other) == render()
+    assert render_run(other) != render_run(all_questions())
+
+
+def test_the_same_inputs_give_the_same_bytes():
+    assert render() == render()
+
+
+def test_numbers_stand_on_the_right_and_words_on_the_left():
+    table = pd.DataFrame({"a": ["x"], "b": ["1.5 ± 0.2"], "c": ["–"], "d": ["3 of 4"], "e": ["-0.1 mm²"]})
+    assert lay_out("t", "T", table).looks == ["text", "number", "text", "text", "number"]
+
+
+def test_notes_of_a_table_stand_below_it(read):
+    assert any("within 1 mm" in words for words in read.words)
+
+
+def test_no_table_or_figure_stands_in_two_sections():
+    sections = read_sections()
+    named = Counter(name for section in sections for name in section.captions)
+    assert max(named.values()) == 1
+    assert len({section.key for section in sections}) == len(sections)
+
+
+def luminance(colour: str) -> float:
+    """WCAG 2.2, relative luminance."""
+    parts = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+    linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts]
+    return sum(weight * part for weight, part in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
+
+
+def test_letters_stand_out_from_what_is_behind_them():
+    text = render()
+    light, dark = (dict(zip(*[iter(part)] * 2, strict=True)) for part in colours(text))
+    for theme in (light, light | dark):
+        pairs = [(ink, ground) for ink in ("ink", "soft", "link") for ground in ("paper",)] + [("ink", "band")]
+        for ink, ground in pairs:
+            assert contrast(theme[ink], theme[ground]) >= 4.5  # WCAG 2.2 AA
+        for source in ("simulated", "recorded"):
+            assert contrast("#ffffff", theme[source]) >= 4.5
+
+
+def contrast(one: str, other: str) -> float:
+    bright, dim = sorted((luminance(one), luminance(other)), reverse=True)
+    return (bright + 0.05) / (dim + 0.05)
+
+
+def colours(text: str) -> list[list[str]]:
+    blocks = re.findall(r":root \{(.*?)\}", text, re.DOTALL)
+    return [[word for pair in re.findall(r"--(\w+): (#\w{6})", block) for word in pair] for block in blocks]

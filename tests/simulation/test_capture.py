@@ -1,0 +1,303 @@
+"""A synthetic capture against the protocol it follows and the field it is made of; names, seeds and terms as laws."""
+
+import numpy as np
+import pytest
+
+from reskin.board.stream import FrameStream
+from reskin.board.wire import concatenate
+from reskin.data.grid import points_mm
+from reskin.errors import ParamsError
+from reskin.physics.board import draw_board
+from reskin.physics.skin import changes_of_field, draw_skin, forces
+from reskin.simulation.capture import record, roster, to_files
+from tests.simulation.scene import AGEING, GRID, RELAXATION, RIGID, SECTIONS, TEMPERATURE, synthesis, with_protocol
+
+LIFTED_N, MOVING_N, DWELL_N = 1 + 4, 2, 1 + 3
+FRAMES_N = LIFTED_N + MOVING_N + DWELL_N + MOVING_N
+READ = slice(LIFTED_N + MOVING_N + 1, LIFTED_N + MOVING_N + DWELL_N)
+HAND = {
+    "kind": "hand", "boards": "rigid", "skins_n": 1, "lines_n": 3, "pokes_per_line_n": 4, "depth_mm": (0.4, 1.2),
+    "place_sd_mm": 0.3, "tilt_sd_deg": 0.0, "terms": [],
+}  # fmt: skip
+
+
+def capture_of(of=None, protocol="grid", *, board="b0", skin="b0_s0", seed=1):
+    return record(of or synthesis(), protocol, board=board, skin=skin, seed=seed)
+
+
+@pytest.fixture(scope="module")
+def capture():
+    return capture_of()
+
+
+def quiet(**changes):
+    return synthesis("chip", noise_xy_uT=0.0, noise_z_uT=0.0, **changes)
+
+
+def same(one, other):
+    arrays = ("b_uT", "temperature_degC", "arrived_frames_n", "arrived_s")
+    logs = [(getattr(one.probe, name), getattr(other.probe, name)) for name in one.probe.__dataclass_fields__]
+    return all(np.array_equal(*pair, equal_nan=True) for pair in logs if pair[0].dtype != bool) and all(
+        getattr(one, name).tobytes() == getattr(other, name).tobytes() for name in arrays
+    )
+
+
+def shaped(capture, frames_n=FRAMES_N):
+    """Frames as indentation, frame within it, chip, axis."""
+    return capture.b_uT.astype(np.float64).reshape(-1, frames_n, 5, 3)
+
+
+def touched(capture, name):
+    return getattr(capture.probe, name)[capture.probe.contact]
+
+
+def test_there_is_a_frame_for_every_reading_and_two_dwells_an_indentation(capture):
+    indentations_n = 2 * 2 * 65
+    assert capture.b_uT.shape == (indentations_n * FRAMES_N, 15)
+    assert capture.temperature_degC.shape == (indentations_n * FRAMES_N, 5)
+    assert len(capture.probe) == 2 * indentations_n
+    assert set(capture.overruns.values()) == {0}
+
+
+def test_a_quiet_capture_holds_the_field_of_its_board_and_skin():
+    of = quiet()
+    b_uT = shaped(capture_of(of))
+    board = draw_board(of.boards["rigid"].design, of.spreads, seed=1, name="b0")
+    rule = of.boards["rigid"].quadrature.quadrature()
+    skin = draw_skin(of.skin, of.spreads, seed=1, name="b0_s0", rule=rule)
+    pokes_m = np.array([[x - 8, y - 8, depth] for depth in (0.6, 1.2) for x, y in points_mm()]) * 1e-3
+    _, changes_T = changes_of_field(board, skin, pokes_m)
+    truth_uT = 1e6 * np.einsum("kij,klj,nkl->nki", board.sensitivity, board.turn, changes_T)
+    found_uT = (b_uT[:, READ] - b_uT[:, 1:2])[:130]
+    assert np.abs(found_uT - truth_uT[:, None]).max() < 0.75  # a step of z, lost twice by half
+
+
+def test_a_robot_that_repeats_badly_changes_the_field_but_not_the_label():
+    exact, loose = capture_of(quiet()), capture_of(synthesis("rig", robot_place_sd_mm=0.3))
+    assert np.array_equal(exact.probe.x_mm, loose.probe.x_mm)
+    moved_uT = (shaped(exact) - shaped(loose))[:, READ].std()
+    assert moved_uT > 2 * 5.0  # twice the noise of one reading
+
+
+def test_labels_are_what_was_commanded_and_the_force_is_the_skins(capture):
+    log = capture.probe
+    np.testing.assert_array_equal(
+        np.column_stack([touched(capture, "x_mm"), touched(capture, "y_mm")]), np.tile(points_mm(), (4, 1))
+    )
+    assert not log.depth_mm[~log.contact].any()
+    of = synthesis()
+    skin = draw_skin(of.skin, of.spreads, seed=1, name="b0_s0")
+    noise_N = touched(capture, "Fz_N") - forces(skin, np.repeat([0.6e-3, 1.2e-3] * 2, 65))
+    assert noise_N.std() == pytest.approx(0.006, rel=0.2)  # four times the sampling error of 260 draws
+    assert np.abs(np.concatenate([noise_N, log.Fz_N[~log.contact], log.Fx_N, log.Fy_N])).max() < 6 * 0.006
+
+
+def test_with_a_perfect_robot_passes_repeat_the_field_and_differ_by_noise(capture):
+    still = [1, 2, 3, 4, 8, 9, 10]  # on the way, a chip that converts earlier sees less
+    b_uT = shaped(capture)[:, still]
+    differences = (b_uT[:130] - b_uT[130:]) / np.sqrt(2)
+    np.testing.assert_allclose(differences.std(axis=(0, 1, 2)), (3.3, 3.3, 5.0), rtol=0.05)  # 7000 draws: 0.8 %
+
+
+def test_a_protocol_with_a_rate_of_its_own_is_recorded_at_it_and_another_at_the_rigs():
+    slow, usual = (
+        capture_of(with_protocol("other", GRID | {"passes_n": 1} | own), "other") for own in ({"rate_hz": 133.0}, {})
+    )
+    for capture, rate_hz in ((slow, 133.0), (usual, 400.0)):
+        frames_n, log = 130 * FRAMES_N, capture.probe
+        # A chunk comes a few tenths of a millisecond late, of 3 s and more.
+        assert capture.arrived_s[-1] == pytest.approx(frames_n / rate_hz, rel=1e-3)
+        np.testing.assert_allclose((log.t_end_s - log.t_start_s)[log.contact], 3 / rate_hz, rtol=1e-3)
+
+
+SLEEVE = {
+    "letter": "v", "boards_n": 1, "skins_per_board_n": 1,
+    "design": RIGID | {"tiles": {"columns_n": 2, "rows_n": 4, "pitch_mm": 25.4}},
+    "skin_mm": (50.8, 101.6), "quadrature": {"cell_mm": 2.2, "layers_n": 2},
+}  # fmt: skip
+SCATTER = {
+    "kind": "scatter", "boards": "sleeve", "skins_n": 1, "pokes_n": 6, "depth_mm": (0.6, 1.2), "margin_mm": 4.0,
+    "terms": [],
+}  # fmt: skip
+
+
+def sleeve(**changes):
+    return with_protocol("sleeve", SCATTER, boards=SECTIONS["boards"] | {"sleeve": SLEEVE}, **changes)
+
+
+def test_scattered_pokes_lie_where_their_labels_say_from_the_skins_corner():
+    of = sleeve(chip=SECTIONS["chip"] | {"noise_xy_uT": 0.0, "noise_z_uT": 0.0})
+    one = capture_of(of, "sleeve", board="v0", skin="v0_s0")
+    place_mm = np.column_stack([touched(one, "x_mm"), touched(one, "y_mm")]).astype(float)
+    board = draw_board(of.boards["sleeve"].design, of.spreads, seed=1, name="v0")
+    rule = of.boards["sleeve"].quadrature.quadrature()
+    skin = draw_skin(of.skin, of.spreads, seed=1, name="v0_s0", rule=rule, sides_m=(50.8e-3, 101.6e-3))
+    pokes_m = np.column_stack([place_mm - (25.4, 50.8), touched(one, "depth_mm")]) * 1e-3
+    _, changes_T = changes_of_field(board, skin, pokes_m)
+    truth_uT = 1e6 * np.einsum("kij,klj,nkl->nki", board.sensitivity, board.turn, changes_T)
+    b_uT = one.b_uT.astype(np.float64).reshape(-1, FRAMES_N, 40, 3)
+    # a step of z, lost twice by half; a label is written as float32, 4 nm, which moves no field
+    assert np.abs(b_uT[:, READ] - b_uT[:, 1:2] - truth_uT[:, None]).max() < 0.75
+
+
+def test_the_frames_of_forty_chips_come_through_the_wire_as_they_went_in():
+    one = capture_of(sleeve(), "sleeve", board="v0", skin="v0_s0")
+    header, files = to_files(one, sleeve())
+    assert (header.chips_n, len(files["stream.bin"])) == (40, 6 * FRAMES_N * (16 * 40 + 2))
+    stream = FrameStream("binary", 40)
+    frames = concatenate([stream.feed(files["stream.bin"]), stream.close()], 40)
+    np.testing.assert_array_equal(frames.b_uT, one.b_uT)
+    np.testing.assert_array_equal(frames.temperature_degC, one.temperature_degC)
+
+
+def test_the_papers_protocol_is_refused_on_a_skin_that_is_not_the_papers():
+    with pytest.raises(ParamsError, match="skin_mm of the boards of protocol grid is .20.0, 20.0."):
+        synthesis("boards", rigid=SECTIONS["boards"]["rigid"] | {"skin_mm": (50.8, 101.6)})
+
+
+def test_a_hand_leaves_no_label_but_a_field_that_changes():
+    one = capture_of(with_protocol("hand", HAND), "hand")
+    for name in ("x_mm", "y_mm", "depth_mm", "Fx_N", "Fy_N", "Fz_N"):
+        assert np.isnan(touched(one, name)).all()
+    np.testing.assert_array_equal(touched(one, "pass_i"), np.repeat([0, 1, 2], 4))
+    assert one.name == "b0_s0-hand"
+    change_uT = np.linalg.norm((shaped(one)[:, READ] - shaped(one)[:, 1:2]).mean(axis=1).reshape(12, 15), axis=1)
+    assert change_uT.min() > 30  # 15 channels of noise, a reading less another, averaged over 3: 13
+
+
+def aged(**changes):
+    grid = GRID | {"terms": list(changes)}
+    return with_protocol("grid", grid, terms=changes)
+
+
+def test_a_skin_that_ages_gets_softer_and_its_baseline_drifts(capture):
+    old = capture_of(aged(ageing=AGEING))
+    ratio = touched(old, "Fz_N")[-65:] / touched(capture, "Fz_N")[-65:]
+    # by hand: 1 - 0.1 (1 - exp(-227/300)) - 0.01 log10(1.227) = 0.946 at contact 227, half way through the last 65
+    assert np.median(ratio) == pytest.approx(0.946, abs=0.005)
+    drift_uT = (shaped(old)[:, 1:5].mean(axis=1) - shaped(capture)[:, 1:5].mean(axis=1))[-1]
+    assert np.abs(drift_uT).max() > 5
+    early_uT = (shaped(old)[:, 1:5].mean(axis=1) - shaped(capture)[:, 1:5].mean(axis=1))[0]
+    assert np.abs(early_uT).max() < 12  # noise only: 5 / sqrt(2) less 5 / sqrt(2), three sd
+
+
+def test_a_skin_that_relaxes_pushes_less_and_shows_the_same_field(capture):
+    slack = capture_of(aged(relaxation=RELAXATION))
+    ratio = np.median(touched(slack, "Fz_N")[65:130] / touched(capture, "Fz_N")[65:130])
+    # after 1 s the two fastest terms, 0.05 each, are gone, of the third at most a tenth
+    assert 0.88 < ratio < 0.91
+    assert np.array_equal(slack.b_uT, capture.b_uT)
+
+
+def test_warmth_is_read_by_the_chips_and_takes_the_field_along(capture):
+    warm = capture_of(aged(temperature=TEMPERATURE))
+    assert warm.temperature_degC[-50:].mean() - warm.temperature_degC[:50].mean() == pytest.approx(2.3, abs=0.3)
+    before_uT, after_uT = (shaped(one)[-40:, 1:5].mean(axis=(0, 1)) for one in (capture, warm))
+    change_uT = np.abs(after_uT).sum() - np.abs(before_uT).sum()
+    offset = 5 * 3 * 200 * 0.8  # the chips' own offset does not follow: mean |normal| of 15 channels
+    assert change_uT == pytest.approx(-0.0012 * 2.5 * np.abs(before_uT).sum(), abs=0.003 * offset)
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_seed_another_skin(capture):
+    assert same(capture, capture_of())
+    assert not same(capture, capture_of(seed=2))
+
+
+def test_more_boards_skins_and_protocols_leave_the_others_as_they_are(capture):
+    boards = {"rigid": SECTIONS["boards"]["rigid"] | {"boards_n": 3, "skins_per_board_n": 5}}
+    more = with_protocol("hand", HAND, boards=boards)
+    assert set(roster(synthesis(), "grid")) < {(f"b{b}", f"b{b}_s{s}") for b in range(3) for s in range(5)}
+    assert same(capture, capture_of(more))
+
+
+def test_the_first_skin_of_every_board_comes_before_the_second_of_any():
+    assert roster(with_protocol("few", GRID | {"skins_n": 3}), "few") == [
+        ("b0", "b0_s0"),
+        ("b0", "b0_s1"),
+        ("b1", "b1_s0"),
+    ]
+
+
+def test_two_skins_on_one_board_share_its_chips_but_not_their_response(capture):
+    other = capture_of(skin="b0_s1")
+    assert not np.allclose(shaped(capture)[0, 1], shaped(other)[0, 1], atol=20)  # six times the noise
+
+
+def test_a_skin_without_magnetisation_reads_offset_and_noise_only():
+    b_uT = shaped(capture_of(synthesis("skin", saturation_T=0.0)))
+    np.testing.assert_allclose(b_uT.std(axis=(0, 1)), np.tile([3.3, 3.3, 5.0], (5, 1)), rtol=0.1)
+
+
+@pytest.mark.parametrize(("section", "name"), [("rig", "rate"), ("skin", "stickiness"), ("spreads", "chip_gian")])
+def test_an_unknown_parameter_is_refused_by_name(section, name):
+    with pytest.raises(ParamsError, match=name):
+        synthesis(section, **{name: 1.0})
+
+
+@pytest.mark.parametrize(
+    ("protocol", "changes", "sentence"),
+    [
+        (GRID | {"skins_n": 5}, {}, "skins_n 5 is more than rigid boards have, 4"),
+        (GRID | {"boards": "soft"}, {}, "boards is one of .'rigid'., not 'soft'"),
+        (GRID | {"terms": ["ageing"]}, {}, "terms holds exactly what a protocol needs"),
+        (GRID, {"terms": {"ageing": AGEING}}, "terms holds exactly what a protocol needs"),
+        (HAND | {"depth_mm": (1.2, 0.4)}, {}, "from the shallower to the deeper"),
+        (HAND | {"tilt_sd_deg": 5.0}, {}, "a stylus that leans .tilt_sd_deg. needs the term friction"),
+    ],
+)
+def test_a_scene_that_contradicts_itself_is_refused(protocol, changes, sentence):
+    with pytest.raises(ParamsError, match=sentence):
+        with_protocol("other", protocol, **changes)
+
+
+def test_a_depth_that_the_skin_cannot_take_is_refused():
+    with pytest.raises(ParamsError, match="depth must be"):
+        capture_of(with_protocol("deep", GRID | {"depths_mm": (2.5,)}), "deep")
+
+
+FLEXIBLE = SECTIONS["boards"] | {"flexible": SECTIONS["boards"]["rigid"] | {"letter": "f"}}
+DRAG = {
+    "kind": "drag", "boards": "rigid", "skins_n": 1, "passes_n": 1, "depths_mm": (0.6,), "step_mm": 2.0,
+    "terms": ["friction"],
+}  # fmt: skip
+FRICTION = {"boards": FLEXIBLE, "terms": {"friction": {"coefficient": 0.8}}}
+LOAD = {"kind": "load", "boards": "rigid", "skins_n": 1, "passes_n": 2, "force_max_N": 1.0, "step_N": 0.5, "terms": []}
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("wear", "grid"), ("flexible", "grid"), ("drag", "drag"), ("hand", "hand"), ("sleeve", "scatter"),
+        ("glass", "load"), ("press", "press"), ("log", "walk"),
+    ],
+)  # fmt: skip
+def test_a_protocol_of_a_kind_that_its_question_cannot_read_is_refused(name, kind):
+    other = HAND if kind == "grid" else GRID | {"skins_n": 1}
+    sentence = f"test: protocol {name}: kind is {kind}, which its question reads, not {other['kind']}. "
+    with pytest.raises(ParamsError, match=sentence) as refused:
+        with_protocol(name, other)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "protocol", "changes", "sentence"),
+    [
+        ("wear", GRID | {"skins_n": 2}, {}, "protocol wear: skins_n is 1, .*, not 2"),
+        ("glass", LOAD | {"skins_n": 2}, {}, "protocol glass: skins_n is 1, .*, not 2"),
+        ("glass", LOAD | {"passes_n": 1}, {}, "protocols.glass.passes_n must be greater than or equal to 2; got 1"),
+        ("glass", LOAD | {"boards": "flexible"}, {"boards": FLEXIBLE}, "protocol glass: boards is rigid, .* flexible"),
+        ("hand", HAND | {"boards": "flexible"}, {"boards": FLEXIBLE}, "protocol hand: boards is rigid, .* flexible"),
+        ("drag", DRAG | {"boards": "flexible"}, FRICTION, "protocol drag: boards is rigid, as of grid, not flexible"),
+        ("drag", DRAG | {"terms": []}, {}, "protocol drag: terms of a drag hold friction"),
+        ("flexible", GRID, {"boards": FLEXIBLE}, "protocol flexible: boards is another kind .*, not rigid too"),
+    ],
+)
+def test_a_protocol_that_its_question_cannot_be_asked_of_is_refused(name, protocol, changes, sentence):
+    with pytest.raises(ParamsError, match=sentence):
+        with_protocol(name, protocol, **changes)
+
+
+def test_protocols_that_suit_their_questions_are_taken():
+    assert with_protocol("drag", DRAG, **FRICTION).protocols["drag"].skins_n == 1
+    assert with_protocol("glass", LOAD).protocols["glass"].kind == "load"
+    assert with_protocol("flexible", GRID | {"boards": "flexible"}, boards=FLEXIBLE).protocols["flexible"].skins_n == 4

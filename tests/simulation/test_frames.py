@@ -1,0 +1,70 @@
+"""Fields become frames: one block as truth for many; warmth and chips' sensitivity by hand."""
+
+import numpy as np
+import pytest
+
+from reskin.physics.aging import REMANENCE_PER_K, Temperature
+from reskin.physics.board import Board
+from reskin.physics.chip import ChipDesign
+from reskin.seeds import rng_for
+from reskin.simulation import rig
+from reskin.simulation.contact import Response
+from reskin.simulation.rig import Reader, Rig, read_frames, timeline
+from tests.simulation.scene import SECTIONS
+
+N, CHIPS_N = 40, 2
+EYES = np.tile(np.eye(3), (CHIPS_N, 1, 1))
+BOARD = Board("b0", np.zeros((CHIPS_N, 3)), EYES, EYES, np.zeros((CHIPS_N, 3)))
+LOUD = ChipDesign(gain_sel=7, noise_xy_uT=3.0, noise_z_uT=5.0, noise_temperature_degC=0.1)
+QUIET = ChipDesign(gain_sel=7, noise_xy_uT=0.0, noise_z_uT=0.0, noise_temperature_degC=0.0)
+WARMING = Temperature(warming_K=10.0, warming_s=1.0, swing_K=2.0, swing_s=3.0, chip_sensitivity_per_K=0.0)
+
+
+def response():
+    rng = rng_for(0, "felt")
+    rest_T = 1e-3 + 1e-4 * rng.standard_normal((N, CHIPS_N, 3))
+    return Response(rest_T, 2e-4 * rng.standard_normal((N, 1, CHIPS_N, 3)), np.zeros((N, 1, 3)), 0)
+
+
+def read(chip=LOUD, rate_hz=400.0, temperature=None, sensitivity_per_K=(0.0, 0.0), of=None):
+    reader = Reader(BOARD, chip, rate_hz, np.array([0.2e-3, 1.5e-3]), temperature, np.array(sensitivity_per_K))
+    line = timeline(Rig(**SECTIONS["rig"]), 1)
+    return read_frames(of or response(), line, reader, noise=rng_for(0, "noise"), warmth_noise=rng_for(0, "warmth"))
+
+
+@pytest.mark.parametrize("rate_hz", [400.0, 1000.0])
+def test_blocks_leave_no_trace(rate_hz, monkeypatch):
+    whole = read(rate_hz=rate_hz, temperature=WARMING)
+    monkeypatch.setattr(rig, "BLOCK_INDENTATIONS_N", 7)
+    parts = read(rate_hz=rate_hz, temperature=WARMING)
+    np.testing.assert_array_equal(whole.b_uT, parts.b_uT)
+    np.testing.assert_array_equal(whole.temperature_degC, parts.temperature_degC)
+
+
+def test_frames_repeat_where_they_outrun_the_chips_noise_included():
+    slow, fast = (read(rate_hz=rate_hz).b_uT.reshape(-1, CHIPS_N, 3) for rate_hz in (400.0, 1000.0))
+    repeats = [(one[1:] == one[:-1]).all(axis=2).mean() for one in (slow, fast)]
+    assert repeats[0] == 0
+    assert repeats[1] == pytest.approx(1 - 1 / 1.84, abs=0.02)  # of conversions of 1.84 ms at 1 kHz
+
+
+def test_a_chip_reads_what_was_there_when_it_converted_and_not_later():
+    one = response()
+    ramp = one.change_T[:, 0].copy()
+    frames_n = len(timeline(Rig(**SECTIONS["rig"]), 1))
+    found_uT = read(QUIET).b_uT.reshape(N, frames_n, CHIPS_N, 3)
+    share = (found_uT[:, 5] / 1e6 - one.rest_T) / ramp  # the first frame on the way down, at a third of the change
+    large = np.abs(ramp) > 1e-4  # a count of 0.15 uT is then 0.002 of the change
+    assert (share[large] < 1 / 3 + 0.002).all()
+    assert (share[large] > -0.01).all()
+    assert share[large].max() - share[large].min() > 0.2  # chips and indentations differ in age
+
+
+def test_a_warm_skin_is_weaker_and_a_warm_chip_as_it_says():
+    warm, room = (read(QUIET, temperature=how, sensitivity_per_K=(0.004, -0.002)).b_uT for how in (WARMING, None))
+    last = slice(-8, -3)  # the same field, later by a constant
+    late_s = len(room) / 400.0
+    warmer_K = 10 * (1 - np.exp(-late_s)) + 2 * np.sin(2 * np.pi * late_s / 3)
+    ratio = (warm[last] / room[last]).mean(axis=0).reshape(CHIPS_N, 3).mean(axis=1)
+    truth = (1 + REMANENCE_PER_K * warmer_K) * (1 + warmer_K * np.array([0.004, -0.002]))
+    np.testing.assert_allclose(ratio, truth, atol=1.5e-3)  # a count of 0.15 in 1000 uT, and the last 10 frames' warming

@@ -1,0 +1,54 @@
+"""What a protocol does not need does not run: the interpreter's own profile of one recording is asked."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from reskin.physics import shear
+from reskin.simulation.capture import record
+from tests.simulation.scene import AGEING, GRID, RELAXATION, TEMPERATURE, with_protocol
+
+TERMS = {
+    "ageing": (AGEING, {"softening", "fading", "wandering"}),
+    "friction": ({"coefficient": 0.5}, {"drag", "slip", "stick", "shear", "carry", "tabulate_depth"}),
+    "relaxation": (RELAXATION, {"relax"}),
+    "temperature": (TEMPERATURE, {"warmer_K", "remanence"}),
+}
+OF_TERMS = set().union(*(names for _, names in TERMS.values()))
+FEW = GRID | {"passes_n": 1, "depths_mm": (0.6,), "skins_n": 1}
+
+
+def functions_run(scene):
+    """Name the functions of the library that were called."""
+    called = set()
+
+    def note(frame, event, _):
+        if event == "call":
+            called.add((frame.f_code.co_filename, frame.f_code.co_name))
+
+    record(scene, "few", board="b0", skin="b0_s0", seed=1)  # makes the flow's tables, which carry material too
+    shear.tabulate_depth.cache_clear()  # what an earlier test left there would hide a call
+    sys.setprofile(note)
+    try:
+        record(scene, "few", board="b0", skin="b0_s0", seed=1)
+    finally:
+        sys.setprofile(None)
+    return {name for file, name in called if "reskin" in Path(file).parts}
+
+
+def scene_with(*terms):
+    return with_protocol("few", FEW | {"terms": list(terms)}, terms={term: TERMS[term][0] for term in terms})
+
+
+def test_a_protocol_without_terms_runs_no_code_of_any_term():
+    run = functions_run(scene_with())
+    assert {"record", "read_field"} <= run  # or the profile would see nothing
+    assert not run & OF_TERMS
+
+
+@pytest.mark.parametrize("term", sorted(TERMS))
+def test_a_term_that_is_asked_for_runs_its_own_code_and_no_others(term):
+    run = functions_run(scene_with(term)) & OF_TERMS
+    assert run
+    assert run <= TERMS[term][1]

@@ -1,0 +1,194 @@
+"""Weights against the skin's own force curve; half sines, footfalls and draws of presses as laws."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from reskin.errors import CaptureError, ParamsError
+from reskin.physics.skin import draw_skin, forces
+from reskin.recordings.header import write_capture
+from reskin.recordings.ingest import open_capture
+from reskin.recordings.readers.sd_card import read_log
+from reskin.seeds import rng_for
+from reskin.simulation.capture import record, to_files
+from reskin.simulation.protocols import (
+    LIFTED_MM,
+    SKIN_MM,
+    Press,
+    depths_under,
+    footfalls,
+    half_sine,
+    presses,
+    weights_N,
+)
+from tests.recordings.headers import AS_USUAL
+from tests.simulation.scene import synthesis, with_protocol
+
+SHARED = {"boards": "rigid", "skins_n": 1, "terms": []}
+GLASS = {"kind": "load", "passes_n": 3, "force_max_N": 1.0, "step_N": 0.25} | SHARED
+PRESS = {"kind": "press", "presses_n": 4, "duration_s": (0.05, 0.2), "depth_mm": (0.4, 1.2), "rate_hz": 400.0} | SHARED
+WALK = {
+    "kind": "walk", "steps_n": 3, "stance_s": (0.2, 0.5), "swing_s": (0.2, 0.6), "quiet_s": 0.4,
+    "depth_mm": (0.4, 1.2), "rate_hz": 250.0,
+} | SHARED  # fmt: skip
+SKIN = draw_skin(synthesis().skin, synthesis().spreads, seed=1, name="b0_s0")
+
+
+def capture_of(name, protocol, **changes):
+    return record(with_protocol(name, protocol, **changes), name, board="b0", skin="b0_s0", seed=1)
+
+
+def drawn(presses_n, name="presses"):
+    return presses(presses_n, duration_s=(0.05, 1.0), depth_mm=(0.4, 1.2), rate_hz=400.0, rng=rng_for(0, name))
+
+
+@given(st.floats(1e-3, 2.0))
+def test_the_skin_bears_at_the_depth_found_just_the_weight_on_it(weight_N):
+    depth_m = depths_under(SKIN, np.array([[weight_N]]))
+    # 1e-12 m on at most 20 N/mm is 2e-8 N
+    assert forces(SKIN, depth_m[0])[0] == pytest.approx(weight_N, abs=2e-8)
+
+
+def test_no_weight_just_touches_the_skin_and_more_weight_sinks_deeper():
+    depth_m = depths_under(SKIN, weights_N(1.0, 0.02)[None])[0]
+    assert depth_m[0] == -SKIN.depth_zero_m
+    assert (np.diff(depth_m) > 0).all()
+
+
+def test_a_weight_that_no_skin_bears_is_refused():
+    with pytest.raises(ParamsError, match=r"skin b0_s0: weight must be at most .* N, which the skin bears"):
+        depths_under(SKIN, np.array([[1e4]]))
+
+
+def test_a_glass_is_filled_from_nothing_to_the_most_in_even_steps():
+    np.testing.assert_allclose(weights_N(1.0, 0.25), [0, 0.25, 0.5, 0.75, 1.0])
+
+
+def test_a_filling_reads_its_weights_and_knows_no_depth():
+    capture = capture_of("glass", GLASS)
+    log = capture.probe
+    assert np.isnan(log.depth_mm[log.contact]).all()
+    read_N = log.Fz_N[log.contact].reshape(3, 5)
+    np.testing.assert_allclose(read_N, np.tile([0, 0.25, 0.5, 0.75, 1.0], (3, 1)), atol=6 * 0.006)  # sd of the sensor
+    assert set(log.x_mm[log.contact]) == {8.0}
+
+
+def test_more_weight_changes_the_field_more():
+    quiet = {**synthesis().chip.model_dump(), "noise_xy_uT": 0.0, "noise_z_uT": 0.0}
+    b_uT = capture_of("glass", GLASS, chip=quiet).b_uT.reshape(3, -1, 15)
+    lifted_n, dwell_n = 1 + 4 + 2, 1 + 3
+    stops_uT = b_uT[:, lifted_n : lifted_n + 5 * dwell_n].reshape(3, 5, dwell_n, 15)[:, :, -1]
+    change_uT = np.linalg.norm(stops_uT - b_uT[:, 1:2], axis=2)
+    assert (change_uT[:, 0] <= 0.7 * 4).all()  # no more than a step of each channel: sqrt(15) / 2 steps
+    assert (np.diff(change_uT, axis=1) > 10).all()
+
+
+def test_a_half_sine_is_deepest_in_its_middle_and_the_same_backwards():
+    depth_mm = half_sine(101, 0.8)
+    assert depth_mm.argmax() == 50
+    assert depth_mm[50] == pytest.approx(0.8)
+    np.testing.assert_allclose(depth_mm, depth_mm[::-1], atol=1e-12)
+    assert depth_mm.mean() == pytest.approx(0.8 * 2 / np.pi, rel=1e-3)  # midpoint rule: (pi / 2 n)^2 / 6
+
+
+def test_durations_lie_evenly_in_their_logarithm_and_the_tip_is_lifted_after_a_press():
+    stops = drawn(2000)
+    frames_n = (stops.depth_mm > 0).sum(axis=1)
+    position = np.log(frames_n / 20) / np.log(20)
+    np.testing.assert_allclose(
+        np.quantile(position, [0.25, 0.5, 0.75]), [0.25, 0.5, 0.75], atol=0.05
+    )  # 4 x 0.5/sqrt(n)
+    after = np.arange(stops.depth_mm.shape[1]) >= frames_n[:, None]
+    assert (stops.depth_mm[after] == LIFTED_MM).all()
+    assert stops.depth_mm.max() <= 1.2
+
+
+def test_a_walk_has_a_footfall_and_a_swing_for_each_step():
+    sizes = {"stance_s": (0.2, 0.5), "swing_s": (0.2, 0.6), "depth_mm": (0.4, 1.2), "rate_hz": 250.0}
+    down = footfalls(40, **sizes, rng=rng_for(0, "walk")).depth_mm[0] > 0
+    edges = np.diff(np.concatenate([[False], down, [False]]).astype(int))
+    stance_n = np.flatnonzero(edges == -1) - np.flatnonzero(edges == 1)
+    assert len(stance_n) == 40
+    assert stance_n.min() >= 50
+    assert stance_n.max() <= 125
+    assert not down[-50:].any()
+
+
+def test_every_frame_of_a_press_is_a_dwell_and_the_frames_above_the_skin_are_none():
+    log = capture_of("press", PRESS).probe
+    plan = Press(**PRESS | {"terms": ()}).plan(rng_for(1, "recording", "press", "b0", "b0_s0", "plan"), SKIN_MM)
+    assert log.contact.sum() == (plan.depth_mm > 0).sum()
+    dwell_s = (log.t_end_s - log.t_start_s)[log.contact]
+    np.testing.assert_allclose(dwell_s, 1 / 400, rtol=1e-3)
+    depths_mm = log.depth_mm[log.contact]
+    np.testing.assert_allclose(depths_mm, plan.depth_mm[plan.depth_mm > 0], rtol=1e-6)
+
+
+def test_chips_read_a_rising_press_a_little_late_and_not_all_at_the_same_moment():
+    quiet = {**synthesis().chip.model_dump(), "noise_xy_uT": 0.0, "noise_z_uT": 0.0}
+    fast, slow = (
+        capture_of("press", PRESS | {"rate_hz": rate_hz, "presses_n": 1, "duration_s": (duration_s,) * 2}, chip=quiet)
+        for rate_hz, duration_s in ((400.0, 0.05), (4.0, 5.0))  # 20 frames each, 2.5 ms and 250 ms apart
+    )
+    still_uT, moving_uT = (one.b_uT.reshape(-1, 5, 3)[4:24].astype(float) for one in (slow, fast))
+    late_uT = np.abs(moving_uT - still_uT)[3].max(axis=1)
+    assert (late_uT > 1.0).all()  # three steps of z
+    # the same press, read up to 1.84 of 2.5 ms late: each reading lies between two of the slow one's
+    low_uT, high_uT = (np.sort([still_uT[1:], still_uT[:-1]], axis=0)[i] for i in (0, 1))
+    assert (moving_uT[1:] >= low_uT - 1).all()  # uT: a step of x and y, and of z
+    assert (moving_uT[1:] <= high_uT + 1).all()
+
+
+def test_a_walk_keeps_the_truth_on_the_logs_own_clock():
+    capture = capture_of("log", WALK)
+    assert capture.card_rate_hz == 250.0
+    log = capture.probe
+    assert log.t_start_s[0] == pytest.approx(0.5 / 250)
+    assert log.t_end_s[0] == pytest.approx(100.5 / 250)  # 0.4 s of quiet
+    touched = log.depth_mm[log.contact].astype(float)
+    skin = draw_skin(
+        synthesis().skin,
+        synthesis().spreads,
+        seed=1,
+        name="b0_s0",
+        rule=synthesis().main_boards.quadrature.quadrature(),
+    )
+    np.testing.assert_allclose(log.Fz_N[log.contact], forces(skin, touched * 1e-3), rtol=1e-4)  # float32 depths
+    assert (np.diff(log.t_start_s[log.contact]) > 1.5 / 250).sum() == 2  # three footfalls
+
+
+def test_what_is_pressed_refuses_physics_that_would_change_its_force():
+    with pytest.raises(ParamsError, match="terms"):
+        with_protocol("press", PRESS | {"terms": ["relaxation"]})
+    with pytest.raises(ParamsError, match="duration_s goes from the lower to the higher"):
+        with_protocol("press", PRESS | {"duration_s": (1.0, 0.05)})
+    with pytest.raises(ParamsError, match="whole number of step_N"):
+        with_protocol("glass", GLASS | {"step_N": 0.3})
+
+
+def test_a_walk_leaves_the_log_of_an_sd_card_and_its_truth_and_is_no_capture_to_learn_from(tmp_path):
+    capture = capture_of("log", WALK)
+    header = write_capture(tmp_path / capture.name, *to_files(capture, with_protocol("log", WALK)))
+    assert sorted(header.files) == ["log.csv", "probe.csv"]
+    assert (header.layout, header.wire, header.source) == ("sd-card", None, "simulated")
+    t_s, b_uT, temperature_degC, account = read_log(tmp_path / capture.name / "log.csv")
+    np.testing.assert_allclose(t_s, (1 + np.arange(len(capture.b_uT))) / 250)
+    np.testing.assert_allclose(b_uT, capture.b_uT, atol=5.1e-3)  # two decimals
+    np.testing.assert_allclose(temperature_degC, capture.temperature_degC, atol=5.1e-3)
+    assert account["rows_n"] == len(t_s)
+    with pytest.raises(CaptureError, match="layout must be native or one of .*; got sd-card"):
+        open_capture(tmp_path / capture.name, AS_USUAL)
+
+
+def test_presses_and_fillings_come_through_the_same_door_as_everything(tmp_path):
+    for name, protocol in (("press", PRESS), ("glass", GLASS)):
+        capture = capture_of(name, protocol)
+        write_capture(tmp_path / capture.name, *to_files(capture, with_protocol(name, protocol)))
+        opened = open_capture(tmp_path / capture.name, AS_USUAL)
+        blocks = list(opened.blocks)
+        logged_N = capture.probe.Fz_N[capture.probe.contact]
+        readings_n = 1 if name == "press" else 3
+        np.testing.assert_array_equal(np.concatenate([one.Fz_N for one in blocks]), np.repeat(logged_N, readings_n))
+        assert not [key for key in opened.account if key.startswith("fault_")]  # a healthy board raises no alarm
+        assert opened.account["indentations_n"] == protocol.get("presses_n", protocol.get("passes_n"))

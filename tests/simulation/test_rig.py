@@ -1,0 +1,90 @@
+"""The rig's timeline laid out by hand; clocks, chunks and dwells as laws."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from reskin.seeds import rng_for
+from reskin.simulation.protocols import SKIN_MM, Drag, Grid
+from reskin.simulation.rig import Rig, chunks, draw_clock, misplace, probe_log, timeline
+from tests.simulation.scene import SECTIONS
+
+SHARED = {"boards": "rigid", "skins_n": 1, "terms": ()}
+
+
+def rig(**changes):
+    return Rig(**(SECTIONS["rig"] | changes))
+
+
+def plan(protocol=None):
+    protocol = protocol or Grid(kind="grid", passes_n=1, depths_mm=(0.6, 1.2), **SHARED)
+    return protocol.plan(rng_for(0, "plan"), SKIN_MM)
+
+
+DRAG = Drag(kind="drag", passes_n=1, depths_mm=(1.0,), step_mm=4.0, **SHARED)
+
+
+def test_an_indentation_settles_rests_goes_down_settles_reads_and_goes_up():
+    frames = timeline(rig(), 1)
+    np.testing.assert_allclose(frames.share, [0] * 5 + [1 / 3, 2 / 3] + [1] * 4 + [2 / 3, 1 / 3])
+    assert frames.noload_i == 1
+    assert frames.contact_i.tolist() == [8]
+    assert not frames.stop_i.any()
+
+
+def test_a_dragged_line_settles_and_reads_at_every_stop():
+    frames = timeline(rig(), 3)
+    assert frames.stop_i.tolist() == [0] * 7 + [0] * 4 + [1] * 4 + [2] * 4 + [2] * 2
+    assert frames.contact_i.tolist() == [8, 12, 16]
+
+
+@given(st.integers(1, 7), st.floats(0, 0.01), st.integers(0, 1000))
+def test_chunks_bring_every_frame_once_in_order_and_never_early(chunk_frames_max_n, jitter_s, seed):
+    frame_s = (1 + np.arange(500)) / 400.0
+    how = rig(chunk_frames_max_n=chunk_frames_max_n, arrival_jitter_s=jitter_s)
+    arrived_n, arrived_s = chunks(frame_s, how, rng_for(seed, "chunks"))
+    assert (arrived_n[0], arrived_n[-1]) == (0, 500)
+    sizes = np.diff(arrived_n)
+    assert sizes.min() >= 1
+    assert sizes.max() <= chunk_frames_max_n
+    assert (np.diff(arrived_s) >= 0).all()
+    assert (arrived_s >= arrived_n / 400.0).all()
+
+
+@pytest.mark.parametrize("protocol", [None, DRAG])
+def test_each_dwell_holds_its_frames_and_no_other_once_the_clocks_are_joined(protocol):
+    how, one = rig(), plan(protocol)
+    stops_n = one.x_mm.shape[1]
+    frames = timeline(how, stops_n)
+    offset_s, rate = clock = draw_clock(how, rng_for(1, "clock"))
+    log = probe_log(one, np.zeros((len(one), 1 + stops_n, 3)), how, clock)
+    assert abs(offset_s) > 0.01
+    assert 0 < abs(rate - 1) < 5e-4
+    frame_s = (1 + np.arange(len(one) * len(frames))) / how.rate_hz
+    first_i, after_i = (np.searchsorted(frame_s, (t_s - offset_s) / rate) for t_s in (log.t_start_s, log.t_end_s))
+    begins = np.arange(len(one))[:, None] * len(frames) + np.append(frames.noload_i, frames.contact_i)
+    np.testing.assert_array_equal(first_i, begins.ravel())
+    np.testing.assert_array_equal(after_i - first_i, np.tile([4] + [3] * stops_n, len(one)))
+    np.testing.assert_array_equal(log.contact, np.tile([False] + [True] * stops_n, len(one)))
+
+
+def test_the_log_names_every_stop_of_a_line_and_the_force_there():
+    one = plan(DRAG)
+    force_N = rng_for(0, "force").standard_normal((len(one), 6, 3))
+    log = probe_log(one, force_N, rig(), (0.0, 1.0))
+    np.testing.assert_allclose(log.x_mm[log.contact].reshape(one.x_mm.shape), one.x_mm)
+    np.testing.assert_allclose(log.Fy_N, force_N[:, :, 1].ravel().astype(np.float32))
+    assert not log.depth_mm[~log.contact].any()
+    np.testing.assert_array_equal(log.indentation, np.repeat(np.arange(18), 6))
+
+
+def test_a_robot_misses_by_its_spread_alike_along_a_line_and_a_perfect_one_not_at_all():
+    grid, line = plan(), plan(DRAG)
+    exact_mm = misplace(grid, rig(), rng_for(0, "robot"))
+    np.testing.assert_array_equal(exact_mm[:, 0], np.hstack([grid.x_mm, grid.y_mm, grid.depth_mm]))
+    loose = rig(robot_place_sd_mm=0.1, robot_depth_sd_mm=0.02)
+    missed_mm = misplace(grid, loose, rng_for(0, "robot")) - exact_mm
+    np.testing.assert_allclose(missed_mm.std(axis=(0, 1)), [0.1, 0.1, 0.02], rtol=0.25)  # 130 draws: 6 %
+    along_mm = misplace(line, loose, rng_for(0, "robot")) - np.stack([line.x_mm, line.y_mm, line.depth_mm], axis=2)
+    np.testing.assert_allclose(along_mm, np.repeat(along_mm[:, :1], 5, axis=1))

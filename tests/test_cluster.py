@@ -1,0 +1,159 @@
+"""The same trainings on two workers of a real scheduler on this machine give the bytes that they give here."""
+
+import importlib.util
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import Future
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import pytest
+
+from pipeline import cluster
+from pipeline.cluster import _check_workers, describe_process
+from pipeline.executors import make_executor, prepare_workers
+from reskin.errors import ParamsError
+from reskin.models.grid import run_trials
+from tests.models.test_grid import alike, trials
+from tests.models.trials import measured
+
+ROOT = Path(__file__).resolve().parents[2]
+# As deploy/dask.sh starts workers.
+CLI = "import pipeline.cluster; from distributed.cli.dask_{0} import main; main()"
+START_MAX_s = 120.0
+HERE_ONLY = ["--host", "127.0.0.1", "--no-dashboard"]
+
+
+@contextmanager
+def started(kind: str, *options: str) -> Iterator[None]:
+    paths = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    environment = {"OMP_NUM_THREADS": "1", **os.environ, "PYTHONPATH": paths}
+    command = [sys.executable, "-W", "ignore", "-c", CLI.format(kind), *HERE_ONLY, *options]
+    process = subprocess.Popen(command, env=environment, cwd="/", stderr=subprocess.DEVNULL)
+    try:
+        yield
+    finally:
+        process.terminate()
+        process.wait()
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory) -> Iterator[str]:
+    """The address of a scheduler with two workers, each a process of one thread."""
+    reason = "Dask is not installed, so no cluster is tried: pip install -c constraints.txt -e '.[dask]'"
+    distributed = pytest.importorskip("distributed", reason=reason)
+    file = tmp_path_factory.mktemp("scheduler") / "scheduler.json"
+    with ExitStack() as processes:
+        processes.enter_context(started("scheduler", "--port", "0", "--no-jupyter", "--scheduler-file", str(file)))
+        for _ in range(2):
+            processes.enter_context(started("worker", "--scheduler-file", str(file), "--nthreads", "1", "--no-nanny"))
+        end_s = time.monotonic() + START_MAX_s
+        while not file.exists() and time.monotonic() < end_s:
+            time.sleep(0.05)
+        found = json.loads(file.read_text())["address"]
+        with distributed.Client(found, set_as_default=False) as client:
+            client.wait_for_workers(2, timeout=START_MAX_s)
+        yield found
+
+
+def where(i: int) -> tuple[int, str, int]:
+    time.sleep(0.1)
+    return os.getpid(), os.getcwd(), i
+
+
+def test_a_sweep_on_two_workers_gives_the_bytes_of_a_local_one(address, tmp_path, monkeypatch):
+    some = [replace(trial, seed_i=seed_i) for trial in trials(2, steps_n=10) for seed_i in (0, 1)]
+    results = []
+    for name, place in (("here", "here"), ("there", f"dask:{address}")):
+        monkeypatch.setenv("RESKIN_EXECUTOR", place)
+        monkeypatch.setenv("OMP_NUM_THREADS", os.environ.get("OMP_NUM_THREADS", "1"))
+        prepare_workers("reskin.models.train")
+        with make_executor(imports="reskin.models.train") as executor:
+            cache = tmp_path / name
+            results.append(run_trials(some, measured(), executor=executor, cache=cache, tell=lambda _: None))
+            ran = [future.result() for future in [executor.submit(where, i) for i in range(6)]]
+    for a, b in zip(*results, strict=True):
+        assert (a.key, a.predicted.tobytes()) == (b.key, b.predicted.tobytes())
+        assert alike(a, b)
+    assert [i for _, _, i in ran] == list(range(6))
+    assert len({process for process, _, _ in ran} - {os.getpid()}) == 2
+    assert {folder for _, folder, _ in ran} == {os.getcwd()}  # paths of stages are relative
+
+
+def test_an_error_on_a_worker_comes_back_as_it_was(address, monkeypatch):
+    monkeypatch.setenv("RESKIN_EXECUTOR", f"dask:{address}")
+    monkeypatch.setenv("OMP_NUM_THREADS", os.environ.get("OMP_NUM_THREADS", "1"))
+    with make_executor(1, imports="json") as executor, pytest.raises(ValueError, match="invalid literal"):
+        executor.submit(int, "x").result()
+
+
+@pytest.mark.parametrize(
+    ("workers", "expected"),
+    [
+        ({}, "workers of tcp://there must be one or more; got none"),
+        ({"w": {"threads": 2}}, "threads of worker w must be 1; got 2"),
+        (
+            {"v": {}, "w": {"variables of numerics": "COMPATIBLE"}},
+            "variables of numerics of worker w must be .* got COMP",
+        ),
+        ({"w": {"the project's code": "/elsewhere"}}, "the project's code of worker w must be .* got /elsewhere"),
+        ({"w": {"RESKIN_DEVICE": "cuda"}}, "RESKIN_DEVICE of worker w must be cpu; got cuda"),
+        ({"w": {"scipy": "0.1"}}, "scipy of worker w must be .* got 0.1"),
+    ],
+)
+def test_workers_that_would_give_other_bits_are_refused(workers, expected):
+    threads = {name: {"nthreads": changed.get("threads", 1)} for name, changed in workers.items()}
+    client = SimpleNamespace(
+        scheduler_info=lambda n_workers: {"workers": threads},
+        run=lambda call: {name: call() | changed for name, changed in workers.items()},
+    )
+    with pytest.raises(ParamsError, match=expected):
+        _check_workers(client, "tcp://there")
+
+
+def test_a_scheduler_that_goes_away_is_one_sentence():
+    pytest.importorskip("distributed", reason="Dask is not installed")
+    submitted, future = Future(), Future()
+    submitted.cancel()  # as Dask does with every call when it loses the scheduler
+    cluster._pass_on(future, "tcp://there", submitted)
+    with pytest.raises(ParamsError, match="the scheduler at tcp://there must be there .* what was finished is kept"):
+        future.result(0)
+
+
+def imported_from(file: Path) -> ModuleType:
+    """The module as a process has it that imports it now."""
+    spec = importlib.util.spec_from_file_location("cluster_of_a_copy", file)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_a_worker_that_was_started_before_an_edit_of_any_module_is_refused_and_a_new_one_passes(tmp_path, monkeypatch):
+    for package in ("pipeline", "reskin"):
+        (tmp_path / package).mkdir()
+        shutil.copy(ROOT / package / "__init__.py", tmp_path / package)
+        monkeypatch.setattr(sys.modules[package], "__file__", str(tmp_path / package / "__init__.py"))
+    source = ROOT / "pipeline/cluster.py"
+    before = imported_from(source)
+    with (tmp_path / "reskin/seeds.py").open("w") as module:
+        module.write("# edited\n")
+    now = imported_from(source)
+    cluster._compare(now.describe_process(), imported_from(source).describe_process(), "w")
+    with pytest.raises(ParamsError, match="sources as imported of worker w must be .* Start it anew"):
+        cluster._compare(now.describe_process(), before.describe_process(), "w")
+    with pytest.raises(ParamsError, match="sources as imported of worker process"):
+        cluster.run_there(str(tmp_path), before.describe_process(), os.getcwd)
+
+
+def test_workers_that_are_as_this_process_pass():
+    client = SimpleNamespace(
+        scheduler_info=lambda n_workers: {"workers": {"w": {"nthreads": 1}}}, run=lambda call: {"w": describe_process()}
+    )
+    _check_workers(client, "tcp://there")

@@ -1,0 +1,92 @@
+"""Places told before their touch: all of them by a scan that repeats, none by one in a random order."""
+
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.settings import Settings
+from pipeline.training.before_contact import score_before_touch
+from pipeline.training.trainings import SceneData
+from reskin import io
+from reskin.data.rows import Selection, gather, gather_hover
+from reskin.data.splits import Split, draw_folds
+from reskin.seeds import rng_for
+from tests.data.tables import readings
+
+PASSES_N, PLACES_N = 4, 64
+WORDS = {"seed": 0, "selection": {"force_min_N": 0.0}}
+BY_CHANCE_PCT = 15.0  # one of 64 places is right by chance, neighbours' means a little more often
+
+
+def scored(folder: Path, *, snake: bool, memory: float) -> dict[str, float]:
+    """Score a scan of a 14 mm grid in four passes, the last tested; `memory` of each poke stays in the next field."""
+    rng = rng_for(0, "scan")
+    order = [np.arange(PLACES_N) if snake else rng.permutation(PLACES_N) for _ in range(PASSES_N)]
+    at = np.concatenate(order)
+    x_mm, y_mm = (2 * (at // 8)).astype(np.float32), (2 * (at % 8)).astype(np.float32)
+    db_uT = np.stack([x_mm, y_mm, x_mm * y_mm], axis=1) * np.float32(10)
+    noise_uT = 0.01 * rng.standard_normal(db_uT.shape)
+    noload_uT = (100 + memory * np.roll(db_uT, 1, axis=0) + noise_uT).astype(np.float32)
+    one = readings(
+        f=len(at), x_mm=x_mm, y_mm=y_mm, noload_uT=noload_uT, b_uT=noload_uT + db_uT,
+        pass_i=np.repeat(np.arange(PASSES_N, dtype=np.int32), PLACES_N),
+    )  # fmt: skip
+    io.write_readings(folder / "c0.parquet", [one], {})
+    rows = gather([one], Selection(force_min_N=0.0))
+    folds = draw_folds(rows, ["single_temporal"], Split(temporal_test_fraction=0.25), 0)
+    table = score_before_touch(
+        SceneData("test", Settings("test", "test.yaml", WORDS, {}), rows, folds), folder, ["c0"], {}
+    )
+    return dict(zip(table["told_by"].to_pylist(), table["accuracy_pct"].to_pylist(), strict=True))
+
+
+def test_a_snake_tells_every_place_by_its_number_and_with_a_memory_by_the_no_load_reading(tmp_path):
+    found = scored(tmp_path, snake=True, memory=0.1)
+    assert found["scan"] == 100.0
+    assert found["noload"] > 95.0
+
+
+def test_a_snake_without_memory_is_told_by_its_number_alone(tmp_path):
+    found = scored(tmp_path, snake=True, memory=0.0)
+    assert found["scan"] == 100.0
+    assert found["noload"] < BY_CHANCE_PCT
+
+
+def hovering(folder: Path, *, magnetic: bool) -> dict[str, dict[str, float]]:
+    """Score a tip that goes down on each place of a grid from above it, without force first; a magnet on it is read."""
+    at = np.tile(np.arange(PLACES_N), PASSES_N).repeat(2)  # above each place, then on it
+    touches = np.tile([False, True], PASSES_N * PLACES_N)
+    place_mm = np.column_stack([2 * (at // 8), 2 * (at % 8)]).astype(np.float32)
+    rng = rng_for(0, "hover")
+    db_uT = np.column_stack([place_mm, place_mm[:, :1] * place_mm[:, 1:]]) * np.float32(10)
+    db_uT = (db_uT * (touches | magnetic)[:, None] + rng.standard_normal(db_uT.shape)).astype(np.float32)
+    corner = np.arange(len(at)) % (2 * PLACES_N) == 0  # off the skin, before a pass
+    one = readings(
+        f=len(at), x_mm=np.where(touches, place_mm[:, 0], np.nan).astype(np.float32),
+        y_mm=np.where(touches, place_mm[:, 1], np.nan).astype(np.float32),
+        Fz_N=touches.astype(np.float32), noload_uT=np.zeros_like(db_uT), b_uT=db_uT,
+        pass_i=np.repeat(np.arange(PASSES_N, dtype=np.int32), 2 * PLACES_N),
+    )  # fmt: skip
+    hover = gather_hover([one])
+    assert len(hover) == (~touches & ~corner).sum()
+    np.testing.assert_array_equal(hover.place_mm, place_mm[~touches & ~corner])  # the place that is touched next
+    io.write_readings(folder / "c0.parquet", [one], {})
+    rows = gather([one], Selection(force_min_N=0.1))
+    folds = draw_folds(rows, ["single_temporal"], Split(temporal_test_fraction=0.25), 0)
+    data = SceneData("test", Settings("test", "test.yaml", WORDS, {}), rows, folds)
+    table = score_before_touch(data, folder, ["c0"], {"s0": [lambda db_uT: np.zeros((len(db_uT), 3), np.float32)]})
+    return {row["told_by"]: row for row in table.to_pylist()}
+
+
+def test_a_tip_that_hovers_is_placed_if_it_is_a_magnet_and_by_chance_if_it_is_none(tmp_path):
+    found = hovering(tmp_path, magnetic=True)
+    assert found["hover"]["accuracy_pct"] > 95
+    assert found["hover"]["hover_uT"] > 0.9 * found["hover"]["touch_uT"]
+    assert found["hover_network"]["accuracy_pct"] < BY_CHANCE_PCT  # the network that always answers one corner
+    found = hovering(tmp_path, magnetic=False)
+    assert found["hover"]["accuracy_pct"] < BY_CHANCE_PCT
+    assert found["hover"]["hover_uT"] < 0.1 * found["hover"]["touch_uT"]
+
+
+def test_a_random_order_tells_nothing_even_where_the_skin_remembers(tmp_path):
+    assert max(scored(tmp_path, snake=False, memory=0.1).values()) < BY_CHANCE_PCT

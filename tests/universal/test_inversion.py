@@ -1,0 +1,70 @@
+"""Inversion finds the law's own pokes and numbers again; its slopes are differences; strangers leave more over."""
+
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+
+from reskin.seeds import rng_for
+from reskin.universal import inversion
+from reskin.universal.inversion import LEAST, NUMBERS, STEP_MM, _Together, chart, fit_unlabelled, search
+from reskin.universal.law import at_rest_uT, simulate_uT
+from reskin.universal.map import NOMINAL, lattice_mm
+from reskin.universal.population import COARSE
+from tests.universal.skins import SETUP
+
+CHEAP = replace(SETUP, rule=COARSE)
+TRUE = replace(NOMINAL, seat_x_mm=0.5, seat_y_mm=-0.4, amplitude=1.8, gap_mm=1.75, give_x_um=40.0)
+PLACE_MM = np.stack(np.meshgrid([-2.0, -0.5, 1.1, 2.4], [-2.2, -0.7, 0.6, 2.1]), axis=-1).reshape(-1, 2)
+FORCE_N = np.exp(rng_for(0, "inversion").uniform(np.log(0.8), np.log(6.0), len(PLACE_MM)))
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    monkeypatch.setattr(inversion, "lattice_mm", lambda: lattice_mm()[7:15])  # 2.8 mm about the middle
+
+
+def fields_uT() -> np.ndarray:
+    return simulate_uT(TRUE, CHEAP, PLACE_MM, FORCE_N).reshape(len(PLACE_MM), -1)
+
+
+def test_a_search_finds_places_and_forces_of_the_laws_own_pokes():
+    found = search(chart(TRUE, CHEAP), fields_uT())
+    np.testing.assert_allclose(
+        found.place_mm, PLACE_MM, atol=0.2
+    )  # a quarter of the pitch: one step, with slopes of the lattice
+    np.testing.assert_allclose(np.log(found.force_N), np.log(FORCE_N), atol=0.2)
+    assert found.left.max() < 0.1
+
+
+def test_points_of_the_lattice_leave_nothing_over_and_strangers_do():
+    known = chart(TRUE, CHEAP)
+    found = search(known, known.field_uT)
+    np.testing.assert_allclose(found.place_mm, known.place_mm, atol=1e-9)
+    np.testing.assert_allclose(found.left, 0.0, atol=1e-9)
+    assert np.median(search(known, -fields_uT()).left) > 0.5
+
+
+def test_slopes_are_differences_of_residuals_number_by_number():
+    two = _Together(TRUE, CHEAP, fields_uT()[:2], at_rest_uT(TRUE, CHEAP).ravel())
+    at = np.column_stack([PLACE_MM[:2], np.log(FORCE_N[:2])]) + 0.2
+    values = np.concatenate([[asdict(TRUE)[name] for name in NUMBERS], at.ravel()])
+    columns = two.slopes(values)
+    for i in (0, len(NUMBERS), len(NUMBERS) + 4):  # a number, x of the first poke, y of the second
+        by = (np.arange(len(values)) == i) * (STEP_MM if i else 0.1 * inversion.STEP.seat_x_mm)
+        expected = (two.residuals(values + by) - two.residuals(values)) / by.max()
+        np.testing.assert_allclose(columns[:, i], expected, rtol=1e-6, atol=1e-9)
+
+
+def test_pokes_nobody_labelled_tell_the_laws_numbers_and_none_tell_those_of_the_field_at_rest(monkeypatch):
+    monkeypatch.setattr(inversion, "ROUNDS_N", 1)
+    rest_uT, pokes_uT = at_rest_uT(TRUE, CHEAP).ravel(), fields_uT()[::2]
+    found = fit_unlabelled(pokes_uT, rest_uT, CHEAP)
+    left = [np.median(search(chart(law, CHEAP), pokes_uT).left) for law in (NOMINAL, found)]
+    assert left[1] < 0.3 * left[0]
+    for name, near in {"seat_x_mm": 0.15, "seat_y_mm": 0.15, "give_x_um": 15.0}.items():
+        assert abs(asdict(found)[name] - asdict(TRUE)[name]) < near
+    assert all(asdict(found)[name] > least for name, least in LEAST.items())
+    untold = fit_unlabelled(pokes_uT[:0], rest_uT, CHEAP)
+    assert untold.seat_x_mm == pytest.approx(TRUE.seat_x_mm, abs=0.15)
+    assert untold.give_x_um == NOMINAL.give_x_um

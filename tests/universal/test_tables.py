@@ -1,0 +1,41 @@
+"""Tables hold what the law simulates, and its slopes."""
+
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+
+from reskin.universal import map
+from reskin.universal.law import simulate_uT
+from reskin.universal.map import NOMINAL, OF_LOG, OF_NOMINAL, OF_RIG, STEP, middle, spread_by, tabulate
+from tests.universal.skins import SETUP
+
+
+def test_tables_hold_the_laws_fields_and_their_slopes(monkeypatch):
+    monkeypatch.setattr(map, "lattice_mm", lambda: np.array([-4.0, 1.0]))
+    found = tabulate(NOMINAL, {"amplitude": 0.2, "label_x_mm": 0.5}, SETUP)
+    at_mm = np.array([[-4.0, 1.0]])
+    for i, force_N in enumerate(found.force_N):
+        there_uT = simulate_uT(NOMINAL, SETUP, at_mm, np.array([force_N])).ravel()
+        np.testing.assert_allclose(found.mean_uT[0, 1, i], there_uT, rtol=1e-9)
+        moved_uT = simulate_uT(NOMINAL, SETUP, at_mm + [STEP * 0.5, 0], np.array([force_N])).ravel()
+        np.testing.assert_allclose(found.slope_uT[0, 1, i, :, 1], (moved_uT - there_uT) / STEP, rtol=1e-9, atol=1e-9)
+    grown = (np.exp(STEP * 0.2) - 1) / STEP  # fields are linear in the amplitude, whose spread is of its logarithm
+    np.testing.assert_allclose(found.slope_uT[..., 0], grown * found.mean_uT, rtol=1e-9)
+    np.testing.assert_allclose(found.rest_slope_uT, np.outer(found.rest_uT, [grown, 0]), rtol=1e-9, atol=1e-9)
+
+
+def test_the_middle_of_laws_is_their_mean_with_the_seat_as_designed():
+    weak, strong = replace(NOMINAL, amplitude=1.0, seat_x_mm=0.4), replace(NOMINAL, amplitude=4.0, gap_mm=2.0)
+    found = middle([weak, strong])
+    assert (found.amplitude, found.gap_mm) == pytest.approx((2.0, 1.8))
+    assert (found.seat_x_mm, found.seat_y_mm, found.rotation_deg) == (0, 0, 0)
+
+
+@pytest.mark.parametrize("spreads", [OF_RIG, OF_NOMINAL])
+def test_spreads_are_of_numbers_of_a_law_and_what_moves_comes_back(spreads):
+    assert set(spreads) <= set(asdict(NOMINAL))
+    assert set(OF_LOG) <= set(spreads)
+    for name, spread in spreads.items():
+        back = spread_by(spread_by(NOMINAL, name, spread), name, -spread)
+        assert getattr(back, name) == pytest.approx(getattr(NOMINAL, name))
