@@ -24,7 +24,7 @@ from reskin.recordings import columns
 from reskin.recordings.header import LOG_FILE, RATE_MAX_HZ, STREAM_FILE
 from reskin.recordings.ingest import read_header, timer
 from reskin.recordings.readers import sd_card
-from reskin.universal.calibration import CHANNELS_N, is_shown
+from reskin.universal.calibration import CHANNELS_N, is_calibration
 from reskin.universal.model import Universal, load_universal
 
 PARQUET_MAGIC = b"PAR1"
@@ -118,7 +118,7 @@ def _read_capture(folder: Path) -> sd_card.Log:
 
 def read_models(files: Sequence[Path]) -> Sequence[Network] | Universal:
     """Read trained networks, or one skin that the universal model was told of (`save`); of no file, that model."""
-    skins = [file for file in files if file.is_file() and is_shown(file)]
+    skins = [file for file in files if file.is_file() and is_calibration(file)]
     if not skins:
         return [read_network(file) for file in files] or load_universal()
     if len(files) > 1:
@@ -142,7 +142,7 @@ def _remedy(model: Path) -> str:
 def read_network(model: Path) -> Network:
     """Read a model and the card beside it; raise if it does not answer x, y and F from changes of field."""
     card_file = model.with_suffix(".json")
-    if model.is_file() and is_shown(model):
+    if model.is_file() and is_calibration(model):
         remedy = "Load it with reskin.load_universal."
         raise ParamsError(model, "the model", "a trained network", "a saved skin", remedy)
     if not model.is_file():

@@ -30,7 +30,7 @@ from reskin.config import parse, read_yaml
 from reskin.data.grid import CENTRE_MM
 from reskin.physics.skin import SkinDesign
 from reskin.universal.axes import CHIPS_MM, to_chips
-from reskin.universal.calibration import Sureness, by_misfit, by_residuals
+from reskin.universal.calibration import LikelihoodPowers, lower_by_misfit, lower_by_residuals
 from reskin.universal.law import Setup
 from reskin.universal.map import NOMINAL, OF_NOMINAL, tabulate
 from reskin.universal.model import SKIN_MM, Universal, write
@@ -40,7 +40,7 @@ from reskin.universal.training import NAMELESS, Lessons, Syllabus, teach
 
 POKES_N = (0, 12, FULL_SET_N)  # unlabelled ones; `reskin live` asks for a dozen
 WAYS = (*((n, False) for n in POKES_N), (FULL_SET_N, True))  # so many, and whether they are said to lie evenly
-UNKNOWN = Sureness({n: {0: 1.0} for n in POKES_N}, {0: 1.0})
+UNKNOWN = LikelihoodPowers({n: {0: 1.0} for n in POKES_N}, {0: 1.0})
 CARD = {
     "name": "universal, simulated alone",
     "source": "simulated",
@@ -60,7 +60,7 @@ CARD = {
 }
 
 
-def tell_sureness(experts: Experts, labels_n: Sequence[int], seed: int) -> Sureness:
+def tell_sureness(experts: Experts, labels_n: Sequence[int], seed: int) -> LikelihoodPowers:
     """Find, on simulated skins, tempers at a misfit of 1 of the model as it is used, by pokes and by labels."""
     model = Universal(experts.tables, experts.networks, UNKNOWN)
     held: dict[tuple[int, bool, int], list[Float[np.ndarray, "t 2"]]] = {}
@@ -73,7 +73,7 @@ def tell_sureness(experts: Experts, labels_n: Sequence[int], seed: int) -> Suren
                     held.setdefault((pokes_n, even, n), []).append(_coverage(model, asked))
     told = {key: best(SURENESS, of)[1] for key, of in held.items()}
     anywhere = {pokes_n: {n: told[pokes_n, False, n] for n in labels_n} for pokes_n in POKES_N}
-    return Sureness(anywhere, {n: told[FULL_SET_N, True, n] for n in labels_n})
+    return LikelihoodPowers(anywhere, {n: told[FULL_SET_N, True, n] for n in labels_n})
 
 
 def shown(
@@ -99,8 +99,8 @@ def _coverage(
     model: Universal, asked: tuple[Float[np.ndarray, "m ch"], Float[np.ndarray, "m 2"]]
 ) -> Float[np.ndarray, "t 2"]:
     # Of the map with networks, twice: as others are given with the map alone.
-    told = [by_misfit(one, model.misfit) for one in SURENESS]
-    tempers = [by_residuals(*one) for one in zip(told, model.ratios(told), strict=True)]
+    told = [lower_by_misfit(one, model.misfit) for one in SURENESS]
+    tempers = [lower_by_residuals(*one) for one in zip(told, model.variance_inflations(told), strict=True)]
     held = [covered(found, asked[1]) for found in model.estimates(asked[0], tempers)]
     return np.column_stack([held, held])
 

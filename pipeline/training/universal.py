@@ -16,7 +16,7 @@ from reskin.data.rows import Rows
 from reskin.data.splits import Fold
 from reskin.errors import ParamsError
 from reskin.seeds import rng_for
-from reskin.universal.calibration import by_misfit, by_residuals, left_out, ratios
+from reskin.universal.calibration import folds_of_labels, lower_by_misfit, lower_by_residuals, variance_inflations
 from reskin.universal.combine import Labels, centre, multiply, off_middle_mm, shift
 from reskin.universal.law import TEN, Law, Seen, Setup, fit, simulate_uT
 from reskin.universal.map import (
@@ -250,7 +250,7 @@ class Told:
 
     def tempers(self, sureness: Tempers) -> Tempers:
         """Believe experts that know no board the less the worse the pokes fit."""
-        of_map, of_both = (by_misfit(one, self.misfit) for one in sureness)
+        of_map, of_both = (lower_by_misfit(one, self.misfit) for one in sureness)
         return of_map, of_both
 
     def first(self, which: Int64[np.ndarray, " k"]) -> "Told":
@@ -327,12 +327,14 @@ def by_own_labels(told: Told, labels_n: int, tempers: Sequence[Tempers]) -> list
     """Believe experts by how far labelled pokes are off that they were not told, under each temper."""
     of_map: list[tuple[list[Estimate], Any]] = []
     of_both: list[tuple[list[Estimate], Any]] = []
-    for kept, left in left_out(min(labels_n, len(told.pool.force_N))):
+    for kept, left in folds_of_labels(min(labels_n, len(told.pool.force_N))):
         found = read_both(ready(told.first(kept), len(kept)), told.pool.db_uT[left], tempers)
         for parts, of_way in zip((of_map, of_both), zip(*found, strict=True), strict=True):
             parts.append((list(of_way), told.pool.place_mm[left]))
-    of_ways = zip(tempers, *(ratios(len(tempers), parts) for parts in (of_map, of_both)), strict=True)
-    return [(by_residuals(alone, of_alone), by_residuals(both, of)) for (alone, both), of_alone, of in of_ways]
+    of_ways = zip(tempers, *(variance_inflations(len(tempers), parts) for parts in (of_map, of_both)), strict=True)
+    return [
+        (lower_by_residuals(alone, of_alone), lower_by_residuals(both, of)) for (alone, both), of_alone, of in of_ways
+    ]
 
 
 def about(answer: Estimate, likely: Estimate) -> Estimate:

@@ -136,6 +136,6 @@ def answering(models: Models) -> Networks | Map | None:
 
 def check_boards(models: Models, boards_n: int, where: str) -> None:
     """Raise ParamsError if a model that learnt one skin is to answer for several boards."""
-    if boards_n > 1 and isinstance(models, Universal) and models.told_n:
+    if boards_n > 1 and isinstance(models, Universal) and models.presses_n:
         rule, remedy = "for one board", "Open that board alone, or give no model."
-        raise ParamsError(where, f"a model that was told {models.told_n} pokes of a skin", rule, boards_n, remedy)
+        raise ParamsError(where, f"a model that was told {models.presses_n} pokes of a skin", rule, boards_n, remedy)

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
@@ -19,7 +19,7 @@ FIELD_MAX_uT = 1e6  # 20 times what a chip can measure: no poke, and single prec
 LABELS_MAX_N = 2000  # pokes at once: memory grows with their square, time faster
 
 
-def rows_of(b_uT: Float[np.ndarray, "..."]) -> Float[np.ndarray, "f ch"]:
+def check_shape(b_uT: Float[np.ndarray, "..."]) -> Float[np.ndarray, "f ch"]:
     """Take one reading or several; raise SchemaError on those of another board."""
     rows_uT = np.atleast_2d(np.asarray(b_uT, float))
     if rows_uT.ndim != 2 or rows_uT.shape[1] != CHANNELS_N:
@@ -28,16 +28,16 @@ def rows_of(b_uT: Float[np.ndarray, "..."]) -> Float[np.ndarray, "f ch"]:
     return rows_uT
 
 
-def learnt_rows_of(b_uT: Float[np.ndarray, "..."]) -> Float[np.ndarray, "f ch"]:
+def check_readings(b_uT: Float[np.ndarray, "..."]) -> Float[np.ndarray, "f ch"]:
     """Take readings to learn from; raise SchemaError on one that is no number, or that no chip measures."""
-    rows_uT = rows_of(b_uT)
+    rows_uT = check_shape(b_uT)
     _need("fields", "readings to learn from", "finite numbers of uT", rows_uT, np.isfinite(rows_uT))
     rule = f"at most {FIELD_MAX_uT:,.0f} uT in size"
     _need("fields", "readings to learn from", rule, rows_uT, np.abs(rows_uT) <= FIELD_MAX_uT)
     return rows_uT
 
 
-def labels_of(
+def check_labels(
     place_mm: Float[np.ndarray, "..."],
     force_N: Float[np.ndarray, "..."],
     rows_n: int,
@@ -76,37 +76,50 @@ SHAPES: Mapping[str, tuple[int, ...]] = {  # behind the number of pokes
 FILE_BYTES_MAX_N = 2**20  # a full set of pokes and LABELS_MAX_N labels take a third of it
 REMEDY = "Take a file that `save` wrote."
 
-Labelled = tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, " m"], Float[np.ndarray, "m ch"]]  # mm, N, uT
+
+class LabelledPresses(NamedTuple):
+    """Presses at known places (from the board's middle) under known forces, and their changes of field."""
+
+    place_mm: Float[np.ndarray, "m 2"]
+    force_N: Float[np.ndarray, " m"]
+    db_uT: Float[np.ndarray, "m ch"]
 
 
-def none() -> Float[np.ndarray, "0 ch"]:
-    """Give no poke."""
+def no_presses() -> Float[np.ndarray, "0 ch"]:
     return np.zeros((0, CHANNELS_N))
 
 
+def no_labels() -> LabelledPresses:
+    return LabelledPresses(np.zeros((0, 2)), np.zeros(0), no_presses())
+
+
 @dataclass(frozen=True)
-class Shown:
-    """What experts are told of a skin: its field at rest, pokes (at most a full set), and labelled ones."""
+class CalibrationData:
+    """All that is known of one skin, along the board's axes.
+
+    rest_uT: its no-load field. presses_uT: changes of field of presses at unknown places, at most a full set. even_uT:
+    those of them that lie evenly over the skin. labels: presses at known places.
+    """
 
     rest_uT: Float[np.ndarray, " ch"]
-    pokes_uT: Float[np.ndarray, "c ch"] = field(default_factory=none)
-    even_uT: Float[np.ndarray, "e ch"] = field(default_factory=none)  # those that lie evenly over the skin
-    labelled: Labelled = field(default_factory=lambda: (np.zeros((0, 2)), np.zeros(0), none()))
+    presses_uT: Float[np.ndarray, "c ch"] = field(default_factory=no_presses)
+    even_uT: Float[np.ndarray, "e ch"] = field(default_factory=no_presses)
+    labels: LabelledPresses = field(default_factory=no_labels)
 
 
-def write_shown(shown: Shown, file: Path) -> None:
-    """Write it as safetensors; the model that learns from it is not in the file."""
-    values = (shown.pokes_uT, shown.even_uT, *shown.labelled)
-    io.write_tensors(file, {"rest_uT": shown.rest_uT, **dict(zip(SHAPES, values, strict=True))}, {"format": FORMAT})
+def write_calibration(data: CalibrationData, file: Path) -> None:
+    """Write calibration data as safetensors; the model is not in the file."""
+    values = (data.presses_uT, data.even_uT, *data.labels)
+    io.write_tensors(file, {"rest_uT": data.rest_uT, **dict(zip(SHAPES, values, strict=True))}, {"format": FORMAT})
 
 
-def is_shown(file: Path) -> bool:
-    """Say whether `write_shown` wrote a file; raise SchemaError on a small one that is damaged or no safetensors."""
+def is_calibration(file: Path) -> bool:
+    """Tell whether `write_calibration` wrote a file; raise SchemaError on a damaged small file."""
     return file.stat().st_size <= FILE_BYTES_MAX_N and io.read_tensors(file)[1].get("format") == FORMAT
 
 
-def read_shown(file: Path, reach_mm: Float[np.ndarray, "2 2"]) -> Shown:
-    """Read it again; raise SchemaError on what no skin within `reach_mm` of its middle was ever told."""
+def read_calibration(file: Path, reach_mm: Float[np.ndarray, "2 2"]) -> CalibrationData:
+    """Read calibration data; raise SchemaError on places that are not within `reach_mm` of the middle."""
     if file.is_file() and (bytes_n := file.stat().st_size) > FILE_BYTES_MAX_N:
         raise SchemaError(file, "a saved skin", f"at most {FILE_BYTES_MAX_N:,} bytes", f"{bytes_n:,}", REMEDY)
     found, words = io.read_tensors(file, digest_needed=True)
@@ -118,22 +131,24 @@ def read_shown(file: Path, reach_mm: Float[np.ndarray, "2 2"]) -> Shown:
     if got != of_skin or max(counts_n["pokes_uT"], counts_n["even_uT"]) > FULL_SET_N:
         rule = f"rest_uT, {', '.join(SHAPES)} of {CHANNELS_N} channels and at most {FULL_SET_N} unlabelled pokes"
         raise SchemaError(file, "arrays", rule, got, REMEDY)
-    fields_uT = {name: learnt_rows_of(values) for name, values in found.items() if values.shape[1:] == (CHANNELS_N,)}
+    fields_uT = {name: check_readings(values) for name, values in found.items() if values.shape[1:] == (CHANNELS_N,)}
     labels_n = len(fields_uT["labelled_uT"])
-    place_mm, force_N = labels_of(
+    place_mm, force_N = check_labels(
         found["labelled_mm"].astype(float), found["labelled_N"].astype(float), labels_n, reach_mm
     )
-    rest_uT = learnt_rows_of(found["rest_uT"])[0]
-    return Shown(rest_uT, fields_uT["pokes_uT"], fields_uT["even_uT"], (place_mm, force_N, fields_uT["labelled_uT"]))
+    rest_uT = check_readings(found["rest_uT"])[0]
+    labels = LabelledPresses(place_mm, force_N, fields_uT["labelled_uT"])
+    return CalibrationData(rest_uT, fields_uT["pokes_uT"], fields_uT["even_uT"], labels)
 
 
 Pokes = tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, " _"]]  # places in mm from the board's middle, log F
 
 
-def worth(skin: SkinMap, place_mm: Float[np.ndarray, "c 2"], force_N: Float[np.ndarray, " c"]) -> np.ndarray:
-    """Give what each poke is expected to take from the variance of fields, relative to |dB|: the mean over places.
+def expected_gain(skin: SkinMap, place_mm: Float[np.ndarray, "c 2"], force_N: Float[np.ndarray, " c"]) -> np.ndarray:
+    """Return by how much a labelled press at each place is expected to reduce the variance of fields over the skin.
 
-    All channels together, under the middle one of the map's forces. Errors of the law that labels have shown are known.
+    Relative to |dB|, all channels together, the mean over places under the middle one of the map's forces. Errors of
+    the law that earlier labels have shown are known.
     """
     of, error_cov, known = skin.hypotheses, skin.error_cov, []
     every = slice(len(of.log_N) // 2, None, len(of.log_N))
@@ -155,7 +170,7 @@ def worth(skin: SkinMap, place_mm: Float[np.ndarray, "c 2"], force_N: Float[np.n
 
 
 def open_errors(skin: SkinMap, a: Pokes, b: Pokes) -> Float[np.ndarray, "n m"]:
-    """Give how the law's errors vary together at two sets of pokes, given those that labels have shown."""
+    """Return the covariance of the law's errors at two sets of presses, given the errors that labels have shown."""
     alike, shown = kernel(a[0], b[0], a[1], b[1]), skin.labelled
     if shown is None:
         return alike
@@ -171,33 +186,34 @@ Parts = Sequence[tuple[Sequence[Estimate], Float[np.ndarray, "_ 2"]]]  # under e
 
 
 @dataclass(frozen=True)
-class Sureness:
-    """Tempers at a misfit of 1, told on simulated skins: by unlabelled pokes and by labels; and where pokes lie evenly.
+class LikelihoodPowers:
+    """Likelihood powers at a misfit of 1, measured on simulated skins: by numbers of unlabelled presses and of labels.
 
-    Between told numbers of labels they lie between; of pokes, what fewer were told counts.
+    anywhere: presses at unknown places, first key their number. even: presses that lie evenly over the skin. Powers
+    are interpolated between numbers of labels; for presses the next smaller number counts.
     """
 
     anywhere: Mapping[int, Mapping[int, float]]
     even: Mapping[int, float]
 
     def of(self, pokes_n: int, labels_n: int, *, even: bool) -> float:
-        """Give the temper for so many pokes and labels."""
+        """Return the power for these numbers of presses and labels."""
         told = self.even if even else self.anywhere[max(n for n in self.anywhere if n <= pokes_n)]
         labels_told_n = sorted(told)
         return float(np.exp(np.interp(labels_n, labels_told_n, np.log([told[n] for n in labels_told_n]))))
 
-    def of_misfit(self, pokes_n: int) -> bool:
-        """Say whether so many pokes are enough for their misfit to count."""
+    def are_enough(self, pokes_n: int) -> bool:
+        """Tell whether so many presses are enough for their misfit to count."""
         return any(0 < n <= pokes_n for n in self.anywhere)
 
     def to_card(self) -> dict[str, dict[str, Any]]:
-        """Write it as JSON has it."""
+        """Return the entry of the model's card."""
         anywhere = {str(pokes_n): _named(of) for pokes_n, of in self.anywhere.items()}
         return {"anywhere": anywhere, "even": _named(self.even)}
 
     @classmethod
-    def of_card(cls, card: Mapping[str, Mapping[str, Any]]) -> "Sureness":
-        """Read what `to_card` wrote."""
+    def from_card(cls, card: Mapping[str, Mapping[str, Any]]) -> "LikelihoodPowers":
+        """Read the entry of a model's card."""
         anywhere = {int(pokes_n): _numbered(of) for pokes_n, of in card["anywhere"].items()}
         return cls(anywhere, _numbered(card["even"]))
 
@@ -210,34 +226,34 @@ def _numbered(told: Mapping[str, float]) -> dict[int, float]:
     return {int(n): temper for n, temper in told.items()}
 
 
-def by_misfit(sureness: float, misfit: float) -> float:
-    """Believe experts the less the worse pokes fit; sure at most as they say themselves."""
-    return min(1.0, sureness / misfit)
+def lower_by_misfit(power: float, misfit: float) -> float:
+    """Lower a power by the misfit of unlabelled presses; at most 1."""
+    return min(1.0, power / misfit)
 
 
-def by_residuals(temper: float, ratio: float) -> float:
-    """Believe experts the less the farther labels are off; sure at most as they say themselves."""
-    return min(1.0, temper / ratio)
+def lower_by_residuals(power: float, inflation: float) -> float:
+    """Lower a power by the variance inflation that held-out labels show; at most 1."""
+    return min(1.0, power / inflation)
 
 
-def left_out(labels_n: int) -> list[tuple[Int64[np.ndarray, " k"], Int64[np.ndarray, " l"]]]:
-    """Leave out every fifth label, then those after them: which are told, and which are left out."""
+def folds_of_labels(labels_n: int) -> list[tuple[Int64[np.ndarray, " k"], Int64[np.ndarray, " l"]]]:
+    """Split labels for cross-validation, every fifth into one fold: indices kept, indices held out."""
     part = np.arange(labels_n) % PARTS_N
     return [(np.flatnonzero(part != i), np.flatnonzero(part == i)) for i in range(min(PARTS_N, labels_n))]
 
 
-def ratios(tempers_n: int, parts: Parts) -> list[float]:
-    """Give by what variances are larger than was said of labels that were left out, under each temper."""
+def variance_inflations(powers_n: int, parts: Parts) -> list[float]:
+    """Return by what factor errors of held-out labels exceed the variances given, for each likelihood power."""
     found = []
-    for i in range(tempers_n):
+    for i in range(powers_n):
         off = [np.abs(of_part[i].place_mm - at_mm) / of_part[i].sd_mm for of_part, at_mm in parts]
-        found.append(ratio(np.concatenate([np.zeros((0, 2)), *off])))
+        found.append(variance_inflation(np.concatenate([np.zeros((0, 2)), *off])))
     return found
 
 
-def ratio(off: Float[np.ndarray, "m 2"]) -> float:
-    """Give the same of coordinates' absolute residuals in standard deviations, by their mean.
+def variance_inflation(off: Float[np.ndarray, "m 2"]) -> float:
+    """Return the factor from coordinates' absolute residuals in standard deviations, by their mean.
 
-    One poke that is far off counts once, not squared.
+    So one press that is far off counts once, not squared.
     """
     return ((PRIOR_N + float(off.sum()) / NORMAL_MEAN) / (PRIOR_N + off.size)) ** 2

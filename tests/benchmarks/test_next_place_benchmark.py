@@ -17,7 +17,7 @@ from reskin.physics.skin import SkinDesign
 from reskin.seeds import rng_for
 from reskin.simulation.defaults import nominal
 from reskin.universal.axes import CHIPS_MM, to_board
-from reskin.universal.calibration import worth
+from reskin.universal.calibration import expected_gain
 from reskin.universal.law import Setup
 from reskin.universal.map import NOMINAL, OF_NOMINAL
 from reskin.universal.model import SKIN_MM, Universal, load_universal
@@ -66,7 +66,7 @@ def ways(pool_mm: np.ndarray, rng: np.random.Generator) -> dict[str, Choose]:
 
     def chosen(skin: Universal, taken: list[int]) -> int:
         free = [i for i in range(len(pool_mm)) if i not in taken]
-        return free[int(worth(skin.skin, pool_mm[free], np.full(len(free), PRESS_N)).argmax())]
+        return free[int(expected_gain(skin.skin, pool_mm[free], np.full(len(free), PRESS_N)).argmax())]
 
     return {
         "fixed": lambda _, taken: fixed[len(taken)],

@@ -125,7 +125,7 @@ def test_shown_places_are_learnt_beside_the_labels_that_a_model_has(pressed):
     answers.zero(noload_uT)
     answers.label(place_mm, b_uT - rest_uT, kept)
     np.testing.assert_allclose(answers((b_uT - rest_uT).astype(np.float32)).answer, at_once, rtol=1e-3)
-    assert learnt.told_n == kept.sum()
+    assert learnt.presses_n == kept.sum()
 
 
 def test_a_knock_is_no_poke():

@@ -7,7 +7,7 @@ from pipeline.training import shipping
 from pipeline.training.shipping import shown, tell_sureness
 from pipeline.training.universal import SURENESS, Experts, by_own_labels, read_both, ready, told_of
 from reskin.seeds import rng_for
-from reskin.universal.calibration import Sureness
+from reskin.universal.calibration import LikelihoodPowers
 from reskin.universal.map import NOMINAL, OF_NOMINAL
 from reskin.universal.model import Universal, load_universal
 from reskin.universal.population import POKES_N, Population
@@ -40,12 +40,12 @@ def test_told_the_same_it_answers_as_surely_as_the_tested_experts(model, labels_
     b_uT, _ = shown(model, skins, 0, (65, labels_n), even=True, seed=0)
     nominal = Experts(model.tables, model.networks, None, Syllabus("nominal", NOMINAL, OF_NOMINAL, SETUP))
     told, asked = told_of(nominal, skins, 0, seed=0)
-    sureness = model.sureness.of(65, labels_n, even=True)
+    sureness = model.powers.of(65, labels_n, even=True)
     tempers = by_own_labels(told, labels_n, [told.tempers((sureness, sureness))])
     ((_, tested),) = read_both(ready(told, labels_n), asked.db_uT, tempers)
     found = model.estimate(b_uT)
     assert model.misfit == pytest.approx(told.misfit, rel=1e-3)
-    assert model.temper == pytest.approx(tempers[0][1], rel=1e-3)
+    assert model.power == pytest.approx(tempers[0][1], rel=1e-3)
     np.testing.assert_allclose(found.place_mm - 8, tested.place_mm, atol=1e-3)  # mm; fields in single precision
     np.testing.assert_allclose(found.sd_mm, tested.sd_mm, rtol=1e-3)
 
@@ -56,11 +56,11 @@ def test_pokes_that_fit_worse_make_it_less_sure_and_a_few_tell_nothing_of_that(m
     for missed in (0.1, 1.0):
         shown(model, skins_of(model, 1, missed), 0, (pokes_n, 0), even=False, seed=0)
         misfits.append(model.misfit)
-        tempers.append(model.temper)
+        tempers.append(model.power)
         shown(model, skins_of(model, 1, missed), 0, (5, 0), even=False, seed=0)
-        assert (model.misfit, model.temper) == (1.0, model.sureness.of(0, 0, even=False))
+        assert (model.misfit, model.power) == (1.0, model.powers.of(0, 0, even=False))
     assert misfits[1] > 3 * misfits[0]
-    assert tempers == pytest.approx([min(1, model.sureness.of(pokes_n, 0, even=False) / of) for of in misfits])
+    assert tempers == pytest.approx([min(1, model.powers.of(pokes_n, 0, even=False) / of) for of in misfits])
 
 
 def test_sureness_is_told_for_every_number_of_pokes_and_labels(model, monkeypatch):
@@ -70,4 +70,4 @@ def test_sureness_is_told_for_every_number_of_pokes_and_labels(model, monkeypatc
     found = tell_sureness(nominal, (0, 10), seed=0)
     assert {n: set(of) for n, of in found.anywhere.items()} == {n: {0, 10} for n in (0, 12, 65)}
     assert {*found.even.values(), *(one for of in found.anywhere.values() for one in of.values())} <= set(SURENESS)
-    assert found == Sureness.of_card(found.to_card())
+    assert found == LikelihoodPowers.from_card(found.to_card())

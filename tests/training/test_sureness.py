@@ -20,7 +20,7 @@ from pipeline.training.universal import (
     told_of,
 )
 from reskin.seeds import rng_for
-from reskin.universal.calibration import ratio
+from reskin.universal.calibration import variance_inflation
 from reskin.universal.map import NOMINAL, OF_NOMINAL
 from reskin.universal.training import Syllabus, draw_weights
 from tests.universal.skins import SETUP, made_population, made_tables
@@ -87,7 +87,7 @@ def test_a_single_label_is_read_by_experts_that_were_told_none(labelled):
     (found,) = by_own_labels(misled, 1, [(0.3, 0.3)])
     (blind,) = read_both(ready(told, 0), told.pool.db_uT[:1], [(0.3, 0.3)])
     off = [np.abs(one.place_mm - misled.pool.place_mm[:1]) / one.sd_mm for one in blind]
-    assert found == pytest.approx([0.3 / ratio(one) for one in off])
+    assert found == pytest.approx([0.3 / variance_inflation(one) for one in off])
 
 
 def test_sureness_is_told_by_skins_of_the_prior_for_every_number_of_labels(nominal, monkeypatch):

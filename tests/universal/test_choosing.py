@@ -1,9 +1,9 @@
-"""The next poke is worth what conditioning a Gaussian on it takes from the variance of all fields."""
+"""The next poke is expected_gain what conditioning a Gaussian on it takes from the variance of all fields."""
 
 import numpy as np
 import pytest
 
-from reskin.universal.calibration import worth
+from reskin.universal.calibration import expected_gain
 from reskin.universal.map import NOISE_uT, SkinMap, kernel, new_map, see_labelled
 from reskin.universal.model import load_universal
 from tests.universal.skins import fields_uT, made_tables
@@ -28,14 +28,14 @@ def test_a_poke_is_worth_what_conditioning_on_it_takes_from_the_variance(skin):
     beside = slope @ skin.cov @ slope[i].T + alike[:, None, None] * skin.error_cov
     read = beside[i] + skin.residual.noise * skin.error_cov + (NOISE_uT / poke_uT) ** 2 * np.eye(15)
     taken = [np.trace(one @ np.linalg.solve(read, one.T)) for one in beside]
-    found = worth(skin, of.place_mm[i : i + 1], force_N)
+    found = expected_gain(skin, of.place_mm[i : i + 1], force_N)
     assert found[0] == pytest.approx(np.mean(taken), rel=1e-5)  # tables in single precision
 
 
 def test_what_is_labelled_is_worth_little_and_what_lies_far_from_it_more(skin):
-    before = worth(skin, PLACE_mm, FORCE_N)
+    before = expected_gain(skin, PLACE_mm, FORCE_N)
     told = see_labelled(skin, PLACE_mm[:1], FORCE_N[:1], fields_uT(PLACE_mm[:1], FORCE_N[:1]))
-    after = worth(told, PLACE_mm, FORCE_N)
+    after = expected_gain(told, PLACE_mm, FORCE_N)
     assert after[0] < 0.2 * before[0]
     assert after[1] > 1.5 * after[0]
 

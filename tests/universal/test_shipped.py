@@ -97,14 +97,14 @@ def test_labels_that_it_cannot_foresee_make_it_less_sure_and_earlier_ones_are_fo
     read_uT, force_N = np.tile(pokes(skin), (3, 1)) + rest_uT, np.full(12, skin.tables.force_N[3])
     place_mm = np.tile(PLACES_MM, (3, 1))
     skin.zero(rest_uT).label(place_mm, force_N, read_uT)
-    fits, number = skin.temper, skin.skin.number
+    fits, number = skin.power, skin.skin.number
     skin.label(place_mm + 3 * np.random.default_rng(0).standard_normal(place_mm.shape), force_N, read_uT)
-    assert skin.temper < fits / 2
+    assert skin.power < fits / 2
     skin.label(place_mm, force_N, read_uT)
     np.testing.assert_allclose(skin.skin.number, number)
-    assert skin.temper == pytest.approx(fits)
+    assert skin.power == pytest.approx(fits)
     skin.zero(rest_uT)
-    assert skin.temper == pytest.approx(skin.sureness.of(0, 0, even=False))
+    assert skin.power == pytest.approx(skin.powers.of(0, 0, even=False))
 
 
 def test_what_is_told_counts_and_neither_its_order_nor_what_was_asked_between(skin):
@@ -165,14 +165,14 @@ def test_a_skin_that_was_saved_answers_the_next_day_as_it_did_and_follows_its_dr
     before = skin.zero(rest_uT).see(further_uT).label(PLACES_MM + (0.8, -0.5), force_N, read_uT).estimate(read_uT)
     skin.save(file)
     again = reskin.load_universal(file)
-    assert again.told_n == skin.told_n == 20
+    assert again.presses_n == skin.presses_n == 20
     after = again.estimate(read_uT)
     np.testing.assert_allclose(after.place_mm, before.place_mm)
     np.testing.assert_allclose(after.sd_mm, before.sd_mm)
     drifted_uT = rest_uT + np.linspace(-20, 20, CHANNELS_N)
     kept = again.zero(drifted_uT, keep=True).predict(pokes(skin) + drifted_uT)
     np.testing.assert_allclose(kept[:, :2], before.place_mm, atol=0.2)
-    assert again.zero(drifted_uT).told_n == 0
+    assert again.zero(drifted_uT).presses_n == 0
 
 
 def test_labels_are_kept_where_that_is_asked_for_and_else_forgotten(skin):
@@ -182,11 +182,11 @@ def test_labels_are_kept_where_that_is_asked_for_and_else_forgotten(skin):
     skin.zero(rest_uT).label(shifted_mm[:2], force_N[:2], read_uT[:2])
     in_turn = skin.label(shifted_mm[2:], force_N[2:], read_uT[2:], keep=True).predict(read_uT)
     np.testing.assert_allclose(in_turn, at_once, rtol=1e-6)
-    assert skin.told_n == 4
+    assert skin.presses_n == 4
     with pytest.raises(SchemaError, match="their number must be at most 2000; got 2003"):
         skin.label(np.full((1999, 2), 8.0), np.ones(1999), np.ones((1999, CHANNELS_N)), keep=True)
-    assert skin.told_n == 4
-    assert skin.label(shifted_mm[2:], force_N[2:], read_uT[2:]).told_n == 2
+    assert skin.presses_n == 4
+    assert skin.label(shifted_mm[2:], force_N[2:], read_uT[2:]).presses_n == 2
 
 
 def test_of_pokes_that_came_one_by_one_a_saved_skin_knows_nearly_the_same(skin, tmp_path):

@@ -4,7 +4,17 @@ import numpy as np
 import pytest
 
 from reskin.seeds import rng_for
-from reskin.universal.calibration import PRIOR_N, Sureness, by_misfit, by_residuals, left_out, ratio, ratios
+from reskin.universal.calibration import (
+    PRIOR_N,
+    LikelihoodPowers,
+    folds_of_labels,
+    lower_by_misfit,
+    lower_by_residuals,
+    variance_inflations,
+)
+from reskin.universal.calibration import (
+    variance_inflation as inflation,
+)
 from reskin.universal.map import Estimate
 
 
@@ -15,7 +25,7 @@ def estimate(off_mm: np.ndarray, sd_mm: float) -> Estimate:
 
 @pytest.mark.parametrize("labels_n", [0, 1, 3, 5, 12, 40])
 def test_every_label_is_left_out_once_and_told_otherwise(labels_n):
-    parts = left_out(labels_n)
+    parts = folds_of_labels(labels_n)
     assert sorted(i for _, left in parts for i in left) == list(range(labels_n))
     assert all(sorted([*kept, *left]) == list(range(labels_n)) for kept, left in parts)
     assert all(len(left) for _, left in parts)
@@ -23,32 +33,34 @@ def test_every_label_is_left_out_once_and_told_otherwise(labels_n):
 
 def test_normal_residuals_as_large_as_said_keep_the_temper_and_twice_as_large_ones_quarter_it():
     off = np.abs(rng_for(0, "residuals").standard_normal((200_000, 2)))
-    assert ratio(off) == pytest.approx(1, abs=0.01)
-    assert ratio(2 * off) == pytest.approx(4, rel=0.01)
+    assert inflation(off) == pytest.approx(1, abs=0.01)
+    assert inflation(2 * off) == pytest.approx(4, rel=0.01)
 
 
 def test_few_residuals_are_weighed_against_the_prior():
-    assert ratio(np.zeros((0, 2))) == 1
-    none_off = ratio(np.zeros((5, 2)))
+    assert inflation(np.zeros((0, 2))) == 1
+    none_off = inflation(np.zeros((5, 2)))
     assert none_off == pytest.approx((PRIOR_N / (PRIOR_N + 10)) ** 2)
-    assert none_off < 1 < ratio(np.full((1, 2), 3.0)) < ratio(np.full((20, 2), 3.0)) < 9 / (2 / np.pi)
+    assert none_off < 1 < inflation(np.full((1, 2), 3.0)) < inflation(np.full((20, 2), 3.0)) < 9 / (2 / np.pi)
 
 
 def test_each_temper_has_its_own_residuals_of_all_that_was_left_out():
     at_mm, off_mm = np.zeros((20, 2)), np.ones((20, 2))
     parts = [([estimate(off_mm, 1.0), estimate(off_mm, 0.25)], at_mm)] * 2
-    assert ratios(2, parts) == pytest.approx([ratio(np.ones((40, 2))), ratio(np.full((40, 2), 4.0))])
-    assert ratios(2, []) == [1, 1]
+    assert variance_inflations(2, parts) == pytest.approx(
+        [inflation(np.ones((40, 2))), inflation(np.full((40, 2), 4.0))]
+    )
+    assert variance_inflations(2, []) == [1, 1]
 
 
 def test_experts_are_believed_at_most_as_they_say_themselves():
-    assert [by_misfit(0.5, misfit) for misfit in (0.1, 1.0, 2.0)] == [1.0, 0.5, 0.25]
-    assert [by_residuals(0.5, of) for of in (0.1, 1.0, 2.0)] == [1.0, 0.5, 0.25]
+    assert [lower_by_misfit(0.5, misfit) for misfit in (0.1, 1.0, 2.0)] == [1.0, 0.5, 0.25]
+    assert [lower_by_residuals(0.5, of) for of in (0.1, 1.0, 2.0)] == [1.0, 0.5, 0.25]
 
 
 def test_sureness_between_told_numbers_of_labels_lies_between_and_of_pokes_is_that_of_fewer():
-    told = Sureness({0: {0: 0.9, 10: 0.9}, 12: {0: 0.8, 10: 0.2}}, {0: 0.3})
+    told = LikelihoodPowers({0: {0: 0.9, 10: 0.9}, 12: {0: 0.8, 10: 0.2}}, {0: 0.3})
     assert [told.of(12, n, even=False) for n in (0, 5, 10, 99)] == pytest.approx([0.8, 0.4, 0.2, 0.2])
     assert [told.of(n, 0, even=False) for n in (0, 11, 12, 65)] == pytest.approx([0.9, 0.9, 0.8, 0.8])
-    assert [told.of_misfit(n) for n in (0, 11, 12, 65)] == [False, False, True, True]
+    assert [told.are_enough(n) for n in (0, 11, 12, 65)] == [False, False, True, True]
     assert told.of(65, 7, even=True) == pytest.approx(0.3)
