@@ -24,7 +24,7 @@ from reskin.models.grid import run_trials
 from tests.models.test_grid import alike, trials
 from tests.models.trials import measured
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 # As deploy/dask.sh starts workers.
 CLI = "import pipeline.cluster; from distributed.cli.dask_{0} import main; main()"
 START_MAX_s = 120.0
