@@ -29,9 +29,8 @@ from pipeline.training.universal import (
 from reskin.config import parse, read_yaml
 from reskin.data.grid import CENTRE_MM
 from reskin.physics.skin import SkinDesign
-from reskin.universal.axes import CHIPS_MM, to_chips
 from reskin.universal.calibration import LikelihoodPowers, lower_by_misfit, lower_by_residuals
-from reskin.universal.law import Setup
+from reskin.universal.law import CHIPS_MM, Setup, to_chips
 from reskin.universal.map import NOMINAL, OF_NOMINAL, tabulate
 from reskin.universal.model import SKIN_MM, Universal, write
 from reskin.universal.network import FULL_SET_N

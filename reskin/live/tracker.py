@@ -1,6 +1,6 @@
-"""A skin at work: a port and models -> contacts while they happen. What `reskin.open` gives, and what the page shows.
+"""A skin at work: reads a board's port and estimates contacts as they happen. `reskin.open` returns its `Skin`.
 
-A thread reads; whoever asks decodes and estimates, so that a slow controller loses no byte. Refuses to know pages.
+A thread reads; the caller decodes and estimates, so that a slow controller loses no bytes.
 """
 
 from bisect import bisect_left
@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64
+from scipy.spatial.transform import Rotation
 
 from reskin.board import find
 from reskin.board.faults import GARBAGE_FRAMES_N
@@ -22,12 +23,48 @@ from reskin.board.find import Chunk
 from reskin.board.reader import PLUGGED_IN, Reader
 from reskin.board.stream import FrameStream
 from reskin.board.wire import Frames, concatenate
+from reskin.config import parse
+from reskin.data.grid import CENTRE_MM
 from reskin.errors import CaptureError, SchemaError
 from reskin.live.answering import Map, Models, Networks, answering
 from reskin.live.contacts import CONTACT_SDS, quiet_start
 from reskin.live.health import LIVE, Health
-from reskin.live.layout import layout_of
 from reskin.recordings.fault_policy import Decisions
+from reskin.simulation.defaults import nominal
+from reskin.simulation.protocols import SKIN_MM
+from reskin.simulation.settings import BoardKind
+
+ASIDE_MM = 5.0  # between chips whose places nobody knows, so that they can be drawn
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Places in the frame of labels, in mm; `turn` holds the chips' axes in the board's frame."""
+
+    known: bool
+    chips_mm: Float64[np.ndarray, "k 2"]
+    turn: Float64[np.ndarray, "k 3 3"]
+    corner_mm: tuple[float, float]
+    skin_mm: tuple[float, float]
+
+
+def layout_of(chips_n: int) -> Layout:
+    """Find the nominal board with this number of chips; chips of an unknown board are drawn in a row.
+
+    The bytes do not say which board it is: five chips are taken for the paper's board, forty for its sleeve.
+    """
+    for name, words in nominal("boards").items():
+        kind = parse(BoardKind, words, f"nominal board {name}")
+        if len(kind.design.places_mm) == chips_n:
+            half_mm = np.array(kind.skin_mm) / 2
+            centre_mm = np.full(2, CENTRE_MM) if kind.skin_mm == SKIN_MM else half_mm
+            turn = Rotation.from_euler("z", np.array(kind.design.turns_deg)[:, None], degrees=True).as_matrix()
+            corner_mm = centre_mm - half_mm
+            chips_mm = centre_mm + np.array(kind.design.places_mm)
+            return Layout(True, chips_mm, turn, (float(corner_mm[0]), float(corner_mm[1])), kind.skin_mm)
+    chips_mm = np.column_stack([ASIDE_MM * (0.5 + np.arange(chips_n)), np.full(chips_n, ASIDE_MM)])
+    return Layout(False, chips_mm, np.tile(np.eye(3), (chips_n, 1, 1)), (0.0, 0.0), (ASIDE_MM * chips_n, 2 * ASIDE_MM))
+
 
 ZERO_S = 1.0  # without contact, from which the no-load reading is taken
 ZERO_FRAMES_MAX_N = 10_000

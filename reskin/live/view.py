@@ -9,8 +9,7 @@ from collections import deque
 import numpy as np
 from jaxtyping import Float, Float64
 
-from reskin.live.layout import Layout
-from reskin.live.tracker import Readings
+from reskin.live.tracker import Layout, Readings
 
 WINDOW_S, BIN_S = 10.0, 0.02
 BINS_N = round(WINDOW_S / BIN_S)

@@ -4,11 +4,12 @@ Also fits the law to the presses of one board. Units: uT, mm, N.
 """
 
 from dataclasses import asdict, dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.constants import kilo, mega, micro, milli
+from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -236,3 +237,23 @@ def _limits(names: tuple[str, ...]) -> tuple[list[float], list[float]]:
     # Below these a skin would lie in its chips, or push back.
     least = {"gap_mm": 0.3, "amplitude": 0.05, "modulus_MPa": 0.01}
     return [least.get(name, -np.inf) for name in names], [np.inf] * len(names)
+
+
+CHIPS_MM = ((0.0, 0.0), (-7.0, 0.0), (0.0, -7.0), (7.0, 0.0), (0.0, 7.0))
+TURNS_DEG = (0.0, 180.0, 270.0, 90.0, 0.0)
+
+
+def to_board(b_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f ch"]:
+    """Turn readings from the chips' axes to the board's."""
+    return b_uT @ _turn()
+
+
+def to_chips(b_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f ch"]:
+    """Turn readings from the board's axes to the chips'."""
+    return b_uT @ _turn().T
+
+
+@cache
+def _turn() -> Float[np.ndarray, "ch ch"]:
+    of_chips = Rotation.from_euler("z", np.array(TURNS_DEG)[:, None], degrees=True).as_matrix()
+    return np.array(block_diag(*of_chips)).T

@@ -17,7 +17,6 @@ from jaxtyping import Float
 from reskin import io
 from reskin.data.grid import CENTRE_MM
 from reskin.errors import SchemaError
-from reskin.universal.axes import to_board, to_chips
 from reskin.universal.calibration import (
     CHANNELS_N,
     CalibrationData,
@@ -35,6 +34,7 @@ from reskin.universal.calibration import (
     write_calibration,
 )
 from reskin.universal.combine import Labels, multiply, off_middle_mm, told_mm
+from reskin.universal.law import to_board, to_chips
 from reskin.universal.map import (
     ROUNDS_N,
     Estimate,

@@ -22,10 +22,9 @@ import numpy as np
 import pytest
 from aiohttp import web
 
-from reskin.live.layout import layout_of
 from reskin.live.server import Server
 from reskin.live.session import Live
-from reskin.live.tracker import Readings, Skin
+from reskin.live.tracker import Readings, Skin, layout_of
 from reskin.live.view import LATENCIES_N, View
 from reskin.predicting import read_network
 from tests.benchmarks import size

@@ -16,9 +16,8 @@ from reskin.live.calibrating import SHOWN_MM
 from reskin.physics.skin import SkinDesign
 from reskin.seeds import rng_for
 from reskin.simulation.defaults import nominal
-from reskin.universal.axes import CHIPS_MM, to_board
 from reskin.universal.calibration import expected_gain
-from reskin.universal.law import Setup
+from reskin.universal.law import CHIPS_MM, Setup, to_board
 from reskin.universal.map import NOMINAL, OF_NOMINAL
 from reskin.universal.model import SKIN_MM, Universal, load_universal
 from reskin.universal.population import PLACES_N, draw_population

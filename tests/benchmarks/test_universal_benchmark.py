@@ -18,8 +18,7 @@ from reskin.config import parse
 from reskin.physics.skin import SkinDesign
 from reskin.simulation.defaults import nominal
 from reskin.universal import map
-from reskin.universal.axes import CHIPS_MM
-from reskin.universal.law import Setup
+from reskin.universal.law import CHIPS_MM, Setup
 from reskin.universal.map import NOMINAL, OF_NOMINAL, Tables, tabulate
 from reskin.universal.model import SKIN_MM, Universal
 from reskin.universal.network import FULL_SET_N, Weights

@@ -23,8 +23,7 @@ from reskin.live.session import Live
 from reskin.predicting import read_network
 from reskin.recordings import clocks, header, probe
 from reskin.recordings.header import PROBE_FILE, Wire
-from reskin.recordings.labelling.places import parse_places
-from reskin.recordings.labelling.prompts import Prompts
+from reskin.recordings.labelling import Prompts, parse_places
 from reskin.recordings.labels import Dwell, ProbeTape
 from reskin.recordings.readers import READERS, sd_card
 from reskin.recordings.samples import Dwells, Gauge, Table

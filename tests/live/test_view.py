@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from reskin.live.layout import layout_of
-from reskin.live.tracker import Readings
+from reskin.live.tracker import Readings, layout_of
 from reskin.live.view import BIN_S, BINS_N, HEAD, NUMBERS_N, View
 
 

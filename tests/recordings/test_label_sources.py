@@ -12,11 +12,17 @@ import pytest
 from reskin.errors import CaptureError, ParamsError
 from reskin.recordings import probe
 from reskin.recordings.header import PROBE_FILE
-from reskin.recordings.labelling.gauge import Forces, from_gauge
-from reskin.recordings.labelling.places import parse_places
-from reskin.recordings.labelling.prompts import Prompts
-from reskin.recordings.labelling.source import Desk, Labeller, Source, from_program
-from reskin.recordings.labelling.table import from_table
+from reskin.recordings.labelling import (
+    Desk,
+    Forces,
+    Labeller,
+    Prompts,
+    Source,
+    from_gauge,
+    from_program,
+    from_table,
+    parse_places,
+)
 from reskin.recordings.labels import Label, ProbeTape
 from reskin.seeds import rng_for
 
@@ -158,8 +164,8 @@ class Telling:
 def telling(monkeypatch):
     def tell(chunks):
         gauge = Telling(chunks)
-        monkeypatch.setattr("reskin.recordings.labelling.gauge.open_port", lambda *_: gauge)
-        monkeypatch.setattr("reskin.recordings.labelling.gauge.read_waiting", Telling.read)
+        monkeypatch.setattr("reskin.recordings.labelling.open_port", lambda *_: gauge)
+        monkeypatch.setattr("reskin.recordings.labelling.read_waiting", Telling.read)
         return gauge
 
     return tell

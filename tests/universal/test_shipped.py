@@ -17,8 +17,8 @@ from reskin.physics.magnet import Quadrature
 from reskin.physics.skin import SkinDesign, changes_of_field, draw_skin
 from reskin.seeds import rng_for
 from reskin.simulation import defaults
-from reskin.universal.axes import to_chips
 from reskin.universal.calibration import CHANNELS_N
+from reskin.universal.law import to_chips
 from reskin.universal.map import NOMINAL
 from reskin.universal.model import FILE, Universal, load_universal
 
