@@ -130,14 +130,14 @@ def publish() -> None:
     from pipeline.tracking import publish as write
 
     for name in checked_plan().scenes:
-        scene, answers = read_scene(root, name), root / "data/answers" / name
+        scene, results = read_scene(root, name), root / "data/results" / name
         arms = {arm: root / "data/models" / name / arm for arm in scene.modelled}
-        written = [answers / f"{stage}.json" for stage in (*scene.curves.values(), *scene.experiments)]
+        written = [results / f"{stage}.json" for stage in (*scene.curves.values(), *scene.analyses)]
         missing = [path for path in (*arms.values(), *written) if not path.exists()]
         if missing:
             typer.echo(f"{name}: {missing[0].relative_to(root)} is not there yet; run dvc repro first")
             continue
-        counts = write(arms, read_curves(scene, answers), root / "reports" / name, scene=name, root=root)
+        counts = write(arms, read_curves(scene, results), root / "reports" / name, scene=name, root=root)
         typer.echo(f"{name}: MLflow runs {counts}")
 
 
@@ -212,7 +212,7 @@ def use(names: list[str]) -> None:
 
 @scenes.command()
 def tidy() -> None:
-    """Remove the files of questions that were switched off since they ran, of the scenes that run."""
+    """Remove the files of experiments that were switched off since they ran, of the scenes that run."""
     from pipeline.manage import tidy as tidying
 
     stale = tidying.tidy(checkout(), checked_plan())

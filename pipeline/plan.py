@@ -12,11 +12,11 @@ from pipeline import PLAN, SCENES
 from pipeline.manage.registry import Registry, read_registry
 from pipeline.manage.running import LOCKS, need_rest
 from pipeline.scenes import (
+    ANALYSES,
     EXPERIMENTS,
     LEARNING,
     MAIN_PROTOCOL,
     NOT_INGESTED,
-    QUESTIONS,
     TABLE_2,
     Plan,
     Scene,
@@ -61,21 +61,21 @@ def make_plan(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, Any]
         "describe": list(scenes),
         "split": list(scenes),
     }
-    for stage in stages(QUESTIONS, *LEARNING, "study"):
+    for stage in stages(EXPERIMENTS, *LEARNING, "study"):
         items[stage] = [name for name, scene in scenes.items() if scene.runs(stage)]
-    for name in EXPERIMENTS:
-        protocol = QUESTIONS[name].protocol
-        running = [scene for scene in scenes if name in scenes[scene].questions]
+    for name in ANALYSES:
+        protocol = EXPERIMENTS[name].protocol
+        running = [scene for scene in scenes if name in scenes[scene].experiments]
         if protocol is None:
             items[name] = running
         else:
             items[name] = {
                 scene: scene if scenes[scene].simulate is None else _folder(scene, protocol) for scene in running
             }
-    items["table2"] = [name for name, scene in scenes.items() if {*TABLE_2.values()} <= {*scene.questions}]
+    items["table2"] = [name for name, scene in scenes.items() if {*TABLE_2.values()} <= {*scene.experiments}]
     items |= {stage: list(scenes) for stage in ("report", "publish")}
     return {
-        "scenes": {name: list(scene.questions) for name, scene in scenes.items()},
+        "scenes": {name: list(scene.experiments) for name, scene in scenes.items()},
         "captures": captures,
         "held_out": {name: list(scene.with_folds) for name, scene in scenes.items()},
         "models": {name: scene.modelled for name, scene in scenes.items()},

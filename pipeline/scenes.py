@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from pipeline import PARAMS
-from pipeline.questions import LEARNING_ROWS, Kind, Question, experiment_rows
+from pipeline.catalogue import LEARNING_ROWS, Experiment, Kind, experiment_rows
 from pipeline.settings import Seeded, Settings, read_settings
 from pipeline.stages import module_of
 from reskin.config import Strict, parse, read_yaml
@@ -20,22 +20,22 @@ from reskin.recordings.fault_policy import Decisions
 MAIN_PROTOCOL = "grid"  # folds are drawn on its captures
 NOT_INGESTED = {"walk"}  # kinds of protocols whose captures are read as they are: an SD card knows no probe
 POOLED_BY = "adapt"  # takes pokes of the held-out skins, so a part of these is kept from every test
-# The rows of table 2 and who answers them; a scene that asks all of these questions has the table early.
+# The rows of table 2 and who answers them; a scene that asks all of these experiments has the table early.
 TABLE_2 = {"single": "transfer", "multi": "lobo", "triplet": "triplet", "adapted": "adapt"}
 
 
 ROWS = (*LEARNING_ROWS, *experiment_rows())
-QUESTIONS: Mapping[str, Question] = {row.name: row for row in ROWS}
+EXPERIMENTS: Mapping[str, Experiment] = {row.name: row for row in ROWS}
 
 
 def stages(names: Iterable[str], *kinds: Kind) -> list[str]:
-    """Name the stages that answer questions of some kinds, in the order of the table; each once."""
+    """Name the stages that answer experiments of some kinds, in the order of the table; each once."""
     chosen = set(names)
     return list(dict.fromkeys(row.stage for row in ROWS if row.name in chosen and row.kind in kinds))
 
 
 LEARNING: tuple[Kind, ...] = ("models", "curve", "other")
-EXPERIMENTS = tuple(row.name for row in ROWS if row.kind == "experiment")
+ANALYSES = tuple(row.name for row in ROWS if row.kind == "analysis")
 SECTIONS = tuple(dict.fromkeys(row.stage for row in ROWS if row.section))
 
 
@@ -60,23 +60,23 @@ class Simulation(Strict):
     protocols: Annotated[dict[str, OnBoards], Field(min_length=1)]
 
 
-class Asking(Strict, extra="ignore"):
+class SceneExperiments(Strict, extra="ignore"):
     """The two settings of a scene that say which stages it has."""
 
     source: Source
-    questions: Annotated[tuple[Literal[tuple(QUESTIONS)], ...], Field(min_length=1)]  # type: ignore[valid-type]
+    experiments: Annotated[tuple[Literal[tuple(EXPERIMENTS)], ...], Field(min_length=1)]  # type: ignore[valid-type]
 
     @property
-    def rows(self) -> list[Question]:
-        """The rows of the table of questions that the scene asks, in the order that it asks them."""
-        return [QUESTIONS[name] for name in self.questions]
+    def rows(self) -> list[Experiment]:
+        """The rows of the table of experiments that the scene asks, in the order that it asks them."""
+        return [EXPERIMENTS[name] for name in self.experiments]
 
     @property
-    def experiments(self) -> tuple[str, ...]:
-        return tuple(row.name for row in self.rows if row.kind == "experiment")
+    def analyses(self) -> tuple[str, ...]:
+        return tuple(row.name for row in self.rows if row.kind == "analysis")
 
     @property
-    def studied(self) -> tuple[str, ...]:
+    def studies(self) -> tuple[str, ...]:
         return tuple(row.name for row in self.rows if row.kind == "study")
 
     @property
@@ -86,16 +86,16 @@ class Asking(Strict, extra="ignore"):
     @property
     def modelled(self) -> list[str]:
         """The stages that leave models, with cards and predictions."""
-        return stages(self.questions, "models")
+        return stages(self.experiments, "models")
 
     @property
     def curves(self) -> dict[str, str]:
-        """The questions whose answers are points of a curve, and the stage that finds them."""
-        return {row.name: row.stage for row in ROWS if row.kind == "curve" and row.name in self.questions}
+        """The experiments whose answers are points of a curve, and the stage that finds them."""
+        return {row.name: row.stage for row in ROWS if row.kind == "curve" and row.name in self.experiments}
 
     @property
     def protocols(self) -> set[str]:
-        """The protocols that a simulated scene needs for its questions."""
+        """The protocols that a simulated scene needs for its experiments."""
         return {MAIN_PROTOCOL} | {row.protocol for row in self.rows if row.protocol is not None}
 
     @property
@@ -111,22 +111,22 @@ class Asking(Strict, extra="ignore"):
         return not part or self.source == "recorded" or part in self.protocols
 
 
-class Scene(Asking, Seeded, extra="allow"):
-    """One named set-up: its captures (or how to simulate them), the questions it asks, and a section for each."""
+class Scene(SceneExperiments, Seeded, extra="allow"):
+    """One named set-up: its captures (or how to simulate them), the experiments it asks, and a section for each."""
 
     selection: Selection
     split: Split
     simulate: Simulation | None = None
 
     @model_validator(mode="after")
-    def _sections_follow_questions(self) -> "Scene":
+    def _sections_follow_experiments(self) -> "Scene":
         if (self.simulate is not None) != (self.source == "simulated"):
             raise ValueError("section simulate stands in a scene if and only if its source is simulated")
         for row in self.rows:
-            if lacking := set(row.needs) - set(self.questions):
+            if lacking := set(row.needs) - set(self.experiments):
                 raise ValueError(f"a scene that asks {row.name} also asks {sorted(lacking)}, on which it goes on")
         keys = {key for row in self.rows for key in row.folds or ()}
-        keys |= {"pool_passes_n"} if POOLED_BY in self.questions else set()
+        keys |= {"pool_passes_n"} if POOLED_BY in self.experiments else set()
         sections = {row.stage for row in self.rows if row.section}
         wrong = [
             *_differ("the scene", set(self.model_extra or ()), sections),
@@ -134,19 +134,21 @@ class Scene(Asking, Seeded, extra="allow"):
             *(_differ("simulate.protocols", set(self.simulate.protocols), self.protocols) if self.simulate else ()),
         ]
         if wrong:
-            raise ValueError(f"a scene holds exactly what its questions need; {'; '.join(wrong)}")
+            raise ValueError(f"a scene holds exactly what its experiments need; {'; '.join(wrong)}")
         return self
 
     @model_validator(mode="after")
-    def _questions_fit_the_source(self) -> "Scene":
+    def _experiments_fit_the_source(self) -> "Scene":
         if not self.with_folds and not any(row.alone for row in self.rows):
             with_folds = sorted(row.name for row in ROWS if row.folds is not None or row.alone)
-            raise ValueError(f"questions holds at least one of {with_folds}")
+            raise ValueError(f"experiments holds at least one of {with_folds}")
         if self.simulate is None:
-            if self.studied:
-                raise ValueError(f"questions {list(self.studied)} are about physics: only a simulated scene asks them")
+            if self.studies:
+                raise ValueError(
+                    f"experiments {list(self.studies)} are about physics: only a simulated scene asks them"
+                )
             if beyond := sorted(row.name for row in self.rows if not row.recorded):
-                raise ValueError(f"questions {beyond} are asked of simulated scenes only, so far")
+                raise ValueError(f"experiments {beyond} are asked of simulated scenes only, so far")
         return self
 
 
@@ -197,13 +199,13 @@ def check_scene(settings: Settings) -> Scene:
     return scene
 
 
-def asked_by(settings: Settings) -> Asking:
+def experiments_of(settings: Settings) -> SceneExperiments:
     """Parse which experiments a scene runs, and on which kind of data."""
-    return parse(Asking, {name: settings[name] for name in ("source", "questions")}, settings.where)
+    return parse(SceneExperiments, {name: settings[name] for name in ("source", "experiments")}, settings.where)
 
 
 def parse_scene(words: Mapping[str, Any], where: str) -> Scene:
-    """Check a scene's questions, and that it has the sections for them; their stages check what stands in these."""
+    """Check a scene's experiments, and that it has the sections for them; their stages check what stands in these."""
     for name, value in words.items():
         if name not in {*Scene.model_fields, *SECTIONS}:
             raise ParamsError(where, name, "a known parameter", repr(value)[:80], "Mend it there.")

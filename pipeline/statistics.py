@@ -22,7 +22,7 @@ KEYS = (*NAMES, *COUNTS)  # every other column is a metric
 SURENESS = ("coverage_pct", "half_width_mm")  # of 90 % intervals, where a method tells how sure it is
 ALL_SKINS = ""  # in column `skin`: all rows that a training was tested on
 AS_LABELLED, REGISTERED = "as_labelled", "registered"  # places: the latter after one offset a board, a diagnosis
-METHODS = {"triplet": "network + triplet", "adapt": "network, adapted"}  # of cards, by question
+METHODS = {"triplet": "network + triplet", "adapt": "network, adapted"}  # of cards, by experiment
 CONFIDENCE = 0.95  # convention
 PERCENTAGES = ("accuracy_pct", "coverage_pct")  # between 0 and 100
 AT_MOST_1 = ("r2_f", "cosine_mean", "explained_median")
@@ -46,13 +46,15 @@ Stat = Mapping[str, Any]
 
 
 def tidy(cards: Cards, points: Mapping[str, Cards] | None = None) -> pd.DataFrame:
-    """Tabulate what cards of models and points of curves, by question, say of their scores.
+    """Tabulate what cards of models and points of curves, by experiment, say of their scores.
 
     Networks adapted to one skin each have a row for all skins of their fold too, by fold and seed.
     """
     keyed = [(_keys_of_card(card), card["scores"]) for card in cards]
     keyed += [
-        (_keys_of_point(question, point), point["scores"]) for question, own in (points or {}).items() for point in own
+        (_keys_of_point(experiment, point), point["scores"])
+        for experiment, own in (points or {}).items()
+        for point in own
     ]
     rows = [dict.fromkeys(NAMES, "") | row for keys, scores in keyed for row in _rows(keys, scores)]
     alike: dict[Hashable, list[dict[str, Any]]] = {}  # for all skins: one training, or one for each skin
@@ -359,10 +361,10 @@ def _keys_of_card(card: Mapping[str, Any]) -> dict[str, Any]:
     return keys | ({"base": tuning["settings"]["base"], "pokes_n": tuning["pokes_n"]} if tuning else {})
 
 
-def _keys_of_point(question: str, point: Mapping[str, Any]) -> dict[str, Any]:
+def _keys_of_point(experiment: str, point: Mapping[str, Any]) -> dict[str, Any]:
     named = {"name": "recipe", "seed_i": "seed", "rows_n": "trained_on_rows_n"}
     keys = {named.get(key, key): value for key, value in point.items()}
-    return {key: value for key, value in keys.items() if key in KEYS} | {"question": question}
+    return {key: value for key, value in keys.items() if key in KEYS} | {"question": experiment}
 
 
 def _rows(keys: Mapping[str, Any], scores: Mapping[str, Any]) -> list[dict[str, Any]]:

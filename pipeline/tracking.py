@@ -342,11 +342,11 @@ def _flat(value: Any, name: str, step: int) -> Iterator[tuple[str, float, int]]:
 
 
 def _log_means(client: Any, run_id: str, cards: list[dict[str, Any]]) -> None:
-    """Write to the parent mean and sd over its children, for each question and recipe."""
+    """Write to the parent mean and sd over its children, for each experiment and recipe."""
     means = []
-    for (question, recipe), rows in tidy(cards).groupby(["question", "recipe"]):
+    for (experiment, recipe), rows in tidy(cards).groupby(["question", "recipe"]):
         for name, summary in over_folds(rows).items():
-            means += [(f"{question}.{recipe}.{name}.{key}", value, 0) for key, value in summary.items()]
+            means += [(f"{experiment}.{recipe}.{name}.{key}", value, 0) for key, value in summary.items()]
     _log(client, run_id, means)
 
 

@@ -1,6 +1,6 @@
 """Scenes for tests, as plain words, and the settings that a stage has of them."""
 
-from pipeline.scenes import Asking, Scene, check_scene
+from pipeline.scenes import Scene, SceneExperiments, check_scene
 from pipeline.settings import Settings
 from reskin.config import parse
 from tests.recordings.headers import AS_USUAL
@@ -17,7 +17,7 @@ TRAINING = {"recipe": "paper", "steps_n": 1, "seeds_n": 1, "variants": {}}
 
 def recorded(**changes: object) -> dict[str, object]:
     scene: dict[str, object] = {
-        "source": "recorded", "seed": 1, "questions": ["lobo"], "selection": {"force_min_N": 0.0}, "split": {},
+        "source": "recorded", "seed": 1, "experiments": ["lobo"], "selection": {"force_min_N": 0.0}, "split": {},
         "train_multi": TRAINING,
     }  # fmt: skip
     return scene | changes
@@ -36,7 +36,7 @@ SHARED: dict[str, object] = {
     "skin": {}, "rig": {}, "chip": {}, "spreads": {}, "terms": {},
 }  # fmt: skip
 
-# what a scene holds, beside the question, for each question about learning
+# what a scene holds, beside the experiment, for each experiment about learning
 SECTIONS: dict[str, dict[str, object]] = {
     "lobo": {"train_multi": TRAINING},
     "transfer": {"train_single": TRAINING},
@@ -80,19 +80,19 @@ DRAWN_WITH: dict[str, dict[str, object]] = {
 }
 
 
-def asking(*questions: str, **changes: object) -> dict[str, object]:
-    """A recorded scene with what these questions need, and nothing else."""
+def asking(*experiments: str, **changes: object) -> dict[str, object]:
+    """A recorded scene with what these experiments need, and nothing else."""
     scene = {name: value for name, value in recorded().items() if name != "train_multi"}
     split: dict[str, object] = {}
-    for question in questions:
-        scene |= SECTIONS[question]
-        split |= DRAWN_WITH.get(question, {})
-    return scene | {"questions": list(questions), "split": split} | changes
+    for experiment in experiments:
+        scene |= SECTIONS[experiment]
+        split |= DRAWN_WITH.get(experiment, {})
+    return scene | {"experiments": list(experiments), "split": split} | changes
 
 
 def settings(scene: dict[str, object], name: str = "tiny", **shared: object) -> Settings:
     """All settings of a scene, as a stage reads them."""
-    asked = parse(Asking, {key: scene[key] for key in ("source", "questions")}, name)
+    asked = parse(SceneExperiments, {key: scene[key] for key in ("source", "experiments")}, name)
     return Settings(name, f"{name}.yaml", scene, SHARED | shared, (), asked.with_folds, tuple(asked.modelled))
 
 

@@ -97,7 +97,7 @@ def test_what_departs_from_section_compare_is_a_warning_and_no_refusal(root, lab
 
     monkeypatch.setattr("pipeline.experiments.compare.departure", departure)
     words = recorded()
-    words["questions"] = [*words["questions"], "compare"]
+    words["experiments"] = [*words["experiments"], "compare"]
     words["compare"] = config.read_yaml(root / SCENES / "lab.yaml")["compare"]
     with (root / SCENES / "small.yaml").open("w") as stream:
         YAML().dump(words, stream)
@@ -392,5 +392,5 @@ def test_a_scene_that_asks_for_folds_its_data_cannot_give_says_so(root, lab_file
     add_lab(root, lab_file)
     done = run(root, "dvc", "repro", "split@small", check=False)
     assert done.returncode != 0
-    assert "question lobo: boards must be two or more; got 1 (board1)" in done.stderr + done.stdout
+    assert "experiment lobo: boards must be two or more; got 1 (board1)" in done.stderr + done.stdout
     assert "Traceback" not in done.stderr + done.stdout

@@ -20,9 +20,9 @@ STAGE = """\
     do:
       cmd: >-
         python -m pipeline repeat --scene ${item} --indentations data/indentations/${item}
-        --answer data/answers/${item}/repeat.json
+        --results data/results/${item}/repeat.json
       deps: [data/code/repeat, "data/indentations/${item}"]
-      outs: ["data/answers/${item}/repeat.json"]
+      outs: ["data/results/${item}/repeat.json"]
 
 """
 FILES = {
@@ -35,12 +35,12 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.experiments.answer import read_folder, write_answer
+from pipeline.experiments.results import read_folder, write_results
 
 
-def repeat(indentations: Path, answer: Path) -> None:
+def repeat(indentations: Path, results: Path) -> None:
     """Write the standard deviation of force by capture."""
-    write_answer(answer, {one.capture: float(one.Fz_N.std()) for one in read_folder(indentations)}, {})
+    write_results(results, {one.capture: float(one.Fz_N.std()) for one in read_folder(indentations)}, {})
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:

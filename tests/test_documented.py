@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from ruamel.yaml import YAML
 
-from pipeline.scenes import QUESTIONS, check_scene
+from pipeline.scenes import EXPERIMENTS, check_scene
 from pipeline.settings import Settings, read_shared_files
 from pipeline.statistics import KEYS, SURENESS
 from reskin import io
@@ -68,7 +68,7 @@ def numbers(words: Any) -> Iterator[str]:
 def test_every_number_is_documented():
     known = words_of("docs/numbers.md")
     patterns = [word for word in known if "*" in word]
-    chosen = {*QUESTIONS, *read_yaml(ROOT / "dvc.yaml")["stages"], *read_yaml(ROOT / "params.yaml")["recipes"]}
+    chosen = {*EXPERIMENTS, *read_yaml(ROOT / "dvc.yaml")["stages"], *read_yaml(ROOT / "params.yaml")["recipes"]}
     chosen |= {name for file in SETTINGS[1:] for name in read_yaml(file).get("simulate", {}).get("protocols", ())}
     found = {key for file in (ROOT / "reports").glob("*/numbers.json") for key in numbers(io.read_json(file))}
     unknown = {key for key in found - known - chosen if not NAME.fullmatch(key)}

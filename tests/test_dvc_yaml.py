@@ -8,7 +8,7 @@ import pytest
 from dvc.repo import Repo
 from ruamel.yaml import YAML
 
-from pipeline.scenes import EXPERIMENTS
+from pipeline.scenes import ANALYSES
 from pipeline.stages.code import digests_of, entries
 from reskin import code
 from reskin.code import file_of
@@ -37,7 +37,7 @@ def test_stage_code_reads_every_module_that_a_stage_imports_and_idle_paths_are_n
 def test_a_stage_knows_the_modules_that_decide_its_results():
     assert "reskin.models.train" in digests_of("train_multi")
     assert "reskin.models.train" not in digests_of("simulate")
-    assert {f"pipeline.experiments.{name}" for name in EXPERIMENTS} <= digests_of("report").keys()
+    assert {f"pipeline.experiments.{name}" for name in ANALYSES} <= digests_of("report").keys()
 
 
 def test_a_caption_runs_the_report_again_and_no_experiment(monkeypatch):
@@ -67,7 +67,7 @@ def test_every_path_that_a_command_takes_is_declared(name):
 
 
 def test_the_flow_stays_below_thirty_stages_beside_experiments():
-    assert len(STAGES.keys() - set(EXPERIMENTS)) < 30
+    assert len(STAGES.keys() - set(ANALYSES)) < 30
 
 
 def test_recordings_that_git_leaves_out_are_known_to_dvc(tmp_path):

@@ -9,7 +9,7 @@ from reskin.errors import ParamsError
 from tests.scenes import ADAPTATIONS, DRAWN_WITH, SECTIONS, TRAINING, asking, check, recorded
 
 ROOT = Path(__file__).resolve().parents[1]
-PAPERS_CLAIM = ("lobo", "triplet", "adapt")  # the questions that those of adaptation go on from
+PAPERS_CLAIM = ("lobo", "triplet", "adapt")  # the experiments that those of adaptation go on from
 
 
 @pytest.mark.parametrize("file", sorted((ROOT / "pipeline/scenes").glob("*.yaml")), ids=lambda file: file.stem)
@@ -28,11 +28,11 @@ def test_the_params_of_the_checkout_are_legal():
         ({"sead": 3}, "scene.yaml: sead must be a known parameter; got 3"),
         ({"seed": "3"}, "scene.yaml: seed must be a valid integer; got '3'"),
         ({"seed": -1}, "seed must be greater than or equal to 0; got -1"),
-        ({"questions": ["lobbo"]}, r"questions.0 must be .*'lobo'.*; got 'lobbo'"),
-        ({"questions": []}, "questions must"),
+        ({"experiments": ["lobbo"]}, r"experiments.0 must be .*'lobo'.*; got 'lobbo'"),
+        ({"experiments": []}, "experiments must"),
         ({"source": "simulated"}, "section simulate stands in a scene if and only if its source is simulated"),
         ({"train_single": TRAINING}, "of the scene nothing asks train_single"),
-        ({"questions": ["lobo", "transfer"], "train_single": TRAINING}, "split lacks transfer_skins_n"),
+        ({"experiments": ["lobo", "transfer"], "train_single": TRAINING}, "split lacks transfer_skins_n"),
         ({"split": {"transfer_skins_n": 3}}, "of split nothing asks transfer_skins_n"),
         ({"train_multi": TRAINING | {"recipe": "other"}}, "a row of recipes must be one of .*; got 'other'"),
         (
@@ -51,8 +51,8 @@ def test_a_wrong_scene_is_one_sentence_that_names_the_parameter(changes, sentenc
         check(recorded(**changes))
 
 
-def scene(*questions: str, **changes: object) -> Scene:
-    return check(asking(*questions, **changes))
+def scene(*experiments: str, **changes: object) -> Scene:
+    return check(asking(*experiments, **changes))
 
 
 @pytest.mark.parametrize(
@@ -69,12 +69,12 @@ def scene(*questions: str, **changes: object) -> Scene:
         ("contacts", ("lobo",)),
     ],
 )
-def test_a_question_that_goes_on_from_others_is_legal_with_them_and_refused_without_the_last(question, others):
-    assert question in scene(*others, question).questions
+def test_an_experiment_that_goes_on_from_others_is_legal_with_them_and_refused_without_the_last(experiment, others):
+    assert experiment in scene(*others, experiment).experiments
     with pytest.raises(ParamsError) as refused:
-        scene(*others[:-1], question)
+        scene(*others[:-1], experiment)
     assert str(refused.value) == (
-        f"scene.yaml: a scene that asks {question} also asks ['{others[-1]}'], on which it goes on. Mend it there."
+        f"scene.yaml: a scene that asks {experiment} also asks ['{others[-1]}'], on which it goes on. Mend it there."
     )
 
 
@@ -94,14 +94,14 @@ def test_windows_that_contradict_each_other_are_refused(changes, sentence):
 
 
 def test_an_experiment_on_skins_that_only_a_simulator_has_is_refused_for_recorded_ones():
-    with pytest.raises(ParamsError, match=r"questions \['sensitivity'\] are asked of simulated scenes only"):
-        parse_scene(recorded(questions=["lobo", "sensitivity"]), "scene.yaml")
+    with pytest.raises(ParamsError, match=r"experiments \['sensitivity'\] are asked of simulated scenes only"):
+        parse_scene(recorded(experiments=["lobo", "sensitivity"]), "scene.yaml")
 
 
 @pytest.mark.parametrize("dropped", ["drift", "shear"])
 def test_an_experiment_that_is_switched_off_takes_its_section_and_its_captures_along(dropped):
     own = read_yaml(ROOT / "pipeline/scenes/ci.yaml")
-    own["questions"].remove(dropped)
+    own["experiments"].remove(dropped)
     own.pop(dropped)
     if dropped == "drift":  # its captures are asked for variation as well
         parse_scene(own, "ci.yaml")
@@ -115,18 +115,18 @@ def test_an_experiment_that_is_switched_off_takes_its_section_and_its_captures_a
 @pytest.mark.parametrize(
     "unit", ["train_multi", "drift", "simulate-wear", "ingest_simulated-wear", "simulate", "report", "left_out"]
 )
-def test_what_a_stage_cost_counts_as_long_as_its_question_is_asked(unit):
+def test_what_a_stage_cost_counts_as_long_as_its_experiment_is_asked(unit):
     own = read_yaml(ROOT / "pipeline/scenes/ci.yaml")
     assert parse_scene(own, "ci.yaml").runs(unit)
     gone = ("drift", "variation")
-    own["questions"] = [question for question in own["questions"] if question not in (*gone, "left_out")]
+    own["experiments"] = [experiment for experiment in own["experiments"] if experiment not in (*gone, "left_out")]
     own = {name: section for name, section in own.items() if name not in gone}
     own["simulate"]["protocols"].pop("wear")
     left = parse_scene(own, "ci.yaml")
     assert left.runs(unit) == (unit in ("train_multi", "simulate", "report"))
 
 
-def test_all_that_a_question_lacks_is_named_at_once():
+def test_all_that_an_experiment_lacks_is_named_at_once():
     with pytest.raises(ParamsError, match=r"asks choice also asks \['adapt', 'triplet'\], on which it goes on"):
         scene("lobo", "choice")
 
@@ -136,7 +136,7 @@ ALL = (*PAPERS_CLAIM, "transfer", "pokes", "sensors", "labels", "baselines", "au
 
 def test_a_scene_may_ask_everything_and_names_the_stages_that_answer():
     asked = scene(*ALL)
-    assert set(stages(asked.questions, *LEARNING)) == {
+    assert set(stages(asked.experiments, *LEARNING)) == {
         "train_single", "train_multi", "train_triplet", "adapt", "sweep_pokes", "sweep_sensors", "train_classical",
         "few_labels", "audit",
     }  # fmt: skip
@@ -147,25 +147,29 @@ def test_a_scene_may_ask_everything_and_names_the_stages_that_answer():
     assert set(asked.with_folds) == {"lobo", "transfer", "sensors", "labels"}  # these have folds of their own
 
 
-def test_a_scene_that_asks_one_question_has_one_stage_and_no_curve():
+def test_a_scene_that_asks_one_experiment_has_one_stage_and_no_curve():
     asked = scene("lobo")
-    assert (stages(asked.questions, *LEARNING), asked.modelled, asked.curves) == (["train_multi"], ["train_multi"], {})
+    assert (stages(asked.experiments, *LEARNING), asked.modelled, asked.curves) == (
+        ["train_multi"],
+        ["train_multi"],
+        {},
+    )
 
 
 @pytest.mark.parametrize("question", [one for one in ALL if SECTIONS[one]])
-def test_a_section_stands_in_a_scene_if_and_only_if_its_question_is_asked(question):
-    ((section, words),) = SECTIONS[question].items()
+def test_a_section_stands_in_a_scene_if_and_only_if_its_experiment_is_asked(experiment):
+    ((section, words),) = SECTIONS[experiment].items()
     lacking = {name: value for name, value in asking(*ALL).items() if name != section}
     with pytest.raises(ParamsError, match=f"the scene lacks {section}. Mend it there."):
         parse_scene(lacking, "scene.yaml")
     with pytest.raises(ParamsError, match=f"of the scene nothing asks {section}[.;]"):
-        scene("single_temporal" if question == "lobo" else "lobo", **{section: words})
+        scene("single_temporal" if experiment == "lobo" else "lobo", **{section: words})
 
 
 @pytest.mark.parametrize("question", DRAWN_WITH)
-def test_split_holds_what_draws_the_folds_of_a_question_and_nothing_else(question):
-    own, others = DRAWN_WITH[question], ("lobo", "triplet", *(["adapt"] if question == "sensors" else []))
-    asked = asking(*others, question)
+def test_split_holds_what_draws_the_folds_of_an_experiment_and_nothing_else(experiment):
+    own, others = DRAWN_WITH[experiment], ("lobo", "triplet", *(["adapt"] if experiment == "sensors" else []))
+    asked = asking(*others, experiment)
     parse_scene(asked, "scene.yaml")
     unasked = asking(*others)
     for key, value in own.items():
@@ -186,13 +190,13 @@ def test_split_holds_what_draws_the_folds_of_a_question_and_nothing_else(questio
         ({"sweep_pokes": {"pokes_n": [8], "boards_n": 0}}, "sweep_pokes: boards_n must be greater than or equal to 1"),
     ],
 )
-def test_a_wrong_setting_of_a_question_is_one_sentence(changes, sentence):
+def test_a_wrong_setting_of_an_experiment_is_one_sentence(changes, sentence):
     with pytest.raises(ParamsError, match=sentence):
         scene(*ALL, **changes)
 
 
 def test_all_that_a_copied_scene_holds_too_much_or_too_little_is_named_at_once():
-    words = read_yaml(ROOT / "pipeline/scenes/ci.yaml") | {"questions": ["lobo", "sensitivity"]}
+    words = read_yaml(ROOT / "pipeline/scenes/ci.yaml") | {"experiments": ["lobo", "sensitivity"]}
     words["split"] = {}
     words["simulate"]["protocols"].pop("glass")
     with pytest.raises(ParamsError) as refused:
@@ -240,8 +244,8 @@ def test_a_base_that_is_no_recipe_of_train_triplet_is_refused_at_once():
         check(scene)
 
 
-def test_a_question_without_the_one_it_goes_on_from_names_that_one():
+def test_an_experiment_without_the_one_it_goes_on_from_names_that_one():
     scene = asking("lobo", "triplet", "adapt")
-    scene["questions"] = ["lobo", "adapt"]
+    scene["experiments"] = ["lobo", "adapt"]
     with pytest.raises(ParamsError, match=r"a scene that asks adapt also asks \['triplet'\]"):
         parse_scene(scene, "scene.yaml")

@@ -6,8 +6,8 @@ from ruamel.yaml import YAML
 
 from pipeline import FLOW, PARAMS, PLAN, SCENES, plan
 from pipeline.manage.registry import Entry, Registry
-from pipeline.scenes import EXPERIMENTS, Plan, Scene, parse_scene
-from pipeline.stages.report import read_asked
+from pipeline.scenes import ANALYSES, Plan, Scene, parse_scene
+from pipeline.stages.report import read_experiments
 from reskin.config import parse
 from reskin.errors import ParamsError
 from reskin.simulation.defaults import SHARED as SIMULATED
@@ -30,7 +30,7 @@ def test_the_plan_of_the_checkout_is_what_its_scenes_ask_for():
     plan.check(ROOT)
 
 
-def test_a_question_that_no_scene_asks_has_no_stage():
+def test_an_experiment_that_no_scene_asks_has_no_stage():
     made = make_plan({"lab": scene()}, Registry(captures={"lab": {"c0": ENTRY}}))["stages"]
     assert made["train_multi"] == ["lab"]
     assert made["train_single"] == made["verification"] == made["runtime"] == []
@@ -41,7 +41,7 @@ ADAPTED = ("lobo", "triplet", "adapt")
 
 
 @pytest.mark.parametrize(
-    ("stage", "questions"),
+    ("stage", "experiments"),
     [
         ("train_triplet", ("lobo", "triplet")),
         ("adapt", ADAPTED),
@@ -52,8 +52,8 @@ ADAPTED = ("lobo", "triplet", "adapt")
         ("audit", ("lobo", "audit")),
     ],
 )
-def test_a_stage_about_learning_runs_for_the_scenes_that_ask_it_and_for_no_other(stage, questions):
-    asked, plain = (parse_scene(asking(*own), "scene.yaml") for own in (questions, ("lobo",)))
+def test_a_stage_about_learning_runs_for_the_scenes_that_ask_it_and_for_no_other(stage, experiments):
+    asked, plain = (parse_scene(asking(*own), "scene.yaml") for own in (experiments, ("lobo",)))
     captures = Registry(captures={"one": {"c0": ENTRY}, "two": {"c0": ENTRY}})
     made = make_plan({"one": plain, "two": asked}, captures)
     parse(Plan, made, "plan")
@@ -69,7 +69,7 @@ def test_an_experiment_of_a_recorded_scene_is_asked_of_its_own_captures_and_of_n
     parse(Plan, made, "plan")
     assert made["stages"]["drift"] == {"two": "two"}
     assert made["captures"] == {"one": ["c0"], "two": ["c0"]}
-    assert not any(made["stages"][question] for question in EXPERIMENTS if question != "drift")
+    assert not any(made["stages"][experiment] for experiment in ANALYSES if experiment != "drift")
 
 
 def test_a_choice_of_settings_needs_no_stage_of_its_own():
@@ -84,10 +84,10 @@ def test_an_experiment_that_was_added_since_the_plan_is_noticed_by_the_report(tm
     Path("pipeline").mkdir()
     Path(PLAN).write_text("scenes: {tiny: [lobo, baselines]}\n")
     own = settings(asking("lobo", "baselines"))
-    assert read_asked(own).questions == ("lobo", "baselines")
+    assert read_experiments(own).experiments == ("lobo", "baselines")
     Path(PLAN).write_text("scenes: {tiny: [lobo]}\n")
     with pytest.raises(ParamsError, match="baselines only in one. Try: reskin scenes use tiny"):
-        read_asked(own)
+        read_experiments(own)
 
 
 def test_every_recorded_capture_has_an_ingest_of_its_own():
@@ -122,9 +122,9 @@ def test_a_recorded_scene_without_recordings_says_how_to_add_one():
 def checkout(folder: Path, running: str = "{}") -> Path:
     (folder / SCENES).mkdir(parents=True)
     (folder / "data").mkdir()
-    for name, questions in (("one", ["lobo"]), ("two", ["lobo"])):
+    for name, experiments in (("one", ["lobo"]), ("two", ["lobo"])):
         with (folder / SCENES / f"{name}.yaml").open("w") as stream:
-            YAML().dump(recorded(questions=questions), stream)
+            YAML().dump(recorded(experiments=experiments), stream)
     with (folder / "data/captures.yaml").open("w") as stream:
         YAML().dump({"captures": {"one": {"c0": ENTRY.model_dump()}, "two": {"c0": ENTRY.model_dump()}}}, stream)
     with (folder / PARAMS).open("w") as stream:
@@ -191,7 +191,7 @@ def test_every_protocol_has_a_folder_and_stages_of_its_own(tmp_path):
     [
         ({"protocols__wear__terms": ["wind"]}, r"protocols.wear.terms.0 must be 'ageing', 'friction', "),
         ({"protocols__wear__skins_n": 99}, "protocol wear: skins_n 99 is more than rigid boards have, 6"),
-        ({"protocols__press__skins_n": 3}, "protocol press: skins_n is 1, as its question reads one skin, not 3"),
+        ({"protocols__press__skins_n": 3}, "protocol press: skins_n is 1, as its experiment reads one skin, not 3"),
         ({"protocols__flexible__boards": "rigid"}, "protocol flexible: boards is another kind than that of grid"),
     ],
 )

@@ -8,7 +8,7 @@ from pipeline.report.numbers import split
 from pipeline.report.readme import blocks_of
 from reskin import io
 from reskin.config import read_yaml
-from tests.report.synthetic import all_questions
+from tests.report.synthetic import all_experiments
 from tests.stages.checkout import ROOT, copy_checkout, run
 
 OWN = ["reports", "params.yaml", "data/captures.yaml", "dvc.yaml", "README.md", "docs"]
@@ -39,7 +39,7 @@ def test_the_pages_show_the_same_scenes_whichever_scene_runs(tmp_path):
     before = [page.read_bytes() for page in pages]
 
     run(root, "reskin", "scenes", "use", "ci")
-    numbers = all_questions()
+    numbers = all_experiments()
     shared, of_this_run = split(numbers | {"provenance": numbers["provenance"] | {"scene": "ci"}})
     io.write_json(root / "reports/ci/numbers.json", shared)
     io.write_json(root / "reports/ci/provenance.json", of_this_run)
@@ -64,7 +64,7 @@ def test_what_was_rewritten_is_said_with_the_scenes_shown(tmp_path):
 
 def test_the_readme_links_the_code_of_every_stage():
     stages = read_yaml(ROOT / "dvc.yaml")["stages"]
-    links = re.findall(r"\]\((\S+)\)", blocks_of([all_questions()], [], stages, None)["stages"])
+    links = re.findall(r"\]\((\S+)\)", blocks_of([all_experiments()], [], stages, None)["stages"])
     assert len(links) == len(stages)
     assert [link for link in links if not (ROOT / "docs" / link).is_file()] == []
 

@@ -1,4 +1,4 @@
-"""What a switched-off question left is found and removed; all else stays: other scenes' results, DVC's own words."""
+"""What a switched-off experiment left is found and removed; all else stays: other scenes' results, DVC's own words."""
 
 import shutil
 from pathlib import Path
@@ -12,10 +12,10 @@ from tests.scenes import asking
 from tests.test_plan import checkout
 
 WRITTEN = {
-    "drift@one": "data/answers/one/drift.json",
+    "drift@one": "data/results/one/drift.json",
     "train_multi@one": "data/models/one/train_multi",
     "simulate@one-gone": "data/raw/one-gone",
-    "drift@two": "data/answers/two/drift.json",
+    "drift@two": "data/results/two/drift.json",
     "split@one": "data/models/one/folds.json",
 }
 
@@ -34,7 +34,7 @@ def root(tmp_path) -> Path:
     return folder
 
 
-def test_what_a_question_left_is_named_with_its_files(root):
+def test_what_an_experiment_left_is_named_with_its_files(root):
     assert tidy.left_over(root, plan.check(root)) == {
         "drift@one": [root / WRITTEN["drift@one"]],
         "simulate@one-gone": [root / WRITTEN["simulate@one-gone"]],
@@ -64,7 +64,7 @@ def test_a_scene_whose_name_begins_like_another_is_its_own(root):
     assert set(tidy.left_over(root, plan.check(root))) == {"drift@one"}
 
 
-def test_a_question_that_is_asked_leaves_nothing_over(root):
+def test_an_experiment_that_is_asked_leaves_nothing_over(root):
     with (root / SCENES / "one.yaml").open("w") as stream:
         YAML().dump(asking("lobo", "drift"), stream)
     plan.use(root, ["one"])

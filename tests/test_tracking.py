@@ -124,7 +124,7 @@ def test_every_training_is_a_child_run_once_however_often_it_is_published(tmp_pa
     assert sorted(run.data.tags["cell"] for run in current) == ["k0", "k1"]
 
 
-def test_a_new_score_replaces_the_old_one_and_a_dropped_question_is_not_current(tmp_path):
+def test_a_new_score_replaces_the_old_one_and_a_dropped_experiment_is_not_current(tmp_path):
     write(tmp_path, b0="k0", b1="k1")
     # The same training, scored anew: the old score is not what is shown.
     write_model(tmp_path / "models", "b1", "k1", accuracy_pct=77.0)
@@ -133,7 +133,7 @@ def test_a_new_score_replaces_the_old_one_and_a_dropped_question_is_not_current(
     current = runs(tmp_path, "tags.kind = 'training' and tags.current = 'true'")
     assert sorted(run.data.metrics["accuracy_pct"] for run in current) == [50.0, 77.0]
 
-    # A question that is asked no more has no current runs.
+    # An experiment that is asked no more has no current runs.
     publish({}, {}, tmp_path / "reports", scene="ci", root=tmp_path)
     assert [run.data.tags["stage"] for run in runs(tmp_path, "tags.current = 'true'")] == ["report"]
 

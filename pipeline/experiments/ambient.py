@@ -12,7 +12,7 @@ from pydantic import Field
 from scipy.constants import micro, milli
 from scipy.spatial.transform import Rotation
 
-from pipeline.experiments.answer import write_answer
+from pipeline.experiments.results import write_results
 from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
 from pipeline.report.formatting import show_digits
 from pipeline.settings import Settings, Training
@@ -186,7 +186,7 @@ def networks_of_common_part(
     """Train the headline recipe anew on inputs whose common part is taken off, as in use; count what collapsed."""
     without = project(data.rows.db_uT, without_common_part(instrument.turn))
     headline = training.model_copy(update={"recipes": {HEADLINE: training.recipes[HEADLINE]}})
-    trials = trials_of(data, headline, [fold], question="ambient")
+    trials = trials_of(data, headline, [fold], experiment="ambient")
     trained = train_all(replace(data, rows=replace(data.rows, db_uT=without)), trials, "ambient")
     networks = [
         Network({"recipe": trial.recipe.model_dump(mode="json")}, {**one.weights, **one.scaler.arrays()})
@@ -235,7 +235,7 @@ def read(settings: Settings) -> Ambient:
     return settings.section(Ambient, "ambient")
 
 
-def ambient(settings: Settings, folds: Path, indentations: Path, models: Path, answer: Path) -> None:
+def ambient(settings: Settings, folds: Path, indentations: Path, models: Path, results: Path) -> None:
     """Test every held-out board in fields that came up after its no-load readings; train one arm on the last board."""
     data = read_data(settings, indentations, folds)
     of, seed = synthesis_of(data.settings), data.settings.seed
@@ -270,7 +270,7 @@ def ambient(settings: Settings, folds: Path, indentations: Path, models: Path, a
             "iron": by_step(points, "distance_mm", last),
         },
     }
-    write_answer(answer, numbers, {}, trainings=trainings)
+    write_results(results, numbers, {}, trainings=trainings)
 
 
 COLUMNS = {

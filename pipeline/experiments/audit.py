@@ -38,7 +38,7 @@ class Check:
 class Sides:
     """Row numbers of a fold: trained on, poked without labels to adapt to, tested on."""
 
-    question: str
+    experiment: str
     name: str
     train: Int[np.ndarray, " a"]
     pool: Int[np.ndarray, " c"]
@@ -47,7 +47,7 @@ class Sides:
     @property
     def where(self) -> str:
         """A name for people."""
-        return f"{self.question}/{self.name}"
+        return f"{self.experiment}/{self.name}"
 
 
 # The same rows give the same scaler but for the order of float64 sums, and that turns the last bit of a float32 at
@@ -197,16 +197,16 @@ def model_checks(data: SceneData, sides: dict[tuple[str, str], Sides], models: P
         cards = {file: io.read_json(file) for file in sorted((models / arm).glob("*.json"))}
         yield audit_collapse(arm, list(cards.values()))
         for file, card in cards.items():
-            question = "lobo" if card["question"] in ("triplet", "adapt") else card["question"]
+            experiment = "lobo" if card["question"] in ("triplet", "adapt") else card["question"]
             inputs, scaling = card["recipe"]["inputs"], card["recipe"]["scaling"]
             yield audit_scaler(
                 file.stem, io.read_tensors(file.with_suffix(".safetensors"))[0], db_uT=views[inputs],
-                target=data.rows.target, sides=sides[question, card["fold"]],
-                fit=partial(_fit_once, fits, (question, card["fold"], inputs, scaling)),
+                target=data.rows.target, sides=sides[experiment, card["fold"]],
+                fit=partial(_fit_once, fits, (experiment, card["fold"], inputs, scaling)),
             )  # fmt: skip
             bases = keys.setdefault((card["fold"], card["seed_i"]), set())
             if "tuning" in card:
-                side = sides[question, card["fold"]]
+                side = sides[experiment, card["fold"]]
                 yield from audit_tuning(
                     file.stem, card["tuning"], bases=bases, sides=side, indentation=data.rows.indentation
                 )
@@ -252,26 +252,26 @@ def read(settings: Settings) -> AuditSettings:
     return settings.section(AuditSettings, "audit")
 
 
-def audit(settings: Settings, indentations: Path, folds: Path, models: Path, choice: Path, answer: Path) -> None:
+def audit(settings: Settings, indentations: Path, folds: Path, models: Path, choice: Path, results: Path) -> None:
     """Check every fold, the scaler of every network and the settings; a leak fails the stage and names itself."""
     data = read_data(settings, indentations, folds)
     labels = Labels(data.rows.board, data.rows.skin, data.rows.indentation, data.rows.capture)
-    sides = [Sides(fold.question, fold.name, fold.train, fold.pool, fold.test) for fold in data.folds]
+    sides = [Sides(fold.experiment, fold.name, fold.train, fold.pool, fold.test) for fold in data.folds]
     checks = [
         check
         for side in sides
         for check in audit_fold(
-            side, labels, db_uT=data.rows.db_uT, rng=rng_for(data.settings.seed, "audit", side.question, side.name)
+            side, labels, db_uT=data.rows.db_uT, rng=rng_for(data.settings.seed, "audit", side.experiment, side.name)
         )
     ]
-    checks += list(model_checks(data, {(side.question, side.name): side for side in sides}, models))
+    checks += list(model_checks(data, {(side.experiment, side.name): side for side in sides}, models))
     checks += settings_checks(data, choice, models) if read(data.settings).settings == "chosen" else []
     if not holds(checks):
         first = next(check for check in checks if not (check.holds or check.known))
         raise LeakError(
             f"audit of {settings.scene}, {first.where}", first.what, first.rule, first.found, "Look at who is held out."
         )
-    io.write_json(answer, to_words(checks))
+    io.write_json(results, to_words(checks))
     unchosen_n = sum(check.found.startswith(NOT_CHOSEN) for check in checks)
     dead_n = sum(check.known and check.what == COLLAPSE for check in checks)
     papers_n = sum(check.known for check in checks) - dead_n
@@ -410,12 +410,12 @@ def audit_fold(
     indentations: 0 of 1 on both sides: True
     copies: 1 of 1 captures compared; s2 like s1: 0.0 % of 1 indentations: True
     """
-    _check_question(sides)
+    _check_experiment(sides)
     checks = [_readings(sides)]
-    if sides.question in SKINS_UNSEEN:
+    if sides.experiment in SKINS_UNSEEN:
         checks += [_apart("boards", labels.board, sides), _apart("skins", labels.skin, sides)]
         checks += [_apart("indentations", labels.indentation, sides), _copies(sides, labels, db_uT, rng)]
-    elif sides.question in SKIN_SHARED:
+    elif sides.experiment in SKIN_SHARED:
         rule = "apart; the skin is shared by design"
         checks.append(_apart("indentations", labels.indentation, sides, rule=rule))
     else:
@@ -424,11 +424,11 @@ def audit_fold(
     return checks + (_pool(sides, labels) if len(sides.pool) else [])
 
 
-def _check_question(sides: Sides) -> None:
+def _check_experiment(sides: Sides) -> None:
     known = (*SKINS_UNSEEN, *SKIN_SHARED, PAPERS_WAY)
-    if sides.question not in known:
+    if sides.experiment not in known:
         raise ParamsError(
-                f"fold {sides.where}", "the question", f"one of {', '.join(known)}", sides.question,
+                f"fold {sides.where}", "the experiment", f"one of {', '.join(known)}", sides.experiment,
                 "Say in the audit what its two sides may share.",
             )  # fmt: skip
     if not (len(sides.train) and len(sides.test)):

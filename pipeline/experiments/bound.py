@@ -11,7 +11,7 @@ from scipy.constants import milli
 from scipy.special import owens_t
 
 from pipeline.experiments.ambient import seen_uT
-from pipeline.experiments.answer import write_answer
+from pipeline.experiments.results import write_results
 from pipeline.report.formatting import COLUMNS, n_of, show, tabulate
 from pipeline.settings import Settings
 from pipeline.stage import say
@@ -30,7 +30,7 @@ from reskin.simulation.settings import MAIN, Synthesis
 
 ROW_READINGS_N = 1  # of a row that a network sees (dataset.rows)
 STEP_MM = 0.01  # of the differences; 0.002 to 0.05 mm give the same bound within 2 %
-NETWORK = "single_pass"  # the question whose networks never saw a reading of the presses that they are tested on
+NETWORK = "single_pass"  # the experiment whose networks never saw a reading of the presses that they are tested on
 
 Read = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n ch"]]  # x, y and depth in mm -> anything
 
@@ -150,10 +150,10 @@ def network_scores(models: Path, skin: str) -> dict[str, Any]:
     return {metric: scores[metric] for metric in METRICS if metric in scores}
 
 
-def bound(settings: Settings, models: Path, answer: Path) -> None:
+def bound(settings: Settings, models: Path, results: Path) -> None:
     """Bound what one row tells of a poke, and put the paper's network beside it."""
     numbers = bound_of(synthesis_of(settings), seed=settings.seed)
-    write_answer(answer, numbers | {"network": network_scores(models, numbers["skin"])}, {})
+    write_results(results, numbers | {"network": network_scores(models, numbers["skin"])}, {})
     least = numbers["all"]["with_label_errors"]
     say(f"{settings.scene}: noise and labels allow {least['accuracy_pct']:.4g} % and {least['mse_xy_mm2']:.3g} mm2")
 

@@ -12,7 +12,7 @@ from jaxtyping import Float, Float32, Int64
 from pydantic import Field
 from scipy.constants import milli
 
-from pipeline.experiments.answer import write_answer
+from pipeline.experiments.results import write_results
 from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
 from pipeline.report.formatting import show_digits
 from pipeline.settings import Settings
@@ -371,7 +371,7 @@ def read(settings: Settings) -> Contacts:
     return settings.section(Contacts, "contacts")
 
 
-def contacts(settings: Settings, folds: Path, indentations: Path, models: Path, answer: Path) -> None:
+def contacts(settings: Settings, folds: Path, indentations: Path, models: Path, results: Path) -> None:
     """Add pokes of every held-out board in pairs, and ask the networks that never saw it."""
     data = read_data(settings, indentations, folds)
     settings, held_out = data.settings, data.folds_of("lobo")
@@ -398,7 +398,7 @@ def contacts(settings: Settings, folds: Path, indentations: Path, models: Path, 
             synthesis_of(data.settings), section.separations_mm, seed=data.settings.seed
         )
     along = {s: [value for one in drawn for value in one["along"][s]] for s in drawn[0]["along"]}
-    write_answer(answer, numbers, {"along": along})
+    write_results(results, numbers, {"along": along})
 
 
 def _row(stats: dict[str, Any], separation_mm: float) -> dict[str, Any]:

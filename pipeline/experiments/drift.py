@@ -14,7 +14,7 @@ from jaxtyping import Float, Int, Int64, Shaped
 from pydantic import Field, model_validator
 from scipy.constants import micro
 
-from pipeline.experiments.answer import read_folder, read_losses, write_answer
+from pipeline.experiments.results import read_folder, read_losses, write_results
 from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
 from pipeline.report.formatting import COLUMNS, show, tabulate
 from pipeline.report.paper import FIGURE_5
@@ -616,7 +616,7 @@ def read(settings: Settings) -> Drift:
     return settings.with_training(Drift, "drift")
 
 
-def drift(settings: Settings, indentations: Path, answer: Path) -> None:
+def drift(settings: Settings, indentations: Path, results: Path) -> None:
     """Train and test under every no-load policy, on every capture of a folder."""
     prepare_training()
     section, selection = read(settings), settings.section(Selection, "selection")
@@ -644,8 +644,8 @@ def drift(settings: Settings, indentations: Path, answer: Path) -> None:
         )
     variants = {name: own for name, own in rows.items() if name != HEADLINE}
     numbers |= {"left_out_units_n": windows.left_out_units_n} | found | ({"variants": variants} if variants else {})
-    write_answer(
-        answer, numbers, drawn, read_losses(indentations, numbers["dropped"]), tally(map(collapse_record, trained))
+    write_results(
+        results, numbers, drawn, read_losses(indentations, numbers["dropped"]), tally(map(collapse_record, trained))
     )
 
 

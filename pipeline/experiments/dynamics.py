@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
 
-from pipeline.experiments.answer import only, read_folder, read_losses, write_answer
+from pipeline.experiments.results import only, read_folder, read_losses, write_results
 from pipeline.report import paper
 from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
 from pipeline.report.formatting import show_difference
@@ -136,13 +136,13 @@ def _scores(
     return {way: summarise(own) for way, own in scores.items()} | {"paired": {"mean5_minus_one": paired(*sides)}}
 
 
-def dynamics(settings: Settings, indentations: Path, models: Path, answer: Path) -> None:
+def dynamics(settings: Settings, indentations: Path, models: Path, results: Path) -> None:
     """Ask the networks of train_multi that never saw the pressed skin's board."""
     one = only(read_folder(indentations), indentations)
     true = np.stack([getattr(one, name) for name in TARGETS], axis=1)
     presses = presses_of(subtract(one.b_uT, one.noload_uT), true, one.t_s, one.indentation)
     numbers = compare(presses, networks_without(models, one.board), board=one.board)
-    write_answer(answer, numbers, {}, read_losses(indentations, {}))
+    write_results(results, numbers, {}, read_losses(indentations, {}))
     of_presses = f"{numbers['presses_n']} presses at {numbers['rate_hz']:.0f} Hz"
     say(f"{settings.scene}: {numbers['readings_n']} readings of {of_presses}")
 

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from pipeline.experiments.answer import read_folder, read_losses, write_answer
+from pipeline.experiments.results import read_folder, read_losses, write_results
 from pipeline.report.drawing import COLOURS, drawing, svg
 from pipeline.report.formatting import COLUMNS, OF_PAPER, show, show_difference, tabulate
 from pipeline.report.paper import FLEXIBLE, FLEXIBLE_BIAS, FLEXIBLE_GAP_LESS_PCT
@@ -86,7 +86,7 @@ def _median_uT(captures: Sequence[ByDepth], depth_mm: float) -> float:
 SHAPE = "shape"  # the recipe on directions, if the scene has one: it ought to care less about the gap
 
 
-def flexible(settings: Settings, folds: Path, main: Path, indentations: Path, started: Path, answer: Path) -> None:
+def flexible(settings: Settings, folds: Path, main: Path, indentations: Path, started: Path, results: Path) -> None:
     """Adapt the networks of the first fold of lobo to every flexible skin, and test on its later passes."""
     prepare_training()
     data = read_data(settings, main, folds)
@@ -103,7 +103,7 @@ def flexible(settings: Settings, folds: Path, main: Path, indentations: Path, st
         (arm, trial)
         for name, arm in arms.items()
         for trial in adaptations(
-            data, fold, (name, adapting.recipes[name]), starts, question="flexible", pokes_n=adapting.pokes_n
+            data, fold, (name, adapting.recipes[name]), starts, experiment="flexible", pokes_n=adapting.pokes_n
         )
     ]
     skins = [str(skin) for skin in np.unique(data.rows.skin[fold.test])]
@@ -122,7 +122,7 @@ def flexible(settings: Settings, folds: Path, main: Path, indentations: Path, st
     if SHAPE in arms:
         numbers[SHAPE] = answer_flexible(before[SHAPE] + [replace(one, arm=AFTER) for one in after if one.arm == SHAPE])
     drawn = forces_drawn(own, rng_for(data.settings.seed, "flexible", "drawn"))
-    write_answer(answer, numbers, drawn, read_losses(indentations, poked.dropped), trainings)
+    write_results(results, numbers, drawn, read_losses(indentations, poked.dropped), trainings)
 
 
 def _by_depth(captures: Sequence[Readings]) -> list[dict[float, np.ndarray]]:

@@ -10,7 +10,7 @@ import pandas as pd
 from jaxtyping import Float, Float32, Float64
 from pydantic import Field
 
-from pipeline.experiments.answer import read_folder, read_losses, write_answer
+from pipeline.experiments.results import read_folder, read_losses, write_results
 from pipeline.experiments.sensitivity import levels_of
 from pipeline.report.drawing import COLOURS, drawing, svg
 from pipeline.settings import Settings
@@ -192,14 +192,14 @@ def read(settings: Settings) -> Gripper:
     return settings.section(Gripper, "gripper")
 
 
-def gripper(settings: Settings, indentations: Path, models: Path, answer: Path) -> None:
+def gripper(settings: Settings, indentations: Path, models: Path, results: Path) -> None:
     """Let a gripper hold objects by the force that is estimated of its finger's skin."""
     load = loads_of(settings, "grip")
     weight_N = weights_N(load.force_max_N, load.step_N)
     fingers = [finger_of(capture, weight_N) for capture in read_folder(indentations)]
     networks = {finger.board: networks_without(models, finger.board) for finger in fingers}
     numbers, drawn = answer_of(fingers, networks, read(settings), seed=settings.seed)
-    write_answer(answer, numbers, drawn, read_losses(indentations, {}))
+    write_results(results, numbers, drawn, read_losses(indentations, {}))
     best = max(numbers["rows"], key=lambda row: row["held_pct"])
     say(
         f"{settings.scene}: {best['aim_N']} N held in {best['held_pct']:.0f} % of runs by {best['feedback']}, "

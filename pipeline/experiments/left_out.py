@@ -287,11 +287,11 @@ def _error_pct(without: Float[np.ndarray, "..."], true: Float[np.ndarray, "..."]
     return float(100 * np.linalg.norm(without - true) / np.linalg.norm(true))
 
 
-def left_out(settings: Settings, answer: Path) -> None:
+def left_out(settings: Settings, results: Path) -> None:
     """Measure every term on the scene's own first skin, and name the protocols that do without it."""
     of, seed = synthesis_of(settings), settings.seed
     omissions = measure(of, seed=seed)
-    io.write_json(answer, [asdict(omission) for omission in omissions])
+    io.write_json(results, [asdict(omission) for omission in omissions])
     left = ", ".join(omission.term for omission in omissions if omission.done == "left out")
     say(f"{settings.scene}: left out by the main protocol, and measured: {left}")
 

@@ -12,7 +12,7 @@ from scipy.constants import micro
 from scipy.spatial.transform import Rotation
 
 from pipeline.experiments.ambient import Instrument, guessed_uT, seen_uT, take_board
-from pipeline.experiments.answer import only, write_answer
+from pipeline.experiments.results import only, write_results
 from pipeline.report import paper
 from pipeline.report.drawing import COLOURS, drawing, svg
 from pipeline.settings import Settings
@@ -98,7 +98,7 @@ def turned(log: Log, board: str, settings: Settings, networks: Sequence[Answers]
     }
 
 
-def logs(settings: Settings, raw: Path, models: Path, answer: Path) -> None:
+def logs(settings: Settings, raw: Path, models: Path, results: Path) -> None:
     """Read a folder's walk with networks that never saw its board; score it where its truth is kept, and turn it."""
     folder = only(sorted(child for child in raw.iterdir() if child.is_dir()), raw)
     t_s, b_uT, _, account = sd_card.read_log(folder / LOG_FILE)
@@ -113,7 +113,7 @@ def logs(settings: Settings, raw: Path, models: Path, answer: Path) -> None:
         true = truth_at(t_s, log.t_start_s, log.t_end_s, known)
         numbers |= score_contacts(found, true) | turned(Log(t_s, b_uT, true, found.quiet_n), board, settings, networks)
     losses = {"accounts": [numbers["account"]], "left_out": {}}
-    write_answer(answer, numbers, thin(found, true), losses)
+    write_results(results, numbers, thin(found, true), losses)
     say(f"{settings.scene}: {numbers['contacts_n']} contacts in {numbers['duration_s']:.1f} s of log")
 
 

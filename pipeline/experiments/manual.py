@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pipeline.experiments.answer import read_folder, read_losses, write_answer
+from pipeline.experiments.results import read_folder, read_losses, write_results
 from pipeline.report.formatting import COLUMNS, OF_PAPER, Stat, gain, show, show_difference, tabulate
 from pipeline.report.paper import GAINS, MANUAL, MANUAL_POKES_N
 from pipeline.settings import Adaptations, Settings
@@ -62,7 +62,7 @@ def answer_manual(answers: Sequence[Answered], *, pokes_n: Sequence[int], lines_
     return counts | arms | {"paired": differences}
 
 
-def manual(settings: Settings, folds: Path, main: Path, indentations: Path, started: Path, answer: Path) -> None:
+def manual(settings: Settings, folds: Path, main: Path, indentations: Path, started: Path, results: Path) -> None:
     """Adapt to every skin that was poked by hand, and by as many pokes of the robot; test on the robot's grid."""
     prepare_training()
     data = read_data(settings, main, folds)
@@ -80,7 +80,7 @@ def manual(settings: Settings, folds: Path, main: Path, indentations: Path, star
     after, trainings = answers_after(data, trials, "manual")
     pokes_n, lines_n = zip(*((_pokes_n(data, own), len(np.unique(own.line_i))) for own in lines.values()), strict=True)
     numbers = answer_manual([*answers, *after], pokes_n=pokes_n, lines_n=lines_n)
-    write_answer(answer, numbers, {}, read_losses(indentations, poked.dropped), trainings)
+    write_results(results, numbers, {}, read_losses(indentations, poked.dropped), trainings)
 
 
 def _trials(
@@ -105,7 +105,7 @@ def _fold_without(data: SceneData, board: str) -> Fold:
     folds = {fold.name: fold for fold in data.folds_of("lobo")}
     if board not in folds:
         remedy = "Poke skins by hand that the grid knows too."
-        raise SchemaError("question manual", f"board {board}", f"one of {sorted(folds)}", "none", remedy)
+        raise SchemaError("experiment manual", f"board {board}", f"one of {sorted(folds)}", "none", remedy)
     return folds[board]
 
 

@@ -16,7 +16,7 @@ from scipy.constants import mega, milli
 from scipy.spatial.transform import Rotation
 
 import reskin.universal
-from pipeline.experiments.answer import read_folder, write_answer
+from pipeline.experiments.results import read_folder, write_results
 from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
 from pipeline.report.formatting import n_of, scores, tabulate
 from pipeline.settings import Settings
@@ -93,7 +93,7 @@ class Lesson:
 def lesson_of(design: SkinDesign, kind: BoardKind, depths_mm: tuple[float, ...], seed: int) -> Lesson:
     """Put a designed skin over designed boards: the law's numbers as the design has them, its slide included."""
     if design.hold is None:
-        remedy = "Ask this question of a scene whose skin has hold."
+        remedy = "Ask this experiment of a scene whose skin has hold."
         raise ParamsError("params.yaml: skin", "hold", "that of a skin that slides, as the law's", "null", remedy)
     modulus_MPa = design.modulus_kPa * 1e-3
     law = Law(
@@ -168,7 +168,7 @@ def _unstack(stacked: np.ndarray) -> Population:
     return Population(db_uT, rest_uT[:, 0], place_mm, force_N[..., 0])
 
 
-QUESTION = "lobo"  # whose folds these are: their pools are those of adaptation
+EXPERIMENT = "lobo"  # whose folds these are: their pools are those of adaptation
 POOL_MAX_N = 65  # pokes: one at each place of the paper's grid, under any of its depths
 TESTED_MAX_N = 2000  # rows of a skin that are read, drawn
 ASKED_FURTHER_N = 16  # skins of the population that tell how sure experts are
@@ -285,14 +285,14 @@ def read(settings: Settings) -> Asked:
     return settings.section(Asked, "population")
 
 
-def population(settings: Settings, folds: Path, indentations: Path, answer: Path) -> None:
+def population(settings: Settings, folds: Path, indentations: Path, results: Path) -> None:
     """Ask experts of simulated skins about every held-out skin of a simulated scene."""
     data, section, synthesis = read_data(settings, indentations, folds), read(settings), synthesis_of(settings)
     kind, design = synthesis.main_boards, settings.shared_section(SkinDesign, "skin")
     lesson = lesson_of(design, kind, synthesis.main.depths_mm, settings.seed)
     turn = Rotation.from_euler("z", np.array(kind.design.turns_deg)[:, None], degrees=True).as_matrix()
     frame, rest_uT = Frame(turn, (CENTRE_MM, CENTRE_MM), mirrored=False), rest_by_skin(indentations)
-    asked = [case for fold in data.folds_of(QUESTION) for case in cases(data, fold, frame, rest_uT)]
+    asked = [case for fold in data.folds_of(EXPERIMENT) for case in cases(data, fold, frame, rest_uT)]
     rows, sizes, words = score_all(lesson, section, asked, settings.scene)
     numbers = {
         "told": over_boards(rows, *BY),
@@ -301,7 +301,7 @@ def population(settings: Settings, folds: Path, indentations: Path, answer: Path
         "pool_n": min(len(case.pool.force_N) for case in asked), "steps_n": section.steps_n,
         "weight_N": WEIGHT_N, "weight_sd": WEIGHT_SD, **words,
     }  # fmt: skip
-    write_answer(answer, numbers, {})
+    write_results(results, numbers, {})
 
 
 NAMES = {

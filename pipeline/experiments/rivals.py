@@ -12,9 +12,9 @@ import pandas as pd
 from jaxtyping import Float, Int64
 from pydantic import Field
 
-from pipeline.experiments.answer import read_folder, write_answer
 from pipeline.experiments.compare import Compare, see, setup_of, skins_of, turns_of
 from pipeline.experiments.contacts import roc_area
+from pipeline.experiments.results import read_folder, write_results
 from pipeline.provenance import SECONDS
 from pipeline.report.formatting import COLUMNS, OF_FORCE, n_of, scores, show, show_difference, tabulate
 from pipeline.settings import Settings
@@ -23,8 +23,8 @@ from pipeline.statistics import AS_LABELLED, REGISTERED, by_skin, over_boards, p
 from pipeline.training.trainings import SceneData, read_data, score_test
 from pipeline.training.universal import (
     ASSUMED_TEMPER,
+    EXPERIMENT,
     METHODS,
-    QUESTION,
     WAYS,
     Bench,
     Experts,
@@ -339,7 +339,7 @@ OWN, NONE, FOREIGN = "its own", "none", "another skin's"  # unlabelled pokes tha
 
 
 def pokes_of(data: SceneData, fold: Fold) -> list[Int64[np.ndarray, " r"]]:
-    """Give the rows of each poke of the pool, in the order in which question labels hands out labels."""
+    """Give the rows of each poke of the pool, in the order in which experiment labels hands out labels."""
     indentation = data.rows.indentation[fold.pool]
     order = rng_for(data.settings.seed, "labelled", fold.name).permutation(np.unique(indentation))
     return [fold.pool[indentation == one] for one in order]
@@ -351,7 +351,7 @@ def means_uT(data: SceneData, pokes: Sequence[Int64[np.ndarray, " r"]]) -> Float
 
 
 def board_of(fold: Fold) -> str:
-    """Name the board that a fold of question labels holds out."""
+    """Name the board that a fold of experiment labels holds out."""
     return fold.name.rsplit("-draw", 1)[0]
 
 
@@ -510,8 +510,8 @@ def read(settings: Settings) -> Rivals:
     return parse(Rivals, full | {"recipe": recipe, "methods": settings.row("methods", row.methods)}, where)
 
 
-def rivals(settings: Settings, indentations: Path, folds: Path, models: Path, answer: Path) -> None:
-    """Score rivals on every held-out board, on the rows that question labels tests."""
+def rivals(settings: Settings, indentations: Path, folds: Path, models: Path, results: Path) -> None:
+    """Score rivals on every held-out board, on the rows that experiment labels tests."""
     data, compare = read_data(settings, indentations, folds), settings.section(Compare, "compare")
     skins = skins_of(read_folder(indentations, tuple(settings.captures_in(indentations))))
     if len(skins) < 2:
@@ -519,7 +519,7 @@ def rivals(settings: Settings, indentations: Path, folds: Path, models: Path, an
     setup = setup_of(compare, settings.shared_section(SkinDesign, "skin"))
     frame = Frame(turns_of(compare), compare.labels_middle_mm, compare.labels_mirrored)
     seen = {board: see(pokes, compare) for board, pokes in skins.items()}
-    section, of_labels = read(settings), data.folds_of(QUESTION)
+    section, of_labels = read(settings), data.folds_of(EXPERIMENT)
     points, trainings, unpaired_n = baselines(data, of_labels, section)
     nominal, rig = read_experts(Known(data, frame, setup, seen), models)
     bench = Bench(data, frame, seen, nominal, {}, {})
@@ -535,7 +535,7 @@ def rivals(settings: Settings, indentations: Path, folds: Path, models: Path, an
         "flagged": [*experts(bench, of_labels, section.false_alarm_fraction), alarms.pop("flagged")],
         "alarm": alarms,
     }
-    write_answer(answer, numbers, {}, trainings=tally(trainings))
+    write_results(results, numbers, {}, trainings=tally(trainings))
     io.write_json(SECONDS / settings.scene / "rivals.json", [asdict(one) for one in took])
 
 

@@ -642,7 +642,7 @@ def read(settings: Settings) -> RunTime:
     return settings.section(RunTime, "runtime")
 
 
-def runtime(settings: Settings, answer: Path) -> None:
+def runtime(settings: Settings, results: Path) -> None:
     """Compare quadratures and integrators; seconds differ between identical runs, so they are no output."""
     of, tried = synthesis_of(settings), read(settings)
     rows, calls = study_quadratures(_trials(of, tried.quadratures, settings.seed), tried.quadratures.rules_of())
@@ -652,7 +652,7 @@ def runtime(settings: Settings, answer: Path) -> None:
     io.write_json(SECONDS / settings.scene / "runtime.json", [asdict(row) for row in seconds])
     words: dict[str, Any] = {"choice": asdict(choice)}
     words |= {"quadratures": [asdict(row) for row in rows], "integrators": [asdict(row) for row in more]}
-    io.write_json(answer, words)
+    io.write_json(results, words)
     failed_n = sum(row.failure is not None for row in [*rows, *more])
     say(
         f"{settings.scene}: {len(rows) + len(more)} ways tried, {failed_n} failed; "

@@ -9,7 +9,7 @@ import pandas as pd
 from jaxtyping import Float, Float32, Float64, Int32
 from scipy.special import ndtr, ndtri
 
-from pipeline.experiments.answer import only, read_folder, read_losses, write_answer
+from pipeline.experiments.results import only, read_folder, read_losses, write_results
 from pipeline.report import paper
 from pipeline.report.drawing import COLOURS, drawing, svg
 from pipeline.settings import Settings
@@ -141,7 +141,7 @@ def monotonic(response_uT: Float64[np.ndarray, "n p"], weight_N: Float64[np.ndar
     return found
 
 
-def sensitivity(settings: Settings, indentations: Path, answer: Path) -> None:
+def sensitivity(settings: Settings, indentations: Path, results: Path) -> None:
     """Tell how small a weight the one skin tells that was loaded."""
     load = loads_of(settings, "glass")
     one = only(read_folder(indentations), indentations)
@@ -149,7 +149,7 @@ def sensitivity(settings: Settings, indentations: Path, answer: Path) -> None:
     change_uT = subtract(one.b_uT, one.noload_uT)
     levels_uT = levels_of(change_uT, one.indentation, one.Fz_N, levels_n=len(weight_N), where=one.capture)
     numbers, drawn = answer_of(levels_uT, weight_N)
-    write_answer(answer, numbers, drawn, read_losses(indentations, {}))
+    write_results(results, numbers, drawn, read_losses(indentations, {}))
     say(f"{settings.scene}: weights {numbers['smallest_step_N']} N apart are told, in {numbers['fillings_n']} fillings")
 
 

@@ -9,7 +9,7 @@ import pandas as pd
 from jaxtyping import Float
 from pydantic import Field
 
-from pipeline.experiments.answer import read_folder, read_losses, write_answer
+from pipeline.experiments.results import read_folder, read_losses, write_results
 from pipeline.report.drawing import COLOURS, drawing, svg
 from pipeline.report.formatting import show, tabulate
 from pipeline.report.paper import SHEAR
@@ -88,7 +88,7 @@ def read(settings: Settings) -> Shear:
     return settings.with_training(Shear, "shear")
 
 
-def shear(settings: Settings, indentations: Path, answer: Path) -> None:
+def shear(settings: Settings, indentations: Path, results: Path) -> None:
     """Train with five targets on both splits of every skin, and score what was held out."""
     prepare_training()
     section = read(settings)
@@ -112,7 +112,9 @@ def shear(settings: Settings, indentations: Path, answer: Path) -> None:
     shown = rng_for(settings.seed, "shear", "drawn").permutation(len(trials[first_i].test))[:DRAWN_N]
     true, predicted = rows.target[trials[first_i].test], trained[first_i].predicted
     drawn = {"true": _forces(true[shown]), "predicted": _forces(predicted[shown])}
-    write_answer(answer, numbers, drawn, read_losses(indentations, rows.dropped), tally(map(collapse_record, trained)))
+    write_results(
+        results, numbers, drawn, read_losses(indentations, rows.dropped), tally(map(collapse_record, trained))
+    )
 
 
 def _folds(rows: Rows, group: np.ndarray, by: str, section: Shear, seed: int) -> list[Fold]:
@@ -122,7 +124,7 @@ def _folds(rows: Rows, group: np.ndarray, by: str, section: Shear, seed: int) ->
         own = np.flatnonzero(rows.skin == skin)
         drawn = draw_sides(
             group[own], test_fraction=section.test_fraction, repeats_n=section.repeats_n,
-            state=seed_for(seed, "shear", by, str(skin)), what=f"{by}s of skin {skin}", where="question shear",
+            state=seed_for(seed, "shear", by, str(skin)), what=f"{by}s of skin {skin}", where="experiment shear",
         )  # fmt: skip
         folds += [
             Fold("shear", f"{skin}-{by}{i}", own[train], own[test], NO_POOL) for i, (train, test) in enumerate(drawn)

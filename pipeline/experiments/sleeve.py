@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int, Int64, Shaped
 from pydantic import Field
 
 from pipeline.executors import Here
-from pipeline.experiments.answer import read_folder, read_losses, write_answer
+from pipeline.experiments.results import read_folder, read_losses, write_results
 from pipeline.report.drawing import COLOURS, drawing, svg
 from pipeline.report.formatting import COLUMNS, scores, show, tabulate
 from pipeline.report.paper import SLEEVE, SLEEVE_SKIN, SLEEVE_WORDS
@@ -87,7 +87,7 @@ def hold_out_last(rows: Rows, test_fraction: float) -> tuple[Int64[np.ndarray, "
         if not 0 < test_n < len(indentations):
             got = f"{test_n} of the {len(indentations)} of {capture}"
             rule = "one or more, and not all"
-            raise ParamsError("question sleeve", "indentations held out", rule, got, "Poke more often.")
+            raise ParamsError("experiment sleeve", "indentations held out", rule, got, "Poke more often.")
         held |= own & (rows.indentation >= indentations[-test_n])
     return np.flatnonzero(~held), np.flatnonzero(held)
 
@@ -101,7 +101,7 @@ def rate_hz(captures: Sequence[Readings]) -> float:
         steps_s += float(np.diff(one.t_s)[same].sum())
     if not steps_s > 0:
         rule, remedy = "two or more an indentation, at known times", "Record more than one reading."
-        raise ParamsError("question sleeve", "readings", rule, f"{steps_n} steps of time", remedy)
+        raise ParamsError("experiment sleeve", "readings", rule, f"{steps_n} steps of time", remedy)
     return steps_n / steps_s
 
 
@@ -165,7 +165,7 @@ def read(settings: Settings) -> Sleeve:
     return settings.with_training(Sleeve, "sleeve")
 
 
-def sleeve(settings: Settings, indentations: Path, answer: Path) -> None:
+def sleeve(settings: Settings, indentations: Path, results: Path) -> None:
     """Train the recipes of section sleeve on the first pokes, score them and nearest neighbours on the last."""
     prepare_training()
     section, captures, area = read(settings), read_folder(indentations), _area(settings)
@@ -192,7 +192,7 @@ def sleeve(settings: Settings, indentations: Path, answer: Path) -> None:
     error_mm = errors_mm(true, answers[HEADLINE][0])
     drawn = to_draw(area, true, error_mm, indentation)
     losses = read_losses(indentations, data.rows.dropped)
-    write_answer(answer, numbers, drawn, losses, tally(map(collapse_record, trained)))
+    write_results(results, numbers, drawn, losses, tally(map(collapse_record, trained)))
 
 
 def _area(settings: Settings) -> Area:

@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float, Float32, Float64
 from pydantic import Field, model_validator
 from scipy.optimize import nnls
 
-from pipeline.experiments.answer import write_answer
 from pipeline.experiments.contacts import NEIGHBOURS_N, NOISE_uT, direction_distance, neighbour_distance, roc_area
+from pipeline.experiments.results import write_results
 from pipeline.report.formatting import show_digits
 from pipeline.settings import Settings
 from pipeline.stage import say
@@ -85,7 +85,7 @@ def explain_pair(known: Directions, pair: tuple[int, int], db_uT: Float32[np.nda
 
 
 def oddness(known_uT: Float32[np.ndarray, "a ch"], known: Directions, asked_uT: Float32[np.ndarray, "f ch"]) -> Scores:
-    """Score rows by the detectors of question contacts that need no network, and by what one place leaves over."""
+    """Score rows by the detectors of experiment contacts that need no network, and by what one place leaves over."""
     alone = [left_over(known, (place,), asked_uT) for place in known]
     return {
         "direction and length": neighbour_distance(shape(known_uT), shape(asked_uT)),
@@ -303,7 +303,7 @@ def of_detection(blocks: Sequence[Blocks], double: Sequence[Touched], section: T
 
 
 def sums_of(blocks: Sequence[Blocks], rng: np.random.Generator) -> list[Float32[np.ndarray, "_ ch"]]:
-    """Add tested single touches of each two places, as question contacts does of boards without two touches."""
+    """Add tested single touches of each two places, as experiment contacts does of boards without two touches."""
     tested = [one.test.db_uT for one in blocks]
     drawn = [
         (a_uT[rng.integers(len(a_uT), size=SUMS_N)], b_uT[rng.integers(len(b_uT), size=SUMS_N)])
@@ -326,7 +326,7 @@ def of_unseen_places(blocks: Sequence[Blocks], false_alarm_fraction: float) -> d
     return {name: float(np.mean([row[name] for row in called])) for name in called[0]}
 
 
-def touches(settings: Settings, indentations: Path, answer: Path) -> None:
+def touches(settings: Settings, indentations: Path, results: Path) -> None:
     """Answer what can be asked of touches at numbered places."""
     section, selection = read(settings), settings.section(Selection, "selection")
     sources = [indentations / f"{name}.parquet" for name in settings.captures_in(indentations)]
@@ -341,7 +341,7 @@ def touches(settings: Settings, indentations: Path, answer: Path) -> None:
     for name, reason in found.left_out.items():
         say(f"{settings.scene}: warning: {name} left out: {reason}")
     if found.problem:
-        write_answer(answer, counts | {"not_computed": found.problem}, {})
+        write_results(results, counts | {"not_computed": found.problem}, {})
         say(f"{settings.scene}: warning: touches not computed: {found.problem}")
         return
     blocks = [in_blocks(one, section.train_fraction, section.aside_fraction) for one in single]
@@ -352,7 +352,7 @@ def touches(settings: Settings, indentations: Path, answer: Path) -> None:
         "superposition": of_superposition(blocks, double),
         "detection": of_detection(blocks, double, section, settings.seed),
     }
-    write_answer(answer, numbers, {})
+    write_results(results, numbers, {})
     say(f"{settings.scene}: {len(single)} recordings of one place, {len(double)} of two")
 
 
@@ -467,7 +467,7 @@ def _detection(numbers: Mapping[str, Any]) -> pd.DataFrame:
     ]
     table = pd.DataFrame(rows)
     table.attrs["meaning"] = (
-        f"Thresholds ask for {numbers['false_alarm_asked_pct']:g} % false alarms, as in question contacts, and are set "
+        f"Thresholds ask for {numbers['false_alarm_asked_pct']:g} % false alarms, as in `contacts`, and are set "
         "on single touches between those that are known and those that are tested. A detector that calls a single "
         "touch at a place it does not know two has found what is new, not what is two: then the first column is no "
         f"evidence for more. {APART}"

@@ -12,8 +12,8 @@ import pandas as pd
 from jaxtyping import Bool, Float, Int
 from pydantic import Field
 
-from pipeline.experiments.answer import read_folder, read_losses, write_answer
 from pipeline.experiments.drift import pace, rms, say_pace
+from pipeline.experiments.results import read_folder, read_losses, write_results
 from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
 from pipeline.report.formatting import tabulate
 from pipeline.report.paper import FIGURE_4
@@ -57,7 +57,7 @@ def find_visits(readings: Readings, place_mm: tuple[float, float], depth_mm: flo
     at = _at(readings, place_mm, depth_mm)
     if not at.any():
         raise ParamsError(
-                f"question variation, capture {readings.capture}", "variation.places_mm and depth_mm", "visited",
+                f"experiment variation, capture {readings.capture}", "variation.places_mm and depth_mm", "visited",
                 f"{place_mm[0]:g}, {place_mm[1]:g} mm at {depth_mm:g} mm, never", _visited(readings, place_mm),
             )  # fmt: skip
     b_uT = readings.b_uT[at]
@@ -122,7 +122,7 @@ def first_of_each_board(boards: Mapping[str, str], skins_n: int) -> list[str]:
         order[boards[skin]] += 1
     if skins_n > len(ranked):
         rule = f"at most the {len(ranked)} skins of the main captures"
-        raise ParamsError("question variation", "variation.skins_n", rule, skins_n, "Ask for fewer.")
+        raise ParamsError("experiment variation", "variation.skins_n", rule, skins_n, "Ask for fewer.")
     return [skin for *_, skin in sorted(ranked)[:skins_n]]
 
 
@@ -151,7 +151,7 @@ def read(settings: Settings) -> Variation:
     return settings.section(Variation, "variation")
 
 
-def variation(settings: Settings, main: Path, indentations: Path, answer: Path) -> None:
+def variation(settings: Settings, main: Path, indentations: Path, results: Path) -> None:
     """Compare visits of equal places: of the worn skin in `indentations`, and of several skins in `main`."""
     section = read(settings)
     worn = read_folder(indentations)[0]
@@ -168,7 +168,7 @@ def variation(settings: Settings, main: Path, indentations: Path, answer: Path) 
         drawn.append(where | {name: lines for name, (_, lines) in over.items()})
     when = pace([worn]) | meanwhile(worn, section.contacts_n)
     numbers = {"depth_mm": section.depth_mm, "worn_skin": worn.skin} | when | {"places": places}
-    write_answer(answer, numbers, {"places": drawn}, read_losses(indentations, {}))
+    write_results(results, numbers, {"places": drawn}, read_losses(indentations, {}))
 
 
 def _visits(main: Path, names: list[str], section: Variation) -> dict[str, list[Visits]]:

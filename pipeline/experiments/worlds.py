@@ -11,7 +11,7 @@ from jaxtyping import Float
 from pydantic import Field
 from scipy.constants import micro, milli
 
-from pipeline.experiments.answer import write_answer
+from pipeline.experiments.results import write_results
 from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
 from pipeline.report.formatting import COLUMNS, SHORT, show, tabulate
 from pipeline.report.paper import TABLE_2
@@ -47,7 +47,7 @@ WAVES_N = 48  # cosines that make a smooth error
 DEFAULT = "default"
 Size = Annotated[float, Field(ge=0, le=2)]
 Sizes = Annotated[tuple[Size, ...], Field(min_length=1)]
-QUESTIONS = {"single": "transfer", "multi": "lobo", "triplet": "triplet", "adapted": "adapt"}  # rows of table 2
+EXPERIMENTS = {"single": "transfer", "multi": "lobo", "triplet": "triplet", "adapted": "adapt"}  # rows of table 2
 
 
 class Residual(Strict):
@@ -181,7 +181,7 @@ def folds_of(rows: Rows, split: Split, seed: int, world: str, before_n: int) -> 
     """Draw a world's folds, numbered among the rows of all worlds and named after it."""
     for fold in draw_folds(rows, ("transfer", "lobo"), split, seed):
         sides = [side + before_n for side in (fold.train, fold.test, fold.pool)]
-        yield Fold(fold.question, f"{world}.{fold.name}", *sides)
+        yield Fold(fold.experiment, f"{world}.{fold.name}", *sides)
 
 
 def read(settings: Settings) -> Worlds:
@@ -189,7 +189,7 @@ def read(settings: Settings) -> Worlds:
     return settings.section(Worlds, "worlds")
 
 
-def worlds(settings: Settings, answer: Path) -> None:
+def worlds(settings: Settings, results: Path) -> None:
     """Train the rows of table 2 in every world, and score them there."""
     prepare_training()
     section, split = read(settings), settings.section(Split, "split")
@@ -204,7 +204,7 @@ def worlds(settings: Settings, answer: Path) -> None:
     data = SceneData(settings.scene, settings, rows, folds)
     cards = _trained(data, listed)
     numbers = {"by_world": [_scored(cards, world) for world in listed], **_constants(section, data, listed)}
-    write_answer(answer, numbers, {})
+    write_results(results, numbers, {})
 
 
 def _trained(data: SceneData, listed: Sequence[World]) -> list[dict[str, Any]]:
@@ -212,19 +212,19 @@ def _trained(data: SceneData, listed: Sequence[World]) -> list[dict[str, Any]]:
     lobo = data.folds_of("lobo")
     trials = trials_of(data, data.settings.training("train_single"), data.folds_of("transfer"))
     trials += trials_of(data, data.settings.training("train_multi"), lobo)
-    trials += trials_of(data, data.settings.training("train_triplet"), lobo, question="triplet")
+    trials += trials_of(data, data.settings.training("train_triplet"), lobo, experiment="triplet")
     trained = train_all(data, trials, "worlds")
     starts: Starts = {
         (trial.recipe_name, trial.fold, trial.seed_i): Start(result.key, result.weights, result.scaler)
         for trial, result in zip(trials, trained, strict=True)
-        if trial.question == "triplet"
+        if trial.experiment == "triplet"
     }
     adapt = data.settings.adaptations()
     adapted: list[Trial] = [
         trial
         for fold in lobo
         for trial in adaptations(
-            data, fold, (HEADLINE, adapt.recipes[HEADLINE]), starts, question="adapt", pokes_n=adapt.pokes_n
+            data, fold, (HEADLINE, adapt.recipes[HEADLINE]), starts, experiment="adapt", pokes_n=adapt.pokes_n
         )
     ]
     trained = [*trained, *train_all(data, adapted, "worlds")]
@@ -240,8 +240,8 @@ def _scored(cards: Sequence[dict[str, Any]], world: World) -> dict[str, Any]:
         if card["fold"].startswith(f"{world.name}.") and card["recipe_name"] == HEADLINE
     ]
     table, found = tidy(own), {}
-    for row, question in QUESTIONS.items():
-        rows = select(table, question=question)
+    for row, experiment in EXPERIMENTS.items():
+        rows = select(table, question=experiment)
         boards = by_skin(rows).groupby("board")[list(METRICS)].mean() if row == "single" else None
         boards = whole(rows).groupby("board")[list(METRICS)].mean() if boards is None else boards
         scored = over_pairs(rows) if row == "single" else over_boards(rows)

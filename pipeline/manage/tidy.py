@@ -1,4 +1,4 @@
-"""Find and remove what switched-off questions left behind in this checkout.
+"""Find and remove what switched-off experiments left behind in this checkout.
 
 Only of scenes in the plan: the outputs of another scene may have taken hours, and it may run again. Knows no content of
 a file.

@@ -60,7 +60,7 @@ def checklist(numbers: Mapping[str, Any], rows: Sequence[Row] | None = None) -> 
         verdict = judge(row, printed, ours, pooled=is_pooled(numbers), simulated=source == "simulated")
         if row.id in p_values:
             verdict = adjusted(row, verdict, p_values[row.id], len(p_values))
-        if ours is None and row.question in numbers:
+        if ours is None and row.experiment in numbers:
             verdict = Verdict(judging.NOT_REACHED)
         lines.append(
             {

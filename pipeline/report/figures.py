@@ -28,13 +28,13 @@ CHIP_MM = 3.0
 
 
 def error_grids(predictions: Iterable[pa.Table], recipe: str, scene: str) -> Iterator[tuple[str, str]]:
-    """Draw the place errors of one recipe for every question: file name and SVG text."""
+    """Draw the place errors of one recipe for every experiment: file name and SVG text."""
     for table in predictions:
-        for question in table["question"].unique().to_pylist():
-            chosen = pc.and_(pc.equal(table["question"], question), pc.equal(table["recipe"], recipe))
+        for experiment in table["question"].unique().to_pylist():
+            chosen = pc.and_(pc.equal(table["question"], experiment), pc.equal(table["recipe"], recipe))
             true_mm, predicted_mm = (_places(table.filter(chosen), side) for side in ("true", "predicted"))
-            title = f"{scene}, {question}: place error on held-out readings"
-            yield f"error_grid_{question}.svg", error_grid(true_mm, predicted_mm, title=title)
+            title = f"{scene}, {experiment}: place error on held-out readings"
+            yield f"error_grid_{experiment}.svg", error_grid(true_mm, predicted_mm, title=title)
 
 
 def error_grid(true_mm: Float[np.ndarray, "f 2"], predicted_mm: Float[np.ndarray, "f 2"], *, title: str) -> str:

@@ -193,7 +193,7 @@ def control_of(numbers: Results) -> dict[str, Any]:
 
 
 def is_pooled(numbers: Results) -> bool:
-    """Tell whether some model of the leave-one-board-out question learnt from more than one skin."""
+    """Tell whether some model of the leave-one-board-out experiment learnt from more than one skin."""
     boards = numbers["lobo"]["by_board"].values() if "lobo" in numbers else ()
     return not boards or max(board["trained_on_skins_n"] for board in boards) > 1
 

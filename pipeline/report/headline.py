@@ -49,7 +49,7 @@ def answer(numbers: Mapping[str, Any]) -> str:
 
 
 def _experts(numbers: Mapping[str, Any]) -> list[tuple[Model, Mapping[str, Any]]]:
-    """Give the experts of question population, told most pokes and no label, as a row beside those of table 2."""
+    """Give the experts of experiment population, told most pokes and no label, as a row beside those of table 2."""
     rows = [row for row in numbers.get("population", {}).get("told", ()) if (row["way"], row["labels_n"]) == EXPERTS]
     if not rows:
         return []

@@ -43,7 +43,7 @@ class Row(Strict):
     paper: str | None = None  # a constant of `reporting.paper`, its parts separated by dots
     says: str | None = None  # the paper's words, where it gives no number
     ours: str | None = None
-    question: str | None = None  # the question that ours follows from, where a small scene may not have ours
+    experiment: str | None = None  # the experiment that ours follows from, where a small scene may not have ours
     # gain: a paired difference is an improvement; sizeable: by half of the paper's at least; each: all of a list are
     # improvements; slight, plateau: it is small; finding:
     # judged by its experiment; view: a figure to look at; input: a setting of simulated scenes; setting: of all scenes;

@@ -10,7 +10,7 @@ import pyarrow as pa
 
 from pipeline.report.formatting import control_of
 from pipeline.report.paper import PLATEAU_POKES_N
-from pipeline.scenes import QUESTIONS, ROWS, TABLE_2
+from pipeline.scenes import EXPERIMENTS, ROWS, TABLE_2
 from pipeline.statistics import (
     AS_LABELLED,
     METHODS,
@@ -44,15 +44,15 @@ PAPERS_SPLITS = ("single_random", "single_temporal")  # the first of these stand
 HONEST = {"by_indentation": "single_indentation", "by_pass": "single_pass"}  # the same skin, more of it held out
 SWEPT = ("multi", "triplet", "adapted")
 TRAINED_IN = {"lobo": "train_multi", "triplet": "train_triplet", "adapt": "adapt"}
-NETWORKS = {METHODS.get(question, "network"): question for question in TRAINED_IN}  # by method
-OWN_POKES = "its own"  # of question rivals: the unlabelled pokes that a method is given
+NETWORKS = {METHODS.get(experiment, "network"): experiment for experiment in TRAINED_IN}  # by method
+OWN_POKES = "its own"  # of experiment rivals: the unlabelled pokes that a method is given
 AXES = {"pokes": ("sweep_pokes", "pokes_n"), "sensors": ("sweep_sensors", "skins_n"), "labels": ("labels", "labels_n")}
 
 
 def learned(table: pd.DataFrame, *, headline: str) -> dict[str, Any]:
     """Compose what the scores say; `headline` names the recipe that stands beside the paper's numbers."""
-    recipes = {row: (question, headline) for row, question in TABLE_2.items()} | {CONTROL: ("adapt", CONTROL)}
-    models = {row: select(table, question=question, recipe=recipe) for row, (question, recipe) in recipes.items()}
+    recipes = {row: (experiment, headline) for row, experiment in TABLE_2.items()} | {CONTROL: ("adapt", CONTROL)}
+    models = {row: select(table, question=experiment, recipe=recipe) for row, (experiment, recipe) in recipes.items()}
     models = {row: group for row, group in models.items() if len(group)}
     table2 = {row: over_pairs(group) if row == "single" else over_boards(group) for row, group in models.items()}
     control = table2.pop(CONTROL, None)
@@ -85,11 +85,11 @@ def _adapt(adapted: pd.DataFrame, control: Mapping[str, Any] | None) -> dict[str
 
 
 def curves_of(points: Points) -> dict[str, list[tuple[str, int, dict[str, float]]]]:
-    """Give the points of sweeps as curves: by question, the method, the step on its axis, the mean of each score."""
+    """Give the points of sweeps as curves: by experiment, the method, the step on its axis, the mean of each score."""
     numbers = _curves(tidy([], points))
     return {
-        question: [(_curve_name(row), row[axis], _score_means(row)) for row in numbers[key]]
-        for question, (key, axis) in AXES.items()
+        experiment: [(_curve_name(row), row[axis], _score_means(row)) for row in numbers[key]]
+        for experiment, (key, axis) in AXES.items()
         if key in numbers
     }
 
@@ -135,25 +135,29 @@ def _lobo(rows: pd.DataFrame) -> dict[str, Any]:
 
 def _single(table: pd.DataFrame, headline: str) -> dict[str, Any]:
     """Summarise one skin by how it was split; `single_sensor` is what stands beside the paper's numbers."""
-    questions = (*PAPERS_SPLITS, *HONEST.values())
-    numbers = {question: over_folds(select(table, question=question, recipe=headline)) for question in questions}
-    numbers = {question: group for question, group in numbers.items() if group}
-    papers = next(({"split": question} | numbers[question] for question in PAPERS_SPLITS if question in numbers), {})
-    honest = {name: numbers[question] for name, question in HONEST.items() if question in numbers}
+    experiments = (*PAPERS_SPLITS, *HONEST.values())
+    numbers = {
+        experiment: over_folds(select(table, question=experiment, recipe=headline)) for experiment in experiments
+    }
+    numbers = {experiment: group for experiment, group in numbers.items() if group}
+    papers = next(
+        ({"split": experiment} | numbers[experiment] for experiment in PAPERS_SPLITS if experiment in numbers), {}
+    )
+    honest = {name: numbers[experiment] for name, experiment in HONEST.items() if experiment in numbers}
     by_skin = whole(select(table, question="single_temporal", recipe=headline)).groupby("fold")[list(METRICS)].mean()
     skins = {"single_skins": records(by_skin)} if len(by_skin) > 1 else {}
     return numbers | {"single_sensor": papers | honest} | skins
 
 
 def _variants(table: pd.DataFrame) -> dict[str, dict[str, Any]]:
-    """Summarise every recipe of every question that leaves models; repeats on one skin are no boards."""
+    """Summarise every recipe of every experiment that leaves models; repeats on one skin are no boards."""
     numbers: dict[str, dict[str, Any]] = {}
     models = table[table["question"].isin([row.name for row in ROWS if row.kind == "models"])]
-    for (question, recipe), group in _parts(models, ["question", "recipe"], sort=False):
+    for (experiment, recipe), group in _parts(models, ["question", "recipe"], sort=False):
         summarise = (
-            over_pairs if question == "transfer" else over_folds if question.startswith("single_") else over_boards
+            over_pairs if experiment == "transfer" else over_folds if experiment.startswith("single_") else over_boards
         )
-        numbers.setdefault(question, {})[recipe] = summarise(group)
+        numbers.setdefault(experiment, {})[recipe] = summarise(group)
     return numbers
 
 
@@ -264,11 +268,11 @@ def _parts(rows: pd.DataFrame, by: str | list[str], *, sort: bool = True) -> Ite
 
 def _times(row: Mapping[str, Any], seconds: Mapping[str, Seconds]) -> dict[str, float]:
     """Give the median seconds of a method's trainings; an adapted network was also trained before."""
-    question = NETWORKS.get(row["method"])
-    if question is None:
+    experiment = NETWORKS.get(row["method"])
+    if experiment is None:
         return _median_times(seconds.get("train_classical", []), f"{row['name']}.")
-    times = _median_times(seconds.get(TRAINED_IN[question], []), f"{question}.{row['name']}.")
-    if question != "adapt" or not times:
+    times = _median_times(seconds.get(TRAINED_IN[experiment], []), f"{experiment}.{row['name']}.")
+    if experiment != "adapt" or not times:
         return times
     base = _median_times(seconds.get("train_triplet", []), f"triplet.{row['base']}.")
     return times | {"train_s": times["train_s"] + base["train_s"]} if base else {}
@@ -319,14 +323,14 @@ def add_up(accounts: Iterable[Mapping[str, int]]) -> dict[str, int]:
 
 
 def foretold(tables: Iterable[pa.Table]) -> dict[str, Any]:
-    """Summarise over folds how well places are told before their touch: by question, and by what tells them."""
+    """Summarise over folds how well places are told before their touch: by experiment, and by what tells them."""
     found: dict[str, dict[str, Any]] = {}
     hover: dict[str, dict[str, Any]] = {}
     for table in tables:
-        for (question, told_by), rows in table.to_pandas().groupby(["question", "told_by"], sort=False):
+        for (experiment, told_by), rows in table.to_pandas().groupby(["question", "told_by"], sort=False):
             if told_by not in HOVER:
                 scored = {name: statistic(rows[name].to_list()) for name in METRICS if name in rows}
-                found.setdefault(question, {})[told_by] = scored
+                found.setdefault(experiment, {})[told_by] = scored
                 continue
             for row in rows.to_dict("records"):
                 own = hover.setdefault(str(row["fold"]), {name: row[name] for name in LENGTHS})
@@ -339,21 +343,21 @@ def foretold(tables: Iterable[pa.Table]) -> dict[str, Any]:
 def count_trainings(
     cards: Sequence[Row], points: Mapping[str, Sequence[Row]], experiments: Mapping[str, Row]
 ) -> dict[str, dict[str, int]]:
-    """Count networks by question: trainings in all, those that collapsed, and those of them that had to be kept."""
+    """Count networks by experiment: trainings in all, those that collapsed, and those of them that had to be kept."""
     trainings: dict[str, list[Row]] = {}
     for card in cards:
         trainings.setdefault(card["question"], []).append(card)
-    for question, swept in points.items():
-        trainings[question] = [point for point in swept if "collapsed" in point]
-    counted = {question: tally(trained) for question, trained in trainings.items() if trained}
+    for experiment, swept in points.items():
+        trainings[experiment] = [point for point in swept if "collapsed" in point]
+    counted = {experiment: tally(trained) for experiment, trained in trainings.items() if trained}
     return counted | {name: dict(answer["trainings"]) for name, answer in experiments.items() if "trainings" in answer}
 
 
 def lost_by_protocol(losses: Mapping[str, Row]) -> dict[str, dict[str, Any]]:
-    """Add the counts of each further protocol's captures, and what questions of it left out of their rows."""
+    """Add the counts of each further protocol's captures, and what experiments of it left out of their rows."""
     found: dict[str, dict[str, Any]] = {}
-    for question, lost in losses.items():
-        protocol = QUESTIONS[question].protocol
+    for experiment, lost in losses.items():
+        protocol = EXPERIMENTS[experiment].protocol
         if protocol is None or not lost["accounts"]:
             continue
         left_out = found.get(protocol, {"left_out": {}})["left_out"]
@@ -377,8 +381,8 @@ def _cost(cost: Row) -> dict[str, float]:
 
 
 def answered(studied: Mapping[str, Any], cost: Row, seconds: Mapping[str, Sequence[Row]]) -> dict[str, Any]:
-    """Put the answers to questions about physics beside each other; those about run time stand with what all cost."""
-    others = {question: answer for question, answer in studied.items() if question != "runtime"}
+    """Put the answers to experiments about physics beside each other; those about run time stand with what all cost."""
+    others = {experiment: answer for experiment, answer in studied.items() if experiment != "runtime"}
     studies = timed(studied["runtime"], seconds.get("runtime", [])) if "runtime" in studied else {}
     return others | {"runtime": {**cost, **studies}}
 
@@ -429,7 +433,7 @@ def _overlay(numbers: Row, costs: Row) -> dict[str, Any]:
 
 
 def headline_scores(numbers: Row) -> dict[str, Any]:
-    """Take a scene's headline scores, nested by question: means, a place's and a force's, with units in their names.
+    """Take a scene's headline scores, nested by experiment: means, a place's and a force's, with units in their names.
 
     Nothing that differs between identical runs: no seconds, no commit, no machine.
     """
@@ -441,7 +445,9 @@ def headline_scores(numbers: Row) -> dict[str, Any]:
         "table2": {name: _means(row) for name, row in table2.items()},
         "lobo": {"registered": _means(numbers["lobo"]["registered"])} if "lobo" in recorded else {},
         "labels": _best_of_labels(numbers["labels"]) if "labels" in recorded else {},
-        "single_sensor": {name: _means(numbers[question]) for name, question in SINGLE.items() if question in numbers},
+        "single_sensor": {
+            name: _means(numbers[experiment]) for name, experiment in SINGLE.items() if experiment in numbers
+        },
         "drift_end": _drift_end(numbers.get("drift", {})),
         "shear": _means(numbers["shear"], OF_SHEAR) if "shear" in numbers else {},
         "touches": _means(numbers.get("touches", {}).get("superposition", {}), OF_TOUCHES),

@@ -7,14 +7,14 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.questions import experiment_files
-from pipeline.scenes import EXPERIMENTS
+from pipeline.catalogue import experiment_files
+from pipeline.scenes import ANALYSES
 from pipeline.stages import module_name
 
 
 def modules(numbers: Mapping[str, Any]) -> dict[str, ModuleType]:
     """Import the module of each experiment that a report has numbers of."""
-    return {name: import_module(module_name(name)) for name in EXPERIMENTS if name in numbers}
+    return {name: import_module(module_name(name)) for name in ANALYSES if name in numbers}
 
 
 def experiment_tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:

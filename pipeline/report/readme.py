@@ -11,7 +11,7 @@ from pipeline.report.formatting import to_markdown
 from pipeline.report.headline import labels_table, short_table
 from pipeline.report.numbers import join
 from pipeline.report.tables import make_tables, skins_table
-from pipeline.scenes import EXPERIMENTS
+from pipeline.scenes import ANALYSES
 from pipeline.stages import module_name
 from reskin import io
 from reskin.code import ROOT, file_of
@@ -78,7 +78,7 @@ def _results(numbers: Numbers, names: Sequence[str]) -> str:
             f"shown here. Run it again: `reskin scenes use {scene}`, `dvc repro`."
         )
     # Results that were committed before the code of other experiments changed can still be shown.
-    tables = make_tables({name: part for name, part in numbers.items() if name not in EXPERIMENTS or name in names})
+    tables = make_tables({name: part for name, part in numbers.items() if name not in ANALYSES or name in names})
     heading = (
         f"Scene `{provenance['scene']}`, **{provenance['source']}**; trained by code {provenance['trained']}, "
         f"seed {provenance['seed']}, {provenance['device']}:"

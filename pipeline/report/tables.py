@@ -293,7 +293,7 @@ def _table_2(numbers: Numbers, source: str) -> pd.DataFrame:
         rows[CONSTANT] = (constant, {})
     table = _beside_paper(rows, source)
     trainings = numbers.get("trainings", {})
-    asked = [trainings[question] for question in scenes.TABLE_2.values() if question in trainings]
+    asked = [trainings[experiment] for experiment in scenes.TABLE_2.values() if experiment in trainings]
     words = [TARGET] * (source == "simulated")
     if kept_n := sum(counts["kept_collapsed_n"] for counts in asked):
         words.append(f"{kept_n} networks collapsed every time that they were trained, and are in these means.")
@@ -375,16 +375,16 @@ def _trainings(counts: Mapping[str, Mapping[str, int]], source: str) -> pd.DataF
         "trainings": "trainings_n", "collapsed": "collapsed_n", "collapsed every time, kept": "kept_collapsed_n",
     }  # fmt: skip
     lines = [
-        {"question": question, "source": source} | {title: str(counted[name]) for title, name in columns.items()}
-        for question, counted in counts.items()
+        {"question": experiment, "source": source} | {title: str(counted[name]) for title, name in columns.items()}
+        for experiment, counted in counts.items()
     ]
     return tabulate(lines, meaning=COLLAPSED_MEANING)
 
 
 def _variants(variants: Mapping[str, Any], source: str) -> pd.DataFrame:
     lines = [
-        {"question": question, "recipe": recipe, "source": source} | scored(row)
-        for question, recipes in variants.items()
+        {"question": experiment, "recipe": recipe, "source": source} | scored(row)
+        for experiment, recipes in variants.items()
         for recipe, row in recipes.items()
     ]
     return pd.DataFrame(lines)

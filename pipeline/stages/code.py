@@ -7,7 +7,7 @@ of experiments count for the stages that show results, not for those that comput
 
 from pathlib import Path
 
-from pipeline.questions import experiment_files
+from pipeline.catalogue import experiment_files
 from pipeline.stages import EXPERIMENTS, STAGES, module_name
 from reskin import io
 from reskin.code import digest, imported

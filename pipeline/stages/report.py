@@ -40,7 +40,7 @@ from pipeline.report.numbers import (
 from pipeline.report.page import index, page, run_page
 from pipeline.report.parts import experiment_figures
 from pipeline.report.tables import make_tables, table_texts
-from pipeline.scenes import TABLE_2, Asking, asked_by, stages
+from pipeline.scenes import TABLE_2, SceneExperiments, experiments_of, stages
 from pipeline.settings import Settings
 from pipeline.stage import say
 from pipeline.statistics import tidy, to_csv
@@ -66,12 +66,12 @@ def table2(settings: Settings, models: Path, shown: Path) -> None:
     say(f"{scene} ({source})\n{table}\n{scene}: {', '.join(str(file) for file in sorted(shown.iterdir()))}")
 
 
-def report(settings: Settings, indentations: Path, folds: Path, models: Path, answers: Path, reports: Path) -> None:
+def report(settings: Settings, indentations: Path, folds: Path, models: Path, results: Path, reports: Path) -> None:
     """Write the numbers, tables, figures and the page of a scene."""
     scene = settings.scene
-    asked = read_asked(settings)
-    numbers, drawn, scores = read_numbers(settings, asked, Places(indentations, folds, models, answers))
-    if "choice" in asked.questions:
+    asked = read_experiments(settings)
+    numbers, drawn, scores = read_numbers(settings, asked, Places(indentations, folds, models, results))
+    if "choice" in asked.experiments:
         record = to_record(
             numbers["chosen"], read_cards(asked, models), source=asked.source, seed=settings.seed,
             physics=fingerprint(settings.shared),
@@ -95,39 +95,39 @@ def report(settings: Settings, indentations: Path, folds: Path, models: Path, an
     # Seconds, commit and machine differ between equal runs: what shows them is in one folder, and no DVC output.
     io.write_texts(reports / "runtime", costs | {"index.html": run_page(numbers, costs)})
     io.write_text(reports / "index.html", page(shared, tables, figures))
-    results = (io.read_json(file) for file in sorted(reports.parent.glob("*/numbers.json")))
+    of_scenes = (io.read_json(file) for file in sorted(reports.parent.glob("*/numbers.json")))
     headlines = {
         file.parent.parent.name: io.read_bytes(file).decode() for file in reports.parent.glob(f"*/figures/{FILE}")
     }
-    described = [result for result in results if "described" in result]
+    described = [numbers for numbers in of_scenes if "described" in numbers]
     io.write_text(reports.parent / "index.html", index(described, headlines))
     if numbers.get("table2"):
         say(f"{scene} ({asked.source})\n{to_markdown(short_table(numbers))}")
     say(f"{scene}: {reports}/index.html, numbers.json, provenance.json, scores.json, tables, figures, runtime")
 
 
-def publish(settings: Settings, models: Path, answers: Path, reports: Path) -> None:
+def publish(settings: Settings, models: Path, results: Path, reports: Path) -> None:
     """Write every training of a scene and its report to MLflow once; if the server is away, warn and go on."""
-    asked, scene = read_asked(settings), settings.scene
+    asked, scene = read_experiments(settings), settings.scene
     variants = {variant: models / variant for variant in asked.modelled}
     name = f"{scene} (dvc exp)" if is_experiment() else scene  # beside the checkout's own results, not in their place
     try:
-        counts = write_runs(variants, read_curves(asked, answers), reports, scene=name, root=home())
+        counts = write_runs(variants, read_curves(asked, results), reports, scene=name, root=home())
         say(f"{name}: MLflow runs {counts}")
     except TrackingAway as away:
         say(f"warning: {scene} is not in MLflow: {away}")
 
 
-def read_curves(asked: Asking, answers: Path) -> Curves:
+def read_curves(asked: SceneExperiments, results: Path) -> Curves:
     """Read the points of every sweep and the numbers of every experiment, as curves by stage."""
     stages = asked.curves
-    points = {question: io.read_json(answers / f"{stage}.json") for question, stage in stages.items()}
+    points = {experiment: io.read_json(results / f"{stage}.json") for experiment, stage in stages.items()}
     curves: dict[str, list[tuple[str, int, dict[str, float]]]]
-    curves = {stages[question]: rows for question, rows in curves_of(points).items()}
-    for question in asked.experiments:
-        numbers = io.read_json(answers / f"{question}.json")["numbers"]
-        named = [(name.rpartition("."), value, step) for name, value, step in metrics_of({question: numbers})]
-        curves[question] = [(head, step, {tail: value}) for (head, _, tail), value, step in named]
+    curves = {stages[experiment]: rows for experiment, rows in curves_of(points).items()}
+    for experiment in asked.analyses:
+        numbers = io.read_json(results / f"{experiment}.json")["numbers"]
+        named = [(name.rpartition("."), value, step) for name, value, step in metrics_of({experiment: numbers})]
+        curves[experiment] = [(head, step, {tail: value}) for (head, _, tail), value, step in named]
     return curves
 
 
@@ -138,35 +138,37 @@ class Places:
     indentations: Path
     folds: Path
     models: Path
-    answers: Path
+    results: Path
 
 
-def read_asked(settings: Settings) -> Asking:
+def read_experiments(settings: Settings) -> SceneExperiments:
     """Read which experiments the scene runs; raise if it was edited since the plan was made."""
-    asked = asked_by(settings)
+    asked = experiments_of(settings)
     planned = read_yaml(Path(PLAN))["scenes"].get(settings.scene, [])
-    if list(asked.questions) != list(planned):
-        differing = ", ".join(sorted(set(asked.questions) ^ set(planned))) or "another order"
+    if list(asked.experiments) != list(planned):
+        differing = ", ".join(sorted(set(asked.experiments) ^ set(planned))) or "another order"
         remedy = f"Try: reskin scenes use {settings.scene}, beside the others that run."
-        raise ParamsError(settings.where, "questions", f"those of {PLAN}", f"{differing} only in one", remedy)
+        raise ParamsError(settings.where, "experiments", f"those of {PLAN}", f"{differing} only in one", remedy)
     return asked
 
 
-def read_cards(asked: Asking, models: Path) -> list[dict[str, Any]]:
+def read_cards(asked: SceneExperiments, models: Path) -> list[dict[str, Any]]:
     """Read the cards of all models that the scene keeps."""
     return [io.read_json(file) for arm in asked.modelled for file in sorted((models / arm).glob("*.json"))]
 
 
-def read_numbers(settings: Settings, asked: Asking, at: Places) -> tuple[dict[str, Any], dict[str, Any], pd.DataFrame]:
+def read_numbers(
+    settings: Settings, asked: SceneExperiments, at: Places
+) -> tuple[dict[str, Any], dict[str, Any], pd.DataFrame]:
     """Read what numbers.json says, by experiment what only its figures show, and the table of scores."""
     folds, cards = io.read_json(at.folds), read_cards(asked, at.models)
     accounts = [io.read_account(at.indentations / f"{name}.parquet") for name in folds["captures"]]
 
-    def answers(names: Sequence[str]) -> dict[str, Any]:
-        return {name: io.read_json(at.answers / f"{name}.json") for name in names}
+    def read(names: Sequence[str]) -> dict[str, Any]:
+        return {name: io.read_json(at.results / f"{name}.json") for name in names}
 
-    points = {question: answers([stage])[stage] for question, stage in asked.curves.items()}
-    experiments, table = answers(asked.experiments), tidy(cards, points)
+    points = {experiment: read([stage])[stage] for experiment, stage in asked.curves.items()}
+    experiments, table = read(asked.analyses), tidy(cards, points)
     costs = {unit: cost for unit, cost in read_costs(COSTS / settings.scene).items() if asked.runs(unit)}
     took = {file.stem: io.read_json(file) for file in sorted((SECONDS / settings.scene).glob("*.json"))}
     numbers = {
@@ -174,24 +176,24 @@ def read_numbers(settings: Settings, asked: Asking, at: Places) -> tuple[dict[st
         **compose(table, accounts, folds["dropped"], headline=HEADLINE),
         **foretold([io.read_table(at.models / arm / SCORED) for arm in asked.modelled if arm == "train_single"]),
         "trainings": count_trainings(cards, points, experiments),
-        "described": {asked.described: io.read_json(at.answers / "described.json")},
-        **answers([question for question in ("audit",) if question in asked.questions]),
-        **{question: answer["numbers"] for question, answer in experiments.items()},
-        **answered(answers(asked.studied), runtime(len(cards), costs), took),
+        "described": {asked.described: io.read_json(at.results / "described.json")},
+        **read([experiment for experiment in ("audit",) if experiment in asked.experiments]),
+        **{experiment: answer["numbers"] for experiment, answer in experiments.items()},
+        **answered(read(asked.studies), runtime(len(cards), costs), took),
     }
     if asked.source == "simulated":
-        losses = {question: answer["losses"] for question, answer in experiments.items()}
+        losses = {experiment: answer["losses"] for experiment, answer in experiments.items()}
         numbers["capture_by_protocol"] = lost_by_protocol(losses)
-    if "choice" in asked.questions:
+    if "choice" in asked.experiments:
         numbers["chosen"] = choose(cards)
     numbers["runtime"] |= timed_learning(numbers, took)
-    return rounded(numbers), {question: answer["drawn"] for question, answer in experiments.items()}, table
+    return rounded(numbers), {experiment: answer["drawn"] for experiment, answer in experiments.items()}, table
 
 
 def _provenance(
-    settings: Settings, asked: Asking, cards: Sequence[Mapping[str, Any]], costs: Mapping[str, Any]
+    settings: Settings, asked: SceneExperiments, cards: Sequence[Mapping[str, Any]], costs: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Say where a result came from; a stage whose question was switched off costs nothing any more."""
+    """Say where a result came from; a stage whose experiment was switched off costs nothing any more."""
     return {
         "scene": settings.scene, "source": asked.source, "git": code_version(), "seed": settings.seed,
         "trained": ", ".join(sorted({card["git"] for card in cards})), "versions": versions(),

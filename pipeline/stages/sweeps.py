@@ -51,7 +51,7 @@ def sweep_pokes(settings: Settings, indentations: Path, folds: Path, started: Pa
         for fold in held_out
         for pokes_n in sweep.pokes_n
         if pokes_n
-        for trial in adaptations(data, fold, (HEADLINE, recipe), starts, question="pokes", pokes_n=pokes_n)
+        for trial in adaptations(data, fold, (HEADLINE, recipe), starts, experiment="pokes", pokes_n=pokes_n)
     ]
     trials = [trial for trial, _ in pairs]
     trained = train_all(data, trials, "sweep_pokes")
@@ -91,7 +91,7 @@ def sweep_sensors(settings: Settings, indentations: Path, folds: Path, scores: P
     adapted = [
         trial
         for fold in _folds(data)
-        for trial in adaptations(data, fold, (HEADLINE, recipe), starts, question="sensors", pokes_n=section.pokes_n)
+        for trial in adaptations(data, fold, (HEADLINE, recipe), starts, experiment="sensors", pokes_n=section.pokes_n)
     ]
     methods = [trial.what for trial in trials] + ["adapted"] * len(adapted)
     trials, trained = trials + adapted, trained + train_all(data, adapted, "sweep_sensors")

@@ -45,7 +45,7 @@ def train_single(settings: Settings, indentations: Path, folds: Path, models: Pa
     """
     prepare_training()
     data = read_data(settings, indentations, folds)
-    own = [fold for fold in data.folds if fold.question in ONE_SKIN]
+    own = [fold for fold in data.folds if fold.experiment in ONE_SKIN]
     trials = trials_of(data, read_train_single(settings), own)
     write_models(models, data, trials, train_all(data, trials, "train_single"), "train_single")
     told = score_before_touch(data, indentations, io.read_json(folds)["captures"], networks_by_fold(models, BY_TIME))
@@ -74,7 +74,7 @@ def train_triplet(settings: Settings, indentations: Path, folds: Path, models: P
     """Train on the skins of all boards but one, with the triplet loss (paper section 5)."""
     prepare_training()
     data = read_data(settings, indentations, folds)
-    trials = trials_of(data, read_train_triplet(settings), data.folds_of("lobo"), question="triplet")
+    trials = trials_of(data, read_train_triplet(settings), data.folds_of("lobo"), experiment="triplet")
     write_models(models, data, trials, train_all(data, trials, "train_triplet"), "train_triplet")
 
 
@@ -91,7 +91,7 @@ def adapt(settings: Settings, indentations: Path, folds: Path, started: Path, mo
         trial
         for fold in data.folds_of("lobo")
         for named in section.recipes.items()
-        for trial in adaptations(data, fold, named, starts, question="adapt", pokes_n=section.pokes_n)
+        for trial in adaptations(data, fold, named, starts, experiment="adapt", pokes_n=section.pokes_n)
     ]
     write_models(models, data, trials, train_all(data, trials, "adapt"), "adapt")
 

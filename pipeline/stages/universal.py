@@ -8,15 +8,15 @@ import numpy as np
 from pydantic import Field
 
 from pipeline.executors import make_executor
-from pipeline.experiments.answer import read_folder
 from pipeline.experiments.compare import Compare, see, setup_of, skins_of, turns_of
+from pipeline.experiments.results import read_folder
 from pipeline.settings import Settings
 from pipeline.stage import say
 from pipeline.training import few_labels as few
 from pipeline.training.few_labels import FewLabels
 from pipeline.training.trainings import SceneData, collapse_record, measured, read_data, score_test, train_all
 from pipeline.training.universal import (
-    QUESTION,
+    EXPERIMENT,
     Bench,
     Frame,
     Known,
@@ -41,7 +41,7 @@ def read_few_labels(settings: Settings) -> FewLabels:
 def few_labels(settings: Settings, indentations: Path, folds: Path, scores: Path) -> None:
     """Score networks, adapted networks and classical methods with every number of labels on the same rows."""
     data = read_data(settings, indentations, folds)
-    study = few.Study(data.rows, data.folds_of(few.QUESTION), settings.seed, read_few_labels(settings))
+    study = few.Study(data.rows, data.folds_of(few.EXPERIMENT), settings.seed, read_few_labels(settings))
     done: list[few.Done] = []
     for step in (few.networks, few.adapted, few.labelled):  # each goes on from what the last ones trained
         pairs = step(study, done)
@@ -92,7 +92,7 @@ def universal(settings: Settings, indentations: Path, folds: Path, models: Path,
     sureness = tell_sureness(nominal, lessons.labels_n, settings.seed)
     bench, points = Bench(data, frame, seen, nominal, {}, sureness), []
     bench = replace(bench, tempers=tell_tempers(bench, lessons.labels_n))
-    for fold in data.folds_of(QUESTION):
+    for fold in data.folds_of(EXPERIMENT):
         points += score_fold(bench, fold, rig, lessons.labels_n)
         say(f"{data.scene} universal: {fold.name} done")
     io.write_json(scores, points)

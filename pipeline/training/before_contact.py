@@ -40,13 +40,13 @@ def score_before_touch(
     scan = gather_scan(read, data.settings.section(Selection, "selection"))
     told_by = {"noload": scan.noload_uT, "scan": scan.scan_i[:, None].astype(np.float32)}
     lines = [
-        {"question": fold.question, "fold": fold.name, "told_by": name, **_score(data, inputs, fold.train, fold.test)}
+        {"question": fold.experiment, "fold": fold.name, "told_by": name, **_score(data, inputs, fold.train, fold.test)}
         for fold in data.folds
-        if fold.question in SAME_SKIN
+        if fold.experiment in SAME_SKIN
         for name, inputs in told_by.items()
     ]
     hover = gather_hover(read)
-    for fold in [fold for fold in data.folds if fold.question == BY_TIME]:
+    for fold in [fold for fold in data.folds if fold.experiment == BY_TIME]:
         lines += _hover(data, fold, hover, networks.get(fold.name, ()))
     kinds = dict.fromkeys(("question", "fold", "told_by"), pa.string())
     kinds |= dict.fromkeys((*PLACE, *LENGTHS), pa.float64())
@@ -72,7 +72,7 @@ def _hover(data: SceneData, fold: Fold, hover: Hover, networks: Sequence[Network
         scores = [score(true, answer) for answer in found]
         if scores:
             means = {name: float(np.mean([one[name] for one in scores])) for name in PLACE}
-            lines.append({"question": fold.question, "fold": fold.name, "told_by": told_by, **means, **lengths})
+            lines.append({"question": fold.experiment, "fold": fold.name, "told_by": told_by, **means, **lengths})
     return lines
 
 

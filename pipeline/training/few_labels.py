@@ -1,4 +1,4 @@
-"""Question labels: what a few labels of a new board are worth. In: rows, folds, settings. Out: what to run.
+"""Experiment labels: what a few labels of a new board are worth. In: rows, folds, settings. Out: what to run.
 
 Networks are trained, adapted by unlabelled pokes, and fine-tuned on labelled ones; classical methods are fitted with
 them. Refuses to know how they are run and scored.
@@ -24,7 +24,7 @@ from reskin.models.recipe import AugmentedRecipe, FineTuning, Labelling, Name, R
 from reskin.models.trial import Adapting, Start, Trained, Trial
 from reskin.seeds import rng_for
 
-QUESTION = "labels"
+EXPERIMENT = "labels"
 Labels = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
 
 
@@ -51,7 +51,7 @@ class FewLabels(Strict):
 
 @dataclass(frozen=True)
 class Study:
-    """Rows, the folds of the question, the scene's seed, and the settings."""
+    """Rows, the folds of the experiment, the scene's seed, and the settings."""
 
     rows: Rows
     folds: Sequence[Fold]
@@ -91,7 +91,7 @@ def networks(study: Study, done: Sequence[Done]) -> list[tuple[Tried, Trial]]:
     return [
         (
             Tried(name, recipe.inputs, 0, fold),
-            Trial(QUESTION, name, recipe, fold.name, study.seed, 0, fold.train, fold.test),
+            Trial(EXPERIMENT, name, recipe, fold.name, study.seed, 0, fold.train, fold.test),
         )
         for fold in study.folds
         for name, recipe in study.settings.recipes.items()

@@ -1,4 +1,4 @@
-"""Question population: experts that were taught simulated skins only, on skins of a scene that these do not contain.
+"""Experiment population: experts that were taught simulated skins only, on skins of a scene that these do not contain.
 
 In: a skin at rest, unlabelled pokes, one known weight, a few labels. Out: scores, and what 90 % intervals hold. How
 sure experts are is told on further skins of the population. Refuses to know files and how scenes are simulated.

@@ -43,9 +43,9 @@ class SceneData:
     rows: Rows
     folds: list[Fold]
 
-    def folds_of(self, question: str) -> list[Fold]:
-        """Take the folds of one question."""
-        return [fold for fold in self.folds if fold.question == question]
+    def folds_of(self, experiment: str) -> list[Fold]:
+        """Take the folds of one experiment."""
+        return [fold for fold in self.folds if fold.experiment == experiment]
 
 
 def prepare_training() -> None:
@@ -63,11 +63,11 @@ def read_data(settings: Settings, indentations: Path, folds: Path) -> SceneData:
 
 
 def trials_of(
-    data: SceneData, training: Training, folds: Iterable[Fold], *, question: str | None = None
+    data: SceneData, training: Training, folds: Iterable[Fold], *, experiment: str | None = None
 ) -> list[Trial]:
-    """Make a trial of every recipe, fold and seed; they answer the folds' own question, or the one that is named."""
+    """Make a trial of every recipe, fold and seed; they answer the folds' own experiment, or the one that is named."""
     return [
-        Trial(question or fold.question, name, recipe, fold.name, data.settings.seed, seed_i, fold.train, fold.test)
+        Trial(experiment or fold.experiment, name, recipe, fold.name, data.settings.seed, seed_i, fold.train, fold.test)
         for fold in folds
         for name, recipe in training.recipes.items()
         for seed_i in range(training.seeds_n)
@@ -144,7 +144,7 @@ def _predictions(trials: Sequence[Trial], trained: Sequence[Trained], rows: Rows
     """One row a test row and training: the truth and the prediction, side by side."""
     tables = []
     for trial, result in zip(trials, trained, strict=True):
-        words = {"question": trial.question, "recipe": trial.recipe_name, "fold": trial.fold, "seed_i": trial.seed_i}
+        words = {"question": trial.experiment, "recipe": trial.recipe_name, "fold": trial.fold, "seed_i": trial.seed_i}
         columns = {name: pa.repeat(word, len(trial.test)) for name, word in words.items()}
         columns["skin"] = pa.array(rows.skin[trial.test].tolist())
         for i, name in enumerate(TARGETS):
@@ -159,7 +159,7 @@ def describe(trial: Trial, trained: Trained, rows: Rows, scene: str) -> dict[str
     card = {
         "format": FORMAT,
         "scene": scene,
-        "question": trial.question,
+        "question": trial.experiment,
         "recipe_name": trial.recipe_name,
         "recipe": trial.recipe.model_dump(mode="json"),
         "fold": trial.fold,
@@ -222,20 +222,20 @@ def read_starts(models: Path) -> Starts:
 
 
 def adaptations(
-    data: SceneData, fold: Fold, named: tuple[str, Adaptation], starts: Starts, *, question: str, pokes_n: int
+    data: SceneData, fold: Fold, named: tuple[str, Adaptation], starts: Starts, *, experiment: str, pokes_n: int
 ) -> Iterator[Trial]:
     """Adapt to each skin of a fold by itself: so many indentations of its pool, of which only lines are passed on."""
     for skin in np.unique(data.rows.skin[fold.test]):
         for seed_i in own_starts(starts, named[1].base, fold):
             lines = pool_lines(data, fold, str(skin), pokes_n=pokes_n, seed_i=seed_i)
-            yield adaptation(data, fold, named, starts, Pokes(question, str(skin), seed_i, f"{pokes_n}pokes", lines))
+            yield adaptation(data, fold, named, starts, Pokes(experiment, str(skin), seed_i, f"{pokes_n}pokes", lines))
 
 
 @dataclass(frozen=True)
 class Pokes:
-    """What one network is adapted by: lines on one skin; `question` and `what` name the training."""
+    """What one network is adapted by: lines on one skin; `experiment` and `what` name the training."""
 
-    question: str
+    experiment: str
     skin: str
     seed_i: int
     what: str
@@ -249,7 +249,7 @@ def adaptation(data: SceneData, fold: Fold, named: tuple[str, Adaptation], start
     start = own_starts(starts, settings.base, fold)[pokes.seed_i]
     recipe = data.settings.training("train_triplet").recipes[settings.base]
     return Trial(
-        pokes.question, name, recipe, fold.name, data.settings.seed, pokes.seed_i, fold.train, test,
+        pokes.experiment, name, recipe, fold.name, data.settings.seed, pokes.seed_i, fold.train, test,
         Adapting(start, settings, pokes.lines), pokes.skin, pokes.what,
     )  # fmt: skip
 

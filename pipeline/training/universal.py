@@ -194,7 +194,7 @@ def card_of(experts: Experts, lessons: Lessons, seed: int) -> dict[str, object]:
     }  # fmt: skip
 
 
-QUESTION = "labels"  # whose folds these are
+EXPERIMENT = "labels"  # whose folds these are
 METHODS = ("universal map, ", "universal, ")  # the map alone; with networks
 WAYS = {"rig": "boards of the rig", "nominal": "simulated alone"}
 REACH = 1.645  # standard deviations to either side of a 90 % interval
@@ -366,7 +366,7 @@ def scored(bench: Bench, test: Int64[np.ndarray, " b"], estimate: Estimate) -> d
 
 
 def pool_of(bench: Bench, fold: Fold) -> Pokes:
-    """Give the means of the pool's pokes, in the order in which question labels hands out labels."""
+    """Give the means of the pool's pokes, in the order in which experiment labels hands out labels."""
     rows, indentation = bench.data.rows, bench.data.rows.indentation[fold.pool]
     order = rng_for(bench.data.settings.seed, "labelled", fold.name).permutation(np.unique(indentation))
     own = [fold.pool[indentation == one] for one in order]

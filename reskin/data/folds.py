@@ -32,7 +32,7 @@ def render_folds(captures: Sequence[str], rows: Rows, folds: Sequence[Fold]) -> 
         "dropped": rows.dropped,
         "folds": [
             {
-                "question": fold.question,
+                "experiment": fold.experiment,
                 "name": fold.name,
                 **{key: labels for side in SIDES for key, labels in _labels(side, rows, getattr(fold, side)).items()},
                 **{side: to_ranges(getattr(fold, side)) for side in SIDES},
@@ -47,7 +47,7 @@ def parse_folds(words: dict[str, Any], rows: Rows, where: str) -> list[Fold]:
     if words["rows_n"] != len(rows):
         raise SchemaError(where, "rows_n", f"the {len(rows)} rows of its captures", words["rows_n"], "Split again.")
     return [
-        Fold(fold["question"], fold["name"], *(from_ranges(fold[side]) for side in SIDES)) for fold in words["folds"]
+        Fold(fold["experiment"], fold["name"], *(from_ranges(fold[side]) for side in SIDES)) for fold in words["folds"]
     ]
 
 

@@ -20,8 +20,8 @@ from reskin.errors import ParamsError
 from reskin.seeds import rng_for, seed_for
 
 WITHIN_SKIN = {"single_random": "readings", "single_indentation": "indentations", "single_pass": "passes"}  # and units
-SAME_SKIN = {"single_temporal", *WITHIN_SKIN}  # questions that test on the skin that was learnt on
-ONE_SKIN = {"transfer", *SAME_SKIN}  # questions whose networks are trained on one skin
+SAME_SKIN = {"single_temporal", *WITHIN_SKIN}  # experiments that test on the skin that was learnt on
+ONE_SKIN = {"transfer", *SAME_SKIN}  # experiments whose networks are trained on one skin
 Count = Annotated[int, Field(ge=1)]
 Fraction = Annotated[float, Field(gt=0, lt=1)]
 STATES_N = 2**32  # scikit-learn's seeds are below it
@@ -30,7 +30,7 @@ Sides = tuple[Int64[np.ndarray, " a"], Int64[np.ndarray, " b"]]  # train and tes
 
 
 class Split(Strict):
-    """How folds are drawn; each part is there if, and only if, its question is asked."""
+    """How folds are drawn; each part is there if, and only if, its experiment is asked."""
 
     random_test_fraction: Fraction | None = None
     random_repeats_n: Count | None = None
@@ -57,7 +57,7 @@ class Fold:
     Adaptation may poke in the pool; nothing is scored there, so that every method is scored on the same rows.
     """
 
-    question: str
+    experiment: str
     name: str
     train: Int64[np.ndarray, " a"]
     test: Int64[np.ndarray, " b"]
@@ -67,8 +67,8 @@ class Fold:
 NO_POOL = np.zeros(0, np.int64)
 
 
-def draw_folds(rows: Rows, questions: Iterable[str], split: Split, seed: int) -> list[Fold]:
-    """Draw the folds of every question that a scene asks.
+def draw_folds(rows: Rows, experiments: Iterable[str], split: Split, seed: int) -> list[Fold]:
+    """Draw the folds of every experiment that a scene asks.
 
     >>> rows = Rows.of_labels(boards=["b1", "b1", "b2"], skins=["s1", "s2", "s3"])
     >>> [(fold.name, fold.train.tolist(), fold.test.tolist()) for fold in draw_folds(rows, ["lobo"], Split(), 0)]
@@ -95,15 +95,15 @@ def draw_folds(rows: Rows, questions: Iterable[str], split: Split, seed: int) ->
     b3-01skins-draw0 [0] [] [3]
     b3-02skins-draw0 [0 1] [] [3]
     """
-    return [fold for question in questions for fold in _DRAW[question](rows, split, seed)]
+    return [fold for experiment in experiments for fold in _DRAW[experiment](rows, split, seed)]
 
 
 def leave_one_board_out(rows: Rows, split: Split, seed: int) -> list[Fold]:
     """One fold a board: train on all other boards, test on its skins (paper section 5.1)."""
     boards = np.unique(rows.board)
     if len(boards) < 2:
-        remedy = "Add another board's recording, or take lobo out of the scene's questions."
-        raise ParamsError("question lobo", "boards", "two or more", f"{len(boards)} ({', '.join(boards)})", remedy)
+        remedy = "Add another board's recording, or take lobo out of the scene's experiments."
+        raise ParamsError("experiment lobo", "boards", "two or more", f"{len(boards)} ({', '.join(boards)})", remedy)
     folds = []
     for board in boards:
         sides = np.flatnonzero(rows.board != board), np.flatnonzero(rows.board == board)
@@ -125,7 +125,7 @@ def fewer_sensors(rows: Rows, split: Split, seed: int) -> list[Fold]:
         if max(split.sensors_skins_n) > len(skins):
             rule = f"at most the {len(skins)} skins beside held-out board {board}"
             remedy = "Ask for fewer, or add another board's recording."
-            raise ParamsError("question sensors", "split.sensors_skins_n", rule, max(split.sensors_skins_n), remedy)
+            raise ParamsError("experiment sensors", "split.sensors_skins_n", rule, max(split.sensors_skins_n), remedy)
         draws = range(split.sensors_draws_n)
         orders = [rng_for(seed, "sensors", str(board), draw_i).permutation(skins) for draw_i in draws]
         for skins_n in split.sensors_skins_n:
@@ -175,7 +175,7 @@ def one_skin_to_others(rows: Rows, split: Split, seed: int) -> list[Fold]:
     if train_n >= len(boards):
         rule = f"less than the scene's {len(boards)} boards"
         remedy = "Each training skin takes a board; another must be left to test on."
-        raise ParamsError("question transfer", "split.transfer_skins_n", rule, train_n, remedy)
+        raise ParamsError("experiment transfer", "split.transfer_skins_n", rule, train_n, remedy)
     held = np.flatnonzero(np.isin(rows.board, boards[train_n:]))
     folds = []
     for board in boards[:train_n]:
@@ -185,7 +185,7 @@ def one_skin_to_others(rows: Rows, split: Split, seed: int) -> list[Fold]:
     return folds
 
 
-def hold_out_skins(rows: Rows, question: str, name: str, sides: tuple[np.ndarray, np.ndarray], split: Split) -> Fold:
+def hold_out_skins(rows: Rows, experiment: str, name: str, sides: tuple[np.ndarray, np.ndarray], split: Split) -> Fold:
     """Make a fold of train and held-out rows; with `pool_passes_n`, each held-out skin's first passes are its pool."""
     train, held = sides
     pooled = np.zeros(len(held), bool)
@@ -196,14 +196,14 @@ def hold_out_skins(rows: Rows, question: str, name: str, sides: tuple[np.ndarray
             if len(passes) <= split.pool_passes_n:
                 what, rule = f"passes of held-out skin {skin}", f"more than split.pool_passes_n, {split.pool_passes_n}"
                 remedy = "Record more passes, or make the pool smaller."
-                raise ParamsError(f"question {question}", what, rule, len(passes), remedy)
+                raise ParamsError(f"experiment {experiment}", what, rule, len(passes), remedy)
             pooled |= on_skin & np.isin(rows.pass_i[held], passes[: split.pool_passes_n])
-    fold = Fold(question, name, train, held[~pooled], held[pooled])
+    fold = Fold(experiment, name, train, held[~pooled], held[pooled])
     _prove_apart(rows, fold)
     return fold
 
 
-def within_first_skin(rows: Rows, split: Split, seed: int, *, question: str) -> list[Fold]:
+def within_first_skin(rows: Rows, split: Split, seed: int, *, experiment: str) -> list[Fold]:
     """Hold out random readings, indentations or passes of the first skin, repeatedly; at least one.
 
     Readings are the paper's way (section 4): those of one indentation fall on both sides, which flatters the model.
@@ -211,13 +211,13 @@ def within_first_skin(rows: Rows, split: Split, seed: int, *, question: str) -> 
     assert split.random_test_fraction is not None
     assert split.random_repeats_n is not None
     group = {"readings": np.arange(len(rows)), "indentations": rows.indentation, "passes": rows.pass_i}
-    unit, skin_rows = WITHIN_SKIN[question], np.flatnonzero(rows.skin == np.unique(rows.skin)[0])
+    unit, skin_rows = WITHIN_SKIN[experiment], np.flatnonzero(rows.skin == np.unique(rows.skin)[0])
     sides = draw_sides(
         group[unit][skin_rows], test_fraction=split.random_test_fraction, repeats_n=split.random_repeats_n,
-        state=seed if unit == "readings" else seed_for(seed, question),
-        what=f"{unit} of skin {rows.skin[skin_rows[0]]}", where=f"question {question}",
+        state=seed if unit == "readings" else seed_for(seed, experiment),
+        what=f"{unit} of skin {rows.skin[skin_rows[0]]}", where=f"experiment {experiment}",
     )  # fmt: skip
-    return [Fold(question, f"repeat{i}", skin_rows[a], skin_rows[b], NO_POOL) for i, (a, b) in enumerate(sides)]
+    return [Fold(experiment, f"repeat{i}", skin_rows[a], skin_rows[b], NO_POOL) for i, (a, b) in enumerate(sides)]
 
 
 def last_passes(rows: Rows, split: Split, seed: int) -> list[Fold]:
@@ -230,10 +230,10 @@ def last_passes(rows: Rows, split: Split, seed: int) -> list[Fold]:
         if len(captures) > 1:
             what, rule = f"the captures of skin {skin}", "one, as no clock orders several"
             remedy = "Record the passes in one capture, or ask single_random."
-            raise ParamsError("question single_temporal", what, rule, ", ".join(captures), remedy)
+            raise ParamsError("experiment single_temporal", what, rule, ", ".join(captures), remedy)
         pass_i = rows.pass_i[skin_rows]
         passes, what = np.unique(pass_i), f"passes of skin {skin}"
-        test_n = _test_n(len(passes), split.temporal_test_fraction, what, "question single_temporal")
+        test_n = _test_n(len(passes), split.temporal_test_fraction, what, "experiment single_temporal")
         train, test = (skin_rows[np.isin(pass_i, side)] for side in (passes[:-test_n], passes[-test_n:]))
         folds.append(Fold("single_temporal", str(skin), train, test, NO_POOL))
     return folds
@@ -259,7 +259,7 @@ def _test_n(all_n: int, fraction: float, what: str, where: str) -> int:
     test_n = round(fraction * all_n)
     if not 0 < test_n < all_n:
         got = f"{all_n}, of which {fraction:g} are {test_n}"
-        remedy = "Record more, change the fraction, or take the question out of the scene's."
+        remedy = "Record more, change the fraction, or take the experiment out of the scene's."
         raise ParamsError(where, what, "enough for both sides", got, remedy)
     return test_n
 
@@ -269,7 +269,7 @@ def _prove_apart(rows: Rows, fold: Fold) -> None:
     for what, labels in (("board", rows.board), ("skin", rows.skin)):
         both = np.intersect1d(np.unique(labels[fold.train]), np.unique(labels[held]))
         if len(both):
-            where, got = f"fold {fold.question}/{fold.name}", f"{', '.join(both)} on both"
+            where, got = f"fold {fold.experiment}/{fold.name}", f"{', '.join(both)} on both"
             remedy = "Give every skin its own name, and each skin one board."
             raise ParamsError(where, f"a {what}", "on one side only", got, remedy)
 
@@ -280,5 +280,5 @@ _DRAW: dict[str, Callable[[Rows, Split, int], list[Fold]]] = {
     "labels": few_labels,
     "transfer": one_skin_to_others,
     "single_temporal": last_passes,
-    **{question: partial(within_first_skin, question=question) for question in WITHIN_SKIN},
+    **{experiment: partial(within_first_skin, experiment=experiment) for experiment in WITHIN_SKIN},
 }

@@ -58,7 +58,7 @@ def lay_windows(units_n: Sequence[int], *, train_n: int, test_n: int, every_n: i
     if not windows_n:
         rule = f"at least drift.every_n + test_n = {every_n + test_n} long"
         remedy = "Record more, or make the windows smaller."
-        raise ParamsError("question drift", "the shortest capture", rule, min(units_n), remedy)
+        raise ParamsError("experiment drift", "the shortest capture", rule, min(units_n), remedy)
     tests = tuple((i * every_n, i * every_n + test_n) for i in range(1, windows_n + 1))
     left_out_n = sum(max(0, length_n - (windows_n + 1) * every_n) for length_n in units_n)
     return Windows((0, train_n), tests, left_out_n)
@@ -78,7 +78,7 @@ def check_one_each(captures: Sequence[Readings]) -> None:
         if len(of_skin) > 1:
             what, rule = f"the captures of skin {skin}", "one, as no clock orders several"
             remedy = "Record its contacts in one capture, or give each skin its own name."
-            raise ParamsError("question drift", what, rule, ", ".join(of_skin), remedy)
+            raise ParamsError("experiment drift", what, rule, ", ".join(of_skin), remedy)
 
 
 def lay_parts(

@@ -58,12 +58,12 @@ def networks_without(models: Path, board: str, *, recipe: str = HEADLINE) -> lis
     return found
 
 
-def networks_by_fold(models: Path, question: str, *, recipe: str = HEADLINE) -> dict[str, list[Network]]:
-    """Read the networks of a question by fold, one a seed; none where it was not asked."""
+def networks_by_fold(models: Path, experiment: str, *, recipe: str = HEADLINE) -> dict[str, list[Network]]:
+    """Read the networks of an experiment by fold, one a seed; none where it was not asked."""
     found: dict[str, list[Network]] = {}
     for file in sorted(models.glob("*.json")):
         card = io.read_json(file)
-        if (card["question"], card["recipe_name"]) == (question, recipe):
+        if (card["question"], card["recipe_name"]) == (experiment, recipe):
             network = Network(card, io.read_tensors(file.with_suffix(".safetensors"))[0])
             found.setdefault(card["fold"], []).append(network)
     return found

@@ -106,7 +106,7 @@ class FewLabels:
 class Trial:
     """One training. `train` and `test` are row numbers; `skin` is the one adapted to, `what` a part of its name."""
 
-    question: str
+    experiment: str
     recipe_name: str
     recipe: Recipe
     fold: str
@@ -122,7 +122,7 @@ class Trial:
     @property
     def name(self) -> str:
         """A name for files and for people, unique within a stage."""
-        parts = [self.question, self.recipe_name, self.fold, self.skin, self.what, f"seed{self.seed_i}"]
+        parts = [self.experiment, self.recipe_name, self.fold, self.skin, self.what, f"seed{self.seed_i}"]
         return ".".join(part for part in parts if part)
 
     @property

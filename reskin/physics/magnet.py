@@ -104,7 +104,7 @@ SEAMS_M = seams_m(SKIN_SIDE_M)  # of the 4x4 array of 0.25 in cubes that magneti
 
 
 class Rule(Strict):
-    """A rule of quadrature as a scene writes it: the nearer the chips, the finer it must be (question runtime)."""
+    """A rule of quadrature as a scene writes it: the nearer the chips, the finer it must be (experiment runtime)."""
 
     cell_mm: Annotated[float, Field(gt=0, le=20)]
     layers_n: Annotated[int, Field(ge=1, le=100)]

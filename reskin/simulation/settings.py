@@ -16,14 +16,14 @@ from reskin.simulation.protocols import SKIN_MM, Drag, Grid, Hand, Protocol
 from reskin.simulation.rig import Rig
 
 MAIN = "grid"  # its captures bear the names of their skins alone
-# The protocols that questions are asked of, and the kind that each question can read.
+# The protocols that experiments are asked of, and the kind that each experiment can read.
 KINDS: dict[str, str] = {
     MAIN: "grid", "wear": "grid", "flexible": "grid", "drag": "drag", "hand": "hand", "sleeve": "scatter",
     "glass": "load", "press": "press", "log": "walk",
 }  # fmt: skip
 ON_MAIN_BOARDS = ("wear", "drag", "hand", "glass", "press", "log")  # compared with, or read by networks of, these
 ON_OTHER_BOARDS = ("flexible",)
-OF_ONE_SKIN = ("wear", "glass", "press", "log")  # a question about the protocol reads one capture
+OF_ONE_SKIN = ("wear", "glass", "press", "log")  # an experiment about the protocol reads one capture
 SHARED: dict[str, type[Strict]] = {"skin": SkinDesign, "rig": Rig, "chip": ChipDesign, "spreads": Spreads}
 Count = Annotated[int, Field(ge=1, le=1000)]
 Side_mm = Annotated[float, Field(gt=0, le=500)]
@@ -85,11 +85,11 @@ class Synthesis(Strict):
         return self
 
     @model_validator(mode="after")
-    def _protocols_suit_their_questions(self) -> "Synthesis":
+    def _protocols_suit_their_experiments(self) -> "Synthesis":
         for name, protocol in self.protocols.items():
             kind, boards, skins_n = KINDS.get(name, protocol.kind), protocol.boards, protocol.skins_n
             if protocol.kind != kind:
-                raise ValueError(f"protocol {name}: kind is {kind}, which its question reads, not {protocol.kind}")
+                raise ValueError(f"protocol {name}: kind is {kind}, which its experiment reads, not {protocol.kind}")
             if isinstance(protocol, Drag) and "friction" not in protocol.terms:
                 raise ValueError(f"protocol {name}: terms of a drag hold friction, without which there is no shear")
             if name in ON_MAIN_BOARDS and boards != self.main.boards:
@@ -97,7 +97,7 @@ class Synthesis(Strict):
             if name in ON_OTHER_BOARDS and boards == self.main.boards:
                 raise ValueError(f"protocol {name}: boards is another kind than that of {MAIN}, not {boards} too")
             if name in OF_ONE_SKIN and skins_n != 1:
-                raise ValueError(f"protocol {name}: skins_n is 1, as its question reads one skin, not {skins_n}")
+                raise ValueError(f"protocol {name}: skins_n is 1, as its experiment reads one skin, not {skins_n}")
         return self
 
     @property

@@ -29,7 +29,7 @@ def inside(place_mm: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
     return (np.maximum(x_mm, y_mm) <= HALF_MM + MARGIN_MM) & (x_mm + y_mm <= CORNER_MM + 1.5 * MARGIN_MM)
 
 
-RULE = Quadrature(cell_m=0.8e-3, layers_n=5)  # as scene quick: the cheapest under 2 % of dB (question runtime)
+RULE = Quadrature(cell_m=0.8e-3, layers_n=5)  # as scene quick: the cheapest under 2 % of dB (experiment runtime)
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ def pool(captures: Sequence[Readings]) -> Pokes:
     known = np.isfinite(place_mm).all(axis=1) & (force_N > 0)
     if not known.any():
         where, remedy = f"board {captures[0].board}", "Record both, or do not ask it."
-        raise SchemaError(where, "question compare", "asked of pokes with place and force", "none", remedy)
+        raise SchemaError(where, "experiment compare", "asked of pokes with place and force", "none", remedy)
     return Pokes(
         board=captures[0].board, groups=tuple(groups.tolist()), group_i=group_i.ravel()[known],
         capture_i=capture_i[known],

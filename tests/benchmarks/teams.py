@@ -29,7 +29,7 @@ from tests.benchmarks.steps import ROOT, Steps, end_on_signals, require
 
 SCENE = "team"
 SETTINGS = {
-    "source": "recorded", "seed": 1, "questions": ["lobo"], "selection": {"force_min_N": 0.0}, "split": {},
+    "source": "recorded", "seed": 1, "experiments": ["lobo"], "selection": {"force_min_N": 0.0}, "split": {},
     "train_multi": {"recipe": "paper", "steps_n": 100, "seeds_n": 1, "variants": {}},
 }  # fmt: skip
 BUCKET, REMOTE = "reskin-team", "store"

@@ -63,7 +63,7 @@ def skins_scene(skins_n: int) -> dict[str, Any]:
     rigid = words["simulate"]["boards"]["rigid"] | {"boards_n": BOARDS_N, "skins_per_board_n": skins_n // BOARDS_N}
     grid = words["simulate"]["protocols"]["grid"] | {"skins_n": skins_n, "passes_n": 1, "depths_mm": [0.8]}
     return {
-        "source": "simulated", "seed": 2021, "questions": ["lobo"], "selection": {"force_min_N": 0.0}, "split": {},
+        "source": "simulated", "seed": 2021, "experiments": ["lobo"], "selection": {"force_min_N": 0.0}, "split": {},
         "simulate": {"boards": {"rigid": rigid}, "protocols": {"grid": grid}},
         "train_multi": words["train_multi"] | {"steps_n": STEPS_N},
     }  # fmt: skip
@@ -152,7 +152,7 @@ def grow_captures(captures_n: int) -> dict[str, Any]:
     rng = np.random.default_rng(captures_n)
     training = {"recipe": "paper", "steps_n": 1, "seeds_n": 1, "variants": {}}
     scene = {
-        "source": "recorded", "seed": 1, "questions": ["lobo"], "selection": {"force_min_N": 0.0}, "split": {},
+        "source": "recorded", "seed": 1, "experiments": ["lobo"], "selection": {"force_min_N": 0.0}, "split": {},
         "train_multi": training,
     }  # fmt: skip
     with checkout(scene) as root:

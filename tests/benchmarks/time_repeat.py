@@ -26,7 +26,7 @@ from tests.benchmarks.pages import MEASURED, ROOT, table, write_block
 
 SCENE = "repeat"
 SKINS_N = 6  # one a board
-QUESTIONS = ("single_random", "lobo", "triplet")
+EXPERIMENTS = ("single_random", "lobo", "triplet")
 TRAINED = ("train_single", "train_multi", "train_triplet")
 AGAIN = f"from pathlib import Path; from pipeline.manage.verify import rerun; rerun(Path(), ['{SCENE}'])"
 # Whatever this processor has, and its libraries choose: nothing that reskin/numerics.py pins holds.
@@ -47,14 +47,14 @@ FIRST = "two processes"
 
 
 def scene_words() -> dict[str, Any]:
-    """Take of scene quick what these questions need."""
+    """Take of scene quick what these experiments need."""
     words = read_yaml(ROOT / "pipeline/scenes/quick.yaml")
     kept = {key: words[key] for key in ("source", "seed", "selection", *TRAINED)}
     split = {key: words["split"][key] for key in ("random_test_fraction", "random_repeats_n")}
     simulate = words["simulate"]
     boards, grid = {"rigid": simulate["boards"]["rigid"]}, simulate["protocols"]["grid"] | {"skins_n": SKINS_N}
     return kept | {
-        "questions": list(QUESTIONS), "split": split, "simulate": {"boards": boards, "protocols": {"grid": grid}},
+        "experiments": list(EXPERIMENTS), "split": split, "simulate": {"boards": boards, "protocols": {"grid": grid}},
     }  # fmt: skip
 
 
@@ -115,7 +115,7 @@ def main() -> None:
             first = first or numbers
             found[name] = {"settings": setting, **differences(first, numbers)}
             print(f"{name}: {json.dumps(found[name])}", flush=True)
-            of = {"git": code_version(), "machine": device(), "questions": QUESTIONS, "runs": found}
+            of = {"git": code_version(), "machine": device(), "experiments": EXPERIMENTS, "runs": found}
             asked.out.write_text(json.dumps(of, indent=1) + "\n")
     show(json.loads(asked.out.read_text()))
 

@@ -29,11 +29,11 @@ def visited(passes_n: int, pokes_n: int, readings_n: int = 2, skins_n: int = 2):
 @pytest.mark.parametrize("question", TOGETHER)
 @given(passes_n=st.integers(2, 7), pokes_n=st.integers(1, 6), split=splits, seed=st.integers(0, 2**40))
 def test_no_indentation_and_no_pass_is_on_both_sides_and_no_row_of_the_skin_is_lost(
-    question, passes_n, pokes_n, split, seed
+    experiment, passes_n, pokes_n, split, seed
 ):
     table = visited(passes_n, pokes_n)
-    group = getattr(table, TOGETHER[question])
-    folds = draw_folds(table, [question], split, seed)
+    group = getattr(table, TOGETHER[experiment])
+    folds = draw_folds(table, [experiment], split, seed)
     assert [fold.name for fold in folds] == [f"repeat{i}" for i in range(split.random_repeats_n)]
     for fold in folds:
         assert not {*group[fold.train]} & {*group[fold.test]}
@@ -45,13 +45,13 @@ def test_no_indentation_and_no_pass_is_on_both_sides_and_no_row_of_the_skin_is_l
 
 @pytest.mark.parametrize("question", TOGETHER)
 @given(order=st.permutations(range(24)))
-def test_which_groups_are_held_out_is_the_same_for_any_order_of_rows_that_keeps_their_numbers(question, order):
+def test_which_groups_are_held_out_is_the_same_for_any_order_of_rows_that_keeps_their_numbers(experiment, order):
     table = visited(3, 4, skins_n=1)
     order = np.array(order)
     shuffled = replace(table, **{name: getattr(table, name)[order] for name in ("indentation", "pass_i", "skin")})
     split = Split(random_test_fraction=0.3, random_repeats_n=2)
-    group = TOGETHER[question]
-    for one, other in zip(*(draw_folds(t, [question], split, 3) for t in (table, shuffled)), strict=True):
+    group = TOGETHER[experiment]
+    for one, other in zip(*(draw_folds(t, [experiment], split, 3) for t in (table, shuffled)), strict=True):
         assert {*getattr(table, group)[one.test]} == {*getattr(shuffled, group)[other.test]}
 
 
@@ -83,5 +83,5 @@ def test_one_pass_of_four_is_tested_though_a_tenth_of_four_is_none():
 
 def test_a_skin_of_one_pass_cannot_be_split_by_pass_and_says_so():
     split = Split(random_test_fraction=0.1, random_repeats_n=1)
-    with pytest.raises(ParamsError, match="question single_pass: passes of skin b0_s0 must be enough for both sides"):
+    with pytest.raises(ParamsError, match="experiment single_pass: passes of skin b0_s0 must be enough for both sides"):
         draw_folds(visited(1, 5), ["single_pass"], split, 0)

@@ -48,8 +48,8 @@ def test_six_boards_give_six_folds_of_three_skins():
 def test_the_order_of_rows_does_not_decide_who_is_held_out(order):
     pairs = [(board, skin) for board in range(6) for skin in range(3)]
     straight, shuffled = of_pairs(pairs), of_pairs([pairs[i] for i in order])
-    for question, split in (("lobo", Split()), ("transfer", TRANSFER)):
-        ahead, behind = (draw_folds(table, [question], split, 0) for table in (straight, shuffled))
+    for experiment, split in (("lobo", Split()), ("transfer", TRANSFER)):
+        ahead, behind = (draw_folds(table, [experiment], split, 0) for table in (straight, shuffled))
         for one, other in zip(ahead, behind, strict=True):
             assert one.name == other.name
             assert set(straight.skin[one.test]) == set(shuffled.skin[other.test])
@@ -103,9 +103,9 @@ SENSORS = Split(sensors_skins_n=(15, 1, 6), sensors_draws_n=3, pool_passes_n=2)
 
 
 @pytest.mark.parametrize(("question", "split"), [("lobo", Split(pool_passes_n=2)), ("sensors", SENSORS)])
-def test_the_pool_is_the_first_passes_of_each_held_out_skin_and_the_test_its_later_ones(question, split):
+def test_the_pool_is_the_first_passes_of_each_held_out_skin_and_the_test_its_later_ones(experiment, split):
     table = six_by_three_in_passes(5)
-    for fold in draw_folds(table, [question], split, 0):
+    for fold in draw_folds(table, [experiment], split, 0):
         board = {*table.board[fold.test]}
         assert len(board) == 1
         held = [i for i in range(len(table)) if table.board[i] in board]
@@ -116,14 +116,14 @@ def test_the_pool_is_the_first_passes_of_each_held_out_skin_and_the_test_its_lat
 
 @pytest.mark.parametrize("question", ["lobo", "sensors"])
 @given(order=st.permutations(range(12)))
-def test_the_order_of_rows_decides_neither_pool_nor_training_skins(question, order):
+def test_the_order_of_rows_decides_neither_pool_nor_training_skins(experiment, order):
     labels = [(f"b{board}", f"b{board}_s{skin}", p) for board in range(3) for skin in range(2) for p in (3, 5)]
     split = Split(sensors_skins_n=(1, 3), sensors_draws_n=2, pool_passes_n=1)  # pass 4 has no row left
     straight, shuffled = (
         rows(*(list(column) for column in zip(*(labels[i] for i in numbers), strict=True)))
         for numbers in (range(12), order)
     )
-    ahead, behind = (draw_folds(table, [question], split, 7) for table in (straight, shuffled))
+    ahead, behind = (draw_folds(table, [experiment], split, 7) for table in (straight, shuffled))
     for one, other in zip(ahead, behind, strict=True):
         assert one.name == other.name
         for side in ("train", "test", "pool"):
@@ -132,17 +132,17 @@ def test_the_order_of_rows_decides_neither_pool_nor_training_skins(question, ord
 
 def test_without_a_pool_all_rows_of_the_held_out_board_are_tested():
     table = six_by_three_in_passes(2)
-    for question in ("lobo", "sensors"):
-        for fold in draw_folds(table, [question], Split(sensors_skins_n=(2,), sensors_draws_n=1), 0):
+    for experiment in ("lobo", "sensors"):
+        for fold in draw_folds(table, [experiment], Split(sensors_skins_n=(2,), sensors_draws_n=1), 0):
             assert len(fold.pool) == 0
             assert fold.test.tolist() == np.flatnonzero(table.board == table.board[fold.test[0]]).tolist()
 
 
 @pytest.mark.parametrize(("question", "split"), [("single_random", RANDOM), ("single_temporal", TEMPORAL)])
-def test_questions_that_adapt_nothing_have_no_pool_even_where_others_have_one(question, split):
+def test_experiments_that_adapt_nothing_have_no_pool_even_where_others_have_one(experiment, split):
     table = six_by_three_in_passes(5)
-    pooled = draw_folds(table, [question], split.model_copy(update={"pool_passes_n": 1}), 0)
-    for fold, plain in zip(pooled, draw_folds(table, [question], split, 0), strict=True):
+    pooled = draw_folds(table, [experiment], split.model_copy(update={"pool_passes_n": 1}), 0)
+    for fold, plain in zip(pooled, draw_folds(table, [experiment], split, 0), strict=True):
         assert len(fold.pool) == 0
         assert fold.test.tolist() == plain.test.tolist()
 
@@ -285,7 +285,7 @@ TWO_CAPTURES = replace(ONE_BOARD, capture=np.array(["run2", "run10", "run10"]))
 @pytest.mark.parametrize(
     ("table", "question", "split", "sentence"),
     [
-        (ONE_BOARD, "lobo", Split(), "question lobo: boards must be two or more; got 1"),
+        (ONE_BOARD, "lobo", Split(), "experiment lobo: boards must be two or more; got 1"),
         (ONE_BOARD, "transfer", TRANSFER, "split.transfer_skins_n must be less than .* 1 boards; got 3"),
         (ONE_BOARD, "single_temporal", TEMPORAL, "passes of skin s0 must be .*; got 1, of which 0.2 are 0"),
         (ONE_BOARD, "single_random", ALMOST_ALL, "got 3, of which 0.95 are 3"),
@@ -293,7 +293,7 @@ TWO_CAPTURES = replace(ONE_BOARD, capture=np.array(["run2", "run10", "run10"]))
         (six_by_three_in_passes(2), "sensors", SENSORS, "passes of held-out skin b0_s0 must be more than .*, 2; got 2"),
         (six_by_three_in_passes(1), "sensors", MANY_SENSORS, "at most the 15 skins beside held-out board b0; got 16"),
         (ONE_BOARD, "sensors", SENSORS, "at most the 0 skins beside held-out board b0; got 15"),
-        (ONE_BOARD, "labels", LABELS, "question lobo: boards must be two or more; got 1"),
+        (ONE_BOARD, "labels", LABELS, "experiment lobo: boards must be two or more; got 1"),
         (
             poked(), "labels", Split(labels_pool_n=10, labels_draws_n=1),
             "fold labels/b0: split.labels_pool_n must be less than its indentations; got 10",
@@ -305,14 +305,14 @@ TWO_CAPTURES = replace(ONE_BOARD, capture=np.array(["run2", "run10", "run10"]))
         (TWO_CAPTURES, "single_temporal", TEMPORAL, "the captures of skin s0 must be one, .*; got run10, run2"),
     ],
 )  # fmt: skip
-def test_folds_that_the_data_cannot_give_are_one_sentence(table, question, split, sentence):
+def test_folds_that_the_data_cannot_give_are_one_sentence(table, experiment, split, sentence):
     with pytest.raises(ParamsError, match=sentence):
-        draw_folds(table, [question], split, 0)
+        draw_folds(table, [experiment], split, 0)
 
 
 @pytest.mark.parametrize(
     ("question", "split"), [("lobo", Split()), ("sensors", Split(sensors_skins_n=(1,), sensors_draws_n=1))]
 )
-def test_a_planted_leak_a_skin_on_two_boards_is_refused(question, split):
+def test_a_planted_leak_a_skin_on_two_boards_is_refused(experiment, split):
     with pytest.raises(ParamsError, match="must be on one side only; got .* on both"):
-        draw_folds(rows(["b0", "b1"], ["s0", "s0"]), [question], split, 0)
+        draw_folds(rows(["b0", "b1"], ["s0", "s0"]), [experiment], split, 0)

@@ -28,7 +28,7 @@ def test_windows_are_what_a_walk_along_the_capture_finds(sizes):
         start += every_n
     asked = {"train_n": max(1, every_n - less_n), "test_n": test_n, "every_n": every_n}
     if not expected:
-        with pytest.raises(ParamsError, match="question drift: the shortest capture must be at least"):
+        with pytest.raises(ParamsError, match="experiment drift: the shortest capture must be at least"):
             lay_windows([units_n], **asked)
         return
     windows = lay_windows([units_n], **asked)

@@ -45,8 +45,8 @@ TOLD = {"shear": (shear, SHEARED, CURVES), "manual": (manual, POKED, {}), "flexi
 
 @pytest.mark.parametrize("question", TOLD)
 @pytest.mark.parametrize("source", ["simulated", "recorded"])
-def test_every_row_and_every_figure_says_its_source(question, source):
-    module, numbers, drawn = TOLD[question]
+def test_every_row_and_every_figure_says_its_source(experiment, source):
+    module, numbers, drawn = TOLD[experiment]
     (table,) = module.tables(numbers, source).values()
     assert set(table["source"]) == {source}
     for text in module.figures(numbers, drawn, source).values():

@@ -1,6 +1,6 @@
 """Inject every fault for real, and write the table: python -m tests.faults [--only WORD] [--work FOLDER] [--out FILE].
 
-Clones the last commit, runs a small scene of a few questions there once, and lets each fault hit a copy of it. Linux;
+Clones the last commit, runs a small scene of a few experiments there once, and lets each fault hit a copy of it. Linux;
 faults that need mounts need root, and are marked where it lacks.
 """
 

@@ -20,8 +20,8 @@ from tests.repositories import git
 from tests.stages.checkout import ROOT, variables
 
 SCENE = "faults"
-QUESTIONS = ("single_random", "transfer", "lobo", "triplet", "adapt", "baselines", "sensitivity", "audit")
-PROTOCOLS = ("grid", "glass")  # those that these questions need
+EXPERIMENTS = ("single_random", "transfer", "lobo", "triplet", "adapt", "baselines", "sensitivity", "audit")
+PROTOCOLS = ("grid", "glass")  # those that these experiments need
 SECTIONS = (
     "source",
     "seed",
@@ -175,8 +175,8 @@ def make_template(folder: Path) -> tuple[Checkout, Said]:
 
 
 def small(ci: dict) -> dict:
-    """Take from scene ci what a few questions need."""
-    scene = {name: ci[name] for name in SECTIONS} | {"questions": list(QUESTIONS)}
+    """Take from scene ci what a few experiments need."""
+    scene = {name: ci[name] for name in SECTIONS} | {"experiments": list(EXPERIMENTS)}
     scene["split"] = {name: ci["split"][name] for name in SPLIT}
     scene["simulate"] = {
         "boards": {"rigid": ci["simulate"]["boards"]["rigid"]},

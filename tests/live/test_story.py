@@ -25,7 +25,7 @@ POKES_N, QUIET_S, DWELL_S = 30, 1.0, 0.3
 CRLF = "crlf@2+1"
 LABELS = ("--board", "b", "--skin", "s", "--scene", "pressed")
 SCENE = {
-    "source": "recorded", "seed": 1, "questions": ["single_temporal"], "selection": {"force_min_N": 0.0},
+    "source": "recorded", "seed": 1, "experiments": ["single_temporal"], "selection": {"force_min_N": 0.0},
     "split": {"temporal_test_fraction": 0.34},
     "train_single": {"recipe": "paper", "steps_n": 400, "seeds_n": 1, "variants": {}},
 }  # fmt: skip

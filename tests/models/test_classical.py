@@ -42,7 +42,7 @@ def fit_to(method: str, db_uT: np.ndarray, target: np.ndarray, weight: np.ndarra
 
 
 def scaled(db_uT: np.ndarray, target: np.ndarray, asked_uT: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows, targets and questions as a method sees them, by the mean and deviation of the rows alone."""
+    """Rows, targets and experiments as a method sees them, by the mean and deviation of the rows alone."""
     mean, sd = db_uT.mean(axis=0, dtype=float), db_uT.std(axis=0, dtype=float)
     wanted = (target - target.mean(axis=0, dtype=float)) / target.std(axis=0, dtype=float)
     return (db_uT - mean) / sd, wanted, (asked_uT - mean) / sd

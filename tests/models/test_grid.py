@@ -47,7 +47,7 @@ def trials(folds_n: int = 3, **changes: object) -> list[Trial]:
     """A fold leaves some rows of each of two skins out."""
     everyone = np.arange(24)
     held = [np.array([i, i + 12]) for i in range(folds_n)]
-    one = replace(pooled(**changes), question="lobo")
+    one = replace(pooled(**changes), experiment="lobo")
     return [replace(one, fold=f"b{i}", train=np.setdiff1d(everyone, test), test=test) for i, test in enumerate(held)]
 
 
@@ -174,7 +174,7 @@ def test_one_more_costs_one_stack(tmp_path, more, trained_n):
 
 def test_the_same_training_under_another_name_costs_none(tmp_path):
     run(trials(1), tmp_path)
-    renamed = replace(trials(1)[0], question="sensors", recipe_name="twin", what="multi")
+    renamed = replace(trials(1)[0], experiment="sensors", recipe_name="twin", what="multi")
     assert trainings_n([renamed], tmp_path) == 0
 
 

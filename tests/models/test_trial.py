@@ -154,7 +154,7 @@ def first_batches(trial: Trial) -> list[np.ndarray]:
 @pytest.mark.parametrize(
     "other",
     [
-        replace(pooled(), recipe_name="variant", question="lobo", what="multi"),
+        replace(pooled(), recipe_name="variant", experiment="lobo", what="multi"),
         pooled(weight_decay=0.5, rate_max=1e-4),
         without_triplets(),
     ],
@@ -291,8 +291,8 @@ def test_all_code_that_a_training_runs_through_is_part_of_its_key():
     assert others <= imported
 
 
-def test_questions_and_names_do_not_enter_a_key():
-    assert key(replace(pooled(), question="sensors", recipe_name="other", what="multi")) == key(pooled())
+def test_experiments_and_names_do_not_enter_a_key():
+    assert key(replace(pooled(), experiment="sensors", recipe_name="other", what="multi")) == key(pooled())
 
 
 def test_rows_that_nobody_uses_may_come_and_go():

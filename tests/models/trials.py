@@ -53,9 +53,9 @@ def start(key: str = "start") -> Start:
 
 def adapting(*, unlabelled_weight: float = 0.5, along: Lines | None = None) -> Trial:
     settings = FineTuning(unlabelled_weight=unlabelled_weight, **SETTINGS)
-    return replace(pooled(), question="adapt", skin="b1_s1", tuning=Adapting(start(), settings, along or lines()))
+    return replace(pooled(), experiment="adapt", skin="b1_s1", tuning=Adapting(start(), settings, along or lines()))
 
 
 def few_labels(*, own_weight: float = 0.5) -> Trial:
     tuning = FewLabels(start(), Labelling(own_weight=own_weight, **SETTINGS), OWN)
-    return replace(pooled(), question="labels", skin="b1_s1", tuning=tuning)
+    return replace(pooled(), experiment="labels", skin="b1_s1", tuning=tuning)

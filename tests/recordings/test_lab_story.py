@@ -25,7 +25,7 @@ def lab(tmp_path_factory, shared_data) -> Iterator[Path]:
     settings = YAML(typ="safe").load(scene.read_text())
     settings["train_multi"]["seeds_n"] = 1
     settings["train_multi"] |= {"steps_n": 100, "variants": {}}
-    settings |= {"questions": ["lobo"], "split": {}}  # more: the story of scene ci
+    settings |= {"experiments": ["lobo"], "split": {}}  # more: the story of scene ci
     for section in ("few_labels", "audit", "compare", "universal", "rivals"):
         del settings[section]
     with scene.open("w") as stream:

@@ -72,7 +72,7 @@ def test_the_lab_forces_reach_from_a_touch_to_ten_newtons(shared_data: Path, tmp
 def test_the_lab_tip_pushes_the_skin_the_way_that_its_fields_say_it_moves(
     shared_data: Path, tmp_path: Path, name: str
 ) -> None:
-    # Question compare, from fields alone: pokes of both boards carry the skin by 48 um along the labels' +x.
+    # Experiment compare, from fields alone: pokes of both boards carry the skin by 48 um along the labels' +x.
     readings, _ = ingest(lab, shared_data / "lab" / f"{name}.csv", tmp_path)
     assert 0.08 < readings.Fx_N.mean() < 0.6
 

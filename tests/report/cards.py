@@ -11,13 +11,13 @@ from tests.scenes import RECIPE
 SKINS = [("b0", "s0"), ("b0", "s1"), ("b1", "s2"), ("b1", "s3")]
 
 
-def card(question: str, fold: str, scores: dict, recipe: str = "paper", seed_i: int = 0, **changes: Any) -> dict:
+def card(experiment: str, fold: str, scores: dict, recipe: str = "paper", seed_i: int = 0, **changes: Any) -> dict:
     """A card; one of an adaptation was adapted by 390 pokes."""
     words = {
-        "question": question, "recipe_name": recipe, "recipe": dict(RECIPE), "fold": fold, "seed_i": seed_i,
+        "question": experiment, "recipe_name": recipe, "recipe": dict(RECIPE), "fold": fold, "seed_i": seed_i,
         "scores": scores, "train_skins": ["s8", "s9"], "train_rows_n": 100,
     }  # fmt: skip
-    tuning = {"tuning": {"pokes_n": 390, "settings": {"base": "paper"}}} if question == "adapt" else {}
+    tuning = {"tuning": {"pokes_n": 390, "settings": {"base": "paper"}}} if experiment == "adapt" else {}
     return words | tuning | changes
 
 

@@ -1,4 +1,4 @@
-"""Numbers and provenance of a run that has every question's contract keys, with values that no run made."""
+"""Numbers and provenance of a run that has every experiment's contract keys, with values that no run made."""
 
 from scipy.stats import t
 
@@ -33,7 +33,7 @@ def cost(seconds: float = 1.0) -> dict:
     }  # fmt: skip
 
 
-def all_questions(source: str = "simulated") -> dict:
+def all_experiments(source: str = "simulated") -> dict:
     plain = dict.fromkeys(METRICS, 1.0)
     windows = [{"contacts_n": 5000, "accuracy_pct": 90.0, "mse_xy_mm2": 0.1, "mse_f_N2": 0.1}]
     names = ("higher_and_faster", "offset", "each_is_worse", "overestimates")

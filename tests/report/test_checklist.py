@@ -11,13 +11,13 @@ from scipy.stats import t
 from pipeline.report import paper
 from pipeline.report.checklist import checklist, claims_table, look_up, read_rows, resolve
 from pipeline.report.judging import Row, judge, p_of
-from pipeline.scenes import EXPERIMENTS
+from pipeline.scenes import ANALYSES
 from pipeline.statistics import FEW_BOARDS, INCONCLUSIVE, NO, YES
 from reskin.errors import SchemaError
-from tests.report.synthetic import all_questions, over_boards, stat
+from tests.report.synthetic import all_experiments, over_boards, stat
 
 ROOT = Path(__file__).resolve().parents[2]
-STAGES = set(YAML(typ="safe").load((ROOT / "dvc.yaml").read_text())["stages"]) | set(EXPERIMENTS)
+STAGES = set(YAML(typ="safe").load((ROOT / "dvc.yaml").read_text())["stages"]) | set(ANALYSES)
 ROWS = read_rows()
 
 
@@ -39,7 +39,7 @@ def sentence(found: Any, printed: Any, pooled: bool = True, simulated: bool = Tr
 
 @pytest.mark.parametrize("one", ROWS, ids=lambda one: one.id)
 def test_every_row_finds_its_number_in_a_scene_that_asks_everything(one):
-    assert one.ours is None or resolve(all_questions(), one.ours) is not None
+    assert one.ours is None or resolve(all_experiments(), one.ours) is not None
     assert one.stage is None or one.stage in STAGES
     assert (one.paper is None) != (one.says is None)
 
@@ -60,8 +60,8 @@ def test_every_figure_and_table_of_the_paper_has_a_row():
     assert len({one.id for one in ROWS}) == len(ROWS)
 
 
-def test_a_question_that_was_not_asked_says_so():
-    numbers = all_questions()
+def test_an_experiment_that_was_not_asked_says_so():
+    numbers = all_experiments()
     del numbers["shear"]
     table = checklist(numbers).set_index("result")
     assert table.loc["dragged lines: MSE of the place", "difference"] == "not asked in this scene"
@@ -175,7 +175,7 @@ def test_a_family_of_claims_is_judged_by_holm_and_other_rows_are_not():
         )
         for i in range(4)
     ]
-    numbers = all_questions() | {f"d{i}": {"accuracy_pct": with_p(p)} for i, p in enumerate((0.01, 0.03, 0.04, 0.04))}
+    numbers = all_experiments() | {f"d{i}": {"accuracy_pct": with_p(p)} for i, p in enumerate((0.01, 0.03, 0.04, 0.04))}
     table = checklist(numbers, rows)
     # Of three, 0.01 becomes 0.03; 0.03 and 0.04 become 0.06: no longer significant, though their intervals exclude 0.
     assert table["verdict"].tolist() == [YES, INCONCLUSIVE, INCONCLUSIVE, YES]
@@ -184,7 +184,7 @@ def test_a_family_of_claims_is_judged_by_holm_and_other_rows_are_not():
 
 
 def test_claims_stand_in_a_table_of_their_own_if_they_are_judged():
-    claims = claims_table(checklist(all_questions()))
+    claims = claims_table(checklist(all_experiments()))
     assert len(claims) > 15
     assert not claims["claim"].str.startswith("claim").any()
     assert "Holm" in claims.attrs["meaning"]
@@ -217,7 +217,7 @@ def test_a_calibration_target_is_no_evidence_where_it_was_simulated():
 
 
 def test_every_claim_of_the_paper_has_a_verdict_in_the_one_vocabulary():
-    table = checklist(all_questions())
+    table = checklist(all_experiments())
     claims = table["result"].str.startswith("claim")
     assert set(table.loc[claims, "verdict"]) <= {YES, NO, INCONCLUSIVE, FEW_BOARDS}
     assert claims.sum() > 20
@@ -225,7 +225,7 @@ def test_every_claim_of_the_paper_has_a_verdict_in_the_one_vocabulary():
 
 
 def test_a_sweep_that_does_not_go_as_far_as_a_claim_says_so():
-    numbers = all_questions()
+    numbers = all_experiments()
     del numbers["contrasts"]["pokes_plateau"]
     assert difference(numbers, "plateau") == "not reached in this scene"
     del numbers["sweep_pokes"]
@@ -239,7 +239,7 @@ def test_one_training_skin_is_not_compared_with_pooled_networks():
 
 
 def test_a_reason_is_given_only_where_ours_differs():
-    numbers = all_questions()
+    numbers = all_experiments()
     mine = [row(ours="single_random.accuracy_pct", why="Because.")]
     assert checklist(numbers, mine)["difference"][0].endswith("Because.")
     numbers["single_random"]["accuracy_pct"] = stat(99.5)
@@ -252,7 +252,7 @@ def difference(numbers: dict, name: str) -> str:
 
 
 def test_what_is_seen_earlier_than_in_the_paper_is_said_first():
-    numbers = all_questions()
+    numbers = all_experiments()
     assert difference(numbers, "figure-5b") == "after 45,000 contacts; ours is above 0"
     numbers["drift"]["late"]["contacts_n"] = 18_000
     assert difference(numbers, "figure-5b") == "not reached: ours after 18,000 contacts; ours is above 0"
@@ -266,13 +266,13 @@ def test_what_is_seen_earlier_than_in_the_paper_is_said_first():
 
 @pytest.mark.parametrize("name", ["rate", "temporal-resolution", "logs", "sleeve-chips", "sleeve-rate"])
 def test_settings_of_a_simulated_rig_are_no_agreement_with_the_paper(name):
-    said = difference(all_questions("simulated"), name)
+    said = difference(all_experiments("simulated"), name)
     assert said == "a setting of this scene, not a result"
-    assert difference(all_questions("recorded"), name) in ("the same", "–")
+    assert difference(all_experiments("recorded"), name) in ("the same", "–")
 
 
 def test_the_flexible_bias_is_judged_after_adaptation():
-    numbers = all_questions()
+    numbers = all_experiments()
     numbers["flexible"]["bias_f_N"] = {"before": stat(1.0), "after": stat(-0.2)}
     assert difference(numbers, "flexible-bias").startswith("ours is not above 0")
 
@@ -280,7 +280,7 @@ def test_the_flexible_bias_is_judged_after_adaptation():
 def test_reasons_about_simulation_are_given_of_simulated_scenes_alone():
     simulation = ("simulat", "assumed", "a possible reason")
     for source in ("simulated", "recorded"):
-        found = checklist(all_questions(source))["difference"]
+        found = checklist(all_experiments(source))["difference"]
         shown = [one for one in ROWS if one.only in (None, source)]
         said = found[[one.rule not in ("input", "target") for one in shown]].str.contains("|".join(simulation))
         assert said.any() == (source == "simulated")
@@ -288,7 +288,7 @@ def test_reasons_about_simulation_are_given_of_simulated_scenes_alone():
 
 
 def test_a_reason_names_numbers_of_the_paper_and_of_ours():
-    said = difference(all_questions(), "flexible-accuracy_pct")
+    said = difference(all_experiments(), "flexible-accuracy_pct")
     assert "80 % nearer to the skin, ours 45 %" in said
 
 
@@ -308,9 +308,9 @@ def test_a_misspelt_constant_is_one_sentence():
 
 
 def test_a_row_of_a_list_is_picked_by_its_value():
-    assert resolve(all_questions(), "sweep_pokes.pokes_n=390.accuracy_pct") == stat()
-    assert resolve(all_questions(), "paired.of=adapted,over=multi.over") == "multi"
-    assert resolve(all_questions(), "sweep_pokes.pokes_n=391.accuracy_pct") is None
+    assert resolve(all_experiments(), "sweep_pokes.pokes_n=390.accuracy_pct") == stat()
+    assert resolve(all_experiments(), "paired.of=adapted,over=multi.over") == "multi"
+    assert resolve(all_experiments(), "sweep_pokes.pokes_n=391.accuracy_pct") is None
 
 
 def test_a_claim_of_several_parts_is_denied_by_one_part_with_bonferronis_p_and_affirmed_by_the_largest():

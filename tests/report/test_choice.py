@@ -14,7 +14,7 @@ from tests.scenes import RECIPE
 Card = dict[str, Any]
 
 
-def card(question: str, name: str, mse_xy_mm2: float, fold: str = "b0", **changes: Any) -> Card:
+def card(experiment: str, name: str, mse_xy_mm2: float, fold: str = "b0", **changes: Any) -> Card:
     """A card with one skin a board; accuracy and force speak for the worst place."""
     score = {"accuracy_pct": mse_xy_mm2, "mse_xy_mm2": mse_xy_mm2, "mse_f_N2": 1 / mse_xy_mm2}
     scores = {
@@ -26,7 +26,7 @@ def card(question: str, name: str, mse_xy_mm2: float, fold: str = "b0", **change
     }
     who = {"scene": "tuning", "test_boards": [fold], "test_skins": [f"{fold}_s0"]}
     went = {"collapsed": False, "collapsed_before_n": 0}
-    return cards.card(question, fold, scores, name) | who | went | changes
+    return cards.card(experiment, fold, scores, name) | who | went | changes
 
 
 def adapted(name: str, mse_xy_mm2: float, base: str, *, unlabelled_weight: float = 0.1, **changes: Any) -> Card:
@@ -118,9 +118,9 @@ SHAPED = {"inputs": "shape"}
         adapted("shaped", 0.001, "light") | {"recipe": RECIPE | SHAPED},
         card("single_random", "single", 0.001),
     ],
-    ids=["shape", "triplet shape", "adapted shape", "another question"],
+    ids=["shape", "triplet shape", "adapted shape", "another experiment"],
 )
-def test_other_inputs_and_other_questions_are_no_candidates_however_good(better):
+def test_other_inputs_and_other_experiments_are_no_candidates_however_good(better):
     assert choose([better, *CARDS]) == choose(CARDS)
 
 

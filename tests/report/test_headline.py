@@ -10,7 +10,7 @@ from pipeline.report.formatting import CONTROL, models, show
 from pipeline.report.headline import ANSWERING, FILE, answer, headline_figures, short_table
 from pipeline.report.paper import TABLE_2
 from pipeline.training.universal import METHODS, WAYS
-from tests.report.synthetic import all_questions, over_boards
+from tests.report.synthetic import all_experiments, over_boards
 
 REPORTS = Path(__file__).resolve().parents[2] / "reports"
 
@@ -20,7 +20,7 @@ def words_of(svg: str) -> str:
 
 
 def test_each_row_of_table_2_is_drawn_and_named_with_source_and_boards():
-    numbers = all_questions()
+    numbers = all_experiments()
     said = words_of(headline_figures(numbers, "simulated")[FILE])
     for name in numbers["table2"]:
         assert models(numbers)[name].title.split(",")[0] in said
@@ -29,7 +29,7 @@ def test_each_row_of_table_2_is_drawn_and_named_with_source_and_boards():
 
 
 def test_the_short_table_holds_ours_and_the_papers_means_and_the_control():
-    numbers = all_questions()
+    numbers = all_experiments()
     table = short_table(numbers).set_index("boards never seen")
     assert len(table) == len(numbers["table2"]) + 1
     for name, model in models(numbers).items():
@@ -42,7 +42,7 @@ def test_the_short_table_holds_ours_and_the_papers_means_and_the_control():
 
 
 def test_the_answer_says_ours_with_its_interval_and_the_papers():
-    numbers = all_questions()
+    numbers = all_experiments()
     numbers["table2"]["multi"] |= {"accuracy_pct": over_boards(70.0, 90.0)}
     said = answer(numbers)
     assert "multi-sensor 80 [70, 90] % (paper: 84.4 %)" in said
@@ -52,7 +52,7 @@ def test_the_answer_says_ours_with_its_interval_and_the_papers():
 
 
 def test_experts_that_were_asked_lead_and_stand_first_in_figure_and_table():
-    numbers = all_questions()
+    numbers = all_experiments()
     told = [
         {"way": way, "pokes_n": pokes_n, "labels_n": labels_n, "accuracy_pct": over_boards(*accuracy), "n": 2}
         | {metric: numbers["table2"]["multi"][metric] for metric in ("mse_xy_mm2", "mse_f_N2")}
@@ -85,11 +85,11 @@ def test_the_answer_with_labels_is_of_the_model_that_is_told_its_skin_and_of_the
 
 
 def test_without_boards_held_out_there_is_no_answer():
-    assert answer({name: value for name, value in all_questions().items() if name != "table2"}) == ""
+    assert answer({name: value for name, value in all_experiments().items() if name != "table2"}) == ""
 
 
-def test_same_numbers_same_bytes_and_no_question_about_boards_no_figure():
-    numbers = all_questions()
+def test_same_numbers_same_bytes_and_no_experiment_about_boards_no_figure():
+    numbers = all_experiments()
     assert headline_figures(numbers, "simulated") == headline_figures(numbers, "simulated")
     assert headline_figures({name: numbers[name] for name in ("provenance",)}, "recorded") == {}
 

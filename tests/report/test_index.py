@@ -3,13 +3,13 @@
 import re
 
 from pipeline.report.page import index
-from tests.report.synthetic import all_questions
+from tests.report.synthetic import all_experiments
 
 SVG = '<svg width="600.0pt" height="200.0pt"><text style="font-size: 9px">a</text></svg>'
 
 
 def numbers(scene: str, source: str) -> dict:
-    found = all_questions(source) | {"trainings": {}}
+    found = all_experiments(source) | {"trainings": {}}
     return found | {"provenance": found["provenance"] | {"scene": scene}}
 
 

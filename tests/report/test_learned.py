@@ -1,4 +1,4 @@
-"""Numbers of the questions about many skins, from cards small enough to be added up by hand."""
+"""Numbers of the experiments about many skins, from cards small enough to be added up by hand."""
 
 import json
 
@@ -23,16 +23,16 @@ def scores(by_skin: dict[str, float]) -> dict:
     }
 
 
-def card(question: str, fold: str, by_skin: dict[str, float], recipe: str = "paper", seed_i: int = 0) -> dict:
-    return cards.card(question, fold, scores(by_skin), recipe, seed_i)
+def card(experiment: str, fold: str, by_skin: dict[str, float], recipe: str = "paper", seed_i: int = 0) -> dict:
+    return cards.card(experiment, fold, scores(by_skin), recipe, seed_i)
 
 
 def point(by_skin: dict[str, float], fold: str = "b1", seed_i: int = 0, **words: object) -> dict:
     return {"fold": fold, "seed_i": seed_i, "scores": scores(by_skin)} | words
 
 
-def of_boards(question: str, pct: float, recipe: str = "paper") -> list[dict]:
-    return [card(question, fold, dict.fromkeys(skins, pct), recipe) for fold, skins in HELD_OUT.items()]
+def of_boards(experiment: str, pct: float, recipe: str = "paper") -> list[dict]:
+    return [card(experiment, fold, dict.fromkeys(skins, pct), recipe) for fold, skins in HELD_OUT.items()]
 
 
 def of_skins(recipe: str, base_pct: float, times: float) -> list[dict]:
@@ -96,7 +96,7 @@ def test_many_skins_are_compared_with_one_on_the_skins_that_one_was_tested_on():
     assert one["accuracy_pct"] == {"mean": 50.0, "n": 1}
 
 
-def test_a_question_that_was_not_asked_is_absent_and_not_null():
+def test_an_experiment_that_was_not_asked_is_absent_and_not_null():
     assert numbers([]) == {"variants": {}}
     assert numbers(of_boards("lobo", 80.0)).keys() == {"table2", "lobo", "variants"}
     without = numbers([*of_boards("lobo", 80.0), *of_boards("triplet", 78.0)])

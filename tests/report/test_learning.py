@@ -219,7 +219,7 @@ def part() -> dict:
     return {"as_labelled": scores, "registered": scores}
 
 
-def test_a_question_that_was_asked_has_its_table_and_every_row_says_where_it_comes_from():
+def test_an_experiment_that_was_asked_has_its_table_and_every_row_says_where_it_comes_from():
     asked = {
         "claims",
         "paired",

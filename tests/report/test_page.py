@@ -25,9 +25,9 @@ from pipeline.report.page import (
     together,
 )
 from pipeline.report.tables import make_tables
-from pipeline.scenes import EXPERIMENTS
+from pipeline.scenes import ANALYSES
 from reskin.errors import SchemaError
-from tests.report.synthetic import all_questions, cost
+from tests.report.synthetic import all_experiments, cost
 
 ROOT = Path(__file__).resolve().parents[2]
 SVG = (
@@ -64,9 +64,9 @@ class Reader(HTMLParser):
 
 
 def render(numbers: dict | None = None, **more: pd.DataFrame) -> str:
-    numbers = all_questions() if numbers is None else numbers
+    numbers = all_experiments() if numbers is None else numbers
     # Experiments have synthetic numbers here, which no real table could be made of.
-    plain = {name: value for name, value in numbers.items() if name not in EXPERIMENTS}
+    plain = {name: value for name, value in numbers.items() if name not in ANALYSES}
     drift = pd.DataFrame({"contacts": ["0"], "accuracy, %": ["90"]})
     tables = make_tables(plain) | {"checklist": checklist(numbers), "drift": drift} | more
     figures = {"drift.svg": SVG.format(300), "sweep_pokes.svg": SVG.format(600), "unheard_of.svg": SVG.format(300)}
@@ -157,7 +157,7 @@ def test_a_number_and_its_interval_are_not_parted(text, kept):
 
 
 def test_the_answer_stands_in_the_first_section_before_its_figure(read):
-    numbers = all_questions()
+    numbers = all_experiments()
     first = render(numbers).split("<section")[1]
     assert first.count('<p class="answer">') == 1
     assert render(numbers).count('<p class="answer">') == 1
@@ -166,7 +166,7 @@ def test_the_answer_stands_in_the_first_section_before_its_figure(read):
 
 
 def test_what_there_is_one_of_is_said_in_the_singular():
-    numbers = all_questions()
+    numbers = all_experiments()
     counts = next(iter(numbers["described"].values()))["counts"]
     counts.clear()
     counts.update(captures_n=1, readings_n=2)
@@ -174,7 +174,7 @@ def test_what_there_is_one_of_is_said_in_the_singular():
 
 
 def test_a_section_says_what_was_found_beside_the_papers_and_verdicts_come_first():
-    numbers = all_questions()
+    numbers = all_experiments()
     table, section = checklist(numbers), next(one for one in read_sections() if one.key == "skins")
     said = findings(section, table)
     assert 0 < len(said) <= FINDINGS_N
@@ -197,7 +197,7 @@ def test_a_finding_says_where_ours_did_not_look_as_far_as_the_paper():
 
 @pytest.mark.parametrize("source", ["simulated", "recorded"])
 def test_the_badge_says_where_the_readings_come_from(source):
-    text = render(all_questions(source))
+    text = render(all_experiments(source))
     assert f'<strong class="badge {source}">{source.upper()}</strong>' in text
     assert {"simulated": "RECORDED", "recorded": "SIMULATED"}[source] not in text
 
@@ -214,7 +214,7 @@ def test_what_no_section_names_is_still_shown(read):
     assert "Unheard of (simulated)" in read.words
 
 
-def test_a_question_that_was_not_asked_leaves_no_section():
+def test_an_experiment_that_was_not_asked_leaves_no_section():
     keys = [section.key for section in arrange(["table2", "captures"], [])]
     assert keys == ["headline", "captures"]
     assert [section.key for section in arrange(["shear", "paired", "drift"], ["training.svg"])] == [
@@ -223,7 +223,7 @@ def test_a_question_that_was_not_asked_leaves_no_section():
 
 
 def test_the_page_of_a_run_shows_its_whole_provenance_and_its_run_times():
-    numbers = all_questions()
+    numbers = all_experiments()
     words = Reader(render_run(numbers)).words
     provenance = numbers["provenance"] | {"versions": "numpy 1, torch 2"}
     assert set(provenance) <= set(words)
@@ -234,11 +234,11 @@ def test_the_page_of_a_run_shows_its_whole_provenance_and_its_run_times():
 
 def test_the_page_embeds_that_of_its_run_and_is_the_same_for_another(read):
     assert [frame["src"] for frame, _ in read.all("iframe")] == ["runtime/index.html"]
-    other = all_questions()
+    other = all_experiments()
     other["provenance"] |= {"git": "other", "trained": "other", "device": "other", "versions": {}, "seconds": 9.0}
     other["runtime"]["stages"] = {"report": cost(9.0), "drift": cost()}
     assert render(other) == render()
-    assert render_run(other) != render_run(all_questions())
+    assert render_run(other) != render_run(all_experiments())
 
 
 def test_the_same_inputs_give_the_same_bytes():

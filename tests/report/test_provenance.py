@@ -7,7 +7,7 @@ import pytest
 from pipeline.manage.compare import leaves
 from pipeline.report.numbers import TIMES, join, split, timed_learning
 from reskin.io import read_json
-from tests.report.synthetic import all_questions, cost, scores
+from tests.report.synthetic import all_experiments, cost, scores
 from tests.stages.checkout import ROOT
 
 SWEPT = [{"pokes_n": pokes_n, **scores()} for pokes_n in (0, 390)]
@@ -21,7 +21,7 @@ def run(seconds: float) -> dict:
         "sweep_pokes": [{"name": f"pokes.paper.b0.{n}pokes.seed0", "train_s": seconds} for n in (0, 390)],
         "train_classical": [{"name": "ridge.b0", "train_s": seconds, "one_reading_s": seconds / 1e3}],
     }
-    numbers = all_questions() | {"sweep_pokes": SWEPT, "baselines": METHODS}
+    numbers = all_experiments() | {"sweep_pokes": SWEPT, "baselines": METHODS}
     numbers["provenance"] |= {"git": f"code {seconds}", "device": f"machine {seconds}", "seconds": seconds}
     numbers["runtime"] = {
         "trainings_n": 1, "stages": {"report": cost(seconds)}, "choice": {"setting": "1 mm x 5"},

@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 
 from pipeline.report.numbers import headline_scores
-from pipeline.scenes import EXPERIMENTS
+from pipeline.scenes import ANALYSES
 from reskin.io import read_json
-from tests.report.synthetic import all_questions, scores, stat
+from tests.report.synthetic import all_experiments, scores, stat
 from tests.stages.checkout import ROOT
 
 
@@ -58,7 +58,7 @@ def test_recorded_boards_are_shown_registered_too_and_with_the_best_method_for_n
 
 
 def test_costs_machine_and_commit_change_no_score():
-    numbers = all_questions()
+    numbers = all_experiments()
     before = headline_scores(numbers)
     numbers["provenance"] |= {"git": "other", "trained": "other", "device": "other", "seconds": 9.0}
     numbers["runtime"] = {}
@@ -70,9 +70,9 @@ def test_a_scene_that_asks_nothing_of_this_has_no_score():
     assert headline_scores({"provenance": {"source": "simulated"}}) == {}
 
 
-@pytest.mark.parametrize("without", EXPERIMENTS)
-def test_a_question_that_was_not_asked_is_absent(without):
-    numbers = all_questions()
+@pytest.mark.parametrize("without", ANALYSES)
+def test_an_experiment_that_was_not_asked_is_absent(without):
+    numbers = all_experiments()
     numbers.pop(without, None)  # compare is asked of recordings only
     assert not any(name.startswith(without) for name in headline_scores(numbers))
 

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from pipeline.report.table1 import LOCALISATION, NOT_GIVEN, OURS, measured, read_table1, table1
 from reskin.errors import ParamsError
-from tests.report.synthetic import all_questions, stat
+from tests.report.synthetic import all_experiments, stat
 
 DATA = read_table1()
 ROWS = (*DATA.rows, LOCALISATION)
@@ -40,7 +40,7 @@ def test_what_was_set_in_a_simulated_rig_is_not_called_measured():
         ("simulated", "400 Hz, a setting read back from the captures, simulated", "mm, a setting, simulated"),
         ("recorded", "400 Hz, recorded", "mm, recorded"),
     ):
-        numbers = all_questions(source)
+        numbers = all_experiments(source)
         numbers["described"]["grid"]["over_skins"]["rate_hz"] = stat(400.0)
         numbers["sleeve"]["area_mm"] = [50.8, 101.6]
         words = measured(numbers)

@@ -14,12 +14,12 @@ from reskin.errors import SchemaError
 from tests.report import cards
 
 
-def card(question: str, fold: str, accuracy_pct: float, recipe: str = "paper") -> dict:
+def card(experiment: str, fold: str, accuracy_pct: float, recipe: str = "paper") -> dict:
     one = {"accuracy_pct": accuracy_pct, "mse_xy_mm2": 1.0, "mse_f_N2": 0.5}
     skins = {"s0": one, "s1": {**one, "accuracy_pct": accuracy_pct + 10}}
-    board = fold if question == "lobo" else "b0"
+    board = fold if experiment == "lobo" else "b0"
     scores = {"all": one, "registered": one, "by_skin": skins, "board_of": dict.fromkeys(skins, board)}
-    return cards.card(question, fold, scores | {"rows_n": 20}, recipe)
+    return cards.card(experiment, fold, scores | {"rows_n": 20}, recipe)
 
 
 CARDS = [
@@ -63,7 +63,7 @@ def test_what_tells_a_place_before_its_touch_stands_below_the_split_that_it_was_
     assert len(make_tables(shown)["single_sensor"]) == 1
 
 
-def test_a_question_that_was_not_asked_is_absent_and_not_null():
+def test_an_experiment_that_was_not_asked_is_absent_and_not_null():
     only_single = numbers([card("single_temporal", "s0", 99.0)])
     assert "table2" not in only_single
     assert "lobo" not in only_single
@@ -73,7 +73,7 @@ def test_a_question_that_was_not_asked_is_absent_and_not_null():
 
 def test_three_ways_to_split_one_skin_stand_side_by_side_and_the_papers_first():
     ways = {"single_pass": 70.0, "single_indentation": 80.0, "single_random": 90.0}
-    shown = numbers([card(question, "repeat0", accuracy_pct) for question, accuracy_pct in ways.items()])
+    shown = numbers([card(experiment, "repeat0", accuracy_pct) for experiment, accuracy_pct in ways.items()])
     single = shown["single_sensor"]
     assert single["split"] == "single_random"
     means = [one["accuracy_pct"]["mean"] for one in (single, single["by_indentation"], single["by_pass"])]

@@ -271,9 +271,9 @@ LOAD = {"kind": "load", "boards": "rigid", "skins_n": 1, "passes_n": 2, "force_m
         ("glass", "load"), ("press", "press"), ("log", "walk"),
     ],
 )  # fmt: skip
-def test_a_protocol_of_a_kind_that_its_question_cannot_read_is_refused(name, kind):
+def test_a_protocol_of_a_kind_that_its_experiment_cannot_read_is_refused(name, kind):
     other = HAND if kind == "grid" else GRID | {"skins_n": 1}
-    sentence = f"test: protocol {name}: kind is {kind}, which its question reads, not {other['kind']}. "
+    sentence = f"test: protocol {name}: kind is {kind}, which its experiment reads, not {other['kind']}. "
     with pytest.raises(ParamsError, match=sentence) as refused:
         with_protocol(name, other)
     assert "\n" not in str(refused.value)
@@ -292,12 +292,12 @@ def test_a_protocol_of_a_kind_that_its_question_cannot_read_is_refused(name, kin
         ("flexible", GRID, {"boards": FLEXIBLE}, "protocol flexible: boards is another kind .*, not rigid too"),
     ],
 )
-def test_a_protocol_that_its_question_cannot_be_asked_of_is_refused(name, protocol, changes, sentence):
+def test_a_protocol_that_its_experiment_cannot_be_asked_of_is_refused(name, protocol, changes, sentence):
     with pytest.raises(ParamsError, match=sentence):
         with_protocol(name, protocol, **changes)
 
 
-def test_protocols_that_suit_their_questions_are_taken():
+def test_protocols_that_suit_their_experiments_are_taken():
     assert with_protocol("drag", DRAG, **FRICTION).protocols["drag"].skins_n == 1
     assert with_protocol("glass", LOAD).protocols["glass"].kind == "load"
     assert with_protocol("flexible", GRID | {"boards": "flexible"}, boards=FLEXIBLE).protocols["flexible"].skins_n == 4

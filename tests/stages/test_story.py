@@ -25,7 +25,7 @@ from pipeline.report.formatting import to_markdown
 from pipeline.report.headline import short_table, table2_figure
 from pipeline.report.judging import NOT_REACHED
 from pipeline.report.numbers import join
-from pipeline.scenes import EXPERIMENTS
+from pipeline.scenes import ANALYSES
 from reskin import io
 from reskin.models.inputs import Scaler
 from tests.stages.checkout import ENVIRONMENT, copy_checkout, run, warm_stages
@@ -35,7 +35,7 @@ LEARNING = (
     "few_labels", "audit",
 )  # fmt: skip
 DRAWING = ("drift", "manual", "contacts", "ambient")  # experiments that draw at random in ways of their own
-ASKED = set(EXPERIMENTS) - {
+ASKED = set(ANALYSES) - {
     "compare",
     "rivals",
     "touches",
@@ -140,7 +140,7 @@ def test_every_protocol_goes_through_the_wire_into_a_folder_of_its_own(story):
     assert wear.n_contacts.max() == 2 * 2 * 65 - 1
 
 
-def test_every_question_about_many_skins_is_answered_on_the_same_test_rows(story):
+def test_every_experiment_about_many_skins_is_answered_on_the_same_test_rows(story):
     numbers = json.loads((story / "reports/ci/numbers.json").read_text())
     assert [row["pokes_n"] for row in numbers["sweep_pokes"]] == [0, 30, 65]
     assert {(row["method"], row["skins_n"]) for row in numbers["sweep_sensors"]} == {
@@ -173,8 +173,8 @@ def test_every_experiment_of_the_paper_is_answered_shown_and_found_by_the_checkl
         assert [row["contacts_n"] for row in numbers["drift"][policy]] == [100, 200]
         assert all({"accuracy_pct", "mse_f_N2"} <= set(row) for row in numbers["drift"][policy])
     assert all("mean" in numbers["shear"][name] for name in ("mse_xy_mm2", "mse_fxy_N2", "mse_fz_N2"))
-    for question, parts in {"manual": ("before", "after", "control"), "flexible": ("before", "after")}.items():
-        assert all("mean" in numbers[question][part]["accuracy_pct"] for part in parts)
+    for experiment, parts in {"manual": ("before", "after", "control"), "flexible": ("before", "after")}.items():
+        assert all("mean" in numbers[experiment][part]["accuracy_pct"] for part in parts)
     assert {"by_indentation", "by_pass"} <= set(numbers["single_sensor"])
     tables = story / "reports/ci/tables"
     assert {file.stem for file in tables.glob("*.md")} >= ASKED | {"table1", "checklist", "single_sensor"}
@@ -198,7 +198,7 @@ def test_another_commit_machine_and_time_change_only_provenance_and_run_times(st
     for words in (["init", "-q"], ["add", "pipeline", "reskin"], [*author, "commit", "-qm", "x"]):
         subprocess.run(["git", *words], cwd=again, check=True)
     words = ["--scene", "ci", "--indentations", "data/indentations/ci", "--folds", "data/models/ci/folds.json",
-             "--models", "data/models/ci", "--answers", "data/answers/ci", "--reports", "reports/ci"]  # fmt: skip
+             "--models", "data/models/ci", "--answers", "data/results/ci", "--reports", "reports/ci"]  # fmt: skip
     on_one_core = "import os, runpy; os.sched_setaffinity(0, [min(os.sched_getaffinity(0))]); "
     on_one_core += "runpy.run_module('pipeline', run_name='__main__', alter_sys=True)"
     run(again, "python", "-c", on_one_core, "report", *words)
@@ -214,10 +214,10 @@ def test_another_commit_machine_and_time_change_only_provenance_and_run_times(st
 
 def test_numbers_of_single_boards_rest_on_several_network_seeds_and_show_their_spread(story):
     numbers = json.loads((story / "reports/ci/numbers.json").read_text())
-    for question in ("manual", "flexible"):
-        assert numbers[question]["seeds_n"] == 2
-        assert all("sd_seeds" in numbers[question][arm]["accuracy_pct"] for arm in ("before", "after", "control"))
-        assert "sd_seeds" in numbers[question]["paired"]["after_minus_before"]["accuracy_pct"]
+    for experiment in ("manual", "flexible"):
+        assert numbers[experiment]["seeds_n"] == 2
+        assert all("sd_seeds" in numbers[experiment][arm]["accuracy_pct"] for arm in ("before", "after", "control"))
+        assert "sd_seeds" in numbers[experiment]["paired"]["after_minus_before"]["accuracy_pct"]
     assert numbers["shear"]["seeds_n"] == numbers["drift"]["seeds_n"] == numbers["logs"]["networks_n"] == 2
     assert all("sd_seeds" in numbers["shear"][name] for name in ("mse_xy_mm2", "mse_fxy_N2", "mse_fz_N2"))
     assert "mse_f_N2" in numbers["logs"]["spread"]
@@ -239,7 +239,7 @@ def test_every_row_of_the_checklist_finds_its_number_and_its_files(story):
     rows = [row for row in read_rows() if row.only != "recorded"]
     missing = [row for row in rows if row.ours and resolve(numbers, row.ours) is None]
     assert [row.id for row in missing] == ["plateau"]  # a sweep that is too short for it, and says so
-    assert all(row.question and resolve(numbers, row.question) is not None for row in missing)
+    assert all(row.experiment and resolve(numbers, row.experiment) is not None for row in missing)
     assert (reports / "tables/checklist.md").read_text().count(NOT_REACHED) == len(missing)
     found = [row for row in rows if row not in missing]
     assert [row.id for row in found if row.reach and resolve(numbers, row.reach.ours) is None] == []
@@ -395,7 +395,7 @@ def test_a_stage_killed_in_the_middle_loses_no_finished_fold(story):
 def test_a_dead_tracking_server_is_said_and_costs_no_result(story):
     start_s = time.monotonic()
     words = ["--scene", "ci", "--models", "data/models/ci",
-             "--answers", "data/answers/ci", "--reports", "reports/ci"]  # fmt: skip
+             "--answers", "data/results/ci", "--reports", "reports/ci"]  # fmt: skip
     done = run(story, "python", "-m", "pipeline", "publish", *words, MLFLOW_TRACKING_URI="http://127.0.0.1:9")
     assert "does not answer" in done.stderr
     assert time.monotonic() - start_s < 100  # not MLflow's own minutes; of a process that starts on a busy machine
@@ -404,14 +404,14 @@ def test_a_dead_tracking_server_is_said_and_costs_no_result(story):
 def test_an_experiment_that_is_switched_off_leaves_no_stage_no_file_and_no_cost(story, run_stages):
     scene = story / "pipeline/scenes/ci.yaml"
     own = YAML(typ="safe").load(scene.read_text())
-    own["questions"].remove("sleeve")
+    own["experiments"].remove("sleeve")
     own.pop("sleeve")
     for part in ("boards", "protocols"):
         own["simulate"][part].pop("sleeve")
     with scene.open("w") as stream:
         YAML().dump(own, stream)
     assert "sleeve@ci" in run(story, "reskin", "scenes", "use", "ci").stdout
-    assert "removed sleeve@ci: data/answers/ci/sleeve.json" in run(story, "reskin", "scenes", "tidy").stdout
+    assert "removed sleeve@ci: data/results/ci/sleeve.json" in run(story, "reskin", "scenes", "tidy").stdout
     assert not any("sleeve" in stage for stage in run(story, "dvc", "stage", "list", "--name-only").stdout.split())
     run_stages("report@ci")
     assert [

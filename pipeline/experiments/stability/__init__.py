@@ -32,12 +32,12 @@ def survey(of: Synthesis, seed: int) -> list[Case]:
     ]
 
 
-def stability(settings: Settings, answer: Path) -> None:
+def stability(settings: Settings, results: Path) -> None:
     """Try every case on the scene's own skins and chips and on small trainings, and write down what happened."""
     with make_executor(imports="pipeline.experiments.stability.learning") as executor:
         learning = executor.submit(_learning_cases, settings.seed)  # beside the physics
         cases = [*survey(synthesis_of(settings), settings.seed), *learning.result()]
-    io.write_json(answer, [asdict(case) for case in cases])
+    io.write_json(results, [asdict(case) for case in cases])
     for case in cases:
         if not case.holds:
             say(f"warning: {settings.scene}: {case.area}, {case.case}: {case.happened}")

@@ -73,8 +73,8 @@ def fold_cases() -> list[Case]:
     }
     return [
         refused(AREA, case, should="refused, with what there is",
-                attempt=partial(draw_folds, Rows.of_labels(groups, skins=groups), [question], split, 0))
-        for case, (question, groups, split) in folds.items()
+                attempt=partial(draw_folds, Rows.of_labels(groups, skins=groups), [experiment], split, 0))
+        for case, (experiment, groups, split) in folds.items()
     ]  # fmt: skip
 
 

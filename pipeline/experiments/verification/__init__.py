@@ -33,11 +33,11 @@ def verify(of: Synthesis, *, depths_m: tuple[float, ...], seed: int) -> list[Che
     ]
 
 
-def verification(settings: Settings, answer: Path) -> None:
+def verification(settings: Settings, results: Path) -> None:
     """Check the scene's own skins, pokes and chips."""
     of = synthesis_of(settings)
     checks = verify(of, depths_m=tuple(milli * depth_mm for depth_mm in of.main.depths_mm), seed=settings.seed)
-    io.write_json(answer, [asdict(check) | {"holds": check.holds} for check in checks])
+    io.write_json(results, [asdict(check) | {"holds": check.holds} for check in checks])
     for check in checks:
         if not check.holds:
             say(

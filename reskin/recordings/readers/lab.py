@@ -37,7 +37,7 @@ READINGS = "readings.csv"
 FILES = (READINGS,)
 FIRST_LINE_N = 2  # the file's line of the first row of numbers
 # The skin feels the opposite of the gauge. On both public boards pokes carry the skin by 48 um along the labels' +x
-# (fitted on fields alone: question compare), and the mean Fx of all six files is negative: turned, it pushes along +x.
+# (fitted on fields alone: `compare`), and the mean Fx of all six files is negative: turned, it pushes along +x.
 # Along y both are too small to tell, but right-handed axes with z into the skin, as Fz asks, leave only the labels' y.
 ON_SKIN = -1.0
 

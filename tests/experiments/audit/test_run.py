@@ -38,7 +38,7 @@ ADAPTATION = SHARED["adaptations"]["paper"]
 SCENE = recorded(
     source="simulated",
     seed=SEED,
-    questions=["single_random", "lobo", "triplet", "adapt", "audit"],
+    experiments=["single_random", "lobo", "triplet", "adapt", "audit"],
     split={"random_test_fraction": 0.1, "random_repeats_n": 1, "pool_passes_n": 1},
     train_single=TRAINING,
     train_multi=TRAINING | {"variants": {"shape": {"inputs": "shape"}}},
@@ -85,19 +85,19 @@ def build(folder: Path, skins: tuple[str, ...] = SKINS) -> Path:
     drawn = draw_folds(rows, ("single_random", "lobo"), read_split(asked), asked.seed)
     io.write_json(folder / "folds.json", render_folds(skins, rows, drawn))
     data = scenery(folder)
-    for arm, section, question in (
+    for arm, section, experiment in (
         ("train_single", asked.training("train_single"), "single_random"),
         ("train_multi", asked.training("train_multi"), "lobo"),
     ):
-        write(folder, arm, data, trials_of(data, section, data.folds_of(question)))
+        write(folder, arm, data, trials_of(data, section, data.folds_of(experiment)))
     write(
         folder,
         "train_triplet",
         data,
-        trials_of(data, asked.training("train_triplet"), data.folds_of("lobo"), question="triplet"),
+        trials_of(data, asked.training("train_triplet"), data.folds_of("lobo"), experiment="triplet"),
     )
     starts, named = read_starts(folder / "models/train_triplet"), ("paper", asked.adaptations().recipes["paper"])
-    adapted = [adaptations(data, fold, named, starts, question="adapt", pokes_n=8) for fold in data.folds_of("lobo")]
+    adapted = [adaptations(data, fold, named, starts, experiment="adapt", pokes_n=8) for fold in data.folds_of("lobo")]
     write(folder, "adapt", data, [trial for trials in adapted for trial in trials])
     io.write_json(folder / "choice.json", CHOICE)
     return folder
@@ -200,7 +200,7 @@ def test_a_network_whose_scaler_saw_test_rows_is_named(scene, arm, name, seen_n)
 def replant(folder: Path, change: Callable[[Fold, SceneData], Fold]) -> None:
     """Change the fold of board b0 in folds.json, and leave the others."""
     data = scenery(folder)
-    folds = [change(fold, data) if (fold.question, fold.name) == ("lobo", "b0") else fold for fold in data.folds]
+    folds = [change(fold, data) if (fold.experiment, fold.name) == ("lobo", "b0") else fold for fold in data.folds]
     io.write_json(
         folder / "folds.json", render_folds(io.read_json(folder / "folds.json")["captures"], data.rows, folds)
     )
@@ -210,23 +210,23 @@ def replant(folder: Path, change: Callable[[Fold, SceneData], Fold]) -> None:
 def a_skin_trained_on(fold: Fold, data: SceneData) -> Fold:
     own = data.rows.skin[fold.test] == "b0_s0"
     pool = fold.pool[data.rows.skin[fold.pool] != "b0_s0"]
-    return Fold(fold.question, fold.name, np.union1d(fold.train, fold.test[own]), fold.test[~own], pool)
+    return Fold(fold.experiment, fold.name, np.union1d(fold.train, fold.test[own]), fold.test[~own], pool)
 
 
 def a_reading_on_both_sides(fold: Fold, data: SceneData) -> Fold:
-    return Fold(fold.question, fold.name, np.union1d(fold.train, fold.test[:1]), fold.test, fold.pool)
+    return Fold(fold.experiment, fold.name, np.union1d(fold.train, fold.test[:1]), fold.test, fold.pool)
 
 
 def a_tested_reading_adapted_to(fold: Fold, data: SceneData) -> Fold:
-    return Fold(fold.question, fold.name, fold.train, fold.test, np.union1d(fold.pool, fold.test[:1]))
+    return Fold(fold.experiment, fold.name, fold.train, fold.test, np.union1d(fold.pool, fold.test[:1]))
 
 
 def a_tested_indentation_adapted_to(fold: Fold, data: SceneData) -> Fold:
-    return Fold(fold.question, fold.name, fold.train, fold.test[1:], np.union1d(fold.pool, fold.test[:1]))
+    return Fold(fold.experiment, fold.name, fold.train, fold.test[1:], np.union1d(fold.pool, fold.test[:1]))
 
 
 def a_stranger_adapted_to(fold: Fold, data: SceneData) -> Fold:
-    return Fold(fold.question, fold.name, fold.train[1:], fold.test, np.union1d(fold.pool, fold.train[:1]))
+    return Fold(fold.experiment, fold.name, fold.train[1:], fold.test, np.union1d(fold.pool, fold.train[:1]))
 
 
 @pytest.mark.parametrize(

@@ -47,9 +47,9 @@ def poked(boards_n: int = 3, pokes_n: int = 60) -> tuple[Labels, np.ndarray]:
     return labels, np.concatenate(dbs_uT).astype(np.float32)
 
 
-def held_out(labels: Labels, question: str = "lobo", board: str = "b0") -> Sides:
+def held_out(labels: Labels, experiment: str = "lobo", board: str = "b0") -> Sides:
     own = labels.board == board
-    return Sides(question, board, np.flatnonzero(~own), NONE, np.flatnonzero(own))
+    return Sides(experiment, board, np.flatnonzero(~own), NONE, np.flatnonzero(own))
 
 
 def audited(fold: Sides, labels: Labels, db_uT: np.ndarray):
@@ -71,8 +71,8 @@ def test_a_fold_drawn_in_the_docstring_is_as_printed():
 
 @pytest.mark.parametrize("question", UNSEEN)
 @pytest.mark.parametrize("board", ["b0", "b1", "b2"])
-def test_honest_folds_pass(question, board):
-    checks = audited(held_out(LABELS, question, board), LABELS, DB_uT)
+def test_honest_folds_pass(experiment, board):
+    checks = audited(held_out(LABELS, experiment, board), LABELS, DB_uT)
     assert failing(checks) == []
     assert [check.what for check in checks] == ["readings", "boards", "skins", "indentations", "copies"]
 
@@ -118,9 +118,9 @@ def test_the_papers_random_readings_are_a_known_leak_that_does_not_fail_the_whol
 
 
 @pytest.mark.parametrize("question", ["single_temporal", "single_indentation", "single_pass"])
-def test_within_one_skin_indentations_are_apart_or_the_audit_fails(question):
+def test_within_one_skin_indentations_are_apart_or_the_audit_fails(experiment):
     own = np.flatnonzero(LABELS.skin == "b0_s0")
-    fold = Sides(question, "b0_s0", own[: 20 * READINGS_N], NONE, own[20 * READINGS_N :])
+    fold = Sides(experiment, "b0_s0", own[: 20 * READINGS_N], NONE, own[20 * READINGS_N :])
     assert failing(audited(fold, LABELS, DB_uT)) == []
     torn = replace(fold, train=own[:61], test=own[61:])
     assert failing(audited(torn, LABELS, DB_uT)) == ["indentations"]
@@ -201,11 +201,11 @@ def test_skins_that_cannot_be_told_from_noise_do_not_pass():
 
 @given(st.integers(0, 1000), st.booleans(), st.sampled_from([*UNSEEN, "single_random"]))
 @settings(max_examples=30, deadline=None)
-def test_the_order_of_rows_does_not_change_what_is_found(draw, copied, question):
+def test_the_order_of_rows_does_not_change_what_is_found(draw, copied, experiment):
     db_uT = with_copy(DB_uT, LABELS, "b2_s1", "b0_s1", sd_uT=3, factor=1) if copied else DB_uT
     order = rng_for(draw, "order").permutation(len(DB_uT))
     place = np.argsort(order)  # where a row went
-    fold = held_out(LABELS, question)
+    fold = held_out(LABELS, experiment)
     shuffled = Labels(*(label[order] for label in vars(LABELS).values()))
     moved = replace(fold, train=place[fold.train], test=place[fold.test])
     assert audited(moved, shuffled, db_uT[order]) == audited(fold, LABELS, db_uT)
@@ -243,13 +243,13 @@ def test_two_recorded_skins_pass_and_a_copy_of_one_fails(shared_data):
 
 
 @pytest.mark.parametrize("question", ["lobo", "by_weather"])
-def test_folds_that_cannot_be_judged_are_one_sentence(question):
-    fold = replace(held_out(LABELS, question), test=NONE)
+def test_folds_that_cannot_be_judged_are_one_sentence(experiment):
+    fold = replace(held_out(LABELS, experiment), test=NONE)
     sentence = {
         "lobo": "rows must be on both sides; got 720 to train on, 0",
         "by_weather": "must be one of .*; got by_weath",
     }
-    with pytest.raises(ParamsError, match=sentence[question]):
+    with pytest.raises(ParamsError, match=sentence[experiment]):
         audited(fold, LABELS, DB_uT)
 
 

@@ -186,7 +186,7 @@ def test_pokes_are_means_of_their_readings_and_what_knows_no_force_is_left_out_a
     assert pokes.db_uT[:, 0, 0].tolist() == [1.0, 3.5]  # rows 0, 1, 2 and 3, 4
     assert pokes.left_out_n == 1
     assert pokes.groups == ("c0 1 mm",)
-    with pytest.raises(SchemaError, match="question compare must be asked of pokes with place and force"):
+    with pytest.raises(SchemaError, match="experiment compare must be asked of pokes with place and force"):
         pool([readings(Fz_N=np.full(6, np.nan, np.float32))])
     with pytest.raises(ParamsError, match="chips of compare.design must be 1, as recorded; got 5"):
         see(pokes, SECTION)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.experiments.answer import only, read_losses, write_answer
+from pipeline.experiments.results import only, read_losses, write_results
 from reskin import io
 from reskin.errors import SchemaError
 from tests.data import tables
@@ -22,7 +22,7 @@ def test_every_capture_of_the_folder_is_accounted_for_beside_what_rows_lost(tmp_
 
 
 def test_an_answer_about_the_main_captures_counts_none_of_its_own(tmp_path):
-    write_answer(tmp_path / "contacts.json", {"pairs_n": 3}, {"along": [1.0]})
+    write_results(tmp_path / "contacts.json", {"pairs_n": 3}, {"along": [1.0]})
     written = json.loads((tmp_path / "contacts.json").read_text())
     assert written["losses"] == {"accounts": [], "left_out": {}}
     assert (written["numbers"], written["drawn"]) == ({"pairs_n": 3}, {"along": [1.0]})

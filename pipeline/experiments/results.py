@@ -1,7 +1,4 @@
-"""What the stages of the experiments share: the captures of a folder, and the answer that they write.
-
-Refuses to know what any of them asks.
-"""
+"""What the modules of experiments share: reading the captures of a folder, and writing results."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -27,7 +24,7 @@ def only(captures: Sequence[Capture], folder: Path) -> Capture:
     """Give the one capture of a folder; more than one is an error, not a choice."""
     if len(captures) != 1:
         remedy = "Ask its protocol of one skin (skins_n), and simulate it again."
-        raise SchemaError(folder, "captures", "one, as its question reads no more", len(captures), remedy)
+        raise SchemaError(folder, "captures", "one, as its experiment reads no more", len(captures), remedy)
     return captures[0]
 
 
@@ -37,8 +34,8 @@ def read_losses(indentations: Path, left_out: Mapping[str, int]) -> dict[str, An
     return {"accounts": accounts, "left_out": dict(left_out)}
 
 
-def write_answer(
-    answer: Path, numbers: Mapping[str, Any], drawn: Mapping[str, Any], losses: Mapping[str, Any] = NO_CAPTURES,
+def write_results(
+    results: Path, numbers: Mapping[str, Any], drawn: Mapping[str, Any], losses: Mapping[str, Any] = NO_CAPTURES,
     trainings: Mapping[str, int] | None = None,
 ) -> None:  # fmt: skip
     """Write what numbers.json takes over as it is, what only figures show, what was lost of captures of its own.
@@ -46,4 +43,4 @@ def write_answer(
     `trainings` counts the networks that the stage trained, and those that collapsed.
     """
     words = {"numbers": dict(numbers), "drawn": dict(drawn), "losses": dict(losses)}
-    io.write_json(answer, words if trainings is None else words | {"trainings": dict(trainings)})
+    io.write_json(results, words if trainings is None else words | {"trainings": dict(trainings)})
