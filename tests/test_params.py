@@ -56,7 +56,7 @@ def scene(*experiments: str, **changes: object) -> Scene:
 
 
 @pytest.mark.parametrize(
-    ("question", "others"),
+    ("experiment", "others"),
     [
         ("triplet", ("lobo",)),
         ("adapt", ("lobo", "triplet")),
@@ -156,7 +156,7 @@ def test_a_scene_that_asks_one_experiment_has_one_stage_and_no_curve():
     )
 
 
-@pytest.mark.parametrize("question", [one for one in ALL if SECTIONS[one]])
+@pytest.mark.parametrize("experiment", [one for one in ALL if SECTIONS[one]])
 def test_a_section_stands_in_a_scene_if_and_only_if_its_experiment_is_asked(experiment):
     ((section, words),) = SECTIONS[experiment].items()
     lacking = {name: value for name, value in asking(*ALL).items() if name != section}
@@ -166,7 +166,7 @@ def test_a_section_stands_in_a_scene_if_and_only_if_its_experiment_is_asked(expe
         scene("single_temporal" if experiment == "lobo" else "lobo", **{section: words})
 
 
-@pytest.mark.parametrize("question", DRAWN_WITH)
+@pytest.mark.parametrize("experiment", DRAWN_WITH)
 def test_split_holds_what_draws_the_folds_of_an_experiment_and_nothing_else(experiment):
     own, others = DRAWN_WITH[experiment], ("lobo", "triplet", *(["adapt"] if experiment == "sensors" else []))
     asked = asking(*others, experiment)

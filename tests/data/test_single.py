@@ -26,7 +26,7 @@ def visited(passes_n: int, pokes_n: int, readings_n: int = 2, skins_n: int = 2):
     return replace(table, indentation=np.arange(len(labels)) // readings_n)
 
 
-@pytest.mark.parametrize("question", TOGETHER)
+@pytest.mark.parametrize("experiment", TOGETHER)
 @given(passes_n=st.integers(2, 7), pokes_n=st.integers(1, 6), split=splits, seed=st.integers(0, 2**40))
 def test_no_indentation_and_no_pass_is_on_both_sides_and_no_row_of_the_skin_is_lost(
     experiment, passes_n, pokes_n, split, seed
@@ -43,7 +43,7 @@ def test_no_indentation_and_no_pass_is_on_both_sides_and_no_row_of_the_skin_is_l
         assert len(fold.pool) == 0
 
 
-@pytest.mark.parametrize("question", TOGETHER)
+@pytest.mark.parametrize("experiment", TOGETHER)
 @given(order=st.permutations(range(24)))
 def test_which_groups_are_held_out_is_the_same_for_any_order_of_rows_that_keeps_their_numbers(experiment, order):
     table = visited(3, 4, skins_n=1)

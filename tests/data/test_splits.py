@@ -102,7 +102,7 @@ def six_by_three_in_passes(passes_n: int, readings_n: int = 2):
 SENSORS = Split(sensors_skins_n=(15, 1, 6), sensors_draws_n=3, pool_passes_n=2)
 
 
-@pytest.mark.parametrize(("question", "split"), [("lobo", Split(pool_passes_n=2)), ("sensors", SENSORS)])
+@pytest.mark.parametrize(("experiment", "split"), [("lobo", Split(pool_passes_n=2)), ("sensors", SENSORS)])
 def test_the_pool_is_the_first_passes_of_each_held_out_skin_and_the_test_its_later_ones(experiment, split):
     table = six_by_three_in_passes(5)
     for fold in draw_folds(table, [experiment], split, 0):
@@ -114,7 +114,7 @@ def test_the_pool_is_the_first_passes_of_each_held_out_skin_and_the_test_its_lat
         assert not {*table.indentation[fold.pool]} & {*table.indentation[fold.test]}
 
 
-@pytest.mark.parametrize("question", ["lobo", "sensors"])
+@pytest.mark.parametrize("experiment", ["lobo", "sensors"])
 @given(order=st.permutations(range(12)))
 def test_the_order_of_rows_decides_neither_pool_nor_training_skins(experiment, order):
     labels = [(f"b{board}", f"b{board}_s{skin}", p) for board in range(3) for skin in range(2) for p in (3, 5)]
@@ -138,7 +138,7 @@ def test_without_a_pool_all_rows_of_the_held_out_board_are_tested():
             assert fold.test.tolist() == np.flatnonzero(table.board == table.board[fold.test[0]]).tolist()
 
 
-@pytest.mark.parametrize(("question", "split"), [("single_random", RANDOM), ("single_temporal", TEMPORAL)])
+@pytest.mark.parametrize(("experiment", "split"), [("single_random", RANDOM), ("single_temporal", TEMPORAL)])
 def test_experiments_that_adapt_nothing_have_no_pool_even_where_others_have_one(experiment, split):
     table = six_by_three_in_passes(5)
     pooled = draw_folds(table, [experiment], split.model_copy(update={"pool_passes_n": 1}), 0)
@@ -283,7 +283,7 @@ TWO_CAPTURES = replace(ONE_BOARD, capture=np.array(["run2", "run10", "run10"]))
 
 
 @pytest.mark.parametrize(
-    ("table", "question", "split", "sentence"),
+    ("table", "experiment", "split", "sentence"),
     [
         (ONE_BOARD, "lobo", Split(), "experiment lobo: boards must be two or more; got 1"),
         (ONE_BOARD, "transfer", TRANSFER, "split.transfer_skins_n must be less than .* 1 boards; got 3"),
@@ -311,7 +311,7 @@ def test_folds_that_the_data_cannot_give_are_one_sentence(table, experiment, spl
 
 
 @pytest.mark.parametrize(
-    ("question", "split"), [("lobo", Split()), ("sensors", Split(sensors_skins_n=(1,), sensors_draws_n=1))]
+    ("experiment", "split"), [("lobo", Split()), ("sensors", Split(sensors_skins_n=(1,), sensors_draws_n=1))]
 )
 def test_a_planted_leak_a_skin_on_two_boards_is_refused(experiment, split):
     with pytest.raises(ParamsError, match="must be on one side only; got .* on both"):

@@ -43,7 +43,7 @@ ARMS = {arm: {"true_N": [0.1, 3.0], "predicted_N": [0.3, 4.5]} for arm in ("befo
 TOLD = {"shear": (shear, SHEARED, CURVES), "manual": (manual, POKED, {}), "flexible": (flexible, BENT, ARMS)}
 
 
-@pytest.mark.parametrize("question", TOLD)
+@pytest.mark.parametrize("experiment", TOLD)
 @pytest.mark.parametrize("source", ["simulated", "recorded"])
 def test_every_row_and_every_figure_says_its_source(experiment, source):
     module, numbers, drawn = TOLD[experiment]

@@ -69,7 +69,7 @@ def test_a_fold_drawn_in_the_docstring_is_as_printed():
     assert outcome.failed == 0
 
 
-@pytest.mark.parametrize("question", UNSEEN)
+@pytest.mark.parametrize("experiment", UNSEEN)
 @pytest.mark.parametrize("board", ["b0", "b1", "b2"])
 def test_honest_folds_pass(experiment, board):
     checks = audited(held_out(LABELS, experiment, board), LABELS, DB_uT)
@@ -117,7 +117,7 @@ def test_the_papers_random_readings_are_a_known_leak_that_does_not_fail_the_whol
     assert holds(checks)
 
 
-@pytest.mark.parametrize("question", ["single_temporal", "single_indentation", "single_pass"])
+@pytest.mark.parametrize("experiment", ["single_temporal", "single_indentation", "single_pass"])
 def test_within_one_skin_indentations_are_apart_or_the_audit_fails(experiment):
     own = np.flatnonzero(LABELS.skin == "b0_s0")
     fold = Sides(experiment, "b0_s0", own[: 20 * READINGS_N], NONE, own[20 * READINGS_N :])
@@ -242,7 +242,7 @@ def test_two_recorded_skins_pass_and_a_copy_of_one_fails(shared_data):
     assert failing(audited(fold, labels, planted)) == ["copies"]
 
 
-@pytest.mark.parametrize("question", ["lobo", "by_weather"])
+@pytest.mark.parametrize("experiment", ["lobo", "by_weather"])
 def test_folds_that_cannot_be_judged_are_one_sentence(experiment):
     fold = replace(held_out(LABELS, experiment), test=NONE)
     sentence = {
