@@ -26,7 +26,7 @@ from reskin.errors import ParamsError
 from reskin.metrics import ACCURACY_LIMIT_MM
 from reskin.models.inputs import shape
 from reskin.models.trained import networks_without
-from reskin.physics import flow_map
+from reskin.physics import deformation
 from reskin.physics.board import Board, draw_board
 from reskin.physics.magnet import change_of_field
 from reskin.physics.skin import Dipoles, Skin, draw_skin
@@ -251,11 +251,14 @@ def press_on(skin: Skin, dipoles: Dipoles, poke_m: Float[np.ndarray, "3"]) -> Di
     at = nodes_m[:, 2] / skin.thickness_m * (HEIGHTS_N - 1)
     low = np.clip(at.astype(np.intp), 0, HEIGHTS_N - 2)
     share = (at - low)[:, None]
-    table = flow_map.tabulate(
+    table = deformation.tabulate(
         skin.thickness_m, skin.tip_radius_m, float(poke_m[2]), heights=tuple(heights.tolist()), base=skin.base
     )
     below, above = (
-        flow_map.move(table, flow_map.Rest(nodes_m, moments_A_m2, low + i, tuple(heights)), poke_m) for i in (0, 1)
+        deformation.move_dipoles(
+            table, deformation.RestingDipoles(nodes_m, moments_A_m2, low + i, tuple(heights)), poke_m
+        )
+        for i in (0, 1)
     )
     after_m, turned_A_m2 = nodes_m.copy(), moments_A_m2.copy()
     near = share[below.i]

@@ -18,8 +18,7 @@ from pipeline.stage import say
 from pipeline.synthesis import synthesis_of
 from reskin import io
 from reskin.data.grid import CENTRE_MM
-from reskin.physics import aging, chip, layer, magnet
-from reskin.physics import layer as flow
+from reskin.physics import aging, chip, deformation, layer, magnet
 from reskin.physics import magnet as nodes
 from reskin.physics.aging import Ageing, Memory, Relaxation
 from reskin.physics.board import Board, draw_board
@@ -184,7 +183,7 @@ def _inside(on: Subject) -> list[Omission]:
     """Move the material of a few pokes as the scene does, and as it would without one part of the physics."""
     skin, depth_m = on.skin, float(on.tip_m[..., 2].max()) + on.skin.depth_zero_m
     base: layer.Base = "bonded" if skin.base == "slipping" else "slipping"
-    press = flow.Press(skin.thickness_m, skin.tip_radius_m, skin.base)
+    press = layer.IndentedLayer(skin.thickness_m, skin.tip_radius_m, skin.base)
     swapped = replace(press, base=base)
     true = _flow(on, depth_m, press)
     wrong_N, true_N = (
@@ -209,16 +208,16 @@ def _inside(on: Subject) -> list[Omission]:
 Moved = tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"], Float[np.ndarray, " s"]]  # r_m, z_m, angle_rad
 
 
-def _flow(on: Subject, depth_m: float, press: flow.Press) -> list[Moved]:
+def _flow(on: Subject, depth_m: float, press: layer.IndentedLayer) -> list[Moved]:
     """Follow the material from every place at once: the same pressures carry it."""
     r_m = np.concatenate([np.hypot(*(on.coarse.nodes_m[:, :2] - place_m).T) for place_m in PLACES_M])
     z_m = np.tile(on.coarse.nodes_m[:, 2], len(PLACES_M))
-    end = flow.follow(r_m, z_m, flow.steps((depth_m,), press), press=press)[-1]
-    moved = (np.split(values, len(PLACES_M)) for values in (end.r_m, end.z_m, flow.angle(end.f)))
+    end = deformation.follow(r_m, z_m, deformation.depth_steps((depth_m,), press), press=press)[-1]
+    moved = (np.split(values, len(PLACES_M)) for values in (end.r_m, end.z_m, deformation.rotation_angle(end.f)))
     return list(zip(*moved, strict=True))
 
 
-def _one_shot(on: Subject, place_m: tuple[float, float], depth_m: float, press: flow.Press) -> Moved:
+def _one_shot(on: Subject, place_m: tuple[float, float], depth_m: float, press: layer.IndentedLayer) -> Moved:
     r_m, z_m = np.hypot(*(on.coarse.nodes_m[:, :2] - place_m).T), on.coarse.nodes_m[:, 2].copy()
     u = layer.displacement(r_m, z_m, layer.waves(press.contact(depth_m), press.thickness_m, press.base))
     return r_m + u.r_m, z_m + u.z_m, (u.r_z - u.z_r) / 2

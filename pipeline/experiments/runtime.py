@@ -28,7 +28,7 @@ from pipeline.synthesis import synthesis_of
 from reskin import io
 from reskin.config import Strict
 from reskin.errors import ParamsError
-from reskin.physics import flow_map, layer, magnet, slide
+from reskin.physics import deformation, layer, magnet, slide
 from reskin.physics.aging import SKIN, Prony, relax
 from reskin.physics.board import Board, Spreads, draw_board
 from reskin.physics.magnet import SEAMS_M, SKIN_SIDE_M, Nodes, Quadrature, change_of_field, place_nodes
@@ -511,7 +511,7 @@ def paths(trial: Trial, skin: Skin) -> NodePath:
     nodes_m = np.tile(skin.nodes_m, (len(trial.pokes_m), 1, 1))
     turns_rad = np.zeros_like(nodes_m)
     true_m = trial.pokes_m[:, 2] + skin.depth_zero_m
-    press = layer.Press(skin.thickness_m, skin.tip_radius_m, skin.base)
+    press = layer.IndentedLayer(skin.thickness_m, skin.tip_radius_m, skin.base)
     bends, reach_m = _bends(press, tuple(np.unique(true_m).tolist()))
     for poke_i, (poke_m, depth_m) in enumerate(zip(trial.pokes_m, true_m, strict=True)):
         bend = bends[float(depth_m)]
@@ -549,15 +549,18 @@ class _Bend:
 
 
 @lru_cache(maxsize=8)
-def _bends(press: layer.Press, depths_m: tuple[float, ...]) -> tuple[dict[float, _Bend], float]:
-    reach_m = press.thickness_m * flow_map.reach(press.tip_radius_m / press.thickness_m, press.base)
+def _bends(press: layer.IndentedLayer, depths_m: tuple[float, ...]) -> tuple[dict[float, _Bend], float]:
+    reach_m = press.thickness_m * deformation.reach(press.tip_radius_m / press.thickness_m, press.base)
     r_m = reach_m * np.linspace(0, 1, RADII_N) ** 1.5
     z_m = press.thickness_m * np.linspace(0, 1, HEIGHTS_N)
     r0_m, z0_m = (part.ravel() for part in np.meshgrid(r_m, z_m, indexing="ij"))
-    steps_m = layer.steps(depths_m, press)
+    steps_m = deformation.depth_steps(depths_m, press)
     found = {}
-    for step_m, end in zip(steps_m, layer.follow(r0_m, z0_m, steps_m, press=press), strict=True):
-        changes = [part.reshape(RADII_N, HEIGHTS_N) for part in (end.r_m - r0_m, end.z_m - z0_m, layer.angle(end.f))]
+    for step_m, end in zip(steps_m, deformation.follow(r0_m, z0_m, steps_m, press=press), strict=True):
+        changes = [
+            part.reshape(RADII_N, HEIGHTS_N)
+            for part in (end.r_m - r0_m, end.z_m - z0_m, deformation.rotation_angle(end.f))
+        ]
         edge_m = reach_m + float(changes[0][-1].mean())
         grown_m2 = edge_m**2 - reach_m**2 if press.base == "slipping" else 0.0
         found[float(step_m)] = _Bend(tuple(RectBivariateSpline(r_m, z_m, change) for change in changes), grown_m2)

@@ -1,9 +1,11 @@
-"""The elastic layer under a round tip: contact, force, and displacement of the material. SI units.
+"""An incompressible elastic layer under a spherical tip: contact, force and linear displacements. SI units.
 
-Waves of pressure on a layer that is bonded to its base or slips on it, summed to displacements and gradients.
+The layer is bonded to a rigid base or slips on it. Fields are Hankel integrals over waves J0(kr) of the pressure; kh
+and kz are the wave number times the thickness and the height, primes are derivatives by kz. For a bonded base
+W = a (sinh z' - z' cosh z') + b z' sinh z' and U = -W'/k, z' = kz (PHYSICS 4).
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import lru_cache
 from math import exp, expm1
 from typing import Literal, no_type_check
@@ -17,127 +19,9 @@ from scipy.special import j0, j1
 
 from reskin.errors import ParamsError
 
-
-def compliance_on_slip(kh: Float[np.ndarray, " w"]) -> Float[np.ndarray, " w"]:
-    """Give the sinking of the surface under a wave of pressure, relative to that of a half-space.
-
-    (cosh 2A - 1) / (sinh 2A + 2A), A = kh, with both sides divided by exp(2A) / 2; A / 2 for long waves.
-    """
-    double = np.minimum(2 * kh, 1e3)
-    fade = np.exp(-double)
-    long_waves = double < 1e-4
-    rest = np.where(long_waves, 1.0, 1 - fade**2 + 2 * double * fade)
-    return np.where(long_waves, double / 4, np.expm1(-double) ** 2 / rest)
-
-
-BESSEL_STEP = 1 / 256  # between tabulated Bessel functions
-
-
-@njit(cache=True, error_model="numpy")
-@no_type_check
-def bonded_whole(kh):
-    """Give what `bonded` needs of the layer as a whole; it is the same at every height."""
-    base = exp(-2 * kh)
-    size = (1 + base) ** 2 + 4 * kh * kh * base
-    return (1 + base) / size, 2 * kh / size * exp(-kh), 0.0
-
-
-@njit(cache=True, error_model="numpy")
-@no_type_check
-def bonded(kz, kh, of):
-    """Give g of one wave at height z of a layer that is held at its base, and its first two derivatives by kz.
-
-    g = [cosh A (sinh z' + t cosh z') - A cosh t - A z' sinh t] / (cosh^2 A + A^2), t = A - z': the W of PHYSICS 4 with
-    a and b put in. All of it is divided by exp(2A) / 4, so that no exponent is positive inside the layer.
-    """
-    t = kh - kz
-    top, fade = exp(-t), exp(-kz)
-    low, high = fade * fade, top * top
-    near, far = of[0] * top, of[1] * fade
-    g = near * (1 + t - (1 - t) * low) - far * (1 + kz + (1 - kz) * high)
-    slope = near * t * (1 - low) + far * kz * (1 + high)
-    bend = near * (t * (1 + low) - (1 - low)) + far * (1 + high - kz * (1 - high))
-    return g, slope, bend
-
-
-@njit(cache=True, error_model="numpy")
-@no_type_check
-def sliding_whole(kh):
-    """Give what `sliding` needs of the layer as a whole; it is the same at every height."""
-    fade, second = exp(-2 * kh), -expm1(-2 * kh)
-    return second * (1 + fade) + 4 * kh * fade, (1 + kh) - (1 - kh) * fade, second
-
-
-@njit(cache=True, error_model="numpy")
-@no_type_check
-def sliding(kz, kh, of):
-    """Give g of one wave at height z, and its first two derivatives by kz; g(kh) is the surface's `compliance`.
-
-    g = [(sinh A + A cosh A) sinh z' - z' sinh A cosh z'] / (sinh A cosh A + A): the odd solution, for at the base both
-    W and W'' + W (the shear) vanish. All of it is multiplied by 4 exp(-2A), so that no exponent is positive inside.
-    """
-    size, first, second = of
-    top, low = exp(kz - kh), exp(-kh - kz)
-    odd, even = (top - low) / size, (top + low) / size
-    g = first * odd - kz * second * even
-    slope = (first - second) * even - kz * second * odd
-    bend = (first - 2 * second) * odd - kz * second * even
-    return g, slope, bend
-
-
-@njit(cache=True, error_model="numpy")
-@no_type_check
-def _between(table, low, share):
-    # Cubic Hermite between points BESSEL_STEP apart, with the true slopes: wrong by less than 1e-12.
-    j0_a, j1_a, slope_a = table[low, 0], table[low, 1], table[low, 2]
-    j0_b, j1_b, slope_b = table[low + 1, 0], table[low + 1, 1], table[low + 1, 2]
-    rest = 1 - share
-    a, b = rest * rest * (1 + 2 * share), share * share * (3 - 2 * share)
-    da, db = BESSEL_STEP * share * rest * rest, -BESSEL_STEP * share * share * rest
-    return a * j0_a + b * j0_b - da * j1_a - db * j1_b, a * j1_a + b * j1_b + da * slope_a + db * slope_b
-
-
-@njit(cache=True, error_model="numpy")
-@no_type_check
-def sum_waves(r_m, z_m, waves, slipping, table):
-    """Sum waves [k, k h, amplitude; w] at places [s] for `layer.displacement`: the rows of the result are its parts."""
-    sums = np.zeros((6, len(r_m)))
-    for w in range(waves.shape[1]):
-        k, kh, amplitude = waves[0, w], waves[1, w], waves[2, w]
-        steep, of = amplitude * k, sliding_whole(kh) if slipping else bonded_whole(kh)
-        for s in range(len(r_m)):
-            g, slope, bend = sliding(k * z_m[s], kh, of) if slipping else bonded(k * z_m[s], kh, of)
-            at = k * r_m[s] / BESSEL_STEP
-            low = int(at)
-            j0_, j1_ = _between(table, low, at - low)
-            sums[0, s] += amplitude * slope * j1_
-            sums[1, s] += steep * slope / 2
-            sums[2, s] -= amplitude * g * j0_
-            sums[3, s] += steep * slope * j0_
-            sums[4, s] += steep * bend * j1_
-            sums[5, s] += steep * g * j1_
-    for s in range(len(r_m)):
-        if r_m[s] > 0:
-            sums[1, s] = sums[0, s] / r_m[s]  # on the axis: its limit
-    return sums
-
-
-def bessel(top: float) -> Float[np.ndarray, "x 3"]:
-    """Tabulate J0, J1 and J1' = J0 - J1 / x from 0 to at least `top`."""
-    return _bessel_to(1 << max(8, int(np.ceil(top)).bit_length()))
-
-
-@lru_cache(maxsize=4)
-def _bessel_to(top: int) -> Float[np.ndarray, "x 3"]:
-    x = BESSEL_STEP * np.arange(round(top / BESSEL_STEP) + 2)
-    with np.errstate(invalid="ignore"):
-        slope = np.where(x > 0, j0(x) - j1(x) / x, 0.5)
-    return np.stack([j0(x), j1(x), slope], axis=1)
-
-
 Base = Literal["bonded", "slipping"]
 
-VERIFIED_DEPTH = 0.6  # of the thickness: Long et al. 2011 compared with finite elements up to here
+VERIFIED_DEPTH = 0.6  # of the thickness: up to here Long et al. 2011 compared with finite elements
 CURVE_N = 48  # contact radii of the force curve
 
 
@@ -153,7 +37,7 @@ WAVES_KH, WAVES_W = _gauss(40.0, 240)  # the shortest wave of the field is 0.3 m
 
 @dataclass(frozen=True)
 class Contact:
-    """Pressure under the tip, as weights of its transform: p^(k) / 2G = sum of weights * cos(k x)."""
+    """Contact pressure, as weights of its Hankel transform: p^(k) / 2G = sum of weights * cos(k x)."""
 
     radius_m: float
     depth_m: float
@@ -163,7 +47,7 @@ class Contact:
 
 @dataclass(frozen=True)
 class Waves:
-    """A pressure as waves J0(k r): wave numbers, and for each p^(k) dk / 2G."""
+    """A pressure as waves J0(k r): wave numbers, and the amplitude p^(k) dk / 2G of each."""
 
     k_per_m: Float[np.ndarray, " w"]
     amplitude_m: Float[np.ndarray, " w"]
@@ -173,7 +57,7 @@ class Waves:
 
 @dataclass(frozen=True)
 class Displacement:
-    """Displacement, outward and up, and its gradient: `r_z` is the derivative of the outward part along z."""
+    """Displacement (outward, up) and its gradient: `r_z` is the derivative of the outward part along z."""
 
     r_m: Float[np.ndarray, " s"]
     z_m: Float[np.ndarray, " s"]
@@ -184,10 +68,11 @@ class Displacement:
     hoop: Float[np.ndarray, " s"]
 
 
-def compliance(kh: Float[np.ndarray, " w"]) -> Float[np.ndarray, " w"]:
-    """Give the sinking of the surface under a wave of pressure, relative to that of a half-space.
+def bonded_compliance(kh: Float[np.ndarray, " w"]) -> Float[np.ndarray, " w"]:
+    """Return the surface compliance of a bonded layer to a pressure wave, relative to that of a half-space.
 
-    (sinh 2A - 2A) / (cosh 2A + 2 A^2 + 1), A = kh, with both sides divided by exp(2A) / 2, so that nothing overflows.
+    (sinh 2A - 2A) / (cosh 2A + 2 A^2 + 1), A = kh, with numerator and denominator divided by exp(2A) / 2 to avoid
+    overflow.
     """
     double = np.minimum(2 * kh, 1e3)  # there it is 1, and squares stay finite
     fade = np.exp(-double)
@@ -197,11 +82,25 @@ def compliance(kh: Float[np.ndarray, " w"]) -> Float[np.ndarray, " w"]:
     return sinh_part / (1 + fade**2 + (s + 2) * fade)
 
 
-def contact_of_radius(radius_m: float, *, thickness_m: float, tip_radius_m: float, base: Base) -> Contact:
-    """Find pressure and depth for a contact of this radius, from a Fredholm equation (Lebedev & Ufliand 1958).
+def slipping_compliance(kh: Float[np.ndarray, " w"]) -> Float[np.ndarray, " w"]:
+    """Return the surface compliance of a slipping layer to a pressure wave, relative to that of a half-space.
 
-    p^(k) = integral of chi(x) cos(kx) makes the pressure vanish outside; chi - K chi = 2/pi (depth - x artanh(x/R))
-    puts the surface on the sphere; the depth is the one that gives chi(radius) = 0, a pressure finite at the edge.
+    (cosh 2A - 1) / (sinh 2A + 2A), A = kh (Johnson 1985, 5.8), with numerator and denominator divided by exp(2A) / 2 to
+    avoid overflow; A / 2 for long waves.
+    """
+    double = np.minimum(2 * kh, 1e3)
+    fade = np.exp(-double)
+    long_waves = double < 1e-4
+    rest = np.where(long_waves, 1.0, 1 - fade**2 + 2 * double * fade)
+    return np.where(long_waves, double / 4, np.expm1(-double) ** 2 / rest)
+
+
+def contact_of_radius(radius_m: float, *, thickness_m: float, tip_radius_m: float, base: Base) -> Contact:
+    """Solve for pressure and depth of a contact of this radius, by a Fredholm equation (Lebedev & Ufliand 1958).
+
+    p^(k) = integral of chi(x) cos(kx) makes the pressure vanish outside the contact. chi - K chi =
+    2/pi (depth - x artanh(x/R)) puts the surface on the sphere. The depth follows from chi(radius) = 0: the pressure is
+    finite at the edge.
     """
     x_m, weights_m = radius_m * CONTACT_X, radius_m * CONTACT_W
     at_m = np.append(x_m, radius_m)
@@ -215,20 +114,33 @@ def contact_of_radius(radius_m: float, *, thickness_m: float, tip_radius_m: floa
 
 @lru_cache(maxsize=4096)
 def contact_of_depth(depth_m: float, *, thickness_m: float, tip_radius_m: float, base: Base) -> Contact:
-    """Find the contact at this depth, above 0."""
+    """Solve for the contact at a depth above 0."""
 
     def miss_m(radius_m: float) -> float:
         here = contact_of_radius(radius_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m, base=base)
         return here.depth_m - depth_m
 
-    # A thick layer has a^2 = R d; a thin one, that can only flow aside, 4 R d.
+    # A thick layer has a^2 = R d; a thin one, whose material can only flow aside, 4 R d.
     top_m = min(2.1 * np.sqrt(tip_radius_m * depth_m), 0.999 * tip_radius_m)
     radius_m = float(brentq(miss_m, 1e-3 * np.sqrt(tip_radius_m * depth_m), top_m, rtol=1e-12))
     return contact_of_radius(radius_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m, base=base)
 
 
+@dataclass(frozen=True)
+class IndentedLayer:
+    """A layer, how its base is held, and the spherical tip that presses it."""
+
+    thickness_m: float
+    tip_radius_m: float
+    base: Base
+
+    def contact(self, depth_m: float) -> Contact:
+        """Return the contact at an indentation depth in m."""
+        return contact_of_depth(depth_m, thickness_m=self.thickness_m, tip_radius_m=self.tip_radius_m, base=self.base)
+
+
 def beyond_verified(depth_m: Float[np.ndarray, " n"], thickness_m: float) -> Bool[np.ndarray, " n"]:
-    """Flag the depths for which no published solution vouches."""
+    """Flag the depths beyond the range of the published solutions."""
     return depth_m >= VERIFIED_DEPTH * thickness_m
 
 
@@ -240,16 +152,22 @@ def force(
     modulus_Pa: float,
     base: Base,
 ) -> Float[np.ndarray, " n"]:
-    """Give the force on the tip in newtons; a depth of zero or less is no contact: no force."""
-    refuse_layer(depth_m, thickness_m, tip_radius_m)
+    """Return the normal force on the tip in N; 0 without contact (depth of 0 or less).
+
+    Raises
+    ------
+    ParamsError
+        If layer, tip or modulus are impossible, or the depth reaches the lesser of thickness and tip radius.
+    """
+    check_layer(depth_m, thickness_m, tip_radius_m)
     if not (np.isfinite(modulus_Pa) and modulus_Pa >= 0):
         raise ParamsError("layer", "modulus", "0 Pa or more", f"{modulus_Pa}", "Check the skin's modulus.")
     root_m = np.sqrt(np.maximum(depth_m, 0.0))
     return modulus_Pa * root_m**3 * _force_curve(thickness_m, tip_radius_m, base)(root_m)
 
 
-def refuse_layer(depth_m: Float[np.ndarray, " n"], thickness_m: float, tip_radius_m: float) -> None:
-    """Raise for a layer or a tip that cannot be, and for a poke through the layer or past the tip's half."""
+def check_layer(depth_m: Float[np.ndarray, " n"], thickness_m: float, tip_radius_m: float) -> None:
+    """Raise `ParamsError` for an impossible layer or tip, or a depth beyond the layer or the tip's radius."""
     for what, size_m in (("thickness", thickness_m), ("tip radius", tip_radius_m)):
         if not 0 < size_m < np.inf:
             raise ParamsError("layer", what, "above 0 m and finite", f"{size_m}", "Check its unit.")
@@ -260,25 +178,26 @@ def refuse_layer(depth_m: Float[np.ndarray, " n"], thickness_m: float, tip_radiu
 
 
 def waves(contact: Contact, thickness_m: float, base: Base) -> Waves:
-    """Write the contact's pressure as waves; a cos^2 window over the shortest half of them hides the cut."""
+    """Decompose the contact pressure into waves; a cos^2 window over the shorter half avoids ringing."""
     window = np.cos(np.pi * np.maximum(WAVES_KH / WAVES_KH[-1] - 0.5, 0)) ** 2
     pressure_m2 = np.cos(np.outer(WAVES_KH / thickness_m, contact.x_m)) @ contact.weights_m2
     return Waves(WAVES_KH / thickness_m, pressure_m2 * window * WAVES_W / thickness_m, thickness_m, base)
 
 
 def displacement(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"], of: Waves) -> Displacement:
-    """Sum the waves at (r, z): u_r = sum of amplitude g' J1, u_z = -sum of amplitude g J0 (PHYSICS 4: U = -W'/k)."""
-    table = bessel(float(np.max(r_m, initial=0.0) * of.k_per_m[-1]))
+    """Sum the waves at (r, z): u_r = sum of amplitude g' J1, u_z = -sum of amplitude g J0."""
+    top = float(np.max(r_m, initial=0.0) * of.k_per_m[-1])
+    table = _bessel_table(1 << max(8, int(np.ceil(top)).bit_length()))
     waves = np.stack([of.k_per_m, of.thickness_m * of.k_per_m, of.amplitude_m])
-    out_m, hoop, up_m, squeeze, r_z, z_r = sum_waves(r_m, z_m, waves, of.base == "slipping", table)
+    out_m, hoop, up_m, squeeze, r_z, z_r = _sum_waves(r_m, z_m, waves, of.base == "slipping", table)
     return Displacement(r_m=out_m, z_m=up_m, r_r=squeeze - hoop, r_z=r_z, z_r=z_r, z_z=-squeeze, hoop=hoop)
 
 
 def depth_profile(
     kz: Float[np.ndarray, "s w"], kh: Float[np.ndarray, " w"], base: Base = "bonded"
 ) -> tuple[Float[np.ndarray, "s w"], Float[np.ndarray, "s w"], Float[np.ndarray, "s w"]]:
-    """Give k W 2G / p^ = g at height z, and its first two derivatives by kz; g(kh) is the surface's `compliance`."""
-    of_all, of_one = (bonded_whole, bonded) if base == "bonded" else (sliding_whole, sliding)
+    """Return g = k W 2G / p^ at height z, and its first two derivatives by kz; g(kh) is the surface compliance."""
+    of_all, of_one = (_bonded_factors, _bonded_wave) if base == "bonded" else (_slipping_factors, _slipping_wave)
     found = [[of_one(z, h, of_all(h)) for z, h in zip(row, kh, strict=True)] for row in kz]
     g, slope, bend = np.array(found).transpose(2, 0, 1)
     return g, slope, bend
@@ -286,7 +205,7 @@ def depth_profile(
 
 @lru_cache(maxsize=64)
 def _force_curve(thickness_m: float, tip_radius_m: float, base: Base) -> CubicSpline:
-    # F / E d^1.5 over sqrt(d): smooth, and Hertz's 16/9 sqrt(R) at 0, where the layer is thick beside the contact.
+    # F / (E d^1.5) over sqrt(d): smooth, and Hertz's 16/9 sqrt(R) at 0, where the contact is small against the layer.
     deepest_m = (1 - 1e-6) * min(thickness_m, tip_radius_m)
     widest = contact_of_depth(deepest_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m, base=base)
     radii_m = widest.radius_m * np.linspace(0, 1, CURVE_N)[1:]
@@ -299,145 +218,110 @@ def _force_curve(thickness_m: float, tip_radius_m: float, base: Base) -> CubicSp
 def _kernel(
     at_m: Float[np.ndarray, " p"], x_m: Float[np.ndarray, " q"], thickness_m: float, base: Base
 ) -> Float[np.ndarray, "p q"]:
-    # 2/pi integral of (1 - compliance) cos(k at) cos(k x) dk.
-    surface = compliance if base == "bonded" else compliance_on_slip
+    # 2/pi times the integral of (1 - compliance) cos(k at) cos(k x) dk.
+    surface = bonded_compliance if base == "bonded" else slipping_compliance
     missing = KERNEL_W / thickness_m * (1 - surface(KERNEL_KH))
     k_per_m = KERNEL_KH / thickness_m
     return 2 / np.pi * np.cos(np.outer(at_m, k_per_m)) * missing @ np.cos(np.outer(k_per_m, x_m))
 
 
-STEP = 0.025  # of `depth_unit`: 0.05 mm in a skin of 2 mm; half of it changes dB by 0.3 % (slipping), 0.6 % (bonded)
-# Where the flow is stepped, whatever depths are asked for. The first step is cut in four and in two: there the
-# contact's radius changes as the root of the depth.
-LADDER = np.array([0.0, STEP / 4, STEP / 2, *(STEP * np.arange(1, round(1 / STEP) + 1))])
-RIM_MAX = 1.2  # of the thickness: waves that end at the surface grow as exp(kz) above it
-MARKS_N = 48  # on the surface, closer towards the axis
-PRESSURES_N = 6  # 4 and 8 move the marks by less than 0.03 mm at 1.2 mm
-DAMPING = 1e-3
+BESSEL_STEP = 1 / 256  # between tabulated Bessel functions
 
 
-@dataclass(frozen=True)
-class Press:
-    """What is pressed by what."""
-
-    thickness_m: float
-    tip_radius_m: float
-    base: Base
-
-    def contact(self, depth_m: float) -> Contact:
-        """Give the contact at a depth."""
-        return contact_of_depth(depth_m, thickness_m=self.thickness_m, tip_radius_m=self.tip_radius_m, base=self.base)
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _bonded_factors(kh):
+    """Compute the factors of `_bonded_wave` that do not depend on the height."""
+    base = exp(-2 * kh)
+    size = (1 + base) ** 2 + 4 * kh * kh * base
+    return (1 + base) / size, 2 * kh / size * exp(-kh), 0.0
 
 
-@dataclass(frozen=True)
-class Material:
-    """Present places of material points, and the gradient F of the map from rest; other entries of F are zero."""
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _bonded_wave(kz, kh, of):
+    """Return g of one wave at height z of a bonded layer, and its first two derivatives by kz.
 
-    r_m: Float[np.ndarray, " s"]
-    z_m: Float[np.ndarray, " s"]
-    f: Float[np.ndarray, "s 2 2"]  # rows and columns: r, z
-    hoop: Float[np.ndarray, " s"]
-
-
-def follow(
-    r_m: Float[np.ndarray, " s"],
-    z_m: Float[np.ndarray, " s"],
-    depths_m: Float[np.ndarray, " d"],
-    press: Press,
-) -> list[Material]:
-    """Carry material from rest through the given depths; one `Material` for each.
-
-    Marks on the surface go along: a pressure that fitted the surface at rest would leave the sunken one 0.3 mm behind a
-    tip at 1.2 mm, so each step finds the pressure anew that brings the marks onto the sphere.
+    g = [cosh A (sinh z' + t cosh z') - A cosh t - A z' sinh t] / (cosh^2 A + A^2), A = kh, z' = kz, t = A - z'.
+    Numerator and denominator are divided by exp(2A) / 4, so that no exponent is positive inside the layer.
     """
-    path = [with_marks(r_m, z_m, press)]
-    for depth_m in depths_m[1:]:
-        path.append(sink(path[-1], float(depth_m), press))
-    return [without_marks(at) for at in path]
+    t = kh - kz
+    top, fade = exp(-t), exp(-kz)
+    low, high = fade * fade, top * top
+    near, far = of[0] * top, of[1] * fade
+    g = near * (1 + t - (1 - t) * low) - far * (1 + kz + (1 - kz) * high)
+    slope = near * t * (1 - low) + far * kz * (1 + high)
+    bend = near * (t * (1 + low) - (1 - low)) + far * (1 + high - kz * (1 - high))
+    return g, slope, bend
 
 
-def sink(material: Material, depth_m: float, press: Press) -> Material:
-    """Carry material, its marks first, one step on to a greater depth."""
-    return carry(material, change(material, depth_m, press), depth_m, press)
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _slipping_factors(kh):
+    """Compute the factors of `_slipping_wave` that do not depend on the height."""
+    fade, second = exp(-2 * kh), -expm1(-2 * kh)
+    return second * (1 + fade) + 4 * kh * fade, (1 + kh) - (1 - kh) * fade, second
 
 
-def carry(material: Material, waves: Waves, depth_m: float, press: Press) -> Material:
-    """Carry material, with marks or without, by the change of pressure that brings the marks to a depth."""
-    sunken = _carry(material, waves)
-    if not sunken.z_m.max() < RIM_MAX * press.thickness_m:
-        rule = f"such that the rim stays below {RIM_MAX} of the skin's thickness"
-        got = f"{depth_m / press.thickness_m:.3g} of the thickness"
-        raise ParamsError("poke", "depth", rule, got, "Poke less deep.")
-    return sunken
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _slipping_wave(kz, kh, of):
+    """Return g of one wave at height z of a slipping layer, and its first two derivatives by kz.
 
-
-def angle(f: Float[np.ndarray, "s 2 2"]) -> Float[np.ndarray, " s"]:
-    """Give the angle from z towards r of the R in F = R U."""
-    return np.arctan2(f[:, 0, 1] - f[:, 1, 0], f[:, 0, 0] + f[:, 1, 1])
-
-
-def depth_unit(size: float) -> float:
-    """Give, in thicknesses, a smooth bound of all depths: below the lesser of thickness and tip radius (`size`)."""
-    return size / (1 + size**4) ** 0.25
-
-
-def steps(depths_m: tuple[float, ...], press: Press) -> Float[np.ndarray, " d"]:
-    """List depths to follow: 0, the `LADDER`'s down to the deepest asked for, and every depth asked for."""
-    ladder_m = press.thickness_m * depth_unit(press.tip_radius_m / press.thickness_m) * LADDER
-    return np.unique(np.append(ladder_m[ladder_m < max(depths_m)], depths_m))
-
-
-def with_marks(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"], press: Press) -> Material:
-    """Put the marks before material at rest; they reach as far as the widest contact, whatever depth is asked for."""
-    widest = press.contact(press.thickness_m * depth_unit(press.tip_radius_m / press.thickness_m))
-    r_m = np.append(widest.radius_m * np.linspace(0, 1, MARKS_N) ** 2, r_m)
-    return resting(r_m, np.append(np.full(MARKS_N, press.thickness_m), z_m))
-
-
-def resting(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"]) -> Material:
-    """Give material at rest."""
-    return Material(r_m, z_m, np.tile(np.eye(2), (len(r_m), 1, 1)), np.ones(len(r_m)))
-
-
-def without_marks(material: Material) -> Material:
-    """Take the marks away."""
-    return Material(*(getattr(material, name)[MARKS_N:] for name in Material.__dataclass_fields__))
-
-
-def change(material: Material, depth_m: float, press: Press) -> Waves:
-    """Find the change of pressure that brings the marks, which stand first in `material`, to a greater depth.
-
-    It is made of pressures of spheres on smaller contacts, and brings all marks inside the contact from where they are
-    to the tip: least squares, damped, for waves shorter than the depth do not reach the marks.
+    g = [(sinh A + A cosh A) sinh z' - z' sinh A cosh z'] / (sinh A cosh A + A): the odd solution, since at the base
+    both W and the shear W'' + W vanish. Numerator and denominator are multiplied by 4 exp(-2A), so that no exponent is
+    positive inside the layer.
     """
-    contact = press.contact(depth_m)
-    inside = np.flatnonzero(material.r_m[:MARKS_N] < contact.radius_m)
-    r_m, z_m = material.r_m[inside], material.z_m[inside]
-    radii_m = contact.radius_m * np.arange(1, PRESSURES_N + 1) / PRESSURES_N
-    parts = [contact_of_radius(a_m, **asdict(press)) for a_m in radii_m]
-    pressures = [waves(part, press.thickness_m, press.base) for part in parts]
-    parted = [displacement(r_m, z_m, pressure) for pressure in pressures]
-    height_m = np.sqrt(press.tip_radius_m**2 - r_m**2)
-    towards = np.stack([u.z_m - r_m / height_m * u.r_m for u in parted], axis=1) / [part.depth_m for part in parts]
-    missing_m = press.thickness_m - contact.depth_m + press.tip_radius_m - height_m - z_m
-    damping = DAMPING * np.linalg.norm(towards, 2) * np.eye(PRESSURES_N)
-    share = np.linalg.lstsq(np.vstack([towards, damping]), np.append(missing_m, np.zeros(PRESSURES_N)))[0]
-    amplitudes = np.stack(
-        [pressure.amplitude_m / part.depth_m for pressure, part in zip(pressures, parts, strict=True)]
-    )
-    return Waves(pressures[0].k_per_m, share @ amplitudes, press.thickness_m, press.base)
+    size, first, second = of
+    top, low = exp(kz - kh), exp(-kh - kz)
+    odd, even = (top - low) / size, (top + low) / size
+    g = first * odd - kz * second * even
+    slope = (first - second) * even - kz * second * odd
+    bend = (first - 2 * second) * odd - kz * second * even
+    return g, slope, bend
 
 
-def _carry(material: Material, change: Waves) -> Material:
-    # Midpoint rule: the change is that of the place where the material is half way; F by the chain rule through it.
-    first = displacement(material.r_m, material.z_m, change)
-    half_r_m, half_z_m = material.r_m + first.r_m / 2, material.z_m + first.z_m / 2
-    second = displacement(half_r_m, half_z_m, change)
-    eye = np.eye(2)
-    half = (eye + _plane(first) / 2) @ material.f
-    stretch = material.hoop * (1 + second.hoop * (1 + first.hoop / 2))
-    return Material(material.r_m + second.r_m, material.z_m + second.z_m, material.f + _plane(second) @ half, stretch)
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _between(table, low, share):
+    # Cubic Hermite interpolation of J0 and J1 between tabulated points, with exact slopes: error below 1e-12.
+    j0_a, j1_a, slope_a = table[low, 0], table[low, 1], table[low, 2]
+    j0_b, j1_b, slope_b = table[low + 1, 0], table[low + 1, 1], table[low + 1, 2]
+    rest = 1 - share
+    a, b = rest * rest * (1 + 2 * share), share * share * (3 - 2 * share)
+    da, db = BESSEL_STEP * share * rest * rest, -BESSEL_STEP * share * share * rest
+    return a * j0_a + b * j0_b - da * j1_a - db * j1_b, a * j1_a + b * j1_b + da * slope_a + db * slope_b
 
 
-def _plane(u: Displacement) -> Float[np.ndarray, "s 2 2"]:
-    return np.stack([np.stack([u.r_r, u.r_z], axis=-1), np.stack([u.z_r, u.z_z], axis=-1)], axis=-2)
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _sum_waves(r_m, z_m, waves, slipping, table):
+    """Sum waves [k, kh, amplitude; w] at places [s]; rows: u_r, hoop, u_z, squeeze, du_r/dz, du_z/dr."""
+    sums = np.zeros((6, len(r_m)))
+    for w in range(waves.shape[1]):
+        k, kh, amplitude = waves[0, w], waves[1, w], waves[2, w]
+        steep, of = amplitude * k, _slipping_factors(kh) if slipping else _bonded_factors(kh)
+        for s in range(len(r_m)):
+            g, slope, bend = _slipping_wave(k * z_m[s], kh, of) if slipping else _bonded_wave(k * z_m[s], kh, of)
+            at = k * r_m[s] / BESSEL_STEP
+            low = int(at)
+            j0_, j1_ = _between(table, low, at - low)
+            sums[0, s] += amplitude * slope * j1_
+            sums[1, s] += steep * slope / 2
+            sums[2, s] -= amplitude * g * j0_
+            sums[3, s] += steep * slope * j0_
+            sums[4, s] += steep * bend * j1_
+            sums[5, s] += steep * g * j1_
+    for s in range(len(r_m)):
+        if r_m[s] > 0:
+            sums[1, s] = sums[0, s] / r_m[s]  # on the axis: its limit
+    return sums
+
+
+@lru_cache(maxsize=4)
+def _bessel_table(top: int) -> Float[np.ndarray, "x 3"]:
+    """Tabulate J0, J1 and J1' = J0 - J1 / x from 0 to `top`, `BESSEL_STEP` apart."""
+    x = BESSEL_STEP * np.arange(round(top / BESSEL_STEP) + 2)
+    with np.errstate(invalid="ignore"):
+        slope = np.where(x > 0, j0(x) - j1(x) / x, 0.5)
+    return np.stack([j0(x), j1(x), slope], axis=1)

@@ -185,7 +185,7 @@ def change_of_field(
 ) -> Float[np.ndarray, "o 3"]:
     """Sum K(x) m' - K(X) m over the dipoles (positions in m, moments in A m^2) at rest (X, m) and moved (x, m').
 
-    Columns that lie together in memory (Fortran order, as `flow_map.move` gives them) are not copied.
+    Columns that lie together in memory (Fortran order, as `deformation.move_dipoles` gives them) are not copied.
     """
     rows = [np.ascontiguousarray(part.T) for part in (*rest, *moved)]
     change_T = MU0_4PI * _sum_of_changes(*rows, np.ascontiguousarray(observers_m))

@@ -13,7 +13,7 @@ from scipy.special import j0, j1
 
 from reskin.config import Strict
 from reskin.errors import ParamsError
-from reskin.physics import flow_map, layer
+from reskin.physics import deformation, layer
 
 
 class Friction(Strict):
@@ -172,11 +172,11 @@ def tabulate_depth(depth_m: float, *, thickness_m: float, tip_radius_m: float, b
 
     The base tells the contact only: sideways it is held, or no force would stay under the tip.
     """
-    layer.refuse_layer(np.array([depth_m]), thickness_m, tip_radius_m)
+    layer.check_layer(np.array([depth_m]), thickness_m, tip_radius_m)
     if not depth_m > 0:
         raise ParamsError("drag", "depth", "above 0 m", f"{depth_m}", "Touch the skin.")
     contact = layer.contact_of_depth(depth_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m, base=base)
-    reach_m = thickness_m * flow_map.reach(tip_radius_m / thickness_m, base)
+    reach_m = thickness_m * deformation.reach(tip_radius_m / thickness_m, base)
     return tabulate(slip(contact), thickness_m, reach_m)
 
 

@@ -15,7 +15,7 @@ from scipy.constants import kilo, milli
 
 from reskin.config import Strict
 from reskin.errors import ParamsError
-from reskin.physics import flow_map, layer, magnet, slide
+from reskin.physics import deformation, layer, magnet, slide
 from reskin.physics import magnet as dipole
 from reskin.physics.board import Board, Spreads
 from reskin.physics.magnet import CHOSEN, SKIN_SIDES_M, Quadrature, change_of_field, place_nodes
@@ -136,14 +136,14 @@ def moved_dipoles(
     contacts = np.flatnonzero(~(true_m[:, 2] <= 0))  # a depth that is NaN goes on, to be refused
     if not contacts.size:
         return
-    rest = flow_map.at_rest(skin.nodes_m, skin.moments_A_m2, skin.thickness_m)
+    rest = deformation.group_by_height(skin.nodes_m, skin.moments_A_m2, skin.thickness_m)
     deepest_m = float(np.max(true_m[:, 2]))
-    table = flow_map.tabulate(skin.thickness_m, skin.tip_radius_m, deepest_m, heights=rest.heights, base=skin.base)
+    table = deformation.tabulate(skin.thickness_m, skin.tip_radius_m, deepest_m, heights=rest.heights, base=skin.base)
     slides = None if skin.hold is None else press_slides(skin, skin.hold, true_m[contacts])
     if slides is not None and slid is not None:
         slides = slides.times(slid[contacts])
     for i, poke_i in enumerate(contacts):
-        moved = flow_map.move(table, rest, true_m[poke_i])
+        moved = deformation.move_dipoles(table, rest, true_m[poke_i])
         if slides is not None:
             slide.apply_in_place(slides, i, moved.after, skin.seat_m)
         yield int(poke_i), moved.before, moved.after

@@ -4,7 +4,7 @@ The base holds every piece of skin alike, by springs as soft in all directions. 
 tip is taken, or which force pulls there, decides the rest, for pressing and for dragging. A tip cannot drag a skin
 further than its friction allows: a slide is bounded by that (`gripped`), and goes to zero with the force.
 
-The force is that of the elastic layer on a sliding base, which `flow_map` moves, times (1 - d/h)^(-3/2): the layer
+The force is that of the elastic layer on a sliding base, which `deformation` moves, times (1 - d/h)^(-3/2): the layer
 stiffens as it thins. That factor is 1.2 at 0.2 mm and 4.0 at 1.2 mm of a 2 mm skin. It and how a press takes the skin
 are empirical: chosen on two recorded boards (scene lab), which the layer's force alone does not fit.
 """

@@ -13,7 +13,7 @@ from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from reskin.physics import flow_map, layer, magnet, slide
+from reskin.physics import deformation, layer, magnet, slide
 from reskin.physics import magnet as dipole
 from reskin.physics.magnet import Quadrature, change_of_field, place_nodes
 from reskin.physics.skin import SkinDesign
@@ -76,20 +76,24 @@ class Setup:
         return self.design.thickness_mm * milli
 
     @cached_property
-    def rest(self) -> flow_map.Rest:
+    def rest(self) -> deformation.RestingDipoles:
         """Magnetise the skin, its middle at the origin."""
         nodes = place_nodes(self.thickness_m, self.rule, sides_m=self.sides_m)
         cubes_n = (magnet.cubes_along(self.sides_m[0]), magnet.cubes_along(self.sides_m[1]))
         b_T = magnet.array_field(nodes.nodes_m, self.thickness_m, self.design.polarity, cubes_n=cubes_n)
         j_T = magnet.magnetise(b_T, saturation_T=self.design.saturation_T, half_field_T=self.design.half_field_T)
         sign = -1 if self.skin_flipped else 1
-        return flow_map.at_rest(nodes.nodes_m, sign * magnet.moments(j_T, nodes.volumes_m3), self.thickness_m)
+        return deformation.group_by_height(
+            nodes.nodes_m, sign * magnet.moments(j_T, nodes.volumes_m3), self.thickness_m
+        )
 
-    def table(self, tip_radius_mm: float) -> flow_map.FlowMap:
+    def table(self, tip_radius_mm: float) -> deformation.DeformationMap:
         """Tabulate the sliding flow under a tip, as deep as forces are followed."""
         deepest_m = slide.DEEPEST * self.thickness_m
         heights = self.rest.heights
-        return flow_map.tabulate(self.thickness_m, tip_radius_mm * milli, deepest_m, heights=heights, base="slipping")
+        return deformation.tabulate(
+            self.thickness_m, tip_radius_mm * milli, deepest_m, heights=heights, base="slipping"
+        )
 
     def chips_under(self, law: Law) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "3 3"]]:
         """Give the chips' places in the skin's frame, in m, and the rotation from the skin to the board."""
@@ -100,7 +104,7 @@ class Setup:
         return chips_mm @ turn * milli, turn
 
 
-def at_rest_uT(law: Law, setup: Setup, rest: flow_map.Rest | None = None) -> Float[np.ndarray, "k 3"]:
+def at_rest_uT(law: Law, setup: Setup, rest: deformation.RestingDipoles | None = None) -> Float[np.ndarray, "k 3"]:
     """Give the field of the untouched skin at the chips, in the board's axes; `rest` as of `simulate_uT`."""
     chips_m, turn = setup.chips_under(law)
     rest = rest or setup.rest
@@ -113,7 +117,7 @@ def simulate_uT(
     setup: Setup,
     place_mm: Float[np.ndarray, "n 2"],
     force_N: Float[np.ndarray, " n"],
-    rest: flow_map.Rest | None = None,
+    rest: deformation.RestingDipoles | None = None,
 ) -> Float[np.ndarray, "n k 3"]:
     """Give the change of field at the chips, in the board's axes, of pokes at labelled places of the board.
 
@@ -170,12 +174,13 @@ def _nominal_curve(setup: Setup) -> tuple[Float[np.ndarray, " c"], Float[np.ndar
 
 
 def _changes_T(
-    rest: flow_map.Rest, table: flow_map.FlowMap, chips_m: np.ndarray, places_m: np.ndarray, depths_m: np.ndarray,
+    rest: deformation.RestingDipoles, table: deformation.DeformationMap, chips_m: np.ndarray,
+    places_m: np.ndarray, depths_m: np.ndarray,
     slides: slide.Slide,
 ) -> Float[np.ndarray, "n k 3"]:  # fmt: skip
     changes_T = np.empty((len(places_m), *chips_m.shape))
     for poke_i, (place_m, depth_m) in enumerate(zip(places_m, depths_m, strict=True)):
-        moved = flow_map.move(table, rest, np.append(place_m, depth_m))
+        moved = deformation.move_dipoles(table, rest, np.append(place_m, depth_m))
         slide.apply_in_place(slides, poke_i, moved.after)
         changes_T[poke_i] = change_of_field(moved.before, moved.after, chips_m)
     return changes_T

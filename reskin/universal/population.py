@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 from scipy.spatial.transform import Rotation
 
-from reskin.physics.flow_map import Rest
+from reskin.physics.deformation import RestingDipoles
 from reskin.physics.magnet import Quadrature
 from reskin.universal.law import Law, Setup, at_rest_uT, inside, simulate_uT
 from reskin.universal.map import OF_LOG, spread_by
@@ -139,7 +139,7 @@ def grid() -> Float[np.ndarray, "65 2"]:
     return PITCH_MM * steps[np.abs(steps).min(axis=1) <= 2].astype(float)
 
 
-def fill(rest: Rest, rng: np.random.Generator) -> Rest:
+def fill(rest: RestingDipoles, rng: np.random.Generator) -> RestingDipoles:
     """Make a skin's filler uneven: its moments grow and shrink smoothly over x and y, log-normally."""
     waves_per_m = rng.standard_normal((2, FILLER_WAVES_N)) / (FILLER_MM * 1e-3)
     phase = rng.uniform(0, 2 * np.pi, FILLER_WAVES_N)

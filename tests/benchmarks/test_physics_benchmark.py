@@ -15,7 +15,7 @@ from scipy.constants import mu_0
 from scipy.spatial.transform import Rotation
 
 from reskin.data.grid import CENTRE_MM, protocol
-from reskin.physics import flow_map, layer, magnet
+from reskin.physics import deformation, layer, magnet
 from reskin.physics.board import Board, draw_board
 from reskin.physics.magnet import change_of_field
 from reskin.physics.skin import Skin, changes_of_field, draw_skin
@@ -42,9 +42,15 @@ def one_pass_m() -> np.ndarray:
 def forget_tables() -> None:
     if not FULL:
         return  # other tests use them at the same time
-    for cached in (flow_map._tabulate, flow_map._displaced, flow_map._waves, flow_map._marks, layer.contact_of_depth):
+    for cached in (
+        deformation._tabulate,
+        deformation._displaced,
+        deformation._pressure_change,
+        deformation._markers,
+        layer.contact_of_depth,
+    ):
         cached.cache_clear()
-    for file in (flow_map.PACKAGE / "__pycache__").glob("kept-*.npy"):
+    for file in (deformation.PACKAGE / "__pycache__").glob("kept-*.npy"):
         file.unlink()
 
 
@@ -61,7 +67,9 @@ def everything_moves(one: Skin) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np
     moments = Rotation.from_rotvec([0.06, 0.08, 0.0]).apply(one.moments_A_m2)
     moved = one.nodes_m + 1e-4 * np.cos(1e3 * one.nodes_m), moments
     rest = one.nodes_m, one.moments_A_m2
-    return tuple(map(np.asfortranarray, rest)), tuple(map(np.asfortranarray, moved))  # as `flow_map.move` gives them
+    return tuple(map(np.asfortranarray, rest)), tuple(
+        map(np.asfortranarray, moved)
+    )  # as `deformation.move_dipoles` gives them
 
 
 def core_field(dipoles: tuple[np.ndarray, np.ndarray], board: Board) -> np.ndarray:

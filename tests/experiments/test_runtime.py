@@ -44,7 +44,7 @@ from pipeline.experiments.runtime import (
 from pipeline.experiments.runtime import written as name_of
 from pipeline.experiments.verification.signals import hereditary
 from reskin.errors import ParamsError
-from reskin.physics import layer
+from reskin.physics import deformation, layer
 from reskin.physics.aging import SKIN
 from reskin.physics.magnet import CHOSEN, SKIN_SIDE_M, Quadrature, cuboid_field, place_nodes
 from reskin.physics.skin import draw_skin
@@ -164,8 +164,8 @@ def test_a_path_goes_where_the_flow_carries_the_very_node():
     path, poke_m, few = paths(one, skin), one.pokes_m[3], slice(700, 1100, 40)
     away_m = skin.nodes_m[few, :2] - poke_m[:2]
     r_m, z_m, depths_m = np.linalg.norm(away_m, axis=1), skin.nodes_m[few, 2], one.pokes_m[:, 2] + skin.depth_zero_m
-    press = layer.Press(skin.thickness_m, skin.tip_radius_m, skin.base)
-    there = layer.follow(r_m, z_m, layer.steps(tuple(np.unique(depths_m)), press), press=press)[-1]
+    press = layer.IndentedLayer(skin.thickness_m, skin.tip_radius_m, skin.base)
+    there = deformation.follow(r_m, z_m, deformation.depth_steps(tuple(np.unique(depths_m)), press), press=press)[-1]
     outward_m = (path.nodes_m[3, few, :2] - poke_m[:2]) * away_m / r_m[:, None]
     assert np.abs(there.r_m - r_m).max() > 20e-6
     # 2 um: the spline between the places where the flow was computed; the material moves by up to 1 mm
@@ -173,7 +173,7 @@ def test_a_path_goes_where_the_flow_carries_the_very_node():
     np.testing.assert_allclose(path.nodes_m[3, few, 2], there.z_m, atol=2e-6)
     turn_rad = np.cross(path.turns_rad[3, few], [0.0, 0.0, 1.0])[:, :2]  # from z towards r
     angle_rad = (turn_rad * away_m / r_m[:, None]).sum(axis=1)
-    np.testing.assert_allclose(angle_rad, layer.angle(there.f), atol=5e-3)
+    np.testing.assert_allclose(angle_rad, deformation.rotation_angle(there.f), atol=5e-3)
 
 
 def test_errors_are_those_of_the_skin_that_is_worst_at_each_depth():

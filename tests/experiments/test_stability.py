@@ -17,8 +17,7 @@ from pipeline.experiments.stability.wire import wire_cases
 from reskin.board import faults, stream
 from reskin.config import parse, read_yaml
 from reskin.errors import CaptureError
-from reskin.physics import aging, chip, flow_map, force_sensor, layer, slide
-from reskin.physics import layer as slip
+from reskin.physics import aging, chip, deformation, force_sensor, layer, slide
 from reskin.simulation import contact
 from reskin.simulation.defaults import nominal
 from reskin.simulation.settings import Synthesis
@@ -88,16 +87,16 @@ def extremes():
 
 
 def test_deep_presses_by_a_table_that_ends_too_early_are_found_out(monkeypatch):
-    at_depth = flow_map.at_depth
+    at_depth = deformation.at_depth
     monkeypatch.setattr(
-        flow_map, "at_depth", lambda flow, depth_m: at_depth(flow, min(depth_m, 0.62 * flow.thickness_m))
+        deformation, "at_depth", lambda flow, depth_m: at_depth(flow, min(depth_m, 0.62 * flow.thickness_m))
     )
     assert broken(extremes()) == {"dB of a press to 0.66 of the thickness", "dB of a press to 0.72 of the thickness"}
 
 
 def test_a_layer_of_another_compliance_is_found_out_by_every_tip(monkeypatch):
-    compliance, kept = slip.compliance_on_slip, (layer.contact_of_depth, layer._force_curve)
-    monkeypatch.setattr(slip, "compliance_on_slip", lambda kh: compliance(1.5 * kh))
+    compliance, kept = layer.slipping_compliance, (layer.contact_of_depth, layer._force_curve)
+    monkeypatch.setattr(layer, "slipping_compliance", lambda kh: compliance(1.5 * kh))
     for one in kept:
         one.cache_clear()
     assert broken(tips(DESIGN.skin.base)) == {f"a tip of {size} thicknesses" for size in ("0.1", "1", "10")}

@@ -12,10 +12,10 @@ from pipeline.experiments.verification.mechanics import check_contact, one_small
 from pipeline.experiments.verification.signals import check_electronics, check_field, check_frames, check_relaxation
 from reskin.board import stream, wire
 from reskin.config import parse, read_yaml
-from reskin.physics import aging, chip, flow_map, layer, magnet
+from reskin.physics import aging, chip, deformation, layer, magnet
 from reskin.physics import magnet as change
 from reskin.physics.board import draw_board
-from reskin.physics.layer import Press
+from reskin.physics.layer import IndentedLayer
 from reskin.physics.skin import draw_skin
 from reskin.simulation.defaults import nominal
 from reskin.simulation.settings import Synthesis
@@ -104,7 +104,7 @@ def test_a_constant_of_exactly_1e_7_is_below_and_one_of_1_001e_7_above_the_toler
 
 
 def test_a_layer_that_is_not_bonded_is_seen_by_every_reference(monkeypatch):
-    monkeypatch.setattr(layer, "compliance", np.ones_like)  # a half-space: no base at all
+    monkeypatch.setattr(layer, "bonded_compliance", np.ones_like)  # a half-space: no base at all
     layer._force_curve.cache_clear()
     layer.contact_of_depth.cache_clear()
     try:
@@ -123,13 +123,13 @@ def test_waves_that_stretch_without_narrowing_lose_volume(monkeypatch):
         return replace(u, z_m=1.01 * u.z_m, z_z=1.01 * u.z_z, z_r=1.01 * u.z_r)
 
     monkeypatch.setattr(layer, "displacement", stretched)
-    wrong = broken(one_small_step(Press(2e-3, 3e-3, DESIGN.skin.base), DEPTHS_M[-1]))
+    wrong = broken(one_small_step(IndentedLayer(2e-3, 3e-3, DESIGN.skin.base), DEPTHS_M[-1]))
     assert "one small step: div u = 0" in wrong
     assert "one small step: the surface lies on the tip" in wrong
 
 
 def test_moments_that_do_not_turn_with_the_material_are_seen(monkeypatch):
-    right = flow_map.move
+    right = deformation.move_dipoles
 
     def unturned(table, rest, poke_m):
         moved = right(table, rest, poke_m)
@@ -138,7 +138,7 @@ def test_moments_that_do_not_turn_with_the_material_are_seen(monkeypatch):
     board = draw_board(DESIGN.boards["rigid"].design, DESIGN.spreads, seed=SEED, name="b0")
     skin = draw_skin(DESIGN.skin, DESIGN.spreads, seed=SEED, name="b0_s0", rule=mechanics.COARSE)
     assert mechanics.shortcuts(board, skin, DEPTHS_M[-1], "deepest", mechanics.PLACES_M[:1]).holds
-    monkeypatch.setattr(flow_map, "move", unturned)
+    monkeypatch.setattr(deformation, "move_dipoles", unturned)
     assert not mechanics.shortcuts(board, skin, DEPTHS_M[-1], "deepest", mechanics.PLACES_M[:1]).holds
 
 

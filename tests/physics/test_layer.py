@@ -12,10 +12,10 @@ from scipy.special import jv
 from pipeline.experiments.verification import mechanics
 from reskin.errors import ParamsError
 from reskin.physics import layer
-from reskin.physics.layer import Press
+from reskin.physics.layer import IndentedLayer
 from tests.laws import broken
 
-PRESS = Press(2e-3, 3e-3, "bonded")
+PRESS = IndentedLayer(2e-3, 3e-3, "bonded")
 SKIN = asdict(PRESS)
 DEPTHS_M = np.arange(1, 7) * 0.2e-3
 waves_kh = st.floats(1e-3, 300)
@@ -37,7 +37,10 @@ def test_the_compliance_is_that_of_50_digits(kh):
 
 
 def test_long_waves_hardly_sink_and_short_ones_as_in_a_half_space():
-    long, short = layer.compliance(np.array([0.0, 1e-6, 1e-3])), layer.compliance(np.array([20.0, 1e4, 1e150]))
+    long, short = (
+        layer.bonded_compliance(np.array([0.0, 1e-6, 1e-3])),
+        layer.bonded_compliance(np.array([20.0, 1e4, 1e150])),
+    )
     np.testing.assert_allclose(long, [0, 2e-18 / 3, 2e-9 / 3], rtol=2e-6)  # 2 A^3 / 3, next term A^2 smaller
     np.testing.assert_allclose(short, 1, rtol=1e-13)
 
@@ -71,12 +74,12 @@ def test_the_base_is_held_and_the_surface_free_of_shear():
 def test_the_force_is_dimitriadis_where_the_tip_is_small_beside_the_layer(thickness_m, tip_radius_m, relative_depth):
     # From chi^2 on the series is low: 8 % at chi = sqrt(R d) / h = 0.5, 16 % at 1, as rings of pressure confirm.
     depth_m = min(relative_depth * thickness_m, 0.2 * tip_radius_m, 0.25 * thickness_m**2 / tip_radius_m)
-    assert mechanics.dimitriadis(np.array([depth_m]), Press(thickness_m, tip_radius_m, "bonded")).holds
+    assert mechanics.dimitriadis(np.array([depth_m]), IndentedLayer(thickness_m, tip_radius_m, "bonded")).holds
 
 
 @pytest.mark.parametrize("tip_m", [2e-3, 3e-3, 4e-3])
 def test_the_force_is_that_of_published_solutions_scales_and_passes_through_each_contact(tip_m):
-    press = Press(2e-3, tip_m, "bonded")
+    press = IndentedLayer(2e-3, tip_m, "bonded")
     thick = mechanics.hertz("bonded", tip_m), *mechanics.sneddon(tip_m * np.array([0.1, 0.4, 0.7]), press)
     laws = mechanics.long_2011(DEPTHS_M, press), *mechanics.scaling(DEPTHS_M, press, 1e9)
     assert not broken([*thick, *laws])
@@ -84,7 +87,7 @@ def test_the_force_is_that_of_published_solutions_scales_and_passes_through_each
 
 @pytest.mark.parametrize("base", ["bonded", "slipping"])
 def test_rings_of_pressure_give_the_same_force_and_pull_nowhere(base):
-    press = Press(2e-3, 3e-3, base)
+    press = IndentedLayer(2e-3, 3e-3, base)
     assert mechanics.rings(1e-3, press).holds
     _, pressure = mechanics.ring_pressures(1e-3, press)
     assert (pressure > 0).all()  # the radius is not too large: nothing pulls
@@ -94,7 +97,7 @@ def test_rings_of_pressure_give_the_same_force_and_pull_nowhere(base):
 @pytest.mark.parametrize("base", ["bonded", "slipping"])
 @pytest.mark.parametrize("depth_m", [0.6e-3, 1.2e-3])
 def test_one_small_step_keeps_volume_and_base_and_puts_the_surface_on_the_tip(base, depth_m):
-    assert not broken(mechanics.one_small_step(Press(2e-3, 3e-3, base), depth_m))
+    assert not broken(mechanics.one_small_step(IndentedLayer(2e-3, 3e-3, base), depth_m))
 
 
 def test_on_the_axis_the_hoop_strain_is_that_beside_it():

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from pipeline.experiments.stability import physics as stability
 from pipeline.experiments.verification import mechanics
 from reskin.errors import ParamsError
-from reskin.physics import flow_map, layer, magnet, slide
+from reskin.physics import deformation, layer, magnet, slide
 from reskin.physics.board import Board
 from reskin.physics.magnet import CHOSEN, MU0_4PI, Quadrature, change_of_field
 from reskin.physics.skin import SkinDesign, beyond_verified_n, changes_of_field, draw_skin, forces, moved_dipoles
@@ -52,12 +52,12 @@ def change(poke_m, on=None, board=BOARD):
 
 def moved_by(one, poke_m):
     true_m = np.array(poke_m) + (0, 0, one.depth_zero_m)
-    rest = flow_map.at_rest(one.nodes_m, one.moments_A_m2, one.thickness_m)
-    return flow_map.move(table_of(one, rest, true_m[2]), rest, true_m)
+    rest = deformation.group_by_height(one.nodes_m, one.moments_A_m2, one.thickness_m)
+    return deformation.move_dipoles(table_of(one, rest, true_m[2]), rest, true_m)
 
 
 def table_of(one, rest, depth_m):
-    return flow_map.tabulate(one.thickness_m, one.tip_radius_m, depth_m, heights=rest.heights, base=one.base)
+    return deformation.tabulate(one.thickness_m, one.tip_radius_m, depth_m, heights=rest.heights, base=one.base)
 
 
 def turned_dipoles_in_a_loop(one, board, poke_m):
@@ -91,8 +91,8 @@ def test_material_under_the_tips_flank_leans_as_the_dent_does():
     r_m = np.linalg.norm(start_m[:, :2], axis=1)
     flank = (r_m > 0.5e-3) & (r_m < 1.5e-3) & (start_m[:, 2] > 1.5e-3)
     up = np.tile([0.0, 0.0, 1.0], (len(one.nodes_m), 1))
-    rest = flow_map.at_rest(one.nodes_m, up, one.thickness_m)
-    leant = flow_map.move(table_of(one, rest, DEPTH_M), rest, np.array([0.0, 0.0, DEPTH_M])).after[1][flank]
+    rest = deformation.group_by_height(one.nodes_m, up, one.thickness_m)
+    leant = deformation.move_dipoles(table_of(one, rest, DEPTH_M), rest, np.array([0.0, 0.0, DEPTH_M])).after[1][flank]
     outwards = np.einsum("si,si->s", leant[:, :2], start_m[flank, :2])
     assert flank.sum() >= 4
     assert (outwards < 0).all()
@@ -224,15 +224,17 @@ def test_tables_give_the_change_that_following_every_node_gives(thickness_mm, at
     # 1.82 mm lies halfway between two tables. At the tables' depths: what interpolating in R/h and r costs. Between
     # them 0.6 %: following ends there with half a step, and half steps change dB by as much themselves (flow.STEP).
     one = skin(SEATED, thickness_mm=thickness_mm, base=base)
-    ladder_m = one.thickness_m * layer.depth_unit(one.tip_radius_m / one.thickness_m) * layer.LADDER
+    ladder_m = one.thickness_m * deformation.depth_scale(one.tip_radius_m / one.thickness_m) * deformation.LADDER
     for rung_i in (6, 16, 22):
         poke_m = np.array([1.3e-3, -2.1e-3, (1 - at) * ladder_m[rung_i] + at * ladder_m[rung_i + 1]])
-        depths_m = layer.steps((float(poke_m[2]),), layer.Press(one.thickness_m, one.tip_radius_m, base))
+        depths_m = deformation.depth_steps(
+            (float(poke_m[2]),), layer.IndentedLayer(one.thickness_m, one.tip_radius_m, base)
+        )
         truth = mechanics.followed(one, poke_m[:2], depths_m)
         # On a bonded base nothing moves past the table's reach.
         near = np.linalg.norm(
             one.nodes_m[:, :2] - poke_m[:2], axis=1, keepdims=True
-        ) < one.thickness_m * flow_map.reach(one.tip_radius_m / one.thickness_m, base)
+        ) < one.thickness_m * deformation.reach(one.tip_radius_m / one.thickness_m, base)
         rest = one.nodes_m, one.moments_A_m2
         moved = tuple(np.where(near | (base == "slipping"), *pair) for pair in zip(truth, rest, strict=True))
         truth_T = change_of_field(rest, moved, BOARD.chips_m)

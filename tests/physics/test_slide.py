@@ -6,7 +6,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from reskin.errors import ParamsError
-from reskin.physics import flow_map, layer, slide
+from reskin.physics import deformation, layer, slide
 from reskin.physics.magnet import change_of_field
 
 SIDE_M, H_M = 20e-3, 2e-3
@@ -115,9 +115,9 @@ def test_without_give_and_slide_the_sliding_flow_is_what_it_was_to_the_last_bit(
     rng = np.random.default_rng(0)
     heights = (0.2, 0.8)
     nodes_m = np.column_stack([rng.uniform(-8e-3, 8e-3, (60, 2)), H_M * rng.choice(heights, 60)])
-    rest = flow_map.at_rest(nodes_m, rng.normal(0, 1e-6, (60, 3)), H_M)
-    table = flow_map.tabulate(H_M, 2e-3, 0.8e-3, heights=rest.heights, base="slipping")
-    moved = flow_map.move(table, rest, np.array([3e-3, -2e-3, 0.8e-3]))
+    rest = deformation.group_by_height(nodes_m, rng.normal(0, 1e-6, (60, 3)), H_M)
+    table = deformation.tabulate(H_M, 2e-3, 0.8e-3, heights=rest.heights, base="slipping")
+    moved = deformation.move_dipoles(table, rest, np.array([3e-3, -2e-3, 0.8e-3]))
     place_m = np.array([[3e-3, -2e-3]])
     still = slide.rigid(place_m, slide.under_tip_m(place_m, np.array([0.2]), **STILL), SQUARE)
     after = slide.apply(still, 0, moved.after)

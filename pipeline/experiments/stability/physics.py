@@ -16,11 +16,11 @@ from pipeline.experiments.verification.checks import worst
 from pipeline.experiments.verification.mechanics import force_N
 from pipeline.experiments.verification.signals import inside_a_box
 from reskin.physics import layer, magnet, shear
-from reskin.physics import shear as friction
 from reskin.physics.aging import SKIN, advance
 from reskin.physics.board import Board, BoardDesign, Spreads, draw_board
+from reskin.physics.deformation import depth_scale
 from reskin.physics.force_sensor import RANGE_N, read_force
-from reskin.physics.layer import Press, depth_unit
+from reskin.physics.layer import IndentedLayer
 from reskin.physics.magnet import CUBE_SIDE_M, Quadrature, change_of_field
 from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, forces
 from reskin.seeds import rng_for
@@ -142,7 +142,7 @@ def depth(board: Board, skin: Skin) -> list[Case]:
 
 def _almost_through(board: Board, skin: Skin) -> Case:
     case, attempt = "a poke to 0.95 of the thickness", partial(poke, board, skin, 0.95)
-    followed_m = skin.thickness_m * depth_unit(skin.tip_radius_m / skin.thickness_m)
+    followed_m = skin.thickness_m * depth_scale(skin.tip_radius_m / skin.thickness_m)
     if skin.base == "bonded" or 0.95 * skin.thickness_m + skin.depth_zero_m > followed_m:
         return refused(AREA, case, should="refused, before the map folds or loses volume", attempt=attempt)
     largest_uT = float(np.abs(attempt()).max() / micro)
@@ -220,13 +220,13 @@ def memory(board: Board, skin: Skin) -> Case:
 
 def drag_cases(skin: SkinDesign) -> list[Case]:
     """Drag the tip along a line without friction, and with a friction that never lets go."""
-    press = Press(skin.thickness_mm * milli, skin.tip_radius_mm * milli, skin.base)
+    press = IndentedLayer(skin.thickness_mm * milli, skin.tip_radius_mm * milli, skin.base)
     depth_m, modulus_Pa = DEPTH * press.thickness_m, skin.modulus_kPa * kilo
     stiffness = modulus_Pa / 3 * shear.tabulate_depth(depth_m, **asdict(press)).stiffness_m
     normal_N = force_N(np.full(len(PATH_MM), depth_m), press, modulus_Pa)
     path_m = np.column_stack([np.array(PATH_MM) * milli, np.zeros(len(PATH_MM))])
     smooth, sticky = (
-        friction.drag(path_m, normal_N, stiffness_N_per_m=stiffness, friction=mu).force_N for mu in (0.0, STICKY)
+        shear.drag(path_m, normal_N, stiffness_N_per_m=stiffness, friction=mu).force_N for mu in (0.0, STICKY)
     )
     error = float(np.abs(sticky[:, 0] - stiffness * path_m[:, 0]).max() / sticky.max())
     return [

@@ -12,14 +12,14 @@ from pipeline.settings import Settings
 from pipeline.stage import say
 from pipeline.synthesis import synthesis_of
 from reskin import io
-from reskin.physics.layer import Press
+from reskin.physics.layer import IndentedLayer
 from reskin.simulation.settings import Synthesis
 
 
 def verify(of: Synthesis, *, depths_m: tuple[float, ...], seed: int) -> list[Check]:
     """Measure every law against its reference, for the designs of a scene, in the order of the simulator's chain."""
     board, skin = of.main_boards, of.skin
-    press = Press(skin.thickness_mm * milli, skin.tip_radius_mm * milli, skin.base)
+    press = IndentedLayer(skin.thickness_mm * milli, skin.tip_radius_mm * milli, skin.base)
     rule = board.quadrature.quadrature()
     return [
         *check_field(skin, seed),

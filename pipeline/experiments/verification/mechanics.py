@@ -17,12 +17,9 @@ from scipy.special import ellipe, ellipk, j0, j1
 from pipeline.experiments.verification.checks import Check, apart, farthest, no_spread, relative, worst
 from pipeline.experiments.verification.signals import TURN, field_of
 from reskin.data.grid import CENTRE_MM, protocol
-from reskin.physics import layer, shear, slide
-from reskin.physics import layer as flow
-from reskin.physics import layer as slip
-from reskin.physics import shear as friction
+from reskin.physics import deformation, layer, shear, slide
 from reskin.physics.board import Board, BoardDesign, Spreads, draw_board
-from reskin.physics.layer import Press
+from reskin.physics.layer import IndentedLayer
 from reskin.physics.magnet import Polarity, Quadrature
 from reskin.physics.skin import Dipoles, Skin, SkinDesign, changes_of_field, draw_skin, press_slides
 
@@ -37,8 +34,8 @@ BONDED_KH, SLIDING_KH = np.geomspace(1e-3, 300, 60), np.geomspace(0.01, 30, 12)
 
 def check_contact(skin: SkinDesign) -> list[Check]:
     """Check the layer's compliance, the force down to the published solutions' 0.6 of the thickness, and friction."""
-    bonded = Press(skin.thickness_mm * milli, skin.tip_radius_mm * milli, "bonded")
-    sliding = Press(bonded.thickness_m, bonded.tip_radius_m, "slipping")
+    bonded = IndentedLayer(skin.thickness_mm * milli, skin.tip_radius_mm * milli, "bonded")
+    sliding = IndentedLayer(bonded.thickness_m, bonded.tip_radius_m, "slipping")
     depth_m = layer.VERIFIED_DEPTH * bonded.thickness_m * np.arange(1, 7) / 6
     return [
         bonded_compliance(), held_back(),
@@ -50,7 +47,7 @@ def check_contact(skin: SkinDesign) -> list[Check]:
     ]  # fmt: skip
 
 
-def force_N(depth_m: Float[np.ndarray, " n"], press: Press, modulus_Pa: float = 1.0) -> Float[np.ndarray, " n"]:
+def force_N(depth_m: Float[np.ndarray, " n"], press: IndentedLayer, modulus_Pa: float = 1.0) -> Float[np.ndarray, " n"]:
     """Give the product's force, for 1 Pa unless said."""
     return layer.force(depth_m, **asdict(press), modulus_Pa=modulus_Pa)
 
@@ -67,12 +64,12 @@ def bonded_compliance(kh: Float[np.ndarray, " w"] = BONDED_KH) -> Check:
             for a in map(mpmath.mpf, kh.tolist())
         ]
     return Check("bonded layer", "compliance, kh 1e-3-300", "its formula in 50 digits (mpmath)",
-                 relative(layer.compliance(kh), np.array(truth)), "1", 3e-12,
+                 relative(layer.bonded_compliance(kh), np.array(truth)), "1", 3e-12,
                  "the series' next term, and 1 - 1 + ... at kh = 1/4, which costs 3 digits")  # fmt: skip
 
 
 def held_back() -> Check:
-    missing, _ = quad(lambda a: 1 - layer.compliance(np.array([a]))[0], 0, 40)
+    missing, _ = quad(lambda a: 1 - layer.bonded_compliance(np.array([a]))[0], 0, 40)
     return Check("bonded layer", "a0: what a half-space lacks adds up", f"{HELD_BACK:.3f}", abs(missing - HELD_BACK),
                  "1", 5e-4, "three printed decimals")  # fmt: skip
 
@@ -81,7 +78,7 @@ def sliding_compliance(kh: Float[np.ndarray, " w"] = SLIDING_KH) -> Check:
     with mpmath.workdps(50):
         truth = [float(dense_profile(mpmath.mpf(a))(mpmath.mpf(a))) for a in kh.tolist()]
     return Check("sliding layer", "compliance, kh 0.01-30", "a dense solve of four conditions, 50 digits (mpmath)",
-                 relative(slip.compliance_on_slip(kh), np.array(truth)), "1", 1e-12,
+                 relative(layer.slipping_compliance(kh), np.array(truth)), "1", 1e-12,
                  "rounding, 1 - 1 + ... at small kh")  # fmt: skip
 
 
@@ -101,11 +98,11 @@ def hertz(base: layer.Base, tip_m: float) -> Check:
                    "d / R, 1e-5; the curve is a spline"),
         "slipping": ("Hertz's, on a sliding base too", "as on a bonded one"),
     }[base]  # fmt: skip
-    error = relative(force_N(depth_m, Press(HALF_SPACE_M, tip_m, base)), hertz_N(depth_m, tip_m))
+    error = relative(force_N(depth_m, IndentedLayer(HALF_SPACE_M, tip_m, base)), hertz_N(depth_m, tip_m))
     return Check("force, thick layer", law, "16/9 E sqrt(R) d^1.5 (Hertz 1882)", error, "1", 1e-4, reason)
 
 
-def sneddon(radii_m: Float[np.ndarray, " n"], press: Press) -> list[Check]:
+def sneddon(radii_m: Float[np.ndarray, " n"], press: IndentedLayer) -> list[Check]:
     tip_m = press.tip_radius_m
     thick = asdict(press) | {"thickness_m": HALF_SPACE_M}
     contacts = [layer.contact_of_radius(float(a), **thick) for a in radii_m]
@@ -124,7 +121,7 @@ def _to_depths(depth_m: Float[np.ndarray, " n"]) -> str:
     return f"bonded layer, {depth_m.min() / milli:g}-{depth_m.max() / milli:g} mm"
 
 
-def dimitriadis(depth_m: Float[np.ndarray, " n"], press: Press) -> Check:
+def dimitriadis(depth_m: Float[np.ndarray, " n"], press: IndentedLayer) -> Check:
     chi = np.sqrt(press.tip_radius_m * depth_m) / press.thickness_m
     bonded_N = hertz_N(depth_m, press.tip_radius_m) * np.polynomial.polynomial.polyval(chi, BONDED)
     return Check(SKIN_FORCE, _to_depths(depth_m), "Dimitriadis et al. 2002, bonded",
@@ -133,7 +130,7 @@ def dimitriadis(depth_m: Float[np.ndarray, " n"], press: Press) -> Check:
                  )  # fmt: skip
 
 
-def long_2011(depth_m: Float[np.ndarray, " n"], press: Press) -> Check:
+def long_2011(depth_m: Float[np.ndarray, " n"], press: IndentedLayer) -> Check:
     h_m, tip_m = press.thickness_m, press.tip_radius_m
     omega, flat = (tip_m * depth_m / h_m**2) ** 1.5, h_m / tip_m
     alpha, beta = 10.05 - 0.63 * np.sqrt(flat) * (3.1 + flat**2), 4.8 - 4.23 * flat**2
@@ -143,7 +140,7 @@ def long_2011(depth_m: Float[np.ndarray, " n"], press: Press) -> Check:
                  "a fit to finite elements of large deformation, made for 0.3 <= R/h <= 12.7, d/h <= 0.6")  # fmt: skip
 
 
-def rings(depth_m: float, press: Press) -> Check:
+def rings(depth_m: float, press: IndentedLayer) -> Check:
     edges_m, pressure = ring_pressures(depth_m, press)
     rings_N = float(2 / 3 * np.pi * (pressure * np.diff(edges_m**2)).sum())
     return Check(SKIN_FORCE, f"{press.base} layer, {depth_m / milli:g} mm", f"{RINGS_N} rings of even pressure",
@@ -151,7 +148,7 @@ def rings(depth_m: float, press: Press) -> Check:
                  "a ring is 2.5 % of the contact's radius")  # fmt: skip
 
 
-def ring_pressures(depth_m: float, press: Press) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " p"]]:
+def ring_pressures(depth_m: float, press: IndentedLayer) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " p"]]:
     """Give the edges of the rings over the product's contact, and their pressures for 1 Pa."""
     h_m, tip_m, radius_m = press.thickness_m, press.tip_radius_m, press.contact(depth_m).radius_m
     edges_m = radius_m * np.linspace(0, 1, RINGS_N + 1)
@@ -166,14 +163,14 @@ def _sinking_m(r_m: float, disc_m: float, h_m: float, base: layer.Base) -> float
     m = (min(r_m, disc_m) / max(r_m, disc_m)) ** 2
     free = 2 / np.pi * max(r_m, disc_m) * (ellipe(m) if r_m <= disc_m else ellipe(m) - (1 - m) * ellipk(m))
     k = np.linspace(1e-3, 25, 1500) / h_m
-    surface = layer.compliance if base == "bonded" else slip.compliance_on_slip
+    surface = layer.bonded_compliance if base == "bonded" else layer.slipping_compliance
     held = disc_m * j1(k * disc_m) / k * (1 - surface(k * h_m)) * j0(k * r_m)
     return float(free - np.trapezoid(held, k))
 
 
-def scaling(depth_m: Float[np.ndarray, " n"], press: Press, modulus_Pa: float) -> list[Check]:
+def scaling(depth_m: Float[np.ndarray, " n"], press: IndentedLayer, modulus_Pa: float) -> list[Check]:
     once_N = force_N(depth_m, press)
-    larger = Press(3 * press.thickness_m, 3 * press.tip_radius_m, press.base)
+    larger = IndentedLayer(3 * press.thickness_m, 3 * press.tip_radius_m, press.base)
     exact_N = [4 * np.pi / 3 * press.contact(float(d)).weights_m2.sum() for d in depth_m]
     return [
         Check(SKIN_FORCE, "proportional to E", "itself, at 1 Pa",
@@ -215,7 +212,7 @@ def straight_drag(
     path_m: Float[np.ndarray, " t"], limit_N: float, *, stiffness_N_per_m: float, coefficient: float
 ) -> Check:
     places_m, normal_N = np.column_stack([path_m, np.zeros_like(path_m)]), np.full_like(path_m, limit_N / coefficient)
-    found = friction.drag(places_m, normal_N, stiffness_N_per_m=stiffness_N_per_m, friction=coefficient)
+    found = shear.drag(places_m, normal_N, stiffness_N_per_m=stiffness_N_per_m, friction=coefficient)
     truth_N = np.minimum(stiffness_N_per_m * path_m, limit_N)
     return Check("friction", "Q = min(k s, mu F) along a straight drag", "itself, by hand",
                  float(np.abs(found.force_N[:, 0] - truth_N).max() / limit_N), "1", 1e-12, "rounding of 30 steps"
@@ -227,7 +224,7 @@ STEP_M = 1e-7  # of finite differences
 HELD = {"bonded": "stays", "slipping": "keeps its height"}
 
 
-def check_kinematics(press: flow.Press, depth_m: float) -> list[Check]:
+def check_kinematics(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
     """Check one linear step and the whole flow down to a depth."""
     far = far_out(press, depth_m) if press.base == "slipping" else []
     return [*one_small_step(press, depth_m), *whole_flow(press, depth_m), *sunken_surface(press, depth_m), *far]
@@ -239,7 +236,7 @@ def descent(depth_m: float, steps_n: int = STEPS_N) -> Float[np.ndarray, " d"]:
     return np.concatenate([[0.0, even[1] / 4, even[1] / 2], even[1:]])
 
 
-def one_small_step(press: flow.Press, depth_m: float) -> list[Check]:
+def one_small_step(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
     h_m, tip_m, contact = press.thickness_m, press.tip_radius_m, press.contact(depth_m)
     waves = layer.waves(contact, h_m, press.base)
     r_m, z_m = _places(h_m, 17, 9)
@@ -265,11 +262,11 @@ def one_small_step(press: flow.Press, depth_m: float) -> list[Check]:
     ]  # fmt: skip
 
 
-def _off(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"], press: flow.Press) -> float:
+def _off(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"], press: layer.IndentedLayer) -> float:
     return float(np.abs([z_m] if press.base == "slipping" else [r_m, z_m]).max())
 
 
-def whole_flow(press: flow.Press, depth_m: float) -> list[Check]:
+def whole_flow(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
     h_m = press.thickness_m
     r_m, z_m = _places(h_m, 25, 11)
     inside = len(r_m)
@@ -279,7 +276,7 @@ def whole_flow(press: flow.Press, depth_m: float) -> list[Check]:
     all_r_m = np.concatenate([*(r_m + dr_m for dr_m, _ in shifts), base_m])
     all_z_m = np.concatenate([*(z_m + dz_m for _, dz_m in shifts), np.zeros_like(base_m)])
     depths_m = descent(depth_m)
-    end = flow.follow(all_r_m, all_z_m, depths_m, press=press)[-1]
+    end = deformation.follow(all_r_m, all_z_m, depths_m, press=press)[-1]
     _, right, left, above, below, base = np.split(np.stack([end.r_m, end.z_m]), inside * np.arange(1, 6), axis=1)
     numeric = np.stack([right - left, above - below], axis=1) / (2 * STEP_M)  # 2 (r, z), 2 (by r0, by z0), places
     f, hoop = end.f[:inside], end.hoop[:inside]
@@ -294,9 +291,9 @@ def whole_flow(press: flow.Press, depth_m: float) -> list[Check]:
     ]  # fmt: skip
 
 
-def sunken_surface(press: flow.Press, depth_m: float) -> list[Check]:
+def sunken_surface(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
     h_m, tip_m, radius_m = press.thickness_m, press.tip_radius_m, press.contact(depth_m).radius_m
-    end = flow.follow(radius_m * np.linspace(0, 1.4, 40), np.full(40, h_m), descent(depth_m), press=press)[-1]
+    end = deformation.follow(radius_m * np.linspace(0, 1.4, 40), np.full(40, h_m), descent(depth_m), press=press)[-1]
     above_m = end.z_m - (h_m - depth_m + tip_m - np.sqrt(tip_m**2 - np.minimum(end.r_m, tip_m) ** 2))
     touches = end.r_m < 0.95 * radius_m
     return [
@@ -307,11 +304,11 @@ def sunken_surface(press: flow.Press, depth_m: float) -> list[Check]:
     ]  # fmt: skip
 
 
-def far_out(press: flow.Press, depth_m: float) -> list[Check]:
+def far_out(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
     """Check, of a sliding skin, that what flows in under the tip flows out through every circle around it."""
     h_m = press.thickness_m
     r_m, z_m = (part.ravel() for part in np.meshgrid(np.array([4.0, 5.0, 6.0]) * h_m, np.linspace(0, h_m, 7)))
-    end = flow.follow(r_m, z_m, descent(depth_m), press=press)[-1]
+    end = deformation.follow(r_m, z_m, descent(depth_m), press=press)[-1]
     grown_m2 = end.r_m**2 - r_m**2
     return [
         Check("flow", "far out all heights move by what the tip displaces", "the mean over heights and circles",
@@ -332,8 +329,8 @@ def followed(skin: Skin, place_m: Float[np.ndarray, "2"], depths_m: Float[np.nda
     """
     away_m = skin.nodes_m[:, :2] - place_m
     r_m = np.linalg.norm(away_m, axis=1)
-    press = flow.Press(skin.thickness_m, skin.tip_radius_m, skin.base)
-    end = flow.follow(r_m, skin.nodes_m[:, 2], depths_m, press=press)[-1]
+    press = layer.IndentedLayer(skin.thickness_m, skin.tip_radius_m, skin.base)
+    end = deformation.follow(r_m, skin.nodes_m[:, 2], depths_m, press=press)[-1]
     outward = np.column_stack([away_m / r_m[:, None], np.zeros_like(r_m)])
     places_m = np.column_stack([place_m + end.r_m[:, None] * outward[:, :2], end.z_m])
     u, _, vt = np.linalg.svd(end.f)

@@ -1,4 +1,4 @@
-"""The tabulated flow: following each node as truth; no poke, base, reach, and material that moves as one as laws."""
+"""The tabulated deformation against following each node; no contact, the base, the reach and rigid motion."""
 
 from functools import cache
 
@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from reskin.errors import ParamsError
-from reskin.physics import flow_map, layer
-from reskin.physics import layer as flow
+from reskin.physics import deformation, layer
 
 H_M, TIP_M = 2e-3, 3e-3
 HEIGHTS = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 1.0)
@@ -20,19 +19,21 @@ bases = st.sampled_from(BASES)
 
 @cache  # not when this file is collected: every worker collects it, one runs it
 def table(base="bonded"):
-    return flow_map.tabulate(H_M, TIP_M, 1.2e-3, heights=HEIGHTS, base=base)
+    return deformation.tabulate(H_M, TIP_M, 1.2e-3, heights=HEIGHTS, base=base)
 
 
 def follow(r_m, z_m, to_m, base):
-    press = flow.Press(H_M, TIP_M, base)
-    return flow.follow(r_m, z_m, flow.steps((to_m,), press), press=press)[-1]
+    press = layer.IndentedLayer(H_M, TIP_M, base)
+    return deformation.follow(r_m, z_m, deformation.depth_steps((to_m,), press), press=press)[-1]
 
 
 def move(places_m, poke_m, base="bonded"):
     places_m = np.asarray(places_m, dtype=float)
     up = np.tile([0.0, 0.0, 1.0], (len(places_m), 1))
     height_i = np.argmin(np.abs(places_m[:, 2:] / H_M - HEIGHTS), axis=1)
-    return flow_map.move(table(base), flow_map.Rest(places_m, up, height_i, HEIGHTS), np.asarray(poke_m, dtype=float))
+    return deformation.move_dipoles(
+        table(base), deformation.RestingDipoles(places_m, up, height_i, HEIGHTS), np.asarray(poke_m, dtype=float)
+    )
 
 
 def places(rng, places_n, half_m=10e-3):
@@ -52,7 +53,7 @@ def test_the_table_gives_what_following_each_node_gives(rung_i, share, base):
     np.testing.assert_allclose(moved.after[0][:, 0], sign * at.r_m, atol=share * depth_m)
     np.testing.assert_allclose(moved.after[0][:, 2], at.z_m, atol=share * depth_m)
     if share < 0.01:
-        np.testing.assert_allclose(moved.after[1][:, 0], sign * np.sin(flow.angle(at.f)), atol=3e-3)
+        np.testing.assert_allclose(moved.after[1][:, 0], sign * np.sin(deformation.rotation_angle(at.f)), atol=3e-3)
 
 
 @given(st.floats(-8e-3, 8e-3), st.floats(-8e-3, 8e-3), depths_m, bases)
@@ -115,10 +116,10 @@ def test_a_sliding_base_keeps_its_height_and_moves_outward(depth_m):
 
 
 def test_a_thin_skin_flows_too():
-    thin = flow_map.tabulate(0.2e-3, TIP_M, 0.058e-3, heights=(0.5, 1.0), base="bonded")
-    assert flow_map.at_depth(thin, 0.058e-3)[-1, 0, 1] * 0.2e-3 == pytest.approx(-0.058e-3, rel=0.02)
+    thin = deformation.tabulate(0.2e-3, TIP_M, 0.058e-3, heights=(0.5, 1.0), base="bonded")
+    assert deformation.at_depth(thin, 0.058e-3)[-1, 0, 1] * 0.2e-3 == pytest.approx(-0.058e-3, rel=0.02)
     with pytest.raises(ParamsError, match="depth must be such that"):
-        flow_map.tabulate(0.2e-3, TIP_M, 0.12e-3, heights=(0.5, 1.0), base="bonded")
+        deformation.tabulate(0.2e-3, TIP_M, 0.12e-3, heights=(0.5, 1.0), base="bonded")
 
 
 @pytest.mark.parametrize(
@@ -126,7 +127,7 @@ def test_a_thin_skin_flows_too():
 )
 def test_impossible_layers_and_pokes_are_refused(thickness_m, depth_m):
     with pytest.raises(ParamsError, match="must be"):
-        flow_map.tabulate(thickness_m, TIP_M, depth_m, heights=(0.5,), base="bonded")
+        deformation.tabulate(thickness_m, TIP_M, depth_m, heights=(0.5,), base="bonded")
 
 
 @pytest.mark.parametrize("depth_m", [1.3e-3, np.nan, np.inf, -np.inf])
@@ -137,15 +138,15 @@ def test_pokes_deeper_than_the_table_or_of_no_depth_at_all_are_refused(depth_m):
 
 def test_a_table_that_was_kept_is_the_table_that_is_computed_and_grows_with_depth(tmp_path, monkeypatch):
     def of_depth(depth_m):
-        for cached in (flow_map._tabulate, flow_map._displaced):
+        for cached in (deformation._tabulate, deformation._displaced):
             cached.cache_clear()
-        return flow_map.tabulate(H_M, TIP_M, depth_m, heights=(0.5,), base="bonded").moved
+        return deformation.tabulate(H_M, TIP_M, depth_m, heights=(0.5,), base="bonded").moved
 
-    monkeypatch.setattr(flow_map, "PACKAGE", tmp_path)
+    monkeypatch.setattr(deformation, "PACKAGE", tmp_path)
     shallow = of_depth(0.2e-3)
     kept_n = len(list(tmp_path.rglob("*.npy")))
     deep = of_depth(0.5e-3)
     np.testing.assert_array_equal(deep[: len(shallow)], shallow)
     np.testing.assert_array_equal(of_depth(0.2e-3), shallow)
     np.testing.assert_array_equal(of_depth(0.5e-3), deep)
-    assert len(list(tmp_path.rglob("*.npy"))) == kept_n == flow_map.STENCIL_N
+    assert len(list(tmp_path.rglob("*.npy"))) == kept_n == deformation.STENCIL_N

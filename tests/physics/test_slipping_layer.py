@@ -1,4 +1,4 @@
-"""The sliding base: a dense solve in 50 digits as truth; limits, volume and the bonded base beside it as laws."""
+"""The slipping layer against a dense solve in 50 digits; limits, volume, and the bonded layer beside it."""
 
 import mpmath
 import numpy as np
@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 
 from pipeline.experiments.verification import mechanics
 from reskin.physics import layer
-from reskin.physics import layer as slip
 
 SKIN = {"thickness_m": 2e-3, "tip_radius_m": 3e-3}
 waves_kh = st.floats(0.01, 30)
@@ -31,11 +30,11 @@ def test_the_base_keeps_its_height_and_feels_no_shear_and_the_surface_none_eithe
     g, _, bend = layer.depth_profile(np.array([[0.0], [kh]]), np.array([kh]), "slipping")
     assert g[0, 0] == 0.0
     np.testing.assert_allclose((g + bend)[:, 0], 0.0, atol=1e-12 * max(1.0, float(np.abs(bend).max())))
-    np.testing.assert_allclose(g[1], slip.compliance_on_slip(np.array([kh])), rtol=1e-9)
+    np.testing.assert_allclose(g[1], layer.slipping_compliance(np.array([kh])), rtol=1e-9)
 
 
 def test_long_waves_sink_by_half_their_kh_and_short_ones_as_in_a_half_space():
-    found = slip.compliance_on_slip(np.array([0.0, 1e-6, 1e-3, 20.0, 1e4, 1e150]))
+    found = layer.slipping_compliance(np.array([0.0, 1e-6, 1e-3, 20.0, 1e4, 1e150]))
     # next term: (kh)^3 / 6 and smaller
     np.testing.assert_allclose(found, [0, 5e-7, 5e-4, 1, 1, 1], rtol=1e-6)
 

@@ -1,4 +1,4 @@
-"""The flow of material under a poke: the laws of `verification` on both bases; small depth as truth, steps as law."""
+"""Finite deformation under a tip: laws of `verification` on both bases, the linear limit, convergence in the steps."""
 
 from itertools import pairwise
 
@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.experiments.verification import mechanics
-from reskin.physics import layer
-from reskin.physics import layer as flow
+from reskin.physics import deformation, layer
 from tests.laws import broken
 
 H_M, TIP_M = 2e-3, 3e-3
@@ -20,12 +19,12 @@ def nodes(r_n=25, z_n=11, r_max_m=5e-3):
 
 
 def follow(r_m, z_m, to_m=1.2e-3, base="bonded"):
-    press = flow.Press(H_M, TIP_M, base)
-    return flow.follow(r_m, z_m, flow.steps((to_m,), press), press=press)[-1]
+    press = layer.IndentedLayer(H_M, TIP_M, base)
+    return deformation.follow(r_m, z_m, deformation.depth_steps((to_m,), press), press=press)[-1]
 
 
 def linear_at(r_m, z_m, depth_m, base="bonded"):
-    contact = flow.Press(H_M, TIP_M, base).contact(depth_m)
+    contact = layer.IndentedLayer(H_M, TIP_M, base).contact(depth_m)
     return layer.displacement(r_m, z_m, layer.waves(contact, H_M, base))
 
 
@@ -37,18 +36,18 @@ def det_f(at):
 @pytest.mark.parametrize("depth_m", [0.2e-3, 0.6e-3, 1.2e-3])
 def test_the_sunken_surface_lies_on_the_sphere(depth_m, base):
     # Without following the surface it is 27 % of the depth beside it at 1.2 mm.
-    assert not broken(mechanics.sunken_surface(flow.Press(H_M, TIP_M, base), depth_m))
+    assert not broken(mechanics.sunken_surface(layer.IndentedLayer(H_M, TIP_M, base), depth_m))
 
 
 @pytest.mark.parametrize("base", BASES)
 def test_volume_and_base_are_kept_and_f_is_the_gradient_of_the_map(base):
-    assert not broken(mechanics.whole_flow(flow.Press(H_M, TIP_M, base), 1.2e-3))
+    assert not broken(mechanics.whole_flow(layer.IndentedLayer(H_M, TIP_M, base), 1.2e-3))
 
 
 def test_the_angle_is_that_of_the_polar_decomposition():
     f = follow(*nodes(14, 7)).f
     u, _, vt = np.linalg.svd(f)  # F = R U, R = u vt
-    np.testing.assert_allclose((u @ vt)[:, 0, 1], np.sin(flow.angle(f)), atol=1e-12)
+    np.testing.assert_allclose((u @ vt)[:, 0, 1], np.sin(deformation.rotation_angle(f)), atol=1e-12)
 
 
 def test_volume_is_kept_where_one_linear_step_loses_most_of_it():
@@ -61,7 +60,7 @@ def test_volume_is_kept_where_one_linear_step_loses_most_of_it():
 
 
 def test_what_flows_in_under_a_sliding_tip_flows_out_and_the_base_goes_along():
-    press = flow.Press(H_M, TIP_M, "slipping")
+    press = layer.IndentedLayer(H_M, TIP_M, "slipping")
     assert not broken(mechanics.far_out(press, 1.2e-3))
     # Between a cone's and a cylinder's volume under the dent.
     grown_m2 = (follow(np.full(5, 9e-3), np.linspace(0, 1, 5) * H_M, base="slipping").r_m ** 2 - 9e-3**2).mean()
@@ -77,8 +76,8 @@ def test_halving_the_steps_quarters_the_loss_of_volume_and_converges(monkeypatch
     found = []
     for step in (0.1, 0.05, 0.025):
         ladder = np.array([0.0, step / 4, step / 2, *np.arange(step, 1.01, step)])
-        monkeypatch.setattr(flow, "LADDER", ladder)
-        found.append(follow(r_m, z_m, 0.6 * H_M * flow.depth_unit(TIP_M / H_M)))  # a whole number of steps
+        monkeypatch.setattr(deformation, "LADDER", ladder)
+        found.append(follow(r_m, z_m, 0.6 * H_M * deformation.depth_scale(TIP_M / H_M)))  # a whole number of steps
     loss = [np.abs(det_f(at) - 1).max() for at in found]
     assert loss[1] < loss[0] / 2.5
     assert loss[2] < loss[1] / 2.5

@@ -1,0 +1,371 @@
+"""Finite deformation of the skin under a tip: material followed in small steps, and tables of it. SI units.
+
+The linear solution of `layer` holds for small depths only. Here the tip sinks in small steps (12 to 24 over the usual
+depths); in each, the pressure change that keeps the deformed surface on the sphere displaces all material. The result
+is axisymmetric and, in units of the thickness, depends on R/h alone: a few tables over R/h serve skins of any
+thickness, and an indentation only interpolates them.
+"""
+
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from math import sqrt
+from pathlib import Path
+from typing import no_type_check
+
+import numpy as np
+from jaxtyping import Float, Int
+from numba import njit
+from scipy.interpolate import CubicSpline
+
+from reskin import io
+from reskin.errors import ParamsError
+from reskin.physics import layer
+from reskin.physics.layer import Displacement, IndentedLayer, Waves, contact_of_radius, displacement, waves
+
+Dipoles = tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]  # positions in m, moments in A m^2
+
+STEP = 0.025  # of `depth_scale`: 0.05 mm in a skin of 2 mm; half of it changes dB by 0.3 % (slipping), 0.6 % (bonded)
+# Depths at which the flow is stepped, whatever depths are requested. The first step is cut in four and in two: there
+# the contact radius grows as the root of the depth.
+LADDER = np.array([0.0, STEP / 4, STEP / 2, *(STEP * np.arange(1, round(1 / STEP) + 1))])
+RIM_MAX = 1.2  # of the thickness: waves that end at the surface grow as exp(kz) above it
+MARKERS_N = 48  # on the surface, closer towards the axis
+PRESSURES_N = 6  # 4 and 8 move the markers by less than 0.03 mm at 1.2 mm
+DAMPING = 1e-3
+
+
+@dataclass(frozen=True)
+class Material:
+    """Current positions of material points, and the gradient F of the map from rest; its other entries are zero."""
+
+    r_m: Float[np.ndarray, " s"]
+    z_m: Float[np.ndarray, " s"]
+    f: Float[np.ndarray, "s 2 2"]  # rows and columns: r, z
+    hoop: Float[np.ndarray, " s"]
+
+
+def follow(
+    r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"], depths_m: Float[np.ndarray, " d"], press: IndentedLayer
+) -> list[Material]:
+    """Follow material points from rest through increasing depths; one `Material` for each depth.
+
+    Markers on the surface are followed too. A pressure that fits the surface at rest would leave the deformed surface
+    0.3 mm behind the tip at 1.2 mm; so each step solves for the pressure that brings the markers onto the sphere.
+    """
+    path = [with_markers(r_m, z_m, press)]
+    for depth_m in map(float, depths_m[1:]):
+        path.append(displace(path[-1], pressure_change(path[-1], depth_m, press), depth_m, press))
+    return [Material(*(getattr(at, name)[MARKERS_N:] for name in Material.__dataclass_fields__)) for at in path]
+
+
+def depth_scale(size: float) -> float:
+    """Return a smooth bound of all depths, in thicknesses, below the lesser of thickness and tip radius (`size`)."""
+    return size / (1 + size**4) ** 0.25
+
+
+def depth_steps(depths_m: tuple[float, ...], press: IndentedLayer) -> Float[np.ndarray, " d"]:
+    """List the depths to step through: 0, those of `LADDER` above the deepest requested one, and all requested ones."""
+    ladder_m = press.thickness_m * depth_scale(press.tip_radius_m / press.thickness_m) * LADDER
+    return np.unique(np.append(ladder_m[ladder_m < max(depths_m)], depths_m))
+
+
+def undeformed(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"]) -> Material:
+    """Return material at rest."""
+    return Material(r_m, z_m, np.tile(np.eye(2), (len(r_m), 1, 1)), np.ones(len(r_m)))
+
+
+def with_markers(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"], press: IndentedLayer) -> Material:
+    """Return material at rest, surface markers first; they reach as far as the widest possible contact."""
+    widest = press.contact(press.thickness_m * depth_scale(press.tip_radius_m / press.thickness_m))
+    r_m = np.append(widest.radius_m * np.linspace(0, 1, MARKERS_N) ** 2, r_m)
+    return undeformed(r_m, np.append(np.full(MARKERS_N, press.thickness_m), z_m))
+
+
+def pressure_change(material: Material, depth_m: float, press: IndentedLayer) -> Waves:
+    """Solve for the pressure change that brings the markers (first in `material`) to a greater depth.
+
+    The pressure is a sum of those of spheres on smaller contacts. Its weights bring all markers inside the contact from
+    their current positions to the tip, by damped least squares, as waves shorter than the depth do not reach them.
+    """
+    contact = press.contact(depth_m)
+    inside = np.flatnonzero(material.r_m[:MARKERS_N] < contact.radius_m)
+    r_m, z_m = material.r_m[inside], material.z_m[inside]
+    radii_m = contact.radius_m * np.arange(1, PRESSURES_N + 1) / PRESSURES_N
+    parts = [contact_of_radius(a_m, **asdict(press)) for a_m in radii_m]
+    pressures = [waves(part, press.thickness_m, press.base) for part in parts]
+    displaced = [displacement(r_m, z_m, pressure) for pressure in pressures]
+    height_m = np.sqrt(press.tip_radius_m**2 - r_m**2)
+    towards = np.stack([u.z_m - r_m / height_m * u.r_m for u in displaced], axis=1) / [part.depth_m for part in parts]
+    missing_m = press.thickness_m - contact.depth_m + press.tip_radius_m - height_m - z_m
+    damping = DAMPING * np.linalg.norm(towards, 2) * np.eye(PRESSURES_N)
+    share = np.linalg.lstsq(np.vstack([towards, damping]), np.append(missing_m, np.zeros(PRESSURES_N)))[0]
+    amplitudes = np.stack(
+        [pressure.amplitude_m / part.depth_m for pressure, part in zip(pressures, parts, strict=True)]
+    )
+    return Waves(pressures[0].k_per_m, share @ amplitudes, press.thickness_m, press.base)
+
+
+def displace(material: Material, change: Waves, depth_m: float, press: IndentedLayer) -> Material:
+    """Displace material by a pressure change: midpoint rule, with F by the chain rule through the midpoint.
+
+    `depth_m` is the depth that the change leads to, for the error message.
+    """
+    first = displacement(material.r_m, material.z_m, change)
+    half_r_m, half_z_m = material.r_m + first.r_m / 2, material.z_m + first.z_m / 2
+    second = displacement(half_r_m, half_z_m, change)
+    half = (np.eye(2) + _gradient(first) / 2) @ material.f
+    hoop = material.hoop * (1 + second.hoop * (1 + first.hoop / 2))
+    moved = Material(material.r_m + second.r_m, material.z_m + second.z_m, material.f + _gradient(second) @ half, hoop)
+    if not moved.z_m.max() < RIM_MAX * press.thickness_m:
+        rule = f"such that the rim stays below {RIM_MAX} of the skin's thickness"
+        got = f"{depth_m / press.thickness_m:.3g} of the thickness"
+        raise ParamsError("poke", "depth", rule, got, "Poke less deep.")
+    return moved
+
+
+def _gradient(u: Displacement) -> Float[np.ndarray, "s 2 2"]:
+    return np.stack([np.stack([u.r_r, u.r_z], axis=-1), np.stack([u.z_r, u.z_z], axis=-1)], axis=-2)
+
+
+def rotation_angle(f: Float[np.ndarray, "s 2 2"]) -> Float[np.ndarray, " s"]:
+    """Return the angle, from z towards r, of the rotation R in F = R U."""
+    return np.arctan2(f[:, 0, 1] - f[:, 1, 0], f[:, 0, 0] + f[:, 1, 1])
+
+
+# In thicknesses, past the contact. Material farther away does not move on a bonded base (a reach of 4 from the axis
+# costs up to 17 % of dB); on a sliding base it moves outward as one, up to waves that decay as exp(-pi r / h).
+REACH = 5.0
+SIZE_STEP = 0.2  # of ln(R/h) between tables; interpolating between them costs less than 0.3 % of dB (test_skin)
+STENCIL_N = 4  # cubic interpolation, between tables and between depths
+DET_F_ERROR_MAX = 0.1
+COARSE_R = np.linspace(0, 1, 56) ** 1.5  # radii at which the flow is computed, over the reach
+FINE_R = np.linspace(0, 1, 512)  # radii at which it is tabulated, so that linear interpolation is enough
+PACKAGE = Path(__file__).parent  # tables are cached beside the sources that determine them
+
+
+@dataclass(frozen=True)
+class DeformationMap:
+    """Displacement of material at given heights and depths, in units of the thickness, over equal steps in r."""
+
+    thickness_m: float
+    reach_m: float
+    depth_m: Float[np.ndarray, " d"]  # from 0 on
+    moved: Float[np.ndarray, "d l i 3"]  # outward, up, tan(angle / 2) with the angle from z towards r
+    base: layer.Base
+
+
+@dataclass(frozen=True)
+class RestingDipoles:
+    """Dipoles at rest, and which of the few heights (in thicknesses) each of them has."""
+
+    nodes_m: Float[np.ndarray, "s 3"]
+    moments_A_m2: Float[np.ndarray, "s 3"]
+    height_i: Int[np.ndarray, " s"]
+    heights: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class MovedDipoles:
+    """The dipoles within reach of an indentation, by their index, before and after it."""
+
+    i: Int[np.ndarray, " m"]
+    before: Dipoles
+    after: Dipoles
+
+
+def group_by_height(
+    nodes_m: Float[np.ndarray, "s 3"], moments_A_m2: Float[np.ndarray, "s 3"], thickness_m: float
+) -> RestingDipoles:
+    """Group a skin's nodes by height; a quadrature rule has few, and the map is tabulated for each."""
+    # Rounded, so that skins of any thickness share the heights of their rule.
+    heights, height_i = np.unique(np.round(nodes_m[:, 2] / thickness_m, 12), return_inverse=True)
+    return RestingDipoles(
+        np.asfortranarray(nodes_m), np.asfortranarray(moments_A_m2), height_i, tuple(heights.tolist())
+    )
+
+
+def reach(size: float, base: layer.Base) -> float:
+    """Return how far from the axis, in thicknesses, a tip of R/h = `size` deforms material, at any depth."""
+    depth = layer.VERIFIED_DEPTH * depth_scale(size)
+    return REACH + IndentedLayer(1.0, size, base).contact(depth).radius_m
+
+
+def tabulate(
+    thickness_m: float, tip_radius_m: float, deepest_m: float, *, heights: tuple[float, ...], base: layer.Base
+) -> DeformationMap:
+    """Tabulate the map down to the first depth of `LADDER` that is at least `deepest_m`.
+
+    Interpolates between tables that are `SIZE_STEP` apart in ln(R/h). The map at a depth does not depend on the deepest
+    depth.
+
+    Parameters
+    ----------
+    heights : heights of the material in thicknesses, as in `RestingDipoles`.
+
+    Raises
+    ------
+    ParamsError
+        If the layer is impossible, or the depth is not followed (see `depth_scale`).
+    """
+    layer.check_layer(np.array([deepest_m]), thickness_m, tip_radius_m)
+    size = tip_radius_m / thickness_m
+    depth_m = thickness_m * depth_scale(size) * LADDER
+    if not 0 < deepest_m <= depth_m[-1]:
+        rule = f"above 0 mm and at most {1e3 * depth_m[-1]:.3g} mm, the deepest that is followed"
+        raise ParamsError("poke", "deepest depth", rule, f"{1e3 * deepest_m:.3g} mm", "Poke less deep.")
+    rungs_n = 1 + max(int(np.searchsorted(depth_m, deepest_m)), STENCIL_N - 1)
+    return _tabulate(thickness_m, tip_radius_m, rungs_n, heights, base)
+
+
+@lru_cache(maxsize=16)
+def _tabulate(
+    thickness_m: float, tip_radius_m: float, rungs_n: int, heights: tuple[float, ...], base: layer.Base
+) -> DeformationMap:
+    size = tip_radius_m / thickness_m
+    depth_m = thickness_m * depth_scale(size) * LADDER[:rungs_n]
+    at = np.log(size) / SIZE_STEP
+    tables_i = int(np.floor(at)) - 1 + np.arange(STENCIL_N)
+    share = _lagrange(tables_i.astype(float), at)
+    parts = [_displaced(int(table_i), heights, rungs_n, base) for table_i in tables_i]
+    coarse = sum(weight * part for weight, part in zip(share, parts, strict=True))
+    # Contiguous, or each indentation would copy its part.
+    moved = np.ascontiguousarray(CubicSpline(COARSE_R, coarse, axis=2)(FINE_R))
+    # Material on the base keeps its height and, where that is bonded, its place; it may turn.
+    moved[:, np.array(heights) == 0, :, 1 if base == "slipping" else slice(2)] = 0.0
+    return DeformationMap(thickness_m, thickness_m * reach(size, base), depth_m, moved, base)
+
+
+def at_depth(table: DeformationMap, depth_m: float) -> Float[np.ndarray, "l i 3"]:
+    """Interpolate the map at one depth: exact at tabulated depths, cubic in the root of the depth between them.
+
+    In that root the tip's depth is a square and a far point's displacement nearly a cube. Below the first tabulated
+    depth (about 10 um on a skin of 2 mm) the map is proportional to that cube, as the force of a light touch is.
+    """
+    if not -np.inf < depth_m <= table.depth_m[-1]:
+        rule = f"finite and at most {1e3 * table.depth_m[-1]:.4g} mm, the deepest that is tabulated"
+        raise ParamsError("poke", "depth", rule, f"{1e3 * depth_m:.4g} mm", "Tabulate deeper.")
+    if depth_m <= 0:
+        return table.moved[0]
+    if depth_m < table.depth_m[1]:
+        return table.moved[1] * (depth_m / table.depth_m[1]) ** 1.5
+    first = max(int(np.searchsorted(table.depth_m, depth_m)) + 1, STENCIL_N) - STENCIL_N
+    near = slice(first, first + STENCIL_N)
+    share = _lagrange(np.sqrt(table.depth_m[near]), np.sqrt(depth_m))
+    return np.dot(share[None], table.moved[near].reshape(STENCIL_N, -1)).reshape(table.moved.shape[1:])
+
+
+def move_dipoles(table: DeformationMap, rest: RestingDipoles, indentation_m: Float[np.ndarray, "3"]) -> MovedDipoles:
+    """Move and turn the dipoles within reach of an indentation (x, y, depth); on a sliding base all of them.
+
+    Moments turn with the material: R m, not F m, as magnetisation is independent of stretch (Danas & Reis 2024).
+    """
+    found = np.empty(0, np.intp), np.empty((6, 0)), np.empty((6, 0))
+    here = at_depth(table, float(indentation_m[2]))
+    if indentation_m[2] > 0:
+        # Past the reach nothing is lost, so that r^2 grows by the same everywhere.
+        edge_m = table.reach_m + table.thickness_m * here[:, -1, 0].mean()
+        grown_m2 = float(edge_m**2 - table.reach_m**2) if table.base == "slipping" else 0.0
+        tip = np.append(indentation_m[:2], (table.reach_m, table.thickness_m, grown_m2))
+        found = _move(rest.nodes_m.T, rest.moments_A_m2.T, rest.height_i, here, tip)
+    i, before, after = found
+    return MovedDipoles(i, (before[:3].T, before[3:].T), (after[:3].T, after[3:].T))
+
+
+@lru_cache(maxsize=256)
+def _displaced(
+    table_i: int, heights: tuple[float, ...], rungs_n: int, base: layer.Base
+) -> Float[np.ndarray, "d l p 3"]:
+    """Load the table of one R/h, or compute it and cache it on disk: outward, up, tan(angle / 2)."""
+    name = f"flow {table_i} {heights} {base}"
+    known = io.load(PACKAGE, name)
+    if known is None or len(known) < rungs_n:
+        known = _follow_ladder(table_i, heights, rungs_n, base)
+        io.save(PACKAGE, name, known)
+    return known[:rungs_n]
+
+
+def _follow_ladder(
+    table_i: int, heights: tuple[float, ...], rungs_n: int, base: layer.Base
+) -> Float[np.ndarray, "d l p 3"]:
+    # Each depth from the one above it, so that a deeper indentation later only adds to the ladder. In thicknesses.
+    size = _size(table_i)
+    at = rest = undeformed(*(part.ravel() for part in np.meshgrid(reach(size, base) * COARSE_R, heights)))
+    parts = np.zeros((rungs_n, 3, len(rest.r_m)))
+    for rung_i in range(1, rungs_n):
+        depth = depth_scale(size) * float(LADDER[rung_i])
+        at = displace(at, _pressure_change(table_i, rung_i, base), depth, IndentedLayer(1.0, size, base))
+        if not np.abs(np.linalg.det(at.f) * at.hoop - 1).max() <= DET_F_ERROR_MAX:
+            rule = f"such that material keeps its volume within {DET_F_ERROR_MAX:.0%}"
+            raise ParamsError("poke", "depth", rule, f"{depth:.3g} of the thickness", "Poke less deep.")
+        parts[rung_i] = at.r_m - rest.r_m, at.z_m - rest.z_m, np.tan(rotation_angle(at.f) / 2)
+    return np.moveaxis(parts, 1, 2).reshape(rungs_n, len(heights), len(COARSE_R), 3)
+
+
+@lru_cache(maxsize=1024)
+def _pressure_change(table_i: int, rung_i: int, base: layer.Base) -> Waves:
+    # From one depth to the next: the same for material of all heights.
+    size = _size(table_i)
+    depth = depth_scale(size) * float(LADDER[rung_i])
+    return pressure_change(_markers(table_i, rung_i - 1, base), depth, IndentedLayer(1.0, size, base))
+
+
+@lru_cache(maxsize=1024)
+def _markers(table_i: int, rung_i: int, base: layer.Base) -> Material:
+    press, none = IndentedLayer(1.0, _size(table_i), base), np.empty(0)
+    if rung_i == 0:
+        return with_markers(none, none, press)
+    depth = depth_scale(press.tip_radius_m) * float(LADDER[rung_i])
+    return displace(_markers(table_i, rung_i - 1, base), _pressure_change(table_i, rung_i, base), depth, press)
+
+
+def _size(table_i: int) -> float:
+    return float(np.exp(SIZE_STEP * table_i))
+
+
+def _lagrange(nodes: Float[np.ndarray, " p"], at: float) -> Float[np.ndarray, " p"]:
+    """Return the weights of Lagrange interpolation at one place."""
+    known, share = nodes.tolist(), np.ones(len(nodes))
+    for j, node in enumerate(known):
+        for i, other in enumerate(known):
+            if i != j:
+                share[j] *= (at - other) / (node - other)
+    return share
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _move(nodes, moments, height_i, table, tip):
+    x, y, reach_m, thickness_m, grown_m2 = tip
+    steps_n = table.shape[1] - 1
+    i = np.empty(nodes.shape[1], np.intp)
+    n = 0
+    for s in range(nodes.shape[1]):
+        i[n] = s
+        n += grown_m2 > 0 or (nodes[0, s] - x) ** 2 + (nodes[1, s] - y) ** 2 < reach_m * reach_m
+    before, after = np.empty((6, n)), np.empty((6, n))
+    for m in range(n):
+        s = i[m]
+        dx, dy = nodes[0, s] - x, nodes[1, s] - y
+        r = sqrt(dx * dx + dy * dy)
+        # On the axis nothing moves sideways or turns, so no direction is needed there.
+        over_r = 1 / r if r > 0 else 0.0
+        cos, sin = dx * over_r, dy * over_r
+        outward, up, tan = sqrt(r * r + grown_m2) - r, 0.0, 0.0
+        if r < reach_m:
+            at = r / reach_m * steps_n
+            low = min(int(at), steps_n - 1)
+            near, far, share = table[height_i[s], low], table[height_i[s], low + 1], at - low
+            outward = thickness_m * (near[0] + share * (far[0] - near[0]))
+            up = thickness_m * (near[1] + share * (far[1] - near[1]))
+            tan = near[2] + share * (far[2] - near[2])  # of half the angle
+        mx, my, mz = moments[0, s], moments[1, s], moments[2, s]
+        radial = cos * mx + sin * my
+        sine = 2 * tan / (1 + tan * tan)  # 1 - cosine is tan of the half times it
+        change = sine * (mz - tan * radial)
+        before[0, m], before[1, m], before[2, m] = nodes[0, s], nodes[1, s], nodes[2, s]
+        before[3, m], before[4, m], before[5, m] = mx, my, mz
+        after[0, m], after[1, m] = nodes[0, s] + outward * cos, nodes[1, s] + outward * sin
+        after[2, m] = nodes[2, s] + up
+        after[3, m], after[4, m] = mx + change * cos, my + change * sin
+        after[5, m] = mz - sine * (radial + tan * mz)
+    return i[:n], before, after
