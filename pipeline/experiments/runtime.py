@@ -531,7 +531,7 @@ def paths(trial: Trial, skin: Skin) -> NodePath:
 
 
 def _slide(
-    nodes_m: Float[np.ndarray, "n s 3"], turns_rad: Float[np.ndarray, "n s 3"], motion: slide.Slide,
+    nodes_m: Float[np.ndarray, "n s 3"], turns_rad: Float[np.ndarray, "n s 3"], motion: slide.RigidMotion,
     middle_m: Float[np.ndarray, "2"],
 ) -> None:  # fmt: skip
     for poke_i, spin_rad in enumerate(motion.spin_rad):

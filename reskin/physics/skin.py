@@ -90,7 +90,7 @@ def draw_skin(
     j_T = magnet.magnetise(b_T, saturation_T=amplitude * design.saturation_T, half_field_T=design.half_field_T)
     strength = _filler(rest.nodes_m[:, :2], spreads, rng) * (-1 if design.flipped else 1)
     at_rest = rest.nodes_m, magnet.moments(j_T * strength[:, None], rest.volumes_m3)
-    seated = slide.Slide(seat_m[None], np.array([rotation_rad]))
+    seated = slide.RigidMotion(seat_m[None], np.array([rotation_rad]))
     nodes_m, moments_A_m2 = slide.apply(seated, 0, at_rest)
     modulus_Pa = float(design.modulus_kPa * kilo * modulus)
     return Skin(
@@ -104,7 +104,7 @@ def draw_skin(
         tip_radius_m=design.tip_radius_mm * milli,
         depth_zero_m=float(depth_zero_mm * milli),
         base=design.base,
-        hold=None if design.hold is None else slide.hold_of(design.hold),
+        hold=None if design.hold is None else design.hold.in_si(),
     )
 
 
@@ -141,7 +141,7 @@ def moved_dipoles(
     table = deformation.tabulate(skin.thickness_m, skin.tip_radius_m, deepest_m, heights=rest.heights, base=skin.base)
     slides = None if skin.hold is None else press_slides(skin, skin.hold, true_m[contacts])
     if slides is not None and slid is not None:
-        slides = slides.times(slid[contacts])
+        slides = slides.scaled(slid[contacts])
     for i, poke_i in enumerate(contacts):
         moved = deformation.move_dipoles(table, rest, true_m[poke_i])
         if slides is not None:
@@ -149,7 +149,7 @@ def moved_dipoles(
         yield int(poke_i), moved.before, moved.after
 
 
-def press_slides(skin: Skin, hold: slide.Hold, true_m: Float[np.ndarray, "n 3"]) -> slide.Slide:
+def press_slides(skin: Skin, hold: slide.Hold, true_m: Float[np.ndarray, "n 3"]) -> slide.RigidMotion:
     """Give how presses (x, y, true depth) slide a skin on its base, as one, as far as the tip's friction allows.
 
     The slide away from the middle is gone at a depth, whatever the modulus; friction is felt in newtons.
@@ -159,9 +159,9 @@ def press_slides(skin: Skin, hold: slide.Hold, true_m: Float[np.ndarray, "n 3"])
         true_m[:, 2], modulus_Pa=1.0, thickness_m=skin.thickness_m, tip_radius_m=skin.tip_radius_m
     )
     load = np.minimum(relative_m2 / hold.lets_go_m2, 1.0)
-    taken_m = slide.under_tip_m(places_m, load, give_m=hold.give_m, away=hold.away)
-    whole = slide.rigid(places_m, taken_m, skin.sides_m)
-    return slide.gripped(whole, skin.modulus_Pa * relative_m2, hold.grip_N_per_m)
+    taken_m = slide.press_displacement_m(places_m, load, give_m=hold.give_m, away=hold.away)
+    whole = slide.rigid_motion(places_m, taken_m, skin.sides_m)
+    return slide.limit_by_friction(whole, skin.modulus_Pa * relative_m2, hold.grip_N_per_m)
 
 
 def beyond_verified_n(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> int:

@@ -1,12 +1,12 @@
-"""How a finite skin slides and turns on its base as one, and how its force grows with depth. SI units.
+"""Rigid sliding of a finite skin on its base, and its force against depth. SI units.
 
-The base holds every piece of skin alike, by springs as soft in all directions. So where and how the material under the
-tip is taken, or which force pulls there, decides the rest, for pressing and for dragging. A tip cannot drag a skin
-further than its friction allows: a slide is bounded by that (`gripped`), and goes to zero with the force.
+The base holds the whole skin by evenly distributed, isotropic springs. The displacement of the material under the tip,
+or the force there, therefore determines the rigid motion of the skin, for pressing and for dragging. Friction between
+tip and skin bounds the slide (`limit_by_friction`), which goes to zero with the normal force.
 
-The force is that of the elastic layer on a sliding base, which `deformation` moves, times (1 - d/h)^(-3/2): the layer
-stiffens as it thins. That factor is 1.2 at 0.2 mm and 4.0 at 1.2 mm of a 2 mm skin. It and how a press takes the skin
-are empirical: chosen on two recorded boards (scene lab), which the layer's force alone does not fit.
+The force is that of the slipping elastic layer (`layer`) times (1 - d/h)^(-3/2): the layer stiffens as it thins, by 1.2
+at 0.2 mm and 4.0 at 1.2 mm for a skin of 2 mm. This factor and how a press displaces the skin are empirical: chosen on
+two recorded boards (scene lab), which the elastic layer alone does not fit.
 """
 
 from dataclasses import dataclass
@@ -23,25 +23,35 @@ from reskin.config import Strict
 from reskin.errors import ParamsError
 from reskin.physics import layer
 
-STIFFENING = 1.5  # exponent of the thinning layer: chosen with both boards in view; 1.25 to 2 explain them as well
-DEEPEST = 0.72  # of the thickness: a larger force counts as the one that goes so deep
-MIDDLE_M = np.zeros(2)
-CURVE_N = 2000  # depths at which the force is inverted; between them d is linear in F^(2/3), as Hertz's is
+STIFFENING = 1.5  # exponent, chosen with both boards in view; 1.25 to 2 explain them as well
+DEEPEST = 0.72  # of the thickness: larger forces are treated as the force at this depth
+CENTRE_M = np.zeros(2)
+CURVE_N = 2000  # depths of the inverse force curve; between them d is linear in F^(2/3), as Hertz's is
 
 
 class HoldDesign(Strict):
-    """Section `skin.hold`: how the base holds a skin that slides on it."""
+    """Section `skin.hold`: how the base holds a skin that slides on it, and how a press displaces it."""
 
-    give_um: tuple[float, float]  # of the rig's arm under a press, with the skin that the tip holds, x and y
-    away_um_mm: Annotated[float, Field(ge=0, le=100)]  # slide away from the skin's middle under a firm grip
-    lets_go_mm2: Annotated[float, Field(gt=0, le=1e6)]  # force over Young's modulus at which that slide is gone
-    springs_N_mm: Annotated[float, Field(gt=0, le=1e6)]  # force that slides the skin as one: screws, clips, friction
-    friction: Annotated[float, Field(gt=0, le=10)]  # of the tip on the skin: bounds what a press slides
+    give_um: tuple[float, float]  # compliance of the rig: displacement of arm and skin under a press, x and y
+    away_um_mm: Annotated[float, Field(ge=0, le=100)]  # displacement away from the skin's centre, per distance from it
+    lets_go_mm2: Annotated[float, Field(gt=0, le=1e6)]  # force over Young's modulus at which that displacement is gone
+    springs_N_mm: Annotated[float, Field(gt=0, le=1e6)]  # lateral stiffness of the base: screws, clips, friction
+    friction: Annotated[float, Field(gt=0, le=10)]  # coefficient of the tip on the skin
+
+    def in_si(self) -> "Hold":
+        """Convert to SI units."""
+        return Hold(
+            give_m=(self.give_um[0] * micro, self.give_um[1] * micro),
+            away=self.away_um_mm * micro / milli,
+            lets_go_m2=self.lets_go_mm2 * milli**2,
+            springs_N_per_m=self.springs_N_mm * kilo,
+            friction=self.friction,
+        )
 
 
 @dataclass(frozen=True)
 class Hold:
-    """The same of one skin, SI."""
+    """`HoldDesign` in SI units."""
 
     give_m: tuple[float, float]
     away: float
@@ -51,102 +61,94 @@ class Hold:
 
     @property
     def grip_N_per_m(self) -> float:
-        """Normal force over the slide that it can hold: k / mu, see `gripped`; infinite without friction."""
+        """Normal force per slide that friction can hold, k / mu; infinite without friction."""
         return self.springs_N_per_m / self.friction if self.friction > 0 else np.inf
 
 
-def hold_of(design: HoldDesign) -> Hold:
-    """Convert a design's hold to SI."""
-    return Hold(
-        give_m=(design.give_um[0] * micro, design.give_um[1] * micro),
-        away=design.away_um_mm * micro / milli,
-        lets_go_m2=design.lets_go_mm2 * milli**2,
-        springs_N_per_m=design.springs_N_mm * kilo,
-        friction=design.friction,
-    )
-
-
 @dataclass(frozen=True)
-class Slide:
-    """The motion of a skin as one, a poke a row: it turns by `spin_rad` about z and its middle, then moves."""
+class RigidMotion:
+    """Rigid motion of a skin, one row per indentation: rotation by `spin_rad` about its centre, then translation."""
 
     move_m: Float[np.ndarray, "n 2"]
     spin_rad: Float[np.ndarray, " n"]
 
-    def times(self, share: Float[np.ndarray, " n"]) -> "Slide":
-        """Give a share of each motion."""
-        return Slide(self.move_m * share[:, None], self.spin_rad * share)
+    def scaled(self, share: Float[np.ndarray, " n"]) -> "RigidMotion":
+        """Return a share of each motion."""
+        return RigidMotion(self.move_m * share[:, None], self.spin_rad * share)
 
 
-def under_tip_m(
+def press_displacement_m(
     places_m: Float[np.ndarray, "n 2"], load: Float[np.ndarray, " n"], *, give_m: tuple[float, float], away: float
 ) -> Float[np.ndarray, "n 2"]:
-    """Give how a press takes the material under a tip that holds it: give - away (1 - load) p, p from the middle.
+    """Return the displacement of the material under a tip that grips it: give - away (1 - load) p.
 
-    `load` is the force over the one at which the slide away is gone; `gripped` says how far a light press does it.
+    p is the place from the skin's centre, `load` the force over the force at which the displacement away from the
+    centre is gone. A light press reaches only a share of it, see `limit_by_friction`.
     """
     return np.array(give_m) - away * (1 - load)[:, None] * places_m
 
 
-def gripped(slide: Slide, force_N: Float[np.ndarray, " n"], grip_N_per_m: float) -> Slide:
-    """Bound slides by the friction of a tip that presses with these forces.
+def limit_by_friction(motion: RigidMotion, force_N: Float[np.ndarray, " n"], grip_N_per_m: float) -> RigidMotion:
+    """Scale motions down to what Coulomb friction allows at these normal forces.
 
-    A slide u needs the sideways force k |u|, which Coulomb bounds by mu F. The share that is reached,
-    1 - exp(-mu F / (k |u|)), is below both bounds: k |u| share <= mu F, and the whole slide under a firm press.
+    A slide u needs the lateral force k |u|, which friction bounds by mu F. The share that is reached,
+    1 - exp(-mu F / (k |u|)), respects the bound, k |u| share <= mu F, and tends to 1 under a firm press.
     `grip_N_per_m` is k / mu.
     """
-    with np.errstate(invalid="ignore"):  # no slide that nothing grips
-        needed_N = grip_N_per_m * np.hypot(*slide.move_m.T)
+    with np.errstate(invalid="ignore"):  # inf * 0: no motion, no friction
+        needed_N = grip_N_per_m * np.hypot(*motion.move_m.T)
     moves = needed_N > 0
-    with np.errstate(over="ignore"):  # of a slide so small that any force takes all of it
+    with np.errstate(over="ignore"):  # a slide so small that any force holds it
         share = np.where(moves, -np.expm1(-force_N / np.where(moves, needed_N, 1.0)), 0.0)
-    return slide.times(share)
+    return motion.scaled(share)
 
 
 def compliance_m_per_N(
     places_m: Float[np.ndarray, "n 2"], sides_m: tuple[float, float], springs_N_per_m: float
 ) -> Float[np.ndarray, "n 2 2"]:
-    """Give how far a force at a place slides that place along: (I + q q^T / rho^2) / springs, see `rigid`."""
+    """Return the displacement of a place per force there: (I + q q^T / rho^2) / k, see `rigid_motion`."""
     q_m = np.stack([-places_m[:, 1], places_m[:, 0]], axis=1)
     spun = q_m[:, :, None] * q_m[:, None, :] / _rho2_m2(sides_m)
     return (np.eye(2) + spun) / springs_N_per_m
 
 
-def rigid(places_m: Float[np.ndarray, "n 2"], taken_m: Float[np.ndarray, "n 2"], sides_m: tuple[float, float]) -> Slide:
-    """Find the motion that takes the places so far against the least work of the springs, mean square displacement.
+def rigid_motion(
+    places_m: Float[np.ndarray, "n 2"], displacement_m: Float[np.ndarray, "n 2"], sides_m: tuple[float, float]
+) -> RigidMotion:
+    """Return the rigid motion that displaces each place as given with the least elastic energy of the base springs.
 
     u = f + theta z x X with u(p) = D: f = (I + q q^T / rho^2)^-1 D, theta = q.f / rho^2, q = z x p; rho^2, the mean of
-    r^2 over the skin, is (a^2 + b^2) / 12. A place off the middle spends part of its displacement on spin.
+    r^2 over the skin, is (a^2 + b^2) / 12. Off the centre, part of the displacement is rotation.
     """
     q_m = np.stack([-places_m[:, 1], places_m[:, 0]], axis=1)
-    spin_rad = (q_m * taken_m).sum(axis=1) / (_rho2_m2(sides_m) + (q_m * q_m).sum(axis=1))
-    return Slide(taken_m - q_m * spin_rad[:, None], spin_rad)
+    spin_rad = (q_m * displacement_m).sum(axis=1) / (_rho2_m2(sides_m) + (q_m * q_m).sum(axis=1))
+    return RigidMotion(displacement_m - q_m * spin_rad[:, None], spin_rad)
 
 
 def apply(
-    slide: Slide,
-    poke_i: int,
+    motion: RigidMotion,
+    i: int,
     dipoles: tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]],
-    middle_m: Float[np.ndarray, "2"] = MIDDLE_M,
+    centre_m: Float[np.ndarray, "2"] = CENTRE_M,
 ) -> tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]:
-    """Turn positions about the skin's middle and moments, and move the positions; without a slide nothing changes."""
+    """Apply motion `i` to dipoles: rotate positions (about the skin's centre) and moments, then translate."""
     positions_m, moments_A_m2 = (part.T.copy() for part in dipoles)
-    apply_in_place(slide, poke_i, (positions_m.T, moments_A_m2.T), middle_m)
+    apply_in_place(motion, i, (positions_m.T, moments_A_m2.T), centre_m)
     return positions_m.T, moments_A_m2.T
 
 
 def apply_in_place(
-    slide: Slide,
-    poke_i: int,
+    motion: RigidMotion,
+    i: int,
     dipoles: tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]],
-    middle_m: Float[np.ndarray, "2"] = MIDDLE_M,
+    centre_m: Float[np.ndarray, "2"] = CENTRE_M,
 ) -> None:
-    """Do as `apply` does to the arrays themselves, which nobody else may need: a poke moves thousands of dipoles."""
+    """Apply motion `i` as `apply` does, overwriting the arrays: an indentation moves thousands of dipoles."""
     positions_m, moments_A_m2 = dipoles
-    cos, sin = float(np.cos(slide.spin_rad[poke_i])), float(np.sin(slide.spin_rad[poke_i]))
-    (x_m, y_m), (middle_x_m, middle_y_m) = slide.move_m[poke_i], middle_m
-    # R (X - middle) + middle + move
-    move_m = x_m + (1 - cos) * middle_x_m + sin * middle_y_m, y_m + (1 - cos) * middle_y_m - sin * middle_x_m
+    cos, sin = float(np.cos(motion.spin_rad[i])), float(np.sin(motion.spin_rad[i]))
+    (x_m, y_m), (centre_x_m, centre_y_m) = motion.move_m[i], centre_m
+    # R (X - centre) + centre + move
+    move_m = x_m + (1 - cos) * centre_x_m + sin * centre_y_m, y_m + (1 - cos) * centre_y_m - sin * centre_x_m
     _turn(positions_m.T, (cos, sin), move_m)
     _turn(moments_A_m2.T, (cos, sin), (0.0, 0.0))
 
@@ -164,7 +166,7 @@ def _turn(rows, turn, move):
 def force_at(
     depth_m: Float[np.ndarray, " n"], *, modulus_Pa: float, thickness_m: float, tip_radius_m: float
 ) -> Float[np.ndarray, " n"]:
-    """Give the force of a tip on a sliding layer that thins under it: that of `layer.force` times `stiffening`."""
+    """Return the normal force in N at depths: that of the slipping elastic layer times `stiffening`."""
     elastic_N = layer.force(
         depth_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m, modulus_Pa=modulus_Pa, base="slipping"
     )
@@ -172,12 +174,14 @@ def force_at(
 
 
 def stiffening(depth_m: Float[np.ndarray, " n"], thickness_m: float) -> Float[np.ndarray, " n"]:
-    """Give by how much a layer is stiffer that thins under a tip, against pressing and (assumed) shear alike."""
+    """Return the stiffening factor (1 - d/h)^(-3/2) of a layer that thins, for pressing and (assumed) shear alike."""
     return (1 - np.maximum(depth_m, 0.0) / thickness_m) ** -STIFFENING
 
 
-def beyond_n(force_N: Float[np.ndarray, " n"], *, modulus_Pa: float, thickness_m: float, tip_radius_m: float) -> int:
-    """Count the forces that `depth_at` holds at its deepest, as they lie beyond it."""
+def count_clipped(
+    force_N: Float[np.ndarray, " n"], *, modulus_Pa: float, thickness_m: float, tip_radius_m: float
+) -> int:
+    """Count the forces that `depth_at` clips to its greatest depth."""
     at_m = np.array([_deepest_m(thickness_m, tip_radius_m)])
     deepest_N = force_at(at_m, modulus_Pa=modulus_Pa, thickness_m=thickness_m, tip_radius_m=tip_radius_m)
     return int((force_N > deepest_N).sum())
@@ -186,7 +190,7 @@ def beyond_n(force_N: Float[np.ndarray, " n"], *, modulus_Pa: float, thickness_m
 def depth_at(
     force_N: Float[np.ndarray, " n"], *, modulus_Pa: float, thickness_m: float, tip_radius_m: float
 ) -> Float[np.ndarray, " n"]:
-    """Give the depth at which a tip feels a force: at most `DEEPEST` thicknesses; `beyond_n` counts what is held."""
+    """Return the depth of normal forces, clipped to `DEEPEST` thicknesses (see `count_clipped`)."""
     if not modulus_Pa > 0:
         raise ParamsError("layer", "modulus", "above 0 Pa", f"{modulus_Pa}", "Check its unit.")
     curve_m, curve_m2 = _curve(thickness_m, tip_radius_m)
@@ -195,7 +199,7 @@ def depth_at(
 
 
 def _deepest_m(thickness_m: float, tip_radius_m: float) -> float:
-    """Give the depth that is followed at most: `DEEPEST` thicknesses, and less than the radius of a sharp tip."""
+    """Return the greatest depth of `depth_at`: `DEEPEST` thicknesses, below the radius of a sharp tip."""
     return min(DEEPEST * thickness_m, 0.999 * tip_radius_m)
 
 

@@ -152,7 +152,7 @@ def _push_once(
     slid_m = (slides_m_per_N @ force_N[:, :, None])[:, :, 0]
     elastic_m = force_N / np.where(layer_N_per_m > 0, layer_N_per_m, 1.0)[:, None] + slid_m
     centre_m = np.column_stack([tip_m[:, :2] - elastic_m, tip_m[:, 2]])
-    dragged_slide = slide.rigid(tip_m[:, :2] - skin.seat_m, slid_m, skin.sides_m)
+    dragged_slide = slide.rigid_motion(tip_m[:, :2] - skin.seat_m, slid_m, skin.sides_m)
     limit_N = coefficient * normal_N
     left = 1 - np.minimum(np.hypot(*force_N.T) / np.where(limit_N > 0, limit_N, 1.0), 1.0)
     change_T = np.zeros((len(tip_m), *board.chips_m.shape))
@@ -165,7 +165,7 @@ def _push_once(
     slide_m = np.zeros((len(tip_m), 2))
     if skin.hold is not None:
         true_m = centre_m + np.array([0.0, 0.0, skin.depth_zero_m])
-        slide_m = dragged_slide.move_m + press_slides(skin, skin.hold, true_m).times(left).move_m
+        slide_m = dragged_slide.move_m + press_slides(skin, skin.hold, true_m).scaled(left).move_m
     return Sideways(force_N, change_T, slide_m)
 
 

@@ -49,7 +49,7 @@ class Law:
     give_y_um: float
     # What no fit of ten numbers moves.
     lets_go_N: float = 8.0  # where the slide away from the middle is gone: chosen with both boards of scene lab in view
-    grip_N_mm: float = 8.75  # springs of 7 N/mm over a friction of 0.8 (params.yaml: skin.hold), see `slide.gripped`
+    grip_N_mm: float = 8.75  # springs of 7 N/mm over a friction of 0.8 (nominal.yaml: skin.hold)
     tilt_x_deg: float = 0.0  # of the skin over the board
     tilt_y_deg: float = 0.0
     label_rotation_deg: float = 0.0  # of the labels' axes about the board's middle
@@ -129,9 +129,9 @@ def simulate_uT(
     places_m = (place_mm @ labels.T + offset_mm) @ turn[:2, :2] * milli
     depths_m = slide.depth_at(force_N, **_layer(law, setup))
     give_m, away = (law.give_x_um * micro, law.give_y_um * micro), law.away_um_mm * micro / milli
-    taken_m = slide.under_tip_m(places_m, force_N / law.lets_go_N, give_m=give_m, away=away)
-    whole = slide.rigid(places_m, taken_m, setup.sides_m)
-    slides = slide.gripped(whole, force_N, law.grip_N_mm * kilo)
+    taken_m = slide.press_displacement_m(places_m, force_N / law.lets_go_N, give_m=give_m, away=away)
+    whole = slide.rigid_motion(places_m, taken_m, setup.sides_m)
+    slides = slide.limit_by_friction(whole, force_N, law.grip_N_mm * kilo)
     table = setup.table(setup.tip_radius_mm)
     change_T = _changes_T(rest or setup.rest, table, chips_m, places_m, depths_m, slides)
     return law.amplitude * change_T @ turn.T / micro
@@ -143,7 +143,7 @@ def nominal_uT(
     """Give the same of the skin as designed: nothing fitted, no slide, force by the elastic layer."""
     depths_m = np.interp(force_N, *_nominal_curve(setup))
     chips_m = np.column_stack([setup.chips_mm, np.full(len(setup.chips_mm), -setup.gap_mm)]) * milli
-    still = slide.Slide(np.zeros(place_mm.shape), np.zeros(len(place_mm)))
+    still = slide.RigidMotion(np.zeros(place_mm.shape), np.zeros(len(place_mm)))
     table = setup.table(setup.design.tip_radius_mm)
     return _changes_T(setup.rest, table, chips_m, place_mm * milli, depths_m, still) / micro
 
@@ -153,7 +153,7 @@ def beyond_n(law: Law | None, setup: Setup, force_N: Float[np.ndarray, " n"]) ->
     if law is None:
         known_N, _ = _nominal_curve(setup)
         return int((force_N > known_N[-1]).sum())
-    return slide.beyond_n(force_N, **_layer(law, setup))
+    return slide.count_clipped(force_N, **_layer(law, setup))
 
 
 def _layer(law: Law, setup: Setup) -> dict[str, float]:
@@ -176,7 +176,7 @@ def _nominal_curve(setup: Setup) -> tuple[Float[np.ndarray, " c"], Float[np.ndar
 def _changes_T(
     rest: deformation.RestingDipoles, table: deformation.DeformationMap, chips_m: np.ndarray,
     places_m: np.ndarray, depths_m: np.ndarray,
-    slides: slide.Slide,
+    slides: slide.RigidMotion,
 ) -> Float[np.ndarray, "n k 3"]:  # fmt: skip
     changes_T = np.empty((len(places_m), *chips_m.shape))
     for poke_i, (place_m, depth_m) in enumerate(zip(places_m, depths_m, strict=True)):

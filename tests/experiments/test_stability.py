@@ -73,8 +73,8 @@ def test_a_slide_that_forgets_to_turn_and_a_depth_between_straight_lines_are_fou
         curve_m = np.linspace(0, slide.DEEPEST * thickness_m, 2000)
         return np.interp(force_N, slide.force_at(curve_m, thickness_m=thickness_m, **of), curve_m)
 
-    rigid = slide.rigid
-    monkeypatch.setattr(slide, "rigid", lambda *of: replace(rigid(*of), spin_rad=np.zeros(len(of[0]))))
+    rigid = slide.rigid_motion
+    monkeypatch.setattr(slide, "rigid_motion", lambda *of: replace(rigid(*of), spin_rad=np.zeros(len(of[0]))))
     monkeypatch.setattr(slide, "depth_at", straight)
     assert broken(sliding()) == {
         "the slide of a skin that is poked at its free edge",

@@ -110,7 +110,7 @@ def test_a_plate_on_even_drag_moves_as_one_the_more_the_stiffer_it_is(sides_m):
     misses_m = []
     for stiffness in (1e3, 1e4):
         middle_m, move_m, spin_rad = plate(sides_m, (6e-3, -3e-3), TAKEN_M, stiffness)
-        rigid = slide.rigid(middle_m[None], TAKEN_M[None], sides_m)
+        rigid = slide.rigid_motion(middle_m[None], TAKEN_M[None], sides_m)
         misses_m.append(np.append(move_m - rigid.move_m[0], (spin_rad - rigid.spin_rad[0]) * sides_m[0] / 2))
     assert np.abs(misses_m[1]).max() < 1e-4 * TAKEN_M.max()
     # what is bent goes as drag over stiffness

@@ -327,7 +327,7 @@ def test_a_held_skin_is_the_free_one_slid_as_one_and_without_slide_the_free_one(
     away_m, depth_m = poke_m[0, :2] - one.seat_m, poke_m[0, 2:]
     (normal_N,) = forces(one, depth_m)
     taken_m = (48e-6, 7e-6) - 6e-3 * (1 - normal_N / one.modulus_Pa / 40e-6) * away_m
-    needed_N = 7e3 * np.linalg.norm(slide.rigid(away_m[None], taken_m[None], one.sides_m).move_m)
+    needed_N = 7e3 * np.linalg.norm(slide.rigid_motion(away_m[None], taken_m[None], one.sides_m).move_m)
     share = 1 - np.exp(-0.8 * normal_N / needed_N)
     assert 0.2 < share < 0.9
     nearest = np.argmin(np.linalg.norm(free_m[0][:, :2] - poke_m[0, :2], axis=1))

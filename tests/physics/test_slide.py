@@ -18,7 +18,7 @@ HELD = {"give_um": (48.0, 7.0), "away_um_mm": 6.0, "lets_go_mm2": 40.0, "springs
 
 
 def one(place_m, taken_m, sides_m=SQUARE) -> tuple[np.ndarray, float]:
-    found = slide.rigid(np.array([place_m]), np.array([taken_m]), sides_m)
+    found = slide.rigid_motion(np.array([place_m]), np.array([taken_m]), sides_m)
     return found.move_m[0], float(found.spin_rad[0])
 
 
@@ -70,7 +70,7 @@ def test_a_square_turned_by_a_quarter_turns_its_motion_and_a_pull_along_the_radi
 
 def test_material_goes_away_from_the_middle_less_under_more_force_and_with_the_arm():
     places_m = np.array([[4e-3, 0.0]] * 3)
-    found_m = slide.under_tip_m(places_m, np.array([0.0, 0.5, 1.0]), give_m=(5e-5, 1e-5), away=7e-3)
+    found_m = slide.press_displacement_m(places_m, np.array([0.0, 0.5, 1.0]), give_m=(5e-5, 1e-5), away=7e-3)
     # 7 um/mm 4 mm from the middle is 28 um, half of it at half of the load that lets go.
     np.testing.assert_allclose(found_m, [[2.2e-5, 1e-5], [3.6e-5, 1e-5], [5e-5, 1e-5]], atol=1e-18)
 
@@ -89,9 +89,9 @@ def test_a_force_slides_a_skin_as_far_as_the_same_motion_asks_for(place_m, sprin
 @given(place, taken, st.floats(1e-6, 20.0))
 @example((0.0, 0.0), (0.0, 2.2e-313), 1.0)  # a force over it overflows
 def test_friction_bounds_a_slide_in_the_direction_that_it_has(place_m, taken_m, force_N):
-    hold = slide.hold_of(slide.HoldDesign(**HELD))
-    whole = slide.rigid(np.array([place_m]), np.array([taken_m]), SQUARE)
-    found = slide.gripped(whole, np.array([force_N]), hold.grip_N_per_m)
+    hold = slide.HoldDesign(**HELD).in_si()
+    whole = slide.rigid_motion(np.array([place_m]), np.array([taken_m]), SQUARE)
+    found = slide.limit_by_friction(whole, np.array([force_N]), hold.grip_N_per_m)
     sideways_N = hold.springs_N_per_m * np.hypot(*found.move_m[0])
     assert sideways_N <= min(0.8 * force_N, hold.springs_N_per_m * np.hypot(*whole.move_m[0])) * (1 + 1e-12)
     moves, (x, y), (whole_x, whole_y) = whole.move_m.any(), found.move_m[0], whole.move_m[0]
@@ -104,9 +104,9 @@ def test_friction_bounds_a_slide_in_the_direction_that_it_has(place_m, taken_m, 
 
 
 def test_a_firm_press_takes_the_whole_slide_and_none_takes_none():
-    whole = slide.Slide(np.array([[5e-5, 0.0], [0.0, 0.0]]), np.array([1e-3, 0.0]))
+    whole = slide.RigidMotion(np.array([[5e-5, 0.0], [0.0, 0.0]]), np.array([1e-3, 0.0]))
     for force_N, share in ((0.0, 0.0), (1e3, 1.0)):
-        found = slide.gripped(whole, np.full(2, force_N), 8750.0)
+        found = slide.limit_by_friction(whole, np.full(2, force_N), 8750.0)
         np.testing.assert_array_equal(found.move_m, share * whole.move_m)
         np.testing.assert_array_equal(found.spin_rad, share * whole.spin_rad)
 
@@ -119,7 +119,7 @@ def test_without_give_and_slide_the_sliding_flow_is_what_it_was_to_the_last_bit(
     table = deformation.tabulate(H_M, 2e-3, 0.8e-3, heights=rest.heights, base="slipping")
     moved = deformation.move_dipoles(table, rest, np.array([3e-3, -2e-3, 0.8e-3]))
     place_m = np.array([[3e-3, -2e-3]])
-    still = slide.rigid(place_m, slide.under_tip_m(place_m, np.array([0.2]), **STILL), SQUARE)
+    still = slide.rigid_motion(place_m, slide.press_displacement_m(place_m, np.array([0.2]), **STILL), SQUARE)
     after = slide.apply(still, 0, moved.after)
     for found, expected in zip(after, moved.after, strict=True):
         assert np.array_equal(found, expected)
@@ -132,7 +132,7 @@ def test_without_give_and_slide_the_sliding_flow_is_what_it_was_to_the_last_bit(
 def test_every_dipole_turns_about_the_middle_and_moves_as_a_loop_says():
     rng = np.random.default_rng(1)
     nodes_m, moments = rng.normal(0, 5e-3, (7, 3)), rng.normal(0, 1e-6, (7, 3))
-    motion = slide.Slide(np.array([[0.0, 0.0], [3e-5, -2e-5]]), np.array([0.0, 0.2]))
+    motion = slide.RigidMotion(np.array([[0.0, 0.0], [3e-5, -2e-5]]), np.array([0.0, 0.2]))
     there_m, turned = slide.apply(motion, 1, (nodes_m, moments))
     turn = np.array([[np.cos(0.2), -np.sin(0.2), 0], [np.sin(0.2), np.cos(0.2), 0], [0, 0, 1]])
     for i in range(7):
@@ -162,7 +162,7 @@ def test_force_begins_as_hertz_has_it_and_has_no_end_as_the_layer_is_used_up():
     at_m = np.array([0.75 * H_M])
     assert slide.force_at(at_m, **of)[0] == pytest.approx(8 * layer.force(at_m, **of, base="slipping")[0])
     assert slide.depth_at(np.array([1e6]), **of)[0] == pytest.approx(slide.DEEPEST * H_M)
-    assert slide.beyond_n(np.array([1.0, 1e6]), **of) == 1
+    assert slide.count_clipped(np.array([1.0, 1e6]), **of) == 1
     assert slide.force_at(np.array([-1e-6]), **of)[0] == 0  # above the skin
     for wrong_m in (H_M, np.nan):
         with pytest.raises(ParamsError, match="poke: depth must be finite and below"):
@@ -175,4 +175,4 @@ def test_a_tip_sharper_than_the_layer_is_thick_is_followed_to_its_own_radius():
     of = {"thickness_m": H_M, "tip_radius_m": 0.5e-3, "modulus_Pa": 2e5}
     assert slide.depth_at(np.array([0.1]), **of)[0] < 0.5e-3
     assert slide.depth_at(np.array([1e6]), **of)[0] == pytest.approx(0.999 * 0.5e-3)
-    assert slide.beyond_n(np.array([1e-3, 1e6]), **of) == 1
+    assert slide.count_clipped(np.array([1e-3, 1e6]), **of) == 1

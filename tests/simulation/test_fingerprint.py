@@ -35,10 +35,10 @@ def test_another_setting_has_another_fingerprint(section, name, value):
 
 
 def test_another_law_has_another_fingerprint_and_rounding_has_not(monkeypatch):
-    rigid = slide.under_tip_m
-    monkeypatch.setattr(slide, "under_tip_m", lambda *of, **how: rigid(*of, **how) * (1 + 1e-12))
+    rigid = slide.press_displacement_m
+    monkeypatch.setattr(slide, "press_displacement_m", lambda *of, **how: rigid(*of, **how) * (1 + 1e-12))
     assert fingerprint(PARAMS) == TODAY
-    monkeypatch.setattr(slide, "under_tip_m", lambda *of, **how: rigid(*of, **how) * 1.02)
+    monkeypatch.setattr(slide, "press_displacement_m", lambda *of, **how: rigid(*of, **how) * 1.02)
     assert fingerprint(PARAMS) != TODAY
 
 

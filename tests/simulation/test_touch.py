@@ -127,7 +127,7 @@ def test_half_the_step_of_force_and_place_is_half_the_largest_step_of_the_field(
 
 def test_a_slide_that_is_taken_whole_at_first_contact_is_found_out(monkeypatch):
     board, skin = drawn("b0")
-    monkeypatch.setattr(slide, "gripped", lambda whole, *_: whole)
+    monkeypatch.setattr(slide, "limit_by_friction", lambda whole, *_: whole)
     place_m = (6e-3, 2e-3)
     coarse, fine = (
         largest_step_uT(board, skin, path(skin, (place_m, place_m), (0.5, 0.6), n), 0.4) for n in (STOPS_N, 2 * STOPS_N)

@@ -104,7 +104,7 @@ def edge(board: Board, skin: Skin) -> list[Case]:
         pokes_m[:, 2], modulus_Pa=1.0, thickness_m=skin.thickness_m, tip_radius_m=skin.tip_radius_m
     )
     load = np.minimum(force_N / (skin.modulus_Pa * skin.hold.lets_go_m2), 1.0)
-    asked_m = slide.under_tip_m(places_m, load, give_m=skin.hold.give_m, away=skin.hold.away)
+    asked_m = slide.press_displacement_m(places_m, load, give_m=skin.hold.give_m, away=skin.hold.away)
     went_m = slides.move_m + slides.spin_rad[:, None] * np.stack([-places_m[:, 1], places_m[:, 0]], axis=1)
     share = (went_m * asked_m).sum(axis=1) / (asked_m**2).sum(axis=1)
     off = float(np.abs(went_m - share[:, None] * asked_m).max() / np.abs(asked_m).max())
@@ -133,7 +133,7 @@ def force_control(skin: Skin) -> list[Case]:
     force_N = slide.force_at(depth_m, **of)
     off = float(np.abs(slide.depth_at(force_N, **of) - depth_m).max() / skin.thickness_m)
     beyond_N = force_N.max() * np.array([1.0, 2.0, 1e6])
-    held_m, counted_n = slide.depth_at(beyond_N, **of), slide.beyond_n(beyond_N, **of)
+    held_m, counted_n = slide.depth_at(beyond_N, **of), slide.count_clipped(beyond_N, **of)
     deepest = held_m / (slide.DEEPEST * skin.thickness_m)
     return [
         measured(AREA, f"pressed to {slide.DEEPEST:g} of the thickness by force, and let go",
