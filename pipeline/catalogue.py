@@ -21,7 +21,7 @@ class Experiment:
     `pipeline.experiments`, a study of the physics, or a part of the report. needs: experiments that a scene runs
     besides. protocol: the simulated protocol whose captures it reads; None: those of the main protocol. folds: the keys
     of section `split` that its folds are drawn with; None: it has no folds of its own. section: the scene's file holds
-    a section of settings, named as the stage.
+    a section of settings, named as the stage. key: its name in numbers.json, its own name unless given.
     """
 
     name: str
@@ -33,9 +33,11 @@ class Experiment:
     section: bool = False
     recorded: bool = True  # a scene of recordings may run it too
     alone: bool = False  # a scene may run it and nothing else: it needs no folds, and no places in mm
+    key: str = ""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "stage", self.stage or self.name)
+        object.__setattr__(self, "key", self.key or self.name)
 
 
 class Requirements(Strict):
@@ -44,7 +46,8 @@ class Requirements(Strict):
     kind: an analysis has results of its own; a study is about the physics, and the same for all simulated scenes.
     protocol: the simulated protocol whose captures it reads; None: those of the main protocol. needs: what the scene
     runs besides. settings: the scene holds a section of settings of its name. recorded: a scene of recordings may run
-    it. alone: a scene may run nothing else.
+    it. alone: a scene may run nothing else. key: the name of its results in numbers.json, if not the experiment's: an
+    experiment that is renamed keeps it.
     """
 
     kind: Literal["analysis", "study"] = "analysis"
@@ -53,6 +56,7 @@ class Requirements(Strict):
     settings: bool = False
     recorded: bool = False
     alone: bool = False
+    key: str = ""
 
 
 class ExperimentFile(Strict):
@@ -77,7 +81,8 @@ def experiment_rows() -> Iterator[Experiment]:
     for name, file in experiment_files().items():
         own = file.experiment
         yield Experiment(
-            name, own.kind, "", own.needs, own.protocol, section=own.settings, recorded=own.recorded, alone=own.alone
+            name, own.kind, "", own.needs, own.protocol, section=own.settings, recorded=own.recorded, alone=own.alone,
+            key=own.key,
         )
 
 

@@ -8,24 +8,25 @@ from typing import Any
 import pandas as pd
 
 from pipeline.catalogue import experiment_files
-from pipeline.scenes import ANALYSES
+from pipeline.scenes import ANALYSES, EXPERIMENTS
 from pipeline.stages import module_name
 
 
 def modules(numbers: Mapping[str, Any]) -> dict[str, ModuleType]:
-    """Import the module of each experiment that a report has numbers of."""
-    return {name: import_module(module_name(name)) for name in ANALYSES if name in numbers}
+    """Import the module of each experiment with results in numbers.json, by its key there."""
+    keys = {name: EXPERIMENTS[name].key for name in ANALYSES}
+    return {key: import_module(module_name(name)) for name, key in keys.items() if key in numbers}
 
 
 def experiment_tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     """Make the tables of every experiment that was asked."""
-    made = [module.tables(numbers[name], source) for name, module in modules(numbers).items()]
+    made = [module.tables(numbers[key], source) for key, module in modules(numbers).items()]
     return {name: table for tables in made for name, table in tables.items()}
 
 
 def experiment_figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
     """Draw the figures of every experiment that was asked."""
-    made = [module.figures(numbers[name], drawn[name], source) for name, module in modules(numbers).items()]
+    made = [module.figures(numbers[key], drawn[key], source) for key, module in modules(numbers).items()]
     return {name: text for figures in made for name, text in figures.items()}
 
 

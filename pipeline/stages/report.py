@@ -40,7 +40,7 @@ from pipeline.report.numbers import (
 from pipeline.report.page import index, page, run_page
 from pipeline.report.parts import experiment_figures
 from pipeline.report.tables import make_tables, table_texts
-from pipeline.scenes import TABLE_2, SceneExperiments, experiments_of, stages
+from pipeline.scenes import EXPERIMENTS, TABLE_2, SceneExperiments, experiments_of, stages
 from pipeline.settings import Settings
 from pipeline.stage import say
 from pipeline.statistics import tidy, to_csv
@@ -160,7 +160,7 @@ def read_cards(asked: SceneExperiments, models: Path) -> list[dict[str, Any]]:
 def read_numbers(
     settings: Settings, asked: SceneExperiments, at: Places
 ) -> tuple[dict[str, Any], dict[str, Any], pd.DataFrame]:
-    """Read what numbers.json says, by experiment what only its figures show, and the table of scores."""
+    """Read the content of numbers.json, what only figures show (by key in numbers.json), and the table of scores."""
     folds, cards = io.read_json(at.folds), read_cards(asked, at.models)
     accounts = [io.read_account(at.indentations / f"{name}.parquet") for name in folds["captures"]]
 
@@ -168,26 +168,27 @@ def read_numbers(
         return {name: io.read_json(at.results / f"{name}.json") for name in names}
 
     points = {experiment: read([stage])[stage] for experiment, stage in asked.curves.items()}
-    experiments, table = read(asked.analyses), tidy(cards, points)
+    results, table = read(asked.analyses), tidy(cards, points)
+    by_key = {EXPERIMENTS[name].key: result for name, result in results.items()}
+    studies = {EXPERIMENTS[name].key: result for name, result in read(asked.studies).items()}
     costs = {unit: cost for unit, cost in read_costs(COSTS / settings.scene).items() if asked.runs(unit)}
     took = {file.stem: io.read_json(file) for file in sorted((SECONDS / settings.scene).glob("*.json"))}
     numbers = {
         "provenance": _provenance(settings, asked, cards, costs),
         **compose(table, accounts, folds["dropped"], headline=HEADLINE),
         **foretold([io.read_table(at.models / arm / SCORED) for arm in asked.modelled if arm == "train_single"]),
-        "trainings": count_trainings(cards, points, experiments),
+        "trainings": count_trainings(cards, points, by_key),
         "described": {asked.described: io.read_json(at.results / "described.json")},
         **read([experiment for experiment in ("audit",) if experiment in asked.experiments]),
-        **{experiment: answer["numbers"] for experiment, answer in experiments.items()},
-        **answered(read(asked.studies), runtime(len(cards), costs), took),
+        **{key: result["numbers"] for key, result in by_key.items()},
+        **answered(studies, runtime(len(cards), costs), took),
     }
     if asked.source == "simulated":
-        losses = {experiment: answer["losses"] for experiment, answer in experiments.items()}
-        numbers["capture_by_protocol"] = lost_by_protocol(losses)
+        numbers["capture_by_protocol"] = lost_by_protocol({name: result["losses"] for name, result in results.items()})
     if "choice" in asked.experiments:
         numbers["chosen"] = choose(cards)
     numbers["runtime"] |= timed_learning(numbers, took)
-    return rounded(numbers), {experiment: answer["drawn"] for experiment, answer in experiments.items()}, table
+    return rounded(numbers), {key: result["drawn"] for key, result in by_key.items()}, table
 
 
 def _provenance(
