@@ -1,14 +1,12 @@
-"""Makes the model that comes with the project: its map, its network, and how sure they are -> `twin.shipped`'s file.
+"""Make the universal model that `reskin` ships: `python -m pipeline.training.shipping`, a few minutes on one core.
 
-    python -m pipeline.training.shipping
-
-The network is that which scene lab tests as the one that knows no board: the same lessons, the same seed. How sure both
-are is told as for that test, on the model as it is used. Refuses to know recordings.
+Writes reskin/universal/universal.safetensors and its card. The network has the training settings and the seed of scene
+lab, which tests it as `universal, simulated alone`. The likelihood powers are calibrated on simulated skins.
 """
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +27,7 @@ from pipeline.training.universal import (
 from reskin.config import parse, read_yaml
 from reskin.data.grid import CENTRE_MM
 from reskin.physics.skin import SkinDesign
+from reskin.simulation import defaults
 from reskin.universal.calibration import LikelihoodPowers, lower_by_misfit, lower_by_residuals
 from reskin.universal.law import CHIPS_MM, Setup, to_chips
 from reskin.universal.map import NOMINAL, OF_NOMINAL, tabulate
@@ -104,22 +103,40 @@ def _coverage(
     return np.column_stack([held, held])
 
 
-def make() -> None:
-    """Make the file anew, of the skin of params.yaml over the paper's board: some minutes."""
-    design = parse(SkinDesign, read_yaml(Path("params.yaml"))["skin"], "params.yaml: skin")
+@dataclass(frozen=True)
+class Inputs:
+    """What the shipped model is made from."""
+
+    setup: Setup
+    lessons: Lessons
+    labels_n: tuple[int, ...]
+    seed: int
+
+
+def read_inputs(scene: Path = Path("pipeline/scenes/lab.yaml")) -> Inputs:
+    """Read the nominal skin, placed on the paper's board, and the training settings of a scene."""
+    design = parse(SkinDesign, defaults.nominal("skin"), f"{defaults.NOMINAL}: skin")
     setup = Setup(design, np.array(CHIPS_MM), NOMINAL.gap_mm, SKIN_MM, design.flipped, design.tip_radius_mm)
-    scene = read_yaml(Path("pipeline/scenes/lab.yaml"))
-    lessons = {name: scene["universal"][name] for name in Lessons.model_fields}
+    settings = read_yaml(scene)
+    training = {name: settings["universal"][name] for name in Lessons.model_fields}
+    lessons = parse(Lessons, training, f"{scene}: universal")
+    return Inputs(setup, lessons, tuple(settings["universal"]["labels_n"]), settings["seed"])
+
+
+def make() -> None:
+    """Make the model anew and overwrite its file and card."""
+    inputs = read_inputs()
     times_s = [time.process_time()]
-    tables = tabulate(NOMINAL, OF_NOMINAL, setup)
+    tables = tabulate(NOMINAL, OF_NOMINAL, inputs.setup)
     times_s.append(time.process_time())
-    syllabus = Syllabus(NAMELESS, NOMINAL, OF_NOMINAL, setup)
-    networks = teach(syllabus, parse(Lessons, lessons, "pipeline/scenes/lab.yaml: universal"), scene["seed"])
+    syllabus = Syllabus(NAMELESS, NOMINAL, OF_NOMINAL, inputs.setup)
+    networks = teach(syllabus, inputs.lessons, inputs.seed)
     times_s.append(time.process_time())
-    sureness = tell_sureness(Experts(tables, networks, None, syllabus), scene["universal"]["labels_n"], scene["seed"])
+    sureness = tell_sureness(Experts(tables, networks, None, syllabus), inputs.labels_n, inputs.seed)
     times_s.append(time.process_time())
     took_s = dict(zip(("map", "network", "sureness"), np.diff(times_s).round().tolist(), strict=True))
-    write(tables, networks, sureness, CARD | {"lessons": lessons | {"seed": scene["seed"]}, "made_in_s": took_s})
+    lessons = inputs.lessons.model_dump() | {"seed": inputs.seed}
+    write(tables, networks, sureness, CARD | {"lessons": lessons, "made_in_s": took_s})
 
 
 if __name__ == "__main__":

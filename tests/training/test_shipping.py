@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.training import shipping
-from pipeline.training.shipping import shown, tell_sureness
+from pipeline.training.shipping import read_inputs, shown, tell_sureness
 from pipeline.training.universal import SURENESS, Experts, by_own_labels, read_both, ready, told_of
 from reskin.seeds import rng_for
 from reskin.universal.calibration import LikelihoodPowers
@@ -12,7 +12,7 @@ from reskin.universal.map import NOMINAL, OF_NOMINAL
 from reskin.universal.model import Universal, load_universal
 from reskin.universal.population import POKES_N, Population
 from reskin.universal.training import Syllabus
-from tests.universal.skins import SETUP
+from tests.universal.skins import DESIGN, SETUP
 
 
 @pytest.fixture
@@ -71,3 +71,10 @@ def test_sureness_is_told_for_every_number_of_pokes_and_labels(model, monkeypatc
     assert {n: set(of) for n, of in found.anywhere.items()} == {n: {0, 10} for n in (0, 12, 65)}
     assert {*found.even.values(), *(one for of in found.anywhere.values() for one in of.values())} <= set(SURENESS)
     assert found == LikelihoodPowers.from_card(found.to_card())
+
+
+def test_the_shipped_model_is_made_from_the_nominal_skin_and_the_settings_of_scene_lab(model):
+    inputs = read_inputs()
+    assert inputs.setup.design == DESIGN.model_copy(update={"tip_radius_mm": inputs.setup.tip_radius_mm})
+    assert inputs.lessons.model_dump() | {"seed": inputs.seed} == model.card["lessons"]
+    assert set(inputs.labels_n) == set(model.powers.even)
