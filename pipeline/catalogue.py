@@ -81,7 +81,14 @@ def experiment_rows() -> Iterator[Experiment]:
     for name, file in experiment_files().items():
         own = file.experiment
         yield Experiment(
-            name, own.kind, "", own.needs, own.protocol, section=own.settings, recorded=own.recorded, alone=own.alone,
+            name,
+            own.kind,
+            "",
+            own.needs,
+            own.protocol,
+            section=own.settings,
+            recorded=own.recorded,
+            alone=own.alone,
             key=own.key,
         )
 

@@ -113,13 +113,16 @@ def test_an_experiment_that_is_switched_off_takes_its_section_and_its_captures_a
 
 
 @pytest.mark.parametrize(
-    "unit", ["train_multi", "drift", "simulate-wear", "ingest_simulated-wear", "simulate", "report", "left_out"]
+    "unit",
+    ["train_multi", "drift", "simulate-wear", "ingest_simulated-wear", "simulate", "report", "neglected_effects"],
 )
 def test_what_a_stage_cost_counts_as_long_as_its_experiment_is_asked(unit):
     own = read_yaml(ROOT / "pipeline/scenes/ci.yaml")
     assert parse_scene(own, "ci.yaml").runs(unit)
     gone = ("drift", "variation")
-    own["experiments"] = [experiment for experiment in own["experiments"] if experiment not in (*gone, "left_out")]
+    own["experiments"] = [
+        experiment for experiment in own["experiments"] if experiment not in (*gone, "neglected_effects")
+    ]
     own = {name: section for name, section in own.items() if name not in gone}
     own["simulate"]["protocols"].pop("wear")
     left = parse_scene(own, "ci.yaml")

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 
 from pipeline import scenes
-from pipeline.experiments.left_out import left_out_table
+from pipeline.experiments.neglected_effects import neglected_effects_table
 from pipeline.report.checklist import checklist, claims_table
 from pipeline.report.formatting import (
     COLUMNS,
@@ -179,7 +179,8 @@ def make_tables(numbers: Numbers) -> dict[str, pd.DataFrame]:
     makers: dict[str, Callable[[Any, str], pd.DataFrame]] = {
         "sweep_pokes": sweep_pokes_table, "sweep_sensors": sweep_sensors_table, "baselines": baselines_table,
         "audit": audit_table, "chosen": chosen_table, "verification": verification_table,
-        "stability": stability_table, "left_out": left_out_table, "trainings": _trainings, "variants": _variants,
+        "stability": stability_table, "left_out": neglected_effects_table, "trainings": _trainings,
+        "variants": _variants,
     }  # fmt: skip
     tables |= {name: make(numbers[name], source) for name, make in makers.items() if name in numbers}
     if "labels" in numbers:

@@ -1,4 +1,4 @@
-"""What the physics leaves out, and what that costs."""
+"""Effects that the simulation neglects, and the error of each on the field and the force."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -19,10 +19,9 @@ from pipeline.synthesis import synthesis_of
 from reskin import io
 from reskin.data.grid import CENTRE_MM
 from reskin.physics import aging, chip, deformation, layer, magnet
-from reskin.physics import magnet as nodes
 from reskin.physics.aging import Ageing, Memory, Relaxation
 from reskin.physics.board import Board, draw_board
-from reskin.physics.magnet import change_of_field
+from reskin.physics.magnet import Quadrature, change_of_field
 from reskin.physics.shear import Friction
 from reskin.physics.skin import Skin, beyond_verified_n, changes_of_field, draw_skin, forces, moved_dipoles
 from reskin.seeds import rng_for
@@ -31,36 +30,36 @@ from reskin.simulation.contact import Response, Terms, push, respond
 from reskin.simulation.protocols import Plan
 from reskin.simulation.settings import MAIN, Synthesis
 
-# Sizes of the terms that a scene leaves out: the design values of PHYSICS 5 (assumed there).
+# Sizes of effects that a scene may neglect: the design values of PHYSICS 5 (assumed there).
 AGEING = Ageing(settling=0.10, ageing=0.01, fading_per_decade=0.005, wandering_uT=0.2)
 RELAXATION = Relaxation(approach_s=0.5, hold_s=0.5)
 MEMORY = Memory(share=(0.11, 0.1), tau_s=(5.0, 60.0), contact_s=5.0, rest_s=1.0)
 WARMER_K = 1.0
-EARTH_T = np.array([20e-6, 0.0, -45e-6])  # some place of middle latitude
-PLACES_M = ((4e-3, 2e-3), (-6e-3, 4e-3))  # pokes for what moves inside the skin: flank and edge
-BOXES = nodes.Quadrature(cell_m=1.5e-3, layers_n=3)  # whose own field is summed
+EARTH_T = np.array([20e-6, 0.0, -45e-6])  # at a middle latitude
+PLACES_M = ((4e-3, 2e-3), (-6e-3, 4e-3))  # indentations for effects inside the skin: flank and edge
+BOXES = Quadrature(cell_m=1.5e-3, layers_n=3)  # of the powder's own field
 FRICTION = Friction(coefficient=0.8)  # 0.5-1.2, assumed (PHYSICS 4)
 FEW = 5
-COARSE = nodes.Quadrature(cell_m=1.2e-3, layers_n=4)  # where every node is followed by itself, or is a box of its own
+COARSE = Quadrature(cell_m=1.2e-3, layers_n=4)  # where every node is followed by itself
 
 
 @dataclass(frozen=True)
-class Omission:
-    """One term: rms error of the change of field and of the force in %, largest error of the field at rest in uT."""
+class Effect:
+    """One effect: rms error of dB and of the force in %, and largest error of the no-load field in uT, without it."""
 
     term: str
-    done: str  # "left out", "kept"
+    done: str  # by the main protocol: "left out" or "kept"
     field_pct: float | None
     rest_uT: float | None
     force_pct: float | None
     how: str
-    left_out_by: tuple[str, ...] = ()  # protocols; none of a term that is no protocol's to ask for
+    left_out_by: tuple[str, ...] = ()  # protocols; empty for effects that are no term of a protocol
     computed_by: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class Subject:
-    """What everything is measured on: the first skin of the main protocol, and that protocol."""
+    """The first skin of the main protocol, on which everything is measured, and that protocol."""
 
     board: Board
     skin: Skin
@@ -70,27 +69,27 @@ class Subject:
     used: tuple[str, ...]
 
 
-def measure(of: Synthesis, *, seed: int) -> list[Omission]:
-    """Measure every term of PHYSICS 8 on a scene."""
-    subject = _subject(of, seed)
-    without = _feel(subject, Terms(), seed)
+def measure(of: Synthesis, *, seed: int) -> list[Effect]:
+    """Measure every effect of PHYSICS 8 on a scene."""
+    subject = _make_subject(of, seed)
+    without = _simulate(subject, Terms(), seed)
     of_protocols = *_over_time(subject, without, seed), _temperature(subject, without), _friction(subject)
     return [
-        *(_by_protocol(omission, of) for omission in of_protocols),
+        *(_by_protocol(effect, of) for effect in of_protocols),
         _earth(without), *_hold(subject), *_inside(subject), *_free_edge(subject), _steps(without, of),
         _own_field(subject, of), _too_deep(of, seed),
     ]  # fmt: skip
 
 
-def _by_protocol(omission: Omission, of: Synthesis) -> Omission:
-    """Name the protocols that leave a term out, and those that compute it."""
-    computed = tuple(name for name, protocol in of.protocols.items() if omission.term in protocol.terms)
+def _by_protocol(effect: Effect, of: Synthesis) -> Effect:
+    """Add the protocols that neglect an effect, and those that compute it."""
+    computed = tuple(name for name, protocol in of.protocols.items() if effect.term in protocol.terms)
     return replace(
-        omission, left_out_by=tuple(name for name in of.protocols if name not in computed), computed_by=computed
+        effect, left_out_by=tuple(name for name in of.protocols if name not in computed), computed_by=computed
     )
 
 
-def _subject(of: Synthesis, seed: int) -> Subject:
+def _make_subject(of: Synthesis, seed: int) -> Subject:
     kind, (board, skin) = of.main_boards, roster(of, MAIN)[0]
     plan = of.main.plan(rng_for(seed, "left out"), kind.skin_mm)
     tip_mm = np.stack([plan.x_mm - CENTRE_MM, plan.y_mm - CENTRE_MM, plan.depth_mm], axis=2)
@@ -104,8 +103,8 @@ def _subject(of: Synthesis, seed: int) -> Subject:
     )
 
 
-def _over_time(on: Subject, without: Response, seed: int) -> list[Omission]:
-    """Feel the whole protocol with a term, and compare with what was felt without."""
+def _over_time(on: Subject, without: Response, seed: int) -> list[Effect]:
+    """Simulate the whole protocol with a term, and compare with the simulation without."""
     n, slack = len(on.plan), RELAXATION
     rows = []
     for name, terms, how in (
@@ -113,42 +112,42 @@ def _over_time(on: Subject, without: Response, seed: int) -> list[Omission]:
         ("relaxation", Terms(relaxation=slack), f"{slack.approach_s:g} s down, held for {slack.hold_s:g} s"),
         ("memory", Terms(memory=MEMORY), f"pokes held for {MEMORY.contact_s:g} s, {MEMORY.rest_s:g} s between them"),
     ):
-        felt = _feel(on, terms, seed)
-        rest_uT = np.abs(felt.rest_T[-1] - without.rest_T[-1]).max() / micro
-        force_pct = _error_pct(without.force_N[-1], felt.force_N[-1])
-        field_pct = _error_pct(without.change_T, felt.change_T)
-        rows.append(Omission(name, _done(name, on), field_pct, float(rest_uT), force_pct, how))
+        simulated = _simulate(on, terms, seed)
+        rest_uT = np.abs(simulated.rest_T[-1] - without.rest_T[-1]).max() / micro
+        force_pct = _error_pct(without.force_N[-1], simulated.force_N[-1])
+        field_pct = _error_pct(without.change_T, simulated.change_T)
+        rows.append(Effect(name, _status(name, on), field_pct, float(rest_uT), force_pct, how))
     return rows
 
 
-def _temperature(on: Subject, without: Response) -> Omission:
+def _temperature(on: Subject, without: Response) -> Effect:
     factor = aging.remanence(np.array([WARMER_K]))[0]
     rest_uT = float(np.abs((factor - 1) * without.rest_T).max() / micro)
     field_pct = _error_pct(without.change_T, factor * without.change_T)
     how = f"{WARMER_K:g} K warmer, a no-load reading before each contact"
-    return Omission("temperature", _done("temperature", on), field_pct, rest_uT, 0.0, how)
+    return Effect("temperature", _status("temperature", on), field_pct, rest_uT, 0.0, how)
 
 
-def _friction(on: Subject) -> Omission:
+def _friction(on: Subject) -> Effect:
     tip_m, pressed = on.tip_m[:FEW], changes_of_field(on.board, on.skin, on.tip_m[:FEW].reshape(-1, 3))[1]
     pushed = push(on.board, on.skin, tip_m, tilt=on.plan.tilt[:FEW], how=FRICTION)
     field_pct = _error_pct(pressed.reshape(pushed.change_T.shape), pushed.change_T)
     force_pct = 100 * float(np.abs(pushed.force_N).max() / forces(on.skin, tip_m[..., 2].ravel()).max())
     how = f"coefficient {FRICTION.coefficient:g}, {FEW} indentations of the protocol: nothing moves sideways"
-    return Omission("friction", _done("friction", on), field_pct, 0.0, force_pct, how)
+    return Effect("friction", _status("friction", on), field_pct, 0.0, force_pct, how)
 
 
-def _earth(without: Response) -> Omission:
-    """Add a steady field to no-load reading and contact alike, and take one from the other."""
+def _earth(without: Response) -> Effect:
+    """Add a steady field to no-load reading and contact, and subtract one from the other."""
     rest_T = without.rest_T[:, None] + EARTH_T
     seen_T = (rest_T + without.change_T) - rest_T
     how = "a steady field, as long as the board does not turn; a no-load reading before each contact"
     rest_uT = float(np.abs(EARTH_T).max() / micro)
-    return Omission("the earth's field", "left out", _error_pct(without.change_T, seen_T), rest_uT, 0.0, how)
+    return Effect("the earth's field", "left out", _error_pct(without.change_T, seen_T), rest_uT, 0.0, how)
 
 
-def _hold(on: Subject) -> list[Omission]:
-    """Let an endless layer slide freely, and press it as a linear elastic one."""
+def _hold(on: Subject) -> list[Effect]:
+    """Compare with an infinite layer that slides freely and whose force is linear elasticity's."""
     if on.skin.hold is None:
         return []
     free, deepest_m = replace(on.skin, hold=None), np.array([on.tip_m[..., 2].max()])
@@ -158,11 +157,11 @@ def _hold(on: Subject) -> list[Omission]:
     how = (
         f"an endless layer that slides freely, its force linear elasticity's; {FEW} indentations, force at the deepest"
     )
-    return [Omission("the base's hold", "kept", _error_pct(free_T, held_T), 0.0, force_pct, how)]
+    return [Effect("the base's hold", "kept", _error_pct(free_T, held_T), 0.0, force_pct, how)]
 
 
-def _free_edge(on: Subject) -> list[Omission]:
-    """Let a sliding skin end: a free disc stretches by c r / 3 R^2 on top of the c / r of an endless one."""
+def _free_edge(on: Subject) -> list[Effect]:
+    """Compare with a finite skin: a free disc stretches by c r / 3 R^2 on top of the c / r of an infinite layer."""
     if on.skin.base == "bonded":
         return []
     depth_m = float(on.tip_m[..., 2].max())
@@ -176,11 +175,11 @@ def _free_edge(on: Subject) -> list[Omission]:
     endless_T = change_of_field(before, after, on.board.chips_m)
     ended_T = change_of_field(before, (stretched_m, after[1]), on.board.chips_m)
     how = f"a free disc of {2 * edge_m / milli:g} mm, plane stress, poked in its middle to {depth_m / milli:.2g} mm"
-    return [Omission("the skin's free edge", "left out", _error_pct(endless_T, ended_T), 0.0, None, how)]
+    return [Effect("the skin's free edge", "left out", _error_pct(endless_T, ended_T), 0.0, None, how)]
 
 
-def _inside(on: Subject) -> list[Omission]:
-    """Move the material of a few pokes as the scene does, and as it would without one part of the physics."""
+def _inside(on: Subject) -> list[Effect]:
+    """Deform the material of a few indentations as the scene does, and without one part of the physics."""
     skin, depth_m = on.skin, float(on.tip_m[..., 2].max()) + on.skin.depth_zero_m
     base: layer.Base = "bonded" if skin.base == "slipping" else "slipping"
     press = layer.IndentedLayer(skin.thickness_m, skin.tip_radius_m, skin.base)
@@ -200,7 +199,7 @@ def _inside(on: Subject) -> list[Omission]:
     }  # fmt: skip
     true_T, pokes = _change(on, true), f"{len(PLACES_M)} pokes of {depth_m / milli:.2g} mm"
     return [
-        Omission(term, "kept", _error_pct(_change(on, moved), true_T), 0.0, force_pct, f"{how}; {pokes}")
+        Effect(term, "kept", _error_pct(_change(on, moved), true_T), 0.0, force_pct, f"{how}; {pokes}")
         for term, (moved, force_pct, how) in cases.items()
     ]
 
@@ -209,7 +208,7 @@ Moved = tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"], Float[np.ndarray
 
 
 def _flow(on: Subject, depth_m: float, press: layer.IndentedLayer) -> list[Moved]:
-    """Follow the material from every place at once: the same pressures carry it."""
+    """Follow the material under all indentations at once: the pressures are the same."""
     r_m = np.concatenate([np.hypot(*(on.coarse.nodes_m[:, :2] - place_m).T) for place_m in PLACES_M])
     z_m = np.tile(on.coarse.nodes_m[:, 2], len(PLACES_M))
     end = deformation.follow(r_m, z_m, deformation.depth_steps((depth_m,), press), press=press)[-1]
@@ -224,7 +223,7 @@ def _one_shot(on: Subject, place_m: tuple[float, float], depth_m: float, press: 
 
 
 def _change(on: Subject, moved: Sequence[Moved]) -> Float[np.ndarray, "p k 3"]:
-    """Sum what the material of each poke changes."""
+    """Return dB at the chips for the moved material of each indentation."""
     skin, changes_T = on.coarse, []
     for place_m, (moved_r_m, moved_z_m, angle_rad) in zip(PLACES_M, moved, strict=True):
         away_m = skin.nodes_m[:, :2] - place_m
@@ -237,15 +236,15 @@ def _change(on: Subject, moved: Sequence[Moved]) -> Float[np.ndarray, "p k 3"]:
     return np.array(changes_T)
 
 
-def _steps(without: Response, of: Synthesis) -> Omission:
+def _steps(without: Response, of: Synthesis) -> Effect:
     change_uT = without.change_T / micro
     step_uT = chip.steps_uT(of.chip.gain_sel)
     share = np.sqrt((step_uT**2 / 12).mean() / (change_uT**2).mean())
-    return Omission("the chips' steps", "kept", float(100 * share), float(step_uT.max() / 2), 0.0, "rounding alone")
+    return Effect("the chips' steps", "kept", float(100 * share), float(step_uT.max() / 2), 0.0, "rounding alone")
 
 
-def _own_field(on: Subject, of: Synthesis) -> Omission:
-    """Let the powder feel the field that it makes itself, once, and see what that changes (boxes, magpylib)."""
+def _own_field(on: Subject, of: Synthesis) -> Effect:
+    """Magnetise the powder by its own field too, to first order (boxes, magpylib)."""
     rest = midpoints(on.skin.thickness_m, BOXES)
     b_T = magnet.array_field(rest.nodes_m, on.skin.thickness_m, of.skin.polarity)
     sizes = {"saturation_T": of.skin.saturation_T, "half_field_T": of.skin.half_field_T}
@@ -253,7 +252,7 @@ def _own_field(on: Subject, of: Synthesis) -> Omission:
     away_m = (rest.nodes_m[:, None] - rest.nodes_m).reshape(-1, 3)
     boxes_m = np.tile(box_m(on.skin.thickness_m, BOXES), (boxes_n**2, 1))
     own_T = magnet_cuboid_Bfield(away_m, boxes_m, np.tile(j_T, (boxes_n, 1))).reshape(boxes_n, boxes_n, 3).sum(axis=1)
-    with_own_T = magnet.magnetise(b_T + own_T - j_T, **sizes)  # B less J, mu0 H, is what acts on the powder
+    with_own_T = magnet.magnetise(b_T + own_T - j_T, **sizes)  # mu0 H = B - J acts on the powder
     pokes_m = np.array([(*place_m, float(on.tip_m[..., 2].max())) for place_m in PLACES_M])
     nodes_m = rest.nodes_m + np.append(on.skin.seat_m, 0.0)
     moments_A_m2 = [magnet.moments(each_T, rest.volumes_m3) for each_T in (j_T, with_own_T)]
@@ -262,23 +261,23 @@ def _own_field(on: Subject, of: Synthesis) -> Omission:
     how = (
         f"{boxes_n} boxes, first order, {len(PLACES_M)} pokes; of the magnetisation {_error_pct(j_T, with_own_T):.2g} %"
     )
-    return Omission("the powder's own field", "left out", _error_pct(*changes_T), None, 0.0, how)
+    return Effect("the powder's own field", "left out", _error_pct(*changes_T), None, 0.0, how)
 
 
-def _too_deep(of: Synthesis, seed: int) -> Omission:
-    """Count, over all skins, the stops that are deeper than any published solution vouches for."""
+def _too_deep(of: Synthesis, seed: int) -> Effect:
+    """Count, over all skins, the stops beyond the depths of published solutions."""
     depth_m = milli * of.main.plan(rng_for(seed, "left out"), of.main_boards.skin_mm).depth_mm.ravel()
     skins = [draw_skin(of.skin, of.spreads, seed=seed, name=skin, rule=COARSE) for _, skin in roster(of, MAIN)]
     share_pct = 100 * sum(beyond_verified_n(skin, depth_m) for skin in skins) / (len(depth_m) * len(skins))
     how = f"{share_pct:.3g} % of the stops of {len(skins)} skins are past 0.6 of the thickness: nothing published there"
-    return Omission("depths past 0.6 of the thickness", "kept", None, None, None, how)
+    return Effect("depths past 0.6 of the thickness", "kept", None, None, None, how)
 
 
-def _feel(on: Subject, terms: Terms, seed: int) -> Response:
+def _simulate(on: Subject, terms: Terms, seed: int) -> Response:
     return respond(on.board, on.skin, on.tip_m, tilt=on.plan.tilt, terms=terms, rng=rng_for(seed, "left out", "walk"))
 
 
-def _done(term: str, on: Subject) -> str:
+def _status(term: str, on: Subject) -> str:
     return "kept" if term in on.used else "left out"
 
 
@@ -286,29 +285,28 @@ def _error_pct(without: Float[np.ndarray, "..."], true: Float[np.ndarray, "..."]
     return float(100 * np.linalg.norm(without - true) / np.linalg.norm(true))
 
 
-def left_out(settings: Settings, results: Path) -> None:
-    """Measure every term on the scene's own first skin, and name the protocols that do without it."""
+def neglected_effects(settings: Settings, results: Path) -> None:
+    """Measure every effect on the scene's first skin, and name the protocols that neglect it."""
     of, seed = synthesis_of(settings), settings.seed
-    omissions = measure(of, seed=seed)
-    io.write_json(results, [asdict(omission) for omission in omissions])
-    left = ", ".join(omission.term for omission in omissions if omission.done == "left out")
-    say(f"{settings.scene}: left out by the main protocol, and measured: {left}")
+    effects = measure(of, seed=seed)
+    io.write_json(results, [asdict(effect) for effect in effects])
+    left = ", ".join(effect.term for effect in effects if effect.done == "left out")
+    say(f"{settings.scene}: neglected by the main protocol, and measured: {left}")
 
 
 MEANING = (
-    "Errors that leaving a term out makes, measured on this scene's first skin under the main protocol, whichever "
-    "protocols leave it out: of all changes of field together (root "
-    "of the mean square), the largest of the field at rest before the no-load reading is taken off, and of the force. "
-    "Not quantified, and always left out: the skin's corner tabs, and its screws one by one: all of it is held alike."
+    "Error of neglecting each effect, measured on this scene's first skin under the main protocol, whichever protocols "
+    "neglect it: root mean square of all changes of field, relative; the largest of the no-load field, before it is "
+    "subtracted; the force. Always neglected and not quantified: the skin's corner tabs, and its screws one by one."
 )
 
 
-def left_out_table(rows: Sequence[Mapping[str, Any]], source: str) -> pd.DataFrame:
-    """Show every term and the protocols that leave it out; what the main protocol leaves out first."""
+def neglected_effects_table(rows: Sequence[Mapping[str, Any]], source: str) -> pd.DataFrame:
+    """Tabulate every effect and the protocols that neglect it; those that the main protocol neglects first."""
     ordered = sorted(rows, key=lambda row: row["done"] != "left out")
     table = pd.DataFrame(
         {
-            "term": row["term"],
+            "effect": row["term"],
             "in this scene": _where(row),
             "error of the change of field, %": _show(row["field_pct"]),
             "error of the field at rest, µT": _show(row["rest_uT"]),
@@ -323,8 +321,9 @@ def left_out_table(rows: Sequence[Mapping[str, Any]], source: str) -> pd.DataFra
 
 
 def _where(row: Mapping[str, Any]) -> str:
-    by = {"left out": row["left_out_by"], "computed": row["computed_by"]}
-    return "; ".join(f"{what}: {', '.join(protocols)}" for what, protocols in by.items() if protocols) or row["done"]
+    by = {"neglected": row["left_out_by"], "computed": row["computed_by"]}
+    shown = "; ".join(f"{what}: {', '.join(protocols)}" for what, protocols in by.items() if protocols)
+    return shown or row["done"].replace("left out", "neglected")
 
 
 def _show(value: float | None) -> str:

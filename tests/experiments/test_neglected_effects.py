@@ -1,10 +1,10 @@
-"""What leaving physics out costs, against closed forms of the terms; what scales with what as laws."""
+"""Errors of neglected effects against closed forms of the terms, and how they scale."""
 
 import numpy as np
 import pytest
 
-from pipeline.experiments import left_out
-from pipeline.experiments.left_out import AGEING, RELAXATION, measure
+from pipeline.experiments import neglected_effects
+from pipeline.experiments.neglected_effects import AGEING, RELAXATION, measure
 from reskin.physics.aging import force_left, softening
 from reskin.physics.board import draw_board
 from reskin.physics.magnet import Quadrature
@@ -19,7 +19,7 @@ INDENTATIONS_N = 130
 @pytest.fixture(autouse=True, scope="module")
 def few_nodes():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(left_out, "COARSE", Quadrature(2e-3, 3))
+        patch.setattr(neglected_effects, "COARSE", Quadrature(2e-3, 3))
         yield
 
 
@@ -35,11 +35,11 @@ def rows(few_nodes):
 
 @pytest.fixture
 def not_inside(monkeypatch):
-    """Do not follow material inside the skin, which takes most of the time and is the same for any other term."""
-    monkeypatch.setattr(left_out, "_inside", lambda on: [])
+    """Skip the effects inside the skin, which take most of the time."""
+    monkeypatch.setattr(neglected_effects, "_inside", lambda on: [])
 
 
-def test_terms_that_a_scene_does_without_are_left_out_and_others_are_kept(rows, not_inside):
+def test_effects_that_the_main_protocol_neglects(rows, not_inside):
     assert {term for term, row in rows.items() if row.done == "left out"} == {
         "ageing", "relaxation", "memory", "temperature", "friction", "the earth's field", "the skin's free edge",
         "the powder's own field",
@@ -49,7 +49,7 @@ def test_terms_that_a_scene_does_without_are_left_out_and_others_are_kept(rows, 
     assert aged["ageing"].done == "kept"
 
 
-def test_a_term_names_the_protocols_that_leave_it_out_and_those_that_compute_it(rows, not_inside):
+def test_each_effect_lists_the_protocols_that_neglect_and_compute_it(rows, not_inside):
     wear = FEW | {"skins_n": 1, "terms": ["ageing"]}
     found = rows_of(with_protocol("wear", wear, protocols={"grid": FEW, "wear": wear}, terms={"ageing": SIZES}))
     assert (found["ageing"].left_out_by, found["ageing"].computed_by) == (("grid",), ("wear",))
@@ -59,14 +59,14 @@ def test_a_term_names_the_protocols_that_leave_it_out_and_those_that_compute_it(
     assert found["the powder's own field"].left_out_by == found["the chips' steps"].computed_by == ()
 
 
-def test_ageing_and_relaxation_cost_the_force_what_their_formulas_say(rows):
+def test_errors_of_the_force_without_ageing_and_relaxation(rows):
     left = softening(np.array([INDENTATIONS_N - 1]), settling=AGEING.settling, ageing=AGEING.ageing)[0]
     assert rows["ageing"].force_pct == pytest.approx(100 * (1 / left - 1), rel=1e-9)
     assert rows["relaxation"].force_pct == pytest.approx(100 * (1 / force_left(RELAXATION) - 1), rel=1e-9)
     assert rows["ageing"].field_pct == rows["relaxation"].field_pct == 0  # displacement is prescribed (PHYSICS 0)
 
 
-def test_a_kelvin_costs_0_12_percent_of_every_field(rows):
+def test_one_kelvin_changes_every_field_by_0_12_percent(rows):
     of = synthesis()
     board = draw_board(of.main_boards.design, of.spreads, seed=1, name="b0")
     skin = draw_skin(of.skin, of.spreads, seed=1, name="b0_s0", rule=of.main_boards.quadrature.quadrature())
@@ -75,12 +75,12 @@ def test_a_kelvin_costs_0_12_percent_of_every_field(rows):
     assert rows["temperature"].rest_uT == pytest.approx(0.0012e6 * np.abs(rest_T).max(), rel=1e-6)
 
 
-def test_a_steady_field_is_taken_off_with_the_no_load_reading(rows):
+def test_a_steady_field_is_subtracted_with_the_no_load_reading(rows):
     assert 0 < rows["the earth's field"].field_pct < 1e-6  # rounding
     assert rows["the earth's field"].rest_uT == pytest.approx(45)
 
 
-def test_what_is_kept_could_not_go(rows):
+def test_effects_that_are_kept_matter(rows):
     # PHYSICS 8: increments 16-23 % of a bonded skin at 1.2 mm; of a sliding one the far field, which is linear, counts
     assert rows["increments"].field_pct > 2
     assert rows["rotation of the magnetisation"].field_pct > 5
@@ -88,7 +88,7 @@ def test_what_is_kept_could_not_go(rows):
     assert rows["the chips' steps"].field_pct < 0.5
 
 
-def test_a_base_that_holds_the_skin_is_kept_where_there_is_one(rows, not_inside):
+def test_the_hold_of_the_base_is_kept_where_there_is_one(rows, not_inside):
     hold = {
         "give_um": (48.0, 7.0),
         "away_um_mm": 6.0,
@@ -102,7 +102,7 @@ def test_a_base_that_holds_the_skin_is_kept_where_there_is_one(rows, not_inside)
     assert found["the base's hold"].field_pct > 10
 
 
-def test_the_powders_own_field_matters_by_how_much_powder_there_is(rows, not_inside):
+def test_the_error_of_the_powders_own_field_is_proportional_to_its_amount(rows, not_inside):
     half = rows_of(with_protocol("grid", FEW, skin=synthesis("skin", saturation_T=0.055).skin.model_dump()))
     # 10 %: the field that acts is half as strong, and the magnetisation is not quite linear in it
     assert half["the powder's own field"].field_pct == pytest.approx(
