@@ -35,12 +35,12 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.experiments.results import read_folder, write_results
+from pipeline.experiments.results import read_captures, write_results
 
 
 def repeat(indentations: Path, results: Path) -> None:
     """Write the standard deviation of force by capture."""
-    write_results(results, {one.capture: float(one.Fz_N.std()) for one in read_folder(indentations)}, {})
+    write_results(results, {one.capture: float(one.Fz_N.std()) for one in read_captures(indentations)}, {})
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:

@@ -14,7 +14,7 @@ from scipy.constants import milli
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
-from pipeline.experiments.results import read_folder, write_results
+from pipeline.experiments.results import read_captures, write_results
 from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
 from pipeline.report.formatting import show_digits, tabulate
 from pipeline.settings import Settings
@@ -372,7 +372,7 @@ def read(settings: Settings) -> Compare:
 def compare(settings: Settings, indentations: Path, results: Path) -> None:
     """Compare the recorded boards of a scene with simulated ones."""
     design = settings.shared_section(SkinDesign, "skin")
-    boards = skins_of(read_folder(indentations, tuple(settings.captures_in(indentations))))
+    boards = skins_of(read_captures(indentations, tuple(settings.captures_in(indentations))))
     write_results(results, *compare_boards(boards, read(settings), design, settings.seed))
 
 

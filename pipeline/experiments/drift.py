@@ -1,4 +1,8 @@
-"""A skin over its contacts, by no-load policy (paper section 4, figure 5)."""
+"""Drift: networks trained on a skin's first contacts and tested on later ones (paper section 4, figure 5).
+
+Each no-load policy (how often the no-load reading is renewed) has networks of its own. The paper's statements about
+the policies and about the force bias of late contacts are tested over boards.
+"""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -6,7 +10,7 @@ from functools import partial
 from itertools import pairwise
 from math import ceil
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -14,16 +18,13 @@ from jaxtyping import Float, Int, Int64, Shaped
 from pydantic import Field, model_validator
 from scipy.constants import micro
 
-from pipeline.experiments.results import read_folder, read_losses, write_results
+from pipeline.experiments.results import read_captures, read_losses, write_results
 from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
 from pipeline.report.formatting import COLUMNS, show, tabulate
 from pipeline.report.paper import FIGURE_5
 from pipeline.settings import Settings, Training
 from pipeline.statistics import (
-    BOARDS_MIN,
-    FEW_BOARDS,
     INCONCLUSIVE,
-    NO,
     VERDICTS,
     YES,
     Stat,
@@ -54,98 +55,259 @@ from reskin.seeds import rng_for
 
 LATE_CONTACTS_N = 45_000  # paper figure 5b: "after 45,000 interactions"
 FORCE = 2  # column of a target
-POINTS_MAX_N = 2000
+POINTS_MAX_N = 2000  # of the scatter plot
 DECIMALS = 3  # of a newton or millimetre
+
+Count = Annotated[int, Field(ge=1)]
+# No-load reading: once, every so often, before each contact, or whenever a reading is judged free of contact.
+PolicyName = Literal["initial", "regular", "each", "free"]
+UNIT_COLUMN = {"indentation": "indentation", "pass": "pass_i"}
+Errors = Mapping[str, Float[np.ndarray, "u w"]]  # by metric; rows: networks (skin and seed); columns: windows
+
+
+class Drift(Strict):
+    """Section drift: windows of contacts that are trained on and tested, and the no-load policies."""
+
+    unit: Literal["indentation", "pass"]  # what the numbers below count
+    train_n: Count
+    test_n: Count
+    every_n: Count
+    policies: Annotated[tuple[PolicyName, ...], Field(min_length=1)]
+    regular_n: Count | None = None  # indentations from one no-load reading of policy `regular` to its next
+    # Random walk added to the field after training, sd per contact; simulated scenes only.
+    wander_uT: tuple[Annotated[float, Field(ge=0, le=1000)], ...] = ()
+    training: Training
+
+    @model_validator(mode="after")
+    def _check_windows_and_policies(self) -> "Drift":
+        if self.test_n > self.every_n:
+            raise ValueError(f"test_n is at most every_n, {self.every_n}, so that windows do not overlap")
+        if self.train_n > self.every_n:
+            raise ValueError(f"train_n is at most every_n, {self.every_n}, after which the first test follows")
+        if ("regular" in self.policies) != (self.regular_n is not None):
+            raise ValueError("regular_n stands there if and only if policies holds regular")
+        if len(set(self.policies)) < len(self.policies):
+            raise ValueError(f"policies names each policy once, not {list(self.policies)}")
+        return self
+
+
+def read(settings: Settings) -> Drift:
+    """Read section drift."""
+    return settings.with_training(Drift, "drift")
+
+
+# --- Stage ---
 
 
 @dataclass(frozen=True)
-class Answers:
-    """What one network said of the readings of one test window of one skin, and what was true."""
+class WindowPredictions:
+    """Predictions of one network for one test window of one skin."""
 
     policy: str
     board: str
     skin: str
     seed_i: int
     window_i: int
-    contacts_n: int  # that the skin had felt when the window began
+    contacts_n: int  # contacts of the skin before the window
     noload_off_uT: float  # rms over rows and channels: the policy's no-load field less that read before the contact
     indentation: Int[np.ndarray, " f"]
     true: Float[np.ndarray, "f 3"]
     predicted: Float[np.ndarray, "f 3"]
 
 
+def drift(settings: Settings, indentations: Path, results: Path) -> None:
+    """Train and test networks under every no-load policy, on every capture of a folder."""
+    prepare_training()
+    section, selection = read(settings), settings.section(Selection, "selection")
+    captures = read_captures(indentations, tuple(settings.captures_in(indentations)))
+    if section.wander_uT and captures[0].source != "simulated":
+        rule = "none in a recorded scene: a walk would be added to what was recorded"
+        raise ParamsError(settings.where, "drift.wander_uT", rule, list(section.wander_uT), "Take it out.")
+    windows, parts = cut_windows(captures, section, selection)
+    trials = list(make_trials(parts, section, settings.seed))
+    data = SceneData(settings.scene, settings, stack(parts), [])
+    trained = train_all(data, [trial for trial, _ in trials], "drift")
+
+    predictions: dict[str, list[WindowPredictions]] = {name: [] for name in section.training.recipes}
+    for (trial, tests), one in zip(trials, trained, strict=True):
+        predictions[trial.recipe_name] += split_predictions(trial, one, tests)
+    numbers: dict[str, Any] = section.model_dump(
+        mode="json", include={"unit", "train_n", "test_n", "every_n", "regular_n"}, exclude_none=True
+    )
+    numbers |= {"skins_n": len(captures), "seeds_n": section.training.seeds_n, "dropped": data.rows.dropped}
+    numbers |= pace(captures) | {"left_out_units_n": windows.left_out_units_n}
+    if section.wander_uT:
+        headline = [
+            (trial, tests, one)
+            for (trial, tests), one in zip(trials, trained, strict=True)
+            if trial.recipe_name == HEADLINE
+        ]
+        numbers["wander"] = score_wandering(section, selection, captures, headline, settings.seed)
+    of_headline, drawn = summarise_headline(section, predictions.pop(HEADLINE), parts, field_sizes(captures))
+    numbers |= of_headline
+    if predictions:
+        tables_of = {name: score_windows(own) for name, own in predictions.items()}
+        numbers["variants"] = {
+            name: {policy: window_means(table, policy) for policy in section.policies}
+            for name, table in tables_of.items()
+        }
+    losses = read_losses(indentations, numbers["dropped"])
+    write_results(results, numbers, drawn, losses, tally(map(collapse_record, trained)))
+
+
+def cut_windows(captures: Sequence[Readings], section: Drift, selection: Selection) -> tuple[Windows, list[Part]]:
+    """Cut the windows that all captures have, and gather their rows under every policy."""
+    check_one_each(captures)
+    units = [rank(getattr(one, UNIT_COLUMN[section.unit])) for one in captures]
+    units_n = [1 + int(own.max()) for own in units]
+    windows = lay_windows(units_n, train_n=section.train_n, test_n=section.test_n, every_n=section.every_n)
+    policies: dict[str, Policy] = {policy: partial(noload_field, policy, section) for policy in section.policies}
+    parts = lay_parts(list(zip(captures, units, strict=True)), policies, windows=windows, selection=selection)
+    return windows, parts
+
+
+def noload_field(policy: PolicyName, section: Drift, readings: Readings) -> np.ndarray:
+    """Give the no-load field of each reading under a policy."""
+    fields = readings.noload_uT, readings.indentation
+    if policy == "regular":
+        assert section.regular_n is not None
+        return baseline.regular(*fields, regular_n=section.regular_n)
+    if policy == "free":
+        trained_on = rank(getattr(readings, UNIT_COLUMN[section.unit])) < section.train_n
+        within_uT = baseline.alike_within_uT(*(of[trained_on] for of in fields))
+        return baseline.free(readings.b_uT, *fields, within_uT=within_uT)
+    return (baseline.initial if policy == "initial" else baseline.each)(*fields)
+
+
+def make_trials(parts: Sequence[Part], section: Drift, seed: int) -> Iterator[tuple[Trial, list[Part]]]:
+    """Make a trial of every recipe, skin, policy and seed, with its test windows."""
+    starts = [i for i, part in enumerate(parts) if part.window_i == TRAIN]
+    for start, end in pairwise([*starts, len(parts)]):
+        train, tests = parts[start], list(parts[start + 1 : end])
+        fold, test = f"{train.readings.skin}-{train.policy}", np.concatenate([part.row_i for part in tests])
+        for name, recipe in section.training.recipes.items():
+            for seed_i in range(section.training.seeds_n):
+                yield Trial("drift", name, recipe, fold, seed, seed_i, train.row_i, test), tests
+
+
+def split_predictions(trial: Trial, trained: Trained, tests: Sequence[Part]) -> Iterator[WindowPredictions]:
+    """Split a network's predictions by window."""
+    ends = np.cumsum([len(part.rows) for part in tests])[:-1]
+    for part, predicted in zip(tests, np.split(trained.predicted, ends), strict=True):
+        yield WindowPredictions(
+            part.policy, part.readings.board, part.readings.skin, trial.seed_i, part.window_i,
+            int(part.readings.n_contacts[0]), part.noload_off_uT, part.rows.indentation, part.rows.target, predicted,
+        )  # fmt: skip
+
+
+def summarise_headline(
+    section: Drift, predictions: Sequence[WindowPredictions], parts: Sequence[Part], field: dict[str, float]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Summarise the networks of the headline recipe: numbers, and the points of figure 5b.
+
+    The paper does not say which policy figure 5b is of; `regular` is used where it was run.
+    """
+    scores = score_windows(predictions)
+    windows = {policy: window_means(scores, policy) for policy in section.policies}
+    policy = "regular" if "regular" in windows else section.policies[0]
+    window_i = late_window(windows[policy])
+    numbers: dict[str, Any] = windows | {"field": field}
+    drawn: dict[str, Any] = {}
+    late = late_force(predictions, policy, window_i)
+    if late is not None:
+        left_pct = force_left_pct(parts, policy, window_i)
+        numbers["late"] = {"policy": policy, "contacts_n": windows[policy][window_i]["contacts_n"]} | late[0]
+        numbers["late"] |= {} if left_pct is None else {"force_left_pct": left_pct}
+        drawn = {"late": late[1]}
+    errors: dict[str, Errors] = {name: network_errors(scores, name) for name in section.policies}
+    boards = scores[scores["policy"] == policy].groupby(["skin", "seed_i"])["board"].first().tolist()
+    contacts_n = [row["contacts_n"] for row in windows[policy]]
+    numbers["findings"] = judge_findings(errors, boards=boards, contacts_n=contacts_n, late=numbers.get("late"))
+    numbers["last_window"] = {name: last_window(scores, name) for name in section.policies}
+    return numbers, drawn
+
+
+# --- Scores of windows ---
+
+
+def score_windows(predictions: Sequence[WindowPredictions]) -> pd.DataFrame:
+    """Score every window of every network: one row each, `bias_f_N` (mean of predicted less true force) included.
+
+    Metrics of force are absent where no force is known.
+    """
+    rows = []
+    for one in predictions:
+        row: dict[str, Any] = {"policy": one.policy, "board": one.board, "skin": one.skin, "seed_i": one.seed_i}
+        row |= {"window_i": one.window_i, "contacts_n": one.contacts_n, "noload_off_uT": one.noload_off_uT}
+        row |= score(one.true, one.predicted)
+        error_N = (one.predicted.astype(float) - one.true)[:, FORCE]
+        if not np.isnan(error_N).all():
+            row["bias_f_N"] = float(np.nanmean(error_N))
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def _metrics_in(scores: pd.DataFrame, *names: str) -> list[str]:
+    return [name for name in names if name in scores and scores[name].notna().all()]
+
+
+def window_means(scores: pd.DataFrame, policy: str) -> list[dict[str, Any]]:
+    """Give a row for each window: means over skins and seeds, and under `spread` their standard deviations."""
+    rows = []
+    for _, own in scores[scores["policy"] == policy].groupby("window_i"):
+        values = {name: own[name].to_numpy() for name in _metrics_in(own, *METRICS, "bias_f_N")}
+        row: dict[str, Any] = {"contacts_n": round(float(np.mean(own["contacts_n"].to_numpy())))}
+        row |= {name: float(of.mean()) for name, of in values.items()}
+        row["noload_off_uT"] = float(np.mean(own["noload_off_uT"].to_numpy()))
+        row["spread"] = {name: float(of.std(ddof=1)) for name, of in values.items() if len(of) > 1}
+        rows.append(row)
+    return rows
+
+
+def network_errors(scores: pd.DataFrame, policy: str) -> dict[str, Float[np.ndarray, "u w"]]:
+    """Give each metric of each network (row: skin and seed) in each window (column); rows of two policies are pairs."""
+    own = scores[scores["policy"] == policy]
+    return {
+        name: np.ascontiguousarray(own.pivot_table(name, index=["skin", "seed_i"], columns="window_i"))
+        for name in _metrics_in(own, *METRICS)
+    }
+
+
+def last_window(scores: pd.DataFrame, policy: str) -> dict[str, Any]:
+    """Summarise the scores of the last window over boards; `sd_seeds` is over the networks of one skin."""
+    own = scores[(scores["policy"] == policy) & (scores["window_i"] == scores["window_i"].max())]
+    contacts_n = round(float(np.mean(own["contacts_n"].to_numpy())))
+    rows = own.drop(columns=["policy", "seed_i", "window_i", "contacts_n", "noload_off_uT"]).dropna(axis=1, how="all")
+    return {"contacts_n": contacts_n} | with_seeds(summarise(board_means(rows), boards=True), rows, "board", "skin")
+
+
+def late_window(rows: Sequence[Mapping[str, Any]]) -> int:
+    """Find the first window after the paper's 45,000 contacts, or else the last one."""
+    late = [i for i, row in enumerate(rows) if row["contacts_n"] >= LATE_CONTACTS_N]
+    return late[0] if late else len(rows) - 1
+
+
+# --- Force bias of late contacts (figure 5b) ---
+
+
 @dataclass(frozen=True)
-class Contacts:
-    """One point an indentation: the means of its readings; where no force is known there is none."""
+class ContactForces:
+    """Forces of one window, a point per indentation: the means of its readings, where the true force is known."""
 
     skin: Shaped[np.ndarray, " n"]
     true_N: Float[np.ndarray, " n"]
     predicted_N: Float[np.ndarray, " n"]
 
 
-def score_window(one: Answers) -> dict[str, float]:
-    """Score a window, and give the mean of predicted less true force where it is known."""
-    numbers = score(one.true, one.predicted)
-    error_N = (one.predicted.astype(float) - one.true)[:, FORCE]
-    if not np.isnan(error_N).all():
-        numbers["bias_f_N"] = float(np.nanmean(error_N))
-    return numbers
+def contact_forces(predictions: Sequence[WindowPredictions]) -> ContactForces:
+    """Average the readings of each indentation, which are not independent.
 
-
-def over_windows(answers: Sequence[Answers], policy: str) -> list[dict[str, Any]]:
-    """Give a row for each window: means over skins and seeds, and their sd where there are several."""
-    rows = []
-    for window_i in sorted({one.window_i for one in answers}):
-        own = [one for one in answers if (one.window_i, one.policy) == (window_i, policy)]
-        scores = [score_window(one) for one in own]
-        values = {name: np.array([one[name] for one in scores]) for name in (*METRICS, "bias_f_N") if name in scores[0]}
-        row: dict[str, Any] = {"contacts_n": round(float(np.mean([one.contacts_n for one in own])))}
-        row |= {name: float(of.mean()) for name, of in values.items()}
-        row["noload_off_uT"] = float(np.mean([one.noload_off_uT for one in own]))
-        row["spread"] = {name: float(of.std(ddof=1)) for name, of in values.items() if len(of) > 1}
-        rows.append(row)
-    return rows
-
-
-def of_networks(answers: Sequence[Answers], policy: str) -> dict[str, Float[np.ndarray, "u w"]]:
-    """Give the scores of each network, a row for each skin and seed, in each window: rows of two policies are pairs."""
-    own = {(one.skin, one.seed_i, one.window_i): score_window(one) for one in answers if one.policy == policy}
-    units = sorted({(skin, seed_i) for skin, seed_i, _ in own})
-    windows = sorted({window_i for _, _, window_i in own})
-    named = [name for name in METRICS if all(name in scores for scores in own.values())]
-    return {name: np.array([[own[(*unit, i)][name] for i in windows] for unit in units]) for name in named}
-
-
-def boards_of(answers: Sequence[Answers], policy: str) -> list[str]:
-    """Give the board of each network, in the order of `of_networks`."""
-    units = {(one.skin, one.seed_i): one.board for one in answers if one.policy == policy}
-    return [units[unit] for unit in sorted(units)]
-
-
-def last_window(answers: Sequence[Answers], policy: str) -> dict[str, Any]:
-    """Summarise the scores of the last window over boards; `sd_seeds` is over the networks of one skin."""
-    last_i = max(one.window_i for one in answers)
-    own = [one for one in answers if (one.policy, one.window_i) == (policy, last_i)]
-    contacts_n = round(float(np.mean([one.contacts_n for one in own])))
-    rows = pd.DataFrame([{"board": one.board, "skin": one.skin, **score_window(one)} for one in own])
-    return {"contacts_n": contacts_n, **with_seeds(summarise(board_means(rows), boards=True), rows, "board", "skin")}
-
-
-def late_window(rows: Sequence[dict[str, Any]]) -> int:
-    """Find the first window after the paper's 45,000 contacts, or else the last one."""
-    late = [i for i, row in enumerate(rows) if row["contacts_n"] >= LATE_CONTACTS_N]
-    return late[0] if late else len(rows) - 1
-
-
-def by_contact(answers: Sequence[Answers]) -> Contacts:
-    """Take the readings of an indentation together: they are not independent.
-
-    All answers are of one window, each of one skin and one network.
+    All predictions are of one window, each of one skin and one network.
     """
-    skin = np.concatenate([np.full(len(one.indentation), one.skin) for one in answers])
-    indentation = np.concatenate([one.indentation for one in answers])
+    skin = np.concatenate([np.full(len(one.indentation), one.skin) for one in predictions])
+    indentation = np.concatenate([one.indentation for one in predictions])
     true_N, predicted_N = (
-        np.concatenate([getattr(one, side)[:, FORCE].astype(float) for one in answers])
+        np.concatenate([getattr(one, side)[:, FORCE].astype(float) for one in predictions])
         for side in ("true", "predicted")
     )
     known = ~np.isnan(true_N)
@@ -153,10 +315,10 @@ def by_contact(answers: Sequence[Answers]) -> Contacts:
     pairs, which = np.unique(np.stack([skin_i, indentation[known]], axis=1), axis=0, return_inverse=True)
     n = np.bincount(which.ravel(), minlength=len(pairs))
     means = [np.bincount(which.ravel(), values[known], len(pairs)) / n for values in (true_N, predicted_N)]
-    return Contacts(skins[pairs[:, 0]], *means)
+    return ContactForces(skins[pairs[:, 0]], *means)
 
 
-def force_bias(contacts: Contacts) -> dict[str, Any]:
+def force_bias(contacts: ContactForces) -> dict[str, Any]:
     """Give the mean of predicted less true force, its standard error over contacts, and the least-squares slope."""
     error_N = contacts.predicted_N - contacts.true_N
     away_N = contacts.true_N - contacts.true_N.mean()
@@ -169,10 +331,44 @@ def force_bias(contacts: Contacts) -> dict[str, Any]:
     }
 
 
-def force_left(early: Readings, late: Readings) -> float | None:
-    """Give late force over early force at equal places and depths, in %: what softening leaves.
+def late_force(
+    predictions: Sequence[WindowPredictions], policy: str, window_i: int
+) -> tuple[dict[str, Any], dict[str, list[float]]] | None:
+    """Give the force bias of one window, mean over seeds, that of each network, and the first seed's points to draw.
 
-    None where no place and depth with a known force was met both early and late.
+    None if fewer than two contacts have a known force.
+    """
+    own = [one for one in predictions if (one.policy, one.window_i) == (policy, window_i)]
+    seeds = sorted({one.seed_i for one in own})
+    contacts = [contact_forces([one for one in own if one.seed_i == seed_i]) for seed_i in seeds]
+    if len(contacts[0].true_N) < 2:
+        return None
+    biases = [force_bias(one) for one in contacts]
+    # The indentations are the same for every seed, so their standard error does not shrink with more seeds.
+    means = {name: float(np.mean([one[name] for one in biases])) for name in biases[0]}
+    means["indentations_n"] = biases[0]["indentations_n"]
+    each_N = [force_bias(contact_forces([one]))["bias_N"] for one in own]
+    return means | {"network_bias_N": each_N, "network_board": [one.board for one in own]}, points(contacts[0])
+
+
+def points(contacts: ContactForces) -> dict[str, list[float]]:
+    """Give true and predicted forces to draw, to 1 mN; every second, third, ... if there are very many."""
+    every_n = ceil(len(contacts.true_N) / POINTS_MAX_N)
+    sides = {"true_N": contacts.true_N, "predicted_N": contacts.predicted_N}
+    return {name: np.round(values[::every_n], DECIMALS).tolist() for name, values in sides.items()}
+
+
+def force_left_pct(parts: Sequence[Part], policy: str, window_i: int) -> float | None:
+    """Give `force_left` of a window relative to training, mean over skins; None if unknown for a skin."""
+    own = {(part.readings.skin, part.window_i): part.readings for part in parts if part.policy == policy}
+    left = [force_left(own[skin, TRAIN], late) for (skin, i), late in own.items() if i == window_i]
+    return None if None in left else float(np.mean([one for one in left if one is not None]))
+
+
+def force_left(early: Readings, late: Readings) -> float | None:
+    """Give late force over early force at equal places and depths, in %: below 100 where the skin softened.
+
+    None if no place and depth with a known force was visited both early and late.
     """
     sides = []
     for one in (early, late):
@@ -190,42 +386,17 @@ def force_left(early: Readings, late: Readings) -> float | None:
     return float(100 * late_N.sum() / early_N.sum())
 
 
-def late_force(
-    answers: Sequence[Answers], policy: str, window_i: int
-) -> tuple[dict[str, Any], dict[str, list[float]]] | None:
-    """Give the force bias of one window, mean over seeds, that of each network, and the first seed's points to draw.
-
-    None if fewer than two contacts have a known force.
-    """
-    own = [one for one in answers if (one.policy, one.window_i) == (policy, window_i)]
-    seeds = sorted({one.seed_i for one in own})
-    contacts = [by_contact([one for one in own if one.seed_i == seed_i]) for seed_i in seeds]
-    if len(contacts[0].true_N) < 2:
-        return None
-    biases = [force_bias(one) for one in contacts]
-    # The indentations are the same for every seed, so that their standard error is not less for several.
-    means = {name: float(np.mean([one[name] for one in biases])) for name in biases[0]}
-    means["indentations_n"] = biases[0]["indentations_n"]
-    each_N = [force_bias(by_contact([one]))["bias_N"] for one in own]
-    networks = {"network_bias_N": each_N, "network_board": [one.board for one in own]}
-    return means | networks, points(contacts[0])
-
-
-def points(contacts: Contacts) -> dict[str, list[float]]:
-    """Give true and predicted forces to draw, to 1 mN; of very many every second, third, ..."""
-    every_n = ceil(len(contacts.true_N) / POINTS_MAX_N)
-    sides = {"true_N": contacts.true_N, "predicted_N": contacts.predicted_N}
-    return {name: np.round(values[::every_n], DECIMALS).tolist() for name, values in sides.items()}
+# --- Sizes of fields, and time ---
 
 
 def field_sizes(captures: Sequence[Readings]) -> dict[str, float]:
-    """Give, rms over channels, the change that a contact makes, and the noise of a no-load reading.
+    """Give, rms over channels, the change of field that a contact makes, and the noise of a no-load reading.
 
-    The change is against the no-load reading before that contact, whatever policy is tried. Noise is taken from each
+    The change is against the no-load reading before that contact, whatever the policy. Noise is taken from each
     no-load reading to the next, where drift is small.
     """
     changes_uT = [subtract(one.b_uT, one.noload_uT)[~np.isnan(one.x_mm)] for one in captures]
-    steps_uT = [np.diff(one.noload_uT[_first_i(one)].astype(float), axis=0) for one in captures]
+    steps_uT = [np.diff(one.noload_uT[_first_rows(one)].astype(float), axis=0) for one in captures]
     pairs_n = sum(len(own) for own in steps_uT)
     noise_uT = rms(np.concatenate(steps_uT)) / float(np.sqrt(2)) if pairs_n else 0.0
     return {"contact_uT": rms(np.concatenate(changes_uT)), "noload_noise_uT": noise_uT}
@@ -234,10 +405,10 @@ def field_sizes(captures: Sequence[Readings]) -> dict[str, float]:
 def pace(captures: Sequence[Readings]) -> dict[str, float]:
     """Give the median time from one indentation to the next, and how long the longest capture lasts.
 
-    Nothing is given where a recording knows no time, or has one indentation.
+    Empty where recordings have no times, or one indentation.
     """
     timed = [one for one in captures if np.isfinite(one.t_s).all()]
-    steps_s = [step_s for one in timed for step_s in np.diff(one.t_s[_first_i(one)])]
+    steps_s = [step_s for one in timed for step_s in np.diff(one.t_s[_first_rows(one)])]
     if not steps_s:
         return {}
     return {
@@ -246,8 +417,18 @@ def pace(captures: Sequence[Readings]) -> dict[str, float]:
     }
 
 
-def _first_i(readings: Readings) -> Int64[np.ndarray, " n"]:
-    """Find the first row of each indentation."""
+def describe_pace(numbers: Mapping[str, Any], source: str) -> str:
+    """Describe `pace` in a sentence, with what it means in a simulated capture."""
+    if "lasts_s" not in numbers:
+        return "When the contacts were is not known."
+    every = f"A contact follows the one before after {numbers['contact_every_s']:.3g} s (median)"
+    text = f"{every}; the whole capture lasts {numbers['lasts_s']:,.0f} s."
+    if source != "simulated":
+        return text
+    return f"{text} A real rig takes seconds a contact: temperature wanders here over many more contacts than there."
+
+
+def _first_rows(readings: Readings) -> Int64[np.ndarray, " n"]:
     return np.unique(rank(readings.indentation), return_index=True)[1]
 
 
@@ -256,8 +437,47 @@ def rms(values: Float[np.ndarray, "..."]) -> float:
     return float(np.sqrt(np.mean(values.astype(float) ** 2)))
 
 
-def walked(readings: Readings, step_uT: float, *, after_n: int, seed: int) -> Readings:
-    """Add a walk of so many uT a contact and channel (sd) to what is read after `after_n` contacts."""
+# --- A field at rest that wanders more than the simulated one ---
+
+
+def score_wandering(
+    section: Drift,
+    selection: Selection,
+    captures: Sequence[Readings],
+    networks: Sequence[tuple[Trial, list[Part], Trained]],
+    seed: int,
+) -> dict[str, list[dict[str, Any]]]:
+    """Test the networks on their last window again, after a random walk was added to the captures.
+
+    Gives for each policy a row for each step size: mean scores over skins and seeds, and their sd under `spread`.
+    """
+    from reskin.models.network import Predictor  # torch, late
+
+    trained_on = rank(getattr(captures[0], UNIT_COLUMN[section.unit])) < section.train_n
+    after_n = 1 + int(rank(captures[0].indentation)[trained_on].max())
+    rows: dict[str, list[dict[str, Any]]] = {}
+    for step_uT in section.wander_uT:
+        walked = [add_walk(one, step_uT, after_n=after_n, seed=seed) for one in captures]
+        parts = {part.first_row_i: part for part in cut_windows(walked, section, selection)[1]}
+        scores: dict[str, list[dict[str, float]]] = {}
+        off_uT: dict[str, list[float]] = {}
+        for trial, tests, trained in networks:
+            part = parts[tests[-1].first_row_i]
+            predict = Predictor(trained.weights, trial.recipe.architecture, device())
+            inputs = trained.scaler.encode(VIEW[trial.recipe.inputs](part.rows.db_uT))
+            scores.setdefault(part.policy, []).append(score(part.rows.target, trained.scaler.decode(predict(inputs))))
+            off_uT.setdefault(part.policy, []).append(part.noload_off_uT)
+        for policy, own in scores.items():
+            stats = summarise(pd.DataFrame(own)[[name for name in METRICS if name in own[0]]])
+            row: dict[str, Any] = {"step_uT": step_uT, "noload_off_uT": float(np.mean(off_uT[policy])), "n": len(own)}
+            row |= {name: stat["mean"] for name, stat in stats.items()}
+            row["spread"] = {name: stat["sd"] for name, stat in stats.items() if "sd" in stat}
+            rows.setdefault(policy, []).append(row)
+    return rows
+
+
+def add_walk(readings: Readings, step_uT: float, *, after_n: int, seed: int) -> Readings:
+    """Add a random walk of so many uT per contact and channel (sd) to all readings after `after_n` contacts."""
     since_n = np.maximum(rank(readings.indentation) + 1 - after_n, 0)
     rng = rng_for(seed, "drift", "wander", readings.skin)  # the same walk at every step size, scaled
     walk_T = wandering(since_n, readings.b_uT.shape[1], step_T=step_uT * micro, rng=rng)
@@ -265,37 +485,7 @@ def walked(readings: Readings, step_uT: float, *, after_n: int, seed: int) -> Re
     return replace(readings, b_uT=readings.b_uT + walk_uT, noload_uT=readings.noload_uT + walk_uT)
 
 
-def over_steps(
-    networks: Sequence[tuple[Trial, Trained, int]], steps_uT: Sequence[float], parts_at: Callable[[float], list[Part]]
-) -> dict[str, list[dict[str, Any]]]:
-    """Give for each policy a row for each step: scores of the last window, mean and sd (`spread`) over skins and seeds.
-
-    `networks` stand beside the index of the part that each was last tested on; `parts_at` lays the parts anew.
-    """
-    rows: dict[str, list[dict[str, Any]]] = {}
-    for step_uT in steps_uT:
-        parts = parts_at(step_uT)
-        scores: dict[str, list[dict[str, float]]] = {}
-        off_uT: dict[str, list[float]] = {}
-        for trial, trained, part_i in networks:
-            part = parts[part_i]
-            scores.setdefault(part.policy, []).append(score(part.rows.target, _answer(trial, trained, part)))
-            off_uT.setdefault(part.policy, []).append(part.noload_off_uT)
-        for policy, own in scores.items():
-            stats = summarise(pd.DataFrame(own)[[name for name in METRICS if name in own[0]]])
-            means = {name: stat["mean"] for name, stat in stats.items()}
-            row = {"step_uT": step_uT, "noload_off_uT": float(np.mean(off_uT[policy])), "n": len(own), **means}
-            row["spread"] = {name: stat["sd"] for name, stat in stats.items() if "sd" in stat}
-            rows.setdefault(policy, []).append(row)
-    return rows
-
-
-def _answer(trial: Trial, trained: Trained, part: Part) -> np.ndarray:
-    from reskin.models.network import Predictor  # torch, late
-
-    predict = Predictor(trained.weights, trial.recipe.architecture, device())
-    return trained.scaler.decode(predict(trained.scaler.encode(VIEW[trial.recipe.inputs](part.rows.db_uT))))
-
+# --- The paper's findings ---
 
 HIGHER_AND_FASTER = (
     '"prediction errors are higher and increase faster when we only make a single no-load measurement at the start"'
@@ -305,444 +495,211 @@ EACH_IS_WORSE = '"errors are also higher when no-load measurements are updated b
 OVERESTIMATES = (
     '"the model, on average, overestimates the applied force"; "attributed to the softening of the elastomer"'
 )
-
-INDENTATION_SES = 2.0  # about 95 % confidence for the many indentations of a window
-ERRORS = {"mse_xy_mm2": ("MSE_xy", "mm²"), "mse_f_N2": ("MSE_F", "N²")}  # force last; absent where it is unknown
-OTHERWISE = {"regular": "regular ones", "each": "one before every contact"}  # no-load readings
+INDENTATION_SES = 2.0  # standard errors: about 95 % confidence for the many indentations of a window
+ERRORS = {"mse_xy_mm2": ("MSE_xy", "mm²"), "mse_f_N2": ("MSE_F", "N²")}  # force is absent where it is unknown
 PER_CONTACTS_N = 10_000
-Row = Mapping[str, Any]
-Found = dict[str, Any]
-Networks = Mapping[str, Float[np.ndarray, "u w"]]  # errors by metric; rows: skins and seeds; columns: windows
 
 
-@dataclass(frozen=True)
-class Gap:
-    """A mean over networks, positive where it is as the paper says: over boards, and over trainings on these boards."""
+class Comparison(NamedTuple):
+    """A quantity of networks compared in pairs; the difference is positive where the paper is right."""
 
-    word: str
-    unit: str
-    boards: Stat
-    trainings: list[float] | None  # 95 % interval over networks; None: one network alone has none
-
-    @property
-    def verdict(self) -> str:
-        """Judge over boards which side of 0 it is on."""
-        return verdict(self.boards)
-
-    @property
-    def of_trainings(self) -> str:
-        """Judge by the interval over all networks: on one board, how much trainings vary; on several, boards too."""
-        if self.trainings is None:
-            return INCONCLUSIVE
-        return verdict({"ci95": self.trainings})
-
-    def __str__(self) -> str:
-        ends = self.boards["ci95"] if "ci95" in self.boards else self.trainings
-        shown = "" if ends is None else f" [{ends[0]:+.2g}, {ends[1]:+.2g}]"
-        return f"{self.boards['mean']:+.2g}{shown} {self.unit}"
+    text: str
+    over_boards: Stat
+    over_trainings: list[float] | None  # 95 % interval over networks; None for one network
 
 
-def findings(
-    rows: Mapping[str, Sequence[Row]],
-    networks: Mapping[str, Networks],
-    *,
-    boards: Sequence[str],
-    field: Mapping[str, float],
-    late: Row | None,
-) -> list[Found]:
-    """Test each finding that the policies and the known quantities allow.
+def compare_networks(
+    quantity: str, unit: str, values: Mapping[str, Float[np.ndarray, " u"]], boards: Sequence[str]
+) -> Comparison:
+    """Compare the networks of two policies, values by policy, in pairs that each belong to a board."""
+    (policy, own), (other_policy, other) = values.items()
+    over_boards, over_trainings = mean_over_boards(own - other, boards)
+    text = (
+        f"{quantity}: {policy} {own.mean():.3g}, {other_policy} {other.mean():.3g}, "
+        f"difference {over_boards['mean']:+.2g}{_show_ends(over_boards, over_trainings)} {unit}"
+    )
+    return Comparison(text, over_boards, over_trainings)
 
-    `rows` are the windows of each policy, `networks` the errors of each of its networks there: equal rows of two
-    policies are a pair, `boards` their boards. `field` holds rms values over channels in uT: `contact_uT`, the change
-    that a contact makes, and `noload_noise_uT`, the noise of one no-load reading.
+
+def _show_ends(over_boards: Stat, over_trainings: list[float] | None) -> str:
+    ends = over_boards.get("ci95", over_trainings)
+    return "" if ends is None else f" [{ends[0]:+.2g}, {ends[1]:+.2g}]"
+
+
+def mean_over_boards(
+    values: Float[np.ndarray, " u"], boards: Sequence[str]
+) -> tuple[dict[str, Any], list[float] | None]:
+    """Give the statistic of values over boards, and their 95 % interval over networks."""
+    by_board = pd.Series(values, dtype=float).groupby(list(boards)).mean()
+    return statistic(by_board, boards=True), interval(values.astype(float))
+
+
+def judge_findings(
+    networks: Mapping[str, Errors], *, boards: Sequence[str], contacts_n: Sequence[int], late: Mapping[str, Any] | None
+) -> list[dict[str, Any]]:
+    """Test each finding of the paper that the policies and the known quantities allow.
+
+    `networks` are the errors of the networks of each policy: equal rows of two policies are a pair, on `boards`.
+    `contacts_n` counts the contacts before each window.
     """
-    frequent = [policy for policy in ("regular", "each") if policy in rows]
-    found = []
-    pairs = Pairs(networks, boards)
-    if "initial" in rows and frequent and len(rows["initial"]) > 1:
-        found.append(_higher_and_faster(rows["initial"], pairs, frequent[0], field))
-    if "initial" in rows and frequent:
-        found.append(_offset(rows["initial"], pairs, frequent[0], field))
+    frequent = [policy for policy in ("regular", "each") if policy in networks]
+    findings = []
+
+    def compare(quantity: str, of: str, over: str, value: Callable[[np.ndarray], np.ndarray]) -> list[Comparison]:
+        return [
+            compare_networks(
+                f"{title}, {quantity}", unit, {policy: value(networks[policy][metric]) for policy in (of, over)}, boards
+            )
+            for metric, (title, unit) in ERRORS.items()
+            if metric in networks[of]
+        ]
+
+    def mean(errors: np.ndarray) -> np.ndarray:
+        return errors.mean(axis=1)
+
+    if "initial" in networks and frequent:
+        means = compare("mean over windows", "initial", frequent[0], mean)
+        if len(contacts_n) > 1:
+            title = f"growth in {PER_CONTACTS_N:,} contacts"
+            growths = compare(title, "initial", frequent[0], partial(growth, contacts_n))
+            findings.append(judge_finding("higher_and_faster", HIGHER_AND_FASTER, means + growths))
+        findings.append(judge_finding("offset", OFFSET, means))
     if len(frequent) == 2:
-        found.append(_each_is_worse(rows["regular"], pairs, field))
+        worse = compare("mean over windows", "each", "regular", mean)
+        findings.append(judge_finding("each_is_worse", EACH_IS_WORSE, worse))
     if late is not None:
-        found.append(_overestimates(late))
-    return found
+        findings.append(judge_finding("overestimates", OVERESTIMATES, [late_bias(late)]))
+    return findings
 
 
-@dataclass(frozen=True)
-class Pairs:
-    """Errors of networks by policy and metric: equal rows of two policies are a pair, on the board of that row."""
-
-    networks: Mapping[str, Networks]
-    boards: Sequence[str]
-
-    def gap(self, words: tuple[str, str], own: Float[np.ndarray, " u"], other: Float[np.ndarray, " u"]) -> Gap:
-        """Compare values of networks in pairs."""
-        return _gap(words, own - other, self.boards)
-
-    @property
-    def bars(self) -> str:
-        """Say what brackets are."""
-        boards_n = len(set(self.boards))
-        if boards_n >= BOARDS_MIN:
-            return f" ([low, high]: 95 %, Student's t over {boards_n} boards)"
-        pairs_n, of = len(self.boards), "one board" if boards_n == 1 else f"{boards_n} boards"
-        return f" ([low, high]: 95 %, over {pairs_n} networks of {of})" if pairs_n > 1 else " (one network)"
-
-
-def rates(contacts_n: Sequence[int], errors: Float[np.ndarray, "u w"]) -> Float[np.ndarray, " u"]:
-    """Give each network's least-squares slope of errors against contacts, linear, for 10,000 of them."""
+def growth(contacts_n: Sequence[int], errors: Float[np.ndarray, "u w"]) -> Float[np.ndarray, " u"]:
+    """Give the least-squares slope of each network's errors against contacts, per 10,000 contacts."""
     tens = np.array(contacts_n, float) / PER_CONTACTS_N
     away = tens - tens.mean()
     return errors @ away / (away @ away)
 
 
-def _higher_and_faster(initial: Sequence[Row], pairs: Pairs, name: str, field: Row) -> Found:
-    parts, gaps = [], []
-    contacts_n = [row["contacts_n"] for row in initial]
-    for metric, (word, unit) in _known(pairs.networks["initial"]).items():
-        single, other = pairs.networks["initial"][metric], pairs.networks[name][metric]
-        higher = pairs.gap((word, unit), single.mean(axis=1), other.mean(axis=1))
-        rate, other_rate = rates(contacts_n, single), rates(contacts_n, other)
-        faster = pairs.gap((f"the growth of {word}", unit), rate, other_rate)
-        parts.append(
-            f"{word} is {single.mean():.3g} against {other.mean():.3g} {unit} with {OTHERWISE[name]}, mean over "
-            f"windows (difference {higher}), and changes by {rate.mean():.2g} against {other_rate.mean():.2g} {unit} "
-            f"in {PER_CONTACTS_N:,} contacts, linear fit (difference {faster})"
-        )
-        gaps += [higher, faster]
-    measured = "; ".join(parts) + pairs.bars
-    return _finding("higher_and_faster", HIGHER_AND_FASTER, gaps, measured, lambda: _off(initial, field))
+def late_bias(late: Mapping[str, Any]) -> Comparison:
+    """Judge the bias of late forces against the variation of indentations and of trainings: one network cannot tell."""
+    over_boards, ends_N = mean_over_boards(np.array(late["network_bias_N"]), late["network_board"])
+    reach_N = INDENTATION_SES * late["bias_se_N"]
+    if ends_N is not None:
+        ends_N = [min(ends_N[0], late["bias_N"] - reach_N), max(ends_N[1], late["bias_N"] + reach_N)]
+    bias = f"{over_boards['mean']:+.2g}{_show_ends(over_boards, ends_N)} N ({late['bias_pct']:+.2g} %)"
+    return Comparison(f"bias of force: {bias}, slope {late['slope']:.3g}", over_boards, ends_N)
 
 
-def _offset(initial: Sequence[Row], pairs: Pairs, name: str, field: Row) -> Found:
-    parts, gaps = [], []
-    for metric, (word, unit) in _known(pairs.networks["initial"]).items():
-        single, more = pairs.networks["initial"][metric], pairs.networks[name][metric]
-        gaps.append(pairs.gap((word, unit), single.mean(axis=1), more.mean(axis=1)))
-        parts.append(
-            f"{word} is {more.mean():.3g} {unit} with {OTHERWISE[name]}, {single.mean():.3g} with a single no-load "
-            f"reading (gain {gaps[-1]})"
-        )
-    measured = "mean over windows: " + "; ".join(parts) + pairs.bars
-    return _finding("offset", OFFSET, gaps, measured, lambda: _off(initial, field))
-
-
-def _each_is_worse(regular: Sequence[Row], pairs: Pairs, field: Row) -> Found:
-    parts, gaps = [], []
-    for metric, (word, unit) in _known(pairs.networks["each"]).items():
-        own, other = pairs.networks["each"][metric], pairs.networks["regular"][metric]
-        gaps.append(pairs.gap((word, unit), own.mean(axis=1), other.mean(axis=1)))
-        parts.append(
-            f"{word} is {own.mean():.3g} against {other.mean():.3g} {unit} with regular ones, mean over windows "
-            f"(difference {gaps[-1]})"
-        )
-    shows = [gap.word for gap in gaps if gap.of_trainings == YES]
-
-    def why() -> str:
-        noise_uT = field["noload_noise_uT"]
-        off_uT = np.mean([row["noload_off_uT"] for row in regular])
-        stale_uT = np.sqrt(max(0.0, off_uT**2 - 2 * noise_uT**2))
-        alone = f"It shows in {', '.join(shows)} alone. " if shows else ""
-        return (
-            f"{alone}A no-load reading has the same noise under both policies, {noise_uT:.2g} µT rms over channels. "
-            f"One right before the contact is never stale, a regular one is off by {stale_uT:.2g} µT of drift; a "
-            f"contact changes the field by {field['contact_uT']:.3g} µT. The paper suspects overfitting to training "
-            "data, and saw later experiments gain from a reading before every contact"
-        )
-
-    return _finding("each_is_worse", EACH_IS_WORSE, gaps, "; ".join(parts) + pairs.bars, why)
-
-
-def _overestimates(late: Row) -> Found:
-    """Ask that the bias be clear of both what indentations and what trainings vary by: one network cannot tell."""
-    biases_N = np.array(late["network_bias_N"])
-    gap = _gap(("the bias", "N"), biases_N, late["network_board"])
-    if gap.trainings is not None:
-        reach_N = INDENTATION_SES * late["bias_se_N"]
-        ends_N = [min(gap.trainings[0], late["bias_N"] - reach_N), max(gap.trainings[1], late["bias_N"] + reach_N)]
-        gap = replace(gap, trainings=ends_N)
-    measured = (
-        f"policy {late['policy']} after {late['contacts_n']:,} contacts: bias {late['bias_N']:+.3g} ± "
-        f"{late['bias_se_N']:.2g} N ({late['bias_pct']:+.2g} %), standard error over {late['indentations_n']} "
-        f"indentations, mean over {len(biases_N)} network(s); {gap}{Pairs({}, late['network_board']).bars}"
-    )
-    measured += f"; slope {late['slope']:.3g}"
-    left_pct = late.get("force_left_pct")
-    if left_pct is not None:
-        measured += f"; at equal places and depths the skin gives {left_pct:.4g} % of its early force"
-
-    def why() -> str:
-        if left_pct is None:
-            return "No depth is known, so it cannot be told whether the skin softened"
-        return (
-            f"At equal places and depths the skin gives {left_pct:.4g} % of the force of the training contacts, so "
-            f"softening explains a bias of {100 - left_pct:+.2g} % of force and no more; what the network adds by "
-            f"itself makes it {late['bias_pct']:+.2g} % in all"
-        )
-
-    return _finding("overestimates", OVERESTIMATES, [gap], measured, why)
-
-
-def _gap(words: tuple[str, str], values: Float[np.ndarray, " u"], boards: Sequence[str]) -> Gap:
-    """Summarise values of networks, each on its board."""
-    word, unit = words
-    of_boards = pd.Series(values, dtype=float).groupby(list(boards)).mean()
-    return Gap(word, unit, statistic(of_boards, boards=True), interval(values.astype(float)))
-
-
-def _off(initial: Sequence[Row], field: Row) -> str:
-    return (
-        f"After {initial[-1]['contacts_n']:,} contacts the single no-load reading is off by "
-        f"{initial[-1]['noload_off_uT']:.2g} µT rms, where a contact changes the field by {field['contact_uT']:.3g} µT "
-        f"and a no-load reading has a noise of {field['noload_noise_uT']:.2g} µT: no more than that could be mended"
-    )
-
-
-def _known(networks: Networks) -> dict[str, tuple[str, str]]:
-    return {metric: words for metric, words in ERRORS.items() if metric in networks}
-
-
-def _finding(name: str, finding: str, gaps: Sequence[Gap], measured: str, why: Callable[[], str]) -> Found:
-    """Judge a finding by all of its parts, over boards; and of trainings, by the networks of these boards alone."""
-    judged = all_of([gap.verdict for gap in gaps])
-    row = {
-        "id": name, "finding": finding, "holds": judged == YES, "verdict": judged,
-        "of_trainings": all_of([gap.of_trainings for gap in gaps]),
-        "measured": measured[0].upper() + measured[1:] + ".",
-    }  # fmt: skip
-    return row if judged == YES else row | {"why": f"{_inconclusive(judged, gaps)}{why()}."}
-
-
-def _inconclusive(judged: str, gaps: Sequence[Gap]) -> str:
-    """Say of which parts nothing can be concluded."""
-    if judged == NO:
-        return ""
-    if judged == FEW_BOARDS:
-        return f"Not judged: fewer than {BOARDS_MIN} boards say little of others. "
-    covered = "; ".join(f"{gap.word}, {gap}" for gap in gaps if gap.verdict == INCONCLUSIVE)
-    return f"Undecided: the 95 % interval over boards includes 0 ({covered}). "
-
-
-Count = Annotated[int, Field(ge=1)]
-# No-load reading: once, every so often, before each contact, or whenever a reading is judged free of contact.
-PolicyName = Literal["initial", "regular", "each", "free"]
-
-
-class Drift(Strict):
-    """Train on the first of a skin's contacts, test on those after every so many (paper section 4, figure 5)."""
-
-    unit: Literal["indentation", "pass"]  # what the numbers below count
-    train_n: Count
-    test_n: Count
-    every_n: Count
-    policies: Annotated[tuple[PolicyName, ...], Field(min_length=1)]
-    regular_n: Count | None = None  # indentations from one no-load reading of policy `regular` to its next
-    wander_uT: tuple[
-        Annotated[float, Field(ge=0, le=1000)], ...
-    ] = ()  # added after training, sd a contact; simulated only
-    training: Training
-
-    @model_validator(mode="after")
-    def _windows_follow_each_other(self) -> "Drift":
-        if self.test_n > self.every_n:
-            raise ValueError(f"test_n is at most every_n, {self.every_n}, so that windows do not overlap")
-        if self.train_n > self.every_n:
-            raise ValueError(f"train_n is at most every_n, {self.every_n}, after which the first test follows")
-        if ("regular" in self.policies) != (self.regular_n is not None):
-            raise ValueError("regular_n stands there if and only if policies holds regular")
-        if len(set(self.policies)) < len(self.policies):
-            raise ValueError(f"policies names each policy once, not {list(self.policies)}")
-        return self
-
-
-UNIT = {"indentation": "indentation", "pass": "pass_i"}
-
-
-def cut(captures: Sequence[Readings], section: Drift, selection: Selection) -> tuple[Windows, list[Part]]:
-    """Lay the windows that all captures have, and their rows under every policy."""
-    check_one_each(captures)
-    units = [baseline.rank(getattr(one, UNIT[section.unit])) for one in captures]
-    units_n = [1 + int(own.max()) for own in units]
-    windows = lay_windows(units_n, train_n=section.train_n, test_n=section.test_n, every_n=section.every_n)
-    policies: dict[str, Policy] = {policy: partial(_choose, policy, section) for policy in section.policies}
-    laid = lay_parts(list(zip(captures, units, strict=True)), policies, windows=windows, selection=selection)
-    return windows, laid
-
-
-def _choose(policy: PolicyName, section: Drift, readings: Readings) -> np.ndarray:
-    fields = readings.noload_uT, readings.indentation
-    if policy == "regular":
-        assert section.regular_n is not None
-        return baseline.regular(*fields, regular_n=section.regular_n)
-    if policy == "free":
-        trained_on = baseline.rank(getattr(readings, UNIT[section.unit])) < section.train_n
-        within_uT = baseline.alike_within_uT(*(of[trained_on] for of in fields))
-        return baseline.free(readings.b_uT, *fields, within_uT=within_uT)
-    return (baseline.initial if policy == "initial" else baseline.each)(*fields)
-
-
-def trials(parts: Sequence[Part], section: Drift, seed: int) -> Iterator[tuple[Trial, list[Part]]]:
-    """Make a trial of every recipe, skin, policy and seed, beside its test windows."""
-    starts = [i for i, part in enumerate(parts) if part.window_i == TRAIN]
-    for start, end in pairwise([*starts, len(parts)]):
-        train, tests = parts[start], list(parts[start + 1 : end])
-        fold, test = f"{train.readings.skin}-{train.policy}", np.concatenate([part.row_i for part in tests])
-        for name, recipe in section.training.recipes.items():
-            for seed_i in range(section.training.seeds_n):
-                yield Trial("drift", name, recipe, fold, seed, seed_i, train.row_i, test), tests
-
-
-def answers(trial: Trial, trained: Trained, tests: Sequence[Part]) -> Iterator[Answers]:
-    """Cut a network's answers into its windows."""
-    cuts = np.cumsum([len(part.rows) for part in tests])[:-1]
-    for part, predicted in zip(tests, np.split(trained.predicted, cuts), strict=True):
-        yield Answers(
-            part.policy, part.readings.board, part.readings.skin, trial.seed_i, part.window_i,
-            int(part.readings.n_contacts[0]), part.noload_off_uT, part.rows.indentation, part.rows.target, predicted,
-        )  # fmt: skip
-
-
-def force_left_pct(parts: Sequence[Part], policy: str, window_i: int) -> float | None:
-    """Give force in a window over that in training, at equal places and depths, mean over skins; None if unknown."""
-    own = {(part.readings.skin, part.window_i): part.readings for part in parts if part.policy == policy}
-    left = [force_left(own[skin, TRAIN], late) for (skin, i), late in own.items() if i == window_i]
-    return None if None in left else float(np.mean([one for one in left if one is not None]))
-
-
-def read(settings: Settings) -> Drift:
-    """Read section drift."""
-    return settings.with_training(Drift, "drift")
-
-
-def drift(settings: Settings, indentations: Path, results: Path) -> None:
-    """Train and test under every no-load policy, on every capture of a folder."""
-    prepare_training()
-    section, selection = read(settings), settings.section(Selection, "selection")
-    captures = read_folder(indentations, tuple(settings.captures_in(indentations)))
-    windows, parts = cut(captures, section, selection)
-    if section.wander_uT and captures[0].source != "simulated":
-        rule = "none in a recorded scene: a walk would be added to what was recorded"
-        raise ParamsError(settings.where, "drift.wander_uT", rule, list(section.wander_uT), "Take it out.")
-    pairs = list(trials(parts, section, settings.seed))
-    data = SceneData(settings.scene, settings, stack(parts), [])
-    answered: dict[str, list[Answers]] = {}
-    trained = train_all(data, [trial for trial, _ in pairs], "drift")
-    for (trial, tests), one in zip(pairs, trained, strict=True):
-        answered.setdefault(trial.recipe_name, []).extend(answers(trial, one, tests))
-    rows: dict[str, dict[str, Any]] = {
-        name: {policy: over_windows(own, policy) for policy in section.policies} for name, own in answered.items()
+def judge_finding(name: str, finding: str, parts: Sequence[Comparison]) -> dict[str, Any]:
+    """Judge a finding by all of its comparisons, over boards and over trainings on these boards."""
+    judged = all_of([verdict(part.over_boards) for part in parts])
+    trainings = [part.over_trainings for part in parts]
+    of_trainings = all_of([INCONCLUSIVE if ends is None else verdict({"ci95": ends}) for ends in trainings])
+    return {
+        "id": name,
+        "finding": finding,
+        "holds": judged == YES,
+        "verdict": judged,
+        "of_trainings": of_trainings,
+        "measured": "; ".join(part.text for part in parts),
     }
-    found, drawn = _tell(section, answered[HEADLINE], rows[HEADLINE], parts, field_sizes(captures))
-    counts = {"skins_n": len(captures), "seeds_n": section.training.seeds_n, "dropped": data.rows.dropped}
-    words = section.model_dump(mode="json", include={"unit", "train_n", "test_n", "every_n", "regular_n"})
-    numbers = {name: value for name, value in words.items() if value is not None} | counts | pace(captures)
-    if section.wander_uT:
-        numbers["wander"] = _wander(
-            section, selection, captures, parts, list(zip(pairs, trained, strict=True)), settings.seed
-        )
-    variants = {name: own for name, own in rows.items() if name != HEADLINE}
-    numbers |= {"left_out_units_n": windows.left_out_units_n} | found | ({"variants": variants} if variants else {})
-    write_results(
-        results, numbers, drawn, read_losses(indentations, numbers["dropped"]), tally(map(collapse_record, trained))
-    )
 
 
-def _wander(
-    section: Drift,
-    selection: Selection,
-    captures: Sequence[Readings],
-    parts: Sequence[Part],
-    trained: Sequence[tuple[tuple[Trial, list[Part]], Trained]],
-    seed: int,
-) -> dict[str, Any]:
-    """Test the networks of the headline's recipe again on their last window, of captures that wander further."""
-    at = {part.first_row_i: i for i, part in enumerate(parts)}
-    last = [(trial, one, at[tests[-1].first_row_i]) for (trial, tests), one in trained if trial.recipe_name == HEADLINE]
-    trained_on = baseline.rank(getattr(captures[0], UNIT[section.unit])) < section.train_n
-    after_n = 1 + int(baseline.rank(captures[0].indentation)[trained_on].max())
-
-    def parts_at(step_uT: float) -> list[Part]:
-        return cut([walked(one, step_uT, after_n=after_n, seed=seed) for one in captures], section, selection)[1]
-
-    return over_steps(last, section.wander_uT, parts_at)
-
-
-def _tell(
-    section: Drift, answered: Sequence[Answers], rows: dict[str, Any], parts: Sequence[Part], field: dict[str, float]
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Put the windows together with late forces and findings; the paper does not say of which policy figure 5b is."""
-    policy = "regular" if "regular" in rows else section.policies[0]
-    window_i = late_window(rows[policy])
-    numbers, drawn, late = rows | {"field": field}, {}, late_force(answered, policy, window_i)
-    if late is not None:
-        left_pct = force_left_pct(parts, policy, window_i)
-        where = {"policy": policy, "contacts_n": rows[policy][window_i]["contacts_n"]}
-        numbers["late"] = where | late[0] | ({} if left_pct is None else {"force_left_pct": left_pct})
-        drawn = {"late": late[1]}
-    networks: dict[str, Any] = {name: of_networks(answered, name) for name in section.policies}
-    boards = boards_of(answered, policy)
-    found = findings(rows, networks, boards=boards, field=field, late=numbers.get("late"))
-    last = {name: last_window(answered, name) for name in section.policies}
-    return numbers | {"findings": found, "last_window": last}, drawn
-
+# --- Tables ---
 
 POLICIES = ("initial", "regular", "each", "free")
-WALKED = (
+WANDER_MEANING = (
     "The networks of figure 5a on their last window again, of captures to which a random walk was added: one normal "
     "step a contact and channel, from the end of training on, in contact and no-load readings alike. The first row is "
     "that of figure 5a. How far fields at rest really go is in the table of skins: rms change over 1 to 1,000 contacts."
 )
-MARGIN = 0.05  # of the largest force
-JUDGED = (
+FINDINGS_MEANING = (
     f"{VERDICTS} A finding of several parts: no, if one part is no; yes, if all are. Of these trainings: judged in the "
     "same words by the 95 % interval over pairs of networks (policies trained from the same seed on the same skin), "
     "each network's value the mean over its windows; for the bias of the force also by two standard errors over "
-    "indentations. Several trainings on one skin say how much trainings vary, not how much boards do."
+    "indentations. Several trainings on one skin say how much trainings vary, not how much boards do. Measured: "
+    "values by no-load policy; brackets are the interval over boards, or over these trainings where boards are too few."
 )
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Make a table of scores against contacts, and one of the paper's findings."""
-    named, error = _policies(numbers), _error(numbers)
+    """Tabulate scores against contacts, the paper's findings, and scores with a walk that was added."""
+    policies, error, spread = _policies(numbers), _error(numbers), _spread(numbers)
     lines = []
-    for i, first in enumerate(next(iter(named.values()))[1]):
+    for i, first in enumerate(next(iter(policies.values()))[1]):
         line = {"contacts": f"{first['contacts_n']:,}", "source": source}
-        for words, rows in named.values():
-            for metric in ("accuracy_pct", error):
-                line[f"{COLUMNS[metric]} ({words})"] = show(_stat(rows[i], metric))
+        for title, rows in policies.values():
+            line |= {f"{COLUMNS[metric]} ({title})": show(_stat(rows[i], metric)) for metric in ("accuracy_pct", error)}
         lines.append(line)
-    spread = _spread(numbers)
-    found = [
+    meaning = f"{_protocol(numbers)} {describe_pace(numbers, source)} {FIGURE_5}"
+    findings = [
         {
-            "finding (paper)": one["finding"], "holds": one["verdict"], **_of_trainings(one),
-            "measured": one["measured"], "why not": one.get("why", "–"), "source": source,
+            "finding (paper)": one["finding"],
+            "holds": one["verdict"],
+            "of these trainings": one["of_trainings"],
+            "measured": one["measured"],
+            "source": source,
         }
         for one in numbers["findings"]
-    ]  # fmt: skip
-    shown = {
-        "drift": tabulate(lines, meaning=f"{_protocol(numbers)} {say_pace(numbers, source)} {FIGURE_5}", spread=spread),
-        "drift_findings": tabulate(found, meaning=JUDGED),
+    ]
+    made = {
+        "drift": tabulate(lines, meaning=meaning, spread=spread),
+        "drift_findings": tabulate(findings, meaning=f"{FINDINGS_MEANING} {_possible_reasons(numbers)}"),
     }
-    return shown | ({"drift_wander": _wander_table(numbers, source)} if "wander" in numbers else {})
+    if "wander" in numbers:
+        walked = []
+        for i, first in enumerate(next(iter(numbers["wander"].values()))):
+            line = {"further walk, µT a contact": f"{first['step_uT']:g}", "source": source}
+            for policy, (title, _) in policies.items():
+                row = numbers["wander"][policy][i]
+                line[f"no-load reading off by, µT ({title})"] = f"{row['noload_off_uT']:.3g}"
+                line |= {f"{COLUMNS[name]} ({title})": show(_stat(row, name)) for name in ("accuracy_pct", error)}
+            walked.append(line)
+        made["drift_wander"] = tabulate(walked, meaning=WANDER_MEANING, spread=spread)
+    return made
 
 
-def _wander_table(numbers: Mapping[str, Any], source: str) -> pd.DataFrame:
-    named = _policies(numbers)
-    lines = []
-    for i, step_uT in enumerate(row["step_uT"] for row in next(iter(numbers["wander"].values()))):
-        line = {"further walk, µT a contact": f"{step_uT:g}", "source": source}
-        for policy, (words, _) in named.items():
-            row = numbers["wander"][policy][i]
-            line[f"no-load reading off by, µT ({words})"] = f"{row['noload_off_uT']:.3g}"
-            line |= {f"{COLUMNS[name]} ({words})": show(_stat(row, name)) for name in ("accuracy_pct", _error(numbers))}
-        lines.append(line)
-    return tabulate(lines, meaning=WALKED, spread=_spread(numbers))
+def _possible_reasons(numbers: Mapping[str, Any]) -> str:
+    """Give the sizes that bound what a no-load reading can change, and what softening explains of the force bias."""
+    field, late = numbers["field"], numbers.get("late", {})
+    off = ", ".join(
+        f"{numbers[policy][-1]['noload_off_uT']:.2g} µT ({title})" for policy, (title, _) in _policies(numbers).items()
+    )
+    text = (
+        f"A contact changes the field by {field['contact_uT']:.3g} µT rms over channels, a no-load reading has a noise "
+        f"of {field['noload_noise_uT']:.2g} µT; in the last window it is off by {off}."
+    )
+    if "force_left_pct" in late:
+        left_pct = late["force_left_pct"]
+        text += (
+            f" At equal places and depths the skin gives {left_pct:.4g} % of its early force after "
+            f"{late['contacts_n']:,} contacts, so softening explains {100 - left_pct:+.2g} % of the force bias."
+        )
+    return text
+
+
+def _policies(numbers: Mapping[str, Any]) -> dict[str, tuple[str, Sequence[Mapping[str, Any]]]]:
+    """Give the title and the windows of each policy that was tested."""
+    titles = {
+        "initial": "once at the start",
+        "regular": f"every {numbers.get('regular_n')} indentations",
+        "each": "before every contact",
+        "free": "whenever judged free of contact",
+    }
+    return {policy: (titles[policy], numbers[policy]) for policy in POLICIES if policy in numbers}
+
+
+def _error(numbers: Mapping[str, Any]) -> str:
+    """Choose the error to show beside accuracy: that of places where no force is known."""
+    [(_, rows), *_] = _policies(numbers).values()
+    return "mse_f_N2" if "mse_f_N2" in rows[0] else "mse_xy_mm2"
+
+
+def _stat(row: Mapping[str, Any], metric: str) -> dict[str, float]:
+    return {"mean": row[metric]} | ({"sd": row["spread"][metric]} if metric in row["spread"] else {})
 
 
 def _spread(numbers: Mapping[str, Any]) -> str:
-    """Say over what ± is, which all rows of all policies share."""
+    """Describe what ± means in the rows of all policies."""
     [(_, rows), *_] = _policies(numbers).values()
     seeds_n, skins_n = numbers["seeds_n"], numbers["skins_n"]
     if not rows[0]["spread"]:
@@ -752,84 +709,70 @@ def _spread(numbers: Mapping[str, Any]) -> str:
     return f"± is the sd over {skins_n} skins with {seeds_n} network seeds each."
 
 
-def _legend(numbers: Mapping[str, Any]) -> str:
-    """Say what the lines of a figure differ in, and what their bars are."""
-    spread = _spread(numbers)
-    return (
-        f"no-load reading; {spread.removesuffix('.').replace('± is', 'bars:')}" if "±" in spread else "no-load reading"
+def _protocol(numbers: Mapping[str, Any]) -> str:
+    several = {"indentation": "indentations", "pass": "passes"}[numbers["unit"]]
+    train, test, every, left = (
+        f"{numbers[name]:,} {numbers['unit'] if numbers[name] == 1 else several}"
+        for name in ("train_n", "test_n", "every_n", "left_out_units_n")
     )
+    text = (
+        f"Trained on the first {train} of each skin, tested on {test} after every {every}; each policy of "
+        "the no-load reading has networks of its own. Contacts: what the skin had felt before the test."
+    )
+    return text + (f" The last {left} fill no whole test, and are left out." if numbers["left_out_units_n"] else "")
 
 
-def _of_trainings(one: Mapping[str, Any]) -> dict[str, str]:
-    return {"of these trainings": one["of_trainings"]} if "of_trainings" in one else {}
+# --- Figures ---
+
+MARGIN = 0.05  # of the largest force
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw scores against contacts (figure 5a), and where force is known predicted against true force (figure 5b)."""
-    texts = {"drift.svg": _scores(numbers, source)}
-    texts |= {"drift_wander.svg": _wander_figure(numbers, source)} if "wander" in numbers else {}
-    return texts | ({"drift_force.svg": _forces(numbers["late"], drawn["late"], source)} if "late" in numbers else {})
-
-
-def say_pace(numbers: Mapping[str, Any], source: str) -> str:
-    """Say how fast contacts follow each other by the capture's own clock, and what that does to a simulated one."""
-    if "lasts_s" not in numbers:
-        return "When the contacts were is not known."
-    every = f"A contact follows the one before after {numbers['contact_every_s']:.3g} s (median)"
-    said = f"{every}; the whole capture lasts {numbers['lasts_s']:,.0f} s."
-    if source != "simulated":
-        return said
-    return f"{said} A real rig takes seconds a contact: temperature wanders here over many more contacts than there."
-
-
-def _scores(numbers: Mapping[str, Any], source: str) -> str:
-    with drawing(7.6, 4.0) as figure:
-        error = _error(numbers)
-        for axes, metric in zip(figure.subplots(1, 2), ("accuracy_pct", error), strict=True):
-            for policy, (words, rows) in _policies(numbers).items():
-                i = POLICIES.index(policy)
-                contacts_n, values = ([row[name] for row in rows] for name in ("contacts_n", metric))
-                bars = [row["spread"].get(metric, 0.0) for row in rows] if rows[0]["spread"] else None
-                look = {"color": COLOURS[i], "marker": MARKERS[i], "markersize": 5, "linewidth": 1.2, "capsize": 2}
-                axes.errorbar(contacts_n, values, bars, label=words, **look)
-            axes.set(xlabel="contacts the skin has felt", ylabel=COLUMNS[metric].replace(", ", " / "))
-            axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k" if value else "0")
-            axes.set_xlim(left=0)
-            axes.grid(alpha=0.25)
-        axes.set_yscale("log")
-        figure.axes[0].set_ylim(0, 102)
-        names = figure.axes[0].get_legend_handles_labels()
-        figure.legend(*names, loc="outside lower center", ncols=3, frameon=False, title=_legend(numbers))
-        figure.suptitle(f"Trained on first contacts, tested on later ones ({source})", x=0.01, ha="left", fontsize=11)
-        return svg(figure)
-
-
-def _wander_figure(numbers: Mapping[str, Any], source: str) -> str:
-    with drawing(7.6, 4.0) as figure:
-        error = _error(numbers)
-        for axes, metric in zip(figure.subplots(1, 2), ("accuracy_pct", error), strict=True):
-            for policy, (words, _) in _policies(numbers).items():
-                i, rows = POLICIES.index(policy), numbers["wander"][policy]
-                steps_uT = [row["step_uT"] for row in rows]
-                bars = [row["spread"].get(metric, 0.0) for row in rows] if rows[0]["spread"] else None
-                look = {"color": COLOURS[i], "marker": MARKERS[i], "markersize": 5, "linewidth": 1.2, "capsize": 2}
-                axes.errorbar(steps_uT, [row[metric] for row in rows], bars, label=words, **look)
-            least_uT = min((step for step in steps_uT if step > 0), default=1.0)
-            axes.set_xscale("symlog", linthresh=least_uT)
-            axes.set(xlabel="further random walk / µT a contact", ylabel=COLUMNS[metric].replace(", ", " / "))
-            axes.set_xlim(left=0)
-            axes.grid(alpha=0.25)
-        axes.set_yscale("log")
-        figure.axes[0].set_ylim(0, 102)
-        names = figure.axes[0].get_legend_handles_labels()
-        figure.legend(*names, loc="outside lower center", ncols=3, frameon=False, title=_legend(numbers))
-        last_n = next(iter(_policies(numbers).values()))[1][-1]["contacts_n"]
+    """Draw scores against contacts (figure 5a) and against an added walk; late forces where known (figure 5b)."""
+    windows = {policy: rows for policy, (_, rows) in _policies(numbers).items()}
+    title = f"Trained on first contacts, tested on later ones ({source})"
+    texts = {"drift.svg": _draw_scores(numbers, windows, "contacts_n", title)}
+    if "wander" in numbers:
+        last_n = next(iter(windows.values()))[-1]["contacts_n"]
         title = f"After {last_n:,} contacts, if the field at rest wandered more ({source})"
+        texts["drift_wander.svg"] = _draw_scores(numbers, numbers["wander"], "step_uT", title)
+    if "late" in numbers:
+        texts["drift_force.svg"] = _draw_forces(numbers["late"], drawn["late"], source)
+    return texts
+
+
+def _draw_scores(
+    numbers: Mapping[str, Any], lines: Mapping[str, Sequence[Mapping[str, Any]]], x: str, title: str
+) -> str:
+    """Draw accuracy and an error against `contacts_n` or `step_uT`, a line for each policy."""
+    policies, spread = _policies(numbers), _spread(numbers)
+    with drawing(7.6, 4.0) as figure:
+        for axes, metric in zip(figure.subplots(1, 2), ("accuracy_pct", _error(numbers)), strict=True):
+            for policy, (name, _) in policies.items():
+                i, rows = POLICIES.index(policy), lines[policy]
+                bars = [row["spread"].get(metric, 0.0) for row in rows] if rows[0]["spread"] else None
+                look = {"color": COLOURS[i], "marker": MARKERS[i], "markersize": 5, "linewidth": 1.2, "capsize": 2}
+                axes.errorbar([row[x] for row in rows], [row[metric] for row in rows], bars, label=name, **look)
+            axes.set_ylabel(COLUMNS[metric].replace(", ", " / "))
+            if x == "contacts_n":
+                axes.set_xlabel("contacts the skin has felt")
+                axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k" if value else "0")
+            else:
+                steps_uT = [row[x] for row in next(iter(lines.values())) if row[x] > 0]
+                axes.set_xscale("symlog", linthresh=min(steps_uT, default=1.0))
+                axes.set_xlabel("further random walk / µT a contact")
+            axes.set_xlim(left=0)
+            axes.grid(alpha=0.25)
+        axes.set_yscale("log")
+        figure.axes[0].set_ylim(0, 102)
+        bars_are = f"; {spread.removesuffix('.').replace('± is', 'bars:')}" if "±" in spread else ""
+        names = figure.axes[0].get_legend_handles_labels()
+        figure.legend(*names, loc="outside lower center", ncols=3, frameon=False, title=f"no-load reading{bars_are}")
         figure.suptitle(title, x=0.01, ha="left", fontsize=11)
         return svg(figure)
 
 
-def _forces(late: Mapping[str, Any], points: Mapping[str, Sequence[float]], source: str) -> str:
+def _draw_forces(late: Mapping[str, Any], points: Mapping[str, Sequence[float]], source: str) -> str:
     with drawing(5.2, 5.0) as figure:
         axes = figure.subplots()
         ends = min(0.0, *points["true_N"], *points["predicted_N"]), max(*points["true_N"], *points["predicted_N"])
@@ -838,52 +781,15 @@ def _forces(late: Mapping[str, Any], points: Mapping[str, Sequence[float]], sour
         axes.plot(limits, limits, color="0.5", linewidth=1, linestyle="--", label="predicted = true")
         axes.scatter(points["true_N"], points["predicted_N"], s=9, color=COLOURS[1], alpha=0.5, linewidths=0)
         axes.set(xlabel="true force / N", ylabel="predicted force / N", xlim=limits, ylim=limits, aspect="equal")
-        said = (
+        text = (
             f"bias {late['bias_N']:+.3g} ± {late['bias_se_N']:.1g} N ({late['bias_pct']:+.2g} %)\n"
             f"slope {late['slope']:.3g}, {late['indentations_n']:,} indentations\n"
             f"no-load reading: policy {late['policy']}\n"
             f"means over {len(late['network_bias_N'])} network(s)\n"
             "points: first seed"
         )
-        axes.text(0.03, 0.97, said, transform=axes.transAxes, va="top", fontsize=10)
+        axes.text(0.03, 0.97, text, transform=axes.transAxes, va="top", fontsize=10)
         axes.legend(loc="lower right", frameon=False)
         axes.grid(alpha=0.25)
         figure.suptitle(f"Force after {late['contacts_n']:,} contacts ({source})", x=0.01, ha="left", fontsize=11)
         return svg(figure)
-
-
-def _policies(numbers: Mapping[str, Any]) -> dict[str, tuple[str, Sequence[Mapping[str, Any]]]]:
-    """Name the policies that were tried in words, each with its rows."""
-    words = {
-        "initial": "once at the start",
-        "regular": f"every {numbers.get('regular_n')} indentations",
-        "each": "before every contact",
-        "free": "whenever judged free of contact",
-    }
-    return {policy: (words[policy], numbers[policy]) for policy in POLICIES if policy in numbers}
-
-
-def _error(numbers: Mapping[str, Any]) -> str:
-    """Choose what is shown beside accuracy: places where no force is known."""
-    [(_, rows), *_] = _policies(numbers).values()
-    return "mse_f_N2" if "mse_f_N2" in rows[0] else "mse_xy_mm2"
-
-
-def _stat(row: Mapping[str, Any], metric: str) -> dict[str, float]:
-    return {"mean": row[metric]} | ({"sd": row["spread"][metric]} if metric in row["spread"] else {})
-
-
-def _protocol(numbers: Mapping[str, Any]) -> str:
-    train, test, every, left = (
-        _count(numbers[name], numbers["unit"]) for name in ("train_n", "test_n", "every_n", "left_out_units_n")
-    )
-    said = (
-        f"Trained on the first {train} of each skin, tested on {test} after every {every}; each policy of "
-        "the no-load reading has networks of its own. Contacts: what the skin had felt before the test."
-    )
-    return said + (f" The last {left} fill no whole test, and are left out." if numbers["left_out_units_n"] else "")
-
-
-def _count(n: int, unit: str) -> str:
-    several = {"indentation": "indentations", "pass": "passes"}[unit]
-    return f"{n:,} {unit if n == 1 else several}"

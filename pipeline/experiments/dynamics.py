@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
 
-from pipeline.experiments.results import only, read_folder, read_losses, write_results
+from pipeline.experiments.results import only, read_captures, read_losses, write_results
 from pipeline.report import paper
 from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
 from pipeline.report.formatting import show_difference
@@ -138,7 +138,7 @@ def _scores(
 
 def dynamics(settings: Settings, indentations: Path, models: Path, results: Path) -> None:
     """Ask the networks of train_multi that never saw the pressed skin's board."""
-    one = only(read_folder(indentations), indentations)
+    one = only(read_captures(indentations), indentations)
     true = np.stack([getattr(one, name) for name in TARGETS], axis=1)
     presses = presses_of(subtract(one.b_uT, one.noload_uT), true, one.t_s, one.indentation)
     numbers = compare(presses, networks_without(models, one.board), board=one.board)

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from pipeline.experiments.results import read_folder, read_losses, write_results
+from pipeline.experiments.results import read_captures, read_losses, write_results
 from pipeline.report.drawing import COLOURS, drawing, svg
 from pipeline.report.formatting import COLUMNS, OF_PAPER, show, show_difference, tabulate
 from pipeline.report.paper import FLEXIBLE, FLEXIBLE_BIAS, FLEXIBLE_GAP_LESS_PCT
@@ -90,7 +90,7 @@ def flexible(settings: Settings, folds: Path, main: Path, indentations: Path, st
     """Adapt the networks of the first fold of lobo to every flexible skin, and test on its later passes."""
     prepare_training()
     data = read_data(settings, main, folds)
-    starts, captures = read_starts(started), read_folder(indentations)
+    starts, captures = read_starts(started), read_captures(indentations)
     adapting, first, trained_n = data.settings.adaptations(), data.folds_of("lobo")[0], len(data.rows)
     poked = gather(captures, data.settings.section(Selection, "selection"))
     data = replace(data, rows=stack(data.rows, poked))
@@ -117,7 +117,7 @@ def flexible(settings: Settings, folds: Path, main: Path, indentations: Path, st
         "skins_n": len(skins), "boards_n": len(np.unique(data.rows.board[fold.test])),
         "seeds_n": len({one.seed_i for one in own}), "pokes_n": adapting.pokes_n, "fold": first.name,
         "trained_on_skins_n": len(np.unique(data.rows.skin[fold.train])),
-        "strength_ratio": strength_ratio(_by_depth(captures), _by_depth(read_folder(main))),
+        "strength_ratio": strength_ratio(_by_depth(captures), _by_depth(read_captures(main))),
     } | _gaps(data) | answer_flexible(own)  # fmt: skip
     if SHAPE in arms:
         numbers[SHAPE] = answer_flexible(before[SHAPE] + [replace(one, arm=AFTER) for one in after if one.arm == SHAPE])

@@ -10,7 +10,7 @@ import pandas as pd
 from jaxtyping import Float, Float32, Float64
 from pydantic import Field
 
-from pipeline.experiments.results import read_folder, read_losses, write_results
+from pipeline.experiments.results import read_captures, read_losses, write_results
 from pipeline.experiments.sensitivity import levels_of
 from pipeline.report.drawing import COLOURS, drawing, svg
 from pipeline.settings import Settings
@@ -196,7 +196,7 @@ def gripper(settings: Settings, indentations: Path, models: Path, results: Path)
     """Let a gripper hold objects by the force that is estimated of its finger's skin."""
     load = loads_of(settings, "grip")
     weight_N = weights_N(load.force_max_N, load.step_N)
-    fingers = [finger_of(capture, weight_N) for capture in read_folder(indentations)]
+    fingers = [finger_of(capture, weight_N) for capture in read_captures(indentations)]
     networks = {finger.board: networks_without(models, finger.board) for finger in fingers}
     numbers, drawn = answer_of(fingers, networks, read(settings), seed=settings.seed)
     write_results(results, numbers, drawn, read_losses(indentations, {}))

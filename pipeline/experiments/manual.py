@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pipeline.experiments.results import read_folder, read_losses, write_results
+from pipeline.experiments.results import read_captures, read_losses, write_results
 from pipeline.report.formatting import COLUMNS, OF_PAPER, Stat, gain, show, show_difference, tabulate
 from pipeline.report.paper import GAINS, MANUAL, MANUAL_POKES_N
 from pipeline.settings import Adaptations, Settings
@@ -68,7 +68,7 @@ def manual(settings: Settings, folds: Path, main: Path, indentations: Path, star
     data = read_data(settings, main, folds)
     starts = read_starts(started)
     adapting = data.settings.adaptations()
-    poked, found = hand_rows(read_folder(indentations))
+    poked, found = hand_rows(read_captures(indentations))
     lines = {skin: shifted(own, len(data.rows)) for skin, own in found.items()}
     data = replace(data, rows=stack(data.rows, poked))
     trials: list[tuple[str, Trial]] = []

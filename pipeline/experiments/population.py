@@ -16,7 +16,7 @@ from scipy.constants import mega, milli
 from scipy.spatial.transform import Rotation
 
 import reskin.universal
-from pipeline.experiments.results import read_folder, write_results
+from pipeline.experiments.results import read_captures, write_results
 from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
 from pipeline.report.formatting import n_of, scores, tabulate
 from pipeline.settings import Settings
@@ -238,7 +238,7 @@ def rest_by_skin(indentations: Path) -> dict[str, np.ndarray]:
     """Give the mean no-load field of each skin's first pass, in the chips' axes."""
     return {
         one.skin: one.noload_uT[one.pass_i == one.pass_i.min()].mean(axis=0, dtype=float)
-        for one in read_folder(indentations)
+        for one in read_captures(indentations)
     }
 
 

@@ -14,7 +14,7 @@ from pydantic import Field
 
 from pipeline.experiments.compare import Compare, see, setup_of, skins_of, turns_of
 from pipeline.experiments.contacts import roc_area
-from pipeline.experiments.results import read_folder, write_results
+from pipeline.experiments.results import read_captures, write_results
 from pipeline.provenance import SECONDS
 from pipeline.report.formatting import COLUMNS, OF_FORCE, n_of, scores, show, show_difference, tabulate
 from pipeline.settings import Settings
@@ -513,7 +513,7 @@ def read(settings: Settings) -> Rivals:
 def rivals(settings: Settings, indentations: Path, folds: Path, models: Path, results: Path) -> None:
     """Score rivals on every held-out board, on the rows that experiment labels tests."""
     data, compare = read_data(settings, indentations, folds), settings.section(Compare, "compare")
-    skins = skins_of(read_folder(indentations, tuple(settings.captures_in(indentations))))
+    skins = skins_of(read_captures(indentations, tuple(settings.captures_in(indentations))))
     if len(skins) < 2:
         raise ParamsError(f"scene {settings.scene}", "boards with known forces", "two or more", len(skins), "Add one.")
     setup = setup_of(compare, settings.shared_section(SkinDesign, "skin"))

@@ -9,7 +9,7 @@ import pandas as pd
 from jaxtyping import Float, Float32, Float64, Int32
 from scipy.special import ndtr, ndtri
 
-from pipeline.experiments.results import only, read_folder, read_losses, write_results
+from pipeline.experiments.results import only, read_captures, read_losses, write_results
 from pipeline.report import paper
 from pipeline.report.drawing import COLOURS, drawing, svg
 from pipeline.settings import Settings
@@ -144,7 +144,7 @@ def monotonic(response_uT: Float64[np.ndarray, "n p"], weight_N: Float64[np.ndar
 def sensitivity(settings: Settings, indentations: Path, results: Path) -> None:
     """Tell how small a weight the one skin tells that was loaded."""
     load = loads_of(settings, "glass")
-    one = only(read_folder(indentations), indentations)
+    one = only(read_captures(indentations), indentations)
     weight_N = weights_N(load.force_max_N, load.step_N)
     change_uT = subtract(one.b_uT, one.noload_uT)
     levels_uT = levels_of(change_uT, one.indentation, one.Fz_N, levels_n=len(weight_N), where=one.capture)

@@ -9,7 +9,7 @@ import pandas as pd
 from jaxtyping import Float
 from pydantic import Field
 
-from pipeline.experiments.results import read_folder, read_losses, write_results
+from pipeline.experiments.results import read_captures, read_losses, write_results
 from pipeline.report.drawing import COLOURS, drawing, svg
 from pipeline.report.formatting import show, tabulate
 from pipeline.report.paper import SHEAR
@@ -92,7 +92,7 @@ def shear(settings: Settings, indentations: Path, results: Path) -> None:
     """Train with five targets on both splits of every skin, and score what was held out."""
     prepare_training()
     section = read(settings)
-    rows = gather(read_folder(indentations), settings.section(Selection, "selection"), targets=SHEAR_TARGETS)
+    rows = gather(read_captures(indentations), settings.section(Selection, "selection"), targets=SHEAR_TARGETS)
     by_reading = _folds(rows, np.arange(len(rows)), "reading", section, settings.seed)
     by_line = _folds(rows, rows.indentation, "line", section, settings.seed)
     data = SceneData(settings.scene, settings, rows, [*by_reading, *by_line])

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int, Int64, Shaped
 from pydantic import Field
 
 from pipeline.executors import Here
-from pipeline.experiments.results import read_folder, read_losses, write_results
+from pipeline.experiments.results import read_captures, read_losses, write_results
 from pipeline.report.drawing import COLOURS, drawing, svg
 from pipeline.report.formatting import COLUMNS, scores, show, tabulate
 from pipeline.report.paper import SLEEVE, SLEEVE_SKIN, SLEEVE_WORDS
@@ -168,7 +168,7 @@ def read(settings: Settings) -> Sleeve:
 def sleeve(settings: Settings, indentations: Path, results: Path) -> None:
     """Train the recipes of section sleeve on the first pokes, score them and nearest neighbours on the last."""
     prepare_training()
-    section, captures, area = read(settings), read_folder(indentations), _area(settings)
+    section, captures, area = read(settings), read_captures(indentations), _area(settings)
     data = SceneData(settings.scene, settings, gather(captures, settings.section(Selection, "selection")), [])
     train, test = hold_out_last(data.rows, section.test_fraction)
     trials = [

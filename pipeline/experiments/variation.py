@@ -1,4 +1,4 @@
-"""How the field of equal pokes differs over time and skins (paper figure 4)."""
+"""Variation: how the field of equal indentations differs over time and from skin to skin (paper figure 4)."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -12,8 +12,8 @@ import pandas as pd
 from jaxtyping import Bool, Float, Int
 from pydantic import Field
 
-from pipeline.experiments.drift import pace, rms, say_pace
-from pipeline.experiments.results import read_folder, read_losses, write_results
+from pipeline.experiments.drift import describe_pace, pace, rms
+from pipeline.experiments.results import read_captures, read_losses, write_results
 from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
 from pipeline.report.formatting import tabulate
 from pipeline.report.paper import FIGURE_4
@@ -24,36 +24,64 @@ from reskin.data.baseline import rank, subtract
 from reskin.errors import ParamsError
 from reskin.schema import Readings
 
+SAME_MM = 1e-3  # labels are commanded values in float32
+LISTED_N = 8  # places or depths that an error message names
+LINES_MAX_N = 40  # visits drawn in a panel
+DECIMALS = 1  # of a microtesla that is drawn
+
 Count = Annotated[int, Field(ge=1)]
 Place_mm = tuple[float, float]
 
 
 class Variation(Strict):
-    """How the field of equal pokes differs over time and from skin to skin (paper figure 4)."""
+    """Section variation: the places and the depth that are compared, and over how many skins and contacts."""
 
     places_mm: Annotated[tuple[Place_mm, ...], Field(min_length=1, max_length=4)]
     depth_mm: Annotated[float, Field(gt=0)]
     skins_n: Count
-    contacts_n: Count  # over so many contacts of one skin
+    contacts_n: Count  # contacts of the worn skin
 
 
-SAME_MM = 1e-3  # labels are commanded values in float32
-LISTED_N = 8
-LINES_MAX_N = 40
-DECIMALS = 1  # of a microtesla that is drawn
+def read(settings: Settings) -> Variation:
+    """Read section variation."""
+    return settings.section(Variation, "variation")
+
+
+def variation(settings: Settings, main: Path, indentations: Path, results: Path) -> None:
+    """Compare visits of equal places: of the worn skin in `indentations`, and of several skins in `main`."""
+    section = read(settings)
+    worn = read_captures(indentations)[0]
+    boards: dict[str, str] = {}
+    visits: dict[str, list[Visits]] = {}
+    for name in settings.captures_in(main):  # one capture in memory at a time
+        one = io.read_readings(main / f"{name}.parquet")
+        boards[one.skin] = one.board
+        visits[one.skin] = [find_visits(one, place_mm, section.depth_mm) for place_mm in section.places_mm]
+    skins = first_of_each_board(boards, section.skins_n)
+
+    places: list[dict[str, Any]] = []
+    drawn: list[dict[str, Any]] = []
+    for place_i, (x_mm, y_mm) in enumerate(section.places_mm):
+        time, time_lines = over_time(find_visits(worn, (x_mm, y_mm), section.depth_mm), section.contacts_n)
+        of_skins, skin_lines = over_skins({skin: visits[skin][place_i] for skin in skins})
+        places.append({"x_mm": x_mm, "y_mm": y_mm, "time": time, "skins": of_skins})
+        drawn.append({"x_mm": x_mm, "y_mm": y_mm, "time": time_lines, "skins": skin_lines})
+    numbers = {"depth_mm": section.depth_mm, "worn_skin": worn.skin} | pace([worn])
+    numbers |= duration_and_warming(worn, section.contacts_n) | {"places": places}
+    write_results(results, numbers, {"places": drawn}, read_losses(indentations, {}))
 
 
 @dataclass(frozen=True)
 class Visits:
     """The visits of one place at one depth in order of time, each the mean of its readings, in uT."""
 
-    contacts_n: Int[np.ndarray, " n"]  # felt before
+    contacts_n: Int[np.ndarray, " n"]  # contacts of the skin before each visit
     b_uT: Float[np.ndarray, "n ch"]
     db_uT: Float[np.ndarray, "n ch"]
 
 
 def find_visits(readings: Readings, place_mm: tuple[float, float], depth_mm: float) -> Visits:
-    """Take the indentations of a capture at one place and depth; raise if there are none."""
+    """Average the readings of each indentation at one place and depth; raise `ParamsError` if there are none."""
     at = _at(readings, place_mm, depth_mm)
     if not at.any():
         raise ParamsError(
@@ -70,36 +98,46 @@ def find_visits(readings: Readings, place_mm: tuple[float, float], depth_mm: flo
     return Visits(n_contacts[first_i], *means)
 
 
-def over_time(visits: Visits, contacts_n: int) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Compare the visits of a skin's first contacts with the first of them: field as read, and change of field.
+def _at(readings: Readings, place_mm: tuple[float, float], depth_mm: float | None) -> Bool[np.ndarray, " f"]:
+    near = (np.abs(readings.x_mm - place_mm[0]) < SAME_MM) & (np.abs(readings.y_mm - place_mm[1]) < SAME_MM)
+    return near if depth_mm is None else near & (np.abs(readings.depth_mm - depth_mm) < SAME_MM)
 
-    Gives rms values over channels at the last visit, and the lines to draw: each visit's change less the first's.
+
+def _visited(readings: Readings, place_mm: tuple[float, float]) -> str:
+    """List the depths visited at a place, or the places and depths visited at all."""
+
+    def listed(values_mm: np.ndarray) -> str:
+        return ", ".join(f"{value:g}" for value in values_mm[:LISTED_N])
+
+    at = _at(readings, place_mm, None)
+    if at.any():
+        return f"Visited depths there: {listed(np.unique(readings.depth_mm[at]))} mm."
+    places = np.unique(np.stack([readings.x_mm, readings.y_mm], axis=1), axis=0)
+    some = "; ".join(f"{x:g}, {y:g}" for x, y in places[:LISTED_N])
+    depths = listed(np.unique(readings.depth_mm))
+    return f"Visited: depths {depths} mm, and {len(places)} places, among them {some} mm."
+
+
+def over_time(visits: Visits, contacts_n: int) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Compare the visits within a skin's first contacts with the first visit: field as read, and change of field.
+
+    Gives rms values over channels at the last visit, and the lines to draw: each visit's field less the first's.
     """
     early = visits.contacts_n - visits.contacts_n[0] < contacts_n
-    felt_n, b_uT, db_uT = visits.contacts_n[early], visits.b_uT[early], visits.db_uT[early]
-    raw_uT, seen_uT, size_uT = rms(b_uT[-1] - b_uT[0]), rms(db_uT[-1] - db_uT[0]), rms(db_uT[0])
+    before_n, b_uT, db_uT = visits.contacts_n[early], visits.b_uT[early], visits.db_uT[early]
+    raw_uT, change_uT, size_uT = rms(b_uT[-1] - b_uT[0]), rms(db_uT[-1] - db_uT[0]), rms(db_uT[0])
     numbers = {
-        "visits_n": len(felt_n),
-        "contacts_n": int(felt_n[-1] - felt_n[0]),
+        "visits_n": len(before_n),
+        "contacts_n": int(before_n[-1] - before_n[0]),
         "first_db_uT": size_uT,
         "raw_change_uT": raw_uT,
         "raw_change_pct": 100 * raw_uT / size_uT,
-        "db_change_uT": seen_uT,
-        "db_change_pct": 100 * seen_uT / size_uT,
+        "db_change_uT": change_uT,
+        "db_change_pct": 100 * change_uT / size_uT,
     }
-    shown = np.unique(np.linspace(0, len(felt_n) - 1, LINES_MAX_N).round().astype(int))
+    shown = np.unique(np.linspace(0, len(before_n) - 1, LINES_MAX_N).round().astype(int))
     lines = np.round(b_uT[shown] - b_uT[0], DECIMALS)
-    return numbers, {"contacts_n": felt_n[shown].tolist(), "b_uT": lines.tolist()}
-
-
-def meanwhile(readings: Readings, contacts_n: int) -> dict[str, float]:
-    """Give how long a skin's first contacts take, and by how much its chips grow warmer, mean over them; if known."""
-    early = readings.n_contacts - readings.n_contacts[0] < contacts_n
-    t_s, temperature_degC = readings.t_s[early], readings.temperature_degC[early].astype(float)
-    order = rank(readings.indentation[early])
-    warmer_K = float(temperature_degC[order == order[-1]].mean() - temperature_degC[order == 0].mean())
-    told = {"shown_s": float(t_s[-1] - t_s[0]), "warmer_K": warmer_K}
-    return {name: value for name, value in told.items() if np.isfinite(value)}
+    return numbers, {"contacts_n": before_n[shown].tolist(), "b_uT": lines.tolist()}
 
 
 def over_skins(visits: Mapping[str, Visits]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -111,6 +149,16 @@ def over_skins(visits: Mapping[str, Visits]) -> tuple[dict[str, Any], dict[str, 
         spread_uT = rms(np.array([one - other for one, other in combinations(mean_uT.values(), 2)]))
         numbers |= {"spread_uT": spread_uT, "spread_pct": 100 * spread_uT / size_uT}
     return numbers, {skin: np.round(line, DECIMALS).tolist() for skin, line in mean_uT.items()}
+
+
+def duration_and_warming(readings: Readings, contacts_n: int) -> dict[str, float]:
+    """Give how long a skin's first contacts take, and how much warmer its chips get in them, where known."""
+    early = readings.n_contacts - readings.n_contacts[0] < contacts_n
+    t_s, temperature_degC = readings.t_s[early], readings.temperature_degC[early].astype(float)
+    order = rank(readings.indentation[early])
+    warmer_K = float(temperature_degC[order == order[-1]].mean() - temperature_degC[order == 0].mean())
+    found = {"shown_s": float(t_s[-1] - t_s[0]), "warmer_K": warmer_K}
+    return {name: value for name, value in found.items() if np.isfinite(value)}
 
 
 def first_of_each_board(boards: Mapping[str, str], skins_n: int) -> list[str]:
@@ -126,111 +174,54 @@ def first_of_each_board(boards: Mapping[str, str], skins_n: int) -> list[str]:
     return [skin for *_, skin in sorted(ranked)[:skins_n]]
 
 
-def _at(readings: Readings, place_mm: tuple[float, float], depth_mm: float | None) -> Bool[np.ndarray, " f"]:
-    near = (np.abs(readings.x_mm - place_mm[0]) < SAME_MM) & (np.abs(readings.y_mm - place_mm[1]) < SAME_MM)
-    return near if depth_mm is None else near & (np.abs(readings.depth_mm - depth_mm) < SAME_MM)
-
-
-def _visited(readings: Readings, place_mm: tuple[float, float]) -> str:
-    """Say what was visited: the depths of that place, or places that there are."""
-    at = _at(readings, place_mm, None)
-    if at.any():
-        return f"Visited depths there: {_list(np.unique(readings.depth_mm[at]))} mm."
-    places = np.unique(np.stack([readings.x_mm, readings.y_mm], axis=1), axis=0)
-    some = "; ".join(f"{x:g}, {y:g}" for x, y in places[:LISTED_N])
-    depths = _list(np.unique(readings.depth_mm))
-    return f"Visited: depths {depths} mm, and {len(places)} places, among them {some} mm."
-
-
-def _list(values: Sequence[float] | np.ndarray) -> str:
-    return ", ".join(f"{value:g}" for value in values[:LISTED_N])
-
-
-def read(settings: Settings) -> Variation:
-    """Read section variation."""
-    return settings.section(Variation, "variation")
-
-
-def variation(settings: Settings, main: Path, indentations: Path, results: Path) -> None:
-    """Compare visits of equal places: of the worn skin in `indentations`, and of several skins in `main`."""
-    section = read(settings)
-    worn = read_folder(indentations)[0]
-    of_skins = _visits(main, settings.captures_in(main), section)
-    places: list[dict[str, Any]] = []
-    drawn: list[dict[str, Any]] = []
-    for place_i, (x_mm, y_mm) in enumerate(section.places_mm):
-        over = {
-            "time": over_time(find_visits(worn, (x_mm, y_mm), section.depth_mm), section.contacts_n),
-            "skins": over_skins({skin: visits[place_i] for skin, visits in of_skins.items()}),
-        }
-        where = {"x_mm": x_mm, "y_mm": y_mm}
-        places.append(where | {name: told for name, (told, _) in over.items()})
-        drawn.append(where | {name: lines for name, (_, lines) in over.items()})
-    when = pace([worn]) | meanwhile(worn, section.contacts_n)
-    numbers = {"depth_mm": section.depth_mm, "worn_skin": worn.skin} | when | {"places": places}
-    write_results(results, numbers, {"places": drawn}, read_losses(indentations, {}))
-
-
-def _visits(main: Path, names: list[str], section: Variation) -> dict[str, list[Visits]]:
-    """Find each asked skin's visits of each place, one capture in memory at a time."""
-    boards: dict[str, str] = {}
-    visits: dict[str, list[Visits]] = {}
-    for name in names:
-        one = io.read_readings(main / f"{name}.parquet")
-        boards[one.skin] = one.board
-        visits[one.skin] = [find_visits(one, place_mm, section.depth_mm) for place_mm in section.places_mm]
-    return {skin: visits[skin] for skin in first_of_each_board(boards, section.skins_n)}
-
-
 MEANING = (
     "By how much equal pokes differ: rms over the channels, and as a part of the change of field that the poke makes. "
     "As read: the field itself. Change: less the no-load reading of the same indentation, which is what a model sees."
 )
-AXES_PER_CHIP_N = 3
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Make a table of how far equal pokes differ, over time and between skins; the paper gives no numbers."""
+    """Tabulate how far equal indentations differ over time and between skins; the paper gives no numbers."""
     lines = []
     for place in numbers["places"]:
         time, skins = place["time"], place["skins"]
         at = {"place, mm": f"{place['x_mm']:g}, {place['y_mm']:g}", "depth, mm": f"{numbers['depth_mm']:g}"}
         over = f"over {time['contacts_n']:,} contacts of {numbers['worn_skin']}, {time['visits_n']} visits"
-        for what, name in (("field as read", "raw"), ("change of field", "db")):
-            lines.append(at | _line(f"{over}: {what}", time[f"{name}_change_uT"], time[f"{name}_change_pct"]))
+        rows = [
+            (f"{over}: field as read", time["raw_change_uT"], time["raw_change_pct"]),
+            (f"{over}: change of field", time["db_change_uT"], time["db_change_pct"]),
+        ]
         if "spread_uT" in skins:
             over = f"between {len(skins['skins'])} skins: change of field"
-            lines.append(at | _line(over, skins["spread_uT"], skins["spread_pct"]))
-    meaning = f"{MEANING} {say_pace(numbers, source)}{_say_shown(numbers)} Paper: {FIGURE_4}."
-    return {"variation": tabulate([line | {"source": source} for line in lines], meaning=meaning)}
-
-
-def _say_shown(numbers: Mapping[str, Any]) -> str:
-    if "shown_s" not in numbers or "warmer_K" not in numbers:
-        return ""
-    return (
-        f" The contacts compared over time take {numbers['shown_s']:,.0f} s, in which the chips' temperature changes "
-        f"by {numbers['warmer_K']:+.2g} K: the field shows that too, beside the skin's own wear."
-    )
+            rows.append((over, skins["spread_uT"], skins["spread_pct"]))
+        for what, rms_uT, pct in rows:
+            values = {"difference, µT": f"{rms_uT:.3g}", "difference, % of the change": f"{pct:.3g}"}
+            lines.append(at | {"what": what} | values | {"source": source})
+    meaning = f"{MEANING} {describe_pace(numbers, source)}"
+    if "shown_s" in numbers and "warmer_K" in numbers:
+        meaning += (
+            f" The contacts compared over time take {numbers['shown_s']:,.0f} s, in which the chips' temperature "
+            f"changes by {numbers['warmer_K']:+.2g} K: the field shows that too, beside the skin's own wear."
+        )
+    return {"variation": tabulate(lines, meaning=f"{meaning} Paper: {FIGURE_4}.")}
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
     """Draw how the field varies over time (figure 4a) and from skin to skin (figure 4b), a panel a place."""
     return {
-        "variation_time.svg": _over_time(numbers, drawn["places"], source),
-        "variation_skins.svg": _over_skins(numbers, drawn["places"], source),
+        "variation_time.svg": _draw_time(numbers, drawn["places"], source),
+        "variation_skins.svg": _draw_skins(numbers, drawn["places"], source),
     }
 
 
-def _over_time(numbers: Mapping[str, Any], places: Sequence[Mapping[str, Any]], source: str) -> str:
+def _draw_time(numbers: Mapping[str, Any], places: Sequence[Mapping[str, Any]], source: str) -> str:
     import matplotlib as mpl
 
     most_n = max(place["time"]["contacts_n"][-1] for place in places)
     title = f"Field over time at {numbers['depth_mm']:g} mm depth, first visit subtracted ({source})"
     with _panels(places, title, "field less the first / µT") as (figure, panels):
-        colours = mpl.colors.ListedColormap(
-            mpl.colormaps["viridis"](np.linspace(0, 0.85, 256))
-        )  # its yellow is pale on white
+        # Without the upper end of the colour map: its yellow is pale on white.
+        colours = mpl.colors.ListedColormap(mpl.colormaps["viridis"](np.linspace(0, 0.85, 256)))
         scale = mpl.colors.Normalize(0, most_n)
         for axes, place in zip(panels, places, strict=True):
             for contacts_n, line_uT in zip(place["time"]["contacts_n"], place["time"]["b_uT"], strict=True):
@@ -241,7 +232,7 @@ def _over_time(numbers: Mapping[str, Any], places: Sequence[Mapping[str, Any]], 
         return svg(figure)
 
 
-def _over_skins(numbers: Mapping[str, Any], places: Sequence[Mapping[str, Any]], source: str) -> str:
+def _draw_skins(numbers: Mapping[str, Any], places: Sequence[Mapping[str, Any]], source: str) -> str:
     title = f"Mean change of field on several skins at {numbers['depth_mm']:g} mm depth ({source})"
     with _panels(places, title, "change of field / µT") as (figure, panels):
         for axes, place in zip(panels, places, strict=True):
@@ -256,7 +247,7 @@ def _over_skins(numbers: Mapping[str, Any], places: Sequence[Mapping[str, Any]],
 
 @contextmanager
 def _panels(places: Sequence[Mapping[str, Any]], title: str, ylabel: str) -> Iterator[tuple[Any, Any]]:
-    """Set up a panel a place, one below the other."""
+    """Set up a panel for each place, one below the other."""
     with drawing(7.2, 0.8 + 2.5 * len(places)) as figure:
         panels = figure.subplots(len(places), 1, squeeze=False)[:, 0]
         for axes, place in zip(panels, places, strict=True):
@@ -269,10 +260,6 @@ def _panels(places: Sequence[Mapping[str, Any]], title: str, ylabel: str) -> Ite
 
 
 def _name_channels(axes: Any, channels_n: int) -> None:
-    """Name the ticks by axis and chip: Bx of chip 0 is x0."""
-    names = [f"{'xyz'[i % AXES_PER_CHIP_N]}{i // AXES_PER_CHIP_N}" for i in range(channels_n)]
-    axes.set_xticks(range(channels_n), [f"B{name}" for name in names], rotation=90 if channels_n > 15 else 0)
-
-
-def _line(what: str, rms_uT: float, pct: float) -> dict[str, str]:
-    return {"what": what, "difference, µT": f"{rms_uT:.3g}", "difference, % of the change": f"{pct:.3g}"}
+    """Label the ticks by axis and chip: Bx of chip 0 is Bx0."""
+    names = [f"B{'xyz'[i % 3]}{i // 3}" for i in range(channels_n)]
+    axes.set_xticks(range(channels_n), names, rotation=90 if channels_n > 15 else 0)

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from pipeline.executors import make_executor
 from pipeline.experiments.compare import Compare, see, setup_of, skins_of, turns_of
-from pipeline.experiments.results import read_folder
+from pipeline.experiments.results import read_captures
 from pipeline.settings import Settings
 from pipeline.stage import say
 from pipeline.training import few_labels as few
@@ -80,7 +80,7 @@ def universal(settings: Settings, indentations: Path, folds: Path, models: Path,
     A map, and a network with it; calibrated with recorded boards of the rig, and with simulated skins alone.
     """
     data, section = read_data(settings, indentations, folds), settings.section(Compare, "compare")
-    skins = skins_of(read_folder(indentations, tuple(settings.captures_in(indentations))))
+    skins = skins_of(read_captures(indentations, tuple(settings.captures_in(indentations))))
     if len(skins) < 2:
         raise ParamsError(f"scene {data.scene}", "boards with known forces", "two or more", len(skins), "Add one.")
     setup = setup_of(section, settings.shared_section(SkinDesign, "skin"))

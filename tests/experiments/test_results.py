@@ -1,4 +1,4 @@
-"""What every experiment's stage reads and writes: its captures, its numbers, what figures draw, and what was lost."""
+"""Results of experiments: numbers, data of figures, and losses of their captures."""
 
 import json
 from pathlib import Path
@@ -21,19 +21,19 @@ def test_every_capture_of_the_folder_is_accounted_for_beside_what_rows_lost(tmp_
     assert losses["left_out"] == {"low_force_rows_n": 3}
 
 
-def test_an_answer_about_the_main_captures_counts_none_of_its_own(tmp_path):
+def test_results_of_the_main_captures_have_no_losses_of_their_own(tmp_path):
     write_results(tmp_path / "contacts.json", {"pairs_n": 3}, {"along": [1.0]})
     written = json.loads((tmp_path / "contacts.json").read_text())
     assert written["losses"] == {"accounts": [], "left_out": {}}
     assert (written["numbers"], written["drawn"]) == ({"pairs_n": 3}, {"along": [1.0]})
 
 
-def test_the_one_capture_of_a_folder_is_given():
+def test_only_returns_the_one_capture_of_a_folder():
     assert only(["b0_s0-glass"], Path("ci-glass")) == "b0_s0-glass"
 
 
 @pytest.mark.parametrize("captures", [[], ["b0_s0-glass", "b1_s0-glass"]])
-def test_none_or_several_captures_are_refused_and_counted(captures):
-    with pytest.raises(SchemaError, match=f"ci-glass: captures must be one, as .*; got {len(captures)}. Ask its") as no:
+def test_none_or_several_captures_are_an_error(captures):
+    with pytest.raises(SchemaError, match=f"ci-glass: captures must be one, as .*; got {len(captures)}. Run its") as no:
         only(captures, Path("ci-glass"))
     assert "\n" not in str(no.value)

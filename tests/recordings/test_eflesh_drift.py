@@ -29,9 +29,9 @@ def test_fresh_no_load_readings_keep_eflesh_accurate_and_a_single_one_loses_it(s
     settings["drift"]["training"]["steps_n"] = 300
     drift(
         Settings("eflesh", "eflesh.yaml", settings, read_shared_files(ROOT), (readings.capture,)),
-        indentations=tmp_path / "indentations", answer=tmp_path / "answer.json",
+        indentations=tmp_path / "indentations", results=tmp_path / "results.json",
     )  # fmt: skip
-    numbers = io.read_json(tmp_path / "answer.json")["numbers"]
+    numbers = io.read_json(tmp_path / "results.json")["numbers"]
     assert [row["accuracy_pct"] for row in numbers["each"]] == pytest.approx(FRESH_PCT, abs=TOLERANCE_PCT)
     assert [row["accuracy_pct"] for row in numbers["initial"]] == pytest.approx(INITIAL_PCT, abs=TOLERANCE_PCT)
     assert [row["contacts_n"] for row in numbers["each"]] == [961, 2 * 961, 3 * 961, 4 * 961]

@@ -10,7 +10,7 @@ from ruamel.yaml import YAML
 
 from pipeline.experiments import drift as drift_pages
 from pipeline.experiments import variation as variation_pages
-from pipeline.experiments.drift import drift
+from pipeline.experiments.drift import add_walk, drift
 from pipeline.experiments.variation import variation
 from pipeline.settings import Settings, read_shared_files
 from reskin import io
@@ -60,14 +60,14 @@ def scene(tmp_path, monkeypatch) -> dict[str, Any]:
     settings["variation"]["skins_n"] = 2
     return {
         "settings": Settings("ci", "ci.yaml", settings, read_shared_files(ROOT)),
-        "answer": tmp_path / "answer.json",
+        "results": tmp_path / "results.json",
     }
 
 
-def test_a_drifting_skin_is_answered_in_every_window_and_a_single_no_load_reading_is_worst(scene, tmp_path):
+def test_on_a_drifting_skin_a_single_no_load_reading_is_worst_in_every_window(scene, tmp_path):
     drift(indentations=write(tmp_path / "wear", capture("s0-wear")), **scene)
-    answer = io.read_json(scene["answer"])
-    numbers = answer["numbers"]
+    results = io.read_json(scene["results"])
+    numbers = results["numbers"]
     assert {name: numbers[name] for name in ("skins_n", "seeds_n", "train_n", "left_out_units_n")} == {
         "skins_n": 1, "seeds_n": 2, "train_n": 100, "left_out_units_n": 0,
     }  # fmt: skip
@@ -82,7 +82,7 @@ def test_a_drifting_skin_is_answered_in_every_window_and_a_single_no_load_readin
     last = {policy: numbers[policy][-1]["mse_xy_mm2"] for policy in off_uT}
     assert last["initial"] > 2 * max(last["regular"], last["each"])
     assert numbers["late"]["force_left_pct"] == pytest.approx(100)  # this skin does not soften
-    assert numbers["late"]["indentations_n"] == len(answer["drawn"]["late"]["true_N"]) == 30
+    assert numbers["late"]["indentations_n"] == len(results["drawn"]["late"]["true_N"]) == 30
     assert len(numbers["late"]["network_bias_N"]) == 2
     assert all(row["spread"]["mse_xy_mm2"] > 0 for policy in off_uT for row in numbers[policy])
     assert all(numbers["last_window"][policy]["mse_xy_mm2"]["sd_seeds"] > 0 for policy in off_uT)
@@ -94,7 +94,7 @@ def test_a_drifting_skin_is_answered_in_every_window_and_a_single_no_load_readin
     assert numbers["lasts_s"] == pytest.approx(389 * EVERY_s)
     assert len(numbers["findings"]) == 4
     assert set(drift_pages.tables(numbers, "simulated")) == {"drift", "drift_findings", "drift_wander"}
-    drawn = drift_pages.figures(numbers, answer["drawn"], "simulated")
+    drawn = drift_pages.figures(numbers, results["drawn"], "simulated")
     assert set(drawn) == {"drift.svg", "drift_wander.svg", "drift_force.svg"}
     # A walk of no step is the last window itself; a reading before every contact sees any walk.
     for policy, (still, _) in numbers["wander"].items():
@@ -104,7 +104,7 @@ def test_a_drifting_skin_is_answered_in_every_window_and_a_single_no_load_readin
     assert numbers["wander"]["each"][1]["mse_xy_mm2"] == pytest.approx(numbers["each"][-1]["mse_xy_mm2"], rel=1e-3)
 
 
-def test_no_walk_is_added_to_what_was_recorded(scene, tmp_path):
+def test_no_walk_is_added_to_recordings(scene, tmp_path):
     worn = write(tmp_path / "wear", replace(capture("s0-wear"), source="recorded"))
     with pytest.raises(ParamsError, match="drift.wander_uT must be none in a recorded scene"):
         drift(indentations=worn, **scene)
@@ -120,30 +120,53 @@ def test_no_walk_is_added_to_what_was_recorded(scene, tmp_path):
         ),
     ],
 )
-def test_what_has_no_order_or_no_window_is_refused_before_anything_is_trained(scene, tmp_path, captures, sentence):
+def test_captures_without_order_or_windows_are_an_error_before_training(scene, tmp_path, captures, sentence):
     with pytest.raises(ParamsError, match=sentence):
         drift(indentations=write(tmp_path / "wear", *captures), **scene)
     assert not (tmp_path / ".reskin").exists()
 
 
-def test_variation_finds_the_drift_in_what_is_read_and_the_gain_between_skins(scene, tmp_path):
+def test_variation_finds_the_drift_over_time_and_the_gain_between_skins(scene, tmp_path):
     worn = write(tmp_path / "wear", capture("s0-wear"))
     main = write(
         tmp_path / "main", capture("s0"), capture("s1", "b1", "s1", gain=1.5), capture("s2", "b0", "s2", gain=9)
     )
     variation(main=main, indentations=worn, **scene)
-    answer = io.read_json(scene["answer"])
-    assert answer["numbers"]["contact_every_s"] == pytest.approx(EVERY_s)
-    assert answer["numbers"]["shown_s"] == pytest.approx(199 * EVERY_s)  # the first 200 contacts
-    assert answer["numbers"]["warmer_K"] == pytest.approx(199 * EVERY_s * WARMING_K_PER_s, rel=1e-4)  # float32 degrees
-    for place in answer["numbers"]["places"]:
+    results = io.read_json(scene["results"])
+    assert results["numbers"]["contact_every_s"] == pytest.approx(EVERY_s)
+    assert results["numbers"]["shown_s"] == pytest.approx(199 * EVERY_s)  # the first 200 contacts
+    assert results["numbers"]["warmer_K"] == pytest.approx(199 * EVERY_s * WARMING_K_PER_s, rel=1e-4)  # float32 degrees
+    for place in results["numbers"]["places"]:
         assert place["time"]["visits_n"] == 2  # of three, in the first 200 contacts
         assert place["time"]["raw_change_uT"] == pytest.approx(DRIFT_uT * 130, rel=1e-3)
         assert place["time"]["db_change_uT"] < 1e-3  # float32 fields of 1000 uT
         assert place["skins"]["skins"] == ["s0", "s1"]  # the first of each board
         # Two skins, one 1.5 times the other: half of the weaker's field, over the rms of both.
         assert place["skins"]["spread_pct"] == pytest.approx(100 * 0.5 / np.sqrt((1 + 1.5**2) / 2), rel=1e-4)
-    assert set(variation_pages.figures(answer["numbers"], answer["drawn"], "simulated")) == {
+    assert set(variation_pages.figures(results["numbers"], results["drawn"], "simulated")) == {
         "variation_time.svg", "variation_skins.svg",
     }  # fmt: skip
-    assert len(variation_pages.tables(answer["numbers"], "simulated")["variation"]) == 6
+    assert len(variation_pages.tables(results["numbers"], "simulated")["variation"]) == 6
+
+
+AFTER_N = 100
+
+
+def walk_uT(step_uT: float, seed: int = 0) -> np.ndarray:
+    line = capture("s0-wear")
+    further = add_walk(line, step_uT, after_n=AFTER_N, seed=seed)
+    np.testing.assert_allclose(further.b_uT - line.b_uT, further.noload_uT - line.noload_uT, atol=2e-3)
+    return (further.noload_uT - line.noload_uT)[::2].astype(float)  # two readings a contact
+
+
+def test_the_walk_begins_where_training_ends_and_grows_as_the_root_of_the_contacts():
+    walk = np.concatenate([walk_uT(2.0, seed) for seed in range(20)], axis=1)
+    assert np.abs(walk[:AFTER_N]).max() == 0
+    for contacts_n in (1, 16, 256):
+        rms_uT = np.sqrt((walk[AFTER_N - 1 + contacts_n] ** 2).mean())
+        assert rms_uT == pytest.approx(2.0 * np.sqrt(contacts_n), rel=0.15)  # 300 walks
+
+
+def test_twice_the_step_is_twice_the_same_walk():
+    np.testing.assert_allclose(walk_uT(2.0), 2 * walk_uT(1.0), atol=2e-3)
+    assert np.abs(walk_uT(0.0)).max() == 0
