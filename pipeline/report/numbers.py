@@ -45,7 +45,7 @@ HONEST = {"by_indentation": "single_indentation", "by_pass": "single_pass"}  # t
 SWEPT = ("multi", "triplet", "adapted")
 TRAINED_IN = {"lobo": "train_multi", "triplet": "train_triplet", "adapt": "adapt"}
 NETWORKS = {METHODS.get(experiment, "network"): experiment for experiment in TRAINED_IN}  # by method
-OWN_POKES = "its own"  # of experiment rivals: the unlabelled pokes that a method is given
+OWN_POKES = "its own"  # of experiment reference_methods: the unlabelled pokes that a method is given
 AXES = {"pokes": ("sweep_pokes", "pokes_n"), "sensors": ("sweep_sensors", "skins_n"), "labels": ("labels", "labels_n")}
 
 
@@ -106,7 +106,7 @@ def timed_learning(numbers: Mapping[str, Any], seconds: Mapping[str, Seconds]) -
             times_s = [training["train_s"] for training in took if f".{row['pokes_n']}pokes." in training["name"]]
             joined["adaptation"].append(row | ({"seconds": float(np.median(times_s))} if times_s else {}))
     if "rivals" in numbers:
-        took = seconds.get("rivals", [])
+        took = seconds.get("reference_methods", [])
         joined["rivals_costs"] = [
             {"method": row["method"]} | row[AS_LABELLED] | _median_times(took, f"{row['method']}.")
             for row in _told(numbers["rivals"])

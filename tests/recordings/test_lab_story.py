@@ -26,7 +26,7 @@ def lab(tmp_path_factory, shared_data) -> Iterator[Path]:
     settings["train_multi"]["seeds_n"] = 1
     settings["train_multi"] |= {"steps_n": 100, "variants": {}}
     settings |= {"experiments": ["lobo"], "split": {}}  # more: the story of scene ci
-    for section in ("few_labels", "audit", "compare", "universal", "rivals"):
+    for section in ("few_labels", "audit", "compare", "universal", "reference_methods"):
         del settings[section]
     with scene.open("w") as stream:
         YAML().dump(settings, stream)

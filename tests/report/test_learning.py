@@ -170,13 +170,13 @@ def test_what_was_not_timed_here_has_a_dash():
     assert tables["adaptation"]["adaptation, s"].tolist() == ["1.5", "–"]
 
 
-def test_rivals_stand_beside_what_they_took_told_the_skins_own_pokes():
+def test_reference_methods_have_their_errors_beside_their_seconds():
     methods = [
         {"method": method, "pokes": pokes, "labels_n": 0, "as_labelled": row(accuracy_pct)}
         for method, pokes, accuracy_pct in (("map", "none", 20.0), ("map", "its own", 40.0), ("ridge", "its own", 30.0))
     ]
     took = [{"name": f"map.b{i}-draw0", "train_s": 2.0 + i, "one_reading_s": 5e-5} for i in range(3)]
-    found = timed_learning({"rivals": {"methods": methods}}, {"rivals": took})
+    found = timed_learning({"rivals": {"methods": methods}}, {"reference_methods": took})
     (line,) = learning_costs(found, "recorded")["rivals_costs"].to_dict("records")
     assert (line["method"], line["accuracy, %"]) == ("map", "40 ± 1")
     assert (line["until ready, s"], line["one reading, µs"]) == ("3", "50")

@@ -37,7 +37,7 @@ LEARNING = (
 DRAWING = ("drift", "manual", "contacts", "ambient")  # experiments that draw at random in ways of their own
 ASKED = set(ANALYSES) - {
     "compare",
-    "rivals",
+    "reference_methods",
     "touches",
     "population",
     "worlds",

@@ -1,23 +1,31 @@
-"""Pairs, strangers and controls of rivals, each beside what is known in closed form; and what is shown of them."""
+"""Pairs, foreign boards and controls of reference methods against closed forms; and their tables."""
 
 from typing import Any
 
 import numpy as np
 import pytest
 
-from pipeline.experiments import rivals
-from pipeline.experiments.rivals import (
+from pipeline.experiments import reference_methods
+from pipeline.experiments.reference_methods import (
     FOREIGN,
+    INVERSION,
     NONE,
+    OF_RIGHT,
     OWN,
-    QUARTER,
+    QUARTER_TURN,
     STRANGERS,
     WHY,
     Board,
+    alarm_statistics,
+    limits_of,
     next_board,
+    pairs_uT,
     pokes_of,
+    score_flagged,
+    standardised_uT,
     summarise,
     tables,
+    unlabelled_controls,
 )
 from pipeline.settings import Settings
 from pipeline.training.trainings import SceneData
@@ -62,34 +70,34 @@ DATA = SceneData("test", Settings("test", "test.yaml", {"seed": 0}, {}), recorde
 FOLD = fold("b1-draw0", range(20), range(20, 40), range(20, 40))
 
 
-def test_a_pair_is_what_known_boards_read_at_the_same_place_and_force():
+def test_pairs_are_fields_of_known_boards_at_the_same_place_and_force():
     rows = recorded()
     rows.target[20:22, 2] = 2.0  # between the two forces there
     rows.target[22:24, 2] = 9.0  # past the strongest
     rows.target[24:26, :2] = 50.0  # nobody poked there
-    found = rivals.pairs_uT(rows, FOLD.train, [np.arange(i, i + 2) for i in (20, 22, 24, 26)])
+    found = pairs_uT(rows, FOLD.train, [np.arange(i, i + 2) for i in (20, 22, 24, 26)])
     place_mm = PLACES_MM[[0, 0]]
     np.testing.assert_allclose(found[:2], old_uT(place_mm, np.array([2.0, 4.0])), rtol=1e-5)
     assert np.isnan(found[2]).all()
     np.testing.assert_allclose(found[3], rows.db_uT[6], rtol=1e-5)
 
 
-def test_enough_pairs_turn_a_new_boards_fields_into_the_known_ones():
-    back_uT = rivals.standardised_uT(DATA, FOLD, pokes_of(DATA, FOLD))
+def test_enough_pairs_map_a_new_boards_fields_to_the_known_ones():
+    back_uT = standardised_uT(DATA, FOLD, pokes_of(DATA, FOLD))
     np.testing.assert_allclose(back_uT, DATA.rows.db_uT[:20], rtol=0.02, atol=2.0)  # the least ridge is not 0
     nowhere = fold("b1-draw0", range(2), range(36, 40), range(20, 40))
     with pytest.raises(ParamsError, match="labelled pokes must be within"):
-        rivals.standardised_uT(DATA, nowhere, pokes_of(DATA, nowhere))
+        standardised_uT(DATA, nowhere, pokes_of(DATA, nowhere))
 
 
-def test_a_network_that_collapses_is_trained_again_with_other_draws(monkeypatch):
+def test_a_collapsed_network_is_trained_again_with_other_draws(monkeypatch):
     good = draw_weights(paper_layers(15), rng_for(0, "good"))
     known = rng_for(0, "known").normal(size=(20, 15)).astype(np.float32)
     target = Predictor(good, "paper", "cpu")(known)
     dead = {name: np.zeros_like(value) for name, value in good.items()}
     tries = iter([dead, good])
-    monkeypatch.setattr(rivals, "train_adversarial", lambda *words: next(tries))
-    weights, record = rivals.trained_again(Domains(known, target, known), recipe(), 1.0, (0, "b1"))
+    monkeypatch.setattr(reference_methods, "train_adversarial", lambda *words: next(tries))
+    weights, record = reference_methods.train_until_converged(Domains(known, target, known), recipe(), 1.0, 0, "b1")
     assert weights is good
     assert record == {"collapsed": False, "collapsed_before_n": 1}
 
@@ -100,32 +108,32 @@ def test_another_skins_pokes_are_those_of_the_next_board_in_the_same_draw():
     assert [next_board(one, folds).name for one in folds] == ["b1-draw0", "b1-draw1", "b0-draw0", "b0-draw1"]
 
 
-def test_strangers_read_as_much_as_the_board_and_elsewhere():
+def test_foreign_boards_read_fields_of_equal_length_and_other_direction():
     chips = rng_for(0, "chips").standard_normal((3, 5, 3))
     for name, change in STRANGERS.items():
         np.testing.assert_allclose(np.linalg.norm(change(chips), axis=(1, 2)), np.linalg.norm(chips, axis=(1, 2)))
         assert not np.allclose(change(chips), chips), name
-    np.testing.assert_allclose(chips @ np.linalg.matrix_power(QUARTER, 4), chips)
+    np.testing.assert_allclose(chips @ np.linalg.matrix_power(QUARTER_TURN, 4), chips)
     own = Board(chips[:1].reshape(1, -1), chips.reshape(3, -1), chips.reshape(3, -1))
-    exchanged = own.seen_as(STRANGERS["two chips exchanged"]).pool_uT.reshape(3, 5, 3)
+    exchanged = own.alter(STRANGERS["two chips exchanged"]).pool_uT.reshape(3, 5, 3)
     np.testing.assert_array_equal(exchanged, chips[:, [0, 2, 1, 3, 4]])
 
 
-def test_alarms_are_counted_above_each_boards_limit():
+def test_alarms_are_readings_above_each_boards_limit():
     right = {"b0": np.array([0.1, 0.2, 0.3, 0.4]), "b1": np.array([0.1, 0.1, 0.2, 0.2])}
     stranger = {"b0": np.array([0.9, 0.9]), "b1": np.array([0.1, 0.9])}
-    found = rivals.told(stranger, right, {"b0": 0.35, "b1": 0.15})
+    found = alarm_statistics(stranger, right, {"b0": 0.35, "b1": 0.15})
     assert found["alarm_pct"]["mean"] == pytest.approx((100 + 50) / 2)
     assert found["auc"]["mean"] == pytest.approx((1.0 + 0.5 * 0.25 + 0.5) / 2)  # ties count half
     assert found["left_median"]["mean"] == pytest.approx((0.9 + 0.5) / 2)
-    assert rivals.told(right, right, {"b0": 0.35, "b1": 0.15})["auc"]["mean"] == pytest.approx(0.5)
+    assert alarm_statistics(right, right, {"b0": 0.35, "b1": 0.15})["auc"]["mean"] == pytest.approx(0.5)
 
 
-def test_flagged_readings_are_scored_beside_all_others_board_by_board():
+def test_flagged_readings_and_all_others_are_scored_board_by_board():
     value = {"b0": np.array([0.0, 1.0, 2.0, 9.0]), "b1": np.array([0.0, 1.0, 2.0, 3.0])}
     off_mm = {board: np.array([[0.0, 0.5], [0.5, 0.0], [0.0, 0.5], [2.0, 0.0]]) for board in value}
-    assert rivals.limits_of(value, 0.0) == {"b0": 3.0, "b1": 9.0}
-    found = rivals.worse(value, off_mm, 0.0)
+    assert limits_of(value, 0.0) == {"b0": 3.0, "b1": 9.0}
+    found = score_flagged(value, off_mm, 0.0)
     assert found["flagged_pct"]["mean"] == pytest.approx((25 + 0) / 2)
     assert found["accuracy_pct_flagged"] == {"mean": 0.0, "n": 1}  # b1 flags none
     assert found["mse_xy_mm2_flagged"]["mean"] == pytest.approx(2.0)
@@ -145,13 +153,13 @@ def points(method: str, given: str, off_mm: dict[str, float]) -> list[dict[str, 
 
 
 def numbers() -> dict[str, Any]:
-    name = rivals.INVERSION
+    name = INVERSION
     told_points = points(name, OWN, {"0": 0.0, "1": 0.5}) + points(name, FOREIGN, {"0": 2.0, "1": 0.5})
     others = points("ridge", NONE, {"0": 2.0, "1": 2.0}) + points("ridge, CORAL", OWN, {"0": 0.0, "1": 2.0})
-    controls = rivals.told_controls() | {("ridge, CORAL", OWN, 0): ("ridge", NONE, 0)}
+    controls = unlabelled_controls() | {("ridge, CORAL", OWN, 0): ("ridge", NONE, 0)}
     stat = {"mean": 0.9, "n": 2, "ci95": [0.8, 1.0]}
     row = {"alarm_pct": stat, "auc": stat, "left_median": stat}
-    strangers = [{"stranger": "north for south", "law": rivals.OF_RIGHT} | row]
+    strangers = [{"stranger": "north for south", "law": OF_RIGHT} | row]
     return {
         "methods": summarise(told_points + others, controls), "unpaired_n": 2,
         "alarm": {"asked_pct": 5.0, "limit": stat, "right": row, "strangers": strangers},
@@ -161,20 +169,20 @@ def numbers() -> dict[str, Any]:
 
 def test_a_control_is_paired_board_by_board():
     rows = {(row["method"], row["pokes"]): row for row in numbers()["methods"]}
-    over = rows[rivals.INVERSION, FOREIGN]["over"]
+    over = rows[INVERSION, FOREIGN]["over"]
     assert over["by_board"]["b0"]["accuracy_pct"] == pytest.approx(-50.0)
     assert over["accuracy_pct"]["mean"] == pytest.approx(-25.0)
     assert rows["ridge, CORAL", OWN]["over"]["accuracy_pct"]["mean"] == pytest.approx(25.0)
     assert "over" not in rows["ridge", NONE]
 
 
-def test_four_tables_say_what_helped_by_how_much_and_why():
+def test_tables_give_gains_reasons_and_sources():
     made = tables(numbers(), "recorded")
     assert made["rivals"]["method"].tolist() == ["ridge", "ridge, CORAL"]
     assert made["rivals"]["why"].tolist() == ["–", WHY["CORAL"]]
     assert made["rivals"]["paired, accuracy, points"][1].startswith("+25")
     assert made["rivals_told"]["paired, accuracy, points"].tolist()[1].startswith("-25")
-    assert made["rivals_alarm"]["law"].tolist() == [rivals.OF_RIGHT] * 2
+    assert made["rivals_alarm"]["law"].tolist() == [OF_RIGHT] * 2
     assert made["rivals_flagged"]["MSE_xy, mm² (flagged)"].tolist() == ["–"]  # none was
     assert made["rivals"].attrs["meaning"].endswith("2 labelled pokes had no pair.")
     assert all(set(table["source"]) == {"recorded"} for table in made.values())

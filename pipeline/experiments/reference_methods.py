@@ -1,0 +1,634 @@
+"""Reference methods for a board that nobody calibrated, on the folds and tested rows of experiment labels (ours).
+
+- Regressors and networks of known boards, with inputs aligned by the board's unlabelled pokes or by a few labels.
+- The universal model and a fitted physical model (inversion), given the skin's own unlabelled pokes, none, or another
+  skin's.
+- Alarms: whether what a fitted model leaves unexplained detects a foreign board.
+"""
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float, Int64
+from pydantic import Field
+
+from pipeline.experiments.compare import Compare, see, setup_of, skins_of, turns_of
+from pipeline.experiments.detection import roc_area
+from pipeline.experiments.results import read_captures, write_results
+from pipeline.provenance import SECONDS
+from pipeline.report.formatting import COLUMNS, OF_FORCE, n_of, scores, show, show_difference, tabulate
+from pipeline.settings import Settings, take
+from pipeline.stage import say
+from pipeline.statistics import AS_LABELLED, REGISTERED, by_skin, over_boards, paired, statistic, tally, tidy
+from pipeline.training.trainings import SceneData, read_data, score_test
+from pipeline.training.universal import (
+    ASSUMED_TEMPER,
+    EXPERIMENT,
+    METHODS,
+    WAYS,
+    Bench,
+    Experts,
+    Frame,
+    Known,
+    Pokes,
+    Told,
+    pool_of,
+    read_both,
+    read_experts,
+    ready,
+    tell,
+)
+from reskin import io
+from reskin.config import Strict, parse
+from reskin.data.rows import Rows
+from reskin.data.splits import Fold
+from reskin.errors import ParamsError
+from reskin.metrics import ACCURACY_LIMIT_MM
+from reskin.models.adversarial import Domains, train_adversarial
+from reskin.models.alignment import choose_ridge, coral, direct, match_channels
+from reskin.models.classical import Classical, fit
+from reskin.models.grid import ATTEMPTS_MAX_N
+from reskin.models.inputs import FIT, VIEW
+from reskin.models.network import Predictor
+from reskin.models.recipe import Name, Recipe
+from reskin.models.trial import COLLAPSED, Weights
+from reskin.physics.skin import SkinDesign
+from reskin.seeds import rng_for
+from reskin.universal.inversion import Chart, chart, fit_unlabelled, search
+from reskin.universal.law import Seen, Setup
+from reskin.universal.map import new_map, see_rest
+
+OWN, NONE, FOREIGN = "its own", "none", "another skin's"  # unlabelled pokes that a method receives
+Key = tuple[str, str, int]  # method, unlabelled pokes, number of labels
+Point = dict[str, Any]  # scores of one method on one fold
+RNG = "rivals"  # name of the random draws, from an earlier name of this experiment
+
+
+class ReferenceMethods(Strict):
+    """Section reference_methods: numbers of labels, models of known boards, and the share of false alarms."""
+
+    labels_n: Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1)]
+    methods: dict[Name, Classical]
+    recipe: Recipe
+    adversarial_weight: Annotated[float, Field(gt=0)]
+    false_alarm_fraction: Annotated[float, Field(gt=0, lt=1)]
+
+
+def read(settings: Settings) -> ReferenceMethods:
+    """Read section reference_methods, with the rows of params.yaml that it names."""
+    section, where = dict(settings["reference_methods"]), f"{settings.where}: reference_methods"
+    recipe = settings.row("recipes", take(section, "recipe", where))
+    recipe |= {"inputs": take(section, "inputs", where), "steps_n": take(section, "steps_n", where)}
+    methods = settings.row("methods", take(section, "methods", where))
+    return parse(ReferenceMethods, section | {"recipe": recipe, "methods": methods}, where)
+
+
+def reference_methods(settings: Settings, indentations: Path, folds: Path, models: Path, results: Path) -> None:
+    """Score reference methods on every held-out board, on the rows that experiment labels tests."""
+    data, compare = read_data(settings, indentations, folds), settings.section(Compare, "compare")
+    skins = skins_of(read_captures(indentations, tuple(settings.captures_in(indentations))))
+    if len(skins) < 2:
+        raise ParamsError(f"scene {settings.scene}", "boards with known forces", "two or more", len(skins), "Add one.")
+    setup = setup_of(compare, settings.shared_section(SkinDesign, "skin"))
+    frame = Frame(turns_of(compare), compare.labels_middle_mm, compare.labels_mirrored)
+    seen = {board: see(pokes, compare) for board, pokes in skins.items()}
+    section, of_labels = read(settings), data.folds_of(EXPERIMENT)
+
+    points: list[Point] = []
+    trainings: list[dict[str, Any]] = []
+    unpaired_n = 0
+    for fold in of_labels:
+        for method in section.methods.values():
+            points += score_regressor(data, fold, method, section.labels_n)
+        adversarial_points, records = score_adversarial(data, fold, section.recipe, section.adversarial_weight)
+        points, trainings = points + adversarial_points, trainings + records
+        paired_uT = pairs_uT(data.rows, fold.train, pokes_of(data, fold)[: max(section.labels_n)])
+        unpaired_n += int(np.isnan(paired_uT).any(axis=1).sum())
+        say(f"{data.scene} reference_methods: methods with aligned inputs on {fold.name} done")
+
+    nominal, rig = read_experts(Known(data, frame, setup, seen), models)
+    bench = Bench(data, frame, seen, nominal, {}, {})
+    seconds: list[Seconds] = []
+    for fold in of_labels:
+        unlabelled_points, took = score_unlabelled(bench, setup, of_labels, fold, rig)
+        points, seconds = points + unlabelled_points, seconds + took
+        say(f"{settings.scene} reference_methods: methods with unlabelled pokes on {fold.name} done")
+
+    alarm, flagged = evaluate_alarm(data, frame, setup, seen, of_labels, section.false_alarm_fraction)
+    numbers: dict[str, Any] = {
+        "methods": summarise(points, alignment_controls(section.methods, section.labels_n) | unlabelled_controls()),
+        "unpaired_n": unpaired_n,
+        "flagged": [*flag_by_universal(bench, of_labels, section.false_alarm_fraction), flagged],
+        "alarm": alarm,
+    }
+    write_results(results, numbers, {}, trainings=tally(trainings))
+    io.write_json(SECONDS / settings.scene / "reference_methods.json", [asdict(one) for one in seconds])
+
+
+# --- Folds, pokes, points ---
+
+
+def board_of(fold: Fold) -> str:
+    """Name the board that a fold of experiment labels holds out."""
+    return fold.name.rsplit("-draw", 1)[0]
+
+
+def next_board(fold: Fold, folds: Iterable[Fold]) -> Fold:
+    """Give the fold of the board after this one, of the same draw: its pool is another skin's pokes."""
+    same = [one for one in folds if one.name.rsplit("-draw", 1)[1] == fold.name.rsplit("-draw", 1)[1]]
+    names = [one.name for one in same]
+    return same[(names.index(fold.name) + 1) % len(same)]
+
+
+def first_folds(folds: Sequence[Fold]) -> dict[str, Fold]:
+    """Give the first fold of each board."""
+    return dict(sorted({board_of(fold): fold for fold in reversed(folds)}.items()))
+
+
+def pokes_of(data: SceneData, fold: Fold) -> list[Int64[np.ndarray, " r"]]:
+    """Give the rows of each poke of the pool, in the order in which experiment labels labels them."""
+    indentation = data.rows.indentation[fold.pool]
+    order = rng_for(data.settings.seed, "labelled", fold.name).permutation(np.unique(indentation))
+    return [fold.pool[indentation == one] for one in order]
+
+
+def means_uT(data: SceneData, pokes: Sequence[Int64[np.ndarray, " r"]]) -> Float[np.ndarray, "m ch"]:
+    """Give the mean change of field of each poke, in the chips' axes."""
+    return np.array([data.rows.db_uT[row].mean(axis=0, dtype=np.float64) for row in pokes])
+
+
+def point(
+    data: SceneData, fold: Fold, predicted: Float[np.ndarray, "b 3"], *, method: str, pokes: str, labels_n: int = 0
+) -> Point:
+    """Score predictions (x and y as labelled, F) for the tested rows of a fold."""
+    board, draw = fold.name.rsplit("-draw", 1)
+    keys = {"method": method, "name": pokes, "labels_n": labels_n, "fold": board, "seed_i": int(draw)}
+    return keys | {"scores": score_test(data, fold.test, predicted.astype(np.float32))}
+
+
+def summarise(points: Sequence[Point], controls: Mapping[Key, Key]) -> list[dict[str, Any]]:
+    """Summarise every method over boards, with the difference to its control, paired by board."""
+    table = tidy([], {"rivals": points})
+    table["labels_n"] = table["labels_n"].astype(int)
+    groups: dict[Any, Any] = dict(iter(table.groupby(["method", "recipe", "labels_n"], sort=False)))
+    rows = []
+    for key, group in groups.items():
+        row = dict(zip(("method", "pokes", "labels_n"), key, strict=True))
+        row |= {places: over_boards(group, places) for places in (AS_LABELLED, REGISTERED)}
+        if key in controls:
+            over = paired(by_skin(group), by_skin(groups[controls[key]]))
+            row["over"] = dict(zip(("method", "pokes", "labels_n"), controls[key], strict=True)) | over
+        rows.append(row)
+    return rows
+
+
+# --- Models of known boards with aligned inputs ---
+
+EVERY_N = 10  # of a labelled poke's readings, one is a training row: they differ by noise alone
+SAME_MM = 0.5  # pokes that are nearer are at one place
+ALIGNMENTS = {"channels matched": match_channels, "CORAL": coral}
+DIRECT, AS_ROWS = "direct standardisation", "labels as rows"
+ADVERSARIAL, CONTROL = "network, domain-adversarial", "network, trained as long without it"
+
+
+def score_regressor(data: SceneData, fold: Fold, method: Classical, labels_n: Sequence[int]) -> list[Point]:
+    """Score a regressor of known boards as it is, with every alignment, and with labels as rows."""
+    rows, view, pokes = data.rows, VIEW[method.inputs], pokes_of(data, fold)
+    known, new, test = (view(rows.db_uT[at]) for at in (fold.train, fold.pool, fold.test))
+    target, name = rows.target[fold.train], f"{method.title} ({method.inputs})"
+    draws = partial(rng_for, data.settings.seed, RNG, name, fold.name)
+    score = partial(point, data, fold)
+    plain = fit(method, known, target, draws("plain"), weight=None)
+    points = [score(plain.predict(test), method=name, pokes=NONE)]
+    for alignment, align in ALIGNMENTS.items():
+        moved = align(known.astype(float), new.astype(float))(known.astype(float)).astype(np.float32)
+        fitted = fit(method, moved, target, draws(alignment), weight=None)
+        points.append(score(fitted.predict(test), method=f"{name}, {alignment}", pokes=OWN))
+    for n in labels_n:
+        back_uT = standardised_uT(data, fold, pokes[:n])
+        points.append(score(plain.predict(view(back_uT)), method=f"{name}, {DIRECT}", pokes=NONE, labels_n=n))
+        own = np.concatenate([row[::EVERY_N] for row in pokes[:n]])
+        weight = np.concatenate([np.ones(len(known)), np.full(len(own), len(known) / len(own))]).astype(np.float32)
+        more = np.concatenate([known, view(rows.db_uT[own])]), np.concatenate([target, rows.target[own]])
+        fitted = fit(method, *more, draws(AS_ROWS, n), weight=weight)
+        points.append(score(fitted.predict(test), method=f"{name}, {AS_ROWS}", pokes=NONE, labels_n=n))
+    return points
+
+
+def standardised_uT(data: SceneData, fold: Fold, pokes: Sequence[np.ndarray]) -> Float[np.ndarray, "b ch"]:
+    """Map a new board's tested fields to the known boards', by labelled pokes that have a pair on these.
+
+    Each pair has the same weight, however strong the poke; the ridge is chosen on the pairs.
+    """
+    new_uT, old_uT = means_uT(data, pokes), pairs_uT(data.rows, fold.train, pokes)
+    kept = np.isfinite(old_uT).all(axis=1)
+    if not kept.any():
+        remedy = "Record known boards at the same places, or do not run this experiment."
+        raise ParamsError(f"fold {fold.name}", "labelled pokes", f"within {SAME_MM} mm of known ones", "none", remedy)
+    length_uT = np.linalg.norm(new_uT[kept], axis=1, keepdims=True)
+    new, old = new_uT[kept] / length_uT, old_uT[kept] / length_uT
+    moved = direct(new, old, choose_ridge(new, old))(data.rows.db_uT[fold.test].astype(float))
+    return moved.astype(np.float32)
+
+
+def pairs_uT(
+    rows: Rows, train: Int64[np.ndarray, " a"], pokes: Sequence[Int64[np.ndarray, " r"]]
+) -> Float[np.ndarray, "m ch"]:
+    """Give what known boards read at the place and force of each poke, mean over boards; NaN where there is no pair.
+
+    Between the forces that a board has at a place, channels are linear in log F; beyond, they are constant.
+    """
+    found = np.full((len(pokes), rows.db_uT.shape[1]), np.nan)
+    boards = [_poke_means(rows, train[rows.board[train] == board]) for board in np.unique(rows.board[train])]
+    for i, row in enumerate(pokes):
+        x_mm, y_mm, force_N = rows.target[row].mean(axis=0, dtype=np.float64)
+        there = [_interpolate(*known, (x_mm, y_mm), float(force_N)) for known in boards]
+        if there := [one for one in there if one is not None]:
+            found[i] = np.mean(there, axis=0)
+    return found
+
+
+def _poke_means(rows: Rows, own: Int64[np.ndarray, " a"]) -> tuple[np.ndarray, np.ndarray]:
+    """Average targets and fields by poke."""
+    _, poke, count = np.unique(rows.indentation[own], return_inverse=True, return_counts=True)
+    sums = [np.zeros((len(count), values.shape[1])) for values in (rows.target, rows.db_uT)]
+    for total, values in zip(sums, (rows.target, rows.db_uT), strict=True):
+        np.add.at(total, poke.ravel(), values[own])
+    return sums[0] / count[:, None], sums[1] / count[:, None]
+
+
+def _interpolate(
+    target: Float[np.ndarray, "p 3"], db_uT: Float[np.ndarray, "p ch"], place_mm: tuple[float, float], force_N: float
+) -> Float[np.ndarray, " ch"] | None:
+    apart_mm = np.hypot(*(target[:, :2] - place_mm).T)
+    here = np.flatnonzero((apart_mm <= SAME_MM) & (target[:, 2] > 0))
+    if not len(here):
+        return None
+    here = here[np.argsort(target[here, 2])]
+    log_N = np.log(target[here, 2])
+    return np.array([np.interp(np.log(force_N), log_N, channel) for channel in db_uT[here].T])
+
+
+def score_adversarial(
+    data: SceneData, fold: Fold, recipe: Recipe, weight: float
+) -> tuple[list[Point], list[dict[str, Any]]]:
+    """Score a domain-adversarial network and its control, with the record of their trainings."""
+    view, rows = VIEW[recipe.inputs], data.rows
+    scaler = FIT[recipe.scaling](view(rows.db_uT[fold.train]), rows.target[fold.train])
+    known, new, test = (scaler.encode(view(rows.db_uT[at])) for at in (fold.train, fold.pool, fold.test))
+    domains = Domains(known, scaler.encode_target(rows.target[fold.train]), new)
+    points, trainings = [], []
+    for method, pokes, own_weight in ((CONTROL, NONE, 0.0), (ADVERSARIAL, OWN, weight)):
+        weights, record = train_until_converged(domains, recipe, own_weight, data.settings.seed, fold.name)
+        predicted = scaler.decode(Predictor(weights, recipe.architecture, "cpu")(test))
+        points.append(point(data, fold, predicted, method=method, pokes=pokes))
+        trainings.append(record)
+    return points, trainings
+
+
+def train_until_converged(
+    domains: Domains, recipe: Recipe, weight: float, seed: int, fold: str
+) -> tuple[Weights, dict[str, Any]]:
+    """Train, and again with other draws while the network collapses, as all networks are.
+
+    The draws do not depend on the weight, so a network and its control differ in the weight alone.
+    """
+    for attempt_i in range(ATTEMPTS_MAX_N):
+        weights = train_adversarial(domains, recipe, weight, rng_for(seed, RNG, "network", fold, attempt_i))
+        off = Predictor(weights, recipe.architecture, "cpu")(domains.known) - domains.target
+        collapsed = bool(np.min(1 - np.nanmean(off**2, axis=0) / np.nanvar(domains.target, axis=0)) < COLLAPSED)
+        if not collapsed:
+            break
+    return weights, {"collapsed": collapsed, "collapsed_before_n": attempt_i}
+
+
+def alignment_controls(methods: Mapping[str, Classical], labels_n: Sequence[int]) -> dict[Key, Key]:
+    """Name the control of each method with aligned inputs."""
+    controls: dict[Key, Key] = {(ADVERSARIAL, OWN, 0): (CONTROL, NONE, 0)}
+    for method in methods.values():
+        name = f"{method.title} ({method.inputs})"
+        controls |= {(f"{name}, {alignment}", OWN, 0): (name, NONE, 0) for alignment in ALIGNMENTS}
+        controls |= {(f"{name}, {way}", NONE, n): (name, NONE, 0) for way in (DIRECT, AS_ROWS) for n in labels_n}
+    return controls
+
+
+# --- Methods that receive unlabelled pokes ---
+
+INVERSION = "physics inversion"
+CENTRED = f"{INVERSION}, centred"
+UNIVERSAL = ("universal map, ", "universal network, ", "universal, ")  # the map, the network, both
+NOWHERE_MM = np.zeros((1, 2))  # of no poke: nothing is centred
+
+
+@dataclass(frozen=True)
+class Seconds:
+    """Processor seconds until a method is calibrated to a skin, and of one reading of many."""
+
+    name: str
+    train_s: float
+    one_reading_s: float
+
+
+Estimated = tuple[str, Float[np.ndarray, "b 2"], Float[np.ndarray, " b"], Seconds]  # method, places, forces
+
+
+def score_unlabelled(
+    bench: Bench, setup: Setup, folds: Sequence[Fold], fold: Fold, rig: Mapping[str, Experts]
+) -> tuple[list[Point], list[Seconds]]:
+    """Score the universal models and the inversion with a skin's own pokes, with none and with another skin's."""
+    points, took = [], []
+    frame, db_uT = bench.frame, bench.data.rows.db_uT
+    test_uT, rest_uT = frame.field(db_uT[fold.test]), bench.seen[board_of(fold)].rest_uT.ravel()
+    own = pool_of(bench, fold)
+    none = Pokes(own.place_mm[:0], own.force_N[:0], own.db_uT[:0])
+    pools = {OWN: own, NONE: none, FOREIGN: pool_of(bench, next_board(fold, folds))}
+    for given, pool in pools.items():
+        for method, place_mm, force_N, seconds in [
+            *estimate_universal(bench.nominal, rest_uT, pool, test_uT, WAYS["nominal"]),
+            *estimate_universal(rig[board_of(fold)], rest_uT, pool, test_uT, WAYS["rig"]),
+            *estimate_inversion(setup, rest_uT, pool, test_uT),
+        ]:
+            predicted = np.column_stack([frame.label(place_mm), force_N])
+            points.append(point(bench.data, fold, predicted, method=method, pokes=given))
+            took += [replace(seconds, name=f"{method}.{fold.name}")] if given == OWN else []
+    return points, took
+
+
+def estimate_universal(
+    experts: Experts, rest_uT: Float[np.ndarray, " ch"], pool: Pokes, test_uT: Float[np.ndarray, "b ch"], way: str
+) -> Iterator[Estimated]:
+    """Estimate by a map, a network and both, calibrated with a skin's field at rest and some pokes."""
+    start_s = time.process_time()
+    if len(pool.force_N):
+        told = tell(experts, rest_uT, pool)
+    else:
+        skin = see_rest(new_map(experts.tables, experts.residual), rest_uT)
+        told = Told(skin, experts.networks, rest_uT, pool, NOWHERE_MM, misfit=1.0)
+    experts_ready = ready(told, 0)
+    ready_s = time.process_time()
+    ((alone, both),) = read_both(experts_ready, test_uT, [(ASSUMED_TEMPER, ASSUMED_TEMPER)])
+    both_s = time.process_time()
+    opinion = told.opinion(test_uT, 0)
+    network_s = time.process_time()
+    map_seconds = Seconds("", ready_s - start_s, (both_s - ready_s) / len(test_uT))
+    network_seconds = Seconds("", 0.0, (network_s - both_s) / len(test_uT))  # it receives its pokes while it reads
+    places = alone.place_mm, opinion.place_mm, both.place_mm
+    forces = alone.force_N, np.exp(opinion.log_N), both.force_N
+    names = [f"{name}{way}" for name in UNIVERSAL]
+    yield from zip(names, places, forces, (map_seconds, network_seconds, map_seconds), strict=True)
+
+
+def estimate_inversion(
+    setup: Setup, rest_uT: Float[np.ndarray, " ch"], pool: Pokes, test_uT: Float[np.ndarray, "b ch"]
+) -> Iterator[Estimated]:
+    """Invert a physical model that was fitted to some pokes; also with places shifted to centre these pokes."""
+    start_s = time.process_time()
+    known = chart(fit_unlabelled(pool.db_uT, rest_uT, setup), setup)
+    ready_s = time.process_time()
+    found = search(known, test_uT)
+    seconds = Seconds("", ready_s - start_s, (time.process_time() - ready_s) / len(test_uT))
+    yield INVERSION, found.place_mm, found.force_N, seconds
+    middle_mm = search(known, pool.db_uT).place_mm.mean(axis=0) if len(pool.db_uT) else np.zeros(2)
+    yield CENTRED, found.place_mm - middle_mm, found.force_N, seconds
+
+
+def unlabelled_controls() -> dict[Key, Key]:
+    """Compare every method with itself, given the skin's own pokes."""
+    names = [f"{name}{way}" for way in WAYS.values() for name in UNIVERSAL]
+    return {(name, given, 0): (name, OWN, 0) for name in (*names, INVERSION, CENTRED) for given in (NONE, FOREIGN)}
+
+
+# --- Alarms ---
+
+TESTED_EVERY_N = 10  # of the tested readings, one is used
+OF_RIGHT, OF_STRANGER = "the right skin's", "fitted anew to the stranger"
+ANOTHER = "another skin of the rig"
+QUARTER_TURN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+Chips = Float[np.ndarray, "n k 3"]
+# Foreign boards, made of the board's own readings: what a wrong plug, driver or skin does to its fields.
+STRANGERS: Mapping[str, Callable[[Chips], Chips]] = {
+    "x axis of every chip mirrored": lambda chips: chips * (-1.0, 1.0, 1.0),
+    "two chips exchanged": lambda chips: chips[:, [0, 2, 1, *range(3, chips.shape[1])]],
+    "every chip turned by a quarter": lambda chips: chips @ QUARTER_TURN,
+    "north for south": lambda chips: -chips,
+}
+ByBoard = Mapping[str, Float[np.ndarray, "_"]]
+
+
+@dataclass(frozen=True)
+class Board:
+    """A board in its chips' axes: the field at rest, unlabelled pokes, and tested readings."""
+
+    rest_uT: Float[np.ndarray, "1 ch"]
+    pool_uT: Float[np.ndarray, "m ch"]
+    tested_uT: Float[np.ndarray, "b ch"]
+
+    def alter(self, change: Callable[[Chips], Chips]) -> "Board":
+        """Give the board as it would read if its chips were changed."""
+        parts = self.rest_uT, self.pool_uT, self.tested_uT
+        return Board(*(change(part.reshape(len(part), -1, 3)).reshape(part.shape) for part in parts))
+
+
+def evaluate_alarm(
+    data: SceneData, frame: Frame, setup: Setup, seen: Mapping[str, Seen], folds: Sequence[Fold], fraction: float
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Evaluate the residual of inversion as an alarm for foreign boards, and as a flag of wrong estimates.
+
+    A physical model is fitted to each board's unlabelled pokes of its first fold, and inverted for tested readings of
+    the board itself and of foreign boards.
+    """
+    first = first_folds(folds)
+    boards = {}
+    for board, fold in first.items():
+        rest_uT = seen[board].pokes.noload_uT.mean(axis=0).reshape(1, -1)
+        tested_uT = data.rows.db_uT[fold.test[::TESTED_EVERY_N]].astype(float)
+        boards[board] = Board(rest_uT, means_uT(data, pokes_of(data, fold)), tested_uT)
+
+    def fit_board(board: Board) -> Chart:
+        return chart(fit_unlabelled(frame.field(board.pool_uT), frame.field(board.rest_uT)[0], setup), setup)
+
+    def residual(known: Chart, board: Board) -> Float[np.ndarray, " b"]:
+        return search(known, frame.field(board.tested_uT)).left
+
+    known = {board: fit_board(own) for board, own in boards.items()}
+    found = {board: search(known[board], frame.field(own.tested_uT)) for board, own in boards.items()}
+    left = {board: own.left for board, own in found.items()}
+    true_mm = {board: data.rows.target[first[board].test[::TESTED_EVERY_N], :2].astype(float) for board in boards}
+    off_mm = {board: own.place_mm - frame.place(true_mm[board]) for board, own in found.items()}
+    limits = limits_of(left, fraction)
+    strangers: dict[tuple[str, str], dict[str, np.ndarray]] = {}
+    names = list(boards)
+    for i, (board, own) in enumerate(boards.items()):
+        other = boards[names[(i + 1) % len(names)]]
+        strangers.setdefault((ANOTHER, OF_RIGHT), {})[board] = residual(known[board], other)
+        for name, change in STRANGERS.items():
+            stranger = own.alter(change)
+            strangers.setdefault((name, OF_RIGHT), {})[board] = residual(known[board], stranger)
+            strangers.setdefault((name, OF_STRANGER), {})[board] = residual(fit_board(stranger), stranger)
+    alarm = {
+        "asked_pct": 100 * fraction,
+        "limit": statistic(list(limits.values()), boards=True),
+        "right": alarm_statistics(left, left, limits),
+        "strangers": [
+            {"stranger": stranger, "law": law} | alarm_statistics(own, left, limits)
+            for (stranger, law), own in strangers.items()
+        ],
+    }
+    return alarm, {"method": INVERSION, "by": "left over"} | score_flagged(left, off_mm, fraction)
+
+
+def limits_of(value: ByBoard, fraction: float) -> dict[str, float]:
+    """Give for each board the limit that this fraction of the other boards' readings exceeds."""
+    others = {board: [own for other, own in value.items() if other != board] for board in value}
+    return {board: float(np.quantile(np.concatenate(own), 1 - fraction)) for board, own in others.items()}
+
+
+def alarm_statistics(left: ByBoard, right: ByBoard, limits: Mapping[str, float]) -> dict[str, Any]:
+    """Summarise over boards: readings that raise the alarm, the area under the ROC curve, the median residual."""
+    by_board = {
+        "alarm_pct": [100 * float((own > limits[board]).mean()) for board, own in left.items()],
+        "auc": [roc_area(right[board], own) for board, own in left.items()],
+        "left_median": [float(np.median(own)) for own in left.values()],
+    }
+    return {name: statistic(values, boards=True) for name, values in by_board.items()}
+
+
+def score_flagged(value: ByBoard, off_mm: Mapping[str, Float[np.ndarray, "_ 2"]], fraction: float) -> dict[str, Any]:
+    """Summarise over boards the errors of flagged readings and of all others; absent for a board that flags none."""
+    found: dict[str, list[float]] = {}
+    for board, limit in limits_of(value, fraction).items():
+        flagged = value[board] > limit
+        found.setdefault("flagged_pct", []).append(100 * float(flagged.mean()))
+        for name, rows in (("flagged", flagged), ("others", ~flagged)):
+            if rows.any():
+                off = np.abs(off_mm[board][rows])
+                within = (off <= ACCURACY_LIMIT_MM).all(axis=1)
+                found.setdefault(f"accuracy_pct_{name}", []).append(100 * float(within.mean()))
+                found.setdefault(f"mse_xy_mm2_{name}", []).append(float((off**2).mean()))
+    return {name: statistic(values, boards=True) for name, values in found.items()}
+
+
+def flag_by_universal(bench: Bench, folds: Sequence[Fold], fraction: float) -> list[dict[str, Any]]:
+    """Flag readings of the universal model by the standard deviation of the place, and by the misfit of the map."""
+    sd_mm, misfit, off_mm = {}, {}, {}
+    for board, fold in first_folds(folds).items():
+        rows, test = bench.data.rows, fold.test[::TESTED_EVERY_N]
+        told = ready(tell(bench.nominal, bench.seen[board].rest_uT.ravel(), pool_of(bench, fold)), 0)
+        ((_, both),) = read_both(told, bench.frame.field(rows.db_uT[test]), [(ASSUMED_TEMPER, ASSUMED_TEMPER)])
+        off_mm[board] = both.place_mm - bench.frame.place(rows.target[test, :2].astype(float))
+        sd_mm[board], misfit[board] = both.sd_mm.max(axis=1), both.misfit
+    method = METHODS[1] + WAYS["nominal"]
+    by = {"standard deviation of the place": sd_mm, "misfit of the map": misfit}
+    return [{"method": method, "by": name} | score_flagged(value, off_mm, fraction) for name, value in by.items()]
+
+
+# --- Tables ---
+
+DASH = "–"
+# What each method can do and what it cannot, by its mechanism; whether it helps is in the columns beside it.
+WHY = {
+    "channels matched": "undoes a gain of each channel; a seat or a turn mixes channels, and where forces differ so do "
+    "deviations",
+    "CORAL": "also undoes what mixes channels, as far as the pokes tell all their covariances; many maps have the same "
+    "covariances, and it knows not which keeps places",
+    "direct standardisation": "knows which places belong together, but has as many unknowns as channels squared, and a "
+    "linear map is not how a seat changes a field",
+    "labels as rows": "says where this skin's fields lie, at the labelled places alone",
+    "network, domain-adversarial": "makes features of both boards alike as a whole; nothing says that like features "
+    "have like places",
+}
+BASELINES = (
+    "Regressors and networks of the known boards on the held-out one; aligned by all its unlabelled pokes, or by so "
+    "many labelled ones, each paired with what known boards read at its place and force. Paired: difference to the row "
+    "without it (the same regressor, no label; the network, trained as long), board by board. Ridge of direct "
+    "standardisation: by leaving out these pairs one by one, as one training board has no second to be validated on. "
+    "Nothing else was searched."
+)
+UNLABELLED = (
+    "No label of the held-out board. Paired: difference to the same method told the skin's own pokes, board by board. "
+    "Physics inversion: a law's eight numbers, and place and force of each poke, by least squares from nominal "
+    "numbers, whose stiffness and slide are the middle of recorded boards, these included; then each reading is "
+    "searched in that law. Centred: places shifted so that the pokes' mean is the middle, as maps and networks assume "
+    "too. Its stiffness is nominal, so its forces are in nominal units. Another skin's: the pokes of "
+    "the next board, beside the held-out board's own field at rest."
+)
+ALARM = (
+    "Left over: |dB - simulated| / |dB| of the best place in the law, the median over readings. The alarm is raised "
+    "above the limit that {asked:g} % of readings of boards not held out exceed; limit {limit}. Area under the ROC "
+    "curve: 0.5 tells nothing, 1 all. Strangers are recorded readings of the same board with changed chips; the law is "
+    "that of the right skin, or fitted anew to the stranger's own pokes and field at rest. n boards; "
+    "[low, high]: 95 % interval over them (Student's t, which knows no bounds)."
+)
+FLAGGED = (
+    "Each told the right skin's own unlabelled pokes and no label. Flagged: above the limit that {asked:g} % of "
+    "readings of boards not held out exceed. n boards; an error is of those that flag any reading. A misfit says that "
+    "dB is none of such a skin, a standard deviation that several places would read alike: only the latter is about "
+    "the place."
+)
+
+
+def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
+    """Tabulate aligned methods, the worth of unlabelled pokes, the alarm, and errors of flagged readings."""
+    unlabelled = [row for row in numbers["methods"] if row["method"].startswith(("universal", INVERSION))]
+    aligned = [row for row in numbers["methods"] if row not in unlabelled]
+    alarm = numbers["alarm"]
+    right = {"stranger": "none: the right skin", "law": OF_RIGHT} | alarm["right"]
+    unpaired = f" {numbers['unpaired_n']} labelled pokes had no pair." if numbers["unpaired_n"] else ""
+    return {
+        "rivals": tabulate(
+            [_line(row, source) | {"why": _why(row["method"])} for row in aligned], meaning=BASELINES + unpaired
+        ),
+        "rivals_told": tabulate([_line(row, source) for row in unlabelled], meaning=UNLABELLED),
+        "rivals_alarm": tabulate(
+            [
+                {
+                    "stranger": row["stranger"],
+                    "law": row["law"],
+                    "alarm, % of readings": show(row["alarm_pct"]),
+                    "area under ROC": show(row["auc"]),
+                    "left over": show(row["left_median"]),
+                    "n": str(row["auc"]["n"]),
+                    "source": source,
+                }
+                for row in (right, *alarm["strangers"])
+            ],
+            meaning=ALARM.format(asked=alarm["asked_pct"], limit=show(alarm["limit"])),
+        ),
+        "rivals_flagged": tabulate(
+            [_flagged_line(row, source) for row in numbers["flagged"]],
+            meaning=FLAGGED.format(asked=alarm["asked_pct"]),
+        ),
+    }
+
+
+def _line(row: Mapping[str, Any], source: str) -> dict[str, str]:
+    places = {metric: f"{title} (registered)" for metric, title in COLUMNS.items() if metric not in OF_FORCE}
+    line = {"method": row["method"], "unlabelled pokes": row["pokes"], "labels": str(row["labels_n"]), "source": source}
+    line |= scores(row["as_labelled"]) | scores(row["registered"], places)
+    over = row.get("over", {})
+    differences = {"paired, accuracy, points": "accuracy_pct", "paired, MSE_xy, mm²": "mse_xy_mm2"}
+    line |= {title: show_difference(over.get(name)) for title, name in differences.items()}
+    return line | {"n": n_of(row["as_labelled"])}
+
+
+def _why(method: str) -> str:
+    return next((reason for name, reason in WHY.items() if method.endswith(name)), DASH)
+
+
+def _flagged_line(row: Mapping[str, Any], source: str) -> dict[str, str]:
+    line = {"method": row["method"], "flagged by": row["by"], "flagged, %": show(row["flagged_pct"])}
+    for metric in ("accuracy_pct", "mse_xy_mm2"):
+        for name, readings in (("flagged", "flagged"), ("others", "all others")):
+            line[f"{COLUMNS[metric]} ({readings})"] = show(row.get(f"{metric}_{name}"))
+    return line | {"n": str(row["flagged_pct"]["n"]), "source": source}
+
+
+def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
+    """Draw nothing."""
+    return {}
