@@ -15,7 +15,7 @@ from reskin.data.rows import Selection
 from reskin.data.splits import Split
 from reskin.errors import ParamsError
 from reskin.models.recipe import FineTuning, Labelling, Name, Recipe, Schedule
-from reskin.recordings.fault_policy import Decisions
+from reskin.recordings.fault_policy import FaultPolicy
 
 MAIN_PROTOCOL = "grid"  # folds are drawn on its captures
 NOT_INGESTED = {"walk"}  # kinds of protocols whose captures are read as they are: an SD card knows no probe
@@ -162,7 +162,7 @@ class Shared(Strict):
     """`params.yaml`: what scenes share, by name."""
 
     lost_fraction_max: Annotated[float, Field(ge=0, le=1)]
-    faults: Decisions
+    faults: FaultPolicy
     recipes: dict[Name, Section]
     adaptations: dict[Name, Section]
     labellings: dict[Name, Section]

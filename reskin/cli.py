@@ -185,13 +185,13 @@ def live(
     from reskin.board.find import the_boards
     from reskin.errors import ParamsError
     from reskin.live.emulator import playing, read_script
-    from reskin.live.health import LIVE
+    from reskin.live.health import LIVE_POLICY
     from reskin.live.server import serve
     from reskin.live.session import several
     from reskin.predicting import read_models
-    from reskin.recordings.fault_policy import decide
+    from reskin.recordings.fault_policy import override
 
-    decisions = decide(LIVE, on_fault or (), "--on-fault")
+    fault_policy = override(LIVE_POLICY, on_fault or (), "--on-fault")
     given = [word for word, value in (("--port", port), ("--replay", replay), ("--emulate", emulate)) if value]
     if len(given) > 1:
         raise ParamsError("live", "the board", "from one of --port, --replay, --emulate", ", ".join(given), "Give one.")
@@ -201,7 +201,7 @@ def live(
         if source := replay or emulate:
             script = read_script(source)
             port, what = [stack.enter_context(playing(script))], f"{script.source}: {source}, played"
-        boards = several(port or [found.port for found in the_boards()], models, what, decisions)
+        boards = several(port or [found.port for found in the_boards()], models, what, fault_policy)
         serve(boards, host=host, http_port=http_port, say=typer.echo)
 
 

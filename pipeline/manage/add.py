@@ -17,7 +17,7 @@ from pipeline.scenes import Scene, read_plan, read_scene, read_shared
 from pipeline.stage import say
 from reskin import config, io
 from reskin.errors import CaptureError, ReskinError
-from reskin.recordings.fault_policy import Decisions
+from reskin.recordings.fault_policy import FaultPolicy
 from reskin.recordings.header import STREAM_FILE, Header, write_capture
 from reskin.recordings.ingest import check_losses, open_capture
 from reskin.recordings.orientation import other_orientation, presses_of
@@ -41,21 +41,21 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
         )
         raise CaptureError(f"capture {header.capture}", "source", rule, header.source, remedy)
     shared, before = read_shared(root / PARAMS), read_registry(root)
-    decisions = config.parse(Decisions, shared["faults"], f"{PARAMS}: faults")
+    policy = config.parse(FaultPolicy, shared["faults"], f"{PARAMS}: faults")
     target = root / RAW / scene / header.capture
     _check_free(target, header.capture in before.captures.get(scene, {}))
     with io.restoring(root / REGISTRY, root / PLAN), _forgetting_on_failure(target):
         with _naming_sources(target, files):
             complete = write_capture(target, header, files)
-            fingerprints = _read_through(target, complete, shared["lost_fraction_max"], decisions)
+            fingerprints = _read_through(target, complete, shared["lost_fraction_max"], policy)
         after = with_capture(before, scene, complete, fingerprints, allow_copy=allow_copy)
         _track(target, root)
         write_registry(root, after)
         plan.use(root, [*read_plan(root / PLAN).scenes, scene])
     if "compare" in (settings.model_extra or {}):
-        _warn_of_departures(target, settings, nominal("skin"), decisions)
+        _warn_of_departures(target, settings, nominal("skin"), policy)
     else:
-        _warn_of_other_labels(target, list(before.captures.get(scene, {})), decisions)
+        _warn_of_other_labels(target, list(before.captures.get(scene, {})), policy)
     return complete
 
 
@@ -79,9 +79,9 @@ def _check_free(target: Path, registered: bool) -> None:
         raise CaptureError(target, "a new capture's folder", "free", "one that is there", remedy)
 
 
-def _read_through(folder: Path, header: Header, limit: float, decisions: Decisions) -> tuple[str, ...]:
+def _read_through(folder: Path, header: Header, limit: float, policy: FaultPolicy) -> tuple[str, ...]:
     """Read a capture as ingest will; return the hashes that tell a copy of it, however it is labelled or laid out."""
-    _, blocks, account = open_capture(folder, decisions)
+    _, blocks, account = open_capture(folder, policy)
     rows_n, readings = 0, hashlib.sha256()
     for block in blocks:
         rows_n += len(block)
@@ -95,7 +95,7 @@ def _read_through(folder: Path, header: Header, limit: float, decisions: Decisio
     return (readings.hexdigest(), *(header.files[name] for name in (STREAM_FILE,) if name in header.files))
 
 
-def _warn_of_departures(folder: Path, scene: Scene, skin: Mapping[str, Any], decisions: Decisions) -> None:
+def _warn_of_departures(folder: Path, scene: Scene, skin: Mapping[str, Any], policy: FaultPolicy) -> None:
     """Warn if a capture seems to lie otherwise than section compare of its scene says; it stays added."""
     from pipeline.experiments.compare import (
         Compare,
@@ -103,7 +103,7 @@ def _warn_of_departures(folder: Path, scene: Scene, skin: Mapping[str, Any], dec
     )
     from reskin.physics.skin import SkinDesign
 
-    _, blocks, _ = open_capture(folder, decisions)
+    _, blocks, _ = open_capture(folder, policy)
     section = config.parse(Compare, (scene.model_extra or {})["compare"], "section compare")
     try:
         sentence = departure(list(blocks), section, config.parse(SkinDesign, skin, "params.yaml: skin"))
@@ -113,13 +113,13 @@ def _warn_of_departures(folder: Path, scene: Scene, skin: Mapping[str, Any], dec
         say(f"warning: capture {folder.name}: {sentence} It was added all the same.")
 
 
-def _warn_of_other_labels(folder: Path, others: Sequence[str], decisions: Decisions) -> None:
+def _warn_of_other_labels(folder: Path, others: Sequence[str], policy: FaultPolicy) -> None:
     """Warn if places seem turned, mirrored or exchanged beside those of the scene's other captures; it stays added."""
     found = []
-    own = presses_of(open_capture(folder, decisions)[1])
+    own = presses_of(open_capture(folder, policy)[1])
     for other in others[-COMPARED_N:]:
         if (folder.parent / other).is_dir():
-            found.append(other_orientation(own, presses_of(open_capture(folder.parent / other, decisions)[1])))
+            found.append(other_orientation(own, presses_of(open_capture(folder.parent / other, policy)[1])))
     usual = max(set(found), key=found.count, default=None)
     if usual is not None:
         say(

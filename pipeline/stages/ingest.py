@@ -13,7 +13,7 @@ from reskin import io
 from reskin.data.folds import load_rows, render_folds
 from reskin.data.rows import Rows, Selection
 from reskin.data.splits import Split, draw_folds
-from reskin.recordings.fault_policy import Decisions
+from reskin.recordings.fault_policy import FaultPolicy
 from reskin.recordings.ingest import check_losses, open_capture
 
 CACHE = ".reskin/readings"  # of ingest_many; DVC deletes a stage's outputs before it runs
@@ -22,8 +22,8 @@ NO_ROWS = Rows.of_labels(boards=[], skins=[])
 
 def ingest(settings: Settings, raw: Path, indentations: Path) -> None:
     """Read one recorded capture, check what it lost, and write its readings: one row each."""
-    decisions = settings.shared_section(Decisions, "faults")
-    header, blocks, account = open_capture(raw, decisions)
+    policy = settings.shared_section(FaultPolicy, "faults")
+    header, blocks, account = open_capture(raw, policy)
     io.write_readings(indentations, blocks, account)
     try:
         check_losses(account, settings.shared["lost_fraction_max"], str(raw))

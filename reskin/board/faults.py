@@ -1,12 +1,16 @@
-"""Detect faulty readings: out of range, stuck, jumped, repeated, exchanged or failed chips, and impossible times.
+"""Detect the faults of a board: failed reads, stuck or reset chips, values out of range, repeated or missing frames.
 
-Masks of frames and flags of chips, for files as a whole and block by block.
+The functions say how each fault looks; `FaultDetector` finds all of them in a stream that comes in portions. What
+becomes of faulty readings is decided elsewhere: `recordings.fault_policy` for recordings, `live.health` live.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int
 
 from reskin.board.stream import TEMPERATURE_MAX_degC, TEMPERATURE_MIN_degC
+from reskin.board.wire import Frames
 
 # What the ReSkin firmware sends for a chip whose I2C read failed; seen in INI's recording AFG_flex_50.
 FAILED_B_uT = (8028.16, 5194.00, 12943.36)
@@ -31,6 +35,19 @@ SAME_VALUE_uT = 1e-3  # float32 arithmetic may write one value in two ways
 # (1.84 ms), or where its LSB is coarse: for at most 3 frames in 14 real recordings.
 STUCK_FRAMES_MIN_N = 20
 OTHERS_MOVE_MIN = 0.5  # without noise a board moves only while it is pressed or released
+
+B_MAX_uT = 49_000.0  # an MLX90393 measures up to 50 mT (data sheet)
+INT16_STEPS_N = 2**15
+CLOCK_STEP_MAX_S = 1.0
+REPEATED_LOOK_N, REPEATED_SHARE = 40, 0.4  # assumed: so many of so many frames, which is a tenth of a second at 400 Hz
+MISSING_STEPS = 1.6  # of the usual step of the board's clock
+SILENCE_S = 1.0
+SILENCE_STEPS = 50.0  # of the usual time between two frames: a slow log is not silent
+GARBAGE_FRAMES_N = 10  # so many frames' bytes in a row that are none are no torn frame
+LONG_LINE = 1.5  # of the usual length of a line of text
+
+SCALE_FRAMES_N = 400  # every sound chip of real recordings shows its LSB in so many frames; in 200 it may not
+GRID_ROWS_N = 1000  # rows of a table in which the LSB is looked for
 
 
 def failed_reads(
@@ -71,10 +88,12 @@ def reset_chips(b_uT: Float[np.ndarray, "f ch"], expected_lsb_uT: tuple[float, f
     Without an expectation: those whose grid differs from that of most chips, or is the one of a chip after a reset. A
     chip that shows no grid is not flagged.
     """
-    return odd_scales(find_lsb(b_uT), expected_lsb_uT)
+    return unusual_lsb(find_lsb(b_uT), expected_lsb_uT)
 
 
-def odd_scales(lsb_uT: Float[np.ndarray, "k 2"], expected_lsb_uT: tuple[float, float] | None) -> Bool[np.ndarray, " k"]:
+def unusual_lsb(
+    lsb_uT: Float[np.ndarray, "k 2"], expected_lsb_uT: tuple[float, float] | None
+) -> Bool[np.ndarray, " k"]:
     """Flag chips as `reset_chips` does, from the steps that `find_lsb` gave."""
     if expected_lsb_uT is not None:
         return _not_on_grid(lsb_uT, expected_lsb_uT)
@@ -148,6 +167,62 @@ class ConstantChannels:
         ]
 
 
+def too_hot(temperature_degC: Float[np.ndarray, "f k"]) -> Bool[np.ndarray, "f k"]:
+    """Mark temperatures out of the chip's range; unknown ones are not."""
+    return (temperature_degC < TEMPERATURE_MIN_degC) | (temperature_degC > TEMPERATURE_MAX_degC)
+
+
+def saturated(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
+    """Mark the readings of a chip that are at the end of its range."""
+    return np.asarray((np.abs(b_uT) > B_MAX_uT).reshape(len(b_uT), b_uT.shape[1] // 3, 3).any(axis=2))
+
+
+def wrapped(step_uT: Float[np.ndarray, "f ch"], lsb_uT: Float[np.ndarray, "k 2"]) -> Bool[np.ndarray, "f k"]:
+    """Mark steps from frame to frame that int16 does not hold; of a chip whose LSB is not known, none."""
+    wrap_uT = INT16_STEPS_N * lsb_uT[:, [0, 0, 1]]
+    return np.asarray((np.abs(step_uT.reshape(len(step_uT), -1, 3)) > wrap_uT).any(axis=2))
+
+
+def repeated_frames(step_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, " f"]:
+    """Mark frames that repeat the one before, where many do: a loop may outrun the chips now and then."""
+    same = np.asarray((step_uT == 0).all(axis=1))
+    if len(same) < REPEATED_LOOK_N:
+        return np.zeros(len(same), bool)
+    window = np.full(REPEATED_LOOK_N, 1 / REPEATED_LOOK_N)
+    share, inside = (np.convolve(each, window, mode="same") for each in (same, np.ones(len(same))))
+    inside[inside > 1 - 0.5 / REPEATED_LOOK_N] = 1.0  # the window is cut only at the ends
+    return np.asarray(same & (share / inside > REPEATED_SHARE))
+
+
+def clock_jumps(device_step_s: Float[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
+    """Mark steps of the board's clock that no loop takes."""
+    return np.asarray((device_step_s < 0) | (device_step_s > CLOCK_STEP_MAX_S))
+
+
+def missing_frames(device_step_s: Float[np.ndarray, " f"]) -> Int[np.ndarray, " f"]:
+    """Count the frames that are missing before each, by the board's clock; without one nothing tells."""
+    usual_s = np.median(device_step_s) if len(device_step_s) else np.nan
+    if not usual_s > 0:
+        return np.zeros(len(device_step_s), np.int64)
+    late = (device_step_s > MISSING_STEPS * usual_s) & ~clock_jumps(device_step_s)
+    return np.where(late, np.rint(device_step_s / usual_s) - 1, 0).astype(np.int64)
+
+
+def silent_gaps(step_s: Float64[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
+    """Mark frames before which nothing came for a second or more: unplugged, or stalled."""
+    usual_s = np.median(step_s[np.isfinite(step_s)]) if np.isfinite(step_s).any() else np.inf
+    return np.asarray(step_s > max(SILENCE_S, SILENCE_STEPS * usual_s))
+
+
+def lost_bytes(end_byte: Int[np.ndarray, " f"], first_byte: int, frame_bytes_n: int | None) -> Int[np.ndarray, " f"]:
+    """Count the bytes before each frame that are none; without a frame's length (text) the usual line tells."""
+    length_n = np.diff(end_byte, prepend=first_byte)
+    if frame_bytes_n is not None:
+        return length_n - frame_bytes_n
+    usual_n = int(np.median(length_n)) if len(length_n) else 0
+    return np.where(length_n > LONG_LINE * usual_n, length_n - usual_n, 0)
+
+
 def _step(axes_uT: list[Float[np.ndarray, " f"]], steps_min_n: int) -> float:
     """Find the step of the grid on which all values of some axes lie."""
     gaps_uT = np.concatenate([np.diff(np.unique(axis[np.isfinite(axis)])) for axis in axes_uT])
@@ -172,66 +247,147 @@ def _by_chip(b_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f k 3"]:
     return b_uT.reshape(len(b_uT), b_uT.shape[1] // 3, 3)
 
 
-B_MAX_uT = 49_000.0  # an MLX90393 measures up to 50 mT (data sheet)
-INT16_STEPS_N = 2**15
-CLOCK_STEP_MAX_S = 1.0
-REPEATED_LOOK_N, REPEATED_SHARE = 40, 0.4  # assumed: so many of so many frames, which is a tenth of a second at 400 Hz
-MISSING_STEPS = 1.6  # of the usual step of the board's clock
-SILENCE_S = 1.0
-SILENCE_STEPS = 50.0  # of the usual time between two frames: a slow log is not silent
-GARBAGE_FRAMES_N = 10  # so many frames' bytes in a row that are none are no torn frame
-LONG_LINE = 1.5  # of the usual length of a line of text
+class ReadingFaults(NamedTuple):
+    """Masks of the faults that a single reading shows, [frame chip]."""
+
+    failed_read: Bool[np.ndarray, "f k"]
+    zeros: Bool[np.ndarray, "f k"]
+    too_hot: Bool[np.ndarray, "f k"]
+    saturated: Bool[np.ndarray, "f k"]
+
+    @property
+    def failed_rows(self) -> Bool[np.ndarray, " f"]:
+        """Frames in which a chip was not read."""
+        return np.asarray((self.failed_read | self.zeros).any(axis=1))
+
+    @property
+    def faulty_rows(self) -> Bool[np.ndarray, " f"]:
+        """Frames in which any chip has any of these faults."""
+        return np.asarray((self.failed_read | self.zeros | self.too_hot | self.saturated).any(axis=1))
 
 
-def too_hot(temperature_degC: Float[np.ndarray, "f k"]) -> Bool[np.ndarray, "f k"]:
-    """Mark temperatures out of the chip's range; unknown ones are not."""
-    return (temperature_degC < TEMPERATURE_MIN_degC) | (temperature_degC > TEMPERATURE_MAX_degC)
+def find_reading_faults(b_uT: Float[np.ndarray, "f ch"], temperature_degC: Float[np.ndarray, "f k"]) -> ReadingFaults:
+    """Mark the readings that are faulty by themselves, whatever came before."""
+    failed = failed_reads(b_uT, temperature_degC)
+    return ReadingFaults(failed, zero_reads(b_uT), too_hot(temperature_degC) & ~failed, saturated(b_uT) & ~failed)
 
 
-def saturated(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
-    """Mark the readings of a chip that are at the end of its range."""
-    return np.asarray((np.abs(b_uT) > B_MAX_uT).reshape(len(b_uT), b_uT.shape[1] // 3, 3).any(axis=2))
+class ScaleWindow(NamedTuple):
+    """The LSB of each chip in `SCALE_FRAMES_N` frames, with the first frame's number (from 1) and all their times.
+
+    `unusual` chips differ from the expected LSB or the other chips, `changed` ones from their own LSB before.
+    """
+
+    first_frame: int
+    t_s: Float64[np.ndarray, " w"]
+    lsb_uT: Float[np.ndarray, "k 2"]
+    expected_lsb_uT: tuple[float, float] | None
+    unusual: Bool[np.ndarray, " k"]
+    changed: Bool[np.ndarray, " k"]
 
 
-def wrapped(step_uT: Float[np.ndarray, "f ch"], lsb_uT: Float[np.ndarray, "k 2"]) -> Bool[np.ndarray, "f k"]:
-    """Mark steps from frame to frame that int16 does not hold; of a chip whose LSB is not known, none."""
-    wrap_uT = INT16_STEPS_N * lsb_uT[:, [0, 0, 1]]
-    return np.asarray((np.abs(step_uT.reshape(len(step_uT), -1, 3)) > wrap_uT).any(axis=2))
+class Faults(NamedTuple):
+    """What `FaultDetector` found in the frames that it was fed: masks and counts by frame, or by frame and chip."""
+
+    readings: ReadingFaults
+    stuck: Bool[np.ndarray, "f k"]
+    int16_wrap: Bool[np.ndarray, "f k"]
+    repeated: Bool[np.ndarray, " f"]
+    clock_jump: Bool[np.ndarray, " f"]
+    unplug: Bool[np.ndarray, " f"]
+    missing_frames_n: Int[np.ndarray, " f"]  # before each frame, by the board's clock
+    torn_bytes_n: Int[np.ndarray, " f"]  # before each frame
+    garbage_bytes_n: Int[np.ndarray, " f"]  # before each frame: so many bytes that the baud rate may be wrong
+    scale: tuple[ScaleWindow, ...]  # of the windows that are complete now
 
 
-def repeated(step_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, " f"]:
-    """Mark frames that are the one before again, where that is many: a loop may outrun the chips now and then."""
-    same = np.asarray((step_uT == 0).all(axis=1))
-    if len(same) < REPEATED_LOOK_N:
-        return np.zeros(len(same), bool)
-    share = np.convolve(same, np.full(REPEATED_LOOK_N, 1 / REPEATED_LOOK_N), mode="same")
-    return np.asarray(same & (share > REPEATED_SHARE))
+class FaultDetector:
+    """Find the faults of a stream of frames, fed in portions of any length.
 
+    Ingestion and the live view both use it. It keeps at most `SCALE_FRAMES_N` frames.
 
-def clock_jumps(device_step_s: Float[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
-    """Mark steps of the board's clock that no loop takes."""
-    return np.asarray((device_step_s < 0) | (device_step_s > CLOCK_STEP_MAX_S))
+    Parameters
+    ----------
+    chips_n : chips of a frame.
+    frame_bytes_n : length of a binary frame; None for text, whose lines vary.
+    expected_lsb_uT : LSB along x, y and along z that the header promises, if it does.
+    """
 
+    def __init__(
+        self,
+        chips_n: int,
+        *,
+        frame_bytes_n: int | None = None,
+        expected_lsb_uT: tuple[float, float] | None = None,
+    ) -> None:
+        self._expected_lsb_uT = expected_lsb_uT
+        self._frame_bytes_n = frame_bytes_n
+        self._stuck, self._constant = StuckChips(chips_n), ConstantChannels(chips_n)
+        self._window_uT, self._window_s = np.zeros((0, 3 * chips_n), np.float32), np.zeros(0)
+        self._windowed_n = 0  # frames in complete windows
+        self._lsb_uT = np.full((chips_n, 2), np.nan)  # of each chip, once known
+        self._last_b_uT: Float[np.ndarray, "1 ch"] | None = None  # of the last frame without a faulty reading
+        self._last: tuple[float, float, int] | None = None  # time, board's time and end byte of the last frame
 
-def missing(device_step_s: Float[np.ndarray, " f"]) -> Int[np.ndarray, " f"]:
-    """Count the frames that are missing before each, by the board's clock; without one nothing tells."""
-    usual_s = np.median(device_step_s) if len(device_step_s) else np.nan
-    if not usual_s > 0:
-        return np.zeros(len(device_step_s), np.int64)
-    late = (device_step_s > MISSING_STEPS * usual_s) & ~clock_jumps(device_step_s)
-    return np.where(late, np.rint(device_step_s / usual_s) - 1, 0).astype(np.int64)
+    def feed(self, frames: Frames, t_s: Float64[np.ndarray, " f"]) -> Faults:
+        """Take the next frames and their times in s; return their faults."""
+        b_uT, chips_n = frames.b_uT, frames.temperature_degC.shape[1]
+        readings = find_reading_faults(b_uT, frames.temperature_degC)
+        read = np.isfinite(b_uT).all(axis=1) & np.isfinite(frames.temperature_degC).all(axis=1) & ~readings.failed_rows
+        sound = ~readings.faulty_rows
+        scale = self._find_scale(b_uT[read], t_s[read])
+        stuck, int16_wrap = np.zeros((2, len(frames), chips_n), bool)
+        repeated = np.zeros(len(frames), bool)
+        stuck[read] = self._stuck.feed(b_uT[read])
+        stuck[~sound] = False
+        if sound.any():
+            last_uT = b_uT[sound][:1] + 1 if self._last_b_uT is None else self._last_b_uT  # the first repeats none
+            step_uT = np.diff(b_uT[sound], axis=0, prepend=last_uT)
+            self._last_b_uT = b_uT[sound][-1:]
+            int16_wrap[sound] = wrapped(step_uT, self._lsb_uT)
+            repeated[sound] = repeated_frames(step_uT)
+        self._constant.feed(b_uT[sound])
+        return Faults(readings, stuck, int16_wrap, repeated, *self._find_gaps(frames, t_s), scale)
 
+    def constant_channels(self) -> list[str]:
+        """Name the channels that have never changed so far, see `ConstantChannels`."""
+        return self._constant.found()
 
-def silences(step_s: Float64[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
-    """Mark frames before which nothing came for a second or more: unplugged, or stalled."""
-    usual_s = np.median(step_s[np.isfinite(step_s)]) if np.isfinite(step_s).any() else np.inf
-    return np.asarray(step_s > max(SILENCE_S, SILENCE_STEPS * usual_s))
+    def _find_scale(self, b_uT: Float[np.ndarray, "f ch"], t_s: Float64[np.ndarray, " f"]) -> tuple[ScaleWindow, ...]:
+        held_uT, held_s = np.concatenate([self._window_uT, b_uT]), np.concatenate([self._window_s, t_s])
+        windows = []
+        complete_n = len(held_uT) // SCALE_FRAMES_N * SCALE_FRAMES_N
+        for first in range(0, complete_n, SCALE_FRAMES_N):
+            rows = slice(first, first + SCALE_FRAMES_N)
+            lsb_uT = find_lsb(held_uT[rows], steps_min_n=SURE_STEPS_MIN_N)
+            changed = np.any(np.abs(lsb_uT / self._lsb_uT - 1) > LSB_TOLERANCE, axis=1)
+            unusual = unusual_lsb(lsb_uT, self._expected_lsb_uT)
+            first_frame = self._windowed_n + 1
+            windows.append(ScaleWindow(first_frame, held_s[rows], lsb_uT, self._expected_lsb_uT, unusual, changed))
+            self._windowed_n += SCALE_FRAMES_N
+            self._lsb_uT = np.where(np.isnan(self._lsb_uT), lsb_uT, self._lsb_uT)
+        self._window_uT, self._window_s = held_uT[complete_n:].copy(), held_s[complete_n:].copy()
+        return tuple(windows)
 
-
-def lost_before(end_byte: Int[np.ndarray, " f"], first_byte: int, frame_bytes_n: int | None) -> Int[np.ndarray, " f"]:
-    """Count the bytes before each frame that are none; without a frame's length (text) the usual line tells."""
-    length_n = np.diff(end_byte, prepend=first_byte)
-    if frame_bytes_n is not None:
-        return length_n - frame_bytes_n
-    usual_n = int(np.median(length_n)) if len(length_n) else 0
-    return np.where(length_n > LONG_LINE * usual_n, length_n - usual_n, 0)
+    def _find_gaps(
+        self, frames: Frames, t_s: Float64[np.ndarray, " f"]
+    ) -> tuple[
+        Bool[np.ndarray, " f"], Bool[np.ndarray, " f"], Int[np.ndarray, " f"], Int[np.ndarray, " f"],
+        Int[np.ndarray, " f"],
+    ]:  # fmt: skip
+        """Compare each frame's times and place in the stream with those of the frame before."""
+        if not len(frames):
+            return *np.zeros((2, 0), bool), *np.zeros((3, 0), np.int64)
+        last_s, last_device_s, last_byte = self._last or (float(t_s[0]), float(frames.device_s[0]), 0)
+        self._last = float(t_s[-1]), float(frames.device_s[-1]), int(frames.end_byte[-1])
+        device_step_s = np.diff(frames.device_s, prepend=last_device_s)
+        lost_n = lost_bytes(frames.end_byte, last_byte, self._frame_bytes_n)
+        usual_n = self._frame_bytes_n or int(np.median(np.diff(frames.end_byte, prepend=last_byte)))
+        garbage = lost_n > GARBAGE_FRAMES_N * usual_n
+        return (
+            clock_jumps(device_step_s),
+            silent_gaps(np.diff(t_s, prepend=last_s)),
+            missing_frames(device_step_s),
+            np.where(garbage, 0, lost_n),
+            np.where(garbage, lost_n, 0),
+        )

@@ -14,10 +14,10 @@ from reskin.board.port import Tape
 from reskin.errors import ReskinError
 from reskin.live.answering import Map, Models, check_boards
 from reskin.live.calibrating import Pokes, ShownPokes
-from reskin.live.health import LIVE
+from reskin.live.health import LIVE_POLICY
 from reskin.live.tracker import WAITING, Contact, Readings, Skin
 from reskin.live.view import View
-from reskin.recordings.fault_policy import Decisions
+from reskin.recordings.fault_policy import FaultPolicy
 from reskin.recordings.header import Header
 from reskin.recordings.recorder import UNTOLD, begin_capture, end_capture, new_folder
 
@@ -32,9 +32,9 @@ class Live:
     """A skin that is polled on a thread of its own, what pages see of it, and its recording."""
 
     def __init__(
-        self, port: str, models: Models, what: str, decisions: Decisions = LIVE, *, alone: bool = True
+        self, port: str, models: Models, what: str, fault_policy: FaultPolicy = LIVE_POLICY, *, alone: bool = True
     ) -> None:
-        self.skin, self.what = Skin(port, models, decisions=decisions), what
+        self.skin, self.what = Skin(port, models, fault_policy=fault_policy), what
         self._alone = alone
         self.view: View | None = None
         self.problem = ""
@@ -115,7 +115,7 @@ class Live:
             layout, alarms = skin.layout, list(skin.health.alarms.values())
             state |= {
                 "board": f"{found.port}: {found.format}, {found.scale}",
-                "seen": [[one.name, one.count_n, round(one.last_s - one.first_s, 1), one.decision] for one in alarms],
+                "seen": [[one.name, one.count_n, round(one.last_s - one.first_s, 1), one.action] for one in alarms],
                 "chips_mm": layout.chips_mm.tolist(), "places_known": layout.known, "corner_mm": layout.corner_mm,
                 "skin_mm": layout.skin_mm,
             }  # fmt: skip
@@ -162,11 +162,11 @@ class Live:
                 self._recorded = f"{folder}.part could not be closed: {error.strerror}"
 
 
-def several(ports: Sequence[str], models: Models, what: str, decisions: Decisions = LIVE) -> list[Live]:
+def several(ports: Sequence[str], models: Models, what: str, fault_policy: FaultPolicy = LIVE_POLICY) -> list[Live]:
     """Make one of each port; all share what the models are made of, and nothing else."""
     check_named_once(ports, "--port")
     check_boards(models, len(ports), "--model")
-    return [Live(port, models, what, decisions, alone=len(ports) == 1) for port in ports]
+    return [Live(port, models, what, fault_policy, alone=len(ports) == 1) for port in ports]
 
 
 class Skins:

@@ -28,8 +28,8 @@ from reskin.data.grid import CENTRE_MM
 from reskin.errors import CaptureError, SchemaError
 from reskin.live.answering import Map, Models, Networks, answering
 from reskin.live.contacts import CONTACT_SDS, quiet_start
-from reskin.live.health import LIVE, Health
-from reskin.recordings.fault_policy import Decisions
+from reskin.live.health import LIVE_POLICY, Health
+from reskin.recordings.fault_policy import FaultPolicy
 from reskin.simulation.defaults import nominal
 from reskin.simulation.protocols import SKIN_MM
 from reskin.simulation.settings import BoardKind
@@ -122,8 +122,10 @@ class Zero(NamedTuple):
 class Skin:
     """A board on a port. Iterate over it for the latest contact, or over `every()` for all."""
 
-    def __init__(self, port: str, models: Models = (), *, baud: int = find.BAUD, decisions: Decisions = LIVE) -> None:
-        self.decisions = decisions
+    def __init__(
+        self, port: str, models: Models = (), *, baud: int = find.BAUD, fault_policy: FaultPolicy = LIVE_POLICY
+    ) -> None:
+        self.fault_policy = fault_policy
         self.port, self.found = port, find.Found(port, WAITING)
         self.account: Counter[str] = Counter()  # of all streams since the start, as a `FrameStream` counts
         self.reader = Reader(port, baud)
@@ -235,7 +237,7 @@ class Skin:
             return []
         if self.answers is not None and self.answers.channels_n != 3 * found.chips_n:
             self._refuse_model(self.answers, found.chips_n)
-        self.health, self.layout = Health(found.chips_n, self.decisions), layout_of(found.chips_n)
+        self.health, self.layout = Health(found.chips_n, self.fault_policy), layout_of(found.chips_n)
         self._begin_stream(found)
         self.found = found  # last: another thread that sees it asks for the rest
         return chunks

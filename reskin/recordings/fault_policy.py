@@ -1,117 +1,283 @@
-"""Policy for faulty readings: drop them, flag and count them, or refuse the recording."""
+"""Policy for faulty readings, by fault: drop them, flag (keep and count) them, or refuse the recording.
+
+`FaultLog` applies it to a stream in portions, `check_rows` to a table as a whole; both count what they find.
+"""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int
+from jaxtyping import Bool, Float, Float64, Int
 
+from reskin.board.faults import (
+    GRID_ROWS_N,
+    ConstantChannels,
+    Faults,
+    ReadingFaults,
+    find_lsb,
+    find_reading_faults,
+    stuck_chips,
+    unusual_lsb,
+)
 from reskin.config import Strict
 from reskin.errors import CaptureError, ParamsError
 
-Decision = Literal["drop", "flag", "refuse"]
-Lost = Literal["drop", "refuse"]  # bytes that are no frame cannot be kept
-Seen = Literal["flag", "refuse"]  # nothing is there that could be dropped
-REMEDY = "Mend the board and record again, or decide otherwise in params.yaml: faults."
+USUAL_LSB = "that of the other chips, and not a reset chip's"
+
+Action = Literal["drop", "flag", "refuse"]
+DropOrRefuse = Literal["drop", "refuse"]  # bytes between frames cannot be kept
+FlagOrRefuse = Literal["flag", "refuse"]  # there is no reading that could be dropped
 
 
-class Decisions(Strict):
-    """What is decided for each fault, by name."""
+class FaultPolicy(Strict):
+    """The action taken for each fault; section `faults` of `params.yaml`."""
 
-    failed_read: Decision  # an I2C read that failed
-    zeros: Decision  # in place of a reading
-    stuck: Decision  # a chip stays the same while others move
-    constant_channel: Seen  # Bx, By or Bz of a chip never changes while other channels do
-    chip_reset: Seen  # a chip's step is not that of the others, or changes
-    too_hot: Decision  # or too cold: temperature out of range
-    saturated: Decision  # field at the end of the chip's range
-    int16_wrap: Decision  # field jumps by more than int16 holds
-    repeated: Decision  # frames come again, far more often than a fast loop sends them
-    dropped: Seen  # the board's clock says that frames are missing
-    clock_jump: Seen  # the board's clock falls, or jumps
-    unplug: Seen  # nothing comes for a second or more
-    torn: Lost  # bytes between frames that are none
-    wrong_baud: Lost  # many such bytes in a row
+    failed_read: Action  # the I2C read of a chip failed
+    zeros: Action  # in place of a reading
+    stuck: Action  # a chip stays the same while others move
+    constant_channel: FlagOrRefuse  # Bx, By or Bz of a chip never changes while its other channels do
+    chip_reset: FlagOrRefuse  # a chip's LSB is not that of the others, or changes
+    too_hot: Action  # or too cold: temperature out of range
+    saturated: Action  # field at the end of the chip's range
+    int16_wrap: Action  # field jumps by more than int16 holds
+    repeated: Action  # frames come again, far more often than a fast loop sends them
+    dropped: FlagOrRefuse  # frames are missing by the board's clock
+    clock_jump: FlagOrRefuse  # the board's clock falls, or jumps
+    unplug: FlagOrRefuse  # nothing comes for a second or more
+    torn: DropOrRefuse  # bytes between frames that belong to none
+    wrong_baud: DropOrRefuse  # many such bytes in a row
 
 
-# For who asks whether a recording would be refused, or whether it can be read at all; ingest does as params.yaml says.
-REFUSE_ALL = Decisions.model_validate(dict.fromkeys(Decisions.model_fields, "refuse"))
-REFUSE_NONE = Decisions.model_validate(
-    {name: get_args(field.annotation)[0] for name, field in Decisions.model_fields.items()}
+REFUSE_ALL = FaultPolicy.model_validate(dict.fromkeys(FaultPolicy.model_fields, "refuse"))
+# The mildest action for each fault, to find out whether a recording can be read at all.
+REFUSE_NONE = FaultPolicy.model_validate(
+    {name: get_args(field.annotation)[0] for name, field in FaultPolicy.model_fields.items()}
 )
-DONE = {"drop": "dropped", "flag": "flagged", "refuse": "refused"}
-PER_UNIT = {"ms": 1000, "row": 1}  # places are given in s, or rows
 
 
-def decide(usual: Decisions, words: Iterable[str], where: str) -> Decisions:
-    """Change some decisions by `NAME=DECISION`.
+def override(policy: FaultPolicy, overrides: Iterable[str], where: str) -> FaultPolicy:
+    """Change the actions of some faults by `NAME=ACTION`; `where` names the option in errors.
 
-    >>> decide(REFUSE_ALL, ["too-hot=drop"], "--on-fault").too_hot
+    >>> override(REFUSE_ALL, ["too-hot=drop"], "--on-fault").too_hot
     'drop'
     """
     changes: dict[str, Any] = {}
-    for word in words:
-        name, _, decision = word.replace("-", "_").partition("=")
-        kind = Decisions.model_fields[name].annotation if name in Decisions.model_fields else None
-        allowed = getattr(kind, "__args__", ())
-        if decision not in allowed:
-            names = ", ".join(Decisions.model_fields)
+    for text in overrides:
+        name, _, action = text.replace("-", "_").partition("=")
+        kind = FaultPolicy.model_fields[name].annotation if name in FaultPolicy.model_fields else None
+        allowed = get_args(kind)
+        if action not in allowed:
+            names = ", ".join(FaultPolicy.model_fields)
             rule = f"{name}={'|'.join(allowed)}" if allowed else f"NAME=drop|flag|refuse with one of {names}"
-            raise ParamsError(where, "a decision", rule, repr(word)[:40], f"Try: {where} too_hot=drop")
-        changes[name] = decision
-    return usual.model_copy(update=changes)
+            raise ParamsError(where, "the action for a fault", rule, repr(text)[:40], f"Try: {where} too_hot=drop")
+        changes[name] = action
+    return policy.model_copy(update=changes)
 
 
 @dataclass
-class Found:
-    """How often a fault was seen, first and last where (s of the stream, or rows from 1), and what was decided.
+class FaultRecord:
+    """How often a fault was seen, first and last where (s of the stream, or rows from 1), and the action taken.
 
-    Where is NaN as long as no time is known: bytes that came last before a recorder was killed may have none.
+    Places are NaN as long as no time is known: the last bytes before a recorder was killed may have none.
     """
 
     count_n: int
     first: float
     last: float
-    decision: Decision
+    action: Action
 
 
-class Ledger:
-    """Remembers what was found of each fault; `unit` is that of its places in accounts: ms, or row."""
+class CheckedRows(NamedTuple):
+    """Masks of the frames or rows to keep, and of those dropped: not read, else a stuck chip, else out of range.
 
-    def __init__(self, decisions: Decisions, where: str, unit: Literal["ms", "row"]) -> None:
-        self.found: dict[str, Found] = {}
-        self._decisions, self._where, self._unit = decisions, where, unit
+    `counts` has each fault's count, action and span, as accounts have them.
+    """
 
-    def note(
+    keep: Bool[np.ndarray, " f"]
+    failed: Bool[np.ndarray, " f"]
+    stuck: Bool[np.ndarray, " f"]
+    out_of_range: Bool[np.ndarray, " f"]
+    counts: Mapping[str, int]
+
+    def account(self) -> dict[str, int]:
+        """Count the dropped rows by reason, and the faults."""
+        out_of_range_n = int(self.out_of_range.sum())
+        return {
+            "dropped_failed_read_rows_n": int(self.failed.sum()),
+            "dropped_stuck_chip_rows_n": int(self.stuck.sum()),
+            **({"dropped_out_of_range_rows_n": out_of_range_n} if out_of_range_n else {}),
+            **self.counts,
+        }
+
+    def part(self, rows: slice) -> "CheckedRows":
+        """Return some of the rows; `counts` stay those of all."""
+        return CheckedRows(self.keep[rows], self.failed[rows], self.stuck[rows], self.out_of_range[rows], self.counts)
+
+
+class FaultLog:
+    """Apply a policy to the faults of a recording, and count them; `unit` is that of places in accounts."""
+
+    def __init__(self, policy: FaultPolicy, where: str, unit: Literal["ms", "row"]) -> None:
+        self.records: dict[str, FaultRecord] = {}
+        self._policy, self._where, self._unit = policy, where, unit
+        self._per_unit = {"ms": 1000, "row": 1}[unit]  # places are given in s, or rows
+        self._span: tuple[float, float] | None = None
+
+    def record(
         self,
         fault: str,
-        marks: Bool[np.ndarray, " f"],
+        mask: Bool[np.ndarray, " f"],
         at: Float64[np.ndarray, " f"] | Int[np.ndarray, " f"],
         count_n: int | None = None,
     ) -> Bool[np.ndarray, " f"]:
-        """Count a fault where it is marked, or as many as is said; give the marks of what is dropped for it."""
-        decision: Decision = getattr(self._decisions, fault)
-        if marks.any():
-            known = at[marks & np.isfinite(at)]
+        """Count a fault where `mask` is set, or `count_n` times; return the mask of what is dropped for it.
+
+        Raises `CaptureError` if the policy refuses recordings with this fault.
+        """
+        action: Action = getattr(self._policy, fault)
+        if mask.any():
+            known = at[mask & np.isfinite(at)]
             first, last = (float(known[0]), float(known[-1])) if len(known) else (math.nan, math.nan)
-            count_n = int(marks.sum()) if count_n is None else count_n
-            if decision == "refuse":
-                place = f"{self._unit} {first * PER_UNIT[self._unit]:.0f}" if len(known) else "an unknown time"
+            count_n = int(mask.sum()) if count_n is None else count_n
+            if action == "refuse":
+                place = f"{self._unit} {first * self._per_unit:.0f}" if len(known) else "an unknown time"
+                remedy = f"Mend the board and record again, or set faults: {fault} in params.yaml."
                 got = f"{count_n}, the first at {place}"
-                raise CaptureError(self._where, fault.replace("_", " "), "nowhere, as was decided", got, REMEDY)
-            before = self.found.setdefault(fault, Found(0, first, last, decision))
-            before.count_n += count_n
-            before.first, before.last = float(np.fmin(before.first, first)), float(np.fmax(before.last, last))
-        return marks if decision == "drop" else np.zeros_like(marks)
+                raise CaptureError(self._where, fault.replace("_", " "), "absent", got, remedy)
+            found = self.records.setdefault(fault, FaultRecord(0, first, last, action))
+            found.count_n += count_n
+            found.first, found.last = float(np.fmin(found.first, first)), float(np.fmax(found.last, last))
+        return mask if action == "drop" else np.zeros_like(mask)
+
+    def apply(self, faults: Faults, t_s: Float64[np.ndarray, " f"]) -> CheckedRows:
+        """Record the faults of the next frames of a stream; return which frames to keep.
+
+        Raises `CaptureError` for a fault that the policy refuses.
+        """
+        failed, out_of_range = self.record_readings(faults.readings, t_s)
+        for window in faults.scale:
+            where = f"{self._where} from sound frame {window.first_frame}"
+            wrong, rule = window.unusual | window.changed, f"as before, {USUAL_LSB}"
+            self.record_scale(wrong, window.lsb_uT, window.expected_lsb_uT, where, rule, window.t_s)
+        stuck = self.record("stuck", np.asarray(faults.stuck.any(axis=1)), t_s)
+        self.record("clock_jump", faults.clock_jump, t_s)
+        self.record("dropped", faults.missing_frames_n > 0, t_s, int(faults.missing_frames_n.sum()))
+        self.record("unplug", faults.unplug, t_s)
+        self.record("wrong_baud", faults.garbage_bytes_n > 0, t_s, int(faults.garbage_bytes_n.sum()))
+        self.record("torn", faults.torn_bytes_n > 0, t_s, int(faults.torn_bytes_n.sum()))
+        out_of_range |= self.record("int16_wrap", np.asarray(faults.int16_wrap.any(axis=1)), t_s)
+        out_of_range |= self.record("repeated", faults.repeated, t_s)
+        out_of_range &= ~stuck
+        if len(t_s):
+            self._span = (self._span[0] if self._span else float(t_s[0])), float(t_s[-1])
+        return CheckedRows(~(failed | stuck | out_of_range), failed, stuck, out_of_range, {})
+
+    def record_readings(
+        self, readings: ReadingFaults, at: Float64[np.ndarray, " f"] | Int[np.ndarray, " f"]
+    ) -> tuple[Bool[np.ndarray, " f"], Bool[np.ndarray, " f"]]:
+        """Record the faults of single readings, each row under the first that fits.
+
+        Returns masks of the dropped rows: not read, and out of range.
+        """
+        failed, zeros = np.asarray(readings.failed_read.any(axis=1)), np.asarray(readings.zeros.any(axis=1))
+        dropped = self.record("failed_read", failed, at) | self.record("zeros", zeros & ~failed, at)
+        read = ~readings.failed_rows
+        too_hot, saturated = readings.too_hot.any(axis=1) & read, readings.saturated.any(axis=1) & read
+        out_of_range = self.record("too_hot", too_hot, at) | self.record("saturated", saturated, at)
+        return dropped, out_of_range & ~dropped
+
+    def record_scale(
+        self,
+        wrong: Bool[np.ndarray, " k"],
+        lsb_uT: Float[np.ndarray, "k 2"],
+        expected_lsb_uT: tuple[float, float] | None,
+        where: str,
+        rule: str,
+        at: Float64[np.ndarray, " f"] | Int[np.ndarray, " f"],
+    ) -> None:
+        """Record frames in which the LSB of some chips is `wrong`, or refuse the recording."""
+        if wrong.any() and self._policy.chip_reset == "refuse":
+            chips = np.flatnonzero(wrong)
+            xy_uT, z_uT = lsb_uT[chips[0]]
+            known = np.isfinite([xy_uT, z_uT]).any()
+            got = f"{xy_uT:.3g} uT in x, y and {z_uT:.3g} uT in z" if known else "no one step"
+            rule = rule if expected_lsb_uT is None else f"{expected_lsb_uT} uT"
+            remedy = "A chip lost its settings: reset the board, record again."
+            raise CaptureError(where, f"the LSB of chip {', '.join(map(str, chips))}", rule, got, remedy)
+        if wrong.any():
+            self.record("chip_reset", np.ones(len(at), bool), at)
+
+    def record_constant(
+        self, channels: list[str], at: Float64[np.ndarray, " f"] | Int[np.ndarray, " f"] | None = None
+    ) -> None:
+        """Record channels that never changed in a whole recording, or refuse it; `at` None: the span of the stream."""
+        if channels and self._policy.constant_channel == "refuse":
+            remedy = (
+                "Check the wiring, the chip and the columns, and record again; or accept it by faults: "
+                "constant_channel: flag in params.yaml."
+            )
+            got = f"one value throughout for {', '.join(channels)}"
+            raise CaptureError(self._where, "each channel", "one that changes", got, remedy)
+        if channels:
+            at = np.array(self._span) if at is None else at
+            self.record("constant_channel", np.ones(len(at), bool), at)
 
     def account(self) -> dict[str, int]:
-        """Say of each fault its count, decision and, if known, span, as accounts do; of a sound recording, nothing."""
-        told: dict[str, int] = {}
-        for name, one in self.found.items():
-            told[f"fault_{name}_{DONE[one.decision]}_n"] = one.count_n
-            if not math.isnan(one.last):
-                told[f"fault_{name}_first_{self._unit}"] = round(one.first * PER_UNIT[self._unit])
-                told[f"fault_{name}_last_{self._unit}"] = round(one.last * PER_UNIT[self._unit])
-        return told
+        """Return the count and action of each fault found and, if known, its span, as accounts have them."""
+        account: dict[str, int] = {}
+        done = {"drop": "dropped", "flag": "flagged", "refuse": "refused"}
+        for fault, found in self.records.items():
+            account[f"fault_{fault}_{done[found.action]}_n"] = found.count_n
+            if not math.isnan(found.last):
+                account[f"fault_{fault}_first_{self._unit}"] = round(found.first * self._per_unit)
+                account[f"fault_{fault}_last_{self._unit}"] = round(found.last * self._per_unit)
+        return account
+
+
+def check_rows(
+    b_uT: Float[np.ndarray, "f ch"],
+    temperature_degC: Float[np.ndarray, "f k"],
+    expected_lsb_uT: tuple[float, float] | None,
+    *,
+    where: str,
+    policy: FaultPolicy,
+    row: Int[np.ndarray, " f"] | None = None,
+) -> CheckedRows:
+    """Find the faults of a table of readings as a whole, and decide which rows to keep.
+
+    A wrong LSB shows among all rows that were read, kept or not.
+
+    Parameters
+    ----------
+    row : the rows' numbers in their file, if some were left out before; counted from 1 if None.
+
+    Raises
+    ------
+    CaptureError
+        if no row holds a reading of every chip, or for a fault that the policy refuses.
+    """
+    log = FaultLog(policy, where, "row")
+    row = 1 + np.arange(len(b_uT)) if row is None else row
+    readings = find_reading_faults(b_uT, temperature_degC)
+    failed, out_of_range = log.record_readings(readings, row)
+    read = ~readings.failed_rows
+    if not read.any():
+        remedy = "Mend the wiring, and record again."
+        raise CaptureError(where, "rows", "read from every chip", "failed I2C reads in all of them", remedy)
+    rows = np.flatnonzero(read)
+    for block in np.array_split(rows, max(1, len(rows) // GRID_ROWS_N)):
+        lsb_uT = find_lsb(b_uT[block])
+        without_grid = np.isnan(lsb_uT).any(axis=1)
+        without_grid &= (not without_grid.all()) & (len(block) >= GRID_ROWS_N)
+        log.record_scale(
+            unusual_lsb(lsb_uT, expected_lsb_uT) | without_grid, np.where(without_grid[:, None], np.nan, lsb_uT),
+            expected_lsb_uT, f"{where} from row {row[block[0]]}", USUAL_LSB, row[block],
+        )  # fmt: skip
+    constant = ConstantChannels(temperature_degC.shape[1])
+    constant.feed(b_uT[read])
+    log.record_constant(constant.found(), row)
+    stuck = log.record("stuck", stuck_chips(b_uT).any(axis=1) & read, row) & ~failed
+    out_of_range &= ~stuck
+    return CheckedRows(~(failed | stuck | out_of_range), failed, stuck, out_of_range, log.account())

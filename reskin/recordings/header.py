@@ -83,6 +83,11 @@ class Header(_Frozen):
     files: dict[str, str]  # name -> sha256, of everything but this header
     note: str
 
+    @property
+    def expected_lsb_uT(self) -> tuple[float, float] | None:
+        """LSB along x, y and along z by the firmware's settings, if they are known."""
+        return None if self.firmware is None else (self.firmware.lsb_xy_uT, self.firmware.lsb_z_uT)
+
     @model_validator(mode="after")
     def _stream_has_wire(self) -> "Header":
         if (self.layout == "native") != (self.wire is not None):

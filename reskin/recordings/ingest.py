@@ -13,14 +13,13 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
 from reskin import io
-from reskin.board import wire
-from reskin.board.stream import FrameStream, no_frame
-from reskin.board.wire import Frames
+from reskin.board.faults import FaultDetector, find_reading_faults
+from reskin.board.stream import FrameStream, TEMPERATURE_MAX_degC, TEMPERATURE_MIN_degC, no_frame
+from reskin.board.wire import TEXT_WIRES, Frames, record_type
 from reskin.errors import CaptureError
 from reskin.recordings import clocks, probe
-from reskin.recordings.chips import Watch
 from reskin.recordings.clocks import Arrivals, ClockMap, from_contacts, from_marks
-from reskin.recordings.fault_policy import Decisions
+from reskin.recordings.fault_policy import CheckedRows, FaultLog, FaultPolicy
 from reskin.recordings.header import (
     ARRIVALS_FILE,
     HEADER_FILE,
@@ -33,7 +32,7 @@ from reskin.recordings.header import (
 )
 from reskin.recordings.probe import LABELS, ProbeLog
 from reskin.recordings.readers import READERS
-from reskin.recordings.text import check_log
+from reskin.recordings.text import check_fields, check_log
 from reskin.schema import Readings
 
 COUNTS = (
@@ -51,27 +50,16 @@ COUNTS = (
     "dropped_no_noload_indentations_n",
 )
 
-BEYOND = "dropped_out_of_range_frames_n"  # counted only where there are some: it is for settings to drop them
+OUT_OF_RANGE = "dropped_out_of_range_frames_n"  # in the account only where there are some
 
 
 @dataclass(frozen=True)
 class TimedFrames:
-    """Frames with the stream time of each (NaN: unknown, as for all that follow); masks of those that are not kept.
-
-    Their reads failed, a chip was stuck, or, where that was decided, a reading is beyond what a board sends.
-    """
+    """Frames with the stream time of each (NaN: unknown, as for all that follow), and which of them to keep."""
 
     frames: Frames
     t_s: Float64[np.ndarray, " f"]
-    failed: Bool[np.ndarray, " f"]
-    stuck: Bool[np.ndarray, " f"]
-    beyond: Bool[np.ndarray, " f"] | None = None
-
-    @property
-    def sound(self) -> Bool[np.ndarray, " f"]:
-        """Mark the frames that hold a fresh reading of every chip."""
-        kept = ~(self.failed | self.stuck)
-        return kept if self.beyond is None else kept & ~self.beyond
+    checked: CheckedRows
 
 
 @dataclass(frozen=True)
@@ -145,7 +133,7 @@ class Joiner:
     def account(self) -> dict[str, int]:
         """Count frames and indentations so far, by what became of them; each total is the sum of its parts."""
         counted = {name: self._count[name] for name in COUNTS}
-        counted |= {BEYOND: self._count[BEYOND]} if self._count[BEYOND] else {}
+        counted |= {OUT_OF_RANGE: self._count[OUT_OF_RANGE]} if self._count[OUT_OF_RANGE] else {}
         logged_n = int((~self._log.contact).sum())
         unseen_n = logged_n - counted["indentations_n"] - counted["dropped_no_noload_indentations_n"]
         return counted | {"logged_indentations_n": logged_n, "dropped_no_frame_indentations_n": unseen_n}
@@ -158,9 +146,9 @@ class Joiner:
             "dropped_not_finite_frames_n": ~(
                 np.isfinite(frames.b_uT).all(axis=1) & np.isfinite(frames.temperature_degC).all(axis=1)
             ),
-            "dropped_failed_read_frames_n": block.failed,
-            "dropped_stuck_chip_frames_n": block.stuck,
-            **({} if block.beyond is None else {BEYOND: block.beyond}),
+            "dropped_failed_read_frames_n": block.checked.failed,
+            "dropped_stuck_chip_frames_n": block.checked.stuck,
+            OUT_OF_RANGE: block.checked.out_of_range,
             "dropped_between_dwells_frames_n": (dwell_i < 0) | (probe_s > log.t_end_s[dwell_i]),
         }
         keep = np.ones(len(probe_s), bool)
@@ -224,6 +212,7 @@ def _rank(group_i: Int64[np.ndarray, " f"]) -> Int32[np.ndarray, " f"]:
 
 
 BLOCK_BYTES_N = 2**22
+SPREAD_MAX_degC = 10.0  # of the chips of one board, in one block
 # A whole that is counted, and the prefix and suffix of counts of its lost parts.
 LOSSES = (
     ("bytes_n", "skipped_", "_bytes_n"),
@@ -251,8 +240,8 @@ class Opened(NamedTuple):
     account: Mapping[str, int]
 
 
-def open_capture(folder: Path, decisions: Decisions) -> Opened:
-    """Check a capture's header and files, and begin to read it; `decisions` say what becomes of faults."""
+def open_capture(folder: Path, policy: FaultPolicy) -> Opened:
+    """Check a capture's header and files, and begin to read it; `policy` says what becomes of faults."""
     header = read_header(folder)
     check_same_capture(header, folder.name)
     for name, digest in header.files.items():
@@ -262,11 +251,11 @@ def open_capture(folder: Path, decisions: Decisions) -> Opened:
             rule, remedy = "unchanged since it was added", "Remove it and add it again."
             raise CaptureError(folder / name, "the file", rule, "another hash", remedy)
     if header.layout == "native":
-        return Opened(header, *read_native(folder, header, decisions))
+        return Opened(header, *read_native(folder, header, policy))
     if header.layout not in READERS:
         remedy = "An SD card's log has no labels to learn from; try: reskin predict."
         raise CaptureError(folder, "layout", f"native or one of {sorted(READERS)}", header.layout, remedy)
-    readings, account = READERS[header.layout].read(folder, header, decisions)
+    readings, account = READERS[header.layout].read(folder, header, policy)
     return Opened(header, [readings], account)
 
 
@@ -289,7 +278,7 @@ def check_losses(account: Mapping[str, int], limit: float, where: str) -> None:
             raise CaptureError(where, f"lost {whole.removesuffix('_n')}", rule, reasons, remedy)
 
 
-def read_native(folder: Path, header: Header, decisions: Decisions) -> tuple[Iterator[Readings], dict[str, int]]:
+def read_native(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Iterator[Readings], dict[str, int]]:
     """Begin to read a capture; the account is complete when the readings are exhausted.
 
     Without sync marks the stream is read twice, first for the clock.
@@ -300,46 +289,75 @@ def read_native(folder: Path, header: Header, decisions: Decisions) -> tuple[Ite
     log = probe.parse(folder / PROBE_FILE, str(folder / PROBE_FILE))
     check_log(log, str(folder / PROBE_FILE))
     times_of = timer(folder, header)
-    clock = _clock(folder, header, log, _timed_frames(folder, header, times_of, {}, decisions))
+    clock = _clock(folder, header, log, _timed_frames(folder, header, times_of, {}, policy))
     account = {
         "clock_residual_us": round(1e6 * clock.residual_s),
         "clock_explained_pct": round(100 * clock.explained),
     }
-    blocks = _timed_frames(folder, header, times_of, account, decisions)
+    blocks = _timed_frames(folder, header, times_of, account, policy)
     return join(blocks, log, clock, header, account), account
 
 
 def _clock(folder: Path, header: Header, log: ProbeLog, blocks: Iterator[TimedFrames]) -> ClockMap:
     if header.clock.marks:
         return from_marks(np.array(header.clock.marks), str(folder))
-    pairs = ((block.t_s[block.sound], block.frames.b_uT[block.sound]) for block in blocks)
+    pairs = ((block.t_s[block.checked.keep], block.frames.b_uT[block.checked.keep]) for block in blocks)
     return from_contacts(pairs, log, str(folder))
 
 
 def _timed_frames(
-    folder: Path, header: Header, times_of: Timer, account: dict[str, int], decisions: Decisions
+    folder: Path, header: Header, times_of: Timer, account: dict[str, int], policy: FaultPolicy
 ) -> Iterator[TimedFrames]:
-    """Decode the stream block by block; the stream's own account is added when it has ended."""
-    stream, watch = FrameStream(_wire(header), header.chips_n), Watch(header, str(folder / STREAM_FILE), decisions)
-    frames_n = 0
+    """Decode the stream block by block; its own account and that of its faults are added when it has ended."""
+    wire, where = _wire(header), str(folder / STREAM_FILE)
+    stream, log = FrameStream(wire, header.chips_n), FaultLog(policy, where, "ms")
+    frame_bytes_n = None if wire in TEXT_WIRES else record_type(wire, header.chips_n).itemsize
+    detector = FaultDetector(header.chips_n, frame_bytes_n=frame_bytes_n, expected_lsb_uT=header.expected_lsb_uT)
+    frames_n, units_checked = 0, False
     with (folder / STREAM_FILE).open("rb") as file:
         head = data = file.read(BLOCK_BYTES_N)
-        while data:
-            frames = stream.feed(data)
-            yield _timed(frames, times_of(frames, frames_n), watch)
+        while True:
+            frames = stream.feed(data) if data else stream.close()
+            units_checked = units_checked or _check_units(frames, wire, where)
+            t_s = times_of(frames, frames_n)
+            checked = log.apply(detector.feed(frames, t_s), t_s)
+            yield TimedFrames(frames, t_s, checked)
             frames_n += len(frames)
+            if not data:
+                break
             data = file.read(BLOCK_BYTES_N)
-    frames = stream.close()
-    yield _timed(frames, times_of(frames, frames_n), watch)
-    if not stream.account()["frames_n"]:
-        raise no_frame(str(folder / STREAM_FILE), head, _wire(header), header.chips_n)
-    watch.close()
-    account.update(stream.account() | watch.ledger.account())
+    if not frames_n:
+        raise no_frame(where, head, wire, header.chips_n)
+    log.record_constant(detector.constant_channels())
+    account.update(stream.account() | log.account())
 
 
-def _timed(frames: Frames, t_s: Float64[np.ndarray, " f"], watch: Watch) -> TimedFrames:
-    found = watch.look(frames, t_s)
-    return TimedFrames(frames, t_s, found.failed, found.stuck, found.beyond)
+def _check_units(frames: Frames, wire: Wire, where: str) -> bool:
+    """Check the first frames that were read for fields in other units and for the other order of text.
+
+    Returns False if no frame was read yet.
+    """
+    read = np.isfinite(frames.b_uT).all(axis=1) & np.isfinite(frames.temperature_degC).all(axis=1)
+    read &= ~find_reading_faults(frames.b_uT, frames.temperature_degC).failed_rows
+    if not read.any():
+        return False
+    b_uT, temperature_degC = frames.b_uT[read], frames.temperature_degC[read]
+    if wire in TEXT_WIRES:
+        other, axis = ("text-txyz", 0) if wire == "text-xyzt" else ("text-xyzt", 2)
+        swapped_degC = b_uT[:, axis::3]  # the temperatures, if the order is the other one
+        (low, high), swapped = np.percentile(temperature_degC, [5, 95]), np.percentile(swapped_degC, [5, 95])
+        alike = float(swapped[1] - swapped[0]) < SPREAD_MAX_degC < float(high - low)
+        if not _mostly_possible(temperature_degC) or (alike and _mostly_possible(swapped_degC)):
+            rule = f"{TEMPERATURE_MIN_degC:g} to {TEMPERATURE_MAX_degC:g} degC, and alike on all chips"
+            remedy = f"Is the wire format {other}?"
+            raise CaptureError(where, f"temperatures of {wire}", rule, f"{low:.4g} to {high:.4g}", remedy)
+    check_fields(b_uT, where, first_line_n=1)
+    return True
+
+
+def _mostly_possible(temperature_degC: Float32[np.ndarray, "f k"]) -> bool:
+    possible = (temperature_degC >= TEMPERATURE_MIN_degC) & (temperature_degC <= TEMPERATURE_MAX_degC)
+    return bool(possible.mean() > 0.5)
 
 
 def timer(folder: Path, header: Header) -> Timer:
@@ -351,9 +369,9 @@ def timer(folder: Path, header: Header) -> Timer:
     if rate_hz is None:
         got = repr(header.clock.kind)
         raise CaptureError(folder, "clock.kind", "'arrivals' or 'rate' for a port's stream", got, "Mend it.")
-    if header.wire in wire.TEXT_WIRES:
+    if header.wire in TEXT_WIRES:
         return lambda frames, before_n: clocks.constant_rate(before_n + 1.0 + np.arange(len(frames)), rate_hz)
-    frame_bytes_n = wire.record_type(_wire(header), header.chips_n).itemsize
+    frame_bytes_n = record_type(_wire(header), header.chips_n).itemsize
     return lambda frames, _: clocks.constant_rate(frames.end_byte / frame_bytes_n, rate_hz)
 
 

@@ -51,4 +51,6 @@ def test_a_page_without_options_is_that_of_all_boards_that_are_there(monkeypatch
     commands.live(None, None, None, None, "127.0.0.1", 8765, ["stuck=flag"])
     assert [str(board) for board in shown["boards"]] == ["a board on /dev/ttyACM0", "a board on /dev/ttyACM1"]
     assert (shown["host"], shown["http_port"]) == ("127.0.0.1", 8765)
-    assert {(board.skin.decisions.stuck, board.skin.decisions.zeros) for board in shown["boards"]} == {("flag", "drop")}
+    assert {(board.skin.fault_policy.stuck, board.skin.fault_policy.zeros) for board in shown["boards"]} == {
+        ("flag", "drop")
+    }

@@ -5,8 +5,8 @@ import pytest
 
 from reskin.board.wire import Frames
 from reskin.live.emulator import inject, parse_fault
-from reskin.live.health import LIVE, LOOK_FRAMES_N, Health
-from reskin.recordings.fault_policy import decide
+from reskin.live.health import BATCH_FRAMES_N, LIVE_POLICY, Health
+from reskin.recordings.fault_policy import override
 from tests.live.boards import make_script
 
 SCRIPT = make_script(pokes_n=2)
@@ -82,12 +82,12 @@ def test_a_board_of_which_half_the_frames_are_missing_is_slower_than_it_was():
 
 
 def test_frames_that_a_fault_has_hit_are_not_believed():
-    frames = SCRIPT.frames.where(np.arange(len(SCRIPT)) < LOOK_FRAMES_N)
+    frames = SCRIPT.frames.where(np.arange(len(SCRIPT)) < BATCH_FRAMES_N)
     for name in ("failed-read", "zeros", "saturated", "too-hot"):
         script = inject(SCRIPT, parse_fault(f"{name}@0+0.05"))
         assert script.pieces[0] != SCRIPT.pieces[0]
-        assert not feed_once(changed_frames(script, LOOK_FRAMES_N))[:20].any(), name
-        assert feed_once(changed_frames(script, LOOK_FRAMES_N))[20:].all(), name
+        assert not feed_once(changed_frames(script, BATCH_FRAMES_N))[:20].any(), name
+        assert feed_once(changed_frames(script, BATCH_FRAMES_N))[20:].all(), name
     assert feed_once(frames).all()
 
 
@@ -114,17 +114,17 @@ def test_a_change_of_field_that_all_chips_share_comes_from_outside():
 def test_what_becomes_of_readings_that_a_fault_has_hit_is_decided_by_setting():
     for name, fault in (("failed-read", "failed_read"), ("saturated", "saturated"), ("too-hot", "too_hot")):
         script = inject(SCRIPT, parse_fault(f"{name}@0+0.05"))
-        frames = changed_frames(script, LOOK_FRAMES_N)
-        for decision, believed in (("drop", False), ("flag", True), ("refuse", False)):
-            health = Health(5, decide(LIVE, [f"{fault}={decision}"], "test"))
+        frames = changed_frames(script, BATCH_FRAMES_N)
+        for action, believed in (("drop", False), ("flag", True), ("refuse", False)):
+            health = Health(5, override(LIVE_POLICY, [f"{fault}={action}"], "test"))
             assert health.feed(frames, 1.0)[:20].all() == believed, name
             (alarm,) = health.alarms.values()
-            assert (alarm.decision, alarm.count_n) == (decision, 20)
+            assert (alarm.action, alarm.count_n) == (action, 20)
 
 
 def test_a_chip_that_is_stuck_is_not_believed_while_it_is_unless_flagged():
-    for decision, unbelieved_n in (("drop", 500), ("flag", 0)):
-        health, script, lost_n = Health(5, decide(LIVE, [f"stuck={decision}"], "test")), changed("stuck"), 0
+    for action, unbelieved_n in (("drop", 500), ("flag", 0)):
+        health, script, lost_n = Health(5, override(LIVE_POLICY, [f"stuck={action}"], "test")), changed("stuck"), 0
         for first in range(0, len(script.frames), 10):
             rows = (np.arange(len(script.frames)) >= first) & (np.arange(len(script.frames)) < first + 10)
             lost_n += int((~health.feed(script.frames.where(rows), float(script.t_s[rows][-1]))).sum())

@@ -4,12 +4,12 @@ from pathlib import Path
 from typing import Any
 
 from reskin.config import parse, read_yaml
-from reskin.recordings.fault_policy import Decisions
+from reskin.recordings.fault_policy import FaultPolicy
 from reskin.recordings.header import Header, recorded
 
 LAB = {"board": "board1", "skin": "skin1", "layout": "lab", "chips_n": 5, "protocol": "", "note": ""}
 # What is decided for faults, as params.yaml says.
-AS_USUAL = parse(Decisions, read_yaml(Path(__file__).parents[2] / "params.yaml")["faults"], "params.yaml: faults")
+AS_USUAL = parse(FaultPolicy, read_yaml(Path(__file__).parents[2] / "params.yaml")["faults"], "params.yaml: faults")
 
 
 def make_header(**changed: Any) -> Header:

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from reskin.board.wire import Frames
 from reskin.recordings.clocks import ClockMap
+from reskin.recordings.fault_policy import CheckedRows
 from reskin.recordings.ingest import Joiner, TimedFrames, join
 from reskin.recordings.probe import LABELS, ProbeLog
 from reskin.schema import Readings
@@ -47,8 +48,9 @@ def timed_of(frames_n: int, faults: dict[int, str] | None = None) -> TimedFrames
             failed[row_i], stuck[row_i] = fault == "failed", fault == "stuck"
             b_uT[row_i, -1] = np.nan if fault == "field" else b_uT[row_i, -1]
             temperature_degC[row_i, 0] = np.inf if fault == "temperature" else 25
+    checked = CheckedRows(~(failed | stuck), failed, stuck, np.zeros(frames_n, bool), {})
     end_byte = 34 * (1 + np.arange(frames_n, dtype=np.int64))
-    return TimedFrames(Frames(b_uT, temperature_degC, np.full(frames_n, np.nan), end_byte), t_s, failed, stuck)
+    return TimedFrames(Frames(b_uT, temperature_degC, np.full(frames_n, np.nan), end_byte), t_s, checked)
 
 
 def cut(whole: TimedFrames, ends: list[int]) -> list[TimedFrames]:
@@ -57,7 +59,7 @@ def cut(whole: TimedFrames, ends: list[int]) -> list[TimedFrames]:
     for begin, end in pairwise(edges):
         names = [field.name for field in dataclasses.fields(Frames)]
         frames = Frames(**{name: getattr(whole.frames, name)[begin:end] for name in names})
-        blocks.append(TimedFrames(frames, whole.t_s[begin:end], whole.failed[begin:end], whole.stuck[begin:end]))
+        blocks.append(TimedFrames(frames, whole.t_s[begin:end], whole.checked.part(slice(begin, end))))
     return blocks
 
 
@@ -81,7 +83,7 @@ def naive(timed: TimedFrames, log: ProbeLog) -> list[dict[str, object]]:
             np.isfinite(timed.frames.b_uT[frame_i]).all() and np.isfinite(timed.frames.temperature_degC[frame_i]).all()
         )
         inside = [d for d in range(len(log)) if log.t_start_s[d] <= CLOCK.offset_s + CLOCK.rate * t_s <= log.t_end_s[d]]
-        if inside and finite and not (timed.failed[frame_i] or timed.stuck[frame_i]):
+        if inside and finite and timed.checked.keep[frame_i]:
             dwell_i = inside[-1]
             if log.contact[dwell_i]:
                 contact.append((frame_i, dwell_i))

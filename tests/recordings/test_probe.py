@@ -1,5 +1,6 @@
 """The probe log: CSV and arrays tell the same, and every fault is one sentence that names its row."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from hypothesis import strategies as st
 from reskin.errors import CaptureError
 from reskin.recordings import probe
 from reskin.recordings.probe import LABELS, ProbeLog
+from reskin.recordings.text import check_log
 from reskin.seeds import rng_for
 
 HEAD = "indentation,pass_i,phase,t_start_s,t_end_s,x_mm,y_mm,depth_mm,Fx_N,Fy_N,Fz_N\n"
@@ -98,3 +100,36 @@ def test_random_bytes_raise_nothing_but_a_capture_error(tmp_path: Path) -> None:
         probe.parse(tmp_path / "probe.csv", "probe.csv")
     with pytest.raises(CaptureError, match="there"):
         probe.parse(tmp_path / "absent.csv", "absent.csv")
+
+
+UNITS_LOG = probe.parse(
+    "indentation,pass_i,phase,t_start_s,t_end_s,x_mm,y_mm,depth_mm,Fx_N,Fy_N,Fz_N\n"
+    "0,0,noload,0.0,0.5,,,,,,0\n0,0,contact,1.0,1.5,2,4,0.6,,,1.25\n"
+    "1,0,noload,2,2.5,,,,,,0\n1,0,contact,3,3.5,16,4,0.8,,,2.5\n",
+    "probe.csv",
+)
+
+
+@pytest.mark.parametrize(
+    ("column", "factor", "says"),
+    [
+        ("x_mm", 1e-3, "places must be .* Convert m or um"),
+        ("x_mm", 1e3, "places must be .* Convert m or um"),
+        ("depth_mm", 1e-3, "depth must be .* Convert m or um"),
+        ("depth_mm", 1e3, "depth must be .* Convert m or um"),
+        ("Fz_N", 102.0, "force must be below 100 N; got 127.5 in line 3. Convert grams"),
+        ("Fz_N", 1e3, "force must be below 100 N"),
+        ("Fz_N", 1e-3, "force must be 0.05 N or more somewhere in contact; got 0.0025 at most"),
+        ("Fz_N", -1.0, "the usual Fz_N in contact must be positive; got -1.875 N. Turn its sign"),
+    ],
+)
+def test_a_probe_log_in_other_units_or_signs_is_refused(column: str, factor: float, says: str) -> None:
+    check_log(UNITS_LOG, "probe.csv")
+    other = dataclasses.replace(UNITS_LOG, **{column: getattr(UNITS_LOG, column) * np.float32(factor)})
+    with pytest.raises(CaptureError, match=rf"^probe.csv: {says}"):
+        check_log(other, "probe.csv")
+
+
+def test_a_log_that_knows_no_label_is_let_pass() -> None:
+    unknown = np.full(len(UNITS_LOG), np.nan, np.float32)
+    check_log(dataclasses.replace(UNITS_LOG, **dict.fromkeys(probe.LABELS, unknown)), "probe.csv")

@@ -14,9 +14,7 @@ from pipeline.experiments.verification.signals import quiet, read_bare
 from reskin.board import faults
 from reskin.board.wire import Frames
 from reskin.physics.chip import ChipDesign, steps_uT
-from reskin.recordings.chips import Watch
-from reskin.recordings.fault_policy import REFUSE_ALL
-from reskin.recordings.header import Clock, Firmware, Header
+from reskin.recordings.fault_policy import REFUSE_ALL, FaultLog
 from reskin.seeds import rng_for
 
 AREA = "chip"
@@ -110,27 +108,23 @@ def _reset(sound_uT: Float32[np.ndarray, "f ch"], broken_i: int, gain_sel: int) 
                  happened=f"flagged: {falsely}", holds=not falsely),
         *(
             refused(AREA, f"a chip loses its settings while it is recorded, {of_header}",
-                    attempt=partial(_watch, np.concatenate([sound_uT, reset_uT]), gain_of_header),
+                    attempt=partial(_detect, np.concatenate([sound_uT, reset_uT]), gain_of_header),
                     should="reported by the ingest, with the chip and the frame")
             for of_header, gain_of_header in known.items()
         ),
     ]  # fmt: skip
 
 
-def _watch(b_uT: Float32[np.ndarray, "f ch"], gain_sel: int | None) -> None:
-    chips_n, firmware = b_uT.shape[1] // 3, None
+def _detect(b_uT: Float32[np.ndarray, "f ch"], gain_sel: int | None) -> None:
+    """Look for faults as ingestion does, and refuse any."""
+    frames_n, chips_n, expected_lsb_uT = len(b_uT), b_uT.shape[1] // 3, None
     if gain_sel is not None:
         xy_uT, _, z_uT = steps_uT(gain_sel).tolist()
-        firmware = Firmware(gain_sel=gain_sel, lsb_xy_uT=xy_uT, lsb_z_uT=z_uT)
-    header = Header(
-        format="reskin-capture/1", capture="stability", board="b0", skin="s0", source="simulated", layout="native",
-        wire="binary", chips_n=chips_n, unit_b="uT", unit_force="N", unit_place="mm", firmware=firmware,
-        clock=Clock(kind="rate", rate_hz=400.0, marks=()), protocol="", contacts_before_n=0, options={}, files={},
-        note="",
-    )  # fmt: skip
-    warm = np.full((len(b_uT), chips_n), 25, np.float32)
-    frames = Frames(b_uT, warm, np.full(len(b_uT), np.nan), np.arange(len(b_uT), dtype=np.int64))
-    Watch(header, "stability", REFUSE_ALL).stuck(frames, np.zeros(len(b_uT), bool))
+        expected_lsb_uT = (xy_uT, z_uT)
+    detector = faults.FaultDetector(chips_n, expected_lsb_uT=expected_lsb_uT)
+    warm_degC, t_s = np.full((frames_n, chips_n), 25, np.float32), np.arange(frames_n) / 400
+    frames = Frames(b_uT, warm_degC, np.full(frames_n, np.nan), np.arange(frames_n, dtype=np.int64))
+    FaultLog(REFUSE_ALL, "stability", "ms").apply(detector.feed(frames, t_s), t_s)
 
 
 def _axes(chip_i: int) -> slice:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Protocol
 
-from reskin.recordings.fault_policy import Decisions
+from reskin.recordings.fault_policy import FaultPolicy
 from reskin.recordings.header import Header
 from reskin.recordings.readers import eflash7, eflesh, ini, lab, table
 from reskin.schema import Readings
@@ -22,7 +22,7 @@ class Reader(Protocol):
     def count_chips(self, files: Mapping[str, Path]) -> int:
         """Count the chips that collected files have columns for."""
 
-    def read(self, folder: Path, header: Header, decisions: Decisions) -> tuple[Readings, dict[str, int]]:
+    def read(self, folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, dict[str, int]]:
         """Read a capture folder; `rows_n` + `noload_rows_n` + all `dropped_*_rows_n` = `rows_read_n`."""
 
 

@@ -16,8 +16,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from reskin.board.faults import zero_reads
 from reskin.errors import CaptureError
-from reskin.recordings.chips import find_whole_rows
-from reskin.recordings.fault_policy import Decisions, Ledger
+from reskin.recordings.fault_policy import FaultLog, FaultPolicy, check_rows
 from reskin.recordings.header import Header
 from reskin.recordings.text import (
     check_changes,
@@ -75,21 +74,21 @@ def count_chips(files: Mapping[str, Path]) -> int:
     return _count_chips(names)
 
 
-def read(folder: Path, header: Header, decisions: Decisions) -> tuple[Readings, Account]:
+def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, Account]:
     """Read all rows from the first touch on as readings, touched or not; the rows before it are the no-load reading."""
     where = f"{header.capture}/{READINGS}"
     table = _read_table(folder / READINGS, where)
     if table.b_uT.shape[1] != 3 * header.chips_n:
         got = table.b_uT.shape[1] // 3
         raise CaptureError(where, "chips", f"{header.chips_n}, as in the header", got, "Mend header or file.")
-    ledger = Ledger(decisions, where, "row")
+    log = FaultLog(policy, where, "row")
     row = FIRST_LINE_N - 1 + np.arange(len(table.b_uT))
-    written = ~ledger.note("zeros", _zero_rows(table.b_uT, where), row)  # of all chips; `rows` tells those of some
+    written = ~log.record("zeros", _zero_rows(table.b_uT, where), row)  # of all chips; `rows` tells those of some
     unknown_degC = np.full((int(written.sum()), header.chips_n), np.nan)
     b_uT = table.b_uT[written]
-    rows = find_whole_rows(b_uT, unknown_degC, header, where=where, decisions=decisions, row=row[written])
+    rows = check_rows(b_uT, unknown_degC, header.expected_lsb_uT, where=where, policy=policy, row=row[written])
     whole = written.copy()
-    whole[written] = rows.whole
+    whole[written] = rows.keep
     noload = _untouched(table.b_uT, whole, where)
     force_N = table.force_N - table.force_N[noload].mean(axis=0)
     _check_force(table.force_N, force_N, where)
@@ -115,8 +114,8 @@ def read(folder: Path, header: Header, decisions: Decisions) -> tuple[Readings, 
         "rows_read_n": len(keep),
         "noload_rows_n": int(noload.sum()),
         "dropped_zero_rows_n": int((~written).sum()),
-        **{name.replace("zeros", "zeros_of_all_chips"): n for name, n in ledger.account().items()},
-        **rows.losses(),
+        **{name.replace("zeros", "zeros_of_all_chips"): n for name, n in log.account().items()},
+        **rows.account(),
         "repeated_rows_n": int((np.diff(table.b_uT[keep], axis=0) == 0).all(axis=1).sum()),
         "gap_rows_n": int((np.diff(table.time_s) > GAP_s).sum()),
         "baseline_subtracted_rows_n": len(readings),

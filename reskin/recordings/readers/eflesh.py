@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Float64, Int32
 
 from reskin.errors import CaptureError
-from reskin.recordings.chips import find_whole_rows
-from reskin.recordings.fault_policy import Decisions
+from reskin.recordings.fault_policy import FaultPolicy, check_rows
 from reskin.recordings.header import Header
 from reskin.recordings.readers.alignment import find_passes
 from reskin.recordings.text import (
@@ -69,20 +68,20 @@ def count_chips(files: Mapping[str, Path]) -> int:
     return (columns_n - 1) // AXES_PER_CHIP_N
 
 
-def read(folder: Path, header: Header, decisions: Decisions) -> tuple[Readings, Account]:
+def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, Account]:
     """Read every row as one indentation; its no-load field is the baseline that the recorder subtracted, raw - dB."""
     time_s, b_uT, noload_uT = _read_fields(folder, header)
     states = _read_states(folder, header)
     _check_rows_n({SENSOR: len(time_s), STATES: len(states)}, header)
     _check_clocks(time_s, states[:, 0], header)
     temperature_degC = np.full((len(time_s), header.chips_n), np.nan, np.float32)
-    rows = find_whole_rows(b_uT, temperature_degC, header, where=f"{header.capture}/{SENSOR}", decisions=decisions)
+    rows = check_rows(b_uT, temperature_degC, header.expected_lsb_uT, where=f"{header.capture}/{SENSOR}", policy=policy)
     place_mm = np.round(states[:, 1:3], PLACE_DECIMALS)
     place_mm -= place_mm.min(axis=0)
     pass_i, touches_i = _number_passes(place_mm, noload_uT)
     readings = make_readings(
         header,
-        rows.whole,
+        rows.keep,
         indentation=np.arange(len(time_s)),
         pass_i=pass_i,
         x_mm=place_mm[:, 0],
@@ -99,8 +98,8 @@ def read(folder: Path, header: Header, decisions: Decisions) -> tuple[Readings, 
         "rows_n": len(readings),
         "rows_read_n": len(time_s),
         "noload_rows_n": 0,
-        **rows.losses(),
-        "no_new_force_rows_n": int((states[rows.whole, WEIGHT_COLUMN:] == NO_NEW_WEIGHT).sum()),
+        **rows.account(),
+        "no_new_force_rows_n": int((states[rows.keep, WEIGHT_COLUMN:] == NO_NEW_WEIGHT).sum()),
         "no_depth_rows_n": int(np.isnan(readings.depth_mm).sum()),
         "force_sign_unknown_rows_n": int(np.isfinite([readings.Fx_N, readings.Fy_N]).any(axis=0).sum()),
         "passes_n": int(pass_i.max()) + 1,

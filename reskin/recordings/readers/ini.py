@@ -15,8 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int32
 
 from reskin.errors import CaptureError
-from reskin.recordings.chips import Rows, find_whole_rows
-from reskin.recordings.fault_policy import Decisions
+from reskin.recordings.fault_policy import CheckedRows, FaultPolicy, check_rows
 from reskin.recordings.header import Header
 from reskin.recordings.readers.alignment import find_change, find_passes
 from reskin.recordings.text import (
@@ -66,18 +65,20 @@ def count_chips(files: Mapping[str, Path]) -> int:
     return columns_n // VALUES_PER_CHIP_N
 
 
-def read(folder: Path, header: Header, decisions: Decisions) -> tuple[Readings, Account]:
+def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, Account]:
     """Read all rows but those with a failed chip; the no-load field of a row is the mean of its pass's corner rows."""
     said_n = _rows_late(header)
     b_uT, temperature_degC = _read_fields(folder, header)
     truths = _read_truths(folder, header)
     _check_rows_n(len(b_uT), len(truths), said_n or 0, header)
-    rows = find_whole_rows(b_uT, temperature_degC, header, where=f"{header.capture}/{READINGS}", decisions=decisions)
+    rows = check_rows(
+        b_uT, temperature_degC, header.expected_lsb_uT, where=f"{header.capture}/{READINGS}", policy=policy
+    )
     best_late_n, tells = _best_rows_late(b_uT, truths[:, 2], rows)
     late_n = said_n if said_n is not None else best_late_n if tells else 0
     _check_lateness(b_uT, truths, rows, header)
     truths, rows = truths[: len(truths) - late_n], rows.part(slice(late_n, None))
-    b_uT, temperature_degC, keep = b_uT[late_n:], temperature_degC[late_n:], rows.whole
+    b_uT, temperature_degC, keep = b_uT[late_n:], temperature_degC[late_n:], rows.keep
     contact = truths[:, 2] >= CONTACT_MIN_N
     pass_i = find_passes(truths[:, :2], contact)
     corner = _corner_rows(pass_i, contact)
@@ -98,7 +99,7 @@ def read(folder: Path, header: Header, decisions: Decisions) -> tuple[Readings, 
     return readings, {
         "rows_n": len(readings),
         "rows_read_n": len(keep) + late_n,
-        **rows.losses(),
+        **rows.account(),
         "dropped_no_partner_rows_n": late_n,
         "noload_rows_n": 0,
         "no_contact_rows_n": int((keep & ~contact).sum()),
@@ -151,12 +152,12 @@ def _rows_late(header: Header) -> int | None:
 
 
 def _best_rows_late(
-    b_uT: Float64[np.ndarray, "f ch"], force_N: Float64[np.ndarray, " f"], rows: Rows
+    b_uT: Float64[np.ndarray, "f ch"], force_N: Float64[np.ndarray, " f"], rows: CheckedRows
 ) -> tuple[int, bool]:
     """Find by how many rows the fields come late, as |dB| goes best with the force then, and whether that is sure."""
     correlations = []
     for rows_late_n in range(min(len(ROWS_LATE), len(force_N) - 1)):
-        whole = rows.whole[rows_late_n:]
+        whole = rows.keep[rows_late_n:]
         late_uT, pressed_N = b_uT[rows_late_n:][whole], force_N[: len(whole)][whole]
         rest = pressed_N < CONTACT_MIN_N
         if not (rest.any() and len(np.unique(pressed_N)) > 1):
@@ -170,10 +171,10 @@ def _best_rows_late(
 
 
 def _check_lateness(
-    b_uT: Float64[np.ndarray, "f ch"], truths: Float64[np.ndarray, "f 3"], rows: Rows, header: Header
+    b_uT: Float64[np.ndarray, "f ch"], truths: Float64[np.ndarray, "f 3"], rows: CheckedRows, header: Header
 ) -> None:
     """Refuse a recording whose fields fall behind their truths, or overtake them, on the way."""
-    change = find_change(b_uT, truths, truths[:, 2] >= CONTACT_MIN_N, rows.whole)
+    change = find_change(b_uT, truths, truths[:, 2] >= CONTACT_MIN_N, rows.keep)
     if change is None:
         return
     rows_n = abs(change.after - change.before)

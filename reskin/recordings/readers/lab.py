@@ -14,8 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int
 
 from reskin.errors import CaptureError
-from reskin.recordings.chips import find_whole_rows
-from reskin.recordings.fault_policy import Decisions
+from reskin.recordings.fault_policy import FaultPolicy, check_rows
 from reskin.recordings.header import Header
 from reskin.recordings.text import (
     check_columns,
@@ -69,15 +68,15 @@ def count_chips(files: Mapping[str, Path]) -> int:
     return count_chips_of(read_cells(files[READINGS], str(files[READINGS]), separator=",")[0])
 
 
-def read(folder: Path, header: Header, decisions: Decisions) -> tuple[Readings, Account]:
+def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, Account]:
     """Read contact rows as readings; the no-load field of a row is the mean over its press's `noload` rows."""
     where = f"{header.capture}/{READINGS}"
     table = _read_table(folder / READINGS, where)
     if table.temperature_degC.shape[1] != header.chips_n:
         got = table.temperature_degC.shape[1]
         raise CaptureError(where, "chips", f"{header.chips_n}, as in the header", got, "Mend header or file.")
-    rows = find_whole_rows(table.b_uT, table.temperature_degC, header, where=where, decisions=decisions)
-    keep, noload = table.contact & rows.whole, ~table.contact & rows.whole
+    rows = check_rows(table.b_uT, table.temperature_degC, header.expected_lsb_uT, where=where, policy=policy)
+    keep, noload = table.contact & rows.keep, ~table.contact & rows.keep
     noload_uT = mean_by_group(table.b_uT[noload], table.press[noload], int(table.press[-1]) + 1)
     without = np.flatnonzero(np.isnan(noload_uT[:, 0]))
     if len(without):
@@ -106,7 +105,7 @@ def read(folder: Path, header: Header, decisions: Decisions) -> tuple[Readings, 
         "rows_n": len(readings),
         "rows_read_n": len(keep),
         "noload_rows_n": int(noload.sum()),
-        **rows.losses(),
+        **rows.account(),
         "ignored_columns_n": table.ignored_columns_n,
     }
 

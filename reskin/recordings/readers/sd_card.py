@@ -14,7 +14,6 @@ from jaxtyping import Bool, Float, Float32, Float64
 from reskin.board import faults
 from reskin.errors import CaptureError
 from reskin.recordings import columns
-from reskin.recordings.chips import GRID_ROWS_N
 from reskin.recordings.columns import FIRST_ROW
 from reskin.recordings.text import check_fields
 
@@ -153,7 +152,7 @@ def _faults(
         remedy = "Mend the wiring, and log again."
         raise CaptureError(where, "lines", "read from every chip", "failed I2C reads in all of them", remedy)
     read = np.flatnonzero(~failed)
-    for block in np.array_split(read, max(1, len(read) // GRID_ROWS_N)):
+    for block in np.array_split(read, max(1, len(read) // faults.GRID_ROWS_N)):
         odd = np.flatnonzero(faults.reset_chips(b_uT[block], None))
         if len(odd):
             what = f"the step of chip {', '.join(map(str, odd))} from row {block[0] + first_row} on"

@@ -9,8 +9,7 @@ import pyarrow.parquet as pq
 from jaxtyping import Bool, Float64, Int
 
 from reskin.errors import CaptureError
-from reskin.recordings.chips import find_whole_rows
-from reskin.recordings.fault_policy import Decisions
+from reskin.recordings.fault_policy import FaultPolicy, check_rows
 from reskin.recordings.header import Header
 from reskin.recordings.readers.alignment import find_passes
 from reskin.recordings.text import (
@@ -65,7 +64,7 @@ def count_chips(files: Mapping[str, Path]) -> int:
     return count_chips_of(_read_cells(file, str(file))[0])
 
 
-def read(folder: Path, header: Header, decisions: Decisions) -> tuple[Readings, Account]:
+def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, Account]:
     """Read contact rows as readings; the no-load field of a row is the mean of the last no-load rows before it."""
     name = next(name for name in (CSV, PARQUET) if (folder / name).exists())
     where = f"{header.capture}/{name}"
@@ -83,12 +82,12 @@ def read(folder: Path, header: Header, decisions: Decisions) -> tuple[Readings, 
     _check(numbers, b_uT, contact, where)
     unknown = np.full(len(contact), np.nan)
     temperature_degC = np.stack([numbers.get(f"T{chip}", unknown) for chip in range(header.chips_n)], axis=1)
-    rows = find_whole_rows(b_uT, temperature_degC, header, where=where, decisions=decisions)
+    rows = check_rows(b_uT, temperature_degC, header.expected_lsb_uT, where=where, policy=policy)
     press = _number_presses(numbers, contact, where)
     block = np.cumsum(np.diff(contact.astype(int), prepend=1) < 0)  # a block of no-load rows, and the contacts after it
-    rest = ~contact & rows.whole
+    rest = ~contact & rows.keep
     noload_uT = mean_by_group(b_uT[rest], block[rest], int(block[-1]) + 1)[block]
-    keep = contact & rows.whole
+    keep = contact & rows.keep
     without = np.flatnonzero(keep & np.isnan(noload_uT[:, 0]))
     if len(without):
         got = f"none before line {FIRST_LINE_N + without[0]}"
@@ -107,7 +106,7 @@ def read(folder: Path, header: Header, decisions: Decisions) -> tuple[Readings, 
         "rows_n": len(readings),
         "rows_read_n": len(keep),
         "noload_rows_n": int(rest.sum()),
-        **rows.losses(),
+        **rows.account(),
         "ignored_columns_n": len(set(names) - set(columns)),
         "passes_n": len(np.unique(readings.pass_i)),
         "no_depth_rows_n": len(readings) if still or "depth_mm" not in numbers else 0,
