@@ -99,7 +99,7 @@ def draw_skin(name: str = "b0_s0", *, seed: int = 0, spreads: Changes | None = N
 
     from reskin.physics import skin
     from reskin.physics.board import Spreads
-    from reskin.physics.magnet import Rule
+    from reskin.physics.magnet import QuadratureSettings
 
     boards = nominal("boards")[NOMINAL_BOARD]
     return skin.draw_skin(
@@ -107,7 +107,7 @@ def draw_skin(name: str = "b0_s0", *, seed: int = 0, spreads: Changes | None = N
         parse(Spreads, nominal("spreads", spreads), "spreads"),
         seed=seed,
         name=name,
-        rule=parse(Rule, boards["quadrature"], "quadrature").quadrature(),
+        rule=parse(QuadratureSettings, boards["quadrature"], "quadrature").in_si(),
         sides_m=(boards["skin_mm"][0] * milli, boards["skin_mm"][1] * milli),
     )
 

@@ -24,7 +24,7 @@ from reskin.data.splits import Fold
 from reskin.metrics import score
 from reskin.models.recipe import HEADLINE
 from reskin.models.trained import Network, networks_without
-from reskin.physics.ambient import EARTH_DIP_DEG, EARTH_SIZE_T, EARTH_T, ball_field, ball_images, directions
+from reskin.physics.ambient import EARTH_DIP_DEG, EARTH_SIZE_T, EARTH_T, ball_field, ball_images, random_directions
 from reskin.physics.board import Board, BoardDesign, draw_board
 from reskin.physics.skin import Skin, draw_skin
 from reskin.seeds import rng_for
@@ -105,7 +105,7 @@ def uniform_cases(
     own: Instrument, fields_uT: Sequence[float], *, rows_n: int, rng: np.random.Generator
 ) -> Iterator[Case]:
     """Let no field and uniform ones come up, each row's in a random direction of its own, whatever the strength."""
-    along = directions(rows_n, rng)
+    along = random_directions(rows_n, rng)
     for field_uT in sorted({0.0, *fields_uT}):
         b_T = field_uT * micro * along
         added_uT = seen_uT(own.board, np.repeat(b_T[:, None], len(own.turn), axis=1))
@@ -222,7 +222,7 @@ def _iron(
     data: SceneData, fold: Fold, test: np.ndarray, section: Ambient, of: Synthesis, instrument: Instrument
 ) -> Iterator[Case]:
     names, which = np.unique(data.rows.skin[test], return_inverse=True)
-    rule = of.main_boards.quadrature.quadrature()
+    rule = of.main_boards.quadrature.in_si()
     skins = [draw_skin(of.skin, of.spreads, seed=data.settings.seed, name=str(name), rule=rule) for name in names]
     rng = rng_for(data.settings.seed, "ambient", fold.name, "iron")
     return iron_cases(

@@ -91,7 +91,7 @@ def bound_of(of: Synthesis, *, seed: int) -> dict[str, Any]:
     """Bound the errors at every place and depth of the main protocol, on its first skin; those above it are counted."""
     kind, (board_name, skin_name) = of.main_boards, roster(of, MAIN)[0]
     board = draw_board(kind.design, of.spreads, seed=seed, name=board_name)
-    rule = kind.quadrature.quadrature()
+    rule = kind.quadrature.in_si()
     skin = draw_skin(of.skin, of.spreads, seed=seed, name=skin_name, rule=rule, sides_m=kind.skin_m)
     places_mm = points_mm() - CENTRE_MM
     depths_mm = np.repeat(of.main.depths_mm, len(places_mm))

@@ -28,8 +28,8 @@ from reskin.models.inputs import shape
 from reskin.models.trained import networks_without
 from reskin.physics import deformation
 from reskin.physics.board import Board, draw_board
-from reskin.physics.magnet import change_of_field
-from reskin.physics.skin import Dipoles, Skin, draw_skin
+from reskin.physics.magnet import Dipoles, change_of_field
+from reskin.physics.skin import Skin, draw_skin
 from reskin.seeds import rng_for
 from reskin.simulation.capture import roster
 from reskin.simulation.settings import MAIN, Synthesis
@@ -225,10 +225,10 @@ def superposition(of: Synthesis, separations_mm: Sequence[float], *, seed: int) 
     """Press the scene's first skin twice, half as deep as its protocol goes and all: rms error of the sum."""
     board_name, skin_name = roster(of, MAIN)[0]
     board = draw_board(of.main_boards.design, of.spreads, seed=seed, name=board_name)
-    rule = of.main_boards.quadrature.quadrature()
+    rule = of.main_boards.quadrature.in_si()
     skin = draw_skin(of.skin, of.spreads, seed=seed, name=skin_name, rule=rule)
     rng = rng_for(seed, "superposition")
-    middles_mm, angles = rng.uniform(-MIDDLE_MM, MIDDLE_MM, (PAIRS_N, 2)), rng.uniform(0, np.pi, PAIRS_N)
+    centres_mm, angles = rng.uniform(-MIDDLE_MM, MIDDLE_MM, (PAIRS_N, 2)), rng.uniform(0, np.pi, PAIRS_N)
     ways = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     rows = []
     for depth_mm in (max(of.main.depths_mm) / 2, max(of.main.depths_mm)):
@@ -236,7 +236,7 @@ def superposition(of: Synthesis, separations_mm: Sequence[float], *, seed: int) 
         for separation_mm in separations_mm:
             half_mm = separation_mm / 2 * ways
             ends_m = [
-                np.column_stack([at_mm * milli, depth_m]) for at_mm in (middles_mm - half_mm, middles_mm + half_mm)
+                np.column_stack([at_mm * milli, depth_m]) for at_mm in (centres_mm - half_mm, centres_mm + half_mm)
             ]
             changes_T = np.array([_together(board, skin, *pair) for pair in zip(*ends_m, strict=True)])
             words = {"depth_mm": depth_mm, "separation_mm": separation_mm, "pairs_n": PAIRS_N}

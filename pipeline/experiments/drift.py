@@ -49,7 +49,7 @@ from reskin.models.inputs import VIEW
 from reskin.models.recipe import HEADLINE
 from reskin.models.trial import Trained, Trial
 from reskin.numerics import device
-from reskin.physics.aging import wandering
+from reskin.physics.aging import baseline_walk
 from reskin.schema import Readings
 from reskin.seeds import rng_for
 
@@ -480,7 +480,7 @@ def add_walk(readings: Readings, step_uT: float, *, after_n: int, seed: int) -> 
     """Add a random walk of so many uT per contact and channel (sd) to all readings after `after_n` contacts."""
     since_n = np.maximum(rank(readings.indentation) + 1 - after_n, 0)
     rng = rng_for(seed, "drift", "wander", readings.skin)  # the same walk at every step size, scaled
-    walk_T = wandering(since_n, readings.b_uT.shape[1], step_T=step_uT * micro, rng=rng)
+    walk_T = baseline_walk(since_n, readings.b_uT.shape[1], step_T=step_uT * micro, rng=rng)
     walk_uT = (walk_T / micro).astype(np.float32)
     return replace(readings, b_uT=readings.b_uT + walk_uT, noload_uT=readings.noload_uT + walk_uT)
 

@@ -23,7 +23,7 @@ from reskin.physics.aging import Ageing, Memory, Relaxation
 from reskin.physics.board import Board, draw_board
 from reskin.physics.magnet import Quadrature, change_of_field
 from reskin.physics.shear import Friction
-from reskin.physics.skin import Skin, beyond_verified_n, changes_of_field, draw_skin, forces, moved_dipoles
+from reskin.physics.skin import Skin, changes_of_field, count_beyond_verified, draw_skin, forces, moved_dipoles
 from reskin.seeds import rng_for
 from reskin.simulation.capture import roster
 from reskin.simulation.contact import Response, Terms, push, respond
@@ -95,7 +95,7 @@ def _make_subject(of: Synthesis, seed: int) -> Subject:
     tip_mm = np.stack([plan.x_mm - CENTRE_MM, plan.y_mm - CENTRE_MM, plan.depth_mm], axis=2)
     return Subject(
         draw_board(kind.design, of.spreads, seed=seed, name=board),
-        draw_skin(of.skin, of.spreads, seed=seed, name=skin, rule=kind.quadrature.quadrature()),
+        draw_skin(of.skin, of.spreads, seed=seed, name=skin, rule=kind.quadrature.in_si()),
         draw_skin(of.skin, of.spreads, seed=seed, name=skin, rule=COARSE),
         plan,
         tip_mm * milli,
@@ -121,7 +121,7 @@ def _over_time(on: Subject, without: Response, seed: int) -> list[Effect]:
 
 
 def _temperature(on: Subject, without: Response) -> Effect:
-    factor = aging.remanence(np.array([WARMER_K]))[0]
+    factor = aging.relative_remanence(np.array([WARMER_K]))[0]
     rest_uT = float(np.abs((factor - 1) * without.rest_T).max() / micro)
     field_pct = _error_pct(without.change_T, factor * without.change_T)
     how = f"{WARMER_K:g} K warmer, a no-load reading before each contact"
@@ -268,7 +268,7 @@ def _too_deep(of: Synthesis, seed: int) -> Effect:
     """Count, over all skins, the stops beyond the depths of published solutions."""
     depth_m = milli * of.main.plan(rng_for(seed, "left out"), of.main_boards.skin_mm).depth_mm.ravel()
     skins = [draw_skin(of.skin, of.spreads, seed=seed, name=skin, rule=COARSE) for _, skin in roster(of, MAIN)]
-    share_pct = 100 * sum(beyond_verified_n(skin, depth_m) for skin in skins) / (len(depth_m) * len(skins))
+    share_pct = 100 * sum(count_beyond_verified(skin, depth_m) for skin in skins) / (len(depth_m) * len(skins))
     how = f"{share_pct:.3g} % of the stops of {len(skins)} skins are past 0.6 of the thickness: nothing published there"
     return Effect("depths past 0.6 of the thickness", "kept", None, None, None, how)
 

@@ -29,10 +29,10 @@ from reskin import io
 from reskin.config import Strict
 from reskin.errors import ParamsError
 from reskin.physics import deformation, layer, magnet, slide
-from reskin.physics.aging import SKIN, Prony, relax
+from reskin.physics.aging import SKIN_RELAXATION, Prony, relax
 from reskin.physics.board import Board, Spreads, draw_board
 from reskin.physics.magnet import SEAMS_M, SKIN_SIDE_M, Nodes, Quadrature, change_of_field, place_nodes
-from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, press_slides
+from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, press_motion
 from reskin.simulation.capture import roster
 from reskin.simulation.settings import MAIN, Synthesis
 
@@ -336,9 +336,9 @@ def stiff(ratio: float) -> Prony:
 
     The slowest stays, so that the fastest goes below any step of an explicit method; shares are the skin's.
     """
-    slowest_s, fastest_s = SKIN.tau_s.max(), SKIN.tau_s.min()
+    slowest_s, fastest_s = SKIN_RELAXATION.tau_s.max(), SKIN_RELAXATION.tau_s.min()
     power = np.log(ratio) / np.log(slowest_s / fastest_s)
-    return Prony(slowest_s * (SKIN.tau_s / slowest_s) ** power, SKIN.share)
+    return Prony(slowest_s * (SKIN_RELAXATION.tau_s / slowest_s) ** power, SKIN_RELAXATION.share)
 
 
 def integrate(history: History, prony: Prony, piece: Piece, counter: Counter) -> Forces:
@@ -526,7 +526,7 @@ def paths(trial: Trial, skin: Skin) -> NodePath:
         turns_rad[poke_i] += angle_rad[:, None] * np.stack([-sin, cos, np.zeros_like(cos)], axis=1)
     if skin.hold is not None:
         true_poke_m = np.column_stack([trial.pokes_m[:, :2], true_m])
-        _slide(nodes_m, turns_rad, press_slides(skin, skin.hold, true_poke_m), skin.seat_m)
+        _slide(nodes_m, turns_rad, press_motion(skin, skin.hold, true_poke_m), skin.seat_m)
     return NodePath(nodes_m, turns_rad)
 
 
@@ -650,7 +650,7 @@ def runtime(settings: Settings, results: Path) -> None:
     of, tried = synthesis_of(settings), read(settings)
     rows, calls = study_quadratures(_trials(of, tried.quadratures, settings.seed), tried.quadratures.rules_of())
     more, more_calls = study_integrators(tried.integrators)
-    choice = choose(rows, used=of.main_boards.quadrature.quadrature())
+    choice = choose(rows, used=of.main_boards.quadrature.in_si())
     seconds = race([*calls, *more_calls], tried.repeats_n)
     io.write_json(SECONDS / settings.scene / "runtime.json", [asdict(row) for row in seconds])
     words: dict[str, Any] = {"choice": asdict(choice)}

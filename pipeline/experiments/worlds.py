@@ -36,11 +36,10 @@ from reskin.metrics import METRICS
 from reskin.models.recipe import HEADLINE
 from reskin.models.trial import Start, Trial
 from reskin.physics.board import draw_board
-from reskin.physics.force_sensor import read_force
 from reskin.physics.skin import changes_of_field, draw_skin, forces
 from reskin.seeds import rng_for
 from reskin.simulation.capture import roster
-from reskin.simulation.rig import misplace
+from reskin.simulation.rig import misplace, read_force
 from reskin.simulation.settings import MAIN, Synthesis
 
 WAVES_N = 48  # cosines that make a smooth error
@@ -146,7 +145,7 @@ def _skin_rows(world: World, section: Worlds, seed: int, board_name: str, skin_n
     kind = synthesis.main_boards
     rng = rng_for(seed, "worlds", board_name, skin_name)  # the same presses and noise in every world
     board = draw_board(kind.design, synthesis.spreads, seed=seed, name=board_name)
-    rule = kind.quadrature.quadrature()
+    rule = kind.quadrature.in_si()
     skin = draw_skin(synthesis.skin, synthesis.spreads, seed=seed, name=skin_name, rule=rule, sides_m=kind.skin_m)
     plan = synthesis.main.plan(rng, kind.skin_mm)
     tip_m = ((misplace(plan, rig, rng) - (*plan.centre_mm, 0)) * milli)[:, 0]

@@ -1,4 +1,4 @@
-"""What time and contacts do to a skin: relaxation, memory of the field, wear and warmth."""
+"""Effects of time and contacts on a skin: relaxation, hysteresis of the field, wear and temperature."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -13,38 +13,40 @@ from reskin.errors import ParamsError
 
 @dataclass(frozen=True)
 class Prony:
-    """Relaxation 1 - sum of share (1 - exp(-t / tau)): stiff at once, softer by the sum of the shares in the end."""
+    """Prony series of the relaxation function, 1 - sum of share (1 - exp(-t / tau))."""
 
     tau_s: Float[np.ndarray, " p"]
     share: Float[np.ndarray, " p"]
 
     def __post_init__(self) -> None:
-        """Refuse times that are no times, and shares that leave nothing or add to the force."""
+        """Raise `ParamsError` for impossible times or shares."""
         if not (np.isfinite(self.tau_s) & (self.tau_s > 0)).all():
             raise ParamsError("prony", "every tau", "above 0 s and finite", f"{self.tau_s}", "Check its unit.")
         if not ((self.share >= 0).all() and self.share.sum() <= 1):
             raise ParamsError("prony", "share", "0 or more, 1 in sum", f"{self.share}", "Lower the shares.")
 
 
-SKIN = Prony(tau_s=np.array([1e-3, 1e-1, 1e1, 1e3, 1e4]), share=np.array([0.05, 0.05, 0.05, 0.03, 0.02]))  # assumed
+SKIN_RELAXATION = Prony(  # assumed (PHYSICS 5)
+    tau_s=np.array([1e-3, 1e-1, 1e1, 1e3, 1e4]), share=np.array([0.05, 0.05, 0.05, 0.03, 0.02])
+)
 
 
 class Relaxation(Strict):
-    """How long a real indentation takes, frames or not: the tip goes down evenly, then holds; a rested skin."""
+    """Duration of an indentation of a rested skin: the tip approaches at constant speed, then holds."""
 
     approach_s: Annotated[float, Field(ge=0, le=100)]
     hold_s: Annotated[float, Field(ge=0, le=100)]  # until the middle of the readings
 
 
 class Memory(Strict):
-    """How a poke's change of field creeps while it is held, and fades after it; times are those of a real rig.
+    """Hysteresis of the field: dB creeps while an indentation is held, and decays after it.
 
-    What stands in the next no-load reading is as recorded (5 to 8 %, FACTS 6); how it is shared among times is assumed.
+    The part of dB left in the next no-load reading is as recorded (5 to 8 %); its distribution over times is assumed.
     """
 
-    share: tuple[Annotated[float, Field(ge=0, le=1)], ...]  # of the change, that a poke held for ever would add
+    share: tuple[Annotated[float, Field(ge=0, le=1)], ...]  # of dB, added by an indentation that is held forever
     tau_s: tuple[Annotated[float, Field(gt=0, le=1e6)], ...]
-    contact_s: Annotated[float, Field(ge=0, le=1e4)]  # how long a poke is held, until the end of its readings
+    contact_s: Annotated[float, Field(ge=0, le=1e4)]  # duration of an indentation, until the end of its readings
     rest_s: Annotated[float, Field(ge=0, le=1e4)]  # from there to the next no-load reading
 
     @model_validator(mode="after")
@@ -54,20 +56,26 @@ class Memory(Strict):
         return self
 
 
-def remembered(
+def field_memory(
     change_T: Float[np.ndarray, "n p k 3"], how: Memory
 ) -> tuple[Float[np.ndarray, "n k 3"], Float[np.ndarray, "n p k 3"]]:
-    """Give what earlier pokes leave in each no-load reading, and what has been added to it at every stop of a poke.
+    """Return the hysteresis of the field in T, from dB at the stops of every indentation.
 
-    q' = (share dB - q) / tau while a poke is held, q' = -q / tau after it, exactly; none before the first poke.
-    A stop has no known time: there the poke counts as held for `contact_s`, with the mean dB of the stops so far.
+    Each state follows q' = (share dB - q) / tau during an indentation and q' = -q / tau after it, integrated exactly;
+    q = 0 before the first. A stop has no known time: the indentation counts as held for `contact_s` at the mean dB of
+    its stops so far.
+
+    Returns
+    -------
+    before_T : what earlier indentations add to each no-load reading.
+    added_T : what each stop adds to the no-load reading of its indentation.
     """
     so_far_T = change_T.cumsum(axis=1) / np.arange(1, change_T.shape[1] + 1)[:, None, None]
     before_T, added_T = np.zeros_like(change_T[:, 0]), np.zeros_like(change_T)
     for share, tau_s in zip(how.share, how.tau_s, strict=True):
         held, rested = np.exp(-how.contact_s / tau_s), np.exp(-how.rest_s / tau_s)
         crept_T = -np.expm1(-how.contact_s / tau_s) * share * so_far_T
-        left_T = np.zeros_like(before_T)  # q before poke i + 1 is what poke i left at its end, rested
+        left_T = np.zeros_like(before_T)  # q before indentation i + 1: that at the end of i, decayed
         for i in range(len(change_T) - 1):
             left_T[i + 1] = rested * crept_T[i, -1] + held * rested * left_T[i]
         before_T += left_T
@@ -75,17 +83,17 @@ def remembered(
     return before_T, added_T
 
 
-def force_left(how: Relaxation, prony: Prony = SKIN) -> float:
-    """Give the force when an indentation is read, over that of a skin without memory."""
+def relaxed_share(how: Relaxation, prony: Prony = SKIN_RELAXATION) -> float:
+    """Return the force when an indentation is read, relative to that of an elastic skin."""
     elastic = np.array([0.0, 1.0, 1.0])
     return float(relax(np.cumsum([0.0, how.approach_s, how.hold_s]), elastic, prony)[-1])
 
 
 def advance(state: Float[np.ndarray, " p"], change: float, dt_s: float, prony: Prony) -> Float[np.ndarray, " p"]:
-    """Carry q' = -q / tau + share e' over `dt_s`, while e grows evenly by `change`; exact for any dt / tau.
+    """Integrate q' = -q / tau + share e' over `dt_s`, for e that grows linearly by `change`; exact for any dt / tau.
 
-    q <- exp(-x) q + share change (1 - exp(-x)) / x, x = dt / tau (Taylor, Pister & Goudreau 1970). No time is a
-    jump: without change it leaves the state as it is.
+    q <- exp(-x) q + share change (1 - exp(-x)) / x, x = dt / tau (Taylor, Pister & Goudreau 1970). dt = 0 is a jump:
+    without change the state stays the same.
     """
     if not (np.isfinite(dt_s) and dt_s >= 0):
         rule = "0 s or more and finite"
@@ -95,9 +103,9 @@ def advance(state: Float[np.ndarray, " p"], change: float, dt_s: float, prony: P
 
 
 def relax(time_s: Float[np.ndarray, " t"], elastic: Float[np.ndarray, " t"], prony: Prony) -> Float[np.ndarray, " t"]:
-    """Give the force with memory at each time, for an elastic one that runs straight between them from 0 before all.
+    """Return the relaxed force at each time, for an elastic force that is linear between the times and starts from 0.
 
-    Lee & Radok 1960: force = integral of relaxation(t - s) d elastic(s), true as long as the contact does not shrink.
+    Lee & Radok 1960: force = integral of relaxation(t - s) d elastic(s), valid while the contact does not shrink.
     """
     state = np.zeros_like(prony.tau_s)
     relaxed = np.empty_like(elastic)
@@ -109,7 +117,7 @@ def relax(time_s: Float[np.ndarray, " t"], elastic: Float[np.ndarray, " t"], pro
 
 
 def _mean_decay(x: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
-    # (1 - exp(-x)) / x; written so, it is 11 % off at x = 1e-16, and expm1 is not.
+    # (1 - exp(-x)) / x; without expm1 it is 11 % off at x = 1e-16.
     return np.where(x > 0, -np.expm1(-x) / np.where(x > 0, x, 1.0), 1.0)
 
 
@@ -118,42 +126,42 @@ REMANENCE_PER_K = -0.12e-2  # NdFeB powder: Br falls by 0.12 % for each kelvin (
 
 
 class Temperature(Strict):
-    """How the temperature runs, and how much the chips' sensitivity follows it."""
+    """Course of the temperature, and how the chips' sensitivity depends on it."""
 
-    warming_K: Annotated[float, Field(ge=0, le=40)]  # from switching on to the end
+    warming_K: Annotated[float, Field(ge=0, le=40)]  # from switching on to thermal equilibrium
     warming_s: Annotated[float, Field(gt=0, le=1e5)]
     swing_K: Annotated[float, Field(ge=0, le=20)]  # of the room, up and down
     swing_s: Annotated[float, Field(gt=0, le=1e6)]
     chip_sensitivity_per_K: Annotated[float, Field(ge=0, le=0.01)]  # sd between chips
 
 
-def warmer_K(time_s: Float[np.ndarray, "..."], how: Temperature) -> Float[np.ndarray, "..."]:
-    """Give how much warmer than at the start it is: warming (1 - exp(-t / tau)) + swing sin(2 pi t / period)."""
+def temperature_rise_K(time_s: Float[np.ndarray, "..."], how: Temperature) -> Float[np.ndarray, "..."]:
+    """Return the temperature over that at the start: warming (1 - exp(-t / tau)) + swing sin(2 pi t / period)."""
     warming = -how.warming_K * np.expm1(-time_s / how.warming_s)
     return warming + how.swing_K * np.sin(2 * np.pi * time_s / how.swing_s)
 
 
-def remanence(warmer_K: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    """Give magnetisation over that at the start; fields at rest and their changes scale alike."""
-    return 1 + REMANENCE_PER_K * warmer_K
+def relative_remanence(rise_K: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """Return the magnetisation relative to that at the start; no-load fields and dB are proportional to it."""
+    return 1 + REMANENCE_PER_K * rise_K
 
 
-SETTLING_CONTACTS = 300  # the first softening is over after a few times as many
+SETTLING_CONTACTS = 300  # scale of the initial softening
 AGEING_CONTACTS = 1e3
 
 
 class Ageing(Strict):
-    """How fast a skin softens and its field at rest drifts."""
+    """Rates of softening and of the drift of the no-load field."""
 
     settling: Annotated[float, Field(ge=0, le=0.5)]  # force lost in the first contacts
     ageing: Annotated[float, Field(ge=0, le=0.1)]  # force lost with each decade of contacts
-    fading_per_decade: Annotated[float, Field(ge=0, le=0.1)]  # of the field at rest
+    fading_per_decade: Annotated[float, Field(ge=0, le=0.1)]  # of the no-load field
     wandering_uT: Annotated[float, Field(ge=0, le=10)]  # sd a contact and channel
 
 
 def softening(contacts_n: Int[np.ndarray, " n"], *, settling: float, ageing: float) -> Float[np.ndarray, " n"]:
-    """Give force over the force of the fresh skin: 1 - settling (1 - exp(-N/300)) - ageing log10(1 + N/1000)."""
-    _refuse_counts(contacts_n)
+    """Return the force relative to a fresh skin: 1 - settling (1 - exp(-N/300)) - ageing log10(1 + N/1000)."""
+    _check_counts(contacts_n)
     settled = -np.expm1(-contacts_n / SETTLING_CONTACTS)
     left = 1 - settling * settled - ageing * np.log10(1 + contacts_n / AGEING_CONTACTS)
     if not (left > 0).all():
@@ -163,19 +171,19 @@ def softening(contacts_n: Int[np.ndarray, " n"], *, settling: float, ageing: flo
 
 
 def fading(contacts_n: Int[np.ndarray, " n"], *, per_decade: float) -> Float[np.ndarray, " n"]:
-    """Give what a skin's field at rest loses, as a share of it: per_decade log10(1 + N)."""
-    _refuse_counts(contacts_n)
+    """Return the relative loss of the no-load field: per_decade log10(1 + N)."""
+    _check_counts(contacts_n)
     return per_decade * np.log10(1 + contacts_n)
 
 
-def wandering(
+def baseline_walk(
     contacts_n: Int[np.ndarray, " n"], channels_n: int, *, step_T: float, rng: np.random.Generator
 ) -> Float[np.ndarray, "n ch"]:
-    """Draw the random walk of each channel's baseline, one normal step of sd `step_T` for every contact, in tesla.
+    """Draw the random walk of each channel's no-load field in T, with a normal step of sd `step_T` at each contact.
 
-    `contacts_n` must not fall; contacts that nobody looks at are walked all the same.
+    `contacts_n` must not decrease; the walk includes the contacts between the given counts.
     """
-    _refuse_counts(contacts_n)
+    _check_counts(contacts_n)
     new_n = np.diff(contacts_n, prepend=0)
     if (new_n < 0).any():
         raise ParamsError("wear", "contact count", "never falling", f"{new_n.min()}", "Sort the contacts.")
@@ -183,6 +191,6 @@ def wandering(
     return np.cumsum(steps_T, axis=0)
 
 
-def _refuse_counts(contacts_n: Int[np.ndarray, " n"]) -> None:
+def _check_counts(contacts_n: Int[np.ndarray, " n"]) -> None:
     if contacts_n.size and contacts_n.min() < 0:
         raise ParamsError("wear", "contact count", "0 or more", f"{contacts_n.min()}", "Count from 0.")

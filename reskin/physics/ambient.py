@@ -1,7 +1,7 @@
-"""Fields from outside the skin. In: strengths, directions, a ball of iron, observers, all SI. Out: tesla at observers.
+"""Ambient fields: the earth's, and that of an iron ball. SI units.
 
-A ball answers a uniform field with one dipole, and dipoles nearby with an image of each. Refuses to know chips, boards
-and skins: what magnetises the ball is given, and does not feel it.
+The ball is magnetised by a uniform field (one dipole) and by nearby dipoles (image sources). Its effect on what
+magnetises it is neglected.
 """
 
 import numpy as np
@@ -9,23 +9,23 @@ from jaxtyping import Float
 from scipy.constants import micro, mu_0
 
 from reskin.physics import magnet
-from reskin.physics.magnet import MU0_4PI
+from reskin.physics.magnet import MU0_4PI, Dipoles
 
-# The earth's field, some place of middle latitude (25-65 uT over the globe, IGRF): x is north here, z is up.
+# The earth's field at a middle latitude (25-65 uT over the globe, IGRF); x is north, z is up.
 EARTH_SIZE_T = 50 * micro
 EARTH_DIP_DEG = 66.0
 EARTH_T = EARTH_SIZE_T * np.array([np.cos(np.radians(EARTH_DIP_DEG)), 0.0, -np.sin(np.radians(EARTH_DIP_DEG))])
-IRON_MU_R = 1000.0  # soft iron; a ball's moment differs by 0.3 % from that of endless permeability
+IRON_MU_R = 1000.0  # soft iron; the moment of a ball differs by 0.3 % from that of infinite permeability
 
 
-def directions(n: int, rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
-    """Draw directions, uniformly over the sphere."""
+def random_directions(n: int, rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
+    """Draw unit vectors, uniformly over the sphere."""
     drawn = rng.standard_normal((n, 3))
     return drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
 
 
 def ball_moment(radius_m: float, b_T: Float[np.ndarray, "3"], mu_r: float = IRON_MU_R) -> Float[np.ndarray, "3"]:
-    """Give the moment that a uniform field induces in a ball: (4 pi a^3 / mu0) (mu_r - 1) / (mu_r + 2) B, in A m^2."""
+    """Return the moment of a ball in a uniform field: (4 pi a^3 / mu0) (mu_r - 1) / (mu_r + 2) B, in A m^2."""
     return 4 * np.pi * radius_m**3 / mu_0 * (mu_r - 1) / (mu_r + 2) * b_T
 
 
@@ -37,22 +37,22 @@ def ball_field(
     radius_m: float,
     mu_r: float = IRON_MU_R,
 ) -> Float[np.ndarray, "o 3"]:
-    """Give what a ball in the field `b_T` adds at observers outside it, in tesla."""
+    """Return the field in T that a ball in the uniform field `b_T` adds at observers outside it."""
     return magnet.field(centre_m[None], ball_moment(radius_m, b_T, mu_r)[None], observers_m)
 
 
 def ball_images(
     observers_m: Float[np.ndarray, "o 3"],
-    dipoles: tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]],
+    dipoles: Dipoles,
     *,
     centre_m: Float[np.ndarray, "3"],
     radius_m: float,
 ) -> Float[np.ndarray, "o 3"]:
-    """Give what a ball of endless permeability adds, in tesla, for dipoles (in m, A m^2) that lie outside it.
+    """Return the field in T that a ball of infinite permeability adds, for dipoles (m, A m^2) outside it.
 
-    As a conducting, uncharged ball does in electrostatics (Jackson, chapter 2): for each dipole an image dipole and a
-    pole at the inverse point, and at the centre a pole against that. Close to a skin, one dipole at the centre would
-    fall far short of it.
+    As for a conducting, uncharged sphere in electrostatics (Jackson, chapter 2): each dipole has an image dipole and a
+    pole at the inverse point, and an opposite pole at the centre. Close to a skin, a single dipole at the centre would
+    underestimate the field by far.
     """
     away_m = dipoles[0] - centre_m
     distance_m = np.linalg.norm(away_m, axis=1, keepdims=True)

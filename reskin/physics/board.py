@@ -1,7 +1,6 @@
-"""The circuit board, and every spread of boards and skins. In: a design and a name. Out: one `Board`, SI inside.
+"""The circuit board: design, drawn boards, and the spreads between boards and between skins.
 
-A board is drawn from a generator that bears its name: board 7 stays the same when board 8 is added.
-Refuses to know magnets, skins and what a chip makes of the field (`sensor`).
+Each board is drawn by a random generator of its name: board 7 stays the same when board 8 is added.
 """
 
 from dataclasses import dataclass
@@ -21,24 +20,24 @@ Share = Annotated[float, Field(ge=0, le=0.5)]
 
 
 class Tiles(Strict):
-    """Several boards side by side under one skin, their middles on a lattice around its middle."""
+    """Several boards side by side under one skin, on a lattice around its centre."""
 
     columns_n: Annotated[int, Field(ge=1, le=CHIPS_MAX_N)]  # along x
     rows_n: Annotated[int, Field(ge=1, le=CHIPS_MAX_N)]  # along y
     pitch_mm: Annotated[float, Field(gt=0, le=500)]
 
     @property
-    def middles_mm(self) -> list[tuple[float, float]]:
-        """Give the middles of the boards, row by row."""
+    def centres_mm(self) -> list[tuple[float, float]]:
+        """Centres of the boards, row by row."""
         x_mm, y_mm = (self.pitch_mm * (np.arange(n) - (n - 1) / 2) for n in (self.columns_n, self.rows_n))
         return [(float(x), float(y)) for y in y_mm for x in x_mm]
 
 
 class BoardDesign(Strict):
-    """Where the chips sit, seen from the middle of the board, and how each is turned about z.
+    """Positions of the chips from the centre of the board, and the rotation of each about z.
 
-    The scenes' turns are those that recordings show (tests/recordings/test_lab_frames.py), not those of a board file.
-    With `tiles`, this is one board of many; chips are then numbered board by board.
+    The scenes' rotations are those that recordings show (tests/recordings/test_lab_frames.py), not those of a board
+    file. With `tiles`, this is one board of many; chips are then numbered board by board.
     """
 
     chips_xy_mm: Annotated[tuple[tuple[float, float], ...], Field(min_length=1, max_length=CHIPS_MAX_N)]
@@ -56,20 +55,20 @@ class BoardDesign(Strict):
 
     @property
     def places_mm(self) -> list[tuple[float, float]]:
-        """Give the places of all chips of all boards, seen from the middle of the skin."""
-        boards_mm = [(0.0, 0.0)] if self.tiles is None else self.tiles.middles_mm
+        """Positions of all chips of all boards, from the centre of the skin."""
+        boards_mm = [(0.0, 0.0)] if self.tiles is None else self.tiles.centres_mm
         return [(x + chip_x, y + chip_y) for x, y in boards_mm for chip_x, chip_y in self.chips_xy_mm]
 
     @property
     def turns_deg(self) -> list[float]:
-        """Give the turns of all chips of all boards."""
+        """Rotations of all chips of all boards."""
         return [*self.chips_turn_deg] * (len(self.places_mm) // len(self.chips_xy_mm))
 
 
 class Spreads(Strict):
-    """Standard deviations between boards and between skins. All of them are ASSUMPTIONS (PHYSICS 6 and 7).
+    """Standard deviations between boards and between skins: all of them assumptions (PHYSICS 6 and 7).
 
-    Factors are drawn as exp(sd * normal), so that they stay positive; all else is normal around the design.
+    Factors are drawn as exp(sd * normal), so that they stay positive; everything else is normal around the design.
     """
 
     board_gap: Share  # of the gap between skin and chips
@@ -79,18 +78,18 @@ class Spreads(Strict):
     chip_tilt_deg: Annotated[float, Field(ge=0, le=10)]
     chip_offset_uT: Annotated[float, Field(ge=0, le=5000)]
     skin_amplitude: Share  # of the magnetisation
-    skin_filler: Share  # of the magnetisation from place to place
+    skin_filler: Share  # local variation of the magnetisation
     skin_filler_length_mm: Annotated[float, Field(gt=0, le=50)]  # correlation exp(-r^2 / 2 length^2)
     skin_thickness: Share
     skin_modulus: Share
-    skin_seat_mm: Annotated[float, Field(ge=0, le=2)]  # skin sideways of its place on the board, each axis
+    skin_seat_mm: Annotated[float, Field(ge=0, le=2)]  # lateral offset of the skin on the board, each axis
     skin_rotation_deg: Annotated[float, Field(ge=0, le=10)]  # skin about z
     skin_depth_zero_mm: Annotated[float, Field(ge=0, le=0.2)]  # true depth minus commanded depth
 
 
 @dataclass(frozen=True)
 class Board:
-    """One board: z = 0 is where the skin's base lies; a chip reads sensitivity @ turn^T @ B + offset."""
+    """One board; z = 0 is the base of the skin. A chip reads sensitivity @ turn^T @ B + offset."""
 
     name: str
     chips_m: Float[np.ndarray, "k 3"]
@@ -100,7 +99,7 @@ class Board:
 
 
 def draw_board(design: BoardDesign, spreads: Spreads, *, seed: int, name: str) -> Board:
-    """Draw the board called `name`; boards side by side lie at one gap (assumed: one skin holds them down)."""
+    """Draw the board of this name; tiled boards have the same gap (assumed: one skin holds them down)."""
     rng = rng_for(seed, "board", name)
     chips_n = len(design.places_mm)
     gap_mm = design.gap_mm * np.exp(spreads.board_gap * rng.standard_normal())
@@ -120,7 +119,7 @@ def draw_board(design: BoardDesign, spreads: Spreads, *, seed: int, name: str) -
 
 
 def _unevenness(design: BoardDesign, rng: np.random.Generator) -> Float[np.ndarray, " k"]:
-    # Tilt and bow of the base over its board, of 1 at the outermost chip; the skin itself is taken as flat.
+    # Tilt and bow of the base over its board, 1 at the outermost chip; the skin itself is taken as flat.
     places_mm = np.array(design.chips_xy_mm)
     away_mm = np.hypot(*places_mm.T)
     share = places_mm / max(away_mm.max(), 1e-12)

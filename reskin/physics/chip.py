@@ -1,4 +1,4 @@
-"""The magnetometer MLX90393: conversion time, noise, range and quantisation of its readings."""
+"""The MLX90393 magnetometer: conversion time, noise, range and quantisation of its readings."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -14,11 +14,11 @@ from reskin.physics.board import Board
 GAINS = (5.0, 4.0, 3.0, 2.5, 2.0, 5 / 3, 4 / 3, 1.0)  # by GAIN_SEL (data sheet, table 17)
 STEP_AT_GAIN_ONE_uT = (0.150, 0.150, 0.242)  # RES 0; x, y, z
 TEMPERATURE_ZERO_DEGC, TEMPERATURE_ZERO_RAW, TEMPERATURE_STEPS_PER_DEGC = 25.0, 46244, 45.2  # data sheet
-FIELD_MAX_T = 50e-3  # the chip measures no more on any axis, whatever its gain (data sheet)
+FIELD_MAX_T = 50e-3  # saturation on any axis, at any gain (data sheet)
 
 
 class ChipDesign(Strict):
-    """How the firmware sets the chip, and the noise of one reading."""
+    """Gain setting of the firmware, and the noise of one reading."""
 
     gain_sel: Annotated[int, Field(ge=0, le=7)]
     noise_xy_uT: Annotated[float, Field(ge=0, le=100)]
@@ -28,21 +28,21 @@ class ChipDesign(Strict):
 
 @dataclass(frozen=True)
 class Overruns:
-    """Values that the chips could not give as they were: held at 50 mT, and past int16, which wraps."""
+    """Counts of values out of range: saturated at 50 mT, and beyond int16, which wraps."""
 
     clipped_n: int
     wrapped_n: int
 
 
 def steps_uT(gain_sel: int) -> Float[np.ndarray, " 3"]:
-    """Give the field of one count on x, y and z."""
+    """Return the field in uT of one count on x, y and z."""
     return np.array(STEP_AT_GAIN_ONE_uT) * GAINS[gain_sel]
 
 
 def read_field(
     b_T: Float[np.ndarray, "f k 3"], board: Board, *, design: ChipDesign, rng: np.random.Generator
 ) -> tuple[Float32[np.ndarray, "f ch"], Overruns]:
-    """Read the field as the board's chips do, each in its own frame; count what the readings could not hold."""
+    """Read the field with the board's chips, each in its own axes; count the values out of range."""
     to_chip = board.sensitivity @ board.turn.transpose(0, 2, 1)
     seen_T = np.einsum("kij,fkj->fki", to_chip, b_T)
     clipped_n = int(np.count_nonzero(np.abs(seen_T) > FIELD_MAX_T))
@@ -72,7 +72,7 @@ CONVERSION_S = 1.84e-3  # MLX90393 at OSR 0, DIG_FILT 2 (data sheet)
 def last_conversions(
     frame_s: Float[np.ndarray, " f"], phase_s: Float[np.ndarray, " k"]
 ) -> tuple[Float[np.ndarray, "f k"], Int[np.ndarray, "f k"]]:
-    """Give the age in s of each chip's reading, and the first frame (index) that brought the same one."""
+    """Return the age in s of each chip's conversion at each frame, and the first frame that carries the same one."""
     conversion = np.floor((frame_s[:, None] - phase_s) / CONVERSION_S)
     age_s = frame_s[:, None] - phase_s - conversion * CONVERSION_S
     fresh = np.ones(conversion.shape, bool)
@@ -81,10 +81,10 @@ def last_conversions(
     return age_s, np.maximum.accumulate(np.where(fresh, here, 0), axis=0)
 
 
-def seen_at(
+def sample_at_conversion(
     value: Float[np.ndarray, "f k a"], age_s: Float[np.ndarray, "f k"], rate_hz: float
 ) -> Float[np.ndarray, "f k a"]:
-    """Give what each chip saw `age_s` before its frame, on a straight line between frames at a constant rate."""
+    """Interpolate each chip's field linearly to its conversion, `age_s` before the frame."""
     frames_n, chips_n = age_s.shape
     place = np.maximum(np.arange(frames_n)[:, None] - age_s * rate_hz, 0.0)
     before = np.minimum(place.astype(np.intp), max(frames_n - 2, 0))

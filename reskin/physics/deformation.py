@@ -21,8 +21,7 @@ from reskin import io
 from reskin.errors import ParamsError
 from reskin.physics import layer
 from reskin.physics.layer import Displacement, IndentedLayer, Waves, contact_of_radius, displacement, waves
-
-Dipoles = tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]  # positions in m, moments in A m^2
+from reskin.physics.magnet import Dipoles
 
 STEP = 0.025  # of `depth_scale`: 0.05 mm in a skin of 2 mm; half of it changes dB by 0.3 % (slipping), 0.6 % (bonded)
 # Depths at which the flow is stepped, whatever depths are requested. The first step is cut in four and in two: there

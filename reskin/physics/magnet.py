@@ -1,7 +1,4 @@
-"""Fields of the magnetised skin: magnetisation, quadrature nodes, point dipoles, and the change when they move.
-
-SI units.
-"""
+"""Magnetic fields: the magnetising array, the skin's magnetisation, quadrature nodes, and point dipoles. SI units."""
 
 from dataclasses import dataclass
 from itertools import pairwise, product
@@ -23,16 +20,16 @@ ARRAY_BELOW_M = 0.50e-3  # from the skin's base down to the lower cubes' faces, 
 ARRAY_ABOVE_M = 0.25e-3  # from the skin's top up to the upper cubes' faces, authors' CAD
 ARRAY_REMANENCE_T = 1.32  # N42 cubes, assumed
 
-Polarity = Literal["checkerboard", "same"]  # the paper does not say; upper and lower cubes attract in both
+Polarity = Literal["checkerboard", "same"]  # the paper does not specify it; upper and lower cubes attract in both
 
 
 def cuboid_field(
     observers_m: Float[np.ndarray, "o 3"], polarization_T: float, *, sides_m: tuple[float, float, float]
 ) -> Float[np.ndarray, "o 3"]:
-    """Give the field, in tesla, of a box around the origin that is magnetised along z.
+    """Return the field in T of a cuboid around the origin that is magnetised along z.
 
-    Two charged rectangles (Engel-Herbert & Hesjedal, J. Appl. Phys. 97:074504, 2005), plus J inside.
-    The lines through the box's edges are left to the caller: there the logarithms are infinite.
+    Two charged rectangles (Engel-Herbert & Hesjedal, J. Appl. Phys. 97:074504, 2005), plus J inside. On the lines
+    through the edges the logarithms are infinite; avoid them.
     """
     half_m = np.array(sides_m) / 2
     b_T = np.zeros_like(observers_m)
@@ -44,21 +41,21 @@ def cuboid_field(
 
 
 def _corner(from_m: Float[np.ndarray, "o 3"]) -> Float[np.ndarray, "o 3"]:
-    """Give what one corner of a box adds to its field, of 4 pi / J."""
+    """Return the contribution of one corner of a cuboid to its field, times 4 pi / J."""
     x, y, z = from_m.T
     xx, yy, zz = x * x, y * y, z * z
-    # asinh(y / hypot(x, z)) is log(y + r) less what both ends share, and keeps its digits where y < 0.
+    # asinh(y / hypot(x, z)) is log(y + r) less a term common to both ends, and keeps its digits where y < 0.
     along_x, along_y = -np.arcsinh(y / np.sqrt(xx + zz)), -np.arcsinh(x / np.sqrt(yy + zz))
     return np.stack([along_x, along_y, np.arctan(x * y / (z * np.sqrt(xx + yy + zz)))], axis=1)
 
 
 def cubes_along(side_m: float) -> int:
-    """Count the cubes along a side of a skin: enough to cover it, as the authors' four do (assumed of other skins)."""
+    """Number of magnet cubes along a side of a skin: enough to cover it, as the authors' four do (else assumed)."""
     return ceil(side_m / CUBE_SIDE_M - 1e-9)
 
 
 def seams_m(side_m: float) -> tuple[float, ...]:
-    """Say where two cubes touch along a side, from the skin's middle; there the magnetisation bends."""
+    """Positions along a side where two cubes touch, from the skin's centre: kinks of the magnetisation."""
     n = cubes_along(side_m)
     return tuple(CUBE_SIDE_M * (i - n / 2) for i in range(1, n))
 
@@ -66,15 +63,15 @@ def seams_m(side_m: float) -> tuple[float, ...]:
 def array_field(
     nodes_m: Float[np.ndarray, "s 3"], thickness_m: float, polarity: Polarity, *, cubes_n: tuple[int, int] = CUBES_N
 ) -> Float[np.ndarray, "s 3"]:
-    """Sum the field of so many cubes below, and as many above, at places in the slab, in tesla.
+    """Return the field in T, inside the skin, of the magnetising array: `cubes_n` cubes below it and as many above.
 
-    Cubes that touch share corners: each corner is computed once, with the signs of all its cubes added up.
+    Adjacent cubes share corners: each corner is computed once, weighted by the sum of its cubes' signs.
     """
     if not (nodes_m[:, 2].min() >= 0 and nodes_m[:, 2].max() <= thickness_m):
         got = f"{nodes_m[:, 2].min():.3g} ... {nodes_m[:, 2].max():.3g} m"
         raise ParamsError("magnet array", "places", "inside the slab", got, "Magnetise the skin at rest.")
     signs = np.ones(cubes_n) if polarity == "same" else (-1.0) ** np.add.outer(*map(np.arange, cubes_n))
-    # Of a cube the corner on its right counts +, the one on its left -; along y and z likewise.
+    # The right corner of a cube counts +, the left one -; likewise along y and z.
     weights = -np.diff(-np.diff(np.pad(signs, 1), axis=0), axis=1)
     below_m, above_m = -ARRAY_BELOW_M, thickness_m + ARRAY_ABOVE_M
     faces_m = {below_m: 1, below_m - CUBE_SIDE_M: -1, above_m + CUBE_SIDE_M: 1, above_m: -1}
@@ -87,14 +84,14 @@ def array_field(
 
 
 def magnetise(b_T: Float[np.ndarray, "s 3"], *, saturation_T: float, half_field_T: float) -> Float[np.ndarray, "s 3"]:
-    """Give the magnetisation J that a field leaves in the powder: phi Br u^3 / (1 + u^3) along B, u = |B| / B_half."""
+    """Return the remanent magnetisation J of the powder: phi Br u^3 / (1 + u^3) along B, u = |B| / B_half."""
     u = np.linalg.norm(b_T, axis=1, keepdims=True) / half_field_T
-    # u^2 / half_field_T stands for u^3 / |B|, which is finite where the field vanishes (seam crossings).
+    # u^2 / half_field_T is u^3 / |B|, finite where the field vanishes (seam crossings).
     return saturation_T * b_T * u**2 / half_field_T / (1 + u**3)
 
 
 def moments(j_T: Float[np.ndarray, "s 3"], volumes_m3: Float[np.ndarray, " s"]) -> Float[np.ndarray, "s 3"]:
-    """Turn magnetisation into the dipole moment of each cell, in A m^2."""
+    """Return the dipole moment of each cell in A m^2."""
     return j_T * (volumes_m3 / mu_0)[:, None]
 
 
@@ -103,38 +100,42 @@ SKIN_SIDES_M = (SKIN_SIDE_M, SKIN_SIDE_M)
 SEAMS_M = seams_m(SKIN_SIDE_M)  # of the 4x4 array of 0.25 in cubes that magnetises the authors' skin
 
 
-class Rule(Strict):
-    """A rule of quadrature as a scene writes it: the nearer the chips, the finer it must be (experiment runtime)."""
+class QuadratureSettings(Strict):
+    """Section `quadrature` of a board: the nearer the chips, the finer it must be (experiment runtime)."""
 
     cell_mm: Annotated[float, Field(gt=0, le=20)]
     layers_n: Annotated[int, Field(ge=1, le=100)]
 
-    def quadrature(self) -> "Quadrature":
-        """Give it in SI."""
+    def in_si(self) -> "Quadrature":
+        """Convert to SI units."""
         return Quadrature(self.cell_mm * milli, self.layers_n)
 
 
 @dataclass(frozen=True)
 class Quadrature:
-    """A rule: cells at most so wide, and so many Gauss nodes over the thickness."""
+    """A quadrature rule: the largest width of a cell, and the number of Gauss nodes over the thickness."""
 
     cell_m: float
     layers_n: int
 
 
-CHOSEN = Quadrature(cell_m=0.5e-3, layers_n=6)  # 42 x 42 x 6 nodes; dB within 2 % of cells half as wide (test_skin)
+DEFAULT_QUADRATURE = Quadrature(
+    cell_m=0.5e-3, layers_n=6
+)  # 42 x 42 x 6 nodes; dB within 2 % of cells half as wide (test_skin)
 
 
 @dataclass(frozen=True)
 class Nodes:
-    """Nodes of a skin at rest; x and y from its middle, z from the base (0) to the top."""
+    """Quadrature nodes of a skin at rest; x and y from its centre, z from the base (0) to the top."""
 
     nodes_m: Float[np.ndarray, "s 3"]
     volumes_m3: Float[np.ndarray, " s"]
 
 
-def place_nodes(thickness_m: float, rule: Quadrature = CHOSEN, *, sides_m: tuple[float, float] = SKIN_SIDES_M) -> Nodes:
-    """Fill the skin with midpoints of cells that end at seams and edges, times Gauss nodes in z."""
+def place_nodes(
+    thickness_m: float, rule: Quadrature = DEFAULT_QUADRATURE, *, sides_m: tuple[float, float] = SKIN_SIDES_M
+) -> Nodes:
+    """Place nodes: midpoints of cells that end at seams and edges, times Gauss nodes in z."""
     if not (thickness_m > 0 and rule.cell_m > 0 and rule.layers_n > 0):
         got = f"{thickness_m:.3g} m, {rule.cell_m:.3g} m and {rule.layers_n}"
         raise ParamsError("quadrature", "thickness, cell and layers", "above 0", got, "Mend the design.")
@@ -146,28 +147,29 @@ def place_nodes(thickness_m: float, rule: Quadrature = CHOSEN, *, sides_m: tuple
 
 
 def _cells(side_m: float, rule: Quadrature) -> tuple[Float[np.ndarray, " i"], Float[np.ndarray, " i"]]:
-    """Give the middles and the widths of the cells along one side."""
+    """Return centres and widths of the cells along one side."""
     marks_m = (-side_m / 2, *seams_m(side_m), side_m / 2)
     spans = [np.linspace(a, b, ceil((b - a) / rule.cell_m - 1e-9) + 1) for a, b in pairwise(marks_m)]
     centres_m = np.concatenate([(edges[1:] + edges[:-1]) / 2 for edges in spans])
     return centres_m, np.concatenate([np.diff(edges) for edges in spans])
 
 
+Dipoles = tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]  # positions in m, moments in A m^2
 MU0_4PI = mu_0 / (4 * np.pi)  # CODATA, T m / A; not exactly 1e-7 since 2019
 
 
 def field(
     positions_m: Float[np.ndarray, "s 3"], moments_A_m2: Float[np.ndarray, "s 3"], observers_m: Float[np.ndarray, "o 3"]
 ) -> Float[np.ndarray, "o 3"]:
-    """Sum the fields of all dipoles at each observer, in tesla."""
+    """Return the field in T of all dipoles at each observer."""
     return field_of_each(positions_m, moments_A_m2, observers_m).sum(axis=1)
 
 
 def field_of_each(
     positions_m: Float[np.ndarray, "s 3"], moments_A_m2: Float[np.ndarray, "s 3"], observers_m: Float[np.ndarray, "o 3"]
 ) -> Float[np.ndarray, "o s 3"]:
-    """Give the field of each dipole at each observer: mu0/4pi (3 (m.r) r / r^5 - m / r^3), in tesla."""
-    # The axis of three comes first inside, so that every product runs over long contiguous rows.
+    """Return the field in T of each dipole at each observer: mu0/4pi (3 (m.r) r / r^5 - m / r^3)."""
+    # The axis of three comes first, so that every product runs over long contiguous rows.
     separation = observers_m.T[:, :, None] - positions_m.T[:, None, :]
     moment = moments_A_m2.T[:, None, :]
     r2 = (separation * separation).sum(axis=0)
@@ -178,14 +180,11 @@ def field_of_each(
     return np.moveaxis(each, 0, 2)
 
 
-def change_of_field(
-    rest: tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]],
-    moved: tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]],
-    observers_m: Float[np.ndarray, "o 3"],
-) -> Float[np.ndarray, "o 3"]:
-    """Sum K(x) m' - K(X) m over the dipoles (positions in m, moments in A m^2) at rest (X, m) and moved (x, m').
+def change_of_field(rest: Dipoles, moved: Dipoles, observers_m: Float[np.ndarray, "o 3"]) -> Float[np.ndarray, "o 3"]:
+    """Return the change of field in T of dipoles (positions in m, moments in A m^2) that move and turn.
 
-    Columns that lie together in memory (Fortran order, as `deformation.move_dipoles` gives them) are not copied.
+    The sum of K(x) m' - K(X) m, dipole by dipole: the difference of the two total fields would lose digits. Columns
+    that are contiguous in memory (Fortran order, as `deformation.move_dipoles` gives them) are not copied.
     """
     rows = [np.ascontiguousarray(part.T) for part in (*rest, *moved)]
     change_T = MU0_4PI * _sum_of_changes(*rows, np.ascontiguousarray(observers_m))
@@ -194,8 +193,8 @@ def change_of_field(
     return change_T
 
 
-# Without fastmath the loop over nodes is still vectorised, since it sums nothing; what stays changes exactly nothing.
-# error_model: a division by zero gives infinity, as in NumPy, and is refused above; no test for it inside the loop.
+# The loop over nodes sums nothing, so it is vectorised without fastmath; dipoles that stay change exactly nothing.
+# error_model: a division by zero gives infinity, as in NumPy, which the caller checks for, not the loop.
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _sum_of_changes(nodes, moments, moved, moved_moments, observers):
@@ -221,7 +220,7 @@ def _sum_of_changes(nodes, moments, moved, moved_moments, observers):
     return total
 
 
-# reassoc: lets several partial sums run side by side. Infinities and NaN are still seen.
+# reassoc allows several partial sums in parallel; infinities and NaN are kept.
 @njit(cache=True, fastmath={"reassoc"})
 @no_type_check
 def _total(parts):

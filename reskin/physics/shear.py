@@ -1,4 +1,4 @@
-"""Shear under a dragged tip: friction along its path, and where the traction takes the skin. SI units."""
+"""A dragged tip: Coulomb friction along its path, and the shear of the elastic layer under it. SI units."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -17,39 +17,44 @@ from reskin.physics import deformation, layer
 
 
 class Friction(Strict):
-    """How well tip and skin hold on to each other."""
+    """Section `terms.friction`: Coulomb friction between tip and skin."""
 
     coefficient: Annotated[float, Field(ge=0, le=10)]
 
 
 @dataclass(frozen=True)
-class Drag:
-    """What the skin feels at each place of a path; the material under the tip rested at path - elastic."""
+class DragForce:
+    """Tangential force at each place of a path; the material under the tip rested at path - elastic."""
 
     force_N: Float[np.ndarray, "t 2"]  # on the skin, so along the tip's motion
     elastic_m: Float[np.ndarray, "t 2"]
     sliding: Bool[np.ndarray, " t"]
 
 
-def drag(
+def drag_force(
     path_m: Float[np.ndarray, "t 2"],
     normal_N: Float[np.ndarray, " t"],
     *,
     stiffness_N_per_m: Float[np.ndarray, "t 2 2"] | Float[np.ndarray, " t"] | float,
     friction: float,
-) -> Drag:
-    """Follow a tip that touches at the first place of `path_m`; places without normal force are no contact.
+) -> DragForce:
+    """Return the friction force along the path of a tip that first touches at `path_m[0]`.
 
-    A stiffness is a number, or a symmetric matrix where a skin gives more in one direction than in another.
+    Return mapping (Simo & Hughes 1998): an elastic trial step, whose force is scaled back radially to Coulomb's disc
+    |Q| <= mu F by slip. A step sticks or slides only if both its ends are in contact; otherwise the spring is released,
+    as the place where the tip lifted or touched is not known.
 
-    Return mapping (Simo & Hughes 1998): the spring follows the whole step, and what exceeds the disc |Q| <= mu F is cut
-    off radially as slip. A step sticks or slides only if both its ends are in contact: where in between the tip lifted
-    or touched is not known, so the spring starts anew.
+    Parameters
+    ----------
+    path_m : places of the tip.
+    normal_N : normal force at each place; 0 is no contact.
+    stiffness_N_per_m : tangential stiffness: a number, one per place, or symmetric matrices for anisotropic skins.
+    friction : coefficient mu.
     """
     stiffness = np.asarray(stiffness_N_per_m, dtype=float)
     if stiffness.ndim < 3:
         stiffness = np.where(np.eye(2, dtype=bool), np.broadcast_to(stiffness, normal_N.shape)[:, None, None], 0.0)
-    _refuse(path_m, normal_N, stiffness, friction)
+    _check_drag(path_m, normal_N, stiffness, friction)
     limit_N, touching = friction * normal_N, normal_N > 0
     force_N, elastic_m = np.zeros(path_m.shape), np.zeros(path_m.shape)
     sliding = np.zeros(len(path_m), dtype=bool)
@@ -61,10 +66,10 @@ def drag(
         sliding[now] = trial_N > limit_N[now]
         elastic_m[now] = trial_m * (limit_N[now] / trial_N) if sliding[now] else trial_m
         force_N[now] = stiffness[now] @ elastic_m[now]
-    return Drag(force_N, elastic_m, sliding)
+    return DragForce(force_N, elastic_m, sliding)
 
 
-def _refuse(
+def _check_drag(
     path_m: Float[np.ndarray, "t 2"],
     normal_N: Float[np.ndarray, " t"],
     stiffness: Float[np.ndarray, "t 2 2"],
@@ -81,29 +86,29 @@ def _refuse(
         raise ParamsError("drag", "friction", "0 or more and finite", f"{friction}", "Check the scene.")
 
 
-REACH = 5.0  # in thicknesses, past the contact, as in `flow`: what lies beyond does not move
-WIDEST = 3.0  # contact radius in thicknesses: waves of `layer.WAVES_KH` are not sampled for more
-RIM_MAX = 1.2  # of the thickness, as in `flow`; a rim above the thickness moves as the surface does
-STEP = 0.75  # half of a curl at most for one step: on the skin, one step to 0.6 mm and mu 0.8
-STEEPEST = 1.5  # half of a curl: mu 0.8 at 1.2 mm; no steps were compared with finer ones for more
+REACH = 5.0  # in thicknesses, past the contact, as in `deformation`: material beyond does not move
+WIDEST = 3.0  # contact radius in thicknesses: `layer.WAVES_KH` does not sample waves for more
+RIM_MAX = 1.2  # of the thickness, as in `deformation`; a rim above the thickness moves as the surface does
+STEP = 0.75  # largest half curl of one step: on the skin, one step to 0.6 mm and mu 0.8
+STEEPEST = 1.5  # largest half curl that was compared with finer steps: mu 0.8 at 1.2 mm
 TABLE_R_N, TABLE_Z_N = 512, 80  # linear interpolation is enough
 DEPTH_STEP_M = 10e-6  # between tabulated depths: stiffness differs by 1 %, dB by 0.1 uT
 
 
 @dataclass(frozen=True)
 class Traction:
-    """A tangential traction round its centre, as weights of its transform: q^(k) / Q = sum of weights * cos(k x)."""
+    """An axisymmetric tangential traction, as weights of its transform: q^(k) / Q = sum of weights * cos(k x)."""
 
     radius_m: float
     x_m: Float[np.ndarray, " q"]
-    weights: Float[np.ndarray, " q"]  # 1 in sum
+    weights: Float[np.ndarray, " q"]  # sum 1
 
 
 @dataclass(frozen=True)
-class Response:
-    """The layer under a wave of tangential traction T, as functions of kz; primes are derivatives by kz.
+class WaveResponse:
+    """Response of the layer to a wave of tangential traction T, as functions of kz; primes are derivatives by kz.
 
-    In the plane of the wave T / 2Gk makes w' along it and -i w up; across it T / Gk makes v.
+    In the plane of the wave T / 2Gk gives w' along it and -i w up; across it T / Gk gives v.
     """
 
     w: Float[np.ndarray, "z k"]
@@ -115,40 +120,40 @@ class Response:
 
 @dataclass(frozen=True)
 class ShearMap:
-    """What a force Q along x does at (r, z), divided by Q / G; equal steps in r and in z.
+    """Displacement and half curl at (r, z) of a force Q along x, divided by Q / G; equal steps in r and in z.
 
     Parts A, B, C in 1/m: displacement A + B cos 2f, B sin 2f, C cos f along x, y, z at the angle f from x.
-    Parts D, E, S in 1/m^2: half of the curl -E sin 2f, D + E cos 2f, S sin f.
+    Parts D, E, S in 1/m^2: half curl -E sin 2f, D + E cos 2f, S sin f.
     """
 
     r_m: Float[np.ndarray, " i"]
     z_m: Float[np.ndarray, " j"]
     parts: Float[np.ndarray, "i j 6"]
     stiffness_m: float  # k_t / G
-    steepest_per_m2: float  # the largest half of a curl
+    steepest_per_m2: float  # the largest half curl
 
 
 @dataclass(frozen=True)
-class Sheared:
-    """Displacement of each node, and half of its curl: the rotation vector, as long as it is small."""
+class ShearDisplacement:
+    """Displacement of each node, and half of its curl, which is the rotation vector for small rotations."""
 
     displacement_m: Float[np.ndarray, "s 3"]
     half_curl: Float[np.ndarray, "s 3"]
 
 
-def slip(contact: layer.Contact) -> Traction:
-    """Give the traction of a sliding tip: Coulomb's q = mu p, so the shape of the pressure.
+def slip_traction(contact: layer.Contact) -> Traction:
+    """Return the traction of a sliding tip: Coulomb's q = mu p, so the shape of the pressure.
 
-    It serves the whole of a drag, which slides but for its first millimetre or two: its k_t is 19 to 20 % below that of
-    `stick` on the skin at 0.2 to 1.2 mm, 1/6 on a thick layer.
+    It is used for the whole drag, which slides except for its first millimetre or two: its k_t is 19 to 20 % below that
+    of `stick_traction` on the skin at 0.2 to 1.2 mm, 1/6 on a thick layer.
     """
     return Traction(contact.radius_m, contact.x_m, contact.weights_m2 / contact.weights_m2.sum())
 
 
-def stick(radius_m: float, thickness_m: float) -> Traction:
-    """Give the traction of a tip that sticks: the axisymmetric one that moves its contact as one, but for B.
+def stick_traction(radius_m: float, thickness_m: float) -> Traction:
+    """Return the traction of a sticking tip: the axisymmetric one that moves its contact rigidly, apart from B.
 
-    chi - K chi = 1 (compare `layer.contact_of_radius`); chi is even for a thick layer: Mindlin's (a^2 - r^2)^(-1/2).
+    chi - K chi = 1 (see `layer.contact_of_radius`); chi is constant for a thick layer: Mindlin's (a^2 - r^2)^(-1/2).
     """
     x_m, weights_m = radius_m * layer.CONTACT_X, radius_m * layer.CONTACT_W
     kernel = _kernel(x_m, thickness_m) * weights_m
@@ -156,10 +161,10 @@ def stick(radius_m: float, thickness_m: float) -> Traction:
     return Traction(radius_m, x_m, weights_m * chi / (weights_m @ chi))
 
 
-def stiffness_m(traction: Traction, thickness_m: float) -> float:
-    """Give k_t / G, force over the mean displacement along it; the mean is weighted with the traction, as work is.
+def tangential_stiffness_m(traction: Traction, thickness_m: float) -> float:
+    """Return k_t / G, the force over the mean displacement along it, weighted with the traction (as work is).
 
-    Parseval: 8 pi / integral of q^2 (w' + 2v) dk at the surface, whose half-space part 3 is done in closed form.
+    Parseval: 8 pi / integral of q^2 (w' + 2v) dk at the surface, whose half-space part 3 is in closed form.
     """
     chi = traction.weights / (traction.radius_m * layer.CONTACT_W)
     held = _kernel(traction.x_m, thickness_m) @ traction.weights
@@ -168,22 +173,22 @@ def stiffness_m(traction: Traction, thickness_m: float) -> float:
 
 @lru_cache(maxsize=32)
 def tabulate_depth(depth_m: float, *, thickness_m: float, tip_radius_m: float, base: layer.Base) -> ShearMap:
-    """Tabulate the traction of a tip that slides at this depth, above 0, as far out as at the deepest verified depth.
+    """Tabulate the shear under a tip that slides at this depth, out to the reach at the deepest verified depth.
 
-    The base tells the contact only: sideways it is held, or no force would stay under the tip.
+    `base` determines the contact only: sideways the base is held, or no force could act on the layer.
     """
     layer.check_layer(np.array([depth_m]), thickness_m, tip_radius_m)
     if not depth_m > 0:
         raise ParamsError("drag", "depth", "above 0 m", f"{depth_m}", "Touch the skin.")
     contact = layer.contact_of_depth(depth_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m, base=base)
     reach_m = thickness_m * deformation.reach(tip_radius_m / thickness_m, base)
-    return tabulate(slip(contact), thickness_m, reach_m)
+    return tabulate(slip_traction(contact), thickness_m, reach_m)
 
 
 def at_depth(depth_m: float, *, thickness_m: float, tip_radius_m: float, base: layer.Base) -> ShearMap:
-    """Give the map at a depth above 0: linear between tabulated depths, so that a tip that sinks moves nothing at once.
+    """Interpolate the map linearly between tabulated depths, so that it is continuous in the depth.
 
-    Above the first of them (`DEPTH_STEP_M`) it is that one's: there the force is close to zero.
+    Below the first of them (`DEPTH_STEP_M`), where the force is close to zero, it is the first.
     """
     at = max(depth_m / DEPTH_STEP_M, 1.0)
     first, share = int(at), at - int(at)
@@ -201,7 +206,7 @@ def at_depth(depth_m: float, *, thickness_m: float, tip_radius_m: float, base: l
 
 
 def tabulate(traction: Traction, thickness_m: float, reach_m: float | None = None) -> ShearMap:
-    """Sum the waves of a traction at every place of a table, `REACH` thicknesses past the contact if not said."""
+    """Tabulate the shear of a traction, by default to `REACH` thicknesses past the contact."""
     if not 0 < traction.radius_m <= WIDEST * thickness_m < np.inf:
         rule, got = f"above 0 m and at most {WIDEST} thicknesses", f"{traction.radius_m} m on {thickness_m} m"
         raise ParamsError("drag", "contact radius", rule, got, "Press less deep.")
@@ -209,25 +214,28 @@ def tabulate(traction: Traction, thickness_m: float, reach_m: float | None = Non
         reach_m = traction.radius_m + REACH * thickness_m
     r_m = np.linspace(0, reach_m, TABLE_R_N)
     z_m = np.linspace(0, thickness_m, TABLE_Z_N)
-    parts = parts_at(traction, r_m, z_m, thickness_m=thickness_m)
-    parts[:, 0, :3] = 0.0  # the base is glued, though the material on it shears and so turns
+    parts = evaluate_map(traction, r_m, z_m, thickness_m=thickness_m)
+    parts[:, 0, :3] = 0.0  # the base is held, though the material on it shears and so turns
     d, e, s = np.moveaxis(parts[..., 3:], 2, 0)
-    steepest_per_m2 = max(np.abs(d + e).max(), np.hypot(d - e, s).max())  # in line and beside; nowhere between is more
-    return ShearMap(r_m, z_m, parts, stiffness_m(traction, thickness_m), float(steepest_per_m2))
+    steepest_per_m2 = max(
+        np.abs(d + e).max(), np.hypot(d - e, s).max()
+    )  # at f = 0 and 90 degrees; in between it is smaller
+    return ShearMap(r_m, z_m, parts, tangential_stiffness_m(traction, thickness_m), float(steepest_per_m2))
 
 
-def parts_at(
+def evaluate_map(
     traction: Traction, r_m: Float[np.ndarray, " i"], z_m: Float[np.ndarray, " j"], *, thickness_m: float
 ) -> Float[np.ndarray, "i j 6"]:
-    """Give the parts of `ShearMap` on a grid: Hankel integrals of J0, J2, J1, a product of matrices each.
+    """Return the parts of `ShearMap` on a grid: Hankel integrals with J0, J2, J1, as matrix products.
 
-    A traction q along x is q cos f along a wave of direction f, -q sin f across it; integrals over f are Bessel's.
+    A traction q along x is q cos f along a wave of direction f and -q sin f across it; integrals over f give Bessel
+    functions.
     """
     k_per_m = layer.WAVES_KH / thickness_m
-    window = np.cos(np.pi * np.maximum(layer.WAVES_KH / layer.WAVES_KH[-1] - 0.5, 0)) ** 2  # hides the cut
+    window = np.cos(np.pi * np.maximum(layer.WAVES_KH / layer.WAVES_KH[-1] - 0.5, 0)) ** 2  # avoids ringing
     waves = np.cos(np.outer(k_per_m, traction.x_m)) @ traction.weights * window
     of = waves * layer.WAVES_W / thickness_m / (8 * np.pi)
-    at = response(np.outer(z_m, k_per_m), layer.WAVES_KH)
+    at = wave_response(np.outer(z_m, k_per_m), layer.WAVES_KH)
     kr = np.outer(r_m, k_per_m)
     bessel0, bessel1 = j0(kr), j1(kr)
     bessel2 = np.where(kr > 0, 2 * bessel1 / np.where(kr > 0, kr, 1.0) - bessel0, 0.0)
@@ -242,18 +250,18 @@ def parts_at(
     return np.stack([bessel @ profile.T for bessel, profile in products], axis=2)
 
 
-def response(kz: Float[np.ndarray, "z k"], kh: Float[np.ndarray, " k"]) -> Response:
-    """Solve the layer for one wave: glued below, on top a tangential traction and nothing else.
+def wave_response(kz: Float[np.ndarray, "z k"], kh: Float[np.ndarray, " k"]) -> WaveResponse:
+    """Return the response of the layer, held at its base, to a wave of tangential traction on top.
 
-    w = [A z' cosh t - t cosh A sinh z'] / (cosh^2 A + A^2), v = sinh z' / cosh A, A = kh, z' = kz, t = A - z'; that is
-    the W of PHYSICS 4 with W''' = 3 W' at the top. Divided by exp(2A) / 4, no exponent is positive inside the layer.
+    w = [A z' cosh t - t cosh A sinh z'] / (cosh^2 A + A^2), v = sinh z' / cosh A, A = kh, z' = kz, t = A - z': the W of
+    `layer` with W''' = 3 W' at the top. Divided by exp(2A) / 4, so that no exponent is positive inside the layer.
     """
     t = kh - kz
     top, low, high = np.exp(-t), np.exp(-2 * kz), np.exp(-2 * t)
     base = np.exp(-2 * kh)
     size = (1 + base) ** 2 + 4 * kh**2 * base
     near, far = (1 + base) / size * top, 2 * kh / size * np.exp(-kh - kz)
-    return Response(
+    return WaveResponse(
         w=far * kz * (1 + high) - near * t * (1 - low),
         w_slope=far * (1 + high - kz * (1 - high)) + near * (1 - low - t * (1 + low)),
         w_spin=2 * near * (1 + low) - 2 * far * (1 - high),
@@ -262,37 +270,36 @@ def response(kz: Float[np.ndarray, "z k"], kh: Float[np.ndarray, " k"]) -> Respo
     )
 
 
-def shear(
+def shear_displacement(
     of: ShearMap,
     places_m: Float[np.ndarray, "s 3"],
     centre_m: Float[np.ndarray, "2"],
     *,
     force_N: Float[np.ndarray, "2"],
     modulus_Pa: float,
-) -> Sheared:
-    """Give what a force on the skin round `centre_m` does to material at these places; the modulus is Young's, 3 G."""
+) -> ShearDisplacement:
+    """Return the linear displacement and half curl by a force around `centre_m`; the modulus is Young's, 3 G."""
     lowest_m, highest_m = places_m[:, 2].min(initial=0.0), places_m[:, 2].max(initial=0.0)
     if not (0 <= lowest_m and highest_m <= RIM_MAX * of.z_m[-1]):
         rule, got = f"0 to {RIM_MAX} of the thickness", f"{lowest_m:.3g} to {highest_m:.3g} m"
         raise ParamsError("drag", "height of nodes", rule, got, "Press less deep.")
     shear_m2 = _over_modulus(force_N, modulus_Pa)
-    return Sheared(*_at_places(of.parts, (of.r_m[1], of.z_m[1]), places_m, centre_m, shear_m2))
+    return ShearDisplacement(*_at_places(of.parts, (of.r_m[1], of.z_m[1]), places_m, centre_m, shear_m2))
 
 
-def carry(
+def shear_in_steps(
     of: ShearMap,
     places_m: Float[np.ndarray, "s 3"],
     centre_m: Float[np.ndarray, "2"],
     *,
     force_N: Float[np.ndarray, "2"],
     modulus_Pa: float,
-) -> Sheared:
-    """Give what the whole force of a drag does to nodes that `flow` has moved, in midpoint steps: shear is not small.
+) -> ShearDisplacement:
+    """Return the finite shear of nodes that `deformation` has moved, in midpoint steps.
 
-    `centre_m` is where the material under the tip rested, for `flow` too: the tip's place less Q / k_t, which is
-    `friction.Drag.elastic_m`; the shear takes it to the tip. Add the displacement, turn by `angle_and_axis` what `flow`
-    has turned. At mu 0.8, dB is within 1.2 % of 24 steps down to 0.8 mm and 3 % at 1.2 mm; by `shear` of nodes at rest
-    it is 13 to 90 % off.
+    `centre_m` is the rest position of the material under the tip, where `deformation` is centred too: the tip's place
+    less Q / k_t (`DragForce.elastic_m`). At mu 0.8, dB is within 1.2 % of 24 steps down to 0.8 mm and within 3 % at
+    1.2 mm; a single `shear_displacement` of the nodes at rest is 13 to 90 % off.
     """
     shear_m2 = _over_modulus(force_N, modulus_Pa)
     steepest = of.steepest_per_m2 * float(np.hypot(*shear_m2))
@@ -304,19 +311,19 @@ def carry(
     moved_m, half_curl = np.zeros_like(places_m), np.zeros_like(places_m)
     for step_i in range(steps_n):
         at_m, there_m = places_m + moved_m, centre_m + step_i * ahead_m
-        first = shear(of, at_m, there_m, force_N=part_N, modulus_Pa=modulus_Pa)
+        first = shear_displacement(of, at_m, there_m, force_N=part_N, modulus_Pa=modulus_Pa)
         half_m = at_m + first.displacement_m / 2
-        middle = shear(of, half_m, there_m + ahead_m / 2, force_N=part_N, modulus_Pa=modulus_Pa)
+        middle = shear_displacement(of, half_m, there_m + ahead_m / 2, force_N=part_N, modulus_Pa=modulus_Pa)
         moved_m += middle.displacement_m
-        half_curl += middle.half_curl  # in simple shear they add up, as F does
-    return Sheared(moved_m, half_curl)
+        half_curl += middle.half_curl  # additive in simple shear, as F is
+    return ShearDisplacement(moved_m, half_curl)
 
 
-def angle_and_axis(half_curl: Float[np.ndarray, "s 3"]) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, "s 3"]]:
-    """Give the R of F = R U: the arc tangent of half the curl, exact in plane strain."""
+def rotation_from_curl(half_curl: Float[np.ndarray, "s 3"]) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, "s 3"]]:
+    """Return angle and axis of R in F = R U: the arc tangent of the half curl, exact in plane strain."""
     size = np.sqrt((half_curl**2).sum(axis=1))
     axis = half_curl / np.where(size > 0, size, 1.0)[:, None]
-    axis[size == 0] = (1.0, 0.0, 0.0)  # where nothing turns, any axis will do
+    axis[size == 0] = (1.0, 0.0, 0.0)  # without rotation any axis serves
     return np.arctan(size), axis
 
 
@@ -329,7 +336,7 @@ def _over_modulus(force_N: Float[np.ndarray, "2"], modulus_Pa: float) -> Float[n
 @njit(cache=True, fastmath=False)
 @no_type_check
 def _at_places(parts, steps, places, centre, force):
-    # Parts bilinear between the table's places, as in `flow`, then put together for a force of any direction.
+    # Bilinear interpolation of the parts, then combined for the direction of the force.
     r_n, z_n, _ = parts.shape
     moved, half_curl = np.zeros_like(places), np.zeros_like(places)
     at, (fx, fy) = np.empty(6), force
@@ -346,7 +353,7 @@ def _at_places(parts, steps, places, centre, force):
             far = parts[j + 1, k, p] + share_z * (parts[j + 1, k + 1, p] - parts[j + 1, k, p])
             at[p] = near + share_r * (far - near)
         a, b, c, d, e, s = at
-        # On the axis the parts that know a direction are zero, so any direction will do there.
+        # On the axis the parts that depend on a direction are zero, so any direction serves.
         cos, sin = (x / r, y / r) if r > 0 else (1.0, 0.0)
         along, across = fx * cos + fy * sin, fx * sin - fy * cos
         twice_x, twice_y = 2 * along * cos - fx, 2 * along * sin - fy
@@ -356,8 +363,8 @@ def _at_places(parts, steps, places, centre, force):
 
 
 def _kernel(x_m: Float[np.ndarray, " q"], thickness_m: float) -> Float[np.ndarray, "q q"]:
-    # 2/pi integral of (1 - (w' + 2v) / 3) cos(k x) cos(k x') dk: what the base holds back of a half-space's 3.
-    at = response(layer.KERNEL_KH[None], layer.KERNEL_KH)
+    # 2/pi times the integral of (1 - (w' + 2v) / 3) cos(k x) cos(k x') dk: the base's part of a half-space's 3.
+    at = wave_response(layer.KERNEL_KH[None], layer.KERNEL_KH)
     missing = layer.KERNEL_W / thickness_m * (1 - (at.w_slope[0] + 2 * at.v[0]) / 3)
     waves = np.cos(np.outer(x_m, layer.KERNEL_KH / thickness_m))
     return 2 / np.pi * (waves * missing) @ waves.T

@@ -1,7 +1,7 @@
-"""One skin, and the change of field that pokes make. In: a design, a name, a board, pokes. Out: tesla and newtons.
+"""A magnetised skin: its design, drawn skins, and the change of field and the force of indentations. SI units.
 
-A skin is drawn from a generator that bears its name: skin 7 stays the same when skin 8 is added.
-Refuses to know chips' electronics, protocols and labels: pokes come as true places in the board's frame.
+Each skin is drawn by a random generator of its name: skin 7 stays the same when skin 8 is added. Indentations are true
+places and commanded depths in the board's frame.
 """
 
 from collections.abc import Iterator
@@ -16,23 +16,20 @@ from scipy.constants import kilo, milli
 from reskin.config import Strict
 from reskin.errors import ParamsError
 from reskin.physics import deformation, layer, magnet, slide
-from reskin.physics import magnet as dipole
 from reskin.physics.board import Board, Spreads
-from reskin.physics.magnet import CHOSEN, SKIN_SIDES_M, Quadrature, change_of_field, place_nodes
+from reskin.physics.magnet import DEFAULT_QUADRATURE, SKIN_SIDES_M, Dipoles, Quadrature, change_of_field, place_nodes
 from reskin.seeds import rng_for
 
-Dipoles = tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]  # positions in m, moments in A m^2
-
-FILLER_WAVES_N = 64  # plane waves that make up a skin's unevenness
+FILLER_WAVES_N = 64  # plane waves of the local variation of the filler
 
 
 class SkinDesign(Strict):
-    """What all skins of a scene have in common, the tip that pokes them included."""
+    """Section `skin`: what all skins of a scene have in common, and the tip that presses them."""
 
     polarity: magnet.Polarity
-    flipped: bool  # every field has the other sign: a checkerboard skin that lies turned by a quarter
+    flipped: bool  # the opposite sign: a checkerboard skin that is turned by 90 degrees
     base: layer.Base
-    hold: slide.HoldDesign | None  # of a finite skin that slides as one; none: endless, its force that of `layer`
+    hold: slide.HoldDesign | None  # of a finite skin that slides rigidly; None: infinite, with the force of `layer`
     saturation_T: Annotated[float, Field(ge=0, le=1)]  # phi Br: volume fraction times remanence of the powder
     half_field_T: Annotated[float, Field(gt=0, le=10)]  # field that magnetises the powder to half of that
     thickness_mm: Annotated[float, Field(gt=0, le=20)]
@@ -48,12 +45,12 @@ class SkinDesign(Strict):
 
 @dataclass(frozen=True)
 class Skin:
-    """One skin at rest on its board, in the board's frame; its pattern and its edges sit where the skin does."""
+    """One skin at rest on its board, in the board's frame."""
 
     name: str
     nodes_m: Float[np.ndarray, "s 3"]
     moments_A_m2: Float[np.ndarray, "s 3"]
-    seat_m: Float[np.ndarray, " 2"]  # the skin's middle
+    seat_m: Float[np.ndarray, " 2"]  # the skin's centre
     sides_m: tuple[float, float]
     thickness_m: float
     modulus_Pa: float
@@ -69,12 +66,12 @@ def draw_skin(
     *,
     seed: int,
     name: str,
-    rule: Quadrature = CHOSEN,
+    rule: Quadrature = DEFAULT_QUADRATURE,
     sides_m: tuple[float, float] = SKIN_SIDES_M,
 ) -> Skin:
-    """Draw the skin called `name`, as it sits on its board; another rule of quadrature sees the same skin.
+    """Draw the skin of this name, as it sits on its board; any quadrature rule discretises the same skin.
 
-    An array of magnets that covers a skin of other sides magnetises it.
+    Skins of other sides are magnetised by an array of magnets that covers them.
     """
     rng = rng_for(seed, "skin", name)
     amplitude, thickness, modulus = np.exp(
@@ -111,12 +108,17 @@ def draw_skin(
 def changes_of_field(
     board: Board, skin: Skin, pokes_m: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "n k 3"]]:
-    """Give the field at rest, and how each poke (x, y, depth) changes it, at the chips, in tesla.
+    """Return the no-load field, and its change by each indentation (x, y, depth), at the chips in T.
 
-    No contact (true depth of zero or less): exactly zero. A poke beside the skin is refused.
+    Without contact (true depth of 0 or less) the change is exactly zero.
+
+    Raises
+    ------
+    ParamsError
+        If an indentation is beside the skin or too deep.
     """
-    # Chip by chip, to bound memory: a large skin under many chips has millions of pairs.
-    rest_T = np.concatenate([dipole.field(skin.nodes_m, skin.moments_A_m2, chip_m[None]) for chip_m in board.chips_m])
+    # Chip by chip, to bound memory: a large skin over many chips has millions of pairs.
+    rest_T = np.concatenate([magnet.field(skin.nodes_m, skin.moments_A_m2, chip_m[None]) for chip_m in board.chips_m])
     changes_T = np.zeros((len(pokes_m), *board.chips_m.shape))
     for poke_i, before, after in moved_dipoles(skin, pokes_m):
         changes_T[poke_i] = change_of_field(before, after, board.chips_m)
@@ -126,20 +128,20 @@ def changes_of_field(
 def moved_dipoles(
     skin: Skin, pokes_m: Float[np.ndarray, "n 3"], slid: Float[np.ndarray, " n"] | None = None
 ) -> Iterator[tuple[int, Dipoles, Dipoles]]:
-    """Yield index, dipoles at rest and dipoles moved, of each poke that moves some: of those within its reach alone.
+    """Yield index, dipoles at rest and dipoles moved (those within reach), of each indentation in contact.
 
-    `slid` is the share of each press's slide that takes place, all of it if not said. What displaces the dipoles
-    further may be applied to the last; `change_of_field` sums what they change.
+    `slid` is the share of the rigid motion of each press that takes place (default: all of it). Further displacements
+    may be applied to the moved dipoles before `change_of_field`.
     """
     true_m = pokes_m + np.array([0.0, 0.0, skin.depth_zero_m])
-    _refuse_beside(true_m, skin)
-    contacts = np.flatnonzero(~(true_m[:, 2] <= 0))  # a depth that is NaN goes on, to be refused
+    _check_on_skin(true_m, skin)
+    contacts = np.flatnonzero(~(true_m[:, 2] <= 0))  # a NaN depth goes on, to be refused
     if not contacts.size:
         return
     rest = deformation.group_by_height(skin.nodes_m, skin.moments_A_m2, skin.thickness_m)
     deepest_m = float(np.max(true_m[:, 2]))
     table = deformation.tabulate(skin.thickness_m, skin.tip_radius_m, deepest_m, heights=rest.heights, base=skin.base)
-    slides = None if skin.hold is None else press_slides(skin, skin.hold, true_m[contacts])
+    slides = None if skin.hold is None else press_motion(skin, skin.hold, true_m[contacts])
     if slides is not None and slid is not None:
         slides = slides.scaled(slid[contacts])
     for i, poke_i in enumerate(contacts):
@@ -149,28 +151,29 @@ def moved_dipoles(
         yield int(poke_i), moved.before, moved.after
 
 
-def press_slides(skin: Skin, hold: slide.Hold, true_m: Float[np.ndarray, "n 3"]) -> slide.RigidMotion:
-    """Give how presses (x, y, true depth) slide a skin on its base, as one, as far as the tip's friction allows.
+def press_motion(skin: Skin, hold: slide.Hold, true_m: Float[np.ndarray, "n 3"]) -> slide.RigidMotion:
+    """Return the rigid motion of the skin under presses (x, y, true depth), as far as the tip's friction allows.
 
-    The slide away from the middle is gone at a depth, whatever the modulus; friction is felt in newtons.
+    The displacement away from the centre depends on the depth, whatever the modulus; the bound of friction on the force
+    in N.
     """
     places_m = true_m[:, :2] - skin.seat_m
     relative_m2 = slide.force_at(
         true_m[:, 2], modulus_Pa=1.0, thickness_m=skin.thickness_m, tip_radius_m=skin.tip_radius_m
     )
     load = np.minimum(relative_m2 / hold.lets_go_m2, 1.0)
-    taken_m = slide.press_displacement_m(places_m, load, give_m=hold.give_m, away=hold.away)
-    whole = slide.rigid_motion(places_m, taken_m, skin.sides_m)
+    displacement_m = slide.press_displacement_m(places_m, load, give_m=hold.give_m, away=hold.away)
+    whole = slide.rigid_motion(places_m, displacement_m, skin.sides_m)
     return slide.limit_by_friction(whole, skin.modulus_Pa * relative_m2, hold.grip_N_per_m)
 
 
-def beyond_verified_n(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> int:
-    """Count the commanded depths that take this skin deeper than any published solution vouches for."""
+def count_beyond_verified(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> int:
+    """Count the commanded depths beyond the range of the published solutions."""
     return int(layer.beyond_verified(depth_m + skin.depth_zero_m, skin.thickness_m).sum())
 
 
 def forces(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Give the force that the tip feels at commanded depths, in newtons, positive in compression."""
+    """Return the normal force on the tip in N at commanded depths, positive in compression."""
     of = {"thickness_m": skin.thickness_m, "tip_radius_m": skin.tip_radius_m, "modulus_Pa": skin.modulus_Pa}
     true_m = depth_m + skin.depth_zero_m
     if skin.hold is not None:
@@ -179,14 +182,14 @@ def forces(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, " 
 
 
 def shear_moduli_Pa(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Give the shear modulus that the layer under the tip shows at commanded depths; incompressible: E / 3."""
+    """Return the shear modulus of the layer under the tip at commanded depths: E / 3 (incompressible), stiffened."""
     if skin.hold is None:
         return np.full(len(depth_m), skin.modulus_Pa / 3)
     return skin.modulus_Pa / 3 * slide.stiffening(depth_m + skin.depth_zero_m, skin.thickness_m)
 
 
-def _refuse_beside(pokes_m: Float[np.ndarray, "n 3"], skin: Skin) -> None:
-    # The layer is endless in the model: past the skin's edge it would press on material that is not there.
+def _check_on_skin(pokes_m: Float[np.ndarray, "n 3"], skin: Skin) -> None:
+    # The model's layer is infinite: past the skin's edge the tip would press on material that is not there.
     half_m = np.array(skin.sides_m) / 2
     off = ~(np.abs(pokes_m[:, :2] - skin.seat_m) <= half_m).all(axis=1)
     if off.any():
@@ -197,7 +200,7 @@ def _refuse_beside(pokes_m: Float[np.ndarray, "n 3"], skin: Skin) -> None:
 
 
 def _filler(xy_m: Float[np.ndarray, "s 2"], spreads: Spreads, rng: np.random.Generator) -> Float[np.ndarray, " s"]:
-    # A smooth random factor as a sum of plane waves: it knows no lattice, so a finer one sees the same skin.
+    # A smooth random factor as a sum of plane waves: independent of the nodes, so finer ones sample the same skin.
     waves = rng.standard_normal((FILLER_WAVES_N, 2)) / (spreads.skin_filler_length_mm * milli)
     phases = rng.uniform(0, 2 * np.pi, FILLER_WAVES_N)
     uneven = np.sqrt(2 / FILLER_WAVES_N) * np.cos(xy_m @ waves.T + phases).sum(axis=1)

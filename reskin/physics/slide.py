@@ -22,6 +22,7 @@ from scipy.constants import kilo, micro, milli
 from reskin.config import Strict
 from reskin.errors import ParamsError
 from reskin.physics import layer
+from reskin.physics.magnet import Dipoles
 
 STIFFENING = 1.5  # exponent, chosen with both boards in view; 1.25 to 2 explain them as well
 DEEPEST = 0.72  # of the thickness: larger forces are treated as the force at this depth
@@ -128,9 +129,9 @@ def rigid_motion(
 def apply(
     motion: RigidMotion,
     i: int,
-    dipoles: tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]],
+    dipoles: Dipoles,
     centre_m: Float[np.ndarray, "2"] = CENTRE_M,
-) -> tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]:
+) -> Dipoles:
     """Apply motion `i` to dipoles: rotate positions (about the skin's centre) and moments, then translate."""
     positions_m, moments_A_m2 = (part.T.copy() for part in dipoles)
     apply_in_place(motion, i, (positions_m.T, moments_A_m2.T), centre_m)
@@ -140,7 +141,7 @@ def apply(
 def apply_in_place(
     motion: RigidMotion,
     i: int,
-    dipoles: tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]],
+    dipoles: Dipoles,
     centre_m: Float[np.ndarray, "2"] = CENTRE_M,
 ) -> None:
     """Apply motion `i` as `apply` does, overwriting the arrays: an indentation moves thousands of dipoles."""

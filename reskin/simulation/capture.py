@@ -13,7 +13,6 @@ from reskin.board import wire
 from reskin.board.wire import Frames
 from reskin.physics.board import draw_board
 from reskin.physics.chip import steps_uT
-from reskin.physics.force_sensor import read_force
 from reskin.physics.skin import Skin, draw_skin
 from reskin.recordings import clocks, probe
 from reskin.recordings.clocks import Arrivals
@@ -23,7 +22,18 @@ from reskin.recordings.readers import sd_card
 from reskin.seeds import rng_for
 from reskin.simulation.contact import Response, respond
 from reskin.simulation.protocols import Plan, Walk, depths_under
-from reskin.simulation.rig import Rig, chunks, draw_clock, misplace, probe_log, read_frames, set_up, switch_on, timeline
+from reskin.simulation.rig import (
+    Rig,
+    chunks,
+    draw_clock,
+    misplace,
+    probe_log,
+    read_force,
+    read_frames,
+    set_up,
+    switch_on,
+    timeline,
+)
 from reskin.simulation.settings import MAIN, Synthesis
 
 WIRE: Wire = "binary"
@@ -65,7 +75,7 @@ def record(synthesis: Synthesis, protocol: str, *, board: str, skin: str, seed: 
     kind = synthesis.boards[settings.boards]
     rngs = {part: rng_for(seed, "recording", protocol, board, skin, part) for part in PARTS}
     drawn_board = draw_board(kind.design, spreads, seed=seed, name=board)
-    rule = kind.quadrature.quadrature()
+    rule = kind.quadrature.in_si()
     drawn_skin = draw_skin(synthesis.skin, spreads, seed=seed, name=skin, rule=rule, sides_m=kind.skin_m)
     plan = settings.plan(rngs["plan"], kind.skin_mm)
     tip_m = _tip(plan, rig, drawn_skin, rngs["robot"])

@@ -20,23 +20,22 @@ from reskin.physics.aging import (
     Memory,
     Relaxation,
     Temperature,
+    baseline_walk,
     fading,
-    force_left,
-    remembered,
+    field_memory,
+    relaxed_share,
     softening,
-    wandering,
 )
 from reskin.physics.board import Board
-from reskin.physics.magnet import change_of_field
-from reskin.physics.shear import Friction, drag
+from reskin.physics.magnet import Dipoles, change_of_field
+from reskin.physics.shear import Friction, drag_force
 from reskin.physics.skin import (
-    Dipoles,
     Skin,
-    beyond_verified_n,
     changes_of_field,
+    count_beyond_verified,
     forces,
     moved_dipoles,
-    press_slides,
+    press_motion,
     shear_moduli_Pa,
 )
 
@@ -107,15 +106,15 @@ def respond(
         contacts_n, ageing = np.arange(n), terms.ageing
         force_N *= softening(contacts_n, settling=ageing.settling, ageing=ageing.ageing)[:, None, None]
         left = 1 - fading(contacts_n, per_decade=ageing.fading_per_decade)
-        walk_T = wandering(contacts_n, rest_T.size, step_T=ageing.wandering_uT * micro, rng=rng)
+        walk_T = baseline_walk(contacts_n, rest_T.size, step_T=ageing.wandering_uT * micro, rng=rng)
         every_rest_T = left[:, None, None] * rest_T + walk_T.reshape(-1, *rest_T.shape)
     if terms.relaxation is not None:
-        force_N *= force_left(terms.relaxation)
+        force_N *= relaxed_share(terms.relaxation)
     if terms.memory is not None:
-        before_T, added_T = remembered(change_T, terms.memory)
+        before_T, added_T = field_memory(change_T, terms.memory)
         every_rest_T = every_rest_T + before_T
         change_T = change_T + added_T
-    deep_n = beyond_verified_n(skin, flat_m[:, 2])
+    deep_n = count_beyond_verified(skin, flat_m[:, 2])
     return Response(every_rest_T, change_T, force_N, deep_n)
 
 
@@ -144,7 +143,7 @@ def _push_once(
     for stop_i in np.flatnonzero(normal_N > 0).tolist():
         layer_N_per_m[stop_i] = shear_Pa[stop_i] * _map(skin, tip_m[stop_i, 2]).stiffness_m
     slides_m_per_N = _slides_m_per_N(skin, tip_m[:, :2])
-    dragged = drag(
+    dragged = drag_force(
         tip_m[:, :2], normal_N, stiffness_N_per_m=_in_series(layer_N_per_m, slides_m_per_N), friction=coefficient
     )
     force_N = _limited(dragged.force_N + normal_N[:, None] * tilt, coefficient * normal_N)
@@ -165,7 +164,7 @@ def _push_once(
     slide_m = np.zeros((len(tip_m), 2))
     if skin.hold is not None:
         true_m = centre_m + np.array([0.0, 0.0, skin.depth_zero_m])
-        slide_m = dragged_slide.move_m + press_slides(skin, skin.hold, true_m).scaled(left).move_m
+        slide_m = dragged_slide.move_m + press_motion(skin, skin.hold, true_m).scaled(left).move_m
     return Sideways(force_N, change_T, slide_m)
 
 
@@ -202,6 +201,6 @@ def _carry(
     modulus_Pa: float,
 ) -> Dipoles:
     nodes_m, moments_A_m2 = dipoles
-    carried = shear.carry(shear_map, nodes_m, centre_m, force_N=force_N, modulus_Pa=modulus_Pa)
-    angle_rad, axis = shear.angle_and_axis(carried.half_curl)
+    carried = shear.shear_in_steps(shear_map, nodes_m, centre_m, force_N=force_N, modulus_Pa=modulus_Pa)
+    angle_rad, axis = shear.rotation_from_curl(carried.half_curl)
     return nodes_m + carried.displacement_m, Rotation.from_rotvec(angle_rad[:, None] * axis).apply(moments_A_m2)

@@ -140,6 +140,18 @@ def probe_log(plan: Plan, read_N: Float[np.ndarray, "n d 3"], rig: Rig, clock: t
     return ProbeLog(*(column[logged] for column in dwells))
 
 
+FORCE_RANGE_N = (25.0, 25.0, 35.0)  # +- on x, y and z: ATI Nano17, calibration SI-25-0.25 (data sheet)
+
+
+def read_force(
+    force_N: Float[np.ndarray, "n 3"], *, noise_N: float, rng: np.random.Generator
+) -> tuple[Float32[np.ndarray, "n 3"], int]:
+    """Read forces on the tip with noise of sd `noise_N`; return the readings, and how many values were clipped."""
+    felt_N = force_N + noise_N * rng.standard_normal(force_N.shape)
+    read_N = felt_N.clip(-np.array(FORCE_RANGE_N), FORCE_RANGE_N)
+    return read_N.astype(np.float32), int(np.count_nonzero(read_N != felt_N))
+
+
 BLOCK_INDENTATIONS_N = 1000
 
 
@@ -215,9 +227,9 @@ def _field_at(
     b_T = b_T.reshape(frames_n, *b_T.shape[2:])
     warm_degC = np.full(frames_n, ROOM_DEGC)
     if reader.temperature is not None:
-        warmer_K = aging.warmer_K((1 + start + np.arange(frames_n)) / reader.rate_hz, reader.temperature)
+        warmer_K = aging.temperature_rise_K((1 + start + np.arange(frames_n)) / reader.rate_hz, reader.temperature)
         warm_degC += warmer_K
-        gain = aging.remanence(warmer_K)[:, None] * (1 + warmer_K[:, None] * reader.sensitivity_per_K)  # [f k]
+        gain = aging.relative_remanence(warmer_K)[:, None] * (1 + warmer_K[:, None] * reader.sensitivity_per_K)  # [f k]
         b_T *= gain[:, :, None]
-    seen_T = conversion.seen_at(b_T, age_s[start : start + frames_n], reader.rate_hz)
+    seen_T = conversion.sample_at_conversion(b_T, age_s[start : start + frames_n], reader.rate_hz)
     return seen_T[lead_n:], np.repeat(warm_degC[lead_n:, None], len(reader.phase_s), axis=1)

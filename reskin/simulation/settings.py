@@ -9,7 +9,7 @@ from scipy.constants import milli
 from reskin.config import Strict, parse
 from reskin.physics.board import BoardDesign, Spreads
 from reskin.physics.chip import ChipDesign
-from reskin.physics.magnet import Rule
+from reskin.physics.magnet import QuadratureSettings
 from reskin.physics.skin import SkinDesign
 from reskin.simulation.contact import Terms
 from reskin.simulation.protocols import SKIN_MM, Drag, Grid, Hand, Protocol
@@ -37,7 +37,7 @@ class BoardKind(Strict):
     skins_per_board_n: Count
     design: BoardDesign
     skin_mm: tuple[Side_mm, Side_mm]  # along x and y
-    quadrature: Rule
+    quadrature: QuadratureSettings
 
     @property
     def skin_m(self) -> tuple[float, float]:

@@ -88,7 +88,7 @@ def test_the_chip_aside_is_as_noisy_as_the_means_of_its_readings():
 
 
 def test_iron_is_felt_less_far_away_and_less_by_the_chip_aside():
-    skin = draw_skin(SCENE.skin, SCENE.spreads, seed=1, name="b0_s0", rule=SCENE.main_boards.quadrature.quadrature())
+    skin = draw_skin(SCENE.skin, SCENE.spreads, seed=1, name="b0_s0", rule=SCENE.main_boards.quadrature.in_si())
     both = [iron_fields(REAL, skin, radius_mm=5.0, distance_mm=mm) for mm in (2.0, 5.0, 20.0, 80.0)]
     chips_uT = [rms_uT(chips) for chips, _ in both]
     assert chips_uT == sorted(chips_uT, reverse=True)
@@ -107,7 +107,7 @@ def test_each_row_keeps_its_direction_and_each_strength_adds_in_proportion():
 
 
 def test_each_row_has_the_iron_over_its_own_skin():
-    rule = SCENE.main_boards.quadrature.quadrature()
+    rule = SCENE.main_boards.quadrature.in_si()
     skins = [draw_skin(SCENE.skin, SCENE.spreads, seed=1, name=name, rule=rule) for name in ("b0_s0", "b0_s1")]
     (case,) = iron_cases(REAL, skins, np.array([1, 0, 1]), radius_mm=5.0, distances_mm=[2.0], rng=rng_for(0, "iron"))
     alone_T, _ = iron_fields(REAL, skins[0], radius_mm=5.0, distance_mm=2.0)

@@ -5,7 +5,7 @@ import pytest
 
 from pipeline.experiments import neglected_effects
 from pipeline.experiments.neglected_effects import AGEING, RELAXATION, measure
-from reskin.physics.aging import force_left, softening
+from reskin.physics.aging import relaxed_share, softening
 from reskin.physics.board import draw_board
 from reskin.physics.magnet import Quadrature
 from reskin.physics.skin import changes_of_field, draw_skin
@@ -62,14 +62,14 @@ def test_each_effect_lists_the_protocols_that_neglect_and_compute_it(rows, not_i
 def test_errors_of_the_force_without_ageing_and_relaxation(rows):
     left = softening(np.array([INDENTATIONS_N - 1]), settling=AGEING.settling, ageing=AGEING.ageing)[0]
     assert rows["ageing"].force_pct == pytest.approx(100 * (1 / left - 1), rel=1e-9)
-    assert rows["relaxation"].force_pct == pytest.approx(100 * (1 / force_left(RELAXATION) - 1), rel=1e-9)
+    assert rows["relaxation"].force_pct == pytest.approx(100 * (1 / relaxed_share(RELAXATION) - 1), rel=1e-9)
     assert rows["ageing"].field_pct == rows["relaxation"].field_pct == 0  # displacement is prescribed (PHYSICS 0)
 
 
 def test_one_kelvin_changes_every_field_by_0_12_percent(rows):
     of = synthesis()
     board = draw_board(of.main_boards.design, of.spreads, seed=1, name="b0")
-    skin = draw_skin(of.skin, of.spreads, seed=1, name="b0_s0", rule=of.main_boards.quadrature.quadrature())
+    skin = draw_skin(of.skin, of.spreads, seed=1, name="b0_s0", rule=of.main_boards.quadrature.in_si())
     rest_T, _ = changes_of_field(board, skin, np.zeros((0, 3)))
     assert rows["temperature"].field_pct == pytest.approx(100 * (1 / 0.9988 - 1), rel=1e-6)
     assert rows["temperature"].rest_uT == pytest.approx(0.0012e6 * np.abs(rest_T).max(), rel=1e-6)

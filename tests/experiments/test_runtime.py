@@ -45,8 +45,8 @@ from pipeline.experiments.runtime import written as name_of
 from pipeline.experiments.verification.signals import hereditary
 from reskin.errors import ParamsError
 from reskin.physics import deformation, layer
-from reskin.physics.aging import SKIN
-from reskin.physics.magnet import CHOSEN, SKIN_SIDE_M, Quadrature, cuboid_field, place_nodes
+from reskin.physics.aging import SKIN_RELAXATION
+from reskin.physics.magnet import DEFAULT_QUADRATURE, SKIN_SIDE_M, Quadrature, cuboid_field, place_nodes
 from reskin.physics.skin import draw_skin
 from tests.physics.test_board import design as board_design
 from tests.physics.test_board import draw_board, no_spread, spreads
@@ -246,7 +246,7 @@ def test_every_rule_has_one_row_and_may_be_timed(quadratures):
     assert [one.key for one in contestants] == [row.key for row in rows[1:]]
     assert all(row.error == max(row.parts.values()) for row in rows)
     nodes_n = {row.setting: row.work_n for row in rows if row.method == CANDIDATES}
-    assert nodes_n[name_of(CHOSEN)] == len(place_nodes(1e-3, CHOSEN).nodes_m)
+    assert nodes_n[name_of(DEFAULT_QUADRATURE)] == len(place_nodes(1e-3, DEFAULT_QUADRATURE).nodes_m)
 
 
 def test_a_method_nobody_knows_is_refused():
@@ -268,15 +268,15 @@ ROWS = [
 
 
 def test_the_cheapest_rule_below_the_limit_is_chosen_and_compared_with_the_one_in_use():
-    choice = choose(ROWS, used=CHOSEN)
+    choice = choose(ROWS, used=DEFAULT_QUADRATURE)
     assert (choice.setting, choice.nodes_n, choice.error) == ("0.5 mm x 5", 8820, 0.015)
     assert (choice.used_setting, choice.used_nodes_n, choice.used_error) == ("0.5 mm x 6", 10584, 0.004)
     assert choice.differs
-    assert not choose(ROWS, used=CHOSEN, error_max=0.01).differs
+    assert not choose(ROWS, used=DEFAULT_QUADRATURE, error_max=0.01).differs
 
 
 def test_where_no_rule_is_good_enough_none_is_chosen():
-    choice = choose(ROWS, used=CHOSEN, error_max=0.001)
+    choice = choose(ROWS, used=DEFAULT_QUADRATURE, error_max=0.001)
     assert choice.setting is None
     assert choice.differs
 
@@ -292,7 +292,7 @@ def test_a_rule_in_use_that_was_not_tried_has_no_error():
 )
 def test_who_accepts_more_error_never_pays_more(points, strict, extra):
     rows = [row(CANDIDATES, i, 1, nodes_n, error) for i, (nodes_n, error) in enumerate(points)]
-    strictly, loosely = (choose(rows, used=CHOSEN, error_max=most) for most in (strict, strict + extra))
+    strictly, loosely = (choose(rows, used=DEFAULT_QUADRATURE, error_max=most) for most in (strict, strict + extra))
     if strictly.nodes_n is not None:
         assert strictly.error < strict
         assert loosely.nodes_n <= strictly.nodes_n
@@ -338,15 +338,15 @@ def of(rows, ratio, method) -> list[Precision]:
 
 
 def test_the_skins_own_relaxation_has_its_own_stiffness():
-    np.testing.assert_allclose(runtime.stiff(1e7).tau_s, SKIN.tau_s, rtol=1e-12)
+    np.testing.assert_allclose(runtime.stiff(1e7).tau_s, SKIN_RELAXATION.tau_s, rtol=1e-12)
 
 
 @pytest.mark.parametrize("ratio", RATIOS)
 def test_a_stiffness_is_the_ratio_of_the_slowest_relaxation_to_the_fastest(ratio):
     prony = runtime.stiff(ratio)
     assert prony.tau_s.max() / prony.tau_s.min() == pytest.approx(ratio, rel=1e-9)
-    assert prony.tau_s.max() == SKIN.tau_s.max()
-    assert (prony.share == SKIN.share).all()
+    assert prony.tau_s.max() == SKIN_RELAXATION.tau_s.max()
+    assert (prony.share == SKIN_RELAXATION.share).all()
 
 
 def test_the_exact_force_is_the_convolution_with_the_relaxation_function():

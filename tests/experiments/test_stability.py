@@ -17,8 +17,8 @@ from pipeline.experiments.stability.wire import wire_cases
 from reskin.board import faults, stream
 from reskin.config import parse, read_yaml
 from reskin.errors import CaptureError
-from reskin.physics import aging, chip, deformation, force_sensor, layer, slide
-from reskin.simulation import contact
+from reskin.physics import aging, chip, deformation, layer, slide
+from reskin.simulation import contact, rig
 from reskin.simulation.defaults import nominal
 from reskin.simulation.settings import Synthesis
 
@@ -160,7 +160,7 @@ def test_time_that_may_run_backwards_is_found_out(monkeypatch):
 
 
 def test_a_force_sensor_without_a_range_and_a_flag_that_never_rises_are_found_out(monkeypatch):
-    monkeypatch.setattr(force_sensor, "RANGE_N", (np.inf,) * 3)
+    monkeypatch.setattr(rig, "FORCE_RANGE_N", (np.inf,) * 3)
     monkeypatch.setattr(layer, "VERIFIED_DEPTH", 0.99)
     monkeypatch.setattr(physics, "POKES_N", 10)
     wrong = broken(physics_cases(BOARD, DESIGN.spreads, skin=DESIGN.skin, seed=SEED))

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from magpylib.core import magnet_sphere_Bfield
 
 from reskin.physics import magnet
-from reskin.physics.ambient import EARTH_SIZE_T, EARTH_T, ball_field, ball_images, directions
+from reskin.physics.ambient import EARTH_SIZE_T, EARTH_T, ball_field, ball_images, random_directions
 from reskin.seeds import rng_for
 
 RADIUS_M = 5e-3
@@ -19,7 +19,7 @@ NEAR = np.array([[3e-3, 1e-3, 2e-3], [-4e-3, -1e-3, 4e-3]]), np.array([[0.0, 1e-
 
 
 def on_sphere(radius_m, n=40):
-    return CENTRE_M + radius_m * directions(n, rng_for(0, "sphere"))
+    return CENTRE_M + radius_m * random_directions(n, rng_for(0, "sphere"))
 
 
 def field(observers_m, b_T=B_T, mu_r=1000.0):
@@ -100,7 +100,7 @@ def test_images_of_a_far_dipole_are_those_of_its_uniform_field():
 
 
 def test_directions_are_unit_vectors_that_favour_none():
-    drawn = directions(20_000, rng_for(0, "directions"))
+    drawn = random_directions(20_000, rng_for(0, "directions"))
     np.testing.assert_allclose(np.linalg.norm(drawn, axis=1), 1, rtol=1e-12)
     np.testing.assert_allclose(drawn.mean(axis=0), 0, atol=5 / np.sqrt(3 * 20_000))  # five sd of a mean
     np.testing.assert_allclose(drawn.T @ drawn / 20_000, np.eye(3) / 3, atol=0.012)  # five sd: 0.3 / sqrt(n)

@@ -93,7 +93,7 @@ def test_a_layer_dragged_along_its_top_moves_turns_and_resists_as_elements_do(ra
     solved = of.solve(0, load, {"axis": [1, 2], "base": [0, 1, 2], "far": [0, 1, 2]}, {})
     at, table = solved.inside, shear.tabulate(traction, H_M)
     (r_m, r_i), (z_m, z_i) = (np.unique(part.round(12), return_inverse=True) for part in (at.r_m, at.z_m))
-    truth = np.moveaxis(shear.parts_at(traction, r_m, z_m, thickness_m=H_M), 2, 0)[:, r_i, z_i]
+    truth = np.moveaxis(shear.evaluate_map(traction, r_m, z_m, thickness_m=H_M), 2, 0)[:, r_i, z_i]
     near = at.r_m < radius_m + 3 * H_M
     found = [*at.parts_m[:, near], *half_curl(at)[:, near]]
     errors = [np.linalg.norm(f - t) / np.linalg.norm(t) for f, t in zip(found, truth[:, near], strict=True)]

@@ -98,9 +98,9 @@ TILES = {"columns_n": 2, "rows_n": 4, "pitch_mm": 25.4}
 def test_eight_boards_side_by_side_have_forty_chips_board_by_board():
     board = draw_board(design(tiles=TILES), no_spread(), seed=1, name="v0")
     one = draw_board(design(), no_spread(), seed=1, name="b0")
-    middles_mm = [(x, y, 0.0) for y in (-38.1, -12.7, 12.7, 38.1) for x in (-12.7, 12.7)]
+    centres_mm = [(x, y, 0.0) for y in (-38.1, -12.7, 12.7, 38.1) for x in (-12.7, 12.7)]
     assert board.chips_m.shape == (40, 3)
-    for board_i, middle_mm in enumerate(middles_mm):
+    for board_i, middle_mm in enumerate(centres_mm):
         own = slice(5 * board_i, 5 * board_i + 5)
         np.testing.assert_allclose(board.chips_m[own], one.chips_m + 1e-3 * np.array(middle_mm), atol=1e-15)
         np.testing.assert_allclose(board.turn[own], one.turn)
@@ -109,10 +109,10 @@ def test_eight_boards_side_by_side_have_forty_chips_board_by_board():
 @given(st.integers(1, 4), st.integers(1, 3), st.floats(1, 100))
 def test_boards_lie_evenly_around_the_middle(columns_n, rows_n, pitch_mm):
     tiles = {"columns_n": columns_n, "rows_n": rows_n, "pitch_mm": pitch_mm}
-    middles_mm = np.array(design(tiles=tiles).tiles.middles_mm)
-    assert len(middles_mm) == columns_n * rows_n
-    np.testing.assert_allclose(middles_mm.mean(axis=0), 0, atol=1e-9)
-    apart_mm = np.linalg.norm(middles_mm[:, None] - middles_mm, axis=2)[~np.eye(len(middles_mm), dtype=bool)]
+    centres_mm = np.array(design(tiles=tiles).tiles.centres_mm)
+    assert len(centres_mm) == columns_n * rows_n
+    np.testing.assert_allclose(centres_mm.mean(axis=0), 0, atol=1e-9)
+    apart_mm = np.linalg.norm(centres_mm[:, None] - centres_mm, axis=2)[~np.eye(len(centres_mm), dtype=bool)]
     assert apart_mm.min(initial=pitch_mm) == pytest.approx(pitch_mm)
 
 

@@ -8,7 +8,7 @@ from hypothesis.extra.numpy import arrays
 
 from pipeline.experiments.verification.mechanics import straight_drag
 from reskin.errors import ParamsError
-from reskin.physics.shear import drag
+from reskin.physics.shear import drag_force
 
 ROUNDING = 1e-12  # some hundred steps on doubles
 K = 1000.0  # newtons per metre: the skin's order
@@ -36,7 +36,7 @@ def test_along_a_straight_line_the_force_is_the_lesser_of_spring_and_friction(en
 
 @given(paths_m)
 def test_without_friction_there_is_no_tangential_force_at_all(path_m):
-    found = drag(path_m, normals(path_m), stiffness_N_per_m=K, friction=0.0)
+    found = drag_force(path_m, normals(path_m), stiffness_N_per_m=K, friction=0.0)
     assert not found.force_N.any()
     assert not found.elastic_m.any()
     moves = np.hypot(*np.diff(path_m, axis=0).T) > 0
@@ -45,7 +45,7 @@ def test_without_friction_there_is_no_tangential_force_at_all(path_m):
 
 @given(paths_m)
 def test_endless_friction_is_a_spring_tied_to_the_first_place(path_m):
-    found = drag(path_m, normals(path_m), stiffness_N_per_m=K, friction=1e6)
+    found = drag_force(path_m, normals(path_m), stiffness_N_per_m=K, friction=1e6)
     np.testing.assert_allclose(found.force_N, K * (path_m - path_m[0]), atol=ROUNDING * K * 1e-2)
     assert not found.sliding.any()
 
@@ -55,7 +55,7 @@ def test_the_force_never_leaves_coulombs_disc_and_is_on_its_rim_where_the_tip_sl
     t = len(path_m)
     normal_N = data.draw(arrays(float, t, elements=st.floats(0, 5)))
     stiffness = data.draw(arrays(float, t, elements=st.floats(0, 5e3)))
-    found = drag(path_m, normal_N, stiffness_N_per_m=stiffness, friction=mu)
+    found = drag_force(path_m, normal_N, stiffness_N_per_m=stiffness, friction=mu)
     size_N = np.hypot(*found.force_N.T)
     assert (size_N <= mu * normal_N * (1 + ROUNDING) + 1e-300).all()  # below that, doubles lose digits
     np.testing.assert_allclose(size_N[found.sliding], (mu * normal_N)[found.sliding], rtol=ROUNDING, atol=1e-300)
@@ -67,7 +67,7 @@ def test_cutting_a_straight_path_into_other_steps_changes_nothing(cuts, end_m, m
     ahead = np.array([0.6, -0.8])
     fine_m = np.sort(np.array([0.0, *cuts, 1.0]))[:, None] * end_m * ahead
     ends = [
-        drag(path_m, normals(path_m), stiffness_N_per_m=K, friction=mu).force_N[-1]
+        drag_force(path_m, normals(path_m), stiffness_N_per_m=K, friction=mu).force_N[-1]
         for path_m in (fine_m, fine_m[[0, -1]])
     ]
     np.testing.assert_allclose(*ends, atol=ROUNDING)
@@ -80,7 +80,7 @@ def test_there_and_back_costs_friction_times_the_length_slid():
         [np.linspace(a, b, n + 1)[:-1] * reach_m for a, b, n in ((0, 1, steps_n), *[(1, -1, 600), (-1, 1, 600)] * 2)]
     )
     path_m = np.append(along_m, reach_m)[:, None] * [0.8, 0.6]
-    found = drag(path_m, normals(path_m), stiffness_N_per_m=K, friction=mu)
+    found = drag_force(path_m, normals(path_m), stiffness_N_per_m=K, friction=mu)
     work_J = ((found.force_N[1:] + found.force_N[:-1]) / 2 * np.diff(path_m, axis=0)).sum(axis=1)
     loop_J = work_J[-1200:].sum()
     # In a loop the spring turns over twice, by twice its length each time; the rest of 4 reaches is slid.
@@ -94,7 +94,7 @@ def test_there_and_back_costs_friction_times_the_length_slid():
 
 @given(paths_m, frictions)
 def test_slip_runs_along_the_force_so_friction_never_drives(path_m, mu):
-    found = drag(path_m, normals(path_m), stiffness_N_per_m=K, friction=mu)
+    found = drag_force(path_m, normals(path_m), stiffness_N_per_m=K, friction=mu)
     slip_m = slipped_m(path_m, found)
     power = (found.force_N[1:] * slip_m).sum(axis=1)
     np.testing.assert_allclose(power, mu * np.hypot(*slip_m.T) * found.sliding[1:], atol=1e-15)
@@ -104,13 +104,15 @@ def test_slip_runs_along_the_force_so_friction_never_drives(path_m, mu):
 @given(paths_m, frictions, st.floats(-np.pi, np.pi))
 def test_turning_the_path_turns_the_forces(path_m, mu, angle_rad):
     turn = np.array([[np.cos(angle_rad), -np.sin(angle_rad)], [np.sin(angle_rad), np.cos(angle_rad)]])
-    still, turned = (drag(p, normals(p), stiffness_N_per_m=K, friction=mu).force_N for p in (path_m, path_m @ turn.T))
+    still, turned = (
+        drag_force(p, normals(p), stiffness_N_per_m=K, friction=mu).force_N for p in (path_m, path_m @ turn.T)
+    )
     np.testing.assert_allclose(turned, still @ turn.T, atol=1e-10)  # 40 steps of up to 30 N before they are cut
 
 
 def test_the_drag_reaches_its_new_direction_within_a_few_spring_lengths_of_a_corner():
     path_m = np.vstack([straight(4e-3, 400, 0.0), straight(8e-3, 800, np.pi / 2)[1:] + [4e-3, 0]])
-    found = drag(path_m, normals(path_m), stiffness_N_per_m=K, friction=0.8)
+    found = drag_force(path_m, normals(path_m), stiffness_N_per_m=K, friction=0.8)
     sideways_N, past_m = found.force_N[401:, 0], path_m[401:, 1]
     # The spring trails behind (a tractrix): at angle f from the new line, tan(f / 2) = exp(-way / length)
     angle_rad = 2 * np.arctan(np.exp(-past_m / 0.8e-3))
@@ -119,13 +121,13 @@ def test_the_drag_reaches_its_new_direction_within_a_few_spring_lengths_of_a_cor
 
 def test_a_lighter_touch_lets_the_spring_go_slack_and_a_firmer_one_does_not_load_it():
     path_m = np.array([[0.0, 0.0], [2e-3, 0.0], [2e-3, 0.0], [2e-3, 0.0]])
-    found = drag(path_m, np.array([1.0, 1.0, 0.25, 1.0]), stiffness_N_per_m=K, friction=0.8)
+    found = drag_force(path_m, np.array([1.0, 1.0, 0.25, 1.0]), stiffness_N_per_m=K, friction=0.8)
     np.testing.assert_allclose(found.force_N[:, 0], [0, 0.8, 0.2, 0.2], rtol=ROUNDING)
 
 
 def test_a_lifted_tip_forgets_and_starts_anew_where_it_lands():
     path_m = np.array([[0.0, 0.0], [0.5e-3, 0.0], [5e-3, 0.0], [9e-3, 1e-3], [9.1e-3, 1e-3]])
-    found = drag(path_m, np.array([1.0, 1.0, 0.0, 1.0, 1.0]), stiffness_N_per_m=K, friction=0.8)
+    found = drag_force(path_m, np.array([1.0, 1.0, 0.0, 1.0, 1.0]), stiffness_N_per_m=K, friction=0.8)
     np.testing.assert_allclose(found.force_N, [[0, 0], [0.5, 0], [0, 0], [0, 0], [0.1, 0]], atol=1e-12)
     assert not found.force_N[2:4].any()
     assert not found.sliding.any()
@@ -133,7 +135,7 @@ def test_a_lifted_tip_forgets_and_starts_anew_where_it_lands():
 
 def test_a_skin_without_stiffness_feels_no_drag():
     path_m = straight(5e-3, 10)
-    found = drag(path_m, normals(path_m), stiffness_N_per_m=0.0, friction=0.8)
+    found = drag_force(path_m, normals(path_m), stiffness_N_per_m=0.0, friction=0.8)
     assert not found.force_N.any()
 
 
@@ -154,4 +156,4 @@ def test_a_skin_without_stiffness_feels_no_drag():
 def test_impossible_drags_are_refused_in_one_sentence(what, of):
     fine = {"path_m": np.zeros((2, 2)), "normal_N": np.ones(2), "stiffness_N_per_m": K, "friction": 0.8}
     with pytest.raises(ParamsError, match=f"drag: {what} must be"):
-        drag(**(fine | of))
+        drag_force(**(fine | of))

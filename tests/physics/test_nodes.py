@@ -8,7 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from reskin.errors import ParamsError
-from reskin.physics.magnet import CHOSEN, CUBE_SIDE_M, SEAMS_M, SKIN_SIDE_M, Quadrature, place_nodes, seams_m
+from reskin.physics.magnet import (
+    CUBE_SIDE_M,
+    DEFAULT_QUADRATURE,
+    SEAMS_M,
+    SKIN_SIDE_M,
+    Quadrature,
+    place_nodes,
+    seams_m,
+)
 
 THICKNESS_M = 2e-3
 rules = st.builds(Quadrature, cell_m=st.floats(0.3e-3, 5e-3), layers_n=st.integers(1, 8))
@@ -52,7 +60,7 @@ def test_a_skin_of_any_sides_is_filled_and_cut_at_the_seams_of_its_own_array(x_m
 
 
 def test_the_authors_skin_keeps_its_nodes_to_the_last_bit():
-    rest, marks_m = place_nodes(THICKNESS_M, CHOSEN), (-10e-3, -6.35e-3, 0.0, 6.35e-3, 10e-3)
+    rest, marks_m = place_nodes(THICKNESS_M, DEFAULT_QUADRATURE), (-10e-3, -6.35e-3, 0.0, 6.35e-3, 10e-3)
     spans = [np.linspace(a, b, n + 1) for (a, b), n in zip(pairwise(marks_m), (8, 13, 13, 8), strict=True)]
     x_m = np.concatenate([(edges[1:] + edges[:-1]) / 2 for edges in spans])
     heights_m = (1 + np.polynomial.legendre.leggauss(6)[0]) / 2 * THICKNESS_M
@@ -61,7 +69,7 @@ def test_the_authors_skin_keeps_its_nodes_to_the_last_bit():
 
 
 def test_six_layers_integrate_every_polynomial_of_degree_eleven_over_the_thickness():
-    rest = place_nodes(THICKNESS_M, CHOSEN)
+    rest = place_nodes(THICKNESS_M, DEFAULT_QUADRATURE)
     for power in range(12):
         mean = rest.volumes_m3 @ (rest.nodes_m[:, 2] / THICKNESS_M) ** power / rest.volumes_m3.sum()
         np.testing.assert_allclose(mean, 1 / (power + 1), rtol=1e-12)

@@ -34,7 +34,7 @@ def hertzian(radius_m=1.5e-3):
 
 
 def sliding(depth_m=0.6e-3):
-    return shear.slip(layer.contact_of_depth(depth_m, **SKIN))
+    return shear.slip_traction(layer.contact_of_depth(depth_m, **SKIN))
 
 
 def displacement_m(traction, places_m, thickness_m=H_M):
@@ -42,7 +42,7 @@ def displacement_m(traction, places_m, thickness_m=H_M):
     found = []
     for x, y, z in np.atleast_2d(places_m):
         r, f = np.hypot(x, y), np.arctan2(y, x)
-        a, b, c = shear.parts_at(traction, np.array([r]), np.array([z]), thickness_m=thickness_m)[0, 0, :3]
+        a, b, c = shear.evaluate_map(traction, np.array([r]), np.array([z]), thickness_m=thickness_m)[0, 0, :3]
         found.append([a + b * np.cos(2 * f), b * np.sin(2 * f), c * np.cos(f)])
     return np.array(found)
 
@@ -60,7 +60,7 @@ def some_places_m(places_n=40, top=0.95):
     return np.stack([r_m * np.cos(f), r_m * np.sin(f), H_M * rng.uniform(0.05, top, places_n)], axis=1)
 
 
-def moved(force_N, nodes_m, of=None, centre_m=(0.3e-3, -0.2e-3), modulus_Pa=YOUNG_PA, by=shear.shear):
+def moved(force_N, nodes_m, of=None, centre_m=(0.3e-3, -0.2e-3), modulus_Pa=YOUNG_PA, by=shear.shear_displacement):
     of = shear.tabulate_depth(0.6e-3, **SKIN) if of is None else of
     force_N, centre_m = np.asarray(force_N, dtype=float), np.asarray(centre_m, dtype=float)
     return by(of, nodes_m, centre_m, force_N=force_N, modulus_Pa=modulus_Pa)
@@ -83,7 +83,7 @@ def test_the_response_to_a_wave_is_that_of_50_digits(kh, share):
             mpmath.sinh(z) / mpmath.cosh(a),
             mpmath.cosh(z) / mpmath.cosh(a),
         ]
-    found = shear.response(np.array([[kh * share]]), np.array([kh]))
+    found = shear.wave_response(np.array([[kh * share]]), np.array([kh]))
     found = [found.w, found.w_slope, found.w_spin, found.v, found.v_slope]
     # relative to tractions of 1; kz carries a rounding of 1e-16 kh into the exponents
     np.testing.assert_allclose([part[0, 0] for part in found], [float(part) for part in truth], atol=1e-13)
@@ -104,7 +104,7 @@ def test_the_response_solves_elasticity_as_a_boundary_value_problem(kh):
     truth = solve_bvp(slopes, ends, z, np.zeros((6, 60)), tol=1e-8, max_nodes=20_000)
     assert truth.success
     along, up, shearing, _, across, across_stress = truth.sol(z)
-    found = shear.response(z[:, None], np.array([kh]))
+    found = shear.wave_response(z[:, None], np.array([kh]))
     parts = {
         "w": 2 * up,
         "w_slope": 2 * along,
@@ -118,7 +118,7 @@ def test_the_response_solves_elasticity_as_a_boundary_value_problem(kh):
 
 def test_the_base_is_held_and_the_top_feels_the_traction_alone_however_short_the_wave():
     kh = np.geomspace(1e-3, 500, 40)
-    base, top = shear.response(np.zeros((1, 40)), kh), shear.response(kh[None], kh)
+    base, top = shear.wave_response(np.zeros((1, 40)), kh), shear.wave_response(kh[None], kh)
     np.testing.assert_allclose([base.w, base.w_slope, base.v], 0, atol=1e-15)
     np.testing.assert_allclose(top.w_spin + 2 * top.w, 2, atol=1e-12)  # w'' + w = 2: stress T
     np.testing.assert_allclose(top.v_slope, 1, atol=1e-14)
@@ -128,13 +128,13 @@ def test_what_a_traction_lifts_is_what_a_pressure_moves_aside():
     """Betti: work of either load on the other's displacement; `layer` solves the other load."""
     kh = np.geomspace(1e-3, 100, 60)
     _, aside, _ = layer.depth_profile(kh[None], kh)
-    np.testing.assert_allclose(shear.response(kh[None], kh).w, aside, atol=1e-14)
+    np.testing.assert_allclose(shear.wave_response(kh[None], kh).w, aside, atol=1e-14)
 
 
 @pytest.mark.parametrize("radius_m", [0.6e-3, 1.5e-3])
 def test_the_surface_moves_as_johnson_has_it_on_a_half_space_less_what_the_base_holds(radius_m):
     traction, r_m = hertzian(radius_m), np.linspace(0, radius_m, 12)
-    found = shear.parts_at(traction, r_m, np.array([H_M]), thickness_m=H_M)[:, 0, :2].T
+    found = shear.evaluate_map(traction, r_m, np.array([H_M]), thickness_m=H_M)[:, 0, :2].T
     # Johnson 1985, 3.91 at nu = 1/2: u_x = pi q0 / 32 G a (6 a^2 - 2.5 x^2 - 3.5 y^2), u_y = pi q0 / 32 G a x y
     free = 3 / (64 * radius_m**3) * np.stack([6 * radius_m**2 - 3 * r_m**2, r_m**2 / 2])
 
@@ -165,12 +165,12 @@ def test_the_surface_under_the_tip_carries_the_traction_and_no_other_shear():
     np.testing.assert_allclose(along_z[:, 1] + slope[1], 0, atol=0.02 * q_per_m2[0])
 
 
-@pytest.mark.parametrize("traction", [sliding(), shear.stick(2e-3, H_M)])
+@pytest.mark.parametrize("traction", [sliding(), shear.stick_traction(2e-3, H_M)])
 def test_every_level_of_the_layer_carries_the_whole_force(traction):
     r_m, step_m = np.linspace(0, 12 * H_M, 1500), 1e-6
     for z_m in (0.0, 0.4 * H_M, 0.8 * H_M):
         z = np.array([z_m, z_m + step_m, z_m + 2 * step_m])
-        along = shear.parts_at(traction, r_m, z, thickness_m=H_M)[..., 0]
+        along = shear.evaluate_map(traction, r_m, z, thickness_m=H_M)[..., 0]
         slope = (-3 * along[:, 0] + 4 * along[:, 1] - along[:, 2]) / (2 * step_m)
         # u_x,z; u_z,x adds up to nothing. 12 h away shear has died down to exp(-0.74 * 12), times the area there
         assert np.trapezoid(2 * np.pi * r_m * slope, r_m) == pytest.approx(1, abs=1e-3)
@@ -202,29 +202,31 @@ def test_the_table_gives_the_field_it_was_made_of(force):
 def test_on_a_thick_layer_a_tip_that_sticks_is_as_stiff_as_mindlins_and_one_that_slides_a_sixth_softer(radius_m):
     assert not broken([mechanics.sticking(radius_m), mechanics.sliding(radius_m, TIP_M, "bonded")])
     # mean of 6 a^2 - 3 r^2 over q ~ sqrt(a^2 - r^2) is 24/5 a^2: u = pi q0 a / 32 G * 24/5 = 9 Q / 40 G a
-    assert shear.stiffness_m(hertzian(radius_m), 100.0) == pytest.approx(40 / 9 * radius_m, rel=1e-4)
+    assert shear.tangential_stiffness_m(hertzian(radius_m), 100.0) == pytest.approx(40 / 9 * radius_m, rel=1e-4)
 
 
 def test_a_thin_layer_shears_like_a_block_with_a_seam_round_it():
     wide_m = np.array([4.0, 5.0, 6.0]) * H_M
-    blocks_m = np.sqrt([H_M / np.pi * shear.stiffness_m(shear.stick(a_m, H_M), H_M) for a_m in wide_m])
+    blocks_m = np.sqrt(
+        [H_M / np.pi * shear.tangential_stiffness_m(shear.stick_traction(a_m, H_M), H_M) for a_m in wide_m]
+    )
     # k_t = pi G (a + seam)^2 / h with one seam for all radii, up to (h / a)^2
     np.testing.assert_allclose(np.diff(blocks_m), H_M, rtol=5e-3)
     seam = (blocks_m - wide_m) / H_M
     assert ((seam > 0.5) & (seam < 1)).all()
-    middle_m = shear.parts_at(shear.stick(3 * H_M, H_M), np.array([0.0]), np.linspace(0, H_M, 9), thickness_m=H_M)[
-        0, :, 0
-    ]
+    middle_m = shear.evaluate_map(
+        shear.stick_traction(3 * H_M, H_M), np.array([0.0]), np.linspace(0, H_M, 9), thickness_m=H_M
+    )[0, :, 0]
     np.testing.assert_allclose(middle_m / middle_m[-1], np.linspace(0, 1, 9), atol=0.01)  # u = q z / G, edges 3 h away
 
 
 def test_a_tip_that_sticks_moves_its_contact_as_one():
     for a_h in (0.5, 1.0, 2.0):
-        traction = shear.stick(a_h * H_M, H_M)
-        parts = shear.parts_at(traction, np.linspace(0, 0.8, 9) * a_h * H_M, np.array([H_M]), thickness_m=H_M)[
+        traction = shear.stick_traction(a_h * H_M, H_M)
+        parts = shear.evaluate_map(traction, np.linspace(0, 0.8, 9) * a_h * H_M, np.array([H_M]), thickness_m=H_M)[
             :, 0, :2
         ].T
-        mean_per_m = 1 / shear.stiffness_m(traction, H_M)
+        mean_per_m = 1 / shear.tangential_stiffness_m(traction, H_M)
         np.testing.assert_allclose(parts[0], mean_per_m, rtol=0.03)  # an edge of endless traction, cut at 0.3 mm
         assert np.abs(parts[1]).max() < 0.05 * mean_per_m  # what the shape, the same all round, cannot do
 
@@ -233,13 +235,15 @@ def test_a_tip_that_sticks_moves_its_contact_as_one():
 def test_no_other_traction_is_as_stiff_as_sticking(a_h, square, fourth):
     """Thomson: of all tractions with one sum, that of the rigid motion stores the least work."""
     other = of_shape(lambda x: 1 + square * x**2 + (1 + square) * fourth * x**4, a_h * H_M)
-    best = shear.stiffness_m(shear.stick(a_h * H_M, H_M), H_M)
-    assert 0 < shear.stiffness_m(other, H_M) <= best * (1 + ROUNDING)
+    best = shear.tangential_stiffness_m(shear.stick_traction(a_h * H_M, H_M), H_M)
+    assert 0 < shear.tangential_stiffness_m(other, H_M) <= best * (1 + ROUNDING)
 
 
 def test_the_specifications_sum_of_limits_is_up_to_5_percent_too_stiff_for_sticking():
     a_m = np.geomspace(0.01, 6, 40) * H_M
-    ratio = [shear.stiffness_m(shear.stick(a, H_M), H_M) for a in a_m] / (16 / 3 * a_m + np.pi * a_m**2 / H_M)
+    ratio = [shear.tangential_stiffness_m(shear.stick_traction(a, H_M), H_M) for a in a_m] / (
+        16 / 3 * a_m + np.pi * a_m**2 / H_M
+    )
     # PHYSICS 4; right at both ends. Sticking that is the same all round is at most as stiff as the true one.
     assert ratio.max() < 1
     assert ratio.min() == pytest.approx(0.955, abs=0.005)
@@ -247,7 +251,10 @@ def test_the_specifications_sum_of_limits_is_up_to_5_percent_too_stiff_for_stick
 
 def test_sliding_is_19_to_20_percent_softer_than_sticking_on_the_skin():
     tractions = [sliding(float(depth_m)) for depth_m in DEPTHS_M]
-    ratio = [shear.stiffness_m(t, H_M) / shear.stiffness_m(shear.stick(t.radius_m, H_M), H_M) for t in tractions]
+    ratio = [
+        shear.tangential_stiffness_m(t, H_M) / shear.tangential_stiffness_m(shear.stick_traction(t.radius_m, H_M), H_M)
+        for t in tractions
+    ]
     np.testing.assert_allclose(ratio, 0.803, atol=0.008)
 
 
@@ -329,7 +336,7 @@ def test_in_simple_shear_the_turning_is_the_one_of_the_polar_decomposition(amoun
     ahead = np.array([np.cos(towards_rad), np.sin(towards_rad), 0.0])
     truth, _ = polar(np.eye(3) + amount * np.outer(ahead, [0, 0, 1]))
     half_curl = amount / 2 * np.array([[-ahead[1], ahead[0], 0]])
-    angle_rad, axis = shear.angle_and_axis(half_curl)
+    angle_rad, axis = shear.rotation_from_curl(half_curl)
     x, y, z = axis[0]
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     found = np.eye(3) + np.sin(angle_rad) * cross + (1 - np.cos(angle_rad)) * cross @ cross
@@ -362,7 +369,8 @@ def test_midpoint_steps_go_where_many_small_steps_go():
         of = shear.tabulate_depth(depth_m, **SKIN)
         truth_m = followed([force_N, 0], nodes_m, of, 48)
         found_m, one_shot_m = (
-            moved([force_N, 0], nodes_m, of, (0, 0), by=by).displacement_m for by in (shear.carry, shear.shear)
+            moved([force_N, 0], nodes_m, of, (0, 0), by=by).displacement_m
+            for by in (shear.shear_in_steps, shear.shear_displacement)
         )
         over.append(np.abs(found_m - truth_m).max() / np.abs(truth_m).max())
         assert over[-1] < np.abs(one_shot_m - truth_m).max() / np.abs(truth_m).max() / 5
@@ -373,7 +381,7 @@ def test_midpoint_steps_go_where_many_small_steps_go():
 
 def test_a_small_force_needs_no_midpoint():
     nodes_m = some_places_m()
-    once, half_way = (moved([3e-5, -4e-5], nodes_m, by=by) for by in (shear.shear, shear.carry))
+    once, half_way = (moved([3e-5, -4e-5], nodes_m, by=by) for by in (shear.shear_displacement, shear.shear_in_steps))
     size_m = np.abs(once.displacement_m).max()
     # half of 0.1 um beside a field that changes over 1 mm
     np.testing.assert_allclose(half_way.displacement_m, once.displacement_m, atol=2e-4 * size_m)
@@ -381,14 +389,14 @@ def test_a_small_force_needs_no_midpoint():
 
 def test_carrying_turns_with_the_force_and_leaves_the_base_alone():
     nodes_m, turn = some_places_m(), np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1]])
-    here = moved([0.5, 0], nodes_m, centre_m=(0, 0), by=shear.carry)
-    there = moved([0.3, 0.4], nodes_m @ turn.T, centre_m=(0, 0), by=shear.carry)
+    here = moved([0.5, 0], nodes_m, centre_m=(0, 0), by=shear.shear_in_steps)
+    there = moved([0.3, 0.4], nodes_m @ turn.T, centre_m=(0, 0), by=shear.shear_in_steps)
     np.testing.assert_allclose(there.displacement_m, here.displacement_m @ turn.T, atol=1e-15)
     np.testing.assert_allclose(there.half_curl, here.half_curl @ turn.T, atol=1e-12)
-    assert not moved([0.5, 0.3], nodes_m * [1, 1, 0], by=shear.carry).displacement_m.any()
+    assert not moved([0.5, 0.3], nodes_m * [1, 1, 0], by=shear.shear_in_steps).displacement_m.any()
 
 
-@pytest.mark.parametrize("traction", [sliding(), shear.stick(1.2 * H_M, H_M)])
+@pytest.mark.parametrize("traction", [sliding(), shear.stick_traction(1.2 * H_M, H_M)])
 def test_the_table_knows_its_steepest_place(traction):
     of, force_N = shear.tabulate(traction, H_M), np.array([YOUNG_PA / 3, 0.0])
     r_m, f = (part.ravel() for part in np.meshgrid(of.r_m[:200], np.linspace(0, np.pi, 13)))
@@ -411,7 +419,7 @@ def test_midpoint_steps_keep_volume_where_one_linear_step_loses_several_times_as
     sides_m = np.linspace(-3.5e-3, 3.5e-3, 36), np.linspace(0, 2.5e-3, 8), np.linspace(0.05, 0.95, 10) * H_M
     places_m = np.stack(np.meshgrid(*sides_m), axis=-1).reshape(-1, 3)
     losses = []
-    for by in (shear.shear, shear.carry):
+    for by in (shear.shear_displacement, shear.shear_in_steps):
         ends = [
             [moved([force_N, 0], places_m + sign * e, of, (0, 0), by=by).displacement_m for e in step_m * np.eye(3)]
             for sign in (1, -1)
@@ -437,9 +445,9 @@ def test_midpoint_steps_keep_volume_where_one_linear_step_loses_several_times_as
         ("height of nodes", lambda: moved([1, 0], np.array([[0.0, 0.0, 2.41e-3]]))),
         ("height of nodes", lambda: moved([1, 0], np.array([[0.0, 0.0, -1e-6]]))),
         ("height of nodes", lambda: moved([1, 0], np.array([[0.0, 0.0, np.nan]]))),
-        ("half of the curl", lambda: moved([3, 0], some_places_m(), by=shear.carry)),
-        ("half of the curl", lambda: moved([0, np.nan], some_places_m(), by=shear.carry)),
-        ("modulus", lambda: moved([1, 0], np.zeros((1, 3)), modulus_Pa=0.0, by=shear.carry)),
+        ("half of the curl", lambda: moved([3, 0], some_places_m(), by=shear.shear_in_steps)),
+        ("half of the curl", lambda: moved([0, np.nan], some_places_m(), by=shear.shear_in_steps)),
+        ("modulus", lambda: moved([1, 0], np.zeros((1, 3)), modulus_Pa=0.0, by=shear.shear_in_steps)),
     ],
 )
 def test_impossible_drags_are_refused(what, of):

@@ -10,8 +10,8 @@ from pipeline.experiments.verification import mechanics
 from reskin.errors import ParamsError
 from reskin.physics import deformation, layer, magnet, slide
 from reskin.physics.board import Board
-from reskin.physics.magnet import CHOSEN, MU0_4PI, Quadrature, change_of_field
-from reskin.physics.skin import SkinDesign, beyond_verified_n, changes_of_field, draw_skin, forces, moved_dipoles
+from reskin.physics.magnet import DEFAULT_QUADRATURE, MU0_4PI, Quadrature, change_of_field
+from reskin.physics.skin import SkinDesign, changes_of_field, count_beyond_verified, draw_skin, forces, moved_dipoles
 from tests.laws import broken
 from tests.physics.test_board import design as board_design
 from tests.physics.test_board import draw_board, no_spread, spreads
@@ -103,7 +103,11 @@ def test_material_under_the_tips_flank_leans_as_the_dent_does():
 def test_cells_half_as_wide_change_a_poke_by_less_than_2_percent_and_more_layers_by_half_a_percent(depth_m, base):
     # PHYSICS 9. Judged on dB, not on the field at rest; a pattern off its place, so that no symmetry helps. Of a
     # shallow poke over a seam 2 % is less than any chip can see: there the bound is a tenth of its noise, 3.3 uT.
-    rules = CHOSEN, Quadrature(CHOSEN.cell_m / 2, CHOSEN.layers_n), Quadrature(CHOSEN.cell_m, 2 * CHOSEN.layers_n)
+    rules = (
+        DEFAULT_QUADRATURE,
+        Quadrature(DEFAULT_QUADRATURE.cell_m / 2, DEFAULT_QUADRATURE.layers_n),
+        Quadrature(DEFAULT_QUADRATURE.cell_m, 2 * DEFAULT_QUADRATURE.layers_n),
+    )
     used, *fine = (skin(SEATED, rule=rule, base=base) for rule in rules)
     pokes_m = mechanics.each_depth(np.array([(x, y) for x in (-6e-3, 0.0, 4e-3) for y in (-2e-3, 6e-3)]), (depth_m,))
     assert not broken(mechanics.quadrature(BOARD, used, tuple(fine), rules=rules, pokes_m=pokes_m, unseen_uT=0.33))
@@ -111,7 +115,7 @@ def test_cells_half_as_wide_change_a_poke_by_less_than_2_percent_and_more_layers
 
 def test_without_the_rotation_of_the_moments_the_change_would_be_wrong_by_more_than_itself():
     # PHYSICS 0.2: 156-242 %, over pokes of the grid; R.M, never M alone
-    one, wrong, size = skin(SEATED, rule=CHOSEN), [], []
+    one, wrong, size = skin(SEATED, rule=DEFAULT_QUADRATURE), [], []
     for place in ((0.0, 0.0), (4e-3, 0.0), (-4e-3, 4e-3), (2e-3, -6e-3)):
         moved = moved_by(one, (*place, DEPTH_M))
         unturned_T = change_of_field(moved.before, (moved.after[0], moved.before[1]), BOARD.chips_m)
@@ -263,7 +267,7 @@ def test_filler_and_amplitude_scale_the_moments_by_their_spreads():
 
 def test_the_field_at_rest_lies_in_the_plane_and_is_as_strong_as_a_recorded_one():
     # PHYSICS 3: recorded B0 in-plane up to 3.6 mT; a factor of two, since the amplitude is one number for all skins.
-    rest_T, _ = changes_of_field(BOARD, skin(rule=CHOSEN), np.zeros((0, 3)))
+    rest_T, _ = changes_of_field(BOARD, skin(rule=DEFAULT_QUADRATURE), np.zeros((0, 3)))
     assert np.abs(rest_T[:, :2]).max() > 10 * np.abs(rest_T[:, 2]).max()
     assert 1.8e-3 < np.abs(rest_T).max() < 7.2e-3
 
@@ -304,7 +308,7 @@ def test_depths_past_what_is_verified_are_counted_from_where_the_skin_begins():
     one = skin()
     high, low = (type(one)(**{**one.__dict__, "depth_zero_m": zero_m}) for zero_m in (-0.1e-3, 0.1e-3))
     depths_m = np.array([0.6, 1.15, 1.25]) * 1e-3  # verified to 1.2 mm of true depth
-    assert [beyond_verified_n(skin_, depths_m) for skin_ in (high, one, low)] == [0, 1, 2]
+    assert [count_beyond_verified(skin_, depths_m) for skin_ in (high, one, low)] == [0, 1, 2]
 
 
 HELD = {"give_um": (48.0, 7.0), "away_um_mm": 6.0, "lets_go_mm2": 40.0, "springs_N_mm": 7.0, "friction": 0.8}

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from pipeline.experiments.runtime import REFERENCE, Precision, Seconds, choose
 from pipeline.report.drawing import COLOURS, MARKERS
 from pipeline.report.figures import costs, failures, front, integrators, pages, quadratures
-from reskin.physics.magnet import CHOSEN
+from reskin.physics.magnet import DEFAULT_QUADRATURE
 from tests.report.synthetic import cost
 
 RULES = [("Gauss in z", "0.5 mm x 6", 10584, 0.004), ("Gauss in z", "0.7 mm x 5", 5120, 0.015)]
@@ -41,7 +41,7 @@ def timed(rows) -> list[Seconds]:
 
 
 def draw_sums(rows=SUMS, **limits) -> str:
-    return quadratures(rows, timed(rows), choose(rows, used=CHOSEN, **limits), source="simulated")
+    return quadratures(rows, timed(rows), choose(rows, used=DEFAULT_QUADRATURE, **limits), source="simulated")
 
 
 def draw_stiff(rows=STIFF) -> str:
@@ -95,7 +95,7 @@ def test_what_failed_is_no_point_of_the_figure():
 
 def test_a_row_that_was_not_timed_is_an_error_and_not_left_out():
     with pytest.raises(KeyError):
-        quadratures(SUMS, timed(SUMS)[1:], choose(SUMS, used=CHOSEN), source="simulated")
+        quadratures(SUMS, timed(SUMS)[1:], choose(SUMS, used=DEFAULT_QUADRATURE), source="simulated")
 
 
 def test_pages_cope_with_a_scene_that_asked_for_one_study_or_none():

@@ -63,7 +63,7 @@ def test_a_quiet_capture_holds_the_field_of_its_board_and_skin():
     of = quiet()
     b_uT = shaped(capture_of(of))
     board = draw_board(of.boards["rigid"].design, of.spreads, seed=1, name="b0")
-    rule = of.boards["rigid"].quadrature.quadrature()
+    rule = of.boards["rigid"].quadrature.in_si()
     skin = draw_skin(of.skin, of.spreads, seed=1, name="b0_s0", rule=rule)
     pokes_m = np.array([[x - 8, y - 8, depth] for depth in (0.6, 1.2) for x, y in points_mm()]) * 1e-3
     _, changes_T = changes_of_field(board, skin, pokes_m)
@@ -130,7 +130,7 @@ def test_scattered_pokes_lie_where_their_labels_say_from_the_skins_corner():
     one = capture_of(of, "sleeve", board="v0", skin="v0_s0")
     place_mm = np.column_stack([touched(one, "x_mm"), touched(one, "y_mm")]).astype(float)
     board = draw_board(of.boards["sleeve"].design, of.spreads, seed=1, name="v0")
-    rule = of.boards["sleeve"].quadrature.quadrature()
+    rule = of.boards["sleeve"].quadrature.in_si()
     skin = draw_skin(of.skin, of.spreads, seed=1, name="v0_s0", rule=rule, sides_m=(50.8e-3, 101.6e-3))
     pokes_m = np.column_stack([place_mm - (25.4, 50.8), touched(one, "depth_mm")]) * 1e-3
     _, changes_T = changes_of_field(board, skin, pokes_m)

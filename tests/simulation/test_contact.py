@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from reskin.physics.aging import Ageing, Relaxation, force_left
+from reskin.physics.aging import Ageing, Relaxation, relaxed_share
 from reskin.physics.board import draw_board
 from reskin.physics.shear import Friction
 from reskin.physics.skin import changes_of_field, draw_skin, forces
@@ -13,7 +13,7 @@ from tests.simulation.scene import synthesis
 
 OF = synthesis()
 BOARD = draw_board(OF.boards["rigid"].design, OF.spreads, seed=1, name="b0")
-SKIN = draw_skin(OF.skin, OF.spreads, seed=1, name="b0_s0", rule=OF.boards["rigid"].quadrature.quadrature())
+SKIN = draw_skin(OF.skin, OF.spreads, seed=1, name="b0_s0", rule=OF.boards["rigid"].quadrature.in_si())
 TIP_M = np.tile([[[1e-3, 2e-3, 0.8e-3]]], (200, 1, 1))
 
 
@@ -47,7 +47,7 @@ def test_force_softens_and_relaxes_in_every_direction():
     relaxation = Relaxation(approach_s=slack[0], hold_s=slack[1])
     plain = response(tilt=0.1, friction=Friction(coefficient=0.8))
     worn = response(tilt=0.1, friction=Friction(coefficient=0.8), ageing=how, relaxation=relaxation)
-    left = (1 - 0.2 * -np.expm1(-199 / 300)) * force_left(relaxation)
+    left = (1 - 0.2 * -np.expm1(-199 / 300)) * relaxed_share(relaxation)
     np.testing.assert_allclose(worn.force_N[199], left * plain.force_N[199], rtol=1e-12)
 
 

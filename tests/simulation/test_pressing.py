@@ -152,7 +152,7 @@ def test_a_walk_keeps_the_truth_on_the_logs_own_clock():
         synthesis().spreads,
         seed=1,
         name="b0_s0",
-        rule=synthesis().main_boards.quadrature.quadrature(),
+        rule=synthesis().main_boards.quadrature.in_si(),
     )
     np.testing.assert_allclose(log.Fz_N[log.contact], forces(skin, touched * 1e-3), rtol=1e-4)  # float32 depths
     assert (np.diff(log.t_start_s[log.contact]) > 1.5 / 250).sum() == 2  # three footfalls

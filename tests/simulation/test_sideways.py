@@ -106,7 +106,9 @@ def test_a_drag_is_the_press_and_many_small_shears_at_where_the_material_under_t
     behind_m = tip_m[0, 1, :2] - force_N / (modulus_Pa / 3 * of.stiffness_m)
     [(_, before, (nodes_m, moments))] = moved_dipoles(SKIN, np.array([[*behind_m, DEPTH_M]]))
     for _ in range(50):
-        step = shear.shear(of, nodes_m.clip(min=0.0), behind_m, force_N=force_N / 50, modulus_Pa=modulus_Pa)
+        step = shear.shear_displacement(
+            of, nodes_m.clip(min=0.0), behind_m, force_N=force_N / 50, modulus_Pa=modulus_Pa
+        )
         nodes_m, moments = nodes_m + step.displacement_m, Rotation.from_rotvec(step.half_curl).apply(moments)
     truth_T = change_of_field(before, (nodes_m, moments), BOARD.chips_m)
     # 20 %: the product takes one or two midpoint steps, and the traction along; a sign turned is off by 50 % and more

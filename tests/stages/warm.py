@@ -63,7 +63,7 @@ def begin(simulated: set[tuple[str, str]]) -> None:
         settings = read_settings(scene)
         of = synthesis_of(settings)
         kind = of.boards[of.protocols[protocol].boards]
-        rule, name = kind.quadrature.quadrature(), f"{kind.letter}0_s0"
+        rule, name = kind.quadrature.in_si(), f"{kind.letter}0_s0"
         skin = draw_skin(of.skin, of.spreads, seed=settings.seed, name=name, rule=rule, sides_m=kind.skin_m)
         list(moved_dipoles(skin, np.array([[0.0, 0.0, DEEP_M]])))  # its tables are kept
     gc.freeze()  # else each stage would look through all this, and copy it, at each search for what nobody holds

@@ -16,14 +16,14 @@ from pipeline.experiments.verification.checks import worst
 from pipeline.experiments.verification.mechanics import force_N
 from pipeline.experiments.verification.signals import inside_a_box
 from reskin.physics import layer, magnet, shear
-from reskin.physics.aging import SKIN, advance
+from reskin.physics.aging import SKIN_RELAXATION, advance
 from reskin.physics.board import Board, BoardDesign, Spreads, draw_board
 from reskin.physics.deformation import depth_scale
-from reskin.physics.force_sensor import RANGE_N, read_force
 from reskin.physics.layer import IndentedLayer
 from reskin.physics.magnet import CUBE_SIDE_M, Quadrature, change_of_field
 from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, forces
 from reskin.seeds import rng_for
+from reskin.simulation.rig import FORCE_RANGE_N, read_force
 
 AREA = "physics"
 COARSE = Quadrature(cell_m=2.2e-3, layers_n=4)
@@ -40,7 +40,7 @@ STIFF = signals.stiff(1e8)
 def time_cases() -> list[Case]:
     """Try steps that no explicit integrator survives, steps of no length, and times that are none."""
     state = np.array([1 / 3, -2e-308, 7e15, 0.0, -0.1])
-    same_n = int(np.count_nonzero(advance(state, 0.0, 0.0, SKIN).view(np.int64) == state.view(np.int64)))
+    same_n = int(np.count_nonzero(advance(state, 0.0, 0.0, SKIN_RELAXATION).view(np.int64) == state.view(np.int64)))
     return [
         _step("tau_max / tau_min 1e8, dt / tau_min 1e8", 1e8, "as in 50 digits (mpmath), and finite"),
         _step("dt / tau_min 1e-16", 1e-16, "as in 50 digits: (1 - exp(-x)) / x by expm1; plainly it is 11 % off"),
@@ -99,7 +99,7 @@ def modulus(board: Board, usual: Skin, soft: Skin, hard: Skin) -> list[Case]:
     pushed_N = np.column_stack([np.zeros((len(hard_N), 2)), hard_N])
     read_N, clipped_n = read_force(pushed_N, noise_N=0.0, rng=rng_for(0, "stability"))
     soft_off_T, hard_off_T = float(np.abs(soft_T - free_T).max()), float(np.abs(hard_T - firm_T).max())
-    held = clipped_n == len(hard_N) and bool((read_N[:, 2] == RANGE_N[2]).all())
+    held = clipped_n == len(hard_N) and bool((read_N[:, 2] == FORCE_RANGE_N[2]).all())
     return [
         observed(AREA, "a skin of no stiffness, E = 0", should="no force, so no slide: dB of the layer's flow alone",
                  happened=f"force {np.abs(soft_N).max():g} N; dB differs by {soft_off_T:g} T",
@@ -226,7 +226,7 @@ def drag_cases(skin: SkinDesign) -> list[Case]:
     normal_N = force_N(np.full(len(PATH_MM), depth_m), press, modulus_Pa)
     path_m = np.column_stack([np.array(PATH_MM) * milli, np.zeros(len(PATH_MM))])
     smooth, sticky = (
-        shear.drag(path_m, normal_N, stiffness_N_per_m=stiffness, friction=mu).force_N for mu in (0.0, STICKY)
+        shear.drag_force(path_m, normal_N, stiffness_N_per_m=stiffness, friction=mu).force_N for mu in (0.0, STICKY)
     )
     error = float(np.abs(sticky[:, 0] - stiffness * path_m[:, 0]).max() / sticky.max())
     return [

@@ -16,7 +16,7 @@ from pipeline.experiments.verification.checks import no_spread
 from reskin.physics import shear, slide
 from reskin.physics.board import Board, BoardDesign, Spreads, draw_board
 from reskin.physics.shear import Friction
-from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, forces, press_slides, shear_moduli_Pa
+from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, forces, press_motion, shear_moduli_Pa
 from reskin.simulation.contact import Sideways, push
 
 AREA = "physics"
@@ -99,7 +99,7 @@ def edge(board: Board, skin: Skin) -> list[Case]:
     pokes_m = np.column_stack([skin.seat_m + places_m, np.full(2, 0.3 * skin.thickness_m)])
     _, change_T = changes_of_field(board, skin, pokes_m)
     assert skin.hold is not None
-    slides = press_slides(skin, skin.hold, pokes_m)
+    slides = press_motion(skin, skin.hold, pokes_m)
     force_N = skin.modulus_Pa * slide.force_at(
         pokes_m[:, 2], modulus_Pa=1.0, thickness_m=skin.thickness_m, tip_radius_m=skin.tip_radius_m
     )

@@ -20,7 +20,7 @@ def verify(of: Synthesis, *, depths_m: tuple[float, ...], seed: int) -> list[Che
     """Measure every law against its reference, for the designs of a scene, in the order of the simulator's chain."""
     board, skin = of.main_boards, of.skin
     press = IndentedLayer(skin.thickness_mm * milli, skin.tip_radius_mm * milli, skin.base)
-    rule = board.quadrature.quadrature()
+    rule = board.quadrature.in_si()
     return [
         *check_field(skin, seed),
         *check_contact(skin),

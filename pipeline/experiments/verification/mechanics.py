@@ -20,8 +20,8 @@ from reskin.data.grid import CENTRE_MM, protocol
 from reskin.physics import deformation, layer, shear, slide
 from reskin.physics.board import Board, BoardDesign, Spreads, draw_board
 from reskin.physics.layer import IndentedLayer
-from reskin.physics.magnet import Polarity, Quadrature
-from reskin.physics.skin import Dipoles, Skin, SkinDesign, changes_of_field, draw_skin, press_slides
+from reskin.physics.magnet import Dipoles, Polarity, Quadrature
+from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, press_motion
 
 HALF_SPACE_M = 100.0  # a layer that a tip of millimetres does not feel the base of
 HELD_BACK = 1.770  # integral of 1 - compliance (PHYSICS 4; Dimitriadis et al. 2002 fit 1.780)
@@ -195,7 +195,7 @@ def check_sideways(skin: SkinDesign) -> list[Check]:
 
 
 def sticking(radius_m: float) -> Check:
-    ratio = shear.stiffness_m(shear.stick(radius_m, HALF_SPACE_M), HALF_SPACE_M) / radius_m
+    ratio = shear.tangential_stiffness_m(shear.stick_traction(radius_m, HALF_SPACE_M), HALF_SPACE_M) / radius_m
     return Check("sideways stiffness, thick layer", "a tip that sticks: 16/3 G a", "Mindlin 1949, nu = 1/2",
                  abs(ratio / (16 / 3) - 1), "1", 1e-3, "the base is felt as a / h, 3e-6; sums over the contact"
                  )  # fmt: skip
@@ -203,7 +203,7 @@ def sticking(radius_m: float) -> Check:
 
 def sliding(radius_m: float, tip_m: float, base: layer.Base) -> Check:
     contact = layer.contact_of_radius(radius_m, thickness_m=HALF_SPACE_M, tip_radius_m=tip_m, base=base)
-    ratio = shear.stiffness_m(shear.slip(contact), HALF_SPACE_M) / radius_m
+    ratio = shear.tangential_stiffness_m(shear.slip_traction(contact), HALF_SPACE_M) / radius_m
     return Check("sideways stiffness, thick layer", "q = mu p of Hertz: 40/9 G a", "Cerruti's integral in closed form",
                  abs(ratio / (40 / 9) - 1), "1", 2e-3, "contact radius R / 10: a sphere is no paraboloid")  # fmt: skip
 
@@ -212,7 +212,7 @@ def straight_drag(
     path_m: Float[np.ndarray, " t"], limit_N: float, *, stiffness_N_per_m: float, coefficient: float
 ) -> Check:
     places_m, normal_N = np.column_stack([path_m, np.zeros_like(path_m)]), np.full_like(path_m, limit_N / coefficient)
-    found = shear.drag(places_m, normal_N, stiffness_N_per_m=stiffness_N_per_m, friction=coefficient)
+    found = shear.drag_force(places_m, normal_N, stiffness_N_per_m=stiffness_N_per_m, friction=coefficient)
     truth_N = np.minimum(stiffness_N_per_m * path_m, limit_N)
     return Check("friction", "Q = min(k s, mu F) along a straight drag", "itself, by hand",
                  float(np.abs(found.force_N[:, 0] - truth_N).max() / limit_N), "1", 1e-12, "rounding of 30 steps"
@@ -340,7 +340,7 @@ def followed(skin: Skin, place_m: Float[np.ndarray, "2"], depths_m: Float[np.nda
     after = places_m, aside + turned[:, :1] * outward + turned[:, 1:] * (0, 0, 1)
     if skin.hold is None:
         return after
-    slides = press_slides(skin, skin.hold, np.append(place_m, depths_m[-1])[None])
+    slides = press_motion(skin, skin.hold, np.append(place_m, depths_m[-1])[None])
     return slide.apply(slides, 0, after, skin.seat_m)
 
 

@@ -20,11 +20,11 @@ from reskin.board.stream import decode_all
 from reskin.board.wire import Frames
 from reskin.physics import magnet
 from reskin.physics import magnet as dipole
-from reskin.physics.aging import SKIN, Prony, advance, relax
+from reskin.physics.aging import SKIN_RELAXATION, Prony, advance, relax
 from reskin.physics.board import Board
 from reskin.physics.chip import ChipDesign, Overruns, read_field, read_temperature, steps_uT
-from reskin.physics.magnet import Quadrature, change_of_field, place_nodes
-from reskin.physics.skin import Dipoles, SkinDesign
+from reskin.physics.magnet import Dipoles, Quadrature, change_of_field, place_nodes
+from reskin.physics.skin import SkinDesign
 from reskin.recordings.header import Wire
 from reskin.seeds import rng_for
 
@@ -339,15 +339,15 @@ def many_pokes() -> Check:
     starts_s = CYCLE_S * np.arange(POKES_N)
     time_s = np.sort(np.concatenate([starts_s, starts_s + RAMP_S, starts_s + RAMP_S + HOLD_S]))
     elastic = np.tile([0.0, 2.0, 2.0], POKES_N)
-    error = worst(relax(time_s, elastic, SKIN), hereditary(time_s, elastic, SKIN))
+    error = worst(relax(time_s, elastic, SKIN_RELAXATION), hereditary(time_s, elastic, SKIN_RELAXATION))
     return Check(NAME, f"{POKES_N} pokes over {POKES_N * CYCLE_S:g} s", "hereditary integral in 50 digits (mpmath)",
                  error, "1", 1e-13, "60 exact steps add up rounding")  # fmt: skip
 
 
 def held(time_s: Float[np.ndarray, " t"]) -> Check:
-    closed = 3.0 * (1 - (SKIN.share * -np.expm1(-time_s[:, None] / SKIN.tau_s)).sum(axis=1))
+    closed = 3.0 * (1 - (SKIN_RELAXATION.share * -np.expm1(-time_s[:, None] / SKIN_RELAXATION.tau_s)).sum(axis=1))
     return Check(NAME, "a held poke, 10 us to 12 days", "1 - sum of shares (1 - exp(-t / tau))",
-                 worst(relax(time_s, np.full(len(time_s), 3.0), SKIN), closed), "1", 1e-13,
+                 worst(relax(time_s, np.full(len(time_s), 3.0), SKIN_RELAXATION), closed), "1", 1e-13,
                  "200 steps add up their rounding")  # fmt: skip
 
 

@@ -126,7 +126,7 @@ def test_every_place_is_bounded_and_deeper_presses_and_exact_labels_are_told_bet
 
 
 def test_pokes_above_the_skin_are_marked_and_a_skin_that_none_touches_is_refused():
-    skin = draw_skin(SCENE.skin, SCENE.spreads, seed=1, name="b0_s0", rule=SCENE.main_boards.quadrature.quadrature())
+    skin = draw_skin(SCENE.skin, SCENE.spreads, seed=1, name="b0_s0", rule=SCENE.main_boards.quadrature.in_si())
     depths_mm = np.array([0.2, 0.6])
     assert touches(replace(skin, depth_zero_m=-0.3e-3), depths_mm).tolist() == [False, True]
     with pytest.raises(ParamsError, match="depths_mm must be deep enough to touch it; got 0.6 mm at most"):

@@ -12,7 +12,7 @@ from tests.simulation.scene import synthesis
 
 SCENE = synthesis()
 BOARD = draw_board(SCENE.main_boards.design, SCENE.spreads, seed=1, name="b0")
-SKIN = draw_skin(SCENE.skin, SCENE.spreads, seed=1, name="b0_s0", rule=SCENE.main_boards.quadrature.quadrature())
+SKIN = draw_skin(SCENE.skin, SCENE.spreads, seed=1, name="b0_s0", rule=SCENE.main_boards.quadrature.in_si())
 REST = SKIN.nodes_m, SKIN.moments_A_m2
 DEPTH_M = 0.6e-3
 

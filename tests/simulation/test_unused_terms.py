@@ -1,4 +1,4 @@
-"""What a protocol does not need does not run: the interpreter's own profile of one recording is asked."""
+"""Terms of physics that a protocol does not name are not computed, by the interpreter's profile of one recording."""
 
 import sys
 from pathlib import Path
@@ -10,10 +10,13 @@ from reskin.simulation.capture import record
 from tests.simulation.scene import AGEING, GRID, RELAXATION, TEMPERATURE, with_protocol
 
 TERMS = {
-    "ageing": (AGEING, {"softening", "fading", "wandering"}),
-    "friction": ({"coefficient": 0.5}, {"drag", "slip", "stick", "shear", "carry", "tabulate_depth"}),
+    "ageing": (AGEING, {"softening", "fading", "baseline_walk"}),
+    "friction": (
+        {"coefficient": 0.5},
+        {"drag_force", "slip_traction", "stick_traction", "shear_displacement", "shear_in_steps", "tabulate_depth"},
+    ),
     "relaxation": (RELAXATION, {"relax"}),
-    "temperature": (TEMPERATURE, {"warmer_K", "remanence"}),
+    "temperature": (TEMPERATURE, {"temperature_rise_K", "relative_remanence"}),
 }
 OF_TERMS = set().union(*(names for _, names in TERMS.values()))
 FEW = GRID | {"passes_n": 1, "depths_mm": (0.6,), "skins_n": 1}
@@ -41,14 +44,14 @@ def scene_with(*terms):
     return with_protocol("few", FEW | {"terms": list(terms)}, terms={term: TERMS[term][0] for term in terms})
 
 
-def test_a_protocol_without_terms_runs_no_code_of_any_term():
+def test_a_protocol_without_terms_computes_none():
     run = functions_run(scene_with())
     assert {"record", "read_field"} <= run  # or the profile would see nothing
     assert not run & OF_TERMS
 
 
 @pytest.mark.parametrize("term", sorted(TERMS))
-def test_a_term_that_is_asked_for_runs_its_own_code_and_no_others(term):
+def test_a_term_computes_itself_and_no_other(term):
     run = functions_run(scene_with(term)) & OF_TERMS
     assert run
     assert run <= TERMS[term][1]

@@ -4,8 +4,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from reskin.physics.force_sensor import RANGE_N, read_force
 from reskin.seeds import rng_for
+from reskin.simulation.rig import FORCE_RANGE_N, read_force
 
 inside_N = st.tuples(st.floats(-25, 25), st.floats(-25, 25), st.floats(-35, 35))
 
@@ -31,8 +31,8 @@ def test_noise_has_the_stated_spread_and_is_clipped_with_the_force():
     read_N, clipped_n = read(np.zeros((40_000, 3)), noise_N=1 / 160)
     np.testing.assert_allclose(read_N.std(axis=0), 1 / 160, rtol=0.02)  # four times 1 / sqrt(2 n)
     assert clipped_n == 0
-    read_N, clipped_n = read(np.tile(RANGE_N, (1000, 1)), noise_N=1 / 160)
-    assert (read_N <= np.float32(RANGE_N)).all()
+    read_N, clipped_n = read(np.tile(FORCE_RANGE_N, (1000, 1)), noise_N=1 / 160)
+    assert (read_N <= np.float32(FORCE_RANGE_N)).all()
     assert 1400 < clipped_n < 1600  # half of 3000, give or take 3.7 sd
 
 
