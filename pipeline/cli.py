@@ -13,7 +13,7 @@ from typer import Argument, Option
 from pipeline import PLAN
 from reskin.cli import Wire
 from reskin.errors import ParamsError
-from reskin.recordings.layouts import Foreign
+from reskin.recordings import ReaderLayout
 
 if TYPE_CHECKING:
     from pipeline.scenes import Plan
@@ -22,7 +22,7 @@ app = typer.Typer()
 scenes = typer.Typer(no_args_is_help=True, help="Choose which scenes `dvc repro` runs.")
 app.add_typer(scenes, name="scenes")
 
-Layout = Literal["capture", "serial-binary", "serial-text", Foreign]
+Layout = Literal["capture", "serial-binary", "serial-text", ReaderLayout]
 Board = Annotated[str, Option(help="The circuit board's name.")]
 Marks = Annotated[list[str] | None, Option(help="capture, serial-*: STREAM_S,PROBE_S of one event; may be repeated.")]
 

@@ -288,7 +288,7 @@ def record(
     """
     from reskin.board.find import the_board
     from reskin.live.taping import Wanted, record_board
-    from reskin.recordings.labelling import from_program
+    from reskin.recordings.label_sources import from_program
 
     board = the_board(None if port is None else [port])
     wanted = Wanted(Path(out) if out is not None else None, seconds, 115200, told)

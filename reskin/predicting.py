@@ -20,7 +20,7 @@ from reskin.live.contacts import Answers, Estimates, describe, estimate, quiet_s
 from reskin.models.inputs import VIEW
 from reskin.models.trained import FORMAT, Network
 from reskin.packages import need
-from reskin.recordings import columns
+from reskin.recordings import tables
 from reskin.recordings.header import LOG_FILE, RATE_MAX_HZ, STREAM_FILE
 from reskin.recordings.ingest import read_header, timer
 from reskin.recordings.readers import sd_card
@@ -183,4 +183,4 @@ def render(found: Estimates) -> str:
     table = {"t_s": pa.array(np.round(found.t_s, 4))}
     # from_pandas: NaN becomes null, which CSV writes as an empty field
     table |= {name: pa.array(values, from_pandas=True) for name, values in fields.items()}
-    return columns.render(pa.table(table | {"contact": pa.array(found.contact.astype(np.int8))}))
+    return tables.render_csv(pa.table(table | {"contact": pa.array(found.contact.astype(np.int8))}))

@@ -16,7 +16,7 @@ from reskin.board.port import PortSettings
 from reskin.board.wire import encode
 from reskin.errors import CaptureError
 from reskin.recordings.header import HEADER_FILE, parse
-from reskin.recordings.labelling import Source
+from reskin.recordings.label_sources import Source
 from reskin.recordings.preparing import Labels, native
 from reskin.recordings.recorder import UNTOLD, Told, _desk, begin_capture, print_progress, record_capture
 from tests.board.signals import make_frames

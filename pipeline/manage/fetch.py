@@ -21,10 +21,9 @@ from pipeline.scenes import read_plan
 from reskin import io
 from reskin.config import Strict, parse, read_yaml
 from reskin.errors import CaptureError, ParamsError
-from reskin.recordings import preparing
+from reskin.recordings import ReaderLayout, preparing
 from reskin.recordings.header import HEADER_FILE
 from reskin.recordings.ingest import read_header
-from reskin.recordings.layouts import Foreign
 from reskin.recordings.pickled import to_lab_csv
 from reskin.recordings.preparing import Labels, Prepared
 
@@ -163,7 +162,7 @@ class Recording(Strict):
     """How fetched files are added: the words of `reskin add`."""
 
     path: Below
-    layout: Foreign
+    layout: ReaderLayout
     board: str
     skin: str
     options: dict[str, str]

@@ -16,7 +16,7 @@ from reskin.board.port import PortSettings
 from reskin.errors import ParamsError
 from reskin.live.health import Health
 from reskin.recordings.header import Wire
-from reskin.recordings.labelling import RANDOM, SNAKE, Forces, Prompts, Source, from_gauge, from_table, parse_places
+from reskin.recordings.label_sources import RANDOM, SNAKE, Forces, Prompts, Source, from_gauge, from_table, parse_places
 from reskin.recordings.recorder import UNTOLD, new_folder, print_progress, record_capture
 from reskin.seeds import rng_for
 

@@ -1,1 +1,6 @@
-"""Recordings: captures and files of other rigs, read into readings with an account of every lost byte and row."""
+"""Captures on disk, readers of other layouts, the probe log, labels, clocks, and ingestion into readings."""
+
+from typing import Literal
+
+# Layouts with a reader of their own in `readers`; here, because `reskin --help` lists them and must import little.
+ReaderLayout = Literal["table", "lab", "ini", "eflesh", "eflash7"]

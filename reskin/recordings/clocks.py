@@ -10,7 +10,7 @@ import pyarrow as pa
 from jaxtyping import Bool, Float32, Float64, Int8, Int64
 
 from reskin.errors import CaptureError
-from reskin.recordings import columns
+from reskin.recordings import tables
 from reskin.recordings.probe import ProbeLog
 
 TYPES = {"byte_end": pa.int64(), "t_s": pa.float64()}
@@ -29,7 +29,7 @@ class Arrivals:
 
 def parse(source: str | Path, where: str) -> Arrivals:
     """Read arrivals from CSV text, or from the file at a path; raise `CaptureError` naming the first bad row."""
-    table = columns.parse(source, TYPES, where)
+    table = tables.parse_csv(source, TYPES, where)
     if len(table) < 2:
         raise CaptureError(where, "arrivals", "two rows or more", len(table), "Give a rate in the header.")
     byte_end, t_s = (table.column(name).to_numpy() for name in TYPES)
@@ -40,7 +40,7 @@ def parse(source: str | Path, where: str) -> Arrivals:
         (np.diff(byte_end, prepend=-1) <= 0, "byte_end", "more than in the row above"),
         (np.diff(t_s, prepend=t_s[0]) < 0, "t_s", "not before the row above"),
     ):
-        columns.refuse(bad, where, name, rule, {"byte_end": byte_end, "t_s": t_s}[name], "Record the capture again.")
+        tables.refuse_row(bad, where, name, rule, {"byte_end": byte_end, "t_s": t_s}[name], "Record the capture again.")
     if t_s[-1] == t_s[0]:
         got = f"{t_s[0]} in every row"
         raise CaptureError(where, "arrivals", "spread in time", got, "Mend the recorder's clock.")
@@ -49,7 +49,7 @@ def parse(source: str | Path, where: str) -> Arrivals:
 
 def render(arrivals: Arrivals) -> str:
     """Write arrivals as CSV; `parse` gives the same arrivals back."""
-    return columns.render(pa.table({name: getattr(arrivals, name) for name in TYPES}))
+    return tables.render_csv(pa.table({name: getattr(arrivals, name) for name in TYPES}))
 
 
 def times_of(end_byte: Int64[np.ndarray, " f"], arrivals: Arrivals) -> Float64[np.ndarray, " f"]:

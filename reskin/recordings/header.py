@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from reskin import io
 from reskin.errors import CaptureError
-from reskin.recordings.layouts import Foreign
+from reskin.recordings import ReaderLayout
 
 RATE_MAX_HZ = 1e5
 HEADER_FILE = "header.json"
@@ -27,7 +27,7 @@ LOG_FILE = "log.csv"
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$"
 
 Name = Annotated[str, Field(pattern=NAME)]
-Layout = Literal["native", Foreign, "sd-card"]
+Layout = Literal["native", ReaderLayout, "sd-card"]
 Wire = Literal["binary", "binary-clock", "text-xyzt", "text-txyz"]
 
 

@@ -32,7 +32,7 @@ from reskin.recordings.header import (
 )
 from reskin.recordings.probe import LABELS, ProbeLog
 from reskin.recordings.readers import READERS
-from reskin.recordings.text import check_fields, check_log
+from reskin.recordings.units import check_fields, check_log
 from reskin.schema import Readings
 
 COUNTS = (

@@ -1,14 +1,15 @@
-"""Labels as they come: where the skin was touched, or that it was not, and when -> rows of `probe.csv` at once.
+"""Labels of a recording as they come: samples of a table or a force gauge -> dwells -> rows of `probe.csv`.
 
-Refuses to know where labels come from (`samples`, `reskin.recordings.labelling`), and frames.
+Where they come from: `label_sources`.
 """
 
 import math
+import re
 import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,11 +17,19 @@ from reskin.board.port import append
 from reskin.errors import CaptureError
 from reskin.recordings.header import PROBE_FILE
 from reskin.recordings.probe import CONTACT, LABELS, NOLOAD, TYPES
-from reskin.recordings.text import SAME_PLACE_mm
+from reskin.recordings.units import SAME_PLACE_mm
 
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 TIME_STEP_s = 1e-6  # as it is written
 TIME_MAX_s = 1e11  # unix time is below it for 3,000 years, unless it is in milliseconds
+CLOCKS = ("unix_s", "t_s")  # this machine's, or one of the source's own
+COLUMNS = (*CLOCKS, "phase", "pass_i", *LABELS)
+CONTACT_N = 0.05  # assumed: what a gauge tells from its own noise
+NOLOAD_N = 0.025  # between the two it comes or goes
+DWELL_MIN_s, DWELL_MAX_s = 0.05, 0.5  # assumed: a longer touch is several dwells, each with its own force
+DWELL_SAMPLES_MAX_N = 10_000  # of a clock that stands still
+LINE_BYTES_MAX_N = 4096
+GAUGE_NUMBERS = {1: ("Fz_N",), 3: ("Fx_N", "Fy_N", "Fz_N")}  # by how many stand in a line, in N
 
 
 class Label(NamedTuple):
@@ -134,3 +143,167 @@ def _check(dwell: Dwell) -> None:
     if not -TIME_MAX_s < dwell.t_start_s <= dwell.t_end_s - TIME_STEP_s < TIME_MAX_s:  # of NaN, nothing is so
         got = f"{dwell.t_start_s} to {dwell.t_end_s} s"
         raise CaptureError("a label", "its time", "a span of the clock", got, "Is the clock in seconds?")
+
+
+class Sample(NamedTuple):
+    """A label at a moment; `label` is None while the source moves."""
+
+    t_s: float
+    label: Label | None
+
+
+class Lines:
+    """Cuts bytes into lines of text; a line without end is not waited for."""
+
+    def __init__(self) -> None:
+        self._rest = b""
+
+    def feed(self, data: bytes) -> list[str]:
+        *whole, self._rest = (self._rest + data).split(b"\n")
+        if len(self._rest) > LINE_BYTES_MAX_N:
+            whole, self._rest = [*whole, self._rest[:LINE_BYTES_MAX_N]], b""
+        return [line.decode("utf-8", errors="replace").strip() for line in whole]
+
+
+class Table:
+    """Reads the lines of a CSV: first its header, then samples. `bad_n` counts lines that are none."""
+
+    def __init__(self, where: str) -> None:
+        self._where = where
+        self._names: list[str] = []
+        self._lines = Lines()
+        self.clock, self.bad_n, self.first_bad = "", 0, ""
+
+    def feed(self, data: bytes) -> list[Sample]:
+        """Take the next bytes; give the samples that are whole. Raises if the columns will not do."""
+        samples = []
+        for line in self._lines.feed(data):
+            if not self._names:
+                self._begin([name.strip() for name in line.removeprefix("\ufeff").split(",")])
+            elif line:
+                try:
+                    samples.append(self._sample(line.split(",")))
+                except ValueError:
+                    self.bad_n, self.first_bad = self.bad_n + 1, self.first_bad or line[:60]
+        return samples
+
+    def _begin(self, names: list[str]) -> None:
+        clocks = [name for name in CLOCKS if name in names]
+        shows_touch = "phase" in names or "Fz_N" in names
+        if len(clocks) != 1 or not shows_touch or len(set(names)) < len(names):
+            rule = (
+                f"one of {' and '.join(CLOCKS)}, phase or Fz_N, and of the rest of {', '.join(COLUMNS)} what is known"
+            )
+            raise CaptureError(self._where, "row 1, the column names,", rule, ascii(names)[:120], "Write them there.")
+        self.clock, self._names = clocks[0], names
+
+    def _sample(self, cells: list[str]) -> Sample:
+        row = dict(zip(self._names, cells, strict=True))
+        t_s = _number(row[self.clock])
+        known: dict[str, Any] = {
+            name: _number(row[name]) if row[name].strip() else math.nan for name in LABELS if name in row
+        }
+        pass_i = int(row["pass_i"]) if "pass_i" in row else 0
+        if not math.isfinite(t_s) or pass_i < 0:
+            raise ValueError(cells)
+        if "phase" in row:
+            contact = {CONTACT: True, NOLOAD: False}.get(row["phase"].strip())
+        else:
+            contact = _touches(known["Fz_N"])
+        return Sample(t_s, None if contact is None else Label(contact, **known, pass_i=pass_i))
+
+
+class Gauge:
+    """Reads the lines of a force gauge: one number, Fz, or three, Fx Fy Fz, in N and with the signs of `Label`."""
+
+    def __init__(self) -> None:
+        self._lines = Lines()
+        self.bad_n, self.first_bad = 0, ""
+
+    def feed(self, data: bytes, came_s: float) -> list[Sample]:
+        """Take the next bytes and when they came; give the forces of the lines that are whole."""
+        samples = []
+        for line in self._lines.feed(data):
+            try:
+                numbers = [_number(cell) for cell in re.split(r"[\s,;]+", line)]
+                forces: dict[str, Any] = dict(zip(GAUGE_NUMBERS[len(numbers)], numbers, strict=True))
+            except (ValueError, KeyError):
+                self.bad_n, self.first_bad = self.bad_n + 1, self.first_bad or line[:60]
+                continue
+            contact = _touches(forces["Fz_N"])
+            samples.append(Sample(came_s, None if contact is None else Label(contact, **forces)))
+        return samples
+
+
+class Dwells:
+    """Joins samples that stay touching at one place, or stay off, into dwells; forces and depths are means.
+
+    A touch of several `DWELL_MAX_s` becomes as many dwells, so that a recording that is killed has its labels too.
+    `short_n` counts touches too short to be one.
+    """
+
+    def __init__(self) -> None:
+        self._run: list[Sample] = []
+        self._cut: Sample | None = None  # where a touch that goes on was cut
+        self.short_n = 0
+
+    def feed(self, samples: Iterable[Sample]) -> Iterator[Dwell]:
+        """Take the next samples; give the dwells that are over."""
+        for sample in samples:
+            run = self._run
+            if run and not _goes_on(run[0], run[-1], sample):
+                yield from self.close()
+            if sample.label is not None:
+                if len(self._run) > 1 and not sample.label.contact:  # a long rest is one dwell, of its two ends
+                    self._run.pop()
+                self._run.append(sample)
+                if sample.label.contact and (self._lasts_s() >= DWELL_MAX_s or len(self._run) >= DWELL_SAMPLES_MAX_N):
+                    yield from self.close()
+                    self._cut = sample
+
+    def close(self) -> Iterator[Dwell]:
+        """Give the dwell that the last samples make, if they last long enough to be one."""
+        lasts_s, run, self._run = self._lasts_s(), self._run, []
+        rest = bool(run) and self._cut is not None and _goes_on(self._cut, self._cut, run[0])
+        self._cut = None
+        if lasts_s >= DWELL_MIN_s:
+            yield Dwell(mean_label([sample.label for sample in run if sample.label]), run[0].t_s, run[-1].t_s)
+        elif run and run[0].label and run[0].label.contact and not rest:
+            self.short_n += 1
+
+    def told(self) -> str:
+        """Say how many touches were too short; a table that has a row a change of state has no others."""
+        if not self.short_n:
+            return ""
+        least = f"{DWELL_MIN_s:g} s from its first line to its last"
+        return f"{self.short_n} touches left out: one lasts {least}, so write lines all the while"
+
+    def _lasts_s(self) -> float:
+        return self._run[-1].t_s - self._run[0].t_s if self._run else 0.0
+
+
+def mean_label(labels: list[Label]) -> Label:
+    """Give the label of the first, with the mean of each number that all have."""
+    means: dict[str, Any] = {name: math.fsum(getattr(label, name) for label in labels) / len(labels) for name in LABELS}
+    return labels[0]._replace(**means)
+
+
+def _goes_on(first: Sample, last: Sample, sample: Sample) -> bool:
+    a, b = first.label, sample.label
+    if a is None or b is None or a.contact != b.contact or a.pass_i != b.pass_i or sample.t_s < last.t_s:
+        return False
+    return not a.contact or same_place(a, b)
+
+
+def _touches(force_N: float) -> bool | None:
+    """Tell by the force whether the skin is touched; None where it comes or goes, or nothing is known."""
+    if abs(force_N) >= CONTACT_N:
+        return True
+    return False if abs(force_N) < NOLOAD_N else None
+
+
+def _number(text: str) -> float:
+    """Read a number; raise `ValueError` for words and what overflows."""
+    if not math.isfinite(number := float(text)) or "_" in text:
+        raise ValueError(text)
+    return number

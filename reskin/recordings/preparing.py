@@ -15,11 +15,11 @@ from reskin import io
 from reskin.board import stream
 from reskin.board.wire import TEXT_WIRES
 from reskin.errors import CaptureError, ReskinError
+from reskin.recordings import ReaderLayout
 from reskin.recordings import header as headers
 from reskin.recordings.fault_policy import REFUSE_NONE
 from reskin.recordings.header import Clock, Header
 from reskin.recordings.ingest import read_header
-from reskin.recordings.layouts import Foreign
 from reskin.recordings.readers import READERS
 
 NATIVE_FILES = (headers.STREAM_FILE, headers.ARRIVALS_FILE, headers.PROBE_FILE)
@@ -82,13 +82,13 @@ def layouts_of(recording: Path) -> list[str]:
     """List the layouts that a recording can be read in."""
     if (recording / headers.HEADER_FILE).is_file():
         return ["capture"]
-    if found := [layout for layout in get_args(Foreign) if _reads(recording, layout)]:
+    if found := [layout for layout in get_args(ReaderLayout) if _reads(recording, layout)]:
         return [layout for layout in found if layout != "table"] or found  # a plain table may leave labels unread
     fits = stream.fitting(io.read_bytes(recording)) if recording.is_file() else []
     return sorted({"serial-text" if wire in TEXT_WIRES else "serial-binary" for wire, _ in fits})
 
 
-def _reads(recording: Path, layout: Foreign) -> bool:
+def _reads(recording: Path, layout: ReaderLayout) -> bool:
     options = {"force_axis": "z"} if layout == "eflesh" else {}
     try:
         prepared = foreign(recording, layout, Labels("board", "skin", None), options)
@@ -100,7 +100,7 @@ def _reads(recording: Path, layout: Foreign) -> bool:
     return True
 
 
-def foreign(recording: Path, layout: Foreign, labels: Labels, options: Mapping[str, str]) -> Prepared:
+def foreign(recording: Path, layout: ReaderLayout, labels: Labels, options: Mapping[str, str]) -> Prepared:
     """Prepare somebody else's recording: its own files, untouched, under a header."""
     _need(recording, folder=True)
     files = READERS[layout].collect(recording)

@@ -1,7 +1,7 @@
-"""The probe log: where the robot dwelt, when, and what it felt. In: `probe.csv`. Out: a checked `ProbeLog`, and back.
+"""The probe log `probe.csv`: places, depths and forces of the rig, one row a dwell, on the rig's own clock.
 
-One row a dwell, on the robot's own clock, in order of time. An indentation is one no-load dwell (robot lifted) and
-then its contact dwells (one, unless the robot drags). Refuses to know frames and their clock.
+Rows are in order of time. An indentation is one no-load dwell (robot lifted) and then its contact dwells (one, unless
+the robot drags).
 """
 
 from dataclasses import dataclass
@@ -13,8 +13,8 @@ import pyarrow.compute as pc
 from jaxtyping import Bool, Float32, Float64, Int32
 
 from reskin.errors import CaptureError
-from reskin.recordings import columns
-from reskin.recordings.columns import refuse
+from reskin.recordings import tables
+from reskin.recordings.tables import refuse_row
 
 NOLOAD, CONTACT = "noload", "contact"
 LABELS = ("x_mm", "y_mm", "depth_mm", "Fx_N", "Fy_N", "Fz_N")
@@ -32,7 +32,7 @@ TYPES = {
 class ProbeLog:
     """The dwells of one capture, axis d; NaN where a label is unknown.
 
-    `phase` is stored as `contact`: False while the robot is lifted. Forces have the signs of `core.schema`.
+    `phase` is stored as `contact`: False while the robot is lifted. Forces have the signs of `reskin.schema`.
     """
 
     indentation: Int32[np.ndarray, " d"]
@@ -53,15 +53,15 @@ class ProbeLog:
 
 def parse(source: str | Path, where: str) -> ProbeLog:
     """Read a probe log from CSV text, or from the file at a path; raise `CaptureError` naming the first bad row."""
-    table = columns.parse(source, TYPES, where)
+    table = tables.parse_csv(source, TYPES, where)
     if not len(table):
         raise CaptureError(where, "the log", "one row a dwell", "no rows", "Record the capture again.")
     for name in ("indentation", "pass_i", "phase", "t_start_s", "t_end_s"):
         unknown = np.asarray(table.column(name).is_null())
-        refuse(unknown, where, name, "known", "an empty field", "Only labels may be left empty.")
+        refuse_row(unknown, where, name, "known", "an empty field", "Only labels may be left empty.")
     phases = table.column("phase")
     foreign = np.asarray(pc.invert(pc.is_in(phases, pa.array([NOLOAD, CONTACT]))))
-    refuse(foreign, where, "phase", f"{NOLOAD} or {CONTACT}", phases, "Write one of the two words.")
+    refuse_row(foreign, where, "phase", f"{NOLOAD} or {CONTACT}", phases, "Write one of the two words.")
     numbers = {name: np.asarray(table.column(name)) for name in TYPES if name != "phase"}
     log = ProbeLog(contact=np.asarray(pc.equal(phases, CONTACT)), **numbers)
     _check_numbers(log, where)
@@ -75,29 +75,29 @@ def render(log: ProbeLog) -> str:
     arrays["phase"] = np.where(log.contact, CONTACT, NOLOAD)
     # from_pandas: NaN becomes null, which CSV writes as an empty field
     fields = {name: pa.array(arrays[name], kind, from_pandas=True) for name, kind in TYPES.items()}
-    return columns.render(pa.table(fields))
+    return tables.render_csv(pa.table(fields))
 
 
 def _check_numbers(log: ProbeLog, where: str) -> None:
     for name in LABELS:
         values = getattr(log, name)
-        refuse(np.isinf(values), where, name, "finite, or empty if unknown", values, "Leave it empty.")
+        refuse_row(np.isinf(values), where, name, "finite, or empty if unknown", values, "Leave it empty.")
     for name in ("t_start_s", "t_end_s"):
         values = getattr(log, name)
-        refuse(~np.isfinite(values), where, name, "a finite time", values, "Remove a dwell without times.")
+        refuse_row(~np.isfinite(values), where, name, "a finite time", values, "Remove a dwell without times.")
     for name in ("indentation", "pass_i"):
         values = getattr(log, name)
-        refuse(values < 0, where, name, "0 or more", values, "Count from 0.")
+        refuse_row(values < 0, where, name, "0 or more", values, "Count from 0.")
 
 
 def _check_order(log: ProbeLog, where: str) -> None:
-    end_s = log.t_end_s
-    refuse(end_s <= log.t_start_s, where, "t_end_s", "later than t_start_s of its row", end_s, "Mend the times.")
-    overlaps = np.append(False, log.t_start_s[1:] < end_s[:-1])
-    refuse(overlaps, where, "t_start_s", "not before the dwell above has ended", log.t_start_s, "Sort dwells by time.")
-    falls = np.diff(log.indentation, prepend=log.indentation[0]) < 0
-    refuse(falls, where, "indentation", "rising with time", log.indentation, "Number indentations on over the passes.")
-    opens = np.diff(log.indentation, prepend=-1) != 0
+    start_s, end_s, number = log.t_start_s, log.t_end_s, log.indentation
+    refuse_row(end_s <= start_s, where, "t_end_s", "later than t_start_s of its row", end_s, "Mend the times.")
+    overlaps = np.append(False, start_s[1:] < end_s[:-1])
+    refuse_row(overlaps, where, "t_start_s", "not before the dwell above has ended", start_s, "Sort dwells by time.")
+    falls = np.diff(number, prepend=number[0]) < 0
+    refuse_row(falls, where, "indentation", "rising with time", number, "Number indentations on over the passes.")
+    opens = np.diff(number, prepend=-1) != 0
     remedy = "Log one no-load dwell, and then the contact, of every indentation."
-    refuse(opens & log.contact, where, "an indentation's first dwell", NOLOAD, CONTACT, remedy)
-    refuse(~opens & ~log.contact, where, "an indentation's later dwells", CONTACT, NOLOAD, remedy)
+    refuse_row(opens & log.contact, where, "an indentation's first dwell", NOLOAD, CONTACT, remedy)
+    refuse_row(~opens & ~log.contact, where, "an indentation's later dwells", CONTACT, NOLOAD, remedy)

@@ -18,7 +18,7 @@ from reskin import io
 from reskin.board.port import PortSettings, Recording, Report, Watch, record
 from reskin.errors import CaptureError
 from reskin.recordings.header import HEADER_FILE, Clock, Header, Wire, recorded, render, seal
-from reskin.recordings.labelling import Desk, Labeller, Source
+from reskin.recordings.label_sources import Desk, Labeller, Source
 from reskin.recordings.labels import ProbeTape
 from reskin.recordings.preparing import UNNAMED
 

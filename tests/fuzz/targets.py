@@ -23,10 +23,9 @@ from reskin.live.session import Live
 from reskin.predicting import read_network
 from reskin.recordings import clocks, header, probe
 from reskin.recordings.header import PROBE_FILE, Wire
-from reskin.recordings.labelling import Prompts, parse_places
-from reskin.recordings.labels import Dwell, ProbeTape
+from reskin.recordings.label_sources import Prompts, parse_places
+from reskin.recordings.labels import Dwell, Dwells, Gauge, ProbeTape, Table
 from reskin.recordings.readers import READERS, sd_card
-from reskin.recordings.samples import Dwells, Gauge, Table
 from reskin.seeds import rng_for
 from tests.recordings.headers import AS_USUAL, make_header
 

@@ -15,7 +15,7 @@ from reskin.live.taping import Wanted, board_of, record_board, source_of
 from reskin.recordings import clocks, probe
 from reskin.recordings.header import ARRIVALS_FILE, HEADER_FILE, PROBE_FILE, STREAM_FILE, parse
 from reskin.recordings.ingest import open_capture
-from reskin.recordings.labelling import Desk
+from reskin.recordings.label_sources import Desk
 from reskin.recordings.labels import Dwell
 from reskin.recordings.preparing import Labels, native
 from tests.live.boards import make_script, plugged_in

@@ -12,7 +12,7 @@ import pytest
 from reskin.errors import CaptureError, ParamsError
 from reskin.recordings import probe
 from reskin.recordings.header import PROBE_FILE
-from reskin.recordings.labelling import (
+from reskin.recordings.label_sources import (
     Desk,
     Forces,
     Labeller,
@@ -164,8 +164,8 @@ class Telling:
 def telling(monkeypatch):
     def tell(chunks):
         gauge = Telling(chunks)
-        monkeypatch.setattr("reskin.recordings.labelling.open_port", lambda *_: gauge)
-        monkeypatch.setattr("reskin.recordings.labelling.read_waiting", Telling.read)
+        monkeypatch.setattr("reskin.recordings.label_sources.open_port", lambda *_: gauge)
+        monkeypatch.setattr("reskin.recordings.label_sources.read_waiting", Telling.read)
         return gauge
 
     return tell

@@ -1,4 +1,4 @@
-"""Whatever a source says, the log is one that ingest takes, at any moment."""
+"""Labels in any portions become the same dwells, and at any moment a log that ingestion takes."""
 
 import math
 
@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from reskin.errors import CaptureError
 from reskin.recordings import probe
 from reskin.recordings.header import PROBE_FILE
-from reskin.recordings.labels import Dwell, Label, ProbeTape
+from reskin.recordings.labels import Dwell, DWELL_MAX_s, Dwells, Gauge, Label, Lines, ProbeTape, Table
 
 NUMBER = st.floats(-1e6, 1e6, width=32) | st.just(math.nan)
 LABEL = st.builds(Label, st.booleans(), *[NUMBER] * 6, st.integers(0, 9))
@@ -71,3 +71,87 @@ def test_what_is_no_number_or_no_time_is_refused(tmp_path, label, end_s):
     with pytest.raises(CaptureError, match="a label: .* must be"):
         tape.write(Dwell(label, 0.0, end_s))
     tape.close()
+
+
+HEAD = "unix_s,phase,x_mm,y_mm,Fz_N,note\n"
+
+
+def rows(phase: str, first_s: float, n: int, x_mm: float, force_N: float = 0.0) -> str:
+    return "".join(f"{first_s + 0.1 * i:.1f},{phase},{x_mm},2,{force_N},\n" for i in range(n))
+
+
+def dwells_of(text: str, portion_n: int = 10**6) -> tuple[list[Dwell], Table]:
+    table, dwells, data = Table("log"), Dwells(), text.encode()
+    parts = [data[first : first + portion_n] for first in range(0, len(data), portion_n)]
+    found = [dwell for part in parts for dwell in dwells.feed(table.feed(part))]
+    return [*found, *dwells.close()], table
+
+
+def test_a_robot_that_stands_still_gives_a_dwell_of_each_phase():
+    text = HEAD + rows("noload", 0, 30, 1) + rows("moving", 3, 5, 2) + rows("contact", 4, 4, 3, 0.5)
+    (rest, touch), _ = dwells_of(text)
+    assert (rest.label.contact, rest.t_start_s, rest.t_end_s) == (False, 0.0, 2.9)
+    assert (touch.label.contact, touch.t_start_s, touch.label.x_mm) == (True, 4.0, 3.0)
+    assert touch.label.Fz_N == 0.5
+
+
+def test_a_long_touch_is_several_dwells_each_with_its_force_and_another_place_is_another_dwell():
+    text = HEAD + "".join(rows("contact", i, 10, 3, 0.1 * (i + 1)) for i in range(3)) + rows("contact", 3, 3, 4)
+    found, _ = dwells_of(text)
+    assert all(dwell.t_end_s - dwell.t_start_s <= DWELL_MAX_s + 0.11 for dwell in found)
+    assert found[-1].label.x_mm == 4
+    assert sorted(dwell.label.Fz_N for dwell in found[:-1]) == [dwell.label.Fz_N for dwell in found[:-1]]
+    assert len(found) == 6
+
+
+@settings(max_examples=40)
+@given(st.integers(1, 60))
+def test_any_portions_make_the_same_dwells(portion_n):
+    text = HEAD + rows("noload", 0, 9, 1) + "rubbish\n\n1,2\n" + rows("contact", 4, 9, 3, 0.5)
+    whole, parts = dwells_of(text), dwells_of(text, portion_n)
+    assert repr(whole[0]) == repr(parts[0])  # NaN is no number
+    assert whole[1].bad_n == parts[1].bad_n == 2
+    assert parts[1].first_bad == "rubbish"
+
+
+def test_without_a_phase_the_force_tells_and_a_force_between_is_neither():
+    forces_N = [0, 0.01] * 3 + [0.03] + [0.4] * 3
+    text = "t_s,Fz_N\n" + "".join(f"{0.1 * i},{force_N}\n" for i, force_N in enumerate(forces_N))
+    (rest, touch), table = dwells_of(text)
+    assert table.clock == "t_s"
+    assert (rest.label.contact, touch.label.contact) == (False, True)
+    assert math.isnan(touch.label.x_mm)
+
+
+@pytest.mark.parametrize("head", ["x_mm,y_mm,Fz_N", "t_s,unix_s,Fz_N", "t_s,x_mm,y_mm", "t_s,t_s,Fz_N", ""])
+def test_columns_without_one_clock_or_a_touch_are_refused(head):
+    with pytest.raises(CaptureError, match="row 1, the column names, must be"):
+        Table("log").feed(head.encode() + b"\n")
+
+
+def test_a_gauge_sends_one_number_or_three_and_what_is_neither_is_counted():
+    gauge = Gauge()
+    found = gauge.feed(b"0.50\r\n0.1 -0.2; 0.7\n1,2\nERR\n0.", 3.0) + gauge.feed(b"9\n", 4.0)
+    assert [(one.t_s, one.label.Fz_N) for one in found] == [(3.0, 0.5), (3.0, 0.7), (4.0, 0.9)]
+    assert (found[1].label.Fx_N, found[1].label.Fy_N) == (0.1, -0.2)
+    assert (gauge.bad_n, gauge.first_bad) == (2, "1,2")
+
+
+def test_a_line_without_end_is_not_kept():
+    lines = Lines()
+    for _ in range(1000):
+        lines.feed(b"9" * 100)
+        assert len(lines._rest) <= 4200
+
+
+def test_touches_too_short_to_be_one_are_counted_and_told_but_not_the_rest_of_a_long_one():
+    table, dwells = Table("robot.csv"), Dwells()
+    changes = "t_s,phase,x_mm,y_mm\n0,noload,4,8\n1,contact,4,8\n2,noload,4,8\n3,contact,5,8\n4,noload,5,8\n"
+    list(dwells.feed(table.feed(changes.encode())))
+    assert dwells.short_n == 2
+    assert dwells.told().startswith("2 touches left out: one lasts 0.05 s")
+    long = "".join(f"{5 + 0.01 * i:.2f},contact,4,8\n" for i in range(53))  # 0.52 s: a dwell, and 0.01 s
+    assert len(list(dwells.feed(table.feed((long + "6,noload,4,8\n").encode())))) == 1
+    assert dwells.short_n == 2
+    list(dwells.feed(table.feed(b"7,contact,4,8\n8,noload,4,8\n")))
+    assert dwells.short_n == 3

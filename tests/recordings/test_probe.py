@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from reskin.errors import CaptureError
 from reskin.recordings import probe
 from reskin.recordings.probe import LABELS, ProbeLog
-from reskin.recordings.text import check_log
+from reskin.recordings.units import check_log
 from reskin.seeds import rng_for
 
 HEAD = "indentation,pass_i,phase,t_start_s,t_end_s,x_mm,y_mm,depth_mm,Fx_N,Fy_N,Fz_N\n"

@@ -13,7 +13,7 @@ import pytest
 from reskin.errors import CaptureError
 from reskin.recordings.header import Header
 from reskin.recordings.readers import eflash7, eflesh, ini, lab
-from reskin.recordings.text import read_cells
+from reskin.recordings.tables import read_cells
 from reskin.schema import Readings
 from tests.recordings.headers import AS_USUAL, make_header
 

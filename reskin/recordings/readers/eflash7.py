@@ -18,16 +18,8 @@ from reskin.board.faults import zero_reads
 from reskin.errors import CaptureError
 from reskin.recordings.fault_policy import FaultLog, FaultPolicy, check_rows
 from reskin.recordings.header import Header
-from reskin.recordings.text import (
-    check_changes,
-    check_columns,
-    check_forces,
-    check_touch,
-    count_within,
-    make_readings,
-    read_cells,
-    to_numbers,
-)
+from reskin.recordings.tables import check_columns, count_within, make_readings, read_cells, to_numbers
+from reskin.recordings.units import check_changes, check_forces, check_touch
 from reskin.schema import Readings
 
 READINGS = "readings.csv"

@@ -16,7 +16,8 @@ from reskin.errors import CaptureError
 from reskin.recordings.fault_policy import FaultPolicy, check_rows
 from reskin.recordings.header import Header
 from reskin.recordings.readers.alignment import find_passes
-from reskin.recordings.text import (
+from reskin.recordings.tables import make_readings, read_cells, to_numbers
+from reskin.recordings.units import (
     DEPTH_MIN_mm,
     SAME_PLACE_mm,
     check_depths,
@@ -24,9 +25,6 @@ from reskin.recordings.text import (
     check_forces,
     check_places,
     check_touch,
-    make_readings,
-    read_cells,
-    to_numbers,
 )
 from reskin.schema import AXES_PER_CHIP_N, Readings
 

@@ -18,16 +18,8 @@ from reskin.errors import CaptureError
 from reskin.recordings.fault_policy import CheckedRows, FaultPolicy, check_rows
 from reskin.recordings.header import Header
 from reskin.recordings.readers.alignment import find_change, find_passes
-from reskin.recordings.text import (
-    check_fields,
-    check_forces,
-    check_places,
-    check_touch,
-    make_readings,
-    mean_by_group,
-    read_cells,
-    to_numbers,
-)
+from reskin.recordings.tables import make_readings, mean_by_group, read_cells, to_numbers
+from reskin.recordings.units import check_fields, check_forces, check_places, check_touch
 from reskin.schema import Readings
 
 READINGS = "readings.txt"

@@ -16,12 +16,8 @@ from jaxtyping import Bool, Float64, Int
 from reskin.errors import CaptureError
 from reskin.recordings.fault_policy import FaultPolicy, check_rows
 from reskin.recordings.header import Header
-from reskin.recordings.text import (
+from reskin.recordings.tables import (
     check_columns,
-    check_fields,
-    check_forces,
-    check_places,
-    check_touch,
     contact_rows,
     count_chips_of,
     count_within,
@@ -30,6 +26,7 @@ from reskin.recordings.text import (
     read_cells,
     to_numbers,
 )
+from reskin.recordings.units import check_fields, check_forces, check_places, check_touch
 from reskin.schema import Readings
 
 READINGS = "readings.csv"

@@ -13,9 +13,9 @@ from jaxtyping import Bool, Float, Float32, Float64
 
 from reskin.board import faults
 from reskin.errors import CaptureError
-from reskin.recordings import columns
-from reskin.recordings.columns import FIRST_ROW
-from reskin.recordings.text import check_fields
+from reskin.recordings import tables
+from reskin.recordings.tables import FIRST_ROW
+from reskin.recordings.units import check_fields
 
 TIME = "t_s"
 CHIP_COLUMNS = ("T", "Bx", "By", "Bz")
@@ -53,7 +53,7 @@ def read_log(path: Path) -> Log:
     """
     where = str(path)
     chips_n = _chips_n(path, where)
-    table = columns.parse(path, dict.fromkeys(column_names(chips_n), pa.float64()), where)
+    table = tables.parse_csv(path, dict.fromkeys(column_names(chips_n), pa.float64()), where)
     if not len(table):
         raise CaptureError(where, "the log", "one line a frame", "no lines", "Copy the log again.")
     numbers = np.column_stack([_finite(table, name, where) for name in table.column_names])
@@ -124,7 +124,7 @@ def _chips_n(path: Path, where: str) -> int:
 def _finite(table: pa.Table, name: str, where: str) -> Float64[np.ndarray, " f"]:
     values = np.asarray(table.column(name), np.float64)  # an empty cell is NaN
     remedy = "Remove that line; the gap is counted."
-    columns.refuse(~np.isfinite(values), where, name, "a finite number", values, remedy)
+    tables.refuse_row(~np.isfinite(values), where, name, "a finite number", values, remedy)
     return values
 
 

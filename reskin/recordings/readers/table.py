@@ -12,15 +12,8 @@ from reskin.errors import CaptureError
 from reskin.recordings.fault_policy import FaultPolicy, check_rows
 from reskin.recordings.header import Header
 from reskin.recordings.readers.alignment import find_passes
-from reskin.recordings.text import (
-    SAME_PLACE_mm,
-    WEAKEST_uT,
+from reskin.recordings.tables import (
     check_columns,
-    check_depths,
-    check_fields,
-    check_forces,
-    check_places,
-    check_touch,
     contact_rows,
     count_chips_of,
     count_within,
@@ -28,6 +21,15 @@ from reskin.recordings.text import (
     mean_by_group,
     read_cells,
     to_numbers,
+)
+from reskin.recordings.units import (
+    SAME_PLACE_mm,
+    WEAKEST_uT,
+    check_depths,
+    check_fields,
+    check_forces,
+    check_places,
+    check_touch,
 )
 from reskin.schema import Readings
 

@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 
 from reskin import seeds
 from reskin.errors import CaptureError
-from reskin.recordings.layouts import Foreign
+from reskin.recordings import ReaderLayout
 from reskin.recordings.readers import READERS
-from reskin.recordings.text import check_depths, check_fields, check_forces, check_places, check_touch, make_readings
+from reskin.recordings.tables import make_readings
+from reskin.recordings.units import check_depths, check_fields, check_forces, check_places, check_touch
 from reskin.schema import to_table
 from tests.recordings.headers import make_header
 
@@ -115,7 +116,7 @@ def test_depths_pass_in_millimetres_only(deepest_mm: float, fine: bool) -> None:
 
 
 def test_each_layout_has_a_reader() -> None:
-    assert set(READERS) == set(get_args(Foreign))
+    assert set(READERS) == set(get_args(ReaderLayout))
 
 
 def test_what_a_reader_does_not_give_is_unknown_on_every_chip() -> None:

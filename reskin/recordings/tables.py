@@ -1,19 +1,76 @@
-"""Parse text tables of recordings: cells and numbers, with the line of whatever is wrong."""
+"""Read tables from text and CSV files, and name the line and column of whatever is wrong.
+
+`parse_csv` reads this project's own files, whose columns and types are known; `read_cells` and `to_numbers` read those
+of other recorders.
+"""
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64, Int, Shaped
+import pyarrow as pa
+import pyarrow.csv as pacsv
+from jaxtyping import Bool, Float64, Int, Shaped
 
-from reskin.board import faults
 from reskin.errors import CaptureError
-from reskin.recordings.columns import FIRST_ROW
 from reskin.recordings.header import Header
-from reskin.recordings.probe import ProbeLog
 from reskin.schema import UNITS, Readings
+
+FIRST_ROW = 2  # row 1 of the file is the header
+
+
+def parse_csv(source: str | Path, types: Mapping[str, pa.DataType], where: str) -> pa.Table:
+    """Read CSV text, or the file at a path, that has exactly the columns of `types`, in any order.
+
+    Row numbers in errors count lines of the file: the header is row 1.
+    """
+    try:
+        table = pacsv.read_csv(
+            pa.py_buffer(source.encode()) if isinstance(source, str) else source,
+            # One thread, because only then do Arrow's messages name the row.
+            read_options=pacsv.ReadOptions(use_threads=False),
+            parse_options=pacsv.ParseOptions(ignore_empty_lines=False),
+            convert_options=pacsv.ConvertOptions(column_types=types, null_values=[""], strings_can_be_null=True),
+        )
+    except (pa.ArrowInvalid, UnicodeDecodeError) as error:
+        got = ascii(" ".join(str(error).split()))[1:-1][:200]  # a row of rubbish is no message
+        rule = f"CSV with columns {_list(types)}"
+        raise CaptureError(where, "the table", rule, got, "Mend that row.") from None
+    except FileNotFoundError:
+        raise CaptureError(where, "the file", "there", "nothing", "Copy the whole capture folder.") from None
+    _check_names(table.column_names, types, where)
+    return table.select(list(types)).combine_chunks()
+
+
+def render_csv(table: pa.Table) -> str:
+    """Write a table as CSV text; numbers keep every digit that tells them apart, null is an empty field."""
+    sink = pa.BufferOutputStream()
+    pacsv.write_csv(table, sink, pacsv.WriteOptions(include_header=False, quoting_style="none"))
+    return ",".join(table.column_names) + "\n" + sink.getvalue().to_pybytes().decode()
+
+
+def refuse_row(bad: Bool[np.ndarray, " rows"], where: str, what: str, rule: str, values: Any, remedy: str) -> None:
+    """Raise for the first row that `bad` marks, if any; `values` are those of all rows, or one text for all."""
+    if bad.any():
+        row_i = int(bad.argmax())
+        got = values if isinstance(values, str) else values[row_i]
+        raise CaptureError(f"{where} row {row_i + FIRST_ROW}", what, rule, got, remedy)
+
+
+def _check_names(names: list[str], types: Mapping[str, pa.DataType], where: str) -> None:
+    missing = [name for name in types if name not in names]
+    unknown = [name for name in names if name not in types]
+    if missing or unknown or len(names) != len(types):
+        got = f"missing {_list(missing)}, unknown {ascii(_list(unknown))[1:-1][:80]}, {len(names)} in all"
+        raise CaptureError(where, "row 1, the column names,", _list(types), got, "Rename or remove columns.")
+
+
+def _list(names: Mapping[str, pa.DataType] | list[str]) -> str:
+    return ",".join(names) or "none"
+
 
 # No reading, place or unix time of these recordings comes near it; float32 holds it without overflow.
 MAGNITUDE_MAX = 1e10
@@ -147,114 +204,3 @@ def count_within(press: Int[np.ndarray, " f"]) -> Int[np.ndarray, " f"]:
     """Count 0, 1, 2 ... within each block of equal numbers."""
     begins = np.flatnonzero(np.diff(press, prepend=-1))
     return np.arange(len(press)) - np.repeat(begins, np.diff(begins, append=len(press)))
-
-
-# MLX90393 data sheet, table 17: 16 bits of the coarsest step, 9.680 uT (z, GAIN_SEL 0, RES 3).
-FULL_SCALE_uT = 32768 * 9.680
-# The earth's field alone is 25-65 uT; a chip under a skin reads 200 to 9000 uT, which in mT or T is below this.
-WEAKEST_uT = 20.0
-# The strongest skin known, 13000 uT, would be 130 G: weaker fields on a grid finer than any of the chip's are gauss.
-GAUSS_MAX = 200.0
-NANO_STEP_MIN = 100.0  # the finest step is 150 nT, the coarsest 9.68 uT
-# Forces on skins a few mm thick; a touch of 1 N read as grams would be 102.
-FORCE_MAX_N = 100.0
-FORCE_MIN_N = 0.05  # the strongest touch of any recording is above it; a touch of 0.4 N in kg is not
-SAME_PLACE_mm = 0.002  # a robot that stands still says so to a few um
-EXTENT_MIN_mm, EXTENT_MAX_mm = 1.0, 200.0
-DEPTH_MIN_mm, DEPTH_MAX_mm = 0.05, 100.0
-
-
-def check_fields(b_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n: int) -> None:
-    """Raise if fields are beyond the chip's full scale, too weak for the earth, or on a grid that no chip has in uT.
-
-    The grid shows only where values were not averaged; what is rounded to whole decimals shows none.
-    """
-    _check_full_scale(b_uT, where, first_line_n)
-    usual_uT = float(np.median(np.linalg.norm(b_uT.reshape(len(b_uT), -1, 3).astype(np.float64), axis=2)))
-    if usual_uT < WEAKEST_uT:
-        rule = f"{WEAKEST_uT:g} uT or more at most chips, as the earth's field is"
-        raise CaptureError(where, "field", rule, f"{usual_uT:.4g}", "Convert mT or G to uT.")
-    step_uT = _find_step(b_uT)
-    if step_uT > NANO_STEP_MIN or (usual_uT < GAUSS_MAX and step_uT < faults.STEP_MIN_uT):
-        unit = "nT" if step_uT > NANO_STEP_MIN else "G"
-        rule = "in the steps of an MLX90393, 0.15 to 9.68 uT"
-        raise CaptureError(where, "field", rule, f"steps of {step_uT:.3g}", f"Convert {unit} to uT.")
-
-
-def check_changes(db_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n: int) -> None:
-    """Raise if changes of field are beyond the chip's full scale or in steps that no chip has; they may be weak."""
-    _check_full_scale(db_uT, where, first_line_n)
-    step_uT = _find_step(db_uT)
-    if step_uT > NANO_STEP_MIN or step_uT < faults.STEP_MIN_uT:
-        rule = "in the steps of an MLX90393, 0.15 to 9.68 uT"
-        raise CaptureError(where, "change of field", rule, f"steps of {step_uT:.3g}", "Convert nT, mT or G to uT.")
-
-
-def check_forces(force_N: Float[np.ndarray, " f"], where: str, *, first_line_n: int) -> None:
-    """Raise if a force is more than these skins bear, as forces in grams are; NaN is no force and passes."""
-    too_strong = np.flatnonzero(np.abs(force_N) > FORCE_MAX_N)
-    if len(too_strong):
-        got = f"{force_N[too_strong[0]]:.6g} in line {first_line_n + int(too_strong[0])}"
-        raise CaptureError(where, "force", f"below {FORCE_MAX_N:g} N", got, "Convert grams or mN to N.")
-
-
-def check_touch(force_N: Float[np.ndarray, "*f"], where: str) -> None:
-    """Raise if forces are known, and none of them is one that a gauge can tell from none, as in kg or kN."""
-    strongest_N = np.abs(force_N[np.isfinite(force_N)]).max(initial=0.0)
-    if 0 < strongest_N < FORCE_MIN_N:
-        got = f"{strongest_N:.3g} at most"
-        rule = f"{FORCE_MIN_N:g} N or more somewhere in contact"
-        raise CaptureError(where, "force", rule, got, "Convert kg or kN to N, or press the skin.")
-
-
-def check_places(place_mm: Float[np.ndarray, "f axes"], where: str) -> None:
-    """Raise if places that differ lie closer together or wider apart than a skin's; NaN is no place and passes."""
-    known_mm = place_mm[np.isfinite(place_mm).all(axis=1)]
-    extent_mm = float(np.ptp(known_mm, axis=0).max()) if len(known_mm) else 0.0
-    if extent_mm > SAME_PLACE_mm and not EXTENT_MIN_mm <= extent_mm <= EXTENT_MAX_mm:
-        rule = f"one, or spread over {EXTENT_MIN_mm:g} to {EXTENT_MAX_mm:g} mm"
-        raise CaptureError(where, "places", rule, f"{extent_mm:.4g}", "Convert m or um to mm.")
-
-
-def check_depths(depth_mm: Float[np.ndarray, " f"], where: str) -> None:
-    """Raise if no depth is one that a robot presses, or one is deeper than a skin; 0 and NaN are none and pass."""
-    deepest_mm = np.abs(depth_mm[np.isfinite(depth_mm)]).max(initial=0.0)
-    if deepest_mm and not DEPTH_MIN_mm <= deepest_mm <= DEPTH_MAX_mm:
-        rule = f"{DEPTH_MIN_mm:g} to {DEPTH_MAX_mm:g} mm where it is greatest"
-        raise CaptureError(where, "depth", rule, f"{deepest_mm:.4g}", "Convert m or um to mm.")
-
-
-def check_log(log: ProbeLog, where: str) -> None:
-    """Raise if places, depths or forces of the contacts are not in mm and N, or compression is negative."""
-    contact = log.contact
-    force_N = np.stack([log.Fx_N, log.Fy_N, log.Fz_N], axis=1)
-    for axis_N in force_N.T:
-        check_forces(axis_N, where, first_line_n=FIRST_ROW)
-    check_touch(force_N[contact], where)
-    check_places(np.stack([log.x_mm, log.y_mm], axis=1)[contact], where)
-    check_depths(log.depth_mm[contact], where)
-    known_N = log.Fz_N[contact & np.isfinite(log.Fz_N)]
-    if len(known_N) and np.median(known_N) < 0:
-        got = f"{np.median(known_N):.4g} N"
-        raise CaptureError(where, "the usual Fz_N in contact", "positive", got, "Turn its sign.")
-
-
-def _check_full_scale(b_uT: Float[np.ndarray, "f ch"], where: str, first_line_n: int) -> None:
-    b_max_uT = np.abs(b_uT).max(axis=1)
-    if b_max_uT.max() > FULL_SCALE_uT:
-        place = f"line {first_line_n + int(b_max_uT.argmax())}"
-        rule = f"below the full scale of {FULL_SCALE_uT:.0f} uT"
-        got = f"{b_max_uT.max():.6g} in {place}"
-        raise CaptureError(where, "field", rule, got, "Are the columns in order, and in uT?")
-
-
-def _find_step(b_uT: Float[np.ndarray, "f ch"]) -> float:
-    """Give the usual step of the chips along x and y; NaN where none shows, or where it is that of rounded decimals."""
-    steps_uT = faults.find_lsb(b_uT, step_min_uT=0.0, steps_min_n=faults.SURE_STEPS_MIN_N)[:, 0]
-    steps_uT = steps_uT[np.isfinite(steps_uT)]
-    if not len(steps_uT):
-        return np.nan
-    step_uT = float(np.median(steps_uT))
-    decimals = np.log10(step_uT)
-    rounded = step_uT < faults.STEP_MIN_uT and abs(decimals - round(decimals)) < 0.01
-    return np.nan if rounded else step_uT

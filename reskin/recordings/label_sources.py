@@ -17,8 +17,7 @@ import numpy as np
 
 from reskin.board.port import Device, open_port, read_waiting
 from reskin.errors import CaptureError, ParamsError
-from reskin.recordings.labels import Dwell, Label, ProbeTape
-from reskin.recordings.samples import Dwells, Gauge, Sample, Table, mean_label
+from reskin.recordings.labels import Dwell, Dwells, Gauge, Label, ProbeTape, Sample, Table, mean_label
 
 
 @dataclass
