@@ -1,4 +1,7 @@
-"""Two contacts at once (paper section 7)."""
+"""Two contacts at once, as sums of two pokes of a held-out skin (paper section 7, future work).
+
+What networks of single contacts predict for two, whether two can be detected, and how far fields of two contacts add.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,6 +15,16 @@ from jaxtyping import Float, Float32, Int64
 from pydantic import Field
 from scipy.constants import milli
 
+from pipeline.experiments.detection import (
+    NEIGHBOURS_N,
+    NOISE_uT,
+    Scores,
+    above_pct,
+    direction_distance,
+    neighbour_distance,
+    roc_areas,
+    thresholds,
+)
 from pipeline.experiments.results import write_results
 from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
 from pipeline.report.formatting import show_digits
@@ -34,71 +47,116 @@ from reskin.seeds import rng_for
 from reskin.simulation.capture import roster
 from reskin.simulation.settings import MAIN, Synthesis
 
-NEIGHBOURS_N = 5  # assumed, of both detectors that ask neighbours
-NOISE_uT = 15.0  # of all channels of a reading together (a channel's is 3 to 5 uT, FACTS 3): what lies below is not odd
-
-
-def neighbour_distance(known: Float[np.ndarray, "a c"], asked: Float[np.ndarray, "f c"]) -> Float[np.ndarray, " f"]:
-    """Give the mean distance to the nearest known rows, each column in units of its deviation among these."""
-    scale = np.maximum(known.std(axis=0), 1e-12)
-    return _neighbour_distance(known / scale, asked / scale)
-
-
-def direction_distance(
-    known_uT: Float[np.ndarray, "a ch"], asked_uT: Float[np.ndarray, "f ch"]
-) -> Float[np.ndarray, " f"]:
-    """Give the mean distance to the nearest known directions dB / (|dB| + noise): a weak reading's weighs less."""
-    known, asked = (db_uT / (np.linalg.norm(db_uT, axis=1, keepdims=True) + NOISE_uT) for db_uT in (known_uT, asked_uT))
-    return _neighbour_distance(known, asked)
-
-
-def _neighbour_distance(known: Float[np.ndarray, "a c"], asked: Float[np.ndarray, "f c"]) -> Float[np.ndarray, " f"]:
-    from sklearn.neighbors import NearestNeighbors  # late: it takes a second, and scenes are checked without it
-
-    found = NearestNeighbors(n_neighbors=min(NEIGHBOURS_N, len(known))).fit(known)
-    return found.kneighbors(asked)[0].mean(axis=1)
-
-
-def residual(
-    known: tuple[Float[np.ndarray, "a 3"], Float[np.ndarray, "a ch"]],
-    answer: Float[np.ndarray, "f 3"],
-    db_uT: Float[np.ndarray, "f ch"],
-) -> Float[np.ndarray, " f"]:
-    """Give what a single contact at the answer leaves of the change of field, as a share of it and its noise.
-
-    Its field is that of the `known` (x_mm, y_mm, F_N; uT) nearest to the answer; a force that none knows is not asked.
-    """
-    from sklearn.neighbors import KNeighborsRegressor  # late, as above
-
-    target, known_uT = known
-    columns = ~np.isnan(target).any(axis=0)
-    scale = np.maximum(target[:, columns].std(axis=0), 1e-12)
-    model = KNeighborsRegressor(min(NEIGHBOURS_N, len(target)), weights="distance")
-    expected_uT = model.fit(target[:, columns] / scale, known_uT).predict(answer[:, columns] / scale)
-    return np.linalg.norm(db_uT - expected_uT, axis=1) / (np.linalg.norm(db_uT, axis=1) + NOISE_uT)
-
-
-def disagreement(answers: Float[np.ndarray, "m f 3"]) -> Float[np.ndarray, " f"]:
-    """Give how far apart networks of several seeds place a contact: rms distance from their mean place, in mm."""
-    place_mm = answers[:, :, :2]
-    return np.sqrt(((place_mm - place_mm.mean(axis=0)) ** 2).sum(axis=2).mean(axis=0))
-
-
-def roc_area(single: Float[np.ndarray, " a"], double: Float[np.ndarray, " b"]) -> float:
-    """Give the share of (single, double) in which the double contact is the odder one; ties count half."""
-    ordered = np.sort(single)
-    below = np.searchsorted(ordered, double, side="left")
-    not_above = np.searchsorted(ordered, double, side="right")
-    return float((below + not_above).mean() / (2 * len(single)))
-
-
-TOLERANCE_MM = 0.5  # assumed: a pair's distance may differ by so much from what is asked, as places lie on a grid
+KNOWN_ROWS_N = 6000  # in which detectors search neighbours, drawn
+SINGLES_N = 1000  # single contacts that a threshold is set on, and as many that are tested
+DRAWN_N = 60  # pairs of each board and separation in the figure
+SAME_PLACE = 0.0  # mm: the effect of strength and noise of two readings, without two places
+TOLERANCE_MM = 0.5  # assumed: of a pair's distance, as places lie on a grid
 PLACE_DECIMALS = 2  # places nearer than 0.01 mm are one
+
+Predict = Callable[[np.ndarray], np.ndarray]  # changes of field in uT -> x and y in mm, F in N
+
+
+class Contacts(Strict):
+    """Section contacts: the pairs that are drawn, and the share of false alarms of detectors."""
+
+    pairs_n: Annotated[int, Field(ge=1)]
+    separations_mm: Annotated[tuple[Annotated[float, Field(gt=0)], ...], Field(min_length=1)]
+    false_alarm_fraction: Annotated[float, Field(gt=0, lt=1)]
+
+
+def read(settings: Settings) -> Contacts:
+    """Read section contacts."""
+    return settings.section(Contacts, "contacts")
+
+
+def contacts(settings: Settings, folds: Path, indentations: Path, models: Path, results: Path) -> None:
+    """Add pokes of every held-out board in pairs, and test networks that never saw it on the sums."""
+    data = read_data(settings, indentations, folds)
+    section = read(settings)
+    boards, drawn = zip(
+        *(evaluate_board(data, fold, section, networks_without(models, fold.name)) for fold in data.folds_of("lobo")),
+        strict=True,
+    )
+    stats = summarise_nested(boards)
+
+    def row(separation_mm: float) -> dict[str, Any]:
+        falls, detected = stats["falls"][separation_mm], stats["by_separation"][separation_mm]
+        return {"separation_mm": separation_mm, **falls, **detected}
+
+    numbers: dict[str, Any] = {
+        "pairs_n": section.pairs_n,
+        "boards_n": len(boards),
+        # The networks behind two of the detectors were trained on all other boards, this part included.
+        "threshold_set_on": (
+            f"training contacts of a {drawn[0]['kept_aside']} among which detectors look no neighbours up; the "
+            "networks behind `residual` and `networks disagree` were trained on them"
+        ),
+        "noise": "that of two readings",
+        "by_separation": [row(separation_mm) for separation_mm in section.separations_mm],
+        "same_place": row(SAME_PLACE),
+        "false_alarm_pct": {
+            detector: {"asked": 100 * section.false_alarm_fraction, "realised": realised}
+            for detector, realised in stats["false_alarm_pct"].items()
+        },
+        "auc": stats["auc"],
+    }
+    if "simulate" in settings.of_scene:
+        numbers["superposition"] = superposition(synthesis_of(settings), section.separations_mm, seed=settings.seed)
+    along = {s: [value for one in drawn for value in one["along"][s]] for s in drawn[0]["along"]}
+    write_results(results, numbers, {"along": along})
+
+
+def evaluate_board(
+    data: SceneData, fold: Fold, section: Contacts, networks: Sequence[Predict]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Predict pairs of one held-out board: its numbers, and where predictions fall for the figure."""
+    rows = data.rows
+    rng = rng_for(data.settings.seed, "contacts", fold.name)
+    fit, aside, what = keep_aside(rows, fold.train)
+    known = rng.choice(fit, min(KNOWN_ROWS_N, len(fit)), replace=False)
+    singles = {
+        side: rng.choice(own, min(SINGLES_N, len(own)), replace=False)
+        for side, own in (("aside", aside), ("test", fold.test))
+    }
+    pairs = {
+        separation_mm: draw_pairs(rows, fold.test, separation_mm, pairs_n=section.pairs_n, rng=rng)
+        for separation_mm in (SAME_PLACE, *section.separations_mm)
+    }
+
+    def predict(db_uT: Float32[np.ndarray, "f ch"]) -> Float32[np.ndarray, "m f 3"]:
+        return np.stack([network(db_uT) for network in networks])
+
+    def detect(db_uT: Float32[np.ndarray, "f ch"], predicted: Float32[np.ndarray, "m f 3"]) -> Scores:
+        reference = rows.target[known], rows.db_uT[known]
+        scores = {
+            "direction and length": neighbour_distance(shape(rows.db_uT[known]), shape(db_uT)),
+            "direction above noise": direction_distance(rows.db_uT[known], db_uT),
+            "residual": residual(reference, predicted.mean(axis=0), db_uT),
+        }
+        return scores | ({"networks disagree": disagreement(predicted)} if len(predicted) > 1 else {})
+
+    predicted = {s: predict(one.sum_uT(rows.db_uT)) for s, one in pairs.items()}
+    double = {s: detect(one.sum_uT(rows.db_uT), predicted[s]) for s, one in pairs.items()}
+    single = {side: detect(rows.db_uT[own], predict(rows.db_uT[own])) for side, own in singles.items()}
+    numbers = detection_rates(single["aside"], single["test"], double, section.false_alarm_fraction)
+    truth = {s: (rows.target[one.weaker], rows.target[one.stronger]) for s, one in pairs.items()}
+    numbers["falls"] = {}
+    for separation_mm, both in truth.items():
+        each = [where_it_falls(*both, one) for one in predicted[separation_mm]]
+        numbers["falls"][separation_mm] = {name: float(np.mean([one[name] for one in each])) for name in each[0]}
+    along = {
+        f"{s:g}": along_the_line(*truth[s], predicted[s][0])[:DRAWN_N].round(2).tolist() for s in section.separations_mm
+    }
+    return numbers, {"kept_aside": what, "along": along}
+
+
+# --- Pairs of pokes ---
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """Row numbers of two pokes of one skin; the weaker one by force, or by |dB| where a force is unknown."""
+    """Rows of two pokes of one skin: the weaker one has less force, or less |dB| where a force is unknown."""
 
     weaker: Int64[np.ndarray, " p"]
     stronger: Int64[np.ndarray, " p"]
@@ -111,7 +169,7 @@ class Pairs:
 def draw_pairs(
     rows: Rows, own: Int64[np.ndarray, " a"], separation_mm: float, *, pairs_n: int, rng: np.random.Generator
 ) -> Pairs:
-    """Draw pairs of the rows `own`: two places of a skin so far apart, then a row at each; 0 mm is one place twice."""
+    """Draw pairs of rows: two places of a skin at this distance, then a row at each; at 0 mm, one place twice."""
     found = [_places_apart(rows, own[rows.skin[own] == skin], separation_mm) for skin in np.unique(rows.skin[own])]
     sides = [(rows_at[i], rows_at[j]) for rows_at, pairs in found for i, j in pairs]
     if not sides:
@@ -128,36 +186,35 @@ def draw_pairs(
 def _places_apart(
     rows: Rows, own: Int64[np.ndarray, " a"], separation_mm: float
 ) -> tuple[list[Int64[np.ndarray, " b"]], Int64[np.ndarray, "p 2"]]:
-    # The rows at each place of a skin, and the pairs of places (by number) that lie so far apart.
+    """Give the rows at each place of a skin, and the pairs of places (by number) at this distance."""
     places_mm, at = np.unique(rows.target[own, :2].round(PLACE_DECIMALS), axis=0, return_inverse=True)
     order = np.argsort(at.ravel(), kind="stable")
     rows_at = np.split(own[order], np.cumsum(np.bincount(at.ravel()))[:-1])
     distance_mm = np.linalg.norm(places_mm[:, None] - places_mm, axis=2)
     near = np.abs(distance_mm - separation_mm) <= TOLERANCE_MM
-    # One place twice only where that is asked: 0 mm is within the tolerance of small separations too.
+    # One place twice only at 0 mm, which is within the tolerance of small separations too.
     return rows_at, np.argwhere(np.triu(near, k=1) if separation_mm else np.eye(len(places_mm), dtype=bool))
 
 
 def keep_aside(rows: Rows, train: Int64[np.ndarray, " a"]) -> tuple[np.ndarray, np.ndarray, str]:
-    """Part training rows into those that single contacts are learned from, and those that a threshold is set on.
+    """Split training rows into those that detectors know, those that thresholds are set on, and what these are.
 
-    Kept aside is the last board, else the last skin, else the last pass: the first of these of which there are two.
+    The latter are the last board, or the last skin of one board, or the last pass of one skin.
     """
     for what, labels in (("board", rows.board), ("skin", rows.skin), ("pass", rows.pass_i)):
         kinds = np.unique(labels[train])
         if len(kinds) > 1:
             last = labels[train] == kinds[-1]
             return train[~last], train[last], what
-    raise ParamsError(
-        "contacts", "training rows", "of two boards, skins or passes", "one", "Record more, or do not ask."
-    )
+    remedy = "Record more, or do not run this experiment."
+    raise ParamsError("contacts", "training rows", "of two boards, skins or passes", "one", remedy)
 
 
 def where_it_falls(
-    weaker: Float32[np.ndarray, "p 3"], stronger: Float32[np.ndarray, "p 3"], answer: Float32[np.ndarray, "p 3"]
+    weaker: Float32[np.ndarray, "p 3"], stronger: Float32[np.ndarray, "p 3"], predicted: Float32[np.ndarray, "p 3"]
 ) -> dict[str, float]:
-    """Compare a single-contact answer (x_mm, y_mm, F_N) with the two true ones; what needs a force may be absent."""
-    off_mm = np.stack([answer[:, :2] - side[:, :2] for side in (weaker, stronger)])
+    """Compare a single predicted contact (x_mm, y_mm, F_N) with two true ones; ratios of force need known forces."""
+    off_mm = np.stack([predicted[:, :2] - side[:, :2] for side in (weaker, stronger)])
     numbers = {
         "near_either_pct": 100 * float((np.abs(off_mm) <= ACCURACY_LIMIT_MM).all(axis=2).any(axis=0).mean()),
         "nearest_mm": float(np.linalg.norm(off_mm, axis=2).min(axis=0).mean()),
@@ -165,64 +222,89 @@ def where_it_falls(
     if (np.abs(stronger - weaker)[:, :2] > 0).any(axis=1).all():
         nearer = np.linalg.norm(off_mm[1], axis=1) < np.linalg.norm(off_mm[0], axis=1)
         numbers["nearer_the_stronger_pct"] = 100 * float(nearer.mean())
-        numbers["along"] = float(along_the_line(weaker, stronger, answer).mean())
+        numbers["along"] = float(along_the_line(weaker, stronger, predicted).mean())
     force_N = np.stack([weaker[:, 2], stronger[:, 2]]).astype(np.float64)
     if not np.isnan(force_N).any():
-        predicted_N = float(answer[:, 2].sum(dtype=np.float64))
+        predicted_N = float(predicted[:, 2].sum(dtype=np.float64))
         numbers["force_over_sum"] = predicted_N / float(force_N.sum())
         numbers["force_over_larger"] = predicted_N / float(force_N.max(axis=0).sum())
     return numbers
 
 
 def along_the_line(
-    weaker: Float32[np.ndarray, "p 3"], stronger: Float32[np.ndarray, "p 3"], answer: Float32[np.ndarray, "p 3"]
+    weaker: Float32[np.ndarray, "p 3"], stronger: Float32[np.ndarray, "p 3"], predicted: Float32[np.ndarray, "p 3"]
 ) -> Float[np.ndarray, " p"]:
-    """Give where an answer's foot on the line through both contacts lies: 0 at the weaker one, 1 at the stronger."""
+    """Project predictions on the line through both contacts: 0 at the weaker one, 1 at the stronger."""
     line_mm = (stronger - weaker)[:, :2].astype(np.float64)
-    return ((answer - weaker)[:, :2] * line_mm).sum(axis=1) / (line_mm**2).sum(axis=1)
+    return ((predicted - weaker)[:, :2] * line_mm).sum(axis=1) / (line_mm**2).sum(axis=1)
 
 
-def detect(
-    aside: Mapping[str, np.ndarray], single: Mapping[str, np.ndarray], double: Mapping[float, Mapping[str, np.ndarray]],
-    false_alarm_fraction: float,
-) -> dict[str, Any]:  # fmt: skip
-    """Call odd what exceeds all but so many of the contacts kept `aside`; by detector, and of pairs by separation."""
-    limits = {name: float(np.quantile(scores, 1 - false_alarm_fraction)) for name, scores in aside.items()}
+# --- Detectors ---
+
+
+def detection_rates(
+    aside: Scores, single: Scores, double: Mapping[float, Scores], false_alarm_fraction: float
+) -> dict[str, Any]:
+    """Give the share of single and double contacts above thresholds that are set on contacts kept `aside`.
+
+    By detector, and for double contacts by separation.
+    """
+    limits = thresholds(aside, false_alarm_fraction)
     apart = {
         name: np.concatenate([own[name] for separation_mm, own in double.items() if separation_mm]) for name in aside
     }
     return {
-        "false_alarm_pct": {name: _above_pct(single[name], limit) for name, limit in limits.items()},
-        "auc": {name: roc_area(single[name], apart[name]) for name in limits},
+        "false_alarm_pct": above_pct(single, limits),
+        "auc": roc_areas(single, apart),
         "by_separation": {
-            separation_mm: {
-                "detected_pct": {name: _above_pct(own[name], limit) for name, limit in limits.items()},
-                "auc": {name: roc_area(single[name], own[name]) for name in limits},
-            }
+            separation_mm: {"detected_pct": above_pct(own, limits), "auc": roc_areas(single, own)}
             for separation_mm, own in double.items()
         },
     }
 
 
-def _above_pct(scores: np.ndarray, limit: float) -> float:
-    return 100 * float((scores > limit).mean())
+def residual(
+    known: tuple[Float[np.ndarray, "a 3"], Float[np.ndarray, "a ch"]],
+    predicted: Float[np.ndarray, "f 3"],
+    db_uT: Float[np.ndarray, "f ch"],
+) -> Float[np.ndarray, " f"]:
+    """Give what a single contact at the prediction leaves of the change of field, as a share of it and its noise.
+
+    Its field is that of the `known` contacts (x_mm, y_mm, F_N; uT) nearest to the prediction; forces count if known.
+    """
+    from sklearn.neighbors import KNeighborsRegressor  # late: it takes a second
+
+    target, known_uT = known
+    columns = ~np.isnan(target).any(axis=0)
+    scale = np.maximum(target[:, columns].std(axis=0), 1e-12)
+    model = KNeighborsRegressor(min(NEIGHBOURS_N, len(target)), weights="distance")
+    expected_uT = model.fit(target[:, columns] / scale, known_uT).predict(predicted[:, columns] / scale)
+    return np.linalg.norm(db_uT - expected_uT, axis=1) / (np.linalg.norm(db_uT, axis=1) + NOISE_uT)
+
+
+def disagreement(predicted: Float[np.ndarray, "m f 3"]) -> Float[np.ndarray, " f"]:
+    """Give how far apart networks of several seeds place a contact: rms distance from their mean place, in mm."""
+    place_mm = predicted[:, :, :2]
+    return np.sqrt(((place_mm - place_mm.mean(axis=0)) ** 2).sum(axis=2).mean(axis=0))
 
 
 def summarise_nested(boards: Sequence[Any]) -> Any:
-    """Summarise over boards each number of nested mappings, one a board."""
+    """Summarise each number of nested mappings over boards; there is one mapping for each board."""
     first = boards[0]
     if isinstance(first, Mapping):
         return {key: summarise_nested([board[key] for board in boards if key in board]) for key in first}
     return statistic(boards, boards=True)
 
 
+# --- Superposition of simulated fields ---
+
 PAIRS_N = 6  # of each distance, drawn
-MIDDLE_MM = 2.0  # a pair's middle lies so near the skin's, each axis
-HEIGHTS_N = 9  # over the thickness, between which the second contact's flow is interpolated linearly
+MIDDLE_MM = 2.0  # largest distance of a pair's middle from the skin's, each axis
+HEIGHTS_N = 9  # of the table of displacements, which is interpolated linearly for the second contact
 
 
 def superposition(of: Synthesis, separations_mm: Sequence[float], *, seed: int) -> list[dict[str, Any]]:
-    """Press the scene's first skin twice, half as deep as its protocol goes and all: rms error of the sum."""
+    """Give the rms error of adding the fields of two contacts of the scene's first skin, at two depths."""
     board_name, skin_name = roster(of, MAIN)[0]
     board = draw_board(of.main_boards.design, of.spreads, seed=seed, name=board_name)
     rule = of.main_boards.quadrature.in_si()
@@ -238,14 +320,14 @@ def superposition(of: Synthesis, separations_mm: Sequence[float], *, seed: int) 
             ends_m = [
                 np.column_stack([at_mm * milli, depth_m]) for at_mm in (centres_mm - half_mm, centres_mm + half_mm)
             ]
-            changes_T = np.array([_together(board, skin, *pair) for pair in zip(*ends_m, strict=True)])
-            words = {"depth_mm": depth_mm, "separation_mm": separation_mm, "pairs_n": PAIRS_N}
-            rows.append(words | _errors(changes_T))
+            changes_T = np.array([_changes_of_pair(board, skin, *pair) for pair in zip(*ends_m, strict=True)])
+            keys = {"depth_mm": depth_mm, "separation_mm": separation_mm, "pairs_n": PAIRS_N}
+            rows.append(keys | _errors(changes_T))
     return rows
 
 
 def press_on(skin: Skin, dipoles: Dipoles, poke_m: Float[np.ndarray, "3"]) -> Dipoles:
-    """Displace and turn dipoles, moved or at rest, as a poke (x, y, true depth) displaces what lies where they are."""
+    """Displace and turn dipoles, at rest or moved before, by a poke (x, y, true depth) at their present places."""
     nodes_m, moments_A_m2 = dipoles
     heights = np.linspace(0, 1, HEIGHTS_N)
     at = nodes_m[:, 2] / skin.thickness_m * (HEIGHTS_N - 1)
@@ -267,10 +349,10 @@ def press_on(skin: Skin, dipoles: Dipoles, poke_m: Float[np.ndarray, "3"]) -> Di
     return after_m, turned_A_m2
 
 
-def _together(
+def _changes_of_pair(
     board: Board, skin: Skin, a_m: Float[np.ndarray, "3"], b_m: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4 k 3"]:
-    # What a and b change alone, then a before b and b before a.
+    """Give the change of field of contact a alone, of b alone, of a before b, and of b before a."""
     rest = skin.nodes_m, skin.moments_A_m2
     only_a, only_b = press_on(skin, rest, a_m), press_on(skin, rest, b_m)
     pressed = (only_a, only_b, press_on(skin, only_a, b_m), press_on(skin, only_b, a_m))
@@ -287,126 +369,7 @@ def _errors(changes_T: Float[np.ndarray, "p 4 k 3"]) -> dict[str, float]:
     }
 
 
-Count = Annotated[int, Field(ge=1)]
-Fraction = Annotated[float, Field(gt=0, lt=1)]
-
-
-class Contacts(Strict):
-    """Two contacts at once, as sums of two pokes of a held-out skin (paper section 7)."""
-
-    pairs_n: Count
-    separations_mm: Annotated[tuple[Annotated[float, Field(gt=0)], ...], Field(min_length=1)]
-    false_alarm_fraction: Fraction
-
-
-KNOWN_ROWS_N = 6000  # that detectors look neighbours up in, drawn
-SINGLES_N = 1000  # single contacts that a threshold is set on, and as many that are tested
-SAME_PLACE = 0.0  # mm: what strength and noise of two readings do, without two places
-Answering = Callable[[np.ndarray], np.ndarray]  # changes of field in uT -> x and y in mm, F in N
-DRAWN_N = 60  # pairs a board and separation that the figure shows
-
-
-def on_board(
-    data: SceneData, fold: Fold, section: Contacts, networks: Sequence[Answering]
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Answer pairs of one held-out board: its numbers, and where answers fall for the figure."""
-    rng = rng_for(data.settings.seed, "contacts", fold.name)
-    fit, aside, what = keep_aside(data.rows, fold.train)
-    known = rng.choice(fit, min(KNOWN_ROWS_N, len(fit)), replace=False)
-    singles = {
-        side: rng.choice(own, min(SINGLES_N, len(own)), replace=False)
-        for side, own in (("aside", aside), ("test", fold.test))
-    }
-    pairs = {
-        separation_mm: draw_pairs(data.rows, fold.test, separation_mm, pairs_n=section.pairs_n, rng=rng)
-        for separation_mm in (SAME_PLACE, *section.separations_mm)
-    }
-    answers = {separation_mm: _answers(networks, one.sum_uT(data.rows.db_uT)) for separation_mm, one in pairs.items()}
-    double = {
-        separation_mm: _odd(data, known, one.sum_uT(data.rows.db_uT), answers[separation_mm])
-        for separation_mm, one in pairs.items()
-    }
-    single = {
-        side: _odd(data, known, data.rows.db_uT[own], _answers(networks, data.rows.db_uT[own]))
-        for side, own in singles.items()
-    }
-    numbers = detect(single["aside"], single["test"], double, section.false_alarm_fraction)
-    numbers["falls"] = {s: _falls(data, pairs[s], answers[s]) for s in pairs}
-    drawn = {
-        f"{s:g}": along_the_line(*_truth(data, pairs[s]), answers[s][0])[:DRAWN_N].round(2).tolist()
-        for s in section.separations_mm
-    }
-    return numbers, {"kept_aside": what, "along": drawn}
-
-
-def _answers(networks: Sequence[Answering], db_uT: Float32[np.ndarray, "f ch"]) -> Float32[np.ndarray, "m f 3"]:
-    return np.stack([network(db_uT) for network in networks])
-
-
-def _odd(data: SceneData, known: np.ndarray, db_uT: np.ndarray, answers: np.ndarray) -> dict[str, np.ndarray]:
-    reference = data.rows.target[known], data.rows.db_uT[known]
-    scores = {
-        "direction and length": neighbour_distance(shape(data.rows.db_uT[known]), shape(db_uT)),
-        "direction above noise": direction_distance(data.rows.db_uT[known], db_uT),
-        "residual": residual(reference, answers.mean(axis=0), db_uT),
-    }
-    return scores | ({"networks disagree": disagreement(answers)} if len(answers) > 1 else {})
-
-
-def _truth(data: SceneData, pairs: Pairs) -> tuple[np.ndarray, np.ndarray]:
-    return data.rows.target[pairs.weaker], data.rows.target[pairs.stronger]
-
-
-def _falls(data: SceneData, pairs: Pairs, answers: np.ndarray) -> dict[str, float]:
-    each = [where_it_falls(*_truth(data, pairs), answer) for answer in answers]
-    return {name: float(np.mean([one[name] for one in each])) for name in each[0]}
-
-
-# The networks behind two of the detectors were trained on all that the held-out board leaves, so on this part as well.
-KEPT_ASIDE = (
-    "training contacts of a {} among which detectors look no neighbours up; the networks behind `residual` and "
-    "`networks disagree` were trained on them"
-)
-
-
-def read(settings: Settings) -> Contacts:
-    """Read section contacts."""
-    return settings.section(Contacts, "contacts")
-
-
-def contacts(settings: Settings, folds: Path, indentations: Path, models: Path, results: Path) -> None:
-    """Add pokes of every held-out board in pairs, and ask the networks that never saw it."""
-    data = read_data(settings, indentations, folds)
-    settings, held_out = data.settings, data.folds_of("lobo")
-    section = read(settings)
-    boards, drawn = zip(
-        *(on_board(data, fold, section, networks_without(models, fold.name)) for fold in held_out), strict=True
-    )
-    stats = summarise_nested(boards)
-    numbers: dict[str, Any] = {
-        "pairs_n": section.pairs_n,
-        "boards_n": len(boards),
-        "threshold_set_on": KEPT_ASIDE.format(drawn[0]["kept_aside"]),
-        "noise": "that of two readings",
-        "by_separation": [_row(stats, separation_mm) for separation_mm in section.separations_mm],
-        "same_place": _row(stats, SAME_PLACE),
-        "false_alarm_pct": {
-            detector: {"asked": 100 * section.false_alarm_fraction, "realised": realised}
-            for detector, realised in stats["false_alarm_pct"].items()
-        },
-        "auc": stats["auc"],
-    }
-    if "simulate" in settings.of_scene:
-        numbers["superposition"] = superposition(
-            synthesis_of(data.settings), section.separations_mm, seed=data.settings.seed
-        )
-    along = {s: [value for one in drawn for value in one["along"][s]] for s in drawn[0]["along"]}
-    write_results(results, numbers, {"along": along})
-
-
-def _row(stats: dict[str, Any], separation_mm: float) -> dict[str, Any]:
-    return {"separation_mm": separation_mm, **stats["falls"][separation_mm], **stats["by_separation"][separation_mm]}
-
+# --- Tables and figures ---
 
 MEANING = (
     "Two contacts are the sum of two changes of field that were read of one held-out skin, so their noise is that of "
@@ -421,7 +384,7 @@ TWO_TIPS = "Two tips cannot stand nearer than they are wide; smaller distances a
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate what is answered and what is told, by distance; and how far fields are from adding."""
+    """Tabulate predictions and detections by distance, and how far fields are from adding."""
     rows = [_table_row(numbers["same_place"], numbers), *(_table_row(one, numbers) for one in numbers["by_separation"])]
     false_alarm = {"distance of the two, mm": "single contacts"} | {
         f"detected by {name}, %": show_digits(one["realised"], 1) for name, one in numbers["false_alarm_pct"].items()
@@ -429,14 +392,14 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     table = pd.DataFrame([*rows, false_alarm]).fillna("–").assign(source=source)
     asked = next(iter(numbers["false_alarm_pct"].values()))["asked"]
     table.attrs["meaning"] = f"{MEANING} Thresholds ask for {asked:g} % false alarms. {TWO_TIPS}"
-    found = {"contacts": table}
+    made = {"contacts": table}
     if "superposition" in numbers:
-        found["superposition"] = _superposition(numbers["superposition"], source)
-    return found
+        made["superposition"] = _superposition(numbers["superposition"], source)
+    return made
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw where answers fall between two contacts, and how often two are told from one."""
+    """Draw where predictions fall between two contacts, and how often two are detected."""
     with drawing(7.8, 4.4) as figure:
         left, right = figure.subplots(1, 2)
         _draw_places(left, drawn["along"])
@@ -464,9 +427,9 @@ def _draw_detection(axes: Any, numbers: Mapping[str, Any]) -> None:
     rows, together = numbers["by_separation"], numbers["same_place"]
     distance_mm = [row["separation_mm"] for row in rows]
     for i, (name, alarm) in enumerate(numbers["false_alarm_pct"].items()):
-        told = [row["detected_pct"][name]["mean"] for row in rows]
+        detected_pct = [row["detected_pct"][name]["mean"] for row in rows]
         colour, marker = COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)]
-        axes.plot(distance_mm, told, color=colour, marker=marker, label=name)
+        axes.plot(distance_mm, detected_pct, color=colour, marker=marker, label=name)
         at_one = together["detected_pct"][name]["mean"]
         axes.plot(
             together["separation_mm"], at_one, color=colour, marker=marker, markerfacecolor="white", clip_on=False
@@ -488,7 +451,7 @@ def _table_row(one: Mapping[str, Any], numbers: Mapping[str, Any]) -> dict[str, 
         "force_over_sum": "force / sum of both",
         "force_over_larger": "force / larger of both",
     }
-    row |= {words: show_digits(one[name], 2) for name, words in optional.items() if name in one}
+    row |= {title: show_digits(one[name], 2) for name, title in optional.items() if name in one}
     return row | {
         f"detected by {name}, %": show_digits(one["detected_pct"][name], 1) for name in numbers["false_alarm_pct"]
     }

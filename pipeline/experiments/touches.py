@@ -1,4 +1,8 @@
-"""Touches at numbered places, one or two at once, recorded (paper section 7)."""
+"""Touches at numbered places of a real pad, one or two at once, recorded (paper section 7, future work).
+
+Which place was touched and how hard, how far the fields of two touches are the sum of two single ones, and whether two
+touches are detected. A recording is cut by time into what is known, what sets thresholds and what is tested.
+"""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -9,11 +13,20 @@ from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Bool, Float, Float32, Float64
+from jaxtyping import Float32, Float64
 from pydantic import Field, model_validator
 from scipy.optimize import nnls
 
-from pipeline.experiments.contacts import NEIGHBOURS_N, NOISE_uT, direction_distance, neighbour_distance, roc_area
+from pipeline.experiments.detection import (
+    NEIGHBOURS_N,
+    NOISE_uT,
+    Scores,
+    above_pct,
+    direction_distance,
+    neighbour_distance,
+    roc_areas,
+    thresholds,
+)
 from pipeline.experiments.results import write_results
 from pipeline.report.formatting import show_digits
 from pipeline.settings import Settings
@@ -29,93 +42,65 @@ from reskin.models.inputs import shape
 from reskin.schema import Readings
 from reskin.seeds import rng_for
 
+PLACE_COUNT = re.compile(r"place_(\d+)_rows_n")  # in the account of a capture, by layouts that number places
+ROWS_MIN_N = 20  # touched rows of a recording
+LINEAR = Ridge(inputs="raw", method="ridge", alpha=1.0)  # model of force
+SUMS_N = 100  # sums of two single touches, of each pair of places, drawn
+
+Fraction = Annotated[float, Field(gt=0, lt=1)]
 Directions = Mapping[int, Float64[np.ndarray, " ch"]]  # by place
-Scores = dict[str, Float[np.ndarray, "_"]]  # by detector: the larger, the less like one touch
 
 
-def unit(db_uT: Float32[np.ndarray, "f ch"]) -> Float64[np.ndarray, "f ch"]:
-    """Give directions dB / (|dB| + noise): a weak reading's is short."""
-    return np.asarray(db_uT / (np.linalg.norm(db_uT.astype(np.float64), axis=1, keepdims=True) + NOISE_uT))
+class Touches(Strict):
+    """Section touches: how a recording is cut by time, and how many single touches a threshold may call two."""
+
+    train_fraction: Fraction
+    aside_fraction: Fraction
+    false_alarm_fraction: Fraction
+
+    @model_validator(mode="after")
+    def _check_test_rows_are_left(self) -> "Touches":
+        if self.train_fraction + self.aside_fraction >= 1:
+            raise ValueError("train_fraction and aside_fraction leave rows to test: together less than 1")
+        return self
 
 
-def name_places(
-    known_uT: Float32[np.ndarray, "a ch"], places: Float64[np.ndarray, " a"], asked_uT: Float32[np.ndarray, "f ch"]
-) -> Float64[np.ndarray, " f"]:
-    """Answer the place that most of the nearest known directions are of."""
-    from sklearn.neighbors import KNeighborsClassifier  # late: it takes a second, and scenes are checked without it
-
-    voters = KNeighborsClassifier(min(NEIGHBOURS_N, len(known_uT))).fit(unit(known_uT), places)
-    return np.asarray(voters.predict(unit(asked_uT)))
+def read(settings: Settings) -> Touches:
+    """Read section touches."""
+    return settings.section(Touches, "touches")
 
 
-def directions(
-    known_uT: Float32[np.ndarray, "a ch"], places: Float64[np.ndarray, " a"]
-) -> dict[int, Float64[np.ndarray, " ch"]]:
-    """Give the mean direction of each place's rows."""
-    units = unit(known_uT)
-    return {int(place): units[places == place].mean(axis=0) for place in np.unique(places)}
-
-
-def left_over(
-    known: Directions, places: Sequence[int], db_uT: Float32[np.ndarray, "f ch"]
-) -> Float64[np.ndarray, " f"]:
-    """Give what amplitudes of 0 or more of these places' directions, fitted row by row, leave of dB, as a share of it.
-
-    This is the least that any two strengths can leave: how hard each place was pressed is not known.
-    """
-    basis = np.stack([known[place] for place in places], axis=1)
-    rows_uT = db_uT.astype(np.float64)
-    return np.array([nnls(basis, row_uT)[1] for row_uT in rows_uT]) / np.linalg.norm(rows_uT, axis=1)
-
-
-def explain_pair(known: Directions, pair: tuple[int, int], db_uT: Float32[np.ndarray, "f ch"]) -> dict[str, Any]:
-    """Say how much of the field of two touches the sum of theirs leaves, beside one place's and all other pairs'."""
-    left = {of: float(np.median(left_over(known, of, db_uT))) for of in combinations(sorted(known), 2)}
-    alone = {place: float(np.median(left_over(known, (place,), db_uT))) for place in known}
-    least = min(alone, key=lambda place: alone[place])
-    others = [share for of, share in left.items() if of != pair]
-    return {
-        "places": list(pair), "rows_n": len(db_uT), "left_over_pct": 100 * left[pair],
-        "weaker_alone_pct": 100 * max(alone[place] for place in pair),
-        "stronger_alone_pct": 100 * min(alone[place] for place in pair),
-        "best_alone_pct": 100 * alone[least], "best_alone": least,
-        "other_pairs_pct": 100 * float(np.mean(others)), "rank": 1 + sum(share < left[pair] for share in others),
-        "pairs_n": len(left),
-    }  # fmt: skip
-
-
-def oddness(known_uT: Float32[np.ndarray, "a ch"], known: Directions, asked_uT: Float32[np.ndarray, "f ch"]) -> Scores:
-    """Score rows by the detectors of experiment contacts that need no network, and by what one place leaves over."""
-    alone = [left_over(known, (place,), asked_uT) for place in known]
-    return {
-        "direction and length": neighbour_distance(shape(known_uT), shape(asked_uT)),
-        "direction above noise": direction_distance(known_uT, asked_uT),
-        "left over by one place": np.min(alone, axis=0),
+def touches(settings: Settings, indentations: Path, results: Path) -> None:
+    """Evaluate touches at numbered places."""
+    section, selection = read(settings), settings.section(Selection, "selection")
+    sources = [indentations / f"{name}.parquet" for name in settings.captures_in(indentations)]
+    found = sort_recordings(touched_rows(io.read_readings(file), io.read_account(file), selection) for file in sources)
+    single, double = found.single, found.double
+    counts = {
+        "force_min_N": selection.force_min_N,
+        "single": {"recordings_n": len(single), "rows_n": sum(len(one.db_uT) for one in single)},
+        "double": {"recordings_n": len(double), "rows_n": sum(len(one.db_uT) for one in double)},
+        "left_out": found.left_out,
     }
+    for name, reason in found.left_out.items():
+        say(f"{settings.scene}: warning: {name} left out: {reason}")
+    if found.problem:
+        write_results(results, counts | {"not_computed": found.problem}, {})
+        say(f"{settings.scene}: warning: touches not computed: {found.problem}")
+        return
+    blocks = [split_by_time(one, section) for one in single]
+    numbers = counts | {
+        "tested_rows_n": sum(len(one.test.db_uT) for one in blocks),
+        "place": evaluate_places(blocks, double),
+        "force": evaluate_forces(blocks, rng_for(settings.seed, "touches", "force")),
+        "superposition": evaluate_superposition(blocks, double),
+        "detection": evaluate_detection(blocks, double, section, settings.seed),
+    }
+    write_results(results, numbers, {})
+    say(f"{settings.scene}: {len(single)} recordings of one place, {len(double)} of two")
 
 
-def limits_of(aside: Scores, false_alarm_fraction: float) -> dict[str, float]:
-    """Set each detector's threshold so that it calls odd so many of the single touches kept aside."""
-    return {name: float(np.quantile(scores, 1 - false_alarm_fraction)) for name, scores in aside.items()}
-
-
-def called_pct(scores: Scores, limits: Mapping[str, float]) -> dict[str, float]:
-    """Give the share of rows above each detector's threshold, in percent."""
-    return {name: 100 * float((scores[name] > limit).mean()) for name, limit in limits.items()}
-
-
-def areas(single: Scores, double: Scores) -> dict[str, float]:
-    """Give each detector's area under the ROC curve, of single touches against double ones."""
-    return {name: roc_area(single[name], double[name]) for name in single}
-
-
-def is_one_of(answers: Float64[np.ndarray, " f"], places: Sequence[int]) -> Bool[np.ndarray, " f"]:
-    """Mark the answers that name one of the touched places."""
-    return np.isin(answers, list(places))
-
-
-PLACE_COUNT = re.compile(r"place_(\d+)_rows_n")  # of an account, by layouts that number places
-ROWS_MIN_N = 20  # touched rows that three blocks are cut of
+# --- Recordings ---
 
 
 @dataclass(frozen=True)
@@ -127,43 +112,43 @@ class Touched:
     db_uT: Float32[np.ndarray, "f ch"]
     force_N: Float32[np.ndarray, " f"]
 
-    def part(self, rows: slice) -> "Touched":
-        """Keep some of the rows."""
+    def __getitem__(self, rows: slice) -> "Touched":
+        """Return some of the rows."""
         return Touched(self.name, self.places, self.db_uT[rows], self.force_N[rows])
 
 
 @dataclass(frozen=True)
-class Blocks:
-    """A recording's rows by time: what is learned from, what a threshold is set on, what is tested; in this order."""
+class Split:
+    """A recording's rows by time: what is known, what thresholds are set on, what is tested; in this order."""
 
     train: Touched
     aside: Touched
     test: Touched
 
 
-def touched(readings: Readings, account: Mapping[str, int], selection: Selection) -> Touched:
-    """Take the rows with enough force; raise for a recording whose places have no numbers."""
+def touched_rows(readings: Readings, account: Mapping[str, int], selection: Selection) -> Touched:
+    """Take the rows with enough force; raise `ParamsError` for a recording whose places have no numbers."""
     places = tuple(sorted(int(found[1]) for name in account if (found := PLACE_COUNT.fullmatch(name))))
     if len(places) not in (1, 2):
         rule = "one or two, by number"
-        remedy = "Only layout eflash7 has such; ask this of a scene of its own."
+        remedy = "Only layout eflash7 has such: run this experiment in a scene of its own."
         raise ParamsError(f"capture {readings.capture}", "its places", rule, list(places), remedy)
     rows = readings.Fz_N >= selection.force_min_N
     db_uT = subtract(readings.b_uT[rows], readings.noload_uT[rows])
     return Touched(readings.capture, places, db_uT, readings.Fz_N[rows])
 
 
-def in_blocks(recording: Touched, train_fraction: float, aside_fraction: float) -> Blocks:
-    """Cut a recording's rows in three by time."""
+def split_by_time(recording: Touched, section: Touches) -> Split:
+    """Split a recording's rows in three by time."""
     rows_n = len(recording.db_uT)
-    first, second = (round(share * rows_n) for share in (train_fraction, train_fraction + aside_fraction))
-    parts = (slice(0, first), slice(first, second), slice(second, None))
-    return Blocks(*(recording.part(part) for part in parts))
+    fractions = (section.train_fraction, section.train_fraction + section.aside_fraction)
+    first, second = (round(fraction * rows_n) for fraction in fractions)
+    return Split(recording[:first], recording[first:second], recording[second:])
 
 
 @dataclass(frozen=True)
 class Sorted:
-    """Recordings of one place and of two, why others are left out (by name), and why nothing can be computed."""
+    """Recordings of one place and of two, reasons why others are left out, and why nothing can be computed."""
 
     single: list[Touched]
     double: list[Touched]
@@ -174,8 +159,8 @@ class Sorted:
 def sort_recordings(recordings: Iterable[Touched]) -> Sorted:
     """Sort recordings by how many places they touch, and leave out those that cannot be used.
 
-    A recording needs `ROWS_MIN_N` touched rows, a pair of places that each was recorded alone, too. A place that was
-    recorded alone twice would mix two blocks of time, so only its first recording is used.
+    A recording needs `ROWS_MIN_N` touched rows; the places of a pair must have been recorded alone, too. A place that
+    was recorded alone twice would mix two blocks of time, so only its first recording is used.
     """
     ordered = sorted(recordings, key=lambda one: (len(one.places), one.places, one.name))  # single places first
     left_out = {
@@ -203,54 +188,83 @@ def sort_recordings(recordings: Iterable[Touched]) -> Sorted:
 
 
 def joined(parts: Sequence[Touched]) -> tuple[Float32[np.ndarray, "f ch"], Float64[np.ndarray, " f"]]:
-    """Stack the changes of field of single touches, and the number of the place of each row."""
+    """Stack single touches: their changes of field, and the number of the place of each row."""
     numbers = np.repeat(np.array([float(part.places[0]) for part in parts]), [len(part.db_uT) for part in parts])
     return np.concatenate([part.db_uT for part in parts]), numbers
 
 
-Fraction = Annotated[float, Field(gt=0, lt=1)]
-LINEAR = Ridge(inputs="raw", method="ridge", alpha=1.0)  # of force
-SUMS_N = 100  # sums of two single touches, of each pair of places, drawn
+# --- Fields of touches ---
 
 
-class Touches(Strict):
-    """How a recording is cut by time, and how many single touches a threshold may call two."""
-
-    train_fraction: Fraction
-    aside_fraction: Fraction
-    false_alarm_fraction: Fraction
-
-    @model_validator(mode="after")
-    def _something_is_left(self) -> "Touches":
-        if self.train_fraction + self.aside_fraction >= 1:
-            raise ValueError("train_fraction and aside_fraction leave rows to test: together less than 1")
-        return self
+def unit(db_uT: Float32[np.ndarray, "f ch"]) -> Float64[np.ndarray, "f ch"]:
+    """Give directions dB / (|dB| + noise): a weak reading's is short."""
+    return np.asarray(db_uT / (np.linalg.norm(db_uT.astype(np.float64), axis=1, keepdims=True) + NOISE_uT))
 
 
-def read(settings: Settings) -> Touches:
-    """Read section touches."""
-    return settings.section(Touches, "touches")
+def name_places(
+    known_uT: Float32[np.ndarray, "a ch"], places: Float64[np.ndarray, " a"], tested_uT: Float32[np.ndarray, "f ch"]
+) -> Float64[np.ndarray, " f"]:
+    """Predict the place that most of the nearest known directions are of."""
+    from sklearn.neighbors import KNeighborsClassifier  # late: it takes a second, and scenes are checked without it
+
+    voters = KNeighborsClassifier(min(NEIGHBOURS_N, len(known_uT))).fit(unit(known_uT), places)
+    return np.asarray(voters.predict(unit(tested_uT)))
 
 
-def of_places(blocks: Sequence[Blocks], double: Sequence[Touched]) -> dict[str, Any]:
-    """Name the place of single touches by time, and of two touches: is the answer one of both?"""
+def directions(
+    known_uT: Float32[np.ndarray, "a ch"], places: Float64[np.ndarray, " a"]
+) -> dict[int, Float64[np.ndarray, " ch"]]:
+    """Give the mean direction of each place's rows."""
+    units = unit(known_uT)
+    return {int(place): units[places == place].mean(axis=0) for place in np.unique(places)}
+
+
+def left_over(
+    known: Directions, places: Sequence[int], db_uT: Float32[np.ndarray, "f ch"]
+) -> Float64[np.ndarray, " f"]:
+    """Fit amplitudes of 0 or more of these places' directions row by row; give the residual as a share of dB.
+
+    How hard each place was pressed is not recorded: this is the least residual of any strengths.
+    """
+    basis = np.stack([known[place] for place in places], axis=1)
+    rows_uT = db_uT.astype(np.float64)
+    return np.array([nnls(basis, row_uT)[1] for row_uT in rows_uT]) / np.linalg.norm(rows_uT, axis=1)
+
+
+def score_unlike_one(
+    known_uT: Float32[np.ndarray, "a ch"], known: Directions, tested_uT: Float32[np.ndarray, "f ch"]
+) -> Scores:
+    """Score rows by the detectors of experiment contacts that need no network, and by the residual of one place."""
+    alone = [left_over(known, (place,), tested_uT) for place in known]
+    return {
+        "direction and length": neighbour_distance(shape(known_uT), shape(tested_uT)),
+        "direction above noise": direction_distance(known_uT, tested_uT),
+        "left over by one place": np.min(alone, axis=0),
+    }
+
+
+# --- Evaluations ---
+
+
+def evaluate_places(blocks: Sequence[Split], double: Sequence[Touched]) -> dict[str, Any]:
+    """Predict the place of later single touches, and of two touches: is it one of both?"""
     known_uT, numbers = joined([one.train for one in blocks])
     right_pct = [
-        100 * float(is_one_of(name_places(known_uT, numbers, part.db_uT), part.places).mean())
+        100 * float(np.isin(name_places(known_uT, numbers, part.db_uT), part.places).mean())
         for part in [*(one.test for one in blocks), *double]
     ]
     singles_n = len(blocks)
-    told = {
+    found = {
         "by_time": statistic(right_pct[:singles_n]) | {"chance_pct": 100 / singles_n},
         "by_place": {str(one.test.places[0]): pct for one, pct in zip(blocks, right_pct, strict=False)},
     }
     if not double:
-        return told
-    return told | {"one_of_two": statistic(right_pct[singles_n:]) | {"chance_pct": 200 / singles_n}}
+        return found
+    return found | {"one_of_two": statistic(right_pct[singles_n:]) | {"chance_pct": 200 / singles_n}}
 
 
-def of_forces(blocks: Sequence[Blocks], rng: np.random.Generator) -> dict[str, Any]:
-    """Fit force to fields of single touches: tested later in the same recordings, and in recordings left out."""
+def evaluate_forces(blocks: Sequence[Split], rng: np.random.Generator) -> dict[str, Any]:
+    """Fit force to fields of single touches; test it later in the same recordings, and in recordings left out."""
     by_time = [_force_error(blocks, one.test, rng) for one in blocks]
     left_out = [_force_error([other for other in blocks if other is not one], one.test, rng) for one in blocks]
     spread = [{"mse_f_N2": float(one.test.force_N.var(dtype=np.float64))} for one in blocks]
@@ -258,17 +272,17 @@ def of_forces(blocks: Sequence[Blocks], rng: np.random.Generator) -> dict[str, A
     return {way: statistic([row["mse_f_N2"] for row in rows]) for way, rows in ways.items()}
 
 
-def _force_error(known: Sequence[Blocks], asked: Touched, rng: np.random.Generator) -> dict[str, float]:
+def _force_error(known: Sequence[Split], tested: Touched, rng: np.random.Generator) -> dict[str, float]:
     train = [one.train for one in known]
     target = np.full((sum(len(part.force_N) for part in train), 3), np.nan, np.float32)
     target[:, 2] = np.concatenate([part.force_N for part in train])
     fitted = fit(LINEAR, np.concatenate([part.db_uT for part in train]), target, rng, weight=None)
-    error_N = fitted.predict(asked.db_uT)[:, 2].astype(np.float64) - asked.force_N
+    error_N = fitted.predict(tested.db_uT)[:, 2].astype(np.float64) - tested.force_N
     return {"mse_f_N2": float((error_N**2).mean())}
 
 
-def of_superposition(blocks: Sequence[Blocks], double: Sequence[Touched]) -> dict[str, Any]:
-    """Explain two touches by the directions of single ones, beside what these leave of single touches themselves."""
+def evaluate_superposition(blocks: Sequence[Split], double: Sequence[Touched]) -> dict[str, Any]:
+    """Explain two touches by the directions of single ones, beside the residual of single touches themselves."""
     known = directions(*joined([one.train for one in blocks]))
     own_pct = [100 * float(np.median(left_over(known, one.test.places, one.test.db_uT))) for one in blocks]
     pairs = [explain_pair(known, (one.places[0], one.places[1]), one.db_uT) for one in double]
@@ -279,31 +293,49 @@ def of_superposition(blocks: Sequence[Blocks], double: Sequence[Touched]) -> dic
     }
 
 
-def of_detection(blocks: Sequence[Blocks], double: Sequence[Touched], section: Touches, seed: int) -> dict[str, Any]:
-    """Tell two touches from one at a set share of false alarms; with the two controls that say what was told."""
+def explain_pair(known: Directions, pair: tuple[int, int], db_uT: Float32[np.ndarray, "f ch"]) -> dict[str, Any]:
+    """Give the residual of two touches by their two places, beside that of one place and of all other pairs."""
+    left = {of: float(np.median(left_over(known, of, db_uT))) for of in combinations(sorted(known), 2)}
+    alone = {place: float(np.median(left_over(known, (place,), db_uT))) for place in known}
+    least = min(alone, key=lambda place: alone[place])
+    others = [share for of, share in left.items() if of != pair]
+    return {
+        "places": list(pair), "rows_n": len(db_uT), "left_over_pct": 100 * left[pair],
+        "weaker_alone_pct": 100 * max(alone[place] for place in pair),
+        "stronger_alone_pct": 100 * min(alone[place] for place in pair),
+        "best_alone_pct": 100 * alone[least], "best_alone": least,
+        "other_pairs_pct": 100 * float(np.mean(others)), "rank": 1 + sum(share < left[pair] for share in others),
+        "pairs_n": len(left),
+    }  # fmt: skip
+
+
+def evaluate_detection(
+    blocks: Sequence[Split], double: Sequence[Touched], section: Touches, seed: int
+) -> dict[str, Any]:
+    """Detect two touches at a set share of false alarms; with two controls: sums, and touches at unknown places."""
     known_uT, numbers = joined([one.train for one in blocks])
     known = directions(known_uT, numbers)
 
     def scored(parts: Sequence[Float32[np.ndarray, "_ ch"]]) -> Scores:
-        return oddness(known_uT, known, np.concatenate(parts))
+        return score_unlike_one(known_uT, known, np.concatenate(parts))
 
-    limits = limits_of(scored([one.aside.db_uT for one in blocks]), section.false_alarm_fraction)
+    limits = thresholds(scored([one.aside.db_uT for one in blocks]), section.false_alarm_fraction)
     single = scored([one.test.db_uT for one in blocks])
     sums = scored(sums_of(blocks, rng_for(seed, "touches", "sums")))
-    told = {
+    found = {
         "false_alarm_asked_pct": 100 * section.false_alarm_fraction,
-        "false_alarm_pct": called_pct(single, limits),
-        "sums_called_two_pct": called_pct(sums, limits),
-        "unseen_place_called_two_pct": of_unseen_places(blocks, section.false_alarm_fraction),
+        "false_alarm_pct": above_pct(single, limits),
+        "sums_called_two_pct": above_pct(sums, limits),
+        "unseen_place_called_two_pct": unseen_places_called_two(blocks, section.false_alarm_fraction),
     }
     if not double:
-        return told
+        return found
     both = scored([one.db_uT for one in double])
-    return told | {"detected_pct": called_pct(both, limits), "auc": areas(single, both)}
+    return found | {"detected_pct": above_pct(both, limits), "auc": roc_areas(single, both)}
 
 
-def sums_of(blocks: Sequence[Blocks], rng: np.random.Generator) -> list[Float32[np.ndarray, "_ ch"]]:
-    """Add tested single touches of each two places, as experiment contacts does of boards without two touches."""
+def sums_of(blocks: Sequence[Split], rng: np.random.Generator) -> list[Float32[np.ndarray, "_ ch"]]:
+    """Add tested single touches of each two places, as experiment contacts does."""
     tested = [one.test.db_uT for one in blocks]
     drawn = [
         (a_uT[rng.integers(len(a_uT), size=SUMS_N)], b_uT[rng.integers(len(b_uT), size=SUMS_N)])
@@ -313,48 +345,20 @@ def sums_of(blocks: Sequence[Blocks], rng: np.random.Generator) -> list[Float32[
     return [a_uT + b_uT for a_uT, b_uT in drawn]
 
 
-def of_unseen_places(blocks: Sequence[Blocks], false_alarm_fraction: float) -> dict[str, float]:
-    """Call two what is one: single touches of each place, by detectors that know all other places; mean over places."""
+def unseen_places_called_two(blocks: Sequence[Split], false_alarm_fraction: float) -> dict[str, float]:
+    """Give the share of single touches that detectors which know all other places call two; mean over places."""
     called = []
     for one in blocks:
         others = [other for other in blocks if other is not one]
         known_uT, numbers = joined([other.train for other in others])
         known = directions(known_uT, numbers)
-        aside = oddness(known_uT, known, joined([other.aside for other in others])[0])
-        limits = limits_of(aside, false_alarm_fraction)
-        called.append(called_pct(oddness(known_uT, known, one.test.db_uT), limits))
+        aside = score_unlike_one(known_uT, known, joined([other.aside for other in others])[0])
+        limits = thresholds(aside, false_alarm_fraction)
+        called.append(above_pct(score_unlike_one(known_uT, known, one.test.db_uT), limits))
     return {name: float(np.mean([row[name] for row in called])) for name in called[0]}
 
 
-def touches(settings: Settings, indentations: Path, results: Path) -> None:
-    """Answer what can be asked of touches at numbered places."""
-    section, selection = read(settings), settings.section(Selection, "selection")
-    sources = [indentations / f"{name}.parquet" for name in settings.captures_in(indentations)]
-    found = sort_recordings(touched(io.read_readings(file), io.read_account(file), selection) for file in sources)
-    single, double = found.single, found.double
-    counts = {
-        "force_min_N": selection.force_min_N,
-        "single": {"recordings_n": len(single), "rows_n": sum(len(one.db_uT) for one in single)},
-        "double": {"recordings_n": len(double), "rows_n": sum(len(one.db_uT) for one in double)},
-        "left_out": found.left_out,
-    }
-    for name, reason in found.left_out.items():
-        say(f"{settings.scene}: warning: {name} left out: {reason}")
-    if found.problem:
-        write_results(results, counts | {"not_computed": found.problem}, {})
-        say(f"{settings.scene}: warning: touches not computed: {found.problem}")
-        return
-    blocks = [in_blocks(one, section.train_fraction, section.aside_fraction) for one in single]
-    numbers = counts | {
-        "tested_rows_n": sum(len(one.test.db_uT) for one in blocks),
-        "place": of_places(blocks, double),
-        "force": of_forces(blocks, rng_for(settings.seed, "touches", "force")),
-        "superposition": of_superposition(blocks, double),
-        "detection": of_detection(blocks, double, section, settings.seed),
-    }
-    write_results(results, numbers, {})
-    say(f"{settings.scene}: {len(single)} recordings of one place, {len(double)} of two")
-
+# --- Tables ---
 
 BY_TIME = "later in the same recordings"
 ONCE = (
@@ -366,7 +370,7 @@ NO_MM = "The pitch of the 3 x 3 places is stated nowhere, so nothing is given in
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate what one touch tells, how two add up, and whether two are told from one."""
+    """Tabulate places and forces of one touch, the superposition of two, and their detection."""
     if "not_computed" in numbers:
         return {"touches": _not_computed(numbers, source)}
     found = {"touches": _single(numbers), "touches_detection": _detection(numbers["detection"])}
@@ -378,7 +382,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Nothing: tables say it all."""
+    """Draw nothing."""
     return {}
 
 

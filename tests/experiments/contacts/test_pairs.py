@@ -1,4 +1,4 @@
-"""Pairs as they are asked for, answers against hand-made truths, thresholds that no test contact can move."""
+"""Pairs of pokes, predictions against hand-made truths, and thresholds."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from pipeline.experiments.contacts import (
     TOLERANCE_MM,
     along_the_line,
-    detect,
+    detection_rates,
     draw_pairs,
     keep_aside,
     summarise_nested,
@@ -42,7 +42,7 @@ def pairs_at(separation_mm, rows=ROWS, own=OWN, pairs_n=80):
 
 
 @given(st.sampled_from([2.0, 4.2, 6.0, 8.5, 12.0, 16.0]))
-def test_pairs_lie_on_one_skin_of_the_board_as_far_apart_as_is_asked(separation_mm):
+def test_pairs_lie_on_one_skin_at_the_given_distance(separation_mm):
     pairs = pairs_at(separation_mm)
     assert (ROWS.skin[pairs.weaker] == ROWS.skin[pairs.stronger]).all()
     assert set(ROWS.board[pairs.weaker]) == {"b0"}
@@ -52,7 +52,7 @@ def test_pairs_lie_on_one_skin_of_the_board_as_far_apart_as_is_asked(separation_
     assert len(pairs.weaker) == 80
 
 
-def test_zero_is_one_place_twice_and_a_small_distance_never_is():
+def test_zero_is_one_place_twice_and_a_small_distance_is_two_places():
     same = pairs_at(0.0)
     np.testing.assert_array_equal(ROWS.target[same.weaker, :2], ROWS.target[same.stronger, :2])
     close = replace(ROWS, target=(ROWS.target * [0.2, 0.2, 1]).astype(np.float32))  # places 0.4 mm apart
@@ -69,14 +69,14 @@ def test_without_forces_the_weaker_one_is_that_of_the_smaller_field():
     assert not {"force_over_sum", "force_over_larger"} & set(numbers)
 
 
-def test_what_is_read_is_the_sum_row_by_row():
+def test_readings_of_pairs_are_sums_row_by_row():
     pairs = pairs_at(6.0)
     for i in range(5):
         both = ROWS.db_uT[pairs.weaker[i]] + ROWS.db_uT[pairs.stronger[i]]
         np.testing.assert_array_equal(pairs.sum_uT(ROWS.db_uT)[i], both)
 
 
-def test_places_that_are_not_there_are_refused_with_the_way_out():
+def test_a_distance_without_places_is_an_error():
     with pytest.raises(ParamsError, match=r"31 mm apart, within 0.5 mm; got none. Mend contacts.separations_mm"):
         pairs_at(31.0)
 
@@ -85,10 +85,10 @@ def three(*rows):
     return np.array(rows, np.float32)
 
 
-def test_an_answer_is_placed_between_two_known_contacts():
+def test_a_prediction_between_two_known_contacts():
     weaker, stronger = three([0, 0, 1], [0, 0, 1]), three([4, 0, 3], [0, 8, 3])
-    answer = three([3, 0.5, 4], [0, 5, 2])
-    numbers = where_it_falls(weaker, stronger, answer)
+    predicted = three([3, 0.5, 4], [0, 5, 2])
+    numbers = where_it_falls(weaker, stronger, predicted)
     assert numbers["near_either_pct"] == 50  # the first: 1 mm and 0.5 mm from the stronger
     assert numbers["nearest_mm"] == pytest.approx((np.hypot(1, 0.5) + 3) / 2)
     assert numbers["along"] == pytest.approx((3 / 4 + 5 / 8) / 2)
@@ -98,11 +98,11 @@ def test_an_answer_is_placed_between_two_known_contacts():
 
 
 @given(st.floats(-1, 2), st.floats(-5, 5))
-def test_what_is_off_the_line_does_not_move_the_foot(share, aside_mm):
+def test_an_offset_across_the_line_does_not_move_the_projection(share, aside_mm):
     weaker, stronger = three([2, 3, 1]), three([5, 7, 2])
     foot = weaker[0] + share * (stronger - weaker)[0]
-    answer = three(foot + aside_mm * np.array([-0.8, 0.6, 0]))
-    assert along_the_line(weaker, stronger, answer)[0] == pytest.approx(share, abs=1e-5)  # float32
+    predicted = three(foot + aside_mm * np.array([-0.8, 0.6, 0]))
+    assert along_the_line(weaker, stronger, predicted)[0] == pytest.approx(share, abs=1e-5)  # float32
 
 
 @pytest.mark.parametrize(
@@ -119,7 +119,7 @@ def test_a_board_is_kept_aside_else_a_skin_else_a_pass(boards, skins, passes, as
     assert sorted([*fit, *kept]) == [0, 1, 2]
 
 
-def test_one_pass_of_one_skin_has_nothing_to_keep_aside():
+def test_one_pass_of_one_skin_cannot_be_split():
     with pytest.raises(ParamsError, match="two boards, skins or passes; got one"):
         keep_aside(tables.rows(["b0"] * 2, ["s0"] * 2), np.arange(2))
 
@@ -128,22 +128,22 @@ def scores(name, shift=0.0, n=400):
     return {"odd": rng_for(0, "scores", name).normal(shift, 1, n)}
 
 
-def test_a_threshold_is_set_on_what_was_kept_aside_and_on_nothing_else():
+def test_thresholds_depend_on_contacts_kept_aside_alone():
     aside, double = scores("aside"), {0.0: scores("same"), 4.0: scores("four", 2)}
-    one = detect(aside, scores("single"), double, 0.1)
-    other = detect(aside, scores("single", 5), double, 0.1)
+    one = detection_rates(aside, scores("single"), double, 0.1)
+    other = detection_rates(aside, scores("single", 5), double, 0.1)
     assert one["by_separation"][4.0]["detected_pct"] == other["by_separation"][4.0]["detected_pct"]
-    assert detect(aside, aside, double, 0.1)["false_alarm_pct"]["odd"] == pytest.approx(10, abs=100 / 400)
+    assert detection_rates(aside, aside, double, 0.1)["false_alarm_pct"]["odd"] == pytest.approx(10, abs=100 / 400)
 
 
 def test_the_area_over_all_pairs_leaves_out_those_at_one_place():
     single, apart = scores("single"), scores("four", 2)
-    found = detect(scores("aside"), single, {0.0: scores("same", -9), 4.0: apart}, 0.1)
+    found = detection_rates(scores("aside"), single, {0.0: scores("same", -9), 4.0: apart}, 0.1)
     assert found["auc"] == found["by_separation"][4.0]["auc"]
     assert found["by_separation"][0.0]["auc"]["odd"] < 0.01
 
 
-def test_boards_are_put_together_leaf_by_leaf():
+def test_nested_numbers_are_summarised_over_boards():
     trees = [{"a": {"b": 1.0}, "c": 4.0}, {"a": {"b": 3.0}, "c": 6.0}]
     assert summarise_nested(trees) == {
         "a": {"b": {"mean": 2.0, "n": 2, "sd": pytest.approx(np.sqrt(2)), "values": [1.0, 3.0]}},

@@ -1,11 +1,11 @@
-"""Two contacts on a made-up linear skin whose network is exact: what it answers, and what test rows cannot decide."""
+"""Two contacts on a linear skin whose network is exact for single contacts."""
 
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from pipeline.experiments.contacts import Contacts, on_board
+from pipeline.experiments.contacts import Contacts, evaluate_board
 from pipeline.settings import Settings
 from pipeline.training.trainings import SceneData
 from reskin.config import read_yaml
@@ -14,7 +14,7 @@ from reskin.data.splits import Fold
 from reskin.seeds import rng_for
 from tests.data import tables
 
-ASKED = Contacts(pairs_n=40, separations_mm=(4.0, 8.0), false_alarm_fraction=0.1)
+SECTION = Contacts(pairs_n=40, separations_mm=(4.0, 8.0), false_alarm_fraction=0.1)
 CI = Path(__file__).resolve().parents[3] / "pipeline/scenes/ci.yaml"
 
 
@@ -36,40 +36,40 @@ def scenery():
 def nearest(data):
     """An exact network, for single contacts: of the row that looks most alike."""
 
-    def answer(db_uT):
+    def predict(db_uT):
         known = data.rows.db_uT / np.linalg.norm(data.rows.db_uT, axis=1, keepdims=True)
         which = (db_uT @ known.T).argmax(axis=1)
         force_N = np.linalg.norm(db_uT, axis=1) / np.linalg.norm(data.rows.db_uT[which], axis=1)
         return np.column_stack([data.rows.target[which, :2], force_N * data.rows.target[which, 2]]).astype(np.float32)
 
-    return answer
+    return predict
 
 
 AT = scenery()
 TEST = np.flatnonzero(AT.rows.board == "b0")
 FOLD = Fold("lobo", "b0", np.flatnonzero(AT.rows.board != "b0"), TEST, np.zeros(0, np.int64))
-NUMBERS, DRAWN = on_board(AT, FOLD, ASKED, [nearest(AT)])
+NUMBERS, DRAWN = evaluate_board(AT, FOLD, SECTION, [nearest(AT)])
 
 
-def test_two_contacts_far_apart_are_odder_than_two_close_by_and_than_one():
+def test_two_contacts_are_detected_the_better_the_farther_apart():
     found = NUMBERS["by_separation"]
     for detector in ("direction and length", "direction above noise", "residual"):
         assert found[8.0]["auc"][detector] > max(found[4.0]["auc"][detector], 0.7)  # 0.5 is guessing
         assert NUMBERS["false_alarm_pct"][detector] < 25  # 10 asked, of as many again
 
 
-def test_the_answer_lies_between_the_two_and_nearer_the_stronger():
+def test_predictions_lie_between_the_two_and_nearer_the_stronger():
     assert 0.5 < NUMBERS["falls"][8.0]["along"] < 1.0
     assert NUMBERS["falls"][4.0]["nearest_mm"] < NUMBERS["falls"][8.0]["nearest_mm"]
     assert NUMBERS["falls"][0.0]["near_either_pct"] == 100  # twice one place is one contact, twice as strong
     assert [len(values) for values in DRAWN["along"].values()] == [40, 40]
 
 
-def test_one_network_cannot_disagree_with_itself_but_two_can():
+def test_disagreement_needs_two_networks():
     assert "networks disagree" not in NUMBERS["auc"]
-    numbers, _ = on_board(AT, FOLD, ASKED, [nearest(AT), lambda db_uT: nearest(AT)(-db_uT)])
+    numbers, _ = evaluate_board(AT, FOLD, SECTION, [nearest(AT), lambda db_uT: nearest(AT)(-db_uT)])
     assert "networks disagree" in numbers["auc"]
 
 
 def test_the_same_board_gives_the_same_numbers():
-    assert on_board(AT, FOLD, ASKED, [nearest(AT)]) == (NUMBERS, DRAWN)
+    assert evaluate_board(AT, FOLD, SECTION, [nearest(AT)]) == (NUMBERS, DRAWN)

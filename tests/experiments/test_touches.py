@@ -1,4 +1,4 @@
-"""A pad whose fields add exactly: its pairs leave nothing over, other pairs do, and a new place is as odd as two."""
+"""Touches of a simulated pad whose fields add exactly."""
 
 from dataclasses import replace
 from itertools import combinations
@@ -8,18 +8,18 @@ import pytest
 from pydantic import ValidationError
 from scipy.optimize import lsq_linear
 
-from pipeline.experiments import touches
 from pipeline.experiments.touches import (
     Touched,
     Touches,
-    in_blocks,
-    of_detection,
-    of_forces,
-    of_places,
-    of_superposition,
+    evaluate_detection,
+    evaluate_forces,
+    evaluate_places,
+    evaluate_superposition,
+    left_over,
     sort_recordings,
+    split_by_time,
     tables,
-    touched,
+    touched_rows,
 )
 from reskin.data.rows import Selection
 from reskin.errors import ParamsError
@@ -47,30 +47,30 @@ def pad(rows_n=40):
 @pytest.fixture(scope="module")
 def cut():
     single, double = pad()
-    return [in_blocks(one, SECTION.train_fraction, SECTION.aside_fraction) for one in single], double
+    return [split_by_time(one, SECTION) for one in single], double
 
 
-def test_blocks_hold_every_row_once_and_in_order_of_time():
+def test_the_split_holds_every_row_once_in_order_of_time():
     recording = pad()[0][0]
-    blocks = in_blocks(recording, 0.6, 0.2)
+    blocks = split_by_time(recording, SECTION)
     parts = [blocks.train, blocks.aside, blocks.test]
     assert [len(part.db_uT) for part in parts] == [24, 8, 8]
     np.testing.assert_array_equal(np.concatenate([part.db_uT for part in parts]), recording.db_uT)
 
 
-def test_what_is_left_over_is_what_bounded_least_squares_leaves():
+def test_the_residual_equals_that_of_bounded_least_squares():
     rng = rng_for(0, "touches", "left over")
     known = {place: rng.normal(size=15) for place in PLACES}
     db_uT = rng.normal(0, 100, (5, 15)).astype(np.float32)
     basis = np.stack([known[2], known[4]], axis=1)
     costs = [lsq_linear(basis, row.astype(float), (0, np.inf)).cost for row in db_uT]
     naive = np.sqrt(2 * np.array(costs)) / np.linalg.norm(db_uT.astype(float), axis=1)
-    np.testing.assert_allclose(touches.left_over(known, (2, 4), db_uT), naive, rtol=1e-6)  # two solvers
+    np.testing.assert_allclose(left_over(known, (2, 4), db_uT), naive, rtol=1e-6)  # two solvers
 
 
-def test_fields_that_add_leave_the_pair_that_was_touched_noise_alone(cut):
+def test_where_fields_add_the_touched_pair_leaves_noise_alone(cut):
     blocks, double = cut
-    numbers = of_superposition(blocks, double)
+    numbers = evaluate_superposition(blocks, double)
     assert len(numbers["pairs"]) == 6
     for pair in numbers["pairs"]:
         assert pair["rank"] == 1
@@ -78,34 +78,34 @@ def test_fields_that_add_leave_the_pair_that_was_touched_noise_alone(cut):
         assert pair["best_alone_pct"] > 10 * pair["left_over_pct"]
 
 
-def test_a_single_touch_at_a_place_unknown_is_as_odd_as_two(cut):
-    found = of_detection(*cut, SECTION, 0)
+def test_a_single_touch_at_an_unknown_place_is_called_two(cut):
+    found = evaluate_detection(*cut, SECTION, 0)
     for name in found["detected_pct"]:
         assert found["unseen_place_called_two_pct"][name] > 90
     assert found["detected_pct"]["direction above noise"] > 90
     assert found["sums_called_two_pct"]["direction above noise"] > 90
 
 
-def test_places_and_forces_of_a_linear_pad_are_told(cut):
+def test_places_and_forces_of_a_linear_pad_are_predicted(cut):
     blocks, double = cut
-    place, force = of_places(blocks, double), of_forces(blocks, rng_for(0, "touches", "force"))
+    place, force = evaluate_places(blocks, double), evaluate_forces(blocks, rng_for(0, "touches", "force"))
     assert place["by_time"]["mean"] == 100
     assert place["by_time"]["chance_pct"] == 25
     assert force["by_time"]["mean"] < 0.02 * force["variance"]["mean"]
 
 
-def test_only_recordings_with_numbered_places_are_taken():
+def test_recordings_need_numbered_places():
     readings = make_readings(f=60, Fz_N=np.linspace(0, 2, 60, dtype=np.float32))
-    found = touched(readings, {"rows_n": 60, "place_7_rows_n": 60}, Selection(force_min_N=1.0))
+    found = touched_rows(readings, {"rows_n": 60, "place_7_rows_n": 60}, Selection(force_min_N=1.0))
     assert found.places == (7,)
     assert found.force_N.min() >= 1
     with pytest.raises(ParamsError, match="its places must be one or two, by number"):
-        touched(readings, {"rows_n": 60}, Selection(force_min_N=1.0))
+        touched_rows(readings, {"rows_n": 60}, Selection(force_min_N=1.0))
 
 
-def test_recordings_that_cannot_be_used_are_left_out_with_a_reason():
+def test_unusable_recordings_are_left_out_with_a_reason():
     single, double = pad()
-    short = replace(single[0].part(slice(0, 19)), name="short")
+    short = replace(single[0][:19], name="short")
     again = replace(single[1], name="second of place 2")
     found = sort_recordings([*single[1:], again, short, *double])
     assert [one.name for one in found.single] == [one.name for one in single[1:]]
@@ -117,7 +117,7 @@ def test_recordings_that_cannot_be_used_are_left_out_with_a_reason():
     assert found.left_out["(1, 2)"] == "place 1 not recorded alone"
 
 
-def test_recordings_of_two_touches_alone_give_a_table_that_says_why_nothing_was_computed():
+def test_recordings_of_two_touches_alone_give_a_table_with_the_reason():
     _, double = pad()
     found = sort_recordings(double)
     assert found.problem == "places recorded alone: 0; at least 2 are needed. Add their recordings to this scene."
@@ -131,7 +131,7 @@ def test_recordings_of_two_touches_alone_give_a_table_that_says_why_nothing_was_
     assert len(shown["touches"]) == 1 + len(double)
 
 
-def test_nothing_left_to_test_is_refused():
+def test_fractions_must_leave_rows_to_test():
     with pytest.raises(ValidationError, match="leave rows to test"):
         Touches(train_fraction=0.8, aside_fraction=0.2, false_alarm_fraction=0.05)
 
@@ -141,9 +141,10 @@ def test_tables_show_pairs_only_where_two_were_touched(cut):
     for pairs in (double, []):
         numbers = {
             "force_min_N": 0.5, "single": {"recordings_n": 4, "rows_n": 160},
-            "double": {"recordings_n": len(pairs), "rows_n": 40 * len(pairs)}, "place": of_places(blocks, pairs),
-            "force": of_forces(blocks, rng_for(0, "touches", "force")),
-            "superposition": of_superposition(blocks, pairs), "detection": of_detection(blocks, pairs, SECTION, 0),
+            "double": {"recordings_n": len(pairs), "rows_n": 40 * len(pairs)}, "place": evaluate_places(blocks, pairs),
+            "force": evaluate_forces(blocks, rng_for(0, "touches", "force")),
+            "superposition": evaluate_superposition(blocks, pairs),
+            "detection": evaluate_detection(blocks, pairs, SECTION, 0),
         }  # fmt: skip
         shown = tables(numbers, "recorded")
         assert ("touches_superposition" in shown) == bool(pairs)

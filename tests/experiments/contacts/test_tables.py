@@ -25,7 +25,7 @@ SUPERPOSED = [{"depth_mm": 1.2, "separation_mm": 4.0, "pairs_n": 6, "error_pct":
 DRAWN = {"along": {"4": [0.5, 0.6, 1.1], "8": [0.2, 0.9, 0.7]}}
 
 
-def test_a_row_a_distance_and_one_of_single_contacts_all_with_their_source():
+def test_the_table_has_a_row_for_each_distance_and_one_of_single_contacts():
     table = tables(NUMBERS, "recorded")["contacts"]
     assert table["distance of the two, mm"].tolist() == ["0", "4", "8", "single contacts"]
     assert set(table["source"]) == {"recorded"}
@@ -36,13 +36,13 @@ def test_a_row_a_distance_and_one_of_single_contacts_all_with_their_source():
     assert "5 % false alarms" in table.attrs["meaning"]
 
 
-def test_how_far_fields_add_is_told_of_simulated_scenes_alone():
+def test_superposition_has_a_table_in_simulated_scenes_alone():
     assert set(tables(NUMBERS, "recorded")) == {"contacts"}
     table = tables(NUMBERS | {"superposition": SUPERPOSED}, "simulated")["superposition"]
     assert table["error of the sum, % of the change of field"].tolist() == ["13.2"]
 
 
-def test_the_figure_names_detectors_units_and_source_and_is_the_same_twice():
+def test_the_figure_names_detectors_units_and_source_and_is_deterministic():
     drawn = figures(NUMBERS, DRAWN, "recorded")
     words = said(drawn["contacts.svg"])
     for word in ("direction", "residual", "stronger contact", "distance of the two / mm", "%", "(recorded)"):
