@@ -14,7 +14,7 @@ from reskin.config import Strict, parse, read_yaml
 from reskin.data.rows import Selection
 from reskin.data.splits import Split
 from reskin.errors import ParamsError
-from reskin.models.recipe import FineTuning, Labelling, Name, Recipe, Schedule
+from reskin.models.recipe import AdaptationRecipe, FineTuningRecipe, Name, Recipe, Schedule
 from reskin.recordings.fault_policy import FaultPolicy
 
 MAIN_PROTOCOL = "grid"  # folds are drawn on its captures
@@ -39,7 +39,11 @@ ANALYSES = tuple(row.name for row in ROWS if row.kind == "analysis")
 SECTIONS = tuple(dict.fromkeys(row.stage for row in ROWS if row.section))
 
 
-SHARED_ROWS: dict[str, type[Schedule]] = {"recipes": Recipe, "adaptations": FineTuning, "labellings": Labelling}
+SHARED_ROWS: dict[str, type[Schedule]] = {
+    "recipes": Recipe,
+    "adaptations": AdaptationRecipe,
+    "labellings": FineTuningRecipe,
+}
 STEPS = "How many steps is a scene's budget: write them in its sections."
 Section = dict[str, Any]  # checked by the stage that reads it
 Source = Literal["simulated", "recorded"]

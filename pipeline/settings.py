@@ -14,7 +14,7 @@ from pydantic import Field
 from pipeline import PARAMS, PLAN, SCENES
 from reskin.config import Strict, parse, read_yaml
 from reskin.errors import ParamsError
-from reskin.models.recipe import HEADLINE, Adaptation, AugmentedRecipe, Name, Recipe
+from reskin.models.recipe import HEADLINE, AdaptationWithBase, AugmentedRecipe, Name, Recipe
 from reskin.simulation.defaults import NOMINAL, SHARED
 
 PLANNED = ("captures", "held_out", "models")  # of each scene in the plan
@@ -40,7 +40,7 @@ class Adaptations(Strict):
     """Adaptations by name, each with `pokes_n` unlabelled indentations of every held-out skin."""
 
     pokes_n: Count
-    recipes: dict[Name, Adaptation]
+    recipes: dict[Name, AdaptationWithBase]
 
 
 @dataclass(frozen=True)

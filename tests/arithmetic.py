@@ -18,9 +18,9 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from reskin.models.adversarial import Domains, train_adversarial
+from reskin.models.job import LossWeights
 from reskin.models.recipe import Schedule
 from reskin.models.train import train
-from reskin.models.trial import Terms
 from reskin.seeds import rng_for
 from reskin.universal.map import NOMINAL, OF_NOMINAL
 from reskin.universal.population import POKES_N, Population
@@ -42,7 +42,7 @@ def digest(arrays: Iterable[np.ndarray]) -> str:
 
 def paper_networks() -> str:
     jobs = [some_job(name, n=300, terms=True) for name in range(3)]
-    outcomes = train(jobs, "paper", SCHEDULE, Terms(0.1, 0.1, 0.1), "cpu")
+    outcomes = train(jobs, "paper", SCHEDULE, LossWeights(0.1, 0.1, 0.1), "cpu")
     return digest(outcome.weights[name] for outcome in outcomes for name in sorted(outcome.weights))
 
 

@@ -9,8 +9,8 @@ import pytest
 
 from pipeline import FLOW, PLAN, SCENES
 from reskin import code
-from reskin.models.trial import DECIDING, Keys
-from tests.models.trials import measured, pooled
+from reskin.models.job import CODE_MODULES, JobKeys
+from tests.models.example_jobs import measured, pooled
 from tests.stages.checkout import ROOT, copy_checkout, run
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of DVC's own libraries
@@ -169,7 +169,7 @@ def test_words_in_a_module_that_every_stage_imports_run_nothing(root, before):
 
 
 def test_words_in_the_code_of_learning_change_no_key_of_a_training_and_code_does(tmp_path, monkeypatch):
-    files = {name: f"{name.replace('.', '/')}.py" for name in DECIDING}
+    files = {name: f"{name.replace('.', '/')}.py" for name in CODE_MODULES}
     sources = {name: (ROOT / file).read_text() for name, file in files.items()}
     (tmp_path / "reskin/models").mkdir(parents=True)
     monkeypatch.setattr(code, "ROOT", tmp_path)
@@ -178,7 +178,7 @@ def test_words_in_the_code_of_learning_change_no_key_of_a_training_and_code_does
         for name, text in sources.items():
             (tmp_path / files[name]).write_text(text)
         code.digest.cache_clear()
-        return Keys(measured()).key(pooled())
+        return JobKeys(measured()).key(pooled())
 
     told = {name: "# More.\n" + text.replace('"""', '"""More. ', 1) for name, text in sources.items()}
     assert (

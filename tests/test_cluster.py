@@ -20,9 +20,9 @@ from pipeline import cluster
 from pipeline.cluster import _check_workers, describe_process
 from pipeline.executors import make_executor, prepare_workers
 from reskin.errors import ParamsError
-from reskin.models.grid import run_trials
-from tests.models.test_grid import alike, trials
-from tests.models.trials import measured
+from reskin.models.runner import run_jobs
+from tests.models.example_jobs import measured
+from tests.models.test_runner import alike, jobs
 
 ROOT = Path(__file__).resolve().parents[1]
 # As deploy/dask.sh starts workers.
@@ -69,7 +69,7 @@ def where(i: int) -> tuple[int, str, int]:
 
 
 def test_a_sweep_on_two_workers_gives_the_bytes_of_a_local_one(address, tmp_path, monkeypatch):
-    some = [replace(trial, seed_i=seed_i) for trial in trials(2, steps_n=10) for seed_i in (0, 1)]
+    some = [replace(job, seed_i=seed_i) for job in jobs(2, steps_n=10) for seed_i in (0, 1)]
     results = []
     for name, place in (("here", "here"), ("there", f"dask:{address}")):
         monkeypatch.setenv("RESKIN_EXECUTOR", place)
@@ -77,7 +77,7 @@ def test_a_sweep_on_two_workers_gives_the_bytes_of_a_local_one(address, tmp_path
         prepare_workers("reskin.models.train")
         with make_executor(imports="reskin.models.train") as executor:
             cache = tmp_path / name
-            results.append(run_trials(some, measured(), executor=executor, cache=cache, tell=lambda _: None))
+            results.append(run_jobs(some, measured(), executor=executor, cache=cache, log=lambda _: None))
             ran = [future.result() for future in [executor.submit(where, i) for i in range(6)]]
     for a, b in zip(*results, strict=True):
         assert (a.key, a.predicted.tobytes()) == (b.key, b.predicted.tobytes())

@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.executors import end_workers, make_executor
 from reskin.errors import ParamsError
-from reskin.models import trial
+from reskin.models import job
 from reskin.numerics import device
 
 
@@ -89,17 +89,17 @@ def test_a_call_is_timed_after_one_that_warms_and_the_middle_time_counts(monkeyp
         calls.append(len(calls))
         now_s[0] += 1000.0 if len(calls) == 1 else float(len(calls))  # cold once, then 2 s, 3 s, ...
 
-    monkeypatch.setattr(trial, "perf_counter", lambda: now_s[0])
-    median_s = trial.median_s(call)
-    assert len(calls) == trial.REPEATS_N + 1
-    assert median_s == (2 + trial.REPEATS_N + 1) / 2  # of 2 .. 26 s
+    monkeypatch.setattr(job, "perf_counter", lambda: now_s[0])
+    median_s = job.median_call_s(call)
+    assert len(calls) == job.REPEATS_N + 1
+    assert median_s == (2 + job.REPEATS_N + 1) / 2  # of 2 .. 26 s
 
 
 def test_one_slow_call_changes_little(monkeypatch):
-    now_s, took_s = [0.0], iter([1.0] * 10 + [500.0] + [1.0] * trial.REPEATS_N)
+    now_s, took_s = [0.0], iter([1.0] * 10 + [500.0] + [1.0] * job.REPEATS_N)
 
     def call() -> None:
         now_s[0] += next(took_s)
 
-    monkeypatch.setattr(trial, "perf_counter", lambda: now_s[0])
-    assert trial.median_s(call) == 1.0
+    monkeypatch.setattr(job, "perf_counter", lambda: now_s[0])
+    assert job.median_call_s(call) == 1.0

@@ -18,12 +18,12 @@ from pipeline.report.formatting import show_digits
 from pipeline.settings import Settings, Training
 from pipeline.statistics import summarise, tally, with_seeds
 from pipeline.synthesis import synthesis_of
-from pipeline.training.trainings import SceneData, collapse_record, read_data, train_all, trials_of
+from pipeline.training.jobs import SceneData, collapse_record, make_jobs, read_data, train_jobs
 from reskin.config import Strict
 from reskin.data.splits import Fold
 from reskin.metrics import score
 from reskin.models.recipe import HEADLINE
-from reskin.models.trained import Network, networks_without
+from reskin.models.trained import Network, networks_held_out
 from reskin.physics.ambient import EARTH_DIP_DEG, EARTH_SIZE_T, EARTH_T, ball_field, ball_images, random_directions
 from reskin.physics.board import Board, BoardDesign, draw_board
 from reskin.physics.skin import Skin, draw_skin
@@ -186,11 +186,11 @@ def networks_of_common_part(
     """Train the headline recipe anew on inputs whose common part is taken off, as in use; count what collapsed."""
     without = project(data.rows.db_uT, without_common_part(instrument.turn))
     headline = training.model_copy(update={"recipes": {HEADLINE: training.recipes[HEADLINE]}})
-    trials = trials_of(data, headline, [fold], experiment="ambient")
-    trained = train_all(replace(data, rows=replace(data.rows, db_uT=without)), trials, "ambient")
+    jobs = make_jobs(data, headline, [fold], experiment="ambient")
+    trained = train_jobs(replace(data, rows=replace(data.rows, db_uT=without)), jobs, "ambient")
     networks = [
-        Network({"recipe": trial.recipe.model_dump(mode="json")}, {**one.weights, **one.scaler.arrays()})
-        for trial, one in zip(trials, trained, strict=True)
+        Network({"recipe": job.recipe.model_dump(mode="json")}, {**one.weights, **one.scaler.arrays()})
+        for job, one in zip(jobs, trained, strict=True)
     ]
     return networks, tally(map(collapse_record, trained))
 
@@ -245,7 +245,7 @@ def ambient(settings: Settings, folds: Path, indentations: Path, models: Path, r
     points: list[dict[str, Any]] = []
     for fold in held_out:
         instrument = take_board(of, fold.name, seed=seed)
-        networks = {arm: networks_without(models, fold.name) for arm in (AS_IT_IS, ASIDE)}
+        networks = {arm: networks_held_out(models, fold.name) for arm in (AS_IT_IS, ASIDE)}
         if fold is held_out[-1]:
             networks[OWN], trainings = networks_of_common_part(data, fold, trained, instrument)
         points += on_board(data, fold, section, of=of, instrument=instrument, networks=networks)

@@ -12,7 +12,7 @@ from jaxtyping import Float, Float32, Int
 from pipeline.report.choice import settings_of, trimmed
 from pipeline.settings import Settings
 from pipeline.stage import say
-from pipeline.training.trainings import SceneData, read_data
+from pipeline.training.jobs import SceneData, read_data
 from reskin import io
 from reskin.config import Strict, parse
 from reskin.errors import LeakError, ParamsError, SchemaError

@@ -31,14 +31,14 @@ from pipeline.report.formatting import show_digits
 from pipeline.settings import Settings
 from pipeline.statistics import statistic
 from pipeline.synthesis import synthesis_of
-from pipeline.training.trainings import SceneData, read_data
+from pipeline.training.jobs import SceneData, read_data
 from reskin.config import Strict
 from reskin.data.rows import Rows
 from reskin.data.splits import Fold
 from reskin.errors import ParamsError
 from reskin.metrics import ACCURACY_LIMIT_MM
 from reskin.models.inputs import shape
-from reskin.models.trained import networks_without
+from reskin.models.trained import networks_held_out
 from reskin.physics import deformation
 from reskin.physics.board import Board, draw_board
 from reskin.physics.magnet import Dipoles, change_of_field
@@ -75,7 +75,7 @@ def contacts(settings: Settings, folds: Path, indentations: Path, models: Path, 
     data = read_data(settings, indentations, folds)
     section = read(settings)
     boards, drawn = zip(
-        *(evaluate_board(data, fold, section, networks_without(models, fold.name)) for fold in data.folds_of("lobo")),
+        *(evaluate_board(data, fold, section, networks_held_out(models, fold.name)) for fold in data.folds_of("lobo")),
         strict=True,
     )
     stats = summarise_nested(boards)

@@ -37,7 +37,7 @@ from pipeline.statistics import (
     verdict,
     with_seeds,
 )
-from pipeline.training.trainings import SceneData, collapse_record, prepare_training, train_all
+from pipeline.training.jobs import SceneData, collapse_record, preload_training, train_jobs
 from reskin.config import Strict
 from reskin.data import baseline
 from reskin.data.baseline import rank, subtract
@@ -46,8 +46,8 @@ from reskin.data.windows import TRAIN, Part, Policy, Windows, check_one_each, la
 from reskin.errors import ParamsError
 from reskin.metrics import METRICS, score
 from reskin.models.inputs import VIEW
+from reskin.models.job import TrainingJob, TrainingResult
 from reskin.models.recipe import HEADLINE
-from reskin.models.trial import Trained, Trial
 from reskin.numerics import device
 from reskin.physics.aging import baseline_walk
 from reskin.schema import Readings
@@ -117,20 +117,20 @@ class WindowPredictions:
 
 def drift(settings: Settings, indentations: Path, results: Path) -> None:
     """Train and test networks under every no-load policy, on every capture of a folder."""
-    prepare_training()
+    preload_training()
     section, selection = read(settings), settings.section(Selection, "selection")
     captures = read_captures(indentations, tuple(settings.captures_in(indentations)))
     if section.wander_uT and captures[0].source != "simulated":
         rule = "none in a recorded scene: a walk would be added to what was recorded"
         raise ParamsError(settings.where, "drift.wander_uT", rule, list(section.wander_uT), "Take it out.")
     windows, parts = cut_windows(captures, section, selection)
-    trials = list(make_trials(parts, section, settings.seed))
+    jobs = list(make_jobs(parts, section, settings.seed))
     data = SceneData(settings.scene, settings, stack(parts), [])
-    trained = train_all(data, [trial for trial, _ in trials], "drift")
+    trained = train_jobs(data, [job for job, _ in jobs], "drift")
 
     predictions: dict[str, list[WindowPredictions]] = {name: [] for name in section.training.recipes}
-    for (trial, tests), one in zip(trials, trained, strict=True):
-        predictions[trial.recipe_name] += split_predictions(trial, one, tests)
+    for (job, tests), one in zip(jobs, trained, strict=True):
+        predictions[job.recipe_name] += split_predictions(job, one, tests)
     numbers: dict[str, Any] = section.model_dump(
         mode="json", include={"unit", "train_n", "test_n", "every_n", "regular_n"}, exclude_none=True
     )
@@ -138,9 +138,7 @@ def drift(settings: Settings, indentations: Path, results: Path) -> None:
     numbers |= pace(captures) | {"left_out_units_n": windows.left_out_units_n}
     if section.wander_uT:
         headline = [
-            (trial, tests, one)
-            for (trial, tests), one in zip(trials, trained, strict=True)
-            if trial.recipe_name == HEADLINE
+            (job, tests, one) for (job, tests), one in zip(jobs, trained, strict=True) if job.recipe_name == HEADLINE
         ]
         numbers["wander"] = score_wandering(section, selection, captures, headline, settings.seed)
     of_headline, drawn = summarise_headline(section, predictions.pop(HEADLINE), parts, field_sizes(captures))
@@ -179,23 +177,23 @@ def noload_field(policy: PolicyName, section: Drift, readings: Readings) -> np.n
     return (baseline.initial if policy == "initial" else baseline.each)(*fields)
 
 
-def make_trials(parts: Sequence[Part], section: Drift, seed: int) -> Iterator[tuple[Trial, list[Part]]]:
-    """Make a trial of every recipe, skin, policy and seed, with its test windows."""
+def make_jobs(parts: Sequence[Part], section: Drift, seed: int) -> Iterator[tuple[TrainingJob, list[Part]]]:
+    """Make a job of every recipe, skin, policy and seed, with its test windows."""
     starts = [i for i, part in enumerate(parts) if part.window_i == TRAIN]
     for start, end in pairwise([*starts, len(parts)]):
         train, tests = parts[start], list(parts[start + 1 : end])
         fold, test = f"{train.readings.skin}-{train.policy}", np.concatenate([part.row_i for part in tests])
         for name, recipe in section.training.recipes.items():
             for seed_i in range(section.training.seeds_n):
-                yield Trial("drift", name, recipe, fold, seed, seed_i, train.row_i, test), tests
+                yield TrainingJob("drift", name, recipe, fold, seed, seed_i, train.row_i, test), tests
 
 
-def split_predictions(trial: Trial, trained: Trained, tests: Sequence[Part]) -> Iterator[WindowPredictions]:
+def split_predictions(job: TrainingJob, trained: TrainingResult, tests: Sequence[Part]) -> Iterator[WindowPredictions]:
     """Split a network's predictions by window."""
     ends = np.cumsum([len(part.rows) for part in tests])[:-1]
     for part, predicted in zip(tests, np.split(trained.predicted, ends), strict=True):
         yield WindowPredictions(
-            part.policy, part.readings.board, part.readings.skin, trial.seed_i, part.window_i,
+            part.policy, part.readings.board, part.readings.skin, job.seed_i, part.window_i,
             int(part.readings.n_contacts[0]), part.noload_off_uT, part.rows.indentation, part.rows.target, predicted,
         )  # fmt: skip
 
@@ -444,7 +442,7 @@ def score_wandering(
     section: Drift,
     selection: Selection,
     captures: Sequence[Readings],
-    networks: Sequence[tuple[Trial, list[Part], Trained]],
+    networks: Sequence[tuple[TrainingJob, list[Part], TrainingResult]],
     seed: int,
 ) -> dict[str, list[dict[str, Any]]]:
     """Test the networks on their last window again, after a random walk was added to the captures.
@@ -461,10 +459,10 @@ def score_wandering(
         parts = {part.first_row_i: part for part in cut_windows(walked, section, selection)[1]}
         scores: dict[str, list[dict[str, float]]] = {}
         off_uT: dict[str, list[float]] = {}
-        for trial, tests, trained in networks:
+        for job, tests, trained in networks:
             part = parts[tests[-1].first_row_i]
-            predict = Predictor(trained.weights, trial.recipe.architecture, device())
-            inputs = trained.scaler.encode(VIEW[trial.recipe.inputs](part.rows.db_uT))
+            predict = Predictor(trained.weights, job.recipe.architecture, device())
+            inputs = trained.scaler.encode(VIEW[job.recipe.inputs](part.rows.db_uT))
             scores.setdefault(part.policy, []).append(score(part.rows.target, trained.scaler.decode(predict(inputs))))
             off_uT.setdefault(part.policy, []).append(part.noload_off_uT)
         for policy, own in scores.items():

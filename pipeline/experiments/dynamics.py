@@ -20,7 +20,7 @@ from pipeline.statistics import VERDICTS, negated, paired, statistic, summarise,
 from reskin.data.baseline import subtract
 from reskin.data.rows import TARGETS
 from reskin.metrics import score
-from reskin.models.trained import networks_without
+from reskin.models.trained import networks_held_out
 
 WINDOW_N = 5  # readings that the paper takes at rest (section 3)
 FORCE_MIN_N = 0.2  # assumed: below it there is little contact to place, and a press's first and last readings lie there
@@ -141,7 +141,7 @@ def dynamics(settings: Settings, indentations: Path, models: Path, results: Path
     one = only(read_captures(indentations), indentations)
     true = np.stack([getattr(one, name) for name in TARGETS], axis=1)
     presses = presses_of(subtract(one.b_uT, one.noload_uT), true, one.t_s, one.indentation)
-    numbers = compare(presses, networks_without(models, one.board), board=one.board)
+    numbers = compare(presses, networks_held_out(models, one.board), board=one.board)
     write_results(results, numbers, {}, read_losses(indentations, {}))
     of_presses = f"{numbers['presses_n']} presses at {numbers['rate_hz']:.0f} Hz"
     say(f"{settings.scene}: {numbers['readings_n']} readings of {of_presses}")

@@ -16,18 +16,18 @@ from pipeline.report.paper import FLEXIBLE, FLEXIBLE_BIAS, FLEXIBLE_GAP_LESS_PCT
 from pipeline.settings import Settings
 from pipeline.statistics import statistic
 from pipeline.synthesis import synthesis_of
-from pipeline.training.trainings import SceneData, adaptations, prepare_training, read_data, read_starts
+from pipeline.training.jobs import SceneData, adaptation_jobs, preload_training, read_data, read_pretrained
 from pipeline.training.variants import (  # fmt: skip
     AFTER,
     BEFORE,
     CONTROL,
     FORCE,
-    Answered,
-    answers_after,
-    answers_before,
+    VariantPrediction,
+    adapt_and_predict,
     biases,
-    compare_arms,
-    summarise_arms,
+    compare_variants,
+    predict_before,
+    summarise_variants,
 )
 from reskin.data.rows import Selection, gather, stack
 from reskin.data.splits import Split, hold_out_skins
@@ -59,13 +59,13 @@ def gap_less_pct(gap_mm: Mapping[str, float]) -> float:
     return 100 * (1 - gap_mm["flexible"] / gap_mm["rigid"])
 
 
-def answer_flexible(answers: Sequence[Answered]) -> dict[str, Any]:
+def answer_flexible(answers: Sequence[VariantPrediction]) -> dict[str, Any]:
     """Summarise over boards, by arm; the force bias and the gain by adaptation apart."""
-    differences = {f"{AFTER}_minus_{BEFORE}": compare_arms(answers, AFTER, BEFORE)}
-    return summarise_arms(answers) | biases(answers) | {"paired": differences}
+    differences = {f"{AFTER}_minus_{BEFORE}": compare_variants(answers, AFTER, BEFORE)}
+    return summarise_variants(answers) | biases(answers) | {"paired": differences}
 
 
-def forces_drawn(answers: Sequence[Answered], rng: np.random.Generator) -> dict[str, dict[str, list[float]]]:
+def forces_drawn(answers: Sequence[VariantPrediction], rng: np.random.Generator) -> dict[str, dict[str, list[float]]]:
     """Choose equal readings of both arms' first networks at random: true and predicted force, in newtons."""
     arms = {arm: [one for one in answers if one.arm == arm and one.seed_i == 0] for arm in (BEFORE, AFTER)}
     shown = rng.permutation(sum(len(one.true) for one in arms[BEFORE]))[:DRAWN_N]
@@ -88,9 +88,9 @@ SHAPE = "shape"  # the recipe on directions, if the scene has one: it ought to c
 
 def flexible(settings: Settings, folds: Path, main: Path, indentations: Path, started: Path, results: Path) -> None:
     """Adapt the networks of the first fold of lobo to every flexible skin, and test on its later passes."""
-    prepare_training()
+    preload_training()
     data = read_data(settings, main, folds)
-    starts, captures = read_starts(started), read_captures(indentations)
+    starts, captures = read_pretrained(started), read_captures(indentations)
     adapting, first, trained_n = data.settings.adaptations(), data.folds_of("lobo")[0], len(data.rows)
     poked = gather(captures, data.settings.section(Selection, "selection"))
     data = replace(data, rows=stack(data.rows, poked))
@@ -99,19 +99,19 @@ def flexible(settings: Settings, folds: Path, main: Path, indentations: Path, st
     arms = {
         name: arm for name, arm in ((HEADLINE, AFTER), (CONTROL, CONTROL), (SHAPE, SHAPE)) if name in adapting.recipes
     }
-    trials = [
-        (arm, trial)
+    jobs = [
+        (arm, job)
         for name, arm in arms.items()
-        for trial in adaptations(
+        for job in adaptation_jobs(
             data, fold, (name, adapting.recipes[name]), starts, experiment="flexible", pokes_n=adapting.pokes_n
         )
     ]
     skins = [str(skin) for skin in np.unique(data.rows.skin[fold.test])]
     before = {
-        name: [one for skin in skins for one in answers_before(data, fold, adapting.recipes[name], starts, skin)]
+        name: [one for skin in skins for one in predict_before(data, fold, adapting.recipes[name], starts, skin)]
         for name in arms if name != CONTROL
     }  # fmt: skip
-    after, trainings = answers_after(data, trials, "flexible")
+    after, trainings = adapt_and_predict(data, jobs, "flexible")
     own = before[HEADLINE] + [one for one in after if one.arm != SHAPE]
     numbers: dict[str, Any] = {
         "skins_n": len(skins), "boards_n": len(np.unique(data.rows.board[fold.test])),

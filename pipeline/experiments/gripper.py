@@ -21,7 +21,7 @@ from reskin.config import Strict
 from reskin.data.baseline import subtract
 from reskin.data.grid import CENTRE_MM
 from reskin.live.contacts import CONTACT_SDS
-from reskin.models.trained import networks_without
+from reskin.models.trained import networks_held_out
 from reskin.schema import Readings
 from reskin.seeds import rng_for
 from reskin.simulation.protocols import weights_N
@@ -197,7 +197,7 @@ def gripper(settings: Settings, indentations: Path, models: Path, results: Path)
     load = loads_of(settings, "grip")
     weight_N = weights_N(load.force_max_N, load.step_N)
     fingers = [finger_of(capture, weight_N) for capture in read_captures(indentations)]
-    networks = {finger.board: networks_without(models, finger.board) for finger in fingers}
+    networks = {finger.board: networks_held_out(models, finger.board) for finger in fingers}
     numbers, drawn = answer_of(fingers, networks, read(settings), seed=settings.seed)
     write_results(results, numbers, drawn, read_losses(indentations, {}))
     best = max(numbers["rows"], key=lambda row: row["held_pct"])

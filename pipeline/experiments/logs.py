@@ -19,7 +19,7 @@ from pipeline.settings import Settings
 from pipeline.stage import say
 from pipeline.synthesis import synthesis_of
 from reskin.live.contacts import Answers, contacts_n, describe, estimate, estimate_after, score_contacts, thin, truth_at
-from reskin.models.trained import networks_without
+from reskin.models.trained import networks_held_out
 from reskin.physics.ambient import EARTH_SIZE_T, EARTH_T
 from reskin.recordings import probe
 from reskin.recordings.header import LOG_FILE, PROBE_FILE
@@ -103,7 +103,7 @@ def logs(settings: Settings, raw: Path, models: Path, results: Path) -> None:
     folder = only(sorted(child for child in raw.iterdir() if child.is_dir()), raw)
     t_s, b_uT, _, account = sd_card.read_log(folder / LOG_FILE)
     board = read_header(folder).board
-    networks = networks_without(models, board)
+    networks = networks_held_out(models, board)
     found = estimate(t_s, b_uT, networks, where=str(folder / LOG_FILE))
     numbers, true = describe(found) | {"networks_n": len(networks), "account": account}, None
     if (folder / PROBE_FILE).is_file():

@@ -13,40 +13,42 @@ from pipeline.report.formatting import COLUMNS, OF_PAPER, Stat, gain, show, show
 from pipeline.report.paper import GAINS, MANUAL, MANUAL_POKES_N
 from pipeline.settings import Adaptations, Settings
 from pipeline.statistics import VERDICTS, verdict
-from pipeline.training.trainings import (
-    Pokes,
+from pipeline.training.jobs import (
+    AdaptationPokes,
+    PretrainedNetworks,
     SceneData,
-    Starts,
-    adaptation,
-    own_starts,
+    adaptation_job,
     pool_lines,
-    prepare_training,
+    preload_training,
     read_data,
-    read_starts,
+    read_pretrained,
+    select_pretrained,
 )
 from pipeline.training.variants import (  # fmt: skip
     AFTER,
     BEFORE,
     CONTROL,
-    Answered,
-    answers_after,
-    answers_before,
-    compare_arms,
-    summarise_arms,
+    VariantPrediction,
+    adapt_and_predict,
+    compare_variants,
+    predict_before,
+    summarise_variants,
 )
 from reskin.data.lines import Lines, hand_rows, shifted
 from reskin.data.rows import stack
 from reskin.data.splits import Fold
 from reskin.errors import SchemaError
+from reskin.models.job import TrainingJob
 from reskin.models.recipe import HEADLINE
-from reskin.models.trial import Trial
 
 GRID = "grid"  # as many pokes, by the robot
 
 
-def answer_manual(answers: Sequence[Answered], *, pokes_n: Sequence[int], lines_n: Sequence[int]) -> dict[str, Any]:
+def answer_manual(
+    answers: Sequence[VariantPrediction], *, pokes_n: Sequence[int], lines_n: Sequence[int]
+) -> dict[str, Any]:
     """Summarise over boards; `pokes_n` and `lines_n` are those of each skin, and what is told is their mean."""
-    arms = summarise_arms(answers)
+    arms = summarise_variants(answers)
     counts = {
         "pokes_n": round(np.mean(pokes_n)),
         "lines_n": round(np.mean(lines_n)),
@@ -55,7 +57,7 @@ def answer_manual(answers: Sequence[Answered], *, pokes_n: Sequence[int], lines_
         "seeds_n": len({one.seed_i for one in answers}),
     }
     differences = {
-        f"{AFTER}_minus_{other}": compare_arms(answers, AFTER, other)
+        f"{AFTER}_minus_{other}": compare_variants(answers, AFTER, other)
         for other in (BEFORE, CONTROL, GRID)
         if other in arms
     }
@@ -64,37 +66,37 @@ def answer_manual(answers: Sequence[Answered], *, pokes_n: Sequence[int], lines_
 
 def manual(settings: Settings, folds: Path, main: Path, indentations: Path, started: Path, results: Path) -> None:
     """Adapt to every skin that was poked by hand, and by as many pokes of the robot; test on the robot's grid."""
-    prepare_training()
+    preload_training()
     data = read_data(settings, main, folds)
-    starts = read_starts(started)
+    starts = read_pretrained(started)
     adapting = data.settings.adaptations()
     poked, found = hand_rows(read_captures(indentations))
     lines = {skin: shifted(own, len(data.rows)) for skin, own in found.items()}
     data = replace(data, rows=stack(data.rows, poked))
-    trials: list[tuple[str, Trial]] = []
-    answers: list[Answered] = []
+    jobs: list[tuple[str, TrainingJob]] = []
+    answers: list[VariantPrediction] = []
     for skin, own in lines.items():
         fold = _fold_without(data, str(poked.board[poked.skin == skin][0]))
-        answers += answers_before(data, fold, adapting.recipes[HEADLINE], starts, skin)
-        trials += _trials(data, fold, adapting, starts, (skin, own))
-    after, trainings = answers_after(data, trials, "manual")
+        answers += predict_before(data, fold, adapting.recipes[HEADLINE], starts, skin)
+        jobs += _jobs(data, fold, adapting, starts, (skin, own))
+    after, trainings = adapt_and_predict(data, jobs, "manual")
     pokes_n, lines_n = zip(*((_pokes_n(data, own), len(np.unique(own.line_i))) for own in lines.values()), strict=True)
     numbers = answer_manual([*answers, *after], pokes_n=pokes_n, lines_n=lines_n)
     write_results(results, numbers, {}, read_losses(indentations, poked.dropped), trainings)
 
 
-def _trials(
-    data: SceneData, fold: Fold, adapting: Adaptations, starts: Starts, poked: tuple[str, Lines]
-) -> Iterator[tuple[str, Trial]]:
+def _jobs(
+    data: SceneData, fold: Fold, adapting: Adaptations, starts: PretrainedNetworks, poked: tuple[str, Lines]
+) -> Iterator[tuple[str, TrainingJob]]:
     """Make the arms of one skin: by hand, by the robot, and as long without pokes if there is such a recipe."""
     (skin, by_hand), headline = poked, (HEADLINE, adapting.recipes[HEADLINE])
-    for seed_i in own_starts(starts, headline[1].base, fold):
+    for seed_i in select_pretrained(starts, headline[1].base, fold):
         by_robot = pool_lines(data, fold, skin, pokes_n=_pokes_n(data, by_hand), seed_i=seed_i)
-        pokes = Pokes("manual", skin, seed_i, "hand", by_hand)
-        yield AFTER, adaptation(data, fold, headline, starts, pokes)
-        yield GRID, adaptation(data, fold, headline, starts, replace(pokes, what="grid", lines=by_robot))
+        pokes = AdaptationPokes("manual", skin, seed_i, "hand", by_hand)
+        yield AFTER, adaptation_job(data, fold, headline, starts, pokes)
+        yield GRID, adaptation_job(data, fold, headline, starts, replace(pokes, what="grid", lines=by_robot))
         if CONTROL in adapting.recipes:
-            yield CONTROL, adaptation(data, fold, (CONTROL, adapting.recipes[CONTROL]), starts, pokes)
+            yield CONTROL, adaptation_job(data, fold, (CONTROL, adapting.recipes[CONTROL]), starts, pokes)
 
 
 def _pokes_n(data: SceneData, lines: Lines) -> int:

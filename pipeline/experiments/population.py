@@ -23,6 +23,7 @@ from pipeline.settings import Settings
 from pipeline.stage import say
 from pipeline.statistics import summarise
 from pipeline.synthesis import synthesis_of
+from pipeline.training.jobs import SceneData, read_data
 from pipeline.training.population import (
     WEIGHT_N,
     WEIGHT_SD,
@@ -36,7 +37,6 @@ from pipeline.training.population import (
     trust,
     weight_of,
 )
-from pipeline.training.trainings import SceneData, read_data
 from pipeline.training.universal import Frame, Pokes
 from reskin import io
 from reskin.code import digest, imported

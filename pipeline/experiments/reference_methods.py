@@ -26,7 +26,7 @@ from pipeline.report.formatting import COLUMNS, OF_FORCE, n_of, scores, show, sh
 from pipeline.settings import Settings, take
 from pipeline.stage import say
 from pipeline.statistics import AS_LABELLED, REGISTERED, by_skin, over_boards, paired, statistic, tally, tidy
-from pipeline.training.trainings import SceneData, read_data, score_test
+from pipeline.training.jobs import SceneData, read_data, score_test
 from pipeline.training.universal import (
     ASSUMED_TEMPER,
     EXPERIMENT,
@@ -53,11 +53,11 @@ from reskin.metrics import ACCURACY_LIMIT_MM
 from reskin.models.adversarial import Domains, train_adversarial
 from reskin.models.alignment import choose_ridge, coral, direct, match_channels
 from reskin.models.classical import Classical, fit
-from reskin.models.grid import ATTEMPTS_MAX_N
 from reskin.models.inputs import FIT, VIEW
+from reskin.models.job import COLLAPSED, Weights
 from reskin.models.network import Predictor
 from reskin.models.recipe import Name, Recipe
-from reskin.models.trial import COLLAPSED, Weights
+from reskin.models.runner import MAX_ATTEMPTS_N
 from reskin.physics.skin import SkinDesign
 from reskin.seeds import rng_for
 from reskin.universal.inversion import Chart, chart, fit_unlabelled, search
@@ -299,7 +299,7 @@ def train_until_converged(
 
     The draws do not depend on the weight, so a network and its control differ in the weight alone.
     """
-    for attempt_i in range(ATTEMPTS_MAX_N):
+    for attempt_i in range(MAX_ATTEMPTS_N):
         weights = train_adversarial(domains, recipe, weight, rng_for(seed, RNG, "network", fold, attempt_i))
         off = Predictor(weights, recipe.architecture, "cpu")(domains.known) - domains.target
         collapsed = bool(np.min(1 - np.nanmean(off**2, axis=0) / np.nanvar(domains.target, axis=0)) < COLLAPSED)

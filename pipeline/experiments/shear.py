@@ -15,7 +15,7 @@ from pipeline.report.formatting import show, tabulate
 from pipeline.report.paper import SHEAR
 from pipeline.settings import Settings, Training
 from pipeline.statistics import over_units, tally
-from pipeline.training.trainings import SceneData, collapse_record, note_seconds, prepare_training, train_all, trials_of
+from pipeline.training.jobs import SceneData, collapse_record, make_jobs, preload_training, train_jobs, write_timings
 from reskin.config import Strict
 from reskin.data.rows import SHEAR_TARGETS, Rows, Selection, gather
 from reskin.data.splits import NO_POOL, Fold, draw_sides
@@ -90,17 +90,17 @@ def read(settings: Settings) -> Shear:
 
 def shear(settings: Settings, indentations: Path, results: Path) -> None:
     """Train with five targets on both splits of every skin, and score what was held out."""
-    prepare_training()
+    preload_training()
     section = read(settings)
     rows = gather(read_captures(indentations), settings.section(Selection, "selection"), targets=SHEAR_TARGETS)
     by_reading = _folds(rows, np.arange(len(rows)), "reading", section, settings.seed)
     by_line = _folds(rows, rows.indentation, "line", section, settings.seed)
     data = SceneData(settings.scene, settings, rows, [*by_reading, *by_line])
-    trials = trials_of(data, section.training, data.folds)
-    trained = train_all(data, trials, "shear")
-    note_seconds(settings.scene, "shear", trials, trained)
+    jobs = make_jobs(data, section.training, data.folds)
+    trained = train_jobs(data, jobs, "shear")
+    write_timings(settings.scene, "shear", jobs, trained)
     scores = [
-        (one.fold, score5(rows.target[one.test], done.predicted)) for one, done in zip(trials, trained, strict=True)
+        (one.fold, score5(rows.target[one.test], done.predicted)) for one, done in zip(jobs, trained, strict=True)
     ]
     names = {fold.name for fold in by_line}
     numbers = answer_shear(
@@ -108,9 +108,9 @@ def shear(settings: Settings, indentations: Path, results: Path) -> None:
         target=rows.target, lines_n=len(np.unique(rows.indentation)), passes_n=len(np.unique(rows.pass_i)),
         seeds_n=section.training.seeds_n,
     )  # fmt: skip
-    first_i = next(i for i, trial in enumerate(trials) if trial.fold in names)
-    shown = rng_for(settings.seed, "shear", "drawn").permutation(len(trials[first_i].test))[:DRAWN_N]
-    true, predicted = rows.target[trials[first_i].test], trained[first_i].predicted
+    first_i = next(i for i, job in enumerate(jobs) if job.fold in names)
+    shown = rng_for(settings.seed, "shear", "drawn").permutation(len(jobs[first_i].test))[:DRAWN_N]
+    true, predicted = rows.target[jobs[first_i].test], trained[first_i].predicted
     drawn = {"true": _forces(true[shown]), "predicted": _forces(predicted[shown])}
     write_results(
         results, numbers, drawn, read_losses(indentations, rows.dropped), tally(map(collapse_record, trained))

@@ -19,14 +19,14 @@ from pipeline.settings import Settings, Training
 from pipeline.stage import say
 from pipeline.statistics import tally
 from pipeline.synthesis import synthesis_of
-from pipeline.training.trainings import SceneData, collapse_record, note_seconds, prepare_training, train_all
+from pipeline.training.jobs import SceneData, collapse_record, preload_training, train_jobs, write_timings
 from reskin.config import Strict
 from reskin.data.rows import Rows, Selection, gather
 from reskin.errors import ParamsError
 from reskin.metrics import score
-from reskin.models.classical import Neighbours, Task, run_tasks
+from reskin.models.classical import ClassicalJob, Neighbours, run_classical_jobs
+from reskin.models.job import TrainingData, TrainingJob
 from reskin.models.recipe import HEADLINE
-from reskin.models.trial import Measured, Trial
 from reskin.schema import Readings
 
 Count = Annotated[int, Field(ge=1)]
@@ -167,18 +167,18 @@ def read(settings: Settings) -> Sleeve:
 
 def sleeve(settings: Settings, indentations: Path, results: Path) -> None:
     """Train the recipes of section sleeve on the first pokes, score them and nearest neighbours on the last."""
-    prepare_training()
+    preload_training()
     section, captures, area = read(settings), read_captures(indentations), _area(settings)
     data = SceneData(settings.scene, settings, gather(captures, settings.section(Selection, "selection")), [])
     train, test = hold_out_last(data.rows, section.test_fraction)
-    trials = [
-        Trial("sleeve", name, recipe, "last", data.settings.seed, seed_i, train, test)
+    jobs = [
+        TrainingJob("sleeve", name, recipe, "last", data.settings.seed, seed_i, train, test)
         for name, recipe in section.training.recipes.items()
         for seed_i in range(section.training.seeds_n)
     ]
-    trained = train_all(data, trials, "sleeve")
-    note_seconds(settings.scene, "sleeve", trials, trained)
-    answers = {name: [o.predicted for c, o in zip(trials, trained, strict=True) if c.recipe_name == name]
+    trained = train_jobs(data, jobs, "sleeve")
+    write_timings(settings.scene, "sleeve", jobs, trained)
+    answers = {name: [o.predicted for c, o in zip(jobs, trained, strict=True) if c.recipe_name == name]
                for name in section.training.recipes}  # fmt: skip
     answers |= _neighbours(data, section, train, test)
     true, indentation = data.rows.target[test], data.rows.indentation[test]
@@ -206,12 +206,12 @@ def _area(settings: Settings) -> Area:
 def _neighbours(data: SceneData, section: Sleeve, train: np.ndarray, test: np.ndarray) -> dict[str, list[np.ndarray]]:
     none = np.zeros(0, np.int64)
     tasks = [
-        Task(f"knn-{inputs}", Neighbours(method="knn", inputs=inputs, neighbours_n=section.neighbours_n),
+        ClassicalJob(f"knn-{inputs}", Neighbours(method="knn", inputs=inputs, neighbours_n=section.neighbours_n),
              train, test, none, len(train), data.settings.seed)
         for inputs in ("raw", "shape")
     ]  # fmt: skip
-    rows = Measured(data.rows.db_uT, data.rows.target, data.rows.skin)
-    done = run_tasks(tasks, rows, Here(), lambda line: say(f"{data.scene} sleeve: {line}"))
+    rows = TrainingData(data.rows.db_uT, data.rows.target, data.rows.skin)
+    done = run_classical_jobs(tasks, rows, Here(), lambda line: say(f"{data.scene} sleeve: {line}"))
     return {task.name: [one.predicted] for task, one in zip(tasks, done, strict=True)}
 
 

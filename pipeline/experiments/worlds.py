@@ -19,22 +19,22 @@ from pipeline.settings import Settings
 from pipeline.stage import say
 from pipeline.statistics import by_skin, over_boards, over_pairs, records, select, tidy, whole
 from pipeline.synthesis import synthesis_of
-from pipeline.training.trainings import (
+from pipeline.training.jobs import (
+    PretrainedNetworks,
     SceneData,
-    Starts,
-    adaptations,
-    card_of,
-    note_seconds,
-    prepare_training,
-    train_all,
-    trials_of,
+    adaptation_jobs,
+    make_jobs,
+    preload_training,
+    scored_card,
+    train_jobs,
+    write_timings,
 )
 from reskin.config import Strict
 from reskin.data.rows import Rows, stack
 from reskin.data.splits import Fold, Split, draw_folds
 from reskin.metrics import METRICS
+from reskin.models.job import Pretrained, TrainingJob
 from reskin.models.recipe import HEADLINE
-from reskin.models.trial import Start, Trial
 from reskin.physics.board import draw_board
 from reskin.physics.skin import changes_of_field, draw_skin, forces
 from reskin.seeds import rng_for
@@ -190,7 +190,7 @@ def read(settings: Settings) -> Worlds:
 
 def worlds(settings: Settings, results: Path) -> None:
     """Train the rows of table 2 in every world, and score them there."""
-    prepare_training()
+    preload_training()
     section, split = read(settings), settings.section(Split, "split")
     listed = worlds_of(synthesis_of(settings), section)
     rows, folds = None, []
@@ -209,26 +209,26 @@ def worlds(settings: Settings, results: Path) -> None:
 def _trained(data: SceneData, listed: Sequence[World]) -> list[dict[str, Any]]:
     """Train one skin, many skins, and many with triplets, then adapt the last; give their cards."""
     lobo = data.folds_of("lobo")
-    trials = trials_of(data, data.settings.training("train_single"), data.folds_of("transfer"))
-    trials += trials_of(data, data.settings.training("train_multi"), lobo)
-    trials += trials_of(data, data.settings.training("train_triplet"), lobo, experiment="triplet")
-    trained = train_all(data, trials, "worlds")
-    starts: Starts = {
-        (trial.recipe_name, trial.fold, trial.seed_i): Start(result.key, result.weights, result.scaler)
-        for trial, result in zip(trials, trained, strict=True)
-        if trial.experiment == "triplet"
+    jobs = make_jobs(data, data.settings.training("train_single"), data.folds_of("transfer"))
+    jobs += make_jobs(data, data.settings.training("train_multi"), lobo)
+    jobs += make_jobs(data, data.settings.training("train_triplet"), lobo, experiment="triplet")
+    trained = train_jobs(data, jobs, "worlds")
+    starts: PretrainedNetworks = {
+        (job.recipe_name, job.fold, job.seed_i): Pretrained(result.key, result.weights, result.scaler)
+        for job, result in zip(jobs, trained, strict=True)
+        if job.experiment == "triplet"
     }
     adapt = data.settings.adaptations()
-    adapted: list[Trial] = [
-        trial
+    adapted: list[TrainingJob] = [
+        job
         for fold in lobo
-        for trial in adaptations(
+        for job in adaptation_jobs(
             data, fold, (HEADLINE, adapt.recipes[HEADLINE]), starts, experiment="adapt", pokes_n=adapt.pokes_n
         )
     ]
-    trained = [*trained, *train_all(data, adapted, "worlds")]
-    note_seconds(data.scene, "worlds", [*trials, *adapted], trained)
-    return [card_of(data, trial, result) for trial, result in zip([*trials, *adapted], trained, strict=True)]
+    trained = [*trained, *train_jobs(data, adapted, "worlds")]
+    write_timings(data.scene, "worlds", [*jobs, *adapted], trained)
+    return [{**scored_card(data, job, result)} for job, result in zip([*jobs, *adapted], trained, strict=True)]
 
 
 def _scored(cards: Sequence[dict[str, Any]], world: World) -> dict[str, Any]:

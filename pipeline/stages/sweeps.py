@@ -7,22 +7,22 @@ import numpy as np
 from pydantic import Field
 
 from pipeline.settings import Settings
-from pipeline.training.trainings import (
+from pipeline.training.jobs import (
     SceneData,
-    adaptations,
-    note_seconds,
-    point_of,
-    prepare_training,
+    adaptation_jobs,
+    preload_training,
     read_data,
-    read_starts,
-    train_all,
+    read_pretrained,
+    sweep_point,
+    train_jobs,
+    write_timings,
 )
 from reskin import io
 from reskin.config import Strict
 from reskin.data.splits import Fold
 from reskin.errors import ParamsError
+from reskin.models.job import Pretrained, TrainingJob
 from reskin.models.recipe import HEADLINE, Recipe
-from reskin.models.trial import Start, Trial
 
 
 class PokesSweep(Strict):
@@ -39,28 +39,28 @@ def read_sweep_pokes(settings: Settings) -> PokesSweep:
 
 def sweep_pokes(settings: Settings, indentations: Path, folds: Path, started: Path, scores: Path) -> None:
     """Adapt with every number of unlabelled indentations and score (paper figure 6a)."""
-    prepare_training()
-    data, starts = read_data(settings, indentations, folds), read_starts(started)
+    preload_training()
+    data, starts = read_data(settings, indentations, folds), read_pretrained(started)
     sweep, recipe = read_sweep_pokes(settings), settings.adaptations().recipes[HEADLINE]
     held_out = data.folds_of("lobo")[-sweep.boards_n :]
     if sweep.boards_n > len(held_out):
         rule = f"at most the {len(held_out)} boards of the scene"
         raise ParamsError(settings.where, "sweep_pokes.boards_n", rule, sweep.boards_n, "Ask for fewer.")
     pairs = [
-        (trial, pokes_n)
+        (job, pokes_n)
         for fold in held_out
         for pokes_n in sweep.pokes_n
         if pokes_n
-        for trial in adaptations(data, fold, (HEADLINE, recipe), starts, experiment="pokes", pokes_n=pokes_n)
+        for job in adaptation_jobs(data, fold, (HEADLINE, recipe), starts, experiment="pokes", pokes_n=pokes_n)
     ]
-    trials = [trial for trial, _ in pairs]
-    trained = train_all(data, trials, "sweep_pokes")
+    jobs = [job for job, _ in pairs]
+    trained = train_jobs(data, jobs, "sweep_pokes")
     points = [
-        point_of(data, trial, result, "adapted") | {"pokes_n": pokes_n}
-        for (trial, pokes_n), result in zip(pairs, trained, strict=True)
+        sweep_point(data, job, result, "adapted") | {"pokes_n": pokes_n}
+        for (job, pokes_n), result in zip(pairs, trained, strict=True)
     ]
     io.write_json(scores, points + _unadapted(started, recipe.base, {fold.name for fold in held_out}))
-    note_seconds(settings.scene, "sweep_pokes", trials, trained)
+    write_timings(settings.scene, "sweep_pokes", jobs, trained)
 
 
 def _unadapted(started: Path, base: str, held_out: set[str]) -> list[dict[str, Any]]:
@@ -76,28 +76,30 @@ def _unadapted(started: Path, base: str, held_out: set[str]) -> list[dict[str, A
 
 def sweep_sensors(settings: Settings, indentations: Path, folds: Path, scores: Path) -> None:
     """Train the headline recipes on every draw of skins, adapt to each held-out skin, and score (paper figure 6b)."""
-    prepare_training()
+    preload_training()
     data = read_data(settings, indentations, folds)
     multi, triplet = (settings.training(section).recipes for section in ("train_multi", "train_triplet"))
     section = settings.adaptations()
     recipe = section.recipes[HEADLINE]
-    trials = _trials(data, multi[HEADLINE], "multi") + _trials(data, triplet[recipe.base], "triplet")
-    trained = train_all(data, trials, "sweep_sensors")
+    jobs = _jobs(data, multi[HEADLINE], "multi") + _jobs(data, triplet[recipe.base], "triplet")
+    trained = train_jobs(data, jobs, "sweep_sensors")
     starts = {
-        (recipe.base, trial.fold, trial.seed_i): Start(result.key, result.weights, result.scaler)
-        for trial, result in zip(trials, trained, strict=True)
-        if trial.what == "triplet"
+        (recipe.base, job.fold, job.seed_i): Pretrained(result.key, result.weights, result.scaler)
+        for job, result in zip(jobs, trained, strict=True)
+        if job.what == "triplet"
     }
     adapted = [
-        trial
+        job
         for fold in _folds(data)
-        for trial in adaptations(data, fold, (HEADLINE, recipe), starts, experiment="sensors", pokes_n=section.pokes_n)
+        for job in adaptation_jobs(
+            data, fold, (HEADLINE, recipe), starts, experiment="sensors", pokes_n=section.pokes_n
+        )
     ]
-    methods = [trial.what for trial in trials] + ["adapted"] * len(adapted)
-    trials, trained = trials + adapted, trained + train_all(data, adapted, "sweep_sensors")
-    three = zip(trials, trained, methods, strict=True)
-    io.write_json(scores, [point_of(data, trial, result, method) for trial, result, method in three])
-    note_seconds(settings.scene, "sweep_sensors", trials, trained)
+    methods = [job.what for job in jobs] + ["adapted"] * len(adapted)
+    jobs, trained = jobs + adapted, trained + train_jobs(data, adapted, "sweep_sensors")
+    three = zip(jobs, trained, methods, strict=True)
+    io.write_json(scores, [sweep_point(data, job, result, method) for job, result, method in three])
+    write_timings(settings.scene, "sweep_sensors", jobs, trained)
 
 
 def _folds(data: SceneData) -> list[Fold]:
@@ -108,9 +110,9 @@ def _folds(data: SceneData) -> list[Fold]:
     return sorted(data.folds_of("sensors"), key=lambda fold: -len(np.unique(data.rows.skin[fold.train])))
 
 
-def _trials(data: SceneData, recipe: Recipe, method: str) -> list[Trial]:
-    """Make one trial for each draw of skins; its seed is the draw, as the fold's name is part of the generator's."""
+def _jobs(data: SceneData, recipe: Recipe, method: str) -> list[TrainingJob]:
+    """Make one job for each draw of skins; its seed is the draw, as the fold's name is part of the generator's."""
     return [
-        Trial("sensors", HEADLINE, recipe, fold.name, data.settings.seed, 0, fold.train, fold.test, what=method)
+        TrainingJob("sensors", HEADLINE, recipe, fold.name, data.settings.seed, 0, fold.train, fold.test, what=method)
         for fold in _folds(data)
     ]

@@ -10,23 +10,23 @@ from pipeline.executors import make_executor
 from pipeline.settings import Adaptations, Settings, Training, take
 from pipeline.stage import say
 from pipeline.training.before_contact import BY_TIME, score_before_touch
-from pipeline.training.trainings import (
-    adaptations,
-    measured,
-    note_seconds,
-    prepare_training,
+from pipeline.training.jobs import (
+    adaptation_jobs,
+    make_jobs,
+    preload_training,
     read_data,
-    read_starts,
+    read_pretrained,
     score_test,
-    train_all,
-    trials_of,
+    train_jobs,
+    training_data,
     write_models,
+    write_timings,
 )
 from reskin import io
 from reskin.config import Strict, parse
 from reskin.data.rows import SCORED
 from reskin.data.splits import ONE_SKIN
-from reskin.models.classical import Classical, Task, run_tasks
+from reskin.models.classical import Classical, ClassicalJob, run_classical_jobs
 from reskin.models.recipe import Name
 from reskin.models.trained import networks_by_fold
 
@@ -43,11 +43,11 @@ def train_single(settings: Settings, indentations: Path, folds: Path, models: Pa
 
     Also scores how well a place is known before its contact, on the folds within one skin.
     """
-    prepare_training()
+    preload_training()
     data = read_data(settings, indentations, folds)
     own = [fold for fold in data.folds if fold.experiment in ONE_SKIN]
-    trials = trials_of(data, read_train_single(settings), own)
-    write_models(models, data, trials, train_all(data, trials, "train_single"), "train_single")
+    jobs = make_jobs(data, read_train_single(settings), own)
+    write_models(models, data, jobs, train_jobs(data, jobs, "train_single"), "train_single")
     told = score_before_touch(data, indentations, io.read_json(folds)["captures"], networks_by_fold(models, BY_TIME))
     io.write_table(models / SCORED, told)
 
@@ -59,10 +59,10 @@ def read_train_multi(settings: Settings) -> Training:
 
 def train_multi(settings: Settings, indentations: Path, folds: Path, models: Path) -> None:
     """Train on the skins of all boards but one (paper section 5.1)."""
-    prepare_training()
+    preload_training()
     data = read_data(settings, indentations, folds)
-    trials = trials_of(data, read_train_multi(settings), data.folds_of("lobo"))
-    write_models(models, data, trials, train_all(data, trials, "train_multi"), "train_multi")
+    jobs = make_jobs(data, read_train_multi(settings), data.folds_of("lobo"))
+    write_models(models, data, jobs, train_jobs(data, jobs, "train_multi"), "train_multi")
 
 
 def read_train_triplet(settings: Settings) -> Training:
@@ -72,10 +72,10 @@ def read_train_triplet(settings: Settings) -> Training:
 
 def train_triplet(settings: Settings, indentations: Path, folds: Path, models: Path) -> None:
     """Train on the skins of all boards but one, with the triplet loss (paper section 5)."""
-    prepare_training()
+    preload_training()
     data = read_data(settings, indentations, folds)
-    trials = trials_of(data, read_train_triplet(settings), data.folds_of("lobo"), experiment="triplet")
-    write_models(models, data, trials, train_all(data, trials, "train_triplet"), "train_triplet")
+    jobs = make_jobs(data, read_train_triplet(settings), data.folds_of("lobo"), experiment="triplet")
+    write_models(models, data, jobs, train_jobs(data, jobs, "train_triplet"), "train_triplet")
 
 
 def read_adapt(settings: Settings) -> Adaptations:
@@ -85,15 +85,15 @@ def read_adapt(settings: Settings) -> Adaptations:
 
 def adapt(settings: Settings, indentations: Path, folds: Path, started: Path, models: Path) -> None:
     """Adapt the networks with triplet loss to each held-out skin by its unlabelled indentations (paper section 5)."""
-    prepare_training()
-    data, starts, section = read_data(settings, indentations, folds), read_starts(started), read_adapt(settings)
-    trials = [
-        trial
+    preload_training()
+    data, starts, section = read_data(settings, indentations, folds), read_pretrained(started), read_adapt(settings)
+    jobs = [
+        job
         for fold in data.folds_of("lobo")
         for named in section.recipes.items()
-        for trial in adaptations(data, fold, named, starts, experiment="adapt", pokes_n=section.pokes_n)
+        for job in adaptation_jobs(data, fold, named, starts, experiment="adapt", pokes_n=section.pokes_n)
     ]
-    write_models(models, data, trials, train_all(data, trials, "adapt"), "adapt")
+    write_models(models, data, jobs, train_jobs(data, jobs, "adapt"), "adapt")
 
 
 class ClassicalMethods(Strict):
@@ -115,15 +115,17 @@ def train_classical(settings: Settings, indentations: Path, folds: Path, scores:
     data, section = read_data(settings, indentations, folds), read_train_classical(settings)
     pairs = [(fold, name, method) for fold in data.folds_of("lobo") for name, method in section.methods.items()]
     tasks = [
-        Task(f"{name}.{fold.name}", method, fold.train, fold.test, NO_LABELS, section.rows_max_n, settings.seed)
+        ClassicalJob(f"{name}.{fold.name}", method, fold.train, fold.test, NO_LABELS, section.rows_max_n, settings.seed)
         for fold, name, method in pairs
     ]
     with make_executor(imports="reskin.models.classical") as executor:
-        fitted = run_tasks(tasks, measured(data), executor, lambda line: say(f"{settings.scene} classical: {line}"))
+        fitted = run_classical_jobs(
+            tasks, training_data(data), executor, lambda line: say(f"{settings.scene} classical: {line}")
+        )
     points = [
         {"name": name, "method": method.title, "inputs": method.inputs, "fold": fold.name, "seed_i": 0}
         | {"rows_n": answer.rows_n, "scores": score_test(data, fold.test, answer.predicted)}
         for (fold, name, method), answer in zip(pairs, fitted, strict=True)
     ]
     io.write_json(scores, points)
-    note_seconds(settings.scene, "train_classical", tasks, fitted)
+    write_timings(settings.scene, "train_classical", tasks, fitted)

@@ -14,7 +14,7 @@ from pipeline.settings import Settings
 from pipeline.stage import say
 from pipeline.training import few_labels as few
 from pipeline.training.few_labels import FewLabels
-from pipeline.training.trainings import SceneData, collapse_record, measured, read_data, score_test, train_all
+from pipeline.training.jobs import SceneData, collapse_record, read_data, score_test, train_jobs, training_data
 from pipeline.training.universal import (
     EXPERIMENT,
     Bench,
@@ -28,7 +28,7 @@ from pipeline.training.universal import (
 )
 from reskin import io
 from reskin.errors import ParamsError
-from reskin.models.classical import run_tasks
+from reskin.models.classical import run_classical_jobs
 from reskin.physics.skin import SkinDesign
 from reskin.universal.training import Lessons
 
@@ -45,12 +45,15 @@ def few_labels(settings: Settings, indentations: Path, folds: Path, scores: Path
     done: list[few.Done] = []
     for step in (few.networks, few.adapted, few.labelled):  # each goes on from what the last ones trained
         pairs = step(study, done)
-        trained = train_all(data, [trial for _, trial in pairs], "few_labels")
-        done = [*done, *((tried, trial, result) for (tried, trial), result in zip(pairs, trained, strict=True))]
+        trained = train_jobs(data, [job for _, job in pairs], "few_labels")
+        done = [*done, *((tried, job, result) for (tried, job), result in zip(pairs, trained, strict=True))]
     tasks = few.classical(study)
     with make_executor(imports="reskin.models.classical") as executor:
-        fitted = run_tasks(
-            [task for _, task in tasks], measured(data), executor, lambda line: say(f"{data.scene} few_labels: {line}")
+        fitted = run_classical_jobs(
+            [task for _, task in tasks],
+            training_data(data),
+            executor,
+            lambda line: say(f"{data.scene} few_labels: {line}"),
         )
     points = [_point(data, tried, trained.predicted) | collapse_record(trained) for tried, _, trained in done]
     points += [_point(data, tried, answer.predicted) for (tried, _), answer in zip(tasks, fitted, strict=True)]

@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import Float32
 
-from pipeline.training.trainings import SceneData
+from pipeline.training.jobs import SceneData
 from reskin import io
 from reskin.data.rows import Hover, Selection, gather_hover, gather_scan
 from reskin.data.splits import SAME_SKIN, Fold

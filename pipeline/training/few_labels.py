@@ -18,10 +18,9 @@ from reskin.data.lines import grid_lines
 from reskin.data.rows import Rows
 from reskin.data.splits import Fold
 from reskin.errors import ParamsError
-from reskin.models import trial as trials
-from reskin.models.classical import Classical, Task
-from reskin.models.recipe import AugmentedRecipe, FineTuning, Labelling, Name, Recipe
-from reskin.models.trial import Adapting, Start, Trained, Trial
+from reskin.models.classical import Classical, ClassicalJob
+from reskin.models.job import Adaptation, FineTuning, Pretrained, TrainingJob, TrainingResult
+from reskin.models.recipe import AdaptationRecipe, AugmentedRecipe, FineTuningRecipe, Name, Recipe
 from reskin.seeds import rng_for
 
 EXPERIMENT = "labels"
@@ -37,8 +36,8 @@ class FewLabels(Strict):
     labels_n: Labels
     recipes: dict[Name, Recipe | AugmentedRecipe]
     adapted: tuple[Name, ...]
-    adapting: FineTuning
-    labelling: Labelling
+    adapting: AdaptationRecipe
+    labelling: FineTuningRecipe
     rows_max_n: Annotated[int, Field(ge=1)]
     methods: dict[Name, Classical]
 
@@ -69,7 +68,7 @@ class Tried:
     fold: Fold
 
 
-Done = tuple[Tried, Trial, Trained]
+Done = tuple[Tried, TrainingJob, TrainingResult]
 
 
 def read_few_labels(settings: Settings) -> FewLabels:
@@ -86,49 +85,49 @@ def read_few_labels(settings: Settings) -> FewLabels:
     return parse(FewLabels, section | resolved, where)
 
 
-def networks(study: Study, done: Sequence[Done]) -> list[tuple[Tried, Trial]]:
+def networks(study: Study, done: Sequence[Done]) -> list[tuple[Tried, TrainingJob]]:
     """Train every recipe on every fold."""
     return [
         (
             Tried(name, recipe.inputs, 0, fold),
-            Trial(EXPERIMENT, name, recipe, fold.name, study.seed, 0, fold.train, fold.test),
+            TrainingJob(EXPERIMENT, name, recipe, fold.name, study.seed, 0, fold.train, fold.test),
         )
         for fold in study.folds
         for name, recipe in study.settings.recipes.items()
     ]
 
 
-def adapted(study: Study, done: Sequence[Done]) -> list[tuple[Tried, Trial]]:
+def adapted(study: Study, done: Sequence[Done]) -> list[tuple[Tried, TrainingJob]]:
     """Adapt the named recipes by all pokes of the pool, unlabelled."""
     pairs = []
-    for tried, trial, trained in done:
-        if trial.recipe_name in study.settings.adapted:
+    for tried, job, trained in done:
+        if job.recipe_name in study.settings.adapted:
             lines = grid_lines(study.rows, tried.fold.pool)
-            tuning = Adapting(_start(trained), study.settings.adapting, lines)
+            tuning = Adaptation(_start(trained), study.settings.adapting, lines)
             pair = Tried(f"{tried.method}, adapted", tried.inputs, 0, tried.fold)
-            pairs.append((pair, _tuned(trial, tuning, "adapted")))
+            pairs.append((pair, _tuned(job, tuning, "adapted")))
     return pairs
 
 
-def labelled(study: Study, done: Sequence[Done]) -> list[tuple[Tried, Trial]]:
+def labelled(study: Study, done: Sequence[Done]) -> list[tuple[Tried, TrainingJob]]:
     """Fine-tune every network on every number of labelled pokes."""
     pairs = []
-    for tried, trial, trained in done:
+    for tried, job, trained in done:
         for labels_n, row in _labelled_rows(study, tried.fold).items():
             if labels_n:
-                tuning = trials.FewLabels(_start(trained), study.settings.labelling, row)
+                tuning = FineTuning(_start(trained), study.settings.labelling, row)
                 pair = Tried(tried.method, tried.inputs, labels_n, tried.fold)
-                pairs.append((pair, _tuned(trial, tuning, f"{trial.what}{labels_n}labels")))
+                pairs.append((pair, _tuned(job, tuning, f"{job.what}{labels_n}labels")))
     return pairs
 
 
-def classical(study: Study) -> list[tuple[Tried, Task]]:
+def classical(study: Study) -> list[tuple[Tried, ClassicalJob]]:
     """Fit every classical method with every number of labelled pokes."""
     most_n = study.settings.rows_max_n
     return [
         (
             Tried(method.title, method.inputs, labels_n, fold),
-            Task(f"{name}.{fold.name}.{labels_n}", method, fold.train, fold.test, row, most_n, study.seed),
+            ClassicalJob(f"{name}.{fold.name}.{labels_n}", method, fold.train, fold.test, row, most_n, study.seed),
         )
         for fold in study.folds
         for name, method in study.settings.methods.items()
@@ -148,9 +147,9 @@ def _labelled_rows(study: Study, fold: Fold) -> Mapping[int, Int64[np.ndarray, "
     return {n: fold.pool[np.isin(indentation, order[:n])] for n in labels_n}
 
 
-def _start(trained: Trained) -> Start:
-    return Start(trained.key, trained.weights, trained.scaler)
+def _start(trained: TrainingResult) -> Pretrained:
+    return Pretrained(trained.key, trained.weights, trained.scaler)
 
 
-def _tuned(trial: Trial, tuning: Adapting | trials.FewLabels, what: str) -> Trial:
-    return replace(trial, tuning=tuning, skin=trial.fold.rsplit("-draw", 1)[0], what=what)
+def _tuned(job: TrainingJob, tuning: Adaptation | FineTuning, what: str) -> TrainingJob:
+    return replace(job, tuning=tuning, skin=job.fold.rsplit("-draw", 1)[0], what=what)

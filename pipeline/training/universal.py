@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int64
 
 from pipeline.executors import make_executor
-from pipeline.training.trainings import SceneData, score_test
+from pipeline.training.jobs import SceneData, score_test
 from reskin import io
 from reskin.data.rows import Rows
 from reskin.data.splits import Fold

@@ -13,12 +13,19 @@ import pandas as pd
 from jaxtyping import Float
 
 from pipeline import statistics
-from pipeline.training.trainings import SceneData, Starts, collapse_record, note_seconds, own_starts, train_all
+from pipeline.training.jobs import (
+    PretrainedNetworks,
+    SceneData,
+    collapse_record,
+    select_pretrained,
+    train_jobs,
+    write_timings,
+)
 from reskin.data.splits import Fold
 from reskin.metrics import METRICS, score
 from reskin.models.inputs import VIEW
-from reskin.models.recipe import Adaptation
-from reskin.models.trial import Trial
+from reskin.models.job import TrainingJob
+from reskin.models.recipe import AdaptationWithBase
 from reskin.numerics import device
 
 FORCE = 2  # column
@@ -27,7 +34,7 @@ Judge = Callable[[np.ndarray, np.ndarray], dict[str, float]]  # of true and pred
 
 
 @dataclass(frozen=True)
-class Answered:
+class VariantPrediction:
     """What one network answers on one skin's tested rows, axes x_mm, y_mm, F_N."""
 
     arm: str
@@ -38,30 +45,32 @@ class Answered:
     predicted: Float[np.ndarray, "b 3"]
 
 
-def answers_before(data: SceneData, fold: Fold, settings: Adaptation, starts: Starts, skin: str) -> Iterator[Answered]:
+def predict_before(
+    data: SceneData, fold: Fold, settings: AdaptationWithBase, starts: PretrainedNetworks, skin: str
+) -> Iterator[VariantPrediction]:
     """Answer on a skin's tested rows as the networks do before they are adapted."""
     from reskin.models.network import Predictor  # torch, late: only a stage that answers pays for it
 
     recipe = data.settings.training("train_triplet").recipes[settings.base]
     test = fold.test[data.rows.skin[fold.test] == skin]
     view = VIEW[recipe.inputs](data.rows.db_uT[test])
-    for seed_i, start in own_starts(starts, settings.base, fold).items():
+    for seed_i, start in select_pretrained(starts, settings.base, fold).items():
         predict = Predictor(start.weights, recipe.architecture, device())
         predicted = start.scaler.decode(predict(start.scaler.encode(view)))
-        yield Answered(BEFORE, str(data.rows.board[test[0]]), skin, seed_i, data.rows.target[test], predicted)
+        yield VariantPrediction(BEFORE, str(data.rows.board[test[0]]), skin, seed_i, data.rows.target[test], predicted)
 
 
-def answers_after(
-    data: SceneData, trials: Sequence[tuple[str, Trial]], stage: str
-) -> tuple[list[Answered], dict[str, int]]:
-    """Adapt by (arm, trial), and answer on each trial's tested rows; count what collapsed."""
-    adapted = [trial for _, trial in trials]
-    trained = train_all(data, adapted, stage)
-    note_seconds(data.scene, stage, adapted, trained)
+def adapt_and_predict(
+    data: SceneData, jobs: Sequence[tuple[str, TrainingJob]], stage: str
+) -> tuple[list[VariantPrediction], dict[str, int]]:
+    """Adapt by (arm, job), and answer on each job's tested rows; count what collapsed."""
+    adapted = [job for _, job in jobs]
+    trained = train_jobs(data, adapted, stage)
+    write_timings(data.scene, stage, adapted, trained)
     answered = []
-    for (arm, trial), done in zip(trials, trained, strict=True):
-        board, true = str(data.rows.board[trial.test[0]]), data.rows.target[trial.test]
-        answered.append(Answered(arm, board, trial.skin, trial.seed_i, true, done.predicted))
+    for (arm, job), done in zip(jobs, trained, strict=True):
+        board, true = str(data.rows.board[job.test[0]]), data.rows.target[job.test]
+        answered.append(VariantPrediction(arm, board, job.skin, job.seed_i, true, done.predicted))
     return answered, statistics.tally(map(collapse_record, trained))
 
 
@@ -72,7 +81,7 @@ def bias(true: Float[np.ndarray, "b 3"], predicted: Float[np.ndarray, "b 3"]) ->
     return {"bias_f_N": over_N, "bias_f_pct": 100 * over_N / float(true_N.mean())}
 
 
-def summarise_arms(answers: Sequence[Answered], judge: Judge = score) -> dict[str, dict[str, Any]]:
+def summarise_variants(answers: Sequence[VariantPrediction], judge: Judge = score) -> dict[str, dict[str, Any]]:
     """Summarise every metric over boards, each the mean of its skins, each of these of its seeds; by arm.
 
     `sd_seeds` is the standard deviation over the networks of one skin, mean over skins.
@@ -86,13 +95,13 @@ def summarise_arms(answers: Sequence[Answered], judge: Judge = score) -> dict[st
     }
 
 
-def biases(answers: Sequence[Answered]) -> dict[str, dict[str, Any]]:
+def biases(answers: Sequence[VariantPrediction]) -> dict[str, dict[str, Any]]:
     """Both ways to say the force bias, each by arm, over boards."""
-    by_arm = summarise_arms(answers, bias)
+    by_arm = summarise_variants(answers, bias)
     return {name: {arm: found[name] for arm, found in by_arm.items()} for name in ("bias_f_N", "bias_f_pct")}
 
 
-def compare_arms(answers: Sequence[Answered], of: str, over: str) -> dict[str, Any]:
+def compare_variants(answers: Sequence[VariantPrediction], of: str, over: str) -> dict[str, Any]:
     """Compare two arms skin by skin, `of` less `over`: over boards, and `by_board`.
 
     `sd_seeds` is that of the differences: networks of equal seeds started from the same weights.
@@ -107,7 +116,7 @@ def compare_arms(answers: Sequence[Answered], of: str, over: str) -> dict[str, A
     return statistics.with_seeds(compared, each, "board", "skin") | {"by_board": by_board}
 
 
-def _tidy(answers: Sequence[Answered], judge: Judge) -> pd.DataFrame:
+def _tidy(answers: Sequence[VariantPrediction], judge: Judge) -> pd.DataFrame:
     rows = (
         {"method": answer.arm, "board": answer.board, "skin": answer.skin, "seed": answer.seed_i}
         | judge(answer.true, answer.predicted)

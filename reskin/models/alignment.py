@@ -1,7 +1,7 @@
-"""Alignment of skins: inputs of one skin beside those of others -> a linear map between them, in closed form.
+"""Alignment of two skins by a linear map in closed form, reference methods for adaptation.
 
-By channels' means and deviations, or all their covariances, which need no label; or by pairs at the same places, which
-do. Refuses to know regressors, skins and folds.
+Means and deviations of channels, or their covariance (CORAL), need no labels; direct standardisation needs pairs of
+readings at the same places.
 """
 
 from dataclasses import dataclass
@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-CORAL_RIDGE = 1.0  # added to every variance of standardised inputs, as Sun, Feng & Saenko (AAAI 2016) do
-SD_MIN = 1e-6  # a channel that is constant is moved, not stretched
+CORAL_RIDGE = 1.0  # added to every variance of standardised inputs (Sun, Feng & Saenko, AAAI 2016)
+SD_MIN = 1e-6  # a constant channel is shifted, not scaled
 RIDGES = tuple(10.0 ** np.arange(-4, 2.1, 0.5))  # of the mean square of a channel, times the number of pairs
 Inputs = Float[np.ndarray, "n c"]
 
@@ -24,12 +24,12 @@ class Map:
     after: Float[np.ndarray, " c"]
 
     def __call__(self, inputs: Inputs) -> Inputs:
-        """Move inputs of the one skin to where the other's lie."""
+        """Map inputs of the first skin to those of the second."""
         return (inputs - self.before) @ self.matrix + self.after
 
 
 def match_channels(of: Float[np.ndarray, "n c"], to: Float[np.ndarray, "m c"]) -> Map:
-    """Give each channel the mean and the standard deviation that it has on the other skin."""
+    """Match the mean and the standard deviation of every channel."""
     return Map(of.mean(axis=0), np.diag(_sd(to) / _sd(of)), to.mean(axis=0))
 
 
@@ -45,28 +45,28 @@ def coral(of: Float[np.ndarray, "n c"], to: Float[np.ndarray, "m c"], ridge: flo
 
 
 def direct(of: Float[np.ndarray, "p c"], to: Float[np.ndarray, "p c"], ridge: float) -> Map:
-    """Find the linear map that takes a few inputs to their pairs (direct standardisation, Wang & Kowalski 1991).
+    """Fit the linear map from a few inputs to their pairs (direct standardisation, Wang & Kowalski 1991).
 
-    Ridge regression of what pairs differ by, so that what no pair tells stays as it is; no constant, as no contact is
-    no change on any skin.
+    Ridge regression of the differences of the pairs, so that directions without data are left unchanged; no constant,
+    because no contact is no change of field on any skin.
     """
     none = np.zeros(of.shape[1])
-    gain = np.linalg.solve(of.T @ of + _held(of, ridge), of.T @ (to - of))
+    gain = np.linalg.solve(of.T @ of + _penalty(of, ridge), of.T @ (to - of))
     return Map(none, np.eye(of.shape[1]) + gain, none)
 
 
 def choose_ridge(of: Float[np.ndarray, "p c"], to: Float[np.ndarray, "p c"]) -> float:
-    """Choose the ridge of `direct` that errs least on pairs left out one by one: no row but the pairs is looked at."""
+    """Choose the ridge of `direct` by leave-one-out cross-validation over the pairs."""
 
     def error(ridge: float) -> float:
-        hat = of @ np.linalg.solve(of.T @ of + _held(of, ridge), of.T)
+        hat = of @ np.linalg.solve(of.T @ of + _penalty(of, ridge), of.T)
         off = (to - of) - hat @ (to - of)
         return float(((off / (1 - np.diag(hat))[:, None]) ** 2).sum())
 
     return min(RIDGES, key=error)
 
 
-def _held(of: Float[np.ndarray, "p c"], ridge: float) -> Float[np.ndarray, "c c"]:
+def _penalty(of: Float[np.ndarray, "p c"], ridge: float) -> Float[np.ndarray, "c c"]:
     return ridge * (of**2).sum() / of.shape[1] * np.eye(of.shape[1])
 
 

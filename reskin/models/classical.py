@@ -21,7 +21,7 @@ from threadpoolctl import ThreadpoolController  # type: ignore[import-untyped]
 from reskin.config import Strict
 from reskin.errors import TrainingError
 from reskin.models.inputs import SCALE_FLOOR, VIEW, Scaler, fit_standard
-from reskin.models.trial import Measured, median_s
+from reskin.models.job import TrainingData, median_call_s
 from reskin.seeds import rng_for
 
 
@@ -88,7 +88,7 @@ class _Part:
 
 
 @dataclass(frozen=True)
-class Fitted:
+class FittedRegressor:
     """A fitted method with the scaler of its training rows."""
 
     scaler: Scaler
@@ -119,7 +119,7 @@ def fit(
     rng: np.random.Generator,
     *,
     weight: Float32[np.ndarray, " n"] | None,
-) -> Fitted:
+) -> FittedRegressor:
     """Fit to the rows that know a target (mm, mm, N), each target by itself where they differ.
 
     `weight` counts a row as so many in the loss (in a vote, of neighbours); the scaler does not know it.
@@ -141,7 +141,7 @@ def fit(
         with one_thread():
             regressor.fit(encoded[rows], encoded_target[rows][:, targets], row_weights)
         parts.append(_Part(targets, regressor, len(rows)))
-    return Fitted(scaler, tuple(parts))
+    return FittedRegressor(scaler, tuple(parts))
 
 
 def _without_constant_channels(scaler: Scaler) -> Scaler:
@@ -266,7 +266,7 @@ def blocks(rows_n: int) -> list[slice]:
 
 
 @dataclass(frozen=True)
-class Task:
+class ClassicalJob:
     """A method on one fold; `few_labels` are labelled rows of a new skin, which together weigh as much as all others.
 
     More than `rows_max_n` training rows are thinned to this number at random.
@@ -282,7 +282,7 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Fit:
+class ClassicalResult:
     """Predictions (mm, mm, N) for the test rows, the number of training rows, and times of fit and prediction."""
 
     predicted: Float32[np.ndarray, "b 3"]
@@ -301,7 +301,9 @@ class _Inputs:
     test: Float32[np.ndarray, "b c"]
 
 
-def run_tasks(tasks: Sequence[Task], rows: Measured, executor: Executor, tell: Callable[[str], None]) -> list[Fit]:
+def run_classical_jobs(
+    tasks: Sequence[ClassicalJob], rows: TrainingData, executor: Executor, tell: Callable[[str], None]
+) -> list[ClassicalResult]:
     running = [executor.submit(_fit, task.method, task.name, task.seed, _inputs(task, rows)) for task in tasks]
     fits = []
     for task, future in zip(tasks, running, strict=True):
@@ -310,7 +312,7 @@ def run_tasks(tasks: Sequence[Task], rows: Measured, executor: Executor, tell: C
     return fits
 
 
-def _inputs(task: Task, rows: Measured) -> _Inputs:
+def _inputs(task: ClassicalJob, rows: TrainingData) -> _Inputs:
     train, weight, view = task.train, None, VIEW[task.method.inputs]
     if len(train) > task.rows_max_n:
         kept = rng_for(task.seed, "thin", task.name).choice(len(train), task.rows_max_n, replace=False)
@@ -322,9 +324,9 @@ def _inputs(task: Task, rows: Measured) -> _Inputs:
     return _Inputs(view(rows.db_uT[train]), rows.target[train], weight, view(rows.db_uT[task.test]))
 
 
-def _fit(method: Classical, name: str, seed: int, inputs: _Inputs) -> Fit:
+def _fit(method: Classical, name: str, seed: int, inputs: _Inputs) -> ClassicalResult:
     start_s = time.monotonic()
     fitted = fit(method, inputs.train, inputs.target, rng_for(seed, "baseline", name), weight=inputs.weight)
     seconds = time.monotonic() - start_s
-    one_reading_s = median_s(partial(fitted.predict, inputs.test[:1]))
-    return Fit(fitted.predict(inputs.test), fitted.rows_n, seconds, one_reading_s)
+    one_reading_s = median_call_s(partial(fitted.predict, inputs.test[:1]))
+    return ClassicalResult(fitted.predict(inputs.test), fitted.rows_n, seconds, one_reading_s)

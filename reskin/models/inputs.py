@@ -1,7 +1,6 @@
-"""What a method sees: a view of the change of field, and the scaler between uT, mm, N and the numbers of a network.
+"""Inputs of the models: views of the change of field, and scalers between uT, mm, N and the numbers of a network.
 
-A view is a fixed function of one row, so it cannot leak; a scaler is fitted on training rows only
-(tests/models/test_trial.py plants the leak). Refuses to know skins, folds and networks.
+A view is a fixed function of one row; a scaler is fitted on training rows only, so that no test row leaks into it.
 """
 
 from collections.abc import Callable, Mapping
@@ -10,10 +9,10 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from jaxtyping import Float32
 
-# Assumed: a shorter |dB| is taken as this long. It is below the noise: 3 uT of one channel (FACTS 3), some 15 uT of
-# fifteen. Its log is 0, so that no change at all is zeros throughout.
+# Assumed: least |dB|, below the noise (3 uT of one channel, some 15 uT of fifteen). Its log is 0, so that no change of
+# field gives zeros throughout.
 DB_FLOOR_uT = 1.0
-# Least scale: a channel that is constant in training must not blow up in use.
+# Least scale, for a channel that is constant in training.
 SCALE_FLOOR = np.float32(1e-6)
 RELEASED_INPUT_SDS = np.float32(5.0)  # the released weights divide by about five standard deviations
 RELEASED_PLACE_MM, RELEASED_FORCE_N = 16.0, 3.0
@@ -24,7 +23,7 @@ def raw(db_uT: Float32[np.ndarray, "f ch"]) -> Float32[np.ndarray, "f ch"]:
 
 
 def shape(db_uT: Float32[np.ndarray, "f ch"]) -> Float32[np.ndarray, "f c"]:
-    """Give dB / |dB|, which a magnet's strength leaves alone, and append the natural log of |dB| / uT."""
+    """Return dB / |dB|, which does not depend on the magnet's strength, and the natural log of |dB| / uT."""
     length_uT = np.linalg.norm(db_uT.astype(np.float64), axis=1, keepdims=True)  # [f 1]
     floored_uT = np.maximum(length_uT, DB_FLOOR_uT)
     return np.hstack([db_uT / floored_uT, np.log(floored_uT)]).astype(np.float32)
@@ -46,12 +45,12 @@ class Scaler:
         return (db_uT - self.input_shift) / self.input_scale
 
     def encode_target(self, target: Float32[np.ndarray, "f t"]) -> Float32[np.ndarray, "f t"]:
-        """Turn places and forces into what the network is to answer."""
+        """Scale places and forces."""
         return (target - self.target_shift) / self.target_scale
 
-    def decode(self, answer: Float32[np.ndarray, "f t"]) -> Float32[np.ndarray, "f t"]:
-        """Turn the network's answers into mm, mm, N."""
-        return answer * self.target_scale + self.target_shift
+    def decode(self, scaled: Float32[np.ndarray, "f t"]) -> Float32[np.ndarray, "f t"]:
+        """Convert outputs of the network to mm, mm, N."""
+        return scaled * self.target_scale + self.target_shift
 
     def arrays(self) -> dict[str, np.ndarray]:
         return asdict(self)
@@ -62,7 +61,7 @@ class Scaler:
 
 
 def fit_standard(db_uT: Float32[np.ndarray, "f ch"], target: Float32[np.ndarray, "f t"]) -> Scaler:
-    """Zero mean and unit deviation of every channel and target over the training rows."""
+    """Fit a scaler to zero mean and unit standard deviation of every channel and target."""
     known = ~np.isnan(target).all(axis=0)
     shift, scale = np.zeros(target.shape[1], np.float32), np.ones(target.shape[1], np.float32)
     shift[known] = np.nanmean(target[:, known], axis=0, dtype=np.float64)
@@ -76,7 +75,7 @@ def fit_standard(db_uT: Float32[np.ndarray, "f ch"], target: Float32[np.ndarray,
 
 
 def fit_released(db_uT: Float32[np.ndarray, "f ch"], target: Float32[np.ndarray, "f t"]) -> Scaler:
-    """The scaling of the authors' released network: 5 sd of each channel, no mean removed; x/16, y/16, F/3."""
+    """Fit the scaler of the released network: 5 sd of each channel, no mean removed; x/16, y/16, F/3."""
     return Scaler(
         input_shift=np.zeros(db_uT.shape[1], np.float32),
         input_scale=_floored(RELEASED_INPUT_SDS * db_uT.std(axis=0, dtype=np.float64)),

@@ -1,22 +1,51 @@
-"""Triplets ordered by distance, for the triplet loss (paper section 5)."""
+"""Training losses: the squared error, and the triplet loss of the paper (section 5) with the sampling of its triplets.
+
+A triplet is an anchor, a positive and a negative of one group (a skin, or a line of pokes), the positive strictly
+nearer to the anchor than the negative.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, Int64, Shaped
 
 from reskin.errors import TrainingError
 
-ROUNDS_MAX_N = 100  # with half of the draws tied, 1e-30 of the anchors are left after so many
-TIED = 1e-5  # of the sum of both squared distances; places are float32 numbers, equal distances differ by 1e-6
-
-PLACES_COMPARED_N = 64  # of a group; a place from which so many are equally far is taken for no anchor
+MAX_DRAWS_N = 100  # with half of the draws tied, 1e-30 of the anchors are left after so many
+TIE_RTOL = 1e-5  # of the sum of both squared distances; places are float32 numbers, equal distances differ by 1e-6
+COMPARED_PLACES_N = 64  # of a group; a place from which so many are equally far is not used as an anchor
 
 Pairs = tuple[Int64[np.ndarray, " b"], Int64[np.ndarray, " b"]]
 
 
+def squared_error(
+    predicted: Float[torch.Tensor, "m b t"], truth: Float[torch.Tensor, "m b t"]
+) -> Float[torch.Tensor, " m"]:
+    """Mean squared error over the known targets of a batch, for each of m networks.
+
+    An unknown target (NaN) has no gradient.
+    """
+    known = ~torch.isnan(truth)
+    # Masked before it is squared: NaN times zero is NaN, in the gradient too.
+    difference = torch.where(known, predicted - truth, 0.0)
+    return (difference**2).sum((1, 2)) / known.sum((1, 2))
+
+
+def triplet_loss(
+    anchor: Float[torch.Tensor, "m b d"], positive: Float[torch.Tensor, "m b d"], negative: Float[torch.Tensor, "m b d"]
+) -> Float[torch.Tensor, " m"]:
+    """Batch mean of max(0, |a - p|^2 - |a - n|^2): squared distances of features, without a margin (section 5).
+
+    Squares, not roots: the gradient of identical points is 0 and finite.
+    """
+    positive_d2 = ((anchor - positive) ** 2).sum(-1)
+    negative_d2 = ((anchor - negative) ** 2).sum(-1)
+    return torch.relu(positive_d2 - negative_d2).mean(-1)
+
+
 @dataclass(frozen=True)
-class Points:
+class TripletPoints:
     """Points sorted by group: group g has `order[start[g] : start[g] + count[g]]`.
 
     A point is an anchor if some other points of its group are nearer to it than others.
@@ -31,15 +60,19 @@ class Points:
 
     @property
     def anchors(self) -> Int64[np.ndarray, " a"]:
-        """The points that triplets can be ordered from."""
         return np.flatnonzero(self.is_anchor)
 
     def __len__(self) -> int:
         return len(self.group)
 
 
-def make_points(place: Float[np.ndarray, "n d"], group: Shaped[np.ndarray, " n"]) -> Points:
-    """Sort points by group; raise if all points of a group lie on one place, where nothing is nearer than anything."""
+def triplet_points(place: Float[np.ndarray, "n d"], group: Shaped[np.ndarray, " n"]) -> TripletPoints:
+    """Sort points by group and find the anchors.
+
+    Raises
+    ------
+    TrainingError : all points of a group lie at one place, or no point is an anchor
+    """
     names, codes = np.unique(group, return_inverse=True)
     order = np.argsort(codes, kind="stable")
     count = np.bincount(codes, minlength=len(names))
@@ -53,54 +86,59 @@ def make_points(place: Float[np.ndarray, "n d"], group: Shaped[np.ndarray, " n"]
         raise TrainingError(where, "the places of its points", "two or more", got, remedy)
     is_anchor = np.zeros(len(place), bool)
     for first, n in zip(start, count, strict=True):
-        is_anchor[order[first : first + n]] = _anchors(place[order[first : first + n]])
+        is_anchor[order[first : first + n]] = _find_anchors(place[order[first : first + n]])
     if not is_anchor.any():
         rule, got = "some nearer to one than others are", f"{len(place)} that are equally far"
         raise TrainingError("triplets", "points", rule, got, "Poke at more places.")
-    return Points(place.astype(np.float64), codes.astype(np.int64), order, start, count, is_anchor)
+    return TripletPoints(place.astype(np.float64), codes.astype(np.int64), order, start, count, is_anchor)
 
 
-def draw_pairs(points: Points, anchor: Int64[np.ndarray, " b"], rng: np.random.Generator) -> Pairs:
-    """Draw a positive and a negative of its group for every anchor, the positive strictly nearer.
+def draw_triplets(points: TripletPoints, anchor: Int64[np.ndarray, " b"], rng: np.random.Generator) -> Pairs:
+    """Draw a positive and a negative for each anchor.
 
-    Both are drawn uniformly from the other points of the group; draws in which they are equally near are drawn again. A
-    point that is no anchor gets itself twice, which costs and teaches nothing.
+    Both are drawn uniformly from the other points of the anchor's group; ties are drawn again. A point that is not an
+    anchor gets itself twice, so its loss and gradient are 0.
     """
     positive, negative = anchor.copy(), anchor.copy()
     left = np.flatnonzero(points.is_anchor[anchor])
-    for _ in range(ROUNDS_MAX_N):
+    for _ in range(MAX_DRAWS_N):
         a = anchor[left]
-        p, q = _of_group(points, a, rng), _of_group(points, a, rng)
+        p, q = _draw_from_group(points, a, rng), _draw_from_group(points, a, rng)
         p_d2 = ((points.place[p] - points.place[a]) ** 2).sum(axis=1)
         q_d2 = ((points.place[q] - points.place[a]) ** 2).sum(axis=1)
         p_is_nearer = p_d2 < q_d2
         positive[left], negative[left] = np.where(p_is_nearer, p, q), np.where(p_is_nearer, q, p)
-        tied = (np.abs(p_d2 - q_d2) <= TIED * (p_d2 + q_d2)) | (p == a) | (q == a)
+        tied = (np.abs(p_d2 - q_d2) <= TIE_RTOL * (p_d2 + q_d2)) | (p == a) | (q == a)
         left = left[tied]
         if not len(left):
             return positive, negative
-    got = f"ties in {ROUNDS_MAX_N} draws at place {points.place[anchor[left[0]]].tolist()}"
-    raise TrainingError("triplets", "the distances from an anchor", "different ones", got, "Poke at more places.")
+    place = points.place[anchor[left[0]]].tolist()
+    raise TrainingError(f"triplets: {MAX_DRAWS_N} draws from the anchor at {place} were ties. Poke at more places.")
 
 
-def _anchors(place: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, " n"]:
-    """Find a group's points with others at two different distances, among `PLACES_COMPARED_N` of its places."""
-    places, index, visits_n = _distinct(place)
-    others = places[:PLACES_COMPARED_N].astype(np.float64)
+def _draw_from_group(points: TripletPoints, anchor: np.ndarray, rng: np.random.Generator) -> Int64[np.ndarray, " b"]:
+    group = points.group[anchor]
+    return points.order[points.start[group] + rng.integers(points.count[group])]
+
+
+def _find_anchors(place: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, " n"]:
+    """Mark the points that have others at two different distances, among `COMPARED_PLACES_N` places of the group."""
+    places, index, points_n = _unique_places(place)
+    others = places[:COMPARED_PLACES_N].astype(np.float64)
     d2 = ((places[:, None].astype(np.float64) - others) ** 2).sum(axis=2)  # [places others]
     farthest, nearest = d2.max(axis=1), np.where(d2 > 0, d2, np.inf).min(axis=1)
-    is_anchor: np.ndarray = (visits_n > 1) | (farthest - nearest > TIED * (farthest + nearest))
+    is_anchor: np.ndarray = (points_n > 1) | (farthest - nearest > TIE_RTOL * (farthest + nearest))
     return is_anchor[index]
 
 
-def _distinct(
+def _unique_places(
     place: Float[np.ndarray, "n d"],
 ) -> tuple[Float[np.ndarray, "p d"], Int64[np.ndarray, " n"], Int64[np.ndarray, " p"]]:
-    """Give the different places in order, which of them each point is, and how many points are there.
+    """Return the sorted unique places, the index of each point's place, and the number of points at each place.
 
     As `np.unique(place, axis=0, ...)`, which compares rows as records and takes three times as long.
 
-    >>> _distinct(np.array([[1.0, 2.0], [0.0, 3.0], [1.0, 2.0]]))[1:]
+    >>> _unique_places(np.array([[1.0, 2.0], [0.0, 3.0], [1.0, 2.0]]))[1:]
     (array([1, 0, 1]), array([1, 2]))
     """
     order = np.lexsort(place.T[::-1])
@@ -108,8 +146,3 @@ def _distinct(
     index = np.empty(len(place), np.int64)
     index[order] = np.cumsum(is_new) - 1
     return place[order[is_new]], index, np.bincount(index)
-
-
-def _of_group(points: Points, anchor: np.ndarray, rng: np.random.Generator) -> Int64[np.ndarray, " b"]:
-    group = points.group[anchor]
-    return points.order[points.start[group] + rng.integers(points.count[group])]

@@ -1,7 +1,7 @@
-"""The paper's perceptron: layers and first weights; and many at once. In: scaled inputs [m b c]. Out: scaled x, y, F.
+"""The networks of the paper and of its authors' release: architecture, first weights, and stacks of many networks.
 
-A stack of m networks is one tensor a layer, and a batched product replaces m small ones: for small networks calls cost
-more than sums. Refuses to know how it is trained, and in which units.
+A stack of m networks holds one tensor a layer, so that one batched product replaces m small ones: for networks of this
+size, calls cost more than sums.
 """
 
 from collections.abc import Sequence
@@ -13,13 +13,14 @@ import torch
 from jaxtyping import Bool, Float, Float32
 from torch import nn
 
+from reskin.models.job import Weights
 from reskin.models.reproducible import affine
-from reskin.models.trial import Weights
 
 HIDDEN_N = 200
-FEATURES_N = 40  # the bottleneck that the triplet term acts on (paper section 4)
+FEATURES_N = 40  # width of the bottleneck, on which the triplet loss acts (paper section 4)
 FEATURE_LAYERS_N = 3
-OUTPUTS_N = 3  # x, y, F; five where shear is answered too: x, y, Fx, Fy, Fz
+OUTPUTS_N = 3  # x, y, F; five with shear: x, y, Fx, Fy, Fz
+BLOCK_ROWS_N = 65_536  # predicted at once, to bound memory
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ def paper_layers(inputs_n: int, outputs_n: int = OUTPUTS_N) -> tuple[Layer, ...]
 
 
 def released_layers(inputs_n: int, outputs_n: int = OUTPUTS_N) -> tuple[Layer, ...]:
-    """The network that the authors released: also a ReLU after layer 2 and one on the output."""
+    """The network that the authors released: with a ReLU after layer 2 and one on the output, too."""
     return _layers(inputs_n, outputs_n, relus=(True, True, False, True, True, True))
 
 
@@ -45,7 +46,7 @@ LAYERS = {"paper": paper_layers, "released": released_layers}
 
 
 def draw_weights(layers: Sequence[Layer], rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Draw first weights as PyTorch does by default for linear layers: uniform within 1/sqrt(fan in)."""
+    """Draw first weights as PyTorch does for linear layers: uniform within 1/sqrt(fan in)."""
     weights = {}
     for i, layer in enumerate(layers, 1):
         limit = layer.in_n**-0.5
@@ -59,40 +60,38 @@ def _layers(inputs_n: int, outputs_n: int, relus: tuple[bool, ...]) -> tuple[Lay
     return tuple(Layer(in_n, out_n, relu) for (in_n, out_n), relu in zip(pairwise(widths), relus, strict=True))
 
 
-BLOCK_ROWS_N = 65_536
-
-
 class Stack(nn.Module):
-    """Networks of one architecture, side by side; those of one stack never touch each other."""
+    """Independent networks of one architecture, computed side by side."""
 
     def __init__(self, layers: Sequence[Layer], members: Sequence[Weights]) -> None:
         super().__init__()
         self.relus = [layer.relu for layer in layers]
         self.members_n = len(members)
         numbers = range(1, len(layers) + 1)
-        # In one piece: autograd and AdamW would copy gradients to the order of a merely transposed weight.
+        # Contiguous: for a transposed view, autograd and AdamW would copy the gradients.
         self.weights = nn.ParameterList(_stacked(members, f"layer{i}.weight").mT.contiguous() for i in numbers)
         self.biases = nn.ParameterList(_stacked(members, f"layer{i}.bias")[:, None] for i in numbers)
 
     def features(self, inputs: Float[torch.Tensor, "m b c"]) -> Float[torch.Tensor, "m b 40"]:
-        """What the first three layers make of a batch for each network."""
+        """Output of the first three layers, on which the triplet loss acts."""
         return self._run(inputs, 0, FEATURE_LAYERS_N)
 
-    def answer(self, features: Float[torch.Tensor, "m b 40"]) -> Float[torch.Tensor, "m b t"]:
+    def head(self, features: Float[torch.Tensor, "m b 40"]) -> Float[torch.Tensor, "m b t"]:
+        """Output of the remaining layers."""
         return self._run(features, FEATURE_LAYERS_N, len(self.relus))
 
     def forward(self, inputs: Float[torch.Tensor, "m b c"]) -> Float[torch.Tensor, "m b t"]:
-        return self.answer(self.features(inputs))
+        return self.head(self.features(inputs))
 
-    def member(self, i: int) -> dict[str, np.ndarray]:
-        """Take the weights of one network out, as `layer1.weight` [out in], `layer1.bias` [out], ..."""
-        taken = {}
+    def weights_of(self, i: int) -> dict[str, np.ndarray]:
+        """Copy the weights of one network, as `layer1.weight` [out in], `layer1.bias` [out], ..."""
+        weights = {}
         for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True), 1):
-            taken[f"layer{k}.weight"] = weight.detach()[i].T.contiguous().cpu().numpy().copy()
-            taken[f"layer{k}.bias"] = bias.detach()[i, 0].cpu().numpy().copy()
-        return taken
+            weights[f"layer{k}.weight"] = weight.detach()[i].T.contiguous().cpu().numpy().copy()
+            weights[f"layer{k}.bias"] = bias.detach()[i, 0].cpu().numpy().copy()
+        return weights
 
-    def finite(self) -> Bool[torch.Tensor, " m"]:
+    def is_finite(self) -> Bool[torch.Tensor, " m"]:
         return torch.stack([torch.isfinite(values.detach()).flatten(1).all(1) for values in self.parameters()]).all(0)
 
     def _run(self, values: torch.Tensor, first: int, last: int) -> torch.Tensor:
@@ -103,7 +102,7 @@ class Stack(nn.Module):
 
 
 class Predictor:
-    """One trained network, ready to answer; rows are answered a block at a time to bound memory."""
+    """One trained network: scaled inputs -> scaled outputs, a block of rows at a time."""
 
     def __init__(self, weights: Weights, architecture: str, device: str) -> None:
         inputs_n, outputs_n = weights["layer1.weight"].shape[1], len(weights[f"layer{len(weights) // 2}.bias"])

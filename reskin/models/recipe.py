@@ -55,7 +55,7 @@ class AugmentedRecipe(Recipe):
     augmentation: Augmentation
 
 
-class FineTuning(Schedule):
+class AdaptationRecipe(Schedule):
     """How a trained network is adapted to a new skin: its recipe's loss goes on, beside a term on the skin's pokes.
 
     `unlabelled_weight` weighs the triplet loss of unlabelled pokes along lines (paper section 5).
@@ -64,13 +64,13 @@ class FineTuning(Schedule):
     unlabelled_weight: Weight
 
 
-class Labelling(Schedule):
+class FineTuningRecipe(Schedule):
     """How a trained network is fine-tuned on a few labelled pokes of a new skin, weighed by `own_weight`."""
 
     own_weight: Weight
 
 
-class Adaptation(FineTuning):
+class AdaptationWithBase(AdaptationRecipe):
     """Fine-tuning from one recipe of train_triplet; with an `unlabelled_weight` of 0 it is the control."""
 
     base: Name

@@ -45,7 +45,7 @@ class Network:
         return Predictor(weights, self.card["recipe"]["architecture"], device())
 
 
-def networks_without(models: Path, board: str, *, recipe: str = HEADLINE) -> list[Network]:
+def networks_held_out(models: Path, board: str, *, recipe: str = HEADLINE) -> list[Network]:
     """Read the networks of train_multi that never saw this board, one a seed."""
     found = []
     for file in sorted(models.glob("*.json")):

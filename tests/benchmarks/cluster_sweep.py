@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from pipeline.executors import end_workers, make_executor
-from reskin.models.grid import _read_rows, run_trials
+from reskin.models.job import TrainingData, TrainingJob
 from reskin.models.recipe import Recipe
-from reskin.models.trial import Measured, Trial
+from reskin.models.runner import _read_rows, run_jobs
 from reskin.seeds import rng_for
 
 BOARDS_N, SEEDS_N, ROWS_N, STEPS_N = 6, 6, 20_000, 200
@@ -61,21 +61,21 @@ def nothing() -> None:
     """The task that shows what a task costs beside its work."""
 
 
-def measured() -> Measured:
+def measured() -> TrainingData:
     rng = rng_for(0, "cluster")
     place_mm = 2.0 * rng.integers(0, 9, (ROWS_N, 2))
     target = np.column_stack([place_mm, rng.uniform(0, 3, ROWS_N)])
     db_uT = 50 * np.tanh(target @ rng.normal(0, 0.1, (3, 15))) + rng.normal(0, 3, (ROWS_N, 15))
-    return Measured(db_uT.astype(np.float32), target.astype(np.float32), np.arange(ROWS_N) * BOARDS_N // ROWS_N)
+    return TrainingData(db_uT.astype(np.float32), target.astype(np.float32), np.arange(ROWS_N) * BOARDS_N // ROWS_N)
 
 
-def trials(rows: Measured) -> list[Trial]:
+def jobs(rows: TrainingData) -> list[TrainingJob]:
     recipe = Recipe(
         architecture="paper", inputs="raw", scaling="standard", triplet_weight=0.0, steps_n=STEPS_N, batch_n=128,
         rate_max=3e-3, gradient_norm_max=1.0, weight_decay=0.0,
     )  # fmt: skip
     return [
-        Trial("lobo", "paper", recipe, f"b{held}", 0, seed_i, np.flatnonzero(rows.skin != held),
+        TrainingJob("lobo", "paper", recipe, f"b{held}", 0, seed_i, np.flatnonzero(rows.skin != held),
               np.flatnonzero(rows.skin == held))
         for seed_i in range(SEEDS_N)
         for held in range(BOARDS_N)
@@ -92,7 +92,7 @@ def main() -> None:
         executor.submit(nothing).result()  # local workers have loaded what tasks need
         ready_s = time.monotonic()
         noting = Noted(executor, folder / "ran.txt")
-        done = run_trials(trials(rows), rows, executor=noting, cache=folder / "cells", tell=lambda line: None)
+        done = run_jobs(jobs(rows), rows, executor=noting, cache=folder / "cells", log=lambda line: None)
         swept_s = time.monotonic()
         if empty:
             for future in [executor.submit(nothing) for _ in range(EMPTY_N)]:

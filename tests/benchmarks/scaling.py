@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from reskin.models.grid import STACK_N
+from reskin.models.runner import STACK_N
 from reskin.seeds import rng_for
 from tests.benchmarks.steps import ROOT
 

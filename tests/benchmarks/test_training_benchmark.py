@@ -24,11 +24,12 @@ from torch.utils.data import DataLoader, TensorDataset
 
 from pipeline.executors import make_executor
 from reskin.models import train as train_module
-from reskin.models.grid import STACK_N, run_trials
+from reskin.models.batches import BatchSampler
+from reskin.models.job import TrainingData, TrainingJob
 from reskin.models.network import FEATURE_LAYERS_N, Stack, paper_layers
 from reskin.models.recipe import Recipe
-from reskin.models.train import AdamW, Feed, Watch, train_stack
-from reskin.models.trial import Measured, Trial
+from reskin.models.runner import STACK_N, run_jobs
+from reskin.models.train import AdamW, Monitor, train_stack
 from reskin.seeds import rng_for
 from tests.benchmarks import FULL, size
 
@@ -47,19 +48,19 @@ def recipe(triplet_weight: float, steps_n: int = STEPS_N) -> Recipe:
     )  # fmt: skip
 
 
-def measured() -> Measured:
+def measured() -> TrainingData:
     rng = rng_for(0, "training benchmark")
     place_mm = 2.0 * rng.integers(0, 9, (ROWS_N, 2))
     target = np.column_stack([place_mm, rng.uniform(0, 3, ROWS_N)])
     db_uT = 50 * np.tanh(target @ rng.normal(0, 0.1, (3, CHANNELS_N))) + rng.normal(0, 3, (ROWS_N, CHANNELS_N))
     skin = np.arange(ROWS_N) * BOARDS_N * SKINS_PER_BOARD_N // ROWS_N
-    return Measured(db_uT.astype(np.float32), target.astype(np.float32), skin)
+    return TrainingData(db_uT.astype(np.float32), target.astype(np.float32), skin)
 
 
-def fold_grid(rows: Measured, triplet_weight: float) -> list[Trial]:
+def fold_grid(rows: TrainingData, triplet_weight: float) -> list[TrainingJob]:
     board = rows.skin // SKINS_PER_BOARD_N
     return [
-        Trial("lobo", "paper", recipe(triplet_weight), f"b{held}", 0, seed_i,
+        TrainingJob("lobo", "paper", recipe(triplet_weight), f"b{held}", 0, seed_i,
              np.flatnonzero(board != held), np.flatnonzero(board == held))
         for held in range(BOARDS_N)
         for seed_i in range(SEEDS_N)
@@ -91,23 +92,23 @@ def seconds(call: Callable[[], object], clock: Callable[[], float] = time.perf_c
     return clock() - start_s
 
 
-def started(trial: Trial, rows: Measured) -> int:
-    train_stack([trial], rows)
+def started(job: TrainingJob, rows: TrainingData) -> int:
+    train_stack([job], rows)
     return os.getpid()
 
 
 def start(executor: Executor, workers_n: int = 2) -> None:
     """Start the workers with a step of training each: the first step of a process loads most of PyTorch."""
-    few = Measured(*(values[:BATCH_N] for values in (measured().db_uT, measured().target, measured().skin)))
-    trial = replace(fold_grid(few, 0.0)[0], recipe=recipe(0.0, 1), train=np.arange(64), test=np.arange(64, BATCH_N))
-    running = [executor.submit(started, trial, few) for _ in range(workers_n)]
+    few = TrainingData(*(values[:BATCH_N] for values in (measured().db_uT, measured().target, measured().skin)))
+    job = replace(fold_grid(few, 0.0)[0], recipe=recipe(0.0, 1), train=np.arange(64), test=np.arange(64, BATCH_N))
+    running = [executor.submit(started, job, few) for _ in range(workers_n)]
     assert len({one.result() for one in running}) == workers_n
 
 
-def run_grid(trials: list[Trial], rows: Measured, executor: Executor, cache: Path) -> tuple[float, float]:
+def run_grid(jobs: list[TrainingJob], rows: TrainingData, executor: Executor, cache: Path) -> tuple[float, float]:
     """Train the grid; give its seconds, and the seconds of all networks together, each within its process."""
     start_s = time.perf_counter()
-    trained = run_trials(trials, rows, executor=executor, cache=cache, tell=lambda line: None)
+    trained = run_jobs(jobs, rows, executor=executor, cache=cache, log=lambda line: None)
     took_s = time.perf_counter() - start_s
     assert all(one.stopped_step is None and (not FULL or one.curve[-1] < one.curve[0]) for one in trained)
     return took_s, sum(one.seconds for one in trained)
@@ -129,26 +130,28 @@ def plain_loop(batches: Iterable[Sequence[torch.Tensor]]) -> None:
     assert torch.isfinite(loss)
 
 
-def plain_grid(rows: Measured, threads_n: int, batches_of: Callable[[TensorDataset], Iterable]) -> tuple[float, float]:
+def plain_grid(
+    rows: TrainingData, threads_n: int, batches_of: Callable[[TensorDataset], Iterable]
+) -> tuple[float, float]:
     """Train a part of the grid one network at a time, as a user would; give wall and CPU seconds for the whole."""
     torch.set_num_threads(threads_n)
-    trials = fold_grid(rows, 0.0)
+    jobs = fold_grid(rows, 0.0)
     start_s, start_cpu_s = time.perf_counter(), time.process_time()
-    for trial in trials[:: len(trials) // PLAIN_N]:
-        view, target = (torch.from_numpy(one[trial.train]) for one in (rows.db_uT, rows.target))
+    for job in jobs[:: len(jobs) // PLAIN_N]:
+        view, target = (torch.from_numpy(one[job.train]) for one in (rows.db_uT, rows.target))
         data = TensorDataset((view - view.mean(0)) / view.std(0), (target - target.mean(0)) / target.std(0))
         plain_loop(islice(batches_of(data), STEPS_N))
     took_s, took_cpu_s = time.perf_counter() - start_s, time.process_time() - start_cpu_s
     torch.set_num_threads(1)
-    return took_s * len(trials) / PLAIN_N, took_cpu_s * len(trials) / PLAIN_N
+    return took_s * len(jobs) / PLAIN_N, took_cpu_s * len(jobs) / PLAIN_N
 
 
-def engine_cpu_s(rows: Measured) -> float:
+def engine_cpu_s(rows: TrainingData) -> float:
     """Train one stack in this process; give CPU seconds for the whole grid: a busy machine leaves them alone."""
-    trials = [replace(one, test=one.test[:1]) for one in fold_grid(rows, 0.0)]
+    jobs = [replace(one, test=one.test[:1]) for one in fold_grid(rows, 0.0)]
     start_s = time.process_time()
-    train_stack(trials[: STACK_N["cpu"]], rows)
-    return (time.process_time() - start_s) * len(trials) / STACK_N["cpu"]
+    train_stack(jobs[: STACK_N["cpu"]], rows)
+    return (time.process_time() - start_s) * len(jobs) / STACK_N["cpu"]
 
 
 def by_loader(data: TensorDataset) -> Iterable:
@@ -184,13 +187,13 @@ def clocked(parts: dict[str, list[tuple[object, str]]]):
 
 
 STEP = {
-    "draw and gather batches": [(Feed, "draw")],
-    "forward": [(Stack, "features"), (Stack, "answer")],
-    "losses": [(train_module, "squared_error"), (train_module, "triplet")],
+    "draw and gather batches": [(BatchSampler, "sample")],
+    "forward": [(Stack, "features"), (Stack, "head")],
+    "losses": [(train_module, "squared_error"), (train_module, "triplet_loss")],
     "backward": [(torch.Tensor, "backward")],
     "AdamW": [(AdamW, "step"), (Stack, "zero_grad")],
     "one-cycle rate": [(train_module, "one_cycle")],
-    "watch for finite weights, keep them": [(Watch, "look")],
+    "watch for finite weights, keep them": [(Monitor, "check")],
 }
 
 
@@ -215,10 +218,10 @@ def test_the_fold_grid_is_timed_beside_plain_loops_and_sgemm(tmp_path: Path) -> 
             both = harmonic_mean(list(chain.from_iterable(one.result() for one in beside)))
             columns["sgemm, in both processes at once, GFLOP/s"].append(1e-9 * both)
             for what, weight in (("grid", 0.0), ("grid with triplets", 0.1)):
-                trials = fold_grid(rows, weight)
-                took_s, within_s = run_grid(trials, rows, executor, tmp_path / f"{i}{weight}")
+                jobs = fold_grid(rows, weight)
+                took_s, within_s = run_grid(jobs, rows, executor, tmp_path / f"{i}{weight}")
                 columns[f"{what}, s"].append(took_s)
-                rate = len(trials) * STEPS_N * flop(weight) / within_s
+                rate = len(jobs) * STEPS_N * flop(weight) / within_s
                 columns[f"{what}, % of one thread's sgemm"].append(100 * rate / sgemm)
                 columns[f"{what}, % of sgemm in both processes"].append(100 * rate / both)
         plain = {
@@ -236,10 +239,10 @@ def test_the_fold_grid_is_timed_beside_plain_loops_and_sgemm(tmp_path: Path) -> 
             columns[f"{what} / grid with start of workers"].append(plain_s / (grid_s + start_s))
             columns[f"{what} / grid, CPU s"].append(plain_cpu_s / grid_cpu_s)
     print(
-        f"\n{len(trials)} networks, {STEPS_N} steps of {BATCH_N} of {ROWS_N:,} rows x {CHANNELS_N}; two processes;",
+        f"\n{len(jobs)} networks, {STEPS_N} steps of {BATCH_N} of {ROWS_N:,} rows x {CHANNELS_N}; two processes;",
         end=" ",
     )
-    print(f"plain loops: {PLAIN_N} networks timed, scaled to {len(trials)}; {REPEATS_N} repeats")
+    print(f"plain loops: {PLAIN_N} networks timed, scaled to {len(jobs)}; {REPEATS_N} repeats")
     print(f"{'':67}{'lowest':>8} {'median':>8} {'highest':>8}")
     for name, values in columns.items():
         print(f"  {name:65}{min(values):8.2f} {median(values):8.2f} {max(values):8.2f}")
@@ -249,17 +252,17 @@ def test_the_fold_grid_is_timed_beside_plain_loops_and_sgemm(tmp_path: Path) -> 
 @pytest.mark.parametrize("triplet_weight", [0.0, 0.1])
 def test_a_step_is_taken_apart(triplet_weight: float) -> None:
     rows = measured()
-    trials = [replace(one, test=one.test[:1]) for one in fold_grid(rows, triplet_weight)[: STACK_N["cpu"]]]
-    train_stack([replace(trials[0], recipe=recipe(triplet_weight, 1))], rows)  # loads
+    jobs = [replace(one, test=one.test[:1]) for one in fold_grid(rows, triplet_weight)[: STACK_N["cpu"]]]
+    train_stack([replace(jobs[0], recipe=recipe(triplet_weight, 1))], rows)  # loads
     sgemm, best_s, best = max(sgemm_flop_per_s()), np.inf, {}
     for _ in range(REPEATS_N):
         with clocked({"all": [(train_module, "train")]}) as whole, clocked(STEP) as spent_s:
-            assert all(one.stopped_step is None for one in train_stack(trials, rows))
+            assert all(one.stopped_step is None for one in train_stack(jobs, rows))
         if whole["all"] < best_s:
             best_s, best = whole["all"], dict(spent_s)
     best["rest: slices of batches, sums, the loop, the first copies of rows"] = best_s - sum(best.values())
-    rate = len(trials) * STEPS_N * flop(triplet_weight) / best_s
-    print(f"\na step of {len(trials)} networks{' with triplets' if triplet_weight else ''}: ", end="")
+    rate = len(jobs) * STEPS_N * flop(triplet_weight) / best_s
+    print(f"\na step of {len(jobs)} networks{' with triplets' if triplet_weight else ''}: ", end="")
     print(f"{1e3 * best_s / STEPS_N:.2f} ms, {100 * rate / sgemm:.0f} % of sgemm; best of {REPEATS_N}")
     for part, part_s in best.items():
         print(f"  {part:66}{1e3 * part_s / STEPS_N:7.3f} ms {100 * part_s / best_s:5.1f} %")

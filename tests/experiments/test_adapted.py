@@ -15,7 +15,16 @@ from pipeline.experiments.flexible import (  # fmt: skip
 )
 from pipeline.experiments.manual import GRID, answer_manual
 from pipeline.statistics import by_skin, paired, tidy
-from pipeline.training.variants import AFTER, BEFORE, CONTROL, Answered, bias, biases, compare_arms, summarise_arms
+from pipeline.training.variants import (
+    AFTER,
+    BEFORE,
+    CONTROL,
+    VariantPrediction,
+    bias,
+    biases,
+    compare_variants,
+    summarise_variants,
+)
 from reskin.metrics import METRICS, score, score_groups
 from reskin.seeds import rng_for
 from tests.report.cards import card
@@ -30,10 +39,10 @@ def truth(skin: str, f: int = 30) -> np.ndarray:
     return rng_for(0, "truth", skin).uniform([0, 0, 0.2], [16, 16, 3], (f, 3)).astype(np.float32)
 
 
-def answered(arm: str, skin: str, seed_i: int, spread: float = 1.0) -> Answered:
+def answered(arm: str, skin: str, seed_i: int, spread: float = 1.0) -> VariantPrediction:
     true = truth(skin)
     noise = rng_for(0, arm, skin, seed_i).normal(0, spread, true.shape)
-    return Answered(arm, BOARD[skin], skin, seed_i, true, (true + noise).astype(np.float32))
+    return VariantPrediction(arm, BOARD[skin], skin, seed_i, true, (true + noise).astype(np.float32))
 
 
 ANSWERS = [
@@ -54,8 +63,8 @@ def test_the_bias_is_what_was_added_to_every_force(over_N):
 def test_forces_half_as_large_again_are_a_bias_of_fifty_percent_in_each_arm_by_itself():
     true = truth("s0")
     answers = [
-        Answered(BEFORE, "b0", "s0", 0, true, true * np.float32(1.5)),
-        Answered(AFTER, "b0", "s0", 0, true, true),
+        VariantPrediction(BEFORE, "b0", "s0", 0, true, true * np.float32(1.5)),
+        VariantPrediction(AFTER, "b0", "s0", 0, true, true),
     ]
     assert biases(answers)["bias_f_pct"][BEFORE]["mean"] == pytest.approx(50, abs=100 * SINGLE)
     assert biases(answers)["bias_f_N"][AFTER]["mean"] == 0
@@ -68,7 +77,7 @@ def test_each_board_counts_once_as_the_mean_of_its_skins_and_each_skin_as_that_o
         for skin in BOARD
     }
     boards = [(skins["s0"] + skins["s1"]) / 2, skins["s2"]]
-    ours = summarise_arms(ANSWERS)[AFTER]["mse_xy_mm2"]
+    ours = summarise_variants(ANSWERS)[AFTER]["mse_xy_mm2"]
     assert ours["mean"] == pytest.approx(np.mean(boards))
     assert ours["values"] == pytest.approx(boards)
     assert ours["n"] == 2
@@ -83,7 +92,7 @@ def test_differences_are_those_of_the_summary_of_cards():
         for arm in (BEFORE, AFTER)
     }  # fmt: skip
     of, over = (by_skin(tidy(cards[arm])) for arm in (AFTER, BEFORE))
-    found = compare_arms(ANSWERS, AFTER, BEFORE)
+    found = compare_variants(ANSWERS, AFTER, BEFORE)
     for name in METRICS:
         del found[name]["sd_seeds"]
     assert found == paired(of, over)
@@ -95,17 +104,17 @@ def by_seed(arm: str, skin: str) -> np.ndarray:
 
 
 def test_the_spread_over_seeds_is_that_of_one_skins_networks_and_differences_pair_equal_seeds():
-    found = summarise_arms(ANSWERS)[AFTER]["mse_xy_mm2"]
+    found = summarise_variants(ANSWERS)[AFTER]["mse_xy_mm2"]
     assert found["sd_seeds"] == pytest.approx(np.mean([by_seed(AFTER, skin).std(ddof=1) for skin in BOARD]))
-    found = compare_arms(ANSWERS, AFTER, BEFORE)["mse_xy_mm2"]
+    found = compare_variants(ANSWERS, AFTER, BEFORE)["mse_xy_mm2"]
     differences = [by_seed(AFTER, skin) - by_seed(BEFORE, skin) for skin in BOARD]
     assert found["sd_seeds"] == pytest.approx(np.mean([one.std(ddof=1) for one in differences]))
 
 
 def test_one_network_has_no_spread_over_seeds():
     first = [one for one in ANSWERS if one.seed_i == 0]
-    assert "sd_seeds" not in summarise_arms(first)[AFTER]["accuracy_pct"]
-    assert "sd_seeds" not in compare_arms(first, AFTER, BEFORE)["accuracy_pct"]
+    assert "sd_seeds" not in summarise_variants(first)[AFTER]["accuracy_pct"]
+    assert "sd_seeds" not in compare_variants(first, AFTER, BEFORE)["accuracy_pct"]
     assert "sd_seeds" in answer_manual(ANSWERS, pokes_n=[3], lines_n=[1])["after"]["accuracy_pct"]
     assert "sd_seeds" in answer_flexible(ANSWERS)["bias_f_N"][AFTER]
 
@@ -144,7 +153,7 @@ def test_depths_that_only_one_kind_of_board_has_are_not_compared():
 
 
 def test_the_figure_shows_equal_readings_of_both_arms_and_no_more_than_are_seen():
-    many = [Answered(arm, "b0", "s0", 0, truth("s0", 900), truth("s0", 900)) for arm in (BEFORE, AFTER)]
+    many = [VariantPrediction(arm, "b0", "s0", 0, truth("s0", 900), truth("s0", 900)) for arm in (BEFORE, AFTER)]
     drawn = forces_drawn(many, rng_for(0, "drawn"))
     assert drawn[BEFORE]["true_N"] == drawn[AFTER]["true_N"] == drawn[AFTER]["predicted_N"]
     assert len(drawn[BEFORE]["true_N"]) == DRAWN_N

@@ -28,7 +28,7 @@ from pipeline.experiments.reference_methods import (
     unlabelled_controls,
 )
 from pipeline.settings import Settings
-from pipeline.training.trainings import SceneData
+from pipeline.training.jobs import SceneData
 from reskin.data.rows import Rows
 from reskin.data.splits import Fold
 from reskin.errors import ParamsError

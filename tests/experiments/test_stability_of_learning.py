@@ -9,11 +9,10 @@ import torch
 from pipeline.experiments.stability import learning
 from pipeline.experiments.stability.learning import fold_cases, learning_cases, scaling_cases, triplet_cases
 from reskin.data import splits
-from reskin.models import inputs, losses, network, train, trial
-from reskin.models import train as job
+from reskin.models import batches, inputs, job, losses, network, train
 
 SEED = 2021
-ROWS, TRIAL = learning._rows(SEED), learning._trial(SEED)
+ROWS, JOB = learning._rows(SEED), learning._job(SEED)
 
 
 def broken(cases):
@@ -61,13 +60,13 @@ def test_a_triplet_loss_of_roots_is_found_out(monkeypatch):
         nearer, farther = ((anchor - one).pow(2).sum(-1).sqrt() for one in (positive, negative))
         return torch.relu(nearer - farther + 1e-3).mean(-1)
 
-    monkeypatch.setattr(train, "triplet", of_roots)
+    monkeypatch.setattr(train, "triplet_loss", of_roots)
     assert broken(triplet_cases(SEED)) == {"triplets of identical readings, weighed 1000"}
 
 
 def test_a_sampler_that_takes_ties_is_found_out(monkeypatch):
-    monkeypatch.setattr(losses, "_anchors", lambda place: np.ones(len(place), bool))
-    monkeypatch.setattr(job, "draw_pairs", lambda points, anchor, rng: (anchor, anchor))
+    monkeypatch.setattr(losses, "_find_anchors", lambda place: np.ones(len(place), bool))
+    monkeypatch.setattr(batches, "draw_triplets", lambda points, anchor, rng: (anchor, anchor))
     assert broken(triplet_cases(SEED)) == {"two pokes a skin: from each, only the other one"}
 
 
@@ -75,17 +74,17 @@ def test_a_loop_that_never_looks_at_its_loss_is_found_out(monkeypatch):
     def blind(self, error, step):
         for i in range(len(error)):
             self.curves[i].append(float(error[i]))
-            self.last[i] = self.net.member(i)
+            self.weights[i] = self.net.weights_of(i)
         return True
 
-    monkeypatch.setattr(train.Watch, "look", blind)
-    cases = [learning._explodes(TRIAL, ROWS, 1e10), learning._beside_one_that_overflows(TRIAL, ROWS)]
+    monkeypatch.setattr(train.Monitor, "check", blind)
+    cases = [learning._explodes(JOB, ROWS, 1e10), learning._beside_one_that_overflows(JOB, ROWS)]
     assert broken(cases) == {case.case for case in cases}
 
 
 def test_a_network_that_died_and_is_taken_as_sound_is_found_out(monkeypatch):
-    monkeypatch.setattr(trial, "COLLAPSED", -np.inf)
-    assert not learning._collapsed(TRIAL, ROWS).holds
+    monkeypatch.setattr(job, "COLLAPSED", -np.inf)
+    assert not learning._collapsed(JOB, ROWS).holds
 
 
 def test_a_network_that_touches_its_neighbour_is_found_out(monkeypatch):
@@ -96,18 +95,18 @@ def test_a_network_that_touches_its_neighbour_is_found_out(monkeypatch):
         return features + 0 * features.sum(0, keepdim=True)
 
     monkeypatch.setattr(network.Stack, "features", mixed)
-    assert not learning._beside_one_that_overflows(TRIAL, ROWS).holds
+    assert not learning._beside_one_that_overflows(JOB, ROWS).holds
 
 
 def test_a_batch_that_ignores_the_seed_is_found_out(monkeypatch):
-    right = train.make_job
+    right = train.prepare
 
-    def of_no_seed(trial, rows):
-        job, scaler = right(replace(trial, seed_i=0), rows)
-        return job, scaler
+    def of_no_seed(job, rows):
+        prepared, scaler = right(replace(job, seed_i=0), rows)
+        return prepared, scaler
 
-    monkeypatch.setattr(train, "make_job", of_no_seed)
-    assert not learning._again(TRIAL, ROWS).holds
+    monkeypatch.setattr(train, "prepare", of_no_seed)
+    assert not learning._again(JOB, ROWS).holds
 
 
 def test_folds_that_are_drawn_from_too_few_groups_are_found_out(monkeypatch):

@@ -6,10 +6,11 @@ import numpy as np
 import torch
 from torch import nn
 
+from reskin.models.batches import Batch
+from reskin.models.job import LossWeights
 from reskin.models.recipe import Schedule
-from reskin.models.train import UNLABELLED, Batch
-from reskin.models.trial import Terms
 
+UNLABELLED = ("unlabelled", "unlabelled_positive", "unlabelled_negative")
 # paper section 4: B(15) -> MLP+ReLU(200) -> MLP(200) -> MLP(40) -> MLP+ReLU(200) -> MLP+ReLU(200) -> xyF(3)
 PAPER = ("15-200", "ReLU", "200-200", "200-40", "40-200", "ReLU", "200-200", "ReLU", "200-3")
 RELEASED = ("15-200", "ReLU", "200-200", "ReLU", "200-40", "40-200", "ReLU", "200-200", "ReLU", "200-3", "ReLU")
@@ -48,7 +49,7 @@ def weights_of(net: nn.Sequential, gradient: bool = False) -> dict[str, np.ndarr
 
 
 def plain_train(
-    start: Mapping[str, np.ndarray], batches: Iterable[Batch], schedule: Schedule, terms: Terms
+    start: Mapping[str, np.ndarray], batches: Iterable[Batch], schedule: Schedule, terms: LossWeights
 ) -> dict[str, np.ndarray]:
     """The plainest loop that trains one network by autograd, on the batches of a stack of one."""
     net = plain_net("paper", start)
@@ -57,9 +58,9 @@ def plain_train(
     rate = torch.optim.lr_scheduler.OneCycleLR(optimizer, max_lr=schedule.rate_max, total_steps=schedule.steps_n)
     for stacked in batches:
         batch = {name: values[0] for name, values in stacked.items()}
-        loss = nn.functional.mse_loss(net(batch["labelled"]), batch["targets"])
+        loss = nn.functional.mse_loss(net(batch["inputs"]), batch["targets"])
         if terms.triplet:
-            loss = loss + terms.triplet * hinge(features, batch["labelled"], batch["near"], batch["far"])
+            loss = loss + terms.triplet * hinge(features, batch["inputs"], batch["positive"], batch["negative"])
         if terms.unlabelled:
             loss = loss + terms.unlabelled * hinge(features, *(batch[name] for name in UNLABELLED))
         if terms.few_labels:

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from reskin.models.adversarial import Domains, rising, train_adversarial, turned_back
+from reskin.models.adversarial import Domains, ramp, reverse_gradient, train_adversarial
 from reskin.models.network import Stack, paper_layers
 from reskin.models.recipe import Schedule
 from reskin.seeds import rng_for
@@ -29,16 +29,16 @@ def apart(weights: dict[str, np.ndarray]) -> float:
 
 def test_values_pass_and_gradients_come_back_turned_and_weighed():
     values = torch.tensor([[[1.0, -2.0]]], requires_grad=True)
-    passed = turned_back(values, 0.25)
+    passed = reverse_gradient(values, 0.25)
     torch.testing.assert_close(passed, values)
     (passed * torch.tensor([3.0, 5.0])).sum().backward()
     torch.testing.assert_close(values.grad, torch.tensor([[[-0.75, -1.25]]]))
 
 
 def test_the_weight_rises_from_nothing_to_all():
-    assert rising(0.0) == 0.0
-    assert np.all(np.diff([rising(part) for part in np.linspace(0, 1, 9)]) > 0)
-    assert abs(rising(1.0) - 1) < 1e-4
+    assert ramp(0.0) == 0.0
+    assert np.all(np.diff([ramp(part) for part in np.linspace(0, 1, 9)]) > 0)
+    assert abs(ramp(1.0) - 1) < 1e-4
 
 
 def test_features_of_both_skins_come_nearer_to_each_other():

@@ -2,8 +2,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from reskin.models.batches import virtual_boards
 from reskin.models.recipe import Augmentation
-from reskin.models.train import virtual_boards
 from reskin.seeds import rng_for
 
 SKIN = np.array(["s1", "s1", "s2", "s1", "s2"])

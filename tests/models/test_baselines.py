@@ -11,8 +11,8 @@ from pydantic import TypeAdapter
 from sklearn.linear_model import Ridge
 
 from reskin.models import classical
-from reskin.models.classical import Classical, Fit, Task, fit, run_tasks
-from reskin.models.trial import Measured
+from reskin.models.classical import Classical, ClassicalJob, ClassicalResult, fit, run_classical_jobs
+from reskin.models.job import TrainingData
 from reskin.seeds import rng_for
 
 SETTINGS = {
@@ -37,11 +37,11 @@ class Elsewhere(Executor):
         return done
 
 
-def measured() -> Measured:
+def measured() -> TrainingData:
     rng = rng_for(0, "baselines")
     db_uT = rng.normal(0, 50, (ROWS_N, CH_N)).astype(np.float32)
     target = (np.tanh(db_uT[:, :3] / 50) + rng.normal(0, 0.1, (ROWS_N, 3))).astype(np.float32)
-    return Measured(db_uT, target, np.array(["s0"] * ROWS_N))
+    return TrainingData(db_uT, target, np.array(["s0"] * ROWS_N))
 
 
 ROWS = measured()
@@ -51,13 +51,13 @@ def method(name: str = "ridge", inputs: str = "raw") -> Classical:
     return TypeAdapter(Classical).validate_python(SETTINGS[name] | {"inputs": inputs})
 
 
-def task(one: Classical | None = None, **changes: Any) -> Task:
+def task(one: Classical | None = None, **changes: Any) -> ClassicalJob:
     values = {"name": "one", "method": one or method(), "train": TRAIN, "test": TEST, "few_labels": NONE}
-    return Task(**values | {"rows_max_n": 1000, "seed": 3} | changes)
+    return ClassicalJob(**values | {"rows_max_n": 1000, "seed": 3} | changes)
 
 
-def answered(*tasks: Task, rows: Measured = ROWS) -> list[Fit]:
-    return run_tasks(tasks, rows, Elsewhere(), lambda line: None)
+def answered(*tasks: ClassicalJob, rows: TrainingData = ROWS) -> list[ClassicalResult]:
+    return run_classical_jobs(tasks, rows, Elsewhere(), lambda line: None)
 
 
 @pytest.fixture
@@ -161,7 +161,7 @@ def test_answers_come_in_the_order_of_tasks_and_each_is_told_of():
     lines: list[str] = []
     names = {"first": TEST, "second": TEST[:5], "third": TEST[5:]}
     tasks = [task(name=name, test=test) for name, test in names.items()]
-    done = run_tasks(tasks, ROWS, Elsewhere(), lines.append)
+    done = run_classical_jobs(tasks, ROWS, Elsewhere(), lines.append)
     assert lines == ["1/3 first", "2/3 second", "3/3 third"]
     np.testing.assert_array_equal(np.concatenate([one.predicted for one in done[1:]]), done[0].predicted)
 
@@ -173,6 +173,6 @@ def test_no_target_but_those_of_training_rows_and_labels_changes_an_answer(name)
     others[np.setdiff1d(np.arange(ROWS_N), used)] = 1e6
     (got,), (other,) = (
         answered(task(method(name), few_labels=OWN), rows=rows)
-        for rows in (ROWS, Measured(ROWS.db_uT, others, ROWS.skin))
+        for rows in (ROWS, TrainingData(ROWS.db_uT, others, ROWS.skin))
     )
     assert (got.predicted == other.predicted).all()

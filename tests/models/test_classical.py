@@ -9,7 +9,7 @@ from sklearn.linear_model import Ridge
 from sklearn.preprocessing import PolynomialFeatures
 
 from reskin.errors import TrainingError
-from reskin.models.classical import BLOCK_ROWS_N, Classical, Fitted, fit
+from reskin.models.classical import BLOCK_ROWS_N, Classical, FittedRegressor, fit
 from reskin.seeds import rng_for
 
 SETTINGS = {
@@ -37,7 +37,9 @@ def rows(seed: int = 0, n: int = 200, ch: int = 5) -> tuple[np.ndarray, np.ndarr
     return db_uT.astype(np.float32), target.astype(np.float32)
 
 
-def fit_to(method: str, db_uT: np.ndarray, target: np.ndarray, weight: np.ndarray | None = None, **changes) -> Fitted:
+def fit_to(
+    method: str, db_uT: np.ndarray, target: np.ndarray, weight: np.ndarray | None = None, **changes
+) -> FittedRegressor:
     return fit(asked(method, **changes), db_uT, target, rng_for(0, "fit"), weight=weight)
 
 

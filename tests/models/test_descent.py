@@ -34,9 +34,9 @@ def test_it_moves_weights_as_torch_does_bit_for_bit(steps_n, weight_decay):
 def test_training_imports_no_compiler():
     """It takes a process that trains two seconds, and nothing here is compiled."""
     code = (
-        "import sys\nfrom reskin.models.train import train\nfrom reskin.models.trial import Terms\n"
+        "import sys\nfrom reskin.models.train import train\nfrom reskin.models.job import LossWeights\n"
         "from tests.models.jobs import some_job\nfrom tests.models.recipes import recipe\n"
-        "train([some_job(0)], 'paper', recipe(steps_n=2), Terms(0.0), 'cpu')\n"
+        "train([some_job(0)], 'paper', recipe(steps_n=2), LossWeights(0.0), 'cpu')\n"
         "sys.exit('torch._dynamo' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

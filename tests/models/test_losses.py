@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import special_ortho_group
 
-from reskin.models.train import squared_error, triplet
+from reskin.models.losses import squared_error, triplet_loss
 from reskin.seeds import rng_for
 
 M, B, D = 3, 7, 40
@@ -85,28 +85,28 @@ def test_the_triplet_loss_is_what_three_nested_loops_find(seed):
     anchor, positive, negative = three(seed)
     assert any(0 < one for one in looped_triplet(anchor, positive, negative))
     np.testing.assert_allclose(
-        triplet(anchor, positive, negative), looped_triplet(anchor, positive, negative), rtol=SUM_RTOL
+        triplet_loss(anchor, positive, negative), looped_triplet(anchor, positive, negative), rtol=SUM_RTOL
     )
 
 
 def test_a_positive_that_is_nearer_by_however_little_costs_nothing():
     anchor = torch.zeros(1, 1, 2)
     positive, negative = torch.tensor([[[1.0, 0.0]]]), torch.tensor([[[0.0, 1.0 + 1e-6]]])
-    assert float(triplet(anchor, positive, negative)) == 0  # no margin
-    assert float(triplet(anchor, negative, positive)) > 0
+    assert float(triplet_loss(anchor, positive, negative)) == 0  # no margin
+    assert float(triplet_loss(anchor, negative, positive)) > 0
 
 
 def test_a_violated_triplet_pulls_the_positive_in_and_pushes_the_negative_out():
     # loss 2^2 - 1^2: d/dp = -2 (a - p), d/dn = 2 (a - n), d/da = 2 (a - p) - 2 (a - n)
     a, p, n = (torch.tensor([[[x]]], requires_grad=True) for x in (0.0, 2.0, 1.0))
-    loss = triplet(a, p, n)
+    loss = triplet_loss(a, p, n)
     loss.sum().backward()
     assert [float(one) for one in (loss.detach(), a.grad, p.grad, n.grad)] == [3.0, -2.0, 4.0, -2.0]
 
 
 def test_identical_points_cost_nothing_and_pull_nowhere():
     points = [features("anchor").clone().requires_grad_() for _ in range(3)]
-    loss = triplet(*points)
+    loss = triplet_loss(*points)
     loss.sum().backward()
     assert (loss == 0).all()
     assert all((one.grad == 0).all() for one in points)
@@ -114,9 +114,9 @@ def test_identical_points_cost_nothing_and_pull_nowhere():
 
 def test_networks_of_a_stack_are_each_charged_their_own_triplets():
     anchor, positive, negative = three()
-    before = triplet(anchor, positive, negative)
+    before = triplet_loss(anchor, positive, negative)
     positive[1] += 10
-    after = triplet(anchor, positive, negative)
+    after = triplet_loss(anchor, positive, negative)
     assert (after == before).tolist() == [True, False, True]
 
 
@@ -125,18 +125,20 @@ def test_turning_and_shifting_the_features_changes_nothing(seed, shift):
     turn = torch.from_numpy(special_ortho_group.rvs(D, random_state=rng_for(seed, "turn")).astype(np.float32))
     moved = [one @ turn + shift for one in three()]
     # differences of sums of about 80, in float32 numbers of up to 10
-    torch.testing.assert_close(triplet(*moved), triplet(*three()), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(triplet_loss(*moved), triplet_loss(*three()), rtol=1e-4, atol=1e-4)
 
 
 @given(st.floats(0.01, 100))
 def test_the_triplet_loss_grows_with_the_square_of_the_features(k):
     stretched = [one * k for one in three()]
-    torch.testing.assert_close(triplet(*stretched), triplet(*three()) * k**2, rtol=1e-4, atol=0)  # float32 rounding
+    torch.testing.assert_close(
+        triplet_loss(*stretched), triplet_loss(*three()) * k**2, rtol=1e-4, atol=0
+    )  # float32 rounding
 
 
 @given(st.integers(0, 1000))
 def test_swapping_positive_and_negative_changes_the_sign_of_what_is_hinged(seed):
     anchor, positive, negative = three(seed)
-    both = triplet(anchor, positive, negative) - triplet(anchor, negative, positive)
+    both = triplet_loss(anchor, positive, negative) - triplet_loss(anchor, negative, positive)
     mean = ((anchor - positive) ** 2).sum(-1).mean(-1) - ((anchor - negative) ** 2).sum(-1).mean(-1)
     torch.testing.assert_close(both, mean, rtol=1e-4, atol=1e-4)  # float32 sums of about 80

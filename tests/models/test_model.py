@@ -41,14 +41,14 @@ def test_each_network_of_a_stack_is_the_plain_network_that_is_printed(architectu
         torch.testing.assert_close(answers[i], answer, **CLOSE)
         features = features_of(alone)(inputs[i])
         torch.testing.assert_close(net.features(inputs)[i], features, **CLOSE)
-        gradients = _with_gradients_for_weights(net).member(i)
+        gradients = _with_gradients_for_weights(net).weights_of(i)
         for name, values in weights_of(alone, gradient=True).items():
             # gradients are sums over the batch, too
             np.testing.assert_allclose(gradients[name], values, rtol=1e-3, atol=1e-5, err_msg=name)
 
 
 def _with_gradients_for_weights(net: Stack) -> Stack:
-    twin = Stack(LAYERS["paper"](15), [net.member(i) for i in range(net.members_n)])
+    twin = Stack(LAYERS["paper"](15), [net.weights_of(i) for i in range(net.members_n)])
     for own, one in zip(twin.parameters(), net.parameters(), strict=True):
         own.data = one.grad
     return twin
@@ -77,14 +77,14 @@ def test_numbers_that_are_not_finite_stay_in_their_network():
 def test_a_network_is_taken_out_of_a_stack_as_it_was_put_in():
     net = stack(3)
     for i in range(3):
-        put, taken = drawn(name=i), net.member(i)
+        put, taken = drawn(name=i), net.weights_of(i)
         assert list(taken) == list(put)
         assert all((taken[name] == put[name]).all() for name in put)
 
 
 def test_what_is_taken_out_does_not_change_when_the_stack_goes_on():
     net = stack(2)
-    taken = net.member(1)
+    taken = net.weights_of(1)
     with torch.no_grad():
         for one in net.parameters():
             one += 1
@@ -95,7 +95,7 @@ def test_what_is_taken_out_does_not_change_when_the_stack_goes_on():
 def test_one_weight_that_is_not_finite_tells_on_its_network_alone(bad):
     members = [drawn(name=i) for i in range(3)]
     members[1]["layer4.bias"][7] = bad
-    assert Stack(LAYERS["paper"](15), members).finite().tolist() == [True, False, True]
+    assert Stack(LAYERS["paper"](15), members).is_finite().tolist() == [True, False, True]
 
 
 def test_features_are_forty_numbers_and_the_answer_is_made_of_them_alone():
@@ -103,7 +103,7 @@ def test_features_are_forty_numbers_and_the_answer_is_made_of_them_alone():
     features = net.features(inputs)
     assert features.shape == (2, 16, 40)
     assert (features < 0).any()  # no ReLU stands behind the bottleneck
-    assert torch.equal(net.answer(features), net(inputs))
+    assert torch.equal(net.head(features), net(inputs))
 
 
 def test_the_released_network_answers_no_number_below_zero():

@@ -6,24 +6,25 @@ import pytest
 import torch
 from torch import nn
 
+from reskin.models.batches import BatchSampler, LabelledRows, PreparedJob
+from reskin.models.job import LossWeights, Weights
 from reskin.models.network import Stack, paper_layers
 from reskin.models.recipe import Recipe
-from reskin.models.train import BLOCK_STEPS_N, Feed, Job, Labelled, Outcome, Watch, clip, train
-from reskin.models.trial import Terms, Weights
+from reskin.models.train import BLOCK_STEPS_N, Monitor, Outcome, clip_gradients, train
 from reskin.seeds import rng_for
 from tests.models.jobs import some_job, some_weights
 from tests.models.plain import plain_net, plain_train
 from tests.models.recipes import recipe
 
-ALL_TERMS = Terms(0.5, unlabelled=0.7, few_labels=0.3)
-NO_TERMS = Terms(0.0)
+ALL_TERMS = LossWeights(0.5, unlabelled=0.7, few_labels=0.3)
+NO_TERMS = LossWeights(0.0)
 # Sums in another order, on another processor or at another place in memory, round otherwise: 6e-8 of a term. AdamW
 # divides a gradient by its own size, so a ReLU that rounding opens for one row moves all weights of its unit by a
 # whole step: one unit of 200 is at most 7 % of the way there, a term left out more than that.
 WAY = 2e-2
 
 
-def run(jobs: list[Job], schedule: Recipe, terms: Terms = NO_TERMS) -> list[Outcome]:
+def run(jobs: list[PreparedJob], schedule: Recipe, terms: LossWeights = NO_TERMS) -> list[Outcome]:
     return train(jobs, "paper", schedule, terms, "cpu")
 
 
@@ -46,7 +47,7 @@ def test_a_gradient_is_cut_to_its_longest_network_by_network():
     for parameter in net.parameters():
         parameter.grad *= (lengths / whole)[:, None, None]
     before = [parameter.grad.clone() for parameter in net.parameters()]
-    clip(net, 1.0)
+    clip_gradients(net, 1.0)
     after = torch.cat([one.grad.flatten(1) for one in net.parameters()], dim=1)
     torch.testing.assert_close(after.norm(dim=1), torch.tensor([0.0, 0.5, 1.0]))
     torch.testing.assert_close(after[2] * 70, torch.cat([one.flatten(1) for one in before], dim=1)[2])
@@ -60,7 +61,7 @@ def test_a_rate_at_which_networks_die_without_it_trains_with_short_gradients():
     assert max(one.curve[-1] for one in cut) < 0.2 < 0.3 < max(one.curve[-1] for one in free)
 
 
-def jobs_of(jobs: list[Job]) -> list[Job]:
+def jobs_of(jobs: list[PreparedJob]) -> list[PreparedJob]:
     return [replace(job, rng=some_job(i).rng) for i, job in enumerate(jobs)]
 
 
@@ -89,7 +90,7 @@ def test_a_network_becomes_the_same_in_a_stack_and_alone(terms, batch_n):
     together = run([some_job(i, terms=True) for i in range(3)], schedule, terms)
     for i in range(3):
         (alone,) = run([some_job(i, terms=True)], schedule, terms)
-        assert off_the_way(together[i].weights, alone.weights, some_job(i, terms=True).start) < WAY
+        assert off_the_way(together[i].weights, alone.weights, some_job(i, terms=True).initial_weights) < WAY
         np.testing.assert_allclose(together[i].curve, alone.curve, rtol=1e-3)
 
 
@@ -97,9 +98,9 @@ def test_a_network_becomes_the_same_in_a_stack_and_alone(terms, batch_n):
     ("terms", "decay"),
     [
         (NO_TERMS, 0.0),
-        (Terms(0.5), 10.0),
-        (Terms(0.0, unlabelled=0.7), 0.0),
-        (Terms(0.0, few_labels=0.3), 10.0),
+        (LossWeights(0.5), 10.0),
+        (LossWeights(0.0, unlabelled=0.7), 0.0),
+        (LossWeights(0.0, few_labels=0.3), 10.0),
         (ALL_TERMS, 10.0),
     ],
     ids=str,
@@ -107,10 +108,10 @@ def test_a_network_becomes_the_same_in_a_stack_and_alone(terms, batch_n):
 def test_the_stack_descends_as_the_plainest_pytorch_loop_does(terms, decay):
     schedule, steps_n = recipe(steps_n=70, rate_max=5e-4, weight_decay=decay), 70
     (outcome,) = run([some_job(terms=True)], schedule, terms)
-    feed = Feed([some_job(terms=True)], schedule.batch_n, "cpu")
-    batches = chain.from_iterable(feed.draw(n) for n in block_sizes(steps_n))
-    truth = plain_train(some_job().start, batches, schedule, terms)
-    assert off_the_way(outcome.weights, truth, some_job(terms=True).start) < WAY
+    feed = BatchSampler([some_job(terms=True)], schedule.batch_n, "cpu")
+    batches = chain.from_iterable(feed.sample(n) for n in block_sizes(steps_n))
+    truth = plain_train(some_job().initial_weights, batches, schedule, terms)
+    assert off_the_way(outcome.weights, truth, some_job(terms=True).initial_weights) < WAY
 
 
 def off_the_way(weights: Weights, truth: Weights, start: Weights) -> float:
@@ -126,7 +127,9 @@ def test_each_term_pulls_and_a_weight_of_none_makes_what_it_stands_on_irrelevant
     (with_it,) = run([job], schedule, replace(NO_TERMS, **{name: 0.5}))
     (without,) = run([some_job(terms=True)], schedule)
     assert not same(with_it, without)
-    stripped = Job(job.start, some_job().rng, Labelled(job.labelled.inputs, job.labelled.targets, None))
+    stripped = PreparedJob(
+        job.initial_weights, some_job().rng, LabelledRows(job.labelled.inputs, job.labelled.targets, None)
+    )
     assert same(without, run([stripped], schedule)[0])
 
 
@@ -140,7 +143,7 @@ def test_what_a_term_stands_on_decides_the_weights(name):
 
 def test_unlabelled_pokes_move_the_feature_layers_only():
     far = recipe(steps_n=1, rate_max=1e-2, gradient_norm_max=1e12)  # a cut gradient is shorter in all layers
-    (outcome,) = run([some_job(terms=True)], far, Terms(0.0, unlabelled=1e6))
+    (outcome,) = run([some_job(terms=True)], far, LossWeights(0.0, unlabelled=1e6))
     (plain,) = run([some_job(terms=True)], far)
     for i in range(1, 7):
         name = f"layer{i}.weight"
@@ -152,9 +155,9 @@ def test_the_curve_has_the_mean_loss_of_every_block_of_steps(steps_n):
     schedule = recipe(steps_n=steps_n, rate_max=1e-12)  # hardly moves: the losses are those of the first weights
     job = some_job()
     (outcome,) = run([job], schedule)
-    feed, net, blocks = Feed([some_job()], schedule.batch_n, "cpu"), plain_net("paper", job.start), []
+    feed, net, blocks = BatchSampler([some_job()], schedule.batch_n, "cpu"), plain_net("paper", job.initial_weights), []
     for n in block_sizes(steps_n):
-        losses = [nn.functional.mse_loss(net(b["labelled"][0]), b["targets"][0]).item() for b in feed.draw(n)]
+        losses = [nn.functional.mse_loss(net(b["inputs"][0]), b["targets"][0]).item() for b in feed.sample(n)]
         blocks.append(sum(losses) / n)
     assert outcome.curve == pytest.approx(blocks, rel=1e-5)  # float32 sums
 
@@ -176,10 +179,10 @@ def test_a_training_that_explodes_stops_with_its_last_finite_weights(times, rate
     assert all(np.isfinite(values).all() for values in outcome.weights.values())
     assert np.isfinite(outcome.curve).all()
     if outcome.stopped_step == BLOCK_STEPS_N:
-        assert all((outcome.weights[name] == job.start[name]).all() for name in job.start)
+        assert all((outcome.weights[name] == job.initial_weights[name]).all() for name in job.initial_weights)
 
 
-def scaled(job: Job, times: float) -> Job:
+def scaled(job: PreparedJob, times: float) -> PreparedJob:
     return replace(job, labelled=replace(job.labelled, inputs=(job.labelled.inputs * times).astype(np.float32)))
 
 
@@ -187,9 +190,9 @@ def test_weights_that_break_at_the_last_step_are_found_though_its_loss_was_finit
     """Pokes of 1e30 break the triplet term: the L2 loss of the same step knows nothing of it yet."""
     job = some_job(terms=True)
     job.unlabelled.inputs[:] *= 1e30
-    (outcome,) = run([job], recipe(steps_n=1), Terms(0.0, unlabelled=1.0))
+    (outcome,) = run([job], recipe(steps_n=1), LossWeights(0.0, unlabelled=1.0))
     assert (outcome.stopped_step, outcome.curve) == (1, [])
-    assert all((outcome.weights[name] == job.start[name]).all() for name in job.start)
+    assert all((outcome.weights[name] == job.initial_weights[name]).all() for name in job.initial_weights)
 
 
 def test_a_loss_that_overflows_is_found_though_the_weights_are_finite():
@@ -205,22 +208,24 @@ def test_a_network_that_stops_late_is_as_it_was_a_block_before(monkeypatch):
     seed = next(seed for seed in range(1000) if first_step_of_row_0(n, seed) // BLOCK_STEPS_N == 1)
     broken, sound = some_job(n=n, draws=seed), some_job(n=n, draws=seed)
     broken.labelled.inputs[0] = 1e30
-    looks, look = [], Watch.look
-    monkeypatch.setattr(Watch, "look", lambda self, *found: looks.append(self.net.member(0)) or look(self, *found))
+    looks, look = [], Monitor.check
+    monkeypatch.setattr(
+        Monitor, "check", lambda self, *found: looks.append(self.net.weights_of(0)) or look(self, *found)
+    )
     (whole,) = run([sound], schedule)
     (outcome,) = run([broken], schedule)
     assert len(looks) == len(block_sizes(170)) + 2  # nothing is left to train after the second look
     assert outcome.stopped_step == 2 * BLOCK_STEPS_N
     assert outcome.curve == whole.curve[:1]
     assert all((outcome.weights[name] == looks[0][name]).all() for name in looks[0])
-    assert any((outcome.weights[name] != broken.start[name]).any() for name in looks[0])
+    assert any((outcome.weights[name] != broken.initial_weights[name]).any() for name in looks[0])
 
 
 def first_step_of_row_0(n: int, seed: int) -> int:
     job = some_job(n=n, draws=seed)
-    feed = Feed([job], 1, "cpu")
-    steps = chain.from_iterable(feed.draw(BLOCK_STEPS_N) for _ in range(2))
-    drawn = [i for i, step in enumerate(steps) if (step["labelled"][0, 0].numpy() == job.labelled.inputs[0]).all()]
+    feed = BatchSampler([job], 1, "cpu")
+    steps = chain.from_iterable(feed.sample(BLOCK_STEPS_N) for _ in range(2))
+    drawn = [i for i, step in enumerate(steps) if (step["inputs"][0, 0].numpy() == job.labelled.inputs[0]).all()]
     return drawn[0] if drawn else -1
 
 
@@ -239,6 +244,6 @@ def test_neighbours_of_a_network_that_explodes_go_on_as_if_it_were_well():
 def test_starts_and_rows_are_left_as_they_are():
     job, untouched = some_job(terms=True), some_job(terms=True)
     run([job], recipe(), ALL_TERMS)
-    assert all((job.start[name] == untouched.start[name]).all() for name in job.start)
+    assert all((job.initial_weights[name] == untouched.initial_weights[name]).all() for name in job.initial_weights)
     assert (job.labelled.inputs == untouched.labelled.inputs).all()
     assert (job.labelled.targets == untouched.labelled.targets).all()

@@ -4,15 +4,15 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from reskin.errors import TrainingError
-from reskin.models.losses import Points, draw_pairs, make_points
+from reskin.models.losses import TripletPoints, draw_triplets, triplet_points
 from reskin.seeds import rng_for
 
 DRAWN_N = 400
 ROW = np.arange(5, dtype=np.float64)[:, None]  # five pokes of a line, placed by index
 
 
-def draw(points: Points, anchor: np.ndarray, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    return draw_pairs(points, anchor, rng_for(seed, "pairs"))
+def draw(points: TripletPoints, anchor: np.ndarray, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    return draw_triplets(points, anchor, rng_for(seed, "pairs"))
 
 
 def distances(place: np.ndarray, anchor: int) -> list[float]:
@@ -22,7 +22,7 @@ def distances(place: np.ndarray, anchor: int) -> list[float]:
 
 @st.composite
 def placed(draw_one: st.DrawFn) -> tuple[np.ndarray, np.ndarray, int]:
-    """Points in up to four groups, on few integer places: ties abound. Every place is visited twice at least."""
+    """TripletPoints in up to four groups, on few integer places: ties abound. Every place is visited twice at least."""
     axes_n = draw_one(st.sampled_from([1, 2]))
     place, group = [], []
     for name in draw_one(st.lists(st.integers(0, 99), min_size=1, max_size=4, unique=True)):
@@ -40,7 +40,7 @@ def placed(draw_one: st.DrawFn) -> tuple[np.ndarray, np.ndarray, int]:
 def test_pairs_lie_in_the_anchors_group_and_the_positive_is_strictly_nearer(case):
     place, group, seed = case
     anchor = rng_for(seed, "anchors").integers(len(group), size=64)
-    positive, negative = draw(make_points(place, group), anchor, seed)
+    positive, negative = draw(triplet_points(place, group), anchor, seed)
     for a, p, n in zip(anchor, positive, negative, strict=True):
         away = distances(place, a)
         assert group[a] == group[p] == group[n]
@@ -52,8 +52,8 @@ def test_pairs_lie_in_the_anchors_group_and_the_positive_is_strictly_nearer(case
 def test_moving_and_stretching_a_skin_changes_no_triplet(case, shift, times):
     place, group, seed = case
     anchor = rng_for(seed, "anchors").integers(len(group), size=32)
-    one = draw(make_points(place, group), anchor, seed)
-    other = draw(make_points(place * times + round(shift), group), anchor, seed)
+    one = draw(triplet_points(place, group), anchor, seed)
+    other = draw(triplet_points(place * times + round(shift), group), anchor, seed)
     assert all((a == b).all() for a, b in zip(one, other, strict=True))
 
 
@@ -61,21 +61,21 @@ def test_moving_and_stretching_a_skin_changes_no_triplet(case, shift, times):
 def test_what_groups_are_called_changes_no_triplet(case):
     place, group, seed = case
     anchor = np.arange(len(group))
-    one = draw(make_points(place, group), anchor, seed)
-    other = draw(make_points(place, np.array([f"skin{name:03d}" for name in group])), anchor, seed)
+    one = draw(triplet_points(place, group), anchor, seed)
+    other = draw(triplet_points(place, np.array([f"skin{name:03d}" for name in group])), anchor, seed)
     assert all((a == b).all() for a, b in zip(one, other, strict=True))
 
 
 def test_places_on_skins_in_mm_are_compared_over_both_axes():
     # from the corner: 3 mm along x is nearer than 2 mm and 3 mm along both
     place = np.array([[0, 0], [3, 0], [2, 3]], np.float32)
-    positive, negative = draw(make_points(place, np.zeros(3, int)), np.zeros(DRAWN_N, int))
+    positive, negative = draw(triplet_points(place, np.zeros(3, int)), np.zeros(DRAWN_N, int))
     assert set(positive) == {1}
     assert set(negative) == {2}
 
 
 def test_two_places_suffice_where_each_has_two_visits():
-    points = make_points(np.array([[0.0], [0.0], [1.0], [1.0]]), np.zeros(4, int))
+    points = triplet_points(np.array([[0.0], [0.0], [1.0], [1.0]]), np.zeros(4, int))
     positive, negative = draw(points, np.tile(np.arange(4), 50))
     assert (positive == np.tile([1, 0, 3, 2], 50)).all()  # the other visit of the anchor's own place
     assert all(set(negative[i::4]) == ({2, 3} if i < 2 else {0, 1}) for i in range(4))
@@ -85,15 +85,15 @@ def test_a_group_on_one_place_is_named():
     place = np.array([[1.0, 2.0], [0.0, 0.0], [1.0, 2.0], [3.0, 0.0], [1.0, 2.0]])
     skins = np.array(["b3_s2", "b1_s1", "b3_s2", "b1_s1", "b3_s2"])
     with pytest.raises(TrainingError, match=r"group b3_s2: the places of its points must be two or more; got 3 points"):
-        make_points(place, skins)
+        triplet_points(place, skins)
 
 
 def test_places_that_differ_along_one_axis_only_are_two():
-    assert len(make_points(np.array([[0.0, 5.0], [0.0, 6.0], [0.0, 5.0]]), np.zeros(3, int))) == 3
+    assert len(triplet_points(np.array([[0.0, 5.0], [0.0, 6.0], [0.0, 5.0]]), np.zeros(3, int))) == 3
 
 
 def test_a_point_from_which_all_others_are_equally_far_is_no_anchor_and_pulls_nowhere():
-    three_pokes = make_points(np.arange(3.0)[:, None], np.zeros(3, int))
+    three_pokes = triplet_points(np.arange(3.0)[:, None], np.zeros(3, int))
     assert three_pokes.anchors.tolist() == [0, 2]
     near, far = draw(three_pokes, np.array([0, 1, 2]))
     assert (near.tolist(), far.tolist()) == ([1, 1, 1], [2, 1, 0])
@@ -101,7 +101,7 @@ def test_a_point_from_which_all_others_are_equally_far_is_no_anchor_and_pulls_no
 
 def test_points_that_are_all_equally_far_are_one_sentence_and_no_endless_loop():
     with pytest.raises(TrainingError, match="some nearer to one than others are; got 2 that are equally far"):
-        make_points(np.array([[0.0], [1.0]]), np.zeros(2, int))
+        triplet_points(np.array([[0.0], [1.0]]), np.zeros(2, int))
 
 
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 3)), min_size=3, max_size=12))
@@ -112,11 +112,11 @@ def test_anchors_are_the_points_with_two_distances_to_others_as_a_double_loop_fi
     ]
     assume(len(set(places)) > 1)
     assume(any(expected))
-    assert make_points(np.array(places, float), np.zeros(len(places), int)).is_anchor.tolist() == expected
+    assert triplet_points(np.array(places, float), np.zeros(len(places), int)).is_anchor.tolist() == expected
 
 
 def test_the_same_state_of_the_generator_draws_the_same():
-    points, anchor = make_points(ROW, np.zeros(5, int)), np.tile(np.arange(5), 20)
+    points, anchor = triplet_points(ROW, np.zeros(5, int)), np.tile(np.arange(5), 20)
     one, again, other = draw(points, anchor, 1), draw(points, anchor, 1), draw(points, anchor, 2)
     assert all((a == b).all() for a, b in zip(one, again, strict=True))
     assert any((a != b).any() for a, b in zip(one, other, strict=True))
@@ -125,7 +125,7 @@ def test_the_same_state_of_the_generator_draws_the_same():
 def test_every_ordered_pair_of_other_points_is_drawn_equally_often():
     # from index 0 of a line of five, all distances differ: six pairs of the four others
     n = 6000
-    positive, negative = draw(make_points(ROW, np.zeros(5, int)), np.zeros(n, int))
+    positive, negative = draw(triplet_points(ROW, np.zeros(5, int)), np.zeros(n, int))
     pairs, times = np.unique(np.stack([positive, negative]), axis=1, return_counts=True)
     assert pairs.T.tolist() == [[1, 2], [1, 3], [1, 4], [2, 3], [2, 4], [3, 4]]
     assert (np.abs(times - n / 6) < 6 * (n * 5 / 36) ** 0.5).all()  # six binomial sd
@@ -138,7 +138,7 @@ def test_every_other_point_of_the_group_takes_part(case):
     assume(len(mates) <= 12)
     others = mates[mates != 0]
     away = np.array(distances(place, 0))[others]
-    positive, negative = draw(make_points(place, group), np.zeros(3000, int), seed)
+    positive, negative = draw(triplet_points(place, group), np.zeros(3000, int), seed)
     # at the worst, one point in eleven ordered against one other only: (1 - 2 / 121)^3000 = 1e-22
     assert set(positive) == set(others[away < away.max()])
     assert set(negative) == set(others[away > away.min()])
@@ -146,5 +146,5 @@ def test_every_other_point_of_the_group_takes_part(case):
 
 def test_the_anchors_passed_in_are_left_as_they_are():
     anchor = np.arange(5)
-    draw(make_points(ROW, np.zeros(5, int)), anchor)
+    draw(triplet_points(ROW, np.zeros(5, int)), anchor)
     assert (anchor == np.arange(5)).all()

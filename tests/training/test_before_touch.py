@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeline.settings import Settings
 from pipeline.training.before_contact import score_before_touch
-from pipeline.training.trainings import SceneData
+from pipeline.training.jobs import SceneData
 from reskin import io
 from reskin.data.rows import Selection, gather, gather_hover
 from reskin.data.splits import Split, draw_folds

@@ -16,9 +16,9 @@ from reskin.config import parse
 from reskin.data.rows import Rows
 from reskin.data.splits import Split, draw_folds
 from reskin.errors import ParamsError
-from reskin.models.classical import Task
-from reskin.models.train import make_job
-from reskin.models.trial import Adapting, FewLabels, Keys, Measured, Trained, Trial
+from reskin.models.batches import prepare
+from reskin.models.classical import ClassicalJob
+from reskin.models.job import Adaptation, FineTuning, JobKeys, TrainingData, TrainingJob, TrainingResult
 from reskin.seeds import rng_for
 from tests.scenes import RECIPE
 
@@ -66,33 +66,43 @@ def study(seed: int = 5, rows: Rows = ROWS, **changes: object) -> few.Study:
     return few.Study(rows, folds, seed, parse(Settings, ASKED | changes, "scene: few_labels"))
 
 
-def of(rows: Rows) -> Measured:
-    return Measured(rows.db_uT, rows.target, rows.skin)
+def of(rows: Rows) -> TrainingData:
+    return TrainingData(rows.db_uT, rows.target, rows.skin)
 
 
-def as_drawn(trial: Trial) -> Trained:
+def as_drawn(job: TrainingJob) -> TrainingResult:
     """A network that was not trained: what it starts from, scaled as it will be."""
-    job, scaler = make_job(trial, of(ROWS))
-    return Trained(f"key of {trial.name}", job.start, scaler, [1.0], np.zeros((0, 3), np.float32), None, None, 0.0, 0.0)
+    prepared, scaler = prepare(job, of(ROWS))
+    return TrainingResult(
+        f"key of {job.name}",
+        prepared.initial_weights,
+        scaler,
+        [1.0],
+        np.zeros((0, 3), np.float32),
+        None,
+        None,
+        0.0,
+        0.0,
+    )
 
 
 def networks_of(at: few.Study) -> list[few.Done]:
     """Every network of the study, each step going on from those before, as the stage does."""
     done: list[few.Done] = []
     for step in (few.networks, few.adapted, few.labelled):
-        done = [*done, *((tried, trial, as_drawn(trial)) for tried, trial in step(at, done))]
+        done = [*done, *((tried, job, as_drawn(job)) for tried, job in step(at, done))]
     return done
 
 
 STUDY = study()
 NETWORKS = networks_of(STUDY)
 TASKS = few.classical(STUDY)
-ADAPTED = [trial for _, trial, _ in NETWORKS if isinstance(trial.tuning, Adapting)]
-LABELLED = [(tried, trial) for tried, trial, _ in NETWORKS if isinstance(trial.tuning, FewLabels)]
+ADAPTED = [job for _, job, _ in NETWORKS if isinstance(job.tuning, Adaptation)]
+LABELLED = [(tried, job) for tried, job, _ in NETWORKS if isinstance(job.tuning, FineTuning)]
 
 
-def all_tried(at: few.Study, networks: list[few.Done]) -> list[tuple[few.Tried, Trial | Task]]:
-    return [*((tried, trial) for tried, trial, _ in networks), *few.classical(at)]
+def all_tried(at: few.Study, networks: list[few.Done]) -> list[tuple[few.Tried, TrainingJob | ClassicalJob]]:
+    return [*((tried, job) for tried, job, _ in networks), *few.classical(at)]
 
 
 def test_every_method_is_tried_once_on_every_fold_with_every_number_of_labels():
@@ -115,11 +125,11 @@ def test_all_methods_and_numbers_of_labels_are_tested_on_the_same_rows_and_train
         assert tried.fold.name[:2] not in {*ROWS.board[one.train]}
 
 
-def labels_of(one: Trial | Task) -> np.ndarray:
-    return one.few_labels if isinstance(one, Task) else one.tuning.row
+def labels_of(one: TrainingJob | ClassicalJob) -> np.ndarray:
+    return one.few_labels if isinstance(one, ClassicalJob) else one.tuning.row
 
 
-def with_labels(at: few.Study, networks: list[few.Done]) -> list[tuple[few.Tried, Trial | Task]]:
+def with_labels(at: few.Study, networks: list[few.Done]) -> list[tuple[few.Tried, TrainingJob | ClassicalJob]]:
     return [(tried, one) for tried, one in all_tried(at, networks) if tried.labels_n]
 
 
@@ -136,7 +146,7 @@ def test_labels_are_whole_indentations_of_the_pool_as_many_as_asked():
 def test_without_labels_there_are_none():
     for tried, one in all_tried(STUDY, NETWORKS):
         if not tried.labels_n:
-            assert len(one.few_labels) == 0 if isinstance(one, Task) else not isinstance(one.tuning, FewLabels)
+            assert len(one.few_labels) == 0 if isinstance(one, ClassicalJob) else not isinstance(one.tuning, FineTuning)
 
 
 def test_every_method_is_given_the_same_labels_and_every_fold_others():
@@ -185,54 +195,54 @@ def unknown(what: np.ndarray, rows: Rows = ROWS) -> Rows:
 
 
 def test_labels_of_a_new_board_change_no_scaler():
-    pooled = {(tried.method, tried.fold.name): one.scaler for tried, trial, one in NETWORKS if trial.tuning is None}
-    for tried, trial in LABELLED:
+    pooled = {(tried.method, tried.fold.name): one.scaler for tried, job, one in NETWORKS if job.tuning is None}
+    for tried, job in LABELLED:
         changed = of(ROWS).db_uT.copy()
-        changed[trial.tuning.row] += 500
-        (job, scaler), (other, same) = (make_job(trial, one) for one in (of(ROWS), replace(of(ROWS), db_uT=changed)))
+        changed[job.tuning.row] += 500
+        (prepared, scaler), (other, same) = (prepare(job, one) for one in (of(ROWS), replace(of(ROWS), db_uT=changed)))
         for name, values in pooled[tried.method.removesuffix(", adapted"), tried.fold.name].arrays().items():
             assert (scaler.arrays()[name] == values).all()
             assert (same.arrays()[name] == values).all()
-        assert (other.few_labels.inputs != job.few_labels.inputs).any()  # learned from they are
-        assert len(job.few_labels.inputs) == READINGS_N * tried.labels_n
+        assert (other.few_labels.inputs != prepared.few_labels.inputs).any()  # learned from they are
+        assert len(prepared.few_labels.inputs) == READINGS_N * tried.labels_n
 
 
 def test_labels_go_on_from_the_network_of_the_same_method_and_fold():
     by_key = {one.key: tried for tried, _, one in NETWORKS}
-    for tried, trial in LABELLED:
-        base = by_key[trial.tuning.start.key]
+    for tried, job in LABELLED:
+        base = by_key[job.tuning.start.key]
         assert (base.method, base.inputs, base.fold, base.labels_n) == (tried.method, tried.inputs, tried.fold, 0)
 
 
 def test_only_the_networks_named_are_adapted_by_all_pokes_of_their_pool():
-    assert [(trial.recipe_name, trial.fold) for trial in ADAPTED] == [("triplet", fold.name) for fold in STUDY.folds]
-    for trial, fold in zip(ADAPTED, STUDY.folds, strict=True):
-        assert {*trial.tuning.lines.row} == {*fold.pool}  # no place of 8 pokes on a 3 x 3 grid is alone on its lines
+    assert [(job.recipe_name, job.fold) for job in ADAPTED] == [("triplet", fold.name) for fold in STUDY.folds]
+    for job, fold in zip(ADAPTED, STUDY.folds, strict=True):
+        assert {*job.tuning.lines.row} == {*fold.pool}  # no place of 8 pokes on a 3 x 3 grid is alone on its lines
     assert few.adapted(study(adapted=[]), few_done(study(adapted=[]))) == []
 
 
 def few_done(at: few.Study) -> list[few.Done]:
-    return [(tried, trial, as_drawn(trial)) for tried, trial in few.networks(at, [])]
+    return [(tried, job, as_drawn(job)) for tried, job in few.networks(at, [])]
 
 
 def test_adaptation_sees_no_label_of_the_new_board():
-    for trial in ADAPTED:
-        blind = of(unknown(ROWS.board == trial.fold[:2]))
-        job, other = make_job(trial, of(ROWS))[0], make_job(trial, blind)[0]
-        assert job.few_labels is other.few_labels is None
-        assert (job.labelled.inputs == other.labelled.inputs).all()
-        assert (job.labelled.targets == other.labelled.targets).all()
-        assert (job.unlabelled.inputs == other.unlabelled.inputs).all()
-        assert (job.unlabelled.row == other.unlabelled.row).all()
-        assert job.rng.integers(2**63) == other.rng.integers(2**63)
-        assert Keys(of(ROWS)).key(trial) == Keys(blind).key(trial)
+    for job in ADAPTED:
+        blind = of(unknown(ROWS.board == job.fold[:2]))
+        prepared, other = prepare(job, of(ROWS))[0], prepare(job, blind)[0]
+        assert prepared.few_labels is other.few_labels is None
+        assert (prepared.labelled.inputs == other.labelled.inputs).all()
+        assert (prepared.labelled.targets == other.labelled.targets).all()
+        assert (prepared.unlabelled.inputs == other.unlabelled.inputs).all()
+        assert (prepared.unlabelled.row == other.unlabelled.row).all()
+        assert prepared.rng.integers(2**63) == other.rng.integers(2**63)
+        assert JobKeys(of(ROWS)).key(job) == JobKeys(blind).key(job)
 
 
 def test_of_places_only_the_order_along_lines_reaches_adaptation():
     stretched = replace(ROWS, target=(ROWS.target * np.float32([3, 0.5, 0]) + np.float32([7, -2, 1])))
     done = few_done(STUDY)
-    for (_, trial), (_, other) in zip(few.adapted(STUDY, done), few.adapted(study(rows=stretched), done), strict=True):
-        for name, values in vars(trial.tuning.lines).items():
+    for (_, job), (_, other) in zip(few.adapted(STUDY, done), few.adapted(study(rows=stretched), done), strict=True):
+        for name, values in vars(job.tuning.lines).items():
             assert (values == getattr(other.tuning.lines, name)).all()
 
 

@@ -6,11 +6,12 @@ import pytest
 import reskin
 from reskin.errors import ParamsError
 from reskin.models import trained as onnx_file
+from reskin.models.batches import LabelledRows, PreparedJob
 from reskin.models.inputs import FIT, VIEW
+from reskin.models.job import LossWeights
 from reskin.models.network import LAYERS, draw_weights
-from reskin.models.train import Job, Labelled, train
+from reskin.models.train import train
 from reskin.models.trained import Network
-from reskin.models.trial import Terms
 from reskin.seeds import rng_for
 from tests.models.recipes import recipe
 
@@ -28,9 +29,9 @@ def trained(architecture: str, inputs: str) -> tuple[Network, np.ndarray]:
     db_uT = (np.hstack([centred, centred**2]) @ field + 3 * rng.standard_normal((600, 15))).astype(np.float32)
     settings, view = recipe(architecture=architecture, inputs=inputs, steps_n=STEPS_N, batch_n=64), VIEW[inputs]
     scaler = FIT[SCALING[architecture]](view(db_uT[:500]), target[:500])
-    labelled = Labelled(scaler.encode(view(db_uT[:500])), scaler.encode_target(target[:500]), None)
+    labelled = LabelledRows(scaler.encode(view(db_uT[:500])), scaler.encode_target(target[:500]), None)
     start = draw_weights(LAYERS[architecture](labelled.inputs.shape[1]), rng)
-    (outcome,) = train([Job(start, rng, labelled)], architecture, settings, Terms(0.0), "cpu")
+    (outcome,) = train([PreparedJob(start, rng, labelled)], architecture, settings, LossWeights(0.0), "cpu")
     assert outcome.stopped_step is None
     assert outcome.curve[-1] < 0.7 * outcome.curve[0]  # its weights are an optimiser's, and no longer the drawn ones
     card = {"recipe": {"architecture": architecture, "inputs": inputs}, "input": {"channels_n": 15}}

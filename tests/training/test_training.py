@@ -3,11 +3,11 @@ import json
 import numpy as np
 import pytest
 
-from pipeline.training.trainings import describe
+from pipeline.training.jobs import model_card
 from reskin.data.rows import Rows
+from reskin.models.job import TrainingJob, TrainingResult
 from reskin.models.train import train_stack
-from reskin.models.trial import Trained, Trial
-from tests.models.trials import OWN, POKED, ROWS_N, TEST, TRAIN, adapting, few_labels, measured, pooled
+from tests.models.example_jobs import OWN, POKED, ROWS_N, TEST, TRAIN, adapting, few_labels, measured, pooled
 
 
 def rows() -> Rows:
@@ -18,10 +18,10 @@ def rows() -> Rows:
     return Rows(np.array(["c"] * ROWS_N), board, own.skin, own.db_uT, own.target, passes, indentation, {})
 
 
-def card(trial: Trial, **changes: object) -> dict:
-    (one,) = train_stack([trial], measured())
-    trained = Trained(**{**vars(one), "key": "k", **changes})
-    return describe(trial, trained, rows(), scene="lab")
+def card(job: TrainingJob, **changes: object) -> dict:
+    (one,) = train_stack([job], measured())
+    trained = TrainingResult(**{**vars(one), "key": "k", **changes})
+    return model_card(job, trained, rows(), scene="lab")
 
 
 def test_a_card_says_what_was_trained_on_what_and_tested_on_what():
@@ -46,9 +46,9 @@ def test_a_card_says_all_that_a_user_of_the_network_needs():
         assert (np.array(words["scaler"][name], np.float32) == values).all()
 
 
-@pytest.mark.parametrize("trial", [pooled(), adapting(), few_labels()], ids=["pooled", "adapting", "few labels"])
-def test_a_card_is_json_that_reads_back_as_it_was(trial):
-    words = card(trial)
+@pytest.mark.parametrize("job", [pooled(), adapting(), few_labels()], ids=["pooled", "adapting", "few labels"])
+def test_a_card_is_json_that_reads_back_as_it_was(job):
+    words = card(job)
     assert json.loads(json.dumps(words, allow_nan=False)) == words
 
 
@@ -64,13 +64,13 @@ def test_an_early_stop_stands_on_the_card():
 
 
 @pytest.mark.parametrize(
-    ("trial", "kind", "used"),
+    ("job", "kind", "used"),
     [(adapting(), "unlabelled", POKED), (few_labels(), "labelled", OWN)],
     ids=["unlabelled", "labelled"],
 )
-def test_a_tuned_network_says_from_what_by_what_and_on_how_many_indentations(trial, kind, used):
-    tuning = card(trial)["tuning"]
+def test_a_tuned_network_says_from_what_by_what_and_on_how_many_indentations(job, kind, used):
+    tuning = card(job)["tuning"]
     assert (tuning["from"], tuning["kind"], tuning["skins"]) == ("start", kind, ["b1_s1"])
-    assert tuning["settings"] == trial.tuning.settings.model_dump()
+    assert tuning["settings"] == job.tuning.settings.model_dump()
     assert tuning["pokes_n"] == len({row // 2 for row in used})  # two readings an indentation
     assert not set(used) & set(TEST)

@@ -14,9 +14,9 @@ from pipeline.experiments.stability.cases import Case, measured, observed, refus
 from reskin.data.rows import Rows
 from reskin.data.splits import Split, draw_folds
 from reskin.metrics import METRICS, score
-from reskin.models.recipe import Labelling, Recipe
-from reskin.models.train import BLOCK_STEPS_N, JUDGED_STEPS_N, train_stack
-from reskin.models.trial import FewLabels, Measured, Start, Trained, Trial
+from reskin.models.job import FineTuning, Pretrained, TrainingData, TrainingJob, TrainingResult
+from reskin.models.recipe import FineTuningRecipe, Recipe
+from reskin.models.train import BLOCK_STEPS_N, CHECKED_STEPS_N, train_stack
 from reskin.seeds import rng_for
 
 AREA = "learning"
@@ -42,25 +42,25 @@ def learning_cases(seed: int) -> list[Case]:
 
 def scaling_cases(seed: int) -> list[Case]:
     """Try channels that never move, and labels of other scales."""
-    trial, rows = _trial(seed), _rows(seed)
+    job, rows = _job(seed), _rows(seed)
     return [
-        _constant(trial, rows, [7], "a channel that never moves"),
-        _constant(trial, rows, list(range(CHANNELS_N)), "no channel ever moves, as without a magnet"),
-        *_label_scales(trial, rows),
+        _constant(job, rows, [7], "a channel that never moves"),
+        _constant(job, rows, list(range(CHANNELS_N)), "no channel ever moves, as without a magnet"),
+        *_label_scales(job, rows),
     ]
 
 
 def triplet_cases(seed: int) -> list[Case]:
     """Try readings that are all alike, and places that are all equally far."""
-    trial, rows = _trial(seed), _rows(seed)
-    return [_alike(trial, rows), *_tied(trial, rows)]
+    job, rows = _job(seed), _rows(seed)
+    return [_alike(job, rows), *_tied(job, rows)]
 
 
 def loop_cases(seed: int) -> list[Case]:
     """Try rates and weights that overflow, a network that died, hardly any rows, and the same seed twice."""
-    trial, rows = _trial(seed), _rows(seed)
-    overflow = [_explodes(trial, rows, 1e1), _explodes(trial, rows, 1e10), _beside_one_that_overflows(trial, rows)]
-    return [*overflow, _collapsed(trial, rows), *_few(trial, rows), _again(trial, rows)]
+    job, rows = _job(seed), _rows(seed)
+    overflow = [_explodes(job, rows, 1e1), _explodes(job, rows, 1e10), _beside_one_that_overflows(job, rows)]
+    return [*overflow, _collapsed(job, rows), *_few(job, rows), _again(job, rows)]
 
 
 def fold_cases() -> list[Case]:
@@ -78,20 +78,20 @@ def fold_cases() -> list[Case]:
     ]  # fmt: skip
 
 
-def _trial(seed: int) -> Trial:
-    return Trial("stability", "paper", RECIPE, "f", seed, 0, np.arange(TRAIN_N), np.arange(TRAIN_N, ROWS_N))
+def _job(seed: int) -> TrainingJob:
+    return TrainingJob("stability", "paper", RECIPE, "f", seed, 0, np.arange(TRAIN_N), np.arange(TRAIN_N, ROWS_N))
 
 
-def _rows(seed: int) -> Measured:
+def _rows(seed: int) -> TrainingData:
     signal = rng_for(seed, "stability", "learning").normal(0, 1, (ROWS_N, CHANNELS_N))
     target = MIDDLE + REACH * np.tanh(signal[:, :3])
-    return Measured((SIGNAL_uT * signal).astype(np.float32), target.astype(np.float32), np.arange(ROWS_N) % 2)
+    return TrainingData((SIGNAL_uT * signal).astype(np.float32), target.astype(np.float32), np.arange(ROWS_N) % 2)
 
 
-def _constant(trial: Trial, rows: Measured, channels: list[int], case: str) -> Case:
+def _constant(job: TrainingJob, rows: TrainingData, channels: list[int], case: str) -> Case:
     db_uT = rows.db_uT.copy()
     db_uT[:, channels] = CONSTANT_uT
-    trained = _train(trial, replace(rows, db_uT=db_uT))
+    trained = _train(job, replace(rows, db_uT=db_uT))
     scaler = trained.scaler
     seen = float(np.abs(scaler.encode(db_uT)[:, channels]).max())
     happened = f"its scale {scaler.input_scale[channels].min():.0e} uT, at most {seen:g} seen; {_words(trained)}"
@@ -99,9 +99,9 @@ def _constant(trial: Trial, rows: Measured, channels: list[int], case: str) -> C
                     error=seen if _is_sound(trained) else np.inf, limit=0.0)  # fmt: skip
 
 
-def _alike(trial: Trial, rows: Measured) -> Case:
+def _alike(job: TrainingJob, rows: TrainingData) -> Case:
     same = replace(rows, db_uT=np.full_like(rows.db_uT, CONSTANT_uT))
-    plain, pulled = (_train(_changed(trial, triplet_weight=weight), same) for weight in (0.0, 1e3))
+    plain, pulled = (_train(_changed(job, triplet_weight=weight), same) for weight in (0.0, 1e3))
     apart = _apart(plain.weights, pulled.weights)
     happened = f"weights {apart:g} apart from those without triplets after {STEPS_N} steps; {_words(pulled)}"
     should = "loss 0 and a finite gradient of 0: whatever its weight, it pulls nowhere"
@@ -109,21 +109,21 @@ def _alike(trial: Trial, rows: Measured) -> Case:
                     error=apart if _is_sound(pulled) else np.inf, limit=0.0)  # fmt: skip
 
 
-def _tied(trial: Trial, rows: Measured) -> list[Case]:
-    trial = _changed(trial, triplet_weight=0.1)
+def _tied(job: TrainingJob, rows: TrainingData) -> list[Case]:
+    job = _changed(job, triplet_weight=0.1)
     target = rows.target.copy()
     target[:, :2] = MIDDLE[:2]
     attempts = {
-        "all pokes of a skin on one place": (trial, replace(rows, target=target)),
-        "two pokes a skin: from each, only the other one": (replace(trial, train=np.arange(4)), rows),
+        "all pokes of a skin on one place": (job, replace(rows, target=target)),
+        "two pokes a skin: from each, only the other one": (replace(job, train=np.arange(4)), rows),
     }
     should = "refused: nothing is nearer than anything, and no sampler is endless"
     return [refused(AREA, case, should=should, attempt=partial(_train, *at)) for case, at in attempts.items()]
 
 
-def _explodes(trial: Trial, rows: Measured, rate: float) -> Case:
-    start, steps_n = _start(trial, rows, 1e3), 3 * STEPS_N
-    trained = _train(_tuned(trial, start, steps_n=steps_n, rate_max=rate), rows)
+def _explodes(job: TrainingJob, rows: TrainingData, rate: float) -> Case:
+    start, steps_n = _start(job, rows, 1e3), 3 * STEPS_N
+    trained = _train(_tuned(job, start, steps_n=steps_n, rate_max=rate), rows)
     kept_step = STEPS_N * len(trained.curve)
     stopped = "never stopped" if trained.stopped_step is None else f"not finite at step {trained.stopped_step}"
     losses = f", losses {max(trained.curve):.1e} at most, {trained.curve[-1]:.2g} at last" if trained.curve else ""
@@ -134,8 +134,8 @@ def _explodes(trial: Trial, rows: Measured, rate: float) -> Case:
                 holds=sound and trained.stopped_step == kept_step + STEPS_N)  # fmt: skip
 
 
-def _beside_one_that_overflows(trial: Trial, rows: Measured) -> Case:
-    sound, broken = (_tuned(trial, _start(trial, rows, scale)) for scale in (1.0, 1e30))
+def _beside_one_that_overflows(job: TrainingJob, rows: TrainingData) -> Case:
+    sound, broken = (_tuned(job, _start(job, rows, scale)) for scale in (1.0, 1e30))
     alone = _train(sound, rows)
     beside, overflowing = train_stack([sound, broken], rows)
     apart = _apart(alone.weights, beside.weights)
@@ -145,9 +145,9 @@ def _beside_one_that_overflows(trial: Trial, rows: Measured) -> Case:
                     error=apart if _is_sound(beside) and overflowing.stopped_step == STEPS_N else np.inf)  # fmt: skip
 
 
-def _collapsed(trial: Trial, rows: Measured) -> Case:
+def _collapsed(job: TrainingJob, rows: TrainingData) -> Case:
     dead, alive = (
-        _train(_tuned(trial, _start(trial, rows, scale), steps_n=JUDGED_STEPS_N, rate_max=STILL), rows)
+        _train(_tuned(job, _start(job, rows, scale), steps_n=CHECKED_STEPS_N, rate_max=STILL), rows)
         for scale in (0.0, 1.0)
     )
     spread = float(np.ptp(dead.predicted, axis=0).max())
@@ -160,10 +160,10 @@ def _collapsed(trial: Trial, rows: Measured) -> Case:
                     happened=happened, holds=_is_sound(dead) and dead.collapsed and not alive.collapsed)  # fmt: skip
 
 
-def _few(trial: Trial, rows: Measured) -> list[Case]:
-    single = _train(replace(trial, train=trial.train[:1], test=trial.train[:1]), rows)
-    error = float(np.abs(single.predicted - rows.target[trial.train[:1]]).max())
-    by_one = _train(_changed(trial, batch_n=1), rows)
+def _few(job: TrainingJob, rows: TrainingData) -> list[Case]:
+    single = _train(replace(job, train=job.train[:1], test=job.train[:1]), rows)
+    error = float(np.abs(single.predicted - rows.target[job.train[:1]]).max())
+    by_one = _train(_changed(job, batch_n=1), rows)
     return [
         observed(AREA, "batches of one row", should="trained as ever", happened=_words(by_one),
                  holds=_is_sound(by_one)),
@@ -171,17 +171,17 @@ def _few(trial: Trial, rows: Measured) -> list[Case]:
                  happened=f"off by {error:.1e} (mm, mm, N); {_words(single)}",
                  error=error if _is_sound(single) else np.inf, limit=ROUNDING),
         refused(AREA, "one training row, with triplets", should="refused: no triplet is in it",
-                attempt=partial(_train, _changed(replace(trial, train=trial.train[:1]), triplet_weight=0.1), rows)),
+                attempt=partial(_train, _changed(replace(job, train=job.train[:1]), triplet_weight=0.1), rows)),
     ]  # fmt: skip
 
 
-def _label_scales(trial: Trial, rows: Measured) -> list[Case]:
-    true = rows.target[trial.test]
-    as_ever = score(true, _train(trial, rows).predicted)
+def _label_scales(job: TrainingJob, rows: TrainingData) -> list[Case]:
+    true = rows.target[job.test]
+    as_ever = score(true, _train(job, rows).predicted)
     cases = []
     for power in SCALE_POWERS:
         scale = 2.0**power
-        trained = _train(trial, replace(rows, target=_times(rows.target, scale)))
+        trained = _train(job, replace(rows, target=_times(rows.target, scale)))
         back = score(true, _times(trained.predicted, 1 / scale))
         error = max(abs(back[name] / as_ever[name] - 1) for name in METRICS)
         happened = ", ".join(f"{name} {back[name]:.4g}, was {as_ever[name]:.4g}" for name in METRICS)
@@ -190,41 +190,43 @@ def _label_scales(trial: Trial, rows: Measured) -> list[Case]:
     return cases
 
 
-def _again(trial: Trial, rows: Measured) -> Case:
-    trial = _changed(trial, triplet_weight=0.1)
-    first, again = (_train(trial, rows) for _ in range(2))
+def _again(job: TrainingJob, rows: TrainingData) -> Case:
+    job = _changed(job, triplet_weight=0.1)
+    first, again = (_train(job, rows) for _ in range(2))
     pairs = [
         (first.predicted, again.predicted),
         *((first.weights[name], again.weights[name]) for name in again.weights),
     ]
     same_n = sum(value.tobytes() == twin.tobytes() for value, twin in pairs)
-    away = _apart(first.weights, _train(replace(trial, seed_i=1), rows).weights)
+    away = _apart(first.weights, _train(replace(job, seed_i=1), rows).weights)
     happened = f"{same_n} of {len(pairs)} arrays identical bit for bit; another seed's weights {away:.2g} away"
     return observed(AREA, "trained twice from one seed", should="the same bytes, and others from another seed",
                 happened=happened, holds=same_n == len(pairs) and away > 0)  # fmt: skip
 
 
-def _train(trial: Trial, rows: Measured) -> Trained:
-    return train_stack([trial], rows)[0]
+def _train(job: TrainingJob, rows: TrainingData) -> TrainingResult:
+    return train_stack([job], rows)[0]
 
 
-def _changed(trial: Trial, **settings: float | int) -> Trial:
-    return replace(trial, recipe=RECIPE.model_copy(update=settings))
+def _changed(job: TrainingJob, **settings: float | int) -> TrainingJob:
+    return replace(job, recipe=RECIPE.model_copy(update=settings))
 
 
-def _start(trial: Trial, rows: Measured, scale: float) -> Start:
+def _start(job: TrainingJob, rows: TrainingData, scale: float) -> Pretrained:
     """Train a network, and scale its bottleneck."""
-    trained = _train(trial, rows)
+    trained = _train(job, rows)
     weights = {**trained.weights, BOTTLENECK: trained.weights[BOTTLENECK] * np.float32(scale)}
-    return Start("", weights, trained.scaler)
+    return Pretrained("", weights, trained.scaler)
 
 
-def _tuned(trial: Trial, start: Start, *, steps_n: int = STEPS_N, rate_max: float = RECIPE.rate_max) -> Trial:
-    settings = Labelling(
+def _tuned(
+    job: TrainingJob, start: Pretrained, *, steps_n: int = STEPS_N, rate_max: float = RECIPE.rate_max
+) -> TrainingJob:
+    settings = FineTuningRecipe(
         steps_n=steps_n, batch_n=RECIPE.batch_n, rate_max=rate_max, gradient_norm_max=RECIPE.gradient_norm_max,
         weight_decay=0.0, own_weight=1.0,
     )  # fmt: skip
-    return replace(trial, tuning=FewLabels(start, settings, trial.test[:20]))
+    return replace(job, tuning=FineTuning(start, settings, job.test[:20]))
 
 
 def _times(target: Float32[np.ndarray, "f 3"], scale: float) -> Float32[np.ndarray, "f 3"]:
@@ -235,11 +237,11 @@ def _apart(weights: Mapping[str, np.ndarray], others: Mapping[str, np.ndarray]) 
     return max(float(np.abs(others[name] - weights[name]).max()) for name in others)
 
 
-def _is_sound(trained: Trained) -> bool:
+def _is_sound(trained: TrainingResult) -> bool:
     return trained.stopped_step is None and bool(np.isfinite(trained.predicted).all())
 
 
-def _words(trained: Trained) -> str:
+def _words(trained: TrainingResult) -> str:
     if trained.stopped_step is not None:
         return f"not finite at step {trained.stopped_step}"
     finite_n = int(np.isfinite(trained.predicted).all(axis=1).sum())

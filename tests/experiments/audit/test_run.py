@@ -10,16 +10,16 @@ import pytest
 from pipeline.experiments.audit import audit
 from pipeline.settings import Settings
 from pipeline.stages.ingest import read_split
-from pipeline.training import trainings as _training
-from pipeline.training.trainings import SceneData, adaptations, read_data, read_starts, trials_of, write_models
+from pipeline.training import jobs as _training
+from pipeline.training.jobs import SceneData, adaptation_jobs, make_jobs, read_data, read_pretrained, write_models
 from reskin import io
 from reskin.data.folds import load_rows, parse_folds, render_folds
 from reskin.data.rows import Selection
 from reskin.data.splits import Fold, draw_folds
 from reskin.errors import LeakError
+from reskin.models.batches import prepare
 from reskin.models.inputs import FIT, VIEW
-from reskin.models.train import make_job
-from reskin.models.trial import Measured, Trained, Trial
+from reskin.models.job import TrainingData, TrainingJob, TrainingResult
 from reskin.schema import Readings
 from reskin.seeds import rng_for
 from tests.data.tables import readings
@@ -89,16 +89,18 @@ def build(folder: Path, skins: tuple[str, ...] = SKINS) -> Path:
         ("train_single", asked.training("train_single"), "single_random"),
         ("train_multi", asked.training("train_multi"), "lobo"),
     ):
-        write(folder, arm, data, trials_of(data, section, data.folds_of(experiment)))
+        write(folder, arm, data, make_jobs(data, section, data.folds_of(experiment)))
     write(
         folder,
         "train_triplet",
         data,
-        trials_of(data, asked.training("train_triplet"), data.folds_of("lobo"), experiment="triplet"),
+        make_jobs(data, asked.training("train_triplet"), data.folds_of("lobo"), experiment="triplet"),
     )
-    starts, named = read_starts(folder / "models/train_triplet"), ("paper", asked.adaptations().recipes["paper"])
-    adapted = [adaptations(data, fold, named, starts, experiment="adapt", pokes_n=8) for fold in data.folds_of("lobo")]
-    write(folder, "adapt", data, [trial for trials in adapted for trial in trials])
+    starts, named = read_pretrained(folder / "models/train_triplet"), ("paper", asked.adaptations().recipes["paper"])
+    adapted = [
+        adaptation_jobs(data, fold, named, starts, experiment="adapt", pokes_n=8) for fold in data.folds_of("lobo")
+    ]
+    write(folder, "adapt", data, [job for jobs in adapted for job in jobs])
     io.write_json(folder / "choice.json", CHOICE)
     return folder
 
@@ -107,14 +109,15 @@ def scenery(folder: Path) -> SceneData:
     return read_data(settings(SCENE), folder / "indentations", folder / "folds.json")
 
 
-def write(folder: Path, arm: str, data: SceneData, trials: list[Trial]) -> None:
-    write_models(folder / "models" / arm, data, trials, [as_drawn(trial, data) for trial in trials], arm)
+def write(folder: Path, arm: str, data: SceneData, jobs: list[TrainingJob]) -> None:
+    write_models(folder / "models" / arm, data, jobs, [as_drawn(job, data) for job in jobs], arm)
 
 
-def as_drawn(trial: Trial, data: SceneData) -> Trained:
-    job, scaler = make_job(trial, Measured(data.rows.db_uT, data.rows.target, data.rows.skin))
-    predicted = np.zeros((len(trial.test), 3), np.float32)
-    return Trained(f"key of {trial.name}", job.start, scaler, [1.0], predicted, None, None, 0.0, 0.0)
+def as_drawn(job: TrainingJob, data: SceneData) -> TrainingResult:
+    prepared, scaler = prepare(job, TrainingData(data.rows.db_uT, data.rows.target, data.rows.skin))
+    predicted = np.zeros((len(job.test), 3), np.float32)
+    weights = prepared.initial_weights
+    return TrainingResult(f"key of {job.name}", weights, scaler, [1.0], predicted, None, None, 0.0, 0.0)
 
 
 @pytest.fixture(autouse=True)

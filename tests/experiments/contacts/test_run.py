@@ -7,7 +7,7 @@ import numpy as np
 
 from pipeline.experiments.contacts import Contacts, evaluate_board
 from pipeline.settings import Settings
-from pipeline.training.trainings import SceneData
+from pipeline.training.jobs import SceneData
 from reskin.config import read_yaml
 from reskin.data.grid import points_mm
 from reskin.data.splits import Fold

@@ -12,14 +12,15 @@ from pipeline.executors import make_executor
 from reskin import io
 from reskin.errors import ReskinError, TrainingError
 from reskin.models import train
-from reskin.models.grid import STACK_N, run_trials, stacks
-from reskin.models.train import JUDGED_STEPS_N, make_job, train_stack
-from reskin.models.trial import Trained, Trial
+from reskin.models.batches import prepare
+from reskin.models.job import TrainingJob, TrainingResult
+from reskin.models.runner import STACK_N, make_stacks, run_jobs
+from reskin.models.train import CHECKED_STEPS_N, train_stack
+from tests.models.example_jobs import TRAIN, adapting, few_labels, measured, pooled, without_triplets
 from tests.models.recipes import recipe
-from tests.models.trials import TRAIN, adapting, few_labels, measured, pooled, without_triplets
 
 SIZE_N = STACK_N["cpu"]
-STACKED_ATOL = 1e-3  # mm, N: a trial in another stack is the same to float32 rounding of its weights (test_train.py)
+STACKED_ATOL = 1e-3  # mm, N: a job in another stack is the same to float32 rounding of its weights (test_train.py)
 
 
 class Here(Executor):
@@ -43,7 +44,7 @@ class Here(Executor):
         return future
 
 
-def trials(folds_n: int = 3, **changes: object) -> list[Trial]:
+def jobs(folds_n: int = 3, **changes: object) -> list[TrainingJob]:
     """A fold leaves some rows of each of two skins out."""
     everyone = np.arange(24)
     held = [np.array([i, i + 12]) for i in range(folds_n)]
@@ -52,43 +53,43 @@ def trials(folds_n: int = 3, **changes: object) -> list[Trial]:
 
 
 def run(
-    some: list[Trial], cache: Path, executor: Executor | None = None, said: list[str] | None = None
-) -> list[Trained]:
+    some: list[TrainingJob], cache: Path, executor: Executor | None = None, said: list[str] | None = None
+) -> list[TrainingResult]:
     tell = (lambda line: None) if said is None else said.append
-    return run_trials(some, measured(), executor=executor or Here(), cache=cache, tell=tell)
+    return run_jobs(some, measured(), executor=executor or Here(), cache=cache, log=tell)
 
 
-def trainings_n(some: list[Trial], cache: Path) -> int:
+def trainings_n(some: list[TrainingJob], cache: Path) -> int:
     """How many stacks are trained."""
     executor = Here()
     run(some, cache, executor)
     return executor.calls_n
 
 
-def alike(one: Trained, other: Trained) -> bool:
+def alike(one: TrainingResult, other: TrainingResult) -> bool:
     weights = all((one.weights[name] == other.weights[name]).all() for name in one.weights)
     return weights and (one.predicted == other.predicted).all() and one.curve == other.curve
 
 
 def test_a_training_says_whether_an_earlier_run_finished_it(tmp_path):
-    first = run(trials(2), tmp_path)
-    both = run([*trials(2), *trials(2, steps_n=3)], tmp_path)
+    first = run(jobs(2), tmp_path)
+    both = run([*jobs(2), *jobs(2, steps_n=3)], tmp_path)
     assert [one.reused for one in first] == [False, False]
     assert [one.reused for one in both] == [True, True, False, False]
     assert [one.seconds for one in both[:2]] == pytest.approx([one.seconds for one in first])  # when it was computed
 
 
-def test_results_come_in_the_order_of_trials_with_a_prediction_a_test_row(tmp_path):
-    some = [*trials(2), pooled(), *trials(5, steps_n=3), without_triplets(), adapting(), few_labels()]
+def test_results_come_in_the_order_of_jobs_with_a_prediction_a_test_row(tmp_path):
+    some = [*jobs(2), pooled(), *jobs(5, steps_n=3), without_triplets(), adapting(), few_labels()]
     done = run(some, tmp_path)
     assert len({one.key for one in done}) == len(some)
-    assert [one.predicted.shape for one in done] == [(len(trial.test), 3) for trial in some]
+    assert [one.predicted.shape for one in done] == [(len(job.test), 3) for job in some]
 
 
 def test_a_result_is_that_of_its_own_cell_whatever_it_was_stacked_with(tmp_path):
-    some = [*trials(2), pooled(), adapting(), trials(3)[2]]
-    for trial, one in zip(some, run(some, tmp_path), strict=True):
-        (alone,) = train_stack([trial], measured())
+    some = [*jobs(2), pooled(), adapting(), jobs(3)[2]]
+    for job, one in zip(some, run(some, tmp_path), strict=True):
+        (alone,) = train_stack([job], measured())
         np.testing.assert_allclose(one.predicted, alone.predicted, rtol=0, atol=STACKED_ATOL)
         assert (one.scaler.input_shift == alone.scaler.input_shift).all()
 
@@ -100,13 +101,13 @@ def test_a_call_carries_no_row_numbers_and_the_file_of_rows_each_set_once(tmp_pa
     monkeypatch.setattr(
         io, "write_tensors", lambda file, tensors, of: (written.append(tensors), write(file, tensors, of))
     )
-    run([replace(trial, seed_i=seed_i) for trial in trials(2) for seed_i in (0, 1)], tmp_path, here)
-    assert {trial.train.size + trial.test.size for _, stack, _ in sent for trial, *_ in stack} == {0}
+    run([replace(job, seed_i=seed_i) for job in jobs(2) for seed_i in (0, 1)], tmp_path, here)
+    assert {job.train.size + job.test.size for _, stack, _ in sent for job, *_ in stack} == {0}
     assert len(written[0]) == 3 + 4  # fields, targets and skins; the rows of two folds, trained and tested on
 
 
 def test_a_killed_grid_loses_no_finished_cell(tmp_path):
-    some = trials(2 * SIZE_N + 1)
+    some = jobs(2 * SIZE_N + 1)
     with pytest.raises(BrokenProcessPool):
         run(some, tmp_path / "killed", Here(die_after=1))
     assert trainings_n(some, tmp_path / "killed") == 2  # of three stacks
@@ -116,7 +117,7 @@ def test_a_killed_grid_loses_no_finished_cell(tmp_path):
 
 def test_a_stack_killed_while_it_was_written_gives_what_it_would_have_given(tmp_path):
     # Batches of 1 and many steps: here the place in a stack shows in the last bits, and those grow.
-    some = trials(SIZE_N, steps_n=60, batch_n=1)
+    some = jobs(SIZE_N, steps_n=60, batch_n=1)
     done = run(some, tmp_path)
     (tmp_path / f"{done[1].key}.safetensors").unlink()
     assert all(alike(a, b) for a, b in zip(done, run(some, tmp_path), strict=True))
@@ -124,12 +125,12 @@ def test_a_stack_killed_while_it_was_written_gives_what_it_would_have_given(tmp_
 
 @pytest.mark.parametrize("damage", ["cut", "empty", "bit"])
 def test_a_damaged_result_is_said_and_trained_again(tmp_path, damage):
-    first, said = run(trials(), tmp_path), []
+    first, said = run(jobs(), tmp_path), []
     file = tmp_path / f"{first[1].key}.safetensors"
     content = bytearray(file.read_bytes())
     content[-5] ^= 1  # of a weight: what no reader of the format can notice
     file.write_bytes({"cut": content[: len(content) // 2], "empty": b"", "bit": content}[damage])
-    again = run(trials(), tmp_path, said=said)
+    again = run(jobs(), tmp_path, said=said)
     assert [line.startswith("warning: a finished training is damaged") for line in said[:2]] == [True, False]
     assert all(alike(a, b) for a, b in zip(first, again, strict=True))
 
@@ -140,18 +141,18 @@ def test_a_network_that_does_not_fit_into_memory_is_said_so(tmp_path, monkeypatc
 
     monkeypatch.setattr(train, "train_stack", allocate)
     with pytest.raises(MemoryError, match="8000000000 bytes"):
-        run(trials(), tmp_path, make_executor(1, imports="reskin.models.train"))
+        run(jobs(), tmp_path, make_executor(1, imports="reskin.models.train"))
 
 
-def test_a_training_that_cannot_be_is_one_sentence_that_names_its_cell(tmp_path):
+def test_an_error_of_a_training_names_its_job(tmp_path):
     with pytest.raises(TrainingError, match=r"^lobo.paper.b0.seed0, triplets of group 0: the places of its points"):
-        run([replace(trial, train=np.array([0, 0, 12])) for trial in trials(1)], tmp_path)
+        run([replace(job, train=np.array([0, 0, 12])) for job in jobs(1)], tmp_path)
 
 
 def test_what_is_finished_is_not_trained_again(tmp_path):
     said: list[str] = []
-    first = run(trials(), tmp_path)
-    again = run(trials(), tmp_path, Here(die_after=0), said)
+    first = run(jobs(), tmp_path)
+    again = run(jobs(), tmp_path, Here(die_after=0), said)
     assert all(alike(a, b) for a, b in zip(first, again, strict=True))
     assert said == ["3 of 3 trainings were finished before"]
 
@@ -159,27 +160,27 @@ def test_what_is_finished_is_not_trained_again(tmp_path):
 @pytest.mark.parametrize(
     ("more", "trained_n"),
     [
-        (replace(trials(1)[0], seed_i=1), 1),
-        (trials(1, steps_n=5)[0], 1),
-        (replace(trials(1)[0], recipe=without_triplets().recipe), 1),
-        (trials(3)[2], 3),  # a fold more joins the stack of the others
+        (replace(jobs(1)[0], seed_i=1), 1),
+        (jobs(1, steps_n=5)[0], 1),
+        (replace(jobs(1)[0], recipe=without_triplets().recipe), 1),
+        (jobs(3)[2], 3),  # a fold more joins the stack of the others
     ],
     ids=["seed", "schedule", "terms", "fold"],
 )
 def test_one_more_costs_one_stack(tmp_path, more, trained_n):
-    run(trials(2), tmp_path)
-    assert trainings_n([*trials(2), more], tmp_path) == 1
+    run(jobs(2), tmp_path)
+    assert trainings_n([*jobs(2), more], tmp_path) == 1
     assert len(list(tmp_path.glob("*.safetensors"))) == 2 + trained_n
 
 
 def test_the_same_training_under_another_name_costs_none(tmp_path):
-    run(trials(1), tmp_path)
-    renamed = replace(trials(1)[0], experiment="sensors", recipe_name="twin", what="multi")
+    run(jobs(1), tmp_path)
+    renamed = replace(jobs(1)[0], experiment="sensors", recipe_name="twin", what="multi")
     assert trainings_n([renamed], tmp_path) == 0
 
 
 def test_equal_trainings_of_one_run_are_trained_once(tmp_path):
-    one = trials(1)[0]
+    one = jobs(1)[0]
     some = [one, replace(one, recipe_name="twin"), one]
     done = run(some, tmp_path)
     assert len(list(tmp_path.glob("*.safetensors"))) == 1
@@ -187,37 +188,37 @@ def test_equal_trainings_of_one_run_are_trained_once(tmp_path):
 
 
 def test_different_trainings_of_one_name_are_not_mixed_up(tmp_path):
-    one, other = trials(1)[0], trials(1, steps_n=3)[0]
+    one, other = jobs(1)[0], jobs(1, steps_n=3)[0]
     assert one.name == other.name
     done = run([one, other], tmp_path)
     assert not alike(*done)
-    assert [training.curve for training in done] == [run([trial], tmp_path)[0].curve for trial in (one, other)]
+    assert [training.curve for training in done] == [run([job], tmp_path)[0].curve for job in (one, other)]
 
 
 def test_rows_are_left_in_no_cache(tmp_path):
-    run(trials(), tmp_path)
+    run(jobs(), tmp_path)
     assert [one for one in tmp_path.rglob("*.safetensors") if one.parent != tmp_path] == []
 
 
 def test_what_is_left_in_the_cache_opens_without_pickle(tmp_path):
-    run(trials(1), tmp_path)
+    run(jobs(1), tmp_path)
     (file,) = tmp_path.glob("*.safetensors")
     tensors, metadata = io.read_tensors(file)
     assert tensors["weights.layer1.weight"].shape == (200, 15)
-    assert metadata["trial"] == "lobo.paper.b0.seed0"
+    assert metadata["job"] == "lobo.paper.b0.seed0"
     assert float(metadata["seconds"]) > 0
 
 
-@pytest.mark.parametrize("trial", [pooled(), adapting(), few_labels()], ids=["pooled", "adapting", "few labels"])
-def test_a_result_survives_the_cache_whole(tmp_path, trial):
-    (direct,), (read,) = train_stack([trial], measured()), run([trial], tmp_path)
+@pytest.mark.parametrize("job", [pooled(), adapting(), few_labels()], ids=["pooled", "adapting", "few labels"])
+def test_a_result_survives_the_cache_whole(tmp_path, job):
+    (direct,), (read,) = train_stack([job], measured()), run([job], tmp_path)
     assert alike(direct, read)
     assert all((a == read.scaler.arrays()[name]).all() for name, a in direct.scaler.arrays().items())
     assert read.stopped_step is direct.stopped_step is None
 
 
 def test_a_cell_that_explodes_stands_with_its_last_finite_weights_and_says_so(tmp_path):
-    wild = trials(2, rate_max=1e30, batch_n=4)
+    wild = jobs(2, rate_max=1e30, batch_n=4)
     for done in (run(wild, tmp_path), run(wild, tmp_path)):
         assert [one.stopped_step for one in done] == [4, 4]
         assert [one.curve for one in done] == [[], []]
@@ -230,21 +231,21 @@ DEAD = {"layer1.weight": 0, "layer1.bias": 0}  # answers the same to any input, 
 def dies(attempts: set[int]) -> object:
     """Start some attempts of fold b0 dead; what is dead stays dead."""
 
-    def make(trial: Trial, rows: object) -> object:
-        job, scaler = make_job(trial, rows)
-        if trial.fold == "b0" and trial.attempt_i in attempts:
-            start = {name: value * DEAD.get(name, 1) for name, value in job.start.items()}
-            start["layer2.weight"] = 0 * start["layer2.weight"]
-            job = replace(job, start=start)
-        return job, scaler
+    def make(job: TrainingJob, rows: object) -> object:
+        prepared, scaler = prepare(job, rows)
+        if job.fold == "b0" and job.attempt_i in attempts:
+            weights = {name: value * DEAD.get(name, 1) for name, value in prepared.initial_weights.items()}
+            weights["layer2.weight"] = 0 * weights["layer2.weight"]
+            prepared = replace(prepared, initial_weights=weights)
+        return prepared, scaler
 
     return make
 
 
 @pytest.mark.parametrize(("dead", "before_n", "collapsed"), [(set(), 0, 0), ({0}, 1, 0), ({0, 1, 2}, 2, 1)])
 def test_what_collapses_is_trained_again_at_most_twice_and_counted(tmp_path, monkeypatch, dead, before_n, collapsed):
-    monkeypatch.setattr(train, "make_job", dies(dead))
-    some, said = trials(2, steps_n=JUDGED_STEPS_N, rate_max=1e-2), []
+    monkeypatch.setattr(train, "prepare", dies(dead))
+    some, said = jobs(2, steps_n=CHECKED_STEPS_N, rate_max=1e-2), []
     for _ in range(2):  # the second time, from the cache
         first, second = run(some, tmp_path, said=said)
         assert (first.collapsed_before_n, first.collapsed) == (before_n, bool(collapsed))
@@ -254,8 +255,8 @@ def test_what_collapses_is_trained_again_at_most_twice_and_counted(tmp_path, mon
 
 
 def test_a_training_too_short_to_have_left_its_start_is_not_judged(tmp_path, monkeypatch):
-    monkeypatch.setattr(train, "make_job", dies({0, 1, 2}))
-    first, _ = run(trials(2, steps_n=JUDGED_STEPS_N - 1), tmp_path)
+    monkeypatch.setattr(train, "prepare", dies({0, 1, 2}))
+    first, _ = run(jobs(2, steps_n=CHECKED_STEPS_N - 1), tmp_path)
     assert (first.explained_min, first.collapsed) == (None, False)
 
 
@@ -263,7 +264,7 @@ def test_a_target_that_is_unknown_or_never_changes_judges_nobody(tmp_path):
     rows = measured()
     flat, unknown = rows.target.copy(), rows.target.copy()
     flat[:, 2], unknown[:, 2] = 1.5, np.nan
-    one = replace(without_triplets(), recipe=recipe(steps_n=JUDGED_STEPS_N, rate_max=1e-2), test=TRAIN)
+    one = replace(without_triplets(), recipe=recipe(steps_n=CHECKED_STEPS_N, rate_max=1e-2), test=TRAIN)
     for target in (flat, unknown):
         (trained,) = train_stack([one], replace(rows, target=target))
         off = (trained.predicted - target[TRAIN])[:, :2].astype(float)
@@ -279,24 +280,24 @@ def test_trainings_in_a_process_of_their_own_are_the_same(tmp_path, monkeypatch)
     assert all(alike(a, b) for a, b in zip(apart, run(some, tmp_path / "here"), strict=True))
 
 
-def keyed(some: list[Trial]) -> dict[str, Trial]:
-    return {f"key{i}": trial for i, trial in enumerate(some)}
+def keyed(some: list[TrainingJob]) -> dict[str, TrainingJob]:
+    return {f"key{i}": job for i, job in enumerate(some)}
 
 
 def test_recipes_of_equal_settings_are_stacked_and_others_are_not():
-    twin = [replace(trial, recipe_name="twin") for trial in trials(1)]
-    assert [len(stack) for stack in stacks(keyed([*trials(2), *twin]), 3)] == [3]
+    twin = [replace(job, recipe_name="twin") for job in jobs(1)]
+    assert [len(stack) for stack in make_stacks(keyed([*jobs(2), *twin]), 3)] == [3]
     released = replace(adapting(), recipe=pooled(architecture="released").recipe)
     tuned = [adapting(), released, adapting(unlabelled_weight=0.0), few_labels()]
-    others = [trials(1, steps_n=5)[0], without_triplets(), replace(trials(1)[0], seed_i=1), *tuned]
-    assert [len(stack) for stack in stacks(keyed([*trials(1), *others]), 3)] == [1] * 8
+    others = [jobs(1, steps_n=5)[0], without_triplets(), replace(jobs(1)[0], seed_i=1), *tuned]
+    assert [len(stack) for stack in make_stacks(keyed([*jobs(1), *others]), 3)] == [1] * 8
 
 
 @given(st.lists(st.integers(0, 4), max_size=20), st.integers(1, 5))
 def test_stacks_cover_every_cell_once_and_are_no_larger_than_asked(kinds, size_n):
     settings = [{"steps_n": 3}, {"steps_n": 4}, {"rate_max": 1e-3}, {"architecture": "released"}, {"batch_n": 8}]
     some = keyed([pooled(**settings[kind]) for kind in kinds])
-    found = stacks(some, size_n)
+    found = make_stacks(some, size_n)
     assert sorted(key for one in found for key in one) == sorted(some)
     for one in found:
         assert 1 <= len(one) <= size_n

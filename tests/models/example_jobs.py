@@ -1,4 +1,4 @@
-"""A scene of four skins and its trials, small enough for tests: two skins are trained on, the last one is new."""
+"""A scene of four skins and its jobs, small enough for tests: two skins are trained on, the last one is new."""
 
 from dataclasses import replace
 
@@ -6,9 +6,9 @@ import numpy as np
 
 from reskin.data.lines import Lines, hand_lines
 from reskin.models.inputs import fit_standard
+from reskin.models.job import Adaptation, FineTuning, Pretrained, TrainingData, TrainingJob
 from reskin.models.network import draw_weights, paper_layers
-from reskin.models.recipe import FineTuning, Labelling
-from reskin.models.trial import Adapting, FewLabels, Measured, Start, Trial
+from reskin.models.recipe import AdaptationRecipe, FineTuningRecipe
 from reskin.seeds import rng_for
 from tests.models.recipes import recipe
 
@@ -17,25 +17,25 @@ TRAIN, TEST, POKED, OWN = np.arange(24), np.arange(42, 48), np.arange(36, 42), n
 SETTINGS = {"steps_n": 4, "batch_n": 16, "rate_max": 3e-3, "gradient_norm_max": 1.0, "weight_decay": 0.0}
 
 
-def measured() -> Measured:
+def measured() -> TrainingData:
     rng = rng_for(0, "rows")
     db_uT = rng.normal(0, 50, (ROWS_N, 15)).astype(np.float32)
     target = np.hstack([2.0 * rng.integers(0, 5, (ROWS_N, 2)), rng.uniform(0, 3, (ROWS_N, 1))]).astype(np.float32)
-    return Measured(db_uT, target, np.repeat(["b0_s0", "b0_s1", "b1_s0", "b1_s1"], 12))
+    return TrainingData(db_uT, target, np.repeat(["b0_s0", "b0_s1", "b1_s0", "b1_s1"], 12))
 
 
-def changed(rows: Measured, part: str, at: np.ndarray, to: object) -> Measured:
+def changed(rows: TrainingData, part: str, at: np.ndarray, to: object) -> TrainingData:
     """The same scene, with other values in some rows."""
     values = getattr(rows, part).copy()
     values[at] = to
     return replace(rows, **{part: values})
 
 
-def pooled(**changes: object) -> Trial:
-    return Trial("triplet", "paper", recipe(triplet_weight=0.5, **changes), "b1", 7, 0, TRAIN, TEST)
+def pooled(**changes: object) -> TrainingJob:
+    return TrainingJob("triplet", "paper", recipe(triplet_weight=0.5, **changes), "b1", 7, 0, TRAIN, TEST)
 
 
-def without_triplets() -> Trial:
+def without_triplets() -> TrainingJob:
     return replace(pooled(), recipe=recipe())
 
 
@@ -45,17 +45,17 @@ def lines(row: np.ndarray = POKED) -> Lines:
     return replace(one, row=row[one.row])
 
 
-def start(key: str = "start") -> Start:
+def start(key: str = "start") -> Pretrained:
     rows = measured()
     weights = draw_weights(paper_layers(15), rng_for(0, "start"))
-    return Start(key, weights, fit_standard(rows.db_uT[TRAIN], rows.target[TRAIN]))
+    return Pretrained(key, weights, fit_standard(rows.db_uT[TRAIN], rows.target[TRAIN]))
 
 
-def adapting(*, unlabelled_weight: float = 0.5, along: Lines | None = None) -> Trial:
-    settings = FineTuning(unlabelled_weight=unlabelled_weight, **SETTINGS)
-    return replace(pooled(), experiment="adapt", skin="b1_s1", tuning=Adapting(start(), settings, along or lines()))
+def adapting(*, unlabelled_weight: float = 0.5, along: Lines | None = None) -> TrainingJob:
+    settings = AdaptationRecipe(unlabelled_weight=unlabelled_weight, **SETTINGS)
+    return replace(pooled(), experiment="adapt", skin="b1_s1", tuning=Adaptation(start(), settings, along or lines()))
 
 
-def few_labels(*, own_weight: float = 0.5) -> Trial:
-    tuning = FewLabels(start(), Labelling(own_weight=own_weight, **SETTINGS), OWN)
+def few_labels(*, own_weight: float = 0.5) -> TrainingJob:
+    tuning = FineTuning(start(), FineTuningRecipe(own_weight=own_weight, **SETTINGS), OWN)
     return replace(pooled(), experiment="labels", skin="b1_s1", tuning=tuning)

@@ -2,14 +2,15 @@ import numpy as np
 import pytest
 import torch
 
-from reskin.models.train import UNLABELLED, Batch, Feed, Job
+from reskin.models.batches import Batch, BatchSampler, PreparedJob
 from tests.models.jobs import some_job
 
 STEPS_N, BATCH_N = 20, 16
+UNLABELLED = ("unlabelled", "unlabelled_positive", "unlabelled_negative")
 
 
-def batches(jobs: list[Job], steps_n: int = STEPS_N, batch_n: int = BATCH_N) -> list[Batch]:
-    return list(Feed(jobs, batch_n, "cpu").draw(steps_n))
+def batches(jobs: list[PreparedJob], steps_n: int = STEPS_N, batch_n: int = BATCH_N) -> list[Batch]:
+    return list(BatchSampler(jobs, batch_n, "cpu").sample(steps_n))
 
 
 def rows_of(batch: torch.Tensor, rows: np.ndarray) -> list[int]:
@@ -25,19 +26,19 @@ def test_a_step_has_a_batch_of_every_kind_for_every_network():
     for step in steps:
         assert {name: tuple(values.shape) for name, values in step.items()} == {
             name: (3, BATCH_N, 3 if name.endswith("targets") else 15)
-            for name in ("labelled", "targets", "near", "far", *UNLABELLED, "few_labels", "few_labels_targets")
+            for name in ("inputs", "targets", "positive", "negative", *UNLABELLED, "few_labels", "few_labels_targets")
         }
 
 
 def test_nothing_is_drawn_of_what_a_job_does_not_hold():
-    assert batches([some_job()])[0].keys() == {"labelled", "targets"}
+    assert batches([some_job()])[0].keys() == {"inputs", "targets"}
 
 
 def test_targets_stand_beside_their_own_rows_and_networks_see_their_own_rows_only():
     jobs = [some_job(i, n=n, terms=True) for i, n in enumerate((12, 32, 17))]
     for step in batches(jobs):
         for i, job in enumerate(jobs):
-            chosen = rows_of(step["labelled"][i], job.labelled.inputs)
+            chosen = rows_of(step["inputs"][i], job.labelled.inputs)
             assert (step["targets"][i].numpy() == job.labelled.targets[chosen]).all()
             own = rows_of(step["few_labels"][i], job.few_labels.inputs)
             assert (step["few_labels_targets"][i].numpy() == job.few_labels.targets[own]).all()
@@ -48,7 +49,9 @@ def test_near_and_far_are_triplets_of_the_labelled_rows():
     job = some_job(terms=True)
     place, group = job.labelled.points.place, job.labelled.points.group
     for step in batches([job]):
-        three = zip(*(rows_of(step[name][0], job.labelled.inputs) for name in ("labelled", "near", "far")), strict=True)
+        three = zip(
+            *(rows_of(step[name][0], job.labelled.inputs) for name in ("inputs", "positive", "negative")), strict=True
+        )
         for anchor, near, far in three:
             assert group[anchor] == group[near] == group[far]
             assert ((place[anchor] - place[near]) ** 2).sum() < ((place[anchor] - place[far]) ** 2).sum()
@@ -73,7 +76,7 @@ def test_pokes_are_triplets_of_one_line_by_index_and_a_row_on_two_lines_takes_pa
 
 def test_every_row_is_drawn_about_equally_often():
     job, n = some_job(n=8), 400 * BATCH_N
-    drawn = np.concatenate([rows_of(step["labelled"][0], job.labelled.inputs) for step in batches([job], 400)])
+    drawn = np.concatenate([rows_of(step["inputs"][0], job.labelled.inputs) for step in batches([job], 400)])
     assert (np.abs(np.bincount(drawn, minlength=8) - n / 8) < 6 * (n * 7 / 64) ** 0.5).all()  # six binomial sd
 
 
@@ -89,29 +92,31 @@ def test_one_more_term_leaves_all_other_batches_as_they_are():
     """Methods are compared in pairs: in every block, not only in the first."""
     full = some_job(terms=True)
     without = {
-        "triplet": Job(full.start, some_job().rng, some_job().labelled, full.unlabelled, full.few_labels),
-        "unlabelled": Job(full.start, some_job().rng, full.labelled, None, full.few_labels),
-        "few_labels": Job(full.start, some_job().rng, full.labelled, full.unlabelled),
+        "triplet": PreparedJob(
+            full.initial_weights, some_job().rng, some_job().labelled, full.unlabelled, full.few_labels
+        ),
+        "unlabelled": PreparedJob(full.initial_weights, some_job().rng, full.labelled, None, full.few_labels),
+        "few_labels": PreparedJob(full.initial_weights, some_job().rng, full.labelled, full.unlabelled),
     }
-    feed = Feed([full], BATCH_N, "cpu")
-    blocks = [list(feed.draw(STEPS_N)) for _ in range(3)]
+    feed = BatchSampler([full], BATCH_N, "cpu")
+    blocks = [list(feed.sample(STEPS_N)) for _ in range(3)]
     for job in without.values():
-        less = Feed([job], BATCH_N, "cpu")
+        less = BatchSampler([job], BATCH_N, "cpu")
         for block in blocks:
-            for one, other in zip(less.draw(STEPS_N), block, strict=True):
+            for one, other in zip(less.sample(STEPS_N), block, strict=True):
                 assert all(torch.equal(one[name], other[name]) for name in one)
 
 
 def test_blocks_and_networks_draw_rows_of_their_own():
     same_rows = some_job(0)
-    other = Job(same_rows.start, some_job(1).rng, same_rows.labelled)
-    feed = Feed([same_rows, other], BATCH_N, "cpu")
-    (first,), (second,) = feed.draw(1), feed.draw(1)
-    assert not torch.equal(first["labelled"][0], first["labelled"][1])
-    assert not torch.equal(first["labelled"], second["labelled"])
+    other = PreparedJob(same_rows.initial_weights, some_job(1).rng, same_rows.labelled)
+    feed = BatchSampler([same_rows, other], BATCH_N, "cpu")
+    (first,), (second,) = feed.sample(1), feed.sample(1)
+    assert not torch.equal(first["inputs"][0], first["inputs"][1])
+    assert not torch.equal(first["inputs"], second["inputs"])
 
 
 @pytest.mark.parametrize(("n", "batch_n"), [(1, 16), (1, 1), (32, 1), (3, 100)])
 def test_any_number_of_rows_fills_any_batch(n, batch_n):
     (step,) = batches([some_job(n=n)], 1, batch_n)
-    assert step["labelled"].shape == (1, batch_n, 15)
+    assert step["inputs"].shape == (1, batch_n, 15)

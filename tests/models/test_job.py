@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from reskin.data.lines import Lines
-from reskin.models import trial as trial_module
+from reskin.models import job as job_module
+from reskin.models.batches import BatchSampler, prepare
+from reskin.models.job import CODE_MODULES, JobKeys, LossWeights, TrainingData, TrainingJob, TrainingResult
 from reskin.models.recipe import AugmentedRecipe
-from reskin.models.train import Feed, make_job, train_stack
-from reskin.models.trial import DECIDING, Keys, Measured, Terms, Trained, Trial
-from tests.models.recipes import recipe
-from tests.models.trials import (
+from reskin.models.train import train_stack
+from tests.models.example_jobs import (
     OWN,
     POKED,
     ROWS_N,
@@ -26,16 +26,17 @@ from tests.models.trials import (
     start,
     without_triplets,
 )
+from tests.models.recipes import recipe
 
 NEW = np.arange(24, ROWS_N)  # every row of a skin that is not trained on
 KINDS = {"pooled": pooled, "adapting": adapting, "few labels": few_labels}
 
 
-def trained(trial: Trial, rows: Measured) -> Trained:
-    return train_stack([trial], rows)[0]
+def trained(job: TrainingJob, rows: TrainingData) -> TrainingResult:
+    return train_stack([job], rows)[0]
 
 
-def alike(one: Trained, other: Trained) -> bool:
+def alike(one: TrainingResult, other: TrainingResult) -> bool:
     """Bit for bit: weights, scaler, curve."""
     weights = all((one.weights[name] == other.weights[name]).all() for name in one.weights)
     scaler, again = one.scaler.arrays(), other.scaler.arrays()
@@ -73,15 +74,15 @@ def test_pokes_are_scaled_as_the_start_was_and_each_point_names_its_row():
     line_i, order_i = np.array([[0, 0, 0, 1, 1, 1], [0, 1, 2, 0, 2, 3]], np.int32)
     along = Lines(np.array([40, 36, 38, 40, 36, 41]), line_i, order_i)
     scaler = replace(start().scaler, input_shift=np.arange(15, dtype=np.float32))
-    job, used = make_job(tuned(adapting(along=along), start=replace(start(), scaler=scaler)), measured())
+    prepared, used = prepare(tuned(adapting(along=along), start=replace(start(), scaler=scaler)), measured())
     assert used is scaler
     db_uT = measured().db_uT
     for point, row in enumerate(along.row):
         expected = [(db_uT[row, ch] - scaler.input_shift[ch]) / scaler.input_scale[ch] for ch in range(15)]
-        assert job.unlabelled.inputs[job.unlabelled.row[point]].tolist() == expected
-    assert job.unlabelled.points.place[:, 0].tolist() == order_i.tolist()
-    assert job.unlabelled.points.group.tolist() == line_i.tolist()
-    assert len(job.unlabelled.inputs) == 4
+        assert prepared.unlabelled.inputs[prepared.unlabelled.row[point]].tolist() == expected
+    assert prepared.unlabelled.points.place[:, 0].tolist() == order_i.tolist()
+    assert prepared.unlabelled.points.group.tolist() == line_i.tolist()
+    assert len(prepared.unlabelled.inputs) == 4
 
 
 @pytest.mark.parametrize("at", [POKED, NEW], ids=["poked", "all"])
@@ -107,28 +108,28 @@ def test_a_few_labels_are_seen_and_no_others():
 @pytest.mark.parametrize("scaling", ["standard", "released"])
 @pytest.mark.parametrize("view", ["raw", "shape"])
 def test_a_planted_leak_would_show_nothing_of_a_test_row_reaches_the_model(scaling, view):
-    trial = pooled(scaling=scaling, inputs=view)
-    once = trained(trial, measured())
+    job = pooled(scaling=scaling, inputs=view)
+    once = trained(job, measured())
     planted = changed(changed(measured(), "db_uT", TEST, 1e4), "target", TEST, -1e4)
-    again = trained(trial, planted)
+    again = trained(job, planted)
     assert alike(once, again)
     assert (once.predicted != again.predicted).any()
 
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
 def test_a_scaler_is_that_of_the_rows_trained_on(kind):
-    _, scaler = make_job(KINDS[kind](), changed(measured(), "db_uT", NEW, 1e6))
+    _, scaler = prepare(KINDS[kind](), changed(measured(), "db_uT", NEW, 1e6))
     np.testing.assert_allclose(scaler.input_shift, measured().db_uT[TRAIN].mean(axis=0, dtype=float), rtol=1e-6)
     np.testing.assert_allclose(scaler.target_scale, measured().target[TRAIN].std(axis=0, dtype=float), rtol=1e-6)
 
 
 def test_labelled_triplets_are_by_place_on_each_skin_in_mm():
     rows = measured()
-    job, _ = make_job(pooled(), rows)
-    assert (job.labelled.points.place == rows.target[TRAIN, :2]).all()
-    assert job.labelled.points.group.tolist() == [0] * 12 + [1] * 12
+    prepared, _ = prepare(pooled(), rows)
+    assert (prepared.labelled.points.place == rows.target[TRAIN, :2]).all()
+    assert prepared.labelled.points.group.tolist() == [0] * 12 + [1] * 12
     assert (
-        make_job(replace(pooled(), recipe=pooled().recipe.model_copy(update={"triplet_weight": 0.0})), rows)[
+        prepare(replace(pooled(), recipe=pooled().recipe.model_copy(update={"triplet_weight": 0.0})), rows)[
             0
         ].labelled.points
         is None
@@ -136,9 +137,9 @@ def test_labelled_triplets_are_by_place_on_each_skin_in_mm():
 
 
 def test_terms_weigh_what_the_recipe_and_the_tuning_say():
-    assert pooled().terms == Terms(0.5)
-    assert adapting(unlabelled_weight=0.25).terms == Terms(0.5, unlabelled=0.25)
-    assert few_labels(own_weight=0.75).terms == Terms(0.5, few_labels=0.75)
+    assert pooled().loss_weights == LossWeights(0.5)
+    assert adapting(unlabelled_weight=0.25).loss_weights == LossWeights(0.5, unlabelled=0.25)
+    assert few_labels(own_weight=0.75).loss_weights == LossWeights(0.5, few_labels=0.75)
     assert adapting().schedule == adapting().tuning.settings
     assert pooled().schedule == pooled().recipe
 
@@ -146,9 +147,9 @@ def test_terms_weigh_what_the_recipe_and_the_tuning_say():
 # Pairs
 
 
-def first_batches(trial: Trial) -> list[np.ndarray]:
-    feed = Feed([make_job(trial, measured())[0]], 16, "cpu")
-    return [step["labelled"].numpy() for _ in range(3) for step in feed.draw(5)]
+def first_batches(job: TrainingJob) -> list[np.ndarray]:
+    feed = BatchSampler([prepare(job, measured())[0]], 16, "cpu")
+    return [step["inputs"].numpy() for _ in range(3) for step in feed.sample(5)]
 
 
 @pytest.mark.parametrize(
@@ -161,7 +162,7 @@ def first_batches(trial: Trial) -> list[np.ndarray]:
     ids=["another name", "another schedule", "no triplets"],
 )
 def test_recipes_are_compared_from_equal_starts_on_equal_batches(other):
-    one, two = (make_job(trial, measured())[0].start for trial in (pooled(), other))
+    one, two = (prepare(job, measured())[0].initial_weights for job in (pooled(), other))
     assert all((one[name] == two[name]).all() for name in one)
     assert all((a == b).all() for a, b in zip(first_batches(pooled()), first_batches(other), strict=True))
 
@@ -175,24 +176,24 @@ def test_adaptation_is_compared_with_its_control_on_equal_batches():
 def test_folds_and_seeds_start_and_draw_differently(changes):
     other = replace(pooled(), **changes)
     assert (
-        make_job(pooled(), measured())[0].start["layer1.weight"]
-        != make_job(other, measured())[0].start["layer1.weight"]
+        prepare(pooled(), measured())[0].initial_weights["layer1.weight"]
+        != prepare(other, measured())[0].initial_weights["layer1.weight"]
     ).any()
     assert any((a != b).any() for a, b in zip(first_batches(pooled()), first_batches(other), strict=True))
 
 
-# Keys
+# JobKeys
 
 
-def key(trial: Trial, rows: Measured | None = None) -> str:
-    return Keys(rows or measured()).key(trial)
+def key(job: TrainingJob, rows: TrainingData | None = None) -> str:
+    return JobKeys(rows or measured()).key(job)
 
 
-def tuned(trial: Trial, **changes: object) -> Trial:
-    return replace(trial, tuning=replace(trial.tuning, **changes))
+def tuned(job: TrainingJob, **changes: object) -> TrainingJob:
+    return replace(job, tuning=replace(job.tuning, **changes))
 
 
-def with_row(part: str, row: int, to: object) -> Callable[[], Measured]:
+def with_row(part: str, row: int, to: object) -> Callable[[], TrainingData]:
     return lambda: changed(measured(), part, np.array([row]), to)
 
 
@@ -227,13 +228,13 @@ def test_a_key_does_not_change_with_what_decides_nothing(what):
     assert key(KINDS[kind](), rows()) == key(KINDS[kind]())
 
 
-def finer(trial: Trial, **changes: object) -> Trial:
-    return tuned(trial, settings=trial.tuning.settings.model_copy(update=changes))
+def finer(job: TrainingJob, **changes: object) -> TrainingJob:
+    return tuned(job, settings=job.tuning.settings.model_copy(update=changes))
 
 
 def test_no_two_settings_share_a_key():
     along = lines()
-    trials = [
+    jobs = [
         pooled(), adapting(), few_labels(), replace(pooled(), train=TRAIN[1:]), replace(pooled(), test=TEST[1:]),
         *[pooled(**one) for one in (
             {"architecture": "released"}, {"inputs": "shape"}, {"scaling": "released"}, {"steps_n": 5}, {"batch_n": 8},
@@ -248,25 +249,25 @@ def test_no_two_settings_share_a_key():
         adapting(along=replace(along, row=along.row[::-1].copy())),
         tuned(few_labels(), row=OWN[:2]), finer(few_labels(), own_weight=0.25),
     ]  # fmt: skip
-    assert len({key(trial) for trial in trials}) == len(trials)
+    assert len({key(job) for job in jobs}) == len(jobs)
 
 
 def test_a_training_after_one_that_collapsed_has_a_key_a_start_and_batches_of_its_own():
     again = replace(pooled(), attempt_i=1)
     assert key(again) != key(pooled())
-    (one, _), (other, _) = make_job(pooled(), measured()), make_job(again, measured())
-    assert (one.start["layer1.weight"] != other.start["layer1.weight"]).all()
+    (one, _), (other, _) = prepare(pooled(), measured()), prepare(again, measured())
+    assert (one.initial_weights["layer1.weight"] != other.initial_weights["layer1.weight"]).all()
     assert one.rng.integers(1 << 60) != other.rng.integers(1 << 60)
 
 
 @pytest.mark.parametrize("scaling", ["standard", "released"])
 def test_a_network_begins_with_the_mean_of_the_targets_as_its_last_bias(scaling):
-    trial = replace(without_triplets(), recipe=recipe(scaling=scaling))
+    job = replace(without_triplets(), recipe=recipe(scaling=scaling))
     rows = changed(measured(), "target", np.arange(3), np.nan)
-    job, scaler = make_job(trial, changed(rows, "target", (slice(None), 2), np.nan))
-    predicted = scaler.decode(job.start["layer6.bias"][None])[0]
+    prepared, scaler = prepare(job, changed(rows, "target", (slice(None), 2), np.nan))
+    predicted = scaler.decode(prepared.initial_weights["layer6.bias"][None])[0]
     np.testing.assert_allclose(predicted[:2], rows.target[TRAIN[3:], :2].mean(axis=0), rtol=1e-5)
-    assert job.start["layer6.bias"][2] == 0  # a target that nobody knows
+    assert prepared.initial_weights["layer6.bias"][2] == 0  # a target that nobody knows
 
 
 NOT_DECIDING = {
@@ -287,7 +288,7 @@ def test_all_code_that_a_training_runs_through_is_part_of_its_key():
     modules = {"reskin.models.train", *graph.find_upstream_modules("reskin.models.train")}
     imported = {module for module in modules if not graph.find_children(module)}
     others = {f"reskin.{name}" for name in NOT_DECIDING}
-    assert imported - others == set(DECIDING)
+    assert imported - others == set(CODE_MODULES)
     assert others <= imported
 
 
@@ -297,23 +298,23 @@ def test_experiments_and_names_do_not_enter_a_key():
 
 def test_rows_that_nobody_uses_may_come_and_go():
     rows = measured()
-    fewer = Measured(*(getattr(rows, field.name)[6:] for field in fields(rows)))
+    fewer = TrainingData(*(getattr(rows, field.name)[6:] for field in fields(rows)))
     moved = replace(pooled(), train=TRAIN[6:] - 6, test=TEST - 6)
     assert key(moved, fewer) == key(replace(pooled(), train=TRAIN[6:]))
 
 
 def test_keys_are_the_same_from_one_book_of_keys_and_from_many():
-    book, trials = Keys(measured()), [pooled(), replace(pooled(), train=TRAIN[1:]), pooled(), adapting()]
-    assert [book.key(trial) for trial in trials] == [key(trial) for trial in trials]
+    book, jobs = JobKeys(measured()), [pooled(), replace(pooled(), train=TRAIN[1:]), pooled(), adapting()]
+    assert [book.key(job) for job in jobs] == [key(job) for job in jobs]
 
 
 def test_a_key_changes_with_the_code_that_trains(monkeypatch):
     before = key(pooled())
-    monkeypatch.setattr(trial_module, "digest", lambda name: f"another {name}")
+    monkeypatch.setattr(job_module, "digest", lambda name: f"another {name}")
     assert key(pooled()) != before
 
 
-def test_a_name_says_what_tells_a_trial_apart():
+def test_a_name_says_what_tells_a_job_apart():
     assert pooled().name == "triplet.paper.b1.seed0"
     assert replace(adapting(), what="65pokes").name == "adapt.paper.b1.b1_s1.65pokes.seed0"
 
@@ -322,7 +323,7 @@ def test_copies_of_rows_keep_their_targets_and_are_skins_of_their_own():
     words = {"copies_n": 2, "gain_sd": 0.0, "lean_sd_deg": 0.0, "noise_uT": 0.0}
     plain = pooled()
     recipe = AugmentedRecipe.model_validate(plain.recipe.model_dump() | {"augmentation": words})
-    (one, _), (more, _) = (make_job(trial, measured()) for trial in (plain, replace(plain, recipe=recipe)))
+    (one, _), (more, _) = (prepare(job, measured()) for job in (plain, replace(plain, recipe=recipe)))
     # Boards that do not differ: the same rows three times over, with the same targets.
     np.testing.assert_array_equal(more.labelled.inputs, np.tile(one.labelled.inputs, (3, 1)))
     np.testing.assert_array_equal(more.labelled.targets, np.tile(one.labelled.targets, (3, 1)))
@@ -333,11 +334,11 @@ def test_copies_are_drawn_anew_in_every_fold_and_seed_and_enter_the_key():
     words = {"copies_n": 1, "gain_sd": 0.1, "lean_sd_deg": 5.0, "noise_uT": 1.0}
     recipe = AugmentedRecipe.model_validate(pooled().recipe.model_dump() | {"augmentation": words})
     other = AugmentedRecipe.model_validate(pooled().recipe.model_dump() | {"augmentation": words | {"gain_sd": 0.2}})
-    trial = replace(pooled(), recipe=recipe)
+    job = replace(pooled(), recipe=recipe)
     drawn = [
-        make_job(one, measured())[0].labelled.inputs
-        for one in (trial, trial, replace(trial, fold="b9"), replace(trial, seed_i=5))
+        prepare(one, measured())[0].labelled.inputs
+        for one in (job, job, replace(job, fold="b9"), replace(job, seed_i=5))
     ]
     assert (drawn[0] == drawn[1]).all()
     assert not any((drawn[0] == one).all() for one in drawn[2:])
-    assert key(trial) != key(replace(trial, recipe=other)) != key(pooled())
+    assert key(job) != key(replace(job, recipe=other)) != key(pooled())

@@ -1,0 +1,340 @@
+"""Trainings of one scene: read its rows and folds, make and run training jobs, write models with their cards."""
+
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NotRequired, Protocol, TypedDict
+
+import numpy as np
+import pyarrow as pa
+from jaxtyping import Float32, Int64
+
+from pipeline.executors import make_executor, prepare_workers
+from pipeline.provenance import COSTS, SECONDS, home, note_trainings, version_of
+from pipeline.settings import Settings, Training
+from pipeline.stage import say
+from pipeline.stages import module_name
+from reskin import io
+from reskin.code import imported
+from reskin.data.folds import load_rows, parse_folds
+from reskin.data.lines import Lines, grid_lines, take_pokes
+from reskin.data.rows import TARGETS, Rows, Selection
+from reskin.data.splits import Fold
+from reskin.errors import SchemaError
+from reskin.metrics import score_groups
+from reskin.models.inputs import Scaler
+from reskin.models.job import Adaptation, FineTuning, Pretrained, TrainingData, TrainingJob, TrainingResult
+from reskin.models.recipe import AdaptationWithBase
+from reskin.models.runner import run_jobs
+from reskin.models.trained import FORMAT
+from reskin.seeds import rng_for
+
+TRAINING_MODULE = "reskin.models.train"
+CACHE = ".reskin/cells"  # finished trainings: a cache, and no output
+
+PretrainedNetworks = dict[tuple[str, str, int], Pretrained]  # by recipe, fold and seed
+
+
+@dataclass(frozen=True)
+class SceneData:
+    """Inputs of a stage that trains: the scene's settings, its rows and its folds."""
+
+    scene: str
+    settings: Settings
+    rows: Rows
+    folds: list[Fold]
+
+    def folds_of(self, experiment: str) -> list[Fold]:
+        """Return the folds of one experiment."""
+        return [fold for fold in self.folds if fold.experiment == experiment]
+
+
+@dataclass(frozen=True)
+class AdaptationPokes:
+    """Unlabelled pokes along lines that adapt one network to one skin; `experiment` and `what` name the job."""
+
+    experiment: str
+    skin: str
+    seed_i: int
+    what: str
+    lines: Lines
+
+
+class ModelCard(TypedDict):
+    """The JSON card beside a model: how it was trained, what it takes and returns, and its scores."""
+
+    format: str
+    scene: str
+    question: str  # the experiment
+    recipe_name: str
+    recipe: dict[str, Any]
+    fold: str
+    seed: int
+    seed_i: int
+    key: str
+    architecture: dict[str, list[int]]
+    input: dict[str, Any]
+    output: dict[str, str]
+    scaler: dict[str, list[float]]
+    stopped_step: int | None
+    explained_min: float | None
+    collapsed: bool
+    collapsed_before_n: int
+    train_boards: list[str]
+    train_skins: list[str]
+    train_rows_n: int
+    test_boards: list[str]
+    test_skins: list[str]
+    curve: list[float]
+    tuning: NotRequired[dict[str, Any]]
+    scores: NotRequired[dict[str, Any]]
+    git: NotRequired[str]
+
+
+class _Named(Protocol):
+    @property
+    def name(self) -> str: ...
+
+
+class _Timed(Protocol):
+    @property
+    def seconds(self) -> float: ...
+    @property
+    def one_reading_s(self) -> float: ...
+
+
+def preload_training() -> None:
+    """Start the workers' imports while the stage reads its data."""
+    prepare_workers(TRAINING_MODULE)
+
+
+def read_data(settings: Settings, indentations: Path, folds: Path) -> SceneData:
+    """Read the rows and folds of a scene."""
+    content = io.read_json(folds)
+    files = [indentations / f"{name}.parquet" for name in content["captures"]]
+    rows = load_rows(files, settings.section(Selection, "selection"))
+    return SceneData(settings.scene, settings, rows, parse_folds(content, rows, str(folds)))
+
+
+def training_data(data: SceneData) -> TrainingData:
+    return TrainingData(data.rows.db_uT, data.rows.target, data.rows.skin)
+
+
+# --- Jobs ---
+
+
+def make_jobs(
+    data: SceneData, training: Training, folds: Iterable[Fold], *, experiment: str | None = None
+) -> list[TrainingJob]:
+    """Make a job for every fold, recipe and seed; it belongs to the fold's experiment unless another is named."""
+    return [
+        TrainingJob(
+            experiment or fold.experiment, name, recipe, fold.name, data.settings.seed, seed_i, fold.train, fold.test
+        )
+        for fold in folds
+        for name, recipe in training.recipes.items()
+        for seed_i in range(training.seeds_n)
+    ]
+
+
+def adaptation_jobs(
+    data: SceneData,
+    fold: Fold,
+    named: tuple[str, AdaptationWithBase],
+    pretrained: PretrainedNetworks,
+    *,
+    experiment: str,
+    pokes_n: int,
+) -> Iterator[TrainingJob]:
+    """Adapt every network of a fold to each of its held-out skins, by `pokes_n` indentations of the skin's pool."""
+    for skin in np.unique(data.rows.skin[fold.test]):
+        for seed_i in select_pretrained(pretrained, named[1].base, fold):
+            lines = pool_lines(data, fold, str(skin), pokes_n=pokes_n, seed_i=seed_i)
+            pokes = AdaptationPokes(experiment, str(skin), seed_i, f"{pokes_n}pokes", lines)
+            yield adaptation_job(data, fold, named, pretrained, pokes)
+
+
+def adaptation_job(
+    data: SceneData,
+    fold: Fold,
+    named: tuple[str, AdaptationWithBase],
+    pretrained: PretrainedNetworks,
+    pokes: AdaptationPokes,
+) -> TrainingJob:
+    """Adapt the fold's network of one seed to one skin, and test it on that skin's rows of the fold's test side."""
+    name, settings = named
+    test = fold.test[data.rows.skin[fold.test] == pokes.skin]
+    start = select_pretrained(pretrained, settings.base, fold)[pokes.seed_i]
+    recipe = data.settings.training("train_triplet").recipes[settings.base]
+    return TrainingJob(
+        pokes.experiment, name, recipe, fold.name, data.settings.seed, pokes.seed_i, fold.train, test,
+        Adaptation(start, settings, pokes.lines), pokes.skin, pokes.what,
+    )  # fmt: skip
+
+
+def pool_lines(data: SceneData, fold: Fold, skin: str, *, pokes_n: int, seed_i: int) -> Lines:
+    """Draw `pokes_n` indentations of a skin's pool, and index them along the robot's grid."""
+    pool = fold.pool[data.rows.skin[fold.pool] == skin]
+    rng = rng_for(data.settings.seed, "pokes", skin, seed_i)
+    return grid_lines(data.rows, take_pokes(data.rows, pool, pokes_n, rng))
+
+
+def read_pretrained(models: Path) -> PretrainedNetworks:
+    """Read the networks of train_triplet."""
+    pretrained = {}
+    for file in sorted(models.glob("*.json")):
+        card = io.read_json(file)
+        tensors, _ = io.read_tensors(file.with_suffix(".safetensors"))
+        weights = {name: values for name, values in tensors.items() if name.startswith("layer")}
+        network = Pretrained(card["key"], weights, Scaler.of_arrays(tensors))
+        pretrained[card["recipe_name"], card["fold"], card["seed_i"]] = network
+    return pretrained
+
+
+def select_pretrained(pretrained: PretrainedNetworks, base: str, fold: Fold) -> dict[int, Pretrained]:
+    """Return the networks of one recipe and fold, by seed."""
+    own = (base, fold.name)
+    selected = {seed_i: one for (recipe, name, seed_i), one in pretrained.items() if (recipe, name) == own}
+    if not selected:
+        where, rule = f"fold {fold.name}", f"those of recipe {base}"
+        raise SchemaError(where, "networks to adapt", rule, "none", "Train them.")
+    return selected
+
+
+# --- Runs ---
+
+
+def train_jobs(data: SceneData, jobs: Sequence[TrainingJob], stage: str) -> list[TrainingResult]:
+    """Run the jobs that are not in the cache, record what they cost, and warn of trainings that diverged."""
+    start_s, prefix = time.monotonic(), f"{data.scene} {stage}"
+    with make_executor(imports=TRAINING_MODULE) as executor:
+        results = run_jobs(
+            jobs,
+            training_data(data),
+            executor=executor,
+            cache=home() / CACHE,
+            log=lambda line: say(f"{prefix}: {line}"),
+        )
+    took = {result.key: (result.seconds, result.reused) for result in results}
+    note_trainings(COSTS / data.scene, stage, took, time.monotonic() - start_s)
+    for job, result in zip(jobs, results, strict=True):
+        if result.stopped_step is not None:
+            say(f"warning: {prefix}: {job.name} diverged by step {result.stopped_step}: kept as it was before")
+    return results
+
+
+# --- Results ---
+
+
+def write_models(
+    models: Path, data: SceneData, jobs: Sequence[TrainingJob], results: Sequence[TrainingResult], stage: str
+) -> None:
+    """Write models, cards and predictions; the times, which differ between equal runs, stand beside the outputs."""
+    code = version_of(imported(module_name(stage)))
+    cards = [scored_card(data, job, result) for job, result in zip(jobs, results, strict=True)]
+    with io.replacing(models) as folder:
+        folder.mkdir()
+        for job, result, card in zip(jobs, results, cards, strict=True):
+            tensors = dict(result.weights) | result.scaler.arrays()
+            io.write_tensors(folder / f"{job.name}.safetensors", tensors, {"format": card["format"]})
+            io.write_json(folder / f"{job.name}.json", card | {"git": code})
+        io.write_table(folder / "predictions.parquet", _predictions(jobs, results, data.rows))
+    write_timings(data.scene, stage, jobs, results)
+
+
+def model_card(job: TrainingJob, result: TrainingResult, rows: Rows, scene: str) -> ModelCard:
+    """Describe a trained network; scores are added where the truth is known."""
+    card = ModelCard(
+        format=FORMAT,
+        scene=scene,
+        question=job.experiment,
+        recipe_name=job.recipe_name,
+        recipe=job.recipe.model_dump(mode="json"),
+        fold=job.fold,
+        seed=job.seed,
+        seed_i=job.seed_i,
+        key=result.key,
+        architecture={name: list(value.shape) for name, value in result.weights.items()},
+        input={
+            "quantity": "change of field",
+            "unit": "uT",
+            "channels_n": rows.db_uT.shape[1],
+            "view": job.recipe.inputs,
+        },
+        output={name: name.rsplit("_", 1)[1] for name in TARGETS},
+        scaler={name: value.tolist() for name, value in result.scaler.arrays().items()},
+        stopped_step=result.stopped_step,
+        explained_min=None if result.explained_min is None else round(result.explained_min, 6),
+        collapsed=result.collapsed,
+        collapsed_before_n=result.collapsed_before_n,
+        train_boards=np.unique(rows.board[job.train]).tolist(),
+        train_skins=np.unique(rows.skin[job.train]).tolist(),
+        train_rows_n=len(job.train),
+        test_boards=np.unique(rows.board[job.test]).tolist(),
+        test_skins=np.unique(rows.skin[job.test]).tolist(),
+        curve=[round(value, 9) for value in result.curve],
+    )
+    if job.tuning is not None:
+        card["tuning"] = _tuning_record(job.tuning, rows)
+    return card
+
+
+def _tuning_record(tuning: Adaptation | FineTuning, rows: Rows) -> dict[str, Any]:
+    row = tuning.lines.row if isinstance(tuning, Adaptation) else tuning.row
+    indentations = np.unique(rows.indentation[row])
+    return {
+        "from": tuning.start.key,
+        "settings": tuning.settings.model_dump(mode="json"),
+        "kind": "unlabelled" if isinstance(tuning, Adaptation) else "labelled",
+        "skins": np.unique(rows.skin[row]).tolist(),
+        "indentations": indentations.tolist(),
+        "pokes_n": len(indentations),
+    }
+
+
+def scored_card(data: SceneData, job: TrainingJob, result: TrainingResult) -> ModelCard:
+    """Describe a trained network with its scores on the test rows."""
+    card = model_card(job, result, data.rows, data.scene)
+    card["scores"] = score_test(data, job.test, result.predicted)
+    return card
+
+
+def score_test(data: SceneData, test: Int64[np.ndarray, " b"], predicted: Float32[np.ndarray, "b 3"]) -> dict[str, Any]:
+    """Score predictions for test rows."""
+    return score_groups(data.rows.target[test], predicted, data.rows.board[test], data.rows.skin[test])
+
+
+def sweep_point(data: SceneData, job: TrainingJob, result: TrainingResult, method: str) -> dict[str, Any]:
+    """Return the point of a training on the curve of a sweep: scores, without weights and predictions."""
+    card: dict[str, Any] = {**scored_card(data, job, result)}
+    kept = ("key", "question", "fold", "seed_i", "stopped_step", "scores", "collapsed", "collapsed_before_n")
+    return {name: card[name] for name in kept} | {"method": method, "trained_on_skins_n": len(card["train_skins"])}
+
+
+def collapse_record(result: TrainingResult) -> dict[str, Any]:
+    """Return whether a training collapsed, and how often the same job did before, with other draws."""
+    return {"collapsed": result.collapsed, "collapsed_before_n": result.collapsed_before_n}
+
+
+def write_timings(scene: str, stage: str, jobs: Sequence[_Named], results: Sequence[_Timed]) -> None:
+    """Write the seconds of each training, and of one prediction, beside the pipeline."""
+    took = [
+        {"name": job.name, "train_s": result.seconds, "one_reading_s": result.one_reading_s}
+        for job, result in zip(jobs, results, strict=True)
+    ]
+    io.write_json(SECONDS / scene / f"{stage}.json", took)
+
+
+def _predictions(jobs: Sequence[TrainingJob], results: Sequence[TrainingResult], rows: Rows) -> pa.Table:
+    """One row for each job and test row: the truth and the prediction."""
+    tables = []
+    for job, result in zip(jobs, results, strict=True):
+        names = {"question": job.experiment, "recipe": job.recipe_name, "fold": job.fold, "seed_i": job.seed_i}
+        columns = {name: pa.repeat(value, len(job.test)) for name, value in names.items()}
+        columns["skin"] = pa.array(rows.skin[job.test].tolist())
+        for i, name in enumerate(TARGETS):
+            columns[f"true_{name}"] = pa.array(rows.target[job.test, i])
+            columns[f"predicted_{name}"] = pa.array(result.predicted[:, i])
+        tables.append(pa.table(columns))
+    return pa.concat_tables(tables)

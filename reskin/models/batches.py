@@ -1,0 +1,203 @@
+"""Training data of a stack of networks: scaled rows, first weights, and the batches of every step."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Int64, Shaped
+
+from reskin.models.inputs import FIT, VIEW, Scaler
+from reskin.models.job import Adaptation, FineTuning, TrainingData, TrainingJob, Weights
+from reskin.models.losses import TripletPoints, draw_triplets, triplet_points
+from reskin.models.network import LAYERS, draw_weights
+from reskin.models.recipe import Augmentation, AugmentedRecipe
+from reskin.seeds import rng_for
+
+AXES_N = 3
+
+
+@dataclass(frozen=True)
+class LabelledRows:
+    """Scaled inputs and targets; `points` orders them by distance, for a recipe with a triplet term."""
+
+    inputs: Float32[np.ndarray, "n c"]
+    targets: Float32[np.ndarray, "n t"]
+    points: TripletPoints | None
+
+
+@dataclass(frozen=True)
+class UnlabelledRows:
+    """Scaled inputs of which only the order along lines is known.
+
+    A row may lie on two lines, so `row` names the row of each point.
+    """
+
+    inputs: Float32[np.ndarray, "p c"]
+    points: TripletPoints
+    row: Int64[np.ndarray, " q"]
+
+
+@dataclass(frozen=True)
+class PreparedJob:
+    """One network of a stack: its first weights, its generator, and its scaled rows.
+
+    `unlabelled` and `few_labels` are rows of a new skin, for adaptation and for fine-tuning.
+    """
+
+    initial_weights: Weights
+    rng: np.random.Generator
+    labelled: LabelledRows
+    unlabelled: UnlabelledRows | None = None
+    few_labels: LabelledRows | None = None
+
+
+def prepare(job: TrainingJob, data: TrainingData) -> tuple[PreparedJob, Scaler]:
+    """Scale the rows of a job and draw its first weights.
+
+    The scaler is fitted on the training rows; fine-tuning takes scaler and weights of the network that it starts from.
+    """
+    recipe, target = job.recipe, data.target[job.train]
+    # The recipe is no part of the name: recipes are compared from equal first weights on equal batches.
+    retry = ("again", job.attempt_i) if job.attempt_i else ()
+    rng = rng_for(job.seed, "train", job.fold, job.skin, job.seed_i, *retry)
+    if job.tuning is None:
+        view = VIEW[recipe.inputs](data.db_uT[job.train])
+        scaler = FIT[recipe.scaling](view, target)
+        layers = LAYERS[recipe.architecture](view.shape[1], target.shape[1])
+        # Where the output has a ReLU (the released network), a random bias leaves some target dead from the start in
+        # about every third network, and a dead output never learns. So the bias is the mean of every scaled target.
+        known = ~np.isnan(target).all(axis=0)
+        mean = np.zeros(target.shape[1], np.float32)
+        mean[known] = np.nanmean(scaler.encode_target(target)[:, known], axis=0, dtype=np.float64)
+        weights: Weights = draw_weights(layers, rng) | {f"layer{len(layers)}.bias": mean}
+    else:
+        scaler, weights = job.tuning.start.scaler, job.tuning.start.weights
+
+    unlabelled = few_labels = None
+    if job.loss_weights.unlabelled:
+        assert isinstance(job.tuning, Adaptation)
+        lines = job.tuning.lines  # the change of field and the order along lines are all that adaptation sees
+        row, point_row = np.unique(lines.row, return_inverse=True)
+        view = VIEW[recipe.inputs](data.db_uT[row])
+        points = triplet_points(lines.order_i[:, None].astype(np.float64), lines.line_i)
+        unlabelled = UnlabelledRows(scaler.encode(view), points, point_row.astype(np.int64))
+    if job.loss_weights.few_labels:
+        assert isinstance(job.tuning, FineTuning)
+        view = VIEW[recipe.inputs](data.db_uT[job.tuning.row])
+        few_labels = LabelledRows(scaler.encode(view), scaler.encode_target(data.target[job.tuning.row]), None)
+    return PreparedJob(weights, rng, _labelled_rows(job, data, scaler), unlabelled, few_labels), scaler
+
+
+def _labelled_rows(job: TrainingJob, data: TrainingData, scaler: Scaler) -> LabelledRows:
+    db_uT, target, skin = (values[job.train] for values in (data.db_uT, data.target, data.skin))
+    if isinstance(job.recipe, AugmentedRecipe):
+        rng = rng_for(job.seed, "augment", job.fold, job.seed_i)
+        virtual_uT, virtual_skin = virtual_boards(db_uT, skin, job.recipe.augmentation, rng)
+        skin_i = np.unique(skin, return_inverse=True)[1]
+        skin = np.concatenate([skin_i, virtual_skin + skin_i.max() + 1])
+        db_uT = np.concatenate([db_uT, virtual_uT])
+        target = np.tile(target, (1 + job.recipe.augmentation.copies_n, 1))
+    points = triplet_points(target[:, :2], skin) if job.recipe.triplet_weight else None
+    return LabelledRows(scaler.encode(VIEW[job.recipe.inputs](db_uT)), scaler.encode_target(target), points)
+
+
+def virtual_boards(
+    db_uT: Float32[np.ndarray, "f ch"],
+    skin: Shaped[np.ndarray, " f"],
+    settings: Augmentation,
+    rng: np.random.Generator,
+) -> tuple[Float32[np.ndarray, "v ch"], Shaped[np.ndarray, " v"]]:
+    """Copy all rows `copies_n` times, each copy of a skin as another board would read it.
+
+    Each copy of a skin has random gains for each channel and tilts for each chip; noise is random for each reading.
+
+    Returns
+    -------
+    db_uT : row i of copy c is row c * f + i
+    skin : number of the virtual skin of each row
+    """
+    from scipy.spatial.transform import Rotation  # imported late: few recipes have virtual boards
+
+    codes = np.unique(skin, return_inverse=True)[1]
+    skins_n, chips_n = codes.max() + 1, db_uT.shape[1] // AXES_N
+    copies = []
+    for _ in range(settings.copies_n):
+        tilt = Rotation.from_rotvec(
+            np.radians(settings.lean_sd_deg) * rng.standard_normal((skins_n * chips_n, AXES_N))
+        ).as_matrix()
+        gain = 1.0 + settings.gain_sd * rng.standard_normal((skins_n, chips_n, AXES_N, 1))
+        response = (gain * tilt.reshape(skins_n, chips_n, AXES_N, AXES_N)).astype(np.float32)
+        read = np.einsum("fkij,fkj->fki", response[codes], db_uT.reshape(len(db_uT), chips_n, AXES_N))
+        noise = settings.noise_uT * rng.standard_normal(db_uT.shape, dtype=np.float32)
+        copies.append(read.reshape(db_uT.shape) + noise)
+    names = [codes + copy_i * skins_n for copy_i in range(settings.copies_n)]
+    return np.concatenate(copies).astype(np.float32), np.concatenate(names)
+
+
+Batch = dict[str, torch.Tensor]
+# Tensors of a batch, and the rows that each is gathered from.
+_SOURCE = {
+    "inputs": "inputs", "targets": "targets", "positive": "inputs", "negative": "inputs",
+    "unlabelled": "unlabelled", "unlabelled_positive": "unlabelled", "unlabelled_negative": "unlabelled",
+    "few_labels": "few_labels", "few_labels_targets": "few_labels_targets",
+}  # fmt: skip
+# A generator for each kind of draw: one more term of the loss leaves all other batches as they are.
+_STREAMS = ("labelled", "pairs", "unlabelled", "few_labels")
+
+
+class BatchSampler:
+    """The rows of a stack on the device, one network's below the other's, and batches drawn from them."""
+
+    def __init__(self, jobs: Sequence[PreparedJob], batch_n: int, device: str) -> None:
+        self.jobs, self.batch_n, self.device = jobs, batch_n, device
+        self.rngs = [dict(zip(_STREAMS, job.rng.spawn(len(_STREAMS)), strict=True)) for job in jobs]
+        rows: dict[str, list[np.ndarray]] = {
+            "inputs": [job.labelled.inputs for job in jobs],
+            "targets": [job.labelled.targets for job in jobs],
+            "unlabelled": [job.unlabelled.inputs for job in jobs if job.unlabelled],
+            "few_labels": [job.few_labels.inputs for job in jobs if job.few_labels],
+            "few_labels_targets": [job.few_labels.targets for job in jobs if job.few_labels],
+        }
+        self.rows = {
+            name: torch.from_numpy(np.concatenate(values)).to(device) for name, values in rows.items() if values
+        }
+        self.first_row = {name: np.cumsum([0, *map(len, values)])[:-1] for name, values in rows.items()}
+
+    def sample(self, steps_n: int) -> Iterator[Batch]:
+        """Draw the batches of `steps_n` steps; each tensor is [m b ...].
+
+        `inputs` and `targets` are labelled rows, `positive` and `negative` complete their triplets. With unlabelled
+        rows: `unlabelled` (the anchors), `unlabelled_positive`, `unlabelled_negative`. With a few labelled rows of the
+        new skin: `few_labels`, `few_labels_targets`.
+        """
+        shape = (steps_n, self.batch_n)
+        drawn = [_draw_rows(job, shape, rngs) for job, rngs in zip(self.jobs, self.rngs, strict=True)]
+        batches = {name: self._gather(_SOURCE[name], [rows[name] for rows in drawn]) for name in drawn[0]}
+        return ({name: values[i] for name, values in batches.items()} for i in range(steps_n))
+
+    def _gather(self, source: str, drawn: Sequence[Int64[np.ndarray, "s b"]]) -> torch.Tensor:
+        pairs = zip(drawn, self.first_row[source], strict=True)
+        rows = np.stack([row + first for row, first in pairs], axis=1)  # [s m b]
+        return self.rows[source][torch.from_numpy(rows).to(self.device)]
+
+
+def _draw_rows(
+    job: PreparedJob, shape: tuple[int, int], rngs: Mapping[str, np.random.Generator]
+) -> dict[str, Int64[np.ndarray, "s b"]]:
+    rows = rngs["labelled"].integers(len(job.labelled.inputs), size=shape)
+    drawn = {"inputs": rows, "targets": rows}
+    if job.labelled.points is not None:
+        positive, negative = draw_triplets(job.labelled.points, rows.ravel(), rngs["pairs"])
+        drawn |= {"positive": positive.reshape(shape), "negative": negative.reshape(shape)}
+    if job.unlabelled is not None:
+        points, row, rng = job.unlabelled.points, job.unlabelled.row, rngs["unlabelled"]
+        anchor = points.anchors[rng.integers(len(points.anchors), size=shape[0] * shape[1])]
+        positive, negative = draw_triplets(points, anchor, rng)
+        drawn["unlabelled"] = row[anchor].reshape(shape)
+        drawn["unlabelled_positive"] = row[positive].reshape(shape)
+        drawn["unlabelled_negative"] = row[negative].reshape(shape)
+    if job.few_labels is not None:
+        rows = rngs["few_labels"].integers(len(job.few_labels.inputs), size=shape)
+        drawn |= {"few_labels": rows, "few_labels_targets": rows}
+    return drawn

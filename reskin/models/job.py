@@ -1,0 +1,206 @@
+"""Training jobs: a recipe on one fold with one seed, or a trained network fine-tuned on a new skin.
+
+`JobKeys` names the result of a job by a digest of everything that decides it; finished trainings are cached by it.
+"""
+
+import hashlib
+import importlib.metadata
+import json
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from time import perf_counter
+
+import numpy as np
+from jaxtyping import Float32, Int64, Shaped
+
+from reskin.code import digest
+from reskin.data.lines import Lines
+from reskin.models.inputs import Scaler
+from reskin.models.recipe import AdaptationRecipe, FineTuningRecipe, Recipe, Schedule
+from reskin.numerics import device, signature
+
+COLLAPSED = 0.05  # explained variance of a target on training rows; sound networks explain more than 0.9
+# The modules whose code decides the result of a training (tests/models/test_job.py compares them with the imports).
+CODE_MODULES = (
+    "reskin.seeds",
+    *(f"reskin.models.{name}" for name in ("batches", "inputs", "job", "losses", "network", "reproducible", "train")),
+)
+LIBRARIES = ("torch", "numpy", "scipy")
+REPEATS_N = 25
+
+Weights = Mapping[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """Weights of the loss terms beside the squared error on labelled rows.
+
+    triplet: triplet loss of labelled rows. unlabelled: triplet loss of unlabelled pokes of the new skin. few_labels:
+    squared error on labelled pokes of the new skin.
+    """
+
+    triplet: float
+    unlabelled: float = 0.0
+    few_labels: float = 0.0
+
+
+@dataclass(frozen=True)
+class TrainingData:
+    """Changes of field, targets (x, y, F or x, y, Fx, Fy, Fz), and the skin of each row, for triplets."""
+
+    db_uT: Float32[np.ndarray, "f ch"]
+    target: Float32[np.ndarray, "f t"]
+    skin: Shaped[np.ndarray, " f"]
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """A finished training.
+
+    key: name of the result in the cache. curve: mean squared error of every block of steps. predicted: x, y in mm and
+    F in N for the test rows. stopped_step: step at which the training diverged; the weights are those before.
+    explained_min: least explained variance (R2) of a target on training rows; None for a short training. seconds: time
+    of the training, its share of the stack's. one_reading_s: median time of a prediction for one reading. reused:
+    finished by an earlier run. collapsed_before_n: trainings of the same job that collapsed before this one.
+    """
+
+    key: str
+    weights: Weights
+    scaler: Scaler
+    curve: list[float]
+    predicted: Float32[np.ndarray, "b t"]
+    stopped_step: int | None
+    explained_min: float | None
+    seconds: float
+    one_reading_s: float
+    reused: bool = False
+    collapsed_before_n: int = 0
+
+    @property
+    def collapsed(self) -> bool:
+        """Whether the network predicts nearly the same for any input, for at least one target."""
+        return self.explained_min is not None and self.explained_min < COLLAPSED
+
+
+@dataclass(frozen=True)
+class Pretrained:
+    """A trained network that fine-tuning starts from, and its key."""
+
+    key: str
+    weights: Weights
+    scaler: Scaler
+
+
+@dataclass(frozen=True)
+class Adaptation:
+    """Self-supervised fine-tuning on unlabelled pokes of a new skin (paper section 5).
+
+    Of the rows of `lines`, only the change of field is used.
+    """
+
+    start: Pretrained
+    settings: AdaptationRecipe
+    lines: Lines
+
+
+@dataclass(frozen=True)
+class FineTuning:
+    """Fine-tuning on a few labelled pokes of a new skin; `row` are their row numbers."""
+
+    start: Pretrained
+    settings: FineTuningRecipe
+    row: Int64[np.ndarray, " o"]
+
+
+@dataclass(frozen=True)
+class TrainingJob:
+    """One training.
+
+    experiment: what the training is for, such as `lobo` (leave one board out). train, test: row numbers. skin: the skin
+    that is adapted to. what: a further part of the name. attempt_i: trainings of this job that collapsed before.
+    """
+
+    experiment: str
+    recipe_name: str
+    recipe: Recipe
+    fold: str
+    seed: int
+    seed_i: int
+    train: Int64[np.ndarray, " a"]
+    test: Int64[np.ndarray, " b"]
+    tuning: Adaptation | FineTuning | None = None
+    skin: str = ""
+    what: str = ""
+    attempt_i: int = 0
+
+    @property
+    def name(self) -> str:
+        """File name of the model, unique within a stage."""
+        parts = [self.experiment, self.recipe_name, self.fold, self.skin, self.what, f"seed{self.seed_i}"]
+        return ".".join(part for part in parts if part)
+
+    @property
+    def schedule(self) -> Schedule:
+        return self.recipe if self.tuning is None else self.tuning.settings
+
+    @property
+    def loss_weights(self) -> LossWeights:
+        match self.tuning:
+            case Adaptation(settings=settings):
+                return LossWeights(self.recipe.triplet_weight, unlabelled=settings.unlabelled_weight)
+            case FineTuning(settings=settings):
+                return LossWeights(self.recipe.triplet_weight, few_labels=settings.own_weight)
+        return LossWeights(self.recipe.triplet_weight)
+
+
+class JobKeys:
+    """Keys of the results of jobs on the same data: digests of rows, recipe, seed, start, code and libraries."""
+
+    def __init__(self, data: TrainingData) -> None:
+        self.data = data
+        self._train_digests: dict[int, tuple[np.ndarray, str]] = {}
+
+    def key(self, job: TrainingJob) -> str:
+        decisive = [
+            device(), *signature(), job.fold, job.skin, job.recipe.model_dump_json(), job.seed, job.seed_i,
+            job.attempt_i, self._train_digest(job.train), _digest(self.data.db_uT[job.test]),
+            *map(digest, CODE_MODULES), *map(importlib.metadata.version, LIBRARIES), sys.platform,
+        ]  # fmt: skip
+        if job.tuning is not None:
+            decisive += [job.tuning.start.key, job.tuning.settings.model_dump_json()]
+        match job.tuning:
+            case Adaptation(lines=lines):
+                decisive += [_digest(self.data.db_uT[lines.row], lines.line_i, lines.order_i)]
+            case FineTuning(row=row):
+                decisive += [_digest(self.data.db_uT[row], self.data.target[row])]
+        return hashlib.sha256(json.dumps(decisive).encode()).hexdigest()[:32]
+
+    def data_digest(self) -> str:
+        return _digest(self.data.db_uT, self.data.target)
+
+    def _train_digest(self, train: np.ndarray) -> str:
+        if id(train) not in self._train_digests:  # the array is kept, so that its id is not reused
+            skin = np.unique(self.data.skin[train], return_inverse=True)[1]
+            content = _digest(self.data.db_uT[train], self.data.target[train], skin)
+            self._train_digests[id(train)] = (train, content)
+        return self._train_digests[id(train)][1]
+
+
+def _digest(*arrays: np.ndarray) -> str:
+    found = hashlib.sha256()
+    for array in arrays:
+        found.update(f"{array.dtype}{array.shape}".encode())
+        found.update(np.ascontiguousarray(array).data)
+    return found.hexdigest()[:32]
+
+
+def median_call_s(call: Callable[[], object]) -> float:
+    """Return the median time of a call in s, of `REPEATS_N` after one that warms the caches."""
+    call()
+    times_s = []
+    for _ in range(REPEATS_N):
+        start_s = perf_counter()
+        call()
+        times_s.append(perf_counter() - start_s)
+    return float(np.median(times_s))

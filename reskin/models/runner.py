@@ -1,0 +1,188 @@
+"""Run many training jobs in parallel, with a cache of finished trainings.
+
+Jobs of equal settings and seed are trained as one stack. The place of a network in a stack shows in the last bits of
+its sums, so stacks are made of all jobs that are requested, finished or not, and a result is cached by the keys of all
+members of its stack. A stage that was killed goes on with the stacks that are not complete.
+"""
+
+import hashlib
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor, as_completed
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from reskin import io
+from reskin.errors import SchemaError, TrainingError
+from reskin.models.inputs import Scaler
+from reskin.models.job import JobKeys, TrainingData, TrainingJob, TrainingResult
+from reskin.numerics import device
+
+MAX_ATTEMPTS_N = (
+    3  # trainings of one job; one that collapses in all of them is kept, recorded, and refused by `predict`
+)
+STACK_N = {"cpu": 3, "cuda": 64}  # networks trained side by side; on a CPU more gain nothing, and two processes share
+NO_ROWS = np.zeros(0, np.int64)  # stands for row numbers that lie in the shared file
+
+RemoteJob = tuple[TrainingJob, str, str]  # a job without its row numbers, and the names of those of `train` and `test`
+FoldRows = Mapping[int, tuple[str, np.ndarray]]  # by id of the array: its name in the shared file, and the array
+
+
+def run_jobs(
+    jobs: Sequence[TrainingJob], data: TrainingData, *, executor: Executor, cache: Path, log: Callable[[str], None]
+) -> list[TrainingResult]:
+    """Train the jobs that are not in the cache, and return all results in the order of `jobs`.
+
+    A job that collapses is trained again with other random draws, at most `MAX_ATTEMPTS_N` times in all.
+
+    Parameters
+    ----------
+    data : rows that the jobs name by number
+    executor : where stacks are trained
+    cache : folder of finished trainings
+    log : receives one line for each finished stack, and warnings
+    """
+    results = _run_once(jobs, data, executor, cache, log)
+    for attempt_i in range(1, MAX_ATTEMPTS_N):
+        collapsed = [i for i, result in enumerate(results) if result.collapsed]
+        if not collapsed:
+            break
+        log(f"{len(collapsed)} of {len(jobs)} trainings collapsed: once more with other draws")
+        retries = [replace(jobs[i], attempt_i=attempt_i) for i in collapsed]
+        for i, result in zip(collapsed, _run_once(retries, data, executor, cache, log), strict=True):
+            seconds = results[i].seconds + result.seconds
+            results[i] = replace(result, collapsed_before_n=attempt_i, seconds=seconds)
+    return results
+
+
+def _run_once(
+    jobs: Sequence[TrainingJob], data: TrainingData, executor: Executor, cache: Path, log: Callable[[str], None]
+) -> list[TrainingResult]:
+    job_keys = JobKeys(data)
+    keys = [job_keys.key(job) for job in jobs]
+    unique = dict(zip(keys, jobs, strict=True))  # equal jobs are trained once
+    planned = [(stack, _result_files(stack, cache)) for stack in make_stacks(unique, STACK_N[device()])]
+    missing = [(stack, files) for stack, files in planned if not all([_is_intact(file, log) for file in files])]
+    fresh = {key for stack, _ in missing for key in stack}
+    if len(fresh) < len(unique):
+        log(f"{len(unique) - len(fresh)} of {len(unique)} trainings were finished before")
+    if missing:
+        shared_file = cache / "rows" / f"{job_keys.data_digest()}-{os.getpid()}.safetensors"  # one for each process
+        work = [([unique[key] for key in stack], files) for stack, files in missing]
+        # Row numbers are named by their content: a worker reads a set once, and no call carries 8 bytes a row.
+        sets = {id(rows): rows for stack, _ in work for job in stack for rows in (job.train, job.test)}
+        folds = {i: (hashlib.sha256(rows.tobytes()).hexdigest()[:32], rows) for i, rows in sets.items()}
+        skin = np.unique(data.skin, return_inverse=True)[1].astype(np.int64)
+        tensors = {"db_uT": data.db_uT, "target": data.target, "skin": skin} | dict(folds.values())
+        io.write_tensors(shared_file, tensors, {})
+        try:
+            _run_stacks(work, shared_file, folds, executor, log)
+        finally:
+            io.remove(shared_file)
+    file_of = {key: file for stack, files in planned for key, file in zip(stack, files, strict=True)}
+    return [replace(_read_result(file_of[key]), reused=key not in fresh) for key in keys]
+
+
+def make_stacks(jobs: Mapping[str, TrainingJob], size_n: int) -> list[list[str]]:
+    """Group the keys of jobs of equal settings and seed, in order, at most `size_n` in a stack."""
+    alike: dict[tuple[object, ...], list[str]] = {}
+    for key, job in jobs.items():
+        alike.setdefault((job.recipe, job.schedule, job.loss_weights, job.seed, job.seed_i), []).append(key)
+    return [group[i : i + size_n] for group in alike.values() for i in range(0, len(group), size_n)]
+
+
+def _result_files(stack: Sequence[str], cache: Path) -> list[Path]:
+    digest = hashlib.sha256("".join(stack).encode()).hexdigest()[:32]
+    return [cache / f"{digest}-{i}.safetensors" for i in range(len(stack))]
+
+
+def _run_stacks(
+    stacks: Sequence[tuple[Sequence[TrainingJob], Sequence[Path]]], shared_file: Path, folds: FoldRows,
+    executor: Executor, log: Callable[[str], None],
+) -> None:  # fmt: skip
+    start_s, done_n, jobs_n = time.monotonic(), 0, sum(len(stack) for stack, _ in stacks)
+    running = {}
+    for stack, files in stacks:
+        remote = [
+            (replace(job, train=NO_ROWS, test=NO_ROWS), folds[id(job.train)][0], folds[id(job.test)][0])
+            for job in stack
+        ]
+        running[executor.submit(_train_to_files, shared_file, remote, files)] = stack
+    for future in as_completed(running):
+        try:
+            future.result()
+        except Exception as error:
+            executor.shutdown(cancel_futures=True)
+            if isinstance(error, TrainingError):
+                raise TrainingError(f"{running[future][0].name}, {error}") from None
+            raise
+        done_n += len(running[future])
+        left_s = (time.monotonic() - start_s) / done_n * (jobs_n - done_n)
+        log(f"{done_n}/{jobs_n} {running[future][-1].name}, about {left_s:.0f} s left")
+
+
+def _train_to_files(shared_file: Path, remote: Sequence[RemoteJob], files: Sequence[Path]) -> None:
+    """Train a stack in a worker, and write the result of each job to its file."""
+    from reskin.models.train import train_stack  # imports torch: only a process that trains needs it
+
+    jobs = [
+        replace(job, train=_read_rows(shared_file, train), test=_read_rows(shared_file, test))
+        for job, train, test in remote
+    ]
+    try:
+        results = train_stack(jobs, _read_data(shared_file))
+    except RuntimeError as error:
+        if "out of memory" in str(error) or "allocate memory" in str(error):  # torch has no error of its own on a CPU
+            raise MemoryError(str(error)) from None
+        raise
+    for job, file, result in zip(jobs, files, results, strict=True):
+        tensors = {f"weights.{name}": value for name, value in result.weights.items()} | result.scaler.arrays()
+        tensors |= {"curve": np.array(result.curve), "predicted": result.predicted}
+        metadata = {"seconds": f"{result.seconds:.3f}", "one_reading_s": f"{result.one_reading_s:.3g}"}
+        metadata["job"] = job.name
+        optional = {"stopped_step": result.stopped_step, "explained_min": result.explained_min}
+        metadata |= {name: repr(value) for name, value in optional.items() if value is not None}
+        io.write_tensors(file, tensors, metadata)
+
+
+def _is_intact(file: Path, log: Callable[[str], None]) -> bool:
+    """Return whether a result is in the cache; delete one that is damaged."""
+    if not file.exists():
+        return False
+    try:
+        io.read_tensors(file)
+    except SchemaError as error:
+        log(f"warning: a finished training is damaged and is trained again ({str(error).partition('. ')[0]})")
+        io.remove(file)
+        return False
+    return True
+
+
+@lru_cache(maxsize=1)
+def _read_data(shared_file: Path) -> TrainingData:
+    return TrainingData(**io.read_tensors(shared_file, ("db_uT", "target", "skin"))[0])
+
+
+@lru_cache(maxsize=16)  # row numbers of a few folds
+def _read_rows(shared_file: Path, name: str) -> np.ndarray:
+    return io.read_tensors(shared_file, (name,))[0][name]
+
+
+def _read_result(file: Path) -> TrainingResult:
+    tensors, metadata = io.read_tensors(file)
+    weights = {name.removeprefix("weights."): v for name, v in tensors.items() if name.startswith("weights.")}
+    return TrainingResult(
+        key=file.stem,
+        weights=weights,
+        scaler=Scaler.of_arrays(tensors),
+        curve=[float(value) for value in tensors["curve"]],
+        predicted=tensors["predicted"],
+        stopped_step=int(metadata["stopped_step"]) if "stopped_step" in metadata else None,
+        explained_min=float(metadata["explained_min"]) if "explained_min" in metadata else None,
+        seconds=float(metadata["seconds"]),
+        one_reading_s=float(metadata["one_reading_s"]),
+    )
