@@ -1,7 +1,8 @@
 """The public functions and classes of `reskin`, for notebooks and robot programs.
 
-They take names and plain values and return NumPy arrays. Units are in names: mm, N, uT; a channel is Bx, By or Bz of a
-chip. Functions import what they need when they are called, so that `import reskin` costs little.
+They take names and plain values and return NumPy arrays. Names end in units: mm, N, s, uT. The channels of a field are
+Bx, By, Bz of chip 0, then of chip 1, and so on. Each function imports what it needs when it is called, so that
+`import reskin` is quick.
 """
 
 from __future__ import annotations
@@ -21,56 +22,81 @@ from reskin.simulation.defaults import nominal
 
 if TYPE_CHECKING:
     from reskin.data.rows import Rows
-    from reskin.live.session import Skins as LiveSkins
-    from reskin.live.tracker import Skin as LiveSkin
+    from reskin.live.tracker import LiveSkin, LiveSkins
     from reskin.models.trained import Network
     from reskin.physics.board import Board
     from reskin.physics.skin import Skin
     from reskin.recordings.labels import Label
     from reskin.universal.model import Universal
 
-Answering = Union[Path, str, Sequence[Path | str], "Model", "Universal"]
+AnyModel = Union[Path, str, Sequence[Path | str], "Model", "Universal"]
 Changes = Mapping[str, Any]  # of nominal settings, by name
 NOMINAL_BOARD = "rigid"
 
 
 def load_rows(folder: Path | str, *, force_min_N: float = 0.0) -> Rows:
-    """Load ingested readings of contacts, as models are trained on them.
+    """Load the readings in contact that networks are trained on.
 
     Parameters
     ----------
-    folder : folder of Parquet files, such as `data/indentations/quick` after `dvc repro`
-    force_min_N : readings with less normal force are left out
+    folder : path
+        A folder of ingested readings (Parquet), such as `data/indentations/quick` after `dvc repro`.
+    force_min_N : float
+        Leave out readings with a smaller normal force.
 
     Returns
     -------
-    Rows : `db_uT` [f ch] is the change of field, `target` [f 3] is x_mm, y_mm and Fz_N; `board` and `skin` [f] names
+    Rows
+        `db_uT` [f ch] is the change of field; `target` [f 3] is x_mm, y_mm and Fz_N; `board` and `skin` [f] are names.
 
-    >>> rows = load_rows("data/indentations/quick")  # doctest: +SKIP
-    >>> rows.db_uT, rows.target, rows.board  # doctest: +SKIP
+    Raises
+    ------
+    ParamsError
+        If the folder holds no Parquet file.
+
+    Examples
+    --------
+    >>> rows = reskin.load_rows("data/indentations/quick")  # doctest: +SKIP
+    >>> rows.db_uT.shape, rows.target.shape  # doctest: +SKIP
+    ((8190, 15), (8190, 3))
     """
     from reskin.data import folds
     from reskin.data.rows import Selection
 
     files = sorted(Path(folder).glob("*.parquet"))
     if not files:
-        remedy = "Ingest captures first: dvc repro."
-        raise ParamsError("load_rows", "the folder", "one with Parquet files", str(folder), remedy)
+        raise ParamsError(f"{folder}: no Parquet files in this folder. Ingest captures first: dvc repro.")
     return folds.load_rows(files, Selection(force_min_N=force_min_N))
 
 
 def draw_board(name: str = "b0", *, seed: int = 0, spreads: Changes | None = None, **design: Any) -> Board:
-    """Draw a simulated circuit board; the same name and seed give the same board.
+    """Draw a simulated circuit board, with the tolerances of real ones.
 
     Parameters
     ----------
-    name : name of the board
-    seed : seed of all draws
-    spreads : changes of the standard deviations between boards, such as `{"chip_offset_uT": 0.0}`
-    design : changes of the nominal board: `chips_xy_mm` [[x, y], ...] seen from the middle of the skin,
-        `chips_turn_deg` [turn, ...], `gap_mm`
+    name, seed : str, int
+        The same name and seed give the same board.
+    spreads : mapping, optional
+        Standard deviations between boards that differ from the nominal ones, such as `{"chip_offset_uT": 0.0}`.
+    **design
+        Settings that differ from the nominal board's: `chips_xy_mm` [[x, y], ...] from the middle of the skin,
+        `chips_turn_deg` [turn, ...], `gap_mm`.
 
-    >>> board = draw_board(gap_mm=0.6)
+    Returns
+    -------
+    Board
+        `chips_m` [k 3] holds the places of the chips.
+
+    Raises
+    ------
+    ParamsError
+        If a setting is unknown or its value is invalid.
+
+    Examples
+    --------
+    >>> board = reskin.draw_board(chips_xy_mm=[[0, 0], [7, 0]], chips_turn_deg=[0, 90])
+    >>> board.chips_m.shape
+    (2, 3)
     """
     from reskin.physics import board
     from reskin.physics.board import BoardDesign, Spreads
@@ -80,20 +106,30 @@ def draw_board(name: str = "b0", *, seed: int = 0, spreads: Changes | None = Non
 
 
 def draw_skin(name: str = "b0_s0", *, seed: int = 0, spreads: Changes | None = None, **design: Any) -> Skin:
-    """Draw a simulated skin; the same name and seed give the same skin.
+    """Draw a simulated skin, with the tolerances of real ones.
 
     Parameters
     ----------
-    name : name of the skin
-    seed : seed of all draws
-    spreads : changes of the standard deviations between skins, such as `{"skin_modulus": 0.0}`
-    design : changes of the nominal skin: `thickness_mm`, `modulus_kPa`, `tip_radius_mm`, ...
+    name, seed : str, int
+        The same name and seed give the same skin.
+    spreads : mapping, optional
+        Standard deviations between skins that differ from the nominal ones, such as `{"skin_modulus": 0.0}`.
+    **design
+        Settings that differ from the nominal skin's: `thickness_mm`, `modulus_kPa`, `tip_radius_mm`, ...
 
     Returns
     -------
-    Skin : `nodes_m` [s 3] and `moments_A_m2` [s 3] are the dipoles that the skin is summed of
+    Skin
+        `nodes_m` [s 3] and `moments_A_m2` [s 3] are the dipoles that stand for its magnetisation.
 
-    >>> skin = draw_skin(seed=1, thickness_mm=3.0)
+    Raises
+    ------
+    ParamsError
+        If a setting is unknown or its value is invalid.
+
+    Examples
+    --------
+    >>> skin = reskin.draw_skin(seed=1, thickness_mm=3.0)
     """
     from scipy.constants import milli
 
@@ -113,22 +149,49 @@ def draw_skin(name: str = "b0_s0", *, seed: int = 0, spreads: Changes | None = N
 
 
 class Pokes(NamedTuple):
-    """Simulated pokes: fields in uT as the chips read them, before and at each poke, and the normal force in N."""
+    """Simulated indentations, as `simulate_pokes` returns them."""
 
-    noload_uT: np.ndarray  # [n ch]
-    b_uT: np.ndarray  # [n ch]
-    Fz_N: np.ndarray  # [n], positive in compression
+    noload_uT: np.ndarray  # [n ch] fields before each one
+    b_uT: np.ndarray  # [n ch] fields at each one
+    Fz_N: np.ndarray  # [n] normal forces, positive in compression
 
 
 def simulate_pokes(
     skin: Skin, pokes: ArrayLike, *, board: Board | None = None, seed: int = 0, chip: Changes | None = None
 ) -> Pokes:
-    """Poke a fresh skin at places [[x_mm, y_mm, depth_mm], ...] [n 3]; the middle of the skin is at (8, 8) mm.
+    """Simulate indentations of a fresh skin: what the chips read, and the normal force.
 
-    >>> noload_uT, b_uT, Fz_N = simulate_pokes(draw_skin(), [[8.0, 8.0, 1.0], [2.0, 4.0, 0.5]])  # doctest: +SKIP
+    Ageing and friction, which only some protocols of the pipeline simulate, are left out.
 
-    Without a board, it is poked on the default one. `chip` changes the nominal magnetometer, as
-    `{"noise_xy_uT": 0.0, "noise_z_uT": 0.0}`. Terms that only some protocols need (ageing, friction) are left out.
+    Parameters
+    ----------
+    skin : Skin
+        The skin, of `draw_skin`.
+    pokes : array [n 3]
+        x_mm, y_mm and depth_mm of each; the middle of the skin is at (8, 8) mm.
+    board : Board, optional
+        The board under the skin, of `draw_board`; the nominal one if not given.
+    seed : int
+        Seed of the noise, and of the board if none is given.
+    chip : mapping, optional
+        Settings that differ from the nominal magnetometer's, such as `{"noise_xy_uT": 0.0, "noise_z_uT": 0.0}`.
+
+    Returns
+    -------
+    Pokes
+        `noload_uT` and `b_uT` [n ch], and `Fz_N` [n].
+
+    Raises
+    ------
+    ParamsError
+        If `pokes` has another shape or a setting is invalid.
+
+    Examples
+    --------
+    >>> skin = reskin.draw_skin(seed=1)
+    >>> noload_uT, b_uT, force_N = reskin.simulate_pokes(skin, [[8.0, 8.0, 1.0], [2.0, 4.0, 0.5]])
+    >>> b_uT.shape, force_N.shape
+    ((2, 15), (2,))
     """
     from scipy.constants import milli
 
@@ -138,8 +201,10 @@ def simulate_pokes(
 
     places_mm = np.asarray(pokes, np.float64)
     if places_mm.ndim != 2 or places_mm.shape[1] != 3:
-        remedy = "Try: [[8.0, 8.0, 1.0]]"
-        raise ParamsError("simulate_pokes", "pokes", "rows of x_mm, y_mm, depth_mm", f"shape {places_mm.shape}", remedy)
+        raise ParamsError(
+            f"simulate_pokes: pokes has shape {places_mm.shape}; it needs rows of x_mm, y_mm, depth_mm. "
+            "Try: [[8.0, 8.0, 1.0]]"
+        )
     tip_m = (places_mm - (CENTRE_MM, CENTRE_MM, 0.0)) * milli
     board = board or draw_board(seed=seed)
     rngs = {part: rng_for(seed, "poking", skin.name, part) for part in ("drift", "noload", "contact")}
@@ -152,7 +217,15 @@ def simulate_pokes(
 
 
 class Model:
-    """A trained network with a no-load reading: `zero` it while nothing touches the skin, then let it `predict`."""
+    """A trained network and the no-load reading of a skin, returned by `load_model`.
+
+    Call `zero` with readings without contact, then `predict`.
+
+    Attributes
+    ----------
+    card : mapping
+        The model's JSON card: what it was trained on, and how.
+    """
 
     def __init__(self, network: Network) -> None:
         self._network = network
@@ -160,28 +233,60 @@ class Model:
 
     @property
     def card(self) -> Mapping[str, Any]:
-        """What the model was trained on, and how (its JSON card)."""
         return self._network.card
 
     def zero(self, b_uT: ArrayLike) -> Model:
-        """Take the mean of fields in uT without contact, [f ch] or one reading [ch], as the no-load reading."""
+        """Set the no-load reading.
+
+        Parameters
+        ----------
+        b_uT : array [f ch] or [ch]
+            Fields without contact; their mean is subtracted from now on.
+
+        Returns
+        -------
+        Model
+            The model itself.
+
+        Raises
+        ------
+        SchemaError
+            If the number of channels is not the model's.
+        """
         self._noload_uT = self._rows(b_uT).mean(axis=0, dtype=np.float64)
         return self
 
     def predict(self, b_uT: ArrayLike) -> np.ndarray:
-        """Give x_mm, y_mm and the normal force in N, [f 3], of fields in uT [f ch]; of one reading [ch], [3].
+        """Predict place and normal force.
 
-        Off contact the three numbers mean nothing: the change of field is then noise.
+        Parameters
+        ----------
+        b_uT : array [f ch] or [ch]
+            Fields in contact. Without contact the change of field is noise, and the prediction has no meaning.
+
+        Returns
+        -------
+        array [f 3] or [3]
+            x_mm, y_mm and the normal force in N.
+
+        Raises
+        ------
+        ParamsError
+            Before `zero` was called.
+        SchemaError
+            If the number of channels is not the model's.
         """
         if self._noload_uT is None:
-            remedy = "First call zero with readings without contact."
-            raise ParamsError("predict", "the model", "zeroed", "no no-load reading", remedy)
+            raise ParamsError("predict: the model has no no-load reading. First call zero with fields without contact.")
         rows_uT = self._rows(b_uT)
-        answer = self._network((rows_uT - self._noload_uT).astype(np.float32))
-        return answer if np.ndim(b_uT) == 2 else answer[0]
+        predicted = self._network((rows_uT - self._noload_uT).astype(np.float32))
+        return predicted if np.ndim(b_uT) == 2 else predicted[0]
 
     def export_onnx(self, file: Path | str) -> None:
-        """Write the network as an ONNX file: changes of field in uT in, x_mm, y_mm and F_N out; needs package onnx."""
+        """Write the network as an ONNX file: changes of field in uT in, x_mm, y_mm and F_N out.
+
+        Needs the package onnx (`pip install '.[onnx]'`).
+        """
         from reskin.models import trained
 
         trained.write(self._network, Path(file))
@@ -189,111 +294,215 @@ class Model:
     def _rows(self, b_uT: ArrayLike) -> np.ndarray:
         rows_uT, channels_n = np.atleast_2d(np.asarray(b_uT, np.float32)), self.card["input"]["channels_n"]
         if rows_uT.ndim != 2 or rows_uT.shape[1] != channels_n:
-            rule, remedy = f"the {channels_n} of the model", "Give Bx, By, Bz of chip 0, then of chip 1, ..."
-            raise SchemaError("fields", "channels", rule, f"shape {np.shape(b_uT)}", remedy)
+            raise SchemaError(
+                f"fields of shape {np.shape(b_uT)} do not fit the {channels_n} channels of the model. "
+                "Give Bx, By, Bz of chip 0, then of chip 1, ..."
+            )
         return rows_uT
 
 
 def load_model(file: Path | str) -> Model:
-    """Load a trained model (.safetensors), its card (.json) beside it.
+    """Load a trained network.
 
-    >>> model = load_model("data/models/quick/train_multi/NAME.safetensors").zero(noload_uT)  # doctest: +SKIP
-    >>> x_mm, y_mm, force_N = model.predict(b_uT)  # doctest: +SKIP
+    Parameters
+    ----------
+    file : path
+        The weights (.safetensors); the JSON card with the same name lies beside them.
+
+    Returns
+    -------
+    Model
+
+    Raises
+    ------
+    ReskinError
+        If a file is missing, or the card does not fit the weights.
+
+    Examples
+    --------
+    >>> file = "data/models/quick/train_multi/NAME.safetensors"
+    >>> model = reskin.load_model(file).zero(noload_uT)  # doctest: +SKIP
+    >>> x_mm, y_mm, force_N = model.predict(b_uT)[0]  # doctest: +SKIP
     """
     from reskin.predicting import read_network
 
     return Model(read_network(Path(file)))
 
 
-def load_universal(skin: Path | str | None = None) -> Universal:
-    """Load the map and network of simulated skins that come with the project, for a skin that nobody calibrated.
+def load_universal(calibration: Path | str | None = None) -> Universal:
+    """Load the universal model that comes with the library, for a skin that nobody has recorded.
 
-    >>> skin = load_universal().zero(noload_uT)  # doctest: +SKIP
-    >>> x_mm, y_mm, force_N = skin.predict(b_uT)[0]  # doctest: +SKIP
+    Its methods calibrate it to a skin: `zero` to readings without contact, `see` to presses at unknown places, `label`
+    to presses at known ones; `next_place` proposes where to press next, and `save` writes the calibration.
 
-    It learns while it is used: `see` pokes anywhere, `label` some at known places; `next_place` says which tells most.
-    What it was told of a skin can be kept: `skin.save("FILE.safetensors")`, then `load_universal("FILE.safetensors")`.
+    Parameters
+    ----------
+    calibration : path, optional
+        A file that `save` wrote, to go on with that skin.
+
+    Returns
+    -------
+    Universal
+
+    Raises
+    ------
+    ReskinError
+        If the file is missing or no calibration.
+
+    Examples
+    --------
+    >>> noload_uT, b_uT, force_N = reskin.simulate_pokes(reskin.draw_skin(seed=1), [[8.0, 8.0, 1.5]])
+    >>> model = reskin.load_universal().zero(noload_uT)
+    >>> model.predict(b_uT).shape  # x_mm, y_mm, F_N
+    (1, 3)
     """
-    from reskin.universal import model as shipped
+    from reskin.universal.model import load_universal as load
 
-    return shipped.load_universal(skin)
+    return load(calibration)
 
 
 @overload
-def open(port: str, *, model: Answering = (), baud: int = 115200) -> LiveSkin: ...
+def open(port: str, *, model: AnyModel = (), baud: int = 115200) -> LiveSkin: ...
 @overload
-def open(port: list[str], *, model: Answering = (), baud: int = 115200) -> LiveSkins: ...
-def open(port: str | list[str], *, model: Answering = (), baud: int = 115200) -> LiveSkin | LiveSkins:
-    """Open a board's port: its contacts while they happen. In the first second nothing may touch the skin.
+def open(port: list[str], *, model: AnyModel = (), baud: int = 115200) -> LiveSkins: ...
+def open(port: str | list[str], *, model: AnyModel = (), baud: int = 115200) -> LiveSkin | LiveSkins:
+    """Open a board's port, to read contacts while they happen.
 
-    >>> with open("/dev/ttyACM0", model="data/models/quick/train_multi/NAME.safetensors") as skin:  # doctest: +SKIP
-    ...     for contact in skin:  # the latest; skin.every() for each
+    The `with` statement opens the port, detects wire format and chips, and takes the no-load reading: nothing may touch
+    the skin in the first second. A thread reads the port, so that a slow loop loses no bytes.
+
+    Parameters
+    ----------
+    port : str or list of str
+        A serial port or `socket://host:port`; a list for several boards at once.
+    model : optional
+        One or more trained networks (files, or one `Model`), or a universal model (the file of a calibration, or the
+        object, which is not changed). The uncalibrated universal model if not given.
+    baud : int
+        Baud rate; USB ports ignore it.
+
+    Returns
+    -------
+    LiveSkin or LiveSkins
+        Iterate over it for the latest `Contact`: time, place, force, standard deviation of the place, field, alarms;
+        `every()` yields each reading. For a list of ports, iterate over tuples of contacts, in the order of the ports;
+        a board that is unplugged does not hold up the others.
+
+    Raises
+    ------
+    ReskinError
+        If a model cannot be read or a port is named twice; in the `with` statement, if a port does not open, sends no
+        frames, or has other chips than the model.
+
+    Examples
+    --------
+    >>> with reskin.open("/dev/ttyACM0") as skin:  # doctest: +SKIP
+    ...     for contact in skin:
     ...         print(contact.t_s, contact.x_mm, contact.y_mm, contact.F_N, contact.alarms)
-
-    Format and chips are told from the bytes; `port` may also be `socket://host:port`. Without a model the map of
-    simulated skins answers (`load_universal`); `model` may be loaded already, also one that learnt this skin, which it
-    then keeps but for the no-load reading. Several models give means, and how far they are apart. A list of ports
-    gives the latest contacts of all boards, in its order; one that is unplugged does not hold up the others.
     """
-    from reskin.board.find import check_named_once
-    from reskin.live.answering import check_boards
-    from reskin.live.session import Skins
-    from reskin.live.tracker import Skin
+    from reskin.live.tracker import LiveSkin, LiveSkins, check_ports
     from reskin.predicting import read_models
     from reskin.universal.model import Universal
 
-    if not isinstance(port, str):
-        check_named_once(port, "reskin.open")
+    models: Sequence[Network] | Universal
     if isinstance(model, Universal):
-        models: Sequence[Network] | Universal = model
+        models = model
     elif isinstance(model, Model):
         models = [model._network]
     else:
         models = read_models([Path(file) for file in ([model] if isinstance(model, str | Path) else model)])
     if isinstance(port, str):
-        return Skin(port, models, baud=baud)
-    check_boards(models, len(port), "reskin.open")
-    return Skins([Skin(each, models, baud=baud) for each in port])
+        return LiveSkin(port, models, baud=baud)
+    check_ports(port, models, "reskin.open")
+    return LiveSkins([LiveSkin(each, models, baud=baud) for each in port])
 
 
 def lifted() -> Label:
-    """Make the label of a board that nothing touches; it comes before that of each touch."""
+    """Make the label of a board that nothing touches, for `record`; one has to precede each touch."""
     from reskin.recordings.labels import Label
 
     return Label(False)
 
 
 def touch(x_mm: float, y_mm: float, **known: Any) -> Label:
-    """Make the label of a touch that stands still; `known`: depth_mm, Fx_N, Fy_N, Fz_N (on the skin), pass_i."""
+    """Make the label of a touch that holds still, for `record`.
+
+    Parameters
+    ----------
+    x_mm, y_mm : float
+        Its place.
+    **known
+        What else is known: depth_mm, Fx_N, Fy_N and Fz_N (forces on the skin, Fz positive in compression), pass_i.
+
+    Examples
+    --------
+    >>> reskin.touch(8.0, 4.0, Fz_N=0.5).Fz_N
+    0.5
+    """
     from reskin.recordings.labels import Label
 
     return Label(True, x_mm, y_mm, **known)
 
 
 def record(
-    labels: Iterable[Label] | Callable[[], Label | None], *, port: str | None = None, out: Path | str | None = None,
-    seconds: float = float("inf"), dwell_s: float = 0.5, **told: str,
-) -> Path:  # fmt: skip
-    """Record a board while a program moves a robot and says where it stands; give the capture's folder.
+    labels: Iterable[Label] | Callable[[], Label | None],
+    *,
+    port: str | None = None,
+    out: Path | str | None = None,
+    seconds: float = float("inf"),
+    dwell_s: float = 0.5,
+    **names: str,
+) -> Path:
+    """Record a board while a program moves a robot and says where it stands.
 
-    >>> def pokes():  # doctest: +SKIP
-    ...     for x_mm, y_mm in places:  # in random order: skins remember the touch before
-    ...         robot.lift_and_go_to(x_mm, y_mm); yield reskin.lifted()
-    ...         robot.press(); yield reskin.touch(x_mm, y_mm, Fz_N=robot.force_N())
-    >>> reskin.record(pokes(), board="b1", skin="s1", scan="random")  # doctest: +SKIP
+    Prints to stderr what was recorded, lost and left out.
 
-    Each label holds for `dwell_s`, in which the program is not asked for the next. In place of a generator: a
-    function that is called each time, until it gives None. `told`: board, skin, scan. What came, and what was lost or
-    left out, is said on stderr.
+    Parameters
+    ----------
+    labels : iterable or callable
+        Yields `lifted()` or `touch(...)` once the robot stands still. A callable is called for each label, until it
+        returns None.
+    port : str, optional
+        The board's port; the only board there is if not given.
+    out : path, optional
+        The capture's folder, which must be new; `captures/DATE-TIME` if not given.
+    seconds : float
+        Longest duration.
+    dwell_s : float
+        How long each label holds; the next one is asked for afterwards.
+    **names
+        Names for the header: `board`, `skin`, and `scan`, the order of places.
+
+    Returns
+    -------
+    Path
+        The capture's folder, for `reskin add`.
+
+    Raises
+    ------
+    ReskinError
+        If no board is found, or it sends no frames.
+    Exception
+        Whatever the program raised; what was recorded until then is kept.
+
+    Examples
+    --------
+    >>> def presses():
+    ...     for x_mm, y_mm in places:  # in random order, because a skin remembers the last touch
+    ...         robot.lift_and_go_to(x_mm, y_mm)
+    ...         yield reskin.lifted()
+    ...         robot.press()
+    ...         yield reskin.touch(x_mm, y_mm, Fz_N=robot.force_N())
+    >>> reskin.record(presses(), board="b1", skin="s1", scan="random")  # doctest: +SKIP
     """
     from reskin.board.find import the_board
-    from reskin.live.taping import Wanted, record_board
+    from reskin.live.record import record_board
     from reskin.recordings.label_sources import from_program
 
     board = the_board(None if port is None else [port])
-    wanted = Wanted(Path(out) if out is not None else None, seconds, 115200, told)
-    done = record_board(board, wanted, from_program(labels, dwell_s))
-    print(done.said, file=sys.stderr)
-    if done.failed is not None:
-        raise done.failed
+    folder = Path(out) if out is not None else None
+    done = record_board(board, from_program(labels, dwell_s), folder=folder, seconds=seconds, names=names)
+    print(done.summary, file=sys.stderr)
+    if done.error is not None:
+        raise done.error
     return done.folder

@@ -1,5 +1,7 @@
 """Every use of `import reskin` in at most three lines, from plain values, beside what the pipeline itself gives."""
 
+import doctest
+import importlib
 import subprocess
 import sys
 from pathlib import Path
@@ -23,6 +25,12 @@ from tests.test_predicting import model  # noqa: F401 (a fixture)
 
 ROOT = Path(__file__).resolve().parents[1]
 QUIET_CHIP = {"noise_xy_uT": 0.0, "noise_z_uT": 0.0}
+
+
+@pytest.mark.parametrize("name", ["reskin", "reskin.api", "reskin.errors", "reskin.live.emulator"])
+def test_examples_in_docstrings_run(name):
+    done = doctest.testmod(importlib.import_module(name), extraglobs={"reskin": reskin})
+    assert (done.failed, done.attempted > 0) == (0, True)
 
 
 def test_the_import_is_cheap_and_finds_no_torch():
@@ -71,7 +79,7 @@ def test_a_design_is_changed_with_plain_values_and_a_wrong_one_is_a_sentence():
     assert reskin.simulate_pokes(reskin.draw_skin(thickness_mm=3), [[8, 8, 1]], board=board).b_uT.shape == (1, 6)
     with pytest.raises(ReskinError, match="draw_skin: thickness_mm must be"):
         reskin.draw_skin(thickness_mm="thick")
-    with pytest.raises(ReskinError, match="pokes must be rows of x_mm, y_mm, depth_mm; got shape"):
+    with pytest.raises(ReskinError, match=r"pokes has shape \(3,\); it needs rows of x_mm, y_mm, depth_mm"):
         reskin.simulate_pokes(reskin.draw_skin(), [8, 8, 1])
 
 
@@ -84,7 +92,7 @@ def test_a_zeroed_model_answers_as_the_stages_network_does(model):  # noqa: F811
     noload_uT = b_uT[:2].mean(axis=0, dtype=np.float64)
     np.testing.assert_array_equal(answer, read_network(model)((b_uT[2:] - noload_uT).astype(np.float32)))
     np.testing.assert_array_equal(loaded.predict(b_uT[2].tolist()), answer[0])
-    with pytest.raises(ReskinError, match="the model must be zeroed"):
+    with pytest.raises(ReskinError, match="the model has no no-load reading"):
         reskin.load_model(model).predict(b_uT)
-    with pytest.raises(ReskinError, match="channels must be the 15 of the model; got shape"):
+    with pytest.raises(ReskinError, match=r"fields of shape \(2,\) do not fit the 15 channels"):
         loaded.predict([1.0, 2.0])
