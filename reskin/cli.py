@@ -128,15 +128,20 @@ def record(
     dwell_s: Annotated[float, Option("--dwell", help="How long each prompt's label holds, in s.", min=0.1)] = 1.0,
 ) -> None:
     """Record what a board sends, and labels beside it; or label it with the robot's log when adding it."""
-    from reskin.live.taping import Wanted, board_of, record_board, source_of
+    from reskin.board.find import Found, the_board
+    from reskin.live.record import label_source, record_board
 
-    source = source_of(labels, gauge, scan, dwell_s=dwell_s, say=typer.echo)
-    told = {"board": board, "skin": skin, "scan": scan}
-    board_there = board_of(port, wire, chips_n, say=typer.echo)
-    wanted = Wanted(out, seconds, baud, {name: word for name, word in told.items() if word is not None})
-    done = record_board(board_there, wanted, source)
-    typer.echo(done.said)
-    if done.failed is not None:
+    source = label_source(labels, gauge, scan, dwell_s=dwell_s, say=typer.echo)
+    if port is None:
+        found = the_board()
+        typer.echo(str(found))
+    else:
+        found = Found(port, None, wire or "binary", chips_n or 5)
+    given = {"board": board, "skin": skin, "scan": scan}
+    names = {key: name for key, name in given.items() if name is not None}
+    done = record_board(found, source, folder=out, seconds=seconds, baud=baud, names=names)
+    typer.echo(done.summary)
+    if done.error is not None:
         raise typer.Exit(2)
 
 
@@ -149,22 +154,22 @@ def emulate(
     loop: Annotated[bool, Option("--loop", help="Begin again when it has ended.")] = False,
 ) -> None:
     """Be a board: send a capture or a simulated scene, with faults if asked, to whoever reads the port."""
-    from reskin.live.emulator import inject, open_far_end, parse_fault, play, read_script
+    from reskin.live.emulator import inject, make_port, parse_fault, play, read_script
 
     faults = [parse_fault(text) for text in fault or ()]
     script = read_script(source)
     for one in faults:
         script = inject(script, one)
-    end, stop = open_far_end(port), threading.Event()
-    typer.echo(f"{end.name}: {len(script)} frames of {script.duration_s:.1f} s, {script.wire}; Ctrl-C ends it")
+    emulated, stop = make_port(port), threading.Event()
+    typer.echo(f"{emulated.name}: {len(script)} frames of {script.duration_s:.1f} s, {script.wire}; Ctrl-C ends it")
     started_s = time.monotonic()
     try:
-        sent_n = play(script, end, stop, speed=speed, loop=loop)
+        sent_n = play(script, emulated, stop, speed=speed, loop=loop)
         typer.echo(f"sent {sent_n} bytes in {time.monotonic() - started_s:.1f} s")
     except KeyboardInterrupt:
         typer.echo("stopped")
     finally:
-        end.unplug()
+        emulated.unplug()
 
 
 @app.command()
@@ -187,22 +192,22 @@ def live(
     from reskin.live.emulator import playing, read_script
     from reskin.live.health import LIVE_POLICY
     from reskin.live.server import serve
-    from reskin.live.session import several
+    from reskin.live.session import open_sessions
     from reskin.predicting import read_models
     from reskin.recordings.fault_policy import override
 
     fault_policy = override(LIVE_POLICY, on_fault or (), "--on-fault")
-    given = [word for word, value in (("--port", port), ("--replay", replay), ("--emulate", emulate)) if value]
+    given = [name for name, value in (("--port", port), ("--replay", replay), ("--emulate", emulate)) if value]
     if len(given) > 1:
-        raise ParamsError("live", "the board", "from one of --port, --replay, --emulate", ", ".join(given), "Give one.")
+        raise ParamsError(f"live: give only one of {', '.join(given)}.")
     models = read_models(model or ())
     with ExitStack() as stack:
-        what = "a board"
+        shown = "a board"
         if source := replay or emulate:
             script = read_script(source)
-            port, what = [stack.enter_context(playing(script))], f"{script.source}: {source}, played"
-        boards = several(port or [found.port for found in the_boards()], models, what, fault_policy)
-        serve(boards, host=host, http_port=http_port, say=typer.echo)
+            port, shown = [stack.enter_context(playing(script))], f"{script.source}: {source}, played"
+        sessions = open_sessions(port or [found.port for found in the_boards()], models, shown, fault_policy)
+        serve(sessions, host=host, http_port=http_port, say=typer.echo)
 
 
 @app.command()

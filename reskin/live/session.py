@@ -1,52 +1,198 @@
-"""Skins at work on threads of their own: polled, recorded when asked, one or several at once."""
+"""One board on the page of `reskin live`: the thread that estimates, what pages are sent, and what their buttons do."""
 
 import re
+import struct
 import threading
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from collections import deque
+from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
-from reskin.board.find import check_named_once
+import numpy as np
+from jaxtyping import Bool, Float64
+
 from reskin.board.port import Tape
+from reskin.data.grid import CENTRE_MM
 from reskin.errors import ReskinError
-from reskin.live.answering import Map, Models, check_boards
-from reskin.live.calibrating import Pokes, ShownPokes
 from reskin.live.health import LIVE_POLICY
-from reskin.live.tracker import WAITING, Contact, Readings, Skin
-from reskin.live.view import View
+from reskin.live.tracker import WAITING, Estimates, Layout, LiveSkin, Models, UniversalEstimator, check_ports
 from reskin.recordings.fault_policy import FaultPolicy
 from reskin.recordings.header import Header
 from reskin.recordings.recorder import UNTOLD, begin_capture, end_capture, new_folder
+from reskin.seeds import rng_for
 
 POLL_S = 0.1
-GATHER_S = (
-    0.02  # for which frames of several boards are gathered: estimated together they cost less, and no page draws faster
-)
-ADAPTING = {"adapt": Pokes, "places": ShownPokes}  # by button
+# Over which frames of several boards are gathered: estimating them together costs less, and no page draws faster.
+GATHER_S = 0.02
+
+WINDOW_S, BIN_S = 10.0, 0.02
+BINS_N = round(WINDOW_S / BIN_S)
+LATENCIES_N = 4000  # the last frames: ten seconds at 400 Hz
+UNCONFIRMED_MAX_N = 64  # messages that may be on their way to a screen
+HEAD = struct.Struct("<IHHd")  # message number, chips, bins, time of the last reading since the start
+NUMBERS_N = 12  # x_mm, y_mm, F_N, sd x, sd y, contact, rate, lost bytes, and four latencies in ms
+
+PRESSES_N = 12
+GUIDED_MM = CENTRE_MM + 3.0 * np.array([-1.5, -0.5, 0.5, 1.5])  # places shown to the user, along x and along y
+READINGS_MIN_N = 4  # in a press; a shorter contact is a knock
 
 
-class Live:
-    """A skin that is polled on a thread of its own, what pages see of it, and its recording."""
+class Traces:
+    """The last ten seconds, as pages draw them: least and greatest values in bins of 20 ms, in a ring buffer."""
+
+    def __init__(self, layout: Layout, start_s: float) -> None:
+        self._layout, self._start_s = layout, start_s
+        self._chips_n = len(layout.chips_mm)
+        self._bin = np.full(BINS_N, -1)  # number of the bin at each place of the ring
+        self._low = np.full((BINS_N, 1 + self._chips_n), np.nan, np.float32)  # force in N, then |dB| of each chip in uT
+        self._high = self._low.copy()
+        self._last: Estimates | None = None
+        self._message_i = 0
+        self._unconfirmed: deque[tuple[int, float]] = deque(maxlen=UNCONFIRMED_MAX_N)
+        self.to_estimate_s: deque[float] = deque(maxlen=LATENCIES_N)
+        self.to_screen_s: deque[float] = deque(maxlen=LATENCIES_N)
+
+    @property
+    def newest_bin(self) -> int:
+        return int(self._bin.max())
+
+    def add(self, estimates: Estimates, now_s: float) -> None:
+        """Add estimates that were ready at `now_s`."""
+        self._last = estimates
+        self.to_estimate_s.extend((now_s - estimates.t_s).tolist())
+        chips_uT = np.linalg.norm(estimates.db_uT.reshape(len(estimates), -1, 3), axis=2)
+        values = np.column_stack([estimates.target[:, 2], chips_uT]).astype(np.float32)
+        bins = ((estimates.t_s - self._start_s) / BIN_S).astype(int)
+        for number in np.unique(bins):
+            rows, i = values[bins == number], number % BINS_N
+            if self._bin[i] != number:
+                self._bin[i], self._low[i], self._high[i] = number, np.nan, np.nan
+            self._low[i] = np.fmin(self._low[i], np.fmin.reduce(rows))
+            self._high[i] = np.fmax(self._high[i], np.fmax.reduce(rows))
+
+    def message(self, after_bin: int, *, rate_hz: float, lost_bytes_n: int) -> bytes:
+        """Return the last reading and the bins from `after_bin` on, which may have grown; empty before any reading."""
+        last = self._last
+        if last is None:
+            return b""
+        self._message_i += 1
+        self._unconfirmed.append((self._message_i, float(last.t_s[-1])))
+        newest = self.newest_bin
+        numbers = np.arange(max(after_bin, newest - BINS_N + 1, 0), newest + 1)
+        numbers = numbers[self._bin[numbers % BINS_N] == numbers]  # a bin without readings still holds an older one
+        i = numbers % BINS_N
+        latencies_ms = [
+            1e3 * np.percentile(times_s, [50, 99]) if times_s else np.full(2, np.nan)
+            for times_s in (self.to_estimate_s, self.to_screen_s)
+        ]
+        now = [*last.target[-1], *last.sd_mm[-1], last.contact[-1], rate_hz, lost_bytes_n]
+        change_uT = np.einsum("kij,kj->ki", self._layout.turn, last.db_uT[-1].reshape(-1, 3).astype(np.float64))
+        t_s = float(last.t_s[-1]) - self._start_s
+        head = HEAD.pack(self._message_i % 2**32, self._chips_n, len(i), t_s)
+        parts = [
+            np.array(now),
+            *latencies_ms,
+            change_uT.ravel(),
+            numbers * BIN_S - t_s,  # relative: in float32, days since the start would be rounded to more than a bin
+            self._low[i].ravel(),
+            self._high[i].ravel(),
+        ]
+        return head + np.concatenate(parts).astype("<f4").tobytes()
+
+    def confirm(self, message_i: int, now_s: float) -> None:
+        """Record that a screen has shown a message."""
+        for sent_i, t_s in self._unconfirmed:
+            if sent_i == message_i:
+                self.to_screen_s.append(now_s - t_s)
+
+
+class Presses:
+    """Collects the strongest reading of each contact, until there are enough to adapt to."""
+
+    def __init__(self, presses_n: int = PRESSES_N) -> None:
+        self.presses_n = presses_n
+        self._strongest_uT: list[Float64[np.ndarray, " ch"]] = []
+        self._current_uT: Float64[np.ndarray, " ch"] | None = None  # strongest so far of the contact that lasts
+        self._readings_n = 0
+
+    def __len__(self) -> int:
+        return len(self._strongest_uT)
+
+    @property
+    def complete(self) -> bool:
+        return len(self) >= self.presses_n
+
+    @property
+    def instruction(self) -> str:
+        """What the user has to do next."""
+        return f"press {len(self) + 1} of {self.presses_n}, anywhere"
+
+    @property
+    def next_mm(self) -> list[float] | None:
+        """The place to press, if it matters."""
+        return None
+
+    @property
+    def db_uT(self) -> Float64[np.ndarray, "n ch"]:
+        return np.array(self._strongest_uT)
+
+    def add(self, estimates: Estimates) -> None:
+        """Add the next readings; one with a fault does not end a contact."""
+        known = np.isfinite(estimates.db_uT).all(axis=1)
+        for db_uT, contact in zip(estimates.db_uT[known].astype(np.float64), estimates.contact[known], strict=True):
+            if contact:
+                self._readings_n += 1
+                if self._current_uT is None or np.linalg.norm(db_uT) > np.linalg.norm(self._current_uT):
+                    self._current_uT = db_uT
+                continue
+            if self._current_uT is not None and self._readings_n >= READINGS_MIN_N and not self.complete:
+                self._strongest_uT.append(self._current_uT)
+            self._current_uT, self._readings_n = None, 0
+
+
+class GuidedPresses(Presses):
+    """Presses at places that the page shows, a grid in random order; every other one is held out to test the model."""
+
+    def __init__(self) -> None:
+        grid_mm = np.stack(np.meshgrid(GUIDED_MM, GUIDED_MM), axis=-1).reshape(-1, 2)
+        self.place_mm = rng_for(0, "shown places").permutation(grid_mm)
+        super().__init__(len(self.place_mm))
+
+    @property
+    def instruction(self) -> str:
+        return f"press {len(self) + 1} of {self.presses_n}, at the cross"
+
+    @property
+    def next_mm(self) -> list[float] | None:
+        return None if self.complete else self.place_mm[len(self)].tolist()
+
+    @property
+    def held_out(self) -> Bool[np.ndarray, " n"]:
+        return np.arange(self.presses_n) % 2 == 1
+
+
+ADAPTING = {"adapt": Presses, "places": GuidedPresses}  # by button
+
+
+class Session:
+    """A board that is polled on a thread of its own, with its traces, recording and adaptation."""
 
     def __init__(
-        self, port: str, models: Models, what: str, fault_policy: FaultPolicy = LIVE_POLICY, *, alone: bool = True
+        self, port: str, models: Models, source: str, fault_policy: FaultPolicy = LIVE_POLICY, *, alone: bool = True
     ) -> None:
-        self.skin, self.what = Skin(port, models, fault_policy=fault_policy), what
+        self.skin, self.source = LiveSkin(port, models, fault_policy=fault_policy), source
         self._alone = alone
-        self.view: View | None = None
-        self.problem = ""
-        self._pokes: Pokes | None = None
+        self.traces: Traces | None = None
+        self._error = ""
+        self._presses: Presses | None = None
         self._adapted = ""
         self._recording: tuple[Path, Header] | None = None
         self._recorded = ""
-        self._lock, self._buttons, self._stop = threading.Lock(), threading.Lock(), threading.Event()
-        self._thread = threading.Thread(target=self._poll, name="estimates", daemon=True)
+        self._lock, self._button_lock, self._stop = threading.Lock(), threading.Lock(), threading.Event()
+        self._thread = threading.Thread(target=self.run, name="estimates", daemon=True)
 
     def __str__(self) -> str:
-        return f"{self.what} on {self.skin.port}"
+        return f"{self.source} on {self.skin.port}"
 
     def start(self) -> None:
         self.skin.reader.start(there=False)
@@ -55,103 +201,104 @@ class Live:
     def stop(self) -> None:
         self._stop.set()
         self._thread.join()
-        self.end_recording()
+        self._end_recording()
         self.skin.reader.stop()
 
-    def _poll(self) -> None:
+    def run(self) -> None:
+        """Estimate until `stop`; an error ends it and becomes an alarm on the page."""
         try:
             while not self._stop.is_set():
-                readings = self.skin.poll(POLL_S)
-                if readings is not None:
+                estimates = self.skin.poll(POLL_S)
+                if estimates is not None:
                     now_s = self.skin.reader.unix_s()
-                    self._adapt(readings)
+                    self._adapt(estimates)
                     with self._lock:
-                        self.view = self.view or View(self.skin.layout, now_s - 1.0)
-                        self.view.feed(readings, now_s)
+                        self.traces = self.traces or Traces(self.skin.layout, now_s - 1.0)
+                        self.traces.add(estimates, now_s)
                 if not self._alone:
                     self._stop.wait(GATHER_S)
         except ReskinError as error:
-            self.problem = str(error)
-        except Exception as error:  # of a model: the page says that nothing is estimated any more
-            self.problem = f"estimates ended: {error!r}"
+            self._error = str(error)
+        except Exception as error:  # of a model
+            self._error = f"estimates ended: {error!r}"
 
-    def _adapt(self, readings: Readings) -> None:
-        """Let the map learn from pokes, if it was asked for; frames wait meanwhile, and none is lost."""
-        pokes, answers = self._pokes, self.skin.answers
-        if pokes is not None and isinstance(answers, Map):
-            pokes.feed(readings)
-            if pokes.enough:
-                if isinstance(pokes, ShownPokes):
-                    self._adapted = answers.label(pokes.place_mm, pokes.db_uT, pokes.kept)
+    def _adapt(self, estimates: Estimates) -> None:
+        """Collect presses if a button asked for it, and adapt the model; the reader keeps frames meanwhile."""
+        presses, estimator = self._presses, self.skin.estimator
+        if presses is not None and isinstance(estimator, UniversalEstimator):
+            presses.add(estimates)
+            if presses.complete:
+                if isinstance(presses, GuidedPresses):
+                    self._adapted = estimator.label(presses.place_mm, presses.db_uT, presses.held_out)
                 else:
-                    self._adapted = answers.see(pokes.db_uT)
-                self._pokes = None
+                    self._adapted = estimator.adapt(presses.db_uT)
+                self._presses = None
 
     def message(self, after_bin: int) -> tuple[bytes, int]:
-        """Give the next message of a client that has the bins before `after_bin`, and what it has then."""
+        """Return the next binary message for a page that has the bins before `after_bin`, and the newest bin in it."""
         with self._lock:
-            if self.view is None:
+            if self.traces is None:
                 return b"", 0
             rate_hz, lost_bytes_n = self.skin.health.rate_hz, self.skin.lost_bytes_n
-            data = self.view.message(after_bin, rate_hz=rate_hz, lost_bytes_n=lost_bytes_n)
-            return data, self.view.newest_bin
+            data = self.traces.message(after_bin, rate_hz=rate_hz, lost_bytes_n=lost_bytes_n)
+            return data, self.traces.newest_bin
 
     def state(self) -> dict[str, Any]:
-        """Say what a page shows beside the numbers."""
-        skin, found = self.skin, self.skin.found
+        """Return the JSON message of a page: texts, alarms, layout of the board. `page/live.js` reads its keys."""
+        skin, detected, presses = self.skin, self.skin.detected, self._presses
         state: dict[str, Any] = {
-            "what": self.what if self._alone else str(self), "zeroed": skin.zeroed,
-            "model": skin.answers.about if skin.answers else "",
-            "adaptable": isinstance(skin.answers, Map),
-            "adapting": pokes.words if (pokes := self._pokes) is not None else "",
-            "next_mm": pokes.next_mm if pokes is not None else None,
+            "what": self.source if self._alone else str(self), "zeroed": skin.zeroed,
+            "model": skin.estimator.name if skin.estimator else "",
+            "adaptable": isinstance(skin.estimator, UniversalEstimator),
+            "adapting": presses.instruction if presses is not None else "",
+            "next_mm": presses.next_mm if presses is not None else None,
             "adapted": self._adapted,
-            "waiting": found.problem is not None, "silent": skin.silent,
-            "alarms": [alarm for alarm in (self.problem, *skin.alarms()) if alarm not in ("", WAITING)],
+            "waiting": detected.problem is not None, "silent": skin.silent,
+            "alarms": [alarm for alarm in (self._error, *skin.alarms()) if alarm not in ("", WAITING)],
             "recording": f"{self._recording[0]} {skin.reader.tape_problem}" if self._recording else "",
             "recorded": self._recorded,
         }  # fmt: skip
-        if found.problem is None:
+        if detected.problem is None:
             layout, alarms = skin.layout, list(skin.health.alarms.values())
             state |= {
-                "board": f"{found.port}: {found.format}, {found.scale}",
+                "board": f"{detected.port}: {detected.format}, {detected.scale}",
                 "seen": [[one.name, one.count_n, round(one.last_s - one.first_s, 1), one.action] for one in alarms],
                 "chips_mm": layout.chips_mm.tolist(), "places_known": layout.known, "corner_mm": layout.corner_mm,
                 "skin_mm": layout.skin_mm,
             }  # fmt: skip
         return state
 
-    def seen(self, message_i: object) -> None:
-        """Note that a screen has shown a message."""
-        if isinstance(message_i, int) and self.view is not None:
+    def confirm(self, message_i: object) -> None:
+        """Record that a screen has shown a message."""
+        if isinstance(message_i, int) and self.traces is not None:
             with self._lock:
-                self.view.seen(message_i, self.skin.reader.unix_s())
+                self.traces.confirm(message_i, self.skin.reader.unix_s())
 
     def press(self, button: object) -> None:
-        """Do what a button of the page says; what is no button does nothing."""
-        with self._buttons:
+        """Do what a button of the page stands for; ignore anything else."""
+        with self._button_lock:
             if button == "zero":
                 self.skin.zero()
-            elif isinstance(button, str) and button in ADAPTING and isinstance(self.skin.answers, Map):
-                self._pokes = ADAPTING[button]() if self._pokes is None else None
+            elif isinstance(button, str) and button in ADAPTING and isinstance(self.skin.estimator, UniversalEstimator):
+                self._presses = ADAPTING[button]() if self._presses is None else None
             elif button == "record" and self._recording is not None:
-                self.end_recording()
-            elif button == "record" and self.skin.found.problem is None:
-                self.begin_recording()
+                self._end_recording()
+            elif button == "record" and self.skin.detected.problem is None:
+                self._begin_recording()
 
-    def begin_recording(self) -> None:
-        """Write the stream, as it comes from now on, into a new capture."""
-        folder, found = new_folder(), self.skin.found
-        if not self._alone:  # others may begin theirs in the same second
-            folder = folder.with_name(f"{folder.name}-{re.sub(r'[^A-Za-z0-9]+', '-', found.port).strip('-')}")
+    def _begin_recording(self) -> None:
+        """Write the stream from now on into a new capture."""
+        folder, detected = new_folder(), self.skin.detected
+        if not self._alone:  # other boards may begin theirs in the same second
+            folder = folder.with_name(f"{folder.name}-{re.sub(r'[^A-Za-z0-9]+', '-', detected.port).strip('-')}")
         try:
-            part, header = begin_capture(folder, UNTOLD, wire=found.wire, chips_n=found.chips_n, by="reskin live")
-            self.skin.reader.set_tape(Tape(part, found.wire))
+            part, header = begin_capture(folder, UNTOLD, wire=detected.wire, chips_n=detected.chips_n, by="reskin live")
+            self.skin.reader.set_tape(Tape(part, detected.wire))
             self._recording, self._recorded = (folder, header), ""
         except (OSError, ReskinError) as error:
             self._recorded = str(error)
 
-    def end_recording(self) -> None:
+    def _end_recording(self) -> None:
         if self._recording is not None:
             (folder, header), self._recording = self._recording, None
             self.skin.reader.set_tape(None)
@@ -159,68 +306,10 @@ class Live:
                 end_capture(folder, header)
                 self._recorded = f"recorded {folder}"
             except OSError as error:
-                self._recorded = f"{folder}.part could not be closed: {error.strerror}"
+                self._recorded = f"cannot close {folder}.part: {error.strerror}"
 
 
-def several(ports: Sequence[str], models: Models, what: str, fault_policy: FaultPolicy = LIVE_POLICY) -> list[Live]:
-    """Make one of each port; all share what the models are made of, and nothing else."""
-    check_named_once(ports, "--port")
-    check_boards(models, len(ports), "--model")
-    return [Live(port, models, what, fault_policy, alone=len(ports) == 1) for port in ports]
-
-
-class Skins:
-    """Boards on ports, opened and zeroed at once. Iterate for the latest contacts, in the order of the ports."""
-
-    def __init__(self, skins: Sequence[Skin]) -> None:
-        self.skins = skins
-        self._latest: list[Contact | None] = [None] * len(skins)
-        self._failed: Exception | None = None
-        self._news, self._came, self._stop = False, threading.Condition(), threading.Event()
-        self._opened = ExitStack()
-        self._threads = [
-            threading.Thread(target=self._follow, args=[i], name=f"contacts of {skin.port}", daemon=True)
-            for i, skin in enumerate(skins)
-        ]
-
-    def __enter__(self) -> "Skins":
-        """Open all ports; nothing may touch the skins meanwhile. If one board is not there, none is left open."""
-        with self._opened as opening, ThreadPoolExecutor(len(self.skins)) as pool:
-            for entering in [pool.submit(opening.enter_context, skin) for skin in self.skins]:
-                entering.result()
-            self._opened = opening.pop_all()
-        for thread in self._threads:
-            thread.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._stop.set()
-        for thread in self._threads:
-            thread.join()
-        self._opened.close()
-
-    def __iter__(self) -> Iterator[tuple[Contact, ...]]:
-        """Give the latest contact of each board whenever one has a new one; a silent board's is NaN and says why."""
-        while True:
-            with self._came:
-                self._came.wait_for(lambda: self._failed or (self._news and None not in self._latest))
-                if self._failed is not None:
-                    raise self._failed
-                self._news = False
-                latest = tuple(contact for contact in self._latest if contact is not None)
-            yield latest
-
-    def _follow(self, index: int) -> None:
-        try:
-            for contact in self.skins[index]:
-                with self._came:
-                    self._latest[index], self._news = contact, True
-                    self._came.notify()
-                if self._stop.is_set():
-                    return
-        except Exception as error:  # also one of a model: raised where somebody iterates
-            with self._came:
-                self._failed = error
-                self._came.notify()
+def open_sessions(ports: Sequence[str], models: Models, source: str, fault_policy: FaultPolicy = LIVE_POLICY) -> list[Session]:
+    """Make a session for each port; they share the models' weights and nothing else."""
+    check_ports(ports, models, "--port")
+    return [Session(port, models, source, fault_policy, alone=len(ports) == 1) for port in ports]

@@ -1,16 +1,19 @@
-"""A skin at work: reads a board's port and estimates contacts as they happen. `reskin.open` returns its `Skin`.
+"""Estimate contacts on a board while it runs: bytes from its port -> frames -> changes of field -> place and force.
 
-A thread reads; the caller decodes and estimates, so that a slow controller loses no bytes.
+`reskin.open` returns a `LiveSkin`, or `LiveSkins` for several ports. One thread per port reads bytes; the caller's
+thread decodes them and estimates, so that a slow controller loses none.
 """
 
+import threading
 from bisect import bisect_left
 from collections import Counter, deque
-from collections.abc import Iterator
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, suppress
+from copy import copy
 from dataclasses import dataclass
 from itertools import pairwise
 from operator import itemgetter
-from types import TracebackType
 from typing import NamedTuple
 
 import numpy as np
@@ -25,36 +28,167 @@ from reskin.board.stream import FrameStream
 from reskin.board.wire import Frames, concatenate
 from reskin.config import parse
 from reskin.data.grid import CENTRE_MM
-from reskin.errors import CaptureError, SchemaError
-from reskin.live.answering import Map, Models, Networks, answering
+from reskin.errors import CaptureError, ParamsError, SchemaError
 from reskin.live.contacts import CONTACT_SDS, quiet_start
 from reskin.live.health import LIVE_POLICY, Health
+from reskin.models.inputs import VIEW, Scaler
+from reskin.models.trained import Network
 from reskin.recordings.fault_policy import FaultPolicy
 from reskin.simulation.defaults import nominal
 from reskin.simulation.protocols import SKIN_MM
 from reskin.simulation.settings import BoardKind
+from reskin.universal.calibration import CHANNELS_N
+from reskin.universal.map import Estimate
+from reskin.universal.model import Universal
 
-ASIDE_MM = 5.0  # between chips whose places nobody knows, so that they can be drawn
+NOLOAD_S = 1.0  # without contact, over which the no-load reading is averaged
+NOLOAD_FRAMES_MAX_N = 10_000
+HEAD_S, HEAD_BYTES_MAX_N = 0.5, 2**18  # from which the wire format is detected
+SILENT_S = 0.3  # without data, after which a controller is told
+OPENING_S = 10.0
+ENDS_KEPT_N = 256  # chunks, to time frames that are decoded late
+FRAME_BYTES_MIN_N = 16  # per chip, in any wire format
+SPACING_MM = 5.0  # at which chips are drawn whose places are unknown
+UNKNOWN_SDS = 10.0  # assumed, of an input in training; 6 in scene quick, 7 on lab's boards under its models
+MISFIT_MAX = 4.0  # assumed, chi^2 per channel: about 1 where the universal model knows the skin
+
+WAITING = "waiting for data"
+TAKING_NOLOAD = "taking the no-load reading: do not touch, do not move"
+UNKNOWN_SKIN = "unknown skin: the model knows no such change of field"
+
+Models = Sequence[Network] | Universal  # an empty sequence: no estimates
+
+
+class Prediction(NamedTuple):
+    """Predictions for readings in contact."""
+
+    target: Float64[np.ndarray, "f 3"]  # x_mm, y_mm, F_N
+    sd_mm: Float64[np.ndarray, "f 2"]  # standard deviation of the place; NaN if not known
+    unknown: Bool[np.ndarray, " f"]  # unlike any skin that the model knows
+
+
+class NetworkEstimator:
+    """The mean of trained networks. Their standard deviation is their disagreement, not their error."""
+
+    def __init__(self, networks: Sequence[Network]) -> None:
+        self.channels_n: int = networks[0].card["input"]["channels_n"]
+        self.name = f"{len(networks)} network{'s' if len(networks) > 1 else ''}"
+        self._networks = networks
+        self._inputs = [(VIEW[one.card["recipe"]["inputs"]], Scaler.of_arrays(one.tensors)) for one in networks]
+        for network in networks:  # imports torch and builds the network now, not at the first contact
+            network(np.zeros((1, network.card["input"]["channels_n"]), np.float32))
+
+    def set_noload(self, b_uT: Float[np.ndarray, "f ch"]) -> None:
+        """Do nothing: networks use changes of field only."""
+
+    def __call__(self, db_uT: Float32[np.ndarray, "f ch"]) -> Prediction:
+        targets = np.stack([network(db_uT) for network in self._networks]).astype(np.float64)
+        sd_mm = targets[:, :, :2].std(axis=0, ddof=1) if len(targets) > 1 else np.full((len(db_uT), 2), np.nan)
+        inputs_sds = np.stack([np.abs(scaler.encode(view(db_uT))).max(axis=1) for view, scaler in self._inputs])
+        return Prediction(targets.mean(axis=0), sd_mm, np.asarray((inputs_sds > UNKNOWN_SDS).any(axis=0)))
+
+
+class UniversalEstimator:
+    """The universal model, calibrated on the page: to the no-load field and to presses.
+
+    The model that is passed in is not changed, and its own calibration is kept. New presses here replace the earlier
+    ones made here, so that a dozen bad presses are corrected by another dozen.
+    """
+
+    channels_n = CHANNELS_N
+    name = "universal model"
+
+    def __init__(self, model: Universal) -> None:
+        self._given = model
+        self._noload_uT = model.noload_uT
+        self._presses_uT = np.zeros((0, CHANNELS_N))  # changes of field of presses at unknown places
+        self._labelled_mm, self._labelled_uT = np.zeros((0, 2)), np.zeros((0, CHANNELS_N))
+        self._calibrate()
+
+    def set_noload(self, b_uT: Float[np.ndarray, "f ch"]) -> None:
+        """Take the mean of readings without contact as the no-load field, and calibrate again."""
+        self._noload_uT = b_uT.mean(axis=0, dtype=np.float64)
+        self._calibrate()
+
+    def adapt(self, db_uT: Float[np.ndarray, "n ch"]) -> str:
+        """Calibrate to presses at unknown places; return what that did to standard deviation and misfit."""
+        before, self._presses_uT = self._estimate(db_uT), db_uT.astype(np.float64)
+        self._calibrate()
+        after = self._estimate(db_uT)
+        sd_mm = [np.median(each.sd_mm.max(axis=1)) for each in (before, after)]
+        misfit = [np.median(each.misfit) for each in (before, after)]
+        return (
+            f"adapted to {len(db_uT)} presses: standard deviation of a place {sd_mm[0]:.2f} mm before, {sd_mm[1]:.2f} "
+            f"mm after; misfit {misfit[0]:.2f} before, {misfit[1]:.2f} after"
+        )
+
+    def label(
+        self, place_mm: Float[np.ndarray, "n 2"], db_uT: Float[np.ndarray, "n ch"], held_out: Bool[np.ndarray, " n"]
+    ) -> str:
+        """Calibrate to presses at known places; return the error at the held-out ones before and after.
+
+        Nobody measured the force: the model's own estimate stands for it.
+        """
+
+        def error_mm() -> float:
+            found_mm = self._estimate(db_uT[held_out]).place_mm
+            return float(np.median(np.linalg.norm(found_mm - place_mm[held_out], axis=1)))
+
+        before_mm = error_mm()
+        self._labelled_mm, self._labelled_uT = place_mm[~held_out], db_uT[~held_out].astype(np.float64)
+        self._calibrate()
+        return (
+            f"adapted to {(~held_out).sum()} known places: median error at {held_out.sum()} others {before_mm:.2f} mm "
+            f"before, {error_mm():.2f} mm after"
+        )
+
+    def __call__(self, db_uT: Float32[np.ndarray, "f ch"]) -> Prediction:
+        found = self._estimate(db_uT)
+        target = np.column_stack([found.place_mm, found.force_N])
+        return Prediction(target, found.sd_mm, np.asarray(found.misfit > MISFIT_MAX))
+
+    def _estimate(self, db_uT: Float[np.ndarray, "n ch"]) -> Estimate:
+        return self._model.estimate(db_uT + self._noload_uT)
+
+    def _calibrate(self) -> None:
+        model = copy(self._given).zero(self._noload_uT, keep=True)
+        if len(self._presses_uT):
+            model.see(self._presses_uT + self._noload_uT)
+        if len(self._labelled_uT):
+            b_uT = self._labelled_uT + self._noload_uT
+            model.label(self._labelled_mm, model.estimate(b_uT).force_N, b_uT, keep=True)
+        model.estimate(self._noload_uT)  # prepares the model now, not at the first contact
+        self._model = model
+
+
+def check_ports(ports: Sequence[str], models: Models, where: str) -> None:
+    """Raise ParamsError for ports named twice, too many ports, or one skin's calibration used for several boards."""
+    find.check_named_once(ports, where)
+    if len(ports) > 1 and isinstance(models, Universal) and models.presses_n:
+        raise ParamsError(
+            f"{where}: a model that is calibrated to one skin ({models.presses_n} presses) cannot estimate for "
+            f"{len(ports)} boards. Open that board alone, or give no model."
+        )
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Places in the frame of labels, in mm; `turn` holds the chips' axes in the board's frame."""
+    """Where the chips of a board lie, in the frame of labels."""
 
     known: bool
     chips_mm: Float64[np.ndarray, "k 2"]
-    turn: Float64[np.ndarray, "k 3 3"]
+    turn: Float64[np.ndarray, "k 3 3"]  # each chip's axes in the frame of the board
     corner_mm: tuple[float, float]
     skin_mm: tuple[float, float]
 
 
 def layout_of(chips_n: int) -> Layout:
-    """Find the nominal board with this number of chips; chips of an unknown board are drawn in a row.
+    """Return the nominal board with this number of chips; chips of other boards are laid out in a row.
 
     The bytes do not say which board it is: five chips are taken for the paper's board, forty for its sleeve.
     """
-    for name, words in nominal("boards").items():
-        kind = parse(BoardKind, words, f"nominal board {name}")
+    for name, settings in nominal("boards").items():
+        kind = parse(BoardKind, settings, f"nominal board {name}")
         if len(kind.design.places_mm) == chips_n:
             half_mm = np.array(kind.skin_mm) / 2
             centre_mm = np.full(2, CENTRE_MM) if kind.skin_mm == SKIN_MM else half_mm
@@ -62,41 +196,35 @@ def layout_of(chips_n: int) -> Layout:
             corner_mm = centre_mm - half_mm
             chips_mm = centre_mm + np.array(kind.design.places_mm)
             return Layout(True, chips_mm, turn, (float(corner_mm[0]), float(corner_mm[1])), kind.skin_mm)
-    chips_mm = np.column_stack([ASIDE_MM * (0.5 + np.arange(chips_n)), np.full(chips_n, ASIDE_MM)])
-    return Layout(False, chips_mm, np.tile(np.eye(3), (chips_n, 1, 1)), (0.0, 0.0), (ASIDE_MM * chips_n, 2 * ASIDE_MM))
-
-
-ZERO_S = 1.0  # without contact, from which the no-load reading is taken
-ZERO_FRAMES_MAX_N = 10_000
-HEAD_S, HEAD_BYTES_MAX_N = 0.5, 2**18  # from which a format is recognised
-SILENT_S = 0.3  # a controller is told when nothing comes
-OPENING_S = 10.0
-ENDS_KEPT_N = 256  # chunks, to time frames that were settled late
-WAITING = "waiting for data"
-ZEROING = "taking the no-load reading: do not touch, do not move"
-UNLIKE = "not a skin that the model knows: a change of field like none of its own"
+    chips_mm = np.column_stack([SPACING_MM * (0.5 + np.arange(chips_n)), np.full(chips_n, SPACING_MM)])
+    skin_mm = (SPACING_MM * chips_n, 2 * SPACING_MM)
+    return Layout(False, chips_mm, np.tile(np.eye(3), (chips_n, 1, 1)), (0.0, 0.0), skin_mm)
 
 
 class Contact(NamedTuple):
-    """One reading: off contact the place is NaN and the force 0; all three are NaN where nothing is known."""
+    """One reading of a board, with its estimate.
 
-    t_s: float  # unix, when its last byte came
+    Without contact the place is NaN and the force 0. All three are NaN where nothing is known: a failed read, or a
+    board that is silent or unplugged. `alarms` then says why.
+    """
+
+    t_s: float  # unix time at which its last byte came
     x_mm: float
     y_mm: float
     F_N: float
-    sd_mm: tuple[float, float]  # of the place along x and y: the map's, or that between networks; NaN of a single one
+    sd_mm: tuple[float, float]  # of x and y: the universal model's, or between networks (NaN for a single one)
     b_uT: Float32[np.ndarray, " ch"]
     alarms: tuple[str, ...]  # what is wrong with the board; empty when all is well
 
 
 @dataclass(frozen=True)
-class Readings:
-    """Estimates of frames in order, as far as there are models and a no-load reading."""
+class Estimates:
+    """Frames that were decoded together, in order, with their estimates."""
 
     t_s: Float64[np.ndarray, " f"]
     b_uT: Float32[np.ndarray, "f ch"]
-    db_uT: Float32[np.ndarray, "f ch"]  # NaN before the no-load reading is taken, and where a chip was not read
-    answer: Float64[np.ndarray, "f 3"]  # x_mm, y_mm, F_N
+    db_uT: Float32[np.ndarray, "f ch"]  # NaN before the no-load reading is taken, and for frames with faults
+    target: Float64[np.ndarray, "f 3"]  # x_mm, y_mm, F_N, as in `Contact`; NaN without a model
     sd_mm: Float64[np.ndarray, "f 2"]
     contact: Bool[np.ndarray, " f"]
 
@@ -104,105 +232,116 @@ class Readings:
         return len(self.t_s)
 
 
-class Zero(NamedTuple):
-    """The field without contact, and the length of a change of field from which on there is one."""
+class LiveSkin:
+    """A skin at work on a port, returned by `reskin.open`.
 
-    noload_uT: Float64[np.ndarray, " ch"]
-    contact_uT: float
+    Use it in a `with` statement, which opens the port and takes the no-load reading. Iterate over it for the latest
+    contact, or over `every()` for each reading.
+    """
 
-    @classmethod
-    def of(cls, b_uT: Float[np.ndarray, "f ch"]) -> "Zero":
-        """Take it from readings without contact; the threshold is that of a log (`experiments.logs`)."""
-        noload_uT = b_uT.mean(axis=0, dtype=np.float64)
-        noise_uT = b_uT - noload_uT
-        usual_uT = np.median(np.linalg.norm(noise_uT, axis=1))
-        return cls(noload_uT, float(usual_uT + CONTACT_SDS * np.sqrt((noise_uT**2).mean())))
-
-
-class Skin:
-    """A board on a port. Iterate over it for the latest contact, or over `every()` for all."""
-
-    def __init__(
-        self, port: str, models: Models = (), *, baud: int = find.BAUD, fault_policy: FaultPolicy = LIVE_POLICY
-    ) -> None:
-        self.fault_policy = fault_policy
-        self.port, self.found = port, find.Found(port, WAITING)
-        self.account: Counter[str] = Counter()  # of all streams since the start, as a `FrameStream` counts
+    def __init__(self, port: str, models: Models = (), *, baud: int = find.BAUD, fault_policy: FaultPolicy = LIVE_POLICY) -> None:
+        self.port, self.fault_policy = port, fault_policy
+        self.detected = find.Found(port, WAITING)
+        self.account: Counter[str] = Counter()  # of all streams since the start, as `FrameStream` counts
         self.reader = Reader(port, baud)
-        self.answers = answering(models)
-        self.problem = ""  # of the model with this board
+        self.estimator: NetworkEstimator | UniversalEstimator | None = None
+        if isinstance(models, Universal):
+            self.estimator = UniversalEstimator(models)
+        elif models:
+            self.estimator = NetworkEstimator(models)
+        self._model_problem = ""
         self._head: list[Chunk] = []
-        self._opening_bytes_n = 0
-        self._begin_zero()
+        self._partial_first_bytes_n = 0  # of frames that were on their way when the port was opened
+        self._restart_noload()
 
-    def __enter__(self) -> "Skin":
-        """Open the port, learn what it sends, and take the no-load reading: nothing may touch the skin meanwhile."""
+    def __enter__(self) -> "LiveSkin":
+        """Open the port, detect what it sends, and take the no-load reading: nothing may touch the skin meanwhile."""
         self.reader.start(there=True)
         try:
-            self._wait_until_zeroed()
+            end_s = self.reader.unix_s() + OPENING_S
+            while not self.zeroed:
+                if self.reader.unix_s() > end_s:
+                    raise CaptureError(
+                        f"{self.port}: no no-load reading within {OPENING_S:g} s: "
+                        f"{'; '.join(self.alarms()) or 'no data'}. Run `reskin ports` to see what the port sends."
+                    )
+                self.poll(SILENT_S)
         except BaseException:
             self.reader.stop()
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.reader.stop()
 
     def __iter__(self) -> Iterator[Contact]:
-        """Give the latest reading, again and again, each once; what came in between is decoded and left out.
+        """Yield the latest reading, each at most once; those in between are decoded and skipped.
 
-        When nothing comes for `SILENT_S`, or the board is unplugged, that is said in a reading of NaN.
+        When no data comes for `SILENT_S`, or the board is unplugged, a contact of NaN says so.
         """
         while True:
             yield self._contact(self.poll(SILENT_S, latest=True), -1)
 
     def every(self) -> Iterator[Contact]:
-        """Give every reading; who is two minutes late loses the oldest, and `reader.missed_bytes_n` counts them."""
+        """Yield every reading. A caller two minutes late loses the oldest; `reader.missed_bytes_n` counts them."""
         while True:
-            readings = self.poll(SILENT_S)
-            for i in range(max(len(readings) if readings else 0, 1)):
-                yield self._contact(readings, i)
+            estimates = self.poll(SILENT_S)
+            for i in range(max(len(estimates) if estimates else 0, 1)):
+                yield self._contact(estimates, i)
 
     def zero(self) -> None:
-        """Take the no-load reading from the next second in which nothing touches the skin; any thread may ask."""
-        self._zero_asked = True  # `poll` begins anew: what it gathers, its thread alone changes
+        """Take a new no-load reading from the next second without contact; may be called from any thread."""
+        self._noload_asked = True  # the thread that polls restarts it: only that thread changes the frames gathered
 
     @property
     def zeroed(self) -> bool:
-        return self._zero is not None and not self._zero_asked
+        """Whether the no-load reading has been taken."""
+        return self.noload_uT is not None and not self._noload_asked
 
     @property
     def silent(self) -> bool:
-        """Say whether nothing comes: what was read last is no more so."""
-        return not self.found.problem and self.reader.unix_s() - self._ends[-1][1] > SILENT_S
+        """Whether no data comes, so that the last reading is out of date."""
+        return not self.detected.problem and self.reader.unix_s() - self._ends[-1][1] > SILENT_S
 
     @property
     def lost_bytes_n(self) -> int:
-        """Count bytes that came too late or were no frame's; the end of a frame that was on its way is not lost."""
+        """Bytes that were read too late or belong to no frame, but for a frame cut off by opening the port."""
         skipped_n = sum(count for name, count in self.account.items() if name.startswith("skipped_"))
-        return skipped_n + self.reader.missed_bytes_n - self._opening_bytes_n
+        return skipped_n + self.reader.missed_bytes_n - self._partial_first_bytes_n
 
     def alarms(self) -> tuple[str, ...]:
-        """Say what is wrong now."""
-        gone = [f"{'unplugged' if self.reader.was_plugged_in else 'not open'}: {self.reader.problem}"]
-        own = gone if self.reader.problem and not self.reader.plugged_in else []
-        own += [self.found.problem] if self.found.problem else []
-        own += [self.problem] if self.problem else []
-        own += [ZEROING] if not self.found.problem and not self.zeroed else []
-        health = [] if self.found.problem else self.health.active(self.reader.unix_s())
-        return (*own, *(alarm.name for alarm in health))
+        """Return what is wrong now."""
+        alarms = []
+        if self.reader.problem and not self.reader.plugged_in:
+            alarms.append(f"{'unplugged' if self.reader.was_plugged_in else 'not open'}: {self.reader.problem}")
+        if self.detected.problem:
+            alarms.append(self.detected.problem)
+        if self._model_problem:
+            alarms.append(self._model_problem)
+        if not self.detected.problem:
+            alarms += [] if self.zeroed else [TAKING_NOLOAD]
+            alarms += [alarm.name for alarm in self.health.active(self.reader.unix_s())]
+        return tuple(alarms)
 
-    def poll(self, wait_s: float, *, latest: bool = False) -> Readings | None:
-        """Decode what came, wait for it at most so long, and estimate; `latest` estimates the last frame alone."""
+    def poll(self, wait_s: float, *, latest: bool = False) -> Estimates | None:
+        """Decode what has come and estimate.
+
+        Parameters
+        ----------
+        wait_s : longest time to wait for data
+        latest : whether to estimate for the last frame only
+
+        Returns
+        -------
+        Estimates, or None if no frame came
+        """
         chunks = self.reader.take(wait_s)
         if not chunks:
             if self.silent:
-                self.health.note("nothing comes", 1, self.reader.unix_s(), "unplug")
+                self.health.note("no data", 1, self.reader.unix_s(), "unplug")
             return None
-        if self.found.problem:
-            chunks = self._recognise(chunks)
+        if self.detected.problem:
+            chunks = self._detect(chunks)
         if not chunks:
             return None
         frames, t_s = self._decode(chunks)
@@ -210,130 +349,191 @@ class Skin:
             return None
         sound = self.health.feed(frames, t_s[-1])
         if not self.zeroed:
-            self._take_zero(frames.where(sound), t_s)
+            self._take_noload(frames.where(sound), t_s)
         if latest:
             last = np.arange(len(frames)) == len(frames) - 1
             frames, t_s, sound = frames.where(last), t_s[-1:], sound[-1:]
         return self._estimate(frames, t_s, sound)
 
-    def _wait_until_zeroed(self) -> None:
-        end_s = self.reader.unix_s() + OPENING_S
-        while not self.zeroed:
-            if self.reader.unix_s() > end_s:
-                got, remedy = "; ".join(self.alarms()) or "nothing", "See what `reskin ports` says of it."
-                raise CaptureError(self.port, "the skin", f"heard and zeroed within {OPENING_S:g} s", got, remedy)
-            self.poll(SILENT_S)
-
-    def _recognise(self, chunks: list[Chunk]) -> list[Chunk]:
-        """Gather bytes until a format shows; give all of them then."""
+    def _detect(self, chunks: list[Chunk]) -> list[Chunk]:
+        """Collect bytes until the wire format is detected; then return all of them."""
         self._head += chunks
         bytes_n = sum(len(chunk) for chunk, _ in self._head)
         if self._head[-1][1] - self._head[0][1] < HEAD_S and bytes_n < HEAD_BYTES_MAX_N:
             return []
         chunks, self._head = self._head, []
-        found = find.recognise(self.port, chunks)
-        if found.problem:
-            self.found = found
+        detected = find.recognise(self.port, chunks)
+        if detected.problem:
+            self.detected = detected
             return []
-        if self.answers is not None and self.answers.channels_n != 3 * found.chips_n:
-            self._refuse_model(self.answers, found.chips_n)
-        self.health, self.layout = Health(found.chips_n, self.fault_policy), layout_of(found.chips_n)
-        self._begin_stream(found)
-        self.found = found  # last: another thread that sees it asks for the rest
+        if self.estimator is not None and self.estimator.channels_n != 3 * detected.chips_n:
+            self._reject_model(self.estimator, detected.chips_n)
+        self.health, self.layout = Health(detected.chips_n, self.fault_policy), layout_of(detected.chips_n)
+        self._start_stream(detected)
+        self.detected = detected  # last: another thread that sees it uses the attributes above
         return chunks
 
-    def _refuse_model(self, answers: Networks | Map, chips_n: int) -> None:
-        """Do without the map, which nobody asked for, on a board that it is not of; raise for networks."""
-        if isinstance(answers, Networks):
-            remedy = "Take a model of such boards."
-            raise SchemaError(self.port, "channels", f"the {answers.channels_n} of the model", 3 * chips_n, remedy)
-        self.answers, self.problem = None, f"no place, no force: the {answers.about} is for five chips; name a model"
+    def _reject_model(self, estimator: NetworkEstimator | UniversalEstimator, chips_n: int) -> None:
+        """Raise for networks of other boards; do without the universal model, which may be the default."""
+        if isinstance(estimator, NetworkEstimator):
+            raise SchemaError(
+                f"{self.port}: the board has {3 * chips_n} channels, but the model {estimator.channels_n}. "
+                "Give a model that was trained on such boards."
+            )
+        self.estimator = None
+        self._model_problem = f"no place and force: the {estimator.name} is for five chips. Give a model of this board."
 
-    def _begin_stream(self, found: find.Found) -> None:
-        self._stream = FrameStream(found.wire, found.chips_n)
+    def _start_stream(self, detected: find.Found) -> None:
+        self._stream = FrameStream(detected.wire, detected.chips_n)
         self._counted: Counter[str] = Counter()
-        self._lost_in_row_n = self._opening_n = 0
+        self._garbage_bytes_n = self._first_bytes_n = 0
         self._ends: deque[tuple[int, float]] = deque([(0, self.reader.unix_s())], maxlen=ENDS_KEPT_N)
 
     def _decode(self, chunks: list[Chunk]) -> tuple[Frames, Float64[np.ndarray, " f"]]:
-        """Decode chunks; a board that was plugged in again begins a stream anew."""
-        anew = [i for i, (chunk, _) in enumerate(chunks) if chunk == PLUGGED_IN]
+        """Return the frames in chunks and when each came; a board that was plugged in again starts a new stream."""
+        starts = [i for i, (chunk, _) in enumerate(chunks) if chunk == PLUGGED_IN]
         parts = []
-        for first, last in pairwise([0, *anew, len(chunks)]):
-            if first in anew:
+        for first, last in pairwise([0, *starts, len(chunks)]):
+            if first in starts:
                 self._stream.close()
-                self._count(chunks[first][1])
-                self._begin_stream(self.found)
-            parts.append(self._feed(chunks[first:last]))
-        frames = concatenate([part for part, _ in parts], self.found.chips_n)
+                self._count_bytes(chunks[first][1])
+                self._start_stream(self.detected)
+            parts.append(self._decode_stream(chunks[first:last]))
+        frames = concatenate([part for part, _ in parts], self.detected.chips_n)
         return frames, np.concatenate([t_s for _, t_s in parts])
 
-    def _feed(self, chunks: list[Chunk]) -> tuple[Frames, Float64[np.ndarray, " f"]]:
+    def _decode_stream(self, chunks: list[Chunk]) -> tuple[Frames, Float64[np.ndarray, " f"]]:
         """Decode chunks of one stream; a frame came when the chunk that ends it did."""
         for chunk, came_s in chunks:
             self._ends.append((self._ends[-1][0] + len(chunk), came_s))
         frames = self._stream.feed(b"".join(chunk for chunk, _ in chunks))
-        self._count(self._ends[-1][1])
+        self._count_bytes(self._ends[-1][1])
         last = len(self._ends) - 1
         chunk_i = (min(bisect_left(self._ends, end, key=itemgetter(0)), last) for end in frames.end_byte.tolist())
         return frames, np.fromiter((self._ends[i][1] for i in chunk_i), np.float64, len(frames))
 
-    def _count(self, now_s: float) -> None:
+    def _count_bytes(self, now_s: float) -> None:
+        """Add the stream's counts since the last call to the account, and raise alarms for lost bytes."""
+        frame_min_n = FRAME_BYTES_MIN_N * self.detected.chips_n
         counted = Counter(self._stream.account())
-        more, first, self._counted = counted - self._counted, not self._counted["frames_n"], counted
-        self.account += more
-        lost_n = sum(count for name, count in more.items() if name.startswith("skipped_"))
-        frame_n = more["frame_bytes_n"] / more["frames_n"] if more["frames_n"] else 16 * self.found.chips_n  # at least
-        if first and self._opening_n + lost_n <= frame_n + 1:  # behind a last byte alone, one is not sure
-            self._opening_n, self._opening_bytes_n = self._opening_n + lost_n, self._opening_bytes_n + lost_n
-            return  # the port was opened in a frame
+        new, at_start, self._counted = counted - self._counted, not self._counted["frames_n"], counted
+        self.account += new
+        lost_n = sum(count for name, count in new.items() if name.startswith("skipped_"))
+        frame_n = new["frame_bytes_n"] / new["frames_n"] if new["frames_n"] else frame_min_n
+        # The port was opened within a frame. One more byte: a last byte alone does not show where the next one begins.
+        if at_start and self._first_bytes_n + lost_n <= frame_n + 1:
+            self._first_bytes_n += lost_n
+            self._partial_first_bytes_n += lost_n
+            return
         self.health.note("bytes lost between frames", lost_n, now_s, "torn")
-        self._lost_in_row_n = 0 if more["frames_n"] else self._lost_in_row_n + lost_n
-        if self._lost_in_row_n > GARBAGE_FRAMES_N * 16 * self.found.chips_n:  # no format has less than 16 bytes a chip
+        self._garbage_bytes_n = 0 if new["frames_n"] else self._garbage_bytes_n + lost_n
+        if self._garbage_bytes_n > GARBAGE_FRAMES_N * frame_min_n:
             self.health.note("no frames in what comes: wrong baud rate?", lost_n, now_s, "wrong_baud")
 
-    def _begin_zero(self) -> None:
-        self._zero: Zero | None = None
+    def _restart_noload(self) -> None:
+        self.noload_uT: Float64[np.ndarray, " ch"] | None = None
+        self._contact_uT = np.inf  # length of a change of field above which there is contact
         self._quiet: list[Frames] = []
         self._quiet_from_s = np.inf
-        self._zero_asked = False  # last: who asks from here on is heard by the next `poll`
+        self._noload_asked = False  # last: a request from here on is seen by the next `poll`
 
-    def _take_zero(self, frames: Frames, t_s: Float64[np.ndarray, " f"]) -> None:
-        if self._zero_asked:
-            self._begin_zero()
+    def _take_noload(self, frames: Frames, t_s: Float64[np.ndarray, " f"]) -> None:
+        """Collect a second of frames; if nothing moved, take their mean as the no-load reading."""
+        if self._noload_asked:
+            self._restart_noload()
         self._quiet.append(frames)
         self._quiet_from_s = min(self._quiet_from_s, t_s[0])
         lasted_s = t_s[-1] - self._quiet_from_s
         b_uT = np.concatenate([part.b_uT for part in self._quiet])
-        if len(b_uT) < 2 or (lasted_s < ZERO_S and len(b_uT) < ZERO_FRAMES_MAX_N):
+        if len(b_uT) < 2 or (lasted_s < NOLOAD_S and len(b_uT) < NOLOAD_FRAMES_MAX_N):
             return
         self._quiet, self._quiet_from_s = [], np.inf
-        with suppress(CaptureError):  # it moved: the next second may be quiet; frames of one chunk came at once
-            quiet_n = quiet_start(np.linspace(0, lasted_s, len(b_uT)), b_uT, where=self.port)
-            if self.answers is not None:
-                self.answers.zero(b_uT[:quiet_n])
-            self._zero = Zero.of(b_uT[:quiet_n])
+        with suppress(CaptureError):  # something moved: the next second may be quiet
+            # Evenly spaced times: frames of one chunk came at once.
+            b_uT = b_uT[: quiet_start(np.linspace(0, lasted_s, len(b_uT)), b_uT, where=self.port)]
+            if self.estimator is not None:
+                self.estimator.set_noload(b_uT)
+            noload_uT = b_uT.mean(axis=0, dtype=np.float64)
+            noise_uT = b_uT - noload_uT
+            length_uT = np.median(np.linalg.norm(noise_uT, axis=1))
+            self._contact_uT = float(length_uT + CONTACT_SDS * np.sqrt((noise_uT**2).mean()))
+            self.noload_uT = noload_uT
 
-    def _estimate(self, frames: Frames, t_s: Float64[np.ndarray, " f"], sound: Bool[np.ndarray, " f"]) -> Readings:
-        answer, sd_mm = np.full((len(frames), 3), np.nan), np.full((len(frames), 2), np.nan)
-        zero = self._zero
-        if zero is None:
+    def _estimate(self, frames: Frames, t_s: Float64[np.ndarray, " f"], sound: Bool[np.ndarray, " f"]) -> Estimates:
+        target, sd_mm = np.full((len(frames), 3), np.nan), np.full((len(frames), 2), np.nan)
+        if self.noload_uT is None:
             unknown_uT, contact = np.full_like(frames.b_uT, np.nan), np.zeros(len(t_s), bool)
-            return Readings(t_s, frames.b_uT, unknown_uT, answer, sd_mm, contact)
-        db_uT = (np.where(sound[:, None], frames.b_uT, np.nan) - zero.noload_uT).astype(np.float32)
-        contact = np.linalg.norm(db_uT, axis=1) > zero.contact_uT  # of NaN, nothing is more
-        if self.answers is not None:
-            answer[sound & ~contact, 2] = 0.0
+            return Estimates(t_s, frames.b_uT, unknown_uT, target, sd_mm, contact)
+        db_uT = (np.where(sound[:, None], frames.b_uT, np.nan) - self.noload_uT).astype(np.float32)
+        contact = np.linalg.norm(db_uT, axis=1) > self._contact_uT  # False for NaN
+        if self.estimator is not None:
+            target[sound & ~contact, 2] = 0.0
             if contact.any():
-                answer[contact], sd_mm[contact], unlike = self.answers(db_uT[contact])
-                self.health.note(UNLIKE, int(unlike.sum()), t_s[-1])
+                target[contact], sd_mm[contact], unknown = self.estimator(db_uT[contact])
+                self.health.note(UNKNOWN_SKIN, int(unknown.sum()), t_s[-1])
         if sound[-1] and self.layout.known:
             self.health.feed_change(db_uT[-1], self.layout.turn, t_s[-1])
-        return Readings(t_s, frames.b_uT, db_uT, answer, sd_mm, contact)
+        return Estimates(t_s, frames.b_uT, db_uT, target, sd_mm, contact)
 
-    def _contact(self, readings: Readings | None, i: int) -> Contact:
-        if readings is None:
-            nothing = np.full(3 * self.found.chips_n, np.nan, np.float32)
-            return Contact(self.reader.taken_s, np.nan, np.nan, np.nan, (np.nan, np.nan), nothing, self.alarms())
-        (x_mm, y_mm, force_N), (sd_x_mm, sd_y_mm) = readings.answer[i].tolist(), readings.sd_mm[i].tolist()
-        return Contact(float(readings.t_s[i]), x_mm, y_mm, force_N, (sd_x_mm, sd_y_mm), readings.b_uT[i], self.alarms())
+    def _contact(self, estimates: Estimates | None, i: int) -> Contact:
+        if estimates is None:
+            nothing_uT = np.full(3 * self.detected.chips_n, np.nan, np.float32)
+            return Contact(self.reader.taken_s, np.nan, np.nan, np.nan, (np.nan, np.nan), nothing_uT, self.alarms())
+        (x_mm, y_mm, force_N), (sd_x_mm, sd_y_mm) = estimates.target[i].tolist(), estimates.sd_mm[i].tolist()
+        t_s, sd_mm = float(estimates.t_s[i]), (sd_x_mm, sd_y_mm)
+        return Contact(t_s, x_mm, y_mm, force_N, sd_mm, estimates.b_uT[i], self.alarms())
+
+
+class LiveSkins:
+    """Skins on several ports. Iterate for a tuple of their latest contacts, in the order of the ports."""
+
+    def __init__(self, skins: Sequence[LiveSkin]) -> None:
+        self.skins = skins
+        self._latest: list[Contact | None] = [None] * len(skins)
+        self._error: Exception | None = None
+        self._new, self._changed, self._stop = False, threading.Condition(), threading.Event()
+        self._open_ports = ExitStack()
+        self._threads = [
+            threading.Thread(target=self._follow, args=[i], name=f"contacts of {skin.port}", daemon=True)
+            for i, skin in enumerate(skins)
+        ]
+
+    def __enter__(self) -> "LiveSkins":
+        """Open all ports and take all no-load readings at once; if one port fails, none is left open."""
+        with self._open_ports as ports, ThreadPoolExecutor(len(self.skins)) as pool:
+            for opening in [pool.submit(ports.enter_context, skin) for skin in self.skins]:
+                opening.result()
+            self._open_ports = ports.pop_all()
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        for thread in self._threads:
+            thread.join()
+        self._open_ports.close()
+
+    def __iter__(self) -> Iterator[tuple[Contact, ...]]:
+        """Yield the latest contact of each board whenever one has a new one; that of a silent board is NaN."""
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._error or (self._new and None not in self._latest))
+                if self._error is not None:
+                    raise self._error
+                self._new = False
+                latest = tuple(contact for contact in self._latest if contact is not None)
+            yield latest
+
+    def _follow(self, index: int) -> None:
+        try:
+            for contact in self.skins[index]:
+                with self._changed:
+                    self._latest[index], self._new = contact, True
+                    self._changed.notify()
+                if self._stop.is_set():
+                    return
+        except Exception as error:  # raised again where the caller iterates
+            with self._changed:
+                self._error = error
+                self._changed.notify()

@@ -23,9 +23,8 @@ import pytest
 from aiohttp import web
 
 from reskin.live.server import Server
-from reskin.live.session import Live
-from reskin.live.tracker import Readings, Skin, layout_of
-from reskin.live.view import LATENCIES_N, View
+from reskin.live.session import LATENCIES_N, Session, Traces
+from reskin.live.tracker import Estimates, LiveSkin, layout_of
 from reskin.predicting import read_network
 from tests.benchmarks import size
 from tests.live.boards import make_script, write_model, write_script
@@ -59,12 +58,12 @@ every_way = pytest.mark.parametrize("boards", BOARDS.values(), ids=BOARDS.keys()
 
 @every_way
 def test_from_the_last_byte_of_a_frame_to_its_estimate(tmp_path, boards):
-    with at_work(tmp_path, boards) as (lives, server):
-        addresses = [f"{server}/live?board={i}" for i in range(len(lives))]
+    with at_work(tmp_path, boards) as (sessions, server):
+        addresses = [f"{server}/live?board={i}" for i in range(len(sessions))]
         page = subprocess.Popen([sys.executable, "-c", PAGE, *addresses], env=ENVIRONMENT)
         try:
             time.sleep(size(2.0, 0.1))
-            with measured(lives, boards):
+            with measured(sessions, boards):
                 time.sleep(min(SECONDS, LATENCIES_N / boards[0][1]))
         finally:
             page.kill()
@@ -76,54 +75,54 @@ def test_from_the_last_byte_of_a_frame_to_its_estimate(tmp_path, boards):
 def test_from_the_last_byte_of_a_frame_to_the_screen(tmp_path, boards):
     async def act(tab: Tab) -> None:
         await tab.until(f"boards.length === {len(boards)} && boards.every(({{last}}) => last)")
-        with measured(lives, boards):
+        with measured(sessions, boards):
             await asyncio.sleep(SECONDS)
 
     async def look() -> None:
         async with aiohttp.ClientSession() as client:
             await in_browser(tmp_path, act)(server, client)
 
-    with at_work(tmp_path, boards) as (lives, server):
+    with at_work(tmp_path, boards) as (sessions, server):
         asyncio.run(look())
 
 
 @contextmanager
-def at_work(folder: Path, boards: list[tuple[int, float]]) -> Iterator[tuple[list[Live], str]]:
+def at_work(folder: Path, boards: list[tuple[int, float]]) -> Iterator[tuple[list[Session], str]]:
     """Plug boards in, each a process of its own, and serve their page; give them when all have been zeroed."""
-    lives, players = [], []
+    sessions, players = [], []
     try:
         for i, (chips_n, rate_hz) in enumerate(boards):
             capture = write_script(make_script(chips_n=chips_n, rate_hz=rate_hz), folder / f"c{i}")
             words = ["-m", "pipeline", "emulate", str(capture), "--port", str(folder / f"board{i}"), "--loop"]
             players.append(subprocess.Popen([sys.executable, *words], env=ENVIRONMENT, cwd=ROOT))
             model = read_network(write_model(folder, f"model{i}", chips_n=chips_n))
-            lives.append(Live(str(folder / f"board{i}"), [model], "benchmark", alone=len(boards) == 1))
-            lives[-1].start()
-        address = serve_beside(lives)
-        while not all(live.view is not None and live.skin.zeroed for live in lives):
+            sessions.append(Session(str(folder / f"board{i}"), [model], "benchmark", alone=len(boards) == 1))
+            sessions[-1].start()
+        address = serve_beside(sessions)
+        while not all(session.traces is not None and session.skin.zeroed for session in sessions):
             time.sleep(0.1)
-        yield lives, address
+        yield sessions, address
     finally:
         for player in players:
             player.kill()
             player.wait()
-        for live in lives:
-            live.stop()
+        for session in sessions:
+            session.stop()
 
 
 @contextmanager
-def measured(lives: list[Live], boards: list[tuple[int, float]]) -> Iterator[None]:
+def measured(sessions: list[Session], boards: list[tuple[int, float]]) -> Iterator[None]:
     """Print what frames took that came meanwhile, of all boards together."""
-    for live in lives:
-        live.view.to_estimate_s.clear()
-        live.view.to_screen_s.clear()
-    before_s, wall_s, before_n = time.process_time(), time.monotonic(), frames_of(lives)
+    for session in sessions:
+        session.traces.to_estimate_s.clear()
+        session.traces.to_screen_s.clear()
+    before_s, wall_s, before_n = time.process_time(), time.monotonic(), frames_of(sessions)
     yield
-    took_s, wall_s, frames_n = time.process_time() - before_s, time.monotonic() - wall_s, frames_of(lives) - before_n
+    took_s, wall_s, frames_n = time.process_time() - before_s, time.monotonic() - wall_s, frames_of(sessions) - before_n
     assert frames_n
     print(f"\n{', '.join(f'{chips_n} chips at {rate_hz:g} Hz' for chips_n, rate_hz in boards)}: {frames_n} frames")
     for where in ("to_estimate_s", "to_screen_s"):
-        if latency_ms := [1e3 * late_s for live in lives for late_s in list(getattr(live.view, where))]:
+        if latency_ms := [1e3 * late_s for session in sessions for late_s in list(getattr(session.traces, where))]:
             p50, p95, p99 = np.percentile(latency_ms, [50, 95, 99])
             print(f"  byte {where[:-2].replace('_', ' ')}: p50 {p50:.2f} ms, p95 {p95:.2f} ms, p99 {p99:.2f} ms")
     print(f"  processor time, page and reading included: {1e3 * took_s / frames_n:.2f} ms a frame,", end=" ")
@@ -131,16 +130,16 @@ def measured(lives: list[Live], boards: list[tuple[int, float]]) -> Iterator[Non
     print(f"  load of the machine: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
 
 
-def frames_of(lives: list[Live]) -> int:
-    return sum(live.skin.account["frames_n"] for live in lives)
+def frames_of(sessions: list[Session]) -> int:
+    return sum(session.skin.account["frames_n"] for session in sessions)
 
 
-def serve_beside(lives: list[Live]) -> str:
+def serve_beside(sessions: list[Session]) -> str:
     """Serve the page on a thread; give its address."""
     ready, address = threading.Event(), []
 
     async def run() -> None:
-        runner = web.AppRunner(Server(lives, "").application())
+        runner = web.AppRunner(Server(sessions, "").application())
         await runner.setup()
         site = web.TCPSite(runner, "127.0.0.1", 0)
         await site.start()
@@ -155,14 +154,14 @@ def serve_beside(lives: list[Live]) -> str:
 
 @pytest.mark.timeout(3600)
 def test_a_day_of_frames_takes_the_memory_of_ten_minutes():
-    view, made_n = View(layout_of(5), 0.0), 400
+    traces, made_n = Traces(layout_of(5), 0.0), 400
     rng = np.random.Generator(np.random.PCG64(0))
     db_uT = rng.standard_normal((made_n, 15)).astype(np.float32)
-    answer, sd_mm = rng.standard_normal((made_n, 3)), np.full((made_n, 2), np.nan)
+    target, sd_mm = rng.standard_normal((made_n, 3)), np.full((made_n, 2), np.nan)
     tracemalloc.start()
     for second in range(size(86_400, 60)):
         t_s = second + np.arange(made_n) / made_n
-        view.feed(Readings(t_s, db_uT, db_uT, answer, sd_mm, answer[:, 2] > 0), t_s[-1])
+        traces.add(Estimates(t_s, db_uT, db_uT, target, sd_mm, target[:, 2] > 0), t_s[-1])
         if second in size((600, 86_399), (30, 59)):
             print(f"\n  after {second} s: {tracemalloc.get_traced_memory()[0] / 1e6:.3f} MB")
     tracemalloc.stop()
@@ -190,13 +189,13 @@ def test_hours_of_bytes_take_the_memory_of_ten_minutes(tmp_path):
     script, hours = make_script(pokes_n=20), float(os.environ.get("RESKIN_HOURS", size("1", "0.02")))
     frames_n = round(400 * QUARTER_S)
     chunks = [b"".join(script.pieces[i : i + frames_n]) for i in range(0, len(script) - frames_n + 1, frames_n)]
-    skin, view = Skin("day", [read_network(write_model(tmp_path))]), View(layout_of(5), 0.0)
+    skin, traces = LiveSkin("day", [read_network(write_model(tmp_path))]), Traces(layout_of(5), 0.0)
     skin.reader, next_s = Accelerated(chunks), 600.0
     begun_s = time.process_time()
     while skin.reader.now_s < 3600 * hours:
-        if (readings := skin.poll(0.0)) is not None:
-            view.feed(readings, skin.reader.now_s)
-            view.message(view.newest_bin - 2, rate_hz=skin.health.rate_hz, lost_bytes_n=0)
+        if (estimates := skin.poll(0.0)) is not None:
+            traces.add(estimates, skin.reader.now_s)
+            traces.message(traces.newest_bin - 2, rate_hz=skin.health.rate_hz, lost_bytes_n=0)
         if skin.reader.now_s >= next_s:
             next_s += 1800.0
             resident_MB = int(STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6

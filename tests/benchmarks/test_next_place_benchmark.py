@@ -12,7 +12,7 @@ import numpy as np
 
 from reskin.config import parse
 from reskin.data.grid import CENTRE_MM
-from reskin.live.calibrating import SHOWN_MM
+from reskin.live.session import GUIDED_MM
 from reskin.physics.skin import SkinDesign
 from reskin.seeds import rng_for
 from reskin.simulation.defaults import nominal
@@ -59,7 +59,7 @@ def test_errors_after_labels_at_fixed_random_and_chosen_places():
 
 def ways(pool_mm: np.ndarray, rng: np.random.Generator) -> dict[str, Choose]:
     """Fixed: of the places that `reskin live` shows, in random order, each the next poke to it that there is."""
-    shown_mm = np.stack(np.meshgrid(SHOWN_MM, SHOWN_MM), axis=-1).reshape(-1, 2) - CENTRE_MM
+    shown_mm = np.stack(np.meshgrid(GUIDED_MM, GUIDED_MM), axis=-1).reshape(-1, 2) - CENTRE_MM
     fixed = [int(np.linalg.norm(pool_mm - one, axis=1).argmin()) for one in rng.permutation(shown_mm)]
     anywhere = rng.permutation(len(pool_mm)).tolist()
 

@@ -3,7 +3,6 @@
 Used by `fuzz.py`, for as long as one likes, and by `test_corpus.py` on what is committed. Refuses to know fuzzers.
 """
 
-import asyncio
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
@@ -18,8 +17,8 @@ from aiohttp.test_utils import make_mocked_request
 from reskin.board import find
 from reskin.board.stream import FrameStream
 from reskin.errors import ReskinError
-from reskin.live.server import Server
-from reskin.live.session import Live
+from reskin.live.server import Server, receive
+from reskin.live.session import Session
 from reskin.predicting import read_network
 from reskin.recordings import clocks, header, probe
 from reskin.recordings.header import PROBE_FILE, Wire
@@ -31,8 +30,7 @@ from tests.recordings.headers import AS_USUAL, make_header
 
 FOLDER = Path(tempfile.mkdtemp(prefix="reskin-fuzz-"))
 WIRES = get_args(Wire)
-LIVE = Live("none", [], "a board that is not there")
-LOOP = asyncio.new_event_loop()
+LIVE = Session("none", [], "a board that is not there")
 
 
 def stream(data: bytes) -> None:
@@ -53,7 +51,7 @@ def stream(data: bytes) -> None:
 
 def page(data: bytes) -> None:
     """What a page says on its websocket: buttons are three words, and nothing else is done."""
-    Server([LIVE], "")._listen(LIVE, data.decode(errors="replace"))
+    receive(LIVE, data.decode(errors="replace"))
 
 
 def request(data: bytes) -> None:
@@ -62,17 +60,14 @@ def request(data: bytes) -> None:
     words = {"Host": host} | ({"Origin": origin} if origin else {})
     asked = make_mocked_request("GET", "/?" + token.replace(" ", "+"), headers=words)
 
-    async def answer(_: web.Request) -> web.StreamResponse:
-        name, _, port = host.lower().rpartition(":") if host[-1] != "]" and ":" in host else (host.lower(), "", "")
-        assert name in ("localhost", "127.0.0.1", "[::1]"), host
-        assert not port or port.isdecimal()
-        assert not origin or origin.endswith(host)
-        return web.Response()
-
     try:
-        LOOP.run_until_complete(Server([LIVE], "")._check(asked, answer))
+        Server([LIVE], "").check(asked)
     except web.HTTPForbidden:
         return
+    name, _, port = host.lower().rpartition(":") if host[-1] != "]" and ":" in host else (host.lower(), "", "")
+    assert name in ("localhost", "127.0.0.1", "[::1]"), host
+    assert not port or port.isdecimal()
+    assert not origin or origin.endswith(host)
 
 
 def card(data: bytes) -> None:

@@ -9,9 +9,8 @@ import numpy as np
 
 from reskin import io
 from reskin.board.wire import Frames
-from reskin.live.answering import Models
-from reskin.live.emulator import Script, encode_pieces, open_far_end, play
-from reskin.live.tracker import Readings, Skin
+from reskin.live.emulator import Script, encode_pieces, make_port, play
+from reskin.live.tracker import Estimates, LiveSkin, Models
 from reskin.models.network import draw_weights, paper_layers
 from reskin.recordings import clocks
 from reskin.recordings.header import ARRIVALS_FILE, STREAM_FILE, Clock, Wire, write_capture
@@ -109,29 +108,29 @@ class PlayedReader:
         return [(b"".join(pieces), self.unix_s())] if pieces else []
 
 
-def played(script: Script, models: Models = ()) -> tuple[Skin, list[Readings]]:
-    """Take a skin through a script as fast as it goes; give it, and all that it read."""
-    skin, readings = Skin("played", models), []
+def played(script: Script, models: Models = ()) -> tuple[LiveSkin, list[Estimates]]:
+    """Play a script to a skin as fast as it goes; return the skin and all its estimates."""
+    skin, estimates = LiveSkin("played", models), []
     skin.reader = reader = PlayedReader(script)
     while not reader.at_end:
         if (found := skin.poll(0.0)) is not None:
-            readings.append(found)
-    return skin, readings
+            estimates.append(found)
+    return skin, estimates
 
 
-def zeros_asked(monkeypatch) -> list[Skin]:
+def zeros_asked(monkeypatch) -> list[LiveSkin]:
     """List the skins as they are asked for a no-load reading: on a busy machine it is over before a page is told."""
-    asked, zero = [], Skin.zero
-    monkeypatch.setattr(Skin, "zero", lambda skin: (zero(skin), asked.append(skin)))
+    asked, zero = [], LiveSkin.zero
+    monkeypatch.setattr(LiveSkin, "zero", lambda skin: (zero(skin), asked.append(skin)))
     return asked
 
 
 class Dying:
     """A model that raises at the first contact, by a fault that is none of ours to name."""
 
-    channels_n, about = 15, "a model that raises"
+    channels_n, name = 15, "a model that raises"
 
-    def zero(self, b_uT: np.ndarray) -> None:
+    def set_noload(self, b_uT: np.ndarray) -> None:
         """Take any no-load reading."""
 
     def __call__(self, db_uT: np.ndarray) -> None:
@@ -141,7 +140,7 @@ class Dying:
 @contextmanager
 def plugged_in(script: Script, port: str = "pty", **how: object) -> Iterator[str]:
     """Play a script beside the test; give the name of its port."""
-    end, stop = open_far_end(port), threading.Event()
+    end, stop = make_port(port), threading.Event()
     player = threading.Thread(target=play, args=[script, end, stop], kwargs=how)
     player.start()
     try:

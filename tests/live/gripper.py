@@ -12,9 +12,8 @@ from sklearn.neural_network import MLPRegressor
 
 import reskin
 from reskin.board.wire import Frames
-from reskin.live.answering import Models
 from reskin.live.emulator import encode_pieces
-from reskin.live.tracker import Skin
+from reskin.live.tracker import LiveSkin, Models
 from reskin.models.inputs import Scaler, fit_standard
 from reskin.models.trained import Network
 from reskin.seeds import rng_for
@@ -103,13 +102,13 @@ def grip(
     finger: Finger, models: Models, rng: np.random.Generator, *, aim_N: float = AIM_N, seconds: float = PERIOD_S
 ) -> np.ndarray:
     """Hold an object that stiffens tenfold and gives way; give true and estimated force in N of every step [f 2]."""
-    skin, wire, closed_mm, held = Skin("gripper", models), Wire(finger, rng), 0.0, []
+    skin, wire, closed_mm, held = LiveSkin("gripper", models), Wire(finger, rng), 0.0, []
     skin.reader = wire
     while len(held) < seconds * RATE_HZ:
-        readings = skin.poll(0.0, latest=True)
-        if readings is None or not skin.zeroed:
+        estimates = skin.poll(0.0, latest=True)
+        if estimates is None or not skin.zeroed:
             continue
-        estimate_N = float(readings.answer[-1, 2])
+        estimate_N = float(estimates.target[-1, 2])
         held.append((wire.force_N, estimate_N))
         closed_mm += GAIN_MM_N * (aim_N - estimate_N)  # the controller
         share = (1 - np.cos(2 * np.pi * len(held) / RATE_HZ / PERIOD_S)) / 2

@@ -7,10 +7,9 @@ import pytest
 
 import reskin
 from reskin.errors import ParamsError
-from reskin.live.answering import Map
-from reskin.live.calibrating import POKES_N, Pokes, ShownPokes
 from reskin.live.emulator import Script, encode_pieces
-from reskin.live.tracker import UNLIKE, Readings
+from reskin.live.session import PRESSES_N, GuidedPresses, Presses
+from reskin.live.tracker import UNKNOWN_SKIN, Estimates, UniversalEstimator
 from reskin.predicting import read_models
 from reskin.seeds import rng_for
 from reskin.universal.model import load_universal
@@ -22,7 +21,7 @@ QUIET_N, POKED_N = 600, 100
 @pytest.fixture(scope="module")
 def simulated():
     """A simulated skin's no-load reading, and pokes all over it: fields, places, forces."""
-    places = np.column_stack([rng_for(0, "places").uniform(3, 13, (POKES_N, 2)), np.full(POKES_N, 1.0)])
+    places = np.column_stack([rng_for(0, "places").uniform(3, 13, (PRESSES_N, 2)), np.full(PRESSES_N, 1.0)])
     noload_uT, b_uT, force_N = reskin.simulate_pokes(reskin.draw_skin(seed=3), places, seed=3)
     return noload_uT, b_uT, places[:, :2], force_N
 
@@ -40,7 +39,7 @@ def poked(simulated, chips_on_n: int = 0):
 
 def test_without_a_model_the_map_answers_and_says_how_sure_it_is(simulated):
     skin, readings = played(poked(simulated), load_universal())
-    answers = np.concatenate([each.answer[each.contact] for each in readings])
+    answers = np.concatenate([each.target[each.contact] for each in readings])
     sd_mm = np.concatenate([each.sd_mm[each.contact] for each in readings])
     true = np.repeat(simulated[2], POKED_N, axis=0)
     assert len(answers) == pytest.approx(len(true), abs=20)
@@ -52,94 +51,94 @@ def test_without_a_model_the_map_answers_and_says_how_sure_it_is(simulated):
 
 def test_a_board_with_its_chips_in_another_order_is_none_that_it_knows(simulated):
     skin, _ = played(poked(simulated, chips_on_n=1), load_universal())
-    assert skin.health.alarms[UNLIKE].count_n > 0.5 * POKED_N * POKES_N
+    assert skin.health.alarms[UNKNOWN_SKIN].count_n > 0.5 * POKED_N * PRESSES_N
 
 
 def test_a_dozen_pokes_are_gathered_one_a_contact_and_the_map_learns_from_them(simulated):
     _, readings = played(poked(simulated), load_universal())
-    pokes = Pokes()
+    pokes = Presses()
     for each in readings:
-        pokes.feed(each)
-    assert pokes.enough
+        pokes.add(each)
+    assert pokes.complete
     change_uT = simulated[1] - simulated[0].mean(axis=0)
     np.testing.assert_allclose(pokes.db_uT, change_uT, atol=30)  # the strongest of 200 readings with noise of 3 uT
-    answers = Map(load_universal())
-    answers.zero(simulated[0])
-    assert "adapted to 12 pokes: standard deviation of a place" in answers.see(pokes.db_uT)
+    answers = UniversalEstimator(load_universal())
+    answers.set_noload(simulated[0])
+    assert "adapted to 12 presses: standard deviation of a place" in answers.adapt(pokes.db_uT)
     before = answers(pokes.db_uT.astype(np.float32))
-    answers.zero(simulated[0])  # what it has seen is kept
-    np.testing.assert_allclose(answers(pokes.db_uT.astype(np.float32)).answer, before.answer, rtol=1e-6)
+    answers.set_noload(simulated[0])  # what it has seen is kept
+    np.testing.assert_allclose(answers(pokes.db_uT.astype(np.float32)).target, before.target, rtol=1e-6)
 
 
 def test_a_dozen_pokes_that_went_wrong_are_mended_by_another(simulated):
     db_uT = simulated[1] - simulated[0].mean(axis=0)
-    mended, once = Map(load_universal()), Map(load_universal())
+    mended, once = UniversalEstimator(load_universal()), UniversalEstimator(load_universal())
     for answers in (mended, once):
-        answers.zero(simulated[0])
-    mended.see(rng_for(0, "a hand").normal(0, 300, db_uT.shape))
-    wrong = mended(db_uT.astype(np.float32)).answer
+        answers.set_noload(simulated[0])
+    mended.adapt(rng_for(0, "a hand").normal(0, 300, db_uT.shape))
+    wrong = mended(db_uT.astype(np.float32)).target
     for answers in (mended, once):
-        answers.see(db_uT)
-    right = once(db_uT.astype(np.float32)).answer
-    np.testing.assert_allclose(mended(db_uT.astype(np.float32)).answer, right, rtol=1e-6)
+        answers.adapt(db_uT)
+    right = once(db_uT.astype(np.float32)).target
+    np.testing.assert_allclose(mended(db_uT.astype(np.float32)).target, right, rtol=1e-6)
     assert np.abs(wrong - right).max() > 1.0
 
 
 @pytest.fixture(scope="module")
 def pressed():
     """A simulated skin that is pressed where the page shows it, in that order."""
-    places = np.column_stack([ShownPokes().place_mm, np.full(ShownPokes().pokes_n, 1.0)])
+    places = np.column_stack([GuidedPresses().place_mm, np.full(GuidedPresses().presses_n, 1.0)])
     noload_uT, b_uT, force_N = reskin.simulate_pokes(reskin.draw_skin(seed=5), places, seed=5)
     return noload_uT, b_uT, places[:, :2], force_N
 
 
 def test_presses_at_shown_places_are_learnt_from_and_judged_at_those_in_between(pressed):
     _, readings = played(poked(pressed), load_universal())
-    pokes, crosses = ShownPokes(), []
+    pokes, crosses = GuidedPresses(), []
     for each in readings:
         crosses += [pokes.next_mm] if pokes.next_mm not in [None, *crosses] else []
-        pokes.feed(each)
+        pokes.add(each)
     np.testing.assert_allclose(crosses, pressed[2])
-    assert len(np.unique(pokes.place_mm, axis=0)) == len(pokes) == 2 * pokes.kept.sum()
+    assert len(np.unique(pokes.place_mm, axis=0)) == len(pokes) == 2 * pokes.held_out.sum()
     assert pokes.next_mm is None
-    answers = Map(load_universal())
-    answers.zero(pressed[0])
-    told = answers.label(pokes.place_mm, pokes.db_uT, pokes.kept)
+    answers = UniversalEstimator(load_universal())
+    answers.set_noload(pressed[0])
+    told = answers.label(pokes.place_mm, pokes.db_uT, pokes.held_out)
     before_mm, after_mm = map(float, re.findall(r"([0-9.]+) mm (?:before|after)", told))
-    found = answers(pokes.db_uT[pokes.kept].astype(np.float32)).answer[:, :2]
+    found = answers(pokes.db_uT[pokes.held_out].astype(np.float32)).target[:, :2]
     assert after_mm == pytest.approx(
-        np.median(np.linalg.norm(found - pressed[2][pokes.kept], axis=1)), abs=0.006
+        np.median(np.linalg.norm(found - pressed[2][pokes.held_out], axis=1)), abs=0.006
     )  # of the places that were pressed
     assert after_mm < before_mm
-    answers.zero(pressed[0])  # what it has learnt is kept
-    np.testing.assert_allclose(answers(pokes.db_uT[pokes.kept].astype(np.float32)).answer[:, :2], found, rtol=1e-6)
+    answers.set_noload(pressed[0])  # what it has learnt is kept
+    np.testing.assert_allclose(answers(pokes.db_uT[pokes.held_out].astype(np.float32)).target[:, :2], found, rtol=1e-6)
 
 
 def test_shown_places_are_learnt_beside_the_labels_that_a_model_has(pressed):
     noload_uT, b_uT, place_mm, force_N = pressed
-    kept, rest_uT = ShownPokes().kept, noload_uT.mean(axis=0)
+    kept, rest_uT = GuidedPresses().held_out, noload_uT.mean(axis=0)
     learnt = load_universal().zero(noload_uT).label(place_mm[kept], force_N[kept], b_uT[kept])
     all_force_N = np.where(kept, force_N, learnt.estimate(b_uT).force_N)  # nobody measured that of the shown ones
     at_once = load_universal().zero(noload_uT).label(place_mm, all_force_N, b_uT).predict(b_uT)
-    answers = Map(learnt)
-    answers.zero(noload_uT)
+    answers = UniversalEstimator(learnt)
+    answers.set_noload(noload_uT)
     answers.label(place_mm, b_uT - rest_uT, kept)
-    np.testing.assert_allclose(answers((b_uT - rest_uT).astype(np.float32)).answer, at_once, rtol=1e-3)
+    np.testing.assert_allclose(answers((b_uT - rest_uT).astype(np.float32)).target, at_once, rtol=1e-3)
     assert learnt.presses_n == kept.sum()
 
 
 def test_a_knock_is_no_poke():
-    pokes, db_uT = Pokes(), np.full((6, 15), 100.0, np.float32)
+    pokes, db_uT = Presses(), np.full((6, 15), 100.0, np.float32)
     contact = np.array([True, True, False, True, False, False])
-    pokes.feed(Readings(np.arange(6.0), db_uT, db_uT, np.zeros((6, 3)), np.zeros((6, 2)), contact))
+    pokes.add(Estimates(np.arange(6.0), db_uT, db_uT, np.zeros((6, 3)), np.zeros((6, 2)), contact))
     assert len(pokes) == 0
 
 
 def test_on_a_board_of_other_chips_it_says_that_it_cannot_answer():
     skin, readings = played(make_script(pokes_n=1, chips_n=4), load_universal())
-    assert skin.answers is None
-    assert "no place, no force: the map of simulated skins is for five chips; name a model" in skin.alarms()
-    assert all(np.isnan(each.answer).all() for each in readings)
+    assert skin.estimator is None
+    assert "no place and force: the universal model is for five chips. Give a model of this board." in skin.alarms()
+    assert all(np.isnan(each.target).all() for each in readings)
 
 
 def test_a_model_that_learnt_the_skin_keeps_what_it_learnt_when_its_board_is_opened(simulated, tmp_path):
@@ -150,9 +149,9 @@ def test_a_model_that_learnt_the_skin_keeps_what_it_learnt_when_its_board_is_ope
     (tmp_path / "s3.json").write_text("{}")  # a user's own file of that name is no network's card
     for models in (learnt, read_models([tmp_path / "s3.safetensors"])):
         _, readings = played(poked(simulated), models)
-        answers = np.concatenate([each.answer[each.contact] for each in readings])
+        answers = np.concatenate([each.target[each.contact] for each in readings])
         true_mm = np.repeat(place_mm, POKED_N, axis=0)[: len(answers)]
-        untaught = np.concatenate([each.answer[each.contact] for each in played(poked(simulated), load_universal())[1]])
+        untaught = np.concatenate([each.target[each.contact] for each in played(poked(simulated), load_universal())[1]])
         assert np.abs(answers[:, :2] - true_mm).mean() < 0.6 * np.abs(untaught[:, :2] - true_mm).mean()
     np.testing.assert_array_equal(learnt.predict(b_uT), before)  # the user's own stays as it is
     np.testing.assert_array_equal(learnt.skin.number, number)
@@ -161,7 +160,7 @@ def test_a_model_that_learnt_the_skin_keeps_what_it_learnt_when_its_board_is_ope
 def test_one_skin_does_not_answer_for_several_boards(simulated, tmp_path):
     noload_uT, b_uT, place_mm, force_N = simulated
     learnt = load_universal().zero(noload_uT).label(place_mm, force_N, b_uT)
-    with pytest.raises(ParamsError, match="a model that was told 12 pokes of a skin must be for one board; got 2"):
+    with pytest.raises(ParamsError, match=r"to one skin \(12 presses\) cannot estimate for 2 boards"):
         reskin.open(["/dev/a", "/dev/b"], model=learnt)
     learnt.save(tmp_path / "s3.safetensors")
     with pytest.raises(ParamsError, match="must be a trained network; got a saved skin. Load it with reskin.load_univ"):

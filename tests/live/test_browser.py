@@ -19,7 +19,7 @@ import aiohttp
 import numpy as np
 import pytest
 
-from reskin.live.calibrating import POKES_N
+from reskin.live.session import PRESSES_N
 from reskin.predicting import read_network
 from reskin.recordings.header import HEADER_FILE
 from reskin.universal.model import load_universal
@@ -177,8 +177,8 @@ def test_a_dozen_pokes_adapt_the_map_and_its_ellipse_is_drawn(tmp_path, simulate
             "boards[0].last && boards[0].last.contact && boards[0].last.sdX > .1 && boards[0].last.sdY > .1"
         )
         await tab.press_key("a")
-        await tab.until(f"boards[0].state.adapting.includes('of {POKES_N}')")
-        await tab.until("boards[0].state.adapted.startsWith('adapted to 12 pokes')")
+        await tab.until(f"boards[0].state.adapting.includes('of {PRESSES_N}')")
+        await tab.until("boards[0].state.adapted.startsWith('adapted to 12 presses')")
         assert "mm before" in await tab.text("adapting")
         await tab.look("map")
 
@@ -197,7 +197,7 @@ def test_presses_at_the_crosses_adapt_the_map_and_errors_before_and_after_are_sh
         await tab.press_key("p")
         await tab.until("boards[0].state.next_mm && !boards[0].dirty")
         await tab.look("cross")
-        await tab.until("boards[0].state.adapted.startsWith('adapted to 8 shown places')")
+        await tab.until("boards[0].state.adapted.startsWith('adapted to 8 known places')")
         before_mm, after_mm = map(float, re.findall(r"([0-9.]+) mm (?:before|after)", await tab.text("adapting")))
         assert after_mm < before_mm
         assert await tab.value("boards[0].state.next_mm") is None

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from pipeline.experiments.stability.wire import deliver
-from reskin.live.emulator import PIECES, VALUES, Fault, Script, encode_pieces, inject
+from reskin.live.emulator import BYTE_FAULTS, VALUE_FAULTS, Fault, Script, encode_pieces, inject
 from reskin.seeds import rng_for
 from tests.board.signals import TEXT_WIRES, WIRES, make_frames
 
@@ -23,13 +23,13 @@ def draw(seed: int) -> tuple[Script, list[bytes], list[bool], np.random.Generato
     rng = rng_for(seed, "byte account")
     wire, chips_n = str(rng.choice(WIRES)), int(rng.integers(1, 6))
     frames = make_frames(SLOTS_N * SLOT_FRAMES_N, chips_n, seed)
-    faults = [str(name) for name in rng.choice([*VALUES, *PIECES, "none"], SLOTS_N - 1)]
+    faults = [str(name) for name in rng.choice([*VALUE_FAULTS, *BYTE_FAULTS, "none"], SLOTS_N - 1)]
     # Behind damage, a frame that makes no sense passes for the rest of one: it is lost to the search for the next.
     finite = rng.random(len(frames)) >= NOT_FINITE_SHARE
-    finite |= np.repeat([name in PIECES for name in [*faults, "none"]], SLOT_FRAMES_N)
+    finite |= np.repeat([name in BYTE_FAULTS for name in [*faults, "none"]], SLOT_FRAMES_N)
     script = Script("recorded", wire, frames, encode_pieces(frames, wire), np.arange(len(frames)) / RATE_HZ)
     for slot_i, name in enumerate(faults):  # first what the chips give, then what the wire makes of it
-        if name in VALUES and (name != "clock-jump" or wire == "binary-clock"):
+        if name in VALUE_FAULTS and (name != "clock-jump" or wire == "binary-clock"):
             script = inject(script, in_slot(name, slot_i, rng))
     pieces = list(script.pieces)
     finite |= np.array([b"\r\n" in piece[:-2] for piece in pieces])  # of two readings of such bytes, sense decides
@@ -37,7 +37,7 @@ def draw(seed: int) -> tuple[Script, list[bytes], list[bool], np.random.Generato
         pieces[i] = not_finite(pieces[i], wire)
     script, clean = replace(script, pieces=pieces), pieces
     for slot_i, name in enumerate(faults):
-        if name in PIECES:
+        if name in BYTE_FAULTS:
             script = inject(script, in_slot(name, slot_i, rng))
     return script, clean, finite.tolist(), rng
 

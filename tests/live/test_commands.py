@@ -46,11 +46,11 @@ def test_a_recording_says_which_chip_was_broken(tmp_path, monkeypatch, capsys):
 
 def test_a_page_without_options_is_that_of_all_boards_that_are_there(monkeypatch):
     shown = {}
-    monkeypatch.setattr("reskin.live.server.serve", lambda boards, **words: shown.update(words, boards=boards))
+    monkeypatch.setattr("reskin.live.server.serve", lambda sessions, **words: shown.update(words, sessions=sessions))
     monkeypatch.setattr("reskin.board.find.the_boards", lambda: [find.Found(f"/dev/ttyACM{i}", None) for i in (0, 1)])
     commands.live(None, None, None, None, "127.0.0.1", 8765, ["stuck=flag"])
-    assert [str(board) for board in shown["boards"]] == ["a board on /dev/ttyACM0", "a board on /dev/ttyACM1"]
+    assert [str(session) for session in shown["sessions"]] == ["a board on /dev/ttyACM0", "a board on /dev/ttyACM1"]
     assert (shown["host"], shown["http_port"]) == ("127.0.0.1", 8765)
-    assert {(board.skin.fault_policy.stuck, board.skin.fault_policy.zeros) for board in shown["boards"]} == {
+    assert {(session.skin.fault_policy.stuck, session.skin.decisions.zeros) for session in shown["sessions"]} == {
         ("flag", "drop")
     }

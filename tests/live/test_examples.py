@@ -22,7 +22,7 @@ class OneContact:
         self.port = port
 
     def __enter__(self):
-        contact = Contact(12.5, 4.0, 6.0, 0.5, (0.1, 0.2), np.arange(15, dtype=np.float32), ("nothing comes",))
+        contact = Contact(12.5, 4.0, 6.0, 0.5, (0.1, 0.2), np.arange(15, dtype=np.float32), ("no data",))
         return iter([contact])
 
     def __exit__(self, *_: object) -> None: ...
@@ -56,7 +56,7 @@ def test_a_ros_2_node_publishes_each_contact_with_its_time(run):
         6.0,
         0.5,
         [0.1, 0.2],
-        ["nothing comes"],
+        ["no data"],
     )
     assert (told.header.stamp.sec, told.header.stamp.nanosec) == (12, 500_000_000)
 

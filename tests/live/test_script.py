@@ -44,6 +44,6 @@ def test_a_simulated_scene_is_a_skin_that_is_poked(source):
 
 def test_what_is_neither_a_capture_nor_simulated_is_refused(tmp_path):
     for source in (str(tmp_path), "nowhere", str(ROOT / "pipeline/scenes/lab.yaml"), "../scenes/quick"):
-        with pytest.raises(ReskinError, match=r"must be|simulated") as told:
+        with pytest.raises(ReskinError, match="not the folder of a capture|not a simulated scene") as told:
             read_script(source)
         assert "Traceback" not in str(told.value)

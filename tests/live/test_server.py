@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 from aiohttp import web
 
-from reskin.live.answering import Models
 from reskin.live.server import PAGES_MAX_N, REQUEST_BYTES_MAX_N, Server
-from reskin.live.session import several
-from reskin.live.view import BINS_N, HEAD, NUMBERS_N
+from reskin.live.session import BINS_N, HEAD, NUMBERS_N, open_sessions
+from reskin.live.tracker import Models
 from reskin.predicting import read_network
 from reskin.recordings.header import HEADER_FILE, parse
 from tests.live.boards import PLACES, RATE_HZ, make_script, plugged_in, write_model, zeros_asked
@@ -30,7 +29,7 @@ def serve(
     """Serve the page of a board or several, let a client act, and stop."""
 
     async def run() -> None:
-        boards = several([ports] if isinstance(ports, str) else ports, models, "a board")
+        boards = open_sessions([ports] if isinstance(ports, str) else ports, models, "a board")
         for board in boards:
             board.start()
         runner = web.AppRunner(Server(boards, token).application())

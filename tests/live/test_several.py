@@ -14,9 +14,8 @@ import reskin
 from reskin.board.find import BOARDS_MAX_N
 from reskin.errors import ReskinError
 from reskin.live.server import PAGES_MAX_N
-from reskin.live.session import Live, Skins, several
-from reskin.live.tracker import Skin
-from reskin.live.view import BINS_N, LATENCIES_N
+from reskin.live.session import BINS_N, LATENCIES_N, Session, open_sessions
+from reskin.live.tracker import LiveSkin, LiveSkins
 from reskin.universal.model import load_universal
 from tests.live.boards import PLACES, Dying, PlayedReader, make_script, plugged_in, write_model
 from tests.live.test_server import serve, until
@@ -92,33 +91,33 @@ def test_a_controller_has_the_latest_of_all_and_waits_for_none_that_is_unplugged
         assert np.median(nearest) < 0.5
 
 
-def played_at(port: str) -> Skin:
-    skin = Skin(port)
+def played_at(port: str) -> LiveSkin:
+    skin = LiveSkin(port)
     skin.reader = PlayedReader(make_script(pokes_n=1))
     return skin
 
 
 def test_an_error_of_a_model_is_raised_where_somebody_iterates_over_the_boards():
     dying, well = played_at("dying"), played_at("well")
-    dying.answers = Dying()
-    with Skins([dying, well]) as skins:
+    dying.estimator = Dying()
+    with LiveSkins([dying, well]) as skins:
         skins._threads[0].join(60.0)
         with pytest.raises(RuntimeError, match="out of memory"):
             next(iter(skins))
 
 
 def test_an_error_of_a_model_is_told_on_the_page():
-    live = Live("played", [], "a board")
+    live = Session("played", [], "a board")
     live.skin = played_at("played")
-    live.skin.answers = Dying()
-    live._poll()
+    live.skin.estimator = Dying()
+    live.run()
     assert "estimates ended: RuntimeError('out of memory')" in live.state()["alarms"]
 
 
 def test_ports_that_are_named_twice_or_too_many_or_not_there_are_refused(tmp_path):
     for ports in (["a", "a"], [f"p{i}" for i in range(BOARDS_MAX_N + 1)], []):
         with pytest.raises(ReskinError, match="--port: ports must be 1 to 16, each named once"):
-            several(ports, [], "a board")
+            open_sessions(ports, [], "a board")
         with pytest.raises(ReskinError, match=r"reskin.open: ports must be 1 to 16, each named once; got \w+"):
             reskin.open(ports)
     with plugged_in(make_script(pokes_n=1), loop=True) as name, pytest.raises(ReskinError, match="/dev/none"):

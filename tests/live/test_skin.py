@@ -16,8 +16,8 @@ import pytest
 import reskin
 from reskin.board.port import open_port
 from reskin.errors import ReskinError
-from reskin.live.emulator import inject, open_far_end, parse_fault, play
-from reskin.live.tracker import ZEROING, Skin
+from reskin.live.emulator import inject, make_port, parse_fault, play
+from reskin.live.tracker import TAKING_NOLOAD, LiveSkin
 from reskin.predicting import read_network
 from reskin.seeds import rng_for
 from tests.live.boards import (
@@ -31,7 +31,7 @@ from tests.live.boards import (
 )
 
 SCRIPT = make_script(pokes_n=2)
-LATE = {"nothing comes", "slower than it was: frames are missing"}  # what a busy machine makes of a healthy board
+LATE = {"no data", "slower than it was: frames are missing"}  # what a busy machine makes of a healthy board
 
 
 def test_every_reading_has_its_time_place_and_force_in_contact_and_none_off_it(tmp_path):
@@ -70,9 +70,7 @@ def test_who_is_slow_gets_the_latest_and_no_byte_is_lost(tmp_path):
         plugged_in(SCRIPT, loop=True) as name,
         reskin.open(name, model=reskin.load_model(write_model(tmp_path))) as skin,
     ):
-        came = (
-            contact for contact in skin if np.isfinite(contact.b_uT).all()
-        )  # not that nothing comes on a busy machine
+        came = (contact for contact in skin if np.isfinite(contact.b_uT).all())  # not that no data on a busy machine
         before, before_n = next(came), skin.account["frames_n"]
         while skin.reader.waiting_bytes_n < 300 * 82:  # a slow controller
             time.sleep(0.01)
@@ -92,13 +90,13 @@ def test_a_stall_and_an_unplugging_are_told_while_they_last_and_it_goes_on_after
             if any("unplugged" in alarm for alarms in told for alarm in alarms) and contact.F_N > 0:
                 break
     words = " ".join(alarm for alarms in told for alarm in alarms)
-    assert "nothing comes" in words
+    assert "no data" in words
     assert "unplugged" in words
 
 
 def test_a_failed_read_is_no_contact(tmp_path):
     skin, readings = played(inject(SCRIPT, parse_fault("failed-read@1.7+0.5")), [read_network(write_model(tmp_path))])
-    failed = [row for each in readings for row in each.answer[each.b_uT[:, 3] == np.float32(8028.16)]]
+    failed = [row for each in readings for row in each.target[each.b_uT[:, 3] == np.float32(8028.16)]]
     assert len(failed) == 200
     assert np.isnan(failed).all()
     assert skin.health.alarms["chip 1: failed I2C reads"].count_n == 200
@@ -118,9 +116,9 @@ def test_a_port_that_is_opened_inside_a_frame_loses_nothing_and_raises_no_alarm_
 def test_garbage_behind_a_replug_is_lost_and_told(chunk_n):
     skin, _ = played(make_script(pokes_n=0))
     garbage = np.random.default_rng(0).bytes(40 * 3280)
-    skin._begin_stream(skin.found)
+    skin._start_stream(skin.detected)
     for i in range(0, len(garbage), chunk_n):
-        skin._feed([(garbage[i : i + chunk_n], 0.0)])
+        skin._decode_stream([(garbage[i : i + chunk_n], 0.0)])
     assert skin.lost_bytes_n > 0.9 * len(garbage)
     assert {"bytes lost between frames", "no frames in what comes: wrong baud rate?"} <= set(skin.health.alarms)
 
@@ -134,7 +132,7 @@ def test_a_second_in_which_something_moves_is_no_no_load_reading():
     script = inject(make_script(pokes_n=0, quiet_s=4.0), parse_fault("magnet@0.35+0.7"))
     skin, _ = played(script)
     rest_uT = script.frames.b_uT[:100].mean(axis=0)
-    np.testing.assert_allclose(skin._zero.noload_uT, rest_uT, atol=4 * 3 / np.sqrt(100))  # of noise of 3 uT
+    np.testing.assert_allclose(skin.noload_uT, rest_uT, atol=4 * 3 / np.sqrt(100))  # of noise of 3 uT
     moving = inject(make_script(pokes_n=0, quiet_s=2.0), parse_fault("magnet@0.35+0.7"))
     assert not played(moving)[0].zeroed
 
@@ -145,14 +143,14 @@ def test_a_no_load_reading_that_is_asked_for_again_by_another_thread_is_begun_an
             super().append(frames)
             skin.zero()
 
-    skin = Skin("played")
+    skin = LiveSkin("played")
     skin.reader, skin._quiet = PlayedReader(make_script(pokes_n=0, quiet_s=2.0)), Pressed()
     while not skin.zeroed:
         assert not skin.reader.at_end
         skin.poll(0.0)
     skin.zero()
     assert not skin.zeroed
-    assert ZEROING in skin.alarms()
+    assert TAKING_NOLOAD in skin.alarms()
 
 
 @pytest.mark.timeout(3600)
@@ -161,11 +159,11 @@ def test_every_byte_that_was_sent_is_a_frames_or_lost_and_counted():
     script, rng = make_script(pokes_n=20), rng_for(0, "faults")
     for fault in ("torn", "dropped", "repeated", "wrong-baud", "crlf", "failed-read", "torn"):
         script = inject(script, parse_fault(f"{fault}@{rng.uniform(3, 55):.2f}+{rng.uniform(0.1, 2):.2f}"))
-    end, stop, sent = open_far_end("pty"), threading.Event(), []
+    end, stop, sent = make_port("pty"), threading.Event(), []
     player = threading.Thread(
         target=lambda: sent.extend(play(script, end, stop, speed=100.0) for _ in range(minutes_n))
     )
-    skin = Skin(end.name)
+    skin = LiveSkin(end.name)
     skin.reader.start(there=True)
     player.start()
     while skin.poll(1.0) is not None or player.is_alive():
@@ -189,8 +187,8 @@ def test_the_forty_chips_of_a_sleeve_are_drawn_where_they_lie_and_answered_for(t
     model = read_network(write_model(tmp_path, chips_n=40))
     skin, readings = played(make_script(pokes_n=2, chips_n=40, rate_hz=133.0), [model])
     assert skin.layout.known
-    assert skin.found.chips_n == 40
-    found = np.concatenate([each.answer[each.contact] for each in readings])
+    assert skin.detected.chips_n == 40
+    found = np.concatenate([each.target[each.contact] for each in readings])
     nearest = np.abs(found[:, None] - PLACES).sum(axis=2).argmin(axis=1)
     assert set(nearest) == {0, 1}
     np.testing.assert_allclose(found, PLACES[nearest], atol=0.5)
@@ -201,7 +199,7 @@ def test_eight_boards_on_eight_ports_are_each_their_own():
     chips_n = range(1, 9)
 
     def look(name: str) -> int:
-        with Skin(name) as skin:
+        with LiveSkin(name) as skin:
             contact = next(iter(skin))
             assert skin.reader.missed_bytes_n == 0
             return len(contact.b_uT) // 3
@@ -214,7 +212,7 @@ def test_eight_boards_on_eight_ports_are_each_their_own():
 
 def test_a_model_of_other_boards_and_a_port_without_one_are_refused(tmp_path):
     with plugged_in(make_script(pokes_n=1, chips_n=4)) as name:
-        with pytest.raises(ReskinError, match="channels must be the 15 of the model; got 12"):
+        with pytest.raises(ReskinError, match="the board has 12 channels, but the model 15"):
             reskin.open(name, model=write_model(tmp_path)).__enter__()
     with pytest.raises(ReskinError, match="the port must be one that opens"), reskin.open("/dev/none"):
         pass
@@ -222,7 +220,7 @@ def test_a_model_of_other_boards_and_a_port_without_one_are_refused(tmp_path):
 
 def test_a_port_that_another_program_holds_is_called_not_open_and_not_unplugged():
     with plugged_in(SCRIPT, loop=True) as name, open_port(name, 115200):
-        skin = Skin(name)
+        skin = LiveSkin(name)
         skin.reader.start(there=False)
         try:
             while not skin.reader.problem:  # the suite's time limit ends it

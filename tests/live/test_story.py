@@ -95,7 +95,7 @@ def test_a_board_that_was_recorded_becomes_a_table_and_a_model_that_sees_it_live
     model = min((root / "data/models/pressed/train_single").glob("*.safetensors"))
     _, readings = played(script, [read_network(model)])
     t_s = np.concatenate([each.t_s[each.contact] for each in readings])
-    found = np.concatenate([each.answer[each.contact] for each in readings])
+    found = np.concatenate([each.target[each.contact] for each in readings])
     assert len(found) > 0.8 * POKES_N * DWELL_S * RATE_HZ
     pressed = log.contact.nonzero()[0][np.searchsorted(log.t_start_s[log.contact] - 100, t_s + 0.1) - 1]
     true = np.column_stack([log.x_mm, log.y_mm, log.Fz_N])[pressed]

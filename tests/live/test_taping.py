@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 import reskin
+from reskin.board.find import Found
 from reskin.board.stream import decode_all
 from reskin.errors import ParamsError
-from reskin.live.taping import Wanted, board_of, record_board, source_of
+from reskin.live.record import label_source, record_board
 from reskin.recordings import clocks, probe
 from reskin.recordings.header import ARRIVALS_FILE, HEADER_FILE, PROBE_FILE, STREAM_FILE, parse
 from reskin.recordings.ingest import open_capture
@@ -90,11 +91,10 @@ def test_a_recording_that_is_killed_has_the_labels_that_had_come(tmp_path):
     """The recorder is a child of this process, so that no interpreter has to start."""
     robot = tmp_path / "robot.csv"
     with plugged_in(make_script(pokes_n=1), loop=True) as port:
-        source = source_of(str(robot), None, None, dwell_s=1.0, say=print)
-        wanted = Wanted(tmp_path / "run1", 60.0, 115200, {})
+        source = label_source(str(robot), None, None, dwell_s=1.0, say=print)
         child = os.fork()
         if child == 0:
-            record_board(board_of(port, None, None, say=print), wanted, source)
+            record_board(Found(port, None, "binary", 5), source, folder=tmp_path / "run1", seconds=60.0)
             os._exit(0)
         write_robots_log(robot, tmp_path / "run1.part")
         os.kill(child, signal.SIGKILL)
@@ -144,16 +144,16 @@ def test_a_full_disk_ends_it_and_what_came_can_be_added(tmp_path, monkeypatch, h
 
 @pytest.mark.parametrize(
     ("labels", "gauge", "scan", "told"),
-    [("robot.txt", None, None, "--labels: labels must be"), ("grid:2x2:4", None, "spiral", "--scan: the order"),
-     (None, "/dev/x@fast", None, "--gauge: the gauge must be"), ("robot.csv", "/dev/x", None, "--labels")],
+    [("robot.txt", None, None, "--labels: robot.txt is none of"), ("grid:2x2:4", None, "spiral", "--scan: prompts"),
+     (None, "/dev/x@fast", None, "--gauge: /dev/x@fast is not PORT"), ("robot.csv", "/dev/x", None, "--labels")],
 )  # fmt: skip
 def test_what_is_no_source_is_refused(labels, gauge, scan, told):
     with pytest.raises(ParamsError, match=told):
-        source_of(labels, gauge, scan, dwell_s=1.0, say=print)
+        label_source(labels, gauge, scan, dwell_s=1.0, say=print)
 
 
 def test_prompts_come_in_random_order_unless_told_and_nothing_is_asked_for_nothing():
-    assert source_of("grid:2x2:4", None, None, dwell_s=1.0, say=print).scan == "random"
-    assert source_of("line:5:2", "/dev/x@9600", "snake", dwell_s=1.0, say=print).scan == "snake"
-    assert source_of(None, "/dev/x", None, dwell_s=1.0, say=print).name == "gauge"
-    assert source_of(None, None, None, dwell_s=1.0, say=print) is None
+    assert label_source("grid:2x2:4", None, None, dwell_s=1.0, say=print).scan == "random"
+    assert label_source("line:5:2", "/dev/x@9600", "snake", dwell_s=1.0, say=print).scan == "snake"
+    assert label_source(None, "/dev/x", None, dwell_s=1.0, say=print).name == "gauge"
+    assert label_source(None, None, None, dwell_s=1.0, say=print) is None

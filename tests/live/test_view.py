@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from reskin.live.tracker import Readings, layout_of
-from reskin.live.view import BIN_S, BINS_N, HEAD, NUMBERS_N, View
+from reskin.live.session import BIN_S, BINS_N, HEAD, NUMBERS_N, Traces
+from reskin.live.tracker import Estimates, layout_of
 
 
 def readings(t_s, force_N):
     db_uT = np.zeros((len(t_s), 15), np.float32)
-    answer = np.column_stack([np.full((len(t_s), 2), 8.0), force_N])
-    return Readings(t_s, db_uT, db_uT, answer, np.full((len(t_s), 2), np.nan), force_N > 0)
+    target = np.column_stack([np.full((len(t_s), 2), 8.0), force_N])
+    return Estimates(t_s, db_uT, db_uT, target, np.full((len(t_s), 2), np.nan), force_N > 0)
 
 
 def forces(data):
@@ -21,41 +21,41 @@ def forces(data):
 
 
 def test_a_peak_of_one_frame_is_in_its_bin_and_minutes_of_frames_are_ten_seconds_of_bins():
-    view, peak_s = View(layout_of(5), 0.0), 115.0
+    traces, peak_s = Traces(layout_of(5), 0.0), 115.0
     for first in range(0, 48_000, 40):  # two minutes at 400 Hz
         t_s = (first + np.arange(40)) / 400
-        view.feed(readings(t_s, np.where(np.abs(t_s - peak_s) < 1e-3, 3.0, 0.1)), t_s[-1] + 0.001)
-    start_s, low_N, high_N = forces(view.message(0, rate_hz=400.0, lost_bytes_n=0))
+        traces.add(readings(t_s, np.where(np.abs(t_s - peak_s) < 1e-3, 3.0, 0.1)), t_s[-1] + 0.001)
+    start_s, low_N, high_N = forces(traces.message(0, rate_hz=400.0, lost_bytes_n=0))
     assert len(start_s) <= BINS_N
     np.testing.assert_allclose(start_s[-1], 120, atol=2 * BIN_S)
     peak = np.abs(start_s - peak_s) < 1.5 * BIN_S
     assert high_N[peak].max() == 3.0
     assert set(high_N[~peak]) == set(low_N) == {np.float32(0.1)}
-    assert len(view.message(view.newest_bin, rate_hz=400.0, lost_bytes_n=0)) < 300
+    assert len(traces.message(traces.newest_bin, rate_hz=400.0, lost_bytes_n=0)) < 300
 
 
 def test_a_gap_is_left_out_and_a_page_that_has_some_bins_gets_the_others():
-    view = View(layout_of(5), 0.0)
+    traces = Traces(layout_of(5), 0.0)
     for t_s in (np.arange(0, 1, 0.01), np.arange(5, 6, 0.01)):
-        view.feed(readings(t_s, np.ones(len(t_s))), t_s[-1])
-    start_s, _, _ = forces(view.message(0, rate_hz=100.0, lost_bytes_n=0))
+        traces.add(readings(t_s, np.ones(len(t_s))), t_s[-1])
+    start_s, _, _ = forces(traces.message(0, rate_hz=100.0, lost_bytes_n=0))
     assert not np.any((start_s > 1.0) & (start_s < 4.9))
-    later_s, _, _ = forces(view.message(275, rate_hz=100.0, lost_bytes_n=0))
+    later_s, _, _ = forces(traces.message(275, rate_hz=100.0, lost_bytes_n=0))
     np.testing.assert_allclose(later_s, start_s[start_s >= 5.5 - 1e-6], atol=1e-5)
 
 
 def test_after_a_fortnight_bins_lie_as_far_apart_as_in_the_first_minute():
-    view, t_s = View(layout_of(5), 0.0), 14 * 86_400 + np.arange(0, 2, 0.005)
-    view.feed(readings(t_s, np.ones(len(t_s))), t_s[-1])
-    start_s, _, _ = forces(view.message(0, rate_hz=200.0, lost_bytes_n=0))
+    traces, t_s = Traces(layout_of(5), 0.0), 14 * 86_400 + np.arange(0, 2, 0.005)
+    traces.add(readings(t_s, np.ones(len(t_s))), t_s[-1])
+    start_s, _, _ = forces(traces.message(0, rate_hz=200.0, lost_bytes_n=0))
     np.testing.assert_allclose(np.diff(start_s), BIN_S, atol=1e-5)
 
 
 def test_the_time_to_a_screen_is_that_of_the_message_that_it_shows():
-    view = View(layout_of(5), 0.0)
-    view.feed(readings(np.array([1.0]), np.ones(1)), 1.002)
-    number = HEAD.unpack_from(view.message(0, rate_hz=1.0, lost_bytes_n=0))[0]
+    traces = Traces(layout_of(5), 0.0)
+    traces.add(readings(np.array([1.0]), np.ones(1)), 1.002)
+    number = HEAD.unpack_from(traces.message(0, rate_hz=1.0, lost_bytes_n=0))[0]
     for seen in (number, number + 1, -1):  # those that were never sent tell nothing
-        view.seen(seen, 1.03)
-    np.testing.assert_allclose(view.to_screen_s, [0.03])
-    np.testing.assert_allclose(view.to_estimate_s, [0.002])
+        traces.seen(seen, 1.03)
+    np.testing.assert_allclose(traces.to_screen_s, [0.03])
+    np.testing.assert_allclose(traces.to_estimate_s, [0.002])

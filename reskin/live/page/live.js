@@ -1,4 +1,4 @@
-// Draws what the server sends: binary messages (view.py) as numbers, board and traces; JSON (session.py) as words.
+// Draws what session.py sends: binary messages (Traces.message) as numbers, board and traces; JSON (Session.state) as text.
 // Each board has a socket, a state and canvases of its own: one that is unplugged leaves the others as they are.
 "use strict";
 const NUMBERS_N = 12, HEAD_BYTES_N = 16, RETRY_MS = 1000, DRAWING_MS = 12;

@@ -1,0 +1,100 @@
+"""Record a board into a capture, with labels from prompts, a robot's table, a force gauge or a program."""
+
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+from reskin.board.find import BAUD, Found
+from reskin.board.port import PortSettings
+from reskin.errors import ParamsError
+from reskin.live.health import Health
+from reskin.recordings.label_sources import RANDOM, SNAKE, Forces, Prompts, Source, from_gauge, from_table, parse_places
+from reskin.recordings.recorder import UNTOLD, new_folder, print_progress, record_capture
+from reskin.seeds import rng_for
+
+GAUGE_BAUD = 9600
+SILENCE_S = NO_FRAME_S = 5.0
+
+
+class Finished(NamedTuple):
+    """A finished recording."""
+
+    folder: Path
+    summary: str
+    error: Exception | None  # that ended its labels
+
+
+def label_source(
+    labels: str | None, gauge: str | None, scan: str | None, *, dwell_s: float, say: Callable[[str], object]
+) -> Source | None:
+    """Return the source of labels that the options of `reskin record` ask for, None without any.
+
+    Parameters
+    ----------
+    labels : places to prompt for, such as `grid:5x5:4`, or the CSV file that a robot's program appends to
+    gauge : port of a force gauge, `PORT` or `PORT@BAUD`
+    scan : order of prompts, "random" or "snake"
+    dwell_s : how long the label of a prompt holds
+    say : called with each prompt
+    """
+    port, _, baud = (gauge or "").partition("@")
+    if baud and not baud.isdecimal():
+        raise ParamsError(f"--gauge: {gauge} is not PORT or PORT@BAUD. Try: --gauge /dev/ttyUSB0@9600")
+    gauge_baud = int(baud or GAUGE_BAUD)
+    if labels is None:
+        return from_gauge(port, gauge_baud) if gauge else None
+    if (places := parse_places(labels)) is None:
+        if Path(labels).suffix != ".csv" or gauge:
+            raise ParamsError(
+                f"--labels: {labels} is none of grid:NXxNY:STEP_MM, line:N:STEP_MM, or a .csv file (without --gauge). "
+                "Try: --labels grid:5x5:4"
+            )
+        return from_table(Path(labels))
+    if scan not in (None, RANDOM, SNAKE):
+        raise ParamsError(f"--scan: prompts come in {RANDOM} or {SNAKE} order, not {scan}. The default is {RANDOM}.")
+    forces = Forces(port, gauge_baud) if gauge else None
+    rng = rng_for(time.time_ns() % 2**31, "prompts")
+    return Prompts(places, dwell_s, say, lambda: sys.stdin, forces, rng, scan or RANDOM).source()
+
+
+def record_board(
+    board: Found,
+    labels: Source | None,
+    *,
+    folder: Path | None = None,
+    seconds: float = float("inf"),
+    baud: int = BAUD,
+    names: Mapping[str, str] | None = None,
+) -> Finished:
+    """Record until stopped, until the labels end, or until the board is unplugged.
+
+    Parameters
+    ----------
+    board : the port and its wire format
+    labels : where labels come from, if they come during the recording
+    folder : the capture's folder, which must be new; the default is captures/DATE-TIME
+    seconds : longest duration
+    baud : baud rate; USB ports ignore it
+    names : names of board and skin and the order of places, under the keys board, skin and scan
+    """
+    folder, health = folder or new_folder(), Health(board.chips_n)
+    scan = {"scan": labels.scan} if labels is not None and labels.scan is not None else {}
+    settings = PortSettings(
+        baud, board.wire, board.chips_n, seconds, bytes_max_n=None, silence_s=SILENCE_S, no_frame_s=NO_FRAME_S
+    )
+    stream, of_labels, error = record_capture(
+        board.port, folder, told=replace(UNTOLD, **(scan | dict(names or {})), labels=labels), settings=settings,
+        report=print_progress(lambda: [alarm.name for alarm in health.active(time.monotonic())]),
+        watch=lambda frames: health.feed(frames, time.monotonic()),
+    )  # fmt: skip
+    counts = ", ".join(f"{key} {count}" for key, count in stream.account.items() if count)
+    alarms = [f"{one.name} ({one.count_n}, {one.last_s - one.first_s:.1f} s)" for one in health.alarms.values()]
+    where = str(folder)
+    if stream.ended == "not written":
+        folder = folder.with_name(f"{folder.name}.part")
+        where = f"{folder}: no more could be written"
+    counted = "; ".join([counts, *alarms, *([of_labels] if of_labels else [])])
+    return Finished(folder, f"recorded {where} ({stream.ended} after {stream.duration_s:.1f} s): {counted}", error)
