@@ -56,6 +56,6 @@ def test_the_time_to_a_screen_is_that_of_the_message_that_it_shows():
     traces.add(readings(np.array([1.0]), np.ones(1)), 1.002)
     number = HEAD.unpack_from(traces.message(0, rate_hz=1.0, lost_bytes_n=0))[0]
     for seen in (number, number + 1, -1):  # those that were never sent tell nothing
-        traces.seen(seen, 1.03)
+        traces.confirm(seen, 1.03)
     np.testing.assert_allclose(traces.to_screen_s, [0.03])
     np.testing.assert_allclose(traces.to_estimate_s, [0.002])
