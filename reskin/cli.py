@@ -1,7 +1,7 @@
-"""The `reskin` command: ports, record, decode, emulate, live, predict, template.
+"""The `reskin` command: ports, template, record, emulate, live, decode, predict.
 
-In a checkout of the project, the commands of `pipeline.cli` join it. A command imports what it needs when it runs, so
-that `reskin --help` is quick.
+In a checkout of the project the commands of `pipeline.cli` are added. Each command imports what it needs when it runs,
+so that `reskin --help` is quick.
 """
 
 import importlib
@@ -10,6 +10,7 @@ import signal
 import sys
 import threading
 import time
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Literal, NoReturn
 
@@ -17,45 +18,37 @@ import typer
 from typer import Argument, Option
 
 from reskin.errors import ParamsError, ReskinError, explaining
-from reskin.packages import explain, show_version
 
-CHECKOUT = ("dvc.yaml", "pipeline/cli.py")  # files of a checkout of the project
-OF_CHECKOUT = (  # commands of `pipeline.cli`
+CHECKOUT_COMMANDS = (  # of `pipeline.cli`, so that help and errors elsewhere can name them
     "add", "check-cache", "compare", "fetch", "merge", "publish", "readme", "remove", "scenes", "verify-reports",
 )  # fmt: skip
-
 
 app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     help="Learning for magnetic tactile skins: read boards, record, see contacts live, turn logs into contacts.",
-    epilog=f"In a checkout of the project also: {', '.join(OF_CHECKOUT)}.",
+    epilog=f"In a checkout of the project also: {', '.join(CHECKOUT_COMMANDS)}.",
 )
 
 Wire = Literal["binary", "binary-clock", "text-xyzt", "text-txyz"]
-Speed = Annotated[float, Option(help="Times its own rate; inf: as fast as it is taken.", min=0.01)]
-Baud = Annotated[int, Option(help="Baud rate; USB ports ignore it.", min=1)]
-SOURCE = "A capture's folder, nominal (a simulated skin), or the YAML file of a simulated scene."
-ON_FAULT = "NAME=drop|flag|refuse: are readings that a fault has hit shown? May be repeated, such as stuck=flag."
-LABELS = "grid:NXxNY:STEP_MM or line:N:STEP_MM asks you to press places (Enter); or a CSV that a robot appends to."
-GAUGE = "Port of a force gauge that sends lines of Fz, or Fx Fy Fz, in N; @BAUD behind it, if not 9600."
-FAULT = "NAME[@START_S[+SECONDS]], such as stuck@3+1; may be repeated. A wrong name lists them all."
-MODEL = "A trained model (.safetensors), its card (.json) beside it, or a saved skin; else the map of simulated skins."
-LOGS = "A log of an SD card (t_s,T0,Bx0,By0,Bz0,T1,...; degC, uT), a folder of `record`, a file of `decode`."
 Chips = Annotated[int, Option("--chips", help="Chips in a frame.", min=1, max=64)]
-Version = Annotated[bool, Option("--version", help="Show the version.", callback=show_version, is_eager=True)]
+SOURCE = "A capture's folder, nominal (a simulated skin), or the YAML file of a simulated scene."
+ON_FAULT = "NAME=drop|flag|refuse: what to do with readings that have a fault, such as stuck=flag. May be repeated."
+LABELS = "grid:NXxNY:STEP_MM or line:N:STEP_MM prompts for places to press; or a CSV that a robot's program appends to."
+GAUGE = "Port of a force gauge that sends lines of Fz, or Fx Fy Fz, in N; PORT@BAUD if its rate is not 9600."
+FAULT = "NAME[@START_S[+SECONDS]], such as stuck@3+1; may be repeated. An unknown name lists all."
+MODEL = "A trained model (.safetensors, its card beside it) or a saved calibration. Default: the universal model."
+LOG = "A log of an SD card (t_s,T0,Bx0,By0,Bz0,T1,...; degC, uT), a folder of `record`, or a file of `decode`."
 
 
 def main() -> None:
-    """Run the command; show what a user did wrong as one sentence, without a traceback."""
+    """Run the command; print what a user did wrong without a traceback."""
     try:
-        signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what began is undone
+        signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that `finally` and `with` clean up
         with explaining("reskin"):
             add_checkout_commands()
             app()
-    except ModuleNotFoundError as error:
-        fail(explain(error))
     except ReskinError as error:
         fail(error)
 
@@ -66,28 +59,40 @@ def fail(error: ReskinError) -> NoReturn:
 
 
 def add_checkout_commands() -> None:
-    """Add the commands of the checkout that the working directory is; its own code runs, wherever `reskin` is from."""
+    """Add the commands of `pipeline.cli`, imported from the working directory if that is a checkout of the project."""
     here = Path.cwd()
-    if all((here / file).is_file() for file in CHECKOUT):
+    if (here / "dvc.yaml").is_file() and (here / "pipeline/cli.py").is_file():
         sys.path.insert(0, str(here))
         app.add_typer(importlib.import_module("pipeline.cli").app)
         app.info.epilog = None
-    elif sys.argv[1:2] and sys.argv[1] in OF_CHECKOUT:
-        rule = "a checkout of the project, with dvc.yaml in it"
-        raise ParamsError("reskin", "the working directory", rule, here, "Change to the checkout first.")
+    elif sys.argv[1:2] and sys.argv[1] in CHECKOUT_COMMANDS:
+        raise ParamsError(
+            f"reskin {sys.argv[1]} works in a checkout of the project, a folder with dvc.yaml and pipeline/; {here} is "
+            "none. Change to the checkout first."
+        )
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(version("reskin"))
+        raise typer.Exit
 
 
 @app.callback()
-def begin(version: Version = False) -> None:
-    """Take the options that stand before a command."""
+def common_options(
+    version: Annotated[
+        bool, Option("--version", help="Show the version.", callback=_show_version, is_eager=True)
+    ] = False,
+) -> None:
+    """Declare the options that stand before a command."""
 
 
 @app.command("ports")
 def find_ports(
-    names: Annotated[list[str] | None, Argument(help="Ports to listen to; without any, all of this machine.")] = None,
-    hunt: Annotated[bool, Option("--hunt", help="Find the board by unplugging it and plugging it in again.")] = False,
+    names: Annotated[list[str] | None, Argument(help="Ports to listen to. Default: all of this machine.")] = None,
+    hunt: Annotated[bool, Option("--hunt", help="Find the board by unplugging it and plugging it in.")] = False,
 ) -> None:
-    """Find boards: which port, what they send, how often, and the scale of their chips."""
+    """Find boards: their port, wire format, number of chips, rate and scale."""
     from reskin.board import find
 
     for found in find.find_boards([find.hunt(typer.echo)] if hunt else names):
@@ -97,37 +102,36 @@ def find_ports(
 @app.command()
 def template(
     out: Annotated[Path, Argument(help="The CSV file to write; must be new.")],
-    chips_n: Annotated[int, Option("--chips", help="Chips in a frame.", min=1, max=64)] = 5,
+    chips_n: Chips = 5,
 ) -> None:
-    """Write the first line of a recording in layout `table`; which columns may go stands in data/README.md."""
+    """Write the header line of a recording in layout `table`; data/README.md says which columns are optional."""
     from reskin import io
-    from reskin.errors import ParamsError
     from reskin.recordings.readers.table import NEEDED, columns_of
 
     if out.exists():
-        raise ParamsError(out, "the file", "new", "one that is there", "Choose another name.")
+        raise ParamsError(f"{out}: the file exists. Choose another name.")
     io.write_text(out, ",".join(columns_of(chips_n)) + "\n")
-    typer.echo(f"wrote {out}: {', '.join(NEEDED)} and fields in uT are needed. Then: reskin add --layout table")
+    typer.echo(f"wrote {out}; required: {', '.join(NEEDED)} and fields in uT. Then: reskin add --layout table")
 
 
 @app.command()
 def record(
     port: Annotated[
-        str | None, Option(help="/dev/ttyACM0, COM3, socket://host:port; not given: the one there.")
+        str | None, Option(help="/dev/ttyACM0, COM3 or socket://host:port. Default: the only board there is.")
     ] = None,
-    board: Annotated[str | None, Option(help="The circuit board's name; `reskin add` asks for it anyhow.")] = None,
-    skin: Annotated[str | None, Option(help="The skin's name, likewise.")] = None,
-    out: Annotated[Path | None, Option(help="The capture's folder; new. Not given: captures/DATE-TIME.")] = None,
-    wire: Annotated[Wire | None, Option(help="What the firmware sends; with --port, binary if not given.")] = None,
-    chips_n: Annotated[int | None, Option("--chips", help="With --port, 5 if not given.", min=1, max=64)] = None,
-    baud: Baud = 115200,
-    seconds: Annotated[float, Option(help="How long; without it, until Ctrl-C.", min=0.0)] = math.inf,
-    scan: Annotated[str | None, Option(help="The order of the rig's places: random, snake, or your words.")] = None,
+    board: Annotated[str | None, Option(help="Name of the circuit board; `reskin add` can give it too.")] = None,
+    skin: Annotated[str | None, Option(help="Name of the skin, likewise.")] = None,
+    out: Annotated[Path | None, Option(help="New folder for the capture. Default: captures/DATE-TIME.")] = None,
+    wire: Annotated[Wire | None, Option(help="Wire format of --port. Default: binary.")] = None,
+    chips_n: Annotated[int | None, Option("--chips", help="Chips of --port. Default: 5.", min=1, max=64)] = None,
+    baud: Annotated[int, Option(help="Baud rate; USB ports ignore it.", min=1)] = 115200,
+    seconds: Annotated[float, Option(help="Duration. Default: until Ctrl-C.", min=0.0)] = math.inf,
+    scan: Annotated[str | None, Option(help="Order of the places: random, snake, or a description.")] = None,
     labels: Annotated[str | None, Option(help=LABELS)] = None,
     gauge: Annotated[str | None, Option(help=GAUGE)] = None,
-    dwell_s: Annotated[float, Option("--dwell", help="How long each prompt's label holds, in s.", min=0.1)] = 1.0,
+    dwell_s: Annotated[float, Option("--dwell", help="Seconds for which the label of a prompt holds.", min=0.1)] = 1.0,
 ) -> None:
-    """Record what a board sends, and labels beside it; or label it with the robot's log when adding it."""
+    """Record what a board sends, with labels if asked; a robot's log can give labels later, in `reskin add`."""
     from reskin.board.find import Found, the_board
     from reskin.live.record import label_source, record_board
 
@@ -149,11 +153,11 @@ def record(
 def emulate(
     source: Annotated[str, Argument(help=SOURCE)],
     port: Annotated[str, Option(help="pty, tcp, tcp:PORT, or ./NAME of a link to a pseudo-terminal.")] = "pty",
-    speed: Speed = 1.0,
+    speed: Annotated[float, Option(help="Multiple of its own rate; inf: as fast as it is read.", min=0.01)] = 1.0,
     fault: Annotated[list[str] | None, Option(help=FAULT)] = None,
-    loop: Annotated[bool, Option("--loop", help="Begin again when it has ended.")] = False,
+    loop: Annotated[bool, Option("--loop", help="Start again at the end.")] = False,
 ) -> None:
-    """Be a board: send a capture or a simulated scene, with faults if asked, to whoever reads the port."""
+    """Emulate a board: send a capture or a simulation through a port, with faults if asked."""
     from reskin.live.emulator import inject, make_port, parse_fault, play, read_script
 
     faults = [parse_fault(text) for text in fault or ()]
@@ -174,21 +178,18 @@ def emulate(
 
 @app.command()
 def live(
-    port: Annotated[list[str] | None, Option(help="A board's port, or several; not given: all that are there.")] = None,
-    model: Annotated[
-        list[Path] | None, Option(help="Trained models, or one skin that was saved; else the map of simulated skins.")
-    ] = None,
-    replay: Annotated[str | None, Option(help="In place of a board: the folder of a capture.")] = None,
-    emulate: Annotated[str | None, Option(help="In place of a board: nominal, or a simulated scene's YAML.")] = None,
-    host: Annotated[str, Option(help="Where the page listens; elsewhere than here, behind a token.")] = "127.0.0.1",
-    http_port: Annotated[int, Option(help="The page's port.", min=1, max=65535)] = 8765,
+    port: Annotated[list[str] | None, Option(help="Port of a board; may be repeated. Default: all boards.")] = None,
+    model: Annotated[list[Path] | None, Option(help=f"{MODEL} Several models: their mean.")] = None,
+    replay: Annotated[str | None, Option(help="Instead of a board: the folder of a capture.")] = None,
+    emulate: Annotated[str | None, Option(help="Instead of a board: nominal, or a simulated scene's YAML.")] = None,
+    host: Annotated[str, Option(help="Address to listen on; other than this machine's needs a token.")] = "127.0.0.1",
+    http_port: Annotated[int, Option(help="Port of the page.", min=1, max=65535)] = 8765,
     on_fault: Annotated[list[str] | None, Option(help=ON_FAULT)] = None,
 ) -> None:
-    """Show boards at work in the browser: chips, contact, force, traces, and what is wrong."""
+    """Show boards in the browser: chips, contact, force, traces and alarms."""
     from contextlib import ExitStack
 
     from reskin.board.find import the_boards
-    from reskin.errors import ParamsError
     from reskin.live.emulator import playing, read_script
     from reskin.live.health import LIVE_POLICY
     from reskin.live.server import serve
@@ -214,10 +215,10 @@ def live(
 def decode(
     stream: Annotated[Path, Argument(help="A file of bytes as they came from a port.")],
     out: Annotated[Path, Option(help="The Parquet file to write.")],
-    wire: Annotated[Wire, Option(help="What the firmware sent.")] = "binary",
+    wire: Annotated[Wire, Option(help="Wire format.")] = "binary",
     chips_n: Chips = 5,
 ) -> None:
-    """Decode a dump of a port to one row a frame, and account for every byte."""
+    """Decode a dump of a port to a table of frames, and count lost bytes."""
     from reskin import io
     from reskin.board.decode import decode_dump
 
@@ -228,12 +229,12 @@ def decode(
 
 @app.command()
 def predict(
-    log: Annotated[Path, Argument(help=LOGS)],
+    log: Annotated[Path, Argument(help=LOG)],
     out: Annotated[Path, Option(help="The CSV to write: t_s,x_mm,y_mm,F_N,contact.")],
     model: Annotated[Path | None, Option(help=MODEL)] = None,
-    rate_hz: Annotated[float, Option("--rate-hz", help="Parquet without a device clock: frames a second.")] = 400.0,
+    rate_hz: Annotated[float, Option("--rate-hz", help="Frames a second of a decoded file without a clock.")] = 400.0,
 ) -> None:
-    """Turn a board's log into contacts, places and forces; it begins with a second without contact."""
+    """Turn a log into contacts, places and forces. The log must begin with a second without contact."""
     from reskin.predicting import predict as write
 
     counts = write(log, model, out, rate_hz=rate_hz)

@@ -1,16 +1,29 @@
-"""Errors that a user can cause, one class for each boundary, and explanations of what the machine refuses."""
+"""The errors that a user can cause or mend, and explanations of what the machine and missing packages refuse."""
 
 import errno
 from collections.abc import Iterator
 from concurrent.futures import BrokenExecutor
 from contextlib import contextmanager
+from importlib.util import find_spec
 
 
 class ReskinError(ValueError):
-    """Bad input from outside: a recording, a parameter or a file that breaks a contract.
+    """Base class: an input that is wrong. Commands print its message without a traceback and exit with `exit_code`.
 
+    Parameters
+    ----------
+    where : object
+        The whole message, if it is the only argument: what is wrong, where, and what to try. Else the place: a file
+        with its line or byte, an option, a setting.
+    what, rule, got, remedy
+        The parts of a message: what is wrong, what it must be, what it is, and what to try.
+
+    Examples
+    --------
     >>> print(ReskinError("b3_s2/stream.bin @8192", "frame", "whole", "40 bytes", "Wrong baud rate?"))
     b3_s2/stream.bin @8192: frame must be whole; got 40 bytes. Wrong baud rate?
+    >>> print(ReskinError("model.safetensors: file not found. Train it first: dvc repro."))
+    model.safetensors: file not found. Train it first: dvc repro.
     """
 
     exit_code = 2
@@ -20,59 +33,80 @@ class ReskinError(ValueError):
 
 
 class CaptureError(ReskinError):
-    """Bytes, headers or recordings that cannot be read."""
+    """Bytes, headers or recordings cannot be read, or a board does not answer."""
 
 
 class SchemaError(ReskinError):
-    """A table whose columns, types or units are not those of `reskin.schema`."""
+    """A table, file or array has other columns, types, units or shapes than it needs."""
 
 
 class ParamsError(ReskinError):
-    """A YAML file, a scene or a command line that asks for what cannot be."""
+    """A setting, a scene, an option of a command or an argument is invalid."""
 
 
 class TrainingError(ReskinError):
-    """A training that cannot go on: no rows, or a loss that is no longer finite."""
+    """A training cannot go on: it has no rows, or its loss is no longer finite."""
 
 
 class LeakError(ReskinError):
-    """A result that would rest on rows it is tested on."""
-
-
-ROOM = dict.fromkeys(("ENOSPC", "EDQUOT", "EFBIG"), ("have room", "Make room."))
-RIGHTS = dict.fromkeys(("EROFS", "EACCES", "EPERM"), ("be readable and writable", "Mend its rights or its mount."))
-BROKEN = {"EIO": ("be readable", "Check the disk.")}
-DISK = {getattr(errno, name): words for name, words in (ROOM | RIGHTS | BROKEN).items() if hasattr(errno, name)}
+    """Rows that a result is tested on were used to train."""
 
 
 class MachineError(ReskinError):
-    """What the machine could not do; what was finished before is kept."""
+    """The machine could not go on: no disk space, no memory, no rights, a dead worker. Finished work is kept."""
+
+
+EXTRAS = {"torch": "train", "onnx": "onnx", "onnxruntime": "onnx"}  # by package; all others come with `pipeline`
+DISK_REMEDIES = {  # by number of the system's error
+    getattr(errno, name): remedy
+    for names, remedy in (
+        ("ENOSPC EDQUOT EFBIG", "Free some disk space."),
+        ("EROFS EACCES EPERM", "Check its permissions and its mount."),
+        ("EIO", "Check the disk."),
+    )
+    for name in names.split()
+    if hasattr(errno, name)
+}
+RETRY = "Run it again: finished work is kept."
 
 
 @contextmanager
 def explaining(where: str) -> Iterator[None]:
-    """Raise `MachineError` for what the machine refuses; other errors pass as they are.
+    """Turn errors of the machine into `MachineError`, and a missing package into `ParamsError`; pass on all others.
 
     >>> with explaining("split"):
     ...     raise OSError(errno.ENOSPC, "No space left on device", "data/folds/lab.json")
     Traceback (most recent call last):
-    reskin.errors.MachineError: split: data/folds/lab.json must have room; got No space left on device. Make \
-room. Run it again: what was finished is kept.
+    reskin.errors.MachineError: split: data/folds/lab.json: No space left on device. Free some disk space. \
+Run it again: finished work is kept.
     """
     try:
         yield
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package in ("", "pipeline", "reskin"):
+            raise
+        raise missing_package(package, where) from None
     except BrokenExecutor:
-        rule, got = "be alive to its end", "one that died"
-        raise _error(where, "a worker process", rule, got, "Out of memory? Try RESKIN_EXECUTOR=processes:1.") from None
+        remedy = f"Try RESKIN_EXECUTOR=processes:1. {RETRY}"
+        raise MachineError(f"{where}: a worker process died, perhaps out of memory. {remedy}") from None
     except (MemoryError, OSError) as error:
         if isinstance(error, MemoryError) or error.errno == errno.ENOMEM:
-            rule, got = "be enough for its work", " ".join(str(error).split()) or "none left"
-            raise _error(where, "memory", rule, got, "Try RESKIN_EXECUTOR=processes:1.") from None
-        if error.errno not in DISK:
+            detail = " ".join(str(error).split()) or "nothing is left"
+            raise MachineError(f"{where}: out of memory: {detail}. Try RESKIN_EXECUTOR=processes:1. {RETRY}") from None
+        if error.errno not in DISK_REMEDIES:
             raise
-        rule, remedy = DISK[error.errno]
-        raise _error(where, str(error.filename or "the disk"), rule, error.strerror, remedy) from None
+        file, remedy = error.filename or "the disk", DISK_REMEDIES[error.errno]
+        raise MachineError(f"{where}: {file}: {error.strerror}. {remedy} {RETRY}") from None
 
 
-def _error(where: str, what: str, rule: str, got: object, remedy: str) -> MachineError:
-    return MachineError(f"{where}: {what} must {rule}; got {got}. {remedy} Run it again: what was finished is kept.")
+def require(package: str, where: object) -> None:
+    """Raise if an optional package is not installed, before another thread or a long computation needs it."""
+    if find_spec(package) is None:
+        raise missing_package(package, where)
+
+
+def missing_package(package: str, where: object) -> ParamsError:
+    """Make the error that names the extra which installs a package."""
+    extra = EXTRAS.get(package, "pipeline")
+    return ParamsError(f"{where}: package {package} is not installed. In the checkout: pip install '.[{extra}]'")

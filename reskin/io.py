@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 import safetensors
 import safetensors.numpy
 
-from reskin.errors import DISK, SchemaError
+from reskin.errors import DISK_REMEDIES, SchemaError
 from reskin.numerics import signature
 from reskin.schema import Readings, arrow_schema, from_table, to_table
 
@@ -52,7 +52,7 @@ def replacing(path: Path) -> Iterator[Path]:
             raise SchemaError(path, "a file to write", "no folder", "a folder", "Choose another name.")
         temporary.replace(path)
     except BaseException as error:
-        if isinstance(error, OSError) and error.errno in DISK and _is_written(error, temporary):
+        if isinstance(error, OSError) and error.errno in DISK_REMEDIES and _is_written(error, temporary):
             error.filename = str(path)  # not the temporary name, which nobody knows
         with suppress(OSError):  # what the disk refuses here, too, is told by the first error
             remove(temporary)

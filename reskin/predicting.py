@@ -15,11 +15,10 @@ from reskin import io
 from reskin.board.decode import read_frames
 from reskin.board.stream import decode_all
 from reskin.config import Strict, parse
-from reskin.errors import CaptureError, ParamsError, SchemaError
+from reskin.errors import CaptureError, ParamsError, SchemaError, require
 from reskin.live.contacts import Answers, Estimates, describe, estimate, quiet_start
 from reskin.models.inputs import VIEW
 from reskin.models.trained import FORMAT, Network
-from reskin.packages import need
 from reskin.recordings import tables
 from reskin.recordings.header import LOG_FILE, RATE_MAX_HZ, STREAM_FILE
 from reskin.recordings.ingest import read_header, timer
@@ -161,7 +160,7 @@ def read_network(model: Path) -> Network:
         rule, got = "one that learnt", "one that answers nearly the same to any input"
         raise SchemaError(card_file, "the model", rule, got, "Take the model of another seed.")
     _check_inputs(card, tensors, card_file)
-    need("torch", model)
+    require("torch", model)
     return Network(content, tensors)
 
 

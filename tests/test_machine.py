@@ -16,18 +16,18 @@ from reskin.errors import MachineError, SchemaError, explaining
 @pytest.mark.parametrize(
     ("error", "sentence"),
     [
-        (OSError(errno.ENOSPC, "No space left on device", "models"), "split: models must have room; got No space left"),
-        (OSError(errno.EROFS, "Read-only file system", "reports"), "split: reports must be readable and writable; got"),
-        (OSError(errno.ENOSPC, "No space left on device"), "split: the disk must have room"),
-        (BrokenProcessPool("gone"), "split: a worker process must be alive to its end; got one that died. Out of"),
-        (MemoryError("Unable to allocate 8 GiB"), "split: memory must be enough for its work; got Unable to allocate"),
-        (OSError(errno.ENOMEM, "Cannot allocate memory"), "split: memory must be enough for its work; got .*Cannot"),
+        (OSError(errno.ENOSPC, "No space left on device", "models"), "split: models: No space left on device. Free"),
+        (OSError(errno.EROFS, "Read-only file system", "reports"), "split: reports: Read-only file system. Check its"),
+        (OSError(errno.ENOSPC, "No space left on device"), "split: the disk: No space left on device"),
+        (BrokenProcessPool("gone"), "split: a worker process died, perhaps out of memory. Try RESKIN_EXECUTOR"),
+        (MemoryError("Unable to allocate 8 GiB"), "split: out of memory: Unable to allocate 8 GiB. Try RESKIN_EXEC"),
+        (OSError(errno.ENOMEM, "Cannot allocate memory"), "split: out of memory: .*Cannot allocate memory"),
     ],
 )
 def test_what_the_machine_refuses_is_one_sentence(error, sentence):
     with pytest.raises(MachineError, match=f"^{sentence}") as found, explaining("split"):
         raise error
-    assert str(found.value).endswith("Run it again: what was finished is kept.")
+    assert str(found.value).endswith("Run it again: finished work is kept.")
 
 
 @pytest.mark.parametrize(
@@ -46,7 +46,7 @@ def test_a_full_disk_is_told_by_the_name_of_the_target_whatever_writes(tmp_path,
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(io, "remove", lambda path: path.unlink(missing_ok=True) or path.symlink_to("/dev/full"))
         with (
-            pytest.raises(MachineError, match=rf"^split: {target} must have room; got .*No space"),
+            pytest.raises(MachineError, match=rf"^split: {target}: .*No space"),
             explaining("split"),
         ):
             write(target, content, *([{}] if write is io.write_tensors else []))
@@ -70,4 +70,4 @@ def test_a_stage_that_the_machine_stops_ends_with_a_sentence_and_a_status(tmp_pa
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit, match="2"):
         stage.run(split, ["--scene", "lab", "--folds", "reports/lab"])
-    assert capsys.readouterr().err.startswith("error: split: reports/lab must be readable and writable; got Read-only")
+    assert capsys.readouterr().err.startswith("error: split: reports/lab: Read-only")

@@ -12,10 +12,9 @@ from pipeline.cli import app as checkout
 from release import constraints
 from release.constraints import render
 from release.licences import TOLERATED, closure, incompatible, is_compatible, wanted
-from reskin.cli import OF_CHECKOUT, add_checkout_commands
+from reskin.cli import CHECKOUT_COMMANDS, add_checkout_commands
 from reskin.config import read_yaml
-from reskin.errors import ParamsError
-from reskin.packages import explain, need
+from reskin.errors import ParamsError, explaining, require
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -79,11 +78,12 @@ def test_what_runs_outside_a_checkout_imports_the_core_alone():
 
 
 def test_a_package_that_is_not_there_is_one_sentence_with_the_extra_that_brings_it():
-    with pytest.raises(ParamsError, match=r"model.safetensors: package nowhere must be installed; got .*\[pipeline\]"):
-        need("nowhere", "model.safetensors")
-    assert "'.[train]'" in str(explain(ModuleNotFoundError("", name="torch.nn")))
-    with pytest.raises(ModuleNotFoundError):
-        explain(ModuleNotFoundError("", name="pipeline.gone"))
+    with pytest.raises(ParamsError, match=r"model.safetensors: package nowhere is not installed.*\[pipeline\]"):
+        require("nowhere", "model.safetensors")
+    with pytest.raises(ParamsError, match=r"package torch is not installed.*'\.\[train\]'"), explaining("reskin"):
+        raise ModuleNotFoundError("", name="torch.nn")
+    with pytest.raises(ModuleNotFoundError), explaining("reskin"):
+        raise ModuleNotFoundError("", name="pipeline.gone")
 
 
 def test_every_package_that_the_code_imports_is_asked_for():
@@ -143,11 +143,11 @@ def test_constraints_name_no_project_of_ours_and_no_package_of_one_graphics_card
 
 def test_the_command_of_the_library_knows_which_commands_a_checkout_adds():
     names = {one.name or one.callback.__name__.replace("_", "-") for one in checkout.registered_commands}
-    assert {"scenes", *names} == {*OF_CHECKOUT}
+    assert {"scenes", *names} == {*CHECKOUT_COMMANDS}
 
 
 def test_elsewhere_a_command_of_a_checkout_says_where_it_works(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["reskin", "add", "mine.csv"])
-    with pytest.raises(ParamsError, match="the working directory must be a checkout of the project"):
+    with pytest.raises(ParamsError, match="reskin add works in a checkout of the project"):
         add_checkout_commands()

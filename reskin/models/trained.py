@@ -10,11 +10,10 @@ import numpy as np
 from jaxtyping import Float32
 
 from reskin import io
-from reskin.errors import SchemaError
+from reskin.errors import SchemaError, missing_package
 from reskin.models.inputs import VIEW, DB_FLOOR_uT, Scaler
 from reskin.models.recipe import HEADLINE
 from reskin.numerics import device
-from reskin.packages import lacking
 
 FORMAT = "reskin-model/3"  # of a model's card
 
@@ -84,7 +83,7 @@ def build(network: Network) -> "ModelProto":
     try:
         from onnx import TensorProto, checker, helper, numpy_helper
     except ImportError:
-        raise lacking("onnx", "export_onnx") from None
+        raise missing_package("onnx", "export_onnx") from None
     from reskin.models.network import LAYERS  # late: imports torch
 
     card, scaler = network.card, dict(network.tensors)
