@@ -309,7 +309,9 @@ class Session:
                 self._recorded = f"cannot close {folder}.part: {error.strerror}"
 
 
-def open_sessions(ports: Sequence[str], models: Models, source: str, fault_policy: FaultPolicy = LIVE_POLICY) -> list[Session]:
+def open_sessions(
+    ports: Sequence[str], models: Models, source: str, fault_policy: FaultPolicy = LIVE_POLICY
+) -> list[Session]:
     """Make a session for each port; they share the models' weights and nothing else."""
     check_ports(ports, models, "--port")
     return [Session(port, models, source, fault_policy, alone=len(ports) == 1) for port in ports]

@@ -239,7 +239,9 @@ class LiveSkin:
     contact, or over `every()` for each reading.
     """
 
-    def __init__(self, port: str, models: Models = (), *, baud: int = find.BAUD, fault_policy: FaultPolicy = LIVE_POLICY) -> None:
+    def __init__(
+        self, port: str, models: Models = (), *, baud: int = find.BAUD, fault_policy: FaultPolicy = LIVE_POLICY
+    ) -> None:
         self.port, self.fault_policy = port, fault_policy
         self.detected = find.Found(port, WAITING)
         self.account: Counter[str] = Counter()  # of all streams since the start, as `FrameStream` counts
