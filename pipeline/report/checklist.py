@@ -1,23 +1,23 @@
-"""The checklist: each figure, table and numbered result of the paper beside ours. In: numbers.json. Out: one table.
+"""The checklist: each figure, table and numbered result of the paper beside ours, with a verdict on each claim.
 
-Its rows are data, `checklist.yaml` and the YAML file of each experiment; the paper's numbers are constants of
-`reporting.paper`. Refuses to know how ours were computed.
+Its rows are data: `checklist.yaml`, and `checklist` of each experiment's YAML file. The paper's numbers are constants
+of `pipeline.report.paper`.
 """
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pandas as pd
 
-from pipeline.report import judging, paper
-from pipeline.report.formatting import FEW_POINTS, is_pooled, show, show_difference
-from pipeline.report.judging import NONE, Row, Verdict, adjusted, judge, mean_of, p_of
-from pipeline.report.parts import add_rows
-from pipeline.statistics import VERDICTS, holm
-from reskin.config import parse, read_yaml
+from pipeline import statistics
+from pipeline.report import paper
+from pipeline.report.experiments import add_rows
+from pipeline.report.formatting import FEW_POINTS, Stat, gain, is_pooled, show, show_difference
+from pipeline.statistics import FEW_BOARDS, INCONCLUSIVE, NO, VERDICTS, YES
+from reskin.config import Strict, parse, read_yaml
 from reskin.errors import SchemaError
 
 FILE = Path(__file__).with_name("checklist.yaml")
@@ -27,101 +27,94 @@ METRICS = {
 }  # fmt: skip
 UNITS = {"pct": "%", "mm2": "mm²", "N2": "N²", "mm": "mm", "N": "N", "hz": "Hz"}
 CLAIM = "claim: "
+NEAR = 0.10  # assumed: relative tolerance where the paper gives no sd
+SIZEABLE = 0.5  # assumed: a sizeable difference is at least this part of the paper's own; below it, it is negligible
+SIGNIFICANT = 0.05  # convention: of p-values adjusted for the family of claims
+PLATEAU_POINTS = 1.0  # assumed: "seems to plateau"
+NONE = "–"
+NOT_RUN = "not run in this scene"
+NOT_REACHED = "not reached in this scene"
+SHORT_OF = "not reached: "  # begins the note where ours did not go as far as the paper
+ONE_SKIN = "ours has one training skin: not comparable"
+SETTING = "a setting of this scene, not a result"
+TARGET = "a calibration target of the simulated spreads: agreement is no evidence"
+EQUIVALENT = "equivalent to none within half of the paper's"
+NOT_POOLED = ("table2.multi.", "table2.triplet.", "table2.adapted.", "paired.", "contrasts.")  # need several skins
+DIFFERENCES = ("gain", "sizeable", "slight", "plateau")  # rules about differences, which are shown with their sign
 FAMILY = (
     "The claims of section 5 about accuracy, the primary score, are one family, listed before any run (checklist.yaml, "
     "family): their p-values (t over boards) are adjusted by Holm's method, and a claim is supported or contradicted "
-    f"only if its adjusted p is {judging.SIGNIFICANT:g} or less. All other verdicts are unadjusted: exploratory. "
-    f"Sizeable: at least {100 * judging.SIZEABLE:g} % of the paper's own difference; equivalent to none: the whole "
-    "interval is nearer to 0 than that."
+    f"only if its adjusted p is {SIGNIFICANT:g} or less. All other verdicts are unadjusted: exploratory. "
+    f"Sizeable: at least {100 * SIZEABLE:g} % of the paper's own difference; equivalent to none: the whole interval is "
+    "nearer to 0 than that."
 )
 MEANING = (
-    f"Verdicts are on claims. {VERDICTS} {FAMILY} Pairs of numbers have no verdict: a number differs where it is "
-    f"outside the paper's sd, or by more than {100 * judging.NEAR:g} % where the paper gives none. Slightly: less than "
-    f"{FEW_POINTS:g} points of accuracy up or down; a plateau: less than {judging.PLATEAU_POINTS:g}. Reasons are "
-    "assumed: no run tested them. Where there is no number to compare, see the file named last."
+    f"Verdicts are on claims. {VERDICTS} {FAMILY} Other numbers have no verdict. Met: whether our mean meets the "
+    f"criterion. Slightly: less than {FEW_POINTS:g} points of accuracy up or down; a plateau: less than "
+    f"{PLATEAU_POINTS:g}. Reasons in notes are assumed: no run tested them. Where there is no number to compare, see "
+    "the file named last."
 )
-NAMED = re.compile(r"\{([\w.]+)\}")  # a number that a reason names
+CLAIMS_MEANING = f"{VERDICTS} {FAMILY}"
+NAMED_NUMBER = re.compile(r"\{([\w.]+)\}")  # in a reason
+
+
+class Reach(Strict):
+    """How far the paper went (a constant of `pipeline.report.paper`), and how far ours did (a path in numbers.json)."""
+
+    paper: str
+    ours: str
+    of: str  # what is counted
+
+
+class Row(Strict):
+    """One result: where it stands in the paper, what the paper gives, and the path of ours in numbers.json.
+
+    Rules: `near`, close to the paper's number; `at_most`, `at_least`, `positive`, limits; `gain`, a paired difference
+    is an improvement; `sizeable`, by half of the paper's at least; `each`, all differences of a list are improvements;
+    `slight`, `plateau`, it is small; `finding`, judged by its experiment; `view`, a figure to look at; `input`, a
+    setting of simulated scenes; `setting`, of all scenes; `target`, in simulated scenes a calibration target.
+    """
+
+    id: str
+    where: str
+    what: str
+    paper: str | None = None  # a constant of `pipeline.report.paper`, its parts separated by dots
+    says: str | None = None  # the paper's words, where it gives no number
+    ours: str | None = None
+    experiment: str | None = None  # the experiment that ours follows from, where a small scene may not have ours
+    rule: Literal[
+        "near", "at_most", "at_least", "positive", "gain", "sizeable", "each", "slight", "plateau", "finding", "input",
+        "setting", "target", "view",
+    ] = "near"  # fmt: skip
+    family: bool = False  # one of the claims that are tested together: p-values are adjusted by Holm's method
+    reach: Reach | None = None
+    only: Literal["recorded", "simulated"] | None = None  # the row is shown for scenes of this source alone
+    stage: str | None = None
+    shown: tuple[str, ...] = ()
+    why: str = ""  # a possible reason, shown where ours does not meet the criterion; {name} is replaced by that number
+    why_simulated: str = ""  # the same, for simulated scenes only
+
+    @property
+    def metric(self) -> str:
+        """The last part of the path of ours."""
+        return (self.ours or "").rsplit(".", 1)[-1]
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """The verdict on a claim, the criterion, whether our mean meets it, the adjusted p-value, and a note."""
+
+    verdict: str = NONE
+    criterion: str = NONE
+    met: str = NONE
+    p_adjusted: float | None = None
+    notes: tuple[str, ...] = ()
 
 
 def read_rows() -> list[Row]:
     """Read the rows of the checklist, in the paper's order."""
     entries = add_rows(read_yaml(FILE))
     return [parse(Row, row, f"checklist, row {row['id']}") for entry in entries for row in _by_metric(entry)]
-
-
-def checklist(numbers: Mapping[str, Any], rows: Sequence[Row] | None = None) -> pd.DataFrame:
-    """Put every result of the paper beside ours, with a sentence on how they differ."""
-    source = numbers["provenance"]["source"]
-    lines = []
-    asked = [row for row in (read_rows() if rows is None else rows) if row.only in (None, source)]
-    p_values = family_p(numbers, asked)
-    for row in asked:
-        printed, ours = _both(numbers, row)
-        verdict = judge(row, printed, ours, pooled=is_pooled(numbers), simulated=source == "simulated")
-        if row.id in p_values:
-            verdict = adjusted(row, verdict, p_values[row.id], len(p_values))
-        if ours is None and row.experiment in numbers:
-            verdict = Verdict(judging.NOT_REACHED)
-        lines.append(
-            {
-                "in the paper": row.where,
-                "result": row.what,
-                "paper": row.says if printed is None else _write(row, printed),
-                "ours": _write_ours(row, ours),
-                "verdict": verdict.word,
-                "difference": _explain(verdict if ours is None else _after(verdict, row, numbers), row, numbers),
-                "stage": row.stage or NONE,
-                "shown in": ", ".join(row.shown) if row.shown and (ours is not None or not row.ours) else NONE,
-                "source": source,
-            }
-        )
-    table = pd.DataFrame(lines)
-    table.attrs["meaning"] = MEANING
-    return table
-
-
-def claims_table(table: pd.DataFrame) -> pd.DataFrame:
-    """Take of a checklist the paper's claims that are judged, with their verdicts."""
-    judged = table["result"].str.startswith(CLAIM) & (table["verdict"] != NONE)
-    claims = table[judged].drop(columns=["stage", "shown in"])
-    claims = claims.assign(result=claims["result"].str.removeprefix(CLAIM)).rename(columns={"result": "claim"})
-    claims.attrs["meaning"] = f"{VERDICTS} {FAMILY}"
-    return claims
-
-
-def family_p(numbers: Mapping[str, Any], rows: Sequence[Row]) -> dict[str, float]:
-    """Give the p-values of the claims that are tested together, by row, adjusted for their number."""
-    found = {row.id: p_of(row, *_both(numbers, row)) for row in rows if row.family}
-    return holm({name: p for name, p in found.items() if p is not None})
-
-
-def _both(numbers: Mapping[str, Any], row: Row) -> tuple[Any, Any]:
-    """Find the paper's number and ours."""
-    printed = look_up(numbers, row.paper) if row.paper else None
-    return printed, resolve(numbers, row.ours) if row.ours else None
-
-
-def resolve(numbers: Any, path: str) -> Any:
-    """Follow a dotted path; `name=3,other=x` picks that row of a list. None where the scene has no such number."""
-    here = numbers
-    for part in path.split("."):
-        if isinstance(here, list) and "=" in part:
-            wanted = dict(pair.split("=", 1) for pair in part.split(","))
-            here = next((row for row in here if wanted.items() <= {key: str(row[key]) for key in row}.items()), None)
-        elif isinstance(here, Mapping) and part in here:
-            here = here[part]
-        else:
-            return None
-    return here
-
-
-def look_up(numbers: Mapping[str, Any], name: str) -> Any:
-    """Find a number by its dotted name: a constant of `reporting.paper` (`SHEAR.mse_fz_N2`), or one of ours."""
-    found = resolve(vars(paper) if name[0].isupper() else numbers, name)
-    if found is None:
-        rule = "a constant of reporting.paper, or a path in numbers.json"
-        raise SchemaError(FILE.name, "a number", rule, name, "Mend the name.")
-    return found
 
 
 def _by_metric(entry: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
@@ -135,37 +128,254 @@ def _by_metric(entry: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
         yield row | paths | {"id": f"{row['id']}-{metric}", "what": f"{row['what']}: {METRICS[metric]}"}
 
 
-def _after(verdict: Verdict, row: Row, numbers: Mapping[str, Any]) -> Verdict:
-    """Say first how far ours looked, and whether that is as far as the paper did."""
-    if row.reach is None:
-        return verdict
+def checklist(numbers: Mapping[str, Any], rows: Sequence[Row] | None = None) -> pd.DataFrame:
+    """Tabulate every result of the paper beside ours, with the criterion by which ours is judged."""
+    source = numbers["provenance"]["source"]
+    rows = [row for row in (read_rows() if rows is None else rows) if row.only in (None, source)]
+    p_adjusted = family_p(numbers, rows)
+    lines = []
+    for row in rows:
+        printed, ours = _both(numbers, row)
+        judgement = judge(row, printed, ours, pooled=is_pooled(numbers), simulated=source == "simulated")
+        if ours is None and row.experiment in numbers:
+            judgement = Judgement(notes=(NOT_REACHED,))
+        elif row.id in p_adjusted:
+            judgement = adjust(judgement, p_adjusted[row.id])
+        notes = [*_reach(numbers, row, ours), *judgement.notes, *_reason(numbers, row, judgement)]
+        lines.append(
+            {
+                "in the paper": row.where,
+                "result": row.what,
+                "paper": row.says if printed is None else _show(row, printed),
+                "ours": _show_ours(row, ours),
+                "verdict": judgement.verdict,
+                "criterion": judgement.criterion,
+                "met": judgement.met,
+                "paper in our interval": _paper_in_interval(printed, ours),
+                "p (Holm)": NONE if judgement.p_adjusted is None else f"{judgement.p_adjusted:.2g}",
+                "note": ". ".join(notes) or NONE,
+                "stage": row.stage or NONE,
+                "shown in": ", ".join(row.shown) if row.shown and (ours is not None or not row.ours) else NONE,
+                "source": source,
+            }
+        )
+    table = pd.DataFrame(lines)
+    table.attrs["meaning"] = MEANING
+    return table
+
+
+def claims_table(table: pd.DataFrame) -> pd.DataFrame:
+    """Select the paper's claims that are judged from a checklist."""
+    judged = table["result"].str.startswith(CLAIM) & (table["verdict"] != NONE)
+    claims = table[judged].drop(columns=["stage", "shown in"])
+    claims = claims.assign(result=claims["result"].str.removeprefix(CLAIM)).rename(columns={"result": "claim"})
+    claims.attrs["meaning"] = CLAIMS_MEANING
+    return claims
+
+
+def family_p(numbers: Mapping[str, Any], rows: Sequence[Row]) -> dict[str, float]:
+    """Adjust the p-values of the claims that are tested together by Holm's method; by row."""
+    found = {row.id: p_of(row, *_both(numbers, row)) for row in rows if row.family}
+    return statistics.holm({name: p for name, p in found.items() if p is not None})
+
+
+def p_of(row: Row, printed: Any, ours: Any) -> float | None:
+    """Compute the p-value of a claim about differences over boards; None where too few boards were compared.
+
+    A claim about every number of training skins holds only if it does for all: the largest p-value. One number that
+    contradicts it is enough to deny it: then the smallest, by Bonferroni's correction for their number.
+    """
+    if isinstance(ours, Sequence):
+        points = [one["accuracy_pct"] for one in ours]
+        each = [p for p in (p_of(row, None, one) for one in points) if p is not None]
+        if not each or len(each) < len(points):
+            return None
+        against = [
+            p for p, one in zip(each, points, strict=True) if gain(one, row.metric)["mean"] < 0 and p <= SIGNIFICANT
+        ]
+        return min(1.0, len(each) * min(against)) if against else max(each)
+    if not isinstance(ours, Mapping) or "se" not in ours:
+        return None
+    limit = sizeable(mean_of(printed)) if row.rule == "sizeable" else 0.0
+    return statistics.p_value(gain(ours, row.metric)["mean"] - limit, ours["se"], ours["df"])
+
+
+def adjust(judgement: Judgement, p_adjusted: float) -> Judgement:
+    """Make a claim of the family undecided unless it is significant among all of them."""
+    verdict = judgement.verdict
+    if verdict in (YES, NO) and p_adjusted > SIGNIFICANT:
+        verdict = INCONCLUSIVE
+    return replace(judgement, verdict=verdict, p_adjusted=p_adjusted)
+
+
+def judge(row: Row, printed: Any, ours: Any, *, pooled: bool, simulated: bool) -> Judgement:
+    """Judge ours by the rule of the row; claims about means over boards get a verdict by their interval.
+
+    `pooled`: some network was trained on several skins. `simulated`: the scene's readings were simulated.
+    """
+    if row.ours is None:
+        return Judgement()
+    if ours is None:
+        return Judgement(notes=(NOT_RUN,))
+    if not pooled and row.ours.startswith(NOT_POOLED):
+        return Judgement(notes=(ONE_SKIN,))
+    if isinstance(ours, bool):
+        return Judgement(FEW_BOARDS, "holds on the board that was measured", _yes(ours))
+    if row.rule == "setting" or (row.rule == "input" and simulated):
+        return Judgement(notes=(SETTING,))
+    if row.rule == "view":
+        return Judgement()
+    if row.rule == "finding":
+        of_trainings = {YES: "yes", NO: "no"}.get(ours["of_trainings"], ours["of_trainings"])
+        return Judgement(ours["verdict"], "holds for these trainings", of_trainings)
+    if row.rule == "each":
+        return _judge_each(ours)
+    if row.rule in DIFFERENCES:
+        return _judge_difference(row, mean_of(printed), ours)
+    if row.rule in ("at_most", "at_least", "positive"):
+        limit = 0.0 if row.rule == "positive" else mean_of(printed)
+        assert limit is not None, "a row that is judged by a limit prints one"
+        return _judge_limit(row.rule, limit, ours if isinstance(ours, Mapping) else {"mean": float(ours)})
+    return _judge_number(printed, ours, target=row.rule == "target" and simulated)
+
+
+def _judge_difference(row: Row, printed: float | None, ours: Stat) -> Judgement:
+    """Judge a paired difference: a gain beyond a limit, or equivalence to 0 within a margin."""
+    if row.rule in ("slight", "plateau"):
+        margin = FEW_POINTS if row.rule == "slight" else PLATEAU_POINTS
+        verdict = statistics.verdict_within(ours, margin)
+        return Judgement(verdict, f"within ±{margin:g} points", _yes(abs(ours["mean"]) < margin))
+    better = gain(ours, row.metric)
+    limit, criterion = 0.0, "gain above 0"
+    if row.rule == "sizeable":
+        limit = sizeable(printed)
+        criterion = f"gain above {limit:.3g}, half of the paper's"
+    low, high = better.get("ci95", (-float("inf"), float("inf")))
+    notes = (EQUIVALENT,) if printed and max(-low, high) < sizeable(printed) else ()
+    return Judgement(statistics.verdict(better, above=limit), criterion, _yes(better["mean"] > limit), notes=notes)
+
+
+def _judge_limit(rule: str, limit: float, ours: Stat) -> Judgement:
+    """Judge whether a number is beyond a limit (the paper's, or 0)."""
+    mean = ours["mean"]
+    if rule == "at_most":
+        verdict = statistics.verdict(statistics.negated(ours), above=-limit)
+        return Judgement(verdict, f"at most {limit:g}", _yes(mean <= limit))
+    verdict = statistics.verdict(ours, above=limit)
+    if rule == "at_least":
+        return Judgement(verdict, f"at least {limit:g}", _yes(mean >= limit))
+    return Judgement(verdict, "above 0", _yes(mean > 0))
+
+
+def _judge_each(contrasts: Sequence[Mapping[str, Any]]) -> Judgement:
+    """Judge a claim that is to hold at every number of training skins, by accuracy."""
+    verdicts = {row["skins_n"]: statistics.verdict(row["accuracy_pct"]) for row in contrasts}
+    return Judgement(
+        statistics.all_of(list(verdicts.values())),
+        "gain above 0 at every number of training skins",
+        _yes(all(row["accuracy_pct"]["mean"] > 0 for row in contrasts)),
+        notes=(", ".join(f"{skins_n} skins: {verdict}" for skins_n, verdict in verdicts.items()),),
+    )
+
+
+def _judge_number(printed: Any, ours: Any, *, target: bool) -> Judgement:
+    """Tell whether our mean is near the paper's: within its sd, or within 10 % where it gives none."""
+    value, mean = mean_of(ours), mean_of(printed)
+    if value is None or mean is None:
+        return Judgement()
+    tolerance, criterion = NEAR * abs(mean), f"within {100 * NEAR:g} % of the paper's"
+    if isinstance(printed, tuple):
+        tolerance, criterion = printed[1], "within the paper's sd"
+    return Judgement(NONE, criterion, _yes(abs(value - mean) <= tolerance), notes=(TARGET,) if target else ())
+
+
+def sizeable(printed: float | None) -> float:
+    """Return the gain that counts as sizeable: half of the paper's own difference."""
+    assert printed is not None, "a row that is judged by the paper's difference prints one"
+    return SIZEABLE * abs(printed)
+
+
+def _yes(holds: bool) -> str:
+    return "yes" if holds else "no"
+
+
+def _both(numbers: Mapping[str, Any], row: Row) -> tuple[Any, Any]:
+    """Find the paper's number and ours."""
+    printed = look_up(numbers, row.paper) if row.paper else None
+    return printed, resolve(numbers, row.ours) if row.ours else None
+
+
+def resolve(numbers: Any, path: str) -> Any:
+    """Follow a dotted path; `name=3,other=x` selects that row of a list. None where the scene has no such number."""
+    here = numbers
+    for part in path.split("."):
+        if isinstance(here, list) and "=" in part:
+            wanted = dict(pair.split("=", 1) for pair in part.split(","))
+            here = next((row for row in here if wanted.items() <= {key: str(row[key]) for key in row}.items()), None)
+        elif isinstance(here, Mapping) and part in here:
+            here = here[part]
+        else:
+            return None
+    return here
+
+
+def look_up(numbers: Mapping[str, Any], name: str) -> Any:
+    """Find a number by its dotted name: a constant of `pipeline.report.paper` (`SHEAR.mse_fz_N2`), or one of ours."""
+    found = resolve(vars(paper) if name[0].isupper() else numbers, name)
+    if found is None:
+        rule = "a constant of pipeline.report.paper, or a path in numbers.json"
+        raise SchemaError(FILE.name, "a number", rule, name, "Correct the name.")
+    return found
+
+
+def mean_of(value: Any) -> float | None:
+    """Return the mean of a summary or of the paper's pair, or a plain number; None where there is none."""
+    if isinstance(value, Mapping):
+        return value.get("mean")
+    if isinstance(value, tuple):
+        return float(value[0])
+    return float(value) if isinstance(value, int | float) else None
+
+
+def _paper_in_interval(printed: Any, ours: Any) -> str:
+    """Tell whether our interval over boards includes the paper's number, where there are both."""
+    mean = mean_of(printed)
+    if mean is None or not isinstance(ours, Mapping) or "ci95" not in ours:
+        return NONE
+    low, high = ours["ci95"]
+    return _yes(low <= mean <= high)
+
+
+def _reach(numbers: Mapping[str, Any], row: Row, ours: Any) -> list[str]:
+    """Say how far ours went, and how far the paper did."""
+    if row.reach is None or ours is None:
+        return []
     ours_n, paper_n = resolve(numbers, row.reach.ours), look_up(numbers, row.reach.paper)
-    missed = "" if ours_n >= paper_n else "not reached: ours "
-    return replace(verdict, sentence=f"{missed}after {ours_n:,.0f} {row.reach.of}; {verdict.sentence}")
+    return [f"{SHORT_OF if ours_n < paper_n else ''}{ours_n:,.0f} {row.reach.of}, paper {paper_n:,.0f}"]
 
 
-def _explain(verdict: Verdict, row: Row, numbers: Mapping[str, Any]) -> str:
+def _reason(numbers: Mapping[str, Any], row: Row, judgement: Judgement) -> list[str]:
     why = row.why or (row.why_simulated if numbers["provenance"]["source"] == "simulated" else "")
-    if not (verdict.differs and why):
-        return verdict.sentence
-    return f"{verdict.sentence}. {NAMED.sub(lambda name: f'{look_up(numbers, name[1]):.3g}', why)}"
+    if not why or judgement.met != "no":
+        return []
+    return [NAMED_NUMBER.sub(lambda name: f"{look_up(numbers, name[1]):.3g}", why)]
 
 
-def _write_ours(row: Row, ours: Any) -> str:
+def _show_ours(row: Row, ours: Any) -> str:
     if ours is None:
         return "see file" if row.shown and not row.ours else NONE
     if isinstance(ours, bool):
-        return "yes" if ours else "no"
+        return _yes(ours)
     if isinstance(ours, int):
         return str(ours)
-    return "see file" if mean_of(ours) is None else _write(row, ours)
+    return "see file" if mean_of(ours) is None else _show(row, ours)
 
 
-def _write(row: Row, value: Any) -> str:
+def _show(row: Row, value: Any) -> str:
     """Write a number with the unit of the last name with one in the path of ours; differences with their sign."""
     ends = [part.rsplit("_", 1)[-1] for part in reversed((row.ours or "").split("."))]
     unit = next((UNITS[end] for end in ends if end in UNITS), "")
-    if row.rule in judging.DIFFERENCES:
+    if row.rule in DIFFERENCES:
         text = show_difference(value if isinstance(value, Mapping) else {"mean": value})
         unit = "points" if unit == "%" else unit
     elif isinstance(value, tuple):

@@ -11,11 +11,12 @@ import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from pydantic import Field
 
-from pipeline.report import judging
-from pipeline.report.figures import cost_tables, learning_costs
+from pipeline.report.checklist import ONE_SKIN
+from pipeline.report.costs import cost_tables
+from pipeline.report.experiments import add_sections
+from pipeline.report.figures import HEADLINE
 from pipeline.report.formatting import notes
-from pipeline.report.headline import FILE, answer
-from pipeline.report.parts import add_sections
+from pipeline.report.tables import summary_table
 from pipeline.stages import is_stage, module_name
 from reskin.code import ROOT, file_of
 from reskin.config import Strict, parse, read_yaml
@@ -23,36 +24,38 @@ from reskin.errors import SchemaError
 
 Captions = dict[str, str]  # by name of a table or figure
 PAGE_FILE = Path(__file__).with_name("page.yaml")
-SHORT_OF = "not reached"  # how the checklist begins where ours did not look as far as the paper
-NOTHING = ("–", "see file", "")  # cells of the checklist that say no number
-PARTED = re.compile(r"(?<=\d) ± (?=\d)|\[[-+\d.e]+, [-+\d.e]+\]( (%|mm²|N²|mm|N)(?![\w]))?")
-NO_BREAK = "\u00a0"
-FURTHER = "further"  # the section of what no other section names
-NUMBER = re.compile(r"[-+−]?\d[\d.,]*(e[-+]?\d+)?( ± [\d.e+-]+)?( \(seeds\))?( (%|mm|N|mm²|N²|Hz|s|µT))?|–?")
-SVG_SIZE_PT = re.compile(r'<svg [^>]*?width="([\d.]+)pt" height="([\d.]+)pt"')
-LETTERS_PT = re.compile(r"font(?:-size)?: ([\d.]+)px")  # in a file measured in points
-PX_PER_PT = 4 / 3
-WIDE_PT = 500.0  # above it, a figure has a row of its own
-LEGIBLE_PX = 8.0  # no letter is shown smaller: where that needs more width than there is, the figure scrolls
-NARROW_PX = 340.0  # what a telephone has
-LONG = 40  # letters of a cell that needs a wide column
-FINDINGS_N = 4  # sentences at the head of a section; the checklist holds all
-OPEN = {"table2", "labels", "claims"}  # tables that answer the first question; all others open on demand
+NO_NUMBER = ("–", "see file", "")  # cells of the checklist without a number
+FURTHER = "further"  # the section for tables and figures that no other section names
+OPEN = {"table2", "labels", "claims"}  # tables that are shown at once; all others open on demand
+BESIDE_N = 4  # results of the paper that a section lists; the checklist has all
+SUMMARY = "Scores on boards never seen"
 SOURCES = {
     "simulated": "Every reading of this scene was simulated: no number on this page was measured on hardware.",
     "recorded": "Every reading of this scene was recorded from hardware.",
 }
+KINDS = {"recorded": "Recorded boards", "simulated": "Simulated boards"}
+# Where no line breaks: within a number and its deviation, and within an interval and its unit.
+UNBROKEN = re.compile(r"(?<=\d) ± (?=\d)|\[[-+\d.e]+, [-+\d.e]+\]( (%|mm²|N²|mm|N)(?![\w]))?")
+NO_BREAK = "\u00a0"
+NUMBER = re.compile(r"[-+−]?\d[\d.,]*(e[-+]?\d+)?( ± [\d.e+-]+)?( \(seeds\))?( (%|mm|N|mm²|N²|Hz|s|µT))?|–?")
+LONG = 40  # letters of a cell that needs a wide column
+SVG_SIZE_PT = re.compile(r'<svg [^>]*?width="([\d.]+)pt" height="([\d.]+)pt"')
+LETTERS_PT = re.compile(r"font(?:-size)?: ([\d.]+)px")  # in a file measured in points
+PX_PER_PT = 4 / 3
+WIDE_PT = 500.0  # a wider figure has a row of its own
+LEGIBLE_PX = 8.0  # letters are not shown smaller: a figure that needs more width than there is scrolls
+NARROW_PX = 340.0  # width of a telephone
 
 
 class Section(Strict):
-    """A part of the page: its heading, what it answers, and what it shows, in order, with captions by name."""
+    """A part of the page: its heading, a sentence, and its tables and figures in order, with captions by name."""
 
     key: str
     title: str
     sentence: str
     tables: Captions = Field(default_factory=dict)
     figures: Captions = Field(default_factory=dict)
-    folded: Captions = Field(default_factory=dict)  # tables so long that they open on demand
+    folded: Captions = Field(default_factory=dict)  # long tables, last
 
     @property
     def captions(self) -> Captions:
@@ -88,19 +91,30 @@ class Table:
     notes: list[str]
 
 
+@dataclass(frozen=True)
+class Entry:
+    """A scene on the page of all scenes; a stale one was computed by earlier code and shows no results."""
+
+    scene: str
+    about: str
+    summary: Table | None
+    figure: Drawing | None
+    stale: bool
+
+
 def page(numbers: Mapping[str, Any], tables: Mapping[str, pd.DataFrame], figures: Mapping[str, str]) -> str:
     """Render the page of a scene, equal for equal runs; figures are SVG text by file name."""
-    source = numbers["provenance"]["source"]
+    source, summary = numbers["provenance"]["source"], summary_table(numbers)
     drawings = {name: measure(f"figures/{name}", text) for name, text in figures.items()}
-    found = tables.get("checklist", pd.DataFrame())
+    checklist = tables.get("checklist", pd.DataFrame())
     return template("page.html").render(
         scene=numbers["provenance"]["scene"],
         source=source,
         about=about(numbers),
-        answer=answer(numbers),
+        summary=None if summary is None else lay_out("summary", SUMMARY, summary),
         sections=[
             _fill(section, tables, drawings, source)
-            | {"findings": findings(section, found), "stages": stages_of(section, found)}
+            | {"beside": beside_paper(section, checklist), "stages": stages_of(section, checklist)}
             for section in arrange(tables, drawings)
         ],
         saved=[*tables],
@@ -111,87 +125,104 @@ def page(numbers: Mapping[str, Any], tables: Mapping[str, pd.DataFrame], figures
 def run_page(numbers: Mapping[str, Any], costs: Mapping[str, str]) -> str:
     """Render the page of one run, which the page of the scene embeds: its commit, machine, versions and times.
 
-    `numbers` are joined with their provenance, `costs` the texts of the folder that the page stands in.
+    `numbers` are joined with their provenance; `costs` are the texts of the folder that the page is written to.
     """
-    source, provenance = numbers["provenance"]["source"], _flat(numbers["provenance"])
-    tables = cost_tables(numbers["runtime"], source) | learning_costs(numbers["runtime"], source)
+    source = numbers["provenance"]["source"]
+    tables = cost_tables(numbers["runtime"], source)
     drawings = {name: measure(name, text) for name, text in costs.items() if name.endswith(".svg")}
-    rows = pd.DataFrame([{"what": key, "value": value} for key, value in provenance.items()])
+    provenance = pd.DataFrame(
+        {
+            "what": key,
+            "value": ", ".join(f"{name} {one}" for name, one in value.items()) if isinstance(value, Mapping) else value,
+        }
+        for key, value in numbers["provenance"].items()
+    )
     return template("page.run.html").render(
         scene=numbers["provenance"]["scene"],
         source=source,
-        provenance=lay_out("provenance", "Provenance", rows),
+        provenance=lay_out("provenance", "Provenance", provenance),
         sections=[_fill(section, tables, drawings, source) for section in arrange(tables, drawings)],
     )
 
 
-def _flat(provenance: Mapping[str, Any]) -> dict[str, str]:
-    """Write each value as text, a mapping as its names and values."""
-    return {
-        key: ", ".join(f"{name} {one}" for name, one in value.items()) if isinstance(value, Mapping) else str(value)
-        for key, value in provenance.items()
-    }
+def index(results: Sequence[Mapping[str, Any]], drawn: Mapping[str, str]) -> str:
+    """Render the page of all scenes, recorded ones first. `drawn`: headline figures by scene."""
+    kinds = []
+    for source, title in KINDS.items():
+        entries = [_entry(numbers, drawn) for numbers in results if numbers["provenance"]["source"] == source]
+        if entries:
+            entries.sort(key=lambda entry: (entry.summary is None, entry.scene))  # scenes with an answer first
+            kinds.append({"source": source, "title": title, "sentence": SOURCES[source], "entries": entries})
+    return template("page.index.html").render(kinds=kinds)
+
+
+def _entry(numbers: Mapping[str, Any], drawn: Mapping[str, str]) -> Entry:
+    scene = str(numbers["provenance"]["scene"])
+    if "trainings" not in numbers:
+        return Entry(scene, "", None, None, stale=True)
+    summary = summary_table(numbers)
+    table = None if summary is None else lay_out(f"summary-{scene}", SUMMARY, summary)
+    figure = measure(f"{scene}/figures/{HEADLINE}", drawn[scene]) if scene in drawn else None
+    return Entry(scene, counts_of(numbers), table, figure, stale=False)
 
 
 def template(name: str) -> Template:
     """Load a template of this folder."""
     environment = Environment(loader=PackageLoader("pipeline.report", "."), autoescape=True, undefined=StrictUndefined)
     environment.tests["number_text"] = NUMBER.fullmatch
-    environment.filters["together"] = together
+    environment.filters["unbroken"] = unbroken
     return environment.get_template(name)
 
 
-def together(text: str) -> str:
+def unbroken(text: str) -> str:
     """Keep a number with its deviation, and the ends of an interval, on one line."""
-    return PARTED.sub(lambda found: found[0].replace(" ", NO_BREAK), text)
+    return UNBROKEN.sub(lambda found: found[0].replace(" ", NO_BREAK), text)
 
 
 def read_sections() -> list[Section]:
     """Read the sections of a page, in order."""
-    return [parse(Section, words, f"page, section {words['key']}") for words in add_sections(read_yaml(PAGE_FILE))]
+    return [parse(Section, entry, f"page, section {entry['key']}") for entry in add_sections(read_yaml(PAGE_FILE))]
 
 
 def arrange(tables: Iterable[str], figures: Iterable[str]) -> list[Section]:
-    """List the sections that have something to show, in order, with captions for what no section names."""
+    """List the sections that have something to show; section `further` takes what no other section names."""
     sections, names = read_sections(), {"tables": dict.fromkeys(tables), "figures": dict.fromkeys(figures)}
     named = {name for section in sections for name in section.captions}
-    further = {kind: {name: _title(name) for name in all_ if name not in named} for kind, all_ in names.items()}
-    filled = [s.model_copy(update=further) if s.key == FURTHER else s for s in sections]
+    further = {kind: {name: _title(name) for name in of_kind if name not in named} for kind, of_kind in names.items()}
+    filled = [section.model_copy(update=further) if section.key == FURTHER else section for section in sections]
     return [section for section in filled if section.captions.keys() & {*names["tables"], *names["figures"]}]
 
 
+def _title(name: str) -> str:
+    text = name.removesuffix(".svg").replace("_", " ")
+    return text[:1].upper() + text[1:]
+
+
 def about(numbers: Mapping[str, Any]) -> str:
-    """Say what a scene is: where its readings come from, and how many of them its main captures hold."""
+    """Say where the readings of a scene come from, and how many there are."""
+    return f"{SOURCES[numbers['provenance']['source']]} {counts_of(numbers)}"
+
+
+def counts_of(numbers: Mapping[str, Any]) -> str:
+    """List the counts of the main captures."""
     counts = next(iter(numbers["described"].values()))["counts"]
-    names = {name: name.removesuffix("_n").replace("_", " ") for name in counts}
-    words = ", ".join(
-        f"{n:,} {names[name].removesuffix('s') if n == 1 else names[name]}" for name, n in counts.items() if n
-    )
-    return f"{SOURCES[numbers['provenance']['source']]} Its main captures hold {words}."
+    listed = ", ".join(f"{name.removesuffix('_n').replace('_', ' ')} {n:,}" for name, n in counts.items() if n)
+    return f"Main captures: {listed}."
 
 
-def findings(section: Section, checklist: pd.DataFrame) -> list[str]:
-    """Say what the checklist says of what a section shows: ours with its interval, and the paper's; verdicts first.
-
-    Where ours did not look as far as the paper, the sentence says so; what cannot be compared is no finding.
-    """
-    rows = [
-        row
-        for row in _rows_of(section, checklist)
-        if row["ours"] not in NOTHING and row["difference"] != judging.ONE_SKIN
-    ]
-    judged = sorted(rows, key=lambda row: row["verdict"] in NOTHING)
-    return [
-        f"{row['result']}: {row['ours']}; paper: {row['paper']}"
-        + (f" ({row['difference'].split(';')[0]})" if row["difference"].startswith(SHORT_OF) else "")
-        + ("" if row["verdict"] in NOTHING else f". {row['verdict'].capitalize()}.")
-        for row in judged[:FINDINGS_N]
-    ]
+def beside_paper(section: Section, checklist: pd.DataFrame) -> Table | None:
+    """Select the checklist's rows about a section that have a number of ours; rows with verdicts first."""
+    rows = [row for row in _rows_of(section, checklist) if row["ours"] not in NO_NUMBER and row["note"] != ONE_SKIN]
+    if not rows:
+        return None
+    rows.sort(key=lambda row: row["verdict"] in NO_NUMBER)
+    columns = ["result", "ours", "paper", "verdict", "note"]
+    return lay_out(f"beside-{section.key}", "Beside the paper", pd.DataFrame(rows[:BESIDE_N])[columns])
 
 
 def stages_of(section: Section, checklist: pd.DataFrame) -> list[tuple[str, str]]:
     """Name the stages behind a section, and the files of their code."""
-    stages = dict.fromkeys(row["stage"] for row in _rows_of(section, checklist) if row["stage"] not in NOTHING)
+    stages = dict.fromkeys(row["stage"] for row in _rows_of(section, checklist))
     return [(stage, str(file_of(module_name(stage)).relative_to(ROOT))) for stage in stages if is_stage(stage)]
 
 
@@ -218,22 +249,10 @@ def measure(file: str, svg: str) -> Drawing:
 
 
 def lay_out(name: str, caption: str, table: pd.DataFrame) -> Table:
-    """Lay a table out: the look of its columns, its cells as text, and its notes."""
+    """Prepare a table for the page: the look of its columns, its cells as text, and its notes."""
     cells = table.fillna("").astype(str)
     looks = [_look(cells[title]) for title in cells.columns]
     return Table(name, caption, [*map(str, cells.columns)], looks, [*cells.itertuples(index=False)], notes(table))
-
-
-def _fill(
-    section: Section, tables: Mapping[str, pd.DataFrame], figures: Mapping[str, Drawing], source: str
-) -> dict[str, Any]:
-    words: dict[str, Any] = {name: getattr(section, name) for name in ("key", "title", "sentence")}
-    captions = section.tables | section.folded
-    words["tables"] = [lay_out(name, text, tables[name]) for name, text in captions.items() if name in tables]
-    words["figures"] = [
-        (figures[name], f"{text} ({source})") for name, text in section.figures.items() if name in figures
-    ]
-    return words
 
 
 def _look(cells: "pd.Series[str]") -> str:
@@ -242,41 +261,15 @@ def _look(cells: "pd.Series[str]") -> str:
     return "text long" if cells.str.len().max() > LONG else "text"
 
 
-def _title(name: str) -> str:
-    text = name.removesuffix(".svg").replace("_", " ")
-    return text[:1].upper() + text[1:]
-
-
-KINDS = {"recorded": "Recorded boards", "simulated": "Simulated boards"}
-
-
-@dataclass(frozen=True)
-class Entry:
-    """One scene: its name, its answer, what it says of itself, its headline figure, and whether it is out of date."""
-
-    scene: str
-    answer: str
-    about: str
-    figure: Drawing | None
-    stale: bool
-
-
-def index(results: Sequence[Mapping[str, Any]], drawn: Mapping[str, str]) -> str:
-    """Render the page of all scenes, recorded ones first: they are what counts. `drawn`: headline figures by scene."""
-    kinds = []
-    for source, title in KINDS.items():
-        own = [numbers for numbers in results if numbers["provenance"]["source"] == source]
-        # Those that answer the question stand first.
-        entries = sorted((_entry(numbers, drawn) for numbers in own), key=lambda entry: (not entry.answer, entry.scene))
-        if entries:
-            kinds.append({"source": source, "title": title, "sentence": SOURCES[source], "entries": entries})
-    return template("page.index.html").render(kinds=kinds)
-
-
-def _entry(numbers: Mapping[str, Any], drawn: Mapping[str, str]) -> Entry:
-    scene, stale = str(numbers["provenance"]["scene"]), "trainings" not in numbers
-    if stale:
-        return Entry(scene, "", "", None, stale)
-    words = about(numbers).removeprefix(SOURCES[numbers["provenance"]["source"]]).strip()
-    figure = measure(f"{scene}/figures/{FILE}", drawn[scene]) if scene in drawn else None
-    return Entry(scene, answer(numbers), words, figure, stale)
+def _fill(
+    section: Section, tables: Mapping[str, pd.DataFrame], figures: Mapping[str, Drawing], source: str
+) -> dict[str, Any]:
+    """Prepare a section for the template: its heading, and the tables and figures that exist."""
+    captions = section.tables | section.folded
+    return {
+        "key": section.key,
+        "title": section.title,
+        "sentence": section.sentence,
+        "tables": [lay_out(name, text, tables[name]) for name, text in captions.items() if name in tables],
+        "figures": [(figures[name], f"{text} ({source})") for name, text in section.figures.items() if name in figures],
+    }

@@ -6,11 +6,12 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+import pandas as pd
+
 from pipeline import FLOW
-from pipeline.report.formatting import to_markdown
-from pipeline.report.headline import labels_table, short_table
+from pipeline.report.formatting import tabulate, to_markdown
 from pipeline.report.numbers import join
-from pipeline.report.tables import make_tables, skins_table
+from pipeline.report.tables import make_tables, skins_table, summary_table
 from pipeline.scenes import ANALYSES
 from pipeline.stages import module_name
 from reskin import io
@@ -18,138 +19,16 @@ from reskin.code import ROOT, file_of
 from reskin.config import read_yaml
 from reskin.errors import ParamsError, SchemaError
 
-SEVERAL_min = 100  # from here on whole minutes
 TABLES = ("table2", "claims", "manual", "flexible", "single_sensor")  # of each simulated scene in docs/results.md
 COMPARED = ("compare", "compare_parameters", "compare_frames")
-Numbers = Mapping[str, Any]  # of one scene
-
-
-def fill(texts: Mapping[str, str], blocks: Mapping[str, str]) -> dict[str, str]:
-    """Put each block between its marks `<!-- name -->` and `<!-- /name -->`, in the one page that has them."""
-    filled = dict(texts)
-    for name, content in blocks.items():
-        marks = re.compile(rf"(<!-- {name} -->\n).*?(<!-- /{name} -->)", re.DOTALL)
-        pages = {page: found for page, text in filled.items() if (found := marks.search(text))}
-        if len(pages) != 1:
-            got = ", ".join(pages) or "no page"
-            raise SchemaError("README.md and docs", f"the block {name}", "in one page", got, "Put its marks back.")
-        page, found = pages.popitem()
-        # Not as a template: a backslash in the content is a backslash.
-        text = filled[page]
-        filled[page] = "".join([text[: found.end(1)], content.strip("\n"), "\n", text[found.start(2) :]])
-    return filled
-
-
-def blocks_of(
-    results: Sequence[Numbers], recorded: Sequence[Numbers], stages: Mapping[str, Any], timed: Numbers | None
-) -> dict[str, str]:
-    """Make the blocks: results beside the paper's, skins beside recorded ones, the stages and their code.
-
-    The last of `results` is the headline scene: README shows its scores, and its skins are compared.
-    """
-    labels = [_results(numbers, ("labels",)) for numbers in recorded if "labels" in numbers]
-    compared = [_results(numbers, COMPARED) for numbers in recorded if "compare" in numbers]
-    skins = {
-        f"{numbers['provenance']['scene']} ({numbers['provenance']['source']})": next(
-            iter(numbers["described"].values())
-        )
-        for numbers in (results[-1], *recorded)
-    }
-    return {
-        "headline": _headline(results[-1]),
-        "recorded": "\n\n".join(_recorded(numbers) for numbers in recorded if "labels" in numbers) or "None yet.",
-        "results": "\n\n".join(_results(numbers, TABLES) for numbers in results),
-        "time": _time(timed),
-        "costs": _costs([numbers for numbers in (*results, *recorded) if "trainings" in numbers]),
-        "labels": "\n\n".join(labels) or "No recorded scene asked yet.",
-        "compare": "\n\n".join(compared) or "No recorded scene asked yet.",
-        "skins": to_markdown(skins_table(skins)),
-        "stages": _stages(stages),
-    }
-
-
-def _results(numbers: Numbers, names: Sequence[str]) -> str:
-    provenance = numbers["provenance"]
-    if "trainings" not in numbers:
-        scene = provenance["scene"]
-        return (
-            f"Scene `{scene}`, **{provenance['source']}**: stale. `reports/{scene}` was made by code "
-            f"{provenance['git']}, with other settings and before the check for collapsed networks; no number of it is "
-            f"shown here. Run it again: `reskin scenes use {scene}`, `dvc repro`."
-        )
-    # Results that were committed before the code of other experiments changed can still be shown.
-    tables = make_tables({name: part for name, part in numbers.items() if name not in ANALYSES or name in names})
-    heading = (
-        f"Scene `{provenance['scene']}`, **{provenance['source']}**; trained by code {provenance['trained']}, "
-        f"seed {provenance['seed']}, {provenance['device']}:"
-    )
-    return "\n\n".join([heading] + [to_markdown(tables[name]) for name in names if name in tables])
-
-
-def _headline(numbers: Numbers) -> str:
-    provenance = numbers["provenance"]
-    heading = f"Scene `{provenance['scene']}`, **{provenance['source']}**, code {provenance['trained']}:"
-    return f"{heading}\n\n{to_markdown(short_table(numbers))}"
-
-
-def _recorded(numbers: Numbers) -> str:
-    provenance = numbers["provenance"]
-    heading = f"Scene `{provenance['scene']}`, **{provenance['source']}**, code {provenance['trained']}:"
-    return f"{heading}\n\n{to_markdown(labels_table(numbers['labels']))}"
-
-
-def _time(timed: Numbers | None) -> str:
-    """Write how long fresh clones took, the median of their runs."""
-    if timed is None:
-        return "Not timed yet: `make time-repro`."
-    runs = timed["runs"]
-    minutes = {
-        (part, unit): median(run[part][unit] for run in runs) / 60
-        for part in ("environment", "stages")
-        for unit in ("wall_s", "cpu_s")
-    }
-    disk = f"{median(run['all_MB'] for run in runs) / 1e3:.1f} GB on disk"
-    clones = "a fresh clone" + (f", stages the median of {len(runs)} runs from nothing" if len(runs) > 1 else "")
-    return (
-        f"Environment {minutes['environment', 'wall_s']:.1f} min, stages {minutes['stages', 'wall_s']:.1f} min "
-        f"({minutes['stages', 'cpu_s']:.1f} min of CPU), {disk}, of which the environment takes "
-        f"{median(run['environment_MB'] for run in runs) / 1e3:.1f} GB: {clones} on "
-        f"{timed['machine']} (`make time-repro`, code {timed['git']})."
-    )
-
-
-def _costs(scenes: Sequence[Numbers]) -> str:
-    """Write what each scene costs when all of it is computed, on the machine that computed it."""
-    by_device: dict[str, list[str]] = {}
-    for provenance in (numbers["provenance"] for numbers in scenes):
-        minutes = provenance["seconds"] / 60
-        cost = f"`{provenance['scene']}` {minutes:{'.2g' if minutes < SEVERAL_min else ',.0f'}} min"
-        by_device.setdefault(provenance["device"], []).append(cost)
-    costs = "; ".join(f"{', '.join(own)} ({device})" for device, own in by_device.items())
-    counts = [count for numbers in scenes for count in numbers["trainings"].values()]
-    trained_n, collapsed_n = (sum(count[name] for count in counts) for name in ("trainings_n", "collapsed_n"))
-    return (
-        f"Computed from nothing, trainings added up as if one ran after another: {costs}. Two run side by side "
-        f"by default, so that less time passes. Of the {trained_n:,} trainings of these scenes {collapsed_n} collapsed."
-    )
-
-
-def _stages(stages: Mapping[str, Any]) -> str:
-    lines = ["| stage | code | writes |", "|---|---|---|"]
-    for name, stage in stages.items():
-        outs = [
-            out if isinstance(out, str) else next(iter(out))
-            for key in ("outs", "metrics", "plots")
-            for out in stage.get("do", stage).get(key, [])
-        ]
-        written = ", ".join(f"`{re.sub(r'[$]{[^}]*}', '…', out)}`" for out in outs) or "MLflow runs"
-        code = file_of(module_name(name) if name != "code" else "pipeline.stages.code").relative_to(ROOT)
-        lines.append(f"| {name} | [{code}](../{code}) | {written} |")
-    return "\n".join(lines)
-
-
-TIMED = "reports/time.json"  # what `make time-repro` measured
+NONE_YET = "None yet."
+COSTS_MEANING = (
+    "Computed from nothing, trainings added up as if one ran after another; two run side by side by default, so that "
+    "less time passes."
+)
+TIMES = "reports/time.json"  # written by `make time-repro`
 FULL_SIZE, HEADLINE = "paper", "quick"  # the simulated scenes that the pages show; README begins with the second
+Numbers = Mapping[str, Any]  # of one scene
 
 
 def fill_pages(root: Path, *, write: bool) -> tuple[list[str], list[str]]:
@@ -169,11 +48,123 @@ def fill_pages(root: Path, *, write: bool) -> tuple[list[str], list[str]]:
             )
     recorded = [result for result in numbers.values() if result["provenance"]["source"] == "recorded"]
     results = [numbers[name] for name in (FULL_SIZE, HEADLINE)]
-    timed = io.read_json(root / TIMED) if (root / TIMED).exists() else None
-    texts = [root / "README.md", *sorted((root / "docs").glob("*.md"))]
-    before = {str(file): file.read_text(encoding="utf-8") for file in texts}
-    after = fill(before, blocks_of(results, recorded, read_yaml(root / FLOW)["stages"], timed))
+    times = io.read_json(root / TIMES) if (root / TIMES).exists() else None
+    pages = [root / "README.md", *sorted((root / "docs").glob("*.md"))]
+    before = {str(page): page.read_text(encoding="utf-8") for page in pages}
+    after = fill(before, blocks_of(results, recorded, read_yaml(root / FLOW)["stages"], times))
     changed = [page for page in after if after[page] != before[page]]
     for page in changed if write else ():
         io.write_text(Path(page), after[page])
     return changed, [result["provenance"]["scene"] for result in (*results, *recorded)]
+
+
+def fill(texts: Mapping[str, str], blocks: Mapping[str, str]) -> dict[str, str]:
+    """Put each block between its marks `<!-- name -->` and `<!-- /name -->`, in the one page that has them."""
+    filled = dict(texts)
+    for name, content in blocks.items():
+        marks = re.compile(rf"(<!-- {name} -->\n)(.*?)(<!-- /{name} -->)", re.DOTALL)
+        pages = [page for page, text in filled.items() if marks.search(text)]
+        if len(pages) != 1:
+            got = ", ".join(pages) or "no page"
+            raise SchemaError("README.md and docs", f"the block {name}", "in one page", got, "Restore its marks.")
+        before, opening, _, closing, after = marks.split(filled[pages[0]])
+        filled[pages[0]] = f"{before}{opening}{content.strip()}\n{closing}{after}"
+    return filled
+
+
+def blocks_of(
+    results: Sequence[Numbers], recorded: Sequence[Numbers], stages: Mapping[str, Any], times: Numbers | None
+) -> dict[str, str]:
+    """Make the generated blocks of the pages, by name.
+
+    The last of `results` is the headline scene: README shows its scores, and its skins are compared with recorded ones.
+    """
+    labelled = [numbers for numbers in recorded if "labels" in numbers]
+    compared = [numbers for numbers in recorded if "compare" in numbers]
+    skins = {
+        f"{numbers['provenance']['scene']} ({numbers['provenance']['source']})": next(
+            iter(numbers["described"].values())
+        )
+        for numbers in (results[-1], *recorded)
+    }
+    return {
+        "headline": _summary(results[-1]),
+        "recorded": "\n\n".join(map(_summary, labelled)) or NONE_YET,
+        "results": "\n\n".join(_tables(numbers, TABLES) for numbers in results),
+        "time": "Not timed yet: `make time-repro`." if times is None else _time(times),
+        "costs": to_markdown(costs_table([numbers for numbers in (*results, *recorded) if "trainings" in numbers])),
+        "labels": "\n\n".join(_tables(numbers, ("labels",)) for numbers in labelled) or NONE_YET,
+        "compare": "\n\n".join(_tables(numbers, COMPARED) for numbers in compared) or NONE_YET,
+        "skins": to_markdown(skins_table(skins)),
+        "stages": _stages(stages),
+    }
+
+
+def _summary(numbers: Numbers) -> str:
+    provenance, table = numbers["provenance"], summary_table(numbers)
+    heading = f"Scene `{provenance['scene']}`, **{provenance['source']}**, code {provenance['trained']}:"
+    return heading if table is None else f"{heading}\n\n{to_markdown(table)}"
+
+
+def _tables(numbers: Numbers, names: Sequence[str]) -> str:
+    """Write the named tables of a scene, below a heading with its provenance."""
+    provenance = numbers["provenance"]
+    if "trainings" not in numbers:
+        scene = provenance["scene"]
+        return (
+            f"Scene `{scene}`, **{provenance['source']}**: stale. `reports/{scene}` was made by code "
+            f"{provenance['git']}, with other settings and before the check for collapsed networks; its numbers are "
+            f"not shown here. Run it again: `reskin scenes use {scene}`, `dvc repro`."
+        )
+    # Results that were committed before the code of other experiments changed can still be shown.
+    tables = make_tables({name: part for name, part in numbers.items() if name not in ANALYSES or name in names})
+    heading = (
+        f"Scene `{provenance['scene']}`, **{provenance['source']}**; trained by code {provenance['trained']}, "
+        f"seed {provenance['seed']}, {provenance['device']}:"
+    )
+    return "\n\n".join([heading] + [to_markdown(tables[name]) for name in names if name in tables])
+
+
+def _time(times: Numbers) -> str:
+    """Write how long fresh clones took, the median of their runs."""
+    runs = times["runs"]
+    environment_min, stages_min = (
+        median(run[part]["wall_s"] for run in runs) / 60 for part in ("environment", "stages")
+    )
+    cpu_min = median(run["stages"]["cpu_s"] for run in runs) / 60
+    all_GB, environment_GB = (median(run[part] for run in runs) / 1e3 for part in ("all_MB", "environment_MB"))
+    return (
+        f"Environment {environment_min:.1f} min, stages {stages_min:.1f} min ({cpu_min:.1f} CPU min); {all_GB:.1f} GB, "
+        f"{environment_GB:.1f} GB of them the environment. Median of {len(runs)} fresh clones on {times['machine']} "
+        f"(`make time-repro`, code {times['git']})."
+    )
+
+
+def costs_table(scenes: Sequence[Numbers]) -> pd.DataFrame:
+    """Tabulate what each scene costs when all of it is computed, and its trainings."""
+    lines = [
+        {
+            "scene": f"`{numbers['provenance']['scene']}`",
+            "computed, min": f"{numbers['provenance']['seconds'] / 60:.2g}",
+            "trainings": f"{sum(count['trainings_n'] for count in numbers['trainings'].values()):,}",
+            "collapsed": str(sum(count["collapsed_n"] for count in numbers["trainings"].values())),
+            "machine": numbers["provenance"]["device"],
+        }
+        for numbers in scenes
+    ]
+    return tabulate(lines, meaning=COSTS_MEANING)
+
+
+def _stages(stages: Mapping[str, Any]) -> str:
+    """Tabulate the stages of dvc.yaml with their code and outputs; unpadded, so that one stage changes one line."""
+    lines = ["| stage | code | writes |", "|---|---|---|"]
+    for name, stage in stages.items():
+        outs = [
+            out if isinstance(out, str) else next(iter(out))
+            for key in ("outs", "metrics", "plots")
+            for out in stage.get("do", stage).get(key, [])
+        ]
+        code = file_of(module_name(name) if name != "code" else "pipeline.stages.code").relative_to(ROOT)
+        written = ", ".join(f"`{re.sub(r'[$]{[^}]*}', '…', out)}`" for out in outs) or "MLflow runs"
+        lines.append(f"| {name} | [{code}](../{code}) | {written} |")
+    return "\n".join(lines)

@@ -1,36 +1,99 @@
 """Tables of a scene: numbers.json -> rows, as Markdown for people and CSV for programs."""
 
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from pydantic import model_validator
 
 from pipeline import scenes
 from pipeline.experiments.neglected_effects import neglected_effects_table
 from pipeline.report.checklist import checklist, claims_table
+from pipeline.report.experiments import experiment_tables
 from pipeline.report.formatting import (
     COLUMNS,
     INTERVAL,
     OF_FORCE,
+    OF_PAPER,
     SHORT,
+    Model,
     beside,
+    models,
     n_of,
-    paired_boards_table,
-    paired_table,
     scored,
     scores,
     show,
     show_both,
-    stability_table,
+    show_difference,
     table_2_rows,
     tabulate,
     to_markdown,
-    verification_table,
+    universal_rows,
 )
 from pipeline.report.paper import ADAPTED_POKES_N, FIGURE_6A, FIGURE_6B, SINGLE_SENSOR, TABLE_2, Number
-from pipeline.report.parts import experiment_tables
-from pipeline.report.table1 import measured, read_table1, table1
+from reskin.config import Strict, parse, read_yaml
+from reskin.errors import ParamsError
+
+Numbers = Mapping[str, Any]
+Rows = Sequence[Mapping[str, Any]]
+SPLITS = {
+    "single_random": "random readings held out (the paper's way: readings of one indentation on both sides)",
+    "single_indentation": "random indentations held out (all readings of one on the same side)",
+    "single_pass": "random passes held out (each visits every place and depth again)",
+    "single_temporal": "first passes → last passes",
+}
+UNCERTAINTY = {"coverage_pct": "in 90 % intervals, %", "half_width_mm": "half of them, mm (median)"}
+BEFORE_TOUCH = {
+    "noload": "the no-load reading before the poke alone",
+    "scan": "the number of the poke in its pass alone",
+}
+BEFORE_TOUCH_MEANING = (
+    "Place from ... alone: predicted by the 2 nearest training rows, on the rows and folds above, without any change "
+    "of field. The number in the pass shows how far the rig repeats its order; no network receives it. The no-load "
+    "reading shows what a skin that remembers its pokes reveals of that order; it is part of every change of field, so "
+    "a network that is tested on its training skin may have used it."
+)
+SEEN_TIP = (
+    "Not comparable with the paper's numbers: a tip that only hovers is placed too, so the indenter itself is magnetic "
+    "and these scores are no evidence of touch"
+)
+HOVER_MEANING = (
+    "Hover control: rows of the tested passes without force, above the place that is touched next, predicted by models "
+    "that were trained on contacts. Without any signal a few in a hundred are right by chance. A tip that the nearest "
+    "contacts place a quarter of the time is called seen (assumed): the chips sense its own magnetism. |dB| without "
+    "contact includes the noise of the no-load reading."
+)
+TABLE_2_SPREAD = (
+    "± is the sd, as in the paper: over n boards held out, or over n pairs of a training and a test skin for one skin "
+    f"on others. {INTERVAL} (for one skin on others: over its training skins and the boards that it was tested on)."
+)
+TARGET = (
+    "The row of one skin on others was a calibration target of an earlier simulated skin: spreads that were set with "
+    "it in view remain, so agreement there is no evidence."
+)
+CONSTANT = "a constant force, the mean of the tested presses"
+COLLAPSED_MEANING = (
+    "Collapsed: a network that explains next to nothing of some target on its own training rows, because its output is "
+    "nearly constant. It is trained again with other random draws, at most twice; one that collapses every time is "
+    "kept in all means; those of train_* and adapt are also named in the audit. Very short trainings are not judged."
+)
+PLACES = (
+    "Registered: after one offset a board (uses its labels: a diagnosis). Labels and unlabelled pokes are indentations "
+    "of the new board at places where it is also tested, at other depths."
+)
+TRAINING_ROWS = (
+    "Training rows of the first fold; a classical method is given at most so many, drawn at random. Settings of "
+    "classical methods were not searched."
+)
+CONTROLLED = "0 is the network before fine-tuning; the effect of fine-tuning without pokes is the control of table 2."
+BUDGETS = "The number of steps is a budget of each scene, and no part of the choice."
+DRAWS = (
+    "[low, high] is the 95 % interval over n held-out boards (Student's t), each with its own draw of training skins; "
+    "networks of one board are averaged first."
+)
+OF_BOARDS = "± is the sd over n boards."
 
 QUANTITIES = {
     "field_at_rest_chip_median_uT": "field at rest, median chip, µT",
@@ -53,112 +116,28 @@ QUANTITIES = {
     "force_median_N": "force, median, N",
     "force_max_N": "force, largest, N",
 }
-ALIKE = 2.0  # assumed: means within this factor count as alike
-MEANING_OF_SKINS = (
+PAIRED = (
+    "Differences on the same test rows, skin by skin, each side the mean of its networks on a skin and a board the "
+    "mean of its skins; [low, high] is the 95 % interval over n boards (Student's t). One skin on others: on the "
+    "boards that it was tested on, and the interval is over its training skins too. Verdicts on them: table claims."
+)
+SKINS_MEANING = (
     "Mean over skins [least … most] (number of skins); a change of field is the length of the vector of all channels, "
     "the median over readings within 20 % of the force. – : too few readings."
 )
-COMPARED = f" Alike: the means are within a factor of {ALIKE:g} of a recorded one."
-
-
-def skins_table(columns: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
-    """Put descriptions side by side by title; compare simulated with recorded ones where there are both."""
-    both = {described["source"] for described in columns.values()} == {"simulated", "recorded"}
-    lines = []
-    for name, title in QUANTITIES.items():
-        values = {column: described["over_skins"].get(name) for column, described in columns.items()}
-        if not any(values.values()):
-            continue
-        line = {"quantity": title} | {column: _show_quantity(value) for column, value in values.items()}
-        if both:
-            means = [(columns[column]["source"], value["mean"]) for column, value in values.items() if value]
-            line["simulated against recorded"] = _compare(means)
-        lines.append(line)
-    table = pd.DataFrame(lines)
-    table.attrs["meaning"] = MEANING_OF_SKINS + COMPARED * both
-    return table
-
-
-def _show_quantity(value: Mapping[str, float] | None) -> str:
-    if value is None:
-        return "–"
-    return f"{value['mean']:.3g} [{value['least']:.3g} … {value['most']:.3g}] ({value['n']})"
-
-
-def _compare(means: Sequence[tuple[str, float]]) -> str:
-    """Compare simulated with recorded means by the ratio that is nearest to 1."""
-    ratios = [a / b for side, a in means if side == "simulated" for of, b in means if of == "recorded"]
-    if not ratios:
-        return "–"
-    nearest = min(ratios, key=lambda ratio: abs(np.log(ratio)))
-    if 1 / ALIKE <= nearest <= ALIKE:
-        return "alike"
-    return f"differs: {nearest:.2g} times the nearest recorded"
-
-
-SPLIT_WORDS = {
-    "single_random": "random readings held out (the paper's way: readings of one indentation on both sides)",
-    "single_indentation": "random indentations held out (all readings of one on the same side)",
-    "single_pass": "random passes held out (each visits every place and depth again)",
-    "single_temporal": "first passes → last passes",
-}
-SURENESS = {"coverage_pct": "in 90 % intervals, %", "half_width_mm": "half of them, mm (median)"}
-BEFORE_TOUCH = {
-    "noload": "the no-load reading before the poke alone",
-    "scan": "the number of the poke in its pass alone",
-}  # what tells a place: words
-BEFORE_TOUCH_MEANING = (
-    "Told before the touch: the place by the 2 nearest training rows, on the rows and folds above, from no change of "
-    "field. The number in the pass says how far the rig repeats its order; no network sees it. The no-load reading "
-    "says what a skin that remembers its pokes gives away of that order; it is in every change of field, so a network "
-    "that is tested on the skin it learnt on may have used it."
-)
-SEEN_TIP = (
-    "Not beside the paper's numbers: a tip that only hovers is placed too, so the indenter itself is magnetic and "
-    "these scores are no evidence of touch"
-)
-HOVER_MEANING = (
-    "Hover control: rows of the tested passes in which the gauge feels nothing, at the place that is touched next, "
-    "answered by what was learnt on contacts. A skin that feels nothing is placed by chance, a few in a hundred. A tip "
-    "that the nearest contacts place a quarter of the time is called seen (assumed): its own magnetism is read. |dB| "
-    "without contact holds the noise of the no-load reading too."
-)
-TABLE_2_SPREAD = (
-    "± is the sd, as in the paper: over n boards held out, or over n pairs of a training and a test skin for one skin "
-    f"on others. {INTERVAL} (for one skin on others: over its training skins and the boards that it was tested on)."
-)
-TARGET = (
-    "The row of one skin on others was a calibration target of an earlier simulated skin: spreads that were set with "
-    "it in view remain, so agreement there is no evidence."
-)
-CONSTANT = "a constant force, the mean of the tested presses"
-COLLAPSED_MEANING = (
-    "Collapsed: a network that explains next to nothing of some target on its own training rows, as it answers nearly "
-    "the same to any input. It is trained again with other draws, at most twice; what collapses every time is kept in "
-    "all means; those of train_* and adapt are also named in the audit. Trainings too short to have left their start "
-    "are not judged."
-)
-PLACES = (
-    "Registered: after one offset a board (uses its labels: a diagnosis). Labels and unlabelled pokes are indentations "
-    "of the new board at places where it is also tested, at other depths."
-)
-TRAINING_ROWS = (
-    "Training rows of the first fold; a classical method is given at most so many, drawn at random. Settings of "
-    "classical methods were not searched."
-)
-CONTROLLED = (
-    "0 is the network as it was trained, all others are fine-tuned: what that does without pokes is the control of "
-    "table 2."
-)
-BUDGETS = "How many steps there are is a budget of each scene, and no part of the choice."
-DRAWS = (
-    "[low, high] is the 95 % interval over n held-out boards (Student's t), each with its own draw of training skins; "
-    "networks of one board are averaged first."
-)
-OF_BOARDS = "± is the sd over n boards."
-
-Numbers = Mapping[str, Any]
-Rows = Sequence[Mapping[str, Any]]
+SUMMARY_TITLES = {"accuracy_pct": "within 1 mm, %", "r2_f": "R² of F"}
+UNIVERSAL = "universal, "  # begins the name of a method that is calibrated to the skin
+CHECKS = {
+    "subject": "what", "law": "law", "against": "against", "error": "error", "tolerance": "allowed",
+    "reason": "why so much",
+}  # fmt: skip
+CASES = {
+    "area": "area", "case": "case", "should": "should", "happened": "happened", "error": "error", "limit": "allowed",
+}  # fmt: skip
+TABLE_1 = Path(__file__).with_name("table1.yaml")
+LOCALISATION = "Localisation (within 1 mm, new skin)"  # our row: the paper's table has none
+OURS = "ours, measured"
+NOT_GIVEN = "–"
 
 
 def make_tables(numbers: Numbers) -> dict[str, pd.DataFrame]:
@@ -168,10 +147,10 @@ def make_tables(numbers: Numbers) -> dict[str, pd.DataFrame]:
     if "table2" in numbers:
         tables["table2"] = _table_2(numbers, source)
     if "paired" in numbers:
-        orders = {"paired": paired_table, "paired_boards": paired_boards_table}
-        made = {name: make(numbers, source) for name, make in orders.items()}
-        tables |= {name: table for name, table in made.items() if not table.empty}
-    if any(name in numbers for name in SPLIT_WORDS):
+        tables["paired"] = paired_table(numbers, source)
+        boards = paired_boards_table(numbers, source)
+        tables |= {} if boards.empty else {"paired_boards": boards}
+    if any(name in numbers for name in SPLITS):
         tables["single_sensor"] = _single(numbers, source)
     if "hover" in numbers:
         tables["hover"] = _hover(numbers, source)
@@ -236,25 +215,25 @@ def baselines_table(rows: Rows, source: str) -> pd.DataFrame:
 
 
 def labels_table(rows: Rows, source: str, constant: Numbers | None = None) -> pd.DataFrame:
-    """List scores by how many labelled indentations of the new skin were at hand."""
+    """List scores by the number of labelled indentations of the new skin; last a constant force, where given."""
     places = {metric: f"{title} (registered)" for metric, title in COLUMNS.items() if metric not in OF_FORCE}
-    sure = SURENESS if any(metric in row["as_labelled"] for row in rows for metric in SURENESS) else {}
+    uncertainty = UNCERTAINTY if any(metric in row["as_labelled"] for row in rows for metric in UNCERTAINTY) else {}
     lines = [
         {"method": row["method"], "inputs": row["inputs"], "labels": str(row["labels_n"]), "source": source}
         | scores(row["as_labelled"])
         | scores(row["registered"], places)
-        | scores(row["as_labelled"], sure)
+        | scores(row["as_labelled"], uncertainty)
         | {"n": n_of(row["as_labelled"])}
         for row in rows
     ]
     if constant:
-        words = {"method": CONSTANT, "inputs": "–", "labels": "all", "source": source}
-        lines.append(words | scores(constant) | {"n": n_of(constant)})
+        line = {"method": CONSTANT, "inputs": "–", "labels": "all", "source": source}
+        lines.append(line | scores(constant) | {"n": n_of(constant)})
     return tabulate(lines, meaning=PLACES)
 
 
 def labels_boards_table(rows: Rows, source: str) -> pd.DataFrame:
-    """List the same board by board."""
+    """List scores by the number of labelled indentations, on each held-out board."""
     lines = [
         {"method": row["method"], "inputs": row["inputs"], "labels": str(row["labels_n"]), "held-out board": board}
         | {title: f"{own[metric]:.3g}" for metric, title in COLUMNS.items() if metric in own}
@@ -266,7 +245,7 @@ def labels_boards_table(rows: Rows, source: str) -> pd.DataFrame:
 
 
 def audit_table(rows: Rows, source: str) -> pd.DataFrame:
-    """List what was searched for leaks; a leak that is known and stated is told from one that is not."""
+    """List the checks for leaks of test data; a leak that is known and stated is marked as such."""
     lines = [
         {name: str(row[name]) for name in ("what", "where", "rule", "found")}
         | {"holds": "yes" if row["holds"] else "no, known" if row["known"] else "NO", "source": source}
@@ -275,45 +254,51 @@ def audit_table(rows: Rows, source: str) -> pd.DataFrame:
     return tabulate(lines)
 
 
-def chosen_table(arms: Mapping[str, Any], source: str) -> pd.DataFrame:
-    """List the candidates of each arm and which was chosen, by leave-one-board-out on boards of their own."""
-    lines = []
-    for arm, choice in arms.items():
-        for row in choice["candidates"]:
-            chosen = f"yes, by {choice['by']}" if row["recipe_name"] == choice["recipe_name"] else ""
-            words = {"arm": arm, "candidate": row["recipe_name"], "settings": row["settings"], "chosen": chosen}
-            lines.append(words | {"source": source} | scored(row))
+def chosen_table(choices: Mapping[str, Any], source: str) -> pd.DataFrame:
+    """List the candidate settings of each stage and which was chosen, by leave-one-board-out on boards of their own."""
+    lines = [
+        {
+            "arm": stage,
+            "candidate": row["recipe_name"],
+            "settings": row["settings"],
+            "chosen": f"yes, by {choice['by']}" if row["recipe_name"] == choice["recipe_name"] else "",
+            "source": source,
+        }
+        | scored(row)
+        for stage, choice in choices.items()
+        for row in choice["candidates"]
+    ]
     return tabulate(lines, meaning=BUDGETS, spread=OF_BOARDS)
 
 
 def _table_2(numbers: Numbers, source: str) -> pd.DataFrame:
-    """Put each row beside the paper's row of the same kind, in the paper's order; the control is ours."""
+    """Tabulate table 2 beside the paper's, in its order; the control and the constant force are ours."""
     rows = {model.title: (row, model.paper) for model, row in table_2_rows(numbers).values()}
     constant = numbers.get("constant_force", {}).get("table2")
     if constant:
         rows[CONSTANT] = (constant, {})
     table = _beside_paper(rows, source)
     trainings = numbers.get("trainings", {})
-    asked = [trainings[experiment] for experiment in scenes.TABLE_2.values() if experiment in trainings]
-    words = [TARGET] * (source == "simulated")
-    if kept_n := sum(counts["kept_collapsed_n"] for counts in asked):
-        words.append(f"{kept_n} networks collapsed every time that they were trained, and are in these means.")
-    table.attrs |= {"spread": TABLE_2_SPREAD} | ({"meaning": " ".join(words)} if words else {})
+    kept_n = sum(trainings[name]["kept_collapsed_n"] for name in scenes.TABLE_2.values() if name in trainings)
+    meaning = [TARGET] * (source == "simulated")
+    if kept_n:
+        meaning.append(f"{kept_n} networks collapsed every time that they were trained, and are in these means.")
+    table.attrs |= {"spread": TABLE_2_SPREAD} | ({"meaning": " ".join(meaning)} if meaning else {})
     return table
 
 
 def _single(numbers: Numbers, source: str) -> pd.DataFrame:
-    """Put each split of one skin beside the paper, and below it what tells its places before the touch."""
+    """Tabulate each split of one skin beside the paper, and predictions of its places without any change of field."""
     rows: dict[str, tuple[Mapping[str, Any], Mapping[str, Number]]] = {}
     seen = [skin for skin, own in numbers.get("hover", {}).items() if own["seen"]]
-    for name, words in SPLIT_WORDS.items():
+    for name, split in SPLITS.items():
         if name in numbers:
             skins = numbers.get("single_skins", {}) if name == "single_temporal" else {}
-            own = {f"{words}: {skin}": (_stats(scores), skin in seen) for skin, scores in skins.items()}
-            own = own or {words: (numbers[name], bool(seen))}
+            own = {f"{split}: {skin}": (_stats(scores), skin in seen) for skin, scores in skins.items()}
+            own = own or {split: (numbers[name], bool(seen))}
             rows |= {title: (scores, {} if of_seen else SINGLE_SENSOR) for title, (scores, of_seen) in own.items()}
-            told = numbers.get("before_touch", {}).get(name, {})
-            rows |= {f"{words}: place from {BEFORE_TOUCH[by]}": (told[by], {}) for by in BEFORE_TOUCH if by in told}
+            alone = numbers.get("before_touch", {}).get(name, {})
+            rows |= {f"{split}: place from {BEFORE_TOUCH[by]}": (alone[by], {}) for by in BEFORE_TOUCH if by in alone}
     table = _beside_paper(rows, source)
     meaning = [BEFORE_TOUCH_MEANING] if "before_touch" in numbers else []
     if seen:
@@ -324,14 +309,14 @@ def _single(numbers: Numbers, source: str) -> pd.DataFrame:
 
 
 def _hover(numbers: Numbers, source: str) -> pd.DataFrame:
-    """List what a tip that does not touch gives away, skin by skin, beside the scores of contacts."""
+    """List how well places of a tip that does not touch are predicted, by skin, beside the scores of contacts."""
     skins, lines = numbers.get("single_skins", {}), []
     for skin, own in numbers["hover"].items():
         contact = skins.get(skin, _means(numbers["single_temporal"]))
         line = {"skin": skin, "source": source, "contacts, within 1 mm, %": f"{contact['accuracy_pct']:.3g}"}
         line |= {
-            f"no contact, within 1 mm, % ({words})": f"{own[by]['accuracy_pct']:.3g}" if by in own else "–"
-            for by, words in (("hover", "2 nearest contacts"), ("hover_network", "network"))
+            f"no contact, within 1 mm, % ({model})": f"{own[by]['accuracy_pct']:.3g}" if by in own else "–"
+            for by, model in (("hover", "2 nearest contacts"), ("hover_network", "network"))
         }
         line |= {"|dB| without contact, µT": f"{own['hover_uT']:.3g}", "|dB| at 1 N, µT": f"{own['touch_uT']:.3g}"}
         lines.append(line | {"the tip": "is seen without touch" if own["seen"] else "is not seen"})
@@ -361,11 +346,11 @@ def _printed(paper: Mapping[str, Number]) -> dict[str, str]:
 def _boards(by_board: Mapping[str, Any], source: str) -> pd.DataFrame:
     places = {"as_labelled": "as labelled", "registered": "after one offset a board (uses its labels: a diagnosis)"}
     lines = [
-        {"held-out board": board, "trained on skins": str(parts["trained_on_skins_n"]), "places": words}
+        {"held-out board": board, "trained on skins": str(parts["trained_on_skins_n"]), "places": title}
         | {"source": source}
-        | {title: f"{parts[part][metric]:.3g}" for metric, title in COLUMNS.items() if metric in parts[part]}
+        | {name: f"{parts[part][metric]:.3g}" for metric, name in COLUMNS.items() if metric in parts[part]}
         for board, parts in by_board.items()
-        for part, words in places.items()
+        for part, title in places.items()
     ]
     return pd.DataFrame(lines)
 
@@ -407,3 +392,170 @@ def _captures(numbers: Numbers, source: str) -> pd.DataFrame:
 def _counts(account: Mapping[str, Any]) -> dict[str, int]:
     counts = {name: count for name, count in account.items() if name != "left_out"}
     return counts | {f"left out of training: {name}": count for name, count in account["left_out"].items()}
+
+
+def skins_table(columns: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
+    """Compare descriptions of skins by title; where there are simulated and recorded ones, by the nearest ratio."""
+    both = {described["source"] for described in columns.values()} == {"simulated", "recorded"}
+    lines = []
+    for name, title in QUANTITIES.items():
+        values = {column: described["over_skins"].get(name) for column, described in columns.items()}
+        if not any(values.values()):
+            continue
+        line = {"quantity": title} | {
+            column: f"{value['mean']:.3g} [{value['least']:.3g} … {value['most']:.3g}] ({value['n']})" if value else "–"
+            for column, value in values.items()
+        }
+        if both:
+            means = [(columns[column]["source"], value["mean"]) for column, value in values.items() if value]
+            ratios = [a / b for side, a in means if side == "simulated" for of, b in means if of == "recorded"]
+            nearest = min(ratios, key=lambda ratio: abs(np.log(ratio)), default=None)
+            line["simulated / nearest recorded"] = "–" if nearest is None else f"{nearest:.2g}"
+        lines.append(line)
+    return tabulate(lines, meaning=SKINS_MEANING)
+
+
+def table_2_summary(numbers: Numbers) -> pd.DataFrame:
+    """Tabulate scores on boards never seen, for a first look; the paper's means in brackets."""
+    lines = []
+    for model, row in [*universal_rows(numbers), *table_2_rows(numbers).values()]:
+        line = {
+            "boards never seen": model.title.replace("Multi-sensor with triplet loss, adapted", "The same, adapted")
+        }
+        for metric, title in COLUMNS.items():
+            paper = f" ({model.paper[metric][0]:.3g})" if metric in model.paper else ""
+            line[f"{title} (paper)" if metric in OF_PAPER else title] = show(row.get(metric)) + paper
+        lines.append(line | {"n": n_of(row)})
+    return tabulate(lines, spread=f"{INTERVAL}; n boards, or pairs of skins for one skin on others")
+
+
+def labels_summary(rows: Rows) -> pd.DataFrame:
+    """Tabulate scores on boards never seen, without a label and with most: calibrated methods, and the first one."""
+    methods = list(dict.fromkeys((row["method"], row["inputs"]) for row in rows))
+    by_method = {(row["method"], row["inputs"], row["labels_n"]): row["as_labelled"] for row in rows}
+    counts = {row["labels_n"] for row in rows}
+    lines = [
+        {"boards never seen": method}
+        | {
+            f"{title}, {labels_n} labels": show(by_method.get((method, inputs, labels_n), {}).get(metric))
+            for metric, title in SUMMARY_TITLES.items()
+            for labels_n in sorted({min(counts), max(counts)})
+        }
+        for method, inputs in dict.fromkeys([*(one for one in methods if one[0].startswith(UNIVERSAL)), methods[0]])
+    ]
+    return tabulate(lines, spread=f"{INTERVAL}.")
+
+
+def summary_table(numbers: Numbers) -> pd.DataFrame | None:
+    """Tabulate the scores on boards never seen that a scene is about; None where no board was held out."""
+    if numbers.get("labels"):
+        return labels_summary(numbers["labels"])
+    return table_2_summary(numbers) if numbers.get("table2") else None
+
+
+def paired_table(numbers: Numbers, source: str) -> pd.DataFrame:
+    """List the differences between two models over boards, beside the difference of the paper's means."""
+    known = models(numbers)
+    lines = []
+    for row in numbers["paired"]:
+        of, over = known[row["of"]].paper, known[row["over"]].paper
+        printed = {m: f"{of[m][0] - over[m][0]:+.4g}" for m in of if m in over and of != over}
+        cells = beside(row, printed, show_difference, paper="paper: difference of means")
+        lines.append({"difference": _difference_of(row, known), "source": source} | cells)
+    return tabulate(lines, spread=PAIRED)
+
+
+def paired_boards_table(numbers: Numbers, source: str) -> pd.DataFrame:
+    """List the difference between two models on each held-out board."""
+    known = models(numbers)
+    lines = [
+        {"difference": _difference_of(row, known), "held-out board": board, "source": source}
+        | {title: show_difference({"mean": means[m]}) for m, title in COLUMNS.items() if m in means}
+        for row in numbers["paired"]
+        for board, means in row.get("by_board", {}).items()
+    ]
+    return tabulate(lines, spread=PAIRED)
+
+
+def _difference_of(row: Mapping[str, Any], known: Mapping[str, Model]) -> str:
+    return f"{known[row['of']].short} − {known[row['over']].short}"
+
+
+def verification_table(rows: Rows, source: str) -> pd.DataFrame:
+    """List the checks of the physics: what was compared with what, its error, and the allowed error with its reason."""
+    return _checks(rows, CHECKS, source)
+
+
+def stability_table(rows: Rows, source: str) -> pd.DataFrame:
+    """List stiff, extreme and broken cases: what should happen, what happened, and by how much."""
+    return _checks(rows, CASES, source)
+
+
+def _checks(rows: Rows, titles: Mapping[str, str], source: str) -> pd.DataFrame:
+    def show_value(value: str | float | None, unit: str) -> str:
+        if value is None or isinstance(value, str):
+            return value or "–"
+        return f"{value:.2g}" if unit == "1" else f"{value:.2g} {unit}"
+
+    return pd.DataFrame(
+        {title: show_value(row[name], row.get("unit", "1")) for name, title in titles.items()}
+        | {"holds": "yes" if row["holds"] else "NO", "source": source}
+        for row in rows
+    )
+
+
+class Table1(Strict):
+    """Table 1 as printed: by column the source that the paper cites, by row a cell for each column."""
+
+    columns: dict[str, str]
+    rows: dict[str, tuple[str, ...]]
+
+    @model_validator(mode="after")
+    def _rows_fill_the_columns(self) -> "Table1":
+        for name, cells in self.rows.items():
+            if len(cells) != len(self.columns):
+                raise ValueError(f"row {name!r} must have {len(self.columns)} cells, not {len(cells)}")
+        return self
+
+
+def read_table1(path: Path = TABLE_1) -> Table1:
+    """Read the paper's table 1 from its YAML file."""
+    return parse(Table1, read_yaml(path), str(path))
+
+
+def table1(data: Table1, measured: Mapping[str, str]) -> pd.DataFrame:
+    """Add our column (cells by row) to the paper's table 1, whose cells stay as printed."""
+    rows = data.rows | {LOCALISATION: (NOT_GIVEN,) * len(data.columns)}
+    if unknown := sorted(measured.keys() - rows.keys()):
+        raise ParamsError("table 1", "measured rows", f"among {sorted(rows)}", unknown, "Use the names of the table.")
+    lines = [
+        {"property": name, **dict(zip(data.columns, cells, strict=True)), OURS: measured.get(name, NOT_GIVEN)}
+        for name, cells in rows.items()
+    ]
+    sources = " ".join(f"{name}: {source}" for name, source in data.columns.items())
+    meaning = f"As printed in the paper (table 1), ? included. The last row and column are ours. {sources}"
+    return tabulate(lines, meaning=meaning)
+
+
+def measured(numbers: Numbers) -> dict[str, str]:
+    """Write our cells of table 1, by row: what the scene measured or was set to."""
+    source = numbers["provenance"]["source"]
+    simulated = source == "simulated"
+    described: Mapping[str, Any] = next(iter(numbers.get("described", {}).values()), {"over_skins": {}})
+    cells = {}
+    if rate := described["over_skins"].get("rate_hz"):
+        cells["Frequency"] = f"{rate['mean']:.4g} Hz" + ", a setting read back from the captures" * simulated
+    if sleeve := numbers.get("sleeve"):
+        area = " x ".join(f"{side:g}" for side in sleeve["area_mm"])
+        cells["Area coverage"] = f"{sleeve['chips_n']} chips under {area} mm" + ", a setting" * simulated
+    if drift := numbers.get("drift"):
+        policy = next(name for name in ("each", "regular", "initial") if name in drift)
+        last = drift[policy][-1]
+        cells["Durable (> 50k contacts)"] = (
+            f"{last['accuracy_pct']:.3g} % within 1 mm after {last['contacts_n']:,.0f} contacts, "
+            f"no-load reading: {policy}"
+        )
+    best = next((row for row in ("adapted", "triplet", "multi") if row in numbers.get("table2", {})), None)
+    if best:
+        cells[LOCALISATION] = f"{show(numbers['table2'][best]['accuracy_pct'])} % ({best})"
+    return {row: f"{text}, {source}" for row, text in cells.items()}

@@ -13,7 +13,7 @@ from reskin import io
 from reskin.code import digest, imported
 
 REPORT = "pipeline.report"
-SHOWING = f"{REPORT}.parts"  # imports the modules of experiments by name
+SHOWING = f"{REPORT}.experiments"  # imports the modules of experiments by name
 
 
 def entries() -> dict[str, str]:

@@ -21,9 +21,11 @@ from pipeline.provenance import (
     versions,
 )
 from pipeline.report.choice import choose, to_record
-from pipeline.report.figures import error_grids, learning_figures, learning_pages, pages
+from pipeline.report.costs import cost_pages
+from pipeline.report.experiments import experiment_figures
+from pipeline.report.figures import HEADLINE as HEADLINE_FIGURE
+from pipeline.report.figures import error_grids, headline_figures, learning_figures
 from pipeline.report.formatting import rounded, to_markdown
-from pipeline.report.headline import FILE, headline_figures, short_table
 from pipeline.report.numbers import (
     answered,
     compose,
@@ -38,8 +40,7 @@ from pipeline.report.numbers import (
     timed_learning,
 )
 from pipeline.report.page import index, page, run_page
-from pipeline.report.parts import experiment_figures
-from pipeline.report.tables import make_tables, table_texts
+from pipeline.report.tables import make_tables, table_2_summary, table_texts
 from pipeline.scenes import EXPERIMENTS, TABLE_2, SceneExperiments, experiments_of, stages
 from pipeline.settings import Settings
 from pipeline.stage import say
@@ -61,7 +62,7 @@ def table2(settings: Settings, models: Path, shown: Path) -> None:
     variants = stages(TABLE_2.values(), "models")
     cards = [io.read_json(file) for variant in variants for file in sorted((models / variant).glob("*.json"))]
     numbers = rounded({"provenance": {"scene": scene, "source": source}, **learned(tidy(cards, {}), headline=HEADLINE)})
-    table = to_markdown(short_table(numbers))
+    table = to_markdown(table_2_summary(numbers))
     io.write_texts(shown, {"table2.md": table, **headline_figures(numbers, source)})
     say(f"{scene} ({source})\n{table}\n{scene}: {', '.join(str(file) for file in sorted(shown.iterdir()))}")
 
@@ -81,28 +82,27 @@ def report(settings: Settings, indentations: Path, folds: Path, models: Path, re
     files_of = {"numbers": shared, "provenance": of_this_run, "scores": headline_scores(numbers)}
     for name, content in files_of.items():
         io.write_json(reports / f"{name}.json", content)
-    with make_executor(imports="pipeline.report.parts") as executor:  # to draw takes most of the time
+    with make_executor(imports="pipeline.report.experiments") as executor:  # to draw takes most of the time
         of_experiments = executor.submit(experiment_figures, numbers, drawn, asked.source)
-        timed = executor.submit(pages, numbers["runtime"], source=asked.source)
+        of_costs = executor.submit(cost_pages, numbers["runtime"], asked.source)
         tables = make_tables(numbers)
         io.write_texts(reports / "tables", table_texts(tables) | {"scores.csv": to_csv(scores)})
-        predictions = [io.read_table(models / arm / "predictions.parquet") for arm in asked.modelled]
+        predictions = [io.read_table(models / stage / "predictions.parquet") for stage in asked.modelled]
         figures = dict(error_grids(predictions, HEADLINE, f"{scene} ({asked.source})"))
         figures |= headline_figures(numbers, asked.source) | dict(learning_figures(numbers, asked.source))
-        costs = timed.result() | learning_pages(numbers["runtime"], asked.source)
         figures |= of_experiments.result()
+        costs = of_costs.result()
     io.write_texts(reports / "figures", figures)
-    # Seconds, commit and machine differ between equal runs: what shows them is in one folder, and no DVC output.
+    # Seconds, commit and machine differ between equal runs: they are in a folder that is no output of DVC.
     io.write_texts(reports / "runtime", costs | {"index.html": run_page(numbers, costs)})
     io.write_text(reports / "index.html", page(shared, tables, figures))
     of_scenes = (io.read_json(file) for file in sorted(reports.parent.glob("*/numbers.json")))
-    headlines = {
-        file.parent.parent.name: io.read_bytes(file).decode() for file in reports.parent.glob(f"*/figures/{FILE}")
-    }
+    files = reports.parent.glob(f"*/figures/{HEADLINE_FIGURE}")
+    headlines = {file.parents[1].name: io.read_bytes(file).decode() for file in files}
     described = [numbers for numbers in of_scenes if "described" in numbers]
     io.write_text(reports.parent / "index.html", index(described, headlines))
     if numbers.get("table2"):
-        say(f"{scene} ({asked.source})\n{to_markdown(short_table(numbers))}")
+        say(f"{scene} ({asked.source})\n{to_markdown(table_2_summary(numbers))}")
     say(f"{scene}: {reports}/index.html, numbers.json, provenance.json, scores.json, tables, figures, runtime")
 
 

@@ -1,7 +1,7 @@
 """What the report says of fields from outside: every arm where it was tried, units, and the earth's field."""
 
 from pipeline.experiments.ambient import figures, tables
-from tests.report.test_work_precision import said
+from tests.report.synthetic import texts_of
 
 
 def scores(accuracy, boards_n):
@@ -32,7 +32,7 @@ def test_an_arm_of_one_board_stands_beside_others_on_that_board_alone():
 
 def test_the_figure_names_arms_units_the_earth_the_board_and_the_source():
     drawn = figures(NUMBERS, {}, "simulated")
-    words = said(drawn["ambient.svg"])
+    words = texts_of(drawn["ambient.svg"])
     for word in ("a", "b", "c", "uniform field / µT", "iron ball above the skin / mm", "earth", "b2", "(simulated)"):
         assert word in words.split() or word in words
     assert figures(NUMBERS, {}, "simulated") == drawn

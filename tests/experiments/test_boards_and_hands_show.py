@@ -7,7 +7,7 @@ import pytest
 from pipeline.experiments import flexible, manual, shear
 from pipeline.report.formatting import to_markdown
 from pipeline.report.paper import FLEXIBLE, MANUAL, SHEAR
-from tests.report.test_work_precision import said
+from tests.report.synthetic import texts_of
 
 
 def stat(mean: float, n: int = 3) -> dict[str, float]:
@@ -50,7 +50,7 @@ def test_every_row_and_every_figure_says_its_source(experiment, source):
     (table,) = module.tables(numbers, source).values()
     assert set(table["source"]) == {source}
     for text in module.figures(numbers, drawn, source).values():
-        assert f"({source})" in said(text)
+        assert f"({source})" in texts_of(text)
         ET.fromstring(text)
         assert text == next(iter(module.figures(numbers, drawn, source).values()))
 
@@ -64,7 +64,7 @@ def test_shear_shows_both_splits_beside_the_papers_numbers_and_what_is_explained
     assert "± (seeds) is the sd over 3 network seeds" in text
     assert table["split"].tolist()[0] == "random readings held out (ours; the paper names no split)"
     assert "4590 readings of 54 dragged lines in 1 passes" in text
-    words = said(shear.figures(SHEARED, CURVES, "simulated")["shear.svg"])
+    words = texts_of(shear.figures(SHEARED, CURVES, "simulated")["shear.svg"])
     assert "0.980 ± 0.020 (seeds) sideways, 0.999 ± 0.020 (seeds) normal" in words
     assert words.count("/ N") == 6
 
@@ -90,7 +90,7 @@ def test_flexible_states_the_bias_with_its_sign_and_how_our_boards_differ_from_t
     table = flexible.tables(BENT, "simulated")["flexible"]
     assert table["bias of F, N"].tolist() == [f"{mean} ± 0.1 ± 0.02 (seeds)" for mean in ("+0.96", "-0.83", "+0.97")]
     assert "over 3 network seeds" in text
-    words = said(flexible.figures(BENT, ARMS, "simulated")["flexible.svg"])
+    words = texts_of(flexible.figures(BENT, ARMS, "simulated")["flexible.svg"])
     assert "bias +0.96 ± 0.1 ± 0.02 (seeds) N" in words
     assert "bias -0.83 ± 0.1 ± 0.02 (seeds) N" in words
 

@@ -1,8 +1,15 @@
 """Numbers and provenance of a run that has every experiment's contract keys, with values that no run made."""
 
+import xml.etree.ElementTree as ET
+
 from scipy.stats import t
 
 from reskin.metrics import METRICS
+
+
+def texts_of(svg: str) -> str:
+    """Join the texts of a figure."""
+    return " ".join("".join(one.itertext()) for one in ET.fromstring(svg).iter() if one.tag.endswith("text"))
 
 
 def stat(mean: float = 1.0, sd: float = 0.5, n: int = 3) -> dict:

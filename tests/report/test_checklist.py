@@ -1,5 +1,4 @@
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -9,8 +8,23 @@ from ruamel.yaml import YAML
 from scipy.stats import t
 
 from pipeline.report import paper
-from pipeline.report.checklist import checklist, claims_table, look_up, read_rows, resolve
-from pipeline.report.judging import Row, judge, p_of
+from pipeline.report.checklist import (
+    EQUIVALENT,
+    NOT_REACHED,
+    NOT_RUN,
+    ONE_SKIN,
+    SETTING,
+    TARGET,
+    Judgement,
+    Row,
+    checklist,
+    claims_table,
+    judge,
+    look_up,
+    p_of,
+    read_rows,
+    resolve,
+)
 from pipeline.scenes import ANALYSES
 from pipeline.statistics import FEW_BOARDS, INCONCLUSIVE, NO, YES
 from reskin.errors import SchemaError
@@ -32,9 +46,10 @@ def row(**words: Any) -> Row:
     return Row(**{"id": "a", "where": "section 9", "what": "b", "paper": "SINGLE_SENSOR.accuracy_pct"} | words)
 
 
-def sentence(found: Any, printed: Any, pooled: bool = True, simulated: bool = True, **words: Any) -> str:
-    mine = row(**{"ours": "a.accuracy_pct"} | words)
-    return judge(mine, printed, found, pooled=pooled, simulated=simulated).sentence
+def judged(
+    found: Any, printed: Any = None, *, pooled: bool = True, simulated: bool = True, **changes: Any
+) -> Judgement:
+    return judge(row(**{"ours": "a.accuracy_pct"} | changes), printed, found, pooled=pooled, simulated=simulated)
 
 
 @pytest.mark.parametrize("one", ROWS, ids=lambda one: one.id)
@@ -60,55 +75,54 @@ def test_every_figure_and_table_of_the_paper_has_a_row():
     assert len({one.id for one in ROWS}) == len(ROWS)
 
 
-def test_an_experiment_that_was_not_asked_says_so():
+def line(numbers: dict, name: str) -> dict[str, str]:
+    """The line of the checklist with this id."""
+    (one,) = [one for one in ROWS if one.id == name]
+    return checklist(numbers, [one]).to_dict("records")[0]
+
+
+def test_an_experiment_that_was_not_run_is_named_so():
     numbers = all_experiments()
     del numbers["shear"]
-    table = checklist(numbers).set_index("result")
-    assert table.loc["dragged lines: MSE of the place", "difference"] == "not asked in this scene"
-    assert table.loc["dragged lines: MSE of the place", "shown in"] == "–"
-    assert table.loc["dragged lines: MSE of the place", "paper"] == "0.085 ± 0.006 mm²"
-    assert set(table["source"]) == {"simulated"}
-
-
-def test_better_and_worse_follow_the_metric():
-    assert sentence(stat(90.0), (85.0, 10.0)) == "ours is 5 points higher (better); within one sd of the paper's"
-    assert sentence(stat(70.0), (85.0, 10.0)) == "ours is 15 points lower (worse); outside one sd of the paper's"
-    mse = {"ours": "a.mse_f_N2"}
-    assert sentence(stat(0.5), (1.0, 0.1), **mse) == "ours is 50 % lower (better); outside one sd of the paper's"
-    assert (
-        sentence(stat(3.0), (1.0, 0.1), **mse) == "ours is 3 times the paper's (worse); outside one sd of the paper's"
-    )
-    assert sentence(stat(200.4), (1.0, 0.1), **mse).startswith("ours is 200 times the paper's")
-    assert sentence(105.0, 100.0, ours="a.rate_hz") == "ours is 5 % higher; within 10 % of the paper's"
+    shear = line(numbers, "shear-mse_xy_mm2")
+    assert (shear["note"], shear["shown in"], shear["paper"]) == (NOT_RUN, "–", "0.085 ± 0.006 mm²")
+    assert set(checklist(numbers)["source"]) == {"simulated"}
 
 
 @given(
     mean=st.floats(1, 100), sd=st.floats(0.1, 50), ours=st.floats(0, 200), path=st.sampled_from(["accuracy_pct", "mse"])
 )
-def test_a_result_differs_exactly_outside_the_papers_sd(mean, sd, ours, path):
-    verdict = judge(row(ours=f"a.{path}"), (mean, sd), stat(ours), pooled=True, simulated=True)
-    assert verdict.differs == (abs(ours - mean) > sd)
-    alone = judge(row(ours=f"a.{path}"), mean, stat(ours), pooled=True, simulated=True)
-    assert alone.differs == (abs(ours - mean) > 0.1 * mean)
-
-
-def test_limits_findings_and_words_are_judged_by_what_they_say():
-    assert sentence(0.05, 0.2, rule="at_most") == "ours is at most 0.2"
-    assert sentence(0.3, 0.2, rule="at_most") == "ours is not at most 0.2"
-    assert sentence(80.0, 90.0, rule="at_least") == "ours is not at least 90"
-    assert sentence(-0.1, None, rule="positive") == "ours is not above 0"
-    assert sentence(False, None).startswith("does not hold")
-    found = {"verdict": "no", "of_trainings": "yes", "why": "Because."}
-    assert sentence(found, None, rule="finding") == "over these trainings: yes. Because"
-
-
-def word(found: Any, printed: Any = None, **words: Any) -> str:
-    mine = row(**{"ours": "a.accuracy_pct"} | words)
-    return judge(mine, printed, found, pooled=True, simulated=True).word
+def test_a_number_is_near_within_the_papers_sd_or_ten_percent(mean, sd, ours, path):
+    found = judged(stat(ours), (mean, sd), ours=f"a.{path}")
+    assert (found.criterion, found.met) == ("within the paper's sd", "yes" if abs(ours - mean) <= sd else "no")
+    alone = judged(stat(ours), mean, ours=f"a.{path}")
+    assert (alone.criterion, alone.met) == (
+        "within 10 % of the paper's", "yes" if abs(ours - mean) <= 0.1 * mean else "no",
+    )  # fmt: skip
+    assert found.verdict == alone.verdict == "–"
 
 
 @pytest.mark.parametrize(
-    ("rule", "low", "high", "said"),
+    ("rule", "ours", "paper", "criterion", "met"),
+    [
+        ("at_most", 0.05, 0.2, "at most 0.2", "yes"), ("at_most", 0.3, 0.2, "at most 0.2", "no"),
+        ("at_least", 80.0, 90.0, "at least 90", "no"), ("at_least", 90.0, 90.0, "at least 90", "yes"),
+        ("positive", -0.1, None, "above 0", "no"),
+    ],
+)  # fmt: skip
+def test_limits_are_met_by_the_mean(rule, ours, paper, criterion, met):
+    found = judged(ours, paper, rule=rule)
+    assert (found.verdict, found.criterion, found.met) == (FEW_BOARDS, criterion, met)
+
+
+def test_a_finding_has_the_verdict_of_its_experiment():
+    found = judged({"verdict": "undecided", "of_trainings": YES}, rule="finding")
+    assert (found.verdict, found.met) == ("undecided", "yes")
+    assert judged(False).met == "no"
+
+
+@pytest.mark.parametrize(
+    ("rule", "low", "high", "verdict"),
     [
         ("gain", 0.1, 3.0, YES), ("gain", -3.0, -0.1, NO), ("gain", -0.1, 3.0, INCONCLUSIVE),
         ("slight", -4.9, 1.0, YES), ("slight", -9.0, -5.1, NO), ("slight", -6.0, 1.0, INCONCLUSIVE),
@@ -116,101 +130,55 @@ def word(found: Any, printed: Any = None, **words: Any) -> str:
         ("positive", 0.1, 3.0, YES), ("positive", -3.0, -0.1, NO), ("positive", -1.0, 3.0, INCONCLUSIVE),
     ],
 )  # fmt: skip
-def test_claims_are_judged_by_their_interval_over_boards(rule, low, high, said):
-    assert word(over_boards(low, high), rule=rule) == said
-    assert word({"mean": (low + high) / 2, "n": 1}, rule=rule) == FEW_BOARDS
+def test_claims_are_judged_by_their_interval_over_boards(rule, low, high, verdict):
+    assert judged(over_boards(low, high), rule=rule).verdict == verdict
+    assert judged({"mean": (low + high) / 2, "n": 1}, rule=rule).verdict == FEW_BOARDS
 
 
 @given(low=st.floats(50, 99), width=st.floats(0.1, 20), limit=st.floats(60, 99))
 def test_limits_are_judged_from_both_sides_alike(low, width, limit):
-    stat = over_boards(low, low + width)
-    least, most = word(stat, limit, rule="at_least"), word(stat, limit, rule="at_most")
+    ours = over_boards(low, low + width)
+    least, most = (judged(ours, limit, rule=rule).verdict for rule in ("at_least", "at_most"))
     assert (least, most) in {(YES, NO), (NO, YES), (INCONCLUSIVE, INCONCLUSIVE)}
     assert (least == YES) == (low > limit)
 
 
 def test_less_of_an_error_is_a_gain():
-    assert word(over_boards(-0.3, -0.1), ours="paired.x.mse_xy_mm2", rule="gain") == YES
-    assert word(over_boards(0.1, 0.3), ours="paired.x.mse_xy_mm2", rule="gain") == NO
-
-
-def test_a_claim_says_whether_the_papers_difference_lies_in_our_interval():
-    said = sentence(over_boards(-0.5, 4.3), 5.97, rule="gain")
-    assert said == "the 95 % interval over 6 boards includes 0; our 95 % interval excludes the paper's"
-    assert sentence(over_boards(2.0, 8.0), 5.97, rule="gain").endswith("our 95 % interval includes the paper's")
+    assert judged(over_boards(-0.3, -0.1), ours="paired.x.mse_xy_mm2", rule="gain").verdict == YES
+    assert judged(over_boards(0.1, 0.3), ours="paired.x.mse_xy_mm2", rule="gain").verdict == NO
 
 
 @pytest.mark.parametrize(
-    ("low", "high", "said", "more"),
-    [
-        (3.0, 8.0, YES, "lies beyond half of the paper's difference"),
-        (2.0, 8.0, INCONCLUSIVE, "includes half"),
-        (-1.0, 2.9, NO, "equivalent to none within half of the paper's"),
-        (-4.0, 2.9, NO, "lies short of half of the paper's difference, 2.98"),
-    ],
+    ("low", "high", "verdict", "equivalent"),
+    [(3.0, 8.0, YES, False), (2.0, 8.0, INCONCLUSIVE, False), (-1.0, 2.9, NO, True), (-4.0, 2.9, NO, False)],
 )
-def test_a_sizeable_gain_is_half_of_the_papers_and_one_below_that_may_be_equivalent_to_none(low, high, said, more):
-    assert word(over_boards(low, high), 5.97, rule="sizeable") == said
-    found = sentence(over_boards(low, high), 5.97, rule="sizeable")
-    assert more in found
-    assert ("equivalent" in found) == (max(-low, high) < 5.97 / 2)
-
-
-def with_p(p: float, mean: float = 1.0) -> dict:
-    """A difference over boards whose two-sided p-value is p."""
-    se = mean / t.isf(p / 2, 5)
-    return {"mean": mean, "sd": se * 6**0.5, "n": 6, "ci95": [mean - 2.571 * se, mean + 2.571 * se], "se": se, "df": 5}
-
-
-def test_a_family_of_claims_is_judged_by_holm_and_other_rows_are_not():
-    rows = [
-        row(
-            id=f"r{i}",
-            what="claim: x",
-            paper=None,
-            says="claimed",
-            ours=f"d{i}.accuracy_pct",
-            rule="gain",
-            family=i < 3,
-        )
-        for i in range(4)
-    ]
-    numbers = all_experiments() | {f"d{i}": {"accuracy_pct": with_p(p)} for i, p in enumerate((0.01, 0.03, 0.04, 0.04))}
-    table = checklist(numbers, rows)
-    # Of three, 0.01 becomes 0.03; 0.03 and 0.04 become 0.06: no longer significant, though their intervals exclude 0.
-    assert table["verdict"].tolist() == [YES, INCONCLUSIVE, INCONCLUSIVE, YES]
-    assert table["difference"].tolist()[1].endswith("p = 0.06, adjusted for 3 claims")
-    assert "adjusted" not in table["difference"].tolist()[3]
-
-
-def test_claims_stand_in_a_table_of_their_own_if_they_are_judged():
-    claims = claims_table(checklist(all_experiments()))
-    assert len(claims) > 15
-    assert not claims["claim"].str.startswith("claim").any()
-    assert "Holm" in claims.attrs["meaning"]
-    family = {one.id for one in ROWS if one.family}
-    assert len(family) == 12
-    assert all(name.endswith("accuracy_pct") or name.startswith(("pokes", "sensors")) for name in family)
+def test_a_sizeable_gain_is_half_of_the_papers_and_one_below_that_may_be_equivalent_to_none(
+    low, high, verdict, equivalent
+):
+    found = judged(over_boards(low, high), 5.97, rule="sizeable")
+    assert (found.verdict, found.criterion) == (verdict, "gain above 2.98, half of the paper's")
+    assert (EQUIVALENT in found.notes) == equivalent == (max(-low, high) < 5.97 / 2)
 
 
 def test_a_score_on_repeats_of_one_skin_is_one_board_however_many_repeats():
-    assert word(stat(96.3, 0.1, 5), 90.0, rule="at_least") == FEW_BOARDS
+    assert judged(stat(96.3, 0.1, 5), 90.0, rule="at_least").verdict == FEW_BOARDS
 
 
 def test_what_is_to_hold_at_every_number_of_skins_fails_where_one_fails():
     sweep = [
         {"skins_n": n, "accuracy_pct": over_boards(*ends)} for n, ends in ((1, (1, 2)), (6, (-1, 2)), (15, (2, 3)))
     ]
-    assert word(sweep, rule="each") == INCONCLUSIVE
-    assert sentence(sweep, None, rule="each") == "supported with 1, 15; undecided with 6 training skins"
+    found = judged(sweep, rule="each")
+    assert (found.verdict, found.met) == (INCONCLUSIVE, "yes")
+    assert found.notes == ("1 skins: supported, 6 skins: undecided, 15 skins: supported",)
     sweep[0]["accuracy_pct"] = over_boards(-2, -1)
-    assert word(sweep, rule="each") == NO
+    assert judged(sweep, rule="each").verdict == NO
 
 
 def test_a_calibration_target_is_no_evidence_where_it_was_simulated():
-    one = {"ours": "table2.single.accuracy_pct", "rule": "target"}
-    assert sentence(stat(25.0), (25.0, 10.0), **one).startswith("a calibration target of the simulated spreads")
-    assert sentence(stat(25.0), (25.0, 10.0), simulated=False, **one) == "the same"
+    target = {"ours": "table2.single.accuracy_pct", "rule": "target"}
+    assert judged(stat(25.0), (25.0, 10.0), **target).notes == (TARGET,)
+    assert judged(stat(25.0), (25.0, 10.0), simulated=False, **target).notes == ()
     assert {one.id for one in ROWS if one.rule == "target"} == {
         f"table-2-single-{metric}" for metric in ("accuracy_pct", "mse_xy_mm2", "mse_f_N2")
     }
@@ -224,85 +192,108 @@ def test_every_claim_of_the_paper_has_a_verdict_in_the_one_vocabulary():
     assert set(table["verdict"]) <= {YES, NO, INCONCLUSIVE, FEW_BOARDS, "–"}
 
 
-def test_a_sweep_that_does_not_go_as_far_as_a_claim_says_so():
+def test_a_sweep_that_does_not_go_as_far_as_a_claim_is_named_so():
     numbers = all_experiments()
     del numbers["contrasts"]["pokes_plateau"]
-    assert difference(numbers, "plateau") == "not reached in this scene"
+    assert line(numbers, "plateau")["note"] == NOT_REACHED
     del numbers["sweep_pokes"]
-    assert difference(numbers, "plateau") == "not asked in this scene"
+    assert line(numbers, "plateau")["note"] == NOT_RUN
 
 
 def test_one_training_skin_is_not_compared_with_pooled_networks():
     own = {"ours": "table2.multi.accuracy_pct"}
-    assert "not comparable" in sentence(stat(90.0), (85.0, 1.0), pooled=False, **own)
-    assert "points" in sentence(stat(90.0), (85.0, 1.0), pooled=True, **own)
+    assert judged(stat(90.0), (85.0, 1.0), pooled=False, **own).notes == (ONE_SKIN,)
+    assert judged(stat(90.0), (85.0, 1.0), **own).met == "no"
 
 
 def test_a_reason_is_given_only_where_ours_differs():
     numbers = all_experiments()
     mine = [row(ours="single_random.accuracy_pct", why="Because.")]
-    assert checklist(numbers, mine)["difference"][0].endswith("Because.")
+    assert checklist(numbers, mine)["note"][0] == "Because."
     numbers["single_random"]["accuracy_pct"] = stat(99.5)
-    assert "Because" not in checklist(numbers, mine)["difference"][0]
+    assert checklist(numbers, mine)["note"][0] == "–"
 
 
-def difference(numbers: dict, name: str) -> str:
-    (one,) = [one for one in ROWS if one.id == name]
-    return checklist(numbers, [one])["difference"][0]
-
-
-def test_what_is_seen_earlier_than_in_the_paper_is_said_first():
+def test_where_ours_did_not_go_as_far_as_the_paper_the_note_begins_so():
     numbers = all_experiments()
-    assert difference(numbers, "figure-5b") == "after 45,000 contacts; ours is above 0"
+    assert line(numbers, "figure-5b")["note"] == "45,000 contacts, paper 45,000"
     numbers["drift"]["late"]["contacts_n"] = 18_000
-    assert difference(numbers, "figure-5b") == "not reached: ours after 18,000 contacts; ours is above 0"
+    assert line(numbers, "figure-5b")["note"] == "not reached: 18,000 contacts, paper 45,000"
     numbers["drift"]["late"]["bias_N"] = -0.1
-    assert difference(numbers, "figure-5b").startswith(
-        "not reached: ours after 18,000 contacts; ours is not above 0. The paper explains"
-    )
+    found = line(numbers, "figure-5b")
+    assert found["met"] == "no"
+    assert found["note"].startswith("not reached: 18,000 contacts, paper 45,000. The paper explains")
     del numbers["drift"]
-    assert difference(numbers, "figure-5b") == "not asked in this scene"
+    assert line(numbers, "figure-5b")["note"] == NOT_RUN
 
 
 @pytest.mark.parametrize("name", ["rate", "temporal-resolution", "logs", "sleeve-chips", "sleeve-rate"])
 def test_settings_of_a_simulated_rig_are_no_agreement_with_the_paper(name):
-    said = difference(all_experiments("simulated"), name)
-    assert said == "a setting of this scene, not a result"
-    assert difference(all_experiments("recorded"), name) in ("the same", "–")
+    assert line(all_experiments("simulated"), name)["note"] == SETTING
+    assert line(all_experiments("recorded"), name)["met"] in ("yes", "–")
 
 
 def test_the_flexible_bias_is_judged_after_adaptation():
     numbers = all_experiments()
     numbers["flexible"]["bias_f_N"] = {"before": stat(1.0), "after": stat(-0.2)}
-    assert difference(numbers, "flexible-bias").startswith("ours is not above 0")
+    assert line(numbers, "flexible-bias")["met"] == "no"
 
 
 def test_reasons_about_simulation_are_given_of_simulated_scenes_alone():
     simulation = ("simulat", "assumed", "a possible reason")
     for source in ("simulated", "recorded"):
-        found = checklist(all_experiments(source))["difference"]
+        found = checklist(all_experiments(source))["note"]
         shown = [one for one in ROWS if one.only in (None, source)]
-        said = found[[one.rule not in ("input", "target") for one in shown]].str.contains("|".join(simulation))
-        assert said.any() == (source == "simulated")
+        named = found[[one.rule not in ("input", "target") for one in shown]].str.contains("|".join(simulation))
+        assert named.any() == (source == "simulated")
     assert not any(word in one.why for one in ROWS for word in simulation)
 
 
 def test_a_reason_names_numbers_of_the_paper_and_of_ours():
-    said = difference(all_experiments(), "flexible-accuracy_pct")
-    assert "80 % nearer to the skin, ours 45 %" in said
+    assert "80 % nearer to the skin, ours 45 %" in line(all_experiments(), "flexible-accuracy_pct")["note"]
 
 
-def test_the_papers_number_is_held_against_our_interval_over_boards():
-    inside = "within 10 % of the paper's; our 95 % interval includes the paper's"
-    assert sentence(over_boards(74.0, 86.0), 85.0).endswith(inside)
-    assert sentence(over_boards(76.0, 84.0), (85.0, 9.0)).endswith("our 95 % interval excludes the paper's")
-    assert "our 95 %" not in sentence(stat(80.0, 6.0, 5), 85.0)  # repeats are no boards
-    assert "our 95 %" not in sentence({"mean": 80.0, "n": 1}, 85.0)
+@pytest.mark.parametrize(
+    ("ours", "within"),
+    [
+        (over_boards(95.0, 99.7), "yes"), (over_boards(95.0, 99.5), "no"), (stat(99.0, 6.0, 5), "–"),  # no boards
+        ({"mean": 99.0, "n": 1}, "–"),
+    ],
+)  # fmt: skip
+def test_the_papers_number_is_compared_with_our_interval_over_boards(ours, within):
+    numbers = all_experiments() | {"a": {"accuracy_pct": ours}}
+    assert checklist(numbers, [row(ours="a.accuracy_pct")])["paper in our interval"][0] == within
 
 
-def test_a_misspelt_constant_is_one_sentence():
+def with_p(p: float, mean: float = 1.0) -> dict:
+    """A difference over boards whose two-sided p-value is p."""
+    se = mean / t.isf(p / 2, 5)
+    return {"mean": mean, "sd": se * 6**0.5, "n": 6, "ci95": [mean - 2.571 * se, mean + 2.571 * se], "se": se, "df": 5}
+
+
+def test_a_family_of_claims_is_judged_by_holm_and_other_rows_are_not():
+    claim = {"what": "claim: x", "paper": None, "says": "claimed", "rule": "gain"}
+    rows = [row(id=f"r{i}", ours=f"d{i}.accuracy_pct", family=i < 3, **claim) for i in range(4)]
+    numbers = all_experiments() | {f"d{i}": {"accuracy_pct": with_p(p)} for i, p in enumerate((0.01, 0.03, 0.04, 0.04))}
+    table = checklist(numbers, rows)
+    # Of three, 0.01 becomes 0.03; 0.03 and 0.04 become 0.06: no longer significant, though their intervals exclude 0.
+    assert table["verdict"].tolist() == [YES, INCONCLUSIVE, INCONCLUSIVE, YES]
+    assert table["p (Holm)"].tolist() == ["0.03", "0.06", "0.06", "–"]
+
+
+def test_claims_stand_in_a_table_of_their_own_if_they_are_judged():
+    claims = claims_table(checklist(all_experiments()))
+    assert len(claims) > 15
+    assert not claims["claim"].str.startswith("claim").any()
+    assert "Holm" in claims.attrs["meaning"]
+    family = {one.id for one in ROWS if one.family}
+    assert len(family) == 12
+    assert all(name.endswith("accuracy_pct") or name.startswith(("pokes", "sensors")) for name in family)
+
+
+def test_a_misspelt_constant_is_named():
     with pytest.raises(
-        SchemaError, match="must be a constant of reporting.paper, or a path in numbers.json; got SHEARS.x"
+        SchemaError, match="must be a constant of pipeline.report.paper, or a path in numbers.json; got SHEARS.x"
     ):
         look_up({}, "SHEARS.x")
 
@@ -314,12 +305,12 @@ def test_a_row_of_a_list_is_picked_by_its_value():
 
 
 def test_a_claim_of_several_parts_is_denied_by_one_part_with_bonferronis_p_and_affirmed_by_the_largest():
-    row = SimpleNamespace(rule="better", ours="x.accuracy_pct")
+    claim = row(rule="each", ours="x.accuracy_pct")
 
     def parts(*means: float) -> list[dict]:
         return [{"accuracy_pct": {"mean": mean, "se": se, "df": 5}} for mean, se in zip(means, (0.5, 1.0), strict=True)]
 
-    alone = [p_of(row, None, one["accuracy_pct"]) for one in parts(-5.0, 0.2)]
-    assert p_of(row, None, parts(-5.0, 0.2)) == pytest.approx(2 * alone[0])  # not the 0.85 of the other
-    assert p_of(row, None, parts(5.0, 0.2)) == pytest.approx(alone[1])
-    assert p_of(row, None, []) is None
+    alone = [p_of(claim, None, one["accuracy_pct"]) for one in parts(-5.0, 0.2)]
+    assert p_of(claim, None, parts(-5.0, 0.2)) == pytest.approx(2 * alone[0])  # not the 0.85 of the other
+    assert p_of(claim, None, parts(5.0, 0.2)) == pytest.approx(alone[1])
+    assert p_of(claim, None, []) is None

@@ -1,13 +1,11 @@
-"""Tables of learning on many skins show the numbers they were given, and say where the paper's order does not hold."""
+"""Tables of trainings on many skins, and the blocks of README and docs that show them."""
 
 from itertools import pairwise
 
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.report.figures import learning_costs
-from pipeline.report.formatting import CONTROL, paired_boards_table, paired_table, to_markdown
-from pipeline.report.numbers import timed_learning
+from pipeline.report.formatting import CONTROL, to_markdown
 from pipeline.report.paper import TABLE_2
 from pipeline.report.readme import blocks_of
 from pipeline.report.tables import (
@@ -16,6 +14,8 @@ from pipeline.report.tables import (
     chosen_table,
     labels_table,
     make_tables,
+    paired_boards_table,
+    paired_table,
     sweep_pokes_table,
     sweep_sensors_table,
 )
@@ -80,10 +80,9 @@ def test_paired_differences_stand_beside_the_difference_of_the_papers_means():
 
 def test_with_one_training_skin_nothing_is_called_multi_sensor_and_no_pooled_number_stands_beside_it():
     numbers = NUMBERS | {"lobo": {"by_board": ALONE}, "paired": PAIRED[1:]}
-    for table in (paired_table(numbers, "recorded"),):
-        text = to_markdown(table)
-        assert "multi-sensor" not in text
-        assert "one training skin + triplet" in text
+    text = to_markdown(paired_table(numbers, "recorded"))
+    assert "multi-sensor" not in text
+    assert "one training skin + triplet" in text
     assert set(paired_table(numbers, "recorded")["accuracy, % (paper: difference of means)"]) == {"–"}
 
 
@@ -138,8 +137,8 @@ def test_labelled_pokes_show_both_ways_of_scoring_places():
         "MSE_xy, mm²": "0.5 ± 1", "MSE_F, N²": "–", "R² of F": "–", "accuracy, % (registered)": "42 ± 1",
         "MSE_xy, mm² (registered)": "0.2 ± 1", "n": "6",
     }  # fmt: skip
-    sure = one | {"as_labelled": row(30.0) | {"coverage_pct": {"mean": 91.0, "n": 2}}}
-    (_, line) = labels_table([one, sure], "recorded").to_dict("records")
+    uncertain = one | {"as_labelled": row(30.0) | {"coverage_pct": {"mean": 91.0, "n": 2}}}
+    (_, line) = labels_table([one, uncertain], "recorded").to_dict("records")
     assert (line["in 90 % intervals, %"], line["half of them, mm (median)"]) == ("91", "–")
 
 
@@ -158,28 +157,6 @@ def test_all_candidates_are_listed_and_the_chosen_one_is_marked_with_what_decide
     arms = {"triplet": {"recipe_name": "fast", "by": "MSE_xy", "candidates": candidates}}
     table = chosen_table(arms, "simulated")
     assert dict(zip(table["candidate"], table["chosen"], strict=True)) == {"slow": "", "fast": "yes, by MSE_xy"}
-
-
-def test_what_was_not_timed_here_has_a_dash():
-    timed = {"method": "ridge", "inputs": "raw", "train_s": 0.0123, "inference_us": 4.56, **row(30.0)}
-    untimed = {name: value for name, value in timed.items() if name not in ("train_s", "inference_us")}
-    rows = [{"pokes_n": 390, **row(87.0)}, {"pokes_n": 65, "seconds": 1.5, **row(85.0)}]
-    tables = learning_costs({"learning": [timed, untimed], "adaptation": rows}, "simulated")
-    assert tables["learning"]["training, s"].tolist() == ["0.0123", "–"]
-    assert tables["learning"]["one reading, µs"].tolist() == ["4.56", "–"]
-    assert tables["adaptation"]["adaptation, s"].tolist() == ["1.5", "–"]
-
-
-def test_reference_methods_have_their_errors_beside_their_seconds():
-    methods = [
-        {"method": method, "pokes": pokes, "labels_n": 0, "as_labelled": row(accuracy_pct)}
-        for method, pokes, accuracy_pct in (("map", "none", 20.0), ("map", "its own", 40.0), ("ridge", "its own", 30.0))
-    ]
-    took = [{"name": f"map.b{i}-draw0", "train_s": 2.0 + i, "one_reading_s": 5e-5} for i in range(3)]
-    found = timed_learning({"rivals": {"methods": methods}}, {"reference_methods": took})
-    (line,) = learning_costs(found, "recorded")["rivals_costs"].to_dict("records")
-    assert (line["method"], line["accuracy, %"]) == ("map", "40 ± 1")
-    assert (line["until ready, s"], line["one reading, µs"]) == ("3", "50")
 
 
 def everything() -> dict:
@@ -253,11 +230,13 @@ def test_the_readme_takes_what_a_scene_costs_from_its_provenance():
     described = {"grid": {"source": "simulated", "over_skins": {}}}
     numbers = everything() | {"described": described, "trainings": {}}
     numbers["provenance"] |= {"seconds": 5400.0, "scene": "paper"}
-    assert "`paper` 90 min" in blocks_of([numbers], [], {}, None)["costs"]
+    row = next(line for line in blocks_of([numbers], [], {}, None)["costs"].splitlines() if "`paper`" in line)
+    assert [cell.strip() for cell in row.split("|")[1:5]] == ["`paper`", "90", "0", "0"]
 
 
 def test_a_scene_of_earlier_code_is_called_stale_and_none_of_its_numbers_is_shown():
     numbers = everything() | {"described": {"grid": {"source": "simulated", "over_skins": {}}}}
     blocks = blocks_of([numbers], [], {}, None)
     assert "stale" in blocks["results"]
-    assert "|" not in blocks["results"] + blocks["costs"]
+    assert "|" not in blocks["results"]
+    assert "`x`" not in blocks["costs"]

@@ -1,28 +1,27 @@
 import re
 from collections import Counter
-from html import escape
 from html.parser import HTMLParser
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
-from pipeline.report import judging
-from pipeline.report.checklist import checklist
-from pipeline.report.headline import answer
+from pipeline.report.checklist import ONE_SKIN, checklist
 from pipeline.report.numbers import split
 from pipeline.report.page import (
-    FINDINGS_N,
+    BESIDE_N,
     LEGIBLE_PX,
+    SUMMARY,
     about,
     arrange,
-    findings,
+    beside_paper,
+    index,
     lay_out,
     measure,
     page,
     read_sections,
     run_page,
-    together,
+    unbroken,
 )
 from pipeline.report.tables import make_tables
 from pipeline.scenes import ANALYSES
@@ -122,10 +121,9 @@ def test_every_figure_is_a_document_on_a_white_card_with_words_for_it_and_else_a
     assert [attributes.get("class") for attributes, _ in read.all("figure")].count("wide") == 1
 
 
-def test_figures_stand_before_findings_and_these_before_tables():
-    text = render()
-    for part in text.split("<section id=")[1:]:
-        places = [part.index(tag) for tag in ("<figure", '<ul class="findings"', "<details") if tag in part]
+def test_figures_stand_before_the_papers_results_and_these_before_tables():
+    for part in render().split("<section id=")[1:]:
+        places = [part.index(mark) for mark in ("<figure", "Beside the paper", "<details") if mark in part]
         assert places == sorted(places)
 
 
@@ -153,46 +151,39 @@ def test_a_figure_without_a_size_is_refused():
     ],
 )
 def test_a_number_and_its_interval_are_not_parted(text, kept):
-    assert together(text) == kept.replace("_", "\u00a0")
+    assert unbroken(text) == kept.replace("_", "\u00a0")
 
 
-def test_the_answer_stands_in_the_first_section_before_its_figure(read):
-    numbers = all_experiments()
-    first = render(numbers).split("<section")[1]
-    assert first.count('<p class="answer">') == 1
-    assert render(numbers).count('<p class="answer">') == 1
-    said = escape(together(answer(numbers)), quote=True)
-    assert said in first
+def test_the_summary_stands_in_the_first_section_before_its_figure():
+    text = render(all_experiments())
+    first = text.split("<section")[1]
+    assert text.count(SUMMARY) == first.count(SUMMARY) == 1
 
 
-def test_what_there_is_one_of_is_said_in_the_singular():
+def test_counts_of_the_main_captures_are_listed():
     numbers = all_experiments()
     counts = next(iter(numbers["described"].values()))["counts"]
     counts.clear()
-    counts.update(captures_n=1, readings_n=2)
-    assert about(numbers).endswith("hold 1 capture, 2 readings.")
+    counts.update(captures_n=1, readings_n=2000, indentations_n=0)
+    assert about(numbers).endswith("captures 1, readings 2,000.")
 
 
-def test_a_section_says_what_was_found_beside_the_papers_and_verdicts_come_first():
-    numbers = all_experiments()
-    table, section = checklist(numbers), next(one for one in read_sections() if one.key == "skins")
-    said = findings(section, table)
-    assert 0 < len(said) <= FINDINGS_N
-    assert all("paper: " in sentence for sentence in said)
-    judged = [sentence.endswith(".") for sentence in said]
+def test_a_section_lists_results_beside_the_papers_and_verdicts_come_first():
+    table, section = checklist(all_experiments()), next(one for one in read_sections() if one.key == "skins")
+    shown = beside_paper(section, table)
+    assert 0 < len(shown.rows) <= BESIDE_N
+    assert {row[0] for row in shown.rows} <= set(table["result"])
+    judged = [row[3] != "–" for row in shown.rows]
     assert judged == sorted(judged, reverse=True)
-    assert said == [sentence for sentence in said if any(row["result"] in sentence for row in table.to_dict("records"))]
 
 
-def test_a_finding_says_where_ours_did_not_look_as_far_as_the_paper():
+def test_results_that_cannot_be_compared_are_not_listed_beside_the_papers():
     section = next(one for one in read_sections() if one.key == "drift")
     row = {"result": "r", "paper": "90 %", "ours": "92 %", "verdict": "yes", "stage": "drift", "shown in": "drift"}
-    short, far = "not reached: ours after 8,000 contacts; ours is at least 90", "after 50,000 contacts"
-    (said,) = findings(section, pd.DataFrame([row | {"difference": short}]))
-    assert "(not reached: ours after 8,000 contacts). Yes." in said
-    (said,) = findings(section, pd.DataFrame([row | {"difference": far}]))
-    assert "not reached" not in said
-    assert findings(section, pd.DataFrame([row | {"difference": judging.ONE_SKIN}])) == []
+    (shown,) = beside_paper(section, pd.DataFrame([row | {"note": "not reached: 8,000 contacts"}])).rows
+    assert shown == ("r", "92 %", "90 %", "yes", "not reached: 8,000 contacts")
+    assert beside_paper(section, pd.DataFrame([row | {"note": ONE_SKIN}])) is None
+    assert beside_paper(section, pd.DataFrame([row | {"note": "–", "ours": "see file"}])) is None
 
 
 @pytest.mark.parametrize("source", ["simulated", "recorded"])
@@ -203,7 +194,7 @@ def test_the_badge_says_where_the_readings_come_from(source):
 
 
 def test_the_page_says_first_what_the_scene_is(read):
-    words = next(i for i, word in enumerate(read.words) if "2 captures, 1,000 readings" in word)
+    words = next(i for i, word in enumerate(read.words) if "captures 2, readings 1,000" in word)
     assert words < read.words.index(read_sections()[0].title)
 
 
@@ -287,3 +278,51 @@ def contrast(one: str, other: str) -> float:
 def colours(text: str) -> list[list[str]]:
     blocks = re.findall(r":root \{(.*?)\}", text, re.DOTALL)
     return [[word for pair in re.findall(r"--(\w+): (#\w{6})", block) for word in pair] for block in blocks]
+
+
+HEADLINE_SVG = '<svg width="600.0pt" height="200.0pt"><text style="font-size: 9px">a</text></svg>'
+
+
+def of_scene(scene: str, source: str) -> dict:
+    found = all_experiments(source) | {"trainings": {}}
+    return found | {"provenance": found["provenance"] | {"scene": scene}}
+
+
+def test_recorded_scenes_come_first_and_no_scene_stands_under_the_other_word():
+    text = index([of_scene("here", "simulated"), of_scene("there", "recorded")], {"here": HEADLINE_SVG})
+    recorded, simulated = text.split('<section id="simulated">')
+    assert 'href="there/index.html"' in recorded
+    assert 'href="here/index.html"' in simulated
+    assert "there/" not in simulated
+    assert "here/" not in recorded.replace("there/", "")
+    assert "there/figures" not in text  # no file, no image
+
+
+def test_each_scene_says_how_it_does_on_boards_never_seen_or_that_it_held_out_none():
+    # "a" comes before "here", and held out no board.
+    alone = {name: value for name, value in of_scene("a", "simulated").items() if name != "table2"}
+    both = index([alone, of_scene("here", "simulated")], {})
+    assert both.index("Scene here") < both.index("Scene a")
+    one_board = {name: value for name, value in of_scene("there", "recorded").items() if name != "table2"}
+    text = index([of_scene("here", "simulated"), one_board], {})
+    recorded, simulated = text.split('<section id="simulated">')
+    assert f"{SUMMARY}</span>" in simulated
+    assert "No board was held out" in recorded
+
+
+def test_a_scene_of_earlier_code_is_named_without_a_figure():
+    old = of_scene("old", "simulated")
+    old.pop("trainings")
+    text = index([old], {"old": HEADLINE_SVG})
+    assert "Out of date" in text
+    assert "<figure" not in text
+    assert "<table" not in text
+
+
+def test_the_page_needs_nothing_but_the_pages_beside_it():
+    text = index([of_scene("here", "simulated")], {"here": HEADLINE_SVG})
+    addresses = re.findall(r'(?:src|href|data)="([^"]+)"', text)
+    assert addresses
+    assert all(address.startswith("here/") for address in addresses)
+    assert "<script" not in text
+    assert "url(" not in text

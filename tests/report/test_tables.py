@@ -1,17 +1,37 @@
+"""Tables: numbers as they were given beside the paper's, in its order, with their source."""
+
 import json
 
 import pyarrow as pa
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from pipeline.report.formatting import OF_PAPER, rounded, show, show_digits, to_markdown
+from pipeline.report.figures import HEADLINE, headline_figures
+from pipeline.report.formatting import CONTROL, OF_PAPER, models, rounded, show, show_digits, to_markdown
 from pipeline.report.numbers import add_up, compose, foretold, lost_by_protocol
 from pipeline.report.paper import TABLE_2
 from pipeline.report.readme import fill
-from pipeline.report.table1 import NOT_GIVEN, OURS
-from pipeline.report.tables import make_tables
+from pipeline.report.tables import (
+    LOCALISATION,
+    NOT_GIVEN,
+    OURS,
+    make_tables,
+    measured,
+    read_table1,
+    skins_table,
+    stability_table,
+    summary_table,
+    table1,
+    verification_table,
+)
 from pipeline.statistics import tidy
-from reskin.errors import SchemaError
+from pipeline.training.universal import METHODS, WAYS
+from reskin.errors import ParamsError, SchemaError
+from reskin.io import read_json
 from tests.report import cards
+from tests.report.synthetic import all_experiments, over_boards, stat, texts_of
+from tests.stages.checkout import ROOT
 
 
 def card(experiment: str, fold: str, accuracy_pct: float, recipe: str = "paper") -> dict:
@@ -51,7 +71,7 @@ def test_pooled_numbers_are_over_boards_and_single_ones_over_pairs_of_skins():
     assert table2["single"]["accuracy_pct"] == pairs
 
 
-def test_what_tells_a_place_before_its_touch_stands_below_the_split_that_it_was_scored_on():
+def test_places_predicted_without_any_change_of_field_stand_below_the_split_that_it_was_scored_on():
     columns = {"question": ["single_temporal"] * 4, "fold": ["s0", "s0", "s1", "s1"], "told_by": ["noload", "scan"] * 2}
     told = pa.table(columns | {"accuracy_pct": [10.0, 99.0, 20.0, 97.0], "mse_xy_mm2": [9.0, 0.1, 8.0, 0.3]})
     shown = numbers([card("single_temporal", "s0", 95.0)])
@@ -59,7 +79,7 @@ def test_what_tells_a_place_before_its_touch_stands_below_the_split_that_it_was_
     assert table["accuracy, % (ours)"].str.partition(" ")[0].tolist() == ["95", "15", "98"]
     assert ["no-load" in row or "number" in row for row in table["model"]] == [False, True, True]
     assert set(table["MSE_F, N² (ours)"][1:]) == {"–"}
-    assert "before the touch" in table.attrs["meaning"]
+    assert "without any change of field" in table.attrs["meaning"]
     assert len(make_tables(shown)["single_sensor"]) == 1
 
 
@@ -178,3 +198,170 @@ def test_generated_blocks_replace_only_what_is_between_their_marks():
 
 def test_all_metrics_have_a_column():
     assert {metric for row in TABLE_2.values() for metric in row} == set(OF_PAPER)
+
+
+def test_the_summary_holds_ours_and_the_papers_means_and_the_control():
+    numbers = all_experiments()
+    table = summary_table(numbers).set_index("boards never seen")
+    assert len(table) == len(numbers["table2"]) + 1
+    for name, model in models(numbers).items():
+        if name in numbers["table2"]:
+            title = model.title.replace("Multi-sensor with triplet loss, adapted", "The same, adapted")
+            for metric, column in (("accuracy_pct", "accuracy, %"), ("mse_f_N2", "MSE_F, N²")):
+                assert table.loc[title, f"{column} (paper)"].endswith(f"({TABLE_2[name][metric][0]:.3g})")
+    assert "(" not in table.loc[CONTROL, "accuracy, % (paper)"]
+    assert "R² of F" in table
+
+
+def test_the_universal_model_without_labels_and_with_most_pokes_stands_first():
+    numbers = all_experiments()
+    rows = [
+        {"way": way, "pokes_n": pokes_n, "labels_n": labels_n, "accuracy_pct": over_boards(*accuracy), "n": 2}
+        | {metric: numbers["table2"]["multi"][metric] for metric in ("mse_xy_mm2", "mse_f_N2")}
+        for way, pokes_n, labels_n, accuracy in (
+            ("universal", 16, 0, (70.0, 72.0)), ("universal", 65, 0, (90.0, 92.0)), ("universal", 65, 5, (95.0, 97.0)),
+            ("map", 65, 0, (50.0, 52.0)),
+        )
+    ]  # fmt: skip
+    numbers |= {"population": {"told": rows}}
+    first = summary_table(numbers).iloc[0]
+    assert "65 unlabelled pokes" in first["boards never seen"]
+    assert first["accuracy, % (paper)"] == "91 [90, 92]"
+    assert "65 unlabelled" in texts_of(headline_figures(numbers, "simulated")[HEADLINE])
+
+
+def test_the_summary_with_labels_is_of_the_calibrated_models_and_the_first_method():
+    numbers = read_json(ROOT / "reports/lab/numbers.json")
+    table, usual = summary_table(numbers), numbers["labels"][0]["method"]
+    lines = table.set_index("boards never seen").to_dict("index")
+    assert list(lines) == [*(f"{METHODS[1]}{way}" for way in WAYS.values()), usual]
+    for row in numbers["labels"]:
+        if row["method"] in lines and row["labels_n"] in (0, 40):
+            shown = lines[row["method"]][f"within 1 mm, %, {row['labels_n']} labels"]
+            assert shown == show(row["as_labelled"]["accuracy_pct"])
+
+
+def test_without_boards_held_out_there_is_no_summary():
+    assert summary_table({name: own for name, own in all_experiments().items() if name != "table2"}) is None
+
+
+TABLE_1 = read_table1()
+PROPERTIES = (*TABLE_1.rows, LOCALISATION)
+
+
+def test_the_columns_are_the_papers_and_each_has_a_source_with_its_year():
+    assert list(TABLE_1.columns) == ["ReSkin", "DIGIT", "GelSlim", "BioTac", "RSkin"]
+    for name, year in zip(TABLE_1.columns, (2021, 2020, 2018, 2019, 2013), strict=True):
+        assert f"{year}" in TABLE_1.columns[name]
+
+
+def test_as_the_caption_says_only_reskin_meets_every_requirement():
+    asked = [name for name in TABLE_1.rows if name not in ("Type", "Frequency")]
+    met = {column: all(TABLE_1.rows[name][i] == "yes" for name in asked) for i, column in enumerate(TABLE_1.columns)}
+    assert [column for column, all_met in met.items() if all_met] == ["ReSkin"]
+    assert {cell for name in asked for cell in TABLE_1.rows[name]} == {"yes", "no", "?"}
+
+
+@given(st.dictionaries(st.sampled_from(PROPERTIES), st.text(max_size=9)))
+def test_the_papers_cells_are_never_overwritten(measured):
+    table = table1(TABLE_1, measured)
+    for (name, cells), (_, row) in zip(TABLE_1.rows.items(), table.iterrows(), strict=False):
+        assert [row["property"], *(row[column] for column in TABLE_1.columns)] == [name, *cells]
+        assert row[OURS] == measured.get(name, NOT_GIVEN)
+    assert set(table.iloc[-1][list(TABLE_1.columns)]) == {NOT_GIVEN}
+    assert table.iloc[-1]["property"] == LOCALISATION
+
+
+def test_what_was_set_in_a_simulated_rig_is_not_called_measured():
+    for source, rate, area in (
+        ("simulated", "400 Hz, a setting read back from the captures, simulated", "mm, a setting, simulated"),
+        ("recorded", "400 Hz, recorded", "mm, recorded"),
+    ):
+        numbers = all_experiments(source)
+        numbers["described"]["grid"]["over_skins"]["rate_hz"] = stat(400.0)
+        numbers["sleeve"]["area_mm"] = [50.8, 101.6]
+        cells = measured(numbers)
+        assert cells["Frequency"] == rate
+        assert cells["Area coverage"] == f"40 chips under 50.8 x 101.6 {area}"
+
+
+def test_every_source_is_named_below_the_table():
+    meaning = table1(TABLE_1, {}).attrs["meaning"]
+    assert all(source in meaning for source in TABLE_1.columns.values())
+
+
+def test_a_measured_row_that_the_table_lacks_is_refused():
+    with pytest.raises(ParamsError, match="Weight"):
+        table1(TABLE_1, {"Weight": "5 g"})
+
+
+@pytest.mark.parametrize(("rows", "fault"), [("{Type: [Magnetic]}", "2 cells, not 1"), ("{Type: [1, 2]}", "string")])
+def test_a_broken_file_is_refused(tmp_path, rows, fault):
+    file = tmp_path / "table1.yaml"
+    file.write_text(f"columns: {{a: x, b: y}}\nrows: {rows}\n")
+    with pytest.raises(ParamsError, match=fault):
+        read_table1(file)
+
+
+def described(source, **means):
+    return {
+        "source": source,
+        "over_skins": {name: {"mean": m, "least": m / 2, "most": 2 * m, "n": 3} for name, m in means.items()},
+    }
+
+
+SIMULATED = described("simulated", noise_xy_uT=3.3, force_max_N=40.0, step_z_uT=0.3227)
+RECORDED = described("recorded", noise_xy_uT=3.1, force_max_N=4.0)
+
+
+def test_each_quantity_shows_mean_range_and_number_of_skins():
+    table = skins_table({"quick (simulated)": SIMULATED})
+    assert table["quick (simulated)"].tolist() == [
+        "3.3 [1.65 … 6.6] (3)",
+        "0.323 [0.161 … 0.645] (3)",
+        "40 [20 … 80] (3)",
+    ]
+    assert "simulated / nearest recorded" not in table
+
+
+def test_simulated_and_recorded_skins_are_compared_row_by_row():
+    table = skins_table({"quick (simulated)": SIMULATED, "lab (recorded)": RECORDED})
+    ratios = dict(zip(table["quantity"], table["simulated / nearest recorded"], strict=True))
+    assert ratios["noise of one reading, x and y, µT"] == "1.1"
+    assert ratios["force, largest, N"] == "10"
+    assert ratios["step of a chip, z, µT"] == "–"
+
+
+CHECK = {
+    "subject": "chip", "law": "conversion", "against": "data sheet", "error": 3.33e-05, "unit": "uT",
+    "tolerance": 5e-5, "reason": "four decimals", "holds": True,
+}  # fmt: skip
+CASE = {
+    "area": "wire", "case": "truncated", "should": "counted", "happened": "59 of 60 frames back", "error": 1.0,
+    "limit": 1.0, "holds": True,
+}  # fmt: skip
+
+
+def test_a_check_is_a_row_with_its_error_beside_what_is_allowed():
+    table = verification_table([CHECK, CHECK | {"unit": "1", "error": 1.5e-15}], "simulated")
+    assert table["error"].tolist() == ["3.3e-05 uT", "1.5e-15"]
+    assert table["allowed"].tolist() == ["5e-05 uT", "5e-05"]
+    assert table["why so much"].tolist() == ["four decimals"] * 2
+
+
+def test_a_case_without_a_number_has_a_dash():
+    table = stability_table([CASE, CASE | {"error": None, "limit": None}], "simulated")
+    assert table["error"].tolist() == ["1", "–"]
+    assert table["allowed"].tolist() == ["1", "–"]
+
+
+@pytest.mark.parametrize(("layout", "row"), [(verification_table, CHECK), (stability_table, CASE)])
+def test_a_row_that_does_not_hold_stands_out_and_each_names_its_source(layout, row):
+    table = layout([row, row | {"holds": False}], "simulated")
+    assert table["holds"].tolist() == ["yes", "NO"]
+    assert table["source"].tolist() == ["simulated"] * 2
+
+
+@pytest.mark.parametrize("layout", [verification_table, stability_table])
+def test_no_rows_make_an_empty_table(layout):
+    assert layout([], "simulated").empty

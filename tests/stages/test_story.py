@@ -20,11 +20,11 @@ import pytest
 from ruamel.yaml import YAML
 
 import reskin
-from pipeline.report.checklist import read_rows, resolve
+from pipeline.report.checklist import NOT_REACHED, NOT_RUN, read_rows, resolve
+from pipeline.report.figures import table2_figure
 from pipeline.report.formatting import to_markdown
-from pipeline.report.headline import short_table, table2_figure
-from pipeline.report.judging import NOT_REACHED
 from pipeline.report.numbers import join
+from pipeline.report.tables import table_2_summary
 from pipeline.scenes import ANALYSES
 from reskin import io
 from reskin.models.inputs import Scaler
@@ -102,7 +102,7 @@ def test_table_2_is_shown_early_with_the_numbers_of_the_page(story):
     numbers = json.loads((story / "reports/ci/numbers.json").read_text())
     assert (story / "data/table2/ci/headline.svg").read_text() == table2_figure(numbers, "simulated")
     table = (story / "data/table2/ci/table2.md").read_text()
-    assert table == to_markdown(short_table(numbers))
+    assert table == to_markdown(table_2_summary(numbers))
     assert table in (story / SAID).read_text()
 
 
@@ -178,7 +178,7 @@ def test_every_experiment_of_the_paper_is_answered_shown_and_found_by_the_checkl
     assert {"by_indentation", "by_pass"} <= set(numbers["single_sensor"])
     tables = story / "reports/ci/tables"
     assert {file.stem for file in tables.glob("*.md")} >= ASKED | {"table1", "checklist", "single_sensor"}
-    assert "not asked in this scene" not in (tables / "checklist.md").read_text()
+    assert NOT_RUN not in (tables / "checklist.md").read_text()
     page = (story / "reports/ci/index.html").read_text()
     figures = sorted((story / "reports/ci/figures").glob("*.svg"))
     assert {file.stem for file in figures} >= ASKED - {"bound", "drift", "variation", "manual"}

@@ -4,7 +4,7 @@ import copy
 
 from pipeline.experiments.compare import figures, tables
 from reskin.universal.law import Law
-from tests.report.test_work_precision import said
+from tests.report.synthetic import texts_of
 
 LAW = dict.fromkeys(Law.__dataclass_fields__, 1.0)
 OWN = {
@@ -64,7 +64,7 @@ def test_a_board_alone_whose_force_hardly_differs_is_told_without_growth_and_ano
     table = tables(numbers, "recorded")["compare"]
     assert table["within bounds"].tolist() == ["no", "yes"]
     assert set(table["growth (within 0.10)"]) == {"–"}
-    assert "simulated" in said(figures(numbers, DRAWN, "recorded")["compare_growth.svg"])
+    assert "simulated" in texts_of(figures(numbers, DRAWN, "recorded")["compare_growth.svg"])
 
 
 def test_frames_are_told_in_one_sentence_and_parameters_with_their_units():
@@ -77,10 +77,10 @@ def test_frames_are_told_in_one_sentence_and_parameters_with_their_units():
 def test_figures_name_sides_units_and_source_and_are_the_same_twice():
     drawn = figures(NUMBERS, DRAWN, "recorded")
     for word in ("recorded", "simulated", "µT", "(recorded; ×: poke; number: along z, µT)", "b1"):
-        assert word in said(drawn["compare_arrows.svg"])
-    assert "recorded: power 0.30" in said(drawn["compare_growth.svg"])
+        assert word in texts_of(drawn["compare_arrows.svg"])
+    assert "recorded: power 0.30" in texts_of(drawn["compare_growth.svg"])
     for word in ("k / μ 8.75 N/mm (used)", "any force slides it", "recorded"):
-        assert word in said(drawn["compare_touch.svg"])
+        assert word in texts_of(drawn["compare_touch.svg"])
     assert figures(NUMBERS, DRAWN, "recorded") == drawn
 
 

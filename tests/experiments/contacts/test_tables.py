@@ -1,7 +1,7 @@
 """What the report says of two contacts: every distance and detector, the false alarms, and the source of each row."""
 
 from pipeline.experiments.contacts import figures, tables
-from tests.report.test_work_precision import said
+from tests.report.synthetic import texts_of
 
 
 def stat(mean):
@@ -44,7 +44,7 @@ def test_superposition_has_a_table_in_simulated_scenes_alone():
 
 def test_the_figure_names_detectors_units_and_source_and_is_deterministic():
     drawn = figures(NUMBERS, DRAWN, "recorded")
-    words = said(drawn["contacts.svg"])
+    words = texts_of(drawn["contacts.svg"])
     for word in ("direction", "residual", "stronger contact", "distance of the two / mm", "%", "(recorded)"):
         assert word in words
     assert figures(NUMBERS, DRAWN, "recorded") == drawn

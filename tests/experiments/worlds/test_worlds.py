@@ -13,7 +13,7 @@ from pipeline.synthesis import synthesis_of
 from reskin import io
 from reskin.config import parse, read_yaml
 from reskin.metrics import METRICS
-from tests.report.test_work_precision import said
+from tests.report.synthetic import texts_of
 
 ROOT = Path(__file__).resolve().parents[3]
 HOW = Residual(sizes=(0.4,), length_mm=3.5, length_log_N=1.2, own_share=0.5)
@@ -75,7 +75,7 @@ def test_every_world_has_the_rows_of_table_2_board_by_board_and_is_shown(files, 
     assert len(table) == 8
     drawn = show.figures(numbers, {}, "simulated")["worlds.svg"]
     for words in ("What decides table 2 (simulated", "friction under the tip", "adapted"):
-        assert words in said(drawn)
+        assert words in texts_of(drawn)
 
 
 def test_worlds_differ_in_one_thing_and_press_the_same_places(files):

@@ -1,0 +1,300 @@
+"""Error against run time: tables and figures of what was timed on this machine (`reports/<scene>/runtime`)."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from math import ceil
+from textwrap import fill
+from typing import Any
+
+import pandas as pd
+
+from pipeline.experiments.runtime import CANDIDATES, ERROR_MAX, REFERENCE
+from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
+from pipeline.report.formatting import scored, tabulate, to_markdown
+
+TRADE_OFFS = {
+    "training": ("train_s", "median time of a training / s"),
+    "inference": ("inference_us", "median time of one reading / µs"),
+}
+STUDIES = ("quadratures", "integrators")
+COMPUTED = (
+    "Computed: what the stage cost when its results were computed, its trainings added up as if one ran after another "
+    "(two run side by side, so that less time passes). Last run: the time of the last run, which reuses trainings that "
+    "were finished before."
+)
+MARGIN = 1.6  # factor beyond the outermost points on a logarithmic axis
+LOWEST = 1e-16  # rounding: no error is drawn below it, because the axis is logarithmic
+COLUMNS_N = 3
+CAPTION_LETTERS = 38  # in the width of a panel, and in that of the legend
+
+Row = Mapping[str, Any]
+Rows = Sequence[Row]
+
+
+def cost_pages(runtime: Row, source: str) -> dict[str, str]:
+    """Draw and tabulate errors against costs: text by file name; no figure where nothing was timed here."""
+    texts = {f"{name}.md": to_markdown(table) for name, table in cost_tables(runtime, source).items()}
+    for name, (key, cost) in TRADE_OFFS.items():
+        if any(key in row for row in runtime.get("learning", [])):
+            title = f"Error on new skins against {name} time ({source})"
+            texts[f"{name}.svg"] = trade_off(runtime["learning"], key, title=title, cost=cost)
+    if any("seconds" in row for row in runtime.get("adaptation", [])):
+        texts["adaptation.svg"] = adaptation(runtime["adaptation"], source)
+    if "quadratures.md" in texts:
+        texts["quadratures.svg"] = quadratures(runtime["quadratures"], runtime["choice"], source)
+    if "integrators.md" in texts:
+        texts["integrators.svg"] = integrators(runtime["integrators"])
+    return texts
+
+
+def cost_tables(runtime: Row, source: str) -> dict[str, pd.DataFrame]:
+    """Tabulate costs by name: of stages, and beside errors those of methods, of adaptation and of timed studies."""
+    methods = [
+        {"method": row["method"], "inputs": row["inputs"], "training, s": _time(row, "train_s")}
+        | {"one reading, µs": _time(row, "inference_us"), "source": source}
+        | scored(row)
+        for row in runtime.get("learning", [])
+    ]
+    adaptations = [
+        {"pokes": str(row["pokes_n"]), "adaptation, s": _time(row, "seconds"), "source": source} | scored(row)
+        for row in sorted(runtime.get("adaptation", []), key=lambda row: row["pokes_n"])
+    ]
+    rivals = [
+        {"method": row["method"], "until ready, s": _time(row, "train_s")}
+        | {"one reading, µs": _time(row, "inference_us"), "source": source}
+        | scored(row)
+        for row in runtime.get("rivals_costs", [])
+        if "train_s" in row
+    ]
+    lines = {"learning": methods, "adaptation": adaptations, "rivals_costs": rivals}
+    tables = {name: tabulate(lines[name]) for name in lines if name in runtime}
+    timed = [name for name in STUDIES if any("median_s" in row for row in runtime.get(name, []))]
+    tables |= {name: study_table(runtime[name], source) for name in timed}
+    return tables | ({"stages": stage_costs(runtime["stages"])} if "stages" in runtime else {})
+
+
+def stage_costs(stages: Mapping[str, Mapping[str, float]]) -> pd.DataFrame:
+    """List what each stage cost when it was computed, and what its last run took."""
+    lines = [
+        {
+            "stage": name,
+            "computed, s": f"{cost['computed_s']:.1f}",
+            "last run, s": f"{cost['seconds']:.1f}",
+            "CPU of it, s": f"{cost['cpu_s']:.1f}" if "cpu_s" in cost else "–",  # older costs lack it
+            "trainings": str(cost["trainings_n"]),
+            "of them reused": str(cost["reused_n"]),
+            "peak memory of a process, MB": f"{cost['peak_process_memory_MB']:.0f}",
+        }
+        for name, cost in stages.items()
+    ]
+    return tabulate(lines, meaning=COMPUTED)
+
+
+def study_table(rows: Rows, source: str) -> pd.DataFrame:
+    """List every method and setting of a study: its work, error and time, or why it failed."""
+    lines = [
+        {
+            "study": row["study"],
+            "method": row["method"],
+            "setting": row["setting"],
+            "nodes or right-hand sides": str(row["work_n"]),
+            "error": "–" if row["error"] is None else f"{row['error']:.2g}",
+            "median ms an indentation": f"{1e3 * row['median_s']:.3g}" if "median_s" in row else "–",
+            "failed": row["failure"] or "",
+            "source": source,
+        }
+        for row in rows
+    ]
+    return tabulate(lines)
+
+
+def _time(row: Row, name: str) -> str:
+    return f"{row[name]:.3g}" if name in row else "–"
+
+
+@dataclass(frozen=True)
+class Point:
+    """A method or setting in a figure of error against cost; members of the Pareto front have a label."""
+
+    name: str
+    label: str
+    place: tuple[float, float]  # cost, error
+    look: Mapping[str, Any]
+
+
+def trade_off(rows: Rows, key: str, *, title: str, cost: str) -> str:
+    """Draw errors of methods against the cost `key`, log-log; a step joins the Pareto front, its members numbered."""
+    points = trade_off_points(rows, key)
+    members = [point for point in points if point.label]
+    with drawing(7.6, 4.2) as figure:
+        axes = _trade_off_axes(figure, points, title=title, xlabel=cost, xscale="log")
+        for point in points:
+            mark = axes.plot(*point.place, **point.look, linestyle="none")[0]
+            mark.set_label(f"{point.label}  {point.name}" if point.label else point.name)
+            _label(axes, point, (-5, -5))  # no point lies to the lower left of a member of the front
+        steps = zip(*(point.place for point in members), strict=True)
+        axes.step(*steps, where="post", color="0.4", linewidth=1, zorder=1, label="Pareto front (numbers)")
+        figure.legend(loc="outside right upper", frameon=False, fontsize=8)
+        return svg(figure)
+
+
+def trade_off_points(rows: Rows, key: str) -> list[Point]:
+    """List the timed methods, those of the Pareto front first, by cost, and numbered; a look for each method."""
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    inputs = list(dict.fromkeys(row["inputs"] for row in rows))
+    timed = sorted((row for row in rows if key in row), key=lambda row: (row[key], row["mse_xy_mm2"]["mean"]))
+    places = [(row[key], row["mse_xy_mm2"]["mean"]) for row in timed]
+    best = front(places)
+    points = []
+    for row, place in zip(timed, places, strict=True):
+        look = look_of(methods.index(row["method"]))
+        if row["inputs"] != inputs[0]:
+            look["markerfacecolor"] = "white"
+        label = str(best.index(place) + 1) if place in best else ""
+        points.append(Point(f"{row['method']} ({row['inputs']})", label, place, look))
+    return sorted(points, key=lambda point: not point.label)
+
+
+def adaptation(rows: Rows, source: str) -> str:
+    """Draw the error after adaptation against its seconds, every point with its number of pokes."""
+    timed = sorted((row for row in rows if "seconds" in row), key=lambda row: row["pokes_n"])
+    points = [Point("", str(row["pokes_n"]), (row["seconds"], row["mse_xy_mm2"]["mean"]), look_of(1)) for row in timed]
+    with drawing(7.6, 4.2) as figure:
+        title = f"Error on a new skin against adaptation time ({source})"
+        axes = _trade_off_axes(figure, points, title=title, xlabel="median time of an adaptation / s", xscale="linear")
+        for point in points:
+            axes.plot(*point.place, **point.look, linestyle="none")
+            _label(axes, point, (-6, 0))
+        figure.supxlabel("A number: unlabelled pokes of the new skin.", x=0.01, ha="left", fontsize=9)
+        return svg(figure)
+
+
+def _trade_off_axes(figure: Any, points: Sequence[Point], *, title: str, xlabel: str, xscale: str) -> Any:
+    """Make axes of error against cost with room around the points for their labels; a linear axis begins at 0."""
+    axes = figure.subplots()
+    axes.set(xscale=xscale, yscale="log", xlabel=xlabel, ylabel="MSE_xy / mm²")
+    axes.grid(alpha=0.25)
+    figure.suptitle(title, x=0.01, ha="left", fontsize=10)
+    costs, errors = zip(*(point.place for point in points), strict=True)
+    axes.set_ylim(min(errors) / MARGIN, max(errors) * MARGIN)
+    axes.set_xlim((min(costs) / MARGIN, max(costs) * MARGIN) if xscale == "log" else (0.0, 1.15 * max(costs)))
+    return axes
+
+
+def _label(axes: Any, point: Point, offset_pt: tuple[float, float]) -> None:
+    vertical = "center" if offset_pt[1] == 0 else "top"
+    where = {"xytext": offset_pt, "textcoords": "offset points", "ha": "right", "va": vertical, "fontsize": 8}
+    axes.annotate(point.label, point.place, **where)
+
+
+def look_of(i: int) -> dict[str, Any]:
+    """Return a colour and a marker for each of the first 49 methods, no two alike."""
+    marker = MARKERS[(i + i // len(COLOURS)) % len(MARKERS)]
+    return {"color": COLOURS[i % len(COLOURS)], "marker": marker, "markersize": 6}
+
+
+def front(points: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Return the Pareto front of points (cost, error), by cost."""
+    kept: list[tuple[float, float]] = []
+    for cost, error in sorted(points):
+        if not kept or error < kept[-1][1]:
+            kept.append((cost, error))
+    return kept
+
+
+def quadratures(rows: Rows, choice: Mapping[str, Any], source: str) -> str:
+    """Draw the study of quadratures, with the error limit, the cheapest rule below it and the rule in use."""
+    study = rows[0]["study"]
+    rings = {}
+    if choice["setting"]:
+        rings[f"cheapest below it: {choice['setting']}"] = (study, CANDIDATES, choice["setting"])
+    if choice["used_error"]:
+        rings[f"in use: {choice['used_setting']}"] = (study, CANDIDATES, choice["used_setting"])
+    return draw_study(
+        rows,
+        title=f"Error of dB against run time ({source})",
+        error="rms error / rms dB, worst skin and depth",
+        note="Kernel alone and magpylib: the field only, their nodes were moved before. All else: flow and field.",
+        limit=ERROR_MAX,
+        rings=rings,
+    )
+
+
+def integrators(rows: Rows) -> str:
+    """Draw the study of integrators, a panel for each ratio of the slowest relaxation to the fastest."""
+    return draw_study(rows, title="Error of the relaxed force against run time", error="rms error / rms force")
+
+
+def draw_study(
+    rows: Rows,
+    *,
+    title: str,
+    error: str,
+    note: str = "",
+    limit: float | None = None,
+    rings: Mapping[str, tuple[str, str, str]] | None = None,
+) -> str:
+    """Draw error against median time, log-log: a panel a study, a colour and a marker a method, failures below.
+
+    Lines join the Pareto front of each method. `limit` is drawn as a line, and a ring around each point of `rings`,
+    which maps a label to study, method and setting. What was not timed is left out.
+    """
+    studies = list(dict.fromkeys(row["study"] for row in rows))
+    methods = [name for name in dict.fromkeys(row["method"] for row in rows) if name != REFERENCE]
+    points_ms = {
+        (row["study"], row["method"], row["setting"]): (1e3 * row["median_s"], max(row["error"], LOWEST))
+        for row in rows
+        if row["method"] != REFERENCE and row["error"] is not None and "median_s" in row
+    }
+    columns_n = min(COLUMNS_N, len(studies))
+    lines_n = ceil(len(studies) / columns_n)
+    caption = "\n".join(fill(line, CAPTION_LETTERS * (1 + columns_n)) for line in (note, *failures(rows)))
+    with drawing(3.2 + 2.6 * columns_n, max(1.2 + 2.6 * lines_n + 0.15 * caption.count("\n"), 5.0)) as figure:
+        panels = figure.subplots(lines_n, columns_n, sharex=True, sharey=True, squeeze=False)
+        for axes, study in zip(panels.flat, studies, strict=False):
+            axes.set(xscale="log", yscale="log")
+            axes.grid(alpha=0.25)
+            axes.set_title(study, loc="left", fontsize=9)
+            for i, method in enumerate(methods):
+                points = [point for key, point in points_ms.items() if key[:2] == (study, method)]
+                if points:
+                    colour, marker = COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)]
+                    axes.plot(*zip(*front(points), strict=True), color=colour, linewidth=1)
+                    axes.plot(*zip(*points, strict=True), marker, color=colour, markersize=4.5, label=method)
+            for row in rows:
+                if (row["study"], row["method"]) == (study, REFERENCE):
+                    label = f"{REFERENCE}'s own error, at most"
+                    axes.axhline(row["error"], color="0.5", linestyle=":", linewidth=1, label=label)
+            if limit is not None:
+                axes.axhline(limit, color="0.3", linestyle="--", linewidth=1, label=f"{100 * limit:.3g} %")
+            for i, (label, key) in enumerate((rings or {}).items()):
+                if key not in points_ms:
+                    continue
+                ring = {"color": "0.2", "fillstyle": "none", "markersize": 11 + 2 * i}
+                axes.plot(*points_ms[key], "so"[i % 2], label=label, **ring)
+        for axes in panels[-1]:
+            axes.set_xlabel("median time an indentation / ms")
+        for axes in panels[:, 0]:
+            axes.set_ylabel(error)
+        labelled = [axes.get_legend_handles_labels() for axes in panels.flat[: len(studies)]]
+        handles = {label: handle for found in reversed(labelled) for handle, label in zip(*found, strict=True)}
+        names = dict.fromkeys(label for _, labels in labelled for label in labels)
+        figure.legend([handles[name] for name in names], names, loc="outside right upper", frameon=False, fontsize=8)
+        for axes in panels.flat[len(studies) :]:
+            axes.set_axis_off()
+        figure.suptitle(title, x=0.01, ha="left", fontsize=10)
+        figure.supxlabel(caption, x=0.01, ha="left", fontsize=9)
+        return svg(figure)
+
+
+def failures(rows: Rows) -> list[str]:
+    """List what failed: a line for each method and kind of failure, with the studies and settings where it did."""
+    found: dict[tuple[str, str], dict[str, list[str]]] = {}
+    for row in rows:
+        if row["failure"] is not None:
+            kind = row["failure"].split(":")[0]
+            found.setdefault((row["method"], kind), {}).setdefault(row["study"], []).append(row["setting"])
+    return [
+        f"Failed: {method}, {kind}: " + "; ".join(f"{study} ({', '.join(where)})" for study, where in places.items())
+        for (method, kind), places in found.items()
+    ]

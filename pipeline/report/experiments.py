@@ -1,0 +1,54 @@
+"""What experiments add to a report: tables and figures of their modules, sections and checklist rows of their YAML."""
+
+from collections.abc import Iterable, Mapping
+from importlib import import_module
+from types import ModuleType
+from typing import Any
+
+import pandas as pd
+
+from pipeline.catalogue import experiment_files
+from pipeline.scenes import ANALYSES, EXPERIMENTS
+from pipeline.stages import module_name
+
+
+def experiment_tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
+    """Make the tables of every experiment that the numbers hold, by name of the table."""
+    tables: dict[str, pd.DataFrame] = {}
+    for key, module in _modules(numbers).items():
+        tables |= module.tables(numbers[key], source)
+    return tables
+
+
+def experiment_figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
+    """Draw the figures of every experiment that the numbers hold: SVG text by file name.
+
+    `drawn` holds, by key in numbers.json, the data that only its figures show.
+    """
+    figures: dict[str, str] = {}
+    for key, module in _modules(numbers).items():
+        figures |= module.figures(numbers[key], drawn[key], source)
+    return figures
+
+
+def _modules(numbers: Mapping[str, Any]) -> dict[str, ModuleType]:
+    """Import the module of each experiment with results in numbers.json, by its key there."""
+    keys = {name: EXPERIMENTS[name].key for name in ANALYSES}
+    return {key: import_module(module_name(name)) for name, key in keys.items() if key in numbers}
+
+
+def add_sections(order: Iterable[Any]) -> list[dict[str, Any]]:
+    """Replace the names of experiments in `order` by their sections of the page; sections not named come last."""
+    files = experiment_files().items()
+    return _replace({name: {"key": name} | file.section for name, file in files if file.section is not None}, order)
+
+
+def add_rows(order: Iterable[Any]) -> list[dict[str, Any]]:
+    """Replace ids of rows in `order` by the rows of experiments' YAML files; rows not named come last."""
+    rows = [row | {"stage": name} for name, file in experiment_files().items() for row in file.checklist]
+    return _replace({row["id"]: row for row in rows}, order)
+
+
+def _replace(entries: dict[str, dict[str, Any]], order: Iterable[Any]) -> list[dict[str, Any]]:
+    listed = [entries.pop(entry) if isinstance(entry, str) else entry for entry in order]
+    return [*listed, *entries.values()]

@@ -1,0 +1,304 @@
+"""Error against run time: the Pareto front, failures, what was not timed, and the same bytes for the same numbers."""
+
+import re
+from dataclasses import asdict
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.experiments.runtime import REFERENCE, Precision, choose
+from pipeline.report.costs import (
+    cost_pages,
+    cost_tables,
+    failures,
+    front,
+    integrators,
+    look_of,
+    quadratures,
+    stage_costs,
+    trade_off,
+    trade_off_points,
+)
+from pipeline.report.drawing import COLOURS, MARKERS
+from pipeline.report.numbers import timed_learning
+from reskin.physics.magnet import DEFAULT_QUADRATURE
+from tests.report.synthetic import cost, texts_of
+
+RULES = [("Gauss in z", "0.5 mm x 6", 10584, 0.004), ("Gauss in z", "0.7 mm x 5", 5120, 0.015)]
+RULES += [("Gauss in z", "1 mm x 4", 1936, 0.08), ("midpoint", "0.5 mm x 4", 6400, 0.4)]
+SUMS = [
+    Precision("dB", REFERENCE, "0.5 mm x 8", 127008, 3e-4),
+    *(Precision("dB", method, setting, nodes_n, error) for method, setting, nodes_n, error in RULES),
+]
+STIFF = [
+    Precision(study, method, setting, 100, error, failure)
+    for study in ("relaxation, stiffness 1e+03", "relaxation, stiffness 1e+08")
+    for method, setting, error, failure in (
+        ("exact update", "", 0.0, None),
+        ("Radau", "1e-03", 1e-5, None),
+        ("Radau", "1e-07", 1e-9, None),
+        ("explicit Euler", "1e-02 s", None, "diverged: error 4e+115 of the force"),
+        ("explicit Euler", "1e-03 s", None, "diverged: error nan of the force"),
+        ("explicit Euler", "1e-04 s", None, "stopped after 20000 right-hand sides"),
+    )
+]
+
+
+def timed(rows: list[Precision]) -> list[dict]:
+    """Rows of a study as numbers.json joined with its times has them; neither failures nor references are timed."""
+    done = [row for row in rows if row.error is not None and row.method != REFERENCE]
+    times = {row.key: {"median_s": 1e-4 * (i + 1), "repeats_n": 5} for i, row in enumerate(done)}
+    return [asdict(row) | times.get(row.key, {}) for row in rows]
+
+
+def draw_sums(rows=SUMS, **limits) -> str:
+    return quadratures(timed(rows), asdict(choose(rows, used=DEFAULT_QUADRATURE, **limits)), "simulated")
+
+
+def draw_stiff(rows=STIFF) -> str:
+    return integrators(timed(rows))
+
+
+def test_the_figure_of_quadratures_says_units_limit_choice_source_and_how_good_its_reference_is():
+    words = texts_of(draw_sums())
+    for word in ("median time an indentation / ms", "rms error / rms dB", "2 %", "simulated", "Gauss in z", "midpoint"):
+        assert word in words
+    assert "cheapest below it: 0.7 mm x 5" in words
+    assert "in use: 0.5 mm x 6" in words
+    assert "reference's own error, at most" in words
+
+
+def test_where_no_rule_is_good_enough_only_the_one_in_use_is_ringed():
+    words = texts_of(draw_sums(error_max=1e-6))
+    assert "cheapest" not in words
+    assert "in use: 0.5 mm x 6" in words
+
+
+def test_the_figure_of_integrators_has_a_panel_a_stiffness_and_lists_every_failure():
+    words = texts_of(draw_stiff())
+    for word in ("stiffness 1e+03", "stiffness 1e+08", "exact update", "Radau", "rms error / rms force"):
+        assert word in words
+    for line in failures(timed(STIFF)):
+        for word in line.split():
+            assert word in words
+
+
+def test_failures_are_gathered_by_method_and_kind_and_none_is_dropped():
+    diverged, stopped = failures(timed(STIFF))
+    assert diverged == (
+        "Failed: explicit Euler, diverged: relaxation, stiffness 1e+03 (1e-02 s, 1e-03 s);"
+        " relaxation, stiffness 1e+08 (1e-02 s, 1e-03 s)"
+    )
+    assert stopped.startswith("Failed: explicit Euler, stopped after 20000 right-hand sides: ")
+    assert failures(timed(SUMS)) == []
+
+
+def test_what_failed_or_was_not_timed_is_no_point_of_the_figure():
+    # Each point is one use of a marker; without these rows there are as many.
+    done = [row for row in STIFF if row.failure is None]
+    assert drawn(draw_stiff()) == drawn(draw_stiff(done))
+    last = {key: value for key, value in timed(SUMS)[-1].items() if key != "median_s"}
+    choice = asdict(choose(SUMS, used=DEFAULT_QUADRATURE))
+    untimed, without = (quadratures([*timed(SUMS)[:-1], *more], choice, "simulated") for more in ([last], []))
+    assert drawn(untimed) == drawn(without)
+
+
+def test_pages_hold_the_studies_that_a_scene_ran():
+    stages = {"stages": {"simulate": cost()}}
+    assert set(cost_pages(stages, "simulated")) == {"stages.md"}
+    assert set(cost_pages(stages | {"integrators": timed(STIFF)}, "simulated")) == {
+        "integrators.svg", "integrators.md", "stages.md",
+    }  # fmt: skip
+
+
+def test_what_a_stage_cost_stands_beside_its_last_run_and_what_that_reused():
+    (line,) = stage_costs({"train_multi": cost(seconds=0.25)}).to_dict("records")
+    assert line == {
+        "stage": "train_multi", "computed, s": "3.0", "last run, s": "0.2", "CPU of it, s": "–",
+        "trainings": "2", "of them reused": "1", "peak memory of a process, MB": "2",
+    }  # fmt: skip
+
+
+def test_same_rows_same_bytes_other_seconds_other_bytes():
+    assert draw_sums() == draw_sums()
+    stiff = draw_stiff()
+    assert draw_stiff() == stiff
+    slower = [row | ({"median_s": row["median_s"] ** 2} if "median_s" in row else {}) for row in timed(STIFF)]
+    assert integrators(slower) != stiff
+
+
+@given(st.lists(st.tuples(st.floats(1e-6, 1), st.floats(1e-16, 1)), max_size=12))
+def test_on_the_front_who_takes_longer_is_more_exact_and_beats_all_that_are_left_out(points):
+    kept = front(points)
+    assert set(kept) <= set(points)
+    times, errors = np.array(kept).reshape(-1, 2).T
+    assert (np.diff(times) > 0).all()
+    assert (np.diff(errors) < 0).all()
+    for time, error in points:
+        assert any(t <= time and e <= error for t, e in kept)
+
+
+def test_seven_methods_differ_in_colour_and_in_marker():
+    assert len(set(COLOURS)) == len(set(MARKERS)) == 7
+
+
+def rows_of(places) -> list[dict]:
+    return [
+        {"method": f"m{i}", "inputs": "raw", "train_s": float(cost), "mse_xy_mm2": {"mean": float(error), "n": 1}}
+        for i, (cost, error) in enumerate(places)
+    ]
+
+
+def dominates(some, other) -> bool:
+    return some != other and all(a <= b for a, b in zip(some, other, strict=True))
+
+
+PLACES = st.lists(st.tuples(st.integers(1, 9), st.integers(1, 9)), min_size=1, max_size=20)
+
+
+@given(PLACES)
+def test_the_numbered_methods_are_those_that_no_other_dominates(places):
+    points = trade_off_points(rows_of(places), "train_s")
+    naive = set()
+    for place in places:
+        beaten = False
+        for other in places:
+            beaten |= dominates(other, place)
+        if not beaten:
+            naive.add(place)
+    assert {point.place for point in points if point.label} == naive
+    assert sorted(point.place for point in points) == sorted(places)
+
+
+@given(PLACES)
+def test_numbers_of_the_front_rise_with_cost_and_fall_with_error(places):
+    members = [point for point in trade_off_points(rows_of(places), "train_s") if point.label]
+    numbered = {int(point.label): point.place for point in members}
+    assert sorted(numbered) == list(range(1, len(numbered) + 1))
+    ordered = [numbered[i] for i in sorted(numbered)]
+    for (cheap, error), (dear, next_error) in pairwise(ordered):
+        assert cheap < dear
+        assert error > next_error
+
+
+def test_the_figure_names_every_method_and_numbers_the_front():
+    words = texts_of(trade_off(rows_of([(1, 3), (2, 2), (3, 2.5)]), "train_s", title="t", cost="c"))
+    for word in ("1  m0 (raw)", "2  m1 (raw)", "m2 (raw)", "Pareto front"):
+        assert word in words
+
+
+def test_a_step_of_the_front_promises_no_error_before_it_was_reached():
+    # With more time the error stays (to the right) until the next method reaches less (down).
+    svg = trade_off(rows_of([(1, 3), (2, 2)]), "train_s", title="t", cost="c")
+    (step,) = re.findall(r'<path d="([^"]+)"[^>]*stroke: #666666', svg.split('id="legend_1"')[0])
+    first, corner, last = re.findall(r"[ML] (\S+) (\S+)", step)
+    assert first[1] == corner[1]
+    assert corner[0] == last[0]
+
+
+def test_raw_and_other_inputs_of_a_method_share_colour_and_marker_and_differ_in_filling():
+    raw_row, other_row = rows_of([(1, 3), (2, 2)])
+    rows = [raw_row | {"method": "ridge"}, other_row | {"method": "ridge", "inputs": "shape"}]
+    raw, shape = (point.look for point in trade_off_points(rows, "train_s"))
+    assert {key: shape[key] for key in raw} == raw
+    assert shape["markerfacecolor"] == "white"
+
+
+def test_forty_nine_methods_differ_in_colour_or_marker():
+    assert len({(look_of(i)["color"], look_of(i)["marker"]) for i in range(49)}) == 49
+
+
+def row(accuracy_pct: float, mse_xy_mm2: float = 0.5, **spread) -> dict:
+    spread = spread or {"sd": 0.1, "n": 6}
+    return {
+        "accuracy_pct": {"mean": accuracy_pct, **spread},
+        "mse_xy_mm2": {"mean": mse_xy_mm2, **spread},
+    }
+
+
+LEARNING = [
+    {"method": method, "inputs": inputs, "train_s": train_s, "inference_us": 5.0 / train_s, **row(40.0, error)}
+    for method, inputs, train_s, error in (
+        ("ridge", "raw", 0.01, 3.0),
+        ("ridge", "shape", 0.02, 2.0),
+        ("kNN", "raw", 0.1, 2.5),
+        ("network", "raw", 10.0, 0.3),
+    )
+]
+
+
+ADAPTATION = [{"pokes_n": n, "seconds": 1.0 + n / 1000, **row(85.0, 0.5 - n / 10000)} for n in (65, 390, 3900)]
+
+
+@pytest.fixture(scope="module")
+def costs() -> dict[str, str]:
+    return cost_pages({"learning": LEARNING, "adaptation": ADAPTATION}, "simulated")
+
+
+def test_pages_of_costs_hold_what_was_asked_for_and_no_figure_of_what_was_not_timed(costs):
+    assert set(costs) == {"training.svg", "inference.svg", "adaptation.svg", "learning.md", "adaptation.md"}
+    untimed = [{key: value for key, value in one.items() if key != "train_s"} for one in LEARNING]
+    assert set(cost_pages({"learning": untimed}, "simulated")) == {"inference.svg", "learning.md"}
+    never = [{key: value for key, value in one.items() if key != "seconds"} for one in ADAPTATION]
+    assert set(cost_pages({"adaptation": never}, "simulated")) == {"adaptation.md"}
+    assert cost_pages({"choice": {}}, "simulated") == {}
+
+
+def test_what_was_not_timed_is_left_out_of_the_figure_and_stays_in_the_table():
+    untimed = {key: value for key, value in LEARNING[2].items() if key != "train_s"}
+    pages = cost_pages({"learning": [*LEARNING[:2], untimed, *LEARNING[3:]]}, "simulated")
+    assert "kNN" not in texts_of(pages["training.svg"])
+    assert "kNN" in texts_of(pages["inference.svg"])
+    (line,) = [line for line in pages["learning.md"].splitlines() if "kNN" in line]
+    assert [cell.strip() for cell in line.split("|")][3] == "–"
+
+
+def test_costs_name_units_and_source_and_label_every_number_of_pokes():
+    pages = cost_pages({"learning": LEARNING, "adaptation": ADAPTATION}, "recorded")
+    for name, unit in (("training", " / s"), ("inference", " / µs"), ("adaptation", " / s")):
+        words = texts_of(pages[f"{name}.svg"])
+        assert unit in words
+        assert "MSE_xy / mm²" in words
+        assert "recorded" in words
+    assert {"65", "390", "3900"} <= set(texts_of(pages["adaptation.svg"]).split())
+
+
+def test_one_point_more_is_one_mark_more(costs):
+    few, all_ = cost_pages({"learning": LEARNING[:3]}, "simulated")["training.svg"], costs["training.svg"]
+    ticks = {name: len(re.findall('id="[xy]tick_', text)) for name, text in (("few", few), ("all", all_))}
+    # A mark stands in the panel and in the legend; a tick is one mark; every label is text and no mark.
+    assert drawn(all_) - ticks["all"] - (drawn(few) - ticks["few"]) == 2
+
+
+def test_pages_of_costs_are_the_same_bytes_for_the_same_numbers(costs):
+    assert cost_pages({"learning": LEARNING, "adaptation": ADAPTATION}, "simulated") == costs
+
+
+def drawn(svg: str) -> int:
+    """Count marks: each is one use of a path."""
+    return len(re.findall("<use ", svg))
+
+
+def test_what_was_not_timed_here_has_a_dash():
+    timed = {"method": "ridge", "inputs": "raw", "train_s": 0.0123, "inference_us": 4.56, **row(30.0)}
+    untimed = {name: value for name, value in timed.items() if name not in ("train_s", "inference_us")}
+    rows = [{"pokes_n": 390, **row(87.0)}, {"pokes_n": 65, "seconds": 1.5, **row(85.0)}]
+    tables = cost_tables({"learning": [timed, untimed], "adaptation": rows}, "simulated")
+    assert tables["learning"]["training, s"].tolist() == ["0.0123", "–"]
+    assert tables["learning"]["one reading, µs"].tolist() == ["4.56", "–"]
+    assert tables["adaptation"]["adaptation, s"].tolist() == ["1.5", "–"]
+
+
+def test_reference_methods_have_their_errors_beside_their_seconds():
+    methods = [
+        {"method": method, "pokes": pokes, "labels_n": 0, "as_labelled": row(accuracy_pct)}
+        for method, pokes, accuracy_pct in (("map", "none", 20.0), ("map", "its own", 40.0), ("ridge", "its own", 30.0))
+    ]
+    took = [{"name": f"map.b{i}-draw0", "train_s": 2.0 + i, "one_reading_s": 5e-5} for i in range(3)]
+    found = timed_learning({"rivals": {"methods": methods}}, {"reference_methods": took})
+    (line,) = cost_tables(found, "recorded")["rivals_costs"].to_dict("records")
+    assert (line["method"], line["accuracy, %"]) == ("map", "40 ± 0.1")
+    assert (line["until ready, s"], line["one reading, µs"]) == ("3", "50")
