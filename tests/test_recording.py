@@ -16,9 +16,16 @@ from reskin.board.port import PortSettings
 from reskin.board.wire import encode
 from reskin.errors import CaptureError
 from reskin.recordings.header import HEADER_FILE, parse
-from reskin.recordings.label_sources import Source
+from reskin.recordings.label_sources import LabelSource
 from reskin.recordings.preparing import Labels, native
-from reskin.recordings.recorder import UNTOLD, Told, _desk, begin_capture, print_progress, record_capture
+from reskin.recordings.recorder import (
+    NO_INFO,
+    CaptureInfo,
+    _label_context,
+    begin_capture,
+    print_progress,
+    record_capture,
+)
 from tests.board.signals import make_frames
 from tests.stages.checkout import ROOT
 
@@ -110,22 +117,22 @@ def test_labels_that_fail_before_a_frame_came_say_why(terminal, tmp_path):
     def no_gauge(_):
         raise CaptureError("the gauge", "the port", "one that opens", "none", "Plug it in.")
 
-    told = Told("b0", "s0", "random", Source("gauge", None, no_gauge))
+    info = CaptureInfo("b0", "s0", "random", LabelSource("gauge", None, no_gauge))
     settings = PortSettings(115200, "binary", 5, LONG_S, None, silence_s=LONG_S, no_frame_s=LONG_S)
     with pytest.raises(CaptureError, match="the gauge: the port must be one that opens") as raised:
-        record_capture(terminal[1], tmp_path / "run1", told=told, settings=settings, report=len, watch=len)
+        record_capture(terminal[1], tmp_path / "run1", info=info, settings=settings, report=len, watch=len)
     assert "bytes must be coming in" in str(raised.value.__cause__)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_label_thread_that_hangs_writes_no_header_after_the_end(tmp_path):
-    part, header = begin_capture(tmp_path / "run1", UNTOLD, wire="binary", chips_n=5, by="a test")
+    part, header = begin_capture(tmp_path / "run1", NO_INFO, wire="binary", chips_n=5, by="a test")
     headers = [header]
-    desk = _desk(part, headers, threading.Event())
-    desk.mark(5.0, 6.0)
+    context = _label_context(part, headers, threading.Event())
+    context.mark(5.0, 6.0)
     assert headers[0].clock.marks == ((5.0, 6.0),)
-    desk.tape.close()
-    desk.mark(7.0, 8.0)
+    context.writer.close()
+    context.mark(7.0, 8.0)
     assert headers[0].clock.marks == ((5.0, 6.0),)
     assert parse((part / HEADER_FILE).read_text(), "header").clock.marks == ((5.0, 6.0),)
 

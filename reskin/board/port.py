@@ -39,7 +39,7 @@ Ended = Literal["duration", "bytes", "stopped", "unplugged", "silent", "no frame
 
 @dataclass(frozen=True)
 class PortSettings:
-    """How to listen, and for how long; `math.inf` seconds and no `bytes_max_n` go on until stopped."""
+    """How to read a port, and for how long; `math.inf` seconds and no `bytes_max_n` go on until stopped."""
 
     baud: int
     wire: Wire
@@ -74,8 +74,12 @@ def record(
     Raises `CaptureError` if the port does not open or not one frame comes. A port that falls silent after its first
     frame ends the recording: what came is kept.
     """
-    with open_port(port, settings.baud) as device, _stopping_on_signals(stop), Tape(folder, settings.wire) as tape:
-        recorder = _Recorder(port, settings, tape, watch)
+    with (
+        open_port(port, settings.baud) as device,
+        _stopping_on_signals(stop),
+        CaptureWriter(folder, settings.wire) as writer,
+    ):
+        recorder = _Recorder(port, settings, writer, watch)
         ended = recorder.listen(device, stop, report)
     return recorder.finish(ended)
 
@@ -94,7 +98,7 @@ def open_port(port: str, baud: int) -> Device:
 
 
 def read_waiting(device: Device, bytes_max_n: int = READ_BYTES_MAX_N) -> bytes:
-    """Give the bytes that wait, or those that come within `READ_TIMEOUT_s`; raise `OSError` if the board is gone."""
+    """Return the bytes that wait, or come within `READ_TIMEOUT_s`; raise `OSError` if the board is gone."""
     if isinstance(device, serial.Serial):  # it sleeps until a byte comes; with it come others
         first = device.read(min(1, bytes_max_n))
         waiting_n = min(device.in_waiting, READ_BYTES_MAX_N, bytes_max_n) - 1 if first else 0
@@ -104,26 +108,26 @@ def read_waiting(device: Device, bytes_max_n: int = READ_BYTES_MAX_N) -> bytes:
 
 
 def port_names() -> list[str]:
-    """Name the serial ports that this machine has."""
+    """List the serial ports of this machine."""
     return sorted(found.device for found in list_ports.comports())
 
 
-class Tape:
-    """The two files of a recording as they grow: a chunk is written first, then when it came.
+class CaptureWriter:
+    """Write the two files of a recording as it comes: first each chunk of bytes, then its time of arrival.
 
-    So no arrival speaks of bytes that are not there; what a full disk does not take whole is taken back.
+    So no arrival is of bytes that are not there. A chunk that a full disk does not take whole is taken back.
     """
 
     def __init__(self, folder: Path, wire: Wire) -> None:
         self.bytes_n = self.partial_line_bytes_n = 0
         self._in_partial_line = wire in TEXT_WIRES
-        # Unbuffered: what a killed process had written is there, and nothing waits to fail again on closing.
+        # Unbuffered: what a killed process has written is kept, and closing cannot fail.
         self._stream = (folder / STREAM_FILE).open("xb", buffering=0)
         self._arrivals = (folder / ARRIVALS_FILE).open("xb", buffering=0)
         self._arrivals.write(b"byte_end,t_s\n")
         self._note_arrival(time.time())
 
-    def __enter__(self) -> "Tape":
+    def __enter__(self) -> "CaptureWriter":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -134,7 +138,7 @@ class Tape:
         self._arrivals.close()
 
     def write(self, chunk: bytes, unix_s: float) -> bytes:
-        """Write a chunk; give what of it was written: of a number cut at the start of text, nobody could tell."""
+        """Write a chunk; return what was written of it: the first line of text may be cut inside a number."""
         if self._in_partial_line:
             partial, newline, rest = chunk.partition(b"\n")
             self.partial_line_bytes_n += len(partial + newline)
@@ -150,7 +154,7 @@ class Tape:
 
 
 def append(file: FileIO, data: bytes) -> None:
-    """Write all of some bytes or none."""
+    """Write all bytes, or none if the disk is full."""
     start = file.tell()
     try:
         while data:
@@ -161,10 +165,10 @@ def append(file: FileIO, data: bytes) -> None:
 
 
 class _Recorder:
-    """Remembers what has come since the port was opened."""
+    """A recording since its port was opened."""
 
-    def __init__(self, port: str, settings: PortSettings, tape: Tape, watch: Watch) -> None:
-        self._port, self._settings, self._tape, self._watch = port, settings, tape, watch
+    def __init__(self, port: str, settings: PortSettings, writer: CaptureWriter, watch: Watch) -> None:
+        self._port, self._settings, self._writer, self._watch = port, settings, writer, watch
         self._frames = FrameStream(settings.wire, settings.chips_n)
         self._head = b""
         self._start_s = self._last_byte_s = time.monotonic()
@@ -173,7 +177,7 @@ class _Recorder:
         self._unix_s = time.time() - self._start_s
 
     def listen(self, device: Device, stop: threading.Event, report: Report) -> Ended:
-        """Read until there is a reason to end."""
+        """Read until there is a reason to end; return it."""
         while not (ended := self._reason_to_end(stop)):
             report(self._frames.account())
             try:
@@ -187,7 +191,7 @@ class _Recorder:
         return ended
 
     def finish(self, ended: Ended) -> Recording:
-        """Say what came; raise if there is no frame in it."""
+        """Return the finished recording; raise `CaptureError` if there is no frame in it."""
         self._frames.close()
         account = self._frames.account()
         duration_s = time.monotonic() - self._start_s
@@ -196,7 +200,7 @@ class _Recorder:
             raise CaptureError(self._port, "bytes", "coming in", got, remedy)
         if not account["frames_n"]:
             raise no_frame(self._port, self._head, self._settings.wire, self._settings.chips_n)
-        return Recording(ended, duration_s, self._tape.partial_line_bytes_n, account)
+        return Recording(ended, duration_s, self._writer.partial_line_bytes_n, account)
 
     def _reason_to_end(self, stop: threading.Event) -> Ended | None:
         settings, now_s = self._settings, time.monotonic()
@@ -212,7 +216,7 @@ class _Recorder:
 
     def _room_n(self) -> int:
         bytes_max_n = self._settings.bytes_max_n
-        return sys.maxsize if bytes_max_n is None else bytes_max_n - self._tape.bytes_n
+        return sys.maxsize if bytes_max_n is None else bytes_max_n - self._writer.bytes_n
 
     def _keep(self, chunk: bytes) -> None:
         if not chunk:
@@ -220,7 +224,7 @@ class _Recorder:
         self._last_byte_s = time.monotonic()
         self._first_byte_s = min(self._first_byte_s, self._last_byte_s)
         self._head = (self._head + chunk)[:HEAD_BYTES_N]
-        if written := self._tape.write(chunk, self._unix_s + self._last_byte_s):
+        if written := self._writer.write(chunk, self._unix_s + self._last_byte_s):
             self._watch(self._frames.feed(written))
 
 
@@ -231,7 +235,7 @@ def _found_ports() -> str:
 
 @contextmanager
 def _stopping_on_signals(stop: threading.Event) -> Iterator[None]:
-    """Let Ctrl-C and SIGTERM set `stop`; only the main thread can, and may."""
+    """Let Ctrl-C and SIGTERM set `stop`, in the main thread."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -1,31 +1,28 @@
-"""A thread that reads a port and waits for nobody. In: a port. Out: chunks and when they came; a tape, if asked for.
-
-A board that is unplugged is waited for. Refuses to know formats and what chunks hold.
-"""
+"""Read a port in a thread of its own; an unplugged board is opened again when it is back."""
 
 import threading
 import time
 from collections import deque
 
 from reskin.board.find import BAUD, Chunk
-from reskin.board.port import Device, Tape, open_port, read_waiting
+from reskin.board.port import CaptureWriter, Device, open_port, read_waiting
 from reskin.errors import CaptureError
 
-QUEUE_BYTES_MAX_N = 2**22  # two minutes of five chips at 400 Hz: who is later than that loses the oldest
+QUEUE_BYTES_MAX_N = 2**22  # two minutes of five chips at 400 Hz; then the oldest chunks are dropped
 RETRY_S = 0.5
-PLUGGED_IN = b""  # a chunk that says that the stream begins anew
+PLUGGED_IN = b""  # a chunk that marks the begin of a new stream
 
 
 class Reader:
-    """Remembers what came and was not taken; `missed_bytes_n` counts what nobody took in time."""
+    """Queue the chunks that come from a port, with their times; `missed_bytes_n` counts dropped bytes."""
 
     def __init__(self, port: str, baud: int = BAUD) -> None:
         self.port, self.baud = port, baud
         self.plugged_in, self.was_plugged_in, self.problem = False, False, ""
         self.missed_bytes_n = self.waiting_bytes_n = 0
-        self.taken_s = 0.0  # when it was last asked, in unix seconds
-        self.tape: Tape | None = None
-        self.tape_problem = ""
+        self.taken_s = 0.0  # when `take` was last called, in unix seconds
+        self.writer: CaptureWriter | None = None
+        self.writer_problem = ""
         self._clock_s = time.time() - time.monotonic()  # the system's clock may be set while we read
         self._chunks: deque[Chunk] = deque()
         self._came = threading.Condition()
@@ -33,20 +30,20 @@ class Reader:
         self._thread = threading.Thread(target=self._read, name=f"reader of {port}", daemon=True)
 
     def start(self, *, there: bool) -> None:
-        """Begin to read; a port that must be `there` is opened first, and an error if it is not."""
+        """Begin to read; raise `CaptureError` if the port must be `there` and does not open."""
         self._device = open_port(self.port, self.baud) if there else None
         self._thread.start()
 
     def stop(self) -> None:
         self._stop.set()
         self._thread.join()
-        self.set_tape(None)
+        self.write_to(None)
 
     def unix_s(self) -> float:
         return self._clock_s + time.monotonic()
 
     def take(self, wait_s: float) -> list[Chunk]:
-        """Take all that came; wait for something at most so long."""
+        """Take all queued chunks; wait for one at most `wait_s`."""
         with self._came:
             self._came.wait_for(lambda: bool(self._chunks), wait_s)
             taken = list(self._chunks)
@@ -55,10 +52,10 @@ class Reader:
             self.taken_s = self.unix_s()
         return taken
 
-    def set_tape(self, tape: Tape | None) -> None:
-        """Write what comes from now on to another tape, or to none; the one before is closed."""
+    def write_to(self, writer: CaptureWriter | None) -> None:
+        """Write what comes from now on to another recording, or none; the one before is closed."""
         with self._came:
-            before, self.tape, self.tape_problem = self.tape, tape, ""
+            before, self.writer, self.writer_problem = self.writer, writer, ""
         if before is not None:
             before.close()
 
@@ -94,10 +91,10 @@ class Reader:
                 self.waiting_bytes_n -= oldest_n
                 self.missed_bytes_n += oldest_n
             self._came.notify()
-            tape = self.tape
-            if tape is not None:
+            writer = self.writer
+            if writer is not None:
                 try:
-                    tape.write(chunk, now_s)
+                    writer.write(chunk, now_s)
                 except OSError as error:  # a full disk ends the recording, and nothing else
-                    self.tape, self.tape_problem = None, f"cannot be written any more: {error.strerror}"
-                    tape.close()
+                    self.writer, self.writer_problem = None, f"cannot be written any more: {error.strerror}"
+                    writer.close()

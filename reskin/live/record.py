@@ -11,8 +11,17 @@ from reskin.board.find import BAUD, Found
 from reskin.board.port import PortSettings
 from reskin.errors import ParamsError
 from reskin.live.health import Health
-from reskin.recordings.label_sources import RANDOM, SNAKE, Forces, Prompts, Source, from_gauge, from_table, parse_places
-from reskin.recordings.recorder import UNTOLD, new_folder, print_progress, record_capture
+from reskin.recordings.label_sources import (
+    RANDOM,
+    SNAKE,
+    ForceGauge,
+    LabelSource,
+    Prompts,
+    from_gauge,
+    from_table,
+    parse_places,
+)
+from reskin.recordings.recorder import NO_INFO, new_folder, print_progress, record_capture
 from reskin.seeds import rng_for
 
 GAUGE_BAUD = 9600
@@ -29,7 +38,7 @@ class Finished(NamedTuple):
 
 def label_source(
     labels: str | None, gauge: str | None, scan: str | None, *, dwell_s: float, say: Callable[[str], object]
-) -> Source | None:
+) -> LabelSource | None:
     """Return the source of labels that the options of `reskin record` ask for, None without any.
 
     Parameters
@@ -55,14 +64,14 @@ def label_source(
         return from_table(Path(labels))
     if scan not in (None, RANDOM, SNAKE):
         raise ParamsError(f"--scan: prompts come in {RANDOM} or {SNAKE} order, not {scan}. The default is {RANDOM}.")
-    forces = Forces(port, gauge_baud) if gauge else None
+    forces = ForceGauge(port, gauge_baud) if gauge else None
     rng = rng_for(time.time_ns() % 2**31, "prompts")
     return Prompts(places, dwell_s, say, lambda: sys.stdin, forces, rng, scan or RANDOM).source()
 
 
 def record_board(
     board: Found,
-    labels: Source | None,
+    labels: LabelSource | None,
     *,
     folder: Path | None = None,
     seconds: float = float("inf"),
@@ -86,7 +95,7 @@ def record_board(
         baud, board.wire, board.chips_n, seconds, bytes_max_n=None, silence_s=SILENCE_S, no_frame_s=NO_FRAME_S
     )
     stream, of_labels, error = record_capture(
-        board.port, folder, told=replace(UNTOLD, **(scan | dict(names or {})), labels=labels), settings=settings,
+        board.port, folder, info=replace(NO_INFO, **(scan | dict(names or {})), labels=labels), settings=settings,
         report=print_progress(lambda: [alarm.name for alarm in health.active(time.monotonic())]),
         watch=lambda frames: health.feed(frames, time.monotonic()),
     )  # fmt: skip

@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from reskin.board.port import Tape
+from reskin.board.port import CaptureWriter
 from reskin.data.grid import CENTRE_MM
 from reskin.errors import ReskinError
 from reskin.live.health import LIVE_POLICY
 from reskin.live.tracker import WAITING, Estimates, Layout, LiveSkin, Models, UniversalEstimator, check_ports
 from reskin.recordings.fault_policy import FaultPolicy
 from reskin.recordings.header import Header
-from reskin.recordings.recorder import UNTOLD, begin_capture, end_capture, new_folder
+from reskin.recordings.recorder import NO_INFO, begin_capture, end_capture, new_folder
 from reskin.seeds import rng_for
 
 POLL_S = 0.1
@@ -255,7 +255,7 @@ class Session:
             "adapted": self._adapted,
             "waiting": detected.problem is not None, "silent": skin.silent,
             "alarms": [alarm for alarm in (self._error, *skin.alarms()) if alarm not in ("", WAITING)],
-            "recording": f"{self._recording[0]} {skin.reader.tape_problem}" if self._recording else "",
+            "recording": f"{self._recording[0]} {skin.reader.writer_problem}" if self._recording else "",
             "recorded": self._recorded,
         }  # fmt: skip
         if detected.problem is None:
@@ -292,8 +292,10 @@ class Session:
         if not self._alone:  # other boards may begin theirs in the same second
             folder = folder.with_name(f"{folder.name}-{re.sub(r'[^A-Za-z0-9]+', '-', detected.port).strip('-')}")
         try:
-            part, header = begin_capture(folder, UNTOLD, wire=detected.wire, chips_n=detected.chips_n, by="reskin live")
-            self.skin.reader.set_tape(Tape(part, detected.wire))
+            part, header = begin_capture(
+                folder, NO_INFO, wire=detected.wire, chips_n=detected.chips_n, by="reskin live"
+            )
+            self.skin.reader.write_to(CaptureWriter(part, detected.wire))
             self._recording, self._recorded = (folder, header), ""
         except (OSError, ReskinError) as error:
             self._recorded = str(error)
@@ -301,7 +303,7 @@ class Session:
     def _end_recording(self) -> None:
         if self._recording is not None:
             (folder, header), self._recording = self._recording, None
-            self.skin.reader.set_tape(None)
+            self.skin.reader.write_to(None)
             try:
                 end_capture(folder, header)
                 self._recorded = f"recorded {folder}"

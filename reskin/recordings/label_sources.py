@@ -1,4 +1,4 @@
-"""Labels for a recording: places that a person presses, a robot's program or CSV, a force gauge."""
+"""Sources of labels for a recording: a person who presses places, a robot's program or CSV, a force gauge."""
 
 import math
 import os
@@ -17,86 +17,91 @@ import numpy as np
 
 from reskin.board.port import Device, open_port, read_waiting
 from reskin.errors import CaptureError, ParamsError
-from reskin.recordings.labels import Dwell, Dwells, Gauge, Label, ProbeTape, Sample, Table, mean_label
+from reskin.recordings.labels import (
+    Dwell,
+    DwellBuilder,
+    GaugeLines,
+    Label,
+    ProbeLogWriter,
+    Sample,
+    SampleTable,
+    mean_label,
+)
 
 
 @dataclass
-class Desk:
-    """What a source works with: the tape, a clock in unix seconds, and when to stop; `mark` tells of another clock."""
+class LabelContext:
+    """What a source works with: writer, clock in unix seconds, stop event; `mark` gives one event on both clocks."""
 
-    tape: ProbeTape
+    writer: ProbeLogWriter
     unix_s: Callable[[], float]
     stop: threading.Event
-    mark: Callable[[float, float], object]  # unix time and the source's time of one event
+    mark: Callable[[float, float], object]  # unix time, time of the source's own clock
 
     def hold(self, label: Label, dwell_s: float) -> Dwell:
-        """Let a label hold from now on for so long, or until the recording stops."""
+        """Wait `dwell_s`, or until the recording stops; return the dwell."""
         start_s = self.unix_s()
         self.stop.wait(dwell_s)
         return Dwell(label, start_s, self.unix_s())
 
 
-class Source(NamedTuple):
-    """A source of labels: what it is called in the header, in which order places come, and what to run."""
+class LabelSource(NamedTuple):
+    """A source of labels: its name in the header, the order of places, and a function that runs until it ends."""
 
     name: str
     scan: str | None
-    run: Callable[[Desk], str]  # gives what is to be told at the end
+    run: Callable[[LabelContext], str]  # returns a summary for the user
 
 
-def from_program(labels: Iterable[Label] | Callable[[], Label | None], dwell_s: float) -> Source:
-    """Take labels from a generator, or from a function that is called each time until it gives None.
+def from_program(labels: Iterable[Label] | Callable[[], Label | None], dwell_s: float) -> LabelSource:
+    """Take labels from a generator, or from a function that is called until it returns None.
 
-    The program moves the robot before it gives a label; while the label holds, it is not asked for the next one.
+    The program moves the robot before it gives a label; the next label is taken after the dwell.
     """
     each = iter(labels, None) if callable(labels) else iter(labels)
 
-    def run(desk: Desk) -> str:
+    def run(context: LabelContext) -> str:
         for label in each:
             if not isinstance(label, Label):
                 remedy = "Yield reskin.lifted() or reskin.touch(x_mm, y_mm)."
                 raise ParamsError(
-                    "labels", "what the program gives", "reskin.lifted() or reskin.touch(...)", repr(label)[:60], remedy
+                    "labels", "a label of the program", "reskin.lifted() or reskin.touch(...)", repr(label)[:60], remedy
                 )
-            desk.tape.write(desk.hold(label, dwell_s))
-            if desk.stop.is_set():
+            context.writer.write(context.hold(label, dwell_s))
+            if context.stop.is_set():
                 break
         return ""
 
-    return Source("program", None, run)
+    return LabelSource("program", None, run)
 
 
-def told_bad(where: str, bad_n: int, first_bad: str) -> str:
-    return f"{where}: {bad_n} lines could not be read, the first {first_bad!a}" if bad_n else ""
+class LabelThread:
+    """Run a source of labels in a thread; `problem` says what ended it early."""
 
-
-class Labeller:
-    """Runs a source beside a recording; `problem` is what ended it, if it did not end by itself."""
-
-    def __init__(self, source: Source, desk: Desk) -> None:
-        self.told, self.problem = "", ""
+    def __init__(self, source: LabelSource, context: LabelContext) -> None:
+        self.summary, self.problem = "", ""
         self.failed: Exception | None = None
-        self._source, self._desk = source, desk
+        self._source, self._label_context = source, context
         self._thread = threading.Thread(target=self._run, name="labels", daemon=True)
         self._thread.start()
 
     def end(self, wait_s: float = 1.0) -> str:
-        """Stop, and give in a sentence what came: a program that hangs is not waited for, and its labels are kept."""
-        self._desk.stop.set()
+        """Stop, and return a summary. A program that hangs is not waited for, and its labels are kept."""
+        self._label_context.stop.set()
         self._thread.join(wait_s)
-        tape = self._desk.tape
-        tape.close()
-        lost = {"without a no-load dwell before": tape.without_noload_n, "out of order": tape.out_of_order_n}
-        words = [f"{tape.touches_n} touches labelled", *(f"{n} {why}" for why, n in lost.items() if n)]
-        return "; ".join(word for word in (", ".join(words), self.told, self.problem) if word)
+        writer = self._label_context.writer
+        writer.close()
+        lost = {"without a no-load dwell before": writer.without_noload_n, "out of order": writer.out_of_order_n}
+        counts = [f"{writer.touches_n} touches labelled", *(f"{n} {why}" for why, n in lost.items() if n)]
+        return "; ".join(filter(None, (", ".join(counts), self.summary, self.problem)))
 
     def _run(self) -> None:
         try:
-            self.told = self._source.run(self._desk)
+            self.summary = self._source.run(self._label_context)
         except Exception as error:
             self.failed, self.problem = error, f"labels ended: {error or type(error).__name__}"
         finally:
-            self._desk.stop.set()
+            self._label_context.stop.set()
 
 
 PLACES_MAX_N = 10_000
@@ -105,7 +110,7 @@ RANDOM, SNAKE = "random", "snake"
 
 @dataclass(frozen=True)
 class Places:
-    """Numbered places in mm, [(x, y), ...], row by row; each row of a snake is gone through the other way."""
+    """Numbered places in mm, [(x, y), ...], row by row; a snake goes through every other row backwards."""
 
     name: str
     xy_mm: Sequence[tuple[float, float]]
@@ -138,33 +143,37 @@ def parse_places(text: str) -> Places | None:
 
 
 TABLE_POLL_s = 0.02
-BETTER_s = 0.005  # a mark of two clocks that is so much better is written down
+BETTER_s = 0.005  # a clock mark is replaced by one that is so much better
 
 
-def from_table(file: Path) -> Source:
-    """Follow a CSV that a robot's program appends to; what stands in it before the recording begins is passed over."""
+def from_table(file: Path) -> LabelSource:
+    """Follow a CSV that a robot's program appends to; rows from before the recording are skipped."""
 
-    def run(desk: Desk) -> str:
-        table, dwells, best_s = Table(str(file)), Dwells(), math.inf
+    def run(context: LabelContext) -> str:
+        table, dwells, best_s = SampleTable(str(file)), DwellBuilder(), math.inf
         try:
-            for data, is_new in _grown(file, desk.stop):
-                came_s, samples = desk.unix_s(), table.feed(data)
+            for data, is_new in _grown(file, context.stop):
+                came_s, samples = context.unix_s(), table.feed(data)
                 if not samples or not is_new:
                     continue
                 late_s = came_s - samples[-1].t_s if table.clock == "t_s" else best_s
                 if late_s < best_s - BETTER_s:  # a row is written after its time: the least delay is nearest to none
                     best_s = late_s
-                    desk.mark(came_s, samples[-1].t_s)
-                desk.tape.write_all(dwells.feed(samples))
+                    context.mark(came_s, samples[-1].t_s)
+                context.writer.write_all(dwells.feed(samples))
         finally:
-            desk.tape.write_all(dwells.close())
-        return "; ".join(filter(None, (told_bad(str(file), table.bad_n, table.first_bad), dwells.told())))
+            context.writer.write_all(dwells.close())
+        return "; ".join(filter(None, (_bad_lines(str(file), table), dwells.summary())))
 
-    return Source(f"table {file.name}", None, run)
+    return LabelSource(f"table {file.name}", None, run)
+
+
+def _bad_lines(where: str, lines: SampleTable | GaugeLines) -> str:
+    return f"{where}: {lines.bad_n} lines could not be read, the first {lines.first_bad!a}" if lines.bad_n else ""
 
 
 def _grown(file: Path, stop: threading.Event) -> Iterator[tuple[bytes, bool]]:
-    """Give what a file holds, and what is appended to it, and whether it came since; wait for one that is not there."""
+    """Yield what a file holds and what is appended, with whether it is new; wait for a missing file."""
     is_new = not file.exists()
     while not stop.is_set() and not file.exists():
         stop.wait(TABLE_POLL_s)
@@ -182,7 +191,7 @@ def _grown(file: Path, stop: threading.Event) -> Iterator[tuple[bytes, bool]]:
 
 
 def _check_grows(file: Path, stream: BinaryIO) -> None:
-    """Raise if the file is no longer the one that is followed, or shorter than what was read of it."""
+    """Raise `CaptureError` if the file was replaced or shortened."""
     rule, remedy = "the same file, with rows appended", "Open it once, or append: do not write it anew."
     try:
         there = file.stat()
@@ -198,100 +207,100 @@ def _check_grows(file: Path, stream: BinaryIO) -> None:
 KEPT_N = 10_000  # samples, of which a touch is a few hundred
 
 
-class Forces:
-    """What a gauge says; it remembers the last of it, and why it fell silent."""
+class ForceGauge:
+    """A force gauge at a port, read in a thread; it keeps the last samples."""
 
     def __init__(self, port: str, baud: int) -> None:
-        self.port, self._baud, self._gauge = port, baud, Gauge()
+        self.port, self._baud, self._gauge = port, baud, GaugeLines()
         self._kept: deque[Sample] = deque(maxlen=KEPT_N)
         self._silent = ""
         self._without_n = 0
 
     def during(self, start_s: float, end_s: float) -> Label:
-        """Give the mean force between two times; NaN, and counted, where nothing was said."""
+        """Return the mean force between two times; NaN, and counted, without a sample."""
         found = [one.label for one in list(self._kept) if one.label and start_s <= one.t_s <= end_s]
         self._without_n += not found
         return mean_label(found) if found else Label(True)
 
-    def told(self) -> str:
-        """Say what could not be read of it, and how many touches have no force."""
-        bad = told_bad(f"the gauge at {self.port}", self._gauge.bad_n, self._gauge.first_bad)
-        without = f"{self._without_n} touches without a force: the gauge at {self.port} said none while they lasted"
-        return "; ".join(words for words in (bad, self._silent, without if self._without_n else "") if words)
+    def summary(self) -> str:
+        """Say how many lines could not be read, and how many contacts have no force."""
+        bad = _bad_lines(f"the gauge at {self.port}", self._gauge)
+        without = f"{self._without_n} touches without a force: the gauge at {self.port} sent none while they lasted"
+        return "; ".join(filter(None, (bad, self._silent, without if self._without_n else "")))
 
     @contextmanager
-    def listening(self, desk: Desk) -> Iterator[None]:
-        """Keep what it says while something else is done; raise if its port does not open."""
+    def listening(self, context: LabelContext) -> Iterator[None]:
+        """Read in a thread within the `with` block; raise `CaptureError` if the port does not open."""
         with open_port(self.port, self._baud) as device:
-            ear = threading.Thread(target=self._listen, args=[device, desk], daemon=True)
-            ear.start()
+            thread = threading.Thread(target=self._listen, args=[device, context], daemon=True)
+            thread.start()
             try:
                 yield
             finally:
-                desk.stop.set()
-                ear.join()
+                context.stop.set()
+                thread.join()
 
-    def _listen(self, device: Device, desk: Desk) -> None:
+    def _listen(self, device: Device, context: LabelContext) -> None:
         try:
-            self.read(device, desk, self._kept.extend)
+            self.read(device, context, self._kept.extend)
         except CaptureError as error:
             self._silent = f"{error} Forces are missing from then on"
 
-    def read(self, device: Device, desk: Desk, use: Callable[[list[Sample]], object]) -> None:
-        """Read until the recording stops; raise if the gauge is unplugged before."""
-        while not desk.stop.is_set():
+    def read(self, device: Device, context: LabelContext, use: Callable[[list[Sample]], object]) -> None:
+        """Read until the recording stops; raise `CaptureError` if the gauge is unplugged before."""
+        while not context.stop.is_set():
             try:
                 chunk = read_waiting(device)
             except OSError as error:
                 rule, remedy = "plugged in until the recording ends", "What came is kept; plug it in, record again."
                 raise CaptureError(self.port, "the force gauge", rule, error, remedy) from None
             if chunk:
-                use(self._gauge.feed(chunk, desk.unix_s()))
+                use(self._gauge.feed(chunk, context.unix_s()))
 
 
-def from_gauge(port: str, baud: int) -> Source:
-    """Take forces alone: touches without places, told by the force."""
+def from_gauge(port: str, baud: int) -> LabelSource:
+    """Take contacts without places from a force gauge."""
 
-    def run(desk: Desk) -> str:
-        forces, dwells = Forces(port, baud), Dwells()
+    def run(context: LabelContext) -> str:
+        forces, dwells = ForceGauge(port, baud), DwellBuilder()
         try:
             with open_port(port, baud) as device:
-                forces.read(device, desk, lambda samples: desk.tape.write_all(dwells.feed(samples)))
+                forces.read(device, context, lambda samples: context.writer.write_all(dwells.feed(samples)))
         finally:
-            desk.tape.write_all(dwells.close())
-        return "; ".join(filter(None, (forces.told(), dwells.told())))
+            context.writer.write_all(dwells.close())
+        return "; ".join(filter(None, (forces.summary(), dwells.summary())))
 
-    return Source("gauge", None, run)
+    return LabelSource("gauge", None, run)
 
 
 POLL_s = 0.05
 ENDS = ("q", "quit", "end")
 # A place, a force, or both with a blank between: else 12N would be place 1 with 2 N.
-ANSWER = re.compile(r"(?:(\d{1,5})(?:\s+|$))?(?:(\d{1,3}(?:\.\d{1,4})?)\s*[nN])?")
+REPLY = re.compile(r"(?:(\d{1,5})(?:\s+|$))?(?:(\d{1,3}(?:\.\d{1,4})?)\s*[nN])?")
 Say = Callable[[str], object]
 
 
 @dataclass(frozen=True)
 class Prompts:
-    """Asks a person to press places one after the other; Enter says that the finger, or the tip, stands still."""
+    """Ask a person to press places one after the other; Enter says that the tip stands still."""
 
     places: Places
     dwell_s: float
     say: Say
     lines: Callable[[], Iterable[str]]  # what is typed, line by line
-    forces: Forces | None
+    forces: ForceGauge | None
     rng: np.random.Generator
     scan: str = RANDOM
 
-    def source(self) -> Source:
-        return Source(self.places.name, self.scan, self.run)
+    def source(self) -> LabelSource:
+        return LabelSource(self.places.name, self.scan, self.run)
 
-    def run(self, desk: Desk) -> str:
-        with self.forces.listening(desk) if self.forces else nullcontext():
-            self._ask(desk, typed_until(self.lines, desk.stop))
-        return self.forces.told() if self.forces else ""
+    def run(self, context: LabelContext) -> str:
+        with self.forces.listening(context) if self.forces else nullcontext():
+            self._ask(context, typed_until(self.lines, context.stop))
+        return self.forces.summary() if self.forces else ""
 
-    def _ask(self, desk: Desk, typed: Iterator[str]) -> None:
+    def _ask(self, context: LabelContext, typed: Iterator[str]) -> None:
         n = len(self.places.xy_mm)
         self.say(f"{n} places, {self.scan} order. Enter when it holds still; or type the number of another place, a "
                  "force such as 0.8N, or both; s passes a place over, q ends.")  # fmt: skip
@@ -301,31 +310,31 @@ class Prompts:
                 self.say(f"pass {pass_i}, {i + 1} of {n}: lift off, Enter")
                 if next(typed, ENDS[0]) in ENDS:
                     return
-                desk.tape.write(desk.hold(Label(False), self.dwell_s))
+                context.writer.write(context.hold(Label(False), self.dwell_s))
                 following = f"; then {self._name(order[i + 1])}" if i + 1 < n else ""
                 self.say(f"  press {self._name(place_i)}, hold, Enter{following}")
-                label = self._answer(typed, place_i)
+                label = self._read_label(typed, place_i)
                 if label is None:
                     return
                 if label.contact:
-                    desk.tape.write(self._with_force(desk.hold(label._replace(pass_i=pass_i), self.dwell_s)))
+                    context.writer.write(self._with_force(context.hold(label._replace(pass_i=pass_i), self.dwell_s)))
 
     def _name(self, place_i: int) -> str:
         x_mm, y_mm = self.places.xy_mm[place_i]
         return f"place {place_i} (x {x_mm:g}, y {y_mm:g} mm)"
 
-    def _answer(self, typed: Iterator[str], place_i: int) -> Label | None:
-        """Give the label that a person means; None at the end, one without contact for a place that is passed over."""
-        for words in typed:
-            found = ANSWER.fullmatch(words)
-            if words in ENDS:
+    def _read_label(self, typed: Iterator[str], place_i: int) -> Label | None:
+        """Read the label of a press; None at the end, a label without contact for a skipped place."""
+        for line in typed:
+            found = REPLY.fullmatch(line)
+            if line in ENDS:
                 return None
-            if words == "s":
+            if line == "s":
                 return Label(False)
             if found and int(found[1] or place_i) < len(self.places.xy_mm):
                 x_mm, y_mm = self.places.xy_mm[int(found[1] or place_i)]
                 return Label(True, x_mm, y_mm, Fz_N=float(found[2] or math.nan))
-            self.say(f"  {words[:20]!r} is no place from 0 to {len(self.places.xy_mm) - 1}, and no force such as 0.8N")
+            self.say(f"  {line[:20]!r} is no place from 0 to {len(self.places.xy_mm) - 1}, and no force such as 0.8N")
         return None
 
     def _with_force(self, dwell: Dwell) -> Dwell:
@@ -336,7 +345,7 @@ class Prompts:
 
 
 def typed_until(lines: Callable[[], Iterable[str]], stop: threading.Event) -> Iterator[str]:
-    """Give lines as they are typed, until they end or the recording does: no key is waited for then."""
+    """Yield lines as they are typed, until they end or the recording stops."""
     typed: queue.SimpleQueue[str | None] = queue.SimpleQueue()
 
     def read() -> None:

@@ -24,18 +24,18 @@ TIME_STEP_s = 1e-6  # as it is written
 TIME_MAX_s = 1e11  # unix time is below it for 3,000 years, unless it is in milliseconds
 CLOCKS = ("unix_s", "t_s")  # this machine's, or one of the source's own
 COLUMNS = (*CLOCKS, "phase", "pass_i", *LABELS)
-CONTACT_N = 0.05  # assumed: what a gauge tells from its own noise
-NOLOAD_N = 0.025  # between the two it comes or goes
-DWELL_MIN_s, DWELL_MAX_s = 0.05, 0.5  # assumed: a longer touch is several dwells, each with its own force
+CONTACT_N = 0.05  # assumed: above the noise of a gauge
+NOLOAD_N = 0.025  # between the two, contact begins or ends
+DWELL_MIN_s, DWELL_MAX_s = 0.05, 0.5  # assumed: a longer contact is several dwells, each with its own force
 DWELL_SAMPLES_MAX_N = 10_000  # of a clock that stands still
 LINE_BYTES_MAX_N = 4096
 GAUGE_NUMBERS = {1: ("Fz_N",), 3: ("Fx_N", "Fy_N", "Fz_N")}  # by how many stand in a line, in N
 
 
 class Label(NamedTuple):
-    """What is known of a dwell, in which nothing moves; NaN where it is not known.
+    """The label of a dwell, in which nothing moves; NaN where a number is not known.
 
-    Forces have the signs of `core.schema`: on the skin, `Fz_N` positive in compression.
+    Forces have the signs of `reskin.schema`: on the skin, `Fz_N` positive in compression.
     """
 
     contact: bool
@@ -49,17 +49,17 @@ class Label(NamedTuple):
 
 
 class Dwell(NamedTuple):
-    """A label, and from when to when it held, on the clock of its source."""
+    """A label and its time, on the clock of its source."""
 
     label: Label
     t_start_s: float
     t_end_s: float
 
 
-class ProbeTape:
-    """The probe log of a recording as it grows; a touch is written with the no-load dwell before it, or not at all.
+class ProbeLogWriter:
+    """Write the probe log of a recording as labels come: each contact with the no-load dwell before it, or not at all.
 
-    So what a killed recorder leaves is a log that `probe.parse` takes. Touches that it would refuse are counted.
+    So a killed recorder leaves a log that `probe.parse` reads. Contacts that it would refuse are counted.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -73,23 +73,23 @@ class ProbeTape:
         append(self._file, (",".join(TYPES) + "\n").encode())
 
     def close(self) -> None:
-        """Take no more labels: what a source says from now on is of another time."""
+        """Take no more labels."""
         with self._lock:
             self._file.close()
 
     @contextmanager
-    def held_open(self) -> Iterator[bool]:
-        """Tell whether labels are still taken; while this is asked, they cannot end."""
+    def locked(self) -> Iterator[bool]:
+        """Hold the lock; the value says whether labels are still taken."""
         with self._lock:
             yield not self._file.closed
 
     def write(self, dwell: Dwell) -> None:
-        """Write a touch; keep a no-load dwell for the touch that follows it.
+        """Write a contact; keep a no-load dwell for the contact that follows it.
 
-        A touch may go on over several dwells, at the same place; elsewhere, it is one without a no-load dwell.
+        A contact may go on over several dwells at one place; at another place, it lacks a no-load dwell.
         """
         _check(dwell)
-        with self.held_open() as is_open:
+        with self.locked() as is_open:
             if not is_open:
                 return
             if dwell.t_start_s < (self._noload.t_end_s if self._noload else self._end_s):
@@ -117,7 +117,7 @@ class ProbeTape:
 
 
 def same_place(a: Label, b: Label) -> bool:
-    """Tell whether two labels are of one place; of two that are not known, nothing says otherwise."""
+    """Return whether two labels are of one place; coordinates that both do not know count as equal."""
     return all(
         abs(a_mm - b_mm) <= SAME_PLACE_mm or (math.isnan(a_mm) and math.isnan(b_mm))
         for a_mm, b_mm in ((a.x_mm, b.x_mm), (a.y_mm, b.y_mm))
@@ -146,14 +146,14 @@ def _check(dwell: Dwell) -> None:
 
 
 class Sample(NamedTuple):
-    """A label at a moment; `label` is None while the source moves."""
+    """A label at one time; None while the rig moves."""
 
     t_s: float
     label: Label | None
 
 
-class Lines:
-    """Cuts bytes into lines of text; a line without end is not waited for."""
+class LineBuffer:
+    """Split bytes into lines of text; a line without end is cut at `LINE_BYTES_MAX_N`."""
 
     def __init__(self) -> None:
         self._rest = b""
@@ -165,17 +165,17 @@ class Lines:
         return [line.decode("utf-8", errors="replace").strip() for line in whole]
 
 
-class Table:
-    """Reads the lines of a CSV: first its header, then samples. `bad_n` counts lines that are none."""
+class SampleTable:
+    """Read samples from a CSV that comes in portions; `bad_n` counts unreadable lines."""
 
     def __init__(self, where: str) -> None:
         self._where = where
         self._names: list[str] = []
-        self._lines = Lines()
+        self._lines = LineBuffer()
         self.clock, self.bad_n, self.first_bad = "", 0, ""
 
     def feed(self, data: bytes) -> list[Sample]:
-        """Take the next bytes; give the samples that are whole. Raises if the columns will not do."""
+        """Take the next bytes; return the complete samples. Raises `CaptureError` if columns are missing."""
         samples = []
         for line in self._lines.feed(data):
             if not self._names:
@@ -213,15 +213,15 @@ class Table:
         return Sample(t_s, None if contact is None else Label(contact, **known, pass_i=pass_i))
 
 
-class Gauge:
-    """Reads the lines of a force gauge: one number, Fz, or three, Fx Fy Fz, in N and with the signs of `Label`."""
+class GaugeLines:
+    """Read lines of a force gauge: one number, Fz, or three, Fx Fy Fz, in N and with the signs of `Label`."""
 
     def __init__(self) -> None:
-        self._lines = Lines()
+        self._lines = LineBuffer()
         self.bad_n, self.first_bad = 0, ""
 
     def feed(self, data: bytes, came_s: float) -> list[Sample]:
-        """Take the next bytes and when they came; give the forces of the lines that are whole."""
+        """Take the next bytes and their time; return the forces of the complete lines."""
         samples = []
         for line in self._lines.feed(data):
             try:
@@ -235,20 +235,20 @@ class Gauge:
         return samples
 
 
-class Dwells:
-    """Joins samples that stay touching at one place, or stay off, into dwells; forces and depths are means.
+class DwellBuilder:
+    """Join samples of one contact at one place, or of no contact, into dwells; forces and depths are means.
 
-    A touch of several `DWELL_MAX_s` becomes as many dwells, so that a recording that is killed has its labels too.
-    `short_n` counts touches too short to be one.
+    A contact of several `DWELL_MAX_s` becomes as many dwells, so that a killed recording has its labels too.
+    `short_n` counts contacts that are too short for a dwell.
     """
 
     def __init__(self) -> None:
         self._run: list[Sample] = []
-        self._cut: Sample | None = None  # where a touch that goes on was cut
+        self._cut: Sample | None = None  # where a contact that goes on was cut
         self.short_n = 0
 
     def feed(self, samples: Iterable[Sample]) -> Iterator[Dwell]:
-        """Take the next samples; give the dwells that are over."""
+        """Take the next samples; yield the dwells that are over."""
         for sample in samples:
             run = self._run
             if run and not _goes_on(run[0], run[-1], sample):
@@ -262,7 +262,7 @@ class Dwells:
                     self._cut = sample
 
     def close(self) -> Iterator[Dwell]:
-        """Give the dwell that the last samples make, if they last long enough to be one."""
+        """Yield the dwell of the last samples, if they last long enough."""
         lasts_s, run, self._run = self._lasts_s(), self._run, []
         rest = bool(run) and self._cut is not None and _goes_on(self._cut, self._cut, run[0])
         self._cut = None
@@ -271,8 +271,8 @@ class Dwells:
         elif run and run[0].label and run[0].label.contact and not rest:
             self.short_n += 1
 
-    def told(self) -> str:
-        """Say how many touches were too short; a table that has a row a change of state has no others."""
+    def summary(self) -> str:
+        """Say how many contacts were too short; a table with a row only at each change of state has no others."""
         if not self.short_n:
             return ""
         least = f"{DWELL_MIN_s:g} s from its first line to its last"
@@ -283,7 +283,7 @@ class Dwells:
 
 
 def mean_label(labels: list[Label]) -> Label:
-    """Give the label of the first, with the mean of each number that all have."""
+    """Return the first label, with the mean of each number that all have."""
     means: dict[str, Any] = {name: math.fsum(getattr(label, name) for label in labels) / len(labels) for name in LABELS}
     return labels[0]._replace(**means)
 
@@ -296,14 +296,14 @@ def _goes_on(first: Sample, last: Sample, sample: Sample) -> bool:
 
 
 def _touches(force_N: float) -> bool | None:
-    """Tell by the force whether the skin is touched; None where it comes or goes, or nothing is known."""
+    """Return whether a force is a contact; None between the thresholds, or for NaN."""
     if abs(force_N) >= CONTACT_N:
         return True
     return False if abs(force_N) < NOLOAD_N else None
 
 
 def _number(text: str) -> float:
-    """Read a number; raise `ValueError` for words and what overflows."""
+    """Parse a finite number; raise `ValueError` for anything else."""
     if not math.isfinite(number := float(text)) or "_" in text:
         raise ValueError(text)
     return number

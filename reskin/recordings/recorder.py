@@ -1,8 +1,7 @@
-"""Recording from a board: a port -> a capture folder that `reskin add` takes. Or the part that came, kept.
+"""Record a board as a capture folder that `reskin add` takes, with its labels if they come meanwhile.
 
-The header is written first and sealed last, into `<folder>.part`, which is renamed when the recording has ended: a
-killed recorder leaves a `.part` that can still be added, with the labels that had come. Refuses to know ports
-(`capture.port`), and where labels come from (`labelling`).
+The capture is written into `<folder>.part`, its header first, and renamed when the recording has ended: a killed
+recorder leaves a `.part` that can still be added, with the labels that had come.
 """
 
 import sys
@@ -18,8 +17,8 @@ from reskin import io
 from reskin.board.port import PortSettings, Recording, Report, Watch, record
 from reskin.errors import CaptureError
 from reskin.recordings.header import HEADER_FILE, Clock, Header, Wire, recorded, render, seal
-from reskin.recordings.label_sources import Desk, Labeller, Source
-from reskin.recordings.labels import ProbeTape
+from reskin.recordings.label_sources import LabelContext, LabelSource, LabelThread
+from reskin.recordings.labels import ProbeLogWriter
 from reskin.recordings.preparing import UNNAMED
 
 PROGRESS_s = 1.0
@@ -27,84 +26,83 @@ CAPTURES = Path("captures")
 
 
 @dataclass(frozen=True)
-class Told:
-    """What the user says of a recording to come; `scan` is the order of the rig's places: random, snake, or words.
-
-    `labels` is where its labels come from, if they come while it is recorded.
-    """
+class CaptureInfo:
+    """Facts for the header of a capture: names, the order of the rig's places (random, snake or text), and labels."""
 
     board: str
     skin: str
     scan: str
-    labels: Source | None = None
+    labels: LabelSource | None = None
 
 
 class Recorded(NamedTuple):
-    """What a port gave, what is told of the labels, and the error that ended these, if one did."""
+    """A finished recording, a summary of its labels, and the error that ended the labels, if one did."""
 
     stream: Recording
     labels: str
     failed: Exception | None
 
 
-UNTOLD = Told(UNNAMED, UNNAMED, "not stated")
+NO_INFO = CaptureInfo(UNNAMED, UNNAMED, "not stated")
 
 
 def record_capture(
-    port: str, folder: Path, *, told: Told, settings: PortSettings, report: Report, watch: Watch
+    port: str, folder: Path, *, info: CaptureInfo, settings: PortSettings, report: Report, watch: Watch
 ) -> Recorded:
-    """Record what a port sends as a native capture, and beside it what a source of labels says, until either ends."""
-    part, header = begin_capture(folder, told, wire=settings.wire, chips_n=settings.chips_n, by="reskin record")
-    stop, headers, labeller = threading.Event(), [header], None
+    """Record a port as a native capture, and labels if `info` has a source of them, until either ends."""
+    part, header = begin_capture(folder, info, wire=settings.wire, chips_n=settings.chips_n, by="reskin record")
+    stop, headers, label_thread = threading.Event(), [header], None
     try:
-        if told.labels is not None:
-            labeller = Labeller(told.labels, _desk(part, headers, stop))
+        if info.labels is not None:
+            label_thread = LabelThread(info.labels, _label_context(part, headers, stop))
         done = record(port, part, settings=settings, stop=stop, report=report, watch=watch)
     except CaptureError as error:
-        if labeller is not None:
-            labeller.end()
+        if label_thread is not None:
+            label_thread.end()
         io.remove(part)  # no frame came: there is nothing to keep
-        if labeller is not None and labeller.failed is not None:  # this ended the recording, before a frame came
-            raise labeller.failed from error
+        if (
+            label_thread is not None and label_thread.failed is not None
+        ):  # this ended the recording, before a frame came
+            raise label_thread.failed from error
         raise
-    said = labeller.end() if labeller is not None else ""
-    failed = labeller.failed if labeller is not None else None
+    summary = label_thread.end() if label_thread is not None else ""
+    failed = label_thread.failed if label_thread is not None else None
     if isinstance(failed, OSError) and failed.errno == ENOSPC:
         done = replace(done, ended="not written")
-    if done.ended != "not written":  # else there is no room for hashes either; the part can be added as it is
+    if done.ended != "not written":  # else the disk is full; the .part can be added as it is
         end_capture(folder, headers[-1])
-    return Recorded(done, said, failed)
+    return Recorded(done, summary, failed)
 
 
-def _desk(part: Path, headers: list[Header], stop: threading.Event) -> Desk:
-    """Lay out what a source of labels works with; its clock is the port's until it says that it has another."""
+def _label_context(part: Path, headers: list[Header], stop: threading.Event) -> LabelContext:
+    """Make the context of a source of labels; its clock is that of the arrivals until `mark` gives another."""
     offset_s = time.time() - time.monotonic()  # the system's clock may be set while we record
-    tape = ProbeTape(part)
+    writer = ProbeLogWriter(part)
 
     def unix_s() -> float:
         return offset_s + time.monotonic()
 
     def mark(stream_s: float, source_s: float) -> None:
-        with tape.held_open() as is_open:
-            if is_open:  # else the header is sealed, or soon will be
+        with writer.locked() as is_open:
+            if is_open:  # else the header is sealed
                 clock = headers[-1].clock.model_copy(update={"marks": ((stream_s, source_s),)})
                 headers[-1] = headers[-1].model_copy(update={"clock": clock})
                 io.write_text(part / HEADER_FILE, render(headers[-1]))
 
     now_s = unix_s()
     mark(now_s, now_s)
-    return Desk(tape, unix_s, stop, mark)
+    return LabelContext(writer, unix_s, stop, mark)
 
 
-def begin_capture(folder: Path, told: Told, *, wire: Wire, chips_n: int, by: str) -> tuple[Path, Header]:
-    """Make the folder that a stream is written into, with its header; it becomes `folder` at the end."""
+def begin_capture(folder: Path, info: CaptureInfo, *, wire: Wire, chips_n: int, by: str) -> tuple[Path, Header]:
+    """Make `<folder>.part` with its header, to write the stream into."""
     part = _part_of(folder)
     for path in (folder, part):
         if path.exists():
             raise CaptureError(path, "the capture's folder", "new", "one that is there", "Choose another --out.")
-    options = {"scan": told.scan} | ({"labels": told.labels.name} if told.labels is not None else {})
+    options = {"scan": info.scan} | ({"labels": info.labels.name} if info.labels is not None else {})
     header = recorded(
-        f"--out {folder.name}", capture=folder.name, board=told.board, skin=told.skin, layout="native",
+        f"--out {folder.name}", capture=folder.name, board=info.board, skin=info.skin, layout="native",
         wire=wire, chips_n=chips_n, options=options,
         clock=Clock(kind="arrivals", rate_hz=None, marks=()), protocol="as the probe log says",
         note=f"recorded by {by}; arrival times are unix seconds of the host",
@@ -115,7 +113,7 @@ def begin_capture(folder: Path, told: Told, *, wire: Wire, chips_n: int, by: str
 
 
 def end_capture(folder: Path, header: Header) -> None:
-    """Seal what was written, and give it its name."""
+    """Hash the files of `<folder>.part` into its header and rename it to `folder`."""
     seal(_part_of(folder), header)
     _part_of(folder).rename(folder)
 
@@ -125,12 +123,12 @@ def _part_of(folder: Path) -> Path:
 
 
 def new_folder() -> Path:
-    """Name a capture's folder after the time."""
+    """Return a new capture folder, named after the time."""
     return CAPTURES / time.strftime("%Y%m%d-%H%M%S")
 
 
 def print_progress(alarms: Callable[[], Sequence[str]]) -> Report:
-    """Make a report that writes rate, losses and alarms to stderr once a second; nothing where that is no terminal."""
+    """Return a report that prints rate, losses and alarms once a second, if stderr is a terminal."""
     start_s = last_s = time.monotonic()
     last_n = 0
 

@@ -23,7 +23,7 @@ from reskin.predicting import read_network
 from reskin.recordings import clocks, header, probe
 from reskin.recordings.header import PROBE_FILE, Wire
 from reskin.recordings.label_sources import Prompts, parse_places
-from reskin.recordings.labels import Dwell, Dwells, Gauge, ProbeTape, Table
+from reskin.recordings.labels import Dwell, DwellBuilder, GaugeLines, ProbeLogWriter, SampleTable
 from reskin.recordings.readers import READERS, sd_card
 from reskin.seeds import rng_for
 from tests.recordings.headers import AS_USUAL, make_header
@@ -96,7 +96,7 @@ def _log(data: bytes) -> None:
 
 def labels(data: bytes) -> None:
     """What a robot's program appends to its table, in portions: any of it makes a log that ingest takes, or none."""
-    table, dwells, cut_n = Table("labels"), Dwells(), 1 + data[0]
+    table, dwells, cut_n = SampleTable("labels"), DwellBuilder(), 1 + data[0]
     _write_log(
         dwell
         for first in range(1, len(data), cut_n)
@@ -106,7 +106,7 @@ def labels(data: bytes) -> None:
 
 def gauge(data: bytes) -> None:
     """What a force gauge says, a few bytes every 10 ms."""
-    lines, dwells, cut_n = Gauge(), Dwells(), 1 + data[0]
+    lines, dwells, cut_n = GaugeLines(), DwellBuilder(), 1 + data[0]
     _write_log(
         dwell
         for i, first in enumerate(range(1, len(data), cut_n))
@@ -118,13 +118,13 @@ def _write_log(dwells: Iterator[Dwell]) -> None:
     folder = FOLDER / "labels"
     folder.mkdir(exist_ok=True)
     (folder / PROBE_FILE).unlink(missing_ok=True)
-    tape = ProbeTape(folder)
+    writer = ProbeLogWriter(folder)
     try:
-        tape.write_all(dwells)
+        writer.write_all(dwells)
     finally:
-        tape.close()
-        if tape.touches_n:
-            assert len(probe.parse(folder / PROBE_FILE, "log")) >= 2 * tape.touches_n
+        writer.close()
+        if writer.touches_n:
+            assert len(probe.parse(folder / PROBE_FILE, "log")) >= 2 * writer.touches_n
 
 
 def typed(data: bytes) -> None:
@@ -133,7 +133,7 @@ def typed(data: bytes) -> None:
     if (places := parse_places(first)) is None:
         return
     prompts = Prompts(places, 0.0, lambda _: None, list, None, rng_for(0, "fuzz"))
-    label = prompts._answer(iter(words), 0)
+    label = prompts._read_label(iter(words), 0)
     assert label is None or not label.contact or (label.x_mm, label.y_mm) in places.xy_mm
 
 

@@ -16,7 +16,7 @@ from reskin.live.record import label_source, record_board
 from reskin.recordings import clocks, probe
 from reskin.recordings.header import ARRIVALS_FILE, HEADER_FILE, PROBE_FILE, STREAM_FILE, parse
 from reskin.recordings.ingest import open_capture
-from reskin.recordings.label_sources import Desk
+from reskin.recordings.label_sources import LabelContext
 from reskin.recordings.labels import Dwell
 from reskin.recordings.preparing import Labels, native
 from tests.live.boards import make_script, plugged_in
@@ -44,7 +44,7 @@ def held(monkeypatch, tmp_path):
             pass
         return Dwell(label, start_s, self.unix_s())
 
-    monkeypatch.setattr(Desk, "hold", hold)
+    monkeypatch.setattr(LabelContext, "hold", hold)
 
 
 def pokes():

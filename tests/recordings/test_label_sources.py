@@ -13,17 +13,17 @@ from reskin.errors import CaptureError, ParamsError
 from reskin.recordings import probe
 from reskin.recordings.header import PROBE_FILE
 from reskin.recordings.label_sources import (
-    Desk,
-    Forces,
-    Labeller,
+    ForceGauge,
+    LabelContext,
+    LabelSource,
+    LabelThread,
     Prompts,
-    Source,
     from_gauge,
     from_program,
     from_table,
     parse_places,
 )
-from reskin.recordings.labels import Label, ProbeTape
+from reskin.recordings.labels import Label, ProbeLogWriter
 from reskin.seeds import rng_for
 
 DWELL_s = 0.002
@@ -31,12 +31,12 @@ LONG_S = 120.0  # for what must not happen in a test that passes
 
 
 @pytest.fixture
-def desk(tmp_path):
+def context(tmp_path):
     marks = []
-    desk = Desk(ProbeTape(tmp_path), time.time, threading.Event(), lambda *mark: marks.append(mark))
-    desk.marks = marks
-    yield desk
-    desk.tape.close()
+    context = LabelContext(ProbeLogWriter(tmp_path), time.time, threading.Event(), lambda *mark: marks.append(mark))
+    context.marks = marks
+    yield context
+    context.writer.close()
 
 
 def log_of(folder):
@@ -49,48 +49,48 @@ def prompts(words, *, scan="random", forces=None, text="grid:3x2:4", dwell_s=DWE
     return asked, said
 
 
-def test_a_robots_program_moves_and_says_where_it_stands(desk, tmp_path):
+def test_a_robots_program_moves_and_says_where_it_stands(context, tmp_path):
     def pokes():
         for x_mm in (4.0, 12.0):
             yield Label(False)
             yield Label(True, x_mm, 8.0, Fz_N=0.5)
 
-    assert from_program(pokes(), DWELL_s).run(desk) == ""
-    assert desk.tape.touches_n == 2
+    assert from_program(pokes(), DWELL_s).run(context) == ""
+    assert context.writer.touches_n == 2
     log = log_of(tmp_path)
     assert log.x_mm[log.contact].tolist() == [4.0, 12.0]
     assert (log.t_end_s - log.t_start_s >= DWELL_s - 1e-5).all()
 
 
-def test_a_function_is_called_each_time_until_it_gives_none(desk, tmp_path):
+def test_a_function_is_called_each_time_until_it_gives_none(context, tmp_path):
     labels = [None, Label(True, 1.0, 1.0), Label(False)]
-    from_program(labels.pop, DWELL_s).run(desk)
+    from_program(labels.pop, DWELL_s).run(context)
     assert len(log_of(tmp_path)) == 2
 
 
-def test_what_is_no_label_and_a_robot_that_fails_end_the_labels_and_are_told(desk):
+def test_what_is_no_label_and_a_robot_that_fails_end_the_labels_and_are_told(context):
     def pokes():
         yield Label(False)
         raise RuntimeError("the robot is in its limits")
 
-    labeller = Labeller(from_program(pokes(), DWELL_s), desk)
-    labeller._thread.join()
-    assert labeller.end() == "0 touches labelled; labels ended: the robot is in its limits"
-    assert isinstance(labeller.failed, RuntimeError)
+    label_thread = LabelThread(from_program(pokes(), DWELL_s), context)
+    label_thread._thread.join()
+    assert label_thread.end() == "0 touches labelled; labels ended: the robot is in its limits"
+    assert isinstance(label_thread.failed, RuntimeError)
     with pytest.raises(ParamsError, match=r"must be reskin.lifted\(\) or reskin.touch\(...\); got 'lifted'"):
-        from_program(["lifted"], DWELL_s).run(Desk(desk.tape, time.time, threading.Event(), desk.mark))
+        from_program(["lifted"], DWELL_s).run(LabelContext(context.writer, time.time, threading.Event(), context.mark))
 
 
-def test_a_program_that_hangs_is_not_waited_for(desk):
+def test_a_program_that_hangs_is_not_waited_for(context):
     hung = threading.Event()
-    labeller = Labeller(Source("hangs", None, lambda _: str(hung.wait(30))), desk)
-    assert labeller.end(0.05) == "0 touches labelled"
+    label_thread = LabelThread(LabelSource("hangs", None, lambda _: str(hung.wait(30))), context)
+    assert label_thread.end(0.05) == "0 touches labelled"
     hung.set()
 
 
-def test_a_person_presses_the_places_shown_in_an_order_drawn_anew_each_pass(desk, tmp_path):
+def test_a_person_presses_the_places_shown_in_an_order_drawn_anew_each_pass(context, tmp_path):
     asked, said = prompts([""] * 24 + ["q"])
-    asked.run(desk)
+    asked.run(context)
     log = log_of(tmp_path)
     places = [tuple(xy) for xy in np.stack([log.x_mm, log.y_mm], axis=1)[log.contact].tolist()]
     assert set(places[:6]) == set(places[6:]) == {(x, y) for x in (0.0, 4.0, 8.0) for y in (0.0, 4.0)}
@@ -101,10 +101,10 @@ def test_a_person_presses_the_places_shown_in_an_order_drawn_anew_each_pass(desk
     assert "then place" in shown[0]
 
 
-def test_another_index_a_force_and_a_slip_of_the_finger_are_understood(desk, tmp_path):
+def test_another_index_a_force_and_a_slip_of_the_finger_are_understood(context, tmp_path):
     words = ["", "4", "", "0.8N", "", "2 1.5 n", "", "99", "what", "s", "", "q"]
     asked, said = prompts(words, scan="snake", text="line:5:2@1,8")
-    asked.run(desk)
+    asked.run(context)
     log = log_of(tmp_path)
     assert log.x_mm[log.contact].tolist() == [9.0, 3.0, 5.0]
     assert log.Fz_N[log.contact][1:] == pytest.approx([0.8, 1.5])
@@ -116,9 +116,9 @@ def test_another_index_a_force_and_a_slip_of_the_finger_are_understood(desk, tmp
     ("words", "x_mm", "force_N"),
     [("12N", 0, 12), ("10N", 0, 10), ("10.5N", 0, 10.5), ("3 2.5N", 3, 2.5), ("3", 3, np.nan), ("12", 12, np.nan)],
 )
-def test_a_force_is_never_cut_into_a_place_and_a_smaller_one(desk, tmp_path, words, x_mm, force_N):
+def test_a_force_is_never_cut_into_a_place_and_a_smaller_one(context, tmp_path, words, x_mm, force_N):
     asked, said = prompts(["", "3.5", "1 2", "12N3", "1.2.3N", "3 N N", words, "", "q"], scan="snake", text="line:13:1")
-    asked.run(desk)
+    asked.run(context)
     log = log_of(tmp_path)
     np.testing.assert_equal((log.x_mm[1], log.Fz_N[1]), (x_mm, force_N))
     assert len([line for line in said if "is no place" in line]) == 5
@@ -171,8 +171,8 @@ def telling(monkeypatch):
     return tell
 
 
-class Heard(Desk):
-    """A desk where a label holds until the gauge has said something, or is gone, however late the machine is."""
+class Heard(LabelContext):
+    """A context where a label holds until the gauge has said something, or is gone, however late the machine is."""
 
     gauge: Telling
 
@@ -182,43 +182,43 @@ class Heard(Desk):
         return held._replace(t_end_s=self.unix_s())
 
 
-def heard(desk, gauge):
-    beside = Heard(desk.tape, desk.unix_s, desk.stop, desk.mark)
+def heard(context, gauge):
+    beside = Heard(context.writer, context.unix_s, context.stop, context.mark)
     beside.gauge = gauge
     return beside
 
 
-def test_a_gauge_beside_the_keys_gives_each_touch_its_mean_force(desk, tmp_path, telling):
+def test_a_gauge_beside_the_keys_gives_each_touch_its_mean_force(context, tmp_path, telling):
     gauge = telling(repeat(b"0.4\n0.6\n"))
-    asked, _ = prompts(["", "", "q"], forces=Forces("gauge", 9600))
-    assert asked.run(heard(desk, gauge)) == ""
+    asked, _ = prompts(["", "", "q"], forces=ForceGauge("gauge", 9600))
+    assert asked.run(heard(context, gauge)) == ""
     log = log_of(tmp_path)
     assert log.Fz_N[log.contact] == pytest.approx(0.5)
 
 
-def test_touches_of_which_the_gauge_said_nothing_are_counted(desk, telling):
+def test_touches_of_which_the_gauge_said_nothing_are_counted(context, telling):
     telling(repeat(b""))
-    asked, _ = prompts(["", "", "", "0.8N", "", "", "q"], forces=Forces("gauge", 9600))
-    assert asked.run(desk) == "2 touches without a force: the gauge at gauge said none while they lasted"
+    asked, _ = prompts(["", "", "", "0.8N", "", "", "q"], forces=ForceGauge("gauge", 9600))
+    assert asked.run(context) == "2 touches without a force: the gauge at gauge sent none while they lasted"
 
 
-def test_a_gauge_that_is_unplugged_beside_the_keys_is_told_and_touches_go_on(desk, telling):
+def test_a_gauge_that_is_unplugged_beside_the_keys_is_told_and_touches_go_on(context, telling):
     gauge = telling([b"0.5\n"])
-    asked, _ = prompts(["", "", "", "0.8N", "q"], forces=Forces("gauge", 9600))
-    assert "gauge: the force gauge must be plugged in" in (told := asked.run(heard(desk, gauge)))
+    asked, _ = prompts(["", "", "", "0.8N", "q"], forces=ForceGauge("gauge", 9600))
+    assert "gauge: the force gauge must be plugged in" in (told := asked.run(heard(context, gauge)))
     assert "Forces are missing from then on" in told
-    assert desk.tape.touches_n == 2
+    assert context.writer.touches_n == 2
 
 
-def test_a_gauge_alone_tells_touches_by_force_and_that_it_was_unplugged(desk, tmp_path, telling):
+def test_a_gauge_alone_tells_touches_by_force_and_that_it_was_unplugged(context, tmp_path, telling):
     telling([b"0.00\n"] * 40 + [b"0.50\n"] * 40 + [b"oops\n"])
     ticks = count()  # a clock of its own: where the machine stalls, a touch of 0.5 s becomes several
-    desk = replace(desk, unix_s=lambda: 1e9 + 0.002 * next(ticks))
-    labeller = Labeller(from_gauge("gauge", 9600), desk)
-    labeller._thread.join()
+    context = replace(context, unix_s=lambda: 1e9 + 0.002 * next(ticks))
+    label_thread = LabelThread(from_gauge("gauge", 9600), context)
+    label_thread._thread.join()
     unplugged = "labels ended: gauge: the force gauge must be plugged in until the recording ends; got gone. What came"
-    assert unplugged in labeller.end()
-    assert isinstance(labeller.failed, CaptureError)
+    assert unplugged in label_thread.end()
+    assert isinstance(label_thread.failed, CaptureError)
     log = log_of(tmp_path)
     assert log.contact.tolist() == [False, True]
     assert log.Fz_N[1] == pytest.approx(0.5)
@@ -238,38 +238,38 @@ class Looks(threading.Event):
 
 
 @pytest.mark.parametrize("there", [False, True])
-def test_a_table_is_followed_as_it_grows_and_its_own_clock_is_marked(desk, tmp_path, there):
+def test_a_table_is_followed_as_it_grows_and_its_own_clock_is_marked(context, tmp_path, there):
     file, old = tmp_path / "robot.csv", "t_s,phase,x_mm,y_mm\n"
     rows = "".join(f"{7 + 0.1 * i:.1f},{phase},4,8\n" for i, phase in enumerate(["noload"] * 3 + ["contact"] * 3))
     if there:
         file.write_text(old + rows.replace("\n7.", "\n1."))
     looks = Looks()
-    labeller = Labeller(from_table(file), replace(desk, stop=looks))
+    label_thread = LabelThread(from_table(file), replace(context, stop=looks))
     wait_until(lambda: looks.looks_n)
     with file.open("a") as stream:
         stream.write(rows if there else old + rows)
     before_n = looks.looks_n
     wait_until(lambda: looks.looks_n > before_n + 1)  # the first may have been begun before
-    assert labeller.end(LONG_S) == "1 touches labelled"
+    assert label_thread.end(LONG_S) == "1 touches labelled"
     log = log_of(tmp_path)
     assert log.t_start_s.tolist() == pytest.approx([7.0, 7.3])
-    assert desk.marks[-1][1] == pytest.approx(7.5)
-    assert desk.marks[-1][0] == pytest.approx(time.time(), abs=LONG_S)
+    assert context.marks[-1][1] == pytest.approx(7.5)
+    assert context.marks[-1][0] == pytest.approx(time.time(), abs=LONG_S)
 
 
 @pytest.mark.parametrize(
     ("how", "said"),
     [("replaced", "another file in its place"), ("cut", r"10 bytes, of which \d+ were read"), ("removed", "no file")],
 )
-def test_a_table_that_does_not_go_on_ends_the_labels_with_a_sentence(desk, tmp_path, how, said):
+def test_a_table_that_does_not_go_on_ends_the_labels_with_a_sentence(context, tmp_path, how, said):
     file, header = tmp_path / "robot.csv", "t_s,phase\n"
     file.write_text(header)
-    labeller = Labeller(from_table(file), desk)
+    label_thread = LabelThread(from_table(file), context)
     for begin_s in range(int(LONG_S / 0.02)):
         with file.open("a") as stream:
             stream.write("".join(f"{begin_s}.{i},{'contact' if i > 4 else 'noload'}\n" for i in range(9)))
         time.sleep(0.02)
-        if desk.marks:  # what was there before is passed over
+        if context.marks:  # what was there before is passed over
             break
     if how == "replaced":
         (tmp_path / "new.csv").write_text(header)
@@ -278,7 +278,7 @@ def test_a_table_that_does_not_go_on_ends_the_labels_with_a_sentence(desk, tmp_p
         file.write_text(header)
     else:
         file.unlink()
-    labeller._thread.join(LONG_S)
-    told = labeller.end()
+    label_thread._thread.join(LONG_S)
+    told = label_thread.end()
     assert re.search(f"a table that is followed must be the same file, with rows appended; got {said}", told)
     assert not told.startswith("0 touches")

@@ -9,7 +9,16 @@ from hypothesis import strategies as st
 from reskin.errors import CaptureError
 from reskin.recordings import probe
 from reskin.recordings.header import PROBE_FILE
-from reskin.recordings.labels import Dwell, DWELL_MAX_s, Dwells, Gauge, Label, Lines, ProbeTape, Table
+from reskin.recordings.labels import (
+    Dwell,
+    DWELL_MAX_s,
+    DwellBuilder,
+    GaugeLines,
+    Label,
+    LineBuffer,
+    ProbeLogWriter,
+    SampleTable,
+)
 
 NUMBER = st.floats(-1e6, 1e6, width=32) | st.just(math.nan)
 LABEL = st.builds(Label, st.booleans(), *[NUMBER] * 6, st.integers(0, 9))
@@ -18,47 +27,47 @@ DWELL = st.builds(lambda label, start_s, lasts_s: Dwell(label, start_s, start_s 
 
 
 def test_a_touch_is_written_with_the_rest_before_it_and_not_before(tmp_path):
-    tape = ProbeTape(tmp_path)
-    tape.write(Dwell(Label(True, 1.0, 2.0), 0.0, 1.0))  # no rest before it
-    tape.write(Dwell(Label(False), 1.0, 2.0))
+    writer = ProbeLogWriter(tmp_path)
+    writer.write(Dwell(Label(True, 1.0, 2.0), 0.0, 1.0))  # no rest before it
+    writer.write(Dwell(Label(False), 1.0, 2.0))
     assert len((tmp_path / PROBE_FILE).read_text().splitlines()) == 1
-    tape.write(Dwell(Label(True, 4.0, 8.0, Fz_N=0.5, pass_i=1), 3.0, 4.0))
-    tape.write(Dwell(Label(True, 4.0, 8.0, Fz_N=0.7, pass_i=1), 4.0, 5.0))  # the touch goes on
-    tape.write(Dwell(Label(False), 4.5, 5.5))  # before the touch has ended
+    writer.write(Dwell(Label(True, 4.0, 8.0, Fz_N=0.5, pass_i=1), 3.0, 4.0))
+    writer.write(Dwell(Label(True, 4.0, 8.0, Fz_N=0.7, pass_i=1), 4.0, 5.0))  # the touch goes on
+    writer.write(Dwell(Label(False), 4.5, 5.5))  # before the touch has ended
     log = probe.parse(tmp_path / PROBE_FILE, "log")
     assert log.indentation.tolist() == [0, 0, 0]
     assert log.contact.tolist() == [False, True, True]
     assert log.pass_i.tolist() == [1, 1, 1]
     assert log.Fz_N[1:] == pytest.approx([0.5, 0.7])
     assert math.isnan(log.x_mm[0])
-    assert (tape.touches_n, tape.without_noload_n, tape.out_of_order_n) == (1, 1, 1)
-    tape.close()
-    tape.write(Dwell(Label(True, 1.0, 1.0), 8.0, 9.0))  # of a program that was not waited for
+    assert (writer.touches_n, writer.without_noload_n, writer.out_of_order_n) == (1, 1, 1)
+    writer.close()
+    writer.write(Dwell(Label(True, 1.0, 1.0), 8.0, 9.0))  # of a program that was not waited for
 
 
 def test_a_touch_that_goes_on_elsewhere_without_a_lift_is_left_out(tmp_path):
-    tape = ProbeTape(tmp_path)
+    writer = ProbeLogWriter(tmp_path)
     places = [(4.0, 8.0), (4.001, 8.0), (5.0, 8.0), (4.0, 9.0), (math.nan, 8.0), (4.0, 8.0)]
-    tape.write(Dwell(Label(False), 0.0, 1.0))
+    writer.write(Dwell(Label(False), 0.0, 1.0))
     for i, (x_mm, y_mm) in enumerate(places):
-        tape.write(Dwell(Label(True, x_mm, y_mm), i + 1.0, i + 2.0))
-    tape.close()
+        writer.write(Dwell(Label(True, x_mm, y_mm), i + 1.0, i + 2.0))
+    writer.close()
     log = probe.parse(tmp_path / PROBE_FILE, "log")
     assert log.t_start_s.tolist() == [0.0, 1.0, 2.0, 6.0]
-    assert (tape.touches_n, tape.without_noload_n) == (1, 3)
+    assert (writer.touches_n, writer.without_noload_n) == (1, 3)
 
 
 @settings(max_examples=60)
 @given(st.lists(DWELL, max_size=12))
 def test_any_labels_make_a_log_that_can_be_read(tmp_path_factory, dwells):
     folder = tmp_path_factory.mktemp("labels")
-    tape = ProbeTape(folder)
+    writer = ProbeLogWriter(folder)
     for dwell in dwells:
-        tape.write(dwell)
-    tape.close()
-    if tape.touches_n:
+        writer.write(dwell)
+    writer.close()
+    if writer.touches_n:
         log = probe.parse(folder / PROBE_FILE, "log")
-        assert len(set(log.indentation)) == tape.touches_n == (~log.contact).sum()
+        assert len(set(log.indentation)) == writer.touches_n == (~log.contact).sum()
 
 
 @pytest.mark.parametrize(
@@ -67,10 +76,10 @@ def test_any_labels_make_a_log_that_can_be_read(tmp_path_factory, dwells):
      (Label(True), math.nan), (Label(True), 1e15)],
 )  # fmt: skip
 def test_what_is_no_number_or_no_time_is_refused(tmp_path, label, end_s):
-    tape = ProbeTape(tmp_path)
+    writer = ProbeLogWriter(tmp_path)
     with pytest.raises(CaptureError, match="a label: .* must be"):
-        tape.write(Dwell(label, 0.0, end_s))
-    tape.close()
+        writer.write(Dwell(label, 0.0, end_s))
+    writer.close()
 
 
 HEAD = "unix_s,phase,x_mm,y_mm,Fz_N,note\n"
@@ -80,8 +89,8 @@ def rows(phase: str, first_s: float, n: int, x_mm: float, force_N: float = 0.0) 
     return "".join(f"{first_s + 0.1 * i:.1f},{phase},{x_mm},2,{force_N},\n" for i in range(n))
 
 
-def dwells_of(text: str, portion_n: int = 10**6) -> tuple[list[Dwell], Table]:
-    table, dwells, data = Table("log"), Dwells(), text.encode()
+def dwells_of(text: str, portion_n: int = 10**6) -> tuple[list[Dwell], SampleTable]:
+    table, dwells, data = SampleTable("log"), DwellBuilder(), text.encode()
     parts = [data[first : first + portion_n] for first in range(0, len(data), portion_n)]
     found = [dwell for part in parts for dwell in dwells.feed(table.feed(part))]
     return [*found, *dwells.close()], table
@@ -126,11 +135,11 @@ def test_without_a_phase_the_force_tells_and_a_force_between_is_neither():
 @pytest.mark.parametrize("head", ["x_mm,y_mm,Fz_N", "t_s,unix_s,Fz_N", "t_s,x_mm,y_mm", "t_s,t_s,Fz_N", ""])
 def test_columns_without_one_clock_or_a_touch_are_refused(head):
     with pytest.raises(CaptureError, match="row 1, the column names, must be"):
-        Table("log").feed(head.encode() + b"\n")
+        SampleTable("log").feed(head.encode() + b"\n")
 
 
 def test_a_gauge_sends_one_number_or_three_and_what_is_neither_is_counted():
-    gauge = Gauge()
+    gauge = GaugeLines()
     found = gauge.feed(b"0.50\r\n0.1 -0.2; 0.7\n1,2\nERR\n0.", 3.0) + gauge.feed(b"9\n", 4.0)
     assert [(one.t_s, one.label.Fz_N) for one in found] == [(3.0, 0.5), (3.0, 0.7), (4.0, 0.9)]
     assert (found[1].label.Fx_N, found[1].label.Fy_N) == (0.1, -0.2)
@@ -138,18 +147,18 @@ def test_a_gauge_sends_one_number_or_three_and_what_is_neither_is_counted():
 
 
 def test_a_line_without_end_is_not_kept():
-    lines = Lines()
+    lines = LineBuffer()
     for _ in range(1000):
         lines.feed(b"9" * 100)
         assert len(lines._rest) <= 4200
 
 
 def test_touches_too_short_to_be_one_are_counted_and_told_but_not_the_rest_of_a_long_one():
-    table, dwells = Table("robot.csv"), Dwells()
+    table, dwells = SampleTable("robot.csv"), DwellBuilder()
     changes = "t_s,phase,x_mm,y_mm\n0,noload,4,8\n1,contact,4,8\n2,noload,4,8\n3,contact,5,8\n4,noload,5,8\n"
     list(dwells.feed(table.feed(changes.encode())))
     assert dwells.short_n == 2
-    assert dwells.told().startswith("2 touches left out: one lasts 0.05 s")
+    assert dwells.summary().startswith("2 touches left out: one lasts 0.05 s")
     long = "".join(f"{5 + 0.01 * i:.2f},contact,4,8\n" for i in range(53))  # 0.52 s: a dwell, and 0.01 s
     assert len(list(dwells.feed(table.feed((long + "6,noload,4,8\n").encode())))) == 1
     assert dwells.short_n == 2
