@@ -131,7 +131,7 @@ def publish() -> None:
 
     for name in checked_plan().scenes:
         scene, results = read_scene(root, name), root / "data/results" / name
-        arms = {arm: root / "data/models" / name / arm for arm in scene.modelled}
+        arms = {arm: root / "data/models" / name / arm for arm in scene.model_stages}
         written = [results / f"{stage}.json" for stage in (*scene.curves.values(), *scene.analyses)]
         missing = [path for path in (*arms.values(), *written) if not path.exists()]
         if missing:

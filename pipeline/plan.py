@@ -11,107 +11,72 @@ from ruamel.yaml import YAML
 from pipeline import PLAN, SCENES
 from pipeline.manage.registry import Registry, read_registry
 from pipeline.manage.running import LOCKS, need_rest
-from pipeline.scenes import (
-    ANALYSES,
-    EXPERIMENTS,
-    LEARNING,
-    MAIN_PROTOCOL,
-    NOT_INGESTED,
-    TABLE_2,
-    Plan,
-    Scene,
-    read_plan,
-    read_scene,
-    stages,
-)
+from pipeline.scenes import ANALYSES, EXPERIMENTS, MAIN_PROTOCOL, TABLE_2, Plan, Scene, read_plan, read_scene, stages
 from reskin import io
 from reskin.errors import ParamsError
 from reskin.recordings.header import NAME
 
 HEADER = """\
-# Which scenes run, and over what each stage of dvc.yaml iterates. Generated from pipeline/scenes and data/captures.yaml
-# by `reskin scenes use` and `reskin add`: do not edit.
+# Which scenes run, and the items that each stage of dvc.yaml iterates over. Generated from pipeline/scenes and
+# data/captures.yaml by `reskin scenes use` and `reskin add`: do not edit.
 """
 MANY_N = 30  # captures of a recorded scene; with more, one stage reads them all (docs/growth.md)
+NOT_INGESTED = {"walk"}  # kinds of protocols that record no probe: their experiment reads the log as it is
 
 
 def make_plan(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, Any]:
-    """Derive the plan: what each scene runs, its recorded captures, and the items of every stage.
+    """Derive the plan: the experiments of each scene, its recorded captures, and the items of every stage.
 
-    A stage iterates over names of scenes; over captures by folder (simulate, ingest); or over names of scenes, each
-    with the folder of readings that its experiment uses. What no scene runs has no items, and so no stage.
+    Most stages iterate over names of scenes. `simulate` and `ingest_simulated` iterate over folders of captures, one
+    for each protocol of a scene, and `ingest` over recorded captures. An experiment on the captures of a protocol that
+    recorded scenes may run too (`drift`) iterates over scenes, each with its folder of captures.
     """
-    captures = _captures(scenes, registry)
+    captures = {name: sorted(registry.captures.get(name, {})) for name in scenes}
+    for name, scene in scenes.items():
+        if scene.source == "recorded" and not captures[name]:
+            remedy = f"Try: reskin add RECORDING --scene {name} ..."
+            raise ParamsError(f"scene {name}", "recorded captures", "one or more", "none", remedy)
     many = [name for name in scenes if len(captures[name]) > MANY_N]
     pairs = [(name, capture) for name in scenes if name not in many for capture in captures[name]]
     ingest = {f"{name}-{capture}": {"scene": name, "capture": capture} for name, capture in pairs}
     if len(ingest) < len(pairs):
         rule, got = "unlike any other", "two that read the same"
         raise ParamsError("stage ingest", "scene-capture", rule, got, "Rename a scene.")
-    simulated = _folders(scenes)
+    simulate: dict[str, dict[str, str]] = {}
+    ingest_simulated: dict[str, str] = {}
+    for name, scene in scenes.items():
+        for protocol, settings in scene.simulate.protocols.items() if scene.simulate else ():
+            folder = _folder(name, protocol)
+            if folder in simulate or (folder in scenes and folder != name):
+                rule = "unlike any scene and any other's protocol"
+                raise ParamsError(f"scene {name}", "a protocol's folder", rule, folder, "Rename one.")
+            simulate[folder] = {"scene": name, "protocol": protocol}
+            if settings.kind not in NOT_INGESTED:
+                ingest_simulated[folder] = name
     items: dict[str, Any] = {
-        "simulate": simulated,
-        "ingest_simulated": {
-            folder: item
-            for folder, item in simulated.items()
-            if _kind(scenes[item["scene"]], item["protocol"]) not in NOT_INGESTED
-        },
-        "ingest": ingest,
-        "ingest_many": many,
-        "describe": list(scenes),
-        "split": list(scenes),
-    }
-    for stage in stages(EXPERIMENTS, *LEARNING, "study"):
+        "simulate": simulate, "ingest_simulated": ingest_simulated, "ingest": ingest, "ingest_many": many,
+        "describe": list(scenes), "split": list(scenes),
+    }  # fmt: skip
+    for stage in (*stages(EXPERIMENTS, "models", "curve", "other", "study"), *ANALYSES):
         items[stage] = [name for name, scene in scenes.items() if scene.runs(stage)]
-    for name in ANALYSES:
-        protocol = EXPERIMENTS[name].protocol
-        running = [scene for scene in scenes if name in scenes[scene].experiments]
-        if protocol is None:
-            items[name] = running
-        else:
-            items[name] = {
-                scene: scene if scenes[scene].simulate is None else _folder(scene, protocol) for scene in running
+    for one in EXPERIMENTS.values():
+        if one.protocol is not None and one.recorded:
+            items[one.stage] = {
+                name: _folder(name, one.protocol) if scenes[name].simulate else name for name in items[one.stage]
             }
     items["table2"] = [name for name, scene in scenes.items() if {*TABLE_2.values()} <= {*scene.experiments}]
-    items |= {stage: list(scenes) for stage in ("report", "publish")}
+    items |= {"report": list(scenes), "publish": list(scenes)}
     return {
         "scenes": {name: list(scene.experiments) for name, scene in scenes.items()},
         "captures": captures,
         "held_out": {name: list(scene.with_folds) for name, scene in scenes.items()},
-        "models": {name: scene.modelled for name, scene in scenes.items()},
+        "models": {name: scene.model_stages for name, scene in scenes.items()},
         "stages": items,
     }
 
 
-def _captures(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, list[str]]:
-    captures = {name: sorted(registry.captures.get(name, {})) for name in scenes}
-    for name, scene in scenes.items():
-        if scene.source == "recorded" and not captures[name]:
-            remedy = f"Try: reskin add RECORDING --scene {name} ..."
-            raise ParamsError(f"scene {name}", "recorded captures", "one or more", "none", remedy)
-    return captures
-
-
-def _kind(scene: Scene, protocol: str) -> str:
-    assert scene.simulate is not None, "only a simulated scene has folders by protocol"
-    return scene.simulate.protocols[protocol].kind
-
-
 def _folder(scene: str, protocol: str) -> str:
     return scene if protocol == MAIN_PROTOCOL else f"{scene}-{protocol}"
-
-
-def _folders(scenes: Mapping[str, Scene]) -> dict[str, dict[str, str]]:
-    """Name the folder of each protocol's captures: the scene's own for the main one."""
-    folders: dict[str, dict[str, str]] = {}
-    for name, scene in scenes.items():
-        for protocol in scene.simulate.protocols if scene.simulate is not None else ():
-            folder = _folder(name, protocol)
-            if folder in folders or (folder in scenes and folder != name):
-                rule = "unlike any scene and any other's protocol"
-                raise ParamsError(f"scene {name}", "a protocol's folder", rule, folder, "Rename one.")
-            folders[folder] = {"scene": name, "protocol": protocol}
-    return folders
 
 
 def scene_names(root: Path) -> list[str]:
@@ -121,7 +86,7 @@ def scene_names(root: Path) -> list[str]:
 
 
 def scene_file(root: Path, name: str) -> Path:
-    """The file of a scene; raise if there is none."""
+    """Return the file of a scene; raise `ParamsError` if there is none."""
     known = scene_names(root)
     if name not in known:
         remedy = f"Check the name, or copy a scene: {SCENES}/{name}.yaml, or reskin add --like SCENE."
@@ -131,9 +96,9 @@ def scene_file(root: Path, name: str) -> Path:
 
 @contextmanager
 def copied(root: Path, name: str, like: str | None) -> Iterator[None]:
-    """Write scene `name` as a copy of scene `like`, and take it away again if the block fails; without `like`, nothing.
+    """Write scene `name` as a copy of scene `like`, and remove it if the block fails; without `like`, do nothing.
 
-    Comments go along, but for those above the first word, which tell of the other scene.
+    Comments are copied, except those above the first setting, which describe the other scene.
     """
     if like is None:
         yield
@@ -145,11 +110,10 @@ def copied(root: Path, name: str, like: str | None) -> Iterator[None]:
     if target.exists():
         remedy = "Leave out --like to add to it."
         raise ParamsError(f"--like {like}", "the new scene", "a free name", f"{name}, which is there", remedy)
-    words = original.read_text(encoding="utf-8").splitlines(keepends=True)
-    told = next(i for i, line in enumerate(words) if not line.startswith("#"))
-    io.write_text(
-        target, "".join([f"# Scene {name}: a copy of scene {like}, by `reskin add --like`.\n", *words[told:]])
-    )
+    lines = original.read_text(encoding="utf-8").splitlines(keepends=True)
+    first_i = next(i for i, line in enumerate(lines) if not line.startswith("#"))
+    header = f"# Scene {name}: a copy of scene {like}, by `reskin add --like`.\n"
+    io.write_text(target, "".join([header, *lines[first_i:]]))
     try:
         yield
     except BaseException:
@@ -158,11 +122,11 @@ def copied(root: Path, name: str, like: str | None) -> Iterator[None]:
 
 
 def use(root: Path, names: Sequence[str]) -> None:
-    """Let `dvc repro` run exactly these scenes; raise if it runs now, as stages read the plan when they begin."""
+    """Write the plan of exactly these scenes; raise if `dvc repro` runs, as its stages read the plan."""
     need_rest(root)
     yaml = YAML()
     yaml.width = 120
-    document = {key: _flow(value) for key, value in plan_of(root, names).items()}
+    document = {key: _in_short_lines(value) for key, value in plan_of(root, names).items()}
     with io.replacing(root / PLAN) as temporary, temporary.open("w", encoding="utf-8") as stream:
         stream.write(HEADER)
         yaml.dump(document, stream)
@@ -170,10 +134,10 @@ def use(root: Path, names: Sequence[str]) -> None:
 
 
 def _keep_outputs(root: Path) -> None:
-    """Let the outputs of scenes that leave the plan stay in the working tree.
+    """Make DVC leave the outputs of scenes that left the plan in the working tree.
 
-    DVC lists the outputs that it wrote; `dvc checkout`, `dvc exp run` and `dvc exp apply` delete those that no stage of
-    the current plan writes. Outputs that are not listed are left alone.
+    DVC lists the outputs that it wrote; `dvc checkout`, `dvc exp run` and `dvc exp apply` delete those on the list that
+    no stage of the current plan writes.
     """
     if not (root / LOCKS).is_dir():  # DVC has not run here
         return
@@ -185,11 +149,11 @@ def _keep_outputs(root: Path) -> None:
 
 
 def check(root: Path) -> Plan:
-    """Return the plan; raise if it is not that of its scenes, or if a scene or params.yaml is wrong."""
+    """Read the plan; raise `ParamsError` if it is out of date, or if a scene or params.yaml is wrong."""
     plan = read_plan(root / PLAN)
     if plan.model_dump(mode="json") != plan_of(root, list(plan.scenes)):
         remedy = f"Try: reskin scenes use {' '.join(plan.scenes)}"
-        raise ParamsError(root / PLAN, "the plan", "what its scenes ask for", "an older one", remedy)
+        raise ParamsError(f"{root / PLAN} is out of date: its scenes or captures have changed since. {remedy}")
     return plan
 
 
@@ -199,8 +163,8 @@ def plan_of(root: Path, names: Sequence[str]) -> dict[str, Any]:
     return make_plan(scenes, read_registry(root))
 
 
-def _flow(value: Any) -> Any:
-    """Let ruamel write short lists on one line."""
+def _in_short_lines(value: Any) -> Any:
+    """Make ruamel write lists, and mappings that hold plain values only, on one line."""
     from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
     if isinstance(value, list):
@@ -208,8 +172,8 @@ def _flow(value: Any) -> Any:
         sequence.fa.set_flow_style()
         return sequence
     if isinstance(value, dict):
-        mapping = CommentedMap({key: _flow(item) for key, item in value.items()})
-        if not value:
+        mapping = CommentedMap({key: _in_short_lines(item) for key, item in value.items()})
+        if all(isinstance(item, str) for item in value.values()):
             mapping.fa.set_flow_style()
         return mapping
     return value

@@ -1,7 +1,6 @@
 """Settings of a scene: its own file, `params.yaml`, and the nominal skin of the library, each read once.
 
-A stage receives them as one `Settings` and parses the sections that it needs into typed models. `dvc.yaml` lists the
-same sections as the stage's parameters (tests/test_dvc_yaml.py compares the two).
+`dvc.yaml` lists the sections that a stage parses as its parameters (tests/test_settings.py compares the two).
 """
 
 from collections.abc import Mapping
@@ -17,7 +16,6 @@ from reskin.errors import ParamsError
 from reskin.models.recipe import HEADLINE, AdaptationWithBase, AugmentedRecipe, Name, Recipe
 from reskin.simulation.defaults import NOMINAL, SHARED
 
-PLANNED = ("captures", "held_out", "models")  # of each scene in the plan
 Section = TypeVar("Section", bound=Strict)
 Seed = Annotated[int, Field(ge=0)]
 Count = Annotated[int, Field(ge=1)]
@@ -45,11 +43,12 @@ class Adaptations(Strict):
 
 @dataclass(frozen=True)
 class Settings:
-    """The settings of a scene.
+    """The settings of a scene; a stage parses the sections that it needs into typed models.
 
-    scene: name of the scene. where: its file, for error messages. of_scene: the content of that file. shared: the
-    content of `params.yaml` and of the library's nominal skin. From the plan: the names of its recorded captures, of
-    what holds rows out, and of the stages that write models.
+    where: the scene's file, for error messages. of_scene: its content.
+    shared: the content of `params.yaml` and of the library's nominal skin.
+    captures: names of its recorded captures; none if it is simulated.
+    held_out: its experiments that have folds of their own. models: its stages that write models.
     """
 
     scene: str
@@ -108,14 +107,14 @@ class Settings:
         return found
 
     def expand_training(self, section: Mapping[str, Any], where: str) -> dict[str, Any]:
-        """Replace the name of a shared recipe and the differences of its variants by whole recipes."""
+        """Replace the name of a shared recipe, and the changes of its variants, by complete recipes."""
         section = dict(section)
         return expand_variants(section, self.row("recipes", take(section, "recipe", where)), where)
 
     def captures_in(self, indentations: Path) -> list[str]:
-        """Name the captures of a folder of readings: those registered if recorded, all that are there if simulated.
+        """Return the names of the captures in a folder of readings.
 
-        The registry decides for recorded ones, so that the file of a removed capture does not come back.
+        Those of a recorded scene come from the registry, so that a file left by a removed capture is not read.
         """
         return sorted(self.captures) or sorted(file.stem for file in indentations.glob("*.parquet"))
 
@@ -124,8 +123,8 @@ def read_settings(scene: str, root: Path = Path()) -> Settings:
     """Read the settings of a scene of a checkout."""
     file, plan = root / SCENES / f"{scene}.yaml", root / PLAN
     planned = read_yaml(plan) if plan.is_file() else {}
-    captures, held_out, models = (tuple(planned.get(key, {}).get(scene, ())) for key in PLANNED)
-    return Settings(scene, str(file), read_yaml(file), read_shared_files(root), captures, held_out, models)
+    lists = {key: tuple(planned.get(key, {}).get(scene, ())) for key in ("captures", "held_out", "models")}
+    return Settings(scene, str(file), read_yaml(file), read_shared_files(root), **lists)
 
 
 def read_shared_files(root: Path = Path()) -> dict[str, Any]:
@@ -142,11 +141,11 @@ def take(section: dict[str, Any], key: str, where: str) -> Any:
 
 
 def expand_variants(section: Mapping[str, Any], shared: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Replace `steps_n` and `variants` of a section by `recipes`: the headline, and each variant in full."""
+    """Replace `steps_n` and `variants` of a section by `recipes`: the headline recipe, and every variant of it."""
     section = dict(section)
     headline = dict(shared) | {"steps_n": take(section, "steps_n", where)}
     variants = take(section, "variants", where)
     if HEADLINE in variants:
-        rule = f"other than {HEADLINE}, by which tables call the section's own recipe"
+        rule = f"other than {HEADLINE}, the name of the section's own recipe in tables"
         raise ParamsError(f"{where}.variants", "a variant's name", rule, HEADLINE, "Choose another name.")
     return section | {"recipes": {HEADLINE: headline} | {name: headline | own for name, own in variants.items()}}

@@ -1,8 +1,7 @@
 """Scenes for tests, as plain words, and the settings that a stage has of them."""
 
-from pipeline.scenes import Scene, SceneExperiments, check_scene
+from pipeline.scenes import EXPERIMENTS, Scene, check_scene, stages
 from pipeline.settings import Settings
-from reskin.config import parse
 from tests.recordings.headers import AS_USUAL
 
 RECIPE = {
@@ -92,8 +91,10 @@ def asking(*experiments: str, **changes: object) -> dict[str, object]:
 
 def settings(scene: dict[str, object], name: str = "tiny", **shared: object) -> Settings:
     """All settings of a scene, as a stage reads them."""
-    asked = parse(SceneExperiments, {key: scene[key] for key in ("source", "experiments")}, name)
-    return Settings(name, f"{name}.yaml", scene, SHARED | shared, (), asked.with_folds, tuple(asked.modelled))
+    experiments = scene["experiments"]
+    held_out = tuple(one for one in experiments if EXPERIMENTS[one].folds is not None)
+    models = tuple(stages(experiments, "models"))
+    return Settings(name, f"{name}.yaml", scene, SHARED | shared, (), held_out, models)
 
 
 def check(scene: dict[str, object]) -> Scene:

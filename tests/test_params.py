@@ -3,13 +3,14 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.scenes import LEARNING, Scene, parse_scene, read_plan, read_scene, read_shared, stages
+from pipeline.scenes import Scene, parse_scene, read_plan, read_scene, read_shared, stages
 from reskin.config import read_yaml
 from reskin.errors import ParamsError
 from tests.scenes import ADAPTATIONS, DRAWN_WITH, SECTIONS, TRAINING, asking, check, recorded
 
 ROOT = Path(__file__).resolve().parents[1]
-PAPERS_CLAIM = ("lobo", "triplet", "adapt")  # the experiments that those of adaptation go on from
+ADAPTED = ("lobo", "triplet", "adapt")  # the experiments that those of adaptation need
+LEARNING = ("models", "curve", "other")
 
 
 @pytest.mark.parametrize("file", sorted((ROOT / "pipeline/scenes").glob("*.yaml")), ids=lambda file: file.stem)
@@ -31,9 +32,9 @@ def test_the_params_of_the_checkout_are_legal():
         ({"experiments": ["lobbo"]}, r"experiments.0 must be .*'lobo'.*; got 'lobbo'"),
         ({"experiments": []}, "experiments must"),
         ({"source": "simulated"}, "section simulate stands in a scene if and only if its source is simulated"),
-        ({"train_single": TRAINING}, "of the scene nothing asks train_single"),
+        ({"train_single": TRAINING}, "no experiment uses train_single of the scene"),
         ({"experiments": ["lobo", "transfer"], "train_single": TRAINING}, "split lacks transfer_skins_n"),
-        ({"split": {"transfer_skins_n": 3}}, "of split nothing asks transfer_skins_n"),
+        ({"split": {"transfer_skins_n": 3}}, "no experiment uses transfer_skins_n of split"),
         ({"train_multi": TRAINING | {"recipe": "other"}}, "a row of recipes must be one of .*; got 'other'"),
         (
             {"train_multi": TRAINING | {"steps_n": 0}},
@@ -46,7 +47,7 @@ def test_the_params_of_the_checkout_are_legal():
         ({"train_multi": TRAINING | {"variants": {"paper": {}}}}, "a variant's name must be other than paper"),
     ],
 )
-def test_a_wrong_scene_is_one_sentence_that_names_the_parameter(changes, sentence):
+def test_a_wrong_scene_is_refused_with_the_name_of_the_parameter(changes, sentence):
     with pytest.raises(ParamsError, match=sentence):
         check(recorded(**changes))
 
@@ -60,22 +61,21 @@ def scene(*experiments: str, **changes: object) -> Scene:
     [
         ("triplet", ("lobo",)),
         ("adapt", ("lobo", "triplet")),
-        ("pokes", PAPERS_CLAIM),
-        ("sensors", PAPERS_CLAIM),
+        ("pokes", ADAPTED),
+        ("sensors", ADAPTED),
         ("baselines", ("lobo",)),
         ("labels", ("lobo",)),
         ("audit", ("lobo",)),
-        ("choice", PAPERS_CLAIM),
+        ("choice", ADAPTED),
         ("contacts", ("lobo",)),
     ],
 )
-def test_an_experiment_that_goes_on_from_others_is_legal_with_them_and_refused_without_the_last(experiment, others):
+def test_an_experiment_without_one_that_it_needs_is_refused(experiment, others):
     assert experiment in scene(*others, experiment).experiments
     with pytest.raises(ParamsError) as refused:
         scene(*others[:-1], experiment)
-    assert str(refused.value) == (
-        f"scene.yaml: a scene that asks {experiment} also asks ['{others[-1]}'], on which it goes on. Mend it there."
-    )
+    message = f"scene.yaml: experiment {experiment} needs {others[-1]} in the same scene. Mend it there."
+    assert str(refused.value) == message
 
 
 @pytest.mark.parametrize(
@@ -88,25 +88,25 @@ def test_an_experiment_that_goes_on_from_others_is_legal_with_them_and_refused_w
         ({"policies": ["each", "each"]}, "policies names each policy once"),
     ],
 )
-def test_windows_that_contradict_each_other_are_refused(changes, sentence):
+def test_contradictory_windows_are_refused(changes, sentence):
     with pytest.raises(ParamsError, match=sentence):
         scene("lobo", "drift", drift=SECTIONS["drift"]["drift"] | changes)
 
 
-def test_an_experiment_on_skins_that_only_a_simulator_has_is_refused_for_recorded_ones():
-    with pytest.raises(ParamsError, match=r"experiments \['sensitivity'\] are asked of simulated scenes only"):
+def test_an_experiment_on_simulated_skins_is_refused_for_recorded_scenes():
+    with pytest.raises(ParamsError, match="only a simulated scene can run experiments sensitivity"):
         parse_scene(recorded(experiments=["lobo", "sensitivity"]), "scene.yaml")
 
 
 @pytest.mark.parametrize("dropped", ["drift", "shear"])
-def test_an_experiment_that_is_switched_off_takes_its_section_and_its_captures_along(dropped):
+def test_a_removed_experiment_leaves_neither_its_section_nor_its_protocol(dropped):
     own = read_yaml(ROOT / "pipeline/scenes/ci.yaml")
     own["experiments"].remove(dropped)
     own.pop(dropped)
     if dropped == "drift":  # its captures are asked for variation as well
         parse_scene(own, "ci.yaml")
         return
-    with pytest.raises(ParamsError, match="of simulate.protocols nothing asks drag"):
+    with pytest.raises(ParamsError, match="no experiment uses drag of simulate.protocols"):
         parse_scene(own, "ci.yaml")
     own["simulate"]["protocols"].pop("drag")
     parse_scene(own, "ci.yaml")
@@ -116,7 +116,7 @@ def test_an_experiment_that_is_switched_off_takes_its_section_and_its_captures_a
     "unit",
     ["train_multi", "drift", "simulate-wear", "ingest_simulated-wear", "simulate", "report", "neglected_effects"],
 )
-def test_what_a_stage_cost_counts_as_long_as_its_experiment_is_asked(unit):
+def test_a_scene_runs_the_stages_of_its_experiments_and_protocols(unit):
     own = read_yaml(ROOT / "pipeline/scenes/ci.yaml")
     assert parse_scene(own, "ci.yaml").runs(unit)
     gone = ("drift", "variation")
@@ -129,30 +129,30 @@ def test_what_a_stage_cost_counts_as_long_as_its_experiment_is_asked(unit):
     assert left.runs(unit) == (unit in ("train_multi", "simulate", "report"))
 
 
-def test_all_that_an_experiment_lacks_is_named_at_once():
-    with pytest.raises(ParamsError, match=r"asks choice also asks \['adapt', 'triplet'\], on which it goes on"):
+def test_all_missing_experiments_are_named_at_once():
+    with pytest.raises(ParamsError, match="experiment choice needs adapt, triplet in the same scene"):
         scene("lobo", "choice")
 
 
-ALL = (*PAPERS_CLAIM, "transfer", "pokes", "sensors", "labels", "baselines", "audit", "choice")
+ALL = (*ADAPTED, "transfer", "pokes", "sensors", "labels", "baselines", "audit", "choice")
 
 
-def test_a_scene_may_ask_everything_and_names_the_stages_that_answer():
+def test_a_scene_may_run_all_experiments_and_names_their_stages():
     asked = scene(*ALL)
     assert set(stages(asked.experiments, *LEARNING)) == {
         "train_single", "train_multi", "train_triplet", "adapt", "sweep_pokes", "sweep_sensors", "train_classical",
         "few_labels", "audit",
     }  # fmt: skip
-    assert asked.modelled == ["train_single", "train_multi", "train_triplet", "adapt"]
+    assert asked.model_stages == ["train_single", "train_multi", "train_triplet", "adapt"]
     assert asked.curves == {
         "pokes": "sweep_pokes", "sensors": "sweep_sensors", "baselines": "train_classical", "labels": "few_labels"
     }  # fmt: skip
     assert set(asked.with_folds) == {"lobo", "transfer", "sensors", "labels"}  # these have folds of their own
 
 
-def test_a_scene_that_asks_one_experiment_has_one_stage_and_no_curve():
+def test_a_scene_of_one_experiment_has_one_stage_and_no_curve():
     asked = scene("lobo")
-    assert (stages(asked.experiments, *LEARNING), asked.modelled, asked.curves) == (
+    assert (stages(asked.experiments, *LEARNING), asked.model_stages, asked.curves) == (
         ["train_multi"],
         ["train_multi"],
         {},
@@ -160,17 +160,17 @@ def test_a_scene_that_asks_one_experiment_has_one_stage_and_no_curve():
 
 
 @pytest.mark.parametrize("experiment", [one for one in ALL if SECTIONS[one]])
-def test_a_section_stands_in_a_scene_if_and_only_if_its_experiment_is_asked(experiment):
+def test_a_scene_has_a_section_if_and_only_if_it_runs_its_experiment(experiment):
     ((section, words),) = SECTIONS[experiment].items()
     lacking = {name: value for name, value in asking(*ALL).items() if name != section}
     with pytest.raises(ParamsError, match=f"the scene lacks {section}. Mend it there."):
         parse_scene(lacking, "scene.yaml")
-    with pytest.raises(ParamsError, match=f"of the scene nothing asks {section}[.;]"):
+    with pytest.raises(ParamsError, match=f"no experiment uses {section} of the scene[.;]"):
         scene("single_temporal" if experiment == "lobo" else "lobo", **{section: words})
 
 
 @pytest.mark.parametrize("experiment", DRAWN_WITH)
-def test_split_holds_what_draws_the_folds_of_an_experiment_and_nothing_else(experiment):
+def test_split_has_the_keys_of_the_folds_of_its_experiments_and_no_others(experiment):
     own, others = DRAWN_WITH[experiment], ("lobo", "triplet", *(["adapt"] if experiment == "sensors" else []))
     asked = asking(*others, experiment)
     parse_scene(asked, "scene.yaml")
@@ -179,7 +179,7 @@ def test_split_holds_what_draws_the_folds_of_an_experiment_and_nothing_else(expe
         lacking = {name: value for name, value in asked["split"].items() if name != key}
         with pytest.raises(ParamsError, match=f"split lacks {key}"):
             parse_scene(asked | {"split": lacking}, "scene.yaml")
-        with pytest.raises(ParamsError, match=f"of split nothing asks {key}"):
+        with pytest.raises(ParamsError, match=f"no experiment uses {key} of split"):
             parse_scene(unasked | {"split": unasked["split"] | {key: value}}, "scene.yaml")
 
 
@@ -193,22 +193,22 @@ def test_split_holds_what_draws_the_folds_of_an_experiment_and_nothing_else(expe
         ({"sweep_pokes": {"pokes_n": [8], "boards_n": 0}}, "sweep_pokes: boards_n must be greater than or equal to 1"),
     ],
 )
-def test_a_wrong_setting_of_an_experiment_is_one_sentence(changes, sentence):
+def test_a_wrong_setting_of_an_experiment_is_refused(changes, sentence):
     with pytest.raises(ParamsError, match=sentence):
         scene(*ALL, **changes)
 
 
-def test_all_that_a_copied_scene_holds_too_much_or_too_little_is_named_at_once():
+def test_all_missing_and_unused_settings_of_a_scene_are_named_at_once():
     words = read_yaml(ROOT / "pipeline/scenes/ci.yaml") | {"experiments": ["lobo", "sensitivity"]}
     words["split"] = {}
     words["simulate"]["protocols"].pop("glass")
     with pytest.raises(ParamsError) as refused:
         parse_scene(words, "ci.yaml")
-    assert "nothing asks adapt, ambient, audit, contacts, drift" in str(refused.value)
-    assert "simulate.protocols lacks glass; of simulate.protocols nothing asks drag, flexible" in str(refused.value)
+    assert "no experiment uses adapt, ambient, audit, contacts, drift" in str(refused.value)
+    assert "simulate.protocols lacks glass; no experiment uses drag, flexible" in str(refused.value)
 
 
-def test_what_is_not_written_is_an_error_and_no_default():
+def test_settings_have_no_defaults():
     words = recorded()
     del words["seed"]
     with pytest.raises(ParamsError, match="scene.yaml: seed must be given; got nothing"):
@@ -229,7 +229,7 @@ def test_yaml_reads_exponents_as_numbers(tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"a: [1", b"a: 1\na: 2\n", b"\xff\xfe\x00"])
-def test_broken_yaml_is_one_sentence(tmp_path, content):
+def test_broken_yaml_is_refused(tmp_path, content):
     (tmp_path / "a.yaml").write_bytes(content)
     with pytest.raises(ParamsError, match="a.yaml: the file must be YAML"):
         read_yaml(tmp_path / "a.yaml")
@@ -240,15 +240,15 @@ def test_a_missing_file_is_named(tmp_path):
         read_yaml(tmp_path / "none.yaml")
 
 
-def test_a_base_that_is_no_recipe_of_train_triplet_is_refused_at_once():
+def test_a_base_that_is_no_recipe_of_train_triplet_is_refused():
     scene = copy.deepcopy(asking("lobo", "triplet", "adapt"))
     scene["adapt"]["base"] = "nope"
     with pytest.raises(ParamsError, match=r"adapt: base of paper must be one of \['paper'\]; got 'nope'"):
         check(scene)
 
 
-def test_an_experiment_without_the_one_it_goes_on_from_names_that_one():
+def test_adaptation_without_its_training_is_refused():
     scene = asking("lobo", "triplet", "adapt")
     scene["experiments"] = ["lobo", "adapt"]
-    with pytest.raises(ParamsError, match=r"a scene that asks adapt also asks \['triplet'\]"):
+    with pytest.raises(ParamsError, match="experiment adapt needs triplet in the same scene"):
         parse_scene(scene, "scene.yaml")

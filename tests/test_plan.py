@@ -6,6 +6,7 @@ from ruamel.yaml import YAML
 
 from pipeline import FLOW, PARAMS, PLAN, SCENES, plan
 from pipeline.manage.registry import Entry, Registry
+from pipeline.plan import make_plan
 from pipeline.scenes import ANALYSES, Plan, Scene, parse_scene
 from pipeline.stages.report import read_experiments
 from reskin.config import parse
@@ -18,19 +19,15 @@ ROOT = Path(__file__).resolve().parents[1]
 ENTRY = Entry(board="b", skin="s", layout="lab", chips_n=5, fingerprints=("0",), copy_of=None)
 
 
-def make_plan(scenes, registry):
-    return plan.make_plan(scenes, registry)
-
-
 def scene(**changes: object) -> Scene:
     return parse_scene(recorded(**changes), "scene.yaml")
 
 
-def test_the_plan_of_the_checkout_is_what_its_scenes_ask_for():
+def test_the_plan_of_the_checkout_is_up_to_date():
     plan.check(ROOT)
 
 
-def test_an_experiment_that_no_scene_asks_has_no_stage():
+def test_an_experiment_that_no_scene_runs_has_no_stage():
     made = make_plan({"lab": scene()}, Registry(captures={"lab": {"c0": ENTRY}}))["stages"]
     assert made["train_multi"] == ["lab"]
     assert made["train_single"] == made["verification"] == made["runtime"] == []
@@ -52,7 +49,7 @@ ADAPTED = ("lobo", "triplet", "adapt")
         ("audit", ("lobo", "audit")),
     ],
 )
-def test_a_stage_about_learning_runs_for_the_scenes_that_ask_it_and_for_no_other(stage, experiments):
+def test_a_stage_runs_for_the_scenes_with_its_experiment_and_for_no_other(stage, experiments):
     asked, plain = (parse_scene(asking(*own), "scene.yaml") for own in (experiments, ("lobo",)))
     captures = Registry(captures={"one": {"c0": ENTRY}, "two": {"c0": ENTRY}})
     made = make_plan({"one": plain, "two": asked}, captures)
@@ -62,7 +59,7 @@ def test_a_stage_about_learning_runs_for_the_scenes_that_ask_it_and_for_no_other
     assert make_plan({"one": plain}, captures)["stages"][stage] == []
 
 
-def test_an_experiment_of_a_recorded_scene_is_asked_of_its_own_captures_and_of_no_other_scene():
+def test_an_experiment_of_a_recorded_scene_reads_its_captures():
     asked, plain = (parse_scene(asking(*own), "scene.yaml") for own in (("lobo", "drift"), ("lobo",)))
     captures = Registry(captures={"one": {"c0": ENTRY}, "two": {"c0": ENTRY}})
     made = make_plan({"one": plain, "two": asked}, captures)
@@ -79,7 +76,7 @@ def test_a_choice_of_settings_needs_no_stage_of_its_own():
     assert with_choice == without
 
 
-def test_an_experiment_that_was_added_since_the_plan_is_noticed_by_the_report(tmp_path, monkeypatch):
+def test_the_report_refuses_a_plan_that_lacks_an_experiment_of_the_scene(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("pipeline").mkdir()
     Path(PLAN).write_text("scenes: {tiny: [lobo, baselines]}\n")
@@ -106,12 +103,8 @@ def test_a_scene_of_many_captures_has_one_ingest_for_all():
     made = make_plan({"lab": scene()}, Registry(captures={"lab": dict.fromkeys(names, ENTRY)}))["stages"]
     assert made["ingest"] == {}
     assert made["ingest_many"] == ["lab"]
-    assert (
-        make_plan({"lab": scene()}, Registry(captures={"lab": dict.fromkeys(names[1:], ENTRY)}))["stages"][
-            "ingest_many"
-        ]
-        == []
-    )
+    fewer = Registry(captures={"lab": dict.fromkeys(names[1:], ENTRY)})
+    assert make_plan({"lab": scene()}, fewer)["stages"]["ingest_many"] == []
 
 
 def test_a_recorded_scene_without_recordings_says_how_to_add_one():
@@ -134,19 +127,19 @@ def checkout(folder: Path, running: str = "{}") -> Path:
     return folder
 
 
-def test_use_writes_the_plan_and_no_file_of_hands(tmp_path):
+def test_use_writes_the_plan_and_no_other_file(tmp_path):
     root = checkout(tmp_path)
-    by_hand = [root / PARAMS, *(root / SCENES).iterdir()]
-    before = [file.read_bytes() for file in by_hand]
+    others = [root / PARAMS, *(root / SCENES).iterdir()]
+    before = [file.read_bytes() for file in others]
     plan.use(root, ["two", "one", "two"])
     made = plan.check(root)
     assert list(made.scenes) == ["two", "one"]
     assert list(made.stages["train_multi"]) == ["two", "one"]
     assert "do not edit" in (root / PLAN).read_text()
-    assert [file.read_bytes() for file in by_hand] == before
+    assert [file.read_bytes() for file in others] == before
 
 
-def test_a_plan_that_is_behind_its_scenes_is_refused_with_the_remedy(tmp_path):
+def test_a_plan_that_is_out_of_date_is_refused(tmp_path):
     root = checkout(tmp_path, "{one: [lobo]}")
     with pytest.raises(ParamsError, match="Try: reskin scenes use one"):
         plan.check(root)

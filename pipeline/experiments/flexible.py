@@ -86,11 +86,11 @@ def _median_uT(captures: Sequence[ByDepth], depth_mm: float) -> float:
 SHAPE = "shape"  # the recipe on directions, if the scene has one: it ought to care less about the gap
 
 
-def flexible(settings: Settings, folds: Path, main: Path, indentations: Path, started: Path, results: Path) -> None:
+def flexible(settings: Settings, folds: Path, main: Path, indentations: Path, pretrained: Path, results: Path) -> None:
     """Adapt the networks of the first fold of lobo to every flexible skin, and test on its later passes."""
     preload_training()
     data = read_data(settings, main, folds)
-    starts, captures = read_pretrained(started), read_captures(indentations)
+    starts, captures = read_pretrained(pretrained), read_captures(indentations)
     adapting, first, trained_n = data.settings.adaptations(), data.folds_of("lobo")[0], len(data.rows)
     poked = gather(captures, data.settings.section(Selection, "selection"))
     data = replace(data, rows=stack(data.rows, poked))

@@ -64,11 +64,11 @@ def answer_manual(
     return counts | arms | {"paired": differences}
 
 
-def manual(settings: Settings, folds: Path, main: Path, indentations: Path, started: Path, results: Path) -> None:
+def manual(settings: Settings, folds: Path, main: Path, indentations: Path, pretrained: Path, results: Path) -> None:
     """Adapt to every skin that was poked by hand, and by as many pokes of the robot; test on the robot's grid."""
     preload_training()
     data = read_data(settings, main, folds)
-    starts = read_pretrained(started)
+    starts = read_pretrained(pretrained)
     adapting = data.settings.adaptations()
     poked, found = hand_rows(read_captures(indentations))
     lines = {skin: shifted(own, len(data.rows)) for skin, own in found.items()}

@@ -41,21 +41,20 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
         )
         raise CaptureError(f"capture {header.capture}", "source", rule, header.source, remedy)
     shared, before = read_shared(root / PARAMS), read_registry(root)
-    policy = config.parse(FaultPolicy, shared["faults"], f"{PARAMS}: faults")
     target = root / RAW / scene / header.capture
     _check_free(target, header.capture in before.captures.get(scene, {}))
     with io.restoring(root / REGISTRY, root / PLAN), _forgetting_on_failure(target):
         with _naming_sources(target, files):
             complete = write_capture(target, header, files)
-            fingerprints = _read_through(target, complete, shared["lost_fraction_max"], policy)
+            fingerprints = _read_through(target, complete, shared.lost_fraction_max, shared.faults)
         after = with_capture(before, scene, complete, fingerprints, allow_copy=allow_copy)
         _track(target, root)
         write_registry(root, after)
         plan.use(root, [*read_plan(root / PLAN).scenes, scene])
     if "compare" in (settings.model_extra or {}):
-        _warn_of_departures(target, settings, nominal("skin"), policy)
+        _warn_of_departures(target, settings, nominal("skin"), shared.faults)
     else:
-        _warn_of_other_labels(target, list(before.captures.get(scene, {})), policy)
+        _warn_of_other_labels(target, list(before.captures.get(scene, {})), shared.faults)
     return complete
 
 

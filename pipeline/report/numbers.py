@@ -10,7 +10,7 @@ import pyarrow as pa
 
 from pipeline.report.formatting import control_of
 from pipeline.report.paper import PLATEAU_POKES_N
-from pipeline.scenes import EXPERIMENTS, ROWS, TABLE_2
+from pipeline.scenes import EXPERIMENTS, TABLE_2
 from pipeline.statistics import (
     AS_LABELLED,
     METHODS,
@@ -152,7 +152,7 @@ def _single(table: pd.DataFrame, headline: str) -> dict[str, Any]:
 def _variants(table: pd.DataFrame) -> dict[str, dict[str, Any]]:
     """Summarise every recipe of every experiment that leaves models; repeats on one skin are no boards."""
     numbers: dict[str, dict[str, Any]] = {}
-    models = table[table["question"].isin([row.name for row in ROWS if row.kind == "models"])]
+    models = table[table["question"].isin([one.name for one in EXPERIMENTS.values() if one.kind == "models"])]
     for (experiment, recipe), group in _parts(models, ["question", "recipe"], sort=False):
         summarise = (
             over_pairs if experiment == "transfer" else over_folds if experiment.startswith("single_") else over_boards

@@ -41,7 +41,7 @@ from pipeline.report.numbers import (
 )
 from pipeline.report.page import index, page, run_page
 from pipeline.report.tables import make_tables, table_2_summary, table_texts
-from pipeline.scenes import EXPERIMENTS, TABLE_2, SceneExperiments, experiments_of, stages
+from pipeline.scenes import EXPERIMENTS, TABLE_2, Scene, parse_scene, stages
 from pipeline.settings import Settings
 from pipeline.stage import say
 from pipeline.statistics import tidy, to_csv
@@ -56,15 +56,15 @@ from reskin.numerics import device as trained_on
 from reskin.simulation.fingerprint import fingerprint
 
 
-def table2(settings: Settings, models: Path, shown: Path) -> None:
+def table2(settings: Settings, models: Path, tables: Path) -> None:
     """Write table 2 of the paper and its figure as soon as its networks are trained; the report shows them again."""
     source, scene = settings["source"], settings.scene
     variants = stages(TABLE_2.values(), "models")
     cards = [io.read_json(file) for variant in variants for file in sorted((models / variant).glob("*.json"))]
     numbers = rounded({"provenance": {"scene": scene, "source": source}, **learned(tidy(cards, {}), headline=HEADLINE)})
     table = to_markdown(table_2_summary(numbers))
-    io.write_texts(shown, {"table2.md": table, **headline_figures(numbers, source)})
-    say(f"{scene} ({source})\n{table}\n{scene}: {', '.join(str(file) for file in sorted(shown.iterdir()))}")
+    io.write_texts(tables, {"table2.md": table, **headline_figures(numbers, source)})
+    say(f"{scene} ({source})\n{table}\n{scene}: {', '.join(str(file) for file in sorted(tables.iterdir()))}")
 
 
 def report(settings: Settings, indentations: Path, folds: Path, models: Path, results: Path, reports: Path) -> None:
@@ -87,7 +87,7 @@ def report(settings: Settings, indentations: Path, folds: Path, models: Path, re
         of_costs = executor.submit(cost_pages, numbers["runtime"], asked.source)
         tables = make_tables(numbers)
         io.write_texts(reports / "tables", table_texts(tables) | {"scores.csv": to_csv(scores)})
-        predictions = [io.read_table(models / stage / "predictions.parquet") for stage in asked.modelled]
+        predictions = [io.read_table(models / stage / "predictions.parquet") for stage in asked.model_stages]
         figures = dict(error_grids(predictions, HEADLINE, f"{scene} ({asked.source})"))
         figures |= headline_figures(numbers, asked.source) | dict(learning_figures(numbers, asked.source))
         figures |= of_experiments.result()
@@ -109,7 +109,7 @@ def report(settings: Settings, indentations: Path, folds: Path, models: Path, re
 def publish(settings: Settings, models: Path, results: Path, reports: Path) -> None:
     """Write every training of a scene and its report to MLflow once; if the server is away, warn and go on."""
     asked, scene = read_experiments(settings), settings.scene
-    variants = {variant: models / variant for variant in asked.modelled}
+    variants = {variant: models / variant for variant in asked.model_stages}
     name = f"{scene} (dvc exp)" if is_experiment() else scene  # beside the checkout's own results, not in their place
     try:
         counts = write_runs(variants, read_curves(asked, results), reports, scene=name, root=home())
@@ -118,7 +118,7 @@ def publish(settings: Settings, models: Path, results: Path, reports: Path) -> N
         say(f"warning: {scene} is not in MLflow: {away}")
 
 
-def read_curves(asked: SceneExperiments, results: Path) -> Curves:
+def read_curves(asked: Scene, results: Path) -> Curves:
     """Read the points of every sweep and the numbers of every experiment, as curves by stage."""
     stages = asked.curves
     points = {experiment: io.read_json(results / f"{stage}.json") for experiment, stage in stages.items()}
@@ -141,9 +141,9 @@ class Places:
     results: Path
 
 
-def read_experiments(settings: Settings) -> SceneExperiments:
+def read_experiments(settings: Settings) -> Scene:
     """Read which experiments the scene runs; raise if it was edited since the plan was made."""
-    asked = experiments_of(settings)
+    asked = parse_scene(settings.of_scene, settings.where)
     planned = read_yaml(Path(PLAN))["scenes"].get(settings.scene, [])
     if list(asked.experiments) != list(planned):
         differing = ", ".join(sorted(set(asked.experiments) ^ set(planned))) or "another order"
@@ -152,14 +152,12 @@ def read_experiments(settings: Settings) -> SceneExperiments:
     return asked
 
 
-def read_cards(asked: SceneExperiments, models: Path) -> list[dict[str, Any]]:
+def read_cards(asked: Scene, models: Path) -> list[dict[str, Any]]:
     """Read the cards of all models that the scene keeps."""
-    return [io.read_json(file) for arm in asked.modelled for file in sorted((models / arm).glob("*.json"))]
+    return [io.read_json(file) for arm in asked.model_stages for file in sorted((models / arm).glob("*.json"))]
 
 
-def read_numbers(
-    settings: Settings, asked: SceneExperiments, at: Places
-) -> tuple[dict[str, Any], dict[str, Any], pd.DataFrame]:
+def read_numbers(settings: Settings, asked: Scene, at: Places) -> tuple[dict[str, Any], dict[str, Any], pd.DataFrame]:
     """Read the content of numbers.json, what only figures show (by key in numbers.json), and the table of scores."""
     folds, cards = io.read_json(at.folds), read_cards(asked, at.models)
     accounts = [io.read_account(at.indentations / f"{name}.parquet") for name in folds["captures"]]
@@ -176,7 +174,7 @@ def read_numbers(
     numbers = {
         "provenance": _provenance(settings, asked, cards, costs),
         **compose(table, accounts, folds["dropped"], headline=HEADLINE),
-        **foretold([io.read_table(at.models / arm / SCORED) for arm in asked.modelled if arm == "train_single"]),
+        **foretold([io.read_table(at.models / arm / SCORED) for arm in asked.model_stages if arm == "train_single"]),
         "trainings": count_trainings(cards, points, by_key),
         "described": {asked.described: io.read_json(at.results / "described.json")},
         **read([experiment for experiment in ("audit",) if experiment in asked.experiments]),
@@ -192,7 +190,7 @@ def read_numbers(
 
 
 def _provenance(
-    settings: Settings, asked: SceneExperiments, cards: Sequence[Mapping[str, Any]], costs: Mapping[str, Any]
+    settings: Settings, asked: Scene, cards: Sequence[Mapping[str, Any]], costs: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Say where a result came from; a stage whose experiment was switched off costs nothing any more."""
     return {

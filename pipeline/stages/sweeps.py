@@ -37,10 +37,10 @@ def read_sweep_pokes(settings: Settings) -> PokesSweep:
     return settings.section(PokesSweep, "sweep_pokes")
 
 
-def sweep_pokes(settings: Settings, indentations: Path, folds: Path, started: Path, scores: Path) -> None:
+def sweep_pokes(settings: Settings, indentations: Path, folds: Path, pretrained: Path, scores: Path) -> None:
     """Adapt with every number of unlabelled indentations and score (paper figure 6a)."""
     preload_training()
-    data, starts = read_data(settings, indentations, folds), read_pretrained(started)
+    data, starts = read_data(settings, indentations, folds), read_pretrained(pretrained)
     sweep, recipe = read_sweep_pokes(settings), settings.adaptations().recipes[HEADLINE]
     held_out = data.folds_of("lobo")[-sweep.boards_n :]
     if sweep.boards_n > len(held_out):
@@ -59,13 +59,13 @@ def sweep_pokes(settings: Settings, indentations: Path, folds: Path, started: Pa
         sweep_point(data, job, result, "adapted") | {"pokes_n": pokes_n}
         for (job, pokes_n), result in zip(pairs, trained, strict=True)
     ]
-    io.write_json(scores, points + _unadapted(started, recipe.base, {fold.name for fold in held_out}))
+    io.write_json(scores, points + _unadapted(pretrained, recipe.base, {fold.name for fold in held_out}))
     write_timings(settings.scene, "sweep_pokes", jobs, trained)
 
 
-def _unadapted(started: Path, base: str, held_out: set[str]) -> list[dict[str, Any]]:
+def _unadapted(pretrained: Path, base: str, held_out: set[str]) -> list[dict[str, Any]]:
     """Take the scores of the networks that adaptation starts from, as points with no pokes."""
-    cards = [io.read_json(file) for file in sorted(started.glob("*.json"))]
+    cards = [io.read_json(file) for file in sorted(pretrained.glob("*.json"))]
     kept = ("key", "question", "fold", "seed_i", "stopped_step", "scores")
     return [
         {name: card[name] for name in kept} | {"method": "triplet", "pokes_n": 0}

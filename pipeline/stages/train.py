@@ -83,10 +83,10 @@ def read_adapt(settings: Settings) -> Adaptations:
     return settings.adaptations()
 
 
-def adapt(settings: Settings, indentations: Path, folds: Path, started: Path, models: Path) -> None:
+def adapt(settings: Settings, indentations: Path, folds: Path, pretrained: Path, models: Path) -> None:
     """Adapt the networks with triplet loss to each held-out skin by its unlabelled indentations (paper section 5)."""
     preload_training()
-    data, starts, section = read_data(settings, indentations, folds), read_pretrained(started), read_adapt(settings)
+    data, starts, section = read_data(settings, indentations, folds), read_pretrained(pretrained), read_adapt(settings)
     jobs = [
         job
         for fold in data.folds_of("lobo")
