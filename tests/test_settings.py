@@ -133,7 +133,7 @@ SIMULATE = {"simulate@ci", *(f"simulate@ci-{protocol}" for protocol in OWN)}
 BASED = {"adapt", "sweep_pokes", "sweep_sensors", "manual", "flexible"}
 RECIPES = {"train_single", "train_multi", "train_triplet", "few_labels", "drift", "shear", "sleeve", "ambient", *BASED}
 PHYSICS = {"audit", "report"}  # its fingerprint is compared with that of scene tuning
-DRAWN = {"flexible", "sensitivity", "logs", "sleeve", "contacts", "ambient", "gripper", "runtime", "left_out"}
+DRAWN = {"flexible", "sensitivity", "logs", "sleeve", "contacts", "ambient", "gripper", "runtime", "neglected_effects"}
 # By override the stages that DVC runs again. Sections of params.yaml are taken whole: finished trainings are cached.
 OVERRIDES: list[tuple[str, str, set[str]]] = [
     (PARAMS, "recipes.slow.rate_max=0.001", RECIPES),
