@@ -89,7 +89,7 @@ def test_a_table_of_something_else_and_a_recording_with_labels_are_refused(tmp_p
     with pytest.raises(CaptureError, match="columns must be those of reskin decode; got x"):
         predict(tmp_path / "x.parquet", model, tmp_path / "out.csv")
     write_capture(tmp_path / "c0", make_header(capture="c0"), {})
-    with pytest.raises(CaptureError, match="layout must be native or sd-card; got"):
+    with pytest.raises(CaptureError, match="layout .* cannot be predicted"):
         predict(tmp_path / "c0", model, tmp_path / "out.csv")
 
 
@@ -107,7 +107,7 @@ def test_every_line_is_answered_and_only_contacts_have_places_and_forces(tmp_pat
 
 def test_a_model_that_answers_one_place_to_any_input_is_refused_and_nothing_is_written(tmp_path, model):
     io.write_json(model.with_suffix(".json"), CARD | {"collapsed": True})
-    with pytest.raises(ReskinError, match=r"the model must be one that learnt; got .* Take the model of another seed"):
+    with pytest.raises(ReskinError, match="the model has collapsed"):
         predict(write_log(tmp_path), model, tmp_path / "out.csv")
     assert not (tmp_path / "out.csv").exists()
 
@@ -117,12 +117,12 @@ def test_what_does_not_fit_is_refused_and_nothing_is_written(tmp_path, model):
     four = tmp_path / "four"
     four.mkdir()
     refusals = [
-        (write_log(four, chips_n=4), model, out, "channels must be the 15 of the model; got 12"),
+        (write_log(four, chips_n=4), model, out, "the log has 12 channels, but the model 15"),
         (log, tmp_path / "other.safetensors", out, r"model file not found. Models in its folder: model\.safetensors"),
-        (log, model, log, "the file to write must be another than the log, the model and its card"),
-        (log, model, model, "the file to write must be another"),
-        (log, model, model.with_suffix(".json"), "the file to write must be another"),
-        (log, model, tmp_path / "four" / ".." / "model.json", "the file to write must be another"),
+        (log, model, log, "is the log, the model or its card"),
+        (log, model, model, "is the log, the model or its card"),
+        (log, model, model.with_suffix(".json"), "is the log, the model or its card"),
+        (log, model, tmp_path / "four" / ".." / "model.json", "is the log, the model or its card"),
         (tmp_path / "none.csv", model, out, r"none\.csv: the file must be there; got nothing"),
     ]
     files = (log, model, model.with_suffix(".json"))
@@ -137,16 +137,22 @@ def test_what_does_not_fit_is_refused_and_nothing_is_written(tmp_path, model):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"format": "reskin-model/1"}, "format must be reskin-model/3; got reskin-model/1"),
-        ({"format": 2}, "format must be reskin-model/3; got 2"),
-        ({"output": {"x_mm": "mm", "y_mm": "mm"}}, "the model's answers must be for x_mm, y_mm, Fz_N; got x_mm, y_mm"),
+        ({"format": "reskin-model/1"}, "format reskin-model/1 is not supported, only reskin-model/3"),
+        ({"format": 2}, "format 2 is not supported"),
+        ({"output": {"x_mm": "mm", "y_mm": "mm"}}, "the model predicts x_mm, y_mm, not x_mm, y_mm, Fz_N"),
         ({"input": None}, r"model\.json: input must be"),
         ({"input": {}}, "input.quantity, input.unit, .* must be given; got nothing"),
         ({"input": CARD["input"] | {"unit": "T"}}, "input.unit must be 'uT'; got 'T'"),
         ({"input": CARD["input"] | {"channels_n": "15"}}, "input.channels_n must be a valid integer; got '15'"),
         ({"input": CARD["input"] | {"channels_n": 14}}, "input.channels_n must be a multiple of 3; got 14"),
-        ({"input": CARD["input"] | {"channels_n": 12}}, "12 channels shown as raw must be the 15 that .*; got 12"),
-        ({"recipe": {"inputs": "shape", "architecture": "paper"}}, "15 channels shown as shape must be .*; got 16"),
+        (
+            {"input": CARD["input"] | {"channels_n": 12}},
+            "inputs raw give 12 inputs, but the weights take 15",
+        ),
+        (
+            {"recipe": {"inputs": "shape", "architecture": "paper"}},
+            "inputs shape give 16 inputs, but the weights take 15",
+        ),
         ({"recipe": {"inputs": "spectrum", "architecture": "paper"}}, "recipe.inputs must be 'raw' or 'shape'"),
         ({"recipe": {"inputs": "raw"}}, "recipe.architecture must be given; got nothing"),
     ],
@@ -161,13 +167,13 @@ def test_a_card_that_says_otherwise_is_refused(tmp_path, model, change, message)
 @pytest.mark.parametrize("lacking", ["input", "recipe", "output", "format"])
 def test_a_card_that_says_too_little_is_refused(tmp_path, model, lacking):
     model.with_suffix(".json").write_text(json.dumps({name: CARD[name] for name in CARD if name != lacking}))
-    with pytest.raises(ReskinError, match=f"{lacking} must be (given|reskin-model/3); got (nothing|None)"):
+    with pytest.raises(ReskinError, match=f"{lacking} (must be given|None is not supported)"):
         predict(write_log(tmp_path), model, tmp_path / "out.csv")
 
 
 def test_a_card_that_is_no_card_is_refused(tmp_path, model):
     model.with_suffix(".json").write_text("[1]")
-    with pytest.raises(ReskinError, match="format must be reskin-model/3; got None"):
+    with pytest.raises(ReskinError, match="format None is not supported"):
         predict(write_log(tmp_path), model, tmp_path / "out.csv")
 
 
@@ -196,7 +202,7 @@ def test_a_log_that_begins_in_contact_is_refused(tmp_path, model):
     log = write_log(tmp_path)
     first, *rows = log.read_text().splitlines(keepends=True)
     log.write_text("".join([first, *rows[QUIET_N - 50 :]]))
-    with pytest.raises(CaptureError, match="the start without contact must be"):
+    with pytest.raises(CaptureError, match="the start without contact lasts"):
         predict(log, model, tmp_path / "out.csv")
 
 

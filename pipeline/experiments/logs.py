@@ -18,7 +18,16 @@ from pipeline.report.drawing import COLOURS, drawing, svg
 from pipeline.settings import Settings
 from pipeline.stage import say
 from pipeline.synthesis import synthesis_of
-from reskin.live.contacts import Answers, contacts_n, describe, estimate, estimate_after, score_contacts, thin, truth_at
+from reskin.live.contacts import (
+    Estimator,
+    contacts_n,
+    describe,
+    estimate,
+    estimate_after,
+    score_contacts,
+    thin,
+    truth_at,
+)
 from reskin.models.trained import networks_held_out
 from reskin.physics.ambient import EARTH_SIZE_T, EARTH_T
 from reskin.recordings import probe
@@ -42,7 +51,9 @@ class Log:
     quiet_n: int
 
 
-def turn_log(log: Log, own: Instrument, networks: Sequence[Answers], rng: np.random.Generator) -> list[dict[str, Any]]:
+def turn_log(
+    log: Log, own: Instrument, networks: Sequence[Estimator], rng: np.random.Generator
+) -> list[dict[str, Any]]:
     """Let the board pitch by more and more after its quiet start; score it as it is, and less what a chip aside reads.
 
     `own.noise_uT` is that of one reading of the chip aside.
@@ -80,13 +91,13 @@ def earth_T(pitch_rad: Float64[np.ndarray, " f"]) -> Float[np.ndarray, "f 3"]:
     return Rotation.from_euler("y", pitch_rad[:, None]).inv().apply(EARTH_T)
 
 
-def _told(log: Log, added_uT: Float[np.ndarray, "f ch"], networks: Sequence[Answers]) -> dict[str, Any]:
+def _told(log: Log, added_uT: Float[np.ndarray, "f ch"], networks: Sequence[Estimator]) -> dict[str, Any]:
     found = estimate_after(log.quiet_n, log.t_s, (log.b_uT + added_uT).astype(np.float32), networks)
     scores = score_contacts(found, log.true)
     return {"contacts_n": contacts_n(found.contact)} | {name: scores[name] for name in TOLD if name in scores}
 
 
-def turned(log: Log, board: str, settings: Settings, networks: Sequence[Answers]) -> dict[str, Any]:
+def turned(log: Log, board: str, settings: Settings, networks: Sequence[Estimator]) -> dict[str, Any]:
     """Tell what the networks find in the log if its board turns in the earth's field."""
     of, seed = synthesis_of(settings), settings.seed
     noise_uT = np.array([of.chip.noise_xy_uT, of.chip.noise_xy_uT, of.chip.noise_z_uT])  # a log's readings are single

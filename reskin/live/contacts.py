@@ -1,7 +1,6 @@
-"""A log without labels becomes contacts, places and forces (section 6: dog shoe, glove). In: readings. Out: estimates.
+"""Contacts, places and forces in a log without labels (paper section 6: dog shoe, glove), and their scores.
 
-The no-load reading is the quiet start of the log itself. Truth, where a simulator kept it, is only scored. Refuses to
-know files, and which network answers.
+The no-load reading is the mean of the log's quiet start.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,51 +14,54 @@ from reskin.errors import CaptureError
 from reskin.metrics import score
 
 WINDOW_S = 0.1  # assumed: windows whose means are compared with the start's
-QUIET_MIN_S = 0.5  # assumed: a shorter start gives no no-load reading to rely on
-WANDER_SDS = 4.0  # of a window's mean, any channel: by chance in 1 of 1,000 windows of 15 channels
-START_WINDOWS_N = 2  # the first windows, from which the noise is taken
-CONTACT_SDS = 6.0  # times the noise of one channel beyond what the quiet start's |dB| usually is
-POINTS_MAX_N = 1500  # of a drawn series
+QUIET_MIN_S = 0.5  # assumed: a shorter start gives no reliable no-load reading
+WANDER_SDS = 4.0  # of a window's mean, in any channel: by chance in 1 of 1,000 windows of 15 channels
+START_WINDOWS_N = 2  # the first windows, which give the noise
+CONTACT_SDS = 6.0  # standard deviations of one channel's noise above the median |dB| of the quiet start: a contact
+POINTS_MAX_N = 1500  # of a series in a figure
 
-Answers = Callable[[Float32[np.ndarray, "f ch"]], Float32[np.ndarray, "f 3"]]
+Estimator = Callable[[Float32[np.ndarray, "f ch"]], Float32[np.ndarray, "f 3"]]
 
 
 @dataclass(frozen=True)
-class Estimates:
-    """What a log says, row by row; places and forces mean something in contact only."""
+class LogEstimates:
+    """Estimates for each reading of a log; places and forces have a meaning in contact only."""
 
     t_s: Float64[np.ndarray, " f"]
-    answers: Float64[np.ndarray, "m f 3"]  # x_mm, y_mm, F_N of each network
+    targets: Float64[np.ndarray, "m f 3"]  # x_mm, y_mm, F_N by each of m models
     contact: Bool[np.ndarray, " f"]
     quiet_n: int
     noise_uT: float
 
 
 def estimate(
-    t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"], networks: Sequence[Answers], *, where: str
-) -> Estimates:
-    """Find the quiet start, take it off, and let the networks answer for every reading."""
-    return estimate_after(quiet_start(t_s, b_uT, where=where), t_s, b_uT, networks)
+    t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"], models: Sequence[Estimator], *, where: str
+) -> LogEstimates:
+    """Find the quiet start of a log, subtract its mean, and estimate for every reading.
+
+    Raises CaptureError, which names `where`, if the log does not start without contact.
+    """
+    return estimate_after(quiet_start(t_s, b_uT, where=where), t_s, b_uT, models)
 
 
 def estimate_after(
-    quiet_n: int, t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"], networks: Sequence[Answers]
-) -> Estimates:
-    """Take off the mean of a quiet start of so many readings, and let the networks answer for every reading."""
+    quiet_n: int, t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"], models: Sequence[Estimator]
+) -> LogEstimates:
+    """Subtract the mean of the first `quiet_n` readings, and estimate for every reading."""
     noload_uT = b_uT[:quiet_n].mean(axis=0, dtype=np.float64)
     db_uT = (b_uT - noload_uT).astype(np.float32)
     noise_uT = float(np.sqrt((db_uT[:quiet_n].astype(np.float64) ** 2).mean()))
     length_uT = np.linalg.norm(db_uT, axis=1)
     contact = length_uT > np.median(length_uT[:quiet_n]) + CONTACT_SDS * noise_uT
-    answers = np.stack([network(db_uT) for network in networks]).astype(np.float64)
-    return Estimates(t_s, answers, contact, quiet_n, noise_uT)
+    targets = np.stack([model(db_uT) for model in models]).astype(np.float64)
+    return LogEstimates(t_s, targets, contact, quiet_n, noise_uT)
 
 
 def quiet_start(t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"], *, where: str) -> int:
-    """Count the readings of the longest start without contact.
+    """Return the number of readings before the first contact.
 
-    The start is cut into windows of 0.1 s; it lasts as long as every channel's mean over a window stays within 4
-    standard errors of the first two windows' mean, their own error included. Shorter than 0.5 s is refused.
+    The quiet start lasts as long as the mean of every channel over a window of 0.1 s stays within 4 standard errors of
+    the mean of the first two windows. Raises CaptureError if it is shorter than 0.5 s.
     """
     window_n = max(round(WINDOW_S / step_s(t_s)), 2)
     windows_n = len(b_uT) // window_n
@@ -67,7 +69,7 @@ def quiet_start(t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"
     if windows_n > START_WINDOWS_N:
         first_uT = b_uT[:start_n].astype(np.float64)
         means_uT = b_uT[: windows_n * window_n].reshape(windows_n, window_n, -1).mean(axis=1, dtype=np.float64)
-        # Differences of neighbours, so that a contact that begins at once does not pass for noise.
+        # From differences of neighbours: a contact that begins at once does not count as noise.
         sd_uT = np.diff(first_uT, axis=0).std(axis=0) / np.sqrt(2)
         error_uT = sd_uT * np.sqrt(1 / window_n + 1 / start_n)
         wandered = (np.abs(means_uT - first_uT.mean(axis=0)) > WANDER_SDS * error_uT).any(axis=1)
@@ -75,27 +77,28 @@ def quiet_start(t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"
     else:
         quiet_n = 0
     if quiet_n * step_s(t_s) < QUIET_MIN_S:
-        got = f"{quiet_n * step_s(t_s):.2g} s"
-        remedy = "Log the skin untouched for a second first."
-        raise CaptureError(where, "the start without contact", f"{QUIET_MIN_S:g} s or more", got, remedy)
+        raise CaptureError(
+            f"{where}: the start without contact lasts {quiet_n * step_s(t_s):.2g} s, less than {QUIET_MIN_S:g} s. "
+            "Leave the skin untouched for the first second."
+        )
     return quiet_n
 
 
 def step_s(t_s: Float64[np.ndarray, " f"]) -> float:
-    """Give the usual time from one reading to the next."""
+    """Return the median time between readings."""
     return float(np.median(np.diff(t_s)))
 
 
 def contacts_n(contact: Bool[np.ndarray, " f"]) -> int:
-    """Count the runs of readings in contact; a single reading is noise, and a single one off it parts nothing."""
+    """Count runs of readings in contact. A single reading in contact is noise; a single gap does not end a run."""
     padded = np.concatenate([[False], contact, [False]])
     closed = padded | (np.roll(padded, 1) & np.roll(padded, -1))
     edges = np.flatnonzero(np.diff(np.concatenate([[False], closed, [False]]).astype(int)))
     return int((np.diff(edges)[::2] > 1).sum())
 
 
-def describe(of: Estimates) -> dict[str, Any]:
-    """Say how long the log is, and what is in it; the largest force is the mean of the networks' largest ones."""
+def describe(of: LogEstimates) -> dict[str, Any]:
+    """Summarise a log: duration, rate, noise, contacts, and the largest force (mean over models)."""
     return {
         "rate_hz": 1 / step_s(of.t_s),
         "duration_s": float(of.t_s[-1] - of.t_s[0] + step_s(of.t_s)),
@@ -104,13 +107,13 @@ def describe(of: Estimates) -> dict[str, Any]:
         "noise_uT": of.noise_uT,
         "contact_readings_n": int(of.contact.sum()),
         "contacts_n": contacts_n(of.contact),
-    } | ({"force_max_N": float(of.answers[:, of.contact, 2].max(axis=1).mean())} if of.contact.any() else {})
+    } | ({"force_max_N": float(of.targets[:, of.contact, 2].max(axis=1).mean())} if of.contact.any() else {})
 
 
-def score_contacts(of: Estimates, true: Float64[np.ndarray, "f 3"]) -> dict[str, Any]:
-    """Score the readings found in contact; true rows are NaN where there is none, and count what was missed.
+def score_contacts(of: LogEstimates, true: Float64[np.ndarray, "f 3"]) -> dict[str, Any]:
+    """Score estimates against the truth, which is NaN without contact; count missed and false readings.
 
-    Each network is scored by itself: scores are the mean over networks, and `spread` holds their standard deviation.
+    Each model is scored by itself: scores are the mean over models, and `spread` holds their standard deviation.
     """
     touched = np.isfinite(true[:, 2])
     both = of.contact & touched
@@ -124,12 +127,12 @@ def score_contacts(of: Estimates, true: Float64[np.ndarray, "f 3"]) -> dict[str,
         counts["missed_force_max_N"] = float(true[touched & ~of.contact, 2].max())
     if not both.any():
         return counts
-    scores = [score(true[both], answer[both]) for answer in of.answers]
-    of_networks = {name: np.array([one[name] for one in scores]) for name in scores[0]}
-    spread = {name: float(values.std(ddof=1)) for name, values in of_networks.items()} if len(scores) > 1 else {}
+    scores = [score(true[both], target[both]) for target in of.targets]
+    by_name = {name: np.array([one[name] for one in scores]) for name in scores[0]}
+    spread = {name: float(values.std(ddof=1)) for name, values in by_name.items()} if len(scores) > 1 else {}
     return (
         counts
-        | {name: float(values.mean()) for name, values in of_networks.items()}
+        | {name: float(values.mean()) for name, values in by_name.items()}
         | ({"spread": spread} if spread else {})
     )
 
@@ -140,22 +143,22 @@ def truth_at(
     end_s: Float64[np.ndarray, " d"],
     true: Float[np.ndarray, "d 3"],
 ) -> Float64[np.ndarray, "f 3"]:
-    """Give each reading what the dwell says that it lies in; NaN between dwells."""
+    """Return the truth of the dwell that each reading lies in; NaN between dwells."""
     dwell_i = np.searchsorted(start_s, t_s, "right") - 1
     inside = (dwell_i >= 0) & (t_s <= end_s[dwell_i])
     return np.where(inside[:, None], true[dwell_i].astype(np.float64), np.nan)
 
 
-def thin(of: Estimates, true: Float64[np.ndarray, "f 3"] | None) -> dict[str, Any]:
-    """Keep at most 1,500 readings of the series, evenly, for figures; None where there is no contact.
+def thin(of: LogEstimates, true: Float64[np.ndarray, "f 3"] | None) -> dict[str, Any]:
+    """Return at most 1,500 evenly spaced readings for figures; None without contact.
 
-    `estimated` is what the first network answers; of several networks, `low` and `high` are the least and most.
+    `estimated` is that of the first model; with several models, `low` and `high` are their range.
     """
     kept = np.unique(np.linspace(0, len(of.t_s) - 1, POINTS_MAX_N).astype(int))
-    answers = np.where(of.contact[:, None], of.answers, np.nan)[:, kept]
-    drawn: dict[str, Any] = {"t_s": np.round(of.t_s[kept], 3).tolist(), "estimated": _columns(answers[0])}
-    if len(answers) > 1:
-        drawn |= {"low": _columns(answers.min(axis=0)), "high": _columns(answers.max(axis=0))}
+    targets = np.where(of.contact[:, None], of.targets, np.nan)[:, kept]
+    drawn: dict[str, Any] = {"t_s": np.round(of.t_s[kept], 3).tolist(), "estimated": _columns(targets[0])}
+    if len(targets) > 1:
+        drawn |= {"low": _columns(targets.min(axis=0)), "high": _columns(targets.max(axis=0))}
     return drawn if true is None else drawn | {"true": _columns(true[kept])}
 
 

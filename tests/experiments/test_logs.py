@@ -48,9 +48,9 @@ def test_the_quiet_start_lasts_until_the_window_of_the_first_step(quiet_s):
 
 def test_a_log_without_a_quiet_start_is_refused():
     t_s, b_uT, _ = walk(0.2)
-    with pytest.raises(CaptureError, match=r"log: the start without contact must be 0\.5 s or more"):
+    with pytest.raises(CaptureError, match=r"log: the start without contact lasts .* less than 0\.5 s"):
         quiet_start(t_s, b_uT, where="log")
-    with pytest.raises(CaptureError, match=r"the start without contact must be .* got 0 s"):
+    with pytest.raises(CaptureError, match="the start without contact lasts 0 s"):
         quiet_start(t_s[:40], b_uT[:40], where="log")
 
 

@@ -163,7 +163,7 @@ def test_one_skin_does_not_answer_for_several_boards(simulated, tmp_path):
     with pytest.raises(ParamsError, match=r"to one skin \(12 presses\) cannot estimate for 2 boards"):
         reskin.open(["/dev/a", "/dev/b"], model=learnt)
     learnt.save(tmp_path / "s3.safetensors")
-    with pytest.raises(ParamsError, match="must be a trained network; got a saved skin. Load it with reskin.load_univ"):
+    with pytest.raises(ParamsError, match="a calibration of the universal model. Load it with reskin.load_univ"):
         reskin.load_model(tmp_path / "s3.safetensors")
-    with pytest.raises(ParamsError, match="a saved skin must be given alone; got 2 models"):
+    with pytest.raises(ParamsError, match="a calibration cannot be combined with other models"):
         read_models([tmp_path / "s3.safetensors"] * 2)
