@@ -24,8 +24,8 @@ from pipeline.training.variants import (  # fmt: skip
     FORCE,
     VariantPrediction,
     adapt_and_predict,
-    biases,
     compare_variants,
+    force_biases,
     predict_before,
     summarise_variants,
 )
@@ -62,12 +62,12 @@ def gap_less_pct(gap_mm: Mapping[str, float]) -> float:
 def answer_flexible(answers: Sequence[VariantPrediction]) -> dict[str, Any]:
     """Summarise over boards, by arm; the force bias and the gain by adaptation apart."""
     differences = {f"{AFTER}_minus_{BEFORE}": compare_variants(answers, AFTER, BEFORE)}
-    return summarise_variants(answers) | biases(answers) | {"paired": differences}
+    return summarise_variants(answers) | force_biases(answers) | {"paired": differences}
 
 
 def forces_drawn(answers: Sequence[VariantPrediction], rng: np.random.Generator) -> dict[str, dict[str, list[float]]]:
     """Choose equal readings of both arms' first networks at random: true and predicted force, in newtons."""
-    arms = {arm: [one for one in answers if one.arm == arm and one.seed_i == 0] for arm in (BEFORE, AFTER)}
+    arms = {arm: [one for one in answers if one.variant == arm and one.seed_i == 0] for arm in (BEFORE, AFTER)}
     shown = rng.permutation(sum(len(one.true) for one in arms[BEFORE]))[:DRAWN_N]
     return {
         arm: {
@@ -112,7 +112,7 @@ def flexible(settings: Settings, folds: Path, main: Path, indentations: Path, pr
         for name in arms if name != CONTROL
     }  # fmt: skip
     after, trainings = adapt_and_predict(data, jobs, "flexible")
-    own = before[HEADLINE] + [one for one in after if one.arm != SHAPE]
+    own = before[HEADLINE] + [one for one in after if one.variant != SHAPE]
     numbers: dict[str, Any] = {
         "skins_n": len(skins), "boards_n": len(np.unique(data.rows.board[fold.test])),
         "seeds_n": len({one.seed_i for one in own}), "pokes_n": adapting.pokes_n, "fold": first.name,
@@ -120,7 +120,9 @@ def flexible(settings: Settings, folds: Path, main: Path, indentations: Path, pr
         "strength_ratio": strength_ratio(_by_depth(captures), _by_depth(read_captures(main))),
     } | _gaps(data) | answer_flexible(own)  # fmt: skip
     if SHAPE in arms:
-        numbers[SHAPE] = answer_flexible(before[SHAPE] + [replace(one, arm=AFTER) for one in after if one.arm == SHAPE])
+        numbers[SHAPE] = answer_flexible(
+            before[SHAPE] + [replace(one, variant=AFTER) for one in after if one.variant == SHAPE]
+        )
     drawn = forces_drawn(own, rng_for(data.settings.seed, "flexible", "drawn"))
     write_results(results, numbers, drawn, read_losses(indentations, poked.dropped), trainings)
 

@@ -8,7 +8,6 @@ from pydantic import Field
 
 from pipeline.settings import Settings
 from pipeline.training.jobs import (
-    SceneData,
     adaptation_jobs,
     preload_training,
     read_data,
@@ -19,10 +18,9 @@ from pipeline.training.jobs import (
 )
 from reskin import io
 from reskin.config import Strict
-from reskin.data.splits import Fold
 from reskin.errors import ParamsError
 from reskin.models.job import Pretrained, TrainingJob
-from reskin.models.recipe import HEADLINE, Recipe
+from reskin.models.recipe import HEADLINE
 
 
 class PokesSweep(Strict):
@@ -40,31 +38,33 @@ def read_sweep_pokes(settings: Settings) -> PokesSweep:
 def sweep_pokes(settings: Settings, indentations: Path, folds: Path, pretrained: Path, scores: Path) -> None:
     """Adapt with every number of unlabelled indentations and score (paper figure 6a)."""
     preload_training()
-    data, starts = read_data(settings, indentations, folds), read_pretrained(pretrained)
+    data, networks = read_data(settings, indentations, folds), read_pretrained(pretrained)
     sweep, recipe = read_sweep_pokes(settings), settings.adaptations().recipes[HEADLINE]
     held_out = data.folds_of("lobo")[-sweep.boards_n :]
     if sweep.boards_n > len(held_out):
         rule = f"at most the {len(held_out)} boards of the scene"
         raise ParamsError(settings.where, "sweep_pokes.boards_n", rule, sweep.boards_n, "Ask for fewer.")
+    named = (HEADLINE, recipe)
     pairs = [
         (job, pokes_n)
         for fold in held_out
         for pokes_n in sweep.pokes_n
         if pokes_n
-        for job in adaptation_jobs(data, fold, (HEADLINE, recipe), starts, experiment="pokes", pokes_n=pokes_n)
+        for job in adaptation_jobs(data, fold, named, networks, experiment="pokes", pokes_n=pokes_n)
     ]
     jobs = [job for job, _ in pairs]
-    trained = train_jobs(data, jobs, "sweep_pokes")
+    results = train_jobs(data, jobs, "sweep_pokes")
     points = [
         sweep_point(data, job, result, "adapted") | {"pokes_n": pokes_n}
-        for (job, pokes_n), result in zip(pairs, trained, strict=True)
+        for (job, pokes_n), result in zip(pairs, results, strict=True)
     ]
-    io.write_json(scores, points + _unadapted(pretrained, recipe.base, {fold.name for fold in held_out}))
-    write_timings(settings.scene, "sweep_pokes", jobs, trained)
+    points += _points_before_adaptation(pretrained, recipe.base, {fold.name for fold in held_out})
+    io.write_json(scores, points)
+    write_timings(settings.scene, "sweep_pokes", jobs, results)
 
 
-def _unadapted(pretrained: Path, base: str, held_out: set[str]) -> list[dict[str, Any]]:
-    """Take the scores of the networks that adaptation starts from, as points with no pokes."""
+def _points_before_adaptation(pretrained: Path, base: str, held_out: set[str]) -> list[dict[str, Any]]:
+    """Return the scores of the networks that adaptation starts from, as points with 0 pokes."""
     cards = [io.read_json(file) for file in sorted(pretrained.glob("*.json"))]
     kept = ("key", "question", "fold", "seed_i", "stopped_step", "scores")
     return [
@@ -77,42 +77,37 @@ def _unadapted(pretrained: Path, base: str, held_out: set[str]) -> list[dict[str
 def sweep_sensors(settings: Settings, indentations: Path, folds: Path, scores: Path) -> None:
     """Train the headline recipes on every draw of skins, adapt to each held-out skin, and score (paper figure 6b)."""
     preload_training()
-    data = read_data(settings, indentations, folds)
-    multi, triplet = (settings.training(section).recipes for section in ("train_multi", "train_triplet"))
-    section = settings.adaptations()
-    recipe = section.recipes[HEADLINE]
-    jobs = _jobs(data, multi[HEADLINE], "multi") + _jobs(data, triplet[recipe.base], "triplet")
-    trained = train_jobs(data, jobs, "sweep_sensors")
-    starts = {
-        (recipe.base, job.fold, job.seed_i): Pretrained(result.key, result.weights, result.scaler)
-        for job, result in zip(jobs, trained, strict=True)
+    data, section = read_data(settings, indentations, folds), settings.adaptations()
+    adaptation = section.recipes[HEADLINE]
+    recipes = {
+        "multi": settings.training("train_multi").recipes[HEADLINE],
+        "triplet": settings.training("train_triplet").recipes[adaptation.base],
+    }
+    # Most training skins first: finished trainings are cached by their whole stack, and only in this order do the
+    # folds of all skins form the stacks of `train_multi`.
+    draws = sorted(data.folds_of("sensors"), key=lambda fold: -len(np.unique(data.rows.skin[fold.train])))
+    # The draw is part of the fold's name, and so of the generator's: one seed for each draw.
+    jobs = [
+        TrainingJob("sensors", HEADLINE, recipe, fold.name, settings.seed, 0, fold.train, fold.test, what=method)
+        for method, recipe in recipes.items()
+        for fold in draws
+    ]
+    results = train_jobs(data, jobs, "sweep_sensors")
+    pretrained = {
+        (adaptation.base, job.fold, job.seed_i): Pretrained(result.key, result.weights, result.scaler)
+        for job, result in zip(jobs, results, strict=True)
         if job.what == "triplet"
     }
+    named = (HEADLINE, adaptation)
     adapted = [
         job
-        for fold in _folds(data)
-        for job in adaptation_jobs(
-            data, fold, (HEADLINE, recipe), starts, experiment="sensors", pokes_n=section.pokes_n
-        )
+        for fold in draws
+        for job in adaptation_jobs(data, fold, named, pretrained, experiment="sensors", pokes_n=section.pokes_n)
     ]
     methods = [job.what for job in jobs] + ["adapted"] * len(adapted)
-    jobs, trained = jobs + adapted, trained + train_jobs(data, adapted, "sweep_sensors")
-    three = zip(jobs, trained, methods, strict=True)
-    io.write_json(scores, [sweep_point(data, job, result, method) for job, result, method in three])
-    write_timings(settings.scene, "sweep_sensors", jobs, trained)
-
-
-def _folds(data: SceneData) -> list[Fold]:
-    """Order folds by their number of training skins, most first, so that those of all skins stack as in `train_multi`.
-
-    Finished trainings are cached by their whole stack; only in this order are those of `train_multi` reused.
-    """
-    return sorted(data.folds_of("sensors"), key=lambda fold: -len(np.unique(data.rows.skin[fold.train])))
-
-
-def _jobs(data: SceneData, recipe: Recipe, method: str) -> list[TrainingJob]:
-    """Make one job for each draw of skins; its seed is the draw, as the fold's name is part of the generator's."""
-    return [
-        TrainingJob("sensors", HEADLINE, recipe, fold.name, data.settings.seed, 0, fold.train, fold.test, what=method)
-        for fold in _folds(data)
+    jobs, results = jobs + adapted, results + train_jobs(data, adapted, "sweep_sensors")
+    points = [
+        sweep_point(data, job, result, method) for job, result, method in zip(jobs, results, methods, strict=True)
     ]
+    io.write_json(scores, points)
+    write_timings(settings.scene, "sweep_sensors", jobs, results)

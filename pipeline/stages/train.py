@@ -1,4 +1,4 @@
-"""Stages that train on the folds of a scene: train_single, train_multi, train_triplet, adapt, train_classical."""
+"""Stages that train on the folds of a scene: networks of one skin, of many skins, adapted ones, classical methods."""
 
 from pathlib import Path
 from typing import Annotated
@@ -39,17 +39,17 @@ def read_train_single(settings: Settings) -> Training:
 
 
 def train_single(settings: Settings, indentations: Path, folds: Path, models: Path) -> None:
-    """Train on one skin at a time: same-sensor splits, and one skin on others (paper sections 4 and 5.1).
+    """Train on one skin at a time: splits within a skin, and transfer to other skins (paper sections 4 and 5.1).
 
-    Also scores how well a place is known before its contact, on the folds within one skin.
+    Also scores how well a place is known before the contact, on the folds within one skin.
     """
     preload_training()
     data = read_data(settings, indentations, folds)
-    own = [fold for fold in data.folds if fold.experiment in ONE_SKIN]
-    jobs = make_jobs(data, read_train_single(settings), own)
+    folds_of_one_skin = [fold for fold in data.folds if fold.experiment in ONE_SKIN]
+    jobs = make_jobs(data, read_train_single(settings), folds_of_one_skin)
     write_models(models, data, jobs, train_jobs(data, jobs, "train_single"), "train_single")
-    told = score_before_touch(data, indentations, io.read_json(folds)["captures"], networks_by_fold(models, BY_TIME))
-    io.write_table(models / SCORED, told)
+    captures, networks = io.read_json(folds)["captures"], networks_by_fold(models, BY_TIME)
+    io.write_table(models / SCORED, score_before_touch(data, indentations, captures, networks))
 
 
 def read_train_multi(settings: Settings) -> Training:
@@ -86,12 +86,13 @@ def read_adapt(settings: Settings) -> Adaptations:
 def adapt(settings: Settings, indentations: Path, folds: Path, pretrained: Path, models: Path) -> None:
     """Adapt the networks with triplet loss to each held-out skin by its unlabelled indentations (paper section 5)."""
     preload_training()
-    data, starts, section = read_data(settings, indentations, folds), read_pretrained(pretrained), read_adapt(settings)
+    data, section = read_data(settings, indentations, folds), read_adapt(settings)
+    networks = read_pretrained(pretrained)
     jobs = [
         job
         for fold in data.folds_of("lobo")
         for named in section.recipes.items()
-        for job in adaptation_jobs(data, fold, named, starts, experiment="adapt", pokes_n=section.pokes_n)
+        for job in adaptation_jobs(data, fold, named, networks, experiment="adapt", pokes_n=section.pokes_n)
     ]
     write_models(models, data, jobs, train_jobs(data, jobs, "adapt"), "adapt")
 
@@ -114,18 +115,18 @@ def train_classical(settings: Settings, indentations: Path, folds: Path, scores:
     """Fit classical methods on the folds of train_multi."""
     data, section = read_data(settings, indentations, folds), read_train_classical(settings)
     pairs = [(fold, name, method) for fold in data.folds_of("lobo") for name, method in section.methods.items()]
-    tasks = [
+    jobs = [
         ClassicalJob(f"{name}.{fold.name}", method, fold.train, fold.test, NO_LABELS, section.rows_max_n, settings.seed)
         for fold, name, method in pairs
     ]
     with make_executor(imports="reskin.models.classical") as executor:
-        fitted = run_classical_jobs(
-            tasks, training_data(data), executor, lambda line: say(f"{settings.scene} classical: {line}")
+        results = run_classical_jobs(
+            jobs, training_data(data), executor, lambda line: say(f"{settings.scene} classical: {line}")
         )
     points = [
         {"name": name, "method": method.title, "inputs": method.inputs, "fold": fold.name, "seed_i": 0}
-        | {"rows_n": answer.rows_n, "scores": score_test(data, fold.test, answer.predicted)}
-        for (fold, name, method), answer in zip(pairs, fitted, strict=True)
+        | {"rows_n": result.rows_n, "scores": score_test(data, fold.test, result.predicted)}
+        for (fold, name, method), result in zip(pairs, results, strict=True)
     ]
     io.write_json(scores, points)
-    write_timings(settings.scene, "train_classical", tasks, fitted)
+    write_timings(settings.scene, "train_classical", jobs, results)

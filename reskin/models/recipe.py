@@ -1,4 +1,4 @@
-"""Recipes: the settings of one training, fine-tuning or labelling."""
+"""Recipes: the settings of a training, an adaptation or a fine-tuning."""
 
 from typing import Annotated, Literal
 
@@ -6,16 +6,16 @@ from pydantic import Field
 
 from reskin.config import Strict
 
-HEADLINE = "paper"  # the recipe whose numbers stand beside the paper's; others are variants
+HEADLINE = "paper"  # the recipe that is compared with the paper; others are variants
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,40}$")]  # a name is part of file names
 Weight = Annotated[float, Field(ge=0)]
 
 
 class Schedule(Strict):
-    """How the loop descends: AdamW under a one-cycle rate whose peak is `rate_max`; a batch is drawn at every step.
+    """Optimisation: AdamW under a one-cycle learning rate with peak `rate_max`.
 
-    A gradient longer than `gradient_norm_max` (all weights of a network as one vector, scaled units) is cut to it.
+    Gradients (all weights of a network as one vector, scaled units) are clipped to a norm of `gradient_norm_max`.
     """
 
     steps_n: Annotated[int, Field(ge=1)]
@@ -26,12 +26,12 @@ class Schedule(Strict):
 
 
 class Recipe(Schedule):
-    """What the paper leaves open is written here: inputs, scaling, schedule, weight of the triplet term.
+    """How a network is trained, including what the paper leaves open.
 
-    `architecture` is the paper's text or the network that its authors released (FACTS: ReLU after layer 2 and on the
-    output). `inputs` is the change of field as it is, or its direction and the logarithm of its length. `scaling` is
-    per-channel standardisation or the released one (5 sd without mean; x/16, y/16, F/3). With a `triplet_weight` of 0
-    no triplet is drawn.
+    architecture: that of the paper's text, or of the released network (ReLU after layer 2 and on the output). inputs:
+    the change of field as it is, or its direction and the logarithm of its length. scaling: per-channel
+    standardisation, or that of the released network (5 sd without mean; x/16, y/16, F/3). triplet_weight: weight of the
+    triplet loss; with 0 no triplet is drawn.
     """
 
     architecture: Literal["paper", "released"]
@@ -41,7 +41,7 @@ class Recipe(Schedule):
 
 
 class Augmentation(Strict):
-    """Copies of every training skin as other boards would read it; standard deviations of what differs."""
+    """Copies of every training skin as other boards would read it; standard deviations of the boards' differences."""
 
     copies_n: Annotated[int, Field(ge=1, le=100)]
     gain_sd: Weight  # of each channel
@@ -50,27 +50,27 @@ class Augmentation(Strict):
 
 
 class AugmentedRecipe(Recipe):
-    """Ours: a recipe that is also trained on boards that might have been."""
+    """A recipe that also trains on virtual boards (ours, not the paper's)."""
 
     augmentation: Augmentation
 
 
 class AdaptationRecipe(Schedule):
-    """How a trained network is adapted to a new skin: its recipe's loss goes on, beside a term on the skin's pokes.
+    """Adaptation to a new skin: the recipe's loss, and the triplet loss of unlabelled pokes along lines (section 5).
 
-    `unlabelled_weight` weighs the triplet loss of unlabelled pokes along lines (paper section 5).
+    unlabelled_weight: weight of that triplet loss; with 0 it is the control.
     """
 
     unlabelled_weight: Weight
 
 
 class FineTuningRecipe(Schedule):
-    """How a trained network is fine-tuned on a few labelled pokes of a new skin, weighed by `own_weight`."""
+    """Fine-tuning on a few labelled pokes of a new skin, whose squared error has weight `own_weight`."""
 
     own_weight: Weight
 
 
 class AdaptationWithBase(AdaptationRecipe):
-    """Fine-tuning from one recipe of train_triplet; with an `unlabelled_weight` of 0 it is the control."""
+    """Adaptation of the networks that train_triplet trained by recipe `base`."""
 
     base: Name

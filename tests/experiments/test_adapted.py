@@ -21,8 +21,8 @@ from pipeline.training.variants import (
     CONTROL,
     VariantPrediction,
     bias,
-    biases,
     compare_variants,
+    force_biases,
     summarise_variants,
 )
 from reskin.metrics import METRICS, score, score_groups
@@ -66,12 +66,12 @@ def test_forces_half_as_large_again_are_a_bias_of_fifty_percent_in_each_arm_by_i
         VariantPrediction(BEFORE, "b0", "s0", 0, true, true * np.float32(1.5)),
         VariantPrediction(AFTER, "b0", "s0", 0, true, true),
     ]
-    assert biases(answers)["bias_f_pct"][BEFORE]["mean"] == pytest.approx(50, abs=100 * SINGLE)
-    assert biases(answers)["bias_f_N"][AFTER]["mean"] == 0
+    assert force_biases(answers)["bias_f_pct"][BEFORE]["mean"] == pytest.approx(50, abs=100 * SINGLE)
+    assert force_biases(answers)["bias_f_N"][AFTER]["mean"] == 0
 
 
 def test_each_board_counts_once_as_the_mean_of_its_skins_and_each_skin_as_that_of_its_seeds():
-    own = [one for one in ANSWERS if one.arm == AFTER]
+    own = [one for one in ANSWERS if one.variant == AFTER]
     skins = {
         skin: np.mean([score(one.true, one.predicted)["mse_xy_mm2"] for one in own if one.skin == skin])
         for skin in BOARD
@@ -87,7 +87,7 @@ def test_differences_are_those_of_the_summary_of_cards():
     cards = {
         arm: [
             card("adapt", a.board, score_groups(a.true, a.predicted, np.full(30, a.board), np.full(30, a.skin)))
-            for a in ANSWERS if a.arm == arm
+            for a in ANSWERS if a.variant == arm
         ]
         for arm in (BEFORE, AFTER)
     }  # fmt: skip
@@ -99,7 +99,7 @@ def test_differences_are_those_of_the_summary_of_cards():
 
 
 def by_seed(arm: str, skin: str) -> np.ndarray:
-    own = sorted((one for one in ANSWERS if (one.arm, one.skin) == (arm, skin)), key=lambda one: one.seed_i)
+    own = sorted((one for one in ANSWERS if (one.variant, one.skin) == (arm, skin)), key=lambda one: one.seed_i)
     return np.array([score(one.true, one.predicted)["mse_xy_mm2"] for one in own])
 
 
@@ -130,7 +130,7 @@ def test_adaptation_by_hand_is_told_with_its_counts_its_control_and_its_price():
 
 
 def test_without_a_control_no_difference_to_it_is_told():
-    answer = answer_manual([one for one in ANSWERS if one.arm != CONTROL], pokes_n=[3], lines_n=[1])
+    answer = answer_manual([one for one in ANSWERS if one.variant != CONTROL], pokes_n=[3], lines_n=[1])
     assert CONTROL not in answer
     assert "after_minus_control" not in answer["paired"]
 
