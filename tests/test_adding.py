@@ -95,7 +95,7 @@ def test_what_departs_from_section_compare_is_a_warning_and_no_refusal(root, lab
             raise found
         return found
 
-    monkeypatch.setattr("pipeline.experiments.compare.departure", departure)
+    monkeypatch.setattr("pipeline.experiments.compare.find_departure", departure)
     words = recorded()
     words["experiments"] = [*words["experiments"], "compare"]
     words["compare"] = config.read_yaml(root / SCENES / "lab.yaml")["compare"]
@@ -109,7 +109,7 @@ def test_what_departs_from_section_compare_is_a_warning_and_no_refusal(root, lab
 
 
 def test_a_scene_without_section_compare_is_held_against_nothing(root, lab_file, monkeypatch, capsys):
-    monkeypatch.setattr("pipeline.experiments.compare.departure", lambda *_: pytest.fail("was asked"))
+    monkeypatch.setattr("pipeline.experiments.compare.find_departure", lambda *_: pytest.fail("was asked"))
     add_lab(root, lab_file)
     assert "warning" not in capsys.readouterr().err
 

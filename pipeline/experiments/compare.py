@@ -1,4 +1,9 @@
-"""Recorded changes of field beside simulated ones, poke by poke."""
+"""Compare recorded changes of field with simulated ones, poke by poke (ours; boards with known forces).
+
+Three simulations of each board: the nominal skin, a physical model (law) fitted to the board, and the law of another
+board with what may differ between boards fitted. Beside agreement: what the recordings tell of friction under the tip,
+what a poke leaves in the next no-load reading (memory), and whether labels, chips and skin lie as the scene says.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -28,11 +33,21 @@ from reskin.seeds import rng_for
 from reskin.universal.law import SEVEN, START, TEN, Law, Seen, Setup, beyond_n, fit, nominal_uT, simulate_uT
 from reskin.universal.presses import Pokes, cosines, explained, growth, lengths_uT, memory, pool
 
+ARROWS_N = 4  # places that the figure shows
+WALK_uT = 0.5  # of the no-load field from poke to poke, assumed, where memory is simulated
+NOLOAD_READINGS_N = 10
+CURVE_N = np.geomspace(3e-4, 10.0, 46)  # forces of the curve from the lightest touch to a firm press
+LIGHT_N = 1e-3
+EVERY = 5  # of a board's places, one is on that curve
+# Friction under the tip bounds the slide: k / mu in N/mm, of none (the whole slide at any force) to a slippery tip.
+GRIPS_N_MM = (1e-6, 4.0, START.grip_N_mm, 18.0)
+
+Fields = Float[np.ndarray, "n k 3"]
 Side_mm = Annotated[float, Field(gt=0, le=500)]
 
 
 class Compare(Strict):
-    """How the recorded board lies under its labels and its skin, and what is put in by hand."""
+    """Section compare: how the recorded board lies under its labels and its skin, and the memory that is simulated."""
 
     design: BoardDesign
     skin_mm: tuple[Side_mm, Side_mm]
@@ -40,11 +55,199 @@ class Compare(Strict):
     labels_middle_mm: tuple[float, float]  # the label of the board's middle
     labels_mirrored: bool  # y labels run against the board's y
     tip_radius_mm: Annotated[float, Field(gt=0, le=50)]
-    memory: Annotated[float, Field(ge=0, lt=1)]  # part of a poke's change that stays in the next no-load reading
+    memory: Annotated[
+        float, Field(ge=0, lt=1)
+    ]  # part of a poke's change that stays in the next no-load reading, assumed
 
 
-# What a departure must add to the sum over chips of the cosines to be named. Assumed: chips that are read wrongly lose
-# 0.5 and more each, and a skin that sits 0.5 mm aside moves no cosine by so much.
+def read(settings: Settings) -> Compare:
+    """Read section compare."""
+    return settings.section(Compare, "compare")
+
+
+def compare(settings: Settings, indentations: Path, results: Path) -> None:
+    """Compare the recorded boards of a scene with simulated ones."""
+    design = settings.shared_section(SkinDesign, "skin")
+    boards = pool_skins(read_captures(indentations, tuple(settings.captures_in(indentations))))
+    write_results(results, *compare_boards(boards, read(settings), design, settings.seed))
+
+
+def compare_boards(
+    boards: Mapping[str, Pokes], section: Compare, design: SkinDesign, seed: int
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Compare every board; return the numbers, and what the figures draw."""
+    setup = make_setup(section, design)
+    seen = {board: to_board_axes(pokes, section) for board, pokes in boards.items()}
+    fitted = {board: fit(own, setup, TEN) for board, own in seen.items()}
+    names = list(seen)
+    by_board, drawn = {}, {}
+    for i, (board, own) in enumerate(seen.items()):
+        laws, parameters = {"fitted": fitted[board]}, {"fitted": asdict(fitted[board])}
+        if len(names) > 1:
+            law_of = names[(i + 1) % len(names)]
+            laws["refitted"] = fit(own, setup, SEVEN, fitted[law_of])
+            parameters["refitted"] = asdict(laws["refitted"]) | {"law_of": law_of}
+        simulated_uT = {name: simulate_uT(law, setup, own.place_mm, own.pokes.force_N) for name, law in laws.items()}
+        simulated_uT["nominal"] = nominal_uT(setup, own.place_mm, own.pokes.force_N)
+        agreements = {
+            name: agreement(own, fields_uT) | {"beyond_n": beyond_n(laws.get(name), setup, own.pokes.force_N)}
+            for name, fields_uT in simulated_uT.items()
+        }
+        frictions = fit_frictions(own, setup, fitted[board])
+        curves = {f"{row['grip_N_mm']:g}": row.pop("curve_uT") for row in frictions}
+        by_board[board] = (
+            agreements.pop("fitted")
+            | {"grips": frictions}
+            | agreements
+            | estimate_memory(own, simulated_uT["fitted"], section, seed)
+            | {"laws": parameters, "frames": check_frames(own, setup, section)}
+            | {"noise_uT": dict(zip("xyz", own.pokes.noise_uT.tolist(), strict=True))}
+            | {"pokes_n": len(own.pokes), "left_out_n": own.pokes.left_out_n}
+        )
+        drawn[board] = _drawn(own, simulated_uT["fitted"]) | {"curve_uT": curves}
+    numbers = {
+        "by_board": by_board,
+        "over_boards": summarise_boards(by_board),
+        "memory_put_in": section.memory,
+        "light_N": LIGHT_N,
+        "grip_N_mm": START.grip_N_mm,
+    }
+    return numbers, {"chips_mm": setup.chips_mm.tolist(), "curve_N": CURVE_N.tolist(), "boards": drawn}
+
+
+def summarise_boards(by_board: Mapping[str, Any]) -> dict[str, Any]:
+    """Summarise agreement over boards."""
+    found: dict[str, Any] = {}
+    for simulation in ("nominal", "fitted", "refitted"):
+        rows = [_of_simulation(own, simulation) for own in by_board.values() if _has_simulation(own, simulation)]
+        values = {name: [own[name] for own in rows] for name in ("cosine_mean", "explained_median")}
+        grown = [own["growth"] for own in rows if "growth" in own]
+        values["growth_difference"] = [one["simulated"] - one["recorded"] for one in grown]
+        if rows:
+            found[simulation] = {name: statistic(each, boards=True) for name, each in values.items() if each}
+    return found
+
+
+def _has_simulation(board: Mapping[str, Any], simulation: str) -> bool:
+    return simulation == "fitted" or simulation in board
+
+
+def _of_simulation(board: Mapping[str, Any], simulation: str) -> Mapping[str, Any]:
+    """Return the agreement of a simulation; that of the fitted law stands in the board's own mapping."""
+    own: Mapping[str, Any] = board if simulation == "fitted" else board[simulation]
+    return own
+
+
+def _drawn(seen: Seen, simulated_uT: Float[np.ndarray, "n k 3"]) -> dict[str, Any]:
+    """Choose what figures show: changes of field at some places of the middle group, and sizes against force."""
+    own = np.flatnonzero(seen.pokes.group_i == len(seen.pokes.groups) // 2)
+    order = own[np.argsort(np.hypot(*seen.place_mm[own].T), kind="stable")]
+    chosen = order[np.unique(np.linspace(0, len(order) - 1, ARROWS_N).round().astype(int))]
+    fields = {"recorded": seen.db_uT, "simulated": simulated_uT}
+    return {
+        "group": seen.pokes.groups[len(seen.pokes.groups) // 2],
+        "places_mm": seen.place_mm[chosen].round(2).tolist(),
+        "arrows_uT": {name: of[chosen].round(1).tolist() for name, of in fields.items()},
+        "force_N": seen.pokes.force_N.round(3).tolist(),
+        "length_uT": {name: lengths_uT(of).round(1).tolist() for name, of in fields.items()},
+    }
+
+
+# --- Recordings in the board's axes ---
+
+
+def pool_skins(captures: Sequence[Readings]) -> dict[str, Pokes]:
+    """Pool the captures of each skin; skins are named by their board, or by board and skin where it has several."""
+    skins: dict[str, list[Readings]] = {}
+    for one in captures:
+        skins.setdefault(f"{one.board}/{one.skin}", []).append(one)
+    boards = [name.partition("/")[0] for name in skins]
+    names = {name: board if boards.count(board) == 1 else name for name, board in zip(skins, boards, strict=True)}
+    return {names[name]: pool(own) for name, own in skins.items()}
+
+
+def chip_rotations(section: Compare) -> Float[np.ndarray, "k 3 3"]:
+    """Give the rotations from the chips' axes to the board's, as the scene has them."""
+    return Rotation.from_euler("z", np.array(section.design.turns_deg)[:, None], degrees=True).as_matrix()
+
+
+def make_setup(section: Compare, design: SkinDesign) -> Setup:
+    """Put the designed skin over the scene's chips."""
+    chips_mm, flipped = np.array(section.design.places_mm), section.skin_flipped
+    return Setup(design, chips_mm, section.design.gap_mm, section.skin_mm, flipped, section.tip_radius_mm)
+
+
+def to_board_axes(pokes: Pokes, section: Compare) -> Seen:
+    """Transform labels and fields to the board's axes."""
+    turn, chips_n = chip_rotations(section), pokes.db_uT.shape[1]
+    if len(turn) != chips_n:
+        rule, remedy = f"{chips_n}, as recorded", "Mend compare.design of the scene."
+        raise ParamsError(f"board {pokes.board}", "chips of compare.design", rule, len(turn), remedy)
+    place_mm = (pokes.place_mm - section.labels_middle_mm) * (1, -1 if section.labels_mirrored else 1)
+    rest_uT = np.einsum("kij,kj->ki", turn, pokes.noload_uT.mean(axis=0))
+    return Seen(pokes, place_mm, np.einsum("kij,nkj->nki", turn, pokes.db_uT), rest_uT)
+
+
+# --- Agreement, memory, friction ---
+
+
+def agreement(seen: Seen, simulated_uT: Fields) -> dict[str, Any]:
+    """Compare simulated changes with recorded ones: direction, size and growth with force."""
+    cosine, groups = cosines(simulated_uT, seen.db_uT), seen.pokes.groups
+    grown = {"recorded": growth(seen.pokes, seen.db_uT), "simulated": growth(seen.pokes, simulated_uT)}
+    return {
+        "cosine_mean": float(cosine.mean()),
+        "cosine_by_group": {name: float(cosine[seen.pokes.group_i == i].mean()) for i, name in enumerate(groups)},
+        "explained_median": float(np.median(explained(simulated_uT, seen.db_uT))),
+    } | ({"growth": grown} if None not in grown.values() else {})
+
+
+def estimate_memory(seen: Seen, simulated_uT: Fields, section: Compare, seed: int) -> dict[str, Any]:
+    """Estimate the memory of the recordings, and of simulated no-load readings that have that of the section."""
+    pokes = seen.pokes  # memory does not depend on the axes of the chips
+    rng = rng_for(seed, "compare", pokes.board)
+    walk_uT = WALK_uT * rng.standard_normal(simulated_uT.shape).cumsum(axis=0)
+    noise_uT = pokes.noise_uT / np.sqrt(NOLOAD_READINGS_N) * rng.standard_normal(simulated_uT.shape)
+    before_uT = np.roll(simulated_uT, 1, axis=0)  # the first of a capture follows none, and is not used
+    found = {
+        "recorded": memory(pokes, pokes.db_uT, pokes.noload_uT),
+        "simulated": memory(pokes, simulated_uT, walk_uT + noise_uT + section.memory * before_uT),
+    }
+    return {"memory": found} if None not in found.values() else {}
+
+
+def size_against_force(law: Law, setup: Setup, place_mm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " c"]:
+    """Give |dB| in uT of presses with the forces of `CURVE_N`, the median over some places."""
+    places_mm = np.unique(place_mm.round(2), axis=0)[::EVERY]
+    at_mm, force_N = np.repeat(places_mm, len(CURVE_N), axis=0), np.tile(CURVE_N, len(places_mm))
+    length_uT = lengths_uT(simulate_uT(law, setup, at_mm, force_N)).reshape(len(places_mm), -1)
+    return np.median(length_uT, axis=0)
+
+
+def fit_frictions(seen: Seen, setup: Setup, fitted: Law) -> list[dict[str, Any]]:
+    """Fit the law anew with other frictions under the tip; give agreement, and the field of a light touch.
+
+    `grip_N` is the force that takes two thirds of the slide in the skin's middle.
+    """
+    rows = []
+    for grip_N_mm in GRIPS_N_MM:
+        law = replace(fitted, grip_N_mm=grip_N_mm)
+        if grip_N_mm != fitted.grip_N_mm:
+            law = fit(seen, setup, TEN, replace(START, grip_N_mm=grip_N_mm))
+        agreed = agreement(seen, simulate_uT(law, setup, seen.place_mm, seen.pokes.force_N))
+        length_uT = size_against_force(law, setup, seen.place_mm)
+        rows.append(
+            {name: agreed[name] for name in ("cosine_mean", "explained_median", "growth") if name in agreed}
+            | {"grip_N_mm": grip_N_mm, "grip_N": grip_N_mm * milli * float(np.hypot(law.give_x_um, law.give_y_um))}
+            | {"light_uT": float(np.interp(LIGHT_N, CURVE_N, length_uT)), "curve_uT": length_uT.round(2).tolist()}
+        )
+    return rows
+
+
+# --- Frames: do labels, chips and skin lie as the scene says? ---
+
+# By how much a departure from the scene must raise the sum over chips of the cosines. Assumed: chips that are read
+# wrongly lose 0.5 and more each, and a skin that sits 0.5 mm aside changes no cosine by as much.
 PENALTY = 0.1
 AXES = "xyz"
 AS_SAID = "Labels, chips and skin lie as the scene says."
@@ -61,15 +264,15 @@ class Turn:
     def matrix(self) -> Float[np.ndarray, "3 3"]:
         return quarter_turn(self.quarters) @ np.diag(self.signs)
 
-    def say(self) -> str:
-        """Say what differs from the scene, of a chip."""
+    def describe(self) -> str:
+        """Describe how a chip differs from the scene; empty if it does not."""
         mirrored = " and ".join(axis for axis, sign in zip(AXES, self.signs, strict=True) if sign < 0)
-        words = [f"turned by {90 * self.quarters} degrees more than the scene says"] * bool(self.quarters)
-        return " and ".join(words + [f"mirrored along {mirrored}"] * bool(mirrored))
+        turned = [f"turned by {90 * self.quarters} degrees more than the scene says"] * bool(self.quarters)
+        return " and ".join(turned + [f"mirrored along {mirrored}"] * bool(mirrored))
 
 
-# Each of 16 ways once, in few words: a mirrored x turned by a half is a mirrored y. The first is the scene's own; the
-# first eight leave z alone, as labels do.
+# Each of 16 orientations once: a mirrored x turned by a half is a mirrored y. The first is the scene's own; the first
+# eight leave z alone, as labels do.
 PLAIN = [(quarters, 1, 1) for quarters in range(4)] + [(0, -1, 1), (0, 1, -1), (1, -1, 1), (1, 1, -1)]
 TURNS = [Turn(quarters, (x, y, z)) for z in (1, -1) for quarters, x, y in PLAIN]
 
@@ -81,8 +284,8 @@ def quarter_turn(quarters: int) -> Float[np.ndarray, "3 3"]:
 
 
 @dataclass(frozen=True)
-class Found:
-    """The best way to read a recording; `chips` is where each recorded chip sits, by the scene's numbers."""
+class Frames:
+    """The orientations that agree best; `chips` is where each recorded chip sits, by the scene's numbers."""
 
     labels: Turn
     flipped: bool
@@ -94,26 +297,26 @@ class Found:
 
     @property
     def sentence(self) -> str:
-        """Name what departs from the scene."""
-        words = [f"the labels are {self.labels.say()}"] * (self.labels != TURNS[0])
-        words += ["the skin is flipped: every field has the other sign"] * self.flipped
-        words += _exchanged(self.chips)
+        """Describe what departs from the scene."""
+        parts = [f"the labels are {self.labels.describe()}"] * (self.labels != TURNS[0])
+        parts += ["the skin is flipped: every field has the other sign"] * self.flipped
+        parts += _describe_exchanges(self.chips)
         for turn in dict.fromkeys(self.turns):
             own = [i for i, found in enumerate(self.turns) if found == turn]
             if turn != TURNS[0]:
-                words.append(f"{_name(own, len(self.turns))} {turn.say()}")
-        if not words:
+                parts.append(f"{_name_chips(own, len(self.turns))} {turn.describe()}")
+        if not parts:
             return AS_SAID
-        return f"Against the scene, {'; '.join(words)}."
+        return f"Against the scene, {'; '.join(parts)}."
 
 
-def _name(chips: Sequence[int], chips_n: int) -> str:
+def _name_chips(chips: Sequence[int], chips_n: int) -> str:
     if len(chips) == chips_n:
         return "all chips are"
     return f"chip {chips[0]} is" if len(chips) == 1 else f"chips {', '.join(map(str, chips))} are"
 
 
-def _exchanged(at: Int[np.ndarray, " k"]) -> list[str]:
+def _describe_exchanges(at: Int[np.ndarray, " k"]) -> list[str]:
     moved = np.flatnonzero(at != np.arange(len(at))).tolist()
     if len(moved) == 2:
         return [f"chips {moved[0]} and {moved[1]} are exchanged"]
@@ -121,16 +324,30 @@ def _exchanged(at: Int[np.ndarray, " k"]) -> list[str]:
     return [f"chips are exchanged ({places})"] if moved else []
 
 
-def check(
+def check_frames(seen: Seen, setup: Setup, section: Compare) -> dict[str, Any]:
+    """Check whether labels, chips and skin lie as the scene says."""
+    found = find_frames(
+        seen.place_mm, seen.pokes.db_uT, chip_rotations(section),
+        lambda at_mm: nominal_uT(setup, at_mm, seen.pokes.force_N),
+    )  # fmt: skip
+    columns = zip(found.chips.tolist(), found.as_written.tolist(), found.cosines.tolist(), found.turns, strict=True)
+    chips = [
+        {"chip": i, "at": at, "cosine_as_written": written, "cosine_best": best, "read": turn.describe()}
+        for i, (at, written, best, turn) in enumerate(columns)
+    ]
+    return {"sentence": found.sentence, "chips": chips}
+
+
+def find_frames(
     place_mm: Float[np.ndarray, "n 2"],
     read_uT: Float[np.ndarray, "n k 3"],
     chips_turn: Float[np.ndarray, "k 3 3"],
     nominal: Callable[[Float[np.ndarray, "n 2"]], Float[np.ndarray, "n k 3"]],
-) -> Found:
-    """Find the best way to read pokes, their places on the board and their changes of field in the chips' axes.
+) -> Frames:
+    """Find the orientations of labels, skin and chips that agree best with the nominal skin.
 
-    The scene has the chips' turns; `nominal` simulates places, in the board's axes. A chip that sits at another's place
-    is taken to be turned as that one.
+    `read_uT` is in the chips' axes, `chips_turn` the scene's rotations of the chips; `nominal` simulates places in the
+    board's axes. A chip that sits at another's place is taken to be turned as that one.
     """
     turns = np.stack([turn.matrix for turn in TURNS])
     as_written, found = np.empty(0), []
@@ -144,14 +361,17 @@ def check(
         if labels == TURNS[0]:
             as_written = np.diagonal(cosine[..., 0]).copy()
         ways = product((False, True), TURNS)
-        found += [_best(labels, flipped, common, cosine, as_written) for flipped, common in ways]
+        found += [_best_chips(labels, flipped, common, cosine, as_written) for flipped, common in ways]
     return max(found, key=lambda one: one.worth)
 
 
-def _best(
+def _best_chips(
     labels: Turn, flipped: bool, common: Turn, cosine: Float[np.ndarray, "k l t"], as_written: np.ndarray
-) -> Found:
-    # What all chips have in common is one departure, a little larger: a flipped skin reads as such a turn, too.
+) -> Frames:
+    """Find the best places and turns of the chips, given the labels, the skin and the turn most chips share.
+
+    A turn that all chips share counts as one departure, a little larger: a flipped skin reads as such a turn, too.
+    """
     signed = -cosine if flipped else cosine
     worth = signed - PENALTY * np.array([turn != common for turn in TURNS])
     of_pair = worth.max(axis=2) - PENALTY * (1 - np.eye(len(worth)))
@@ -159,226 +379,41 @@ def _best(
     turn_i = worth[own, at].argmax(axis=1)
     total = of_pair[own, at].sum() - PENALTY * ((labels != TURNS[0]) + flipped + 1.5 * (common != TURNS[0]))
     turns = tuple(TURNS[i] for i in turn_i)
-    return Found(labels, flipped, at, turns, signed[own, at, turn_i], as_written, float(total))
+    return Frames(labels, flipped, at, turns, signed[own, at, turn_i], as_written, float(total))
 
 
-CHIPS_N = 5  # frames are told by chips on all sides of the middle
-# Fewer pokes tell nothing sure; more tell the same, and take seconds: on lab every third of 65 places tells it right.
+CHIPS_N = 5  # frames are found by chips on all sides of the middle
+# Fewer pokes are not reliable; more take seconds and add nothing: on lab every third of 65 places is enough.
 POKES_MIN_N, POKES_MAX_N = 20, 70
 
 
-def departure(blocks: Sequence[Readings], section: Compare, design: SkinDesign) -> str | None:
-    """Name what departs from the scene; None where nothing does, or where the capture cannot tell."""
-    if blocks[0].chips_n != CHIPS_N or not any(_pressed(block).any() for block in blocks):
+def find_departure(blocks: Sequence[Readings], section: Compare, design: SkinDesign) -> str | None:
+    """Describe how a capture departs from the scene; None if it does not, or if the capture cannot tell."""
+    if blocks[0].chips_n != CHIPS_N or not any(_pressed_rows(block).any() for block in blocks):
         return None
     pokes = _thin(pool(blocks))
     if len(pokes) < POKES_MIN_N or not (np.linalg.norm(pokes.db_uT, axis=(0, 2)) > 0).all():
         return None
-    sentence = framed(see(pokes, section), setup_of(section, design), section)["sentence"]
+    sentence = check_frames(to_board_axes(pokes, section), make_setup(section, design), section)["sentence"]
     return None if sentence == AS_SAID else str(sentence)
 
 
-def _pressed(readings: Readings) -> np.ndarray:
+def _pressed_rows(readings: Readings) -> np.ndarray:
     return np.isfinite(readings.x_mm) & np.isfinite(readings.y_mm) & (readings.Fz_N > 0)
 
 
 def _thin(pokes: Pokes) -> Pokes:
-    """Keep at most so many pokes, evenly over the recording."""
+    """Keep at most `POKES_MAX_N` pokes, evenly over the recording."""
     kept = np.unique(np.linspace(0, len(pokes) - 1, POKES_MAX_N).round().astype(int))
-    of_poke = ("group_i", "capture_i", "place_mm", "force_N", "db_uT", "noload_uT")
-    return replace(pokes, **{name: getattr(pokes, name)[kept] for name in of_poke})
+    names = ("group_i", "capture_i", "place_mm", "force_N", "db_uT", "noload_uT")
+    return replace(pokes, **{name: getattr(pokes, name)[kept] for name in names})
 
 
-ARROWS_N = 4  # places that the figure shows
-WALK_uT = 0.5  # of the no-load field from poke to poke, assumed, where memory is simulated
-NOLOAD_READINGS_N = 10
-CURVE_N = np.geomspace(3e-4, 10.0, 46)  # forces of the curve from the lightest touch to a firm press
-LIGHT_N = 1e-3
-EVERY = 5  # of a board's places, one is on that curve
-# Friction under the tip bounds the slide: k / mu in N/mm, of none (the whole slide at any force) to a slippery tip.
-GRIPS_N_MM = (1e-6, 4.0, START.grip_N_mm, 18.0)
-
-
-def turns_of(section: Compare) -> Float[np.ndarray, "k 3 3"]:
-    """Give the rotations from the chips' axes to the board's, as the scene has them."""
-    return Rotation.from_euler("z", np.array(section.design.turns_deg)[:, None], degrees=True).as_matrix()
-
-
-def setup_of(section: Compare, design: SkinDesign) -> Setup:
-    """Put the designed skin over the scene's chips."""
-    chips_mm, flipped = np.array(section.design.places_mm), section.skin_flipped
-    return Setup(design, chips_mm, section.design.gap_mm, section.skin_mm, flipped, section.tip_radius_mm)
-
-
-def see(pokes: Pokes, section: Compare) -> Seen:
-    """Turn what was read into the board's axes."""
-    turn, chips_n = turns_of(section), pokes.db_uT.shape[1]
-    if len(turn) != chips_n:
-        rule, remedy = f"{chips_n}, as recorded", "Mend compare.design of the scene."
-        raise ParamsError(f"board {pokes.board}", "chips of compare.design", rule, len(turn), remedy)
-    place_mm = (pokes.place_mm - section.labels_middle_mm) * (1, -1 if section.labels_mirrored else 1)
-    rest_uT = np.einsum("kij,kj->ki", turn, pokes.noload_uT.mean(axis=0))
-    return Seen(pokes, place_mm, np.einsum("kij,nkj->nki", turn, pokes.db_uT), rest_uT)
-
-
-def beside(seen: Seen, simulated_uT: Float[np.ndarray, "n k 3"]) -> dict[str, Any]:
-    """Compare simulated changes with recorded ones: direction, size and growth with force."""
-    cosine, groups = cosines(simulated_uT, seen.db_uT), seen.pokes.groups
-    grown = {"recorded": growth(seen.pokes, seen.db_uT), "simulated": growth(seen.pokes, simulated_uT)}
-    return {
-        "cosine_mean": float(cosine.mean()),
-        "cosine_by_group": {name: float(cosine[seen.pokes.group_i == i].mean()) for i, name in enumerate(groups)},
-        "explained_median": float(np.median(explained(simulated_uT, seen.db_uT))),
-    } | ({"growth": grown} if None not in grown.values() else {})
-
-
-def remembered(seen: Seen, simulated_uT: Float[np.ndarray, "n k 3"], section: Compare, seed: int) -> dict[str, Any]:
-    """Find the memory of the recordings, and of simulated no-load readings into which one was put by hand."""
-    pokes = seen.pokes  # turning a chip changes no sum of products, so its axes may be any
-    rng = rng_for(seed, "compare", pokes.board)
-    walk_uT = WALK_uT * rng.standard_normal(simulated_uT.shape).cumsum(axis=0)
-    noise_uT = pokes.noise_uT / np.sqrt(NOLOAD_READINGS_N) * rng.standard_normal(simulated_uT.shape)
-    before_uT = np.roll(simulated_uT, 1, axis=0)  # the first of a capture follows none, and is not asked
-    found = {
-        "recorded": memory(pokes, pokes.db_uT, pokes.noload_uT),
-        "simulated": memory(pokes, simulated_uT, walk_uT + noise_uT + section.memory * before_uT),
-    }
-    return {"memory": found} if None not in found.values() else {}
-
-
-def curve(law: Law, setup: Setup, place_mm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " c"]:
-    """Give |dB| in uT, the median over some places, of presses with the forces of `CURVE_N`."""
-    places_mm = np.unique(place_mm.round(2), axis=0)[::EVERY]
-    at_mm, force_N = np.repeat(places_mm, len(CURVE_N), axis=0), np.tile(CURVE_N, len(places_mm))
-    length_uT = lengths_uT(simulate_uT(law, setup, at_mm, force_N)).reshape(len(places_mm), -1)
-    return np.median(length_uT, axis=0)
-
-
-def grips(seen: Seen, setup: Setup, fitted: Law) -> list[dict[str, Any]]:
-    """Fit the law anew with other frictions under the tip: what recordings tell of it, and what a touch would read.
-
-    `grip_N` is the force that takes two thirds of the slide in the skin's middle.
-    """
-    rows = []
-    for grip_N_mm in GRIPS_N_MM:
-        law = replace(fitted, grip_N_mm=grip_N_mm)
-        if grip_N_mm != fitted.grip_N_mm:
-            law = fit(seen, setup, TEN, replace(START, grip_N_mm=grip_N_mm))
-        agrees = beside(seen, simulate_uT(law, setup, seen.place_mm, seen.pokes.force_N))
-        length_uT = curve(law, setup, seen.place_mm)
-        rows.append(
-            {name: agrees[name] for name in ("cosine_mean", "explained_median", "growth") if name in agrees}
-            | {"grip_N_mm": grip_N_mm, "grip_N": grip_N_mm * milli * float(np.hypot(law.give_x_um, law.give_y_um))}
-            | {"light_uT": float(np.interp(LIGHT_N, CURVE_N, length_uT)), "curve_uT": length_uT.round(2).tolist()}
-        )
-    return rows
-
-
-def framed(seen: Seen, setup: Setup, section: Compare) -> dict[str, Any]:
-    """Say whether labels, chips and skin lie as the scene has them."""
-    found = check(
-        seen.place_mm, seen.pokes.db_uT, turns_of(section),
-        lambda at_mm: nominal_uT(setup, at_mm, seen.pokes.force_N),
-    )  # fmt: skip
-    columns = zip(found.chips.tolist(), found.as_written.tolist(), found.cosines.tolist(), found.turns, strict=True)
-    chips = [
-        {"chip": i, "at": at, "cosine_as_written": written, "cosine_best": best, "read": turn.say()}
-        for i, (at, written, best, turn) in enumerate(columns)
-    ]
-    return {"sentence": found.sentence, "chips": chips}
-
-
-def skins_of(captures: Sequence[Readings]) -> dict[str, Pokes]:
-    """Pool the captures of each skin on its board; named by the board, where that has one skin only."""
-    skins: dict[str, list[Readings]] = {}
-    for one in captures:
-        skins.setdefault(f"{one.board}/{one.skin}", []).append(one)
-    boards = [name.partition("/")[0] for name in skins]
-    names = {name: board if boards.count(board) == 1 else name for name, board in zip(skins, boards, strict=True)}
-    return {names[name]: pool(own) for name, own in skins.items()}
-
-
-def compare_boards(boards: Mapping[str, Pokes], section: Compare, design: SkinDesign, seed: int) -> tuple[Any, Any]:
-    """Compare every board; give the numbers, and what the figures draw."""
-    setup = setup_of(section, design)
-    seen = {board: see(pokes, section) for board, pokes in boards.items()}
-    fitted = {board: fit(own, setup, TEN) for board, own in seen.items()}
-    names = list(seen)
-    by_board, drawn = {}, {}
-    for i, (board, own) in enumerate(seen.items()):
-        laws, told = {"fitted": fitted[board]}, {"fitted": asdict(fitted[board])}
-        if len(names) > 1:
-            law_of = names[(i + 1) % len(names)]
-            laws["refitted"] = fit(own, setup, SEVEN, fitted[law_of])
-            told["refitted"] = asdict(laws["refitted"]) | {"law_of": law_of}
-        simulated_uT = {way: simulate_uT(law, setup, own.place_mm, own.pokes.force_N) for way, law in laws.items()}
-        simulated_uT["nominal"] = nominal_uT(setup, own.place_mm, own.pokes.force_N)
-        ways = {
-            way: beside(own, of_way) | {"beyond_n": beyond_n(laws.get(way), setup, own.pokes.force_N)}
-            for way, of_way in simulated_uT.items()
-        }
-        gripped = grips(own, setup, fitted[board])
-        curves = {f"{row['grip_N_mm']:g}": row.pop("curve_uT") for row in gripped}
-        by_board[board] = (
-            ways.pop("fitted")
-            | {"grips": gripped}
-            | ways
-            | remembered(own, simulated_uT["fitted"], section, seed)
-            | {"laws": told, "frames": framed(own, setup, section)}
-            | {"noise_uT": dict(zip("xyz", own.pokes.noise_uT.tolist(), strict=True))}
-            | {"pokes_n": len(own.pokes), "left_out_n": own.pokes.left_out_n}
-        )
-        drawn[board] = _drawn(own, simulated_uT["fitted"]) | {"curve_uT": curves}
-    numbers = {
-        "by_board": by_board, "over_boards": over_boards(by_board), "memory_put_in": section.memory,
-        "light_N": LIGHT_N, "grip_N_mm": START.grip_N_mm,
-    }  # fmt: skip
-    return numbers, {"chips_mm": setup.chips_mm.tolist(), "curve_N": CURVE_N.tolist(), "boards": drawn}
-
-
-def over_boards(by_board: Mapping[str, Any]) -> dict[str, Any]:
-    """Summarise over boards what has bounds: the board is the unit."""
-    found: dict[str, Any] = {}
-    for way in ("nominal", "fitted", "refitted"):
-        rows = [own if way == "fitted" else own[way] for own in by_board.values() if way == "fitted" or way in own]
-        values = {name: [own[name] for own in rows] for name in ("cosine_mean", "explained_median")}
-        grown = [own["growth"] for own in rows if "growth" in own]
-        values["growth_difference"] = [one["simulated"] - one["recorded"] for one in grown]
-        if rows:
-            found[way] = {name: statistic(each, boards=True) for name, each in values.items() if each}
-    return found
-
-
-def _drawn(seen: Seen, simulated_uT: Float[np.ndarray, "n k 3"]) -> dict[str, Any]:
-    # Places in the middle group, from the middle outwards.
-    own = np.flatnonzero(seen.pokes.group_i == len(seen.pokes.groups) // 2)
-    order = own[np.argsort(np.hypot(*seen.place_mm[own].T), kind="stable")]
-    chosen = order[np.unique(np.linspace(0, len(order) - 1, ARROWS_N).round().astype(int))]
-    fields = {"recorded": seen.db_uT, "simulated": simulated_uT}
-    return {
-        "group": seen.pokes.groups[len(seen.pokes.groups) // 2],
-        "places_mm": seen.place_mm[chosen].round(2).tolist(),
-        "arrows_uT": {name: of[chosen].round(1).tolist() for name, of in fields.items()},
-        "force_N": seen.pokes.force_N.round(3).tolist(),
-        "length_uT": {name: lengths_uT(of).round(1).tolist() for name, of in fields.items()},
-    }
-
-
-def read(settings: Settings) -> Compare:
-    """Read section compare."""
-    return settings.section(Compare, "compare")
-
-
-def compare(settings: Settings, indentations: Path, results: Path) -> None:
-    """Compare the recorded boards of a scene with simulated ones."""
-    design = settings.shared_section(SkinDesign, "skin")
-    boards = skins_of(read_captures(indentations, tuple(settings.captures_in(indentations))))
-    write_results(results, *compare_boards(boards, read(settings), design, settings.seed))
-
+# --- Tables and figures ---
 
 COSINE_MIN = {"nominal": 0.90, "fitted": 0.90, "refitted": 0.85}
 EXPLAINED_MIN, GROWTH_WITHIN, MEMORY_PCT = 0.80, 0.10, (5.0, 8.0)
-WAYS = {
+SIMULATIONS = {
     "nominal": "nominal skin, nothing fitted", "fitted": "ten numbers, fitted on this board",
     "refitted": "law of another board, seven refitted",
 }  # fmt: skip
@@ -427,30 +462,31 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     """Tabulate agreement beside its bounds, what was fitted, and how labels, chips and skin lie."""
     by_board = numbers["by_board"]
     rows = [
-        _row(board, way, own if way == "fitted" else own[way], own["laws"].get(way, {}))
+        _board_row(board, name, _of_simulation(own, name), own["laws"].get(name, {}))
         for board, own in by_board.items()
-        for way in WAYS
-        if way == "fitted" or way in own
-    ] + [_over_boards(way, of_way) for way, of_way in numbers["over_boards"].items()]
+        for name in SIMULATIONS
+        if _has_simulation(own, name)
+    ] + [_summary_row(name, own) for name, own in numbers["over_boards"].items()]
     laws = [
-        {"board": board, "law": _say(way, law)} | {title: f"{law[name]:.3g}" for name, title in TITLES.items()}
+        {"board": board, "law": _title(name, law)}
+        | {title: f"{law[parameter]:.3g}" for parameter, title in TITLES.items()}
         for board, own in by_board.items()
-        for way, law in own["laws"].items()
+        for name, law in own["laws"].items()
     ]
-    found = {
+    made = {
         "compare": tabulate(rows, meaning=MEANING.format(100 * numbers["memory_put_in"])),
         "compare_parameters": tabulate(laws, meaning=ABOUT_PARAMETERS),
-        "compare_grip": tabulate(_grips(by_board), meaning=ABOUT_GRIP.format(**numbers)),
-        "compare_frames": tabulate([_lies(*row) for row in by_board.items()], meaning=ABOUT_FRAMES),
+        "compare_grip": tabulate(_friction_rows(by_board), meaning=ABOUT_GRIP.format(**numbers)),
+        "compare_frames": tabulate([_frames_row(*row) for row in by_board.items()], meaning=ABOUT_FRAMES),
     }
-    for table in found.values():
+    for table in made.values():
         table["source"] = source
-    return found
+    return made
 
 
-def _row(board: str, way: str, own: Mapping[str, Any], law: Mapping[str, Any]) -> dict[str, str]:
-    good = [own["cosine_mean"] >= COSINE_MIN[way], own["explained_median"] >= EXPLAINED_MIN]
-    row = _cells(board, _say(way, law), f"{own['cosine_mean']:.3f}", f"{own['explained_median']:.3f}", way)
+def _board_row(board: str, name: str, own: Mapping[str, Any], law: Mapping[str, Any]) -> dict[str, str]:
+    good = [own["cosine_mean"] >= COSINE_MIN[name], own["explained_median"] >= EXPLAINED_MIN]
+    row = _cells(board, _title(name, law), f"{own['cosine_mean']:.3f}", f"{own['explained_median']:.3f}", name)
     row[HELD] = f"{own['beyond_n']}"
     row["cosine by file"] = ", ".join(f"{value:.3f}" for value in own["cosine_by_group"].values())
     if "growth" in own:
@@ -462,28 +498,28 @@ def _row(board: str, way: str, own: Mapping[str, Any], law: Mapping[str, Any]) -
     return row | {"within bounds": "yes" if all(good) else "no"}
 
 
-def _over_boards(way: str, own: Mapping[str, Any]) -> dict[str, str]:
-    told = [
-        verdict(own["cosine_mean"], above=COSINE_MIN[way]), verdict(own["explained_median"], above=EXPLAINED_MIN)
+def _summary_row(name: str, own: Mapping[str, Any]) -> dict[str, str]:
+    verdicts = [
+        verdict(own["cosine_mean"], above=COSINE_MIN[name]), verdict(own["explained_median"], above=EXPLAINED_MIN)
     ]  # fmt: skip
-    shown = [show_digits(own[name], 3) for name in ("cosine_mean", "explained_median")]
-    row = _cells(f"all ({own['cosine_mean']['n']})", WAYS[way], shown[0], shown[1], way)
+    cosine, explained = (show_digits(own[metric], 3) for metric in ("cosine_mean", "explained_median"))
+    row = _cells(f"all ({own['cosine_mean']['n']})", SIMULATIONS[name], cosine, explained, name)
     if "growth_difference" in own:
         row[GROWTH] = f"difference {show_digits(own['growth_difference'], 2)}"
-        told.append(verdict_within(own["growth_difference"], GROWTH_WITHIN))
-    return row | {"within bounds": all_of(told)}
+        verdicts.append(verdict_within(own["growth_difference"], GROWTH_WITHIN))
+    return row | {"within bounds": all_of(verdicts)}
 
 
-def _cells(board: str, law: str, cosine: str, explained: str, way: str) -> dict[str, str]:
-    cells = {"board": board, "simulated with": law, COSINE: f"{cosine} (≥ {COSINE_MIN[way]:.2f})"}
+def _cells(board: str, law: str, cosine: str, explained: str, name: str) -> dict[str, str]:
+    cells = {"board": board, "simulated with": law, COSINE: f"{cosine} (≥ {COSINE_MIN[name]:.2f})"}
     return cells | {"cosine by file": NONE, EXPLAINED: explained, GROWTH: NONE, MEMORY: NONE, HELD: NONE}
 
 
-def _grips(by_board: Mapping[str, Any]) -> list[dict[str, str]]:
+def _friction_rows(by_board: Mapping[str, Any]) -> list[dict[str, str]]:
     lines = []
     for board, own in by_board.items():
         for row in own.get("grips", []):
-            line = {"board": board, "k / mu, N/mm": f"{row['grip_N_mm']:.3g}", "two thirds slide at, N": NONE}
+            line = {"board": board, "k / mu, N/mm": f"{row['grip_N_mm']:.3g}"}
             line["two thirds slide at, N"] = f"{row['grip_N']:.2g}"
             line |= {"cosine": f"{row['cosine_mean']:.3f}", "explained": f"{row['explained_median']:.3f}"}
             grown = row.get("growth")
@@ -492,15 +528,16 @@ def _grips(by_board: Mapping[str, Any]) -> list[dict[str, str]]:
     return lines
 
 
-def _say(way: str, law: Mapping[str, Any]) -> str:
-    return WAYS[way].replace("another board", str(law["law_of"])) if "law_of" in law else WAYS[way]
+def _title(name: str, law: Mapping[str, Any]) -> str:
+    title = SIMULATIONS[name]
+    return title.replace("another board", str(law["law_of"])) if "law_of" in law else title
 
 
-def _lies(board: str, own: Mapping[str, Any]) -> dict[str, str]:
+def _frames_row(board: str, own: Mapping[str, Any]) -> dict[str, str]:
     chips, noise_uT = own["frames"]["chips"], own["noise_uT"]
     cosine = {
-        f"cosine by chip, {words}": ", ".join(f"{chip[key]:.2f}" for chip in chips)
-        for words, key in (("as written", "cosine_as_written"), ("best", "cosine_best"))
+        f"cosine by chip, {title}": ", ".join(f"{chip[key]:.2f}" for chip in chips)
+        for title, key in (("as written", "cosine_as_written"), ("best", "cosine_best"))
     }
     noise = {"noise of a reading x, y, z, µT": ", ".join(f"{value:.2g}" for value in noise_uT.values())}
     pokes = {"pokes": str(own["pokes_n"]), "left out": str(own["left_out_n"])}
@@ -511,13 +548,13 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
     """Draw the field's change at the chips for a few places, and its growth with force, recorded and simulated."""
     boards = dict(list(drawn["boards"].items())[:BOARDS_MAX_N])
     return {
-        "compare_arrows.svg": _arrows(boards, np.array(drawn["chips_mm"]), source),
-        "compare_growth.svg": _growth(drawn["boards"], numbers["by_board"], source),
-        "compare_touch.svg": _touch(drawn, numbers, source),
+        "compare_arrows.svg": _draw_arrows(boards, np.array(drawn["chips_mm"]), source),
+        "compare_growth.svg": _draw_growth(drawn["boards"], numbers["by_board"], source),
+        "compare_touch.svg": _draw_touch(drawn, numbers, source),
     }
 
 
-def _touch(drawn: Mapping[str, Any], numbers: Mapping[str, Any], source: str) -> str:
+def _draw_touch(drawn: Mapping[str, Any], numbers: Mapping[str, Any], source: str) -> str:
     """Draw |dB| against force from the lightest touch on: recorded presses, and the law with some frictions."""
     boards, used = drawn["boards"], f"{numbers['grip_N_mm']:g}"
     with drawing(4.2 * len(boards) + 0.6, 4.2) as figure:
@@ -528,8 +565,8 @@ def _touch(drawn: Mapping[str, Any], numbers: Mapping[str, Any], source: str) ->
             styles = iter(("-.", ":", "--", (0, (1, 3))))
             for grip, length_uT in own["curve_uT"].items():
                 line = {"linestyle": "-", "linewidth": 2} if grip == used else {"linestyle": next(styles)}
-                words = "any force slides it" if float(grip) < 1e-3 else f"k / μ {grip} N/mm"
-                label = f"simulated, {words}" + (" (used)" if grip == used else "")
+                friction = "any force slides it" if float(grip) < 1e-3 else f"k / μ {grip} N/mm"
+                label = f"simulated, {friction}" + (" (used)" if grip == used else "")
                 axes.plot(drawn["curve_N"], length_uT, color=COLOURS[1], label=label, **line)
             axes.set(xscale="log", yscale="log", xlabel="force / N", ylabel="|dB| / µT", title=board)
             axes.set_ylim(bottom=0.1)
@@ -540,7 +577,7 @@ def _touch(drawn: Mapping[str, Any], numbers: Mapping[str, Any], source: str) ->
         return svg(figure)
 
 
-def _arrows(boards: Mapping[str, Any], chips_mm: np.ndarray, source: str) -> str:
+def _draw_arrows(boards: Mapping[str, Any], chips_mm: np.ndarray, source: str) -> str:
     columns_n = max(len(own["places_mm"]) for own in boards.values())
     half_mm = np.abs(chips_mm).max() + 0.6 * ARROW_MM
     with drawing(2.0 * columns_n, 4.2 * len(boards) + 0.6) as figure:
@@ -566,7 +603,7 @@ def _arrows(boards: Mapping[str, Any], chips_mm: np.ndarray, source: str) -> str
         return svg(figure)
 
 
-def _growth(boards: Mapping[str, Any], by_board: Mapping[str, Any], source: str) -> str:
+def _draw_growth(boards: Mapping[str, Any], by_board: Mapping[str, Any], source: str) -> str:
     with drawing(3.6 * len(boards) + 0.6, 3.6) as figure:
         panels = figure.subplots(1, len(boards), squeeze=False)[0]
         for axes, (board, own) in zip(panels, boards.items(), strict=True):

@@ -18,7 +18,7 @@ import pandas as pd
 from jaxtyping import Float, Int64
 from pydantic import Field
 
-from pipeline.experiments.compare import Compare, see, setup_of, skins_of, turns_of
+from pipeline.experiments.compare import Compare, chip_rotations, make_setup, pool_skins, to_board_axes
 from pipeline.experiments.detection import roc_area
 from pipeline.experiments.results import read_captures, write_results
 from pipeline.provenance import SECONDS
@@ -92,12 +92,12 @@ def read(settings: Settings) -> ReferenceMethods:
 def reference_methods(settings: Settings, indentations: Path, folds: Path, models: Path, results: Path) -> None:
     """Score reference methods on every held-out board, on the rows that experiment labels tests."""
     data, compare = read_data(settings, indentations, folds), settings.section(Compare, "compare")
-    skins = skins_of(read_captures(indentations, tuple(settings.captures_in(indentations))))
+    skins = pool_skins(read_captures(indentations, tuple(settings.captures_in(indentations))))
     if len(skins) < 2:
         raise ParamsError(f"scene {settings.scene}", "boards with known forces", "two or more", len(skins), "Add one.")
-    setup = setup_of(compare, settings.shared_section(SkinDesign, "skin"))
-    frame = Frame(turns_of(compare), compare.labels_middle_mm, compare.labels_mirrored)
-    seen = {board: see(pokes, compare) for board, pokes in skins.items()}
+    setup = make_setup(compare, settings.shared_section(SkinDesign, "skin"))
+    frame = Frame(chip_rotations(compare), compare.labels_middle_mm, compare.labels_mirrored)
+    seen = {board: to_board_axes(pokes, compare) for board, pokes in skins.items()}
     section, of_labels = read(settings), data.folds_of(EXPERIMENT)
 
     points: list[Point] = []

@@ -98,14 +98,14 @@ def _warn_of_departures(folder: Path, scene: Scene, skin: Mapping[str, Any], pol
     """Warn if a capture seems to lie otherwise than section compare of its scene says; it stays added."""
     from pipeline.experiments.compare import (
         Compare,
-        departure,  # late: the physics takes seconds
+        find_departure,  # late: the physics takes seconds
     )
     from reskin.physics.skin import SkinDesign
 
     _, blocks, _ = open_capture(folder, policy)
     section = config.parse(Compare, (scene.model_extra or {})["compare"], "section compare")
     try:
-        sentence = departure(list(blocks), section, config.parse(SkinDesign, skin, "params.yaml: skin"))
+        sentence = find_departure(list(blocks), section, config.parse(SkinDesign, skin, "params.yaml: skin"))
     except ReskinError as error:
         sentence = f"Whether labels, chips and skin lie as the scene says was not checked: {error}"
     if sentence:

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from pipeline.executors import make_executor
-from pipeline.experiments.compare import Compare, see, setup_of, skins_of, turns_of
+from pipeline.experiments.compare import Compare, chip_rotations, make_setup, pool_skins, to_board_axes
 from pipeline.experiments.results import read_captures
 from pipeline.settings import Settings
 from pipeline.stage import say
@@ -83,12 +83,12 @@ def universal(settings: Settings, indentations: Path, folds: Path, models: Path,
     A map, and a network with it; calibrated with recorded boards of the rig, and with simulated skins alone.
     """
     data, section = read_data(settings, indentations, folds), settings.section(Compare, "compare")
-    skins = skins_of(read_captures(indentations, tuple(settings.captures_in(indentations))))
+    skins = pool_skins(read_captures(indentations, tuple(settings.captures_in(indentations))))
     if len(skins) < 2:
         raise ParamsError(f"scene {data.scene}", "boards with known forces", "two or more", len(skins), "Add one.")
-    setup = setup_of(section, settings.shared_section(SkinDesign, "skin"))
-    frame = Frame(turns_of(section), section.labels_middle_mm, section.labels_mirrored)
-    seen = {board: see(pokes, section) for board, pokes in skins.items()}
+    setup = make_setup(section, settings.shared_section(SkinDesign, "skin"))
+    frame = Frame(chip_rotations(section), section.labels_middle_mm, section.labels_mirrored)
+    seen = {board: to_board_axes(pokes, section) for board, pokes in skins.items()}
     lessons = read_universal(settings)
     nominal, rig = make_experts(Known(data, frame, setup, seen), lessons)
     write_networks(models, [nominal, *rig.values()], lessons, settings.seed)

@@ -80,23 +80,25 @@ def build(folder: Path, skins: tuple[str, ...] = SKINS) -> Path:
     for skin in skins:
         io.write_readings(folder / f"indentations/{skin}.parquet", [capture(skin)], {})
     io.write_json(folder / "scene.json", SCENE)
-    asked = settings(SCENE)
-    rows = load_rows([folder / f"indentations/{skin}.parquet" for skin in skins], asked.section(Selection, "selection"))
-    drawn = draw_folds(rows, ("single_random", "lobo"), read_split(asked), asked.seed)
+    parsed = settings(SCENE)
+    rows = load_rows(
+        [folder / f"indentations/{skin}.parquet" for skin in skins], parsed.section(Selection, "selection")
+    )
+    drawn = draw_folds(rows, ("single_random", "lobo"), read_split(parsed), parsed.seed)
     io.write_json(folder / "folds.json", render_folds(skins, rows, drawn))
     data = scenery(folder)
     for arm, section, experiment in (
-        ("train_single", asked.training("train_single"), "single_random"),
-        ("train_multi", asked.training("train_multi"), "lobo"),
+        ("train_single", parsed.training("train_single"), "single_random"),
+        ("train_multi", parsed.training("train_multi"), "lobo"),
     ):
         write(folder, arm, data, make_jobs(data, section, data.folds_of(experiment)))
     write(
         folder,
         "train_triplet",
         data,
-        make_jobs(data, asked.training("train_triplet"), data.folds_of("lobo"), experiment="triplet"),
+        make_jobs(data, parsed.training("train_triplet"), data.folds_of("lobo"), experiment="triplet"),
     )
-    starts, named = read_pretrained(folder / "models/train_triplet"), ("paper", asked.adaptations().recipes["paper"])
+    starts, named = read_pretrained(folder / "models/train_triplet"), ("paper", parsed.adaptations().recipes["paper"])
     adapted = [
         adaptation_jobs(data, fold, named, starts, experiment="adapt", pokes_n=8) for fold in data.folds_of("lobo")
     ]
@@ -140,26 +142,26 @@ def scene(honest, tmp_path) -> Path:
     return shutil.copytree(honest, tmp_path / "scene")
 
 
-def asked_of(folder: Path) -> Settings:
+def settings_of(folder: Path) -> Settings:
     return settings(io.read_json(folder / "scene.json"), **{name: SECTIONS[name] for name in PHYSICS})
 
 
 def audited(folder: Path) -> list[dict]:
-    answer = folder / "audit.json"
+    results = folder / "audit.json"
     audit(
-        asked_of(folder), folder / "indentations", folder / "folds.json", folder / "models", folder / "choice.json",
-        answer,
+        settings_of(folder), folder / "indentations", folder / "folds.json", folder / "models", folder / "choice.json",
+        results,
     )  # fmt: skip
-    return io.read_json(answer)
+    return io.read_json(results)
 
 
-def refused(folder: Path, sentence: str) -> None:
+def assert_leak(folder: Path, sentence: str) -> None:
     with pytest.raises(LeakError, match=sentence):
         audited(folder)
     assert not (folder / "audit.json").exists()
 
 
-def test_honest_files_pass_and_every_fold_network_and_arm_was_looked_at(scene, capsys):
+def test_honest_files_pass_and_every_fold_network_and_variant_is_checked(scene, capsys):
     checks = audited(scene)
     assert {check["where"] for check in checks if check["what"] == "copies"} == {"lobo/b0", "lobo/b1", "lobo/b2"}
     assert {check["where"] for check in checks if check["what"] == "pool indentations"} == {
@@ -175,7 +177,7 @@ def test_honest_files_pass_and_every_fold_network_and_arm_was_looked_at(scene, c
     assert f"tiny: {len(checks)} checks, no leak; 1 known" in capsys.readouterr().err
 
 
-def test_a_scene_whose_settings_are_for_speed_needs_no_record_of_a_choice(scene):
+def test_settings_for_speed_need_no_record_of_a_choice(scene):
     io.write_json(scene / "scene.json", SCENE | {"audit": {"settings": "for speed"}})
     (scene / "choice.json").unlink()
     assert not any(check["what"].startswith("settings") for check in audited(scene))
@@ -190,14 +192,14 @@ def test_a_scene_whose_settings_are_for_speed_needs_no_record_of_a_choice(scene)
         ("train_triplet", "triplet.paper.b1.seed0"),
     ],
 )
-def test_a_network_whose_scaler_saw_test_rows_is_named(scene, arm, name, seen_n):
+def test_a_scaler_fitted_to_test_rows_too_is_a_leak(scene, arm, name, seen_n):
     file, data = scene / f"models/{arm}/{name}.safetensors", scenery(scene)
     (fold,) = (one for one in data.folds_of("lobo") if one.name == "b1")
     seen = np.concatenate([fold.train, fold.test[:seen_n]])
     view = VIEW["shape" if ".shape." in name else "raw"](data.rows.db_uT[seen])
     leaked = FIT["standard"](view, data.rows.target[seen]).arrays()
     io.write_tensors(file, io.read_tensors(file)[0] | leaked, {})
-    refused(scene, f"audit of tiny, {name}: scaler must be that of the training rows, .*; got off by")
+    assert_leak(scene, f"audit of tiny, {name}: scaler must be that of the training rows, .*; got off by")
 
 
 def replant(folder: Path, change: Callable[[Fold, SceneData], Fold]) -> None:
@@ -242,13 +244,13 @@ def a_stranger_adapted_to(fold: Fold, data: SceneData) -> Fold:
         (a_stranger_adapted_to, "pool skins must be skins of the test; got 1 of 3 are not held out: b1_s0"),
     ],
 )
-def test_a_fold_that_trains_on_or_adapts_to_what_it_tests_is_named(scene, leak, sentence):
+def test_a_fold_that_trains_on_or_adapts_to_test_rows_is_a_leak(scene, leak, sentence):
     replant(scene, leak)
-    refused(scene, f"audit of tiny, lobo/b0: {sentence}")
+    assert_leak(scene, f"audit of tiny, lobo/b0: {sentence}")
 
 
-def test_a_capture_copied_under_another_name_is_named_though_its_labels_are_apart(tmp_path):
-    refused(
+def test_a_capture_copied_under_another_name_is_a_leak(tmp_path):
+    assert_leak(
         build(tmp_path / "scene", (*SKINS, COPY)),
         r"audit of tiny, lobo/b0: copies must be .*; got 2 of 2 captures compared; b0_s0 like b3_s0: 100.0 %",
     )
@@ -262,9 +264,9 @@ def test_a_capture_copied_under_another_name_is_named_though_its_labels_are_apar
     ],
     ids=["board", "skin"],
 )
-def test_settings_chosen_on_what_is_tested_are_named(scene, changes, sentence):
+def test_settings_chosen_on_tested_boards_or_skins_are_a_leak(scene, changes, sentence):
     io.write_json(scene / "choice.json", CHOICE | changes)
-    refused(scene, f"audit of tiny, {sentence}")
+    assert_leak(scene, f"audit of tiny, {sentence}")
 
 
 @pytest.mark.parametrize(
@@ -297,7 +299,7 @@ def test_a_setting_that_the_study_did_not_choose_is_a_stated_row_and_no_leak(sce
     ],
     ids=["a network that saw the board", "pokes that are tested", "pokes of a training skin"],
 )
-def test_adaptation_with_what_it_may_not_have_is_named(scene, change, sentence):
+def test_adaptation_from_a_wrong_network_or_with_wrong_pokes_is_a_leak(scene, change, sentence):
     file = next((scene / "models/adapt").glob("*.json"))
     card = io.read_json(file)
     data = scenery(scene)
@@ -305,4 +307,4 @@ def test_adaptation_with_what_it_may_not_have_is_named(scene, change, sentence):
     sides = {"tested": fold.test, "trained": fold.train}
     own = {name: np.unique(data.rows.indentation[rows])[:3].tolist() for name, rows in sides.items()}
     io.write_json(file, card | {"tuning": change(card["tuning"], own)})
-    refused(scene, f"{file.stem}: {sentence}")
+    assert_leak(scene, f"{file.stem}: {sentence}")

@@ -16,9 +16,7 @@ from pipeline.experiments.audit import (
     audit_choice,
     audit_fold,
     audit_scaler,
-    holds,
     nearest_rays,
-    to_words,
 )
 from reskin.errors import ParamsError, SchemaError
 from reskin.models.inputs import FIT
@@ -60,10 +58,14 @@ def failing(checks) -> list[str]:
     return [check.what for check in checks if not check.holds]
 
 
+def passes(checks) -> bool:
+    return all(check.holds or check.known for check in checks)
+
+
 LABELS, DB_uT = poked()
 
 
-def test_a_fold_drawn_in_the_docstring_is_as_printed():
+def test_the_example_of_the_docstring_holds():
     outcome = doctest.testmod(audit, extraglobs={"rng": rng_for(0, "doctest")})
     assert outcome.attempted >= 4
     assert outcome.failed == 0
@@ -96,7 +98,7 @@ FIRST_SKIN = LABELS.skin[LABELS.board == "b0"] == "b0_s0"
 )
 def test_a_planted_split_leak_fails_and_is_named(leak, named):
     checks = audited(moved_to_train(leak), LABELS, DB_uT)
-    assert not holds(checks)
+    assert not passes(checks)
     assert failing(checks) == named
     assert checks[1].found == "1 of 1 on both sides: b0"
 
@@ -105,16 +107,16 @@ def test_a_reading_trained_and_tested_on_fails_even_where_indentations_may_be_sh
     own = np.flatnonzero(LABELS.skin == "b0_s0")
     fold = Sides("single_random", "repeat0", own[:100], NONE, own[99:])
     assert failing(audited(fold, LABELS, DB_uT)) == ["readings", "indentations"]
-    assert not holds(audited(fold, LABELS, DB_uT))
+    assert not passes(audited(fold, LABELS, DB_uT))
 
 
-def test_the_papers_random_readings_are_a_known_leak_that_does_not_fail_the_whole():
+def test_the_papers_random_readings_are_a_known_leak_that_does_not_fail_the_audit():
     own = np.flatnonzero(LABELS.skin == "b0_s0")
     checks = audited(Sides("single_random", "repeat0", own[::2], NONE, own[1::2]), LABELS, DB_uT)
     (leak,) = [check for check in checks if not check.holds]
     assert (leak.what, leak.known) == ("indentations", True)
     assert leak.found.startswith("60 of 60 on both sides")  # 3 readings: one side has 2, the other 1
-    assert holds(checks)
+    assert passes(checks)
 
 
 @pytest.mark.parametrize("experiment", ["single_temporal", "single_indentation", "single_pass"])
@@ -124,10 +126,10 @@ def test_within_one_skin_indentations_are_apart_or_the_audit_fails(experiment):
     assert failing(audited(fold, LABELS, DB_uT)) == []
     torn = replace(fold, train=own[:61], test=own[61:])
     assert failing(audited(torn, LABELS, DB_uT)) == ["indentations"]
-    assert not holds(audited(torn, LABELS, DB_uT))
+    assert not passes(audited(torn, LABELS, DB_uT))
 
 
-def test_pokes_to_adapt_by_are_of_the_held_out_skins_and_not_tested():
+def test_unlabelled_pokes_are_of_the_held_out_skins_and_not_tested():
     fold = held_out(LABELS)
     pool, test = fold.test[: 10 * READINGS_N], fold.test[10 * READINGS_N :]
     assert failing(audited(replace(fold, pool=pool, test=test), LABELS, DB_uT)) == []
@@ -151,7 +153,7 @@ def test_a_perturbed_copy_under_another_skins_name_fails_and_is_named(sd_uT, fac
     checks = audited(held_out(LABELS), LABELS, planted)
     assert failing(checks) == ["copies"]
     assert checks[-1].found.startswith("2 of 2 captures compared; c_b0_s1 like b2_s1:")
-    assert not holds(checks)
+    assert not passes(checks)
 
 
 def test_a_copied_capture_is_found_among_a_skins_many_own():
@@ -193,7 +195,7 @@ def test_a_response_turned_by_ten_degrees_is_no_copy():
     assert audited(held_out(LABELS), LABELS, planted)[-1].holds
 
 
-def test_skins_that_cannot_be_told_from_noise_do_not_pass():
+def test_skins_with_fields_within_the_noise_do_not_pass():
     checks = audited(held_out(LABELS), LABELS, np.where((LABELS.skin == "b0_s1")[:, None], DB_uT / 1000, DB_uT))
     assert failing(checks) == ["copies"]
     assert checks[-1].found == "cannot be told: fields within the noise: b0_s1"
@@ -243,7 +245,7 @@ def test_two_recorded_skins_pass_and_a_copy_of_one_fails(shared_data):
 
 
 @pytest.mark.parametrize("experiment", ["lobo", "by_weather"])
-def test_folds_that_cannot_be_judged_are_one_sentence(experiment):
+def test_folds_that_cannot_be_judged_are_an_error(experiment):
     fold = replace(held_out(LABELS, experiment), test=NONE)
     sentence = {
         "lobo": "rows must be on both sides; got 720 to train on, 0",
@@ -283,7 +285,7 @@ def test_a_planted_scaler_leak_fails_even_by_one_row(scaling, seen_n):
 
 
 @pytest.mark.parametrize("scaling", list(FIT))
-def test_one_test_row_among_a_hundred_thousand_is_seen_in_the_scaler(scaling):
+def test_one_test_row_among_a_hundred_thousand_is_found_in_the_scaler(scaling):
     copies_n = 100_000 // len(DB_uT)
     db_uT, target = np.tile(DB_uT, (copies_n, 1)), np.tile(TARGET, (copies_n, 1))
     train = np.arange(len(db_uT) - 2)
@@ -318,7 +320,7 @@ def test_a_scaler_within_the_tolerance_but_nearer_to_both_sides_fails():
     assert not check.holds
 
 
-def test_a_scaler_of_nan_does_not_pass_and_a_missing_array_is_one_sentence():
+def test_a_scaler_of_nan_does_not_pass_and_a_missing_array_is_an_error():
     fold = held_out(LABELS)
     arrays = FIT["standard"](DB_uT[fold.train], TARGET[fold.train]).arrays()
     assert not scaler_check(arrays | {"target_shift": np.full(3, np.nan, np.float32)}, fold, DB_uT, "standard").holds
@@ -340,17 +342,17 @@ def choice_checks(choice=CHOICE, recipes=None, source="simulated", seed=2021):
     return audit_choice(choice, recipes, source=source, seed=seed, **names)
 
 
-def test_settings_chosen_on_skins_of_another_draw_pass_though_names_are_alike():
+def test_settings_chosen_on_skins_of_another_seed_pass_though_names_are_alike():
     assert failing(choice_checks()) == []
     assert failing(choice_checks(source="recorded")) == []
 
 
 @pytest.mark.parametrize(("source", "seed"), [("simulated", 777), ("recorded", 5)])
-def test_a_planted_settings_leak_fails_and_names_the_skin(source, seed):
+def test_a_planted_settings_leak_fails_and_is_named(source, seed):
     checks = choice_checks(CHOICE | {"source": source}, source=source, seed=seed)
     assert failing(checks) == ["settings: boards", "settings: skins"]
     assert checks[1].found == "1 of 3 tested were chosen on: b0_s0"
-    assert not holds(checks)
+    assert not passes(checks)
 
 
 @pytest.mark.parametrize(
@@ -361,23 +363,15 @@ def test_a_planted_settings_leak_fails_and_names_the_skin(source, seed):
         ({"scaling": "standard", "rate_max": 0.003, "tau": 1}, "steps_n absent (study: 4000), tau 1 (study: absent)"),
     ],
 )  # fmt: skip
-def test_a_recipe_other_than_the_chosen_one_is_stated_key_by_key_and_is_no_leak(recipe, found):
+def test_a_recipe_that_differs_from_the_chosen_one_is_stated_and_is_no_leak(recipe, found):
     checks = choice_checks(recipes={"train_multi": recipe})
-    assert holds(checks)
+    assert passes(checks)
     assert checks[-1].found == f"not chosen by the study: {found}"
 
 
-def test_an_arm_that_no_study_chose_for_is_stated_and_a_broken_record_is_one_sentence():
+def test_a_variant_without_a_choice_is_stated_and_a_broken_record_is_an_error():
     checks = choice_checks(recipes={"adapt": RECIPE})
-    assert holds(checks)
+    assert passes(checks)
     assert checks[-1].found == "not chosen by the study: it chose none for this"
     with pytest.raises(ParamsError, match="skins must be given; got nothing"):
         choice_checks({key: value for key, value in CHOICE.items() if key != "skins"})
-
-
-def test_checks_are_written_as_plain_words():
-    (words, *_) = to_words(audited(held_out(LABELS), LABELS, DB_uT))
-    assert words == {
-        "what": "readings", "where": "lobo/b0", "rule": "on one side only",
-        "found": "0 of 360 test readings trained on or adapted to", "holds": True, "known": False,
-    }  # fmt: skip

@@ -1,4 +1,4 @@
-"""Recordings made with known numbers: the fit finds them, and a wrong frame is named; and real ones."""
+"""Fits and frames of simulated recordings with known parameters, and of real ones."""
 
 import itertools
 from dataclasses import asdict, replace
@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 
 from pipeline.experiments import compare
-from pipeline.experiments.compare import Compare, beside, compare_boards, framed, remembered, see, turns_of
+from pipeline.experiments.compare import (
+    Compare,
+    agreement,
+    check_frames,
+    chip_rotations,
+    compare_boards,
+    estimate_memory,
+    to_board_axes,
+)
 from reskin.config import parse, read_yaml
 from reskin.errors import ParamsError, SchemaError
 from reskin.physics import layer
@@ -30,7 +38,7 @@ SETUP = law.Setup(DESIGN, np.array(SECTION.design.places_mm), 1.1, SECTION.skin_
 TRUE = law.Law(0.4, -0.3, 0.0, 1.6, 1.8, 0.5, -0.6, 0.22, 6.0, 40.0, 10.0)
 # How near a fit comes with 3 uT of noise on 50 pokes; gap and amplitude trade against each other.
 NEAR = law.Law(0.05, 0.05, 0.0, 0.15, 0.3, 0.1, 0.1, 0.03, 0.6, 3.0, 3.0)
-TURN = turns_of(SECTION)
+TURN = chip_rotations(SECTION)
 
 
 def made(how: law.Law = TRUE, noise_uT: float = 3.0) -> Pokes:
@@ -54,25 +62,25 @@ def recorded() -> Pokes:
 
 
 def sentence(pokes: Pokes) -> str:
-    return framed(see(pokes, SECTION), SETUP, SECTION)["sentence"]
+    return check_frames(to_board_axes(pokes, SECTION), SETUP, SECTION)["sentence"]
 
 
-def test_a_fit_finds_the_numbers_that_a_recording_was_made_with(recorded):
-    found, near = asdict(fit.fit(see(recorded, SECTION), SETUP, fit.TEN)), asdict(NEAR)
+def test_a_fit_finds_the_true_parameters(recorded):
+    found, near = asdict(fit.fit(to_board_axes(recorded, SECTION), SETUP, fit.TEN)), asdict(NEAR)
     assert {
         name: (found[name], true) for name, true in asdict(TRUE).items() if abs(found[name] - true) > near[name]
     } == {}
 
 
-def test_what_may_differ_between_boards_is_found_with_the_law_held(recorded):
+def test_refitting_finds_what_differs_between_boards_and_holds_the_law(recorded):
     start = replace(fit.START, modulus_MPa=0.25, away_um_mm=6.0, give_x_um=40.0, give_y_um=10.0)
-    found = fit.fit(see(made(replace(TRUE, rotation_deg=2.0)), SECTION), SETUP, fit.SEVEN, start)
+    found = fit.fit(to_board_axes(made(replace(TRUE, rotation_deg=2.0)), SECTION), SETUP, fit.SEVEN, start)
     assert found.rotation_deg == pytest.approx(2.0, abs=0.3)
     assert (found.seat_x_mm, found.seat_y_mm) == pytest.approx((0.4, -0.3), abs=0.05)
     assert [getattr(found, name) for name in fit.TEN[6:]] == [0.25, 6.0, 40.0, 10.0]
 
 
-def test_a_skin_read_as_the_scene_says_departs_from_nothing(recorded):
+def test_a_recording_that_agrees_with_the_scene_departs_in_nothing(recorded):
     assert sentence(recorded) == "Labels, chips and skin lie as the scene says."
 
 
@@ -82,14 +90,14 @@ def test_exchanged_chips_are_named(recorded):
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_an_axis_that_reads_with_the_other_sign_is_named(recorded, axis):
+def test_a_mirrored_axis_is_named(recorded, axis):
     signs = np.where(np.arange(3) == axis, -1.0, 1.0)
     assert sentence(replace(recorded, db_uT=recorded.db_uT * signs)) == (
         f"Against the scene, all chips are mirrored along {'xyz'[axis]}."
     )
 
 
-def test_one_chip_that_is_soldered_a_quarter_aside_is_named(recorded):
+def test_one_chip_turned_by_a_quarter_is_named(recorded):
     db_uT = recorded.db_uT.copy()
     db_uT[:, 3] = db_uT[:, 3] @ compare.quarter_turn(1)
     assert sentence(replace(recorded, db_uT=db_uT)) == (
@@ -98,7 +106,7 @@ def test_one_chip_that_is_soldered_a_quarter_aside_is_named(recorded):
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-def test_labels_that_run_the_other_way_are_named(recorded, axis):
+def test_mirrored_labels_are_named(recorded, axis):
     place_mm = recorded.place_mm.copy()
     place_mm[:, axis] = 16.0 - place_mm[:, axis]
     assert sentence(replace(recorded, place_mm=place_mm)) == (
@@ -111,10 +119,10 @@ def test_a_flipped_skin_is_named(recorded):
     assert sentence(flipped) == "Against the scene, the skin is flipped: every field has the other sign."
 
 
-def test_each_of_the_sixteen_ways_to_read_a_chip_is_tried_once():
+def test_the_sixteen_orientations_are_distinct():
     matrices = {tuple(turn.matrix.ravel().round().astype(int)) for turn in compare.TURNS}
     assert len(matrices) == len(compare.TURNS) == 16
-    assert compare.TURNS[0].say() == ""
+    assert compare.TURNS[0].describe() == ""
     assert all(turn.matrix[2, 2] == (1 if i < 8 else -1) for i, turn in enumerate(compare.TURNS))
 
 
@@ -169,7 +177,7 @@ def test_direction_size_and_growth_of_fields_that_are_known():
     assert growth(replace(pokes, force_N=np.ones(50)), power_uT) is None
 
 
-def test_memory_is_the_part_that_was_put_in_whatever_drifts():
+def test_memory_is_estimated_in_spite_of_drift():
     pokes, rng = made(), rng_for(1, "compare")
     for part in (0.0, 0.07):
         rest_uT = np.linspace(0, 60, 50)[:, None, None] ** 2 / 60 + 0.3 * rng.standard_normal((50, 5, 3))
@@ -189,7 +197,7 @@ def test_pokes_are_means_of_their_readings_and_what_knows_no_force_is_left_out_a
     with pytest.raises(SchemaError, match="experiment compare must be asked of pokes with place and force"):
         pool([readings(Fz_N=np.full(6, np.nan, np.float32))])
     with pytest.raises(ParamsError, match="chips of compare.design must be 1, as recorded; got 5"):
-        see(pokes, SECTION)
+        to_board_axes(pokes, SECTION)
 
 
 @pytest.fixture(scope="module")
@@ -204,18 +212,18 @@ def real(shared_data, tmp_path_factory) -> dict[str, Pokes]:
     return {board: pool(own) for board, own in captures.items()}
 
 
-def test_laws_fitted_on_a_third_of_the_places_of_real_boards_give_all_of_them(real):
+def test_laws_fitted_to_a_third_of_the_places_of_real_boards_agree_with_all_of_them(real):
     # A third leaves 22 of 65 in each of three files; what is fitted on these must hold on all.
     some = {board: _some(pokes, np.arange(len(pokes)) % 65 % 3 == 0) for board, pokes in real.items()}
     numbers, drawn = compare_boards(some, SECTION, DESIGN, seed=2021)
     cosine_min = {"fitted": 0.89, "refitted": 0.85}
     for board, way in itertools.product(real, cosine_min):
-        words, seen = numbers["by_board"][board]["laws"][way], see(real[board], SECTION)
+        words, seen = numbers["by_board"][board]["laws"][way], to_board_axes(real[board], SECTION)
         found = law.Law(**{name: words[name] for name in law.Law.__dataclass_fields__})
-        told = beside(seen, law.simulate_uT(found, SETUP, seen.place_mm, seen.pokes.force_N))
-        assert told["cosine_mean"] > cosine_min[way]
-        assert told["explained_median"] > 0.78
-        assert told["growth"]["simulated"] == pytest.approx(told["growth"]["recorded"], abs=0.12)
+        agreed = agreement(seen, law.simulate_uT(found, SETUP, seen.place_mm, seen.pokes.force_N))
+        assert agreed["cosine_mean"] > cosine_min[way]
+        assert agreed["explained_median"] > 0.78
+        assert agreed["growth"]["simulated"] == pytest.approx(agreed["growth"]["recorded"], abs=0.12)
     for board, own in numbers["by_board"].items():
         assert 0.6 < own["nominal"]["cosine_mean"] < 0.82
         assert own["frames"]["sentence"] == "Labels, chips and skin lie as the scene says."
@@ -229,9 +237,9 @@ def _some(pokes: Pokes, chosen: np.ndarray) -> Pokes:
     return replace(pokes, **{name: getattr(pokes, name)[chosen] for name in names})
 
 
-def test_real_no_load_readings_remember_the_poke_before_and_simulated_ones_what_was_put_in(real):
+def test_memory_of_real_and_of_simulated_no_load_readings(real):
     for pokes in real.values():
-        seen = see(pokes, SECTION)
-        found = remembered(seen, seen.db_uT, SECTION, seed=2021)["memory"]
+        seen = to_board_axes(pokes, SECTION)
+        found = estimate_memory(seen, seen.db_uT, SECTION, seed=2021)["memory"]
         assert 0.05 < found["recorded"] < 0.08
         assert found["simulated"] == pytest.approx(SECTION.memory, abs=0.005)

@@ -1,4 +1,4 @@
-"""What the report says of a comparison: every board and law beside its bounds, frames, the same figure twice."""
+"""Tables and figures of experiment compare."""
 
 import copy
 
@@ -42,7 +42,7 @@ DRAWN = {
 }  # fmt: skip
 
 
-def test_each_law_stands_beside_its_bounds_and_one_number_beyond_them_is_a_no():
+def test_each_simulation_is_judged_by_its_bounds():
     table = tables(NUMBERS, "recorded")["compare"]
     assert table["within bounds"].tolist() == ["no", "yes", "no", "undecided"]
     assert table["cosine"].tolist()[:3] == ["0.700 (≥ 0.90)", "0.910 (≥ 0.90)", "0.910 (≥ 0.85)"]
@@ -54,7 +54,7 @@ def test_each_law_stands_beside_its_bounds_and_one_number_beyond_them_is_a_no():
         assert words in table.attrs["meaning"]
 
 
-def test_a_board_alone_whose_force_hardly_differs_is_told_without_growth_and_another_boards_law():
+def test_a_single_board_with_equal_forces_has_no_growth_and_no_refitted_law():
     alone = copy.deepcopy(BOARD)
     for own in (alone, alone["nominal"]):
         del own["growth"]
@@ -67,14 +67,14 @@ def test_a_board_alone_whose_force_hardly_differs_is_told_without_growth_and_ano
     assert "simulated" in texts_of(figures(numbers, DRAWN, "recorded")["compare_growth.svg"])
 
 
-def test_frames_are_told_in_one_sentence_and_parameters_with_their_units():
+def test_tables_of_frames_and_parameters():
     found = tables(NUMBERS, "recorded")
     assert found["compare_frames"]["in one sentence"].tolist() == ["Against the scene, chips 1 and 2 are exchanged."]
     assert found["compare_frames"]["cosine by chip, best"].tolist() == ["0.80"]
     assert {"gap, mm", "slide away, µm/mm", "Young's modulus, MPa"} <= set(found["compare_parameters"].columns)
 
 
-def test_figures_name_sides_units_and_source_and_are_the_same_twice():
+def test_figures_name_units_and_source_and_are_deterministic():
     drawn = figures(NUMBERS, DRAWN, "recorded")
     for word in ("recorded", "simulated", "µT", "(recorded; ×: poke; number: along z, µT)", "b1"):
         assert word in texts_of(drawn["compare_arrows.svg"])
@@ -84,7 +84,7 @@ def test_figures_name_sides_units_and_source_and_are_the_same_twice():
     assert figures(NUMBERS, DRAWN, "recorded") == drawn
 
 
-def test_what_recordings_tell_of_the_grip_stands_beside_what_a_light_touch_would_read():
+def test_the_table_of_frictions_gives_the_field_of_a_light_touch():
     table = tables(NUMBERS, "recorded")["compare_grip"]
     assert table["k / mu, N/mm"].tolist() == ["1e-06", "8.75"]
     assert table["|dB| of 1 mN, µT (median place)"].tolist() == ["300", "3"]
