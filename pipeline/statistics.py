@@ -1,7 +1,7 @@
-"""The scores of learning: one tidy table, and its only statistics. In: cards, points of sweeps. Out: plain numbers.
+"""The table of scores of all trainings, and the statistics over boards that reports give of it.
 
-A row is one training on one skin, or on all skins that it was tested on. The unit of inference is the board: its skins
-share it and the network that never saw it. Refuses to know networks, files, and who claims what.
+A row of the table is one training on one skin, or on all skins that it was tested on. The unit of inference is the
+board: its skins share it and the network that never saw it.
 """
 
 from collections.abc import Hashable, Iterable, Mapping, Sequence
@@ -19,14 +19,14 @@ COUNTS = (
     "seed", "labels_n", "pokes_n", "contacts_n", "trained_on_skins_n", "trained_on_rows_n", "rows_n",
 )  # fmt: skip
 KEYS = (*NAMES, *COUNTS)  # every other column is a metric
-SURENESS = ("coverage_pct", "half_width_mm")  # of 90 % intervals, where a method tells how sure it is
+UNCERTAINTY = ("coverage_pct", "half_width_mm")  # of 90 % intervals, of methods that give an uncertainty
 ALL_SKINS = ""  # in column `skin`: all rows that a training was tested on
 AS_LABELLED, REGISTERED = "as_labelled", "registered"  # places: the latter after one offset a board, a diagnosis
 METHODS = {"triplet": "network + triplet", "adapt": "network, adapted"}  # of cards, by experiment
 CONFIDENCE = 0.95  # convention
 PERCENTAGES = ("accuracy_pct", "coverage_pct")  # between 0 and 100
 AT_MOST_1 = ("r2_f", "cosine_mean", "explained_median")
-ABOVE_ROUNDING = 12  # decimals of a difference in %, mm2 or N2: what lies below is of float sums
+DECIMALS = 12  # of a difference in %, mm2 or N2: what is below is rounding of float sums
 BOARDS_MIN = 4  # from so many on there is an interval; of fewer, each board's value is given
 YES, NO, INCONCLUSIVE = "supported", "contradicted", "undecided"
 FEW_BOARDS = f"not judged (fewer than {BOARDS_MIN} boards)"
@@ -36,7 +36,7 @@ VERDICTS = (
     f"{BOARDS_MIN} boards have no interval, and their own values are given. The interval is over boards (Student's t "
     "of the boards' means; skins and networks of a board are averaged first), on a scale that keeps it in the possible "
     "range: logit of accuracies, logarithm of squared errors, differences as they are. Folds share training boards, "
-    "which no interval knows."
+    "which no interval takes into account."
 )
 
 Cards = Sequence[Mapping[str, Any]]
@@ -45,10 +45,23 @@ Values = Sequence[float] | Float[np.ndarray, " n"] | pd.Series
 Stat = Mapping[str, Any]
 
 
-def tidy(cards: Cards, points: Mapping[str, Cards] | None = None) -> pd.DataFrame:
-    """Tabulate what cards of models and points of curves, by experiment, say of their scores.
+# --- The table of scores ---
 
-    Networks adapted to one skin each have a row for all skins of their fold too, by fold and seed.
+
+def tidy(cards: Cards, points: Mapping[str, Cards] | None = None) -> pd.DataFrame:
+    """Tabulate the scores of all trainings.
+
+    Parameters
+    ----------
+    cards
+        Cards of models. Networks adapted to one skin each also get a row for all skins of their fold, by fold and seed.
+    points
+        Points of sweeps, by experiment.
+
+    Returns
+    -------
+    DataFrame
+        Columns `KEYS`, then metrics; NaN where a method has no such metric.
     """
     keyed = [(_keys_of_card(card), card["scores"]) for card in cards]
     keyed += [
@@ -61,9 +74,47 @@ def tidy(cards: Cards, points: Mapping[str, Cards] | None = None) -> pd.DataFram
     for row in (row for row in rows if row["skin"] == ALL_SKINS):
         alike.setdefault(tuple(row.get(key) for key in KEYS if key != "rows_n"), []).append(row)
     kept = [*map(_pool, alike.values()), *(row for row in rows if row["skin"] != ALL_SKINS)]
-    return pd.DataFrame(kept, columns=[*KEYS, *METRICS, *SURENESS]).astype(
-        dict.fromkeys((*COUNTS, *METRICS, *SURENESS), float)
+    return pd.DataFrame(kept, columns=[*KEYS, *METRICS, *UNCERTAINTY]).astype(
+        dict.fromkeys((*COUNTS, *METRICS, *UNCERTAINTY), float)
     )
+
+
+def _keys_of_card(card: Mapping[str, Any]) -> dict[str, Any]:
+    keys = {key: card[key] for key in ("question", "fold")} | {"recipe": card["recipe_name"], "seed": card["seed_i"]}
+    keys |= {key: card["recipe"][key] for key in ("inputs", "architecture")}
+    keys |= {"method": METHODS.get(card["question"], "network"), "trained_on_skins_n": len(card["train_skins"])}
+    keys |= {"trained_on_rows_n": card["train_rows_n"]}
+    tuning = card.get("tuning")
+    return keys | ({"base": tuning["settings"]["base"], "pokes_n": tuning["pokes_n"]} if tuning else {})
+
+
+def _keys_of_point(experiment: str, point: Mapping[str, Any]) -> dict[str, Any]:
+    renamed = {"name": "recipe", "seed_i": "seed", "rows_n": "trained_on_rows_n"}
+    keys = {renamed.get(key, key): value for key, value in point.items()}
+    return {key: value for key, value in keys.items() if key in KEYS} | {"question": experiment}
+
+
+def _rows(keys: Mapping[str, Any], scores: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Make the rows of a training: all skins as labelled and registered, then each skin."""
+    boards = {*scores["board_of"].values()}
+    every = {**keys, "skin": ALL_SKINS, "board": boards.pop() if len(boards) == 1 else "", "rows_n": scores["rows_n"]}
+    rows = [every | {"places": AS_LABELLED} | scores["all"], every | {"places": REGISTERED} | scores["registered"]]
+    for skin, own in scores["by_skin"].items():
+        rows.append({**keys, "skin": skin, "board": scores["board_of"][skin], "places": AS_LABELLED, **own})
+    return rows
+
+
+def _pool(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Pool scores of one fold and seed that were tested on a skin each, weighted by their numbers of rows."""
+    rows_n = np.array([row["rows_n"] for row in rows])
+    known = [name for name in (*METRICS, *TRUTH) if all(name in row for row in rows)]
+    parts = {name: np.array([row[name] for row in rows]) for name in known}
+    scores = {name: float(np.average(values, weights=rows_n)) for name, values in parts.items()}
+    if "r2_f" in parts:
+        between_N2 = (parts["force_mean_N"] - scores["force_mean_N"]) ** 2
+        scores["force_var_N2"] += float(np.average(between_N2, weights=rows_n))
+        scores["r2_f"] = 1 - scores["mse_f_N2"] / scores["force_var_N2"]
+    return {**rows[0], **scores, "rows_n": int(rows_n.sum())}
 
 
 def to_csv(table: pd.DataFrame) -> str:
@@ -71,27 +122,45 @@ def to_csv(table: pd.DataFrame) -> str:
     return table.convert_dtypes().to_csv(index=False, float_format="%.6g")
 
 
-def select(rows: pd.DataFrame, **words: str | float) -> pd.DataFrame:
-    """Keep the rows whose columns say these words."""
-    for column, word in words.items():
-        rows = rows[rows[column] == word]
+def select(rows: pd.DataFrame, **values: str | float) -> pd.DataFrame:
+    """Select the rows whose columns have these values."""
+    for column, value in values.items():
+        rows = rows[rows[column] == value]
     return rows
 
 
 def whole(rows: pd.DataFrame, places: str = AS_LABELLED) -> pd.DataFrame:
-    """Keep a row a training: all skins that it was tested on."""
+    """Select the rows about all skins that a training was tested on: one a training."""
     return select(rows, skin=ALL_SKINS, places=places)
 
 
 def by_skin(rows: pd.DataFrame) -> pd.DataFrame:
-    """Keep a row a training and skin."""
+    """Select the rows about single skins."""
     return rows[rows["skin"] != ALL_SKINS]
 
 
-def interval(values: Values, metric: str = "") -> list[float] | None:
-    """Give the two-sided 95 % interval of a mean by Student's t with n - 1 degrees of freedom; None below two values.
+def records(rows: pd.DataFrame) -> dict[str, dict[str, float]]:
+    """Return the values by index and column; NaN is left out."""
+    known = {str(index): row.dropna() for index, row in rows.iterrows()}
+    return {index: {str(name): float(value) for name, value in row.items()} for index, row in known.items()}
 
-    A metric with a bounded range has its interval on a scale without bounds, see `reached`.
+
+def tally(trainings: Iterable[Mapping[str, Any]]) -> dict[str, int]:
+    """Count trainings: all, those that collapsed, and those of them that were kept because every repeat collapsed.
+
+    >>> tally([{"collapsed": False, "collapsed_before_n": 1}, {"collapsed": True, "collapsed_before_n": 2}])
+    {'trainings_n': 5, 'collapsed_n': 4, 'kept_collapsed_n': 1}
+    """
+    counted = [(training["collapsed"], training["collapsed_before_n"]) for training in trainings]
+    kept_n, before_n = sum(collapsed for collapsed, _ in counted), sum(before_n for _, before_n in counted)
+    return {"trainings_n": len(counted) + before_n, "collapsed_n": before_n + kept_n, "kept_collapsed_n": kept_n}
+
+
+# --- Intervals and p-values ---
+
+
+def interval(values: Values, metric: str = "") -> list[float] | None:
+    """Compute the two-sided 95 % interval of a mean by Student's t; None below two values. See `t_interval`.
 
     >>> interval([1.0]) is None
     True
@@ -103,18 +172,18 @@ def interval(values: Values, metric: str = "") -> list[float] | None:
     n = len(values)
     if n < 2:
         return None
-    return reached(float(np.mean(values)), float(np.std(values, ddof=1) / np.sqrt(n)), n - 1, metric)
+    return t_interval(float(np.mean(values)), float(np.std(values, ddof=1) / np.sqrt(n)), n - 1, metric)
 
 
-def reached(mean: float, se: float, freedom: float, metric: str = "") -> list[float]:
-    """Give the 95 % interval of a mean with this standard error, by Student's t, inside the metric's range.
+def t_interval(mean: float, se: float, df: float, metric: str = "") -> list[float]:
+    """Compute the 95 % interval of a mean with this standard error by Student's t, inside the metric's range.
 
-    Delta method: g(mean) +- t g'(mean) se, taken back by the inverse of g. g is the logit of a percentage, the
-    logarithm of a squared error, -log(1 - x) of what is 1 at most, and x itself of anything else.
+    Delta method: g(mean) +- t g'(mean) se, transformed back by the inverse of g. g is the logit of a percentage, the
+    logarithm of a squared error, -log(1 - x) of a metric that is at most 1, and x itself of any other.
     """
     from scipy.special import expit, logit, stdtrit  # late: only where there are intervals
 
-    reach = float(stdtrit(freedom, (1 + CONFIDENCE) / 2)) * se
+    reach = float(stdtrit(df, (1 + CONFIDENCE) / 2)) * se
     if reach == 0:
         return [mean, mean]
     ends = np.array([-reach, reach])
@@ -128,17 +197,17 @@ def reached(mean: float, se: float, freedom: float, metric: str = "") -> list[fl
     return [float(end) for end in mean + ends]
 
 
-def p_value(mean: float, se: float, freedom: float) -> float:
-    """Give the two-sided p-value of a mean difference being 0, by Student's t."""
+def p_value(mean: float, se: float, df: float) -> float:
+    """Compute the two-sided p-value of a mean difference of 0 by Student's t."""
     from scipy.special import stdtr
 
     if se == 0:
         return 1.0 if mean == 0 else 0.0
-    return float(2 * stdtr(freedom, -abs(mean) / se))
+    return float(2 * stdtr(df, -abs(mean) / se))
 
 
 def holm(p_values: Mapping[str, float]) -> dict[str, float]:
-    """Adjust the p-values of a family for their number (Holm 1979); each is compared with 0.05 as it is.
+    """Adjust the p-values of a family of tests for their number (Holm 1979).
 
     >>> holm({"a": 0.01, "b": 0.04, "c": 0.03})
     {'a': 0.03, 'c': 0.06, 'b': 0.06}
@@ -150,8 +219,11 @@ def holm(p_values: Mapping[str, float]) -> dict[str, float]:
     return adjusted
 
 
+# --- Summaries over boards, folds, pairs ---
+
+
 def statistic(values: Values, *, boards: bool = False, metric: str = "") -> dict[str, Any]:
-    """Give mean and number, and of two values or more sd (n - 1).
+    """Summarise values: `mean` and `n`, and of two or more `sd` (n - 1).
 
     Of `boards` also the interval `ci95`, or of fewer than `BOARDS_MIN` their `values`, in the order of the boards.
     """
@@ -166,7 +238,7 @@ def statistic(values: Values, *, boards: bool = False, metric: str = "") -> dict
 
 
 def summarise(units: pd.DataFrame, *, boards: bool = False, differences: bool = False) -> dict[str, dict[str, Any]]:
-    """Summarise each column over the rows that have it; of `differences` no range is known."""
+    """Summarise each column over the rows that have it. `differences`: the columns are not bounded as metrics are."""
     known = {str(name): units[name].dropna().to_numpy() for name in units}
     return {
         name: statistic(values, boards=boards, metric="" if differences else name)
@@ -176,16 +248,16 @@ def summarise(units: pd.DataFrame, *, boards: bool = False, differences: bool = 
 
 
 def over_units(rows: pd.DataFrame, *unit: str, boards: bool = False) -> dict[str, dict[str, Any]]:
-    """Summarise every metric over units, each the mean of its rows; `sd_seeds` is the mean sd within a unit.
+    """Summarise every metric over units (groups by these columns), each the mean of its rows.
 
-    Over several boards there is no `sd_seeds`.
+    `sd_seeds` is the mean sd within a unit; it is not given over several boards.
     """
     groups = rows.groupby(list(unit))[_metrics(rows)]
     summary = summarise(groups.mean(), boards=boards)
-    return with_seeds(summary, rows, *unit) if not boards or groups.ngroups == 1 else summary
+    return add_seed_sd(summary, rows, *unit) if not boards or groups.ngroups == 1 else summary
 
 
-def with_seeds(summary: Mapping[str, Stat], rows: pd.DataFrame, *unit: str) -> dict[str, dict[str, Any]]:
+def add_seed_sd(summary: Mapping[str, Stat], rows: pd.DataFrame, *unit: str) -> dict[str, dict[str, Any]]:
     """Add `sd_seeds` to each statistic: the standard deviation (n - 1) of the rows of a unit, mean over units.
 
     The rows of a unit are networks that differ in their seed. A metric whose units have one row each is left as it is.
@@ -209,26 +281,26 @@ def over_boards(rows: pd.DataFrame, places: str = AS_LABELLED) -> dict[str, dict
 def over_pairs(rows: pd.DataFrame) -> dict[str, dict[str, Any]]:
     """Summarise pairs of a training and a test skin, as the paper does (3 x 9 pairs).
 
-    `ci95` is over training skins and test boards alike (`two_way`), `training_n` and `boards_n` how many there are.
+    `ci95` is over training skins and test boards alike (`two_way_error`); `training_n` and `boards_n` count them.
     """
     own = by_skin(rows)
     pairs, crossed = over_units(own, "fold", "skin"), own.groupby(["fold", "board"])[_metrics(own)].mean()
     found = {}
     for name, stat in pairs.items():
         table = crossed[name].dropna().unstack()
-        error = two_way(table)
+        error = two_way_error(table)
         found[name] = stat | {"training_n": len(table), "boards_n": len(table.columns)}
         if error is not None:
-            found[name]["ci95"] = reached(stat["mean"], *error, name)
+            found[name]["ci95"] = t_interval(stat["mean"], *error, name)
     return found
 
 
-def two_way(table: pd.DataFrame) -> tuple[float, float] | None:
-    """Give the standard error, and its degrees of freedom, of a mean over rows and columns that are both samples.
+def two_way_error(table: pd.DataFrame) -> tuple[float, float] | None:
+    """Compute the standard error of a mean over rows and columns that are both samples, and its degrees of freedom.
 
     Training skins are rows, test boards columns; cells may be missing. The variance is that of row means over their
-    number plus that of column means over theirs, with Satterthwaite's degrees of freedom: a little too wide, as what is
-    left in single cells counts twice. None below two rows or `BOARDS_MIN` columns.
+    number plus that of column means over theirs, with Satterthwaite's degrees of freedom. The error is a little too
+    large, because the residual variance of cells counts twice. None below two rows or `BOARDS_MIN` columns.
     """
     if len(table) < 2 or len(table.columns) < BOARDS_MIN:
         return None
@@ -243,6 +315,22 @@ def board_means(rows: pd.DataFrame) -> pd.DataFrame:
     return _skin_means(rows).groupby("board").mean()
 
 
+def _metrics(rows: pd.DataFrame) -> list[str]:
+    return [str(name) for name in rows if name not in (*KEYS, *TRUTH)]
+
+
+def _skin_means(rows: pd.DataFrame) -> pd.DataFrame:
+    return rows.groupby(["board", "skin"])[_metrics(rows)].mean()
+
+
+# --- Paired differences ---
+
+
+def paired(of: pd.DataFrame, over: pd.DataFrame) -> dict[str, Any]:
+    """Summarise the paired differences of two methods on the same skins over boards; `by_board` has each board's."""
+    return summarise_differences(differences(of, over))
+
+
 def differences(of: pd.DataFrame, over: pd.DataFrame) -> pd.DataFrame:
     """Subtract skin by skin, each side the mean of its networks there; a row a board, the mean of its skins."""
     ours, theirs = _skin_means(of), _skin_means(over)
@@ -251,45 +339,40 @@ def differences(of: pd.DataFrame, over: pd.DataFrame) -> pd.DataFrame:
     return (ours - theirs).groupby("board").mean()
 
 
-def with_boards(by_board: pd.DataFrame) -> dict[str, Any]:
-    """Summarise differences over boards, and give `by_board` each board's value; what is left of equal sides is 0.
+def summarise_differences(by_board: pd.DataFrame) -> dict[str, Any]:
+    """Summarise differences over boards; `by_board` has each board's value.
 
     Over `BOARDS_MIN` boards or more, `p` is the p-value of no difference, from `se` and `df` (degrees of freedom).
     """
     summary = summarise(by_board, boards=True, differences=True)
-    means = {name: stat | {"mean": round(stat["mean"], ABOVE_ROUNDING)} for name, stat in summary.items()}
+    means = {name: stat | {"mean": round(stat["mean"], DECIMALS)} for name, stat in summary.items()}
     for stat in means.values():
         if "ci95" in stat:
-            stat |= _tested(stat["mean"], stat["sd"] / stat["n"] ** 0.5, stat["n"] - 1)
+            stat |= _t_test(stat["mean"], stat["sd"] / stat["n"] ** 0.5, stat["n"] - 1)
     return {**means, "by_board": records(by_board)}
 
 
-def paired(of: pd.DataFrame, over: pd.DataFrame) -> dict[str, Any]:
-    """Compare two sides of equal skins: every metric's difference over boards, and `by_board`."""
-    return with_boards(differences(of, over))
-
-
 def paired_with_single(of: pd.DataFrame, single: pd.DataFrame) -> dict[str, Any]:
-    """Compare networks of many skins with networks of one skin each, where these were tested: as `paired`.
+    """Summarise differences of networks of many skins and of one skin each, where the latter were tested: as `paired`.
 
-    Both the boards and the single networks' training skins are samples: the interval and `p` are those of `two_way`.
+    Both the boards and the single networks' training skins are samples: interval and `p` are of `two_way_error`.
     """
     theirs = single.groupby(["fold", "board", "skin"])[_metrics(single)].mean()
     ours, skins = _skin_means(of), pd.MultiIndex.from_tuples([pair[1:] for pair in theirs.index])
     if unpaired := sorted(set(skins) - set(ours.index)):
         raise _unpaired(unpaired)
     apart = (ours.loc[skins, theirs.columns].set_axis(theirs.index) - theirs).groupby(["fold", "board"]).mean()
-    found = with_boards(apart.groupby("board").mean())
+    found = summarise_differences(apart.groupby("board").mean())
     for name in apart:
         if name in found:
             stat = {key: value for key, value in found[name].items() if key in ("mean", "sd", "n", "values")}
-            error = two_way(apart[name].dropna().unstack())
-            found[name] = stat if error is None else stat | _tested(stat["mean"], *error)
+            error = two_way_error(apart[name].dropna().unstack())
+            found[name] = stat if error is None else stat | _t_test(stat["mean"], *error)
     return found
 
 
-def _tested(mean: float, se: float, freedom: float) -> dict[str, Any]:
-    return {"ci95": reached(mean, se, freedom), "se": se, "df": freedom, "p": p_value(mean, se, freedom)}
+def _t_test(mean: float, se: float, df: float) -> dict[str, Any]:
+    return {"ci95": t_interval(mean, se, df), "se": se, "df": df, "p": p_value(mean, se, df)}
 
 
 def _unpaired(skins: Sequence[Any]) -> SchemaError:
@@ -297,10 +380,14 @@ def _unpaired(skins: Sequence[Any]) -> SchemaError:
     return SchemaError("a paired difference", "held-out skins", "the same on both sides", skins, remedy)
 
 
-def records(rows: pd.DataFrame) -> dict[str, dict[str, float]]:
-    """Give known numbers by index and column."""
-    known = {str(index): row.dropna() for index, row in rows.iterrows()}
-    return {index: {str(name): float(value) for name, value in row.items()} for index, row in known.items()}
+def negate(stat: Stat) -> dict[str, Any]:
+    """Change the sign of a difference."""
+    negative = {**stat, "mean": -stat["mean"]}
+    negative |= {"values": [-one for one in stat["values"]]} if "values" in stat else {}
+    return negative | ({"ci95": [-end for end in reversed(stat["ci95"])]} if "ci95" in stat else {})
+
+
+# --- Verdicts ---
 
 
 def verdict(stat: Stat, *, above: float = 0.0) -> str:
@@ -311,79 +398,16 @@ def verdict(stat: Stat, *, above: float = 0.0) -> str:
     return YES if low > above else NO if high < above else INCONCLUSIVE
 
 
-def verdict_within(stat: Stat, reach: float) -> str:
-    """Judge whether a mean over boards is nearer to 0 than `reach`, by its interval (equivalence)."""
+def verdict_within(stat: Stat, margin: float) -> str:
+    """Judge whether a mean over boards is nearer to 0 than `margin`, by its interval (equivalence)."""
     if "ci95" not in stat:
         return FEW_BOARDS
     low, high = stat["ci95"]
-    if -reach < low and high < reach:
+    if -margin < low and high < margin:
         return YES
-    return NO if low > reach or high < -reach else INCONCLUSIVE
+    return NO if low > margin or high < -margin else INCONCLUSIVE
 
 
-def negated(stat: Stat) -> dict[str, Any]:
-    """Turn a difference round: of an error, less is a gain."""
-    turned = {**stat, "mean": -stat["mean"]}
-    turned |= {"values": [-one for one in stat["values"]]} if "values" in stat else {}
-    return turned | ({"ci95": [-end for end in reversed(stat["ci95"])]} if "ci95" in stat else {})
-
-
-def all_of(verdicts: Sequence[str]) -> str:
-    """Judge a claim of several parts: one no is enough to deny it, and only yes throughout affirms it."""
-    return next((word for word in (NO, FEW_BOARDS, INCONCLUSIVE) if word in verdicts), YES)
-
-
-def tally(trainings: Iterable[Mapping[str, Any]]) -> dict[str, int]:
-    """Count trainings: all, those that collapsed, and those of them that were kept as no other draw went better.
-
-    >>> tally([{"collapsed": False, "collapsed_before_n": 1}, {"collapsed": True, "collapsed_before_n": 2}])
-    {'trainings_n': 5, 'collapsed_n': 4, 'kept_collapsed_n': 1}
-    """
-    counted = [(training["collapsed"], training["collapsed_before_n"]) for training in trainings]
-    kept_n, before_n = sum(collapsed for collapsed, _ in counted), sum(before_n for _, before_n in counted)
-    return {"trainings_n": len(counted) + before_n, "collapsed_n": before_n + kept_n, "kept_collapsed_n": kept_n}
-
-
-def _metrics(rows: pd.DataFrame) -> list[str]:
-    return [str(name) for name in rows if name not in (*KEYS, *TRUTH)]
-
-
-def _skin_means(rows: pd.DataFrame) -> pd.DataFrame:
-    return rows.groupby(["board", "skin"])[_metrics(rows)].mean()
-
-
-def _keys_of_card(card: Mapping[str, Any]) -> dict[str, Any]:
-    keys = {key: card[key] for key in ("question", "fold")} | {"recipe": card["recipe_name"], "seed": card["seed_i"]}
-    keys |= {key: card["recipe"][key] for key in ("inputs", "architecture")}
-    keys |= {"method": METHODS.get(card["question"], "network"), "trained_on_skins_n": len(card["train_skins"])}
-    keys |= {"trained_on_rows_n": card["train_rows_n"]}
-    tuning = card.get("tuning")
-    return keys | ({"base": tuning["settings"]["base"], "pokes_n": tuning["pokes_n"]} if tuning else {})
-
-
-def _keys_of_point(experiment: str, point: Mapping[str, Any]) -> dict[str, Any]:
-    named = {"name": "recipe", "seed_i": "seed", "rows_n": "trained_on_rows_n"}
-    keys = {named.get(key, key): value for key, value in point.items()}
-    return {key: value for key, value in keys.items() if key in KEYS} | {"question": experiment}
-
-
-def _rows(keys: Mapping[str, Any], scores: Mapping[str, Any]) -> list[dict[str, Any]]:
-    boards = {*scores["board_of"].values()}
-    every = {**keys, "skin": ALL_SKINS, "board": boards.pop() if len(boards) == 1 else "", "rows_n": scores["rows_n"]}
-    rows = [every | {"places": AS_LABELLED} | scores["all"], every | {"places": REGISTERED} | scores["registered"]]
-    for skin, own in scores["by_skin"].items():
-        rows.append({**keys, "skin": skin, "board": scores["board_of"][skin], "places": AS_LABELLED, **own})
-    return rows
-
-
-def _pool(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Put the scores of one fold and seed together that were tested on a skin each, by their numbers of rows."""
-    rows_n = np.array([row["rows_n"] for row in rows])
-    known = [name for name in (*METRICS, *TRUTH) if all(name in row for row in rows)]
-    parts = {name: np.array([row[name] for row in rows]) for name in known}
-    scores = {name: float(np.average(values, weights=rows_n)) for name, values in parts.items()}
-    if "r2_f" in parts:
-        between_N2 = (parts["force_mean_N"] - scores["force_mean_N"]) ** 2
-        scores["force_var_N2"] += float(np.average(between_N2, weights=rows_n))
-        scores["r2_f"] = 1 - scores["mse_f_N2"] / scores["force_var_N2"]
-    return {**rows[0], **scores, "rows_n": int(rows_n.sum())}
+def combine_verdicts(verdicts: Sequence[str]) -> str:
+    """Judge a claim of several parts: contradicted if one part is, supported if all are."""
+    return next((verdict for verdict in (NO, FEW_BOARDS, INCONCLUSIVE) if verdict in verdicts), YES)

@@ -11,7 +11,7 @@ from ruamel.yaml import YAML
 
 from pipeline.scenes import EXPERIMENTS, check_scene
 from pipeline.settings import Settings, read_shared_files
-from pipeline.statistics import KEYS, SURENESS
+from pipeline.statistics import KEYS, UNCERTAINTY
 from reskin import io
 from reskin.config import read_yaml
 from reskin.data.rows import TARGETS
@@ -56,7 +56,7 @@ def test_every_column_of_readings_is_documented_with_its_unit():
 
 def test_every_column_of_predictions_and_scores_is_documented():
     told = {f"{side}_{name}" for side in ("true", "predicted") for name in TARGETS}
-    assert sorted(told.union(KEYS, METRICS, SURENESS) - words_of("data/README.md")) == []
+    assert sorted(told.union(KEYS, METRICS, UNCERTAINTY) - words_of("data/README.md")) == []
 
 
 def numbers(words: Any) -> Iterator[str]:

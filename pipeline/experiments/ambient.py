@@ -16,7 +16,7 @@ from pipeline.experiments.results import write_results
 from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
 from pipeline.report.formatting import show_digits
 from pipeline.settings import Settings, Training
-from pipeline.statistics import summarise, tally, with_seeds
+from pipeline.statistics import add_seed_sd, summarise, tally
 from pipeline.synthesis import synthesis_of
 from pipeline.training.jobs import SceneData, collapse_record, make_jobs, read_data, train_jobs
 from reskin.config import Strict
@@ -147,7 +147,7 @@ def by_step(points: Sequence[dict[str, Any]], case: str, boards: Sequence[str]) 
                 row[name] = float(np.sqrt(np.mean([point[size] ** 2 for point in here])))
         for arm in dict.fromkeys(point["arm"] for point in here):
             own = pd.DataFrame([{"board": point["board"], **point["scores"]} for point in here if point["arm"] == arm])
-            row[arm] = with_seeds(summarise(own.groupby("board").mean(), boards=True), own, "board")
+            row[arm] = add_seed_sd(summarise(own.groupby("board").mean(), boards=True), own, "board")
         rows.append(row)
     return rows
 

@@ -23,7 +23,7 @@ from pipeline.experiments.results import read_captures, write_results
 from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
 from pipeline.report.formatting import show_digits, tabulate
 from pipeline.settings import Settings
-from pipeline.statistics import all_of, statistic, verdict, verdict_within
+from pipeline.statistics import combine_verdicts, statistic, verdict, verdict_within
 from reskin.config import Strict
 from reskin.errors import ParamsError
 from reskin.physics.board import BoardDesign
@@ -507,7 +507,7 @@ def _summary_row(name: str, own: Mapping[str, Any]) -> dict[str, str]:
     if "growth_difference" in own:
         row[GROWTH] = f"difference {show_digits(own['growth_difference'], 2)}"
         verdicts.append(verdict_within(own["growth_difference"], GROWTH_WITHIN))
-    return row | {"within bounds": all_of(verdicts)}
+    return row | {"within bounds": combine_verdicts(verdicts)}
 
 
 def _cells(board: str, law: str, cosine: str, explained: str, name: str) -> dict[str, str]:

@@ -28,14 +28,14 @@ from pipeline.statistics import (
     VERDICTS,
     YES,
     Stat,
-    all_of,
+    add_seed_sd,
     board_means,
+    combine_verdicts,
     interval,
     statistic,
     summarise,
     tally,
     verdict,
-    with_seeds,
 )
 from pipeline.training.jobs import SceneData, collapse_record, preload_training, train_jobs
 from reskin.config import Strict
@@ -276,7 +276,7 @@ def last_window(scores: pd.DataFrame, policy: str) -> dict[str, Any]:
     own = scores[(scores["policy"] == policy) & (scores["window_i"] == scores["window_i"].max())]
     contacts_n = round(float(np.mean(own["contacts_n"].to_numpy())))
     rows = own.drop(columns=["policy", "seed_i", "window_i", "contacts_n", "noload_off_uT"]).dropna(axis=1, how="all")
-    return {"contacts_n": contacts_n} | with_seeds(summarise(board_means(rows), boards=True), rows, "board", "skin")
+    return {"contacts_n": contacts_n} | add_seed_sd(summarise(board_means(rows), boards=True), rows, "board", "skin")
 
 
 def late_window(rows: Sequence[Mapping[str, Any]]) -> int:
@@ -589,9 +589,9 @@ def late_bias(late: Mapping[str, Any]) -> Comparison:
 
 def judge_finding(name: str, finding: str, parts: Sequence[Comparison]) -> dict[str, Any]:
     """Judge a finding by all of its comparisons, over boards and over trainings on these boards."""
-    judged = all_of([verdict(part.over_boards) for part in parts])
+    judged = combine_verdicts([verdict(part.over_boards) for part in parts])
     trainings = [part.over_trainings for part in parts]
-    of_trainings = all_of([INCONCLUSIVE if ends is None else verdict({"ci95": ends}) for ends in trainings])
+    of_trainings = combine_verdicts([INCONCLUSIVE if ends is None else verdict({"ci95": ends}) for ends in trainings])
     return {
         "id": name,
         "finding": finding,

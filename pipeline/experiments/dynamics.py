@@ -16,7 +16,7 @@ from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
 from pipeline.report.formatting import show_difference
 from pipeline.settings import Settings
 from pipeline.stage import say
-from pipeline.statistics import VERDICTS, negated, paired, statistic, summarise, verdict
+from pipeline.statistics import VERDICTS, negate, paired, statistic, summarise, verdict
 from reskin.data.baseline import subtract
 from reskin.data.rows import TARGETS
 from reskin.metrics import score
@@ -217,7 +217,7 @@ def _less(one: Mapping[str, Any]) -> str:
     if "paired" not in one or "mse_f_N2" not in one["paired"]["mean5_minus_one"]:
         return "–"  # no force is known, or an older run
     difference = one["paired"]["mean5_minus_one"]["mse_f_N2"]
-    return f"{verdict(negated(difference))}: {show_difference(difference)}"
+    return f"{verdict(negate(difference))}: {show_difference(difference)}"
 
 
 def _lag(numbers: Mapping[str, Any], way: str) -> Mapping[str, float] | None:

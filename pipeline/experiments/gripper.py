@@ -15,7 +15,7 @@ from pipeline.experiments.sensitivity import levels_of
 from pipeline.report.drawing import COLOURS, drawing, svg
 from pipeline.settings import Settings
 from pipeline.stage import say
-from pipeline.statistics import summarise, with_seeds
+from pipeline.statistics import add_seed_sd, summarise
 from pipeline.synthesis import loads_of
 from reskin.config import Strict
 from reskin.data.baseline import subtract
@@ -146,7 +146,7 @@ def judge(runs: Mapping[str, Sequence[Float64[np.ndarray, "f r"]]], aim_N: float
     rows = pd.DataFrame(
         [{"board": board, "error_pct": 100 * np.abs(one).mean()} for board, own in off.items() for one in own]
     )
-    error = with_seeds(summarise(rows.groupby("board").mean(), boards=True), rows, "board")["error_pct"]
+    error = add_seed_sd(summarise(rows.groupby("board").mean(), boards=True), rows, "board")["error_pct"]
     return {
         "runs_n": every.shape[1],
         "held_pct": 100 * float((np.abs(every.mean(axis=0)) < WITHIN).mean()),

@@ -259,7 +259,7 @@ def _judge_limit(rule: str, limit: float, ours: Stat) -> Judgement:
     """Judge whether a number is beyond a limit (the paper's, or 0)."""
     mean = ours["mean"]
     if rule == "at_most":
-        verdict = statistics.verdict(statistics.negated(ours), above=-limit)
+        verdict = statistics.verdict(statistics.negate(ours), above=-limit)
         return Judgement(verdict, f"at most {limit:g}", _yes(mean <= limit))
     verdict = statistics.verdict(ours, above=limit)
     if rule == "at_least":
@@ -271,7 +271,7 @@ def _judge_each(contrasts: Sequence[Mapping[str, Any]]) -> Judgement:
     """Judge a claim that is to hold at every number of training skins, by accuracy."""
     verdicts = {row["skins_n"]: statistics.verdict(row["accuracy_pct"]) for row in contrasts}
     return Judgement(
-        statistics.all_of(list(verdicts.values())),
+        statistics.combine_verdicts(list(verdicts.values())),
         "gain above 0 at every number of training skins",
         _yes(all(row["accuracy_pct"]["mean"] > 0 for row in contrasts)),
         notes=(", ".join(f"{skins_n} skins: {verdict}" for skins_n, verdict in verdicts.items()),),

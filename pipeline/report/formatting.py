@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from pipeline.report.paper import ADAPTED_POKES_N, TABLE_2, TABLE_2_ROWS, Number
-from pipeline.statistics import negated
+from pipeline.statistics import negate
 
 Stat = Mapping[str, Any]  # mean, n, and where known sd and ci95: [low, high], or values: each of a few boards
 Results = Mapping[str, Any]  # numbers.json of one scene
@@ -80,7 +80,7 @@ def show_difference(value: Stat | None) -> str:
 
 def gain(difference: Stat, metric: str) -> Stat:
     """Change the sign of the difference of an error, so that more is better."""
-    return negated(difference) if metric.startswith("mse_") else difference
+    return negate(difference) if metric.startswith("mse_") else difference
 
 
 def _show_seeds(value: Stat) -> str:

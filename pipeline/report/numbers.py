@@ -26,10 +26,10 @@ from pipeline.statistics import (
     select,
     statistic,
     summarise,
+    summarise_differences,
     tally,
     tidy,
     whole,
-    with_boards,
 )
 from reskin.metrics import METRICS
 
@@ -223,7 +223,7 @@ def contrasts_of_sensors(rows: pd.DataFrame) -> dict[str, Any]:
     words = {"from_skins_n": few, "to_skins_n": many}
     more = {f"sensors_more_{method}": words | paired(at[method, many], at[method, few]) for method in SWEPT}
     gain_few, gain_many = (differences(at["adapted", n], at["triplet", n]) for n in (few, many))
-    return adapted | more | {"sensors_gain_fewer": words | with_boards(gain_few - gain_many)}
+    return adapted | more | {"sensors_gain_fewer": words | summarise_differences(gain_few - gain_many)}
 
 
 def _methods(rows: pd.DataFrame) -> Iterator[dict[str, Any]]:

@@ -84,7 +84,7 @@ def summarise_variants(predictions: Sequence[VariantPrediction], metric: Metric 
     """
     variants = _tidy(predictions, metric).groupby("method", sort=False)
     return {
-        str(variant): statistics.with_seeds(
+        str(variant): statistics.add_seed_sd(
             statistics.summarise(statistics.board_means(rows), boards=True), rows, "board", "skin"
         )
         for variant, rows in variants
@@ -111,7 +111,7 @@ def compare_variants(predictions: Sequence[VariantPrediction], of: str, over: st
     metrics = [name for name in METRICS if name in rows]
     each = sides[0].set_index(network)[metrics] - sides[1].set_index(network)[metrics]
     by_board = compared.pop("by_board")
-    return statistics.with_seeds(compared, each, "board", "skin") | {"by_board": by_board}
+    return statistics.add_seed_sd(compared, each, "board", "skin") | {"by_board": by_board}
 
 
 def _tidy(predictions: Sequence[VariantPrediction], metric: Metric) -> pd.DataFrame:

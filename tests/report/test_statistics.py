@@ -16,29 +16,29 @@ from pipeline.statistics import (
     KEYS,
     NO,
     REGISTERED,
-    SURENESS,
+    UNCERTAINTY,
     YES,
-    all_of,
+    add_seed_sd,
     board_means,
     by_skin,
+    combine_verdicts,
     holm,
     interval,
-    negated,
+    negate,
     over_boards,
     over_folds,
     over_pairs,
     paired,
     paired_with_single,
-    reached,
     select,
     statistic,
+    t_interval,
     tidy,
     to_csv,
-    two_way,
+    two_way_error,
     verdict,
     verdict_within,
     whole,
-    with_seeds,
 )
 from reskin.data.splits import Split, draw_folds
 from reskin.errors import SchemaError
@@ -92,10 +92,10 @@ def test_seeds_of_one_fold_are_averaged_before_folds_are_counted():
 
 def test_the_spread_over_seeds_is_that_within_a_unit_and_one_row_has_none():
     rows = scored({"b0": [[1.0, 3.0], [5.0, 5.0]], "b1": [[8.0]]})
-    found = with_seeds({"accuracy_pct": {"mean": 5.5, "n": 2}}, rows, "board", "skin")["accuracy_pct"]
+    found = add_seed_sd({"accuracy_pct": {"mean": 5.5, "n": 2}}, rows, "board", "skin")["accuracy_pct"]
     assert found == {"mean": 5.5, "n": 2, "sd_seeds": pytest.approx(np.mean([2**0.5, 0]))}
     alone = {"accuracy_pct": {"mean": 8.0, "n": 1}}
-    assert with_seeds(alone, select(rows, board="b1"), "board", "skin") == alone
+    assert add_seed_sd(alone, select(rows, board="b1"), "board", "skin") == alone
 
 
 def test_networks_adapted_to_one_skin_each_have_a_row_for_all_skins_by_fold_and_seed():
@@ -126,7 +126,7 @@ def test_the_table_is_one_row_a_training_and_skin_and_survives_csv():
     points = {"labels": [{"method": "ridge", "inputs": "raw", "labels_n": 5, "fold": "b0", "seed_i": 1,
                           "scores": every()[0]["scores"]}]}  # fmt: skip
     table = tidy([shifted("b0", 1), *every()], points)
-    assert list(table.columns) == [*KEYS, *METRICS, *SURENESS]
+    assert list(table.columns) == [*KEYS, *METRICS, *UNCERTAINTY]
     assert len(table) == (2 + 3) + (2 * 6 + 12) + (2 + 1)  # as labelled and registered, and each skin
     (row,) = by_skin(select(table, question="labels")).to_dict("records")
     assert (row["board"], row["skin"], row["labels_n"], row["method"]) == ("b0", "s0", 5, "ridge")
@@ -215,7 +215,7 @@ def test_the_order_of_boards_and_scores_is_no_matter(values, seed):
 def test_swapped_sides_turn_the_difference_and_the_verdict_round(values):
     of, over = of_boards(values), of_boards([1.0] * len(values))
     ahead, back = paired(of, over)["accuracy_pct"], paired(over, of)["accuracy_pct"]
-    turned = negated(ahead)
+    turned = negate(ahead)
     assert back["ci95"] == pytest.approx(turned["ci95"], abs=DOUBLE)
     assert back["mean"] == pytest.approx(turned["mean"], abs=DOUBLE)
     opposite = {YES: NO, NO: YES, INCONCLUSIVE: INCONCLUSIVE}
@@ -248,7 +248,7 @@ def test_small_is_what_lies_wholly_between_both_limits(ends, word):
 def test_one_board_has_no_interval_and_concludes_nothing():
     stat = paired(scored({"b0": [[3.0], [4.0]]}), scored({"b0": [[1.0], [1.0]]}))["accuracy_pct"]
     assert stat == {"mean": 2.5, "n": 1}
-    assert verdict(stat) == verdict_within(stat, 5.0) == verdict(negated(stat)) == FEW_BOARDS
+    assert verdict(stat) == verdict_within(stat, 5.0) == verdict(negate(stat)) == FEW_BOARDS
 
 
 def test_repeats_on_one_skin_are_no_boards():
@@ -256,10 +256,10 @@ def test_repeats_on_one_skin_are_no_boards():
 
 
 def test_a_claim_of_several_parts_holds_where_all_do_and_fails_where_one_does():
-    assert all_of([YES, YES]) == YES
-    assert all_of([YES, INCONCLUSIVE, NO]) == NO
-    assert all_of([YES, INCONCLUSIVE]) == INCONCLUSIVE
-    assert all_of([YES, FEW_BOARDS]) == FEW_BOARDS
+    assert combine_verdicts([YES, YES]) == YES
+    assert combine_verdicts([YES, INCONCLUSIVE, NO]) == NO
+    assert combine_verdicts([YES, INCONCLUSIVE]) == INCONCLUSIVE
+    assert combine_verdicts([YES, FEW_BOARDS]) == FEW_BOARDS
 
 
 def test_sides_with_other_skins_make_no_pair():
@@ -300,12 +300,12 @@ def test_one_skin_against_many_counts_the_training_skins_as_a_sample_too():
 @given(VALUES, VALUES)
 def test_the_variance_of_a_crossed_mean_is_at_least_that_of_either_factor(rows, columns):
     table = pd.DataFrame(np.add.outer(rows, columns))
-    se, freedom = two_way(table)
+    se, freedom = two_way_error(table)
     of_rows, of_columns = (np.var(part, ddof=1) / len(part) for part in (rows, columns))
     assert se**2 == pytest.approx(of_rows + of_columns)
     assert min(len(rows), len(columns)) - 1 <= freedom * (1 + 1e-9)
     assert freedom <= (len(rows) + len(columns) - 2) * (1 + 1e-9)
-    assert two_way(table[[0, 1]]) is None  # two boards
+    assert two_way_error(table[[0, 1]]) is None  # two boards
 
 
 @FEW
@@ -383,7 +383,9 @@ def test_one_skin_on_others_counts_pairs_as_the_paper_does_and_its_interval_know
         [[np.mean([one["scores"]["by_skin"][f"{board}_s{i}"]["mse_xy_mm2"] for i in range(2)]) for board in tested]
          for one in cards]
     )  # fmt: skip
-    assert stat["ci95"] == pytest.approx(reached(float(table.to_numpy().mean()), *two_way(table), "mse_xy_mm2"))
+    assert stat["ci95"] == pytest.approx(
+        t_interval(float(table.to_numpy().mean()), *two_way_error(table), "mse_xy_mm2")
+    )
     assert stat["ci95"][0] > 0
 
 
