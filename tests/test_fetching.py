@@ -265,7 +265,7 @@ def test_a_disk_without_room_is_told_before_and_while_it_fills(root, monkeypatch
     def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(fetching, "_content", full)
+    monkeypatch.setattr(fetching, "_read_checked", full)
     refuse(root, "the folder must be writable; got No space left on device")
 
 
@@ -296,7 +296,7 @@ def test_what_is_added_was_fetched_and_its_scene_is_there(name):
 
 @pytest.mark.parametrize("name", SOURCES)
 def test_real_recordings_have_the_checksums_on_record_and_are_read(name, shared_data, tmp_path):
-    fetching.bring(SOURCES[name], str(shared_data / name), tmp_path / name)
+    fetching.download(SOURCES[name], str(shared_data / name), tmp_path / name)
     counts = {"lab": 7150, "ini": 23300, "eflesh": 4805, "eflash7": 268}  # rows, as data/README.md tells
     readers = {"lab": lab, "ini": ini, "eflesh": eflesh, "eflash7": eflash7}
     for recording in SOURCES[name].recordings[:1]:
