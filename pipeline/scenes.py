@@ -50,7 +50,7 @@ class OnBoards(Strict, extra="allow"):
 
 
 class Simulation(Strict):
-    """Section `simulate`. `pipeline.synthesis` checks the rest, so that only its stages depend on the physics."""
+    """Section `simulate`. `pipeline.simulation` checks the rest, so that only its stages depend on the physics."""
 
     boards: dict[str, dict[str, Any]]
     protocols: Annotated[dict[str, OnBoards], Field(min_length=1)]
@@ -182,9 +182,9 @@ def check_scene(settings: Settings) -> Scene:
         if read := getattr(module, f"read_{stage}", getattr(module, "read", None)):
             read(settings)
     if scene.simulate is not None:
-        from pipeline.synthesis import synthesis_of  # the physics, for a simulated scene only
+        from pipeline.simulation import simulation_settings  # the physics, for a simulated scene only
 
-        synthesis_of(settings)
+        simulation_settings(settings)
     return scene
 
 

@@ -197,7 +197,7 @@ def simulate_pokes(
 
     from reskin.data.grid import CENTRE_MM
     from reskin.physics.chip import ChipDesign, read_field
-    from reskin.simulation.contact import Terms, respond
+    from reskin.simulation.contact import Terms, simulate_response
 
     places_mm = np.asarray(pokes, np.float64)
     if places_mm.ndim != 2 or places_mm.shape[1] != 3:
@@ -209,7 +209,7 @@ def simulate_pokes(
     board = board or draw_board(seed=seed)
     rngs = {part: rng_for(seed, "poking", skin.name, part) for part in ("drift", "noload", "contact")}
     no_tilt = np.zeros((len(tip_m), 2))
-    response = respond(board, skin, tip_m[:, None], tilt=no_tilt, terms=Terms(), rng=rngs["drift"])
+    response = simulate_response(board, skin, tip_m[:, None], tilt=no_tilt, terms=Terms(), rng=rngs["drift"])
     design = parse(ChipDesign, nominal("chip", chip), "chip")
     noload_uT, _ = read_field(response.rest_T, board, design=design, rng=rngs["noload"])
     b_uT, _ = read_field(response.rest_T + response.change_T[:, 0], board, design=design, rng=rngs["contact"])

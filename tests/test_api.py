@@ -17,9 +17,9 @@ from reskin.data.rows import Selection
 from reskin.errors import ReskinError
 from reskin.predicting import read_network
 from reskin.seeds import rng_for
-from reskin.simulation.capture import record
+from reskin.simulation.capture import simulate_capture
 from reskin.simulation.defaults import nominal
-from reskin.simulation.settings import parse_synthesis
+from reskin.simulation.settings import parse_simulation
 from tests.test_io import readings
 from tests.test_predicting import model  # noqa: F401 (a fixture)
 
@@ -55,7 +55,7 @@ def test_pokes_are_read_as_a_simulated_capture_without_noise_is():
     exact = {name: 0.0 for name in ("robot_place_sd_mm", "robot_depth_sd_mm", "place_offset_sd_mm", "force_noise_N")}
     shared = {name: nominal(name) for name in ("skin", "spreads", "terms")}
     shared |= {"chip": nominal("chip", QUIET_CHIP), "rig": nominal("rig", exact)}
-    capture = record(parse_synthesis(simulate, shared, "quick"), "grid", board="b0", skin="b0_s0", seed=3)
+    capture = simulate_capture(parse_simulation(simulate, shared, "quick"), "grid", board="b0", skin="b0_s0", seed=3)
     contact = capture.probe.contact
     places = np.stack([getattr(capture.probe, name)[contact] for name in ("x_mm", "y_mm", "depth_mm")], axis=1)
 

@@ -16,8 +16,8 @@ from pipeline.experiments.results import write_results
 from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
 from pipeline.report.formatting import show_digits
 from pipeline.settings import Settings, Training
+from pipeline.simulation import simulation_settings
 from pipeline.statistics import add_seed_sd, summarise, tally
-from pipeline.synthesis import synthesis_of
 from pipeline.training.jobs import SceneData, collapse_record, make_jobs, read_data, train_jobs
 from reskin.config import Strict
 from reskin.data.splits import Fold
@@ -28,7 +28,7 @@ from reskin.physics.ambient import EARTH_DIP_DEG, EARTH_SIZE_T, EARTH_T, ball_fi
 from reskin.physics.board import Board, BoardDesign, draw_board
 from reskin.physics.skin import Skin, draw_skin
 from reskin.seeds import rng_for
-from reskin.simulation.settings import Synthesis
+from reskin.simulation.settings import SimulationSettings
 
 REFERENCE_ASIDE_MM = 30.0  # the lone chip, from the board's middle along x: assumed far enough to read no poke
 
@@ -43,7 +43,7 @@ class Instrument:
     noise_uT: Float[np.ndarray, " 3"]  # of the change that the chip aside reads
 
 
-def take_board(of: Synthesis, name: str, *, seed: int) -> Instrument:
+def take_board(of: SimulationSettings, name: str, *, seed: int) -> Instrument:
     """Draw the board of this name as its captures did, and a chip beside it that differs from its design as much."""
     design, rig, chip = of.main_boards.design, of.rig, of.chip
     lone = BoardDesign(chips_xy_mm=((REFERENCE_ASIDE_MM, 0.0),), chips_turn_deg=(0.0,), gap_mm=design.gap_mm)
@@ -196,7 +196,7 @@ def networks_of_common_part(
 
 
 def on_board(
-    data: SceneData, fold: Fold, section: Ambient, *, of: Synthesis, instrument: Instrument, networks: Networks
+    data: SceneData, fold: Fold, section: Ambient, *, of: SimulationSettings, instrument: Instrument, networks: Networks
 ) -> Iterator[dict[str, Any]]:
     """Score every network of every arm in every field, on one reading of each of the board's held-out pokes."""
     test = one_a_poke(data.rows.indentation, fold.test, rng_for(data.settings.seed, "ambient", fold.name, "pokes"))
@@ -219,7 +219,7 @@ def on_board(
 
 
 def _iron(
-    data: SceneData, fold: Fold, test: np.ndarray, section: Ambient, of: Synthesis, instrument: Instrument
+    data: SceneData, fold: Fold, test: np.ndarray, section: Ambient, of: SimulationSettings, instrument: Instrument
 ) -> Iterator[Case]:
     names, which = np.unique(data.rows.skin[test], return_inverse=True)
     rule = of.main_boards.quadrature.in_si()
@@ -238,7 +238,7 @@ def read(settings: Settings) -> Ambient:
 def ambient(settings: Settings, folds: Path, indentations: Path, models: Path, results: Path) -> None:
     """Test every held-out board in fields that came up after its no-load readings; train one arm on the last board."""
     data = read_data(settings, indentations, folds)
-    of, seed = synthesis_of(data.settings), data.settings.seed
+    of, seed = simulation_settings(data.settings), data.settings.seed
     section, trained = read(data.settings), data.settings.training("train_multi")
     held_out = data.folds_of("lobo")
     boards = [fold.name for fold in held_out]

@@ -14,9 +14,9 @@ from pipeline.experiments.ambient import seen_uT
 from pipeline.experiments.results import write_results
 from pipeline.report.formatting import COLUMNS, n_of, show, tabulate
 from pipeline.settings import Settings
+from pipeline.simulation import simulation_settings
 from pipeline.stage import say
 from pipeline.statistics import over_folds, tidy
-from pipeline.synthesis import synthesis_of
 from reskin import io
 from reskin.data.grid import CENTRE_MM, points_mm
 from reskin.errors import ParamsError, SchemaError
@@ -25,8 +25,8 @@ from reskin.models.recipe import HEADLINE
 from reskin.physics.board import draw_board
 from reskin.physics.chip import ChipDesign, steps_uT
 from reskin.physics.skin import Skin, changes_of_field, draw_skin, forces
-from reskin.simulation.capture import roster
-from reskin.simulation.settings import MAIN, Synthesis
+from reskin.simulation.capture import list_captures
+from reskin.simulation.settings import MAIN, SimulationSettings
 
 ROW_READINGS_N = 1  # of a row that a network sees (dataset.rows)
 STEP_MM = 0.01  # of the differences; 0.002 to 0.05 mm give the same bound within 2 %
@@ -87,9 +87,9 @@ def probability_within(
     return 1 - 2 * outside
 
 
-def bound_of(of: Synthesis, *, seed: int) -> dict[str, Any]:
+def bound_of(of: SimulationSettings, *, seed: int) -> dict[str, Any]:
     """Bound the errors at every place and depth of the main protocol, on its first skin; those above it are counted."""
-    kind, (board_name, skin_name) = of.main_boards, roster(of, MAIN)[0]
+    kind, (board_name, skin_name) = of.main_boards, list_captures(of, MAIN)[0]
     board = draw_board(kind.design, of.spreads, seed=seed, name=board_name)
     rule = kind.quadrature.in_si()
     skin = draw_skin(of.skin, of.spreads, seed=seed, name=skin_name, rule=rule, sides_m=kind.skin_m)
@@ -152,7 +152,7 @@ def network_scores(models: Path, skin: str) -> dict[str, Any]:
 
 def bound(settings: Settings, models: Path, results: Path) -> None:
     """Bound what one row tells of a poke, and put the paper's network beside it."""
-    numbers = bound_of(synthesis_of(settings), seed=settings.seed)
+    numbers = bound_of(simulation_settings(settings), seed=settings.seed)
     write_results(results, numbers | {"network": network_scores(models, numbers["skin"])}, {})
     least = numbers["all"]["with_label_errors"]
     say(f"{settings.scene}: noise and labels allow {least['accuracy_pct']:.4g} % and {least['mse_xy_mm2']:.3g} mm2")

@@ -29,8 +29,8 @@ from pipeline.experiments.results import write_results
 from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
 from pipeline.report.formatting import show_digits
 from pipeline.settings import Settings
+from pipeline.simulation import simulation_settings
 from pipeline.statistics import statistic
-from pipeline.synthesis import synthesis_of
 from pipeline.training.jobs import SceneData, read_data
 from reskin.config import Strict
 from reskin.data.rows import Rows
@@ -44,8 +44,8 @@ from reskin.physics.board import Board, draw_board
 from reskin.physics.magnet import Dipoles, change_of_field
 from reskin.physics.skin import Skin, draw_skin
 from reskin.seeds import rng_for
-from reskin.simulation.capture import roster
-from reskin.simulation.settings import MAIN, Synthesis
+from reskin.simulation.capture import list_captures
+from reskin.simulation.settings import MAIN, SimulationSettings
 
 KNOWN_ROWS_N = 6000  # in which detectors search neighbours, drawn
 SINGLES_N = 1000  # single contacts that a threshold is set on, and as many that are tested
@@ -102,7 +102,9 @@ def contacts(settings: Settings, folds: Path, indentations: Path, models: Path, 
         "auc": stats["auc"],
     }
     if "simulate" in settings.of_scene:
-        numbers["superposition"] = superposition(synthesis_of(settings), section.separations_mm, seed=settings.seed)
+        numbers["superposition"] = superposition(
+            simulation_settings(settings), section.separations_mm, seed=settings.seed
+        )
     along = {s: [value for one in drawn for value in one["along"][s]] for s in drawn[0]["along"]}
     write_results(results, numbers, {"along": along})
 
@@ -303,9 +305,9 @@ MIDDLE_MM = 2.0  # largest distance of a pair's middle from the skin's, each axi
 HEIGHTS_N = 9  # of the table of displacements, which is interpolated linearly for the second contact
 
 
-def superposition(of: Synthesis, separations_mm: Sequence[float], *, seed: int) -> list[dict[str, Any]]:
+def superposition(of: SimulationSettings, separations_mm: Sequence[float], *, seed: int) -> list[dict[str, Any]]:
     """Give the rms error of adding the fields of two contacts of the scene's first skin, at two depths."""
-    board_name, skin_name = roster(of, MAIN)[0]
+    board_name, skin_name = list_captures(of, MAIN)[0]
     board = draw_board(of.main_boards.design, of.spreads, seed=seed, name=board_name)
     rule = of.main_boards.quadrature.in_si()
     skin = draw_skin(of.skin, of.spreads, seed=seed, name=skin_name, rule=rule)

@@ -14,8 +14,8 @@ from pipeline.report.drawing import COLOURS, drawing, svg
 from pipeline.report.formatting import COLUMNS, OF_PAPER, show, show_difference, tabulate
 from pipeline.report.paper import FLEXIBLE, FLEXIBLE_BIAS, FLEXIBLE_GAP_LESS_PCT
 from pipeline.settings import Settings
+from pipeline.simulation import simulation_settings
 from pipeline.statistics import statistic
-from pipeline.synthesis import synthesis_of
 from pipeline.training.jobs import SceneData, adaptation_jobs, preload_training, read_data, read_pretrained
 from pipeline.training.variants import (  # fmt: skip
     AFTER,
@@ -134,7 +134,7 @@ def _by_depth(captures: Sequence[Readings]) -> list[dict[float, np.ndarray]]:
 def _gaps(data: SceneData) -> dict[str, Any]:
     """Tell the gaps between skin and chips of both kinds of boards, and by how much one is less."""
     kinds = {"rigid": "grid", "flexible": "flexible"}
-    of = synthesis_of(data.settings)
+    of = simulation_settings(data.settings)
     gap_mm = {kind: of.boards[of.protocols[name].boards].design.gap_mm for kind, name in kinds.items()}
     return {"gap_mm": gap_mm, "gap_less_pct": gap_less_pct(gap_mm)}
 

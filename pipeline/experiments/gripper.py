@@ -14,9 +14,9 @@ from pipeline.experiments.results import read_captures, read_losses, write_resul
 from pipeline.experiments.sensitivity import levels_of
 from pipeline.report.drawing import COLOURS, drawing, svg
 from pipeline.settings import Settings
+from pipeline.simulation import load_protocol
 from pipeline.stage import say
 from pipeline.statistics import add_seed_sd, summarise
-from pipeline.synthesis import loads_of
 from reskin.config import Strict
 from reskin.data.baseline import subtract
 from reskin.data.grid import CENTRE_MM
@@ -24,7 +24,7 @@ from reskin.live.contacts import CONTACT_SDS
 from reskin.models.trained import networks_held_out
 from reskin.schema import Readings
 from reskin.seeds import rng_for
-from reskin.simulation.protocols import weights_N
+from reskin.simulation.protocols import load_steps_N
 from reskin.universal.model import Universal, load_universal
 
 RATE_HZ, SECONDS, SETTLED_S = 50.0, 4.0, 1.0  # of the controller; from SETTLED_S on the force is judged
@@ -194,8 +194,8 @@ def read(settings: Settings) -> Gripper:
 
 def gripper(settings: Settings, indentations: Path, models: Path, results: Path) -> None:
     """Let a gripper hold objects by the force that is estimated of its finger's skin."""
-    load = loads_of(settings, "grip")
-    weight_N = weights_N(load.force_max_N, load.step_N)
+    load = load_protocol(settings, "grip")
+    weight_N = load_steps_N(load.force_max_N, load.step_N)
     fingers = [finger_of(capture, weight_N) for capture in read_captures(indentations)]
     networks = {finger.board: networks_held_out(models, finger.board) for finger in fingers}
     numbers, drawn = answer_of(fingers, networks, read(settings), seed=settings.seed)

@@ -16,8 +16,8 @@ from pipeline.experiments.results import only, write_results
 from pipeline.report import paper
 from pipeline.report.drawing import COLOURS, drawing, svg
 from pipeline.settings import Settings
+from pipeline.simulation import simulation_settings
 from pipeline.stage import say
-from pipeline.synthesis import synthesis_of
 from reskin.live.contacts import (
     Estimator,
     contacts_n,
@@ -99,7 +99,7 @@ def _told(log: Log, added_uT: Float[np.ndarray, "f ch"], networks: Sequence[Esti
 
 def turned(log: Log, board: str, settings: Settings, networks: Sequence[Estimator]) -> dict[str, Any]:
     """Tell what the networks find in the log if its board turns in the earth's field."""
-    of, seed = synthesis_of(settings), settings.seed
+    of, seed = simulation_settings(settings), settings.seed
     noise_uT = np.array([of.chip.noise_xy_uT, of.chip.noise_xy_uT, of.chip.noise_z_uT])  # a log's readings are single
     own = replace(take_board(of, board, seed=seed), noise_uT=noise_uT)
     return {

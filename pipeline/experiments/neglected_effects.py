@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.experiments.runtime import box_m, midpoints
 from pipeline.settings import Settings
+from pipeline.simulation import simulation_settings
 from pipeline.stage import say
-from pipeline.synthesis import synthesis_of
 from reskin import io
 from reskin.data.grid import CENTRE_MM
 from reskin.physics import aging, chip, deformation, layer, magnet
@@ -25,10 +25,10 @@ from reskin.physics.magnet import Quadrature, change_of_field
 from reskin.physics.shear import Friction
 from reskin.physics.skin import Skin, changes_of_field, count_beyond_verified, draw_skin, forces, moved_dipoles
 from reskin.seeds import rng_for
-from reskin.simulation.capture import roster
-from reskin.simulation.contact import Response, Terms, push, respond
+from reskin.simulation.capture import list_captures
+from reskin.simulation.contact import Response, Terms, drag_tip, simulate_response
 from reskin.simulation.protocols import Plan
-from reskin.simulation.settings import MAIN, Synthesis
+from reskin.simulation.settings import MAIN, SimulationSettings
 
 # Sizes of effects that a scene may neglect: the design values of PHYSICS 5 (assumed there).
 AGEING = Ageing(settling=0.10, ageing=0.01, fading_per_decade=0.005, wandering_uT=0.2)
@@ -69,7 +69,7 @@ class Subject:
     used: tuple[str, ...]
 
 
-def measure(of: Synthesis, *, seed: int) -> list[Effect]:
+def measure(of: SimulationSettings, *, seed: int) -> list[Effect]:
     """Measure every effect of PHYSICS 8 on a scene."""
     subject = _make_subject(of, seed)
     without = _simulate(subject, Terms(), seed)
@@ -81,7 +81,7 @@ def measure(of: Synthesis, *, seed: int) -> list[Effect]:
     ]  # fmt: skip
 
 
-def _by_protocol(effect: Effect, of: Synthesis) -> Effect:
+def _by_protocol(effect: Effect, of: SimulationSettings) -> Effect:
     """Add the protocols that neglect an effect, and those that compute it."""
     computed = tuple(name for name, protocol in of.protocols.items() if effect.term in protocol.terms)
     return replace(
@@ -89,8 +89,8 @@ def _by_protocol(effect: Effect, of: Synthesis) -> Effect:
     )
 
 
-def _make_subject(of: Synthesis, seed: int) -> Subject:
-    kind, (board, skin) = of.main_boards, roster(of, MAIN)[0]
+def _make_subject(of: SimulationSettings, seed: int) -> Subject:
+    kind, (board, skin) = of.main_boards, list_captures(of, MAIN)[0]
     plan = of.main.plan(rng_for(seed, "left out"), kind.skin_mm)
     tip_mm = np.stack([plan.x_mm - CENTRE_MM, plan.y_mm - CENTRE_MM, plan.depth_mm], axis=2)
     return Subject(
@@ -130,9 +130,9 @@ def _temperature(on: Subject, without: Response) -> Effect:
 
 def _friction(on: Subject) -> Effect:
     tip_m, pressed = on.tip_m[:FEW], changes_of_field(on.board, on.skin, on.tip_m[:FEW].reshape(-1, 3))[1]
-    pushed = push(on.board, on.skin, tip_m, tilt=on.plan.tilt[:FEW], how=FRICTION)
-    field_pct = _error_pct(pressed.reshape(pushed.change_T.shape), pushed.change_T)
-    force_pct = 100 * float(np.abs(pushed.force_N).max() / forces(on.skin, tip_m[..., 2].ravel()).max())
+    dragged = drag_tip(on.board, on.skin, tip_m, tilt=on.plan.tilt[:FEW], how=FRICTION)
+    field_pct = _error_pct(pressed.reshape(dragged.change_T.shape), dragged.change_T)
+    force_pct = 100 * float(np.abs(dragged.force_N).max() / forces(on.skin, tip_m[..., 2].ravel()).max())
     how = f"coefficient {FRICTION.coefficient:g}, {FEW} indentations of the protocol: nothing moves sideways"
     return Effect("friction", _status("friction", on), field_pct, 0.0, force_pct, how)
 
@@ -236,14 +236,14 @@ def _change(on: Subject, moved: Sequence[Moved]) -> Float[np.ndarray, "p k 3"]:
     return np.array(changes_T)
 
 
-def _steps(without: Response, of: Synthesis) -> Effect:
+def _steps(without: Response, of: SimulationSettings) -> Effect:
     change_uT = without.change_T / micro
     step_uT = chip.steps_uT(of.chip.gain_sel)
     share = np.sqrt((step_uT**2 / 12).mean() / (change_uT**2).mean())
     return Effect("the chips' steps", "kept", float(100 * share), float(step_uT.max() / 2), 0.0, "rounding alone")
 
 
-def _own_field(on: Subject, of: Synthesis) -> Effect:
+def _own_field(on: Subject, of: SimulationSettings) -> Effect:
     """Magnetise the powder by its own field too, to first order (boxes, magpylib)."""
     rest = midpoints(on.skin.thickness_m, BOXES)
     b_T = magnet.array_field(rest.nodes_m, on.skin.thickness_m, of.skin.polarity)
@@ -264,17 +264,18 @@ def _own_field(on: Subject, of: Synthesis) -> Effect:
     return Effect("the powder's own field", "left out", _error_pct(*changes_T), None, 0.0, how)
 
 
-def _too_deep(of: Synthesis, seed: int) -> Effect:
+def _too_deep(of: SimulationSettings, seed: int) -> Effect:
     """Count, over all skins, the stops beyond the depths of published solutions."""
     depth_m = milli * of.main.plan(rng_for(seed, "left out"), of.main_boards.skin_mm).depth_mm.ravel()
-    skins = [draw_skin(of.skin, of.spreads, seed=seed, name=skin, rule=COARSE) for _, skin in roster(of, MAIN)]
+    skins = [draw_skin(of.skin, of.spreads, seed=seed, name=skin, rule=COARSE) for _, skin in list_captures(of, MAIN)]
     share_pct = 100 * sum(count_beyond_verified(skin, depth_m) for skin in skins) / (len(depth_m) * len(skins))
     how = f"{share_pct:.3g} % of the stops of {len(skins)} skins are past 0.6 of the thickness: nothing published there"
     return Effect("depths past 0.6 of the thickness", "kept", None, None, None, how)
 
 
 def _simulate(on: Subject, terms: Terms, seed: int) -> Response:
-    return respond(on.board, on.skin, on.tip_m, tilt=on.plan.tilt, terms=terms, rng=rng_for(seed, "left out", "walk"))
+    rng = rng_for(seed, "left out", "walk")
+    return simulate_response(on.board, on.skin, on.tip_m, tilt=on.plan.tilt, terms=terms, rng=rng)
 
 
 def _status(term: str, on: Subject) -> str:
@@ -287,7 +288,7 @@ def _error_pct(without: Float[np.ndarray, "..."], true: Float[np.ndarray, "..."]
 
 def neglected_effects(settings: Settings, results: Path) -> None:
     """Measure every effect on the scene's first skin, and name the protocols that neglect it."""
-    of, seed = synthesis_of(settings), settings.seed
+    of, seed = simulation_settings(settings), settings.seed
     effects = measure(of, seed=seed)
     io.write_json(results, [asdict(effect) for effect in effects])
     left = ", ".join(effect.term for effect in effects if effect.done == "left out")

@@ -20,9 +20,9 @@ from pipeline.experiments.results import read_captures, write_results
 from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
 from pipeline.report.formatting import n_of, scores, tabulate
 from pipeline.settings import Settings
+from pipeline.simulation import simulation_settings
 from pipeline.stage import say
 from pipeline.statistics import summarise
-from pipeline.synthesis import synthesis_of
 from pipeline.training.jobs import SceneData, read_data
 from pipeline.training.population import (
     WEIGHT_N,
@@ -287,9 +287,9 @@ def read(settings: Settings) -> Asked:
 
 def population(settings: Settings, folds: Path, indentations: Path, results: Path) -> None:
     """Ask experts of simulated skins about every held-out skin of a simulated scene."""
-    data, section, synthesis = read_data(settings, indentations, folds), read(settings), synthesis_of(settings)
-    kind, design = synthesis.main_boards, settings.shared_section(SkinDesign, "skin")
-    lesson = lesson_of(design, kind, synthesis.main.depths_mm, settings.seed)
+    data, section, simulation = read_data(settings, indentations, folds), read(settings), simulation_settings(settings)
+    kind, design = simulation.main_boards, settings.shared_section(SkinDesign, "skin")
+    lesson = lesson_of(design, kind, simulation.main.depths_mm, settings.seed)
     turn = Rotation.from_euler("z", np.array(kind.design.turns_deg)[:, None], degrees=True).as_matrix()
     frame, rest_uT = Frame(turn, (CENTRE_MM, CENTRE_MM), mirrored=False), rest_by_skin(indentations)
     asked = [case for fold in data.folds_of(EXPERIMENT) for case in cases(data, fold, frame, rest_uT)]

@@ -23,8 +23,8 @@ from scipy.spatial.transform import Rotation
 from pipeline.experiments.verification.signals import field_of, hereditary
 from pipeline.provenance import SECONDS
 from pipeline.settings import Settings
+from pipeline.simulation import simulation_settings
 from pipeline.stage import say
-from pipeline.synthesis import synthesis_of
 from reskin import io
 from reskin.config import Strict
 from reskin.errors import ParamsError
@@ -33,8 +33,8 @@ from reskin.physics.aging import SKIN_RELAXATION, Prony, relax
 from reskin.physics.board import Board, Spreads, draw_board
 from reskin.physics.magnet import SEAMS_M, SKIN_SIDE_M, Nodes, Quadrature, change_of_field, place_nodes
 from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, press_motion
-from reskin.simulation.capture import roster
-from reskin.simulation.settings import MAIN, Synthesis
+from reskin.simulation.capture import list_captures
+from reskin.simulation.settings import MAIN, SimulationSettings
 
 Changes = Float[np.ndarray, "n k 3"]
 
@@ -647,7 +647,7 @@ def read(settings: Settings) -> RunTime:
 
 def runtime(settings: Settings, results: Path) -> None:
     """Compare quadratures and integrators; seconds differ between identical runs, so they are no output."""
-    of, tried = synthesis_of(settings), read(settings)
+    of, tried = simulation_settings(settings), read(settings)
     rows, calls = study_quadratures(_trials(of, tried.quadratures, settings.seed), tried.quadratures.rules_of())
     more, more_calls = study_integrators(tried.integrators)
     choice = choose(rows, used=of.main_boards.quadrature.in_si())
@@ -663,10 +663,11 @@ def runtime(settings: Settings, results: Path) -> None:
     )
 
 
-def _trials(of: Synthesis, tried: Quadratures, seed: int) -> list[Trial]:
+def _trials(of: SimulationSettings, tried: Quadratures, seed: int) -> list[Trial]:
     """Take the skins on the boards whose chips are nearest: there a quadrature has to be finest."""
     drawn = [
-        (draw_board(of.main_boards.design, of.spreads, seed=seed, name=board), skin) for board, skin in roster(of, MAIN)
+        (draw_board(of.main_boards.design, of.spreads, seed=seed, name=board), skin)
+        for board, skin in list_captures(of, MAIN)
     ]
     nearest = sorted(drawn, key=lambda pair: -pair[0].chips_m[0, 2])[: tried.skins_n]
     return [

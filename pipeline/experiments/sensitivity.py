@@ -13,12 +13,12 @@ from pipeline.experiments.results import only, read_captures, read_losses, write
 from pipeline.report import paper
 from pipeline.report.drawing import COLOURS, drawing, svg
 from pipeline.settings import Settings
+from pipeline.simulation import load_protocol
 from pipeline.stage import say
 from pipeline.statistics import FEW_BOARDS, INCONCLUSIVE
-from pipeline.synthesis import loads_of
 from reskin.data.baseline import subtract
 from reskin.errors import SchemaError
-from reskin.simulation.protocols import weights_N
+from reskin.simulation.protocols import load_steps_N
 
 TOLD_SHARE = 0.95  # of pairs ordered rightly: told apart
 WATER_N_PER_ML = 9.81e-3  # 1 g at 9.81 m/s^2
@@ -143,9 +143,9 @@ def monotonic(response_uT: Float64[np.ndarray, "n p"], weight_N: Float64[np.ndar
 
 def sensitivity(settings: Settings, indentations: Path, results: Path) -> None:
     """Tell how small a weight the one skin tells that was loaded."""
-    load = loads_of(settings, "glass")
+    load = load_protocol(settings, "glass")
     one = only(read_captures(indentations), indentations)
-    weight_N = weights_N(load.force_max_N, load.step_N)
+    weight_N = load_steps_N(load.force_max_N, load.step_N)
     change_uT = subtract(one.b_uT, one.noload_uT)
     levels_uT = levels_of(change_uT, one.indentation, one.Fz_N, levels_n=len(weight_N), where=one.capture)
     numbers, drawn = answer_of(levels_uT, weight_N)

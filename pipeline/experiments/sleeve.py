@@ -16,9 +16,9 @@ from pipeline.report.drawing import COLOURS, drawing, svg
 from pipeline.report.formatting import COLUMNS, scores, show, tabulate
 from pipeline.report.paper import SLEEVE, SLEEVE_SKIN, SLEEVE_WORDS
 from pipeline.settings import Settings, Training
+from pipeline.simulation import simulation_settings
 from pipeline.stage import say
 from pipeline.statistics import tally
-from pipeline.synthesis import synthesis_of
 from pipeline.training.jobs import SceneData, collapse_record, preload_training, train_jobs, write_timings
 from reskin.config import Strict
 from reskin.data.rows import Rows, Selection, gather
@@ -196,7 +196,7 @@ def sleeve(settings: Settings, indentations: Path, results: Path) -> None:
 
 
 def _area(settings: Settings) -> Area:
-    of = synthesis_of(settings)
+    of = simulation_settings(settings)
     kind = of.boards[of.protocols["sleeve"].boards]
     tiles = kind.design.tiles
     boards_n, pitch_mm = ((1, 1), 0.0) if tiles is None else ((tiles.columns_n, tiles.rows_n), tiles.pitch_mm)

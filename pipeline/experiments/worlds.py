@@ -16,9 +16,9 @@ from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
 from pipeline.report.formatting import COLUMNS, SHORT, show, tabulate
 from pipeline.report.paper import TABLE_2
 from pipeline.settings import Settings
+from pipeline.simulation import simulation_settings
 from pipeline.stage import say
 from pipeline.statistics import by_skin, over_boards, over_pairs, records, select, tidy, whole
-from pipeline.synthesis import synthesis_of
 from pipeline.training.jobs import (
     PretrainedNetworks,
     SceneData,
@@ -38,9 +38,9 @@ from reskin.models.recipe import HEADLINE
 from reskin.physics.board import draw_board
 from reskin.physics.skin import changes_of_field, draw_skin, forces
 from reskin.seeds import rng_for
-from reskin.simulation.capture import roster
-from reskin.simulation.rig import misplace, read_force
-from reskin.simulation.settings import MAIN, Synthesis
+from reskin.simulation.capture import list_captures
+from reskin.simulation.rig import actual_positions, read_force
+from reskin.simulation.settings import MAIN, SimulationSettings
 
 WAVES_N = 48  # cosines that make a smooth error
 DEFAULT = "default"
@@ -73,7 +73,7 @@ class World:
 
     factor: str
     value: float
-    synthesis: Synthesis
+    simulation: SimulationSettings
     residual: float = 0.0
 
     @property
@@ -82,24 +82,24 @@ class World:
         return f"{self.factor}-{self.value:g}"
 
 
-def worlds_of(synthesis: Synthesis, section: Worlds) -> list[World]:
+def worlds_of(simulation: SimulationSettings, section: Worlds) -> list[World]:
     """List the worlds; that of the scene's own settings comes first, and once."""
-    spreads, hold = synthesis.spreads, synthesis.skin.hold
-    found = [World(DEFAULT, 1.0, synthesis)]
-    found += [World("residual", size, synthesis, size) for size in section.residual.sizes if size > 0]
+    spreads, hold = simulation.spreads, simulation.skin.hold
+    found = [World(DEFAULT, 1.0, simulation)]
+    found += [World("residual", size, simulation, size) for size in section.residual.sizes if size > 0]
     for sd in section.skin_modulus:
         if sd != spreads.skin_modulus:
             changed = spreads.model_copy(update={"skin_modulus": sd})
-            found.append(World("skin_modulus", sd, synthesis.model_copy(update={"spreads": changed})))
+            found.append(World("skin_modulus", sd, simulation.model_copy(update={"spreads": changed})))
     for times in section.amplitude_and_gap:
         if times != 1:
             both = {name: times * getattr(spreads, name) for name in ("skin_amplitude", "board_gap")}
             changed = spreads.model_copy(update=both)
-            found.append(World("amplitude_and_gap", times, synthesis.model_copy(update={"spreads": changed})))
+            found.append(World("amplitude_and_gap", times, simulation.model_copy(update={"spreads": changed})))
     for friction in section.friction:
         if hold is not None and friction != hold.friction:
-            skin = synthesis.skin.model_copy(update={"hold": hold.model_copy(update={"friction": friction})})
-            found.append(World("friction", friction, synthesis.model_copy(update={"skin": skin})))
+            skin = simulation.skin.model_copy(update={"hold": hold.model_copy(update={"friction": friction})})
+            found.append(World("friction", friction, simulation.model_copy(update={"skin": skin})))
     return found
 
 
@@ -133,7 +133,7 @@ def with_residual(
 
 def rows_of(world: World, section: Worlds, seed: int) -> Rows:
     """Press every skin of a world as the main protocol does, and read its chips and the force sensor."""
-    parts = [_skin_rows(world, section, seed, board, skin) for board, skin in roster(world.synthesis, MAIN)]
+    parts = [_skin_rows(world, section, seed, board, skin) for board, skin in list_captures(world.simulation, MAIN)]
     rows = parts[0]
     for part in parts[1:]:
         rows = stack(rows, part)
@@ -141,14 +141,14 @@ def rows_of(world: World, section: Worlds, seed: int) -> Rows:
 
 
 def _skin_rows(world: World, section: Worlds, seed: int, board_name: str, skin_name: str) -> Rows:
-    synthesis, rig, chip = world.synthesis, world.synthesis.rig, world.synthesis.chip
-    kind = synthesis.main_boards
+    simulation, rig, chip = world.simulation, world.simulation.rig, world.simulation.chip
+    kind = simulation.main_boards
     rng = rng_for(seed, "worlds", board_name, skin_name)  # the same presses and noise in every world
-    board = draw_board(kind.design, synthesis.spreads, seed=seed, name=board_name)
+    board = draw_board(kind.design, simulation.spreads, seed=seed, name=board_name)
     rule = kind.quadrature.in_si()
-    skin = draw_skin(synthesis.skin, synthesis.spreads, seed=seed, name=skin_name, rule=rule, sides_m=kind.skin_m)
-    plan = synthesis.main.plan(rng, kind.skin_mm)
-    tip_m = ((misplace(plan, rig, rng) - (*plan.centre_mm, 0)) * milli)[:, 0]
+    skin = draw_skin(simulation.skin, simulation.spreads, seed=seed, name=skin_name, rule=rule, sides_m=kind.skin_m)
+    plan = simulation.main.plan(rng, kind.skin_mm)
+    tip_m = ((actual_positions(plan, rig, rng) - (*plan.centre_mm, 0)) * milli)[:, 0]
     tip_m[:, :2] += rig.place_offset_sd_mm * milli * rng_for(seed, "rig", board_name).standard_normal(2)
     _, change_T = changes_of_field(board, skin, tip_m)
     read_T = np.einsum("kij,nkj->nki", board.sensitivity @ board.turn.transpose(0, 2, 1), change_T)
@@ -192,7 +192,7 @@ def worlds(settings: Settings, results: Path) -> None:
     """Train the rows of table 2 in every world, and score them there."""
     preload_training()
     section, split = read(settings), settings.section(Split, "split")
-    listed = worlds_of(synthesis_of(settings), section)
+    listed = worlds_of(simulation_settings(settings), section)
     rows, folds = None, []
     for i, world in enumerate(listed):
         own = rows_of(world, section, settings.seed)
@@ -250,7 +250,7 @@ def _scored(cards: Sequence[dict[str, Any]], world: World) -> dict[str, Any]:
 
 def _constants(section: Worlds, data: SceneData, listed: Sequence[World]) -> dict[str, Any]:
     """Say what was done: settings of the scene's own world, and how much was trained."""
-    first = listed[0].synthesis
+    first = listed[0].simulation
     return {
         "residual_length_mm": section.residual.length_mm, "residual_own_share": section.residual.own_share,
         "skin_modulus": first.spreads.skin_modulus,

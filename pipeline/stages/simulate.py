@@ -4,31 +4,33 @@ from pathlib import Path
 
 from pipeline.executors import make_executor
 from pipeline.settings import Settings
+from pipeline.simulation import simulation_settings
 from pipeline.stage import say
-from pipeline.synthesis import synthesis_of
 from reskin import io
 from reskin.errors import ParamsError
 from reskin.recordings.header import write_capture
-from reskin.simulation.capture import record, roster, to_files
-from reskin.simulation.settings import Synthesis
+from reskin.simulation.capture import list_captures, simulate_capture, to_files
+from reskin.simulation.settings import SimulationSettings
 
 
 def simulate(settings: Settings, protocol: str, raw: Path) -> None:
-    """Record every skin of one protocol."""
-    synthesis, seed = synthesis_of(settings), settings.seed
-    pairs, skins_n = roster(synthesis, protocol), synthesis.protocols[protocol].skins_n
+    """Simulate the captures of one protocol, one for each skin."""
+    simulation, seed = simulation_settings(settings), settings.seed
+    pairs, skins_n = list_captures(simulation, protocol), simulation.protocols[protocol].skins_n
     if len(pairs) < skins_n:
         rule = f"at most the {len(pairs)} that its boards have"
         raise ParamsError(settings.where, f"skins_n of protocol {protocol}", rule, skins_n, "Ask for fewer.")
     with io.replacing(raw) as folder, make_executor(len(pairs), imports="reskin.simulation.capture") as executor:
         folder.mkdir()
-        waiting = [executor.submit(_record, synthesis, protocol, pair, seed, folder) for pair in pairs]
+        waiting = [executor.submit(_write_capture, simulation, protocol, pair, seed, folder) for pair in pairs]
         for i, done in enumerate(waiting, 1):
             say(f"{settings.scene}: simulated {done.result()} ({i}/{len(pairs)})")
 
 
-def _record(synthesis: Synthesis, protocol: str, pair: tuple[str, str], seed: int, folder: Path) -> str:
+def _write_capture(
+    simulation: SimulationSettings, protocol: str, pair: tuple[str, str], seed: int, folder: Path
+) -> str:
     board, skin = pair
-    capture = record(synthesis, protocol, board=board, skin=skin, seed=seed)
-    header = write_capture(folder / capture.name, *to_files(capture, synthesis))
+    capture = simulate_capture(simulation, protocol, board=board, skin=skin, seed=seed)
+    header = write_capture(folder / capture.name, *to_files(capture, simulation))
     return f"{capture.name} on {board}, {header.protocol}; {header.note}"

@@ -27,9 +27,9 @@ from reskin.recordings.header import HEADER_FILE, LOG_FILE, STREAM_FILE, Wire
 from reskin.recordings.ingest import read_header, timer
 from reskin.recordings.readers import sd_card
 from reskin.seeds import rng_for
-from reskin.simulation.capture import record, roster
+from reskin.simulation.capture import list_captures, simulate_capture
 from reskin.simulation.defaults import NOMINAL, SHARED, nominal
-from reskin.simulation.settings import MAIN, parse_synthesis
+from reskin.simulation.settings import MAIN, parse_simulation
 
 NOMINAL_SOURCE = "nominal"
 SEED = 2021  # of a simulation without a seed of its own
@@ -115,10 +115,10 @@ def read_capture(folder: Path) -> Script:
 
 def simulate(section: Mapping[str, Any], seed: int, where: str) -> Script:
     """Simulate the first skin of a section `simulate`: its protocol `log` if it has one, else its grid."""
-    synthesis = parse_synthesis(section, {name: nominal(name) for name in SHARED}, f"{where}: simulate")
-    protocol = WALK if WALK in synthesis.protocols else MAIN
-    board, skin = roster(synthesis, protocol)[0]
-    capture = record(synthesis, protocol, board=board, skin=skin, seed=seed)
+    simulation = parse_simulation(section, {name: nominal(name) for name in SHARED}, f"{where}: simulate")
+    protocol = WALK if WALK in simulation.protocols else MAIN
+    board, skin = list_captures(simulation, protocol)[0]
+    capture = simulate_capture(simulation, protocol, board=board, skin=skin, seed=seed)
     chunk_i = np.searchsorted(capture.arrived_frames_n, 1 + np.arange(len(capture.b_uT)))
     return _binary_script("simulated", capture.b_uT, capture.temperature_degC, capture.arrived_s[chunk_i])
 

@@ -1,1 +1,1 @@
-"""The synthetic skin: SI inside, uT at the border (`sensor`). Knows nothing of files, wires or learning."""
+"""Physics of the synthetic skin, in SI units; chips read in uT (`chip`)."""

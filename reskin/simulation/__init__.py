@@ -1,4 +1,1 @@
-"""Captures of skins that do not exist: a plan, a rig and physics -> what a port and a probe would have written.
-
-Refuses to know who reads them.
-"""
+"""Simulated captures: a protocol, a rig and the physics of a skin give the files of a recorded capture."""

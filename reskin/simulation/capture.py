@@ -1,6 +1,6 @@
-"""A capture of a skin that does not exist. In: settings and names. Out: the files that a port and a probe leave.
+"""Simulated captures: a skin is taken through a protocol, and written in the formats of a recorded capture.
 
-From there on only the word `simulated` in its header tells it from a recorded one. Refuses to know folders.
+Only `source: simulated` in its header distinguishes such a capture from a recorded one.
 """
 
 from dataclasses import dataclass
@@ -20,76 +20,77 @@ from reskin.recordings.header import ARRIVALS_FILE, LOG_FILE, PROBE_FILE, STREAM
 from reskin.recordings.probe import ProbeLog
 from reskin.recordings.readers import sd_card
 from reskin.seeds import rng_for
-from reskin.simulation.contact import Response, respond
-from reskin.simulation.protocols import Plan, Walk, depths_under
+from reskin.simulation.contact import Response, simulate_response
+from reskin.simulation.protocols import Plan, Walk, depths_under_load
 from reskin.simulation.rig import (
     Rig,
-    chunks,
+    actual_positions,
+    draw_arrivals,
     draw_clock,
-    misplace,
     probe_log,
     read_force,
     read_frames,
-    set_up,
-    switch_on,
+    rig_for,
+    start_readout,
     timeline,
 )
-from reskin.simulation.settings import MAIN, Synthesis
+from reskin.simulation.settings import MAIN, SimulationSettings
 
 WIRE: Wire = "binary"
-# Each has a random generator named after it, so that one more term leaves all other draws as they are.
+# Each has a random generator of its name, so that a further term leaves all other draws the same.
 PARTS = ("plan", "robot", "drift", "chips", "noise", "warmth", "port", "probe")
 
 
 @dataclass(frozen=True)
-class SyntheticCapture:
-    """One capture before it is encoded: frames in order of time, chunks as they arrived, probe log, clock marks."""
+class SimulatedCapture:
+    """A capture before it is encoded: frames in order of time, arrivals, probe log, clock marks."""
 
     name: str
     board: str
     skin: str
     b_uT: Float32[np.ndarray, "f ch"]
     temperature_degC: Float32[np.ndarray, "f k"]
-    arrived_frames_n: Int64[np.ndarray, " c"]  # frames come in all; the first row is 0, at the start
+    arrived_frames_n: Int64[np.ndarray, " c"]  # cumulative number of frames; the first row is 0, at the start
     arrived_s: Float64[np.ndarray, " c"]  # on the stream's clock
     probe: ProbeLog
-    marks: tuple[tuple[float, float], ...]  # (stream_s, probe_s) of the same event
-    protocol: str  # in words
-    overruns: dict[str, int]  # what went past a range, counted
-    card_rate_hz: float | None  # of frames that went to an SD card; None: they came through a port
+    marks: tuple[tuple[float, float], ...]  # (stream_s, probe_s) of the same events
+    protocol: str  # description
+    overruns: dict[str, int]  # counts of values out of range, by kind
+    card_rate_hz: float | None  # of frames on an SD card; None: frames came through a port
 
 
-def roster(synthesis: Synthesis, protocol: str) -> list[tuple[str, str]]:
-    """Name (board, skin) of every capture of a protocol; more of either leave the others' names and draws alone."""
-    settings = synthesis.protocols[protocol]
-    kind = synthesis.boards[settings.boards]
+def list_captures(settings: SimulationSettings, protocol: str) -> list[tuple[str, str]]:
+    """List the names (board, skin) of a protocol's captures; further boards or skins leave the others unchanged."""
+    kind, skins_n = settings.boards[settings.protocols[protocol].boards], settings.protocols[protocol].skins_n
     boards = [f"{kind.letter}{board_i}" for board_i in range(kind.boards_n)]
     skins = [(board, f"{board}_s{skin_i}") for skin_i in range(kind.skins_per_board_n) for board in boards]
-    return sorted(skins[: settings.skins_n])
+    return sorted(skins[:skins_n])
 
 
-def record(synthesis: Synthesis, protocol: str, *, board: str, skin: str, seed: int) -> SyntheticCapture:
+def simulate_capture(
+    settings: SimulationSettings, protocol: str, *, board: str, skin: str, seed: int
+) -> SimulatedCapture:
     """Draw the board and the skin of these names, take the skin through the protocol, and record it."""
-    settings, chip, spreads = synthesis.protocols[protocol], synthesis.chip, synthesis.spreads
-    rig, terms = set_up(synthesis.rig, settings), synthesis.terms.only(settings.terms)
-    kind = synthesis.boards[settings.boards]
+    presses, chip, spreads = settings.protocols[protocol], settings.chip, settings.spreads
+    rig, terms = rig_for(settings.rig, presses), settings.terms.only(presses.terms)
+    kind = settings.boards[presses.boards]
     rngs = {part: rng_for(seed, "recording", protocol, board, skin, part) for part in PARTS}
     drawn_board = draw_board(kind.design, spreads, seed=seed, name=board)
     rule = kind.quadrature.in_si()
-    drawn_skin = draw_skin(synthesis.skin, spreads, seed=seed, name=skin, rule=rule, sides_m=kind.skin_m)
-    plan = settings.plan(rngs["plan"], kind.skin_mm)
+    drawn_skin = draw_skin(settings.skin, spreads, seed=seed, name=skin, rule=rule, sides_m=kind.skin_m)
+    plan = presses.plan(rngs["plan"], kind.skin_mm)
     tip_m = _tip(plan, rig, drawn_skin, rngs["robot"])
     if plan.labelled:
         tip_m[..., :2] += rig.place_offset_sd_mm * milli * rng_for(seed, "rig", board).standard_normal(2)
-    response = respond(drawn_board, drawn_skin, tip_m, tilt=plan.tilt, terms=terms, rng=rngs["drift"])
-    reader = switch_on(drawn_board, chip, rate_hz=rig.rate_hz, temperature=terms.temperature, rng=rngs["chips"])
+    response = simulate_response(drawn_board, drawn_skin, tip_m, tilt=plan.tilt, terms=terms, rng=rngs["drift"])
+    readout = start_readout(drawn_board, chip, rate_hz=rig.rate_hz, temperature=terms.temperature, rng=rngs["chips"])
     line = timeline(rig, plan.x_mm.shape[1])
-    frames = read_frames(response, line, reader, noise=rngs["noise"], warmth_noise=rngs["warmth"])
+    frames = read_frames(response, line, readout, noise=rngs["noise"], warmth_noise=rngs["warmth"])
     frame_s = (1 + np.arange(len(frames.b_uT))) / rig.rate_hz
-    arrived_frames_n, arrived_s = chunks(frame_s, rig, rngs["port"])
+    arrived_frames_n, arrived_s = draw_arrivals(frame_s, rig, rngs["port"])
     offset_s, rate = clock = draw_clock(rig, rngs["port"])
     read_N, past_range_n = _force_readings(response, rig, rngs["probe"])
-    return SyntheticCapture(
+    return SimulatedCapture(
         name=skin if protocol == MAIN else f"{skin}-{protocol}",
         board=board,
         skin=skin,
@@ -106,20 +107,20 @@ def record(synthesis: Synthesis, protocol: str, *, board: str, skin: str, seed: 
             "force past the sensor": past_range_n,
             "stops past 0.6 of the thickness": response.beyond_verified_n,
         },
-        card_rate_hz=rig.rate_hz if isinstance(settings, Walk) else None,
+        card_rate_hz=rig.rate_hz if isinstance(presses, Walk) else None,
     )
 
 
-def to_files(capture: SyntheticCapture, synthesis: Synthesis) -> tuple[Header, dict[str, bytes]]:
-    """Write a synthetic capture as the files of a native one, or an SD card's; the files' hashes are still to come."""
+def to_files(capture: SimulatedCapture, settings: SimulationSettings) -> tuple[Header, dict[str, bytes]]:
+    """Encode a capture as the files of a native capture or of an SD card; the header has no hashes of files yet."""
     on_card = capture.card_rate_hz is not None
     frames_n, chips_n = capture.temperature_degC.shape
-    xy_uT, _, z_uT = steps_uT(synthesis.chip.gain_sel).tolist()
+    xy_uT, _, z_uT = steps_uT(settings.chip.gain_sel).tolist()
     header = Header(
         format="reskin-capture/1", capture=capture.name, board=capture.board, skin=capture.skin, source="simulated",
         layout="sd-card" if on_card else "native", wire=None if on_card else WIRE,
         chips_n=chips_n, unit_b="uT", unit_force="N", unit_place="mm",
-        firmware=Firmware(gain_sel=synthesis.chip.gain_sel, lsb_xy_uT=xy_uT, lsb_z_uT=z_uT),
+        firmware=Firmware(gain_sel=settings.chip.gain_sel, lsb_xy_uT=xy_uT, lsb_z_uT=z_uT),
         clock=Clock(kind="recording" if on_card else "arrivals", rate_hz=None, marks=capture.marks),
         protocol=capture.protocol,
         contacts_before_n=0, options={}, files={},
@@ -139,15 +140,15 @@ def to_files(capture: SyntheticCapture, synthesis: Synthesis) -> tuple[Header, d
 
 
 def _tip(plan: Plan, rig: Rig, skin: Skin, rng: np.random.Generator) -> Float64[np.ndarray, "n p 3"]:
-    """Give where the tip is in the board's frame, in m; a weight sinks as deep as the skin lets it."""
-    tip_m = (misplace(plan, rig, rng) - (*plan.centre_mm, 0)) * milli
+    """Return the tip's positions in the board's frame in m; under a commanded load, the skin determines the depth."""
+    tip_m = (actual_positions(plan, rig, rng) - (*plan.centre_mm, 0)) * milli
     if plan.weight_N is not None:
-        tip_m[:, :, 2] = depths_under(skin, plan.weight_N)
+        tip_m[:, :, 2] = depths_under_load(skin, plan.weight_N)
     return tip_m
 
 
 def _force_readings(response: Response, rig: Rig, rng: np.random.Generator) -> tuple[Float32[np.ndarray, "n d 3"], int]:
-    """Give the force sensor's readings in N, and how many exceed its range; in the first dwell, no load, only noise."""
+    """Return the force readings in N, the no-load dwell of each indentation first, and how many were clipped."""
     force_N = np.concatenate([np.zeros((len(response.force_N), 1, 3)), response.force_N], axis=1)
     read_N, past_range_n = read_force(force_N.reshape(-1, 3), noise_N=rig.force_noise_N, rng=rng)
     return read_N.reshape(force_N.shape), past_range_n

@@ -1,7 +1,6 @@
-"""The contact response: field and force at every stop of the tip. In: board, skin, tips, terms of physics.
+"""Response of a skin to a tip: fields at the chips and forces at every stop of a protocol.
 
-A term of physics that a protocol does not name is not computed (PHYSICS 8 says what that costs).
-Refuses to know frames, chips' electronics and clocks.
+Terms of physics that a protocol does not name are not computed (experiment neglected_effects gives the error).
 """
 
 from collections.abc import Collection
@@ -41,7 +40,7 @@ from reskin.physics.skin import (
 
 
 class Terms(Strict):
-    """Physics that only some protocols need, each with its sizes."""
+    """Section `terms`: physics that only some protocols need."""
 
     ageing: Ageing | None = None
     friction: Friction | None = None
@@ -56,10 +55,10 @@ class Terms(Strict):
         return Terms(**{name: getattr(self, name) for name in names})
 
 
-class Sideways(NamedTuple):
-    """At every stop: the force in the skin's plane, and what press and push make together.
+class TangentialResponse(NamedTuple):
+    """Response to a dragged or leaning tip at every stop.
 
-    `slide_m` is how far the skin has moved as one, without its turn: its springs pull it back by k times that.
+    force_N: tangential force. change_T: dB of pressing and dragging together. slide_m: translation of the whole skin.
     """
 
     force_N: Float[np.ndarray, "n p 2"]
@@ -74,10 +73,10 @@ class Response:
     rest_T: Float[np.ndarray, "n k 3"]  # before each indentation
     change_T: Float[np.ndarray, "n p k 3"]
     force_N: Float[np.ndarray, "n p 3"]
-    beyond_verified_n: int  # stops deeper than any published solution vouches for
+    beyond_verified_n: int  # stops beyond the depths of published solutions
 
 
-def respond(
+def simulate_response(
     board: Board,
     skin: Skin,
     tip_m: Float[np.ndarray, "n p 3"],
@@ -86,9 +85,10 @@ def respond(
     terms: Terms,
     rng: np.random.Generator,
 ) -> Response:
-    """Press the skin at every stop (x, y, depth in the board's frame), fresh at the first indentation.
+    """Simulate the response of a fresh skin at every stop (x, y, depth in the board's frame).
 
-    Without friction nothing pushes sideways: a tip that is dragged or leans (`tilt`, x and y over z) only presses.
+    `tilt` is the lean of the stylus, x and y over z. Without the term friction there is no tangential force: a tip that
+    is dragged or leans only presses.
     """
     n, stops_n, _ = tip_m.shape
     flat_m = tip_m.reshape(-1, 3)
@@ -97,8 +97,8 @@ def respond(
         rest_T, change_T = changes_of_field(board, skin, flat_m)
     else:
         rest_T, _ = changes_of_field(board, skin, flat_m[:0])
-        pushed = push(board, skin, tip_m, tilt=tilt, how=terms.friction)
-        force_N[:, :, :2], change_T = pushed.force_N, pushed.change_T
+        dragged = drag_tip(board, skin, tip_m, tilt=tilt, how=terms.friction)
+        force_N[:, :, :2], change_T = dragged.force_N, dragged.change_T
     force_N[:, :, 2] = forces(skin, flat_m[:, 2]).reshape(n, stops_n)
     change_T = change_T.reshape(n, stops_n, *rest_T.shape)
     every_rest_T = np.broadcast_to(rest_T, (n, *rest_T.shape))
@@ -118,36 +118,36 @@ def respond(
     return Response(every_rest_T, change_T, force_N, deep_n)
 
 
-def push(
+def drag_tip(
     board: Board, skin: Skin, tip_m: Float[np.ndarray, "n p 3"], *, tilt: Float[np.ndarray, "n 2"], how: Friction
-) -> Sideways:
-    """Drag or lean a tip through the stops of every indentation, from its first in contact; Coulomb limits the force.
+) -> TangentialResponse:
+    """Drag or lean a tip through the stops of every indentation, with Coulomb friction.
 
-    The force shears the layer under the tip, and slides a skin that its base holds by springs (`Skin.hold`) as one;
-    another skin's base is taken as fixed sideways: an assumption, without which it would come along with the tip.
-    One friction, that of `how`, bounds the slide of press and drag together: a drag that takes a share of it leaves the
-    rest to the press (assumed), so that a tip which slips has let go of the skin that it took along when it pressed.
+    The tangential force shears the layer under the tip, and slides the whole skin if springs hold its base
+    (`Skin.hold`); otherwise the base is assumed fixed sideways. One coefficient of friction bounds pressing and
+    dragging together: a drag that uses a share of it leaves the rest to the press (assumed), so that a tip that slips
+    has released the skin that it displaced when it pressed.
     """
     if skin.hold is not None:
         skin = replace(skin, hold=replace(skin.hold, friction=how.coefficient))
-    pushed = [_push_once(board, skin, *each, how.coefficient) for each in zip(tip_m, tilt, strict=True)]
-    return Sideways(*map(np.stack, zip(*pushed, strict=True)))
+    responses = [_drag_once(board, skin, *each, how.coefficient) for each in zip(tip_m, tilt, strict=True)]
+    return TangentialResponse(*map(np.stack, zip(*responses, strict=True)))
 
 
-def _push_once(
+def _drag_once(
     board: Board, skin: Skin, tip_m: Float[np.ndarray, "p 3"], tilt: Float[np.ndarray, "2"], coefficient: float
-) -> Sideways:
+) -> TangentialResponse:
     normal_N = forces(skin, tip_m[:, 2])
     shear_Pa = shear_moduli_Pa(skin, tip_m[:, 2])
     layer_N_per_m = np.zeros(len(tip_m))
     for stop_i in np.flatnonzero(normal_N > 0).tolist():
-        layer_N_per_m[stop_i] = shear_Pa[stop_i] * _map(skin, tip_m[stop_i, 2]).stiffness_m
-    slides_m_per_N = _slides_m_per_N(skin, tip_m[:, :2])
+        layer_N_per_m[stop_i] = shear_Pa[stop_i] * _shear_map(skin, tip_m[stop_i, 2]).stiffness_m
+    slides_m_per_N = _base_compliance(skin, tip_m[:, :2])
     dragged = drag_force(
         tip_m[:, :2], normal_N, stiffness_N_per_m=_in_series(layer_N_per_m, slides_m_per_N), friction=coefficient
     )
-    force_N = _limited(dragged.force_N + normal_N[:, None] * tilt, coefficient * normal_N)
-    # The material under the tip rested behind it: there both press and push are centred.
+    force_N = _clip(dragged.force_N + normal_N[:, None] * tilt, coefficient * normal_N)
+    # Pressing and dragging are centred where the material under the tip rested.
     slid_m = (slides_m_per_N @ force_N[:, :, None])[:, :, 0]
     elastic_m = force_N / np.where(layer_N_per_m > 0, layer_N_per_m, 1.0)[:, None] + slid_m
     centre_m = np.column_stack([tip_m[:, :2] - elastic_m, tip_m[:, 2]])
@@ -157,18 +157,18 @@ def _push_once(
     change_T = np.zeros((len(tip_m), *board.chips_m.shape))
     for stop_i, before, after in moved_dipoles(skin, centre_m, left):
         if force_N[stop_i].any():
-            shear_map = _map(skin, centre_m[stop_i, 2])
-            after = _carry(shear_map, after, centre_m[stop_i, :2], force_N[stop_i], 3 * shear_Pa[stop_i])
+            shear_map = _shear_map(skin, centre_m[stop_i, 2])
+            after = _apply_shear(shear_map, after, centre_m[stop_i, :2], force_N[stop_i], 3 * shear_Pa[stop_i])
             after = slide.apply(dragged_slide, stop_i, after, skin.seat_m)
         change_T[stop_i] = change_of_field(before, after, board.chips_m)
     slide_m = np.zeros((len(tip_m), 2))
     if skin.hold is not None:
         true_m = centre_m + np.array([0.0, 0.0, skin.depth_zero_m])
         slide_m = dragged_slide.move_m + press_motion(skin, skin.hold, true_m).scaled(left).move_m
-    return Sideways(force_N, change_T, slide_m)
+    return TangentialResponse(force_N, change_T, slide_m)
 
 
-def _slides_m_per_N(skin: Skin, places_m: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, "p 2 2"]:
+def _base_compliance(skin: Skin, places_m: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, "p 2 2"]:
     if skin.hold is None:
         return np.zeros((len(places_m), 2, 2))
     return slide.compliance_m_per_N(places_m - skin.seat_m, skin.sides_m, skin.hold.springs_N_per_m)
@@ -177,23 +177,23 @@ def _slides_m_per_N(skin: Skin, places_m: Float[np.ndarray, "p 2"]) -> Float[np.
 def _in_series(
     layer_N_per_m: Float[np.ndarray, " p"], slides_m_per_N: Float[np.ndarray, "p 2 2"]
 ) -> Float[np.ndarray, "p 2 2"]:
-    # A layer without stiffness passes no force on to its springs.
+    # A layer without stiffness transmits no force to the springs.
     stiff = layer_N_per_m > 0
     layers_m_per_N = np.eye(2) / np.where(stiff, layer_N_per_m, 1.0)[:, None, None]
     return np.where(stiff[:, None, None], np.linalg.inv(layers_m_per_N + slides_m_per_N), 0.0)
 
 
-def _map(skin: Skin, depth_m: float) -> shear.ShearMap:
+def _shear_map(skin: Skin, depth_m: float) -> shear.ShearMap:
     true_m = depth_m + skin.depth_zero_m
     return shear.at_depth(true_m, thickness_m=skin.thickness_m, tip_radius_m=skin.tip_radius_m, base=skin.base)
 
 
-def _limited(force_N: Float[np.ndarray, "p 2"], limit_N: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p 2"]:
+def _clip(force_N: Float[np.ndarray, "p 2"], limit_N: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p 2"]:
     size_N = np.hypot(*force_N.T)
     return force_N * np.minimum(1.0, limit_N / np.where(size_N > 0, size_N, 1.0))[:, None]
 
 
-def _carry(
+def _apply_shear(
     shear_map: shear.ShearMap,
     dipoles: Dipoles,
     centre_m: Float[np.ndarray, "2"],

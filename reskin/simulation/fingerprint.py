@@ -1,4 +1,4 @@
-"""A fingerprint of the simulated skin: the same as long as equal presses make equal fields and forces."""
+"""A fingerprint of the simulation: equal as long as equal indentations give equal fields and forces."""
 
 import hashlib
 import json
@@ -21,23 +21,23 @@ BOARD = BoardDesign(
 )
 PLACES_MM = ((0.0, 0.0), (4.0, -2.0), (-6.0, 4.0), (8.0, 4.0))
 DEPTHS_MM = (0.2, 0.6, 1.2)
-DIGITS = 4  # significant ones: rounding differs less, another law more
+DIGITS = 4  # significant digits: rounding errors are smaller, changes of the physics larger
 
 
 def fingerprint(sections: Mapping[str, Any]) -> str:
-    """Press two drawn skins at some places and depths: a digest of fields in uT, forces in N, and rig and chips.
+    """Return a digest of fields and forces of two skins under some indentations, and of the rig and chip settings.
 
-    Code that computes the same in another way has the same fingerprint; another law or another setting has not.
+    A refactoring keeps the fingerprint; a change of the physics or of a setting changes it.
     """
     design = parse(SkinDesign, sections["skin"], "skin")
     spreads = parse(Spreads, sections["spreads"], "spreads")
-    pokes_m = milli * np.array([(*place, depth) for place in PLACES_MM for depth in DEPTHS_MM])
-    felt = []
+    indentations_m = milli * np.array([(*place, depth) for place in PLACES_MM for depth in DEPTHS_MM])
+    simulated = []
     for name in ("b0", "b1"):
         board = draw_board(BOARD, spreads, seed=0, name=name)
         skin = draw_skin(design, spreads, seed=0, name=f"{name}_s0", rule=RULE)
-        rest_T, change_T = changes_of_field(board, skin, pokes_m)
-        felt += [rest_T.ravel() / micro, change_T.ravel() / micro, forces(skin, pokes_m[:, 2])]
-    rounded = [f"{value:.{DIGITS - 1}e}" for value in np.concatenate(felt)]
-    words = json.dumps([rounded, sections["rig"], sections["chip"]], sort_keys=True, default=str)
-    return hashlib.sha256(words.encode()).hexdigest()[:16]
+        rest_T, change_T = changes_of_field(board, skin, indentations_m)
+        simulated += [rest_T.ravel() / micro, change_T.ravel() / micro, forces(skin, indentations_m[:, 2])]
+    rounded = [f"{value:.{DIGITS - 1}e}" for value in np.concatenate(simulated)]
+    content = json.dumps([rounded, sections["rig"], sections["chip"]], sort_keys=True, default=str)
+    return hashlib.sha256(content.encode()).hexdigest()[:16]

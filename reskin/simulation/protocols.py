@@ -1,4 +1,4 @@
-"""Protocols: where the tip goes, in which order, and presses that change while they are read."""
+"""Protocols of simulated captures: the places and depths of the tip, in order of time."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -13,85 +13,18 @@ from reskin.data.grid import CENTRE_MM, PITCH_MM, SIDE_POINTS_N, points_mm, prot
 from reskin.errors import ParamsError
 from reskin.physics.skin import Skin, forces
 
-LIFTED_MM = -1.0  # depth of a stop above the skin: no contact, and no dwell of the robot's log
-DEPTH_STEP_M = 1e-12  # to which the depth under a weight is found: 1e-8 N on a skin of 10 N/mm
-DEEPEST_SHARE = 0.999  # of the lesser of thickness and tip radius, where the force's model ends
-
-Range = tuple[float, float]
+LIFTED_MM = -1.0  # depth of a stop above the skin: no contact, and not in the robot's log
+DEPTH_STEP_M = 1e-12  # tolerance of the depth under a load: 1e-8 N on a skin of 10 N/mm
+DEEPEST_SHARE = 0.999  # of the lesser of thickness and tip radius, the limit of the force model
 
 
 @dataclass(frozen=True)
 class Stops:
-    """Where the tip is at each stop, axes n indentations and p stops, in mm."""
+    """Positions of the tip at each stop in mm, axes n indentations and p stops."""
 
     x_mm: Float64[np.ndarray, "n p"]
     y_mm: Float64[np.ndarray, "n p"]
     depth_mm: Float64[np.ndarray, "n p"]
-
-
-def weights_N(force_max_N: float, step_N: float) -> Float64[np.ndarray, " p"]:
-    """List the weights of one filling: nothing, a step, two steps, ... the most."""
-    return step_N * np.arange(round(force_max_N / step_N) + 1)
-
-
-def depths_under(skin: Skin, weight_N: Float[np.ndarray, "n p"]) -> Float64[np.ndarray, "n p"]:
-    """Find the commanded depth in m at which the skin bears each weight; no weight just touches it."""
-    distinct_N, index = np.unique(weight_N, return_inverse=True)
-    return np.array([_depth_under(skin, float(distinct)) for distinct in distinct_N])[index].reshape(weight_N.shape)
-
-
-def presses(presses_n: int, *, duration_s: Range, depth_mm: Range, rate_hz: float, rng: np.random.Generator) -> Stops:
-    """Draw presses at grid places, durations log-uniform; after a short one the tip stays lifted."""
-    long_s = np.exp(rng.uniform(np.log(duration_s[0]), np.log(duration_s[1]), size=presses_n))
-    long_n = np.maximum(np.round(long_s * rate_hz).astype(np.int64), 1)
-    place_mm = _places_mm(presses_n, rng)
-    depths_mm = np.full((presses_n, int(long_n.max())), LIFTED_MM)
-    for i, peak_mm in enumerate(rng.uniform(*depth_mm, size=presses_n)):
-        depths_mm[i, : long_n[i]] = half_sine(int(long_n[i]), float(peak_mm))
-    flat = np.ones(depths_mm.shape)
-    return Stops(place_mm[:, :1] * flat, place_mm[:, 1:] * flat, depths_mm)
-
-
-def footfalls(
-    steps_n: int, *, stance_s: Range, swing_s: Range, depth_mm: Range, rate_hz: float, rng: np.random.Generator
-) -> Stops:
-    """Draw one walk: a footfall, a swing above the skin, and so on; one indentation of many stops."""
-    stance_n, swing_n = (
-        np.maximum(np.round(rng.uniform(*range_s, size=steps_n) * rate_hz).astype(np.int64), 1)
-        for range_s in (stance_s, swing_s)
-    )
-    peaks_mm = rng.uniform(*depth_mm, size=steps_n)
-    place_mm = np.repeat(_places_mm(steps_n, rng), stance_n + swing_n, axis=0)
-    parts = [
-        part
-        for stance, swing, peak_mm in zip(stance_n, swing_n, peaks_mm, strict=True)
-        for part in (half_sine(int(stance), float(peak_mm)), np.full(int(swing), LIFTED_MM))
-    ]
-    return Stops(place_mm[None, :, 0], place_mm[None, :, 1], np.concatenate(parts)[None])
-
-
-def half_sine(frames_n: int, peak_mm: float) -> Float64[np.ndarray, " p"]:
-    """Give the depth in the middle of each frame of a press of `frames_n` frames."""
-    return peak_mm * np.sin(np.pi * (np.arange(frames_n) + 0.5) / frames_n)
-
-
-def _places_mm(places_n: int, rng: np.random.Generator) -> Float64[np.ndarray, "n 2"]:
-    grid_mm = points_mm()
-    return grid_mm[rng.integers(len(grid_mm), size=places_n)]
-
-
-def _depth_under(skin: Skin, weight_N: float) -> float:
-    if weight_N == 0:
-        return -skin.depth_zero_m
-    deepest_m = DEEPEST_SHARE * min(skin.thickness_m, skin.tip_radius_m) - skin.depth_zero_m
-
-    def missing_N(depth_m: float) -> float:
-        return float(forces(skin, np.array([depth_m]))[0]) - weight_N
-
-    if missing_N(deepest_m) < 0:
-        rule = f"at most {missing_N(deepest_m) + weight_N:.3g} N, which the skin bears at its deepest"
-        raise ParamsError(f"skin {skin.name}", "weight", rule, f"{weight_N:.3g} N", "Lower force_max_N.")
-    return float(brentq(missing_N, -skin.depth_zero_m, deepest_m, xtol=DEPTH_STEP_M))
 
 
 SKIN_MM = (20.0, 20.0)  # authors' CAD
@@ -105,10 +38,10 @@ Sides_mm = tuple[float, float]
 
 @dataclass(frozen=True)
 class Plan:
-    """Stops in order of time: a stop is a place and a depth at which readings are taken, an indentation has p of them.
+    """Stops in order of time: a place and a depth at which readings are taken; an indentation has p stops.
 
-    A depth below zero is a stop above the skin; where a weight is commanded, the depth is unknown: NaN. `tilt` is the
-    lean of the stylus, x and y over z. `centre_mm` is the label of the skin's middle.
+    A negative depth is a stop above the skin; where a load is commanded, the depth is NaN. `tilt` is the lean of the
+    stylus, x and y over z. `centre_mm` is the label of the skin's centre.
     """
 
     pass_i: Int32[np.ndarray, " n"]
@@ -125,40 +58,40 @@ class Plan:
         return len(self.pass_i)
 
 
-class Shared(Strict):
-    """Settings that all protocols have."""
+class ProtocolSettings(Strict):
+    """Settings common to all protocols."""
 
     boards: str  # the kind of board, one of `boards` of the scene
-    skins_n: Count  # the first skin of each board before the second of any
+    skins_n: Count  # the first skin of each board comes before the second of any
     terms: tuple[
         Literal["ageing", "friction", "memory", "relaxation", "temperature"], ...
-    ]  # physics that it needs (PHYSICS 8)
-    rate_hz: Rate_hz | None = None  # the rig's unless given: more chips take longer
+    ]  # terms of physics that are simulated
+    rate_hz: Rate_hz | None = None  # default: the rig's; more chips take longer
 
 
-class _Poked(Shared):
+class _RandomDepth(ProtocolSettings):
     depth_mm: tuple[Depth_mm, Depth_mm]  # uniform between these
 
     @model_validator(mode="after")
-    def _depths_rise(self) -> "_Poked":
+    def _depths_rise(self) -> "_RandomDepth":
         if not self.depth_mm[0] <= self.depth_mm[1]:
             raise ValueError(f"depth_mm goes from the shallower to the deeper, not {self.depth_mm}")
         return self
 
 
-class _Pressed(Shared):
-    # Ageing and relaxation would change the force between stops, which no model here follows; nothing goes sideways.
+class _OnlyTemperature(ProtocolSettings):
+    # Ageing and relaxation would change the force between stops, which is not modelled; nothing moves sideways.
     terms: tuple[Literal["temperature"], ...]
 
     @model_validator(mode="after")
-    def _ranges_rise(self) -> "_Pressed":
+    def _ranges_rise(self) -> "_OnlyTemperature":
         for name, value in self:
             if isinstance(value, tuple) and len(value) == 2 and value[0] > value[1]:
                 raise ValueError(f"{name} goes from the lower to the higher, not {value}")
         return self
 
 
-class Grid(Shared):
+class Grid(ProtocolSettings):
     """The paper's grid: 65 places, depth by depth, pass by pass (section 3)."""
 
     kind: Literal["grid"]
@@ -166,13 +99,15 @@ class Grid(Shared):
     depths_mm: Depths_mm
 
     def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
-        """Poke every place at every depth, in every pass."""
+        """Press every place at every depth, in every pass."""
         pokes = protocol(self.depths_mm, self.passes_n)
         stops = Stops(pokes.x_mm[:, None], pokes.y_mm[:, None], pokes.depth_mm[:, None])
-        return _upright(stops, f"65-point grid, {len(self.depths_mm)} depths, {self.passes_n} passes", pokes.pass_i)
+        return _upright_plan(
+            stops, f"65-point grid, {len(self.depths_mm)} depths, {self.passes_n} passes", pokes.pass_i
+        )
 
 
-class Drag(Shared):
+class Drag(ProtocolSettings):
     """Drag lines every 2 mm, along x and along y, over the whole grid (section 4, shear)."""
 
     kind: Literal["drag"]
@@ -181,7 +116,7 @@ class Drag(Shared):
     step_mm: Annotated[float, Field(gt=0, le=4)]  # between stops
 
     def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
-        """Drag in a snake: each next line the other way, along x on every row, then along y on every column."""
+        """Drag along every row, then along every column, each line in the direction opposite to the one before."""
         stops_n = round(2 * CENTRE_MM / self.step_mm) + 1
         along_mm = np.linspace(0, 2 * CENTRE_MM, stops_n)
         there = np.where((np.arange(SIDE_POINTS_N) % 2 == 0)[:, None], along_mm, along_mm[::-1])
@@ -189,7 +124,7 @@ class Drag(Shared):
         lines_n, depths_n = 2 * SIDE_POINTS_N, len(self.depths_mm)
         x_mm = np.tile(np.concatenate([there, across_mm]), (depths_n, 1))
         y_mm = np.tile(np.concatenate([across_mm, there]), (depths_n, 1))
-        # Every second pass goes back along the lines, or where the tip is would tell which way it is pushed.
+        # Every second pass is reversed, or the place of the tip would determine the direction of its force.
         turned = [slice(None, None, -1 if pass_i % 2 else 1) for pass_i in range(self.passes_n)]
         depth_mm = np.tile(np.repeat(np.array(self.depths_mm), lines_n), self.passes_n)
         stops = Stops(
@@ -200,11 +135,11 @@ class Drag(Shared):
         description = f"drag lines every {PITCH_MM:g} mm, {depths_n} depths, {self.passes_n} passes, "
         description += f"stops every {2 * CENTRE_MM / (stops_n - 1):g} mm"
         pass_i = np.repeat(np.arange(self.passes_n, dtype=np.int32), depths_n * lines_n)
-        return _upright(stops, description, pass_i)
+        return _upright_plan(stops, description, pass_i)
 
 
-class Hand(_Poked):
-    """Pokes by hand along lines: only their order is known, not their place, depth or force (section 5.2)."""
+class Hand(_RandomDepth):
+    """Indentations by hand along lines: only their order is known, not place, depth or force (section 5.2)."""
 
     kind: Literal["hand"]
     lines_n: Count
@@ -213,7 +148,7 @@ class Hand(_Poked):
     tilt_sd_deg: Annotated[float, Field(ge=0, le=20)]  # of the stylus, about each axis
 
     def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
-        """Poke along lines side by side over the grid; the pass counts lines."""
+        """Press along parallel lines over the grid; the pass counts lines."""
         across_mm = np.linspace(0, 2 * CENTRE_MM, self.lines_n) if self.lines_n > 1 else np.array([CENTRE_MM])
         along_mm = np.linspace(0, 2 * CENTRE_MM, self.pokes_per_line_n)
         pokes_n = self.lines_n * self.pokes_per_line_n
@@ -230,8 +165,8 @@ class Hand(_Poked):
         )
 
 
-class Scatter(_Poked):
-    """Pokes anywhere on the skin, uniform (section 6, arm sleeve); labels in mm from the skin's corner."""
+class Scatter(_RandomDepth):
+    """Indentations anywhere on the skin, uniform (section 6, arm sleeve); labels in mm from the skin's corner."""
 
     kind: Literal["scatter"]
     pokes_n: Count
@@ -248,11 +183,11 @@ class Scatter(_Poked):
         description = f"{self.pokes_n} pokes scattered over {skin_mm[0]:g} x {skin_mm[1]:g} mm, "
         description += f"{self.margin_mm:g} mm from its edges"
         stops = Stops(place_mm[:, :1], place_mm[:, 1:], depth_mm)
-        return _upright(stops, description, centre_mm=(skin_mm[0] / 2, skin_mm[1] / 2))
+        return _upright_plan(stops, description, centre_mm=(skin_mm[0] / 2, skin_mm[1] / 2))
 
 
-class Load(_Pressed):
-    """A glass that is filled step by step at the skin's middle (section 6); its foot taken as the rig's round tip."""
+class Load(_OnlyTemperature):
+    """A glass on the skin's centre, filled step by step (section 6); its foot is taken as the rig's round tip."""
 
     kind: Literal["load"]
     # Fillings: a direction is fitted on one half of them, and tested on the other.
@@ -268,16 +203,16 @@ class Load(_Pressed):
         return self
 
     def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
-        """Fill the glass once in each pass; depths follow from the skin."""
-        weight_N = np.tile(weights_N(self.force_max_N, self.step_N), (self.passes_n, 1))
+        """Fill the glass once in each pass; the depths follow from the skin."""
+        weight_N = np.tile(load_steps_N(self.force_max_N, self.step_N), (self.passes_n, 1))
         middle_mm = np.full(weight_N.shape, CENTRE_MM)
         stops = Stops(middle_mm, middle_mm, np.full(weight_N.shape, np.nan))
         description = f"{self.passes_n} fillings of a glass, to {self.force_max_N:g} N by {self.step_N:g} N"
-        return _upright(stops, description, np.arange(self.passes_n, dtype=np.int32), weight_N=weight_N)
+        return _upright_plan(stops, description, np.arange(self.passes_n, dtype=np.int32), weight_N=weight_N)
 
 
-class Press(_Pressed):
-    """Presses that never rest: each frame is a stop (section 7, dynamic data), so the frames' rate belongs to it."""
+class Press(_OnlyTemperature):
+    """Half-sine presses at grid places; each frame is a stop (section 7, dynamic data), at a rate of its own."""
 
     kind: Literal["press"]
     presses_n: Count
@@ -286,15 +221,21 @@ class Press(_Pressed):
     rate_hz: Rate_hz
 
     def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
-        stops = presses(
-            self.presses_n, duration_s=self.duration_s, depth_mm=self.depth_mm, rate_hz=self.rate_hz, rng=rng
-        )
+        """Draw places, durations (log-uniform) and depths; after a short press the tip stays lifted."""
         least_s, most_s = self.duration_s
-        return _upright(stops, f"{self.presses_n} presses of {least_s:g} to {most_s:g} s, read throughout")
+        long_s = np.exp(rng.uniform(np.log(least_s), np.log(most_s), size=self.presses_n))
+        long_n = np.maximum(np.round(long_s * self.rate_hz).astype(np.int64), 1)
+        place_mm = _draw_places_mm(self.presses_n, rng)
+        depths_mm = np.full((self.presses_n, int(long_n.max())), LIFTED_MM)
+        for i, peak_mm in enumerate(rng.uniform(*self.depth_mm, size=self.presses_n)):
+            depths_mm[i, : long_n[i]] = half_sine(int(long_n[i]), float(peak_mm))
+        flat = np.ones(depths_mm.shape)
+        stops = Stops(place_mm[:, :1] * flat, place_mm[:, 1:] * flat, depths_mm)
+        return _upright_plan(stops, f"{self.presses_n} presses of {least_s:g} to {most_s:g} s, read throughout")
 
 
-class Walk(_Pressed):
-    """Steps of a shoe or touches of a glove, in one log without labels (section 6: dog shoe, glove)."""
+class Walk(_OnlyTemperature):
+    """Footfalls of a shoe or touches of a glove, in one log without labels (section 6: dog shoe, glove)."""
 
     kind: Literal["walk"]
     steps_n: Count
@@ -305,14 +246,26 @@ class Walk(_Pressed):
     rate_hz: Rate_hz
 
     def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
-        sizes = {name: getattr(self, name) for name in ("stance_s", "swing_s", "depth_mm", "rate_hz")}
-        return _upright(footfalls(self.steps_n, **sizes, rng=rng), f"a walk of {self.steps_n} steps")
+        """Draw one walk as one indentation of many stops: a footfall, a swing above the skin, and so on."""
+        stance_n, swing_n = (
+            np.maximum(np.round(rng.uniform(*range_s, size=self.steps_n) * self.rate_hz).astype(np.int64), 1)
+            for range_s in (self.stance_s, self.swing_s)
+        )
+        peaks_mm = rng.uniform(*self.depth_mm, size=self.steps_n)
+        place_mm = np.repeat(_draw_places_mm(self.steps_n, rng), stance_n + swing_n, axis=0)
+        parts = [
+            part
+            for stance, swing, peak_mm in zip(stance_n, swing_n, peaks_mm, strict=True)
+            for part in (half_sine(int(stance), float(peak_mm)), np.full(int(swing), LIFTED_MM))
+        ]
+        stops = Stops(place_mm[None, :, 0], place_mm[None, :, 1], np.concatenate(parts)[None])
+        return _upright_plan(stops, f"a walk of {self.steps_n} steps")
 
 
 Protocol = Annotated[Grid | Drag | Hand | Scatter | Load | Press | Walk, Field(discriminator="kind")]
 
 
-def _upright(
+def _upright_plan(
     stops: Stops,
     description: str,
     pass_i: Int32[np.ndarray, " n"] | None = None,
@@ -320,10 +273,51 @@ def _upright(
     weight_N: Float64[np.ndarray, "n p"] | None = None,
     centre_mm: tuple[float, float] = (CENTRE_MM, CENTRE_MM),
 ) -> Plan:
-    """Make the plan of a tip that does not lean; one pass unless given."""
+    """Make the plan of an upright tip; one pass unless given."""
     n = len(stops.depth_mm)
     passes = np.zeros(n, np.int32) if pass_i is None else pass_i
     return Plan(
         passes, stops.x_mm, stops.y_mm, stops.depth_mm, np.zeros((n, 2)), description, weight_N=weight_N,
         centre_mm=centre_mm,
     )  # fmt: skip
+
+
+def load_steps_N(force_max_N: float, step_N: float) -> Float64[np.ndarray, " p"]:
+    """List the loads of one filling: 0, a step, two steps, ... the maximum."""
+    return step_N * np.arange(round(force_max_N / step_N) + 1)
+
+
+def depths_under_load(skin: Skin, load_N: Float[np.ndarray, "n p"]) -> Float64[np.ndarray, "n p"]:
+    """Solve for the commanded depth in m under each load; without load the tip just touches the skin.
+
+    Raises
+    ------
+    ParamsError
+        If the skin does not bear a load at its greatest depth.
+    """
+    distinct_N, index = np.unique(load_N, return_inverse=True)
+    return np.array([_depth_under_load(skin, float(distinct)) for distinct in distinct_N])[index].reshape(load_N.shape)
+
+
+def _depth_under_load(skin: Skin, load_N: float) -> float:
+    if load_N == 0:
+        return -skin.depth_zero_m
+    deepest_m = DEEPEST_SHARE * min(skin.thickness_m, skin.tip_radius_m) - skin.depth_zero_m
+
+    def missing_N(depth_m: float) -> float:
+        return float(forces(skin, np.array([depth_m]))[0]) - load_N
+
+    if missing_N(deepest_m) < 0:
+        rule = f"at most {missing_N(deepest_m) + load_N:.3g} N, which the skin bears at its deepest"
+        raise ParamsError(f"skin {skin.name}", "weight", rule, f"{load_N:.3g} N", "Lower force_max_N.")
+    return float(brentq(missing_N, -skin.depth_zero_m, deepest_m, xtol=DEPTH_STEP_M))
+
+
+def half_sine(frames_n: int, peak_mm: float) -> Float64[np.ndarray, " p"]:
+    """Return the depth at the middle of each frame of a half-sine press."""
+    return peak_mm * np.sin(np.pi * (np.arange(frames_n) + 0.5) / frames_n)
+
+
+def _draw_places_mm(places_n: int, rng: np.random.Generator) -> Float64[np.ndarray, "n 2"]:
+    grid_mm = points_mm()
+    return grid_mm[rng.integers(len(grid_mm), size=places_n)]

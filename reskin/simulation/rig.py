@@ -1,4 +1,4 @@
-"""The simulated rig: robot, force sensor, port and clocks; fields at stops become frames as chips read them."""
+"""The simulated rig: robot, force sensor, chips, port and clocks; fields at stops become frames and a probe log."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -8,8 +8,7 @@ from jaxtyping import Float, Float32, Float64, Int64
 from pydantic import Field
 
 from reskin.config import Strict
-from reskin.physics import aging
-from reskin.physics import chip as conversion
+from reskin.physics import aging, chip
 from reskin.physics.aging import ROOM_DEGC, Temperature
 from reskin.physics.board import Board
 from reskin.physics.chip import ChipDesign, read_field, read_temperature
@@ -22,7 +21,7 @@ Spread = Annotated[float, Field(ge=0, le=1)]
 
 
 class Rig(Strict):
-    """Section `rig`: how often frames come, how well the robot repeats, and what the clocks and the port do."""
+    """Section `rig`: frames, repeatability of the robot, noise of the force sensor, clocks and port."""
 
     noload_frames_n: FrameCount
     moving_frames_n: Annotated[int, Field(ge=0, le=1000)]  # on the way down, and as many on the way up
@@ -31,7 +30,7 @@ class Rig(Strict):
     rate_hz: Rate_hz
     robot_place_sd_mm: Spread  # each axis
     robot_depth_sd_mm: Annotated[float, Field(ge=0, le=0.2)]
-    place_offset_sd_mm: Spread  # from where a label says to where the tip is, the same for all skins of a board
+    place_offset_sd_mm: Spread  # label to true place, the same for all skins of a board
     force_noise_N: Annotated[float, Field(ge=0, le=10)]
     chunk_frames_max_n: FrameCount
     arrival_jitter_s: Annotated[float, Field(ge=0, le=1)]  # mean delay of a chunk, exponential
@@ -41,7 +40,7 @@ class Rig(Strict):
 
 @dataclass(frozen=True)
 class Timeline:
-    """The frames of one indentation, axis t: the stop that each sees, and what share of its change of field."""
+    """Frames of one indentation, axis t: the stop of each, and the share of its change of field."""
 
     stop_i: Int64[np.ndarray, " t"]
     share: Float64[np.ndarray, " t"]
@@ -52,8 +51,8 @@ class Timeline:
         return len(self.stop_i)
 
 
-def set_up(rig: Rig, protocol: Protocol) -> Rig:
-    """Set the rig up for a protocol: its rate; a stop a frame where nothing rests; no robot, one clock in a walk."""
+def rig_for(rig: Rig, protocol: Protocol) -> Rig:
+    """Adapt the rig to a protocol: its rate; one stop per frame in presses and walks; no robot, one clock in walks."""
     changes: dict[str, float] = {} if protocol.rate_hz is None else {"rate_hz": protocol.rate_hz}
     if isinstance(protocol, Press | Walk):
         changes |= {"moving_frames_n": 0, "settling_frames_n": 0, "readings_n": 1}
@@ -71,7 +70,7 @@ def set_up(rig: Rig, protocol: Protocol) -> Rig:
 
 
 def timeline(rig: Rig, stops_n: int) -> Timeline:
-    """Lay out one indentation: settle, no load, down, at every stop settle and read, up."""
+    """Lay out the frames of an indentation: settle, no-load dwell, down, settle and read at every stop, up."""
     ramp = np.arange(1, rig.moving_frames_n + 1) / (rig.moving_frames_n + 1)
     lifted_n, dwell_n = rig.settling_frames_n + rig.noload_frames_n, rig.settling_frames_n + rig.readings_n
     share = np.concatenate([np.zeros(lifted_n), ramp, np.ones(stops_n * dwell_n), ramp[::-1]])
@@ -81,10 +80,10 @@ def timeline(rig: Rig, stops_n: int) -> Timeline:
     return Timeline(stop_i, share, rig.settling_frames_n, contact_i)
 
 
-def misplace(plan: Plan, rig: Rig, rng: np.random.Generator) -> Float64[np.ndarray, "n p 3"]:
-    """Give where the tip really goes, in mm: x, y and depth; off the plan alike at all stops of an indentation.
+def actual_positions(plan: Plan, rig: Rig, rng: np.random.Generator) -> Float64[np.ndarray, "n p 3"]:
+    """Return the true positions of the tip (x, y, depth in mm): one error for all stops of an indentation.
 
-    A hand goes where it goes: its plan is what it did.
+    A hand has no commanded places: its plan is exact.
     """
     planned_mm = np.stack([plan.x_mm, plan.y_mm, plan.depth_mm], axis=2)
     if not plan.labelled:
@@ -93,10 +92,10 @@ def misplace(plan: Plan, rig: Rig, rng: np.random.Generator) -> Float64[np.ndarr
     return planned_mm + sd_mm * rng.standard_normal((len(plan), 1, 3))
 
 
-def chunks(
+def draw_arrivals(
     frame_s: Float64[np.ndarray, " f"], rig: Rig, rng: np.random.Generator
 ) -> tuple[Int64[np.ndarray, " c"], Float64[np.ndarray, " c"]]:
-    """Let frames arrive: frames come in all, and when. A port hands over a few at once, none early, all in order."""
+    """Draw the arrivals of frames at the port, in chunks: cumulative number of frames, and time in s."""
     frames_n = len(frame_s)
     sizes = rng.integers(1, rig.chunk_frames_max_n + 1, size=frames_n)
     ends = np.cumsum(sizes)
@@ -106,15 +105,16 @@ def chunks(
 
 
 def draw_clock(rig: Rig, rng: np.random.Generator) -> tuple[float, float]:
-    """Draw offset in s and rate of the probe's clock against the stream's."""
+    """Draw offset in s and rate of the probe's clock relative to the stream's."""
     offset_s, error = rng.standard_normal(2) * (rig.probe_clock_offset_s, rig.probe_clock_rate_error)
     return float(offset_s), float(1 + error)
 
 
 def probe_log(plan: Plan, read_N: Float[np.ndarray, "n d 3"], rig: Rig, clock: tuple[float, float]) -> ProbeLog:
-    """Write what robot and force sensor log: for each indentation its no-load dwell, then its stops (d = 1 + p).
+    """Build the log of robot and force sensor: the no-load dwell of each indentation, then its stops (d = 1 + p).
 
-    A dwell runs from half a frame before its first frame to half a frame after its last. Above the skin there is none.
+    A dwell lasts from half a frame before its first frame to half a frame after its last. Stops above the skin are not
+    logged.
     """
     stops_n = plan.x_mm.shape[1]
     frames = timeline(rig, stops_n)
@@ -156,7 +156,7 @@ BLOCK_INDENTATIONS_N = 1000
 
 
 @dataclass(frozen=True)
-class Frames:
+class SimulatedFrames:
     """Readings in order of time, and how many values were out of the chips' range."""
 
     b_uT: Float32[np.ndarray, "f ch"]
@@ -166,49 +166,49 @@ class Frames:
 
 
 @dataclass(frozen=True)
-class Reader:
-    """Chips that read one capture: each converts at its phase, and may be sensitive to temperature."""
+class Readout:
+    """Readout of a board during one capture: each chip has a phase of conversion and a sensitivity to temperature."""
 
     board: Board
-    chip: ChipDesign
+    design: ChipDesign
     rate_hz: float
     phase_s: Float64[np.ndarray, " k"]
     temperature: Temperature | None
     sensitivity_per_K: Float64[np.ndarray, " k"]
 
 
-def switch_on(
-    board: Board, chip: ChipDesign, *, rate_hz: float, temperature: Temperature | None, rng: np.random.Generator
-) -> Reader:
-    """Draw each chip's phase and sensitivity to temperature."""
+def start_readout(
+    board: Board, design: ChipDesign, *, rate_hz: float, temperature: Temperature | None, rng: np.random.Generator
+) -> Readout:
+    """Draw each chip's phase of conversion and sensitivity to temperature."""
     chips_n = len(board.chips_m)
-    phase_s = conversion.CONVERSION_S * rng.random(chips_n)
+    phase_s = chip.CONVERSION_S * rng.random(chips_n)
     sd = 0.0 if temperature is None else temperature.chip_sensitivity_per_K
-    return Reader(board, chip, rate_hz, phase_s, temperature, sd * rng.standard_normal(chips_n))
+    return Readout(board, design, rate_hz, phase_s, temperature, sd * rng.standard_normal(chips_n))
 
 
 def read_frames(
     response: Response,
     timeline: Timeline,
-    reader: Reader,
+    readout: Readout,
     *,
     noise: np.random.Generator,
     warmth_noise: np.random.Generator,
-) -> Frames:
-    """Read every frame of every indentation; the result does not depend on the size of blocks."""
-    frame_s = (1 + np.arange(len(response.rest_T) * len(timeline))) / reader.rate_hz
-    age_s, source_i = conversion.last_conversions(frame_s, reader.phase_s)
+) -> SimulatedFrames:
+    """Read every frame of every indentation, in blocks; the result does not depend on their size."""
+    frame_s = (1 + np.arange(len(response.rest_T) * len(timeline))) / readout.rate_hz
+    age_s, source_i = chip.last_conversions(frame_s, readout.phase_s)
     b_uT, temperature_degC, overruns = [], [], []
     for first_i in range(0, len(response.rest_T), BLOCK_INDENTATIONS_N):
-        seen_T, chips_degC = _field_at(response, timeline, reader, age_s, first_i)
-        block_uT, overrun = read_field(seen_T, reader.board, design=reader.chip, rng=noise)
+        seen_T, chips_degC = _field_at(response, timeline, readout, age_s, first_i)
+        block_uT, overrun = read_field(seen_T, readout.board, design=readout.design, rng=noise)
         b_uT.append(block_uT)
         overruns.append(overrun)
-        temperature_degC.append(read_temperature(chips_degC, reader.chip, warmth_noise))
-    # A conversion that two frames bring is the same reading twice, its noise included.
-    chip_i = np.arange(len(reader.phase_s))
+        temperature_degC.append(read_temperature(chips_degC, readout.design, warmth_noise))
+    # A conversion that two frames carry is the same reading twice, noise included.
+    chip_i = np.arange(len(readout.phase_s))
     repeated_uT = np.concatenate(b_uT).reshape(len(frame_s), -1, 3)[source_i, chip_i].reshape(len(frame_s), -1)
-    return Frames(
+    return SimulatedFrames(
         repeated_uT,
         np.concatenate(temperature_degC)[source_i, chip_i],
         sum(overrun.clipped_n for overrun in overruns),
@@ -217,19 +217,19 @@ def read_frames(
 
 
 def _field_at(
-    response: Response, timeline: Timeline, reader: Reader, age_s: Float[np.ndarray, "f k"], first_i: int
+    response: Response, timeline: Timeline, readout: Readout, age_s: Float[np.ndarray, "f k"], first_i: int
 ) -> tuple[Float[np.ndarray, "b k 3"], Float[np.ndarray, "b k"]]:
-    # What is read in a block's first frames may have been converted in the indentation before.
+    # The first frames of a block may carry conversions of the indentation before.
     lead_n = len(timeline) if first_i else 0
     block = slice(first_i - (1 if first_i else 0), first_i + BLOCK_INDENTATIONS_N)
     b_T = response.rest_T[block, None] + timeline.share[:, None, None] * response.change_T[block, timeline.stop_i]
     frames_n, start = b_T.shape[0] * b_T.shape[1], block.start * len(timeline)
     b_T = b_T.reshape(frames_n, *b_T.shape[2:])
     warm_degC = np.full(frames_n, ROOM_DEGC)
-    if reader.temperature is not None:
-        warmer_K = aging.temperature_rise_K((1 + start + np.arange(frames_n)) / reader.rate_hz, reader.temperature)
-        warm_degC += warmer_K
-        gain = aging.relative_remanence(warmer_K)[:, None] * (1 + warmer_K[:, None] * reader.sensitivity_per_K)  # [f k]
+    if readout.temperature is not None:
+        rise_K = aging.temperature_rise_K((1 + start + np.arange(frames_n)) / readout.rate_hz, readout.temperature)
+        warm_degC += rise_K
+        gain = aging.relative_remanence(rise_K)[:, None] * (1 + rise_K[:, None] * readout.sensitivity_per_K)  # [f k]
         b_T *= gain[:, :, None]
-    seen_T = conversion.sample_at_conversion(b_T, age_s[start : start + frames_n], reader.rate_hz)
-    return seen_T[lead_n:], np.repeat(warm_degC[lead_n:, None], len(reader.phase_s), axis=1)
+    seen_T = chip.sample_at_conversion(b_T, age_s[start : start + frames_n], readout.rate_hz)
+    return seen_T[lead_n:], np.repeat(warm_degC[lead_n:, None], len(readout.phase_s), axis=1)

@@ -1,4 +1,4 @@
-"""Settings of a simulation: which skins there are, what they are like and how they are recorded."""
+"""Settings of a simulation: boards, skins, protocols and how they are recorded."""
 
 from collections.abc import Mapping
 from typing import Annotated, Any
@@ -15,22 +15,29 @@ from reskin.simulation.contact import Terms
 from reskin.simulation.protocols import SKIN_MM, Drag, Grid, Hand, Protocol
 from reskin.simulation.rig import Rig
 
-MAIN = "grid"  # its captures bear the names of their skins alone
-# The protocols that experiments are asked of, and the kind that each experiment can read.
+MAIN = "grid"  # its captures are named as their skins
+# Protocols that experiments read, and the kind that each can read.
 KINDS: dict[str, str] = {
     MAIN: "grid", "wear": "grid", "flexible": "grid", "drag": "drag", "hand": "hand", "sleeve": "scatter",
     "glass": "load", "press": "press", "log": "walk",
 }  # fmt: skip
-ON_MAIN_BOARDS = ("wear", "drag", "hand", "glass", "press", "log")  # compared with, or read by networks of, these
+ON_MAIN_BOARDS = (
+    "wear",
+    "drag",
+    "hand",
+    "glass",
+    "press",
+    "log",
+)  # compared with, or read by networks of, these
 ON_OTHER_BOARDS = ("flexible",)
-OF_ONE_SKIN = ("wear", "glass", "press", "log")  # an experiment about the protocol reads one capture
+OF_ONE_SKIN = ("wear", "glass", "press", "log")  # their experiments read one capture
 SHARED: dict[str, type[Strict]] = {"skin": SkinDesign, "rig": Rig, "chip": ChipDesign, "spreads": Spreads}
 Count = Annotated[int, Field(ge=1, le=1000)]
 Side_mm = Annotated[float, Field(gt=0, le=500)]
 
 
 class BoardKind(Strict):
-    """Boards of one make, each with its own skins; their names start with the letter."""
+    """Boards of one kind, each with its own skins; their names start with the letter."""
 
     letter: Annotated[str, Field(pattern="^[a-z]$")]
     boards_n: Count
@@ -44,8 +51,8 @@ class BoardKind(Strict):
         return self.skin_mm[0] * milli, self.skin_mm[1] * milli
 
 
-class Synthesis(Strict):
-    """Section `simulate` of a scene: which skins there are, what they are like and how they are recorded."""
+class SimulationSettings(Strict):
+    """Section `simulate` of a scene, with the sections that all simulations share."""
 
     boards: Annotated[dict[str, BoardKind], Field(min_length=1)]
     protocols: Annotated[dict[str, Protocol], Field(min_length=1)]
@@ -56,7 +63,7 @@ class Synthesis(Strict):
     terms: Terms
 
     @model_validator(mode="after")
-    def _nothing_is_named_that_is_not_there(self) -> "Synthesis":
+    def _check_references(self) -> "SimulationSettings":
         used = {term for protocol in self.protocols.values() for term in protocol.terms}
         if used != self.terms.named():
             raise ValueError(
@@ -77,15 +84,15 @@ class Synthesis(Strict):
         return self
 
     @model_validator(mode="after")
-    def _folds_are_drawn_on_the_papers_protocol(self) -> "Synthesis":
+    def _check_main_protocol(self) -> "SimulationSettings":
         if MAIN not in self.protocols or not isinstance(self.protocols[MAIN], Grid):
             raise ValueError(f"protocols holds a grid named {MAIN}")
-        if self.main_boards.skin_mm != SKIN_MM:  # the studies of physics are of the authors' skin
+        if self.main_boards.skin_mm != SKIN_MM:  # studies of the physics assume the authors' skin
             raise ValueError(f"skin_mm of the boards of protocol {MAIN} is {list(SKIN_MM)}")
         return self
 
     @model_validator(mode="after")
-    def _protocols_suit_their_experiments(self) -> "Synthesis":
+    def _check_protocols_of_experiments(self) -> "SimulationSettings":
         for name, protocol in self.protocols.items():
             kind, boards, skins_n = KINDS.get(name, protocol.kind), protocol.boards, protocol.skins_n
             if protocol.kind != kind:
@@ -112,11 +119,8 @@ class Synthesis(Strict):
         return self.boards[self.main.boards]
 
 
-def parse_synthesis(section: Mapping[str, Any], shared: Mapping[str, Any], where: str) -> Synthesis:
-    """Parse section `simulate` of a scene, with the skin, rig, chip, spreads and terms that scenes share.
-
-    Of the terms, those are taken that a protocol names.
-    """
+def parse_simulation(section: Mapping[str, Any], shared: Mapping[str, Any], where: str) -> SimulationSettings:
+    """Parse section `simulate` of a scene, with the shared sections skin, rig, chip, spreads, and the terms in use."""
     protocols = section.get("protocols")
     named = {
         term
@@ -124,4 +128,4 @@ def parse_synthesis(section: Mapping[str, Any], shared: Mapping[str, Any], where
         for term in (protocol.get("terms", ()) if isinstance(protocol, Mapping) else ())
     }
     terms = {name: values for name, values in shared["terms"].items() if name in named}
-    return parse(Synthesis, {**section, **{name: shared[name] for name in SHARED}, "terms": terms}, where)
+    return parse(SimulationSettings, {**section, **{name: shared[name] for name in SHARED}, "terms": terms}, where)

@@ -20,11 +20,12 @@ from reskin.errors import CaptureError
 from reskin.physics import aging, chip, deformation, layer, slide
 from reskin.simulation import contact, rig
 from reskin.simulation.defaults import nominal
-from reskin.simulation.settings import Synthesis
+from reskin.simulation.settings import SimulationSettings
 
 ROOT = Path(__file__).resolve().parents[2]
 SHARED = {name: nominal(name) for name in ("rig", "skin", "chip", "spreads", "terms")}
-DESIGN = parse(Synthesis, SHARED | read_yaml(ROOT / "pipeline" / "scenes" / "quick.yaml")["simulate"], "simulate")
+QUICK = read_yaml(ROOT / "pipeline" / "scenes" / "quick.yaml")
+DESIGN = parse(SimulationSettings, SHARED | QUICK["simulate"], "simulate")
 BOARD = DESIGN.boards["rigid"].design
 SEED = 2021
 

@@ -18,11 +18,12 @@ from reskin.physics.board import draw_board
 from reskin.physics.layer import IndentedLayer
 from reskin.physics.skin import draw_skin
 from reskin.simulation.defaults import nominal
-from reskin.simulation.settings import Synthesis
+from reskin.simulation.settings import SimulationSettings
 
 ROOT = Path(__file__).resolve().parents[2]
 SHARED = {name: nominal(name) for name in ("rig", "skin", "chip", "spreads", "terms")}
-DESIGN = parse(Synthesis, SHARED | read_yaml(ROOT / "pipeline" / "scenes" / "quick.yaml")["simulate"], "simulate")
+QUICK = read_yaml(ROOT / "pipeline" / "scenes" / "quick.yaml")
+DESIGN = parse(SimulationSettings, SHARED | QUICK["simulate"], "simulate")
 DEPTHS_M = (0.4e-3, 1.2e-3)
 SEED = 2021
 

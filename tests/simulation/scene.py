@@ -1,7 +1,7 @@
 """A small scene to simulate, as plain words, and small changes of it."""
 
 from reskin.config import parse
-from reskin.simulation.settings import Synthesis
+from reskin.simulation.settings import SimulationSettings
 from tests.physics.test_board import SPREADS
 
 GRID = {"kind": "grid", "boards": "rigid", "skins_n": 4, "passes_n": 2, "depths_mm": (0.6, 1.2), "terms": []}
@@ -55,11 +55,11 @@ SECTIONS = {
 }
 
 
-def synthesis(section: str = "rig", **changes: object) -> Synthesis:
+def synthesis(section: str = "rig", **changes: object) -> SimulationSettings:
     """The scene, one of its sections changed."""
-    return parse(Synthesis, SECTIONS | {section: {**SECTIONS[section], **changes}}, "test")  # type: ignore[dict-item]
+    return parse(SimulationSettings, SECTIONS | {section: {**SECTIONS[section], **changes}}, "test")  # type: ignore[dict-item]
 
 
-def with_protocol(name: str, protocol: dict[str, object], **changes: object) -> Synthesis:
+def with_protocol(name: str, protocol: dict[str, object], **changes: object) -> SimulationSettings:
     """The scene with one protocol more, and other sections instead of its own."""
-    return parse(Synthesis, SECTIONS | {"protocols": {"grid": GRID, name: protocol}} | changes, "test")
+    return parse(SimulationSettings, SECTIONS | {"protocols": {"grid": GRID, name: protocol}} | changes, "test")

@@ -9,7 +9,7 @@ from reskin.data.grid import points_mm
 from reskin.errors import ParamsError
 from reskin.physics.board import draw_board
 from reskin.physics.skin import changes_of_field, draw_skin, forces
-from reskin.simulation.capture import record, roster, to_files
+from reskin.simulation.capture import list_captures, simulate_capture, to_files
 from tests.simulation.scene import AGEING, GRID, RELAXATION, RIGID, SECTIONS, TEMPERATURE, synthesis, with_protocol
 
 LIFTED_N, MOVING_N, DWELL_N = 1 + 4, 2, 1 + 3
@@ -22,7 +22,7 @@ HAND = {
 
 
 def capture_of(of=None, protocol="grid", *, board="b0", skin="b0_s0", seed=1):
-    return record(of or synthesis(), protocol, board=board, skin=skin, seed=seed)
+    return simulate_capture(of or synthesis(), protocol, board=board, skin=skin, seed=seed)
 
 
 @pytest.fixture(scope="module")
@@ -206,12 +206,12 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_another_skin(captur
 def test_more_boards_skins_and_protocols_leave_the_others_as_they_are(capture):
     boards = {"rigid": SECTIONS["boards"]["rigid"] | {"boards_n": 3, "skins_per_board_n": 5}}
     more = with_protocol("hand", HAND, boards=boards)
-    assert set(roster(synthesis(), "grid")) < {(f"b{b}", f"b{b}_s{s}") for b in range(3) for s in range(5)}
+    assert set(list_captures(synthesis(), "grid")) < {(f"b{b}", f"b{b}_s{s}") for b in range(3) for s in range(5)}
     assert same(capture, capture_of(more))
 
 
 def test_the_first_skin_of_every_board_comes_before_the_second_of_any():
-    assert roster(with_protocol("few", GRID | {"skins_n": 3}), "few") == [
+    assert list_captures(with_protocol("few", GRID | {"skins_n": 3}), "few") == [
         ("b0", "b0_s0"),
         ("b0", "b0_s1"),
         ("b1", "b1_s0"),

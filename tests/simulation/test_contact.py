@@ -8,7 +8,7 @@ from reskin.physics.board import draw_board
 from reskin.physics.shear import Friction
 from reskin.physics.skin import changes_of_field, draw_skin, forces
 from reskin.seeds import rng_for
-from reskin.simulation.contact import Terms, respond
+from reskin.simulation.contact import Terms, simulate_response
 from tests.simulation.scene import synthesis
 
 OF = synthesis()
@@ -26,7 +26,7 @@ def first() -> tuple[np.ndarray, np.ndarray]:
 
 def response(tilt=0.0, **terms):
     lean = np.tile([tilt, 0.0], (len(TIP_M), 1))
-    return respond(BOARD, SKIN, TIP_M, tilt=lean, terms=Terms(**terms), rng=rng_for(0, "felt"))
+    return simulate_response(BOARD, SKIN, TIP_M, tilt=lean, terms=Terms(**terms), rng=rng_for(0, "felt"))
 
 
 def test_without_terms_every_contact_is_the_first(first):
@@ -60,5 +60,5 @@ def test_a_tip_that_leans_pushes_sideways_by_its_lean(first):
 @pytest.mark.parametrize(("depth_mm", "deep"), [(0.5, False), (1.4, True)])
 def test_stops_past_what_is_verified_are_counted(depth_mm, deep):
     tip_m = np.array([[[0.0, 0.0, depth_mm * 1e-3]]])
-    one = respond(BOARD, SKIN, tip_m, tilt=np.zeros((1, 2)), terms=Terms(), rng=rng_for(0, "felt"))
+    one = simulate_response(BOARD, SKIN, tip_m, tilt=np.zeros((1, 2)), terms=Terms(), rng=rng_for(0, "felt"))
     assert one.beyond_verified_n == deep

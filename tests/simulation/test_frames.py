@@ -9,7 +9,7 @@ from reskin.physics.chip import ChipDesign
 from reskin.seeds import rng_for
 from reskin.simulation import rig
 from reskin.simulation.contact import Response
-from reskin.simulation.rig import Reader, Rig, read_frames, timeline
+from reskin.simulation.rig import Readout, Rig, read_frames, timeline
 from tests.simulation.scene import SECTIONS
 
 N, CHIPS_N = 40, 2
@@ -27,7 +27,7 @@ def response():
 
 
 def read(chip=LOUD, rate_hz=400.0, temperature=None, sensitivity_per_K=(0.0, 0.0), of=None):
-    reader = Reader(BOARD, chip, rate_hz, np.array([0.2e-3, 1.5e-3]), temperature, np.array(sensitivity_per_K))
+    reader = Readout(BOARD, chip, rate_hz, np.array([0.2e-3, 1.5e-3]), temperature, np.array(sensitivity_per_K))
     line = timeline(Rig(**SECTIONS["rig"]), 1)
     return read_frames(of or response(), line, reader, noise=rng_for(0, "noise"), warmth_noise=rng_for(0, "warmth"))
 

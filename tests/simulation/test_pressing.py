@@ -11,16 +11,15 @@ from reskin.recordings.header import write_capture
 from reskin.recordings.ingest import open_capture
 from reskin.recordings.readers.sd_card import read_log
 from reskin.seeds import rng_for
-from reskin.simulation.capture import record, to_files
+from reskin.simulation.capture import simulate_capture, to_files
 from reskin.simulation.protocols import (
     LIFTED_MM,
     SKIN_MM,
     Press,
-    depths_under,
-    footfalls,
+    Walk,
+    depths_under_load,
     half_sine,
-    presses,
-    weights_N,
+    load_steps_N,
 )
 from tests.recordings.headers import AS_USUAL
 from tests.simulation.scene import synthesis, with_protocol
@@ -36,33 +35,34 @@ SKIN = draw_skin(synthesis().skin, synthesis().spreads, seed=1, name="b0_s0")
 
 
 def capture_of(name, protocol, **changes):
-    return record(with_protocol(name, protocol, **changes), name, board="b0", skin="b0_s0", seed=1)
+    return simulate_capture(with_protocol(name, protocol, **changes), name, board="b0", skin="b0_s0", seed=1)
 
 
 def drawn(presses_n, name="presses"):
-    return presses(presses_n, duration_s=(0.05, 1.0), depth_mm=(0.4, 1.2), rate_hz=400.0, rng=rng_for(0, name))
+    section = PRESS | {"presses_n": presses_n, "duration_s": (0.05, 1.0), "terms": ()}
+    return Press(**section).plan(rng_for(0, name), SKIN_MM)
 
 
 @given(st.floats(1e-3, 2.0))
 def test_the_skin_bears_at_the_depth_found_just_the_weight_on_it(weight_N):
-    depth_m = depths_under(SKIN, np.array([[weight_N]]))
+    depth_m = depths_under_load(SKIN, np.array([[weight_N]]))
     # 1e-12 m on at most 20 N/mm is 2e-8 N
     assert forces(SKIN, depth_m[0])[0] == pytest.approx(weight_N, abs=2e-8)
 
 
 def test_no_weight_just_touches_the_skin_and_more_weight_sinks_deeper():
-    depth_m = depths_under(SKIN, weights_N(1.0, 0.02)[None])[0]
+    depth_m = depths_under_load(SKIN, load_steps_N(1.0, 0.02)[None])[0]
     assert depth_m[0] == -SKIN.depth_zero_m
     assert (np.diff(depth_m) > 0).all()
 
 
 def test_a_weight_that_no_skin_bears_is_refused():
     with pytest.raises(ParamsError, match=r"skin b0_s0: weight must be at most .* N, which the skin bears"):
-        depths_under(SKIN, np.array([[1e4]]))
+        depths_under_load(SKIN, np.array([[1e4]]))
 
 
 def test_a_glass_is_filled_from_nothing_to_the_most_in_even_steps():
-    np.testing.assert_allclose(weights_N(1.0, 0.25), [0, 0.25, 0.5, 0.75, 1.0])
+    np.testing.assert_allclose(load_steps_N(1.0, 0.25), [0, 0.25, 0.5, 0.75, 1.0])
 
 
 def test_a_filling_reads_its_weights_and_knows_no_depth():
@@ -105,8 +105,8 @@ def test_durations_lie_evenly_in_their_logarithm_and_the_tip_is_lifted_after_a_p
 
 
 def test_a_walk_has_a_footfall_and_a_swing_for_each_step():
-    sizes = {"stance_s": (0.2, 0.5), "swing_s": (0.2, 0.6), "depth_mm": (0.4, 1.2), "rate_hz": 250.0}
-    down = footfalls(40, **sizes, rng=rng_for(0, "walk")).depth_mm[0] > 0
+    plan = Walk(**WALK | {"steps_n": 40, "terms": ()}).plan(rng_for(0, "walk"), SKIN_MM)
+    down = plan.depth_mm[0] > 0
     edges = np.diff(np.concatenate([[False], down, [False]]).astype(int))
     stance_n = np.flatnonzero(edges == -1) - np.flatnonzero(edges == 1)
     assert len(stance_n) == 40

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from reskin.seeds import rng_for
 from reskin.simulation.protocols import SKIN_MM, Drag, Grid
-from reskin.simulation.rig import Rig, chunks, draw_clock, misplace, probe_log, timeline
+from reskin.simulation.rig import Rig, actual_positions, draw_arrivals, draw_clock, probe_log, timeline
 from tests.simulation.scene import SECTIONS
 
 SHARED = {"boards": "rigid", "skins_n": 1, "terms": ()}
@@ -43,7 +43,7 @@ def test_a_dragged_line_settles_and_reads_at_every_stop():
 def test_chunks_bring_every_frame_once_in_order_and_never_early(chunk_frames_max_n, jitter_s, seed):
     frame_s = (1 + np.arange(500)) / 400.0
     how = rig(chunk_frames_max_n=chunk_frames_max_n, arrival_jitter_s=jitter_s)
-    arrived_n, arrived_s = chunks(frame_s, how, rng_for(seed, "chunks"))
+    arrived_n, arrived_s = draw_arrivals(frame_s, how, rng_for(seed, "chunks"))
     assert (arrived_n[0], arrived_n[-1]) == (0, 500)
     sizes = np.diff(arrived_n)
     assert sizes.min() >= 1
@@ -81,10 +81,11 @@ def test_the_log_names_every_stop_of_a_line_and_the_force_there():
 
 def test_a_robot_misses_by_its_spread_alike_along_a_line_and_a_perfect_one_not_at_all():
     grid, line = plan(), plan(DRAG)
-    exact_mm = misplace(grid, rig(), rng_for(0, "robot"))
+    exact_mm = actual_positions(grid, rig(), rng_for(0, "robot"))
     np.testing.assert_array_equal(exact_mm[:, 0], np.hstack([grid.x_mm, grid.y_mm, grid.depth_mm]))
     loose = rig(robot_place_sd_mm=0.1, robot_depth_sd_mm=0.02)
-    missed_mm = misplace(grid, loose, rng_for(0, "robot")) - exact_mm
+    missed_mm = actual_positions(grid, loose, rng_for(0, "robot")) - exact_mm
     np.testing.assert_allclose(missed_mm.std(axis=(0, 1)), [0.1, 0.1, 0.02], rtol=0.25)  # 130 draws: 6 %
-    along_mm = misplace(line, loose, rng_for(0, "robot")) - np.stack([line.x_mm, line.y_mm, line.depth_mm], axis=2)
+    planned_mm = np.stack([line.x_mm, line.y_mm, line.depth_mm], axis=2)
+    along_mm = actual_positions(line, loose, rng_for(0, "robot")) - planned_mm
     np.testing.assert_allclose(along_mm, np.repeat(along_mm[:, :1], 5, axis=1))

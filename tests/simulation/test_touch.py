@@ -14,7 +14,7 @@ from reskin.physics.board import Board, BoardDesign, Spreads, draw_board
 from reskin.physics.magnet import Quadrature
 from reskin.physics.shear import Friction
 from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, forces
-from reskin.simulation.contact import Terms, push, respond
+from reskin.simulation.contact import Terms, drag_tip, simulate_response
 from reskin.simulation.defaults import NOMINAL
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -72,7 +72,7 @@ def path(skin: Skin, ends_m, forces_N, stops_n: int) -> np.ndarray:
 
 
 def largest_step_uT(board: Board, skin: Skin, tip_m, coefficient: float) -> float:
-    found = push(board, skin, tip_m, tilt=np.zeros((1, 2)), how=Friction(coefficient=coefficient))
+    found = drag_tip(board, skin, tip_m, tilt=np.zeros((1, 2)), how=Friction(coefficient=coefficient))
     assert not found.change_T[0, [0, -1]].any()
     return float(sizes_uT(np.diff(found.change_T[0], axis=0)).max())
 
@@ -87,7 +87,7 @@ def test_one_friction_bounds_the_slide_of_press_and_drag_together(start_m, angle
     way_m = 2e-3 * np.array([np.cos(angle_rad), np.sin(angle_rad)])
     end_m = np.subtract(start_m, way_m)  # places of a millimetre inside the skin's edge at least
     tip_m = path(skin, (start_m, end_m), (force_N, force_N), STOPS_N // 4)
-    found = push(board, skin, tip_m, tilt=np.array([[lean, 0.0]]), how=Friction(coefficient=friction))
+    found = drag_tip(board, skin, tip_m, tilt=np.array([[lean, 0.0]]), how=Friction(coefficient=friction))
     limit_N = friction * forces(skin, tip_m[0, :, 2])
     assert (np.hypot(*found.force_N[0].T) <= limit_N * (1 + 1e-9)).all()
     assert (skin.hold.springs_N_per_m * np.hypot(*found.slide_m[0].T) <= limit_N * (1 + 1e-9)).all()
@@ -98,7 +98,7 @@ def test_one_friction_bounds_the_slide_of_press_and_drag_together(start_m, angle
 def test_a_tip_without_friction_takes_no_skin_along_and_says_so_in_force_and_slide():
     board, skin = drawn("b0")
     tip_m = path(skin, ((0.0, 0.0), (1e-3, 0.0)), (0.5, 0.5), STOPS_N // 4)
-    slippery = push(board, skin, tip_m, tilt=np.zeros((1, 2)), how=Friction(coefficient=0.0))
+    slippery = drag_tip(board, skin, tip_m, tilt=np.zeros((1, 2)), how=Friction(coefficient=0.0))
     assert not slippery.force_N.any()
     assert not slippery.slide_m.any()
     assert slippery.change_T.any()
@@ -110,7 +110,7 @@ def test_a_tip_that_sinks_while_it_sticks_sideways_moves_the_field_evenly(depth_
     deeper_m = depth_m + np.arange(41) * 0.5e-6 - skin.depth_zero_m  # across two depths of the shear's tables
     place_m = np.column_stack([np.r_[0.0, np.full(41, 4e-5)], np.zeros(42)])
     tip_m = np.column_stack([place_m, np.r_[deeper_m[0], deeper_m]])[None]
-    found = push(board, skin, tip_m, tilt=np.zeros((1, 2)), how=Friction(coefficient=0.8))
+    found = drag_tip(board, skin, tip_m, tilt=np.zeros((1, 2)), how=Friction(coefficient=0.8))
     steps_uT = sizes_uT(np.diff(found.change_T[0, 1:], axis=0))
     assert steps_uT.max() < 1.5 * np.median(steps_uT)
 
@@ -142,7 +142,7 @@ def test_at_lift_off_nothing_is_left_but_what_the_skin_remembers(terms):
     depth_m = pressed_by(skin, np.array([0.5, 2.0, 0.5, 0.0]))
     tip_m = np.column_stack([np.full(4, 5e-3), np.full(4, -3e-3), depth_m])[None].repeat(3, axis=0)
     rng = np.random.default_rng(0)
-    found = respond(board, skin, tip_m, tilt=np.zeros((3, 2)), terms=TERMS.only(terms), rng=rng)
+    found = simulate_response(board, skin, tip_m, tilt=np.zeros((3, 2)), terms=TERMS.only(terms), rng=rng)
     left_uT, pressed_uT = sizes_uT(found.change_T[:, -1]), sizes_uT(found.change_T[:, 1])
     assert not found.force_N[:, -1].any()
     if terms:  # 5 to 8 % of the last contact stands in the next no-load reading (recorded)

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from reskin.physics import shear
-from reskin.simulation.capture import record
+from reskin.simulation.capture import simulate_capture
 from tests.simulation.scene import AGEING, GRID, RELAXATION, TEMPERATURE, with_protocol
 
 TERMS = {
@@ -30,11 +30,11 @@ def functions_run(scene):
         if event == "call":
             called.add((frame.f_code.co_filename, frame.f_code.co_name))
 
-    record(scene, "few", board="b0", skin="b0_s0", seed=1)  # makes the flow's tables, which carry material too
+    simulate_capture(scene, "few", board="b0", skin="b0_s0", seed=1)  # makes the tables of deformation
     shear.tabulate_depth.cache_clear()  # what an earlier test left there would hide a call
     sys.setprofile(note)
     try:
-        record(scene, "few", board="b0", skin="b0_s0", seed=1)
+        simulate_capture(scene, "few", board="b0", skin="b0_s0", seed=1)
     finally:
         sys.setprofile(None)
     return {name for file, name in called if "reskin" in Path(file).parts}
@@ -46,7 +46,7 @@ def scene_with(*terms):
 
 def test_a_protocol_without_terms_computes_none():
     run = functions_run(scene_with())
-    assert {"record", "read_field"} <= run  # or the profile would see nothing
+    assert {"simulate_capture", "read_field"} <= run  # or the profile would see nothing
     assert not run & OF_TERMS
 
 

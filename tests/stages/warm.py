@@ -53,15 +53,15 @@ def begin(simulated: set[tuple[str, str]]) -> None:
     import numpy as np
 
     from pipeline.settings import read_settings
+    from pipeline.simulation import simulation_settings
     from pipeline.stages.code import entries
-    from pipeline.synthesis import synthesis_of
     from reskin.physics.skin import draw_skin, moved_dipoles
 
     for name in (*LIBRARIES, *entries().values()):
         importlib.import_module(name)
     for scene, protocol in simulated:
         settings = read_settings(scene)
-        of = synthesis_of(settings)
+        of = simulation_settings(settings)
         kind = of.boards[of.protocols[protocol].boards]
         rule, name = kind.quadrature.in_si(), f"{kind.letter}0_s0"
         skin = draw_skin(of.skin, of.spreads, seed=settings.seed, name=name, rule=rule, sides_m=kind.skin_m)

@@ -11,13 +11,13 @@ from pipeline.experiments.stability.physics import drag_cases, physics_cases, ti
 from pipeline.experiments.stability.sliding import sliding_cases
 from pipeline.experiments.stability.wire import wire_cases
 from pipeline.settings import Settings
+from pipeline.simulation import simulation_settings
 from pipeline.stage import say
-from pipeline.synthesis import synthesis_of
 from reskin import io
-from reskin.simulation.settings import Synthesis
+from reskin.simulation.settings import SimulationSettings
 
 
-def survey(of: Synthesis, seed: int) -> list[Case]:
+def survey(of: SimulationSettings, seed: int) -> list[Case]:
     """Try every case of physics, chip and wire on the designs of a scene."""
     board = of.main_boards.design
     chips_n = len(board.places_mm)
@@ -36,7 +36,7 @@ def stability(settings: Settings, results: Path) -> None:
     """Try every case on the scene's own skins and chips and on small trainings, and write down what happened."""
     with make_executor(imports="pipeline.experiments.stability.learning") as executor:
         learning = executor.submit(_learning_cases, settings.seed)  # beside the physics
-        cases = [*survey(synthesis_of(settings), settings.seed), *learning.result()]
+        cases = [*survey(simulation_settings(settings), settings.seed), *learning.result()]
     io.write_json(results, [asdict(case) for case in cases])
     for case in cases:
         if not case.holds:

@@ -17,7 +17,7 @@ from reskin.physics import shear, slide
 from reskin.physics.board import Board, BoardDesign, Spreads, draw_board
 from reskin.physics.shear import Friction
 from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, forces, press_motion, shear_moduli_Pa
-from reskin.simulation.contact import Sideways, push
+from reskin.simulation.contact import TangentialResponse, drag_tip
 
 AREA = "physics"
 DEPTH = 0.35  # of the thickness: the deepest drag of a scene, and the steepest shear
@@ -145,8 +145,8 @@ def force_control(skin: Skin) -> list[Case]:
     ]  # fmt: skip
 
 
-def _pushed(board: Board, skin: Skin, path_m: Float[np.ndarray, "p 3"], mu: float) -> Sideways:
-    return push(board, skin, path_m[None], tilt=np.zeros((1, 2)), how=Friction(coefficient=mu))
+def _pushed(board: Board, skin: Skin, path_m: Float[np.ndarray, "p 3"], mu: float) -> TangentialResponse:
+    return drag_tip(board, skin, path_m[None], tilt=np.zeros((1, 2)), how=Friction(coefficient=mu))
 
 
 def _path(

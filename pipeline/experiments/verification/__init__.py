@@ -9,14 +9,14 @@ from pipeline.experiments.verification.checks import Check
 from pipeline.experiments.verification.mechanics import check_contact, check_kinematics, check_poke, check_sideways
 from pipeline.experiments.verification.signals import check_electronics, check_field, check_frames, check_relaxation
 from pipeline.settings import Settings
+from pipeline.simulation import simulation_settings
 from pipeline.stage import say
-from pipeline.synthesis import synthesis_of
 from reskin import io
 from reskin.physics.layer import IndentedLayer
-from reskin.simulation.settings import Synthesis
+from reskin.simulation.settings import SimulationSettings
 
 
-def verify(of: Synthesis, *, depths_m: tuple[float, ...], seed: int) -> list[Check]:
+def verify(of: SimulationSettings, *, depths_m: tuple[float, ...], seed: int) -> list[Check]:
     """Measure every law against its reference, for the designs of a scene, in the order of the simulator's chain."""
     board, skin = of.main_boards, of.skin
     press = IndentedLayer(skin.thickness_mm * milli, skin.tip_radius_mm * milli, skin.base)
@@ -35,7 +35,7 @@ def verify(of: Synthesis, *, depths_m: tuple[float, ...], seed: int) -> list[Che
 
 def verification(settings: Settings, results: Path) -> None:
     """Check the scene's own skins, pokes and chips."""
-    of = synthesis_of(settings)
+    of = simulation_settings(settings)
     checks = verify(of, depths_m=tuple(milli * depth_mm for depth_mm in of.main.depths_mm), seed=settings.seed)
     io.write_json(results, [asdict(check) | {"holds": check.holds} for check in checks])
     for check in checks:

@@ -9,7 +9,7 @@ from ruamel.yaml import YAML
 from pipeline.experiments import worlds as show
 from pipeline.experiments.worlds import Residual, Worlds, rows_of, with_residual, worlds, worlds_of
 from pipeline.settings import Settings, read_shared_files
-from pipeline.synthesis import synthesis_of
+from pipeline.simulation import simulation_settings
 from reskin import io
 from reskin.config import parse, read_yaml
 from reskin.metrics import METRICS
@@ -81,7 +81,7 @@ def test_every_world_has_the_rows_of_table_2_board_by_board_and_is_shown(files, 
 def test_worlds_differ_in_one_thing_and_press_the_same_places(files):
     settings = files
     section = parse(Worlds, read_yaml(ROOT / "pipeline/scenes/decide.yaml")["worlds"], "worlds")
-    listed = worlds_of(synthesis_of(settings), section)
+    listed = worlds_of(simulation_settings(settings), section)
     assert [world.name for world in listed] == [
         "default-1", "residual-0.21", "residual-0.42", "skin_modulus-0", "skin_modulus-0.3", "amplitude_and_gap-0",
         "amplitude_and_gap-2", "friction-0.35", "friction-1.7",
