@@ -190,7 +190,8 @@ def _shear_map(skin: Skin, depth_m: float) -> shear.ShearMap:
 
 def _clip(force_N: Float[np.ndarray, "p 2"], limit_N: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p 2"]:
     size_N = np.hypot(*force_N.T)
-    return force_N * np.minimum(1.0, limit_N / np.where(size_N > 0, size_N, 1.0))[:, None]
+    with np.errstate(over="ignore"):  # a force far below its limit
+        return force_N * np.minimum(1.0, limit_N / np.where(size_N > 0, size_N, 1.0))[:, None]
 
 
 def _apply_shear(
