@@ -206,7 +206,7 @@ def use(names: list[str]) -> None:
 
     plan.use(checkout(), names)
     typer.echo(f"dvc repro now runs: {', '.join(names)}")
-    if stale := tidying.left_over(checkout(), checked_plan()):
+    if stale := tidying.stale_outputs(checkout(), checked_plan()):
         typer.echo(f"switched off since it ran: {', '.join(stale)}; `reskin scenes tidy` removes their files")
 
 

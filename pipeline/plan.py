@@ -10,7 +10,7 @@ from ruamel.yaml import YAML
 
 from pipeline import PLAN, SCENES
 from pipeline.manage.registry import Registry, read_registry
-from pipeline.manage.running import LOCKS, need_rest
+from pipeline.manage.running import DVC_FILES, require_idle
 from pipeline.scenes import ANALYSES, EXPERIMENTS, MAIN_PROTOCOL, TABLE_2, Plan, Scene, read_plan, read_scene, stages
 from reskin import io
 from reskin.errors import ParamsError
@@ -123,7 +123,7 @@ def copied(root: Path, name: str, like: str | None) -> Iterator[None]:
 
 def use(root: Path, names: Sequence[str]) -> None:
     """Write the plan of exactly these scenes; raise if `dvc repro` runs, as its stages read the plan."""
-    need_rest(root)
+    require_idle(root)
     yaml = YAML()
     yaml.width = 120
     document = {key: _in_short_lines(value) for key, value in plan_of(root, names).items()}
@@ -139,7 +139,7 @@ def _keep_outputs(root: Path) -> None:
     DVC lists the outputs that it wrote; `dvc checkout`, `dvc exp run` and `dvc exp apply` delete those on the list that
     no stage of the current plan writes.
     """
-    if not (root / LOCKS).is_dir():  # DVC has not run here
+    if not (root / DVC_FILES).is_dir():  # DVC has not run here
         return
     from dvc.exceptions import DvcException  # late: DVC takes a second
     from dvc.repo import Repo

@@ -1,4 +1,4 @@
-"""An object of DVC's cache that was changed is found and named, and what it reached; what is whole stays as it is."""
+"""Damaged objects of DVC's cache are found and set aside with their copies; intact ones stay."""
 
 import hashlib
 import json
@@ -58,58 +58,58 @@ def keep(root: Path, name: str, content: bytes) -> None:
     at(root, name).chmod(0o444)
 
 
-def told(root: Path) -> tuple[int, str]:
+def check(root: Path) -> tuple[int, str]:
     done = CliRunner().invoke(app, ["check-cache"])
     return done.exit_code, done.output
 
 
-def test_a_whole_cache_is_said_so(root):
+def test_an_intact_cache_has_no_damaged_objects(root):
     next(root.glob(".dvc/cache/files/md5/??")).joinpath(".tmpXYZ.tmp").write_bytes(b"ha")  # of a DVC that was killed
-    assert told(root) == (0, "DVC's cache: 5 objects, 0 of them damaged\n")
+    assert check(root) == (0, "DVC's cache: 5 objects, 0 of them damaged\n")
 
 
-def test_a_damaged_object_that_was_restored_is_taken_away_with_what_came_of_it(root):
+def test_a_damaged_object_is_set_aside_and_its_copies_are_removed(root):
     keep(root, md5(b"weights"), b"w3ights")
     (root / WEIGHTS / "a.safetensors").write_bytes(b"w3ights")
-    status, words = told(root)
+    status, output = check(root)
     assert status == 1
-    assert "the content of the object must be what its name says; got another MD5" in words
-    assert f"no more in {WEIGHTS}/a.safetensors. Run: dvc repro train_multi@one" in words
+    assert "is damaged: its MD5 is not its name" in output
+    assert f"removed from {WEIGHTS}/a.safetensors. Run: dvc repro train_multi@one" in output
     assert not at(root, md5(b"weights")).exists()
     assert [file.name for file in (root / WEIGHTS).iterdir()] == ["a.json"]
-    assert (root / cache.ASIDE / md5(b"weights")).read_bytes() == b"w3ights"
-    assert told(root) == (0, "DVC's cache: 4 objects, 0 of them damaged\n")
+    assert (root / cache.DAMAGED / md5(b"weights")).read_bytes() == b"w3ights"
+    assert check(root) == (0, "DVC's cache: 4 objects, 0 of them damaged\n")
 
 
-def test_an_output_that_is_whole_mends_the_object(root):
+def test_an_object_is_restored_from_an_intact_output(root):
     keep(root, md5(b"folds"), b"f0lds")
-    assert f"It is mended from {FOLDS}." in told(root)[1]
+    assert f"It was restored from {FOLDS}." in check(root)[1]
     assert at(root, md5(b"folds")).read_bytes() == (root / FOLDS).read_bytes() == b"folds"
     assert at(root, md5(b"folds")).stat().st_mode & 0o777 == 0o444
-    assert told(root)[0] == 0
+    assert check(root)[0] == 0
 
 
-def test_an_output_that_somebody_changed_since_is_left_alone(root):
+def test_an_output_that_was_edited_since_is_kept(root):
     keep(root, md5(b"folds"), b"f0lds")
     (root / FOLDS).write_bytes(b"by hand")
-    assert told(root)[0] == 1
+    assert check(root)[0] == 1
     assert (root / FOLDS).read_bytes() == b"by hand"
 
 
-def test_a_damaged_list_of_a_folder_leaves_the_folder(root):
+def test_the_files_of_a_folder_with_a_damaged_list_are_kept(root):
     name = cache.read_yaml(root / LOCK)["stages"]["train_multi@one"]["outs"][0]["md5"]
     keep(root, name, b"[")
-    assert f"It now lies in {cache.ASIDE}/{name}. Run: dvc repro train_multi@one" in told(root)[1]
+    assert f"It was moved to {cache.DAMAGED}/{name}. Run: dvc repro train_multi@one" in check(root)[1]
     assert len(list((root / WEIGHTS).iterdir())) == 2
 
 
-def test_of_a_recording_the_damaged_copy_is_kept(root):
+def test_a_damaged_recording_is_kept(root):
     keep(root, md5(b"recorded"), b"rec0rded")
     (root / RECORDED).write_bytes(b"rec0rded")
-    assert f"dvc pull {RECORDED}.dvc, or add the recording again" in told(root)[1]
-    assert (root / cache.ASIDE / md5(b"recorded")).read_bytes() == b"rec0rded"
+    assert f"dvc pull {RECORDED}.dvc, or add the recording again" in check(root)[1]
+    assert (root / cache.DAMAGED / md5(b"recorded")).read_bytes() == b"rec0rded"
 
 
-def test_what_nothing_needs_is_only_set_aside(root):
+def test_an_unused_object_is_only_set_aside(root):
     keep(root, "0" * 32, b"of an older run")
-    assert "Nothing of dvc.lock needs it" in told(root)[1]
+    assert "No output in dvc.lock uses it" in check(root)[1]

@@ -1,4 +1,4 @@
-"""Two people add recordings in two clones and merge: nothing of either is lost, and what contradicts is refused."""
+"""Two people add recordings in two clones and merge: both are kept, and contradictions are refused."""
 
 import shutil
 import subprocess
@@ -72,7 +72,7 @@ def two(root: Path, ours: tuple[str, ...], theirs: tuple[str, ...]) -> None:
     git(root, "merge", "theirs", check=False)
 
 
-def test_both_recordings_stand_in_the_registry_the_plan_and_the_lock(root):
+def test_both_recordings_are_in_the_registry_the_plan_and_the_lock(root):
     two(root, ("mine", "s1", "b1"), ("yours", "s2", "b2"))
     assert "2 captures" in merge.merge(root)
     assert list(read_registry(root).captures["shared"]) == ["mine", "yours"]
@@ -99,13 +99,13 @@ def test_a_report_that_we_deleted_and_they_changed_stays_deleted(root):
     assert not (root / "reports/shared/tables/lobo.md").exists()
 
 
-def test_what_contradicts_changes_nothing(root):
+def test_contradicting_recordings_change_nothing(root):
     two(root, ("mine", "s1", "b1"), ("yours", "s1", "b2"))
-    before = {name: (root / name).read_bytes() for name in merge.SETTLED}
+    before = {name: (root / name).read_bytes() for name in merge.RESOLVED}
     with pytest.raises(ReskinError, match="the board of skin s1 must be b1, as in mine; got b2"):
         merge.merge(root)
     assert {name: (root / name).read_bytes() for name in before} == before
-    assert {*merge.SETTLED} <= set(git(root, "diff", "--name-only", "--diff-filter=U").split())
+    assert {*merge.RESOLVED} <= set(git(root, "diff", "--name-only", "--diff-filter=U").split())
 
 
 @pytest.mark.parametrize(
@@ -122,12 +122,12 @@ def test_a_merged_registry_keeps_the_rules_of_one(theirs, sentence):
         merge.merge_registries(NOTHING, ours, Registry(captures={"shared": theirs}))
 
 
-def test_scenes_that_either_side_switched_on_run_and_those_that_one_switched_off_do_not():
+def test_scenes_that_one_side_added_run_and_those_that_one_removed_do_not():
     assert merge.merge_scenes(["a", "b"], ["a", "b", "mine"], ["yours", "b"]) == ["b", "mine", "yours"]
     assert merge.merge_scenes([], ["mine"], ["mine", "yours"]) == ["mine", "yours"]
 
 
-def test_what_people_wrote_is_theirs_to_merge(root):
+def test_files_written_by_people_are_theirs_to_merge(root):
     git(root, "checkout", "-qb", "theirs")
     (root / PARAMS).write_text("theirs: 1\n")
     git(root, "commit", "-qam", "Change a parameter")
@@ -135,16 +135,16 @@ def test_what_people_wrote_is_theirs_to_merge(root):
     (root / PARAMS).write_text("ours: 1\n")
     git(root, "commit", "-qam", "Change it otherwise")
     git(root, "merge", "theirs", check=False)
-    with pytest.raises(ReskinError, match="what people wrote must be merged first; got params.yaml"):
+    with pytest.raises(ReskinError, match="Resolve params.yaml by hand"):
         merge.merge(root)
 
 
-def test_without_a_conflict_there_is_nothing_to_settle(root):
-    with pytest.raises(ReskinError, match="a merge must be under way, with files in conflict; got none"):
+def test_without_a_conflict_merge_is_refused(root):
+    with pytest.raises(ReskinError, match="No file is in conflict"):
         merge.merge(root)
 
 
-def test_what_one_side_removed_or_replaced_stays_so():
+def test_captures_that_one_side_removed_or_replaced_stay_so():
     kept, gone, old, new = (entry(name, name) for name in ("s1", "s2", "s3", "s4"))
     base = Registry(captures={"scene": {"kept": kept, "gone": gone, "replaced": old}})
     theirs = Registry(captures={"scene": {"kept": kept, "replaced": new}})

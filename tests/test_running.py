@@ -1,4 +1,4 @@
-"""Nobody changes what a running `dvc repro` has read; what a killed one left behind disturbs nobody."""
+"""Files that `dvc repro` reads cannot be changed while it runs; the locks of a killed run do no harm."""
 
 import json
 import os
@@ -8,58 +8,56 @@ import sys
 import pytest
 from zc.lockfile import LockFile
 
-from pipeline.manage.running import BUSY, HELD, LOCKS, need_rest
+from pipeline.manage.running import DVC_FILES, LOCK, RWLOCK, require_idle
 from reskin.errors import ParamsError
 
 
 @pytest.fixture
 def locks(tmp_path):
-    (tmp_path / LOCKS).mkdir(parents=True)
-    return tmp_path / LOCKS
+    (tmp_path / DVC_FILES).mkdir(parents=True)
+    return tmp_path / DVC_FILES
 
 
 def note(locks, pid: int) -> None:
     used = {"pid": pid, "cmd": "dvc repro"}
-    (locks / BUSY).write_text(json.dumps({"write": {"data/out": used}, "read": {"params.yaml": [used]}}))
+    (locks / RWLOCK).write_text(json.dumps({"write": {"data/out": used}, "read": {"params.yaml": [used]}}))
 
 
-def test_a_checkout_where_nothing_ever_ran_or_all_has_ended_is_at_rest(tmp_path, locks):
-    need_rest(tmp_path / "elsewhere")
-    (locks / HELD).write_text("1")
-    (locks / BUSY).write_text("{}")
-    need_rest(tmp_path)
+def test_a_checkout_without_a_run_is_idle(tmp_path, locks):
+    require_idle(tmp_path / "elsewhere")
+    (locks / LOCK).write_text("1")
+    (locks / RWLOCK).write_text("{}")
+    require_idle(tmp_path)
 
 
-def test_a_stage_that_runs_is_named_by_its_process(tmp_path, locks):
+def test_a_running_stage_is_refused_with_its_process(tmp_path, locks):
     note(locks, os.getpid())
-    with pytest.raises(ParamsError, match=rf"free of a running `dvc repro`; got .*process {os.getpid()}"):
-        need_rest(tmp_path)
+    with pytest.raises(ParamsError, match=rf"`dvc repro` runs in this checkout \(process {os.getpid()}\)"):
+        require_idle(tmp_path)
 
 
-def test_a_number_that_another_program_has_by_now_is_told_how_to_be_rid_of(tmp_path, locks):
+def test_the_message_says_which_stale_lock_to_delete(tmp_path, locks):
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as other:  # no DVC
         note(locks, other.pid)
-        with pytest.raises(
-            ParamsError, match=rf"or, if process {other.pid} is no DVC, delete \.dvc/tmp/rwlock; not"
-        ) as error:
-            need_rest(tmp_path)
-        (tmp_path / str(error.value).partition("delete ")[2].partition(";")[0]).unlink()
-        need_rest(tmp_path)
+        with pytest.raises(ParamsError, match=rf"If process {other.pid} is not DVC, delete \.dvc/tmp/rwlock first"):
+            require_idle(tmp_path)
+        (locks / RWLOCK).unlink()
+        require_idle(tmp_path)
         other.communicate()
 
 
-def test_between_two_stages_it_runs_too(tmp_path, locks):
-    held = LockFile(str(locks / HELD))
-    with pytest.raises(ParamsError, match="free of a running .* try again; nothing"):
-        need_rest(tmp_path)
+def test_a_run_between_two_stages_is_refused(tmp_path, locks):
+    held = LockFile(str(locks / LOCK))
+    with pytest.raises(ParamsError, match="`dvc repro` runs in this checkout. Nothing was changed"):
+        require_idle(tmp_path)
     held.close()
-    need_rest(tmp_path)
+    require_idle(tmp_path)
 
 
-def test_what_was_killed_is_no_run(tmp_path, locks):
+def test_locks_of_a_killed_run_are_ignored(tmp_path, locks):
     with subprocess.Popen([sys.executable, "-c", ""]) as ended:
         pass
     note(locks, ended.pid)
-    need_rest(tmp_path)
-    (locks / BUSY).write_text('{"write": {"da')
-    need_rest(tmp_path)
+    require_idle(tmp_path)
+    (locks / RWLOCK).write_text('{"write": {"da')
+    require_idle(tmp_path)

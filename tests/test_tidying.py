@@ -1,4 +1,4 @@
-"""What a switched-off experiment left is found and removed; all else stays: other scenes' results, DVC's own words."""
+"""Outputs of experiments that a scene no longer runs are found and removed; all other files stay."""
 
 import shutil
 from pathlib import Path
@@ -22,7 +22,7 @@ WRITTEN = {
 
 @pytest.fixture
 def root(tmp_path) -> Path:
-    """Scene one ran with drift and a protocol `gone`, and asks lobo alone now; scene two ran once, and does not run."""
+    """Scene one ran drift and a protocol `gone`, and now runs lobo only; scene two ran once, and is not in the plan."""
     folder = checkout(tmp_path / "checkout")
     plan.use(folder, ["one"])
     for path in WRITTEN.values():
@@ -34,21 +34,21 @@ def root(tmp_path) -> Path:
     return folder
 
 
-def test_what_an_experiment_left_is_named_with_its_files(root):
-    assert tidy.left_over(root, plan.check(root)) == {
+def test_stale_stages_are_listed_with_their_files(root):
+    assert tidy.stale_outputs(root, plan.check(root)) == {
         "drift@one": [root / WRITTEN["drift@one"]],
         "simulate@one-gone": [root / WRITTEN["simulate@one-gone"]],
     }
 
 
-def test_tidying_removes_that_and_nothing_else(root):
+def test_tidying_removes_stale_outputs_only(root):
     tidy.tidy(root, plan.check(root))
     there = {name for name, path in WRITTEN.items() if (root / path).exists()}
     assert there == {"train_multi@one", "drift@two", "split@one"}
     lock = YAML(typ="safe").load((root / tidy.LOCK).read_text())
     assert set(lock["stages"]) == there
     assert lock["schema"] == "2.0"
-    assert tidy.left_over(root, plan.check(root)) == {}
+    assert tidy.stale_outputs(root, plan.check(root)) == {}
 
 
 def test_a_file_that_a_planned_stage_writes_too_stays(root):
@@ -56,26 +56,26 @@ def test_a_file_that_a_planned_stage_writes_too_stays(root):
     lock["stages"]["drift@one"]["outs"] = [{"path": "data/models/one"}]  # holds what train_multi writes
     with (root / tidy.LOCK).open("w") as stream:
         YAML().dump(lock, stream)
-    assert tidy.left_over(root, plan.check(root))["drift@one"] == []
+    assert tidy.stale_outputs(root, plan.check(root))["drift@one"] == []
 
 
-def test_a_scene_whose_name_begins_like_another_is_its_own(root):
+def test_scenes_with_a_common_prefix_are_told_apart(root):
     shutil.copy(root / SCENES / "one.yaml", root / SCENES / "one-gone.yaml")
-    assert set(tidy.left_over(root, plan.check(root))) == {"drift@one"}
+    assert set(tidy.stale_outputs(root, plan.check(root))) == {"drift@one"}
 
 
-def test_an_experiment_that_is_asked_leaves_nothing_over(root):
+def test_an_experiment_that_runs_has_no_stale_outputs(root):
     with (root / SCENES / "one.yaml").open("w") as stream:
         YAML().dump(asking("lobo", "drift"), stream)
     plan.use(root, ["one"])
-    assert set(tidy.left_over(root, plan.check(root))) == {"simulate@one-gone"}
+    assert set(tidy.stale_outputs(root, plan.check(root))) == {"simulate@one-gone"}
 
 
-def test_a_stage_of_dvc_lock_that_ran_only_elsewhere_is_not_named(root):
+def test_a_stage_that_ran_only_elsewhere_is_not_listed(root):
     (root / WRITTEN["drift@one"]).unlink()
-    assert set(tidy.left_over(root, plan.check(root))) == {"simulate@one-gone"}
+    assert set(tidy.stale_outputs(root, plan.check(root))) == {"simulate@one-gone"}
 
 
-def test_a_checkout_that_never_ran_has_nothing_over(root):
+def test_a_checkout_without_a_run_has_no_stale_outputs(root):
     (root / tidy.LOCK).unlink()
-    assert tidy.left_over(root, plan.check(root)) == tidy.tidy(root, plan.check(root)) == {}
+    assert tidy.stale_outputs(root, plan.check(root)) == tidy.tidy(root, plan.check(root)) == {}

@@ -84,5 +84,5 @@ def test_what_is_not_there_is_one_sentence(checkout, words, sentence):
 
 
 def test_a_command_that_fails_says_where(tmp_path):
-    with pytest.raises(verify.SchemaError, match="json.tool nowhere: the rerun must be one that ends"):
+    with pytest.raises(verify.SchemaError, match="`json.tool nowhere` failed in a clone of the last commit"):
         verify._run(tmp_path, {}, "json.tool", "nowhere", quiet=True)

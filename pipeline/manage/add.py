@@ -12,7 +12,7 @@ from typing import Any
 
 from pipeline import PARAMS, PLAN, plan
 from pipeline.manage.registry import REGISTRY, read_registry, with_capture, without_capture, write_registry
-from pipeline.manage.running import need_rest
+from pipeline.manage.running import require_idle
 from pipeline.scenes import Scene, read_plan, read_scene, read_shared
 from pipeline.stage import say
 from reskin import config, io
@@ -31,7 +31,7 @@ COMPARED_N = 3  # captures of the scene, the last ones, with which the places of
 
 def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Header:
     """Check a prepared recording, write it, track it with DVC, register it, and plan its scene; all, or nothing."""
-    need_rest(root)
+    require_idle(root)
     header, files = prepared
     settings = read_scene(root, plan.scene_file(root, scene).stem)
     if settings.source != header.source:

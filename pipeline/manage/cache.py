@@ -1,7 +1,7 @@
-"""Is DVC's cache what it says? In: its objects, dvc.lock, .dvc files. Out: words, and what was changed is set aside.
+"""Check DVC's cache for damaged objects, and set them aside.
 
-DVC names an object by the MD5 of its content, and restores outputs from one that is read-only without reading it again:
-what a failing disk changed comes back as if it were the result. Refuses to know what an output means.
+DVC names an object by the MD5 of its content, and restores outputs from a read-only object without reading it again, so
+that an object damaged by a failing disk would come back as a result.
 """
 
 import hashlib
@@ -10,74 +10,80 @@ import shutil
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from pipeline.manage.running import need_rest
+from pipeline.manage.running import require_idle
 from pipeline.manage.tidy import LOCK
 from reskin import io
 from reskin.config import read_yaml
 from reskin.errors import SchemaError
 
-ASIDE = ".reskin/damaged"
-FOLDER = ".dir"  # how the name of an object ends that lists the files of a folder
-OBJECT = re.compile(r"[0-9a-f]{30}(\.dir)?")  # other names are what a killed DVC left half-written
+DAMAGED = ".reskin/damaged"  # the folder of objects that were set aside
+FOLDER = ".dir"  # suffix of an object that lists the files of a folder
+OBJECT = re.compile(r"[0-9a-f]{30}(\.dir)?")  # other files are the partial writes of a killed DVC
 READ_ONLY = 0o444  # as DVC keeps objects
 
-Use = tuple[str, Path]  # the command that brings an output back, and the output
+
+class Use(NamedTuple):
+    """An output that holds an object, and the command that restores it."""
+
+    command: str
+    path: Path
 
 
 def check(root: Path, echo: Callable[[str], None]) -> int:
-    """Hold every object against its name; set aside what differs, and its copies among the outputs; 1 if any does."""
-    need_rest(root)
+    """Compare every object with its name; set aside damaged ones and their copies; return 1 if any is, else 0."""
+    require_idle(root)
     cache = _cache_of(root)
     files = (file for file in sorted(cache.glob("[0-9a-f][0-9a-f]/*")) if OBJECT.fullmatch(file.name))
     objects = {f"{file.parent.name}{file.name}": file for file in files}
     damaged = {name: file for name, file in objects.items() if _md5(file) != name.removesuffix(FOLDER)}
     uses = _uses(root, objects) if damaged else {}
     for name, file in damaged.items():
-        rule, cure = "what its name says", _set_aside(root, name, file, uses.get(name, []))
-        echo(f"error: {SchemaError(file, 'the content of the object', rule, 'another MD5', cure)}")
+        cure = _set_aside(root, name, file, uses.get(name, []))
+        echo(f"error: {file} is damaged: its MD5 is not its name. {cure}")
     echo(f"DVC's cache: {len(objects)} objects, {len(damaged)} of them damaged")
     return 1 if damaged else 0
 
 
 def _set_aside(root: Path, name: str, file: Path, uses: Sequence[Use]) -> str:
-    """Mend an object from an output that is whole; else take its copies away, so that what made them runs again."""
-    changed, aside = _md5(file), root / ASIDE / name
-    outputs = [(path, _md5(path)) for _, path in uses if path.is_file()]
+    """Move an object away; restore it from an intact output, else remove its copies, so that their stages run again."""
+    changed, aside = _md5(file), root / DAMAGED / name
+    outputs = [(use.path, _md5(use.path)) for use in uses if use.path.is_file()]
     aside.parent.mkdir(parents=True, exist_ok=True)
-    shutil.move(file, aside)  # kept: of a recording there may be nothing better
+    shutil.move(file, aside)  # kept: of a recording there may be no other copy
     for path, digest in outputs:
         if digest == name:
             with io.replacing(file) as temporary:
                 shutil.copyfile(path, temporary)
                 temporary.chmod(READ_ONLY)
-            return f"It is mended from {path}."
+            return f"It was restored from {path}."
     copies = [path for path, digest in outputs if digest == changed]
     for path in copies:
         io.remove(path)
     if not uses:
-        return f"Nothing of dvc.lock needs it; it now lies in {aside}."
-    gone = f", and no more in {', '.join(map(str, dict.fromkeys(copies)))}" if copies else ""
-    return f"It now lies in {aside}{gone}. Run: {'; '.join(dict.fromkeys(how for how, _ in uses))}"
+        return f"No output in dvc.lock uses it. It was moved to {aside}."
+    removed = f", and removed from {', '.join(map(str, dict.fromkeys(copies)))}" if copies else ""
+    return f"It was moved to {aside}{removed}. Run: {'; '.join(dict.fromkeys(use.command for use in uses))}"
 
 
 def _uses(root: Path, objects: Mapping[str, Path]) -> dict[str, list[Use]]:
-    """List the outputs that hold each object, by its name; those of a folder too."""
+    """List the outputs that hold each object, by the object's name; files of a folder too."""
     found: dict[str, list[Use]] = defaultdict(list)
-    for how, path, name in _outputs(root):
-        found[name].append((how, path))
+    for command, path, name in _outputs(root):
+        found[name].append(Use(command, path))
         if name.endswith(FOLDER) and name in objects:
             try:
                 listed: list[dict[str, Any]] = io.read_json(objects[name])
-            except SchemaError:  # it is damaged itself, and is told of as such
+            except SchemaError:  # damaged itself, and reported as such
                 continue
             for entry in listed:
-                found[entry["md5"]].append((how, path / entry["relpath"]))
+                found[entry["md5"]].append(Use(command, path / entry["relpath"]))
     return found
 
 
 def _outputs(root: Path) -> Iterator[tuple[str, Path, str]]:
+    """Yield the command, the path and the object of every output in dvc.lock and in the .dvc files of recordings."""
     stages = read_yaml(root / LOCK).get("stages", {}) if (root / LOCK).exists() else {}
     for stage, entry in stages.items():
         for out in entry.get("outs", []):

@@ -1,7 +1,6 @@
-"""Settles what `git merge` leaves in conflict where two people added recordings: registry, plan, dvc.lock, reports.
+"""Resolve the conflicts of a `git merge` of two people's recordings: in the registry, the plan, dvc.lock and reports.
 
-In: the three versions of a file that git keeps (their base, ours, theirs). Out: files with the work of both, staged.
-Refuses to know what a recording holds, and to settle what people wrote by hand (params.yaml, scenes, code).
+Files that people write (params.yaml, scenes, code) are theirs to merge first.
 """
 
 import subprocess
@@ -26,40 +25,38 @@ from reskin.config import parse
 from reskin.errors import ParamsError
 
 LOCK = "dvc.lock"
-SETTLED = (REGISTRY, PLAN, LOCK)
-REPORTS = "reports/"  # written by stages, so that ours stand until the next `dvc repro`
-SIDES = ("1", "2", "3")  # base, ours, theirs, as git numbers them
+RESOLVED = (REGISTRY, PLAN, LOCK)
+REPORTS = "reports/"  # written by stages: ours are kept until the next `dvc repro`
+SIDES = ("1", "2", "3")  # git's numbers of base, ours and theirs
 Versions = tuple[dict[str, Any], dict[str, Any], dict[str, Any]]
 
 
 def merge(root: Path) -> str:
-    """Settle what both sides of a merge changed; say what was done, and what is left to do."""
+    """Resolve the conflicts of a merge; return a sentence on what was done and what is left to do."""
     unmerged = _unmerged(root)
-    if by_hand := [name for name in unmerged if name not in SETTLED and not name.startswith(REPORTS)]:
-        remedy = "Mend them, `git add` them, and run this again."
-        raise ParamsError("reskin merge", "what people wrote", "merged first", ", ".join(by_hand), remedy)
+    if by_hand := [name for name in unmerged if name not in RESOLVED and not name.startswith(REPORTS)]:
+        raise ParamsError(f"Resolve {', '.join(by_hand)} by hand, `git add` them, and run `reskin merge` again.")
     if not unmerged:
-        remedy = "First: git merge BRANCH, or git pull."
-        raise ParamsError("reskin merge", "a merge", "under way, with files in conflict", "none", remedy)
-    files = [root / name for name in SETTLED if (root / name).exists()]
+        raise ParamsError("No file is in conflict. Run first: git merge BRANCH, or git pull.")
+    files = [root / name for name in RESOLVED if (root / name).exists()]
     with io.restoring(*files):
         if REGISTRY in unmerged:
             write_registry(root, merge_registries(*_registries(root, unmerged[REGISTRY])))
-        plan.use(root, _scenes(root, unmerged.get(PLAN)))  # anew, if only captures changed too
+        plan.use(root, _scenes(root, unmerged.get(PLAN)))  # also where only captures changed
         both = _merge_lock(root, unmerged[LOCK]) if LOCK in unmerged else []
     gone = {name for name in unmerged if name.startswith(REPORTS) and "2" not in unmerged[name]}
     for name in unmerged:
         if name.startswith(REPORTS):
-            words = ["rm", "--quiet"] if name in gone else ["checkout", "--ours"]
-            _git(root, *words, "--", name)
+            command = ["rm", "--quiet"] if name in gone else ["checkout", "--ours"]
+            _git(root, *command, "--", name)
     _git(root, "add", "--all", "--", *(name for name in unmerged if name not in gone), PLAN)
     changed = f" {len(both)} stages that both sides ran may run again." if both else ""
     captures_n = sum(map(len, read_registry(root).captures.values()))
-    return f"settled {', '.join(unmerged)}: {captures_n} captures.{changed} Now: git commit, dvc pull, dvc repro"
+    return f"resolved {', '.join(unmerged)}: {captures_n} captures.{changed} Now: git commit, dvc pull, dvc repro"
 
 
 def merge_registries(base: Registry, ours: Registry, theirs: Registry) -> Registry:
-    """Do to our registry what they did to the base; raise if a capture of theirs cannot stand beside ours."""
+    """Apply their changes since the base to our registry; raise if one of their captures contradicts ours."""
     merged, before, after = ours, _entries(base), _entries(theirs)
     for (scene, name), entry in before.items():
         if after.get((scene, name)) != entry == _entries(ours).get((scene, name)):
@@ -73,7 +70,9 @@ def merge_registries(base: Registry, ours: Registry, theirs: Registry) -> Regist
 def merge_stages(
     base: Mapping[str, Any], ours: Mapping[str, Any], theirs: Mapping[str, Any]
 ) -> tuple[dict[str, Any], list[str]]:
-    """Take each stage's entry of dvc.lock whole, from the side that changed it; if both did, ours, and name it.
+    """Merge the stages of dvc.lock, each entry from the side that changed it; also name those that both changed.
+
+    Of those, ours is kept.
 
     >>> merge_stages({"a": 1, "b": 1}, {"a": 2, "b": 1}, {"a": 3, "b": 3, "c": 3})
     ({'a': 2, 'b': 3, 'c': 3}, ['a'])
@@ -91,9 +90,9 @@ def merge_stages(
 
 
 def merge_scenes(base: Sequence[str], ours: Sequence[str], theirs: Sequence[str]) -> list[str]:
-    """Name the scenes that run: ours, without those that they switched off, and those that they switched on."""
-    on = [name for name in theirs if name not in ours and name not in base]
-    return [name for name in ours if name in theirs or name not in base] + on
+    """Return the scenes to run: ours, without those that they removed, and with those that they added."""
+    added = [name for name in theirs if name not in ours and name not in base]
+    return [name for name in ours if name in theirs or name not in base] + added
 
 
 def _entries(registry: Registry) -> dict[tuple[str, str], Entry]:
@@ -101,27 +100,27 @@ def _entries(registry: Registry) -> dict[tuple[str, str], Entry]:
 
 
 def _registries(root: Path, blobs: Mapping[str, str]) -> tuple[Registry, Registry, Registry]:
-    base, ours, theirs = (words or {"captures": {}} for words in _versions(root, blobs))
+    base, ours, theirs = (content or {"captures": {}} for content in _versions(root, blobs))
     return parse(Registry, base, REGISTRY), parse(Registry, ours, REGISTRY), parse(Registry, theirs, REGISTRY)
 
 
 def _scenes(root: Path, blobs: Mapping[str, str] | None) -> list[str]:
     if blobs is None:
         return list(read_plan(root / PLAN).scenes)
-    return merge_scenes(*(list(words.get("scenes", {})) for words in _versions(root, blobs)))
+    return merge_scenes(*(list(content.get("scenes", {})) for content in _versions(root, blobs)))
 
 
 def _merge_lock(root: Path, blobs: Mapping[str, str]) -> list[str]:
-    from dvc.utils.serialize import dumps_yaml  # late: DVC takes a second; so that the file looks as DVC writes it
+    from dvc.utils.serialize import dumps_yaml  # as DVC writes it; late: DVC takes a second
 
     base, ours, theirs = _versions(root, blobs)
-    stages, both = merge_stages(*(words.get("stages", {}) for words in (base, ours, theirs)))
+    stages, both = merge_stages(*(content.get("stages", {}) for content in (base, ours, theirs)))
     io.write_text(root / LOCK, dumps_yaml({**(ours or theirs), "stages": stages}))
     return both
 
 
 def _versions(root: Path, blobs: Mapping[str, str]) -> Versions:
-    """Read the three versions of a YAML file; one that a side does not have is empty."""
+    """Read the three versions of a YAML file; a missing one is empty."""
     from dvc.utils.serialize import loads_yaml
 
     base, ours, theirs = (
@@ -131,21 +130,20 @@ def _versions(root: Path, blobs: Mapping[str, str]) -> Versions:
 
 
 def _unmerged(root: Path) -> dict[str, dict[str, str]]:
-    """List files in conflict: name -> side -> the blob that git keeps of it."""
+    """List the files in conflict: name -> side -> git's blob."""
     found: dict[str, dict[str, str]] = {}
     for line in _git(root, "ls-files", "--unmerged", "-z").split("\0")[:-1]:
-        words, name = line.split("\t", 1)
-        _, blob, side = words.split()
+        entry, name = line.split("\t", 1)
+        _, blob, side = entry.split()
         found.setdefault(name, {})[side] = blob
     return found
 
 
 def _git(root: Path, *words: str) -> str:
-    """Run git in the checkout, and give what it prints."""
+    """Run git in the checkout, and return its output."""
     if not which("git"):
-        raise ParamsError("reskin merge", "git", "installed", "none", "Install it.")
+        raise ParamsError("reskin merge needs git: install it.")
     done = subprocess.run(["git", *words], cwd=root, capture_output=True, text=True, check=False)
     if done.returncode:
-        rule, got = "able to do it", " ".join(done.stderr.split())[-300:]
-        raise ParamsError(f"git {words[0]}", "git", rule, got, "See above.")
+        raise ParamsError(f"git {words[0]} failed: {' '.join(done.stderr.split())[-300:]}")
     return done.stdout

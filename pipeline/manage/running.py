@@ -1,7 +1,4 @@
-"""Whether DVC runs stages in a checkout right now. In: DVC's own locks. Out: a refusal, or nothing.
-
-What a run has read of the plan, the captures and dvc.lock must stay as it is until it ends. Refuses to know stages.
-"""
+"""Refuse to change a checkout while DVC runs in it: its stages read the plan, the captures and dvc.lock."""
 
 import os
 from pathlib import Path
@@ -9,41 +6,44 @@ from pathlib import Path
 from reskin import io
 from reskin.errors import ParamsError, SchemaError
 
-LOCKS = Path(".dvc/tmp")
-HELD, BUSY = "lock", "rwlock"  # DVC holds the one between stages; during a stage it lists in the other who uses what
+DVC_FILES = Path(".dvc/tmp")
+LOCK, RWLOCK = "lock", "rwlock"  # DVC locks the first between stages; during one it notes in the second who uses what
 
 
-def need_rest(root: Path) -> None:
-    """Raise if DVC runs in this checkout."""
-    users = _users(root / LOCKS / BUSY)
-    if users or _is_held(root / LOCKS / HELD):
-        got = f"one that runs (process {min(users)})" if users else "one that runs"
-        stale = f", or, if process {min(users)} is no DVC, delete {LOCKS / BUSY}" if users else ""
-        remedy = f"Wait for its end, then try again{stale}; nothing was changed."
-        raise ParamsError("reskin", "this checkout", "free of a running `dvc repro`", got, remedy)
+def require_idle(root: Path) -> None:
+    """Raise `ParamsError` if DVC runs in this checkout."""
+    users = _users(root / DVC_FILES / RWLOCK)
+    if users:
+        pid = min(users)
+        raise ParamsError(
+            f"`dvc repro` runs in this checkout (process {pid}). Nothing was changed: try again when it has ended. "
+            f"If process {pid} is not DVC, delete {DVC_FILES / RWLOCK} first."
+        )
+    if _is_locked(root / DVC_FILES / LOCK):
+        raise ParamsError("`dvc repro` runs in this checkout. Nothing was changed: try again when it has ended.")
 
 
-def _users(file: Path) -> set[int]:
-    """List the processes that live, of those that DVC noted; one that was killed is still noted."""
+def _users(rwlock: Path) -> set[int]:
+    """List the processes noted there that are alive; DVC leaves notes of a process that was killed."""
     try:
-        noted = io.read_json(file)
-    except SchemaError:  # none yet, or one that DVC itself will refuse
+        noted = io.read_json(rwlock)
+    except SchemaError:  # none yet, or broken: DVC refuses it itself
         return set()
-    each = [*noted.get("write", {}).values(), *(user for users in noted.get("read", {}).values() for user in users)]
-    return {user["pid"] for user in each if _lives(user["pid"])}
+    entries = [*noted.get("write", {}).values(), *(one for users in noted.get("read", {}).values() for one in users)]
+    return {entry["pid"] for entry in entries if _is_alive(entry["pid"])}
 
 
-def _lives(pid: int) -> bool:
+def _is_alive(pid: int) -> bool:
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
         return False
     except PermissionError:
-        return True  # somebody else's
+        return True  # another user's
     return True
 
 
-def _is_held(file: Path) -> bool:
+def _is_locked(file: Path) -> bool:
     if not file.exists():
         return False
     from zc.lockfile import LockError, LockFile  # late: a part of DVC

@@ -1,7 +1,6 @@
-"""Find and remove what switched-off experiments left behind in this checkout.
+"""Find and remove the outputs of experiments that a scene no longer runs.
 
-Only of scenes in the plan: the outputs of another scene may have taken hours, and it may run again. Knows no content of
-a file.
+Only of scenes in the plan: the outputs of another scene may have taken hours, and it may run again.
 """
 
 from collections.abc import Iterable, Mapping
@@ -10,7 +9,7 @@ from typing import Any
 
 from ruamel.yaml import YAML
 
-from pipeline.manage.running import need_rest
+from pipeline.manage.running import require_idle
 from pipeline.plan import scene_names
 from pipeline.scenes import Plan
 from reskin import io
@@ -19,10 +18,10 @@ from reskin.config import read_yaml
 LOCK = "dvc.lock"
 
 
-def left_over(root: Path, plan: Plan) -> dict[str, list[Path]]:
-    """List stages that ran here and are not planned any more, and the files that only they wrote, by stage.
+def stale_outputs(root: Path, plan: Plan) -> dict[str, list[Path]]:
+    """List the stages that ran here and are no longer in the plan, each with the files that only it wrote.
 
-    dvc.lock is committed, and so also lists stages that ran only elsewhere: those have no output here.
+    dvc.lock is committed, and so also lists stages that ran only elsewhere: those have no outputs here.
     """
     if not (root / LOCK).exists():
         return {}
@@ -31,7 +30,7 @@ def left_over(root: Path, plan: Plan) -> dict[str, list[Path]]:
     kept = {path for name, stage in stages.items() if name in planned for path in _outs(stage)}
     known = scene_names(root)
     return {
-        name: [root / path for path in _outs(stage) if not _touches(path, kept)]
+        name: [root / path for path in _outs(stage) if not _overlaps(path, kept)]
         for name, stage in stages.items()
         if name not in planned
         and _scene_of(name, known) in plan.scenes
@@ -40,9 +39,9 @@ def left_over(root: Path, plan: Plan) -> dict[str, list[Path]]:
 
 
 def tidy(root: Path, plan: Plan) -> dict[str, list[Path]]:
-    """Remove what is left over, and forget its stages; give what was removed."""
-    need_rest(root)
-    stale = left_over(root, plan)
+    """Remove stale outputs, and their stages from dvc.lock; return what was removed."""
+    require_idle(root)
+    stale = stale_outputs(root, plan)
     for paths in stale.values():
         for path in paths:
             io.remove(path)
@@ -60,12 +59,12 @@ def _outs(stage: Mapping[str, Any]) -> list[Path]:
     return [Path(out["path"]) for out in stage.get("outs", [])]
 
 
-def _touches(path: Path, others: Iterable[Path]) -> bool:
-    """Tell whether a path is one of others, lies in one or holds one."""
+def _overlaps(path: Path, others: Iterable[Path]) -> bool:
+    """Tell whether a path equals one of the others, lies in one or contains one."""
     return any(path.is_relative_to(other) or other.is_relative_to(path) for other in others)
 
 
 def _scene_of(stage: str, known: Iterable[str]) -> str:
-    """Name the scene of `stage@scene` or `stage@scene-part`: the longest name that fits."""
+    """Return the scene of `stage@scene` or `stage@scene-part`: the longest name that fits."""
     key = stage.partition("@")[2]
     return max((name for name in known if f"{key}-".startswith(f"{name}-")), key=len, default="")

@@ -1,7 +1,4 @@
-"""`reskin verify-reports`: run scenes again in a clone of the last commit, and compare their reports.
-
-A scene runs from nothing: no cache of stages or trainings is there. This module knows no stage but `report`.
-"""
+"""`reskin verify-reports`: run scenes again in a clone of the last commit, without any cache, and compare reports."""
 
 import os
 import shutil
@@ -19,13 +16,13 @@ from pipeline.stage import say
 from reskin import io
 from reskin.errors import SchemaError
 
-VERIFIED = ".reskin/verified"  # what the last reruns reported, for a look and for `--against` elsewhere
+VERIFIED = ".reskin/verified"  # reports of the last reruns, to look at and for `--against` elsewhere
 QUIET = {"MLFLOW_DISABLE_TELEMETRY": "true", "DVC_NO_ANALYTICS": "1", "OMP_NUM_THREADS": "1"}  # as the Makefile does
 
 
 def verify(root: Path, names: Sequence[str], against: Path | None, echo: Echo) -> int:
     """Compare each scene's rerun, or its reports in `against`, with the last commit; return the exit status."""
-    committed = {name: read_revision(root, name, "HEAD") for name in names}  # first: hours later is late to find none
+    committed = {name: read_revision(root, name, "HEAD") for name in names}  # first: the rerun takes hours
     if against is None:
         rerun(root, names)
     return max(
@@ -34,7 +31,7 @@ def verify(root: Path, names: Sequence[str], against: Path | None, echo: Echo) -
 
 
 def rerun(root: Path, names: Sequence[str]) -> None:
-    """Run scenes in a clone of the last commit, and keep what they report."""
+    """Run scenes in a clone of the last commit, and keep their reports."""
     if changed := _git(root, "status", "--porcelain", "--untracked-files=no"):
         say(f"warning: {len(changed.splitlines())} files differ from the last commit, which is what runs")
     with tempfile.TemporaryDirectory(prefix="reskin-verify-", ignore_cleanup_errors=True) as temporary:
@@ -45,8 +42,8 @@ def rerun(root: Path, names: Sequence[str]) -> None:
         environment = {**QUIET, **os.environ, "PYTHONPATH": str(clone), "PATH": path}
         _run(clone, environment, "pipeline", "scenes", "use", *names, quiet=True)
         for name in names:
-            shutil.rmtree(clone / "reports" / name, ignore_errors=True)  # what does not run cannot pass
-        # Forced: no cache of this machine stands in for a stage. What only tells others of results is left out.
+            shutil.rmtree(clone / "reports" / name, ignore_errors=True)  # so that a scene that does not run cannot pass
+        # Forced: no cache of this machine replaces a stage. Stage publish does not run.
         _run(clone, environment, "dvc", "repro", "--quiet", "--force", *(f"report@{name}" for name in names))
         for name in names:
             with io.replacing(root / VERIFIED / name) as folder:
@@ -71,14 +68,13 @@ def _run(clone: Path, environment: Mapping[str, str], *words: str, quiet: bool =
             os.killpg(running.pid, signal.SIGTERM)  # DVC's stages too: they would go on in a folder that is no more
             raise
     if running.returncode:
-        remedy = "See above: it fails in a clean copy of the last commit."
-        raise SchemaError(" ".join(words), "the rerun", "one that ends", f"exit status {running.returncode}", remedy)
+        raise SchemaError(
+            f"`{' '.join(words)}` failed in a clone of the last commit (exit status {running.returncode})."
+        )
 
 
 def _git(root: Path, *words: str) -> str:
     done = subprocess.run(["git", *words], cwd=root, capture_output=True, text=True, check=False)
     if done.returncode:
-        raise SchemaError(
-            f"git {words[0]}", "the checkout", "one of git", done.stderr.strip()[-300:], "Clone the project."
-        )
+        raise SchemaError(f"git {words[0]} failed: {done.stderr.strip()[-300:]}")
     return done.stdout
