@@ -92,7 +92,8 @@ def test_only_what_is_read_is_transferred(tmp_path, home, scratch):
     origin = open_origin(url, commit, scratch)
     origin.read("data/lf.csv")
     # Git prints the objects that it has not got with a question mark.
-    missing = repositories.git(scratch / "lean", "rev-list", "--objects", "--missing=print", commit).splitlines()
+    (fetched,) = scratch.iterdir()
+    missing = repositories.git(fetched, "rev-list", "--objects", "--missing=print", commit).splitlines()
     assert f"?{repositories.git(home, 'rev-parse', f'{commit}:large.bin')}" in missing
     assert origin.read("large.bin") == large
 
