@@ -60,13 +60,14 @@ def load_rows(folder: Path | str, *, force_min_N: float = 0.0) -> Rows:
     >>> rows.db_uT.shape, rows.target.shape  # doctest: +SKIP
     ((8190, 15), (8190, 3))
     """
-    from reskin.data import folds
+
     from reskin.data.rows import Selection
+    from reskin.data.rows import load_rows as load
 
     files = sorted(Path(folder).glob("*.parquet"))
     if not files:
         raise ParamsError(f"{folder}: no Parquet files in this folder. Ingest captures first: dvc repro.")
-    return folds.load_rows(files, Selection(force_min_N=force_min_N))
+    return load(files, Selection(force_min_N=force_min_N))
 
 
 def draw_board(name: str = "b0", *, seed: int = 0, spreads: Changes | None = None, **design: Any) -> Board:

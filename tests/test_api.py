@@ -12,8 +12,7 @@ import pytest
 import reskin
 from reskin import io
 from reskin.config import read_yaml
-from reskin.data.folds import load_rows
-from reskin.data.rows import Selection
+from reskin.data.rows import Selection, load_rows
 from reskin.errors import ReskinError
 from reskin.predicting import read_network
 from reskin.seeds import rng_for

@@ -42,7 +42,7 @@ from reskin.config import Strict
 from reskin.data import baseline
 from reskin.data.baseline import rank, subtract
 from reskin.data.rows import Selection
-from reskin.data.windows import TRAIN, Part, Policy, Windows, check_one_each, lay_parts, lay_windows, stack
+from reskin.data.windows import TRAIN, Part, Policy, Windows, check_one_each, make_parts, make_windows, stack
 from reskin.errors import ParamsError
 from reskin.metrics import METRICS, score
 from reskin.models.inputs import VIEW
@@ -158,9 +158,9 @@ def cut_windows(captures: Sequence[Readings], section: Drift, selection: Selecti
     check_one_each(captures)
     units = [rank(getattr(one, UNIT_COLUMN[section.unit])) for one in captures]
     units_n = [1 + int(own.max()) for own in units]
-    windows = lay_windows(units_n, train_n=section.train_n, test_n=section.test_n, every_n=section.every_n)
+    windows = make_windows(units_n, train_n=section.train_n, test_n=section.test_n, every_n=section.every_n)
     policies: dict[str, Policy] = {policy: partial(noload_field, policy, section) for policy in section.policies}
-    parts = lay_parts(list(zip(captures, units, strict=True)), policies, windows=windows, selection=selection)
+    parts = make_parts(list(zip(captures, units, strict=True)), policies, windows=windows, selection=selection)
     return windows, parts
 
 

@@ -10,9 +10,8 @@ from pipeline.report.description import over_skins, without_rest
 from pipeline.settings import Settings
 from pipeline.stage import say
 from reskin import io
-from reskin.data.folds import load_rows, render_folds
-from reskin.data.rows import Rows, Selection
-from reskin.data.splits import Split, draw_folds
+from reskin.data.rows import Rows, Selection, load_rows
+from reskin.data.splits import Split, draw_folds, render_folds
 from reskin.recordings.fault_policy import FaultPolicy
 from reskin.recordings.ingest import check_losses, open_capture
 

@@ -17,10 +17,9 @@ from pipeline.stage import say
 from pipeline.stages import module_name
 from reskin import io
 from reskin.code import imported
-from reskin.data.folds import load_rows, parse_folds
 from reskin.data.lines import Lines, grid_lines, take_pokes
-from reskin.data.rows import TARGETS, Rows, Selection
-from reskin.data.splits import Fold
+from reskin.data.rows import TARGETS, Rows, Selection, load_rows
+from reskin.data.splits import Fold, parse_folds
 from reskin.errors import SchemaError
 from reskin.metrics import score_groups
 from reskin.models.inputs import Scaler

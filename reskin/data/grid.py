@@ -1,7 +1,6 @@
-"""The paper's protocol of pokes: a 65-point grid, depth by depth, pass by pass. In: depths, passes. Out: arrays.
+"""The paper's protocol of pokes: a 65-point grid, depth by depth, pass by pass.
 
 Places are labels: mm from 0 to 16, the middle of the skin at (8, 8).
-Refuses to know robots, clocks and fields.
 """
 
 from collections.abc import Sequence
@@ -32,7 +31,7 @@ class Protocol:
 
 
 def points_mm() -> Float64[np.ndarray, "65 2"]:
-    """Give (x, y) of the grid points in snake order: along x, every second row backwards."""
+    """Return (x, y) of the grid points in snake order: along x, every second row backwards."""
     points = []
     for row_i in range(SIDE_POINTS_N):
         row = range(SIDE_POINTS_N)[:: -1 if row_i % 2 else 1]

@@ -1,7 +1,7 @@
-"""Pokes along lines, all that an unlabelled recording knows. In: rows, or readings of pokes by hand. Out: `Lines`.
+"""Pokes along lines: the only labels of an unlabelled recording.
 
-The paper's way (section 5): "indent in a straight line and incrementally index these points". Places serve here to
-index the robot's grid, and stay here: row, line and index leave. Refuses to know fields, forces and trainings.
+The paper's way (section 5): "indent in a straight line and incrementally index these points". Places are used here to
+index the robot's grid, and are not passed on: `Lines` hold row, line and index.
 """
 
 from collections.abc import Sequence
@@ -16,14 +16,14 @@ from reskin.data.rows import TARGETS, Rows, stack
 from reskin.errors import ParamsError
 from reskin.schema import Readings
 
-PLACE_STEP_MM = 0.1  # assumed: places nearer than this are one, however a recording wrote them
+PLACE_STEP_MM = 0.1  # assumed: nearer places are the same place
 PLACES_MIN_N = 2  # one place orders nothing
 X, Y = TARGETS.index("x_mm"), TARGETS.index("y_mm")
 
 
 @dataclass(frozen=True)
 class Lines:
-    """Pokes by line and index; no place, no force. A row may lie on two lines (a grid's row and column).
+    """Pokes by line and index, without place and force. A row may lie on two lines (a grid's row and column).
 
     Sorted by line, then index, then row.
     """
@@ -39,7 +39,7 @@ class Lines:
 def grid_lines(rows: Rows, chosen: Int64[np.ndarray, " c"]) -> Lines:
     """Index chosen rows along the rows and the columns of each skin's grid, as the robot's operator does.
 
-    Sees skins and commanded places. The index is the rank of a coordinate among the distinct ones of the skin's chosen
+    Uses skins and commanded places. The index is the rank of a coordinate among the distinct ones of the skin's chosen
     rows, so a place that one line lacks leaves a gap. A line of one place orders nothing and is left out.
     """
     row, line, order_i = [chosen[:0]], [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)]
@@ -55,9 +55,9 @@ def grid_lines(rows: Rows, chosen: Int64[np.ndarray, " c"]) -> Lines:
 
 
 def hand_lines(pass_i: Int32[np.ndarray, " f"], indentation: Int32[np.ndarray, " f"]) -> Lines:
-    """Index the readings of one capture by hand: the pass counts lines, the indentation counts along it.
+    """Index the readings of one capture by hand: a pass is a line, the indentation counts along it.
 
-    Sees these two counts alone; `row` is the reading's number in the capture. An indentation that was lost leaves a
+    `row` is the reading's number in the capture. An indentation that was lost leaves a
     gap; a line of one indentation orders nothing and is left out.
     """
     order_i = indentation.astype(np.int64)
@@ -95,32 +95,32 @@ def hand_rows(captures: Sequence[Readings]) -> tuple[Rows, dict[str, Lines]]:
 
 
 def shifted(lines: Lines, rows_n: int) -> Lines:
-    """Give the lines of rows that are stacked below `rows_n` others."""
+    """Return the lines of rows that are stacked below `rows_n` others."""
     return replace(lines, row=lines.row + rows_n)
 
 
 def take_pokes(
     rows: Rows, pool: Int64[np.ndarray, " c"], indentations_n: int, rng: np.random.Generator
 ) -> Int64[np.ndarray, " d"]:
-    """Choose so many indentations of one skin's pool, every place equally often; give all their rows, sorted.
+    """Choose indentations of one skin's pool, every place equally often; return all their rows, sorted.
 
-    Sees which indentation is at which place (that of its first row), and nothing else. A place's visits, be they depths
-    or passes, come in random order: one of every place first, then a second; a remainder takes places at random. From
-    the same state of `rng`, a smaller choice is part of a larger one.
+    Uses the place of each indentation (that of its first row) alone. The visits of a place (depths or passes) come in
+    random order: one of every place first, then a second; the remainder is at random places. From the same state of
+    `rng`, a smaller choice is part of a larger one.
     """
     _check_pool(rows, pool, indentations_n)
     indentations, first = np.unique(rows.indentation[pool], return_index=True)
     _, place_i = np.unique(_steps(rows.target[pool[first]]), axis=0, return_inverse=True)
     shuffled = rng.permutation(len(indentations))
-    in_turn = np.lexsort((rng.random(len(indentations)), _counted(place_i.ravel()[shuffled])))
+    in_turn = np.lexsort((rng.random(len(indentations)), _visit_numbers(place_i.ravel()[shuffled])))
     taken = indentations[shuffled[in_turn[:indentations_n]]]
     return np.sort(pool[np.isin(rows.indentation[pool], taken)])
 
 
-def _counted(place_i: Int64[np.ndarray, " c"]) -> Int64[np.ndarray, " c"]:
+def _visit_numbers(place_i: Int64[np.ndarray, " c"]) -> Int64[np.ndarray, " c"]:
     """Count the visits of each place in their order.
 
-    >>> _counted(np.array([1, 0, 1, 1, 0]))
+    >>> _visit_numbers(np.array([1, 0, 1, 1, 0]))
     array([0, 0, 1, 2, 1])
     """
     by_place = np.argsort(place_i, kind="stable")
@@ -135,7 +135,7 @@ def _steps(target: Float32[np.ndarray, "f 3"]) -> Int64[np.ndarray, "f 2"]:
 
 
 def _number(row: Int64[np.ndarray, " p"], line: Int64[np.ndarray, "p key"], order_i: Int64[np.ndarray, " p"]) -> Lines:
-    """Leave out the lines of one place, number the others from 0, and sort."""
+    """Drop lines of one place, number the others from 0, and sort."""
     line_i = np.unique(line, axis=0, return_inverse=True)[1].ravel()
     places = np.unique(np.stack([line_i, order_i], axis=1), axis=0)
     ordering = np.bincount(places[:, 0]) >= PLACES_MIN_N

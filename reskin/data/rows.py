@@ -1,14 +1,16 @@
-"""Rows that a model sees: readings of many captures, selected and stacked.
+"""Rows of a dataset: the readings of many captures, selected and stacked.
 
-Also what is known of a row before its contact: the no-load field, its number in the scan, and rows without contact.
+Also what is known before a contact: the no-load field, the number of the indentation in its scan, and hovering rows.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
+from reskin import io
 from reskin.config import Strict
 from reskin.data.baseline import subtract
 from reskin.errors import ParamsError
@@ -48,15 +50,20 @@ class Rows:
 
     @classmethod
     def of_labels(cls, boards: Sequence[str], skins: Sequence[str], pass_i: Sequence[int] | None = None) -> "Rows":
-        """Rows without readings, one an indentation, for showing how folds are drawn; one pass unless told."""
+        """Make rows without readings, one an indentation, in one pass unless given; for examples of folds."""
         f = len(boards)
         empty, passes = np.zeros((f, 3), np.float32), np.array(pass_i if pass_i is not None else [0] * f, np.int32)
         labels = np.array(["c"] * f), np.array(boards), np.array(skins)
         return cls(*labels, empty, empty, passes, np.arange(f), {})
 
 
+def load_rows(files: Sequence[Path], selection: Selection) -> Rows:
+    """Read the captures of a scene and stack their rows."""
+    return gather([io.read_readings(file) for file in files], selection)
+
+
 def gather(captures: Sequence[Readings], selection: Selection, *, targets: Sequence[str] = TARGETS) -> Rows:
-    """Stack the captures of a scene into rows, and count what is no contact; `targets` name columns of `Readings`."""
+    """Stack the contacts of a scene's captures, and count dropped rows; `targets` name columns of `Readings`."""
     if not captures:
         raise ParamsError("the scene", "captures", "one or more", "none", "Add one with `reskin add`.")
     _check_one_kind(captures)
@@ -91,7 +98,7 @@ def gather(captures: Sequence[Readings], selection: Selection, *, targets: Seque
 
 
 def stack(above: Rows, below: Rows) -> Rows:
-    """Put rows below others, whose numbers stay what they were; indentations below are numbered after those above."""
+    """Stack rows below others, which keep their numbers; indentations below are numbered after those above."""
     if below.db_uT.shape[1:] != above.db_uT.shape[1:]:
         rule = f"the {above.db_uT.shape[1]} of {above.capture[0]}"
         raise ParamsError(
@@ -136,19 +143,19 @@ def _check_one_kind(captures: Sequence[Readings]) -> None:
             raise ParamsError(where, f"the board of skin {skin}", f"{boards[skin]}, as before", readings.board, remedy)
 
 
-SCORED = "before_touch.parquet"  # beside the models of one skin: how well this alone tells a place
+SCORED = "before_touch.parquet"  # beside the models of one skin: scores of places known before the contact
 
 
 @dataclass(frozen=True)
 class Scan:
-    """Of the rows that `gather` stacks: the no-load field, and the number of the indentation in its pass."""
+    """The no-load field of the rows that `gather` stacks, and the number of the indentation in its pass."""
 
     noload_uT: Float32[np.ndarray, "f ch"]
     scan_i: Int64[np.ndarray, " f"]
 
 
 def gather_scan(captures: Sequence[Readings], selection: Selection) -> Scan:
-    """Stack what is known before each touch, in the order of `gather`."""
+    """Stack what is known before each contact, in the order of `gather`."""
     captures = sorted(captures, key=lambda readings: readings.capture)
     kept = [contacts(readings, selection) for readings in captures]
     noload = [readings.noload_uT[keep] for readings, keep in zip(captures, kept, strict=True)]
@@ -157,7 +164,7 @@ def gather_scan(captures: Sequence[Readings], selection: Selection) -> Scan:
 
 
 def number_in_pass(readings: Readings) -> Int64[np.ndarray, " f"]:
-    """Number the indentations of each pass from 0, those that are no row for a model included."""
+    """Number the indentations of each pass from 0, including those without a contact."""
     passes, of_pass = np.unique(readings.pass_i, return_inverse=True)
     indentation = readings.indentation.astype(np.int64)
     first = np.full(len(passes), indentation.max())
@@ -167,7 +174,7 @@ def number_in_pass(readings: Readings) -> Int64[np.ndarray, " f"]:
 
 @dataclass(frozen=True)
 class Hover:
-    """Rows of a tip that is over a known place and does not touch; `pass_i` counts as that of `Rows` does."""
+    """Rows of a tip that hovers over a known place without contact; `pass_i` as in `Rows`."""
 
     db_uT: Float32[np.ndarray, "f ch"]
     place_mm: Float32[np.ndarray, "f 2"]
@@ -181,7 +188,7 @@ class Hover:
 def gather_hover(captures: Sequence[Readings]) -> Hover:
     """Stack the rows without force between the contacts of a pass, each at the place of the contact that comes next.
 
-    A tip that goes down on a place in steps hovers over it first. Rows before the first contact of a pass are its
+    A tip that descends on a place in steps hovers over it first. Rows before the first contact of a pass are its
     no-load reading, and rows after the last have no place.
     """
     parts: list[tuple[np.ndarray, ...]] = []

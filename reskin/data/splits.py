@@ -1,13 +1,13 @@
-"""Who is held out: boards, sensors, one skin's readings, indentations or passes. In: rows, settings. Out: folds.
+"""Folds: which boards, skins, readings, indentations or passes are held out, and the file `folds.json`.
 
-The drawing is scikit-learn's; this module names the groups and proves that no skin or board is on both sides of a fold
-between skins. Refuses to know what is trained on a fold.
+The drawing is scikit-learn's; this module names the groups, and checks that no skin or board is on both sides of a fold
+between skins.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Int64, Shaped
@@ -16,7 +16,7 @@ from pydantic import Field, field_validator
 from reskin.config import Strict
 from reskin.data.lines import take_pokes
 from reskin.data.rows import Rows
-from reskin.errors import ParamsError
+from reskin.errors import ParamsError, SchemaError
 from reskin.seeds import rng_for, seed_for
 
 WITHIN_SKIN = {"single_random": "readings", "single_indentation": "indentations", "single_pass": "passes"}  # and units
@@ -52,9 +52,9 @@ class Split(Strict):
 
 @dataclass(frozen=True)
 class Fold:
-    """Row numbers (of `Rows`): the two sides of one hold-out, and the pool of unlabelled pokes on the held-out skins.
+    """Row numbers (of `Rows`) of the train side, the test side, and the pool of pokes on the held-out skins.
 
-    Adaptation may poke in the pool; nothing is scored there, so that every method is scored on the same rows.
+    Adaptation may use the pool. Nothing is scored there, so that every method is scored on the same rows.
     """
 
     experiment: str
@@ -199,7 +199,7 @@ def hold_out_skins(rows: Rows, experiment: str, name: str, sides: tuple[np.ndarr
                 raise ParamsError(f"experiment {experiment}", what, rule, len(passes), remedy)
             pooled |= on_skin & np.isin(rows.pass_i[held], passes[: split.pool_passes_n])
     fold = Fold(experiment, name, train, held[~pooled], held[pooled])
-    _prove_apart(rows, fold)
+    _check_disjoint(rows, fold)
     return fold
 
 
@@ -264,7 +264,7 @@ def _test_n(all_n: int, fraction: float, what: str, where: str) -> int:
     return test_n
 
 
-def _prove_apart(rows: Rows, fold: Fold) -> None:
+def _check_disjoint(rows: Rows, fold: Fold) -> None:
     held = np.concatenate([fold.test, fold.pool])
     for what, labels in (("board", rows.board), ("skin", rows.skin)):
         both = np.intersect1d(np.unique(labels[fold.train]), np.unique(labels[held]))
@@ -282,3 +282,48 @@ _DRAW: dict[str, Callable[[Rows, Split, int], list[Fold]]] = {
     "single_temporal": last_passes,
     **{experiment: partial(within_first_skin, experiment=experiment) for experiment in WITHIN_SKIN},
 }
+
+
+# --- folds.json ---
+
+SIDES = ("train", "test", "pool")
+
+
+def render_folds(captures: Sequence[str], rows: Rows, folds: Sequence[Fold]) -> dict[str, Any]:
+    """Convert folds to JSON values; row numbers are half-open ranges, and each side names its boards and skins."""
+    content: list[dict[str, Any]] = []
+    for fold in folds:
+        sides = {side: getattr(fold, side) for side in SIDES}
+        labels: dict[str, list[str]] = {}
+        for side, numbers in sides.items():
+            labels[f"{side}_boards"] = np.unique(rows.board[numbers]).tolist()
+            labels[f"{side}_skins"] = np.unique(rows.skin[numbers]).tolist()
+        ranges = {side: to_ranges(numbers) for side, numbers in sides.items()}
+        content.append({"experiment": fold.experiment, "name": fold.name, **labels, **ranges})
+    return {"captures": list(captures), "rows_n": len(rows), "dropped": rows.dropped, "folds": content}
+
+
+def parse_folds(content: dict[str, Any], rows: Rows, where: str) -> list[Fold]:
+    """Read folds from JSON values; raise `SchemaError` if they were drawn from other rows."""
+    if content["rows_n"] != len(rows):
+        raise SchemaError(where, "rows_n", f"the {len(rows)} rows of its captures", content["rows_n"], "Split again.")
+    return [
+        Fold(fold["experiment"], fold["name"], *(from_ranges(fold[side]) for side in SIDES))
+        for fold in content["folds"]
+    ]
+
+
+def to_ranges(numbers: Int64[np.ndarray, " n"]) -> list[list[int]]:
+    """Convert increasing numbers to half-open ranges.
+
+    >>> to_ranges(np.array([3, 4, 5, 9]))
+    [[3, 6], [9, 10]]
+    """
+    if len(numbers) == 0:
+        return []
+    cuts = np.flatnonzero(np.diff(numbers) != 1) + 1
+    return [[int(run[0]), int(run[-1]) + 1] for run in np.split(numbers, cuts)]
+
+
+def from_ranges(ranges: Sequence[Sequence[int]]) -> Int64[np.ndarray, " n"]:
+    return np.concatenate([np.arange(start, stop) for start, stop in ranges] or [np.zeros(0, np.int64)])

@@ -1,7 +1,6 @@
-"""Windows of captures in order of time under several no-load policies. In: `Readings`. Out: parts, one stack of rows.
+"""Windows of captures in order of time, under several no-load policies (paper section 4, drift).
 
-A window is a range of units (indentations or passes); a part is one window of one skin under one policy. Refuses to
-know what is trained on a part.
+A window is a range of units (indentations or passes); a part is one window of one skin under one policy.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -20,7 +19,7 @@ TRAIN = -1
 
 @dataclass(frozen=True)
 class Windows:
-    """Half-open ranges of units: those trained on, and each test's; a window that was cut short is left out."""
+    """Half-open ranges of units for training and for each test; a window that is cut short is left out."""
 
     train: tuple[int, int]
     tests: tuple[tuple[int, int], ...]
@@ -35,7 +34,7 @@ class Part:
     window_i: int
     readings: Readings
     rows: Rows
-    noload_off_uT: float  # rms over rows and channels: the policy's no-load field less that read before the contact
+    noload_off_uT: float  # rms over rows and channels: the policy's no-load field minus that read before the contact
     first_row_i: int
 
     @property
@@ -44,14 +43,14 @@ class Part:
         return np.arange(self.first_row_i, self.first_row_i + len(self.rows))
 
 
-def lay_windows(units_n: Sequence[int], *, train_n: int, test_n: int, every_n: int) -> Windows:
-    """Train on the first units, test on some after every so many, as far as all captures go (paper section 4).
+def make_windows(units_n: Sequence[int], *, train_n: int, test_n: int, every_n: int) -> Windows:
+    """Train on the first `train_n` units, and test on `test_n` units after every `every_n`, as far as all captures go.
 
     `units_n` is the length of each capture, in units.
 
-    >>> lay_windows([23], train_n=5, test_n=2, every_n=5)
+    >>> make_windows([23], train_n=5, test_n=2, every_n=5)
     Windows(train=(0, 5), tests=((5, 7), (10, 12), (15, 17), (20, 22)), left_out_units_n=0)
-    >>> lay_windows([21], train_n=5, test_n=2, every_n=5)
+    >>> make_windows([21], train_n=5, test_n=2, every_n=5)
     Windows(train=(0, 5), tests=((5, 7), (10, 12), (15, 17)), left_out_units_n=1)
     """
     windows_n = max(0, (min(units_n) - test_n) // every_n)
@@ -81,16 +80,16 @@ def check_one_each(captures: Sequence[Readings]) -> None:
             raise ParamsError("experiment drift", what, rule, ", ".join(of_skin), remedy)
 
 
-def lay_parts(
+def make_parts(
     captures: Sequence[tuple[Readings, Int64[np.ndarray, " _"]]],
     policies: Mapping[str, Policy],
     *,
     windows: Windows,
     selection: Selection,
 ) -> list[Part]:
-    """Lay the rows of every capture, policy and window below each other; beside a capture stands the unit of each row.
+    """Make the part of every capture, policy and window; each capture comes with the unit of each of its rows.
 
-    A policy sees the whole capture, whatever the windows and the selection leave out.
+    A policy sees the whole capture, including rows that windows and selection leave out.
     """
     parts: list[Part] = []
     next_i = 0
@@ -107,7 +106,7 @@ def lay_parts(
 
 
 def stack(parts: Sequence[Part]) -> Rows:
-    """Make one set of rows of all parts; what the selection left out is counted once, as it is so for every policy."""
+    """Stack the rows of all parts; dropped rows are counted for one policy, because all policies drop the same."""
     arrays = [field.name for field in fields(Rows) if field.name != "dropped"]
     stacked = {name: np.concatenate([getattr(part.rows, name) for part in parts]) for name in arrays}
     dropped = [part.rows.dropped for part in parts if part.policy == parts[0].policy]

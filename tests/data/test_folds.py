@@ -6,10 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from reskin.data import folds as module
 from reskin.data import splits
-from reskin.data.folds import from_ranges, parse_folds, render_folds, to_ranges
-from reskin.data.splits import Split, draw_folds
+from reskin.data.splits import Split, draw_folds, from_ranges, parse_folds, render_folds, to_ranges
 from reskin.errors import SchemaError
 from tests.data.tables import rows
 
@@ -50,8 +48,7 @@ def test_folds_of_other_rows_are_refused():
         parse_folds(words, rows(["b0", "b1"], ["s0", "s1"]), "folds.json")
 
 
-@pytest.mark.parametrize("documented", [module, splits])
-def test_the_folds_drawn_in_the_docstrings_are_right(documented):
-    outcome = doctest.testmod(documented, extraglobs={"np": np})
+def test_the_folds_drawn_in_the_docstrings_are_right():
+    outcome = doctest.testmod(splits, extraglobs={"np": np})
     assert outcome.attempted > 0
     assert outcome.failed == 0

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from reskin.data import windows as documented
 from reskin.data.baseline import each, initial, rank
 from reskin.data.rows import Selection, gather
-from reskin.data.windows import TRAIN, check_one_each, lay_parts, lay_windows, stack, take
+from reskin.data.windows import TRAIN, check_one_each, make_parts, make_windows, stack, take
 from reskin.errors import ParamsError
 from tests.data.tables import readings
 
@@ -29,9 +29,9 @@ def test_windows_are_what_a_walk_along_the_capture_finds(sizes):
     asked = {"train_n": max(1, every_n - less_n), "test_n": test_n, "every_n": every_n}
     if not expected:
         with pytest.raises(ParamsError, match="experiment drift: the shortest capture must be at least"):
-            lay_windows([units_n], **asked)
+            make_windows([units_n], **asked)
         return
-    windows = lay_windows([units_n], **asked)
+    windows = make_windows([units_n], **asked)
     assert list(windows.tests) == expected
     assert windows.left_out_units_n == cut_n
 
@@ -40,7 +40,7 @@ def test_windows_are_what_a_walk_along_the_capture_finds(sizes):
 def test_no_unit_is_trained_on_and_tested_or_tested_twice(sizes):
     units_n, test_n, more_n, less_n = sizes
     every_n = test_n + more_n
-    windows = lay_windows(
+    windows = make_windows(
         [units_n + every_n + test_n], train_n=max(1, every_n - less_n), test_n=test_n, every_n=every_n
     )
     used = [unit for span in (windows.train, *windows.tests) for unit in range(*span)]
@@ -48,7 +48,7 @@ def test_no_unit_is_trained_on_and_tested_or_tested_twice(sizes):
 
 
 def test_captures_of_several_skins_are_tested_as_far_as_all_go_and_the_rest_is_counted():
-    windows = lay_windows([12, 24], train_n=5, test_n=2, every_n=5)
+    windows = make_windows([12, 24], train_n=5, test_n=2, every_n=5)
     assert windows.tests == ((5, 7), (10, 12))
     assert windows.left_out_units_n == 24 - 15  # all after the start of the first window that the shorter one lacks
 
@@ -86,8 +86,8 @@ def capture(skin: str, f: int = 24):
 
 def lay(*skins: str):
     captures = [(one, rank(one.indentation)) for one in map(capture, skins)]
-    windows = lay_windows([24] * len(skins), train_n=6, test_n=4, every_n=8)
-    return lay_parts(captures, POLICIES, windows=windows, selection=Selection(force_min_N=0.1))
+    windows = make_windows([24] * len(skins), train_n=6, test_n=4, every_n=8)
+    return make_parts(captures, POLICIES, windows=windows, selection=Selection(force_min_N=0.1))
 
 
 def test_each_window_of_each_skin_stands_under_each_policy_with_that_policys_change():
@@ -122,9 +122,11 @@ def test_what_the_selection_left_out_is_counted_once_for_all_policies():
 @given(st.integers(1, 5), st.integers(1, 4), st.integers(0, 3))
 def test_as_read_a_part_is_what_gather_makes_of_its_readings(train_n, test_n, more_n):
     every_n = max(train_n, test_n) + more_n
-    windows = lay_windows([24], train_n=train_n, test_n=test_n, every_n=every_n)
+    windows = make_windows([24], train_n=train_n, test_n=test_n, every_n=every_n)
     one, everything = capture("s0"), Selection(force_min_N=0.0)
-    parts = lay_parts([(one, rank(one.indentation))], {"each": POLICIES["each"]}, windows=windows, selection=everything)
+    parts = make_parts(
+        [(one, rank(one.indentation))], {"each": POLICIES["each"]}, windows=windows, selection=everything
+    )
     whole = gather([one], everything)
     for part, (start, end) in zip(parts, (windows.train, *windows.tests), strict=True):
         assert (part.rows.db_uT == whole.db_uT[start:end]).all()

@@ -13,9 +13,8 @@ from pipeline.stages.ingest import read_split
 from pipeline.training import jobs as _training
 from pipeline.training.jobs import SceneData, adaptation_jobs, make_jobs, read_data, read_pretrained, write_models
 from reskin import io
-from reskin.data.folds import load_rows, parse_folds, render_folds
-from reskin.data.rows import Selection
-from reskin.data.splits import Fold, draw_folds
+from reskin.data.rows import Selection, load_rows
+from reskin.data.splits import Fold, draw_folds, parse_folds, render_folds
 from reskin.errors import LeakError
 from reskin.models.batches import prepare
 from reskin.models.inputs import FIT, VIEW
