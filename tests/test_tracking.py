@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from pipeline import tracking
-from pipeline import tracking as server
 from pipeline.tracking import TrackingAway, probe, publish
 from reskin import io
 
@@ -265,7 +264,7 @@ def test_an_embedded_store_that_is_not_there_yet_is_made_by_nobody_who_only_asks
 
 
 def test_a_store_that_another_program_holds_costs_seconds_and_no_result(tmp_path, monkeypatch):
-    monkeypatch.setattr(server, "LOCK_TIMEOUT_S", 0.1)
+    monkeypatch.setattr(tracking, "LOCK_TIMEOUT_S", 0.1)
     with closing(sqlite3.connect(tmp_path / "mlflow.db")) as other:
         other.execute("BEGIN EXCLUSIVE")
         with pytest.raises(TrackingAway, match="database is locked.*Results are kept"):
@@ -275,14 +274,14 @@ def test_a_store_that_another_program_holds_costs_seconds_and_no_result(tmp_path
 
 def test_a_store_that_fails_in_mid_run_is_one_sentence_and_no_traceback(tmp_path, monkeypatch):
     write(tmp_path, b0="k0")
-    find, told = tracking.Diary.find, []
+    find, told = tracking.Publisher.find, []
 
     def fails(self, *words, **tags):
         with closing(sqlite3.connect(tmp_path / "mlflow.db")) as other:
             other.execute("DROP TABLE IF EXISTS tags")
         return find(self, *words, **tags)
 
-    monkeypatch.setattr(tracking.Diary, "find", fails)
+    monkeypatch.setattr(tracking.Publisher, "find", fails)
     hears = logging.Handler()
     hears.emit = told.append
     logging.getLogger("mlflow.store.db.utils").addHandler(hears)
@@ -293,7 +292,7 @@ def test_a_store_that_fails_in_mid_run_is_one_sentence_and_no_traceback(tmp_path
 
 
 def test_a_server_that_is_too_slow_is_left_with_what_is_written_and_taken_up_again(tmp_path, monkeypatch):
-    monkeypatch.setattr(server, "PATIENCE_S", -2.0 * 2)  # none left for two trainings
+    monkeypatch.setattr(tracking, "PATIENCE_S", -2.0 * 2)  # none left for two trainings
     with pytest.raises(TrackingAway, match="took longer than 0 s"):
         write(tmp_path, b0="k0", b1="k1")
     monkeypatch.undo()
