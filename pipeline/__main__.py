@@ -1,4 +1,4 @@
-"""`python -m pipeline STAGE --scene NAME ...`: what dvc.yaml calls, and the commands that manage a checkout."""
+"""`python -m pipeline STAGE --scene NAME ...` runs a stage, as dvc.yaml does; other words are commands of `reskin`."""
 
 import sys
 from pathlib import Path

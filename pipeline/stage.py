@@ -1,4 +1,4 @@
-"""Run one stage: parse its arguments, explain its errors, record its cost."""
+"""Run one stage: parse its arguments, report its errors, record its cost."""
 
 import argparse
 import inspect
@@ -15,7 +15,7 @@ from reskin.errors import ReskinError, explaining
 
 
 def run(work: Callable[..., None], arguments: Sequence[str]) -> None:
-    """Call the function of a stage with options of the names of its parameters; its settings are those of `--scene`."""
+    """Call the function of a stage; its parameters are the command's options, its settings those of `--scene`."""
     stage = work.__name__
     parser = argparse.ArgumentParser(prog=f"python -m pipeline {stage}", description=work.__doc__)
     parser.add_argument("--scene", required=True)
@@ -27,7 +27,7 @@ def run(work: Callable[..., None], arguments: Sequence[str]) -> None:
     scene = options.pop("scene")
     if place := announce():
         say(f"{stage}: {place}")
-    digest = settings_of(scene) if place else None  # read now: they may be edited while it runs
+    digest = settings_of(scene) if place else None  # now: they may be edited while it runs
     start_s, costs, unit = time.monotonic(), COSTS / scene, _unit(stage, scene, options)
     try:
         with explaining(stage):
@@ -43,14 +43,13 @@ def run(work: Callable[..., None], arguments: Sequence[str]) -> None:
 
 
 def _unit(stage: str, scene: str, options: Mapping[str, Any]) -> str:
-    """Name what ran, for its cost: some stages run once for each recorded capture, or for each protocol's folder."""
+    """Name a run for its cost; a stage that runs for every capture or protocol of a scene is named with that."""
     if stage == "ingest":
         return f"{stage}-{options['indentations'].stem}"
-    of = {"ingest_simulated": "indentations", "describe": "indentations", "simulate": "raw"}
-    if stage not in of:
-        return stage
-    part = options[of[stage]].stem.removeprefix(scene).strip("-")
-    return f"{stage}-{part}" if part else stage
+    if stage in ("simulate", "ingest_simulated"):
+        protocol = options["raw"].name.removeprefix(scene).strip("-")
+        return f"{stage}-{protocol}" if protocol else stage
+    return stage
 
 
 def say(sentence: str) -> None:

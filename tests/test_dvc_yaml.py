@@ -1,4 +1,4 @@
-"""DVC does not follow imports: stage `code` does. Every path of a command is one that DVC knows."""
+"""Stage `code` follows the imports of every stage, and dvc.yaml declares every path of its commands."""
 
 import shutil
 import subprocess
@@ -9,7 +9,7 @@ from dvc.repo import Repo
 from ruamel.yaml import YAML
 
 from pipeline.scenes import ANALYSES
-from pipeline.stages.code import digests_of, entries
+from pipeline.stages.code import all_stages, digests_of
 from reskin import code
 from reskin.code import file_of
 
@@ -20,27 +20,27 @@ MANUAL = "pipeline.experiments.manual"
 OTHERS = sorted(STAGES.keys() - {"code"})
 
 
-def test_stage_code_writes_what_every_other_stage_depends_on():
-    assert {*entries(), "code"} == STAGES.keys()
+def test_every_stage_depends_on_the_digests_of_its_code():
+    assert {*all_stages(), "code"} == STAGES.keys()
     assert {name: [dep for dep in STAGES[name]["deps"] if "code/" in dep] for name in OTHERS} == {
         name: [f"data/code/{name}"] for name in OTHERS
     }
 
 
-def test_stage_code_reads_every_module_that_a_stage_imports_and_idle_paths_are_not_named():
+def test_stage_code_depends_on_all_imported_modules_and_no_others():
     named = {ROOT / path for path in STAGES["code"]["deps"]}
-    needed = {file_of(name) for stage in entries() for name in digests_of(stage)}
+    needed = {file_of(name) for stage in all_stages() for name in digests_of(stage)}
     homes = {next((path for path in (file, *file.parents) if path in named), file) for file in needed}
     assert homes == named
 
 
-def test_a_stage_knows_the_modules_that_decide_its_results():
+def test_the_digests_of_a_stage_hold_the_modules_that_decide_its_results():
     assert "reskin.models.train" in digests_of("train_multi")
     assert "reskin.models.train" not in digests_of("simulate")
     assert {f"pipeline.experiments.{name}" for name in ANALYSES} <= digests_of("report").keys()
 
 
-def test_a_caption_runs_the_report_again_and_no_experiment(monkeypatch):
+def test_a_caption_runs_only_the_report_again(monkeypatch):
     monkeypatch.setattr(code, "meaning", lambda file, content: b"other" if file == "manual.yaml" else b"same")
     code.digest.cache_clear()
     other = {stage: digests_of(stage)[MANUAL] for stage in ("manual", "report")}
@@ -59,10 +59,8 @@ def test_every_path_that_a_command_takes_is_declared(name):
     outs = [one if isinstance(one, str) else next(iter(one)) for key in ("outs", "plots") for one in stage.get(key, [])]
     params = [next(iter(one)) for one in stage.get("params", [])]
     declared = [*stage["deps"], *outs, *params]
-    words = stage["cmd"].split()
-    # Which keys of its settings a stage declares, test_settings tells.
-    words = [word for word in words if "/" in word]
-    unknown = [w for w in words if not any(d == w or d.startswith(f"{w}/") or w.startswith(f"{d}/") for d in declared)]
+    paths = [word for word in stage["cmd"].split() if "/" in word]  # test_settings checks the keys of params
+    unknown = [p for p in paths if not any(d == p or d.startswith(f"{p}/") or p.startswith(f"{d}/") for d in declared)]
     assert unknown == []
 
 
@@ -70,7 +68,7 @@ def test_the_flow_stays_below_thirty_stages_beside_experiments():
     assert len(STAGES.keys() - set(ANALYSES)) < 30
 
 
-def test_recordings_that_git_leaves_out_are_known_to_dvc(tmp_path):
+def test_recordings_that_git_ignores_are_tracked_by_dvc(tmp_path):
     subprocess.run(["git", "init", "-q", str(tmp_path)], check=True)
     shutil.copy(ROOT / ".gitignore", tmp_path)
     (tmp_path / ".dvc").mkdir()
@@ -81,5 +79,5 @@ def test_recordings_that_git_leaves_out_are_known_to_dvc(tmp_path):
     (tmp_path / "data/raw/lab/one.dvc").write_text("outs:\n- path: one\n  md5: d41d8cd98f00b204e9800998ecf8427e.dir\n")
     with Repo(str(tmp_path)) as repo:
         assert [stage.path_in_repo for stage in repo.index.stages] == ["data/raw/lab/one.dvc"]  # so they are pushed
-    told = subprocess.check_output(["git", "status", "--porcelain", "-uall", "data"], cwd=tmp_path, text=True)
-    assert told == "?? data/raw/lab/one.dvc\n"
+    status = subprocess.check_output(["git", "status", "--porcelain", "-uall", "data"], cwd=tmp_path, text=True)
+    assert status == "?? data/raw/lab/one.dvc\n"

@@ -1,13 +1,14 @@
 """The stages of the pipeline: thin functions that read inputs, call the library, and write outputs.
 
-`python -m pipeline STAGE --scene NAME ...` runs one; dvc.yaml says with which inputs and outputs.
+dvc.yaml runs one by `python -m pipeline STAGE --scene NAME ...`. The stage of an experiment is the function of its name
+in its module of `pipeline.experiments`.
 """
 
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
-MODULES = {
+STAGES = {
     "simulate": ("simulate",),
     "ingest": ("ingest", "ingest_many", "ingest_simulated", "describe", "split"),
     "train": ("train_single", "train_multi", "train_triplet", "adapt", "train_classical"),
@@ -15,19 +16,19 @@ MODULES = {
     "universal": ("few_labels", "universal"),
     "report": ("table2", "report", "publish"),
 }
+MODULES = {stage: f"pipeline.stages.{module}" for module, stages in STAGES.items() for stage in stages}
 EXPERIMENTS = "pipeline.experiments"
 FOLDER = Path(__file__).parents[1] / "experiments"
-STAGES = {stage: f"pipeline.stages.{module}" for module, names in MODULES.items() for stage in names}
 
 
 def is_stage(name: str) -> bool:
     """Tell whether a stage or an experiment has this name."""
-    return name in STAGES or (FOLDER / f"{name}.py").is_file() or (FOLDER / name / "__init__.py").is_file()
+    return name in MODULES or (FOLDER / f"{name}.py").is_file() or (FOLDER / name / "__init__.py").is_file()
 
 
 def module_name(stage: str) -> str:
-    """Name the module that holds a stage's function: one of `pipeline.stages`, or that of an experiment."""
-    return STAGES.get(stage, f"{EXPERIMENTS}.{stage}")
+    """Return the name of the module that holds a stage's function."""
+    return MODULES.get(stage, f"{EXPERIMENTS}.{stage}")
 
 
 def module_of(stage: str) -> ModuleType:

@@ -1,9 +1,8 @@
-"""Runs stages as DVC would, each in a process of its own, forked from one that holds what they would all begin with.
+"""Run stages as DVC does, each in a fork of one process that has imported everything.
 
-`warm_stages` starts it in a checkout. Each line of its input names stages (`drift@ci sleeve@ci`; none: all), which run
-in DVC's order and are committed as `dvc commit` does; then it says `DONE`, or `FAILED`, and reads on. Most of a tiny
-stage's time is imports, and following the material under a tip for its tables; tests/recordings/test_lab_story.py runs
-DVC itself.
+`warm_stages` starts it in a checkout. Each line of input names stages (`drift@ci sleeve@ci`; none: all). They run in
+DVC's order and are committed as by `dvc commit`; then it prints `DONE` or `FAILED`, and reads the next line. Most of a
+small stage's time is imports and the tables of skin deformation. tests/recordings/test_lab_story.py runs DVC itself.
 """
 
 import gc
@@ -27,7 +26,7 @@ DEEP_M = 1.3e-3  # past the deepest poke of scene ci
 
 
 def run_stage(name: str, command: str) -> int:
-    """Run `python -m pipeline STAGE ...` in a fork; give its exit status."""
+    """Run `python -m pipeline STAGE ...` in a fork; return its exit status."""
     sys.stdout.flush()
     if child := os.fork():
         return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
@@ -47,44 +46,47 @@ def run_stage(name: str, command: str) -> int:
         os._exit(status)
 
 
-def begin(simulated: set[tuple[str, str]]) -> None:
-    """Import what stages import, and follow the material under a tip for the skins of these scenes' protocols."""
+def preload(protocols: set[tuple[str, str]]) -> None:
+    """Import the modules of all stages, and compute the deformation tables of skins for (scene, protocol) pairs."""
     importlib.import_module("pipeline")  # first, as it tells NumPy which instructions to use
     import numpy as np
 
     from pipeline.settings import read_settings
     from pipeline.simulation import simulation_settings
-    from pipeline.stages.code import entries
+    from pipeline.stages import module_name
+    from pipeline.stages.code import all_stages
     from reskin.physics.skin import draw_skin, moved_dipoles
 
-    for name in (*LIBRARIES, *entries().values()):
+    for name in (*LIBRARIES, *map(module_name, all_stages())):
         importlib.import_module(name)
-    for scene, protocol in simulated:
+    for scene, protocol in protocols:
         settings = read_settings(scene)
         of = simulation_settings(settings)
         kind = of.boards[of.protocols[protocol].boards]
         rule, name = kind.quadrature.in_si(), f"{kind.letter}0_s0"
         skin = draw_skin(of.skin, of.spreads, seed=settings.seed, name=name, rule=rule, sides_m=kind.skin_m)
-        list(moved_dipoles(skin, np.array([[0.0, 0.0, DEEP_M]])))  # its tables are kept
-    gc.freeze()  # else each stage would look through all this, and copy it, at each search for what nobody holds
+        list(moved_dipoles(skin, np.array([[0.0, 0.0, DEEP_M]])))  # caches its tables
+    gc.freeze()  # else every fork would copy the pages of all these objects at its first garbage collection
 
 
-def run_stages(asked: list[str]) -> str:
+def run_stages(names: list[str]) -> str:
     with Repo() as repo:
         planned = plan_repro(get_active_graph(repo.index.graph))
-        with_words = [stage for stage in planned if stage.cmd]  # the others are recordings that were added
-        stages = {stage.addressing: stage for stage in with_words if not asked or stage.addressing in asked}
-        simulating = [shlex.split(stage.cmd) for name, stage in stages.items() if name.startswith("simulate@")]
-        begin({(words[words.index("--scene") + 1], words[words.index("--protocol") + 1]) for words in simulating})
+        with_commands = [stage for stage in planned if stage.cmd]  # the others are added recordings
+        stages = {stage.addressing: stage for stage in with_commands if not names or stage.addressing in names}
+        commands = [shlex.split(stage.cmd) for name, stage in stages.items() if name.startswith("simulate@")]
+        preload(
+            {(command[command.index("--scene") + 1], command[command.index("--protocol") + 1]) for command in commands}
+        )
         for name, stage in stages.items():
             print(f"Running stage '{name}':", flush=True)
-            for out in stage.outs:  # as `dvc repro` does: a stage that writes nothing has nothing
+            for out in stage.outs:  # as `dvc repro` does
                 out.remove()
             if run_stage(name, stage.cmd):
                 return FAILED
         with lock_repo(repo):
             for stage in stages.values():
-                stage.save(run_cache=False)  # which holds former runs: no story asks for them
+                stage.save(run_cache=False)  # no test needs earlier runs
                 stage.commit()
             next(iter(stages.values())).dvcfile.dump_stages([*stages.values()], update_pipeline=False)
     return DONE
