@@ -43,7 +43,7 @@ def said(*words: str) -> tuple[int, str]:
         ((80.0,), 0, "quick: reproduced: all 6 values"),
         ((90.0,), 1, "| table2.accuracy_pct.mean "),
         ((80.0, 70.0), 1, "| scores[lobo].accuracy_pct "),
-        ((80.0, 80.0, "ridge"), 1, "tables: 1 of 5 differ: table2 1"),
+        ((80.0, 80.0, "ridge"), 1, "| tables | table2    | 1       | 1        |"),
     ],
 )
 def test_finished_reports_are_compared_with_the_commit(checkout, tmp_path_factory, changed, status, told):

@@ -8,7 +8,7 @@ import subprocess
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from enum import Enum
+from itertools import chain
 from pathlib import Path
 from shutil import which
 from typing import Any
@@ -18,21 +18,21 @@ import pandas as pd
 from pipeline.stage import say
 from reskin.errors import ReskinError, SchemaError
 
-LABEL_N = 3  # leading words of a row that may name it
-# How a cell with a verdict begins; the first three are of results before 2026-11.
+LABEL_N = 3  # leading texts and counts of a row that may name it
+LISTED_N = 10  # largest differences that are listed
+# Verdicts that cells begin with; the first three are of results before 2026-11.
 VERDICT = re.compile(
     r"(yes|no|inconclusive( \(one board\))?|supported|contradicted|undecided|not judged \([^)]*\))(?![\w ])"
 )
+MACHINE = ("device", "versions", "trained", "git")  # of the provenance: possible causes of a difference
+EXPECTED = (
+    "With the code, settings and versions (constraints.txt) of the committed run, values are equal on every x86-64 "
+    "processor with AVX2; a GPU or other versions may differ. If none of these explains it, please report it."
+)
+MISSING: Any = object()  # in place of a value that one of the two runs does not have
+
 Leaf = bool | int | float | str | None
-
-
-class Absent(Enum):
-    """Marks a value that one of the two runs does not have."""
-
-    ABSENT = "absent"
-
-
-ABSENT = Absent.ABSENT
+Echo = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -46,19 +46,21 @@ class Difference:
     @property
     def relative(self) -> float | None:
         """The difference relative to the larger of two numbers (0 to 2); None if one is no number."""
-        old, new = (_number(value) for value in (self.committed, self.fresh))
-        return None if old is None or new is None else abs(new - old) / max(abs(old), abs(new))
+        old, new = self.committed, self.fresh
+        if not all(isinstance(value, int | float) and not isinstance(value, bool) for value in (old, new)):
+            return None
+        return abs(float(new) - float(old)) / max(abs(float(old)), abs(float(new)))  # type: ignore[arg-type]
 
     @property
     def verdicts(self) -> tuple[str, str] | None:
-        """The verdicts that two texts begin with; None if one does not or they are equal."""
+        """The verdicts that two texts begin with; None if they are equal or one text has none."""
         old, new = (VERDICT.match(value) if isinstance(value, str) else None for value in (self.committed, self.fresh))
         return (old[1], new[1]) if old and new and old[1] != new[1] else None
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """The values that differ, the names that only one run has, and the number of equal values by first name."""
+    """The values that differ, the names that only one run has, and the number of equal values by section."""
 
     equal: Counter[str]
     differing: list[Difference]
@@ -70,27 +72,36 @@ class Comparison:
         """Whether both runs have the same values."""
         return not (self.differing or self.missing or self.new)
 
+    @property
+    def compared_n(self) -> int:
+        """Number of values that both runs have."""
+        return self.equal.total() + len(self.differing)
+
 
 def compare(committed: Mapping[str, Any], fresh: Mapping[str, Any]) -> Comparison:
     """Compare nested numbers, truths and texts of a fresh run with committed ones."""
-    equal: Counter[str] = Counter()
-    differing, missing, added = [], [], []
+    done = Comparison(Counter(), [], [], [])
     for name, old, new in _pairs(committed, fresh, ""):
-        if new is ABSENT:
-            missing.append(name)
-        elif old is ABSENT:
-            added.append(name)
-        elif _same(old, new):
-            equal[part_of(name)] += 1
+        if new is MISSING:
+            done.missing.append(name)
+        elif old is MISSING:
+            done.new.append(name)
+        elif _equal(old, new):
+            done.equal[section_of(name)] += 1
         else:
-            differing.append(Difference(name, old, new))
-    return Comparison(equal, differing, missing, added)
+            done.differing.append(Difference(name, old, new))
+    return done
 
 
-def part_of(name: str) -> str:
-    """Give the first part of a name.
+def _equal(old: Leaf, new: Leaf) -> bool:
+    both_nan = old != old and new != new  # the only value that is unequal to itself
+    return (old == new or both_nan) and isinstance(old, bool) == isinstance(new, bool)
 
-    >>> part_of("sweep_pokes[65].mse_xy_mm2.sd")
+
+def section_of(name: str) -> str:
+    """Return the first part of a name.
+
+    >>> section_of("sweep_pokes[65].mse_xy_mm2.sd")
     'sweep_pokes'
     """
     return re.split(r"[.\[]", name, maxsplit=1)[0]
@@ -98,31 +109,31 @@ def part_of(name: str) -> str:
 
 def leaves(value: Any) -> Iterator[tuple[str, Leaf]]:
     """Name every number, truth and text of a nested value."""
-    yield from ((name, leaf) for name, leaf, _ in _pairs(value, ABSENT, ""))
+    yield from ((name, leaf) for name, leaf, _ in _pairs(value, MISSING, ""))
 
 
 def _pairs(old: Any, new: Any, name: str) -> Iterator[tuple[str, Any, Any]]:
-    """Name every value of either side, with what stands under this name in both."""
-    present = [value for value in (old, new) if value is not ABSENT]
+    """Yield the name of every value of either side, with the values of both sides."""
+    present = [value for value in (old, new) if value is not MISSING]
     if all(isinstance(value, Mapping) for value in present):
-        before, after = ({} if value is ABSENT else value for value in (old, new))
+        before, after = ({} if value is MISSING else value for value in (old, new))
         for key in {**before, **after}:
-            yield from _pairs(before.get(key, ABSENT), after.get(key, ABSENT), f"{name}.{key}" if name else str(key))
+            yield from _pairs(before.get(key, MISSING), after.get(key, MISSING), f"{name}.{key}" if name else str(key))
     elif all(isinstance(value, list) for value in present):
-        before, after = _rows([] if old is ABSENT else old, [] if new is ABSENT else new)
+        before, after = _label_rows([] if old is MISSING else old, [] if new is MISSING else new)
         for label in {**before, **after}:
-            yield from _pairs(before.get(label, ABSENT), after.get(label, ABSENT), f"{name}[{label}]")
-    elif any(isinstance(value, Mapping | list) for value in present):  # another kind on each side
-        yield from _pairs(old, ABSENT, name)
-        yield from _pairs(ABSENT, new, name)
+            yield from _pairs(before.get(label, MISSING), after.get(label, MISSING), f"{name}[{label}]")
+    elif any(isinstance(value, Mapping | list) for value in present):  # of different kinds
+        yield from _pairs(old, MISSING, name)
+        yield from _pairs(MISSING, new, name)
     else:
         yield name, old, new
 
 
-def _rows(old: Sequence[Any], new: Sequence[Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Name the rows of two lists by their leading words, so that an additional row shifts no other.
+def _label_rows(old: Sequence[Any], new: Sequence[Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Label the rows of two lists by their leading values, so that an additional row shifts no other.
 
-    Where the words differ and the lists are equally long, rows are paired by their places.
+    Where the labels differ and the lists are equally long, rows are paired by position.
     """
     before, after = _labels(old), _labels(new)
     if set(before) != set(after) and len(before) == len(after):
@@ -131,64 +142,43 @@ def _rows(old: Sequence[Any], new: Sequence[Any]) -> tuple[dict[str, Any], dict[
 
 
 def _labels(rows: Sequence[Any]) -> list[str]:
-    """Name rows by as few leading words as make them differ; rows that still agree are numbered."""
+    """Label rows by as few leading texts and counts as make them unique; rows that still agree are numbered."""
     if not all(isinstance(row, Mapping) for row in rows):
         return [str(i) for i in range(len(rows))]
-    named: list[str] = []
-    for words_n in range(1, LABEL_N + 1):
-        named = [", ".join(_words(row)[:words_n]) for row in rows]
-        if len(set(named)) == len(named):
-            return named
+    leading: list[list[str]] = []
+    for row in rows:
+        leading.append([])
+        for value in row.values():
+            if not isinstance(value, str | int) or isinstance(value, bool):
+                break
+            leading[-1].append(str(value))
+    labels: list[str] = []
+    for n in range(1, LABEL_N + 1):
+        labels = [", ".join(texts[:n]) for texts in leading]
+        if len(set(labels)) == len(labels):
+            return labels
     seen: Counter[str] = Counter()
-    labels = []
-    for label in named:
+    numbered = []
+    for label in labels:
         seen[label] += 1
-        labels.append(f"{label} #{seen[label]}".strip() if seen[label] > 1 or not label else label)
-    return labels
-
-
-def _words(row: Mapping[str, Any]) -> list[str]:
-    """Take the texts and counts that a row begins with."""
-    words = []
-    for value in row.values():
-        if not isinstance(value, str | int) or isinstance(value, bool):
-            break
-        words.append(str(value))
-    return words
-
-
-def _same(old: Leaf, new: Leaf) -> bool:
-    both_nan = old != old and new != new  # the only value that is unequal to itself
-    return (old == new or both_nan) and isinstance(old, bool) == isinstance(new, bool)
-
-
-def _number(value: Leaf) -> float | None:
-    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
-
-
-LISTED_N = 10  # largest differences, and differing parts, that are listed
-MACHINE = ("device", "versions", "trained", "git")  # of the provenance: what may explain a difference
-EXPECTED = (
-    "With the code, settings and versions (constraints.txt) of the committed run, values are equal on every x86-64 "
-    "processor with AVX2; a GPU or other versions may differ. If none of these explains it, please report it."
-)
-Echo = Callable[[str], None]
+        numbered.append(f"{label} #{seen[label]}".strip() if seen[label] > 1 or not label else label)
+    return numbered
 
 
 @dataclass(frozen=True)
-class Reports:
-    """What two runs are compared by: numbers.json, the cells of tables, and where they came from."""
+class Report:
+    """What is compared of a report: numbers.json and the cells of tables; also its place and its provenance."""
 
-    where: str  # how a sentence names them
+    where: str
     numbers: dict[str, Any]
     tables: dict[str, list[dict[str, Any]]]
     provenance: dict[str, Any]
 
 
 def compare_scene(root: Path, scene: str, against: str, echo: Echo) -> int:
-    """Compare `reports/<scene>` with those of a revision or a folder; return the exit status of `tell`.
+    """Compare `reports/<scene>` with those of a revision or a folder; return the exit status.
 
-    A scene that cannot be compared is an error in one sentence, so that other scenes are compared all the same.
+    A scene that cannot be compared is an error in one sentence; other scenes are compared all the same.
     """
     try:
         folder = root / "reports" / scene
@@ -196,137 +186,58 @@ def compare_scene(root: Path, scene: str, against: str, echo: Echo) -> int:
             remedy = f"Try: reskin scenes use {scene}, then dvc repro."
             raise SchemaError(folder / "numbers.json", "the file", "there", "none", remedy)
         committed = read_folder(Path(against), scene) if Path(against).exists() else read_revision(root, scene, against)
-        return tell(scene, committed, read_folder(folder, scene), echo)
+        return print_comparison(scene, committed, read_folder(folder, scene), echo)
     except ReskinError as error:
         say(f"error: {error}")
         return error.exit_code
 
 
-def read_folder(place: Path, scene: str) -> Reports:
-    """Read the reports of a scene from `reports/<scene>` itself, a folder around it, or the folder of a file."""
-    around = place if place.is_dir() else place.parent
+def read_folder(path: Path, scene: str) -> Report:
+    """Read the report of a scene from `reports/<scene>` itself, a folder around it, or the folder of a file."""
+    around = path if path.is_dir() else path.parent
     candidates = (around, around / scene, around / "reports" / scene)
     folder = next((one for one in candidates if (one / "numbers.json").is_file()), None)
     if folder is None:
         remedy = "Name reports/<scene> of another checkout."
-        raise SchemaError(place, "the folder", f"one that holds {scene}/numbers.json", "none", remedy)
-    names = [file for pattern in ("*.json", "tables/*.csv") for file in sorted(folder.glob(pattern))]
-    return _parse(f"in {folder}", {str(file.relative_to(folder)): file.read_text("utf-8") for file in names})
+        raise SchemaError(path, "the folder", f"one that holds {scene}/numbers.json", "none", remedy)
+    files = [file for pattern in ("*.json", "tables/*.csv") for file in sorted(folder.glob(pattern))]
+    return _parse(f"in {folder}", {str(file.relative_to(folder)): file.read_text("utf-8") for file in files})
 
 
-def read_revision(root: Path, scene: str, revision: str) -> Reports:
-    """Read the reports of a scene from git."""
+def read_revision(root: Path, scene: str, revision: str) -> Report:
+    """Read the report of a scene from a git revision."""
     folder = f"./reports/{scene}"
-    listed = _git(root, "ls-tree", "-r", "--name-only", revision, f"{folder}/") if which("git") else None
-    names = [name for name in (listed or "").splitlines() if name.endswith((".json", ".csv"))]
+    listed = _git(root, "ls-tree", "-r", "--name-only", revision, f"{folder}/") if which("git") else ""
+    names = [name for name in listed.splitlines() if name.endswith((".json", ".csv"))]
     if f"reports/{scene}/numbers.json" not in names:
         remedy = "Try: reskin compare SCENE --against REVISION-OR-FOLDER."
         raise SchemaError(f"git revision {revision}", f"reports/{scene}/numbers.json", "committed", "none", remedy)
-    commit = _git(root, "log", "-1", "--format=%h", revision, "--", folder) or ""
-    texts = {name.removeprefix(f"reports/{scene}/"): _git(root, "show", f"{revision}:./{name}") or "" for name in names}
-    return _parse(f"committed at {commit.strip()}", texts)
+    commit = _git(root, "log", "-1", "--format=%h", revision, "--", folder).strip()
+    texts = {name.removeprefix(f"reports/{scene}/"): _git(root, "show", f"{revision}:./{name}") for name in names}
+    return _parse(f"committed at {commit}", texts)
 
 
-def tell(title: str, committed: Reports, fresh: Reports, echo: Echo) -> int:
-    """Say how two runs compare, the summary last; return 0 if all values are equal, else 1."""
-    parts = {
-        "numbers.json": compare(committed.numbers, fresh.numbers),
-        "tables": compare(committed.tables, fresh.tables),
-    }
-    counts = {part: done.equal.total() + len(done.differing) for part, done in parts.items()}
-    values = f"{sum(counts.values()):,} values"
-    of_parts = " and ".join(f"{n:,} of {part}" for part, n in counts.items())
-    if all(done.reproduced for done in parts.values()):
-        echo(f"{title}: reproduced: all {values} equal those {committed.where} ({of_parts}).")
-        return 0
-    echo(_machines(committed.provenance, fresh.provenance))
-    for part, done in parts.items():
-        echo(f"\n{part}: {_counted(done)}")
-        for word, names in (("only committed", done.missing), ("only fresh", done.new)):
-            if names:
-                echo(f"{word}: {_listed(Counter(map(part_of, names)))}")
-    sized = [[one for one in done.differing if one.relative] for done in parts.values()]
-    numbers = sorted(next(filter(None, sized), []), key=_by_size)  # tables repeat what numbers.json holds
-    if numbers:
-        echo(f"\nLargest differences, relative to the larger of the two numbers:\n{_largest(numbers[:LISTED_N])}")
-    turned = [one for done in parts.values() for one in done.differing if one.verdicts]
-    echo("\n".join([f"\nVerdicts that changed: {len(turned) or 'none'}", *map(_turned, turned)]))
-    differing_n = sum(len(done.differing) for done in parts.values())
-    lone_n = sum(len(done.missing) + len(done.new) for done in parts.values())
-    by = f", numbers by up to {_percent(numbers[0])}" if numbers else ""
-    lone = f"; {lone_n:,} are in one run only" if lone_n else ""
-    verdicts = f"{len(turned)} verdict{'s' if len(turned) != 1 else ''} changed" if turned else "no verdict changed"
-    echo(
-        f"\n{title}: not equal: {differing_n:,} of {values} differ from those {committed.where}{by}{lone}; {verdicts}. "
-        f"{EXPECTED}"
-    )
-    return 1
+def _git(root: Path, *arguments: str) -> str:
+    """Run git in the checkout and return its output; empty if it fails."""
+    done = subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True, check=False)
+    return "" if done.returncode else done.stdout
 
 
-def _machines(committed: Mapping[str, Any], fresh: Mapping[str, Any]) -> str:
-    """Tabulate on what machine, with what code and versions both ran."""
-    rows = [{"run": key, "committed": _short(committed.get(key)), "fresh": _short(fresh.get(key))} for key in MACHINE]
-    return str(pd.DataFrame(rows).to_markdown(index=False, disable_numparse=True))
-
-
-def _counted(done: Comparison) -> str:
-    compared_n = done.equal.total() + len(done.differing)
-    differing = Counter(part_of(one.name) for one in done.differing)
-    if not differing:
-        return f"all {compared_n:,} that both have are equal"
-    return f"{len(done.differing):,} of {compared_n:,} differ: {_listed(differing)}"
-
-
-def _listed(counts: Counter[str]) -> str:
-    return ", ".join(f"{part} {n:,}" for part, n in counts.most_common())
-
-
-def _by_size(one: Difference) -> float:
-    return -(one.relative or 0.0)
-
-
-def _percent(one: Difference) -> str:
-    return f"{100 * (one.relative or 0.0):.3g} %"
-
-
-def _largest(differences: Sequence[Difference]) -> str:
-    rows = [
-        {
-            "number": one.name,
-            "committed": _short(one.committed),
-            "fresh": _short(one.fresh),
-            "differs by": _percent(one),
-        }
-        for one in differences
-    ]
-    return str(pd.DataFrame(rows).to_markdown(index=False, disable_numparse=True))
-
-
-def _turned(one: Difference) -> str:
-    old, new = one.verdicts or ("", "")
-    return f"- {one.name}: {old} -> {new}"
-
-
-def _short(value: object) -> str:
-    if isinstance(value, Mapping):
-        return ", ".join(f"{name} {one}" for name, one in value.items())
-    return "unknown" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
-
-
-def _parse(where: str, texts: Mapping[str, str]) -> Reports:
+def _parse(where: str, texts: Mapping[str, str]) -> Report:
     """Parse the files of a report by name."""
     numbers = json.loads(texts["numbers.json"])
     provenance = numbers.get("provenance", {}) | json.loads(texts.get("provenance.json", "{}"))
-    tables = {Path(name).stem: _cells(words) for name, words in sorted(texts.items()) if name.endswith(".csv")}
-    return Reports(where, numbers, tables, provenance)
+    tables = {
+        Path(name).stem: [
+            {str(title): _parse_cell(cell) for title, cell in row.items()} for row in csv.DictReader(io.StringIO(text))
+        ]
+        for name, text in sorted(texts.items())
+        if name.endswith(".csv")
+    }
+    return Report(where, numbers, tables, provenance)
 
 
-def _cells(words: str) -> list[dict[str, Any]]:
-    rows = csv.DictReader(io.StringIO(words))
-    return [{str(key): _one_number(cell) for key, cell in row.items()} for row in rows]
-
-
-def _one_number(cell: str) -> int | float | str:
+def _parse_cell(cell: str) -> int | float | str:
     for kind in (int, float):
         try:
             return kind(cell)
@@ -335,7 +246,60 @@ def _one_number(cell: str) -> int | float | str:
     return cell
 
 
-def _git(root: Path, *words: str) -> str | None:
-    """Run git in the checkout and give what it prints; None if it fails."""
-    done = subprocess.run(["git", *words], cwd=root, capture_output=True, text=True, check=False)
-    return None if done.returncode else done.stdout
+def print_comparison(scene: str, committed: Report, fresh: Report, echo: Echo) -> int:
+    """Print how the reports of two runs differ, the summary last; return 0 if all values are equal, else 1."""
+    parts = {
+        "numbers.json": compare(committed.numbers, fresh.numbers),
+        "tables": compare(committed.tables, fresh.tables),
+    }
+    values = f"{sum(part.compared_n for part in parts.values()):,} values"
+    if all(part.reproduced for part in parts.values()):
+        by_part = " and ".join(f"{part.compared_n:,} of {name}" for name, part in parts.items())
+        echo(f"{scene}: reproduced: all {values} equal those {committed.where} ({by_part}).")
+        return 0
+    machines = [
+        {"run": key, "committed": _show(committed.provenance.get(key)), "fresh": _show(fresh.provenance.get(key))}
+        for key in MACHINE
+    ]
+    counts = []
+    for name, part in parts.items():
+        found = {
+            "differ": Counter(section_of(one.name) for one in part.differing),
+            "only committed": Counter(map(section_of, part.missing)),
+            "only fresh": Counter(map(section_of, part.new)),
+        }
+        for section in dict.fromkeys(chain.from_iterable(found.values())):
+            numbers = {title: str(by_section[section]) for title, by_section in found.items()}
+            counts.append({"part": name, "section": section, "equal": str(part.equal[section])} | numbers)
+    differing = [one for part in parts.values() for one in part.differing]
+    # Tables repeat the numbers of numbers.json: theirs are listed only if no number there differs.
+    numeric = next(filter(None, ([one for one in part.differing if one.relative] for part in parts.values())), [])
+    largest = [
+        {
+            "largest differences": one.name,
+            "committed": _show(one.committed),
+            "fresh": _show(one.fresh),
+            "relative, %": f"{100 * (one.relative or 0.0):.3g}",
+        }
+        for one in sorted(numeric, key=lambda one: -(one.relative or 0.0))[:LISTED_N]
+    ]
+    verdicts = [
+        {"changed verdicts": one.name, "committed": one.verdicts[0], "fresh": one.verdicts[1]}
+        for one in differing
+        if one.verdicts
+    ]
+    for rows in (machines, counts, largest, verdicts):
+        if rows:
+            echo(str(pd.DataFrame(rows).to_markdown(index=False, disable_numparse=True)) + "\n")
+    lone_n = sum(len(part.missing) + len(part.new) for part in parts.values())
+    echo(
+        f"{scene}: not equal: {len(differing):,} of {values} differ from those {committed.where}; {lone_n:,} in one "
+        f"run only; {len(verdicts)} verdicts changed. {EXPECTED}"
+    )
+    return 1
+
+
+def _show(value: object) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name} {one}" for name, one in value.items())
+    return "unknown" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from pipeline.manage.add import RAW
-from pipeline.manage.compare import Echo, read_folder, read_revision, tell
+from pipeline.manage.compare import Echo, print_comparison, read_folder, read_revision
 from pipeline.manage.registry import REGISTRY
 from pipeline.stage import say
 from reskin import io
@@ -25,9 +25,8 @@ def verify(root: Path, names: Sequence[str], against: Path | None, echo: Echo) -
     committed = {name: read_revision(root, name, "HEAD") for name in names}  # first: the rerun takes hours
     if against is None:
         rerun(root, names)
-    return max(
-        tell(name, committed[name], read_folder(against or root / VERIFIED / name, name), echo) for name in names
-    )
+    fresh = {name: read_folder(against or root / VERIFIED / name, name) for name in names}
+    return max(print_comparison(name, committed[name], fresh[name], echo) for name in names)
 
 
 def rerun(root: Path, names: Sequence[str]) -> None:
