@@ -1,4 +1,4 @@
-"""The whole flow on the tiny scene: twice, killed in the middle, deleted and restored."""
+"""The whole pipeline on scene ci: run twice, killed during a stage, with outputs deleted and restored."""
 
 import json
 import os
@@ -10,6 +10,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import mlflow
 import numpy as np
@@ -34,20 +35,20 @@ LEARNING = (
     "train_single", "train_multi", "train_triplet", "adapt", "sweep_pokes", "sweep_sensors", "train_classical",
     "few_labels", "audit",
 )  # fmt: skip
-DRAWING = ("drift", "manual", "contacts", "ambient")  # experiments that draw at random in ways of their own
-ASKED = set(ANALYSES) - {
+RANDOM = ("drift", "manual", "contacts", "ambient")  # experiments with random draws of their own
+OF_CI = set(ANALYSES) - {
     "compare",
     "reference_methods",
     "touches",
     "population",
     "worlds",
-}  # asked of recordings, and of many skins
-SAID = "said.txt"  # by the first run
-pytestmark = pytest.mark.timeout(1800)  # a guard against a hang; a busy machine takes four times as long as a quiet one
+}  # experiments on recordings or on many skins
+OUTPUT = "output.txt"  # of the first run
+pytestmark = pytest.mark.timeout(1800)  # against a hang; a busy machine takes four times as long as a quiet one
 
 
 def compile_kernels() -> None:
-    """Compile what a poke and the shipped map call, which takes longer than all that a story computes with it."""
+    """Compile the kernels of simulated presses and of the universal model once, for all stages."""
     noload_uT, b_uT, force_N = reskin.simulate_pokes(reskin.draw_skin(), [[8.0, 8.0, 1.0]])
     shipped = reskin.load_universal().zero(noload_uT)
     shipped.label(np.array([[8.0, 8.0]]), force_N, b_uT)
@@ -70,12 +71,16 @@ def run_stages(checkout) -> Iterator[Callable[..., str]]:
 
 @pytest.fixture(scope="module")
 def story(checkout, run_stages) -> Path:
-    (checkout / SAID).write_text(run_stages())
+    (checkout / OUTPUT).write_text(run_stages())
     return checkout
 
 
-def test_every_number_of_the_first_tables_is_there_and_says_that_it_is_simulated(story):
-    numbers = json.loads((story / "reports/ci/numbers.json").read_text())
+@pytest.fixture
+def numbers(story) -> dict[str, Any]:
+    return json.loads((story / "reports/ci/numbers.json").read_text())
+
+
+def test_the_first_tables_have_all_numbers_and_name_their_source(story, numbers):
     assert numbers["provenance"]["source"] == "simulated"
     provenance = json.loads((story / "reports/ci/provenance.json").read_text())
     assert {"git", "trained", "device", "versions", "seconds", "runtime"} == set(provenance)
@@ -91,23 +96,21 @@ def test_every_number_of_the_first_tables_is_there_and_says_that_it_is_simulated
     assert "<svg" in (story / "reports/ci/figures/error_grid_lobo.svg").read_text()
 
 
-def test_every_stage_says_which_of_all_it_is(story):
+def test_every_stage_prints_its_position_among_all_stages(story):
     order = json.loads((story / ".reskin/order.json").read_text())["stages"]
-    said = (story / SAID).read_text()
-    numbers = [int(number) for number in re.findall(rf"stage (\d+) of {len(order)}\b", said)]
-    assert sorted(numbers) == list(range(2, len(order) + 1))  # stage code, the first, says nothing
+    output = (story / OUTPUT).read_text()
+    numbers = [int(number) for number in re.findall(rf"stage (\d+) of {len(order)}\b", output)]
+    assert sorted(numbers) == list(range(2, len(order) + 1))  # stage code, the first, prints nothing
 
 
-def test_table_2_is_shown_early_with_the_numbers_of_the_page(story):
-    numbers = json.loads((story / "reports/ci/numbers.json").read_text())
+def test_the_early_table_2_equals_that_of_the_report(story, numbers):
     assert (story / "data/table2/ci/headline.svg").read_text() == table2_figure(numbers, "simulated")
     table = (story / "data/table2/ci/table2.md").read_text()
     assert table == to_markdown(table_2_summary(numbers))
-    assert table in (story / SAID).read_text()
+    assert table in (story / OUTPUT).read_text()
 
 
-def test_dvc_shows_a_few_scores_which_are_numbers_of_numbers_json(story):
-    numbers = json.loads((story / "reports/ci/numbers.json").read_text())
+def test_dvc_metrics_are_numbers_of_the_report(story, numbers):
     shown = json.loads(run(story, "dvc", "metrics", "show", "--json").stdout)
     scores = shown[""]["data"]["reports/ci/scores.json"]["data"]
     assert set(scores) == {"table2", "single_sensor", "drift_end", "shear"}
@@ -115,7 +118,7 @@ def test_dvc_shows_a_few_scores_which_are_numbers_of_numbers_json(story):
     assert scores["table2"]["multi"]["mse_xy_mm2"] == numbers["table2"]["multi"]["mse_xy_mm2"]["mean"]
 
 
-def test_a_stage_costs_what_its_trainings_cost_and_says_what_it_reused(story):
+def test_the_cost_of_a_stage_counts_its_trainings(story):
     stages = json.loads((story / "reports/ci/provenance.json").read_text())["runtime"]["stages"]
     for arm in ("train_single", "train_multi", "train_triplet", "adapt", "sweep_sensors", "drift", "few_labels"):
         assert stages[arm]["trainings_n"] > 0
@@ -125,7 +128,7 @@ def test_a_stage_costs_what_its_trainings_cost_and_says_what_it_reused(story):
     assert stages["split"]["computed_s"] == stages["split"]["seconds"]
 
 
-def test_every_protocol_goes_through_the_wire_into_a_folder_of_its_own(story):
+def test_every_protocol_is_recorded_into_its_own_folder(story):
     names = {"ci-wear": "b0_s0-wear", "ci-flexible": "f0_s0-flexible", "ci-hand": "b0_s0-hand", "ci-drag": "b0_s0-drag"}
     for folder, capture in names.items():
         assert [file.stem for file in (story / "data/indentations" / folder).glob("*.parquet")] == [capture]
@@ -140,8 +143,7 @@ def test_every_protocol_goes_through_the_wire_into_a_folder_of_its_own(story):
     assert wear.n_contacts.max() == 2 * 2 * 65 - 1
 
 
-def test_every_experiment_about_many_skins_is_answered_on_the_same_test_rows(story):
-    numbers = json.loads((story / "reports/ci/numbers.json").read_text())
+def test_experiments_on_many_skins_test_the_same_rows(story, numbers):
     assert [row["pokes_n"] for row in numbers["sweep_pokes"]] == [0, 30, 65]
     assert {(row["method"], row["skins_n"]) for row in numbers["sweep_sensors"]} == {
         (method, skins_n) for method in ("multi", "triplet", "adapted") for skins_n in (1, 4)
@@ -166,9 +168,8 @@ def test_every_experiment_about_many_skins_is_answered_on_the_same_test_rows(sto
     assert "<svg" in (story / "reports/ci/runtime/training.svg").read_text()
 
 
-def test_every_experiment_of_the_paper_is_answered_shown_and_found_by_the_checklist(story):
-    numbers = json.loads((story / "reports/ci/numbers.json").read_text())
-    assert ASKED <= set(numbers)
+def test_every_experiment_has_numbers_tables_and_figures(story, numbers):
+    assert OF_CI <= set(numbers)
     for policy in ("initial", "regular", "each"):
         assert [row["contacts_n"] for row in numbers["drift"][policy]] == [100, 200]
         assert all({"accuracy_pct", "mse_f_N2"} <= set(row) for row in numbers["drift"][policy])
@@ -177,11 +178,11 @@ def test_every_experiment_of_the_paper_is_answered_shown_and_found_by_the_checkl
         assert all("mean" in numbers[experiment][part]["accuracy_pct"] for part in parts)
     assert {"by_indentation", "by_pass"} <= set(numbers["single_sensor"])
     tables = story / "reports/ci/tables"
-    assert {file.stem for file in tables.glob("*.md")} >= ASKED | {"table1", "checklist", "single_sensor"}
+    assert {file.stem for file in tables.glob("*.md")} >= OF_CI | {"table1", "checklist", "single_sensor"}
     assert NOT_RUN not in (tables / "checklist.md").read_text()
     page = (story / "reports/ci/index.html").read_text()
     figures = sorted((story / "reports/ci/figures").glob("*.svg"))
-    assert {file.stem for file in figures} >= ASKED - {"bound", "drift", "variation", "manual"}
+    assert {file.stem for file in figures} >= OF_CI - {"bound", "drift", "variation", "manual"}
     for figure in figures:
         assert f'src="figures/{figure.name}"' in page
 
@@ -198,7 +199,7 @@ def test_another_commit_machine_and_time_change_only_provenance_and_run_times(st
     for words in (["init", "-q"], ["add", "pipeline", "reskin"], [*author, "commit", "-qm", "x"]):
         subprocess.run(["git", *words], cwd=again, check=True)
     words = ["--scene", "ci", "--indentations", "data/indentations/ci", "--folds", "data/models/ci/folds.json",
-             "--models", "data/models/ci", "--answers", "data/results/ci", "--reports", "reports/ci"]  # fmt: skip
+             "--models", "data/models/ci", "--results", "data/results/ci", "--reports", "reports/ci"]  # fmt: skip
     on_one_core = "import os, runpy; os.sched_setaffinity(0, [min(os.sched_getaffinity(0))]); "
     on_one_core += "runpy.run_module('pipeline', run_name='__main__', alter_sys=True)"
     run(again, "python", "-c", on_one_core, "report", *words)
@@ -212,8 +213,7 @@ def test_another_commit_machine_and_time_change_only_provenance_and_run_times(st
     assert {"ci/runtime/index.html", "ci/runtime/stages.md", "ci/runtime/quadratures.svg"} <= changed
 
 
-def test_numbers_of_single_boards_rest_on_several_network_seeds_and_show_their_spread(story):
-    numbers = json.loads((story / "reports/ci/numbers.json").read_text())
+def test_experiments_on_single_boards_report_the_spread_over_seeds(story, numbers):
     for experiment in ("manual", "flexible"):
         assert numbers[experiment]["seeds_n"] == 2
         assert all("sd_seeds" in numbers[experiment][arm]["accuracy_pct"] for arm in ("before", "after", "control"))
@@ -233,12 +233,12 @@ def test_numbers_of_single_boards_rest_on_several_network_seeds_and_show_their_s
         assert re.search("over (2 |the )?network seeds", table)
 
 
-def test_every_row_of_the_checklist_finds_its_number_and_its_files(story):
+def test_every_row_of_the_checklist_finds_its_number_and_files(story):
     reports = story / "reports/ci"
     numbers = json.loads((reports / "numbers.json").read_text())
     rows = [row for row in read_rows() if row.only != "recorded"]
     missing = [row for row in rows if row.ours and resolve(numbers, row.ours) is None]
-    assert [row.id for row in missing] == ["plateau"]  # a sweep that is too short for it, and says so
+    assert [row.id for row in missing] == ["plateau"]  # this sweep is too short for it
     assert all(row.experiment and resolve(numbers, row.experiment) is not None for row in missing)
     assert (reports / "tables/checklist.md").read_text().count(NOT_REACHED) == len(missing)
     found = [row for row in rows if row not in missing]
@@ -248,8 +248,7 @@ def test_every_row_of_the_checklist_finds_its_number_and_its_files(story):
     assert {name for row in rows for name in row.shown} - there == set()
 
 
-def test_losses_of_every_further_protocol_are_counted(story):
-    numbers = json.loads((story / "reports/ci/numbers.json").read_text())
+def test_losses_of_all_protocols_are_counted(story, numbers):
     for protocol in ("wear", "drag", "hand", "flexible", "sleeve"):
         account = numbers["capture_by_protocol"][protocol]
         files = list((story / f"data/indentations/ci-{protocol}").glob("*.parquet"))
@@ -257,7 +256,7 @@ def test_losses_of_every_further_protocol_are_counted(story):
         assert account["frames_n"] == sum(io.read_account(file)["frames_n"] for file in files)
 
 
-def test_a_log_of_a_card_is_predicted_by_a_model_of_the_scene(story):
+def test_a_model_of_the_scene_predicts_an_sd_card_log(story):
     model = min((story / "data/models/ci/train_multi").glob("lobo.paper.b0.*.safetensors"))
     (log,) = (story / "data/raw/ci-log").glob("*/log.csv")
     run(story, "reskin", "predict", str(log), "--model", str(model), "--out", "contacts.csv")
@@ -268,8 +267,7 @@ def test_a_log_of_a_card_is_predicted_by_a_model_of_the_scene(story):
     assert np.isfinite(found.loc[contact, ["x_mm", "y_mm", "F_N"]]).all(axis=None)
 
 
-def test_the_physics_is_answered_for_and_says_that_it_is_simulated(story):
-    numbers = json.loads((story / "reports/ci/numbers.json").read_text())
+def test_studies_of_the_physics_have_numbers_and_tables(story, numbers):
     assert {row["term"] for row in numbers["left_out"] if row["done"] == "left out"} >= {"ageing", "temperature"}
     costs = json.loads((story / "reports/ci/provenance.json").read_text())
     runtime = join(numbers, costs)["runtime"]
@@ -281,13 +279,13 @@ def test_the_physics_is_answered_for_and_says_that_it_is_simulated(story):
     assert "<svg" in (story / "reports/ci/runtime/quadratures.svg").read_text()
 
 
-def test_there_is_one_parquet_file_a_capture_with_units(story):
+def test_every_capture_has_a_parquet_file_with_units(story):
     files = sorted((story / "data/indentations/ci").glob("*.parquet"))
     assert [file.stem for file in files] == ["b0_s0", "b0_s1", "b1_s0", "b1_s1", "b2_s0", "b2_s1"]
     assert pq.read_schema(files[0]).field("b_uT").metadata[b"unit"] == b"uT"
 
 
-def test_a_score_is_what_a_naive_loop_over_the_held_out_readings_finds(story):
+def test_a_score_equals_that_of_a_naive_loop(story):
     card = json.loads((story / "data/models/ci/train_multi/lobo.paper.b1.seed0.json").read_text())
     predictions = pq.read_table(story / "data/models/ci/train_multi/predictions.parquet").to_pylist()
     own = [row for row in predictions if (row["fold"], row["seed_i"]) == ("b1", 0)]
@@ -321,7 +319,7 @@ def test_predictions_follow_from_the_saved_model_alone(story):
 
 
 @pytest.mark.filterwarnings("ignore")  # MLflow warns about its own types when pyfunc is imported
-def test_mlflow_loads_a_model_by_its_run_and_it_answers_as_ours_does(story, monkeypatch):
+def test_a_model_loaded_by_mlflow_predicts_the_same(story, monkeypatch):
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{story / 'mlflow.db'}")
     client = mlflow.MlflowClient()
     query = "tags.kind = 'training' and tags.question = 'lobo' and tags.current = 'true'"
@@ -332,11 +330,11 @@ def test_mlflow_loads_a_model_by_its_run_and_it_answers_as_ours_does(story, monk
     np.testing.assert_allclose(theirs.to_numpy(), ours.predict(db_uT), rtol=1e-6)
 
 
-def test_training_again_from_nothing_gives_the_same_lock_file(story, run_stages):
+def test_training_again_gives_the_same_lock_file(story, run_stages):
     before = (story / "dvc.lock").read_text()
     for file in (story / ".reskin/cells").glob("*.safetensors"):
-        file.unlink()  # else finished trainings would be reused, and prove nothing
-    stages = [f"{name}@ci" for name in ("simulate", "ingest_simulated", "split", *LEARNING, *DRAWING, "report")]
+        file.unlink()  # else finished trainings would be reused
+    stages = [f"{name}@ci" for name in ("simulate", "ingest_simulated", "split", *LEARNING, *RANDOM, "report")]
     run_stages(*stages)
     assert (story / "dvc.lock").read_text() == before
 
@@ -348,20 +346,20 @@ def test_a_second_repro_runs_no_stage_and_restores_deleted_models(story):
         file.unlink()
     for file in (story / ".reskin/cells").glob("*.safetensors"):
         file.unlink()
-    said = run(story, "dvc", "repro").stdout
-    assert "Stage 'train_multi@ci' is cached" in said
-    assert "Running stage" not in said
+    output = run(story, "dvc", "repro").stdout
+    assert "Stage 'train_multi@ci' is cached" in output
+    assert "Running stage" not in output
     assert models[0].read_bytes() == content
     assert list((story / ".reskin/cells").glob("*.safetensors")) == []
 
 
-def test_an_edited_number_of_a_report_is_noticed(story):
+def test_dvc_notices_an_edited_report(story):
     file = story / "reports/ci/numbers.json"
     content = file.read_text()
     file.write_text(content.replace("simulated", "recorded", 1))
-    said = run(story, "dvc", "status", "report@ci").stdout
+    output = run(story, "dvc", "status", "report@ci").stdout
     file.write_text(content)
-    assert re.search(r"modified:\s+reports/ci/numbers.json", said)
+    assert re.search(r"modified:\s+reports/ci/numbers.json", output)
 
 
 def test_a_stage_killed_in_the_middle_loses_no_finished_fold(story):
@@ -374,7 +372,7 @@ def test_a_stage_killed_in_the_middle_loses_no_finished_fold(story):
     for file in trials.glob("*.safetensors"):
         file.unlink()
 
-    def finished() -> int:  # three trainings run as one, and are finished when the last of them is written
+    def finished() -> int:  # three trainings run as one stack, which is finished with its last file
         stacks = Counter(file.stem.rpartition("-")[0] for file in trials.glob("*.safetensors"))
         return sum(written_n for written_n in stacks.values() if written_n == 3)
 
@@ -386,22 +384,22 @@ def test_a_stage_killed_in_the_middle_loses_no_finished_fold(story):
     stage.wait()
     finished_n = finished()
     assert not models.exists()
-    environment |= ENVIRONMENT  # what is left is trained here
+    environment |= ENVIRONMENT  # the other trainings run in this process
     again = subprocess.run(command, cwd=story, env=environment, capture_output=True, text=True, check=True)
     assert f"{finished_n} of 6 trainings were finished before" in again.stderr
     assert len(list(models.glob("*.safetensors"))) == 6
 
 
-def test_a_dead_tracking_server_is_said_and_costs_no_result(story):
+def test_a_missing_tracking_server_is_reported_and_costs_little_time(story):
     start_s = time.monotonic()
     words = ["--scene", "ci", "--models", "data/models/ci",
-             "--answers", "data/results/ci", "--reports", "reports/ci"]  # fmt: skip
+             "--results", "data/results/ci", "--reports", "reports/ci"]  # fmt: skip
     done = run(story, "python", "-m", "pipeline", "publish", *words, MLFLOW_TRACKING_URI="http://127.0.0.1:9")
     assert "does not answer" in done.stderr
-    assert time.monotonic() - start_s < 100  # not MLflow's own minutes; of a process that starts on a busy machine
+    assert time.monotonic() - start_s < 100  # MLflow itself retries for minutes
 
 
-def test_an_experiment_that_is_switched_off_leaves_no_stage_no_file_and_no_cost(story, run_stages):
+def test_a_removed_experiment_leaves_no_stage_no_file_and_no_cost(story, run_stages):
     scene = story / "pipeline/scenes/ci.yaml"
     own = YAML(typ="safe").load(scene.read_text())
     own["experiments"].remove("sleeve")
@@ -417,7 +415,7 @@ def test_an_experiment_that_is_switched_off_leaves_no_stage_no_file_and_no_cost(
     assert [
         *story.glob("data/[!c]*/**/*sleeve*"),
         *story.glob("reports/ci/**/*sleeve*"),
-    ] == []  # data/code: of every stage
+    ] == []  # data/code has digests of every stage
     numbers = json.loads((story / "reports/ci/numbers.json").read_text())
     assert "sleeve" not in numbers
     provenance = json.loads((story / "reports/ci/provenance.json").read_text())
@@ -425,11 +423,11 @@ def test_an_experiment_that_is_switched_off_leaves_no_stage_no_file_and_no_cost(
     assert not any("sleeve" in stage for stage in YAML(typ="safe").load((story / "dvc.lock").read_text())["stages"])
 
 
-def test_a_parameter_that_nobody_knows_is_one_sentence(story, run_stages):
+def test_an_unknown_parameter_is_one_sentence(story, run_stages):
     scene = story / "pipeline/scenes/ci.yaml"
     before = scene.read_text()
     scene.write_text(before.replace("random_repeats_n:", "random_repeets_n:"))
-    said = run_stages("split@ci", end=False)
+    output = run_stages("split@ci", end=False)
     scene.write_text(before)
-    assert "split: random_repeets_n must be a known parameter; got 2" in said
-    assert "Traceback" not in said
+    assert "split: random_repeets_n must be a known parameter; got 2" in output
+    assert "Traceback" not in output
