@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.experiments.stability.wire import Damage, deliver, joined, records, suffer
+from pipeline.experiments.stability.wire import Damage, decode_damaged, deliver, joined, records
 from reskin.board import stream
 from reskin.board.stream import FrameStream, decode_all
 from reskin.board.wire import Frames, encode, line_bytes_max_n, record_type
@@ -31,7 +31,7 @@ def check_account(account: dict[str, int], data: bytes) -> None:
 
 def check_cost(frames, wire, portions, *, lost_n, false_n):
     damage = Damage("", "", portions, lost_n=lost_n, false_n=false_n, not_finite_n=None)
-    assert not broken([suffer(damage, frames, wire)])
+    assert not broken([decode_damaged(damage, frames, wire)])
 
 
 def check_same(frames: Frames, others: Frames) -> None:
@@ -108,7 +108,7 @@ def test_bytes_full_of_terminators_are_cut_into_the_same_frames_under_any_portio
     check_account(account, data)
 
 
-# What was damaged costs little: `suffer` counts frames that are lost or false, and every byte ------------------------
+# Damage costs little: `decode_damaged` counts lost frames, false frames and every byte ----------------------------
 
 
 @settings(max_examples=150)
@@ -143,13 +143,13 @@ def test_missing_bytes_of_text_cost_at_most_the_lines_they_touch(frames, wire, w
 def test_a_stream_joined_in_the_middle_of_a_frame_loses_that_frame_alone(frames, wire, where):
     length_n = record_type(wire, chips_of(frames)).itemsize
     joined_n = 1 + int(where * (length_n - 3))  # not between CR and LF: that takes the next frame's mark too
-    assert suffer(joined(frames, wire, (joined_n + 0.5) / length_n), frames, wire).holds
+    assert decode_damaged(joined(frames, wire, (joined_n + 0.5) / length_n), frames, wire).holds
 
 
 def test_a_steady_temperature_that_holds_the_terminator_misleads_nobody():
     frames = make_frames(50, 5, 3)
     frames.temperature_degC[:] = CRLF_TEMPERATURE_degC
-    assert not broken([suffer(joined(frames, "binary", n / 82), frames, "binary") for n in range(1, 81)])
+    assert not broken([decode_damaged(joined(frames, "binary", n / 82), frames, "binary") for n in range(1, 81)])
 
 
 def test_the_rest_of_two_frames_behind_a_terminator_in_a_payload_is_no_frame():

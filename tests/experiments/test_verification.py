@@ -138,9 +138,9 @@ def test_moments_that_do_not_turn_with_the_material_are_seen(monkeypatch):
 
     board = draw_board(DESIGN.boards["rigid"].design, DESIGN.spreads, seed=SEED, name="b0")
     skin = draw_skin(DESIGN.skin, DESIGN.spreads, seed=SEED, name="b0_s0", rule=mechanics.COARSE)
-    assert mechanics.shortcuts(board, skin, DEPTHS_M[-1], "deepest", mechanics.PLACES_M[:1]).holds
+    assert mechanics.approximations(board, skin, DEPTHS_M[-1], "deepest", mechanics.PLACES_M[:1]).holds
     monkeypatch.setattr(deformation, "move_dipoles", unturned)
-    assert not mechanics.shortcuts(board, skin, DEPTHS_M[-1], "deepest", mechanics.PLACES_M[:1]).holds
+    assert not mechanics.approximations(board, skin, DEPTHS_M[-1], "deepest", mechanics.PLACES_M[:1]).holds
 
 
 def test_the_naive_quotient_of_a_small_step_is_seen(monkeypatch):

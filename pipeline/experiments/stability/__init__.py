@@ -1,4 +1,4 @@
-"""What the stiff, the extreme and the broken do to physics, chip, wire and learning."""
+"""Stability: stiff, extreme and broken cases of physics, chips, wire formats and learning."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -18,7 +18,7 @@ from reskin.simulation.settings import SimulationSettings
 
 
 def survey(of: SimulationSettings, seed: int) -> list[Case]:
-    """Try every case of physics, chip and wire on the designs of a scene."""
+    """Run every case of physics, chip and wire format with the settings of a scene."""
     board = of.main_boards.design
     chips_n = len(board.places_mm)
     return [
@@ -33,9 +33,9 @@ def survey(of: SimulationSettings, seed: int) -> list[Case]:
 
 
 def stability(settings: Settings, results: Path) -> None:
-    """Try every case on the scene's own skins and chips and on small trainings, and write down what happened."""
+    """Run every case on the scene's skins and chips and on small trainings, and write the table."""
     with make_executor(imports="pipeline.experiments.stability.learning") as executor:
-        learning = executor.submit(_learning_cases, settings.seed)  # beside the physics
+        learning = executor.submit(_learning_cases, settings.seed)  # in parallel with the physics
         cases = [*survey(simulation_settings(settings), settings.seed), *learning.result()]
     io.write_json(results, [asdict(case) for case in cases])
     for case in cases:
@@ -45,6 +45,6 @@ def stability(settings: Settings, results: Path) -> None:
 
 
 def _learning_cases(seed: int) -> list[Case]:
-    from pipeline.experiments.stability.learning import learning_cases  # torch, late: only a worker pays for it
+    from pipeline.experiments.stability.learning import learning_cases  # imports torch: only in the worker
 
     return learning_cases(seed)

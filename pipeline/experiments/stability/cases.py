@@ -1,7 +1,6 @@
-"""One row of the stability table: an extreme case, what came of it, and whether that is what should have.
+"""A row of the stability table: an extreme case, the expected and the actual behaviour.
 
-Cases (the modules beside this one) are tried on any inputs: the stage tabulates those of a scene, tests draw others.
-Refuses to know what is tried.
+The modules beside this one run cases on any inputs: the experiment tabulates those of a scene, tests draw others.
 """
 
 import tracemalloc
@@ -13,29 +12,29 @@ from reskin.errors import ReskinError
 
 @dataclass(frozen=True)
 class Case:
-    """A case of PHYSICS 10: what should happen and why, what happened, and the error where there is one."""
+    """A case of PHYSICS 10: expected and actual behaviour, and the error where there is one."""
 
     area: str
     case: str
     should: str
-    happened: str  # worded from what was measured, never typed
+    happened: str  # composed from measured values
     error: float | None
     limit: float | None
     holds: bool
 
 
 def measured(area: str, case: str, *, should: str, happened: str, error: float, limit: float) -> Case:
-    """Judge a case by its error; NaN does not hold."""
+    """Return a case that holds if its error is at most `limit`; NaN does not hold."""
     return Case(area, case, should, happened, error, limit, holds=bool(error <= limit))
 
 
 def observed(area: str, case: str, *, should: str, happened: str, holds: bool) -> Case:
-    """Judge a case by a fact."""
+    """Return a case that holds if a condition does."""
     return Case(area, case, should, happened, None, None, holds=bool(holds))
 
 
 def refused(area: str, case: str, *, should: str, attempt: Callable[[], object]) -> Case:
-    """Try what must not go through; any error but the project's own is a fault of ours and is let out."""
+    """Return a case that holds if `attempt` raises `ReskinError`; other errors are bugs and propagate."""
     try:
         attempt()
     except ReskinError as error:
@@ -44,7 +43,7 @@ def refused(area: str, case: str, *, should: str, attempt: Callable[[], object])
 
 
 def peak_bytes(work: Callable[[], object]) -> int:
-    """Give the most memory that Python and NumPy held at once while working, what was there before left out."""
+    """Return the peak memory in bytes that Python and NumPy allocate during `work`."""
     tracemalloc.start()
     try:
         work()

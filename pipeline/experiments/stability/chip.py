@@ -1,7 +1,4 @@
-"""Fields past a chip's range, and chips that break (PHYSICS 10). In: a scene's chip. Out: cases.
-
-The faults are those of real recordings. Refuses to know skins: fields are made up.
-"""
+"""Fields beyond a chip's range, and broken chips (PHYSICS 10); the faults are those of real recordings."""
 
 from functools import partial
 
@@ -24,7 +21,7 @@ FULL_TURN_N = 2**16
 
 
 def chip_cases(chip: ChipDesign, chips_n: int, seed: int) -> list[Case]:
-    """Try fields past int16 and past 50 mT, and a failed, a stuck and a reset chip on a board."""
+    """Fields beyond int16 and 50 mT, and a failed, a stuck and a reset chip on a board."""
     sound_uT = _still_board(chip, chips_n, seed)
     broken_i = min(BROKEN_I, chips_n - 1)
     return [
@@ -44,7 +41,7 @@ def _range() -> list[Case]:
 
 
 def out_of_range(b_uT: Float[np.ndarray, "n 3"], case: str, should: str, *, wrapped_n: int, clipped_n: int) -> Case:
-    """Read a field with a quiet chip at GAIN_SEL 7: held at 50 mT, whole turns of int16 taken off."""
+    """Read a field with a noiseless chip at GAIN_SEL 7: clipped at 50 mT, wrapped as int16."""
     read_uT, overruns = read_bare(b_uT * micro, quiet(7), rng_for(0, "stability", "range"))
     step_uT = steps_uT(7)
     truth_uT = b_uT.clip(-50e3, 50e3)

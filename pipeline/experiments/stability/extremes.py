@@ -1,7 +1,7 @@
-"""Skins and presses at the ends of what is allowed, against references.
+"""Skins and indentations at the limits of what is allowed, against references.
 
-A path of four times finer steps without tables, from the same slides; rings of pressure with the textbook's
-compliance of a sliding layer; magpylib's closed form of a magnetised box; and the exact scaling of lengths.
+References: four times finer steps without tables; rings of pressure with the textbook's compliance of a layer;
+magpylib's closed form of a magnetised box; and the exact scaling of lengths.
 """
 
 from dataclasses import asdict, replace
@@ -21,7 +21,7 @@ from reskin.physics.magnet import Quadrature, change_of_field, place_nodes
 from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, forces
 
 AREA = "physics"
-COARSE = Quadrature(cell_m=2.2e-3, layers_n=4)  # of both sides alike: steps and scaling are asked, not quadrature
+COARSE = Quadrature(cell_m=2.2e-3, layers_n=4)  # the same on both sides: steps and scaling are compared, not quadrature
 PLACE_M = np.array([2.3, -1.1]) * milli  # on no node's axis
 DEPTHS = (0.6, 0.66, slide.DEEPEST)  # of the thickness
 FINER = 4  # times the product's steps
@@ -35,7 +35,7 @@ THICKNESSES_MM = (0.2, 20.0)
 
 
 def extreme_cases(board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, seed: int) -> list[Case]:
-    """Try deep presses, sharp and blunt tips, near chips, thin and thick skins."""
+    """Deep indentations, sharp and blunt tips, near chips, thin and thick skins."""
     even = no_spread(spreads)
     drawn = draw_board(board, even, seed=seed, name="b0")
     one = draw_skin(skin, even, seed=seed, name="b0_s0", rule=COARSE)
@@ -43,7 +43,7 @@ def extreme_cases(board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, see
 
 
 def deep(board: Board, skin: Skin) -> list[Case]:
-    """Press as deep as forces are followed: dB by the product's tables against finer steps without any."""
+    """The deepest indentations: dB by tables against finer steps without tables."""
     cases = []
     for share in DEPTHS:
         depth_m = share * skin.thickness_m
@@ -51,7 +51,7 @@ def deep(board: Board, skin: Skin) -> list[Case]:
         fine_m = mechanics.descent(depth_m + skin.depth_zero_m, FINER * round(STEPS_N * share))
         moved = mechanics.followed(skin, PLACE_M, fine_m)
         truth_T = change_of_field((skin.nodes_m, skin.moments_A_m2), moved, board.chips_m)
-        error = _off(found_T, truth_T)
+        error = _error(found_T, truth_T)
         cases.append(
             measured(AREA, f"dB of a press to {share:g} of the thickness",
                      should=f"that of {FINER} times as many steps, without tables",
@@ -61,7 +61,7 @@ def deep(board: Board, skin: Skin) -> list[Case]:
 
 
 def tips(base: layer.Base) -> list[Case]:
-    """Press with sharp and blunt tips: force against rings of pressure on the textbook's layer."""
+    """Sharp and blunt tips: force against rings of pressure on the textbook's layer."""
     cases = []
     for size in SIZES:
         thickness_m, tip_m = 2 * milli, 2 * milli * size
@@ -82,9 +82,9 @@ def tips(base: layer.Base) -> list[Case]:
 def ring_force_N(
     depth_m: float, thickness_m: float, tip_radius_m: float, modulus_Pa: float, base: layer.Base, *, reach_m: float
 ) -> float:
-    """Give the force of a sphere on a layer by rings of even pressure: none pulls, and all that press touch it.
+    """Return the force of a sphere on a layer by rings of even pressure, which touch it or carry no pressure.
 
-    A ring sinks the surface by the Hankel integral of its pressure times the layer's compliance (Johnson 1985, 5.8):
+    The deflection by a ring is the Hankel integral of its pressure times the layer's compliance (Johnson 1985, 5.8):
     (cosh 2A - 1) / (sinh 2A + 2A) on a sliding base, (sinh 2A - 2A) / (cosh 2A + 2 A^2 + 1) on one that holds it.
     """
     edges_m = np.linspace(0, reach_m, RINGS_N + 1)
@@ -113,7 +113,7 @@ def ring_force_N(
 
 
 def near(skin: SkinDesign) -> list[Case]:
-    """Slide an evenly magnetised skin over nearer and nearer chips: dipoles on cells against a box in closed form."""
+    """A uniformly magnetised skin that slides over ever nearer chips: dipoles against a box in closed form."""
     cases, side_m, thickness_m = [], 20 * milli, skin.thickness_mm * milli
     j_T = np.array([0.6, -0.3, 1.0]) * skin.saturation_T
     box = magpylib.magnet.Cuboid(polarization=j_T, dimension=(side_m, side_m, thickness_m))
@@ -125,7 +125,7 @@ def near(skin: SkinDesign) -> list[Case]:
         found_T = magnet.field(slid_m, moments, chips_m) - magnet.field(nodes.nodes_m, moments, chips_m)
         middle_m = np.array([0.0, 0.0, thickness_m / 2])
         truth_T = box.getB(chips_m - middle_m - (SLID_M, 0.0, 0.0)) - box.getB(chips_m - middle_m)
-        error = _off(found_T, truth_T)
+        error = _error(found_T, truth_T)
         cases.append(
             measured(AREA, f"chips {gap_mm:g} mm under a skin that slides {SLID_M / milli:g} mm",
                      should=f"dB of a box in closed form (magpylib), with cells of {CELL_SHARE:g} of the gap",
@@ -135,15 +135,15 @@ def near(skin: SkinDesign) -> list[Case]:
 
 
 def scaled(board: Board, skin: Skin) -> list[Case]:
-    """Shrink and blow up everything: equal fields, forces as the square of lengths."""
+    """Everything scaled: equal fields, forces as the square of lengths."""
     poke_m = np.array([[*PLACE_M, 0.45 * skin.thickness_m]])
     (force_N,), (_, (change_T,)) = forces(skin, poke_m[:, 2]), changes_of_field(board, skin, poke_m)
     cases = []
     for thickness_mm in THICKNESSES_MM:
         by = thickness_mm * milli / skin.thickness_m
-        other, chips = resized(skin, by), replace(board, chips_m=board.chips_m * by)
+        other, chips = scale_skin(skin, by), replace(board, chips_m=board.chips_m * by)
         (other_N,), (_, (other_T,)) = forces(other, by * poke_m[:, 2]), changes_of_field(chips, other, by * poke_m)
-        error = max(_off(other_T, change_T), abs(float(other_N / (by**2 * force_N)) - 1))
+        error = max(_error(other_T, change_T), abs(float(other_N / (by**2 * force_N)) - 1))
         cases.append(
             measured(AREA, f"a skin of {thickness_mm:g} mm",
                      should="equal dB where all lengths scale, force as their square",
@@ -152,8 +152,8 @@ def scaled(board: Board, skin: Skin) -> list[Case]:
     return cases
 
 
-def resized(skin: Skin, by: float) -> Skin:
-    """Multiply every length of a skin; its material stays, so springs scale as lengths do."""
+def scale_skin(skin: Skin, by: float) -> Skin:
+    """Scale every length of a skin; its material stays, so springs scale as lengths."""
     hold = skin.hold
     if hold is not None:
         x_m, y_m = hold.give_m
@@ -169,5 +169,5 @@ def resized(skin: Skin, by: float) -> Skin:
     )  # fmt: skip
 
 
-def _off(found: Float[np.ndarray, "k 3"], truth: Float[np.ndarray, "k 3"]) -> float:
+def _error(found: Float[np.ndarray, "k 3"], truth: Float[np.ndarray, "k 3"]) -> float:
     return float(np.linalg.norm(found - truth) / np.linalg.norm(truth))

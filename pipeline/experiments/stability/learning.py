@@ -1,7 +1,4 @@
-"""What the extreme does to learning (PHYSICS 10). In: a seed. Out: cases, tried on small trainings of the real engine.
-
-Refuses to know simulated skins: rows are made up, in uT, mm and N. Leaks between folds are the audit's.
-"""
+"""Extreme cases of learning (PHYSICS 10), on small trainings with random data in uT, mm and N."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -36,12 +33,12 @@ RECIPE = Recipe(
 
 
 def learning_cases(seed: int) -> list[Case]:
-    """Try every extreme case of scalers, triplets, the loop and folds."""
+    """Run every extreme case of scalers, triplets, the training loop and folds."""
     return [*scaling_cases(seed), *triplet_cases(seed), *loop_cases(seed), *fold_cases()]
 
 
 def scaling_cases(seed: int) -> list[Case]:
-    """Try channels that never move, and labels of other scales."""
+    """Constant channels, and labels of other scales."""
     job, rows = _job(seed), _rows(seed)
     return [
         _constant(job, rows, [7], "a channel that never moves"),
@@ -51,20 +48,20 @@ def scaling_cases(seed: int) -> list[Case]:
 
 
 def triplet_cases(seed: int) -> list[Case]:
-    """Try readings that are all alike, and places that are all equally far."""
+    """Identical readings, and equidistant places."""
     job, rows = _job(seed), _rows(seed)
     return [_alike(job, rows), *_tied(job, rows)]
 
 
 def loop_cases(seed: int) -> list[Case]:
-    """Try rates and weights that overflow, a network that died, hardly any rows, and the same seed twice."""
+    """Overflowing rates and weights, a dead network, very few rows, and the same seed twice."""
     job, rows = _job(seed), _rows(seed)
     overflow = [_explodes(job, rows, 1e1), _explodes(job, rows, 1e10), _beside_one_that_overflows(job, rows)]
     return [*overflow, _collapsed(job, rows), *_few(job, rows), _again(job, rows)]
 
 
 def fold_cases() -> list[Case]:
-    """Ask for folds of more groups than there are."""
+    """Folds with more groups than exist."""
     boards = ["b1", "b2", "b3"]
     folds = {
         "one board, to be left out": ("lobo", boards[:1], Split()),

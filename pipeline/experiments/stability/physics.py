@@ -1,7 +1,4 @@
-"""Extreme skins, pokes, drags and times (PHYSICS 10). In: a scene's designs. Out: cases.
-
-Refuses to know chips' electronics and bytes.
-"""
+"""Extreme skins, indentations, drags and times (PHYSICS 10)."""
 
 from dataclasses import asdict, replace
 from functools import partial
@@ -12,7 +9,7 @@ from scipy.constants import kilo, micro, milli
 
 from pipeline.experiments.stability.cases import Case, measured, observed, peak_bytes, refused
 from pipeline.experiments.verification import mechanics, signals
-from pipeline.experiments.verification.checks import worst
+from pipeline.experiments.verification.checks import scaled_error
 from pipeline.experiments.verification.mechanics import force_N
 from pipeline.experiments.verification.signals import inside_a_box
 from reskin.physics import layer, magnet, shear
@@ -33,12 +30,12 @@ FLAGGED_DEPTH = 0.6  # of the thickness (PHYSICS 10)
 POKES_N = 2000
 BYTES_MAX_N = 1000  # a poke: 1e6 pokes in 1 GB, 120 bytes of each its result
 PATH_MM = (0.0, 0.1, 0.5, 4.0)  # of a drag
-STICKY = 1e6  # a friction that never lets go
+STICKY = 1e6  # friction without slip
 STIFF = signals.stiff(1e8)
 
 
 def time_cases() -> list[Case]:
-    """Try steps that no explicit integrator survives, steps of no length, and times that are none."""
+    """Steps that no explicit integrator survives, steps of zero length, and impossible times."""
     state = np.array([1 / 3, -2e-308, 7e15, 0.0, -0.1])
     same_n = int(np.count_nonzero(advance(state, 0.0, 0.0, SKIN_RELAXATION).view(np.int64) == state.view(np.int64)))
     return [
@@ -62,7 +59,7 @@ def _step(case: str, dt_over_fastest: float, should: str) -> Case:
 
 
 def physics_cases(board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, seed: int) -> list[Case]:
-    """Try a scene's first skin on its first board, and what else it might have been."""
+    """Extreme variants of a scene's first skin on its first board."""
     drawn = draw_board(board, spreads, seed=seed, name="b0")
 
     def skin_of(spread: Spreads = spreads, name: str = "b0_s0", **changes: float) -> Skin:
@@ -82,7 +79,7 @@ def physics_cases(board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, see
 
 
 def poke(board: Board, skin: Skin, share: float = DEPTH) -> Float[np.ndarray, "n k 3"]:
-    """Give dB of pokes to a share of the thickness."""
+    """Return dB of indentations to a share of the thickness."""
     return changes_of_field(board, skin, _pokes_m(skin, share))[1]
 
 
@@ -91,7 +88,7 @@ def _pokes_m(skin: Skin, share: float = DEPTH) -> Float[np.ndarray, "n 3"]:
 
 
 def modulus(board: Board, usual: Skin, soft: Skin, hard: Skin) -> list[Case]:
-    """Press skins of no stiffness and of a metal's: the depth is prescribed, so the modulus decides the grip alone."""
+    """Skins of no stiffness and of a metal's: the depth is prescribed, so the modulus only affects the friction."""
     free = replace(usual, hold=None)
     firm = usual if usual.hold is None else replace(usual, hold=replace(usual.hold, friction=1e12))
     free_T, firm_T, soft_T, hard_T = (poke(board, skin) for skin in (free, firm, soft, hard))
@@ -169,7 +166,7 @@ def place(board: Board, skin: Skin) -> list[Case]:
 
 def amplitude(board: Board, usual: Skin, bare: Skin, strong: Skin) -> list[Case]:
     once_T, bare_T, strong_T = (poke(board, skin) for skin in (usual, bare, strong))
-    error, left_T = worst(strong_T, 5 * once_T), float(np.abs(bare_T).max())
+    error, left_T = scaled_error(strong_T, 5 * once_T), float(np.abs(bare_T).max())
     return [
         observed(AREA, "a skin without magnetisation", should="dB exactly 0", happened=f"at most {left_T:g} T",
                  holds=left_T == 0),
@@ -184,7 +181,7 @@ def single_precision(board: Board, fine: Skin) -> Case:
     moved = mechanics.followed(fine, PLACES_M[0], depths_m)
     double_T = change_of_field(rest, moved, board.chips_m)
     x, m, moved_x, moved_m, chips = (part.astype(np.float32) for part in (*rest, *moved, board.chips_m))
-    # Node by node, as the product does: the difference of two large sums would lose more.
+    # Node by node, as the simulator does: the difference of two large sums would lose more digits.
     each_T = magnet.field_of_each(moved_x, moved_m, chips) - magnet.field_of_each(x, m, chips)
     single_T = each_T.sum(axis=1)
     error_uT = float(np.abs(single_T - double_T).max() / micro)
@@ -207,7 +204,7 @@ def memory(board: Board, skin: Skin) -> Case:
     pokes_m = np.column_stack(
         [rng.uniform(-8e-3, 8e-3, (4 * POKES_N, 2)), np.full(4 * POKES_N, DEPTH * skin.thickness_m)]
     )
-    changes_of_field(board, skin, pokes_m[:1])  # the table is made once for all
+    changes_of_field(board, skin, pokes_m[:1])  # the table is computed once for all
     few_n, many_n = (peak_bytes(partial(changes_of_field, board, skin, pokes_m[:n])) for n in (POKES_N, 4 * POKES_N))
     each_n = (many_n - few_n) / (3 * POKES_N)
     happened = (
@@ -219,7 +216,7 @@ def memory(board: Board, skin: Skin) -> Case:
 
 
 def drag_cases(skin: SkinDesign) -> list[Case]:
-    """Drag the tip along a line without friction, and with a friction that never lets go."""
+    """Drags along a line without friction, and without slip."""
     press = IndentedLayer(skin.thickness_mm * milli, skin.tip_radius_mm * milli, skin.base)
     depth_m, modulus_Pa = DEPTH * press.thickness_m, skin.modulus_kPa * kilo
     stiffness = modulus_Pa / 3 * shear.tabulate_depth(depth_m, **asdict(press)).stiffness_m

@@ -1,7 +1,7 @@
-"""A skin that slides on its base, at the edges of what it is made for (PHYSICS 10). In: a scene's designs. Out: cases.
+"""Extreme cases of a skin that slides on its base (PHYSICS 10).
 
-Stick-slip without friction and with great friction, a tip that lifts while the skin is pulled, pokes at the free edge,
-presses under force control. Refuses to know the layer (`physics`), chips' electronics and bytes.
+Drags with almost no and with very high friction, a tip that lifts while it drags, indentations at the free edge, and
+force control.
 """
 
 from dataclasses import replace
@@ -21,9 +21,9 @@ from reskin.simulation.contact import TangentialResponse, drag_tip
 
 AREA = "physics"
 DEPTH = 0.35  # of the thickness: the deepest drag of a scene, and the steepest shear
-PLACE_M = np.array([5.0, -3.0]) * milli  # from the skin's middle: there a pull turns it too
+PLACE_M = np.array([5.0, -3.0]) * milli  # from the skin's centre: there a drag rotates it too
 WAY_M = np.array([0.0, 0.05, 0.2, 0.5]) * milli
-HELD_M = 0.1 * milli  # how far a tip that then lifts has gone
+HELD_M = 0.1 * milli  # displacement of a tip that then lifts
 LIFTS_N = (3, 30)  # stops on the way up
 EDGE_M = 0.1 * milli  # inside the skin's edge
 STICKY, SMOOTH = 10.0, 1e-9
@@ -32,7 +32,7 @@ PRESSES = np.concatenate([[0.0], np.geomspace(1e-6, slide.DEEPEST, 400)])  # of 
 
 
 def sliding_cases(board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, seed: int) -> list[Case]:
-    """Try a skin without spreads on the first board; none where no base holds the skin by springs."""
+    """Cases of a skin without spreads on the first board; none if the base does not hold it by springs."""
     if skin.hold is None:
         return []
     even = no_spread(spreads)
@@ -42,17 +42,17 @@ def sliding_cases(board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, see
 
 
 def stick_slip(board: Board, skin: Skin) -> list[Case]:
-    """Drag with hardly any friction, which slips at once, and with one that does not let go."""
+    """Drags with almost no friction, which slip at once, and without slip."""
     path_m = _path(skin, skin.seat_m + PLACE_M, WAY_M, np.full(len(WAY_M), DEPTH))
     normal_N = forces(skin, path_m[:, 2])
-    smooth, sticky = (_pushed(board, skin, path_m, mu) for mu in (SMOOTH, STICKY))
+    smooth, sticky = (_drag(board, skin, path_m, mu) for mu in (SMOOTH, STICKY))
     assert skin.hold is not None
-    slippery = replace(skin, hold=replace(skin.hold, friction=SMOOTH))  # a press slides it by as little as a drag
+    slippery = replace(skin, hold=replace(skin.hold, friction=SMOOTH))  # pressing slides it as little as dragging
     _, pressed_T = changes_of_field(board, slippery, path_m)
     drawn_N = np.linalg.norm(smooth.force_N[0], axis=1)
     off_N = float(np.abs(drawn_N[1:] / (SMOOTH * normal_N[1:]) - 1).max())
     off_T = float(np.abs(smooth.change_T[0] - pressed_T).max() / np.abs(pressed_T).max())
-    # What sticks follows the tip: layer and springs, one after the other, take the whole way up.
+    # Without slip, layer and springs in series take up the whole path.
     pulled_N = sticky.force_N[0]
     slides_m_per_N = slide.compliance_m_per_N(path_m[:, :2] - skin.seat_m, skin.sides_m, _springs(skin))
     taken_m = pulled_N / _layer_N_per_m(skin, DEPTH) + (slides_m_per_N @ pulled_N[:, :, None])[:, :, 0]
@@ -71,16 +71,16 @@ def stick_slip(board: Board, skin: Skin) -> list[Case]:
 
 
 def lift(board: Board, skin: Skin) -> Case:
-    """Pull a skin by its middle, then lift the tip there: what friction still holds falls with the normal force."""
+    """Drag a skin at its centre, then lift the tip: the friction force falls with the normal force."""
     mu, errors, last_N = 1.0, [], []
     for stops_n in LIFTS_N:
         share = np.append(DEPTH, np.linspace(DEPTH, 0, stops_n + 1))
         way_m = np.append(0.0, np.full(stops_n + 1, HELD_M))
         path_m = _path(skin, skin.seat_m, way_m, share)
-        pulled_N = _pushed(board, skin, path_m, mu).force_N[0]
+        pulled_N = _drag(board, skin, path_m, mu).force_N[0]
         limit_N = mu * forces(skin, path_m[:, 2])
         layers_N_per_m = np.array([_layer_N_per_m(skin, part) for part in share[1:-1]])
-        give_m_per_N = 1 / layers_N_per_m + 1 / _springs(skin)  # at the middle a pull turns nothing
+        give_m_per_N = 1 / layers_N_per_m + 1 / _springs(skin)  # at the centre a drag does not rotate the skin
         reach_m = np.minimum.accumulate(np.minimum(HELD_M, limit_N[1:-1] * give_m_per_N))
         errors.append(np.abs(pulled_N[1:-1, 0] - reach_m / give_m_per_N).max() / limit_N[0])
         last_N.append(np.abs(pulled_N[-1]).max())
@@ -93,7 +93,7 @@ def lift(board: Board, skin: Skin) -> Case:
 
 
 def edge(board: Board, skin: Skin) -> list[Case]:
-    """Poke just inside the free edge, at the middle of a side and at a corner."""
+    """Indent just inside the free edge, at the middle of a side and at a corner."""
     half_m = np.array(skin.sides_m) / 2 - EDGE_M
     places_m = np.array([[half_m[0], 0.0], half_m])
     pokes_m = np.column_stack([skin.seat_m + places_m, np.full(2, 0.3 * skin.thickness_m)])
@@ -104,10 +104,10 @@ def edge(board: Board, skin: Skin) -> list[Case]:
         pokes_m[:, 2], modulus_Pa=1.0, thickness_m=skin.thickness_m, tip_radius_m=skin.tip_radius_m
     )
     load = np.minimum(force_N / (skin.modulus_Pa * skin.hold.lets_go_m2), 1.0)
-    asked_m = slide.press_displacement_m(places_m, load, give_m=skin.hold.give_m, away=skin.hold.away)
-    went_m = slides.move_m + slides.spin_rad[:, None] * np.stack([-places_m[:, 1], places_m[:, 0]], axis=1)
-    share = (went_m * asked_m).sum(axis=1) / (asked_m**2).sum(axis=1)
-    off = float(np.abs(went_m - share[:, None] * asked_m).max() / np.abs(asked_m).max())
+    wanted_m = slide.press_displacement_m(places_m, load, give_m=skin.hold.give_m, away=skin.hold.away)
+    moved_m = slides.move_m + slides.spin_rad[:, None] * np.stack([-places_m[:, 1], places_m[:, 0]], axis=1)
+    share = (moved_m * wanted_m).sum(axis=1) / (wanted_m**2).sum(axis=1)
+    off = float(np.abs(moved_m - share[:, None] * wanted_m).max() / np.abs(wanted_m).max())
     used = skin.hold.grip_N_per_m * np.hypot(*slides.move_m.T) / force_N
     sizes_uT = ", ".join(f"{1e6 * size:.3g}" for size in np.abs(change_T).max(axis=(1, 2)))
     return [
@@ -126,7 +126,7 @@ def edge(board: Board, skin: Skin) -> list[Case]:
 
 
 def force_control(skin: Skin) -> list[Case]:
-    """Press and let go by force: the depth that a force has is the same on the way up, and back."""
+    """Force control: the depth of a force is the same on loading and unloading."""
     assert skin.hold is not None
     of = {"modulus_Pa": skin.modulus_Pa, "thickness_m": skin.thickness_m, "tip_radius_m": skin.tip_radius_m}
     depth_m = skin.thickness_m * np.concatenate([PRESSES, PRESSES[::-1]])
@@ -145,7 +145,7 @@ def force_control(skin: Skin) -> list[Case]:
     ]  # fmt: skip
 
 
-def _pushed(board: Board, skin: Skin, path_m: Float[np.ndarray, "p 3"], mu: float) -> TangentialResponse:
+def _drag(board: Board, skin: Skin, path_m: Float[np.ndarray, "p 3"], mu: float) -> TangentialResponse:
     return drag_tip(board, skin, path_m[None], tilt=np.zeros((1, 2)), how=Friction(coefficient=mu))
 
 

@@ -1,7 +1,4 @@
-"""Broken streams (PHYSICS 10). In: frames, and what is done to their bytes. Out: cases, for every wire format.
-
-What comes back is compared with what the whole stream gave. Refuses to know chips' faults (`chip`).
-"""
+"""Damaged streams of every wire format (PHYSICS 10), compared with the intact stream."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -21,30 +18,30 @@ from reskin.seeds import rng_for
 AREA = "wire"
 FRAMES_N = 40
 CUT_I = 20  # the frame in which a stream is damaged
-RUBBISH = b"\r\n\0\xff9.99\t\n" * 5
+GARBAGE = b"\r\n\0\xff9.99\t\n" * 5
 BLOCKS_N = 3  # and four times as many
 
 
 @dataclass(frozen=True)
 class Damage:
-    """What a stream has become, and what that may cost; all bytes must be accounted for in any case."""
+    """A damaged stream, and the losses allowed; all bytes must be accounted for in any case."""
 
     case: str
     should: str
     portions: Sequence[bytes]
     lost_n: int = 0
     false_n: int = 0
-    not_finite_n: int | None = 0  # exactly; None where garbage may look like a frame with NaN in it
+    not_finite_n: int | None = 0  # exactly; None where garbage may look like a frame with NaN
 
 
 def wire_cases(gain_sel: int, chips_n: int, seed: int) -> list[Case]:
-    """Damage a stream in every way, in every wire format, and count what comes back."""
+    """Damage a stream in every way, in every wire format, and count the decoded frames."""
     frames = make_frames(FRAMES_N, chips_n, gain_sel=gain_sel, rng=rng_for(seed, "stability", "wire"))
     full = replace(frames, temperature_degC=np.full_like(frames.temperature_degC, CRLF_degC))
     wires = get_args(Wire)
     return [
-        *(suffer(damage, frames, wire) for wire in wires for damage in _damages(frames, wire)),
-        *(suffer(joined(full, wire, 0.5), full, wire) for wire in wires if wire not in TEXT_WIRES),
+        *(decode_damaged(damage, frames, wire) for wire in wires for damage in _damages(frames, wire)),
+        *(decode_damaged(joined(full, wire, 0.5), full, wire) for wire in wires if wire not in TEXT_WIRES),
         *_refusals(frames),
         *(_memory(frames, wire) for wire in ("binary", "text-xyzt")),
     ]
@@ -63,7 +60,7 @@ def _damages(frames: Frames, wire: Wire) -> list[Damage]:
                "at most one false frame: no format has a checksum or a counter, so nothing tells it from a true one",
                [whole[:middle] + whole[same:]], lost_n=2, false_n=1),
         Damage("rubbish inside a frame", "no more than two lost, all bytes accounted for",
-               [whole[:middle], RUBBISH, whole[middle:]], lost_n=2),
+               [whole[:middle], GARBAGE, whole[middle:]], lost_n=2),
         Damage("byte by byte", "the same frames as in one piece", [whole[i : i + 1] for i in range(len(whole))]),
         Damage("NaN in one frame, Inf in another", "both lost, counted as not finite", [_with_not_finite(frames, wire)],
                lost_n=2, not_finite_n=2),
@@ -71,15 +68,15 @@ def _damages(frames: Frames, wire: Wire) -> list[Damage]:
 
 
 def joined(frames: Frames, wire: Wire, where: float) -> Damage:
-    """Join a stream of sound frames at a part of its first frame."""
+    """Start reading a stream inside its first frame."""
     data = encode(frames, wire)
     first_end = _clean(data, wire, frames).end_byte.tolist()[0]
     case, should = "CR LF inside every temperature, joined in the middle", "in step again: that frame lost, no other"
     return Damage(case, should, [data[int(where * first_end) :]], lost_n=1)
 
 
-def suffer(damage: Damage, frames: Frames, wire: Wire) -> Case:
-    """Deliver what a stream has become, and count the frames that are lost and false, and the bytes."""
+def decode_damaged(damage: Damage, frames: Frames, wire: Wire) -> Case:
+    """Decode a damaged stream, and count lost frames, false frames and bytes."""
     kept, account = deliver(damage.portions, wire, frames.temperature_degC.shape[1])
     sent, got = (Counter(records(of)) for of in (_clean(encode(frames, wire), wire, frames), kept))
     missing_n, false_n = (sent - got).total(), (got - sent).total()
@@ -146,12 +143,12 @@ def _clean(data: bytes, wire: Wire, frames: Frames) -> Frames:
 
 
 def deliver(portions: Sequence[bytes], wire: Wire, chips_n: int) -> tuple[Frames, dict[str, int]]:
-    """Feed a stream in portions; give its frames and its account."""
+    """Decode a stream in portions; return frames and counts."""
     stream = FrameStream(wire, chips_n)
     parts = [stream.feed(portion) for portion in portions]
     return concatenate([*parts, stream.close()], chips_n), stream.account()
 
 
 def records(frames: Frames) -> list[bytes]:
-    """Give the values of each frame as bytes, to be compared and counted."""
+    """Return the values of each frame as bytes, for comparison."""
     return [row.tobytes() for row in np.hstack([frames.temperature_degC, frames.b_uT])]

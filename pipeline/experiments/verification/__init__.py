@@ -1,4 +1,4 @@
-"""Each law of the simulator against a reference that shares no code with it."""
+"""Verification of the simulator: each part against a reference that shares no code with it."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -6,7 +6,12 @@ from pathlib import Path
 from scipy.constants import milli
 
 from pipeline.experiments.verification.checks import Check
-from pipeline.experiments.verification.mechanics import check_contact, check_kinematics, check_poke, check_sideways
+from pipeline.experiments.verification.mechanics import (
+    check_contact,
+    check_indentations,
+    check_kinematics,
+    check_sideways,
+)
 from pipeline.experiments.verification.signals import check_electronics, check_field, check_frames, check_relaxation
 from pipeline.settings import Settings
 from pipeline.simulation import simulation_settings
@@ -17,7 +22,7 @@ from reskin.simulation.settings import SimulationSettings
 
 
 def verify(of: SimulationSettings, *, depths_m: tuple[float, ...], seed: int) -> list[Check]:
-    """Measure every law against its reference, for the designs of a scene, in the order of the simulator's chain."""
+    """Compare every part of the simulator with its reference, for the settings of a scene."""
     board, skin = of.main_boards, of.skin
     press = IndentedLayer(skin.thickness_mm * milli, skin.tip_radius_mm * milli, skin.base)
     rule = board.quadrature.in_si()
@@ -26,7 +31,7 @@ def verify(of: SimulationSettings, *, depths_m: tuple[float, ...], seed: int) ->
         *check_contact(skin),
         *check_kinematics(press, max(depths_m)),
         *check_sideways(skin),
-        *check_poke(board.design, of.spreads, skin=skin, rule=rule, depths_m=depths_m, seed=seed),
+        *check_indentations(board.design, of.spreads, skin=skin, rule=rule, depths_m=depths_m, seed=seed),
         *check_relaxation(),
         *check_electronics(of.chip, seed),
         *check_frames(of.chip.gain_sel, len(board.design.places_mm), seed),
@@ -34,7 +39,7 @@ def verify(of: SimulationSettings, *, depths_m: tuple[float, ...], seed: int) ->
 
 
 def verification(settings: Settings, results: Path) -> None:
-    """Check the scene's own skins, pokes and chips."""
+    """Check the scene's own skins, indentations and chips, and write the table."""
     of = simulation_settings(settings)
     checks = verify(of, depths_m=tuple(milli * depth_mm for depth_mm in of.main.depths_mm), seed=settings.seed)
     io.write_json(results, [asdict(check) | {"holds": check.holds} for check in checks])

@@ -1,7 +1,6 @@
-"""One row of the verification table: a law of the product, its error against a reference, and what that may be.
+"""A row of the verification table, and the error measures that its checks use.
 
-Laws (the modules beside this one) return it for any inputs: the stage tabulates those of a scene, tests draw others.
-Refuses to know what is checked.
+The modules beside this one return checks for any inputs: the experiment tabulates those of a scene, tests draw others.
 """
 
 from dataclasses import dataclass
@@ -14,43 +13,43 @@ from reskin.physics.board import Spreads
 
 @dataclass(frozen=True)
 class Check:
-    """A law of `subject` against a reference: the measured error, what it may be, and why so much."""
+    """A property of `subject` compared with a reference: measured error, tolerance and the reason for the tolerance."""
 
     subject: str
     law: str
     against: str
     error: float
-    unit: str  # "1" for an error relative to the size of the reference
+    unit: str  # "1" for a relative error
     tolerance: float
     reason: str
 
     @property
     def holds(self) -> bool:
-        """Tell whether the error is within its tolerance; NaN is not."""
+        """Whether the error is within its tolerance; False for NaN."""
         return bool(self.error <= self.tolerance)
 
 
-def farthest(found: Float[np.ndarray, "*any"], truth: Float[np.ndarray, "*any"] | float) -> float:
-    """Give the largest deviation, in the unit of both."""
+def max_error(found: Float[np.ndarray, "*any"], truth: Float[np.ndarray, "*any"] | float) -> float:
+    """Return the largest absolute error."""
     return float(np.abs(found - truth).max())
 
 
-def relative(found: Float[np.ndarray, "*any"], truth: Float[np.ndarray, "*any"]) -> float:
-    """Give the largest deviation, each relative to its own truth."""
+def relative_error(found: Float[np.ndarray, "*any"], truth: Float[np.ndarray, "*any"]) -> float:
+    """Return the largest relative error."""
     return float(np.abs(found / truth - 1).max())
 
 
-def worst(found: Float[np.ndarray, "*any"], truth: Float[np.ndarray, "*any"]) -> float:
-    """Give the largest deviation, relative to the largest size of the truth."""
+def scaled_error(found: Float[np.ndarray, "*any"], truth: Float[np.ndarray, "*any"]) -> float:
+    """Return the largest absolute error over the largest absolute true value."""
     return float(np.abs(found - truth).max() / np.abs(truth).max())
 
 
-def apart(found: Float[np.ndarray, "*any"], truth: Float[np.ndarray, "*any"]) -> float:
-    """Give the deviation of all values together (root of the sum of squares), relative to the truth's."""
+def norm_error(found: Float[np.ndarray, "*any"], truth: Float[np.ndarray, "*any"]) -> float:
+    """Return the Euclidean norm of the errors over that of the true values."""
     return float(np.linalg.norm(found - truth) / np.linalg.norm(truth))
 
 
 def no_spread(spreads: Spreads) -> Spreads:
-    """Take away all that differs between boards and between skins: the designs themselves, for laws of symmetry."""
+    """Return spreads of zero: boards and skins as designed, for checks of symmetry."""
     length = "skin_filler_length_mm"
     return spreads.model_copy(update={name: 0.0 for name in Spreads.model_fields if name != length})

@@ -1,6 +1,6 @@
-"""Laws of contact, force and friction, against closed forms, published fits and rings of pressure. Out: checks.
+"""Checks of contact, force, friction, deformation and dB of indentations.
 
-Refuses to know magnets, and where the material goes (`kinematics`).
+References: closed forms, published fits, rings of pressure, finite differences, finer steps, and symmetries.
 """
 
 from collections.abc import Callable
@@ -14,7 +14,14 @@ from scipy.constants import kilo, micro, milli
 from scipy.integrate import quad
 from scipy.special import ellipe, ellipk, j0, j1
 
-from pipeline.experiments.verification.checks import Check, apart, farthest, no_spread, relative, worst
+from pipeline.experiments.verification.checks import (
+    Check,
+    max_error,
+    no_spread,
+    norm_error,
+    relative_error,
+    scaled_error,
+)
 from pipeline.experiments.verification.signals import TURN, field_of
 from reskin.data.grid import CENTRE_MM, protocol
 from reskin.physics import deformation, layer, shear, slide
@@ -23,8 +30,8 @@ from reskin.physics.layer import IndentedLayer
 from reskin.physics.magnet import Dipoles, Polarity, Quadrature
 from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, press_motion
 
-HALF_SPACE_M = 100.0  # a layer that a tip of millimetres does not feel the base of
-HELD_BACK = 1.770  # integral of 1 - compliance (PHYSICS 4; Dimitriadis et al. 2002 fit 1.780)
+HALF_SPACE_M = 100.0  # thickness of a layer whose base does not matter under a tip of millimetres
+A0 = 1.770  # integral of 1 - compliance (PHYSICS 4; Dimitriadis et al. 2002 fit 1.780)
 BONDED = (1.0, 1.133, 1.283, 0.769, 0.0975)  # Dimitriadis et al. 2002, powers of chi = sqrt(R d) / h
 RINGS_N = 40
 SKIN_FORCE = "force of the skin"
@@ -33,12 +40,12 @@ BONDED_KH, SLIDING_KH = np.geomspace(1e-3, 300, 60), np.geomspace(0.01, 30, 12)
 
 
 def check_contact(skin: SkinDesign) -> list[Check]:
-    """Check the layer's compliance, the force down to the published solutions' 0.6 of the thickness, and friction."""
+    """Check the layer's compliance, and the force down to 0.6 of the thickness, the range of published solutions."""
     bonded = IndentedLayer(skin.thickness_mm * milli, skin.tip_radius_mm * milli, "bonded")
     sliding = IndentedLayer(bonded.thickness_m, bonded.tip_radius_m, "slipping")
     depth_m = layer.VERIFIED_DEPTH * bonded.thickness_m * np.arange(1, 7) / 6
     return [
-        bonded_compliance(), held_back(),
+        bonded_compliance(), compliance_integral(),
         sliding_compliance(), hertz("slipping", bonded.tip_radius_m),
         hertz("bonded", bonded.tip_radius_m), *sneddon(bonded.tip_radius_m * np.array([0.1, 0.3, 0.7]), bonded),
         dimitriadis(depth_m, bonded), long_2011(depth_m, bonded),
@@ -48,12 +55,12 @@ def check_contact(skin: SkinDesign) -> list[Check]:
 
 
 def force_N(depth_m: Float[np.ndarray, " n"], press: IndentedLayer, modulus_Pa: float = 1.0) -> Float[np.ndarray, " n"]:
-    """Give the product's force, for 1 Pa unless said."""
+    """Return the simulator's force, by default for 1 Pa."""
     return layer.force(depth_m, **asdict(press), modulus_Pa=modulus_Pa)
 
 
 def hertz_N(depth_m: Float[np.ndarray, " n"], tip_m: float) -> Float[np.ndarray, " n"]:
-    """Give Hertz's force on an incompressible half-space of 1 Pa: 16/9 E sqrt(R) d^1.5."""
+    """Return Hertz's force on an incompressible half-space of 1 Pa: 16/9 E sqrt(R) d^1.5."""
     return 16 / 9 * np.sqrt(tip_m) * depth_m**1.5
 
 
@@ -64,13 +71,13 @@ def bonded_compliance(kh: Float[np.ndarray, " w"] = BONDED_KH) -> Check:
             for a in map(mpmath.mpf, kh.tolist())
         ]
     return Check("bonded layer", "compliance, kh 1e-3-300", "its formula in 50 digits (mpmath)",
-                 relative(layer.bonded_compliance(kh), np.array(truth)), "1", 3e-12,
+                 relative_error(layer.bonded_compliance(kh), np.array(truth)), "1", 3e-12,
                  "the series' next term, and 1 - 1 + ... at kh = 1/4, which costs 3 digits")  # fmt: skip
 
 
-def held_back() -> Check:
+def compliance_integral() -> Check:
     missing, _ = quad(lambda a: 1 - layer.bonded_compliance(np.array([a]))[0], 0, 40)
-    return Check("bonded layer", "a0: what a half-space lacks adds up", f"{HELD_BACK:.3f}", abs(missing - HELD_BACK),
+    return Check("bonded layer", "a0: what a half-space lacks adds up", f"{A0:.3f}", abs(missing - A0),
                  "1", 5e-4, "three printed decimals")  # fmt: skip
 
 
@@ -78,7 +85,7 @@ def sliding_compliance(kh: Float[np.ndarray, " w"] = SLIDING_KH) -> Check:
     with mpmath.workdps(50):
         truth = [float(dense_profile(mpmath.mpf(a))(mpmath.mpf(a))) for a in kh.tolist()]
     return Check("sliding layer", "compliance, kh 0.01-30", "a dense solve of four conditions, 50 digits (mpmath)",
-                 relative(layer.slipping_compliance(kh), np.array(truth)), "1", 1e-12,
+                 relative_error(layer.slipping_compliance(kh), np.array(truth)), "1", 1e-12,
                  "rounding, 1 - 1 + ... at small kh")  # fmt: skip
 
 
@@ -98,7 +105,7 @@ def hertz(base: layer.Base, tip_m: float) -> Check:
                    "d / R, 1e-5; the curve is a spline"),
         "slipping": ("Hertz's, on a sliding base too", "as on a bonded one"),
     }[base]  # fmt: skip
-    error = relative(force_N(depth_m, IndentedLayer(HALF_SPACE_M, tip_m, base)), hertz_N(depth_m, tip_m))
+    error = relative_error(force_N(depth_m, IndentedLayer(HALF_SPACE_M, tip_m, base)), hertz_N(depth_m, tip_m))
     return Check("force, thick layer", law, "16/9 E sqrt(R) d^1.5 (Hertz 1882)", error, "1", 1e-4, reason)
 
 
@@ -112,8 +119,8 @@ def sneddon(radii_m: Float[np.ndarray, " n"], press: IndentedLayer) -> list[Chec
     found_m = np.array([contact.depth_m for contact in contacts])
     law, base = "a sphere's, contact radius to 0.7 R", "the base is felt as a / h, 2e-5"
     return [
-        Check("force, thick layer", law, "Sneddon 1965", relative(found_N, sneddon_N), "1", 1e-4, base),
-        Check("depth, thick layer", law, "Sneddon 1965", relative(found_m, radii_m * log / 2), "1", 1e-4, base),
+        Check("force, thick layer", law, "Sneddon 1965", relative_error(found_N, sneddon_N), "1", 1e-4, base),
+        Check("depth, thick layer", law, "Sneddon 1965", relative_error(found_m, radii_m * log / 2), "1", 1e-4, base),
     ]
 
 
@@ -125,7 +132,7 @@ def dimitriadis(depth_m: Float[np.ndarray, " n"], press: IndentedLayer) -> Check
     chi = np.sqrt(press.tip_radius_m * depth_m) / press.thickness_m
     bonded_N = hertz_N(depth_m, press.tip_radius_m) * np.polynomial.polynomial.polyval(chi, BONDED)
     return Check(SKIN_FORCE, _to_depths(depth_m), "Dimitriadis et al. 2002, bonded",
-                 relative(force_N(depth_m, press), bonded_N), "1", 0.10,
+                 relative_error(force_N(depth_m, press), bonded_N), "1", 0.10,
                  "a series in chi = sqrt(R d) / h, from chi^2 on low: 8 % at chi = 0.5 against rings of pressure"
                  )  # fmt: skip
 
@@ -136,7 +143,7 @@ def long_2011(depth_m: Float[np.ndarray, " n"], press: IndentedLayer) -> Check:
     alpha, beta = 10.05 - 0.63 * np.sqrt(flat) * (3.1 + flat**2), 4.8 - 4.23 * flat**2
     psi = (1 + 2.3 * omega) / (1 + 1.15 * np.cbrt(omega) + alpha * omega + beta * omega**2)
     return Check(SKIN_FORCE, _to_depths(depth_m), "Long et al. 2011",
-                 relative(force_N(depth_m, press), hertz_N(depth_m, tip_m) / psi), "1", 0.05,
+                 relative_error(force_N(depth_m, press), hertz_N(depth_m, tip_m) / psi), "1", 0.05,
                  "a fit to finite elements of large deformation, made for 0.3 <= R/h <= 12.7, d/h <= 0.6")  # fmt: skip
 
 
@@ -149,17 +156,17 @@ def rings(depth_m: float, press: IndentedLayer) -> Check:
 
 
 def ring_pressures(depth_m: float, press: IndentedLayer) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " p"]]:
-    """Give the edges of the rings over the product's contact, and their pressures for 1 Pa."""
+    """Return the edges of rings over the simulator's contact, and their pressures for 1 Pa, by collocation."""
     h_m, tip_m, radius_m = press.thickness_m, press.tip_radius_m, press.contact(depth_m).radius_m
     edges_m = radius_m * np.linspace(0, 1, RINGS_N + 1)
     middles_m = (edges_m[1:] + edges_m[:-1]) / 2
-    discs_m = np.array([[_sinking_m(r, edge, h_m, press.base) for edge in edges_m[1:]] for r in middles_m])
+    discs_m = np.array([[_disc_deflection_m(r, edge, h_m, press.base) for edge in edges_m[1:]] for r in middles_m])
     rings_m = np.diff(discs_m, axis=1, prepend=0.0)
     return edges_m, np.linalg.solve(rings_m, depth_m - (tip_m - np.sqrt(tip_m**2 - middles_m**2)))
 
 
-def _sinking_m(r_m: float, disc_m: float, h_m: float, base: layer.Base) -> float:
-    # Under unit pressure / 2G on a disc: that of a half-space (elliptic integrals) less the hold of the base.
+def _disc_deflection_m(r_m: float, disc_m: float, h_m: float, base: layer.Base) -> float:
+    # Under unit pressure / 2G on a disc: that of a half-space (elliptic integrals) less the effect of the base.
     m = (min(r_m, disc_m) / max(r_m, disc_m)) ** 2
     free = 2 / np.pi * max(r_m, disc_m) * (ellipe(m) if r_m <= disc_m else ellipe(m) - (1 - m) * ellipk(m))
     k = np.linspace(1e-3, 25, 1500) / h_m
@@ -174,17 +181,17 @@ def scaling(depth_m: Float[np.ndarray, " n"], press: IndentedLayer, modulus_Pa: 
     exact_N = [4 * np.pi / 3 * press.contact(float(d)).weights_m2.sum() for d in depth_m]
     return [
         Check(SKIN_FORCE, "proportional to E", "itself, at 1 Pa",
-              worst(force_N(depth_m, press, modulus_Pa), modulus_Pa * once_N), "1", 1e-13, "rounding"),
+              scaled_error(force_N(depth_m, press, modulus_Pa), modulus_Pa * once_N), "1", 1e-13, "rounding"),
         Check(SKIN_FORCE, "three times the size, nine times the force", "itself, scaled",
-              worst(force_N(3 * depth_m, larger), 9 * once_N), "1", 1e-9,
+              scaled_error(force_N(3 * depth_m, larger), 9 * once_N), "1", 1e-9,
               "the spline's knots are found by a root search to 1e-12"),
         Check(SKIN_FORCE, "the curve passes through each contact", "the contact itself",
-              worst(once_N, np.array(exact_N)), "1", 1e-6, "a cubic spline over 48 contacts"),
+              scaled_error(once_N, np.array(exact_N)), "1", 1e-6, "a cubic spline over 48 contacts"),
     ]  # fmt: skip
 
 
 def check_sideways(skin: SkinDesign) -> list[Check]:
-    """Check the stiffness of a thick layer and the friction along a straight drag."""
+    """Check the tangential stiffness of a thick layer and the friction along a straight drag."""
     tip_m, modulus_Pa = skin.tip_radius_mm * milli, skin.modulus_kPa * kilo
     radius_m = 0.1 * tip_m
     limit_N, stiffness = FRICTION * modulus_Pa * radius_m**2, modulus_Pa * radius_m
@@ -225,13 +232,13 @@ HELD = {"bonded": "stays", "slipping": "keeps its height"}
 
 
 def check_kinematics(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
-    """Check one linear step and the whole flow down to a depth."""
-    far = far_out(press, depth_m) if press.base == "slipping" else []
-    return [*one_small_step(press, depth_m), *whole_flow(press, depth_m), *sunken_surface(press, depth_m), *far]
+    """Check one linear step, and the deformation down to a depth."""
+    far = far_field(press, depth_m) if press.base == "slipping" else []
+    return [*one_small_step(press, depth_m), *finite_deformation(press, depth_m), *sunken_surface(press, depth_m), *far]
 
 
 def descent(depth_m: float, steps_n: int = STEPS_N) -> Float[np.ndarray, " d"]:
-    """List depths from 0 in even steps, the first cut in four and in two, where the contact grows as the root."""
+    """List depths from 0 in even steps; the first is cut in four and in two, as the contact radius grows as a root."""
     even = np.linspace(0, depth_m, steps_n + 1)
     return np.concatenate([[0.0, even[1] / 4, even[1] / 2], even[1:]])
 
@@ -252,12 +259,12 @@ def one_small_step(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
     name, differences = "one small step", "central differences over 0.1 um"
     length = "of strains near 1: step squared over length squared"
     return [
-        Check(name, "div u = 0", differences, farthest(numeric[0] + numeric[3] + numeric[4], 0.0), "1", 1e-6, length),
-        Check(name, "gradient of u", differences, farthest(np.stack([u.r_r, u.z_r, u.r_z, u.z_z, u.hoop]), numeric),
+        Check(name, "div u = 0", differences, max_error(numeric[0] + numeric[3] + numeric[4], 0.0), "1", 1e-6, length),
+        Check(name, "gradient of u", differences, max_error(np.stack([u.r_r, u.z_r, u.r_z, u.z_z, u.hoop]), numeric),
               "1", 1e-6, length),
         Check(name, f"the {press.base} base {HELD[press.base]}", "0 m", _off(base.r_m, base.z_m, press), "m", 1e-17,
               "rounding: 1e-14 of the depth"),
-        Check(name, "the surface lies on the tip", "a sphere", farthest(sunken.z_m, sphere_m) / depth_m,
+        Check(name, "the surface lies on the tip", "a sphere", max_error(sunken.z_m, sphere_m) / depth_m,
               "of the depth", 0.005, "waves shorter than 1/6 of the thickness are cut"),
     ]  # fmt: skip
 
@@ -266,11 +273,11 @@ def _off(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"], press: laye
     return float(np.abs([z_m] if press.base == "slipping" else [r_m, z_m]).max())
 
 
-def whole_flow(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
+def finite_deformation(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
     h_m = press.thickness_m
     r_m, z_m = _places(h_m, 25, 11)
     inside = len(r_m)
-    # The places, their neighbours for finite differences, and the base: one flow for all of them.
+    # The places, their neighbours for finite differences, and the base are followed together.
     shifts = [(0.0, 0.0), (STEP_M, 0.0), (-STEP_M, 0.0), (0.0, STEP_M), (0.0, -STEP_M)]
     base_m = np.linspace(0, 4 * h_m, 40)
     all_r_m = np.concatenate([*(r_m + dr_m for dr_m, _ in shifts), base_m])
@@ -280,9 +287,9 @@ def whole_flow(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
     _, right, left, above, below, base = np.split(np.stack([end.r_m, end.z_m]), inside * np.arange(1, 6), axis=1)
     numeric = np.stack([right - left, above - below], axis=1) / (2 * STEP_M)  # 2 (r, z), 2 (by r0, by z0), places
     f, hoop = end.f[:inside], end.hoop[:inside]
-    gradient = max(farthest(f, numeric.transpose(2, 0, 1)), farthest(hoop, end.r_m[:inside] / r_m))
+    gradient = max(max_error(f, numeric.transpose(2, 0, 1)), max_error(hoop, end.r_m[:inside] / r_m))
     return [
-        Check("flow", f"det F = 1 in {STEPS_N} steps", "1", farthest(np.linalg.det(f) * hoop, 1.0), "1", 0.02,
+        Check("flow", f"det F = 1 in {STEPS_N} steps", "1", max_error(np.linalg.det(f) * hoop, 1.0), "1", 0.02,
               "second order in the steps; worst at the contact's edge"),
         Check("flow", "F is the gradient of the map", "central differences over 0.1 um", gradient, "1", 1e-5,
               "of stretches near 1: step squared over length squared"),
@@ -297,22 +304,22 @@ def sunken_surface(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
     above_m = end.z_m - (h_m - depth_m + tip_m - np.sqrt(tip_m**2 - np.minimum(end.r_m, tip_m) ** 2))
     touches = end.r_m < 0.95 * radius_m
     return [
-        Check("flow", "the sunken surface lies on the tip", "a sphere", farthest(above_m[touches], 0.0) / depth_m,
+        Check("flow", "the sunken surface lies on the tip", "a sphere", max_error(above_m[touches], 0.0) / depth_m,
               "of the depth", 0.02, "six pressures a step"),
         Check("flow", "nothing beside the contact pierces the tip", "a sphere",
               max(0.0, float(above_m.max() / depth_m)), "of the depth", 0.02, "as above"),
     ]  # fmt: skip
 
 
-def far_out(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
-    """Check, of a sliding skin, that what flows in under the tip flows out through every circle around it."""
+def far_field(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
+    """Check that on a slipping base the displaced volume flows out through every circle around the tip."""
     h_m = press.thickness_m
     r_m, z_m = (part.ravel() for part in np.meshgrid(np.array([4.0, 5.0, 6.0]) * h_m, np.linspace(0, h_m, 7)))
     end = deformation.follow(r_m, z_m, descent(depth_m), press=press)[-1]
     grown_m2 = end.r_m**2 - r_m**2
     return [
         Check("flow", "far out all heights move by what the tip displaces", "the mean over heights and circles",
-              worst(grown_m2, np.full_like(grown_m2, grown_m2.mean())), "1", 0.03,
+              scaled_error(grown_m2, np.full_like(grown_m2, grown_m2.mean())), "1", 0.03,
               "waves fade as exp(-pi r / h) past the contact; the map goes on in closed form from 5 thicknesses on"),
     ]  # fmt: skip
 
@@ -323,9 +330,9 @@ def _places(h_m: float, r_n: int, z_n: int) -> tuple[Float[np.ndarray, " s"], Fl
 
 
 def followed(skin: Skin, place_m: Float[np.ndarray, "2"], depths_m: Float[np.ndarray, " d"]) -> Dipoles:
-    """Carry all dipoles of a skin through a poke down to true depths, without a table; then it slides as one.
+    """Follow all dipoles of a skin through an indentation to true depths without a table; then slide the skin.
 
-    Each moment turns by the R of F = R U from a singular value decomposition. None may lie on the poke's axis.
+    Each moment turns by R of F = R U, from a singular value decomposition. No dipole may lie on the axis.
     """
     away_m = skin.nodes_m[:, :2] - place_m
     r_m = np.linalg.norm(away_m, axis=1)
@@ -344,8 +351,8 @@ def followed(skin: Skin, place_m: Float[np.ndarray, "2"], depths_m: Float[np.nda
     return slide.apply(slides, 0, after, skin.seat_m)
 
 
-COARSE = Quadrature(cell_m=2.2e-3, layers_n=4)  # for laws that hold for any rule
-DENSE = Quadrature(cell_m=1.5e-3, layers_n=4)  # for what the table and the steps cost
+COARSE = Quadrature(cell_m=2.2e-3, layers_n=4)  # for checks that hold for any rule
+DENSE = Quadrature(cell_m=1.5e-3, layers_n=4)  # for the errors of the table and of the steps
 EVERY_PLACE = 5  # of the protocol's 65
 REFERENCE_STEPS_N = 16
 UNSEEN_uT = 1.0  # a third of a chip's noise, to which it adds 5 %, as squares add
@@ -353,10 +360,10 @@ PLACES_M = np.array([[1.1, -2.3], [-4.2, 0.7], [5.3, 6.1]]) * milli  # on no nod
 Places = Float[np.ndarray, "p 2"]
 
 
-def check_poke(
+def check_indentations(
     board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, rule: Quadrature, depths_m: tuple[float, ...], seed: int
 ) -> list[Check]:
-    """Check dB on a scene's own first skin, and its symmetries on the design without spreads."""
+    """Check dB of indentations on a scene's first skin, and the symmetries of the design without spreads."""
     drawn, exact = draw_board(board, spreads, seed=seed, name="b0"), no_spread(spreads)
 
     def skin_of(rule: Quadrature, design: SkinDesign = skin, spreads: Spreads = spreads) -> Skin:
@@ -368,7 +375,7 @@ def check_poke(
         skin.model_copy(update={"saturation_T": 2.5 * skin.saturation_T}),
     )
     dense = skin_of(DENSE)
-    # A rig's arm gives in one direction: no symmetry is to be expected of that.
+    # The rig's compliance has a direction: without it there are symmetries.
     even = (
         skin
         if skin.hold is None
@@ -376,7 +383,8 @@ def check_poke(
     )
     return [
         *quadrature(drawn, skin_of(rule), fine, rules=(rule, cells, layers), pokes_m=each_depth(_grid_m(), depths_m)),
-        shortcuts(drawn, dense, min(depths_m), "shallowest"), shortcuts(drawn, dense, max(depths_m), "deepest"),
+        approximations(drawn, dense, min(depths_m), "shallowest"),
+        approximations(drawn, dense, max(depths_m), "deepest"),
         *symmetries(draw_board(board, exact, seed=seed, name="b0"), skin_of(COARSE, even, exact), skin.polarity),
         amplitude(drawn, skin_of(COARSE), skin_of(COARSE, stronger),
                   pokes_m=each_depth(PLACES_M, (0.3 * skin.thickness_mm * milli,))),
@@ -392,7 +400,7 @@ def quadrature(
     pokes_m: Float[np.ndarray, "n 3"],
     unseen_uT: float = UNSEEN_uT,
 ) -> list[Check]:
-    """Compare dB of a skin with that of the same skin on narrower cells, and on more layers."""
+    """Compare dB with that of the same skin on narrower cells, and on more layers."""
     found_T, cells_T, layers_T = (changes_of_field(board, each, pokes_m)[1] for each in (skin, *fine))
     size_T = np.linalg.norm(cells_T, axis=(1, 2), keepdims=True)
     allowed_T = np.maximum(0.02 * size_T, unseen_uT * micro)
@@ -400,18 +408,18 @@ def quadrature(
     narrower = f"cells of {cells.cell_m / milli:g} mm for {used.cell_m / milli:g} mm"
     few = f"{len(np.unique(pokes_m[:, :2], axis=0))} places of the protocol"
     return [
-        Check("dB of pokes", f"quadrature, {few}, all depths", narrower, apart(found_T, cells_T), "1", 0.02,
+        Check("dB of pokes", f"quadrature, {few}, all depths", narrower, norm_error(found_T, cells_T), "1", 0.02,
               "2 % is what an indentation may be wrong by in all (DESIGN 6)"),
         Check("dB of pokes", f"quadrature, {few}, each channel of each poke", narrower,
               float((np.abs(found_T - cells_T) / allowed_T).max()), "of the allowed", 1.0,
               f"2 % of the poke's dB, or {unseen_uT:g} uT where that is more: a third of a chip's noise"),
         Check("dB of pokes", f"quadrature, {few}, all depths", f"{layers.layers_n} layers for {used.layers_n}",
-              apart(found_T, layers_T), "1", 0.005, "Gauss nodes converge fast: a quarter of what the cells cost"),
+              norm_error(found_T, layers_T), "1", 0.005, "Gauss nodes converge fast: a quarter of what the cells cost"),
     ]  # fmt: skip
 
 
-def shortcuts(board: Board, skin: Skin, depth_m: float, kind: str, places_m: Places = PLACES_M) -> Check:
-    """Compare dB with that of magpylib's dipoles, each followed by itself."""
+def approximations(board: Board, skin: Skin, depth_m: float, kind: str, places_m: Places = PLACES_M) -> Check:
+    """Compare dB with that of magpylib's dipoles, each followed without a table."""
     pokes_m = each_depth(places_m, (depth_m,))
     _, found_T = changes_of_field(board, skin, pokes_m)
     before_T = field_of((skin.nodes_m, skin.moments_A_m2), board.chips_m)
@@ -420,12 +428,12 @@ def shortcuts(board: Board, skin: Skin, depth_m: float, kind: str, places_m: Pla
     truth_T = np.stack([field_of(dipoles, board.chips_m) - before_T for dipoles in moved])
     return Check("dB of pokes", f"table, steps and kernel, {kind} depth ({depth_m / milli:g} mm)",
                  f"each node followed in {REFERENCE_STEPS_N} steps, F = R U by SVD, magpylib's dipoles",
-                 apart(found_T, truth_T), "1", 0.02,
+                 norm_error(found_T, truth_T), "1", 0.02,
                  "2 % is what an indentation may be wrong by in all (steps, table, kernel; DESIGN 6)")  # fmt: skip
 
 
 def symmetries(board: Board, skin: Skin, polarity: Polarity, places_m: Places = PLACES_M) -> list[Check]:
-    """Turn, mirror and shift board, skin and pokes without spreads; the shift holds for any skin."""
+    """Rotate, mirror and shift board, skin and indentations without spreads; the shift holds for any skin."""
     sign = -1 if polarity == "checkerboard" else 1  # a quarter turn, or a mirror in x, swaps a checkerboard's poles
     mirror, shift_m = np.diag([-1.0, 1.0, 1.0]), np.array([0.4, -0.7, 0.0]) * milli
     pokes_m = each_depth(places_m, (0.3 * skin.thickness_m,))
@@ -437,21 +445,22 @@ def symmetries(board: Board, skin: Skin, polarity: Polarity, places_m: Places = 
     rounding = "rounding; no term may know a direction"
     name = f"dB of pokes, {polarity}"
     return [
-        Check(name, "a quarter turn of board and poke", "itself, turned", worst(turned_T, sign * here_T @ TURN.T), "1",
-              1e-9, rounding),
+        Check(name, "a quarter turn of board and poke", "itself, turned",
+              scaled_error(turned_T, sign * here_T @ TURN.T), "1", 1e-9, rounding),
         Check(name, "a mirror image of board and poke", "itself, mirrored",
-              worst(mirrored_T, sign * here_T @ mirror), "1", 1e-9, rounding),
-        Check(name, "skin, poke and chips moved together", "itself", worst(shifted_T, here_T), "1", 1e-9, rounding),
+              scaled_error(mirrored_T, sign * here_T @ mirror), "1", 1e-9, rounding),
+        Check(name, "skin, poke and chips moved together", "itself",
+              scaled_error(shifted_T, here_T), "1", 1e-9, rounding),
     ]  # fmt: skip
 
 
 def amplitude(
     board: Board, skin: Skin, stronger: Skin, *, pokes_m: Float[np.ndarray, "n 3"], factor: float = 2.5
 ) -> Check:
-    """Compare dB with that of a skin that is magnetised so many times as strongly."""
+    """Compare dB with that of a skin that is magnetised `factor` times as strongly."""
     once_T, more_T = (_change(board.chips_m, each, pokes_m) for each in (skin, stronger))
     return Check("dB of pokes", "proportional to the magnetisation", f"itself, {factor:g} times",
-                 worst(more_T, factor * once_T), "1", 1e-12, "rounding")  # fmt: skip
+                 scaled_error(more_T, factor * once_T), "1", 1e-12, "rounding")  # fmt: skip
 
 
 def _change(

@@ -1,6 +1,6 @@
-"""Laws of the fields of magnets and dipoles, against magpylib and Maxwell. In: sizes, a seed. Out: checks.
+"""Checks of magnetic fields, chips, wire formats and relaxation.
 
-magpylib's objects share no code with ours. Refuses to know pokes (`poke`) and chips (`electronics`).
+References: magpylib, Maxwell's equations, the data sheet, recorded noise, struct, and 50 digits (mpmath).
 """
 
 import struct
@@ -14,12 +14,11 @@ from jaxtyping import Float, Float32
 from magpylib.core import dipole_Hfield
 from scipy.constants import micro, milli, mu_0
 
-from pipeline.experiments.verification.checks import Check, farthest, relative, worst
+from pipeline.experiments.verification.checks import Check, max_error, relative_error, scaled_error
 from reskin.board import wire
 from reskin.board.stream import decode_all
 from reskin.board.wire import Frames
 from reskin.physics import magnet
-from reskin.physics import magnet as dipole
 from reskin.physics.aging import SKIN_RELAXATION, Prony, advance, relax
 from reskin.physics.board import Board
 from reskin.physics.chip import ChipDesign, Overruns, read_field, read_temperature, steps_uT
@@ -35,7 +34,7 @@ TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # a quarter turn about z
 
 
 def check_field(skin: SkinDesign, seed: int) -> list[Check]:
-    """Check boxes, the magnetising array and dipoles, at rest and moved."""
+    """Check cuboids, the magnetising array and dipoles, at rest and moved."""
     return [*boxes(seed), octupole(), *array(skin.polarity, skin.thickness_mm * milli, seed), *dipoles(seed)]
 
 
@@ -57,19 +56,19 @@ def boxes(seed: int, side_m: float = 0.5 * milli) -> list[Check]:
 
 
 def inside_a_box(places_m: Float[np.ndarray, "o 3"], side_m: float) -> float:
-    """Give the relative error of the field inside a cube."""
-    return worst(magnet.cuboid_field(places_m, 1.0, sides_m=(side_m,) * 3), cuboid(side_m).getB(places_m))
+    """Return the relative error of the field inside a cube."""
+    return scaled_error(magnet.cuboid_field(places_m, 1.0, sides_m=(side_m,) * 3), cuboid(side_m).getB(places_m))
 
 
 def cuboid(side_m: float, j_T: float = 1.0, place_m: tuple[float, ...] = (0, 0, 0)) -> magpylib.magnet.Cuboid:
-    """Make a cube of magpylib's that is magnetised along z."""
+    """Return magpylib's cube, magnetised along z."""
     return magpylib.magnet.Cuboid(polarization=(0, 0, j_T), dimension=(side_m,) * 3, position=place_m)
 
 
 def octupole() -> Check:
     place, moment = np.array([[0.3, -0.4, np.sqrt(0.75)]]), np.array([[0.0, 0.0, 1 / mu_0]])
     near, far = (
-        worst(dipole.field(np.zeros((1, 3)), moment, sides * place),
+        scaled_error(magnet.field(np.zeros((1, 3)), moment, sides * place),
               magnet.cuboid_field(sides * place, 1.0, sides_m=(1.0, 1.0, 1.0)))
         for sides in (8.0, 16.0)
     )  # fmt: skip
@@ -79,7 +78,7 @@ def octupole() -> Check:
 
 
 def cuboids(polarity: magnet.Polarity, thickness_m: float, cubes_n: tuple[int, int]) -> list[magpylib.magnet.Cuboid]:
-    """Lay out the magnetising array of magpylib's cubes."""
+    """Return the magnetising array as magpylib's cubes."""
     side_m, swaps = magnet.CUBE_SIDE_M, -1 if polarity == "checkerboard" else 1
     heights_m = (-magnet.ARRAY_BELOW_M - side_m / 2, thickness_m + magnet.ARRAY_ABOVE_M + side_m / 2)
     return [
@@ -98,17 +97,17 @@ def array(polarity: magnet.Polarity, thickness_m: float, seed: int) -> list[Chec
     differences = "central differences over 1 um, 0.25 mm and more from an edge: (1/250)^2"
     name = f"magnetising array, {polarity}"
     return [
-        Check(name, "field in the skin", "32 magpylib Cuboids", worst(here_T, theirs_T), "1", 1e-12,
+        Check(name, "field in the skin", "32 magpylib Cuboids", scaled_error(here_T, theirs_T), "1", 1e-12,
               "rounding, 32 boxes that nearly cancel at the seams"),
         Check(name, "div B = 0", "central differences", divergence, "1", 1e-4, differences),
         Check(name, "curl B = 0", "central differences", curl, "1", 1e-4, differences),
         Check(name, "a quarter turn turns the field" + (", and swaps the poles" if swaps < 0 else ""),
-              "itself, turned", worst(turned_T, swaps * here_T @ TURN.T), "1", 1e-12, "rounding, as above"),
+              "itself, turned", scaled_error(turned_T, swaps * here_T @ TURN.T), "1", 1e-12, "rounding, as above"),
     ]  # fmt: skip
 
 
 def _slopes(rng: np.random.Generator, thickness_m: float, polarity: magnet.Polarity) -> tuple[float, float]:
-    """Give the worst divergence and curl relative to the steepest slope of the field there."""
+    """Return the largest divergence and curl, relative to the largest derivative of the field at the same place."""
     step_m = 1e-6
     low, high = np.array([-9e-3, -9e-3, 0.05 * thickness_m]), np.array([9e-3, 9e-3, 0.95 * thickness_m])
     places_m = rng.uniform(low, high, (200, 3))
@@ -124,7 +123,7 @@ def _slopes(rng: np.random.Generator, thickness_m: float, polarity: magnet.Polar
 
 def dipoles(seed: int, factor: float = 2.5) -> list[Check]:
     rng = rng_for(seed, "verification", "dipoles")
-    # Off the origin, or a wrong sign of a separation could hide.
+    # Off the origin, or a wrong sign of the separation could go unnoticed.
     nodes_m = rng.uniform((2e-3, -9e-3, 1e-3), (9e-3, 4e-3, 3e-3), (60, 3))
     moments = 1e-5 * rng.standard_normal((60, 3))
     moved_m, turned = nodes_m + 1e-4 * rng.standard_normal((60, 3)), moments + 1e-6 * rng.standard_normal((60, 3))
@@ -138,18 +137,18 @@ def dipoles(seed: int, factor: float = 2.5) -> list[Check]:
     scaled_T = change_of_field((nodes_m, factor * moments), (moved_m, factor * turned), observers_m)
     year = "rounding; a magpylib of another CODATA year has another mu_0"
     return [
-        Check("field of dipoles", "at rest", "magpylib Dipole", worst(dipole.field(nodes_m, moments, observers_m),
-              before_T), "1", MU_0_DIGITS, year),
+        Check("field of dipoles", "at rest", "magpylib Dipole",
+              scaled_error(magnet.field(nodes_m, moments, observers_m), before_T), "1", MU_0_DIGITS, year),
         Check("change of field", "dipoles that move and turn", "magpylib Dipole, after less before",
-              worst(change_T, after_T - before_T), "1", 10 * MU_0_DIGITS,
+              scaled_error(change_T, after_T - before_T), "1", 10 * MU_0_DIGITS,
               f"{year}, and the difference is a tenth of the sums"),
         Check("change of field", "linear in the moments", f"itself, {factor:g} times",
-              worst(scaled_T, factor * change_T), "1", 1e-12, "rounding of a few thousand operations"),
+              scaled_error(scaled_T, factor * change_T), "1", 1e-12, "rounding of a few thousand operations"),
     ]  # fmt: skip
 
 
 def field_of(of: Dipoles, observers_m: Float[np.ndarray, "o 3"]) -> Float[np.ndarray, "o 3"]:
-    """Sum magpylib.core's field of dipoles at observers, in tesla: one call over every pair."""
+    """Return magpylib.core's field of dipoles at observers in T, in one call over all pairs."""
     places_m, moments = of
     separation_m = (observers_m[:, None] - places_m).reshape(-1, 3)
     h_A_m = dipole_Hfield(observers=separation_m, moments=np.tile(moments, (len(observers_m), 1)))
@@ -163,19 +162,19 @@ STILL_FRAMES_N = 20_000
 
 
 def check_electronics(chip: ChipDesign, seed: int) -> list[Check]:
-    """Check the conversion, the wrap of int16, the temperature and the noise of a scene's chip."""
+    """Check conversion, int16 wrap, temperature and noise of a scene's chip."""
     return [*steps(), *conversion(chip.gain_sel, seed), *noise(chip, seed), temperature(seed)]
 
 
 def quiet(gain_sel: int) -> ChipDesign:
-    """Give a chip without noise."""
+    """Return a chip without noise."""
     return ChipDesign(gain_sel=gain_sel, noise_xy_uT=0.0, noise_z_uT=0.0, noise_temperature_degC=0.0)
 
 
 def read_bare(
     b_T: Float[np.ndarray, "f 3"], design: ChipDesign, rng: np.random.Generator
 ) -> tuple[Float32[np.ndarray, "f 3"], Overruns]:
-    """Read a field with one chip that is not turned, of gain one and without offset."""
+    """Read a field with one ideal chip: not rotated, gain one, no offset."""
     eye = np.eye(3)[None]
     return read_field(b_T[:, None], Board("bare", np.zeros((1, 3)), eye, eye, np.zeros((1, 3))), design=design, rng=rng)
 
@@ -183,12 +182,12 @@ def read_bare(
 def steps() -> list[Check]:
     sheet = np.array([[PUBLISHED_STEPS_uT[7][axis] * gain for axis in range(3)] for gain in PUBLISHED_GAINS])
     ours = np.array([steps_uT(gain_sel) for gain_sel in range(8)])
-    published = max(farthest(ours[gain_sel], np.array(step)) for gain_sel, step in PUBLISHED_STEPS_uT.items())
+    published = max(max_error(ours[gain_sel], np.array(step)) for gain_sel, step in PUBLISHED_STEPS_uT.items())
     return [
         Check("chip", "uT a count, GAIN_SEL 6 and 7", "data sheet, as the firmware's authors publish it", published,
               "uT", 5e-5, "four published decimals"),
-        Check("chip", "uT a count, all gains", "data sheet, 0.150 / 0.242 uT times the gain", relative(ours, sheet),
-              "1", 3e-4, "three published decimals of 5/3 and 4/3"),
+        Check("chip", "uT a count, all gains", "data sheet, 0.150 / 0.242 uT times the gain",
+              relative_error(ours, sheet), "1", 3e-4, "three published decimals of 5/3 and 4/3"),
     ]  # fmt: skip
 
 
@@ -212,14 +211,15 @@ def conversion(gain_sel: int, seed: int) -> list[Check]:
 def noise(chip: ChipDesign, seed: int) -> list[Check]:
     read_uT, _ = read_bare(np.zeros((STILL_FRAMES_N, 3)), chip, rng_for(seed, "verification", "noise"))
     sd_uT = read_uT.std(axis=0)
-    # The noise of the design, and the error of a count that is rounded.
+    # The noise of the design, and the rounding of counts.
     design_uT = np.array([chip.noise_xy_uT, chip.noise_xy_uT, chip.noise_z_uT])
     expected_uT = np.sqrt(design_uT**2 + steps_uT(chip.gain_sel) ** 2 / 12)
     low_uT, high_uT = np.array([RECORDED_NOISE_uT[axis == 2] for axis in range(3)]).T
     outside_uT = np.maximum(low_uT - sd_uT, sd_uT - high_uT).clip(min=0)
     return [
-        Check("chip", "noise of a still board", "the design's sd, and a count's rounding", relative(sd_uT, expected_uT),
-              "1", 4 / np.sqrt(2 * STILL_FRAMES_N), f"{STILL_FRAMES_N} frames: 4 times 1 / sqrt(2 n)"),
+        Check("chip", "noise of a still board", "the design's sd, and a count's rounding",
+              relative_error(sd_uT, expected_uT), "1", 4 / np.sqrt(2 * STILL_FRAMES_N),
+              f"{STILL_FRAMES_N} frames: 4 times 1 / sqrt(2 n)"),
         Check("chip", "noise of a still board, how far outside the recorded", "sd 3.0-3.7 uT in x, y, 4.5-7.0 uT in z",
               float(outside_uT.max()), "uT", 0.1, "sampling, and the two digits of the recorded"),
     ]  # fmt: skip
@@ -229,7 +229,7 @@ def temperature(seed: int) -> Check:
     rng = rng_for(seed, "verification", "temperature")
     true_degC = rng.uniform(0, 60, (500, 5))
     raw = np.rint((true_degC - 25) * 45.2 + 46244)  # counts of the data sheet, back by its own formula
-    error_degC = farthest(read_temperature(true_degC, quiet(7), rng), 25 + (raw - 46244) / 45.2)
+    error_degC = max_error(read_temperature(true_degC, quiet(7), rng), 25 + (raw - 46244) / 45.2)
     return Check("chip", "temperature", "25 + (raw - 46244) / 45.2, data sheet", error_degC, "degC", 4e-6,
                  "rounding of float32 near 60")  # fmt: skip
 
@@ -240,7 +240,7 @@ CRLF_SHARE = 0.05
 
 
 def check_frames(gain_sel: int, chips_n: int, seed: int) -> list[Check]:
-    """Check what is written and what is read, for each wire format; an error is the largest difference of any value."""
+    """Check encoding and decoding of each wire format; the error is the largest difference of any value."""
     frames = make_frames(FRAMES_N, chips_n, gain_sel=gain_sel, rng=rng_for(seed, "verification", "frames"))
     laws: dict[Wire, Callable[[Frames, Wire], list[Check]]] = {
         "binary": binary,
@@ -252,7 +252,7 @@ def check_frames(gain_sel: int, chips_n: int, seed: int) -> list[Check]:
 
 
 def make_frames(frames_n: int, chips_n: int, *, gain_sel: int, rng: np.random.Generator) -> Frames:
-    """Make readings on the chip's grid; some temperatures hold CR LF in their bytes."""
+    """Make readings on the chip's grid; some temperatures contain CR LF in their bytes."""
     counts = rng.integers(-20_000, 20_000, (frames_n, chips_n, 3))
     b_uT = (counts * steps_uT(gain_sel)).reshape(frames_n, -1).astype(np.float32)
     usual_degC = (rng.integers(2000, 4000, (frames_n, chips_n)) / 100).astype(np.float32)
@@ -283,7 +283,7 @@ def text(frames: Frames, layout: Wire) -> list[Check]:
     values = _txyz(frames)
     numbers = values.reshape(len(frames), -1, 4)
     ordered = numbers if layout == "text-txyz" else np.roll(numbers, -1, axis=2)
-    # AnySkin's firmware leaves the tab between two chips out.
+    # AnySkin's firmware omits the tab between two chips.
     gap = "" if layout == "text-txyz" else "\t"
     lines = [gap.join("\t".join(f"{value:.2f}" for value in chip) for chip in row) + gap for row in ordered.tolist()]
     theirs = "".join(line + "\r\n" for line in lines).encode()
@@ -320,7 +320,7 @@ ROUNDING = 1e-14  # a few dozen operations on doubles
 
 
 def check_relaxation() -> list[Check]:
-    """Check pokes in a row, single steps of any stiffness, and a held poke."""
+    """Check repeated indentations, single steps of any stiffness, and a held indentation."""
     steps = [step_error(1e-3 * dt, stiff(ratio)) for ratio, dt in product(RATIOS, STEPS)]
     return [
         many_pokes(),
@@ -331,7 +331,7 @@ def check_relaxation() -> list[Check]:
 
 
 def stiff(ratio: float) -> Prony:
-    """Give three relaxations: of 1 ms, of `ratio` times as long, and between them."""
+    """Return three relaxation times: 1 ms, `ratio` times as long, and their geometric mean."""
     return Prony(np.array([1e-3, 1e-3 * np.sqrt(ratio), 1e-3 * ratio]), np.array([0.3, 0.2, 0.1]))
 
 
@@ -339,7 +339,7 @@ def many_pokes() -> Check:
     starts_s = CYCLE_S * np.arange(POKES_N)
     time_s = np.sort(np.concatenate([starts_s, starts_s + RAMP_S, starts_s + RAMP_S + HOLD_S]))
     elastic = np.tile([0.0, 2.0, 2.0], POKES_N)
-    error = worst(relax(time_s, elastic, SKIN_RELAXATION), hereditary(time_s, elastic, SKIN_RELAXATION))
+    error = scaled_error(relax(time_s, elastic, SKIN_RELAXATION), hereditary(time_s, elastic, SKIN_RELAXATION))
     return Check(NAME, f"{POKES_N} pokes over {POKES_N * CYCLE_S:g} s", "hereditary integral in 50 digits (mpmath)",
                  error, "1", 1e-13, "60 exact steps add up rounding")  # fmt: skip
 
@@ -347,27 +347,27 @@ def many_pokes() -> Check:
 def held(time_s: Float[np.ndarray, " t"]) -> Check:
     closed = 3.0 * (1 - (SKIN_RELAXATION.share * -np.expm1(-time_s[:, None] / SKIN_RELAXATION.tau_s)).sum(axis=1))
     return Check(NAME, "a held poke, 10 us to 12 days", "1 - sum of shares (1 - exp(-t / tau))",
-                 worst(relax(time_s, np.full(len(time_s), 3.0), SKIN_RELAXATION), closed), "1", 1e-13,
+                 scaled_error(relax(time_s, np.full(len(time_s), 3.0), SKIN_RELAXATION), closed), "1", 1e-13,
                  "200 steps add up their rounding")  # fmt: skip
 
 
 def step_error(dt_s: float, prony: Prony) -> float:
-    """Compare a step of `viscoelastic.advance` with its formula in 50 digits."""
+    """Return the error of a step of `aging.advance` against its formula in 50 digits."""
     with mpmath.workdps(50):
         truth = []
         for q, tau, share in zip(STATE.tolist(), prony.tau_s.tolist(), prony.share.tolist(), strict=True):
             x = mpmath.mpf(dt_s) / mpmath.mpf(tau)
             mean = (1 - mpmath.exp(-x)) / x
             truth.append(float(mpmath.exp(-x) * mpmath.mpf(q) + mpmath.mpf(share) * mpmath.mpf(1.3) * mean))
-    return worst(advance(STATE, 1.3, dt_s, prony), np.array(truth))
+    return scaled_error(advance(STATE, 1.3, dt_s, prony), np.array(truth))
 
 
 def hereditary(
     time_s: Float[np.ndarray, " t"], elastic: Float[np.ndarray, " t"], prony: Prony
 ) -> Float[np.ndarray, " t"]:
-    """Give Lee & Radok's integral of relaxation(t - s) d elastic(s) in 50 digits, every ramp from its start anew.
+    """Return Lee & Radok's integral of relaxation(t - s) d elastic(s) in 50 digits, summed over all ramps.
 
-    No state is carried from ramp to ramp, as `viscoelastic` does.
+    Unlike `aging.relax` it carries no state from ramp to ramp.
     """
     with mpmath.workdps(50):
         t, e, tau, share = (
